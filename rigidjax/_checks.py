@@ -1,0 +1,65 @@
+"""Checks at public boundaries: what was wanted, what came, and the likely cause (floor 0)."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Bool, Float
+
+
+def floating(
+    value: Any, shape: tuple[int, ...], name: str, *, hint: str = "", batched: bool = False
+) -> Array:
+    """Return `value` as a float32 or float64 array of exactly `shape`, or say what is wrong.
+
+    **Arguments:** `value` anything array-like; integers become the default float type. `shape` the
+    shape wanted; with `batched` any leading axes may stand before it. `name` how the message calls
+    the argument. `hint` a likely cause, added to a shape message.
+
+    **Raises:** `TypeError` for what is not a real number array, or is half precision (its 3 digits
+    cannot hold a rotation); `ValueError` for a wrong shape.
+    """
+    try:
+        array = jnp.asarray(value)
+    except (TypeError, ValueError) as error:
+        raise TypeError(f"{name}: wanted an array of numbers, got {type(value).__name__}") from error
+    if jnp.issubdtype(array.dtype, jnp.integer):
+        array = array.astype(jnp.result_type(float))
+    if array.dtype not in (jnp.float32, jnp.float64):
+        reason = " (half precision cannot hold a rotation)" if array.dtype.itemsize == 2 else ""
+        raise TypeError(f"{name}: wanted float32 or float64, got {array.dtype}{reason}")
+    found = array.shape[array.ndim - len(shape) :] if batched else array.shape
+    if found != shape:
+        advice = hint or (
+            "functions take one body; batch with jax.vmap"
+            if array.ndim > len(shape) and array.shape[array.ndim - len(shape) :] == shape
+            else ""
+        )
+        raise ValueError(
+            f"{name}: wanted shape {shape}, got {array.shape}" + (f"; {advice}" if advice else "")
+        )
+    return array
+
+
+def refuse(value: Any, bad: Bool[ArrayLike, "..."], message: str) -> Any:
+    """Return `value` unless `bad`; then raise with `message`, the same under `jit` and `vmap`.
+
+    Outside a trace this is a `ValueError` with the bare text. Inside one it is
+    `equinox.error_if`; the result must be used, or the check is dropped.
+    """
+    if not isinstance(bad, jax.core.Tracer):
+        if bool(np.any(np.asarray(bad))):
+            raise ValueError(message)
+        return value
+    return eqx.error_if(value, bad, message)
+
+
+def finite(value: Float[Array, "..."], name: str) -> Float[Array, "..."]:
+    """Return `value` unless it holds a NaN or an infinity."""
+    bad = ~jnp.isfinite(value)
+    where = ""
+    if not isinstance(bad, jax.core.Tracer) and bool(bad.any()):
+        where = f" at index {tuple(int(i) for i in np.argwhere(np.asarray(bad))[0])}"
+    return refuse(value, bad.any(), f"{name}: contains NaN or infinity{where}")

@@ -1,0 +1,46 @@
+"""Names for the arrays that everything passes around (floor 0).
+
+`Vec3`, `Mat3`, `Quat`, `Scalar` are what functions return: JAX arrays. The `…Like` forms are what
+they take: anything NumPy-like of the same shape. One body at a time; batch with `jax.vmap`.
+"""
+
+from typing import Protocol, runtime_checkable
+
+from jaxtyping import Array, ArrayLike, Float
+
+Scalar = Float[Array, ""]
+Vec3 = Float[Array, "3"]
+Mat3 = Float[Array, "3 3"]
+Quat = Float[Array, "4"]
+
+ScalarLike = Float[ArrayLike, ""]
+Vec3Like = Float[ArrayLike, "3"]
+Mat3Like = Float[ArrayLike, "3 3"]
+QuatLike = Float[ArrayLike, "4"]
+
+
+@runtime_checkable
+class HasSpin(Protocol):
+    """Whatever turns: it has a body rate `omega` (rad/s, body frame)."""
+
+    @property
+    def omega(self) -> Float[Array, "*batch 3"]: ...
+
+
+@runtime_checkable
+class HasAttitude(HasSpin, Protocol):
+    """Whatever turns and knows which way it points: `q` (w, x, y, z), body → world."""
+
+    @property
+    def q(self) -> Float[Array, "*batch 4"]: ...
+
+
+@runtime_checkable
+class HasPose(HasAttitude, Protocol):
+    """Whatever turns, points and moves: `x`, `v` of the centre of mass (m, m/s, world frame)."""
+
+    @property
+    def x(self) -> Float[Array, "*batch 3"]: ...
+
+    @property
+    def v(self) -> Float[Array, "*batch 3"]: ...
