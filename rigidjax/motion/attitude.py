@@ -1,0 +1,87 @@
+"""Rung 2: a body that turns and knows which way it points."""
+
+from typing import TypeVar
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from rigidjax import _checks
+from rigidjax._types import HasAttitude, Quat, QuatLike, ScalarLike, Vec3Like
+from rigidjax.body.inertia import Inertia
+from rigidjax.motion.spin import EulerEquations
+from rigidjax.motion.torques import Torque
+from rigidjax.rotation import quaternion
+
+
+class Attitude(eqx.Module):
+    """The state of rung 2: attitude and body rate.
+
+    **Arguments:** `q` (4,) unit quaternion (w, x, y, z), **scalar first**, body → world (the `M` of
+    the notes, eq 8); `omega` (3,) Ω in the body frame, rad/s. Leading axes are allowed in a
+    container of many states; functions take one.
+
+    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype. Whether `q` is a unit
+    quaternion is checked where it is used (`simulate`, `rigidjax.exact.free_body`).
+
+    >>> Attitude([1.0, 0, 0, 0], [0.0, 0, 1]).q.shape
+    (4,)
+    """
+
+    q: Float[Array, "*batch 4"]
+    omega: Float[Array, "*batch 3"]
+
+    def __init__(
+        self, q: Float[Array, "*batch 4"] | object, omega: Float[Array, "*batch 3"] | object
+    ):
+        self.q = _checks.floating(q, (4,), "q", batched=True, hint="a quaternion is (w, x, y, z)")
+        self.omega = _checks.floating(omega, (3,), "omega", batched=True)
+
+
+class AttitudeEquations(eqx.Module):
+    """Euler's equations and the kinematics `dq/dt = ½ q ⊗ (0, Ω)` as a vector field.
+
+    **Arguments:** as for `EulerEquations`. A field for `diffrax.ODETerm`; `args` is not used.
+
+    Source: `dM/dt = M J'` (notes, eq 50), written for the quaternion of M.
+
+    >>> import rigidjax as rj
+    >>> field = rj.AttitudeEquations(rj.Inertia.from_principal(1.0, 2.0, 3.0))
+    >>> field(0.0, Attitude([1.0, 0, 0, 0], [0.0, 0, 1]), None).q
+    Array([0. , 0. , 0. , 0.5], dtype=float64)
+    """
+
+    euler: EulerEquations
+
+    def __init__(self, inertia: Inertia, torque: Torque | None = None):
+        self.euler = EulerEquations(inertia, torque)
+
+    def __call__(self, t: ScalarLike, y: HasAttitude, args: object = None) -> Attitude:
+        return Attitude(quaternion_rate(y.q, y.omega), self.euler.rate_of(t, y))
+
+
+def quaternion_rate(q: QuatLike, omega: Vec3Like) -> Quat:
+    """dq/dt = ½ q ⊗ (0, Ω).
+
+    **Arguments:** `q` (4,) body → world, scalar first; `omega` (3,) Ω, rad/s, body frame.
+    **Returns** (4,) per second. Source: notes, eq 50, on unit quaternions.
+
+    >>> quaternion_rate(jnp.array([1.0, 0, 0, 0]), jnp.array([0.0, 0, 2]))
+    Array([0., 0., 0., 1.], dtype=float64)
+    """
+    q, omega = _checks.floating(q, (4,), "q"), _checks.floating(omega, (3,), "omega")
+    w, x, y, z = q[0], q[1], q[2], q[3]
+    a, b, c = 0.5 * omega[0], 0.5 * omega[1], 0.5 * omega[2]
+    return jnp.stack(
+        [-x * a - y * b - z * c, w * a + y * c - z * b, w * b + z * a - x * c, w * c + x * b - y * a]
+    )
+
+
+State = TypeVar("State")
+
+
+def on_the_group(state: State) -> State:
+    """The same state with its quaternion, if it has one, scaled to length 1."""
+    if isinstance(state, HasAttitude):
+        return eqx.tree_at(lambda s: s.q, state, quaternion.normalise(state.q))
+    return state

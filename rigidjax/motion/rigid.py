@@ -1,0 +1,71 @@
+"""Rung 3: a body that turns, points and moves. Newton–Euler about the centre of mass."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from rigidjax import _checks
+from rigidjax._types import HasPose, ScalarLike
+from rigidjax.body.inertia import MassProperties
+from rigidjax.motion.attitude import quaternion_rate
+from rigidjax.motion.spin import EulerEquations
+from rigidjax.motion.torques import Torque
+
+
+class Rigid(eqx.Module):
+    """The state of rung 3: where the centre of mass is and goes, attitude, body rate.
+
+    **Arguments:** `x` (3,) position of the centre of mass, m, world frame (the `X` of the notes,
+    eq 1); `v` (3,) its velocity, m/s, world frame; `q` (4,) unit quaternion (w, x, y, z), scalar
+    first, body → world; `omega` (3,) Ω in the body frame, rad/s. Leading axes are allowed in a
+    container of many states; functions take one.
+
+    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
+
+    >>> Rigid([0.0, 0, 0], [1.0, 0, 0], [1.0, 0, 0, 0], [0.0, 0, 1]).v.shape
+    (3,)
+    """
+
+    x: Float[Array, "*batch 3"]
+    v: Float[Array, "*batch 3"]
+    q: Float[Array, "*batch 4"]
+    omega: Float[Array, "*batch 3"]
+
+    def __init__(
+        self,
+        x: Float[Array, "*batch 3"] | object,
+        v: Float[Array, "*batch 3"] | object,
+        q: Float[Array, "*batch 4"] | object,
+        omega: Float[Array, "*batch 3"] | object,
+    ):
+        self.x = _checks.floating(x, (3,), "x", batched=True)
+        self.v = _checks.floating(v, (3,), "v", batched=True)
+        self.q = _checks.floating(q, (4,), "q", batched=True, hint="a quaternion is (w, x, y, z)")
+        self.omega = _checks.floating(omega, (3,), "omega", batched=True)
+
+
+class NewtonEuler(eqx.Module):
+    """Newton–Euler equations about the centre of mass as a vector field `f(t, y, args)`.
+
+    `m dv/dt = 0` (no force acts on this rung yet), `I dΩ/dt = IΩ × Ω + τ`, `dq/dt = ½ q ⊗ (0, Ω)`.
+
+    **Arguments:** `body` mass properties; the inertia used is the one about its centre of mass;
+    `torque` τ about the centre of mass, N m, body frame, or `None`.
+
+    Source: notes, eqs 1, 50, 56, 84.
+
+    >>> import rigidjax as rj
+    >>> field = rj.NewtonEuler(rj.shapes.box(2.0, [0.1, 0.2, 0.3]))
+    >>> field(0.0, Rigid([0.0, 0, 0], [1.0, 0, 0], [1.0, 0, 0, 0], [0.0, 0, 1]), None).x
+    Array([1., 0., 0.], dtype=float64)
+    """
+
+    euler: EulerEquations
+
+    def __init__(self, body: MassProperties, torque: Torque | None = None):
+        self.euler = EulerEquations(body.inertia, torque)
+
+    def __call__(self, t: ScalarLike, y: HasPose, args: object = None) -> Rigid:
+        return Rigid(
+            y.v, jnp.zeros_like(y.v), quaternion_rate(y.q, y.omega), self.euler.rate_of(t, y)
+        )
