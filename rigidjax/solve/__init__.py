@@ -1,1 +1,11 @@
+"""Answers with a solver, all of them diffrax's."""
 
+from rigidjax.solve.projected import (
+    GroupInterpolation as GroupInterpolation,
+    Projected as Projected,
+)
+from rigidjax.solve.simulate import (
+    Solution as Solution,
+    equations_of_motion as equations_of_motion,
+    simulate as simulate,
+)

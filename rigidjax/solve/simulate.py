@@ -1,0 +1,256 @@
+"""The one front door: a body, where it starts, when to look, and what turns it."""
+
+import warnings
+from typing import Any
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+from rigidjax import _checks
+from rigidjax._types import HasAttitude, ScalarLike
+from rigidjax.body.inertia import Inertia, MassProperties
+from rigidjax.motion import (
+    Attitude,
+    AttitudeEquations,
+    EulerEquations,
+    NewtonEuler,
+    Rigid,
+    Spin,
+    on_the_group,
+)
+from rigidjax.motion.torques import Torque, require_rung
+from rigidjax.solve.projected import Projected
+
+State = Spin | Attitude | Rigid
+
+
+class Solution(eqx.Module):
+    """What `simulate` returns.
+
+    **Fields:** `ts` (T,) the times asked for, s; `ys` the states there, of the type of `state0`,
+    with a leading time axis; `stats` a dict with `num_steps`, `num_accepted_steps`,
+    `num_rejected_steps`; `result` a `diffrax.RESULTS`, successful or the reason why not.
+    """
+
+    ts: Float[Array, " times"]
+    ys: Any
+    stats: dict[str, Any]
+    result: dfx.RESULTS
+    _setup: "_Setup"
+
+    def evaluate(self, t: ScalarLike) -> Any:
+        """The state at any `t` between the first and the last of `ts`, s.
+
+        The motion is solved again from the last saved state before `t`, so the error is that of the
+        solver, not of an interpolation, and the attitude is on the group.
+
+        **Raises:** `ValueError` (`EquinoxRuntimeError` under `jit`) where `t` is outside.
+        """
+        t = _checks.floating(t, (), "t").astype(self.ts.dtype)
+        outside = (t < self.ts[0]) | (t > self.ts[-1])
+        t = _checks.refuse(t, outside, "evaluate: t lies outside the times that were simulated")
+        index = jnp.clip(jnp.searchsorted(self.ts, t, side="right") - 1, 0, self.ts.shape[0] - 1)
+        start = jax.tree.map(lambda leaf: leaf[index], self.ys)
+        ys, _, _ = _solve(self._setup, start, jnp.stack([self.ts[index], t]))
+        return jax.tree.map(lambda leaf: leaf[-1], ys)
+
+
+class _Setup(eqx.Module):
+    """Everything about a solve but the start and the times."""
+
+    field: EulerEquations | AttitudeEquations | NewtonEuler
+    solver: dfx.AbstractSolver
+    controller: dfx.AbstractStepSizeController
+    dt0: Any
+    adjoint: dfx.AbstractAdjoint
+    progress_meter: dfx.AbstractProgressMeter
+    max_steps: int | None = eqx.field(static=True)
+    throw: bool = eqx.field(static=True)
+
+
+@eqx.filter_jit
+def _solve(setup: _Setup, state0: Any, ts: Array) -> tuple[Any, dict[str, Any], dfx.RESULTS]:
+    out = dfx.diffeqsolve(
+        dfx.ODETerm(setup.field),
+        setup.solver,
+        ts[0],
+        ts[-1],
+        setup.dt0,
+        state0,
+        saveat=dfx.SaveAt(ts=ts),
+        stepsize_controller=setup.controller,
+        adjoint=setup.adjoint,
+        max_steps=setup.max_steps,
+        throw=setup.throw,
+        progress_meter=setup.progress_meter,
+    )
+    stats = {key: value for key, value in out.stats.items() if key != "max_steps"}
+    return out.ys, stats, out.result
+
+
+def simulate(
+    body: Inertia | MassProperties,
+    state0: State,
+    ts: Float[ArrayLike, " times"],
+    torque: Torque | None = None,
+    *,
+    solver: dfx.AbstractSolver | None = None,
+    rtol: float | None = None,
+    atol: float | None = None,
+    dt0: float | None = None,
+    stepsize_controller: dfx.AbstractStepSizeController | None = None,
+    adjoint: dfx.AbstractAdjoint | None = None,
+    max_steps: int | None = 100_000,
+    throw: bool = True,
+    progress_meter: dfx.AbstractProgressMeter | None = None,
+) -> Solution:
+    """The motion of a rigid body from `state0`, saved at `ts`.
+
+    **Arguments:**
+
+    - `body`: `Inertia` for `Spin` and `Attitude`, about the point that the body turns about;
+      `MassProperties` for `Rigid`.
+    - `state0`: `Spin(omega)`, `Attitude(q, omega)` or `Rigid(x, v, q, omega)` at `ts[0]`. The rung
+      says what is solved for: take the lowest that the question needs. One body; for many,
+      `jax.vmap(lambda body, state: rj.simulate(body, state, ts).ys)`.
+    - `ts`: (T,) increasing times, s. The first is the start.
+    - `torque`: a torque of `rigidjax.torques`, or any callable Module `(t, state, body) → (3,)`,
+      N m, body frame; `None` for a free body.
+    - `solver`: any `diffrax.AbstractSolver`; `diffrax.Dopri8` unless given. It is wrapped so that
+      attitudes stay unit quaternions, at every step and every saved time.
+    - `rtol`, `atol`: tolerances of the adaptive steps; 1e-9 and 1e-12 in float64, 1e-5 and 1e-7 in
+      float32.
+    - `dt0`, `stepsize_controller`: first step and controller where the tolerances are not enough,
+      such as `dt0=0.01, stepsize_controller=diffrax.ConstantStepSize()`.
+    - `adjoint`: how gradients are taken. `None` is `diffrax.RecursiveCheckpointAdjoint()`, for
+      `jax.grad`; pass `diffrax.ForwardMode()` for `jax.jacfwd` and least squares.
+    - `max_steps`, `throw`, `progress_meter`: as in `diffrax.diffeqsolve`.
+
+    **Returns** a `Solution`. A second call with other numbers of the same shapes compiles nothing.
+
+    Source: `AttitudeEquations`, `EulerEquations`, `NewtonEuler` (notes, eqs 50, 79, 84).
+
+    **Raises:** `TypeError` where body, state and torque do not fit; `ValueError` for times that do
+    not increase, NaN, or a quaternion that is not unit (`EquinoxRuntimeError` under `jit`).
+
+    >>> import rigidjax as rj
+    >>> body, start = rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([0.01, 1.0, 0.0])
+    >>> bool(abs(rj.simulate(body, start, jnp.linspace(0.0, 9.43, 3)).ys.omega[-1, 1]) < 0.01)
+    True
+    """
+    times = _check_times(ts)
+    state0 = _check_start(state0)
+    dtype = times.dtype
+    for leaf in jax.tree.leaves(state0):
+        dtype = jnp.promote_types(dtype, leaf.dtype)
+    times = times.astype(dtype)
+    state0 = jax.tree.map(lambda leaf: leaf.astype(dtype), state0)
+    controller = stepsize_controller
+    if controller is None:
+        rtol, atol = _tolerances(rtol, atol, dtype)
+        controller = dfx.PIDController(rtol=rtol, atol=atol)
+    elif rtol is not None or atol is not None:
+        raise ValueError("simulate: give either rtol and atol or a stepsize_controller, not both")
+    setup = _Setup(
+        field=equations_of_motion(body, state0, torque),
+        solver=Projected(dfx.Dopri8() if solver is None else solver),
+        controller=controller,
+        dt0=None if dt0 is None else jnp.asarray(dt0, dtype),
+        adjoint=dfx.RecursiveCheckpointAdjoint() if adjoint is None else adjoint,
+        progress_meter=dfx.NoProgressMeter() if progress_meter is None else progress_meter,
+        max_steps=max_steps,
+        throw=throw,
+    )
+    ys, stats, result = _solve(setup, state0, times)
+    return Solution(times, ys, stats, result, setup)
+
+
+def equations_of_motion(
+    body: Inertia | MassProperties, state0: State, torque: Torque | None = None
+) -> EulerEquations | AttitudeEquations | NewtonEuler:
+    """The vector field for this body on the rung of `state0`, for plain `diffrax.ODETerm`.
+
+    **Arguments** as for `simulate`. **Raises** `TypeError` where they do not fit.
+
+    >>> import rigidjax as rj
+    >>> type(equations_of_motion(rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([1.0, 0, 0])))
+    <class 'rigidjax.motion.spin.EulerEquations'>
+    """
+    if torque is not None:
+        require_rung(torque, state0)
+    if isinstance(state0, Rigid):
+        if not isinstance(body, MassProperties):
+            raise TypeError(
+                f"Rigid moves as well as turns: wanted MassProperties, got {type(body).__name__}"
+            )
+        return NewtonEuler(body, torque)
+    if not isinstance(body, Inertia):
+        raise TypeError(
+            f"{type(state0).__name__} only turns: wanted Inertia, got {type(body).__name__}"
+            + ("; pass body.inertia" if isinstance(body, MassProperties) else "")
+        )
+    if isinstance(state0, Attitude):
+        return AttitudeEquations(body, torque)
+    return EulerEquations(body, torque)
+
+
+def _tolerances(rtol: float | None, atol: float | None, dtype: Any) -> tuple[float, float]:
+    double = dtype == jnp.float64
+    rtol = (1e-9 if double else 1e-5) if rtol is None else rtol
+    atol = (1e-12 if double else 1e-7) if atol is None else atol
+    if not rtol > 0 or not atol >= 0:
+        raise ValueError(f"simulate: wanted rtol > 0 and atol >= 0, got rtol={rtol}, atol={atol}")
+    floor = 100 * float(jnp.finfo(dtype).eps)
+    # A relative tolerance below this cannot be met: steps shrink until max_steps ends the run.
+    if rtol < floor:
+        advice = "" if double else "; set jax.config.update('jax_enable_x64', True) for float64"
+        warnings.warn(
+            f"simulate: {np.dtype(dtype).name} cannot reach rtol={rtol:g}; using {floor:.1g}{advice}",
+            stacklevel=3,
+        )
+        rtol = floor
+    return rtol, atol
+
+
+def _check_times(ts: Any) -> Array:
+    try:
+        length = np.shape(ts)
+    except ValueError:
+        length = ()
+    if len(length) != 1 or length[0] < 2:
+        raise ValueError(f"ts: wanted at least two times, shape (T,), got shape {length}")
+    times = _checks.finite(_checks.floating(ts, length, "ts"), "ts")
+    falling = times[1:] <= times[:-1]
+    where = ""
+    if not isinstance(falling, jax.core.Tracer) and bool(falling.any()):
+        where = f"; ts[{int(np.argmax(np.asarray(falling))) + 1}] is not above the one before"
+    return _checks.refuse(times, falling.any(), f"ts: wanted increasing times{where}")
+
+
+def _check_start(state0: State) -> State:
+    if not isinstance(state0, Spin | Attitude | Rigid):
+        raise TypeError(f"state0: wanted Spin, Attitude or Rigid, got {type(state0).__name__}")
+    if state0.omega.ndim != 1:
+        raise ValueError(
+            f"state0: wanted one body, omega of shape (3,), got {state0.omega.shape}; "
+            "batch with jax.vmap"
+        )
+    names = [str(path[-1]).lstrip(".") for path, _ in jax.tree.leaves_with_path(state0)]
+    leaves, tree = jax.tree.flatten(state0)
+    leaves = [_checks.finite(leaf, name) for leaf, name in zip(leaves, names, strict=True)]
+    state0 = jax.tree.unflatten(tree, leaves)
+    if isinstance(state0, HasAttitude):
+        length = jnp.sqrt(jnp.sum(state0.q**2))
+        far = jnp.abs(length - 1) > (1e-6 if state0.q.dtype == jnp.float64 else 1e-3)
+        q = _checks.refuse(
+            state0.q,
+            far,
+            "q: wanted a unit quaternion (w, x, y, z), got one whose length is not 1; normalise it "
+            "with rigidjax.quaternion.normalise, and mind that the scalar comes first",
+        )
+        state0 = on_the_group(eqx.tree_at(lambda s: s.q, state0, q))
+    return state0
