@@ -1,1 +1,12 @@
+"""What is turned: inertia, mass, second moments, shapes, and numbers that are always a body."""
 
+from rigidjax.body.energy import (
+    angular_momentum as angular_momentum,
+    kinetic_energy as kinetic_energy,
+    kinetic_energy_about as kinetic_energy_about,
+    kinetic_energy_of_generator as kinetic_energy_of_generator,
+    kinetic_energy_of_matrix_rate as kinetic_energy_of_matrix_rate,
+    kinetic_energy_of_moments as kinetic_energy_of_moments,
+    spatial_angular_momentum as spatial_angular_momentum,
+)
+from rigidjax.body.inertia import Inertia as Inertia, MassProperties as MassProperties

@@ -1,0 +1,179 @@
+"""Kinetic energy and angular momentum of whatever turns (floor 1).
+
+The notes write the energy of rotation in three forms. Printed eqs 61–65 lack the factor ½ that
+eqs 57 and 73–75 have; here all three have it and agree.
+"""
+
+import jax.numpy as jnp
+from jaxtyping import ArrayLike, Float
+
+from rigidjax import _checks
+from rigidjax._types import (
+    HasAttitude,
+    HasPose,
+    HasSpin,
+    Mat3Like,
+    QuatLike,
+    Scalar,
+    Vec3,
+    Vec3Like,
+)
+from rigidjax.body.inertia import Inertia, MassProperties
+from rigidjax.body.symmetric import apply, product
+
+
+def kinetic_energy(
+    body: Inertia | MassProperties, state: HasSpin | Float[ArrayLike, "3"] | object
+) -> Scalar:
+    """Kinetic energy of a body in a state of motion, J.
+
+    **Arguments:** `body` an `Inertia` about the point it turns about, or `MassProperties`;
+    `state` anything with `.omega` (Ω, rad/s, body frame), or Ω (3,) itself. With `MassProperties`
+    and a state that moves (`.v`, m/s, of the centre of mass, world frame) translation counts too.
+
+    `T = ½ m |v|² + ½ Ω·IΩ`. Source: notes, eqs 75 and 79, in any body axes.
+
+    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
+
+    >>> kinetic_energy(Inertia.from_principal(1.0, 2.0, 3.0), [1.0, 1.0, 1.0])
+    Array(3., dtype=float64)
+    """
+    inertia = body if isinstance(body, Inertia) else body.inertia
+    omega = _omega(state)
+    energy = 0.5 * _dot(omega, apply(inertia.tensor, omega))
+    if isinstance(body, MassProperties) and isinstance(state, HasPose):
+        energy = energy + 0.5 * body.mass * _dot(state.v, state.v)
+    return energy
+
+
+def kinetic_energy_about(
+    body: MassProperties, q: QuatLike, velocity: Vec3Like, omega: Vec3Like
+) -> Scalar:
+    """Kinetic energy when the point followed is not the centre of mass, J.
+
+    `T = ½ m |V|² + m V·R(Ω × c) + ½ Ω·I_o Ω`: the cross term that the notes drop by putting the
+    origin at the centre of mass (eqs 54–57).
+
+    **Arguments:** `body`; its origin, from which `com` is counted, is the point followed. `q` (4,)
+    (w, x, y, z), body → world; `velocity` (3,) V of that point, m/s, world frame; `omega` (3,) Ω,
+    rad/s, body frame.
+
+    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
+
+    >>> ball = MassProperties(1.0, [1.0, 0, 0], [[0.0, 0, 0], [0, 0, 0], [0, 0, 0]])
+    >>> kinetic_energy_about(ball, [1.0, 0, 0, 0], [0.0, 1, 0], [0.0, 0, 1])
+    Array(2., dtype=float64)
+    """
+    from rigidjax.rotation import quaternion
+
+    velocity, omega = _vector(velocity, "velocity"), _vector(omega, "omega")
+    about_origin = body.inertia_about(jnp.zeros_like(body.com)).tensor
+    swing = quaternion.rotate(_checks.floating(q, (4,), "q"), _cross(omega, body.com))
+    return (
+        0.5 * body.mass * _dot(velocity, velocity)
+        + body.mass * _dot(velocity, swing)
+        + 0.5 * _dot(omega, apply(about_origin, omega))
+    )
+
+
+def kinetic_energy_of_matrix_rate(second_moment: Mat3Like, matrix_rate: Mat3Like) -> Scalar:
+    """Energy of rotation `½ Tr(Ṁ 𝔖 Ṁᵀ)`, J (notes, eq 63 with its missing ½).
+
+    **Arguments:** `second_moment` (3, 3) 𝔖, kg m², body frame; `matrix_rate` (3, 3) dM/dt, 1/s, of
+    the rotation matrix body → world.
+
+    >>> kinetic_energy_of_matrix_rate(jnp.eye(3), jnp.asarray([[0.0, -1, 0], [1, 0, 0], [0, 0, 0]]))
+    Array(1., dtype=float64)
+    """
+    s = _checks.floating(second_moment, (3, 3), "second_moment")
+    rate = _checks.floating(matrix_rate, (3, 3), "matrix_rate")
+    return 0.5 * jnp.sum(product(rate, s) * rate)
+
+
+def kinetic_energy_of_generator(second_moment: Mat3Like, generator: Mat3Like) -> Scalar:
+    """Energy of rotation `½ Tr(J'ᵀ J' 𝔖)`, J (notes, eq 65 with its missing ½).
+
+    **Arguments:** `second_moment` (3, 3) 𝔖, kg m², body frame; `generator` (3, 3) J' = hat(Ω), 1/s.
+
+    >>> kinetic_energy_of_generator(jnp.eye(3), jnp.asarray([[0.0, -1, 0], [1, 0, 0], [0, 0, 0]]))
+    Array(1., dtype=float64)
+    """
+    s = _checks.floating(second_moment, (3, 3), "second_moment")
+    generator = _checks.floating(generator, (3, 3), "generator")
+    return 0.5 * jnp.sum(product(generator.T, generator) * s.T)
+
+
+def kinetic_energy_of_moments(second_moments: Vec3Like, omega: Vec3Like) -> Scalar:
+    """Energy of rotation `½((λ2+λ3)Ω1² + (λ3+λ1)Ω2² + (λ1+λ2)Ω3²)`, J (notes, eqs 73–75).
+
+    **Arguments:** `second_moments` (3,) λ, eigenvalues of 𝔖, kg m²; `omega` (3,) Ω along the same
+    principal axes, rad/s.
+
+    >>> kinetic_energy_of_moments([1.0, 2.0, 3.0], [1.0, 0.0, 0.0])
+    Array(2.5, dtype=float64)
+    """
+    s, omega = _vector(second_moments, "second_moments"), _vector(omega, "omega")
+    moments = jnp.stack([s[1] + s[2], s[2] + s[0], s[0] + s[1]])
+    return 0.5 * _dot(moments, omega * omega)
+
+
+def angular_momentum(
+    body: Inertia | MassProperties, state: HasSpin | Float[ArrayLike, "3"] | object
+) -> Vec3:
+    """Angular momentum in the body frame, `Π = IΩ`, (3,), kg m²/s.
+
+    **Arguments:** `body` an `Inertia` about the point it turns about, or `MassProperties` (then
+    about the centre of mass); `state` anything with `.omega`, or Ω (3,) itself, rad/s, body frame.
+
+    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
+
+    >>> angular_momentum(Inertia.from_principal(1.0, 2.0, 3.0), [1.0, 1.0, 1.0])
+    Array([1., 2., 3.], dtype=float64)
+    """
+    inertia = body if isinstance(body, Inertia) else body.inertia
+    return apply(inertia.tensor, _omega(state))
+
+
+def spatial_angular_momentum(body: Inertia | MassProperties, state: HasAttitude) -> Vec3:
+    """Angular momentum in the world frame, `R Π`, (3,), kg m²/s: kept by a free body.
+
+    **Arguments:** as `angular_momentum`; `state` has `.q` (4,), body → world, and `.omega`. With
+    `MassProperties` and a state that moves (`.x`, `.v`), the orbital part `m x × v` about the
+    world's origin is added.
+
+    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype, or a state without attitude.
+
+    >>> from rigidjax import Attitude
+    >>> turned = Attitude([0.0, 1.0, 0, 0], [0.0, 0, 1])
+    >>> spatial_angular_momentum(Inertia.from_principal(1.0, 2.0, 3.0), turned)[2]
+    Array(-3., dtype=float64)
+    """
+    from rigidjax.rotation import quaternion
+
+    if not isinstance(state, HasAttitude):
+        raise TypeError(
+            f"spatial_angular_momentum: wanted a state with an attitude (.q), got "
+            f"{type(state).__name__}; in the body frame use angular_momentum"
+        )
+    momentum = quaternion.rotate(state.q, angular_momentum(body, state))
+    if isinstance(body, MassProperties) and isinstance(state, HasPose):
+        momentum = momentum + body.mass * _cross(state.x, state.v)
+    return momentum
+
+
+def _omega(state):
+    return _vector(state.omega if isinstance(state, HasSpin) else state, "omega")
+
+
+def _vector(value, name):
+    return _checks.floating(value, (3,), name)
+
+
+def _dot(a, b):
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def _cross(a, b):
+    return jnp.stack(
+        [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+    )

@@ -1,0 +1,265 @@
+"""What is turned: the inertia of a body, and its mass, centre of mass and second moment (floor 1).
+
+Two tensors say the same thing: the second moment `𝔖 = ∫ r rᵀ dm` (notes, eq 60) and the inertia
+tensor `I = Tr(𝔖) 1 − 𝔖` (eqs 76–78). A matrix is the 𝔖 of a real body exactly when it is positive
+semi-definite; for I that reads as the triangle inequality of its moments.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from rigidjax import _checks
+from rigidjax._types import Mat3, Mat3Like, Quat, QuatLike, ScalarLike, Vec3, Vec3Like
+from rigidjax.body import physical
+from rigidjax.body.principal import eigensystem, principal
+from rigidjax.body.symmetric import (
+    apply as apply,
+    inverse as inverse,
+    outer,
+    product,
+    solve as solve,
+    swap_trace,
+)
+
+
+class Inertia(eqx.Module):
+    """The inertia tensor I of a body about the point it turns about.
+
+    **Arguments:** `tensor` (3, 3), kg m², body frame. The constructor looks at shape and dtype
+    only; `from_tensor`, `from_principal` and `from_second_moment` also check that a real body has
+    it. Leading axes are allowed in a container of many bodies; methods take one.
+
+    I is what is stored, not 𝔖: `from_tensor` is then the identity, and the small moment of a rod
+    keeps all its digits. Source: notes, eqs 76–78.
+
+    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
+
+    >>> Inertia.from_principal(1.0, 2.0, 2.5).moments
+    Array([1. , 2. , 2.5], dtype=float64)
+    """
+
+    tensor: Float[Array, "*batch 3 3"]
+
+    def __init__(self, tensor: Float[Array, "*batch 3 3"] | object):
+        self.tensor = _checks.floating(tensor, (3, 3), "tensor", batched=True)
+
+    @staticmethod
+    def from_tensor(tensor: Mat3Like | object) -> "Inertia":
+        """A body with this inertia tensor.
+
+        **Arguments:** `tensor` (3, 3), kg m², body frame, about the point it turns about.
+        Plates, rods and points (zero second moments) are bodies.
+
+        **Raises:** `ValueError` (`equinox` error under `jit`) if it is not symmetric to a few
+        units of round-off, has a negative moment, or breaks `I1 + I2 ≥ I3`.
+
+        >>> Inertia.from_tensor([[2.0, 0.1, 0], [0.1, 2, 0], [0, 0, 3]]).tensor.shape
+        (3, 3)
+        """
+        a = _checks.floating(tensor, (3, 3), "inertia tensor")
+        return Inertia(physical.real_inertia(a))
+
+    @staticmethod
+    def from_principal(i1: ScalarLike, i2: ScalarLike, i3: ScalarLike) -> "Inertia":
+        """A body whose principal axes are the body axes.
+
+        **Arguments:** `i1`, `i2`, `i3` scalars, kg m², about the first, second and third axis.
+
+        **Raises:** as `from_tensor`.
+
+        >>> Inertia.from_principal(1.0, 2.0, 3.0).tensor[2, 2]
+        Array(3., dtype=float64)
+        """
+        moments = [_checks.floating(i, (), f"i{k + 1}") for k, i in enumerate((i1, i2, i3))]
+        moments = jnp.stack([m.astype(jnp.result_type(*moments)) for m in moments])
+        return Inertia(jnp.diag(physical.real_moments(moments)))
+
+    @staticmethod
+    def from_second_moment(second_moment: Mat3Like | object) -> "Inertia":
+        """A body with this second moment: `I = Tr(𝔖) 1 − 𝔖`.
+
+        **Arguments:** `second_moment` (3, 3) 𝔖 = ∫ r rᵀ dm, kg m², body frame, about the point it
+        turns about. Source: notes, eqs 60, 76–78.
+
+        **Raises:** `ValueError` (`equinox` error under `jit`) if it is not symmetric, or not
+        positive semi-definite, to a few units of round-off.
+
+        >>> import jax.numpy as jnp
+        >>> Inertia.from_second_moment(jnp.diag(jnp.array([2.0, 1.0, 0.0]))).moments
+        Array([1., 2., 3.], dtype=float64)
+        """
+        s = _checks.floating(second_moment, (3, 3), "second moment")
+        return Inertia(swap_trace(physical.real_second_moment(s)))
+
+    @property
+    def second_moment(self) -> Float[Array, "*batch 3 3"]:
+        """𝔖 = ½ Tr(I) 1 − I, (3, 3), kg m², body frame (notes, eqs 76–78 solved)."""
+        a = self.tensor
+        x, y, z = a[..., 0, 0], a[..., 1, 1], a[..., 2, 2]
+        diagonal = 0.5 * jnp.stack([(y - x) + z, (z - y) + x, (x - z) + y], axis=-1)
+        eye = jnp.broadcast_to(jnp.eye(3, dtype=bool), a.shape)
+        return jnp.where(eye, jnp.broadcast_to(diagonal[..., None], a.shape), -a)
+
+    @property
+    def moments(self) -> Vec3:
+        """Principal moments I1 ≤ I2 ≤ I3, (3,), kg m²."""
+        return eigensystem(self.tensor)[0]
+
+    def principal(self) -> tuple[Vec3, Quat]:
+        """Principal moments, ascending, and the rotation principal axes → body axes.
+
+        **Returns** `(moments, q)`, (3,) kg m² and (4,), with `I = R(q) diag(moments) R(q)ᵀ`.
+        Derivatives are finite for any body, also at equal moments: see
+        `rigidjax.body.principal.principal` for what they mean there.
+
+        >>> Inertia.from_principal(3.0, 2.0, 2.5).principal()[0]
+        Array([2. , 2.5, 3. ], dtype=float64)
+        """
+        return principal(self.tensor)
+
+    def shifted(self, r: Vec3Like, mass: ScalarLike) -> "Inertia":
+        """The inertia about a point away from the centre of mass (parallel axis).
+
+        `I + m (|r|² 1 − r rᵀ)`. **Arguments:** `self` about the centre of mass; `r` (3,) from the
+        centre of mass to the new point (or back: the sign does not matter), m, body frame; `mass`
+        kg. A negative `mass` undoes a shift. Source: Steiner; Landau and Lifshitz, eq 32.12.
+
+        >>> Inertia.from_principal(1.0, 1.0, 1.0).shifted([0.0, 0.0, 2.0], 3.0).moments
+        Array([ 1., 13., 13.], dtype=float64)
+        """
+        r, m = _checks.floating(r, (3,), "r"), _checks.floating(mass, (), "mass")
+        return Inertia(self.tensor + swap_trace(m * outer(r, r)))
+
+    def rotated(self, q: QuatLike) -> "Inertia":
+        """The same body turned, or seen from other axes: `R(q) I R(q)ᵀ`.
+
+        **Arguments:** `q` (4,) unit quaternion (w, x, y, z), active: a feature at `r` is then at
+        `R(q) r`. With q body → world this is the inertia in world axes.
+
+        >>> half = 0.5**0.5
+        >>> Inertia.from_principal(1.0, 2.0, 2.5).rotated([half, 0, 0, half]).tensor[0, 0]
+        Array(2., dtype=float64)
+        """
+        from rigidjax.rotation import quaternion
+
+        m = quaternion.to_matrix(_checks.floating(q, (4,), "q"))
+        return Inertia(product(m, product(self.tensor, m.T)))
+
+    def invertible(self) -> "Inertia":
+        """The same body, refused if a moment is zero: Euler's equations divide by all three.
+
+        **Raises:** `ValueError` (`equinox` error under `jit`) for a thin rod or a point.
+
+        >>> Inertia.from_principal(1.0, 2.0, 2.5).invertible().moments
+        Array([1. , 2. , 2.5], dtype=float64)
+        """
+        return Inertia(physical.nonzero_moments(self.tensor))
+
+    def __add__(self, other: "Inertia") -> "Inertia":
+        """Two bodies turning as one about the same point, in the same axes."""
+        return Inertia(self.tensor + other.tensor)
+
+
+class MassProperties(eqx.Module):
+    """Mass, centre of mass and second moment of a body.
+
+    **Arguments:** `mass` m, kg; `com` (3,) centre of mass c, m, body frame (from the body's
+    origin); `second_moment` (3, 3) 𝔖 **about the centre of mass**, kg m², body axes (notes,
+    eq 60). Values that are known (not traced) are checked; under `jit` call `checked`. Leading
+    axes are allowed in a container of many bodies; methods take one.
+
+    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype, a mass that is not positive,
+    a second moment that is not symmetric and positive semi-definite.
+
+    >>> MassProperties(2.0, [0.0, 0, 0], [[1.0, 0, 0], [0, 1, 0], [0, 0, 1]]).inertia.moments
+    Array([2., 2., 2.], dtype=float64)
+    """
+
+    mass: Float[Array, "*batch"]
+    com: Float[Array, "*batch 3"]
+    second_moment: Float[Array, "*batch 3 3"]
+
+    def __init__(
+        self,
+        mass: Float[Array, "*batch"] | object,
+        com: Float[Array, "*batch 3"] | object,
+        second_moment: Float[Array, "*batch 3 3"] | object,
+    ):
+        mass = _checks.floating(mass, (), "mass", batched=True)
+        com = _checks.floating(com, (3,), "com", batched=True)
+        second_moment = _checks.floating(second_moment, (3, 3), "second_moment", batched=True)
+        dtype = jnp.result_type(mass, com, second_moment)
+        self.mass = physical.if_known(physical.real_mass, mass.astype(dtype))
+        self.com = com.astype(dtype)
+        self.second_moment = physical.if_known(
+            physical.real_second_moment, second_moment.astype(dtype)
+        )
+
+    @property
+    def inertia(self) -> Inertia:
+        """The inertia about the centre of mass, body axes."""
+        return Inertia(swap_trace(self.second_moment))
+
+    def checked(self) -> "MassProperties":
+        """The same body, its values checked also under `jit`.
+
+        **Raises:** `ValueError` (`equinox` error under `jit`) as the constructor.
+
+        >>> MassProperties(1.0, [0.0, 0, 0], [[1.0, 0, 0], [0, 1, 0], [0, 0, 1]]).checked().mass
+        Array(1., dtype=float64)
+        """
+        return MassProperties(
+            physical.real_mass(self.mass), self.com, physical.real_second_moment(self.second_moment)
+        )
+
+    def second_moment_about(self, point: Vec3Like) -> Mat3:
+        """𝔖 about another point: `𝔖 + m d dᵀ`, `d = c − point`.
+
+        **Arguments:** `point` (3,) m, body frame. **Returns** (3, 3), kg m², body axes. Source:
+        eq 60 of the notes with `r' = (r' − c) + d`; the cross terms vanish.
+
+        >>> body = MassProperties(2.0, [1.0, 0, 0], [[1.0, 0, 0], [0, 1, 0], [0, 0, 1]])
+        >>> body.second_moment_about([0.0, 0, 0])[0, 0]
+        Array(3., dtype=float64)
+        """
+        d = self.com - _checks.floating(point, (3,), "point")
+        return self.second_moment + self.mass * outer(d, d)
+
+    def inertia_about(self, point: Vec3Like) -> Inertia:
+        """The inertia about another point of the body, such as a pivot.
+
+        **Arguments:** `point` (3,) m, body frame.
+
+        >>> body = MassProperties(2.0, [1.0, 0, 0], [[1.0, 0, 0], [0, 1, 0], [0, 0, 1]])
+        >>> body.inertia_about([0.0, 0, 0]).moments
+        Array([2., 4., 4.], dtype=float64)
+        """
+        return Inertia(swap_trace(self.second_moment_about(point)))
+
+    def shifted(self, r: Vec3Like) -> "MassProperties":
+        """The body carried by `r` (3,), m, in its own axes: only its centre of mass changes.
+
+        >>> body = MassProperties(2.0, [1.0, 0, 0], [[1.0, 0, 0], [0, 1, 0], [0, 0, 1]])
+        >>> body.shifted([0.0, 1.0, 0.0]).com
+        Array([1., 1., 0.], dtype=float64)
+        """
+        return MassProperties(
+            self.mass, self.com + _checks.floating(r, (3,), "r"), self.second_moment
+        )
+
+    def rotated(self, q: QuatLike) -> "MassProperties":
+        """The body turned about its origin: `c → R c`, `𝔖 → R 𝔖 Rᵀ`.
+
+        **Arguments:** `q` (4,) unit quaternion (w, x, y, z), active.
+
+        >>> body = MassProperties(2.0, [1.0, 0, 0], [[1.0, 0, 0], [0, 1, 0], [0, 0, 1]])
+        >>> body.rotated([0.0, 0, 0, 1]).com
+        Array([-1.,  0.,  0.], dtype=float64)
+        """
+        from rigidjax.rotation import quaternion
+
+        m = quaternion.to_matrix(_checks.floating(q, (4,), "q"))
+        return MassProperties(
+            self.mass, apply(m, self.com), product(m, product(self.second_moment, m.T))
+        )

@@ -1,0 +1,95 @@
+"""Symmetric 3×3 matrices written out in components (floor 1).
+
+Products are spelled out instead of `@`: on CPU the gradient of a 3×3 `@` inside a differentiated
+loop costs fifty times its value, and on GPUs `@` may round to ten bits (TF32).
+"""
+
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float
+
+from rigidjax import _checks
+from rigidjax._types import Mat3, Mat3Like, Vec3, Vec3Like
+
+
+def apply(tensor: Mat3Like, vector: Vec3Like) -> Vec3:
+    """The product `A v` of a 3×3 matrix and a vector.
+
+    **Arguments:** `tensor` (3, 3), `vector` (3,), any units, the same frame.
+    **Returns** (3,). **Raises** `ValueError`, `TypeError` for a wrong shape or dtype.
+
+    >>> apply(jnp.diag(jnp.array([1.0, 2.0, 3.0])), jnp.array([1.0, 1.0, 1.0]))
+    Array([1., 2., 3.], dtype=float64)
+    """
+    a, v = _checks.floating(tensor, (3, 3), "tensor"), _checks.floating(vector, (3,), "vector")
+    return jnp.stack([a[i, 0] * v[0] + a[i, 1] * v[1] + a[i, 2] * v[2] for i in range(3)])
+
+
+def inverse(tensor: Mat3Like) -> Mat3:
+    """The inverse of a symmetric 3×3 matrix, by cofactors.
+
+    **Arguments:** `tensor` (3, 3) symmetric, trace > 0, such as an inertia tensor (kg m²).
+    **Returns** (3, 3), reciprocal units. The matrix is divided by its trace first, so that a
+    body of 1e-20 or of 1e37 kg m² neither underflows nor overflows. A zero moment gives
+    infinities: `Inertia.invertible` refuses it in words.
+
+    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
+
+    >>> inverse(jnp.diag(jnp.array([1.0, 2.0, 4.0])))[2, 2]
+    Array(0.25, dtype=float64)
+    """
+    a = _checks.floating(tensor, (3, 3), "tensor")
+    scale = a[0, 0] + a[1, 1] + a[2, 2]
+    a = a / scale
+    c00 = a[1, 1] * a[2, 2] - a[1, 2] * a[2, 1]
+    c01 = a[1, 2] * a[2, 0] - a[1, 0] * a[2, 2]
+    c02 = a[1, 0] * a[2, 1] - a[1, 1] * a[2, 0]
+    c11 = a[0, 0] * a[2, 2] - a[0, 2] * a[2, 0]
+    c12 = a[0, 1] * a[2, 0] - a[0, 0] * a[2, 1]
+    c22 = a[0, 0] * a[1, 1] - a[0, 1] * a[1, 0]
+    determinant = a[0, 0] * c00 + a[0, 1] * c01 + a[0, 2] * c02
+    return from_components(c00, c11, c22, c01, c02, c12) / determinant / scale
+
+
+def solve(tensor: Mat3Like, vector: Vec3Like) -> Vec3:
+    """The `x` with `A x = v`, for a symmetric 3×3 matrix.
+
+    **Arguments:** `tensor` (3, 3) symmetric, trace > 0; `vector` (3,), the same frame.
+    **Returns** (3,). To solve with one matrix many times, keep `inverse`.
+
+    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
+
+    >>> solve(jnp.diag(jnp.array([1.0, 2.0, 4.0])), jnp.array([1.0, 1.0, 1.0]))
+    Array([1.  , 0.5 , 0.25], dtype=float64)
+    """
+    return apply(inverse(tensor), vector)
+
+
+def from_components(
+    xx: Float[ArrayLike, ""],
+    yy: Float[ArrayLike, ""],
+    zz: Float[ArrayLike, ""],
+    xy: Float[ArrayLike, ""],
+    xz: Float[ArrayLike, ""],
+    yz: Float[ArrayLike, ""],
+) -> Mat3:
+    """The symmetric matrix of six components: the diagonal first, then xy, xz, yz."""
+    return jnp.stack([jnp.stack([xx, xy, xz]), jnp.stack([xy, yy, yz]), jnp.stack([xz, yz, zz])])
+
+
+def outer(a: Float[Array, "3"], b: Float[Array, "3"]) -> Mat3:
+    """The matrix `a bᵀ`."""
+    return a[:, None] * b[None, :]
+
+
+def product(a: Mat3, b: Mat3) -> Mat3:
+    """The matrix product `a b`, by multiplication and addition."""
+    return a[:, 0:1] * b[0:1, :] + a[:, 1:2] * b[1:2, :] + a[:, 2:3] * b[2:3, :]
+
+
+def swap_trace(a: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3 3"]:
+    """`Tr(A) 1 − A` without the cancellation: `[A22 + A33, −A12, …]` (notes, eqs 76–78)."""
+    x, y, z = a[..., 0, 0], a[..., 1, 1], a[..., 2, 2]
+    diagonal = jnp.stack([y + z, z + x, x + y], axis=-1)
+    eye = jnp.eye(3, dtype=bool)
+    eye = jnp.broadcast_to(eye, a.shape)
+    return jnp.where(eye, jnp.broadcast_to(diagonal[..., None], a.shape), -a)
