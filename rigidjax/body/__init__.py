@@ -1,5 +1,6 @@
 """What is turned: inertia, mass, second moments, shapes, and numbers that are always a body."""
 
+from rigidjax.body import parameters as parameters
 from rigidjax.body.energy import (
     angular_momentum as angular_momentum,
     kinetic_energy as kinetic_energy,
