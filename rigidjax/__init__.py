@@ -1,3 +1,37 @@
-"""Differentiable rigid-body and rotating-frame mechanics for JAX."""
+"""Differentiable rigid-body and rotating-frame mechanics for JAX.
+
+Floors, from below: `special` (numbers), `rotation` and `body` (what turns), `motion` (how it turns),
+`exact` and `solve` (answers), `identify` and `plot` (uses). `simulate` is the front door.
+"""
+
+from rigidjax import (
+    exact as exact,
+    identify as identify,
+    plot as plot,
+)
+from rigidjax.body import (
+    Inertia as Inertia,
+    MassProperties as MassProperties,
+    angular_momentum as angular_momentum,
+    kinetic_energy as kinetic_energy,
+    parameters as parameters,
+    spatial_angular_momentum as spatial_angular_momentum,
+)
+from rigidjax.motion import (
+    Attitude as Attitude,
+    AttitudeEquations as AttitudeEquations,
+    EulerEquations as EulerEquations,
+    NewtonEuler as NewtonEuler,
+    Rigid as Rigid,
+    Spin as Spin,
+    torques as torques,
+)
+from rigidjax.rotation import quaternion as quaternion, so3 as so3
+from rigidjax.solve import (
+    Projected as Projected,
+    Solution as Solution,
+    equations_of_motion as equations_of_motion,
+    simulate as simulate,
+)
 
 __version__ = "0.1.0"

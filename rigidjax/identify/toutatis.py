@@ -10,12 +10,18 @@ from datetime import datetime
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
+from rigidjax import exact
+from rigidjax.body import Inertia, spatial_angular_momentum
 from rigidjax.identify.bodies import PrincipalRatios
+from rigidjax.identify.fit import Fit
 from rigidjax.identify.loss import SoftL1
 from rigidjax.identify.problem import Problem
 from rigidjax.identify.recording import Recording
+from rigidjax.identify.report import Row
 from rigidjax.identify.sensors import AttitudeSensor, Gyro
+from rigidjax.motion import Attitude
 from rigidjax.rotation import euler
 
 CITATION = "Takahashi, Busch & Scheeres 2013, AJ 146:95, table 3"
@@ -74,3 +80,54 @@ def problem() -> Problem:
     ('Ix/Iz', 'Iy/Iz')
     """
     return Problem(recording(), PrincipalRatios(), loss=SoftL1())
+
+
+def rows(fit: Fit) -> list[Row]:
+    """Periods and the direction of the angular momentum as rows for `report.table`."""
+
+    def periods(body: Inertia, state: Attitude) -> Array:
+        turning = exact.body_period(body, state.omega)
+        precessing = exact.precession_period(body, state.omega)
+        return jnp.log(jnp.stack([turning, precessing]) / DAY)
+
+    def direction(body: Inertia, state: Attitude) -> Array:
+        momentum = spatial_angular_momentum(body, state)
+        flat = jnp.hypot(momentum[0], momentum[1])
+        return jnp.stack([jnp.arctan2(momentum[1], momentum[0]), jnp.arctan2(momentum[2], flat)])
+
+    out: list[Row] = []
+    middle = np.exp(np.asarray(periods(fit.body, fit.state0)))
+    low, high = (np.exp(bound) for bound in fit.interval_of(periods))
+    names = ("rotation about the long axis", "precession of the long axis")
+    for name, *numbers in zip(names, middle, low, high, strict=True):
+        out.append((name, *numbers, "day"))
+    middle = np.degrees(np.asarray(direction(fit.body, fit.state0)))
+    low, high = (np.degrees(bound) for bound in fit.interval_of(direction))
+    names = ("angular momentum, longitude", "angular momentum, latitude")
+    for name, *numbers in zip(names, middle, low, high, strict=True):
+        turn = 360.0 if "longitude" in name and numbers[0] < 0 else 0.0
+        out.append((name, *(number + turn for number in numbers), "deg, ecliptic J2000"))
+    return out
+
+
+def rms_degrees(fit: Fit) -> float:
+    """Root mean square angle between the observed and the fitted attitudes, degrees."""
+    return float(np.degrees(fit.rms[0]))
+
+
+def remarks(fit: Fit) -> str:
+    """The observations furthest from the fit, and how the noise compares, in words."""
+    lines = []
+    scatter = rms_degrees(fit) / np.sqrt(3)
+    if scatter < 0.5 * ATTITUDE_NOISE_DEG:
+        lines.append(
+            f"The attitudes scatter by {scatter:.0f} deg an axis, less than the {ATTITUDE_NOISE_DEG:.0f} "
+            "deg that was published; the intervals keep the published figure."
+        )
+    errors = np.linalg.norm(np.degrees(np.asarray(fit.residuals[1])) * DAY, axis=1)
+    for index in np.flatnonzero(errors > 3 * RATE_NOISE_DEG_A_DAY):
+        lines.append(
+            f"outlier: the rate of {OBSERVATIONS[index][0][:10]} is {errors[index]:.0f} deg/day off "
+            "(it counts linearly, not quadratically)"
+        )
+    return "\n".join(lines)
