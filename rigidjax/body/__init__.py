@@ -1,6 +1,15 @@
 """What is turned: inertia, mass, second moments, shapes, and numbers that are always a body."""
 
-from rigidjax.body import parameters as parameters
+from rigidjax.body import (
+    parameters as parameters,
+    shapes as shapes,
+    volumes as volumes,
+)
+from rigidjax.body.ellipsoids import (
+    energy_ellipsoid as energy_ellipsoid,
+    equal_ellipsoid as equal_ellipsoid,
+    momentum_ellipsoid as momentum_ellipsoid,
+)
 from rigidjax.body.energy import (
     angular_momentum as angular_momentum,
     kinetic_energy as kinetic_energy,
@@ -11,3 +20,6 @@ from rigidjax.body.energy import (
     spatial_angular_momentum as spatial_angular_momentum,
 )
 from rigidjax.body.inertia import Inertia as Inertia, MassProperties as MassProperties
+from rigidjax.body.principal import principal as principal
+from rigidjax.body.prior import divergence as divergence
+from rigidjax.body.spectral import matrix_function as matrix_function

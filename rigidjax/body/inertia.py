@@ -160,6 +160,10 @@ class Inertia(eqx.Module):
         """Two bodies turning as one about the same point, in the same axes."""
         return Inertia(self.tensor + other.tensor)
 
+    def __sub__(self, other: "Inertia") -> "Inertia":
+        """The rest when a part is cut away, about the same point, in the same axes."""
+        return Inertia(self.tensor - other.tensor)
+
 
 class MassProperties(eqx.Module):
     """Mass, centre of mass and second moment of a body.
@@ -263,3 +267,33 @@ class MassProperties(eqx.Module):
         return MassProperties(
             self.mass, apply(m, self.com), product(m, product(self.second_moment, m.T))
         )
+
+    def __add__(self, other: "MassProperties") -> "MassProperties":
+        """Two bodies as one, in the same axes: `𝔖 = 𝔖a + 𝔖b + (ma mb / m) d dᵀ`, d = cb − ca.
+
+        >>> part = MassProperties(1.0, [0.0, 0, 0], [[1.0, 0, 0], [0, 1, 0], [0, 0, 1]])
+        >>> (part + part.shifted([2.0, 0, 0])).second_moment[0, 0]
+        Array(4., dtype=float64)
+        """
+        return _joined(self, other.mass, other.com, other.second_moment)
+
+    def __sub__(self, other: "MassProperties") -> "MassProperties":
+        """The rest when a part is cut away, in the same axes.
+
+        **Raises:** `ValueError` if more is cut away than is there.
+
+        >>> part = MassProperties(1.0, [0.0, 0, 0], [[1.0, 0, 0], [0, 1, 0], [0, 0, 1]])
+        >>> ((part + part.shifted([2.0, 0, 0])) - part).com
+        Array([2., 0., 0.], dtype=float64)
+        """
+        return _joined(self, -other.mass, other.com, -other.second_moment)
+
+
+def _joined(body, mass, com, second_moment):
+    total = body.mass + mass
+    d = com - body.com
+    return MassProperties(
+        total,
+        body.com + (mass / total) * d,
+        body.second_moment + second_moment + (body.mass * (mass / total)) * outer(d, d),
+    )

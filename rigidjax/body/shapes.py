@@ -1,0 +1,222 @@
+"""Mass properties of solids, shells, plates and rods in closed form (floor 1).
+
+Each function takes the mass and then the dimensions, and is differentiable in all of them. Every
+shape lies with its **centre of mass at the origin** and its axis of symmetry, if it has one, along
+z; place it with `.rotated` and `.shifted`, join with `+`, cut away with `-`. For a density, use
+`rigidjax.body.volumes`: `box(density * volumes.box(size), size)`.
+
+What is written down is the second moment 𝔖 = ∫ r rᵀ dm (notes, eq 60), diagonal in these axes;
+`I1 = λ2 + λ3`, … (eqs 76–78) turns it into the textbook moments of inertia.
+"""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from rigidjax import _checks
+from rigidjax._types import ScalarLike, Vec3Like
+from rigidjax.body import physical
+from rigidjax.body.clouds import (
+    points as points,
+    quadrature as quadrature,
+    voxels as voxels,
+)
+from rigidjax.body.inertia import MassProperties
+from rigidjax.body.meshes import mesh as mesh, mesh_file as mesh_file
+
+
+def box(mass: ScalarLike, size: Vec3Like) -> MassProperties:
+    """A solid box. `𝔖 = m diag(a², b², c²)/12`.
+
+    **Arguments:** `mass` kg; `size` (3,) full edge lengths along x, y, z, m. A zero edge gives a
+    plate. **Raises:** `ValueError` for a mass ≤ 0 or a negative length.
+
+    >>> box(12.0, [1.0, 2.0, 3.0]).inertia.moments
+    Array([ 5., 10., 13.], dtype=float64)
+    """
+    edges = _lengths(size, (3,), "size")
+    return _centred(mass, edges * edges / 12.0)
+
+
+def ellipsoid(mass: ScalarLike, semi_axes: Vec3Like) -> MassProperties:
+    """A solid ellipsoid. `𝔖 = m diag(a², b², c²)/5`.
+
+    **Arguments:** `mass` kg; `semi_axes` (3,) along x, y, z, m.
+    **Raises:** `ValueError` for a mass ≤ 0 or a negative length.
+
+    >>> ellipsoid(5.0, [1.0, 2.0, 3.0]).inertia.moments
+    Array([ 5., 10., 13.], dtype=float64)
+    """
+    half = _lengths(semi_axes, (3,), "semi_axes")
+    return _centred(mass, half * half / 5.0)
+
+
+def sphere(mass: ScalarLike, radius: ScalarLike) -> MassProperties:
+    """A solid sphere. `𝔖 = m r²/5 · 1`, so `I = ⅖ m r² · 1`.
+
+    **Arguments:** `mass` kg; `radius` m. **Raises:** `ValueError` for a mass ≤ 0 or a negative
+    length.
+
+    >>> sphere(5.0, 1.0).inertia.moments
+    Array([2., 2., 2.], dtype=float64)
+    """
+    r = _lengths(radius, (), "radius")
+    return _centred(mass, _round(r * r / 5.0, r * r / 5.0))
+
+
+def hollow_sphere(mass: ScalarLike, inner: ScalarLike, outer: ScalarLike) -> MassProperties:
+    """A ball with a concentric hole. `λ = m/5 · (R⁵ − r⁵)/(R³ − r³)`, the quotient divided out.
+
+    **Arguments:** `mass` kg; `inner` r, `outer` R radii, m; they may be equal (a shell).
+    **Raises:** `ValueError` for a mass ≤ 0, a negative length, or `inner > outer`.
+
+    >>> hollow_sphere(3.0, 1.0, 1.0).inertia.moments
+    Array([2., 2., 2.], dtype=float64)
+    """
+    r, R = _nested(inner, outer)
+    # Homogeneous of degree 2: in u = r/R nothing overflows, and thin shells lose no digit.
+    u = r / R
+    ratio = (1.0 + u * (1.0 + u * (1.0 + u * (1.0 + u)))) / (1.0 + u * (1.0 + u))
+    return _centred(mass, _round(R * R * ratio / 5.0, R * R * ratio / 5.0))
+
+
+def shell(mass: ScalarLike, radius: ScalarLike) -> MassProperties:
+    """A thin spherical shell. `𝔖 = m r²/3 · 1`.
+
+    **Arguments:** `mass` kg; `radius` m. **Raises:** `ValueError` for a mass ≤ 0 or a negative
+    length.
+
+    >>> shell(3.0, 1.0).inertia.moments
+    Array([2., 2., 2.], dtype=float64)
+    """
+    r = _lengths(radius, (), "radius")
+    return _centred(mass, _round(r * r / 3.0, r * r / 3.0))
+
+
+def cylinder(mass: ScalarLike, radius: ScalarLike, height: ScalarLike) -> MassProperties:
+    """A solid cylinder along z. `𝔖 = m diag(r²/4, r²/4, h²/12)`; height 0 is a disc.
+
+    **Arguments:** `mass` kg; `radius`, `height` m. **Raises:** `ValueError` for a mass ≤ 0 or a
+    negative length.
+
+    >>> cylinder(12.0, 1.0, 1.0).inertia.moments
+    Array([4., 4., 6.], dtype=float64)
+    """
+    r, h = _lengths(radius, (), "radius"), _lengths(height, (), "height")
+    return _centred(mass, _round(r * r / 4.0, h * h / 12.0))
+
+
+def hollow_cylinder(
+    mass: ScalarLike, inner: ScalarLike, outer: ScalarLike, height: ScalarLike
+) -> MassProperties:
+    """A tube along z. `𝔖 = m diag((R² + r²)/4, (R² + r²)/4, h²/12)`; equal radii: a thin one.
+
+    **Arguments:** `mass` kg; `inner` r, `outer` R radii and `height` h, m.
+    **Raises:** `ValueError` for a mass ≤ 0, a negative length, or `inner > outer`.
+
+    >>> hollow_cylinder(2.0, 1.0, 1.0, 0.0).inertia.moments
+    Array([1., 1., 2.], dtype=float64)
+    """
+    (r, R), h = _nested(inner, outer), _lengths(height, (), "height")
+    return _centred(mass, _round((r * r + R * R) / 4.0, h * h / 12.0))
+
+
+def capsule(mass: ScalarLike, radius: ScalarLike, length: ScalarLike) -> MassProperties:
+    """A cylinder along z with a half ball on each end, of one density.
+
+    With `f = h/(h + 4r/3)` of the mass in the cylinder: across, `f r²/4 + (1 − f) r²/5`; along,
+    `f h²/12 + (1 − f)(r²/5 + 3hr/8 + h²/4)`.
+
+    **Arguments:** `mass` kg; `radius` r > 0, m; `length` h of the cylindrical part alone, m.
+    **Raises:** `ValueError` for a mass ≤ 0 or a negative length.
+
+    >>> capsule(5.0, 1.0, 0.0).inertia.moments
+    Array([2., 2., 2.], dtype=float64)
+    """
+    r, h = _lengths(radius, (), "radius"), _lengths(length, (), "length")
+    f = h / (h + 4.0 * r / 3.0)
+    ends = (4.0 * r / 3.0) / (h + 4.0 * r / 3.0)
+    across = f * r * r / 4.0 + ends * r * r / 5.0
+    along = f * h * h / 12.0 + ends * (r * r / 5.0 + 3.0 * h * r / 8.0 + h * h / 4.0)
+    return _centred(mass, _round(across, along))
+
+
+def cone(mass: ScalarLike, radius: ScalarLike, height: ScalarLike) -> MassProperties:
+    """A solid cone along z. `𝔖 = m diag(3r²/20, 3r²/20, 3h²/80)`.
+
+    Its centre of mass, put at the origin, lies `height/4` from the base.
+
+    **Arguments:** `mass` kg; `radius` of the base, `height` m. **Raises:** `ValueError` for a
+    mass ≤ 0 or a negative length.
+
+    >>> cone(80.0, 1.0, 2.0).inertia.moments
+    Array([24., 24., 24.], dtype=float64)
+    """
+    r, h = _lengths(radius, (), "radius"), _lengths(height, (), "height")
+    return _centred(mass, _round(3.0 * r * r / 20.0, 3.0 * h * h / 80.0))
+
+
+def torus(mass: ScalarLike, major: ScalarLike, minor: ScalarLike) -> MassProperties:
+    """A solid ring around z. `𝔖 = m diag(R²/2 + 3r²/8, R²/2 + 3r²/8, r²/4)`; minor 0: a hoop.
+
+    **Arguments:** `mass` kg; `major` R from the centre to the middle of the tube, `minor` r of
+    the tube, m. **Raises:** `ValueError` for a mass ≤ 0, a negative length, or `minor > major`.
+
+    >>> torus(2.0, 1.0, 0.0).inertia.moments
+    Array([1., 1., 2.], dtype=float64)
+    """
+    r, R = _nested(minor, major, names=("minor", "major"))
+    return _centred(mass, _round(R * R / 2.0 + 3.0 * r * r / 8.0, r * r / 4.0))
+
+
+def rod(mass: ScalarLike, length: ScalarLike) -> MassProperties:
+    """A rod along z without thickness. `𝔖 = m diag(0, 0, ℓ²/12)`.
+
+    Its moment about z is zero: the equations of motion refuse it. Use `cylinder` for a real one.
+
+    **Arguments:** `mass` kg; `length` m. **Raises:** `ValueError` for a mass ≤ 0 or a negative
+    length.
+
+    >>> rod(12.0, 1.0).inertia.moments
+    Array([0., 1., 1.], dtype=float64)
+    """
+    h = _lengths(length, (), "length")
+    return _centred(mass, _round(jnp.zeros_like(h), h * h / 12.0))
+
+
+def plate(mass: ScalarLike, size: Float[Array, "2"] | object) -> MassProperties:
+    """A rectangular plate in the x–y plane without thickness. `𝔖 = m diag(a², b², 0)/12`.
+
+    **Arguments:** `mass` kg; `size` (2,) edge lengths along x, y, m. **Raises:** `ValueError` for
+    a mass ≤ 0 or a negative length.
+
+    >>> plate(12.0, [1.0, 2.0]).inertia.moments
+    Array([1., 4., 5.], dtype=float64)
+    """
+    edges = _lengths(size, (2,), "size")
+    return _centred(mass, jnp.concatenate([edges * edges / 12.0, jnp.zeros_like(edges[:1])]))
+
+
+def _lengths(value, shape, name):
+    lengths = _checks.floating(value, shape, name)
+    if physical.known(lengths):
+        _checks.finite(lengths, name)
+        _checks.refuse(
+            lengths, (lengths < 0).any(), f"{name}: wanted lengths ≥ 0 (m), got {lengths}"
+        )
+    return lengths
+
+
+def _nested(inner, outer, names=("inner", "outer")):
+    r, R = _lengths(inner, (), names[0]), _lengths(outer, (), names[1])
+    if physical.known(r) and physical.known(R):
+        _checks.refuse(r, r > R, f"{names[0]}: wanted {names[0]} ≤ {names[1]}, got {r} and {R} (m)")
+    return r, R
+
+
+def _round(across, along):
+    return jnp.stack([across, across, along])
+
+
+def _centred(mass, per_mass):
+    m = _checks.floating(mass, (), "mass")
+    return MassProperties(m, jnp.zeros_like(per_mass), jnp.diag(m * per_mass))

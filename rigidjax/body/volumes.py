@@ -1,0 +1,95 @@
+"""Volumes of the solids of `shapes`, to make a mass from a density (floor 1).
+
+`shapes.box(density * volumes.box(size), size)` is differentiable in the density and in the size.
+"""
+
+import jax.numpy as jnp
+
+from rigidjax import _checks
+from rigidjax._types import Scalar, ScalarLike, Vec3Like
+
+
+def box(size: Vec3Like) -> Scalar:
+    """Volume of a box, m³. **Arguments:** `size` (3,) full edge lengths, m.
+
+    >>> box([1.0, 2.0, 3.0])
+    Array(6., dtype=float64)
+    """
+    a = _checks.floating(size, (3,), "size")
+    return a[0] * a[1] * a[2]
+
+
+def ellipsoid(semi_axes: Vec3Like) -> Scalar:
+    """Volume of an ellipsoid, m³, `4π abc/3`. **Arguments:** `semi_axes` (3,) m.
+
+    >>> round(float(ellipsoid([1.0, 1.0, 0.75])), 12)
+    3.14159265359
+    """
+    return (4.0 * jnp.pi / 3.0) * box(semi_axes)
+
+
+def sphere(radius: ScalarLike) -> Scalar:
+    """Volume of a sphere, m³, `4π r³/3`. **Arguments:** `radius` m.
+
+    >>> round(float(sphere(1.0)), 12)
+    4.188790204786
+    """
+    return (4.0 * jnp.pi / 3.0) * _checks.floating(radius, (), "radius") ** 3
+
+
+def hollow_sphere(inner: ScalarLike, outer: ScalarLike) -> Scalar:
+    """Volume between two concentric spheres, m³. **Arguments:** radii `inner`, `outer`, m.
+
+    >>> round(float(hollow_sphere(0.0, 1.0)), 12)
+    4.188790204786
+    """
+    r, R = _checks.floating(inner, (), "inner"), _checks.floating(outer, (), "outer")
+    return (4.0 * jnp.pi / 3.0) * (R - r) * (R * R + R * r + r * r)
+
+
+def cylinder(radius: ScalarLike, height: ScalarLike) -> Scalar:
+    """Volume of a cylinder, m³, `π r² h`. **Arguments:** `radius`, `height` m.
+
+    >>> round(float(cylinder(1.0, 1.0)), 12)
+    3.14159265359
+    """
+    r, h = _checks.floating(radius, (), "radius"), _checks.floating(height, (), "height")
+    return jnp.pi * r * r * h
+
+
+def hollow_cylinder(inner: ScalarLike, outer: ScalarLike, height: ScalarLike) -> Scalar:
+    """Volume of a tube, m³, `π (R² − r²) h`. **Arguments:** `inner`, `outer`, `height` m.
+
+    >>> round(float(hollow_cylinder(0.0, 1.0, 1.0)), 12)
+    3.14159265359
+    """
+    r, R = _checks.floating(inner, (), "inner"), _checks.floating(outer, (), "outer")
+    return jnp.pi * (R - r) * (R + r) * _checks.floating(height, (), "height")
+
+
+def capsule(radius: ScalarLike, length: ScalarLike) -> Scalar:
+    """Volume of a capsule, m³. **Arguments:** `radius`, `length` of the cylindrical part, m.
+
+    >>> round(float(capsule(1.0, 0.0)), 12)
+    4.188790204786
+    """
+    return sphere(radius) + cylinder(radius, length)
+
+
+def cone(radius: ScalarLike, height: ScalarLike) -> Scalar:
+    """Volume of a cone, m³, `π r² h/3`. **Arguments:** `radius`, `height` m.
+
+    >>> round(float(cone(1.0, 3.0)), 12)
+    3.14159265359
+    """
+    return cylinder(radius, height) / 3.0
+
+
+def torus(major: ScalarLike, minor: ScalarLike) -> Scalar:
+    """Volume of a ring, m³, `2π² R r²`. **Arguments:** `major`, `minor` radii, m.
+
+    >>> round(float(torus(0.5, 1.0)), 12)
+    9.869604401089
+    """
+    R, r = _checks.floating(major, (), "major"), _checks.floating(minor, (), "minor")
+    return 2.0 * jnp.pi**2 * R * r * r
