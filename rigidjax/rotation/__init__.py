@@ -1,3 +1,9 @@
 """How a thing can be turned: matrices, quaternions, and charts."""
 
-from rigidjax.rotation import quaternion as quaternion, so3 as so3
+from rigidjax.rotation import (
+    euler as euler,
+    mrp as mrp,
+    quaternion as quaternion,
+    rodrigues as rodrigues,
+    so3 as so3,
+)

@@ -162,7 +162,17 @@ def to_matrix(q: QuatLike) -> Mat3:
     xy, yz, zx = 2 * x * y, 2 * y * z, 2 * z * x
     wx, wy, wz = 2 * w * x, 2 * w * y, 2 * w * z
     return jnp.stack(
-        [1 - yy - zz, xy - wz, zx + wy, xy + wz, 1 - zz - xx, yz - wx, zx - wy, yz + wx, 1 - xx - yy]
+        [
+            1 - yy - zz,
+            xy - wz,
+            zx + wy,
+            xy + wz,
+            1 - zz - xx,
+            yz - wx,
+            zx - wy,
+            yz + wx,
+            1 - xx - yy,
+        ]
     ).reshape(3, 3)
 
 

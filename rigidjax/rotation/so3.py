@@ -122,5 +122,15 @@ def _polynomial(v: Vec3, a: Scalar, b: Scalar) -> Mat3:
     xy, yz, zx = b * x * y, b * y * z, b * z * x
     ax, ay, az = a * x, a * y, a * z
     return jnp.stack(
-        [1 - yy - zz, xy - az, zx + ay, xy + az, 1 - zz - xx, yz - ax, zx - ay, yz + ax, 1 - xx - yy]
+        [
+            1 - yy - zz,
+            xy - az,
+            zx + ay,
+            xy + az,
+            1 - zz - xx,
+            yz - ax,
+            zx - ay,
+            yz + ax,
+            1 - xx - yy,
+        ]
     ).reshape(3, 3)

@@ -1,0 +1,262 @@
+"""Euler angles in all 24 sequences; the 3-1-3 of the notes, "ZXZ", first (floor 1).
+
+A sequence is three letters, the angles are listed in its order, and every angle is active and in
+radians. **Capitals are intrinsic**: each turn is about the axis as already turned, and
+M = R_1(a) R_2(b) R_3(c) (notes, eqs 12, 27–31). **Lower case is extrinsic**: each turn is about a
+fixed axis of the world, and M = R_3(c) R_2(b) R_1(a). SciPy uses the same letters.
+
+**The singular case** ("gimbal lock"): middle angle 0 or π when first and last letter are the same,
+±π/2 when all three differ. Only the sum or the difference of the outer angles is then defined.
+The choice here, wherever the sine or cosine that vanishes is below 4 units of round-off: **the last
+angle listed is 0** (likewise its rate), and the matrix is reproduced all the same. Derivatives there
+are finite: those of the remaining chart, with the middle angle held. `is_singular` tells.
+"""
+
+import warnings
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool
+
+from rigidjax import _checks
+from rigidjax._types import Mat3, Mat3Like, Quat, QuatLike, Scalar, Vec3, Vec3Like
+from rigidjax.rotation import quaternion
+from rigidjax.rotation.algebra import apply, cross, dot
+
+_MANY_TURNS = 8 * np.pi
+
+
+def to_quaternion(angles: Vec3Like, sequence: str = "ZXZ") -> Quat:
+    """The unit quaternion, body → world, of three Euler angles.
+
+    **Arguments:** `angles` (3,), rad, in the order of `sequence`. **Raises:** `ValueError` for an
+    unknown sequence. **Warns** if an angle known now is beyond four turns: degrees, perhaps.
+
+    >>> to_quaternion(jnp.array([0.0, jnp.pi, 0.0])).round(12).tolist()
+    [0.0, 1.0, 0.0, 0.0]
+    """
+    axes, reverse = _axes(sequence)
+    angles = _angles(angles)
+    turns = [_about(axis, angle) for axis, angle in zip(axes, _in_order(angles, reverse))]
+    return quaternion.multiply(quaternion.multiply(turns[0], turns[1]), turns[2])
+
+
+def to_matrix(angles: Vec3Like, sequence: str = "ZXZ") -> Mat3:
+    """The rotation matrix, body → world, of three Euler angles (notes, eqs 31, 33 for "ZXZ").
+
+    **Arguments:** `angles` (3,), rad, in the order of `sequence`: (φ, θ, ψ) for "ZXZ".
+    **Raises:** `ValueError` for an unknown sequence.
+
+    >>> to_matrix(jnp.array([0.0, jnp.pi / 2, 0.0]), "ZXZ").round(12)[1].tolist()
+    [0.0, 0.0, -1.0]
+    """
+    return quaternion.to_matrix(to_quaternion(angles, sequence))
+
+
+def from_matrix(matrix: Mat3Like, sequence: str = "ZXZ") -> Vec3:
+    """The Euler angles of a rotation matrix, rad, in the order of `sequence`.
+
+    **Arguments:** `matrix` (3, 3) rotation, body → world; values are not looked at (`so3.check`).
+
+    **Returns:** (3,): outer angles in (−π, π]; the middle one in [0, π] if first and last letter
+    agree, else in [−π/2, π/2]. In the singular case the last is 0. **Raises:** `ValueError` for an
+    unknown sequence.
+
+    >>> from_matrix(to_matrix(jnp.array([0.3, 0.2, 0.1]), "xyz"), "xyz").round(12).tolist()
+    [0.3, 0.2, 0.1]
+    """
+    return from_quaternion(quaternion.from_matrix(matrix), sequence)
+
+
+def from_quaternion(q: QuatLike, sequence: str = "ZXZ") -> Vec3:
+    """The Euler angles of a quaternion, rad, in the order of `sequence`; same bits for q and −q.
+
+    **Arguments:** `q` (4,), not zero, body → world. Half the sum and half the difference of the
+    outer angles come from two atan2, so that near the singular case the matrix keeps all its digits
+    (Bernardes & Viollet 2022, doi:10.1371/journal.pone.0276302).
+
+    >>> from_quaternion(jnp.array([1.0, 0.0, 0.0, 0.0])).tolist()
+    [0.0, 0.0, 0.0]
+    """
+    (i, j, k), reverse = _axes(sequence)
+    q = quaternion.canonical(q)
+    symmetric = i == k
+    last = 3 - i - j
+    handed = _handed(i, j)
+    w, x, y, z = q[0], q[1 + i], q[1 + j], q[1 + last]
+    if symmetric:
+        z = handed * z
+    else:
+        # A quarter turn about the middle axis makes the last axis the first (all times √2).
+        w, x, y, z = w + handed * y, x + z, w - handed * y, x - z
+    flat, up = y * y + z * z, w * w + x * x
+    tiny = (2 * jnp.finfo(q.dtype).eps) ** 2 * (flat + up)
+    low, high = flat <= tiny, up <= tiny
+    half_sum = jnp.arctan2(jnp.where(high, 0, x), jnp.where(high, 1, w))
+    half_difference = jnp.arctan2(jnp.where(low, 0, z), jnp.where(low, 1, y))
+    # The last angle listed is 0: the third of the intrinsic turns, or the first if reversed.
+    sign = -1 if reverse else 1
+    half_difference = jnp.where(low, sign * half_sum, half_difference)
+    half_sum = jnp.where(high, sign * half_difference, half_sum)
+    s, c = jnp.sqrt(jnp.where(low, 1, flat)), jnp.sqrt(jnp.where(high, 1, up))
+    s, c = jnp.where(low, 0, s), jnp.where(high, 0, c)
+    middle = 2 * jnp.arctan2(s, c) if symmetric else handed * 2 * jnp.arctan2(c - s, c + s)
+    angles = [_wrap(half_sum + half_difference), middle, _wrap(half_sum - half_difference)]
+    return jnp.stack(angles[::-1] if reverse else angles)
+
+
+def is_singular(angles: Vec3Like, sequence: str = "ZXZ") -> Bool[Array, ""]:
+    """Whether these angles are singular: their outer turns have one axis, to 4 units of round-off.
+
+    **Arguments:** `angles` (3,), rad, in the order of `sequence`; of a matrix,
+    `is_singular(from_matrix(matrix, sequence), sequence)`.
+
+    >>> bool(is_singular(jnp.array([0.1, 0.0, 0.0]), "ZXZ"))
+    True
+    """
+    axes, _ = _axes(sequence)
+    return _vanishing(_angles(angles)[1], axes)[1]
+
+
+def rates_to_omega(
+    angles: Vec3Like,
+    rates: Vec3Like,
+    sequence: str = "ZXZ",
+    *,
+    frame: Literal["body", "world"] = "body",
+) -> Vec3:
+    """Angular velocity from Euler angles and their rates (notes, eqs 80–83 for "ZXZ" and "body").
+
+    **Arguments:** `angles` (3,), rad, and `rates` (3,), rad/s, in the order of `sequence`; `frame`
+    of the result. **Returns:** (3,) rad/s. **Raises:** `ValueError` for an unknown sequence or frame.
+
+    >>> rates_to_omega(jnp.array([0.1, 0.2, 0.3]), jnp.array([0.0, 0.0, 2.0])).tolist()
+    [0.0, 0.0, 2.0]
+    """
+    axes, reverse = _axes(sequence)
+    angles, rates = _angles(angles), _checks.floating(rates, (3,), "rates")
+    first, second, third = _turning_axes(axes, _in_order(angles, reverse))
+    a, b, c = _in_order(rates, reverse)
+    return _from_body(a * first + b * second + c * third, angles, sequence, frame)
+
+
+def omega_to_rates(
+    angles: Vec3Like,
+    omega: Vec3Like,
+    sequence: str = "ZXZ",
+    *,
+    frame: Literal["body", "world"] = "body",
+) -> Vec3:
+    """Rates of the Euler angles from the angular velocity: eqs 81–83 of the notes, solved.
+
+    **Arguments:** `angles` (3,), rad, in the order of `sequence`; `omega` (3,), rad/s, in `frame`.
+
+    **Returns:** (3,) rad/s. In the singular case (`is_singular`) the last rate is 0, the others
+    follow, and the part of `omega` that no rates can make is dropped. **Raises:** `ValueError` for an
+    unknown sequence or frame.
+
+    >>> omega_to_rates(jnp.array([0.1, 0.2, 0.3]), jnp.array([0.0, 0.0, 2.0])).tolist()
+    [0.0, 0.0, 2.0]
+    """
+    axes, reverse = _axes(sequence)
+    angles, omega = _angles(angles), _checks.floating(omega, (3,), "omega")
+    omega = _to_body(omega, angles, sequence, frame)
+    first, second, third = _turning_axes(axes, _in_order(angles, reverse))
+    reach, singular = _vanishing(angles[1], axes)
+    # `second` is normal to the other two; `aside` completes it and `third` to a frame.
+    aside, along = cross(third, second), dot(first, third)
+    a = dot(aside, omega) / jnp.where(singular, 1, reach)
+    a = jnp.where(singular, 0 if reverse else along * dot(third, omega), a)
+    c = jnp.where(singular & (not reverse), 0, dot(third, omega) - along * a)
+    b = dot(second, omega)
+    return jnp.stack([c, b, a] if reverse else [a, b, c])
+
+
+def _axes(sequence: str) -> tuple[tuple[int, int, int], bool]:
+    """Axis numbers of the turns as intrinsic ones, and whether the angles are listed the other way."""
+    extrinsic = isinstance(sequence, str) and sequence.islower()
+    letters = "xyz" if extrinsic else "XYZ"
+    if not isinstance(sequence, str) or len(sequence) != 3 or not set(sequence) <= set(letters):
+        raise ValueError(_unknown(sequence, "three letters of one case are wanted"))
+    i, j, k = (letters.index(letter) for letter in sequence)
+    if i == j or j == k:
+        raise ValueError(_unknown(sequence, "two turns in a row are about one axis"))
+    return ((k, j, i) if extrinsic else (i, j, k)), extrinsic
+
+
+def _unknown(sequence: object, reason: str) -> str:
+    return (
+        f"sequence: unknown {sequence!r}, {reason}; capitals are intrinsic (moving axes) as in "
+        "'ZXZ' or 'ZYX', lower case is extrinsic (fixed axes) as in 'xyz'"
+    )
+
+
+def _angles(angles: Vec3Like) -> Vec3:
+    angles = _checks.floating(angles, (3,), "angles")
+    if not isinstance(angles, jax.core.Tracer) and bool(jnp.any(jnp.abs(angles) > _MANY_TURNS)):
+        warnings.warn(
+            f"angles {angles.tolist()} rad are more than four turns: are they degrees? "
+            "use jnp.deg2rad",
+            stacklevel=3,
+        )
+    return angles
+
+
+def _in_order(numbers: Vec3, reverse: bool) -> tuple[Scalar, Scalar, Scalar]:
+    a, b, c = numbers
+    return (c, b, a) if reverse else (a, b, c)
+
+
+def _handed(i: int, j: int) -> int:
+    """+1 if e_i × e_j is the third basis vector, −1 if it is its opposite."""
+    return 1 if (j - i) % 3 == 1 else -1
+
+
+def _about(axis: int, angle: Scalar) -> Quat:
+    parts = [jnp.cos(0.5 * angle)] + [jnp.zeros_like(angle)] * 3
+    parts[1 + axis] = jnp.sin(0.5 * angle)
+    return jnp.stack(parts)
+
+
+def _wrap(angle: Scalar) -> Scalar:
+    """An angle in (−2π, 2π) brought into (−π, π]."""
+    angle = jnp.where(angle > np.pi, angle - 2 * np.pi, angle)
+    return jnp.where(angle <= -np.pi, angle + 2 * np.pi, angle)
+
+
+def _turning_axes(axes: tuple[int, int, int], angles: tuple) -> tuple[Vec3, Vec3, Vec3]:
+    """The three axes of turning, seen from the body: what each unit rate adds to Ω."""
+    _, b, c = angles
+    e = jnp.eye(3, dtype=b.dtype)
+    i, j, k = axes
+    return _back(k, c, _back(j, b, e[i])), _back(k, c, e[j]), e[k]
+
+
+def _back(axis: int, angle: Scalar, y: Vec3) -> Vec3:
+    """y turned by −angle about a coordinate axis."""
+    e = jnp.eye(3, dtype=y.dtype)[axis]
+    along = e * y
+    return along + jnp.cos(angle) * (y - along) - jnp.sin(angle) * cross(e, y)
+
+
+def _vanishing(middle: Scalar, axes: tuple[int, int, int]) -> tuple[Scalar, Bool[Array, ""]]:
+    """first · (third × second) of the turning axes, and whether it is 0 to round-off."""
+    i, j, k = axes
+    size = jnp.sin(middle) if i == k else -_handed(i, j) * jnp.cos(middle)
+    return size, jnp.abs(size) < 4 * jnp.finfo(middle.dtype).eps
+
+
+def _from_body(omega: Vec3, angles: Vec3, sequence: str, frame: str) -> Vec3:
+    if frame == "body":
+        return omega
+    if frame == "world":
+        return apply(to_matrix(angles, sequence), omega)
+    raise ValueError(f"frame: wanted 'body' or 'world', got {frame!r}")
+
+
+def _to_body(omega: Vec3, angles: Vec3, sequence: str, frame: str) -> Vec3:
+    if frame == "world":
+        return apply(to_matrix(angles, sequence).T, omega)
+    return _from_body(omega, angles, sequence, frame)

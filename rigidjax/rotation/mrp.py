@@ -1,0 +1,114 @@
+"""Modified Rodrigues parameters σ = n tan(θ/4), and their shadow set (floor 1).
+
+Three numbers without a sine: regular up to a full turn, where σ runs to infinity. σ and its shadow
+−σ/|σ|² are the same rotation; switching at |σ| = 1 keeps to θ ≤ π. Source: Schaub & Junkins, 2018,
+Analytical Mechanics of Space Systems, sec. 3.5.2.
+"""
+
+import jax.numpy as jnp
+
+from rigidjax import _checks
+from rigidjax._types import Mat3, Mat3Like, Quat, QuatLike, Vec3, Vec3Like
+from rigidjax.rotation import quaternion
+from rigidjax.rotation.algebra import cross, dot
+
+
+def from_quaternion(q: QuatLike) -> Vec3:
+    """σ = q_v/(1 + q_w) of the canonical quaternion: |σ| ≤ 1, the same bits for q and −q.
+
+    **Arguments:** `q` (4,) unit, body → world. **Returns:** (3,) dimensionless.
+
+    >>> from_quaternion(jnp.array([-1.0, 0.0, 0.0, 0.0])).tolist()
+    [-0.0, -0.0, -0.0]
+    """
+    q = quaternion.canonical(q)
+    return q[1:] / (1 + q[0])
+
+
+def to_quaternion(sigma: Vec3Like) -> Quat:
+    """The unit quaternion ((1 − s), 2σ)/(1 + s), s = |σ|²; for the shadow it is −q.
+
+    **Arguments:** `sigma` (3,) dimensionless.
+
+    >>> to_quaternion(jnp.array([0.0, 0.0, 1.0])).tolist()
+    [0.0, 0.0, 0.0, 1.0]
+    """
+    sigma = _checks.floating(sigma, (3,), "sigma")
+    s = dot(sigma, sigma)
+    return jnp.concatenate([(1 - s)[None], 2 * sigma]) / (1 + s)
+
+
+def from_matrix(matrix: Mat3Like) -> Vec3:
+    """The parameters, |σ| ≤ 1, of a rotation matrix, body → world.
+
+    **Arguments:** `matrix` (3, 3) rotation; values are not looked at (`so3.check`).
+
+    >>> from_matrix(jnp.eye(3)).tolist()
+    [0.0, 0.0, 0.0]
+    """
+    return from_quaternion(quaternion.from_matrix(matrix))
+
+
+def to_matrix(sigma: Vec3Like) -> Mat3:
+    """The rotation matrix, body → world; the same for the shadow.
+
+    **Arguments:** `sigma` (3,) dimensionless.
+
+    >>> to_matrix(jnp.zeros(3)).tolist()
+    [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+    """
+    return quaternion.to_matrix(to_quaternion(sigma))
+
+
+def shadow(sigma: Vec3Like) -> Vec3:
+    """The other parameters of the same rotation, −σ/|σ|² (Schaub & Junkins, eq 3.145).
+
+    **Arguments:** `sigma` (3,), not zero: the shadow of no rotation lies at infinity.
+
+    >>> shadow(jnp.array([0.0, 0.5, 0.0])).tolist()
+    [-0.0, -2.0, -0.0]
+    """
+    sigma = _checks.floating(sigma, (3,), "sigma")
+    return -sigma / dot(sigma, sigma)
+
+
+def switch(sigma: Vec3Like) -> Vec3:
+    """σ if |σ| ≤ 1, else its shadow: the parameters of the shorter way round.
+
+    **Arguments:** `sigma` (3,) dimensionless. Do it between steps of a solver, not inside one.
+
+    >>> switch(jnp.array([0.0, 2.0, 0.0])).tolist()
+    [-0.0, -0.5, -0.0]
+    """
+    sigma = _checks.floating(sigma, (3,), "sigma")
+    s = dot(sigma, sigma)
+    return jnp.where(s > 1, -sigma / jnp.where(s > 1, s, 1), sigma)
+
+
+def omega_to_rates(sigma: Vec3Like, omega: Vec3Like) -> Vec3:
+    """dσ/dt = ¼ [(1 − s) Ω + 2 σ × Ω + 2 σ (σ·Ω)] (Schaub & Junkins, eq 3.160); never singular.
+
+    **Arguments:** `sigma` (3,) dimensionless; `omega` (3,) rad/s, body frame. **Returns:** 1/s.
+
+    >>> omega_to_rates(jnp.zeros(3), jnp.array([0.0, 0.0, 4.0])).tolist()
+    [0.0, 0.0, 1.0]
+    """
+    sigma = _checks.floating(sigma, (3,), "sigma")
+    omega = _checks.floating(omega, (3,), "omega")
+    s = dot(sigma, sigma)
+    return 0.25 * ((1 - s) * omega + 2 * cross(sigma, omega) + 2 * dot(sigma, omega) * sigma)
+
+
+def rates_to_omega(sigma: Vec3Like, rates: Vec3Like) -> Vec3:
+    """Ω = 4/(1 + s)² [(1 − s) σ̇ − 2 σ × σ̇ + 2 σ (σ·σ̇)], body frame (Schaub & Junkins, eq 3.164).
+
+    **Arguments:** `sigma` (3,) dimensionless; `rates` (3,) 1/s. **Returns:** (3,) rad/s.
+
+    >>> rates_to_omega(jnp.zeros(3), jnp.array([0.0, 0.0, 1.0])).tolist()
+    [0.0, 0.0, 4.0]
+    """
+    sigma = _checks.floating(sigma, (3,), "sigma")
+    rates = _checks.floating(rates, (3,), "rates")
+    s = dot(sigma, sigma)
+    turned = (1 - s) * rates - 2 * cross(sigma, rates) + 2 * dot(sigma, rates) * sigma
+    return 4 / (1 + s) ** 2 * turned

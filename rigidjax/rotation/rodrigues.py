@@ -1,0 +1,96 @@
+"""Rodrigues (Gibbs, Cayley) parameters g = n tan(θ/2) (floor 1).
+
+Rational in both directions, and without a double cover; a half turn lies at infinity, and
+`is_singular` tells. M = (1 + hat g)(1 − hat g)⁻¹ is Cayley's transform. Source: Schaub & Junkins,
+2018, Analytical Mechanics of Space Systems, sec. 3.5.1.
+"""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool
+
+from rigidjax import _checks
+from rigidjax._types import Mat3, Mat3Like, Quat, QuatLike, Vec3, Vec3Like
+from rigidjax.rotation import quaternion
+from rigidjax.rotation.algebra import cross, dot
+
+
+def from_quaternion(q: QuatLike) -> Vec3:
+    """g = q_v/q_w; infinite at a half turn; the same bits for q and −q.
+
+    **Arguments:** `q` (4,), not zero, body → world. **Returns:** (3,) dimensionless.
+
+    >>> from_quaternion(jnp.array([2.0, 0.0, 0.0, 2.0])).tolist()
+    [0.0, 0.0, 1.0]
+    """
+    q = quaternion.canonical(q)
+    return q[1:] / q[0]
+
+
+def to_quaternion(g: Vec3Like) -> Quat:
+    """The unit quaternion (1, g)/√(1 + |g|²), with w > 0.
+
+    **Arguments:** `g` (3,) dimensionless, finite.
+
+    >>> to_quaternion(jnp.zeros(3)).tolist()
+    [1.0, 0.0, 0.0, 0.0]
+    """
+    g = _checks.floating(g, (3,), "g")
+    return jnp.concatenate([jnp.ones_like(g[:1]), g]) / jnp.sqrt(1 + dot(g, g))
+
+
+def from_matrix(matrix: Mat3Like) -> Vec3:
+    """The parameters of a rotation matrix, body → world; infinite at a half turn.
+
+    **Arguments:** `matrix` (3, 3) rotation; values are not looked at (`so3.check`).
+
+    >>> from_matrix(jnp.eye(3)).tolist()
+    [0.0, 0.0, 0.0]
+    """
+    return from_quaternion(quaternion.from_matrix(matrix))
+
+
+def to_matrix(g: Vec3Like) -> Mat3:
+    """Cayley's transform (1 + hat g)(1 − hat g)⁻¹, the rotation matrix, body → world.
+
+    **Arguments:** `g` (3,) dimensionless, finite.
+
+    >>> to_matrix(jnp.array([0.0, 0.0, 1.0])).round(12)[0].tolist()
+    [0.0, -1.0, 0.0]
+    """
+    return quaternion.to_matrix(to_quaternion(g))
+
+
+def is_singular(q: QuatLike) -> Bool[Array, ""]:
+    """Whether a rotation is a half turn to 4 units of round-off, where g has no digits left.
+
+    **Arguments:** `q` (4,) unit.
+
+    >>> bool(is_singular(jnp.array([0.0, 0.0, 0.0, 1.0])))
+    True
+    """
+    q = _checks.floating(q, (4,), "q")
+    return jnp.abs(q[0]) < 4 * jnp.finfo(q.dtype).eps
+
+
+def omega_to_rates(g: Vec3Like, omega: Vec3Like) -> Vec3:
+    """dg/dt = ½ [Ω + g × Ω + g (g·Ω)] (Schaub & Junkins, eq 3.130).
+
+    **Arguments:** `g` (3,) dimensionless; `omega` (3,) rad/s, body frame. **Returns:** 1/s.
+
+    >>> omega_to_rates(jnp.zeros(3), jnp.array([0.0, 0.0, 2.0])).tolist()
+    [0.0, 0.0, 1.0]
+    """
+    g, omega = _checks.floating(g, (3,), "g"), _checks.floating(omega, (3,), "omega")
+    return 0.5 * (omega + cross(g, omega) + dot(g, omega) * g)
+
+
+def rates_to_omega(g: Vec3Like, rates: Vec3Like) -> Vec3:
+    """Ω = 2/(1 + |g|²) [ġ − g × ġ], body frame (Schaub & Junkins, eq 3.132).
+
+    **Arguments:** `g` (3,) dimensionless; `rates` (3,) 1/s. **Returns:** (3,) rad/s.
+
+    >>> rates_to_omega(jnp.zeros(3), jnp.array([0.0, 0.0, 1.0])).tolist()
+    [0.0, 0.0, 2.0]
+    """
+    g, rates = _checks.floating(g, (3,), "g"), _checks.floating(rates, (3,), "rates")
+    return 2 / (1 + dot(g, g)) * (rates - cross(g, rates))
