@@ -5,17 +5,17 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from rigidjax import _checks
-from rigidjax._types import Vec3Like
 from rigidjax.body import physical
+from rigidjax.body.hints import Numbers, Vector
 from rigidjax.body.inertia import MassProperties
 from rigidjax.body.symmetric import from_components
 
 
 def points(
-    masses: Float[Array, "n"] | object, positions: Float[Array, "n 3"] | object
+    masses: Float[ArrayLike, "n"] | Numbers, positions: Float[ArrayLike, "n 3"] | Numbers
 ) -> MassProperties:
     """The body made of point masses: `𝔖 = Σ m (r − c)(r − c)ᵀ` (notes, eq 60).
 
@@ -40,7 +40,7 @@ def points(
 
 
 def voxels(
-    density: Float[Array, "nx ny nz"] | object, spacing: Vec3Like, corner: Vec3Like
+    density: Float[ArrayLike, "nx ny nz"] | Numbers, spacing: Vector, corner: Vector
 ) -> MassProperties:
     """The body of a density given on the cells of a box, constant in each cell.
 

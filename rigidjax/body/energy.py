@@ -5,26 +5,23 @@ eqs 57 and 73–75 have; here all three have it and agree.
 """
 
 import jax.numpy as jnp
-from jaxtyping import ArrayLike, Float
 
 from rigidjax import _checks
 from rigidjax._types import (
     HasAttitude,
     HasPose,
     HasSpin,
-    Mat3Like,
-    QuatLike,
     Scalar,
     Vec3,
-    Vec3Like,
 )
+from rigidjax.body.hints import Matrix, Quaternion, Vector
 from rigidjax.body.inertia import Inertia, MassProperties
-from rigidjax.body.symmetric import apply, product
+from rigidjax.body.physical import unit_quaternion
+from rigidjax.rotation import quaternion
+from rigidjax.rotation.algebra import apply, cross, dot, product
 
 
-def kinetic_energy(
-    body: Inertia | MassProperties, state: HasSpin | Float[ArrayLike, "3"] | object
-) -> Scalar:
+def kinetic_energy(body: Inertia | MassProperties, state: HasSpin | Vector) -> Scalar:
     """Kinetic energy of a body in a state of motion, J.
 
     **Arguments:** `body` an `Inertia` about the point it turns about, or `MassProperties`;
@@ -40,14 +37,14 @@ def kinetic_energy(
     """
     inertia = body if isinstance(body, Inertia) else body.inertia
     omega = _omega(state)
-    energy = 0.5 * _dot(omega, apply(inertia.tensor, omega))
+    energy = 0.5 * dot(omega, apply(inertia.tensor, omega))
     if isinstance(body, MassProperties) and isinstance(state, HasPose):
-        energy = energy + 0.5 * body.mass * _dot(state.v, state.v)
+        energy = energy + 0.5 * body.mass * dot(state.v, state.v)
     return energy
 
 
 def kinetic_energy_about(
-    body: MassProperties, q: QuatLike, velocity: Vec3Like, omega: Vec3Like
+    body: MassProperties, q: Quaternion, velocity: Vector, omega: Vector
 ) -> Scalar:
     """Kinetic energy when the point followed is not the centre of mass, J.
 
@@ -64,19 +61,17 @@ def kinetic_energy_about(
     >>> kinetic_energy_about(ball, [1.0, 0, 0, 0], [0.0, 1, 0], [0.0, 0, 1])
     Array(2., dtype=float64)
     """
-    from rigidjax.rotation import quaternion
-
     velocity, omega = _vector(velocity, "velocity"), _vector(omega, "omega")
     about_origin = body.inertia_about(jnp.zeros_like(body.com)).tensor
-    swing = quaternion.rotate(_checks.floating(q, (4,), "q"), _cross(omega, body.com))
+    swing = quaternion.rotate(unit_quaternion(q), cross(omega, body.com))
     return (
-        0.5 * body.mass * _dot(velocity, velocity)
-        + body.mass * _dot(velocity, swing)
-        + 0.5 * _dot(omega, apply(about_origin, omega))
+        0.5 * body.mass * dot(velocity, velocity)
+        + body.mass * dot(velocity, swing)
+        + 0.5 * dot(omega, apply(about_origin, omega))
     )
 
 
-def kinetic_energy_of_matrix_rate(second_moment: Mat3Like, matrix_rate: Mat3Like) -> Scalar:
+def kinetic_energy_of_matrix_rate(second_moment: Matrix, matrix_rate: Matrix) -> Scalar:
     """Energy of rotation `½ Tr(Ṁ 𝔖 Ṁᵀ)`, J (notes, eq 63 with its missing ½).
 
     **Arguments:** `second_moment` (3, 3) 𝔖, kg m², body frame; `matrix_rate` (3, 3) dM/dt, 1/s, of
@@ -90,7 +85,7 @@ def kinetic_energy_of_matrix_rate(second_moment: Mat3Like, matrix_rate: Mat3Like
     return 0.5 * jnp.sum(product(rate, s) * rate)
 
 
-def kinetic_energy_of_generator(second_moment: Mat3Like, generator: Mat3Like) -> Scalar:
+def kinetic_energy_of_generator(second_moment: Matrix, generator: Matrix) -> Scalar:
     """Energy of rotation `½ Tr(J'ᵀ J' 𝔖)`, J (notes, eq 65 with its missing ½).
 
     **Arguments:** `second_moment` (3, 3) 𝔖, kg m², body frame; `generator` (3, 3) J' = hat(Ω), 1/s.
@@ -103,7 +98,7 @@ def kinetic_energy_of_generator(second_moment: Mat3Like, generator: Mat3Like) ->
     return 0.5 * jnp.sum(product(generator.T, generator) * s.T)
 
 
-def kinetic_energy_of_moments(second_moments: Vec3Like, omega: Vec3Like) -> Scalar:
+def kinetic_energy_of_moments(second_moments: Vector, omega: Vector) -> Scalar:
     """Energy of rotation `½((λ2+λ3)Ω1² + (λ3+λ1)Ω2² + (λ1+λ2)Ω3²)`, J (notes, eqs 73–75).
 
     **Arguments:** `second_moments` (3,) λ, eigenvalues of 𝔖, kg m²; `omega` (3,) Ω along the same
@@ -114,12 +109,10 @@ def kinetic_energy_of_moments(second_moments: Vec3Like, omega: Vec3Like) -> Scal
     """
     s, omega = _vector(second_moments, "second_moments"), _vector(omega, "omega")
     moments = jnp.stack([s[1] + s[2], s[2] + s[0], s[0] + s[1]])
-    return 0.5 * _dot(moments, omega * omega)
+    return 0.5 * dot(moments, omega * omega)
 
 
-def angular_momentum(
-    body: Inertia | MassProperties, state: HasSpin | Float[ArrayLike, "3"] | object
-) -> Vec3:
+def angular_momentum(body: Inertia | MassProperties, state: HasSpin | Vector) -> Vec3:
     """Angular momentum in the body frame, `Π = IΩ`, (3,), kg m²/s.
 
     **Arguments:** `body` an `Inertia` about the point it turns about, or `MassProperties` (then
@@ -148,8 +141,6 @@ def spatial_angular_momentum(body: Inertia | MassProperties, state: HasAttitude)
     >>> spatial_angular_momentum(Inertia.from_principal(1.0, 2.0, 3.0), turned)[2]
     Array(-3., dtype=float64)
     """
-    from rigidjax.rotation import quaternion
-
     if not isinstance(state, HasAttitude):
         raise TypeError(
             f"spatial_angular_momentum: wanted a state with an attitude (.q), got "
@@ -157,7 +148,7 @@ def spatial_angular_momentum(body: Inertia | MassProperties, state: HasAttitude)
         )
     momentum = quaternion.rotate(state.q, angular_momentum(body, state))
     if isinstance(body, MassProperties) and isinstance(state, HasPose):
-        momentum = momentum + body.mass * _cross(state.x, state.v)
+        momentum = momentum + body.mass * cross(state.x, state.v)
     return momentum
 
 
@@ -167,13 +158,3 @@ def _omega(state):
 
 def _vector(value, name):
     return _checks.floating(value, (3,), name)
-
-
-def _dot(a, b):
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-def _cross(a, b):
-    return jnp.stack(
-        [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
-    )

@@ -10,8 +10,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rigidjax import _checks
-from rigidjax._types import Mat3, Mat3Like, Quat, QuatLike, ScalarLike, Vec3, Vec3Like
+from rigidjax._types import Mat3, Quat, ScalarLike, Vec3
 from rigidjax.body import physical
+from rigidjax.body.hints import Matrices, Matrix, Quaternion, Scalars, Vector, Vectors
 from rigidjax.body.principal import eigensystem, principal
 from rigidjax.body.symmetric import (
     apply as apply,
@@ -21,6 +22,7 @@ from rigidjax.body.symmetric import (
     solve as solve,
     swap_trace,
 )
+from rigidjax.rotation import quaternion
 
 
 class Inertia(eqx.Module):
@@ -41,11 +43,11 @@ class Inertia(eqx.Module):
 
     tensor: Float[Array, "*batch 3 3"]
 
-    def __init__(self, tensor: Float[Array, "*batch 3 3"] | object):
+    def __init__(self, tensor: Matrices):
         self.tensor = _checks.floating(tensor, (3, 3), "tensor", batched=True)
 
     @staticmethod
-    def from_tensor(tensor: Mat3Like | object) -> "Inertia":
+    def from_tensor(tensor: Matrix) -> "Inertia":
         """A body with this inertia tensor.
 
         **Arguments:** `tensor` (3, 3), kg m², body frame, about the point it turns about.
@@ -76,7 +78,7 @@ class Inertia(eqx.Module):
         return Inertia(jnp.diag(physical.real_moments(moments)))
 
     @staticmethod
-    def from_second_moment(second_moment: Mat3Like | object) -> "Inertia":
+    def from_second_moment(second_moment: Matrix) -> "Inertia":
         """A body with this second moment: `I = Tr(𝔖) 1 − 𝔖`.
 
         **Arguments:** `second_moment` (3, 3) 𝔖 = ∫ r rᵀ dm, kg m², body frame, about the point it
@@ -118,7 +120,7 @@ class Inertia(eqx.Module):
         """
         return principal(self.tensor)
 
-    def shifted(self, r: Vec3Like, mass: ScalarLike) -> "Inertia":
+    def shifted(self, r: Vector, mass: ScalarLike) -> "Inertia":
         """The inertia about a point away from the centre of mass (parallel axis).
 
         `I + m (|r|² 1 − r rᵀ)`. **Arguments:** `self` about the centre of mass; `r` (3,) from the
@@ -131,7 +133,7 @@ class Inertia(eqx.Module):
         r, m = _checks.floating(r, (3,), "r"), _checks.floating(mass, (), "mass")
         return Inertia(self.tensor + swap_trace(m * outer(r, r)))
 
-    def rotated(self, q: QuatLike) -> "Inertia":
+    def rotated(self, q: Quaternion) -> "Inertia":
         """The same body turned, or seen from other axes: `R(q) I R(q)ᵀ`.
 
         **Arguments:** `q` (4,) unit quaternion (w, x, y, z), active: a feature at `r` is then at
@@ -141,9 +143,7 @@ class Inertia(eqx.Module):
         >>> Inertia.from_principal(1.0, 2.0, 2.5).rotated([half, 0, 0, half]).tensor[0, 0]
         Array(2., dtype=float64)
         """
-        from rigidjax.rotation import quaternion
-
-        m = quaternion.to_matrix(_checks.floating(q, (4,), "q"))
+        m = quaternion.to_matrix(physical.unit_quaternion(q))
         return Inertia(product(m, product(self.tensor, m.T)))
 
     def invertible(self) -> "Inertia":
@@ -186,9 +186,9 @@ class MassProperties(eqx.Module):
 
     def __init__(
         self,
-        mass: Float[Array, "*batch"] | object,
-        com: Float[Array, "*batch 3"] | object,
-        second_moment: Float[Array, "*batch 3 3"] | object,
+        mass: Scalars,
+        com: Vectors,
+        second_moment: Matrices,
     ):
         mass = _checks.floating(mass, (), "mass", batched=True)
         com = _checks.floating(com, (3,), "com", batched=True)
@@ -217,7 +217,7 @@ class MassProperties(eqx.Module):
             physical.real_mass(self.mass), self.com, physical.real_second_moment(self.second_moment)
         )
 
-    def second_moment_about(self, point: Vec3Like) -> Mat3:
+    def second_moment_about(self, point: Vector) -> Mat3:
         """𝔖 about another point: `𝔖 + m d dᵀ`, `d = c − point`.
 
         **Arguments:** `point` (3,) m, body frame. **Returns** (3, 3), kg m², body axes. Source:
@@ -230,7 +230,7 @@ class MassProperties(eqx.Module):
         d = self.com - _checks.floating(point, (3,), "point")
         return self.second_moment + self.mass * outer(d, d)
 
-    def inertia_about(self, point: Vec3Like) -> Inertia:
+    def inertia_about(self, point: Vector) -> Inertia:
         """The inertia about another point of the body, such as a pivot.
 
         **Arguments:** `point` (3,) m, body frame.
@@ -241,7 +241,7 @@ class MassProperties(eqx.Module):
         """
         return Inertia(swap_trace(self.second_moment_about(point)))
 
-    def shifted(self, r: Vec3Like) -> "MassProperties":
+    def shifted(self, r: Vector) -> "MassProperties":
         """The body carried by `r` (3,), m, in its own axes: only its centre of mass changes.
 
         >>> body = MassProperties(2.0, [1.0, 0, 0], [[1.0, 0, 0], [0, 1, 0], [0, 0, 1]])
@@ -252,7 +252,7 @@ class MassProperties(eqx.Module):
             self.mass, self.com + _checks.floating(r, (3,), "r"), self.second_moment
         )
 
-    def rotated(self, q: QuatLike) -> "MassProperties":
+    def rotated(self, q: Quaternion) -> "MassProperties":
         """The body turned about its origin: `c → R c`, `𝔖 → R 𝔖 Rᵀ`.
 
         **Arguments:** `q` (4,) unit quaternion (w, x, y, z), active.
@@ -261,9 +261,7 @@ class MassProperties(eqx.Module):
         >>> body.rotated([0.0, 0, 0, 1]).com
         Array([-1.,  0.,  0.], dtype=float64)
         """
-        from rigidjax.rotation import quaternion
-
-        m = quaternion.to_matrix(_checks.floating(q, (4,), "q"))
+        m = quaternion.to_matrix(physical.unit_quaternion(q))
         return MassProperties(
             self.mass, apply(m, self.com), product(m, product(self.second_moment, m.T))
         )

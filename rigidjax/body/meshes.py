@@ -10,19 +10,23 @@ import os
 from collections.abc import Iterable
 
 import jax
+import jax.core
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import ArrayLike, Float, Int
 
 from rigidjax import _checks
 from rigidjax._types import ScalarLike
 from rigidjax.body import physical
+from rigidjax.body.hints import Numbers
 from rigidjax.body.inertia import MassProperties
 from rigidjax.body.symmetric import from_components
 
 
 def mesh(
-    vertices: Float[Array, "n 3"] | object, faces: Int[Array, "m 3"] | object, density: ScalarLike
+    vertices: Float[ArrayLike, "n 3"] | Numbers,
+    faces: Int[ArrayLike, "m 3"] | Numbers,
+    density: ScalarLike,
 ) -> MassProperties:
     """The solid of one density inside a closed triangle mesh.
 

@@ -9,10 +9,11 @@ doi:10.1109/LRA.2022.3144517. The order of the ten numbers is theirs (and pinocc
 """
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from rigidjax import _checks
-from rigidjax._types import Mat3, Mat3Like, Vec3, Vec3Like
+from rigidjax._types import Mat3, Vec3
+from rigidjax.body.hints import Matrix, Numbers, Vector
 from rigidjax.body.inertia import MassProperties
 from rigidjax.body.physical import real_moments
 from rigidjax.body.symmetric import from_components
@@ -39,7 +40,7 @@ def pack(body: MassProperties) -> Float[Array, "10"]:
     return jnp.concatenate([_reach(half_log_mass)[None], logs, shape[3:], body.com])
 
 
-def unpack(vector: Float[Array, "10"] | object) -> MassProperties:
+def unpack(vector: Float[ArrayLike, "10"] | Numbers) -> MassProperties:
     """The body of ten unconstrained numbers: any ten.
 
     **Arguments:** `vector` (10,) as `pack` returns them. Exponents beyond what the dtype can hold
@@ -58,7 +59,7 @@ def unpack(vector: Float[Array, "10"] | object) -> MassProperties:
     return MassProperties(jnp.exp(2.0 * alpha), v[7:10], _expand(diagonal, jnp.exp(alpha) * v[4:7]))
 
 
-def pack_second_moment(second_moment: Mat3Like) -> Float[Array, "6"]:
+def pack_second_moment(second_moment: Matrix) -> Float[Array, "6"]:
     """Six unconstrained numbers of a positive definite second moment.
 
     **Arguments:** `second_moment` (3, 3) 𝔖, kg m². **Returns** (6,)
@@ -75,7 +76,7 @@ def pack_second_moment(second_moment: Mat3Like) -> Float[Array, "6"]:
     return jnp.concatenate([_reach(shape[:3]), shape[3:]])
 
 
-def unpack_second_moment(vector: Float[Array, "6"] | object) -> Mat3:
+def unpack_second_moment(vector: Float[ArrayLike, "6"] | Numbers) -> Mat3:
     """The second moment (3, 3), kg m², of six unconstrained numbers.
 
     **Arguments:** `vector` (6,) as `pack_second_moment` returns them.
@@ -90,7 +91,7 @@ def unpack_second_moment(vector: Float[Array, "6"] | object) -> Mat3:
     return _expand(jnp.exp(_hold(v[:3])), v[3:])
 
 
-def pack_shape(second_moment: Mat3Like) -> Float[Array, "5"]:
+def pack_shape(second_moment: Matrix) -> Float[Array, "5"]:
     """Five unconstrained numbers of a second moment up to its scale.
 
     Free motion sees only this: the ratios of inertia and the axes. **Arguments:** `second_moment`
@@ -109,7 +110,7 @@ def pack_shape(second_moment: Mat3Like) -> Float[Array, "5"]:
     return jnp.concatenate([_reach(shape[:2] - mean), jnp.exp(-mean) * shape[3:]])
 
 
-def unpack_shape(vector: Float[Array, "5"] | object) -> Mat3:
+def unpack_shape(vector: Float[ArrayLike, "5"] | Numbers) -> Mat3:
     """The second moment (3, 3) of trace 1 (so `Tr I = 2`) of five unconstrained numbers.
 
     **Arguments:** `vector` (5,) as `pack_shape` returns them.
@@ -126,7 +127,7 @@ def unpack_shape(vector: Float[Array, "5"] | object) -> Mat3:
     return s / (s[0, 0] + s[1, 1] + s[2, 2])
 
 
-def pack_moments(moments: Vec3Like) -> Float[Array, "3"]:
+def pack_moments(moments: Vector) -> Float[Array, "3"]:
     """Three unconstrained numbers of principal moments, the axes being known.
 
     **Arguments:** `moments` (3,) I1, I2, I3 in any order, kg m². **Returns** (3,)
@@ -142,7 +143,7 @@ def pack_moments(moments: Vec3Like) -> Float[Array, "3"]:
     return _reach(0.5 * jnp.log(_interior(s)))
 
 
-def unpack_moments(vector: Float[Array, "3"] | object) -> Vec3:
+def unpack_moments(vector: Float[ArrayLike, "3"] | Numbers) -> Vec3:
     """Principal moments (3,), kg m², of three unconstrained numbers, always a body's.
 
     **Arguments:** `vector` (3,) as `pack_moments` returns them.

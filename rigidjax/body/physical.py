@@ -7,13 +7,16 @@ round-off are forgiven, so that plates, rods and points, which lie on the bounda
 
 from collections.abc import Callable
 
-import jax
+import jax.core
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
 from rigidjax import _checks
+from rigidjax._types import Quat
+from rigidjax.body.hints import Quaternion
+from rigidjax.rotation import quaternion
 
 # Units of round-off, of the largest entry. A product R I Rᵀ is off by about ten.
 _FORGIVEN = 64.0
@@ -72,6 +75,21 @@ def nonzero_moments(tensor: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 
         f"inertia: a principal moment is zero{found}; the equations of motion divide by it. A "
         "thin rod or a point does not resist turning about that axis: give it a thickness",
     )
+
+
+def unit_quaternion(q: Quaternion) -> Quat:
+    """A unit quaternion (w, x, y, z): normalised if off by round-off, refused if by more."""
+    q = _checks.floating(q, (4,), "q", hint="a quaternion is (w, x, y, z)")
+    if known(q):
+        _checks.finite(q, "q")
+        length = float(np.linalg.norm(np.asarray(q)))
+        _checks.refuse(
+            q,
+            abs(length - 1.0) > (1e-3 if q.dtype == jnp.float32 else 1e-6),
+            f"q: wanted a unit quaternion (w, x, y, z), got one of length {length:.6g}; "
+            "rigidjax.quaternion.normalise makes it one",
+        )
+    return quaternion.normalise(q)
 
 
 def _moments_of_a_body(value, moments):

@@ -2,9 +2,10 @@
 
 import jax.numpy as jnp
 
-from rigidjax._types import Mat3, Scalar
+from rigidjax._types import Scalar
 from rigidjax.body.inertia import MassProperties
-from rigidjax.body.symmetric import apply, inverse, product
+from rigidjax.body.symmetric import inverse
+from rigidjax.rotation.algebra import apply, determinant, dot, product
 
 
 def divergence(body: MassProperties, reference: MassProperties) -> Scalar:
@@ -31,20 +32,11 @@ def divergence(body: MassProperties, reference: MassProperties) -> Scalar:
     shape = body.second_moment / body.mass
     d = body.com - reference.com
     overlap = product(spread, shape)
-    apart = apply(spread, d)
     trace = overlap[0, 0] + overlap[1, 1] + overlap[2, 2]
-    distance = d[0] * apart[0] + d[1] * apart[1] + d[2] * apart[2]
+    distance = dot(d, apply(spread, d))
     return (
         ratio * (trace + distance + 1.0)
-        - jnp.log(_determinant(overlap))
+        - jnp.log(determinant(overlap))
         - 4.0 * jnp.log(ratio)
         - 4.0
-    )
-
-
-def _determinant(a: Mat3) -> Scalar:
-    return (
-        a[0, 0] * (a[1, 1] * a[2, 2] - a[1, 2] * a[2, 1])
-        + a[0, 1] * (a[1, 2] * a[2, 0] - a[1, 0] * a[2, 2])
-        + a[0, 2] * (a[1, 0] * a[2, 1] - a[1, 1] * a[2, 0])
     )

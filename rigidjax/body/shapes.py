@@ -10,21 +10,22 @@ What is written down is the second moment 𝔖 = ∫ r rᵀ dm (notes, eq 60), d
 """
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import ArrayLike, Float
 
 from rigidjax import _checks
-from rigidjax._types import ScalarLike, Vec3Like
+from rigidjax._types import ScalarLike
 from rigidjax.body import physical
 from rigidjax.body.clouds import (
     points as points,
     quadrature as quadrature,
     voxels as voxels,
 )
+from rigidjax.body.hints import Numbers, Vector
 from rigidjax.body.inertia import MassProperties
 from rigidjax.body.meshes import mesh as mesh, mesh_file as mesh_file
 
 
-def box(mass: ScalarLike, size: Vec3Like) -> MassProperties:
+def box(mass: ScalarLike, size: Vector) -> MassProperties:
     """A solid box. `𝔖 = m diag(a², b², c²)/12`.
 
     **Arguments:** `mass` kg; `size` (3,) full edge lengths along x, y, z, m. A zero edge gives a
@@ -37,7 +38,7 @@ def box(mass: ScalarLike, size: Vec3Like) -> MassProperties:
     return _centred(mass, edges * edges / 12.0)
 
 
-def ellipsoid(mass: ScalarLike, semi_axes: Vec3Like) -> MassProperties:
+def ellipsoid(mass: ScalarLike, semi_axes: Vector) -> MassProperties:
     """A solid ellipsoid. `𝔖 = m diag(a², b², c²)/5`.
 
     **Arguments:** `mass` kg; `semi_axes` (3,) along x, y, z, m.
@@ -183,7 +184,7 @@ def rod(mass: ScalarLike, length: ScalarLike) -> MassProperties:
     return _centred(mass, _round(jnp.zeros_like(h), h * h / 12.0))
 
 
-def plate(mass: ScalarLike, size: Float[Array, "2"] | object) -> MassProperties:
+def plate(mass: ScalarLike, size: Float[ArrayLike, "2"] | Numbers) -> MassProperties:
     """A rectangular plate in the x–y plane without thickness. `𝔖 = m diag(a², b², 0)/12`.
 
     **Arguments:** `mass` kg; `size` (2,) edge lengths along x, y, m. **Raises:** `ValueError` for

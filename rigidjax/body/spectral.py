@@ -35,15 +35,22 @@ def matrix_function(function: Callable[[Scalar], Scalar], tensor: Mat3Like) -> M
     Array([2., 0., 0.], dtype=float64)
     """
     a = _checks.floating(tensor, (3, 3), "tensor")
-    a = 0.5 * (a + a.T)
+    # In units of the largest entry (a power of two), so that no product leaves the dtype's range.
+    _, exponent = jnp.frexp(jax.lax.stop_gradient(jnp.max(jnp.abs(a))))
+    unit = jnp.ldexp(jnp.ones((), a.dtype), exponent)
+    a = 0.5 * (a + a.T) / unit
     values, _ = eigensystem(a)
+
+    def scaled(value):
+        return function(unit * value)
+
     x, y, z = values[0], values[1], values[2]
     size = jnp.maximum(jnp.abs(x), jnp.abs(z))
-    first = _first(function, x, y, size)
-    second = _second(function, x, y, z, size)
+    first = _first(scaled, x, y, size)
+    second = _second(scaled, x, y, z, size)
     eye = jnp.eye(3, dtype=a.dtype)
     low, middle = a - x * eye, a - y * eye
-    return function(x) * eye + first * low + second * product(low, middle)
+    return scaled(x) * eye + first * low + second * product(low, middle)
 
 
 def _first(f, x, y, size):

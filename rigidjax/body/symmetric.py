@@ -8,20 +8,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from rigidjax import _checks
-from rigidjax._types import Mat3, Mat3Like, Vec3, Vec3Like
-
-
-def apply(tensor: Mat3Like, vector: Vec3Like) -> Vec3:
-    """The product `A v` of a 3×3 matrix and a vector.
-
-    **Arguments:** `tensor` (3, 3), `vector` (3,), any units, the same frame.
-    **Returns** (3,). **Raises** `ValueError`, `TypeError` for a wrong shape or dtype.
-
-    >>> apply(jnp.diag(jnp.array([1.0, 2.0, 3.0])), jnp.array([1.0, 1.0, 1.0]))
-    Array([1., 2., 3.], dtype=float64)
-    """
-    a, v = _checks.floating(tensor, (3, 3), "tensor"), _checks.floating(vector, (3,), "vector")
-    return jnp.stack([a[i, 0] * v[0] + a[i, 1] * v[1] + a[i, 2] * v[2] for i in range(3)])
+from rigidjax._types import Mat3, Mat3Like, Scalar, Vec3, Vec3Like
+from rigidjax.rotation.algebra import apply as apply, product as product
 
 
 def inverse(tensor: Mat3Like) -> Mat3:
@@ -37,17 +25,8 @@ def inverse(tensor: Mat3Like) -> Mat3:
     >>> inverse(jnp.diag(jnp.array([1.0, 2.0, 4.0])))[2, 2]
     Array(0.25, dtype=float64)
     """
-    a = _checks.floating(tensor, (3, 3), "tensor")
-    scale = a[0, 0] + a[1, 1] + a[2, 2]
-    a = a / scale
-    c00 = a[1, 1] * a[2, 2] - a[1, 2] * a[2, 1]
-    c01 = a[1, 2] * a[2, 0] - a[1, 0] * a[2, 2]
-    c02 = a[1, 0] * a[2, 1] - a[1, 1] * a[2, 0]
-    c11 = a[0, 0] * a[2, 2] - a[0, 2] * a[2, 0]
-    c12 = a[0, 1] * a[2, 0] - a[0, 0] * a[2, 1]
-    c22 = a[0, 0] * a[1, 1] - a[0, 1] * a[1, 0]
-    determinant = a[0, 0] * c00 + a[0, 1] * c01 + a[0, 2] * c02
-    return from_components(c00, c11, c22, c01, c02, c12) / determinant / scale
+    relative, scale = _relative_inverse(_checks.floating(tensor, (3, 3), "tensor"))
+    return relative / scale
 
 
 def solve(tensor: Mat3Like, vector: Vec3Like) -> Vec3:
@@ -61,7 +40,23 @@ def solve(tensor: Mat3Like, vector: Vec3Like) -> Vec3:
     >>> solve(jnp.diag(jnp.array([1.0, 2.0, 4.0])), jnp.array([1.0, 1.0, 1.0]))
     Array([1.  , 0.5 , 0.25], dtype=float64)
     """
-    return apply(inverse(tensor), vector)
+    relative, scale = _relative_inverse(_checks.floating(tensor, (3, 3), "tensor"))
+    # v/scale first: 1/1e37 has only half its digits in float32.
+    return apply(relative, _checks.floating(vector, (3,), "vector") / scale)
+
+
+def _relative_inverse(a: Mat3) -> tuple[Mat3, Scalar]:
+    """The inverse of a divided by its trace, and the trace."""
+    scale = a[0, 0] + a[1, 1] + a[2, 2]
+    a = a / scale
+    c00 = a[1, 1] * a[2, 2] - a[1, 2] * a[2, 1]
+    c01 = a[1, 2] * a[2, 0] - a[1, 0] * a[2, 2]
+    c02 = a[1, 0] * a[2, 1] - a[1, 1] * a[2, 0]
+    c11 = a[0, 0] * a[2, 2] - a[0, 2] * a[2, 0]
+    c12 = a[0, 1] * a[2, 0] - a[0, 0] * a[2, 1]
+    c22 = a[0, 0] * a[1, 1] - a[0, 1] * a[1, 0]
+    determinant = a[0, 0] * c00 + a[0, 1] * c01 + a[0, 2] * c02
+    return from_components(c00, c11, c22, c01, c02, c12) / determinant, scale
 
 
 def from_components(
@@ -79,11 +74,6 @@ def from_components(
 def outer(a: Float[Array, "3"], b: Float[Array, "3"]) -> Mat3:
     """The matrix `a bᵀ`."""
     return a[:, None] * b[None, :]
-
-
-def product(a: Mat3, b: Mat3) -> Mat3:
-    """The matrix product `a b`, by multiplication and addition."""
-    return a[:, 0:1] * b[0:1, :] + a[:, 1:2] * b[1:2, :] + a[:, 2:3] * b[2:3, :]
 
 
 def swap_trace(a: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3 3"]:

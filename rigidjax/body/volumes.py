@@ -6,10 +6,11 @@
 import jax.numpy as jnp
 
 from rigidjax import _checks
-from rigidjax._types import Scalar, ScalarLike, Vec3Like
+from rigidjax._types import Scalar, ScalarLike
+from rigidjax.body.hints import Vector
 
 
-def box(size: Vec3Like) -> Scalar:
+def box(size: Vector) -> Scalar:
     """Volume of a box, m³. **Arguments:** `size` (3,) full edge lengths, m.
 
     >>> box([1.0, 2.0, 3.0])
@@ -19,7 +20,7 @@ def box(size: Vec3Like) -> Scalar:
     return a[0] * a[1] * a[2]
 
 
-def ellipsoid(semi_axes: Vec3Like) -> Scalar:
+def ellipsoid(semi_axes: Vector) -> Scalar:
     """Volume of an ellipsoid, m³, `4π abc/3`. **Arguments:** `semi_axes` (3,) m.
 
     >>> round(float(ellipsoid([1.0, 1.0, 0.75])), 12)
