@@ -9,6 +9,11 @@ from rigidjax import (
     identify as identify,
     plot as plot,
 )
+from rigidjax._types import (
+    HasAttitude as HasAttitude,
+    HasPose as HasPose,
+    HasSpin as HasSpin,
+)
 from rigidjax.body import (
     Inertia as Inertia,
     MassProperties as MassProperties,
@@ -26,7 +31,7 @@ from rigidjax.motion import (
     Spin as Spin,
     torques as torques,
 )
-from rigidjax.rotation import quaternion as quaternion, so3 as so3
+from rigidjax.rotation import euler as euler, quaternion as quaternion, so3 as so3
 from rigidjax.solve import (
     Projected as Projected,
     Solution as Solution,

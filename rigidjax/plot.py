@@ -41,7 +41,7 @@ def fit(found: Any, *, time_unit: str = "s", rate_unit: str = "rad/s", title: st
     )
     for column, (reading, errors) in enumerate(zip(record.readings, found.residuals, strict=True)):
         upper, lower = axes[:, column]
-        seen = np.asarray(reading.mask)
+        seen = reading.seen
         if reading.sensor.reading_shape == (4,):
             assert isinstance(motion, Attitude)
             read, line = _long_axis(reading.values), _long_axis(motion.q)

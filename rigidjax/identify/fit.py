@@ -78,7 +78,7 @@ class Fit(eqx.Module):
         """Root mean square length of each sensor's error, in its unit."""
         out = []
         for errors, reading in zip(self.residuals, self.problem.recording.readings, strict=True):
-            lengths = np.sum(np.asarray(errors) ** 2, axis=1)[np.asarray(reading.mask)]
+            lengths = np.sum(np.asarray(errors) ** 2, axis=1)[reading.seen]
             out.append(float(np.sqrt(lengths.mean())))
         return tuple(out)
 

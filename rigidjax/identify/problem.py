@@ -95,7 +95,7 @@ class Problem(eqx.Module):
 def _typical_rate(recording: Recording) -> float:
     for reading in recording.readings:
         if isinstance(reading.sensor, Gyro):
-            values = np.asarray(reading.values)[np.asarray(reading.mask)]
+            values = np.asarray(reading.values)[reading.seen]
             rate = float(np.sqrt(np.mean(np.sum(values**2, axis=1))))
             break
     else:
@@ -106,7 +106,7 @@ def _typical_rate(recording: Recording) -> float:
 def _first_attitude(recording: Recording) -> Quat | None:
     for reading in recording.readings:
         if isinstance(reading.sensor, AttitudeSensor):
-            return reading.values[int(np.argmax(np.asarray(reading.mask)))]
+            return reading.values[int(np.argmax(reading.seen))]
         if reading.sensor.feels is HasAttitude:
             return jnp.array([1.0, 0.0, 0.0, 0.0])
     return None
@@ -116,7 +116,7 @@ def attitude_rate(recording: Recording) -> np.ndarray:
     """A first body rate (3,), rad/s, from the first two attitudes; zero where there are none."""
     for reading in recording.readings:
         if isinstance(reading.sensor, AttitudeSensor):
-            seen = np.flatnonzero(np.asarray(reading.mask))[:2]
+            seen = np.flatnonzero(reading.seen)[:2]
             if seen.size == 2:
                 first, second = reading.values[seen[0]], reading.values[seen[1]]
                 turn = quaternion.log(quaternion.multiply(quaternion.conjugate(first), second))

@@ -17,6 +17,11 @@ class Reading(eqx.Module):
     values: Float[Array, "times ..."]
     mask: Bool[Array, " times"]
 
+    @property
+    def seen(self) -> np.ndarray:
+        """The mask as a NumPy array, for what happens outside `jit`."""
+        return np.asarray(self.mask)
+
 
 class Recording(eqx.Module):
     """Times and readings of one motion.
@@ -49,6 +54,11 @@ class Recording(eqx.Module):
             raise ValueError("Recording: wanted at least one pair (sensor, values)")
         self.t = jnp.asarray(t)
         self.readings = tuple(_reading(t, *reading) for reading in readings)
+
+    @property
+    def size(self) -> int:
+        """How many numbers were read, three for each reading."""
+        return sum(3 * int(reading.seen.sum()) for reading in self.readings)
 
 
 def _reading(t: np.ndarray, sensor: AbstractSensor, values: Any, mask: Any = None) -> Reading:

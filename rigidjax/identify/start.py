@@ -46,7 +46,7 @@ def regress_inertia(recording: Recording) -> Inertia | None:
     gyro = [r for r in recording.readings if isinstance(r.sensor, Gyro)]
     if not gyro:
         return None
-    seen = np.asarray(gyro[0].mask)
+    seen = gyro[0].seen
     t, w = np.asarray(recording.t)[seen], np.asarray(gyro[0].values)[seen]
     if t.size < 10 or np.median(np.diff(t)) * np.linalg.norm(w, axis=1).max() > 0.5:
         return None
@@ -72,5 +72,5 @@ def regress_inertia(recording: Recording) -> Inertia | None:
 def _first_rate(recording: Recording) -> np.ndarray:
     for reading in recording.readings:
         if isinstance(reading.sensor, Gyro):
-            return np.asarray(reading.values[int(np.argmax(np.asarray(reading.mask)))])
+            return np.asarray(reading.values[int(np.argmax(reading.seen))])
     return attitude_rate(recording)

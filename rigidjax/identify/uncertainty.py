@@ -25,7 +25,7 @@ def _linearised(problem: Problem, parameters: Parameters, noise: tuple) -> tuple
 
     def whitened(vector: Array) -> Array:
         errors = problem.errors(restore(vector))
-        return jnp.concatenate([e / s for e, s in zip(errors, noise, strict=True)])
+        return jnp.concatenate([e / s[None] for e, s in zip(errors, noise, strict=True)])
 
     errors, jacobian = whitened(flat), jax.jacfwd(whitened)(flat)
     root = jnp.sqrt(jax.vmap(lambda e: weight(problem.loss, e))(errors))
@@ -63,7 +63,7 @@ def estimate_noise(
     The number of free parameters is taken off the number of errors.
     """
     free = ravel_pytree(parameters)[0].size
-    total = sum(3 * int(np.sum(r.mask)) for r in problem.recording.readings)
+    total = problem.recording.size
     out = []
     for reading, error, sigma in zip(problem.recording.readings, errors, noise, strict=True):
         if reading.sensor.noise is not None:
@@ -72,7 +72,7 @@ def estimate_noise(
         weights = np.asarray(jax.vmap(lambda e, s=sigma: weight(problem.loss, e / s))(error))
         squares = weights * np.sum(np.asarray(error) ** 2, axis=1)
         share = max(1.0 - free / total, 0.1)
-        variance = squares[np.asarray(reading.mask)].sum() / (3 * np.sum(reading.mask) * share)
+        variance = squares[reading.seen].sum() / (3 * reading.seen.sum() * share)
         # Data without noise must not divide by zero: round-off is the least that is believed.
         floor = 1e-15 * float(jnp.abs(reading.values).max() + 1e-300)
         out.append(jnp.full(3, max(float(np.sqrt(variance)), floor)))
@@ -91,7 +91,7 @@ def goodness(
     free = ravel_pytree(parameters)[0].size
     chi2, count, believable = 0.0, 0, True
     for reading, error, sigma in zip(problem.recording.readings, errors, noise, strict=True):
-        mask = np.asarray(reading.mask)
+        mask = reading.seen
         whitened = np.asarray(error)[mask] / np.asarray(sigma)
         if reading.sensor.noise is None:
             values = np.asarray(reading.values)[mask]
@@ -157,7 +157,7 @@ def quantile(fit: "Fit", level: float) -> float:
     sensors = [reading.sensor for reading in fit.problem.recording.readings]
     if all(sensor.noise is not None for sensor in sensors):
         return float(ndtri(tail))
-    count = sum(3 * int(np.sum(r.mask)) for r in fit.problem.recording.readings)
+    count = fit.problem.recording.size
     return float(stdtrit(max(count - fit.covariance.shape[0], 1), tail))
 
 

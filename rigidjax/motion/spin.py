@@ -7,7 +7,7 @@ from rigidjax import _checks
 from rigidjax._types import HasSpin, Mat3, ScalarLike, Vec3
 from rigidjax.body import inertia as _inertia
 from rigidjax.motion.torques import Torque, evaluate
-from rigidjax.rotation import so3
+from rigidjax.rotation import algebra
 
 
 class Spin(eqx.Module):
@@ -58,7 +58,7 @@ class EulerEquations(eqx.Module):
     def rate_of(self, t: ScalarLike, state: HasSpin) -> Vec3:
         """dΩ/dt (3,), rad/s², body frame, of any state that has a spin."""
         momentum = _inertia.apply(self.inertia.tensor, state.omega)
-        turning = so3.cross(momentum, state.omega)
+        turning = algebra.cross(momentum, state.omega)
         if self.torque is not None:
             turning = turning + evaluate(self.torque, t, state, self.inertia)
         return _inertia.apply(self.inverse, turning)

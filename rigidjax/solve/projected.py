@@ -65,6 +65,19 @@ class Projected(dfx.AbstractWrappedSolver):
     def term_compatible_contr_kwargs(self) -> Any:  # pyright: ignore
         return self.solver.term_compatible_contr_kwargs
 
+    # Adjoints set the one, controllers the other, on whatever is a Runge–Kutta or implicit method.
+    @property
+    def scan_kind(self) -> Any:
+        return self.solver.scan_kind  # pyright: ignore[reportAttributeAccessIssue]
+
+    @property
+    def root_finder(self) -> Any:
+        return self.solver.root_finder  # pyright: ignore[reportAttributeAccessIssue]
+
+    @property
+    def root_find_max_steps(self) -> Any:
+        return self.solver.root_find_max_steps  # pyright: ignore[reportAttributeAccessIssue]
+
     def order(self, terms: Any) -> int | None:
         return self.solver.order(terms)
 

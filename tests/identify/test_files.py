@@ -1,0 +1,92 @@
+"""What a user reads when a log is wrong: one line with file, line and column, exit code 2."""
+
+import numpy as np
+import pytest
+
+import rigidjax as rj
+from rigidjax.__main__ import main
+
+GOOD = "t,wx,wy,wz\n" + "\n".join(
+    f"{0.1 * k:.1f},{np.cos(k):.6f},{np.sin(k):.6f},1.0" for k in range(12)
+)
+
+
+def _swap(line, text):
+    lines = GOOD.splitlines()
+    lines[line - 1] = text
+    return "\n".join(lines)
+
+
+WRONG = {
+    "no column": (GOOD.replace("wy", "gyro_y"), "line 1: no column 'wy'; the columns are t, wx, gyro_y, wz"),
+    "nan": (_swap(4, "0.2,nan,1,1"), "line 4: column 'wx': nan is not a finite number"),
+    "text": (_swap(5, "0.3,1,fast,1"), "line 5: column 'wy': 'fast' is not a number"),
+    "empty cell": (_swap(5, "0.3,1,,1"), "line 5: column 'wy': '' is not a number"),
+    "short line": (_swap(6, "0.4,1"), "line 6: column 'wy': the line ends before it"),
+    "time stands": (_swap(6, "0.3,1,1,1"), "line 6: column 't': time 0.3 is not above the 0.3"),
+    "empty": ("", "line 1: wanted a header"),
+    "too short": ("t,wx,wy,wz\n0,1,1,1\n1,1,1,1\n", "wanted at least 4 samples, got 2"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_a_bad_log_gets_one_clear_line(case, tmp_path, capsys):
+    text, words = WRONG[case]
+    path = tmp_path / "log.csv"
+    path.write_text(text)
+    assert main(["identify", str(path)]) == 2
+    out = capsys.readouterr()
+    assert out.out == ""
+    assert out.err.startswith(f"error: {path}: {words}")
+    assert out.err.count("\n") == 1
+
+
+def test_a_missing_file_or_a_folder(tmp_path, capsys):
+    assert main(["identify", str(tmp_path / "none.csv")]) == 2
+    assert capsys.readouterr().err == f"error: {tmp_path / 'none.csv'}: no such file\n"
+    assert main(["identify", str(tmp_path)]) == 2
+    assert "is a folder" in capsys.readouterr().err
+
+
+def test_units_columns_blank_lines_and_byte_order_mark(tmp_path):
+    path = tmp_path / "log.csv"
+    path.write_text("\ufeffextra,time,p,q,r\n" + "\n\n".join(f"x,{k},1,{10 * k},0" for k in range(5)))
+    record = rj.identify.read_gyro_csv(path, columns=("time", "p", "q", "r"), unit="deg/s", noise=2.0)
+    np.testing.assert_allclose(record.readings[0].values[3], np.radians([1, 30, 0]), rtol=1e-15)
+    np.testing.assert_allclose(record.readings[0].sensor.noise, np.radians(2.0), rtol=1e-15)
+    with pytest.raises(rj.identify.LogError, match="wanted one of rad/s, deg/s, got 'rpm'"):
+        rj.identify.read_gyro_csv(path, unit="rpm")
+
+
+def test_a_good_log_prints_ratios_with_intervals(tmp_path, capsys):
+    ts = np.linspace(0.0, 8.0, 120)
+    motion = rj.simulate(rj.Inertia.from_principal(1.0, 1.7, 2.2), rj.Spin([0.3, 2.0, 0.2]), ts).ys
+    noisy = np.asarray(motion.omega) + 0.01 * np.random.default_rng(0).normal(size=(120, 3))
+    path = tmp_path / "log.csv"
+    np.savetxt(
+        path, np.column_stack([ts, noisy]), delimiter=",", header="t,wx,wy,wz", comments=""
+    )
+    figure = tmp_path / "fit.png"
+    assert main(["identify", str(path), "--starts", "3", "--figure", str(figure)]) == 0
+    out = capsys.readouterr().out
+    for name, truth in (("I1/I3", 1.0 / 2.2), ("I2/I3", 1.7 / 2.2)):
+        line = next(line for line in out.splitlines() if line.startswith(name))
+        low, high = (float(x) for x in line.split()[2:5:2])
+        assert low < truth < high
+        assert high - low < 0.05
+    assert "status: ok" in out
+    assert "cannot show the absolute inertia" in out
+    assert figure.stat().st_size > 10_000
+
+
+def test_help_version_and_no_arguments(capsys):
+    assert main([]) == 0
+    assert "identify --demo" in capsys.readouterr().out
+    with pytest.raises(SystemExit) as ended:
+        main(["--version"])
+    assert ended.value.code == 0
+    assert capsys.readouterr().out == f"rigidjax {rj.__version__}\n"
+    with pytest.raises(SystemExit) as ended:
+        main(["identify"])
+    assert ended.value.code == 2
+    assert "either a LOG.csv or --demo" in capsys.readouterr().err

@@ -1,0 +1,160 @@
+"""Fits: exact data come back exactly, intervals cover, masks mask, mistakes are named."""
+
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import rigidjax as rj
+
+BRICK = Path(__file__).parents[3] / "shared" / "data" / "nesc_brick" / "tumbling_brick.csv"
+MOMENTS = np.array([1.0, 1.6, 2.1])
+TURN = rj.quaternion.exp(jnp.array([0.3, -0.5, 0.2]))
+
+
+@pytest.fixture(scope="module")
+def tumble():
+    body = rj.Inertia.from_principal(*MOMENTS).rotated(TURN)
+    ts = jnp.linspace(0.0, 12.0, 80)
+    return body, ts, rj.simulate(body, rj.Attitude([1.0, 0, 0, 0], [0.4, 1.2, -0.3]), ts).ys
+
+
+@pytest.mark.skipif(not BRICK.exists(), reason="NASA's check case is not beside this checkout")
+def test_nasa_brick_returns_its_ratios():
+    # NASA/TM-2015-218675, case 2: I = (0.00189422, 0.006211019, 0.007194665) slug ft².
+    record = rj.identify.read_gyro_csv(
+        BRICK, columns=("t", "p_deg_s", "q_deg_s", "r_deg_s"), unit="deg/s"
+    )
+    found = rj.identify.fit(
+        rj.identify.Problem(record, rj.identify.Ratios()), starts=2, tolerance=1e-13
+    )
+    assert found.ok
+    moments = np.asarray(found.body.moments)
+    np.testing.assert_allclose(
+        moments[:2] / moments[2], [0.2632811952, 0.8632811952], rtol=1e-9, atol=0
+    )
+
+
+def test_full_tensor_comes_back_from_exact_rates(tumble):
+    body, ts, ys = tumble
+    record = rj.identify.Recording(ts, (rj.identify.Gyro(1e-3), ys.omega))
+    found = rj.identify.fit(rj.identify.Problem(record, rj.identify.Ratios()), starts=2)
+    assert found.ok
+    scaled = np.asarray(found.body.tensor) / np.trace(found.body.tensor) * np.trace(body.tensor)
+    np.testing.assert_allclose(scaled, body.tensor, atol=1e-7)
+    np.testing.assert_allclose(found.state0.omega, ys.omega[0], atol=1e-7)
+
+
+def test_a_masked_reading_is_an_absent_one(tumble):
+    _, ts, ys = tumble
+    noisy = np.asarray(ys.omega) + 0.01 * np.random.default_rng(1).normal(size=(80, 3))
+    mask = np.ones(80, bool)
+    mask[[3, 40, 41]] = False
+    results = []
+    for filler in (np.nan, 1e6):
+        values = np.where(mask[:, None], noisy, filler)
+        record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), values, mask))
+        problem = rj.identify.Problem(record, rj.identify.Ratios())
+        results.append(rj.identify.fit(problem, starts=1))
+    for a, b in zip(
+        jax.tree.leaves(results[0].parameters), jax.tree.leaves(results[1].parameters), strict=True
+    ):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_estimated_noise_is_the_noise(tumble):
+    _, ts, ys = tumble
+    rng = np.random.default_rng(2)
+    readings = []
+    gyro = np.asarray(ys.omega) + 0.02 * rng.normal(size=(80, 3))
+    turns = jnp.asarray(0.05 * rng.normal(size=(80, 3)))
+    attitude = jax.vmap(lambda q, e: rj.quaternion.multiply(q, rj.quaternion.exp(e)))(ys.q, turns)
+    readings = [(rj.identify.Gyro(), gyro), (rj.identify.AttitudeSensor(), -attitude)]
+    record = rj.identify.Recording(ts, *readings)
+    problem = rj.identify.Problem(record, rj.identify.Ratios(), loss=rj.identify.SoftL1())
+    found = rj.identify.fit(problem, starts=2)
+    assert found.ok
+    # 80 × 3 readings: the estimate has a standard error of 5 %; a tenth of that is the loss's.
+    np.testing.assert_allclose(found.noise[0], 0.02, rtol=0.2)
+    np.testing.assert_allclose(found.noise[1], 0.05, rtol=0.2)
+
+
+def test_a_wrong_motion_is_not_called_success(tumble):
+    _, ts, ys = tumble
+    rng = np.random.default_rng(3)
+    record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), rng.normal(size=(80, 3))))
+    found = rj.identify.fit(rj.identify.Problem(record, rj.identify.Ratios()), starts=2)
+    assert found.status.startswith("poor fit")
+    record = rj.identify.Recording(ts, (rj.identify.Gyro(), rng.normal(size=(80, 3))))
+    found = rj.identify.fit(rj.identify.Problem(record, rj.identify.Ratios()), starts=2)
+    assert found.status.startswith("poor fit")
+
+
+def test_a_fit_that_stops_early_says_so_and_keeps_its_best(tumble):
+    _, ts, ys = tumble
+    record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), ys.omega))
+    problem = rj.identify.Problem(record, rj.identify.PrincipalRatios())
+    stopped = rj.identify.fit(problem, starts=1, max_steps=1)
+    assert not stopped.ok
+    assert np.isfinite(stopped.body.tensor).all()
+
+
+def test_interrupting_keeps_what_was_found(tumble):
+    _, ts, ys = tumble
+    record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), ys.omega))
+
+    def stop(line):
+        raise KeyboardInterrupt
+
+    found = rj.identify.fit(
+        rj.identify.Problem(record, rj.identify.Ratios()), starts=4, progress=stop
+    )
+    assert len(found.starts) == 1
+
+
+def test_what_cannot_be_seen_is_said(tumble):
+    # Spin about a principal axis: rates alone show nothing of the shape.
+    body = rj.Inertia.from_principal(*MOMENTS)
+    ts = jnp.linspace(0.0, 5.0, 30)
+    ys = rj.simulate(body, rj.Spin([0.0, 0.0, 1.0]), ts).ys
+    noisy = np.asarray(ys.omega) + 0.01 * np.random.default_rng(4).normal(size=(30, 3))
+    record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), noisy))
+    found = rj.identify.fit(rj.identify.Problem(record, rj.identify.PrincipalRatios()), starts=3)
+    words = " ".join(found.identifiability)
+    assert "is not determined by these data" in words
+    assert "cannot show the absolute inertia" in words
+
+
+MISTAKES = [
+    (([0.0, 1.0], (rj.identify.Gyro(), [[1.0, 0, 0]])), r"Gyro: wanted readings of shape \(2, 3\), got \(1, 3\)"),
+    (([0.0, 1.0], (rj.identify.Gyro(), [[1.0, 0, 0], [np.nan, 0, 0]])), "Gyro: the reading at index 1 contains NaN; mask it"),
+    (([0.0, 1.0], (rj.identify.AttitudeSensor(), [[1.0, 0, 0, 0], [2.0, 0, 0, 0]])), "quaternion at index 1 is not unit.*scalar first"),
+    (([1.0, 0.0], (rj.identify.Gyro(), np.zeros((2, 3)))), r"t\[1\] is not above"),
+    (([0.0, np.nan], (rj.identify.Gyro(), np.zeros((2, 3)))), "t: contains NaN at index 1"),
+    (([0.0, 1.0],), "at least one pair"),
+    (([0.0, 1.0], (rj.identify.Gyro(), np.zeros((2, 3)), [True])), r"mask of shape \(2,\), got \(1,\)"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("arguments", "words"), MISTAKES)
+@pytest.mark.usefixtures("unhooked")
+def test_mistakes_in_a_recording_are_named(arguments, words):
+    with pytest.raises(ValueError, match=words):
+        rj.identify.Recording(*arguments)
+
+
+@pytest.mark.usefixtures("unhooked")
+def test_other_mistakes_are_named(tumble):
+    _, ts, ys = tumble
+    record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), ys.omega))
+    problem = rj.identify.Problem(record, rj.identify.Ratios())
+    with pytest.raises(ValueError, match="at least one start, got 0"):
+        rj.identify.fit(problem, starts=0)
+    with pytest.raises(ValueError, match="positive standard deviation"):
+        rj.identify.Gyro(noise=-1.0)
+    with pytest.raises(ValueError, match=r"one number or three, got shape \(2,\)"):
+        rj.identify.Gyro(noise=[1.0, 2.0])
+    with pytest.raises(ValueError, match=r"level between 0 and 1, got 95"):
+        rj.identify.fit(problem, starts=1).interval(95)

@@ -1,0 +1,63 @@
+"""The main job on real observations: 4179 Toutatis, and its intervals on simulated records."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import rigidjax as rj
+from rigidjax.identify import toutatis
+
+
+@pytest.fixture(scope="module")
+def found():
+    return rj.identify.fit(toutatis.problem(), starts=8)
+
+
+def test_fit_is_as_close_as_the_published_one(found):
+    assert found.ok
+    assert toutatis.rms_degrees(found) <= 8.0
+
+
+def test_periods_and_pole_are_the_published_ones(found):
+    rows = {name: (value, low, high) for name, value, low, high, _ in toutatis.rows(found)}
+    # Hudson and Ostro 1995: 5.41 days about the long axis, 7.35 days of precession.
+    assert abs(rows["rotation about the long axis"][0] - 5.41) < 0.05
+    assert abs(rows["precession of the long axis"][0] - 7.35) < 0.05
+    # Takahashi et al. 2013: ratios 3.0836 and 3.235 about the long axis, up to their definition.
+    bounds = found.interval(0.95)
+    assert bounds["Ix/Iz"][0] < 3.0836 < bounds["Ix/Iz"][1]
+    assert bounds["Iy/Iz"][0] < 3.235 < bounds["Iy/Iz"][1]
+
+
+def test_every_start_that_reports_success_agrees(found):
+    good = [s for s in found.starts if s.converged and s.fits]
+    assert len(good) >= 3
+    for start in good:
+        for a, b in zip(
+            jax.tree.leaves(start.parameters), jax.tree.leaves(found.parameters), strict=True
+        ):
+            np.testing.assert_allclose(a, b, atol=1e-4)
+
+
+def test_one_outlying_observation_does_not_move_the_result(found):
+    problem = toutatis.problem()
+    attitudes = problem.recording.readings[0]
+    spoiled = attitudes.values.at[8].set(
+        rj.quaternion.multiply(attitudes.values[8], rj.quaternion.exp(jnp.array([2.0, 1.0, -1.5])))
+    )
+    recording = rj.identify.Recording(
+        problem.recording.t,
+        (attitudes.sensor, spoiled),
+        (problem.recording.readings[1].sensor, problem.recording.readings[1].values),
+    )
+    moved = rj.identify.fit(
+        rj.identify.Problem(recording, problem.body, loss=problem.loss),
+        starts=1,
+        initial=found.parameters,
+    )
+    middle = np.exp(np.asarray(found.problem.body.log_ratios(found.body)))
+    shifted = np.exp(np.asarray(moved.problem.body.log_ratios(moved.body)))
+    for name, a, b in zip(found.problem.body.ratio_names, middle, shifted, strict=True):
+        low, high = found.interval(0.95)[name]
+        assert abs(a - b) < 0.25 * (high - low) / 2

@@ -1,0 +1,89 @@
+"""The free body in mpmath: Taylor series of Π' = Π × KΠ, q' = ½ q ⊗ KΠ, to any number of digits."""
+
+import functools
+
+import mpmath as mp
+
+
+def attitude_and_rate(inertia, q0, omega0, t, *, digits=34, order=32, longest=0.1):
+    """Quaternion (4) and body rate (3) at time t, as lists of mpf.
+
+    `inertia` 3×3 nested list, `q0` (w, x, y, z) of any length (it is scaled to one), `omega0`.
+    """
+    with mp.workdps(digits):
+        tensor = mp.matrix(inertia)
+        inverse = tensor**-1
+        length = mp.sqrt(sum(mp.mpf(c) ** 2 for c in q0))
+        q = [mp.mpf(c) / length for c in q0]
+        momentum = list(tensor * mp.matrix(omega0))
+        steps = max(1, int(mp.ceil(mp.mpf(t) / longest)))
+        h = mp.mpf(t) / steps
+        for _ in range(steps):
+            q, momentum = _step(q, momentum, inverse, h, order)
+        return q, list(inverse * mp.matrix(momentum))
+
+
+def _step(q, momentum, inverse, h, order):
+    qs, ps, ws = [q], [momentum], []
+    for k in range(order):
+        ws.append(list(inverse * mp.matrix(ps[k])))
+        turn, flow = [mp.mpf(0)] * 3, [mp.mpf(0)] * 4
+        for j in range(k + 1):
+            turn = [a + b for a, b in zip(turn, _cross(ps[j], ws[k - j]), strict=True)]
+            flow = [a + b for a, b in zip(flow, _times(qs[j], ws[k - j]), strict=True)]
+        ps.append([c / (k + 1) for c in turn])
+        qs.append([c / (2 * (k + 1)) for c in flow])
+    return [_horner(qs, i, h) for i in range(4)], [_horner(ps, i, h) for i in range(3)]
+
+
+def _horner(series, i, h):
+    total = mp.mpf(0)
+    for term in reversed(series):
+        total = total * h + term[i]
+    return total
+
+
+def _cross(a, b):
+    return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+
+
+def _times(q, w):
+    """q ⊗ (0, w)."""
+    a, x, y, z = q
+    return [
+        -x * w[0] - y * w[1] - z * w[2],
+        a * w[0] + y * w[2] - z * w[1],
+        a * w[1] + z * w[0] - x * w[2],
+        a * w[2] + x * w[1] - y * w[0],
+    ]
+
+
+@functools.cache
+def jacobian(inertia, q0, omega0, t, *, step="1e-10"):
+    """d(q, Ω)/d(Ixx, Iyy, Izz, Ixy, Ixz, Iyz, Ωx, Ωy, Ωz, w, x, y, z): 7 × 13, by differences.
+
+    Hashable arguments: nested tuples.
+    """
+    with mp.workdps(34):
+        places = [(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)]
+
+        def run(index, change):
+            tensor = [[mp.mpf(c) for c in row] for row in inertia]
+            rate, q = [mp.mpf(c) for c in omega0], [mp.mpf(c) for c in q0]
+            if index < 6:
+                i, j = places[index]
+                tensor[i][j] += change
+                tensor[j][i] = tensor[i][j]
+            elif index < 9:
+                rate[index - 6] += change
+            else:
+                q[index - 9] += change
+            q, rate = attitude_and_rate(tensor, q, rate, t)
+            return [*q, *rate]
+
+        d = mp.mpf(step)
+        columns = []
+        for index in range(13):
+            up, down = run(index, d), run(index, -d)
+            columns.append([float((a - b) / (2 * d)) for a, b in zip(up, down, strict=True)])
+        return [[columns[c][r] for c in range(13)] for r in range(7)]
