@@ -104,7 +104,6 @@ def test_a_thousand_wild_steps_meet_no_invalid_body(dtype):
     # The same checks that refuse a wrong body: each raises on the first of the 2000.
     real_mass(bodies.mass)
     real_second_moment(bodies.second_moment)
-    jax.vmap(parameters.pack_second_moment)(parameters_of(walk[:, 1:7]))
     shapes = jax.jit(jax.vmap(parameters.unpack_shape))(walk[:, :5])
     real_second_moment(shapes)
     np.testing.assert_allclose(jnp.trace(shapes, axis1=1, axis2=2), 1, rtol=1e-5)
@@ -113,11 +112,6 @@ def test_a_thousand_wild_steps_meet_no_invalid_body(dtype):
     largest = jnp.sort(moments, axis=1)
     slack = 4 * jnp.finfo(dtype).eps * largest[:, 2]
     assert bool((largest[:, 0] + largest[:, 1] - largest[:, 2] >= -slack).all())
-
-
-def parameters_of(v):
-    tame = jnp.clip(v, -1, 1)
-    return jax.vmap(parameters.unpack_second_moment)(tame)
 
 
 @pytest.mark.parametrize("flat", [(1.0, 2.0, 0.0), (0.0, 0.0, 3.0)])
@@ -132,18 +126,20 @@ def test_plates_and_rods_are_approached_to_a_millionth(flat):
     assert 0 <= float(moments[0] + moments[1] - moments[2]) < 1e-6
 
 
-def test_a_fit_by_gradient_reaches_a_plate_from_noisy_moments():
+def test_a_fit_reaches_a_plate_from_noisy_moments():
     """I9: unconstrained, 22 of 40 such fits end outside; in the chart none can."""
     measured = jnp.array([1.0, 1.05, 2.075])
 
     @jax.jit
-    def descend(v):
-        def loss(x):
-            return ((parameters.unpack_moments(x) - measured) ** 2).sum()
+    def fit(v):
+        def step(_, x):
+            residual = parameters.unpack_moments(x) - measured
+            j = jax.jacfwd(parameters.unpack_moments)(x)
+            return x - jnp.linalg.solve(j.T @ j + 1e-7 * jnp.eye(3), j.T @ residual)
 
-        return jax.lax.fori_loop(0, 3000, lambda _, x: x - 0.05 * jax.grad(loss)(x), v)
+        return parameters.unpack_moments(jax.lax.fori_loop(0, 200, step, v))
 
-    moments = parameters.unpack_moments(descend(jnp.zeros(3)))
+    moments = fit(jnp.zeros(3))
     # The nearest plate to the measurement: the excess 0.025 is shared out equally.
     np.testing.assert_allclose(moments, measured + 0.025 / 3 * np.array([1, 1, -1]), atol=1e-4)
     Inertia.from_principal(*moments)

@@ -1,0 +1,48 @@
+"""Ellipsoids of energy and momentum, and the solid one that moves as the body does."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import rigidjax as rj
+from rigidjax.body import shapes
+from rigidjax.body.ellipsoids import energy_ellipsoid, equal_ellipsoid, momentum_ellipsoid
+
+INERTIA = rj.Inertia.from_principal(1.0, 2.0, 2.5).rotated(np.array([0.8, 0.0, 0.6, 0.0]))
+
+
+def surface(semi_axes, q):
+    """Points of the ellipsoid, in body axes."""
+    n = np.random.default_rng(0).normal(size=(50, 3))
+    n /= np.linalg.norm(n, axis=1, keepdims=True)
+    return (n * np.asarray(semi_axes)) @ np.asarray(rj.quaternion.to_matrix(q)).T
+
+
+def test_every_rate_on_it_has_that_energy_or_momentum():
+    rates = jnp.asarray(surface(*energy_ellipsoid(INERTIA, 3.0)))
+    energies = jax.vmap(lambda w: rj.kinetic_energy(INERTIA, w))(rates)
+    np.testing.assert_allclose(energies, 3.0, rtol=1e-13)
+    rates = jnp.asarray(surface(*momentum_ellipsoid(INERTIA, 3.0)))
+    momenta = jax.vmap(lambda w: rj.angular_momentum(INERTIA, w))(rates)
+    np.testing.assert_allclose(np.linalg.norm(momenta, axis=1), 3.0, rtol=1e-13)
+
+
+def test_the_equal_ellipsoid_has_the_same_mass_properties():
+    body = shapes.box(2.0, [1.0, 2.0, 3.0]).rotated(np.array([0.8, 0.0, 0.6, 0.0]))
+    semi_axes, q = equal_ellipsoid(body)
+    again = shapes.ellipsoid(2.0, semi_axes).rotated(q)
+    np.testing.assert_allclose(again.second_moment, body.second_moment, rtol=1e-13, atol=1e-14)
+
+
+def test_a_sphere_carries_derivatives():
+    def axes(a):
+        return energy_ellipsoid(rj.Inertia(a), 2.0)[0]
+
+    gradient = jax.grad(lambda a: axes(a).sum())(jnp.eye(3))
+    np.testing.assert_allclose(gradient, -np.eye(3), atol=1e-14)
+
+
+def test_a_rod_has_none(unhooked):
+    with pytest.raises(ValueError, match="thin rod"):
+        energy_ellipsoid(shapes.rod(1.0, 1.0).inertia, 1.0)
