@@ -1,7 +1,7 @@
 """Differentiable rigid-body and rotating-frame mechanics for JAX.
 
-Floors, from below: `special` (numbers), `rotation` and `body` (what turns), `motion` (how it turns),
-`exact` and `solve` (answers), `identify` and `plot` (uses). `simulate` is the front door.
+Floors, from below: `special` (numbers), `rotation` and `body` (what turns), `motion` (how it
+turns), `exact` and `solve` (answers), `identify` and `plot` (uses). `simulate` is the front door.
 """
 
 from rigidjax import (

@@ -27,7 +27,7 @@ def main(arguments: list[str] | None = None) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m rigidjax",
-        description="Differentiable rigid-body mechanics for JAX: identify inertia from recordings.",
+        description="Differentiable rigid-body mechanics for JAX: identify inertia from data.",
         epilog="Try: python -m rigidjax identify --demo",
     )
     parser.add_argument("--version", action="version", version=f"rigidjax {rj.__version__}")
@@ -67,7 +67,9 @@ def _demo(options: argparse.Namespace) -> int:
     print(f"data: {toutatis.CITATION}\n")
     found = rj.identify.fit(toutatis.problem(), starts=options.starts or 16, progress=_say)
     print()
-    print(rj.identify.report.table(rj.identify.report.rows(found, "deg/day") + toutatis.rows(found)))
+    print(
+        rj.identify.report.table(rj.identify.report.rows(found, "deg/day") + toutatis.rows(found))
+    )
     print(f"\nrms of the attitudes: {toutatis.rms_degrees(found):.1f} deg")
     print(toutatis.remarks(found))
     print(rj.identify.report.verdict(found))

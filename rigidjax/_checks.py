@@ -3,9 +3,9 @@
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 
@@ -24,7 +24,9 @@ def floating(
     try:
         array = jnp.asarray(value)
     except (TypeError, ValueError) as error:
-        raise TypeError(f"{name}: wanted an array of numbers, got {type(value).__name__}") from error
+        raise TypeError(
+            f"{name}: wanted an array of numbers, got {type(value).__name__}"
+        ) from error
     if jnp.issubdtype(array.dtype, jnp.integer):
         array = array.astype(jnp.result_type(float))
     if array.dtype not in (jnp.float32, jnp.float64):
@@ -49,7 +51,7 @@ def refuse(value: Any, bad: Bool[ArrayLike, "..."], message: str) -> Any:
     Outside a trace this is a `ValueError` with the bare text. Inside one it is
     `equinox.error_if`; the result must be used, or the check is dropped.
     """
-    if not isinstance(bad, jax.core.Tracer):
+    if not isinstance(bad, Tracer):
         if bool(np.any(np.asarray(bad))):
             raise ValueError(message)
         return value
@@ -60,6 +62,6 @@ def finite(value: Float[Array, "..."], name: str) -> Float[Array, "..."]:
     """Return `value` unless it holds a NaN or an infinity."""
     bad = ~jnp.isfinite(value)
     where = ""
-    if not isinstance(bad, jax.core.Tracer) and bool(bad.any()):
+    if not isinstance(bad, Tracer) and bool(bad.any()):
         where = f" at index {tuple(int(i) for i in np.argwhere(np.asarray(bad))[0])}"
     return refuse(value, bad.any(), f"{name}: contains NaN or infinity{where}")

@@ -125,7 +125,7 @@ def _levenberg(
     problem: Problem,
     noise: tuple,
     weights: Float[Array, " times"],
-    tolerance: Float[Array, ""],
+    tolerance: Any,
     max_steps: int,
 ) -> tuple[Parameters, Float[Array, ""], Bool[Array, ""]]:
     args = (problem, noise, weights)
@@ -265,6 +265,4 @@ def _assess(
         status = f"ambiguous: {len(rivals)} of {len(starts)} starts fit as well elsewhere"
     else:
         status = "ok"
-    return Fit(
-        problem, value, covariance, noise, tuple(starts), chi2, dof, singular, null, status
-    )
+    return Fit(problem, value, covariance, noise, tuple(starts), chi2, dof, singular, null, status)

@@ -73,7 +73,8 @@ def _reading(t: np.ndarray, sensor: AbstractSensor, values: Any, mask: Any = Non
     bad = mask & ~np.isfinite(values).all(axis=1)
     if bad.any():
         raise ValueError(
-            f"{name}: the reading at index {int(np.argmax(bad))} contains NaN; mask it if it is a gap"
+            f"{name}: the reading at index {int(np.argmax(bad))} contains NaN; mask it if it is "
+            "a gap"
         )
     if isinstance(sensor, AttitudeSensor):
         length = np.linalg.norm(values, axis=1)

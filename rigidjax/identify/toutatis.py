@@ -7,6 +7,7 @@ doi:10.1088/0004-6256/146/4/95; from the radar imaging of R. S. Hudson and S. J.
 """
 
 from datetime import datetime
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -21,7 +22,6 @@ from rigidjax.identify.problem import Problem
 from rigidjax.identify.recording import Recording
 from rigidjax.identify.report import Row
 from rigidjax.identify.sensors import AttitudeSensor, Gyro
-from rigidjax.motion import Attitude
 from rigidjax.rotation import euler
 
 CITATION = "Takahashi, Busch & Scheeres 2013, AJ 146:95, table 3"
@@ -85,12 +85,12 @@ def problem() -> Problem:
 def rows(fit: Fit) -> list[Row]:
     """Periods and the direction of the angular momentum as rows for `report.table`."""
 
-    def periods(body: Inertia, state: Attitude) -> Array:
+    def periods(body: Inertia, state: Any) -> Array:
         turning = exact.body_period(body, state.omega)
         precessing = exact.precession_period(body, state.omega)
         return jnp.log(jnp.stack([turning, precessing]) / DAY)
 
-    def direction(body: Inertia, state: Attitude) -> Array:
+    def direction(body: Inertia, state: Any) -> Array:
         momentum = spatial_angular_momentum(body, state)
         flat = jnp.hypot(momentum[0], momentum[1])
         return jnp.stack([jnp.arctan2(momentum[1], momentum[0]), jnp.arctan2(momentum[2], flat)])
@@ -121,13 +121,14 @@ def remarks(fit: Fit) -> str:
     scatter = rms_degrees(fit) / np.sqrt(3)
     if scatter < 0.5 * ATTITUDE_NOISE_DEG:
         lines.append(
-            f"The attitudes scatter by {scatter:.0f} deg an axis, less than the {ATTITUDE_NOISE_DEG:.0f} "
-            "deg that was published; the intervals keep the published figure."
+            f"The attitudes scatter by {scatter:.0f} deg an axis, less than the "
+            f"{ATTITUDE_NOISE_DEG:.0f} deg that was published; the intervals keep the published "
+            "figure."
         )
     errors = np.linalg.norm(np.degrees(np.asarray(fit.residuals[1])) * DAY, axis=1)
     for index in np.flatnonzero(errors > 3 * RATE_NOISE_DEG_A_DAY):
         lines.append(
-            f"outlier: the rate of {OBSERVATIONS[index][0][:10]} is {errors[index]:.0f} deg/day off "
-            "(it counts linearly, not quadratically)"
+            f"outlier: the rate of {OBSERVATIONS[index][0][:10]} is {errors[index]:.0f} deg/day "
+            "off (it counts linearly, not quadratically)"
         )
     return "\n".join(lines)

@@ -79,9 +79,7 @@ def estimate_noise(
     return tuple(out)
 
 
-def goodness(
-    problem: Problem, parameters: Parameters, noise: tuple
-) -> tuple[float, int, bool]:
+def goodness(problem: Problem, parameters: Parameters, noise: tuple) -> tuple[float, int, bool]:
     """χ² of the sensors with a given noise, its degrees of freedom, and whether to believe the fit.
 
     Believed where χ² is within five standard deviations of its mean and, for a sensor whose noise
@@ -171,7 +169,9 @@ def in_words(fit: "Fit") -> tuple[str, ...]:
         if not np.isfinite(wide) or wide > 1.9:
             out.append(f"{name} is not determined by these data.")
         elif wide > 0.1:
-            out.append(f"{name} is weakly determined: its 95 % interval is {wide:.0%} of its value.")
+            out.append(
+                f"{name} is weakly determined: its 95 % interval is {wide:.0%} of its value."
+            )
         else:
             out.append(f"{name} is well determined, to ±{0.5 * wide:.2g} of its value.")
     rate = np.asarray(fit.state0.omega)

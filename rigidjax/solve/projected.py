@@ -54,11 +54,11 @@ class Projected(dfx.AbstractWrappedSolver):
     solver: dfx.AbstractSolver
 
     @property
-    def term_structure(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def term_structure(self) -> Any:
         return self.solver.term_structure
 
     @property
-    def interpolation_cls(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def interpolation_cls(self) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
         return _Build(self.solver.interpolation_cls)
 
     @property

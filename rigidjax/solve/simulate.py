@@ -9,6 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
 from rigidjax import _checks
@@ -210,7 +211,8 @@ def _tolerances(rtol: float | None, atol: float | None, dtype: Any) -> tuple[flo
     if rtol < floor:
         advice = "" if double else "; set jax.config.update('jax_enable_x64', True) for float64"
         warnings.warn(
-            f"simulate: {np.dtype(dtype).name} cannot reach rtol={rtol:g}; using {floor:.1g}{advice}",
+            f"simulate: {np.dtype(dtype).name} cannot reach rtol={rtol:g}; "
+            f"using {floor:.1g}{advice}",
             stacklevel=3,
         )
         rtol = floor
@@ -227,7 +229,7 @@ def _check_times(ts: Any) -> Array:
     times = _checks.finite(_checks.floating(ts, length, "ts"), "ts")
     falling = times[1:] <= times[:-1]
     where = ""
-    if not isinstance(falling, jax.core.Tracer) and bool(falling.any()):
+    if not isinstance(falling, Tracer) and bool(falling.any()):
         where = f"; ts[{int(np.argmax(np.asarray(falling))) + 1}] is not above the one before"
     return _checks.refuse(times, falling.any(), f"ts: wanted increasing times{where}")
 

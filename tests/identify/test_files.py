@@ -50,8 +50,12 @@ def test_a_missing_file_or_a_folder(tmp_path, capsys):
 
 def test_units_columns_blank_lines_and_byte_order_mark(tmp_path):
     path = tmp_path / "log.csv"
-    path.write_text("\ufeffextra,time,p,q,r\n" + "\n\n".join(f"x,{k},1,{10 * k},0" for k in range(5)))
-    record = rj.identify.read_gyro_csv(path, columns=("time", "p", "q", "r"), unit="deg/s", noise=2.0)
+    path.write_text(
+        "\ufeffextra,time,p,q,r\n" + "\n\n".join(f"x,{k},1,{10 * k},0" for k in range(5))
+    )
+    record = rj.identify.read_gyro_csv(
+        path, columns=("time", "p", "q", "r"), unit="deg/s", noise=2.0
+    )
     np.testing.assert_allclose(record.readings[0].values[3], np.radians([1, 30, 0]), rtol=1e-15)
     np.testing.assert_allclose(record.readings[0].sensor.noise, np.radians(2.0), rtol=1e-15)
     with pytest.raises(rj.identify.LogError, match="wanted one of rad/s, deg/s, got 'rpm'"):
@@ -63,9 +67,7 @@ def test_a_good_log_prints_ratios_with_intervals(tmp_path, capsys):
     motion = rj.simulate(rj.Inertia.from_principal(1.0, 1.7, 2.2), rj.Spin([0.3, 2.0, 0.2]), ts).ys
     noisy = np.asarray(motion.omega) + 0.01 * np.random.default_rng(0).normal(size=(120, 3))
     path = tmp_path / "log.csv"
-    np.savetxt(
-        path, np.column_stack([ts, noisy]), delimiter=",", header="t,wx,wy,wz", comments=""
-    )
+    np.savetxt(path, np.column_stack([ts, noisy]), delimiter=",", header="t,wx,wy,wz", comments="")
     figure = tmp_path / "fit.png"
     assert main(["identify", str(path), "--starts", "3", "--figure", str(figure)]) == 0
     out = capsys.readouterr().out

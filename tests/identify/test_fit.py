@@ -82,7 +82,7 @@ def test_estimated_noise_is_the_noise(tumble):
 
 
 def test_a_wrong_motion_is_not_called_success(tumble):
-    _, ts, ys = tumble
+    _, ts, _ = tumble
     rng = np.random.default_rng(3)
     record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), rng.normal(size=(80, 3))))
     found = rj.identify.fit(rj.identify.Problem(record, rj.identify.Ratios()), starts=2)

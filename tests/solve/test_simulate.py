@@ -6,9 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from systems import free_body_mp
 
 import rigidjax as rj
-from systems import free_body_mp
 
 TENSOR = np.array([[1.0, 0.1, -0.05], [0.1, 1.6, 0.2], [-0.05, 0.2, 2.1]])
 OMEGA = np.array([0.9, -1.1, 0.4])
@@ -254,7 +254,6 @@ def test_values_are_refused_under_jit_too():
         run(jnp.asarray(2 * Q), jnp.array([0.0, 1.0])).block_until_ready()
     with pytest.raises(Exception, match="wanted increasing times"):
         run(jnp.asarray(Q), jnp.array([1.0, 0.0])).block_until_ready()
-
 
 
 def test_implicit_solvers_keep_their_root_finder():
