@@ -4,10 +4,34 @@
 """
 
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Float
 
 from rigidjax import _checks
-from rigidjax._types import Mat3, Mat3Like, Vec3, Vec3Like
+from rigidjax._types import Mat3, Mat3Like, Scalar, Vec3, Vec3Like
+
+
+def components(v: Float[Array, "n"]) -> tuple[Scalar, ...]:
+    """The entries of a vector, as scalars.
+
+    **Arguments:** `v` (n,), n fixed. One `lax.split`, whose transpose is one concatenation:
+    indexing entry by entry makes gradients several times slower on CPU.
+
+    >>> [float(x) for x in components(jnp.array([1.0, 2.0, 3.0]))]
+    [1.0, 2.0, 3.0]
+    """
+    return tuple(part.reshape(()) for part in lax.split(v, (1,) * v.shape[0]))
+
+
+def entries(m: Float[Array, "3 3"]) -> tuple[Scalar, ...]:
+    """The nine entries of a 3×3 matrix, row by row, as scalars.
+
+    **Arguments:** `m` (3, 3).
+
+    >>> [float(x) for x in entries(jnp.eye(3))]
+    [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
+    """
+    return components(m.reshape(9))
 
 
 def cross(a: Vec3Like, b: Vec3Like) -> Vec3:
@@ -19,9 +43,26 @@ def cross(a: Vec3Like, b: Vec3Like) -> Vec3:
     [0.0, 0.0, 1.0]
     """
     a, b = _checks.floating(a, (3,), "a"), _checks.floating(b, (3,), "b")
-    return jnp.stack(
-        [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
-    )
+    return jnp.stack(cross_components(components(a), components(b)))
+
+
+def cross_components(a: tuple[Scalar, ...], b: tuple[Scalar, ...]) -> tuple[Scalar, ...]:
+    """Vector product of two triples of scalars."""
+    (ax, ay, az), (bx, by, bz) = a, b
+    return ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+
+
+def dot_components(a: tuple[Scalar, ...], b: tuple[Scalar, ...]) -> Scalar:
+    """Scalar product of two triples of scalars."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def square(v: tuple[Scalar, ...]) -> Scalar:
+    """Squared length of a triple of scalars, to be fed to a costly function."""
+    value = dot_components(v, v)
+    # A division by one (2 for NaN): XLA on CPU computes a quotient once, here and in the gradient,
+    # where it would repeat anything cheaper, with all that follows, for every component.
+    return value / jnp.where(value == value, 1, 2)
 
 
 def hat(w: Vec3Like) -> Mat3:
@@ -32,7 +73,7 @@ def hat(w: Vec3Like) -> Mat3:
     >>> hat(jnp.array([1.0, 2.0, 3.0])).tolist()
     [[0.0, -3.0, 2.0], [3.0, 0.0, -1.0], [-2.0, 1.0, 0.0]]
     """
-    x, y, z = _checks.floating(w, (3,), "w")
+    x, y, z = components(_checks.floating(w, (3,), "w"))
     zero = jnp.zeros_like(x)
     return jnp.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
 
@@ -46,12 +87,12 @@ def vee(matrix: Mat3Like) -> Vec3:
     >>> vee(hat(jnp.array([1.0, 2.0, 3.0]))).tolist()
     [1.0, 2.0, 3.0]
     """
-    m = _checks.floating(matrix, (3, 3), "matrix")
-    return 0.5 * jnp.stack([m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]])
+    _, b, c, d, _, f, g, h, _ = entries(_checks.floating(matrix, (3, 3), "matrix"))
+    return 0.5 * jnp.stack([h - f, c - g, d - b])
 
 
 def basis(dtype: object = float) -> Float[Array, "3 3 3"]:
-    """The matrices J_1, J_2, J_3 with J_i y = e_i × y (notes, eqs 41, 42; 52, 53: ½ Tr(J_iᵀJ_j) = δ_ij).
+    """The matrices J_1, J_2, J_3 with J_i y = e_i × y, ½ Tr(J_iᵀ J_j) = δ_ij (notes, eqs 41–43, 53).
 
     Eq 16 of the notes prints J_3 transposed, that is −J_3 of eq 42; eq 42 holds.
 
@@ -70,8 +111,10 @@ def product(a: Mat3Like, b: Mat3Like) -> Mat3:
     >>> product(jnp.eye(3), 2.0 * jnp.eye(3)).tolist()
     [[2.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 2.0]]
     """
-    a, b = _checks.floating(a, (3, 3), "a"), _checks.floating(b, (3, 3), "b")
-    return a[:, 0:1] * b[0:1] + a[:, 1:2] * b[1:2] + a[:, 2:3] * b[2:3]
+    a = entries(_checks.floating(a, (3, 3), "a"))
+    b = entries(_checks.floating(b, (3, 3), "b"))
+    rows, columns = (a[:3], a[3:6], a[6:]), (b[::3], b[1::3], b[2::3])
+    return jnp.stack([dot_components(r, c) for r in rows for c in columns]).reshape(3, 3)
 
 
 def apply(a: Mat3Like, y: Vec3Like) -> Vec3:
@@ -82,8 +125,9 @@ def apply(a: Mat3Like, y: Vec3Like) -> Vec3:
     >>> apply(2.0 * jnp.eye(3), jnp.array([1.0, 2.0, 3.0])).tolist()
     [2.0, 4.0, 6.0]
     """
-    a, y = _checks.floating(a, (3, 3), "a"), _checks.floating(y, (3,), "y")
-    return a[:, 0] * y[0] + a[:, 1] * y[1] + a[:, 2] * y[2]
+    a = entries(_checks.floating(a, (3, 3), "a"))
+    y = components(_checks.floating(y, (3,), "y"))
+    return jnp.stack([dot_components(row, y) for row in (a[:3], a[3:6], a[6:])])
 
 
 def solve(a: Mat3Like, y: Vec3Like) -> Vec3:
@@ -94,15 +138,14 @@ def solve(a: Mat3Like, y: Vec3Like) -> Vec3:
     >>> solve(2.0 * jnp.eye(3), jnp.array([2.0, 4.0, 6.0])).tolist()
     [1.0, 2.0, 3.0]
     """
-    a, y = _checks.floating(a, (3, 3), "a"), _checks.floating(y, (3,), "y")
-    columns = a[:, 0], a[:, 1], a[:, 2]
-    rows = cross(columns[1], columns[2]), cross(columns[2], columns[0])
-    last = cross(columns[0], columns[1])
-    determinant = dot(columns[0], rows[0])
-    return jnp.stack([dot(rows[0], y), dot(rows[1], y), dot(last, y)]) / determinant
+    a = entries(_checks.floating(a, (3, 3), "a"))
+    y = components(_checks.floating(y, (3,), "y"))
+    p, q, r = a[::3], a[1::3], a[2::3]
+    qr, rp, pq = cross_components(q, r), cross_components(r, p), cross_components(p, q)
+    return jnp.stack([dot_components(c, y) for c in (qr, rp, pq)]) / dot_components(p, qr)
 
 
-def determinant(a: Mat3Like) -> Float[Array, ""]:
+def determinant(a: Mat3Like) -> Scalar:
     """Determinant of a 3×3 matrix: +1 for a rotation, −1 for a reflection (notes, eq 10).
 
     **Arguments:** `a` (3, 3).
@@ -110,11 +153,11 @@ def determinant(a: Mat3Like) -> Float[Array, ""]:
     >>> float(determinant(jnp.eye(3)))
     1.0
     """
-    a = _checks.floating(a, (3, 3), "a")
-    return dot(a[:, 0], cross(a[:, 1], a[:, 2]))
+    a = entries(_checks.floating(a, (3, 3), "a"))
+    return dot_components(a[:3], cross_components(a[3:6], a[6:]))
 
 
-def dot(a: Vec3Like, b: Vec3Like) -> Float[Array, ""]:
+def dot(a: Vec3Like, b: Vec3Like) -> Scalar:
     """Scalar product a · b.
 
     **Arguments:** `a`, `b` (3,), in one frame.
@@ -123,4 +166,4 @@ def dot(a: Vec3Like, b: Vec3Like) -> Float[Array, ""]:
     6.0
     """
     a, b = _checks.floating(a, (3,), "a"), _checks.floating(b, (3,), "b")
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+    return dot_components(components(a), components(b))

@@ -5,15 +5,22 @@ The maps here take one quaternion, look at no values and normalise nothing, so t
 little in a vector field; `check` is the gate for data from outside.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
 from rigidjax import _checks
 from rigidjax._types import Mat3, Mat3Like, Quat, QuatLike, Scalar, Vec3, Vec3Like
-from rigidjax.rotation.algebra import cross, dot
+from rigidjax.rotation.algebra import (
+    components,
+    cross_components,
+    dot_components,
+    entries,
+    square,
+)
 from rigidjax.special.series import arctan_ratio, inverse_kernel, stumpff
 
 _HINT = "a quaternion is (w, x, y, z), scalar first"
@@ -29,10 +36,10 @@ def exp(v: Vec3Like) -> Quat:
     >>> exp(jnp.array([0.0, 0.0, jnp.pi])).round(12).tolist()
     [0.0, 0.0, 0.0, 1.0]
     """
-    v = _checks.floating(v, (3,), "v")
-    s = 0.25 * dot(v, v)
+    x, y, z = v = components(_checks.floating(v, (3,), "v"))
+    s = 0.25 * square(v)
     half = 0.5 * stumpff(1, s)
-    return jnp.stack([stumpff(0, s), half * v[0], half * v[1], half * v[2]])
+    return jnp.stack([stumpff(0, s), half * x, half * y, half * z])
 
 
 def log(q: QuatLike) -> Vec3:
@@ -60,8 +67,8 @@ def multiply(p: QuatLike, q: QuatLike) -> Quat:
     >>> multiply(jnp.array([0.0, 1.0, 0.0, 0.0]), jnp.array([0.0, 0.0, 1.0, 0.0])).tolist()
     [0.0, 0.0, 0.0, 1.0]
     """
-    a, b, c, d = _checks.floating(p, (4,), "p", hint=_HINT)
-    e, f, g, h = _checks.floating(q, (4,), "q", hint=_HINT)
+    a, b, c, d = components(_checks.floating(p, (4,), "p", hint=_HINT))
+    e, f, g, h = components(_checks.floating(q, (4,), "q", hint=_HINT))
     return jnp.stack(
         [
             a * e - b * f - c * g - d * h,
@@ -80,7 +87,7 @@ def conjugate(q: QuatLike) -> Quat:
     >>> conjugate(jnp.array([1.0, 2.0, 3.0, 4.0])).tolist()
     [1.0, -2.0, -3.0, -4.0]
     """
-    w, x, y, z = _checks.floating(q, (4,), "q", hint=_HINT)
+    w, x, y, z = components(_checks.floating(q, (4,), "q", hint=_HINT))
     return jnp.stack([w, -x, -y, -z])
 
 
@@ -92,8 +99,8 @@ def rotate(q: QuatLike, y: Vec3Like) -> Vec3:
     >>> rotate(jnp.array([0.0, 0.0, 0.0, 1.0]), jnp.array([1.0, 2.0, 3.0])).tolist()
     [-1.0, -2.0, 3.0]
     """
-    q = _checks.floating(q, (4,), "q", hint=_HINT)
-    return _turn(q[0], q[1:], _checks.floating(y, (3,), "y"))
+    w, *u = components(_checks.floating(q, (4,), "q", hint=_HINT))
+    return _turn(w, u, components(_checks.floating(y, (3,), "y")))
 
 
 def rotate_inverse(q: QuatLike, y: Vec3Like) -> Vec3:
@@ -104,8 +111,8 @@ def rotate_inverse(q: QuatLike, y: Vec3Like) -> Vec3:
     >>> rotate_inverse(jnp.array([0.0, 0.0, 0.0, 1.0]), jnp.array([1.0, 2.0, 3.0])).tolist()
     [-1.0, -2.0, 3.0]
     """
-    q = _checks.floating(q, (4,), "q", hint=_HINT)
-    return _turn(-q[0], q[1:], _checks.floating(y, (3,), "y"))
+    w, *u = components(_checks.floating(q, (4,), "q", hint=_HINT))
+    return _turn(-w, u, components(_checks.floating(y, (3,), "y")))
 
 
 def normalise(q: QuatLike) -> Quat:
@@ -117,7 +124,7 @@ def normalise(q: QuatLike) -> Quat:
     [0.0, 0.6, 0.0, 0.8]
     """
     q = _checks.floating(q, (4,), "q", hint=_HINT)
-    return q / jnp.sqrt(_square(q))
+    return q / jnp.sqrt(_square(components(q)))
 
 
 def canonical(q: QuatLike) -> Quat:
@@ -129,7 +136,7 @@ def canonical(q: QuatLike) -> Quat:
     [1.0, -0.0, -0.0, -0.0]
     """
     q = _checks.floating(q, (4,), "q", hint=_HINT)
-    return jnp.where(_flipped(q), -q, q)
+    return jnp.where(_flipped(components(q)), -q, q)
 
 
 def angle(q: QuatLike) -> Scalar:
@@ -141,11 +148,11 @@ def angle(q: QuatLike) -> Scalar:
     >>> round(float(angle(exp(jnp.array([0.0, 1e-9, 0.0]))) * 1e9), 9)
     1.0
     """
-    q = _checks.floating(q, (4,), "q", hint=_HINT)
-    n2 = dot(q[1:], q[1:])
+    w, *u = components(_checks.floating(q, (4,), "q", hint=_HINT))
+    n2 = dot_components(u, u)
     # Both atan2 and the root see ones, not zeros, where their derivative would be 0/0.
     there = n2 > 0
-    half = jnp.arctan2(jnp.sqrt(jnp.where(there, n2, 1)), jnp.abs(q[0]))
+    half = jnp.arctan2(jnp.sqrt(jnp.where(there, n2, 1)), jnp.abs(w))
     return jnp.where(there, 2 * half, 0)
 
 
@@ -157,7 +164,7 @@ def to_matrix(q: QuatLike) -> Mat3:
     >>> to_matrix(jnp.array([0.0, 0.0, 0.0, 1.0])).tolist()
     [[-1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]]
     """
-    w, x, y, z = _checks.floating(q, (4,), "q", hint=_HINT)
+    w, x, y, z = components(_checks.floating(q, (4,), "q", hint=_HINT))
     xx, yy, zz = 2 * x * x, 2 * y * y, 2 * z * z
     xy, yz, zx = 2 * x * y, 2 * y * z, 2 * z * x
     wx, wy, wz = 2 * w * x, 2 * w * y, 2 * w * z
@@ -188,47 +195,60 @@ def from_matrix(matrix: Mat3Like) -> Quat:
     [0.0, 0.0, 0.0, 1.0]
     """
     m = _checks.floating(matrix, (3, 3), "matrix", hint="a rotation matrix is wanted")
-    (a, b, c), (d, e, f), (g, h, i) = m[0], m[1], m[2]
+    a, b, c, d, e, f, g, h, i = entries(m)
     w, x, y, z = 1 + a + e + i, 1 + a - e - i, 1 - a + e - i, 1 - a - e + i
     wx, wy, wz, xy, yz, zx = h - f, c - g, d - b, b + d, f + h, c + g
-    upper = jnp.where(x > w, jnp.stack([wx, x, xy, zx]), jnp.stack([w, wx, wy, wz]))
-    lower = jnp.where(z > y, jnp.stack([wz, zx, yz, z]), jnp.stack([wy, xy, y, yz]))
-    return canonical(normalise(jnp.where(jnp.maximum(y, z) > jnp.maximum(w, x), lower, upper)))
+    rows = (w, wx, wy, wz), (wx, x, xy, zx), (wy, xy, y, yz), (wz, zx, yz, z)
+    upper = [jnp.where(x > w, one, other) for one, other in zip(rows[1], rows[0], strict=True)]
+    lower = [jnp.where(z > y, one, other) for one, other in zip(rows[3], rows[2], strict=True)]
+    down = jnp.maximum(y, z) > jnp.maximum(w, x)
+    row = [jnp.where(down, one, other) for one, other in zip(lower, upper, strict=True)]
+    scale = 1 / jnp.sqrt(row[0] ** 2 + row[1] ** 2 + row[2] ** 2 + row[3] ** 2)
+    scale = jnp.where(_flipped(row), -scale, scale)
+    return jnp.stack([scale * part for part in row])
 
 
-def _turn(w: Float[Array, ""], u: Vec3, y: Vec3) -> Vec3:
-    """y + 2w u×y + 2 u×(u×y)."""
-    t = 2 * cross(u, y)
-    return y + w * t + cross(u, t)
+def _turn(w: Scalar, u: Sequence[Scalar], y: Sequence[Scalar]) -> Vec3:
+    """The sum y + 2w u×y + 2 u×(u×y)."""
+    t = [2 * part for part in cross_components(u, y)]
+    again = cross_components(u, t)
+    return jnp.stack([y[i] + (w * t[i] + again[i]) for i in range(3)])
 
 
-def _square(q: Quat) -> Float[Array, ""]:
+def _square(q: Sequence[Scalar]) -> Scalar:
     return q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]
 
 
-def _flipped(q: Quat) -> Array:
+def _flipped(q: Sequence[Scalar]) -> Array:
     """Whether −q, not q, is canonical."""
-    lead = jnp.where(q[2] != 0, q[2], q[3])
-    lead = jnp.where(q[1] != 0, q[1], lead)
-    return jnp.where(q[0] != 0, q[0], lead) < 0
+    w, x, y, z = q
+    lead = jnp.where(w != 0, w, jnp.where(x != 0, x, jnp.where(y != 0, y, z)))
+    return lead < 0
 
 
 @jax.custom_jvp
 def _log(q: Quat) -> Vec3:
-    q = canonical(q)
-    w, u = q[0], q[1:]
-    n2 = dot(u, u)
-    # tan of the half angle is n/w, of the quarter n/a, of the eighth n/b: no difference is taken.
-    a = w + jnp.sqrt(n2 + w * w)
+    w, x, y, z = parts = components(q)
+    n2 = x * x + y * y + z * z
+    # tan of the half angle is n/|w|, of the quarter n/a, of the eighth n/b: nothing cancels.
+    a = jnp.abs(w) + jnp.sqrt(n2 + w * w)
     inverse = 1 / (a + jnp.sqrt(n2 + a * a))
-    return (8 * inverse * arctan_ratio(n2 * inverse * inverse)) * u
+    scale = 8 * inverse * arctan_ratio(n2 * inverse * inverse)
+    scale = jnp.where(_flipped(parts), -scale, scale)
+    return jnp.stack([scale * x, scale * y, scale * z])
 
 
 @_log.defjvp
 def _log_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
     (q,), (dq,) = primals, tangents
     v = _log(q)
+    w, *u = parts = components(q)
+    dw, *du = components(dq)
     # The turn seen from the body, 2 vec(q̄ dq)/|q|², then the inverse right Jacobian.
-    turn = (2 / _square(q)) * (q[0] * dq[1:] - dq[0] * q[1:] - cross(q[1:], dq[1:]))
-    across = cross(v, turn)
-    return v, turn + 0.5 * across + inverse_kernel(dot(v, v)) * cross(v, across)
+    scale, aside = 2 / _square(parts), cross_components(u, du)
+    turn = [scale * (w * du[i] - dw * u[i] - aside[i]) for i in range(3)]
+    vs = components(v)
+    across = cross_components(vs, turn)
+    twice = cross_components(vs, across)
+    g = inverse_kernel(dot_components(vs, vs))
+    return v, jnp.stack([turn[i] + 0.5 * across[i] + g * twice[i] for i in range(3)])

@@ -12,12 +12,14 @@ from rigidjax.rotation import quaternion
 from rigidjax.rotation.algebra import (
     apply as apply,
     basis as basis,
+    components,
     cross as cross,
     determinant as determinant,
     dot as dot,
     hat as hat,
     product as product,
     solve as solve,
+    square,
     vee as vee,
 )
 from rigidjax.special.series import inverse_kernel, stumpff
@@ -32,8 +34,8 @@ def exp(v: Vec3Like) -> Mat3:
     >>> exp(jnp.array([0.0, 0.0, jnp.pi / 2])).round(12)[0].tolist()
     [0.0, -1.0, 0.0]
     """
-    v = _checks.floating(v, (3,), "v")
-    s = 0.25 * dot(v, v)
+    v = components(_checks.floating(v, (3,), "v"))
+    s = 0.25 * square(v)
     half = stumpff(1, s)
     return _polynomial(v, stumpff(0, s) * half, 0.5 * half * half)
 
@@ -61,8 +63,8 @@ def left_jacobian(v: Vec3Like) -> Mat3:
     >>> left_jacobian(jnp.zeros(3)).tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
     """
-    v = _checks.floating(v, (3,), "v")
-    t = dot(v, v)
+    v = components(_checks.floating(v, (3,), "v"))
+    t = square(v)
     return _polynomial(v, stumpff(2, t), stumpff(3, t))
 
 
@@ -85,8 +87,8 @@ def left_jacobian_inverse(v: Vec3Like) -> Mat3:
     >>> left_jacobian_inverse(jnp.zeros(3)).tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
     """
-    v = _checks.floating(v, (3,), "v")
-    t = dot(v, v)
+    v = components(_checks.floating(v, (3,), "v"))
+    t = square(v)
     return _polynomial(v, jnp.full_like(t, -0.5), inverse_kernel(t))
 
 
@@ -115,7 +117,7 @@ def distance(a: Mat3Like, b: Mat3Like) -> Scalar:
     return quaternion.angle(quaternion.from_matrix(product(a.T, b)))
 
 
-def _polynomial(v: Vec3, a: Scalar, b: Scalar) -> Mat3:
+def _polynomial(v: tuple[Scalar, ...], a: Scalar, b: Scalar) -> Mat3:
     """1 + a hat v + b (hat v)²."""
     x, y, z = v
     xx, yy, zz = b * x * x, b * y * y, b * z * z

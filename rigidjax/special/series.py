@@ -37,14 +37,16 @@ def stumpff(k: int, t: Float[Array, "..."]) -> Float[Array, "..."]:
     1.0
     """
     if k < 2:
-        return _cosine_and_sinc(t)[k]
+        return _cosine_or_sinc(k, t)
     # From t = π² on, c_{j+2} = (1/j! − c_j)/t loses nothing that matters.
     limit = math.pi**2
     far = t > limit
-    beyond, divisor = _cosine_and_sinc(t)[k % 2], jnp.where(far, t, 1)
-    for j in range(k % 2, k, 2):
-        beyond = (1 / math.factorial(j) - beyond) / divisor
-    return jnp.where(far, beyond, _stumpff_polynomial(k, jnp.where(far, 0, t), limit))
+    divisor = jnp.where(far, t, 1)
+    value = _cosine_or_sinc(k % 2, t)
+    for j in range(k % 2, k - 2, 2):
+        value = (1 / math.factorial(j) - value) / divisor
+    near = _polynomial(k, jnp.where(far, 0, t), limit)
+    return jnp.where(far, 1 / math.factorial(k - 2) - value, near) / divisor
 
 
 @stumpff.defjvp
@@ -79,8 +81,8 @@ def arctan_ratio(z: Float[Array, "..."]) -> Float[Array, "..."]:
     return _horner([(-1) ** n / (2 * n + 1) for n in range(terms)], z)
 
 
-def _cosine_and_sinc(t: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-    """(cos θ, sin θ/θ) from t = θ²; beyond θ = π/2 the angle is reduced by multiples of π."""
+def _cosine_or_sinc(k: int, t: Float[Array, "..."]) -> Float[Array, "..."]:
+    """The cosine (k = 0) or sin θ/θ (k = 1) from t = θ²; beyond π/2, θ is reduced by multiples of π."""
     limit = (math.pi / 2) ** 2
     far = t > limit
     theta = jnp.sqrt(jnp.where(far, t, 1))
@@ -88,12 +90,12 @@ def _cosine_and_sinc(t: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float
     head, tail = _split_pi(t.dtype)
     # turns × head is exact (Cody & Waite 1980), so the remainder is as good as θ itself.
     remainder = (theta - turns * head) - turns * tail
+    value = _polynomial(k, jnp.where(far, remainder * remainder, t), limit)
+    value = value * jnp.where(far, remainder, 1) if k else value
+    # The sign goes into a division although a product would do: XLA on CPU computes a quotient once,
+    # but repeats a polynomial in each place where it is used.
     sign = 1 - 2 * (turns - 2 * jnp.floor(0.5 * turns))
-    x = jnp.where(far, remainder * remainder, t)
-    return (
-        _stumpff_polynomial(0, x, limit) * jnp.where(far, sign, 1),
-        _stumpff_polynomial(1, x, limit) * jnp.where(far, sign * remainder / theta, 1),
-    )
+    return value / jnp.where(far, sign * theta if k else sign, 1)
 
 
 def _split_pi(dtype: Any) -> tuple[float, float]:
@@ -105,7 +107,7 @@ def _split_pi(dtype: Any) -> tuple[float, float]:
     return head, (math.pi - head) + 1.2246467991473532e-16
 
 
-def _stumpff_polynomial(k: int, t: Float[Array, "..."], limit: float) -> Float[Array, "..."]:
+def _polynomial(k: int, t: Float[Array, "..."], limit: float) -> Float[Array, "..."]:
     """As many Taylor terms of c_k as reach round-off at t = limit."""
     tiny = jnp.finfo(t.dtype).eps / 8
     size = 1 / math.factorial(k)
