@@ -1,0 +1,57 @@
+"""Half a period of a free body's rates, by the arithmetic–geometric mean."""
+
+import math
+from typing import NamedTuple
+
+import jax.numpy as jnp
+
+from rigidjax._types import Scalar
+from rigidjax.exact.doubling import Modulus, limits
+
+
+class HalfPeriod(NamedTuple):
+    """Over half a period: the time, the phase ξ, and the mean of S².
+
+    On the separatrix the time is infinite.
+    """
+
+    time: Scalar
+    phase: Scalar
+    mean: Scalar
+
+
+def half_period(m: Modulus, mu: Scalar, turn: Scalar) -> HalfPeriod:
+    """The least T > 0 with S(T) = 0, and what S gathers on the way.
+
+    With λ² = max(p, q), a₀ = λ, b₀ = √|p − q|: `T = π/agm(a₀, b₀)` (DLMF 19.8.5), and with
+    `c₁ = (a₀ − b₀)/2, c_{n+1} = c_n²/(4 a_{n+1})` the mean `⟨S²⟩ = (½ + Σ 2^{n−1} c_n²/w)/λ²`,
+    w = min(p, q) (19.8.6 divided through by w, so that w = 0 is an ordinary value). The phase is
+    the complete integral of the third kind, 19.8.7–19.8.9, with μ in the place of −α².
+    """
+    big, small = jnp.maximum(m.p, m.q), jnp.minimum(m.p, m.q)
+    at_rest = big <= 0
+    big = jnp.where(at_rest, 1.0, big)
+    gap = jnp.abs(m.gap)
+    endless = (gap <= 0) | at_rest
+    a, b = jnp.sqrt(big), jnp.sqrt(jnp.where(endless, big, gap))
+    # c₁ = w/(2(a₀ + b₀)) exactly; `ratio` is c_n²/w and `c` is c_n.
+    c = small / (2.0 * (a + b))
+    ratio = small / (4.0 * (a + b) ** 2)
+    total, weight = 0.5 * jnp.ones_like(a), 1.0
+    point, part, sum_parts = jnp.sqrt(big + mu), jnp.ones_like(a), jnp.ones_like(a)
+    for _ in range(limits(a.dtype).agm):
+        total = total + weight * ratio
+        weight = 2.0 * weight
+        square, product = point * point, a * b
+        r = 1.0 / (square + product)
+        part = 0.5 * part * (square - product) * r
+        point = 0.5 * (square + product) / point
+        a, b = 0.5 * (a + b), jnp.sqrt(product)
+        sum_parts = sum_parts + part
+        narrow = c / (4.0 * 0.5 * (a + b))
+        ratio = ratio * narrow * narrow
+        c = c * narrow
+    time = math.pi / a
+    # turn = κμ h; over a quarter ξ = κ h (π/2a) ½ μ/(λ² + μ) Σ.
+    phase = turn * time * 0.5 / (big + mu) * sum_parts
+    return HalfPeriod(jnp.where(endless, jnp.inf, time), phase, total / big)

@@ -1,0 +1,125 @@
+"""The free motion in principal axes: values only, in components.
+
+The derivatives are in `rigidjax.exact.derivatives`; nothing here is differentiated, so signs,
+orderings and selections may be taken freely.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from rigidjax._types import Scalar
+from rigidjax.exact.doubling import Elliptic, Modulus, duplicate, elliptic, limits
+from rigidjax.exact.half_period import HalfPeriod, half_period
+from rigidjax.exact.sincos import sincos
+
+Triple = tuple[Scalar, Scalar, Scalar]
+
+
+class Orbit(NamedTuple):
+    """What a free motion has that does not depend on time. Axes are labelled 1, 2, 3 in order.
+
+    `a` the largest-or-smallest reciprocal moment, `d12, d13, d23` differences of reciprocal
+    moments, `P` the initial momentum and `h` its length, all in principal axes after the
+    labelling; `swapped` says which of the two monotone labellings was taken.
+    """
+
+    a: Scalar
+    d12: Scalar
+    d13: Scalar
+    d23: Scalar
+    P: Triple
+    h: Scalar
+    modulus: Modulus
+    mu: Scalar
+    turn: Scalar
+    half: HalfPeriod
+    swapped: Float[Array, ""]
+
+
+def orbit(moments: Triple, momentum: Triple) -> Orbit:
+    """Set up the motion of a body with principal moments I1 ≤ I2 ≤ I3 (any of them equal)."""
+    (i1, i2, i3), (p1, p2, p3) = moments, momentum
+    r1, r2, r3 = 1.0 / i1, 1.0 / i2, 1.0 / i3
+    d12, d13, d23 = (i2 - i1) * (r1 * r2), (i3 - i1) * (r1 * r3), (i3 - i2) * (r2 * r3)
+    A1 = d12 * p2 * p2 + d13 * p3 * p3
+    A3 = d13 * p1 * p1 + d23 * p2 * p2
+    A2 = d23 * p3 * p3 - d12 * p1 * p1
+    p, q, gap = d23 * A1, d12 * A3, d13 * A2
+    # Label so that the phase ξ, a correction to the turning about axis 1, stays small.
+    swap = d12 * A1 > d23 * A3
+    p, q, gap = jnp.where(swap, q, p), jnp.where(swap, p, q), jnp.where(swap, -gap, gap)
+    a = jnp.where(swap, r3, r1)
+    d12, d23 = jnp.where(swap, -d23, d12), jnp.where(swap, -d12, d23)
+    d13 = jnp.where(swap, -d13, d13)
+    mu = jnp.where(swap, d12 * -A3, d12 * A1)
+    p1, p2, p3 = jnp.where(swap, p3, p1), jnp.where(swap, -p2, p2), jnp.where(swap, p1, p3)
+    h = jnp.sqrt(p1 * p1 + p2 * p2 + p3 * p3)
+    turn = d13 * h * mu
+    m = Modulus(p, q, gap)
+    return Orbit(
+        a, d12, d13, d23, (p1, p2, p3), h, m, mu, turn, half_period(m, mu, turn), swap
+    )
+
+
+def reduced(o: Orbit, u: Scalar) -> tuple[Elliptic, Scalar]:
+    """S, C, D at u, reduced by whole half periods; and the phase of those half periods."""
+    big = jnp.maximum(o.modulus.p, o.modulus.q)
+    count = jnp.round(u / o.half.time)
+    whole = jnp.where(count == 0, 0.0, count)
+    r = u - whole * jnp.where(count == 0, 0.0, o.half.time)
+    reach = limits(u.dtype).reach / jnp.sqrt(jnp.where(big > 0, big, 1.0))
+    r = jnp.where(big > 0, jnp.clip(r, -reach, reach), r)
+    f = elliptic(r, o.modulus, o.mu, o.turn)
+    odd = jnp.abs(whole - 2.0 * jnp.round(0.5 * whole)) > 0.5
+    sign = jnp.where(odd, -1.0, 1.0)
+    around_three = o.modulus.gap > 0
+    return (
+        f._replace(
+            S=sign * f.S,
+            C=jnp.where(around_three, sign, 1.0) * f.C,
+            D=jnp.where(around_three, 1.0, sign) * f.D,
+        ),
+        whole * jnp.where(count == 0, 0.0, o.half.phase),
+    )
+
+
+def momentum_at(o: Orbit, f: Elliptic) -> Triple:
+    """Body momentum when S, C, D are those of the time passed, in the orbit's labelling."""
+    p1, p2, p3 = o.P
+    y1 = p1 * f.C - o.d23 * p2 * p3 * f.S * f.D
+    y2 = p2 * f.C * f.D + o.d13 * p1 * p3 * f.S
+    y3 = p3 * f.D - o.d12 * p1 * p2 * f.S * f.C
+    size = jnp.maximum(jnp.maximum(jnp.abs(y1), jnp.abs(y2)), jnp.abs(y3))
+    still = size <= 0
+    r = 1.0 / jnp.where(still, 1.0, size)
+    y1, y2, y3 = y1 * r, y2 * r, y3 * r
+    r = o.h / jnp.sqrt(jnp.where(still, 1.0, y1 * y1 + y2 * y2 + y3 * y3))
+    return y1 * r, y2 * r, y3 * r
+
+
+def momentum_and_turn(o: Orbit, t: Scalar) -> tuple[Triple, tuple[Scalar, Scalar, Scalar, Scalar]]:
+    """Body momentum at t, and the quaternion of the turn since t = 0, in principal axes."""
+    f, phase = reduced(o, 0.5 * t)
+    k1, k2, k3 = momentum_at(o, f)
+    m1, m2, m3 = momentum_at(o, duplicate(f, o.modulus, o.mu, o.turn))
+
+    # b turns about (half way) momentum's partner axes, the rest is a turn about the momentum.
+    b0, b2, b3 = f.C, -o.d12 * f.S * k2 * f.C, -o.d13 * f.S * k3
+    size = jnp.maximum(jnp.maximum(jnp.abs(b0), jnp.abs(b2)), jnp.abs(b3))
+    b0, b2, b3 = b0 / size, b2 / size, b3 / size
+    r = 1.0 / jnp.sqrt((b0 * b0 + b2 * b2 + b3 * b3) * (f.x * f.x + f.y * f.y))
+    sine, cosine = sincos(0.5 * o.a * o.h * t - phase)
+    c, s = r * (cosine * f.x + sine * f.y), r * (sine * f.x - cosine * f.y)
+    still = o.h <= 0
+    s = jnp.where(still, 0.0, s / jnp.where(still, 1.0, o.h))
+    p1, p2, p3 = o.P
+    w = c * b0 - s * (p2 * b2 + p3 * b3)
+    x = s * (p1 * b0 + p2 * b3 - p3 * b2)
+    y = c * b2 + s * (p2 * b0 - p1 * b3)
+    z = c * b3 + s * (p3 * b0 + p1 * b2)
+    swap = o.swapped
+    momentum = jnp.where(swap, m3, m1), jnp.where(swap, -m2, m2), jnp.where(swap, m1, m3)
+    turn = w, jnp.where(swap, z, x), jnp.where(swap, -y, y), jnp.where(swap, x, z)
+    return momentum, turn

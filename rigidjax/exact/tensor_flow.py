@@ -1,0 +1,350 @@
+"""The free motion as a smooth function of the whole inertia tensor: what derivatives are made of.
+
+Principal axes are not a smooth function of a tensor; the motion is. With `K = I⁻¹`, Π the body
+momentum, `E₂ = Π·KΠ` and `h = |Π|`, let
+
+    E = E₂ K + h² adj(K)      (symmetric; commutes with K)
+
+and let σ(u) be a scalar, T(u) a matrix that commutes with K, both fixed up to a common factor, with
+
+    T² = w 1 − σ² E,   T(2u) = T⁴ − σ⁴ χ'(E),   σ(2u) = 2 σ det T,   χ the characteristic polynomial
+
+(Weierstrass's sigma functions: T has eigenvalues σ₁, σ₂, σ₃). Then the addition theorem reads
+
+    Π(t) ∝ adj(T) Π + σ T (Π × KΠ),   T and σ at t,   |Π(t)| = h
+
+and, with k = Π(t/2), T and σ at u = t/2, W the factor left out for k, and `Y = ∫₀ᵘ σ² T⁻² du`,
+which doubles as `Y(2u) = 2Y + (σT⁻¹)²(u) (σT⁻¹)(2u)`,
+
+    G = ∫₀ᵗ Π Πᵀ dt = 2σ/(W det T) (adj(T)k)(adj(T)k)ᵀ − 2 adj(E₂ 1 − h² K) Y.
+
+Proof of the first: in principal axes of K it is Jacobi's solution with T = diag(D, 1, C), σ = S, by
+`E₃₃ − E₂₂ = (a₂ − a₃)(a₁h² − E₂) = p`, `E₁₁ − E₂₂ = q`; both sides turn with the axes, so it holds
+in any axes. All is polynomial in K but for `|…|`, so a sphere or a symmetric top is an ordinary
+point, with derivatives of any order. (The second: differentiate in principal axes, axis by axis:
+with g = σ/τᵢ, g' = τⱼτₖ/τᵢ², both sides have the same derivative; the symmetric choice of the mid
+point removes the terms even in time.)
+
+Used in axes that are principal at the point of evaluation: off-diagonal entries are zeros that
+carry tangents, diagonal differences come in as accurate numbers, and of the equal forms of an entry
+the one that does not cancel is taken.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from rigidjax._types import Scalar
+from rigidjax.exact.doubling import limits
+
+Triple = tuple[Scalar, Scalar, Scalar]
+# A symmetric matrix: 11, 22, 33, 12, 13, 23.
+Six = tuple[Scalar, Scalar, Scalar, Scalar, Scalar, Scalar]
+
+
+class Reciprocal(NamedTuple):
+    """K = I⁻¹ and the differences of its diagonal entries."""
+
+    k: Six
+    d12: Scalar
+    d13: Scalar
+    d23: Scalar
+
+
+class Invariants(NamedTuple):
+    """E less E₂₂ 1, and what the doubling needs of it; `a1, a2, a3`: aᵢh² − E₂, signs + + −."""
+
+    h2: Scalar
+    energy2: Scalar
+    a1: Scalar
+    a2: Scalar
+    a3: Scalar
+    q: Scalar
+    p: Scalar
+    gap: Scalar
+    e12: Scalar
+    e13: Scalar
+    e23: Scalar
+
+
+class Sigma(NamedTuple):
+    """σ, T, Y at some time; T is scaled so that T₂₂ = 1."""
+
+    s: Scalar
+    t: Six
+    y: Six
+
+
+def reciprocal(moments: Six) -> Reciprocal:
+    """K of an inertia tensor whose off-diagonal entries are small."""
+    i1, i2, i3, i12, i13, i23 = moments
+    c11, c22, c33 = i2 * i3 - i23 * i23, i1 * i3 - i13 * i13, i1 * i2 - i12 * i12
+    c12, c13, c23 = i13 * i23 - i12 * i3, i12 * i23 - i13 * i2, i12 * i13 - i23 * i1
+    r = 1.0 / (i1 * c11 + i12 * c12 + i13 * c13)
+    return Reciprocal(
+        (c11 * r, c22 * r, c33 * r, c12 * r, c13 * r, c23 * r),
+        ((i2 - i1) * i3 + (i13 * i13 - i23 * i23)) * r,
+        ((i3 - i1) * i2 + (i12 * i12 - i23 * i23)) * r,
+        ((i3 - i2) * i1 + (i12 * i12 - i13 * i13)) * r,
+    )
+
+
+def invariants(body: Reciprocal, momentum: Triple) -> Invariants:
+    (k1, k2, k3, k12, k13, k23), d12, d13, d23 = body
+    p1, p2, p3 = momentum
+    x1, x2, x3 = p1 * p1, p2 * p2, p3 * p3
+    h2 = x1 + x2 + x3
+    mixed = 2.0 * (k12 * (p1 * p2) + k13 * (p1 * p3) + k23 * (p2 * p3))
+    energy2 = k1 * x1 + k2 * x2 + k3 * x3 + mixed
+    a1 = d12 * x2 + d13 * x3 - mixed
+    a2 = d23 * x3 - d12 * x1 - mixed
+    a3 = d13 * x1 + d23 * x2 + mixed
+    s12, s13, s23 = k12 * k12, k13 * k13, k23 * k23
+    return Invariants(
+        h2,
+        energy2,
+        a1,
+        a2,
+        a3,
+        d12 * a3 + h2 * (s13 - s23),
+        d23 * a1 + h2 * (s13 - s12),
+        d13 * a2 + h2 * (s23 - s12),
+        k12 * a3 + h2 * (k13 * k23),
+        h2 * (k12 * k23) - k13 * a2,
+        h2 * (k12 * k13) - k23 * a1,
+    )
+
+
+def start(u: Scalar, v: Invariants) -> Sigma:
+    """σ, T, Y at a small u from their Taylor series."""
+    q, p, e12, e13, e23 = v.q, v.p, v.e12, v.e13, v.e23
+    uu = u * u
+    c1 = (p + q) * uu
+    c2 = (p * q - e12 * e12 - e13 * e13 - e23 * e23) * (uu * uu)
+    c3 = (2.0 * e12 * e13 * e23 - q * e23 * e23 - p * e12 * e12) * (uu * uu * uu)
+    s = u * (
+        1.0
+        + (-c1 / 6)
+        + (c1 * c1 / 120 + c2 / 10)
+        - (c1 * c1 * c1 / 5040 + c1 * c2 * (11 / 420) + c3 / 14)
+        + (
+            c1 * c1 * (c1 * c1 / 362880 + c2 * (17 / 5040))
+            + c1 * c3 / 28
+            + c2 * c2 / 120
+        )
+    )
+    # T = √(1 − x), x = σ²E.
+    ss = s * s
+    zero = jnp.zeros_like(u)
+    x = (ss * q, zero, ss * p, ss * e12, ss * e13, ss * e23)
+    inner = _add_scalar(_scale(x, 7 / 128), 5 / 64)
+    for c in (1 / 8, 1 / 4, 1.0):
+        inner = _add_scalar(_product(x, inner), c)
+    t = _add_scalar(_scale(_product(x, inner), -0.5), 1.0)
+    r = u * uu / 3
+    y = _add_scalar(
+        tuple(c * (0.6 * r * uu) for c in (q, zero, p, e12, e13, e23)), r * (1.0 - 0.2 * c1)
+    )
+    return _scaled(Sigma(s, t, y))
+
+
+def double(f: Sigma, v: Invariants) -> Sigma:
+    """σ, T, Y at 2u."""
+    t1, t2, t3, t12, t13, t23 = f.t
+    s = f.s
+    ss = s * s
+    q, p, gap, e12, e13, e23 = v.q, v.p, v.gap, v.e12, v.e13, v.e23
+    s12, s13, s23 = t12 * t12, t13 * t13, t23 * t23
+    # M = T²: its off-diagonal entries are −σ²E exactly.
+    m11, m22, m33 = t1 * t1 + s12 + s13, t2 * t2 + s12 + s23, t3 * t3 + s13 + s23
+    m12, m13, m23 = -ss * e12, -ss * e13, -ss * e23
+    x12, x13, x23 = m12 * m12, m13 * m13, m23 * m23
+    n22 = 0.5 * (
+        m22 * (m11 + m33)
+        - (x12 + x23)
+        + ss * (p * m11 + q * m33 - 2.0 * e13 * m13 + e12 * m12 + e23 * m23)
+    )
+    n11 = jnp.where(
+        ss * jax.lax.stop_gradient(q) < 0.5,
+        n22 - 2.0 * (m33 * (ss * q) + (x13 - x23)),
+        m11 * m11
+        + x12
+        + x13
+        - ss * ss * (2.0 * (e12 * e12 + e13 * e13) - e23 * e23 - q * gap),
+    )
+    n33 = jnp.where(
+        ss * jax.lax.stop_gradient(p) < 0.5,
+        n22 - 2.0 * (m11 * (ss * p) + (x13 - x12)),
+        m33 * m33
+        + x13
+        + x23
+        - ss * ss * (2.0 * (e13 * e13 + e23 * e23) - e12 * e12 + p * gap),
+    )
+    n12 = 2.0 * (m12 * m33 - m13 * m23)
+    n13 = 2.0 * (m13 * m22 - m12 * m23)
+    n23 = 2.0 * (m23 * m11 - m12 * m13)
+    det = _det(f.t)
+    t = (n11, n22, n33, n12, n13, n23)
+    s2 = 2.0 * s * det
+    before = _scale(_adjugate(f.t), s / det)
+    after = _scale(_adjugate(t), s2 / _det(t))
+    square = _product(before, before)
+    y = tuple(2.0 * a + b for a, b in zip(f.y, _product(square, after), strict=True))
+    return _scaled(Sigma(s2, t, y))
+
+
+def momentum_at(body: Reciprocal, f: Sigma, momentum: Triple) -> tuple[Triple, Scalar]:
+    """Π after the time of `f`, and the factor W that was divided out."""
+    p1, p2, p3 = momentum
+    (_, _, _, k12, k13, k23), d12, d13, d23 = body
+    u1 = -d23 * p2 * p3 + p2 * (k13 * p1 + k23 * p2) - p3 * (k12 * p1 + k23 * p3)
+    u2 = d13 * p1 * p3 + p3 * (k12 * p2 + k13 * p3) - p1 * (k13 * p1 + k23 * p2)
+    u3 = -d12 * p1 * p2 + p1 * (k12 * p1 + k23 * p3) - p2 * (k12 * p2 + k13 * p3)
+    adj, turned = _apply(_adjugate(f.t), momentum), _apply(f.t, (u1, u2, u3))
+    y = tuple(a + f.s * b for a, b in zip(adj, turned, strict=True))
+    size = jax.lax.stop_gradient(
+        jnp.maximum(jnp.maximum(jnp.abs(y[0]), jnp.abs(y[1])), jnp.abs(y[2]))
+    )
+    y = tuple(c / size for c in y)
+    length = jnp.sqrt(y[0] * y[0] + y[1] * y[1] + y[2] * y[2])
+    h = jnp.sqrt(p1 * p1 + p2 * p2 + p3 * p3)
+    r = h / length
+    return (y[0] * r, y[1] * r, y[2] * r), size / r
+
+
+def integral_about(body: Reciprocal, v: Invariants, f: Sigma, k: Triple) -> Six:
+    """∫ Π Πᵀ dt from −u to u about the moment when Π = k, with f at u."""
+    _, w = momentum_at(body, f, k)
+    alpha = _apply(_adjugate(f.t), k)
+    r = 2.0 * f.s / (w * _det(f.t))
+    a1, a2, a3 = alpha
+    hh = v.h2
+    k12, k13, k23 = (hh * c for c in body.k[3:])
+    b = (
+        -v.a2 * v.a3 - k23 * k23,
+        -v.a1 * v.a3 - k13 * k13,
+        v.a1 * v.a2 - k12 * k12,
+        hh * v.e12,
+        hh * v.e13,
+        hh * v.e23,
+    )
+    n = _product(b, f.y)
+    return tuple(
+        r * c - 2.0 * d
+        for c, d in zip((a1 * a1, a2 * a2, a3 * a3, a1 * a2, a1 * a3, a2 * a3), n, strict=True)
+    )
+
+
+def sigma_at(u: Scalar, v: Invariants) -> Sigma:
+    n = limits(u.dtype).doublings + 3
+    f = start(u * 2.0**-n, v)
+    return jax.lax.fori_loop(0, n, lambda _, g: double(g, v), f)
+
+
+def period(v: Invariants) -> Scalar:
+    """The period of Π: `2π/agm(√(z − x), √(z − y))`, z the largest eigenvalue of E.
+
+    z is a simple eigenvalue, so one step of Newton's from the diagonal entry has its derivatives to
+    third order; the other two enter through symmetric functions, the first step of the mean.
+    """
+    v = jax.tree.map(lambda c: c, v)
+    three = v.gap > 0
+    top = jnp.where(three, v.p, v.q)
+    off = v.e12 * v.e12, v.e13 * v.e13, v.e23 * v.e23
+
+    def differences(z):
+        # z − E₁₁ and z − E₃₃ without subtraction where z is one of them.
+        extra = z - top
+        x1 = jnp.where(three, v.gap, jnp.zeros_like(z)) + extra
+        x3 = jnp.where(three, jnp.zeros_like(z), -v.gap) + extra
+        return x1, z, x3
+
+    def slope(x1, x2, x3):
+        return x1 * x2 + x1 * x3 + x2 * x3 - (off[0] + off[1] + off[2])
+
+    x1, x2, x3 = differences(top)
+    f = x1 * x2 * x3 - x1 * off[2] - x2 * off[1] - x3 * off[0] - 2.0 * v.e12 * v.e13 * v.e23
+    x1, x2, x3 = differences(top - f / slope(x1, x2, x3))
+    root = jnp.sqrt(slope(x1, x2, x3))
+    a, b = 0.5 * jnp.sqrt(x1 + x2 + x3 + 2.0 * root), jnp.sqrt(root)
+    for _ in range(limits(a.dtype).agm):
+        a, b = 0.5 * (a + b), jnp.sqrt(a * b)
+    return 2.0 * jnp.pi / a
+
+
+def momentum_and_integral(moments: Six, momentum: Triple, t: Scalar) -> tuple[Triple, Six]:
+    """Π(t) and G = ∫₀ᵗ Π Πᵀ dt, for a motion that is not at rest."""
+    body = reciprocal(moments)
+    v = invariants(body, momentum)
+    big = jax.lax.stop_gradient(jnp.maximum(v.p, v.q))
+    endless = (jax.lax.stop_gradient(v.gap) == 0) | (big <= 0)
+    # Dummy invariants where there is no period keep NaN out of the derivatives.
+    one, zero = jnp.ones_like(t), jnp.zeros_like(t)
+    tame = Invariants(one, one, one, one, one, zero, one, one, zero, zero, zero)
+    usual = jax.tree.map(lambda a, b: jnp.where(endless, b, a), v, tame)
+    count = jnp.round(t / jnp.where(endless, jnp.inf, jax.lax.stop_gradient(period(usual))))
+    several = count != 0
+    usual = jax.tree.map(lambda a, b: jnp.where(several, a, b), usual, tame)
+    whole = period(usual)
+    r = t - jnp.where(several, count * whole, 0.0)
+    reach = 2.0 * limits(t.dtype).reach / jnp.sqrt(jnp.where(big > 0, big, 1.0))
+    r = jnp.where(big > 0, jnp.clip(r, -reach, reach), r)
+
+    f = sigma_at(0.5 * r, v)
+    k, _ = momentum_at(body, f, momentum)
+    out, _ = momentum_at(body, double(f, v), momentum)
+    g = integral_about(body, v, f, k)
+
+    # A whole period: four quarters about four points of the orbit.
+    eighth = sigma_at(0.125 * whole, usual)
+    quarter = double(eighth, usual)
+    point, total = momentum, tuple(zero for _ in range(6))
+    for _ in range(4):
+        part = integral_about(body, v, eighth, point)
+        total = tuple(a + b for a, b in zip(total, part, strict=True))
+        point, _ = momentum_at(body, quarter, point)
+    g = tuple(a + jnp.where(several, count * b, 0.0) for a, b in zip(g, total, strict=True))
+    return out, g
+
+
+def _scaled(f: Sigma) -> Sigma:
+    r = 1.0 / jax.lax.stop_gradient(f.t[1])
+    return Sigma(f.s * r, _scale(f.t, r), f.y)
+
+
+def _det(m: Six) -> Scalar:
+    a, b, c, x, y, z = m
+    return a * b * c + 2.0 * x * y * z - a * z * z - b * y * y - c * x * x
+
+
+def _adjugate(m: Six) -> Six:
+    a, b, c, x, y, z = m
+    return (b * c - z * z, a * c - y * y, a * b - x * x, y * z - x * c, x * z - y * b, x * y - z * a)
+
+
+def _product(m: Six, n: Six) -> Six:
+    """The product of two symmetric matrices that commute, hence symmetric."""
+    a, b, c, x, y, z = m
+    d, e, f, u, v, w = n
+    return (
+        a * d + x * u + y * v,
+        x * u + b * e + z * w,
+        y * v + z * w + c * f,
+        a * u + x * e + y * w,
+        a * v + x * w + y * f,
+        x * v + b * w + z * f,
+    )
+
+
+def _apply(m: Six, p: Triple) -> Triple:
+    a, b, c, x, y, z = m
+    return a * p[0] + x * p[1] + y * p[2], x * p[0] + b * p[1] + z * p[2], y * p[0] + z * p[1] + c * p[2]
+
+
+def _scale(m: Six, r) -> Six:
+    return tuple(c * r for c in m)
+
+
+def _add_scalar(m: Six, r) -> Six:
+    return (m[0] + r, m[1] + r, m[2] + r, *m[3:])
