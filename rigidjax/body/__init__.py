@@ -5,6 +5,7 @@ from rigidjax.body import (
     shapes as shapes,
     volumes as volumes,
 )
+from rigidjax.body.axes import principal as principal
 from rigidjax.body.ellipsoids import (
     energy_ellipsoid as energy_ellipsoid,
     equal_ellipsoid as equal_ellipsoid,
@@ -20,6 +21,5 @@ from rigidjax.body.energy import (
     spatial_angular_momentum as spatial_angular_momentum,
 )
 from rigidjax.body.inertia import Inertia as Inertia, MassProperties as MassProperties
-from rigidjax.body.principal import principal as principal
 from rigidjax.body.prior import divergence as divergence
 from rigidjax.body.spectral import matrix_function as matrix_function

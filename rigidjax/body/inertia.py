@@ -12,8 +12,8 @@ from jaxtyping import Array, Float
 from rigidjax import _checks
 from rigidjax._types import Mat3, Quat, ScalarLike, Vec3
 from rigidjax.body import physical
+from rigidjax.body.axes import eigensystem, principal
 from rigidjax.body.hints import Matrices, Matrix, Quaternion, Scalars, Vector, Vectors
-from rigidjax.body.principal import eigensystem, principal
 from rigidjax.body.symmetric import (
     apply as apply,
     inverse as inverse,
@@ -113,7 +113,7 @@ class Inertia(eqx.Module):
 
         **Returns** `(moments, q)`, (3,) kg m² and (4,), with `I = R(q) diag(moments) R(q)ᵀ`.
         Derivatives are finite for any body, also at equal moments: see
-        `rigidjax.body.principal.principal` for what they mean there.
+        `rigidjax.body.axes.principal` for what they mean there.
 
         >>> Inertia.from_principal(3.0, 2.0, 2.5).principal()[0]
         Array([2. , 2.5, 3. ], dtype=float64)

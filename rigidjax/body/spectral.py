@@ -8,7 +8,7 @@ import numpy as np
 
 from rigidjax import _checks
 from rigidjax._types import Mat3, Mat3Like, Scalar
-from rigidjax.body.principal import eigensystem
+from rigidjax.body.axes import eigensystem
 from rigidjax.body.symmetric import product
 
 # Eigenvalues within this fraction of the largest are handled by an integral, not a quotient.

@@ -6,7 +6,7 @@ import mpmath
 import numpy as np
 import pytest
 
-from rigidjax.body.principal import principal
+from rigidjax.body.axes import principal
 from rigidjax.body.spectral import matrix_function
 from rigidjax.rotation import quaternion
 
