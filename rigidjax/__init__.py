@@ -20,6 +20,7 @@ from rigidjax.body import (
     angular_momentum as angular_momentum,
     kinetic_energy as kinetic_energy,
     parameters as parameters,
+    shapes as shapes,
     spatial_angular_momentum as spatial_angular_momentum,
 )
 from rigidjax.motion import (

@@ -39,11 +39,11 @@ class AbstractBodyChart(eqx.Module):
 class Ratios(AbstractBodyChart):
     """The whole inertia tensor up to scale: two ratios of moments and the principal axes.
 
-    Five numbers: the log-Cholesky factor of the second moment 𝔖, its determinant fixed
+    Five numbers: the log-Cholesky factor of the second moment 𝔖, its scale fixed
     (Rucker and Wensing 2022, doi:10.1109/LRA.2022.3183759).
 
-    >>> Ratios().inertia(jnp.zeros(5)).moments
-    Array([2., 2., 2.], dtype=float64)
+    >>> Ratios().log_ratios(Ratios().inertia(jnp.zeros(5)))
+    Array([0., 0.], dtype=float64)
     """
 
     size: ClassVar[int] = 5
