@@ -7,3 +7,4 @@ from rigidjax.rotation import (
     rodrigues as rodrigues,
     so3 as so3,
 )
+from rigidjax.rotation.interpolant import AttitudeInterpolant as AttitudeInterpolant

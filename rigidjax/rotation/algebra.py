@@ -3,6 +3,9 @@
 `@` on 3×3 matrices is slow in gradients on CPU and runs in TF32 on some GPUs; these do neither.
 """
 
+from collections.abc import Sequence
+from typing import Any
+
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
@@ -46,18 +49,18 @@ def cross(a: Vec3Like, b: Vec3Like) -> Vec3:
     return jnp.stack(cross_components(components(a), components(b)))
 
 
-def cross_components(a: tuple[Scalar, ...], b: tuple[Scalar, ...]) -> tuple[Scalar, ...]:
+def cross_components(a: Sequence[Scalar], b: Sequence[Scalar]) -> tuple[Scalar, ...]:
     """Vector product of two triples of scalars."""
     (ax, ay, az), (bx, by, bz) = a, b
     return ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
 
 
-def dot_components(a: tuple[Scalar, ...], b: tuple[Scalar, ...]) -> Scalar:
+def dot_components(a: Sequence[Scalar], b: Sequence[Scalar]) -> Scalar:
     """Scalar product of two triples of scalars."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-def square(v: tuple[Scalar, ...]) -> Scalar:
+def square(v: Sequence[Scalar]) -> Scalar:
     """Squared length of a triple of scalars, to be fed to a costly function."""
     value = dot_components(v, v)
     # A division by one (2 for NaN): XLA on CPU computes a quotient once, here and in the gradient,
@@ -91,13 +94,13 @@ def vee(matrix: Mat3Like) -> Vec3:
     return 0.5 * jnp.stack([h - f, c - g, d - b])
 
 
-def basis(dtype: object = float) -> Float[Array, "3 3 3"]:
-    """The matrices J_1, J_2, J_3 with J_i y = e_i × y, ½ Tr(J_iᵀ J_j) = δ_ij (notes, eqs 41–43, 53).
+def basis(dtype: Any = float) -> Float[Array, "3 3 3"]:
+    """The matrices J_1, J_2, J_3: J_i y = e_i × y, ½ Tr(J_iᵀ J_j) = δ_ij (notes, eqs 41–43, 53).
 
     Eq 16 of the notes prints J_3 transposed, that is −J_3 of eq 42; eq 42 holds.
 
-    >>> basis()[2].tolist()
-    [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]]
+    >>> vee(basis()[2]).tolist()
+    [0.0, 0.0, 1.0]
     """
     e = jnp.eye(3, dtype=dtype)
     return jnp.stack([hat(e[0]), hat(e[1]), hat(e[2])])
@@ -111,9 +114,9 @@ def product(a: Mat3Like, b: Mat3Like) -> Mat3:
     >>> product(jnp.eye(3), 2.0 * jnp.eye(3)).tolist()
     [[2.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 2.0]]
     """
-    a = entries(_checks.floating(a, (3, 3), "a"))
-    b = entries(_checks.floating(b, (3, 3), "b"))
-    rows, columns = (a[:3], a[3:6], a[6:]), (b[::3], b[1::3], b[2::3])
+    m = entries(_checks.floating(a, (3, 3), "a"))
+    n = entries(_checks.floating(b, (3, 3), "b"))
+    rows, columns = (m[:3], m[3:6], m[6:]), (n[::3], n[1::3], n[2::3])
     return jnp.stack([dot_components(r, c) for r in rows for c in columns]).reshape(3, 3)
 
 
@@ -125,9 +128,9 @@ def apply(a: Mat3Like, y: Vec3Like) -> Vec3:
     >>> apply(2.0 * jnp.eye(3), jnp.array([1.0, 2.0, 3.0])).tolist()
     [2.0, 4.0, 6.0]
     """
-    a = entries(_checks.floating(a, (3, 3), "a"))
-    y = components(_checks.floating(y, (3,), "y"))
-    return jnp.stack([dot_components(row, y) for row in (a[:3], a[3:6], a[6:])])
+    m = entries(_checks.floating(a, (3, 3), "a"))
+    parts = components(_checks.floating(y, (3,), "y"))
+    return jnp.stack([dot_components(row, parts) for row in (m[:3], m[3:6], m[6:])])
 
 
 def solve(a: Mat3Like, y: Vec3Like) -> Vec3:
@@ -138,11 +141,11 @@ def solve(a: Mat3Like, y: Vec3Like) -> Vec3:
     >>> solve(2.0 * jnp.eye(3), jnp.array([2.0, 4.0, 6.0])).tolist()
     [1.0, 2.0, 3.0]
     """
-    a = entries(_checks.floating(a, (3, 3), "a"))
-    y = components(_checks.floating(y, (3,), "y"))
-    p, q, r = a[::3], a[1::3], a[2::3]
+    m = entries(_checks.floating(a, (3, 3), "a"))
+    parts = components(_checks.floating(y, (3,), "y"))
+    p, q, r = m[::3], m[1::3], m[2::3]
     qr, rp, pq = cross_components(q, r), cross_components(r, p), cross_components(p, q)
-    return jnp.stack([dot_components(c, y) for c in (qr, rp, pq)]) / dot_components(p, qr)
+    return jnp.stack([dot_components(c, parts) for c in (qr, rp, pq)]) / dot_components(p, qr)
 
 
 def determinant(a: Mat3Like) -> Scalar:
@@ -153,8 +156,8 @@ def determinant(a: Mat3Like) -> Scalar:
     >>> float(determinant(jnp.eye(3)))
     1.0
     """
-    a = entries(_checks.floating(a, (3, 3), "a"))
-    return dot_components(a[:3], cross_components(a[3:6], a[6:]))
+    m = entries(_checks.floating(a, (3, 3), "a"))
+    return dot_components(m[:3], cross_components(m[3:6], m[6:]))
 
 
 def dot(a: Vec3Like, b: Vec3Like) -> Scalar:

@@ -2,7 +2,8 @@
 
 q and −q are the same rotation. `log`, and every error built on it, gives the same bits for both.
 The maps here take one quaternion, look at no values and normalise nothing, so that they cost
-little in a vector field; `check` is the gate for data from outside.
+little in a vector field; `check` is the gate for data from outside. Only `from_matrix` looks at the
+values, and only if they are known (not traced).
 """
 
 from collections.abc import Sequence
@@ -10,18 +11,20 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+from jax.core import Tracer
+from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
 from rigidjax import _checks
-from rigidjax._types import Mat3, Mat3Like, Quat, QuatLike, Scalar, Vec3, Vec3Like
-from rigidjax.rotation.algebra import (
-    components,
-    cross_components,
-    dot_components,
-    entries,
-    square,
+from rigidjax._types import Mat3, Mat3Like, Quat, QuatLike, Scalar, ScalarLike, Vec3, Vec3Like
+from rigidjax.rotation.algebra import components, cross_components, dot, dot_components
+from rigidjax.rotation.gate import rotation_matrix, unit_quaternion
+from rigidjax.rotation.maps import (
+    flipped,
+    matrix_to_quaternion,
+    quaternion_to_vector,
+    square4,
+    vector_to_quaternion,
 )
-from rigidjax.special.series import arctan_ratio, inverse_kernel, stumpff
 
 _HINT = "a quaternion is (w, x, y, z), scalar first"
 
@@ -36,10 +39,7 @@ def exp(v: Vec3Like) -> Quat:
     >>> exp(jnp.array([0.0, 0.0, jnp.pi])).round(12).tolist()
     [0.0, 0.0, 0.0, 1.0]
     """
-    x, y, z = v = components(_checks.floating(v, (3,), "v"))
-    s = 0.25 * square(v)
-    half = 0.5 * stumpff(1, s)
-    return jnp.stack([stumpff(0, s), half * x, half * y, half * z])
+    return vector_to_quaternion(_checks.floating(v, (3,), "v"))
 
 
 def log(q: QuatLike) -> Vec3:
@@ -52,10 +52,10 @@ def log(q: QuatLike) -> Vec3:
     Q(q)/|q|, by the inverse right Jacobian, and right from 0 to π (Solà 2018, arXiv:1711.02508;
     the angle is halved twice so that nothing cancels or branches).
 
-    >>> log(jnp.array([0.0, 0.0, 0.0, -1.0])).round(6).tolist()
+    >>> abs(log(jnp.array([0.0, 0.0, 0.0, -1.0]))).round(6).tolist()
     [0.0, 0.0, 3.141593]
     """
-    return _log(_checks.floating(q, (4,), "q", hint=_HINT))
+    return quaternion_to_vector(_checks.floating(q, (4,), "q", hint=_HINT))
 
 
 def multiply(p: QuatLike, q: QuatLike) -> Quat:
@@ -115,16 +115,115 @@ def rotate_inverse(q: QuatLike, y: Vec3Like) -> Vec3:
     return _turn(-w, u, components(_checks.floating(y, (3,), "y")))
 
 
+def check(q: Float[ArrayLike, "*batch 4"], *, name: str = "q") -> Float[Array, "*batch 4"]:
+    """The gate for quaternions from outside: normalised, or refused.
+
+    **Arguments:** `q` (..., 4), scalar first; `name` how messages call it. **Returns:** it, with
+    length 1 to round-off. **Raises:** for NaN, a zero quaternion, and a length off by more than
+    1e-6 (float32: 1e-3); a `ValueError`, or under `jit` `equinox.error_if` with the same words.
+
+    >>> check(jnp.array([1.0, 0.0, 0.0, 1e-9])).tolist()[0]
+    1.0
+    """
+    return unit_quaternion(_checks.floating(q, (4,), name, hint=_HINT, batched=True), name)
+
+
+def from_xyzw(xyzw: QuatLike) -> Quat:
+    """Scalar-last components (SciPy, ROS, glTF) → (w, x, y, z).
+
+    **Arguments:** `xyzw` (4,).
+
+    >>> from_xyzw(jnp.array([0.0, 0.0, 0.0, 1.0])).tolist()
+    [1.0, 0.0, 0.0, 0.0]
+    """
+    return jnp.roll(_checks.floating(xyzw, (4,), "xyzw"), 1)
+
+
+def to_xyzw(q: QuatLike) -> Float[Array, "4"]:
+    """(w, x, y, z) → scalar-last components (SciPy, ROS, glTF).
+
+    **Arguments:** `q` (4,).
+
+    >>> to_xyzw(jnp.array([1.0, 0.0, 0.0, 0.0])).tolist()
+    [0.0, 0.0, 0.0, 1.0]
+    """
+    return jnp.roll(_checks.floating(q, (4,), "q", hint=_HINT), -1)
+
+
+def about_axis(axis: Vec3Like, angle: ScalarLike) -> Quat:
+    """The rotation by an angle about an axis (notes, eqs 17, 18).
+
+    **Arguments:** `axis` (3,), not zero, any length; `angle` rad, right-handed about it.
+
+    >>> about_axis(jnp.array([0.0, 0.0, 2.0]), jnp.pi).round(12).tolist()
+    [0.0, 0.0, 0.0, 1.0]
+    """
+    axis = _checks.floating(axis, (3,), "axis")
+    half = 0.5 * _checks.floating(angle, (), "angle").astype(axis.dtype)
+    unit = axis / jnp.sqrt(dot(axis, axis))
+    return jnp.concatenate([jnp.cos(half)[None], jnp.sin(half) * unit])
+
+
+def advance(q: QuatLike, omega: Vec3Like, dt: ScalarLike) -> Quat:
+    """The attitude after a constant body rate for a time dt: q exp(Ω dt), exact.
+
+    **Arguments:** `q` (4,) unit, body → world; `omega` (3,) rad/s, body frame; `dt` s.
+
+    >>> advance(jnp.array([1.0, 0, 0, 0]), jnp.array([0, 0, jnp.pi]), 1.0).round(12).tolist()
+    [0.0, 0.0, 0.0, 1.0]
+    """
+    omega = _checks.floating(omega, (3,), "omega")
+    dt = _checks.floating(dt, (), "dt").astype(omega.dtype)
+    return multiply(q, exp(dt * omega))
+
+
+def rate(q: QuatLike, omega: Vec3Like) -> Quat:
+    """dq/dt = ½ q (0, Ω), with Ω in the body frame.
+
+    **Arguments:** `q` (4,) unit, body → world; `omega` (3,) rad/s, body frame. **Returns:** 1/s.
+
+    >>> rate(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.array([0.0, 0.0, 2.0])).tolist()
+    [0.0, 0.0, 0.0, 1.0]
+    """
+    omega = _checks.floating(omega, (3,), "omega")
+    return 0.5 * multiply(q, jnp.concatenate([jnp.zeros_like(omega[:1]), omega]))
+
+
+def interpolate(p: QuatLike, q: QuatLike, s: ScalarLike) -> Quat:
+    """The point at s of the shortest turn from p (s = 0) to q (s = 1), at a constant rate.
+
+    **Arguments:** `p`, `q` (4,) unit, either sign; `s` dimensionless, may lie beyond [0, 1]
+    (Shoemake 1985, doi:10.1145/325334.325242; here p exp(s log(p̄ q)), regular at p = q).
+
+    >>> p, q = exp(jnp.array([0, 0, 1.0])), exp(jnp.array([0, 0, 2.0]))
+    >>> bool(abs(interpolate(p, q, 0.5) - exp(jnp.array([0, 0, 1.5]))).max() < 1e-15)
+    True
+    """
+    turn = log(multiply(conjugate(p), q))
+    return multiply(p, exp(_checks.floating(s, (), "s").astype(turn.dtype) * turn))
+
+
+def uniform(key: PRNGKeyArray, dtype: Any = float) -> Quat:
+    """A uniformly distributed random rotation (Haar measure): four normal numbers, normalised.
+
+    **Arguments:** `key` of `jax.random`; `dtype` float32 or float64 (Muller 1959).
+
+    >>> uniform(jax.random.key(0)).shape
+    (4,)
+    """
+    return normalise(jax.random.normal(key, (4,), dtype))
+
+
 def normalise(q: QuatLike) -> Quat:
     """The quaternion of length 1 in the direction of q.
 
     **Arguments:** `q` (4,), not zero. The sign is kept.
 
-    >>> normalise(jnp.array([0.0, 3.0, 0.0, 4.0])).round(12).tolist()
-    [0.0, 0.6, 0.0, 0.8]
+    >>> normalise(jnp.array([0.0, 4.0, 0.0, 0.0])).tolist()
+    [0.0, 1.0, 0.0, 0.0]
     """
     q = _checks.floating(q, (4,), "q", hint=_HINT)
-    return q / jnp.sqrt(_square(components(q)))
+    return q / jnp.sqrt(square4(components(q)))
 
 
 def canonical(q: QuatLike) -> Quat:
@@ -136,7 +235,7 @@ def canonical(q: QuatLike) -> Quat:
     [1.0, -0.0, -0.0, -0.0]
     """
     q = _checks.floating(q, (4,), "q", hint=_HINT)
-    return jnp.where(_flipped(components(q)), -q, q)
+    return jnp.where(flipped(components(q)), -q, q)
 
 
 def angle(q: QuatLike) -> Scalar:
@@ -186,7 +285,8 @@ def to_matrix(q: QuatLike) -> Mat3:
 def from_matrix(matrix: Mat3Like) -> Quat:
     """The canonical unit quaternion of a rotation matrix.
 
-    **Arguments:** `matrix` (3, 3) rotation, body → world. Values are not looked at: `so3.check`.
+    **Arguments:** `matrix` (3, 3) rotation, body → world. **Raises:** as `so3.check`, if its values
+    are known now; inside `jit`, `grad` and `vmap` nothing is looked at.
 
     **Returns:** (4,) with w ≥ 0: the largest of the four rows of 4 q qᵀ, normalised (Shepperd 1978,
     doi:10.2514/3.55767b), so that no case loses digits; the derivative goes through that row only.
@@ -194,18 +294,10 @@ def from_matrix(matrix: Mat3Like) -> Quat:
     >>> from_matrix(jnp.diag(jnp.array([-1.0, -1.0, 1.0]))).tolist()
     [0.0, 0.0, 0.0, 1.0]
     """
-    m = _checks.floating(matrix, (3, 3), "matrix", hint="a rotation matrix is wanted")
-    a, b, c, d, e, f, g, h, i = entries(m)
-    w, x, y, z = 1 + a + e + i, 1 + a - e - i, 1 - a + e - i, 1 - a - e + i
-    wx, wy, wz, xy, yz, zx = h - f, c - g, d - b, b + d, f + h, c + g
-    rows = (w, wx, wy, wz), (wx, x, xy, zx), (wy, xy, y, yz), (wz, zx, yz, z)
-    upper = [jnp.where(x > w, one, other) for one, other in zip(rows[1], rows[0], strict=True)]
-    lower = [jnp.where(z > y, one, other) for one, other in zip(rows[3], rows[2], strict=True)]
-    down = jnp.maximum(y, z) > jnp.maximum(w, x)
-    row = [jnp.where(down, one, other) for one, other in zip(lower, upper, strict=True)]
-    scale = 1 / jnp.sqrt(row[0] ** 2 + row[1] ** 2 + row[2] ** 2 + row[3] ** 2)
-    scale = jnp.where(_flipped(row), -scale, scale)
-    return jnp.stack([scale * part for part in row])
+    matrix = _checks.floating(matrix, (3, 3), "matrix", hint="a rotation matrix is wanted")
+    if not isinstance(matrix, Tracer):
+        matrix = rotation_matrix(matrix, "matrix")
+    return matrix_to_quaternion(matrix)
 
 
 def _turn(w: Scalar, u: Sequence[Scalar], y: Sequence[Scalar]) -> Vec3:
@@ -213,42 +305,3 @@ def _turn(w: Scalar, u: Sequence[Scalar], y: Sequence[Scalar]) -> Vec3:
     t = [2 * part for part in cross_components(u, y)]
     again = cross_components(u, t)
     return jnp.stack([y[i] + (w * t[i] + again[i]) for i in range(3)])
-
-
-def _square(q: Sequence[Scalar]) -> Scalar:
-    return q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]
-
-
-def _flipped(q: Sequence[Scalar]) -> Array:
-    """Whether −q, not q, is canonical."""
-    w, x, y, z = q
-    lead = jnp.where(w != 0, w, jnp.where(x != 0, x, jnp.where(y != 0, y, z)))
-    return lead < 0
-
-
-@jax.custom_jvp
-def _log(q: Quat) -> Vec3:
-    w, x, y, z = parts = components(q)
-    n2 = x * x + y * y + z * z
-    # tan of the half angle is n/|w|, of the quarter n/a, of the eighth n/b: nothing cancels.
-    a = jnp.abs(w) + jnp.sqrt(n2 + w * w)
-    inverse = 1 / (a + jnp.sqrt(n2 + a * a))
-    scale = 8 * inverse * arctan_ratio(n2 * inverse * inverse)
-    scale = jnp.where(_flipped(parts), -scale, scale)
-    return jnp.stack([scale * x, scale * y, scale * z])
-
-
-@_log.defjvp
-def _log_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
-    (q,), (dq,) = primals, tangents
-    v = _log(q)
-    w, *u = parts = components(q)
-    dw, *du = components(dq)
-    # The turn seen from the body, 2 vec(q̄ dq)/|q|², then the inverse right Jacobian.
-    scale, aside = 2 / _square(parts), cross_components(u, du)
-    turn = [scale * (w * du[i] - dw * u[i] - aside[i]) for i in range(3)]
-    vs = components(v)
-    across = cross_components(vs, turn)
-    twice = cross_components(vs, across)
-    g = inverse_kernel(dot_components(vs, vs))
-    return v, jnp.stack([turn[i] + 0.5 * across[i] + g * twice[i] for i in range(3)])

@@ -15,7 +15,7 @@ from rigidjax.rotation.algebra import cross, dot
 
 
 def from_quaternion(q: QuatLike) -> Vec3:
-    """g = q_v/q_w; infinite at a half turn; the same bits for q and −q.
+    """The parameters g = q_v/q_w; infinite at a half turn; the same bits for q and −q.
 
     **Arguments:** `q` (4,), not zero, body → world. **Returns:** (3,) dimensionless.
 

@@ -4,10 +4,13 @@
 function of θ², so that values and derivatives of any order are right at θ = 0.
 """
 
+from typing import Any
+
 import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
 from rigidjax import _checks
-from rigidjax._types import Mat3, Mat3Like, Scalar, Vec3, Vec3Like
+from rigidjax._types import Mat3, Mat3Like, Scalar, ScalarLike, Vec3, Vec3Like
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.algebra import (
     apply as apply,
@@ -22,11 +25,20 @@ from rigidjax.rotation.algebra import (
     square,
     vee as vee,
 )
+from rigidjax.rotation.estimate import (
+    align as align,
+    mean as mean,
+    mean_quaternion as mean_quaternion,
+    project as project,
+    wahba as wahba,
+)
+from rigidjax.rotation.gate import rotation_matrix
+from rigidjax.rotation.maps import hat_polynomial, matrix_to_quaternion, vector_to_matrix
 from rigidjax.special.series import inverse_kernel, stumpff
 
 
 def exp(v: Vec3Like) -> Mat3:
-    """The rotation by |v| about v: exp(hat v) = 1 + A hat v + B (hat v)² (notes, eqs 15, 17, 18).
+    """The rotation by |v| about v: 1 + A hat v + B (hat v)² (notes, eqs 15, 17, 18).
 
     **Arguments:** `v` (3,) rotation vector, rad, any length. A = sin θ/θ, B = (1 − cos θ)/θ²
     (Rodrigues 1840), both from half the angle.
@@ -34,22 +46,19 @@ def exp(v: Vec3Like) -> Mat3:
     >>> exp(jnp.array([0.0, 0.0, jnp.pi / 2])).round(12)[0].tolist()
     [0.0, -1.0, 0.0]
     """
-    v = components(_checks.floating(v, (3,), "v"))
-    s = 0.25 * square(v)
-    half = stumpff(1, s)
-    return _polynomial(v, stumpff(0, s) * half, 0.5 * half * half)
+    return vector_to_matrix(_checks.floating(v, (3,), "v"))
 
 
 def log(matrix: Mat3Like) -> Vec3:
     """The shortest rotation vector of a rotation matrix, rad, |v| ≤ π.
 
-    **Arguments:** `matrix` (3, 3) rotation. Values are not looked at: `check` is the gate.
+    **Arguments:** `matrix` (3, 3) rotation. **Raises:** as `check`, if its values are known now.
 
     **Returns:** (3,), by way of the quaternion: right to round-off, with its derivatives, from 0
     to π. At a half turn, of v and −v the one whose first nonzero component is positive.
 
-    >>> log(exp(jnp.array([0.1, 0.2, 0.3]))).round(12).tolist()
-    [0.1, 0.2, 0.3]
+    >>> bool(abs(log(exp(jnp.array([0.1, 0.2, 0.3]))) - jnp.array([0.1, 0.2, 0.3])).max() < 1e-15)
+    True
     """
     return quaternion.log(quaternion.from_matrix(matrix))
 
@@ -63,9 +72,9 @@ def left_jacobian(v: Vec3Like) -> Mat3:
     >>> left_jacobian(jnp.zeros(3)).tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
     """
-    v = components(_checks.floating(v, (3,), "v"))
-    t = square(v)
-    return _polynomial(v, stumpff(2, t), stumpff(3, t))
+    parts = components(_checks.floating(v, (3,), "v"))
+    t = square(parts)
+    return hat_polynomial(parts, stumpff(2, t), stumpff(3, t))
 
 
 def right_jacobian(v: Vec3Like) -> Mat3:
@@ -87,9 +96,9 @@ def left_jacobian_inverse(v: Vec3Like) -> Mat3:
     >>> left_jacobian_inverse(jnp.zeros(3)).tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
     """
-    v = components(_checks.floating(v, (3,), "v"))
-    t = square(v)
-    return _polynomial(v, jnp.full_like(t, -0.5), inverse_kernel(t))
+    parts = components(_checks.floating(v, (3,), "v"))
+    t = square(parts)
+    return hat_polynomial(parts, jnp.full_like(t, -0.5), inverse_kernel(t))
 
 
 def right_jacobian_inverse(v: Vec3Like) -> Mat3:
@@ -114,25 +123,135 @@ def distance(a: Mat3Like, b: Mat3Like) -> Scalar:
     3.0
     """
     a, b = _checks.floating(a, (3, 3), "a"), _checks.floating(b, (3, 3), "b")
-    return quaternion.angle(quaternion.from_matrix(product(a.T, b)))
+    return quaternion.angle(matrix_to_quaternion(product(a.T, b)))
 
 
-def _polynomial(v: tuple[Scalar, ...], a: Scalar, b: Scalar) -> Mat3:
-    """1 + a hat v + b (hat v)²."""
-    x, y, z = v
-    xx, yy, zz = b * x * x, b * y * y, b * z * z
-    xy, yz, zx = b * x * y, b * y * z, b * z * x
-    ax, ay, az = a * x, a * y, a * z
-    return jnp.stack(
-        [
-            1 - yy - zz,
-            xy - az,
-            zx + ay,
-            xy + az,
-            1 - zz - xx,
-            yz - ax,
-            zx - ay,
-            yz + ax,
-            1 - xx - yy,
-        ]
-    ).reshape(3, 3)
+def about_axis(axis: Vec3Like, angle: ScalarLike) -> Mat3:
+    """The rotation exp(γ J_y) by an angle γ about an axis y (notes, eqs 17, 18).
+
+    **Arguments:** `axis` (3,), not zero, any length; `angle` rad, right-handed about it.
+
+    >>> about_axis(jnp.array([0.0, 0.0, 2.0]), jnp.pi / 2).round(12)[0].tolist()
+    [0.0, -1.0, 0.0]
+    """
+    return quaternion.to_matrix(quaternion.about_axis(axis, angle))
+
+
+def adjoint(matrix: Mat3Like) -> Mat3:
+    """Ad_M, with M hat(w) Mᵀ = hat(Ad_M w): on SO(3) it is M itself (notes, eq 48 with Mᵀ).
+
+    **Arguments:** `matrix` (3, 3) rotation.
+
+    >>> adjoint(jnp.eye(3)).tolist()
+    [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+    """
+    return _checks.floating(matrix, (3, 3), "matrix")
+
+
+def to_world(matrix: Mat3Like, y: Vec3Like) -> Vec3:
+    """Body components → world components, y = M y' (notes, eqs 8, 21).
+
+    **Arguments:** `matrix` (3, 3) rotation, body → world; `y` (3,) in the body frame.
+
+    >>> to_world(jnp.eye(3), jnp.array([1.0, 2.0, 3.0])).tolist()
+    [1.0, 2.0, 3.0]
+    """
+    return apply(matrix, y)
+
+
+def to_body(matrix: Mat3Like, y: Vec3Like) -> Vec3:
+    """World components → body components, y' = Mᵀ y (notes, eqs 8, 22).
+
+    **Arguments:** `matrix` (3, 3) rotation, body → world; `y` (3,) in the world frame.
+
+    >>> to_body(jnp.eye(3), jnp.array([1.0, 2.0, 3.0])).tolist()
+    [1.0, 2.0, 3.0]
+    """
+    return apply(_checks.floating(matrix, (3, 3), "matrix").T, y)
+
+
+def conjugate(turn: Mat3Like, matrix: Mat3Like) -> Mat3:
+    """A turn known in the body frame, as the world sees it: M T Mᵀ (notes, eqs 25, 26).
+
+    **Arguments:** `turn` (3, 3) in the frame of the body; `matrix` (3, 3), body → world.
+
+    >>> conjugate(jnp.eye(3), jnp.eye(3)).tolist()
+    [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+    """
+    matrix = _checks.floating(matrix, (3, 3), "matrix")
+    return product(matrix, product(turn, matrix.T))
+
+
+def rate(matrix: Mat3Like, omega: Vec3Like) -> Mat3:
+    """dM/dt = M hat(Ω) (notes, eq 50).
+
+    **Arguments:** `matrix` (3, 3), body → world; `omega` (3,) rad/s, body frame.
+
+    >>> rate(jnp.eye(3), jnp.array([0.0, 0.0, 2.0]))[1].tolist()
+    [2.0, 0.0, 0.0]
+    """
+    return product(matrix, hat(omega))
+
+
+def body_rate(matrix: Mat3Like, rate: Mat3Like) -> Vec3:
+    """Ω from M and dM/dt: Ω_i = ½ Tr(Mᵀ Ṁ J_iᵀ) (notes, eqs 48–50, 80).
+
+    **Arguments:** `matrix` (3, 3), body → world; `rate` (3, 3), 1/s. **Returns:** (3,) rad/s, body
+    frame. What is not antisymmetric in MᵀṀ is dropped.
+
+    >>> body_rate(jnp.eye(3), hat(jnp.array([1.0, 2.0, 3.0]))).tolist()
+    [1.0, 2.0, 3.0]
+    """
+    return vee(product(_checks.floating(matrix, (3, 3), "matrix").T, rate))
+
+
+def world_rate(matrix: Mat3Like, rate: Mat3Like) -> Vec3:
+    """The angular velocity w in space from M and dM/dt: hat(w) = Ṁ Mᵀ (notes, eqs 36–42, 50).
+
+    **Arguments:** `matrix` (3, 3), body → world; `rate` (3, 3), 1/s. **Returns:** (3,) rad/s, world
+    frame.
+
+    >>> world_rate(jnp.eye(3), hat(jnp.array([1.0, 2.0, 3.0]))).tolist()
+    [1.0, 2.0, 3.0]
+    """
+    return vee(product(rate, _checks.floating(matrix, (3, 3), "matrix").T))
+
+
+def interpolate(a: Mat3Like, b: Mat3Like, s: ScalarLike) -> Mat3:
+    """The point at s of the shortest turn from a (s = 0) to b (s = 1): a exp(s log(aᵀb)).
+
+    **Arguments:** `a`, `b` (3, 3) rotations; `s` dimensionless, may lie beyond [0, 1].
+
+    >>> interpolate(jnp.eye(3), exp(jnp.array([0.0, 0.0, 2.0])), 0.5).round(6)[0].tolist()
+    [0.540302, -0.841471, 0.0]
+    """
+    a, b = _checks.floating(a, (3, 3), "a"), _checks.floating(b, (3, 3), "b")
+    turn = quaternion.log(matrix_to_quaternion(product(a.T, b)))
+    return product(a, exp(_checks.floating(s, (), "s").astype(turn.dtype) * turn))
+
+
+def uniform(key: PRNGKeyArray, dtype: Any = float) -> Mat3:
+    """A uniformly distributed random rotation (Haar measure).
+
+    **Arguments:** `key` of `jax.random`; `dtype` float32 or float64.
+
+    >>> import jax
+    >>> uniform(jax.random.key(0)).shape
+    (3, 3)
+    """
+    return quaternion.to_matrix(quaternion.uniform(key, dtype))
+
+
+def check(
+    matrix: Float[ArrayLike, "*batch 3 3"], *, name: str = "matrix"
+) -> Float[Array, "*batch 3 3"]:
+    """The gate for matrices from outside: returned as they are, or refused.
+
+    **Arguments:** `matrix` (..., 3, 3); `name` how messages call it. **Raises:** for NaN, a
+    left-handed frame (det < 0), and |MᵀM − 1| above 1e-6 (float32: 1e-3); a `ValueError`, or under
+    `jit` `equinox.error_if` with the same words. `project` gives the nearest rotation.
+
+    >>> check(jnp.eye(3)).shape
+    (3, 3)
+    """
+    return rotation_matrix(_checks.floating(matrix, (3, 3), name, batched=True), name)

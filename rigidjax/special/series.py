@@ -82,7 +82,7 @@ def arctan_ratio(z: Float[Array, "..."]) -> Float[Array, "..."]:
 
 
 def _cosine_or_sinc(k: int, t: Float[Array, "..."]) -> Float[Array, "..."]:
-    """The cosine (k = 0) or sin θ/θ (k = 1) from t = θ²; beyond π/2, θ is reduced by multiples of π."""
+    """The cosine (k = 0) or sin θ/θ (k = 1) from t = θ²; beyond π/2, θ is reduced by kπ."""
     limit = (math.pi / 2) ** 2
     far = t > limit
     theta = jnp.sqrt(jnp.where(far, t, 1))
@@ -92,8 +92,8 @@ def _cosine_or_sinc(k: int, t: Float[Array, "..."]) -> Float[Array, "..."]:
     remainder = (theta - turns * head) - turns * tail
     value = _polynomial(k, jnp.where(far, remainder * remainder, t), limit)
     value = value * jnp.where(far, remainder, 1) if k else value
-    # The sign goes into a division although a product would do: XLA on CPU computes a quotient once,
-    # but repeats a polynomial in each place where it is used.
+    # The sign goes into a division although a product would do: XLA on CPU computes a quotient
+    # once, but repeats a polynomial in each place where it is used.
     sign = 1 - 2 * (turns - 2 * jnp.floor(0.5 * turns))
     return value / jnp.where(far, sign * theta if k else sign, 1)
 

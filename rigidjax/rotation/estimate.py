@@ -1,0 +1,205 @@
+"""The rotation that fits best: projection, alignment, Wahba's problem, mean (floor 1).
+
+No singular value decomposition and no eigenvectors: their derivatives are NaN at every rotation,
+where all three singular values are 1. The best rotation R of a 3×3 matrix B, the one with the
+largest Tr(RᵀB), has the derivative dR = R hat(x), (Tr(S) 1 − S) x = 2 vee(Rᵀ dB), S = sym(RᵀB),
+which is regular wherever the answer is unique.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.core import Tracer
+from jaxtyping import Array, ArrayLike, Float
+
+from rigidjax import _checks
+from rigidjax._types import Mat3, Mat3Like, Quat, Scalar, Vec3, Vec3Like
+from rigidjax.rotation import quaternion
+from rigidjax.rotation.algebra import cross, determinant, dot, hat, product, solve, vee
+from rigidjax.rotation.maps import matrix_to_quaternion
+from rigidjax.special.series import inverse_kernel
+
+
+def project(matrix: Mat3Like) -> Mat3:
+    """The rotation nearest to a matrix (Frobenius norm), with the right derivative on SO(3) too.
+
+    **Arguments:** `matrix` (3, 3), det > 0. **Returns:** (3, 3) with RᵀR = 1 to round-off.
+
+    **Raises:** `ValueError` if a matrix known now is left-handed (a mirror image has no nearest
+    rotation), singular, or not finite; under `jit` put `so3.check` or a test of your own before.
+
+    >>> project(2.0 * jnp.eye(3)).round(12).tolist()
+    [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+    """
+    matrix = _checks.floating(matrix, (3, 3), "matrix")
+    if not isinstance(matrix, Tracer):
+        _checks.finite(matrix, "matrix")
+        found = np.linalg.det(np.asarray(matrix))
+        if found <= 0:
+            raise ValueError(
+                f"matrix: left-handed frame or singular, det = {found:.3g}; no rotation is nearest"
+            )
+    return _best(matrix)
+
+
+def wahba(
+    body: Float[ArrayLike, "n 3"],
+    world: Float[ArrayLike, "n 3"],
+    weights: Float[ArrayLike, "n"] | None = None,
+) -> Mat3:
+    """The rotation M, body → world, least in Σ w_i |world_i − M body_i|² (Wahba 1965).
+
+    **Arguments:** `body`, `world` (n, 3), n ≥ 2: the same directions in both frames, any units;
+    `weights` (n,), not negative, 1 if not given. Solved for the largest root of the quartic of
+    Markley 1993 (FOAM, J. Astronaut. Sci. 41, 261), then by Newton's method on the group.
+
+    **Raises:** an error, under `jit` too, if the directions leave a turn free (fewer than two, or
+    all parallel).
+
+    >>> wahba(jnp.eye(3)[:2], jnp.eye(3)[:2]).round(12).tolist()
+    [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+    """
+    body = jnp.asarray(body)
+    body = _checks.floating(body, (*body.shape[:1], 3), "body")
+    world = _checks.floating(world, body.shape, "world")
+    w = jnp.ones_like(body[:, 0]) if weights is None else jnp.asarray(weights)
+    w = _checks.floating(w, body.shape[:1], "weights")
+    b = (w[:, None, None] * world[:, :, None] * body[:, None, :]).sum(0)
+    # ζ = (σ1 + σ2)(σ2 + σ3)(σ3 + σ1), σ3 with the sign of det: 0 where a turn is free.
+    size = jnp.sqrt((b * b).sum())
+    zeta = _quartic(b / size)[1]
+    b = _checks.refuse(
+        b,
+        ~(zeta > 100 * jnp.finfo(b.dtype).eps),
+        "wahba: these directions do not fix the attitude; two that are not parallel are needed",
+    )
+    return _best(b)
+
+
+def align(a: Vec3Like, b: Vec3Like) -> Mat3:
+    """The smallest rotation that takes the direction of a into that of b.
+
+    **Arguments:** `a`, `b` (3,), not zero, in one frame, any lengths. **Returns:** (3, 3), R a ∥ b.
+    For exactly opposite directions: half a turn about the axis normal to a that is nearest to the
+    basis vector along which a is smallest. No digits are lost near there (half of a + b is the
+    direction turned to; Markley & Crassidis 2014, sec. 2.9.4 in other words).
+
+    >>> align(jnp.array([1.0, 0, 0]), jnp.array([0, 2.0, 0])).round(12)[:, 0].tolist()
+    [0.0, 1.0, 0.0]
+    """
+    a, b = _checks.floating(a, (3,), "a"), _checks.floating(b, (3,), "b")
+    a, b = a / jnp.sqrt(dot(a, a)), b / jnp.sqrt(dot(b, b))
+    middle = a + b
+    n2 = dot(middle, middle)
+    opposite = n2 == 0
+    length = jnp.sqrt(jnp.where(opposite, 1, n2))
+    smallest = jnp.eye(3, dtype=a.dtype)[jnp.argmin(jnp.abs(a))]
+    across = smallest - dot(smallest, a) * a
+    axis = jnp.where(opposite, across / jnp.sqrt(dot(across, across)), cross(a, middle) / length)
+    w = jnp.where(opposite, 0, 0.5 * length)
+    return quaternion.to_matrix(jnp.concatenate([w[None], axis]))
+
+
+def mean(matrices: Float[ArrayLike, "n 3 3"], weights: Float[ArrayLike, "n"] | None = None) -> Mat3:
+    """The Karcher mean: the rotation least in Σ w_i |angle to R_i|².
+
+    **Arguments:** `matrices` (n, 3, 3) rotations, within a quarter turn of the mean, where it is
+    unique (Karcher 1977, doi:10.1002/cpa.3160300502); `weights` (n,), not negative.
+
+    **Returns:** (3, 3), with first and second derivatives from the last two Newton steps alone.
+
+    >>> mean(jnp.stack([jnp.eye(3), jnp.eye(3)])).round(12).tolist()
+    [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+    """
+    matrices = jnp.asarray(matrices)
+    matrices = _checks.floating(matrices, (*matrices.shape[:1], 3, 3), "matrices")
+    return quaternion.to_matrix(mean_quaternion(jax.vmap(matrix_to_quaternion)(matrices), weights))
+
+
+def mean_quaternion(
+    quaternions: Float[ArrayLike, "n 4"], weights: Float[ArrayLike, "n"] | None = None
+) -> Quat:
+    """The Karcher mean of unit quaternions; each may have either sign.
+
+    **Arguments:** `quaternions` (n, 4); `weights` (n,). See `mean`. **Returns:** (4,), w ≥ 0.
+
+    >>> mean_quaternion(jnp.array([[1.0, 0, 0, 0], [-1.0, 0, 0, 0]])).tolist()
+    [1.0, 0.0, 0.0, 0.0]
+    """
+    q = jnp.asarray(quaternions)
+    q = _checks.floating(q, (*q.shape[:1], 4), "quaternions")
+    w = jnp.ones_like(q[:, 0]) if weights is None else jnp.asarray(weights)
+    w = _checks.floating(w, q.shape[:1], "weights")
+
+    def newton(_: Any, start: Quat, q: Array, w: Array) -> Quat:
+        apart = jax.vmap(lambda each: quaternion.multiply(quaternion.conjugate(start), each))(q)
+        v = jax.vmap(quaternion.log)(apart)
+        slope = (w[:, None, None] * jax.vmap(_left_jacobian_inverse)(v)).sum(0)
+        return quaternion.multiply(start, quaternion.exp(solve(slope, (w[:, None] * v).sum(0))))
+
+    fixed_q, fixed_w = lax.stop_gradient((q, w))
+    chord = (fixed_w[:, None, None] * jax.vmap(quaternion.to_matrix)(fixed_q)).sum(0)
+    start = matrix_to_quaternion(_best(chord))
+    start = lax.fori_loop(0, 6, lambda i, s: newton(i, s, fixed_q, fixed_w), start)
+    # Each Newton step from the solution doubles the order to which derivatives are right.
+    for i in range(2):
+        start = newton(i, lax.stop_gradient(start) if i == 0 else start, q, w)
+    return quaternion.canonical(quaternion.normalise(start))
+
+
+def _left_jacobian_inverse(v: Vec3) -> Mat3:
+    h = hat(v)
+    return jnp.eye(3, dtype=v.dtype) - 0.5 * h + inverse_kernel(dot(v, v)) * product(h, h)
+
+
+def _quartic(b: Mat3) -> tuple[Scalar, Scalar]:
+    """The sum of the singular values λ (signed by det), and ζ, of a matrix of Frobenius norm 1."""
+    det, adjugate = determinant(b), _cofactors(b)
+    flat = 4 * (adjugate * adjugate).sum()
+
+    def newton(_: Any, root: Scalar) -> Scalar:
+        excess = root * root - 1
+        slope = 4 * root * excess - 8 * det
+        return root - (excess * excess - 8 * det * root - flat) / jnp.where(slope > 0, slope, 1)
+
+    # From above the largest root, Newton's method comes down to it without overshooting.
+    root = lax.fori_loop(0, 12, newton, jnp.full_like(det, np.sqrt(3)))
+    return root, 0.5 * (root * root - 1) * root - det
+
+
+def _cofactors(b: Mat3) -> Mat3:
+    return jnp.stack([cross(b[1], b[2]), cross(b[2], b[0]), cross(b[0], b[1])])
+
+
+def _step(r: Mat3, b: Mat3) -> tuple[Mat3, Mat3]:
+    """Rᵀb, and the curvature Tr(S) 1 − S of the gain Tr(RᵀB) at R."""
+    m = product(r.T, b)
+    s = 0.5 * (m + m.T)
+    return m, (s[0, 0] + s[1, 1] + s[2, 2]) * jnp.eye(3, dtype=r.dtype) - s
+
+
+@jax.custom_jvp
+def _best(b: Mat3) -> Mat3:
+    b = b / jnp.sqrt((b * b).sum())
+    root, zeta = _quartic(b)
+    kappa = 0.5 * (root * root - 1)
+    rough = ((kappa + 1) * b + root * _cofactors(b) - product(b, product(b.T, b))) / zeta
+    q = matrix_to_quaternion(rough)
+    # The root of the quartic may have half its digits; two Newton steps on the group mend that.
+    for _ in range(2):
+        m, curvature = _step(quaternion.to_matrix(q), b)
+        q = quaternion.normalise(
+            quaternion.multiply(q, quaternion.exp(solve(curvature, 2 * vee(m))))
+        )
+    return quaternion.to_matrix(q)
+
+
+@_best.defjvp
+def _best_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
+    (b,), (db,) = primals, tangents
+    r = _best(b)
+    _, curvature = _step(r, b)
+    return r, product(r, hat(solve(curvature, 2 * vee(product(r.T, db)))))
