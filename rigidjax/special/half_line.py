@@ -1,0 +1,89 @@
+"""Integrals of products of powers over the half line, and so every derivative of an elliptic integral.
+
+    H(b; a) = ∫₀^∞ ∏ (t + aᵢ)^(−bᵢ) dt
+
+Carlson's R_F, R_D, R_J are of this form (DLMF 19.16.1, 19.16.2, 19.16.5), and the family is closed
+under differentiation: ∂H/∂aᵢ = −bᵢ H(b + eᵢ; a). The integrand is positive, so nothing cancels,
+whatever the order. In s = ln t it is analytic for |Im s| < π and decays exponentially: the plain
+trapezoidal rule converges like exp(−2π²/h) (Trefethen & Weideman 2014, doi 10.1137/130932132), and
+a number of nodes fixed by the dtype reaches round-off for arguments of very different sizes.
+"""
+
+import math
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.custom_derivatives import SymbolicZero
+from jaxtyping import Array, Float
+
+# Enough that h < 0.5 (float64) or 0.95 (float32) for arguments in ratios of 1e35.
+_NODES = {np.dtype("float64"): 384, np.dtype("float32"): 136}
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def half_line(
+    powers: tuple[float, ...], arguments: tuple[Float[Array, "..."], ...]
+) -> Float[Array, "..."]:
+    """∫₀^∞ ∏ (t + aᵢ)^(−bᵢ) dt for aᵢ ≥ 0, to a few units of round-off.
+
+    **Arguments:** `powers` the bᵢ, multiples of ½ with Σ bᵢ > 1 (negative ones may be among them).
+    `arguments` the aᵢ, of one shape and dtype, dimensionless or of one unit.
+
+    **Returns:** an array of that shape. Infinite where the integral diverges at 0 (zero arguments
+    whose powers add up to 1 or more); NaN for a negative argument. Derivatives of every order by
+    the same rule; an argument that is not differentiated costs nothing and may be 0. Full accuracy
+    for ratios of the aᵢ up to 1e35; 1e-13 at 1e60.
+
+    >>> round(float(half_line((2.0,), (jnp.asarray(4.0),))), 12)
+    0.25
+    """
+    dtype = arguments[0].dtype
+    largest = arguments[0]
+    for a in arguments[1:]:
+        largest = jnp.maximum(largest, a)
+    scale = jnp.where(largest > 0, largest, 1)
+    scaled = [a / scale for a in arguments]
+
+    smallest, at_zero = jnp.ones_like(scale), jnp.ones_like(scale)
+    for a, power in zip(scaled, powers, strict=True):
+        smallest = jnp.where(a > 0, jnp.minimum(smallest, a), smallest)
+        at_zero = jnp.where(a == 0, at_zero - power, at_zero)
+    digits = -math.log(float(jnp.finfo(dtype).eps) / 8)
+    low = jnp.log(smallest) - digits / jnp.maximum(at_zero, 0.5)
+    high = digits / (sum(powers) - 1)
+    nodes = _NODES[np.dtype(dtype)]
+    step = (high - low) / nodes
+    count = (jnp.arange(nodes, dtype=dtype) + 0.5).reshape((1,) * scale.ndim + (nodes,))
+    t = jnp.exp(low[..., None] + step[..., None] * count)
+
+    # t first: then the running product stays between the sizes of its neighbours.
+    product = t
+    for a, power in zip(scaled, powers, strict=True):
+        product = product * _power(t + a[..., None], power)
+    value = product.sum(-1) * step * _power(scale, sum(powers) - 1)
+    value = jnp.where(at_zero > 0, value, jnp.inf)
+    negative = jnp.isnan(largest)
+    for a in arguments:
+        negative = negative | ~(a >= 0)
+    return jnp.where(negative, jnp.nan, value)
+
+
+@partial(half_line.defjvp, symbolic_zeros=True)
+def _half_line_jvp(powers: Any, primals: Any, tangents: Any) -> tuple[Any, Any]:
+    (arguments,), (directions,) = primals, tangents
+    tangent = jnp.zeros_like(arguments[0])
+    for i, direction in enumerate(directions):
+        if powers[i] and not isinstance(direction, SymbolicZero):
+            raised = (*powers[:i], powers[i] + 1, *powers[i + 1 :])
+            tangent = tangent - powers[i] * half_line(raised, arguments) * direction
+    return half_line(powers, arguments), tangent
+
+
+def _power(x: Float[Array, "..."], power: float) -> Float[Array, "..."]:
+    """x^(−power) for multiples of ½, by a square root and products."""
+    whole = math.floor(power)
+    value = jax.lax.integer_pow(1 / x, whole) if whole else jnp.ones_like(x)
+    return value * jax.lax.rsqrt(x) if power > whole else value

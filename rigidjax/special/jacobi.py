@@ -1,0 +1,176 @@
+"""Jacobi's elliptic functions sn, cn, dn and the amplitude, for every real parameter (floor 0).
+
+Values: the argument is reduced by the half period 2K, then Bulirsch's descending transformation
+(1965, doi 10.1007/BF01397975) works with 1 − m, so that nothing is lost as m → 1.
+
+Derivatives: with φ = am(u|m) and u = F(φ|m), keeping u fixed gives ∂φ/∂m = dn X with
+
+    X = −∂F/∂m = −½ ∫₀^u sd²(v) dv.
+
+The integrand is positive: X has all its digits at m = 0 and as m → 1, where the textbook formulas
+(DLMF 22.13 has none in m; Byrd & Friedman 1971, 710.50–53) divide a small difference by m m1.
+"""
+
+import math
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.custom_derivatives import SymbolicZero
+from jaxtyping import Array, ArrayLike, Float
+
+from rigidjax.special.arguments import common, complementary, exact_complement
+from rigidjax.special.legendre import MEAN_STEPS, complete, half_turns, integral
+
+# Below this cn and dn, integrals over sd² depend on their ratio only (to the floor squared).
+_FLOOR = {np.dtype("float64"): 1e-40, np.dtype("float32"): 1e-8}
+
+
+def sncndn(
+    u: Float[ArrayLike, "..."],
+    m: Float[ArrayLike, "..."],
+    m1: Float[ArrayLike, "..."] | None = None,
+) -> tuple[Float[Array, "..."], Float[Array, "..."], Float[Array, "..."]]:
+    """Jacobi's sn(u|m), cn(u|m), dn(u|m).
+
+    **Arguments:** `u` real, any size. `m` the parameter k², not the modulus: any real number,
+    also negative or above 1. `m1` = 1 − m given exactly, where m is so near 1 that 1 − m would
+    lose digits; then the functions are functions of m1 alone, value and derivative, and m only
+    lends its digits where it is small. Shapes broadcast.
+
+    **Returns:** three arrays (DLMF 22.2.4–6). m = 0 gives sin, cos, 1; m = 1 gives tanh, sech,
+    sech (DLMF 22.5.3–4); m < 0 and m > 1 by DLMF 22.17. Exact derivatives of every order in u
+    (DLMF 22.13(i)), m, m1.
+
+    **Raises:** `TypeError` for half precision; `ValueError` for shapes that do not broadcast or
+    m + m1 ≠ 1.
+
+    >>> [round(float(x), 12) for x in sncndn(1.0, 0.5)]
+    [0.803001820652, 0.595976566803, 0.823161001284]
+    """
+    u, m, m1 = common(u=u, **complementary("m", m, m1))
+    s, c, d, _ = _functions(u, exact_complement(m, m1), m1)
+    return s, c, d
+
+
+def am(
+    u: Float[ArrayLike, "..."],
+    m: Float[ArrayLike, "..."],
+    m1: Float[ArrayLike, "..."] | None = None,
+) -> Float[Array, "..."]:
+    """Jacobi's amplitude am(u|m) = ∫₀^u dn(v|m) dv, rad: the inverse of F(φ|m) for m ≤ 1.
+
+    **Arguments:** as `sncndn`. For m ≤ 1 the amplitude grows by π each half period 2K, without
+    jumps; for m > 1 it swings within |φ| ≤ arcsin(1/√m).
+
+    **Returns:** DLMF 22.16.1–3.
+
+    **Raises:** as `sncndn`.
+
+    >>> round(float(am(1.0, 0.5)), 12)
+    0.932315052374
+    """
+    u, m, m1 = common(u=u, **complementary("m", m, m1))
+    s, c, _, turns = _functions(u, exact_complement(m, m1), m1)
+    sign = _parity(turns)
+    return jnp.arctan2(sign * s, sign * c) + math.pi * turns
+
+
+def _functions(u: Any, m: Any, m1: Any) -> tuple[Any, Any, Any, Any]:
+    """sn, cn, dn and the half turns of the amplitude, any real m, from 0 ≤ m ≤ 1."""
+    negative, above = m < 0, m1 < 0
+    # DLMF 22.17.2–4: m > 1 becomes 1/m; 22.17.6–8: m < 0 becomes −m/m1.
+    divisor = jnp.where(above, m, jnp.where(negative, m1, 1))
+    root = jnp.sqrt(divisor)
+    inner_m = jnp.where(above, 1, jnp.where(negative, -m, m)) / divisor
+    inner_m1 = jnp.where(above, -m1, jnp.where(negative, 1, m1)) / divisor
+    v = u * root
+    s, c, d = _core(v, inner_m, inner_m1)
+    turns = _turns(jax.lax.stop_gradient(v), jax.lax.stop_gradient(inner_m1))[0]
+
+    quotient = jnp.where(negative, d, 1)
+    first = s / (root * quotient)
+    second = jnp.where(above, d, c / quotient)
+    third = jnp.where(above, c, jnp.where(negative, 1 / quotient, d))
+    return first, second, third, jnp.where(above, 0, turns)
+
+
+@jax.custom_jvp
+def _core(u: Any, m: Any, m1: Any) -> tuple[Any, Any, Any]:
+    """sn, cn, dn for 0 ≤ m ≤ 1, as functions of u and m1; m must be the complement of m1."""
+    turns, angle, lows, highs, mean = _turns(u, m1)
+    sign = _parity(turns)
+    theta = jnp.abs(angle)
+    # Bulirsch's recursion carries cot φ, which is too large at first for tiny arguments.
+    tiny = jnp.abs(u) < float(jnp.finfo(u.dtype).eps) ** (1 / 3)
+    safe = jnp.where(tiny, 1, theta)
+    a = jnp.cos(safe) / jnp.sin(safe)
+    c, d = mean * a, jnp.ones_like(u)
+    for low, high in zip(lows[::-1], highs[::-1], strict=True):
+        a, c = a * c, c * d
+        d = (high + a) / (low + a)
+        a = c / low
+    hypotenuse = jnp.sqrt(1 + c * c)
+    s = jnp.where(angle < 0, -sign, sign) / hypotenuse
+    c = sign * c / hypotenuse
+
+    square = u * u
+    s = jnp.where(tiny, u * (1 - square * (1 + m) / 6), s)
+    c = jnp.where(tiny, 1 - square / 2, c)
+    d = jnp.where(tiny, 1 - m * square / 2, d)
+
+    # m = 1. Beyond the clip sech would underflow, and its quotients with it.
+    largest = 0.97 * math.log(float(jnp.finfo(u.dtype).max))
+    e = jnp.exp(-jnp.minimum(jnp.abs(u), largest))
+    sech = 2 * e / (1 + e * e)
+    hyperbolic = m1 == 0
+    return (
+        jnp.where(hyperbolic, jnp.tanh(u), s),
+        jnp.where(hyperbolic, sech, c),
+        jnp.where(hyperbolic, sech, d),
+    )
+
+
+@partial(_core.defjvp, symbolic_zeros=True)
+def _core_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
+    u, m, m1 = primals
+    du, _, dm1 = tangents
+    values = s, c, d = _core(u, m, m1)
+    ds, dc, dd = jnp.zeros_like(u), jnp.zeros_like(u), jnp.zeros_like(u)
+    if not isinstance(du, SymbolicZero):
+        # DLMF 22.13.1–3.
+        ds, dc, dd = c * d * du, -s * d * du, -m * s * c * du
+    if not isinstance(dm1, SymbolicZero):
+        turns = _turns(jax.lax.stop_gradient(u), jax.lax.stop_gradient(m1))[0]
+        sign = _parity(turns)
+        # Where cn and dn are minute, raise both by one factor: X ~ 1/dn² must not overflow.
+        floor = _FLOOR[np.dtype(u.dtype)]
+        up = jnp.maximum(1, floor / jax.lax.stop_gradient(d))
+        c, d = c * up, d * up
+        near = turns == 0
+        whole = complete((1, 1, 0), jnp.where(near, 1, m1 * up * up))
+        x = integral((1, 1, 0), sign * s, sign * c, m1 * up * up, jnp.ones_like(m1))
+        half = 0.5 * (x + jnp.where(near, 0, 2 * turns * whole)) * dm1
+        ds = ds + c * d * half
+        dc = dc - s * d * half * up
+        dd = dd + (0.5 * s * s / d * dm1 - m * s * c * half) * up
+    return values, (ds, dc, dd)
+
+
+def _turns(u: Any, m1: Any) -> tuple[Any, Any, list[Any], list[Any], Any]:
+    """Half periods n in u, what is left as an angle πr/2K, the two rows of means, agm(1, √m1)."""
+    a, b = jnp.ones_like(m1), jnp.sqrt(jnp.where(m1 == 0, 1, m1))
+    lows, highs = [], []
+    for _ in range(MEAN_STEPS[np.dtype(m1.dtype)]):
+        lows.append(a)
+        highs.append(b)
+        a, b = 0.5 * (a + b), jnp.sqrt(a * b)
+    turns, angle = half_turns(u * a)
+    return jnp.where(m1 == 0, 0, turns), angle, lows, highs, a
+
+
+def _parity(turns: Any) -> Any:
+    """(−1)ⁿ."""
+    return 1 - 2 * (turns - 2 * jnp.floor(0.5 * turns))
