@@ -35,7 +35,7 @@ def kinetic_energy(body: Inertia | MassProperties, state: HasSpin | Vector) -> S
     >>> kinetic_energy(Inertia.from_principal(1.0, 2.0, 3.0), [1.0, 1.0, 1.0])
     Array(3., dtype=float64)
     """
-    inertia = body if isinstance(body, Inertia) else body.inertia
+    inertia = _inertia_of(body)
     omega = _omega(state)
     energy = 0.5 * dot(omega, apply(inertia.tensor, omega))
     if isinstance(body, MassProperties) and isinstance(state, HasPose):
@@ -123,7 +123,7 @@ def angular_momentum(body: Inertia | MassProperties, state: HasSpin | Vector) ->
     >>> angular_momentum(Inertia.from_principal(1.0, 2.0, 3.0), [1.0, 1.0, 1.0])
     Array([1., 2., 3.], dtype=float64)
     """
-    inertia = body if isinstance(body, Inertia) else body.inertia
+    inertia = _inertia_of(body)
     return apply(inertia.tensor, _omega(state))
 
 
@@ -158,3 +158,14 @@ def _omega(state):
 
 def _vector(value, name):
     return _checks.floating(value, (3,), name)
+
+
+def _inertia_of(body: Inertia | MassProperties) -> Inertia:
+    if isinstance(body, Inertia):
+        return body
+    if isinstance(body, MassProperties):
+        return body.inertia
+    raise TypeError(
+        f"body: wanted an Inertia or MassProperties, got {type(body).__name__}; "
+        "Inertia.from_tensor makes one of a matrix"
+    )

@@ -101,7 +101,7 @@ class Inertia(eqx.Module):
         x, y, z = a[..., 0, 0], a[..., 1, 1], a[..., 2, 2]
         diagonal = 0.5 * jnp.stack([(y - x) + z, (z - y) + x, (x - z) + y], axis=-1)
         eye = jnp.broadcast_to(jnp.eye(3, dtype=bool), a.shape)
-        return jnp.where(eye, jnp.broadcast_to(diagonal[..., None], a.shape), -a)
+        return jnp.where(eye, jnp.broadcast_to(diagonal[..., None], a.shape), 0.0 - a)
 
     @property
     def moments(self) -> Vec3:
@@ -273,7 +273,13 @@ class MassProperties(eqx.Module):
         >>> (part + part.shifted([2.0, 0, 0])).second_moment[0, 0]
         Array(4., dtype=float64)
         """
+        if not isinstance(other, MassProperties):
+            return NotImplemented
         return _joined(self, other.mass, other.com, other.second_moment)
+
+    def __radd__(self, other: int) -> "MassProperties":
+        """`sum(parts)` starts from 0."""
+        return self if isinstance(other, int) and other == 0 else NotImplemented
 
     def __sub__(self, other: "MassProperties") -> "MassProperties":
         """The rest when a part is cut away, in the same axes.
@@ -284,6 +290,8 @@ class MassProperties(eqx.Module):
         >>> ((part + part.shifted([2.0, 0, 0])) - part).com
         Array([2., 0., 0.], dtype=float64)
         """
+        if not isinstance(other, MassProperties):
+            return NotImplemented
         return _joined(self, -other.mass, other.com, -other.second_moment)
 
 

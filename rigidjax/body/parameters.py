@@ -4,8 +4,9 @@ A log-Cholesky chart: any vector is a body with positive mass and a positive def
 moment, so that an optimiser needs no constraint and cannot leave the bodies. Plates, rods and
 points lie at infinity (a logarithm of −∞) and are approached as closely as wanted.
 
-Source: Rucker and Wensing 2022, "Smooth parameterization of rigid-body inertia", IEEE RA-L 7:2493,
-doi:10.1109/LRA.2022.3144517. The order of the ten numbers is theirs (and pinocchio's).
+Source: Rucker and Wensing 2022, "Smooth parameterization of rigid-body inertia", IEEE RA-L 7:2771,
+doi:10.1109/LRA.2022.3144517. The ten numbers and their order are those of pinocchio's
+`LogCholeskyParameters`.
 """
 
 import jax.numpy as jnp
@@ -25,7 +26,8 @@ def pack(body: MassProperties) -> Float[Array, "10"]:
     **Arguments:** `body` with a positive definite second moment. **Returns** (10,)
     `(α, d1, d2, d3, s12, s23, s13, t1, t2, t3)`: `mass = e^{2α}`, `com = t` (m, body frame),
     `𝔖 = mass · U Uᵀ` about the centre of mass, U upper triangular with `e^{d_i}` on its diagonal
-    and `s_ij` (m) above it. Source: Rucker and Wensing 2022, eqs 8–10.
+    and `s_ij` (m) above it.
+    Source: Rucker and Wensing 2022.
 
     **Raises:** `ValueError` (`equinox` error under `jit`) on the boundary: a plate, rod or point.
 
@@ -34,6 +36,11 @@ def pack(body: MassProperties) -> Float[Array, "10"]:
     >>> float(unpack(vector).mass)
     2.0
     """
+    if not isinstance(body, MassProperties):
+        raise TypeError(
+            f"pack: wanted MassProperties, got {type(body).__name__}; of an Inertia use "
+            "pack_second_moment(body.second_moment), or pack_shape for its ratios alone"
+        )
     half_log_mass = 0.5 * jnp.log(body.mass)
     shape = _factor(body.second_moment / body.mass)
     logs = _reach(half_log_mass + shape[:3]) - _reach(half_log_mass)

@@ -82,4 +82,4 @@ def swap_trace(a: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3 3"]:
     diagonal = jnp.stack([y + z, z + x, x + y], axis=-1)
     eye = jnp.eye(3, dtype=bool)
     eye = jnp.broadcast_to(eye, a.shape)
-    return jnp.where(eye, jnp.broadcast_to(diagonal[..., None], a.shape), -a)
+    return jnp.where(eye, jnp.broadcast_to(diagonal[..., None], a.shape), 0.0 - a)

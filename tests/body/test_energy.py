@@ -125,6 +125,11 @@ def test_a_state_without_attitude_has_no_momentum_in_the_world(unhooked):
         spatial_angular_momentum(rj.Inertia.from_principal(1.0, 1.0, 1.0), Turning(jnp.ones(3)))
 
 
+def test_a_matrix_is_no_body(unhooked):
+    with pytest.raises(TypeError, match=r"Inertia or MassProperties, got ndarray.*from_tensor"):
+        kinetic_energy(np.eye(3), [1.0, 0, 0])
+
+
 def test_states_of_the_floor_above_are_understood():
     inertia = rj.Inertia.from_principal(1.0, 2.0, 2.5)
     body = rj.MassProperties(2.0, [0.0, 0, 0], inertia.second_moment)

@@ -1,6 +1,7 @@
 """The solid in a mesh: closed forms, far from the origin, derivatives, what is refused (D25)."""
 
 import itertools
+from fractions import Fraction
 
 import equinox as eqx
 import jax
@@ -48,6 +49,45 @@ def test_a_box_anywhere_is_a_box(dtype, offsets, tolerance):
         np.testing.assert_allclose(body.second_moment, box.second_moment, atol=tolerance * size)
         assert body.second_moment.dtype == dtype
         body.checked()
+
+
+def exact_mesh(corners, faces):
+    """Mass, centre, second moment of unit density in rational arithmetic: no rounding at all."""
+    points = [[Fraction(float(x)) for x in row] for row in corners]
+    volume, first = Fraction(0), [Fraction(0)] * 3
+    second = [[Fraction(0)] * 3 for _ in range(3)]
+    for face in faces:
+        a, b, c = (points[k] for k in face)
+        six = sum(
+            a[i] * (b[(i + 1) % 3] * c[(i + 2) % 3] - b[(i + 2) % 3] * c[(i + 1) % 3])
+            for i in range(3)
+        )
+        s = [a[i] + b[i] + c[i] for i in range(3)]
+        volume += six / 6
+        for i in range(3):
+            first[i] += six * s[i] / 24
+            for j in range(3):
+                own = s[i] * s[j] + a[i] * a[j] + b[i] * b[j] + c[i] * c[j]
+                second[i][j] += six * own / 120
+    com = [x / volume for x in first]
+    about = [[second[i][j] - volume * com[i] * com[j] for j in range(3)] for i in range(3)]
+    return float(volume), np.array(com, float), np.array(about, float)
+
+
+@pytest.mark.parametrize(
+    ("dtype", "digits", "offset", "tolerance"),
+    [(jnp.float64, 2.0**24, 2.0**20, 1e-12), (jnp.float32, 2.0**12, 2.0**10, 1e-4)],
+)
+def test_a_crooked_solid_far_away_against_rational_arithmetic(dtype, digits, offset, tolerance):
+    turn, _ = np.linalg.qr(np.random.default_rng(2).normal(size=(3, 3)))
+    corners = CORNERS @ (turn * np.sign(np.linalg.det(turn))).T
+    # Coordinates that the dtype holds exactly also when they are far away.
+    corners = np.round(corners * digits) / digits + offset * np.array([1.0, -1.0, 1.0])
+    volume, com, second = exact_mesh(corners, FACES)
+    body = shapes.mesh(jnp.asarray(corners, dtype), FACES, jnp.ones((), dtype))
+    np.testing.assert_allclose(body.mass, volume, rtol=tolerance)
+    np.testing.assert_allclose(body.com, com, rtol=float(jnp.finfo(dtype).eps))
+    np.testing.assert_allclose(body.second_moment, second, atol=tolerance * np.abs(second).max())
 
 
 def test_ordinary_meshes_agree_with_trimesh():

@@ -155,6 +155,8 @@ def test_what_cannot_be_packed_is_refused_in_words(unhooked):
         parameters.pack_moments([1.0, 2.0, 3.5])
     with pytest.raises(ValueError, match=r"wanted shape \(10,\)"):
         parameters.unpack(np.ones(9))
+    with pytest.raises(TypeError, match=r"MassProperties, got Inertia.*pack_shape"):
+        parameters.pack(plate.inertia)
     with pytest.raises(RuntimeError, match="zero eigenvalue"):
         eqx.filter_jit(parameters.pack)(plate)
 
