@@ -1,10 +1,16 @@
 """How it turns: climb only as far as the scene needs."""
 
+from rigidjax.motion import torques as torques
 from rigidjax.motion.attitude import (
     Attitude as Attitude,
     AttitudeEquations as AttitudeEquations,
     on_the_group as on_the_group,
     quaternion_rate as quaternion_rate,
+)
+from rigidjax.motion.conserved import (
+    conserved as conserved,
+    drift as drift,
+    energy as energy,
 )
 from rigidjax.motion.rigid import NewtonEuler as NewtonEuler, Rigid as Rigid
 from rigidjax.motion.spin import EulerEquations as EulerEquations, Spin as Spin

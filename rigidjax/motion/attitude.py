@@ -73,7 +73,12 @@ def quaternion_rate(q: QuatLike, omega: Vec3Like) -> Quat:
     w, x, y, z = q[0], q[1], q[2], q[3]
     a, b, c = 0.5 * omega[0], 0.5 * omega[1], 0.5 * omega[2]
     return jnp.stack(
-        [-x * a - y * b - z * c, w * a + y * c - z * b, w * b + z * a - x * c, w * c + x * b - y * a]
+        [
+            -x * a - y * b - z * c,
+            w * a + y * c - z * b,
+            w * b + z * a - x * c,
+            w * c + x * b - y * a,
+        ]
     )
 
 

@@ -9,7 +9,7 @@ from rigidjax._types import HasPose, ScalarLike
 from rigidjax.body.inertia import MassProperties
 from rigidjax.motion.attitude import quaternion_rate
 from rigidjax.motion.spin import EulerEquations
-from rigidjax.motion.torques import Torque
+from rigidjax.motion.torques import Torque, act
 
 
 class Rigid(eqx.Module):
@@ -47,12 +47,16 @@ class Rigid(eqx.Module):
 class NewtonEuler(eqx.Module):
     """Newton–Euler equations about the centre of mass as a vector field `f(t, y, args)`.
 
-    `m dv/dt = 0` (no force acts on this rung yet), `I dΩ/dt = IΩ × Ω + τ`, `dq/dt = ½ q ⊗ (0, Ω)`.
+    `m dv/dt = F`, `I dΩ/dt = IΩ × Ω + τ`, `dq/dt = ½ q ⊗ (0, Ω)`.
 
     **Arguments:** `body` mass properties; the inertia used is the one about its centre of mass;
-    `torque` τ about the centre of mass, N m, body frame, or `None`.
+    `torque` a torque τ about the centre of mass, N m, body frame, or a force law that returns a
+    `Wrench` (F in N, world frame, and τ), or `None`. A field for `diffrax.ODETerm`; `args` is not
+    used.
 
     Source: notes, eqs 1, 50, 56, 84.
+
+    **Raises:** as `EulerEquations`.
 
     >>> import rigidjax as rj
     >>> field = rj.NewtonEuler(rj.shapes.box(2.0, [0.1, 0.2, 0.3]))
@@ -61,11 +65,19 @@ class NewtonEuler(eqx.Module):
     """
 
     euler: EulerEquations
+    body: MassProperties
 
     def __init__(self, body: MassProperties, torque: Torque | None = None):
         self.euler = EulerEquations(body.inertia, torque)
+        self.body = body
 
     def __call__(self, t: ScalarLike, y: HasPose, args: object = None) -> Rigid:
-        return Rigid(
-            y.v, jnp.zeros_like(y.v), quaternion_rate(y.q, y.omega), self.euler.rate_of(t, y)
-        )
+        force, torque = None, None
+        if self.euler.torque is not None:
+            force, torque = act(self.euler.torque, t, y, self.body)
+        if force is None:
+            acceleration = jnp.zeros_like(y.v)
+        else:
+            acceleration = force / self.body.mass.astype(y.v.dtype)
+        spin = self.euler.turned_by(torque, y)
+        return Rigid(y.v, acceleration, quaternion_rate(y.q, y.omega), spin)

@@ -5,7 +5,7 @@ from jaxtyping import Array, Float
 
 from rigidjax import _checks
 from rigidjax._types import HasSpin, Mat3, ScalarLike, Vec3
-from rigidjax.body import inertia as _inertia
+from rigidjax.body import inertia as _inertia, physical
 from rigidjax.motion.torques import Torque, evaluate
 from rigidjax.rotation import algebra
 
@@ -32,10 +32,14 @@ class EulerEquations(eqx.Module):
     """Euler's equations `I dΩ/dt = IΩ × Ω + τ` as a vector field `f(t, y, args)`.
 
     **Arguments:** `inertia` the body, about the point that it turns about; `torque` τ in the body
-    frame, N m, or `None` for a free body. A field for `diffrax.ODETerm`; `args` is not used.
+    frame, N m, or `None` for a free body. A field for `diffrax.ODETerm`; `args` is not used. Its
+    values are in the precision of `state.omega`.
 
     Source: Lie–Poisson form `dΠ/dt = Π × ∇H(Π) + τ` with `Π = IΩ`, `H = ½ Π·I⁻¹Π`; Landau and
     Lifshitz, Mechanics, eq 36.4.
+
+    **Raises:** `ValueError` for a rod or a point, whose zero moment the equations divide by: where
+    the numbers are known; under `jit` call `Inertia.invertible` first.
 
     >>> import rigidjax as rj
     >>> rj.EulerEquations(rj.Inertia.from_principal(1.0, 2.0, 3.0))(0.0, Spin([1.0, 1, 1]), None)
@@ -47,7 +51,8 @@ class EulerEquations(eqx.Module):
     torque: Torque | None
 
     def __init__(self, inertia: _inertia.Inertia, torque: Torque | None = None):
-        self.inertia = inertia
+        known = physical.if_known(physical.nonzero_moments, inertia.tensor)
+        self.inertia = _inertia.Inertia(known)
         # Once per solve: a division inside the field costs 25 times the rest of it.
         self.inverse = _inertia.inverse(inertia.tensor)
         self.torque = torque
@@ -57,8 +62,16 @@ class EulerEquations(eqx.Module):
 
     def rate_of(self, t: ScalarLike, state: HasSpin) -> Vec3:
         """dΩ/dt (3,), rad/s², body frame, of any state that has a spin."""
-        momentum = _inertia.apply(self.inertia.tensor, state.omega)
-        turning = algebra.cross(momentum, state.omega)
+        torque = None
         if self.torque is not None:
-            turning = turning + evaluate(self.torque, t, state, self.inertia)
-        return _inertia.apply(self.inverse, turning)
+            torque = evaluate(self.torque, t, state, self.inertia)
+        return self.turned_by(torque, state)
+
+    def turned_by(self, torque: Vec3 | None, state: HasSpin) -> Vec3:
+        """dΩ/dt (3,), rad/s², body frame, under a torque (3,), N m, body frame, that is known."""
+        dtype = state.omega.dtype
+        momentum = _inertia.apply(self.inertia.tensor.astype(dtype), state.omega)
+        turning = algebra.cross(momentum, state.omega)
+        if torque is not None:
+            turning = turning + torque
+        return _inertia.apply(self.inverse.astype(dtype), turning)

@@ -1,0 +1,178 @@
+"""What a scene conserves, and by how much a computed motion fails to (floor 2)."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from rigidjax._types import HasAttitude, HasPose, HasSpin, Scalar, ScalarLike, Vec3
+from rigidjax.body.energy import angular_momentum, kinetic_energy
+from rigidjax.body.inertia import Inertia, MassProperties
+from rigidjax.motion.torques import AbstractTorque, CentralGravity, Sum, Torque, in_precision
+from rigidjax.motion.torques.base import length_or_zero
+from rigidjax.rotation import quaternion
+from rigidjax.rotation.algebra import cross, dot
+
+
+def energy(
+    body: Inertia | MassProperties,
+    state: HasSpin,
+    torque: Torque | None = None,
+    t: ScalarLike = 0.0,
+) -> Scalar:
+    """Kinetic energy plus the potential energy of every torque and force, J.
+
+    **Arguments:** `body`, `state`, `torque` as for `simulate`; `t` s, for what depends on time.
+
+    `T + U`, `T = ½ m |v|² + ½ Ω·IΩ` (notes, eq 79). Wheels inside count as no energy.
+
+    **Raises:** `TypeError` for a torque without a potential.
+
+    >>> import rigidjax as rj
+    >>> top = rj.torques.HeavyTop(2.0, [0.0, 0.0, 0.5], [0.0, 0.0, -9.81])
+    >>> start = rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 1])
+    >>> energy(rj.Inertia.from_principal(1.0, 1.0, 1.0), start, top)
+    Array(10.31, dtype=float64)
+    """
+    parts = _parts(torque)
+    for part in parts:
+        if not hasattr(part, "energy"):
+            raise TypeError(
+                f"energy: {type(part).__name__} has no potential (no method energy(t, state, body)), "
+                "so there is no energy that it conserves; see kinetic_energy"
+            )
+    total = kinetic_energy(in_precision(body, state.omega.dtype), state)
+    for part in parts:
+        total = total + _energy_of(part, t, state, body)
+    return total
+
+
+def conserved(
+    body: Inertia | MassProperties,
+    state: HasSpin,
+    torque: Torque | None = None,
+    t: ScalarLike = 0.0,
+) -> dict[str, Float[Array, "..."]]:
+    """The quantities that the exact motion of this scene keeps, at one state.
+
+    **Arguments:** `body`, `state`, `torque` as for `simulate`; `t` s. A law says what it keeps by
+    optional members, see `rigidjax.torques.AbstractTorque`; one that says nothing keeps nothing.
+
+    **Returns** a dict of those that hold here, which are the same at all times:
+
+    - `energy`, J: every law has a potential and none depends on time;
+    - `momentum` (3,), kg m²/s, world frame, `R(IΩ + h)`, and `momentum_squared`, the Casimir
+      `|IΩ + h|²`: nothing outside turns the body (h is the wheels' momentum);
+    - `momentum_along_axis`, kg m²/s: one law turns it, but not about this axis (gravity, a field);
+    - `linear_momentum` (3,), kg m/s, world frame: nothing pushes it;
+    - `momentum_about_origin` (3,), kg m²/s, world frame, `m x × v + R(IΩ + h)`: free, or attracted
+      by the origin.
+
+    Source: Noether's theorem; Marsden and Ratiu, Introduction to Mechanics and Symmetry, §§14.4,
+    15.10.
+
+    >>> import rigidjax as rj
+    >>> body = rj.Inertia.from_principal(1.0, 2.0, 3.0)
+    >>> sorted(conserved(body, rj.Spin([1.0, 0, 0])))
+    ['energy', 'momentum_squared']
+    """
+    parts = _parts(torque)
+    dtype = state.omega.dtype
+    body = in_precision(body, dtype)
+    found: dict[str, Float[Array, "..."]] = {}
+    if all(hasattr(part, "energy") and getattr(part, "steady", False) for part in parts):
+        found["energy"] = energy(body, state, torque, t)
+    inside = [part for part in parts if hasattr(part, "internal_momentum")]
+    outside = [part for part in parts if not hasattr(part, "internal_momentum")]
+    momentum = _momentum(body, state, inside, t)
+    if not outside:
+        found["momentum_squared"] = dot(momentum, momentum)
+    if isinstance(state, HasAttitude):
+        momentum = quaternion.rotate(state.q, momentum)
+        axis = getattr(outside[0], "axis", None) if len(outside) == 1 else None
+        if not outside:
+            found["momentum"] = momentum
+        elif axis is not None:
+            axis = axis.astype(dtype)
+            length = length_or_zero(axis)
+            found["momentum_along_axis"] = dot(momentum, axis) / jnp.where(length > 0, length, 1)
+    if isinstance(state, HasPose) and isinstance(body, MassProperties):
+        pushed = [part for part in parts if not isinstance(part, AbstractTorque)]
+        if not pushed:
+            found["linear_momentum"] = body.mass * state.v
+        if all(isinstance(part, CentralGravity) for part in [*outside, *pushed]):
+            found["momentum_about_origin"] = body.mass * cross(state.x, state.v) + momentum
+    return found
+
+
+def drift(
+    ts: Float[Array, " times"],
+    ys: Any,
+    body: Inertia | MassProperties,
+    torque: Torque | None = None,
+) -> dict[str, Scalar]:
+    """By how much each conserved quantity moved during a run, relative to its size.
+
+    **Arguments:** `ts` (T,) s; `ys` states with a leading time axis; `body`, `torque` as for
+    `simulate`.
+
+    **Returns** for each name of `conserved` the largest distance from its value at `ts[0]`, divided
+    by the largest kinetic energy, momentum, or momentum squared of the run. Zero is perfect.
+
+    >>> import jax, rigidjax as rj
+    >>> body, ts = rj.Inertia.from_principal(1.0, 2.0, 3.0), jax.numpy.linspace(0.0, 9.0, 4)
+    >>> ys = rj.simulate(body, rj.Spin([0.1, 1.0, 0.0]), ts).ys
+    >>> bool(drift(ts, ys, body)["energy"] < 1e-8)
+    True
+    """
+    at_all = jax.vmap(lambda t, y: conserved(body, y, torque, t))(ts, ys)
+    kinetic = jax.vmap(lambda y: kinetic_energy(in_precision(body, y.omega.dtype), y))(ys)
+    spin = jax.vmap(lambda t, y: _spin_size(body, y, torque, t))(ts, ys)
+    found = {}
+    for name, values in at_all.items():
+        away = _size(values - jax.lax.slice_in_dim(values, 0, 1))
+        if name == "energy":
+            scale = kinetic
+        elif name in ("linear_momentum", "momentum_about_origin"):
+            scale = _size(values)
+        else:
+            scale = spin**2 if name == "momentum_squared" else spin
+        scale = jnp.max(scale)
+        found[name] = jnp.max(away) / jnp.where(scale > 0, scale, 1)
+    return found
+
+
+def _parts(torque: Torque | None) -> tuple[Any, ...]:
+    """The laws in a sum, and in sums within it."""
+    if torque is None:
+        return ()
+    if isinstance(torque, Sum):
+        return tuple(inner for part in torque.parts for inner in _parts(part))
+    return (torque,)
+
+
+def _energy_of(part: Any, t: ScalarLike, state: HasSpin, body: Any) -> Scalar:
+    dtype = state.omega.dtype
+    value = in_precision(part, dtype).energy(
+        jnp.asarray(t, dtype), state, in_precision(body, dtype)
+    )
+    return value.astype(dtype)
+
+
+def _momentum(body: Any, state: HasSpin, inside: list[Any], t: ScalarLike) -> Vec3:
+    """The whole angular momentum, (3,), body frame, with what the wheels hold."""
+    momentum = angular_momentum(body, state)
+    for part in inside:
+        momentum = momentum + part.internal_momentum(t).astype(momentum.dtype)
+    return momentum
+
+
+def _spin_size(body: Any, state: HasSpin, torque: Torque | None, t: ScalarLike) -> Scalar:
+    inside = [part for part in _parts(torque) if hasattr(part, "internal_momentum")]
+    return length_or_zero(_momentum(in_precision(body, state.omega.dtype), state, inside, t))
+
+
+def _size(values: Float[Array, "times *shape"]) -> Float[Array, " times"]:
+    """The length of each row; of numbers, their size."""
+    return jnp.abs(values) if values.ndim == 1 else jnp.sqrt(jnp.sum(values**2, axis=-1))

@@ -1,0 +1,35 @@
+"""Torques and forces. Each names the lowest rung that can feel it, and feels nothing below."""
+
+from rigidjax.motion.torques.base import (
+    AbstractForce as AbstractForce,
+    AbstractTorque as AbstractTorque,
+    Torque as Torque,
+    Wrench as Wrench,
+    act as act,
+    evaluate as evaluate,
+    in_precision as in_precision,
+    jumps_of as jumps_of,
+    require_rung as require_rung,
+)
+from rigidjax.motion.torques.composite import FromPotential as FromPotential, Sum as Sum
+from rigidjax.motion.torques.constant import ConstantTorque as ConstantTorque, InSpace as InSpace
+from rigidjax.motion.torques.damping import (
+    Damping as Damping,
+    QuadraticDamping as QuadraticDamping,
+)
+from rigidjax.motion.torques.flywheel import Flywheel as Flywheel
+from rigidjax.motion.torques.forces import (
+    CentralGravity as CentralGravity,
+    Drag as Drag,
+    UniformGravity as UniformGravity,
+)
+from rigidjax.motion.torques.gravity import (
+    GravityGradient as GravityGradient,
+    HeavyTop as HeavyTop,
+)
+from rigidjax.motion.torques.magnetic import MagneticDipole as MagneticDipole
+from rigidjax.motion.torques.tables import (
+    Linear as Linear,
+    Pulses as Pulses,
+    Tabulated as Tabulated,
+)

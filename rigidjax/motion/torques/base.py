@@ -1,0 +1,196 @@
+"""What a torque or a force is, and how a field asks it for its value (floor 2)."""
+
+import abc
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from rigidjax import _checks
+from rigidjax._types import HasAttitude, HasPose, HasSpin, Scalar, ScalarLike, Vec3, Vec3Like
+from rigidjax.body.hints import Vector
+from rigidjax.body.inertia import Inertia, MassProperties
+
+
+class Wrench(eqx.Module):
+    """A force on the centre of mass and a torque about it: what a force law returns.
+
+    **Arguments:** `force` (3,) N, **world** frame; `torque` (3,) N m, **body** frame, about the
+    centre of mass; none by default.
+
+    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
+
+    >>> Wrench([0.0, 0.0, -9.81]).torque
+    Array([0., 0., 0.], dtype=float64)
+    """
+
+    force: Vec3
+    torque: Vec3
+
+    def __init__(self, force: Vector, torque: Vector | None = None):
+        self.force = _checks.floating(force, (3,), "force", hint="world-frame N")
+        self.torque = (
+            jnp.zeros_like(self.force)
+            if torque is None
+            else _checks.floating(torque, (3,), "torque", hint="body-frame N m")
+        )
+
+
+class AbstractTorque(eqx.Module):
+    """A torque on a body: called with the time, the state and the body, gives N m in body axes.
+
+    Subclass it for your own, or give any callable Module. `feels` is the lowest rung that has what
+    you read from the state: `HasSpin` (`.omega`), `HasAttitude` (also `.q`) or `HasPose` (also
+    `.x`, `.v`). `body` is what `simulate` was given: an `Inertia`, or `MassProperties` for `Rigid`.
+
+    Optional members say what is conserved (see `rigidjax.conserved`): a method
+    `energy(t, state, body)`, J, if the law has a potential; a property `steady`, whether the law
+    is free of explicit time; a property `axis` (3,), world frame, about which it has no torque; a
+    method `internal_momentum(t)` (3,), N m s, body frame, if nothing outside turns the body: what
+    the law holds inside; a property `jump_times` (n,), s, where it jumps or has a kink.
+    """
+
+    feels: eqx.AbstractVar[type]
+
+    @abc.abstractmethod
+    def __call__(self, t: ScalarLike, state: Any, body: Any) -> Vec3:
+        """Torque (3,), N m, body frame."""
+
+
+class AbstractForce(eqx.Module):
+    """A force on a body that moves: as `AbstractTorque`, but returns a `Wrench`.
+
+    Only `Rigid` feels it; `body` is a `MassProperties`.
+    """
+
+    feels: eqx.AbstractVar[type]
+
+    @abc.abstractmethod
+    def __call__(self, t: ScalarLike, state: Any, body: Any) -> Wrench:
+        """Force (3,), N, world frame, and torque (3,), N m, body frame, about the centre of mass."""
+
+
+# A user's own callable Module need not subclass anything.
+Torque = AbstractTorque | AbstractForce | Callable[[Any, Any, Any], Any]
+
+# From below: what a torque may feel.
+LADDER = (HasSpin, HasAttitude, HasPose)
+
+
+def require_rung(torque: Torque, state: object) -> None:
+    """Raise `TypeError` unless `state` has what `torque` feels.
+
+    >>> from rigidjax import Spin
+    >>> require_rung(lambda t, state, body: -state.omega, Spin([0.0, 0, 1]))
+    """
+    feels = getattr(torque, "feels", None)
+    if feels is not None and not isinstance(state, feels):
+        raise TypeError(
+            f"{type(torque).__name__} needs a state with {feels.__name__} (see rigidjax's ladder "
+            f"of states), got {type(state).__name__}; climb to the rung that can feel this torque"
+        )
+
+
+def evaluate(torque: Torque, t: ScalarLike, state: HasSpin, body: Inertia | MassProperties) -> Vec3:
+    """The torque's value (3,), N m, body frame, its shape checked: a user's own may return anything.
+
+    **Arguments:** `torque` any law; `t` s; `state`; `body`. The law is taken in the precision of
+    `state.omega`. **Raises:** `TypeError` for a force, which only `Rigid` feels; `ValueError` for a
+    wrong shape.
+
+    >>> from rigidjax import Inertia, Spin, torques
+    >>> body = Inertia.from_principal(1.0, 2.0, 3.0)
+    >>> evaluate(torques.Damping([1.0, 1.0, 1.0]), 0.0, Spin([0.0, 0.0, 2.0]), body)
+    Array([-0., -0., -2.], dtype=float64)
+    """
+    force, value = act(torque, t, state, body)
+    if force is not None:
+        raise TypeError(
+            f"{type(torque).__name__} gives a force (a Wrench), got a state {type(state).__name__} "
+            "that only turns; a force needs a Rigid state"
+        )
+    return value
+
+
+def act(
+    law: Torque, t: ScalarLike, state: HasSpin, body: Inertia | MassProperties
+) -> tuple[Vec3 | None, Vec3]:
+    """Force on the centre of mass (N, world frame; `None` if there is none) and torque about it.
+
+    **Arguments** as for `evaluate`. **Returns** a force (3,) or `None`, and a torque (3,), N m, body
+    frame, in the precision of `state.omega`.
+
+    >>> from rigidjax import Inertia, Spin, torques
+    >>> act(torques.ConstantTorque([0.0, 0, 1]), 0.0, Spin([0.0, 0, 1]), Inertia(jnp.eye(3)))[0]
+    """
+    dtype = state.omega.dtype
+    # A table in float64 must not lift a float32 solve, nor stop it under strict promotion.
+    found = in_precision(law, dtype)(jnp.asarray(t, dtype), state, in_precision(body, dtype))
+    if isinstance(found, Wrench):
+        return found.force.astype(dtype), found.torque.astype(dtype)
+    value = _checks.floating(found, (3,), f"torque {type(law).__name__}", hint="body-frame N m")
+    return None, value.astype(dtype)
+
+
+def in_precision(tree: Any, dtype: Any) -> Any:
+    """The same tree with every floating array in `dtype`.
+
+    >>> in_precision({"a": jnp.ones(2)}, jnp.float32)["a"].dtype
+    dtype('float32')
+    """
+
+    def cast(leaf: Any) -> Any:
+        if eqx.is_array_like(leaf) and hasattr(leaf, "dtype"):
+            return leaf.astype(dtype) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf
+        return leaf
+
+    return jax.tree.map(cast, tree)
+
+
+def tensor_of(body: Inertia | MassProperties) -> Float[Array, "3 3"]:
+    """The inertia tensor (3, 3), kg m²: of an `Inertia`, or about the centre of mass.
+
+    >>> from rigidjax import shapes
+    >>> tensor_of(Inertia(jnp.eye(3)))[0, 0]
+    Array(1., dtype=float64)
+    """
+    return body.tensor if isinstance(body, Inertia) else body.inertia.tensor
+
+
+def vector_at(source: Any, t: ScalarLike, name: str) -> Vec3:
+    """A vector that is constant, or the value at `t` of a callable Module of time.
+
+    >>> vector_at(jnp.ones(3), 0.0, "field")
+    Array([1., 1., 1.], dtype=float64)
+    """
+    return _checks.floating(source(t), (3,), f"{name}(t)") if callable(source) else source
+
+
+def constant_or_callable(source: Any, name: str) -> Any:
+    """`source` as it is if it can be called with a time; otherwise as a vector (3,)."""
+    return source if callable(source) else _checks.floating(source, (3,), name)
+
+
+def jumps_of(source: object) -> Float[Array, " n"]:
+    """The `jump_times` of a law or of a function of time, s; empty if it has none.
+
+    >>> from rigidjax import torques
+    >>> jumps_of(torques.Pulses([1.0, 2.0], [[0.0, 0.0, 1.0]]))
+    Array([1., 2.], dtype=float64)
+    """
+    found = getattr(source, "jump_times", None)
+    return jnp.zeros(0) if found is None else found
+
+
+def length_or_zero(v: Vec3Like) -> Scalar:
+    """|v|, whose derivative at v = 0 is taken as 0: for |v| v, which has one and it is 0.
+
+    >>> float(length_or_zero(jnp.array([3.0, 4.0, 0.0])))
+    5.0
+    """
+    v = _checks.floating(v, (3,), "v")
+    square = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
+    return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)

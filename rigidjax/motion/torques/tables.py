@@ -1,0 +1,169 @@
+"""Numbers in a table against time: straight lines between rows, or constant pieces."""
+
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+from rigidjax import _checks
+from rigidjax._types import HasSpin, Scalar, ScalarLike, Vec3
+from rigidjax.motion.torques.base import AbstractTorque
+
+Times = Float[ArrayLike, " n"] | Sequence[Any]
+Rows = Float[ArrayLike, "n 3"] | Sequence[Any]
+
+
+class Linear(eqx.Module):
+    """A vector function of time, t → (3,): straight lines between rows, constant beyond the ends.
+
+    **Arguments:** `times` (n,) s, increasing; `values` (n, 3). For `InSpace`, `Flywheel`,
+    `MagneticDipole`, `GravityGradient`. At a row the derivative is that of the line after it.
+
+    **Raises:** `ValueError` for fewer than two rows, numbers of rows that differ, times that do not
+    increase, NaN.
+
+    >>> Linear([0.0, 2.0], [[0.0, 0, 0], [0.0, 0, 4]])(1.0)
+    Array([0., 0., 2.], dtype=float64)
+    """
+
+    times: Float[Array, " n"]
+    values: Float[Array, "n 3"]
+
+    def __init__(self, times: Times, values: Rows):
+        self.times, self.values = _rows(times, values, extra=0)
+
+    @property
+    def jump_times(self) -> Float[Array, " n"]:
+        """The times of the rows, s: the function has a kink at each."""
+        return self.times
+
+    def __call__(self, t: ScalarLike) -> Vec3:
+        t = jnp.asarray(t, self.times.dtype)
+        i = jnp.clip(_row(self.times, t), 0, self.times.shape[0] - 2)
+        low, high = self.times[i], self.times[i + 1]
+        part = (jnp.clip(t, self.times[0], self.times[-1]) - low) / (high - low)
+        return self.values[i] + part * (self.values[i + 1] - self.values[i])
+
+
+class Tabulated(AbstractTorque):
+    """A torque from a table: straight lines between rows, none before the first or after the last.
+
+    **Arguments:** `times` (n,) s, increasing; `torques` (n, 3) N m, body frame. In space:
+    `InSpace(Linear(times, torques))`. Constant pieces: `Pulses`.
+
+    A solver that steps over a kink loses its order, one that steps over a pulse never sees it:
+    `jump_times` are for its step controller, and `simulate` hands them over.
+
+    **Raises:** `ValueError` for fewer than two rows, numbers of rows that differ, times that do not
+    increase, NaN.
+
+    >>> Tabulated([0.0, 2.0], [[0.0, 0, 0], [0.0, 0, 4]]).jump_times
+    Array([0., 2.], dtype=float64)
+    """
+
+    feels: ClassVar[type] = HasSpin
+    times: Float[Array, " n"]
+    torques: Float[Array, "n 3"]
+
+    def __init__(self, times: Times, torques: Rows):
+        self.times, self.torques = _rows(times, torques, extra=0)
+
+    @property
+    def jump_times(self) -> Float[Array, " n"]:
+        """The times of the rows, s: the torque has a kink or a jump at each."""
+        return self.times
+
+    def __call__(self, t: ScalarLike, state: HasSpin, body: object) -> Vec3:
+        t = jnp.asarray(t, self.times.dtype)
+        inside = (t >= self.times[0]) & (t < self.times[-1])
+        i = jnp.clip(_row(self.times, t), 0, self.times.shape[0] - 2)
+        part = (t - self.times[i]) / (self.times[i + 1] - self.times[i])
+        value = self.torques[i] + part * (self.torques[i + 1] - self.torques[i])
+        return jnp.where(inside, value, jnp.zeros_like(value))
+
+
+class Pulses(AbstractTorque):
+    """A torque in constant pieces, such as thruster firings: none before the first or after the last.
+
+    **Arguments:** `edges` (n + 1,) s, increasing; `torques` (n, 3) N m, body frame: row i acts from
+    edge i until edge i + 1. One pulse: `Pulses([1.0, 1.5], [[0.0, 0.0, 3.0]])`.
+
+    The value at a time does not show how it depends on the edges; a solver that ends its steps at
+    `jump_times` does. `impulse` is exact.
+
+    **Raises:** `ValueError` unless there is one edge more than rows, for edges that do not
+    increase, NaN.
+
+    >>> Pulses([1.0, 1.5], [[0.0, 0.0, 3.0]]).impulse
+    Array([0. , 0. , 1.5], dtype=float64)
+    """
+
+    feels: ClassVar[type] = HasSpin
+    edges: Float[Array, " n+1"]
+    torques: Float[Array, "n 3"]
+
+    def __init__(self, edges: Times, torques: Rows):
+        self.edges, self.torques = _rows(edges, torques, extra=1)
+
+    @property
+    def jump_times(self) -> Float[Array, " n+1"]:
+        """The edges, s: the torque jumps at each."""
+        return self.edges
+
+    @property
+    def impulse(self) -> Vec3:
+        """The whole impulse ∫ τ dt, (3,), N m s, body frame."""
+        return jnp.sum((self.edges[1:] - self.edges[:-1])[:, None] * self.torques, axis=0)
+
+    def __call__(self, t: ScalarLike, state: HasSpin, body: object) -> Vec3:
+        t = jnp.asarray(t, self.edges.dtype)
+        inside = (t >= self.edges[0]) & (t < self.edges[-1])
+        value = self.torques[jnp.clip(_row(self.edges, t), 0, self.torques.shape[0] - 1)]
+        return jnp.where(inside, value, jnp.zeros_like(value))
+
+
+def _row(times: Float[Array, " n"], t: Scalar) -> Any:
+    """The last row whose time is not after t. At a jump this is the piece that begins."""
+    # Comparing all keeps a short table inside the solver's one kernel; a search is a loop.
+    method = "compare_all" if times.shape[0] <= 128 else "scan"
+    return jnp.searchsorted(times, t, side="right", method=method) - 1
+
+
+def _rows(times: Any, values: Any, extra: int) -> tuple[Array, Array]:
+    """Times and rows of one precision, checked."""
+    name, other = ("edges", "torques") if extra else ("times", "rows")
+    count, least = _length(times), 2
+    if count is None or count < least:
+        raise ValueError(f"{name}: wanted at least {least} times, shape (n,), got {_shape(times)}")
+    if _length(values) != count - extra:
+        advice = (
+            "; n constant pieces have n + 1 edges (Tabulated draws lines between n rows)"
+            if extra
+            else "; n times go with n rows (constant pieces: Pulses)"
+        )
+        raise ValueError(f"{other}: wanted {count - extra} rows of 3, got {_shape(values)}{advice}")
+    times = _checks.finite(_checks.floating(times, (count,), name), name)
+    values = _checks.finite(_checks.floating(values, (count - extra, 3), other), other)
+    falling = times[1:] <= times[:-1]
+    where = ""
+    if not isinstance(falling, jax.core.Tracer) and bool(falling.any()):
+        where = f"; {name}[{int(np.argmax(np.asarray(falling))) + 1}] is not above the one before"
+    times = _checks.refuse(times, falling.any(), f"{name}: wanted increasing times, s{where}")
+    dtype = jnp.result_type(times, values)
+    return times.astype(dtype), values.astype(dtype)
+
+
+def _length(value: Any) -> int | None:
+    shape = _shape(value)
+    return shape[0] if isinstance(shape, tuple) and shape else None
+
+
+def _shape(value: Any) -> Any:
+    try:
+        return tuple(np.shape(value))
+    except ValueError:
+        return "rows of different lengths"
