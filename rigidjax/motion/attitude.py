@@ -48,7 +48,7 @@ class AttitudeEquations(eqx.Module):
     >>> import rigidjax as rj
     >>> field = rj.AttitudeEquations(rj.Inertia.from_principal(1.0, 2.0, 3.0))
     >>> field(0.0, Attitude([1.0, 0, 0, 0], [0.0, 0, 1]), None).q
-    Array([0. , 0. , 0. , 0.5], dtype=float64)
+    Array([-0. ,  0. ,  0. ,  0.5], dtype=float64)
     """
 
     euler: EulerEquations
@@ -67,7 +67,7 @@ def quaternion_rate(q: QuatLike, omega: Vec3Like) -> Quat:
     **Returns** (4,) per second. Source: notes, eq 50, on unit quaternions.
 
     >>> quaternion_rate(jnp.array([1.0, 0, 0, 0]), jnp.array([0.0, 0, 2]))
-    Array([0., 0., 0., 1.], dtype=float64)
+    Array([-0.,  0.,  0.,  1.], dtype=float64)
     """
     q, omega = _checks.floating(q, (4,), "q"), _checks.floating(omega, (3,), "omega")
     w, x, y, z = q[0], q[1], q[2], q[3]

@@ -39,8 +39,8 @@ def energy(
     for part in parts:
         if not hasattr(part, "energy"):
             raise TypeError(
-                f"energy: {type(part).__name__} has no potential (no method energy(t, state, body)), "
-                "so there is no energy that it conserves; see kinetic_energy"
+                f"energy: {type(part).__name__} has no potential (no method energy(t, state, "
+                "body)), so there is no energy that it conserves; see kinetic_energy"
             )
     total = kinetic_energy(in_precision(body, state.omega.dtype), state)
     for part in parts:

@@ -70,7 +70,7 @@ class AbstractForce(eqx.Module):
 
     @abc.abstractmethod
     def __call__(self, t: ScalarLike, state: Any, body: Any) -> Wrench:
-        """Force (3,), N, world frame, and torque (3,), N m, body frame, about the centre of mass."""
+        """Force (3,), N, world; torque (3,), N m, body frame, about the centre of mass."""
 
 
 # A user's own callable Module need not subclass anything.
@@ -95,7 +95,7 @@ def require_rung(torque: Torque, state: object) -> None:
 
 
 def evaluate(torque: Torque, t: ScalarLike, state: HasSpin, body: Inertia | MassProperties) -> Vec3:
-    """The torque's value (3,), N m, body frame, its shape checked: a user's own may return anything.
+    """The torque's value (3,), N m, body frame, its shape checked.
 
     **Arguments:** `torque` any law; `t` s; `state`; `body`. The law is taken in the precision of
     `state.omega`. **Raises:** `TypeError` for a force, which only `Rigid` feels; `ValueError` for a
@@ -120,8 +120,8 @@ def act(
 ) -> tuple[Vec3 | None, Vec3]:
     """Force on the centre of mass (N, world frame; `None` if there is none) and torque about it.
 
-    **Arguments** as for `evaluate`. **Returns** a force (3,) or `None`, and a torque (3,), N m, body
-    frame, in the precision of `state.omega`.
+    **Arguments** as for `evaluate`. **Returns** a force (3,) or `None`, and a torque (3,), N m,
+    body frame, in the precision of `state.omega`.
 
     >>> from rigidjax import Inertia, Spin, torques
     >>> act(torques.ConstantTorque([0.0, 0, 1]), 0.0, Spin([0.0, 0, 1]), Inertia(jnp.eye(3)))[0]
@@ -167,6 +167,15 @@ def vector_at(source: Any, t: ScalarLike, name: str) -> Vec3:
     Array([1., 1., 1.], dtype=float64)
     """
     return _checks.floating(source(t), (3,), f"{name}(t)") if callable(source) else source
+
+
+def stays(source: Any) -> Vec3 | None:
+    """A vector that is constant; `None` for a function of time.
+
+    >>> stays(jnp.ones(3))
+    Array([1., 1., 1.], dtype=float64)
+    """
+    return None if callable(source) else source
 
 
 def constant_or_callable(source: Any, name: str) -> Any:

@@ -82,7 +82,7 @@ class FromPotential(AbstractTorque):
     >>> from rigidjax import Attitude, quaternion
     >>> at = Attitude(quaternion.exp(jnp.array([0.0, 0.0, 1e-3])), [0.0, 0, 0])
     >>> FromPotential(Spring(jnp.array(2.0)))(0.0, at, None).round(5).tolist()
-    [0.0, 0.0, -0.002]
+    [-0.0, -0.0, -0.002]
     """
 
     feels: ClassVar[type] = HasAttitude

@@ -42,8 +42,8 @@ class ConstantTorque(AbstractTorque):
 class InSpace(AbstractTorque):
     """A torque whose direction is given in space: `τ = Rᵀ τ_w`.
 
-    **Arguments:** `torque` τ_w, N m, world frame: (3,), or a callable Module of time, t → (3,), such
-    as `Linear(times, values)`.
+    **Arguments:** `torque` τ_w, N m, world frame: (3,), or a callable Module of time, t → (3,),
+    such as `Linear(times, values)`.
 
     A constant τ_w keeps the angular momentum across it, and adds τ_w t along it.
 

@@ -24,8 +24,8 @@ class Flywheel(AbstractTorque):
     callable Module of time, t → (3,), for wheels that are spun up, such as `Linear(times, values)`.
     Several wheels: give the sum.
 
-    The body's `Inertia` goes with the meaning of h. With the wheels counted as if locked, h is their
-    momentum relative to the body. With the wheels' axial moments taken out (I − Σ J a aᵀ), h is
+    The body's `Inertia` goes with the meaning of h. With the wheels counted as if locked, h is
+    their momentum relative to the body. With the wheels' axial moments taken out (I − Σ J a aᵀ), h is
     their whole axial momentum, and dh/dt is the torque of the motors.
 
     The momentum in space, `R (IΩ + h)`, is kept; the energy `½ Ω·IΩ` too while h is constant.

@@ -15,7 +15,7 @@ from rigidjax.rotation.algebra import apply, cross, dot
 
 
 class UniformGravity(AbstractForce):
-    """The same acceleration everywhere: `F = m g`, no torque about the centre of mass, `U = −m g·x`.
+    """The same acceleration everywhere: `F = m g`, no torque about the centre, `U = −m g·x`.
 
     **Arguments:** `gravity` (3,) g, m/s², world frame, such as [0, 0, −9.81].
 
@@ -102,8 +102,8 @@ class Drag(AbstractForce):
     """Drag of a fluid: `F = −k |u| u`, `u = v − wind`, at a point of the body.
 
     **Arguments:** `coefficient` k = ½ ρ C_d A, kg/m; `centre` (3,) the point where it acts, m, body
-    frame, from the centre of mass (there `τ = c × RᵀF`); `wind` (3,) the fluid's velocity, m/s, world
-    frame. The body's own turning is not counted in u: that is `Damping`, `QuadraticDamping`.
+    frame, from the centre of mass (there `τ = c × RᵀF`); `wind` (3,) the fluid's velocity, m/s,
+    world frame. The body's own turning is not counted in u: that is `Damping`, `QuadraticDamping`.
 
     Source: Landau and Lifshitz, Fluid Mechanics, §45. At u = 0 the first derivative is right, and
     zero; a second does not exist there.

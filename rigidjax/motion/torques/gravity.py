@@ -14,6 +14,7 @@ from rigidjax.motion.torques.base import (
     AbstractTorque,
     constant_or_callable,
     jumps_of,
+    stays,
     tensor_of,
     vector_at,
 )
@@ -32,12 +33,12 @@ class HeavyTop(AbstractTorque):
     Keeps the energy and the momentum along g. Source: Landau and Lifshitz, Mechanics, §35;
     Arnold, Mathematical Methods of Classical Mechanics, §30.
 
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype; `TypeError` on a `Rigid`, which
-    has no fixed point.
+    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype; `TypeError` on a `Rigid`,
+    which has no fixed point.
 
     >>> top = HeavyTop(2.0, [0.0, 0.0, 0.5], [0.0, 0.0, -9.81])
     >>> from rigidjax import Attitude, Inertia
-    >>> top.energy(0.0, Attitude([1.0, 0, 0, 0], [0.0, 0, 1]), Inertia.from_principal(1.0, 1.0, 1.0))
+    >>> top.energy(0.0, Attitude([1.0, 0, 0, 0], [0.0, 0, 1]), Inertia(jnp.eye(3)))
     Array(9.81, dtype=float64)
     """
 
@@ -64,7 +65,7 @@ class HeavyTop(AbstractTorque):
         return self.gravity
 
     def energy(self, t: ScalarLike, state: HasAttitude, body: object) -> Scalar:
-        """Potential energy, J: `U = −m g·Rc`, zero where the centre of mass is level with the pivot."""
+        """Potential energy, J: `U = −m g·Rc`, zero where c is level with the pivot."""
         return -self.mass * dot(self.com, quaternion.rotate_inverse(state.q, self.gravity))
 
     def __call__(self, t: ScalarLike, state: HasAttitude, body: object) -> Vec3:
@@ -109,8 +110,8 @@ class GravityGradient(AbstractTorque):
 
     @property
     def axis(self) -> Vec3 | None:
-        """The direction about which there is no torque, world frame, if it stays: towards the body."""
-        return None if callable(self.position) else self.position
+        """The direction without torque about it, world frame, if it stays: the position's."""
+        return stays(self.position)
 
     @property
     def jump_times(self) -> Float[Array, " n"]:

@@ -12,6 +12,7 @@ from rigidjax.motion.torques.base import (
     AbstractTorque,
     constant_or_callable,
     jumps_of,
+    stays,
     vector_at,
 )
 from rigidjax.rotation import quaternion
@@ -48,7 +49,7 @@ class MagneticDipole(AbstractTorque):
     @property
     def axis(self) -> Vec3 | None:
         """The direction about which there is no torque, world frame, if it stays: the field's."""
-        return None if callable(self.field) else self.field
+        return stays(self.field)
 
     @property
     def jump_times(self) -> Float[Array, " n"]:

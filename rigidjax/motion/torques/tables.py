@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import equinox as eqx
-import jax
+import jax.core
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
@@ -87,7 +87,7 @@ class Tabulated(AbstractTorque):
 
 
 class Pulses(AbstractTorque):
-    """A torque in constant pieces, such as thruster firings: none before the first or after the last.
+    """A torque in constant pieces, such as thruster firings: none before or after them.
 
     **Arguments:** `edges` (n + 1,) s, increasing; `torques` (n, 3) N m, body frame: row i acts from
     edge i until edge i + 1. One pulse: `Pulses([1.0, 1.5], [[0.0, 0.0, 3.0]])`.
