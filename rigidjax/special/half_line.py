@@ -62,8 +62,8 @@ def half_line(
     # t first: then the running product stays between the sizes of its neighbours.
     product = t
     for a, power in zip(scaled, powers, strict=True):
-        product = product * _power(t + a[..., None], power)
-    value = product.sum(-1) * step * _power(scale, sum(powers) - 1)
+        product = _divide(product, t + a[..., None], power)
+    value = product.sum(-1) * step * _divide(jnp.ones_like(scale), scale, sum(powers) - 1)
     value = jnp.where(at_zero > 0, value, jnp.inf)
     negative = jnp.isnan(largest)
     for a in arguments:
@@ -82,8 +82,13 @@ def _half_line_jvp(powers: Any, primals: Any, tangents: Any) -> tuple[Any, Any]:
     return half_line(powers, arguments), tangent
 
 
-def _power(x: Float[Array, "..."], power: float) -> Float[Array, "..."]:
-    """x^(−power) for multiples of ½, by a square root and products."""
+def _divide(value: Any, x: Any, power: float) -> Any:
+    """value · x^(−power) for multiples of ½, factor by factor."""
     whole = math.floor(power)
-    value = jax.lax.integer_pow(1 / x, whole) if whole else jnp.ones_like(x)
-    return value * jax.lax.rsqrt(x) if power > whole else value
+    if power > whole:
+        value = value * jax.lax.rsqrt(x)
+    for _ in range(whole):
+        value = value / x
+    for _ in range(-whole):
+        value = value * x
+    return value

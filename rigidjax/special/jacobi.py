@@ -79,33 +79,32 @@ def am(
 
 
 def _functions(u: Any, m: Any, m1: Any) -> tuple[Any, Any, Any, Any]:
-    """sn, cn, dn and the half turns of the amplitude, any real m, from 0 ≤ m ≤ 1."""
-    negative, above = m < 0, m1 < 0
-    # DLMF 22.17.2–4: m > 1 becomes 1/m; 22.17.6–8: m < 0 becomes −m/m1.
-    divisor = jnp.where(above, m, jnp.where(negative, m1, 1))
+    """sn, cn, dn for any real m, and the half turns of the amplitude."""
+    # DLMF 22.17.2–4: m > 1 becomes 1/m, and cn and dn change places.
+    above = m1 < 0
+    divisor = jnp.where(above, m, 1)
     root = jnp.sqrt(divisor)
-    inner_m = jnp.where(above, 1, jnp.where(negative, -m, m)) / divisor
-    inner_m1 = jnp.where(above, -m1, jnp.where(negative, 1, m1)) / divisor
-    v = u * root
-    s, c, d = _core(v, inner_m, inner_m1)
-    turns = _turns(jax.lax.stop_gradient(v), jax.lax.stop_gradient(inner_m1))[0]
-
-    quotient = jnp.where(negative, d, 1)
-    first = s / (root * quotient)
-    second = jnp.where(above, d, c / quotient)
-    third = jnp.where(above, c, jnp.where(negative, 1 / quotient, d))
-    return first, second, third, jnp.where(above, 0, turns)
+    inner_m = jnp.where(above, 1, m) / divisor
+    inner_m1 = jnp.where(above, -m1, m1) / divisor
+    s, c, d = _core(u * root, inner_m, inner_m1)
+    turns = _turns(jax.lax.stop_gradient(u), jax.lax.stop_gradient(inner_m1))[0]
+    return (
+        s / root,
+        jnp.where(above, d, c),
+        jnp.where(above, c, d),
+        jnp.where(above, 0, turns),
+    )
 
 
 @jax.custom_jvp
 def _core(u: Any, m: Any, m1: Any) -> tuple[Any, Any, Any]:
-    """sn, cn, dn for 0 ≤ m ≤ 1, as functions of u and m1; m must be the complement of m1."""
+    """sn, cn, dn for m ≤ 1, as functions of u and m1; m must be the complement of m1."""
     turns, angle, lows, highs, mean = _turns(u, m1)
     sign = _parity(turns)
     theta = jnp.abs(angle)
-    # Bulirsch's recursion carries cot φ, which is too large at first for tiny arguments.
-    tiny = jnp.abs(u) < float(jnp.finfo(u.dtype).eps) ** (1 / 3)
-    safe = jnp.where(tiny, 1, theta)
+    # Bulirsch's recursion carries cot²φ: let it not overflow, neither at 0 nor at a half period.
+    tiny = jnp.abs(u) * jnp.maximum(1, jnp.sqrt(m1)) < float(jnp.finfo(u.dtype).eps) ** (1 / 3)
+    safe = jnp.maximum(theta, float(jnp.finfo(u.dtype).tiny) ** 0.4)
     a = jnp.cos(safe) / jnp.sin(safe)
     c, d = mean * a, jnp.ones_like(u)
     for low, high in zip(lows[::-1], highs[::-1], strict=True):
