@@ -68,15 +68,14 @@ def wahba(
     w = jnp.ones_like(body[:, 0]) if weights is None else jnp.asarray(weights)
     w = _checks.floating(w, body.shape[:1], "weights")
     b = (w[:, None, None] * world[:, :, None] * body[:, None, :]).sum(0)
-    # ζ = (σ1 + σ2)(σ2 + σ3)(σ3 + σ1), σ3 with the sign of det: 0 where a turn is free.
-    size = jnp.sqrt((b * b).sum())
-    zeta = _quartic(b / size)[1]
-    b = _checks.refuse(
-        b,
-        ~(zeta > 100 * jnp.finfo(b.dtype).eps),
+    best = _best(b)
+    # (σ1 + σ2)(σ2 + σ3)(σ3 + σ1), σ3 with the sign of det b: 0 where a turn is free.
+    firmness = determinant(_curvature(best, b / jnp.sqrt((b * b).sum())))
+    return _checks.refuse(
+        best,
+        ~(firmness > 100 * jnp.finfo(b.dtype).eps),
         "wahba: these directions do not fix the attitude; two that are not parallel are needed",
     )
-    return _best(b)
 
 
 def align(a: Vec3Like, b: Vec3Like) -> Mat3:
@@ -84,8 +83,8 @@ def align(a: Vec3Like, b: Vec3Like) -> Mat3:
 
     **Arguments:** `a`, `b` (3,), not zero, in one frame, any lengths. **Returns:** (3, 3), R a ∥ b.
     For exactly opposite directions: half a turn about the axis normal to a that is nearest to the
-    basis vector along which a is smallest. No digits are lost near there (half of a + b is the
-    direction turned to; Markley & Crassidis 2014, sec. 2.9.4 in other words).
+    basis vector along which a is smallest. No digits are lost near there: the quaternion is
+    (½|m|, a × m/|m|), m = a + b, and m is small but exact.
 
     >>> align(jnp.array([1.0, 0, 0]), jnp.array([0, 2.0, 0])).round(12)[:, 0].tolist()
     [0.0, 1.0, 0.0]
@@ -100,7 +99,7 @@ def align(a: Vec3Like, b: Vec3Like) -> Mat3:
     across = smallest - dot(smallest, a) * a
     axis = jnp.where(opposite, across / jnp.sqrt(dot(across, across)), cross(a, middle) / length)
     w = jnp.where(opposite, 0, 0.5 * length)
-    return quaternion.to_matrix(jnp.concatenate([w[None], axis]))
+    return quaternion.to_matrix(quaternion.normalise(jnp.concatenate([w[None], axis])))
 
 
 def mean(matrices: Float[ArrayLike, "n 3 3"], weights: Float[ArrayLike, "n"] | None = None) -> Mat3:
@@ -174,11 +173,11 @@ def _cofactors(b: Mat3) -> Mat3:
     return jnp.stack([cross(b[1], b[2]), cross(b[2], b[0]), cross(b[0], b[1])])
 
 
-def _step(r: Mat3, b: Mat3) -> tuple[Mat3, Mat3]:
-    """Rᵀb, and the curvature Tr(S) 1 − S of the gain Tr(RᵀB) at R."""
+def _curvature(r: Mat3, b: Mat3) -> Mat3:
+    """Tr(S) 1 − S, S = sym(Rᵀb): how sharply the gain Tr(Rᵀb) falls off around R."""
     m = product(r.T, b)
     s = 0.5 * (m + m.T)
-    return m, (s[0, 0] + s[1, 1] + s[2, 2]) * jnp.eye(3, dtype=r.dtype) - s
+    return (s[0, 0] + s[1, 1] + s[2, 2]) * jnp.eye(3, dtype=r.dtype) - s
 
 
 @jax.custom_jvp
@@ -190,10 +189,9 @@ def _best(b: Mat3) -> Mat3:
     q = matrix_to_quaternion(rough)
     # The root of the quartic may have half its digits; two Newton steps on the group mend that.
     for _ in range(2):
-        m, curvature = _step(quaternion.to_matrix(q), b)
-        q = quaternion.normalise(
-            quaternion.multiply(q, quaternion.exp(solve(curvature, 2 * vee(m))))
-        )
+        r = quaternion.to_matrix(q)
+        turn = solve(_curvature(r, b), 2 * vee(product(r.T, b)))
+        q = quaternion.normalise(quaternion.multiply(q, quaternion.exp(turn)))
     return quaternion.to_matrix(q)
 
 
@@ -201,5 +199,4 @@ def _best(b: Mat3) -> Mat3:
 def _best_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
     (b,), (db,) = primals, tangents
     r = _best(b)
-    _, curvature = _step(r, b)
-    return r, product(r, hat(solve(curvature, 2 * vee(product(r.T, db)))))
+    return r, product(r, hat(solve(_curvature(r, b), 2 * vee(product(r.T, db)))))

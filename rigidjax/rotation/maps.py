@@ -53,10 +53,14 @@ def matrix_to_quaternion(m: Mat3) -> Quat:
     return jnp.stack([scale * part for part in row])
 
 
-@jax.custom_jvp
 @_compiled
 def quaternion_to_vector(q: Quat) -> Vec3:
     """The shortest rotation vector of either sign of q."""
+    return _log(q)
+
+
+@jax.custom_jvp
+def _log(q: Quat) -> Vec3:
     w, x, y, z = parts = components(q)
     n2 = x * x + y * y + z * z
     # tan of the half angle is n/|w|, of the quarter n/a, of the eighth n/b: nothing cancels.
@@ -67,10 +71,10 @@ def quaternion_to_vector(q: Quat) -> Vec3:
     return jnp.stack([scale * x, scale * y, scale * z])
 
 
-@quaternion_to_vector.defjvp
-def _quaternion_to_vector_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
+@_log.defjvp
+def _log_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
     (q,), (dq,) = primals, tangents
-    v = quaternion_to_vector(q)
+    v = _log(q)
     w, *u = parts = components(q)
     dw, *du = components(dq)
     # The turn seen from the body, 2 vec(q̄ dq)/|q|², then the inverse right Jacobian.
