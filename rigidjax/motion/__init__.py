@@ -1,6 +1,6 @@
 """How it turns: climb only as far as the scene needs."""
 
-from rigidjax.motion import torques as torques
+from rigidjax.motion import lagrangian as lagrangian, torques as torques
 from rigidjax.motion.attitude import (
     Attitude as Attitude,
     AttitudeEquations as AttitudeEquations,

@@ -70,8 +70,8 @@ class FromPotential(AbstractTorque):
 
     **Arguments:** `potential` a callable Module `q → U`, J, with `q` (4,) unit, body → world.
 
-    `τ_i = −∂U/∂q · ½ q ⊗ e_i`, the derivative along a turn about body axis i. Source: Marsden and
-    Ratiu, Introduction to Mechanics and Symmetry, §15.10 (the lift of U to the body frame).
+    `τ_i = −∂U/∂q · ½ q ⊗ e_i`, the derivative along a turn about body axis i. Source: Landau and
+    Lifshitz, Mechanics, §34.
 
     **Raises:** `TypeError` for what cannot be called, `ValueError` for a U that is not a number.
 

@@ -44,8 +44,8 @@ class QuadraticDamping(AbstractTorque):
     """Quadratic damping `τ = −c |Ω| Ω`, component by component.
 
     **Arguments:** `coefficient` (3,) c along the body axes, N m s²/rad². A body turning about a
-    principal axis then slows as Ω0/(1 + c Ω0 t/I): drag at a large Reynolds number (Landau and
-    Lifshitz, Fluid Mechanics, §45).
+    principal axis then slows as Ω0/(1 + c Ω0 t/I): drag at a large Reynolds number (Newton,
+    Principia, Book II, Section II).
 
     At Ω = 0 the first derivative is right, and zero; a second does not exist there.
 

@@ -25,11 +25,11 @@ class Flywheel(AbstractTorque):
     Several wheels: give the sum.
 
     The body's `Inertia` goes with the meaning of h. With the wheels counted as if locked, h is
-    their momentum relative to the body. With the wheels' axial moments taken out (I − Σ J a aᵀ), h is
-    their whole axial momentum, and dh/dt is the torque of the motors.
+    their momentum relative to the body. With the wheels' axial moments taken out (I − Σ J a aᵀ),
+    h is their whole axial momentum, and dh/dt is the torque of the motors.
 
     The momentum in space, `R (IΩ + h)`, is kept; the energy `½ Ω·IΩ` too while h is constant.
-    Source: Zhukovsky 1885, Volterra 1898; Hughes, Spacecraft Attitude Dynamics, §§3.4, 6.2.
+    Source: Zhukovsky 1885, Volterra 1898; Hughes, Spacecraft Attitude Dynamics, chs. 3, 6.
 
     **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
 

@@ -105,7 +105,7 @@ class Drag(AbstractForce):
     frame, from the centre of mass (there `τ = c × RᵀF`); `wind` (3,) the fluid's velocity, m/s,
     world frame. The body's own turning is not counted in u: that is `Damping`, `QuadraticDamping`.
 
-    Source: Landau and Lifshitz, Fluid Mechanics, §45. At u = 0 the first derivative is right, and
+    Source: Newton, Principia, Book II, Section II. At u = 0 the first derivative is right, and
     zero; a second does not exist there.
 
     **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
