@@ -1,0 +1,203 @@
+"""The circular restricted three-body problem, in the plane and in space."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Complex, Float
+
+from rigidjax import _checks
+from rigidjax._types import Mat3, Scalar, ScalarLike, Vec3, Vec3Like
+from rigidjax.frames import flow, lagrange, periodic, richardson
+from rigidjax.frames.periodic import PeriodicOrbit
+from rigidjax.frames.point import Point
+from rigidjax.frames.scene import AbstractScene
+from rigidjax.rotation.algebra import components
+
+
+class ThreeBody(AbstractScene):
+    """A particle under two bodies that circle each other: make one with `scenes.cr3bp(mu)`.
+
+    Rotating axes, origin at the common centre of mass, the first body (mass 1 − μ) at (−μ, 0, 0),
+    the second (mass μ) at (1 − μ, 0, 0). Units: their distance, their total mass, and 1/(their
+    angular rate); a period of theirs is 2π.
+
+    **Fields:** `mu` μ, scalar; `radii` (2,) of the bodies, at which a particle has collided.
+    """
+
+    mu: Scalar
+    radii: Float[Array, "2"]
+
+    def acceleration(self, t: ScalarLike, state: Point) -> Vec3:
+        """d²x/dt² (3,), rotating axes: attraction, centrifugal and Coriolis (notes, eq 91)."""
+        x, y, z = components(state.x)
+        vx, vy, _ = components(state.v)
+        mu = self.mu.astype(x.dtype)
+        first, second = x + mu, (x - 1) + mu
+        flat = y * y + z * z
+        d1, d2 = first * first + flat, second * second + flat
+        a1, a2 = (1 - mu) / (d1 * jnp.sqrt(d1)), mu / (d2 * jnp.sqrt(d2))
+        pull = a1 + a2
+        return jnp.stack(
+            [
+                2 * vy + x - a1 * first - a2 * second,
+                y - 2 * vx - pull * y,
+                -pull * z,
+            ]
+        )
+
+    def potential(self, x: Vec3Like) -> Scalar:
+        """U = ½(x² + y²) + (1 − μ)/r₁ + μ/r₂ (Szebehely 1967, sec. 1.5, without its constant).
+
+        **Arguments:** `x` (3,), rotating axes.
+        """
+        x = _checks.floating(x, (3,), "x")
+        r1, r2 = self.distances(x)
+        mu = self.mu.astype(x.dtype)
+        return 0.5 * (x[0] * x[0] + x[1] * x[1]) + (1 - mu) / r1 + mu / r2
+
+    def distances(self, x: Vec3Like) -> tuple[Scalar, Scalar]:
+        """How far a place (3,) is from the first and from the second body."""
+        a, b, c = components(_checks.floating(x, (3,), "x"))
+        mu = self.mu.astype(a.dtype)
+        first, second, flat = a + mu, (a - 1) + mu, b * b + c * c
+        return jnp.sqrt(first * first + flat), jnp.sqrt(second * second + flat)
+
+    def jacobi_constant(self, state: Point) -> Scalar:
+        """C = 2U − |v|², kept along the motion (Szebehely 1967, eq 1.5(20)).
+
+        >>> from rigidjax.frames import scenes
+        >>> float(scenes.cr3bp(0.5).jacobi_constant(Point([0.0, 0, 0], [0.0, 0, 0])))
+        4.0
+        """
+        return self.speed_squared(state.x, 0.0) - jnp.sum(state.v * state.v)
+
+    def speed_squared(self, x: Vec3Like, jacobi: ScalarLike) -> Scalar:
+        """|v|² = 2U(x) − C at a place: zero-velocity curves are where it is 0.
+
+        **Arguments:** `x` (3,); `jacobi` C. Negative where a particle with this C cannot come.
+        Draw `matplotlib.pyplot.contour(…, levels=[0])` of it.
+        """
+        u = self.potential(x)
+        return 2 * u - _checks.floating(jacobi, (), "jacobi").astype(u.dtype)
+
+    def conserved(self, t: ScalarLike, state: Point) -> dict[str, Scalar]:
+        return {"jacobi": self.jacobi_constant(state)}
+
+    def approach(self, t: ScalarLike, state: Point) -> tuple[Float[Array, "2"], Float[Array, "2"]]:
+        """Distances from the two bodies, and those at which a run ends, named as a collision."""
+        first, second = self.distances(state.x)
+        gaps = jnp.stack([first, second])
+        return gaps, jnp.maximum(self.radii.astype(gaps.dtype), flow.smallest_distance(gaps.dtype))
+
+    @property
+    def lagrange_points(self) -> Float[Array, "5 3"]:
+        """L1 … L5 (5, 3): see `rigidjax.frames.lagrange.points`."""
+        return lagrange.points(self.mu)
+
+    def hessian(self, x: Vec3Like) -> Mat3:
+        """The second derivatives of U (3, 3) at a place."""
+        return jax.hessian(self.potential)(_checks.floating(x, (3,), "x"))
+
+    def exponents(self, x: Vec3Like) -> Complex[Array, "6"]:
+        """The six exponents λ of small motions about an equilibrium in the plane, e^{λt}.
+
+        **Arguments:** `x` (3,), such as a row of `lagrange_points`. Stable (to first order) where
+        no real part is positive: L4 and L5 below Routh's μ = ½(1 − √(23/27)), L1–L3 never.
+        In the plane λ⁴ + (4 − U_xx − U_yy) λ² + U_xx U_yy − U_xy² = 0, across it λ² = U_zz
+        (Szebehely 1967, sec. 5.2).
+
+        >>> from rigidjax.frames import scenes
+        >>> moon = scenes.cr3bp(0.0121505856)
+        >>> bool((moon.exponents(moon.lagrange_points[3]).real < 1e-12).all())
+        True
+        """
+        u = self.hessian(x)
+        middle = 0.5 * (4 - u[0, 0] - u[1, 1])
+        product = u[0, 0] * u[1, 1] - u[0, 1] * u[0, 1]
+        kind = jnp.complex128 if u.dtype == jnp.float64 else jnp.complex64
+        half = jnp.sqrt((middle * middle - product).astype(kind))
+        squares = jnp.stack([half - middle, -half - middle, u[2, 2].astype(half.dtype)])
+        roots = jnp.sqrt(squares)
+        return jnp.concatenate([roots, -roots])
+
+    def transition(
+        self, state: Point, t: ScalarLike, *, rtol: float = 1e-13, atol: float = 1e-14
+    ) -> Float[Array, "6 6"]:
+        """The state-transition matrix ∂(x, v)(t)/∂(x, v)(0) (6, 6), by forward differentiation.
+
+        **Arguments:** `state` the start; `t` when. Its determinant is 1.
+        """
+        return flow.transition(self, state, t, rtol=rtol, atol=atol)
+
+    def monodromy(self, orbit: PeriodicOrbit) -> Float[Array, "6 6"]:
+        """The transition matrix over one period; its eigenvalues say whether the orbit is stable.
+
+        Two of the six are 1, the others come as λ, 1/λ (Szebehely 1967, sec. 8.6).
+        """
+        return self.transition(orbit.state, orbit.period)
+
+    def lyapunov_guess(self, point: int, amplitude: ScalarLike) -> PeriodicOrbit:
+        """A start near a planar Lyapunov orbit about L1, L2 or L3, for `periodic_orbit`.
+
+        **Arguments:** `point` 1, 2 or 3; `amplitude` along x. Source: `richardson.guess`.
+        """
+        return richardson.guess(self.mu, point, amplitude, None)
+
+    def halo_guess(self, point: int, amplitude: ScalarLike) -> PeriodicOrbit:
+        """A start near a halo orbit about L1, L2 or L3, for `periodic_orbit(…, hold="z")`.
+
+        **Arguments:** `point` 1, 2 or 3; `amplitude` along z, its sign the branch. Source:
+        Richardson 1980, doi:10.1007/BF01229511 (third order).
+        """
+        return richardson.guess(self.mu, point, None, amplitude)
+
+    def periodic_orbit(
+        self, guess: PeriodicOrbit, *, hold: str = "x", tolerance: float = 1e-12
+    ) -> PeriodicOrbit:
+        """The periodic orbit near `guess`, by differentiable correction.
+
+        For orbits symmetric about the xz-plane: Lyapunov, halo, Arenstorf's and most others in use.
+        They cross it at a right angle (y = v_x = v_z = 0) twice a period. Newton's method on three
+        of (x, z, v_y, T/2) makes y, v_x, v_z vanish at the half period.
+
+        **Arguments:** `guess` a `PeriodicOrbit(state, period)` whose state crosses at a right
+        angle; `hold` which of `"x"`, `"z"`, `"vy"`, `"period"` stays as guessed: this labels the
+        orbit within its family (`"x"` for Lyapunov orbits, `"z"` for halo orbits); `tolerance`
+        largest |y|, |v_x|, |v_z| left at the half period.
+
+        **Returns** a `PeriodicOrbit`. Its derivatives with respect to μ and the held number are
+        those of the family, by the implicit function theorem, forward and reverse.
+
+        Source: Howell 1984, doi:10.1007/BF01358403.
+
+        **Raises:** `ValueError` (`EquinoxRuntimeError` under `jit`) if Newton does not converge.
+
+        >>> from rigidjax.frames import scenes
+        >>> moon = scenes.cr3bp(0.0121505856)
+        >>> orbit = moon.periodic_orbit(moon.lyapunov_guess(1, 0.01))
+        >>> round(float(orbit.period), 4)
+        2.712
+        """
+        return periodic.correct(self, guess, hold, tolerance)
+
+
+def cr3bp(mu: ScalarLike, radii: Float[Array, "2"] | object = (0.0, 0.0)) -> ThreeBody:
+    """The circular restricted three-body problem with mass ratio μ.
+
+    **Arguments:** `mu` μ = m₂/(m₁ + m₂), 0 < μ ≤ ½ (Earth–Moon 0.01215…); `radii` (2,) of the two
+    bodies in units of their distance: a run that comes closer ends with a collision's name, time
+    and distance. With zeros it ends where float64 can no longer tell the place from the body.
+
+    **Raises:** `ValueError` for μ outside (0, ½] (`EquinoxRuntimeError` under `jit`).
+
+    Source: notes, eq 91, with a uniform Ω = (0, 0, 1); Szebehely 1967, Theory of Orbits.
+
+    >>> cr3bp(0.5).lagrange_points[3].round(12).tolist()
+    [0.0, 0.866025403784, 0.0]
+    """
+    mu = _checks.floating(mu, (), "mu")
+    bad = ~((mu > 0) & (mu <= 0.5))
+    mu = _checks.refuse(
+        mu, bad, "mu: wanted 0 < mu ≤ ½, the mass of the lighter body over that of both"
+    )
+    radii = _checks.floating(list(radii) if isinstance(radii, tuple) else radii, (2,), "radii")
+    return ThreeBody(mu, _checks.refuse(radii, ~(radii >= 0), "radii: wanted two numbers ≥ 0"))

@@ -1,0 +1,70 @@
+"""From a start to a later time, and its derivative: what periodic orbits are corrected with."""
+
+from typing import Any
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from rigidjax import _checks
+from rigidjax._types import ScalarLike
+from rigidjax.frames.point import Point
+from rigidjax.frames.scene import AbstractScene
+
+
+@eqx.filter_jit
+def flow(scene: AbstractScene, state: Point, t: ScalarLike, rtol: float, atol: float) -> Point:
+    """Where `scene` takes `state` in the time `t`; derivatives in forward mode.
+
+    >>> from rigidjax.frames import scenes
+    >>> flow(scenes.turntable(0.0), Point([0.0, 0, 0], [1.0, 0, 0]), 2.0, 1e-9, 1e-9).x.tolist()
+    [2.0, 0.0, 0.0]
+    """
+    t = _checks.floating(t, (), "t").astype(state.x.dtype)
+    out = dfx.diffeqsolve(
+        dfx.ODETerm(scene.field),
+        dfx.Dopri8(),
+        jnp.zeros_like(t),
+        t,
+        None,
+        state,
+        stepsize_controller=dfx.PIDController(rtol=rtol, atol=atol),
+        adjoint=dfx.ForwardMode(),
+        max_steps=100_000,
+    )
+    return jax.tree.map(lambda leaf: leaf[0], out.ys)
+
+
+def transition(
+    scene: AbstractScene, state: Point, t: ScalarLike, *, rtol: float, atol: float
+) -> Float[Array, "6 6"]:
+    """∂(x, v)(t)/∂(x, v)(0) (6, 6): the tangents are solved along with the motion.
+
+    >>> from rigidjax.frames import scenes
+    >>> start = Point([0.0, 0, 0], [1.0, 0, 0])
+    >>> float(transition(scenes.turntable(0.0), start, 2.0, rtol=1e-9, atol=1e-9)[0, 3])
+    2.0
+    """
+    return _transition(scene, jnp.concatenate([state.x, state.v]), t, rtol, atol)
+
+
+@eqx.filter_jit
+def _transition(scene: Any, numbers: Array, t: Any, rtol: float, atol: float) -> Array:
+    def end(numbers: Array) -> Array:
+        out = flow(scene, Point(numbers[:3], numbers[3:]), t, rtol, atol)
+        return jnp.concatenate([out.x, out.v])
+
+    return jax.jacfwd(end)(numbers)
+
+
+def smallest_distance(dtype: Any) -> float:
+    """The distance, of a unit, below which an attraction has lost its digits: eps^0.4.
+
+    x − x₁ is then known to eps/r = eps^0.6 only (4e-10 in float64), and adaptive steps would grind.
+
+    >>> smallest_distance(jnp.float64) < 1e-6
+    True
+    """
+    return float(jnp.finfo(dtype).eps) ** 0.4

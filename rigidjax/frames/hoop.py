@@ -1,0 +1,115 @@
+"""A bead on a turning hoop, and a turntable."""
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from rigidjax import _checks
+from rigidjax._types import Scalar, ScalarLike, Vec3
+from rigidjax.frames.earth import GRAVITY
+from rigidjax.frames.inside import InFrame
+from rigidjax.frames.moving import MovingFrame
+from rigidjax.frames.point import Point
+from rigidjax.frames.scene import AbstractScene, like
+from rigidjax.frames.turning import AboutAxis
+from rigidjax.rotation.algebra import components
+
+
+class Hoop(AbstractScene):
+    """A bead that slides on a hoop turning about its vertical diameter: see `scenes.hoop`.
+
+    Axes of the hoop: x in its plane, y across it, z up; the centre is the origin.
+
+    **Fields:** `radius` m, `rate` rad/s, `gravity` m/s².
+    """
+
+    radius: Scalar
+    rate: Scalar
+    gravity: Scalar
+
+    def acceleration(self, t: ScalarLike, state: Point) -> Vec3:
+        """d²x'/dt² (3,), m/s²: gravity and centrifugal along the hoop, and the hoop's pull."""
+        x, _, z = components(state.x)
+        vx, _, vz = components(state.v)
+        rate, gravity = like(x, self.rate, self.gravity)
+        push, down = rate * rate * x, -gravity
+        pull = (x * push + z * down + vx * vx + vz * vz) / (x * x + z * z)
+        return jnp.stack([push - pull * x, jnp.zeros_like(x), down - pull * z])
+
+    def conserved(self, t: ScalarLike, state: Point) -> dict[str, Scalar]:
+        x, _, z = components(state.x)
+        rate, gravity = like(x, self.rate, self.gravity)
+        jacobi = 0.5 * (jnp.sum(state.v * state.v) - (rate * x) ** 2) + gravity * z
+        return {"jacobi": jacobi, "radius": jnp.sqrt(x * x + z * z)}
+
+    def side_push(self, state: Point) -> Scalar:
+        """What the hoop presses across its plane, m/s² along y: 2Ω v_x, against Coriolis.
+
+        >>> float(hoop(1.0, 3.0).side_push(Point([0.0, 0, -1], [2.0, 0, 0])))
+        12.0
+        """
+        return 2 * like(state.x, self.rate)[0] * state.v[0]
+
+    def state(self, angle: ScalarLike, speed: ScalarLike = 0.0) -> Point:
+        """The bead at an angle from the lowest place, rad, with dθ/dt = `speed`, rad/s.
+
+        >>> hoop(2.0, 3.0).state(0.0, 1.0).v.tolist()
+        [2.0, 0.0, 0.0]
+        """
+        angle, speed = _checks.floating(angle, (), "angle"), _checks.floating(speed, (), "speed")
+        c, s, zero = jnp.cos(angle), jnp.sin(angle), jnp.zeros_like(angle)
+        place, along = jnp.stack([s, zero, -c]), jnp.stack([c, zero, s])
+        radius = like(place, self.radius)[0]
+        return Point(radius * place, radius * speed.astype(angle.dtype) * along)
+
+    def equilibrium_angle(self) -> Scalar:
+        """Where the bead rests stably, rad: arccos(g/(Ω²R)), 0 while the hoop is slow.
+
+        >>> float(hoop(1.0, 1.0).equilibrium_angle())
+        0.0
+        """
+        ratio = self.gravity / (self.rate**2 * self.radius)
+        fast = ratio < 1
+        return jnp.where(fast, jnp.arccos(jnp.where(fast, ratio, 0.5)), 0)
+
+
+def hoop(radius: ScalarLike, rate: ScalarLike, gravity: ScalarLike = GRAVITY) -> Hoop:
+    """A bead without friction on a hoop that turns about its vertical diameter.
+
+    **Arguments:** `radius` R, m; `rate` Ω, rad/s; `gravity` m/s². Source: Goldstein, Mechanics,
+    sec. 2.7 (θ'' = sin θ (Ω² cos θ − g/R)); notes, eq 91.
+
+    **Raises:** `ValueError` for a radius that is not positive.
+
+    >>> hoop(1.0, 5.0).acceleration(0.0, Point([0.0, 0, -1], [0.0, 0, 0])).tolist()
+    [0.0, 0.0, 0.0]
+    """
+    named = {"radius": radius, "rate": rate, "gravity": gravity}
+    values = {name: _checks.floating(value, (), name) for name, value in named.items()}
+    dtype = jnp.result_type(*values.values())
+    r, w, g = (value.astype(dtype) for value in values.values())
+    return Hoop(_checks.refuse(r, ~(r > 0), "radius: wanted a positive number, m"), w, g)
+
+
+class _Angle(eqx.Module):
+    """½αt² + Ωt."""
+
+    rate: Scalar
+    growth: Scalar
+
+    def __call__(self, t: Scalar) -> Scalar:
+        rate, growth = like(t, self.rate, self.growth)
+        return t * (rate + 0.5 * growth * t)
+
+
+def turntable(rate: ScalarLike, growth: ScalarLike = 0.0) -> InFrame:
+    """A frictionless table that turns about z: what it sees of a puck.
+
+    **Arguments:** `rate` Ω at t = 0, rad/s; `growth` dΩ/dt, rad/s². Seen from outside the puck
+    goes straight; `turntable(…).frame` takes states there and back (notes, eqs 85–91).
+
+    >>> turntable(2.0).acceleration(0.0, Point([1.0, 0, 0], [0.0, 0, 0])).tolist()
+    [4.0, 0.0, 0.0]
+    """
+    rate, growth = _checks.floating(rate, (), "rate"), _checks.floating(growth, (), "growth")
+    axis = jnp.stack([jnp.zeros_like(rate), jnp.zeros_like(rate), jnp.ones_like(rate)])
+    return InFrame(MovingFrame(AboutAxis(axis, _Angle(rate, growth))))

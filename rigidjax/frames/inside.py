@@ -1,0 +1,119 @@
+"""Integrate inside a moving frame: a particle, or the attitude of a body."""
+
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from rigidjax import _checks
+from rigidjax._types import HasAttitude, Scalar, ScalarLike, Vec3
+from rigidjax.body import inertia as _inertia
+from rigidjax.frames.moving import MovingFrame
+from rigidjax.frames.scene import AbstractScene, Force, per_mass
+from rigidjax.frames.turning import Uniform
+from rigidjax.rotation import algebra, quaternion
+
+
+class InFrame(AbstractScene):
+    """A particle seen and solved in a moving frame: eq 91 of the notes, corrected.
+
+    **Arguments:**
+
+    - `frame`: the `MovingFrame` S'; states are what it sees.
+    - `inside`: force per mass in S', `(t, Point in S') → (3,)`, m/s², axes of S'.
+    - `outside`: force per mass in S, `(t, Point in S) → (3,)`, m/s², axes of S.
+    - `potential`: V(x') per mass, `(3,) → ()`, m²/s²; its force −∇V is taken by automatic
+      differentiation. In a uniformly turning frame, with no other force, `conserved` then has the
+      Jacobi integral.
+
+    >>> import rigidjax as rj
+    >>> scene = InFrame(MovingFrame(rj.frames.Uniform([0.0, 0.0, 1.0])))
+    >>> scene.acceleration(0.0, rj.frames.Point([2.0, 0, 0], [0.0, 0, 0])).tolist()
+    [2.0, 0.0, 0.0]
+    """
+
+    frame: MovingFrame
+    inside: Callable[..., Any] | None = None
+    outside: Callable[..., Any] | None = None
+    potential: Callable[..., Any] | None = None
+
+    def acceleration(self, t: ScalarLike, state: Any) -> Vec3:
+        now = self.frame.at(t)
+        total = now.fictitious(state.x, state.v)
+        if self.inside is not None:
+            total = total + per_mass(self.inside(t, state), self.inside).astype(total.dtype)
+        if self.outside is not None:
+            outer = per_mass(self.outside(t, now.to_inertial(state)), self.outside)
+            total = total + now.inward(outer).astype(total.dtype)
+        if self.potential is not None:
+            total = total - jax.grad(self.potential)(state.x)
+        return total
+
+    def conserved(self, t: ScalarLike, state: Any) -> dict[str, Scalar]:
+        frame = self.frame
+        steady = isinstance(frame.rotation, Uniform) and frame.origin is None
+        if not steady or self.inside is not None or self.outside is not None:
+            return {}
+        v = jnp.zeros((), state.x.dtype) if self.potential is None else self.potential(state.x)
+        return {"jacobi": frame.jacobi_integral(state, t, v)}
+
+
+def scene_of(force: Any) -> AbstractScene:
+    """The scene that `simulate` solves: a scene, a frame seen from inside, or a plain force.
+
+    **Raises:** `TypeError` for anything else.
+
+    >>> type(scene_of(None)).__name__
+    'Force'
+    """
+    if isinstance(force, AbstractScene):
+        return force
+    if isinstance(force, MovingFrame):
+        return InFrame(force)
+    if force is None or callable(force):
+        return Force(force)
+    raise TypeError(
+        "Point: wanted a scene (rigidjax.scenes), a MovingFrame or a force (t, state, body) → (3,) "
+        f"per mass, got {type(force).__name__}"
+    )
+
+
+class BodyInFrame(eqx.Module):
+    """The torque that makes Euler's equations right inside a moving frame.
+
+    Give it to `simulate` as the torque of an `Attitude` state that S' sees: q' body → S', and Ω'
+    the rate relative to S', both as ever in body axes. With W = Q'ᵀ Ω the frame's rate in body
+    axes, Ω' = Ω_abs − W, and from I dΩ_abs/dt = IΩ_abs × Ω_abs + τ follows
+
+    I dΩ'/dt = IΩ' × Ω' + [τ + IΩ_abs × Ω_abs − IΩ' × Ω' − I(Q'ᵀ dΩ/dt − Ω' × W)].
+
+    **Arguments:** `frame` the `MovingFrame` S'; `torque` the real τ, `(t, state in S', body) →
+    (3,)`, N m, body axes, or `None`. Source: notes, eqs 50, 91, for a body instead of a point.
+
+    >>> import rigidjax as rj
+    >>> frame = MovingFrame(rj.frames.Uniform([0.0, 0.0, 1.0]))
+    >>> still = rj.Attitude([1.0, 0, 0, 0], [0.0, 0, -1.0])
+    >>> BodyInFrame(frame)(0.0, still, rj.Inertia.from_principal(1.0, 2.0, 3.0)).tolist()
+    [0.0, 0.0, 0.0]
+    """
+
+    feels: ClassVar[type] = HasAttitude
+    frame: MovingFrame
+    torque: Callable[..., Any] | None = None
+
+    def __call__(self, t: ScalarLike, state: Any, body: Any) -> Vec3:
+        now = self.frame.at(t)
+        tensor, omega = body.tensor, state.omega
+        carried = quaternion.rotate_inverse(state.q, now.rate.astype(omega.dtype))
+        change = quaternion.rotate_inverse(state.q, now.rate_change.astype(omega.dtype))
+        total = omega + carried
+        gyroscopic = algebra.cross(_inertia.apply(tensor, total), total)
+        relative = algebra.cross(_inertia.apply(tensor, omega), omega)
+        needed = _inertia.apply(tensor, change - algebra.cross(omega, carried))
+        fictitious = gyroscopic - relative - needed
+        if self.torque is None:
+            return fictitious
+        real = _checks.floating(self.torque(t, state, body), (3,), "torque", hint="body-frame N m")
+        return real.astype(omega.dtype) + fictitious

@@ -1,0 +1,81 @@
+"""A body in orbit, turned by the tide: attitude in the orbital frame."""
+
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from rigidjax import _checks
+from rigidjax._types import HasAttitude, Scalar, ScalarLike, Vec3
+from rigidjax.body import inertia as _inertia
+from rigidjax.frames.inside import BodyInFrame
+from rigidjax.frames.moving import MovingFrame
+from rigidjax.frames.turning import Uniform
+from rigidjax.rotation import algebra, quaternion
+
+
+class Tide(eqx.Module):
+    """Gravity-gradient torque 3n² u × I u on a circular orbit, seen from the orbital frame.
+
+    u is the direction away from the planet, the first axis of that frame. Source: Hughes 1986,
+    Spacecraft Attitude Dynamics, sec. 8.1.
+
+    **Arguments:** `rate` n, rad/s, scalar array.
+
+    >>> import rigidjax as rj
+    >>> body = rj.Inertia.from_principal(1.0, 2.0, 2.5)
+    >>> Tide(jnp.asarray(1.0))(0.0, rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 0]), body).tolist()
+    [0.0, 0.0, 0.0]
+    """
+
+    feels: ClassVar[type] = HasAttitude
+    rate: Scalar
+
+    def __call__(self, t: ScalarLike, state: Any, body: Any) -> Vec3:
+        up = quaternion.rotate_inverse(state.q, jnp.eye(3, dtype=state.q.dtype)[0])
+        n = self.rate.astype(up.dtype)
+        return 3 * n * n * algebra.cross(up, _inertia.apply(body.tensor, up))
+
+
+def libration(rate: ScalarLike) -> BodyInFrame:
+    """The torque on a body in a circular orbit, for `simulate` with `Attitude` states.
+
+    Orbital frame: x away from the planet, y along the motion, z along the orbit's normal; it turns
+    at n about z. `q` takes body axes to it, `omega` is the rate relative to it, in body axes.
+
+    **Arguments:** `rate` n of the orbit, rad/s. Small librations in the plane of a body with
+    principal moments (a, b, c) along (x, y, z) have the rate n √(3 (b − a)/c).
+
+    Source: Hughes 1986, ch. 9; notes, eqs 50, 91.
+
+    >>> import rigidjax as rj
+    >>> body = rj.Inertia.from_principal(1.0, 2.0, 2.5)
+    >>> at_rest = rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 0])
+    >>> libration(0.001)(0.0, at_rest, body).tolist()
+    [0.0, 0.0, 0.0]
+    """
+    n = _checks.floating(rate, (), "rate")
+    normal = jnp.stack([jnp.zeros_like(n), jnp.zeros_like(n), n])
+    return BodyInFrame(MovingFrame(Uniform(normal)), Tide(n))
+
+
+def libration_integral(state: Any, body: Any, rate: ScalarLike) -> Scalar:
+    """½Ω'·IΩ' + (3/2)n² u·Iu − ½n² w·Iw, J: the Jacobi integral of `libration`, kept.
+
+    **Arguments:** `state` an `Attitude` in the orbital frame; `body` an `Inertia`; `rate` n, rad/s.
+    u and w are the frame's first and third axes in body axes (Hughes 1986, sec. 9.1).
+
+    >>> import rigidjax as rj
+    >>> body = rj.Inertia.from_principal(1.0, 2.0, 2.5)
+    >>> at_rest = rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 0])
+    >>> float(libration_integral(at_rest, body, 2.0))
+    1.0
+    """
+    axes = jnp.eye(3, dtype=state.q.dtype)
+    n = _checks.floating(rate, (), "rate").astype(state.q.dtype)
+    up, normal = (quaternion.rotate_inverse(state.q, axes[i]) for i in (0, 2))
+
+    def weighed(y: Vec3) -> Scalar:
+        return algebra.dot(y, _inertia.apply(body.tensor, y))
+
+    return 0.5 * (weighed(state.omega) + n * n * (3 * weighed(up) - weighed(normal)))

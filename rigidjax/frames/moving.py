@@ -1,0 +1,266 @@
+"""A moving frame: any R(t), any origin(t) (notes, section 3, eqs 84–91)."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from rigidjax import _checks
+from rigidjax._types import Mat3, Scalar, ScalarLike, Vec3, Vec3Like
+from rigidjax.frames import turning
+from rigidjax.frames.instant import Instant
+from rigidjax.rotation import algebra
+
+
+class MovingFrame(eqx.Module):
+    """A frame S' that turns and moves in any differentiable way, seen from an inertial S.
+
+    Coordinates go as x = X(t) + M(t) x' (notes, eqs 85, 86, with an origin added).
+
+    **Arguments:**
+
+    - `rotation`: a function of time, s, to M (3, 3) or to its unit quaternion (4,), S' → S; or
+      anything with `.evaluate(t)` that gives a state with `q` and `omega`, such as the solution of
+      `simulate` for a body: then the frame rides on the body. A Module (`frames.Uniform`) does not
+      compile again for other numbers, a fresh `lambda` does.
+    - `origin`: a function of time to X (3,), m, axes of S; `None` where the origins coincide.
+    - `rate`: Ω (3,), rad/s, **axes of S'**, as a function of time, where it is known; else it is
+      Ω = vee(Mᵀ dM/dt) (eqs 45–50) by automatic differentiation. dΩ/dt always is.
+
+    Its numbers may be traced: gradients with respect to a rate or an origin pass through.
+
+    **Raises:** `TypeError` for a `rotation` that is neither; when used, `ValueError` for a value
+    that is no rotation (checked where the value is known, that is outside `jit`).
+
+    >>> turntable = MovingFrame(turning.Uniform([0.0, 0.0, 2.0]))
+    >>> turntable.centrifugal([1.0, 0.0, 0.0], 0.3).tolist()
+    [4.0, 0.0, 0.0]
+    """
+
+    rotation: Any
+    origin: Callable[[Any], Any] | None
+    rate: Callable[[Any], Any] | None
+
+    def __init__(
+        self,
+        rotation: Any,
+        origin: Callable[[Any], Any] | None = None,
+        rate: Callable[[Any], Any] | None = None,
+    ):
+        if not callable(rotation) and not hasattr(rotation, "evaluate"):
+            raise TypeError(
+                "rotation: wanted a function of time or a solution of simulate, got "
+                f"{type(rotation).__name__}; for a uniform turn take frames.Uniform(omega)"
+            )
+        if origin is not None and not callable(origin):
+            raise TypeError(
+                f"origin: wanted a function of time to (3,), got {type(origin).__name__}; "
+                "for one at rest pass lambda t: point"
+            )
+        self.rotation, self.origin = rotation, origin
+        self.rate = getattr(rotation, "rate", None) if rate is None else rate
+
+    def matrix(self, t: ScalarLike) -> Mat3:
+        """M(t) (3, 3), S' → S (notes, eq 85)."""
+        t = _checks.floating(t, (), "t")
+        return turning.matrix(self.rotation, t)
+
+    def at(self, t: ScalarLike) -> Instant:
+        """The frame at time `t`, s: M, Ω, dΩ/dt, and the origin with two derivatives.
+
+        Take it once where several of the methods below are wanted at the same time.
+
+        >>> MovingFrame(turning.Uniform([0.0, 0.0, 2.0])).at(0.0).rate.tolist()
+        [0.0, 0.0, 2.0]
+        """
+        t = _checks.floating(t, (), "t")
+        one = jnp.ones_like(t)
+        rate, rate_change = jax.jvp(self.angular_velocity, (t,), (one,))
+        zero = jnp.zeros(3, t.dtype)
+        origin, velocity, acceleration = zero, zero, zero
+        if self.origin is not None:
+            place = _Place(self.origin)
+            (origin, velocity), (_, acceleration) = jax.jvp(
+                lambda s: jax.jvp(place, (s,), (jnp.ones_like(s),)), (t,), (one,)
+            )
+        return Instant(self.matrix(t), rate, rate_change, origin, velocity, acceleration)
+
+    def angular_velocity(self, t: ScalarLike) -> Vec3:
+        """Ω(t) (3,), rad/s, axes of S': given, or vee(Mᵀ dM/dt) (notes, eqs 45–50)."""
+        t = _checks.floating(t, (), "t")
+        if self.rate is not None:
+            return _checks.floating(self.rate(t), (3,), "rate").astype(t.dtype)
+        if hasattr(self.rotation, "evaluate"):
+            return self.rotation.evaluate(t).omega.astype(t.dtype)
+        m, m_dot = jax.jvp(self.matrix, (t,), (jnp.ones_like(t),))
+        return algebra.vee(algebra.product(m.T, m_dot))
+
+    def to_inertial(self, state: Any, t: ScalarLike) -> Any:
+        """What S sees of a state that S' sees, of the same type.
+
+        **Arguments:** `state` a `Point`, `Attitude` or `Rigid`, or any Module with `x` and `v`,
+        with `q` and `omega`, or with all four; one state. `t` time, s. Then
+
+        x = X + M x',  v = dX/dt + M (v' + Ω × x')  (notes, eqs 85, 87, 88),
+        q = q_M q',  Ω_body = Ω'_body + (M')ᵀ Ω, in body axes both.
+
+        Many: `jax.vmap(frame.to_inertial)(states, times)`.
+
+        >>> import rigidjax as rj
+        >>> frame = MovingFrame(turning.Uniform([0.0, 0.0, 2.0]))
+        >>> frame.to_inertial(rj.frames.Point([1.0, 0, 0], [0.0, 0, 0]), 0.0).v.tolist()
+        [0.0, 2.0, 0.0]
+        """
+        return self.at(t).to_inertial(state)
+
+    def from_inertial(self, state: Any, t: ScalarLike) -> Any:
+        """What S' sees of a state that S sees: the inverse of `to_inertial`.
+
+        **Arguments:** as there. x' = Mᵀ(x − X), v' = Mᵀ(v − dX/dt) − Ω × x' (notes, eqs 86–88).
+
+        >>> import rigidjax as rj
+        >>> frame = MovingFrame(turning.Uniform([0.0, 0.0, 2.0]))
+        >>> frame.from_inertial(rj.frames.Point([1.0, 0, 0], [0.0, 2, 0]), 0.0).v.tolist()
+        [0.0, 0.0, 0.0]
+        """
+        return self.at(t).from_inertial(state)
+
+    def centrifugal(self, x: Vec3Like, t: ScalarLike) -> Vec3:
+        """Centrifugal acceleration −Ω × (Ω × x') (3,), m/s², axes of S' (notes, eq 91).
+
+        **Arguments:** `x` (3,) position in S', m; `t` s.
+        """
+        return self.at(t).centrifugal(x)
+
+    def coriolis(self, v: Vec3Like, t: ScalarLike) -> Vec3:
+        """Coriolis acceleration −2 Ω × v' (3,), m/s², axes of S' (notes, eq 91).
+
+        **Arguments:** `v` (3,) velocity in S', m/s; `t` s.
+        """
+        return self.at(t).coriolis(v)
+
+    def euler_acceleration(self, x: Vec3Like, t: ScalarLike) -> Vec3:
+        """Euler acceleration −dΩ/dt × x' (3,), m/s², axes of S' (notes, eq 91, "inercial").
+
+        **Arguments:** `x` (3,) position in S', m; `t` s.
+        """
+        return self.at(t).euler_acceleration(x)
+
+    def translation(self, t: ScalarLike) -> Vec3:
+        """What an accelerated origin adds, −Mᵀ d²X/dt² (3,), m/s², axes of S'."""
+        return self.at(t).translation()
+
+    def acceleration(
+        self, x: Vec3Like, v: Vec3Like, t: ScalarLike, force: Vec3Like | None = None
+    ) -> Vec3:
+        """The acceleration that S' sees: eq 91 of the notes, corrected, with a moving origin.
+
+        d²x'/dt² = f − Ω×(Ω×x') − 2Ω×v' − dΩ/dt×x' − Mᵀ d²X/dt². (Eq 91 prints one more x'' inside
+        its bracket; eq 90 shows that it is a slip.)
+
+        **Arguments:** `x`, `v` (3,) in S', m and m/s; `t` s; `force` f = MᵀF (3,) per mass, m/s²,
+        **axes of S'** (`force_from_inertial` makes it from F), `None` for a free particle.
+
+        >>> frame = MovingFrame(turning.Uniform([0.0, 0.0, 2.0]))
+        >>> frame.acceleration([1.0, 0, 0], [0.0, -2, 0], 0.0).tolist()
+        [-4.0, 0.0, 0.0]
+        """
+        x = _checks.floating(x, (3,), "x")
+        free = self.at(t).fictitious(x, v)
+        return free if force is None else _checks.floating(force, (3,), "force") + free
+
+    def acceleration_to_inertial(
+        self, x: Vec3Like, v: Vec3Like, a: Vec3Like, t: ScalarLike
+    ) -> Vec3:
+        """The acceleration that S sees (3,), m/s² (notes, eqs 89, 90, with a moving origin).
+
+        **Arguments:** `x`, `v`, `a` (3,) position, velocity and acceleration in S'; `t` s.
+        """
+        now, a = self.at(t), _checks.floating(a, (3,), "a")
+        return now.outward(a - now.fictitious(x, v))
+
+    def force_from_inertial(self, force: Vec3Like, t: ScalarLike) -> Vec3:
+        """Force f = MᵀF (3,): a force, or any direction, in the axes of S' (notes, eq 91)."""
+        return algebra.apply(self.matrix(t).T, force)
+
+    def force_to_inertial(self, force: Vec3Like, t: ScalarLike) -> Vec3:
+        """Force F = M f (3,): a force, or any direction, in the axes of S (notes, eq 85)."""
+        return algebra.apply(self.matrix(t), force)
+
+    def jacobi_integral(self, state: Any, t: ScalarLike, potential: ScalarLike = 0.0) -> Scalar:
+        """½|v'|² − ½|Ω × x'|² + V, m²/s²: kept where Ω and V(x') do not depend on time.
+
+        **Arguments:** `state` a `Point` in S'; `t` s; `potential` V per mass there, m²/s².
+        Source: Goldstein, Mechanics, sec. 3.12 (as h = −C/2 in the three-body problem).
+        """
+        speed = algebra.dot(state.v, state.v)
+        moved = algebra.cross(self.at(t).rate.astype(state.x.dtype), state.x)
+        v = _checks.floating(potential, (), "potential").astype(state.x.dtype)
+        return 0.5 * (speed - algebra.dot(moved, moved)) + v
+
+    def then(self, inner: "MovingFrame") -> "MovingFrame":
+        """The frame that moves as `inner` does **within this one**: M = M₁M₂, X = X₁ + M₁X₂.
+
+        >>> half = MovingFrame(turning.Uniform([0.0, 0.0, 1.0]))
+        >>> half.then(half).at(0.0).rate.tolist()
+        [0.0, 0.0, 2.0]
+        """
+        return MovingFrame(_ComposedRotation(self, inner), _ComposedOrigin(self, inner))
+
+    def inverse(self) -> "MovingFrame":
+        """S as S' sees it: M → Mᵀ, X → −MᵀX. `frame.then(frame.inverse())` is no motion at all."""
+        return MovingFrame(_InverseRotation(self), _InverseOrigin(self))
+
+    def place(self, t: ScalarLike) -> Vec3:
+        """X(t) (3,), m, axes of S."""
+        t = _checks.floating(t, (), "t")
+        return jnp.zeros(3, t.dtype) if self.origin is None else _Place(self.origin)(t)
+
+
+class _Place(eqx.Module):
+    """An origin, its shape and dtype checked."""
+
+    origin: Callable[[Any], Any]
+
+    def __call__(self, t: Any) -> Any:
+        return _checks.floating(self.origin(t), (3,), "origin").astype(t.dtype)
+
+
+class _ComposedRotation(eqx.Module):
+    outer: MovingFrame
+    inner: MovingFrame
+
+    def __call__(self, t: Any) -> Any:
+        return algebra.product(self.outer.matrix(t), self.inner.matrix(t))
+
+    def rate(self, t: Any) -> Any:
+        # Rates add in one set of axes, which saves one derivative of the product.
+        carried = algebra.apply(self.inner.matrix(t).T, self.outer.angular_velocity(t))
+        return carried + self.inner.angular_velocity(t)
+
+
+class _ComposedOrigin(eqx.Module):
+    outer: MovingFrame
+    inner: MovingFrame
+
+    def __call__(self, t: Any) -> Any:
+        return self.outer.place(t) + algebra.apply(self.outer.matrix(t), self.inner.place(t))
+
+
+class _InverseRotation(eqx.Module):
+    frame: MovingFrame
+
+    def __call__(self, t: Any) -> Any:
+        return self.frame.matrix(t).T
+
+    def rate(self, t: Any) -> Any:
+        return -algebra.apply(self.frame.matrix(t), self.frame.angular_velocity(t))
+
+
+class _InverseOrigin(eqx.Module):
+    frame: MovingFrame
+
+    def __call__(self, t: Any) -> Any:
+        return -algebra.apply(self.frame.matrix(t).T, self.frame.place(t))

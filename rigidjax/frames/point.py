@@ -1,0 +1,31 @@
+"""The state of a particle: no body at all."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from rigidjax import _checks
+
+
+class Point(eqx.Module):
+    """Where a particle is and how it moves, in the frame that watches it.
+
+    **Arguments:** `x` (3,) position, m; `v` (3,) its velocity **in that frame**, m/s. Scenes with
+    units of their own (the restricted three-body problem) say so. Leading axes are allowed in a
+    container of many states; functions take one. Source: notes, eq 84 (x, and ẋ).
+
+    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
+
+    >>> Point([1.0, 0, 0], [0.0, 2, 0]).v.shape
+    (3,)
+    """
+
+    x: Float[Array, "*batch 3"]
+    v: Float[Array, "*batch 3"]
+
+    def __init__(self, x: Float[Array, "*batch 3"] | object, v: Float[Array, "*batch 3"] | object):
+        hint = "a plane problem has z = 0; functions take one particle, batch with jax.vmap"
+        x = _checks.floating(x, (3,), "x", batched=True, hint=hint)
+        v = _checks.floating(v, (3,), "v", batched=True, hint=hint)
+        dtype = jnp.promote_types(x.dtype, v.dtype)
+        self.x, self.v = x.astype(dtype), v.astype(dtype)

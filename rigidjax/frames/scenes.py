@@ -1,0 +1,12 @@
+"""Ready-made scenes: `rigidjax.simulate(None, Point(x, v), ts, scene)`, no body is needed."""
+
+from rigidjax.frames.cr3bp import ThreeBody as ThreeBody, cr3bp as cr3bp
+from rigidjax.frames.earth import Earth as Earth, earth as earth
+from rigidjax.frames.foucault import Foucault as Foucault, foucault as foucault
+from rigidjax.frames.hill import Hill as Hill, hill as hill
+from rigidjax.frames.hoop import Hoop as Hoop, hoop as hoop, turntable as turntable
+from rigidjax.frames.libration import (
+    libration as libration,
+    libration_integral as libration_integral,
+)
+from rigidjax.frames.periodic import PeriodicOrbit as PeriodicOrbit

@@ -1,0 +1,82 @@
+"""Ways of turning, as functions of time: uniform, about one axis, or read off something else."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from rigidjax import _checks
+from rigidjax._types import Mat3, Vec3
+from rigidjax.rotation import algebra, quaternion, so3
+
+
+class Uniform(eqx.Module):
+    """A uniform turn M(t) = exp(t hat Ω), which is 1 at t = 0 (notes, eqs 17, 18).
+
+    **Arguments:** `omega` Ω (3,), rad/s: the same numbers in S and in S'.
+
+    >>> Uniform([0.0, 0.0, 1.0])(jnp.pi).round(12)[0].tolist()
+    [-1.0, -0.0, 0.0]
+    """
+
+    omega: Float[Array, "3"]
+
+    def __init__(self, omega: Float[Array, "3"] | object):
+        self.omega = _checks.floating(omega, (3,), "omega")
+
+    def __call__(self, t: Any) -> Mat3:
+        t = _checks.floating(t, (), "t")
+        return so3.exp(t * self.omega.astype(t.dtype))
+
+    def rate(self, t: Any) -> Vec3:
+        """Ω, whatever the time."""
+        return self.omega.astype(_checks.floating(t, (), "t").dtype)
+
+
+class AboutAxis(eqx.Module):
+    """A turn about a fixed axis by any angle(t): turntables that speed up, pendula that swing.
+
+    **Arguments:** `axis` (3,), of any length but zero; `angle` a function of time to rad.
+
+    >>> float(AboutAxis([0.0, 0.0, 2.0], lambda t: 3.0 * t**2).rate(1.0)[2])
+    6.0
+    """
+
+    axis: Float[Array, "3"]
+    angle: Callable[[Any], Any]
+
+    def __init__(self, axis: Float[Array, "3"] | object, angle: Callable[[Any], Any]):
+        axis = _checks.floating(axis, (3,), "axis")
+        length = jnp.sqrt(algebra.dot(axis, axis))
+        self.axis = _checks.refuse(axis, length == 0, "axis: wanted a direction, got zero") / length
+        self.angle = angle
+
+    def __call__(self, t: Any) -> Mat3:
+        t = _checks.floating(t, (), "t")
+        return so3.exp(_checks.floating(self.angle(t), (), "angle") * self.axis.astype(t.dtype))
+
+    def rate(self, t: Any) -> Vec3:
+        """Ω (3,), rad/s: the axis times the angle's derivative."""
+        t = _checks.floating(t, (), "t")
+        _, speed = jax.jvp(self.angle, (t,), (jnp.ones_like(t),))
+        return speed * self.axis.astype(t.dtype)
+
+
+def matrix(rotation: Any, t: Array) -> Mat3:
+    """M(t) of whatever a frame was given: a function to (3, 3) or (4,), or a solution."""
+    value = rotation.evaluate(t).q if hasattr(rotation, "evaluate") else rotation(t)
+    shape = jnp.shape(value)
+    if shape == (4,):
+        q = _checks.floating(value, (4,), "rotation").astype(t.dtype)
+        return quaternion.to_matrix(quaternion.normalise(q))
+    m = _checks.floating(value, (3, 3), "rotation", hint="wanted a matrix or a quaternion (4,)")
+    if not isinstance(m, jax.core.Tracer):
+        tolerance = 1e-6 if m.dtype == jnp.float64 else 1e-3
+        off = jnp.max(jnp.abs(algebra.product(m.T, m) - jnp.eye(3, dtype=m.dtype)))
+        _checks.refuse(m, ~(off < tolerance), "rotation: Mᵀ M is not 1, so this is no rotation")
+        left = algebra.determinant(m) < 0
+        _checks.refuse(m, left, "rotation: left-handed axes, det = −1 (notes, eq 10)")
+    return m.astype(t.dtype)
