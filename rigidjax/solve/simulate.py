@@ -1,7 +1,7 @@
 """The one front door: a body, where it starts, when to look, and what turns it."""
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import diffrax as dfx
@@ -14,6 +14,7 @@ from jaxtyping import Array, ArrayLike, Float
 from rigidjax import _checks
 from rigidjax._types import HasAttitude, ScalarLike
 from rigidjax.body.inertia import Inertia, MassProperties
+from rigidjax.frames import AbstractScene, MovingFrame, Point, collision, scene_of
 from rigidjax.motion import (
     Attitude,
     AttitudeEquations,
@@ -26,7 +27,7 @@ from rigidjax.motion import (
 from rigidjax.motion.torques import Torque, require_rung
 from rigidjax.solve.projected import Projected
 
-State = Spin | Attitude | Rigid
+State = Spin | Attitude | Rigid | Point
 
 
 class Solution(eqx.Module):
@@ -34,7 +35,8 @@ class Solution(eqx.Module):
 
     **Fields:** `ts` (T,) the times asked for, s; `ys` the states there, of the type of `state0`,
     with a leading time axis; `stats` a dict with `num_steps`, `num_accepted_steps`,
-    `num_rejected_steps`; `result` a `diffrax.RESULTS`, successful or the reason why not.
+    `num_rejected_steps`, for a `Point` also `drift` of what its scene conserves; `result` a
+    `diffrax.RESULTS`, successful or the reason why not.
     """
 
     ts: Float[Array, " times"]
@@ -63,8 +65,8 @@ class Solution(eqx.Module):
 class _Setup(eqx.Module):
     """Everything about a solve but the start and the times."""
 
-    body: Inertia | MassProperties
-    torque: Torque | None
+    body: Inertia | MassProperties | None
+    torque: Torque | AbstractScene | MovingFrame | None
     solver: dfx.AbstractSolver
     controller: dfx.AbstractStepSizeController
     dt0: Any
@@ -79,6 +81,11 @@ def _solve(setup: _Setup, state0: Any, ts: Array) -> tuple[Any, dict[str, Any], 
     # One jit around everything: an operation outside of it costs as much as a hundred steps.
     state0 = on_the_group(state0)
     field = equations_of_motion(setup.body, state0, setup.torque)
+    scene = scene_of(setup.torque) if isinstance(state0, Point) else None
+    watch = collision.event(scene)
+    saveat = dfx.SaveAt(ts=ts)
+    if watch is not None:
+        saveat = dfx.SaveAt(subs=(dfx.SubSaveAt(ts=ts), dfx.SubSaveAt(t1=True)))
     out = dfx.diffeqsolve(
         dfx.ODETerm(field),
         setup.solver,
@@ -86,22 +93,31 @@ def _solve(setup: _Setup, state0: Any, ts: Array) -> tuple[Any, dict[str, Any], 
         ts[-1],
         setup.dt0,
         state0,
-        saveat=dfx.SaveAt(ts=ts),
+        saveat=saveat,
         stepsize_controller=setup.controller,
         adjoint=setup.adjoint,
         max_steps=setup.max_steps,
         throw=setup.throw,
         progress_meter=setup.progress_meter,
+        event=watch,
     )
-    stats = {key: value for key, value in out.stats.items() if key != "max_steps"}
-    return out.ys, stats, out.result
+    stats: dict[str, Any] = {k: value for k, value in out.stats.items() if k != "max_steps"}
+    ys: Any = out.ys
+    if scene is not None:
+        if watch is not None:
+            (ys, ends), (_, end_times) = ys, out.ts
+            end = jax.tree.map(lambda leaf: leaf[0], ends)
+            stats["end_time"] = end_times[0]
+            stats["end_distances"] = scene.approach(end_times[0], end)[0]
+        stats["drift"] = scene.drift(ts, ys)
+    return ys, stats, out.result
 
 
 def simulate(
-    body: Inertia | MassProperties,
+    body: Inertia | MassProperties | None,
     state0: State,
     ts: Float[ArrayLike, " times"] | Sequence[float],
-    torque: Torque | None = None,
+    torque: Torque | AbstractScene | MovingFrame | None = None,
     *,
     solver: dfx.AbstractSolver | None = None,
     rtol: float | None = None,
@@ -118,13 +134,14 @@ def simulate(
     **Arguments:**
 
     - `body`: `Inertia` for `Spin` and `Attitude`, about the point that the body turns about;
-      `MassProperties` for `Rigid`.
+      `MassProperties` for `Rigid`; `None` for a `Point`.
     - `state0`: `Spin(omega)`, `Attitude(q, omega)` or `Rigid(x, v, q, omega)` at `ts[0]`. The rung
       says what is solved for: take the lowest that the question needs. One body; for many,
       `jax.vmap(lambda body, state: rj.simulate(body, state, ts).ys)`.
     - `ts`: (T,) increasing times, s. The first is the start.
     - `torque`: a torque of `rigidjax.torques`, or any callable Module `(t, state, body) → (3,)`,
-      N m, body frame; `None` for a free body.
+      N m, body frame; `None` for a free body. For a `Point` a scene of `rigidjax.scenes`, a
+      `MovingFrame` to see it from, or a force per mass `(t, state, None) → (3,)`, m/s².
     - `solver`: any `diffrax.AbstractSolver`; `diffrax.Dopri8` unless given. It is wrapped so that
       attitudes stay unit quaternions, at every step and every saved time.
     - `rtol`, `atol`: tolerances of the adaptive steps; 1e-9 and 1e-12 in float64, 2e-5 and 1e-7 in
@@ -173,12 +190,16 @@ def simulate(
         throw=throw,
     )
     ys, stats, result = _solve(setup, state0, times)
+    if throw and "end_time" in stats:
+        ys = collision.refuse(ys, result == dfx.RESULTS.event_occurred, stats, times)
     return Solution(times, ys, stats, result, setup)
 
 
 def equations_of_motion(
-    body: Inertia | MassProperties, state0: State, torque: Torque | None = None
-) -> EulerEquations | AttitudeEquations | NewtonEuler:
+    body: Inertia | MassProperties | None,
+    state0: State,
+    torque: Torque | AbstractScene | MovingFrame | None = None,
+) -> Callable[..., Any]:
     """The vector field for this body on the rung of `state0`, for plain `diffrax.ODETerm`.
 
     **Arguments** as for `simulate`. **Raises** `TypeError` where they do not fit.
@@ -188,6 +209,8 @@ def equations_of_motion(
     <class 'rigidjax.motion.spin.EulerEquations'>
     """
     require_fit(body, state0, torque)
+    if isinstance(state0, Point):
+        return scene_of(torque).field
     if isinstance(body, MassProperties):
         return NewtonEuler(body, torque)
     if isinstance(state0, Attitude):
@@ -195,15 +218,24 @@ def equations_of_motion(
     return EulerEquations(body, torque)
 
 
-def require_fit(body: Any, state0: Any, torque: Torque | None) -> None:
+def require_fit(body: Any, state0: Any, torque: Any) -> None:
     """Raise `TypeError` unless body, state and torque belong on one rung."""
+    if isinstance(state0, Point) and body is not None:
+        raise TypeError(f"Point is no body: wanted None in its place, got {type(body).__name__}")
+    if isinstance(torque, AbstractScene | MovingFrame) and not isinstance(state0, Point):
+        raise TypeError(
+            f"{type(torque).__name__} moves a Point: wanted Point(x, v), got "
+            f"{type(state0).__name__}; frames.BodyInFrame is for a body in a moving frame"
+        )
     if torque is not None:
         require_rung(torque, state0)
     if isinstance(state0, Rigid) and not isinstance(body, MassProperties):
         raise TypeError(
             f"Rigid moves as well as turns: wanted MassProperties, got {type(body).__name__}"
         )
-    if not isinstance(state0, Rigid) and not isinstance(body, Inertia):
+    if isinstance(state0, Point):
+        scene_of(torque)
+    elif not isinstance(state0, Rigid) and not isinstance(body, Inertia):
         raise TypeError(
             f"{type(state0).__name__} only turns: wanted Inertia, got {type(body).__name__}"
             + ("; pass body.inertia" if isinstance(body, MassProperties) else "")
@@ -246,12 +278,15 @@ def _check_times(ts: Any) -> Array:
 
 
 def _check_start(state0: State) -> State:
-    if not isinstance(state0, Spin | Attitude | Rigid):
-        raise TypeError(f"state0: wanted Spin, Attitude or Rigid, got {type(state0).__name__}")
-    if state0.omega.ndim != 1:
+    if not isinstance(state0, Spin | Attitude | Rigid | Point):
+        raise TypeError(
+            "state0: wanted Spin, Attitude or Rigid, or Point without a body, got "
+            f"{type(state0).__name__}"
+        )
+    name, first = ("v", state0.v) if isinstance(state0, Point) else ("omega", state0.omega)
+    if first.ndim != 1:
         raise ValueError(
-            f"state0: wanted one body, omega of shape (3,), got {state0.omega.shape}; "
-            "batch with jax.vmap"
+            f"state0: wanted one body, {name} of shape (3,), got {first.shape}; batch with jax.vmap"
         )
     names = [str(path[-1]).lstrip(".") for path, _ in jax.tree.leaves_with_path(state0)]
     leaves, tree = jax.tree.flatten(state0)
