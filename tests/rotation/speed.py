@@ -108,7 +108,9 @@ def main() -> None:
     jax.config.update("jax_enable_x64", True)
     dtype = jnp.float32 if options.float32 else jnp.float64
     print(f"jax {jax.__version__} on {jax.default_backend()}, {jnp.dtype(dtype).name}\n")
-    print("| map | what | batch | ours, µs | ours / jaxlie | ours / scipy |\n|---|---|---|---|---|---|")
+    print(
+        "| map | what | batch | ours, µs | ours / jaxlie | ours / scipy |\n|---|---|---|---|---|---|"
+    )
     for name, libraries in cases().items():
         if options.only and name != options.only:
             continue
