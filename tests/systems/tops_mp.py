@@ -1,0 +1,55 @@
+"""Lagrange's top and the pendulum in mpmath: elliptic functions and quadrature, to any number of digits."""
+
+import mpmath as mp
+
+
+def lagrange_top(i1, i3, mgl, theta, rates, t, *, digits=30):
+    """3-1-3 Euler angles (φ, θ, ψ) at t, from φ = ψ = 0, θ = theta and rates (φ', θ', ψ').
+
+    Moments i1 = i2, i3 about the fixed point; mgl the weight times the distance to the centre of
+    mass, along the third axis; gravity down the world's third axis. u = cos θ obeys u'² = cubic(u).
+    """
+    with mp.workdps(digits):
+        i1, i3, mgl, theta, t = (mp.mpf(x) for x in (i1, i3, mgl, theta, t))
+        dphi, dtheta, dpsi = (mp.mpf(x) for x in rates)
+        u0, s0 = mp.cos(theta), mp.sin(theta)
+        a = i3 * (dpsi + dphi * u0) / i1
+        b = dphi * s0**2 + a * u0
+        beta = 2 * mgl / i1
+        alpha = dtheta**2 + (dphi * s0) ** 2 + beta * u0
+        roots = mp.polyroots(
+            [beta, -(alpha + a**2), 2 * a * b - beta, alpha - b**2], maxsteps=200, extraprec=200
+        )
+        u1, u2, u3 = sorted(mp.re(r) for r in roots)
+        m = (u2 - u1) / (u3 - u1)
+        speed = mp.sqrt(beta * (u3 - u1)) / 2
+        part = min(max((u0 - u1) / (u2 - u1), mp.mpf(0)), mp.mpf(1))
+        start = mp.ellipf(mp.asin(mp.sqrt(part)), m)
+        start = start if -s0 * dtheta >= 0 else -start
+
+        def u(s):
+            return u1 + (u2 - u1) * mp.ellipfun("sn", start + speed * s, m=m) ** 2
+
+        def phi_rate(s):
+            return (b - a * u(s)) / (1 - u(s) ** 2)
+
+        def psi_rate(s):
+            return i1 * a / i3 - u(s) * phi_rate(s)
+
+        pieces = mp.linspace(0, t, max(2, int(mp.ceil(t * speed / mp.ellipk(m))) * 2 + 1))
+        return mp.quad(phi_rate, pieces), mp.acos(u(t)), mp.quad(psi_rate, pieces)
+
+
+def pendulum(rate2, angle, t, *, digits=30):
+    """Angle of x'' = −rate2 sin x at t, from rest at `angle` (0 < angle < π)."""
+    with mp.workdps(digits):
+        k = mp.sin(mp.mpf(angle) / 2)
+        u = mp.ellipk(k**2) - mp.sqrt(mp.mpf(rate2)) * mp.mpf(t)
+        return 2 * mp.asin(k * mp.ellipfun("sn", u, m=k**2))
+
+
+def derivative(function, x, *, step="1e-8", digits=30):
+    """Derivative of a real function of one number, by a central difference in many digits."""
+    with mp.workdps(digits):
+        x, h = mp.mpf(x), mp.mpf(step)
+        return (function(x + h) - function(x - h)) / (2 * h)
