@@ -8,7 +8,8 @@ Derivatives: with φ = am(u|m) and u = F(φ|m), keeping u fixed gives ∂φ/∂m
     X = −∂F/∂m = −½ ∫₀^u sd²(v) dv.
 
 The integrand is positive: X has all its digits at m = 0 and as m → 1, where the textbook formulas
-(DLMF 22.13 has none in m; Byrd & Friedman 1971, 710.50–53) divide a small difference by m m1.
+(Byrd & Friedman 1971, 710.51–53) divide a small difference by m m1. The second derivative in m
+comes from X too for m ≤ 0.9 or |u| ≤ 1; elsewhere from a sum over images (`images.py`).
 """
 
 import math
@@ -22,6 +23,7 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, ArrayLike, Float
 
 from rigidjax.special.arguments import common, complementary, exact_complement
+from rigidjax.special.images import LARGEST_M1, near_one
 from rigidjax.special.legendre import MEAN_STEPS, complete, half_turns, integral
 
 # Below this cn and dn, integrals over sd² depend on their ratio only (to the floor squared).
@@ -84,10 +86,12 @@ def _functions(u: Any, m: Any, m1: Any) -> tuple[Any, Any, Any, Any]:
     above = m1 < 0
     divisor = jnp.where(above, m, 1)
     root = jnp.sqrt(divisor)
+    v = u * root
     inner_m = jnp.where(above, 1, m) / divisor
     inner_m1 = jnp.where(above, -m1, m1) / divisor
-    s, c, d = _core(u * root, inner_m, inner_m1)
-    turns = _turns(jax.lax.stop_gradient(u), jax.lax.stop_gradient(inner_m1))[0]
+
+    s, c, d = _core(v, inner_m, inner_m1)
+    turns = _turns(jax.lax.stop_gradient(v), jax.lax.stop_gradient(inner_m1))[0]
     return (
         s / root,
         jnp.where(above, d, c),
@@ -134,28 +138,68 @@ def _core(u: Any, m: Any, m1: Any) -> tuple[Any, Any, Any]:
 
 @partial(_core.defjvp, symbolic_zeros=True)
 def _core_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
-    u, m, m1 = primals
-    du, _, dm1 = tangents
-    values = s, c, d = _core(u, m, m1)
+    (u, m, m1), (du, _, dm1) = primals, tangents
+    s, c, d = _core(u, m, m1)
     ds, dc, dd = jnp.zeros_like(u), jnp.zeros_like(u), jnp.zeros_like(u)
     if not isinstance(du, SymbolicZero):
         # DLMF 22.13.1–3.
         ds, dc, dd = c * d * du, -s * d * du, -m * s * c * du
     if not isinstance(dm1, SymbolicZero):
-        turns = _turns(jax.lax.stop_gradient(u), jax.lax.stop_gradient(m1))[0]
-        sign = _parity(turns)
-        # Where cn and dn are minute, raise both by one factor: X ~ 1/dn² must not overflow.
-        floor = _FLOOR[np.dtype(u.dtype)]
-        up = jnp.maximum(1, floor / jax.lax.stop_gradient(d))
-        c, d = c * up, d * up
-        near = turns == 0
-        whole = complete((1, 1, 0), jnp.where(near, 1, m1 * up * up))
-        x = integral((1, 1, 0), sign * s, sign * c, m1 * up * up, jnp.ones_like(m1))
-        half = 0.5 * (x + jnp.where(near, 0, 2 * turns * whole)) * dm1
-        ds = ds + c * d * half
-        dc = dc - s * d * half * up
-        dd = dd + (0.5 * s * s / d * dm1 - m * s * c * half) * up
-    return values, (ds, dc, dd)
+        sm, cm, dm = _slopes(u, m, m1)
+        ds, dc, dd = ds - sm * dm1, dc - cm * dm1, dd - dm * dm1
+    return (s, c, d), (ds, dc, dd)
+
+
+@jax.custom_jvp
+def _slopes(u: Any, m: Any, m1: Any) -> tuple[Any, Any, Any]:
+    """Derivatives of sn, cn, dn with respect to m."""
+    return _slopes_from_integral(u, m, m1)
+
+
+@partial(_slopes.defjvp, symbolic_zeros=True)
+def _slopes_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
+    (u, m, m1), (du, _, dm1) = primals, tangents
+    sm, cm, dm = slopes = _slopes(u, m, m1)
+    ds, dc, dd = jnp.zeros_like(u), jnp.zeros_like(u), jnp.zeros_like(u)
+    if not isinstance(du, SymbolicZero):
+        s, c, d = _core(u, m, m1)
+        ds, dc, dd = (
+            (cm * d + c * dm) * du,
+            -(sm * d + s * dm) * du,
+            -(s * c + m * (sm * c + s * cm)) * du,
+        )
+    if not isinstance(dm1, SymbolicZero):
+        # For small u the images cancel to leave u³, and the integral has no large terms.
+        near = (m1 < LARGEST_M1) & (jnp.abs(u) > 1)
+        middle, one = jnp.full_like(m1, 0.5), jnp.ones_like(m1)
+        far_m, far_m1 = jnp.where(near, middle, m), jnp.where(near, middle, m1)
+        _, far = jax.jvp(partial(_slopes_from_integral, u), (far_m, far_m1), (one, -one))
+        near_m = jnp.where(near, m, 1 - LARGEST_M1)
+        near_m1 = jnp.where(near, m1, LARGEST_M1)
+
+        def first(a: Any, b: Any) -> Any:
+            return jax.jvp(partial(near_one, u), (a, b), (one, -one))[1]
+
+        _, close = jax.jvp(first, (near_m, near_m1), (one, -one))
+        ss, cc, d2 = (jnp.where(near, a, b) for a, b in zip(close, far, strict=True))
+        ds, dc, dd = ds - ss * dm1, dc - cc * dm1, dd - d2 * dm1
+    return slopes, (ds, dc, dd)
+
+
+def _slopes_from_integral(u: Any, m: Any, m1: Any) -> tuple[Any, Any, Any]:
+    """dn X times the slopes in φ, X by Carlson's R_D over what is left of u after half periods."""
+    s, c, d = _core(u, m, m1)
+    turns = _turns(jax.lax.stop_gradient(u), jax.lax.stop_gradient(m1))[0]
+    sign = _parity(turns)
+    # X ~ 1/dn² must not overflow. Where cn and dn are minute it depends, but for that factor, on
+    # their ratio only (to the floor squared): raise both.
+    up = jnp.maximum(1, _FLOOR[np.dtype(u.dtype)] / jax.lax.stop_gradient(d))
+    c, d, raised = c * up, d * up, m1 * up * up
+    near = turns == 0
+    whole = complete((1, 1, 0), jnp.where(near, 1, raised))
+    x = integral((1, 1, 0), sign * s, sign * c, raised, jnp.ones_like(m1))
+    x = -0.5 * (x + jnp.where(near, 0, 2 * turns * whole))
+    return c * d * x, -s * d * x * up, -(0.5 * s * s / d + m * s * c * x) * up
 
 
 def _turns(u: Any, m1: Any) -> tuple[Any, Any, list[Any], list[Any], Any]:

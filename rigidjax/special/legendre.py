@@ -161,9 +161,7 @@ def ellippiinc(
     >>> round(float(ellippiinc(0.5, 1.0, 0.5)), 12)
     1.294006483171
     """
-    _, n1, phi, _, m1 = common(
-        **complementary("n", n, n1), phi=phi, **complementary("m", m, m1)
-    )
+    _, n1, phi, _, m1 = common(**complementary("n", n, n1), phi=phi, **complementary("m", m, m1))
     return _incomplete((0, 0, 1), phi, m1, n1)
 
 
