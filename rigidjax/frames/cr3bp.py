@@ -5,7 +5,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
 from rigidjax import _checks
-from rigidjax._types import Mat3, Scalar, ScalarLike, Vec3, Vec3Like
+from rigidjax._types import Mat3, Scalar, ScalarLike, Vec3
+from rigidjax.body.hints import Vector
 from rigidjax.frames import flow, lagrange, periodic, richardson
 from rigidjax.frames.periodic import PeriodicOrbit
 from rigidjax.frames.point import Point
@@ -44,7 +45,7 @@ class ThreeBody(AbstractScene):
             ]
         )
 
-    def potential(self, x: Vec3Like) -> Scalar:
+    def potential(self, x: Vector) -> Scalar:
         """U = ½(x² + y²) + (1 − μ)/r₁ + μ/r₂ (Szebehely 1967, sec. 1.5, without its constant).
 
         **Arguments:** `x` (3,), rotating axes.
@@ -54,7 +55,7 @@ class ThreeBody(AbstractScene):
         mu = self.mu.astype(x.dtype)
         return 0.5 * (x[0] * x[0] + x[1] * x[1]) + (1 - mu) / r1 + mu / r2
 
-    def distances(self, x: Vec3Like) -> tuple[Scalar, Scalar]:
+    def distances(self, x: Vector) -> tuple[Scalar, Scalar]:
         """How far a place (3,) is from the first and from the second body."""
         a, b, c = components(_checks.floating(x, (3,), "x"))
         mu = self.mu.astype(a.dtype)
@@ -70,7 +71,7 @@ class ThreeBody(AbstractScene):
         """
         return self.speed_squared(state.x, 0.0) - jnp.sum(state.v * state.v)
 
-    def speed_squared(self, x: Vec3Like, jacobi: ScalarLike) -> Scalar:
+    def speed_squared(self, x: Vector, jacobi: ScalarLike) -> Scalar:
         """|v|² = 2U(x) − C at a place: zero-velocity curves are where it is 0.
 
         **Arguments:** `x` (3,); `jacobi` C. Negative where a particle with this C cannot come.
@@ -93,11 +94,11 @@ class ThreeBody(AbstractScene):
         """L1 … L5 (5, 3): see `rigidjax.frames.lagrange.points`."""
         return lagrange.points(self.mu)
 
-    def hessian(self, x: Vec3Like) -> Mat3:
+    def hessian(self, x: Vector) -> Mat3:
         """The second derivatives of U (3, 3) at a place."""
         return jax.hessian(self.potential)(_checks.floating(x, (3,), "x"))
 
-    def exponents(self, x: Vec3Like) -> Complex[Array, "6"]:
+    def exponents(self, x: Vector) -> Complex[Array, "6"]:
         """The six exponents λ of small motions about an equilibrium in the plane, e^{λt}.
 
         **Arguments:** `x` (3,), such as a row of `lagrange_points`. Stable (to first order) where

@@ -6,7 +6,8 @@ import equinox as eqx
 from jaxtyping import Array, Float
 
 from rigidjax import _checks
-from rigidjax._types import Mat3, Vec3, Vec3Like
+from rigidjax._types import Mat3, Vec3
+from rigidjax.body.hints import Vector
 from rigidjax.rotation import algebra, quaternion
 
 
@@ -59,28 +60,28 @@ class Instant(eqx.Module):
             turned["omega"] = state.omega - rate
         return _replaced(state, turned)
 
-    def outward(self, y: Vec3Like) -> Vec3:
+    def outward(self, y: Vector) -> Vec3:
         """Components in S' → components in S, M y' (notes, eq 85): forces, directions."""
         y = _checks.floating(y, (3,), "y")
         return algebra.apply(self.rotation.astype(y.dtype), y)
 
-    def inward(self, y: Vec3Like) -> Vec3:
+    def inward(self, y: Vector) -> Vec3:
         """Components in S → components in S', Mᵀ y (notes, eq 86; f = MᵀF of eq 91)."""
         y = _checks.floating(y, (3,), "y")
         return algebra.apply(self.rotation.T.astype(y.dtype), y)
 
-    def centrifugal(self, x: Vec3Like) -> Vec3:
+    def centrifugal(self, x: Vector) -> Vec3:
         """Centrifugal acceleration −Ω × (Ω × x')."""
         x = _checks.floating(x, (3,), "x")
         rate = self.rate.astype(x.dtype)
         return algebra.cross(algebra.cross(rate, x), rate)
 
-    def coriolis(self, v: Vec3Like) -> Vec3:
+    def coriolis(self, v: Vector) -> Vec3:
         """Coriolis acceleration −2 Ω × v'."""
         v = _checks.floating(v, (3,), "v")
         return 2 * algebra.cross(v, self.rate.astype(v.dtype))
 
-    def euler_acceleration(self, x: Vec3Like) -> Vec3:
+    def euler_acceleration(self, x: Vector) -> Vec3:
         """Euler acceleration −dΩ/dt × x'."""
         x = _checks.floating(x, (3,), "x")
         return algebra.cross(x, self.rate_change.astype(x.dtype))
@@ -89,7 +90,7 @@ class Instant(eqx.Module):
         """Acceleration −Mᵀ d²X/dt²: what an accelerated origin adds."""
         return -self.inward(self.origin_acceleration)
 
-    def fictitious(self, x: Vec3Like, v: Vec3Like) -> Vec3:
+    def fictitious(self, x: Vector, v: Vector) -> Vec3:
         """All four terms that no force makes."""
         x = _checks.floating(x, (3,), "x")
         turning = self.centrifugal(x) + self.coriolis(v) + self.euler_acceleration(x)

@@ -8,7 +8,8 @@ import jax
 import jax.numpy as jnp
 
 from rigidjax import _checks
-from rigidjax._types import Mat3, Scalar, ScalarLike, Vec3, Vec3Like
+from rigidjax._types import Mat3, Scalar, ScalarLike, Vec3
+from rigidjax.body.hints import Vector
 from rigidjax.frames import turning
 from rigidjax.frames.instant import Instant
 from rigidjax.rotation import algebra
@@ -22,9 +23,9 @@ class MovingFrame(eqx.Module):
     **Arguments:**
 
     - `rotation`: a function of time, s, to M (3, 3) or to its unit quaternion (4,), S' → S; or
-      anything with `.evaluate(t)` that gives a state with `q` and `omega`, such as the solution of
-      `simulate` for a body: then the frame rides on the body. A Module (`frames.Uniform`) does not
-      compile again for other numbers, a fresh `lambda` does.
+      what gives a state with `q` and `omega`, such as a solution of `simulate` (its `evaluate` is
+      called) or a `FreeBody`: then the frame rides on the body. A Module (`frames.Uniform`) does
+      not compile again for other numbers, a fresh `lambda` does.
     - `origin`: a function of time to X (3,), m, axes of S; `None` where the origins coincide.
     - `rate`: Ω (3,), rad/s, **axes of S'**, as a function of time, where it is known; else it is
       Ω = vee(Mᵀ dM/dt) (eqs 45–50) by automatic differentiation. dΩ/dt always is.
@@ -92,8 +93,9 @@ class MovingFrame(eqx.Module):
         t = _checks.floating(t, (), "t")
         if self.rate is not None:
             return _checks.floating(self.rate(t), (3,), "rate").astype(t.dtype)
-        if hasattr(self.rotation, "evaluate"):
-            return self.rotation.evaluate(t).omega.astype(t.dtype)
+        state = turning.state_of(self.rotation, t)
+        if hasattr(state, "omega"):
+            return state.omega.astype(t.dtype)
         m, m_dot = jax.jvp(self.matrix, (t,), (jnp.ones_like(t),))
         return algebra.vee(algebra.product(m.T, m_dot))
 
@@ -127,21 +129,21 @@ class MovingFrame(eqx.Module):
         """
         return self.at(t).from_inertial(state)
 
-    def centrifugal(self, x: Vec3Like, t: ScalarLike) -> Vec3:
+    def centrifugal(self, x: Vector, t: ScalarLike) -> Vec3:
         """Centrifugal acceleration −Ω × (Ω × x') (3,), m/s², axes of S' (notes, eq 91).
 
         **Arguments:** `x` (3,) position in S', m; `t` s.
         """
         return self.at(t).centrifugal(x)
 
-    def coriolis(self, v: Vec3Like, t: ScalarLike) -> Vec3:
+    def coriolis(self, v: Vector, t: ScalarLike) -> Vec3:
         """Coriolis acceleration −2 Ω × v' (3,), m/s², axes of S' (notes, eq 91).
 
         **Arguments:** `v` (3,) velocity in S', m/s; `t` s.
         """
         return self.at(t).coriolis(v)
 
-    def euler_acceleration(self, x: Vec3Like, t: ScalarLike) -> Vec3:
+    def euler_acceleration(self, x: Vector, t: ScalarLike) -> Vec3:
         """Euler acceleration −dΩ/dt × x' (3,), m/s², axes of S' (notes, eq 91, "inercial").
 
         **Arguments:** `x` (3,) position in S', m; `t` s.
@@ -153,7 +155,7 @@ class MovingFrame(eqx.Module):
         return self.at(t).translation()
 
     def acceleration(
-        self, x: Vec3Like, v: Vec3Like, t: ScalarLike, force: Vec3Like | None = None
+        self, x: Vector, v: Vector, t: ScalarLike, force: Vector | None = None
     ) -> Vec3:
         """The acceleration that S' sees: eq 91 of the notes, corrected, with a moving origin.
 
@@ -171,9 +173,7 @@ class MovingFrame(eqx.Module):
         free = self.at(t).fictitious(x, v)
         return free if force is None else _checks.floating(force, (3,), "force") + free
 
-    def acceleration_to_inertial(
-        self, x: Vec3Like, v: Vec3Like, a: Vec3Like, t: ScalarLike
-    ) -> Vec3:
+    def acceleration_to_inertial(self, x: Vector, v: Vector, a: Vector, t: ScalarLike) -> Vec3:
         """The acceleration that S sees (3,), m/s² (notes, eqs 89, 90, with a moving origin).
 
         **Arguments:** `x`, `v`, `a` (3,) position, velocity and acceleration in S'; `t` s.
@@ -181,11 +181,11 @@ class MovingFrame(eqx.Module):
         now, a = self.at(t), _checks.floating(a, (3,), "a")
         return now.outward(a - now.fictitious(x, v))
 
-    def force_from_inertial(self, force: Vec3Like, t: ScalarLike) -> Vec3:
+    def force_from_inertial(self, force: Vector, t: ScalarLike) -> Vec3:
         """Force f = MᵀF (3,): a force, or any direction, in the axes of S' (notes, eq 91)."""
         return algebra.apply(self.matrix(t).T, force)
 
-    def force_to_inertial(self, force: Vec3Like, t: ScalarLike) -> Vec3:
+    def force_to_inertial(self, force: Vector, t: ScalarLike) -> Vec3:
         """Force F = M f (3,): a force, or any direction, in the axes of S (notes, eq 85)."""
         return algebra.apply(self.matrix(t), force)
 

@@ -65,9 +65,15 @@ class AboutAxis(eqx.Module):
         return speed * self.axis.astype(t.dtype)
 
 
+def state_of(rotation: Any, t: Array) -> Any:
+    """What `rotation` gives at `t`: a matrix, a quaternion, or a state with `q` and `omega`."""
+    return rotation.evaluate(t) if hasattr(rotation, "evaluate") else rotation(t)
+
+
 def matrix(rotation: Any, t: Array) -> Mat3:
     """M(t) of whatever a frame was given: a function to (3, 3) or (4,), or a solution."""
-    value = rotation.evaluate(t).q if hasattr(rotation, "evaluate") else rotation(t)
+    value = state_of(rotation, t)
+    value = getattr(value, "q", value)
     shape = jnp.shape(value)
     if shape == (4,):
         q = _checks.floating(value, (4,), "rotation").astype(t.dtype)

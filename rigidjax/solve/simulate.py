@@ -227,7 +227,7 @@ def require_fit(body: Any, state0: Any, torque: Any) -> None:
             f"{type(torque).__name__} moves a Point: wanted Point(x, v), got "
             f"{type(state0).__name__}; frames.BodyInFrame is for a body in a moving frame"
         )
-    if torque is not None:
+    if torque is not None and not isinstance(torque, AbstractScene | MovingFrame):
         require_rung(torque, state0)
     if isinstance(state0, Rigid) and not isinstance(body, MassProperties):
         raise TypeError(
