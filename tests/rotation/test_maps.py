@@ -148,19 +148,25 @@ def test_log_at_exactly_half_a_turn():
         np.testing.assert_allclose(jnp.linalg.norm(v), np.pi, rtol=4e-16)
         np.testing.assert_array_equal(v, quaternion.log(-q))
         side = np.sign(np.dot(v, axis))
-        turned = lambda x, v=v: quaternion.log(quaternion.exp(v - x * v / jnp.pi))
+
+        def turned(x, v=v):
+            return quaternion.log(quaternion.exp(v - x * v / jnp.pi))
+
         np.testing.assert_allclose(jax.jacfwd(turned)(1e-13), -v / np.pi, atol=1e-12)
         # The one-sided slope of 2 atan2(1, w), w being the scalar of q or of −q.
         slope = jax.jvp(quaternion.log, (q,), (jnp.array([1.0, 0, 0, 0]),))[1]
         np.testing.assert_allclose(slope, -2 * axis, atol=1e-14)
-        loss = lambda q: (quaternion.log(q) ** 2).sum()
+
+        def loss(q):
+            return (quaternion.log(q) ** 2).sum()
+
         np.testing.assert_allclose(jax.grad(loss)(q)[0], -4 * np.pi * side, rtol=1e-14)
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_jacobians(dtype):
     """J_l is the derivative of exp; the inverses are inverse; exact for tiny turns (SE(3))."""
-    v, length = vectors(dtype, 40)
+    v, _length = vectors(dtype, 40)
     tol = 1e-14 if dtype == np.float64 else 3e-6
 
     def parts(v):
@@ -203,9 +209,12 @@ def test_derivative_at_rest(dtype):
     """R2: d(attitude)/dω at ω = 0 is T 1, and the attitude is linear in a tiny ω."""
     duration = np.array(0.7, dtype)
     q0 = quaternion.exp(jnp.array([0.3, -1.0, 0.4], dtype))
-    moved = lambda w: quaternion.log(
-        quaternion.multiply(quaternion.conjugate(q0), quaternion.advance(q0, w, duration))
-    )
+
+    def moved(w):
+        return quaternion.log(
+            quaternion.multiply(quaternion.conjugate(q0), quaternion.advance(q0, w, duration))
+        )
+
     tol = 1e-13 if dtype == np.float64 else 1e-6
     for mode in (jax.jacfwd, jax.jacrev):
         got = mode(moved)(jnp.zeros(3, dtype))
