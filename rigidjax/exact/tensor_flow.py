@@ -43,20 +43,21 @@ Triple = tuple[Scalar, Scalar, Scalar]
 Six = tuple[Scalar, Scalar, Scalar, Scalar, Scalar, Scalar]
 
 
-class Reciprocal(NamedTuple):
-    """K = I⁻¹ and the differences of its diagonal entries."""
+class Differences(NamedTuple):
+    """K = I⁻¹ but for its trace: differences of its diagonal, and its off-diagonal entries."""
 
-    k: Six
     d12: Scalar
     d13: Scalar
     d23: Scalar
+    k12: Scalar
+    k13: Scalar
+    k23: Scalar
 
 
 class Invariants(NamedTuple):
-    """E less E₂₂ 1, and what the doubling needs of it; `a1, a2, a3`: aᵢh² − E₂, signs + + −."""
+    """Of E less E₂₂ 1. `a1, a2, a3`: a₁h² − E₂, a₂h² − E₂, E₂ − a₃h²."""
 
     h2: Scalar
-    energy2: Scalar
     a1: Scalar
     a2: Scalar
     a3: Scalar
@@ -76,34 +77,18 @@ class Sigma(NamedTuple):
     y: Six
 
 
-def reciprocal(moments: Six) -> Reciprocal:
-    """K of an inertia tensor whose off-diagonal entries are small."""
-    i1, i2, i3, i12, i13, i23 = moments
-    c11, c22, c33 = i2 * i3 - i23 * i23, i1 * i3 - i13 * i13, i1 * i2 - i12 * i12
-    c12, c13, c23 = i13 * i23 - i12 * i3, i12 * i23 - i13 * i2, i12 * i13 - i23 * i1
-    r = 1.0 / (i1 * c11 + i12 * c12 + i13 * c13)
-    return Reciprocal(
-        (c11 * r, c22 * r, c33 * r, c12 * r, c13 * r, c23 * r),
-        ((i2 - i1) * i3 + (i13 * i13 - i23 * i23)) * r,
-        ((i3 - i1) * i2 + (i12 * i12 - i23 * i23)) * r,
-        ((i3 - i2) * i1 + (i12 * i12 - i13 * i13)) * r,
-    )
-
-
-def invariants(body: Reciprocal, momentum: Triple) -> Invariants:
-    (k1, k2, k3, k12, k13, k23), d12, d13, d23 = body
+def invariants(body: Differences, momentum: Triple) -> Invariants:
+    d12, d13, d23, k12, k13, k23 = body
     p1, p2, p3 = momentum
     x1, x2, x3 = p1 * p1, p2 * p2, p3 * p3
     h2 = x1 + x2 + x3
     mixed = 2.0 * (k12 * (p1 * p2) + k13 * (p1 * p3) + k23 * (p2 * p3))
-    energy2 = k1 * x1 + k2 * x2 + k3 * x3 + mixed
     a1 = d12 * x2 + d13 * x3 - mixed
     a2 = d23 * x3 - d12 * x1 - mixed
     a3 = d13 * x1 + d23 * x2 + mixed
     s12, s13, s23 = k12 * k12, k13 * k13, k23 * k23
     return Invariants(
         h2,
-        energy2,
         a1,
         a2,
         a3,
@@ -194,33 +179,42 @@ def double(f: Sigma, v: Invariants) -> Sigma:
     return _scaled(Sigma(s2, t, y))
 
 
-def momentum_at(body: Reciprocal, f: Sigma, momentum: Triple) -> tuple[Triple, Scalar]:
+def momentum_at(
+    body: Differences, v: Invariants, f: Sigma, momentum: Triple
+) -> tuple[Triple, Scalar]:
     """Π after the time of `f`, and the factor W that was divided out."""
     p1, p2, p3 = momentum
-    (_, _, _, k12, k13, k23), d12, d13, d23 = body
+    d12, d13, d23, k12, k13, k23 = body
     u1 = -d23 * p2 * p3 + p2 * (k13 * p1 + k23 * p2) - p3 * (k12 * p1 + k23 * p3)
     u2 = d13 * p1 * p3 + p3 * (k12 * p2 + k13 * p3) - p1 * (k13 * p1 + k23 * p2)
     u3 = -d12 * p1 * p2 + p1 * (k12 * p1 + k23 * p3) - p2 * (k12 * p2 + k13 * p3)
     adj, turned = _apply(_adjugate(f.t), momentum), _apply(f.t, (u1, u2, u3))
-    y = tuple(a + f.s * b for a, b in zip(adj, turned, strict=True))
-    size = jax.lax.stop_gradient(
-        jnp.maximum(jnp.maximum(jnp.abs(y[0]), jnp.abs(y[1])), jnp.abs(y[2]))
+    t1, _, t3, t12, t13, t23 = f.t
+    ss = f.s * f.s
+    # W = (T²)ᵢᵢ + σ² (Eᵢᵢ − Tr K E₂ + |KΠ|²) for each i; 1 and 3 are sums of positive terms.
+    v12, v13, v23 = k12 * (p1 * p2), k13 * (p1 * p3), k23 * (p2 * p3)
+    r1, r2, r3 = k12 * p2 + k13 * p3, k12 * p1 + k23 * p3, k13 * p1 + k23 * p2
+    more = r1 * r1 + r2 * r2 + r3 * r3
+    h2 = p1 * p1 + p2 * p2 + p3 * p3
+    z1 = d12 * d13 * (p1 * p1) + 2.0 * (d13 * v12 + d12 * v13) + (more - h2 * (k23 * k23))
+    z3 = d13 * d23 * (p3 * p3) - 2.0 * (d23 * v13 + d13 * v23) + (more - h2 * (k12 * k12))
+    w = jnp.where(
+        v.gap > 0,
+        t1 * t1 + t12 * t12 + t13 * t13 + ss * z1,
+        t3 * t3 + t13 * t13 + t23 * t23 + ss * z3,
     )
-    y = tuple(c / size for c in y)
-    length = jnp.sqrt(y[0] * y[0] + y[1] * y[1] + y[2] * y[2])
-    h = jnp.sqrt(p1 * p1 + p2 * p2 + p3 * p3)
-    r = h / length
-    return (y[0] * r, y[1] * r, y[2] * r), size / r
+    r = 1.0 / w
+    return tuple((a + f.s * b) * r for a, b in zip(adj, turned, strict=True)), w
 
 
-def integral_about(body: Reciprocal, v: Invariants, f: Sigma, k: Triple) -> Six:
+def integral_about(body: Differences, v: Invariants, f: Sigma, k: Triple) -> Six:
     """∫ Π Πᵀ dt from −u to u about the moment when Π = k, with f at u."""
-    _, w = momentum_at(body, f, k)
+    _, w = momentum_at(body, v, f, k)
     alpha = _apply(_adjugate(f.t), k)
     r = 2.0 * f.s / (w * _det(f.t))
     a1, a2, a3 = alpha
     hh = v.h2
-    k12, k13, k23 = (hh * c for c in body.k[3:])
+    k12, k13, k23 = (hh * c for c in body[3:])
     b = (
         -v.a2 * v.a3 - k23 * k23,
         -v.a1 * v.a3 - k13 * k13,
@@ -248,7 +242,6 @@ def period(v: Invariants) -> Scalar:
     z is a simple eigenvalue, so one step of Newton's from the diagonal entry has its derivatives to
     third order; the other two enter through symmetric functions, the first step of the mean.
     """
-    v = jax.tree.map(lambda c: c, v)
     three = v.gap > 0
     top = jnp.where(three, v.p, v.q)
     off = v.e12 * v.e12, v.e13 * v.e13, v.e23 * v.e23
@@ -273,15 +266,16 @@ def period(v: Invariants) -> Scalar:
     return 2.0 * jnp.pi / a
 
 
-def momentum_and_integral(moments: Six, momentum: Triple, t: Scalar) -> tuple[Triple, Six]:
-    """Π(t) and G = ∫₀ᵗ Π Πᵀ dt, for a motion that is not at rest."""
-    body = reciprocal(moments)
+def momentum_and_integral(
+    body: Differences, momentum: Triple, t: Scalar
+) -> tuple[Triple, Six]:
+    """Π(t) and G = ∫₀ᵗ Π Πᵀ dt."""
     v = invariants(body, momentum)
     big = jax.lax.stop_gradient(jnp.maximum(v.p, v.q))
     endless = (jax.lax.stop_gradient(v.gap) == 0) | (big <= 0)
     # Dummy invariants where there is no period keep NaN out of the derivatives.
     one, zero = jnp.ones_like(t), jnp.zeros_like(t)
-    tame = Invariants(one, one, one, one, one, zero, one, one, zero, zero, zero)
+    tame = Invariants(one, one, one, one, zero, one, one, zero, zero, zero)
     usual = jax.tree.map(lambda a, b: jnp.where(endless, b, a), v, tame)
     count = jnp.round(t / jnp.where(endless, jnp.inf, jax.lax.stop_gradient(period(usual))))
     several = count != 0
@@ -292,8 +286,8 @@ def momentum_and_integral(moments: Six, momentum: Triple, t: Scalar) -> tuple[Tr
     r = jnp.where(big > 0, jnp.clip(r, -reach, reach), r)
 
     f = sigma_at(0.5 * r, v)
-    k, _ = momentum_at(body, f, momentum)
-    out, _ = momentum_at(body, double(f, v), momentum)
+    k, _ = momentum_at(body, v, f, momentum)
+    out, _ = momentum_at(body, v, double(f, v), momentum)
     g = integral_about(body, v, f, k)
 
     # A whole period: four quarters about four points of the orbit.
@@ -303,7 +297,7 @@ def momentum_and_integral(moments: Six, momentum: Triple, t: Scalar) -> tuple[Tr
     for _ in range(4):
         part = integral_about(body, v, eighth, point)
         total = tuple(a + b for a, b in zip(total, part, strict=True))
-        point, _ = momentum_at(body, quarter, point)
+        point, _ = momentum_at(body, usual, quarter, point)
     g = tuple(a + jnp.where(several, count * b, 0.0) for a, b in zip(g, total, strict=True))
     return out, g
 

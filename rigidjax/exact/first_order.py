@@ -1,0 +1,155 @@
+"""First derivatives of the free momentum in closed form, in principal axes.
+
+With f = S/E (E = D or C, whichever has no zero) and `Y₂ = ∫ S²`, `Y = ∫ f²`, at fixed initial data
+δS, δC, δD follow from `∂τ/∂p = ½ ∫ S²/C² …` without any division by p, q or p − q:
+
+    θ = δt + ½ δ|p−q| Y + ½ δmax(p,q) Y₂
+    δS = C D θ − ½ S³ δmax,   δC = −p S D θ − ½ S² C δmax (+ ½ S² δ|p−q|/C if q > p),   …
+
+Both integrals double: `Y(2u) = 2Y(u) + f(u)² f(2u)`, and grow by their means over whole periods.
+Off-diagonal entries of K enter through the divided differences of T = diag(D, 1, C), which the last
+doubling gives without a quotient (see `tensor_flow`, whose derivatives these are).
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from rigidjax._types import Scalar
+from rigidjax.exact import tensor_flow
+from rigidjax.exact.doubling import Elliptic, Modulus, duplicate, limits, series
+from rigidjax.exact.fence import fence, opaque_one
+from rigidjax.exact.half_period import half_period
+from rigidjax.exact.tensor_flow import Differences, Six, Triple
+
+# Columns: d12, d23, k12, k13, k23, Π1, Π2, Π3, t.
+Row = tuple[Scalar, ...]
+
+
+class _Functions(NamedTuple):
+    S: Scalar
+    C: Scalar
+    D: Scalar
+    y2: Scalar
+    y: Scalar
+
+
+def jacobian_and_integral(body: Differences, momentum: Triple, t: Scalar) -> tuple[tuple, Six]:
+    """dΠ(t)/d(d12, d23, k12, k13, k23, Π(0), t) as three rows, and G = ∫ Π Πᵀ dt.
+
+    Takes off-diagonal entries as zero. Regular at rest.
+    """
+    d12, d13, d23 = body.d12, body.d13, body.d23
+    p1, p2, p3 = momentum
+    A1 = d12 * p2 * p2 + d13 * p3 * p3
+    A3 = d13 * p1 * p1 + d23 * p2 * p2
+    A2 = d23 * p3 * p3 - d12 * p1 * p1
+    p, q, gap = d23 * A1, d12 * A3, d13 * A2
+    m = Modulus(p, q, gap)
+    three = gap > 0
+    top = jnp.where(three, p, q)
+    zero = jnp.zeros_like(t)
+    half = half_period(m, zero, zero)
+    count = jnp.where(jnp.isfinite(half.time), jnp.round(t / (2.0 * half.time)), 0.0)
+    whole = count * jnp.where(count == 0, 0.0, 2.0 * half.time)
+    reach = 2.0 * limits(t.dtype).reach / jnp.sqrt(jnp.where(top > 0, top, 1.0))
+    r = t - whole
+    r = jnp.where(top > 0, jnp.clip(r, -reach, reach), r)
+    before, f = _integrals(r, m, three)
+    S, C, D = f.S, f.C, f.D
+    grown2 = f.y2 + whole * half.mean
+    grown = f.y + whole * (1.0 - top * half.mean) / jnp.where(count == 0, 1.0, jnp.abs(gap))
+
+    # Divided differences of T = diag(D, 1, C) by k12, k13, k23.
+    s = before.S * before.S
+    cc, dd = before.C * before.C, before.D * before.D
+    g = 2.0 * s / (cc + p * s * dd)
+    t12, t13, t23 = -g * cc * A3, g * A2, g * dd * A1
+
+    u1, u2, u3 = -d23 * p2 * p3, d13 * p1 * p3, -d12 * p1 * p2
+    y1, y2, y3 = p1 * C + S * D * u1, p2 * C * D + S * u2, p3 * D + S * C * u3
+    z = jnp.where(three, d12 * d13 * p1 * p1, d13 * d23 * p3 * p3)
+    ss, tt = S * S, jnp.where(three, D, C)
+    rw = 1.0 / (tt * tt + ss * z)
+    m1, m2, m3 = y1 * rw, y2 * rw, y3 * rw
+    one = opaque_one(t)
+    shared = (A1, A2, A3, p, q, S, C, D, grown, grown2, ss, tt, z, rw)
+    A1, A2, A3, p, q, S, C, D, grown, grown2, ss, tt, z, rw = fence(shared, one)
+    t12, t13, t23, u1, u2, u3, m1, m2, m3 = fence((t12, t13, t23, u1, u2, u3, m1, m2, m3), one)
+    rc, rd = 0.5 * ss / jnp.where(three, 1.0, C), 0.5 * ss / jnp.where(three, D, 1.0)
+
+    def tangent(e12, e23, o12, o13, o23, e1, e2, e3, et):
+        e13 = e12 + e23
+        mixed = 2.0 * (o12 * (p1 * p2) + o13 * (p1 * p3) + o23 * (p2 * p3))
+        dA1 = e12 * (p2 * p2) + e13 * (p3 * p3) + 2.0 * (e2 * (d12 * p2) + e3 * (d13 * p3)) - mixed
+        dA3 = e13 * (p1 * p1) + e23 * (p2 * p2) + 2.0 * (e1 * (d13 * p1) + e2 * (d23 * p2)) + mixed
+        dA2 = e23 * (p3 * p3) - e12 * (p1 * p1) + 2.0 * (e3 * (d23 * p3) - e1 * (d12 * p1)) - mixed
+        dp, dq = e23 * A1 + d23 * dA1, e12 * A3 + d12 * dA3
+        dgap = e13 * A2 + d13 * dA2
+        dgap, dtop = jnp.where(three, dgap, -dgap), jnp.where(three, dp, dq)
+        theta = et + 0.5 * (dgap * grown + dtop * grown2)
+        shrink = 0.5 * ss * dtop
+        theta, shrink, dgap = fence((theta, shrink, dgap), one)
+        dS = C * D * theta - S * shrink
+        dC = -p * S * D * theta - C * shrink + jnp.where(three, 0.0, rc * dgap)
+        dD = -q * S * C * theta - D * shrink + jnp.where(three, rd * dgap, 0.0)
+        dS, dC, dD = fence((dS, dC, dD), one)
+        x12, x13, x23 = o12 * t12, o13 * t13, o23 * t23
+        du1 = -e23 * (p2 * p3) - d23 * (e2 * p3 + e3 * p2) + o12 * (-p1 * p3) + o13 * (p1 * p2) + o23 * (p2 * p2 - p3 * p3)
+        du2 = e13 * (p1 * p3) + d13 * (e1 * p3 + e3 * p1) + o12 * (p2 * p3) + o13 * (p3 * p3 - p1 * p1) - o23 * (p1 * p2)
+        du3 = -e12 * (p1 * p2) - d12 * (e1 * p2 + e2 * p1) + o12 * (p1 * p1 - p2 * p2) - o13 * (p2 * p3) + o23 * (p1 * p3)
+        dy1 = e1 * C + p1 * dC - x12 * C * p2 - x13 * p3 + dS * D * u1 + S * (dD * u1 + D * du1 + x12 * u2 + x13 * u3)
+        dy2 = e2 * C * D + p2 * (dC * D + C * dD) - x12 * C * p1 - x23 * D * p3 + dS * u2 + S * (du2 + x12 * u1 + x23 * u3)
+        dy3 = e3 * D + p3 * dD - x13 * p1 - x23 * D * p2 + dS * C * u3 + S * (dC * u3 + C * du3 + x13 * u1 + x23 * u2)
+        dz = jnp.where(
+            three,
+            (e12 * d13 + d12 * e13) * (p1 * p1)
+            + 2.0 * p1 * (d12 * d13 * e1 + d13 * o12 * p2 + d12 * o13 * p3),
+            (e13 * d23 + d13 * e23) * (p3 * p3)
+            + 2.0 * p3 * (d13 * d23 * e3 - d23 * o13 * p1 - d13 * o23 * p2),
+        )
+        dy1, dy2, dy3 = fence((dy1, dy2, dy3), one)
+        dw = 2.0 * (tt * jnp.where(three, dD, dC) + S * dS * z) + ss * dz
+        return (dy1 - m1 * dw) * rw, (dy2 - m2 * dw) * rw, (dy3 - m3 * dw) * rw
+
+    rows = jax.vmap(lambda e: tangent(*e))(jnp.eye(9, dtype=t.dtype))
+
+    # G: its 22 entry, the other two by ∫A₁ and ∫A₃, and the off-diagonal ones.
+    g22 = A1 * A3 * grown2 + (S * C * D * p2 * p2 + ss * p2 * u2) * rw
+    still = d13 == 0
+    rest = (g22 - p2 * p2 * t) / jnp.where(still, 1.0, d13)
+    g11, g33 = p1 * p1 * t - d23 * rest, p3 * p3 * t - d12 * rest
+    h = 0.5 * ss
+    g12 = (p1 * p2 * S * C + h * (p1 * u2 + p2 * u1) + 0.5 * p3 * d12 * t12 * t12) * rw
+    g13 = (p1 * p3 * S + h * (p1 * u3 + p3 * u1) - 0.5 * p2 * d13 * t13 * t13) * rw
+    g23 = (p2 * p3 * S * D + h * (p2 * u3 + p3 * u2) + 0.5 * p1 * d23 * t23 * t23) * rw
+    return rows, (g11, g22, g33, g12, g13, g23)
+
+
+def _integrals(u: Scalar, m: Modulus, three) -> tuple[_Functions, _Functions]:
+    """The functions at u/2 and at u."""
+    n = limits(u.dtype).doublings + 1
+    h = u * 2.0**-n
+    one = jnp.ones_like(u)
+    f0 = series(h, m, jnp.zeros_like(u), jnp.zeros_like(u))
+    e = jnp.where(three, 2.0 * m.q - m.p, 2.0 * m.p - m.q)
+    third = h * h * h / 3
+    f = _Functions(
+        f0.S,
+        f0.C,
+        f0.D,
+        third * (1.0 - 0.2 * h * h * (m.p + m.q)),
+        third * (1.0 + 0.2 * h * h * e),
+    )
+    before = jax.lax.fori_loop(0, n - 1, lambda _, g: _twice(g, m, three), f)
+    return before, _twice(before, m, three)
+
+
+def _twice(f: _Functions, m: Modulus, three) -> _Functions:
+    zero, one = jnp.zeros_like(f.S), jnp.ones_like(f.S)
+    g = duplicate(Elliptic(f.S, f.C, f.D, one, zero), m, zero, zero)
+    a, b = f.S / jnp.where(three, f.D, f.C), g.S / jnp.where(three, g.D, g.C)
+    return _Functions(
+        g.S, g.C, g.D, 2.0 * f.y2 + f.S * f.S * g.S, 2.0 * f.y + a * a * b
+    )

@@ -1,0 +1,100 @@
+"""Principal axes as a fixed frame: chosen once by value, never differentiated.
+
+In this frame the inertia is diagonal in value; its off-diagonal entries are exact zeros that carry
+the tangents (and `tensor_flow` says what they do). So nothing is divided by a difference of moments,
+and no derivative of an axis is taken.
+"""
+
+import jax
+import jax.numpy as jnp
+
+from rigidjax._types import Mat3, Scalar, Vec3
+from rigidjax.exact.tensor_flow import Six, Triple
+
+# Cyclic Jacobi converges quadratically; 3×3 needs four or five sweeps from anywhere.
+_SWEEPS = 6
+
+
+def principal_frame(tensor: Mat3) -> tuple[Six, Mat3]:
+    """The inertia in its own principal axes, ascending, and those axes as columns (a rotation).
+
+    Values are Jacobi's (small moments keep their digits; a diagonal tensor stays as it is);
+    derivatives are those of `AᵀIA` with A held fixed.
+    """
+    axes, moments = _jacobi(jax.lax.stop_gradient(tensor))
+    a = axes
+    rows = [[tensor[i, 0] * a[0][j] + tensor[i, 1] * a[1][j] + tensor[i, 2] * a[2][j] for j in range(3)] for i in range(3)]
+
+    def entry(i, j):
+        return a[0][i] * rows[0][j] + a[1][i] * rows[1][j] + a[2][i] * rows[2][j]
+
+    def at_value(x, value):
+        return value + (x - jax.lax.stop_gradient(x))
+
+    zero = jnp.zeros_like(tensor[0, 0])
+    places = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+    values = (*moments, zero, zero, zero)
+    six = tuple(at_value(entry(i, j), v) for (i, j), v in zip(places, values, strict=True))
+    return six, jnp.stack([jnp.stack(row) for row in axes])
+
+
+def into(axes: Mat3, v: Vec3) -> Triple:
+    """Components along the columns of `axes`."""
+    return tuple(axes[0, i] * v[0] + axes[1, i] * v[1] + axes[2, i] * v[2] for i in range(3))
+
+
+def out_of(axes: Mat3, v: Triple) -> Triple:
+    """The inverse of `into`."""
+    return tuple(axes[i, 0] * v[0] + axes[i, 1] * v[1] + axes[i, 2] * v[2] for i in range(3))
+
+
+def _jacobi(m: Mat3) -> tuple[list[list[Scalar]], Triple]:
+    one, zero = jnp.ones_like(m[0, 0]), jnp.zeros_like(m[0, 0])
+    d = (m[0, 0], m[1, 1], m[2, 2])
+    o = tuple(0.5 * (m[i, j] + m[j, i]) for i, j in ((1, 2), (0, 2), (0, 1)))
+    axes = ((one, zero, zero), (zero, one, zero), (zero, zero, one))
+
+    def sweep(_, state):
+        d, o, axes = state
+        for k, (i, j) in enumerate(((1, 2), (0, 2), (0, 1))):
+            d, o, axes = _rotate(d, o, axes, i, j, k)
+        return d, o, axes
+
+    # `axes` are columns: axes[i] is the i-th axis.
+    d, _, axes = jax.lax.fori_loop(0, _SWEEPS, sweep, (d, o, axes))
+    for i, j in ((0, 1), (1, 2), (0, 1)):
+        d, axes = _order(d, axes, i, j)
+    return [[axes[j][i] for j in range(3)] for i in range(3)], d
+
+
+def _rotate(d, o, axes, i, j, k):
+    """Annihilate the entry i, j; o[k] is the one that does not touch axis k."""
+    x = o[k]
+    none = x == 0
+    cot = 0.5 * (d[j] - d[i]) / jnp.where(none, 1.0, x)
+    size = jnp.abs(cot)
+    # √(1 + cot²) overflows in float32 for tiny x: there t = 1/(2 cot).
+    t = 1.0 / (size + jnp.where(size > 1e15, size, jnp.sqrt(1.0 + jnp.minimum(size, 1e15) ** 2)))
+    t = jnp.where(none, 0.0, jnp.where(cot < 0, -t, t))
+    c = 1.0 / jnp.sqrt(1.0 + t * t)
+    s = t * c
+    d, o = list(d), list(o)
+    d[i], d[j], o[k] = d[i] - t * x, d[j] + t * x, jnp.zeros_like(x)
+    # Entry (i, k) is o[j], entry (j, k) is o[i].
+    o[j], o[i] = c * o[j] - s * o[i], s * o[j] + c * o[i]
+    a, b = axes[i], axes[j]
+    axes = list(axes)
+    axes[i] = tuple(c * x - s * y for x, y in zip(a, b, strict=True))
+    axes[j] = tuple(s * x + c * y for x, y in zip(a, b, strict=True))
+    return tuple(d), tuple(o), tuple(axes)
+
+
+def _order(d, axes, i, j):
+    """Exchange axes i and j (turning one round) unless d[i] ≤ d[j]."""
+    wrong = d[i] > d[j]
+    d, axes = list(d), list(axes)
+    d[i], d[j] = jnp.where(wrong, d[j], d[i]), jnp.where(wrong, d[i], d[j])
+    a, b = axes[i], axes[j]
+    axes[i] = tuple(jnp.where(wrong, y, x) for x, y in zip(a, b, strict=True))
+    axes[j] = tuple(jnp.where(wrong, -x, y) for x, y in zip(a, b, strict=True))
+    return tuple(d), tuple(axes)

@@ -1,0 +1,90 @@
+"""The free body in mpmath, to any number of digits, at any time: Jacobi's solution as in textbooks.
+
+Unlike the code under test: ordered axes, no reduction by periods, the attitude from the precession
+angle of one axis with its integral of the third kind done by Gauss–Legendre quadrature on doubled
+pieces … here replaced by the addition theorem at high precision. It is itself compared with a Taylor
+series of the differential equation (tests/systems/free_body_mp.py) in `test_free_body.py`.
+"""
+
+import mpmath as mp
+
+
+def free_body(inertia, q0, omega0, t):
+    """q (4) and Ω (3) at t; inertia 3×3 nested list. Uses the current precision of mpmath."""
+    tensor = mp.matrix(inertia)
+    moments, axes = _principal(tensor)
+    omega0 = list(axes.T * mp.matrix(omega0))
+    momentum = [i * w for i, w in zip(moments, omega0, strict=True)]
+    out, (w, *turn) = _principal_flow([1 / i for i in moments], momentum, mp.mpf(t))
+    omega = list(axes * mp.matrix([p / i for p, i in zip(out, moments, strict=True)]))
+    return _times(q0, [w, *(axes * mp.matrix(turn))]), omega
+
+
+def _principal(tensor):
+    if all(tensor[i, j] == 0 for i in range(3) for j in range(3) if i != j):
+        moments, axes = [tensor[i, i] for i in range(3)], mp.eye(3)
+    else:
+        moments, axes = mp.eigsy(tensor)
+        moments = list(moments)
+    order = sorted(range(3), key=lambda i: moments[i])
+    moments = [moments[i] for i in order]
+    axes = mp.matrix([[axes[i, j] for j in order] for i in range(3)])
+    if mp.det(axes) < 0:
+        for i in range(3):
+            axes[i, 2] = -axes[i, 2]
+    return moments, axes
+
+
+def _principal_flow(a, momentum, t):
+    d12, d13, d23 = a[0] - a[1], a[0] - a[2], a[1] - a[2]
+    p1, p2, p3 = momentum
+    A1, A3 = d12 * p2**2 + d13 * p3**2, d13 * p1**2 + d23 * p2**2
+    h = mp.sqrt(p1**2 + p2**2 + p3**2)
+    if h == 0:
+        return momentum, [mp.mpf(1), mp.mpf(0), mp.mpf(0), mp.mpf(0)]
+    p, q, mu = d23 * A1, d12 * A3, d12 * A1
+    turn = d13 * h * mu
+    # Small enough that the first neglected term of the series is below round-off.
+    size = mp.sqrt(max(p, q, mu)) * abs(t)
+    n = max(int(mp.log(size + mp.mpf(10) ** -30, 2)), 0) + int(mp.mp.prec / 6) + 2
+    # Doubling loses two bits a step.
+    with mp.workprec(mp.mp.prec + 4 * n + 20):
+        u = t / mp.mpf(2) ** (n + 1)
+        S = u - (p + q) * u**3 / 6 + (p * p + 14 * p * q + q * q) * u**5 / 120
+        C, D = mp.sqrt(1 - p * S * S), mp.sqrt(1 - q * S * S)
+        xi = turn * (u**3 / 3 - (p + q + 3 * mu) * u**5 / 15)
+        for k in range(n + 1):
+            if k == n:
+                half = S, C, D, xi
+            s, cc, dd = S * S, C * C, D * D
+            den = 1 - p * q * s * s
+            xi = 2 * xi + mp.atan(2 * turn * s * S * C * D / (den + mu * s * (cc * dd + cc + dd)))
+            S, C, D = 2 * S * C * D / den, (cc - p * s * dd) / den, (dd - q * s * cc) / den
+    full = S, C, D
+
+    def moved(S, C, D):
+        w = 1 - d12 * d23 * p2**2 * S * S
+        return [
+            (p1 * C - d23 * p2 * p3 * S * D) / w,
+            (p2 * C * D + d13 * p1 * p3 * S) / w,
+            (p3 * D - d12 * p1 * p2 * S * C) / w,
+        ]
+
+    S, C, D, xi = half
+    k = moved(S, C, D)
+    b = [C, mp.mpf(0), -d12 * S * k[1] * C, -d13 * S * k[2]]
+    length = mp.sqrt(sum(c * c for c in b))
+    angle = a[0] * h * t / 2 - xi
+    e = [mp.cos(angle), *(mp.sin(angle) * c / h for c in momentum)]
+    return moved(*full), _times(e, [c / length for c in b])
+
+
+def _times(p, q):
+    a, b, c, d = p
+    w, x, y, z = q
+    return [
+        a * w - b * x - c * y - d * z,
+        a * x + b * w + c * z - d * y,
+        a * y - b * z + c * w + d * x,
+        a * z + b * y - c * x + d * w,
+    ]
