@@ -13,8 +13,8 @@ from rigidjax import _checks
 from rigidjax._types import HasSpin, Scalar, ScalarLike, Vec3
 from rigidjax.motion.torques.base import AbstractTorque
 
-Times = Float[ArrayLike, " n"] | Sequence[Any]
-Rows = Float[ArrayLike, "n 3"] | Sequence[Any]
+Times = Float[ArrayLike, " times"] | Sequence[Any]
+Rows = Float[ArrayLike, "rows 3"] | Sequence[Any]
 
 
 class Linear(eqx.Module):
@@ -103,14 +103,14 @@ class Pulses(AbstractTorque):
     """
 
     feels: ClassVar[type] = HasSpin
-    edges: Float[Array, " n+1"]
+    edges: Float[Array, " edges"]
     torques: Float[Array, "n 3"]
 
     def __init__(self, edges: Times, torques: Rows):
         self.edges, self.torques = _rows(edges, torques, extra=1)
 
     @property
-    def jump_times(self) -> Float[Array, " n+1"]:
+    def jump_times(self) -> Float[Array, " edges"]:
         """The edges, s: the torque jumps at each."""
         return self.edges
 
