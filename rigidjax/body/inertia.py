@@ -154,7 +154,7 @@ class Inertia(eqx.Module):
         >>> Inertia.from_principal(1.0, 2.0, 2.5).invertible().moments
         Array([1. , 2. , 2.5], dtype=float64)
         """
-        return Inertia(physical.nonzero_moments(self.tensor))
+        return physical.nonzero_moments(self, self.tensor)
 
     def __add__(self, other: "Inertia") -> "Inertia":
         """Two bodies turning as one about the same point, in the same axes."""
@@ -216,6 +216,16 @@ class MassProperties(eqx.Module):
         return MassProperties(
             physical.real_mass(self.mass), self.com, physical.real_second_moment(self.second_moment)
         )
+
+    def invertible(self) -> "MassProperties":
+        """The same body, refused if a moment about its centre of mass is zero.
+
+        **Raises:** `ValueError` (`equinox` error under `jit`) for a thin rod or a point.
+
+        >>> MassProperties(1.0, [0.0, 0, 0], [[1.0, 0, 0], [0, 1, 0], [0, 0, 1]]).invertible().mass
+        Array(1., dtype=float64)
+        """
+        return physical.nonzero_moments(self, self.inertia.tensor)
 
     def second_moment_about(self, point: Vector) -> Mat3:
         """𝔖 about another point: `𝔖 + m d dᵀ`, `d = c − point`.

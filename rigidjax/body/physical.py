@@ -6,6 +6,7 @@ round-off are forgiven, so that plates, rods and points, which lie on the bounda
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import jax.core
 import jax.numpy as jnp
@@ -65,12 +66,12 @@ def real_second_moment(s: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3 
     )
 
 
-def nonzero_moments(tensor: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3 3"]:
-    """Refuse a moment that is zero to round-off."""
+def nonzero_moments(body: Any, tensor: Float[Array, "*batch 3 3"]) -> Any:
+    """Return `body` unless its inertia `tensor` has a moment that is zero to round-off."""
     moments = _eigenvalues(tensor)
     found = f" {_show(moments)} kg m²" if known(tensor) else ""
     return _checks.refuse(
-        tensor,
+        body,
         (moments[..., 0] <= _slack(tensor) * moments[..., 2]).any(),
         f"inertia: a principal moment is zero{found}; the equations of motion divide by it. A "
         "thin rod or a point does not resist turning about that axis: give it a thickness",

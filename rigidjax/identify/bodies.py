@@ -40,7 +40,7 @@ class Ratios(AbstractBodyChart):
     """The whole inertia tensor up to scale: two ratios of moments and the principal axes.
 
     Five numbers: the log-Cholesky factor of the second moment 𝔖, its scale fixed
-    (Rucker and Wensing 2022, doi:10.1109/LRA.2022.3183759).
+    (Rucker and Wensing 2022, IEEE RA-L 7:2771, doi:10.1109/LRA.2022.3144517).
 
     >>> Ratios().log_ratios(Ratios().inertia(jnp.zeros(5)))
     Array([0., 0.], dtype=float64)

@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 
 from rigidjax._types import HasAttitude, Quat
 from rigidjax.body.inertia import Inertia
+from rigidjax.exact import FreeBody
 from rigidjax.identify.bodies import AbstractBodyChart
 from rigidjax.identify.loss import SoftL1
 from rigidjax.identify.recording import Recording
@@ -77,6 +78,9 @@ class Problem(eqx.Module):
     def motion(self, parameters: Parameters) -> Spin | Attitude:
         """The states at the recording's times, with a leading time axis."""
         body, state0 = self.unpack(parameters)
+        if self.torque is None:
+            # The checks of `simulate` are for users; inside a fit they are host callbacks.
+            return jax.vmap(FreeBody(body, state0))(self.recording.t - self.recording.t[0])
         out = simulate(
             body, state0, self.recording.t, self.torque, adjoint=dfx.ForwardMode(), throw=False
         )

@@ -116,7 +116,9 @@ def intervals(fit: "Fit", level: float) -> dict[str, tuple[float, float]]:
     """See `Fit.interval`."""
     chart = fit.problem.body
     low, high = interval_of(fit, lambda body, state: chart.log_ratios(body), level)
-    out = dict(zip(chart.ratio_names, zip(np.exp(low), np.exp(high), strict=True), strict=True))
+    with np.errstate(over="ignore"):
+        low, high = np.exp(low), np.exp(high)
+    out = dict(zip(chart.ratio_names, zip(low, high, strict=True), strict=True))
     low, high = interval_of(fit, lambda body, state: state.omega, level)
     out.update(zip(("Ωx", "Ωy", "Ωz"), zip(low, high, strict=True), strict=True))
     return {name: (float(low), float(high)) for name, (low, high) in out.items()}

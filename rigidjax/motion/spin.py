@@ -51,8 +51,8 @@ class EulerEquations(eqx.Module):
     torque: Torque | None
 
     def __init__(self, inertia: _inertia.Inertia, torque: Torque | None = None):
-        known = physical.if_known(physical.nonzero_moments, inertia.tensor)
-        self.inertia = _inertia.Inertia(known)
+        # Where the numbers are traced, `simulate` has looked at them before.
+        self.inertia = inertia.invertible() if physical.known(inertia.tensor) else inertia
         # Once per solve: a division inside the field costs 25 times the rest of it.
         self.inverse = _inertia.inverse(inertia.tensor)
         self.torque = torque

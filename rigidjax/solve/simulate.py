@@ -14,6 +14,7 @@ from jaxtyping import Array, ArrayLike, Float
 from rigidjax import _checks
 from rigidjax._types import HasAttitude, ScalarLike
 from rigidjax.body.inertia import Inertia, MassProperties
+from rigidjax.exact import FreeBody
 from rigidjax.frames import AbstractScene, MovingFrame, Point, collision, scene_of
 from rigidjax.motion import (
     Attitude,
@@ -43,13 +44,13 @@ class Solution(eqx.Module):
     ys: Any
     stats: dict[str, Any]
     result: dfx.RESULTS
-    _setup: "_Setup"
+    _setup: "_Free | _Setup"
 
     def evaluate(self, t: ScalarLike) -> Any:
         """The state at any `t` between the first and the last of `ts`, s.
 
-        The motion is solved again from the last saved state before `t`, so the error is that of the
-        solver, not of an interpolation, and the attitude is on the group.
+        The motion is worked out again from the last saved state before `t`, so the error is that of
+        the method, not of an interpolation, and the attitude is on the group.
 
         **Raises:** `ValueError` (`EquinoxRuntimeError` under `jit`) where `t` is outside.
         """
@@ -60,6 +61,12 @@ class Solution(eqx.Module):
         start = jax.tree.map(lambda leaf: leaf[index], self.ys)
         ys, _, _ = _solve(self._setup, start, jnp.stack([self.ts[index], t]))
         return jax.tree.map(lambda leaf: leaf[-1], ys)
+
+
+class _Free(eqx.Module):
+    """A free body: the closed form, any time at the cost of one."""
+
+    body: Inertia | MassProperties
 
 
 class _Setup(eqx.Module):
@@ -77,9 +84,13 @@ class _Setup(eqx.Module):
 
 
 @eqx.filter_jit
-def _solve(setup: _Setup, state0: Any, ts: Array) -> tuple[Any, dict[str, Any], dfx.RESULTS]:
+def _solve(
+    setup: _Free | _Setup, state0: Any, ts: Array
+) -> tuple[Any, dict[str, Any], dfx.RESULTS]:
     # One jit around everything: an operation outside of it costs as much as a hundred steps.
     state0 = on_the_group(state0)
+    if isinstance(setup, _Free):
+        return _free(setup.body, state0, ts)
     field = equations_of_motion(setup.body, state0, setup.torque)
     scene = scene_of(setup.torque) if isinstance(state0, Point) else None
     watch = collision.event(scene)
@@ -113,6 +124,19 @@ def _solve(setup: _Setup, state0: Any, ts: Array) -> tuple[Any, dict[str, Any], 
     return ys, stats, out.result
 
 
+def _free(
+    body: Inertia | MassProperties, state0: Any, ts: Array
+) -> tuple[Any, dict[str, Any], dfx.RESULTS]:
+    since = ts - ts[0]
+    inertia = body if isinstance(body, Inertia) else body.inertia
+    ys = jax.vmap(FreeBody(inertia, state0))(since)
+    if isinstance(state0, Rigid):
+        ys = eqx.tree_at(lambda s: s.x, ys, state0.x[None] + since[:, None] * state0.v[None])
+    none = jnp.zeros((), int)
+    stats = {"num_steps": none, "num_accepted_steps": none, "num_rejected_steps": none}
+    return ys, stats, dfx.RESULTS.successful
+
+
 def simulate(
     body: Inertia | MassProperties | None,
     state0: State,
@@ -142,14 +166,16 @@ def simulate(
     - `torque`: a torque of `rigidjax.torques`, or any callable Module `(t, state, body) → (3,)`,
       N m, body frame; `None` for a free body. For a `Point` a scene of `rigidjax.scenes`, a
       `MovingFrame` to see it from, or a force per mass `(t, state, None) → (3,)`, m/s².
-    - `solver`: any `diffrax.AbstractSolver`; `diffrax.Dopri8` unless given. It is wrapped so that
+    - `solver`: `None` is the cheapest that is right: the closed form (`rigidjax.exact`) for a free
+      body, else `diffrax.Dopri8`. Any `diffrax.AbstractSolver` may be given; it is wrapped so that
       attitudes stay unit quaternions, at every step and every saved time.
     - `rtol`, `atol`: tolerances of the adaptive steps; 1e-9 and 1e-12 in float64, 2e-5 and 1e-7 in
-      float32.
+      float32. The closed form has no use for them.
     - `dt0`, `stepsize_controller`: first step and controller where the tolerances are not enough,
       such as `dt0=0.01, stepsize_controller=diffrax.ConstantStepSize()`.
-    - `adjoint`: how gradients are taken. `None` is `diffrax.RecursiveCheckpointAdjoint()`, for
-      `jax.grad`; pass `diffrax.ForwardMode()` for `jax.jacfwd` and least squares.
+    - `adjoint`: how gradients through a solver are taken. `None` is
+      `diffrax.RecursiveCheckpointAdjoint()`, for `jax.grad`; pass `diffrax.ForwardMode()` for
+      `jax.jacfwd` and least squares. The closed form takes both.
     - `max_steps`, `throw`, `progress_meter`: as in `diffrax.diffeqsolve`.
 
     **Returns** a `Solution`. A second call with other numbers of the same shapes compiles nothing.
@@ -172,12 +198,17 @@ def simulate(
     times = times.astype(dtype)
     state0 = jax.tree.map(lambda leaf: leaf.astype(dtype), state0)
     require_fit(body, state0, torque)
+    if body is not None:
+        body = body.invertible()
     controller = stepsize_controller
     if controller is None:
         rtol, atol = _tolerances(rtol, atol, dtype)
         controller = dfx.PIDController(rtol=rtol, atol=atol)
     elif rtol is not None or atol is not None:
         raise ValueError("simulate: give either rtol and atol or a stepsize_controller, not both")
+    if torque is None and solver is None and stepsize_controller is None and body is not None:
+        free = _Free(body)
+        return Solution(times, *_solve(free, state0, times), free)
     setup = _Setup(
         body=body,
         torque=torque,
@@ -239,6 +270,14 @@ def require_fit(body: Any, state0: Any, torque: Any) -> None:
         raise TypeError(
             f"{type(state0).__name__} only turns: wanted Inertia, got {type(body).__name__}"
             + ("; pass body.inertia" if isinstance(body, MassProperties) else "")
+        )
+    tensor = (
+        body.inertia.tensor if isinstance(body, MassProperties) else getattr(body, "tensor", None)
+    )
+    if tensor is not None and tensor.ndim != 2:
+        raise ValueError(
+            f"body: wanted one body, a tensor of shape (3, 3), got {tensor.shape}; batch with "
+            "jax.vmap"
         )
 
 
