@@ -1,3 +1,7 @@
 """Answers without a solver."""
 
 from rigidjax.exact.free_body import FreeBody as FreeBody, free_body as free_body
+from rigidjax.exact.periods import (
+    body_period as body_period,
+    precession_period as precession_period,
+)

@@ -21,7 +21,8 @@ from rigidjax.exact import tensor_flow
 from rigidjax.exact.doubling import Elliptic, Modulus, duplicate, limits, series
 from rigidjax.exact.fence import fence, opaque_one
 from rigidjax.exact.half_period import half_period
-from rigidjax.exact.tensor_flow import Differences, Six, Triple
+from rigidjax.exact.tensor_flow import Differences
+from rigidjax.exact.triples import Six, Triple
 
 # Columns: d12, d23, k12, k13, k23, Π1, Π2, Π3, t.
 Row = tuple[Scalar, ...]

@@ -20,9 +20,8 @@ from rigidjax.exact import tensor_flow
 from rigidjax.exact.fence import fence, opaque_one
 from rigidjax.exact.first_order import jacobian_and_integral
 from rigidjax.exact.principal_flow import momentum_and_turn, orbit
-from rigidjax.exact.tensor_flow import Differences, Six, Triple
-
-Four = tuple[Scalar, Scalar, Scalar, Scalar]
+from rigidjax.exact.tensor_flow import Differences
+from rigidjax.exact.triples import Four, Six, Triple, cross, half_product, times, turned_back
 
 # Below this turn (rad) the Taylor series, of this order, is right to round-off; above, what the
 # quotient by h² loses is round-off/turn in a first and round-off/turn² in a second derivative.
@@ -43,11 +42,11 @@ def _flow_jvp(primals, tangents):
     moments, momentum, t = primals
     _, d_momentum, d_t = tangents
     (body, k, energy2), (d_body, d_k, d_energy2) = jax.jvp(
-        _reciprocal, (moments, momentum), tangents[:2]
+        reciprocal, (moments, momentum), tangents[:2]
     )
     one = opaque_one(t)
     d_body, d_k, d_energy2 = fence((d_body, d_k, d_energy2), one)
-    rows, g = fence(_first_order(body, momentum, t), one)
+    rows, g = fence(first_order(body, momentum, t), one)
     inputs = (d_body.d12, d_body.d23, d_body.k12, d_body.k13, d_body.k23, *d_momentum, d_t)
     d_out = tuple(sum(row[i] * d for i, d in enumerate(inputs)) for row in rows)
     d_out = fence(d_out, one)
@@ -58,8 +57,8 @@ def _flow_jvp(primals, tangents):
     small = jax.lax.stop_gradient(h2 * (k[0] * k[0]) * (t * t)) < _SMALL[t.dtype] ** 2
     along = 0.5 * t * d_energy2 + energy2 * d_t
     along = along + 0.5 * sum(g[i] * d_k[i] for i in range(3)) + sum(g[i] * d_k[i] for i in range(3, 6))
-    back = _turned_back(turn, d_momentum)
-    across = _cross(out, tuple(a - b for a, b in zip(back, d_out, strict=True)))
+    back = turned_back(turn, d_momentum)
+    across = cross(out, tuple(a - b for a, b in zip(back, d_out, strict=True)))
     r = 1.0 / jnp.where(small, 1.0, h2)
     along, across = fence((along, across), one)
     theta = tuple(r * (a + b * along) for a, b in zip(across, out, strict=True))
@@ -68,18 +67,18 @@ def _flow_jvp(primals, tangents):
     safe = jnp.where(small, t, 0.0)
     _, d_series = jax.jvp(_series, (k, momentum, safe), (d_k, d_momentum, d_t))
     d_turn = tuple(
-        jnp.where(small, a, b) for a, b in zip(d_series, _half_product(turn, theta), strict=True)
+        jnp.where(small, a, b) for a, b in zip(d_series, half_product(turn, theta), strict=True)
     )
     return (out, turn), (d_out, fence(d_turn, one))
 
 
 # The jvp of a closed first derivative is taken from the tensor form, which is smooth to any order.
 @jax.custom_jvp
-def _first_order(body, momentum, t):
+def first_order(body, momentum, t):
     return jacobian_and_integral(body, momentum, t)
 
 
-@_first_order.defjvp
+@first_order.defjvp
 def _first_order_jvp(primals, tangents):
     return jax.jvp(_first_order_of_tensor, primals, tangents)
 
@@ -97,7 +96,7 @@ def _first_order_of_tensor(body, momentum, t):
     return jax.jacfwd(lambda x: of_inputs(tuple(x))[0])(jnp.stack(inputs)), g
 
 
-def _reciprocal(moments: Six, momentum: Triple):
+def reciprocal(moments: Six, momentum: Triple):
     """Differences of K = I⁻¹, K itself and E₂ = Π·KΠ."""
     i1, i2, i3, i12, i13, i23 = moments
     c11, c22, c33 = i2 * i3 - i23 * i23, i1 * i3 - i13 * i13, i1 * i2 - i12 * i12
@@ -127,43 +126,10 @@ def _series(k: Six, momentum: Triple, t: Scalar) -> Four:
     # Powers of t are kept inside the terms: each P and W carries one.
     fresh = opaque_one(t)
     for n in range(_ORDER):
-        ws.append(fence(_symmetric(k, ps[n]), fresh))
-        flows = [_half_product(xs[j], ws[n - j]) for j in range(n + 1)]
+        ws.append(fence(times(k, ps[n]), fresh))
+        flows = [half_product(xs[j], ws[n - j]) for j in range(n + 1)]
         xs.append(fence(tuple(sum(c) / (n + 1) for c in zip(*flows, strict=True)), fresh))
         if n < _ORDER - 1:
-            turns = [_cross(ps[j], ws[n - j]) for j in range(n + 1)]
+            turns = [cross(ps[j], ws[n - j]) for j in range(n + 1)]
             ps.append(fence(tuple(sum(c) / (n + 1) for c in zip(*turns, strict=True)), fresh))
     return tuple(sum(c[::-1]) for c in zip(*xs, strict=True))
-
-
-def _symmetric(k: Six, p: Triple) -> Triple:
-    a, b, c, x, y, z = k
-    return (
-        a * p[0] + x * p[1] + y * p[2],
-        x * p[0] + b * p[1] + z * p[2],
-        y * p[0] + z * p[1] + c * p[2],
-    )
-
-
-def _cross(a: Triple, b: Triple) -> Triple:
-    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
-
-
-def _half_product(q: Four, v: Triple) -> Four:
-    """½ q ⊗ (0, v)."""
-    w, x, y, z = q
-    a, b, c = 0.5 * v[0], 0.5 * v[1], 0.5 * v[2]
-    return (
-        -x * a - y * b - z * c,
-        w * a + y * c - z * b,
-        w * b + z * a - x * c,
-        w * c + x * b - y * a,
-    )
-
-
-def _turned_back(q: Four, v: Triple) -> Triple:
-    """R(q)ᵀ v."""
-    w, *axis = q
-    first = _cross(v, tuple(axis))
-    second = _cross(first, tuple(axis))
-    return tuple(c + 2.0 * (w * a + b) for c, a, b in zip(v, first, second, strict=True))

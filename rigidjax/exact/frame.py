@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from rigidjax._types import Mat3, Scalar, Vec3
-from rigidjax.exact.tensor_flow import Six, Triple
+from rigidjax.exact.triples import Six, Triple
 
 # Cyclic Jacobi converges quadratically; 3×3 needs four or five sweeps from anywhere.
 _SWEEPS = 6

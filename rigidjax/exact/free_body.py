@@ -13,7 +13,7 @@ from rigidjax.body.inertia import Inertia
 from rigidjax.exact.fence import fence, opaque_one
 from rigidjax.exact.flow import flow
 from rigidjax.exact.frame import into, out_of, principal_frame
-from rigidjax.exact.tensor_flow import Six, Triple
+from rigidjax.exact.triples import Six, Triple, times
 
 State = TypeVar("State", bound=HasSpin)
 
@@ -47,7 +47,7 @@ class FreeBody(eqx.Module):
         one = opaque_one(tensor[0, 0])
         self.moments, self.axes = fence(principal_frame(tensor), one)
         rate = into(self.axes, jnp.ldexp(omega, -self.exponent))
-        self.momentum = fence(_times(self.moments, rate), one)
+        self.momentum = fence(times(self.moments, rate), one)
         self.state0 = state0
 
     def __call__(self, t: ScalarLike) -> HasSpin:
@@ -82,18 +82,9 @@ def _solve(moments: Six, momentum: Triple) -> Triple:
 @_solve.defjvp
 def _solve_jvp(primals, tangents):
     rate = _solve(*primals)
-    turned = _times(tangents[0], rate)
+    turned = times(tangents[0], rate)
     return rate, _solve(
         primals[0], tuple(a - b for a, b in zip(tangents[1], turned, strict=True))
-    )
-
-
-def _times(m: Six, v: Triple) -> Triple:
-    a, b, c, x, y, z = m
-    return (
-        a * v[0] + x * v[1] + y * v[2],
-        x * v[0] + b * v[1] + z * v[2],
-        y * v[0] + z * v[1] + c * v[2],
     )
 
 

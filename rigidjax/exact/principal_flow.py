@@ -14,8 +14,7 @@ from rigidjax.exact.doubling import Elliptic, Modulus, duplicate, elliptic, limi
 from rigidjax.exact.fence import fence, opaque_one
 from rigidjax.exact.half_period import HalfPeriod, half_period
 from rigidjax.exact.sincos import sincos
-
-Triple = tuple[Scalar, Scalar, Scalar]
+from rigidjax.exact.triples import Four, Triple
 
 
 class Orbit(NamedTuple):
@@ -101,7 +100,7 @@ def momentum_at(o: Orbit, f: Elliptic) -> Triple:
     return y1 * r, y2 * r, y3 * r
 
 
-def momentum_and_turn(o: Orbit, t: Scalar) -> tuple[Triple, tuple[Scalar, Scalar, Scalar, Scalar]]:
+def momentum_and_turn(o: Orbit, t: Scalar) -> tuple[Triple, Four]:
     """Body momentum at t, and the quaternion of the turn since t = 0, in principal axes."""
     one = opaque_one(t)
     f, phase = fence(reduced(o, 0.5 * t), one)

@@ -37,11 +37,7 @@ import jax.numpy as jnp
 
 from rigidjax._types import Scalar
 from rigidjax.exact.doubling import limits
-
-Triple = tuple[Scalar, Scalar, Scalar]
-# A symmetric matrix: 11, 22, 33, 12, 13, 23.
-Six = tuple[Scalar, Scalar, Scalar, Scalar, Scalar, Scalar]
-
+from rigidjax.exact.triples import Six, Triple, adjugate, determinant, product, times
 
 class Differences(NamedTuple):
     """K = I⁻¹ but for its trace: differences of its diagonal, and its off-diagonal entries."""
@@ -125,8 +121,8 @@ def start(u: Scalar, v: Invariants) -> Sigma:
     x = (ss * q, zero, ss * p, ss * e12, ss * e13, ss * e23)
     inner = _add_scalar(_scale(x, 7 / 128), 5 / 64)
     for c in (1 / 8, 1 / 4, 1.0):
-        inner = _add_scalar(_product(x, inner), c)
-    t = _add_scalar(_scale(_product(x, inner), -0.5), 1.0)
+        inner = _add_scalar(product(x, inner), c)
+    t = _add_scalar(_scale(product(x, inner), -0.5), 1.0)
     r = u * uu / 3
     y = _add_scalar(
         tuple(c * (0.6 * r * uu) for c in (q, zero, p, e12, e13, e23)), r * (1.0 - 0.2 * c1)
@@ -169,13 +165,13 @@ def double(f: Sigma, v: Invariants) -> Sigma:
     n12 = 2.0 * (m12 * m33 - m13 * m23)
     n13 = 2.0 * (m13 * m22 - m12 * m23)
     n23 = 2.0 * (m23 * m11 - m12 * m13)
-    det = _det(f.t)
+    det = determinant(f.t)
     t = (n11, n22, n33, n12, n13, n23)
     s2 = 2.0 * s * det
-    before = _scale(_adjugate(f.t), s / det)
-    after = _scale(_adjugate(t), s2 / _det(t))
-    square = _product(before, before)
-    y = tuple(2.0 * a + b for a, b in zip(f.y, _product(square, after), strict=True))
+    before = _scale(adjugate(f.t), s / det)
+    after = _scale(adjugate(t), s2 / determinant(t))
+    square = product(before, before)
+    y = tuple(2.0 * a + b for a, b in zip(f.y, product(square, after), strict=True))
     return _scaled(Sigma(s2, t, y))
 
 
@@ -188,7 +184,7 @@ def momentum_at(
     u1 = -d23 * p2 * p3 + p2 * (k13 * p1 + k23 * p2) - p3 * (k12 * p1 + k23 * p3)
     u2 = d13 * p1 * p3 + p3 * (k12 * p2 + k13 * p3) - p1 * (k13 * p1 + k23 * p2)
     u3 = -d12 * p1 * p2 + p1 * (k12 * p1 + k23 * p3) - p2 * (k12 * p2 + k13 * p3)
-    adj, turned = _apply(_adjugate(f.t), momentum), _apply(f.t, (u1, u2, u3))
+    adj, turned = times(adjugate(f.t), momentum), times(f.t, (u1, u2, u3))
     t1, _, t3, t12, t13, t23 = f.t
     ss = f.s * f.s
     # W = (T²)ᵢᵢ + σ² (Eᵢᵢ − Tr K E₂ + |KΠ|²) for each i; 1 and 3 are sums of positive terms.
@@ -210,8 +206,8 @@ def momentum_at(
 def integral_about(body: Differences, v: Invariants, f: Sigma, k: Triple) -> Six:
     """∫ Π Πᵀ dt from −u to u about the moment when Π = k, with f at u."""
     _, w = momentum_at(body, v, f, k)
-    alpha = _apply(_adjugate(f.t), k)
-    r = 2.0 * f.s / (w * _det(f.t))
+    alpha = times(adjugate(f.t), k)
+    r = 2.0 * f.s / (w * determinant(f.t))
     a1, a2, a3 = alpha
     hh = v.h2
     k12, k13, k23 = (hh * c for c in body[3:])
@@ -223,7 +219,7 @@ def integral_about(body: Differences, v: Invariants, f: Sigma, k: Triple) -> Six
         hh * v.e13,
         hh * v.e23,
     )
-    n = _product(b, f.y)
+    n = product(b, f.y)
     return tuple(
         r * c - 2.0 * d
         for c, d in zip((a1 * a1, a2 * a2, a3 * a3, a1 * a2, a1 * a3, a2 * a3), n, strict=True)
@@ -305,35 +301,6 @@ def momentum_and_integral(
 def _scaled(f: Sigma) -> Sigma:
     r = 1.0 / jax.lax.stop_gradient(f.t[1])
     return Sigma(f.s * r, _scale(f.t, r), f.y)
-
-
-def _det(m: Six) -> Scalar:
-    a, b, c, x, y, z = m
-    return a * b * c + 2.0 * x * y * z - a * z * z - b * y * y - c * x * x
-
-
-def _adjugate(m: Six) -> Six:
-    a, b, c, x, y, z = m
-    return (b * c - z * z, a * c - y * y, a * b - x * x, y * z - x * c, x * z - y * b, x * y - z * a)
-
-
-def _product(m: Six, n: Six) -> Six:
-    """The product of two symmetric matrices that commute, hence symmetric."""
-    a, b, c, x, y, z = m
-    d, e, f, u, v, w = n
-    return (
-        a * d + x * u + y * v,
-        x * u + b * e + z * w,
-        y * v + z * w + c * f,
-        a * u + x * e + y * w,
-        a * v + x * w + y * f,
-        x * v + b * w + z * f,
-    )
-
-
-def _apply(m: Six, p: Triple) -> Triple:
-    a, b, c, x, y, z = m
-    return a * p[0] + x * p[1] + y * p[2], x * p[0] + b * p[1] + z * p[2], y * p[0] + z * p[1] + c * p[2]
 
 
 def _scale(m: Six, r) -> Six:

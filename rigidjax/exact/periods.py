@@ -1,0 +1,128 @@
+"""The two periods of a free body."""
+
+import math
+
+import jax
+import jax.numpy as jnp
+
+from rigidjax import _checks
+from rigidjax._types import Scalar, Vec3Like
+from rigidjax.body.inertia import Inertia
+from rigidjax.exact import tensor_flow
+from rigidjax.exact.doubling import Modulus
+from rigidjax.exact.flow import first_order, reciprocal
+from rigidjax.exact.frame import into, principal_frame
+from rigidjax.exact.half_period import half_period
+from rigidjax.exact.triples import Six, Triple, times
+
+
+def body_period(inertia: Inertia, omega0: Vec3Like) -> Scalar:
+    """Time after which the body rates repeat: one rotation about the axis that is circulated.
+
+    Seen from the body, the angular momentum circles the axis of the smallest or of the largest
+    moment. This is the time of one round: the rotation period about that axis (5.41 days about the
+    long axis for 4179 Toutatis). For a spin about a stable axis it is the limit, the period of small
+    wobbles. It is infinite on the separatrix, for a sphere and at rest.
+
+    **Arguments:** `inertia` of the body about its centre of mass (kg m²); `omega0` (3,) Ω at any
+    moment, rad/s, body frame. **Returns** a scalar, s.
+
+    `T = 2π/agm(√(e₁ − e₂), √(e₁ − e₃))`, eᵢ the roots in `rigidjax.exact.tensor_flow` (DLMF
+    19.8.5; Landau and Lifshitz, Mechanics, eq 37.11). Its derivatives are right wherever it is
+    finite, symmetric tops and principal axes included.
+
+    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
+
+    >>> import rigidjax as rj
+    >>> float(body_period(rj.Inertia.from_principal(1.0, 2.0, 2.0), [1.0, 0.5, 0.0]))  # 4π
+    12.566370614359172
+    """
+    moments, momentum, exponent = _scaled(inertia, omega0)
+    return jnp.ldexp(_periods(moments, momentum)[0], -exponent)
+
+
+def precession_period(inertia: Inertia, omega0: Vec3Like) -> Scalar:
+    """Mean time in which the circulated axis goes round the angular momentum, in space.
+
+    The axis of the smallest or largest moment, whichever the momentum circles in the body, turns
+    about the fixed angular momentum at a rate that varies within `body_period`; this is 2π over its
+    mean (7.35 days for the long axis of 4179 Toutatis). Where nothing is circulated (separatrix,
+    sphere) it is the period of the turn about the middle axis, `2π I₂/|L|`, its limit. Infinite at
+    rest.
+
+    **Arguments:** as for `body_period`. **Returns** a scalar, s.
+
+    The angle in one body period is `χ ∓ 2π`, χ the turn of the body about its momentum: a complete
+    integral of the third kind (DLMF 19.8.7). Its derivative is `½ T δE₂ + ½ δK:∫ΠΠᵀ dt + E₂ δT`,
+    over |Π|: see `rigidjax.exact.flow`.
+
+    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
+
+    >>> import rigidjax as rj
+    >>> top = rj.Inertia.from_principal(1.0, 2.0, 2.0)
+    >>> float(precession_period(top, [1.0, 0.5, 0.0]))  # 2π I₂/|L|
+    8.885765876316732
+    """
+    moments, momentum, exponent = _scaled(inertia, omega0)
+    return jnp.ldexp(_periods(moments, momentum)[1], -exponent)
+
+
+def _scaled(inertia: Inertia, omega0):
+    omega = _checks.floating(omega0, (3,), "omega0").astype(inertia.tensor.dtype)
+    tensor = _checks.floating(inertia.tensor, (3, 3), "inertia tensor")
+    _, size = jnp.frexp(jax.lax.stop_gradient(jnp.max(jnp.abs(tensor))))
+    _, exponent = jnp.frexp(jax.lax.stop_gradient(jnp.max(jnp.abs(omega))))
+    moments, axes = principal_frame(jnp.ldexp(tensor, -size))
+    return moments, times(moments, into(axes, jnp.ldexp(omega, -exponent))), exponent
+
+
+def _periods(moments: Six, momentum: Triple) -> tuple[Scalar, Scalar]:
+    body, _, energy2 = reciprocal(moments, momentum)
+    v = tensor_flow.invariants(body, momentum)
+    h = jnp.sqrt(sum(p * p for p in momentum))
+    endless = jax.lax.stop_gradient((v.gap == 0) | (jnp.maximum(v.p, v.q) <= 0))
+    # A tame body stands in where there is no period, so that no derivative is NaN there.
+    one, zero = jnp.ones_like(h), jnp.zeros_like(h)
+    safe_moments = _choose(endless, (one, 2 * one, 3 * one, zero, zero, zero), moments)
+    safe_momentum = _choose(endless, (one, zero, zero), momentum)
+    body, _, _ = reciprocal(safe_moments, safe_momentum)
+    period = tensor_flow.period(tensor_flow.invariants(body, safe_momentum))
+    angle = _precession(safe_moments, safe_momentum, period)
+    still = h == 0
+    middle = 2.0 * math.pi * moments[1] / jnp.where(still, 1.0, h)
+    precession = jnp.where(endless, middle, 2.0 * math.pi * period / angle)
+    return jnp.where(endless, jnp.inf, period), jnp.where(still, jnp.inf, precession)
+
+
+@jax.custom_jvp
+def _precession(moments: Six, momentum: Triple, period: Scalar) -> Scalar:
+    """Angle that the circulated axis goes round the momentum in one period of the body rates."""
+    (i1, i2, i3, *_), (p1, p2, p3) = moments, momentum
+    r1, r2, r3 = 1.0 / i1, 1.0 / i2, 1.0 / i3
+    d12, d13, d23 = (i2 - i1) * (r1 * r2), (i3 - i1) * (r1 * r3), (i3 - i2) * (r2 * r3)
+    A1, A3 = d12 * p2 * p2 + d13 * p3 * p3, d13 * p1 * p1 + d23 * p2 * p2
+    A2 = d23 * p3 * p3 - d12 * p1 * p1
+    about_three = A2 > 0
+    m = Modulus(d23 * A1, d12 * A3, d13 * A2)
+    h = jnp.sqrt(p1 * p1 + p2 * p2 + p3 * p3)
+    mu = jnp.where(about_three, d23 * A3, d12 * A1)
+    half = half_period(m, mu, jnp.where(about_three, -d13, d13) * h * mu)
+    turn = jnp.where(about_three, r3, r1) * h * period - 2.0 * half.phase
+    return turn + jnp.where(about_three, 2.0 * math.pi, -2.0 * math.pi)
+
+
+@_precession.defjvp
+def _precession_jvp(primals, tangents):
+    moments, momentum, period = primals
+    (body, _, energy2), (_, d_k, d_energy2) = jax.jvp(
+        reciprocal, (moments, momentum), tangents[:2]
+    )
+    _, g = first_order(body, momentum, period)
+    along = 0.5 * period * d_energy2 + energy2 * tangents[2]
+    along = along + 0.5 * sum(g[i] * d_k[i] for i in range(3)) + sum(g[i] * d_k[i] for i in range(3, 6))
+    h = jnp.sqrt(sum(p * p for p in momentum))
+    return _precession(*primals), along / h
+
+
+def _choose(condition, a, b):
+    return tuple(jnp.where(condition, x, y) for x, y in zip(a, b, strict=True))

@@ -1,0 +1,68 @@
+"""Vectors, quaternions and symmetric matrices as tuples of scalars: 3, 4 and (11, 22, 33, 12, 13, 23).
+
+Written on components so that XLA makes one kernel of a batch (a stacked array costs ten times it).
+"""
+
+from rigidjax._types import Scalar
+
+Triple = tuple[Scalar, Scalar, Scalar]
+Four = tuple[Scalar, Scalar, Scalar, Scalar]
+Six = tuple[Scalar, Scalar, Scalar, Scalar, Scalar, Scalar]
+
+
+def times(m: Six, v: Triple) -> Triple:
+    """A symmetric matrix times a vector."""
+    a, b, c, x, y, z = m
+    return (
+        a * v[0] + x * v[1] + y * v[2],
+        x * v[0] + b * v[1] + z * v[2],
+        y * v[0] + z * v[1] + c * v[2],
+    )
+
+
+def product(m: Six, n: Six) -> Six:
+    """The product of two symmetric matrices that commute, hence symmetric."""
+    a, b, c, x, y, z = m
+    d, e, f, u, v, w = n
+    return (
+        a * d + x * u + y * v,
+        x * u + b * e + z * w,
+        y * v + z * w + c * f,
+        a * u + x * e + y * w,
+        a * v + x * w + y * f,
+        x * v + b * w + z * f,
+    )
+
+
+def determinant(m: Six) -> Scalar:
+    a, b, c, x, y, z = m
+    return a * b * c + 2.0 * x * y * z - a * z * z - b * y * y - c * x * x
+
+
+def adjugate(m: Six) -> Six:
+    a, b, c, x, y, z = m
+    return (b * c - z * z, a * c - y * y, a * b - x * x, y * z - x * c, x * z - y * b, x * y - z * a)
+
+
+def cross(a: Triple, b: Triple) -> Triple:
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+def half_product(q: Four, v: Triple) -> Four:
+    """½ q ⊗ (0, v)."""
+    w, x, y, z = q
+    a, b, c = 0.5 * v[0], 0.5 * v[1], 0.5 * v[2]
+    return (
+        -x * a - y * b - z * c,
+        w * a + y * c - z * b,
+        w * b + z * a - x * c,
+        w * c + x * b - y * a,
+    )
+
+
+def turned_back(q: Four, v: Triple) -> Triple:
+    """R(q)ᵀ v."""
+    w, *axis = q
+    first = cross(v, tuple(axis))
+    second = cross(first, tuple(axis))
+    return tuple(c + 2.0 * (w * a + b) for c, a, b in zip(v, first, second, strict=True))
