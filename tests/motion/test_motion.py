@@ -65,6 +65,14 @@ def test_a_scene_pays_only_for_what_it_has():
     assert free < _operations(rj.AttitudeEquations(inertia), attitude)
     numbers = [sum(leaf.size for leaf in jax.tree.leaves(s)) for s in (spin, attitude, rigid)]
     assert numbers == [3, 7, 13]
+    turning = _operations(rj.AttitudeEquations(inertia), attitude)
+    top = rj.torques.HeavyTop(1.0, [0.0, 0, 1], [0.0, 0, -9.81])
+    assert turning < _operations(rj.AttitudeEquations(inertia, top), attitude)
+    # A body that moves freely pays nothing for forces; one in uniform gravity next to nothing.
+    moving = _operations(rj.NewtonEuler(body), rigid)
+    assert moving == turning
+    fall = rj.torques.UniformGravity([0.0, 0, -9.81])
+    assert moving <= _operations(rj.NewtonEuler(body, fall), rigid) < moving + 20
     field = rj.NewtonEuler(body, damping)
     assert _operations(rj.AttitudeEquations(inertia), attitude) < _operations(field, rigid)
 

@@ -303,6 +303,7 @@ def test_energy_adds_up():
         (lambda: torques.HeavyTop(1.0, [0, 0, 1.0], 9.81), r"gravity: .*\[0, 0, -9.81\]"),
         (lambda: torques.UniformGravity(9.81), r"gravity: .*\[0, 0, -9.81\]"),
         (lambda: torques.GravityGradient([1.0, 2, 3], 5.0), r"mu: wanted shape \(\), got \(3,\)"),
+        (lambda: torques.CentralGravity([1.0, 2, 3]), r"mu: wanted shape \(\), got \(3,\)"),
         (lambda: torques.MagneticDipole([1.0, 2], [0.0, 0, 1]), r"moment: wanted shape \(3,\)"),
         (lambda: torques.Flywheel(2.0), r"momentum: wanted shape \(3,\), got \(\)"),
         (lambda: torques.InSpace("up"), "torque: wanted"),
