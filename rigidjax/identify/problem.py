@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from rigidjax._types import HasAttitude, Quat
+from rigidjax._types import HasAttitude, Quat, Scalar
 from rigidjax.body.inertia import Inertia
 from rigidjax.exact import FreeBody
 from rigidjax.identify.bodies import AbstractBodyChart
@@ -44,7 +44,7 @@ class Problem(eqx.Module):
     >>> import rigidjax as rj
     >>> record = rj.identify.Recording([0.0, 1.0], (rj.identify.Gyro(), [[1.0, 0, 0]] * 2))
     >>> rj.identify.Problem(record, rj.identify.Ratios()).typical_rate
-    1.0
+    Array(1., dtype=float64)
     """
 
     recording: Recording
@@ -52,7 +52,7 @@ class Problem(eqx.Module):
     torque: Torque | None
     loss: SoftL1 | None
     reference: Quat | None
-    typical_rate: float
+    typical_rate: Scalar
 
     def __init__(
         self,
@@ -64,7 +64,8 @@ class Problem(eqx.Module):
     ):
         self.recording, self.body, self.torque, self.loss = recording, body, torque, loss
         self.reference = _first_attitude(recording)
-        self.typical_rate = _typical_rate(recording)
+        # An array, not a float: another recording must not compile again.
+        self.typical_rate = jnp.asarray(_typical_rate(recording))
 
     def unpack(self, parameters: Parameters) -> tuple[Inertia, Spin | Attitude]:
         """The body and the first state that the parameters stand for."""

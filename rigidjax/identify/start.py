@@ -19,7 +19,7 @@ def starting_points(problem: Problem, count: int, key: PRNGKeyArray) -> list[Par
     equations where a gyro sampled them finely enough, else a sphere; further starts scatter the
     shape over the whole chart and the rate by a tenth.
     """
-    rate = _first_rate(problem.recording) / problem.typical_rate
+    rate = _first_rate(problem.recording) / float(problem.typical_rate)
     regressed = regress_inertia(problem.recording)
     centre = np.zeros(problem.body.size)
     if regressed is not None:
