@@ -38,6 +38,7 @@ from rigidjax.solve import (
     Solution as Solution,
     equations_of_motion as equations_of_motion,
     simulate as simulate,
+    solvers as solvers,
 )
 
 __version__ = "0.1.0"

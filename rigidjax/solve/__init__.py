@@ -1,5 +1,6 @@
 """Answers with a solver, all of them diffrax's."""
 
+from rigidjax.solve import lean as lean, solvers as solvers
 from rigidjax.solve.projected import (
     GroupInterpolation as GroupInterpolation,
     Projected as Projected,

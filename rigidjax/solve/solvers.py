@@ -1,0 +1,7 @@
+"""The methods, under one name: `rigidjax.solvers`."""
+
+from rigidjax.solve.explicit import (
+    DormandPrince8 as DormandPrince8,
+    RungeKutta4 as RungeKutta4,
+    Tsitouras5 as Tsitouras5,
+)
