@@ -5,6 +5,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from rigidjax import _checks
@@ -39,7 +40,7 @@ def complementary(name: str, value: Any, complement: Any) -> dict[str, Any]:
     if complement is None:
         return {name: value, name + "1": 1 - value}
     other = _checks.floating(complement, (), name + "1", batched=True)
-    if not isinstance(value, jax.core.Tracer) and not isinstance(other, jax.core.Tracer):
+    if not isinstance(value, Tracer) and not isinstance(other, Tracer):
         a, b = np.asarray(value), np.asarray(other)
         eps = max(np.finfo(a.dtype).eps, np.finfo(b.dtype).eps)
         excess = np.abs(a + b - 1)
@@ -53,7 +54,7 @@ def complementary(name: str, value: Any, complement: Any) -> dict[str, Any]:
 
 @jax.custom_jvp
 def exact_complement(value: Float[Array, "..."], complement: Float[Array, "..."]) -> Any:
-    """`value`, whose digits are kept, as a function of its `complement` alone: its tangent is −1."""
+    """`value` with its own digits, but as a function of its `complement` alone: slope −1."""
     return value
 
 

@@ -1,4 +1,4 @@
-"""Integrals of products of powers over the half line, and so every derivative of an elliptic integral.
+"""Integrals of products of powers over the half line: elliptic integrals and all their derivatives.
 
     H(b; a) = ∫₀^∞ ∏ (t + aᵢ)^(−bᵢ) dt
 
@@ -21,6 +21,8 @@ from jaxtyping import Array, Float
 
 # Enough that h < 0.5 (float64) or 0.95 (float32) for arguments in ratios of 1e35.
 _NODES = {np.dtype("float64"): 384, np.dtype("float32"): 136}
+# What the largest argument is scaled to: float32 has no room below 1e-30 for the tail at t → 0.
+_UNIT = {np.dtype("float64"): 1.0, np.dtype("float32"): 2.0**24}
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
@@ -40,30 +42,34 @@ def half_line(
     >>> round(float(half_line((2.0,), (jnp.asarray(4.0),))), 12)
     0.25
     """
-    dtype = arguments[0].dtype
     largest = arguments[0]
     for a in arguments[1:]:
         largest = jnp.maximum(largest, a)
     scale = jnp.where(largest > 0, largest, 1)
-    scaled = [a / scale for a in arguments]
+    dtype = np.dtype(arguments[0].dtype)
+    unit = _UNIT[dtype]
+    scaled = [a / scale * unit for a in arguments]
 
-    smallest, at_zero = jnp.ones_like(scale), jnp.ones_like(scale)
+    smallest, at_zero = jnp.full_like(scale, unit), jnp.ones_like(scale)
     for a, power in zip(scaled, powers, strict=True):
         smallest = jnp.where(a > 0, jnp.minimum(smallest, a), smallest)
         at_zero = jnp.where(a == 0, at_zero - power, at_zero)
     digits = -math.log(float(jnp.finfo(dtype).eps) / 8)
     low = jnp.log(smallest) - digits / jnp.maximum(at_zero, 0.5)
-    high = digits / (sum(powers) - 1)
-    nodes = _NODES[np.dtype(dtype)]
+    low = jnp.maximum(low, 0.99 * math.log(float(jnp.finfo(dtype).tiny)))
+    high = math.log(unit) + digits / (sum(powers) - 1)
+    nodes = _NODES[dtype]
     step = (high - low) / nodes
-    count = (jnp.arange(nodes, dtype=dtype) + 0.5).reshape((1,) * scale.ndim + (nodes,))
-    t = jnp.exp(low[..., None] + step[..., None] * count)
+    count = (jnp.arange(nodes, dtype=dtype) + 0.5).reshape((nodes,) + (1,) * scale.ndim)
+    t = jnp.exp(low[None] + step[None] * count)
 
     # t first: then the running product stays between the sizes of its neighbours.
     product = t
     for a, power in zip(scaled, powers, strict=True):
-        product = _divide(product, t + a[..., None], power)
-    value = product.sum(-1) * step * _divide(jnp.ones_like(scale), scale, sum(powers) - 1)
+        product = _divide(product, t + a[None], power)
+    excess = sum(powers) - 1
+    value = product.sum(0) * step * unit**excess
+    value = _divide(value, scale, excess)
     value = jnp.where(at_zero > 0, value, jnp.inf)
     negative = jnp.isnan(largest)
     for a in arguments:
@@ -83,12 +89,14 @@ def _half_line_jvp(powers: Any, primals: Any, tangents: Any) -> tuple[Any, Any]:
 
 
 def _divide(value: Any, x: Any, power: float) -> Any:
-    """value · x^(−power) for multiples of ½, factor by factor."""
+    """`value` times x^(−power) for multiples of ½, factor by factor."""
     whole = math.floor(power)
     if power > whole:
-        value = value * jax.lax.rsqrt(x)
-    for _ in range(whole):
-        value = value / x
-    for _ in range(-whole):
-        value = value * x
+        factor = jax.lax.rsqrt(x)
+        for _ in range(abs(round(2 * power))):
+            value = value * (factor if power > 0 else factor * x)
+        return value
+    factor = 1 / x if power > 0 else x
+    for _ in range(abs(whole)):
+        value = value * factor
     return value

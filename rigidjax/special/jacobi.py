@@ -62,7 +62,7 @@ def am(
     m: Float[ArrayLike, "..."],
     m1: Float[ArrayLike, "..."] | None = None,
 ) -> Float[Array, "..."]:
-    """Jacobi's amplitude am(u|m) = ∫₀^u dn(v|m) dv, rad: the inverse of F(φ|m) for m ≤ 1.
+    """Jacobi's amplitude φ = ∫₀^u dn(v|m) dv, rad: the inverse of F(φ|m) for m ≤ 1.
 
     **Arguments:** as `sncndn`. For m ≤ 1 the amplitude grows by π each half period 2K, without
     jumps; for m > 1 it swings within |φ| ≤ arcsin(1/√m).
@@ -187,7 +187,7 @@ def _slopes_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
 
 
 def _slopes_from_integral(u: Any, m: Any, m1: Any) -> tuple[Any, Any, Any]:
-    """dn X times the slopes in φ, X by Carlson's R_D over what is left of u after half periods."""
+    """The slopes in φ times dn X, X by Carlson's R_D over the rest of u after half periods."""
     s, c, d = _core(u, m, m1)
     turns = _turns(jax.lax.stop_gradient(u), jax.lax.stop_gradient(m1))[0]
     sign = _parity(turns)
