@@ -1,0 +1,155 @@
+"""Projection, alignment, Wahba's problem and the mean: against SVD, Sylvester and optimality."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.linalg import solve_sylvester
+from scipy.spatial.transform import Rotation
+
+from rigidjax.rotation import quaternion, so3
+
+DTYPES = [np.float64, np.float32]
+
+
+def project_truth(a, e):
+    """Polar factor by SVD, and its derivative in direction e from P X + X P = RᵀE − EᵀR."""
+    u, s, vt = np.linalg.svd(a.astype(np.float64))
+    r, p = u @ vt, vt.T @ np.diag(s) @ vt
+    return r, r @ solve_sylvester(p, p, r.T @ e - e.T @ r)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_projection_and_its_derivative(dtype):
+    """R6: at 1, at rotations, 1e-9 and 1e-4 from them, and far: 1e-13 / 1e-6, jvp and vjp."""
+    rng = np.random.default_rng(0)
+    turns = [np.eye(3), *Rotation.random(4, random_state=rng).as_matrix()]
+    noise = [0, 1e-9, 1e-4, 0.2]
+    a = np.array([r + n * rng.normal(size=(3, 3)) for r in turns for n in noise]).astype(dtype)
+    e, c = rng.normal(size=(2, *a.shape)).astype(dtype)
+
+    def parts(a, e, c):
+        r, forward = jax.jvp(so3.project, (a,), (e,))
+        _, backward = jax.vjp(so3.project, a)
+        return r, forward, backward(c)[0]
+
+    r, forward, backward = (np.asarray(x, np.float64) for x in jax.jit(jax.vmap(parts))(a, e, c))
+    want = [project_truth(*pair) for pair in zip(a, e.astype(np.float64), strict=True)]
+    tol = 1e-13 if dtype == np.float64 else 1e-6
+    assert abs(r - [w[0] for w in want]).max() < (5e-15 if dtype == np.float64 else tol)
+    orth = r.swapaxes(1, 2) @ r - np.eye(3)
+    assert abs(orth).max() < (1.5e-15 if dtype == np.float64 else tol)
+    scale = abs(np.array([w[1] for w in want])).max()
+    assert abs(forward - [w[1] for w in want]).max() < tol * scale
+    paired = (backward * e).sum((1, 2)) - (c * forward).sum((1, 2))
+    assert abs(paired).max() < 20 * tol
+
+
+def test_second_derivative_of_projection():
+    """Against central differences of the first derivative, on SO(3) itself."""
+    rng = np.random.default_rng(1)
+    r = Rotation.random(random_state=rng).as_matrix()
+    e, g = rng.normal(size=(2, 3, 3))
+    first = jax.jit(lambda a: jax.jvp(so3.project, (a,), (e,))[1])
+    _, second = jax.jvp(first, (r,), (g,))
+    h = 1e-5
+    np.testing.assert_allclose(second, (first(r + h * g) - first(r - h * g)) / (2 * h), atol=1e-8)
+
+
+def test_wahba_against_scipy_and_two_vectors():
+    """Noisy and exact, weighted; two directions are enough; also when the noise mirrors."""
+    rng = np.random.default_rng(2)
+    for n in (2, 3, 20):
+        m = Rotation.random(random_state=rng).as_matrix()
+        body, w = rng.normal(size=(n, 3)), rng.uniform(0.5, 2, n)
+        world = body @ m.T
+        np.testing.assert_allclose(so3.wahba(body, world), m, atol=1e-14)
+        noisy = world + 0.2 * rng.normal(size=(n, 3))
+        want = Rotation.align_vectors(noisy, body, weights=w)[0].as_matrix()
+        np.testing.assert_allclose(so3.wahba(body, noisy, w), want, atol=1e-13)
+    mirrored = np.diag([3.0, 2.0, -1.0])
+    np.testing.assert_allclose(so3.wahba(np.eye(3), mirrored), np.eye(3), atol=1e-15)
+    body = np.array([[1.0, 0, 0], [1.0, 1e-3, 0]])
+    np.testing.assert_allclose(so3.wahba(body, body @ m.T), m, atol=1e-11)
+
+
+def test_wahba_derivative():
+    """Turning all world directions turns the answer; a general direction by differences."""
+    rng = np.random.default_rng(3)
+    body, d = rng.normal(size=(2, 5, 3))
+    world = body @ Rotation.random(random_state=rng).as_matrix().T + 0.1 * d
+    f = jax.jit(lambda w: so3.wahba(body, w))
+    m = f(world)
+
+    def turned(v):
+        return so3.log(so3.product(f(world @ so3.exp(v).T), m.T))
+
+    np.testing.assert_allclose(jax.jacrev(turned)(jnp.zeros(3)), np.eye(3), atol=1e-13)
+    h = 1e-6
+    _, slope = jax.jvp(f, (jnp.asarray(world),), (jnp.asarray(d),))
+    np.testing.assert_allclose(slope, (f(world + h * d) - f(world - h * d)) / (2 * h), atol=1e-8)
+
+
+@pytest.mark.parametrize("body", [[[1.0, 2.0, 3.0]], [[1.0, 2.0, 3.0], [-2.0, -4.0, -6.0]]])
+def test_wahba_refuses_a_free_turn(body, unhooked):
+    body = np.array(body)
+    with pytest.raises(ValueError, match="do not fix the attitude"):
+        so3.wahba(body, body)
+    with pytest.raises(RuntimeError, match="do not fix the attitude"):
+        jax.block_until_ready(jax.jit(so3.wahba)(body, body))
+
+
+@pytest.mark.parametrize("off", [2.0, 1e-3, 1e-8, 1e-12, 1e-15, 0.0])
+def test_alignment(off):
+    """Also of nearly and exactly opposite directions: R a = b, orthogonal, least angle."""
+    rng = np.random.default_rng(4)
+    for a in (*np.eye(3), *rng.normal(size=(4, 3))):
+        a = a / np.linalg.norm(a)
+        b = -a + off * rng.normal(size=3)
+        b = b / np.linalg.norm(b)
+        m = np.asarray(so3.align(3 * a, 0.1 * b))
+        np.testing.assert_allclose(m @ a, b, atol=1e-15)
+        np.testing.assert_allclose(m.T @ m, np.eye(3), atol=2e-15)
+        angle = 2 * np.arctan2(np.linalg.norm(a - b), np.linalg.norm(a + b))
+        np.testing.assert_allclose(so3.distance(np.eye(3), m), angle, atol=2e-15)
+    # Smooth where a = b: da across a turns by a × da.
+    slope = jax.jacfwd(lambda b: so3.log(so3.align(jnp.array([0, 0, 1.0]), b)))(
+        jnp.array([0, 0, 1.0])
+    )
+    np.testing.assert_allclose(slope, so3.hat(jnp.array([0, 0, 1.0])), atol=1e-15)
+
+
+def test_karcher_mean():
+    """The residual vanishes; equivariant; first and second derivatives by differences."""
+    rng = np.random.default_rng(5)
+    v, w = 0.6 * rng.normal(size=(6, 3)), rng.uniform(0.5, 2, 6)
+    f = jax.jit(lambda v, w: so3.mean(jax.vmap(so3.exp)(v), w))
+    m = f(v, w)
+    residual = sum(a * so3.log(so3.product(m.T, so3.exp(x))) for a, x in zip(w, v, strict=True))
+    np.testing.assert_allclose(residual, np.zeros(3), atol=1e-14)
+    g = so3.exp(jnp.array([1.0, 2.0, -1.0]))
+    moved = so3.mean(jax.vmap(lambda x: so3.product(g, so3.exp(x)))(v), w)
+    np.testing.assert_allclose(moved, so3.product(g, m), atol=1e-14)
+    both_signs = jax.vmap(quaternion.exp)(v) * np.array([1.0, -1, 1, -1, -1, 1])[:, None]
+    np.testing.assert_allclose(
+        quaternion.to_matrix(so3.mean_quaternion(both_signs, w)), m, atol=1e-14
+    )
+
+    # Two rotations: the middle of the geodesic, whose derivative in an end is known at equality.
+    def ends(x):
+        return so3.log(so3.mean(jnp.stack([jnp.eye(3), so3.exp(x)])))
+
+    np.testing.assert_allclose(jax.jacfwd(ends)(jnp.zeros(3)), 0.5 * np.eye(3), atol=1e-15)
+
+
+@pytest.mark.slow
+def test_derivatives_of_the_karcher_mean():
+    """First and second, by central differences (minutes to compile)."""
+    rng = np.random.default_rng(6)
+    v, w, e = 0.6 * rng.normal(size=(4, 3)), rng.uniform(0.5, 2, 4), rng.normal(size=(4, 3))
+    f = jax.jit(lambda v: so3.mean(jax.vmap(so3.exp)(v), w))
+    h = 1e-5
+    first = jax.jit(lambda v: jax.jvp(f, (v,), (e,))[1])
+    np.testing.assert_allclose(first(v), (f(v + h * e) - f(v - h * e)) / (2 * h), atol=1e-9)
+    _, second = jax.jvp(first, (v,), (e,))
+    np.testing.assert_allclose(second, (first(v + h * e) - first(v - h * e)) / (2 * h), atol=1e-8)
