@@ -63,6 +63,7 @@ def fit(found: Any, *, time_unit: str = "s", rate_unit: str = "rad/s", title: st
             lower.plot(t[seen] / seconds, left[seen, axis], color=colour, alpha=0.7, **mark)
         lower.axhline(0, color="0.6", lw=0.8)
         lower.set_xlabel(f"time, {time_unit}")
+        upper.margins(x=0.02, y=0.2)
         upper.legend(loc="upper right", ncols=3, fontsize="small")
         upper.set_title(f"{type(reading.sensor).__name__}: points read, lines fitted", fontsize=10)
     if title:

@@ -249,12 +249,16 @@ def _assess(
 ) -> Fit:
     covariance, singular, null = uncertainty.covariance(problem, value, noise)
     chi2, dof, believable = uncertainty.goodness(problem, value, noise)
+    # Ten units of log-likelihood: a point further above the best is e¹⁰ times less likely. Where the
+    # noise is estimated from the best point, its cost is half the number of readings.
+    margin = 10.0
+    if any(r.sensor.noise is None for r in problem.recording.readings):
+        margin *= 2 * best_cost / problem.recording.size
     starts = []
     for parameters, cost, converged in tried:
-        same = cost <= best_cost * (1 + 1e-6) + 1e-9
-        fits = believable if same else uncertainty.goodness(problem, parameters, noise)[2]
+        fits = believable and cost <= best_cost + margin
         starts.append(Start(parameters, cost, converged, fits))
-    rivals = [s for s in starts if s.fits and s.converged and s.cost > best_cost * 1.01 + 1e-6]
+    rivals = [s for s in starts if s.fits and s.converged and s.cost > best_cost + 0.01 * margin]
     if not np.isfinite(best_cost):
         status = "failed: no start gave a finite misfit"
     elif not believable:

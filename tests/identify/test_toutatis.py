@@ -22,8 +22,13 @@ def test_fit_is_as_close_as_the_published_one(found):
 def test_periods_and_pole_are_the_published_ones(found):
     rows = {name: (value, low, high) for name, value, low, high, _ in toutatis.rows(found)}
     # Hudson and Ostro 1995: 5.41 days about the long axis, 7.35 days of precession.
-    assert abs(rows["rotation about the long axis"][0] - 5.41) < 0.05
-    assert abs(rows["precession of the long axis"][0] - 7.35) < 0.05
+    for name, published in (
+        ("rotation about the long axis", 5.41),
+        ("precession of the long axis", 7.35),
+    ):
+        value, low, high = rows[name]
+        assert low < published < high
+        assert abs(value - published) < 0.1
     # Takahashi et al. 2013: ratios 3.0836 and 3.235 about the long axis, up to their definition.
     bounds = found.interval(0.95)
     assert bounds["Ix/Iz"][0] < 3.0836 < bounds["Ix/Iz"][1]
@@ -61,3 +66,30 @@ def test_one_outlying_observation_does_not_move_the_result(found):
     for name, a, b in zip(found.problem.body.ratio_names, middle, shifted, strict=True):
         low, high = found.interval(0.95)[name]
         assert abs(a - b) < 0.25 * (high - low) / 2
+
+
+@pytest.mark.slow
+def test_intervals_hold_the_truth_in_ninety_of_a_hundred_records(found):
+    problem, rng = toutatis.problem(), np.random.default_rng(0)
+    motion = problem.motion(found.parameters)
+    attitude, gyro = (reading.sensor for reading in problem.recording.readings)
+    truth = np.concatenate(
+        [np.exp(np.asarray(problem.body.log_ratios(found.body))), np.asarray(found.state0.omega)]
+    )
+    held = np.zeros(5)
+    for number in range(100):
+        turns = jnp.asarray(np.radians(15.0) * rng.normal(size=(17, 3)))
+        read = jax.vmap(lambda q, e: rj.quaternion.multiply(q, rj.quaternion.exp(e)))(
+            motion.q, turns
+        )
+        rates = motion.omega + np.radians(10.0) / 86400 * rng.normal(size=(17, 3))
+        record = rj.identify.Recording(problem.recording.t, (attitude, read), (gyro, rates))
+        again = rj.identify.fit(
+            rj.identify.Problem(record, problem.body, loss=problem.loss),
+            starts=16,
+            key=jax.random.key(number),
+        )
+        assert again.ok
+        bounds = np.array(list(again.interval(0.95).values()))
+        held += (bounds[:, 0] <= truth) & (truth <= bounds[:, 1])
+    assert (held >= 90).all(), held
