@@ -73,7 +73,7 @@ def stacked(u, m, m1):
 def check(dtype, u, m1, got, orders, bound):
     """Errors, in units of round-off × (size + change when u or m1 moves relatively by one)."""
     eps, step = float(np.finfo(dtype).eps), mp.mpf(10) ** -8
-    with mp.workdps(90):
+    with mp.workdps(130):
         for i in range(len(u)):
             x, b = mp.mpf(float(u[i])), mp.mpf(float(m1[i]))
             tables = [derivatives(x, b), derivatives(x * (1 + step), b)]
@@ -108,8 +108,8 @@ def test_values_over_eight_quarter_periods_up_to_the_separatrix(dtype):
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 def test_first_and_second_derivatives(dtype):
     # In float32 the second derivatives leave the range below 1e-16.
-    m1s = (0.3, 1.0, 3.0, 0.0, 1e-3, 1e-10, 1e-16) + ((1e-30,) if dtype == np.float64 else ())
-    u, m1, m = points(dtype, m1s, (1e-3, 0.41, 1.0, 1.2, -5.1))
+    m1s = (0.3, 1.0, 0.0, 1e-10) + ((1e-30,) if dtype == np.float64 else (1e-16,))
+    u, m1, m = points(dtype, m1s, (1e-3, 0.41, 1.2, -5.1))
 
     def everything(u, m1, m):
         value = stacked(u, m, m1)
