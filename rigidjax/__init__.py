@@ -6,6 +6,7 @@ turns), `exact` and `solve` (answers), `identify` and `plot` (uses). `simulate` 
 
 from rigidjax import (
     exact as exact,
+    frames as frames,
     identify as identify,
     plot as plot,
 )
@@ -22,7 +23,9 @@ from rigidjax.body import (
     parameters as parameters,
     shapes as shapes,
     spatial_angular_momentum as spatial_angular_momentum,
+    volumes as volumes,
 )
+from rigidjax.frames import Point as Point, scenes as scenes
 from rigidjax.motion import (
     Attitude as Attitude,
     AttitudeEquations as AttitudeEquations,
@@ -30,9 +33,16 @@ from rigidjax.motion import (
     NewtonEuler as NewtonEuler,
     Rigid as Rigid,
     Spin as Spin,
+    lagrangian as lagrangian,
     torques as torques,
 )
-from rigidjax.rotation import euler as euler, quaternion as quaternion, so3 as so3
+from rigidjax.rotation import (
+    euler as euler,
+    mrp as mrp,
+    quaternion as quaternion,
+    rodrigues as rodrigues,
+    so3 as so3,
+)
 from rigidjax.solve import (
     Projected as Projected,
     Solution as Solution,
@@ -40,5 +50,6 @@ from rigidjax.solve import (
     simulate as simulate,
     solvers as solvers,
 )
+from rigidjax.special import elliptic as elliptic
 
 __version__ = "0.1.0"
