@@ -21,7 +21,7 @@ from rigidjax.exact.fence import fence, opaque_one
 from rigidjax.exact.first_order import jacobian_and_integral
 from rigidjax.exact.principal_flow import momentum_and_turn, orbit
 from rigidjax.exact.tensor_flow import Differences
-from rigidjax.exact.triples import Four, Six, Triple, cross, half_product, times, turned_back
+from rigidjax.exact.triples import Four, Six, Triple, adjugate, cross, determinant, half_product, times, turned_back
 
 # Below this turn (rad) the Taylor series, of this order, is right to round-off; above, what the
 # quotient by h² loses is round-off/turn in a first and round-off/turn² in a second derivative.
@@ -99,10 +99,8 @@ def _first_order_of_tensor(body, momentum, t):
 def reciprocal(moments: Six, momentum: Triple):
     """Differences of K = I⁻¹, K itself and E₂ = Π·KΠ."""
     i1, i2, i3, i12, i13, i23 = moments
-    c11, c22, c33 = i2 * i3 - i23 * i23, i1 * i3 - i13 * i13, i1 * i2 - i12 * i12
-    c12, c13, c23 = i13 * i23 - i12 * i3, i12 * i23 - i13 * i2, i12 * i13 - i23 * i1
-    r = 1.0 / (i1 * c11 + i12 * c12 + i13 * c13)
-    k = (c11 * r, c22 * r, c33 * r, c12 * r, c13 * r, c23 * r)
+    r = 1.0 / determinant(moments)
+    k = tuple(c * r for c in adjugate(moments))
     body = Differences(
         ((i2 - i1) * i3 + (i13 * i13 - i23 * i23)) * r,
         ((i3 - i1) * i2 + (i12 * i12 - i23 * i23)) * r,
