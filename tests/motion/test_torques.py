@@ -242,6 +242,21 @@ def test_float32_states_stay_float32(law):
     np.testing.assert_allclose(found.omega, exact.omega, rtol=3e-6, atol=3e-6)
 
 
+@pytest.mark.parametrize(
+    ("law", "state"),
+    [
+        (torques.Sum(TOP, GRADIENT, DIPOLE, WHEEL, SPRING, torques.Flywheel(TABLE)), ATTITUDE),
+        (torques.Sum(CENTRE, FALL, torques.Drag(0.7, [0.1, 0.2, -0.3])), RIGID),
+    ],
+)
+def test_the_equations_are_elementwise(law, state):
+    """No matrix product: its gradient is slow on CPU, and GPUs round it to ten bits."""
+    rigid = isinstance(state, rj.Rigid)
+    field = rj.NewtonEuler(BODY, law) if rigid else rj.AttitudeEquations(INERTIA, law)
+    text = str(jax.make_jaxpr(lambda y: field(0.5, y))(state))
+    assert "dot_general" not in text and "while" not in text and "cross" not in text
+
+
 @pytest.mark.parametrize("rows", [5, 300])
 def test_tables_against_numpy(rows):
     rng = np.random.default_rng(rows)
@@ -315,7 +330,12 @@ def test_energy_adds_up():
         (lambda: torques.Tabulated([0.0, np.nan], np.ones((2, 3))), "times: contains NaN.*index"),
         (lambda: torques.Linear([0.0], np.ones((1, 3))), "wanted at least 2 times"),
         (lambda: torques.Sum(), "at least one torque"),
-        (lambda: torques.Sum([TOP, WHEEL]), r"not Sum\(\[a, b\]\)"),
+        (lambda: torques.Sum([TOP, WHEEL]), r"got list; several go in a Sum: Sum\(a, b\)"),
+        (lambda: torques.Sum(TOP, torques.Damping), r"got the class Damping, wanted one.*Damping\(\.\.\.\)"),
+        (lambda: torques.require_rung([TOP], ATTITUDE), r"torque: wanted a torque.*got list"),
+        (lambda: torques.require_rung(torques.Damping, SPIN), "torque: got the class Damping"),
+        (lambda: torques.Damping([1.0, np.nan, 1.0]), "coefficient: contains NaN"),
+        (lambda: torques.GravityGradient(1.0, np.zeros(3)), "position: .*got zero"),
         (lambda: torques.FromPotential(3.0), "wanted a callable q → U, got float"),
         (lambda: torques.require_rung(TOP, SPIN), "HeavyTop needs a state with HasAttitude.*climb"),
         (lambda: torques.require_rung(torques.Sum(WHEEL, TOP), SPIN), "Sum needs.*HasAttitude"),

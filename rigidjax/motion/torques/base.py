@@ -7,10 +7,12 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from rigidjax import _checks
 from rigidjax._types import HasAttitude, HasPose, HasSpin, Scalar, ScalarLike, Vec3, Vec3Like
+from rigidjax.body import physical
 from rigidjax.body.hints import Vector
 from rigidjax.body.inertia import Inertia, MassProperties
 
@@ -80,12 +82,45 @@ Torque = AbstractTorque | AbstractForce | Callable[[Any, Any, Any], Any]
 LADDER = (HasSpin, HasAttitude, HasPose)
 
 
+def given(value: Any, shape: tuple[int, ...], name: str, *, hint: str = "") -> Array:
+    """A law's number or vector, its shape checked, and that it is finite where it is known.
+
+    >>> given([1.0, 2.0, 3.0], (3,), "torque").shape
+    (3,)
+    """
+    array = _checks.floating(value, shape, name, hint=hint)
+    # NumPy: inside a trace a check with jax would become part of the program.
+    if physical.known(array) and not np.isfinite(np.asarray(array)).all():
+        raise ValueError(f"{name}: contains NaN or infinity, got {np.asarray(array)}")
+    return array
+
+
+def require_law(torque: object, name: str = "torque") -> None:
+    """Raise `TypeError` unless `torque` is something that can be called for its value.
+
+    >>> require_law(lambda t, state, body: -state.omega)
+    """
+    if isinstance(torque, type):
+        raise TypeError(
+            f"{name}: got the class {torque.__name__}, wanted one made from it: "
+            f"{torque.__name__}(...)"
+        )
+    if not callable(torque):
+        several = isinstance(torque, list | tuple)
+        advice = "; several go in a Sum: Sum(a, b)" if several else ""
+        raise TypeError(
+            f"{name}: wanted a torque or force of rigidjax.torques, or a callable (t, state, "
+            f"body), got {type(torque).__name__}{advice}"
+        )
+
+
 def require_rung(torque: Torque, state: object) -> None:
-    """Raise `TypeError` unless `state` has what `torque` feels.
+    """Raise `TypeError` unless `torque` is a law and `state` has what it feels.
 
     >>> from rigidjax import Spin
     >>> require_rung(lambda t, state, body: -state.omega, Spin([0.0, 0, 1]))
     """
+    require_law(torque)
     feels = getattr(torque, "feels", None)
     if feels is not None and not isinstance(state, feels):
         raise TypeError(
@@ -180,7 +215,7 @@ def stays(source: Any) -> Vec3 | None:
 
 def constant_or_callable(source: Any, name: str) -> Any:
     """`source` as it is if it can be called with a time; otherwise as a vector (3,)."""
-    return source if callable(source) else _checks.floating(source, (3,), name)
+    return source if callable(source) else given(source, (3,), name)
 
 
 def jumps_of(source: object) -> Float[Array, " n"]:

@@ -10,7 +10,15 @@ from jaxtyping import Array, Float
 
 from rigidjax import _checks
 from rigidjax._types import HasAttitude, Scalar, ScalarLike, Vec3
-from rigidjax.motion.torques.base import LADDER, AbstractTorque, Torque, Wrench, act, jumps_of
+from rigidjax.motion.torques.base import (
+    LADDER,
+    AbstractTorque,
+    Torque,
+    Wrench,
+    act,
+    jumps_of,
+    require_law,
+)
 
 
 class Sum(eqx.Module):
@@ -31,11 +39,7 @@ class Sum(eqx.Module):
         if not parts:
             raise ValueError("Sum: wanted at least one torque; for a free body give torque=None")
         for part in parts:
-            if not callable(part):
-                advice = (
-                    "; write Sum(a, b), not Sum([a, b])" if isinstance(part, list | tuple) else ""
-                )
-                raise TypeError(f"Sum: wanted torques, got {type(part).__name__}{advice}")
+            require_law(part, "Sum")
         self.parts = parts
 
     @property

@@ -5,10 +5,15 @@ from typing import ClassVar
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from rigidjax import _checks
 from rigidjax._types import HasAttitude, HasSpin, ScalarLike, Vec3
 from rigidjax.body.hints import Vector
-from rigidjax.motion.torques.base import AbstractTorque, constant_or_callable, jumps_of, vector_at
+from rigidjax.motion.torques.base import (
+    AbstractTorque,
+    constant_or_callable,
+    given,
+    jumps_of,
+    vector_at,
+)
 from rigidjax.rotation import quaternion
 
 
@@ -28,7 +33,7 @@ class ConstantTorque(AbstractTorque):
     torque: Float[Array, "3"]
 
     def __init__(self, torque: Vector):
-        self.torque = _checks.floating(torque, (3,), "torque")
+        self.torque = given(torque, (3,), "torque")
 
     @property
     def steady(self) -> bool:

@@ -4,10 +4,9 @@ from typing import ClassVar
 
 from jaxtyping import Array, Float
 
-from rigidjax import _checks
 from rigidjax._types import HasSpin, ScalarLike, Vec3
 from rigidjax.body.hints import Vector
-from rigidjax.motion.torques.base import AbstractTorque, length_or_zero
+from rigidjax.motion.torques.base import AbstractTorque, given, length_or_zero
 
 
 class Damping(AbstractTorque):
@@ -27,7 +26,7 @@ class Damping(AbstractTorque):
     coefficient: Float[Array, "3"]
 
     def __init__(self, coefficient: Vector):
-        self.coefficient = _checks.floating(
+        self.coefficient = given(
             coefficient, (3,), "coefficient", hint="one number for each body axis"
         )
 
@@ -59,7 +58,7 @@ class QuadraticDamping(AbstractTorque):
     coefficient: Float[Array, "3"]
 
     def __init__(self, coefficient: Vector):
-        self.coefficient = _checks.floating(
+        self.coefficient = given(
             coefficient, (3,), "coefficient", hint="one number for each body axis"
         )
 

@@ -5,11 +5,10 @@ from typing import ClassVar
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from rigidjax import _checks
 from rigidjax._types import HasPose, Scalar, ScalarLike, Vec3
 from rigidjax.body.hints import Vector
 from rigidjax.body.inertia import MassProperties
-from rigidjax.motion.torques.base import AbstractForce, Wrench, length_or_zero
+from rigidjax.motion.torques.base import AbstractForce, Wrench, given, length_or_zero
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.algebra import apply, cross, dot
 
@@ -31,7 +30,7 @@ class UniformGravity(AbstractForce):
     gravity: Float[Array, "3"]
 
     def __init__(self, gravity: Vector):
-        self.gravity = _checks.floating(
+        self.gravity = given(
             gravity, (3,), "gravity", hint="a vector in world axes, such as [0, 0, -9.81]"
         )
 
@@ -70,7 +69,7 @@ class CentralGravity(AbstractForce):
     mu: Float[Array, ""]
 
     def __init__(self, mu: ScalarLike):
-        self.mu = _checks.floating(mu, (), "mu")
+        self.mu = given(mu, (), "mu")
 
     @property
     def steady(self) -> bool:
@@ -125,9 +124,9 @@ class Drag(AbstractForce):
         centre: Vector = (0.0, 0.0, 0.0),
         wind: Vector = (0.0, 0.0, 0.0),
     ):
-        self.coefficient = _checks.floating(coefficient, (), "coefficient")
-        self.centre = _checks.floating(centre, (3,), "centre")
-        self.wind = _checks.floating(wind, (3,), "wind")
+        self.coefficient = given(coefficient, (), "coefficient")
+        self.centre = given(centre, (3,), "centre")
+        self.wind = given(wind, (3,), "wind")
 
     @property
     def steady(self) -> bool:

@@ -1,18 +1,20 @@
 """Gravity on what only turns: a heavy top about its fixed point, and the gradient of a far body."""
 
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from rigidjax import _checks
 from rigidjax._types import HasAttitude, HasPose, Scalar, ScalarLike, Vec3
+from rigidjax.body import physical
 from rigidjax.body.hints import Vector
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.motion.torques.base import (
     AbstractTorque,
     constant_or_callable,
+    given,
     jumps_of,
     stays,
     tensor_of,
@@ -48,9 +50,9 @@ class HeavyTop(AbstractTorque):
     gravity: Float[Array, "3"]
 
     def __init__(self, mass: ScalarLike, com: Vector, gravity: Vector):
-        self.mass = _checks.floating(mass, (), "mass")
-        self.com = _checks.floating(com, (3,), "com")
-        self.gravity = _checks.floating(
+        self.mass = given(mass, (), "mass")
+        self.com = given(com, (3,), "com")
+        self.gravity = given(
             gravity, (3,), "gravity", hint="a vector in world axes, such as [0, 0, -9.81]"
         )
 
@@ -89,7 +91,7 @@ class GravityGradient(AbstractTorque):
     not changed by it. Source: Hughes, Spacecraft Attitude Dynamics, §8.1; Goldstein, Poole and
     Safko, Classical Mechanics, eq 5.86.
 
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
+    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype; `ValueError` for no distance.
 
     >>> GravityGradient(3.986e14, [7.0e6, 0.0, 0.0]).feels.__name__
     'HasAttitude'
@@ -100,8 +102,13 @@ class GravityGradient(AbstractTorque):
     position: eqx.Module | Float[Array, "3"]
 
     def __init__(self, mu: ScalarLike, position: object):
-        self.mu = _checks.floating(mu, (), "mu")
+        self.mu = given(mu, (), "mu")
         self.position = constant_or_callable(position, "position")
+        at: Any = self.position
+        if not callable(at) and physical.known(at) and not np.asarray(at).any():
+            raise ValueError(
+                "position: wanted the vector between the body and the central body, got zero"
+            )
 
     @property
     def steady(self) -> bool:

@@ -5,12 +5,12 @@ from typing import ClassVar
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from rigidjax import _checks
 from rigidjax._types import HasAttitude, Scalar, ScalarLike, Vec3
 from rigidjax.body.hints import Vector
 from rigidjax.motion.torques.base import (
     AbstractTorque,
     constant_or_callable,
+    given,
     jumps_of,
     stays,
     vector_at,
@@ -38,7 +38,7 @@ class MagneticDipole(AbstractTorque):
     field: eqx.Module | Float[Array, "3"]
 
     def __init__(self, moment: Vector, field: object):
-        self.moment = _checks.floating(moment, (3,), "moment")
+        self.moment = given(moment, (3,), "moment")
         self.field = constant_or_callable(field, "field")
 
     @property
