@@ -4,11 +4,11 @@ from typing import Any
 
 import diffrax as dfx
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool
 
+from rigidjax import _checks
 from rigidjax._types import ScalarLike
 
 
@@ -52,7 +52,7 @@ def refuse(ys: Any, hit: Bool[ArrayLike, "..."], stats: dict[str, Any], ts: Any)
     0.0
     """
     advice = "; give throw=False to keep what came before it"
-    if isinstance(hit, jax.core.Tracer):
+    if not _checks.known(hit):
         words = "simulate: the particle collided with one of the scene's bodies" + advice
         return eqx.error_if(ys, hit, words)
     if not np.any(np.asarray(hit)):

@@ -152,7 +152,7 @@ class ThreeBody(AbstractScene):
         return richardson.guess(self.mu, point, None, amplitude)
 
     def periodic_orbit(
-        self, guess: PeriodicOrbit, *, hold: str = "x", tolerance: float = 1e-12
+        self, guess: PeriodicOrbit, *, hold: str = "x", tolerance: float | None = None
     ) -> PeriodicOrbit:
         """The periodic orbit near `guess`, by differentiable correction.
 
@@ -163,7 +163,7 @@ class ThreeBody(AbstractScene):
         **Arguments:** `guess` a `PeriodicOrbit(state, period)` whose state crosses at a right
         angle; `hold` which of `"x"`, `"z"`, `"vy"`, `"period"` stays as guessed: this labels the
         orbit within its family (`"x"` for Lyapunov orbits, `"z"` for halo orbits); `tolerance`
-        largest |y|, |v_x|, |v_z| left at the half period.
+        largest |y|, |v_x|, |v_z| left at the half period, 1e-12 unless given (1e-4 in float32).
 
         **Returns** a `PeriodicOrbit`. Its derivatives with respect to μ and the held number are
         those of the family, by the implicit function theorem, forward and reverse.
@@ -195,10 +195,10 @@ def cr3bp(mu: ScalarLike, radii: Float[Array, "2"] | object = (0.0, 0.0)) -> Thr
     >>> cr3bp(0.5).lagrange_points[3].round(12).tolist()
     [0.0, 0.866025403784, 0.0]
     """
-    mu = _checks.floating(mu, (), "mu")
-    bad = ~((mu > 0) & (mu <= 0.5))
-    mu = _checks.refuse(
-        mu, bad, "mu: wanted 0 < mu ≤ ½, the mass of the lighter body over that of both"
+    ratio = _checks.floating(mu, (), "mu")
+    bad = ~((ratio > 0) & (ratio <= 0.5))
+    ratio = _checks.refuse(
+        ratio, bad, "mu: wanted 0 < mu ≤ ½, the mass of the lighter body over that of both"
     )
     radii = _checks.floating(list(radii) if isinstance(radii, tuple) else radii, (2,), "radii")
-    return ThreeBody(mu, _checks.refuse(radii, ~(radii >= 0), "radii: wanted two numbers ≥ 0"))
+    return ThreeBody(ratio, _checks.refuse(radii, ~(radii >= 0), "radii: wanted two numbers ≥ 0"))

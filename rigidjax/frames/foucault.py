@@ -124,6 +124,6 @@ def foucault(
     [0.0, 0.0, 0.0]
     """
     place = Earth(*checked(latitude, gravity, rate))
-    length = _checks.floating(length, (), "length")
-    length = _checks.refuse(length, ~(length > 0), "length: wanted a positive number, m")
-    return Foucault(place, length.astype(jnp.promote_types(length.dtype, place.rate.dtype)))
+    string = _checks.floating(length, (), "length")
+    string = _checks.refuse(string, ~(string > 0), "length: wanted a positive number, m")
+    return Foucault(place, string.astype(jnp.promote_types(string.dtype, place.rate.dtype)))

@@ -55,7 +55,7 @@ class Hill(AbstractScene):
         return jnp.stack([-place, place])
 
     def periodic_orbit(
-        self, guess: PeriodicOrbit, *, hold: str = "x", tolerance: float = 1e-12
+        self, guess: PeriodicOrbit, *, hold: str = "x", tolerance: float | None = None
     ) -> PeriodicOrbit:
         """The symmetric periodic orbit near `guess`: as `ThreeBody.periodic_orbit`."""
         return periodic.correct(self, guess, hold, tolerance)

@@ -48,7 +48,7 @@ def distances(mu: Scalar) -> tuple[Scalar, Scalar, Scalar]:
 def _root(coefficients: list[Scalar], start: Scalar) -> Scalar:
     """Newton's root of a polynomial, highest power first; the start is near for every μ."""
 
-    def step(_: int, x: Scalar) -> Scalar:
+    def step(_: object, x: Scalar) -> Scalar:
         value, slope = coefficients[0], jnp.zeros_like(x)
         for c in coefficients[1:]:
             value, slope = value * x + c, slope * x + value

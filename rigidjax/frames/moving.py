@@ -183,11 +183,11 @@ class MovingFrame(eqx.Module):
 
     def force_from_inertial(self, force: Vector, t: ScalarLike) -> Vec3:
         """Force f = MᵀF (3,): a force, or any direction, in the axes of S' (notes, eq 91)."""
-        return algebra.apply(self.matrix(t).T, force)
+        return algebra.apply(self.matrix(t).T, _checks.floating(force, (3,), "force"))
 
     def force_to_inertial(self, force: Vector, t: ScalarLike) -> Vec3:
         """Force F = M f (3,): a force, or any direction, in the axes of S (notes, eq 85)."""
-        return algebra.apply(self.matrix(t), force)
+        return algebra.apply(self.matrix(t), _checks.floating(force, (3,), "force"))
 
     def jacobi_integral(self, state: Any, t: ScalarLike, potential: ScalarLike = 0.0) -> Scalar:
         """½|v'|² − ½|Ω × x'|² + V, m²/s²: kept where Ω and V(x') do not depend on time.

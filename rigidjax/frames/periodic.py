@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from rigidjax import _checks
@@ -36,14 +37,16 @@ class PeriodicOrbit(eqx.Module):
         self.period = period.astype(state.x.dtype)
 
 
-def correct(scene: Any, guess: PeriodicOrbit, hold: str, tolerance: float) -> PeriodicOrbit:
+def correct(
+    scene: Any, guess: PeriodicOrbit, hold: str, tolerance: float | None = None
+) -> PeriodicOrbit:
     """The orbit near `guess` that crosses y = 0 at right angles twice: see `periodic_orbit`.
 
     **Raises:** `ValueError` (`EquinoxRuntimeError` under `jit`) if Newton does not converge.
 
     >>> from rigidjax.frames import scenes
     >>> hill = scenes.hill()
-    >>> orbit = correct(hill, PeriodicOrbit(Point([0.3, 0, 0], [0.0, 1.6, 0]), 1.2), "x", 1e-11)
+    >>> orbit = correct(hill, PeriodicOrbit(Point([0.3, 0, 0], [0.0, 1.6, 0]), 1.2), "x")
     >>> round(float(orbit.period), 3)
     1.404
     """
@@ -64,16 +67,26 @@ def correct(scene: Any, guess: PeriodicOrbit, hold: str, tolerance: float) -> Pe
     numbers = jnp.stack([x[0], x[2], v[1], 0.5 * guess.period])
     index = _NAMES.index(hold)
     free = np.array([i for i in range(4) if i != index])
+    if tolerance is None:
+        tolerance = 1e-12 if numbers.dtype == jnp.float64 else 1e-4
     unknown, left = _solve(scene, numbers[free], numbers[index], index, tolerance)
     bad = ~(left <= tolerance)
-    said = "" if isinstance(left, jax.core.Tracer) else f" ({float(left):.1e} left at half period)"
+    said = f" ({float(left):.1e} left at half period)" if _checks.known(left) else ""
     unknown = _checks.refuse(
         unknown,
         bad,
-        f"periodic_orbit: Newton's method found no orbit near the guess{said}; start nearer, or "
-        "hold another of x, z, vy, period",
+        f"periodic_orbit: Newton's method found no orbit near the guess{said}; start nearer, "
+        "hold another of x, z, vy, period, or loosen the tolerance",
     )
     x0, z0, vy, half = _together(unknown, numbers[index], index)
+    # A half period of zero solves the equations of every start.
+    ratio = half / numbers[3]
+    half = _checks.refuse(
+        half,
+        ~((ratio > 0.5) & (ratio < 2)),
+        "periodic_orbit: Newton's method slid from the guess to an orbit of less than half or more "
+        "than twice its period; start nearer",
+    )
     zero = jnp.zeros_like(x0)
     return PeriodicOrbit(Point(jnp.stack([x0, zero, z0]), jnp.stack([zero, vy, zero])), 2 * half)
 
@@ -124,33 +137,32 @@ def _corrected_jvp(primals: Any, tangents: Any) -> Any:
     index, tolerance, scene, unknown, held = primals
     _, _, scene_dot, _, held_dot = tangents
     found, left = _corrected(index, tolerance, scene, unknown, held)
-    slope = jax.jacfwd(lambda u: _miss(scene, u, held, index))(found)
-    # ∂(miss)/∂(scene, held) as a matrix, so that the rule stays linear and can be transposed.
-    leaves, tree = jax.tree.flatten(eqx.filter(scene, eqx.is_inexact_array))
-    rest = eqx.filter(scene, eqx.is_inexact_array, inverse=True)
-    sizes = [leaf.size for leaf in leaves]
-    flat = jnp.concatenate([*[leaf.reshape(-1) for leaf in leaves], held.reshape(1)])
+    # All derivatives of the miss as one matrix, so that the rule stays linear in the tangents and
+    # can be transposed.
+    numbers, rest = eqx.partition(scene, eqx.is_inexact_array)
+    leaves, tree = jax.tree.flatten(numbers)
+    flat, unflatten = ravel_pytree((leaves, held, found))
 
-    def of_numbers(flat: Array) -> Array:
-        parts = jnp.split(flat[:-1], np.cumsum(sizes)[:-1]) if leaves else []
-        made = [p.reshape(leaf.shape) for p, leaf in zip(parts, leaves, strict=True)]
-        return _miss(eqx.combine(jax.tree.unflatten(tree, made), rest), found, flat[-1], index)
+    def miss(flat: Array) -> Array:
+        leaves, held, unknown = unflatten(flat)
+        return _miss(eqx.combine(jax.tree.unflatten(tree, leaves), rest), unknown, held, index)
 
-    matrix = -jnp.linalg.solve(slope, jax.jacfwd(of_numbers)(flat))
-    dots = jax.tree.flatten(scene_dot, is_leaf=lambda leaf: leaf is None)[0]
-    total = jnp.zeros_like(found)
-    columns = jnp.split(matrix, np.cumsum(sizes), axis=1)
-    wanted = [leaf for leaf in jax.tree.leaves(scene) if True]
-    position = 0
-    for leaf, dot in zip(wanted, dots, strict=True):
-        if not eqx.is_inexact_array(leaf):
-            continue
-        if dot is not None:
-            total = total + jnp.sum(columns[position] * dot.reshape(1, -1), axis=1)
-        position += 1
-    if held_dot is not None:
-        total = total + columns[-1][:, 0] * held_dot
+    matrix = jax.jacfwd(miss)(flat)
+    dots = [
+        jnp.zeros_like(leaf) if dot is None else dot
+        for leaf, dot in zip(leaves, _tangents(numbers, scene_dot), strict=True)
+    ]
+    held_dot = jnp.zeros_like(held) if held_dot is None else held_dot
+    pushed, _ = ravel_pytree((dots, held_dot))
+    moved = jnp.sum(matrix[:, :-3] * pushed[None], axis=1)
+    total = -jnp.linalg.solve(matrix[:, -3:], moved)
     return (found, left), (total, jnp.zeros_like(left))
+
+
+def _tangents(numbers: Any, dots: Any) -> list[Any]:
+    """The tangents that belong to the leaves of `numbers`; `None` where there is none."""
+    paths = {path: leaf for path, leaf in jax.tree.leaves_with_path(dots) if leaf is not None}
+    return [paths.get(path) for path, _ in jax.tree.leaves_with_path(numbers)]
 
 
 def _value_and_jacobian(f: Any, x: Array) -> tuple[Array, Array]:

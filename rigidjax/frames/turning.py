@@ -79,7 +79,7 @@ def matrix(rotation: Any, t: Array) -> Mat3:
         q = _checks.floating(value, (4,), "rotation").astype(t.dtype)
         return quaternion.to_matrix(quaternion.normalise(q))
     m = _checks.floating(value, (3, 3), "rotation", hint="wanted a matrix or a quaternion (4,)")
-    if not isinstance(m, jax.core.Tracer):
+    if _checks.known(m):
         tolerance = 1e-6 if m.dtype == jnp.float64 else 1e-3
         off = jnp.max(jnp.abs(algebra.product(m.T, m) - jnp.eye(3, dtype=m.dtype)))
         _checks.refuse(m, ~(off < tolerance), "rotation: Mᵀ M is not 1, so this is no rotation")

@@ -92,7 +92,7 @@ def _solve(
     if isinstance(setup, _Free):
         return _free(setup.body, state0, ts)
     field = equations_of_motion(setup.body, state0, setup.torque)
-    scene = scene_of(setup.torque) if isinstance(state0, Point) else None
+    scene: Any = scene_of(setup.torque) if isinstance(state0, Point) else None
     watch = collision.event(scene)
     saveat = dfx.SaveAt(ts=ts)
     if watch is not None:
@@ -116,7 +116,8 @@ def _solve(
     ys: Any = out.ys
     if scene is not None:
         if watch is not None:
-            (ys, ends), (_, end_times) = ys, out.ts
+            times: Any = out.ts
+            (ys, ends), (_, end_times) = ys, times
             end = jax.tree.map(lambda leaf: leaf[0], ends)
             stats["end_time"] = end_times[0]
             stats["end_distances"] = scene.approach(end_times[0], end)[0]
@@ -242,11 +243,13 @@ def equations_of_motion(
     require_fit(body, state0, torque)
     if isinstance(state0, Point):
         return scene_of(torque).field
+    matter: Any = body
+    turning: Any = torque
     if isinstance(body, MassProperties):
-        return NewtonEuler(body, torque)
+        return NewtonEuler(body, turning)
     if isinstance(state0, Attitude):
-        return AttitudeEquations(body, torque)
-    return EulerEquations(body, torque)
+        return AttitudeEquations(matter, turning)
+    return EulerEquations(matter, turning)
 
 
 def require_fit(body: Any, state0: Any, torque: Any) -> None:
