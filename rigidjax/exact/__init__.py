@@ -5,3 +5,4 @@ from rigidjax.exact.periods import (
     body_period as body_period,
     precession_period as precession_period,
 )
+from rigidjax.exact.solver import FreeInterpolation as FreeInterpolation, FreeSolver as FreeSolver
