@@ -14,10 +14,12 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from rigidjax.motion import on_the_group
+from rigidjax.motion import Attitude, AttitudeEquations, on_the_group
+from rigidjax.solve import splitting
 from rigidjax.solve.components import join, split
 from rigidjax.solve.explicit import Atoms, ExplicitSolver, advance, error_estimate
 from rigidjax.solve.scalarise import scalarise
+from rigidjax.solve.splitting import SplittingSolver
 
 # What diffrax.PIDController does unless told: the same steps, so that figures can be compared.
 _SAFETY, _SMALLEST, _LARGEST = 0.9, 0.2, 10.0
@@ -202,6 +204,38 @@ def _first_step(field: Any, order: int, t0: Array, y0: Any, rtol: Any, atol: Any
     flat = largest <= 1e-15
     guess = (0.01 / jnp.where(flat, 1.0, largest)) ** (1 / order)
     return jnp.minimum(100 * h, jnp.where(flat, jnp.maximum(1e-6, 1e-3 * h), guess))
+
+
+def split_fixed(
+    solver: SplittingSolver, field: AttitudeEquations, ts: Array, y0: Attitude, substeps: Any
+) -> Attitude:
+    """As `fixed`, with a splitting; the loop carries the momentum in principal axes.
+
+    No step goes through Ω = I⁻¹Π and back, so that |Π| drifts by round-off of the flow alone.
+    **Raises** as the splitting.
+
+    >>> import rigidjax as rj
+    >>> field = rj.AttitudeEquations(rj.Inertia.from_principal(1.0, 2.0, 3.0))
+    >>> start = rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 1])
+    >>> split_fixed(rj.solvers.Splitting4(), field, jnp.array([0.0, 1.0]), start, 8).q[1, 3]
+    Array(0.47942554, dtype=float64)
+    """
+    frame = splitting.frame_of(field, ts[0], y0)
+
+    def span(state: Any, ends: tuple[Array, Array]) -> tuple[Any, Attitude]:
+        left, right = ends
+        h = (right - left) / jnp.asarray(substeps, left.dtype)
+
+        def one(i: Array, state: Any) -> Any:
+            t = left + i.astype(h.dtype) * h
+            return splitting.compose(solver.composition, field, frame, t, h, state)
+
+        q, momentum = state = lax.fori_loop(0, substeps, one, state)
+        return state, Attitude(q, splitting.leave(frame, momentum))
+
+    start = (y0.q, splitting.enter(frame, y0.omega))
+    _, rest = lax.scan(span, start, (ts[:-1], ts[1:]))
+    return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), y0, rest)
 
 
 def _stacked(start: Atoms, rest: Atoms, like: Any) -> Any:

@@ -5,3 +5,8 @@ from rigidjax.solve.explicit import (
     RungeKutta4 as RungeKutta4,
     Tsitouras5 as Tsitouras5,
 )
+from rigidjax.solve.splitting import (
+    Splitting2 as Splitting2,
+    Splitting4 as Splitting4,
+    Splitting6 as Splitting6,
+)

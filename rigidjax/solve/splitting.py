@@ -1,0 +1,304 @@
+"""Splittings on the exact free flow: free motion in closed form, torque as kicks of momentum.
+
+`A` is the free body (`rigidjax.exact`), `B` the kick `Π ← Π + c h τ(t, q)` at a fixed attitude; a
+step is `B(b1) A(a1) B(b2) … A(a1) B(b1)`, symmetric, so that it also runs back onto itself. Each
+part is an exact flow of its own Hamiltonian: the energy's error stays bounded for as long as the
+steps are equal, and a torque-free scene costs one formula and no error at all.
+"""
+
+from typing import Any, ClassVar, NamedTuple
+
+import diffrax as dfx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jax.extend import core
+from jaxtyping import Array
+
+from rigidjax.exact.flow import flow
+from rigidjax.exact.frame import into, out_of, principal_frame
+from rigidjax.exact.triples import times
+from rigidjax.motion import Attitude, AttitudeEquations
+from rigidjax.motion.torques import evaluate
+from rigidjax.rotation import quaternion
+from rigidjax.solve.explicit import NestedInterpolation
+
+Triple = tuple[Array, Array, Array]
+
+
+class Composition(NamedTuple):
+    """A symmetric composition `B(b1) A(a1) … B(b1)`: its order, and the weights of A and B."""
+
+    order: int
+    flows: tuple[float, ...]
+    kicks: tuple[float, ...]
+
+
+def _symmetric(order: int, flows: tuple[float, ...], kicks: tuple[float, ...]) -> Composition:
+    """The composition whose first halves these are; the middle weights make the sums 1."""
+    if len(flows) < len(kicks):
+        middle = 1 - 2 * sum(kicks)
+        flows = (*flows, 0.5 - sum(flows))
+        return Composition(order, (*flows, *flows[::-1]), (*kicks, middle, *kicks[::-1]))
+    middle = 1 - 2 * sum(flows)
+    kicks = (*kicks, 0.5 - sum(kicks))
+    return Composition(order, (*flows, middle, *flows[::-1]), (*kicks, *kicks[::-1]))
+
+
+# Strang 1968, doi:10.1137/0705041.
+STRANG = Composition(2, (1.0,), (0.5, 0.5))
+# Blanes and Moan 2002, doi:10.1016/S0377-0427(01)00492-7, methods SRKN6b and SRKN11b. They use that
+# kicks commute with each other's commutators: true here too, as a kick depends on attitude alone.
+SRKN6 = _symmetric(
+    4,
+    (0.245298957184271, 0.604872665711080),
+    (0.0829844064174052, 0.396309801498368, -0.0390563049223486),
+)
+SRKN11 = _symmetric(
+    6,
+    (
+        0.123229775946271,
+        0.290553797799558,
+        -0.127049212625417,
+        -0.246331761062075,
+        0.357208872795928,
+    ),
+    (
+        0.0414649985182624,
+        0.198128671918067,
+        -0.0400061921041533,
+        0.0752539843015807,
+        -0.0115113874206879,
+    ),
+)
+
+
+class Frame(NamedTuple):
+    """What the free flow needs of a body: moments in its principal axes, and those axes."""
+
+    moments: tuple[Array, ...]
+    axes: Array
+
+
+class Splitting2(dfx.AbstractSolver):
+    """Order 2: half a kick, the exact free motion, half a kick (Strang).
+
+    For long runs, equal steps and torques that are small beside the free motion. The torque may
+    depend on time and attitude, not on the body rate. Attitude keeps |q| = 1, and without a torque
+    momentum in space and energy are kept to round-off.
+
+    Use equal steps: an adaptive controller destroys the bounded energy error, and there is no error
+    estimate. Dense output is on the group with the order of the method.
+
+    Source: Strang 1968, doi:10.1137/0705041, with the free flow of `rigidjax.exact.free_body`.
+
+    >>> import diffrax, rigidjax as rj
+    >>> field = rj.AttitudeEquations(rj.Inertia.from_principal(1.0, 2.0, 3.0))
+    >>> start = rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 1])
+    >>> term = diffrax.ODETerm(field)
+    >>> diffrax.diffeqsolve(term, Splitting2(), 0.0, 1.0, 0.5, start).ys.q[0, 3]
+    Array(0.47942554, dtype=float64)
+    """
+
+    term_structure: ClassVar = dfx.ODETerm
+    interpolation_cls: ClassVar = NestedInterpolation
+    composition: ClassVar[Composition] = STRANG
+
+    def order(self, terms: Any) -> int:
+        return self.composition.order
+
+    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> Frame:
+        return frame_of(_field_of(terms)[0], t0, y0)
+
+    def step(
+        self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Frame, made_jump: Any
+    ) -> Any:
+        return _diffrax_step(self.composition, terms, t0, t1, y0, args, solver_state)
+
+    def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
+        return terms.vf(t0, y0, args)
+
+
+class Splitting4(dfx.AbstractSolver):
+    """Order 4: seven kicks and six free flows. For long runs; see `Splitting2` for what it asks.
+
+    Source: Blanes and Moan 2002, doi:10.1016/S0377-0427(01)00492-7, method SRKN6b.
+
+    >>> Splitting4().order(None)
+    4
+    """
+
+    term_structure: ClassVar = dfx.ODETerm
+    interpolation_cls: ClassVar = NestedInterpolation
+    composition: ClassVar[Composition] = SRKN6
+
+    def order(self, terms: Any) -> int:
+        return self.composition.order
+
+    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> Frame:
+        return frame_of(_field_of(terms)[0], t0, y0)
+
+    def step(
+        self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Frame, made_jump: Any
+    ) -> Any:
+        return _diffrax_step(self.composition, terms, t0, t1, y0, args, solver_state)
+
+    def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
+        return terms.vf(t0, y0, args)
+
+
+class Splitting6(dfx.AbstractSolver):
+    """Order 6: twelve kicks and eleven free flows. For long runs; see `Splitting2`.
+
+    Source: Blanes and Moan 2002, doi:10.1016/S0377-0427(01)00492-7, method SRKN11b.
+
+    >>> Splitting6().order(None)
+    6
+    """
+
+    term_structure: ClassVar = dfx.ODETerm
+    interpolation_cls: ClassVar = NestedInterpolation
+    composition: ClassVar[Composition] = SRKN11
+
+    def order(self, terms: Any) -> int:
+        return self.composition.order
+
+    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> Frame:
+        return frame_of(_field_of(terms)[0], t0, y0)
+
+    def step(
+        self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Frame, made_jump: Any
+    ) -> Any:
+        return _diffrax_step(self.composition, terms, t0, t1, y0, args, solver_state)
+
+    def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
+        return terms.vf(t0, y0, args)
+
+
+SplittingSolver = Splitting2 | Splitting4 | Splitting6
+
+
+def frame_of(field: Any, t0: Any, y0: Any) -> Frame:
+    """The principal frame of the field's body.
+
+    **Raises:** `TypeError` for another field than `AttitudeEquations`, or a torque that feels the
+    body rate: a kick at a fixed attitude is then no exact flow, and the order falls to 1.
+    """
+    if not isinstance(field, AttitudeEquations) or not isinstance(y0, Attitude):
+        raise TypeError(
+            "Splitting: wanted AttitudeEquations and an Attitude state, got "
+            f"{type(field).__name__} and {type(y0).__name__}; use DormandPrince8"
+        )
+    torque = field.euler.torque
+    if torque is not None and _feels_rate(field, t0, y0):
+        raise TypeError(
+            f"Splitting: the torque {type(torque).__name__} depends on the body rate (damping, a "
+            "flywheel); only time and attitude may enter a kick; use DormandPrince8"
+        )
+    return Frame(*principal_frame(field.euler.inertia.tensor.astype(y0.omega.dtype)))
+
+
+def enter(frame: Frame, omega: Array) -> Triple:
+    """Π in principal axes."""
+    return times(frame.moments, into(frame.axes, omega))
+
+
+def leave(frame: Frame, momentum: Triple) -> Array:
+    """Ω in body axes."""
+    rate = tuple(p / i for p, i in zip(momentum, frame.moments[:3], strict=True))
+    return jnp.stack(out_of(frame.axes, rate))
+
+
+def compose(
+    composition: Composition, field: AttitudeEquations, frame: Frame, t: Any, h: Any, state: Any
+) -> tuple[Array, Triple]:
+    """One step of (q, Π in principal axes)."""
+    dtype = state[0].dtype
+
+    def kicked(t: Any, weight: Any, q: Array, momentum: Triple) -> Triple:
+        if field.euler.torque is None:
+            return momentum
+        # The torque has been seen not to look at the rate.
+        at = Attitude(q, jnp.zeros(3, dtype))
+        torque = into(frame.axes, evaluate(field.euler.torque, t, at, field.euler.inertia))
+        return tuple(p + weight * c for p, c in zip(momentum, torque, strict=True))
+
+    # A loop, not twelve copies: the flow is long to compile.
+    def stage(carry: Any, weights: tuple[Array, Array]) -> tuple[Any, None]:
+        t, q, momentum = carry
+        drift, kick = weights
+        length = drift.astype(dtype)
+        momentum, (w, *axis) = flow(frame.moments, momentum, length)
+        q = quaternion.multiply(q, jnp.stack([w, *out_of(frame.axes, tuple(axis))]))
+        t = t + drift
+        return (t, q, kicked(t, kick.astype(dtype), q, momentum)), None
+
+    q, momentum = state
+    h = jnp.asarray(h)
+    t = jnp.asarray(t, h.dtype)
+    first, *rest = composition.kicks
+    momentum = kicked(t, (first * h).astype(dtype), q, momentum)
+    weights = (
+        jnp.asarray(composition.flows, h.dtype) * h,
+        jnp.asarray(rest, h.dtype) * h,
+    )
+    (_, q, momentum), _ = lax.scan(stage, (t, q, momentum), weights)
+    # Products of unit quaternions: off by round-off only, which would add up.
+    return quaternion.normalise(q), momentum
+
+
+def _diffrax_step(
+    composition: Composition, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, frame: Frame
+) -> Any:
+    field, direction = _field_of(terms)
+    h = jnp.asarray(t1 - t0) * direction
+    state = (y0.q, enter(frame, y0.omega))
+    q, momentum = compose(composition, field, frame, jnp.asarray(t0) * direction, h, state)
+    y1 = Attitude(q, leave(frame, momentum))
+    dense = dict(y0=y0, coefficients=_dense_rows(terms, t0, t1, args, y0, y1))
+    return y1, None, dense, frame, dfx.RESULTS.successful
+
+
+def _dense_rows(terms: Any, t0: Any, t1: Any, args: Any, y0: Any, y1: Any) -> Any:
+    """The quintic through both ends with first and second derivatives: of order 6."""
+    h = terms.contr(t0, t1)
+
+    def slopes(t: Any, y: Any) -> tuple[Any, Any]:
+        t = jnp.asarray(t, y.q.dtype)
+        rate = terms.vf(t, y, args)
+        _, second = jax.jvp(lambda s, z: terms.vf(s, z, args), (t, y), (jnp.ones_like(t), rate))
+        return rate, second
+
+    (f0, s0), (f1, s1) = slopes(t0, y0), slopes(t1, y1)
+
+    # Backwards, diffrax turns time round: the second derivative along the step keeps its sign.
+    def rows(a: Array, b: Array, k: Array, m: Array, u: Array, v: Array) -> Array:
+        step = jnp.asarray(h, a.dtype)
+        rise = b - a
+        second, third = step * k - rise, 2 * rise - step * (k + m)
+        fourth = 0.5 * (step**2 * u + 2 * second - 2 * third)
+        fifth = 0.5 * (step**2 * v + 2 * second + 4 * third) - fourth
+        return jnp.stack([rise, second, third, fourth, fifth])
+
+    return jax.tree.map(rows, y0, y1, f0, f1, s0, s1)
+
+
+def _field_of(terms: Any) -> tuple[Any, Any]:
+    """The vector field inside the term, and the direction of time that diffrax wraps around it."""
+    if isinstance(terms, dfx.ODETerm):
+        return terms.vector_field, 1
+    return terms.term.vector_field, terms.direction
+
+
+def _feels_rate(field: AttitudeEquations, t0: Any, y0: Attitude) -> bool:
+    """Whether the torque's value is computed from the body rate, read off its operations."""
+
+    def torque(omega: Array, t: Any, q: Array) -> Array:
+        return evaluate(field.euler.torque, t, Attitude(q, omega), field.euler.inertia)
+
+    jaxpr = jax.make_jaxpr(torque)(y0.omega, t0, y0.q).jaxpr
+    reached = {jaxpr.invars[0]}
+    for equation in jaxpr.eqns:
+        if any(not isinstance(a, core.Literal) and a in reached for a in equation.invars):
+            reached.update(equation.outvars)
+    return any(not isinstance(a, core.Literal) and a in reached for a in jaxpr.outvars)
