@@ -62,10 +62,16 @@ def dot_components(a: Sequence[Scalar], b: Sequence[Scalar]) -> Scalar:
 
 def square(v: Sequence[Scalar]) -> Scalar:
     """Squared length of a triple of scalars, to be fed to a costly function."""
-    value = dot_components(v, v)
-    # A division by one (2 for NaN): XLA on CPU computes a quotient once, here and in the gradient,
-    # where it would repeat anything cheaper, with all that follows, for every component.
-    return value / jnp.where(value == value, 1, 2)
+    return once(dot_components(v, v))
+
+
+def once(x: Scalar) -> Scalar:
+    """The same number, computed once however often it is used.
+
+    A division by one (by 2 for NaN): XLA on CPU computes a quotient once, here and in the gradient,
+    where it would repeat anything cheaper, with all that leads to it, for every component.
+    """
+    return x / jnp.where(x == x, 1, 2)
 
 
 def hat(w: Vec3Like) -> Mat3:

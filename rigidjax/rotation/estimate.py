@@ -62,8 +62,7 @@ def wahba(
     >>> wahba(jnp.eye(3)[:2], jnp.eye(3)[:2]).round(12).tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
     """
-    body = jnp.asarray(body)
-    body = _checks.floating(body, (*body.shape[:1], 3), "body")
+    body = _rows(body, (3,), "body")
     world = _checks.floating(world, body.shape, "world")
     w = jnp.ones_like(body[:, 0]) if weights is None else jnp.asarray(weights)
     w = _checks.floating(w, body.shape[:1], "weights")
@@ -113,8 +112,7 @@ def mean(matrices: Float[ArrayLike, "n 3 3"], weights: Float[ArrayLike, "n"] | N
     >>> mean(jnp.stack([jnp.eye(3), jnp.eye(3)])).round(12).tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
     """
-    matrices = jnp.asarray(matrices)
-    matrices = _checks.floating(matrices, (*matrices.shape[:1], 3, 3), "matrices")
+    matrices = _rows(matrices, (3, 3), "matrices")
     return quaternion.to_matrix(mean_quaternion(jax.vmap(matrix_to_quaternion)(matrices), weights))
 
 
@@ -128,8 +126,7 @@ def mean_quaternion(
     >>> mean_quaternion(jnp.array([[1.0, 0, 0, 0], [-1.0, 0, 0, 0]])).tolist()
     [1.0, 0.0, 0.0, 0.0]
     """
-    q = jnp.asarray(quaternions)
-    q = _checks.floating(q, (*q.shape[:1], 4), "quaternions")
+    q = _rows(quaternions, (4,), "quaternions")
     w = jnp.ones_like(q[:, 0]) if weights is None else jnp.asarray(weights)
     w = _checks.floating(w, q.shape[:1], "weights")
 
@@ -147,6 +144,15 @@ def mean_quaternion(
     for i in range(2):
         start = newton(i, lax.stop_gradient(start) if i == 0 else start, q, w)
     return quaternion.canonical(quaternion.normalise(start))
+
+
+def _rows(values: Any, shape: tuple[int, ...], name: str) -> Array:
+    """Many of one shape, as one array (n, *shape)."""
+    array = _checks.floating(values, np.shape(values), name)
+    if array.ndim != len(shape) + 1 or array.shape[1:] != shape:
+        wanted = ", ".join(map(str, ("n", *shape)))
+        raise ValueError(f"{name}: wanted shape ({wanted}), got {array.shape}")
+    return array
 
 
 def _left_jacobian_inverse(v: Vec3) -> Mat3:

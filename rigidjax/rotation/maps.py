@@ -12,7 +12,14 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from rigidjax._types import Mat3, Quat, Scalar, Vec3
-from rigidjax.rotation.algebra import components, cross_components, dot_components, entries, square
+from rigidjax.rotation.algebra import (
+    components,
+    cross_components,
+    dot_components,
+    entries,
+    once,
+    square,
+)
 from rigidjax.special.series import arctan_ratio, inverse_kernel, stumpff
 
 # Inlined in whatever is being traced, so that XLA and `jax.grad` see no boundary.
@@ -34,7 +41,7 @@ def vector_to_matrix(v: Vec3) -> Mat3:
     parts = components(v)
     s = 0.25 * square(parts)
     half = stumpff(1, s)
-    return hat_polynomial(parts, stumpff(0, s) * half, 0.5 * half * half)
+    return hat_polynomial(parts, once(stumpff(0, s) * half), once(0.5 * half * half))
 
 
 @_compiled

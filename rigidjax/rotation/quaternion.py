@@ -26,7 +26,7 @@ from rigidjax.rotation.maps import (
     vector_to_quaternion,
 )
 
-_HINT = "a quaternion is (w, x, y, z), scalar first"
+_HINT = "one quaternion is (w, x, y, z), scalar first; batch with jax.vmap"
 
 
 def exp(v: Vec3Like) -> Quat:

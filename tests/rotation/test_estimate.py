@@ -99,6 +99,13 @@ def test_wahba_refuses_a_free_turn(body, unhooked):
         jax.block_until_ready(jax.jit(so3.wahba)(body, body))
 
 
+def test_wrong_shapes(unhooked):
+    with pytest.raises(ValueError, match=r"body: wanted shape \(n, 3\), got \(3,\)"):
+        so3.wahba(np.ones(3), np.ones(3))
+    with pytest.raises(ValueError, match=r"matrices: wanted shape \(n, 3, 3\), got \(3, 3\)"):
+        so3.mean(np.eye(3))
+
+
 @pytest.mark.parametrize("off", [2.0, 1e-3, 1e-8, 1e-12, 1e-15, 0.0])
 def test_alignment(off):
     """Also of nearly and exactly opposite directions: R a = b, orthogonal, least angle."""
