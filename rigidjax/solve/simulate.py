@@ -261,15 +261,15 @@ def require_fit(body: Any, state0: Any, torque: Any) -> None:
             f"{type(torque).__name__} moves a Point: wanted Point(x, v), got "
             f"{type(state0).__name__}; frames.BodyInFrame is for a body in a moving frame"
         )
+    if isinstance(state0, Point):
+        scene_of(torque)
     if torque is not None and not isinstance(torque, AbstractScene | MovingFrame):
         require_rung(torque, state0)
     if isinstance(state0, Rigid) and not isinstance(body, MassProperties):
         raise TypeError(
             f"Rigid moves as well as turns: wanted MassProperties, got {type(body).__name__}"
         )
-    if isinstance(state0, Point):
-        scene_of(torque)
-    elif not isinstance(state0, Rigid) and not isinstance(body, Inertia):
+    if not isinstance(state0, Rigid | Point) and not isinstance(body, Inertia):
         raise TypeError(
             f"{type(state0).__name__} only turns: wanted Inertia, got {type(body).__name__}"
             + ("; pass body.inertia" if isinstance(body, MassProperties) else "")
