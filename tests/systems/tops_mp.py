@@ -12,10 +12,7 @@ def _lagrange(i1, i3, mgl, theta, rates):
     b = dphi * s0**2 + a * u0
     beta = 2 * mgl / i1
     alpha = dtheta**2 + (dphi * s0) ** 2 + beta * u0
-    roots = mp.polyroots(
-        [beta, -(alpha + a**2), 2 * a * b - beta, alpha - b**2], maxsteps=200, extraprec=200
-    )
-    u1, u2, u3 = sorted(mp.re(r) for r in roots)
+    u1, u2, u3 = _cubic(-(alpha + a**2) / beta, (2 * a * b - beta) / beta, (alpha - b**2) / beta)
     m = (u2 - u1) / (u3 - u1)
     speed = mp.sqrt(beta * (u3 - u1)) / 2
     part = min(max((u0 - u1) / (u2 - u1), mp.mpf(0)), mp.mpf(1))
@@ -26,6 +23,16 @@ def _lagrange(i1, i3, mgl, theta, rates):
         return u1 + (u2 - u1) * mp.ellipfun("sn", start + speed * s, m=m) ** 2
 
     return u, a, b, mp.ellipk(m) / speed
+
+
+def _cubic(p, q, r):
+    """The three real roots of x³ + p x² + q x + r, ascending (Viète)."""
+    with mp.extradps(mp.mp.dps + 10):
+        slope, value = q - p**2 / 3, 2 * p**3 / 27 - p * q / 3 + r
+        size = 2 * mp.sqrt(-slope / 3)
+        cosine = min(max(3 * value / (slope * size), mp.mpf(-1)), mp.mpf(1))
+        turn = mp.acos(cosine) / 3
+        return sorted(size * mp.cos(turn - 2 * mp.pi * k / 3) - p / 3 for k in range(3))
 
 
 def lagrange_cosine(i1, i3, mgl, theta, rates, t, *, digits=30):
