@@ -66,8 +66,9 @@ def scalarise(function: Callable[..., Any], *like: Any) -> Callable[..., tuple[A
                 values.append(_objects(scalars, shape.shape))
         out = _evaluate(closed.jaxpr, constants, values)
         flattened: list[Any] = []
-        for value in out:
-            flattened.extend(value.reshape(-1) if isinstance(value, np.ndarray) else [value])
+        for value, variable in zip(out, closed.jaxpr.outvars, strict=True):
+            parts = value.reshape(-1) if isinstance(value, np.ndarray) else [value]
+            flattened.extend(jnp.asarray(part, variable.aval.dtype) for part in parts)
         return tuple(flattened)
 
     return numbers
@@ -110,23 +111,21 @@ def _apply(equation: Any, given: list[Value]) -> list[Value]:
 
 def _on_arrays(equation: Any, given: list[Value]) -> list[Value]:
     """Carry out one operation as it stands, `custom_jvp` and loops included."""
-    values = {
-        atom: value
-        for atom, value in zip(equation.invars, given, strict=True)
-        if not isinstance(atom, core.Literal)
-    }
-    jaxpr = core.Jaxpr([], list(values), list(equation.outvars), [equation])
-    arrays = [_array(value, atom.aval) for atom, value in values.items()]
-    out = core.jaxpr_as_fun(core.ClosedJaxpr(jaxpr, []))(*arrays)
-    return [_take(value) for value in out]
+    arrays = [_array(value, atom.aval) for atom, value in zip(equation.invars, given, strict=True)]
+    # JAX before 0.12 gives functions apart from parameters.
+    bound: Any = equation.primitive.get_bind_params(equation.params)
+    functions, params = bound if isinstance(bound, tuple) else ((), bound)
+    out = equation.primitive.bind(*functions, *arrays, **params)
+    return [_take(value) for value in (out if equation.primitive.multiple_results else [out])]
 
 
 def _each(equation: Any, given: list[np.ndarray]) -> np.ndarray:
     shape = equation.outvars[0].aval.shape
     out = np.empty(shape, object)
+    # `select_n` and `clamp` mix scalars with arrays, and newer products axes of length 1.
+    wide = [np.broadcast_to(value, shape) for value in given]
     for index in np.ndindex(*shape):
-        # Only `select_n` and `clamp` mix scalars with arrays.
-        scalars = [value[index] if value.shape == shape else value[()] for value in given]
+        scalars = [value[index] for value in wide]
         out[index] = equation.primitive.bind(*scalars, **equation.params)
     return out
 
