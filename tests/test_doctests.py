@@ -9,11 +9,14 @@ import pytest
 
 import rigidjax
 
-MODULES = [rigidjax.__name__] + sorted(
-    info.name
-    for info in pkgutil.walk_packages(rigidjax.__path__, "rigidjax.")
-    if not info.name.endswith("__main__")
-)
+MODULES = [
+    rigidjax.__name__,
+    *sorted(
+        info.name
+        for info in pkgutil.walk_packages(rigidjax.__path__, "rigidjax.")
+        if not info.name.endswith("__main__")
+    ),
+]
 
 
 @pytest.mark.parametrize("name", MODULES)

@@ -249,8 +249,8 @@ def _assess(
 ) -> Fit:
     covariance, singular, null = uncertainty.covariance(problem, value, noise)
     chi2, dof, believable = uncertainty.goodness(problem, value, noise)
-    # Ten units of log-likelihood: a point further above the best is e¹⁰ times less likely. Where the
-    # noise is estimated from the best point, its cost is half the number of readings.
+    # Ten units of log-likelihood: a point further above the best is e¹⁰ times less likely. Where
+    # the noise is estimated from the best point, its cost is half the number of readings.
     margin = 10.0
     if any(r.sensor.noise is None for r in problem.recording.readings):
         margin *= 2 * best_cost / problem.recording.size

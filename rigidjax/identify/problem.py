@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from rigidjax._types import HasAttitude, Quat, Scalar
+from rigidjax._types import HasAttitude, HasSpin, Quat, Scalar
 from rigidjax.body.inertia import Inertia
 from rigidjax.exact import FreeBody
 from rigidjax.identify.bodies import AbstractBodyChart
@@ -76,7 +76,7 @@ class Problem(eqx.Module):
         q = quaternion.multiply(self.reference, quaternion.exp(parameters.turn))
         return body, Attitude(q, omega)
 
-    def motion(self, parameters: Parameters) -> Spin | Attitude:
+    def motion(self, parameters: Parameters) -> HasSpin:
         """The states at the recording's times, with a leading time axis."""
         body, state0 = self.unpack(parameters)
         if self.torque is None:

@@ -5,7 +5,6 @@ from rigidjax.motion.attitude import (
     Attitude as Attitude,
     AttitudeEquations as AttitudeEquations,
     on_the_group as on_the_group,
-    quaternion_rate as quaternion_rate,
 )
 from rigidjax.motion.conserved import (
     conserved as conserved,

@@ -3,11 +3,10 @@
 from typing import TypeVar
 
 import equinox as eqx
-import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rigidjax import _checks
-from rigidjax._types import HasAttitude, Quat, QuatLike, ScalarLike, Vec3Like
+from rigidjax._types import HasAttitude, ScalarLike
 from rigidjax.body.inertia import Inertia
 from rigidjax.motion.spin import EulerEquations
 from rigidjax.motion.torques import Torque
@@ -57,29 +56,7 @@ class AttitudeEquations(eqx.Module):
         self.euler = EulerEquations(inertia, torque)
 
     def __call__(self, t: ScalarLike, y: HasAttitude, args: object = None) -> Attitude:
-        return Attitude(quaternion_rate(y.q, y.omega), self.euler.rate_of(t, y))
-
-
-def quaternion_rate(q: QuatLike, omega: Vec3Like) -> Quat:
-    """dq/dt = ½ q ⊗ (0, Ω).
-
-    **Arguments:** `q` (4,) body → world, scalar first; `omega` (3,) Ω, rad/s, body frame.
-    **Returns** (4,) per second. Source: notes, eq 50, on unit quaternions.
-
-    >>> quaternion_rate(jnp.array([1.0, 0, 0, 0]), jnp.array([0.0, 0, 2]))
-    Array([-0.,  0.,  0.,  1.], dtype=float64)
-    """
-    q, omega = _checks.floating(q, (4,), "q"), _checks.floating(omega, (3,), "omega")
-    w, x, y, z = q[0], q[1], q[2], q[3]
-    a, b, c = 0.5 * omega[0], 0.5 * omega[1], 0.5 * omega[2]
-    return jnp.stack(
-        [
-            -x * a - y * b - z * c,
-            w * a + y * c - z * b,
-            w * b + z * a - x * c,
-            w * c + x * b - y * a,
-        ]
-    )
+        return Attitude(quaternion.rate(y.q, y.omega), self.euler.rate_of(t, y))
 
 
 State = TypeVar("State")

@@ -7,9 +7,9 @@ from jaxtyping import Array, Float
 from rigidjax import _checks
 from rigidjax._types import HasPose, ScalarLike
 from rigidjax.body.inertia import MassProperties
-from rigidjax.motion.attitude import quaternion_rate
 from rigidjax.motion.spin import EulerEquations
 from rigidjax.motion.torques import Torque, act
+from rigidjax.rotation import quaternion
 
 
 class Rigid(eqx.Module):
@@ -80,4 +80,4 @@ class NewtonEuler(eqx.Module):
         else:
             acceleration = force / self.body.mass.astype(y.v.dtype)
         spin = self.euler.turned_by(torque, y)
-        return Rigid(y.v, acceleration, quaternion_rate(y.q, y.omega), spin)
+        return Rigid(y.v, acceleration, quaternion.rate(y.q, y.omega), spin)

@@ -199,7 +199,7 @@ def _unknown(sequence: object, reason: str) -> str:
 
 def _angles(angles: Vec3Like) -> Vec3:
     angles = _checks.floating(angles, (3,), "angles")
-    if not isinstance(angles, Tracer) and bool(jnp.any(jnp.abs(angles) > _MANY_TURNS)):
+    if not isinstance(angles, Tracer) and bool(np.any(np.abs(np.asarray(angles)) > _MANY_TURNS)):
         warnings.warn(
             f"angles {angles.tolist()} rad are more than four turns: are they degrees? "
             "use jnp.deg2rad",

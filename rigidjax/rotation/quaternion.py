@@ -181,12 +181,22 @@ def rate(q: QuatLike, omega: Vec3Like) -> Quat:
     """dq/dt = ½ q (0, Ω), with Ω in the body frame.
 
     **Arguments:** `q` (4,) unit, body → world; `omega` (3,) rad/s, body frame. **Returns:** 1/s.
+    Source: notes, eq 50, on unit quaternions.
 
     >>> rate(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.array([0.0, 0.0, 2.0])).tolist()
     [0.0, 0.0, 0.0, 1.0]
     """
-    omega = _checks.floating(omega, (3,), "omega")
-    return 0.5 * multiply(q, jnp.concatenate([jnp.zeros_like(omega[:1]), omega]))
+    q, omega = _checks.floating(q, (4,), "q"), _checks.floating(omega, (3,), "omega")
+    w, x, y, z = q[0], q[1], q[2], q[3]
+    a, b, c = 0.5 * omega[0], 0.5 * omega[1], 0.5 * omega[2]
+    return jnp.stack(
+        [
+            -x * a - y * b - z * c,
+            w * a + y * c - z * b,
+            w * b + z * a - x * c,
+            w * c + x * b - y * a,
+        ]
+    )
 
 
 def interpolate(p: QuatLike, q: QuatLike, s: ScalarLike) -> Quat:
