@@ -6,7 +6,7 @@ import diffrax as dfx
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool
+from jaxtyping import Array, Bool
 
 from rigidjax import _checks
 from rigidjax._types import ScalarLike
@@ -41,16 +41,17 @@ def event(scene: Any) -> dfx.Event | None:
     return dfx.Event(TooClose(scene)) if hasattr(scene, "approach") else None
 
 
-def refuse(ys: Any, hit: Bool[ArrayLike, "..."], stats: dict[str, Any], ts: Any) -> Any:
+def refuse(ys: Any, stats: dict[str, Any], ts: Any) -> Any:
     """The states `ys`, unless the run has ended in a collision: then an error that says which.
 
-    **Arguments:** `hit` whether the event happened; `stats` with `end_time` and `end_distances`;
-    `ts` the times asked for. **Raises:** `ValueError` with body, time, distance and the last time
-    saved before; under `jit` or `vmap` `EquinoxRuntimeError` without the numbers.
+    **Arguments:** `ys` the states saved at `ts`; `stats` with `collided`, `end_time` and
+    `end_distances`. **Raises:** `ValueError` with body, time, distance and the last time saved
+    before; under `jit` or `vmap` `EquinoxRuntimeError` without the numbers.
 
-    >>> refuse(0.0, False, {}, None)
+    >>> refuse(0.0, {"collided": np.asarray(False)}, None)
     0.0
     """
+    hit = stats["collided"]
     advice = "; give throw=False to keep what came before it"
     if not _checks.known(hit):
         words = "simulate: the particle collided with one of the scene's bodies" + advice

@@ -119,6 +119,7 @@ def _solve(
             times: Any = out.ts
             (ys, ends), (_, end_times) = ys, times
             end = jax.tree.map(lambda leaf: leaf[0], ends)
+            stats["collided"] = out.result == dfx.RESULTS.event_occurred
             stats["end_time"] = end_times[0]
             stats["end_distances"] = scene.approach(end_times[0], end)[0]
         stats["drift"] = scene.drift(ts, ys)
@@ -222,8 +223,8 @@ def simulate(
         throw=throw,
     )
     ys, stats, result = _solve(setup, state0, times)
-    if throw and "end_time" in stats:
-        ys = collision.refuse(ys, result == dfx.RESULTS.event_occurred, stats, times)
+    if throw and "collided" in stats:
+        ys = collision.refuse(ys, stats, times)
     return Solution(times, ys, stats, result, setup)
 
 
