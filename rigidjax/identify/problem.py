@@ -65,7 +65,7 @@ class Problem(eqx.Module):
         self.recording, self.body, self.torque, self.loss = recording, body, torque, loss
         self.reference = _first_attitude(recording)
         # An array, not a float: another recording must not compile again.
-        self.typical_rate = jnp.asarray(_typical_rate(recording))
+        self.typical_rate = jnp.asarray(_typical_rate(recording), recording.t.dtype)
 
     def unpack(self, parameters: Parameters) -> tuple[Inertia, Spin | Attitude]:
         """The body and the first state that the parameters stand for."""

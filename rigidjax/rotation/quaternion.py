@@ -183,8 +183,8 @@ def rate(q: QuatLike, omega: Vec3Like) -> Quat:
     **Arguments:** `q` (4,) unit, body → world; `omega` (3,) rad/s, body frame. **Returns:** 1/s.
     Source: notes, eq 50, on unit quaternions.
 
-    >>> rate(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.array([0.0, 0.0, 2.0])).tolist()
-    [0.0, 0.0, 0.0, 1.0]
+    >>> float(rate(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.array([0.0, 0.0, 2.0]))[3])
+    1.0
     """
     q, omega = _checks.floating(q, (4,), "q"), _checks.floating(omega, (3,), "omega")
     w, x, y, z = q[0], q[1], q[2], q[3]

@@ -72,7 +72,7 @@ def am(
     **Raises:** as `sncndn`.
 
     >>> round(float(am(1.0, 0.5)), 12)
-    0.932315052374
+    0.932315079884
     """
     u, m, m1 = common(u=u, **complementary("m", m, m1))
     s, c, _, turns = _functions(u, exact_complement(m, m1), m1)
