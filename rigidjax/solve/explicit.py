@@ -200,8 +200,10 @@ def _diffrax_step(
     rows, slopes = _dense_rows(tableau, field, t0, t1, h, start, end, slopes)
     # Which steps are taken is not a thing to differentiate: their error is below the tolerance.
     error = lax.stop_gradient(error_estimate(tableau, h, slopes, y0))
-    # Without the barrier XLA computes all stages again for each number that it stacks below.
-    end, rows, error = lax.optimization_barrier((end, rows, error))
+    # Without a barrier XLA computes all stages again for each number that it stacks below. None for
+    # the rows: a barrier is kept, with all that it needs, even where nobody asks for its result.
+    end = lax.optimization_barrier(end)
+    error = lax.optimization_barrier(error)
     coefficients = jax.tree.map(lambda *r: jnp.stack(r), *[join(row, y0) for row in rows])
     dense = dict(y0=y0, coefficients=coefficients)
     return join(end, y0), join(error, y0), dense, None, dfx.RESULTS.successful

@@ -52,11 +52,12 @@ def scalarise(function: Callable[..., Any], *like: Any) -> Callable[..., tuple[A
     def flat(*arrays: Any) -> list[Any]:
         return jax.tree.leaves(function(*jax.tree.unflatten(structure, arrays)))
 
-    closed = jax.make_jaxpr(flat)(*shapes)
+    closed: Any = jax.make_jaxpr(flat)(*shapes)
     constants = [_take(constant) for constant in closed.consts]
 
     def numbers(*parts: Any) -> tuple[Any, ...]:
-        queue, values = iter(parts), []
+        queue = iter(parts)
+        values: list[Value] = []
         for shape in shapes:
             if _long(shape.shape):
                 values.append(next(queue))
@@ -67,8 +68,8 @@ def scalarise(function: Callable[..., Any], *like: Any) -> Callable[..., tuple[A
         out = _evaluate(closed.jaxpr, constants, values)
         flattened: list[Any] = []
         for value, variable in zip(out, closed.jaxpr.outvars, strict=True):
-            parts = value.reshape(-1) if isinstance(value, np.ndarray) else [value]
-            flattened.extend(jnp.asarray(part, variable.aval.dtype) for part in parts)
+            scalars = value.reshape(-1) if isinstance(value, np.ndarray) else [value]
+            flattened.extend(jnp.asarray(scalar, variable.aval.dtype) for scalar in scalars)
         return tuple(flattened)
 
     return numbers
@@ -79,7 +80,7 @@ def _evaluate(jaxpr: Any, constants: Sequence[Value], arguments: Sequence[Value]
 
     def read(atom: Any) -> Value:
         if isinstance(atom, core.Literal):
-            return _take(np.asarray(atom.val, atom.aval.dtype))
+            return _take(np.asarray(atom.val, jnp.result_type(atom.aval)))
         return known[atom]
 
     for variable, value in zip(
@@ -97,7 +98,7 @@ def _apply(equation: Any, given: list[Value]) -> list[Value]:
     name, params = equation.primitive.name, equation.params
     if name in _INLINE:
         inner = params["jaxpr"] if "jaxpr" in params else params["call_jaxpr"]
-        if not isinstance(inner, core.ClosedJaxpr):
+        if not hasattr(inner, "consts"):
             return _evaluate(inner, [], given)
         return _evaluate(inner.jaxpr, [_take(c) for c in inner.consts], given)
     short = all(isinstance(value, np.ndarray) for value in given)

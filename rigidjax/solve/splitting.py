@@ -17,13 +17,11 @@ from jaxtyping import Array
 
 from rigidjax.exact.flow import flow
 from rigidjax.exact.frame import into, out_of, principal_frame
-from rigidjax.exact.triples import times
+from rigidjax.exact.triples import Six, Triple, times
 from rigidjax.motion import Attitude, AttitudeEquations
 from rigidjax.motion.torques import evaluate
 from rigidjax.rotation import quaternion
 from rigidjax.solve.explicit import NestedInterpolation
-
-Triple = tuple[Array, Array, Array]
 
 
 class Composition(NamedTuple):
@@ -76,7 +74,7 @@ SRKN11 = _symmetric(
 class Frame(NamedTuple):
     """What the free flow needs of a body: moments in its principal axes, and those axes."""
 
-    moments: tuple[Array, ...]
+    moments: Six
     axes: Array
 
 
@@ -190,7 +188,7 @@ def frame_of(field: Any, t0: Any, y0: Any) -> Frame:
             f"{type(field).__name__} and {type(y0).__name__}; use DormandPrince8"
         )
     torque = field.euler.torque
-    if torque is not None and _feels_rate(field, t0, y0):
+    if _feels_rate(field, t0, y0):
         raise TypeError(
             f"Splitting: the torque {type(torque).__name__} depends on the body rate (damping, a "
             "flywheel); only time and attitude may enter a kick; use DormandPrince8"
@@ -205,8 +203,8 @@ def enter(frame: Frame, omega: Array) -> Triple:
 
 def leave(frame: Frame, momentum: Triple) -> Array:
     """Ω in body axes."""
-    rate = tuple(p / i for p, i in zip(momentum, frame.moments[:3], strict=True))
-    return jnp.stack(out_of(frame.axes, rate))
+    (x, y, z), (a, b, c, *_) = momentum, frame.moments
+    return jnp.stack(out_of(frame.axes, (x / a, y / b, z / c)))
 
 
 def compose(
@@ -220,16 +218,17 @@ def compose(
             return momentum
         # The torque has been seen not to look at the rate.
         at = Attitude(q, jnp.zeros(3, dtype))
-        torque = into(frame.axes, evaluate(field.euler.torque, t, at, field.euler.inertia))
-        return tuple(p + weight * c for p, c in zip(momentum, torque, strict=True))
+        a, b, c = into(frame.axes, evaluate(field.euler.torque, t, at, field.euler.inertia))
+        x, y, z = momentum
+        return x + weight * a, y + weight * b, z + weight * c
 
     # A loop, not twelve copies: the flow is long to compile.
     def stage(carry: Any, weights: tuple[Array, Array]) -> tuple[Any, None]:
         t, q, momentum = carry
         drift, kick = weights
         length = drift.astype(dtype)
-        momentum, (w, *axis) = flow(frame.moments, momentum, length)
-        q = quaternion.multiply(q, jnp.stack([w, *out_of(frame.axes, tuple(axis))]))
+        momentum, (w, x, y, z) = flow(frame.moments, momentum, length)
+        q = quaternion.multiply(q, jnp.stack([w, *out_of(frame.axes, (x, y, z))]))
         t = t + drift
         return (t, q, kicked(t, kick.astype(dtype), q, momentum)), None
 
@@ -292,9 +291,12 @@ def _field_of(terms: Any) -> tuple[Any, Any]:
 
 def _feels_rate(field: AttitudeEquations, t0: Any, y0: Attitude) -> bool:
     """Whether the torque's value is computed from the body rate, read off its operations."""
+    law = field.euler.torque
+    if law is None:
+        return False
 
     def torque(omega: Array, t: Any, q: Array) -> Array:
-        return evaluate(field.euler.torque, t, Attitude(q, omega), field.euler.inertia)
+        return evaluate(law, t, Attitude(q, omega), field.euler.inertia)
 
     jaxpr = jax.make_jaxpr(torque)(y0.omega, t0, y0.q).jaxpr
     reached = {jaxpr.invars[0]}

@@ -5,6 +5,7 @@ steps) is run; the time at an error is interpolated in log–log. Compilation is
 timed in turn, round after round, and only ratios mean anything.
 """
 
+import itertools
 import sys
 import time
 
@@ -128,7 +129,7 @@ def ladder(name, field, y0, ts, right):
 def at(error, points, times):
     """log–log interpolation of time against error, along the ladder until it stops improving."""
     rungs = list(zip(points, times, strict=True))
-    for (e0, t0), (e1, t1) in zip(rungs[:-1], rungs[1:], strict=True):
+    for (e0, t0), (e1, t1) in itertools.pairwise(rungs):
         if e0 > error >= e1:
             s = np.log(e0 / error) / np.log(e0 / e1)
             return float(np.exp((1 - s) * np.log(t0) + s * np.log(t1)))
