@@ -65,7 +65,7 @@ def kinematics(numbers, t):
 
     def derivatives(f):
         one = jnp.ones(())
-        first = lambda s: jax.jvp(f, (s,), (one,))[1]  # noqa: E731
+        first = lambda s: jax.jvp(f, (s,), (one,))[1]
         return f(t), first(t), jax.jvp(first, (t,), (one,))[1]
 
     x, v, acc = derivatives(inside)

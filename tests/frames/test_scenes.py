@@ -152,7 +152,7 @@ def test_libration_in_space_keeps_its_integral():
 
 
 def test_single_precision_stays():
-    single = lambda *n: np.float32(n)  # noqa: E731
+    single = lambda *n: np.float32(n)
     state = Point(single(0, 0, -1), single(0.5, 0, 0))
     for scene in (
         scenes.earth(0.5),

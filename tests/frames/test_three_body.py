@@ -101,7 +101,7 @@ def test_stability_of_the_points():
         return jnp.concatenate([y[3:], MOON.acceleration(0.0, Point(y[:3], y[3:]))])
 
     matrix = jax.jacfwd(rate)(jnp.concatenate([point, jnp.zeros(3)]))
-    key = lambda z: (np.round(z.real, 8), np.round(z.imag, 8))  # noqa: E731
+    key = lambda z: (np.round(z.real, 8), np.round(z.imag, 8))
     wanted = sorted(np.linalg.eigvals(np.asarray(matrix)), key=key)
     found = sorted(np.asarray(MOON.exponents(point)), key=key)
     np.testing.assert_allclose(found, wanted, atol=1e-12)
@@ -113,7 +113,7 @@ def test_rotating_field_is_the_inertial_one_seen_from_the_frame():
     mu, t = PYKEP_MU, 0.8
 
     def pull(t, state):
-        at = lambda r: r * jnp.stack([jnp.cos(t), jnp.sin(t), 0 * t])  # noqa: E731
+        at = lambda r: r * jnp.stack([jnp.cos(t), jnp.sin(t), 0 * t])
         total = jnp.zeros(3)
         for mass, r in ((1 - mu, -mu), (mu, 1 - mu)):
             gap = state.x - at(r)
