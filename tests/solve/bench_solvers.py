@@ -18,8 +18,8 @@ from scipy.integrate import solve_ivp
 
 jax.config.update("jax_enable_x64", True)
 
-import rigidjax as rj  # noqa: E402
-from rigidjax.solve import lean  # noqa: E402
+import rigidjax as rj
+from rigidjax.solve import lean
 
 ERRORS = (1e-4, 1e-8, 1e-10)
 ROUNDS = 7

@@ -301,7 +301,7 @@ def test_backwards_rigid_spin_and_batches():
 
 def test_single_precision_and_long_times():
     # A thousand steps from t = 86400 s in float32 would stop at 223 if times were added up.
-    single = lambda x: jnp.asarray(x, jnp.float32)  # noqa: E731
+    single = lambda x: jnp.asarray(x, jnp.float32)
     field, y0 = driven.field(jnp.float32), driven.start(single(0.0))
     ts = single([0.0, LATE])
     end = lean.fixed(Tsitouras5(), field, ts, y0, 1000).q[-1]
