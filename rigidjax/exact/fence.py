@@ -22,4 +22,6 @@ def opaque_one(t: Scalar) -> Scalar:
 
 def fence(tree: Tree, one: Scalar) -> Tree:
     """The same numbers, computed once."""
-    return jax.tree.map(lambda x: x / (one if x.ndim == 0 else jnp.broadcast_to(one, x.shape)), tree)
+    return jax.tree.map(
+        lambda x: x / (one if x.ndim == 0 else jnp.broadcast_to(one, x.shape)), tree
+    )

@@ -17,7 +17,6 @@ import jax
 import jax.numpy as jnp
 
 from rigidjax._types import Scalar
-from rigidjax.exact import tensor_flow
 from rigidjax.exact.doubling import Elliptic, Modulus, duplicate, limits, series
 from rigidjax.exact.fence import fence, opaque_one
 from rigidjax.exact.half_period import half_period
@@ -97,12 +96,51 @@ def jacobian_and_integral(body: Differences, momentum: Triple, t: Scalar) -> tup
         dD = -q * S * C * theta - D * shrink + jnp.where(three, rd * dgap, 0.0)
         dS, dC, dD = fence((dS, dC, dD), one)
         x12, x13, x23 = o12 * t12, o13 * t13, o23 * t23
-        du1 = -e23 * (p2 * p3) - d23 * (e2 * p3 + e3 * p2) + o12 * (-p1 * p3) + o13 * (p1 * p2) + o23 * (p2 * p2 - p3 * p3)
-        du2 = e13 * (p1 * p3) + d13 * (e1 * p3 + e3 * p1) + o12 * (p2 * p3) + o13 * (p3 * p3 - p1 * p1) - o23 * (p1 * p2)
-        du3 = -e12 * (p1 * p2) - d12 * (e1 * p2 + e2 * p1) + o12 * (p1 * p1 - p2 * p2) - o13 * (p2 * p3) + o23 * (p1 * p3)
-        dy1 = e1 * C + p1 * dC - x12 * C * p2 - x13 * p3 + dS * D * u1 + S * (dD * u1 + D * du1 + x12 * u2 + x13 * u3)
-        dy2 = e2 * C * D + p2 * (dC * D + C * dD) - x12 * C * p1 - x23 * D * p3 + dS * u2 + S * (du2 + x12 * u1 + x23 * u3)
-        dy3 = e3 * D + p3 * dD - x13 * p1 - x23 * D * p2 + dS * C * u3 + S * (dC * u3 + C * du3 + x13 * u1 + x23 * u2)
+        du1 = (
+            -e23 * (p2 * p3)
+            - d23 * (e2 * p3 + e3 * p2)
+            + o12 * (-p1 * p3)
+            + o13 * (p1 * p2)
+            + o23 * (p2 * p2 - p3 * p3)
+        )
+        du2 = (
+            e13 * (p1 * p3)
+            + d13 * (e1 * p3 + e3 * p1)
+            + o12 * (p2 * p3)
+            + o13 * (p3 * p3 - p1 * p1)
+            - o23 * (p1 * p2)
+        )
+        du3 = (
+            -e12 * (p1 * p2)
+            - d12 * (e1 * p2 + e2 * p1)
+            + o12 * (p1 * p1 - p2 * p2)
+            - o13 * (p2 * p3)
+            + o23 * (p1 * p3)
+        )
+        dy1 = (
+            e1 * C
+            + p1 * dC
+            - x12 * C * p2
+            - x13 * p3
+            + dS * D * u1
+            + S * (dD * u1 + D * du1 + x12 * u2 + x13 * u3)
+        )
+        dy2 = (
+            e2 * C * D
+            + p2 * (dC * D + C * dD)
+            - x12 * C * p1
+            - x23 * D * p3
+            + dS * u2
+            + S * (du2 + x12 * u1 + x23 * u3)
+        )
+        dy3 = (
+            e3 * D
+            + p3 * dD
+            - x13 * p1
+            - x23 * D * p2
+            + dS * C * u3
+            + S * (dC * u3 + C * du3 + x13 * u1 + x23 * u2)
+        )
         dz = jnp.where(
             three,
             (e12 * d13 + d12 * e13) * (p1 * p1)
@@ -132,7 +170,6 @@ def _integrals(u: Scalar, m: Modulus, three) -> tuple[_Functions, _Functions]:
     """The functions at u/2 and at u."""
     n = limits(u.dtype).doublings + 1
     h = u * 2.0**-n
-    one = jnp.ones_like(u)
     f0 = series(h, m, jnp.zeros_like(u), jnp.zeros_like(u))
     e = jnp.where(three, 2.0 * m.q - m.p, 2.0 * m.p - m.q)
     third = h * h * h / 3
@@ -151,6 +188,4 @@ def _twice(f: _Functions, m: Modulus, three) -> _Functions:
     zero, one = jnp.zeros_like(f.S), jnp.ones_like(f.S)
     g = duplicate(Elliptic(f.S, f.C, f.D, one, zero), m, zero, zero)
     a, b = f.S / jnp.where(three, f.D, f.C), g.S / jnp.where(three, g.D, g.C)
-    return _Functions(
-        g.S, g.C, g.D, 2.0 * f.y2 + f.S * f.S * g.S, 2.0 * f.y + a * a * b
-    )
+    return _Functions(g.S, g.C, g.D, 2.0 * f.y2 + f.S * f.S * g.S, 2.0 * f.y + a * a * b)

@@ -21,7 +21,17 @@ from rigidjax.exact.fence import fence, opaque_one
 from rigidjax.exact.first_order import jacobian_and_integral
 from rigidjax.exact.principal_flow import momentum_and_turn, orbit
 from rigidjax.exact.tensor_flow import Differences
-from rigidjax.exact.triples import Four, Six, Triple, adjugate, cross, determinant, half_product, times, turned_back
+from rigidjax.exact.triples import (
+    Four,
+    Six,
+    Triple,
+    adjugate,
+    cross,
+    determinant,
+    half_product,
+    times,
+    turned_back,
+)
 
 # Below this turn (rad) the Taylor series, of this order, is right to round-off; above, what the
 # quotient by h² loses is round-off/turn in a first and round-off/turn² in a second derivative.
@@ -56,7 +66,9 @@ def _flow_jvp(primals, tangents):
     h2 = p1 * p1 + p2 * p2 + p3 * p3
     small = jax.lax.stop_gradient(h2 * (k[0] * k[0]) * (t * t)) < _SMALL[t.dtype] ** 2
     along = 0.5 * t * d_energy2 + energy2 * d_t
-    along = along + 0.5 * sum(g[i] * d_k[i] for i in range(3)) + sum(g[i] * d_k[i] for i in range(3, 6))
+    along = (
+        along + 0.5 * sum(g[i] * d_k[i] for i in range(3)) + sum(g[i] * d_k[i] for i in range(3, 6))
+    )
     back = turned_back(turn, d_momentum)
     across = cross(out, tuple(a - b for a, b in zip(back, d_out, strict=True)))
     r = 1.0 / jnp.where(small, 1.0, h2)

@@ -1,8 +1,8 @@
 """Principal axes as a fixed frame: chosen once by value, never differentiated.
 
 In this frame the inertia is diagonal in value; its off-diagonal entries are exact zeros that carry
-the tangents (and `tensor_flow` says what they do). So nothing is divided by a difference of moments,
-and no derivative of an axis is taken.
+the tangents (and `tensor_flow` says what they do). So nothing is divided by a difference of
+moments, and no derivative of an axis is taken.
 """
 
 import jax
@@ -23,7 +23,10 @@ def principal_frame(tensor: Mat3) -> tuple[Six, Mat3]:
     """
     axes, moments = _jacobi(jax.lax.stop_gradient(tensor))
     a = axes
-    rows = [[tensor[i, 0] * a[0][j] + tensor[i, 1] * a[1][j] + tensor[i, 2] * a[2][j] for j in range(3)] for i in range(3)]
+    rows = [
+        [tensor[i, 0] * a[0][j] + tensor[i, 1] * a[1][j] + tensor[i, 2] * a[2][j] for j in range(3)]
+        for i in range(3)
+    ]
 
     def entry(i, j):
         return a[0][i] * rows[0][j] + a[1][i] * rows[1][j] + a[2][i] * rows[2][j]

@@ -89,7 +89,8 @@ def free_body(inertia: Inertia, state0: State, t: ScalarLike) -> State:
     theorem of the Weierstrass sigma function taken half way, proved by differentiation.) Nothing is
     divided by a difference of moments, a rate or an energy: sphere, symmetric tops, plates, spins
     about any axis, the separatrix and rest are ordinary points. The quaternion is continuous in t
-    (it does not jump between q and −q), has length 1, and `R(q) I Ω` stays what it was to round-off.
+    (it does not jump between q and −q), has length 1, and `R(q) I Ω` stays what
+    it was to round-off.
 
     Derivatives with respect to all arguments are closed forms and right to second order at all
     those points: they are taken from the motion as a function of the whole tensor
@@ -119,8 +120,8 @@ def _evaluate(inertia, state0, t):
 def _check(inertia: Inertia, state0: HasSpin) -> None:
     if isinstance(state0, HasPose) or not isinstance(state0, HasSpin):
         raise TypeError(
-            f"free_body: wanted a Spin or an Attitude, got {type(state0).__name__}; a body that also "
-            "moves is free in both: add x + v t yourself, or use simulate"
+            f"free_body: wanted a Spin or an Attitude, got {type(state0).__name__}; a body that "
+            "also moves is free in both: add x + v t yourself, or use simulate"
         )
     tensor = _checks.floating(inertia.tensor, (3, 3), "inertia tensor")
     arrays = {"omega": _checks.floating(state0.omega, (3,), "omega")}

@@ -21,8 +21,8 @@ def body_period(inertia: Inertia, omega0: Vec3Like) -> Scalar:
 
     Seen from the body, the angular momentum circles the axis of the smallest or of the largest
     moment. This is the time of one round: the rotation period about that axis (5.41 days about the
-    long axis for 4179 Toutatis). For a spin about a stable axis it is the limit, the period of small
-    wobbles. It is infinite on the separatrix, for a sphere and at rest.
+    long axis for 4179 Toutatis). For a spin about a stable axis it is the limit, the period of
+    small wobbles. It is infinite on the separatrix, for a sphere and at rest.
 
     **Arguments:** `inertia` of the body about its centre of mass (kg m²); `omega0` (3,) Ω at any
     moment, rad/s, body frame. **Returns** a scalar, s.
@@ -34,8 +34,9 @@ def body_period(inertia: Inertia, omega0: Vec3Like) -> Scalar:
     **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
 
     >>> import rigidjax as rj, jax.numpy as jnp
-    >>> float(body_period(rj.Inertia.from_principal(1.0, 2.0, 2.0), jnp.array([1.0, 0.5, 0.0])))  # 4π
-    12.566370614359172
+    >>> top = rj.Inertia.from_principal(1.0, 2.0, 2.0)
+    >>> bool(abs(body_period(top, jnp.array([1.0, 0.5, 0.0])) - 4 * jnp.pi) < 1e-14)
+    True
     """
     moments, momentum, exponent = _scaled(inertia, omega0)
     return jnp.ldexp(_periods(moments, momentum)[0], -exponent)
@@ -77,7 +78,7 @@ def _scaled(inertia: Inertia, omega0):
 
 
 def _periods(moments: Six, momentum: Triple) -> tuple[Scalar, Scalar]:
-    body, _, energy2 = reciprocal(moments, momentum)
+    body, _, _ = reciprocal(moments, momentum)
     v = tensor_flow.invariants(body, momentum)
     h = jnp.sqrt(sum(p * p for p in momentum))
     endless = jax.lax.stop_gradient((v.gap == 0) | (jnp.maximum(v.p, v.q) <= 0))
@@ -114,12 +115,12 @@ def _precession(moments: Six, momentum: Triple, period: Scalar) -> Scalar:
 @_precession.defjvp
 def _precession_jvp(primals, tangents):
     moments, momentum, period = primals
-    (body, _, energy2), (_, d_k, d_energy2) = jax.jvp(
-        reciprocal, (moments, momentum), tangents[:2]
-    )
+    (body, _, energy2), (_, d_k, d_energy2) = jax.jvp(reciprocal, (moments, momentum), tangents[:2])
     _, g = first_order(body, momentum, period)
     along = 0.5 * period * d_energy2 + energy2 * tangents[2]
-    along = along + 0.5 * sum(g[i] * d_k[i] for i in range(3)) + sum(g[i] * d_k[i] for i in range(3, 6))
+    along = (
+        along + 0.5 * sum(g[i] * d_k[i] for i in range(3)) + sum(g[i] * d_k[i] for i in range(3, 6))
+    )
     h = jnp.sqrt(sum(p * p for p in momentum))
     return _precession(*primals), along / h
 

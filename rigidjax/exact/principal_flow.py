@@ -59,9 +59,7 @@ def orbit(moments: Triple, momentum: Triple) -> Orbit:
     turn = d13 * h * mu
     m = Modulus(p, q, gap)
     m, mu, turn, half = fence((m, mu, turn, half_period(m, mu, turn)), opaque_one(h))
-    return Orbit(
-        a, d12, d13, d23, (p1, p2, p3), h, m, mu, turn, half, swap
-    )
+    return Orbit(a, d12, d13, d23, (p1, p2, p3), h, m, mu, turn, half, swap)
 
 
 def reduced(o: Orbit, u: Scalar) -> tuple[Elliptic, Scalar]:
@@ -105,7 +103,7 @@ def momentum_and_turn(o: Orbit, t: Scalar) -> tuple[Triple, Four]:
     one = opaque_one(t)
     f, phase = fence(reduced(o, 0.5 * t), one)
     full = fence(duplicate(f, o.modulus, o.mu, o.turn), one)
-    k1, k2, k3 = fence(momentum_at(o, f), one)
+    _, k2, k3 = fence(momentum_at(o, f), one)
     m1, m2, m3 = fence(momentum_at(o, full), one)
 
     # b turns about (half way) momentum's partner axes, the rest is a turn about the momentum.

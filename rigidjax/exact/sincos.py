@@ -1,4 +1,4 @@
-"""Sine and cosine by short polynomials: XLA calls scalar libm for batches in float64 (20 times slower).
+"""Sine and cosine by short polynomials: for batches in float64 XLA calls scalar libm.
 
 Cody and Waite 1980 (reduction by π/2 in parts), fdlibm's and Cephes' minimax kernels. Right to one
 or two units in the last place up to 1e6 rad; beyond that within the round-off of the argument.
@@ -31,7 +31,7 @@ _COS32 = (4.166664568298827e-2, -1.388731625493765e-3, 2.443315711809948e-5)
 
 
 def sincos(x: Scalar) -> tuple[Scalar, Scalar]:
-    """sin x and cos x of an angle in radians. Not for differentiation."""
+    """Sin x and cos x of an angle in radians. Not for differentiation."""
     wide = x.dtype == jnp.float64
     parts, sines, cosines = (_PARTS64, _SIN64, _COS64) if wide else (_PARTS32, _SIN32, _COS32)
     n = jnp.round(x * (2.0 / jnp.pi))

@@ -39,6 +39,7 @@ from rigidjax._types import Scalar
 from rigidjax.exact.doubling import limits
 from rigidjax.exact.triples import Six, Triple, adjugate, determinant, product, times
 
+
 class Differences(NamedTuple):
     """K = I⁻¹ but for its trace: differences of its diagonal, and its off-diagonal entries."""
 
@@ -109,11 +110,7 @@ def start(u: Scalar, v: Invariants) -> Sigma:
         + (-c1 / 6)
         + (c1 * c1 / 120 + c2 / 10)
         - (c1 * c1 * c1 / 5040 + c1 * c2 * (11 / 420) + c3 / 14)
-        + (
-            c1 * c1 * (c1 * c1 / 362880 + c2 * (17 / 5040))
-            + c1 * c3 / 28
-            + c2 * c2 / 120
-        )
+        + (c1 * c1 * (c1 * c1 / 362880 + c2 * (17 / 5040)) + c1 * c3 / 28 + c2 * c2 / 120)
     )
     # T = √(1 − x), x = σ²E.
     ss = s * s
@@ -149,18 +146,12 @@ def double(f: Sigma, v: Invariants) -> Sigma:
     n11 = jnp.where(
         ss * jax.lax.stop_gradient(q) < 0.5,
         n22 - 2.0 * (m33 * (ss * q) + (x13 - x23)),
-        m11 * m11
-        + x12
-        + x13
-        - ss * ss * (2.0 * (e12 * e12 + e13 * e13) - e23 * e23 - q * gap),
+        m11 * m11 + x12 + x13 - ss * ss * (2.0 * (e12 * e12 + e13 * e13) - e23 * e23 - q * gap),
     )
     n33 = jnp.where(
         ss * jax.lax.stop_gradient(p) < 0.5,
         n22 - 2.0 * (m11 * (ss * p) + (x13 - x12)),
-        m33 * m33
-        + x13
-        + x23
-        - ss * ss * (2.0 * (e13 * e13 + e23 * e23) - e12 * e12 + p * gap),
+        m33 * m33 + x13 + x23 - ss * ss * (2.0 * (e13 * e13 + e23 * e23) - e12 * e12 + p * gap),
     )
     n12 = 2.0 * (m12 * m33 - m13 * m23)
     n13 = 2.0 * (m13 * m22 - m12 * m23)
@@ -262,9 +253,7 @@ def period(v: Invariants) -> Scalar:
     return 2.0 * jnp.pi / a
 
 
-def momentum_and_integral(
-    body: Differences, momentum: Triple, t: Scalar
-) -> tuple[Triple, Six]:
+def momentum_and_integral(body: Differences, momentum: Triple, t: Scalar) -> tuple[Triple, Six]:
     """Π(t) and G = ∫₀ᵗ Π Πᵀ dt."""
     v = invariants(body, momentum)
     big = jax.lax.stop_gradient(jnp.maximum(v.p, v.q))

@@ -1,13 +1,14 @@
-"""Vectors, quaternions and symmetric matrices as tuples of scalars: 3, 4 and (11, 22, 33, 12, 13, 23).
+"""Vectors, quaternions and symmetric matrices (11, 22, 33, 12, 13, 23) as tuples of scalars.
 
 Written on components so that XLA makes one kernel of a batch (a stacked array costs ten times it).
 """
 
 from rigidjax._types import Scalar
 
-Triple = tuple[Scalar, Scalar, Scalar]
-Four = tuple[Scalar, Scalar, Scalar, Scalar]
-Six = tuple[Scalar, Scalar, Scalar, Scalar, Scalar, Scalar]
+# Of 3, 4 and 6 entries; generators do not carry their length for a type checker.
+Triple = tuple[Scalar, ...]
+Four = tuple[Scalar, ...]
+Six = tuple[Scalar, ...]
 
 
 def times(m: Six, v: Triple) -> Triple:
@@ -41,7 +42,14 @@ def determinant(m: Six) -> Scalar:
 
 def adjugate(m: Six) -> Six:
     a, b, c, x, y, z = m
-    return (b * c - z * z, a * c - y * y, a * b - x * x, y * z - x * c, x * z - y * b, x * y - z * a)
+    return (
+        b * c - z * z,
+        a * c - y * y,
+        a * b - x * x,
+        y * z - x * c,
+        x * z - y * b,
+        x * y - z * a,
+    )
 
 
 def cross(a: Triple, b: Triple) -> Triple:

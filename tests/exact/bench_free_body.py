@@ -74,18 +74,29 @@ def main():
     graded, second = compiled(gradient, *one)
     print(f"compile, CPU s: value {first:.1f}, gradient {second:.1f}")
     single, graded = jax.jit(closed), jax.jit(gradient)
-    print(f"one body, us: value {cost(single, *one, inner=500):.1f}, gradient {cost(graded, *one, inner=200):.1f}")
+    print(
+        f"one body, us: value {cost(single, *one, inner=500):.1f}, gradient {cost(graded, *one, inner=200):.1f}"
+    )
     batch, slopes = jax.jit(jax.vmap(closed)), jax.jit(jax.vmap(gradient))
     b, g = cost(batch, tensors, omegas, t) / n, cost(slopes, tensors, omegas, t, repeats=5) / n
     print(f"batch of {n}, us a body: value {b:.2f}, gradient {g:.2f}")
     one_body = jax.jit(jax.vmap(closed, (None, None, 0)))
-    print(f"one body, {n} times, us a time: {cost(one_body, one[0], one[1], jnp.linspace(0, 1e3, n)) / n:.2f}")
-    print(f"SciPy ellipj + ellipkinc, us a body: {scipy_form(r.uniform(0, 10, n), r.uniform(0, 1, n)):.2f}")
+    print(
+        f"one body, {n} times, us a time: {cost(one_body, one[0], one[1], jnp.linspace(0, 1e3, n)) / n:.2f}"
+    )
+    print(
+        f"SciPy ellipj + ellipkinc, us a body: {scipy_form(r.uniform(0, 10, n), r.uniform(0, 1, n)):.2f}"
+    )
     solver = jax.jit(solved)
     for end in (1.0, 10.0, 100.0, 1000.0):
         end = jnp.asarray(end)
-        a, d = cost(single, one[0], one[1], end, inner=200), cost(solver, one[0], one[1], end, repeats=5)
-        print(f"T = {float(end):6.0f}: Dopri8 1e-12 / closed form: one {d / a:.0f}, batch {d / b:.0f} (solver one at a time)")
+        a, d = (
+            cost(single, one[0], one[1], end, inner=200),
+            cost(solver, one[0], one[1], end, repeats=5),
+        )
+        print(
+            f"T = {float(end):6.0f}: Dopri8 1e-12 / closed form: one {d / a:.0f}, batch {d / b:.0f} (solver one at a time)"
+        )
 
 
 if __name__ == "__main__":

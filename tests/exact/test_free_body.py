@@ -1,3 +1,4 @@
+import os
 import sys
 from pathlib import Path
 
@@ -95,14 +96,48 @@ def test_the_oracle_solves_the_differential_equation():
 @pytest.mark.parametrize("name", classes.NAMES)
 def test_right_in_every_class(name):
     # On an unstable axis e^{λt} beats any number of digits, the oracle's too.
-    unstable = name in ("axis 2", "near axis 2", "on separatrix")
-    x = inputs(name, 8, [1.0, 3.0, 10.0, 20.0] if unstable else [1.0, 30.0, 1e3, 1e6])
+    x = inputs(name, 8, [1.0, 3.0, 10.0, 20.0] if name in UNSTABLE else [1.0, 30.0, 1e3, 1e6])
     got = np.asarray(value(jnp.asarray(x)))
     assert np.abs(np.linalg.norm(got[:, :4], axis=1) - 1).max() <= 4e-15
     for row, out in zip(x, got, strict=True):
         # Once the rounding of the input decides the result (an unstable axis), anything goes.
         units = error_in_units(row, out, 2.0**-53)
         assert units < 10, (row, units)
+
+
+UNSTABLE = ("axis 2", "near axis 2", "on separatrix")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", classes.NAMES)
+def test_many_bodies_of_every_class(name):
+    count = int(os.environ.get("RIGIDJAX_BODIES", "10000"))
+    ts = [1.0, 3.0, 10.0, 20.0] if name in UNSTABLE else [1.0, 30.0, 1e3, 1e6]
+    x = inputs(name, count, ts, seed=1)
+    for dtype, eps in ((np.float64, 2.0**-53), (np.float32, 2.0**-24)):
+        rows = x.astype(dtype)
+        got = np.asarray(value(jnp.asarray(rows)), float)
+        assert np.isfinite(got).all()
+        moved = np.abs(np.asarray(jacobian(jnp.asarray(rows.astype(float))))) * np.abs(
+            rows[:, None]
+        )
+        moved = moved.astype(float).sum(2)
+        assert np.isfinite(moved).all()
+        units = []
+        for row, out, m in zip(rows.astype(float), got, moved, strict=True):
+            ref = np.array([float(a - mp.mpf(b)) for a, b in zip(truth(row), out, strict=True)])
+            # What rounding the input moves beyond a radian is not information any more.
+            if eps * np.linalg.norm(m[:4]) > 0.1:
+                continue
+            q = np.linalg.norm(ref[:4]) / (eps * (np.linalg.norm(m[:4]) + 1))
+            size = np.linalg.norm(m[4:]) + np.linalg.norm(out[4:])
+            units.append(max(q, np.linalg.norm(ref[4:]) / (eps * size + 1e-300)))
+        orthogonal = np.abs(np.linalg.norm(got[:, :4], axis=1) - 1).max() / eps
+        print(
+            f"{name:18} {dtype.__name__} {len(units):6} median {np.median(units or [0]):.2f} "
+            f"max {np.max(units or [0]):.1f} |q|-1 {orthogonal:.1f} eps"
+        )
+        assert not units or np.max(units) < 20
 
 
 @pytest.mark.parametrize("scale", [1e-20, 1e37])
@@ -214,7 +249,10 @@ def test_second_derivatives_in_every_class():
     for k, row in enumerate(x):
         h = mp.mpf("1e-10")
         up, down = (
-            true_jacobian([mp.mpf(a) + s * h * mp.mpf(b) for a, b in zip(row, v[k], strict=True)], step="1e-22")
+            true_jacobian(
+                [mp.mpf(a) + s * h * mp.mpf(b) for a, b in zip(row, v[k], strict=True)],
+                step="1e-22",
+            )
             for s in (1, -1)
         )
         ref = c[k] @ ((up - down) / (2 * h)).astype(float)
@@ -253,7 +291,9 @@ def test_periods(omega):
     period = exact.body_period(i, omega)
     again = exact.free_body(i, Spin(omega), period).omega
     np.testing.assert_allclose(again, omega, atol=1e-14)
-    np.testing.assert_allclose(exact.precession_period(i, omega), _mean_precession(i, omega), rtol=1e-13)
+    np.testing.assert_allclose(
+        exact.precession_period(i, omega), _mean_precession(i, omega), rtol=1e-13
+    )
     for function in (exact.body_period, exact.precession_period):
         turn = jnp.array([[0.1, 0.2, -0.1], [0.2, 0.3, 0.15], [-0.1, 0.15, -0.2]])
 
@@ -323,18 +363,30 @@ def test_solver_adjoints_agree():
 @pytest.mark.parametrize(
     ("call", "words"),
     [
-        (lambda: exact.free_body(Inertia(jnp.diag(jnp.array([1.0, 2, -3]))), START, 1.0), "positive"),
-        (lambda: exact.free_body(BODY, Attitude([2.0, 0, 0, 0], [0.0, 1, 0]), 1.0), "unit quaternion"),
+        (
+            lambda: exact.free_body(Inertia(jnp.diag(jnp.array([1.0, 2, -3]))), START, 1.0),
+            "positive",
+        ),
+        (
+            lambda: exact.free_body(BODY, Attitude([2.0, 0, 0, 0], [0.0, 1, 0]), 1.0),
+            "unit quaternion",
+        ),
         (lambda: exact.free_body(BODY, Spin([0.0, jnp.nan, 0]), 1.0), "NaN"),
         (lambda: exact.free_body(BODY, Spin(jnp.ones(3, jnp.float32)), 1.0), "float32"),
         (
-            lambda: exact.free_body(BODY, Rigid([0.0] * 3, [0.0] * 3, [1.0, 0, 0, 0], [0.0] * 3), 1.0),
+            lambda: exact.free_body(
+                BODY, Rigid([0.0] * 3, [0.0] * 3, [1.0, 0, 0, 0], [0.0] * 3), 1.0
+            ),
             "Rigid",
         ),
         (lambda: exact.free_body(BODY, START, [1.0, 2.0]), "vmap"),
         (
             lambda: exact.FreeSolver().init(
-                diffrax.ODETerm(EulerEquations(BODY, ConstantTorque([0.0, 0, 1]))), 0, 1, START, None
+                diffrax.ODETerm(EulerEquations(BODY, ConstantTorque([0.0, 0, 1]))),
+                0,
+                1,
+                START,
+                None,
             ),
             "not free",
         ),

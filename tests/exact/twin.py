@@ -1,9 +1,9 @@
-"""The free body in mpmath, to any number of digits, at any time: Jacobi's solution as in textbooks.
+"""The free body in mpmath, to any number of digits, at any time.
 
-Unlike the code under test: ordered axes, no reduction by periods, the attitude from the precession
-angle of one axis with its integral of the third kind done by Gauss–Legendre quadrature on doubled
-pieces … here replaced by the addition theorem at high precision. It is itself compared with a Taylor
-series of the differential equation (tests/systems/free_body_mp.py) in `test_free_body.py`.
+The closed form at high precision: one ordering of the axes, one expression each, no reduction by
+periods, no choice between equal forms, guard digits for what the doublings lose. It shares its
+formula with the code under test, so `test_free_body.py` first holds it against another method, the
+Taylor series of the differential equation (tests/systems/free_body_mp.py).
 """
 
 import mpmath as mp
