@@ -33,6 +33,9 @@ from rigidjax.motion import (
     NewtonEuler as NewtonEuler,
     Rigid as Rigid,
     Spin as Spin,
+    conserved as conserved,
+    drift as drift,
+    energy as energy,
     lagrangian as lagrangian,
     torques as torques,
 )
