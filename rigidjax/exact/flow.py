@@ -12,6 +12,8 @@ and along it `d(Π·θ)/dt = Π·δΩ = ½ δE₂ + ½ Π·δK Π`, E₂ = Π·K
 That divides by h²: for a small turn, rest included, the derivative is that of the Taylor series.
 """
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 
@@ -58,7 +60,9 @@ def _flow_jvp(primals, tangents):
     d_body, d_k, d_energy2 = fence((d_body, d_k, d_energy2), one)
     rows, g = fence(first_order(body, momentum, t), one)
     inputs = (d_body.d12, d_body.d23, d_body.k12, d_body.k13, d_body.k23, *d_momentum, d_t)
-    d_out = tuple(sum(row[i] * d for i, d in enumerate(inputs)) for row in rows)
+    d_out: Triple = tuple(
+        sum((row[i] * d for i, d in enumerate(inputs)), jnp.zeros_like(t)) for row in rows
+    )
     d_out = fence(d_out, one)
 
     out, turn = fence(flow(moments, momentum, t), one)
@@ -132,7 +136,9 @@ def reciprocal(moments: Six, momentum: Triple):
 def _series(k: Six, momentum: Triple, t: Scalar) -> Four:
     """The turn by its Taylor series: Π' = Π × KΠ, x' = ½ x ⊗ (0, KΠ)."""
     one, zero = jnp.ones_like(t), jnp.zeros_like(t)
-    ps, ws, xs = [tuple(c * t for c in momentum)], [], [(one, zero, zero, zero)]
+    ps: list[Any] = [tuple(c * t for c in momentum)]
+    ws: list[Any] = []
+    xs: list[Any] = [(one, zero, zero, zero)]
     # Powers of t are kept inside the terms: each P and W carries one.
     fresh = opaque_one(t)
     for n in range(_ORDER):
@@ -142,4 +148,4 @@ def _series(k: Six, momentum: Triple, t: Scalar) -> Four:
         if n < _ORDER - 1:
             turns = [cross(ps[j], ws[n - j]) for j in range(n + 1)]
             ps.append(fence(tuple(sum(c) / (n + 1) for c in zip(*turns, strict=True)), fresh))
-    return tuple(sum(c[::-1]) for c in zip(*xs, strict=True))
+    return tuple(sum(c[::-1], zero) for c in zip(*xs, strict=True))

@@ -6,6 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array
 
 from rigidjax import _checks
@@ -104,7 +105,7 @@ def free_body(inertia: Inertia, state0: State, t: ScalarLike) -> State:
     >>> import rigidjax as rj
     >>> state0 = rj.Attitude([1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 1e-4])
     >>> free_body(rj.Inertia.from_principal(1.0, 2.0, 3.0), state0, 20.0).omega
-    Array([-0.42522036, -0.90508985,  0.24550111], dtype=float64)
+    Array([-0.42522037, -0.90508985,  0.24550111], dtype=float64)
     """
     return _evaluate(inertia, state0, _checks.floating(t, (), "t"))
 
@@ -130,7 +131,7 @@ def _check(inertia: Inertia, state0: HasSpin) -> None:
     for name, array in arrays.items():
         if array.dtype != tensor.dtype:
             raise TypeError(f"{name} is {array.dtype}, but the inertia tensor is {tensor.dtype}")
-    if any(isinstance(x, jax.core.Tracer) for x in (tensor, *arrays.values())):
+    if any(isinstance(x, Tracer) for x in (tensor, *arrays.values())):
         return
     tensor = np.asarray(_checks.finite(tensor, "inertia tensor"), dtype=np.float64)
     least = np.linalg.eigvalsh(tensor).min()

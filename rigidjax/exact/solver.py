@@ -47,7 +47,7 @@ class FreeSolver(dfx.AbstractSolver):
     >>> solver = FreeSolver()
     >>> sol = diffrax.diffeqsolve(diffrax.ODETerm(field), solver, 0.0, 20.0, 20.0, y0)
     >>> sol.ys.omega[0]
-    Array([-0.42522036, -0.90508985,  0.24550111], dtype=float64)
+    Array([-0.42522037, -0.90508985,  0.24550111], dtype=float64)
     """
 
     term_structure: ClassVar = dfx.AbstractTerm

@@ -102,7 +102,26 @@ def test_right_in_every_class(name):
     for row, out in zip(x, got, strict=True):
         # Once the rounding of the input decides the result (an unstable axis), anything goes.
         units = error_in_units(row, out, 2.0**-53)
-        assert units < 10, (row, units)
+        assert units < 5, (row, units)
+
+
+HEAD, TAIL = slice(0, 4), slice(4, 7)
+
+
+def measure(error, moved_q, moved_omega, size, eps):
+    q = np.linalg.norm(error[HEAD]) / (moved_q + eps)
+    return max(q, np.linalg.norm(error[TAIL]) / (moved_omega + eps * size + 1e-300))
+
+
+def rounded(row, eps, count=8):
+    """How the result moves when each input is off by up to one rounding."""
+    r, there = np.random.default_rng(5), truth(row)
+    moves = []
+    for signs in r.choice([-1.0, 1.0], (count, 14)):
+        off = [mp.mpf(a) * (1 + mp.mpf(eps) * mp.mpf(b)) for a, b in zip(row, signs, strict=True)]
+        off[9:13] = [mp.mpf(a) for a in row[9:13]]
+        moves.append(np.array([float(a - b) for a, b in zip(truth(off), there, strict=True)]))
+    return moves
 
 
 UNSTABLE = ("axis 2", "near axis 2", "on separatrix")
@@ -129,15 +148,20 @@ def test_many_bodies_of_every_class(name):
             # What rounding the input moves beyond a radian is not information any more.
             if eps * np.linalg.norm(m[:4]) > 0.1:
                 continue
-            q = np.linalg.norm(ref[:4]) / (eps * (np.linalg.norm(m[:4]) + 1))
-            size = np.linalg.norm(m[4:]) + np.linalg.norm(out[4:])
-            units.append(max(q, np.linalg.norm(ref[4:]) / (eps * size + 1e-300)))
+            size = np.linalg.norm(out[4:])
+            one = measure(ref, eps * np.linalg.norm(m[:4]), eps * np.linalg.norm(m[4:]), size, eps)
+            if one > 5:
+                # Within round-off of the separatrix a derivative says little: round the inputs.
+                moves = rounded(row, eps)
+                q, omega = (max(np.linalg.norm(d[k]) for d in moves) for k in (HEAD, TAIL))
+                one = min(one, measure(ref, q, omega, size, eps))
+            units.append(one)
         orthogonal = np.abs(np.linalg.norm(got[:, :4], axis=1) - 1).max() / eps
         print(
             f"{name:18} {dtype.__name__} {len(units):6} median {np.median(units or [0]):.2f} "
             f"max {np.max(units or [0]):.1f} |q|-1 {orthogonal:.1f} eps"
         )
-        assert not units or np.max(units) < 20
+        assert not units or np.max(units) <= 5
 
 
 @pytest.mark.parametrize("scale", [1e-20, 1e37])

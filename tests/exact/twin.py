@@ -47,8 +47,10 @@ def _principal_flow(a, momentum, t):
     # Small enough that the first neglected term of the series is below round-off.
     size = mp.sqrt(max(p, q, mu)) * abs(t)
     n = max(int(mp.log(size + mp.mpf(10) ** -30, 2)), 0) + int(mp.mp.prec / 6) + 2
-    # Doubling loses two bits a step.
-    with mp.workprec(mp.mp.prec + 4 * n + 20):
+    # A doubling loses two bits, and beside a saddle as many as |p − q|/max(p, q) is small.
+    near = abs(p - q) / max(p, q) if max(p, q) > 0 and p != q else mp.mpf(1)
+    lost = 4 + max(0, -2 * int(mp.log(near, 2)))
+    with mp.workprec(mp.mp.prec + lost * n + 20):
         u = t / mp.mpf(2) ** (n + 1)
         S = u - (p + q) * u**3 / 6 + (p * p + 14 * p * q + q * q) * u**5 / 120
         C, D = mp.sqrt(1 - p * S * S), mp.sqrt(1 - q * S * S)
