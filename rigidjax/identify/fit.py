@@ -170,7 +170,7 @@ def fit(
 
     Levenberg–Marquardt of optimistix, Jacobians by forward mode through the motion.
 
-    **Raises:** `ValueError` for fewer than one start.
+    **Raises:** `TypeError` for what is no `Problem`, `ValueError` for fewer than one start.
 
     >>> import jax.numpy as jnp, rigidjax as rj
     >>> ts = jnp.linspace(0.0, 10.0, 60)
@@ -181,6 +181,8 @@ def fit(
     ...                                 jnp.diag(jnp.array([1.0, 2.0, 2.5])), atol=1e-6))
     ('ok', True)
     """
+    if not isinstance(problem, Problem):
+        raise TypeError(f"fit: wanted a Problem, got {type(problem).__name__}")
     if starts < 1:
         raise ValueError(f"fit: wanted at least one start, got {starts}")
     key = jax.random.key(0) if key is None else key

@@ -41,6 +41,8 @@ class Problem(eqx.Module):
     body besides its own spin, or `None`; `loss` how an outlier counts: `SoftL1()`, or `None` for
     plain least squares. The motion starts at the first time of the recording.
 
+    **Raises:** `TypeError` for arguments of another kind.
+
     >>> import rigidjax as rj
     >>> record = rj.identify.Recording([0.0, 1.0], (rj.identify.Gyro(), [[1.0, 0, 0]] * 2))
     >>> rj.identify.Problem(record, rj.identify.Ratios()).typical_rate
@@ -62,6 +64,13 @@ class Problem(eqx.Module):
         torque: Torque | None = None,
         loss: SoftL1 | None = None,
     ):
+        if not isinstance(recording, Recording):
+            raise TypeError(f"Problem: wanted a Recording, got {type(recording).__name__}")
+        if not isinstance(body, AbstractBodyChart):
+            raise TypeError(
+                "Problem: wanted what of the body is free, such as Ratios() or PrincipalRatios(), "
+                f"got {type(body).__name__}"
+            )
         self.recording, self.body, self.torque, self.loss = recording, body, torque, loss
         self.reference = _first_attitude(recording)
         # An array, not a float: another recording must not compile again.

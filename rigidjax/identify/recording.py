@@ -63,6 +63,8 @@ class Recording(eqx.Module):
 
 def _reading(t: np.ndarray, sensor: AbstractSensor, values: Any, mask: Any = None) -> Reading:
     name = type(sensor).__name__
+    if not isinstance(sensor, AbstractSensor):
+        raise TypeError(f"Recording: wanted pairs (sensor, values), got {name} for a sensor")
     values = np.asarray(values, float)
     wanted = (t.size, *sensor.reading_shape)
     if values.shape != wanted:

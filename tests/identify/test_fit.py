@@ -150,6 +150,14 @@ def test_other_mistakes_are_named(tumble):
     _, ts, ys = tumble
     record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), ys.omega))
     problem = rj.identify.Problem(record, rj.identify.Ratios())
+    with pytest.raises(TypeError, match="wanted a Problem, got Recording"):
+        rj.identify.fit(record)
+    with pytest.raises(TypeError, match=r"such as Ratios\(\) or .*got Inertia"):
+        rj.identify.Problem(record, rj.Inertia.from_principal(1.0, 2.0, 3.0))
+    with pytest.raises(TypeError, match="wanted a Recording, got Problem"):
+        rj.identify.Problem(problem, rj.identify.Ratios())
+    with pytest.raises(TypeError, match="got ndarray for a sensor"):
+        rj.identify.Recording(ts, (np.zeros(3), ys.omega))
     with pytest.raises(ValueError, match="at least one start, got 0"):
         rj.identify.fit(problem, starts=0)
     with pytest.raises(ValueError, match="positive standard deviation"):
