@@ -1,5 +1,7 @@
 """The restricted three-body problem and Hill's: published values, roots at 50 digits, orbits."""
 
+import functools
+
 import diffrax as dfx
 import equinox as eqx
 import jax
@@ -62,7 +64,7 @@ def quintic(mu, which):
         3: [1, 2 + mu, 1 + 2 * mu, mu - 1, 2 * mu - 2, mu - 1],
     }[which]
     start = mp.mpf("0.9") if which == 3 else mp.cbrt(mu / 3)
-    return mp.findroot(lambda g: mp.polyval(c, g), start)
+    return mp.findroot(lambda g: functools.reduce(lambda total, a: total * g + a, c), start)
 
 
 @pytest.mark.parametrize("mu", [1e-12, 3.0035e-6, 9.5e-4, PYKEP_MU, 0.2, 0.5])
