@@ -87,6 +87,20 @@ def test_derivatives_at_and_near_the_singular_case(sequence):
         assert abs(np.asarray(got) - m).max() < 1e-6
 
 
+@pytest.mark.parametrize("sequence", SEQUENCES)
+def test_float32_keeps_the_matrix_in_every_sequence(sequence):
+    """Row R8 in single precision: both singular cases, at and near them, and in between."""
+    symmetric = sequence[0].lower() == sequence[2].lower()
+    ends = (0.0, np.pi) if symmetric else (-np.pi / 2, np.pi / 2)
+    away = [0.0, 1e-7, 1e-5, 1e-3, 0.7]
+    middle = np.array([ends[0] + d for d in away] + [ends[1] - d for d in away])
+    angles = np.stack([np.full_like(middle, 1.0), middle, np.full_like(middle, -2.0)], axis=1)
+    trip = jax.jit(jax.vmap(lambda m: euler.to_matrix(euler.from_matrix(m, sequence), sequence)))
+    m = jax.vmap(lambda a: euler.to_matrix(a, sequence))(jnp.asarray(angles, jnp.float32))
+    assert trip(m).dtype == jnp.float32
+    assert np.abs(np.asarray(trip(m)) - np.asarray(m)).max() < 1e-6
+
+
 def test_world_frame_and_float32():
     a, r = jnp.array([0.3, 1.0, -0.4], jnp.float32), jnp.array([1.0, 2.0, 3.0], jnp.float32)
     m = euler.to_matrix(a)
