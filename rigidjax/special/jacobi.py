@@ -50,7 +50,7 @@ def sncndn(
     m + m1 ≠ 1.
 
     >>> [round(float(x), 12) for x in sncndn(1.0, 0.5)]
-    [0.803001820652, 0.595976566803, 0.823161001284]
+    [0.803001824896, 0.595976567672, 0.823161001632]
     """
     u, m, m1 = common(u=u, **complementary("m", m, m1))
     s, c, d, _ = _functions(u, exact_complement(m, m1), m1)
