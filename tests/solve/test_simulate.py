@@ -194,7 +194,7 @@ def test_damping_of_a_sphere_is_exponential():
 
 
 def test_float32_stays_float32_and_says_what_it_cannot_reach():
-    single = lambda x: jnp.asarray(x, jnp.float32)  # noqa: E731
+    single = lambda x: jnp.asarray(x, jnp.float32)
     body = rj.Inertia(single(TENSOR))
     start = rj.Attitude(single(Q), single(OMEGA))
     ts = single([0.0, 1.0, 2.5])
