@@ -76,7 +76,7 @@ def test_intervals_hold_the_truth_in_ninety_of_a_hundred_records(found):
     truth = np.concatenate(
         [np.exp(np.asarray(problem.body.log_ratios(found.body))), np.asarray(found.state0.omega)]
     )
-    held = np.zeros(5)
+    held, plain = np.zeros(5), 0
     for number in range(100):
         turns = jnp.asarray(np.radians(15.0) * rng.normal(size=(17, 3)))
         read = jax.vmap(lambda q, e: rj.quaternion.multiply(q, rj.quaternion.exp(e)))(
@@ -89,7 +89,10 @@ def test_intervals_hold_the_truth_in_ninety_of_a_hundred_records(found):
             starts=16,
             key=jax.random.key(number),
         )
-        assert again.ok
+        # At 15° a second minimum is now and then nearly as likely: that must be said, no more.
+        assert again.ok or again.status.startswith("ambiguous")
+        plain += again.ok
         bounds = np.array(list(again.interval(0.95).values()))
         held += (bounds[:, 0] <= truth) & (truth <= bounds[:, 1])
     assert (held >= 90).all(), held
+    assert plain >= 90, plain
