@@ -5,7 +5,7 @@ import functools
 import mpmath as mp
 
 
-def attitude_and_rate(inertia, q0, omega0, t, *, digits=34, order=32, longest=0.1):
+def attitude_and_rate(inertia, q0, omega0, t, *, digits=50, order=32, longest=0.1):
     """Quaternion (4) and body rate (3) at time t, as lists of mpf.
 
     `inertia` 3×3 nested list, `q0` (w, x, y, z) of any length (it is scaled to one), `omega0`.
@@ -64,7 +64,7 @@ def jacobian(inertia, q0, omega0, t, *, step="1e-10"):
 
     Hashable arguments: nested tuples.
     """
-    with mp.workdps(34):
+    with mp.workdps(50):
         places = [(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)]
 
         def run(index, change):
