@@ -114,7 +114,7 @@ class Tsitouras5(dfx.AbstractAdaptiveSolver):
 
 
 class DormandPrince8(dfx.AbstractAdaptiveSolver):
-    """The method DOP853 of order 8: twelve stages, estimates of orders 5 and 3. The default.
+    """The method DOP853 of order 8: twelve stages, estimates of orders 5 and 3.
 
     For everything smooth, from 1e-4 to round-off. Stages and projection as for `RungeKutta4`;
     dense output of degree 7, whose three more stages are computed only where it is asked for.

@@ -2,7 +2,7 @@
 
 A vector field is written on arrays of 3 and 4 numbers. XLA on CPU makes one kernel of each small
 array operation, and of a step of twelve stages hundreds; of the same step on scalars it makes a
-few, and of the loop around it one, 10 to 20 times faster. So the field is traced once, and its
+few, and of the loop around it one. So the field is traced once, and its
 operations are carried out number by number: elementwise ones on each element, slices and stacks by
 moving references, sums and products of matrices written out (which also keeps them out of TF32).
 What is not known here is called on arrays, as it was, with its own derivative rules.
