@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
 import diffrax as dfx
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
@@ -46,7 +47,29 @@ class NestedInterpolation(dfx.AbstractLocalInterpolation):
         return on_the_group(jax.tree.map(value, self.y0, self.coefficients))
 
 
-class RungeKutta4(dfx.AbstractAdaptiveSolver):
+class AbstractExplicit(dfx.AbstractAdaptiveSolver):
+    """All stages of `tableau` inside one step, on scalars; subclasses name the tableau."""
+
+    term_structure: ClassVar = dfx.ODETerm
+    interpolation_cls: ClassVar = NestedInterpolation
+    tableau: eqx.AbstractClassVar[Tableau]
+
+    def order(self, terms: Any) -> int:
+        return self.tableau.order
+
+    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> None:
+        return None
+
+    def step(
+        self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Any, made_jump: Any
+    ) -> Any:
+        return _diffrax_step(self.tableau, terms, t0, t1, y0, args)
+
+    def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
+        return terms.vf(t0, y0, args)
+
+
+class RungeKutta4(AbstractExplicit):
     """The classical Runge–Kutta method: order 4, four stages, an estimate of order 3.
 
     For coarse tolerances (1e-3) and torques known to few digits. Every stage of a step is written
@@ -63,26 +86,10 @@ class RungeKutta4(dfx.AbstractAdaptiveSolver):
     Array(0.47942554, dtype=float64)
     """
 
-    term_structure: ClassVar = dfx.ODETerm
-    interpolation_cls: ClassVar = NestedInterpolation
     tableau: ClassVar[Tableau] = KUTTA4
 
-    def order(self, terms: Any) -> int:
-        return self.tableau.order
 
-    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> None:
-        return None
-
-    def step(
-        self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Any, made_jump: Any
-    ) -> Any:
-        return _diffrax_step(self.tableau, terms, t0, t1, y0, args)
-
-    def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
-        return terms.vf(t0, y0, args)
-
-
-class Tsitouras5(dfx.AbstractAdaptiveSolver):
+class Tsitouras5(AbstractExplicit):
     """Tsitouras' method of order 5, six stages, with an estimate of order 4.
 
     For tolerances about 1e-4 to 1e-6. Stages, projection and dense output (quartic) as for
@@ -94,26 +101,10 @@ class Tsitouras5(dfx.AbstractAdaptiveSolver):
     5
     """
 
-    term_structure: ClassVar = dfx.ODETerm
-    interpolation_cls: ClassVar = NestedInterpolation
     tableau: ClassVar[Tableau] = TSITOURAS5
 
-    def order(self, terms: Any) -> int:
-        return self.tableau.order
 
-    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> None:
-        return None
-
-    def step(
-        self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Any, made_jump: Any
-    ) -> Any:
-        return _diffrax_step(self.tableau, terms, t0, t1, y0, args)
-
-    def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
-        return terms.vf(t0, y0, args)
-
-
-class DormandPrince8(dfx.AbstractAdaptiveSolver):
+class DormandPrince8(AbstractExplicit):
     """The method DOP853 of order 8: twelve stages, estimates of orders 5 and 3.
 
     For everything smooth, from 1e-4 to round-off. Stages and projection as for `RungeKutta4`;
@@ -126,26 +117,7 @@ class DormandPrince8(dfx.AbstractAdaptiveSolver):
     8
     """
 
-    term_structure: ClassVar = dfx.ODETerm
-    interpolation_cls: ClassVar = NestedInterpolation
     tableau: ClassVar[Tableau] = DORMAND_PRINCE8
-
-    def order(self, terms: Any) -> int:
-        return self.tableau.order
-
-    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> None:
-        return None
-
-    def step(
-        self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Any, made_jump: Any
-    ) -> Any:
-        return _diffrax_step(self.tableau, terms, t0, t1, y0, args)
-
-    def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
-        return terms.vf(t0, y0, args)
-
-
-ExplicitSolver = RungeKutta4 | Tsitouras5 | DormandPrince8
 
 
 def advance(

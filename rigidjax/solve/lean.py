@@ -17,9 +17,9 @@ from jaxtyping import Array
 from rigidjax.motion import Attitude, AttitudeEquations, on_the_group
 from rigidjax.solve import splitting
 from rigidjax.solve.components import join, split
-from rigidjax.solve.explicit import Atoms, ExplicitSolver, advance, error_estimate
+from rigidjax.solve.explicit import AbstractExplicit, Atoms, advance, error_estimate
 from rigidjax.solve.scalarise import scalarise
-from rigidjax.solve.splitting import SplittingSolver
+from rigidjax.solve.splitting import AbstractSplitting
 
 # What diffrax.PIDController does unless told: the same steps, so that figures can be compared.
 _SAFETY, _SMALLEST, _LARGEST = 0.9, 0.2, 10.0
@@ -49,7 +49,7 @@ class _Span(NamedTuple):
 
 
 def fixed(
-    solver: ExplicitSolver, field: Callable[..., Any], ts: Array, y0: Any, substeps: Any
+    solver: AbstractExplicit, field: Callable[..., Any], ts: Array, y0: Any, substeps: Any
 ) -> Any:
     """`substeps` equal steps between each two times of `ts`.
 
@@ -84,7 +84,7 @@ def fixed(
 
 
 def adaptive(
-    solver: ExplicitSolver,
+    solver: AbstractExplicit,
     field: Callable[..., Any],
     ts: Array,
     y0: Any,
@@ -150,7 +150,7 @@ def adaptive(
 
 
 def _stepper(
-    solver: ExplicitSolver, field: Callable[..., Any], t0: Array, y0: Any
+    solver: AbstractExplicit, field: Callable[..., Any], t0: Array, y0: Any
 ) -> Callable[[Any, Any, Atoms], tuple[Atoms, Atoms]]:
     """One step and its error on scalars, of a field that is traced here and only here."""
     numbers = scalarise(lambda t, y: field(t, y, None), t0, y0)
@@ -207,7 +207,7 @@ def _first_step(field: Any, order: int, t0: Array, y0: Any, rtol: Any, atol: Any
 
 
 def split_fixed(
-    solver: SplittingSolver, field: AttitudeEquations, ts: Array, y0: Attitude, substeps: Any
+    solver: AbstractSplitting, field: AttitudeEquations, ts: Array, y0: Attitude, substeps: Any
 ) -> Attitude:
     """As `fixed`, with a splitting; the loop carries the momentum in principal axes.
 

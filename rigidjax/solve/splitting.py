@@ -9,6 +9,7 @@ steps are equal, and a torque-free scene costs one formula and no error at all.
 from typing import Any, ClassVar, NamedTuple
 
 import diffrax as dfx
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
@@ -78,7 +79,29 @@ class Frame(NamedTuple):
     axes: Array
 
 
-class Splitting2(dfx.AbstractSolver):
+class AbstractSplitting(dfx.AbstractSolver):
+    """Kicks and exact free flows in the order that `composition` says; subclasses name it."""
+
+    term_structure: ClassVar = dfx.ODETerm
+    interpolation_cls: ClassVar = NestedInterpolation
+    composition: eqx.AbstractClassVar[Composition]
+
+    def order(self, terms: Any) -> int:
+        return self.composition.order
+
+    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> Frame:
+        return frame_of(_field_of(terms)[0], t0, y0)
+
+    def step(
+        self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Frame, made_jump: Any
+    ) -> Any:
+        return _diffrax_step(self.composition, terms, t0, t1, y0, args, solver_state)
+
+    def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
+        return terms.vf(t0, y0, args)
+
+
+class Splitting2(AbstractSplitting):
     """Order 2: half a kick, the exact free motion, half a kick (Strang).
 
     For long runs, equal steps and torques that are small beside the free motion. The torque may
@@ -98,26 +121,10 @@ class Splitting2(dfx.AbstractSolver):
     Array(0.47942554, dtype=float64)
     """
 
-    term_structure: ClassVar = dfx.ODETerm
-    interpolation_cls: ClassVar = NestedInterpolation
     composition: ClassVar[Composition] = STRANG
 
-    def order(self, terms: Any) -> int:
-        return self.composition.order
 
-    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> Frame:
-        return frame_of(_field_of(terms)[0], t0, y0)
-
-    def step(
-        self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Frame, made_jump: Any
-    ) -> Any:
-        return _diffrax_step(self.composition, terms, t0, t1, y0, args, solver_state)
-
-    def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
-        return terms.vf(t0, y0, args)
-
-
-class Splitting4(dfx.AbstractSolver):
+class Splitting4(AbstractSplitting):
     """Order 4: seven kicks and six free flows. For long runs; see `Splitting2` for what it asks.
 
     Source: Blanes and Moan 2002, doi:10.1016/S0377-0427(01)00492-7, method SRKN6b.
@@ -126,26 +133,10 @@ class Splitting4(dfx.AbstractSolver):
     4
     """
 
-    term_structure: ClassVar = dfx.ODETerm
-    interpolation_cls: ClassVar = NestedInterpolation
     composition: ClassVar[Composition] = SRKN6
 
-    def order(self, terms: Any) -> int:
-        return self.composition.order
 
-    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> Frame:
-        return frame_of(_field_of(terms)[0], t0, y0)
-
-    def step(
-        self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Frame, made_jump: Any
-    ) -> Any:
-        return _diffrax_step(self.composition, terms, t0, t1, y0, args, solver_state)
-
-    def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
-        return terms.vf(t0, y0, args)
-
-
-class Splitting6(dfx.AbstractSolver):
+class Splitting6(AbstractSplitting):
     """Order 6: twelve kicks and eleven free flows. For long runs; see `Splitting2`.
 
     Source: Blanes and Moan 2002, doi:10.1016/S0377-0427(01)00492-7, method SRKN11b.
@@ -154,26 +145,7 @@ class Splitting6(dfx.AbstractSolver):
     6
     """
 
-    term_structure: ClassVar = dfx.ODETerm
-    interpolation_cls: ClassVar = NestedInterpolation
     composition: ClassVar[Composition] = SRKN11
-
-    def order(self, terms: Any) -> int:
-        return self.composition.order
-
-    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> Frame:
-        return frame_of(_field_of(terms)[0], t0, y0)
-
-    def step(
-        self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Frame, made_jump: Any
-    ) -> Any:
-        return _diffrax_step(self.composition, terms, t0, t1, y0, args, solver_state)
-
-    def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
-        return terms.vf(t0, y0, args)
-
-
-SplittingSolver = Splitting2 | Splitting4 | Splitting6
 
 
 def frame_of(field: Any, t0: Any, y0: Any) -> Frame:
