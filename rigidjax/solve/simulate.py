@@ -1,5 +1,6 @@
 """The one front door: a body, where it starts, when to look, and what turns it."""
 
+import functools
 import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -29,6 +30,11 @@ from rigidjax.motion.torques import Torque, jumps_of, require_rung
 from rigidjax.solve.projected import Projected
 
 State = Spin | Attitude | Rigid | Point
+
+# Made once: building a Module costs as much as ten steps, and `jit` compares it leaf by leaf.
+_SOLVER = Projected(dfx.Dopri8())
+_ADJOINT = dfx.RecursiveCheckpointAdjoint()
+_NO_METER = dfx.NoProgressMeter()
 
 
 class Solution(eqx.Module):
@@ -217,19 +223,17 @@ def simulate(
     dtype = times.dtype
     for leaf in jax.tree.leaves(state0):
         dtype = jnp.promote_types(dtype, leaf.dtype)
-    times = times.astype(dtype)
-    state0 = jax.tree.map(lambda leaf: leaf.astype(dtype), state0)
+    times, state0 = jax.tree.map(lambda leaf: _as(leaf, dtype), (times, state0))
     require_fit(body, state0, torque)
     if body is not None:
         body = body.invertible()
     controller = stepsize_controller
     if controller is None:
         rtol, atol = _tolerances(rtol, atol, dtype)
-        controller = dfx.PIDController(rtol=rtol, atol=atol)
-        jumps = jumps_of(torque)
-        if jumps.size:
+        controller = _controller(rtol, atol)
+        if hasattr(torque, "jump_times") and jumps_of(torque).size:
             # An adaptive step passes over a short pulse without seeing it.
-            jump_ts = jnp.sort(jumps.astype(dtype))
+            jump_ts = jnp.sort(jumps_of(torque).astype(dtype))
             controller = dfx.ClipStepSizeController(controller, jump_ts=jump_ts)
     elif rtol is not None or atol is not None:
         raise ValueError("simulate: give either rtol and atol or a stepsize_controller, not both")
@@ -239,11 +243,11 @@ def simulate(
     setup = _Setup(
         body=body,
         torque=torque,
-        solver=Projected(dfx.Dopri8() if solver is None else solver),
+        solver=_SOLVER if solver is None else Projected(solver),
         controller=controller,
         dt0=None if dt0 is None else jnp.asarray(dt0, dtype),
-        adjoint=dfx.RecursiveCheckpointAdjoint() if adjoint is None else adjoint,
-        progress_meter=dfx.NoProgressMeter() if progress_meter is None else progress_meter,
+        adjoint=_ADJOINT if adjoint is None else adjoint,
+        progress_meter=_NO_METER if progress_meter is None else progress_meter,
         max_steps=max_steps,
         throw=throw,
     )
@@ -329,6 +333,16 @@ def _tolerances(rtol: float | None, atol: float | None, dtype: Any) -> tuple[flo
     return rtol, atol
 
 
+@functools.cache
+def _controller(rtol: float, atol: float) -> dfx.PIDController:
+    return dfx.PIDController(rtol=rtol, atol=atol)
+
+
+def _as(leaf: Array, dtype: Any) -> Array:
+    # Outside of `jit` even a conversion to the same dtype costs as much as a step.
+    return leaf if leaf.dtype == dtype else leaf.astype(dtype)
+
+
 def _check_times(ts: Any) -> Array:
     try:
         length = np.shape(ts)
@@ -338,7 +352,8 @@ def _check_times(ts: Any) -> Array:
         raise ValueError(f"ts: wanted at least two times, shape (T,), got shape {length}")
     times = _checks.finite(_checks.floating(ts, length, "ts"), "ts")
     xp = _checks.namespace(times)
-    falling = xp.diff(xp.asarray(times)) <= 0
+    found = xp.asarray(times)
+    falling = found[1:] <= found[:-1]
     where = ""
     if xp is np and falling.any():
         where = f"; ts[{int(np.argmax(falling)) + 1}] is not above the one before"
