@@ -3,16 +3,35 @@
 from rigidjax.identify import report as report, toutatis as toutatis
 from rigidjax.identify.bodies import (
     AbstractBodyChart as AbstractBodyChart,
+    Known as Known,
+    Mass as Mass,
+    Principal as Principal,
     PrincipalRatios as PrincipalRatios,
     Ratios as Ratios,
+    Tensor as Tensor,
 )
 from rigidjax.identify.files import LogError as LogError, read_gyro_csv as read_gyro_csv
 from rigidjax.identify.fit import Fit as Fit, Start as Start, fit as fit
-from rigidjax.identify.loss import SoftL1 as SoftL1
-from rigidjax.identify.problem import Parameters as Parameters, Problem as Problem
+from rigidjax.identify.free import Free as Free
+from rigidjax.identify.loss import AbstractLoss as AbstractLoss, Huber as Huber, SoftL1 as SoftL1
+from rigidjax.identify.prior import Entropic as Entropic
+from rigidjax.identify.problem import Own as Own, Parameters as Parameters, Problem as Problem
+from rigidjax.identify.propagate import (
+    AbstractIntegrator as AbstractIntegrator,
+    Adaptive as Adaptive,
+    FixedSteps as FixedSteps,
+)
 from rigidjax.identify.recording import Reading as Reading, Recording as Recording
+from rigidjax.identify.reported import Quantity as Quantity
 from rigidjax.identify.sensors import (
     AbstractSensor as AbstractSensor,
+    Accelerometer as Accelerometer,
     AttitudeSensor as AttitudeSensor,
+    Direction as Direction,
     Gyro as Gyro,
+    Magnetometer as Magnetometer,
+    Marker as Marker,
+    Moment as Moment,
+    quaternions_from_euler as quaternions_from_euler,
+    quaternions_from_matrices as quaternions_from_matrices,
 )

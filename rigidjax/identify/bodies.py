@@ -1,4 +1,4 @@
-"""Unconstrained numbers ↔ inertia, as a fit needs them. Every point is a real body."""
+"""Unconstrained numbers ↔ the body, as a fit needs them. Every point is a real body."""
 
 import abc
 from typing import Any, ClassVar
@@ -8,60 +8,71 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rigidjax.body import parameters as charts
-from rigidjax.body.inertia import Inertia
+from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.body.symmetric import swap_trace
+
+COMPONENTS = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))
 
 
 class AbstractBodyChart(eqx.Module):
-    """A chart of bodies: `size` numbers → an `Inertia` of a fixed overall scale, and back."""
+    """A chart of bodies: `size` numbers → an `Inertia` or `MassProperties`, and back.
 
-    size: eqx.AbstractClassVar[int]
+    `log_names`, `unit` and `logs(body)` are the positive quantities that are reported, through
+    their logarithms; `plain_names` and `plain(body)` those that may have either sign.
+    """
+
+    size: eqx.AbstractVar[int]
     in_words: eqx.AbstractClassVar[str]
+    log_names: eqx.AbstractClassVar[tuple[str, ...]]
+    plain_names: eqx.AbstractClassVar[tuple[str, ...]]
+    unit: eqx.AbstractClassVar[str]
 
     @abc.abstractmethod
-    def inertia(self, vector: Float[Array, " chart"]) -> Inertia:
+    def body(self, vector: Float[Array, " chart"]) -> Inertia | MassProperties:
         """The body of these numbers."""
 
     @abc.abstractmethod
     def vector(self, body: Inertia) -> Float[Array, " chart"]:
-        """The numbers of this body; its overall scale is dropped."""
+        """The numbers of a body with this inertia, a guess where a fit starts."""
 
     @abc.abstractmethod
-    def log_ratios(self, body: Inertia) -> Any:
-        """Logarithms of the two ratios that are reported (2,)."""
+    def logs(self, body: Any) -> Float[Array, " logs"]:
+        """Logarithms of the positive quantities that are reported."""
 
-    @property
     @abc.abstractmethod
-    def ratio_names(self) -> tuple[str, str]:
-        """What the two ratios are called."""
+    def plain(self, body: Any) -> Float[Array, " plain"]:
+        """The other quantities that are reported."""
 
 
 class Ratios(AbstractBodyChart):
     """The whole inertia tensor up to scale: two ratios of moments and the principal axes.
 
     Five numbers: the log-Cholesky factor of the second moment 𝔖, its scale fixed
-    (Rucker and Wensing 2022, IEEE RA-L 7:2771, doi:10.1109/LRA.2022.3144517).
+    (Rucker and Wensing 2022, IEEE RA-L 7:2771, doi:10.1109/LRA.2022.3144517). For free motion,
+    which cannot show the scale.
 
-    >>> Ratios().log_ratios(Ratios().inertia(jnp.zeros(5)))
+    >>> Ratios().logs(Ratios().body(jnp.zeros(5)))
     Array([0., 0.], dtype=float64)
     """
 
     size: ClassVar[int] = 5
     in_words: ClassVar[str] = "the inertia tensor up to scale"
+    log_names: ClassVar[tuple[str, ...]] = ("I1/I3", "I2/I3")
+    plain_names: ClassVar[tuple[str, ...]] = ()
+    unit: ClassVar[str] = ""
 
-    def inertia(self, vector: Float[Array, " chart"]) -> Inertia:
+    def body(self, vector: Float[Array, " chart"]) -> Inertia:
         return Inertia(swap_trace(charts.unpack_shape(vector)))
 
     def vector(self, body: Inertia) -> Float[Array, " chart"]:
         return charts.pack_shape(body.second_moment)
 
-    def log_ratios(self, body: Inertia) -> Any:
+    def logs(self, body: Inertia) -> Float[Array, "2"]:
         moments = jnp.log(body.moments)
         return moments[:2] - moments[2]
 
-    @property
-    def ratio_names(self) -> tuple[str, str]:
-        return ("I1/I3", "I2/I3")
+    def plain(self, body: Inertia) -> Float[Array, "0"]:
+        return jnp.zeros(0, body.tensor.dtype)
 
 
 class PrincipalRatios(AbstractBodyChart):
@@ -70,25 +81,187 @@ class PrincipalRatios(AbstractBodyChart):
     Two numbers: the logarithms of λ1/λ3 and λ2/λ3, the second moments along the axes (notes,
     eqs 72, 76–78), so that every pair of numbers obeys the triangle inequalities.
 
-    >>> PrincipalRatios().inertia(jnp.zeros(2)).tensor[0, 0]
+    >>> PrincipalRatios().body(jnp.zeros(2)).tensor[0, 0]
     Array(2., dtype=float64)
     """
 
     size: ClassVar[int] = 2
     in_words: ClassVar[str] = "two ratios of moments, the body axes being principal"
+    log_names: ClassVar[tuple[str, ...]] = ("Ix/Iz", "Iy/Iz")
+    plain_names: ClassVar[tuple[str, ...]] = ()
+    unit: ClassVar[str] = ""
 
-    def inertia(self, vector: Float[Array, " chart"]) -> Inertia:
-        a, b, c = jnp.exp(vector[0]), jnp.exp(vector[1]), jnp.ones((), vector.dtype)
-        return Inertia(jnp.diag(jnp.stack([b + c, c + a, a + b])))
+    def body(self, vector: Float[Array, " chart"]) -> Inertia:
+        return _diagonal(jnp.stack([vector[0], vector[1], jnp.zeros((), vector.dtype)]))
 
     def vector(self, body: Inertia) -> Float[Array, " chart"]:
         s = body.second_moment
         return jnp.log(jnp.stack([s[0, 0], s[1, 1]]) / s[2, 2])
 
-    def log_ratios(self, body: Inertia) -> Any:
+    def logs(self, body: Inertia) -> Float[Array, "2"]:
         i = body.tensor
         return jnp.log(jnp.stack([i[0, 0], i[1, 1]]) / i[2, 2])
 
-    @property
-    def ratio_names(self) -> tuple[str, str]:
-        return ("Ix/Iz", "Iy/Iz")
+    def plain(self, body: Inertia) -> Float[Array, "0"]:
+        return jnp.zeros(0, body.tensor.dtype)
+
+
+class Tensor(AbstractBodyChart):
+    """The whole inertia tensor with its scale, which a known torque or momentum inside shows.
+
+    Six numbers: the log-Cholesky factor of 𝔖 (as `Ratios`), in units of `typical`.
+
+    **Arguments:** `typical` kg m², about how large the moments are: a fit starts there. **Raises**
+    `ValueError` where it is not positive.
+
+    >>> Tensor(1e-3).body(jnp.zeros(6)).tensor[0, 0]
+    Array(0.001, dtype=float64)
+    """
+
+    typical: Float[Array, ""]
+    size: ClassVar[int] = 6
+    in_words: ClassVar[str] = "the inertia tensor"
+    log_names: ClassVar[tuple[str, ...]] = ("I1", "I2", "I3")
+    plain_names: ClassVar[tuple[str, ...]] = ("Ixx", "Iyy", "Izz", "Iyz", "Ixz", "Ixy")
+    unit: ClassVar[str] = "kg m²"
+
+    def __init__(self, typical: float = 1.0):
+        self.typical = _typical(typical)
+
+    def body(self, vector: Float[Array, " chart"]) -> Inertia:
+        s = charts.unpack_second_moment(vector) * (0.5 * self.typical)
+        return Inertia(swap_trace(s))
+
+    def vector(self, body: Inertia) -> Float[Array, " chart"]:
+        return charts.pack_second_moment(body.second_moment / (0.5 * self.typical))
+
+    def logs(self, body: Inertia) -> Float[Array, "3"]:
+        return jnp.log(body.moments)
+
+    def plain(self, body: Inertia) -> Float[Array, "6"]:
+        return jnp.stack([body.tensor[i, j] for i, j in COMPONENTS])
+
+
+class Principal(AbstractBodyChart):
+    """Three principal moments with their scale, where the body axes are known to be principal.
+
+    Three numbers: ½ log of the second moments along the axes, in units of `typical`.
+
+    **Arguments:** as for `Tensor`.
+
+    >>> Principal(2.0).body(jnp.zeros(3)).tensor[0, 0]
+    Array(2., dtype=float64)
+    """
+
+    typical: Float[Array, ""]
+    size: ClassVar[int] = 3
+    in_words: ClassVar[str] = "three moments, the body axes being principal"
+    log_names: ClassVar[tuple[str, ...]] = ("Ix", "Iy", "Iz")
+    plain_names: ClassVar[tuple[str, ...]] = ()
+    unit: ClassVar[str] = "kg m²"
+
+    def __init__(self, typical: float = 1.0):
+        self.typical = _typical(typical)
+
+    def body(self, vector: Float[Array, " chart"]) -> Inertia:
+        return Inertia(_diagonal(2.0 * vector).tensor * (0.5 * self.typical))
+
+    def vector(self, body: Inertia) -> Float[Array, " chart"]:
+        s = body.second_moment / (0.5 * self.typical)
+        return 0.5 * jnp.log(jnp.stack([s[0, 0], s[1, 1], s[2, 2]]))
+
+    def logs(self, body: Inertia) -> Float[Array, "3"]:
+        i = body.tensor
+        return jnp.log(jnp.stack([i[0, 0], i[1, 1], i[2, 2]]))
+
+    def plain(self, body: Inertia) -> Float[Array, "0"]:
+        return jnp.zeros(0, body.tensor.dtype)
+
+
+class Mass(AbstractBodyChart):
+    """Mass, centre of mass and inertia: all ten numbers, where forces show them.
+
+    The log-Cholesky chart of the 4 × 4 pseudo-inertia around a `guess`, which is where it starts.
+
+    **Arguments:** `guess` a `MassProperties`, about the right size.
+
+    >>> import rigidjax as rj
+    >>> float(Mass(rj.shapes.box(2.0, [1.0, 1.0, 1.0])).body(jnp.zeros(10)).mass)
+    2.0
+    """
+
+    guess: MassProperties
+    size: ClassVar[int] = 10
+    in_words: ClassVar[str] = "mass, centre of mass and inertia tensor"
+    log_names: ClassVar[tuple[str, ...]] = ("mass", "I1", "I2", "I3")
+    plain_names: ClassVar[tuple[str, ...]] = ("com x", "com y", "com z")
+    unit: ClassVar[str] = "SI"
+
+    def __init__(self, guess: MassProperties):
+        if not isinstance(guess, MassProperties):
+            raise TypeError(f"Mass: wanted MassProperties, got {type(guess).__name__}")
+        self.guess = guess
+
+    def body(self, vector: Float[Array, " chart"]) -> MassProperties:
+        # Lengths in units of the body's own size: every number is of order one.
+        size = jnp.sqrt(jnp.trace(self.guess.second_moment) / self.guess.mass)
+        step = jnp.concatenate([vector[:4], size * vector[4:]])
+        return charts.unpack(charts.pack(self.guess) + step)
+
+    def vector(self, body: Inertia) -> Float[Array, " chart"]:
+        return jnp.zeros(10, self.guess.mass.dtype)
+
+    def logs(self, body: MassProperties) -> Float[Array, "4"]:
+        return jnp.log(jnp.concatenate([body.mass[None], body.inertia.moments]))
+
+    def plain(self, body: MassProperties) -> Float[Array, "3"]:
+        return body.com
+
+
+class Known(AbstractBodyChart):
+    """A body that is known: only states, torques and sensors are fitted.
+
+    **Arguments:** `known` an `Inertia` or `MassProperties`.
+
+    >>> import rigidjax as rj
+    >>> Known(rj.Inertia.from_principal(1.0, 2.0, 3.0)).size
+    0
+    """
+
+    known: Inertia | MassProperties
+    size: ClassVar[int] = 0
+    in_words: ClassVar[str] = "nothing of the body"
+    log_names: ClassVar[tuple[str, ...]] = ()
+    plain_names: ClassVar[tuple[str, ...]] = ()
+    unit: ClassVar[str] = ""
+
+    def __init__(self, known: Inertia | MassProperties):
+        if not isinstance(known, Inertia | MassProperties):
+            raise TypeError(
+                f"Known: wanted an Inertia or MassProperties, got {type(known).__name__}"
+            )
+        self.known = known
+
+    def body(self, vector: Float[Array, " chart"]) -> Inertia | MassProperties:
+        return self.known
+
+    def vector(self, body: Inertia) -> Float[Array, " chart"]:
+        return jnp.zeros(0, body.tensor.dtype)
+
+    def logs(self, body: Any) -> Float[Array, "0"]:
+        return jnp.zeros(0)
+
+    def plain(self, body: Any) -> Float[Array, "0"]:
+        return jnp.zeros(0)
+
+
+def _diagonal(logs: Float[Array, "3"]) -> Inertia:
+    """The body whose second moments along the axes have these logarithms."""
+    a, b, c = jnp.exp(logs[0]), jnp.exp(logs[1]), jnp.exp(logs[2])
+    return Inertia(jnp.diag(jnp.stack([b + c, c + a, a + b])))
+
+
+def _typical(value: float) -> Array:
+    if not value > 0:
+        raise ValueError(f"typical: wanted a positive moment of inertia, kg m², got {value}")
+    return jnp.asarray(value, jnp.result_type(float))

@@ -1,26 +1,32 @@
 """Least squares from several starts, and what came of it."""
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray
 
-from rigidjax.body.inertia import Inertia
-from rigidjax.identify import uncertainty
-from rigidjax.identify.loss import shrink
+from rigidjax.body.inertia import Inertia, MassProperties
+from rigidjax.identify import reported, uncertainty, words
 from rigidjax.identify.problem import Parameters, Problem
+from rigidjax.identify.propagate import Adaptive, FixedSteps
+from rigidjax.identify.residual import Noise
+from rigidjax.identify.search import (
+    HORIZONS,
+    Checkpoint,
+    Tried,
+    climb,
+    climb_together,
+    cost_of,
+    least_squares,
+    solver_for,
+)
 from rigidjax.identify.start import starting_points
-from rigidjax.motion import Attitude, Spin
-
-# The record is fitted from its beginning first: a long one is a forest of wrong minima (the phase
-# slips by whole turns), a short one is not.
-HORIZONS = (0.25, 0.5, 1.0)
 
 
 class Start(eqx.Module):
@@ -36,21 +42,25 @@ class Fit(eqx.Module):
     """What `fit` returns: the best point and how sure it is.
 
     **Fields:** `parameters` the free numbers at the best point; `covariance` (n, n) of them,
-    flattened in order; `noise` one (3,) standard deviation per sensor, given or estimated;
-    `starts` what came of each start; `chi2` and `dof` of the whitened errors of the sensors whose
-    noise was given; `singular_values` (n,) of the whitened Jacobian; `status` one line: `ok`, or
-    what is wrong.
+    flattened in order, and `covariance_kind` what it rests on; `starts` what came of each start;
+    `chi2` and `dof` of the whitened errors of the sensors whose noise was given; `correlation` over
+    how many samples the errors hang together, 1 for white ones; `singular_values` (n,) of the
+    whitened Jacobian; `null_directions` (k, n) that leave no trace in the data; `quantities` all
+    that is reported, by name; `status` one line: `ok`, or what is wrong.
     """
 
     problem: Problem
     parameters: Parameters
     covariance: Float[Array, "n n"]
-    noise: tuple[Float[Array, "3"], ...]
+    covariance_kind: str
+    noises: Noise
     starts: tuple[Start, ...]
     chi2: float
     dof: int
+    correlation: float
     singular_values: Float[Array, " n"]
-    null_directions: Float[Array, "k n"]
+    null_directions: Float[Array, "unseen n"]
+    quantities: tuple[reported.Quantity, ...]
     status: str
 
     @property
@@ -59,87 +69,66 @@ class Fit(eqx.Module):
         return self.status == "ok"
 
     @property
-    def body(self) -> Inertia:
-        """The inertia, up to scale."""
+    def body(self) -> Inertia | MassProperties:
+        """The body; up to scale where the chart has none."""
         return self.problem.unpack(self.parameters)[0]
 
     @property
-    def state0(self) -> Spin | Attitude:
-        """The state at the first time."""
+    def state0(self) -> Any:
+        """The state at the first time; with several recordings, one for each (leading axis)."""
         return self.problem.unpack(self.parameters)[1]
 
     @property
-    def residuals(self) -> tuple[Float[Array, "times 3"], ...]:
-        """Reading minus prediction for each sensor, in its unit; zero where masked."""
-        return _errors(self.parameters, self.problem)
+    def values(self) -> dict[str, Array]:
+        """The value of each `Free` by name, in its unit."""
+        return self.problem.values(self.parameters)
+
+    @property
+    def noise(self) -> tuple[Float[Array, "*records _"], ...]:
+        """One (k,) standard deviation per sensor, given or estimated; (R, k) of R recordings."""
+        return tuple(n[0] for n in self.noises) if self.problem.count == 1 else self.noises
+
+    @property
+    def residuals(self) -> tuple[Float[Array, "*records times _"], ...]:
+        """Reading minus prediction for each sensor, in its unit; zero where masked.
+
+        With several recordings a leading axis.
+        """
+        errors = uncertainty.errors_at(self.parameters, self.problem)
+        return tuple(e[0] for e in errors) if self.problem.count == 1 else errors
 
     @property
     def rms(self) -> tuple[float, ...]:
         """Root mean square length of each sensor's error, in its unit."""
         out = []
-        for errors, reading in zip(self.residuals, self.problem.recording.readings, strict=True):
-            lengths = np.sum(np.asarray(errors) ** 2, axis=1)[reading.seen]
+        errors = uncertainty.errors_at(self.parameters, self.problem)
+        for error, reading in zip(errors, self.problem.records.readings, strict=True):
+            lengths = np.sum(np.asarray(error) ** 2, axis=-1)[reading.seen]
             out.append(float(np.sqrt(lengths.mean())))
         return tuple(out)
 
     def interval(self, level: float = 0.95) -> dict[str, tuple[float, float]]:
-        """Intervals of the two ratios of moments and the first body rate, name → (low, high).
+        """Intervals of everything that is reported, name → (low, high).
 
-        Gauss–Newton covariance; ratios through their logarithm. **Arguments:** `level` the
-        probability with which each holds the truth. **Raises** `ValueError` outside (0, 1).
+        What is positive goes through its logarithm. **Arguments:** `level` the probability with
+        which each holds the truth. **Raises** `ValueError` outside (0, 1).
         """
-        return uncertainty.intervals(self, level)
+        reach = reported.quantile(self, level)
+        return {quantity.name: quantity.interval(reach) for quantity in self.quantities}
 
     def interval_of(
-        self, of: Callable[[Inertia, Any], Any], level: float = 0.95
+        self, of: Callable[[Any, Any], Any], level: float = 0.95
     ) -> tuple[np.ndarray, np.ndarray]:
         """Interval (low, high) of any differentiable function `of(body, state0) → array`.
 
         The covariance is carried by the function's derivative. **Raises** as `interval`.
         """
-        return uncertainty.interval_of(self, of, level)
+        return reported.interval_of(self, of, level)
 
     @property
     def identifiability(self) -> tuple[str, ...]:
         """In words: what the data fix, what they fix weakly, what they cannot see."""
-        return uncertainty.in_words(self)
-
-
-def _residual(parameters: Parameters, args: tuple) -> tuple[Float[Array, "times 3"], ...]:
-    problem, noise, weights = args
-    out = []
-    for error, sigma in zip(problem.errors(parameters), noise, strict=True):
-        whitened = jax.vmap(lambda e, s=sigma: shrink(problem.loss, e / s))(error)
-        out.append(whitened * weights[:, None])
-    return tuple(out)
-
-
-@eqx.filter_jit
-def _errors(parameters: Parameters, problem: Problem) -> tuple[Float[Array, "times 3"], ...]:
-    return problem.errors(parameters)
-
-
-@eqx.filter_jit
-def _levenberg(
-    start: Parameters,
-    problem: Problem,
-    noise: tuple,
-    weights: Float[Array, " times"],
-    tolerance: Any,
-    max_steps: int,
-) -> tuple[Parameters, Float[Array, ""], Bool[Array, ""]]:
-    args = (problem, noise, weights)
-    out = optx.least_squares(
-        _residual,
-        optx.LevenbergMarquardt(rtol=tolerance, atol=tolerance),
-        start,
-        args,
-        options={"jac": "fwd"},
-        max_steps=max_steps,
-        throw=False,
-    )
-    residual = ravel_pytree(_residual(out.value, args))[0]
-    return out.value, 0.5 * jnp.sum(residual**2), out.result == optx.RESULTS.successful
+        return words.identifiability(self)
 
 
 def fit(
@@ -150,6 +139,8 @@ def fit(
     key: PRNGKeyArray | None = None,
     tolerance: float = 1e-10,
     max_steps: int = 200,
+    together: int = 1,
+    checkpoint: str | Path | None = None,
     progress: Callable[[str], Any] | None = None,
 ) -> Fit:
     """The body and the first state that explain a recording best.
@@ -162,15 +153,19 @@ def fit(
     - `initial`: a starting point of your own, tried first.
     - `key`: random key of the scattered starts; `jax.random.key(0)` unless given.
     - `tolerance`, `max_steps`: where Levenberg–Marquardt stops, relative and absolute; steps.
+    - `together`: how many starts go through one `vmap` at once.
+    - `checkpoint`: a file that keeps what was found after every 25 steps; a second call with the
+      same problem and options goes on from there and ends at the same point. `together` = 1 only.
     - `progress`: called with a line of text after each start, such as `print`.
 
     **Returns** a `Fit`. It always holds the best point that was reached; `fit.status` says in words
     when that is not to be trusted: not converged, or far above the noise. Interrupting (Ctrl-C)
-    after the first start ends the search and keeps what was found.
+    ends the search and keeps what was found.
 
     Levenberg–Marquardt of optimistix, Jacobians by forward mode through the motion.
 
-    **Raises:** `TypeError` for what is no `Problem`, `ValueError` for fewer than one start.
+    **Raises:** `TypeError` for what is no `Problem`, `ValueError` for fewer than one start or a
+    checkpoint of another problem.
 
     >>> import jax.numpy as jnp, rigidjax as rj
     >>> ts = jnp.linspace(0.0, 10.0, 60)
@@ -183,61 +178,143 @@ def fit(
     """
     if not isinstance(problem, Problem):
         raise TypeError(f"fit: wanted a Problem, got {type(problem).__name__}")
-    if starts < 1:
-        raise ValueError(f"fit: wanted at least one start, got {starts}")
-    key = jax.random.key(0) if key is None else key
-    points = starting_points(problem, starts, key)
+    if starts < 1 or together < 1:
+        raise ValueError(f"fit: wanted at least one start, got {min(starts, together)}")
+    if checkpoint is not None and together > 1:
+        raise ValueError("fit: a checkpoint goes with together=1, one start after another")
+    points = starting_points(problem, starts, jax.random.key(0) if key is None else key)
     if initial is not None:
         points = [initial, *points][:starts]
-    noise = _first_noise(problem)
-    limit = jnp.asarray(tolerance)
-    tried: list[tuple[Parameters, float, bool]] = []
+    noise, solver = _first_noise(problem), solver_for(tolerance)
+    if together > 1:
+        tried = _together(points, problem, noise, solver, max_steps, together, progress)
+    else:
+        tried = _one_by_one(points, problem, noise, solver, max_steps, checkpoint, progress)
+    best = min(
+        tried, key=lambda item: float(item.cost) if np.isfinite(float(item.cost)) else np.inf
+    )
+    lowest = float(best.cost)
+    problem, best = _finer_if_needed(problem, best, noise, solver, max_steps)
+    value, done = best.parameters, best.converged
+    if any(sensor.noise is None for sensor in problem.records.sensors):
+        whole = jnp.ones_like(problem.records.t)
+        # Twice: the weights of the channels and the robust loss both depend on the noise.
+        for _ in range(2):
+            noise = uncertainty.estimate_noise(
+                problem, uncertainty.errors_at(value, problem), noise, value
+            )
+            again = least_squares(value, problem, noise, whole, solver, max_steps)
+            value, done = again.parameters, again.converged
+        noise = uncertainty.estimate_noise(
+            problem, uncertainty.errors_at(value, problem), noise, value
+        )
+    return _assess(problem, value, bool(done), noise, tried, lowest)
+
+
+def _one_by_one(
+    points: list[Parameters],
+    problem: Problem,
+    noise: Noise,
+    solver: Any,
+    max_steps: int,
+    checkpoint: str | Path | None,
+    progress: Callable[[str], Any] | None,
+) -> list[Tried]:
+    like = Tried(points[0], jnp.asarray(jnp.inf), jnp.asarray(False))
+    print_of = float("nan")
+    if checkpoint is not None:
+        print_of = float(sum(cost_of(point, problem, noise) for point in points))
+    keep = Checkpoint(checkpoint, like, print_of)
+    tried, latest = list(keep.done), [keep.current]
     try:
         for number, point in enumerate(points, 1):
-            value, cost, done = _climb(point, problem, noise, limit, max_steps)
-            tried.append((value, float(cost), bool(done)))
-            if progress is not None:
-                best = min(cost for _, cost, _ in tried)
-                progress(f"start {number}/{len(points)}: misfit {float(cost):.6g}, best {best:.6g}")
+            if number <= len(keep.done):
+                continue
+            resumed = number == len(keep.done) + 1 and np.isfinite(float(keep.current.cost))
+            stage = keep.stage if resumed else 0
+            latest = [like]
+
+            def look(stage: int, now: Tried) -> None:
+                # A part of the record only: its misfit is no measure of the whole.
+                if stage == len(HORIZONS) - 1:
+                    latest[0] = now  # noqa: B023
+                following = stage + bool(now.converged) if stage < len(HORIZONS) - 1 else stage
+                keep.save(tried, following, now)
+
+            at = keep.current.parameters if resumed else point
+            out = climb(at, problem, noise, solver, max_steps, first_stage=stage, look=look)
+            latest = [like]
+            tried.append(out)
+            keep.save(tried, 0, like)
+            _say(progress, number, len(points), tried)
+    except KeyboardInterrupt:
+        if np.isfinite(float(latest[0].cost)):
+            tried.append(latest[0])
+        if not tried:
+            raise
+    return tried
+
+
+def _together(
+    points: list[Parameters],
+    problem: Problem,
+    noise: Noise,
+    solver: Any,
+    max_steps: int,
+    together: int,
+    progress: Callable[[str], Any] | None,
+) -> list[Tried]:
+    tried: list[Tried] = []
+    try:
+        for first in range(0, len(points), together):
+            batch = points[first : first + together]
+            stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *batch)
+            tried += climb_together(stacked, problem, noise, solver, max_steps)
+            _say(progress, len(tried), len(points), tried)
     except KeyboardInterrupt:
         if not tried:
             raise
-    best = min(tried, key=lambda item: item[1] if np.isfinite(item[1]) else np.inf)
-    estimated = any(r.sensor.noise is None for r in problem.recording.readings)
-    value, cost, done = best
-    if estimated:
-        # Twice: the weights of the channels and the robust loss both depend on the noise.
-        for _ in range(2):
-            noise = uncertainty.estimate_noise(problem, _errors(value, problem), noise, value)
-            whole = jnp.ones(problem.recording.t.shape)
-            value, cost, done = _levenberg(value, problem, noise, whole, limit, max_steps)
-        noise = uncertainty.estimate_noise(problem, _errors(value, problem), noise, value)
-    return _assess(problem, value, bool(done), noise, tried, best[1])
+    return tried
 
 
-def _climb(
-    point: Parameters, problem: Problem, noise: tuple, tolerance: Any, max_steps: int
-) -> tuple[Parameters, Any, Any]:
-    t = problem.recording.t
-    cost, done = jnp.inf, False
-    for horizon in HORIZONS:
-        seen = (t - t[0]) <= horizon * (t[-1] - t[0])
-        rough = tolerance if horizon == 1.0 else jnp.maximum(tolerance, 1e-4)
-        point, cost, done = _levenberg(
-            point, problem, noise, seen.astype(t.dtype), rough, max_steps
-        )
-    return point, cost, done
+def _say(progress: Any, number: int, total: int, tried: list[Tried]) -> None:
+    if progress is not None:
+        best = min(float(item.cost) for item in tried)
+        progress(f"start {number}/{total}: misfit {float(tried[-1].cost):.6g}, best {best:.6g}")
 
 
-def _first_noise(problem: Problem) -> tuple[Float[Array, "3"], ...]:
+def _finer_if_needed(
+    problem: Problem, best: Tried, noise: Noise, solver: Any, max_steps: int
+) -> tuple[Problem, Tried]:
+    """Fixed steps are checked against adaptive ones; where they were too long, go on with these."""
+    if not isinstance(problem.integrator, FixedSteps):
+        return problem, best
+    finer = eqx.tree_at(lambda p: p.integrator, problem, Adaptive())
+    coarse, exact = (
+        uncertainty.errors_at(best.parameters, problem),
+        uncertainty.errors_at(best.parameters, finer),
+    )
+    apart = max(
+        float(jnp.max(jnp.abs(a - b) / sigma[:, None]))
+        for a, b, sigma in zip(coarse, exact, noise, strict=True)
+    )
+    if not apart > 0.05:
+        return problem, best
+    whole = jnp.ones_like(problem.records.t)
+    return finer, least_squares(best.parameters, finer, noise, whole, solver, max_steps)
+
+
+def _first_noise(problem: Problem) -> Noise:
     out = []
-    for reading in problem.recording.readings:
-        if reading.sensor.noise is not None:
-            out.append(reading.sensor.noise)
+    for reading in problem.records.readings:
+        sensor = reading.sensor
+        if sensor.noise is not None:
+            out.append(sensor.noise)
         else:
             # A tenth of the signal: what counts is that no channel drowns another.
-            size = jnp.sqrt(jnp.mean(jnp.sum(reading.values**2, axis=1)) + 1e-300)
-            out.append(jnp.full(3, 0.1) * size)
+            values = reading.values.reshape(*reading.mask.shape, -1)
+            size = jnp.sqrt(jnp.mean(jnp.sum(values**2, axis=-1)) + 1e-300)
+            out.append(jnp.full((problem.count, sensor.components), 0.1) * size)
     return tuple(out)
 
 
@@ -245,21 +322,26 @@ def _assess(
     problem: Problem,
     value: Parameters,
     done: bool,
-    noise: tuple,
-    tried: list[tuple[Parameters, float, bool]],
+    noise: Noise,
+    tried: list[Tried],
     best_cost: float,
 ) -> Fit:
-    covariance, singular, null = uncertainty.covariance(problem, value, noise)
-    chi2, dof, believable = uncertainty.goodness(problem, value, noise)
+    linear = uncertainty.linearise(problem, value, noise)
+    correlation, closeness = uncertainty.correlation_time(linear)
+    spread = uncertainty.spread(linear, correlation)
+    free = ravel_pytree(value)[0].size
+    errors = uncertainty.errors_at(value, problem)
+    chi2, dof, believable = uncertainty.goodness(problem, errors, linear, free, closeness)
     # Ten units of log-likelihood: a point further above the best is e¹⁰ times less likely. Where
     # the noise is estimated from the best point, its cost is half the number of readings.
     margin = 10.0
-    if any(r.sensor.noise is None for r in problem.recording.readings):
-        margin *= 2 * best_cost / problem.recording.size
+    if any(sensor.noise is None for sensor in problem.records.sensors):
+        count = sum(r.sensor.components * int(r.seen.sum()) for r in problem.records.readings)
+        margin *= 2 * best_cost / count
     starts = []
-    for parameters, cost, converged in tried:
-        fits = believable and cost <= best_cost + margin
-        starts.append(Start(parameters, cost, converged, fits))
+    for item in tried:
+        fits = believable and float(item.cost) <= best_cost + margin
+        starts.append(Start(item.parameters, float(item.cost), bool(item.converged), fits))
     rivals = [s for s in starts if s.fits and s.converged and s.cost > best_cost + 0.01 * margin]
     if not np.isfinite(best_cost):
         status = "failed: no start gave a finite misfit"
@@ -271,4 +353,18 @@ def _assess(
         status = f"ambiguous: {len(rivals)} of {len(starts)} starts fit as well elsewhere"
     else:
         status = "ok"
-    return Fit(problem, value, covariance, noise, tuple(starts), chi2, dof, singular, null, status)
+    return Fit(
+        problem,
+        value,
+        jnp.asarray(spread.covariance),
+        spread.kind,
+        noise,
+        tuple(starts),
+        chi2,
+        dof,
+        correlation,
+        jnp.asarray(spread.singular_values),
+        jnp.asarray(spread.null_directions),
+        reported.quantities(problem, value, spread.covariance),
+        status,
+    )

@@ -1,20 +1,34 @@
 """How much an outlier counts."""
 
+import abc
 from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from rigidjax._types import Scalar, Vec3
+from rigidjax._types import Scalar
 
 
-class SoftL1(eqx.Module):
+class AbstractLoss(eqx.Module):
+    """`ρ(s)` of the squared length s of a sensor's error in units of its noise.
+
+    A reading counts as a whole, so that the loss does not depend on the frame.
+    """
+
+    @abc.abstractmethod
+    def shrink(self, error: Float[Array, " k"]) -> Float[Array, " k"]:
+        """The error scaled so that its square is ρ(s): what least squares then minimises."""
+
+    @abc.abstractmethod
+    def weight(self, error: Float[Array, " k"]) -> Scalar:
+        """dρ/ds, the weight of the reading in the normal equations: 1 for a small error."""
+
+
+class SoftL1(AbstractLoss):
     """Quadratic for ordinary errors, linear for large ones: `ρ(s) = 2c²(√(1 + s/c²) − 1)`.
 
-    `s` is the squared length of a sensor's error in units of its noise, so one reading counts as a
-    whole and the loss does not depend on the frame. Convex, unlike Cauchy's, which has minima of
-    its own making.
+    Convex, unlike Cauchy's, which has minima of its own making.
 
     **Arguments:** `scale` c, where quadratic turns to linear, in standard deviations.
 
@@ -27,21 +41,44 @@ class SoftL1(eqx.Module):
 
     scale: float = 3.0
 
-    def shrink(self, error: Vec3) -> Vec3:
-        """The error scaled so that its square is ρ(s): what least squares then minimises."""
+    def shrink(self, error: Float[Array, " k"]) -> Float[Array, " k"]:
         s = jnp.sum(error**2) / self.scale**2
         return error * jnp.sqrt(2.0 / (1.0 + jnp.sqrt(1.0 + s)))
 
-    def weight(self, error: Vec3) -> Scalar:
-        """dρ/ds, the weight of the reading in the normal equations: 1 for a small error."""
+    def weight(self, error: Float[Array, " k"]) -> Scalar:
         return 1.0 / jnp.sqrt(1.0 + jnp.sum(error**2) / self.scale**2)
 
 
-def shrink(loss: SoftL1 | None, error: Float[Array, "3"]) -> Vec3:
+class Huber(AbstractLoss):
+    """Quadratic up to c, linear beyond: `ρ(s) = s` for s ≤ c², else `2c√s − c²`.
+
+    **Arguments:** `scale` c, in standard deviations.
+
+    Source: Huber 1964, doi:10.1214/aoms/1177703732.
+
+    >>> import jax.numpy as jnp
+    >>> Huber(3.0).weight(jnp.array([6.0, 0.0, 0.0]))
+    Array(0.5, dtype=float64)
+    """
+
+    scale: float = 3.0
+
+    def shrink(self, error: Float[Array, " k"]) -> Float[Array, " k"]:
+        s = jnp.sum(error**2) / self.scale**2
+        large = s > 1.0
+        length = jnp.sqrt(jnp.where(large, s, 1.0))
+        return error * jnp.where(large, jnp.sqrt(2.0 * length - 1.0) / length, 1.0)
+
+    def weight(self, error: Float[Array, " k"]) -> Scalar:
+        s = jnp.sum(error**2) / self.scale**2
+        return 1.0 / jnp.sqrt(jnp.maximum(s, 1.0))
+
+
+def shrink(loss: AbstractLoss | None, error: Float[Array, " k"]) -> Float[Array, " k"]:
     """The error as least squares is to see it."""
     return error if loss is None else loss.shrink(error)
 
 
-def weight(loss: SoftL1 | None, error: Float[Array, "3"]) -> Any:
+def weight(loss: AbstractLoss | None, error: Float[Array, " k"]) -> Any:
     """The weight of the reading in the normal equations."""
     return jnp.ones((), error.dtype) if loss is None else loss.weight(error)

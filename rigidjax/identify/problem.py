@@ -1,47 +1,96 @@
 """What is known, what is free, and how far a guess is from the data."""
 
-import diffrax as dfx
+from collections.abc import Sequence
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from rigidjax._types import HasAttitude, HasSpin, Quat, Scalar
-from rigidjax.body.inertia import Inertia
-from rigidjax.exact import FreeBody
+from rigidjax._types import HasAttitude, HasPose, Scalar
+from rigidjax.body.inertia import Inertia, MassProperties
+from rigidjax.identify import stacking
 from rigidjax.identify.bodies import AbstractBodyChart
-from rigidjax.identify.loss import SoftL1
+from rigidjax.identify.free import Free, Slot, find, put
+from rigidjax.identify.loss import AbstractLoss
+from rigidjax.identify.prior import Entropic
+from rigidjax.identify.propagate import (
+    AbstractIntegrator,
+    free_states,
+    integrator_for,
+    shifted,
+    states_at,
+)
 from rigidjax.identify.recording import Recording
-from rigidjax.identify.sensors import AttitudeSensor, Gyro
-from rigidjax.motion import Attitude, Spin
-from rigidjax.motion.torques import Torque
+from rigidjax.identify.sensors import AttitudeSensor, Gyro, Marker, Moment
+from rigidjax.motion import Attitude, Rigid, Spin
+from rigidjax.motion.torques import AbstractForce, Sum, Torque
 from rigidjax.rotation import quaternion
-from rigidjax.solve import simulate
+from rigidjax.solve import equations_of_motion
+
+
+class Own(eqx.Module):
+    """The free numbers that belong to one recording, of order one.
+
+    **Fields:** `spin` (3,) the first body rate over the typical rate; `turn` (3,) the rotation
+    vector from the reference attitude to the first one (body frame, rad), or `None` where nothing
+    feels the attitude; `place`, `speed` (3,) the first position and velocity from the reference, in
+    typical lengths and speeds, or `None`; `each` the steps of the `Free`s with one value for each.
+    """
+
+    spin: Float[Array, "*records 3"]
+    turn: Float[Array, "*records 3"] | None
+    place: Float[Array, "*records 3"] | None
+    speed: Float[Array, "*records 3"] | None
+    each: tuple[Array, ...]
 
 
 class Parameters(eqx.Module):
     """The free numbers of a fit, all unconstrained and of order one.
 
-    **Fields:** `body` the chart's numbers; `spin` (3,) the first body rate over the typical rate;
-    `turn` (3,) the rotation vector from the reference attitude to the first one (body frame, rad),
-    or `None` where no sensor sees the attitude.
+    **Fields:** `body` the chart's numbers; `shared` the steps of the `Free`s with one value for
+    all; `own` what belongs to each recording, with a leading axis.
     """
 
     body: Float[Array, " chart"]
-    spin: Float[Array, "3"]
-    turn: Float[Array, "3"] | None
+    shared: tuple[Array, ...]
+    own: Own
+
+
+class Reference(eqx.Module):
+    """Where the first state of a recording is counted from, and in which units."""
+
+    q: Float[Array, "*records 4"] | None
+    x: Float[Array, "*records 3"] | None
+    v: Float[Array, "*records 3"] | None
+    rate: Float[Array, "*records"]
+    length: Float[Array, "*records"]
 
 
 class Problem(eqx.Module):
-    """A recording, and what of the motion behind it is free.
+    """A recording or several of one body, and what of the motion behind them is free.
 
-    **Arguments:** `recording`; `body` the chart of the inertia, such as `Ratios()` (the full tensor
-    up to scale) or `PrincipalRatios()` (body axes known to be principal); `torque` what turns the
-    body besides its own spin, or `None`; `loss` how an outlier counts: `SoftL1()`, or `None` for
-    plain least squares. The motion starts at the first time of the recording.
+    **Arguments:**
 
-    **Raises:** `TypeError` for arguments of another kind.
+    - `recording`: one `Recording`, or a sequence of them with the same sensors: each has its own
+      first state, all share the body.
+    - `body`: the chart of the body: `Ratios()` (the full tensor up to scale), `PrincipalRatios()`
+      (body axes known to be principal), `Tensor()`, `Principal()` (with the scale), `Mass(guess)`
+      (all ten numbers), `Known(body)`.
+    - `free`: what else is free, a sequence of `Free(where, name, …)`.
+    - `torque`: what turns the body besides its own spin, for the recordings that have none.
+    - `loss`: how an outlier counts: `SoftL1()`, `Huber()`, or `None` for plain least squares.
+    - `prior`: `Entropic(guess, weight)`, a pull towards a body that is roughly known, or `None`.
+    - `integrator`: `FixedSteps(n)` or `Adaptive(rtol, atol)` for a forced motion; `None` chooses by
+      how finely it was sampled. A free body is followed by the closed form.
+
+    The motion starts at the first time of each recording. The state climbs only as far as the
+    sensors and the torque need: `Spin`, `Attitude`, `Rigid`.
+
+    **Raises:** `TypeError` for arguments of another kind; `ValueError` where they do not fit.
 
     >>> import rigidjax as rj
     >>> record = rj.identify.Recording([0.0, 1.0], (rj.identify.Gyro(), [[1.0, 0, 0]] * 2))
@@ -49,61 +98,342 @@ class Problem(eqx.Module):
     Array(1., dtype=float64)
     """
 
-    recording: Recording
+    records: Recording
+    counts: tuple[int, ...] = eqx.field(static=True)
     body: AbstractBodyChart
-    torque: Torque | None
-    loss: SoftL1 | None
-    reference: Quat | None
-    typical_rate: Scalar
+    slots: tuple[Slot, ...]
+    loss: AbstractLoss | None
+    prior: Entropic | None
+    integrator: AbstractIntegrator | None
+    rung: type = eqx.field(static=True)
+    reference: Reference
+    links: "Links | None"
 
     def __init__(
         self,
-        recording: Recording,
+        recording: Recording | Sequence[Recording],
         body: AbstractBodyChart,
         *,
+        free: Sequence[Free] = (),
         torque: Torque | None = None,
-        loss: SoftL1 | None = None,
+        loss: AbstractLoss | None = None,
+        prior: Entropic | None = None,
+        integrator: AbstractIntegrator | None = None,
     ):
-        if not isinstance(recording, Recording):
-            raise TypeError(f"Problem: wanted a Recording, got {type(recording).__name__}")
+        recordings = [recording] if isinstance(recording, Recording) else recording
+        recordings = list(recordings) if isinstance(recordings, Sequence) else [recordings]
+        if not recordings:
+            raise ValueError("Problem: wanted at least one Recording, got an empty sequence")
+        for item in recordings:
+            if not isinstance(item, Recording):
+                raise TypeError(f"Problem: wanted a Recording, got {type(item).__name__}")
         if not isinstance(body, AbstractBodyChart):
             raise TypeError(
                 "Problem: wanted what of the body is free, such as Ratios() or PrincipalRatios(), "
                 f"got {type(body).__name__}"
             )
-        self.recording, self.body, self.torque, self.loss = recording, body, torque, loss
-        self.reference = _first_attitude(recording)
-        # An array, not a float: another recording must not compile again.
-        self.typical_rate = jnp.asarray(_typical_rate(recording), recording.t.dtype)
+        if torque is not None:
+            recordings = [_with(item, torque) for item in recordings]
+        self.records, self.counts = stacking.stack(recordings)
+        self.body, self.loss, self.prior = body, loss, prior
+        self.slots = find(free, recordings[0])
+        self.rung = _rung(recordings[0], body)
+        self.reference = _reference(recordings, self.rung)
+        if integrator is None and self.records.torque is not None:
+            widest = max(float(jnp.max(jnp.diff(r.t))) for r in recordings)
+            integrator = integrator_for(widest, 1.5 * float(jnp.max(self.reference.rate)))
+        self.integrator = integrator
+        self.links = None
 
-    def unpack(self, parameters: Parameters) -> tuple[Inertia, Spin | Attitude]:
-        """The body and the first state that the parameters stand for."""
-        omega = parameters.spin * self.typical_rate
-        body = self.body.inertia(parameters.body)
-        if self.reference is None or parameters.turn is None:
-            return body, Spin(omega)
-        q = quaternion.multiply(self.reference, quaternion.exp(parameters.turn))
-        return body, Attitude(q, omega)
+    @property
+    def count(self) -> int:
+        """How many recordings there are."""
+        return len(self.counts)
 
-    def motion(self, parameters: Parameters) -> HasSpin:
-        """The states at the recording's times, with a leading time axis."""
-        body, state0 = self.unpack(parameters)
-        if self.torque is None:
-            # The checks of `simulate` are for users; inside a fit they are host callbacks.
-            return jax.vmap(FreeBody(body, state0))(self.recording.t - self.recording.t[0])
-        out = simulate(
-            body, state0, self.recording.t, self.torque, adjoint=dfx.ForwardMode(), throw=False
+    @property
+    def recordings(self) -> tuple[Recording, ...]:
+        """The recordings, one by one."""
+        return tuple(
+            stacking.cut(stacking.one(self.records, index), count)
+            for index, count in enumerate(self.counts)
         )
-        return out.ys
 
-    def errors(self, parameters: Parameters) -> tuple[Float[Array, "times 3"], ...]:
+    @property
+    def recording(self) -> Recording:
+        """The only recording, or the first."""
+        return self.recordings[0]
+
+    @property
+    def torque(self) -> Torque | None:
+        """What turns the body besides its own spin, with a leading axis over recordings."""
+        return self.records.torque
+
+    @property
+    def typical_rate(self) -> Scalar:
+        """The size of the body rate in the first recording, rad/s: the unit of `Own.spin`."""
+        return self.reference.rate[0]
+
+    def start(self, body: Inertia | None = None) -> Parameters:
+        """The parameters of the recordings as they are given, with this body or a sphere."""
+        matter = Inertia(jnp.eye(3)) if body is None else body
+        vector = self.body.vector(matter) if body is not None else jnp.zeros(self.body.size)
+        moved = [jnp.zeros(jnp.shape(slot.read(self.recording))) for slot in self.slots]
+        shared = tuple(v for v, slot in zip(moved, self.slots, strict=True) if not slot.each)
+        each = tuple(
+            jnp.zeros((self.count, *v.shape))
+            for v, slot in zip(moved, self.slots, strict=True)
+            if slot.each
+        )
+        nothing = jnp.zeros((self.count, 3))
+        return Parameters(
+            vector,
+            shared,
+            Own(
+                nothing,
+                None if self.rung is Spin else nothing,
+                nothing if self.rung is Rigid else None,
+                nothing if self.rung is Rigid else None,
+                each,
+            ),
+        )
+
+    def unpack(self, parameters: Parameters) -> tuple[Any, Any]:
+        """The body and the first state that the parameters stand for.
+
+        With several recordings the states have a leading axis.
+        """
+        body = self.body.body(parameters.body)
+        states = jax.vmap(lambda own, ref: first_state(self.rung, own, ref))(
+            parameters.own, self.reference
+        )
+        return body, stacking.one(states, 0) if self.count == 1 else states
+
+    def scenes(self, parameters: Parameters) -> Recording:
+        """The recordings with the parameters' values in the slots, with a leading axis."""
+        return jax.vmap(lambda own, record: filled(self, parameters.shared, own, record))(
+            parameters.own, self.records
+        )
+
+    def values(self, parameters: Parameters) -> dict[str, Array]:
+        """The value of each `Free`, by name, in its unit; (R, …) for those with one for each."""
+        scenes = self.scenes(parameters)
+        out = {}
+        for slot in self.slots:
+            value = slot.read(scenes)
+            out[slot.name] = value if slot.each else value[0]
+        return out
+
+    def motion(self, parameters: Parameters) -> Any:
+        """The states at the recording's times, with a leading time axis.
+
+        With several recordings another axis leads.
+        """
+        states = jax.vmap(
+            lambda own, record, ref: _states(
+                self, self.body.body(parameters.body), parameters.shared, own, record, ref
+            )[2]
+        )(parameters.own, self.records, self.reference)
+        return stacking.one(states, 0) if self.count == 1 else states
+
+    def errors(self, parameters: Parameters) -> tuple[Float[Array, "*records times _"], ...]:
         """Reading minus prediction for each sensor, in its unit; zero where masked."""
-        states = self.motion(parameters)
-        out = []
-        for reading in self.recording.readings:
-            error = jax.vmap(reading.sensor.error)(states, reading.values)
-            out.append(jnp.where(reading.mask[:, None], error, 0.0))
-        return tuple(out)
+        out = all_errors(parameters, self)[0]
+        return tuple(e[0] for e in out) if self.count == 1 else out
+
+
+class Links(eqx.Module):
+    """That each recording goes on where the one before it ended: the pieces of a long one.
+
+    **Fields:** `on` (R,) one where the recording goes on into the next, else zero; `width` the gap
+    between them that counts as one standard deviation, of order-one numbers.
+    """
+
+    on: Float[Array, " records"]
+    width: Scalar
+
+
+def first_state(rung: type, own: Own, ref: Reference) -> Any:
+    """The first state of one recording."""
+    omega = own.spin * ref.rate
+    if rung is Spin:
+        return Spin(omega)
+    q = quaternion.multiply(ref.q, quaternion.exp(own.turn))
+    if rung is Attitude:
+        return Attitude(q, omega)
+    assert ref.x is not None and ref.v is not None
+    assert own.place is not None and own.speed is not None
+    x = ref.x + ref.length * own.place
+    return Rigid(x, ref.v + ref.length * ref.rate * own.speed, q, omega)
+
+
+def filled(problem: Problem, shared: tuple, own: Own, record: Recording) -> Recording:
+    """One recording with the values of the free numbers in it."""
+    of_all, of_each = iter(shared), iter(own.each)
+    values = [
+        slot.move(slot.read(record), next(of_each if slot.each else of_all))
+        for slot in problem.slots
+    ]
+    return put(record, problem.slots, values)
+
+
+def _states(
+    problem: Problem, body: Any, shared: tuple, own: Own, record: Recording, ref: Reference
+) -> tuple[Recording, Any, Any]:
+    """One recording with its values filled in, its first state and its states."""
+    record = filled(problem, shared, own, record)
+    state0 = first_state(problem.rung, own, ref)
+    matter = body
+    if problem.rung is not Rigid and isinstance(body, MassProperties):
+        matter = body.inertia
+    states = states_at(problem.integrator, matter, state0, record.t, record.torque)
+    return record, state0, states
+
+
+def errors_of_one(
+    problem: Problem, vector: Array, shared: tuple, own: Own, record: Recording, ref: Reference
+) -> tuple[tuple[Array, ...], Any]:
+    """The errors (T, k) of each sensor in one recording, and the last state."""
+    body = problem.body.body(vector)
+    record, state0, states = _states(problem, body, shared, own, record, ref)
+    matter = (
+        body.inertia if isinstance(body, MassProperties) and problem.rung is not Rigid else body
+    )
+    field = equations_of_motion(matter, state0, record.torque)
+    out = []
+    for reading in record.readings:
+        sensor = reading.sensor
+        offset = getattr(sensor, "offset", None)
+        seen, times = states, record.t
+        if offset is not None:
+            times = record.t + offset
+            if record.torque is None:
+                seen = free_states(body, state0, times - record.t[0])
+            else:
+                seen = jax.vmap(lambda t, s: shifted(field, t, s, offset))(record.t, states)
+
+        def error(t: Array, state: Any, value: Array, sensor: Any = sensor) -> Array:
+            return sensor.error(Moment(t, state, body, field), value)
+
+        errors = jax.vmap(error)(times, seen, reading.values)
+        out.append(jnp.where(reading.mask[:, None], errors, 0.0))
+    return tuple(out), jax.tree.map(lambda leaf: leaf[-1], states)
+
+
+def _all(parameters: Parameters, problem: Problem) -> tuple[tuple[Array, ...], Any]:
+    def of_one(own: Own, record: Recording, ref: Reference) -> Any:
+        return errors_of_one(problem, parameters.body, parameters.shared, own, record, ref)
+
+    return over_records(of_one, problem, parameters.own, problem.records, problem.reference)
+
+
+def over_records(function: Any, problem: Problem, *trees: Any) -> Any:
+    """`vmap` over the recordings; a single one is left alone, its loop compiles to less."""
+    if problem.count > 1:
+        return jax.vmap(function)(*trees)
+    out = function(*(stacking.one(tree, 0) for tree in trees))
+    return jax.tree.map(lambda leaf: leaf[None], out)
+
+
+@eqx.filter_custom_jvp
+def all_errors(parameters: Parameters, problem: Problem) -> tuple[tuple[Array, ...], Any]:
+    """The errors (R, T, k) of each sensor, and the last states (R, …).
+
+    Its derivative is taken recording by recording: the Jacobian has a block for what all share and
+    one for what each has of its own, and no zeros are carried through the motion.
+    """
+    return _all(parameters, problem)
+
+
+@all_errors.def_jvp
+def _all_errors_jvp(primals: Any, tangents: Any) -> Any:
+    parameters, problem = primals
+    step, beside = tangents
+    if jax.tree.leaves(beside):
+        raise TypeError(
+            "all_errors: only derivatives in the parameters are taken block by block; use "
+            "errors_of_one for those in the problem"
+        )
+    out, blocks = with_blocks(parameters, problem)
+    zeros = jax.tree.map(
+        lambda p, s: jnp.zeros_like(p) if s is None and p is not None else s,
+        parameters,
+        step,
+        is_leaf=lambda node: node is None,
+    )
+    return out, along(problem, blocks, zeros)
+
+
+def along(problem: Problem, blocks: Any, step: Parameters) -> Any:
+    """The derivatives of `with_blocks` along a step of all parameters."""
+
+    def flat(tree: Any, axes: int) -> Array:
+        leaves = [leaf.reshape(*leaf.shape[:axes], -1) for leaf in jax.tree.leaves(tree)]
+        return jnp.concatenate(leaves, axis=-1)
+
+    common = flat((step.body, step.shared), 0)
+    common = jnp.broadcast_to(common, (problem.count, common.shape[0]))
+    moved = jnp.concatenate([common, flat(step.own, 1)], axis=1)
+    return jax.tree.map(lambda block: jnp.einsum("r...n,rn->r...", block, moved), blocks)
+
+
+def with_blocks(parameters: Parameters, problem: Problem) -> tuple[Any, Any]:
+    """The errors and last states, and their derivatives (…, n) in what each recording depends on.
+
+    The n numbers are the body's, the shared ones, then the recording's own, each flattened.
+    """
+
+    def of_one(own: Own, record: Recording, ref: Reference) -> Any:
+        flat, restore = ravel_pytree((parameters.body, parameters.shared, own))
+
+        def value(vector: Array) -> Any:
+            body, shared, mine = restore(vector)
+            out = errors_of_one(problem, body, shared, mine, record, ref)
+            return out, out
+
+        blocks, out = jax.jacfwd(value, has_aux=True)(flat)
+        return out, blocks
+
+    return over_records(of_one, problem, parameters.own, problem.records, problem.reference)
+
+
+def _with(recording: Recording, torque: Torque) -> Recording:
+    if recording.torque is not None:
+        raise ValueError(
+            "Problem: a recording has a torque of its own; put both in it: Sum(its, this)"
+        )
+    return eqx.tree_at(lambda r: r.torque, recording, torque, is_leaf=lambda node: node is None)
+
+
+def _rung(recording: Recording, body: AbstractBodyChart) -> type:
+    felt = [reading.sensor.feels for reading in recording.readings]
+    law: Any = recording.torque
+    if law is not None:
+        felt.append(getattr(law, "feels", HasAttitude))
+    parts = law.parts if isinstance(law, Sum) else (law,)
+    forced = any(isinstance(part, AbstractForce) for part in parts)
+    if HasPose in felt or forced:
+        sample: Any = eqx.filter_eval_shape(body.body, jnp.zeros(body.size))
+        if not isinstance(sample, MassProperties):
+            raise ValueError(
+                "Problem: a sensor or force needs a body that moves, whose mass is known or free: "
+                f"wanted Mass(guess) or Known(MassProperties), got {type(body).__name__}"
+            )
+        return Rigid
+    return Attitude if HasAttitude in felt else Spin
+
+
+def _reference(recordings: Sequence[Recording], rung: type) -> Reference:
+    turns = [_first_attitude(r) for r in recordings]
+    places = [_first_place(r) for r in recordings]
+    dtype = recordings[0].t.dtype
+    # Arrays, not floats: another recording must not compile again.
+    return Reference(
+        None if rung is Spin else jnp.asarray(np.stack(turns), dtype),
+        jnp.asarray(np.stack([x for x, _, _ in places]), dtype) if rung is Rigid else None,
+        jnp.asarray(np.stack([v for _, v, _ in places]), dtype) if rung is Rigid else None,
+        jnp.asarray([_typical_rate(r) for r in recordings], dtype),
+        jnp.asarray([length for _, _, length in places], dtype),
+    )
 
 
 def _typical_rate(recording: Recording) -> float:
@@ -117,13 +447,24 @@ def _typical_rate(recording: Recording) -> float:
     return rate if rate > 0 else 1.0
 
 
-def _first_attitude(recording: Recording) -> Quat | None:
+def _first_attitude(recording: Recording) -> np.ndarray:
     for reading in recording.readings:
         if isinstance(reading.sensor, AttitudeSensor):
-            return reading.values[int(np.argmax(reading.seen))]
-        if reading.sensor.feels is HasAttitude:
-            return jnp.array([1.0, 0.0, 0.0, 0.0])
-    return None
+            return np.asarray(reading.values[int(np.argmax(reading.seen))])
+    return np.array([1.0, 0.0, 0.0, 0.0])
+
+
+def _first_place(recording: Recording) -> tuple[np.ndarray, np.ndarray, float]:
+    """Position and velocity of the first marker, m and m/s, and a typical length, m."""
+    for reading in recording.readings:
+        if isinstance(reading.sensor, Marker):
+            seen = np.flatnonzero(reading.seen)
+            x, t = np.asarray(reading.values)[seen], np.asarray(recording.t)[seen]
+            few = slice(0, max(2, min(5, seen.size)))
+            v = np.polyfit(t[few] - t[0], x[few], 1)[0] if seen.size > 1 else np.zeros(3)
+            length = float(np.linalg.norm(x - x.mean(axis=0), axis=1).max())
+            return x[0], v, length if length > 0 else 1.0
+    return np.zeros(3), np.zeros(3), 1.0
 
 
 def attitude_rate(recording: Recording) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""A recording: times, and what each sensor read then."""
+"""A recording: times, what each sensor read then, and what turned the body meanwhile."""
 
 from typing import Any
 
@@ -7,15 +7,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from rigidjax.identify.sensors import AbstractSensor, AttitudeSensor
+from rigidjax.identify.sensors import AbstractSensor
+from rigidjax.motion.torques import Torque
 
 
 class Reading(eqx.Module):
-    """What one sensor read: `values` (T, …) and `mask` (T,), true where there is a reading."""
+    """What one sensor read: `values` (T, …) and `mask` (T,), true where there is a reading.
+
+    Inside a `Problem` all arrays have a leading axis over recordings.
+    """
 
     sensor: AbstractSensor
     values: Float[Array, "times ..."]
-    mask: Bool[Array, " times"]
+    mask: Bool[Array, "*records times"]
 
     @property
     def seen(self) -> np.ndarray:
@@ -28,7 +32,11 @@ class Recording(eqx.Module):
 
     **Arguments:** `t` (T,) increasing times, s; then, for each sensor, a pair `(sensor, values)` or
     a triple `(sensor, values, mask)`: `values` (T, 3) for a `Gyro`, (T, 4) for an
-    `AttitudeSensor`; `mask` (T,) true where there is a reading (what it masks may be NaN).
+    `AttitudeSensor`, as the sensor's `reading_shape` says; `mask` (T,) true where there is a
+    reading (what it masks may be NaN). A time at which no sensor read anything is dropped: a masked
+    reading and an absent one are the same. Sensors with their own times share the union of these.
+    `torque`, by keyword, is what turned this body besides its own spin: a wheel whose speed was
+    logged, a law with coefficients that a `Free` may move; `None` for none.
 
     **Raises** `ValueError` for times that do not increase, a wrong shape, an unmasked NaN (with its
     index), or a quaternion that is not unit.
@@ -38,10 +46,11 @@ class Recording(eqx.Module):
     (2,)
     """
 
-    t: Float[Array, " times"]
+    t: Float[Array, "*records times"]
     readings: tuple[Reading, ...]
+    torque: Torque | None
 
-    def __init__(self, t: Any, *readings: tuple):
+    def __init__(self, t: Any, *readings: tuple, torque: Torque | None = None):
         t = np.asarray(t, float)
         if t.ndim != 1 or t.size < 2:
             raise ValueError(f"t: wanted at least two times, shape (T,), got shape {t.shape}")
@@ -52,16 +61,36 @@ class Recording(eqx.Module):
             raise ValueError(f"t: wanted increasing times; t[{index}] is not above the one before")
         if not readings:
             raise ValueError("Recording: wanted at least one pair (sensor, values)")
-        self.t = jnp.asarray(t)
-        self.readings = tuple(_reading(t, *reading) for reading in readings)
+        rows = [_reading(t, *reading) for reading in readings]
+        used = np.any([mask for _, _, mask in rows], axis=0)
+        if used.sum() < 2:
+            raise ValueError("Recording: wanted readings at two times at least; the rest is masked")
+        self.t = jnp.asarray(t[used])
+        self.readings = tuple(
+            Reading(sensor, jnp.asarray(values[used]), jnp.asarray(mask[used]))
+            for sensor, values, mask in rows
+        )
+        self.torque = torque
 
     @property
     def size(self) -> int:
-        """How many numbers were read, three for each reading."""
-        return sum(3 * int(reading.seen.sum()) for reading in self.readings)
+        """How many numbers were read."""
+        return sum(count_of(reading) for reading in self.readings)
+
+    @property
+    def sensors(self) -> tuple[AbstractSensor, ...]:
+        """The sensors, in the order of the readings."""
+        return tuple(reading.sensor for reading in self.readings)
 
 
-def _reading(t: np.ndarray, sensor: AbstractSensor, values: Any, mask: Any = None) -> Reading:
+def count_of(reading: Reading) -> int:
+    """How many numbers a reading holds: those seen, times the components of an error."""
+    return reading.sensor.components * int(reading.seen.sum())
+
+
+def _reading(
+    t: np.ndarray, sensor: AbstractSensor, values: Any, mask: Any = None
+) -> tuple[AbstractSensor, np.ndarray, np.ndarray]:
     name = type(sensor).__name__
     if not isinstance(sensor, AbstractSensor):
         raise TypeError(f"Recording: wanted pairs (sensor, values), got {name} for a sensor")
@@ -72,21 +101,21 @@ def _reading(t: np.ndarray, sensor: AbstractSensor, values: Any, mask: Any = Non
     mask = np.ones(t.size, bool) if mask is None else np.asarray(mask, bool)
     if mask.shape != t.shape:
         raise ValueError(f"{name}: wanted a mask of shape {t.shape}, got {mask.shape}")
-    bad = mask & ~np.isfinite(values).all(axis=1)
+    across = tuple(range(1, values.ndim))
+    bad = mask & ~np.isfinite(values).all(axis=across)
     if bad.any():
         raise ValueError(
             f"{name}: the reading at index {int(np.argmax(bad))} contains NaN; mask it if it is "
             "a gap"
         )
-    if isinstance(sensor, AttitudeSensor):
-        length = np.linalg.norm(values, axis=1)
-        bad = mask & (np.abs(length - 1) > 1e-6)
-        if bad.any():
-            raise ValueError(
-                f"{name}: the quaternion at index {int(np.argmax(bad))} is not unit; wanted "
-                "(w, x, y, z) with the scalar first"
-            )
-    # What is masked must not reach a derivative: 0 · NaN is NaN.
-    filler = np.eye(1, values.shape[1]) if isinstance(sensor, AttitudeSensor) else 0.0
-    values = np.where(mask[:, None], values, filler)
-    return Reading(sensor, jnp.asarray(values), jnp.asarray(mask))
+    if not mask.any():
+        raise ValueError(f"{name}: every reading is masked")
+    # What is masked must not reach a derivative, for 0 · NaN is NaN: any reading will do instead.
+    shaped = mask.reshape(-1, *(1 for _ in across))
+    values = np.where(shaped, values, values[int(np.argmax(mask))])
+    refusal = getattr(sensor, "refusal", None)
+    if refusal is not None:
+        wrong, why = refusal(values)
+        if wrong.any():
+            raise ValueError(f"{name}: {why.format(index=int(np.argmax(wrong)))}")
+    return sensor, values, mask

@@ -17,9 +17,9 @@ def rows(fit: "Fit", rate_unit: str = "rad/s") -> list[Row]:
     """
     scale = {"rad/s": 1.0, "deg/s": 180 / np.pi, "deg/day": 86400 * 180 / np.pi}[rate_unit]
     bounds = fit.interval(0.95)
-    ratios = np.exp(np.asarray(fit.problem.body.log_ratios(fit.body)))
+    ratios = np.exp(np.asarray(fit.problem.body.logs(fit.body)))
     out: list[Row] = []
-    for name, value in zip(fit.problem.body.ratio_names, ratios, strict=True):
+    for name, value in zip(fit.problem.body.log_names, ratios, strict=True):
         out.append((name, float(value), *bounds[name], ""))
     for axis, value in zip("xyz", np.asarray(fit.state0.omega), strict=True):
         low, high = bounds[f"Ω{axis}"]

@@ -1,14 +1,24 @@
 """Where a fit starts: a linear regression where the data allow it, and scattered points around."""
 
+from typing import Any
+
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
+from rigidjax._types import HasSpin
 from rigidjax.body.inertia import Inertia
 from rigidjax.identify.problem import Parameters, Problem, attitude_rate
 from rigidjax.identify.recording import Recording
 from rigidjax.identify.sensors import Gyro
+from rigidjax.motion import Spin
+from rigidjax.motion.torques import Torque, evaluate
+
+BASIS = np.zeros((6, 3, 3))
+for _k, (_i, _j) in enumerate([(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)]):
+    BASIS[_k, _i, _j] = BASIS[_k, _j, _i] = 1.0
 
 
 def starting_points(problem: Problem, count: int, key: PRNGKeyArray) -> list[Parameters]:
@@ -17,32 +27,62 @@ def starting_points(problem: Problem, count: int, key: PRNGKeyArray) -> list[Par
     **Arguments:** `problem`; `count` ≥ 1; `key` a JAX random key. The first body rate is the first
     reading (or the first two attitudes over their time). The inertia is the regression on Euler's
     equations where a gyro sampled them finely enough, else a sphere; further starts scatter the
-    shape over the whole chart and the rate by a tenth.
+    shape over the whole chart and the rate by a tenth. What a `Free` moves starts as it is given.
     """
-    rate = _first_rate(problem.recording) / float(problem.typical_rate)
-    regressed = regress_inertia(problem.recording)
-    centre = np.zeros(problem.body.size)
-    if regressed is not None:
-        centre = np.asarray(problem.body.vector(regressed))
-    turn = None if problem.reference is None else jnp.zeros(3)
+    recordings = problem.recordings
+    regressed = regress_inertia(recordings)
+    start = problem.start(regressed)
+    rates = np.stack([_first_rate(recording) for recording in recordings])
+    rates = rates / np.asarray(problem.reference.rate)[:, None]
+    centre = np.asarray(start.body)
     out = []
     for index in range(count):
         shape_key, rate_key, key = jax.random.split(key, 3)
         wide = 0.0 if index == 0 else (0.5 if regressed is not None and index % 2 else 1.5)
         middle = centre if (index == 0 or wide < 1) else 0 * centre
         body = middle + wide * jax.random.normal(shape_key, centre.shape)
-        spin = rate + (0.0 if index == 0 else 0.1) * jax.random.normal(rate_key, (3,))
-        out.append(Parameters(jnp.asarray(body), jnp.asarray(spin), turn))
+        spin = rates + (0.0 if index == 0 else 0.1) * jax.random.normal(rate_key, rates.shape)
+        point = eqx.tree_at(
+            lambda p: (p.body, p.own.spin), start, (jnp.asarray(body), jnp.asarray(spin))
+        )
+        out.append(point)
     return out
 
 
-def regress_inertia(recording: Recording) -> Inertia | None:
-    """The inertia, up to scale, that Euler's equations fit best in integral form.
+def regress_inertia(recordings: tuple[Recording, ...]) -> Inertia | None:
+    """The inertia that Euler's equations in integral form fit best; without torque up to scale.
 
-    Between two samples `I ΔΩ + ∫ Ω × IΩ dt = 0` is linear in the six components of I; the smallest
-    right singular vector of all such rows is the answer, moved to the nearest second moment whose
-    eigenvalues are positive. `None` where no gyro was there, or sampled too coarsely.
+    Between two samples `I ΔΩ + ∫ Ω × IΩ dt = ∫ τ dt` is linear in the six components of I: without
+    a torque the smallest right singular vector of all such rows is the answer, with one (at its
+    starting values, along the measured rates) the least squares solution. Then moved to the nearest
+    second moment whose eigenvalues are positive. `None` where no gyro was there, sampled too
+    coarsely, or the torque needs more than a rate.
     """
+    rows, sides = [], []
+    for recording in recordings:
+        found = _equations(recording)
+        if found is None:
+            return None
+        rows.append(found[0])
+        sides.append(found[1])
+    matrix, side = np.concatenate(rows), np.concatenate(sides)
+    if recordings[0].torque is None:
+        components = np.linalg.svd(matrix, full_matrices=False)[2][-1]
+        components = components * np.sign(components[:3].sum())
+        components = components / components[:3].sum()
+    else:
+        components = np.linalg.lstsq(matrix, side, rcond=None)[0]
+        if not components[:3].sum() > 0:
+            return None
+    tensor = np.einsum("k,kij->ij", components, BASIS)
+    values, axes = np.linalg.eigh(0.5 * np.trace(tensor) * np.eye(3) - tensor)
+    values = np.maximum(values, 1e-2 * values.max())
+    second_moment = (axes * values) @ axes.T
+    return Inertia(jnp.asarray(np.trace(second_moment) * np.eye(3) - second_moment))
+
+
+def _equations(recording: Recording) -> tuple[np.ndarray, np.ndarray] | None:
+    """Rows (n, 6) and right sides (n,) of the integral of Euler's equations over one recording."""
     gyro = [r for r in recording.readings if isinstance(r.sensor, Gyro)]
     if not gyro:
         return None
@@ -50,23 +90,31 @@ def regress_inertia(recording: Recording) -> Inertia | None:
     t, w = np.asarray(recording.t)[seen], np.asarray(gyro[0].values)[seen]
     if t.size < 10 or np.median(np.diff(t)) * np.linalg.norm(w, axis=1).max() > 0.5:
         return None
+    pushed = np.zeros((t.size, 3))
+    if recording.torque is not None:
+        felt: Any = getattr(recording.torque, "feels", None)
+        if felt is not HasSpin:
+            return None
+        pushed = np.asarray(_torques(recording.torque, jnp.asarray(t), jnp.asarray(w)))
     stride = max(1, t.size // 60)
-    basis = np.zeros((6, 3, 3))
-    for k, (i, j) in enumerate([(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)]):
-        basis[k, i, j] = basis[k, j, i] = 1.0
-    momenta = np.einsum("kij,tj->tki", basis, w)
+    momenta = np.einsum("kij,tj->tki", BASIS, w)
     flux = np.cross(w[:, None, :], momenta)
-    steps = 0.5 * (flux[1:] + flux[:-1]) * np.diff(t)[:, None, None]
-    total = momenta + np.concatenate([np.zeros((1, 6, 3)), np.cumsum(steps, axis=0)])
+    total = momenta + _integral(flux, t)
     # What is conserved is constant: compare with its mean over the record.
+    impulse = _integral(pushed[:, None, :], t)[:, 0]
     rows = (total - total.mean(axis=0))[::stride].transpose(0, 2, 1).reshape(-1, 6)
-    components = np.linalg.svd(rows, full_matrices=False)[2][-1]
-    tensor = np.einsum("k,kij->ij", components, basis)
-    tensor = tensor * np.sign(np.trace(tensor)) / abs(np.trace(tensor))
-    values, axes = np.linalg.eigh(0.5 * np.trace(tensor) * np.eye(3) - tensor)
-    values = np.maximum(values, 1e-3)
-    second_moment = (axes * values) @ axes.T
-    return Inertia(jnp.asarray(np.trace(second_moment) * np.eye(3) - second_moment))
+    return rows, (impulse - impulse.mean(axis=0))[::stride].reshape(-1)
+
+
+@eqx.filter_jit
+def _torques(torque: Torque, t: Any, w: Any) -> Any:
+    body = Inertia(jnp.eye(3))
+    return jax.vmap(lambda time, omega: evaluate(torque, time, Spin(omega), body))(t, w)
+
+
+def _integral(values: np.ndarray, t: np.ndarray) -> np.ndarray:
+    steps = 0.5 * (values[1:] + values[:-1]) * np.diff(t)[:, None, None]
+    return np.concatenate([np.zeros((1, *values.shape[1:])), np.cumsum(steps, axis=0)])
 
 
 def _first_rate(recording: Recording) -> np.ndarray:

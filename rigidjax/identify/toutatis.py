@@ -76,7 +76,7 @@ def recording() -> Recording:
 def problem() -> Problem:
     """Free motion with the body axes principal, outliers counted linearly.
 
-    >>> problem().body.ratio_names
+    >>> problem().body.log_names
     ('Ix/Iz', 'Iy/Iz')
     """
     return Problem(recording(), PrincipalRatios(), loss=SoftL1())

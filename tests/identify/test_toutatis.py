@@ -61,9 +61,9 @@ def test_one_outlying_observation_does_not_move_the_result(found):
         starts=1,
         initial=found.parameters,
     )
-    middle = np.exp(np.asarray(found.problem.body.log_ratios(found.body)))
-    shifted = np.exp(np.asarray(moved.problem.body.log_ratios(moved.body)))
-    for name, a, b in zip(found.problem.body.ratio_names, middle, shifted, strict=True):
+    middle = np.exp(np.asarray(found.problem.body.logs(found.body)))
+    shifted = np.exp(np.asarray(moved.problem.body.logs(moved.body)))
+    for name, a, b in zip(found.problem.body.log_names, middle, shifted, strict=True):
         low, high = found.interval(0.95)[name]
         assert abs(a - b) < 0.25 * (high - low) / 2
 
@@ -74,7 +74,7 @@ def test_intervals_hold_the_truth_in_ninety_of_a_hundred_records(found):
     motion = problem.motion(found.parameters)
     attitude, gyro = (reading.sensor for reading in problem.recording.readings)
     truth = np.concatenate(
-        [np.exp(np.asarray(problem.body.log_ratios(found.body))), np.asarray(found.state0.omega)]
+        [np.exp(np.asarray(problem.body.logs(found.body))), np.asarray(found.state0.omega)]
     )
     held, plain = np.zeros(5), 0
     for number in range(100):

@@ -28,6 +28,7 @@ from rigidjax.motion.torques.gravity import (
     HeavyTop as HeavyTop,
 )
 from rigidjax.motion.torques.magnetic import MagneticDipole as MagneticDipole
+from rigidjax.motion.torques.series import Series as Series, Wheel as Wheel
 from rigidjax.motion.torques.tables import (
     Linear as Linear,
     Pulses as Pulses,

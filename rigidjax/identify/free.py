@@ -1,0 +1,134 @@
+"""What of a recording's torque and sensors a fit may move."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from rigidjax.identify.recording import Recording
+
+
+class Free(eqx.Module):
+    """A number or array inside the recording's torque or sensors that the fit may move.
+
+    **Arguments:** `where` picks it: `lambda r: r.readings[0].sensor.bias`, or
+    `lambda r: r.torque.coefficient`; what the recording holds there is the starting value. `name`
+    for reports. `scale` its natural size: a step of one in the fit is one `scale`, in its unit.
+    `each`: one value for each recording, instead of one for all. `positive`: moved through its
+    logarithm, so that it keeps its sign. `prior` a standard deviation around the starting value (a
+    Gaussian prior, in its unit; relative for `positive`), or `None`.
+
+    **Raises** `ValueError` for a scale or prior that is not positive.
+
+    >>> import rigidjax as rj
+    >>> Free(lambda r: r.readings[0].sensor.bias, "gyro bias", scale=0.01).name
+    'gyro bias'
+    """
+
+    where: Callable[[Recording], Any]
+    name: str
+    scale: float
+    each: bool
+    positive: bool
+    prior: float | None
+
+    def __init__(
+        self,
+        where: Callable[[Recording], Any],
+        name: str,
+        *,
+        scale: float = 1.0,
+        each: bool = False,
+        positive: bool = False,
+        prior: float | None = None,
+    ):
+        if not callable(where):
+            raise TypeError(
+                f"Free: wanted a function of a recording for where, got {type(where).__name__}"
+            )
+        if not scale > 0:
+            raise ValueError(f"Free {name!r}: wanted a positive scale, got {scale}")
+        if prior is not None and not prior > 0:
+            raise ValueError(f"Free {name!r}: wanted a positive prior, got {prior}")
+        self.where, self.name, self.scale = where, name, float(scale)
+        self.each, self.positive, self.prior = each, positive, prior
+
+
+class Slot(eqx.Module):
+    """A `Free` found in the recordings: which leaf it is. No function is kept, so that a second
+    problem of the same form does not compile again.
+    """
+
+    leaf: int = eqx.field(static=True)
+    name: str = eqx.field(static=True)
+    each: bool = eqx.field(static=True)
+    positive: bool = eqx.field(static=True)
+    scale: Array
+    prior: Array | None
+
+    def read(self, recording: Recording) -> Array:
+        """Its value in a recording."""
+        return jax.tree.leaves(recording)[self.leaf]
+
+    def move(self, start: Array, step: Array) -> Array:
+        """The value that lies `step` away from `start`, in units of the scale."""
+        if self.positive:
+            return start * jnp.exp(step * self.scale)
+        return start + step * self.scale
+
+    def step(self, start: Array, value: Array) -> Array:
+        """The inverse of `move`."""
+        if self.positive:
+            return jnp.log(value / start) / self.scale
+        return (value - start) / self.scale
+
+
+def find(free: Sequence[Free], recording: Recording) -> tuple[Slot, ...]:
+    """Where each `Free` is among the recording's leaves.
+
+    **Raises** `ValueError` where it picks nothing, something that is no number, or the same twice.
+    """
+    leaves, structure = jax.tree.flatten(recording)
+    numbered = jax.tree.unflatten(structure, list(range(len(leaves))))
+    slots: list[Slot] = []
+    for item in free:
+        if not isinstance(item, Free):
+            raise TypeError(f"free: wanted Free(where, name), got {type(item).__name__}")
+        try:
+            index = item.where(numbered)
+        except (AttributeError, IndexError, TypeError) as error:
+            raise ValueError(f"Free {item.name!r}: nothing is there ({error})") from None
+        if index is None:
+            raise ValueError(
+                f"Free {item.name!r}: None is there; give it a starting value, such as "
+                "Gyro(bias=[0.0, 0.0, 0.0])"
+            )
+        if not isinstance(index, int):
+            raise ValueError(
+                f"Free {item.name!r}: wanted one array, got {type(index).__name__}; one Free each"
+            )
+        value = leaves[index]
+        if not eqx.is_inexact_array_like(value):
+            raise ValueError(f"Free {item.name!r}: wanted numbers, got {type(value).__name__}")
+        if any(slot.leaf == index for slot in slots):
+            raise ValueError(f"Free {item.name!r}: another Free moves the same numbers")
+        if item.positive and not (np.asarray(value) > 0).all():
+            raise ValueError(f"Free {item.name!r}: wanted a positive starting value, got {value}")
+        scale = jnp.asarray(item.scale)
+        prior = None if item.prior is None else jnp.asarray(item.prior / item.scale)
+        slots.append(Slot(index, item.name, item.each, item.positive, scale, prior))
+    return tuple(slots)
+
+
+def put(recording: Recording, slots: Sequence[Slot], values: Sequence[Array]) -> Recording:
+    """The recording with these values in the slots."""
+    leaves, structure = jax.tree.flatten(recording)
+    for slot, value in zip(slots, values, strict=True):
+        leaves[slot.leaf] = jnp.broadcast_to(value, jnp.shape(leaves[slot.leaf])).astype(
+            jnp.result_type(leaves[slot.leaf])
+        )
+    return jax.tree.unflatten(structure, leaves)

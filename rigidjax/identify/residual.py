@@ -1,0 +1,109 @@
+"""From errors to what least squares makes small: noise, saturation, losses, priors, joints."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from rigidjax.identify.loss import shrink, weight
+from rigidjax.identify.problem import Parameters, Problem, all_errors, first_state
+from rigidjax.motion import Attitude, Rigid
+from rigidjax.rotation import quaternion
+
+# One (R, k) for each sensor: R recordings, k components.
+Noise = tuple[Float[Array, "records _"], ...]
+
+
+def whitened(problem: Problem, errors: tuple, noise: Noise) -> tuple[Float[Array, "..."], ...]:
+    """Errors in standard deviations, (R, T, k) for each sensor; saturated channels by their odds.
+
+    A channel at its limit says "at least that much": it counts as `√(−2 log Φ(z))`, with z how far
+    the prediction is beyond the limit in standard deviations (Tobin 1958, doi:10.2307/1907382).
+    """
+    out = []
+    for reading, error, sigma in zip(problem.records.readings, errors, noise, strict=True):
+        scaled = error / sigma[:, None]
+        limit = getattr(reading.sensor, "limit", None)
+        if limit is not None:
+            # The limit has a leading axis over recordings.
+            full = jnp.abs(reading.values) >= limit[:, None] * (1 - 1e-6)
+            side = jnp.sign(reading.values)
+            beyond = -side * scaled
+            scaled = jnp.where(
+                full & reading.mask[..., None],
+                -side * _censored(jnp.where(full, beyond, 0.0)),
+                scaled,
+            )
+        out.append(scaled)
+    return tuple(out)
+
+
+def _censored(z: Float[Array, "..."]) -> Float[Array, "..."]:
+    # Beyond five standard deviations nothing is left to say, and the root has no derivative.
+    inside = jnp.minimum(z, 5.0)
+    return jnp.where(z < 5.0, jnp.sqrt(-2.0 * jax.scipy.special.log_ndtr(inside)), 0.0)
+
+
+def residuals(parameters: Parameters, args: Any) -> Any:
+    """Everything whose squares a fit adds up, as a tree: readings, priors, joints between pieces.
+
+    **Arguments:** `parameters`; `args` the problem, the noise of each sensor, and weights (R, T)
+    of the times.
+    """
+    return assembled(parameters, args, *all_errors(parameters, args[0]))
+
+
+def assembled(parameters: Parameters, args: Any, errors: tuple, ends: Any) -> Any:
+    """`residuals` of errors and last states that are known."""
+    problem, noise, weights = args
+    read = []
+    for scaled in whitened(problem, errors, noise):
+        shrunk = jax.vmap(jax.vmap(lambda e: shrink(problem.loss, e)))(scaled)
+        read.append(shrunk * weights[..., None])
+    return tuple(read), beside(parameters, problem, ends)
+
+
+def beside(parameters: Parameters, problem: Problem, ends: Any) -> tuple[Array, ...]:
+    """Residuals that are no readings: priors, and joints between pieces of one recording."""
+    out = []
+    shared, each = iter(parameters.shared), iter(parameters.own.each)
+    for slot in problem.slots:
+        step = next(each if slot.each else shared)
+        if slot.prior is not None:
+            out.append(step / slot.prior)
+    if problem.prior is not None:
+        body = problem.body.body(parameters.body)
+        out.append(problem.prior.residuals(body, scaled=problem.body.unit != ""))
+    if problem.links is not None:
+        out.append(gaps(parameters, problem, ends) / problem.links.width)
+    return tuple(out)
+
+
+def gaps(parameters: Parameters, problem: Problem, ends: Any) -> Float[Array, "records n"]:
+    """How far each piece's end is from the start of the next, in typical units; zero at the last."""
+    assert problem.links is not None
+    ref = problem.reference
+    starts = jax.vmap(lambda own, r: first_state(problem.rung, own, r))(parameters.own, ref)
+    following = jax.tree.map(lambda leaf: jnp.roll(leaf, -1, axis=0), starts)
+    rate = ref.rate[:, None]
+    parts = [(ends.omega - following.omega) / rate]
+    if problem.rung in (Attitude, Rigid):
+        between = jax.vmap(
+            lambda a, b: quaternion.log(quaternion.multiply(quaternion.conjugate(a), b))
+        )
+        parts.append(between(following.q, ends.q))
+    if problem.rung is Rigid:
+        length = ref.length[:, None]
+        parts += [(ends.x - following.x) / length, (ends.v - following.v) / (length * rate)]
+    return jnp.concatenate(parts, axis=1) * problem.links.on[:, None]
+
+
+def weights_of(problem: Problem, errors: tuple, noise: Noise) -> tuple[Float[Array, "..."], ...]:
+    """The weight (R, T) of each reading in the normal equations: the loss's, zero where masked."""
+    out = []
+    scaled = whitened(problem, errors, noise)
+    for reading, e in zip(problem.records.readings, scaled, strict=True):
+        each = jax.vmap(jax.vmap(lambda x: weight(problem.loss, x)))(e)
+        out.append(jnp.where(reading.mask, each, 0.0))
+    return tuple(out)

@@ -1,0 +1,236 @@
+"""Where the misfit is least: Levenberg–Marquardt from several starts, the record from its start."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jaxtyping import Array, Bool, Float
+
+from rigidjax.identify.problem import Parameters, Problem, with_blocks
+from rigidjax.identify.residual import Noise, assembled, residuals
+
+# The record is fitted from its beginning first: a long one is a forest of wrong minima (the phase
+# slips by whole turns), a short one is not.
+HORIZONS = (0.25, 0.5, 1.0)
+# Steps between two looks at the clock, the keyboard and the checkpoint.
+STRIDE = 25
+
+
+class Tried(eqx.Module):
+    """Where one start ended: its parameters, misfit (½ Σ of squares), and whether it converged."""
+
+    parameters: Parameters
+    cost: Float[Array, ""]
+    converged: Bool[Array, ""]
+
+
+def least_squares(
+    start: Parameters,
+    problem: Problem,
+    noise: Noise,
+    weights: Float[Array, "records times"],
+    solver: Any,
+    max_steps: int,
+) -> Tried:
+    """At most `max_steps` steps of the solver from `start`."""
+    value, done = _solve(start, problem, noise, weights, solver, max_steps)
+    # By the program that everything else runs as well: less to compile.
+    cost = _cost(value, problem, noise, weights, evaluate(value, problem)[0])
+    return _safe(start, value, cost, done)
+
+
+@eqx.filter_jit
+def _solve(
+    start: Parameters, problem: Problem, noise: Noise, weights: Any, solver: Any, max_steps: int
+) -> tuple[Parameters, Array]:
+    return _one(start, problem, noise, weights, solver, max_steps)
+
+
+@eqx.filter_jit
+def evaluate(parameters: Parameters, problem: Problem) -> Any:
+    """Errors and last states with their derivatives (see `with_blocks`).
+
+    The one program outside the search that follows the motion: all else is made of it.
+    """
+    return with_blocks(parameters, problem)
+
+
+@eqx.filter_jit
+def _cost(
+    parameters: Parameters, problem: Problem, noise: Noise, weights: Any, found: Any
+) -> Float[Array, ""]:
+    return _half_sum(assembled(parameters, (problem, noise, weights), *found))
+
+
+@eqx.filter_jit
+def many(
+    starts: Parameters,
+    problem: Problem,
+    noise: Noise,
+    weights: Float[Array, "records times"],
+    solver: Any,
+    max_steps: int,
+) -> Tried:
+    """`least_squares` from many starts at once (a leading axis on `starts`)."""
+
+    def one(start: Parameters) -> Tried:
+        value, done = _one(start, problem, noise, weights, solver, max_steps)
+        return _safe(start, value, misfit(value, (problem, noise, weights)), done)
+
+    return jax.vmap(one)(starts)
+
+
+def _one(
+    start: Parameters, problem: Problem, noise: Noise, weights: Any, solver: Any, max_steps: int
+) -> tuple[Parameters, Array]:
+    least: Any = optx.least_squares
+    out = least(
+        residuals,
+        solver,
+        start,
+        (problem, noise, weights),
+        options={"jac": "fwd"} if isinstance(solver, optx.AbstractLeastSquaresSolver) else {},
+        max_steps=max_steps,
+        throw=False,
+    )
+    return out.value, out.result == optx.RESULTS.successful
+
+
+def _safe(start: Parameters, value: Parameters, cost: Array, done: Array) -> Tried:
+    # A wild step can end in NaN: the start is then the better point.
+    lost = ~jnp.isfinite(cost)
+    value = jax.tree.map(lambda a, b: jnp.where(lost, b, a), value, start)
+    return Tried(value, jnp.where(lost, jnp.inf, cost), done & ~lost)
+
+
+def cost_of(parameters: Parameters, problem: Problem, noise: Noise) -> float:
+    """The misfit over the whole of the records."""
+    whole = jnp.ones_like(problem.records.t)
+    return float(_cost(parameters, problem, noise, whole, evaluate(parameters, problem)[0]))
+
+
+def misfit(parameters: Parameters, args: Any) -> Float[Array, ""]:
+    """Half the sum of the squares of all residuals."""
+    return _half_sum(residuals(parameters, args))
+
+
+def _half_sum(tree: Any) -> Float[Array, ""]:
+    return 0.5 * sum((jnp.sum(leaf**2) for leaf in jax.tree.leaves(tree)), jnp.zeros(()))
+
+
+def solver_for(tolerance: float) -> optx.LevenbergMarquardt:
+    """Levenberg–Marquardt of optimistix; the tolerance an array, so as not to compile again."""
+    limit: Any = jnp.asarray(tolerance)
+    return optx.LevenbergMarquardt(rtol=limit, atol=limit)
+
+
+def horizons(problem: Problem) -> tuple[Float[Array, "records times"], ...]:
+    """Weights that show the first quarter, the first half and the whole of each record."""
+    t = problem.records.t
+    since, length = t - t[:, :1], t[:, -1:] - t[:, :1]
+    return tuple((since <= part * length).astype(t.dtype) for part in HORIZONS)
+
+
+class Checkpoint:
+    """What a long search has found so far, on disk after every stride of steps.
+
+    **Arguments:** `path` of the file, or `None` to keep nothing; `like` a `Tried` of the right
+    shapes; `print_of` a number that belongs to this problem alone. A file of another problem is
+    refused with a `ValueError`, not overwritten.
+    """
+
+    def __init__(self, path: str | Path | None, like: Tried, print_of: float):
+        self.path, self.like = None if path is None else Path(path), like
+        self.print_of = print_of
+        self.done: list[Tried] = []
+        self.stage, self.current = 0, like
+        if self.path is not None and self.path.exists():
+            self._read(self.path)
+
+    def save(self, done: Sequence[Tried], stage: int, current: Tried) -> None:
+        """Write what is finished and where the search stands, replacing the file at once."""
+        if self.path is None:
+            return
+        leaves = [np.asarray(x) for item in (*done, current) for x in jax.tree.leaves(item)]
+        beside = self.path.with_name(self.path.name + ".new")
+        with beside.open("wb") as file:
+            np.savez(
+                file,
+                print_of=self.print_of,
+                stage=stage,
+                done=len(done),
+                **{f"leaf{i}": leaf for i, leaf in enumerate(leaves)},
+            )
+        beside.replace(self.path)
+
+    def _read(self, path: Path) -> None:
+        try:
+            with np.load(path) as file:
+                held = {name: file[name] for name in file.files}
+            print_of, stage, done = (held[name] for name in ("print_of", "stage", "done"))
+        except (OSError, ValueError, KeyError) as error:
+            raise ValueError(f"{path}: no checkpoint of a fit ({type(error).__name__})") from None
+        structure = jax.tree.structure(self.like)
+        if float(print_of) != self.print_of:
+            raise ValueError(f"{path}: the checkpoint of another problem; name another file")
+        size = structure.num_leaves
+        items = []
+        for index in range(int(done) + 1):
+            leaves = [
+                jnp.asarray(held[f"leaf{i}"]) for i in range(index * size, (index + 1) * size)
+            ]
+            items.append(jax.tree.unflatten(structure, leaves))
+        self.done, self.current, self.stage = items[:-1], items[-1], int(stage)
+
+
+def climb(
+    point: Parameters,
+    problem: Problem,
+    noise: Noise,
+    solver: Any,
+    max_steps: int,
+    *,
+    first_stage: int = 0,
+    look: Callable[[int, Tried], None] = lambda stage, tried: None,
+) -> Tried:
+    """One start through the horizons; `look` is called after each stride with where it stands."""
+    tried = Tried(point, jnp.asarray(jnp.inf), jnp.asarray(False))
+    rough = eqx.tree_at(
+        lambda s: (s.rtol, s.atol), solver, replace_fn=lambda x: jnp.maximum(x, 1e-4)
+    )
+    for stage, seen in enumerate(horizons(problem)):
+        if stage < first_stage:
+            continue
+        last = stage == len(HORIZONS) - 1
+        for _ in range(0, max_steps, STRIDE):
+            count = min(STRIDE, max_steps)
+            tried = least_squares(
+                tried.parameters, problem, noise, seen, solver if last else rough, count
+            )
+            look(stage, tried)
+            if bool(tried.converged) or not np.isfinite(float(tried.cost)):
+                break
+    return tried
+
+
+def climb_together(
+    points: Parameters, problem: Problem, noise: Noise, solver: Any, max_steps: int
+) -> list[Tried]:
+    """Many starts through the horizons in one `vmap` (a leading axis on `points`)."""
+    tried = None
+    rough = eqx.tree_at(
+        lambda s: (s.rtol, s.atol), solver, replace_fn=lambda x: jnp.maximum(x, 1e-4)
+    )
+    stages = horizons(problem)
+    for stage, seen in enumerate(stages):
+        last = stage == len(stages) - 1
+        tried = many(points, problem, noise, seen, solver if last else rough, max_steps)
+        points = tried.parameters
+    assert tried is not None
+    count = int(tried.cost.shape[0])
+    return [jax.tree.map(lambda leaf, i=i: leaf[i], tried) for i in range(count)]

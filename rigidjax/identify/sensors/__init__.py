@@ -1,0 +1,15 @@
+"""What a recording was read with."""
+
+from rigidjax.identify.sensors.base import AbstractSensor as AbstractSensor, Moment as Moment
+from rigidjax.identify.sensors.pointing import (
+    AttitudeSensor as AttitudeSensor,
+    Direction as Direction,
+    Marker as Marker,
+    quaternions_from_euler as quaternions_from_euler,
+    quaternions_from_matrices as quaternions_from_matrices,
+)
+from rigidjax.identify.sensors.vectors import (
+    Accelerometer as Accelerometer,
+    Gyro as Gyro,
+    Magnetometer as Magnetometer,
+)

@@ -1,0 +1,115 @@
+"""What a sensor is: what it reads of a moment of a motion, and how far a reading is from that."""
+
+import abc
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from rigidjax import _checks
+from rigidjax._types import Scalar, Vec3
+from rigidjax.body.inertia import MassProperties
+from rigidjax.rotation import quaternion
+
+
+class Moment(eqx.Module):
+    """One moment of a motion, as a sensor meets it.
+
+    **Fields:** `t` s; `state` on the rung that the problem needs; `body` the `Inertia` or
+    `MassProperties`; `field` the equations of motion `f(t, state, args)`.
+    """
+
+    t: Scalar
+    state: Any
+    body: Any
+    field: Callable[..., Any]
+
+    @property
+    def rate(self) -> Any:
+        """The derivative of the state in time: `.omega` is dΩ/dt, `.v` the acceleration."""
+        return self.field(self.t, self.state, None)
+
+    def lever(self, place: Vec3) -> Vec3:
+        """From the point that the state is about to a `place` (3,) in the body frame, m."""
+        return place - self.body.com if isinstance(self.body, MassProperties) else place
+
+
+class AbstractSensor(eqx.Module):
+    """A sensor: what shape its readings have, which rung it sees, and the error of a reading.
+
+    Subclass it for your own: say `reading_shape`, `feels` (`HasSpin`, `HasAttitude` or `HasPose`),
+    how many `components` the error has and in which `unit`, `noise` (k,) the standard deviation of
+    each component, or `None` to have it estimated; and write `error`.
+
+    Optional members: `offset`, s: the sensor's clock is behind, it shows at t what was at
+    t + offset; `limit` (k,): where a channel saturates, in the unit of the error; a method
+    `refusal(values)`: which rows cannot be readings, (T,) true where wrong, and why.
+    """
+
+    reading_shape: eqx.AbstractClassVar[tuple[int, ...]]
+    components: eqx.AbstractClassVar[int]
+    feels: eqx.AbstractVar[type]
+    unit: eqx.AbstractClassVar[str]
+    noise: eqx.AbstractVar[Array | None]
+
+    @abc.abstractmethod
+    def error(self, moment: Moment, reading: Array) -> Float[Array, " k"]:
+        """Reading minus prediction (k,), in the sensor's unit."""
+
+
+def noise_of(noise: Any, size: int = 3) -> Array | None:
+    """A standard deviation (size,) of one number or as many, positive; or `None`."""
+    if noise is None:
+        return None
+    noise = jnp.asarray(noise, jnp.result_type(float))
+    if noise.shape not in ((), (size,)):
+        count = {1: "one", 2: "two", 3: "three"}.get(size, str(size))
+        raise ValueError(f"noise: wanted one number or {count}, got shape {noise.shape}")
+    noise = jnp.broadcast_to(noise, (size,))
+    return _checks.refuse(noise, ~(noise > 0), "noise: wanted a positive standard deviation")
+
+
+def number_of(value: Any, name: str) -> Scalar | None:
+    """A number that is finite, as an array that a fit may move; or `None`."""
+    if value is None:
+        return None
+    return jnp.asarray(_checks.finite(_checks.floating(value, (), name), name))
+
+
+def vector_of(value: Any, name: str) -> Vec3 | None:
+    """Three finite numbers, as an array that a fit may move; or `None`."""
+    return None if value is None else place_of(value, name)
+
+
+def place_of(value: Any, name: str) -> Vec3:
+    """Three finite numbers, as an array that a fit may move."""
+    if value is None:
+        raise ValueError(f"{name}: wanted three numbers, got None")
+    return jnp.asarray(_checks.finite(_checks.floating(value, (3,), name), name))
+
+
+def limit_of(limit: Any) -> Vec3 | None:
+    """Where the channels saturate (3,), one number or three, positive; or `None`."""
+    if limit is None:
+        return None
+    limit = jnp.asarray(limit, jnp.result_type(float))
+    if limit.shape not in ((), (3,)):
+        raise ValueError(f"limit: wanted one number or three, got shape {limit.shape}")
+    limit = jnp.broadcast_to(limit, (3,))
+    return _checks.refuse(limit, ~(limit > 0), "limit: wanted a positive full scale")
+
+
+def shown(truth: Vec3, bias: Vec3 | None, scale: Vec3 | None, mounting: Vec3 | None) -> Vec3:
+    """What a vector sensor shows of a vector in the body frame: `scale · exp(−mounting) v + bias`.
+
+    **Arguments:** `truth` (3,) body frame; `bias` (3,) in the sensor's unit; `scale` (3,) per
+    channel; `mounting` (3,) rotation vector that turns the body's axes onto the sensor's, rad.
+    """
+    seen = truth
+    if mounting is not None:
+        seen = quaternion.rotate(quaternion.exp(-mounting), seen)
+    if scale is not None:
+        seen = scale * seen
+    return seen if bias is None else seen + bias

@@ -1,0 +1,175 @@
+"""Sensors that read a vector in their own axes: rate gyro, accelerometer, magnetometer."""
+
+from typing import Any, ClassVar
+
+from jaxtyping import Array, Float
+
+from rigidjax._types import HasAttitude, HasPose, HasSpin, Scalar, Vec3
+from rigidjax.identify.sensors.base import (
+    AbstractSensor,
+    Moment,
+    limit_of,
+    noise_of,
+    number_of,
+    place_of,
+    shown,
+    vector_of,
+)
+from rigidjax.rotation import quaternion
+from rigidjax.rotation.algebra import cross
+
+
+class Gyro(AbstractSensor):
+    """Reads the body rate: `scale · exp(−mounting) Ω + bias`, rad/s.
+
+    **Arguments:** `noise` standard deviation of a reading, rad/s, one number or (3,); `None` has it
+    estimated from the residuals. Then, `None` unless the sensor has it (give a value to let a
+    `Free` move it): `bias` (3,) rad/s; `scale` (3,) per channel; `mounting` (3,) rotation vector
+    from the body's axes to the sensor's, rad; `limit` full scale, rad/s, one number or (3,): a
+    reading at it counts as "at least that much"; `offset` s: it shows at t what was at t + offset.
+
+    **Raises** `ValueError` for a noise or limit that is not positive, a wrong shape, NaN.
+
+    >>> Gyro(noise=0.01).noise.shape
+    (3,)
+    """
+
+    reading_shape: ClassVar[tuple[int, ...]] = (3,)
+    components: ClassVar[int] = 3
+    feels: ClassVar[type] = HasSpin
+    unit: ClassVar[str] = "rad/s"
+    noise: Float[Array, "3"] | None
+    bias: Float[Array, "3"] | None
+    scale: Float[Array, "3"] | None
+    mounting: Float[Array, "3"] | None
+    limit: Float[Array, "3"] | None
+    offset: Scalar | None
+
+    def __init__(
+        self,
+        noise: Any = None,
+        *,
+        bias: Any = None,
+        scale: Any = None,
+        mounting: Any = None,
+        limit: Any = None,
+        offset: Any = None,
+    ):
+        self.noise = noise_of(noise)
+        self.bias, self.scale = vector_of(bias, "bias"), vector_of(scale, "scale")
+        self.mounting, self.limit = vector_of(mounting, "mounting"), limit_of(limit)
+        self.offset = number_of(offset, "offset")
+
+    def error(self, moment: Moment, reading: Array) -> Vec3:
+        return reading - shown(moment.state.omega, self.bias, self.scale, self.mounting)
+
+
+class Accelerometer(AbstractSensor):
+    """Reads the specific force where it sits: `scale · exp(−mounting) f + bias`, m/s².
+
+    `f = Rᵀ(a − g) + dΩ/dt × r + Ω × (Ω × r)` in the body frame (notes, eq 88, seen from the body),
+    with r the lever arm from the centre of mass, or from the fixed point of a body on a pivot. A
+    body that falls freely has a = g: then only the terms of r are left.
+
+    **Arguments:** `noise` m/s², one number or (3,), `None` to have it estimated; `place` (3,) where
+    it sits, m, body frame: from the point that the `Inertia` is about, or in the frame of the
+    `MassProperties`; `gravity` (3,) m/s², world frame: `None` for a body in free fall (`Spin`,
+    `Attitude`), needed by a body on a pivot and by a `Rigid`; `bias`, `scale`, `mounting`, `limit`,
+    `offset` as for `Gyro`.
+
+    **Raises** `ValueError` as `Gyro`.
+
+    >>> Accelerometer(noise=0.1, place=[0.01, 0.0, 0.0]).unit
+    'm/s²'
+    """
+
+    reading_shape: ClassVar[tuple[int, ...]] = (3,)
+    components: ClassVar[int] = 3
+    unit: ClassVar[str] = "m/s²"
+    place: Float[Array, "3"]
+    noise: Float[Array, "3"] | None
+    gravity: Float[Array, "3"] | None
+    bias: Float[Array, "3"] | None
+    scale: Float[Array, "3"] | None
+    mounting: Float[Array, "3"] | None
+    limit: Float[Array, "3"] | None
+    offset: Scalar | None
+
+    def __init__(
+        self,
+        noise: Any = None,
+        *,
+        place: Any,
+        gravity: Any = None,
+        bias: Any = None,
+        scale: Any = None,
+        mounting: Any = None,
+        limit: Any = None,
+        offset: Any = None,
+    ):
+        self.place, self.noise = place_of(place, "place"), noise_of(noise)
+        self.gravity = vector_of(gravity, "gravity")
+        self.bias, self.scale = vector_of(bias, "bias"), vector_of(scale, "scale")
+        self.mounting, self.limit = vector_of(mounting, "mounting"), limit_of(limit)
+        self.offset = number_of(offset, "offset")
+
+    @property
+    def feels(self) -> type:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Only gravity needs the attitude."""
+        return HasSpin if self.gravity is None else HasAttitude
+
+    def error(self, moment: Moment, reading: Array) -> Vec3:
+        state, rate = moment.state, moment.rate
+        r = moment.lever(self.place)
+        force = cross(rate.omega, r) + cross(state.omega, cross(state.omega, r))
+        if self.gravity is not None:
+            carried = rate.v if isinstance(state, HasPose) else 0.0
+            world = carried - self.gravity
+            force = force + quaternion.rotate(quaternion.conjugate(state.q), world)
+        return reading - shown(force, self.bias, self.scale, self.mounting)
+
+
+class Magnetometer(AbstractSensor):
+    """Reads a field that is known in the world: `scale · exp(−mounting) Rᵀ b + bias`.
+
+    **Arguments:** `noise` in the field's unit, one number or (3,), `None` to have it estimated;
+    `field` (3,) b, world frame, any unit; `bias` (the body's own magnetism), `scale`, `mounting`,
+    `limit`, `offset` as for `Gyro`. For a direction without a strength use `Direction`.
+
+    **Raises** `ValueError` as `Gyro`.
+
+    >>> Magnetometer(noise=1e-7, field=[2e-5, 0.0, 4e-5]).reading_shape
+    (3,)
+    """
+
+    reading_shape: ClassVar[tuple[int, ...]] = (3,)
+    components: ClassVar[int] = 3
+    feels: ClassVar[type] = HasAttitude
+    unit: ClassVar[str] = "of the field"
+    field: Float[Array, "3"]
+    noise: Float[Array, "3"] | None
+    bias: Float[Array, "3"] | None
+    scale: Float[Array, "3"] | None
+    mounting: Float[Array, "3"] | None
+    limit: Float[Array, "3"] | None
+    offset: Scalar | None
+
+    def __init__(
+        self,
+        noise: Any = None,
+        *,
+        field: Any,
+        bias: Any = None,
+        scale: Any = None,
+        mounting: Any = None,
+        limit: Any = None,
+        offset: Any = None,
+    ):
+        self.field, self.noise = place_of(field, "field"), noise_of(noise)
+        self.bias, self.scale = vector_of(bias, "bias"), vector_of(scale, "scale")
+        self.mounting, self.limit = vector_of(mounting, "mounting"), limit_of(limit)
+        self.offset = number_of(offset, "offset")
+
+    def error(self, moment: Moment, reading: Array) -> Vec3:
+        seen = quaternion.rotate(quaternion.conjugate(moment.state.q), self.field)
+        return reading - shown(seen, self.bias, self.scale, self.mounting)

@@ -1,0 +1,100 @@
+"""Several recordings of one body as one tree with a leading axis, so that one program fits all."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from rigidjax.identify.recording import Reading, Recording
+from rigidjax.motion.torques import Linear, Series
+
+
+def stack(recordings: Sequence[Recording]) -> tuple[Recording, tuple[int, ...]]:
+    """One recording with a leading axis, and how many times each of them had.
+
+    The shorter ones are continued with masked readings at their last time, tables of time with
+    their last value. **Raises** `ValueError` where sensors or torques differ in kind.
+    """
+    counts = tuple(int(r.t.shape[0]) for r in recordings)
+    longest = max(counts)
+    rows = max((_rows(r.torque) for r in recordings), default=0)
+    alike = [_lengthen(r, longest, rows) for r in recordings]
+    first = jax.tree.structure(alike[0])
+    for index, other in enumerate(alike):
+        if jax.tree.structure(other) != first or _shapes(other) != _shapes(alike[0]):
+            raise ValueError(
+                f"recordings: the one at index {index} differs from the first in its sensors or "
+                "its torque; give all of them the same kinds in the same order, with the same "
+                "options"
+            )
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *alike), counts
+
+
+def one(records: Any, index: int) -> Any:
+    """The tree at an index of the leading axis."""
+    return jax.tree.map(lambda leaf: leaf[index] if eqx.is_array(leaf) else leaf, records)
+
+
+def cut(recording: Recording, count: int) -> Recording:
+    """A recording without what `stack` appended."""
+    readings = tuple(
+        Reading(r.sensor, r.values[:count], r.mask[:count]) for r in recording.readings
+    )
+    return eqx.tree_at(lambda r: (r.t, r.readings), recording, (recording.t[:count], readings))
+
+
+def _shapes(tree: Any) -> list[tuple[int, ...]]:
+    return [np.shape(leaf) for leaf in jax.tree.leaves(tree)]
+
+
+def _is_table(node: Any) -> bool:
+    return isinstance(node, Linear | Series)
+
+
+def _rows(torque: Any) -> int:
+    tables = [n for n in jax.tree.leaves(torque, is_leaf=_is_table) if _is_table(n)]
+    return max((int(n.values.shape[0]) for n in tables), default=0)
+
+
+def _lengthen(recording: Recording, count: int, rows: int) -> Recording:
+    missing = count - recording.t.shape[0]
+    if missing:
+        t = jnp.concatenate([recording.t, jnp.broadcast_to(recording.t[-1], (missing,))])
+        readings = tuple(
+            Reading(
+                r.sensor,
+                _repeat_last(r.values, missing),
+                jnp.concatenate([r.mask, jnp.zeros(missing, bool)]),
+            )
+            for r in recording.readings
+        )
+        recording = eqx.tree_at(lambda r: (r.t, r.readings), recording, (t, readings))
+    torque = jax.tree.map(
+        lambda node: _table(node, rows) if _is_table(node) else node,
+        recording.torque,
+        is_leaf=_is_table,
+    )
+    return eqx.tree_at(lambda r: r.torque, recording, torque, is_leaf=lambda node: node is None)
+
+
+def _table(table: Any, rows: int) -> Any:
+    missing = rows - table.values.shape[0]
+    if missing <= 0:
+        return table
+    values = _repeat_last(table.values, missing)
+    if isinstance(table, Series):
+        slopes = jnp.concatenate(
+            [table.slopes, jnp.zeros((missing, *table.slopes.shape[1:]), table.slopes.dtype)]
+        )
+        return eqx.tree_at(lambda s: (s.values, s.slopes), table, (values, slopes))
+    gap = table.times[-1] - table.times[-2]
+    more = table.times[-1] + gap * jnp.arange(1, missing + 1, dtype=gap.dtype)
+    times = jnp.concatenate([table.times, more])
+    return eqx.tree_at(lambda s: (s.times, s.values), table, (times, values))
+
+
+def _repeat_last(values: Any, count: int) -> Any:
+    return jnp.concatenate([values, jnp.broadcast_to(values[-1], (count, *values.shape[1:]))])

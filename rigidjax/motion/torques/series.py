@@ -1,0 +1,100 @@
+"""A logged quantity as a smooth function of time: a cubic spline through evenly spaced samples."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+from scipy.interpolate import CubicSpline
+
+from rigidjax._types import Scalar, ScalarLike, Vec3
+
+Samples = Float[ArrayLike, "n *channels"] | Sequence[Any]
+
+
+class Series(eqx.Module):
+    """A cubic spline through evenly spaced samples; beyond the ends, the last value.
+
+    Found by division, not by search, so that it costs little inside a solver; its derivative is
+    continuous, so that a step may pass over a sample.
+
+    **Arguments:** `times` (n,) s, evenly spaced to 1e-6 of a step; `values` (n,) or (n, k).
+
+    **Raises:** `ValueError` for fewer than four samples, numbers that differ, NaN, uneven times.
+
+    >>> Series([0.0, 1.0, 2.0, 3.0], [0.0, 1.0, 4.0, 9.0])(1.5)
+    Array(2.25, dtype=float64)
+    """
+
+    start: Scalar
+    step: Scalar
+    values: Float[Array, "n *channels"]
+    slopes: Float[Array, "n *channels"]
+
+    def __init__(self, times: Float[ArrayLike, " n"] | Sequence[Any], values: Samples):
+        t, rows = np.asarray(times, float), np.asarray(values, float)
+        if t.ndim != 1 or t.size < 4 or rows.shape[:1] != t.shape:
+            raise ValueError(
+                f"Series: wanted at least four times and as many rows, got shapes {t.shape} and "
+                f"{rows.shape}"
+            )
+        if not (np.isfinite(t).all() and np.isfinite(rows).all()):
+            raise ValueError("Series: contains NaN or infinity")
+        step = (t[-1] - t[0]) / (t.size - 1)
+        if not step > 0 or np.abs(np.diff(t) - step).max() > 1e-6 * step:
+            raise ValueError(
+                "Series: wanted evenly spaced, increasing times; resample, or use Linear"
+            )
+        dtype = jnp.result_type(float)
+        self.start, self.step = jnp.asarray(t[0], dtype), jnp.asarray(step, dtype)
+        self.values = jnp.asarray(rows, dtype)
+        self.slopes = jnp.asarray(CubicSpline(t, rows)(t, 1) * step, dtype)
+
+    def __call__(self, t: ScalarLike) -> Any:
+        """The value at `t` (s), () or (k,)."""
+        n = self.values.shape[0]
+        place = (jnp.asarray(t, self.start.dtype) - self.start) / self.step
+        place = jnp.clip(place, 0.0, n - 1.0)
+        i = jnp.clip(jnp.floor(place).astype(jnp.int32), 0, n - 2)
+        s = place - i.astype(place.dtype)
+        left, right = self.values[i], self.values[i + 1]
+        out, into = self.slopes[i], self.slopes[i + 1]
+        # Cubic Hermite form, from the left value.
+        bend = 3.0 * (right - left) - 2.0 * out - into
+        twist = 2.0 * (left - right) + out + into
+        return left + s * (out + s * (bend + s * twist))
+
+
+class Wheel(eqx.Module):
+    """The momentum of a wheel about a fixed axis whose speed was logged: `h = J s(t) a`.
+
+    Give it to `Flywheel`: a known momentum inside is what shows the absolute inertia of a body.
+
+    **Arguments:** `inertia` J, kg m², about the axis; `axis` (3,) a, body frame, unit; `speed`
+    rad/s relative to the body, a callable Module of time such as `Series(times, speeds)`.
+
+    **Raises:** `ValueError` for an axis that is not a unit vector.
+
+    >>> speed = Series([0.0, 1.0, 2.0, 3.0], [0.0, 10.0, 20.0, 30.0])
+    >>> bool(abs(Wheel(2.0, [0.0, 0.0, 1.0], speed)(0.5)[2] - 10.0) < 1e-12)
+    True
+    """
+
+    inertia: Scalar
+    axis: Vec3
+    speed: Any
+
+    def __init__(self, inertia: ScalarLike, axis: Any, speed: Any):
+        direction = np.asarray(axis, float)
+        if direction.shape != (3,) or not abs(np.linalg.norm(direction) - 1) < 1e-6:
+            raise ValueError(f"axis: wanted a unit vector (3,), got {direction}")
+        if not callable(speed):
+            raise TypeError(f"speed: wanted a function of time, got {type(speed).__name__}")
+        self.inertia = jnp.asarray(inertia, jnp.result_type(float))
+        self.axis = jnp.asarray(direction, jnp.result_type(float))
+        self.speed = speed
+
+    def __call__(self, t: ScalarLike) -> Vec3:
+        return self.inertia * self.axis * self.speed(t)
