@@ -257,6 +257,7 @@ def first_state(rung: type, own: Own, ref: Reference) -> Any:
     omega = own.spin * ref.rate
     if rung is Spin:
         return Spin(omega)
+    assert ref.q is not None and own.turn is not None
     q = quaternion.multiply(ref.q, quaternion.exp(own.turn))
     if rung is Attitude:
         return Attitude(q, omega)
@@ -309,7 +310,7 @@ def errors_of_one(
             if record.torque is None:
                 seen = free_states(body, state0, times - record.t[0])
             else:
-                seen = jax.vmap(lambda t, s: shifted(field, t, s, offset))(record.t, states)
+                seen = jax.vmap(lambda t, s, by=offset: shifted(field, t, s, by))(record.t, states)
 
         def error(t: Array, state: Any, value: Array, sensor: Any = sensor) -> Array:
             return sensor.error(Moment(t, state, body, field), value)

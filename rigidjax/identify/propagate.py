@@ -105,7 +105,7 @@ def free_states(body: Inertia | MassProperties, state0: Any, since: Float[Array,
     inertia = body if isinstance(body, Inertia) else body.inertia
     if not isinstance(state0, Rigid):
         return jax.vmap(FreeBody(inertia, state0))(since)
-    turning = jax.vmap(FreeBody(inertia, Attitude(state0.q, state0.omega)))(since)
+    turning: Any = jax.vmap(FreeBody(inertia, Attitude(state0.q, state0.omega)))(since)
     x = state0.x[None] + since[:, None] * state0.v[None]
     return Rigid(x, jnp.broadcast_to(state0.v, x.shape), turning.q, turning.omega)
 

@@ -81,7 +81,7 @@ def beside(parameters: Parameters, problem: Problem, ends: Any) -> tuple[Array, 
 
 
 def gaps(parameters: Parameters, problem: Problem, ends: Any) -> Float[Array, "records n"]:
-    """How far each piece's end is from the start of the next, in typical units; zero at the last."""
+    """How far each piece's end is from the next one's start, typical units; zero at the last."""
     assert problem.links is not None
     ref = problem.reference
     starts = jax.vmap(lambda own, r: first_state(problem.rung, own, r))(parameters.own, ref)

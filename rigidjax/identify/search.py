@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float
 
 from rigidjax.identify.problem import Parameters, Problem, with_blocks
@@ -19,6 +20,8 @@ from rigidjax.identify.residual import Noise, assembled, residuals
 HORIZONS = (0.25, 0.5, 1.0)
 # Steps between two looks at the clock, the keyboard and the checkpoint.
 STRIDE = 25
+# How many times the curvature's root a unit of the search is: 1/30² is where the damping starts.
+UNDAMPED = 30.0
 
 
 class Tried(eqx.Module):
@@ -38,17 +41,60 @@ def least_squares(
     max_steps: int,
 ) -> Tried:
     """At most `max_steps` steps of the solver from `start`."""
-    value, done = _solve(start, problem, noise, weights, solver, max_steps)
     # By the program that everything else runs as well: less to compile.
+    sizes = _sizes(start, problem, noise, weights, evaluate(start, problem)[1])
+    value, done = _solve(start, sizes, problem, noise, weights, solver, max_steps)
     cost = _cost(value, problem, noise, weights, evaluate(value, problem)[0])
     return _safe(start, value, cost, done)
 
 
 @eqx.filter_jit
 def _solve(
-    start: Parameters, problem: Problem, noise: Noise, weights: Any, solver: Any, max_steps: int
+    start: Parameters,
+    sizes: Parameters,
+    problem: Problem,
+    noise: Noise,
+    weights: Any,
+    solver: Any,
+    max_steps: int,
 ) -> tuple[Parameters, Array]:
-    return _one(start, problem, noise, weights, solver, max_steps)
+    return _one(start, sizes, problem, noise, weights, solver, max_steps)
+
+
+@eqx.filter_jit
+def _sizes(
+    parameters: Parameters, problem: Problem, noise: Noise, weights: Any, blocks: Any
+) -> Parameters:
+    """The step of each parameter that the data feel alike, all else at rest.
+
+    Levenberg's damping is the same for all parameters: in these units it is Marquardt's
+    (Moré 1978, doi:10.1007/BFb0067700), and starts at a thousandth of the curvature.
+    """
+    first = jax.tree.map(lambda leaf: leaf[0], parameters.own)
+    _, restore = ravel_pytree((parameters.body, parameters.shared, first))
+    squares = jnp.zeros((problem.count, 1), weights.dtype)
+    for block, sigma in zip(blocks[0], noise, strict=True):
+        felt = (block / sigma[:, None, :, None] * weights[..., None, None]) ** 2
+        squares = squares + felt.sum(axis=(1, 2))
+    body, shared, own = jax.vmap(restore)(squares)
+    found = Parameters(body.sum(axis=0), jax.tree.map(lambda leaf: leaf.sum(axis=0), shared), own)
+    of_all, of_each = iter(found.shared), iter(found.own.each)
+    moved = {True: [], False: []}
+    for slot in problem.slots:
+        felt = next(of_each if slot.each else of_all)
+        held = 0.0 if slot.prior is None else 1.0 / slot.prior**2
+        moved[slot.each].append(felt + held)
+    found = eqx.tree_at(
+        lambda p: (p.shared, p.own.each), found, (tuple(moved[False]), tuple(moved[True]))
+    )
+    most = ravel_pytree(found)[0].max()
+    floor = jnp.where(most > 0, 1e-12 * most, 1.0)
+
+    def size(felt: Array) -> Array:
+        return 1.0 / (UNDAMPED * jnp.sqrt(jnp.maximum(felt, floor)))
+
+    good = jnp.isfinite(most)
+    return jax.tree.map(lambda felt: jnp.where(good, size(felt), 1.0), found)
 
 
 @eqx.filter_jit
@@ -79,26 +125,43 @@ def many(
     """`least_squares` from many starts at once (a leading axis on `starts`)."""
 
     def one(start: Parameters) -> Tried:
-        value, done = _one(start, problem, noise, weights, solver, max_steps)
+        blocks = with_blocks(start, problem)[1]
+        sizes = _sizes(start, problem, noise, weights, blocks)
+        value, done = _one(start, sizes, problem, noise, weights, solver, max_steps)
         return _safe(start, value, misfit(value, (problem, noise, weights)), done)
 
     return jax.vmap(one)(starts)
 
 
 def _one(
-    start: Parameters, problem: Problem, noise: Noise, weights: Any, solver: Any, max_steps: int
+    start: Parameters,
+    sizes: Parameters,
+    problem: Problem,
+    noise: Noise,
+    weights: Any,
+    solver: Any,
+    max_steps: int,
 ) -> tuple[Parameters, Array]:
     least: Any = optx.least_squares
     out = least(
-        residuals,
+        _in_units,
         solver,
-        start,
-        (problem, noise, weights),
+        jax.tree.map(jnp.zeros_like, start),
+        (start, sizes, (problem, noise, weights)),
         options={"jac": "fwd"} if isinstance(solver, optx.AbstractLeastSquaresSolver) else {},
         max_steps=max_steps,
         throw=False,
     )
-    return out.value, out.result == optx.RESULTS.successful
+    return _stepped(start, sizes, out.value), out.result == optx.RESULTS.successful
+
+
+def _stepped(start: Parameters, sizes: Parameters, steps: Parameters) -> Parameters:
+    return jax.tree.map(lambda p, size, step: p + size * step, start, sizes, steps)
+
+
+def _in_units(steps: Parameters, args: Any) -> Any:
+    start, sizes, rest = args
+    return residuals(_stepped(start, sizes, steps), rest)
 
 
 def _safe(start: Parameters, value: Parameters, cost: Array, done: Array) -> Tried:
@@ -159,13 +222,8 @@ class Checkpoint:
         leaves = [np.asarray(x) for item in (*done, current) for x in jax.tree.leaves(item)]
         beside = self.path.with_name(self.path.name + ".new")
         with beside.open("wb") as file:
-            np.savez(
-                file,
-                print_of=self.print_of,
-                stage=stage,
-                done=len(done),
-                **{f"leaf{i}": leaf for i, leaf in enumerate(leaves)},
-            )
+            held: dict[str, Any] = {f"leaf{i}": leaf for i, leaf in enumerate(leaves)}
+            np.savez(file, print_of=self.print_of, stage=stage, done=len(done), **held)
         beside.replace(self.path)
 
     def _read(self, path: Path) -> None:
@@ -207,7 +265,8 @@ def climb(
         if stage < first_stage:
             continue
         last = stage == len(HORIZONS) - 1
-        for _ in range(0, max_steps, STRIDE):
+        # A part of the record need not be fitted to the end, only to come near.
+        for _ in range(0, max_steps if last else min(STRIDE, max_steps), STRIDE):
             count = min(STRIDE, max_steps)
             tried = least_squares(
                 tried.parameters, problem, noise, seen, solver if last else rough, count

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array
 
 from rigidjax import exact
-from rigidjax.body import Inertia, spatial_angular_momentum
+from rigidjax.body import spatial_angular_momentum
 from rigidjax.identify.bodies import PrincipalRatios
 from rigidjax.identify.fit import Fit
 from rigidjax.identify.loss import SoftL1
@@ -85,12 +85,12 @@ def problem() -> Problem:
 def rows(fit: Fit) -> list[Row]:
     """Periods and the direction of the angular momentum as rows for `report.table`."""
 
-    def periods(body: Inertia, state: Any) -> Array:
+    def periods(body: Any, state: Any) -> Array:
         turning = exact.body_period(body, state.omega)
         precessing = exact.precession_period(body, state.omega)
         return jnp.log(jnp.stack([turning, precessing]) / DAY)
 
-    def direction(body: Inertia, state: Any) -> Array:
+    def direction(body: Any, state: Any) -> Array:
         momentum = spatial_angular_momentum(body, state)
         flat = jnp.hypot(momentum[0], momentum[1])
         return jnp.stack([jnp.arctan2(momentum[1], momentum[0]), jnp.arctan2(momentum[2], flat)])

@@ -43,10 +43,11 @@ class Linearised(eqx.Module):
     @property
     def scores(self) -> np.ndarray:
         """What each time adds to the gradient of the misfit, (R, T, n)."""
-        return sum(
+        parts = [
             np.einsum("rtk,rtkn,rt->rtn", error, slope, weight)
             for error, slope, weight in zip(self.errors, self.slopes, self.weights, strict=True)
-        )
+        ]
+        return np.sum(parts, axis=0)
 
 
 @eqx.filter_jit

@@ -56,7 +56,8 @@ class Series(eqx.Module):
         """The value at `t` (s), () or (k,)."""
         n = self.values.shape[0]
         place = (jnp.asarray(t, self.start.dtype) - self.start) / self.step
-        place = jnp.clip(place, 0.0, n - 1.0)
+        # Not clip: at an end itself it has half the derivative.
+        place = jnp.where(place < 0.0, 0.0, jnp.where(place > n - 1.0, n - 1.0, place))
         i = jnp.clip(jnp.floor(place).astype(jnp.int32), 0, n - 2)
         s = place - i.astype(place.dtype)
         left, right = self.values[i], self.values[i + 1]
