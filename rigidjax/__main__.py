@@ -1,4 +1,4 @@
-"""`python -m rigidjax`: identify a body from a recording on the command line."""
+"""`python -m rigidjax`: identify a body from recordings on the command line."""
 
 import argparse
 import sys
@@ -19,9 +19,9 @@ def main(arguments: list[str] | None = None) -> int:
         return 0
     # A program of its own, not a library: the switch is ours to set here.
     jax.config.update("jax_enable_x64", True)
-    if options.demo == (options.log is not None):
-        parser.error("identify: give either a LOG.csv or --demo")
-    return _demo(options) if options.demo else _log(options)
+    if options.demo == bool(options.logs):
+        parser.error("identify: give either log FILES or --demo")
+    return _demo(options) if options.demo else _logs(options)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -34,18 +34,22 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(dest="command", metavar="COMMAND")
     identify = commands.add_parser(
         "identify",
-        help="fit inertia ratios and first state to a torque-free recording",
-        description="Fit a torque-free motion to a gyro log (CSV with a header line), or, with "
-        "--demo, to the radar observations of asteroid 4179 Toutatis.",
+        help="fit a body and its motion to recordings",
+        description="Fit a body's inertia and motion to logs (.csv with a header line, .npz, "
+        ".mat), several together if several are given; or, with --demo, to the radar observations "
+        "of asteroid 4179 Toutatis.",
+        epilog="A throw with a gyro and a flywheel whose inertia is known: identify throw1.csv "
+        "throw2.csv --wheel flywheel:1.2e-6:z --model tensor --typical 3e-4 --free drag bias "
+        "--report throws.html",
     )
-    identify.add_argument("log", metavar="LOG.csv", nargs="?", help="gyro log")
+    identify.add_argument("logs", metavar="FILE", nargs="*", help="logs of one body")
     identify.add_argument("--demo", action="store_true", help="the tumbling of 4179 Toutatis")
     identify.add_argument(
         "--columns",
         nargs=4,
         metavar=("T", "WX", "WY", "WZ"),
         default=("t", "wx", "wy", "wz"),
-        help="names of the time column (s) and of the three body rates (default: t wx wy wz)",
+        help="names of the time column and of the three body rates (default: t wx wy wz)",
     )
     identify.add_argument(
         "--unit", choices=("rad/s", "deg/s"), default="rad/s", help="of the rates (default: rad/s)"
@@ -53,10 +57,49 @@ def _parser() -> argparse.ArgumentParser:
     identify.add_argument(
         "--noise", type=float, help="standard deviation of a rate, in --unit (default: estimated)"
     )
+    identify.add_argument(
+        "--sensor",
+        action="append",
+        metavar="KIND=COLUMNS[:UNIT[:NOISE]]",
+        help="instead of --columns: gyro=wx,wy,wz:deg/s:0.1, accelerometer=ax,ay,az:m/s2, "
+        "quaternion=qw,qx,qy,qz, euler-ZYX=yaw,pitch,roll:deg (body to world); may be repeated",
+    )
+    identify.add_argument(
+        "--time-unit", choices=("s", "ms", "us"), default="s", help="of the time column"
+    )
+    identify.add_argument(
+        "--window", nargs=2, type=float, metavar=("FROM", "TO"), help="use these seconds only"
+    )
+    identify.add_argument(
+        "--wheel",
+        action="append",
+        default=[],
+        metavar="COLUMN:INERTIA[:AXIS[:UNIT]]",
+        help="a wheel whose speed was logged: its inertia in kg m², axis x, y or z, rad/s or rpm",
+    )
+    identify.add_argument(
+        "--model",
+        choices=("ratios", "principal-ratios", "tensor", "principal"),
+        default="ratios",
+        help="what of the body is free (default: ratios, all that free motion shows)",
+    )
+    identify.add_argument(
+        "--typical", type=float, default=1.0, metavar="KG_M2", help="about how large a moment is"
+    )
+    identify.add_argument(
+        "--free",
+        nargs="+",
+        default=[],
+        choices=("bias", "drag", "delay"),
+        help="what else is free: sensor bias and wheel delay of each log, linear drag of all",
+    )
     identify.add_argument("--starts", type=int, help="how many starting points to try")
+    identify.add_argument("--checkpoint", type=Path, help="keep and resume a long fit in this file")
     identify.add_argument(
         "--figure", type=Path, metavar="FILE", help="where the figure goes (.png, .pdf, .svg)"
     )
+    identify.add_argument("--report", type=Path, metavar="OUT.html", help="a page with all of it")
+    identify.add_argument("--json", type=Path, metavar="OUT.json", help="the same as numbers")
     return parser
 
 
@@ -78,25 +121,96 @@ def _demo(options: argparse.Namespace) -> int:
     return 0 if found.ok else 1
 
 
-def _log(options: argparse.Namespace) -> int:
+def _logs(options: argparse.Namespace) -> int:
+    from rigidjax.identify import logs
+
+    time, *rates = options.columns
     try:
-        record = rj.identify.read_gyro_csv(
-            options.log, columns=tuple(options.columns), unit=options.unit, noise=options.noise
+        if options.sensor:
+            channels = [logs.channel(text) for text in options.sensor]
+        else:
+            channels = [logs.Channel("gyro", tuple(rates), options.unit, options.noise)]
+        wheels = [logs.wheel(text) for text in options.wheel]
+        if options.model in ("tensor", "principal") and not wheels:
+            raise rj.identify.LogError(
+                f"--model {options.model}: free motion shows ratios only; a scale needs a --wheel"
+            )
+        records = [
+            logs.read_log(
+                path,
+                channels,
+                time=time,
+                time_unit=options.time_unit,
+                window=options.window,
+                wheels=wheels,
+                free=options.free,
+            )
+            for path in options.logs
+        ]
+        problem = logs.problem_of(
+            records, options.model, typical=options.typical, free=options.free
         )
     except ValueError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    print(f"{options.log}: {record.t.shape[0]} samples over {record.t[-1] - record.t[0]:.4g} s\n")
-    problem = rj.identify.Problem(record, rj.identify.Ratios(), loss=rj.identify.SoftL1())
-    found = rj.identify.fit(problem, starts=options.starts or 8, progress=_say)
+    for path, record in zip(options.logs, records, strict=True):
+        print(f"{path}: {record.t.shape[0]} samples over {record.t[-1] - record.t[0]:.4g} s")
     print()
-    print(rj.identify.report.table(rj.identify.report.rows(found, options.unit)))
-    scale = 1.0 if options.unit == "rad/s" else 180 / 3.141592653589793
-    print(f"\nrms of the rates: {found.rms[0] * scale:.4g} {options.unit}")
+    try:
+        found = rj.identify.fit(
+            problem, starts=options.starts or 8, progress=_say, checkpoint=options.checkpoint
+        )
+    except ValueError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    rate_unit = next((c.unit for c in channels if c.kind == "gyro" and c.unit != "rpm"), "rad/s")
+    print()
+    print(rj.identify.report.table(rj.identify.report.rows(found, rate_unit)))
+    for sensor, rms in zip(problem.records.sensors, found.rms, strict=True):
+        scale = 180 / 3.141592653589793 if sensor.unit == "rad/s" and rate_unit == "deg/s" else 1.0
+        unit = rate_unit if sensor.unit == "rad/s" else sensor.unit
+        print(f"\nrms of the {type(sensor).__name__}: {rms * scale:.4g} {unit}", end="")
+    print()
     print(rj.identify.report.verdict(found))
+    return _write(found, options, rate_unit)
+
+
+def _write(found: Any, options: argparse.Namespace, rate_unit: str) -> int:
+    names = [Path(path).name for path in options.logs]
     if options.figure is not None:
-        _draw(found, options.figure, rate_unit=options.unit, title=Path(options.log).name)
+        _draw(found, options.figure, rate_unit=rate_unit, title=names[0])
+    try:
+        if options.json is not None:
+            rj.identify.report.write_json(found, options.json, names)
+            print(f"numbers: {options.json}")
+        if options.report is not None:
+            figures = _figures(found, names, rate_unit)
+            rj.identify.report.write_html(
+                found,
+                options.report,
+                title=f"Identification of {', '.join(names[:3])}{' …' if names[3:] else ''}",
+                figures=figures,
+                rate_unit=rate_unit,
+                files=names,
+            )
+            print(f"report: {options.report}")
+    except OSError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
     return 0 if found.ok else 1
+
+
+def _figures(found: Any, names: list[str], rate_unit: str) -> list[Any]:
+    try:
+        import matplotlib
+    except ModuleNotFoundError:
+        print("no figures: matplotlib is missing (pip install 'rigidjax[view]')")
+        return []
+    matplotlib.use("Agg")
+    return [
+        rj.plot.fit(found, index=index, rate_unit=rate_unit, title=name)
+        for index, name in enumerate(names[:12])
+    ]
 
 
 def _say(line: str) -> None:

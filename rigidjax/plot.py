@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rigidjax.motion import Attitude
 from rigidjax.rotation import quaternion
 from rigidjax.solve import simulate
 
@@ -14,53 +13,43 @@ from rigidjax.solve import simulate
 COLOURS = ("#0072B2", "#D55E00", "#009E73")
 
 
-def fit(found: Any, *, time_unit: str = "s", rate_unit: str = "rad/s", title: str = "") -> Any:
+def fit(
+    found: Any,
+    *,
+    index: int = 0,
+    time_unit: str = "s",
+    rate_unit: str = "rad/s",
+    title: str = "",
+) -> Any:
     """Data and fit of each sensor above, what is left over below.
 
-    **Arguments:** `found` a `rigidjax.identify.Fit`; `time_unit` `s` or `day`; `rate_unit`
-    `rad/s`, `deg/s` or `deg/day`; `title`. **Returns** the matplotlib figure.
+    **Arguments:** `found` a `rigidjax.identify.Fit`; `index` which of its recordings; `time_unit`
+    `s` or `day`; `rate_unit` `rad/s`, `deg/s` or `deg/day`; `title`. **Returns** the matplotlib
+    figure.
 
     **Raises** `ModuleNotFoundError` where matplotlib is missing (install the extra `view`).
     """
     plt = _pyplot()
     seconds = {"s": 1.0, "day": 86400.0}[time_unit]
     rate = {"rad/s": 1.0, "deg/s": 180 / np.pi, "deg/day": 86400 * 180 / np.pi}[rate_unit]
-    record = found.problem.recording
-    t = np.asarray(record.t)
-    dense = jnp.linspace(record.t[0], record.t[-1], 800)
-    motion = simulate(found.body, found.state0, dense, found.problem.torque).ys
+    record = found.problem.recordings[index]
+    left = [e if found.problem.count == 1 else e[index] for e in found.residuals]
+    left = [np.asarray(e)[: record.t.shape[0]] for e in left]
+    t = np.asarray(record.t) / seconds
     count = len(record.readings)
     figure, axes = plt.subplots(
         2,
         count,
-        figsize=(6.2 * count, 6),
+        figsize=(max(6.2 * count, 7.5), 6),
         sharex=True,
         squeeze=False,
         height_ratios=(2, 1),
         layout="constrained",
     )
-    for column, (reading, errors) in enumerate(zip(record.readings, found.residuals, strict=True)):
+    dense = _between(found, index)
+    for column, (reading, errors) in enumerate(zip(record.readings, left, strict=True)):
         upper, lower = axes[:, column]
-        seen = reading.seen
-        if reading.sensor.reading_shape == (4,):
-            assert isinstance(motion, Attitude)
-            read, line = _long_axis(reading.values), _long_axis(motion.q)
-            names = [f"{axis} of body z" for axis in "xyz"]
-            upper.set_ylabel("body z axis in world axes")
-            left = np.degrees(np.asarray(errors))
-            lower.set_ylabel("error, deg (body axes)")
-        else:
-            read, line = np.asarray(reading.values) * rate, np.asarray(motion.omega) * rate
-            names = [f"Ω{axis}" for axis in "xyz"]
-            upper.set_ylabel(f"body rate, {rate_unit}")
-            left = np.asarray(errors) * rate
-            lower.set_ylabel(f"error, {rate_unit}")
-        many = seen.sum() > 100
-        for axis, (name, colour) in enumerate(zip(names, COLOURS, strict=True)):
-            upper.plot(np.asarray(dense) / seconds, line[:, axis], color=colour, lw=1.2, label=name)
-            mark = {"marker": "." if many else "o", "ls": "", "ms": 2 if many else 5}
-            upper.plot(t[seen] / seconds, read[seen, axis], color=colour, alpha=0.7, **mark)
-            lower.plot(t[seen] / seconds, left[seen, axis], color=colour, alpha=0.7, **mark)
+        _one_sensor(upper, lower, t, reading, errors, dense, seconds, rate, rate_unit)
         lower.axhline(0, color="0.6", lw=0.8)
         lower.set_xlabel(f"time, {time_unit}")
         upper.margins(x=0.02, y=0.2)
@@ -69,6 +58,66 @@ def fit(found: Any, *, time_unit: str = "s", rate_unit: str = "rad/s", title: st
     if title:
         figure.suptitle(title)
     return figure
+
+
+def _between(found: Any, index: int) -> tuple[np.ndarray, Any] | None:
+    """Times and states between sparse samples of a free body, for a smooth line; else `None`."""
+    problem = found.problem
+    record = problem.recordings[index]
+    if problem.torque is not None or record.t.shape[0] > 300:
+        return None
+    state0 = found.state0
+    if problem.count > 1:
+        state0 = jax.tree.map(lambda leaf: leaf[index], state0)
+    dense = jnp.linspace(record.t[0], record.t[-1], 800)
+    return np.asarray(dense), simulate(found.body, state0, dense).ys
+
+
+def _one_sensor(
+    upper: Any,
+    lower: Any,
+    t: np.ndarray,
+    reading: Any,
+    errors: np.ndarray,
+    dense: tuple[np.ndarray, Any] | None,
+    seconds: float,
+    rate: float,
+    rate_unit: str,
+) -> None:
+    seen, sensor = reading.seen, reading.sensor
+    values = np.asarray(reading.values)
+    names: tuple[str, ...] = ("x", "y", "z")
+    scale, unit, line_t = 1.0, sensor.unit, t
+    if sensor.reading_shape == (4,):
+        read, scale = _long_axis(values), 180 / np.pi
+        # The reading turned back by its error is the prediction.
+        back = jax.vmap(lambda q, e: quaternion.multiply(q, quaternion.exp(-e)))
+        line = _long_axis(back(jnp.asarray(values), jnp.asarray(errors)))
+        names = tuple(f"{axis} of body z" for axis in "xyz")
+        upper.set_ylabel("body z axis in world axes")
+        unit = "deg (body axes)"
+        if dense is not None:
+            line_t, line = dense[0] / seconds, _long_axis(dense[1].q)
+    else:
+        if sensor.unit == "rad/s":
+            scale, unit, names = rate, rate_unit, ("Ωx", "Ωy", "Ωz")
+        whole = errors.shape == values.shape
+        read = values * scale if sensor.unit != "rad" else values
+        line = (values - errors) * scale if whole else None
+        upper.set_ylabel("body rate, " + unit if sensor.unit == "rad/s" else f"reading, {unit}")
+        bare = getattr(sensor, "bias", None) is None and getattr(sensor, "scale", None) is None
+        if dense is not None and sensor.unit == "rad/s" and bare:
+            line_t, line = dense[0] / seconds, np.asarray(dense[1].omega) * scale
+    lower.set_ylabel(f"error, {unit}")
+    many = seen.sum() > 100
+    mark: dict[str, Any] = {"marker": "." if many else "o", "ls": "", "ms": 2 if many else 5}
+    for axis, (name, colour) in enumerate(zip(names, COLOURS, strict=True)):
+        if line is not None:
+            whole = slice(None) if line_t is not t else seen
+            upper.plot(line_t[whole], line[whole, axis], color=colour, lw=1.2, label=name)
+        upper.plot(t[seen], read[seen, axis], color=colour, alpha=0.6, **mark)
+        if axis < errors.shape[1]:
+            lower.plot(t[seen], errors[seen, axis] * scale, color=colour, alpha=0.7, **mark)
 
 
 def _long_axis(q: Any) -> np.ndarray:

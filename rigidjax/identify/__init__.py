@@ -10,12 +10,25 @@ from rigidjax.identify.bodies import (
     Ratios as Ratios,
     Tensor as Tensor,
 )
+from rigidjax.identify.compare import (
+    Comparison as Comparison,
+    compare as compare,
+    cross_validate as cross_validate,
+)
+from rigidjax.identify.design import (
+    best_first_rate as best_first_rate,
+    expected as expected,
+    fisher as fisher,
+    plan_of as plan_of,
+)
 from rigidjax.identify.files import LogError as LogError, read_gyro_csv as read_gyro_csv
 from rigidjax.identify.fit import Fit as Fit, Start as Start, fit as fit
 from rigidjax.identify.free import Free as Free
 from rigidjax.identify.loss import AbstractLoss as AbstractLoss, Huber as Huber, SoftL1 as SoftL1
+from rigidjax.identify.pieces import pieces as pieces
 from rigidjax.identify.prior import Entropic as Entropic
 from rigidjax.identify.problem import Own as Own, Parameters as Parameters, Problem as Problem
+from rigidjax.identify.profile import profile as profile
 from rigidjax.identify.propagate import (
     AbstractIntegrator as AbstractIntegrator,
     Adaptive as Adaptive,

@@ -13,6 +13,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.identify import reported, uncertainty, words
+from rigidjax.identify.pieces import WIDTHS, joined, pieces as in_pieces, with_width
 from rigidjax.identify.problem import Parameters, Problem
 from rigidjax.identify.propagate import Adaptive, FixedSteps
 from rigidjax.identify.residual import Noise
@@ -140,6 +141,7 @@ def fit(
     tolerance: float = 1e-10,
     max_steps: int = 200,
     together: int = 1,
+    pieces: int = 1,
     checkpoint: str | Path | None = None,
     progress: Callable[[str], Any] | None = None,
 ) -> Fit:
@@ -154,6 +156,8 @@ def fit(
     - `key`: random key of the scattered starts; `jax.random.key(0)` unless given.
     - `tolerance`, `max_steps`: where Levenberg–Marquardt stops, relative and absolute; steps.
     - `together`: how many starts go through one `vmap` at once.
+    - `pieces`: where more than one, the record is first fitted in so many pieces whose ends are
+      drawn together (see `pieces`), and what they agree on is the first start.
     - `checkpoint`: a file that keeps what was found after every 25 steps; a second call with the
       same problem and options goes on from there and ends at the same point. `together` = 1 only.
     - `progress`: called with a line of text after each start, such as `print`.
@@ -183,9 +187,11 @@ def fit(
     if checkpoint is not None and together > 1:
         raise ValueError("fit: a checkpoint goes with together=1, one start after another")
     points = starting_points(problem, starts, jax.random.key(0) if key is None else key)
+    noise, solver = _first_noise(problem), solver_for(tolerance)
+    if pieces > 1:
+        points = [_from_pieces(problem, pieces, solver, max_steps), *points][:starts]
     if initial is not None:
         points = [initial, *points][:starts]
-    noise, solver = _first_noise(problem), solver_for(tolerance)
     if together > 1:
         tried = _together(points, problem, noise, solver, max_steps, together, progress)
     else:
@@ -209,6 +215,16 @@ def fit(
             problem, uncertainty.errors_at(value, problem), noise, value
         )
     return _assess(problem, value, bool(done), noise, tried, lowest)
+
+
+def _from_pieces(problem: Problem, count: int, solver: Any, max_steps: int) -> Parameters:
+    cut = in_pieces(problem, count)
+    noise, whole = _first_noise(cut), jnp.ones_like(cut.records.t)
+    point = starting_points(cut, 1, jax.random.key(0))[0]
+    for width in WIDTHS:
+        narrowed = with_width(cut, width)
+        point = least_squares(point, narrowed, noise, whole, solver, max_steps).parameters
+    return joined(problem, cut, point)
 
 
 def _one_by_one(

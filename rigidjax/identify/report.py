@@ -1,6 +1,12 @@
-"""A fit as a table for the terminal."""
+"""A fit as a table for the terminal, as JSON, and as a page of HTML that stands alone."""
 
-from typing import TYPE_CHECKING
+import base64
+import html
+import io
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -11,19 +17,21 @@ Row = tuple[str, float, float, float, str]
 
 
 def rows(fit: "Fit", rate_unit: str = "rad/s") -> list[Row]:
-    """Ratios and first body rate as rows (name, value, low, high, unit), 95 % intervals.
+    """All that was found as rows (name, value, low, high, unit), 95 % intervals.
 
-    **Arguments:** `fit`; `rate_unit` one of `rad/s`, `deg/s`, `deg/day`.
+    **Arguments:** `fit`; `rate_unit` of the first body rate: `rad/s`, `deg/s`, `deg/day`.
     """
     scale = {"rad/s": 1.0, "deg/s": 180 / np.pi, "deg/day": 86400 * 180 / np.pi}[rate_unit]
     bounds = fit.interval(0.95)
-    ratios = np.exp(np.asarray(fit.problem.body.logs(fit.body)))
     out: list[Row] = []
-    for name, value in zip(fit.problem.body.log_names, ratios, strict=True):
-        out.append((name, float(value), *bounds[name], ""))
-    for axis, value in zip("xyz", np.asarray(fit.state0.omega), strict=True):
-        low, high = bounds[f"Ω{axis}"]
-        out.append((f"Ω{axis} at the start", value * scale, low * scale, high * scale, rate_unit))
+    for quantity in fit.quantities:
+        low, high = bounds[quantity.name]
+        if quantity.name.startswith("Ω"):
+            axis, _, where = quantity.name.partition(" ")
+            name = f"{axis} at the start{' ' + where if where else ''}"
+            out.append((name, quantity.value * scale, low * scale, high * scale, rate_unit))
+        else:
+            out.append((quantity.name, quantity.value, low, high, quantity.unit))
     return out
 
 
@@ -32,10 +40,21 @@ def table(lines: list[Row]) -> str:
     wide = max(len(name) for name, *_ in lines)
     out = [f"{'':{wide}}  {'value':>14}  95 % interval"]
     for name, value, low, high, unit in lines:
-        digits = _decimals(high - low)
-        shown = [f"{number:.{digits}f}" for number in (value, low, high)]
+        shown = numbers(value, low, high)
         out.append(f"{name:{wide}}  {shown[0]:>14}  {shown[1]} … {shown[2]} {unit}".rstrip())
     return "\n".join(out)
+
+
+def numbers(value: float, low: float, high: float) -> list[str]:
+    """The three as text, with the digits that the interval allows."""
+    width, size = high - low, max(abs(value), abs(low) if np.isfinite(low) else 0.0)
+    if 0 < size < 1e-3 or size >= 1e6:
+        digits = 3
+        if np.isfinite(width) and width > 0:
+            digits = int(np.clip(2 + np.floor(np.log10(size)) - np.floor(np.log10(width)), 1, 12))
+        return [f"{number:.{digits}e}" for number in (value, low, high)]
+    digits = _decimals(width)
+    return [f"{number:.{digits}f}" for number in (value, low, high)]
 
 
 def _decimals(width: float) -> int:
@@ -54,3 +73,99 @@ def verdict(fit: "Fit") -> str:
     )
     lines += [f"- {line}" for line in fit.identifiability]
     return "\n".join(lines)
+
+
+def as_dict(fit: "Fit", files: Sequence[str] = ()) -> dict[str, Any]:
+    """All that was found as plain numbers and text, for JSON. Infinity is written as `null`."""
+
+    def plain(number: float) -> float | None:
+        return float(number) if np.isfinite(number) else None
+
+    bounds = fit.interval(0.95)
+    return {
+        "files": list(files),
+        "status": fit.status,
+        "quantities": {
+            quantity.name: {
+                "value": plain(quantity.value),
+                "interval_95": [plain(x) for x in bounds[quantity.name]],
+                "unit": quantity.unit,
+            }
+            for quantity in fit.quantities
+        },
+        "rms": {
+            f"{index} {type(sensor).__name__}": {"value": plain(rms), "unit": sensor.unit}
+            for index, (sensor, rms) in enumerate(
+                zip(fit.problem.records.sensors, fit.rms, strict=True)
+            )
+        },
+        "noise": [np.asarray(noise).tolist() for noise in fit.noise],
+        "chi2": fit.chi2,
+        "degrees_of_freedom": fit.dof,
+        "correlation_samples": fit.correlation,
+        "covariance": fit.covariance_kind,
+        "starts": [
+            {"misfit": plain(s.cost), "converged": s.converged, "fits": s.fits} for s in fit.starts
+        ],
+        "identifiability": list(fit.identifiability),
+    }
+
+
+def write_json(fit: "Fit", path: str | Path, files: Sequence[str] = ()) -> None:
+    """`as_dict` to a file."""
+    text = json.dumps(as_dict(fit, files), indent=2, ensure_ascii=False, allow_nan=False)
+    Path(path).write_text(text + "\n", encoding="utf-8")
+
+
+def write_html(
+    fit: "Fit",
+    path: str | Path,
+    *,
+    title: str = "Identification",
+    figures: Sequence[Any] = (),
+    rate_unit: str = "rad/s",
+    files: Sequence[str] = (),
+) -> None:
+    """A page that stands alone: verdict, table, words, figures inside it.
+
+    **Arguments:** `fit`; `path`; `title`; `figures` of matplotlib, such as those of
+    `rigidjax.plot.fit`; `rate_unit` as for `rows`; `files` the names of what was read.
+    """
+    good = fit.ok
+    lines = []
+    for name, value, low, high, unit in rows(fit, rate_unit):
+        shown = numbers(value, low, high)
+        cells = (name, shown[0], f"{shown[1]} … {shown[2]}", unit)
+        lines.append("<tr>" + "".join(f"<td>{html.escape(c)}</td>" for c in cells) + "</tr>")
+    words = "".join(f"<li>{html.escape(line)}</li>" for line in fit.identifiability)
+    pictures = "".join(
+        f'<img alt="figure {index}" src="data:image/png;base64,{_png(figure)}">'
+        for index, figure in enumerate(figures, 1)
+    )
+    read = ", ".join(html.escape(str(name)) for name in files)
+    colour = "#009E73" if good else "#D55E00"
+    page = f"""<!doctype html>
+<html lang="en"><meta charset="utf-8"><title>{html.escape(title)}</title>
+<style>
+body {{ font: 15px/1.5 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto;
+padding: 0 1rem }}
+table {{ border-collapse: collapse }} td, th {{ padding: .2rem .8rem; text-align: left;
+border-bottom: 1px solid #ddd; font-variant-numeric: tabular-nums }}
+img {{ max-width: 100%; margin: 1rem 0 }} .status {{ color: {colour}; font-weight: 600 }}
+</style>
+<h1>{html.escape(title)}</h1>
+<p>{read}</p>
+<p class="status">{html.escape(fit.status)}</p>
+<table><tr><th></th><th>value</th><th>95 % interval</th><th>unit</th></tr>{"".join(lines)}</table>
+<p>Covariance: {html.escape(fit.covariance_kind)}.</p>
+<ul>{words}</ul>
+{pictures}
+</html>
+"""
+    Path(path).write_text(page, encoding="utf-8")
+
+
+def _png(figure: Any) -> str:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=110)
+    return base64.b64encode(buffer.getvalue()).decode("ascii")

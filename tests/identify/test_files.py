@@ -21,7 +21,7 @@ WRONG = {
     "no column": (GOOD.replace("wy", "gyro_y"), "line 1: no column 'wy'; the columns are t, wx, gyro_y, wz"),
     "nan": (_swap(4, "0.2,nan,1,1"), "line 4: column 'wx': nan is not a finite number"),
     "text": (_swap(5, "0.3,1,fast,1"), "line 5: column 'wy': 'fast' is not a number"),
-    "empty cell": (_swap(5, "0.3,1,,1"), "line 5: column 'wy': '' is not a number"),
+    "empty cell": (_swap(5, "0.3,1,,1"), "line 5: column 'wy': nan is not a finite number"),
     "short line": (_swap(6, "0.4,1"), "line 6: column 'wy': the line ends before it"),
     "time stands": (_swap(6, "0.3,1,1,1"), "line 6: column 't': time 0.3 is not above the 0.3"),
     "empty": ("", "line 1: wanted a header"),
@@ -91,4 +91,4 @@ def test_help_version_and_no_arguments(capsys):
     with pytest.raises(SystemExit) as ended:
         main(["identify"])
     assert ended.value.code == 2
-    assert "either a LOG.csv or --demo" in capsys.readouterr().err
+    assert "either log FILES or --demo" in capsys.readouterr().err

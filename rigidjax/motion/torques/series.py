@@ -74,7 +74,8 @@ class Wheel(eqx.Module):
     Give it to `Flywheel`: a known momentum inside is what shows the absolute inertia of a body.
 
     **Arguments:** `inertia` J, kg m², about the axis; `axis` (3,) a, body frame, unit; `speed`
-    rad/s relative to the body, a callable Module of time such as `Series(times, speeds)`.
+    rad/s relative to the body, a callable Module of time such as `Series(times, speeds)`; `delay`
+    s: the log shows at t what was at t − delay; `None` for none.
 
     **Raises:** `ValueError` for an axis that is not a unit vector.
 
@@ -86,8 +87,11 @@ class Wheel(eqx.Module):
     inertia: Scalar
     axis: Vec3
     speed: Any
+    delay: Scalar | None
 
-    def __init__(self, inertia: ScalarLike, axis: Any, speed: Any):
+    def __init__(
+        self, inertia: ScalarLike, axis: Any, speed: Any, *, delay: ScalarLike | None = None
+    ):
         direction = np.asarray(axis, float)
         if direction.shape != (3,) or not abs(np.linalg.norm(direction) - 1) < 1e-6:
             raise ValueError(f"axis: wanted a unit vector (3,), got {direction}")
@@ -96,6 +100,8 @@ class Wheel(eqx.Module):
         self.inertia = jnp.asarray(inertia, jnp.result_type(float))
         self.axis = jnp.asarray(direction, jnp.result_type(float))
         self.speed = speed
+        self.delay = None if delay is None else jnp.asarray(delay, jnp.result_type(float))
 
     def __call__(self, t: ScalarLike) -> Vec3:
-        return self.inertia * self.axis * self.speed(t)
+        when = t if self.delay is None else t + self.delay
+        return self.inertia * self.axis * self.speed(when)

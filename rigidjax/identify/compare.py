@@ -1,0 +1,110 @@
+"""Which model do the data ask for: information criteria, and prediction of what was left out."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+
+from rigidjax.identify.bodies import Known
+from rigidjax.identify.fit import Fit, fit
+from rigidjax.identify.problem import Problem
+from rigidjax.identify.recording import Recording
+
+
+class Comparison(eqx.Module):
+    """One model among others of the same data.
+
+    **Fields:** `name`; `free` how many numbers are free; `rms` of each sensor; `correlation` over
+    how many samples its errors hang together; `information` its Bayesian information criterion
+    less the best one's: 0 for the best, 10 and more is strong evidence against.
+    """
+
+    name: str
+    free: int
+    rms: tuple[float, ...]
+    correlation: float
+    information: float
+
+
+def compare(fits: Mapping[str, Fit]) -> tuple[Comparison, ...]:
+    """Models of the same data, best first, by Schwarz's criterion.
+
+    `N log s² + p log N` with s² the mean square of each sensor's errors and N the number of
+    independent readings: the number of readings over how many samples the errors of the best
+    fitting model hang together, the same for all.
+
+    **Arguments:** `fits` name → `Fit`, all of the same readings. **Raises** `ValueError` for none,
+    or for fits of other readings.
+
+    Source: Schwarz 1978, doi:10.1214/aos/1176344136.
+
+    >>> compare({})
+    Traceback (most recent call last):
+    ValueError: compare: wanted at least one fit
+    """
+    if not fits:
+        raise ValueError("compare: wanted at least one fit")
+    counts = {name: _counts(found) for name, found in fits.items()}
+    if len(set(counts.values())) > 1:
+        raise ValueError(f"compare: wanted fits of the same readings, got {counts}")
+    shortest = max(min(found.correlation for found in fits.values()), 1.0)
+    rows = []
+    for name, found in fits.items():
+        size = int(found.covariance.shape[0])
+        total = 0.0
+        for count, rms in zip(counts[name], found.rms, strict=True):
+            total += count / shortest * 2.0 * np.log(max(rms, 1e-300))
+        independent = sum(counts[name]) / shortest
+        total += size * np.log(max(independent, 2.0))
+        rows.append((total, name, size, found))
+    best = min(total for total, *_ in rows)
+    rows.sort(key=lambda row: row[0])
+    return tuple(
+        Comparison(name, size, found.rms, found.correlation, float(total - best))
+        for total, name, size, found in rows
+    )
+
+
+def _counts(found: Fit) -> tuple[int, ...]:
+    return tuple(r.sensor.components * int(r.seen.sum()) for r in found.problem.records.readings)
+
+
+def cross_validate(
+    build: Callable[[Sequence[Recording]], Problem],
+    recordings: Sequence[Recording],
+    **options: Any,
+) -> tuple[tuple[float, ...], ...]:
+    """How well each recording is predicted by a body that was fitted to all others.
+
+    The body and all that recordings share come from the others; the left-out recording fits only
+    what is its own: its first state and the `Free`s with one value for each.
+
+    **Arguments:** `build` the problem of a sequence of recordings; `recordings` two at least;
+    `options` for `fit`. **Returns** for each recording the root mean square error of each sensor.
+    The model whose errors are smallest predicts best. **Raises** `ValueError` for fewer than two
+    recordings.
+
+    >>> cross_validate(lambda records: None, [])
+    Traceback (most recent call last):
+    ValueError: cross_validate: wanted at least two recordings, got 0
+    """
+    if len(recordings) < 2:
+        raise ValueError(f"cross_validate: wanted at least two recordings, got {len(recordings)}")
+    out = []
+    for index, left_out in enumerate(recordings):
+        others = [r for k, r in enumerate(recordings) if k != index]
+        found = fit(build(others), **options)
+        out.append(fit(_with_shared(build([left_out]), found), **{**options, "starts": 1}).rms)
+    return tuple(out)
+
+
+def _with_shared(problem: Problem, found: Fit) -> Problem:
+    """The problem with the body and all shared values of a fit, no longer free."""
+    here = problem.start()
+    here = eqx.tree_at(lambda p: p.shared, here, found.parameters.shared)
+    records = problem.scenes(here)
+    own = tuple(slot for slot in problem.slots if slot.each)
+    return eqx.tree_at(
+        lambda p: (p.body, p.records, p.slots), problem, (Known(found.body), records, own)
+    )

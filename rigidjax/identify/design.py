@@ -1,0 +1,160 @@
+"""Experiment design: what a motion would show before it is made, and which motion shows most."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float
+
+from rigidjax._types import Scalar, Vec3
+from rigidjax.identify import reported
+from rigidjax.identify.problem import Parameters, Problem, errors_of_one
+from rigidjax.identify.stacking import one
+
+
+def expected(problem: Problem, parameters: Parameters) -> tuple[reported.Quantity, ...]:
+    """What a fit of such a recording would report, and how sure it would be.
+
+    **Arguments:** `problem` whose recordings give times, sensors with known noise, and torques (the
+    readings themselves do not matter); `parameters` the motion that is planned. **Returns** the
+    quantities of `Fit.quantities` with the standard deviations of the Cramér–Rao bound, infinite
+    where the motion would show nothing.
+
+    **Raises:** `ValueError` for a sensor whose noise is not given.
+
+    >>> import rigidjax as rj
+    >>> ts = jnp.linspace(0.0, 5.0, 50)
+    >>> record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), jnp.zeros((50, 3))))
+    >>> problem = rj.identify.Problem(record, rj.identify.PrincipalRatios())
+    >>> body = rj.Inertia.from_principal(1.0, 2.0, 2.5)
+    >>> plan = plan_of(problem, body, [1.0, 0.1, 1.0])
+    >>> bool(expected(problem, plan)[0].deviation < 0.05)
+    True
+    """
+    information = np.asarray(_fisher_jit(problem, parameters))
+    size = np.sqrt(np.maximum(np.diag(information), 1e-300))
+    values, vectors = np.linalg.eigh(information / np.outer(size, size))
+    seen = values > 1e-14 * values.max()
+    inverse = np.where(seen, 1.0 / np.where(seen, values, 1.0), 0.0)
+    covariance = (vectors * inverse) @ vectors.T / np.outer(size, size)
+    blind = np.abs(vectors[:, ~seen]).max(axis=1, initial=0.0) > 1e-6
+    covariance[blind, blind] = np.inf
+    return reported.quantities(problem, parameters, covariance)
+
+
+def plan_of(problem: Problem, body: Any, omega: Any) -> Parameters:
+    """The parameters of a planned motion: this body, this first rate (3,), rad/s, body frame.
+
+    What else is free stays as the recordings give it.
+
+    >>> import rigidjax as rj
+    >>> record = rj.identify.Recording([0.0, 1.0], (rj.identify.Gyro(), [[1.0, 0, 0]] * 2))
+    >>> problem = rj.identify.Problem(record, rj.identify.PrincipalRatios())
+    >>> plan_of(problem, rj.Inertia.from_principal(2.0, 2.0, 2.0), [0.0, 0.0, 3.0]).own.spin
+    Array([[0., 0., 3.]], dtype=float64)
+    """
+    start = problem.start(body)
+    rates = jnp.broadcast_to(jnp.asarray(omega, start.own.spin.dtype), start.own.spin.shape)
+    spin = rates / problem.reference.rate[:, None]
+    return eqx.tree_at(lambda p: p.own.spin, start, spin)
+
+
+def fisher(problem: Problem, parameters: Parameters) -> Float[Array, "n n"]:
+    """Fisher's information (n, n) of the free numbers: `Jᵀ Σ⁻¹ J` of the predictions.
+
+    Differentiable in the parameters: a design follows its gradient. **Raises** `ValueError` for a
+    sensor whose noise is not given.
+
+    >>> import rigidjax as rj
+    >>> record = rj.identify.Recording([0.0, 1.0], (rj.identify.Gyro(0.1), [[1.0, 0, 0]] * 2))
+    >>> problem = rj.identify.Problem(record, rj.identify.PrincipalRatios())
+    >>> fisher(problem, problem.start()).shape
+    (5, 5)
+    """
+    for sensor in problem.records.sensors:
+        if sensor.noise is None:
+            raise ValueError(
+                f"design: wanted a {type(sensor).__name__} with known noise, got noise=None"
+            )
+    flat, restore = ravel_pytree(parameters)
+
+    def predicted(vector: Array) -> Any:
+        here = restore(vector)
+        parts = []
+        for index in range(problem.count):
+            own, record, ref = (
+                one(x, index) for x in (here.own, problem.records, problem.reference)
+            )
+            errors, _ = errors_of_one(problem, here.body, here.shared, own, record, ref)
+            parts += [
+                (e / reading.sensor.noise).reshape(-1)
+                for e, reading in zip(errors, record.readings, strict=True)
+            ]
+        return jnp.concatenate(parts)
+
+    slopes = jax.jacfwd(predicted)(flat)
+    return slopes.T @ slopes
+
+
+@eqx.filter_jit
+def _fisher_jit(problem: Problem, parameters: Parameters) -> Array:
+    return fisher(problem, parameters)
+
+
+def best_first_rate(
+    problem: Problem, body: Any, omega: Any, *, max_steps: int = 60
+) -> tuple[Vec3, tuple[reported.Quantity, ...]]:
+    """The direction of the first rate that shows most of the body, its length kept.
+
+    Makes the mean logarithm of the standard deviations of the body's free numbers small
+    (D-optimality of the body, all else free as well), by BFGS of optimistix on the gradient through
+    Fisher's information. It finds the best direction near `omega`: try several.
+
+    **Arguments:** `problem`, `body` as for `plan_of`; `omega` (3,) rad/s, body frame, where the
+    search starts and how fast the body can be thrown; `max_steps`. **Returns** the rate (3,) and
+    what to expect from it (`expected`).
+
+    **Raises:** as `fisher`.
+
+    >>> best_first_rate.__name__
+    'best_first_rate'
+    """
+    start = jnp.asarray(omega, problem.records.t.dtype)
+    size = jnp.sqrt(jnp.sum(start**2))
+    found = _search(problem, body, start / size, size, max_steps)
+    rate = size * found / jnp.sqrt(jnp.sum(found**2))
+    return rate, expected(problem, plan_of(problem, body, rate))
+
+
+@eqx.filter_jit
+def _search(problem: Problem, body: Any, start: Array, size: Array, max_steps: int) -> Array:
+    minimise: Any = optx.minimise
+    out = minimise(
+        _doubt,
+        optx.BFGS(rtol=1e-4, atol=1e-4),
+        start,
+        (problem, body, size),
+        options={"autodiff_mode": "fwd"},
+        max_steps=max_steps,
+        throw=False,
+    )
+    return out.value
+
+
+def _doubt(direction: Array, args: Any) -> Scalar:
+    """½ log det of the body's covariance over its size, plus a hold on the length."""
+    problem, body, size = args
+    length = jnp.sqrt(jnp.sum(direction**2))
+    information = fisher(problem, plan_of(problem, body, size * direction / length))
+    n = problem.body.size
+    # The body's own information, all else free: Schur's complement.
+    mine, across, rest = information[:n, :n], information[:n, n:], information[n:, n:]
+    scale = jnp.sqrt(jnp.diagonal(rest))
+    rest = rest / (scale[:, None] * scale[None, :]) + 1e-12 * jnp.eye(rest.shape[0])
+    half = jnp.linalg.solve(rest, (across / scale[None, :]).T)
+    left = mine - (across / scale[None, :]) @ half
+    return -0.5 * jnp.linalg.slogdet(left)[1] / n + (length - 1.0) ** 2
