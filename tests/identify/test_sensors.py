@@ -1,0 +1,175 @@
+"""What each sensor reads, against the motion of a point worked out in the world."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import rigidjax as rj
+from rigidjax.identify.sensors.base import Moment
+
+BODY = rj.shapes.box(1.3, [0.1, 0.2, 0.3])
+GRAVITY = jnp.array([0.0, 0.0, -9.81])
+Q = rj.quaternion.exp(jnp.array([0.4, -0.7, 0.2]))
+OMEGA = jnp.array([1.0, -2.0, 0.5])
+PLACE = jnp.array([0.05, -0.02, 0.08])
+
+
+def moment(state, body, torque=None):
+    return Moment(jnp.asarray(0.3), state, body, rj.equations_of_motion(body, state, torque))
+
+
+def along(state, body, point, torque=None):
+    """Position in the world of a body point at a time after this state, by small exact steps."""
+
+    def position(s):
+        field = rj.equations_of_motion(body, state, torque)
+        # Taylor to third order: its second derivative at s = 0 is exact.
+        rate, at = field(0.0, state, None), state
+        twice = jax.jvp(lambda y: field(0.0, y, None), (state,), (rate,))[1]
+        now = jax.tree.map(lambda y, a, b: y + s * a + 0.5 * s * s * b, at, rate, twice)
+        start = now.x if isinstance(state, rj.Rigid) else jnp.zeros(3)
+        return start + rj.quaternion.rotate(now.q, point)
+
+    return position
+
+
+def test_gyro_reads_the_rate_through_its_errors():
+    turn = jnp.array([0.02, -0.01, 0.03])
+    gyro = rj.identify.Gyro(0.1, bias=[0.1, 0.2, 0.3], scale=[1.1, 0.9, 1.0], mounting=turn)
+    axes = rj.so3.exp(turn)
+    read = jnp.array([1.1, 0.9, 1.0]) * (axes.T @ OMEGA) + jnp.array([0.1, 0.2, 0.3])
+    np.testing.assert_allclose(
+        gyro.error(moment(rj.Spin(OMEGA), BODY.inertia), read), 0, atol=1e-15
+    )
+
+
+@pytest.mark.parametrize("torque", [None, "damping"])
+def test_accelerometer_is_the_second_derivative_of_where_it_sits(torque):
+    law = None if torque is None else rj.torques.Damping([0.1, 0.2, 0.3])
+    state = rj.Attitude(Q, OMEGA)
+    here = moment(state, BODY.inertia, law)
+    second = jax.jacfwd(jax.jacfwd(along(state, BODY.inertia, PLACE, law)))(0.0)
+    force = rj.quaternion.rotate(rj.quaternion.conjugate(Q), second)
+    falling = rj.identify.Accelerometer(place=PLACE)
+    np.testing.assert_allclose(falling.error(here, force), 0, atol=1e-12)
+    pivot = rj.identify.Accelerometer(place=PLACE, gravity=GRAVITY)
+    weight = rj.quaternion.rotate(rj.quaternion.conjugate(Q), second - GRAVITY)
+    np.testing.assert_allclose(pivot.error(here, weight), 0, atol=1e-12)
+
+
+def test_accelerometer_on_a_body_that_moves():
+    body = rj.MassProperties(1.3, [0.01, 0.02, -0.01], BODY.second_moment)
+    state = rj.Rigid([1.0, 2, 3], [0.5, 0, 0], Q, OMEGA)
+    wind = rj.torques.UniformGravity(GRAVITY)
+    second = jax.jacfwd(jax.jacfwd(along(state, body, PLACE - body.com, wind)))(0.0)
+    force = rj.quaternion.rotate(rj.quaternion.conjugate(Q), second - GRAVITY)
+    sensor = rj.identify.Accelerometer(place=PLACE, gravity=GRAVITY)
+    np.testing.assert_allclose(sensor.error(moment(state, body, wind), force), 0, atol=1e-12)
+
+
+def test_marker_magnetometer_and_direction():
+    state = rj.Rigid([1.0, 2, 3], [0.5, 0, 0], Q, OMEGA)
+    here = moment(state, BODY)
+    matrix = np.asarray(rj.quaternion.to_matrix(Q))
+    seen = jnp.asarray(np.asarray(state.x) + matrix @ np.asarray(PLACE))
+    np.testing.assert_allclose(rj.identify.Marker(PLACE).error(here, seen), 0, atol=1e-15)
+    pinned = rj.identify.Marker(PLACE, origin=[5.0, 0, 0])
+    turned = jnp.asarray(np.array([5.0, 0, 0]) + matrix @ np.asarray(PLACE))
+    np.testing.assert_allclose(pinned.error(here, turned), 0, atol=1e-15)
+    field = jnp.array([2.0, 0.3, -1.0])
+    inside = jnp.asarray(matrix.T @ np.asarray(field))
+    np.testing.assert_allclose(
+        rj.identify.Magnetometer(field=field).error(here, inside), 0, atol=1e-15
+    )
+    sun = rj.identify.Direction(field, 0.01)
+    unit = inside / jnp.linalg.norm(inside)
+    np.testing.assert_allclose(sun.error(here, unit), 0, atol=1e-15)
+    for angle in (1e-6, 0.1, 1.5, 3.0):
+        axis = jnp.cross(unit, jnp.array([0.0, 0.0, 1.0]))
+        off = rj.so3.exp(angle * axis / jnp.linalg.norm(axis)) @ unit
+        length = jnp.linalg.norm(sun.error(here, off))
+        np.testing.assert_allclose(length, 2 * np.sin(angle / 2), rtol=1e-9)
+
+
+def test_attitude_reads_the_same_for_q_and_minus_q_bit_for_bit():
+    sensor = rj.identify.AttitudeSensor(0.1, mounting=[0.1, 0.0, 0.2])
+    here = moment(rj.Attitude(Q, OMEGA), BODY.inertia)
+    read = rj.quaternion.exp(jnp.array([0.5, 0.4, -0.3]))
+    np.testing.assert_array_equal(sensor.error(here, read), sensor.error(here, -read))
+    placed = rj.quaternion.multiply(Q, rj.quaternion.exp(sensor.mounting))
+    turn = jnp.array([0.3, -0.2, 0.1])
+    read = rj.quaternion.multiply(placed, rj.quaternion.exp(turn))
+    np.testing.assert_allclose(sensor.error(here, read), turn, atol=1e-15)
+
+
+def test_readings_as_matrices_and_euler_angles_are_the_same():
+    angles = np.array([[0.3, 0.4, 0.5], [1.0, 0.2, -0.4]])
+    matrices = np.stack([np.asarray(rj.euler.to_matrix(jnp.asarray(a), "ZYX")) for a in angles])
+    one = rj.identify.quaternions_from_matrices(matrices)
+    two = rj.identify.quaternions_from_euler(np.degrees(angles), "ZYX", unit="deg")
+    np.testing.assert_allclose(np.abs(np.sum(one * two, axis=1)), 1, atol=1e-15)
+    gap = rj.identify.quaternions_from_euler([[np.nan, 0, 0], [0.0, 0, 0]], "ZYX")
+    assert np.isnan(gap[0]).all() and gap[1, 0] == 1
+
+
+class Tachometer(rj.identify.AbstractSensor):
+    """A user's own: it reads |Ω|²."""
+
+    noise: jax.Array | None = None
+    reading_shape = (1,)
+    components = 1
+    unit = "rad²/s²"
+    feels = rj.identify.Gyro.feels
+
+    def error(self, moment, reading):
+        return reading - jnp.sum(moment.state.omega**2)[None]
+
+
+def test_a_sensor_of_ones_own():
+    ts = jnp.linspace(0.0, 6.0, 40)
+    body = rj.Inertia.from_principal(1.0, 1.6, 2.1)
+    ys = rj.simulate(body, rj.Spin([0.3, 1.2, 0.4]), ts).ys
+    squares = jnp.sum(ys.omega**2, axis=1, keepdims=True)
+    record = rj.identify.Recording(ts, (Tachometer(), squares), (rj.identify.Gyro(1e-4), ys.omega))
+    problem = rj.identify.Problem(record, rj.identify.PrincipalRatios())
+    truth = rj.identify.plan_of(problem, body, ys.omega[0])
+    for error in problem.errors(truth):
+        np.testing.assert_allclose(error, 0, atol=1e-12)
+
+
+MISTAKES = [
+    (lambda: rj.identify.Gyro(bias=[0.0, 0.0]), r"bias: wanted shape \(3,\)"),
+    (lambda: rj.identify.Gyro(limit=-1.0), "limit: wanted a positive full scale"),
+    (lambda: rj.identify.Gyro(scale=[1.0, np.nan, 1.0]), "scale.*NaN"),
+    (lambda: rj.identify.Accelerometer(place=None), "place: wanted three numbers, got None"),
+    (lambda: rj.identify.Direction([0.0, 0.0, 0.0]), "got a vector of length zero"),
+    (lambda: rj.identify.Direction([0.0, 0, 1], [0.1, 0.1, 0.1]), r"one number or two, got shape \(3,\)"),
+    (lambda: rj.identify.quaternions_from_matrices(np.diag([1.0, 1, -1])[None]), "index 0 is no rotation.*det = -1"),
+    (lambda: rj.identify.quaternions_from_euler([[0.0, 0, 0]], "ZYX", unit="grad"), "wanted rad or deg"),
+    (lambda: rj.identify.Recording([0.0, 1.0], (rj.identify.Direction([0.0, 0, 1]), [[0.0, 0, 1], [0.0, 0, 2]])), "direction at index 1 is not of length 1"),
+    (lambda: rj.identify.Recording([0.0, 1.0], (rj.identify.Gyro(), np.zeros((2, 3)), [False, False])), "it is masked|is masked"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("call", "words"), MISTAKES)
+@pytest.mark.usefixtures("unhooked")
+def test_mistakes_are_named(call, words):
+    with pytest.raises(ValueError, match=words):
+        call()
+
+
+def test_a_wheel_follows_its_log():
+    t = np.linspace(0.0, 1.0, 101)
+    speed = rj.torques.Series(t, np.sin(3 * t))
+    wheel = rj.torques.Wheel(2.0, [0.0, 0.0, 1.0], speed, delay=0.1)
+    np.testing.assert_allclose(wheel(0.456)[2], 2 * np.sin(3 * 0.556), atol=1e-8)
+    slope = jax.jacfwd(wheel)(0.456)[2]
+    np.testing.assert_allclose(slope, 6 * np.cos(3 * 0.556), atol=1e-5)
+    # At the first sample itself the slope is whole, not half: a solver starts there.
+    np.testing.assert_allclose(jax.jacfwd(speed)(0.0), 3.0, atol=1e-4)
+    np.testing.assert_array_equal(speed(5.0), speed(1.0))
+    assert eqx.tree_equal(speed, rj.torques.Series(t, np.sin(3 * t)))
+    with pytest.raises(ValueError, match="evenly spaced"):
+        rj.torques.Series([0.0, 1.0, 2.0, 4.0], np.zeros(4))
