@@ -14,6 +14,7 @@ from rigidjax._types import Scalar, Vec3
 from rigidjax.identify import reported
 from rigidjax.identify.problem import Parameters, Problem, errors_of_one
 from rigidjax.identify.stacking import one
+from rigidjax.identify.uncertainty import WEAKEST
 
 
 def expected(problem: Problem, parameters: Parameters) -> tuple[reported.Quantity, ...]:
@@ -36,14 +37,15 @@ def expected(problem: Problem, parameters: Parameters) -> tuple[reported.Quantit
     True
     """
     information = np.asarray(_fisher_jit(problem, parameters))
-    size = np.sqrt(np.maximum(np.diag(information), 1e-300))
+    size = np.sqrt(np.diag(information))
+    size = np.maximum(size, max(WEAKEST * size.max(), 1e-300))
     values, vectors = np.linalg.eigh(information / np.outer(size, size))
     seen = values > 1e-14 * values.max()
     inverse = np.where(seen, 1.0 / np.where(seen, values, 1.0), 0.0)
     covariance = (vectors * inverse) @ vectors.T / np.outer(size, size)
-    blind = np.abs(vectors[:, ~seen]).max(axis=1, initial=0.0) > 1e-6
-    covariance[blind, blind] = np.inf
-    return reported.quantities(problem, parameters, covariance)
+    null = vectors[:, ~seen].T / size
+    null = null / np.linalg.norm(null, axis=1, keepdims=True)
+    return reported.quantities(problem, parameters, covariance, null)
 
 
 def plan_of(problem: Problem, body: Any, omega: Any) -> Parameters:

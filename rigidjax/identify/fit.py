@@ -43,7 +43,8 @@ class Fit(eqx.Module):
     """What `fit` returns: the best point and how sure it is.
 
     **Fields:** `parameters` the free numbers at the best point; `covariance` (n, n) of them,
-    flattened in order, and `covariance_kind` what it rests on; `starts` what came of each start;
+    flattened in order, infinite where the data are blind, `seen` the same within what they see,
+    `covariance_kind` what it rests on; `starts` what came of each start;
     `chi2` and `dof` of the whitened errors of the sensors whose noise was given; `correlation` over
     how many samples the errors hang together, 1 for white ones; `singular_values` (n,) of the
     whitened Jacobian; `null_directions` (k, n) that leave no trace in the data; `quantities` all
@@ -53,12 +54,14 @@ class Fit(eqx.Module):
     problem: Problem
     parameters: Parameters
     covariance: Float[Array, "n n"]
+    seen: Float[Array, "n n"]
     covariance_kind: str
     noises: Noise
     starts: tuple[Start, ...]
     chi2: float
     dof: int
     correlation: float
+    independent: float
     singular_values: Float[Array, " n"]
     null_directions: Float[Array, "unseen n"]
     quantities: tuple[reported.Quantity, ...]
@@ -343,11 +346,11 @@ def _assess(
     best_cost: float,
 ) -> Fit:
     linear = uncertainty.linearise(problem, value, noise)
-    correlation, closeness = uncertainty.correlation_time(linear)
-    spread = uncertainty.spread(linear, correlation)
+    times = uncertainty.correlation_times(linear)
+    spread = uncertainty.spread(linear, times)
     free = ravel_pytree(value)[0].size
     errors = uncertainty.errors_at(value, problem)
-    chi2, dof, believable = uncertainty.goodness(problem, errors, linear, free, closeness)
+    chi2, dof, believable = uncertainty.goodness(problem, errors, linear, free, times.closeness)
     # Ten units of log-likelihood: a point further above the best is e¹⁰ times less likely. Where
     # the noise is estimated from the best point, its cost is half the number of readings.
     margin = 10.0
@@ -373,14 +376,16 @@ def _assess(
         problem,
         value,
         jnp.asarray(spread.covariance),
+        jnp.asarray(spread.seen),
         spread.kind,
         noise,
         tuple(starts),
         chi2,
         dof,
-        correlation,
+        times.longest,
+        times.independent,
         jnp.asarray(spread.singular_values),
         jnp.asarray(spread.null_directions),
-        reported.quantities(problem, value, spread.covariance),
+        reported.quantities(problem, value, spread.seen, spread.null_directions),
         status,
     )

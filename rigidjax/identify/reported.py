@@ -81,11 +81,14 @@ def _value_and_slope(problem: Problem, parameters: Parameters) -> tuple[Array, A
 
 
 def quantities(
-    problem: Problem, parameters: Parameters, covariance: np.ndarray
+    problem: Problem, parameters: Parameters, covariance: np.ndarray, null: np.ndarray
 ) -> tuple[Quantity, ...]:
-    """Every reported quantity with its standard deviation."""
+    """Every reported quantity with its standard deviation.
+
+    **Arguments:** `covariance` (n, n) within what is seen; `null` (k, n) what is not.
+    """
     values, slope = (np.asarray(x) for x in _value_and_slope(problem, parameters))
-    deviations = carried(slope, covariance)
+    deviations = carried(slope, covariance, null)
     out = []
     for (name, unit, positive), value, deviation in zip(
         labels(problem), values, deviations, strict=True
@@ -95,13 +98,15 @@ def quantities(
     return tuple(out)
 
 
-def carried(slope: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """Standard deviations of functions with this derivative (…, n); infinite where not seen."""
-    blind = ~np.isfinite(np.diag(covariance))
+def carried(slope: np.ndarray, covariance: np.ndarray, null: np.ndarray) -> np.ndarray:
+    """Standard deviations of functions with this derivative (…, n).
+
+    Infinite where the function changes along a direction of `null` (k, n).
+    """
     size = np.abs(slope).max(axis=-1, initial=1e-300)
-    touched = np.abs(slope[..., blind]).max(axis=-1, initial=0.0) > 1e-9 * size
-    finite = np.where(np.isfinite(covariance), covariance, 0.0)
-    variance = np.einsum("...i,ij,...j->...", slope, finite, slope)
+    along = np.abs(slope @ null.T).max(axis=-1, initial=0.0)
+    touched = along > 1e-6 * size
+    variance = np.einsum("...i,ij,...j->...", slope, covariance, slope)
     return np.where(touched, np.inf, np.sqrt(np.maximum(variance, 0.0)))
 
 
@@ -115,7 +120,8 @@ def interval_of(
         return jnp.asarray(of(*fit.problem.unpack(restore(x))))
 
     middle, slope = np.asarray(value(flat)), np.asarray(jax.jacfwd(value)(flat))
-    reach = quantile(fit, level) * carried(slope, np.asarray(fit.covariance))
+    found = carried(slope, np.asarray(fit.seen), np.asarray(fit.null_directions))
+    reach = quantile(fit, level) * found
     return middle - reach, middle + reach
 
 
@@ -130,5 +136,4 @@ def quantile(fit: "Fit", level: float) -> float:
     sensors = fit.problem.records.sensors
     if all(sensor.noise is not None for sensor in sensors) and fit.correlation <= 1.5:
         return float(ndtri(tail))
-    independent = fit.problem.records.size / max(fit.correlation, 1.0)
-    return float(stdtrit(max(independent - fit.covariance.shape[0], 1.0), tail))
+    return float(stdtrit(max(fit.independent - fit.covariance.shape[0], 2.0), tail))

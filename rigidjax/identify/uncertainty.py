@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
+from scipy.signal import lfilter
 
 from rigidjax.identify.problem import Parameters, Problem, along
 from rigidjax.identify.residual import Noise, beside, weights_of, whitened
@@ -15,6 +16,8 @@ from rigidjax.identify.search import evaluate
 
 # A direction whose singular value is below this share of the largest is not seen at all.
 BLIND = 1e-8
+# Columns of the Jacobian are brought to length one, but not from below this share of the longest.
+WEAKEST = 1e-6
 
 
 class Linearised(eqx.Module):
@@ -92,25 +95,29 @@ def linearise(problem: Problem, parameters: Parameters, noise: Noise) -> Lineari
 class Spread(eqx.Module):
     """Covariance of the parameters and what it rests on.
 
-    **Fields:** `covariance` (n, n); `kind` in words; `singular_values` (n,) of the weighted
-    Jacobian; `null_directions` (k, n) that leave no trace in the data.
+    **Fields:** `covariance` (n, n), infinite where a number depends on what is not seen; `seen`
+    (n, n) the same within what is seen; `kind` in words; `singular_values` (n,) of the weighted
+    Jacobian, its columns of length one; `null_directions` (k, n) that leave no trace in the data.
     """
 
     covariance: np.ndarray
+    seen: np.ndarray
     kind: str
     singular_values: np.ndarray
     null_directions: np.ndarray
 
 
-def spread(linear: Linearised, correlation: float) -> Spread:
+def spread(linear: Linearised, times: "Times") -> Spread:
     """`(JᵀWJ)⁻¹` where the errors are white, else the sandwich `H⁻¹ M H⁻¹`.
 
-    M adds up products of scores up to some correlation times apart, with Bartlett's weights, so
-    that errors which hang together in time count as the fewer they are.
+    `M = Jᵀ C J` with C the errors' own covariance in time: each channel its variance and an
+    exponential of its correlation time. Fitted errors are smaller than true ones, the more so the
+    fewer of them are independent: M is scaled up by n/(n − p) for n independent errors. With many
+    recordings, what differs between them is taken instead where it is more.
 
-    **Arguments:** `linear`; `correlation` how many samples the errors hang together, 1 for white.
+    **Arguments:** `linear`; `times` how long the errors hang together.
 
-    Source: White 1980, doi:10.2307/1912934; Newey and West 1987, doi:10.2307/1913610.
+    Source: White 1980, doi:10.2307/1912934; Liang and Zeger 1986, doi:10.1093/biomet/73.1.13.
 
     A direction whose singular value is below 1e-8 of the largest has infinite variance, not a
     made-up one.
@@ -118,66 +125,93 @@ def spread(linear: Linearised, correlation: float) -> Spread:
     rows = linear.rows
     n = rows.shape[1]
     if not np.isfinite(rows).all():
-        nothing = np.full((n, n), np.nan)
-        return Spread(
-            nothing, "none: the motion is not finite", np.full(n, np.nan), np.zeros((0, n))
-        )
-    # Columns of order one: a bias in rad/s must not look blind beside a moment.
+        lost, kind = np.full((n, n), np.nan), "none: the motion is not finite"
+        return Spread(lost, lost, kind, np.full(n, np.nan), np.zeros((0, n)))
+    # Columns of order one: a bias in rad/s must not look blind beside a moment. But a column of
+    # round-off is not to be blown up.
     size = np.sqrt(np.sum(rows**2, axis=0))
-    size = np.where(size > 0, size, 1.0)
+    size = np.maximum(size, max(WEAKEST * size.max(), 1e-300))
     _, singular, directions = np.linalg.svd(rows / size, full_matrices=False)
     seen = singular > BLIND * max(singular.max(), 1e-300)
     inverse = np.where(seen, 1.0 / np.where(seen, singular, 1.0), 0.0)
     half = directions.T * inverse
     covariance = (half @ half.T) / np.outer(size, size)
     kind = "Gauss–Newton"
-    if correlation > 1.5:
-        covariance = _sandwich(linear.scores, covariance, correlation)
-        kind = f"sandwich: the errors hang together over {correlation:.0f} samples"
-    null = directions[~seen] * size if not seen.all() else np.zeros((0, n))
-    if len(null):
-        null = directions[~seen] / size
-        null = null / np.linalg.norm(null, axis=1, keepdims=True)
-        blind = np.abs(null).max(axis=0) > 1e-6
-        covariance[blind, blind] = np.inf
-    return Spread(covariance, kind, singular, null)
+    if times.longest > 1.5:
+        covariance = _sandwich(linear, covariance, times)
+        kind = f"sandwich: the errors hang together over {times.longest:.0f} samples"
+    null = directions[~seen] / size
+    null = null / np.linalg.norm(null, axis=1, keepdims=True)
+    shown = covariance.copy()
+    blind = np.abs(null).max(axis=0, initial=0.0) > 1e-6
+    shown[blind, blind] = np.inf
+    return Spread(shown, covariance, kind, singular, null)
 
 
-def _sandwich(scores: np.ndarray, bread: np.ndarray, correlation: float) -> np.ndarray:
-    records, times, n = scores.shape
-    reach = int(min(max(2, np.ceil(2.0 * correlation)), times - 1))
-    meat = np.einsum("rti,rtj->ij", scores, scores)
-    for lag in range(1, reach + 1):
-        product = np.einsum("rti,rtj->ij", scores[:, lag:], scores[:, :-lag])
-        meat += (1.0 - lag / (reach + 1.0)) * (product + product.T)
+def _sandwich(linear: Linearised, bread: np.ndarray, times: "Times") -> np.ndarray:
+    n = bread.shape[0]
+    meat = np.zeros((n, n))
+    for error, slope, weight, spans in zip(
+        linear.errors, linear.slopes, linear.weights, times.spans, strict=True
+    ):
+        root = np.sqrt(weight)
+        for channel, span in enumerate(spans):
+            e, j = error[..., channel] * root, slope[..., channel, :] * root[..., None]
+            variance = np.sum(e**2) / max(np.sum(weight > 0), 1)
+            # 1 + 2 Σ ρˡ = span for an exponential.
+            rho = (span - 1.0) / (span + 1.0)
+            ahead = lfilter([1.0], [1.0, -rho], j, axis=1)
+            behind = lfilter([1.0], [1.0, -rho], j[:, ::-1], axis=1)[:, ::-1]
+            meat += variance * np.einsum("rti,rtj->ij", j, ahead + behind - j)
+    meat *= times.independent / max(times.independent - n, 0.1 * times.independent)
+    scores = linear.scores
+    records = scores.shape[0]
     if records > n // 2 and records > 5:
         # Many recordings: what differs between them shows without any model of their errors.
         total = scores.sum(axis=1)
         apart = total.T @ total * records / (records - 1)
-        meat = np.where(np.trace(bread @ apart) > np.trace(bread @ meat), apart, meat)
-    count = records * times
-    finite = np.where(np.isfinite(bread), bread, 0.0)
-    out = finite @ meat @ finite * count / max(count - n, 1)
+        meat = apart if np.trace(bread @ apart) > np.trace(bread @ meat) else meat
+    out = bread @ meat @ bread
     # Never narrower than white errors would have it.
-    below = np.diag(out) < np.diag(finite)
-    factor = np.sqrt(np.where(below, np.diag(finite) / np.maximum(np.diag(out), 1e-300), 1.0))
+    below = np.diag(out) < np.diag(bread)
+    factor = np.sqrt(np.where(below, np.diag(bread) / np.maximum(np.diag(out), 1e-300), 1.0))
     return out * np.outer(factor, factor)
 
 
-def correlation_time(linear: Linearised) -> tuple[float, float]:
-    """How many samples the errors hang together, and their correlation from one to the next.
+class Times(eqx.Module):
+    """How many samples the errors hang together, for each channel of each sensor.
 
-    The integrated autocorrelation time `1 + 2 Σ ρ_l`, summed up to the first lag at which ρ falls
-    below twice its own scatter, the longest over all channels.
+    **Fields:** `spans` one tuple for each sensor, 1 for white errors; `closeness` the correlation
+    from one sample to the next in the channel of the longest; `independent` how many errors that
+    makes independent.
     """
-    longest, closest = 1.0, 0.0
+
+    spans: tuple[tuple[float, ...], ...]
+    closeness: float
+    independent: float
+
+    @property
+    def longest(self) -> float:
+        """The longest of all channels."""
+        return max(span for sensor in self.spans for span in sensor)
+
+
+def correlation_times(linear: Linearised) -> Times:
+    """The integrated autocorrelation time `1 + 2 Σ ρ_l` of each channel.
+
+    Summed up to the first lag at which ρ falls below twice its own scatter.
+    """
+    spans, longest, closest, independent = [], 1.0, 0.0, 0.0
     for error, weight in zip(linear.errors, linear.weights, strict=True):
-        kept = error * np.sqrt(weight)[..., None]
+        kept, found = error * np.sqrt(weight)[..., None], []
         for channel in range(error.shape[-1]):
-            time, first = _channel_time(kept[..., channel], weight > 0)
-            if time > longest:
-                longest, closest = time, first
-    return longest, closest
+            span, first = _channel_time(kept[..., channel], weight > 0)
+            if span > longest:
+                longest, closest = span, first
+            found.append(span)
+            independent += float(np.sum(weight > 0)) / span
+        spans.append(tuple(found))
+    return Times(tuple(spans), closest, independent)
 
 
 def _channel_time(e: np.ndarray, seen: np.ndarray) -> tuple[float, float]:

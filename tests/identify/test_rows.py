@@ -52,12 +52,13 @@ def test_i1_only_ratios_from_free_motion_and_it_says_so():
     assert (np.abs(ratios - RATIOS) <= (high - low) / 2).all()
 
 
-# Of the six numbers of the inertia, how many leave a trace in the rates.
+# Of the six numbers of the inertia, how many leave a trace in the rates to first order. In a steady
+# motion only what makes I Ω leave Ω does: two products of inertia, for Ω × δI Ω has two components.
 MOTIONS = {
     "generic": (BODY, (0.4, 1.2, -0.3), 5),
-    "about the third axis": (BODY, (0.0, 0.0, 1.0), 3),
-    "about the middle axis": (BODY, (0.0, 1.0, 0.0), 3),
-    "sphere": (rj.Inertia.from_principal(1.0, 1.0, 1.0), (0.4, 1.2, -0.3), 5),
+    "about the third axis": (BODY, (0.0, 0.0, 1.0), 2),
+    "about the middle axis": (BODY, (0.0, 1.0, 0.0), 2),
+    "sphere": (rj.Inertia.from_principal(1.0, 1.0, 1.0), (0.4, 1.2, -0.3), 2),
 }
 
 
@@ -67,7 +68,8 @@ def test_i2_rank_of_degenerate_motions(name):
     problem = gyro_problem(rates(body, omega), chart=identify.Tensor(3.0))
     truth = identify.plan_of(problem, body, list(omega))
     noise = (jnp.full((1, 3), 0.01),)
-    spread = uncertainty.spread(uncertainty.linearise(problem, truth, noise), 1.0)
+    linear = uncertainty.linearise(problem, truth, noise)
+    spread = uncertainty.spread(linear, uncertainty.correlation_times(linear))
     assert 6 - len(spread.null_directions) == rank
 
 
@@ -77,7 +79,7 @@ def test_i2_nearly_a_pure_spin_is_seen_but_weakly():
     truth = identify.plan_of(problem, BODY, list(omega))
     noise = (jnp.full((1, 3), 1e-6),)
     linear = uncertainty.linearise(problem, truth, noise)
-    spread = uncertainty.spread(linear, 1.0)
+    spread = uncertainty.spread(linear, uncertainty.correlation_times(linear))
     assert 6 - len(spread.null_directions) == 5
 
 
@@ -142,7 +144,9 @@ def test_i6_saturation_is_a_censored_reading(share):
     assert censored.ok
     assert off(censored) <= 5 * max(clean, 0.004)
     ignored = identify.fit(gyro_problem(values), starts=2)
-    assert not ignored.ok or off(ignored) > 3 * off(censored)
+    # What is clipped a little hides in the noise; what is clipped more is told by χ².
+    assert ignored.chi2 > censored.chi2
+    assert share < 0.2 or not ignored.ok
 
 
 def test_i7_a_clock_that_is_late_is_found():
@@ -207,7 +211,6 @@ def test_i9_a_thin_rod_from_a_poor_start():
 
 
 def test_carried_deviations_are_infinite_where_blind():
-    covariance = np.diag([1.0, np.inf])
-    np.testing.assert_array_equal(
-        carried(np.array([[2.0, 0.0], [1.0, 1.0]]), covariance), [2, np.inf]
-    )
+    seen, null = np.diag([1.0, 0.0]), np.array([[0.0, 1.0]])
+    found = carried(np.array([[2.0, 0.0], [1.0, 1.0]]), seen, null)
+    np.testing.assert_array_equal(found, [2, np.inf])
