@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
+import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -63,6 +64,21 @@ class AboutAxis(eqx.Module):
         t = _checks.floating(t, (), "t")
         _, speed = jax.jvp(self.angle, (t,), (jnp.ones_like(t),))
         return speed * self.axis.astype(t.dtype)
+
+
+def differentiable(rotation: Any) -> Any:
+    """`rotation`; the solves that it does itself made ready for forward differentiation.
+
+    A frame needs dΩ/dt, and the default adjoint of a solution of `simulate` refuses that.
+
+    >>> differentiable({"adjoint": dfx.RecursiveCheckpointAdjoint()})["adjoint"]
+    ForwardMode()
+    """
+
+    def reverse(part: Any) -> bool:
+        return isinstance(part, dfx.RecursiveCheckpointAdjoint)
+
+    return jax.tree.map(lambda p: dfx.ForwardMode() if reverse(p) else p, rotation, is_leaf=reverse)
 
 
 def state_of(rotation: Any, t: Array) -> Any:
