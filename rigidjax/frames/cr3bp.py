@@ -1,8 +1,11 @@
 """The circular restricted three-body problem, in the plane and in space."""
 
+from collections.abc import Sequence
+
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Complex, Float
+import numpy as np
+from jaxtyping import Array, ArrayLike, Complex, Float
 
 from rigidjax import _checks
 from rigidjax._types import Mat3, Scalar, ScalarLike, Vec3
@@ -79,6 +82,34 @@ class ThreeBody(AbstractMirrored):
         """
         u = self.potential(x)
         return 2 * u - _checks.floating(jacobi, (), "jacobi").astype(u.dtype)
+
+    def zero_velocity(
+        self,
+        xs: Float[ArrayLike, " columns"] | Sequence[float],
+        ys: Float[ArrayLike, " rows"] | Sequence[float],
+    ) -> Float[Array, "rows columns"]:
+        """2U on a grid of the plane z = 0 (rows along y): a particle with constant C keeps to ≥ C.
+
+        **Arguments:** `xs`, `ys` places along the axes. `matplotlib.pyplot.contour(xs, ys, grid,
+        levels=[C])` draws the curve of zero velocity (Szebehely 1967, sec. 4.7).
+
+        >>> from rigidjax.frames import scenes
+        >>> scenes.cr3bp(0.5).zero_velocity([0.0], [0.0]).tolist()
+        [[4.0]]
+        """
+        columns = _checks.floating(xs, np.shape(xs), "xs")
+        rows = _checks.floating(ys, np.shape(ys), "ys")
+        if columns.ndim != 1 or rows.ndim != 1:
+            raise ValueError(
+                f"zero_velocity: wanted xs (N,) and ys (M,), got {columns.shape} and {rows.shape}; "
+                "give the axes, not a mesh"
+            )
+
+        def value(x: Scalar, y: Scalar) -> Scalar:
+            return 2 * self.potential(jnp.stack([x, y, jnp.zeros_like(x)]))
+
+        along = jax.vmap(value, (0, None))
+        return jax.vmap(along, (None, 0))(columns, rows.astype(columns.dtype))
 
     def conserved(self, t: ScalarLike, state: Point) -> dict[str, Scalar]:
         return {"jacobi": self.jacobi_constant(state)}

@@ -68,6 +68,9 @@ def transition(
     >>> float(transition(scenes.turntable(0.0), start, 2.0, rtol=1e-9, atol=1e-9)[0, 3])
     2.0
     """
+    if not isinstance(state, Point):
+        raise TypeError(f"state: wanted a Point(x, v), got {type(state).__name__}")
+    t = _checks.finite(_checks.floating(t, (), "t"), "t")
     return _transition(scene, jnp.concatenate([state.x, state.v]), t, rtol, atol)
 
 

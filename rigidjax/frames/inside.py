@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from rigidjax import _checks
 from rigidjax._types import HasAttitude, Scalar, ScalarLike, Vec3
 from rigidjax.body import inertia as _inertia
-from rigidjax.frames.moving import MovingFrame
+from rigidjax.frames.moving import MovingFrame, require_frame
 from rigidjax.frames.scene import AbstractScene, Force, per_mass
 from rigidjax.frames.turning import Uniform
 from rigidjax.rotation import algebra, quaternion
@@ -38,6 +38,9 @@ class InFrame(AbstractScene):
     inside: Callable[..., Any] | None = None
     outside: Callable[..., Any] | None = None
     potential: Callable[..., Any] | None = None
+
+    def __check_init__(self) -> None:
+        require_frame(self.frame, "InFrame")
 
     def acceleration(self, t: ScalarLike, state: Any) -> Vec3:
         now = self.frame.at(t)
@@ -116,6 +119,9 @@ class BodyInFrame(eqx.Module):
     feels: ClassVar[type] = HasAttitude
     frame: MovingFrame
     torque: Callable[..., Any] | None = None
+
+    def __check_init__(self) -> None:
+        require_frame(self.frame, "BodyInFrame")
 
     def __call__(self, t: ScalarLike, state: Any, body: Any) -> Vec3 | Push:
         now = self.frame.at(t)

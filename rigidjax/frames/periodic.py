@@ -33,6 +33,8 @@ class PeriodicOrbit(eqx.Module):
     period: Float[Array, "*batch"]
 
     def __init__(self, state: Point, period: ScalarLike):
+        if not isinstance(state, Point):
+            raise TypeError(f"state: wanted a Point(x, v), got {type(state).__name__}")
         self.state = state
         period = _checks.floating(period, (), "period", batched=True)
         self.period = period.astype(state.x.dtype)

@@ -123,6 +123,25 @@ def test_zero_velocity():
     np.testing.assert_allclose(jax.grad(MOON.potential)(at), np.zeros(3), atol=1e-13)
 
 
+def test_zero_velocity_curves_pass_through_the_points():
+    points = np.asarray(MOON.lagrange_points)
+    grid = np.asarray(MOON.zero_velocity(points[:, 0], points[:, 1]))
+    constants = np.diag(grid)
+    # Closed form at L4 and L5; the others at 40 digits from Euler's quintics.
+    np.testing.assert_allclose(constants[3:], 3 - PYKEP_MU * (1 - PYKEP_MU), rtol=1e-15)
+    with mp.workdps(40):
+        mu = mp.mpf(PYKEP_MU)
+        for which in (1, 2, 3):
+            gap = quintic(mu, which)
+            x = {1: 1 - mu - gap, 2: 1 - mu + gap, 3: -mu - gap}[which]
+            wanted = x**2 + 2 * (1 - mu) / abs(x + mu) + 2 * mu / abs(x - 1 + mu)
+            assert abs(float(wanted) - constants[which - 1]) < 2e-15
+    # The neck at L1 opens where C falls below its constant: on the line between the bodies the
+    # least of the grid is that of L1.
+    line = np.asarray(MOON.zero_velocity(np.linspace(0.1, 0.95, 2001), [0.0]))[0]
+    assert constants[0] <= line.min() < constants[0] + 1e-5
+
+
 def test_transition_matrix():
     late = 1.5
     found = np.asarray(MOON.transition(PYKEP, late))
