@@ -95,8 +95,11 @@ class Projected(dfx.AbstractWrappedSolver):
     def step(
         self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Any, made_jump: Any
     ) -> Any:
+        # A slope kept from the last step is the one before the projection; and diffrax computes it
+        # anew for all of a batch as soon as one body needs it. True: always anew, for each alone.
+        del made_jump
         y1, error, dense, state, result = self.solver.step(
-            terms, t0, t1, y0, args, solver_state, made_jump
+            terms, t0, t1, y0, args, solver_state, True
         )
         ill = (result == dfx.RESULTS.successful) & ~finite(y1)
         result = dfx.RESULTS.where(ill, NONFINITE, result)

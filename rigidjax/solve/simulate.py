@@ -260,7 +260,7 @@ def simulate(
     solver: dfx.AbstractSolver | None = None,
     rtol: float | None = None,
     atol: float | None = None,
-    dt0: float | None = None,
+    dt0: ScalarLike | None = None,
     stepsize_controller: dfx.AbstractStepSizeController | None = None,
     adjoint: dfx.AbstractAdjoint | None = None,
     max_steps: int | None = 100_000,
