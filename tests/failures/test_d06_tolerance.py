@@ -13,7 +13,7 @@ WANTED = [-0.93965707987292039619, -0.34211777540007490653, 0.741412659619995300
 
 
 @pytest.mark.parametrize(
-    ("dtype", "rtol", "bar"), [(jnp.float32, 1e-12, 2e-5), (jnp.float64, 1e-17, 1e-11)]
+    ("dtype", "rtol", "bar"), [(jnp.float32, 1e-12, 1e-4), (jnp.float64, 1e-17, 1e-11)]
 )
 def test_it_warns_and_does_what_can_be_done(dtype, rtol, bar):
     c = np.array([C[0], C[1], C[0] / C[1]])
