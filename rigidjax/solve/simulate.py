@@ -28,8 +28,8 @@ from rigidjax.motion import (
     on_the_group,
 )
 from rigidjax.motion.torques import Torque, jumps_of
-from rigidjax.solve import inputs
-from rigidjax.solve.explicit import AbstractExplicit
+from rigidjax.solve import inputs, lean, travel
+from rigidjax.solve.explicit import AbstractExplicit, DormandPrince8
 from rigidjax.solve.growth import growth
 from rigidjax.solve.projected import Projected
 from rigidjax.solve.splitting import AbstractSplitting
@@ -59,7 +59,7 @@ class Solution(eqx.Module, Generic[State]):
     ys: State
     stats: dict[str, Any]
     result: dfx.RESULTS
-    _setup: "_Free | _Setup"
+    _setup: "_Free | _Lean | _Setup"
 
     @property
     def drift(self) -> dict[str, Array]:
@@ -123,7 +123,7 @@ class Solution(eqx.Module, Generic[State]):
 
 
 @eqx.filter_jit
-def _drift(setup: "_Free | _Setup", ts: Array, ys: Any) -> dict[str, Array]:
+def _drift(setup: "_Free | _Lean | _Setup", ts: Array, ys: Any) -> dict[str, Array]:
     torque = None if isinstance(setup, _Free) else setup.torque
     return motion.drift(ts, ys, setup.body, torque)  # pyright: ignore[reportArgumentType]
 
@@ -149,14 +149,27 @@ class _Setup(eqx.Module):
     throw: bool = eqx.field(static=True)
 
 
+class _Lean(eqx.Module):
+    """A solve of which nothing is asked but states and `jax.grad`: our own loop."""
+
+    body: Inertia | MassProperties | None
+    torque: Any
+    controller: dfx.AbstractStepSizeController
+    dt0: Any
+    max_steps: int = eqx.field(static=True)
+    throw: bool = eqx.field(static=True)
+
+
 @eqx.filter_jit
 def _solve(
-    setup: _Free | _Setup, state0: Any, ts: Array
+    setup: _Free | _Lean | _Setup, state0: Any, ts: Array
 ) -> tuple[Any, dict[str, Any], dfx.RESULTS]:
     # One jit around everything: an operation outside of it costs as much as a hundred steps.
     state0 = on_the_group(state0)
     if isinstance(setup, _Free):
         return _free(setup, state0, ts)
+    if isinstance(setup, _Lean):
+        return _lean(setup, state0, ts)
     field = equations_of_motion(setup.body, state0, setup.torque)
     scene: Any = scene_of(setup.torque) if isinstance(state0, Point) else None
     watch = collision.event(scene)
@@ -196,6 +209,31 @@ def _solve(
             stats["end_distances"] = scene.approach(end_time, end)[0]
         stats["drift"] = scene.drift(ts, ys)
     return ys, stats, result
+
+
+def _lean(setup: _Lean, state0: Any, ts: Array) -> tuple[Any, dict[str, Any], dfx.RESULTS]:
+    controller: Any = setup.controller
+    out = lean.adaptive(
+        DormandPrince8(),
+        equations_of_motion(setup.body, state0, setup.torque),
+        ts,
+        state0,
+        rtol=controller.rtol,
+        atol=controller.atol,
+        dt0=setup.dt0,
+        max_steps=setup.max_steps,
+        jumps=jumps_of(setup.torque),
+        way=travel.reverse,
+    )
+    ys = _raise(out.ys, out.result) if setup.throw else out.ys
+    stats: dict[str, Any] = {
+        "num_steps": out.num_steps,
+        "num_accepted_steps": out.num_steps - out.num_rejected,
+        "num_rejected_steps": out.num_rejected,
+    }
+    if isinstance(state0, Point):
+        stats["drift"] = scene_of(setup.torque).drift(ts, ys)
+    return ys, stats, out.result
 
 
 def _reached(ys: Any, times: Array) -> Any:
@@ -239,9 +277,21 @@ def _free(setup: _Free, state0: Any, ts: Array) -> tuple[Any, dict[str, Any], df
 class _Flow(eqx.Module):
     """The same run from another start, as a function that forward mode goes through."""
 
-    setup: _Free | _Setup
+    setup: _Free | _Lean | _Setup
 
-    def __init__(self, setup: "_Free | _Setup"):
+    def __init__(self, setup: "_Free | _Lean | _Setup"):
+        if isinstance(setup, _Lean):
+            setup = _Setup(
+                body=setup.body,
+                torque=setup.torque,
+                solver=_SOLVER,
+                controller=setup.controller,
+                dt0=setup.dt0,
+                adjoint=_ADJOINT,
+                progress_meter=_NO_METER,
+                max_steps=setup.max_steps,
+                throw=False,
+            )
         setup = dataclasses.replace(setup, throw=False)
         if isinstance(setup, _Setup):
             setup = dataclasses.replace(setup, adjoint=dfx.ForwardMode())
@@ -283,8 +333,10 @@ def simulate(
       `Point` a scene of `rigidjax.scenes`, a `MovingFrame` to see it from, or a force per mass
       `(t, state, None) → (3,)`, m/s².
     - `solver`: `None` is the cheapest that is right: the closed form (`rigidjax.exact`) for a free
-      body, else `diffrax.Dopri8`. Any `diffrax.AbstractSolver` may be given; it is wrapped so that
-      attitudes stay unit quaternions, at every step and every saved time. Below `rtol=1e-10` mind
+      body, else `rigidjax.solvers.DormandPrince8` in a loop of our own; `diffrax.Dopri8` where
+      more is asked (forward mode, a progress meter, a controller, a `Point` that may collide). Any
+      `diffrax.AbstractSolver` may be given; it is wrapped so that attitudes stay unit quaternions,
+      at every step and every saved time. Below `rtol=1e-10` mind
       that Dopri8 is up to 26 times `rtol` off between its steps (five times at most with
       `rigidjax.solvers.DormandPrince8`).
     - `rtol`, `atol`: tolerances of the adaptive steps; 1e-9 and 1e-12 in float64, 2e-5 and 1e-7 in
@@ -337,6 +389,13 @@ def simulate(
     if torque is None and solver is None and stepsize_controller is None and body is not None:
         free = _Free(body, throw)
         return Solution(times, *_solve(free, state0, times), free)
+    plain = solver is None and stepsize_controller is None and progress_meter is None
+    # Forward mode stays with diffrax: there our loop is faster, but takes far longer to compile.
+    plain = plain and (adjoint is None or adjoint == _ADJOINT) and max_steps is not None
+    if plain and not _can_collide(state0, torque):
+        first = inputs.first_step(dt0, times)
+        quick = _Lean(body, torque, controller, first, max_steps, throw)  # pyright: ignore
+        return Solution(times, *_solve(quick, state0, times), quick)
     setup = _Setup(
         body=body,
         torque=torque,
@@ -377,6 +436,10 @@ def equations_of_motion(
     if isinstance(state0, Attitude):
         return AttitudeEquations(matter, turning)
     return EulerEquations(matter, turning)
+
+
+def _can_collide(state0: Any, torque: Any) -> bool:
+    return isinstance(state0, Point) and collision.event(scene_of(torque)) is not None
 
 
 @functools.cache
