@@ -43,6 +43,8 @@ Law = Callable[[Any, State, Any], Any] | AbstractScene | MovingFrame | None
 _SOLVER = Projected(dfx.Dopri8())
 _ADJOINT = dfx.RecursiveCheckpointAdjoint()
 _NO_METER = dfx.NoProgressMeter()
+# Our loop takes a short step to each saved time, where diffrax has a polynomial to evaluate.
+_FEW_TIMES = 32
 
 
 class Solution(eqx.Module, Generic[State]):
@@ -334,10 +336,9 @@ def simulate(
       `(t, state, None) → (3,)`, m/s².
     - `solver`: `None` is the cheapest that is right: the closed form (`rigidjax.exact`) for a free
       body, else `rigidjax.solvers.DormandPrince8` in a loop of our own; `diffrax.Dopri8` where
-      more is asked (forward mode, a progress meter, a controller, a `Point` that may collide). Any
-      `diffrax.AbstractSolver` may be given; it is wrapped so that attitudes stay unit quaternions,
-      at every step and every saved time. Below `rtol=1e-10` mind
-      that Dopri8 is up to 26 times `rtol` off between its steps (five times at most with
+      more is asked (more than 32 times, forward mode, a progress meter, a controller, a `Point`
+      that may collide). Any `diffrax.AbstractSolver` may be given; it is wrapped so that attitudes
+      stay unit quaternions, at every step and every saved time. Below `rtol=1e-10` mind that Dopri8 is up to 26 times `rtol` off between its steps (five times at most with
       `rigidjax.solvers.DormandPrince8`).
     - `rtol`, `atol`: tolerances of the adaptive steps; 1e-9 and 1e-12 in float64, 2e-5 and 1e-7 in
       float32. Scale `atol` to the smallest number that matters: a flip about the middle axis grows
@@ -392,6 +393,7 @@ def simulate(
     plain = solver is None and stepsize_controller is None and progress_meter is None
     # Forward mode stays with diffrax: there our loop is faster, but takes far longer to compile.
     plain = plain and (adjoint is None or adjoint == _ADJOINT) and max_steps is not None
+    plain = plain and times.shape[0] <= _FEW_TIMES
     if plain and not _can_collide(state0, torque):
         first = inputs.first_step(dt0, times)
         quick = _Lean(body, torque, controller, first, max_steps, throw)  # pyright: ignore
