@@ -338,7 +338,8 @@ def simulate(
       body, else `rigidjax.solvers.DormandPrince8` in a loop of our own; `diffrax.Dopri8` where
       more is asked (more than 32 times, forward mode, a progress meter, a controller, a `Point`
       that may collide). Any `diffrax.AbstractSolver` may be given; it is wrapped so that attitudes
-      stay unit quaternions, at every step and every saved time. Below `rtol=1e-10` mind that Dopri8 is up to 26 times `rtol` off between its steps (five times at most with
+      stay unit quaternions, at every step and every saved time. Below `rtol=1e-10` mind that Dopri8
+      is up to 26 times `rtol` off between its steps (five times at most with
       `rigidjax.solvers.DormandPrince8`).
     - `rtol`, `atol`: tolerances of the adaptive steps; 1e-9 and 1e-12 in float64, 2e-5 and 1e-7 in
       float32. Scale `atol` to the smallest number that matters: a flip about the middle axis grows
