@@ -1,5 +1,7 @@
 """Checks at public boundaries: what was wanted, what came, and the likely cause (floor 0)."""
 
+import functools
+import warnings
 from typing import Any
 
 import equinox as eqx
@@ -28,6 +30,8 @@ def floating(
         raise TypeError(
             f"{name}: wanted an array of numbers, got {type(value).__name__}"
         ) from error
+    if isinstance(value, np.ndarray) and value.dtype == np.float64 and array.dtype != np.float64:
+        _warn_of_lost_digits()
     if jnp.issubdtype(array.dtype, jnp.integer):
         array = array.astype(jnp.result_type(float))
     if array.dtype not in (jnp.float32, jnp.float64):
@@ -44,6 +48,16 @@ def floating(
             f"{name}: wanted shape {shape}, got {array.shape}" + (f"; {advice}" if advice else "")
         )
     return array
+
+
+@functools.cache
+def _warn_of_lost_digits() -> None:
+    # Cached: once in a process.
+    warnings.warn(
+        "rigidjax: float64 numbers become float32, seven digits, because JAX's 64 bits are off; "
+        "set jax.config.update('jax_enable_x64', True), or pass float32 if that is meant",
+        stacklevel=4,
+    )
 
 
 def known(value: Any) -> bool:

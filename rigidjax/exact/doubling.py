@@ -21,6 +21,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Bool
 
 from rigidjax._types import Scalar
 
@@ -47,13 +48,31 @@ class Limits(NamedTuple):
     """How far, and in how many doublings, for a dtype."""
 
     doublings: int  # from u/2^doublings to u
-    reach: float  # the largest √max(p, q) |u|: beyond it the separatrix is at rest
     agm: int  # steps of the arithmetic–geometric mean
+    floor: float  # |p − q|/max(p, q) at and below which the motion is the separatrix's
+    rest: float  # √max(p, q) |u| beyond which the separatrix is at rest
 
 
 def limits(dtype) -> Limits:
-    """`reach` covers the longest quarter period, ln(4/√(1−m)) with 1−m down to round-off cubed."""
-    return Limits(9, 75.0, 10) if dtype == jnp.float64 else Limits(6, 20.0, 8)
+    """`doublings` reach the longest quarter period, `ln(4/√floor)`.
+
+    `floor` is a spin about the middle axis but for 1e-32 (float32: 3e-17) of it. C⁴ must not
+    underflow: that sets `floor` and `rest` in float32.
+    """
+    wide = dtype == jnp.float64
+    return Limits(9, 11, 1e-64, 75.0) if wide else Limits(7, 9, 1e-33, 20.0)
+
+
+def is_endless(m: Modulus) -> Bool[Array, ""]:
+    """Whether the motion has no period: the separatrix, a sphere, rest."""
+    return jnp.abs(m.gap) <= limits(m.p.dtype).floor * jnp.maximum(m.p, m.q)
+
+
+def until_rest(u: Scalar, m: Modulus) -> Scalar:
+    """A reduced u; on the separatrix none beyond the time it takes to come to rest."""
+    big = jnp.maximum(m.p, m.q)
+    rest = limits(u.dtype).rest / jnp.sqrt(jnp.where(big > 0, big, 1.0))
+    return jnp.where(is_endless(m) & (big > 0), jnp.clip(u, -rest, rest), u)
 
 
 def duplicate(f: Elliptic, m: Modulus, mu: Scalar, turn: Scalar) -> Elliptic:
@@ -75,9 +94,9 @@ def duplicate(f: Elliptic, m: Modulus, mu: Scalar, turn: Scalar) -> Elliptic:
 
 
 def series(h: Scalar, m: Modulus, mu: Scalar, turn: Scalar) -> Elliptic:
-    """Taylor series at a small h: `√max(p, q) |h| ≤ reach / 2^doublings`."""
+    """Taylor series, right to round-off for `√max(p, q) |h| ≤ 0.15` (float32: 0.31)."""
     hh = h * h
-    p, q, w = m.p * hh, m.q * hh, mu * hh
+    p, q = m.p * hh, m.q * hh
     e, f = p + q, p * q
     S = h * _horner(
         [
@@ -87,19 +106,34 @@ def series(h: Scalar, m: Modulus, mu: Scalar, turn: Scalar) -> Elliptic:
             -e * (e * e / 5040 + f * (11 / 420)),
             e * e * (e * e / 362880 + f * (17 / 5040)) + f * f / 120,
             -e * (e * e * (e * e / 39916800 + f * (461 / 1663200)) + f * f * (307 / 92400)),
+            e * e * (e * e * f * (8303 / 518918400) + f * f * (9481 / 14414400))
+            + f * f * f * (11 / 15600),
+            -e * f * f * (e * e * (258821 / 3027024000) + f * (13511 / 36036000)),
         ]
     )
     s = S * S
-    xi = (turn * hh * h) * _horner(
-        [
-            1 / 3,
-            -(e + 3 * w) / 15,
-            (2 * e * e + 9 * f + w * (30 * e + 45 * w)) / 315,
-            -(e * (e * e + 27 * f) + w * (63 * e * e + 126 * f + 315 * w * (e + w))) / 2835,
-        ]
-    )
+    xi = turn * growth(S, m, mu)
+    z = xi * xi
+    tangent = xi * (1.0 + z * (1 / 3 + z * (2 / 15 + z * (17 / 315))))
     one = jnp.ones_like(s)
-    return Elliptic(S, jnp.sqrt(1.0 - m.p * s), jnp.sqrt(1.0 - m.q * s), one, xi)
+    return Elliptic(S, jnp.sqrt(1.0 - m.p * s), jnp.sqrt(1.0 - m.q * s), one, tangent)
+
+
+def growth(S: Scalar, m: Modulus, mu: Scalar) -> Scalar:
+    """∫ S²/(1 + μS²) du = ∫ S² dS/((1 + μS²) √(1 − pS²) √(1 − qS²)) for a small S.
+
+    Its power series in S, by the recurrence of Legendre's polynomials for the roots and one more
+    for 1 + μS²; the doublings multiply what it leaves out by 2^doublings.
+    """
+    s = S * S
+    e, f, w = (m.p + m.q) * s, (m.p * m.q) * (s * s), mu * s
+    older, root, term = jnp.zeros_like(s), jnp.ones_like(s), jnp.ones_like(s)
+    total = term / 3
+    for k in range(1, 9):
+        older, root = root, (1 - 0.5 / k) * e * root - (1 - 1 / k) * f * older
+        term = root - w * term
+        total = total + term / (2 * k + 3)
+    return S * s * total
 
 
 def elliptic(u: Scalar, m: Modulus, mu: Scalar, turn: Scalar) -> Elliptic:

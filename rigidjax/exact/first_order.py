@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 
 from rigidjax._types import Scalar
-from rigidjax.exact.doubling import Elliptic, Modulus, duplicate, limits, series
+from rigidjax.exact.doubling import Elliptic, Modulus, duplicate, growth, limits, series, until_rest
 from rigidjax.exact.fence import fence, opaque_one
 from rigidjax.exact.half_period import half_period
 from rigidjax.exact.tensor_flow import Differences
@@ -53,9 +53,7 @@ def jacobian_and_integral(body: Differences, momentum: Triple, t: Scalar) -> tup
     half = half_period(m, zero, zero)
     count = jnp.where(jnp.isfinite(half.time), jnp.round(t / (2.0 * half.time)), 0.0)
     whole = count * jnp.where(count == 0, 0.0, 2.0 * half.time)
-    reach = 2.0 * limits(t.dtype).reach / jnp.sqrt(jnp.where(top > 0, top, 1.0))
-    r = t - whole
-    r = jnp.where(top > 0, jnp.clip(r, -reach, reach), r)
+    r = 2.0 * until_rest(0.5 * (t - whole), m)
     before, f = _integrals(r, m, three)
     S, C, D = f.S, f.C, f.D
     grown2 = f.y2 + whole * half.mean
@@ -171,15 +169,9 @@ def _integrals(u: Scalar, m: Modulus, three) -> tuple[_Functions, _Functions]:
     n = limits(u.dtype).doublings + 1
     h = u * 2.0**-n
     f0 = series(h, m, jnp.zeros_like(u), jnp.zeros_like(u))
-    e = jnp.where(three, 2.0 * m.q - m.p, 2.0 * m.p - m.q)
-    third = h * h * h / 3
-    f = _Functions(
-        f0.S,
-        f0.C,
-        f0.D,
-        third * (1.0 - 0.2 * h * h * (m.p + m.q)),
-        third * (1.0 + 0.2 * h * h * e),
-    )
+    # S²/D² and S²/C² are S²/(1 + μS²) for μ = −q and −p.
+    low = jnp.where(three, -m.q, -m.p)
+    f = _Functions(f0.S, f0.C, f0.D, growth(f0.S, m, jnp.zeros_like(u)), growth(f0.S, m, low))
     before = jax.lax.fori_loop(0, n - 1, lambda _, g: _twice(g, m, three), f)
     return before, _twice(before, m, three)
 

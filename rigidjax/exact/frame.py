@@ -53,7 +53,11 @@ def out_of(axes: Mat3, v: Triple) -> Triple:
 
 def _jacobi(m: Mat3) -> tuple[list[list[Scalar]], Triple]:
     one, zero = jnp.ones_like(m[0, 0]), jnp.zeros_like(m[0, 0])
-    d = (m[0, 0], m[1, 1], m[2, 2])
+    # Nearly equal moments keep their differences: a shift that is exact by Sterbenz' lemma.
+    least = jnp.minimum(jnp.minimum(m[0, 0], m[1, 1]), m[2, 2])
+    most = jnp.maximum(jnp.maximum(m[0, 0], m[1, 1]), m[2, 2])
+    shift = jnp.where(2.0 * least >= most, least, zero)
+    d = (m[0, 0] - shift, m[1, 1] - shift, m[2, 2] - shift)
     o = tuple(0.5 * (m[i, j] + m[j, i]) for i, j in ((1, 2), (0, 2), (0, 1)))
     axes = ((one, zero, zero), (zero, one, zero), (zero, zero, one))
 
@@ -67,7 +71,23 @@ def _jacobi(m: Mat3) -> tuple[list[list[Scalar]], Triple]:
     d, _, axes = jax.lax.fori_loop(0, _SWEEPS, sweep, (d, o, axes))
     for i, j in ((0, 1), (1, 2), (0, 1)):
         d, axes = _order(d, axes, i, j)
-    return [[axes[j][i] for j in range(3)] for i in range(3)], d
+    columns = _polished([[axes[j][i] for j in range(3)] for i in range(3)])
+    return columns, tuple(c + shift for c in d)
+
+
+def _polished(a):
+    """A rotation to round-off again after many: A(3 − AᵀA)/2 (Higham 1986)."""
+    excess = [
+        [
+            a[0][i] * a[0][j] + a[1][i] * a[1][j] + a[2][i] * a[2][j] - float(i == j)
+            for j in range(3)
+        ]
+        for i in range(3)
+    ]
+    return [
+        [a[i][j] - 0.5 * sum(a[i][k] * excess[k][j] for k in range(3)) for j in range(3)]
+        for i in range(3)
+    ]
 
 
 def _rotate(d, o, axes, i, j, k):

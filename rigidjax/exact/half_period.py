@@ -6,7 +6,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 
 from rigidjax._types import Scalar
-from rigidjax.exact.doubling import Modulus, limits
+from rigidjax.exact.doubling import Modulus, is_endless, limits
 
 
 class HalfPeriod(NamedTuple):
@@ -23,22 +23,24 @@ class HalfPeriod(NamedTuple):
 def half_period(m: Modulus, mu: Scalar, turn: Scalar) -> HalfPeriod:
     """The least T > 0 with S(T) = 0, and what S gathers on the way.
 
-    With λ² = max(p, q), a₀ = λ, b₀ = √|p − q|: `T = π/agm(a₀, b₀)` (DLMF 19.8.5), and with
+    With λ² = max(p, q), a₀ = 1, b₀ = √|p − q|/λ: `T = π/(λ agm(a₀, b₀))` (DLMF 19.8.5), and with
     `c₁ = (a₀ − b₀)/2, c_{n+1} = c_n²/(4 a_{n+1})` the mean `⟨S²⟩ = (½ + Σ 2^{n−1} c_n²/w)/λ²`,
-    w = min(p, q) (19.8.6 divided through by w, so that w = 0 is an ordinary value). The phase is
+    w = min(p, q)/λ² (19.8.6 divided through by w, so that w = 0 is an ordinary value). The phase is
     the complete integral of the third kind, 19.8.7–19.8.9, with μ in the place of −α².
     """
     big, small = jnp.maximum(m.p, m.q), jnp.minimum(m.p, m.q)
     at_rest = big <= 0
     big = jnp.where(at_rest, 1.0, big)
     gap = jnp.abs(m.gap)
-    endless = (gap <= 0) | at_rest
-    a, b = jnp.sqrt(big), jnp.sqrt(jnp.where(endless, big, gap))
+    endless = is_endless(m)
+    # In units of λ: XLA may gather the divisors below into one product, which must not underflow.
+    w = small / big
+    a, b = jnp.ones_like(big), jnp.sqrt(jnp.where(endless, 1.0, gap / big))
     # c₁ = w/(2(a₀ + b₀)) exactly; `ratio` is c_n²/w and `c` is c_n.
-    c = small / (2.0 * (a + b))
-    ratio = small / (4.0 * (a + b) ** 2)
+    c = w / (2.0 * (a + b))
+    ratio = w / (4.0 * (a + b) ** 2)
     total, weight = 0.5 * jnp.ones_like(a), 1.0
-    point, part, sum_parts = jnp.sqrt(big + mu), jnp.ones_like(a), jnp.ones_like(a)
+    point, part, sum_parts = jnp.sqrt(1.0 + mu / big), jnp.ones_like(a), jnp.ones_like(a)
     for _ in range(limits(a.dtype).agm):
         total = total + weight * ratio
         weight = 2.0 * weight
@@ -51,7 +53,7 @@ def half_period(m: Modulus, mu: Scalar, turn: Scalar) -> HalfPeriod:
         narrow = c / (4.0 * 0.5 * (a + b))
         ratio = ratio * narrow * narrow
         c = c * narrow
-    time = math.pi / a
+    time = math.pi / (a * jnp.sqrt(big))
     # turn = κμ h; over a quarter ξ = κ h (π/2a) ½ μ/(λ² + μ) Σ.
     phase = turn * time * 0.5 / (big + mu) * sum_parts
     return HalfPeriod(jnp.where(endless, jnp.inf, time), phase, total / big)

@@ -9,7 +9,7 @@ from rigidjax import _checks
 from rigidjax._types import Scalar, Vec3Like
 from rigidjax.body.inertia import Inertia
 from rigidjax.exact import tensor_flow
-from rigidjax.exact.doubling import Modulus
+from rigidjax.exact.doubling import Modulus, is_endless
 from rigidjax.exact.flow import first_order, reciprocal
 from rigidjax.exact.frame import into, principal_frame
 from rigidjax.exact.half_period import half_period
@@ -81,7 +81,7 @@ def _periods(moments: Six, momentum: Triple) -> tuple[Scalar, Scalar]:
     body, _, _ = reciprocal(moments, momentum)
     v = tensor_flow.invariants(body, momentum)
     h = jnp.sqrt(sum(p * p for p in momentum))
-    endless = jax.lax.stop_gradient((v.gap == 0) | (jnp.maximum(v.p, v.q) <= 0))
+    endless = is_endless(jax.lax.stop_gradient(Modulus(v.p, v.q, v.gap)))
     # A tame body stands in where there is no period, so that no derivative is NaN there.
     one, zero = jnp.ones_like(h), jnp.zeros_like(h)
     safe_moments = _choose(endless, (one, 2 * one, 3 * one, zero, zero, zero), moments)

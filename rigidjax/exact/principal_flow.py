@@ -1,6 +1,6 @@
 """The free motion in principal axes: values only, in components.
 
-The derivatives are in `rigidjax.exact.derivatives`; nothing here is differentiated, so signs,
+The derivatives are in `rigidjax.exact.flow`; nothing here is differentiated, so signs,
 orderings and selections may be taken freely.
 """
 
@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rigidjax._types import Scalar
-from rigidjax.exact.doubling import Elliptic, Modulus, duplicate, elliptic, limits
+from rigidjax.exact.doubling import Elliptic, Modulus, duplicate, elliptic, until_rest
 from rigidjax.exact.fence import fence, opaque_one
 from rigidjax.exact.half_period import HalfPeriod, half_period
 from rigidjax.exact.sincos import sincos
@@ -63,14 +63,15 @@ def orbit(moments: Triple, momentum: Triple) -> Orbit:
 
 
 def reduced(o: Orbit, u: Scalar) -> tuple[Elliptic, Scalar]:
-    """S, C, D at u, reduced by whole half periods; and the phase of those half periods."""
+    """S, C, D at u, reduced by whole half periods; and the phase of what is left out."""
     big = jnp.maximum(o.modulus.p, o.modulus.q)
     count = jnp.round(u / o.half.time)
     whole = jnp.where(count == 0, 0.0, count)
     r = u - whole * jnp.where(count == 0, 0.0, o.half.time)
-    reach = limits(u.dtype).reach / jnp.sqrt(jnp.where(big > 0, big, 1.0))
-    r = jnp.where(big > 0, jnp.clip(r, -reach, reach), r)
-    f = elliptic(r, o.modulus, o.mu, o.turn)
+    near = until_rest(r, o.modulus)
+    f = elliptic(near, o.modulus, o.mu, o.turn)
+    # From then on the momentum rests on the middle axis, S² = 1/max(p, q): a steady spin.
+    spin = (r - near) * o.turn / jnp.where(big > 0, big + o.mu, 1.0)
     odd = jnp.abs(whole - 2.0 * jnp.round(0.5 * whole)) > 0.5
     sign = jnp.where(odd, -1.0, 1.0)
     around_three = o.modulus.gap > 0
@@ -80,7 +81,7 @@ def reduced(o: Orbit, u: Scalar) -> tuple[Elliptic, Scalar]:
             C=jnp.where(around_three, sign, 1.0) * f.C,
             D=jnp.where(around_three, 1.0, sign) * f.D,
         ),
-        whole * jnp.where(count == 0, 0.0, o.half.phase),
+        whole * jnp.where(count == 0, 0.0, o.half.phase) + spin,
     )
 
 

@@ -69,7 +69,7 @@ class FreeSolver(dfx.AbstractSolver):
     ) -> tuple[Any, Any, dict[str, Any], None, dfx.RESULTS]:
         del args, solver_state, made_jump
         inertia = _field(terms).inertia
-        direction = jnp.asarray(_direction(terms), jnp.asarray(t0).dtype)
+        direction = _direction(terms, jnp.asarray(t0))
         y1 = FreeBody(inertia, y0)(direction * (t1 - t0))
         error = jax.tree.map(jnp.zeros_like, y0)
         dense = dict(y0=y0, inertia=inertia, direction=direction)
@@ -81,6 +81,7 @@ class FreeSolver(dfx.AbstractSolver):
 
 def _field(terms: Any) -> EulerEquations:
     """Euler's equations inside a term, which diffrax may have wrapped."""
+    # `vf` and `contr`, all that diffrax promises of a wrapped term, give numbers, not the inertia.
     term = getattr(terms, "term", terms)
     field = getattr(term, "vector_field", None)
     euler = field.euler if isinstance(field, AttitudeEquations) else field
@@ -98,6 +99,6 @@ def _field(terms: Any) -> EulerEquations:
     return euler
 
 
-def _direction(terms: Any) -> Any:
-    """−1 where diffrax integrates backwards: then its times run as −t."""
-    return getattr(terms, "direction", 1)
+def _direction(terms: Any, like: Any) -> Any:
+    """−1 where diffrax integrates backwards, its times running as −t: the control of [0, 1]."""
+    return terms.contr(jnp.zeros_like(like), jnp.ones_like(like))

@@ -36,7 +36,7 @@ import jax
 import jax.numpy as jnp
 
 from rigidjax._types import Scalar
-from rigidjax.exact.doubling import limits
+from rigidjax.exact.doubling import Modulus, is_endless, limits, until_rest
 from rigidjax.exact.triples import Six, Triple, adjugate, determinant, product, times
 
 
@@ -120,10 +120,12 @@ def start(u: Scalar, v: Invariants) -> Sigma:
     for c in (1 / 8, 1 / 4, 1.0):
         inner = _add_scalar(product(x, inner), c)
     t = _add_scalar(_scale(product(x, inner), -0.5), 1.0)
+    # Y = ⅓u³ (1 − c₁/5 + (2c₁² + 9c₂)/105 + (3/5 − 2c₁/7) x + 3x²/7), x = u²E.
     r = u * uu / 3
-    y = _add_scalar(
-        tuple(c * (0.6 * r * uu) for c in (q, zero, p, e12, e13, e23)), r * (1.0 - 0.2 * c1)
-    )
+    x = (q * uu, zero, p * uu, e12 * uu, e13 * uu, e23 * uu)
+    inner = _add_scalar(_scale(x, 3 / 7), 0.6 - (2 / 7) * c1)
+    more = 1.0 + (-c1 / 5 + (2.0 * c1 * c1 + 9.0 * c2) / 105)
+    y = _scale(_add_scalar(product(x, inner), more), r)
     return _scaled(Sigma(s, t, y))
 
 
@@ -256,8 +258,8 @@ def period(v: Invariants) -> Scalar:
 def momentum_and_integral(body: Differences, momentum: Triple, t: Scalar) -> tuple[Triple, Six]:
     """Π(t) and G = ∫₀ᵗ Π Πᵀ dt."""
     v = invariants(body, momentum)
-    big = jax.lax.stop_gradient(jnp.maximum(v.p, v.q))
-    endless = (jax.lax.stop_gradient(v.gap) == 0) | (big <= 0)
+    m = jax.lax.stop_gradient(Modulus(v.p, v.q, v.gap))
+    endless = is_endless(m)
     # Dummy invariants where there is no period keep NaN out of the derivatives.
     one, zero = jnp.ones_like(t), jnp.zeros_like(t)
     tame = Invariants(one, one, one, one, zero, one, one, zero, zero, zero)
@@ -266,14 +268,16 @@ def momentum_and_integral(body: Differences, momentum: Triple, t: Scalar) -> tup
     several = count != 0
     usual = jax.tree.map(lambda a, b: jnp.where(several, a, b), usual, tame)
     whole = period(usual)
-    r = t - jnp.where(several, count * whole, 0.0)
-    reach = 2.0 * limits(t.dtype).reach / jnp.sqrt(jnp.where(big > 0, big, 1.0))
-    r = jnp.where(big > 0, jnp.clip(r, -reach, reach), r)
+    r = 2.0 * until_rest(0.5 * (t - jnp.where(several, count * whole, 0.0)), m)
 
-    f = sigma_at(0.5 * r, v)
-    k, _ = momentum_at(body, v, f, momentum)
-    out, _ = momentum_at(body, v, double(f, v), momentum)
-    g = integral_about(body, v, f, k)
+    # About two points of the orbit: T has no inverse a quarter period away.
+    f = sigma_at(0.25 * r, v)
+    half = double(f, v)
+    first, _ = momentum_at(body, v, f, momentum)
+    second, _ = momentum_at(body, v, half, first)
+    out, _ = momentum_at(body, v, double(half, v), momentum)
+    parts = (integral_about(body, v, f, k) for k in (first, second))
+    g = tuple(a + b for a, b in zip(*parts, strict=True))
 
     # A whole period: four quarters about four points of the orbit.
     eighth = sigma_at(0.125 * whole, usual)

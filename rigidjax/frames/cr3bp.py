@@ -1,20 +1,23 @@
 """The circular restricted three-body problem, in the plane and in space."""
 
+from collections.abc import Sequence
+
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Complex, Float
+import numpy as np
+from jaxtyping import Array, ArrayLike, Complex, Float
 
 from rigidjax import _checks
 from rigidjax._types import Mat3, Scalar, ScalarLike, Vec3
 from rigidjax.body.hints import Vector
-from rigidjax.frames import flow, lagrange, periodic, richardson
+from rigidjax.frames import flow, lagrange, richardson
+from rigidjax.frames.mirrored import AbstractMirrored
 from rigidjax.frames.periodic import PeriodicOrbit
 from rigidjax.frames.point import Point
-from rigidjax.frames.scene import AbstractScene
 from rigidjax.rotation.algebra import components
 
 
-class ThreeBody(AbstractScene):
+class ThreeBody(AbstractMirrored):
     """A particle under two bodies that circle each other: make one with `scenes.cr3bp(mu)`.
 
     Rotating axes, origin at the common centre of mass, the first body (mass 1 − μ) at (−μ, 0, 0),
@@ -80,6 +83,34 @@ class ThreeBody(AbstractScene):
         u = self.potential(x)
         return 2 * u - _checks.floating(jacobi, (), "jacobi").astype(u.dtype)
 
+    def zero_velocity(
+        self,
+        xs: Float[ArrayLike, " columns"] | Sequence[float],
+        ys: Float[ArrayLike, " rows"] | Sequence[float],
+    ) -> Float[Array, "rows columns"]:
+        """2U on a grid of the plane z = 0 (rows along y): a particle with constant C keeps to ≥ C.
+
+        **Arguments:** `xs`, `ys` places along the axes. `matplotlib.pyplot.contour(xs, ys, grid,
+        levels=[C])` draws the curve of zero velocity (Szebehely 1967, sec. 4.7).
+
+        >>> from rigidjax.frames import scenes
+        >>> scenes.cr3bp(0.5).zero_velocity([0.0], [0.0]).tolist()
+        [[4.0]]
+        """
+        columns = _checks.floating(xs, np.shape(xs), "xs")
+        rows = _checks.floating(ys, np.shape(ys), "ys")
+        if columns.ndim != 1 or rows.ndim != 1:
+            raise ValueError(
+                f"zero_velocity: wanted xs (N,) and ys (M,), got {columns.shape} and {rows.shape}; "
+                "give the axes, not a mesh"
+            )
+
+        def value(x: Scalar, y: Scalar) -> Scalar:
+            return 2 * self.potential(jnp.stack([x, y, jnp.zeros_like(x)]))
+
+        along = jax.vmap(value, (0, None))
+        return jax.vmap(along, (None, 0))(columns, rows.astype(columns.dtype))
+
     def conserved(self, t: ScalarLike, state: Point) -> dict[str, Scalar]:
         return {"jacobi": self.jacobi_constant(state)}
 
@@ -120,22 +151,6 @@ class ThreeBody(AbstractScene):
         roots = jnp.sqrt(squares)
         return jnp.concatenate([roots, -roots])
 
-    def transition(
-        self, state: Point, t: ScalarLike, *, rtol: float = 1e-13, atol: float = 1e-14
-    ) -> Float[Array, "6 6"]:
-        """The state-transition matrix ∂(x, v)(t)/∂(x, v)(0) (6, 6), by forward differentiation.
-
-        **Arguments:** `state` the start; `t` when. Its determinant is 1.
-        """
-        return flow.transition(self, state, t, rtol=rtol, atol=atol)
-
-    def monodromy(self, orbit: PeriodicOrbit) -> Float[Array, "6 6"]:
-        """The transition matrix over one period; its eigenvalues say whether the orbit is stable.
-
-        Two of the six are 1, the others come as λ, 1/λ (Szebehely 1967, sec. 8.6).
-        """
-        return self.transition(orbit.state, orbit.period)
-
     def lyapunov_guess(self, point: int, amplitude: ScalarLike) -> PeriodicOrbit:
         """A start near a planar Lyapunov orbit about L1, L2 or L3, for `periodic_orbit`.
 
@@ -150,35 +165,6 @@ class ThreeBody(AbstractScene):
         Richardson 1980, doi:10.1007/BF01229511 (third order).
         """
         return richardson.guess(self.mu, point, None, amplitude)
-
-    def periodic_orbit(
-        self, guess: PeriodicOrbit, *, hold: str = "x", tolerance: float | None = None
-    ) -> PeriodicOrbit:
-        """The periodic orbit near `guess`, by differentiable correction.
-
-        For orbits symmetric about the xz-plane: Lyapunov, halo, Arenstorf's and most others in use.
-        They cross it at a right angle (y = v_x = v_z = 0) twice a period. Newton's method on three
-        of (x, z, v_y, T/2) makes y, v_x, v_z vanish at the half period.
-
-        **Arguments:** `guess` a `PeriodicOrbit(state, period)` whose state crosses at a right
-        angle; `hold` which of `"x"`, `"z"`, `"vy"`, `"period"` stays as guessed: this labels the
-        orbit within its family (`"x"` for Lyapunov orbits, `"z"` for halo orbits); `tolerance`
-        largest |y|, |v_x|, |v_z| left at the half period, 1e-12 unless given (1e-4 in float32).
-
-        **Returns** a `PeriodicOrbit`. Its derivatives with respect to μ and the held number are
-        those of the family, by the implicit function theorem, forward and reverse.
-
-        Source: Howell 1984, doi:10.1007/BF01358403.
-
-        **Raises:** `ValueError` (`EquinoxRuntimeError` under `jit`) if Newton does not converge.
-
-        >>> from rigidjax.frames import scenes
-        >>> moon = scenes.cr3bp(0.0121505856)
-        >>> orbit = moon.periodic_orbit(moon.lyapunov_guess(1, 0.01))
-        >>> round(float(orbit.period), 4)
-        2.712
-        """
-        return periodic.correct(self, guess, hold, tolerance)
 
 
 def cr3bp(mu: ScalarLike, radii: Float[Array, "2"] | object = (0.0, 0.0)) -> ThreeBody:

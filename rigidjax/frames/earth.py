@@ -68,6 +68,7 @@ class Earth(AbstractScene):
         0.02195
         """
         h = _checks.floating(height, (), "height")
+        h = _checks.refuse(h, ~(h >= 0), "height: wanted metres above the ground, a number ≥ 0")
         time = jnp.sqrt(2 * h / self.gravity)
         return self.rate * self.gravity * jnp.cos(self.latitude) * time**3 / 3
 
@@ -104,5 +105,7 @@ def checked(
         ~(jnp.abs(lat) <= 0.5000001 * jnp.pi),
         "latitude: wanted radians between −π/2 and π/2; were these degrees?",
     )
-    g = _checks.refuse(g, ~(g > 0), "gravity: wanted a positive number, m/s²; it points down")
+    g = _checks.refuse(
+        g, ~((g > 0) & jnp.isfinite(g)), "gravity: wanted a positive number, m/s²; it points down"
+    )
     return lat, g, _checks.refuse(w, ~jnp.isfinite(w), "rate: wanted a finite number, rad/s")

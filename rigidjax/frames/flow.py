@@ -22,6 +22,26 @@ def flow(scene: AbstractScene, state: Point, t: ScalarLike, rtol: float, atol: f
     >>> flow(scenes.turntable(0.0), Point([0.0, 0, 0], [1.0, 0, 0]), 2.0, 1e-9, 1e-9).x.tolist()
     [2.0, 0.0, 0.0]
     """
+    end, result = _end(scene, state, t, rtol, atol)
+    return result.error_if(end, result != dfx.RESULTS.successful)
+
+
+@eqx.filter_jit
+def attempt(scene: AbstractScene, state: Point, t: ScalarLike, rtol: float, atol: float) -> Point:
+    """As `flow`, but NaN where the solve fails: for starts that Newton's method only tries.
+
+    >>> from rigidjax.frames import scenes
+    >>> attempt(scenes.turntable(0.0), Point([0.0, 0, 0], [1.0, 0, 0]), 2.0, 1e-9, 1e-9).x.tolist()
+    [2.0, 0.0, 0.0]
+    """
+    end, result = _end(scene, state, t, rtol, atol)
+    good = result == dfx.RESULTS.successful
+    return jax.tree.map(lambda leaf: jnp.where(good, leaf, jnp.full_like(leaf, jnp.nan)), end)
+
+
+def _end(
+    scene: AbstractScene, state: Point, t: ScalarLike, rtol: float, atol: float
+) -> tuple[Point, dfx.RESULTS]:
     t = _checks.floating(t, (), "t").astype(state.x.dtype)
     out = dfx.diffeqsolve(
         dfx.ODETerm(scene.field),
@@ -33,8 +53,9 @@ def flow(scene: AbstractScene, state: Point, t: ScalarLike, rtol: float, atol: f
         stepsize_controller=dfx.PIDController(rtol=rtol, atol=atol),
         adjoint=dfx.ForwardMode(),
         max_steps=100_000,
+        throw=False,
     )
-    return jax.tree.map(lambda leaf: leaf[0], out.ys)
+    return jax.tree.map(lambda leaf: leaf[0], out.ys), out.result
 
 
 def transition(
@@ -47,6 +68,9 @@ def transition(
     >>> float(transition(scenes.turntable(0.0), start, 2.0, rtol=1e-9, atol=1e-9)[0, 3])
     2.0
     """
+    if not isinstance(state, Point):
+        raise TypeError(f"state: wanted a Point(x, v), got {type(state).__name__}")
+    t = _checks.finite(_checks.floating(t, (), "t"), "t")
     return _transition(scene, jnp.concatenate([state.x, state.v]), t, rtol, atol)
 
 

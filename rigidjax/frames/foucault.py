@@ -125,5 +125,7 @@ def foucault(
     """
     place = Earth(*checked(latitude, gravity, rate))
     string = _checks.floating(length, (), "length")
-    string = _checks.refuse(string, ~(string > 0), "length: wanted a positive number, m")
+    string = _checks.refuse(
+        string, ~((string > 0) & jnp.isfinite(string)), "length: wanted a positive number, m"
+    )
     return Foucault(place, string.astype(jnp.promote_types(string.dtype, place.rate.dtype)))

@@ -5,14 +5,13 @@ from jaxtyping import Array, Float
 
 from rigidjax import _checks
 from rigidjax._types import Scalar, ScalarLike, Vec3
-from rigidjax.frames import flow, periodic
-from rigidjax.frames.periodic import PeriodicOrbit
+from rigidjax.frames import flow
+from rigidjax.frames.mirrored import AbstractMirrored
 from rigidjax.frames.point import Point
-from rigidjax.frames.scene import AbstractScene
 from rigidjax.rotation.algebra import components
 
 
-class Hill(AbstractScene):
+class Hill(AbstractMirrored):
     """A particle near a small body that circles a large one: make one with `scenes.hill()`.
 
     Rotating axes centred on the small body, x away from the large one. Units: μ^{1/3} of the
@@ -53,12 +52,6 @@ class Hill(AbstractScene):
         """L1 and L2 (2, 3), at x = ∓3^{−1/3}."""
         place = jnp.zeros(3, self.radius.dtype).at[0].set(3.0 ** (-1 / 3))
         return jnp.stack([-place, place])
-
-    def periodic_orbit(
-        self, guess: PeriodicOrbit, *, hold: str = "x", tolerance: float | None = None
-    ) -> PeriodicOrbit:
-        """The symmetric periodic orbit near `guess`: as `ThreeBody.periodic_orbit`."""
-        return periodic.correct(self, guess, hold, tolerance)
 
 
 def hill(radius: ScalarLike = 0.0) -> Hill:

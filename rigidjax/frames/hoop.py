@@ -84,7 +84,7 @@ def hoop(radius: ScalarLike, rate: ScalarLike, gravity: ScalarLike = GRAVITY) ->
     [0.0, 0.0, 0.0]
     """
     named = {"radius": radius, "rate": rate, "gravity": gravity}
-    values = {name: _checks.floating(value, (), name) for name, value in named.items()}
+    values = {n: _checks.finite(_checks.floating(v, (), n), n) for n, v in named.items()}
     dtype = jnp.result_type(*values.values())
     r, w, g = (value.astype(dtype) for value in values.values())
     return Hoop(_checks.refuse(r, ~(r > 0), "radius: wanted a positive number, m"), w, g)
@@ -110,6 +110,7 @@ def turntable(rate: ScalarLike, growth: ScalarLike = 0.0) -> InFrame:
     >>> turntable(2.0).acceleration(0.0, Point([1.0, 0, 0], [0.0, 0, 0])).tolist()
     [4.0, 0.0, 0.0]
     """
-    rate, growth = _checks.floating(rate, (), "rate"), _checks.floating(growth, (), "growth")
+    rate = _checks.finite(_checks.floating(rate, (), "rate"), "rate")
+    growth = _checks.finite(_checks.floating(growth, (), "growth"), "growth")
     axis = jnp.stack([jnp.zeros_like(rate), jnp.zeros_like(rate), jnp.ones_like(rate)])
     return InFrame(MovingFrame(AboutAxis(axis, _Angle(rate, growth))))

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from rigidjax import _checks
 from rigidjax._types import HasAttitude, Scalar, ScalarLike, Vec3
 from rigidjax.body import inertia as _inertia
-from rigidjax.frames.moving import MovingFrame
+from rigidjax.frames.moving import MovingFrame, require_frame
 from rigidjax.frames.scene import AbstractScene, Force, per_mass
 from rigidjax.frames.turning import Uniform
 from rigidjax.rotation import algebra, quaternion
@@ -38,6 +38,9 @@ class InFrame(AbstractScene):
     inside: Callable[..., Any] | None = None
     outside: Callable[..., Any] | None = None
     potential: Callable[..., Any] | None = None
+
+    def __check_init__(self) -> None:
+        require_frame(self.frame, "InFrame")
 
     def acceleration(self, t: ScalarLike, state: Any) -> Vec3:
         now = self.frame.at(t)
@@ -80,17 +83,31 @@ def scene_of(force: Any) -> AbstractScene:
     )
 
 
-class BodyInFrame(eqx.Module):
-    """The torque that makes Euler's equations right inside a moving frame.
+class Push(eqx.Module):
+    """A force on the centre of mass, N, axes of S', and a torque about it, N m, body axes, (3,)."""
 
-    Give it to `simulate` as the torque of an `Attitude` state that S' sees: q' body → S', and Ω'
-    the rate relative to S', both as ever in body axes. With W = Q'ᵀ Ω the frame's rate in body
-    axes, Ω' = Ω_abs − W, and from I dΩ_abs/dt = IΩ_abs × Ω_abs + τ follows
+    force: Vec3
+    torque: Vec3
+
+
+class BodyInFrame(eqx.Module):
+    """The torque, and for `Rigid` the force, that make a body's equations right in a moving frame.
+
+    Give it to `simulate` as the torque of an `Attitude` or `Rigid` state that S' sees: q' body →
+    S', and Ω' the rate relative to S', as ever in body axes; x', v' of the centre of mass.
+
+    With W = Q'ᵀ Ω the frame's rate in body axes, Ω' = Ω_abs − W, and from I dΩ_abs/dt =
+    IΩ_abs × Ω_abs + τ follows
 
     I dΩ'/dt = IΩ' × Ω' + [τ + IΩ_abs × Ω_abs − IΩ' × Ω' − I(Q'ᵀ dΩ/dt − Ω' × W)].
 
+    and the centre of mass moves as a `Point` does (eq 91).
+
     **Arguments:** `frame` the `MovingFrame` S'; `torque` the real τ, `(t, state in S', body) →
-    (3,)`, N m, body axes, or `None`. Source: notes, eqs 50, 91, for a body instead of a point.
+    (3,)`, N m, body axes, or a law that gives a `Wrench`, its force in the axes of S'; or `None`.
+
+    Source: notes, eqs 50, 91, for a body instead of a point. **Raises:** `TypeError` for a force on
+    a state that only turns.
 
     >>> import rigidjax as rj
     >>> frame = MovingFrame(rj.frames.Uniform([0.0, 0.0, 1.0]))
@@ -103,17 +120,31 @@ class BodyInFrame(eqx.Module):
     frame: MovingFrame
     torque: Callable[..., Any] | None = None
 
-    def __call__(self, t: ScalarLike, state: Any, body: Any) -> Vec3:
+    def __check_init__(self) -> None:
+        require_frame(self.frame, "BodyInFrame")
+
+    def __call__(self, t: ScalarLike, state: Any, body: Any) -> Vec3 | Push:
         now = self.frame.at(t)
-        tensor, omega = body.tensor, state.omega
+        # `MassProperties` hold an inertia, about the centre of mass.
+        tensor, omega = getattr(body, "inertia", body).tensor, state.omega
         carried = quaternion.rotate_inverse(state.q, now.rate.astype(omega.dtype))
         change = quaternion.rotate_inverse(state.q, now.rate_change.astype(omega.dtype))
         total = omega + carried
         gyroscopic = algebra.cross(_inertia.apply(tensor, total), total)
         relative = algebra.cross(_inertia.apply(tensor, omega), omega)
         needed = _inertia.apply(tensor, change - algebra.cross(omega, carried))
-        fictitious = gyroscopic - relative - needed
-        if self.torque is None:
-            return fictitious
-        real = _checks.floating(self.torque(t, state, body), (3,), "torque", hint="body-frame N m")
-        return real.astype(omega.dtype) + fictitious
+        torque = gyroscopic - relative - needed
+        moves = hasattr(state, "x")
+        force = body.mass.astype(omega.dtype) * now.fictitious(state.x, state.v) if moves else None
+        if self.torque is not None:
+            real = self.torque(t, state, body)
+            if hasattr(real, "force"):
+                if force is None:
+                    raise TypeError(
+                        f"BodyInFrame: {type(self.torque).__name__} gives a force, got a state "
+                        f"{type(state).__name__} that only turns; a force needs a Rigid state"
+                    )
+                force, real = force + real.force.astype(omega.dtype), real.torque
+            real = _checks.floating(real, (3,), "torque", hint="body-frame N m")
+            torque = torque + real.astype(omega.dtype)
+        return torque if force is None else Push(force, torque)

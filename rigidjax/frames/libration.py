@@ -54,7 +54,7 @@ def libration(rate: ScalarLike) -> BodyInFrame:
     >>> libration(0.001)(0.0, at_rest, body).tolist()
     [0.0, 0.0, 0.0]
     """
-    n = _checks.floating(rate, (), "rate")
+    n = _checks.finite(_checks.floating(rate, (), "rate"), "rate")
     normal = jnp.stack([jnp.zeros_like(n), jnp.zeros_like(n), n])
     return BodyInFrame(MovingFrame(Uniform(normal)), Tide(n))
 

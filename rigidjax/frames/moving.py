@@ -24,7 +24,8 @@ class MovingFrame(eqx.Module):
 
     - `rotation`: a function of time, s, to M (3, 3) or to its unit quaternion (4,), S' → S; or
       what gives a state with `q` and `omega`, such as a solution of `simulate` (its `evaluate` is
-      called) or a `FreeBody`: then the frame rides on the body. A Module (`frames.Uniform`) does
+      called) or a `FreeBody`: then the frame rides on the body, and derivatives through a solved
+      motion are in forward mode only. A Module (`frames.Uniform`) does
       not compile again for other numbers, a fresh `lambda` does.
     - `origin`: a function of time to X (3,), m, axes of S; `None` where the origins coincide.
     - `rate`: Ω (3,), rad/s, **axes of S'**, as a function of time, where it is known; else it is
@@ -60,7 +61,9 @@ class MovingFrame(eqx.Module):
                 f"origin: wanted a function of time to (3,), got {type(origin).__name__}; "
                 "for one at rest pass lambda t: point"
             )
-        self.rotation, self.origin = rotation, origin
+        if rate is not None and not callable(rate):
+            raise TypeError(f"rate: wanted a function of time to (3,), got {type(rate).__name__}")
+        self.rotation, self.origin = turning.differentiable(rotation), origin
         self.rate = getattr(rotation, "rate", None) if rate is None else rate
 
     def matrix(self, t: ScalarLike) -> Mat3:
@@ -207,6 +210,7 @@ class MovingFrame(eqx.Module):
         >>> half.then(half).at(0.0).rate.tolist()
         [0.0, 0.0, 2.0]
         """
+        require_frame(inner, "then")
         return MovingFrame(_ComposedRotation(self, inner), _ComposedOrigin(self, inner))
 
     def inverse(self) -> "MovingFrame":
@@ -217,6 +221,18 @@ class MovingFrame(eqx.Module):
         """X(t) (3,), m, axes of S."""
         t = _checks.floating(t, (), "t")
         return jnp.zeros(3, t.dtype) if self.origin is None else _Place(self.origin)(t)
+
+
+def require_frame(frame: Any, name: str) -> None:
+    """Raise `TypeError` unless `frame` is a `MovingFrame`.
+
+    >>> require_frame(MovingFrame(turning.Uniform([0.0, 0.0, 1.0])), "frame")
+    """
+    if not isinstance(frame, MovingFrame):
+        raise TypeError(
+            f"{name}: wanted a MovingFrame, got {type(frame).__name__}; make one from a rotation "
+            "with MovingFrame(rotation)"
+        )
 
 
 class _Place(eqx.Module):

@@ -11,12 +11,13 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from rigidjax import _checks
-from rigidjax._types import ScalarLike
-from rigidjax.frames.flow import flow
+from rigidjax._types import Scalar, ScalarLike
+from rigidjax.frames.flow import attempt
 from rigidjax.frames.point import Point
+from rigidjax.rotation.algebra import components
 
 _NAMES = ("x", "z", "vy", "period")
-_MAX_STEPS = 25
+MAX_STEPS = 25
 
 
 class PeriodicOrbit(eqx.Module):
@@ -32,6 +33,8 @@ class PeriodicOrbit(eqx.Module):
     period: Float[Array, "*batch"]
 
     def __init__(self, state: Point, period: ScalarLike):
+        if not isinstance(state, Point):
+            raise TypeError(f"state: wanted a Point(x, v), got {type(state).__name__}")
         self.state = state
         period = _checks.floating(period, (), "period", batched=True)
         self.period = period.astype(state.x.dtype)
@@ -50,25 +53,10 @@ def correct(
     >>> round(float(orbit.period), 3)
     1.404
     """
-    if hold not in _NAMES:
-        raise ValueError(f"hold: wanted one of {', '.join(_NAMES)}, got {hold!r}")
-    if not isinstance(guess, PeriodicOrbit):
-        raise TypeError(
-            f"guess: wanted a PeriodicOrbit(state, period), got {type(guess).__name__}; "
-            "lyapunov_guess and halo_guess make one"
-        )
-    x, v = guess.state.x, guess.state.v
-    slant = jnp.maximum(jnp.abs(x[1]), jnp.maximum(jnp.abs(v[0]), jnp.abs(v[2])))
-    x = _checks.refuse(
-        x,
-        slant > 1e-6,
-        "guess: wanted a start that crosses y = 0 at a right angle: y = vx = vz = 0",
-    )
-    numbers = jnp.stack([x[0], x[2], v[1], 0.5 * guess.period])
-    index = _NAMES.index(hold)
+    numbers, index = crossing(guess), named(hold)
     free = np.array([i for i in range(4) if i != index])
     if tolerance is None:
-        tolerance = 1e-12 if numbers.dtype == jnp.float64 else 1e-4
+        tolerance = usual_tolerance(numbers)
     unknown, left = _solve(scene, numbers[free], numbers[index], index, tolerance)
     bad = ~(left <= tolerance)
     said = f" ({float(left):.1e} left at half period)" if _checks.known(left) else ""
@@ -78,76 +66,153 @@ def correct(
         f"periodic_orbit: Newton's method found no orbit near the guess{said}; start nearer, "
         "hold another of x, z, vy, period, or loosen the tolerance",
     )
-    x0, z0, vy, half = _together(unknown, numbers[index], index)
+    found = together(unknown, numbers[index], index)
     # A half period of zero solves the equations of every start.
-    ratio = half / numbers[3]
-    half = _checks.refuse(
-        half,
+    ratio = found[3] / numbers[3]
+    found = _checks.refuse(
+        found,
         ~((ratio > 0.5) & (ratio < 2)),
         "periodic_orbit: Newton's method slid from the guess to an orbit of less than half or more "
         "than twice its period; start nearer",
     )
-    zero = jnp.zeros_like(x0)
-    return PeriodicOrbit(Point(jnp.stack([x0, zero, z0]), jnp.stack([zero, vy, zero])), 2 * half)
+    return orbit_of(found)
 
 
-def _together(unknown: Array, held: Array, index: int) -> list[Array]:
+def named(hold: str) -> int:
+    """Which of the four numbers of a crossing `hold` names.
+
+    >>> named("vy")
+    2
+    """
+    if hold not in _NAMES:
+        raise ValueError(f"hold: wanted one of {', '.join(_NAMES)}, got {hold!r}")
+    return _NAMES.index(hold)
+
+
+def crossing(guess: PeriodicOrbit) -> Float[Array, "4"]:
+    """The four numbers of an orbit that crosses y = 0 at a right angle: x, z, v_y, T/2.
+
+    >>> crossing(PeriodicOrbit(Point([0.9, 0, 0.1], [0.0, -0.5, 0]), 3.0)).tolist()
+    [0.9, 0.1, -0.5, 1.5]
+    """
+    if not isinstance(guess, PeriodicOrbit):
+        raise TypeError(
+            f"guess: wanted a PeriodicOrbit(state, period), got {type(guess).__name__}; "
+            "lyapunov_guess and halo_guess make one"
+        )
+    x, v = guess.state.x, guess.state.v
+    if x.ndim != 1:
+        raise ValueError(f"guess: wanted one orbit, x of shape (3,), got {x.shape}; use jax.vmap")
+    slant = jnp.maximum(jnp.abs(x[1]), jnp.maximum(jnp.abs(v[0]), jnp.abs(v[2])))
+    x = _checks.refuse(
+        x,
+        slant > 1e-6,
+        "guess: wanted a start that crosses y = 0 at a right angle: y = vx = vz = 0",
+    )
+    period = _checks.refuse(
+        guess.period, ~(guess.period > 0), "guess: wanted a period that is positive"
+    )
+    return _checks.finite(jnp.stack([x[0], x[2], v[1], 0.5 * period]), "guess")
+
+
+def orbit_of(numbers: Float[Array, "4"]) -> PeriodicOrbit:
+    """The inverse of `crossing`.
+
+    >>> orbit_of(jnp.array([0.9, 0.1, -0.5, 1.5])).state.v.tolist()
+    [0.0, -0.5, 0.0]
+    """
+    x, z, vy, half = components(numbers)
+    zero = jnp.zeros_like(x)
+    return PeriodicOrbit(Point(jnp.stack([x, zero, z]), jnp.stack([zero, vy, zero])), 2 * half)
+
+
+def together(unknown: Float[Array, "3"], held: Scalar, index: int) -> Float[Array, "4"]:
+    """The four numbers of a crossing, the held one put in its place among the others.
+
+    >>> together(jnp.array([1.0, 2.0, 3.0]), jnp.asarray(9.0), 1).tolist()
+    [1.0, 9.0, 2.0, 3.0]
+    """
     parts = [unknown[0], unknown[1], unknown[2]]
     parts.insert(index, held)
-    return parts
+    return jnp.stack(parts)
 
 
-def _miss(scene: Any, unknown: Array, held: Array, index: int) -> Array:
-    """y, vx and vz at the half period."""
-    x0, z0, vy, half = _together(unknown, held, index)
-    zero = jnp.zeros_like(x0)
-    start = Point(jnp.stack([x0, zero, z0]), jnp.stack([zero, vy, zero]))
-    tight = float(jnp.finfo(x0.dtype).eps)
-    end = flow(scene, start, half, 200 * tight, 10 * tight)
+def usual_tolerance(numbers: Array) -> float:
+    """What is left of y, v_x, v_z at the half period: 1e-12, in float32 1e-4.
+
+    >>> usual_tolerance(jnp.zeros(4))
+    1e-12
+    """
+    return 1e-12 if numbers.dtype == jnp.float64 else 1e-4
+
+
+def miss(scene: Any, numbers: Float[Array, "4"]) -> Float[Array, "3"]:
+    """y, v_x and v_z at the half period: what makes an orbit periodic where they vanish.
+
+    >>> from rigidjax.frames import scenes
+    >>> miss(scenes.hill(), jnp.array([3.0 ** (-1 / 3), 0.0, 0.0, 0.0])).tolist()
+    [0.0, 0.0, 0.0]
+    """
+    orbit = orbit_of(numbers)
+    tight = float(jnp.finfo(numbers.dtype).eps)
+    end = attempt(scene, orbit.state, 0.5 * orbit.period, 200 * tight, 10 * tight)
     return jnp.stack([end.x[1], end.v[0], end.v[2]])
+
+
+def value_and_jacobian(f: Any, x: Array) -> tuple[Array, Array]:
+    """f(x) and its Jacobian from one pass in forward mode.
+
+    >>> value_and_jacobian(lambda x: x**2, jnp.array([3.0]))[1].tolist()
+    [[6.0]]
+    """
+    value, columns = jax.vmap(lambda e: jax.jvp(f, (x,), (e,)), out_axes=(None, 1))(
+        jnp.eye(x.shape[0], dtype=x.dtype)
+    )
+    return value, columns
 
 
 # Newton itself is not differentiated: the rule below is linear in the tangents, so that the same
 # one serves jacfwd and grad although the solves within run in forward mode.
 @eqx.filter_jit
 def _solve(scene: Any, unknown: Array, held: Array, index: int, tolerance: float) -> Any:
-    return _corrected(index, float(tolerance), scene, unknown, held)
+    return corrected(index, float(tolerance), scene, unknown, held)
 
 
 @eqx.filter_custom_jvp
-def _corrected(index: int, tolerance: float, scene: Any, unknown: Array, held: Array) -> Any:
+def corrected(index: int, tolerance: float, scene: Any, unknown: Array, held: Array) -> Any:
     def keep_on(carry: Any) -> Any:
         _, left, count = carry
-        return (left > 0.1 * tolerance) & (count < _MAX_STEPS)
+        return (left > 0.1 * tolerance) & (count < MAX_STEPS)
 
     def step(carry: Any) -> Any:
         unknown, _, count = carry
-        missed, slope = _value_and_jacobian(lambda u: _miss(scene, u, held, index), unknown)
+        missed, slope = value_and_jacobian(lambda u: miss(scene, together(u, held, index)), unknown)
         moved = unknown - jnp.linalg.solve(slope, missed)
         # The miss before the last move says how good the last start was; stop once it is small.
         return jnp.where(jnp.isfinite(moved), moved, unknown), jnp.max(jnp.abs(missed)), count + 1
 
     carry = unknown, jnp.full_like(held, jnp.inf), 0
     unknown, _, _ = lax.while_loop(keep_on, step, carry)
-    return unknown, jnp.max(jnp.abs(_miss(scene, unknown, held, index)))
+    return unknown, jnp.max(jnp.abs(miss(scene, together(unknown, held, index))))
 
 
-@_corrected.def_jvp
+@corrected.def_jvp
 def _corrected_jvp(primals: Any, tangents: Any) -> Any:
     index, tolerance, scene, unknown, held = primals
     _, _, scene_dot, _, held_dot = tangents
-    found, left = _corrected(index, tolerance, scene, unknown, held)
+    found, left = corrected(index, tolerance, scene, unknown, held)
     # All derivatives of the miss as one matrix, so that the rule stays linear in the tangents and
     # can be transposed.
     numbers, rest = eqx.partition(scene, eqx.is_inexact_array)
     leaves, tree = jax.tree.flatten(numbers)
     flat, unflatten = ravel_pytree((leaves, held, found))
 
-    def miss(flat: Array) -> Array:
+    def missed(flat: Array) -> Array:
         leaves, held, unknown = unflatten(flat)
-        return _miss(eqx.combine(jax.tree.unflatten(tree, leaves), rest), unknown, held, index)
+        whole = eqx.combine(jax.tree.unflatten(tree, leaves), rest)
+        return miss(whole, together(unknown, held, index))
 
-    matrix = jax.jacfwd(miss)(flat)
+    matrix = jax.jacfwd(missed)(flat)
     dots = [
         jnp.zeros_like(leaf) if dot is None else dot
         for leaf, dot in zip(leaves, _tangents(numbers, scene_dot), strict=True)
@@ -163,11 +228,3 @@ def _tangents(numbers: Any, dots: Any) -> list[Any]:
     """The tangents that belong to the leaves of `numbers`; `None` where there is none."""
     paths = {path: leaf for path, leaf in jax.tree.leaves_with_path(dots) if leaf is not None}
     return [paths.get(path) for path, _ in jax.tree.leaves_with_path(numbers)]
-
-
-def _value_and_jacobian(f: Any, x: Array) -> tuple[Array, Array]:
-    """f(x) and its Jacobian from one pass in forward mode."""
-    value, columns = jax.vmap(lambda e: jax.jvp(f, (x,), (e,)), out_axes=(None, 1))(
-        jnp.eye(x.shape[0], dtype=x.dtype)
-    )
-    return value, columns

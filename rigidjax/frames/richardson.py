@@ -60,9 +60,9 @@ def guess(
     s2 = 1.5 * c3 * (2 * a22 * (k2 - 2) + a24 * (k2 + 2) + 2 * k * b22 + 5 * d21)
     s2 = (s2 + 0.375 * c4 * (12 - k2)) / below
     if along_z is None:
-        ax, az = _checks.floating(along_x, (), "amplitude") / unit, jnp.zeros_like(unit)
+        ax, az = _amplitude(along_x) / unit, jnp.zeros_like(unit)
     else:
-        az = _checks.floating(along_z, (), "amplitude") / unit
+        az = _amplitude(along_z) / unit
         a1 = -1.5 * c3 * (2 * a21 + a23 + 5 * d21) - 0.375 * c4 * (12 - k2)
         a2 = 1.5 * c3 * (a24 - 2 * a22) + 1.125 * c4
         square = -((a2 + 2 * w2 * s2) * az * az + w2 - c2) / (a1 + 2 * w2 * s1)
@@ -80,6 +80,10 @@ def guess(
     return PeriodicOrbit(
         Point(place, jnp.stack([zero, unit * sweep * y_rate, zero])), 2 * math.pi / sweep
     )
+
+
+def _amplitude(value: ScalarLike | None) -> Scalar:
+    return _checks.finite(_checks.floating(value, (), "amplitude"), "amplitude")
 
 
 def _legendre(mu: Scalar, unit: Scalar, point: int, n: int) -> Scalar:

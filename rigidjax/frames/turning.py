@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
+import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -25,7 +26,7 @@ class Uniform(eqx.Module):
     omega: Float[Array, "3"]
 
     def __init__(self, omega: Float[Array, "3"] | object):
-        self.omega = _checks.floating(omega, (3,), "omega")
+        self.omega = _checks.finite(_checks.floating(omega, (3,), "omega"), "omega")
 
     def __call__(self, t: Any) -> Mat3:
         t = _checks.floating(t, (), "t")
@@ -49,7 +50,12 @@ class AboutAxis(eqx.Module):
     angle: Callable[[Any], Any]
 
     def __init__(self, axis: Float[Array, "3"] | object, angle: Callable[[Any], Any]):
-        axis = _checks.floating(axis, (3,), "axis")
+        axis = _checks.finite(_checks.floating(axis, (3,), "axis"), "axis")
+        if not callable(angle):
+            raise TypeError(
+                f"angle: wanted a function of time to rad, got {type(angle).__name__}; for a "
+                "uniform turn take frames.Uniform(omega)"
+            )
         length = jnp.sqrt(algebra.dot(axis, axis))
         self.axis = _checks.refuse(axis, length == 0, "axis: wanted a direction, got zero") / length
         self.angle = angle
@@ -65,6 +71,21 @@ class AboutAxis(eqx.Module):
         return speed * self.axis.astype(t.dtype)
 
 
+def differentiable(rotation: Any) -> Any:
+    """`rotation`; the solves that it does itself made ready for forward differentiation.
+
+    A frame needs dΩ/dt, and the default adjoint of a solution of `simulate` refuses that.
+
+    >>> differentiable({"adjoint": dfx.RecursiveCheckpointAdjoint()})["adjoint"]
+    ForwardMode()
+    """
+
+    def reverse(part: Any) -> bool:
+        return isinstance(part, dfx.RecursiveCheckpointAdjoint)
+
+    return jax.tree.map(lambda p: dfx.ForwardMode() if reverse(p) else p, rotation, is_leaf=reverse)
+
+
 def state_of(rotation: Any, t: Array) -> Any:
     """What `rotation` gives at `t`: a matrix, a quaternion, or a state with `q` and `omega`."""
     return rotation.evaluate(t) if hasattr(rotation, "evaluate") else rotation(t)
@@ -77,6 +98,9 @@ def matrix(rotation: Any, t: Array) -> Mat3:
     shape = jnp.shape(value)
     if shape == (4,):
         q = _checks.floating(value, (4,), "rotation").astype(t.dtype)
+        if _checks.known(q):
+            far = ~(jnp.abs(jnp.sqrt(jnp.sum(q * q)) - 1) < 1e-3)
+            _checks.refuse(q, far, "rotation: wanted a unit quaternion (w, x, y, z)")
         return quaternion.to_matrix(quaternion.normalise(q))
     m = _checks.floating(value, (3, 3), "rotation", hint="wanted a matrix or a quaternion (4,)")
     if _checks.known(m):

@@ -42,6 +42,9 @@ class AttitudeEquations(eqx.Module):
 
     **Arguments:** as for `EulerEquations`. A field for `diffrax.ODETerm`; `args` is not used.
 
+    The state holds Ω, not Π = IΩ: two heavy tops at tolerances 1e-6, 1e-9, 1e-12 took the same
+    number of steps with either to 3 % (diffrax.Dopri8), and ended equally far off to a third.
+
     Source: `dM/dt = M J'` (notes, eq 50), written for the quaternion of M.
 
     >>> import rigidjax as rj

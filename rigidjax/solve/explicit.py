@@ -121,16 +121,34 @@ class DormandPrince8(AbstractExplicit):
 
 
 def advance(
-    tableau: Tableau, field: Callable[[Any, Atoms], Atoms], t: Any, h: Any, y: Atoms
-) -> tuple[Atoms, list[Atoms]]:
-    """One step from `y`, not projected, and the slopes at its stages.
+    tableau: Tableau,
+    field: Callable[[Any, Atoms], Atoms],
+    t: Any,
+    h: Any,
+    y: Atoms,
+    end: Any = None,
+) -> tuple[Atoms, list[Atoms], list[Atoms]]:
+    """One step from `y`, not projected; the slopes at its stages, and the states there.
 
-    **Arguments:** `field(t, y)` on tuples of arrays, which `y` is; `t`, `h` scalars.
+    **Arguments:** `field(t, y)` on tuples of arrays, which `y` is; `t`, `h` scalars; `end` the time
+    of the stages at the end of the step, where it is not to be `t + h` rounded.
     """
-    slopes = [field(t, y)]
+    end = t + h if end is None else end
+    places, slopes = [y], [_fence(field(t, y))]
     for node, row in zip(tableau.c, tableau.a, strict=True):
-        slopes.append(field(t + node * h, _along(y, h, row, slopes)))
-    return _along(y, h, tableau.b, slopes), slopes
+        place = _fence(_along(y, h, row, slopes))
+        places.append(place)
+        slopes.append(_fence(field(end if node == 1 else t + node * h, place)))
+    return _along(y, h, tableau.b, slopes), slopes, places
+
+
+def _fence(numbers: Atoms) -> Atoms:
+    """The same numbers, not to be computed again in each place that reads them.
+
+    Without it XLA makes of each result of a step one kernel, which repeats all stages before it. On
+    one trajectory LLVM finds the copies; in a batch, or beside tangents, it cannot.
+    """
+    return lax.optimization_barrier(numbers)
 
 
 def error_estimate(tableau: Tableau, h: Any, slopes: Sequence[Atoms], like: Any) -> Atoms:
@@ -166,7 +184,7 @@ def _diffrax_step(
 
     h = terms.contr(t0, t1)
     start = split(y0)
-    end, slopes = advance(tableau, field, t0, h, start)
+    end, slopes, _ = advance(tableau, field, t0, h, start)
     # Once, after the stages: inside them it changes the order (jaxsim#192).
     end = split(on_the_group(join(end, y0)))
     rows, slopes = _dense_rows(tableau, field, t0, t1, h, start, end, slopes)

@@ -1,28 +1,28 @@
 """The same steps in the leanest loop: nothing carried but a time, a step and the state's numbers.
 
 `diffrax.diffeqsolve` can do more, and pays for it at each step. Here the loop's state is a tuple of
-scalars, a few hundred bytes, so that XLA on CPU compiles the whole loop as one kernel. Saved times
-are stepped on exactly: no interpolation, the error is the method's own.
+scalars, a few hundred bytes, so that XLA on CPU compiles the whole loop as one kernel. There is no
+interpolation: at saved times, too, the error is the method's own.
 """
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import diffrax as dfx
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
 from rigidjax.motion import Attitude, AttitudeEquations, on_the_group
-from rigidjax.solve import splitting
+from rigidjax.solve import splitting, travel
 from rigidjax.solve.components import join, split
 from rigidjax.solve.explicit import AbstractExplicit, Atoms, advance, error_estimate
+from rigidjax.solve.method import flat, method_of, unflat
 from rigidjax.solve.scalarise import scalarise
 from rigidjax.solve.splitting import AbstractSplitting
-
-# What diffrax.PIDController does unless told: the same steps, so that figures can be compared.
-_SAFETY, _SMALLEST, _LARGEST = 0.9, 0.2, 10.0
+from rigidjax.solve.watched import NONFINITE
 
 
 class LeanSolution(NamedTuple):
@@ -36,16 +36,6 @@ class LeanSolution(NamedTuple):
     num_steps: Array
     num_rejected: Array
     result: dfx.RESULTS
-
-
-class _Span(NamedTuple):
-    """The loop's state between two saved times."""
-
-    t: Array
-    h: Array
-    y: Atoms
-    steps: Array
-    rejected: Array
 
 
 def fixed(
@@ -93,60 +83,57 @@ def adaptive(
     atol: Any,
     dt0: Any = None,
     max_steps: int = 100_000,
+    jumps: Array | None = None,
+    way: Callable[..., travel.Answer] = travel.forward,
 ) -> LeanSolution:
-    """Steps as long as the tolerances allow, exactly onto each time of `ts`.
+    """Steps as long as the tolerances allow, whatever the times that are asked for.
 
     The norm, the control of the step (integral, safety 0.9) and the first step are those of
-    `diffrax.PIDController`. Forward mode only: a loop of unknown length has no transpose.
+    `diffrax.PIDController`. How states between steps and derivatives come about: `solve/travel.py`.
 
-    **Arguments:** as for `fixed`; `rtol`, `atol` scalars; `dt0` the first step, s, or `None`.
-    **Returns** a `LeanSolution`. A run that needs more than `max_steps`, or meets a NaN, ends
-    early: its `result` says so, and the states not reached are NaN.
+    **Arguments:** as for `fixed`, a state of arrays of at most 32 numbers; `rtol`, `atol` scalars;
+    `dt0` the first step, s, or `None`; `jumps` times, s, in any order, at which the field jumps:
+    steps end there; `way` `travel.forward` (forward mode) or `travel.reverse` (`jax.grad`), which
+    takes memory as the root of `max_steps`. Derivatives are by all numbers of the field, `ts`,
+    `jumps` and `y0`, lengths of steps held; not by tolerances.
+
+    **Returns** a `LeanSolution`. A run that needs more than `max_steps`, or meets a NaN that no
+    shorter step avoids, ends early: its `result` says so, and the states not reached are NaN.
+
+    **Raises:** `TypeError` for a state of several dtypes or of long arrays.
     """
-    step = _stepper(solver, field, ts[0], y0)
-    start = split(y0)
+    method, constants = method_of(solver, field, ts[0], y0)
     order = solver.order(None)
-    h0 = _first_step(field, order, ts[0], y0, rtol, atol) if dt0 is None else dt0
-    h0 = jnp.asarray(lax.stop_gradient(h0), ts.dtype)
-
-    def span(state: _Span, right: Array) -> tuple[_Span, Atoms]:
-        def go_on(s: _Span) -> Array:
-            return (s.t < right) & (s.steps < max_steps) & (s.h > 0)
-
-        def one(s: _Span) -> _Span:
-            left = right - s.t
-            # The step kept is the controller's own, not the one cut short at a saved time.
-            last = s.h >= left
-            h = jnp.where(last, left, s.h)
-            y, error = step(s.t, h, s.y)
-            size = _size(error, s.y, y, rtol, atol)
-            accept = size < 1
-            factor = jnp.clip(_SAFETY * size ** (-1 / order), _SMALLEST, _LARGEST)
-            # A NaN anywhere makes the step NaN, which ends the loop.
-            following = lax.stop_gradient(h * factor.astype(h.dtype))
-            following = jnp.where(last & accept, jnp.maximum(following, s.h), following)
-            following = jnp.where(s.t + following > s.t, following, jnp.zeros_like(following))
-            return _Span(
-                jnp.where(accept, jnp.where(last, right, s.t + h), s.t),
-                following,
-                tuple(jnp.where(accept, b, a) for a, b in zip(s.y, y, strict=True)),
-                s.steps + 1,
-                s.rejected + jnp.where(accept, 0, 1),
-            )
-
-        state = lax.while_loop(go_on, one, state)
-        reached = state.t >= right
-        return state, tuple(jnp.where(reached, a, jnp.full_like(a, jnp.nan)) for a in state.y)
-
-    zero = jnp.zeros((), jnp.int32)
-    begin = _Span(ts[0], h0, start, zero, zero)
-    end, rest = lax.scan(span, begin, ts[1:])
-    result = dfx.RESULTS.where(
-        end.t >= ts[-1],
-        dfx.RESULTS.successful,
-        dfx.RESULTS.where(end.h > 0, dfx.RESULTS.max_steps_reached, dfx.RESULTS.dt_min_reached),
+    h0, sound = _first_step(field, order, ts[0], y0, rtol, atol)
+    # Where there is no slope to begin with, no step is short enough.
+    h0 = jnp.where(sound, h0 if dt0 is None else jnp.asarray(dt0, h0.dtype), jnp.nan)
+    smooth = [jnp.issubdtype(constant.dtype, jnp.inexact) for constant in constants]
+    chosen, rest = eqx.partition(constants, smooth)
+    chosen = jax.tree.map(jnp.asarray, chosen)
+    stops = ts[-1:]
+    if jumps is not None and jumps.size:
+        inside = jnp.clip(jnp.sort(jumps.astype(ts.dtype)), ts[0], ts[-1])
+        stops = jnp.concatenate([inside, stops])
+    given = travel.Given(chosen, ts[0], stops, ts[1:-1], flat(y0))
+    fixed = travel.Fixed(
+        rest,
+        lax.stop_gradient(jnp.asarray(h0, ts.dtype)),
+        lax.stop_gradient(jnp.asarray(rtol, given.y0.dtype)),
+        lax.stop_gradient(jnp.asarray(atol, given.y0.dtype)),
     )
-    return LeanSolution(_stacked(start, rest, y0), end.steps, end.rejected, result)
+    out = way(method, max_steps, given, fixed)
+    result = dfx.RESULTS.where(
+        out.t >= ts[-1],
+        dfx.RESULTS.successful,
+        dfx.RESULTS.where(
+            out.h > 0,
+            dfx.RESULTS.max_steps_reached,
+            dfx.RESULTS.where(jnp.isnan(out.h), NONFINITE, dfx.RESULTS.dt_min_reached),
+        ),
+    )
+    rows = jnp.concatenate([given.y0[None], out.between, out.end[None]])
+    ys = jax.vmap(lambda row: unflat(row, y0))(rows)
+    return LeanSolution(ys, out.steps, out.rejected, result)
 
 
 def _stepper(
@@ -161,7 +148,7 @@ def _stepper(
         return numbers(t, *y)
 
     def step(t: Any, h: Any, y: Atoms) -> tuple[Atoms, Atoms]:
-        end, slopes = advance(tableau, slope, t, h, y)
+        end, slopes, _ = advance(tableau, slope, t, h, y)
         end = project(*end)
         if max(tableau.errors[0]) > len(tableau.a):
             slopes = [*slopes, slope(t + h, end)]
@@ -170,20 +157,10 @@ def _stepper(
     return step
 
 
-def _size(error: Atoms, left: Atoms, right: Atoms, rtol: Any, atol: Any) -> Array:
-    """Root mean square of error over tolerance, as `diffrax.PIDController` takes it."""
-    total, count = jnp.zeros((), error[0].dtype), 0
-    for e, a, b in zip(error, left, right, strict=True):
-        scale = jnp.asarray(atol, e.dtype) + jnp.asarray(rtol, e.dtype) * jnp.maximum(
-            jnp.abs(a), jnp.abs(b)
-        )
-        total, count = total + jnp.sum((e / scale) ** 2), count + e.size
-    tiny = float(jnp.finfo(total.dtype).tiny)
-    return lax.stop_gradient(jnp.sqrt(total / count + tiny))
-
-
-def _first_step(field: Any, order: int, t0: Array, y0: Any, rtol: Any, atol: Any) -> Array:
-    """Hairer, Nørsett and Wanner (1993), II.4, algorithm for the starting step."""
+def _first_step(
+    field: Any, order: int, t0: Array, y0: Any, rtol: Any, atol: Any
+) -> tuple[Array, Array]:
+    """Hairer, Nørsett and Wanner (1993), II.4, algorithm for the starting step; is it one?"""
 
     def norm(tree: Any) -> Array:
         parts = [
@@ -203,7 +180,8 @@ def _first_step(field: Any, order: int, t0: Array, y0: Any, rtol: Any, atol: Any
     largest = jnp.maximum(d1, d2)
     flat = largest <= 1e-15
     guess = (0.01 / jnp.where(flat, 1.0, largest)) ** (1 / order)
-    return jnp.minimum(100 * h, jnp.where(flat, jnp.maximum(1e-6, 1e-3 * h), guess))
+    h = jnp.minimum(100 * h, jnp.where(flat, jnp.maximum(1e-6, 1e-3 * h), guess))
+    return h, jnp.isfinite(d1)
 
 
 def split_fixed(

@@ -7,6 +7,7 @@ import equinox as eqx
 import jax.tree_util as jtu
 
 from rigidjax.motion import on_the_group
+from rigidjax.solve.watched import NONFINITE, finite
 
 
 class GroupInterpolation(dfx.AbstractLocalInterpolation):
@@ -42,7 +43,8 @@ class Projected(dfx.AbstractWrappedSolver):
     Each accepted step ends with q ← q/|q|, and so does every value of the dense output; inside the
     stages nothing is touched, because that changes the order (jaxsim#192). The kinematics is linear
     in q, so scaling q commutes with the exact flow and the order of the wrapped solver is kept. A
-    state without a quaternion passes through.
+    state without a quaternion passes through. A step that gives NaN or infinity ends the run with
+    `RESULTS.nonfinite`.
 
     **Arguments:** `solver` any `diffrax.AbstractSolver` on `Spin`, `Attitude` or `Rigid` states.
 
@@ -93,9 +95,14 @@ class Projected(dfx.AbstractWrappedSolver):
     def step(
         self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Any, made_jump: Any
     ) -> Any:
+        # A slope kept from the last step is the one before the projection; and diffrax computes it
+        # anew for all of a batch as soon as one body needs it. True: always anew, for each alone.
+        del made_jump
         y1, error, dense, state, result = self.solver.step(
-            terms, t0, t1, y0, args, solver_state, made_jump
+            terms, t0, t1, y0, args, solver_state, True
         )
+        ill = (result == dfx.RESULTS.successful) & ~finite(y1)
+        result = dfx.RESULTS.where(ill, NONFINITE, result)
         return on_the_group(y1), error, dense, state, result
 
     def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:

@@ -1,9 +1,10 @@
 """The one front door: a body, where it starts, when to look, and what turns it."""
 
+import dataclasses
 import functools
 import warnings
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import diffrax as dfx
 import equinox as eqx
@@ -13,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from rigidjax import _checks, motion
-from rigidjax._types import HasAttitude, ScalarLike
+from rigidjax._types import ScalarLike
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.exact import FreeBody
 from rigidjax.frames import AbstractScene, MovingFrame, Point, collision, scene_of
@@ -26,31 +27,41 @@ from rigidjax.motion import (
     Spin,
     on_the_group,
 )
-from rigidjax.motion.torques import Torque, jumps_of, require_rung
+from rigidjax.motion.torques import Torque, jumps_of
+from rigidjax.solve import inputs, lean, travel
+from rigidjax.solve.explicit import AbstractExplicit, DormandPrince8
+from rigidjax.solve.growth import growth
 from rigidjax.solve.projected import Projected
+from rigidjax.solve.splitting import AbstractSplitting
+from rigidjax.solve.watched import NONFINITE, Watched, finite
 
-State = Spin | Attitude | Rigid | Point
+State = TypeVar("State", Spin, Attitude, Rigid, Point)
+# A law must take the state that there is: gravity on a `Spin` is an error that type checkers see.
+Law = Callable[[Any, State, Any], Any] | AbstractScene | MovingFrame | None
 
 # Made once: building a Module costs as much as ten steps, and `jit` compares it leaf by leaf.
 _SOLVER = Projected(dfx.Dopri8())
 _ADJOINT = dfx.RecursiveCheckpointAdjoint()
 _NO_METER = dfx.NoProgressMeter()
+# Our loop takes a short step to each saved time, where diffrax has a polynomial to evaluate.
+_FEW_TIMES = 32
 
 
-class Solution(eqx.Module):
+class Solution(eqx.Module, Generic[State]):
     """What `simulate` returns.
 
     **Fields:** `ts` (T,) the times asked for, s; `ys` the states there, of the type of `state0`,
-    with a leading time axis; `stats` a dict with `num_steps`, `num_accepted_steps`,
-    `num_rejected_steps`, for a `Point` also `drift` of what its scene conserves; `result` a
-    `diffrax.RESULTS`, successful or the reason why not.
+    with a leading time axis, NaN where the run did not get to; `stats` a dict with `num_steps`,
+    `num_accepted_steps`, `num_rejected_steps`, for a `Point` also `drift` of what its scene
+    conserves; `result` a `diffrax.RESULTS`: `successful`, or why the run ended early, such as
+    `max_steps_reached`, `nonfinite`, `dt_min_reached`.
     """
 
     ts: Float[Array, " times"]
-    ys: Any
+    ys: State
     stats: dict[str, Any]
     result: dfx.RESULTS
-    _setup: "_Free | _Setup"
+    _setup: "_Free | _Lean | _Setup"
 
     @property
     def drift(self) -> dict[str, Array]:
@@ -63,7 +74,40 @@ class Solution(eqx.Module):
             return self.stats["drift"]
         return _drift(self._setup, self.ts, self.ys)
 
-    def evaluate(self, t: ScalarLike) -> Any:
+    @property
+    def growth(self) -> Float[Array, " times"]:
+        """‖∂y(t)/∂y(t₀)‖ at each of `ts`: by how much a small error at the start has grown.
+
+        Computed when asked for, by forward mode: about as many runs as the state has numbers. It
+        has no unit: each of q, Ω, x, v counts relative to its largest size in the run, and the norm
+        is the largest singular value.
+
+        A solver's own errors grow as much. Where `growth * rtol` exceeds 1, the states there are
+        not known to a single digit and every gradient through them means nothing, however finite it
+        looks, whatever the adjoint: a `UserWarning` names the first such time. So look at it once
+        before differentiating through a long run; then end the run earlier, or fit it in pieces
+        (multiple shooting).
+
+        Source: the largest finite-time Lyapunov exponent is its logarithm over t (Eckmann and
+        Ruelle 1985, doi:10.1103/RevModPhys.57.617).
+        """
+        found = growth(_Flow(self._setup), self.ts, self.ys)
+        rtol = getattr(getattr(self._setup, "controller", None), "rtol", None)
+        if rtol is None:
+            rtol = 100 * float(jnp.finfo(self.ts.dtype).eps)
+        if _checks.known((found, rtol, self.ts)):
+            lost = np.flatnonzero(np.asarray(found) * float(rtol) > 1)
+            if lost.size:
+                i = lost[0]
+                warnings.warn(
+                    f"growth: errors at the start have grown {float(found[i]):.1e} times at t = "
+                    f"{float(self.ts[i]):g} s; at a tolerance of {float(rtol):.0e} the states from "
+                    "there on are not known, and gradients through them mean nothing",
+                    stacklevel=2,
+                )
+        return found
+
+    def evaluate(self, t: ScalarLike) -> State:
         """The state at any `t` between the first and the last of `ts`, s.
 
         The motion is worked out again from the last saved state before `t`, so the error is that of
@@ -81,7 +125,7 @@ class Solution(eqx.Module):
 
 
 @eqx.filter_jit
-def _drift(setup: "_Free | _Setup", ts: Array, ys: Any) -> dict[str, Array]:
+def _drift(setup: "_Free | _Lean | _Setup", ts: Array, ys: Any) -> dict[str, Array]:
     torque = None if isinstance(setup, _Free) else setup.torque
     return motion.drift(ts, ys, setup.body, torque)  # pyright: ignore[reportArgumentType]
 
@@ -90,13 +134,14 @@ class _Free(eqx.Module):
     """A free body: the closed form, any time at the cost of one."""
 
     body: Inertia | MassProperties
+    throw: bool = eqx.field(static=True)
 
 
 class _Setup(eqx.Module):
     """Everything about a solve but the start and the times."""
 
     body: Inertia | MassProperties | None
-    torque: Torque | AbstractScene | MovingFrame | None
+    torque: Any
     solver: dfx.AbstractSolver
     controller: dfx.AbstractStepSizeController
     dt0: Any
@@ -106,20 +151,33 @@ class _Setup(eqx.Module):
     throw: bool = eqx.field(static=True)
 
 
+class _Lean(eqx.Module):
+    """A solve of which nothing is asked but states and `jax.grad`: our own loop."""
+
+    body: Inertia | MassProperties | None
+    torque: Any
+    controller: dfx.AbstractStepSizeController
+    dt0: Any
+    max_steps: int = eqx.field(static=True)
+    throw: bool = eqx.field(static=True)
+
+
 @eqx.filter_jit
 def _solve(
-    setup: _Free | _Setup, state0: Any, ts: Array
+    setup: _Free | _Lean | _Setup, state0: Any, ts: Array
 ) -> tuple[Any, dict[str, Any], dfx.RESULTS]:
     # One jit around everything: an operation outside of it costs as much as a hundred steps.
     state0 = on_the_group(state0)
     if isinstance(setup, _Free):
-        return _free(setup.body, state0, ts)
+        return _free(setup, state0, ts)
+    if isinstance(setup, _Lean):
+        return _lean(setup, state0, ts)
     field = equations_of_motion(setup.body, state0, setup.torque)
     scene: Any = scene_of(setup.torque) if isinstance(state0, Point) else None
     watch = collision.event(scene)
-    saveat = dfx.SaveAt(ts=ts)
-    if watch is not None:
-        saveat = dfx.SaveAt(subs=(dfx.SubSaveAt(ts=ts), dfx.SubSaveAt(t1=True)))
+    subs = (
+        (dfx.SubSaveAt(ts=ts),) if watch is None else (dfx.SubSaveAt(ts=ts), dfx.SubSaveAt(t1=True))
+    )
     out = dfx.diffeqsolve(
         dfx.ODETerm(field),
         setup.solver,
@@ -127,32 +185,83 @@ def _solve(
         ts[-1],
         setup.dt0,
         state0,
-        saveat=saveat,
+        saveat=dfx.SaveAt(subs=subs),
         stepsize_controller=setup.controller,
         adjoint=setup.adjoint,
         max_steps=setup.max_steps,
-        throw=setup.throw,
+        throw=False,
         progress_meter=setup.progress_meter,
         event=watch,
     )
     stats: dict[str, Any] = {k: value for k, value in out.stats.items() if k != "max_steps"}
-    ys: Any = out.ys
+    times: Any = out.ts
+    saved: Any = out.ys
+    ys, result = _reached(saved[0], times[0]), out.result
+    if not isinstance(setup.controller, dfx.AbstractAdaptiveStepSizeController):
+        # Equal steps look at no error, and would go on with NaN.
+        ill = (result == dfx.RESULTS.successful) & ~finite(ys)
+        result = dfx.RESULTS.where(ill, NONFINITE, result)
+    if setup.throw:
+        ys = _raise(ys, result)
     if scene is not None:
         if watch is not None:
-            times: Any = out.ts
-            (ys, ends), (_, end_times) = ys, times
-            end = jax.tree.map(lambda leaf: leaf[0], ends)
+            end, end_time = jax.tree.map(lambda leaf: leaf[0], (saved[1], times[1]))
             stats["collided"] = out.result == dfx.RESULTS.event_occurred
-            stats["end_time"] = end_times[0]
-            stats["end_distances"] = scene.approach(end_times[0], end)[0]
+            stats["end_time"] = end_time
+            stats["end_distances"] = scene.approach(end_time, end)[0]
         stats["drift"] = scene.drift(ts, ys)
+    return ys, stats, result
+
+
+def _lean(setup: _Lean, state0: Any, ts: Array) -> tuple[Any, dict[str, Any], dfx.RESULTS]:
+    controller: Any = setup.controller
+    out = lean.adaptive(
+        DormandPrince8(),
+        equations_of_motion(setup.body, state0, setup.torque),
+        ts,
+        state0,
+        rtol=controller.rtol,
+        atol=controller.atol,
+        dt0=setup.dt0,
+        max_steps=setup.max_steps,
+        jumps=jumps_of(setup.torque),
+        way=travel.reverse,
+    )
+    ys = _raise(out.ys, out.result) if setup.throw else out.ys
+    stats: dict[str, Any] = {
+        "num_steps": out.num_steps,
+        "num_accepted_steps": out.num_steps - out.num_rejected,
+        "num_rejected_steps": out.num_rejected,
+    }
+    if isinstance(state0, Point):
+        stats["drift"] = scene_of(setup.torque).drift(ts, ys)
     return ys, stats, out.result
 
 
-def _free(
-    body: Inertia | MassProperties, state0: Any, ts: Array
-) -> tuple[Any, dict[str, Any], dfx.RESULTS]:
-    since = ts - ts[0]
+def _reached(ys: Any, times: Array) -> Any:
+    """NaN where nothing was saved, there diffrax says t = inf: not to be taken for a state."""
+
+    def mark(leaf: Array) -> Array:
+        there = jnp.isfinite(times).reshape(-1, *[1] * (leaf.ndim - 1))
+        return jnp.where(there, leaf, jnp.full_like(leaf, jnp.nan))
+
+    return jax.tree.map(mark, ys)
+
+
+def _raise(ys: Any, result: dfx.RESULTS) -> Any:
+    ys = eqx.error_if(
+        ys,
+        result == NONFINITE,
+        "simulate: the motion became NaN or infinite. Is the torque finite at every time and state "
+        "that it meets? With equal steps: are they short enough for this spin? throw=False keeps "
+        "what came before",
+    )
+    ill = (result != dfx.RESULTS.successful) & (result != dfx.RESULTS.event_occurred)
+    return result.error_if(ys, ill & (result != NONFINITE))
+
+
+def _free(setup: _Free, state0: Any, ts: Array) -> tuple[Any, dict[str, Any], dfx.RESULTS]:
+    since, body = ts - ts[0], setup.body
     inertia = body if isinstance(body, Inertia) else body.inertia
     turning = Attitude(state0.q, state0.omega) if isinstance(state0, Rigid) else state0
     ys: Any = jax.vmap(FreeBody(inertia, turning))(since)
@@ -161,25 +270,55 @@ def _free(
         ys = Rigid(x, jnp.broadcast_to(state0.v, x.shape), ys.q, ys.omega)
     none = jnp.zeros((), int)
     stats = {"num_steps": none, "num_accepted_steps": none, "num_rejected_steps": none}
-    return ys, stats, dfx.RESULTS.successful
+    result = dfx.RESULTS.successful
+    if not setup.throw:
+        result = dfx.RESULTS.where(finite(ys), result, NONFINITE)
+    return ys, stats, result
+
+
+class _Flow(eqx.Module):
+    """The same run from another start, as a function that forward mode goes through."""
+
+    setup: _Free | _Lean | _Setup
+
+    def __init__(self, setup: "_Free | _Lean | _Setup"):
+        if isinstance(setup, _Lean):
+            setup = _Setup(
+                body=setup.body,
+                torque=setup.torque,
+                solver=_SOLVER,
+                controller=setup.controller,
+                dt0=setup.dt0,
+                adjoint=_ADJOINT,
+                progress_meter=_NO_METER,
+                max_steps=setup.max_steps,
+                throw=False,
+            )
+        setup = dataclasses.replace(setup, throw=False)
+        if isinstance(setup, _Setup):
+            setup = dataclasses.replace(setup, adjoint=dfx.ForwardMode())
+        self.setup = setup
+
+    def __call__(self, state0: Any, ts: Array) -> Any:
+        return _solve(self.setup, state0, ts)[0]
 
 
 def simulate(
     body: Inertia | MassProperties | None,
     state0: State,
     ts: Float[ArrayLike, " times"] | Sequence[float],
-    torque: Torque | AbstractScene | MovingFrame | None = None,
+    torque: Law[State] = None,
     *,
     solver: dfx.AbstractSolver | None = None,
     rtol: float | None = None,
     atol: float | None = None,
-    dt0: float | None = None,
+    dt0: ScalarLike | None = None,
     stepsize_controller: dfx.AbstractStepSizeController | None = None,
     adjoint: dfx.AbstractAdjoint | None = None,
     max_steps: int | None = 100_000,
     throw: bool = True,
     progress_meter: dfx.AbstractProgressMeter | None = None,
-) -> Solution:
+) -> Solution[State]:
     """The motion of a rigid body from `state0`, saved at `ts`.
 
     **Arguments:**
@@ -188,23 +327,33 @@ def simulate(
       `MassProperties` for `Rigid`; `None` for a `Point`.
     - `state0`: `Spin(omega)`, `Attitude(q, omega)` or `Rigid(x, v, q, omega)` at `ts[0]`. The rung
       says what is solved for: take the lowest that the question needs. One body; for many,
-      `jax.vmap(lambda body, state: rj.simulate(body, state, ts).ys)`.
+      `jax.vmap(lambda body, state: rj.simulate(body, state, ts).ys)`, and with `throw=False` take
+      `.result` along: one for each body.
     - `ts`: (T,) increasing times, s. The first is the start.
     - `torque`: a law of `rigidjax.torques` (the jumps of a schedule are given to the stepper), or
       any callable Module `(t, state, body) → (3,)`, N m, body frame; `None` for a free body. For a
       `Point` a scene of `rigidjax.scenes`, a `MovingFrame` to see it from, or a force per mass
       `(t, state, None) → (3,)`, m/s².
     - `solver`: `None` is the cheapest that is right: the closed form (`rigidjax.exact`) for a free
-      body, else `diffrax.Dopri8`. Any `diffrax.AbstractSolver` may be given; it is wrapped so that
-      attitudes stay unit quaternions, at every step and every saved time.
+      body, else `rigidjax.solvers.DormandPrince8` in a loop of our own; `diffrax.Dopri8` where
+      more is asked (more than 32 times, forward mode, a progress meter, a controller, a `Point`
+      that may collide). Any `diffrax.AbstractSolver` may be given; it is wrapped so that attitudes
+      stay unit quaternions, at every step and every saved time. Below `rtol=1e-10` mind that Dopri8
+      is up to 26 times `rtol` off between its steps (five times at most with
+      `rigidjax.solvers.DormandPrince8`).
     - `rtol`, `atol`: tolerances of the adaptive steps; 1e-9 and 1e-12 in float64, 2e-5 and 1e-7 in
-      float32. The closed form has no use for them.
+      float32. Scale `atol` to the smallest number that matters: a flip about the middle axis grows
+      out of how far off the axis it starts, and where that is below `atol` its time is made up. The
+      closed form has no use for either.
     - `dt0`, `stepsize_controller`: first step and controller where the tolerances are not enough,
       such as `dt0=0.01, stepsize_controller=diffrax.ConstantStepSize()`.
     - `adjoint`: how gradients through a solver are taken. `None` is
       `diffrax.RecursiveCheckpointAdjoint()`, for `jax.grad`; pass `diffrax.ForwardMode()` for
       `jax.jacfwd` and least squares. The closed form takes both.
-    - `max_steps`, `throw`, `progress_meter`: as in `diffrax.diffeqsolve`.
+    - `max_steps`, `progress_meter`: as in `diffrax.diffeqsolve`.
+    - `throw`: `False` never raises for numbers met on the way, or for a bad start inside a batch:
+      `result` says what happened, states not reached are NaN, and other bodies of the batch get
+      what they would get alone. Known numbers that are wrong are refused in any case.
 
     **Returns** a `Solution`. A second call with other numbers of the same shapes compiles nothing.
 
@@ -218,18 +367,18 @@ def simulate(
     >>> bool(abs(rj.simulate(body, start, jnp.linspace(0.0, 9.43, 3)).ys.omega[-1, 1]) < 0.01)
     True
     """
-    times = _check_times(ts)
-    state0 = _check_start(state0)
+    times = inputs.times(ts, throw)
+    state0 = inputs.start(state0, throw)
     dtype = times.dtype
     for leaf in jax.tree.leaves(state0):
         dtype = jnp.promote_types(dtype, leaf.dtype)
     times, state0 = jax.tree.map(lambda leaf: _as(leaf, dtype), (times, state0))
-    require_fit(body, state0, torque)
-    if body is not None:
+    inputs.require_fit(body, state0, torque)
+    if body is not None and (throw or _checks.known(body)):
         body = body.invertible()
     controller = stepsize_controller
     if controller is None:
-        rtol, atol = _tolerances(rtol, atol, dtype)
+        rtol, atol = inputs.tolerances(rtol, atol, dtype)
         controller = _controller(rtol, atol)
         if hasattr(torque, "jump_times") and jumps_of(torque).size:
             # An adaptive step passes over a short pulse without seeing it.
@@ -237,15 +386,25 @@ def simulate(
             controller = dfx.ClipStepSizeController(controller, jump_ts=jump_ts)
     elif rtol is not None or atol is not None:
         raise ValueError("simulate: give either rtol and atol or a stepsize_controller, not both")
+    elif isinstance(controller, dfx.AbstractAdaptiveStepSizeController):
+        controller = Watched(controller)
     if torque is None and solver is None and stepsize_controller is None and body is not None:
-        free = _Free(body)
+        free = _Free(body, throw)
         return Solution(times, *_solve(free, state0, times), free)
+    plain = solver is None and stepsize_controller is None and progress_meter is None
+    # Forward mode stays with diffrax: there our loop is faster, but takes far longer to compile.
+    plain = plain and (adjoint is None or adjoint == _ADJOINT) and max_steps is not None
+    plain = plain and times.shape[0] <= _FEW_TIMES
+    if plain and not _can_collide(state0, torque):
+        first = inputs.first_step(dt0, times)
+        quick = _Lean(body, torque, controller, first, max_steps, throw)  # pyright: ignore
+        return Solution(times, *_solve(quick, state0, times), quick)
     setup = _Setup(
         body=body,
         torque=torque,
-        solver=_SOLVER if solver is None else Projected(solver),
+        solver=_on_the_group(solver),
         controller=controller,
-        dt0=None if dt0 is None else jnp.asarray(dt0, dtype),
+        dt0=inputs.first_step(dt0, times),
         adjoint=_ADJOINT if adjoint is None else adjoint,
         progress_meter=_NO_METER if progress_meter is None else progress_meter,
         max_steps=max_steps,
@@ -259,7 +418,7 @@ def simulate(
 
 def equations_of_motion(
     body: Inertia | MassProperties | None,
-    state0: State,
+    state0: Spin | Attitude | Rigid | Point,
     torque: Torque | AbstractScene | MovingFrame | None = None,
 ) -> Callable[..., Any]:
     """The vector field for this body on the rung of `state0`, for plain `diffrax.ODETerm`.
@@ -270,7 +429,7 @@ def equations_of_motion(
     >>> type(equations_of_motion(rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([1.0, 0, 0])))
     <class 'rigidjax.motion.spin.EulerEquations'>
     """
-    require_fit(body, state0, torque)
+    inputs.require_fit(body, state0, torque)
     if isinstance(state0, Point):
         return scene_of(torque).field
     matter: Any = body
@@ -282,109 +441,22 @@ def equations_of_motion(
     return EulerEquations(matter, turning)
 
 
-def require_fit(body: Any, state0: Any, torque: Any) -> None:
-    """Raise `TypeError` unless body, state and torque belong on one rung."""
-    if isinstance(state0, Point) and body is not None:
-        raise TypeError(f"Point is no body: wanted None in its place, got {type(body).__name__}")
-    if isinstance(torque, AbstractScene | MovingFrame) and not isinstance(state0, Point):
-        raise TypeError(
-            f"{type(torque).__name__} moves a Point: wanted Point(x, v), got "
-            f"{type(state0).__name__}; frames.BodyInFrame is for a body in a moving frame"
-        )
-    if isinstance(state0, Point):
-        scene_of(torque)
-    if torque is not None and not isinstance(torque, AbstractScene | MovingFrame):
-        require_rung(torque, state0)
-    if isinstance(state0, Rigid) and not isinstance(body, MassProperties):
-        raise TypeError(
-            f"Rigid moves as well as turns: wanted MassProperties, got {type(body).__name__}"
-        )
-    if not isinstance(state0, Rigid | Point) and not isinstance(body, Inertia):
-        raise TypeError(
-            f"{type(state0).__name__} only turns: wanted Inertia, got {type(body).__name__}"
-            + ("; pass body.inertia" if isinstance(body, MassProperties) else "")
-        )
-    tensor = (
-        body.inertia.tensor if isinstance(body, MassProperties) else getattr(body, "tensor", None)
-    )
-    if tensor is not None and tensor.ndim != 2:
-        raise ValueError(
-            f"body: wanted one body, a tensor of shape (3, 3), got {tensor.shape}; batch with "
-            "jax.vmap"
-        )
-
-
-def _tolerances(rtol: float | None, atol: float | None, dtype: Any) -> tuple[float, float]:
-    double = dtype == jnp.float64
-    rtol = (1e-9 if double else 2e-5) if rtol is None else rtol
-    atol = (1e-12 if double else 1e-7) if atol is None else atol
-    if not rtol > 0 or not atol >= 0:
-        raise ValueError(f"simulate: wanted rtol > 0 and atol >= 0, got rtol={rtol}, atol={atol}")
-    floor = 100 * float(jnp.finfo(dtype).eps)
-    # A relative tolerance below this cannot be met: steps shrink until max_steps ends the run.
-    if rtol < floor:
-        advice = "" if double else "; set jax.config.update('jax_enable_x64', True) for float64"
-        warnings.warn(
-            f"simulate: {np.dtype(dtype).name} cannot reach rtol={rtol:g}; "
-            f"using {floor:.1g}{advice}",
-            stacklevel=3,
-        )
-        rtol = floor
-    return rtol, atol
+def _can_collide(state0: Any, torque: Any) -> bool:
+    return isinstance(state0, Point) and collision.event(scene_of(torque)) is not None
 
 
 @functools.cache
-def _controller(rtol: float, atol: float) -> dfx.PIDController:
-    return dfx.PIDController(rtol=rtol, atol=atol)
+def _controller(rtol: float, atol: float) -> Watched:
+    return Watched(dfx.PIDController(rtol=rtol, atol=atol))
+
+
+def _on_the_group(solver: dfx.AbstractSolver | None) -> dfx.AbstractSolver:
+    # Ours project inside their one kernel; a second time outside of it breaks the kernel up.
+    if isinstance(solver, AbstractExplicit | AbstractSplitting):
+        return solver
+    return _SOLVER if solver is None else Projected(solver)
 
 
 def _as(leaf: Array, dtype: Any) -> Array:
     # Outside of `jit` even a conversion to the same dtype costs as much as a step.
     return leaf if leaf.dtype == dtype else leaf.astype(dtype)
-
-
-def _check_times(ts: Any) -> Array:
-    try:
-        length = np.shape(ts)
-    except ValueError:
-        length = ()
-    if len(length) != 1 or length[0] < 2:
-        raise ValueError(f"ts: wanted at least two times, shape (T,), got shape {length}")
-    times = _checks.finite(_checks.floating(ts, length, "ts"), "ts")
-    xp = _checks.namespace(times)
-    found = xp.asarray(times)
-    falling = found[1:] <= found[:-1]
-    where = ""
-    if xp is np and falling.any():
-        where = f"; ts[{int(np.argmax(falling)) + 1}] is not above the one before"
-    return _checks.refuse(times, falling.any(), f"ts: wanted increasing times{where}")
-
-
-def _check_start(state0: State) -> State:
-    if not isinstance(state0, Spin | Attitude | Rigid | Point):
-        raise TypeError(
-            "state0: wanted Spin, Attitude or Rigid, or Point without a body, got "
-            f"{type(state0).__name__}"
-        )
-    name, first = ("v", state0.v) if isinstance(state0, Point) else ("omega", state0.omega)
-    if first.ndim != 1:
-        raise ValueError(
-            f"state0: wanted one body, {name} of shape (3,), got {first.shape}; batch with jax.vmap"
-        )
-    names = [str(path[-1]).lstrip(".") for path, _ in jax.tree.leaves_with_path(state0)]
-    leaves, tree = jax.tree.flatten(state0)
-    leaves = [_checks.finite(leaf, name) for leaf, name in zip(leaves, names, strict=True)]
-    state0 = jax.tree.unflatten(tree, leaves)
-    if isinstance(state0, HasAttitude):
-        xp = _checks.namespace(state0.q)
-        far = xp.abs(xp.sqrt(xp.sum(xp.square(state0.q))) - 1) > (
-            1e-6 if state0.q.dtype == jnp.float64 else 1e-3
-        )
-        q = _checks.refuse(
-            state0.q,
-            far,
-            "q: wanted a unit quaternion (w, x, y, z), got one whose length is not 1; normalise it "
-            "with rigidjax.quaternion.normalise, and mind that the scalar comes first",
-        )
-        state0 = eqx.tree_at(lambda s: s.q, state0, q)
-    return state0

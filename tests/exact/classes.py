@@ -1,10 +1,11 @@
 """Bodies of every class in which closed forms are known to fail, and their seams."""
 
 import numpy as np
+from scipy.special import ellipk, ellipkinc
 
 
 def bodies(name: str, count: int, seed: int = 0):
-    """Principal moments (count, 3) and body rates (count, 3), float64."""
+    """Principal moments (count, 3), body rates (count, 3) and, for a seam, times; float64."""
     r = np.random.default_rng(seed + sum(map(ord, name)))
     u = np.sort(r.uniform(0.3, 1.0, (count, 3)), axis=1)
     u[:, 2] = np.minimum(u[:, 2], 0.999 * (u[:, 0] + u[:, 1]))
@@ -45,7 +46,42 @@ def bodies(name: str, count: int, seed: int = 0):
         w = np.zeros((count, 3))
     elif name == "slow":
         w = w * 10.0 ** r.uniform(-20, -6, count)[:, None]
-    return u, w
+    elif name == "seam of the labels":
+        w = _between_labels(u, w, r)
+    t = None
+    if name == "seam of the reduction":
+        # An odd number of quarter turns: where the whole half periods go up by one.
+        big, m = _modulus(u, w)
+        t = 2 * ellipk(m) / big * (2 * r.integers(0, 1000, count) + 1)
+    elif name == "seam of the doubling":
+        # max(p, q) S² = ½ in the last doublings.
+        big, m = _modulus(u, w)
+        t = ellipkinc(np.pi / 4, m) / big * 2.0 ** r.integers(-1, 2, count)
+    if t is not None:
+        t = t * (1 + 2.0**-52 * r.integers(-4, 5, count))
+    return u, w, t
+
+
+def _modulus(u, w):
+    """√max(p, q) and m of the motion: what Jacobi's functions want."""
+    a, x = 1 / u.T, (u * w).T ** 2
+    p = (a[1] - a[2]) * ((a[0] - a[1]) * x[1] + (a[0] - a[2]) * x[2])
+    q = (a[0] - a[1]) * ((a[0] - a[2]) * x[0] + (a[1] - a[2]) * x[1])
+    big = np.maximum(p, q)
+    return np.sqrt(big), np.minimum(p, q) / big
+
+
+def _between_labels(u, w, r):
+    """Rates with d₁₂A₁ = d₂₃A₃ within a few units of round-off, on both sides."""
+    a, x = 1 / u.T, (u * w).T ** 2
+    d12, d13, d23 = a[0] - a[1], a[0] - a[2], a[1] - a[2]
+    x1 = ((d12 + d23) * (d12 - d23) * x[1] + d12 * d13 * x[2]) / (d23 * d13)
+    x3 = ((d12 + d23) * (d23 - d12) * x[1] + d23 * d13 * x[0]) / (d12 * d13)
+    first = x1 > 0
+    nudge = 1 + 2.0**-52 * r.integers(-4, 5, len(u))
+    p1 = np.where(first, np.sqrt(np.where(first, x1, 1.0)) * nudge, u[:, 0] * w[:, 0])
+    p3 = np.where(first, u[:, 2] * w[:, 2], np.sqrt(np.where(first, 1.0, x3)) * nudge)
+    return np.stack([p1 / u[:, 0], w[:, 1], p3 / u[:, 2]], 1)
 
 
 NAMES = (
@@ -69,4 +105,13 @@ NAMES = (
     "any order",
     "rest",
     "slow",
+    "seam of the labels",
+    "seam of the reduction",
+    "seam of the doubling",
 )
+# Where a disturbance grows as e^{λt} for good: at long times no digit of the input suffices.
+UNSTABLE = ("axis 2", "near axis 2", "on separatrix", "below separatrix", "above separatrix")
+
+
+def times(name: str):
+    return (1.0, 3.0, 10.0, 20.0, 1e3, 1e6) if name in UNSTABLE else (1.0, 30.0, 1e3, 1e6)

@@ -164,7 +164,8 @@ def act(
     dtype = state.omega.dtype
     # A table in float64 must not lift a float32 solve, nor stop it under strict promotion.
     found = in_precision(law, dtype)(jnp.asarray(t, dtype), state, in_precision(body, dtype))
-    if isinstance(found, Wrench):
+    # Not by class: laws of the moving frames give one too, and know nothing of this floor.
+    if hasattr(found, "force"):
         return found.force.astype(dtype), found.torque.astype(dtype)
     value = _checks.floating(found, (3,), f"torque {type(law).__name__}", hint="body-frame N m")
     return None, value.astype(dtype)

@@ -1,0 +1,132 @@
+"""Scenes whose motion has a mirror: their symmetric periodic orbits, families and stability."""
+
+from collections.abc import Sequence
+
+from jaxtyping import Array, ArrayLike, Complex, Float
+
+from rigidjax._types import ScalarLike
+from rigidjax.frames import families, flow, periodic
+from rigidjax.frames.periodic import PeriodicOrbit
+from rigidjax.frames.point import Point
+from rigidjax.frames.scene import AbstractScene
+
+
+class AbstractMirrored(AbstractScene):
+    """A scene that time run backwards shows in the mirror y → −y: `ThreeBody` and `Hill`.
+
+    An orbit that crosses the xz-plane at a right angle twice is then periodic (Roy and Ovenden
+    1955, doi:10.1093/mnras/115.3.296).
+    """
+
+    def transition(
+        self, state: Point, t: ScalarLike, *, rtol: float = 1e-13, atol: float = 1e-14
+    ) -> Float[Array, "6 6"]:
+        """The state-transition matrix ∂(x, v)(t)/∂(x, v)(0) (6, 6), by forward differentiation.
+
+        **Arguments:** `state` the start; `t` when. Its determinant is 1.
+        """
+        return flow.transition(self, state, t, rtol=rtol, atol=atol)
+
+    def monodromy(self, orbit: PeriodicOrbit) -> Float[Array, "6 6"]:
+        """The transition matrix over one period; its eigenvalues say whether the orbit is stable.
+
+        Two of the six are 1, the others come as λ, 1/λ (Szebehely 1967, sec. 8.6).
+        """
+        return self.transition(orbit.state, orbit.period)
+
+    def stability_indices(self, orbit: PeriodicOrbit) -> Complex[Array, "2"]:
+        """The two ν = ½(λ + 1/λ) of the multipliers that are not 1, larger real part first.
+
+        The orbit is stable to first order where both are real and |ν| ≤ 1. Many:
+        `jax.vmap(scene.stability_indices)(scene.family(…))`.
+
+        Source: Howell 1984, doi:10.1007/BF01358403; from traces: Bray and Goudas 1967, Adv.
+        Astron. Astrophys. 5, 71.
+        """
+        return families.stability_indices(self.monodromy(orbit))
+
+    def periodic_orbit(
+        self, guess: PeriodicOrbit, *, hold: str = "x", tolerance: float | None = None
+    ) -> PeriodicOrbit:
+        """The periodic orbit near `guess`, by differentiable correction.
+
+        For orbits symmetric about the xz-plane: Lyapunov, halo, Arenstorf's and most others in use.
+        They cross it at a right angle (y = v_x = v_z = 0) twice a period. Newton's method on three
+        of (x, z, v_y, T/2) makes y, v_x, v_z vanish at the half period.
+
+        **Arguments:** `guess` a `PeriodicOrbit(state, period)` whose state crosses at a right
+        angle; `hold` which of `"x"`, `"z"`, `"vy"`, `"period"` stays as guessed: this labels the
+        orbit within its family (`"x"` for Lyapunov orbits, `"z"` for halo orbits); `tolerance`
+        largest |y|, |v_x|, |v_z| left at the half period, 1e-12 unless given (1e-4 in float32).
+
+        **Returns** a `PeriodicOrbit`. Its derivatives with respect to μ and the held number are
+        those of the family, by the implicit function theorem, forward and reverse.
+
+        Source: Howell 1984, doi:10.1007/BF01358403.
+
+        **Raises:** `ValueError` (`EquinoxRuntimeError` under `jit`) if Newton does not converge.
+
+        >>> from rigidjax.frames import scenes
+        >>> moon = scenes.cr3bp(0.0121505856)
+        >>> orbit = moon.periodic_orbit(moon.lyapunov_guess(1, 0.01))
+        >>> round(float(orbit.period), 4)
+        2.712
+        """
+        return periodic.correct(self, guess, hold, tolerance)
+
+    def family(
+        self,
+        orbit: PeriodicOrbit,
+        values: Float[ArrayLike, " members"] | Sequence[float],
+        *,
+        hold: str = "x",
+    ) -> PeriodicOrbit:
+        """The members of the family of `orbit` at which `hold` has these values, one by one.
+
+        Each is found from the one before and its tangent, and corrected as by `periodic_orbit`.
+
+        **Arguments:** `orbit` one near the first of them; `values` (N,), neighbours near one
+        another; `hold` `"x"`, `"z"`, `"vy"` or `"period"`, which may not turn back on the way
+        (there `follow` goes on).
+
+        **Returns** a `PeriodicOrbit` with a leading axis; its derivatives with respect to μ and
+        `values` are those of the family, forward and reverse.
+
+        **Raises:** `ValueError` (`EquinoxRuntimeError` under `jit`) saying where it was lost.
+
+        >>> from rigidjax.frames import scenes
+        >>> moon = scenes.cr3bp(0.0121505856)
+        >>> start = moon.lyapunov_guess(1, 0.01)
+        >>> found = moon.family(start, start.state.x[0] - jnp.array([0.0, 0.01]))
+        >>> [round(float(p), 3) for p in found.period]
+        [2.712, 2.811]
+        """
+        return families.at_values(self, orbit, values, hold)
+
+    def family_slope(self, orbit: PeriodicOrbit, *, hold: str = "x") -> PeriodicOrbit:
+        """How start and period of an orbit change along its family, per unit of `hold`.
+
+        **Arguments:** `orbit` a member of it; `hold` as in `family`. **Returns** the derivatives in
+        the shape of an orbit: `.period` is d period/d hold. Exact (implicit function theorem).
+
+        **Raises:** `ValueError` where the family turns back in `hold`.
+        """
+        return families.slope(self, orbit, hold)
+
+    def follow(
+        self, orbit: PeriodicOrbit, step: ScalarLike, count: int, *, rising: str = "x"
+    ) -> PeriodicOrbit:
+        """The next `count` members of a family, at equal steps of arclength, past its turns.
+
+        Pseudo-arclength continuation in (x, z, v_y, T/2): each start lies at `step` along the
+        tangent, and Newton's method goes back across it (Keller 1977, in
+        Applications of Bifurcation Theory).
+
+        **Arguments:** `orbit` a member, not returned; `step` arclength, its sign the way;
+        `rising` the number that grows at first when `step` is positive.
+
+        **Returns** a `PeriodicOrbit` with a leading axis. To differentiate one give it to
+        `periodic_orbit`. **Raises:** `ValueError` (`EquinoxRuntimeError` under `jit`) saying after
+        how many members it was lost.
+        """
+        return families.follow(self, orbit, step, count, rising)

@@ -1,0 +1,172 @@
+"""What `simulate` is given, looked at before anything is integrated."""
+
+import warnings
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from rigidjax import _checks
+from rigidjax._types import HasAttitude
+from rigidjax.body.inertia import Inertia, MassProperties
+from rigidjax.frames import AbstractScene, MovingFrame, Point, scene_of
+from rigidjax.motion import Attitude, Rigid, Spin
+from rigidjax.motion.torques import require_rung
+
+
+def require_fit(body: Any, state0: Any, torque: Any) -> None:
+    """Raise `TypeError` unless body, state and torque belong on one rung."""
+    if isinstance(state0, Point) and body is not None:
+        raise TypeError(f"Point is no body: wanted None in its place, got {type(body).__name__}")
+    if isinstance(torque, AbstractScene | MovingFrame) and not isinstance(state0, Point):
+        raise TypeError(
+            f"{type(torque).__name__} moves a Point: wanted Point(x, v), got "
+            f"{type(state0).__name__}; frames.BodyInFrame is for a body in a moving frame"
+        )
+    if isinstance(state0, Point):
+        scene_of(torque)
+    if torque is not None and not isinstance(torque, AbstractScene | MovingFrame):
+        require_rung(torque, state0)
+    if isinstance(state0, Rigid) and not isinstance(body, MassProperties):
+        raise TypeError(
+            f"Rigid moves as well as turns: wanted MassProperties, got {type(body).__name__}"
+        )
+    if not isinstance(state0, Rigid | Point) and not isinstance(body, Inertia):
+        raise TypeError(
+            f"{type(state0).__name__} only turns: wanted Inertia, got {type(body).__name__}"
+            + ("; pass body.inertia" if isinstance(body, MassProperties) else "")
+        )
+    tensor = (
+        body.inertia.tensor if isinstance(body, MassProperties) else getattr(body, "tensor", None)
+    )
+    if tensor is not None and tensor.ndim != 2:
+        raise ValueError(
+            f"body: wanted one body, a tensor of shape (3, 3), got {tensor.shape}; batch with "
+            "jax.vmap"
+        )
+
+
+def tolerances(rtol: float | None, atol: float | None, dtype: Any) -> tuple[float, float]:
+    """`rtol` and `atol`, by default what `dtype` is good for; a warning where it cannot reach them.
+
+    >>> tolerances(None, 1e-10, jnp.float64)
+    (1e-09, 1e-10)
+    """
+    double = dtype == jnp.float64
+    rtol = (1e-9 if double else 2e-5) if rtol is None else rtol
+    atol = (1e-12 if double else 1e-7) if atol is None else atol
+    if not 0 < rtol < np.inf or not 0 <= atol < np.inf:
+        raise ValueError(f"simulate: wanted rtol > 0 and atol >= 0, got rtol={rtol}, atol={atol}")
+    floor = 100 * float(jnp.finfo(dtype).eps)
+    # A relative tolerance below this cannot be met: steps shrink until max_steps ends the run.
+    if rtol < floor:
+        advice = "" if double else "; set jax.config.update('jax_enable_x64', True) for float64"
+        warnings.warn(
+            f"simulate: {np.dtype(dtype).name} cannot reach rtol={rtol:g}; "
+            f"using {floor:.1g}{advice}",
+            stacklevel=3,
+        )
+        rtol = floor
+    return rtol, atol
+
+
+def times(ts: Any, throw: bool) -> Array:
+    """`ts` as an array of increasing times; poisoned where it is not, is traced and may not throw.
+
+    >>> times([0, 1, 2], True).shape
+    (3,)
+    """
+    try:
+        length = np.shape(ts)
+    except ValueError:
+        length = ()
+    if len(length) != 1 or length[0] < 2:
+        raise ValueError(f"ts: wanted at least two times, shape (T,), got shape {length}")
+    found = _checks.floating(ts, length, "ts")
+    if throw or _checks.known(found):
+        found = _checks.finite(found, "ts")
+    xp = _checks.namespace(found)
+    numbers = xp.asarray(found)
+    falling = ~(numbers[1:] > numbers[:-1])
+    where = ""
+    if xp is np and falling.any():
+        i = int(np.argmax(falling)) + 1
+        where = f"; ts[{i}] is not above the one before"
+        if _checks.known(ts) and float(ts[i]) > float(ts[i - 1]):
+            where += (
+                f" in {found.dtype}, which cannot tell {ts[i - 1]!r} from {ts[i]!r}: count time "
+                "from nearer by, or use float64"
+            )
+    return _guard(found, falling.any(), f"ts: wanted increasing times{where}", throw)
+
+
+def first_step(dt0: Any, times: Array) -> Array | None:
+    """`dt0` in the precision of `times`; refused where it is no step, or too short to count.
+
+    >>> first_step(0.5, jnp.array([0.0, 1.0]))
+    Array(0.5, dtype=float64)
+    """
+    if dt0 is None:
+        return None
+    step = jnp.asarray(dt0, times.dtype)
+    if not _checks.known(step):
+        return step
+    if not 0 < float(step) < np.inf:
+        raise ValueError(
+            f"dt0: wanted a positive step, s, got {dt0}; times run forwards, and to go back in "
+            "time negate Ω (v too) and the torque's time"
+        )
+    if _checks.known(times):
+        gap = float(np.spacing(np.abs(np.asarray(times)).max()))
+        if float(step) < 8 * gap:
+            raise ValueError(
+                f"dt0: steps of {dt0} s are too short for {times.dtype}, whose times near "
+                f"{float(np.abs(np.asarray(times)).max()):g} s are {gap:.2g} s apart; count time "
+                "from nearer by, or use float64"
+            )
+    return step
+
+
+def start(state0: Any, throw: bool) -> Any:
+    """`state0` of one body, finite, with a unit quaternion; poisoned as `times` does it."""
+    if not isinstance(state0, Spin | Attitude | Rigid | Point):
+        raise TypeError(
+            "state0: wanted Spin, Attitude or Rigid, or Point without a body, got "
+            f"{type(state0).__name__}"
+        )
+    name, first = ("v", state0.v) if isinstance(state0, Point) else ("omega", state0.omega)
+    if first.ndim != 1:
+        raise ValueError(
+            f"state0: wanted one body, {name} of shape (3,), got {first.shape}; batch with jax.vmap"
+        )
+    names = [str(path[-1]).lstrip(".") for path, _ in jax.tree.leaves_with_path(state0)]
+    leaves, tree = jax.tree.flatten(state0)
+    leaves = [
+        _checks.finite(leaf, name) if throw or _checks.known(leaf) else leaf
+        for leaf, name in zip(leaves, names, strict=True)
+    ]
+    state0 = jax.tree.unflatten(tree, leaves)
+    if isinstance(state0, HasAttitude):
+        xp = _checks.namespace(state0.q)
+        far = xp.abs(xp.sqrt(xp.sum(xp.square(state0.q))) - 1) > (
+            1e-6 if state0.q.dtype == jnp.float64 else 1e-3
+        )
+        q = _guard(
+            state0.q,
+            far,
+            "q: wanted a unit quaternion (w, x, y, z), got one whose length is not 1; normalise it "
+            "with rigidjax.quaternion.normalise, and mind that the scalar comes first",
+            throw,
+        )
+        state0 = eqx.tree_at(lambda s: s.q, state0, q)
+    return state0
+
+
+def _guard(value: Array, bad: Any, message: str, throw: bool) -> Array:
+    """As `_checks.refuse`; but one bad body in a batch must not end the run of the others."""
+    if throw or _checks.known(bad):
+        return _checks.refuse(value, bad, message)
+    return jnp.where(bad, jnp.full_like(value, jnp.nan), value)

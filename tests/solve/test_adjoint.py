@@ -1,0 +1,155 @@
+"""Gradients of our own loop: against forward mode of the same steps, closed forms and differences."""
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import rigidjax as rj
+from rigidjax.solve import lean, travel
+
+Q = np.array([0.8, -0.2, 0.4, 0.4]) / np.linalg.norm([0.8, -0.2, 0.4, 0.4])
+TENSOR = np.array([[1.0, 0.05, -0.1], [0.05, 1.7, 0.2], [-0.1, 0.2, 2.2]])
+EDGES = jnp.array([0.4, 0.7, 1.1])
+TIMES = jnp.array([0.0, 0.3, 0.6, 0.75, 1.5])
+
+
+class Wheel(eqx.Module):
+    """A torque that depends on time, attitude, rate, and a table of whole numbers."""
+
+    wheel: jax.Array
+    rows: jax.Array
+
+    def __call__(self, t, state, body):
+        turning = jnp.cross(self.wheel[self.rows], state.omega)
+        pull = rj.quaternion.rotate_inverse(state.q, jnp.stack([jnp.sin(t), 0 * t, jnp.cos(3 * t)]))
+        return turning + pull
+
+
+def scenes(p):
+    """Laws with all numbers that they can have a derivative by."""
+    top = rj.torques.HeavyTop(1.0 + p[0], jnp.array([0.0, 0.1, 0.4]) + p[1], [0.0, 0.0, -9.81])
+    pulses = rj.torques.Pulses(EDGES + p[:3], [[0.5, 0.0, 1.0], [0.0, -2.0, 0.3]])
+    wheel = Wheel(jnp.array([0.3, 0.1, -0.2]) + p[:3], jnp.array([2, 0, 1]))
+    return {"pulses": rj.torques.Sum(pulses, top), "wheel": wheel}
+
+
+def run(name, ts, way, p, weights, max_steps=100_000):
+    """A number made of all states at all times; `p` (3,) of the law, (6,) of the body, (7,) start."""
+    law, body, start = p[:3], p[3:9], p[9:]
+    tensor = jnp.asarray(TENSOR) + jnp.diag(body[:3])
+    tensor = tensor + _symmetric(body[3:])
+    torque = scenes(law)[name]
+    field = rj.AttitudeEquations(rj.Inertia(tensor), torque)
+    y0 = rj.Attitude(jnp.asarray(Q) + start[:4], jnp.array([1.3, 0.7, -1.6]) + start[4:])
+    jumps = rj.torques.jumps_of(torque)
+    out = lean.adaptive(
+        rj.solvers.DormandPrince8(), field, ts, y0, rtol=1e-10, atol=1e-12, jumps=jumps, way=way,
+        max_steps=max_steps,
+    )  # fmt: skip
+    flat = jnp.concatenate([out.ys.q, out.ys.omega], axis=1)
+    return (weights[: flat.shape[0]] * jnp.sin(flat)).sum()
+
+
+def _symmetric(off):
+    zero = jnp.zeros(())
+    a, b, c = off
+    return jnp.stack([jnp.stack([zero, a, b]), jnp.stack([a, zero, c]), jnp.stack([b, c, zero])])
+
+
+WEIGHTS = jnp.asarray(np.random.default_rng(1).normal(size=(5, 7)))
+
+
+@pytest.mark.parametrize("name", ["pulses", pytest.param("wheel", marks=pytest.mark.slow)])
+def test_reverse_is_forward_to_round_off_and_close_to_differences(name):
+    p = jnp.zeros(16)
+
+    @jax.jit
+    def both(p, direction):
+        back = jax.grad(lambda p: run(name, TIMES, travel.reverse, p, WEIGHTS))(p)
+        # One tangent, in random directions: as telling as all of them, and quick to compile.
+        ahead = jax.jvp(lambda p: run(name, TIMES, travel.forward, p, WEIGHTS), (p,), (direction,))[
+            1
+        ]
+        return back, ahead
+
+    rng = np.random.default_rng(2)
+    for _ in range(3):
+        direction = jnp.asarray(rng.normal(size=16))
+        back, ahead = both(p, direction)
+        np.testing.assert_allclose(back @ direction, ahead, rtol=1e-11)
+    value = jax.jit(lambda p: run(name, TIMES, travel.forward, p, WEIGHTS))
+    step = 1e-4 * direction
+    slope = (
+        8 * (value(p + step) - value(p - step)) - value(p + 2 * step) + value(p - 2 * step)
+    ) / 12
+    np.testing.assert_allclose(back @ step, slope, rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_times_batches_and_second_derivatives():
+    p = jnp.zeros(16)
+
+    def value(ts, p):
+        return run("pulses", ts, travel.reverse, p, WEIGHTS)
+
+    @jax.jit
+    def all_of(ts, p, turn):
+        by_time, _ = slopes = jax.grad(value, (0, 1))(ts, p)
+        many = jax.vmap(jax.grad(value, (0, 1)), (None, 0))(ts, jnp.stack([p, p + 0.01 * turn]))
+        second = jax.jvp(lambda p: jax.grad(value, 1)(ts, p), (p,), (turn,))[1]
+        return by_time, slopes, many, second
+
+    turn = jnp.asarray(np.random.default_rng(3).normal(size=16))
+    by_time, slopes, many, second = all_of(TIMES, p, turn)
+    for alone, lane in zip(slopes, many, strict=True):
+        np.testing.assert_allclose(lane[0], alone, rtol=1e-10, atol=1e-10)
+    plain, slope = jax.jit(value), jax.jit(jax.grad(value, 1))
+    moved = slope(TIMES, p + 0.01 * turn)
+    np.testing.assert_allclose(many[1][1], moved, rtol=1e-10, atol=1e-10)
+    for i in range(5):
+        h = 1e-5 * (np.arange(5) == i)
+        rise = (plain(TIMES + h, p) - plain(TIMES - h, p)) / 2e-5
+        np.testing.assert_allclose(by_time[i], rise, atol=2e-7)
+    h = 1e-5 * turn
+    bend = (slope(TIMES, p + h) - slope(TIMES, p - h)) / 2e-5
+    np.testing.assert_allclose(second, bend, atol=1e-4 * np.abs(bend).max())
+
+
+def test_many_chapters_are_one(monkeypatch):
+    ts = jnp.linspace(0.0, 1.5, 5)
+
+    def slope(p):
+        return jax.grad(lambda p: run("pulses", ts, travel.reverse, p, WEIGHTS, 300))(p)
+
+    whole = jax.jit(slope)(jnp.zeros(16))
+    monkeypatch.setattr(travel, "CHAPTER", 7)
+    monkeypatch.setattr(travel, "LANES", 3)
+    chapters = jax.jit(lambda p: slope(p))(jnp.zeros(16))
+    np.testing.assert_allclose(chapters, whole, rtol=1e-10, atol=1e-11)
+
+
+def test_through_simulate_each_rung_and_what_is_refused():
+    ts = [0.0, 0.2, 1.0]
+    damping = rj.torques.Damping([0.3, 0.3, 0.3])
+    body = rj.Inertia.from_principal(2.0, 2.0, 2.0)
+
+    def rate(c, inertia):
+        body = rj.Inertia(inertia * jnp.eye(3))
+        out = rj.simulate(
+            body, rj.Spin([0.0, 0.0, 1.5]), ts, rj.torques.Damping(c * jnp.ones(3)), rtol=1e-12
+        )
+        return out.ys.omega[-1, 2]
+
+    # ω = ω0 exp(−c t / I)
+    by_c, by_inertia = jax.jit(jax.grad(rate, (0, 1)))(jnp.asarray(0.3), jnp.asarray(2.0))
+    end = 1.5 * np.exp(-0.15)
+    np.testing.assert_allclose(by_c, -end / 2, rtol=1e-10)
+    np.testing.assert_allclose(by_inertia, end * 0.3 / 4, rtol=1e-10)
+    with pytest.raises(TypeError, match="forward-mode"):
+        jax.jacfwd(rate)(jnp.asarray(0.3), jnp.asarray(2.0))
+    late = rj.simulate(body, rj.Spin([0.0, 0.0, 1.5]), ts, damping, max_steps=2, throw=False)
+    assert late.result == dfx.RESULTS.max_steps_reached
+    assert np.all(np.isnan(late.ys.omega[-1])) and np.all(np.isfinite(late.ys.omega[0]))
