@@ -1,0 +1,361 @@
+"""Several recordings, pieces, priors, profiles, comparison, design, checkpoints, reports."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import rigidjax as rj
+from rigidjax import identify
+from rigidjax.__main__ import main
+from rigidjax.identify.problem import errors_of_one, with_blocks
+from rigidjax.identify.stacking import one
+
+BODY = rj.Inertia.from_principal(1.0, 1.6, 2.1)
+DRAG = [0.05, 0.08, 0.02]
+RATES = ([0.4, 1.2, -0.3], [1.0, 0.2, 0.5], [-0.3, 0.9, 1.1])
+
+
+def throw(omega, bias, count=60, seed=0, sigma=0.005):
+    """A damped body with a wheel inside, read by a gyro with a bias."""
+    ts = jnp.arange(count) * 0.05
+    speed = rj.torques.Series(np.arange(80) * 0.05, 3.0 * np.tanh(np.arange(80) * 0.05))
+    law = rj.torques.Sum(
+        rj.torques.Flywheel(rj.torques.Wheel(0.2, [0.0, 0.0, 1.0], speed)),
+        rj.torques.Damping(DRAG),
+    )
+    ys = rj.simulate(BODY, rj.Spin(omega), ts, law).ys.omega
+    read = np.asarray(ys) + np.asarray(bias)
+    read = read + sigma * np.random.default_rng(seed).normal(size=read.shape)
+    start = rj.torques.Sum(law.parts[0], rj.torques.Damping([0.0, 0.0, 0.0]))
+    gyro = identify.Gyro(sigma, bias=[0.0, 0.0, 0.0])
+    return identify.Recording(ts, (gyro, read), torque=start)
+
+
+FREE = [
+    identify.Free(lambda r: r.torque.parts[1].coefficient, "drag", scale=0.05),
+    identify.Free(lambda r: r.readings[0].sensor.bias, "bias", scale=0.05, each=True),
+]
+BIASES = ([0.02, -0.03, 0.01], [0.0, 0.05, 0.0], [-0.04, 0.0, 0.02])
+
+
+@pytest.fixture(scope="module")
+def records():
+    counts = (60, 52, 60)
+    return [
+        throw(o, b, n, k) for k, (o, b, n) in enumerate(zip(RATES, BIASES, counts, strict=True))
+    ]
+
+
+@pytest.fixture(scope="module")
+def joint(records):
+    problem = identify.Problem(records, identify.Tensor(1.5), free=FREE)
+    return identify.fit(problem, starts=1)
+
+
+def test_three_throws_of_different_lengths_give_one_body_with_its_scale(joint):
+    assert joint.ok
+    bounds = joint.interval(0.999)
+    truth = {"I1": 1.0, "I2": 1.6, "I3": 2.1, "Ixy": 0.0}
+    truth |= {f"drag {a}": v for a, v in zip("xyz", DRAG, strict=True)}
+    for record, bias in enumerate(BIASES):
+        truth |= {f"bias {a} [{record}]": v for a, v in zip("xyz", bias, strict=True)}
+    for name, value in truth.items():
+        low, high = bounds[name]
+        assert low <= value <= high, name
+        assert high - low < 0.4
+    assert joint.values["bias"].shape == (3, 3)
+    assert joint.state0.omega.shape == (3, 3)
+    assert joint.residuals[0].shape == (3, 60, 3)
+    assert not np.asarray(joint.residuals[0])[1, 52:].any()
+    assert 0.8 < joint.chi2 / joint.dof < 1.2
+
+
+def test_the_blocks_are_the_derivative(joint):
+    problem, at = joint.problem, joint.parameters
+    (errors, _), (blocks, _) = with_blocks(at, problem)
+    for index in range(3):
+        own, record, ref = (one(x, index) for x in (at.own, problem.records, problem.reference))
+
+        def body(vector, own=own, record=record, ref=ref):
+            return errors_of_one(problem, vector, at.shared, own, record, ref)[0][0]
+
+        for column in range(2):
+            step = jnp.zeros(6).at[column].set(1e-5)
+            slope = (body(at.body + step) - body(at.body - step)) / 2e-5
+            np.testing.assert_allclose(blocks[0][index, ..., column], slope, atol=1e-7)
+    assert errors[0].shape == (3, 60, 3)
+
+
+def test_models_are_compared_and_the_right_one_wins(records, joint):
+    plain = identify.Problem(records, identify.Tensor(1.5), free=FREE[1:])
+    rows = identify.compare({"drag": joint, "no drag": identify.fit(plain, starts=1)})
+    assert [row.name for row in rows] == ["drag", "no drag"]
+    assert rows[0].information == 0 and rows[1].information > 10
+    short = identify.fit(
+        identify.Problem(records[:1], identify.Tensor(1.5), free=FREE[1:]), starts=1
+    )
+    with pytest.raises(ValueError, match="wanted fits of the same readings"):
+        identify.compare({"all": joint, "one": short})
+
+
+@pytest.mark.slow
+def test_the_left_out_throw_is_predicted_best_by_the_right_model(records):
+    with_drag, without = (
+        identify.cross_validate(
+            lambda r, free=free: identify.Problem(r, identify.Tensor(1.5), free=free),
+            records,
+            starts=1,
+        )
+        for free in (FREE, FREE[1:])
+    )
+    assert np.sum(np.square(with_drag)) < 0.8 * np.sum(np.square(without))
+
+
+def test_priors_hold_what_the_data_cannot_see(records):
+    free = [
+        identify.Free(
+            lambda r: r.torque.parts[0].momentum.inertia,
+            "wheel",
+            scale=0.2,
+            positive=True,
+            prior=0.1,
+        ),
+        FREE[0],
+        FREE[1],
+    ]
+    found = identify.fit(identify.Problem(records, identify.Tensor(1.5), free=free), starts=1)
+    low, high = found.interval(0.95)["wheel"]
+    # The scale of everything hangs on the wheel: its prior is all that is known of it.
+    np.testing.assert_allclose(np.log(high / low) / (2 * 1.96), 0.1, rtol=0.1)
+    assert any("go together" in line for line in found.identifiability)
+
+
+def test_the_entropic_prior_is_the_divergence():
+    for chart, guess, other in (
+        (identify.Tensor(1.0), BODY, rj.Inertia.from_principal(1.4, 1.5, 1.9)),
+        (identify.Mass(rj.shapes.box(1.0, [1.0, 2.0, 3.0])), rj.shapes.box(1.0, [1.0, 2, 3]), None),
+    ):
+        prior = identify.Entropic(guess, 2.0)
+        body = other if other is not None else chart.body(0.1 * jnp.arange(10.0))
+        if isinstance(body, rj.MassProperties):
+            wanted = rj.body.divergence(body, guess)
+        else:
+            ratio = np.linalg.solve(guess.second_moment, body.second_moment)
+            wanted = np.trace(ratio) - np.log(np.linalg.det(ratio)) - 3
+        np.testing.assert_allclose(0.5 * jnp.sum(prior.residuals(body) ** 2), 2 * wanted, rtol=1e-9)
+
+
+@pytest.fixture(scope="module")
+def free_record():
+    ts = jnp.linspace(0.0, 30.0, 121)
+    omega = rj.simulate(BODY, rj.Spin([0.4, 1.2, -0.3]), ts).ys.omega
+    read = np.asarray(omega) + 0.01 * np.random.default_rng(9).normal(size=omega.shape)
+    return identify.Recording(ts, (identify.Gyro(0.01), read))
+
+
+def test_pieces_meet_and_give_the_start(free_record):
+    problem = identify.Problem(free_record, identify.PrincipalRatios())
+    whole = identify.fit(problem, starts=1, pieces=6)
+    assert whole.ok
+    np.testing.assert_allclose(
+        np.exp(problem.body.logs(whole.body)), [1 / 2.1, 1.6 / 2.1], rtol=0.02
+    )
+    cut = identify.fit(identify.pieces(problem, 6), starts=1)
+    np.testing.assert_allclose(
+        problem.body.logs(cut.body), problem.body.logs(whole.body), atol=5e-3
+    )
+    states = cut.state0.omega
+    motion = rj.simulate(whole.body, whole.state0, free_record.t).ys.omega
+    np.testing.assert_allclose(states, motion[::20][:6], atol=0.02)
+    with pytest.raises(ValueError, match="at least two pieces of four samples"):
+        identify.pieces(problem, 60)
+
+
+def test_profile_agrees_with_the_covariance_where_the_misfit_is_quadratic(free_record):
+    problem = identify.Problem(free_record, identify.PrincipalRatios())
+    found = identify.fit(problem, starts=1)
+    low, high = identify.profile(found, "Ix/Iz")
+    np.testing.assert_allclose([low, high], found.interval()["Ix/Iz"], rtol=2e-3)
+    with pytest.raises(ValueError, match=r"no quantity 'mass'; wanted one of Ix/Iz"):
+        identify.profile(found, "mass")
+
+
+def test_a_design_expects_what_a_fit_then_finds(free_record):
+    problem = identify.Problem(free_record, identify.PrincipalRatios())
+    found = identify.fit(problem, starts=1)
+    plan = identify.plan_of(problem, BODY, [0.4, 1.2, -0.3])
+    for before, after in zip(identify.expected(problem, plan), found.quantities, strict=True):
+        np.testing.assert_allclose(before.deviation, after.deviation, rtol=0.05)
+    start = [0.05, 0.1, 1.3]
+    rate, promise = identify.best_first_rate(problem, BODY, start)
+    poor = identify.expected(problem, identify.plan_of(problem, BODY, start))
+    np.testing.assert_allclose(jnp.linalg.norm(rate), np.linalg.norm(start), rtol=1e-9)
+    doubts = [np.prod([q.deviation for q in qs[:2]]) for qs in (promise, poor)]
+    assert doubts[0] < 0.5 * doubts[1]
+    silent = identify.Recording(free_record.t, (identify.Gyro(), free_record.readings[0].values))
+    with pytest.raises(ValueError, match="a Gyro with known noise"):
+        identify.expected(identify.Problem(silent, identify.PrincipalRatios()), plan)
+
+
+def test_many_starts_in_one_vmap_end_where_they_do_one_by_one(free_record):
+    problem = identify.Problem(free_record, identify.PrincipalRatios())
+    alone, at_once = (identify.fit(problem, starts=4, together=n) for n in (1, 4))
+    assert len(at_once.starts) == 4
+    np.testing.assert_allclose(at_once.parameters.body, alone.parameters.body, atol=1e-6)
+
+
+def test_a_fit_goes_on_from_its_checkpoint(free_record, tmp_path):
+    problem = identify.Problem(free_record, identify.PrincipalRatios())
+    path = tmp_path / "fit.npz"
+    whole = identify.fit(problem, starts=3)
+
+    class StopError(Exception):
+        pass
+
+    def stop(line):
+        if line.startswith("start 2"):
+            raise StopError
+
+    with pytest.raises(StopError):
+        identify.fit(problem, starts=3, checkpoint=path, progress=stop)
+    lines = []
+    again = identify.fit(problem, starts=3, checkpoint=path, progress=lines.append)
+    assert len(lines) == 1
+    for a, b in zip(
+        jax.tree.leaves(again.parameters), jax.tree.leaves(whole.parameters), strict=True
+    ):
+        np.testing.assert_array_equal(a, b)
+    other = identify.Problem(free_record, identify.PrincipalRatios(), loss=identify.Huber(0.5))
+    with pytest.raises(ValueError, match="the checkpoint of another problem"):
+        identify.fit(other, starts=3, checkpoint=path)
+
+
+KILLED = """
+import sys, jax
+jax.config.update("jax_enable_x64", True)
+import numpy as np, jax.numpy as jnp, rigidjax as rj
+from rigidjax import identify
+ts = jnp.linspace(0.0, 30.0, 121)
+omega = rj.simulate(rj.Inertia.from_principal(1.0, 1.6, 2.1), rj.Spin([0.4, 1.2, -0.3]), ts).ys.omega
+read = np.asarray(omega) + 0.01 * np.random.default_rng(9).normal(size=omega.shape)
+problem = identify.Problem(identify.Recording(ts, (identify.Gyro(0.01), read)), identify.Ratios())
+found = identify.fit(problem, starts=int(sys.argv[2]), checkpoint=sys.argv[1], progress=print)
+np.save(sys.argv[3], np.concatenate([np.ravel(x) for x in jax.tree.leaves(found.parameters)]))
+"""
+
+
+@pytest.mark.slow
+def test_a_killed_fit_resumes_to_the_same_point(tmp_path):
+    def run(name, **how):
+        ends = str(tmp_path / f"{name}.npz"), "40", str(tmp_path / f"{name}.npy")
+        return subprocess.Popen([sys.executable, "-c", KILLED, *ends], **how)
+
+    assert run("whole").wait(600) == 0
+    process = run("killed")
+    while not (tmp_path / "killed.npz").exists():
+        assert process.poll() is None
+        time.sleep(0.05)
+    os.kill(process.pid, signal.SIGKILL)
+    assert process.wait() == -signal.SIGKILL
+    assert run("killed").wait(600) == 0
+    np.testing.assert_array_equal(np.load(tmp_path / "killed.npy"), np.load(tmp_path / "whole.npy"))
+
+
+def test_the_command_line_reads_wheels_and_writes_reports(records, tmp_path, capsys):
+    paths = []
+    for index, record in enumerate(records[::2]):
+        speed = 3.0 * np.tanh(np.asarray(record.t))
+        rows = np.column_stack([record.t, record.readings[0].values, speed])
+        paths.append(str(tmp_path / f"throw{index}.csv"))
+        np.savetxt(paths[-1], rows, delimiter=",", header="t,wx,wy,wz,s", comments="")
+    page, numbers = tmp_path / "out.html", tmp_path / "out.json"
+    command = ["identify", *paths, "--wheel", "s:0.2:z", "--model", "tensor", "--typical", "1.5"]
+    command += ["--free", "drag", "bias", "--starts", "1"]
+    assert main([*command, "--report", str(page), "--json", str(numbers)]) == 0
+    out = capsys.readouterr().out
+    assert "status: ok" in out and "I3" in out and "drag x" in out
+    held = json.loads(numbers.read_text())
+    assert held["status"] == "ok" and held["files"] == ["throw0.csv", "throw1.csv"]
+    low, high = held["quantities"]["I3"]["interval_95"]
+    assert 0.9 * low < 2.1 < 1.1 * high
+    text = page.read_text()
+    assert text.count("data:image/png;base64,") == 2
+    assert "http" not in text
+    assert "throw1.csv" in text and "95 % interval" in text
+
+
+WRONG = [
+    (["--sensor", "gyro=wx,wy"], "wanted 3 columns, got 'wx,wy'"),
+    (["--sensor", "compass=a,b,c"], "wanted gyro, accelerometer, quaternion or euler-SEQUENCE"),
+    (["--sensor", "gyro=wx,wy,wz:km/h"], "wanted the unit rad/s or deg/s or rpm, got 'km/h'"),
+    (["--sensor", "gyro=wx,wy,wz:rad/s:-1"], "wanted a positive noise"),
+    (["--wheel", "s"], "wanted COLUMN:INERTIA"),
+    (["--wheel", "s:1:w"], "wanted an axis x, y or z"),
+    (["--model", "tensor"], "free motion shows ratios only; a scale needs a --wheel"),
+    (["--window", "5", "6"], "fewer than 4 samples between 5.0 and 6.0 s"),
+]
+
+
+@pytest.mark.parametrize(("options", "words"), WRONG)
+def test_mistakes_on_the_command_line(options, words, tmp_path, capsys):
+    path = tmp_path / "log.csv"
+    rows = "\n".join(f"{0.1 * k:.1f},1,0,{0.01 * k},3" for k in range(12))
+    path.write_text("t,wx,wy,wz,s\n" + rows)
+    assert main(["identify", str(path), *options]) == 2
+    out = capsys.readouterr()
+    assert words in out.err and out.err.count("\n") == 1 and out.out == ""
+
+
+def test_logs_of_other_kinds(tmp_path):
+    t = np.arange(6) * 0.1
+    np.savez(tmp_path / "a.npz", t=t, w=np.ones(6))
+    assert identify.read_table(tmp_path / "a.npz", ["t", "w"])["w"].shape == (6,)
+    from scipy.io import savemat
+
+    savemat(tmp_path / "a.mat", {"t": t, "w": np.ones(5)})
+    with pytest.raises(identify.LogError, match="arrays of different lengths"):
+        identify.read_table(tmp_path / "a.mat", ["t", "w"])
+    with pytest.raises(identify.LogError, match="no array 'q'; the arrays are t, w"):
+        identify.read_table(tmp_path / "a.npz", ["q"])
+
+
+MISTAKES = [
+    (lambda r: identify.Free(lambda x: x.readings[0].sensor.scale, "scale"), "None is there; give it a starting value"),
+    (lambda r: identify.Free(lambda x: x.readings[3].sensor, "x"), "nothing is there"),
+    (lambda r: identify.Free(lambda x: x.readings[0].sensor, "x"), "wanted one array, got Gyro"),
+    (lambda r: identify.Free(lambda x: x.readings[0].sensor.bias, "x", positive=True), "wanted a positive starting value"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("free", "words"), MISTAKES)
+@pytest.mark.usefixtures("unhooked")
+def test_what_is_free_is_checked(records, free, words):
+    with pytest.raises(ValueError, match=words):
+        identify.Problem(records, identify.Tensor(1.5), free=[free(records)])
+
+
+@pytest.mark.usefixtures("unhooked")
+def test_other_mistakes_are_named(records, free_record):
+    with pytest.raises(ValueError, match="the one at index 1 differs from the first"):
+        identify.Problem([records[0], free_record], identify.Tensor(1.5))
+    with pytest.raises(ValueError, match="at least one Recording, got an empty sequence"):
+        identify.Problem([], identify.Tensor(1.5))
+    with pytest.raises(ValueError, match="has a torque of its own; put both in it"):
+        identify.Problem(records, identify.Tensor(1.5), torque=rj.torques.Damping([1.0, 1, 1]))
+    marker = identify.Recording([0.0, 1.0], (identify.Marker([0.0, 0, 0]), np.zeros((2, 3))))
+    with pytest.raises(ValueError, match=r"wanted Mass\(guess\) or Known"):
+        identify.Problem(marker, identify.Tensor(1.0))
+    with pytest.raises(ValueError, match="wanted a positive moment of inertia"):
+        identify.Tensor(-1.0)
+    with pytest.raises(ValueError, match="wanted at least one step, got 0"):
+        identify.FixedSteps(0)
+    with pytest.raises(ValueError, match="a positive scale, got 0"):
+        identify.Free(lambda r: r, "x", scale=0.0)

@@ -1,0 +1,72 @@
+"""Real throws with a flywheel: calibration, choice of a model, two objects of known inertia."""
+
+import importlib.util
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+_spec = importlib.util.spec_from_file_location("throws", Path(__file__).with_name("throws.py"))
+throws = importlib.util.module_from_spec(_spec)
+_spec.loader.exec_module(throws)
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(
+        not throws.FOLDER.exists(), reason="the throws are not beside this checkout"
+    ),
+]
+GROUPS = ("calibration_device_only", "calibration_proof_body", "object_empty", "object_a")
+
+
+@pytest.fixture(scope="module")
+def found():
+    return {g: {m: throws.fits(g, m) for m in throws.MODELS} for g in GROUPS}
+
+
+@pytest.fixture(scope="module")
+def model(found):
+    """The model that the data ask for: all throws together, no truth looked at."""
+    total = dict.fromkeys(throws.MODELS, 0.0)
+    for group in GROUPS:
+        for name, value in throws.preference(group, found[group]).items():
+            total[name] += value
+        print(group, throws.preference(group, found[group]))
+    return min(total, key=total.get)
+
+
+def test_the_data_ask_for_drag_and_bias(model):
+    assert model == "delay drag bias"
+
+
+def test_no_throw_diverges_from_a_blind_start(found, model):
+    for group in GROUPS:
+        assert all(f.ok for f in found[group][model])
+
+
+def test_the_calibration_reproduces_the_proof_body(found, model):
+    _, moments = throws.calibrate(*(found[g][model] for g in GROUPS[:2]))
+    print("proof body", moments, moments / throws.PROOF_MOMENTS - 1)
+    # The bar of the issue is 1 %; measured 0.8 %.
+    np.testing.assert_allclose(moments, throws.PROOF_MOMENTS, rtol=0.01)
+
+
+@pytest.mark.parametrize("group", GROUPS[2:])
+def test_an_object_of_known_inertia(found, model, group):
+    device = found[GROUPS[0]][model]
+    factor, _ = throws.calibrate(device, found[GROUPS[1]][model])
+    _, truth = throws.OBJECTS[group]
+    errors, covered = [], 0
+    for fit in found[group][model]:
+        moments = throws.object_moments(group, fit.body.tensor, device, factor)
+        errors.append(moments / truth - 1)
+        # The wheel's calibration is itself known to about a per cent.
+        reach = 2 * np.hypot(throws.relative_deviation(fit), 0.01)
+        covered += int(np.sum(np.abs(errors[-1]) <= reach))
+    errors = np.array(errors)
+    print(group, "mean |error| %", 100 * np.abs(errors).mean(), "mean", 100 * errors.mean(axis=0))
+    print("worst %", 100 * np.abs(errors).max(), "intervals that hold", covered, "of", errors.size)
+    assert np.abs(errors).mean() <= 0.025
+    assert np.abs(errors.mean(axis=0)).max() <= 0.04
+    assert np.abs(errors).max() <= 0.08
+    assert covered >= 0.5 * errors.size
