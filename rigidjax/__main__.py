@@ -154,7 +154,7 @@ def _logs(options: argparse.Namespace) -> int:
         print(f"error: {error}", file=sys.stderr)
         return 2
     for path, record in zip(options.logs, records, strict=True):
-        print(f"{path}: {record.t.shape[0]} samples over {record.t[-1] - record.t[0]:.4g} s")
+        print(f"{path}: {_extent(record)}")
     print()
     try:
         found = rj.identify.fit(
@@ -173,6 +173,13 @@ def _logs(options: argparse.Namespace) -> int:
     print()
     print(rj.identify.report.verdict(found))
     return _write(found, options, rate_unit)
+
+
+def _extent(record: rj.identify.Recording) -> str:
+    gaps = sum(int((~reading.seen).sum()) for reading in record.readings) + record.dropped
+    told = f", {gaps} gap{'s' if gaps > 1 else ''}" if gaps else ""
+    count = record.t.shape[0] + record.dropped
+    return f"{count} samples over {record.t[-1] - record.t[0]:.4g} s{told}"
 
 
 def _write(found: Any, options: argparse.Namespace, rate_unit: str) -> int:

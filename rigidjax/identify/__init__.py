@@ -21,7 +21,11 @@ from rigidjax.identify.design import (
     fisher as fisher,
     plan_of as plan_of,
 )
-from rigidjax.identify.files import LogError as LogError, read_gyro_csv as read_gyro_csv
+from rigidjax.identify.files import (
+    LogError as LogError,
+    read_gyro_csv as read_gyro_csv,
+    read_table as read_table,
+)
 from rigidjax.identify.fit import Fit as Fit, Start as Start, fit as fit
 from rigidjax.identify.free import Free as Free
 from rigidjax.identify.loss import AbstractLoss as AbstractLoss, Huber as Huber, SoftL1 as SoftL1

@@ -93,7 +93,7 @@ def fisher(problem: Problem, parameters: Parameters) -> Float[Array, "n n"]:
             )
             errors, _ = errors_of_one(problem, here.body, here.shared, own, record, ref)
             parts += [
-                (e / reading.sensor.noise).reshape(-1)
+                (e / reading.sensor.noise[None]).reshape(-1)
                 for e, reading in zip(errors, record.readings, strict=True)
             ]
         return jnp.concatenate(parts)

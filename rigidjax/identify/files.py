@@ -37,7 +37,7 @@ def read_table(path: str | Path, columns: Sequence[str]) -> dict[str, np.ndarray
     """Columns of a log by name: `.csv` with a header line, `.npz`, or `.mat` (MATLAB up to v7).
 
     **Arguments:** `path`; `columns` the names that are wanted, others are ignored. **Returns** name
-    → (T,) numbers. An empty cell or `nan` is a gap and comes back as NaN.
+    → (T,) numbers. An empty cell of a .csv is a gap and comes back as NaN.
 
     **Raises:** `LogError`, one line naming file, line and column, for a file that is missing or not
     of its kind, a missing column, a cell that is not a number, columns of different lengths.
@@ -83,10 +83,7 @@ def read_gyro_csv(
     data = np.stack([table[name] for name in columns], axis=1)
     if not np.isfinite(data).all():
         row, place = np.argwhere(~np.isfinite(data))[0]
-        raise LogError(
-            f"{path}: line {row + 2}: column {columns[place]!r}: {data[row, place]} is not a "
-            "finite number"
-        )
+        raise LogError(f"{path}: column {columns[place]!r}: row {row + 1} is empty")
     increasing(path, data[:, 0], columns[0])
     sensor = Gyro(None if noise is None else noise * UNITS[unit])
     return Recording(data[:, 0], (sensor, data[:, 1:] * UNITS[unit]))
@@ -145,9 +142,12 @@ def _number(path: Path, line: int, column: str, cells: list[str], place: int) ->
     if not cell:
         return math.nan
     try:
-        return float(cell)
+        value = float(cell)
     except ValueError:
         raise LogError(f"{where}: {cells[place]!r} is not a number") from None
+    if not math.isfinite(value):
+        raise LogError(f"{where}: {cell} is not a finite number; leave the cell empty for a gap")
+    return value
 
 
 def _arrays(path: Path, columns: Sequence[str]) -> dict[str, np.ndarray]:

@@ -18,13 +18,14 @@ from rigidjax.identify.problem import Parameters, Problem
 from rigidjax.identify.propagate import Adaptive, FixedSteps
 from rigidjax.identify.residual import Noise
 from rigidjax.identify.search import (
-    HORIZONS,
     Checkpoint,
     Tried,
     climb,
     climb_together,
     cost_of,
+    fresh,
     least_squares,
+    settle,
     solver_for,
 )
 from rigidjax.identify.start import starting_points
@@ -141,7 +142,7 @@ def fit(
     starts: int = 8,
     initial: Parameters | None = None,
     key: PRNGKeyArray | None = None,
-    tolerance: float = 1e-10,
+    tolerance: float = 1e-4,
     max_steps: int = 200,
     together: int = 1,
     pieces: int = 1,
@@ -157,7 +158,9 @@ def fit(
       fitted to a quarter, a half and then the whole of the record.
     - `initial`: a starting point of your own, tried first.
     - `key`: random key of the scattered starts; `jax.random.key(0)` unless given.
-    - `tolerance`, `max_steps`: where Levenberg–Marquardt stops, relative and absolute; steps.
+    - `tolerance`, `max_steps`: where Levenberg–Marquardt stops: at steps of so many standard
+      deviations (of each parameter with all others at rest), and misfits that change as little;
+      after so many steps.
     - `together`: how many starts go through one `vmap` at once.
     - `pieces`: where more than one, the record is first fitted in so many pieces whose ends are
       drawn together (see `pieces`), and what they agree on is the first start.
@@ -212,7 +215,7 @@ def fit(
             noise = uncertainty.estimate_noise(
                 problem, uncertainty.errors_at(value, problem), noise, value
             )
-            again = least_squares(value, problem, noise, whole, solver, max_steps)
+            again = settle(fresh(value), problem, noise, whole, solver, max_steps)
             value, done = again.parameters, again.converged
         noise = uncertainty.estimate_noise(
             problem, uncertainty.errors_at(value, problem), noise, value
@@ -249,18 +252,16 @@ def _one_by_one(
         for number, point in enumerate(points, 1):
             if number <= len(keep.done):
                 continue
-            resumed = number == len(keep.done) + 1 and np.isfinite(float(keep.current.cost))
-            stage = keep.stage if resumed else 0
+            resumed = number == len(keep.done) + 1 and keep.stage > 0
             latest = [like]
 
             def look(stage: int, now: Tried) -> None:
                 # A part of the record only: its misfit is no measure of the whole.
-                if stage == len(HORIZONS) - 1:
+                if np.isfinite(float(now.cost)):
                     latest[0] = now  # noqa: B023
-                following = stage + bool(now.converged) if stage < len(HORIZONS) - 1 else stage
-                keep.save(tried, following, now)
+                keep.save(tried, stage, now)
 
-            at = keep.current.parameters if resumed else point
+            at, stage = (keep.current, keep.stage) if resumed else (fresh(point), 0)
             out = climb(at, problem, noise, solver, max_steps, first_stage=stage, look=look)
             latest = [like]
             tried.append(out)
@@ -320,7 +321,7 @@ def _finer_if_needed(
     if not apart > 0.05:
         return problem, best
     whole = jnp.ones_like(problem.records.t)
-    return finer, least_squares(best.parameters, finer, noise, whole, solver, max_steps)
+    return finer, settle(fresh(best.parameters), finer, noise, whole, solver, max_steps)
 
 
 def _first_noise(problem: Problem) -> Noise:

@@ -49,6 +49,7 @@ class Recording(eqx.Module):
     t: Float[Array, "*records times"]
     readings: tuple[Reading, ...]
     torque: Torque | None
+    dropped: int = eqx.field(static=True)
 
     def __init__(self, t: Any, *readings: tuple, torque: Torque | None = None):
         t = np.asarray(t, float)
@@ -71,6 +72,8 @@ class Recording(eqx.Module):
             for sensor, values, mask in rows
         )
         self.torque = torque
+        # Told in reports, and no part of what a fit sees.
+        self.dropped = int((~used).sum())
 
     @property
     def size(self) -> int:

@@ -22,6 +22,8 @@ HORIZONS = (0.25, 0.5, 1.0)
 STRIDE = 25
 # How many times the curvature's root a unit of the search is: 1/30² is where the damping starts.
 UNDAMPED = 30.0
+# A stride that lowers the misfit by less than this share has come to the bottom.
+SETTLED = 1e-7
 
 
 class Tried(eqx.Module):
@@ -187,9 +189,12 @@ def _half_sum(tree: Any) -> Float[Array, ""]:
 
 
 def solver_for(tolerance: float) -> optx.LevenbergMarquardt:
-    """Levenberg–Marquardt of optimistix; the tolerance an array, so as not to compile again."""
-    limit: Any = jnp.asarray(tolerance)
-    return optx.LevenbergMarquardt(rtol=limit, atol=limit)
+    """Levenberg–Marquardt of optimistix that stops at steps of `tolerance` standard deviations.
+
+    An array, so as not to compile again.
+    """
+    limit: Any = jnp.asarray(UNDAMPED * tolerance)
+    return optx.LevenbergMarquardt(rtol=jnp.asarray(1e-12), atol=limit)  # pyright: ignore
 
 
 def horizons(problem: Problem) -> tuple[Float[Array, "records times"], ...]:
@@ -246,8 +251,40 @@ class Checkpoint:
         self.done, self.current, self.stage = items[:-1], items[-1], int(stage)
 
 
+def settle(
+    tried: Tried,
+    problem: Problem,
+    noise: Noise,
+    weights: Float[Array, "records times"],
+    solver: Any,
+    max_steps: int,
+    look: Callable[[Tried], None] = lambda tried: None,
+) -> Tried:
+    """Strides from where `tried` ended until one more of them changes nothing.
+
+    A search that says it has converged may only have been damped too much: it has converged where a
+    fresh start from there ends there. `tried.cost` is the misfit at its end, infinite if unknown.
+    """
+    for _ in range(0, max_steps, STRIDE):
+        before = float(tried.cost)
+        count = min(STRIDE, max_steps)
+        tried = least_squares(tried.parameters, problem, noise, weights, solver, count)
+        settled = before - float(tried.cost) < SETTLED * (1.0 + abs(before))
+        if bool(tried.converged) and not settled:
+            tried = Tried(tried.parameters, tried.cost, jnp.asarray(False))
+        look(tried)
+        if bool(tried.converged) or not np.isfinite(float(tried.cost)):
+            break
+    return tried
+
+
+def fresh(point: Parameters) -> Tried:
+    """A start whose misfit is not known yet."""
+    return Tried(point, jnp.asarray(jnp.inf), jnp.asarray(False))
+
+
 def climb(
-    point: Parameters,
+    tried: Tried,
     problem: Problem,
     noise: Noise,
     solver: Any,
@@ -257,23 +294,21 @@ def climb(
     look: Callable[[int, Tried], None] = lambda stage, tried: None,
 ) -> Tried:
     """One start through the horizons; `look` is called after each stride with where it stands."""
-    tried = Tried(point, jnp.asarray(jnp.inf), jnp.asarray(False))
-    rough = eqx.tree_at(
-        lambda s: (s.rtol, s.atol), solver, replace_fn=lambda x: jnp.maximum(x, 1e-4)
-    )
     for stage, seen in enumerate(horizons(problem)):
         if stage < first_stage:
             continue
-        last = stage == len(HORIZONS) - 1
-        # A part of the record need not be fitted to the end, only to come near.
-        for _ in range(0, max_steps if last else min(STRIDE, max_steps), STRIDE):
+        if stage < len(HORIZONS) - 1:
+            # A part of the record need not be fitted to the end, only to come near.
             count = min(STRIDE, max_steps)
-            tried = least_squares(
-                tried.parameters, problem, noise, seen, solver if last else rough, count
-            )
-            look(stage, tried)
-            if bool(tried.converged) or not np.isfinite(float(tried.cost)):
-                break
+            tried = least_squares(tried.parameters, problem, noise, seen, solver, count)
+            tried = fresh(tried.parameters)
+            look(stage + 1, tried)
+            continue
+
+        def at_last(now: Tried, stage: int = stage) -> None:
+            look(stage, now)
+
+        tried = settle(tried, problem, noise, seen, solver, max_steps, at_last)
     return tried
 
 
@@ -282,13 +317,9 @@ def climb_together(
 ) -> list[Tried]:
     """Many starts through the horizons in one `vmap` (a leading axis on `points`)."""
     tried = None
-    rough = eqx.tree_at(
-        lambda s: (s.rtol, s.atol), solver, replace_fn=lambda x: jnp.maximum(x, 1e-4)
-    )
     stages = horizons(problem)
-    for stage, seen in enumerate(stages):
-        last = stage == len(stages) - 1
-        tried = many(points, problem, noise, seen, solver if last else rough, max_steps)
+    for seen in stages:
+        tried = many(points, problem, noise, seen, solver, max_steps)
         points = tried.parameters
     assert tried is not None
     count = int(tried.cost.shape[0])

@@ -160,8 +160,8 @@ def _sandwich(linear: Linearised, bread: np.ndarray, times: "Times") -> np.ndarr
             variance = np.sum(e**2) / max(np.sum(weight > 0), 1)
             # 1 + 2 Σ ρˡ = span for an exponential.
             rho = (span - 1.0) / (span + 1.0)
-            ahead = lfilter([1.0], [1.0, -rho], j, axis=1)
-            behind = lfilter([1.0], [1.0, -rho], j[:, ::-1], axis=1)[:, ::-1]
+            ahead = np.asarray(lfilter([1.0], [1.0, -rho], j, axis=1))
+            behind = np.asarray(lfilter([1.0], [1.0, -rho], j[:, ::-1], axis=1))[:, ::-1]
             meat += variance * np.einsum("rti,rtj->ij", j, ahead + behind - j)
     meat *= times.independent / max(times.independent - n, 0.1 * times.independent)
     scores = linear.scores

@@ -21,7 +21,7 @@ WRONG = {
     "no column": (GOOD.replace("wy", "gyro_y"), "line 1: no column 'wy'; the columns are t, wx, gyro_y, wz"),
     "nan": (_swap(4, "0.2,nan,1,1"), "line 4: column 'wx': nan is not a finite number"),
     "text": (_swap(5, "0.3,1,fast,1"), "line 5: column 'wy': 'fast' is not a number"),
-    "empty cell": (_swap(5, "0.3,1,,1"), "line 5: column 'wy': nan is not a finite number"),
+    "no time": (_swap(5, ",1,1,1"), "column 't': row 4 is empty"),
     "short line": (_swap(6, "0.4,1"), "line 6: column 'wy': the line ends before it"),
     "time stands": (_swap(6, "0.3,1,1,1"), "line 6: column 't': time 0.3 is not above the 0.3"),
     "empty": ("", "line 1: wanted a header"),
@@ -37,8 +37,17 @@ def test_a_bad_log_gets_one_clear_line(case, tmp_path, capsys):
     assert main(["identify", str(path)]) == 2
     out = capsys.readouterr()
     assert out.out == ""
-    assert out.err.startswith(f"error: {path}: {words}")
+    assert out.err.startswith(f"error: {path}: {words}"), out.err
     assert out.err.count("\n") == 1
+
+
+def test_an_empty_cell_is_a_gap_that_is_told(tmp_path, capsys):
+    path = tmp_path / "log.csv"
+    path.write_text(_swap(5, "0.3,1,,1"))
+    main(["identify", str(path), "--starts", "1"])
+    assert "12 samples over 1.1 s, 1 gap" in capsys.readouterr().out
+    with pytest.raises(rj.identify.LogError, match="column 'wy': row 4 is empty"):
+        rj.identify.read_gyro_csv(path)
 
 
 def test_a_missing_file_or_a_folder(tmp_path, capsys):

@@ -27,9 +27,7 @@ def test_nasa_brick_returns_its_ratios():
     record = rj.identify.read_gyro_csv(
         BRICK, columns=("t", "p_deg_s", "q_deg_s", "r_deg_s"), unit="deg/s"
     )
-    found = rj.identify.fit(
-        rj.identify.Problem(record, rj.identify.Ratios()), starts=2, tolerance=1e-13
-    )
+    found = rj.identify.fit(rj.identify.Problem(record, rj.identify.Ratios()), starts=2)
     assert found.ok
     moments = np.asarray(found.body.moments)
     np.testing.assert_allclose(

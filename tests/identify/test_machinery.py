@@ -25,7 +25,7 @@ RATES = ([0.4, 1.2, -0.3], [1.0, 0.2, 0.5], [-0.3, 0.9, 1.1])
 
 def throw(omega, bias, count=60, seed=0, sigma=0.005):
     """A damped body with a wheel inside, read by a gyro with a bias."""
-    ts = jnp.arange(count) * 0.05
+    ts = jnp.asarray(np.arange(count) * 0.05)
     speed = rj.torques.Series(np.arange(80) * 0.05, 3.0 * np.tanh(np.arange(80) * 0.05))
     law = rj.torques.Sum(
         rj.torques.Flywheel(rj.torques.Wheel(0.2, [0.0, 0.0, 1.0], speed)),

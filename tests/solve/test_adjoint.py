@@ -139,7 +139,12 @@ def test_through_simulate_each_rung_and_what_is_refused():
     def rate(c, inertia):
         body = rj.Inertia(inertia * jnp.eye(3))
         out = rj.simulate(
-            body, rj.Spin([0.0, 0.0, 1.5]), ts, rj.torques.Damping(c * jnp.ones(3)), rtol=1e-12
+            body,
+            rj.Spin([0.0, 0.0, 1.5]),
+            ts,
+            rj.torques.Damping(c * jnp.ones(3)),
+            solver=rj.solvers.DormandPrince8(),
+            rtol=1e-12,
         )
         return out.ys.omega[-1, 2]
 
@@ -150,6 +155,7 @@ def test_through_simulate_each_rung_and_what_is_refused():
     np.testing.assert_allclose(by_inertia, end * 0.3 / 4, rtol=1e-10)
     with pytest.raises(TypeError, match="forward-mode"):
         jax.jacfwd(rate)(jnp.asarray(0.3), jnp.asarray(2.0))
-    late = rj.simulate(body, rj.Spin([0.0, 0.0, 1.5]), ts, damping, max_steps=2, throw=False)
+    start, ours = rj.Spin([0.0, 0.0, 1.5]), rj.solvers.DormandPrince8()
+    late = rj.simulate(body, start, ts, damping, solver=ours, max_steps=2, throw=False)
     assert late.result == dfx.RESULTS.max_steps_reached
     assert np.all(np.isnan(late.ys.omega[-1])) and np.all(np.isfinite(late.ys.omega[0]))
