@@ -122,7 +122,7 @@ def interval_of(
     middle, slope = np.asarray(value(flat)), np.asarray(jax.jacfwd(value)(flat))
     found = carried(slope, np.asarray(fit.seen), np.asarray(fit.null_directions))
     reach = quantile(fit, level) * found
-    return middle - reach, middle + reach
+    return np.asarray(middle - reach), np.asarray(middle + reach)
 
 
 def quantile(fit: "Fit", level: float) -> float:

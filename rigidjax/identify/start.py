@@ -53,10 +53,11 @@ def regress_inertia(recordings: tuple[Recording, ...]) -> Inertia | None:
     """The inertia that Euler's equations in integral form fit best; without torque up to scale.
 
     Between two samples `I ΔΩ + ∫ Ω × IΩ dt = ∫ τ dt` is linear in the six components of I: without
-    a torque the smallest right singular vector of all such rows is the answer, with one (at its
-    starting values, along the measured rates) the least squares solution. Then moved to the nearest
-    second moment whose eigenvalues are positive. `None` where no gyro was there, sampled too
-    coarsely, or the torque needs more than a rate.
+    a torque, or with one that starts at nothing as a drag does, the smallest right singular vector
+    of all such rows is the answer, else (the torque at its starting values, along the measured
+    rates) the least squares solution. Then moved to the nearest second moment whose eigenvalues are
+    positive. `None` where no gyro was there, sampled too coarsely, or the torque needs more than a
+    rate.
     """
     rows, sides = [], []
     for recording in recordings:
@@ -66,7 +67,7 @@ def regress_inertia(recordings: tuple[Recording, ...]) -> Inertia | None:
         rows.append(found[0])
         sides.append(found[1])
     matrix, side = np.concatenate(rows), np.concatenate(sides)
-    if recordings[0].torque is None:
+    if not np.abs(side).max() > 0:
         components = np.linalg.svd(matrix, full_matrices=False)[2][-1]
         components = components * np.sign(components[:3].sum())
         components = components / components[:3].sum()

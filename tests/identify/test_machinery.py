@@ -94,6 +94,7 @@ def test_the_blocks_are_the_derivative(joint):
     assert errors[0].shape == (3, 60, 3)
 
 
+@pytest.mark.slow
 def test_models_are_compared_and_the_right_one_wins(records, joint):
     plain = identify.Problem(records, identify.Tensor(1.5), free=FREE[1:])
     rows = identify.compare({"drag": joint, "no drag": identify.fit(plain, starts=1)})
@@ -119,6 +120,7 @@ def test_the_left_out_throw_is_predicted_best_by_the_right_model(records):
     assert np.sum(np.square(with_drag)) < 0.8 * np.sum(np.square(without))
 
 
+@pytest.mark.slow
 def test_priors_hold_what_the_data_cannot_see(records):
     free = [
         identify.Free(
@@ -194,17 +196,23 @@ def test_a_design_expects_what_a_fit_then_finds(free_record):
     plan = identify.plan_of(problem, BODY, [0.4, 1.2, -0.3])
     for before, after in zip(identify.expected(problem, plan), found.quantities, strict=True):
         np.testing.assert_allclose(before.deviation, after.deviation, rtol=0.05)
+    silent = identify.Recording(free_record.t, (identify.Gyro(), free_record.readings[0].values))
+    with pytest.raises(ValueError, match="a Gyro with known noise"):
+        identify.expected(identify.Problem(silent, identify.PrincipalRatios()), plan)
+
+
+@pytest.mark.slow
+def test_the_best_first_rate_shows_more(free_record):
+    problem = identify.Problem(free_record, identify.PrincipalRatios())
     start = [0.05, 0.1, 1.3]
     rate, promise = identify.best_first_rate(problem, BODY, start)
     poor = identify.expected(problem, identify.plan_of(problem, BODY, start))
     np.testing.assert_allclose(jnp.linalg.norm(rate), np.linalg.norm(start), rtol=1e-9)
     doubts = [np.prod([q.deviation for q in qs[:2]]) for qs in (promise, poor)]
     assert doubts[0] < 0.5 * doubts[1]
-    silent = identify.Recording(free_record.t, (identify.Gyro(), free_record.readings[0].values))
-    with pytest.raises(ValueError, match="a Gyro with known noise"):
-        identify.expected(identify.Problem(silent, identify.PrincipalRatios()), plan)
 
 
+@pytest.mark.slow
 def test_many_starts_in_one_vmap_end_where_they_do_one_by_one(free_record):
     problem = identify.Problem(free_record, identify.PrincipalRatios())
     alone, at_once = (identify.fit(problem, starts=4, together=n) for n in (1, 4))

@@ -121,7 +121,7 @@ def calibrate(device, proof):
     def moments(factor):
         tensors = factor * mean_tensor(proof), factor * mean_tensor(device)
         tensor = without_device(*tensors, (DEVICE, PROOF), levers)
-        return np.linalg.eigvalsh(tensor) * 1e9
+        return np.linalg.eigvalsh(tensor) * 1e6
 
     def off(factor):
         return np.sum((moments(factor) / PROOF_MOMENTS - 1) ** 2)
@@ -135,7 +135,7 @@ def object_moments(group, tensor, device, factor):
     levers = lever("calibration_device_only"), lever(group)
     mass, _ = OBJECTS[group]
     tensors = factor * np.asarray(tensor), factor * mean_tensor(device)
-    return np.linalg.eigvalsh(without_device(*tensors, (DEVICE, mass), levers)) * 1e9
+    return np.linalg.eigvalsh(without_device(*tensors, (DEVICE, mass), levers)) * 1e6
 
 
 def relative_deviation(found):

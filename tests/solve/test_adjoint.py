@@ -118,6 +118,7 @@ def test_times_batches_and_second_derivatives():
     np.testing.assert_allclose(second, bend, atol=1e-4 * np.abs(bend).max())
 
 
+@pytest.mark.slow
 def test_many_chapters_are_one(monkeypatch):
     ts = jnp.linspace(0.0, 1.5, 5)
 
