@@ -18,6 +18,7 @@ from rigidjax.identify.problem import Parameters, Problem
 from rigidjax.identify.propagate import Adaptive, FixedSteps
 from rigidjax.identify.residual import Noise
 from rigidjax.identify.search import (
+    CAREFUL,
     Checkpoint,
     Tried,
     climb,
@@ -215,7 +216,7 @@ def fit(
             noise = uncertainty.estimate_noise(
                 problem, uncertainty.errors_at(value, problem), noise, value
             )
-            again = settle(fresh(value), problem, noise, whole, solver, max_steps)
+            again = settle(fresh(value), problem, noise, whole, solver, max_steps, near=True)
             value, done = again.parameters, again.converged
         noise = uncertainty.estimate_noise(
             problem, uncertainty.errors_at(value, problem), noise, value
@@ -229,7 +230,7 @@ def _from_pieces(problem: Problem, count: int, solver: Any, max_steps: int) -> P
     point = starting_points(cut, 1, jax.random.key(0))[0]
     for width in WIDTHS:
         narrowed = with_width(cut, width)
-        point = least_squares(point, narrowed, noise, whole, solver, max_steps).parameters
+        point = least_squares(point, narrowed, noise, whole, solver, max_steps, CAREFUL).parameters
     return joined(problem, cut, point)
 
 
@@ -321,7 +322,8 @@ def _finer_if_needed(
     if not apart > 0.05:
         return problem, best
     whole = jnp.ones_like(problem.records.t)
-    return finer, settle(fresh(best.parameters), finer, noise, whole, solver, max_steps)
+    near = fresh(best.parameters)
+    return finer, settle(near, finer, noise, whole, solver, max_steps, near=True)
 
 
 def _first_noise(problem: Problem) -> Noise:

@@ -20,8 +20,10 @@ from rigidjax.identify.residual import Noise, assembled, residuals
 HORIZONS = (0.25, 0.5, 1.0)
 # Steps between two looks at the clock, the keyboard and the checkpoint.
 STRIDE = 25
-# How many times the curvature's root a unit of the search is: 1/30² is where the damping starts.
-UNDAMPED = 30.0
+# How many standard deviations (all else at rest) a unit of the search is. Levenberg's damping
+# starts at 1, the curvature is this squared in every direction: small steps far away, whole ones
+# near the bottom, which a narrow valley needs.
+CAREFUL, BOLD = 1.0 / 30.0, 30.0
 # A stride that lowers the misfit by less than this share has come to the bottom.
 SETTLED = 1e-7
 
@@ -41,10 +43,11 @@ def least_squares(
     weights: Float[Array, "records times"],
     solver: Any,
     max_steps: int,
+    bold: float,
 ) -> Tried:
     """At most `max_steps` steps of the solver from `start`."""
     # By the program that everything else runs as well: less to compile.
-    sizes = _sizes(start, problem, noise, weights, evaluate(start, problem)[1])
+    sizes = _sizes(start, problem, noise, weights, evaluate(start, problem)[1], jnp.asarray(bold))
     value, done = _solve(start, sizes, problem, noise, weights, solver, max_steps)
     cost = _cost(value, problem, noise, weights, evaluate(value, problem)[0])
     return _safe(start, value, cost, done)
@@ -65,12 +68,17 @@ def _solve(
 
 @eqx.filter_jit
 def _sizes(
-    parameters: Parameters, problem: Problem, noise: Noise, weights: Any, blocks: Any
+    parameters: Parameters,
+    problem: Problem,
+    noise: Noise,
+    weights: Any,
+    blocks: Any,
+    bold: Array,
 ) -> Parameters:
     """The step of each parameter that the data feel alike, all else at rest.
 
     Levenberg's damping is the same for all parameters: in these units it is Marquardt's
-    (Moré 1978, doi:10.1007/BFb0067700), and starts at a thousandth of the curvature.
+    (Moré 1978, doi:10.1007/BFb0067700).
     """
     first = jax.tree.map(lambda leaf: leaf[0], parameters.own)
     _, restore = ravel_pytree((parameters.body, parameters.shared, first))
@@ -93,7 +101,7 @@ def _sizes(
     floor = jnp.where(most > 0, 1e-12 * most, 1.0)
 
     def size(felt: Array) -> Array:
-        return 1.0 / (UNDAMPED * jnp.sqrt(jnp.maximum(felt, floor)))
+        return bold / jnp.sqrt(jnp.maximum(felt, floor))
 
     good = jnp.isfinite(most)
     return jax.tree.map(lambda felt: jnp.where(good, size(felt), 1.0), found)
@@ -128,7 +136,7 @@ def many(
 
     def one(start: Parameters) -> Tried:
         blocks = with_blocks(start, problem)[1]
-        sizes = _sizes(start, problem, noise, weights, blocks)
+        sizes = _sizes(start, problem, noise, weights, blocks, jnp.asarray(CAREFUL))
         value, done = _one(start, sizes, problem, noise, weights, solver, max_steps)
         return _safe(start, value, misfit(value, (problem, noise, weights)), done)
 
@@ -193,7 +201,7 @@ def solver_for(tolerance: float) -> optx.LevenbergMarquardt:
 
     An array, so as not to compile again.
     """
-    limit: Any = jnp.asarray(UNDAMPED * tolerance)
+    limit: Any = jnp.asarray(tolerance)
     return optx.LevenbergMarquardt(rtol=jnp.asarray(1e-12), atol=limit)  # pyright: ignore
 
 
@@ -259,19 +267,23 @@ def settle(
     solver: Any,
     max_steps: int,
     look: Callable[[Tried], None] = lambda tried: None,
+    *,
+    near: bool = False,
 ) -> Tried:
     """Strides from where `tried` ended until one more of them changes nothing.
 
     A search that says it has converged may only have been damped too much: it has converged where a
-    fresh start from there ends there. `tried.cost` is the misfit at its end, infinite if unknown.
+    fresh start from there ends there. `tried.cost` is the misfit at its end, infinite if unknown;
+    `near` says that it is near the bottom already.
     """
-    for _ in range(0, max_steps, STRIDE):
+    for first in range(0, max_steps, STRIDE):
         before = float(tried.cost)
         count = min(STRIDE, max_steps)
-        tried = least_squares(tried.parameters, problem, noise, weights, solver, count)
+        bold = BOLD if first or near else CAREFUL
+        tried = least_squares(tried.parameters, problem, noise, weights, solver, count, bold)
+        # At the very bottom round-off refuses every step: whether it moved is what counts.
         settled = before - float(tried.cost) < SETTLED * (1.0 + abs(before))
-        if bool(tried.converged) and not settled:
-            tried = Tried(tried.parameters, tried.cost, jnp.asarray(False))
+        tried = Tried(tried.parameters, tried.cost, jnp.asarray(settled))
         look(tried)
         if bool(tried.converged) or not np.isfinite(float(tried.cost)):
             break
@@ -300,7 +312,7 @@ def climb(
         if stage < len(HORIZONS) - 1:
             # A part of the record need not be fitted to the end, only to come near.
             count = min(STRIDE, max_steps)
-            tried = least_squares(tried.parameters, problem, noise, seen, solver, count)
+            tried = least_squares(tried.parameters, problem, noise, seen, solver, count, CAREFUL)
             tried = fresh(tried.parameters)
             look(stage + 1, tried)
             continue
