@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.identify import reported, uncertainty, words
 from rigidjax.identify.pieces import WIDTHS, joined, pieces as in_pieces, with_width
-from rigidjax.identify.problem import Parameters, Problem
+from rigidjax.identify.problem import Parameters, Problem, all_errors
 from rigidjax.identify.propagate import Adaptive, FixedSteps
 from rigidjax.identify.residual import Noise
 from rigidjax.identify.search import (
@@ -46,11 +46,12 @@ class Fit(eqx.Module):
 
     **Fields:** `parameters` the free numbers at the best point; `covariance` (n, n) of them,
     flattened in order, infinite where the data are blind, `seen` the same within what they see,
-    `covariance_kind` what it rests on; `starts` what came of each start;
-    `chi2` and `dof` of the whitened errors of the sensors whose noise was given; `correlation` over
-    how many samples the errors hang together, 1 for white ones; `singular_values` (n,) of the
-    whitened Jacobian; `null_directions` (k, n) that leave no trace in the data; `quantities` all
-    that is reported, by name; `status` one line: `ok`, or what is wrong.
+    `covariance_kind` what it rests on; `noises` (R, k) for each sensor; `starts` what came of each
+    start; `chi2` and `dof` of the whitened errors of the sensors whose noise was given;
+    `correlation` over how many samples the errors hang together, 1 for white ones, and
+    `independent` how many of them that leaves; `singular_values` (n,) of the whitened Jacobian,
+    its columns of length one; `null_directions` (k, n) that leave no trace in the data;
+    `quantities` all that is reported, by name; `status` one line: `ok`, or what is wrong.
     """
 
     problem: Problem
@@ -207,21 +208,33 @@ def fit(
         tried, key=lambda item: float(item.cost) if np.isfinite(float(item.cost)) else np.inf
     )
     lowest = float(best.cost)
-    problem, best = _finer_if_needed(problem, best, noise, solver, max_steps)
-    value, done = best.parameters, best.converged
-    if any(sensor.noise is None for sensor in problem.records.sensors):
+    best, noise = _with_noise(problem, best, noise, solver, max_steps)
+    if _too_coarse(problem, best.parameters, noise):
+        problem = eqx.tree_at(lambda p: p.integrator, problem, Adaptive())
         whole = jnp.ones_like(problem.records.t)
-        # Twice: the weights of the channels and the robust loss both depend on the noise.
-        for _ in range(2):
-            noise = uncertainty.estimate_noise(
-                problem, uncertainty.errors_at(value, problem), noise, value
-            )
-            again = settle(fresh(value), problem, noise, whole, solver, max_steps, near=True)
-            value, done = again.parameters, again.converged
-        noise = uncertainty.estimate_noise(
-            problem, uncertainty.errors_at(value, problem), noise, value
-        )
-    return _assess(problem, value, bool(done), noise, tried, lowest)
+        near = fresh(best.parameters)
+        best = settle(near, problem, noise, whole, solver, max_steps, near=True)
+        best, noise = _with_noise(problem, best, noise, solver, max_steps)
+    return _assess(problem, best.parameters, bool(best.converged), noise, tried, lowest)
+
+
+def _with_noise(
+    problem: Problem, best: Tried, noise: Noise, solver: Any, max_steps: int
+) -> tuple[Tried, Noise]:
+    """The best point and the noise that belong together, where some noise is to be estimated."""
+    if all(sensor.noise is not None for sensor in problem.records.sensors):
+        return best, noise
+
+    def estimated(noise: Noise) -> Noise:
+        errors = uncertainty.errors_at(best.parameters, problem)
+        return uncertainty.estimate_noise(problem, errors, noise, best.parameters)
+
+    whole = jnp.ones_like(problem.records.t)
+    # Twice: the weights of the channels and the robust loss both depend on the noise.
+    for _ in range(2):
+        noise, near = estimated(noise), fresh(best.parameters)
+        best = settle(near, problem, noise, whole, solver, max_steps, near=True)
+    return best, estimated(noise)
 
 
 def _from_pieces(problem: Problem, count: int, solver: Any, max_steps: int) -> Parameters:
@@ -304,26 +317,23 @@ def _say(progress: Any, number: int, total: int, tried: list[Tried]) -> None:
         progress(f"start {number}/{total}: misfit {float(tried[-1].cost):.6g}, best {best:.6g}")
 
 
-def _finer_if_needed(
-    problem: Problem, best: Tried, noise: Noise, solver: Any, max_steps: int
-) -> tuple[Problem, Tried]:
-    """Fixed steps are checked against adaptive ones; where they were too long, go on with these."""
+@eqx.filter_jit
+def _errors_alone(parameters: Parameters, problem: Problem) -> tuple[Float[Array, "..."], ...]:
+    # Without the derivatives that `errors_at` computes along: less to compile.
+    return all_errors(parameters, problem)[0]
+
+
+def _too_coarse(problem: Problem, parameters: Parameters, noise: Noise) -> bool:
+    """Whether adaptive steps predict otherwise than fixed ones, by a twentieth of the noise."""
     if not isinstance(problem.integrator, FixedSteps):
-        return problem, best
+        return False
     finer = eqx.tree_at(lambda p: p.integrator, problem, Adaptive())
-    coarse, exact = (
-        uncertainty.errors_at(best.parameters, problem),
-        uncertainty.errors_at(best.parameters, finer),
-    )
+    coarse, exact = (_errors_alone(parameters, p) for p in (problem, finer))
     apart = max(
         float(jnp.max(jnp.abs(a - b) / sigma[:, None]))
         for a, b, sigma in zip(coarse, exact, noise, strict=True)
     )
-    if not apart > 0.05:
-        return problem, best
-    whole = jnp.ones_like(problem.records.t)
-    near = fresh(best.parameters)
-    return finer, settle(near, finer, noise, whole, solver, max_steps, near=True)
+    return apart > 0.05
 
 
 def _first_noise(problem: Problem) -> Noise:

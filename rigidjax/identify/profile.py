@@ -3,7 +3,6 @@
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
@@ -14,7 +13,7 @@ from rigidjax.identify import reported
 from rigidjax.identify.fit import Fit
 from rigidjax.identify.problem import Parameters
 from rigidjax.identify.residual import residuals
-from rigidjax.identify.search import solver_for
+from rigidjax.identify.search import cost_of, misfit, solver_for
 
 
 def profile(fit: Fit, name: str, level: float = 0.95) -> tuple[float, float]:
@@ -48,7 +47,7 @@ def profile(fit: Fit, name: str, level: float = 0.95) -> tuple[float, float]:
     if not np.isfinite(deviation) or deviation <= 0:
         deviation = wide / 10
     solver = solver_for(1e-4)
-    bottom = 2.0 * float(_cost(fit.parameters, fit))
+    bottom = 2.0 * cost_of(fit.parameters, fit.problem, fit.noises)
     shares = max(fit.correlation, 1.0)
     ends = []
     for side in (-1.0, 1.0):
@@ -80,16 +79,6 @@ def _end(
 
 
 @eqx.filter_jit
-def _cost(parameters: Parameters, fit: Fit) -> Array:
-    whole = jnp.ones_like(fit.problem.records.t)
-    return _half_sum(residuals(parameters, (fit.problem, fit.noises, whole)))
-
-
-def _half_sum(tree: Any) -> Array:
-    return 0.5 * sum((jnp.sum(leaf**2) for leaf in jax.tree.leaves(tree)), jnp.zeros(()))
-
-
-@eqx.filter_jit
 def _held(
     start: Parameters, fit: Fit, index: int, target: Array, width: Array, solver: Any
 ) -> tuple[Parameters, Array]:
@@ -103,4 +92,4 @@ def _held(
 
     least: Any = optx.least_squares
     out = least(held, solver, start, None, options={"jac": "fwd"}, max_steps=100, throw=False)
-    return out.value, _half_sum(residuals(out.value, args))
+    return out.value, misfit(out.value, args)

@@ -54,19 +54,6 @@ def least_squares(
 
 
 @eqx.filter_jit
-def _solve(
-    start: Parameters,
-    sizes: Parameters,
-    problem: Problem,
-    noise: Noise,
-    weights: Any,
-    solver: Any,
-    max_steps: int,
-) -> tuple[Parameters, Array]:
-    return _one(start, sizes, problem, noise, weights, solver, max_steps)
-
-
-@eqx.filter_jit
 def _sizes(
     parameters: Parameters,
     problem: Problem,
@@ -163,6 +150,9 @@ def _one(
         throw=False,
     )
     return _stepped(start, sizes, out.value), out.result == optx.RESULTS.successful
+
+
+_solve = eqx.filter_jit(_one)
 
 
 def _stepped(start: Parameters, sizes: Parameters, steps: Parameters) -> Parameters:

@@ -10,8 +10,9 @@ from jaxtyping import PRNGKeyArray
 
 from rigidjax._types import HasSpin
 from rigidjax.body.inertia import Inertia
-from rigidjax.identify.problem import Parameters, Problem, attitude_rate
+from rigidjax.identify.problem import Parameters, Problem
 from rigidjax.identify.recording import Recording
+from rigidjax.identify.reference import attitude_rate
 from rigidjax.identify.sensors import Gyro
 from rigidjax.motion import Spin
 from rigidjax.motion.torques import Torque, evaluate

@@ -38,7 +38,7 @@ def columns(path, first):
     return {name: values[inside] for name, values in table.items()}
 
 
-def record(path, model):
+def record(path):
     # The wheel's log begins a little earlier, so that its delay has room.
     wide = columns(path, WINDOW[0] - 0.02)
     log = columns(path, WINDOW[0])
@@ -63,7 +63,7 @@ def problem(recordings, model):
 
 def fits(group, model):
     """One fit for each throw, from a blind start (regression on Euler's equations)."""
-    return [identify.fit(problem([record(p, model)], model), starts=1) for p in paths(group)]
+    return [identify.fit(problem([record(p)], model), starts=1) for p in paths(group)]
 
 
 def preference(group, found):
@@ -142,7 +142,3 @@ def relative_deviation(found):
     """Standard deviations of the log of the three moments of one fit, ascending moments."""
     order = np.argsort([q.value for q in found.quantities[:3]])
     return np.array([found.quantities[i].deviation for i in order])
-
-
-def joint(group, model):
-    return identify.fit(problem([record(p, model) for p in paths(group)], model), starts=1)
