@@ -1,4 +1,4 @@
-"""Pictures. matplotlib is imported when called (extra `view`)."""
+"""A fit beside its data."""
 
 from typing import Any
 
@@ -6,11 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from rigidjax.plot.style import COLOURS, pyplot
 from rigidjax.rotation import quaternion
 from rigidjax.solve import simulate
-
-# Okabe and Ito's colours, told apart by everyone.
-COLOURS = ("#0072B2", "#D55E00", "#009E73")
 
 
 def fit(
@@ -29,7 +27,7 @@ def fit(
 
     **Raises** `ModuleNotFoundError` where matplotlib is missing (install the extra `view`).
     """
-    plt = _pyplot()
+    plt = pyplot()
     seconds = {"s": 1.0, "day": 86400.0}[time_unit]
     rate = {"rad/s": 1.0, "deg/s": 180 / np.pi, "deg/day": 86400 * 180 / np.pi}[rate_unit]
     record = found.problem.recordings[index]
@@ -111,7 +109,7 @@ def _one_sensor(
     lower.set_ylabel(f"error, {unit}")
     many = seen.sum() > 100
     mark: dict[str, Any] = {"marker": "." if many else "o", "ls": "", "ms": 2 if many else 5}
-    for axis, (name, colour) in enumerate(zip(names, COLOURS, strict=True)):
+    for axis, (name, colour) in enumerate(zip(names, COLOURS[:3], strict=True)):
         if line is not None:
             whole = slice(None) if line_t is not t else seen
             upper.plot(line_t[whole], line[whole, axis], color=colour, lw=1.2, label=name)
@@ -122,13 +120,3 @@ def _one_sensor(
 
 def _long_axis(q: Any) -> np.ndarray:
     return np.asarray(jax.vmap(lambda one: quaternion.rotate(one, jnp.eye(3)[2]))(jnp.asarray(q)))
-
-
-def _pyplot() -> Any:
-    try:
-        import matplotlib.pyplot as plt
-    except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(
-            "rigidjax.plot needs matplotlib: pip install 'rigidjax[view]'"
-        ) from error
-    return plt

@@ -1,0 +1,17 @@
+"""Pictures (extra `view`): matplotlib and viser are imported when a function is called.
+
+Each function draws into axes of yours (`ax=`) or into new ones, and returns the axes. Colours are
+Okabe and Ito's, told apart by everyone.
+"""
+
+from rigidjax.plot.bodies import inertia_ellipsoid as inertia_ellipsoid
+from rigidjax.plot.film import Film as Film, tumble as tumble
+from rigidjax.plot.fits import fit as fit
+from rigidjax.plot.leftover import residuals as residuals
+from rigidjax.plot.paths import frames as frames
+from rigidjax.plot.player import player as player
+from rigidjax.plot.poinsot import herpolhode as herpolhode, polhode as polhode
+from rigidjax.plot.sphere import body_axes as body_axes
+from rigidjax.plot.style import COLOURS as COLOURS
+from rigidjax.plot.time import motion as motion
+from rigidjax.plot.tops import phase_portrait as phase_portrait

@@ -1,0 +1,84 @@
+"""What a fit leaves over: is it noise?"""
+
+from typing import Any
+
+import numpy as np
+
+from rigidjax.plot.style import COLOURS, TIMES, pyplot, unit
+
+
+def residuals(
+    found: Any, *, index: int = 0, time_unit: str = "s", title: str = "", ax: Any = None
+) -> Any:
+    """Residuals of each sensor over its noise: against time, their spread, their memory.
+
+    Left: they should scatter evenly within ±2. Middle: their histogram against the normal curve.
+    Right: the correlation of each with a later one; white noise stays inside the band ±2/√N.
+
+    **Arguments:** `found` a `rigidjax.identify.Fit`; `index` which of its recordings; `time_unit`
+    `s`, `min`, `h` or `day`; `title`; `ax` axes of yours (sensors, 3). **Returns** the axes.
+
+    **Raises** `ModuleNotFoundError` where matplotlib is missing; `ValueError` for an unknown unit
+    or axes of another shape; `IndexError` for a recording that is not there.
+    """
+    seconds = unit(time_unit, TIMES, "time_unit")
+    record = found.problem.recordings[index]
+    several = found.problem.count > 1
+    count = len(record.readings)
+    if ax is None:
+        ax = pyplot().subplots(
+            count, 3, figsize=(11, 3.1 * count), squeeze=False, layout="constrained"
+        )[1]
+    ax = np.asarray(ax, dtype=object)
+    if ax.shape != (count, 3):
+        raise ValueError(f"ax: wanted ({count}, 3) axes, a row a sensor, got {ax.shape}")
+    t = np.asarray(record.t) / seconds
+    for row, reading, errors, noise in zip(
+        ax, record.readings, found.residuals, found.noise, strict=True
+    ):
+        one = np.asarray(errors[index] if several else errors)[: t.size]
+        sigma = np.asarray(noise[index] if several else noise)
+        _one_sensor(row, t, one / sigma, np.asarray(reading.seen))
+        row[0].set_ylabel(f"{type(reading.sensor).__name__}\nerror / noise")
+        row[0].set_xlabel(f"time, {time_unit}")
+    ax[0, 1].set_title(title or "what the fit leaves over")
+    return ax
+
+
+def _one_sensor(row: Any, t: np.ndarray, scaled: np.ndarray, seen: np.ndarray) -> None:
+    over_time, spread, memory = row
+    colours, names = COLOURS[: scaled.shape[1]], "xyz"[: scaled.shape[1]]
+    many = seen.sum() > 100
+    for values, colour, name in zip(scaled[seen].T, colours, names, strict=True):
+        over_time.plot(
+            t[seen], values, ".", ms=2.5 if many else 5, color=colour, alpha=0.7, label=name
+        )
+    over_time.axhspan(-2, 2, color="0.9", zorder=0)
+    over_time.legend(loc="upper right", ncols=3, fontsize=8, markerscale=2)
+    reach = max(4.0, float(np.abs(scaled[seen]).max()) * 1.1)
+    over_time.set_ylim(-reach, 1.35 * reach)
+
+    everything = scaled[seen].ravel()
+    bins = np.linspace(-reach, reach, int(np.clip(2 * np.sqrt(everything.size), 9, 41)))
+    spread.hist(everything, bins=bins, density=True, color=COLOURS[5], alpha=0.8)
+    x = np.linspace(-reach, reach, 200)
+    spread.plot(x, np.exp(-0.5 * x**2) / np.sqrt(2 * np.pi), color="0.2", lw=1.4, label="normal")
+    spread.set(xlabel="error / noise", ylabel="density")
+    spread.legend(loc="upper right", fontsize=8)
+
+    number = int(seen.sum())
+    lags = np.arange(1, max(2, min(40, number // 2)))
+    for values, colour in zip(scaled[seen].T, colours, strict=True):
+        memory.plot(lags, _correlation(values, lags), ".-", color=colour, ms=4, lw=0.8)
+    band = 2 / np.sqrt(max(number, 1))
+    memory.axhspan(-band, band, color="0.9", zorder=0)
+    memory.axhline(0, color="0.6", lw=0.8)
+    memory.set(xlabel="lag, samples", ylabel="correlation", ylim=(-1, 1))
+
+
+def _correlation(values: np.ndarray, lags: np.ndarray) -> np.ndarray:
+    centred = values - values.mean()
+    whole = float(centred @ centred)
+    if not whole > 0:
+        return np.zeros(lags.size)
+    return np.array([centred[:-lag] @ centred[lag:] for lag in lags]) / whole

@@ -1,0 +1,74 @@
+"""One path, seen from a moving frame and from an inertial one."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import ArrayLike, Float
+
+from rigidjax.frames import MovingFrame, Point
+from rigidjax.plot.style import AXES, COLOURS, row_of_axes, rows
+
+
+def frames(
+    frame: MovingFrame,
+    ts: Float[ArrayLike, " times"],
+    inside: Point,
+    *,
+    plane: str = "xy",
+    unit: str = "m",
+    marks: Mapping[str, Any] | None = None,
+    title: str = "",
+    ax: Any = None,
+) -> Any:
+    """The path in the moving frame on the left, in the inertial one on the right.
+
+    **Arguments:** `frame` the `MovingFrame`; `ts` (T,); `inside` the path as the frame sees it, a
+    `Point` with a leading time axis (`frame.from_inertial` makes it from the other); `plane` two of
+    `xyz`; `unit` of length; `marks` places at rest in the frame, name → (3,); `title`; `ax` two
+    axes of yours. **Returns** the axes (2,).
+
+    **Raises** `ValueError` for an unknown plane, other lengths, or a batch.
+
+    >>> import rigidjax as rj
+    >>> turntable = MovingFrame(rj.frames.Uniform([0.0, 0.0, 1.0]))
+    >>> ts = jnp.linspace(0.0, 3.0, 20)
+    >>> seen = rj.simulate(None, Point([1.0, 0, 0], [0.0, 0, 0]), ts, turntable).ys
+    >>> [one.get_title() for one in frames(turntable, ts, seen)]
+    ['seen from the moving frame', 'seen from the inertial frame']
+    """
+    if len(plane) != 2 or plane[0] == plane[1] or not set(plane) <= set(AXES):
+        raise ValueError(f"plane: wanted two of x, y, z such as 'xz', got {plane!r}")
+    i, j = (AXES.index(name) for name in plane)
+    path = rows(inside.x, 3, "inside.x")
+    t = jnp.asarray(ts, jnp.asarray(inside.x).dtype)
+    if t.shape != (path.shape[0],):
+        raise ValueError(f"ts: wanted ({path.shape[0]},) as the path has, got {t.shape}")
+    outside = np.asarray(jax.vmap(frame.to_inertial)(inside, t).x)
+    ax = row_of_axes(ax, 2, figsize=(9.6, 4.6))
+    names = (("moving", path), ("inertial", outside))
+    for one, (name, line) in zip(ax, names, strict=True):
+        one.plot(line[:, i], line[:, j], color=COLOURS[0], lw=1.2)
+        one.plot(*line[0, [i, j]], color=COLOURS[0], marker="o", ms=6, ls="", label="start")
+        one.plot(*line[-1, [i, j]], color=COLOURS[0], marker="^", ms=7, ls="", label="end")
+        one.set_title(f"seen from the {name} frame")
+        one.set_aspect("equal", adjustable="datalim")
+        one.grid(alpha=0.3)
+        dash = "'" if name == "moving" else ""
+        one.set(xlabel=f"{plane[0]}{dash}, {unit}", ylabel=f"{plane[1]}{dash}, {unit}")
+    for number, (name, place) in enumerate((marks or {}).items()):
+        colour = COLOURS[1 + number % (len(COLOURS) - 1)]
+        here = np.asarray(place, dtype=float)
+        if here.shape != (3,):
+            raise ValueError(f"marks[{name!r}]: wanted a place (3,), got shape {here.shape}")
+        still = jax.tree.map(lambda leaf: jnp.zeros_like(leaf), inside)
+        still = Point(still.x + jnp.asarray(here, still.x.dtype)[None], still.v)
+        moved = np.asarray(jax.vmap(frame.to_inertial)(still, t).x)
+        ax[0].plot(here[i], here[j], color=colour, marker="s", ms=6, ls="", label=name)
+        ax[1].plot(moved[:, i], moved[:, j], color=colour, lw=0.9, ls="--", label=name)
+    ax[1].legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False, fontsize=9)
+    if title:
+        ax[0].figure.suptitle(title)
+    return ax

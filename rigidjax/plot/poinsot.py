@@ -1,0 +1,164 @@
+"""Poinsot's picture of free motion: the polhode in the body, the herpolhode in space."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from rigidjax._types import HasAttitude, HasSpin
+from rigidjax.body.energy import spatial_angular_momentum
+from rigidjax.body.inertia import Inertia
+from rigidjax.plot.style import (
+    COLOURS,
+    around_ball,
+    attitudes,
+    cube,
+    flat_axes,
+    globe,
+    matrices,
+    rows,
+    solid_axes,
+)
+
+
+def polhode(
+    inertia: Inertia, states: HasSpin, *, energies: int = 9, title: str = "", ax: Any = None
+) -> Any:
+    """The path of Π = IΩ where the momentum sphere |Π| = h meets the ellipsoid ΣΠᵢ²/Iᵢ = 2T.
+
+    Drawn along the principal axes (ascending moments), in units of h = |Π| of the first state.
+    Thin lines are other energies at the same h; the broken ones the separatrix through the middle
+    axis. Source: Landau and Lifshitz, Mechanics, § 37.
+
+    **Arguments:** `inertia`; `states` of one body with a leading time axis; `energies` how many
+    thin lines; `title`; `ax` 3-D axes of yours. **Returns** the axes.
+
+    **Raises** `ValueError` for a body at rest, a zero moment or a batch; `TypeError` for flat axes.
+
+    >>> import rigidjax as rj
+    >>> body = rj.Inertia.from_principal(1.0, 2.0, 3.0)
+    >>> sol = rj.simulate(body, rj.Spin([0.1, 1.0, 0.0]), [0.0, 1.0, 2.0])
+    >>> polhode(body, sol.ys).get_zlabel()
+    'Π₃ / h'
+    """
+    moments, q = inertia.invertible().principal()
+    i = np.asarray(moments, dtype=float)
+    turn = matrices(np.asarray(q, dtype=float)[None])[0]
+    omega = rows(states.omega, 3, "states.omega")
+    pi = omega @ turn * i
+    size = float(np.linalg.norm(pi[0]))
+    if not size > 0:
+        raise ValueError("polhode: the body is at rest, there is no momentum sphere")
+    pi = pi / size
+    twice_energy = float(np.sum(pi[0] ** 2 / i))
+
+    ax = solid_axes(ax)
+    globe(ax, (1.0, 1.0, 1.0), COLOURS[5], 0.10)
+    globe(ax, np.sqrt(twice_energy * i), COLOURS[4], 0.14)
+    # Where all moments are equal every energy is the same one: there are no lines to draw.
+    if i[2] - i[0] > 1e-9 * i[2]:
+        _others(ax, i, energies)
+    around_ball(ax, pi, pi, color=COLOURS[1], lw=2.6, label="this motion")
+    ax.plot(*pi[:1].T, color=COLOURS[1], marker="o", ms=6, ls="")
+    reach = max(1.0, float(np.sqrt(twice_energy * i).max()))
+    cube(ax, reach, ("Π₁ / h", "Π₂ / h", "Π₃ / h"))
+    handles, names = ax.get_legend_handles_labels()
+    from matplotlib.patches import Patch
+
+    handles += [Patch(color=COLOURS[5], alpha=0.4), Patch(color=COLOURS[4], alpha=0.5)]
+    names += ["momentum sphere", "energy ellipsoid"]
+    ax.legend(handles, names, loc="upper left", fontsize=8)
+    ax.set_title(title or "polhode, principal axes of the body")
+    return ax
+
+
+def _others(ax: Any, i: np.ndarray, energies: int) -> None:
+    """Curves of equal energy on the unit momentum sphere."""
+    import contourpy
+
+    inverse = 1 / i
+    # The pole of the grid along the axis of the middle moment: no family of loops goes round it.
+    around, down = np.linspace(0, 2 * np.pi, 181), np.linspace(0, np.pi, 91)
+    ball = np.stack(
+        [
+            np.outer(np.sin(down), np.sin(around)),
+            np.outer(np.cos(down), np.ones_like(around)),
+            np.outer(np.sin(down), np.cos(around)),
+        ]
+    )
+    level = np.einsum("i,ijk->jk", inverse, ball**2)
+    lines = contourpy.contour_generator(around, down, level)
+    for value in np.linspace(inverse[2], inverse[0], energies + 2)[1:-1]:
+        _curves(ax, lines.lines(value), lw=0.6, color="0.35")
+    distinct = min(i[1] - i[0], i[2] - i[1]) > 1e-9 * i[2]
+    if distinct:
+        _curves(ax, lines.lines(inverse[1]), lw=1.2, color="0.1", ls="--", label="separatrix")
+
+
+def _curves(ax: Any, curves: Any, **how: Any) -> None:
+    for curve in curves:
+        around, down = np.asarray(curve).T
+        path = np.stack(
+            [np.sin(down) * np.sin(around), np.cos(down), np.sin(down) * np.cos(around)], axis=-1
+        )
+        around_ball(ax, path, path, **how)
+        how.pop("label", None)
+
+
+def herpolhode(inertia: Inertia, states: HasAttitude, *, title: str = "", ax: Any = None) -> Any:
+    """The path of the world rate ω on the invariable plane, across the angular momentum.
+
+    Free motion only: there the part of ω along the momentum is 2T/h and stays. The circles are the
+    least and the largest distance that this motion reaches.
+
+    **Arguments:** `inertia`; `states` (`Attitude`) of one body with a leading time axis; `title`;
+    `ax` axes of yours. **Returns** the axes.
+
+    **Raises** `ValueError` for a body at rest, a batch, or a momentum that turned by more than
+    1e-3 rad (that is no free motion); `TypeError` for states without an attitude.
+
+    >>> import rigidjax as rj
+    >>> body = rj.Inertia.from_principal(1.0, 2.0, 3.0)
+    >>> sol = rj.simulate(body, rj.Attitude([1.0, 0, 0, 0], [0.1, 1.0, 0.0]), [0.0, 1.0, 2.0])
+    >>> herpolhode(body, sol.ys).get_xlabel()
+    'ω along e₁, rad/s'
+    """
+    m = matrices(attitudes(states))
+    omega = np.einsum("tij,tj->ti", m, rows(states.omega, 3, "states.omega"))
+    momenta = np.asarray(
+        jax.vmap(lambda state: spatial_angular_momentum(inertia, state))(
+            jax.tree.map(jnp.asarray, states)
+        ),
+        dtype=float,
+    )
+    size = np.linalg.norm(momenta, axis=1)
+    if not size[0] > 0:
+        raise ValueError("herpolhode: the body is at rest, there is no invariable plane")
+    up = momenta[0] / size[0]
+    turned = np.linalg.norm(np.cross(momenta, up), axis=1) / size
+    if turned.max() > 1e-3:
+        raise ValueError(
+            f"herpolhode: the angular momentum turned by {turned.max():.2g} rad: a torque acts, "
+            "and there is no invariable plane"
+        )
+    first = omega[0] - (omega[0] @ up) * up
+    if np.linalg.norm(first) < 1e-9 * np.linalg.norm(omega[0]):
+        # A spin about a principal axis: any direction across will do.
+        first = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
+    first = first / np.linalg.norm(first)
+    path = np.stack([omega @ first, omega @ np.cross(up, first)], axis=-1)
+
+    ax = flat_axes(ax, figsize=(5.2, 5.0))
+    ax.plot(*path.T, color=COLOURS[0], lw=1.2)
+    ax.plot(*path[0], color=COLOURS[1], marker="o", ms=6, ls="", label="start")
+    distance = np.linalg.norm(path, axis=1)
+    angle = np.linspace(0, 2 * np.pi, 200)
+    for radius in (distance.min(), distance.max()):
+        ax.plot(radius * np.cos(angle), radius * np.sin(angle), color="0.5", lw=0.8, ls=":")
+    ax.plot(0, 0, color="0.2", marker="+", ms=8, ls="", label="momentum")
+    ax.set_aspect("equal")
+    ax.set(xlabel="ω along e₁, rad/s", ylabel="ω along e₂, rad/s")
+    ax.set_title(title or "herpolhode, across the angular momentum")
+    ax.legend(loc="upper right", fontsize=8)
+    return ax

@@ -1,0 +1,156 @@
+"""What all pictures share: colours, axes, matplotlib when wanted, checks of what comes."""
+
+from typing import Any
+
+import numpy as np
+
+# Okabe and Ito's colours, told apart by everyone (Okabe and Ito 2008, "Color Universal Design").
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+AXES = "xyz"
+TIMES = {"s": 1.0, "min": 60.0, "h": 3600.0, "day": 86400.0}
+RATES = {
+    "rad/s": 1.0,
+    "deg/s": 180 / np.pi,
+    "rpm": 30 / np.pi,
+    "deg/day": 86400 * 180 / np.pi,
+}
+
+
+def pyplot() -> Any:
+    """`matplotlib.pyplot`, imported now.
+
+    **Raises** `ModuleNotFoundError` that names the extra `view`.
+    """
+    try:
+        import matplotlib.pyplot as plt
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError(
+            "rigidjax.plot needs matplotlib: pip install 'rigidjax[view]'"
+        ) from error
+    return plt
+
+
+def unit(name: str, known: dict[str, float], what: str) -> float:
+    """How many SI units, or SI in how many, by name; `ValueError` lists what is known."""
+    if name not in known:
+        raise ValueError(f"{what}: wanted one of {', '.join(known)}, got {name!r}")
+    return known[name]
+
+
+def flat_axes(ax: Any, **how: Any) -> Any:
+    """The axes given, or a figure with one of its own."""
+    if ax is not None:
+        return ax
+    return pyplot().subplots(layout="constrained", **{"figsize": (6.4, 4.4), **how})[1]
+
+
+def solid_axes(ax: Any, **how: Any) -> Any:
+    """The 3-D axes given, or a figure with its own; `TypeError` for flat ones."""
+    if ax is None:
+        figure = pyplot().figure(layout="constrained", **{"figsize": (6.0, 5.6), **how})
+        return figure.add_subplot(projection="3d")
+    if not hasattr(ax, "zaxis"):
+        raise TypeError(
+            "ax: wanted 3-D axes, got flat ones; make them with projection='3d' in add_subplot"
+        )
+    return ax
+
+
+def row_of_axes(ax: Any, count: int, **how: Any) -> Any:
+    """As many axes as given, or new ones side by side; `ValueError` for another number."""
+    if ax is None:
+        ax = pyplot().subplots(1, count, layout="constrained", **how)[1]
+    ax = np.atleast_1d(np.asarray(ax, dtype=object))
+    if ax.shape != (count,):
+        raise ValueError(f"ax: wanted {count} axes in a row, got shape {ax.shape}")
+    return ax
+
+
+def rows(values: Any, width: int, name: str) -> np.ndarray:
+    """Values of one body over time (T, width) as NumPy float64.
+
+    **Raises** `ValueError` for another shape: most often a batch, of which one is to be picked.
+    """
+    out = np.asarray(values, dtype=float)
+    if out.ndim != 2 or out.shape[1] != width:
+        hint = "; of a batch draw one body at a time" if out.ndim == 3 else ""
+        raise ValueError(f"{name}: wanted shape (times, {width}), got {out.shape}{hint}")
+    if not np.isfinite(out).any():
+        raise ValueError(f"{name}: nothing to draw, every value is NaN or infinite")
+    return out
+
+
+def attitudes(states: Any, name: str = "states") -> np.ndarray:
+    """Quaternions (T, 4) of states that have them; `TypeError` for those that have none."""
+    if not hasattr(states, "q"):
+        raise TypeError(
+            f"{name}: wanted states with an attitude (Attitude, Rigid), got {type(states).__name__}"
+        )
+    return rows(states.q, 4, f"{name}.q")
+
+
+def matrices(q: np.ndarray) -> np.ndarray:
+    """Rotation matrices (T, 3, 3), body → world, of quaternions (T, 4), for pictures."""
+    w, x, y, z = (q / np.linalg.norm(q, axis=1, keepdims=True)).T
+    return np.stack(
+        [
+            np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
+            np.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], -1),
+            np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1),
+        ],
+        axis=1,
+    )
+
+
+def towards_viewer(ax: Any) -> np.ndarray:
+    """Unit vector (3,) from the middle of 3-D axes to the eye, as they are turned now."""
+    up, around = np.radians(ax.elev), np.radians(ax.azim)
+    return np.array([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)])
+
+
+def around_ball(ax: Any, path: np.ndarray, centre_free: np.ndarray, **how: Any) -> None:
+    """A line on a ball: drawn in full where it faces the eye, faintly where the ball hides it.
+
+    **Arguments:** `path` (T, 3); `centre_free` (T, 3) the outward normals there.
+    """
+    front = centre_free @ towards_viewer(ax) > 0
+    label = how.pop("label", None)
+    alpha = how.pop("alpha", 1.0)
+    for seen, strength, name in ((front, alpha, label), (~front, 0.25 * alpha, None)):
+        # One point over the edge on both sides, so that no gap opens between the two.
+        wide = seen | np.roll(seen, 1) | np.roll(seen, -1)
+        wide[0], wide[-1] = seen[0], seen[-1]
+        line = np.where(wide[:, None], path, np.nan)
+        ax.plot(*line.T, alpha=strength, label=name, **how)
+
+
+def globe(ax: Any, semi_axes: Any, colour: str, alpha: float) -> None:
+    """An ellipsoid along the axes, translucent, with meridians."""
+    u, v = np.linspace(0, 2 * np.pi, 49), np.linspace(0, np.pi, 25)
+    ball = np.stack(
+        [
+            np.outer(np.cos(u), np.sin(v)),
+            np.outer(np.sin(u), np.sin(v)),
+            np.outer(u * 0 + 1, np.cos(v)),
+        ]
+    )
+    shape = np.asarray(semi_axes)[:, None, None] * ball
+    ax.plot_surface(*shape, color=colour, alpha=alpha, linewidth=0, rstride=1, cstride=1)
+
+
+def cube(ax: Any, reach: float, labels: tuple[str, str, str]) -> None:
+    """Equal scales on all three axes, few ticks, names that do not run into them."""
+    ax.set(xlim=(-reach, reach), ylim=(-reach, reach), zlim=(-reach, reach))
+    ax.set_box_aspect((1, 1, 1))
+    for axis, label in zip((ax.xaxis, ax.yaxis, ax.zaxis), labels, strict=True):
+        axis.set_major_locator(_ticks())
+        axis.set_label_text(label)
+        axis.labelpad = 4
+        axis.set_tick_params(labelsize=8, pad=0)
+
+
+def _ticks() -> Any:
+    from matplotlib.ticker import MaxNLocator
+
+    # The ends left out: at the corners of the cube they would lie on those of the next axis.
+    return MaxNLocator(5, prune="both")

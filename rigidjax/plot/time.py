@@ -1,0 +1,97 @@
+"""Attitude and spin against time."""
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import ArrayLike, Float
+
+from rigidjax._types import HasSpin
+from rigidjax.plot.style import COLOURS, RATES, TIMES, attitudes, matrices, pyplot, rows, unit
+
+
+def motion(
+    ts: Float[ArrayLike, " times"],
+    states: HasSpin,
+    *,
+    attitude: str = "quaternion",
+    time_unit: str = "s",
+    rate_unit: str = "rad/s",
+    title: str = "",
+    ax: Any = None,
+) -> Any:
+    """Body rate against time, and above it the attitude where the states have one.
+
+    **Arguments:** `ts` (T,) s; `states` of one body with a leading time axis, such as `sol.ys`;
+    `attitude` how it is shown: `quaternion` (w, x, y, z), `axes` (the height of each body axis
+    along world z) or `angles` (3-1-3, notes eq 31, deg); `time_unit` `s`, `min`, `h`, `day`;
+    `rate_unit` `rad/s`, `deg/s`, `rpm`, `deg/day`; `title`; `ax` two axes (one for a `Spin`) of
+    yours, else new ones. **Returns** the axes, (2,) or (1,).
+
+    **Raises** `ValueError` for an unknown unit, or a batch instead of one body.
+
+    >>> import rigidjax as rj
+    >>> body = rj.Inertia.from_principal(1.0, 2.0, 3.0)
+    >>> sol = rj.simulate(body, rj.Spin([0, 1, 0.1]), [0.0, 1.0, 2.0])
+    >>> motion(sol.ts, sol.ys)[0].get_ylabel()
+    'body rate Ω, rad/s'
+    """
+    turned, seconds = unit(rate_unit, RATES, "rate_unit"), unit(time_unit, TIMES, "time_unit")
+    omega = rows(states.omega, 3, "states.omega") * turned
+    t = np.asarray(ts, dtype=float) / seconds
+    if t.shape != (omega.shape[0],):
+        raise ValueError(f"ts: wanted ({omega.shape[0]},) as the states have, got {t.shape}")
+    both = hasattr(states, "q")
+    count = 2 if both else 1
+    if ax is None:
+        ax = pyplot().subplots(
+            count, 1, sharex=True, figsize=(7.2, 2.6 * count), layout="constrained"
+        )[1]
+    ax = np.atleast_1d(np.asarray(ax, dtype=object))
+    if ax.shape != (count,):
+        raise ValueError(f"ax: wanted {count} axes, got shape {ax.shape}")
+    if both:
+        _attitude(ax[0], t, attitudes(states), attitude)
+    for values, name, colour in zip(omega.T, "xyz", COLOURS[:3], strict=True):
+        ax[-1].plot(t, values, color=colour, label=f"Ω{name}", lw=1.4)
+    ax[-1].set(xlabel=f"time, {time_unit}", ylabel=f"body rate Ω, {rate_unit}")
+    for one in ax:
+        one.margins(x=0)
+        one.grid(alpha=0.3)
+        # Beside the picture: a legend inside would lie on some line sooner or later.
+        one.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
+    if title:
+        ax[0].set_title(title)
+    return ax
+
+
+def _attitude(ax: Any, t: np.ndarray, q: np.ndarray, how: str) -> None:
+    if how == "quaternion":
+        names, lines, label = [f"q{n}" for n in "wxyz"], q.T, "attitude q"
+    elif how == "axes":
+        names = [f"{n}' · z" for n in "xyz"]
+        lines, label = matrices(q)[:, 2, :].T, "body axes along world z"
+    elif how == "angles":
+        names, lines, label = ["φ", "θ", "ψ"], _angles(q).T, "3-1-3 angles, deg"
+    else:
+        raise ValueError(f"attitude: wanted quaternion, axes or angles, got {how!r}")
+    colours = (COLOURS[6], *COLOURS[:3]) if len(names) == 4 else COLOURS[:3]
+    for values, name, colour in zip(lines, names, colours, strict=True):
+        ax.plot(t, values, color=colour, label=name, lw=1.4)
+    ax.set_ylabel(label)
+
+
+def _angles(q: np.ndarray) -> np.ndarray:
+    m = matrices(q)
+    angles = np.stack(
+        [
+            np.arctan2(m[:, 0, 2], -m[:, 1, 2]),
+            np.arctan2(np.hypot(m[:, 0, 2], m[:, 1, 2]), m[:, 2, 2]),
+            np.arctan2(m[:, 2, 0], m[:, 2, 1]),
+        ],
+        axis=-1,
+    )
+    degrees = np.degrees(angles)
+    # A line across the whole picture where an angle goes from 180° to −180° would be no motion.
+    jump = np.abs(np.diff(degrees, axis=0)) > 180
+    degrees[1:][jump] = np.nan
+    return degrees

@@ -1,0 +1,113 @@
+"""The phase portrait of a heavy symmetric top: tilt against its rate."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from rigidjax._types import HasAttitude
+from rigidjax.body.energy import spatial_angular_momentum
+from rigidjax.body.inertia import Inertia
+from rigidjax.motion.torques import HeavyTop
+from rigidjax.plot.style import COLOURS, attitudes, flat_axes, matrices, rows
+
+
+def phase_portrait(
+    inertia: Inertia,
+    top: HeavyTop,
+    states: HasAttitude,
+    *,
+    levels: int = 14,
+    title: str = "",
+    ax: Any = None,
+) -> Any:
+    """Tilt θ against θ̇ of a symmetric top, with the curves of equal energy around its path.
+
+    `E = ½ I₁ θ̇² + (p_φ − p_ψ cos θ)²/(2 I₁ sin²θ) + m g l cos θ` with the momenta p_φ about the
+    vertical and p_ψ about the top's axis of the first state. Source: Landau and Lifshitz,
+    Mechanics, § 35, problem 1. The cross is steady precession, the least energy.
+
+    **Arguments:** `inertia` about the pivot; `top` weight and place of the centre of mass, which
+    lies on the axis of symmetry; `states` of one body with a leading time axis; `levels` how many
+    thin curves; `title`; `ax` axes of yours. **Returns** the axes.
+
+    **Raises** `ValueError` for a body that is not symmetric about its centre of mass's axis, no
+    weight, or a batch; `TypeError` for states without an attitude.
+
+    >>> import rigidjax as rj
+    >>> body = rj.Inertia.from_principal(2.0, 2.0, 1.0)
+    >>> top = rj.torques.HeavyTop(1.0, [0.0, 0, 1.0], [0, 0, -9.81])
+    >>> start = rj.Attitude(rj.quaternion.exp(jnp.array([0.4, 0.0, 0.0])), [0, 0, 20.0])
+    >>> phase_portrait(body, top, rj.simulate(body, start, [0.0, 0.1, 0.2], top).ys).get_xlabel()
+    'tilt θ, deg'
+    """
+    across, along, axis, weight, up = _symmetric(inertia, top)
+    m = matrices(attitudes(states))
+    omega = np.einsum("tij,tj->ti", m, rows(states.omega, 3, "states.omega"))
+    first = jax.tree.map(lambda leaf: jnp.asarray(leaf)[0], states)
+    about_up = float(np.asarray(spatial_angular_momentum(inertia, first)) @ up)
+    about_axis = along * float(np.asarray(first.omega) @ axis)
+    pointing = m @ axis
+    cosine = np.clip(pointing @ up, -1.0, 1.0)
+    tilt = np.arccos(cosine)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        rate = -np.cross(omega, pointing) @ up / np.sin(tilt)
+
+    def potential(theta: np.ndarray) -> np.ndarray:
+        turning = (about_up - about_axis * np.cos(theta)) ** 2 / (2 * across * np.sin(theta) ** 2)
+        return turning + weight * np.cos(theta)
+
+    ax = flat_axes(ax)
+    seen = np.isfinite(rate)
+    reach = 1.6 * max(float(np.abs(rate[seen]).max(initial=0.0)), 0.2 * np.sqrt(weight / across))
+    middle, half = 0.5 * (tilt.max() + tilt.min()), 0.5 * np.ptp(tilt)
+    wide = max(1.8 * half, 0.15)
+    # Not from 0 to π: the barrier is infinite where the axis stands upright or hangs.
+    grid = np.linspace(max(middle - wide, 1e-3), min(middle + wide, np.pi - 1e-3), 400)
+    rates = np.linspace(-reach, reach, 301)
+    energy = 0.5 * across * rates[:, None] ** 2 + potential(grid)
+    floor = energy.min()
+    own = 0.5 * across * rate[seen] ** 2 + potential(tilt[seen])
+    top_level = max(float(np.median(own)) * 2 - floor, floor + 1e-3 * weight)
+    # Evenly spaced in the amplitude of the nutation, not in energy.
+    steps = np.linspace(0, 1.5, levels + 1)[1:] ** 2
+    ax.contour(
+        np.degrees(grid),
+        rates,
+        energy,
+        levels=floor + steps * (top_level - floor) / 2,
+        colors="0.6",
+        linewidths=0.7,
+    )
+    ax.plot(np.degrees(tilt), rate, color=COLOURS[0], lw=2.0, label="this motion")
+    ax.plot(np.degrees(tilt[:1]), rate[:1], color=COLOURS[0], marker="o", ls="", label="start")
+    lowest = grid[np.argmin(potential(grid))]
+    if grid[0] < lowest < grid[-1]:
+        ax.plot(np.degrees(lowest), 0, color=COLOURS[1], marker="x", ms=8, ls="", label="steady")
+    ax.set(xlabel="tilt θ, deg", ylabel="dθ/dt, rad/s", ylim=(-reach, reach))
+    ax.set_title(title or "phase portrait; thin: equal energy, same momenta")
+    ax.legend(loc="upper right", fontsize=8)
+    return ax
+
+
+def _symmetric(
+    inertia: Inertia, top: HeavyTop
+) -> tuple[float, float, np.ndarray, float, np.ndarray]:
+    """I₁, I₃, the body's axis (3,), m g l, and the upward direction (3,)."""
+    tensor = np.asarray(inertia.tensor, dtype=float)
+    com, gravity = np.asarray(top.com, dtype=float), np.asarray(top.gravity, dtype=float)
+    lever, pull = np.linalg.norm(com), np.linalg.norm(gravity)
+    weight = float(top.mass) * float(lever * pull)
+    if not weight > 0:
+        raise ValueError("phase_portrait: the top has no weight about its pivot")
+    axis = com / lever
+    along = float(axis @ tensor @ axis)
+    across = 0.5 * (float(np.trace(tensor)) - along)
+    symmetric = across * (np.eye(3) - np.outer(axis, axis)) + along * np.outer(axis, axis)
+    if np.abs(tensor - symmetric).max() > 1e-6 * np.abs(tensor).max():
+        raise ValueError(
+            "phase_portrait: wanted a body symmetric about the axis through its centre of mass "
+            f"(two equal moments across {axis.round(3).tolist()}); other tops have no such plane"
+        )
+    return across, along, axis, weight, -gravity / pull

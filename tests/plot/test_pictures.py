@@ -1,0 +1,272 @@
+"""What the pictures show is what they were given: lines against closed forms, words on mistakes."""
+
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import matplotlib as mpl
+import numpy as np
+import pytest
+
+import rigidjax as rj
+
+mpl.use("Agg")
+import matplotlib.pyplot as plt
+
+BODY = rj.Inertia.from_principal(1.0, 2.0, 3.0)
+TS = jnp.linspace(0.0, 20.0, 101)
+
+
+@pytest.fixture(autouse=True)
+def closed():
+    yield
+    plt.close("all")
+
+
+@pytest.fixture(scope="module")
+def flip():
+    return rj.simulate(BODY, rj.Attitude([1.0, 0, 0, 0], [0.2, 1.0, 0.1]), TS)
+
+
+def spun(omega, body=BODY):
+    return rj.simulate(body, rj.Attitude([1.0, 0, 0, 0], omega), TS).ys
+
+
+def batch(states):
+    return jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), states)
+
+
+def line(ax, label):
+    return next(one for one in ax.lines if one.get_label() == label)
+
+
+def test_motion_shows_rates_and_attitude_in_the_units_it_names(flip):
+    above, below = rj.plot.motion(flip.ts, flip.ys, time_unit="min", rate_unit="deg/s")
+    for axis, one in enumerate(below.lines):
+        np.testing.assert_allclose(one.get_xdata(), TS / 60)
+        np.testing.assert_allclose(one.get_ydata(), np.degrees(flip.ys.omega[:, axis]))
+    assert (below.get_xlabel(), below.get_ylabel()) == ("time, min", "body rate Ω, deg/s")
+    assert [one.get_label() for one in above.lines] == ["qw", "qx", "qy", "qz"]
+    (only,) = rj.plot.motion(flip.ts, rj.Spin(flip.ys.omega))
+    assert len(only.lines) == 3
+
+
+def test_motion_shows_the_angles_of_the_notes(flip):
+    above, _ = rj.plot.motion(flip.ts, flip.ys, attitude="angles")
+    shown = np.stack([one.get_ydata() for one in above.lines], axis=-1)
+    wanted = np.degrees(jax.vmap(rj.euler.from_quaternion)(flip.ys.q))
+    kept = np.isfinite(shown)
+    assert kept.mean() > 0.9
+    np.testing.assert_allclose(shown[2:][kept[2:]], wanted[2:][kept[2:]], atol=1e-8)
+
+
+def test_the_polhode_lies_on_the_sphere_and_on_the_ellipsoid(flip):
+    # Axes in another order and turned: the picture is along the ascending principal axes.
+    turn = rj.quaternion.exp(jnp.array([0.3, -0.5, 0.2]))
+    turned = rj.Spin(jax.vmap(lambda w: rj.quaternion.rotate(turn, w))(flip.ys.omega))
+    ax = rj.plot.polhode(BODY.rotated(turn), turned)
+    path = np.stack(line(ax, "this motion").get_data_3d(), axis=-1)
+    hidden = np.isnan(path[:, 0])
+    assert 0 < hidden.sum() < len(path)
+    np.testing.assert_allclose(np.linalg.norm(path[~hidden], axis=1), 1.0, atol=1e-12)
+    first = flip.ys.omega[0] * jnp.array([1.0, 2.0, 3.0])
+    twice_energy = float(flip.ys.omega[0] @ first / (first @ first))
+    np.testing.assert_allclose(path[~hidden] ** 2 @ (1 / np.array([1, 2, 3])), twice_energy)
+    assert line(ax, "separatrix") is not None
+
+
+def test_a_sphere_has_no_family_of_polhodes():
+    ball = rj.Inertia.from_principal(2.0, 2.0, 2.0)
+    ax = rj.plot.polhode(ball, spun([0.3, 1.0, 0.2], ball))
+    assert [one.get_label() for one in ax.lines if one.get_lw() < 1] == []
+
+
+def test_the_herpolhode_of_a_symmetric_body_is_a_circle():
+    ax = rj.plot.herpolhode(
+        rj.Inertia.from_principal(1.0, 1.0, 2.0),
+        spun([0.3, 0.0, 1.0], rj.Inertia.from_principal(1.0, 1.0, 2.0)),
+    )
+    # |L| = √(0.3² + 2²); what is left of |ω|² after (2T/h)² is the square of the radius.
+    momentum = 0.3**2 + 4.0
+    radius = np.sqrt(0.3**2 + 1.0 - (0.3**2 + 2.0) ** 2 / momentum)
+    np.testing.assert_allclose(np.hypot(*ax.lines[0].get_data()), radius, rtol=1e-10)
+
+
+def test_body_axes_start_where_the_attitude_says():
+    ax = rj.plot.body_axes(spun([0.0, 0.0, 1.0]))
+    starts = [one for one in ax.lines if one.get_marker() == "o"]
+    np.testing.assert_allclose(
+        [np.stack(one.get_data_3d())[:, 0] for one in starts], np.eye(3), atol=1e-15
+    )
+
+
+TOP = rj.torques.HeavyTop(1.0, [0.0, 0.0, 0.5], [0.0, 0.0, -9.81])
+TOP_BODY = rj.Inertia.from_principal(0.4, 0.4, 0.1)
+
+
+def spinning_top(spin):
+    start = rj.Attitude(rj.quaternion.exp(jnp.array([0.5, 0.0, 0.0])), spin)
+    return rj.simulate(TOP_BODY, start, jnp.linspace(0.0, 1.0, 40), TOP).ys
+
+
+def test_a_top_keeps_to_its_curve_of_energy():
+    states = spinning_top([0.0, 0.0, 30.0])
+    ax = rj.plot.phase_portrait(TOP_BODY, TOP, states)
+    tilt, rate = line(ax, "this motion").get_data()
+    tilt = np.radians(tilt)
+    up, axis = 3.0 * np.cos(0.5), 3.0
+    energy = 0.2 * rate**2 + (up - axis * np.cos(tilt)) ** 2 / (0.8 * np.sin(tilt) ** 2)
+    energy = energy + 9.81 * 0.5 * np.cos(tilt)
+    np.testing.assert_allclose(energy, energy[0], atol=1e-8)
+    assert np.ptp(tilt) > 0.1
+    # Steady precession at the cross: the least energy for these momenta.
+    cross = np.radians(line(ax, "steady").get_xdata()[0])
+    fine = np.linspace(cross - 0.05, cross + 0.05, 20001)
+    least = (up - axis * np.cos(fine)) ** 2 / (0.8 * np.sin(fine) ** 2) + 4.905 * np.cos(fine)
+    assert abs(fine[np.argmin(least)] - cross) < 0.01
+
+
+def test_the_outline_of_an_ellipsoid_is_its_own():
+    body = rj.shapes.ellipsoid(2.0, [1.0, 2.0, 3.0])
+    for one, (i, j) in zip(rj.plot.inertia_ellipsoid(body), ((0, 1), (0, 2), (1, 2)), strict=True):
+        x, y = line(one, "body").get_data()
+        np.testing.assert_allclose([x.max(), y.max()], [i + 1, j + 1], rtol=1e-3)
+
+
+@pytest.fixture(scope="module")
+def found():
+    rates = rj.simulate(BODY, rj.Spin([1.0, 0.2, 0.8]), TS).ys.omega
+    noise = 0.01 * np.random.default_rng(1).standard_normal(rates.shape)
+    record = rj.identify.Recording(TS, (rj.identify.Gyro(0.01), rates + noise))
+    return rj.identify.fit(rj.identify.Problem(record, rj.identify.PrincipalRatios()), starts=1)
+
+
+def test_the_pictures_of_a_fit(found):
+    assert found.ok
+    ax = rj.plot.inertia_ellipsoid(found, truth=BODY, samples=50)
+    best, truth = (np.stack(line(ax[0], name).get_data()) for name in ("body", "truth"))
+    # The data fix the ratios to a percent or so: the two outlines lie on each other.
+    np.testing.assert_allclose(best, truth, atol=0.02)
+    cloud = np.stack([one.get_data() for one in ax[0].lines if one.get_alpha() == 0.25])
+    assert cloud.shape[0] == 50
+    assert 1e-4 < np.abs(cloud - best).max() < 0.05
+    over_time, spread, memory = rj.plot.residuals(found)[0]
+    shown = np.stack([one.get_ydata() for one in over_time.lines], axis=-1)
+    np.testing.assert_allclose(shown, np.asarray(found.residuals[0]) / 0.01)
+    area = sum(bar.get_width() * bar.get_height() for bar in spread.patches)
+    np.testing.assert_allclose(area, 1.0)
+    # White noise: nearly all of the correlations lie in the band of two standard deviations.
+    inside = np.abs(np.stack([one.get_ydata() for one in memory.lines[:3]])) < 2 / np.sqrt(101)
+    assert inside.mean() > 0.85
+    figure = rj.plot.fit(found, title="a log")
+    assert figure.axes[0].get_ylabel() == "body rate, rad/s"
+
+
+def test_a_free_particle_goes_straight_on_the_right():
+    turntable = rj.frames.MovingFrame(rj.frames.Uniform([0.0, 0.0, 1.5]))
+    ts = jnp.linspace(0.0, 3.0, 30)
+    seen = rj.simulate(None, rj.Point([1.0, 0, 0], [0.0, 0.2, 0.0]), ts, turntable).ys
+    left, right = rj.plot.frames(turntable, ts, seen, marks={"post": [0.5, 0.0, 0.0]})
+    x, y = right.lines[0].get_data()
+    np.testing.assert_allclose(x, 1.0, atol=1e-7)
+    np.testing.assert_allclose(y, 1.7 * ts, atol=1e-7)
+    np.testing.assert_allclose(left.lines[0].get_xdata(), seen.x[:, 0])
+    np.testing.assert_allclose(np.hypot(*line(right, "post").get_data()), 0.5)
+
+
+def test_a_film_has_its_pictures(flip, tmp_path):
+    from PIL import Image
+
+    film = rj.plot.tumble(rj.shapes.box(1.0, [0.1, 0.2, 0.3]), flip.ts, flip.ys, pictures=4)
+    path = film.save(tmp_path / "tumble.gif")
+    with Image.open(path) as picture:
+        assert picture.n_frames == 4
+        first = np.asarray(picture.convert("RGB"), dtype=float)
+        picture.seek(2)
+        assert np.abs(np.asarray(picture.convert("RGB"), dtype=float) - first).mean() > 1
+    assert film._repr_html_().startswith("<img")
+    with pytest.raises(ValueError, match=r"ends in \.gif, got tumble\.png"):
+        film.save(tmp_path / "tumble.png")
+    assert not plt.get_fignums()
+
+
+def test_the_box_of_a_box_is_itself():
+    from rigidjax.plot.film import box_of
+
+    half, turn = box_of(rj.shapes.box(3.0, [0.2, 0.6, 0.4]))
+    np.testing.assert_allclose(half, [0.1, 0.2, 0.3])
+    np.testing.assert_allclose(np.abs(turn), [[1, 0, 0], [0, 0, 1], [0, 1, 0]], atol=1e-12)
+
+
+def test_between_saved_times_a_film_stays_on_the_group():
+    from rigidjax.plot.film import evenly
+
+    ts = jnp.linspace(0.0, 6.0, 40)
+    turning = jax.vmap(lambda t: rj.quaternion.exp(jnp.array([0.0, 0.0, 1.0]) * t))(ts)
+    # The same attitudes with signs as they may come out of a logarithm.
+    signs = jnp.where(jnp.arange(40) % 3 == 0, -1.0, 1.0)[:, None]
+    states = rj.Attitude(turning * signs, jnp.zeros((40, 3)))
+    times, q = evenly(ts, states, 23)
+    exact = np.stack([np.cos(times / 2), 0 * times, 0 * times, np.sin(times / 2)], axis=-1)
+    apart = np.abs(np.einsum("ti,ti->t", q, exact))
+    np.testing.assert_allclose(apart, 1.0, atol=1e-6)
+
+
+def test_the_player_is_one_page_without_a_network(flip, capsys):
+    pytest.importorskip("viser", exc_type=ImportError)
+    body = rj.shapes.box(1.0, [0.1, 0.2, 0.3])
+    film = rj.plot.player(body, flip.ts, flip.ys, pictures=20)
+    page = film.data.decode("utf-8")
+    assert 'window.__VISER_EMBED_DATA__="' in page
+    assert "<script src=" not in page
+    assert 'href="http' not in page
+    assert capsys.readouterr().out == ""
+    assert len(page) < 1_200_000
+
+
+def test_words_on_mistakes(flip, monkeypatch):
+    still = spun([0.0, 0.0, 0.0])
+    with pytest.raises(ValueError, match="of a batch draw one body at a time"):
+        rj.plot.polhode(BODY, batch(flip.ys))
+    with pytest.raises(ValueError, match="wanted one of s, min, h, day, got 'days'"):
+        rj.plot.motion(flip.ts, flip.ys, time_unit="days")
+    with pytest.raises(ValueError, match="quaternion, axes or angles, got 'euler'"):
+        rj.plot.motion(flip.ts, flip.ys, attitude="euler")
+    with pytest.raises(ValueError, match=r"ts: wanted \(101,\) as the states have, got \(100,\)"):
+        rj.plot.motion(flip.ts[1:], flip.ys)
+    with pytest.raises(ValueError, match="at rest, there is no momentum sphere"):
+        rj.plot.polhode(BODY, still)
+    with pytest.raises(ValueError, match="at rest, there is no invariable plane"):
+        rj.plot.herpolhode(BODY, still)
+    with pytest.raises(TypeError, match="wanted 3-D axes, got flat ones"):
+        rj.plot.polhode(BODY, flip.ys, ax=plt.subplots()[1])
+    with pytest.raises(ValueError, match="a torque acts, and there is no invariable plane"):
+        rj.plot.herpolhode(TOP_BODY, spinning_top([0.0, 0.0, 30.0]))
+    with pytest.raises(ValueError, match="wanted a body symmetric about the axis"):
+        rj.plot.phase_portrait(BODY, TOP, flip.ys)
+    with pytest.raises(TypeError, match="wanted an Inertia, a MassProperties or a Fit, got list"):
+        rj.plot.inertia_ellipsoid([1.0, 2.0, 3.0])
+    with pytest.raises(ValueError, match="wanted two of x, y, z such as 'xz', got 'xyz'"):
+        rj.plot.frames(
+            rj.frames.MovingFrame(rj.frames.Uniform([0.0, 0, 1])),
+            flip.ts,
+            rj.Point(flip.ys.omega, flip.ys.omega),
+            plane="xyz",
+        )
+    with pytest.raises(ValueError, match="at least two pictures and times, got 1 and 101"):
+        rj.plot.tumble(BODY, flip.ts, flip.ys, pictures=1)
+    monkeypatch.setitem(sys.modules, "matplotlib.pyplot", None)
+    with pytest.raises(ModuleNotFoundError, match=r"pip install 'rigidjax\[view\]'"):
+        rj.plot.motion(flip.ts, flip.ys)
+
+
+def test_a_state_without_attitude_is_named(flip, unhooked):
+    with pytest.raises(TypeError, match=r"wanted states with an attitude .*, got Spin"):
+        rj.plot.body_axes(rj.Spin(flip.ys.omega))  # pyright: ignore[reportArgumentType]
+
+
+def test_nothing_of_this_is_imported_before_it_is_called():
+    code = "import sys, rigidjax; print([m for m in ('matplotlib', 'viser', 'PIL') if m in sys.modules])"
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert out.stdout.strip() == "[]"
