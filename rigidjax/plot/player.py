@@ -61,7 +61,7 @@ def _record(
     scene = server.scene
     reach = float(np.linalg.norm(half))
     scene.set_up_direction("+z")
-    server.initial_camera.position = tuple(2.4 * reach * np.array([1.0, -1.2, 0.7]))
+    server.initial_camera.position = tuple(1.8 * reach * np.array([1.0, -1.2, 0.7]))
     server.initial_camera.look_at = (0.0, 0.0, 0.0)
     scene.add_frame("/world", axes_length=1.1 * reach, axes_radius=0.008 * reach)
     attitude = scene.add_frame("/body", show_axes=False, wxyz=tuple(q[0]))
