@@ -91,7 +91,7 @@ def tumble(
     from PIL import Image
 
     # Not pyplot's: a film must not leave a figure behind, nor open a window.
-    figure = Figure(figsize=(3.6, 3.6), dpi=90)
+    figure = Figure(figsize=(3.6, 3.6), dpi=80)
     canvas = FigureCanvasAgg(figure)
     ax: Any = figure.add_axes((0.0, 0.02, 0.98, 0.9), projection="3d")
     corners = (CORNERS * half) @ turn.T
@@ -115,8 +115,8 @@ def tumble(
         canvas.draw()
         shots.append(Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB"))
     # One palette for all, or the grey of the panes flickers.
-    palette = shots[0].quantize(64)
-    shots = [shot.quantize(64, palette=palette, dither=Image.Dither.NONE) for shot in shots]
+    palette = shots[0].quantize(48)
+    shots = [shot.quantize(48, palette=palette, dither=Image.Dither.NONE) for shot in shots]
     out = io.BytesIO()
     shots[0].save(
         out,
@@ -126,7 +126,7 @@ def tumble(
         duration=int(1000 * seconds / pictures),
         loop=0,
     )
-    return Film(out.getvalue(), "gif", 324)
+    return Film(out.getvalue(), "gif", 288)
 
 
 def evenly(ts: Any, states: Any, count: int) -> tuple[np.ndarray, np.ndarray]:

@@ -12,7 +12,7 @@ def residuals(
 ) -> Any:
     """Residuals of each sensor over its noise: against time, their spread, their memory.
 
-    Left: they should scatter evenly within ±2. Middle: their histogram against the normal curve.
+    Left: they should scatter evenly within ±2 (what lies beyond ±8 is counted, not drawn). Middle: their histogram against the normal curve.
     Right: the correlation of each with a later one; white noise stays inside the band ±2/√N.
 
     **Arguments:** `found` a `rigidjax.identify.Fit`; `index` which of its recordings; `time_unit`
@@ -55,12 +55,15 @@ def _one_sensor(row: Any, t: np.ndarray, scaled: np.ndarray, seen: np.ndarray) -
         )
     over_time.axhspan(-2, 2, color="0.9", zorder=0)
     over_time.legend(loc="upper right", ncols=3, fontsize=8, markerscale=2)
-    reach = max(4.0, float(np.abs(scaled[seen]).max()) * 1.1)
-    over_time.set_ylim(-reach, 1.35 * reach)
-
     everything = scaled[seen].ravel()
+    # One wild reading must not press all others into a line: what lies beyond is counted.
+    reach = float(np.clip(np.abs(everything).max(initial=0.0) * 1.1, 4.0, 8.0))
+    beyond = int((np.abs(everything) > reach).sum())
+    over_time.set_ylim(-reach, 1.35 * reach)
     bins = np.linspace(-reach, reach, int(np.clip(2 * np.sqrt(everything.size), 9, 41)))
-    spread.hist(everything, bins=bins, density=True, color=COLOURS[5], alpha=0.8)
+    told = f"{beyond} beyond" if beyond else None
+    weights = np.full(everything.size, 1 / (everything.size * (bins[1] - bins[0])))
+    spread.hist(everything, bins=bins, weights=weights, color=COLOURS[5], alpha=0.8, label=told)
     x = np.linspace(-reach, reach, 200)
     spread.plot(x, np.exp(-0.5 * x**2) / np.sqrt(2 * np.pi), color="0.2", lw=1.4, label="normal")
     spread.set(xlabel="error / noise", ylabel="density")

@@ -1,7 +1,5 @@
 """A tumbling body to turn with the mouse: viser's recorded scene, one page without a network."""
 
-import contextlib
-import io
 from typing import Any
 
 import numpy as np
@@ -40,13 +38,19 @@ def player(
         raise ModuleNotFoundError(
             "rigidjax.plot.player needs viser: pip install 'rigidjax[view]'"
         ) from error
+    import rich
+
     # Viser records what a server is told; nobody has to connect to it, or to be told its address.
-    with contextlib.redirect_stdout(io.StringIO()):
+    console = rich.get_console()
+    told, console.quiet = console.quiet, True
+    try:
         server = viser.ViserServer(host="127.0.0.1", verbose=False)
         try:
             page = _record(server, half, turn, times, q, seconds)
         finally:
             server.stop()
+    finally:
+        console.quiet = told
     return Film(page.encode("utf-8"), "html", height)
 
 
