@@ -48,17 +48,18 @@ def residuals(
 def _one_sensor(row: Any, t: np.ndarray, scaled: np.ndarray, seen: np.ndarray) -> None:
     over_time, spread, memory = row
     colours, names = COLOURS[: scaled.shape[1]], "xyz"[: scaled.shape[1]]
+    everything = scaled[seen].ravel()
+    # One wild reading must not press all others into a line: what lies beyond is counted.
+    reach = float(np.clip(np.abs(everything).max(initial=0.0) * 1.1, 4.0, 8.0))
+    beyond = int((np.abs(everything) > reach).sum())
     many = seen.sum() > 100
-    for values, colour, name in zip(scaled[seen].T, colours, names, strict=True):
+    shown = np.where(np.abs(scaled[seen]) <= reach, scaled[seen], np.nan)
+    for values, colour, name in zip(shown.T, colours, names, strict=True):
         over_time.plot(
             t[seen], values, ".", ms=2.5 if many else 5, color=colour, alpha=0.7, label=name
         )
     over_time.axhspan(-2, 2, color="0.9", zorder=0)
     over_time.legend(loc="upper right", ncols=3, fontsize=8, markerscale=2)
-    everything = scaled[seen].ravel()
-    # One wild reading must not press all others into a line: what lies beyond is counted.
-    reach = float(np.clip(np.abs(everything).max(initial=0.0) * 1.1, 4.0, 8.0))
-    beyond = int((np.abs(everything) > reach).sum())
     over_time.set_ylim(-reach, 1.35 * reach)
     bins = np.linspace(-reach, reach, int(np.clip(2 * np.sqrt(everything.size), 9, 41)))
     told = f"{beyond} beyond" if beyond else None

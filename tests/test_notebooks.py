@@ -1,0 +1,66 @@
+"""Every notebook runs, in its short form, without an error or a warning; what is committed is light."""
+
+import json
+import os
+from pathlib import Path
+
+import pytest
+
+FOLDER = Path(__file__).parents[1] / "notebooks"
+NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
+
+
+def outputs(notebook):
+    return [out for cell in notebook["cells"] for out in cell.get("outputs", [])]
+
+
+def complaints(notebook):
+    """What a reader would not want to see: tracebacks, and whatever went to standard error."""
+    return [
+        "\n".join(out.get("traceback", [])) or "".join(out["text"])
+        for out in outputs(notebook)
+        if out["output_type"] == "error" or out.get("name") == "stderr"
+    ]
+
+
+def test_there_are_seven():
+    assert [path.name[:2] for path in NOTEBOOKS] == ["01", "02", "03", "04", "05", "06", "07"]
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_committed_with_outputs_and_light(path):
+    notebook = json.loads(path.read_text(encoding="utf-8"))
+    assert path.stat().st_size < 1_500_000
+    assert complaints(notebook) == []
+    assert any("image/png" in out.get("data", {}) for out in outputs(notebook))
+    counts = [c["execution_count"] for c in notebook["cells"] if c["cell_type"] == "code"]
+    assert counts == list(range(1, len(counts) + 1))
+    # Nothing of the machine that it ran on.
+    text = path.read_text(encoding="utf-8")
+    assert "/tmp/" not in text
+    assert "site-packages" not in text
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_runs_in_its_short_form(path, monkeypatch):
+    nbclient = pytest.importorskip("nbclient", reason="the extra `notebooks` runs notebooks")
+    pytest.importorskip("ipykernel", reason="the extra `notebooks` runs notebooks")
+    pytest.importorskip("viser", reason="the extra `view` has the player of notebook 2")
+    import nbformat
+
+    monkeypatch.setenv("RIGIDJAX_SHORT", "1")
+    # A warning of ours would go to standard error, where `complaints` sees it.
+    monkeypatch.setenv("PYTHONWARNINGS", "default")
+    roots = [str(FOLDER.parent), *filter(None, [os.environ.get("PYTHONPATH")])]
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(roots))
+    notebook = nbformat.read(path, as_version=4)
+    # `python3` is the kernel of the interpreter that runs the tests.
+    client = nbclient.NotebookClient(
+        notebook,
+        timeout=600,
+        kernel_name="python3",
+        resources={"metadata": {"path": str(FOLDER)}},
+    )
+    client.execute()
+    assert complaints(notebook) == []
