@@ -12,8 +12,9 @@ def residuals(
 ) -> Any:
     """Residuals of each sensor over its noise: against time, their spread, their memory.
 
-    Left: they should scatter evenly within ±2 (what lies beyond ±8 is counted, not drawn). Middle: their histogram against the normal curve.
-    Right: the correlation of each with a later one; white noise stays inside the band ±2/√N.
+    Left: they should scatter evenly within ±2 (what lies beyond ±8 is counted, not drawn).
+    Middle: their histogram against the normal curve. Right: the correlation of each with a later
+    one; white noise stays inside the band ±2/√N.
 
     **Arguments:** `found` a `rigidjax.identify.Fit`; `index` which of its recordings; `time_unit`
     `s`, `min`, `h` or `day`; `title`; `ax` axes of yours (sensors, 3). **Returns** the axes.
