@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -135,6 +136,44 @@ def test_the_outline_of_an_ellipsoid_is_its_own():
         np.testing.assert_allclose([x.max(), y.max()], [i + 1, j + 1], rtol=1e-3)
 
 
+def stand_in():
+    """What the pictures ask of a fit, without a fit: one reading is wild, λ known to 10 %."""
+    errors = 0.01 * np.random.default_rng(2).standard_normal((101, 3))
+    errors[7] = 1.0
+    reading = SimpleNamespace(sensor=rj.identify.Gyro(0.01), seen=np.ones(101, dtype=bool))
+    shaped = lambda p: rj.Inertia.from_second_moment(jnp.diag(jnp.exp(p)))
+    return SimpleNamespace(
+        problem=SimpleNamespace(
+            recordings=(SimpleNamespace(t=TS, readings=(reading,)),),
+            count=1,
+            unpack=lambda p: (shaped(p), None),
+        ),
+        residuals=(errors,),
+        noise=(np.full(3, 0.01),),
+        parameters=jnp.zeros(3),
+        seen=0.01 * np.eye(3),
+        body=shaped(jnp.zeros(3)),
+    )
+
+
+def test_a_wild_reading_is_counted_and_does_not_press_the_others():
+    over_time, spread, _ = rj.plot.residuals(stand_in())[0]
+    assert over_time.get_ylim()[0] == -8.0
+    assert np.isnan(over_time.lines[0].get_ydata()).sum() == 1
+    assert spread.get_legend().get_texts()[0].get_text() == "3 beyond"
+    area = sum(bar.get_width() * bar.get_height() for bar in spread.patches)
+    np.testing.assert_allclose(area, 300 / 303)
+
+
+def test_the_cloud_of_outlines_is_as_wide_as_the_covariance_says():
+    ax = rj.plot.inertia_ellipsoid(stand_in(), samples=400)
+    reach = [one.get_xdata().max() for one in ax[0].lines if one.get_alpha() == 0.25]
+    assert len(reach) == 400
+    # Semi-axis √(λ/3), log λ with a standard deviation of 0.1: that of its logarithm is 0.05.
+    np.testing.assert_allclose(np.std(np.log(reach)), 0.05, rtol=0.15)
+    np.testing.assert_allclose(np.mean(np.log(reach)), np.log(3**-0.5), atol=0.01)
+
+
 @pytest.fixture(scope="module")
 def found():
     # Not BODY: a plate lies at the rim of what a fit can reach, some noise would push it beyond.
@@ -144,6 +183,7 @@ def found():
     return rj.identify.fit(rj.identify.Problem(record, rj.identify.PrincipalRatios()), starts=1)
 
 
+@pytest.mark.slow
 def test_the_pictures_of_a_fit(found):
     assert found.ok
     ax = rj.plot.inertia_ellipsoid(found, truth=SOLID, samples=50)
