@@ -107,7 +107,7 @@ def evaluate(parameters: Parameters, problem: Problem) -> Any:
 def _cost(
     parameters: Parameters, problem: Problem, noise: Noise, weights: Any, found: Any
 ) -> Float[Array, ""]:
-    return _half_sum(assembled(parameters, (problem, noise, weights), *found))
+    return half_sum(assembled(parameters, (problem, noise, weights), *found))
 
 
 @eqx.filter_jit
@@ -179,10 +179,11 @@ def cost_of(parameters: Parameters, problem: Problem, noise: Noise) -> float:
 
 def misfit(parameters: Parameters, args: Any) -> Float[Array, ""]:
     """Half the sum of the squares of all residuals."""
-    return _half_sum(residuals(parameters, args))
+    return half_sum(residuals(parameters, args))
 
 
-def _half_sum(tree: Any) -> Float[Array, ""]:
+def half_sum(tree: Any) -> Float[Array, ""]:
+    """Half the sum of the squares of all leaves."""
     return 0.5 * sum((jnp.sum(leaf**2) for leaf in jax.tree.leaves(tree)), jnp.zeros(()))
 
 
