@@ -73,7 +73,8 @@ def descend(
         )
     if problem.links is not None:
         raise ValueError("Descent: pieces of one recording hang together; fit them at once")
-    point, memory = start, how.optimiser.init(start)
+    init: Any = how.optimiser.init
+    point, memory = start, init(start)
     try:
         for first in range(0, how.steps, STRIDE):
             key, own = jax.random.split(key)
@@ -96,29 +97,26 @@ def _stride(
 ) -> tuple[Parameters, Any, Float[Array, " steps"]]:
     def step(carry: Any, key: Array) -> Any:
         point, memory = carry
+        update: Any = how.optimiser.update
         rows = jax.random.choice(key, problem.count, (how.batch,), replace=False)
         cost, slope = jax.value_and_grad(_misfit_of)(point, problem, noise, rows)
         # optax counts its steps in integers, which strict promotion forbids to meet floats.
         with jax.numpy_dtype_promotion("standard"):
-            move, memory = how.optimiser.update(slope, memory, point)
-        return (optax.apply_updates(point, move), memory), cost
+            move, memory = update(slope, memory, point)
+        return (jax.tree.map(jnp.add, point, move), memory), cost
 
     (point, memory), costs = jax.lax.scan(step, (point, memory), keys)
     return point, memory, costs
 
 
-def _misfit_of(
-    point: Parameters, problem: Problem, noise: Noise, rows: Array
-) -> Float[Array, ""]:
+def _misfit_of(point: Parameters, problem: Problem, noise: Noise, rows: Array) -> Float[Array, ""]:
     """The whole misfit as these recordings show it: theirs times how many such batches there are.
 
     What holds the parameters beside the readings (priors) counts once.
     """
     few, mine, theirs = only(problem, rows), _rows(point.own, rows), tuple(n[rows] for n in noise)
     weights = jnp.ones_like(few.records.t)
-    read, beside = residuals(
-        Parameters(point.body, point.shared, mine), (few, theirs, weights)
-    )
+    read, beside = residuals(Parameters(point.body, point.shared, mine), (few, theirs, weights))
     return half_sum(read) * (problem.count / rows.shape[0]) + half_sum(beside)
 
 
@@ -139,5 +137,3 @@ def _rows(tree: Any, rows: Array) -> Any:
         return leaf[rows] if eqx.is_array(leaf) else leaf
 
     return jax.tree.map(pick, tree)
-
-
