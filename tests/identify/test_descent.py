@@ -69,7 +69,7 @@ def test_a_batch_holds_the_recordings_it_names(problem):
 
 @pytest.mark.slow
 def test_descent_alone_comes_near_and_a_fit_ends_at_the_bottom(problem):
-    how = identify.Descent(optax.adam(optax.cosine_decay_schedule(3e-2, 1500)), steps=1500, batch=6)
+    how = identify.Descent(optax.adam(optax.cosine_decay_schedule(3e-2, 4000)), steps=4000, batch=6)
     start = identify.fit(problem, starts=1, descent=how, max_steps=50)
     assert start.ok
     plain = identify.fit(problem, starts=1)
@@ -82,7 +82,7 @@ def test_descent_alone_comes_near_and_a_fit_ends_at_the_bottom(problem):
     before, after = (float(misfit(p, (problem, NOISE, whole))) for p in (blind, near))
     # 1800 readings: the bottom is at 900; descent in noise of its own stays a little above.
     assert after < 1.5 * 900 < 0.01 * before
-    assert said[-1].startswith("descent 1500/1500")
+    assert said[-1].startswith("descent 4000/4000")
 
 
 @pytest.mark.slow
