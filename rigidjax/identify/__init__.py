@@ -15,6 +15,7 @@ from rigidjax.identify.compare import (
     compare as compare,
     cross_validate as cross_validate,
 )
+from rigidjax.identify.descent import Descent as Descent
 from rigidjax.identify.design import (
     best_first_rate as best_first_rate,
     expected as expected,

@@ -13,6 +13,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.identify import reported, uncertainty, words
+from rigidjax.identify.descent import Descent, descend
 from rigidjax.identify.pieces import WIDTHS, joined, pieces as in_pieces, with_width
 from rigidjax.identify.problem import Parameters, Problem, all_errors
 from rigidjax.identify.propagate import Adaptive, FixedSteps
@@ -148,6 +149,7 @@ def fit(
     max_steps: int = 200,
     together: int = 1,
     pieces: int = 1,
+    descent: Descent | None = None,
     checkpoint: str | Path | None = None,
     progress: Callable[[str], Any] | None = None,
 ) -> Fit:
@@ -166,6 +168,8 @@ def fit(
     - `together`: how many starts go through one `vmap` at once.
     - `pieces`: where more than one, the record is first fitted in so many pieces whose ends are
       drawn together (see `pieces`), and what they agree on is the first start.
+    - `descent`: a `Descent(optimiser, steps=…, batch=…)` of optax walks each start down first, a
+      few recordings at a time: for many recordings, where a step of least squares costs much.
     - `checkpoint`: a file that keeps what was found after every 25 steps; a second call with the
       same problem and options goes on from there and ends at the same point. `together` = 1 only.
     - `progress`: called with a line of text after each start, such as `print`.
@@ -196,10 +200,20 @@ def fit(
         raise ValueError("fit: a checkpoint goes with together=1, one start after another")
     points = starting_points(problem, starts, jax.random.key(0) if key is None else key)
     noise, solver = _first_noise(problem), solver_for(tolerance)
+    if descent is not None and not isinstance(descent, Descent):
+        raise TypeError(
+            f"fit: wanted a Descent(optimiser, …) or None, got {type(descent).__name__}"
+        )
     if pieces > 1:
         points = [_from_pieces(problem, pieces, solver, max_steps), *points][:starts]
     if initial is not None:
         points = [initial, *points][:starts]
+    if descent is not None:
+        keys = jax.random.split(jax.random.key(1) if key is None else key, len(points))
+        points = [
+            descend(point, problem, noise, descent, own, progress)
+            for point, own in zip(points, keys, strict=True)
+        ]
     if together > 1:
         tried = _together(points, problem, noise, solver, max_steps, together, progress)
     else:

@@ -138,7 +138,7 @@ class Problem(eqx.Module):
     @property
     def count(self) -> int:
         """How many recordings there are."""
-        return len(self.counts)
+        return int(self.records.t.shape[0])
 
     @property
     def recordings(self) -> tuple[Recording, ...]:

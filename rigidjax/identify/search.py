@@ -26,6 +26,8 @@ STRIDE = 25
 CAREFUL, BOLD = 1.0 / 30.0, 30.0
 # A stride that lowers the misfit by less than this share has come to the bottom.
 SETTLED = 1e-7
+# A part of the record may be fitted at the expense of the whole, but not by more than this factor.
+WILD = 100.0
 
 
 class Tried(eqx.Module):
@@ -107,7 +109,7 @@ def evaluate(parameters: Parameters, problem: Problem) -> Any:
 def _cost(
     parameters: Parameters, problem: Problem, noise: Noise, weights: Any, found: Any
 ) -> Float[Array, ""]:
-    return _half_sum(assembled(parameters, (problem, noise, weights), *found))
+    return half_sum(assembled(parameters, (problem, noise, weights), *found))
 
 
 @eqx.filter_jit
@@ -179,10 +181,11 @@ def cost_of(parameters: Parameters, problem: Problem, noise: Noise) -> float:
 
 def misfit(parameters: Parameters, args: Any) -> Float[Array, ""]:
     """Half the sum of the squares of all residuals."""
-    return _half_sum(residuals(parameters, args))
+    return half_sum(residuals(parameters, args))
 
 
-def _half_sum(tree: Any) -> Float[Array, ""]:
+def half_sum(tree: Any) -> Float[Array, ""]:
+    """Half the sum of the squares of all leaves."""
     return 0.5 * sum((jnp.sum(leaf**2) for leaf in jax.tree.leaves(tree)), jnp.zeros(()))
 
 
@@ -270,12 +273,19 @@ def settle(
         before = float(tried.cost)
         count = min(STRIDE, max_steps)
         bold = BOLD if first or near else CAREFUL
-        tried = least_squares(tried.parameters, problem, noise, weights, solver, count, bold)
+        after = least_squares(tried.parameters, problem, noise, weights, solver, count, bold)
+        if not np.isfinite(float(after.cost)):
+            # The motion was lost on the way: what is known is where this stride began.
+            cost = jnp.asarray(cost_of(tried.parameters, problem, noise))
+            tried = Tried(tried.parameters, cost, jnp.asarray(False))
+            look(tried)
+            break
+        tried = after
         # At the very bottom round-off refuses every step: whether it moved is what counts.
         settled = before - float(tried.cost) < SETTLED * (1.0 + abs(before))
         tried = Tried(tried.parameters, tried.cost, jnp.asarray(settled))
         look(tried)
-        if bool(tried.converged) or not np.isfinite(float(tried.cost)):
+        if settled:
             break
     return tried
 
@@ -301,9 +311,11 @@ def climb(
             continue
         if stage < len(HORIZONS) - 1:
             # A part of the record need not be fitted to the end, only to come near.
-            count = min(STRIDE, max_steps)
-            tried = least_squares(tried.parameters, problem, noise, seen, solver, count, CAREFUL)
-            tried = fresh(tried.parameters)
+            count, before = min(STRIDE, max_steps), tried.parameters
+            after = least_squares(before, problem, noise, seen, solver, count, CAREFUL).parameters
+            # What explains a part alone may be nonsense beyond it: a drag that drives.
+            worse = cost_of(after, problem, noise) / max(cost_of(before, problem, noise), 1e-300)
+            tried = fresh(after if worse < WILD else before)
             look(stage + 1, tried)
             continue
 

@@ -332,4 +332,10 @@ def _answer(given: Given, walk: Walk, between: Array) -> Answer:
     end = jnp.stack(walk.y)
     there = walk.t >= given.stops[-1]
     end = jnp.where(there, end, jnp.full_like(end, jnp.nan))
+    # Under `vmap` JAX wants a result that is one for each of the batch wherever an input is: the
+    # states between depend on their times, the end does not, and neither on a number never used.
+    firsts = [leaf.reshape(-1)[0] for leaf in jax.tree.leaves(given) if leaf.size]
+    own = jnp.stack([first == first for first in firsts]).any()
+    end = jnp.where(own, end, end)
+    between = jnp.where(own, between, between) if between.size else end[None][:0]
     return Answer(between, end, walk.t, walk.h, walk.steps, walk.rejected)

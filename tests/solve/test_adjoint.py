@@ -160,3 +160,51 @@ def test_through_simulate_each_rung_and_what_is_refused():
     late = rj.simulate(body, start, ts, damping, solver=ours, max_steps=2, throw=False)
     assert late.result == dfx.RESULTS.max_steps_reached
     assert np.all(np.isnan(late.ys.omega[-1])) and np.all(np.isfinite(late.ys.omega[0]))
+
+
+BODY = rj.Inertia.from_principal(1.0, 1.6, 2.1)
+
+
+def last_rate(omega, end, height, ts=(), throw=True):
+    """A rate at the end of a run of the top, by its start, the time of its end, and its height."""
+    top = rj.torques.HeavyTop(1.0, jnp.array([0.0, 0.0, 1.0]) * height, [0.0, 0.0, -2.0])
+    ts = jnp.stack([jnp.zeros(()), *ts, end])
+    sol = rj.simulate(
+        BODY, rj.Attitude([1.0, 0, 0, 0], omega), ts, top,
+        solver=rj.solvers.DormandPrince8(), throw=throw,
+    )  # fmt: skip
+    return sol.ys.omega[-1, 0] + sol.ys.omega[0, 1] * sol.ys.omega[1, 2]
+
+
+@pytest.mark.parametrize(
+    "lane", [0, pytest.param(1, marks=pytest.mark.slow), pytest.param(2, marks=pytest.mark.slow)]
+)
+def test_the_gradient_of_a_batch_is_the_batch_of_gradients(lane):
+    # Each input alone batched: the others, and what depends on them alone, are shared.
+    args = (jnp.array([0.4, 1.2, 1.5]), jnp.asarray(0.7), jnp.asarray(0.5))
+    axes = tuple(0 if i == lane else None for i in range(3))
+    rows = jnp.stack([args[lane], args[lane] * 1.1])
+    many = tuple(rows if i == lane else arg for i, arg in enumerate(args))
+
+    def total(*many):
+        return jax.vmap(last_rate, axes)(*many).sum()
+
+    found = jax.jit(jax.grad(total, (0, 1, 2)))(*many)
+    alone = jax.jit(jax.grad(last_rate, (0, 1, 2)))
+    one, two = (alone(*[row if i == lane else arg for i, arg in enumerate(args)]) for row in rows)
+    for i in range(3):
+        wanted = jnp.stack([one[i], two[i]]) if i == lane else one[i] + two[i]
+        np.testing.assert_allclose(found[i], wanted, rtol=1e-10)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("throw", [True, False])
+def test_a_batch_by_a_time_between_that_the_end_does_not_feel(throw):
+    omega, end, height = jnp.array([0.4, 1.2, 1.5]), jnp.asarray(0.7), jnp.asarray(0.5)
+
+    def of(between):
+        return last_rate(omega, end, height, (between,), throw)
+
+    times = jnp.array([0.2, 0.3])
+    found = jax.jit(jax.grad(lambda ts: jax.vmap(of)(ts).sum()))(times)
+    np.testing.assert_allclose(found, [jax.jit(jax.grad(of))(t) for t in times], rtol=1e-10)

@@ -1,0 +1,35 @@
+"""The vector field of a scene: which equations move this body on this rung."""
+
+from collections.abc import Callable
+from typing import Any
+
+from rigidjax.body.inertia import Inertia, MassProperties
+from rigidjax.frames import AbstractScene, MovingFrame, Point, scene_of
+from rigidjax.motion import Attitude, AttitudeEquations, EulerEquations, NewtonEuler, Rigid, Spin
+from rigidjax.motion.torques import Torque
+from rigidjax.solve import inputs
+
+
+def equations_of_motion(
+    body: Inertia | MassProperties | None,
+    state0: Spin | Attitude | Rigid | Point,
+    torque: Torque | AbstractScene | MovingFrame | None = None,
+) -> Callable[..., Any]:
+    """The vector field for this body on the rung of `state0`, for plain `diffrax.ODETerm`.
+
+    **Arguments** as for `simulate`. **Raises** `TypeError` where they do not fit.
+
+    >>> import rigidjax as rj
+    >>> type(equations_of_motion(rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([1.0, 0, 0])))
+    <class 'rigidjax.motion.spin.EulerEquations'>
+    """
+    inputs.require_fit(body, state0, torque)
+    if isinstance(state0, Point):
+        return scene_of(torque).field
+    matter: Any = body
+    turning: Any = torque
+    if isinstance(body, MassProperties):
+        return NewtonEuler(body, turning)
+    if isinstance(state0, Attitude):
+        return AttitudeEquations(matter, turning)
+    return EulerEquations(matter, turning)

@@ -1,0 +1,199 @@
+"""A run in one compiled piece: by the closed form, by diffrax, or by our own loop."""
+
+import dataclasses
+from typing import Any
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from rigidjax.body.inertia import Inertia, MassProperties
+from rigidjax.exact import FreeBody
+from rigidjax.frames import Point, collision, scene_of
+from rigidjax.motion import Attitude, Rigid, on_the_group
+from rigidjax.motion.torques import jumps_of
+from rigidjax.solve import lean, travel
+from rigidjax.solve.explicit import DormandPrince8
+from rigidjax.solve.field import equations_of_motion
+from rigidjax.solve.projected import Projected
+from rigidjax.solve.watched import NONFINITE, finite
+
+# Made once: building a Module costs as much as ten steps, and `jit` compares it leaf by leaf.
+SOLVER = Projected(dfx.Dopri8())
+ADJOINT = dfx.RecursiveCheckpointAdjoint()
+NO_METER = dfx.NoProgressMeter()
+
+
+class Free(eqx.Module):
+    """A free body: the closed form, any time at the cost of one."""
+
+    body: Inertia | MassProperties
+    throw: bool = eqx.field(static=True)
+
+
+class Setup(eqx.Module):
+    """Everything about a solve but the start and the times."""
+
+    body: Inertia | MassProperties | None
+    torque: Any
+    solver: dfx.AbstractSolver
+    controller: dfx.AbstractStepSizeController
+    dt0: Any
+    adjoint: dfx.AbstractAdjoint
+    progress_meter: dfx.AbstractProgressMeter
+    max_steps: int | None = eqx.field(static=True)
+    throw: bool = eqx.field(static=True)
+
+
+class Lean(eqx.Module):
+    """A solve of which nothing is asked but states and `jax.grad`: our own loop."""
+
+    body: Inertia | MassProperties | None
+    torque: Any
+    controller: dfx.AbstractStepSizeController
+    dt0: Any
+    max_steps: int = eqx.field(static=True)
+    throw: bool = eqx.field(static=True)
+
+
+@eqx.filter_jit
+def solve(
+    setup: Free | Lean | Setup, state0: Any, ts: Array
+) -> tuple[Any, dict[str, Any], dfx.RESULTS]:
+    # One jit around everything: an operation outside of it costs as much as a hundred steps.
+    state0 = on_the_group(state0)
+    if isinstance(setup, Free):
+        return _free(setup, state0, ts)
+    if isinstance(setup, Lean):
+        return _lean(setup, state0, ts)
+    field = equations_of_motion(setup.body, state0, setup.torque)
+    scene: Any = scene_of(setup.torque) if isinstance(state0, Point) else None
+    watch = collision.event(scene)
+    subs = (
+        (dfx.SubSaveAt(ts=ts),) if watch is None else (dfx.SubSaveAt(ts=ts), dfx.SubSaveAt(t1=True))
+    )
+    out = dfx.diffeqsolve(
+        dfx.ODETerm(field),
+        setup.solver,
+        ts[0],
+        ts[-1],
+        setup.dt0,
+        state0,
+        saveat=dfx.SaveAt(subs=subs),
+        stepsize_controller=setup.controller,
+        adjoint=setup.adjoint,
+        max_steps=setup.max_steps,
+        throw=False,
+        progress_meter=setup.progress_meter,
+        event=watch,
+    )
+    stats: dict[str, Any] = {k: value for k, value in out.stats.items() if k != "max_steps"}
+    times: Any = out.ts
+    saved: Any = out.ys
+    ys, result = _reached(saved[0], times[0]), out.result
+    if not isinstance(setup.controller, dfx.AbstractAdaptiveStepSizeController):
+        # Equal steps look at no error, and would go on with NaN.
+        ill = (result == dfx.RESULTS.successful) & ~finite(ys)
+        result = dfx.RESULTS.where(ill, NONFINITE, result)
+    if setup.throw:
+        ys = _raise(ys, result)
+    if scene is not None:
+        if watch is not None:
+            end, end_time = jax.tree.map(lambda leaf: leaf[0], (saved[1], times[1]))
+            stats["collided"] = out.result == dfx.RESULTS.event_occurred
+            stats["end_time"] = end_time
+            stats["end_distances"] = scene.approach(end_time, end)[0]
+        stats["drift"] = scene.drift(ts, ys)
+    return ys, stats, result
+
+
+def _lean(setup: Lean, state0: Any, ts: Array) -> tuple[Any, dict[str, Any], dfx.RESULTS]:
+    controller: Any = setup.controller
+    out = lean.adaptive(
+        DormandPrince8(),
+        equations_of_motion(setup.body, state0, setup.torque),
+        ts,
+        state0,
+        rtol=controller.rtol,
+        atol=controller.atol,
+        dt0=setup.dt0,
+        max_steps=setup.max_steps,
+        jumps=jumps_of(setup.torque),
+        way=travel.reverse,
+    )
+    ys = _raise(out.ys, out.result) if setup.throw else out.ys
+    stats: dict[str, Any] = {
+        "num_steps": out.num_steps,
+        "num_accepted_steps": out.num_steps - out.num_rejected,
+        "num_rejected_steps": out.num_rejected,
+    }
+    if isinstance(state0, Point):
+        stats["drift"] = scene_of(setup.torque).drift(ts, ys)
+    return ys, stats, out.result
+
+
+def _reached(ys: Any, times: Array) -> Any:
+    """NaN where nothing was saved, there diffrax says t = inf: not to be taken for a state."""
+
+    def mark(leaf: Array) -> Array:
+        there = jnp.isfinite(times).reshape(-1, *[1] * (leaf.ndim - 1))
+        return jnp.where(there, leaf, jnp.full_like(leaf, jnp.nan))
+
+    return jax.tree.map(mark, ys)
+
+
+def _raise(ys: Any, result: dfx.RESULTS) -> Any:
+    ys = eqx.error_if(
+        ys,
+        result == NONFINITE,
+        "simulate: the motion became NaN or infinite. Is the torque finite at every time and state "
+        "that it meets? With equal steps: are they short enough for this spin? throw=False keeps "
+        "what came before",
+    )
+    ill = (result != dfx.RESULTS.successful) & (result != dfx.RESULTS.event_occurred)
+    return result.error_if(ys, ill & (result != NONFINITE))
+
+
+def _free(setup: Free, state0: Any, ts: Array) -> tuple[Any, dict[str, Any], dfx.RESULTS]:
+    since, body = ts - ts[0], setup.body
+    inertia = body if isinstance(body, Inertia) else body.inertia
+    turning = Attitude(state0.q, state0.omega) if isinstance(state0, Rigid) else state0
+    ys: Any = jax.vmap(FreeBody(inertia, turning))(since)
+    if isinstance(state0, Rigid):
+        x = state0.x[None] + since[:, None] * state0.v[None]
+        ys = Rigid(x, jnp.broadcast_to(state0.v, x.shape), ys.q, ys.omega)
+    none = jnp.zeros((), int)
+    stats = {"num_steps": none, "num_accepted_steps": none, "num_rejected_steps": none}
+    result = dfx.RESULTS.successful
+    if not setup.throw:
+        result = dfx.RESULTS.where(finite(ys), result, NONFINITE)
+    return ys, stats, result
+
+
+class Flow(eqx.Module):
+    """The same run from another start, as a function that forward mode goes through."""
+
+    setup: Free | Lean | Setup
+
+    def __init__(self, setup: "Free | Lean | Setup"):
+        if isinstance(setup, Lean):
+            setup = Setup(
+                body=setup.body,
+                torque=setup.torque,
+                solver=SOLVER,
+                controller=setup.controller,
+                dt0=setup.dt0,
+                adjoint=ADJOINT,
+                progress_meter=NO_METER,
+                max_steps=setup.max_steps,
+                throw=False,
+            )
+        setup = dataclasses.replace(setup, throw=False)
+        if isinstance(setup, Setup):
+            setup = dataclasses.replace(setup, adjoint=dfx.ForwardMode())
+        self.setup = setup
+
+    def __call__(self, state0: Any, ts: Array) -> Any:
+        return solve(self.setup, state0, ts)[0]

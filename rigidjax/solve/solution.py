@@ -1,0 +1,103 @@
+"""What a run gives back."""
+
+import warnings
+from typing import Any, Generic, TypeVar
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from rigidjax import _checks, motion
+from rigidjax._types import ScalarLike
+from rigidjax.frames import Point
+from rigidjax.motion import Attitude, Rigid, Spin
+from rigidjax.solve.growth import growth
+from rigidjax.solve.run import Flow, Free, Lean, Setup, solve
+
+State = TypeVar("State", Spin, Attitude, Rigid, Point)
+
+
+class Solution(eqx.Module, Generic[State]):
+    """What `simulate` returns.
+
+    **Fields:** `ts` (T,) the times asked for, s; `ys` the states there, of the type of `state0`,
+    with a leading time axis, NaN where the run did not get to; `stats` a dict with `num_steps`,
+    `num_accepted_steps`, `num_rejected_steps`, for a `Point` also `drift` of what its scene
+    conserves; `result` a `diffrax.RESULTS`: `successful`, or why the run ended early, such as
+    `max_steps_reached`, `nonfinite`, `dt_min_reached`.
+    """
+
+    ts: Float[Array, " times"]
+    ys: State
+    stats: dict[str, Any]
+    result: dfx.RESULTS
+    _setup: Free | Lean | Setup
+
+    @property
+    def drift(self) -> dict[str, Array]:
+        """How far each quantity that the scene conserves moved, relative to its size.
+
+        See `rigidjax.drift`: energy, angular momentum in the world, its component along gravity…,
+        whichever this scene keeps; for a `Point` what its scene says. Zero is perfect.
+        """
+        if "drift" in self.stats:
+            return self.stats["drift"]
+        return _drift(self._setup, self.ts, self.ys)
+
+    @property
+    def growth(self) -> Float[Array, " times"]:
+        """‖∂y(t)/∂y(t₀)‖ at each of `ts`: by how much a small error at the start has grown.
+
+        Computed when asked for, by forward mode: about as many runs as the state has numbers. It
+        has no unit: each of q, Ω, x, v counts relative to its largest size in the run, and the norm
+        is the largest singular value.
+
+        A solver's own errors grow as much. Where `growth * rtol` exceeds 1, the states there are
+        not known to a single digit and every gradient through them means nothing, however finite it
+        looks, whatever the adjoint: a `UserWarning` names the first such time. So look at it once
+        before differentiating through a long run; then end the run earlier, or fit it in pieces
+        (multiple shooting).
+
+        Source: the largest finite-time Lyapunov exponent is its logarithm over t (Eckmann and
+        Ruelle 1985, doi:10.1103/RevModPhys.57.617).
+        """
+        found = growth(Flow(self._setup), self.ts, self.ys)
+        rtol = getattr(getattr(self._setup, "controller", None), "rtol", None)
+        if rtol is None:
+            rtol = 100 * float(jnp.finfo(self.ts.dtype).eps)
+        if _checks.known((found, rtol, self.ts)):
+            lost = np.flatnonzero(np.asarray(found) * float(rtol) > 1)
+            if lost.size:
+                i = lost[0]
+                warnings.warn(
+                    f"growth: errors at the start have grown {float(found[i]):.1e} times at t = "
+                    f"{float(self.ts[i]):g} s; at a tolerance of {float(rtol):.0e} the states from "
+                    "there on are not known, and gradients through them mean nothing",
+                    stacklevel=2,
+                )
+        return found
+
+    def evaluate(self, t: ScalarLike) -> State:
+        """The state at any `t` between the first and the last of `ts`, s.
+
+        The motion is worked out again from the last saved state before `t`, so the error is that of
+        the method, not of an interpolation, and the attitude is on the group.
+
+        **Raises:** `ValueError` (`EquinoxRuntimeError` under `jit`) where `t` is outside.
+        """
+        t = _checks.floating(t, (), "t").astype(self.ts.dtype)
+        outside = (t < self.ts[0]) | (t > self.ts[-1])
+        t = _checks.refuse(t, outside, "evaluate: t lies outside the times that were simulated")
+        index = jnp.clip(jnp.searchsorted(self.ts, t, side="right") - 1, 0, self.ts.shape[0] - 1)
+        start = jax.tree.map(lambda leaf: leaf[index], self.ys)
+        ys, _, _ = solve(self._setup, start, jnp.stack([self.ts[index], t]))
+        return jax.tree.map(lambda leaf: leaf[-1], ys)
+
+
+@eqx.filter_jit
+def _drift(setup: Free | Lean | Setup, ts: Array, ys: Any) -> dict[str, Array]:
+    torque = None if isinstance(setup, Free) else setup.torque
+    return motion.drift(ts, ys, setup.body, torque)  # pyright: ignore[reportArgumentType]

@@ -1,0 +1,54 @@
+"""What the search does where the motion is lost: it goes back, and says where it stands."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from rigidjax import identify
+from rigidjax.identify import search
+from rigidjax.identify.search import Tried, climb, fresh, settle
+
+TS = np.linspace(0.0, 1.0, 8)
+
+
+@pytest.fixture
+def problem():
+    record = identify.Recording(TS, (identify.Gyro(0.1), np.ones((8, 3))))
+    return identify.Problem(record, identify.PrincipalRatios())
+
+
+def at(problem, value):
+    point = problem.start()
+    return type(point)(jnp.full_like(point.body, value), point.shared, point.own)
+
+
+def place(point):
+    return float(point.body[0])
+
+
+def test_a_stride_that_is_lost_leaves_where_it_began_and_its_misfit(problem, monkeypatch):
+    def lost(start, *_):
+        return Tried(start, jnp.asarray(jnp.inf), jnp.asarray(False))
+
+    monkeypatch.setattr(search, "least_squares", lost)
+    monkeypatch.setattr(search, "cost_of", lambda point, *_: 7.0)
+    seen = []
+    out = settle(fresh(at(problem, 2.0)), problem, (), jnp.ones((1, 8)), None, 100, seen.append)
+    assert place(out.parameters) == 2.0 and float(out.cost) == 7.0
+    assert not bool(out.converged) and len(seen) == 1
+
+
+@pytest.mark.parametrize(("beyond", "kept"), [(np.nan, 0.0), (np.inf, 0.0), (1e4, 0.0), (2.0, 1.0)])
+def test_a_part_is_not_fitted_at_the_cost_of_the_whole(problem, monkeypatch, beyond, kept):
+    # Each search of a part goes from 0 to 1, where the whole has the misfit `beyond`.
+    begun = []
+
+    def step(start, problem, noise, weights, *_):
+        begun.append((place(start), float(weights.mean())))
+        return Tried(at(problem, 1.0), jnp.asarray(1.0), jnp.asarray(True))
+
+    monkeypatch.setattr(search, "least_squares", step)
+    monkeypatch.setattr(search, "cost_of", lambda point, *_: 1.0 if place(point) == 0.0 else beyond)
+    climb(fresh(at(problem, 0.0)), problem, (), None, 25)
+    assert [shown for _, shown in begun] == [0.25, 0.5, 1.0]
+    assert [start for start, _ in begun] == [0.0, kept, kept]
