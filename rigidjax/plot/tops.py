@@ -87,7 +87,8 @@ def phase_portrait(
         ax.plot(np.degrees(lowest), 0, color=COLOURS[1], marker="x", ms=8, ls="", label="steady")
     ax.set(xlabel="tilt θ, deg", ylabel="dθ/dt, rad/s", ylim=(-reach, reach))
     ax.set_title(title or "phase portrait; thin: equal energy, same momenta")
-    ax.legend(loc="upper right", fontsize=8)
+    # Below: inside it would lie on the curves.
+    ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=3, fontsize=8, frameon=False)
     return ax
 
 
