@@ -3,12 +3,14 @@
 from collections.abc import Sequence
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from rigidjax.identify.recording import Recording
-from rigidjax.identify.sensors import AttitudeSensor, Gyro, Marker
+from rigidjax.identify.sensors import Gyro, Marker
+from rigidjax.identify.sightings import attitudes, place_of, rates
 from rigidjax.motion import Rigid, Spin
 from rigidjax.rotation import quaternion
 
@@ -45,37 +47,44 @@ def _typical_rate(recording: Recording) -> float:
             rate = float(np.sqrt(np.mean(np.sum(values**2, axis=1))))
             break
     else:
-        rate = float(np.linalg.norm(attitude_rate(recording)))
+        rate = float(np.linalg.norm(first_rate(recording)))
     return rate if rate > 0 else 1.0
 
 
 def _first_attitude(recording: Recording) -> np.ndarray:
-    for reading in recording.readings:
-        if isinstance(reading.sensor, AttitudeSensor):
-            return np.asarray(reading.values[int(np.argmax(reading.seen))])
-    return np.array([1.0, 0.0, 0.0, 0.0])
+    _, q = attitudes(recording)
+    return q[0] if len(q) else np.array([1.0, 0.0, 0.0, 0.0])
 
 
 def _first_place(recording: Recording) -> tuple[np.ndarray, np.ndarray, float]:
-    """Position and velocity of the first marker, m and m/s, and a typical length, m."""
-    for reading in recording.readings:
-        if isinstance(reading.sensor, Marker):
-            seen = np.flatnonzero(reading.seen)
-            x, t = np.asarray(reading.values)[seen], np.asarray(recording.t)[seen]
-            few = slice(0, max(2, min(5, seen.size)))
-            v = np.polyfit(t[few] - t[0], x[few], 1)[0] if seen.size > 1 else np.zeros(3)
-            length = float(np.linalg.norm(x - x.mean(axis=0), axis=1).max())
-            return x[0], v, length if length > 0 else 1.0
-    return np.zeros(3), np.zeros(3), 1.0
+    """First position and velocity of the body's frame, m and m/s, and a typical length, m.
+
+    Of the frame's origin where attitudes tell how far the markers are from it.
+    """
+    markers = [r for r in recording.readings if isinstance(r.sensor, Marker)]
+    if not markers:
+        return np.zeros(3), np.zeros(3), 1.0
+    seen = np.all([r.seen for r in markers], axis=0)
+    if not seen.any():
+        markers, seen = markers[:1], markers[0].seen
+    t = np.asarray(recording.t)[seen]
+    x = np.mean([np.asarray(r.values)[seen] for r in markers], axis=0)
+    place = np.mean([place_of(r) for r in markers], axis=0)
+    known, q = attitudes(recording)
+    there = np.isin(t, known)
+    if there.all():
+        arms = jax.vmap(lambda turn: quaternion.rotate(turn, place))(q[np.isin(known, t)])
+        x = x - np.asarray(arms)
+    few = slice(0, max(2, min(5, t.size)))
+    v = np.polyfit(t[few] - t[0], x[few], 1)[0] if t.size > 1 else np.zeros(3)
+    length = float(np.linalg.norm(x - x.mean(axis=0), axis=1).max())
+    return x[0], v, length if length > 0 else 1.0
 
 
-def attitude_rate(recording: Recording) -> np.ndarray:
-    """A first body rate (3,), rad/s, from the first two attitudes; zero where there are none."""
+def first_rate(recording: Recording) -> np.ndarray:
+    """A first body rate (3,), rad/s: a gyro's, or between attitudes; zero without either."""
     for reading in recording.readings:
-        if isinstance(reading.sensor, AttitudeSensor):
-            seen = np.flatnonzero(reading.seen)[:2]
-            if seen.size == 2:
-                first, second = reading.values[seen[0]], reading.values[seen[1]]
-                turn = quaternion.log(quaternion.multiply(quaternion.conjugate(first), second))
-                return np.asarray(turn) / float(recording.t[seen[1]] - recording.t[seen[0]])
-    return np.zeros(3)
+        if isinstance(reading.sensor, Gyro):
+            return np.asarray(reading.values[int(np.argmax(reading.seen))])
+    _, w = rates(recording)
+    return w[0] if len(w) else np.zeros(3)

@@ -93,7 +93,15 @@ def _sizes(
         return bold / jnp.sqrt(jnp.maximum(felt, floor))
 
     good = jnp.isfinite(most)
-    return jax.tree.map(lambda felt: jnp.where(good, size(felt), 1.0), found)
+    units = jax.tree.map(lambda felt: jnp.where(good, size(felt), 1.0), found)
+
+    # What the data hardly feel must not be flung about: of the numbers that are of order one by
+    # their making (the unit of a `Free` is a user's guess) none moves faster than that.
+    def made(p: Parameters) -> tuple[Any, ...]:
+        return p.body, p.own.spin, p.own.turn, p.own.place, p.own.speed
+
+    slow = tuple(None if unit is None else jnp.minimum(unit, 1.0) for unit in made(units))
+    return eqx.tree_at(made, units, slow, is_leaf=lambda leaf: leaf is None)
 
 
 @eqx.filter_jit

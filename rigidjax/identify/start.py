@@ -12,8 +12,9 @@ from rigidjax._types import HasSpin
 from rigidjax.body.inertia import Inertia
 from rigidjax.identify.problem import Parameters, Problem
 from rigidjax.identify.recording import Recording
-from rigidjax.identify.reference import attitude_rate
+from rigidjax.identify.reference import first_rate
 from rigidjax.identify.sensors import Gyro
+from rigidjax.identify.sightings import rates
 from rigidjax.motion import Spin
 from rigidjax.motion.torques import Torque, evaluate
 
@@ -26,14 +27,14 @@ def starting_points(problem: Problem, count: int, key: PRNGKeyArray) -> list[Par
     """`count` starting points, the most informed first.
 
     **Arguments:** `problem`; `count` ≥ 1; `key` a JAX random key. The first body rate is the first
-    reading (or the first two attitudes over their time). The inertia is the regression on Euler's
-    equations where a gyro sampled them finely enough, else a sphere; further starts scatter the
+    reading (or the turn between attitudes over its time). The inertia is the regression on Euler's
+    equations where it was sampled finely enough, else a sphere; further starts scatter the
     shape over the whole chart and the rate by a tenth. What a `Free` moves starts as it is given.
     """
     recordings = problem.recordings
     regressed = regress_inertia(recordings)
     start = problem.start(regressed)
-    rates = np.stack([_first_rate(recording) for recording in recordings])
+    rates = np.stack([first_rate(recording) for recording in recordings])
     rates = rates / np.asarray(problem.reference.rate)[:, None]
     centre = np.asarray(start.body)
     out = []
@@ -57,8 +58,8 @@ def regress_inertia(recordings: tuple[Recording, ...]) -> Inertia | None:
     a torque, or with one that starts at nothing as a drag does, the smallest right singular vector
     of all such rows is the answer, else (the torque at its starting values, along the measured
     rates) the least squares solution. Then moved to the nearest second moment whose eigenvalues are
-    positive. `None` where no gyro was there, sampled too coarsely, or the torque needs more than a
-    rate.
+    positive. `None` where there was no gyro and no attitude, they came too seldom, or the torque
+    needs more than a rate.
     """
     rows, sides = [], []
     for recording in recordings:
@@ -86,10 +87,11 @@ def regress_inertia(recordings: tuple[Recording, ...]) -> Inertia | None:
 def _equations(recording: Recording) -> tuple[np.ndarray, np.ndarray] | None:
     """Rows (n, 6) and right sides (n,) of the integral of Euler's equations over one recording."""
     gyro = [r for r in recording.readings if isinstance(r.sensor, Gyro)]
-    if not gyro:
-        return None
-    seen = gyro[0].seen
-    t, w = np.asarray(recording.t)[seen], np.asarray(gyro[0].values)[seen]
+    if gyro:
+        seen = gyro[0].seen
+        t, w = np.asarray(recording.t)[seen], np.asarray(gyro[0].values)[seen]
+    else:
+        t, w = rates(recording)
     if t.size < 10 or np.median(np.diff(t)) * np.linalg.norm(w, axis=1).max() > 0.5:
         return None
     pushed = np.zeros((t.size, 3))
@@ -117,10 +119,3 @@ def _torques(torque: Torque, t: Any, w: Any) -> Any:
 def _integral(values: np.ndarray, t: np.ndarray) -> np.ndarray:
     steps = 0.5 * (values[1:] + values[:-1]) * np.diff(t)[:, None, None]
     return np.concatenate([np.zeros((1, *values.shape[1:])), np.cumsum(steps, axis=0)])
-
-
-def _first_rate(recording: Recording) -> np.ndarray:
-    for reading in recording.readings:
-        if isinstance(reading.sensor, Gyro):
-            return np.asarray(reading.values[int(np.argmax(reading.seen))])
-    return attitude_rate(recording)

@@ -21,8 +21,9 @@ from rigidjax.solve import linear, march
 from rigidjax.solve.march import Control, Rows, Stops, Walk
 from rigidjax.solve.method import Method, spread
 
-# Steps in a chapter; steps and saved states that are worked on side by side.
-CHAPTER, LANES = 512, 64
+# Steps in a chapter; steps and saved states that are worked on side by side. A chapter that is run
+# again rounds differently, and at tight tolerances has other steps: most runs should need only one.
+CHAPTER, LANES = 2048, 64
 
 
 class Given(NamedTuple):
