@@ -93,11 +93,13 @@ def tumble(
     # Not pyplot's: a film must not leave a figure behind, nor open a window.
     figure = Figure(figsize=(3.6, 3.6), dpi=80)
     canvas = FigureCanvasAgg(figure)
-    ax: Any = figure.add_axes((0.0, 0.02, 0.98, 0.9), projection="3d")
+    ax: Any = figure.add_axes((0.0, 0.08, 0.86, 0.84), projection="3d")
     corners = (CORNERS * half) @ turn.T
     m = matrices(q)
     longest = np.argmax(half)
-    tips = m @ turn[:, longest] * half[longest]
+    # At every state that was given: at the pictures alone the path would be a zigzag.
+    when = np.asarray(ts, dtype=float)
+    tips = matrices(attitudes(states)) @ turn[:, longest] * half[longest]
     reach = float(np.linalg.norm(half))
     unit = ", m" if isinstance(body, MassProperties) else ""
     cube(ax, reach, (f"x{unit}", f"y{unit}", f"z{unit}"))
@@ -106,11 +108,11 @@ def tumble(
     (trail,) = ax.plot([], [], [], color="0.3", lw=0.9)
     colours = [COLOURS[axis] for axis in (0, 0, 1, 1, 2, 2)]
     shots = []
-    for index, (moment, rotation) in enumerate(zip(times, m, strict=True)):
+    for moment, rotation in zip(times, m, strict=True):
         placed = corners @ rotation.T
         solid.set_verts([placed[list(face)] for face in FACES])
         solid.set_facecolor(colours)
-        trail.set_data_3d(*tips[: index + 1].T)
+        trail.set_data_3d(*tips[when <= moment].T)
         ax.set_title(f"{title}  t = {moment:.3g} s".strip(), fontsize=10)
         canvas.draw()
         shots.append(Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB"))
