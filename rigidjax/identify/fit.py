@@ -384,11 +384,21 @@ def _assess(
     if any(sensor.noise is None for sensor in problem.records.sensors):
         count = sum(r.sensor.components * int(r.seen.sum()) for r in problem.records.readings)
         margin *= 2 * best_cost / count
+
+    def elsewhere(other: Parameters) -> bool:
+        # In one flat valley searches end apart, where no reading would tell them apart.
+        away = ravel_pytree(other)[0] - ravel_pytree(value)[0]
+        return float(np.sum((linear.rows @ np.asarray(away)) ** 2)) > 2 * margin
+
     starts = []
     for item in tried:
         fits = believable and float(item.cost) <= best_cost + margin
         starts.append(Start(item.parameters, float(item.cost), bool(item.converged), fits))
-    rivals = [s for s in starts if s.fits and s.converged and s.cost > best_cost + 0.01 * margin]
+    rivals = [
+        s
+        for s in starts
+        if s.fits and s.converged and s.cost > best_cost + 0.01 * margin and elsewhere(s.parameters)
+    ]
     if not np.isfinite(best_cost):
         status = "failed: no start gave a finite misfit"
     elif not believable:

@@ -9,6 +9,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 from scipy.signal import lfilter
+from scipy.stats import chi2 as distribution
 
 from rigidjax.identify.problem import Parameters, Problem, along
 from rigidjax.identify.residual import Noise, beside, weights_of, whitened
@@ -270,7 +271,9 @@ def goodness(
     Believed where χ² is within five standard deviations of its mean and, for a sensor whose noise
     was estimated, where the motion explains at least half of the variance of its readings and what
     is left over in one piece (`closeness`, the correlation from one sample to the next, of it) is
-    less than a tenth.
+    less than a tenth. Under a robust loss outliers are expected, and χ² is theirs: there the median
+    of the squared errors counts, as long as it is that of readings without outliers to five
+    standard deviations.
     """
     chi2, count, believable = 0.0, 0, True
     for reading, error, e, weight in zip(
@@ -285,9 +288,16 @@ def goodness(
             believable &= bool(left <= 0.5 * spread_of_values + tiny)
             believable &= bool(max(closeness, 0.0) * left <= 0.1 * spread_of_values + tiny)
         else:
+            size, many = reading.sensor.components, int(seen.sum())
             chi2 += float(np.sum(weight[..., None] * e**2))
-            count += reading.sensor.components * int(seen.sum())
+            count += size * many
+            if problem.loss is not None and many:
+                middle = np.median(np.sum(e[seen] ** 2, axis=-1))
+                half = distribution.median(size)
+                # Of a sample's median: 1 / (2 f √n), f the density there.
+                wide = 0.5 / (distribution.pdf(half, size) * np.sqrt(many))
+                believable &= bool(middle <= half + 5 * wide)
     dof = max(count - free, 1)
-    if count:
+    if count and problem.loss is None:
         believable &= bool(chi2 <= dof + 5 * np.sqrt(2 * dof))
     return chi2, dof, believable

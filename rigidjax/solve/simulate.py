@@ -163,7 +163,7 @@ def _adjoint(rtol: float | None) -> dfx.AbstractAdjoint:
 
 def _on_the_group(solver: dfx.AbstractSolver | None) -> dfx.AbstractSolver:
     # Ours project inside their one kernel; a second time outside of it breaks the kernel up.
-    if isinstance(solver, AbstractExplicit | AbstractSplitting):
+    if isinstance(solver, AbstractExplicit | AbstractSplitting | Projected):
         return solver
     return SOLVER if solver is None else Projected(solver)
 

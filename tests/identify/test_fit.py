@@ -90,6 +90,16 @@ def test_a_wrong_motion_is_not_called_success(tumble):
     assert found.status.startswith("poor fit")
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("loss", [rj.identify.SoftL1(), rj.identify.Huber()])
+def test_a_wrong_motion_is_not_called_outliers(tumble, loss):
+    _, ts, _ = tumble
+    rng = np.random.default_rng(3)
+    record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), rng.normal(size=(80, 3))))
+    found = rj.identify.fit(rj.identify.Problem(record, rj.identify.Ratios(), loss=loss), starts=2)
+    assert found.status.startswith("poor fit")
+
+
 def test_a_fit_that_stops_early_says_so_and_keeps_its_best(tumble):
     _, ts, ys = tumble
     record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), ys.omega))

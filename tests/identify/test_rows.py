@@ -110,6 +110,7 @@ def test_i4_outliers():
     for name, loss in (("huber", identify.Huber()), ("soft", identify.SoftL1())):
         for kind, values in (("clean", clean), ("spoiled", spoiled)):
             found = identify.fit(gyro_problem(values, loss=loss), starts=1)
+            assert found.ok
             errors[name, kind] = off(found)
     plain = off(identify.fit(gyro_problem(spoiled), starts=1))
     reach = 0.01

@@ -281,3 +281,16 @@ def test_drift_is_reported():
     assert 1e-8 < float(loose["energy"]) < 1e-2
     free = rj.simulate(rj.Inertia(TENSOR), start, ts).drift
     assert max(float(value) for value in free.values()) < 1e-13
+
+
+@pytest.mark.slow
+def test_a_solver_that_is_projected_already_takes_every_adjoint():
+    body, law = rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.torques.Damping([0.1, 0.1, 0.1])
+
+    def last(rate, solver):
+        start = rj.Attitude([1.0, 0, 0, 0], jnp.array([0.3, 1.0, 0.2]) * rate)
+        how = dict(solver=solver, adjoint=dfx.ForwardMode())
+        return rj.simulate(body, start, [0.0, 2.0], law, **how).ys.q[-1]
+
+    twice = jax.jacfwd(last)(1.0, rj.Projected(dfx.Dopri8()))
+    np.testing.assert_allclose(twice, jax.jacfwd(last)(1.0, dfx.Dopri8()), rtol=1e-12)
