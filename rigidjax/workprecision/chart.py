@@ -38,6 +38,9 @@ def draw(records: Iterable[Record], *, title: str | None = None) -> Any:
     for row, name in zip(axes, names, strict=True):
         for axis, kind in zip(row, kinds, strict=True):
             of = [r for r in records if (r.scene, r.kind) == (name, kind)]
+            if not of:
+                axis.set_axis_off()
+                continue
             _one(axis, of, labels)
             what = "error of the attitude, rad" if kind == "value" else "relative error"
             if name in ("foucault", "arenstorf") and kind == "value":
@@ -84,5 +87,4 @@ def _one(axis: Any, records: list[Record], labels: list[tuple[str, str]]) -> Non
     # Better is to the right and down.
     axis.invert_xaxis()
     axis.grid(alpha=0.3, which="major")
-    if records:
-        axis.legend(fontsize=6, ncols=2)
+    axis.legend(fontsize=6, ncols=2)
