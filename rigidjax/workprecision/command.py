@@ -27,6 +27,15 @@ SMALL = {
     "diffrax Dopri8": ("forward",),
 }
 DRIFT = "long-drift"
+# Compiling gradients is most of a run: of all scenes, these; of a scene that is named, always.
+GRADED = (
+    "free-top",
+    "heavy-top",
+    "asymmetric-top",
+    "gravity-gradient",
+    "damped-gyrostat",
+    "arenstorf",
+)
 
 
 def add(commands: Any) -> None:
@@ -101,7 +110,8 @@ def _measured(options: argparse.Namespace) -> list[Record]:
         if quick:
             chosen = [smaller(m) for m in chosen if m.name in SMALL]
         found += measure(
-            scenes()[name](), chosen, gradients=not options.no_gradients, progress=say,
+            scenes()[name](), chosen,
+            gradients=not options.no_gradients and (name in GRADED or bool(options.scene)), progress=say,
             thin=4 if quick else options.thin,
         )  # fmt: skip
     return found

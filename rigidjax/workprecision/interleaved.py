@@ -19,8 +19,8 @@ from rigidjax.workprecision.record import Record
 from rigidjax.workprecision.reference import Reference
 from rigidjax.workprecision.scene import Scene, distance
 
-# Runs longer than this are timed three times, those below a tenth of it all rounds.
-LONG = 0.5
+# Runs longer than this, s, are timed three times, those shorter than SHORT thrice as often.
+LONG, SHORT = 0.5, 0.02
 WRONG = 0.5
 
 
@@ -49,7 +49,7 @@ def measure(
     peers: Iterable[Method] = (),
     gradients: bool = True,
     thin: int = 1,
-    rounds: int = 7,
+    rounds: int = 5,
     progress: Callable[[str], None] | None = None,
 ) -> list[Record]:
     """Error and cost of each method at each of its settings, of the value and of its gradient.
@@ -211,7 +211,7 @@ def _timed(jobs: list[_Job], rounds: int) -> None:
     for turn in range(3 * rounds):
         for job in jobs:
             first = job.times[0]
-            if turn >= (3 if first > LONG else rounds if first > LONG / 50 else 3 * rounds):
+            if turn >= (3 if first > LONG else rounds if first > SHORT else 3 * rounds):
                 continue
             begin = time.perf_counter()
             job.ready.run(job.record.setting)

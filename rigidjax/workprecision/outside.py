@@ -11,8 +11,8 @@ import numpy as np
 from rigidjax.workprecision.method import Method, Ready, Run
 from rigidjax.workprecision.scene import Scene
 
-TOLERANCES = (1e-4, 1e-6, 1e-8, 1e-10, 1e-12)
-STEPS = (5e-2, 2e-2, 1e-2, 5e-3)
+TOLERANCES = (1e-4, 1e-7, 1e-10, 1e-13)
+STEPS = (5e-2, 2e-2, 5e-3)
 
 
 def _rates(scene: Scene, wrap: Any = None) -> Any:

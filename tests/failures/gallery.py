@@ -156,7 +156,9 @@ def gimbal(axis):
     gaps = np.logspace(-12, -0.5, 40)
 
     def back(gap):
-        r = rj.euler.to_matrix(jnp.stack([jnp.asarray(0.4, gap.dtype), gap, jnp.asarray(0.3, gap.dtype)]), "ZXZ")
+        r = rj.euler.to_matrix(
+            jnp.stack([jnp.asarray(0.4, gap.dtype), gap, jnp.asarray(0.3, gap.dtype)]), "ZXZ"
+        )
         return jnp.abs(rj.euler.to_matrix(rj.euler.from_matrix(r, "ZXZ"), "ZXZ") - r).max()
 
     def slope(gap):
