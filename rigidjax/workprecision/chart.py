@@ -7,14 +7,15 @@ from rigidjax.workprecision.pareto import front
 from rigidjax.workprecision.record import Record
 
 _MARKS = "osv^<>DPX*hp8d"
-_COLOURS = {"ours": "tab10", "jax": "Set2", "peer": "Dark2"}
+_COLOURS = {"ours": "tab20", "jax": "Set2", "peer": "Dark2"}
 
 
 def draw(records: Iterable[Record], *, title: str | None = None) -> Any:
     """Error against time, log–log: values on the left, gradients on the right, the front marked.
 
-    One scene a row. The grey line is the front: what nothing beats in both error and time, peers
-    included; its points are ringed. Error bars are quartiles of the time.
+    One scene a row. The grey band is the front: what nothing beats in both error and time, peers
+    included; its points are ringed. The coloured band is the front of what runs in JAX. Error bars
+    are quartiles of the time.
 
     **Arguments:** `records` as measured; `title` of the whole.
 
@@ -31,7 +32,7 @@ def draw(records: Iterable[Record], *, title: str | None = None) -> Any:
     names = list(dict.fromkeys(r.scene for r in records))
     kinds = [k for k in ("value", "gradient") if any(r.kind == k for r in records)]
     figure, axes = plt.subplots(
-        len(names), len(kinds), figsize=(6.6 * len(kinds), 4.6 * len(names)), squeeze=False,
+        len(names), len(kinds), figsize=(6.6 * len(kinds), 5.4 * len(names)), squeeze=False,
         layout="constrained",
     )  # fmt: skip
     labels = list(dict.fromkeys((r.label, r.group) for r in records))
@@ -61,7 +62,9 @@ def _one(axis: Any, records: list[Record], labels: list[tuple[str, str]]) -> Non
         if not of:
             continue
         same = [name for name, g in labels if g == group]
-        colour = mpl.colormaps[_COLOURS[group]](same.index(label) % 10)
+        colour = mpl.colormaps[_COLOURS[group]](
+            same.index(label) % mpl.colormaps[_COLOURS[group]].N
+        )
         errors = [max(r.error, 1e-16) for r in of]
         times = [1e3 * r.time for r in of]
         bars = [
@@ -73,13 +76,16 @@ def _one(axis: Any, records: list[Record], labels: list[tuple[str, str]]) -> Non
             markersize=4, linewidth=1.6 if group == "ours" else 0.9, elinewidth=0.6,
             linestyle="-" if group == "ours" else "--" if group == "jax" else ":",
         )  # fmt: skip
-    best = front(records)
+    for best, colour, what in (
+        (front(records), "0.6", "front"),
+        (front(r for r in records if r.group != "peer"), "tab:cyan", "front in JAX"),
+    ):
+        errors = [max(r.error, 1e-16) for r in best]
+        times = [1e3 * r.time for r in best]
+        axis.plot(errors, times, "-", color=colour, linewidth=6, alpha=0.3, zorder=0, label=what)
+    ringed = front(records)
     axis.plot(
-        [max(r.error, 1e-16) for r in best], [1e3 * r.time for r in best], "-", color="0.6",
-        linewidth=5, alpha=0.35, zorder=0, label="front",
-    )  # fmt: skip
-    axis.plot(
-        [max(r.error, 1e-16) for r in best], [1e3 * r.time for r in best], "o", color="k",
+        [max(r.error, 1e-16) for r in ringed], [1e3 * r.time for r in ringed], "o", color="k",
         markerfacecolor="none", markersize=9, zorder=5,
     )  # fmt: skip
     axis.set_xscale("log")
@@ -87,4 +93,4 @@ def _one(axis: Any, records: list[Record], labels: list[tuple[str, str]]) -> Non
     # Better is to the right and down.
     axis.invert_xaxis()
     axis.grid(alpha=0.3, which="major")
-    axis.legend(fontsize=6, ncols=2)
+    axis.legend(fontsize=6, ncols=3, loc="upper left", bbox_to_anchor=(0, -0.13), frameon=False)

@@ -59,6 +59,8 @@ def add(commands: Any) -> None:
     parser.add_argument("--from", dest="stored", type=Path, metavar="FILE",
                         help="measure nothing, read the records of --csv")  # fmt: skip
     parser.add_argument("--choose", action="store_true", help="scene × error → method")
+    parser.add_argument("--keep", nargs="?", type=Path, const=STORED, metavar="FILE",
+                        help=f"store the table that --check compares with (default: {STORED})")  # fmt: skip
     parser.add_argument("--check", nargs="?", type=Path, const=STORED, metavar="FILE",
                         help=f"say what moved since a stored table (default: {STORED}); a quick "
                         "run; exit code 1 if an error or a number of steps did")  # fmt: skip
@@ -82,6 +84,9 @@ def run(options: argparse.Namespace) -> int:
         if options.csv is not None:
             write_csv(records, options.csv)
             print(f"records: {options.csv}")
+        if options.keep is not None:
+            write_csv(regress.kept(records), options.keep)
+            print(f"kept: {options.keep}")
         print(summary(records))
         if options.choose:
             print(f"\n{pareto.table(pareto.choose(_timed(records)))}")
@@ -94,7 +99,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _measured(options: argparse.Namespace) -> list[Record]:
-    quick = options.quick or options.check is not None
+    quick = options.quick or options.check is not None or options.keep is not None
     names = options.scene or (QUICK if quick else [n for n, m in scenes().items() if not m().slow])
     found: list[Record] = []
     begin = time.perf_counter()
@@ -111,7 +116,8 @@ def _measured(options: argparse.Namespace) -> list[Record]:
             chosen = [smaller(m) for m in chosen if m.name in SMALL]
         found += measure(
             scenes()[name](), chosen,
-            gradients=not options.no_gradients and (name in GRADED or bool(options.scene)), progress=say,
+            gradients=not options.no_gradients and (name in GRADED or bool(options.scene)),
+            progress=say,
             thin=4 if quick else options.thin,
         )  # fmt: skip
     return found
@@ -124,7 +130,7 @@ def smaller(method: Method) -> Method:
 
 
 def summary(records: Iterable[Record]) -> str:
-    """Scene by scene: time to each wanted error, µs, the front marked with a star.
+    """Scene by scene: time to each wanted error, µs; on the front *, on that of JAX alone +.
 
     >>> summary([])
     ''
@@ -140,16 +146,15 @@ def summary(records: Iterable[Record]) -> str:
             if not of:
                 continue
             best = {r.label for r in pareto.front(of)}
+            near = {r.label for r in pareto.front(r for r in of if r.group != "peer")}
             wanted = "".join(f"{f'{e:.0e}':>10s}" for e in pareto.WANTED)
             lines.append(f"\n{scene}, {kind}: µs to an error of{wanted}   best error  compile, s")
             for label in dict.fromkeys(r.label for r in of):
                 mine = [r for r in of if r.label == label]
                 spent = "".join(_cell(pareto.time_to(mine, e)) for e in pareto.WANTED)
                 least = min(r.error for r in mine)
-                lines.append(
-                    f"{'*' if label in best else ' '} {label:38s}{spent}   {least:10.1e}  "
-                    f"{mine[0].compile:10.1f}"
-                )
+                mark = "*" if label in best else "+" if label in near else " "
+                lines.append(f"{mark} {label:38s}{spent}   {least:10.1e}  {mine[0].compile:10.1f}")
     return "\n".join(lines)
 
 

@@ -105,19 +105,20 @@ def worked_out(scene: Scene, gradients: bool = True) -> Reference:
     numbers = scene.numbers
     ts = jnp.array([0.0, scene.end], numbers.dtype)
 
-    def flow(numbers: Any, count: int) -> Any:
+    def flow(numbers: Any, count: Any) -> Any:
         body, start = scene.assembled(numbers)
         field = equations_of_motion(body, start, scene.torque)
         ys = lean.fixed(solvers.DormandPrince8(), field, ts, start, count)
         return scene.flat(jax.tree.map(lambda leaf: leaf[-1], ys))
 
     scale = max(1.0, _turn(scene) / 50)
+    run = jax.jit(flow)
+    take = jax.jit(jax.jacfwd(lambda p, count: scene.loss(flow(p, count))))
     ends, slopes = [], []
-    for count in (round(c * scale) for c in counts):
-        ends.append(np.asarray(jax.jit(flow, static_argnums=1)(numbers, count)))
+    for count in (jnp.asarray(round(c * scale)) for c in counts):
+        ends.append(np.asarray(run(numbers, count)))
         if gradients:
-            take = jax.jacfwd(lambda p, count=count: scene.loss(flow(p, count)))
-            slopes.append(np.asarray(jax.jit(take)(numbers)))
+            slopes.append(np.asarray(take(numbers, count)))
     floor = 100 * float(np.finfo(ends[0].dtype).eps)
     error = max(float(np.abs(ends[0] - ends[1]).max()), floor)
     slope = tuple(map(float, slopes[0])) if gradients else ()

@@ -1,5 +1,6 @@
 """What moved since a stored table: errors, steps, and ratios of times. Never absolute times."""
 
+import dataclasses
 import math
 from collections.abc import Iterable
 
@@ -48,6 +49,27 @@ def moved(records: Iterable[Record], stored: Iterable[Record]) -> tuple[list[str
                 f"{ratio:.2g}"
             )
     return wrong, paced
+
+
+def kept(records: Iterable[Record]) -> list[Record]:
+    """What a stored table keeps: no peers, no absolute times but multiples of the base's median.
+
+    >>> kept([Record("s", BASE, "jax", "value", "", 1e-6, error=1e-7, time=3.0)])[0].time
+    1.0
+    """
+    records = [r for r in records if r.group != "peer"]
+    found = []
+    for record in records:
+        here = (r for r in records if (r.scene, r.kind, r.label) == (record.scene, "value", BASE))
+        spent = sorted(r.time for r in here if r.time == r.time)
+        base = spent[len(spent) // 2] if spent else math.nan
+        found.append(
+            dataclasses.replace(
+                record, time=record.time / base, time_low=record.time_low / base,
+                time_high=record.time_high / base, compile=math.nan, memory=math.nan,
+            )
+        )  # fmt: skip
+    return found
 
 
 def _key(record: Record) -> tuple[str, ...]:

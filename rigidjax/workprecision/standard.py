@@ -35,6 +35,10 @@ class Circle(eqx.Module):
         return self.radius * jnp.stack([jnp.cos(angle), jnp.sin(angle), zero])
 
 
+def _same(x: Any) -> Any:
+    return x
+
+
 def _turned(vector: Any) -> np.ndarray:
     """The unit quaternion exp(v), by NumPy alone."""
     angle = np.linalg.norm(vector)
@@ -52,8 +56,11 @@ def _body(
     constants: Any = (),
     **more: Any,
 ) -> Scene:
-    def plain(numbers: Any, sin: Any, cos: Any, sqrt: Any, wrap: Any = lambda f: f) -> Any:
-        torque = kind(numbers[:6], constants, sin, cos, wrap(equations.into_body))
+    def plain(
+        numbers: Any, sin: Any, cos: Any, sqrt: Any, wrap: Any = _same, number: Any = _same
+    ) -> Any:
+        exact = tuple(number(c) for c in constants)
+        torque = kind(numbers[:6], exact, sin, cos, wrap(equations.into_body))
         return wrap(equations.body_rates(numbers[:6], None if torque is None else wrap(torque)))
 
     return Scene(
@@ -64,8 +71,10 @@ def _body(
 
 def _point(name: str, title: str, x: Any, v: Any, end: float, law: Any, kind: Any,
            constants: Any) -> Scene:  # fmt: skip
-    def plain(numbers: Any, sin: Any, cos: Any, sqrt: Any, wrap: Any = lambda f: f) -> Any:
-        return wrap(kind(constants, sqrt))
+    def plain(
+        numbers: Any, sin: Any, cos: Any, sqrt: Any, wrap: Any = _same, number: Any = _same
+    ) -> Any:
+        return wrap(kind(tuple(number(c) for c in constants), sqrt))
 
     return Scene(name, title, None, Point(x, v), law, end, plain, stored(name))
 

@@ -91,7 +91,7 @@ def loss(scene, end):
 
 
 def run(scene, numbers, tolerance):
-    f = scene.plain(numbers, mp.sin, mp.cos, mp.sqrt)
+    f = scene.plain(numbers, mp.sin, mp.cos, mp.sqrt, number=number)
     return solve(f, start(scene, numbers), scene.end, number(tolerance))
 
 

@@ -101,7 +101,12 @@ PROMISED = {
 }
 
 
-@pytest.mark.parametrize("name", NAMES)
+USUAL = ("free-top", "heavy-top", "gravity-gradient", "damped-gyrostat")
+
+
+@pytest.mark.parametrize(
+    "name", [n if n in USUAL else pytest.param(n, marks=pytest.mark.slow) for n in NAMES]
+)
 def test_the_defaults_of_simulate_keep_what_the_table_promises(name):
     scene = scenes()[name]()
     ts = jnp.array([0.0, scene.end])
@@ -118,7 +123,8 @@ def test_a_scene_and_a_method_of_ones_own():
         "ball", "a ball slowed down", rj.Inertia.from_principal(2.0, 2.0, 2.0),
         rj.Attitude([1.0, 0, 0, 0], [0.3, -0.4, 0.5]), rj.torques.Damping([0.1] * 3), 6.0,
     )  # fmt: skip
-    right = worked_out(scene)
+    right = worked_out(scene, gradients=False)
+    scene = dataclasses.replace(scene, reference=right)
     slowed = np.exp(-0.05 * 6.0) * np.array([0.3, -0.4, 0.5])
     np.testing.assert_allclose(right.end[4:], slowed, rtol=1e-13)
     turn = (1 - np.exp(-0.3)) / 0.05 * np.array([0.3, -0.4, 0.5])
@@ -156,7 +162,7 @@ def test_the_gradient_is_compared_with_the_reference():
 
 def test_the_front_and_the_table():
     ladder = [line("a", 1e-2, 1.0), line("a", 1e-6, 2.0), line("a", 1e-12, 8.0)]
-    other = [line("b", 1e-4, 1.5, group="jax"), line("b", 1e-8, 9.0, group="jax")]
+    other = [line("b", 1e-4, 1.2, group="jax"), line("b", 1e-8, 9.0, group="jax")]
     best = front(ladder + other)
     assert [(r.method, r.error) for r in best] == [
         ("a", 1e-2), ("b", 1e-4), ("a", 1e-6), ("a", 1e-12),
@@ -165,7 +171,7 @@ def test_the_front_and_the_table():
     assert math.isnan(time_to(ladder, 1e-13))
     (choice,) = choose(ladder + other, [1e-4])
     assert (choice.method, choice.peer) == ("a", "b")
-    assert choice.time == pytest.approx(math.sqrt(2)) or choice.time > choice.peer_time
+    assert (choice.time, choice.peer_time) == pytest.approx((math.sqrt(2), 1.2))
     assert "| s | 1e-04 | a |" in table([choice])
     with pytest.raises(ValueError, match="front: wanted records of one scene and kind"):
         front([*ladder, line(scene="elsewhere")])
@@ -231,6 +237,12 @@ def test_the_command_reads_what_was_measured(capsys, tmp_path):
     assert main(["workprecision", "--from", str(path), "--choose", "--check", str(path)]) == 0
     told = capsys.readouterr().out
     assert "nothing moved" in told and "| s | 1e-04 | a |" in told
+    kept = tmp_path / "kept.csv"
+    assert main(["workprecision", "--from", str(path), "--keep", str(kept)]) == 0
+    # Times as multiples of the base's: of this machine nothing is left.
+    assert [r.time for r in read_csv(kept)] == [0.5, 1.0]
+    assert main(["workprecision", "--from", str(path), "--check", str(kept)]) == 0
+    capsys.readouterr()
     write_csv([line(error=1e-3)], tmp_path / "worse.csv")
     assert main(["workprecision", "--from", str(path), "--check", str(tmp_path / "worse.csv")]) == 1
     assert "moved: s, value, a at 1e-06: error was 0.001, is 1e-06" in capsys.readouterr().out
