@@ -59,11 +59,23 @@ def add(commands: Any) -> None:
     parser.add_argument("--from", dest="stored", type=Path, metavar="FILE",
                         help="measure nothing, read the records of --csv")  # fmt: skip
     parser.add_argument("--choose", action="store_true", help="scene × error → method")
-    parser.add_argument("--keep", nargs="?", type=Path, const=STORED, metavar="FILE",
-                        help=f"store the table that --check compares with (default: {STORED})")  # fmt: skip
-    parser.add_argument("--check", nargs="?", type=Path, const=STORED, metavar="FILE",
-                        help=f"say what moved since a stored table (default: {STORED}); a quick "
-                        "run; exit code 1 if an error or a number of steps did")  # fmt: skip
+    parser.add_argument(
+        "--keep",
+        nargs="?",
+        type=Path,
+        const=STORED,
+        metavar="FILE",
+        help=f"store the table that --check compares with (default: {STORED}); a quick run",
+    )
+    parser.add_argument(
+        "--check",
+        nargs="?",
+        type=Path,
+        const=STORED,
+        metavar="FILE",
+        help=f"say what moved since a stored table (default: {STORED}); a quick run; exit code 1 "
+        "if an error or a number of steps did",
+    )
 
 
 def run(options: argparse.Namespace) -> int:
