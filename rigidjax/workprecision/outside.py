@@ -83,6 +83,8 @@ def _mujoco(scene: Scene) -> Ready | None:
         f'fullinertia="{words(full)}"/></body></worldbody></mujoco>'
     )
     data: Any = mujoco.MjData(model)
+    # It would write a file into the folder one works in where a step is too long.
+    mujoco.set_mju_user_warning(lambda message: None)
     spent = time.perf_counter() - begin
     start: Any = scene.state0
     q0, omega0 = np.asarray(start.q), np.asarray(start.omega)
