@@ -44,7 +44,11 @@ def run(solver, h, late=LATE):
     ).ys  # fmt: skip
 
 
-@pytest.mark.parametrize("solver", [dfx.Bosh3(), dfx.Tsit5()], ids=["Bosh3", "Tsit5"])
+@pytest.mark.parametrize(
+    "solver",
+    [pytest.param(dfx.Bosh3(), marks=pytest.mark.slow), dfx.Tsit5()],
+    ids=["Bosh3", "Tsit5"],
+)
 def test_d01_projection_keeps_the_order(solver):
     q, _ = right()
     steps = LATE / np.array([100, 150, 225])
@@ -59,7 +63,7 @@ def test_d01_projection_keeps_the_order(solver):
 
 @pytest.mark.parametrize(
     ("solver", "most"),
-    [(rj.solvers.RungeKutta4(), 2e-6), (rj.solvers.Tsitouras5(), 2e-8),
+    [pytest.param(rj.solvers.RungeKutta4(), 2e-6, marks=pytest.mark.slow), (rj.solvers.Tsitouras5(), 2e-8),
      (rj.solvers.Splitting4(), 5e-12),
      pytest.param(rj.solvers.DormandPrince8(), 1e-12, marks=pytest.mark.slow)],
     ids=["RungeKutta4", "Tsitouras5", "Splitting4", "DormandPrince8"],
