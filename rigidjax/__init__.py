@@ -1,7 +1,8 @@
 """Differentiable rigid-body and rotating-frame mechanics for JAX.
 
 Floors, from below: `special` (numbers), `rotation` and `body` (what turns), `motion` (how it
-turns), `exact` and `solve` (answers), `identify` and `plot` (uses). `simulate` is the front door.
+turns), `exact` and `solve` (answers), `identify`, `workprecision` and `plot` (uses). `simulate` is
+the front door.
 """
 
 from rigidjax import (
@@ -9,6 +10,7 @@ from rigidjax import (
     frames as frames,
     identify as identify,
     plot as plot,
+    workprecision as workprecision,
 )
 from rigidjax._types import (
     HasAttitude as HasAttitude,

@@ -1,4 +1,4 @@
-"""`python -m rigidjax`: identify a body from recordings on the command line."""
+"""`python -m rigidjax`: identify a body from recordings; compare methods."""
 
 import argparse
 import sys
@@ -8,6 +8,7 @@ from typing import Any
 import jax
 
 import rigidjax as rj
+from rigidjax.workprecision import command
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -19,6 +20,8 @@ def main(arguments: list[str] | None = None) -> int:
         return 0
     # A program of its own, not a library: the switch is ours to set here.
     jax.config.update("jax_enable_x64", True)
+    if options.command == "workprecision":
+        return command.run(options)
     if options.demo == bool(options.logs):
         parser.error("identify: give either log FILES or --demo")
     return _demo(options) if options.demo else _logs(options)
@@ -42,6 +45,7 @@ def _parser() -> argparse.ArgumentParser:
         "throw2.csv --wheel flywheel:1.2e-6:z --model tensor --typical 3e-4 --free drag bias "
         "--report throws.html",
     )
+    command.add(commands)
     identify.add_argument("logs", metavar="FILE", nargs="*", help="logs of one body")
     identify.add_argument("--demo", action="store_true", help="the tumbling of 4179 Toutatis")
     identify.add_argument(

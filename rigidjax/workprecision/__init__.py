@@ -1,0 +1,31 @@
+"""Error against cost, of the value and of the gradient: what to choose for a scene.
+
+`measure(scene)` runs methods on a scene, `front` finds those that nothing beats, `draw` makes the
+chart, `choose` the short table. `python -m rigidjax workprecision` is all of it.
+"""
+
+from rigidjax.workprecision.chart import draw as draw
+from rigidjax.workprecision.drift import long_drift as long_drift
+from rigidjax.workprecision.in_jax import diffrax_method as diffrax_method
+from rigidjax.workprecision.interleaved import (
+    measure as measure,
+    methods as methods,
+    worked_out as worked_out,
+)
+from rigidjax.workprecision.method import Method as Method, Ready as Ready, Run as Run
+from rigidjax.workprecision.pareto import (
+    Choice as Choice,
+    choose as choose,
+    front as front,
+    table as table,
+    time_to as time_to,
+)
+from rigidjax.workprecision.record import (
+    Record as Record,
+    read_csv as read_csv,
+    write_csv as write_csv,
+)
+from rigidjax.workprecision.reference import Reference as Reference
+from rigidjax.workprecision.regress import moved as moved
+from rigidjax.workprecision.scene import Scene as Scene
+from rigidjax.workprecision.standard import scenes as scenes

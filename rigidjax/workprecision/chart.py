@@ -1,0 +1,96 @@
+"""Charts of error against time. matplotlib is imported only when a chart is asked for."""
+
+from collections.abc import Iterable
+from typing import Any
+
+from rigidjax.workprecision.pareto import front
+from rigidjax.workprecision.record import Record
+
+_MARKS = "osv^<>DPX*hp8d"
+_COLOURS = {"ours": "tab20", "jax": "Set2", "peer": "Dark2"}
+
+
+def draw(records: Iterable[Record], *, title: str | None = None) -> Any:
+    """Error against time, log–log: values on the left, gradients on the right, the front marked.
+
+    One scene a row. The grey band is the front: what nothing beats in both error and time, peers
+    included; its points are ringed. The coloured band is the front of what runs in JAX. Error bars
+    are quartiles of the time.
+
+    **Arguments:** `records` as measured; `title` of the whole.
+
+    **Returns** a `matplotlib` figure.
+
+    **Raises:** `ModuleNotFoundError` where matplotlib is missing (`pip install 'rigidjax[view]'`);
+    `ValueError` where there is nothing to draw.
+    """
+    records = [r for r in records if r.error == r.error]
+    if not records:
+        raise ValueError("draw: wanted records with an error and a time, got none")
+    import matplotlib.pyplot as plt
+
+    names = list(dict.fromkeys(r.scene for r in records))
+    kinds = [k for k in ("value", "gradient") if any(r.kind == k for r in records)]
+    figure, axes = plt.subplots(
+        len(names), len(kinds), figsize=(6.6 * len(kinds), 5.4 * len(names)), squeeze=False,
+        layout="constrained",
+    )  # fmt: skip
+    labels = list(dict.fromkeys((r.label, r.group) for r in records))
+    for row, name in zip(axes, names, strict=True):
+        for axis, kind in zip(row, kinds, strict=True):
+            of = [r for r in records if (r.scene, r.kind) == (name, kind)]
+            if not of:
+                axis.set_axis_off()
+                continue
+            _one(axis, of, labels)
+            what = "error of the attitude, rad" if kind == "value" else "relative error"
+            if name in ("foucault", "arenstorf") and kind == "value":
+                what = "relative error of the place"
+            axis.set_xlabel(what)
+            axis.set_title(f"{name}: {kind}", fontsize=10)
+            axis.set_ylabel("time, ms")
+    if title:
+        figure.suptitle(title)
+    return figure
+
+
+def _one(axis: Any, records: list[Record], labels: list[tuple[str, str]]) -> None:
+    import matplotlib as mpl
+
+    for i, (label, group) in enumerate(labels):
+        of = sorted((r for r in records if r.label == label), key=lambda r: r.setting)
+        if not of:
+            continue
+        same = [name for name, g in labels if g == group]
+        colour = mpl.colormaps[_COLOURS[group]](
+            same.index(label) % mpl.colormaps[_COLOURS[group]].N
+        )
+        errors = [max(r.error, 1e-16) for r in of]
+        times = [1e3 * r.time for r in of]
+        bars = [
+            [max(1e3 * (r.time - r.time_low), 0.0) for r in of],
+            [max(1e3 * (r.time_high - r.time), 0.0) for r in of],
+        ]
+        axis.errorbar(
+            errors, times, bars, label=label, color=colour, marker=_MARKS[i % len(_MARKS)],
+            markersize=4, linewidth=1.6 if group == "ours" else 0.9, elinewidth=0.6,
+            linestyle="-" if group == "ours" else "--" if group == "jax" else ":",
+        )  # fmt: skip
+    for best, colour, what in (
+        (front(records), "0.6", "front"),
+        (front(r for r in records if r.group != "peer"), "tab:cyan", "front in JAX"),
+    ):
+        errors = [max(r.error, 1e-16) for r in best]
+        times = [1e3 * r.time for r in best]
+        axis.plot(errors, times, "-", color=colour, linewidth=6, alpha=0.3, zorder=0, label=what)
+    ringed = front(records)
+    axis.plot(
+        [max(r.error, 1e-16) for r in ringed], [1e3 * r.time for r in ringed], "o", color="k",
+        markerfacecolor="none", markersize=9, zorder=5,
+    )  # fmt: skip
+    axis.set_xscale("log")
+    axis.set_yscale("log")
+    # Better is to the right and down.
+    axis.invert_xaxis()
+    axis.grid(alpha=0.3, which="major")
+    axis.legend(fontsize=6, ncols=3, loc="upper left", bbox_to_anchor=(0, -0.13), frameon=False)

@@ -1,0 +1,208 @@
+"""`python -m rigidjax workprecision`: measure, print, draw, compare with a stored table."""
+
+import argparse
+import math
+import sys
+import time
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from rigidjax.workprecision import chart, pareto, regress
+from rigidjax.workprecision.drift import long_drift
+from rigidjax.workprecision.interleaved import measure, methods
+from rigidjax.workprecision.method import Method
+from rigidjax.workprecision.record import Record, read_csv, write_csv
+from rigidjax.workprecision.standard import scenes
+
+STORED = Path("tests/workprecision/record.csv")
+QUICK = ("free-top", "heavy-top", "damped-gyrostat")
+# What a quick run looks at, and by which adjoints.
+SMALL = {
+    "closed form": ("forward",),
+    "simulate": ("forward",),
+    "DormandPrince8": (),
+    "Tsitouras5": (),
+    "diffrax Tsit5": (),
+    "diffrax Dopri8": ("forward",),
+}
+DRIFT = "long-drift"
+# Compiling gradients is most of a run: of all scenes, these; of a scene that is named, always.
+GRADED = (
+    "free-top",
+    "heavy-top",
+    "asymmetric-top",
+    "gravity-gradient",
+    "damped-gyrostat",
+    "arenstorf",
+)
+
+
+def add(commands: Any) -> None:
+    """Add the subcommand to an `argparse` parser's commands."""
+    parser = commands.add_parser(
+        "workprecision",
+        help="error against cost of each method, of values and gradients",
+        description="Run methods (ours, diffrax's, and SciPy, numba, MuJoCo, heyoka where "
+        "installed) on standard scenes, in one process, in turn, and compare error and time. "
+        "Times are of this machine: only their ratios carry over.",
+        epilog=f"Scenes: {', '.join(scenes())}, {DRIFT} (a million steps). Without a scene: all "
+        "but the slow ones.",
+    )
+    parser.add_argument("scene", nargs="*", metavar="SCENE", help="which scenes (default: all)")
+    parser.add_argument("--quick", action="store_true", help="three scenes, few settings")
+    parser.add_argument("--no-peers", action="store_true", help="only what runs in JAX")
+    parser.add_argument("--no-gradients", action="store_true", help="values only")
+    parser.add_argument("--thin", type=int, default=1, metavar="N", help="every N-th setting")
+    parser.add_argument("--csv", type=Path, metavar="FILE", help="keep the records")
+    parser.add_argument("--figure", type=Path, metavar="FILE", help="draw the charts")
+    parser.add_argument("--from", dest="stored", type=Path, metavar="FILE",
+                        help="measure nothing, read the records of --csv")  # fmt: skip
+    parser.add_argument("--choose", action="store_true", help="scene × error → method")
+    parser.add_argument(
+        "--keep",
+        nargs="?",
+        type=Path,
+        const=STORED,
+        metavar="FILE",
+        help=f"store the table that --check compares with (default: {STORED}); a quick run",
+    )
+    parser.add_argument(
+        "--check",
+        nargs="?",
+        type=Path,
+        const=STORED,
+        metavar="FILE",
+        help=f"say what moved since a stored table (default: {STORED}); a quick run; exit code 1 "
+        "if an error or a number of steps did",
+    )
+
+
+def run(options: argparse.Namespace) -> int:
+    """Run the subcommand; returns the exit code: 0 good, 1 something moved, 2 bad input."""
+    known = [*scenes(), DRIFT]
+    for name in options.scene:
+        if name not in known:
+            print(f"error: no scene {name!r}; there are {', '.join(known)}", file=sys.stderr)
+            return 2
+    if options.thin < 1:
+        print(f"error: --thin: wanted 1 or more, got {options.thin}", file=sys.stderr)
+        return 2
+    try:
+        before = None if options.check is None else read_csv(options.check)
+        records = _measured(options) if options.stored is None else read_csv(options.stored)
+        if options.stored is not None and options.scene:
+            records = [r for r in records if r.scene in options.scene]
+        if options.csv is not None:
+            write_csv(records, options.csv)
+            print(f"records: {options.csv}")
+        if options.keep is not None:
+            write_csv(regress.kept(records), options.keep)
+            print(f"kept: {options.keep}")
+        print(summary(records))
+        if options.choose:
+            print(f"\n{pareto.table(pareto.choose(_timed(records)))}")
+        if options.figure is not None:
+            _draw(records, options.figure)
+    except (OSError, ValueError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    return 0 if before is None else _compared(records, before)
+
+
+def _measured(options: argparse.Namespace) -> list[Record]:
+    quick = options.quick or options.check is not None or options.keep is not None
+    names = options.scene or (QUICK if quick else [n for n, m in scenes().items() if not m().slow])
+    found: list[Record] = []
+    begin = time.perf_counter()
+
+    def say(line: str) -> None:
+        print(f"{time.perf_counter() - begin:6.1f} s  {line}", file=sys.stderr, flush=True)
+
+    for name in names:
+        if name == DRIFT:
+            found += long_drift(progress=say)
+            continue
+        chosen = [m for m in methods() if not (options.no_peers and m.group == "peer")]
+        if quick:
+            chosen = [smaller(m) for m in chosen if m.name in SMALL]
+        found += measure(
+            scenes()[name](), chosen,
+            gradients=not options.no_gradients and (name in GRADED or bool(options.scene)),
+            progress=say,
+            thin=4 if quick else options.thin,
+        )  # fmt: skip
+    return found
+
+
+def smaller(method: Method) -> Method:
+    """The method with only the adjoints of a quick run."""
+    kept = {n: make for n, make in method.gradients.items() if n in SMALL[method.name]}
+    return method._replace(gradients=kept)
+
+
+def summary(records: Iterable[Record]) -> str:
+    """Scene by scene: time to each wanted error, µs; on the front *, on that of JAX alone +.
+
+    >>> summary([])
+    ''
+    """
+    records = list(records)
+    lines: list[str] = []
+    for scene in dict.fromkeys(r.scene for r in records):
+        if scene.startswith(DRIFT):
+            lines += _drifts(scene, [r for r in records if r.scene == scene])
+            continue
+        for kind in ("value", "gradient"):
+            of = [r for r in records if (r.scene, r.kind) == (scene, kind)]
+            if not of:
+                continue
+            best = {r.label for r in pareto.front(of)}
+            near = {r.label for r in pareto.front(r for r in of if r.group != "peer")}
+            wanted = "".join(f"{f'{e:.0e}':>10s}" for e in pareto.WANTED)
+            lines.append(f"\n{scene}, {kind}: µs to an error of{wanted}   best error  compile, s")
+            for label in dict.fromkeys(r.label for r in of):
+                mine = [r for r in of if r.label == label]
+                spent = "".join(_cell(pareto.time_to(mine, e)) for e in pareto.WANTED)
+                least = min(r.error for r in mine)
+                mark = "*" if label in best else "+" if label in near else " "
+                lines.append(f"{mark} {label:38s}{spent}   {least:10.1e}  {mine[0].compile:10.1f}")
+    return "\n".join(lines)
+
+
+def _cell(seconds: float) -> str:
+    return f"{'-' if math.isnan(seconds) else f'{1e6 * seconds:.4g}':>10s}"
+
+
+def _drifts(scene: str, records: list[Record]) -> list[str]:
+    lines = [f"\n{scene}: largest drift of energy, of momentum along gravity; s"]
+    return lines + [
+        f"  {r.label:38s} h = {r.setting:<5g} {r.energy:10.1e} {r.momentum:10.1e} {r.time:10.2f}"
+        for r in records
+    ]
+
+
+def _timed(records: list[Record]) -> list[Record]:
+    return [r for r in records if not r.scene.startswith(DRIFT)]
+
+
+def _draw(records: list[Record], path: Path) -> None:
+    try:
+        import matplotlib
+    except ModuleNotFoundError:
+        print("no figure: matplotlib is missing (pip install 'rigidjax[view]')")
+        return
+    matplotlib.use("Agg")
+    chart.draw(_timed(records)).savefig(path, dpi=110)
+    print(f"figure: {path}")
+
+
+def _compared(records: list[Record], before: list[Record]) -> int:
+    wrong, paced = regress.moved(records, before)
+    for line in wrong:
+        print(f"moved: {line}")
+    for line in paced:
+        print(f"time: {line}")
+    if not wrong and not paced:
+        print("nothing moved")
+    return 1 if wrong else 0

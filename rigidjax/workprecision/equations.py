@@ -1,0 +1,139 @@
+"""The equations of the scenes in plain arithmetic: for peers and for references.
+
+Written apart from the rest of the library, on numbers that may be floats, `mpmath` or `gmpy2`
+numbers, or a peer's symbols. `sin` and `cos` come in as arguments, everything else is + − × ÷.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+Number = Any
+Torque = Callable[[Number, Any, Any], tuple[Number, Number, Number]]
+
+
+def free(inertia: Any, constants: Any, sin: Any, cos: Any, into: Any) -> None:
+    """No torque: the body's equations leave the term away."""
+    return None
+
+
+def heavy(inertia: Any, constants: Any, sin: Any, cos: Any, into: Any) -> Torque:
+    """`τ = c m × Rᵀg`; constants m c (3) and g (3)."""
+    cx, cy, cz, gx, gy, gz = constants
+
+    def torque(t, q, w):
+        ux, uy, uz = into(q, gx, gy, gz)
+        return cy * uz - cz * uy, cz * ux - cx * uz, cx * uy - cy * ux
+
+    return torque
+
+
+def gradient(inertia: Any, constants: Any, sin: Any, cos: Any, into: Any) -> Torque:
+    """`τ = 3n² r × I r`, r the direction of the planet on a circular orbit; constants n."""
+    (n,) = constants
+    ixx, iyy, izz, ixy, ixz, iyz = inertia
+
+    def torque(t, q, w):
+        rx, ry, rz = into(q, cos(n * t), sin(n * t), 0.0)
+        lx = ixx * rx + ixy * ry + ixz * rz
+        ly = ixy * rx + iyy * ry + iyz * rz
+        lz = ixz * rx + iyz * ry + izz * rz
+        k = 3 * n * n
+        return k * (ry * lz - rz * ly), k * (rz * lx - rx * lz), k * (rx * ly - ry * lx)
+
+    return torque
+
+
+def gyrostat(inertia: Any, constants: Any, sin: Any, cos: Any, into: Any) -> Torque:
+    """`τ = h × Ω − c Ω`, a wheel at constant speed and damping; constants h (3), c (3)."""
+    hx, hy, hz, cx, cy, cz = constants
+
+    def torque(t, q, w):
+        wx, wy, wz = w
+        return (
+            hy * wz - hz * wy - cx * wx,
+            hz * wx - hx * wz - cy * wy,
+            hx * wy - hy * wx - cz * wz,
+        )
+
+    return torque
+
+
+def into_body(q, x, y, z):
+    """`Rᵀ(x, y, z)` for a unit quaternion."""
+    a, b, c, d = q
+    return (
+        (1 - 2 * (c * c + d * d)) * x + 2 * (b * c + a * d) * y + 2 * (b * d - a * c) * z,
+        2 * (b * c - a * d) * x + (1 - 2 * (b * b + d * d)) * y + 2 * (c * d + a * b) * z,
+        2 * (b * d + a * c) * x + 2 * (c * d - a * b) * y + (1 - 2 * (b * b + c * c)) * z,
+    )
+
+
+def body_rates(inertia: Any, torque: Torque | None) -> Callable[[Number, Any], Any]:
+    """`(t, (q, Ω)) → (q', Ω')` for an inertia (Ixx, Iyy, Izz, Ixy, Ixz, Iyz), 7 numbers."""
+    ixx, iyy, izz, ixy, ixz, iyz = inertia
+    kxx, kyy, kzz = iyy * izz - iyz * iyz, ixx * izz - ixz * ixz, ixx * iyy - ixy * ixy
+    kxy, kxz, kyz = ixz * iyz - ixy * izz, ixy * iyz - ixz * iyy, ixy * ixz - ixx * iyz
+    det = ixx * kxx + ixy * kxy + ixz * kxz
+    kxx, kyy, kzz, kxy, kxz, kyz = kxx / det, kyy / det, kzz / det, kxy / det, kxz / det, kyz / det
+
+    def rates(t, y):
+        a, b, c, d, wx, wy, wz = y
+        lx = ixx * wx + ixy * wy + ixz * wz
+        ly = ixy * wx + iyy * wy + iyz * wz
+        lz = ixz * wx + iyz * wy + izz * wz
+        tx, ty, tz = ly * wz - lz * wy, lz * wx - lx * wz, lx * wy - ly * wx
+        if torque is not None:
+            ux, uy, uz = torque(t, (a, b, c, d), (wx, wy, wz))
+            tx, ty, tz = tx + ux, ty + uy, tz + uz
+        return (
+            0.5 * (-b * wx - c * wy - d * wz),
+            0.5 * (a * wx + c * wz - d * wy),
+            0.5 * (a * wy + d * wx - b * wz),
+            0.5 * (a * wz + b * wy - c * wx),
+            kxx * tx + kxy * ty + kxz * tz,
+            kxy * tx + kyy * ty + kyz * tz,
+            kxz * tx + kyz * ty + kzz * tz,
+        )
+
+    return rates
+
+
+def foucault(constants: Any, sqrt: Any) -> Callable[[Number, Any], Any]:
+    """A pendulum on the turning Earth, axes east, north, up; constants g, Ω north, Ω up."""
+    g, wn, wu = constants
+
+    def rates(t, y):
+        px, py, pz, vx, vy, vz = y
+        along, square = wn * py + wu * pz, wn * wn + wu * wu
+        ax = square * px + 2 * (wu * vy - wn * vz)
+        ay = square * py - along * wn - 2 * wu * vx
+        az = square * pz - along * wu + 2 * wn * vx - g
+        pull = (px * ax + py * ay + pz * az + vx * vx + vy * vy + vz * vz) / (
+            px * px + py * py + pz * pz
+        )
+        return vx, vy, vz, ax - pull * px, ay - pull * py, az - pull * pz
+
+    return rates
+
+
+def three_body(constants: Any, sqrt: Any) -> Callable[[Number, Any], Any]:
+    """The circular restricted problem in the turning frame; constants μ."""
+    (mu,) = constants
+    nu = 1 - mu
+
+    def rates(t, y):
+        px, py, pz, vx, vy, vz = y
+        da, db = px + mu, px - nu
+        flat = py * py + pz * pz
+        ra, rb = da * da + flat, db * db + flat
+        ka, kb = nu / (ra * sqrt(ra)), mu / (rb * sqrt(rb))
+        return (
+            vx,
+            vy,
+            vz,
+            px + 2 * vy - ka * da - kb * db,
+            py - 2 * vx - (ka + kb) * py,
+            -(ka + kb) * pz,
+        )
+
+    return rates

@@ -1,0 +1,158 @@
+"""Who is on the front, how long an error takes, and the short table that follows from it."""
+
+import itertools
+import math
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
+
+from rigidjax.workprecision.record import Record
+
+WANTED = (1e-4, 1e-7, 1e-10)
+
+
+def front(records: Iterable[Record]) -> list[Record]:
+    """Those records of one scene and kind that nothing beats in both error and time.
+
+    By falling error. Give records of one scene, and of values or gradients only.
+
+    **Raises:** `ValueError` for a mixture.
+
+    >>> slow = Record("scene", "slow", "jax", "value", "", 1e-6, error=1e-6, time=2.0)
+    >>> quick = Record("scene", "quick", "jax", "value", "", 1e-6, error=1e-6, time=1.0)
+    >>> [record.method for record in front([slow, quick])]
+    ['quick']
+    """
+    records = [r for r in records if r.error == r.error and r.time == r.time]
+    kinds = {(r.scene, r.kind) for r in records}
+    if len(kinds) > 1:
+        raise ValueError(
+            f"front: wanted records of one scene and kind, got {sorted(kinds)}; pick them first"
+        )
+    best: list[Record] = []
+    for record in sorted(records, key=lambda r: (r.time, r.error)):
+        if not best or record.error < best[-1].error:
+            best.append(record)
+    return best
+
+
+def time_to(records: Iterable[Record], error: float) -> float:
+    """Time, s, that the method of these records takes to an error, between its settings in log–log.
+
+    Of a run whose error is smaller already at its coarsest setting, that setting's time. NaN where
+    it never gets there.
+
+    >>> rough = Record("scene", "method", "jax", "value", "", 1e-2, error=1e-2, time=1.0)
+    >>> fine = Record("scene", "method", "jax", "value", "", 1e-4, error=1e-4, time=4.0)
+    >>> round(time_to([rough, fine], 1e-3), 6)
+    2.0
+    """
+    rungs = sorted((r for r in records if r.error == r.error), key=lambda r: r.time)
+    # Errors need not fall with every setting: what counts is the least error up to a time.
+    least, seen = math.inf, []
+    for record in rungs:
+        if record.error < least:
+            least = record.error
+            seen.append((max(record.error, 1e-17), record.time))
+    if not seen or least > error:
+        return math.nan
+    if seen[0][0] <= error:
+        return seen[0][1]
+    for (e0, t0), (e1, t1) in itertools.pairwise(seen):
+        if e0 > error >= e1:
+            share = math.log(e0 / error) / math.log(e0 / e1)
+            return math.exp((1 - share) * math.log(t0) + share * math.log(t1))
+    return math.nan
+
+
+class Choice(NamedTuple):
+    """A line of the table.
+
+    **Fields:** for `scene` and the `wanted` error the quickest `method` of ours and its `time`, s;
+    the way to the `gradient` at the same relative error and its `gradient_time`; `default` and
+    `default_gradient`, times of `simulate` as it stands; `peer`, `peer_time`: who is quicker than
+    ours, if anyone.
+    """
+
+    scene: str
+    wanted: float
+    method: str
+    time: float
+    gradient: str
+    gradient_time: float
+    default: float
+    default_gradient: float
+    peer: str
+    peer_time: float
+
+
+def choose(records: Iterable[Record], wanted: Sequence[float] = WANTED) -> list[Choice]:
+    """For each scene and wanted error: the quickest method of ours, and whoever is quicker.
+
+    **Arguments:** `records` as measured, of any scenes; `wanted` errors, rad.
+
+    >>> choose([])
+    []
+    """
+    records = list(records)
+    scenes = dict.fromkeys(r.scene for r in records)
+    return [_choice([r for r in records if r.scene == s], s, e) for s in scenes for e in wanted]
+
+
+def _choice(here: list[Record], scene: str, error: float) -> Choice:
+    values, slopes = quickest(here, "value", error), quickest(here, "gradient", error)
+    ours = {r.label for r in here if r.group == "ours"}
+    free = any(r.method == "closed form" for r in here)
+    default = "closed form" if free else "simulate"
+    method, spent = next(((n, t) for n, t in values.items() if n in ours), ("", math.nan))
+    slope, taken = next(((n, t) for n, t in slopes.items() if n in ours), ("", math.nan))
+    other, others = next(((n, t) for n, t in values.items() if n not in ours), ("", math.nan))
+    quicker = bool(other) and not others >= spent
+    defaults = [t for n, t in slopes.items() if n.split(", ")[0] == default]
+    return Choice(
+        scene=scene,
+        wanted=error,
+        method=method,
+        time=spent,
+        gradient=slope,
+        gradient_time=taken,
+        default=values.get(default, math.nan),
+        default_gradient=min(defaults, default=math.nan),
+        peer=other if quicker else "",
+        peer_time=others if quicker else math.nan,
+    )
+
+
+def quickest(records: Iterable[Record], kind: str, error: float) -> dict[str, float]:
+    """Time to an error of each method that reaches it, label → s, the quickest first."""
+    of = [r for r in records if r.kind == kind]
+    times = {
+        label: time_to([r for r in of if r.label == label], error)
+        for label in dict.fromkeys(r.label for r in of)
+    }
+    reached = {label: t for label, t in times.items() if t == t}
+    return dict(sorted(reached.items(), key=lambda item: item[1]))
+
+
+def table(lines: Iterable[Choice]) -> str:
+    """The lines of `choose` as a table in Markdown.
+
+    >>> print(table([]).splitlines()[0][:28])
+    | scene | wanted error, rad
+    """
+    head = (
+        "| scene | wanted error, rad | method | µs | gradient by | µs | "
+        "`simulate` as it stands, µs (gradient) | quicker elsewhere |"
+    )
+    rows = [head, "| --- | --- | --- | --- | --- | --- | --- | --- |"]
+    for c in lines:
+        peer = f"{c.peer}, {_micro(c.peer_time)}" if c.peer else ""
+        rows.append(
+            f"| {c.scene} | {c.wanted:.0e} | {c.method or 'none'} | {_micro(c.time)} | "
+            f"{c.gradient or 'none'} | {_micro(c.gradient_time)} | {_micro(c.default)} "
+            f"({_micro(c.default_gradient)}) | {peer} |"
+        )
+    return "\n".join(rows)
+
+
+def _micro(seconds: float) -> str:
+    return "–" if seconds != seconds else f"{seconds * 1e6:.3g}"

@@ -1,0 +1,126 @@
+"""A scene: what moves, for how long, and which numbers of it a gradient is taken by."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from rigidjax.body.inertia import Inertia
+from rigidjax.frames import Point
+from rigidjax.motion import Attitude
+from rigidjax.rotation import quaternion
+from rigidjax.workprecision.reference import Reference
+
+# The scalar that gradients are taken of: a.R b + c.Ω/|Ω0| at the end, of no particular direction.
+A, B, C = (0.6, -0.48, 0.64), (0.36, 0.8, -0.48), (0.28, -0.5, 0.82)
+
+
+class Scene(eqx.Module):
+    """One motion that methods are compared on.
+
+    **Fields:** `name`, `title` words; `body` an `Inertia`, `None` for a `Point`; `state0` an
+    `Attitude` or a `Point`; `torque` as for `rigidjax.simulate`; `end` s, the run is from 0 to
+    `end`; `plain` the same equations without JAX, `plain(numbers, sin, cos, sqrt) → f(t, y)`, for
+    peers and references (`None`: peers are left out); `reference` the right answer, `None`: worked
+    out by our own method at small steps; `slow` whether only a full run looks at it; `notes` what
+    a peer needs to know beyond the equations.
+
+    >>> from rigidjax import Attitude, Inertia, torques
+    >>> scene = Scene("mine", "my body", Inertia(jnp.eye(3)),
+    ...     Attitude([1.0, 0, 0, 0], [0.0, 0, 1]), torques.Damping([0.1, 0.1, 0.1]), 5.0)
+    >>> scene.numbers.shape
+    (13,)
+    """
+
+    name: str = eqx.field(static=True)
+    title: str = eqx.field(static=True)
+    body: Inertia | None
+    state0: Attitude | Point
+    torque: Any
+    end: float = eqx.field(static=True)
+    plain: Callable[..., Any] | None = eqx.field(static=True, default=None)
+    reference: Reference | None = eqx.field(static=True, default=None)
+    slow: bool = eqx.field(static=True, default=False)
+    notes: dict[str, Any] | None = eqx.field(static=True, default=None)
+
+    def __check_init__(self) -> None:
+        if isinstance(self.state0, Point) == (self.body is not None):
+            raise TypeError(
+                "Scene: wanted an Inertia with an Attitude, or None with a Point, got "
+                f"{type(self.body).__name__} with {type(self.state0).__name__}"
+            )
+        if not isinstance(self.state0, Attitude | Point):
+            raise TypeError(
+                f"Scene: wanted an Attitude or a Point, got {type(self.state0).__name__}: errors "
+                "are told as angles between attitudes, or as distances"
+            )
+        if not self.end > 0:
+            raise ValueError(f"Scene: wanted an end > 0, s, got {self.end}")
+
+    @property
+    def numbers(self) -> Float[Array, " parameters"]:
+        """What gradients are by: Ixx Iyy Izz Ixy Ixz Iyz, Ω0, q0 (13), or x0, v0 (6)."""
+        if self.body is None:
+            return jnp.concatenate([self.state0.x, self.state0.v])  # pyright: ignore
+        t = self.body.tensor
+        entries = jnp.stack([t[0, 0], t[1, 1], t[2, 2], t[0, 1], t[0, 2], t[1, 2]])
+        state: Any = self.state0
+        return jnp.concatenate([entries, state.omega, state.q])
+
+    @property
+    def blocks(self) -> dict[str, slice]:
+        """Which of `numbers` are what."""
+        if self.body is None:
+            return {"x0": slice(0, 3), "v0": slice(3, 6)}
+        return {"inertia": slice(0, 6), "omega0": slice(6, 9), "q0": slice(9, 13)}
+
+    def assembled(self, numbers: Float[Array, " parameters"]) -> tuple[Any, Any]:
+        """Body and first state of these `numbers`."""
+        if self.body is None:
+            return None, Point(numbers[:3], numbers[3:])
+        xx, yy, zz, xy, xz, yz = (numbers[i] for i in range(6))
+        rows = [jnp.stack([xx, xy, xz]), jnp.stack([xy, yy, yz]), jnp.stack([xz, yz, zz])]
+        q = quaternion.normalise(numbers[9:])
+        return Inertia(jnp.stack(rows)), Attitude(q, numbers[6:9])
+
+    def flat(self, state: Any) -> Float[Array, " state"]:
+        """A state as one vector, (7,) or (6,)."""
+        parts = (state.x, state.v) if self.body is None else (state.q, state.omega)
+        return jnp.concatenate(parts)
+
+    @property
+    def size(self) -> tuple[float, float]:
+        """What errors of the halves of the state are relative to: 1 rad and |Ω0|, or lengths."""
+        if self.body is None:
+            state: Any = self.state0
+            length = float(np.linalg.norm(state.x))
+            return length, max(float(np.linalg.norm(state.v)), length / self.end)
+        turning: Any = self.state0
+        return 1.0, float(np.linalg.norm(turning.omega))
+
+    def loss(self, end: Float[Array, " state"]) -> Float[Array, ""]:
+        """The scalar whose gradient is compared, of a state as one vector."""
+        one, two = self.size
+        a, b, c = (jnp.asarray(v, end.dtype) for v in (A, B, C))
+        if self.body is None:
+            return jnp.sum(a * end[:3]) / one + jnp.sum(c * end[3:]) / two
+        return jnp.sum(a * quaternion.rotate(end[:4], b)) + jnp.sum(c * end[4:]) / two
+
+
+def distance(scene: Scene, end: Any, right: Any) -> tuple[float, float]:
+    """Error of attitude (an angle, rad) and of Ω; of a point's place and velocity, all relative."""
+    end, right = np.asarray(end, float), np.asarray(right, float)
+    one, two = scene.size
+    if scene.body is None:
+        first, second = end[:3] - right[:3], end[3:] - right[3:]
+        return float(np.linalg.norm(first)) / one, float(np.linalg.norm(second)) / two
+    if not np.isfinite(end).all():
+        return float("nan"), float("nan")
+    (a, *u), (b, *v) = end[:4] / np.linalg.norm(end[:4]), right[:4]
+    u, v = np.asarray(u), np.asarray(v)
+    turn = a * v - b * u + np.cross(v, u)
+    angle = 2 * float(np.arctan2(np.linalg.norm(turn), abs(a * b + u @ v)))
+    return angle, float(np.linalg.norm(end[4:] - right[4:])) / two

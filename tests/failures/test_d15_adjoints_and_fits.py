@@ -1,0 +1,56 @@
+"""Row D15: which derivative goes with which adjoint; what is read where it does not.
+
+The default is reverse mode. Forward mode through it is refused (diffrax#336), in words that name
+the way out; least squares of a forced recording, which wants forward mode, picks it itself.
+"""
+
+import diffrax as dfx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from systems.tumble import BODY, OMEGA, TOP, Q
+
+import rigidjax as rj
+from rigidjax import identify
+
+FORWARD = dfx.ForwardMode()
+TS = jnp.array([0.0, 1.0])
+
+
+def end(omega, **how):
+    return rj.simulate(BODY, rj.Attitude(Q, omega), TS, TOP, **how).ys.omega[-1]
+
+
+def test_d15_forward_through_the_default_is_refused():
+    with pytest.raises(TypeError, match=r"forward-mode|ForwardMode|custom_vjp"):
+        jax.jacfwd(end)(jnp.asarray(OMEGA))
+    assert "diffrax.ForwardMode()" in rj.simulate.__doc__
+
+
+@pytest.mark.parametrize(
+    "solver",
+    [dfx.Tsit5(), pytest.param(dfx.Dopri5(), marks=pytest.mark.slow)],
+    ids=["Tsit5", "Dopri5"],
+)
+def test_d15_each_mode_with_its_adjoint(solver):
+    omega = jnp.asarray(OMEGA)
+    forward = jax.jit(jax.jacfwd(lambda w: end(w, solver=solver, adjoint=FORWARD)))(omega)
+    reverse = jax.jit(jax.jacrev(lambda w: end(w, solver=solver)))(omega)
+    np.testing.assert_allclose(forward, reverse, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "loss", [None, pytest.param(identify.Huber(), marks=pytest.mark.slow),
+             pytest.param(identify.SoftL1(), marks=pytest.mark.slow)],
+    ids=["squares", "Huber", "SoftL1"],
+)  # fmt: skip
+def test_d15_a_forced_recording_is_fitted(loss):
+    ts, body = jnp.linspace(0.0, 4.0, 25), rj.Inertia.from_principal(1.0, 1.6, 2.1)
+    law = rj.torques.ConstantTorque([0.3, -0.2, 0.5])
+    truth = rj.simulate(body, rj.Spin([0.4, 1.2, -0.3]), ts, law).ys.omega
+    record = identify.Recording(ts, (identify.Gyro(1e-3), truth), torque=law)
+    options = {} if loss is None else {"loss": loss}
+    found = identify.fit(identify.Problem(record, identify.Principal(1.5), **options), starts=1)
+    moments = np.asarray(found.body.moments)
+    np.testing.assert_allclose(np.sort(moments), [1.0, 1.6, 2.1], rtol=1e-5)
