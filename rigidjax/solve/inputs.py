@@ -56,8 +56,9 @@ def tolerances(rtol: float | None, atol: float | None, dtype: Any) -> tuple[floa
     (1e-09, 1e-10)
     """
     double = dtype == jnp.float64
-    rtol = (1e-9 if double else 2e-5) if rtol is None else rtol
-    atol = (1e-12 if double else 1e-7) if atol is None else atol
+    # Floats of Python: those of NumPy would lift a float32 run to float64.
+    rtol = float((1e-9 if double else 2e-5) if rtol is None else rtol)
+    atol = float((1e-12 if double else 1e-7) if atol is None else atol)
     if not 0 < rtol < np.inf or not 0 <= atol < np.inf:
         raise ValueError(f"simulate: wanted rtol > 0 and atol >= 0, got rtol={rtol}, atol={atol}")
     floor = 100 * float(jnp.finfo(dtype).eps)

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 
 from rigidjax.exact import FreeBody
 from rigidjax.solve import lean, solvers, travel
-from rigidjax.solve.simulate import equations_of_motion, simulate
+from rigidjax.solve import equations_of_motion, simulate
 from rigidjax.workprecision.method import Method, Ready, Run
 from rigidjax.workprecision.scene import Scene
 
