@@ -158,8 +158,12 @@ def _back(method: Method, max_steps: int, kept: Any, cotangents: Answer) -> tupl
         number, bar, bars, ends = state
         number = number - 1
         walk: Any = jax.tree.map(lambda a: a[number], book.starts)
-        rows, count = lax.cond(
-            number == book.number - 1, lambda _: (book.rows, book.length), again, walk
+        # The last chapter is there. No `cond`: under `vmap` both its branches run; a walk without
+        # a step ahead takes none.
+        last = number == book.number - 1
+        rows, count = again(walk._replace(h=jnp.where(last, jnp.zeros_like(walk.h), walk.h)))
+        rows, count = jax.tree.map(
+            lambda a, b: jnp.where(last, a, b), (book.rows, book.length), (rows, count)
         )
         context = _Context(method, values, stops, rows, count)
         bar, bars, ends = _back_through(context, given, cotangents.between, bar, bars, ends)
