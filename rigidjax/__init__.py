@@ -5,6 +5,7 @@ turns), `exact` and `solve` (answers), `identify` and `plot` (uses). `simulate` 
 """
 
 from rigidjax import (
+    batch as batch,
     exact as exact,
     frames as frames,
     identify as identify,
