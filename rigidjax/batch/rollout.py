@@ -26,6 +26,8 @@ Reduced = TypeVar("Reduced")
 # What `reduce` carries, the time, the state of one body → what it carries on.
 Reduce = Callable[[Any, Array, Any], Any]
 Method = AbstractExplicit | Magnus4 | None
+# Bytes that reverse mode may keep of all chunks together.
+_KEPT = 2**23
 
 
 @overload
@@ -193,8 +195,10 @@ def _run(plan: _Plan, reduce: Reduce | None, rest: Any, numbers: Any) -> Any:
             return lane.state(y), carried
         return kept if plan.keep else lane.state(y)
 
-    # Going back, a chunk is worked out anew: else every chunk's pieces would be kept.
-    one = jax.checkpoint(one)
+    size = sum(leaf.size for leaf in jax.tree.leaves(each)) * h.dtype.itemsize
+    if size * (plan.count // plan.every) * (plan.every // piece_length(plan.every) + 1) > _KEPT:
+        # Going back, a chunk is worked out anew: else every chunk's pieces would be kept.
+        one = jax.checkpoint(one)
     return over_bodies(one, (shared, initial, h, t0), each, plan.chunk, plan.mesh)
 
 
@@ -226,7 +230,7 @@ def march(lane: Lane, h: Array, t0: Array, first: Array, count: int, y: Atoms) -
     def some(y: Atoms, begin: Array, many: int) -> Atoms:
         return lax.scan(step, y, begin + jnp.arange(many, dtype=jnp.int32))[0]
 
-    length = math.isqrt(count - 1) + 1
+    length = piece_length(count)
     pieces, left = divmod(count, length)
     if pieces > 1:
         starts = first + length * jnp.arange(pieces, dtype=jnp.int32)
@@ -234,3 +238,14 @@ def march(lane: Lane, h: Array, t0: Array, first: Array, count: int, y: Atoms) -
     else:
         y = some(y, first, length)
     return some(y, first + pieces * length, left) if left else y
+
+
+def piece_length(count: int) -> int:
+    """About √count steps; a divisor of count where there is one near, for less to compile.
+
+    >>> piece_length(1000), piece_length(997)
+    (40, 32)
+    """
+    root = math.isqrt(count - 1) + 1
+    near = [d for d in range(root, min(2 * root, count) + 1) if count % d == 0]
+    return near[0] if near else root
