@@ -11,7 +11,7 @@ from jaxtyping import Array
 from rigidjax import _checks
 from rigidjax._types import HasAttitude
 from rigidjax.body.inertia import Inertia, MassProperties
-from rigidjax.motion import Attitude, Rigid, Spin
+from rigidjax.motion import Attitude, Rigid, Spin, on_the_group
 from rigidjax.solve.inputs import require_fit
 
 
@@ -165,3 +165,13 @@ def step_of(step_size: Any, num_steps: Any, dtype: Any) -> tuple[Array, int]:
 def time_of(value: Any, dtype: Any) -> Array:
     """A scalar time, s."""
     return jnp.asarray(_checks.floating(value, (), "t0"), dtype)
+
+
+def start_of(state0: Any) -> Any:
+    """The start with its quaternion of length 1; NaN, for that body alone, if it is far from it."""
+    if not isinstance(state0, HasAttitude):
+        return state0
+    q = state0.q
+    far = jnp.abs(jnp.sqrt(jnp.sum(q * q)) - 1) > (1e-6 if q.dtype == jnp.float64 else 1e-3)
+    q = jnp.where(far, jnp.full_like(q, jnp.nan), q)
+    return on_the_group(eqx.tree_at(lambda s: s.q, state0, q))

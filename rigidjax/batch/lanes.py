@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
+from rigidjax.batch.given import start_of
 from rigidjax.batch.magnus import Magnus4, require_blind, sees_attitude, turned
 from rigidjax.body.inertia import Inertia, inverse
 from rigidjax.exact.frame import into, out_of, principal_frame
@@ -42,7 +43,7 @@ def lane_of(body: Any, state0: Any, torque: Any, t0: Array, method: Any) -> Lane
 
     **Raises:** `TypeError` for a method that there is no lean step of.
     """
-    state0 = on_the_group(state0)
+    state0 = start_of(state0)
     if isinstance(state0, Rigid):
         return _rigid(RungeKutta4() if method is None else method, body, state0, torque, t0)
     wide = Attitude([1.0, 0.0, 0.0, 0.0], state0.omega) if isinstance(state0, Spin) else state0
@@ -88,9 +89,7 @@ def _free(body: Inertia, state0: Attitude) -> Lane:
 
     def state(y: Atoms) -> Attitude:
         omega = jnp.stack(out_of(axes, _free_rate(weights, y[4:])))
-        return Attitude(
-            quaternion.multiply(jnp.stack(y[:4]), quaternion.conjugate(turn)), omega
-        )
+        return Attitude(quaternion.multiply(jnp.stack(y[:4]), quaternion.conjugate(turn)), omega)
 
     return Lane((*split(start), *momentum), step, state)
 
@@ -151,9 +150,7 @@ def _magnus(body: Inertia, state0: Attitude, torque: Any, t0: Array) -> Lane:
     return Lane((*start[:4], *times(_entries(body.tensor), start[4:])), step, state)
 
 
-def _explicit(
-    method: AbstractExplicit, body: Inertia, state0: Any, torque: Any, t0: Array
-) -> Lane:
+def _explicit(method: AbstractExplicit, body: Inertia, state0: Any, torque: Any, t0: Array) -> Lane:
     weights = _entries(inverse(body.tensor))
     law = None if torque is None else _law(torque, body, state0, t0)
     project = scalarise(on_the_group, state0)

@@ -134,8 +134,7 @@ def rollout(
         raise ValueError("rollout: initial is what reduce begins with; no reduce was given")
     if reduce is not None and not callable(reduce):
         raise TypeError(
-            "reduce: wanted a function (carried, t, state) -> carried, got "
-            f"{type(reduce).__name__}"
+            f"reduce: wanted a function (carried, t, state) -> carried, got {type(reduce).__name__}"
         )
     every = (1 if reduce is not None else count) if save_every is None else save_every
     if not isinstance(every, int) or every < 1 or count % every:
