@@ -101,8 +101,8 @@ def _own_torque(torque: Any, axes: Any, count: int) -> Any:
     for path, leaf in jax.tree.leaves_with_path(own):
         if leaf.ndim == 0 or leaf.shape[0] != count:
             raise ValueError(
-                f"torque_axes: wanted {count} rows in torque{jax.tree_util.keystr(path)}, got shape "
-                f"{leaf.shape}; make one law a body with jax.vmap"
+                f"torque_axes: wanted {count} rows in torque{jax.tree_util.keystr(path)}, got "
+                f"shape {leaf.shape}; make one law a body with jax.vmap"
             )
     return prefix
 

@@ -151,7 +151,8 @@ def sees_attitude(law: Any, t: Array, state: Attitude, body: Inertia) -> bool:
     """Whether the law's value is computed from the attitude, read off its operations.
 
     >>> import rigidjax as rj
-    >>> body, state = rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Attitude([1.0, 0, 0, 0], [1.0] * 3)
+    >>> body = rj.Inertia.from_principal(1.0, 2.0, 3.0)
+    >>> state = rj.Attitude([1.0, 0, 0, 0], [1.0, 0.0, 0.0])
     >>> sees_attitude(rj.torques.Damping([1.0, 1, 1]), jnp.zeros(()), state, body)
     False
     """

@@ -99,8 +99,8 @@ def rollout(
       attitude, and `rigidjax.solvers.RungeKutta4` for all else. Any of `rigidjax.solvers` that is
       explicit may be given; the steps are those that `diffrax` takes with it, to round-off.
     - `save_every`: `None` returns the last states only; k those after k, 2k, … steps.
-    - `reduce`, `initial`: a function `(carried, t, state) → carried` of one body, called after every
-      `save_every` steps (one, by default), and what it begins with. States are not kept then.
+    - `reduce`, `initial`: a function `(carried, t, state) → carried` of one body, called after
+      every `save_every` steps (one, by default), and what it begins with. States are not kept then.
       A function made anew for each call compiles anew: define it once, best as a Module.
     - `t0` s, when the first step begins.
     - `chunk`: how many bodies go side by side. `None` is what fits the first cache, 128 in float64.

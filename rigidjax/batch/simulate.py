@@ -8,6 +8,7 @@ import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, ArrayLike, Float, Int
 
 from rigidjax import _checks
@@ -84,7 +85,8 @@ def simulate(
     - `method`: `None` takes the closed form for free bodies, `rigidjax.solvers.DormandPrince8`
       under a torque, and what `rollout` takes for `Steps`. With times any `diffrax.AbstractSolver`
       may be given; the explicit ones of `rigidjax.solvers` run in our own loop, ten times as fast.
-    - `rtol`, `atol`, `max_steps`: of the adaptive steps, as for `rigidjax.simulate`.
+    - `rtol`, `atol`, `max_steps`: of the adaptive steps, as for `rigidjax.simulate`; our own loop
+      counts steps between two times.
     - `adjoint`: `None` for `jax.grad`; `diffrax.ForwardMode()` for `jax.jacfwd`. The closed form
       and equal steps take both without being told.
 
@@ -198,18 +200,8 @@ def _free(body: Any, state0: Any, ts: Array) -> Any:
 def _adaptive(how: _Adaptive, body: Any, state0: Any, torque: Any, ts: Array) -> Any:
     forward = isinstance(how.adjoint, dfx.ForwardMode)
     if isinstance(how.solver, AbstractExplicit) and (how.adjoint is None or forward):
-        out = lean.adaptive(
-            how.solver,
-            equations_of_motion(body, state0, torque),
-            ts,
-            state0,
-            rtol=how.rtol,
-            atol=how.atol,
-            max_steps=how.max_steps,
-            jumps=jumps_of(torque),
-            way=travel.forward if forward else travel.reverse,
-        )
-        return out.ys, out.result, out.num_steps.astype(jnp.int32)
+        way = travel.forward if forward else travel.reverse
+        return _hops(how, way, body, state0, torque, ts)
     found = simulate_one(
         body,
         state0,
@@ -223,6 +215,43 @@ def _adaptive(how: _Adaptive, body: Any, state0: Any, torque: Any, ts: Array) ->
         throw=False,
     )
     return found.ys, found.result, jnp.asarray(found.stats["num_steps"], jnp.int32)
+
+
+def _hops(how: Any, way: Any, body: Any, state0: Any, torque: Any, ts: Array) -> Any:
+    """From each time to the next, with the step that the last hop found good.
+
+    Steps that end on every time cost a body alone more than states filled in between; but side by
+    side no body looks up its own steps, and going back one hop is kept at a time.
+    """
+    field = equations_of_motion(body, state0, torque)
+    jumps = jumps_of(torque)
+
+    @jax.checkpoint
+    def hop(carry: Any, ends: tuple[Array, Array]) -> Any:
+        y, h, result, steps = carry
+        out = lean.adaptive(
+            how.solver,
+            field,
+            jnp.stack(ends),
+            y,
+            rtol=how.rtol,
+            atol=how.atol,
+            dt0=h,
+            max_steps=how.max_steps,
+            jumps=jumps,
+            way=way,
+        )
+        y = jax.tree.map(lambda leaf: leaf[-1], out.ys)
+        taken = jnp.maximum(out.num_steps - out.num_rejected, 1).astype(h.dtype)
+        h = lax.stop_gradient((ends[1] - ends[0]) / taken)
+        result = dfx.RESULTS.where(result == dfx.RESULTS.successful, out.result, result)
+        return (y, h, result, steps + out.num_steps.astype(jnp.int32)), y
+
+    good = dfx.RESULTS.where(jnp.asarray(True), dfx.RESULTS.successful, NONFINITE)
+    begin = (state0, lax.stop_gradient(ts[1] - ts[0]), good, jnp.zeros((), jnp.int32))
+    (_, _, result, steps), later = lax.scan(hop, begin, (ts[:-1], ts[1:]))
+    ys = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), state0, later)
+    return ys, result, steps
 
 
 def _equal(
