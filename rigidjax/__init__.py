@@ -16,6 +16,7 @@ from rigidjax._types import (
     HasPose as HasPose,
     HasSpin as HasSpin,
 )
+from rigidjax.batch import cpu_flags as cpu_flags
 from rigidjax.body import (
     Inertia as Inertia,
     MassProperties as MassProperties,
