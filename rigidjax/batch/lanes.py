@@ -121,9 +121,10 @@ def _free_slope_jvp(primals, tangents):
     return _free_slope(weights, gaps, p), tuple(a + b for a, b in moved)
 
 
-def _entries(matrix: Array) -> Six:
-    a = matrix
-    return a[0, 0], a[1, 1], a[2, 2], a[0, 1], a[0, 2], a[1, 2]
+def _entries(a: Array) -> Six:
+    # Both halves, so that the derivative is symmetric as the matrix is.
+    off = [0.5 * (a[i, j] + a[j, i]) for i, j in ((0, 1), (0, 2), (1, 2))]
+    return a[0, 0], a[1, 1], a[2, 2], *off
 
 
 def _magnus(body: Inertia, state0: Attitude, torque: Any, t0: Array) -> Lane:

@@ -263,7 +263,7 @@ def _equal(
     torque_axes: Any,
     chunk: Any,
     devices: Any,
-) -> Batch:
+) -> Batch[Any]:
     every = steps.number if steps.save_every is None else steps.save_every
     ys: Any = rollout(
         bodies,
@@ -281,6 +281,13 @@ def _equal(
     dtype = states0.omega.dtype
     h, count = step_of(steps.size, steps.number, dtype)
     ts = time_of(steps.t0, dtype) + h * jnp.arange(every, count + 1, every).astype(dtype)
-    good = jax.vmap(finite)(ys)
-    result = dfx.RESULTS.where(good, dfx.RESULTS.successful, NONFINITE)
-    return Batch(ts, ys, result, jnp.full(good.shape, count, jnp.int32))
+    result = _statuses(ys)
+    return Batch(ts, ys, result, jnp.full(states0.omega.shape[:1], count, jnp.int32))
+
+
+@jax.jit
+def _statuses(ys: Any) -> Any:
+    def one(ys: Any) -> Any:
+        return dfx.RESULTS.where(finite(ys), dfx.RESULTS.successful, NONFINITE)
+
+    return jax.vmap(one)(ys)
