@@ -84,11 +84,14 @@ def over_bodies(
     chunk = min(chunk, -(-count // parts))
     room = -(-count // (chunk * parts)) * chunk * parts
 
+    def side_by_side(shared: Any, row: Any) -> Any:
+        # Fences, so that a chunk is compiled in the same way, to the last bit, wherever it lies.
+        shared, row = lax.optimization_barrier((shared, row))
+        return lax.optimization_barrier(jax.vmap(one, (None, 0))(shared, row))
+
     def some(shared: Any, each: Any) -> Any:
-        if room == chunk * parts:
-            return jax.vmap(one, (None, 0))(shared, each)
         rows = jax.tree.map(lambda a: a.reshape(-1, chunk, *a.shape[1:]), each)
-        out = lax.map(lambda row: jax.vmap(one, (None, 0))(shared, row), rows)
+        out = lax.map(lambda row: side_by_side(shared, row), rows)
         return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), out)
 
     padded = jax.tree.map(lambda a: _padded(a, room), each)

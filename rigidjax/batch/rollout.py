@@ -106,7 +106,8 @@ def rollout(
     - `chunk`: how many bodies go side by side. `None` is what fits the first cache, 128 in float64.
       Bodies are independent: chunks change results in the last digits at most.
     - `devices`: `None` for one, `"all"` of this process, or a sequence of them; N is cut into
-      equal shares.
+      equal shares. Free bodies get the same bits; with a torque whose numbers are shared XLA may
+      order products in another way, which is one rounding.
 
     **Returns** the states, of the type of `states0`, with leading axes (N,) or, with `save_every`,
     (N, num_steps // save_every); with `reduce` the pair (last states, carried).

@@ -247,7 +247,7 @@ def test_words(unhooked):
     bodies, states = batch(3)
     run = rj.batch.rollout
     one = jax.tree.map(lambda a: a[0], states)
-    with pytest.raises(ValueError, match="for one body use rigidjax.simulate"):
+    with pytest.raises(ValueError, match=r"for one body use rigidjax.simulate"):
         run(bodies, one, 0.1, 4)
     with pytest.raises(ValueError, match="wanted one body, or 3 as the states"):
         run(batch(2)[0], states, 0.1, 4)
@@ -255,9 +255,9 @@ def test_words(unhooked):
         run(bodies, states, -0.1, 4)
     with pytest.raises(TypeError, match="whole number"):
         run(bodies, states, 0.1, 4.0)
-    with pytest.raises(ValueError, match="whole part of num_steps = 10"):
+    with pytest.raises(ValueError, match=r"whole part of num_steps = 10"):
         run(bodies, states, 0.1, 10, save_every=3)
-    with pytest.raises(ValueError, match="positive moments.* of body 1"):
+    with pytest.raises(ValueError, match=r"positive moments.* of body 1"):
         run(rj.Inertia(bodies.tensor.at[1, 0, 0].set(-1.0)), states, 0.1, 4)
     with pytest.raises(ValueError, match="of body 2"):
         run(bodies, rj.Attitude(states.q.at[2].mul(2.0), states.omega), 0.1, 4)
