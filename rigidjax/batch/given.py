@@ -19,13 +19,13 @@ class Bodies(NamedTuple):
     """A batch, sorted by what all bodies share and what each has of its own.
 
     **Fields:** `shared`, `each` trees of the same shape, `(body, state0, torque)`, with `None`
-    where the other has the array; `rest` what is no array at all; `count` N; `dtype`.
+    where the other has the array; `rest` what is no array at all; `many` N; `dtype`.
     """
 
     shared: Any
     each: Any
     rest: Any
-    count: int
+    many: int
     dtype: Any
 
     @staticmethod
@@ -63,7 +63,9 @@ def bodies_of(bodies: Any, states0: Any, torque: Any, torque_axes: Any) -> Bodie
         raise TypeError(f"states0: wanted one dtype, got {', '.join(sorted(map(str, kinds)))}")
     dtype = kinds.pop()
     if not isinstance(bodies, Inertia | MassProperties):
-        require_fit(bodies, jax.tree.map(lambda leaf: leaf[0], states0), None)
+        raise TypeError(
+            f"bodies: wanted Inertia, or MassProperties for Rigid, got {type(bodies).__name__}"
+        )
     tensor = bodies.inertia.tensor if isinstance(bodies, MassProperties) else bodies.tensor
     if tensor.ndim not in (2, 3) or (tensor.ndim == 3 and tensor.shape[0] not in (1, count)):
         raise ValueError(
@@ -74,7 +76,7 @@ def bodies_of(bodies: Any, states0: Any, torque: Any, torque_axes: Any) -> Bodie
     if isinstance(states0, HasAttitude):
         _unit(states0.q)
     # In the precision of the states.
-    bodies = jax.tree.map(lambda leaf: leaf.astype(dtype), bodies)
+    bodies = jax.tree.map(lambda a: a if a.dtype == dtype else a.astype(dtype), bodies)
     own = tensor.ndim == 3
     if own and tensor.shape[0] == 1 and count > 1:
         bodies, own = jax.tree.map(lambda leaf: leaf[0], bodies), False
@@ -86,7 +88,8 @@ def bodies_of(bodies: Any, states0: Any, torque: Any, torque_axes: Any) -> Bodie
     )
     each, shared = eqx.partition(arrays, axes)
     found = Bodies(shared, each, rest, count, dtype)
-    first = jax.tree.map(lambda leaf: leaf[0], each)
+    # Shapes are enough, and taking a row costs as much as many steps.
+    first = jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape[1:], a.dtype), each)
     require_fit(*Bodies.one(shared, first, rest))
     return found
 

@@ -20,7 +20,6 @@ from rigidjax.exact.frame import into, out_of, principal_frame
 from rigidjax.exact.triples import Six, Triple, adjugate, cross, determinant, half_product, times
 from rigidjax.motion import Attitude, Rigid, Spin, on_the_group
 from rigidjax.motion.torques import evaluate
-from rigidjax.rotation import quaternion
 from rigidjax.solve import equations_of_motion
 from rigidjax.solve.components import join, split
 from rigidjax.solve.explicit import AbstractExplicit, Atoms, RungeKutta4, advance
@@ -75,9 +74,8 @@ def _free(body: Inertia, state0: Attitude) -> Lane:
     weights: Six = tuple(c / scale / size for c in adjugate(unit))
     a, b, c, *_ = lax.stop_gradient(weights)
     gaps = (c - b, a - c, b - a)
-    turn = lax.stop_gradient(quaternion.from_matrix(axes))
-    start = quaternion.multiply(state0.q, turn)
     momentum = times(six, into(axes, state0.omega))
+    one, none = jnp.ones_like(a), jnp.zeros_like(a)
 
     def step(t: Any, end: Any, h: Any, y: Atoms) -> Atoms:
         q, p = turned(
@@ -88,10 +86,19 @@ def _free(body: Inertia, state0: Attitude) -> Lane:
         return (*q, *p)
 
     def state(y: Atoms) -> Attitude:
+        # The numbers are the turn since the start, seen from the axes: Aᵀ…A turns its vector.
         omega = jnp.stack(out_of(axes, _free_rate(weights, y[4:])))
-        return Attitude(quaternion.multiply(jnp.stack(y[:4]), quaternion.conjugate(turn)), omega)
+        w, x, y_, z = y[0], *out_of(axes, y[1:4])
+        a, b, c, d = split(state0.q)
+        q = (
+            a * w - b * x - c * y_ - d * z,
+            a * x + b * w + c * z - d * y_,
+            a * y_ + c * w + d * x - b * z,
+            a * z + d * w + b * y_ - c * x,
+        )
+        return Attitude(jnp.stack(q), omega)
 
-    return Lane((*split(start), *momentum), step, state)
+    return Lane((one, none, none, none, *momentum), step, state)
 
 
 @jax.custom_jvp

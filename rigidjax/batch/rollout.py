@@ -149,7 +149,7 @@ def rollout(
         count,
         every,
         save_every is not None and reduce is None,
-        chunk_of(chunk, batch.dtype, batch.count),
+        chunk_of(chunk, batch.dtype, batch.many),
         mesh_of(devices),
     )
     # A tracer means that somebody else's jit may be outermost, and only that one takes options.
@@ -209,7 +209,8 @@ _within = eqx.filter_jit(_run)
 def _alone() -> Callable[..., Any]:
     # Made when first called: asking which backend there is starts it.
     options = compiler_options()
-    return eqx.filter_jit(_run, compiler_options=options) if options else _within
+    jitted: Any = eqx.filter_jit
+    return jitted(_run, compiler_options=options) if options else _within
 
 
 def march(lane: Lane, h: Array, t0: Array, first: Array, count: int, y: Atoms) -> Atoms:

@@ -121,7 +121,7 @@ def simulate(
         solver = DormandPrince8() if method is None else method
         how = _Adaptive(solver, rtol, atol, max_steps, adjoint)
     mesh = mesh_of(devices)
-    plan = _Plan(how, chunk_of(chunk, batch.dtype, batch.count), mesh)
+    plan = _Plan(how, chunk_of(chunk, batch.dtype, batch.many), mesh)
     numbers = (batch.shared, batch.each, ts)
     run = _alone() if _checks.known(numbers) else _within
     ys, result, steps = run(plan, batch.rest, numbers)
@@ -181,7 +181,8 @@ _within = eqx.filter_jit(_run)
 @functools.cache
 def _alone() -> Callable[..., Any]:
     options = compiler_options()
-    return eqx.filter_jit(_run, compiler_options=options) if options else _within
+    jitted: Any = eqx.filter_jit
+    return jitted(_run, compiler_options=options) if options else _within
 
 
 def _free(body: Any, state0: Any, ts: Array) -> Any:

@@ -1,6 +1,7 @@
 """Many bodies: body-steps a second beside C++, numba, naive scans, diffrax and MJX, in one process.
 
-Run `python tests/batch/bench_batch.py [--quick] [--float32] [--flag] [--devices 2] [--any-core]`.
+Run `python tests/batch/bench_batch.py [--quick] [--float32] [--flag] [--devices 2] [--any-core]
+[--numba-python /venv/bin/python]`.
 Everything is timed in turn, round after round, on one pinned core, as processor time (on a GPU as
 wall time); medians are printed, and ratios to the first row of each table. Compilation is apart.
 What is not installed is left out and says so. `--flag` starts again with what `rj.cpu_flags` says;
@@ -22,6 +23,7 @@ parser.add_argument("--float32", action="store_true")
 parser.add_argument("--flag", action="store_true", help="with the process-wide XLA flag")
 parser.add_argument("--devices", type=int, default=1)
 parser.add_argument("--any-core", action="store_true", help="do not pin to one core")
+parser.add_argument("--numba-python", default=sys.executable, help="an interpreter that has numba")
 parser.add_argument("--bodies", type=int, nargs="*", default=None)
 OPTIONS = parser.parse_args()
 FLAG = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=10000000"
@@ -101,6 +103,46 @@ int main(int argc, char** argv) {
   for (real v : y) total += v;
   printf("%.9f %.9f\n", seconds, total);
 }
+"""
+
+NUMBA = """
+import sys, time
+import numba, numpy as np
+count, steps, kind = int(sys.argv[1]), int(sys.argv[2]), np.dtype(sys.argv[3])
+
+@numba.njit(fastmath=True)
+def run(r, y, steps, h):
+    half, sixth, two = h / h / (h / h + h / h), h / h / 6, h / h + h / h
+    for block in range(0, y.shape[1], 64):
+        for _ in range(steps):
+            for i in range(block, min(block + 64, y.shape[1])):
+                q0, q1, q2, q3, a, b, c = y[0, i], y[1, i], y[2, i], y[3, i], y[4, i], y[5, i], y[6, i]
+                s0 = s1 = s2 = s3 = s4 = s5 = s6 = y[0, i] - y[0, i]
+                z0, z1, z2, z3, z4, z5, z6 = q0, q1, q2, q3, a, b, c
+                for stage in range(4):
+                    k0 = -half * (z1 * z4 + z2 * z5 + z3 * z6)
+                    k1 = half * (z0 * z4 + z2 * z6 - z3 * z5)
+                    k2 = half * (z0 * z5 + z3 * z4 - z1 * z6)
+                    k3 = half * (z0 * z6 + z1 * z5 - z2 * z4)
+                    k4, k5, k6 = r[0, i] * z5 * z6, r[1, i] * z6 * z4, r[2, i] * z4 * z5
+                    w = h / h if stage == 0 or stage == 3 else two
+                    s0, s1, s2, s3 = s0 + w * k0, s1 + w * k1, s2 + w * k2, s3 + w * k3
+                    s4, s5, s6 = s4 + w * k4, s5 + w * k5, s6 + w * k6
+                    f = h if stage == 2 else half * h
+                    z0, z1, z2, z3 = q0 + f * k0, q1 + f * k1, q2 + f * k2, q3 + f * k3
+                    z4, z5, z6 = a + f * k4, b + f * k5, c + f * k6
+                g = h * sixth
+                y[0, i], y[1, i], y[2, i], y[3, i] = q0 + g * s0, q1 + g * s1, q2 + g * s2, q3 + g * s3
+                y[4, i], y[5, i], y[6, i] = a + g * s4, b + g * s5, c + g * s6
+
+rng = np.random.default_rng(0)
+m = rng.uniform(1, 1.9, (3, count)).astype(kind)
+r = (np.roll(m, -1, 0) - np.roll(m, -2, 0)) / m
+y = np.concatenate([np.ones((1, count)), np.zeros((3, count)), np.full((3, count), 0.577)]).astype(kind)
+run(r, y.copy(), 2, kind.type(0.01))
+begin = time.process_time()
+run(r, y, steps, kind.type(0.01))
+print(time.process_time() - begin)
 """
 
 
@@ -202,67 +244,20 @@ def plain_diffrax(bodies, states, steps):
     return lambda: run(bodies, states)
 
 
-def numba_run(bodies, states):
-    try:
-        import numba
-    except ImportError:
+def numba_run(count):
+    """Seconds of the same in numba, in a process of its own."""
+    python = OPTIONS.numba_python
+    if subprocess.run([python, "-c", "import numba"], capture_output=True).returncode:
         return None
-    moments = np.diagonal(np.asarray(bodies.tensor), axis1=1, axis2=2)
-    ratios = np.stack(
-        [(moments[:, (i + 1) % 3] - moments[:, (i + 2) % 3]) / moments[:, i] for i in range(3)]
-    )
-    start = np.concatenate([states.q, states.omega], axis=1).T.copy()
 
-    @numba.njit(fastmath=True, cache=False)
-    def run(r, y0, steps, h):
-        y = y0.copy()
-        for block in range(0, y.shape[1], 64):
-            for _ in range(steps):
-                for i in range(block, min(block + 64, y.shape[1])):
-                    q0, q1, q2, q3, a, b, c = (
-                        y[0, i],
-                        y[1, i],
-                        y[2, i],
-                        y[3, i],
-                        y[4, i],
-                        y[5, i],
-                        y[6, i],
-                    )
-                    s0 = s1 = s2 = s3 = s4 = s5 = s6 = y[0, i] * 0
-                    z0, z1, z2, z3, z4, z5, z6 = q0, q1, q2, q3, a, b, c
-                    for stage in range(4):
-                        k0 = -0.5 * (z1 * z4 + z2 * z5 + z3 * z6)
-                        k1 = 0.5 * (z0 * z4 + z2 * z6 - z3 * z5)
-                        k2 = 0.5 * (z0 * z5 + z3 * z4 - z1 * z6)
-                        k3 = 0.5 * (z0 * z6 + z1 * z5 - z2 * z4)
-                        k4, k5, k6 = r[0, i] * z5 * z6, r[1, i] * z6 * z4, r[2, i] * z4 * z5
-                        w = 1.0 if stage == 0 or stage == 3 else 2.0
-                        s0 += w * k0
-                        s1 += w * k1
-                        s2 += w * k2
-                        s3 += w * k3
-                        s4 += w * k4
-                        s5 += w * k5
-                        s6 += w * k6
-                        f = h if stage == 2 else 0.5 * h
-                        z0 = q0 + f * k0
-                        z1 = q1 + f * k1
-                        z2 = q2 + f * k2
-                        z3 = q3 + f * k3
-                        z4 = a + f * k4
-                        z5 = b + f * k5
-                        z6 = c + f * k6
-                    g = h / 6
-                    y[0, i] = q0 + g * s0
-                    y[1, i] = q1 + g * s1
-                    y[2, i] = q2 + g * s2
-                    y[3, i] = q3 + g * s3
-                    y[4, i] = a + g * s4
-                    y[5, i] = b + g * s5
-                    y[6, i] = c + g * s6
-        return y
+    def run():
+        arguments = [str(count), str(STEPS), np.dtype(DTYPE).name]
+        out = subprocess.run(
+            [python, "-c", NUMBA, *arguments], check=True, capture_output=True, text=True
+        )
+        return float(out.stdout)
 
-    return lambda: run(ratios, start, STEPS, ratios.dtype.type(H))
+    return run
 
 
 def mjx_run(count, steps):
@@ -314,11 +309,11 @@ def throughput(count, cpp):
         ("rj.batch.rollout, gyrostat with damping", timed(run(GYROSTAT)), 1),
         ("rj.batch.rollout, heavy top", timed(run(TOP)), 1),
     ]
-    other = numba_run(bodies, states) if ON_CPU else None
+    other = numba_run(count) if ON_CPU else None
     if other is None:
         print("numba: absent, or not on a CPU")
     else:
-        rows.append(("numba RK4, blocks of 64", timed(other), 1))
+        rows.append(("numba RK4, blocks of 64", other, 1))
     rows.append(("naive vmap(scan), RK4", timed(naive(bodies, states)), 1))
     few = 50 if ON_CPU else STEPS
     rows.append(
