@@ -88,8 +88,10 @@ def bodies_of(bodies: Any, states0: Any, torque: Any, torque_axes: Any) -> Bodie
     )
     each, shared = eqx.partition(arrays, axes)
     found = Bodies(shared, each, rest, count, dtype)
-    # Shapes are enough, and taking a row costs as much as many steps.
-    first = jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape[1:], a.dtype), each)
+    # Shapes are enough for an Inertia, and taking a row costs as much as many steps.
+    shape = lambda a: jax.ShapeDtypeStruct(a.shape[1:], a.dtype)  # noqa: E731
+    matter = isinstance(bodies, MassProperties)
+    first = jax.tree.map((lambda a: a[0]) if matter else shape, each)
     require_fit(*Bodies.one(shared, first, rest))
     return found
 
