@@ -119,19 +119,7 @@ def run(r, y, steps, h):
                 q0, q1, q2, q3, a, b, c = y[0, i], y[1, i], y[2, i], y[3, i], y[4, i], y[5, i], y[6, i]
                 s0 = s1 = s2 = s3 = s4 = s5 = s6 = y[0, i] - y[0, i]
                 z0, z1, z2, z3, z4, z5, z6 = q0, q1, q2, q3, a, b, c
-                for stage in range(4):
-                    k0 = -half * (z1 * z4 + z2 * z5 + z3 * z6)
-                    k1 = half * (z0 * z4 + z2 * z6 - z3 * z5)
-                    k2 = half * (z0 * z5 + z3 * z4 - z1 * z6)
-                    k3 = half * (z0 * z6 + z1 * z5 - z2 * z4)
-                    k4, k5, k6 = r[0, i] * z5 * z6, r[1, i] * z6 * z4, r[2, i] * z4 * z5
-                    w = h / h if stage == 0 or stage == 3 else two
-                    s0, s1, s2, s3 = s0 + w * k0, s1 + w * k1, s2 + w * k2, s3 + w * k3
-                    s4, s5, s6 = s4 + w * k4, s5 + w * k5, s6 + w * k6
-                    f = h if stage == 2 else half * h
-                    z0, z1, z2, z3 = q0 + f * k0, q1 + f * k1, q2 + f * k2, q3 + f * k3
-                    z4, z5, z6 = a + f * k4, b + f * k5, c + f * k6
-                g = h * sixth
+STAGES                g = h * sixth
                 y[0, i], y[1, i], y[2, i], y[3, i] = q0 + g * s0, q1 + g * s1, q2 + g * s2, q3 + g * s3
                 y[4, i], y[5, i], y[6, i] = a + g * s4, b + g * s5, c + g * s6
 
@@ -144,6 +132,27 @@ begin = time.process_time()
 run(r, y, steps, kind.type(0.01))
 print(time.process_time() - begin)
 """
+
+# Written out, for a loop over stages keeps LLVM from vectors.
+STAGE = """
+                k0 = -half * (z1 * z4 + z2 * z5 + z3 * z6)
+                k1 = half * (z0 * z4 + z2 * z6 - z3 * z5)
+                k2 = half * (z0 * z5 + z3 * z4 - z1 * z6)
+                k3 = half * (z0 * z6 + z1 * z5 - z2 * z4)
+                k4, k5, k6 = r[0, i] * z5 * z6, r[1, i] * z6 * z4, r[2, i] * z4 * z5
+                w = WEIGHT
+                s0, s1, s2, s3 = s0 + w * k0, s1 + w * k1, s2 + w * k2, s3 + w * k3
+                s4, s5, s6 = s4 + w * k4, s5 + w * k5, s6 + w * k6
+                f = h * FRACTION
+                z0, z1, z2, z3 = q0 + f * k0, q1 + f * k1, q2 + f * k2, q3 + f * k3
+                z4, z5, z6 = a + f * k4, b + f * k5, c + f * k6
+"""
+ONE = "(two * half)"
+STAGES = "".join(
+    STAGE.replace("WEIGHT", weight).replace("FRACTION", fraction)
+    for weight, fraction in ((ONE, "half"), ("two", "half"), ("two", ONE), (ONE, ONE))
+)
+NUMBA = NUMBA.replace("STAGES", STAGES)
 
 
 def data(count, dtype=None):
