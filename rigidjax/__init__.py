@@ -6,6 +6,7 @@ the front door.
 """
 
 from rigidjax import (
+    batch as batch,
     exact as exact,
     frames as frames,
     identify as identify,
@@ -17,6 +18,7 @@ from rigidjax._types import (
     HasPose as HasPose,
     HasSpin as HasSpin,
 )
+from rigidjax.batch import cpu_flags as cpu_flags
 from rigidjax.body import (
     Inertia as Inertia,
     MassProperties as MassProperties,

@@ -1,0 +1,182 @@
+"""What a batch is given, looked at before anything runs: shapes, kinds, and known numbers."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from rigidjax import _checks
+from rigidjax._types import HasAttitude
+from rigidjax.body.inertia import Inertia, MassProperties
+from rigidjax.motion import Attitude, Rigid, Spin, on_the_group
+from rigidjax.solve.inputs import require_fit
+
+
+class Bodies(NamedTuple):
+    """A batch, sorted by what all bodies share and what each has of its own.
+
+    **Fields:** `shared`, `each` trees of the same shape, `(body, state0, torque)`, with `None`
+    where the other has the array; `rest` what is no array at all; `many` N; `dtype`.
+    """
+
+    shared: Any
+    each: Any
+    rest: Any
+    many: int
+    dtype: Any
+
+    @staticmethod
+    def one(shared: Any, each: Any, rest: Any) -> tuple[Any, Any, Any]:
+        """A single body, its state and its torque."""
+        return eqx.combine(shared, each, rest)
+
+
+def bodies_of(bodies: Any, states0: Any, torque: Any, torque_axes: Any) -> Bodies:
+    """The batch.
+
+    **Raises:** `TypeError` for what is no body or state, or does not fit together, or for states
+    of several dtypes; `ValueError` for shapes that do not agree, and, where numbers are known, for
+    a moment that is not positive or a quaternion whose length is not 1, naming the first such body.
+    """
+    if not isinstance(states0, Spin | Attitude | Rigid):
+        raise TypeError(
+            f"states0: wanted Spin, Attitude or Rigid, got {type(states0).__name__}; for points in "
+            "moving frames use jax.vmap over rigidjax.simulate"
+        )
+    if states0.omega.ndim != 2 or not states0.omega.shape[0]:
+        raise ValueError(
+            f"states0: wanted one row a body, omega of shape (N, 3), got {states0.omega.shape}"
+            + ("; for one body use rigidjax.simulate" if states0.omega.ndim == 1 else "")
+        )
+    count = states0.omega.shape[0]
+    for path, leaf in jax.tree.leaves_with_path(states0):
+        if leaf.shape[0] != count or leaf.ndim != 2:
+            raise ValueError(
+                f"states0: {count} rows of omega, but {str(path[-1]).lstrip('.')} of shape "
+                f"{leaf.shape}"
+            )
+    kinds = {leaf.dtype for leaf in jax.tree.leaves(states0)}
+    if len(kinds) != 1:
+        raise TypeError(f"states0: wanted one dtype, got {', '.join(sorted(map(str, kinds)))}")
+    dtype = kinds.pop()
+    if not isinstance(bodies, Inertia | MassProperties):
+        raise TypeError(
+            f"bodies: wanted Inertia, or MassProperties for Rigid, got {type(bodies).__name__}"
+        )
+    tensor = bodies.inertia.tensor if isinstance(bodies, MassProperties) else bodies.tensor
+    if tensor.ndim not in (2, 3) or (tensor.ndim == 3 and tensor.shape[0] not in (1, count)):
+        raise ValueError(
+            f"bodies: wanted one body, or {count} as the states, of shape ({count}, 3, 3), got "
+            f"{tensor.shape}"
+        )
+    _positive(tensor)
+    if isinstance(states0, HasAttitude):
+        _unit(states0.q)
+    # In the precision of the states.
+    bodies = jax.tree.map(lambda a: a if a.dtype == dtype else a.astype(dtype), bodies)
+    own = tensor.ndim == 3
+    if own and tensor.shape[0] == 1 and count > 1:
+        bodies, own = jax.tree.map(lambda leaf: leaf[0], bodies), False
+    arrays, rest = eqx.partition((bodies, states0, torque), eqx.is_array)
+    axes = (
+        jax.tree.map(lambda _: own, arrays[0]),
+        jax.tree.map(lambda _: True, arrays[1]),
+        _own_torque(arrays[2], torque_axes, count),
+    )
+    each, shared = eqx.partition(arrays, axes)
+    found = Bodies(shared, each, rest, count, dtype)
+    # Shapes are enough for an Inertia, and taking a row costs as much as many steps.
+    shape = lambda a: jax.ShapeDtypeStruct(a.shape[1:], a.dtype)  # noqa: E731
+    matter = isinstance(bodies, MassProperties)
+    first = jax.tree.map((lambda a: a[0]) if matter else shape, each)
+    require_fit(*Bodies.one(shared, first, rest))
+    return found
+
+
+def _own_torque(torque: Any, axes: Any, count: int) -> Any:
+    """Which arrays of the torque have a row for each body."""
+    for axis in jax.tree.leaves(axes):
+        if not isinstance(axis, int) or axis != 0:
+            raise ValueError(f"torque_axes: wanted 0 and None, got {axis!r}")
+    prefix = jax.tree.map(lambda axis: axis is not None, axes, is_leaf=lambda a: a is None)
+    own, _ = eqx.partition(torque, prefix)
+    for path, leaf in jax.tree.leaves_with_path(own):
+        if leaf.ndim == 0 or leaf.shape[0] != count:
+            raise ValueError(
+                f"torque_axes: wanted {count} rows in torque{jax.tree_util.keystr(path)}, got "
+                f"shape {leaf.shape}; make one law a body with jax.vmap"
+            )
+    return prefix
+
+
+def _positive(tensor: Array) -> None:
+    if not _checks.known(tensor):
+        return
+    a = np.asarray(tensor, np.float64).reshape(-1, 3, 3)
+    with np.errstate(invalid="ignore", over="ignore"):
+        minor = a[:, 0, 0] * a[:, 1, 1] - a[:, 0, 1] * a[:, 1, 0]
+        whole = (
+            a[:, 0, 2] * (a[:, 1, 0] * a[:, 2, 1] - a[:, 1, 1] * a[:, 2, 0])
+            - a[:, 1, 2] * (a[:, 0, 0] * a[:, 2, 1] - a[:, 0, 1] * a[:, 2, 0])
+            + a[:, 2, 2] * minor
+        )
+        # NaN is a body of its own, whose status will say so.
+        bad = (a[:, 0, 0] <= 0) | (minor <= 0) | (whole <= 0)
+    if bad.any():
+        i = int(np.argmax(bad))
+        raise ValueError(
+            f"bodies: wanted positive moments, got {np.linalg.eigvalsh(a[i])} kg m² of body {i}"
+        )
+
+
+def _unit(q: Array) -> None:
+    if not _checks.known(q):
+        return
+    numbers = np.asarray(q)
+    far = np.abs(np.sqrt(np.sum(np.square(numbers), axis=-1)) - 1)
+    bad = far > (1e-6 if numbers.dtype == np.float64 else 1e-3)
+    if bad.any():
+        i = int(np.argmax(bad))
+        raise ValueError(
+            f"q: wanted unit quaternions (w, x, y, z), got length {1 + far[i]:.6g} or less of body "
+            f"{i}; normalise with rigidjax.quaternion.normalise, and mind that the scalar is first"
+        )
+
+
+def step_of(step_size: Any, num_steps: Any, dtype: Any) -> tuple[Array, int]:
+    """The step, s, and the number of steps.
+
+    **Raises:** `ValueError` for a step that is not positive; `TypeError` for a number of steps that
+    is no whole number known beforehand.
+    """
+    h = _checks.floating(step_size, (), "step_size").astype(dtype)
+    if _checks.known(h) and not 0 < float(h) < np.inf:
+        raise ValueError(
+            f"step_size: wanted a positive step, s, got {step_size}; to go back in time negate Ω "
+            "and the torque's time"
+        )
+    if isinstance(num_steps, bool) or not isinstance(num_steps, int | np.integer):
+        raise TypeError(
+            f"num_steps: wanted a whole number known before compiling, got {num_steps!r}"
+        )
+    if num_steps < 1:
+        raise ValueError(f"num_steps: wanted at least one step, got {num_steps}")
+    return h, int(num_steps)
+
+
+def time_of(value: Any, dtype: Any) -> Array:
+    """A scalar time, s."""
+    return jnp.asarray(_checks.floating(value, (), "t0"), dtype)
+
+
+def start_of(state0: Any) -> Any:
+    """The start with its quaternion of length 1; NaN, for that body alone, if it is far from it."""
+    if not isinstance(state0, HasAttitude):
+        return state0
+    q = state0.q
+    far = jnp.abs(jnp.sqrt(jnp.sum(q * q)) - 1) > (1e-6 if q.dtype == jnp.float64 else 1e-3)
+    q = jnp.where(far, jnp.full_like(q, jnp.nan), q)
+    return on_the_group(eqx.tree_at(lambda s: s.q, state0, q))

@@ -1,0 +1,178 @@
+"""Several hosts: each works on its own share of the bodies; only what they found is sent.
+
+Bodies do not see one another, so a run itself sends nothing, and a process gets for its share what
+one process alone would get, bit for bit. What can fail is the gathering: where a peer has died
+there is nothing to wait for. So a share is written down first, and the run then ends with an error.
+"""
+
+import os
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.experimental import multihost_utils
+
+# Seconds without a sign of life after which a peer counts as dead.
+PATIENCE = 20
+
+
+def connect(address: str, processes: int, process: int, *, patience: int = PATIENCE) -> None:
+    """Join the other processes; to be called before anything else of JAX.
+
+    **Arguments:** `address` "host:port" of process 0; `processes` how many there are; `process`
+    which of them this is, from 0; `patience` s after which a silent peer counts as dead: every
+    process then ends, with a message and a non-zero exit code.
+
+    **Raises:** `ValueError` for a number that is none of theirs; `RuntimeError` where JAX is in use
+    already or the others do not come.
+
+    >>> connect("localhost:1234", 2, 2)
+    Traceback (most recent call last):
+    ValueError: process: wanted a number from 0 to 1, got 2
+    """
+    if processes < 1 or not 0 <= process < processes:
+        raise ValueError(f"process: wanted a number from 0 to {processes - 1}, got {process}")
+    if ":" not in address:
+        raise ValueError(f'address: wanted "host:port" of process 0, got {address!r}')
+    jax.distributed.initialize(
+        address,
+        processes,
+        process,
+        initialization_timeout=3 * patience,
+        heartbeat_timeout_seconds=patience,
+        shutdown_timeout_seconds=patience,
+    )
+
+
+def share(tree: Any) -> Any:
+    """This process's rows of arrays that have a leading axis of bodies.
+
+    **Returns** the tree with ⌈N / processes⌉ rows, the last processes fewer. Arrays that all bodies
+    share do not belong in it.
+
+    **Raises:** `ValueError` where there are fewer bodies than processes.
+
+    >>> share(jnp.arange(5)).shape
+    (5,)
+    """
+    many, here = jax.process_count(), jax.process_index()
+    counts = {leaf.shape[0] for leaf in jax.tree.leaves(tree)}
+    if len(counts) != 1:
+        raise ValueError(f"share: wanted one number of bodies, got {sorted(counts)}")
+    count = counts.pop()
+    if count < many:
+        raise ValueError(f"share: {count} bodies for {many} processes; start fewer processes")
+    edges = [count * i // many for i in range(many + 1)]
+    return jax.tree.map(lambda leaf: leaf[edges[here] : edges[here + 1]], tree)
+
+
+def gather(tree: Any, checkpoint: str | os.PathLike[str] | None = None) -> Any:
+    """All processes' rows, on every process, in order.
+
+    **Arguments:** `tree` arrays with this process's rows, as `share` cut them; `checkpoint` a
+    folder: the rows are written there first, as `share-3.npz`, for `recover`.
+    **Returns** the tree with the rows of all, in host memory.
+
+    **Raises:** `RuntimeError` where a peer has died. The process should end then: what JAX holds is
+    of no use any more.
+
+    >>> gather(jnp.arange(3)).tolist()
+    [0, 1, 2]
+    """
+    if checkpoint is not None:
+        save(tree, checkpoint)
+    if jax.process_count() == 1:
+        return jax.tree.map(np.asarray, tree)
+    return _together(lambda: jax.tree.map(_rows_of_all, tree), checkpoint)
+
+
+def total(tree: Any, checkpoint: str | os.PathLike[str] | None = None) -> Any:
+    """The sum over all processes, on every process: of losses, gradients, normal equations.
+
+    **Arguments:** `tree` arrays, the same shapes everywhere; `checkpoint` as for `gather`. The sum
+    is taken in the order of the processes, so that every process has the same bits.
+
+    **Raises:** as `gather`.
+
+    >>> total(jnp.ones(2)).tolist()
+    [1.0, 1.0]
+    """
+    if checkpoint is not None:
+        save(tree, checkpoint)
+    if jax.process_count() == 1:
+        return jax.tree.map(np.asarray, tree)
+    return _together(
+        lambda: jax.tree.map(
+            lambda leaf: multihost_utils.process_allgather(jnp.asarray(leaf)).sum(axis=0), tree
+        ),
+        checkpoint,
+    )
+
+
+def save(tree: Any, folder: str | os.PathLike[str]) -> Path:
+    """Write this process's rows to `folder/share-<process>.npz`; whole or not at all.
+
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     _ = save(jnp.arange(2), folder)
+    ...     recover(jnp.zeros(2), folder)[0].tolist()
+    [0, 1]
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"share-{jax.process_index()}.npz"
+    leaves: dict[str, Any] = {
+        f"leaf{i}": np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(tree))
+    }
+    handle, name = tempfile.mkstemp(dir=folder, suffix=".part")
+    with os.fdopen(handle, "wb") as file:
+        np.savez(file, **leaves)
+    os.replace(name, path)
+    return path
+
+
+def recover(like: Any, folder: str | os.PathLike[str]) -> list[Any]:
+    """What `save` wrote, process by process; `like` a tree of the same structure.
+
+    **Raises:** `FileNotFoundError` for a folder without shares.
+    """
+    paths = sorted(Path(folder).glob("share-*.npz"), key=lambda p: int(p.stem.split("-")[1]))
+    if not paths:
+        raise FileNotFoundError(f"recover: no share-*.npz in {folder}")
+    structure = jax.tree.structure(like)
+    found = []
+    for path in paths:
+        with np.load(path) as file:
+            found.append(
+                jax.tree.unflatten(structure, [file[f"leaf{i}"] for i in range(len(file.files))])
+            )
+    return found
+
+
+def _rows_of_all(leaf: Any) -> np.ndarray:
+    # Shares differ by a row at most: fill up, send, cut.
+    rows = np.asarray(leaf)
+    counts = np.asarray(multihost_utils.process_allgather(jnp.asarray(rows.shape[0])))
+    most = int(counts.max())
+    filled = np.concatenate([rows, np.repeat(rows[-1:], most - rows.shape[0], axis=0)])
+    sent = np.asarray(multihost_utils.process_allgather(jnp.asarray(filled)))
+    return np.concatenate([part[:n] for part, n in zip(sent, counts, strict=True)])
+
+
+def _together(send: Callable[[], Any], checkpoint: Any) -> Any:
+    try:
+        return send()
+    except Exception as error:
+        kept = (
+            f"this process's share is in {Path(checkpoint) / f'share-{jax.process_index()}.npz'}"
+            if checkpoint is not None
+            else "give checkpoint= a folder to keep each share"
+        )
+        raise RuntimeError(
+            f"process {jax.process_index()} of {jax.process_count()}: a peer did not answer, it "
+            f"has most likely died; {kept}; end this process and start all of them again"
+        ) from error

@@ -1,0 +1,168 @@
+"""A step of order 4 for torques that do not look at the attitude: Runge–Kutta, then one rotation.
+
+Euler's equations are then closed in the body rate. So the four stages carry three numbers instead
+of seven, and the attitude is turned once a step, by the exponential of Magnus' series.
+"""
+
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import diffrax as dfx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jax.extend import core
+from jaxtyping import Array
+
+from rigidjax.body.inertia import Inertia
+from rigidjax.exact.triples import Four, Triple, cross
+from rigidjax.motion import Attitude, AttitudeEquations
+from rigidjax.motion.torques import evaluate
+from rigidjax.solve.components import join, split
+from rigidjax.solve.explicit import NestedInterpolation, advance
+from rigidjax.solve.scalarise import scalarise
+from rigidjax.solve.tableaus import KUTTA4
+
+
+def turned(
+    slope: Callable[[Any, Triple], Triple],
+    rate: Callable[[Triple], Triple],
+    t: Any,
+    end: Any,
+    h: Array,
+    q: Four,
+    p: Triple,
+) -> tuple[Four, Triple]:
+    """One step of attitude `q` and momentum (or rate) `p`, from `t` to `end`.
+
+    **Arguments:** `slope(t, p)` dp/dt; `rate(p)` Ω; `h` the step, s. The rotation vector of the
+    step is `∫Ω dt + h²/12 Ω(t) × Ω(t+h)`, the integral by Simpson's rule with the middle of the
+    cubic through both ends. Source: Magnus 1954, doi:10.1002/cpa.3160070404; Iserles, Munthe-Kaas,
+    Nørsett and Zanna 2000, doi:10.1017/S0962492900002154, section 5.
+    """
+    after, slopes, _ = advance(KUTTA4, slope, t, h, p, end)
+    after = lax.optimization_barrier(after)
+    first, last = slopes[0], slope(end, after)
+    middle = tuple(
+        0.5 * (a + b) + 0.125 * h * (k - m)
+        for a, b, k, m in zip(p, after, first, last, strict=True)
+    )
+    left, between, right = rate(p), rate(middle), rate(after)
+    third, square = h / 12.0, h * h / 24.0
+    half = tuple(
+        third * (a + 4.0 * b + c) + square * d
+        for a, b, c, d in zip(left, between, right, cross(left, right), strict=True)
+    )
+    half = lax.optimization_barrier(half)
+    return _product(q, half), after
+
+
+def _product(q: Four, half: Triple) -> Four:
+    """`q ⊗ exp(half)`, of length 1."""
+    # Short series: a step that turns by more than a radian has no digits to lose.
+    x = half[0] * half[0] + half[1] * half[1] + half[2] * half[2]
+    c = 1.0 + x * (-1 / 2 + x * (1 / 24 + x * (-1 / 720 + x * (1 / 40320))))
+    s = 1.0 + x * (-1 / 6 + x * (1 / 120 + x * (-1 / 5040 + x * (1 / 362880))))
+    c, x, y, z = lax.optimization_barrier((c, *(s * a for a in half)))
+    a, b, d, e = q
+    out = (
+        a * c - b * x - d * y - e * z,
+        a * x + b * c + d * z - e * y,
+        a * y - b * z + d * c + e * x,
+        a * z + b * y - d * x + e * c,
+    )
+    # One of Newton's steps to length 1, which is near already.
+    scale = 1.5 - 0.5 * (out[0] * out[0] + out[1] * out[1] + out[2] * out[2] + out[3] * out[3])
+    return tuple(scale * a for a in lax.optimization_barrier(out))
+
+
+class Magnus4(dfx.AbstractSolver):
+    """Order 4 at equal steps, for free bodies and torques of time and body rate only.
+
+    The step that `rigidjax.batch.rollout` takes unless told otherwise, as a `diffrax` solver. About
+    ten times as exact as `rigidjax.solvers.RungeKutta4` at the same step, and half as much work.
+    The attitude keeps |q| = 1. A step should turn the body by less than a radian.
+
+    Source: see `rigidjax.batch.magnus.turned`.
+
+    **Raises:** `TypeError` for a torque that looks at the attitude, or another state.
+
+    >>> import diffrax, rigidjax as rj
+    >>> field = rj.AttitudeEquations(rj.Inertia.from_principal(1.0, 2.0, 3.0))
+    >>> start = rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 1])
+    >>> term = diffrax.ODETerm(field)
+    >>> diffrax.diffeqsolve(term, Magnus4(), 0.0, 1.0, 0.01, start).ys.q[0, 3]
+    Array(0.47942554, dtype=float64)
+    """
+
+    term_structure: ClassVar = dfx.ODETerm
+    interpolation_cls: ClassVar = NestedInterpolation
+
+    def order(self, terms: Any) -> int:
+        return 4
+
+    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> None:
+        # diffrax wraps the term where time runs backwards.
+        term = terms if isinstance(terms, dfx.ODETerm) else terms.term
+        field: Any = term.vector_field
+        if not isinstance(field, AttitudeEquations) or not isinstance(y0, Attitude):
+            raise TypeError(
+                "Magnus4: wanted AttitudeEquations and an Attitude state, got "
+                f"{type(field).__name__} and {type(y0).__name__}; use RungeKutta4"
+            )
+        require_blind(field.euler.torque, jnp.asarray(t0), y0, field.euler.inertia)
+
+    def step(
+        self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Any, made_jump: Any
+    ) -> Any:
+        numbers = scalarise(lambda t, y: terms.vf(t, y, args), t0, y0)
+        start = split(y0)
+        q, omega = start[:4], start[4:]
+        h = jnp.asarray(terms.contr(t0, t1), y0.omega.dtype)
+
+        def slope(t: Any, omega: Triple) -> Triple:
+            return numbers(t, *q, *omega)[4:]
+
+        q1, omega1 = turned(slope, lambda omega: omega, t0, t1, h, q, omega)
+        y1: Any = join((*q1, *omega1), y0)
+        left, right = terms.vf(t0, y0, args), terms.vf(t1, y1, args)
+
+        def rows(a: Array, b: Array, k: Array, m: Array) -> Array:
+            rise = b - a
+            return jnp.stack([rise, h * k - rise, 2 * rise - h * (k + m)])
+
+        dense = dict(y0=y0, coefficients=jax.tree.map(rows, y0, y1, left, right))
+        return y1, None, dense, None, dfx.RESULTS.successful
+
+    def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
+        return terms.vf(t0, y0, args)
+
+
+def require_blind(law: Any, t: Array, state: Attitude, body: Inertia) -> None:
+    """Raise `TypeError` if the law's value is computed from the attitude."""
+    if law is not None and sees_attitude(law, t, state, body):
+        raise TypeError(
+            f"Magnus4: the torque {type(law).__name__} depends on the attitude; only time and body "
+            "rate may enter it; use rigidjax.solvers.RungeKutta4"
+        )
+
+
+def sees_attitude(law: Any, t: Array, state: Attitude, body: Inertia) -> bool:
+    """Whether the law's value is computed from the attitude, read off its operations.
+
+    >>> import rigidjax as rj
+    >>> body = rj.Inertia.from_principal(1.0, 2.0, 3.0)
+    >>> state = rj.Attitude([1.0, 0, 0, 0], [1.0, 0.0, 0.0])
+    >>> sees_attitude(rj.torques.Damping([1.0, 1, 1]), jnp.zeros(()), state, body)
+    False
+    """
+
+    def torque(q: Array, t: Array, omega: Array) -> Array:
+        return evaluate(law, t, Attitude(q, omega), body)
+
+    jaxpr = jax.make_jaxpr(torque)(state.q, t, state.omega).jaxpr
+    reached = {jaxpr.invars[0]}
+    for equation in jaxpr.eqns:
+        if any(not isinstance(a, core.Literal) and a in reached for a in equation.invars):
+            reached.update(equation.outvars)
+    return any(not isinstance(a, core.Literal) and a in reached for a in jaxpr.outvars)

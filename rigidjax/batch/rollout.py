@@ -1,0 +1,252 @@
+"""Equal steps for a whole batch: the leanest loop, differentiable both ways in bounded memory."""
+
+import functools
+import math
+from collections.abc import Callable
+from typing import Any, TypeVar, overload
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array
+
+from rigidjax import _checks
+from rigidjax._types import ScalarLike
+from rigidjax.batch.chunks import chunk_of, compiler_options, mesh_of, over_bodies
+from rigidjax.batch.given import Bodies, bodies_of, step_of, time_of
+from rigidjax.batch.lanes import Lane, lane_of
+from rigidjax.batch.magnus import Magnus4
+from rigidjax.body.inertia import Inertia, MassProperties
+from rigidjax.motion import Attitude, Rigid, Spin
+from rigidjax.solve.explicit import AbstractExplicit, Atoms
+
+State = TypeVar("State", Spin, Attitude, Rigid)
+Reduced = TypeVar("Reduced")
+# What `reduce` carries, the time, the state of one body → what it carries on.
+Reduce = Callable[[Any, Array, Any], Any]
+Method = AbstractExplicit | Magnus4 | None
+# Bytes that reverse mode may keep of all chunks together.
+_KEPT = 2**23
+
+
+@overload
+def rollout(
+    bodies: Inertia | MassProperties,
+    states0: State,
+    step_size: ScalarLike,
+    num_steps: int,
+    torque: Any = None,
+    *,
+    method: Method = None,
+    save_every: int | None = None,
+    reduce: None = None,
+    initial: None = None,
+    t0: ScalarLike = 0.0,
+    torque_axes: Any = None,
+    chunk: int | None = None,
+    devices: Any = None,
+) -> State: ...
+
+
+@overload
+def rollout(
+    bodies: Inertia | MassProperties,
+    states0: State,
+    step_size: ScalarLike,
+    num_steps: int,
+    torque: Any = None,
+    *,
+    reduce: Reduce,
+    initial: Reduced,
+    method: Method = None,
+    save_every: int | None = None,
+    t0: ScalarLike = 0.0,
+    torque_axes: Any = None,
+    chunk: int | None = None,
+    devices: Any = None,
+) -> tuple[State, Reduced]: ...
+
+
+def rollout(
+    bodies: Inertia | MassProperties,
+    states0: Any,
+    step_size: ScalarLike,
+    num_steps: int,
+    torque: Any = None,
+    *,
+    method: Method = None,
+    save_every: int | None = None,
+    reduce: Reduce | None = None,
+    initial: Any = None,
+    t0: ScalarLike = 0.0,
+    torque_axes: Any = None,
+    chunk: int | None = None,
+    devices: Any = None,
+) -> Any:
+    """`num_steps` equal steps of N bodies, each with its own start, inertia and torque.
+
+    **Arguments:**
+
+    - `bodies`: one `Inertia` (3, 3) for all, or one a body (N, 3, 3), kg m², body frame;
+      `MassProperties` likewise for `Rigid`.
+    - `states0`: `Spin`, `Attitude` or `Rigid` whose arrays have a leading axis N, at `t0`.
+    - `step_size` s, the same for all; `num_steps` a whole number, part of what is compiled.
+    - `torque`: `None`, or any law that `rigidjax.simulate` takes. Its arrays are shared by all
+      bodies unless `torque_axes` is 0 (each array has a leading axis N: make one law a body with
+      `jax.vmap`) or a tree of 0 and `None`, one for each array.
+    - `method`: `None` takes `Magnus4` for a free attitude, or a torque that does not look at the
+      attitude, and `rigidjax.solvers.RungeKutta4` for all else. Any of `rigidjax.solvers` that is
+      explicit may be given; the steps are those that `diffrax` takes with it, to round-off.
+    - `save_every`: `None` returns the last states only; k those after k, 2k, … steps.
+    - `reduce`, `initial`: a function `(carried, t, state) → carried` of one body, called after
+      every `save_every` steps (one, by default), and what it begins with. States are not kept then.
+      A function made anew for each call compiles anew: define it once, best as a Module.
+    - `t0` s, when the first step begins.
+    - `chunk`: how many bodies go side by side. `None` is what fits the first cache, 128 in float64.
+      Bodies are independent: chunks change results in the last digits at most.
+    - `devices`: `None` for one, `"all"` of this process, or a sequence of them; N is cut into
+      equal shares. Free bodies get the same bits; with a torque whose numbers are shared XLA may
+      order products in another way, which is one rounding.
+
+    **Returns** the states, of the type of `states0`, with leading axes (N,) or, with `save_every`,
+    (N, num_steps // save_every); with `reduce` the pair (last states, carried).
+
+    Memory: the inputs, what is returned, and a chunk. Derivatives are those of the steps as taken,
+    in forward mode and in reverse; reverse mode goes back in pieces of √`num_steps` steps and
+    holds one chunk's at a time, about five times the time of the value. A body that becomes NaN
+    stays NaN and touches no other.
+
+    Inside `jax.jit` of your own see `rigidjax.batch.compiler_options`.
+
+    **Raises:** `TypeError` where bodies, states, torque and method do not fit; `ValueError` for
+    shapes that do not agree, a step that is not positive, a `save_every` that does not divide
+    `num_steps`, and, where numbers are known, no positive moments or no unit quaternion.
+
+    >>> import rigidjax as rj
+    >>> bodies = rj.Inertia(jnp.diag(jnp.array([1.0, 2.0, 3.0])))
+    >>> states = rj.Attitude(jnp.tile(jnp.eye(4)[0], (5, 1)), jnp.tile(jnp.eye(3)[2], (5, 1)))
+    >>> rj.batch.rollout(bodies, states, 0.01, 100).q[4, 3]
+    Array(0.47942554, dtype=float64)
+    """
+    batch = bodies_of(bodies, states0, torque, torque_axes)
+    h, count = step_of(step_size, num_steps, batch.dtype)
+    if reduce is None and initial is not None:
+        raise ValueError("rollout: initial is what reduce begins with; no reduce was given")
+    if reduce is not None and not callable(reduce):
+        raise TypeError(
+            f"reduce: wanted a function (carried, t, state) -> carried, got {type(reduce).__name__}"
+        )
+    every = (1 if reduce is not None else count) if save_every is None else save_every
+    if not isinstance(every, int) or every < 1 or count % every:
+        raise ValueError(
+            f"save_every: wanted a whole part of num_steps = {count}, got {save_every!r}"
+        )
+    start = jax.tree.map(jnp.asarray, initial)
+    numbers = (batch.shared, batch.each, start, h, time_of(t0, batch.dtype))
+    plan = _Plan(
+        method,
+        count,
+        every,
+        save_every is not None and reduce is None,
+        chunk_of(chunk, batch.dtype, batch.many),
+        mesh_of(devices),
+    )
+    # A tracer means that somebody else's jit may be outermost, and only that one takes options.
+    run = _alone() if _checks.known(numbers) else _within
+    return run(plan, reduce, batch.rest, numbers)
+
+
+class _Plan(eqx.Module):
+    """What is compiled."""
+
+    method: Any
+    count: int = eqx.field(static=True)
+    every: int = eqx.field(static=True)
+    keep: bool = eqx.field(static=True)
+    chunk: int = eqx.field(static=True)
+    mesh: Any = eqx.field(static=True)
+
+
+def _run(plan: _Plan, reduce: Reduce | None, rest: Any, numbers: Any) -> Any:
+    shared, each, initial, h, t0 = numbers
+
+    def one(given: Any, each: Any) -> Any:
+        shared, initial, h, t0 = given
+        body, state0, torque = Bodies.one(shared, each, rest)
+        lane = lane_of(body, state0, torque, t0, plan.method)
+
+        def piece(carry: Any, first: Array) -> Any:
+            y, carried = carry
+            y = march(lane, h, t0, first, plan.every, y)
+            if reduce is not None:
+                t = t0 + (first + plan.every).astype(h.dtype) * h
+                carried = reduce(carried, t, lane.state(y))
+            return (y, carried), lane.state(y) if plan.keep else None
+
+        begin = (lane.start, initial)
+        if plan.every == plan.count:
+            (y, carried), kept = piece(begin, jnp.zeros((), jnp.int32))
+            kept = jax.tree.map(lambda leaf: leaf[None], kept)
+        else:
+            firsts = jnp.arange(0, plan.count, plan.every, dtype=jnp.int32)
+            (y, carried), kept = lax.scan(piece, begin, firsts)
+        if reduce is not None:
+            return lane.state(y), carried
+        return kept if plan.keep else lane.state(y)
+
+    size = sum(leaf.size for leaf in jax.tree.leaves(each)) * h.dtype.itemsize
+    if size * (plan.count // plan.every) * (plan.every // piece_length(plan.every) + 1) > _KEPT:
+        # Going back, a chunk is worked out anew: else every chunk's pieces would be kept.
+        one = jax.checkpoint(one)
+    return over_bodies(one, (shared, initial, h, t0), each, plan.chunk, plan.mesh)
+
+
+_within = eqx.filter_jit(_run)
+
+
+@functools.cache
+def _alone() -> Callable[..., Any]:
+    # Made when first called: asking which backend there is starts it.
+    options = compiler_options()
+    jitted: Any = eqx.filter_jit
+    return jitted(_run, compiler_options=options) if options else _within
+
+
+def march(lane: Lane, h: Array, t0: Array, first: Array, count: int, y: Atoms) -> Atoms:
+    """`count` steps from number `first` on.
+
+    In reverse mode the states at the starts of √count pieces are kept, and those in one piece.
+    """
+
+    def at(i: Array) -> Array:
+        # Not t + h again and again: round-off would add up (a million steps, 1e-3 in float32).
+        return t0 + i.astype(h.dtype) * h
+
+    @functools.partial(jax.checkpoint, prevent_cse=False)
+    def step(y: Atoms, i: Array) -> tuple[Atoms, None]:
+        return lane.step(at(i), at(i + 1), h, y), None
+
+    @functools.partial(jax.checkpoint, prevent_cse=False, static_argnums=2)
+    def some(y: Atoms, begin: Array, many: int) -> Atoms:
+        return lax.scan(step, y, begin + jnp.arange(many, dtype=jnp.int32))[0]
+
+    length = piece_length(count)
+    pieces, left = divmod(count, length)
+    if pieces > 1:
+        starts = first + length * jnp.arange(pieces, dtype=jnp.int32)
+        y, _ = lax.scan(lambda y, begin: (some(y, begin, length), None), y, starts)
+    else:
+        y = some(y, first, length)
+    return some(y, first + pieces * length, left) if left else y
+
+
+def piece_length(count: int) -> int:
+    """About √count steps; a divisor of count where there is one near, for less to compile.
+
+    >>> piece_length(1000), piece_length(997)
+    (40, 32)
+    """
+    root = math.isqrt(count - 1) + 1
+    near = [d for d in range(root, min(2 * root, count) + 1) if count % d == 0]
+    return near[0] if near else root

@@ -1,0 +1,294 @@
+"""The front door for many bodies: closed form, equal steps, or adaptive steps that do not wait."""
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any, Generic, NamedTuple, TypeVar
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, ArrayLike, Float, Int
+
+from rigidjax import _checks
+from rigidjax._types import ScalarLike
+from rigidjax.batch.chunks import chunk_of, compiler_options, mesh_of, over_bodies
+from rigidjax.batch.given import Bodies, bodies_of, start_of, step_of, time_of
+from rigidjax.batch.magnus import Magnus4
+from rigidjax.batch.order import dealt, quickness
+from rigidjax.batch.rollout import rollout
+from rigidjax.body.inertia import Inertia, MassProperties
+from rigidjax.exact import FreeBody
+from rigidjax.motion import Attitude, Rigid, Spin
+from rigidjax.motion.torques import jumps_of
+from rigidjax.solve import equations_of_motion, inputs, lean, simulate as simulate_one, travel
+from rigidjax.solve.explicit import AbstractExplicit, DormandPrince8
+from rigidjax.solve.watched import NONFINITE, finite
+
+State = TypeVar("State", Spin, Attitude, Rigid)
+
+
+class Steps(NamedTuple):
+    """Equal steps, in the place of times.
+
+    **Fields:** `size` s; `number` of steps; `save_every` so many, or the last state only; `t0` s.
+
+    >>> Steps(0.01, 1000).number
+    1000
+    """
+
+    size: ScalarLike
+    number: int
+    save_every: int | None = None
+    t0: ScalarLike = 0.0
+
+
+class Batch(eqx.Module, Generic[State]):
+    """What `simulate` returns.
+
+    **Fields:** `ts` (T,) s; `ys` the states there, of the type of `states0`, with leading axes
+    (N, T), in the order that the bodies were given; NaN where a body did not get to. `result` a
+    `diffrax.RESULTS` for each body: `successful`, `nonfinite`, `max_steps_reached`,
+    `dt_min_reached`. `num_steps` (N,) taken and refused, 0 for the closed form.
+    """
+
+    ts: Float[Array, " times"]
+    ys: State
+    result: dfx.RESULTS
+    num_steps: Int[Array, " bodies"]
+
+
+def simulate(
+    bodies: Inertia | MassProperties,
+    states0: State,
+    ts_or_steps: Steps | Float[ArrayLike, " times"] | Sequence[float],
+    torque: Any = None,
+    *,
+    method: dfx.AbstractSolver | None = None,
+    rtol: float | None = None,
+    atol: float | None = None,
+    max_steps: int = 100_000,
+    adjoint: dfx.AbstractAdjoint | None = None,
+    torque_axes: Any = None,
+    chunk: int | None = None,
+    devices: Any = None,
+) -> Batch[State]:
+    """The motion of N bodies, each with its own start, inertia and torque.
+
+    **Arguments:**
+
+    - `bodies`, `states0`, `torque`, `torque_axes`, `chunk`, `devices`: as for
+      `rigidjax.batch.rollout`.
+    - `ts_or_steps`: (T,) increasing times, s, the first of them the start; or `Steps(size, number)`
+      for equal steps.
+    - `method`: `None` takes the closed form for free bodies, `rigidjax.solvers.DormandPrince8`
+      under a torque, and what `rollout` takes for `Steps`. With times any `diffrax.AbstractSolver`
+      may be given; the explicit ones of `rigidjax.solvers` run in our own loop, ten times as fast.
+    - `rtol`, `atol`, `max_steps`: of the adaptive steps, as for `rigidjax.simulate`; our own loop
+      counts steps between two times.
+    - `adjoint`: `None` for `jax.grad`; `diffrax.ForwardMode()` for `jax.jacfwd`. The closed form
+      and equal steps take both without being told.
+
+    Adaptive steps of bodies side by side go on until the slowest has arrived. So bodies are put in
+    the order of how fast they turn at the start, and only those of a chunk wait for each other. A
+    body that becomes NaN ends within two steps. Whatever happens to a body, the others get the same
+    bits.
+
+    **Returns** a `Batch`. Nothing is raised for what a body meets on its way: look at `result`.
+
+    **Raises:** as `rollout`; `ValueError` for times that do not increase.
+
+    >>> import rigidjax as rj
+    >>> bodies = rj.Inertia(jnp.diag(jnp.array([1.0, 2.0, 3.0])))
+    >>> states = rj.Attitude(jnp.tile(jnp.eye(4)[0], (5, 1)), jnp.tile(jnp.eye(3)[2], (5, 1)))
+    >>> rj.batch.simulate(bodies, states, [0.0, 1.0]).ys.q.shape
+    (5, 2, 4)
+    """
+    if isinstance(ts_or_steps, Steps):
+        lean_method: Any = method
+        return _equal(
+            bodies, states0, ts_or_steps, torque, lean_method, torque_axes, chunk, devices
+        )
+    if isinstance(method, Magnus4):
+        raise ValueError("simulate: Magnus4 takes equal steps; give Steps(size, number), not times")
+    batch = bodies_of(bodies, states0, torque, torque_axes)
+    ts = inputs.times(ts_or_steps, True).astype(batch.dtype)
+    if torque is None and method is None:
+        how: Any = _Free()
+    else:
+        rtol, atol = inputs.tolerances(rtol, atol, batch.dtype)
+        solver = DormandPrince8() if method is None else method
+        how = _Adaptive(solver, rtol, atol, max_steps, adjoint)
+    mesh = mesh_of(devices)
+    plan = _Plan(how, chunk_of(chunk, batch.dtype, batch.many), mesh)
+    numbers = (batch.shared, batch.each, ts)
+    run = _alone() if _checks.known(numbers) else _within
+    ys, result, steps = run(plan, batch.rest, numbers)
+    return Batch(ts, ys, result, steps)
+
+
+class _Free(eqx.Module):
+    """The closed form."""
+
+
+class _Adaptive(eqx.Module):
+    """Adaptive steps."""
+
+    solver: dfx.AbstractSolver
+    rtol: float = eqx.field(static=True)
+    atol: float = eqx.field(static=True)
+    max_steps: int = eqx.field(static=True)
+    adjoint: dfx.AbstractAdjoint | None
+
+
+class _Plan(eqx.Module):
+    """What is compiled."""
+
+    how: _Free | _Adaptive
+    chunk: int = eqx.field(static=True)
+    mesh: Any = eqx.field(static=True)
+
+
+def _run(plan: _Plan, rest: Any, numbers: Any) -> Any:
+    shared, each, ts = numbers
+
+    def one(given: Any, each: Any) -> Any:
+        shared, ts = given
+        body, state0, torque = Bodies.one(shared, each, rest)
+        state0 = start_of(state0)
+        if isinstance(plan.how, _Free):
+            return _free(body, state0, ts)
+        return _adaptive(plan.how, body, state0, torque, ts)
+
+    if isinstance(plan.how, _Free):
+        return over_bodies(one, (shared, ts), each, plan.chunk, plan.mesh)
+
+    def quick(each: Any) -> Array:
+        body, state0, torque = Bodies.one(shared, each, rest)
+        return quickness(body, state0, torque, ts[0])
+
+    parts = 1 if plan.mesh is None else plan.mesh.devices.size
+    order, back = dealt(jax.vmap(quick)(each), plan.chunk, parts)
+    each = jax.tree.map(lambda a: a[order], each)
+    out = over_bodies(one, (shared, ts), each, plan.chunk, plan.mesh)
+    return jax.tree.map(lambda a: a[back], out)
+
+
+_within = eqx.filter_jit(_run)
+
+
+@functools.cache
+def _alone() -> Callable[..., Any]:
+    options = compiler_options()
+    jitted: Any = eqx.filter_jit
+    return jitted(_run, compiler_options=options) if options else _within
+
+
+def _free(body: Any, state0: Any, ts: Array) -> Any:
+    inertia = body if isinstance(body, Inertia) else body.inertia
+    turning = Attitude(state0.q, state0.omega) if isinstance(state0, Rigid) else state0
+    since = ts[1:] - ts[0]
+    later: Any = jax.vmap(FreeBody(inertia, turning))(since)
+    if isinstance(state0, Rigid):
+        x = state0.x[None] + since[:, None] * state0.v[None]
+        later = Rigid(x, jnp.broadcast_to(state0.v, x.shape), later.q, later.omega)
+    ys = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), state0, later)
+    result = dfx.RESULTS.where(finite(ys), dfx.RESULTS.successful, NONFINITE)
+    return ys, result, jnp.zeros((), jnp.int32)
+
+
+def _adaptive(how: _Adaptive, body: Any, state0: Any, torque: Any, ts: Array) -> Any:
+    forward = isinstance(how.adjoint, dfx.ForwardMode)
+    if isinstance(how.solver, AbstractExplicit) and (how.adjoint is None or forward):
+        way = travel.forward if forward else travel.reverse
+        return _hops(how, way, body, state0, torque, ts)
+    found = simulate_one(
+        body,
+        state0,
+        ts,
+        torque,
+        solver=how.solver,
+        rtol=how.rtol,
+        atol=how.atol,
+        max_steps=how.max_steps,
+        adjoint=how.adjoint,
+        throw=False,
+    )
+    return found.ys, found.result, jnp.asarray(found.stats["num_steps"], jnp.int32)
+
+
+def _hops(how: Any, way: Any, body: Any, state0: Any, torque: Any, ts: Array) -> Any:
+    """From each time to the next, with the step that the last hop found good.
+
+    Steps that end on every time cost a body alone more than states filled in between; but side by
+    side no body looks up its own steps, and going back one hop is kept at a time.
+    """
+    field = equations_of_motion(body, state0, torque)
+    jumps = jumps_of(torque)
+
+    @jax.checkpoint
+    def hop(carry: Any, ends: tuple[Array, Array]) -> Any:
+        y, h, result, steps = carry
+        out = lean.adaptive(
+            how.solver,
+            field,
+            jnp.stack(ends),
+            y,
+            rtol=how.rtol,
+            atol=how.atol,
+            dt0=h,
+            max_steps=how.max_steps,
+            jumps=jumps,
+            way=way,
+        )
+        y = jax.tree.map(lambda leaf: leaf[-1], out.ys)
+        taken = jnp.maximum(out.num_steps - out.num_rejected, 1).astype(h.dtype)
+        h = lax.stop_gradient((ends[1] - ends[0]) / taken)
+        result = dfx.RESULTS.where(result == dfx.RESULTS.successful, out.result, result)
+        return (y, h, result, steps + out.num_steps.astype(jnp.int32)), y
+
+    good = dfx.RESULTS.where(jnp.asarray(True), dfx.RESULTS.successful, NONFINITE)
+    begin = (state0, lax.stop_gradient(ts[1] - ts[0]), good, jnp.zeros((), jnp.int32))
+    (_, _, result, steps), later = lax.scan(hop, begin, (ts[:-1], ts[1:]))
+    ys = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), state0, later)
+    return ys, result, steps
+
+
+def _equal(
+    bodies: Any,
+    states0: Any,
+    steps: Steps,
+    torque: Any,
+    method: Any,
+    torque_axes: Any,
+    chunk: Any,
+    devices: Any,
+) -> Batch[Any]:
+    every = steps.number if steps.save_every is None else steps.save_every
+    ys: Any = rollout(
+        bodies,
+        states0,
+        steps.size,
+        steps.number,
+        torque,
+        method=method,
+        save_every=every,
+        t0=steps.t0,
+        torque_axes=torque_axes,
+        chunk=chunk,
+        devices=devices,
+    )
+    dtype = states0.omega.dtype
+    h, count = step_of(steps.size, steps.number, dtype)
+    ts = time_of(steps.t0, dtype) + h * jnp.arange(every, count + 1, every).astype(dtype)
+    result = _statuses(ys)
+    return Batch(ts, ys, result, jnp.full(states0.omega.shape[:1], count, jnp.int32))
+
+
+@jax.jit
+def _statuses(ys: Any) -> Any:
+    def one(ys: Any) -> Any:
+        return dfx.RESULTS.where(finite(ys), dfx.RESULTS.successful, NONFINITE)
+
+    return jax.vmap(one)(ys)
