@@ -335,9 +335,6 @@ def _kept(saved: Saved, given: Given) -> Array:
 
 def _answer(given: Given, walk: Walk, between: Array) -> Answer:
     end = jnp.stack(walk.y)
-    if not between.size:
-        # Under vmap every output must belong to the batch, an empty one too, or JAX refuses.
-        between = jnp.broadcast_to(end, between.shape)
     there = walk.t >= given.stops[-1]
     end = jnp.where(there, end, jnp.full_like(end, jnp.nan))
     # Under `vmap` JAX wants a result that is one for each of the batch wherever an input is: the

@@ -10,8 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from rigidjax.exact import FreeBody
-from rigidjax.solve import lean, solvers, travel
-from rigidjax.solve import equations_of_motion, simulate
+from rigidjax.solve import equations_of_motion, lean, simulate, solvers, travel
 from rigidjax.workprecision.method import Method, Ready, Run
 from rigidjax.workprecision.scene import Scene
 

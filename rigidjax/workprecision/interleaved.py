@@ -10,8 +10,7 @@ import numpy as np
 
 from rigidjax.frames import scene_of
 from rigidjax.motion import Attitude, conserved
-from rigidjax.solve import lean, solvers
-from rigidjax.solve import equations_of_motion
+from rigidjax.solve import equations_of_motion, lean, solvers
 from rigidjax.workprecision.in_jax import methods_in_jax
 from rigidjax.workprecision.method import Method, Ready, Run
 from rigidjax.workprecision.outside import methods_outside

@@ -1,18 +1,19 @@
-"""Row D13, found by the work–precision run: reverse mode at tight tolerances recomputes other steps.
+"""Row D13, found by the work–precision run: reverse mode at tight tolerances recomputed other steps.
 
 Reverse mode in bounded memory runs parts of the motion again. Compiled in another place, the same
-step rounds differently; where the error that steers the steps is near round-off, their lengths then
-differ, and the parts no longer meet. Measured on the heavy top, T = 50, relative error of the
-gradient (forward mode: 9e-11 at 1e-11, 7e-13 at 1e-13):
+step can round differently (roots and quotients do, sums of products do not); where the error that
+steers the steps is near round-off, their lengths then differ, and the parts no longer meet: 7e-6 off
+at a tolerance of 1e-11 on the heavy top, 2e-4 at 1e-13 under the gravity gradient. Now attitudes are
+scaled by products and sums alone, and below 1e-10 the start of every step is kept. Measured, relative
+error of the gradient, T = 50 (`simulate`, and in our own loop):
 
 | | rtol 1e-9 | 1e-11 | 1e-13 |
 | --- | --- | --- | --- |
-| simulate, default adjoint | 1.3e-8 | 7.0e-6 | 4.4e-5 |
-| simulate, max_steps=4096 | 2.2e-7 | 7.0e-6 | 1.7e-3 |
-| DormandPrince8 (reverse) | 2.2e-8 | 1.4e-6 | 3.1e-6 |
-| plain diffrax.Dopri8 | 1.1e-8 | 8.4e-11 | 6.5e-13 |
+| heavy top | 1.3e-8, 2.2e-8 | 9.4e-11, 1.4e-10 | 6.9e-13, 9.9e-13 |
+| gravity gradient | 2.6e-9, 6.0e-9 | 1.3e-11, 4.0e-11 | 4.8e-14, 1.4e-13 |
 
-Bar of the row: 1e3 × tolerance. Missed by us below 1e-10; met by forward mode, and by plain diffrax.
+Bar of the row: 1e3 × tolerance. Limit: a run of more than 4096 steps (2048 in our own loop) at a
+tolerance below 1e-10 is still run again in parts.
 """
 
 import diffrax as dfx
@@ -24,38 +25,40 @@ import pytest
 import rigidjax as rj
 from rigidjax.workprecision import scenes
 
-SCENE = scenes()["heavy-top"]()
-RIGHT = np.asarray(SCENE.reference.gradient)
-MISSED = pytest.mark.xfail(
-    strict=False, reason="steps recomputed in reverse mode differ from those taken"
-)
+NAMES = ("heavy-top", "gravity-gradient")
 
 
-def away(rtol, mode=jax.grad, **how):
+def away(name, rtol, mode=jax.grad, **how):
+    scene = scenes()[name]()
+
     def loss(numbers):
-        body, start = SCENE.assembled(numbers)
-        ts = jnp.array([0.0, SCENE.end])
-        ys = rj.simulate(body, start, ts, SCENE.torque, rtol=rtol, atol=1e-3 * rtol, **how).ys
-        return SCENE.loss(jnp.concatenate([ys.q[-1], ys.omega[-1]]))
+        body, start = scene.assembled(numbers)
+        ts = jnp.array([0.0, scene.end])
+        ys = rj.simulate(body, start, ts, scene.torque, rtol=rtol, atol=1e-3 * rtol, **how).ys
+        return scene.loss(jnp.concatenate([ys.q[-1], ys.omega[-1]]))
 
-    found = np.asarray(jax.jit(mode(loss))(SCENE.numbers))
-    return float(np.linalg.norm(found - RIGHT) / np.linalg.norm(RIGHT))
-
-
-def test_at_the_default_tolerance_reverse_mode_is_right():
-    assert away(1e-9) < 1e3 * 1e-9
+    right = np.asarray(scene.reference.gradient)
+    found = np.asarray(jax.jit(mode(loss))(scene.numbers))
+    return float(np.linalg.norm(found - right) / np.linalg.norm(right))
 
 
-@pytest.mark.slow
-def test_forward_mode_is_right_at_every_tolerance():
-    for rtol in (1e-9, 1e-11, 1e-13):
-        assert away(rtol, jax.jacfwd, adjoint=dfx.ForwardMode()) < 1e3 * rtol
+@pytest.mark.parametrize("rtol", [pytest.param(1e-9, marks=pytest.mark.slow), 1e-11])
+def test_reverse_mode_of_a_top(rtol):
+    assert away("heavy-top", rtol) < 1e3 * rtol
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("solver", [None, rj.solvers.DormandPrince8()], ids=["default", "lean"])
-@MISSED
-def test_reverse_mode_at_1e_11(solver):
-    found = away(1e-11, solver=solver)
-    print(f"D13 reverse at 1e-11: {found:.1e}")
-    assert found < 1e3 * 1e-11
+@pytest.mark.parametrize("rtol", [1e-9, 1e-11, 1e-13])
+def test_reverse_mode_at_every_tolerance(name, solver, rtol):
+    found = away(name, rtol, solver=solver)
+    print(f"D13 {name} {rtol:.0e} {solver}: {found:.1e}")
+    assert found < 1e3 * rtol
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", NAMES)
+def test_forward_mode_is_right_at_every_tolerance(name):
+    for rtol in (1e-9, 1e-11, 1e-13):
+        assert away(name, rtol, jax.jacfwd, adjoint=dfx.ForwardMode()) < 1e3 * rtol
