@@ -218,10 +218,12 @@ def _figures(found: Any, names: list[str], rate_unit: str) -> list[Any]:
         print("no figures: matplotlib is missing (pip install 'rigidjax[view]')")
         return []
     matplotlib.use("Agg")
-    return [
+    figures = [
         rj.plot.fit(found, index=index, rate_unit=rate_unit, title=name)
         for index, name in enumerate(names[:12])
     ]
+    more = (rj.plot.residuals(found).flat[0], rj.plot.inertia_ellipsoid(found)[0])
+    return [*figures, *(axis.figure for axis in more)]
 
 
 def _say(line: str) -> None:

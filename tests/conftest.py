@@ -1,5 +1,9 @@
 """Strict JAX, and every public signature checked at run time (jaxtyping + beartype)."""
 
+import gc
+import itertools
+from pathlib import Path
+
 import jax
 import pytest
 from jaxtyping import config, install_import_hook
@@ -10,6 +14,24 @@ jax.config.update("jax_numpy_dtype_promotion", "strict")
 
 with install_import_hook("rigidjax", "beartype.beartype"):
     import rigidjax  # noqa: F401
+
+
+_MAPS, _MANY, _TESTS = Path("/proc/self/maps"), 30_000, itertools.count()
+
+
+@pytest.fixture(autouse=True)
+def room_for_programs():
+    """Linux lets a process have 65530 memory maps, and every compiled program takes some.
+
+    Beyond that XLA ends in a segmentation fault: so programs are forgotten in time.
+    """
+    yield
+    if next(_TESTS) % 10 == 0 and _MAPS.exists():
+        with _MAPS.open() as lines:
+            many = sum(1 for _ in lines)
+        if many > _MANY:
+            jax.clear_caches()
+            gc.collect()
 
 
 @pytest.fixture

@@ -4,6 +4,7 @@ from typing import TypeVar
 
 import equinox as eqx
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Float
 
 from rigidjax import _checks
@@ -76,18 +77,12 @@ def on_the_group(state: State) -> State:
 
 
 def _unit(q: Quat) -> Quat:
-    """q/|q|, near |q| = 1 by products and sums alone.
+    """q/|q|, rounded alike wherever it is compiled.
 
-    XLA rounds roots and quotients differently in different programs. Reverse mode runs steps again
-    in another program than the first: a last digit that differs there moves the error estimate, at
-    tight tolerances the lengths of steps with it, and the gradient is that of no run at all (7e-6
-    off at a tolerance of 1e-11, now 9e-11). Newton's iteration for 1/√n, four times from 1, is
-    exact to round-off where |n − 1| < 0.1.
+    Where it can, XLA makes q/√n a product with 1/√n, and whether it can depends on the program.
+    Reverse mode runs steps again in another program than the first: a last digit that differs there
+    moves the error estimate, at tight tolerances the lengths of steps with it, and the gradient is
+    that of no run at all (7e-6 off at a tolerance of 1e-11). Root and quotient by themselves are
+    exact to the last digit in every program, and in every lane of a batch.
     """
-    n = square4(components(q))
-    near = jnp.abs(n - 1) < 0.1
-    # Far from 1 the iteration would go astray, and its derivative overflow.
-    inside, scale = jnp.where(near, n, jnp.ones_like(n)), jnp.ones_like(n)
-    for _ in range(4):
-        scale = scale * (1.5 - 0.5 * inside * scale * scale)
-    return q * jnp.where(near, scale, 1 / jnp.sqrt(n))
+    return q / lax.optimization_barrier(jnp.sqrt(square4(components(q))))

@@ -138,6 +138,7 @@ def test_spins_about_the_middle_axis_for_ever():
             np.testing.assert_allclose(out[4:], row[6:9], rtol=2 * eps)
 
 
+@pytest.mark.slow
 def test_flips_that_take_long():
     # Half way between two flips from within 1e-14 of the middle axis: e^{33} of growth behind it.
     row = inputs("near axis 2", 1, [1.0])[0]
@@ -365,6 +366,7 @@ def test_solver_finds_an_event():
     assert abs(float(sol.ts[0]) / 17.402483478546878418 - 1) < 1e-12
 
 
+@pytest.mark.slow
 def test_solver_finds_the_first_of_many_events():
     # Ω₂ changes sign at 17.4, 52.2, 87.0, … and is watched for −½, too, which comes next.
     def middle(t, y, args, **_):

@@ -41,7 +41,7 @@ def test_d15_each_mode_with_its_adjoint(solver):
 
 
 @pytest.mark.parametrize(
-    "loss", [None, pytest.param(identify.Huber(), marks=pytest.mark.slow),
+    "loss", [pytest.param(None, marks=pytest.mark.slow), pytest.param(identify.Huber(), marks=pytest.mark.slow),
              pytest.param(identify.SoftL1(), marks=pytest.mark.slow)],
     ids=["squares", "Huber", "SoftL1"],
 )  # fmt: skip

@@ -7,6 +7,7 @@ fit ends at the same body; of the signs, at the same bits.
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import rigidjax as rj
 from rigidjax import identify
@@ -21,6 +22,7 @@ def fitted(q):
     return identify.fit(identify.Problem(record, identify.PrincipalRatios()), starts=1)
 
 
+@pytest.mark.slow
 def test_signs_and_turns_do_not_matter():
     rng = np.random.default_rng(3)
     turns = jax.vmap(rj.quaternion.exp)(0.01 * rng.normal(size=(40, 3)))

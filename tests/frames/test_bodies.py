@@ -48,6 +48,7 @@ class SeenInside(eqx.Module):
         return rj.torques.Wrench(self.frame.force_from_inertial(outside.force, t), outside.torque)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "law", [pytest.param(None, marks=pytest.mark.slow), Spring()], ids=["free", "spring"]
 )

@@ -41,6 +41,7 @@ def left(scene, orbits):
     return jnp.max(jnp.abs(missed)), jax.vmap(scene.stability_indices)(orbits)
 
 
+@pytest.mark.slow
 def test_published_halo_orbits_and_their_stability():
     scene = scenes.cr3bp(0.04)
     correct = eqx.filter_jit(jax.vmap(lambda row: scene.periodic_orbit(orbit_of(row), hold="z")))
@@ -67,6 +68,7 @@ def test_published_halo_orbits_and_their_stability():
         np.testing.assert_allclose(mean, wanted, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_lyapunov_family_and_its_slope():
     start = MOON.lyapunov_guess(1, 0.01)
     x, step = float(start.state.x[0]), 1e-4

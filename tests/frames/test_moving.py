@@ -227,6 +227,7 @@ def test_a_bodys_whole_state():
     assert abs(abs(float(jnp.sum(back.q * seen.q))) - 1) < 1e-14
 
 
+@pytest.mark.slow
 def test_a_body_solved_inside_a_moving_frame():
     frame, body = (
         MovingFrame(Wobble(jnp.asarray(NUMBERS[:12]))),

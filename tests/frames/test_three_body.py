@@ -189,6 +189,7 @@ def test_lyapunov_family(point):
     assert periods[0] < periods[1] < periods[2]
 
 
+@pytest.mark.slow
 def test_halo_family_with_gradients():
     @eqx.filter_jit
     def numbers(mu, height):

@@ -42,6 +42,7 @@ def test_few_recordings_show_the_whole_misfit_without_bias(problem):
     np.testing.assert_allclose(np.mean(parts), whole, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_slope_is_that_of_differences(problem):
     point = jax.tree.map(lambda leaf: leaf + 0.1, problem.start(BODY))
     rows = jnp.array([3, 7])

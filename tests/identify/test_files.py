@@ -41,6 +41,7 @@ def test_a_bad_log_gets_one_clear_line(case, tmp_path, capsys):
     assert out.err.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_an_empty_cell_is_a_gap_that_is_told(tmp_path, capsys):
     path = tmp_path / "log.csv"
     path.write_text(_swap(5, "0.3,1,,1"))

@@ -35,6 +35,7 @@ def test_nasa_brick_returns_its_ratios():
     )
 
 
+@pytest.mark.slow
 def test_full_tensor_comes_back_from_exact_rates(tumble):
     body, ts, ys = tumble
     record = rj.identify.Recording(ts, (rj.identify.Gyro(1e-3), ys.omega))
@@ -62,6 +63,7 @@ def test_a_masked_reading_is_an_absent_one(tumble):
         np.testing.assert_array_equal(a, b)
 
 
+@pytest.mark.slow
 def test_estimated_noise_is_the_noise(tumble):
     _, ts, ys = tumble
     rng = np.random.default_rng(2)

@@ -163,6 +163,7 @@ def free_record():
     return identify.Recording(ts, (identify.Gyro(0.01), read))
 
 
+@pytest.mark.slow
 def test_pieces_meet_and_give_the_start(free_record):
     problem = identify.Problem(free_record, identify.PrincipalRatios())
     whole = identify.fit(problem, starts=1, pieces=6)
@@ -181,6 +182,7 @@ def test_pieces_meet_and_give_the_start(free_record):
         identify.pieces(problem, 60)
 
 
+@pytest.mark.slow
 def test_profile_agrees_with_the_covariance_where_the_misfit_is_quadratic(free_record):
     problem = identify.Problem(free_record, identify.PrincipalRatios())
     found = identify.fit(problem, starts=1)
@@ -295,7 +297,8 @@ def test_the_command_line_reads_wheels_and_writes_reports(records, tmp_path, cap
     low, high = held["quantities"]["I3"]["interval_95"]
     assert 0.9 * low < 2.1 < 1.1 * high
     text = page.read_text()
-    assert text.count("data:image/png;base64,") == 2
+    # Data and fit of each throw, what is left over, the body with its uncertainty.
+    assert text.count("data:image/png;base64,") == 4
     assert "http" not in text
     assert "throw1.csv" in text and "95 % interval" in text
 

@@ -119,6 +119,7 @@ def test_i4_outliers():
     assert plain > 5 * errors["huber", "spoiled"]
 
 
+@pytest.mark.slow
 def test_i5_a_bias_in_the_model_is_found():
     bias = np.array([0.03, -0.02, 0.03])
     values = noisy(rates(), 0.01, 3) + bias
@@ -150,6 +151,7 @@ def test_i6_saturation_is_a_censored_reading(share):
     assert share < 0.2 or not ignored.ok
 
 
+@pytest.mark.slow
 def test_i7_a_clock_that_is_late_is_found():
     ts = jnp.linspace(0.0, 3.0, 90)
     motion = rj.simulate(BODY, rj.Attitude([1.0, 0, 0, 0], [3.0, 9.0, -2.0]), ts + 0.0).ys
@@ -169,6 +171,7 @@ def test_i7_a_clock_that_is_late_is_found():
     assert high - low < 0.01
 
 
+@pytest.mark.slow
 def test_i8_a_masked_sample_is_an_absent_one_bit_for_bit():
     values = noisy(rates(), 0.01, 6)
     mask = np.ones(80, bool)

@@ -126,6 +126,7 @@ def test_alignment(off):
     np.testing.assert_allclose(slope, so3.hat(jnp.array([0, 0, 1.0])), atol=1e-15)
 
 
+@pytest.mark.slow
 def test_karcher_mean():
     """The residual vanishes; equivariant; first and second derivatives by differences."""
     rng = np.random.default_rng(5)

@@ -42,6 +42,7 @@ def test_knots_rates_and_continuity():
         np.testing.assert_allclose(q @ q, 1, atol=1e-15)
 
 
+@pytest.mark.slow
 def test_order():
     ts = jnp.linspace(0.05, 2.95, 37)
     worst = jax.jit(lambda path: jax.vmap(lambda t: apart(path, t))(ts).max())

@@ -62,6 +62,7 @@ def _symmetric(off):
 WEIGHTS = jnp.asarray(np.random.default_rng(1).normal(size=(5, 7)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["pulses", pytest.param("wheel", marks=pytest.mark.slow)])
 def test_reverse_is_forward_to_round_off_and_close_to_differences(name):
     p = jnp.zeros(16)

@@ -210,6 +210,7 @@ def test_adaptive_loops_and_diffrax_controllers_agree(tolerance):
     assert int(count) < 2 * int(other) + 10
 
 
+@pytest.mark.slow
 def test_every_derivative_agrees():
     # d(attitude)/d(Ω0), in both modes of both loops, and against 50 digits.
     @eqx.filter_jit

@@ -145,6 +145,7 @@ def test_diffrax_saves_on_the_group_with_the_methods_error(method):
     assert np.log2(gaps[0] / gaps[1]) > method.composition.order - 0.4
 
 
+@pytest.mark.slow
 def test_derivatives_of_a_run():
     def end(w):
         ys = lean.split_fixed(
