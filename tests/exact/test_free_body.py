@@ -94,7 +94,14 @@ def test_the_oracle_agrees_with_taylor_series(name):
         assert abs(x - y) < mp.mpf("1e-30")
 
 
-@pytest.mark.parametrize("name", classes.NAMES)
+# A few in every run, all of them in a long one.
+QUICK = ("triaxial", "oblate", "sphere", "plate", "axis 2", "on separatrix", "any order", "rest")
+
+
+@pytest.mark.parametrize(
+    "name",
+    [n if n in QUICK else pytest.param(n, marks=pytest.mark.slow) for n in classes.NAMES],
+)
 def test_right_in_every_class(name):
     # On an unstable axis e^{λt} beats any number of digits, the oracle's too.
     x = inputs(name, 8, [t for t in classes.times(name) if t < 25 or name not in classes.UNSTABLE])
@@ -256,6 +263,7 @@ def test_first_derivatives_in_every_class():
         assert error < 1e-12, (GRADED[k // 2], error)
 
 
+@pytest.mark.slow
 def test_first_derivatives_of_full_tensors():
     names = ("triaxial", "sphere", "oblate", "near axis 2", "rest")
     x = np.concatenate([rotated(inputs(name, 1, [3.0])) for name in names])
@@ -381,6 +389,7 @@ def test_solver_finds_the_first_of_many_events():
     assert abs(float(sol.ts[0]) / 17.402483478546878418 - 1) < 1e-12
 
 
+@pytest.mark.slow
 def test_solver_adjoints_agree():
     def final(omega, adjoint):
         term = diffrax.ODETerm(EulerEquations(BODY))

@@ -41,7 +41,13 @@ def exactly(omega, t):
     return np.array([float(c) for c in [*q, *w]])
 
 
-@pytest.mark.parametrize("dtype", [pytest.param(np.float64, marks=pytest.mark.slow), np.float32])
+@pytest.mark.parametrize(
+    "dtype",
+    [
+        pytest.param(np.float64, marks=pytest.mark.slow),
+        pytest.param(np.float32, marks=pytest.mark.slow),
+    ],
+)
 def test_d05_no_jump_at_the_separatrix(dtype):
     starts = np.array([start(d) for d in DELTAS]).astype(dtype)
     times = np.array([0.3, 5.0], dtype)

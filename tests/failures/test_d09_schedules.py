@@ -6,6 +6,7 @@ Pulses that are stepped over, and the times of a pulse: tests/motion/test_schedu
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from systems.tumble import BODY, OMEGA
 
 import rigidjax as rj
@@ -13,6 +14,7 @@ import rigidjax as rj
 TORQUES = np.array([[0.0, 0.0, 3.0], [2.0, 0.0, 0.0], [0.0, -1.0, 1.0]])
 
 
+@pytest.mark.slow
 def test_the_slope_by_the_times_of_a_table():
     def end(times):
         law = rj.torques.Tabulated(times, TORQUES)

@@ -24,6 +24,7 @@ def carried(t0, y, t):
     return jax.tree.map(lambda leaf: leaf[-1], ys)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "solver",
     [rj.Projected(dfx.Dopri8()), rj.Projected(dfx.Tsit5()), rj.solvers.Tsitouras5(),

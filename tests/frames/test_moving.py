@@ -244,6 +244,7 @@ def test_a_body_solved_inside_a_moving_frame():
     np.testing.assert_allclose(same, 1.0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_frame_that_rides_on_a_body():
     body, start = (
         rj.Inertia.from_principal(1.0, 2.0, 2.5),

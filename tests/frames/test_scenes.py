@@ -118,6 +118,7 @@ def test_bead_on_a_hoop():
     assert float(slow) == 0.0
 
 
+@pytest.mark.slow
 def test_turntable_goes_straight_outside():
     table = scenes.turntable(0.7, 0.2)
     start, ts = Point([0.3, -0.2, 0], [0.4, 0.1, 0]), jnp.array([0.0, 1.5, 4.0])

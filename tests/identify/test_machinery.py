@@ -78,6 +78,7 @@ def test_three_throws_of_different_lengths_give_one_body_with_its_scale(joint):
     assert 0.8 < joint.chi2 / joint.dof < 1.2
 
 
+@pytest.mark.slow
 def test_the_blocks_are_the_derivative(joint):
     problem, at = joint.problem, joint.parameters
     (errors, _), (blocks, _) = with_blocks(at, problem)

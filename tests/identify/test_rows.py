@@ -34,6 +34,7 @@ def off(found):
     return np.abs(np.asarray(found.problem.body.logs(found.body)) - RATIOS).max()
 
 
+@pytest.mark.slow
 def test_i1_only_ratios_from_free_motion_and_it_says_so():
     found = identify.fit(gyro_problem(noisy(rates(), 0.01), chart=identify.Tensor(3.0)), starts=2)
     moments = np.sort(np.asarray(found.body.moments))
@@ -136,7 +137,9 @@ def test_i5_a_bias_in_the_model_is_found():
     assert off(found) < 0.5 * off(left_out)
 
 
-@pytest.mark.parametrize("share", [0.18, 0.29, 0.41])
+@pytest.mark.parametrize(
+    "share", [0.18, *(pytest.param(s, marks=pytest.mark.slow) for s in (0.29, 0.41))]
+)
 def test_i6_saturation_is_a_censored_reading(share):
     truth = noisy(rates(), 0.01, 4)
     limit = float(np.quantile(np.abs(truth).max(axis=1), 1 - share))

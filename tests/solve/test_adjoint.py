@@ -178,7 +178,12 @@ def last_rate(omega, end, height, ts=(), throw=True):
 
 
 @pytest.mark.parametrize(
-    "lane", [0, pytest.param(1, marks=pytest.mark.slow), pytest.param(2, marks=pytest.mark.slow)]
+    "lane",
+    [
+        pytest.param(0, marks=pytest.mark.slow),
+        pytest.param(1, marks=pytest.mark.slow),
+        pytest.param(2, marks=pytest.mark.slow),
+    ],
 )
 def test_the_gradient_of_a_batch_is_the_batch_of_gradients(lane):
     # Each input alone batched: the others, and what depends on them alone, are shared.

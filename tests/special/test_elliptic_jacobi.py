@@ -183,6 +183,7 @@ def outside(u, m):
     return f(0), None, (f(g) - f(-g)) / (2 * g)
 
 
+@pytest.mark.slow
 def test_amplitude():
     """am inverts F for m ≤ 1 and grows without jumps; its slope is dn."""
     u = jnp.linspace(-30, 30, 601)
