@@ -17,15 +17,13 @@ gathered (`hosts.gather`) only if one process needs them all; else each writes i
 (`hosts.save`). *To be expected:* a run's time is that of the slowest share. Shares are equal
 in number, so equal steps scale with cores; adaptive steps are dealt between the devices of a
 process by speed, not between processes: shuffle bodies before `share`. An iteration of a fit adds
-one all-reduce of a few kilobytes, 0.1 ms on a local network, against 30 ms for the gradient of 1000
-bodies over 1000 steps: with 1000 bodies a process, hundreds of processes before it counts for a
-tenth. *When one dies* all end within `patience`; shares written before the collective are
-recovered, the others run again.
+one all-reduce of a few kilobytes, against some 40 ms for the gradient of 1000 bodies over 1000
+steps: with 1000 bodies a process it counts for little. *When one dies* all end within `patience`;
+shares written before the collective are recovered, the others run again.
 """
 
 from rigidjax.batch import hosts as hosts
 from rigidjax.batch.chunks import compiler_options as compiler_options
 from rigidjax.batch.flags import CpuFlags as CpuFlags, cpu_flags as cpu_flags
-from rigidjax.batch.magnus import Magnus4 as Magnus4
 from rigidjax.batch.rollout import rollout as rollout
 from rigidjax.batch.simulate import Batch as Batch, Steps as Steps, simulate as simulate

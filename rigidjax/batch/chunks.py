@@ -3,14 +3,18 @@
 Nothing here knows what is done with a body.
 """
 
+import functools
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, cast
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.sharding import AxisType, Mesh, PartitionSpec as P
+
+from rigidjax import _checks
 
 AXIS = "bodies"
 # Bytes of one number of every body in a chunk: the arrays of a step then stay in the first cache.
@@ -31,6 +35,27 @@ def compiler_options() -> dict[str, Any]:
     True
     """
     return dict(_WIDE) if jax.default_backend() == "cpu" else {}
+
+
+class Compiled:
+    """A function compiled once with `compiler_options`, or, inside a transformation, without.
+
+    A tracer among the `numbers`, its last argument, means that somebody else's `jit` may be
+    outermost, and only that one takes options.
+    """
+
+    def __init__(self, function: Callable[..., Any]):
+        self.function = function
+        self._within = eqx.filter_jit(function)
+
+    @functools.cached_property
+    def _alone(self) -> Callable[..., Any]:
+        # Made when first called: asking which backend there is starts it.
+        options, jitted = compiler_options(), cast(Any, eqx.filter_jit)
+        return jitted(self.function, compiler_options=options) if options else self._within
+
+    def __call__(self, *args: Any) -> Any:
+        return (self._alone if _checks.known(args[-1]) else self._within)(*args)
 
 
 def mesh_of(devices: Any) -> Mesh | None:

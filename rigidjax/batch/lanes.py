@@ -14,15 +14,16 @@ from jax import lax
 from jaxtyping import Array
 
 from rigidjax.batch.given import start_of
-from rigidjax.batch.magnus import Magnus4, require_blind, sees_attitude, turned
 from rigidjax.body.inertia import Inertia, inverse
 from rigidjax.exact.frame import into, out_of, principal_frame
 from rigidjax.exact.triples import Six, Triple, adjugate, cross, determinant, half_product, times
 from rigidjax.motion import Attitude, Rigid, Spin, on_the_group
 from rigidjax.motion.torques import evaluate
+from rigidjax.rotation import quaternion
 from rigidjax.solve import equations_of_motion
 from rigidjax.solve.components import join, split
 from rigidjax.solve.explicit import AbstractExplicit, Atoms, RungeKutta4, advance
+from rigidjax.solve.magnus import Magnus4, require_blind, sees_attitude, turned
 from rigidjax.solve.method import method_of, spread
 from rigidjax.solve.scalarise import scalarise
 
@@ -58,7 +59,7 @@ def lane_of(body: Any, state0: Any, torque: Any, t0: Array, method: Any) -> Lane
         raise TypeError(
             f"rollout: no lean step of {type(method).__name__} on {type(state0).__name__}; wanted "
             "RungeKutta4, Tsitouras5 or DormandPrince8 of rigidjax.solvers, or, for an Attitude, "
-            "rigidjax.batch.Magnus4; for others use simulate with stepsize_controller="
+            "Magnus4 of rigidjax.solvers; for others use simulate with stepsize_controller="
             "diffrax.ConstantStepSize() under jax.vmap"
         )
     return _explicit(method, body, state0, torque, t0)
@@ -88,15 +89,8 @@ def _free(body: Inertia, state0: Attitude) -> Lane:
     def state(y: Atoms) -> Attitude:
         # The numbers are the turn since the start, seen from the axes: Aᵀ…A turns its vector.
         omega = jnp.stack(out_of(axes, _free_rate(weights, y[4:])))
-        w, x, y_, z = y[0], *out_of(axes, y[1:4])
-        a, b, c, d = split(state0.q)
-        q = (
-            a * w - b * x - c * y_ - d * z,
-            a * x + b * w + c * z - d * y_,
-            a * y_ + c * w + d * x - b * z,
-            a * z + d * w + b * y_ - c * x,
-        )
-        return Attitude(jnp.stack(q), omega)
+        turn = jnp.stack([y[0], *out_of(axes, y[1:4])])
+        return Attitude(quaternion.multiply(state0.q, turn), omega)
 
     return Lane((one, none, none, none, *momentum), step, state)
 

@@ -37,6 +37,3 @@ def dealt(key: Array, chunk: int, parts: int) -> tuple[Array, Array]:
     seats = seats[seats < count]
     order = order[seats]
     return order, jnp.zeros_like(order).at[order].set(jnp.arange(count, dtype=order.dtype))
-
-
-__all__ = ["dealt", "quickness"]

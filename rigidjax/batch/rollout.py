@@ -11,15 +11,14 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from rigidjax import _checks
 from rigidjax._types import ScalarLike
-from rigidjax.batch.chunks import chunk_of, compiler_options, mesh_of, over_bodies
+from rigidjax.batch.chunks import Compiled, chunk_of, mesh_of, over_bodies
 from rigidjax.batch.given import Bodies, bodies_of, step_of, time_of
 from rigidjax.batch.lanes import Lane, lane_of
-from rigidjax.batch.magnus import Magnus4
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.solve.explicit import AbstractExplicit, Atoms
+from rigidjax.solve.magnus import Magnus4
 
 State = TypeVar("State", Spin, Attitude, Rigid)
 Reduced = TypeVar("Reduced")
@@ -114,7 +113,7 @@ def rollout(
 
     Memory: the inputs, what is returned, and a chunk. Derivatives are those of the steps as taken,
     in forward mode and in reverse; reverse mode goes back in pieces of √`num_steps` steps and
-    holds one chunk's at a time, about five times the time of the value. A body that becomes NaN
+    holds one chunk's at a time, five to ten times the time of the value. A body that becomes NaN
     stays NaN and touches no other.
 
     Inside `jax.jit` of your own see `rigidjax.batch.compiler_options`.
@@ -152,9 +151,7 @@ def rollout(
         chunk_of(chunk, batch.dtype, batch.many),
         mesh_of(devices),
     )
-    # A tracer means that somebody else's jit may be outermost, and only that one takes options.
-    run = _alone() if _checks.known(numbers) else _within
-    return run(plan, reduce, batch.rest, numbers)
+    return _compiled(plan, reduce, batch.rest, numbers)
 
 
 class _Plan(eqx.Module):
@@ -202,15 +199,7 @@ def _run(plan: _Plan, reduce: Reduce | None, rest: Any, numbers: Any) -> Any:
     return over_bodies(one, (shared, initial, h, t0), each, plan.chunk, plan.mesh)
 
 
-_within = eqx.filter_jit(_run)
-
-
-@functools.cache
-def _alone() -> Callable[..., Any]:
-    # Made when first called: asking which backend there is starts it.
-    options = compiler_options()
-    jitted: Any = eqx.filter_jit
-    return jitted(_run, compiler_options=options) if options else _within
+_compiled = Compiled(_run)
 
 
 def march(lane: Lane, h: Array, t0: Array, first: Array, count: int, y: Atoms) -> Atoms:

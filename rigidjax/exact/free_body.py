@@ -16,6 +16,8 @@ from rigidjax.exact.fence import fence, opaque_one
 from rigidjax.exact.flow import flow
 from rigidjax.exact.frame import into, out_of, principal_frame
 from rigidjax.exact.triples import Six, Triple, adjugate, determinant, times
+from rigidjax.rotation.algebra import components
+from rigidjax.rotation.maps import product4
 
 State = TypeVar("State", bound=HasSpin)
 
@@ -162,14 +164,5 @@ def _solve_jvp(primals, tangents):
 
 
 def _unit_product(q: Quat, other) -> Quat:
-    a, b, c, d = q[0], q[1], q[2], q[3]
-    w, x, y, z = other
-    out = jnp.stack(
-        [
-            a * w - b * x - c * y - d * z,
-            a * x + b * w + c * z - d * y,
-            a * y - b * z + c * w + d * x,
-            a * z + b * y - c * x + d * w,
-        ]
-    )
+    out = jnp.stack(product4(components(q), other))
     return out / jnp.sqrt(jnp.sum(out * out))

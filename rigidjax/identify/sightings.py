@@ -1,7 +1,9 @@
 """Attitudes and rates that readings show without any motion in between: where a fit starts from."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, ArrayLike
 
 from rigidjax.identify.recording import Reading, Recording
 from rigidjax.identify.sensors import AttitudeSensor, Direction, Marker
@@ -10,19 +12,27 @@ from rigidjax.rotation import quaternion, so3
 # A rate is the turn between two attitudes so far apart, rad, that noise counts little, and yet so
 # near that the axis has not moved much.
 _TURN = 0.3
+# Singular values of Σ world bodyᵀ: where two of them are below this share of the largest, a turn is
+# free.
+_FIRM = 1e-3
 
 
 def attitudes(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
     """Times (n,), s, and attitudes (n, 4), body → world, that the readings show; n may be 0.
 
     Those of an attitude sensor, or, at times when all see, the rotation that takes markers' places
-    and directions in the body nearest to where they are in the world (Kabsch 1976,
-    doi:10.1107/S0567739476001873). At least three markers that are not in line, or two directions.
+    and directions in the body nearest to where they are in the world
+    (`rigidjax.so3.wahba`). At least three markers that are not in line, or two directions.
     """
     t = np.asarray(recording.t)
     for reading in recording.readings:
-        if isinstance(reading.sensor, AttitudeSensor):
-            return t[reading.seen], _continuous(np.asarray(reading.values)[reading.seen])
+        sensor = reading.sensor
+        if isinstance(sensor, AttitudeSensor):
+            q = np.asarray(reading.values)[reading.seen]
+            if sensor.mounting is not None:
+                back = quaternion.exp(-sensor.mounting)
+                q = np.asarray(jax.vmap(quaternion.multiply, (0, None))(jnp.asarray(q), back))
+            return t[reading.seen], q
     body, world, seen = [], [], np.ones(t.shape, bool)
     markers = [r for r in recording.readings if isinstance(r.sensor, Marker)]
     if len(markers) >= 3:
@@ -41,16 +51,20 @@ def attitudes(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
             body.append(along[:, None, :])
             world.append(np.broadcast_to(np.asarray(sensor.world), along.shape)[:, None, :])
             seen = seen & reading.seen
-    if not body or not seen.any():
+    if not body:
         return np.zeros(0), np.zeros((0, 4))
     rows, sides = np.concatenate(body, axis=1)[seen], np.concatenate(world, axis=1)[seen]
-    u, s, vt = np.linalg.svd(np.einsum("tni,tnj->tij", sides, rows))
-    flip = np.sign(np.linalg.det(u @ vt))
-    # One direction, or markers in line, leave a turn free.
-    firm = s[:, 1] + flip * s[:, 2] > 1e-3 * s[:, 0]
-    u[:, :, 2] *= flip[:, None]
-    matrices = (u @ vt)[firm]
-    return t[seen][firm], _continuous(np.asarray(jax.vmap(quaternion.from_matrix)(matrices)))
+    b = np.einsum("tni,tnj->tij", sides, rows)
+    s = np.linalg.svd(b, compute_uv=False)
+    firm = s[:, 1] + np.sign(np.linalg.det(b)) * s[:, 2] > _FIRM * s[:, 0]
+    if not firm.any():
+        return np.zeros(0), np.zeros((0, 4))
+    return t[seen][firm], np.asarray(_nearest(rows[firm], sides[firm]))
+
+
+@jax.jit
+def _nearest(body: ArrayLike, world: ArrayLike) -> Array:
+    return jax.vmap(lambda a, b: quaternion.from_matrix(so3.wahba(a, b)))(body, world)
 
 
 def place_of(marker: Reading) -> np.ndarray:
@@ -69,19 +83,14 @@ def rates(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
     last = np.searchsorted(turned, turned[first] + _TURN, side="right") - 1
     last = np.clip(np.maximum(last, first + 1), 1, t.size - 1)
     gap = t[last] - t[first]
-    return 0.5 * (t[first] + t[last]), _turns(q[first], q[last]) / gap[:, None]
+    return 0.5 * (t[first] + t[last]), np.asarray(_turns(q[first], q[last])) / gap[:, None]
 
 
-def _turns(p: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Rotation vectors (n, 3) from p to q, body axes, the short way."""
-    w = p[:, :1] * q[:, :1] + np.sum(p[:, 1:] * q[:, 1:], axis=1, keepdims=True)
-    v = p[:, :1] * q[:, 1:] - q[:, :1] * p[:, 1:] - np.cross(p[:, 1:], q[:, 1:])
-    v, w = np.where(w < 0, -v, v), np.abs(w)
-    size = np.linalg.norm(v, axis=1, keepdims=True)
-    return v * 2 * np.arctan2(size, w) / np.where(size > 0, size, 1.0)
+@jax.jit
+def _turns(p: ArrayLike, q: ArrayLike) -> Array:
+    """Rotation vectors (n, 3) from p to q, body axes, the short way, whatever the signs."""
 
+    def turn(a: Array, b: Array) -> Array:
+        return quaternion.log(quaternion.multiply(quaternion.conjugate(a), b))
 
-def _continuous(q: np.ndarray) -> np.ndarray:
-    """The same attitudes, signs such that neighbours are near."""
-    signs = np.where(np.sum(q[1:] * q[:-1], axis=1) < 0, -1.0, 1.0)
-    return q * np.concatenate([np.ones(1), np.cumprod(signs)])[: len(q), None]
+    return jax.vmap(turn)(jnp.asarray(p), jnp.asarray(q))

@@ -109,6 +109,18 @@ def square4(q: Sequence[Scalar]) -> Scalar:
     return q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]
 
 
+def product4(p: Sequence[Scalar], q: Sequence[Scalar]) -> tuple[Scalar, ...]:
+    """The quaternion product p q of four scalars each."""
+    a, b, c, d = p
+    e, f, g, h = q
+    return (
+        a * e - b * f - c * g - d * h,
+        a * f + b * e + c * h - d * g,
+        a * g - b * h + c * e + d * f,
+        a * h + b * g - c * f + d * e,
+    )
+
+
 def flipped(q: Sequence[Scalar]) -> Array:
     """Whether −q, not q, is canonical."""
     w, x, y, z = q

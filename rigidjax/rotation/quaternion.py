@@ -21,6 +21,7 @@ from rigidjax.rotation.gate import rotation_matrix, unit_quaternion
 from rigidjax.rotation.maps import (
     flipped,
     matrix_to_quaternion,
+    product4,
     quaternion_to_vector,
     square4,
     vector_to_quaternion,
@@ -67,16 +68,8 @@ def multiply(p: QuatLike, q: QuatLike) -> Quat:
     >>> multiply(jnp.array([0.0, 1.0, 0.0, 0.0]), jnp.array([0.0, 0.0, 1.0, 0.0])).tolist()
     [0.0, 0.0, 0.0, 1.0]
     """
-    a, b, c, d = components(_checks.floating(p, (4,), "p", hint=_HINT))
-    e, f, g, h = components(_checks.floating(q, (4,), "q", hint=_HINT))
-    return jnp.stack(
-        [
-            a * e - b * f - c * g - d * h,
-            a * f + b * e + c * h - d * g,
-            a * g - b * h + c * e + d * f,
-            a * h + b * g - c * f + d * e,
-        ]
-    )
+    first = components(_checks.floating(p, (4,), "p", hint=_HINT))
+    return jnp.stack(product4(first, components(_checks.floating(q, (4,), "q", hint=_HINT))))
 
 
 def conjugate(q: QuatLike) -> Quat:

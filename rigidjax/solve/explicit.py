@@ -47,6 +47,11 @@ class NestedInterpolation(dfx.AbstractLocalInterpolation):
         return on_the_group(jax.tree.map(value, self.y0, self.coefficients))
 
 
+def cubic_rows(rise: Any, h: Any, left: Any, right: Any) -> tuple[Any, Any, Any]:
+    """F0, F1, F2 of the cubic with this `rise` over a step `h` and slopes `left` and `right`."""
+    return rise, h * left - rise, 2 * rise - h * (left + right)
+
+
 class AbstractExplicit(dfx.AbstractAdaptiveSolver):
     """All stages of `tableau` inside one step, on scalars; subclasses name the tableau."""
 
@@ -216,11 +221,8 @@ def _dense_rows(
         slopes = [*slopes, field(t0 + node * (t1 - t0), _along(start, h, row, slopes))]
     left, right = slopes[0], slopes[len(tableau.a) + 1]
     rise = tuple(b - a for a, b in zip(start, end, strict=True))
-    rows = [
-        rise,
-        tuple(_as(h, d) * k - d for k, d in zip(left, rise, strict=True)),
-        tuple(2 * d - _as(h, d) * (k + m) for k, m, d in zip(left, right, rise, strict=True)),
-    ]
+    cubic = (cubic_rows(d, _as(h, d), k, m) for k, m, d in zip(left, right, rise, strict=True))
+    rows: list[Atoms] = list(zip(*cubic, strict=True))
     for row in tableau.dense:
         rows.append(tuple(_as(h, k) * k for k in _weighted(row, slopes)))
     return rows, main

@@ -94,7 +94,7 @@ def adaptive(
     **Arguments:** as for `fixed`, a state of arrays of at most 32 numbers; `rtol`, `atol` scalars;
     `dt0` the first step, s, or `None`; `jumps` times, s, in any order, at which the field jumps:
     steps end there; `way` `travel.forward` (forward mode) or `travel.reverse` (`jax.grad`), which
-    takes memory as the root of `max_steps`. Derivatives are by all numbers of the field, `ts`,
+    keeps 2048 steps and every 2048th start. Derivatives are by all numbers of the field, `ts`,
     `jumps` and `y0`, lengths of steps held; not by tolerances.
 
     **Returns** a `LeanSolution`. A run that needs more than `max_steps`, or meets a NaN that no

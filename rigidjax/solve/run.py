@@ -157,19 +157,24 @@ def _raise(ys: Any, result: dfx.RESULTS) -> Any:
 
 
 def _free(setup: Free, state0: Any, ts: Array) -> tuple[Any, dict[str, Any], dfx.RESULTS]:
-    since, body = ts - ts[0], setup.body
-    inertia = body if isinstance(body, Inertia) else body.inertia
-    turning = Attitude(state0.q, state0.omega) if isinstance(state0, Rigid) else state0
-    ys: Any = jax.vmap(FreeBody(inertia, turning))(since)
-    if isinstance(state0, Rigid):
-        x = state0.x[None] + since[:, None] * state0.v[None]
-        ys = Rigid(x, jnp.broadcast_to(state0.v, x.shape), ys.q, ys.omega)
+    ys = free_motion(setup.body, state0, ts - ts[0])
     none = jnp.zeros((), int)
     stats = {"num_steps": none, "num_accepted_steps": none, "num_rejected_steps": none}
     result = dfx.RESULTS.successful
     if not setup.throw:
         result = dfx.RESULTS.where(finite(ys), result, NONFINITE)
     return ys, stats, result
+
+
+def free_motion(body: Inertia | MassProperties, state0: Any, since: Array) -> Any:
+    """The states of a free body (T, …) at times (T,) since its start, s, on any rung."""
+    inertia = body if isinstance(body, Inertia) else body.inertia
+    turning = Attitude(state0.q, state0.omega) if isinstance(state0, Rigid) else state0
+    ys: Any = jax.vmap(FreeBody(inertia, turning))(since)
+    if not isinstance(state0, Rigid):
+        return ys
+    x = state0.x[None] + since[:, None] * state0.v[None]
+    return Rigid(x, jnp.broadcast_to(state0.v, x.shape), ys.q, ys.omega)
 
 
 class Flow(eqx.Module):

@@ -5,6 +5,7 @@ from rigidjax.solve.explicit import (
     RungeKutta4 as RungeKutta4,
     Tsitouras5 as Tsitouras5,
 )
+from rigidjax.solve.magnus import Magnus4 as Magnus4
 from rigidjax.solve.splitting import (
     Splitting2 as Splitting2,
     Splitting4 as Splitting4,

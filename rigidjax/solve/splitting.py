@@ -22,7 +22,7 @@ from rigidjax.exact.triples import Six, Triple, times
 from rigidjax.motion import Attitude, AttitudeEquations
 from rigidjax.motion.torques import evaluate
 from rigidjax.rotation import quaternion
-from rigidjax.solve.explicit import NestedInterpolation
+from rigidjax.solve.explicit import NestedInterpolation, cubic_rows
 
 
 class Composition(NamedTuple):
@@ -245,8 +245,7 @@ def _dense_rows(terms: Any, t0: Any, t1: Any, args: Any, y0: Any, y1: Any) -> An
     # Backwards, diffrax turns time round: the second derivative along the step keeps its sign.
     def rows(a: Array, b: Array, k: Array, m: Array, u: Array, v: Array) -> Array:
         step = jnp.asarray(h, a.dtype)
-        rise = b - a
-        second, third = step * k - rise, 2 * rise - step * (k + m)
+        rise, second, third = cubic_rows(b - a, step, k, m)
         fourth = 0.5 * (step**2 * u + 2 * second - 2 * third)
         fifth = 0.5 * (step**2 * v + 2 * second + 4 * third) - fourth
         return jnp.stack([rise, second, third, fourth, fifth])

@@ -9,9 +9,9 @@ from rigidjax.workprecision.drift import long_drift as long_drift
 from rigidjax.workprecision.in_jax import diffrax_method as diffrax_method
 from rigidjax.workprecision.interleaved import (
     measure as measure,
-    methods as methods,
     worked_out as worked_out,
 )
+from rigidjax.workprecision.known import methods as methods
 from rigidjax.workprecision.method import Method as Method, Ready as Ready, Run as Run
 from rigidjax.workprecision.pareto import (
     Choice as Choice,

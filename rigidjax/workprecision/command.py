@@ -10,7 +10,8 @@ from typing import Any
 
 from rigidjax.workprecision import chart, pareto, regress
 from rigidjax.workprecision.drift import long_drift
-from rigidjax.workprecision.interleaved import measure, methods
+from rigidjax.workprecision.interleaved import measure
+from rigidjax.workprecision.known import methods
 from rigidjax.workprecision.method import Method
 from rigidjax.workprecision.record import Record, read_csv, write_csv
 from rigidjax.workprecision.standard import scenes

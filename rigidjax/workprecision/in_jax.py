@@ -69,7 +69,11 @@ def _closed(scene: Scene) -> Flow | None:
 
 
 def _simulate(scene: Scene, adjoint: Any = None) -> Flow | None:
-    """The front door with its defaults, but for the tolerance."""
+    """The front door with its defaults, but for the tolerance.
+
+    That is traced here, so that one compiled call does for all: `simulate` cannot see that it is
+    below 1e-10, where it would keep more checkpoints for `jax.grad`.
+    """
     if scene.torque is None:
         return None
 
@@ -244,6 +248,7 @@ def methods_in_jax() -> list[Method]:
             "Splitting6, equal steps", "ours", EIGHT,
             partial(_value, partial(_split, solver=solvers.Splitting6())), equal=True,
         ),
+        diffrax_method(eight)._replace(name="DormandPrince8 in diffeqsolve", group="ours"),
         diffrax_method(dfx.Tsit5()),
         diffrax_method(dfx.Dopri8(), gradients=True),
     ]  # fmt: skip

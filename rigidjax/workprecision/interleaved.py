@@ -1,5 +1,6 @@
 """The measurement: every method on a scene made ready, then timed in turn, round after round."""
 
+import dataclasses
 import time
 from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
@@ -11,9 +12,8 @@ import numpy as np
 from rigidjax.frames import scene_of
 from rigidjax.motion import Attitude, conserved
 from rigidjax.solve import equations_of_motion, lean, solvers
-from rigidjax.workprecision.in_jax import methods_in_jax
+from rigidjax.workprecision import known
 from rigidjax.workprecision.method import Method, Ready, Run
-from rigidjax.workprecision.outside import methods_outside
 from rigidjax.workprecision.record import Record
 from rigidjax.workprecision.reference import Reference
 from rigidjax.workprecision.scene import Scene, distance
@@ -29,18 +29,6 @@ class _Job(NamedTuple):
     record: Record
     ready: Ready
     times: list[float]
-
-
-def methods(group: str | None = None) -> list[Method]:
-    """The methods that can be compared here: ours, others in JAX, and the peers installed.
-
-    **Arguments:** `group` `ours`, `jax` or `peer` for those alone.
-
-    >>> [method.name for method in methods("ours")][:2]
-    ['closed form', 'simulate']
-    """
-    found = [*methods_in_jax(), *methods_outside()]
-    return [method for method in found if group in (None, method.group)]
 
 
 def measure(
@@ -70,7 +58,7 @@ def measure(
             f"measure: wanted a Scene, got {type(scene).__name__}; standard ones are made by "
             'rj.workprecision.scenes()["heavy-top"]()'
         )
-    chosen = [*(_all_methods() if methods is None else methods), *peers]
+    chosen = [*(known.methods() if methods is None else methods), *peers]
     for method in chosen:
         if not isinstance(method, Method):
             raise TypeError(f"measure: wanted Methods, got {type(method).__name__}")
@@ -89,9 +77,6 @@ def measure(
                 jobs += _looked_at(scene, method, adjoint, setting, ready, right)
     _timed(jobs, rounds)
     return [_finished(job) for job in jobs]
-
-
-_all_methods = methods
 
 
 def worked_out(scene: Scene, gradients: bool = True) -> Reference:
@@ -226,8 +211,6 @@ def _timed(jobs: list[_Job], rounds: int) -> None:
 
 
 def _finished(job: _Job) -> Record:
-    import dataclasses
-
     low, middle, high = np.percentile(job.times[1:], [25, 50, 75])
     return dataclasses.replace(
         job.record, time=float(middle), time_low=float(low), time_high=float(high)

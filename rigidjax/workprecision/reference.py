@@ -39,7 +39,7 @@ def _all() -> dict[str, Reference]:
 def stored(name: str) -> Reference | None:
     """The stored answer to the standard scene of this name, if there is one.
 
-    They are made by `tests/workprecision/make_references.py` at 34 digits and rounded to float64.
+    They are made by `tests/workprecision/make_references.py` at 40 digits and rounded to float64.
 
     >>> stored("no such scene") is None
     True

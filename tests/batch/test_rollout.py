@@ -41,8 +41,8 @@ def far(a, b):
     ("torque", "method"),
     [
         pytest.param(TOP, KUTTA, id="top"),
-        pytest.param(GYROSTAT, rj.batch.Magnus4(), id="gyrostat"),
-        pytest.param(None, rj.batch.Magnus4(), id="free", marks=pytest.mark.slow),
+        pytest.param(GYROSTAT, rj.solvers.Magnus4(), id="gyrostat"),
+        pytest.param(None, rj.solvers.Magnus4(), id="free", marks=pytest.mark.slow),
         pytest.param(TOP, rj.solvers.DormandPrince8(), id="top-8", marks=pytest.mark.slow),
         pytest.param(None, rj.solvers.Tsitouras5(), id="free-5", marks=pytest.mark.slow),
     ],
@@ -262,7 +262,7 @@ def test_words(unhooked):
     with pytest.raises(ValueError, match="of body 2"):
         run(bodies, rj.Attitude(states.q.at[2].mul(2.0), states.omega), 0.1, 4)
     with pytest.raises(TypeError, match="depends on the attitude"):
-        run(bodies, states, 0.1, 4, TOP, method=rj.batch.Magnus4())
+        run(bodies, states, 0.1, 4, TOP, method=rj.solvers.Magnus4())
     with pytest.raises(TypeError, match="no lean step of Dopri8"):
         run(bodies, states, 0.1, 4, TOP, method=dfx.Dopri8())
     with pytest.raises(TypeError, match="HasAttitude"):

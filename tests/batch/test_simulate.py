@@ -130,7 +130,7 @@ def test_words(unhooked):
     with pytest.raises(ValueError, match="increasing times"):
         rj.batch.simulate(bodies, states, [0.0, 2.0, 1.0])
     with pytest.raises(ValueError, match="Magnus4 takes equal steps"):
-        rj.batch.simulate(bodies, states, TS, method=rj.batch.Magnus4())
+        rj.batch.simulate(bodies, states, TS, method=rj.solvers.Magnus4())
     with pytest.raises(TypeError, match="wanted Spin, Attitude or Rigid"):
         rj.batch.simulate(bodies, states.omega, TS)
     with pytest.raises(TypeError, match="wanted Inertia"):

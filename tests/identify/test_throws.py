@@ -55,8 +55,8 @@ def test_the_calibration_reproduces_the_proof_body(found, model):
     np.testing.assert_allclose(moments, throws.PROOF_MOMENTS, rtol=0.01)
 
 
-@pytest.mark.parametrize("group", GROUPS[2:])
-def test_an_object_of_known_inertia(found, model, group):
+def errors_of(found, model, group):
+    """Errors of each throw's moments (throws, 3), and how many intervals hold the truth."""
     device = found[GROUPS[0]][model]
     factor, _ = throws.calibrate(device, found[GROUPS[1]][model])
     _, truth = throws.OBJECTS[group]
@@ -67,13 +67,30 @@ def test_an_object_of_known_inertia(found, model, group):
         # The wheel's calibration is itself known to about a per cent.
         reach = 2 * np.hypot(throws.relative_deviation(fit), 0.01)
         covered += int(np.sum(np.abs(errors[-1]) <= reach))
-    errors = np.array(errors)
+    return np.array(errors), covered
+
+
+@pytest.mark.parametrize("group", GROUPS[2:])
+def test_an_object_of_known_inertia_comes_out_as_well_as_measured(found, model, group):
+    errors, covered = errors_of(found, model, group)
     print(group, "mean |error| %", 100 * np.abs(errors).mean(), "mean", 100 * errors.mean(axis=0))
     print("worst %", 100 * np.abs(errors).max(), "intervals that hold", covered, "of", errors.size)
+    # What is reached, so that a loss is seen; the bars are below.
     assert np.abs(errors).mean() <= 0.025
     assert np.abs(errors.mean(axis=0)).max() <= 0.04
     assert np.abs(errors).max() <= 0.08
     assert covered >= 0.5 * errors.size
+
+
+@pytest.mark.xfail(
+    strict=True,
+    reason="mean errors 2.15 and 2.03 % a throw (bar 2), worst 7.0 and 6.1 % (bar 5): something is "
+    "missing in the model; quadratic drag in the place of linear is no better",
+)
+@pytest.mark.parametrize("group", GROUPS[2:])
+def test_the_bars_of_a_published_method(found, model, group):
+    errors, _ = errors_of(found, model, group)
+    assert np.abs(errors).mean() <= 0.02 and np.abs(errors).max() <= 0.05
 
 
 def test_a_drag_that_can_drive_does_not_lose_a_throw():
