@@ -85,9 +85,24 @@ def reduced(o: Orbit, u: Scalar) -> tuple[Elliptic, Scalar]:
     )
 
 
+def in_step(f: Elliptic, m: Modulus) -> Elliptic:
+    """The larger of C² and D² made anew from the smaller: D² − C² = (p − q)S².
+
+    Each has gathered an error of its own in the doublings. Near the middle axis, where a motion
+    that decays passes into one that grows, C and SD cancel, and only what they share cancels too.
+    """
+    gs = m.gap * f.S * f.S
+    other = jnp.sqrt(jnp.where(gs > 0, f.C * f.C + gs, f.D * f.D - gs))
+    return f._replace(
+        C=jnp.where(gs > 0, f.C, jnp.copysign(other, f.C)),
+        D=jnp.where(gs > 0, jnp.copysign(other, f.D), f.D),
+    )
+
+
 def momentum_at(o: Orbit, f: Elliptic) -> Triple:
     """Body momentum when S, C, D are those of the time passed, in the orbit's labelling."""
     p1, p2, p3 = o.P
+    f = in_step(f, o.modulus)
     y1 = p1 * f.C - o.d23 * p2 * p3 * f.S * f.D
     y2 = p2 * f.C * f.D + o.d13 * p1 * p3 * f.S
     y3 = p3 * f.D - o.d12 * p1 * p2 * f.S * f.C

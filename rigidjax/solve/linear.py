@@ -5,8 +5,10 @@ a lane each. Only the product of 7×7 matrices along the trajectory is a chain. 
 axis of every array.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,6 +18,7 @@ from jaxtyping import Array
 from rigidjax.solve.explicit import Atoms
 from rigidjax.solve.method import Method
 from rigidjax.solve.scalarise import atoms_of, gathered
+from rigidjax.solve.tableaus import Tableau
 
 
 class Lanes(NamedTuple):
@@ -50,19 +53,22 @@ class Pull(NamedTuple):
     slopes: Array
 
 
-def stepped(method: Method, values: Any, lanes: Lanes) -> tuple[Array, tuple[Array, Array, Array]]:
+def stepped(
+    tableau: Tableau, field: Callable[..., Atoms], lanes: Lanes
+) -> tuple[Array, tuple[Array, Array, Array]]:
     """The states at the ends, not projected (n, R); times, states and slopes at the stages.
 
     One stage after another in a loop: written out they would be as fast, and longer to compile.
+
+    **Arguments:** `field(t, *y)` of lanes, all of one body, or each of its own.
     """
-    tableau, (size, many) = method.tableau, lanes.y.shape
+    size, many = lanes.y.shape
     count = len(tableau.a) + 1
     weights = np.zeros((count + 1, count))
     for i, row in enumerate([{}, *tableau.a, tableau.b]):
         weights[i, list(row)] = list(row.values())
     weights = jnp.asarray(weights, lanes.y.dtype)[..., None, None]
     nodes = np.array([0.0, *tableau.c])
-    field = jax.vmap(lambda t, *y: method.field(values, t, *y))
 
     def stage(slopes: Array, which: Any) -> tuple[Array, tuple[Array, Array]]:
         i, row, node, final = which
@@ -83,24 +89,28 @@ def stepped(method: Method, values: Any, lanes: Lanes) -> tuple[Array, tuple[Arr
     return end, (times, places, slopes)
 
 
+def _of_one(method: Method, values: Any) -> Callable[..., Atoms]:
+    return jax.vmap(lambda t, *y: method.field(values, t, *y))
+
+
 def looped_step(
     method: Method, values: Any, t: Array, end: Array, h: Array, y: Atoms
 ) -> tuple[Atoms, Atoms]:
     """`Method.step_and_error`, its stages in a loop."""
     lanes = Lanes(t[None], h[None], end[None], jnp.stack(y)[:, None])
-    raw, (_, _, slopes) = stepped(method, values, lanes)
+    raw, (_, _, slopes) = stepped(method.tableau, _of_one(method, values), lanes)
     return method.ended(values, end, h, tuple(raw[:, 0]), [tuple(k) for k in slopes[..., 0]])
 
 
 def ends_of(method: Method, values: Any, lanes: Lanes) -> Array:
     """The states at the ends (n, R), on the group."""
-    raw, _ = stepped(method, values, lanes)
+    raw, _ = stepped(method.tableau, _of_one(method, values), lanes)
     return jnp.stack(jax.vmap(method.project)(*raw))
 
 
 def stages_of(method: Method, values: Any, lanes: Lanes) -> Stages:
     """Everything inside the steps that their derivatives are made of."""
-    raw, (times, places, slopes) = stepped(method, values, lanes)
+    raw, (times, places, slopes) = stepped(method.tableau, _of_one(method, values), lanes)
     count, size, many = places.shape
     wide = places.transpose(1, 0, 2).reshape(size, count * many)
 
@@ -142,23 +152,83 @@ def fed(
     count, size, many = slopes.shape
     atoms, replaced = atoms_of(values)
 
-    def one(t: Array, y: Atoms, cotangent: Atoms) -> Any:
-        def field(atoms: list[Array], t: Array) -> Atoms:
-            return method.field(replaced(atoms), t, *y)
-
-        return jax.vjp(field, atoms, t)[1](cotangent)
-
+    few, long = eqx.partition(atoms, [not atom.ndim for atom in atoms])
     wide = [a.transpose(1, 0, 2).reshape(size, count * many) for a in (stages.places, slopes)]
     places, cotangents = (tuple(a) for a in wide)
-    found, times = jax.vmap(one)(stages.times.reshape(-1), places, cotangents)
-    found = [c.sum(0) for c in lax.optimization_barrier(found)]
-    return gathered(values, found), times.reshape(count, many)
+    times = stages.times.reshape(-1)
+
+    def field(few: Any, long: Any, t: Array, y: Atoms) -> Atoms:
+        return method.field(replaced(eqx.combine(few, long)), t, *y)
+
+    def one(t: Array, y: Atoms, cotangent: Atoms) -> Any:
+        return jax.vjp(lambda few, t: field(few, long, t, y), few, t)[1](cotangent)
+
+    found, by_time = jax.vmap(one)(times, places, cotangents)
+    found = jax.tree.map(lambda c: c.sum(0), lax.optimization_barrier(found))
+    if jax.tree.leaves(long):
+        # Of a table, or a network's weights, one cotangent for all lanes, not one in each.
+        def every(long: Any) -> Atoms:
+            return jax.vmap(lambda t, y: field(few, long, t, y))(times, places)
+
+        found = eqx.combine(found, jax.vjp(every, long)[1](cotangents)[0])
+    return gathered(values, found), by_time.reshape(count, many)
 
 
 def lengths(method: Method, stages: Stages, h: Array, slopes: Array, times: Array) -> Array:
     """Cotangents of the steps' lengths (R,), from those of slopes and times of the stages."""
     nodes = jnp.asarray([0.0, *method.tableau.c], times.dtype)
     return (slopes * stages.slopes).sum((0, 1)) / h + (nodes[:, None] * times).sum(0)
+
+
+def step_back(
+    method: Method, field: Callable[..., Atoms], atoms: Any, lanes: Lanes, after: Array
+) -> tuple[Array, Any, Array, Array]:
+    """One cotangent (n, R) after each step pulled back to its start; stages in a loop.
+
+    **Arguments:** `field(atoms, t, y)` of lanes, `atoms` the numbers that it depends on.
+    **Returns** the cotangents before, and those of the atoms, the starts' times, the lengths.
+    """
+    tableau = method.tableau
+    count, many = len(tableau.a) + 1, after.shape[1]
+
+    def pull(t: Array, y: Any, slope: Any) -> Any:
+        return jax.vjp(field, atoms, t, y)[1](slope)
+
+    def land(raw: Any, after: Any) -> Any:
+        return jax.vjp(lambda *y: method.project(*y), *raw)[1](after)
+
+    raw, (times, places, slopes) = stepped(tableau, lambda t, *y: field(atoms, t, y), lanes)
+    end = jnp.stack(jax.vmap(land)(tuple(raw), tuple(after)))
+    columns, weights = np.zeros((count, count)), np.zeros(count)
+    for i, row in enumerate(tableau.a):
+        columns[list(row), i + 1] = list(row.values())
+    weights[list(tableau.b)] = list(tableau.b.values())
+    dtype = after.dtype
+
+    def stage(sums: Any, which: Any) -> tuple[Any, None]:
+        below, found, begin, length = sums
+        i, weight, column, node, t, place, slope = which
+        total = weight * end + (column[:, None, None] * below).sum(0)
+        seed = lax.optimization_barrier(lanes.h[None] * total)
+        by_atoms, by_time, by_place = pull(t, tuple(place), tuple(seed))
+        by_place = lax.optimization_barrier(jnp.stack(by_place))
+        found = jax.tree.map(jnp.add, found, by_atoms)
+        length = length + (total * slope).sum(0) + node * by_time
+        return (below.at[i].set(by_place), found, begin + by_time, length), None
+
+    none = jnp.zeros(many, lanes.t.dtype)
+    start = (jnp.zeros_like(places), jax.tree.map(jnp.zeros_like, atoms), none, none)
+    stages = (
+        jnp.arange(count),
+        jnp.asarray(weights, dtype),
+        jnp.asarray(columns, dtype),
+        jnp.asarray([0.0, *tableau.c], lanes.t.dtype),
+        times,
+        places,
+        slopes,
+    )
+    (below, found, begin, length), _ = lax.scan(stage, start, stages, reverse=True)
+    return end + below.sum(0), found, begin, length
 
 
 def _jacobian(function: Any, y: Atoms) -> Any:

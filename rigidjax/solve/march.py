@@ -13,6 +13,7 @@ from jax import lax
 from jaxtyping import Array
 
 from rigidjax.solve.explicit import Atoms
+from rigidjax.solve.together import anywhere
 
 # What diffrax.PIDController does unless told: the same steps, so that figures can be compared.
 _SAFETY, _SMALLEST, _LARGEST = 0.9, 0.2, 10.0
@@ -132,21 +133,35 @@ def block_size(y0: Atoms) -> int:
     return max(1, min(8, _BLOCK // (y0[0].dtype.itemsize * (len(y0) + 2) + 4)))
 
 
+def empty(walk: Walk, room: int) -> Rows:
+    """Space for `room` steps, and for a block that those who are through write in vain."""
+    return _rows(walk, room + block_size(walk.y))
+
+
 def recorded(
-    step: Step, control: Control, stops: Stops, walk: Walk, room: int
+    step: Step, control: Control, stops: Stops, walk: Walk, rows: Rows, count: Array
 ) -> tuple[Walk, Rows, Array]:
-    """Up to `room` steps from here on, and how many there were; less than a block stays free."""
+    """As many steps from here on as there is room for, after `count`; and how many there are now.
+
+    Less than a block stays free. A walk that has nowhere to go leaves all as it was.
+    """
     size = block_size(walk.y)
+    room = rows.t.shape[0] - size
+
+    def more(state: Any) -> Array:
+        walk, _, count = state
+        return going(walk, stops, control) & (count + size <= room)
 
     def block(state: Any) -> Any:
         walk, rows, count = state
+        alive = more(state)
         index = jnp.minimum(walk.stop, stops.begin.shape[0] - 1)
         begin, end = stops.begin[index], stops.end[index]
 
         def go_on(state: Any) -> Array:
             walk, _, many = state
-            alive = (walk.steps < control.max_steps) & (walk.h > 0)
-            return alive & (walk.t < begin) & (many < size)
+            able = alive & (walk.steps < control.max_steps) & (walk.h > 0)
+            return able & (walk.t < begin) & (many < size)
 
         def body(state: Any) -> Any:
             walk, rows, many = state
@@ -157,20 +172,16 @@ def recorded(
             rows = jax.tree.map(lambda a, b: a.at[many].set(b), rows, row)
             return after, rows, many + accept.astype(jnp.int32)
 
-        few = _empty(walk, size)
+        few = _rows(walk, size)
         walk, few, many = lax.while_loop(go_on, body, (walk, few, jnp.zeros((), jnp.int32)))
         rows = jax.tree.map(lambda a, b: lax.dynamic_update_slice_in_dim(a, b, count, 0), rows, few)
-        reached = (walk.t >= begin).astype(jnp.int32)
+        reached = (alive & (walk.t >= begin)).astype(jnp.int32)
         return walk._replace(stop=walk.stop + reached), rows, count + many
 
-    def more(state: Any) -> Array:
-        walk, _, count = state
-        return going(walk, stops, control) & (count + size <= room)
-
-    return lax.while_loop(more, block, (walk, _empty(walk, room), jnp.zeros((), jnp.int32)))
+    return lax.while_loop(lambda state: anywhere(more(state)), block, (walk, rows, count))
 
 
-def _empty(walk: Walk, many: int) -> Rows:
+def _rows(walk: Walk, many: int) -> Rows:
     none = jnp.zeros(many, walk.t.dtype)
     return Rows(
         none,

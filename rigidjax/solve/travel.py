@@ -19,12 +19,15 @@ from jax import lax
 from jaxtyping import Array
 
 from rigidjax.solve import linear, march
+from rigidjax.solve.abreast import back_through
+from rigidjax.solve.backward import LANES, Bars, Chapter, within
 from rigidjax.solve.march import Control, Rows, Stops, Walk
 from rigidjax.solve.method import Method, spread
+from rigidjax.solve.together import anywhere
 
-# Steps in a chapter; steps and saved states that are worked on side by side. A chapter that is run
-# again rounds differently, and at tight tolerances has other steps: most runs should need only one.
-CHAPTER, LANES = 2048, 64
+# Steps in a chapter. One that is run again rounds differently, and at tight tolerances has other
+# steps: most runs should need only one.
+CHAPTER = 2048
 
 
 class Given(NamedTuple):
@@ -89,15 +92,18 @@ def forward(method: Method, max_steps: int, given: Given, fixed: Fixed) -> Answe
     if not given.between.size:
         walk = march.unrecorded(step, control, stops, walk)
         return _answer(given, walk, jnp.zeros((0, *given.y0.shape), given.y0.dtype))
-    room = _room(walk, max_steps)
 
     def chapter(state: Any) -> Any:
-        walk, saved = state
-        walk, rows, count = march.recorded(step, control, stops, walk, room)
-        return walk, _look(method, values, given.between, stops, walk.t, rows, count, saved)
+        walk, saved, rows = state
+        none = jnp.zeros((), jnp.int32)
+        walk, rows, count = march.recorded(step, control, stops, walk, rows, none)
+        saved = _look(method, values, given.between, stops, walk.t, rows, count, saved)
+        return walk, saved, rows
 
-    walk, saved = lax.while_loop(
-        lambda state: march.going(state[0], stops, control), chapter, (walk, _none_saved(given))
+    walk, saved, _ = lax.while_loop(
+        lambda state: anywhere(march.going(state[0], stops, control)),
+        chapter,
+        (walk, _none_saved(given), march.empty(walk, _room(walk, max_steps))),
     )
     return _answer(given, walk, _kept(saved, given))
 
@@ -121,22 +127,24 @@ def _written(method: Method, max_steps: int, given: Given, fixed: Fixed) -> Any:
     room = _room(walk, max_steps)
     most = max_steps // (room - march.block_size(walk.y) + 1) + 1
     empty: Any = jax.tree.map(lambda a: jnp.zeros((most, *a.shape), a.dtype), walk)
-    shapes: Any = jax.eval_shape(lambda: march.recorded(step, control, stops, walk, room)[1])
-    rows: Any = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), shapes)
     zero = jnp.zeros((), jnp.int32)
+    book = _Chapters(empty, zero, march.empty(walk, room), zero)
 
     def chapter(state: Any) -> Any:
         walk, saved, book = state
+        on = march.going(walk, stops, control)
         starts = jax.tree.map(lambda a, b: a.at[book.number].set(b), book.starts, walk)
-        walk, rows, count = march.recorded(step, control, stops, walk, room)
+        # Those who are through keep the steps of their last chapter.
+        count = jnp.where(on, 0, book.length)
+        walk, rows, count = march.recorded(step, control, stops, walk, book.rows, count)
         if given.between.size:
             saved = _look(method, values, given.between, stops, walk.t, rows, count, saved)
-        return walk, saved, _Chapters(starts, book.number + 1, rows, count)
+        return walk, saved, _Chapters(starts, book.number + on.astype(jnp.int32), rows, count)
 
     walk, saved, book = lax.while_loop(
-        lambda state: march.going(state[0], stops, control),
+        lambda state: anywhere(march.going(state[0], stops, control)),
         chapter,
-        (walk, _none_saved(given), _Chapters(empty, zero, rows, zero)),
+        (walk, _none_saved(given), book),
     )
     return _answer(given, walk, _kept(saved, given)), (given, fixed, book)
 
@@ -144,124 +152,38 @@ def _written(method: Method, max_steps: int, given: Given, fixed: Fixed) -> Any:
 def _back(method: Method, max_steps: int, kept: Any, cotangents: Answer) -> tuple[Given, None]:
     given, fixed, book = kept
     stops, control, values = _set_up(method, max_steps, given, fixed)
-    room = book.rows.t.shape[0]
-    bars = jax.tree.map(jnp.zeros_like, given)
+    none = jax.tree.map(jnp.zeros_like, (book.rows, book.length))
     # The start's time counts as a stop, the first.
     ends = jnp.zeros(stops.begin.shape[0] + 1, given.t0.dtype)
+    sums = jax.tree.map(jnp.zeros_like, (given.constants, given.between))
+    bars = Bars(cotangents.end, *sums, ends)
 
-    def again(walk: Walk) -> tuple[Rows, Array]:
+    def steps(number: Array) -> tuple[Rows, Array]:
+        walk: Any = jax.tree.map(lambda a: a[number], book.starts)
         # Another form of the same step: slower, but quick to compile, and seldom needed.
         looped = partial(linear.looped_step, method, values)
-        _, rows, count = march.recorded(looped, control, stops, walk, room)
-        return rows, count
+        _, *again = march.recorded(looped, control, stops, walk, *none)
+        last = number == book.number - 1
+        kept = book.rows, book.length
+        return jax.tree.map(lambda a, b: jnp.where(last, a, b), kept, tuple(again))
 
     def chapter(state: Any) -> Any:
-        number, bar, bars, ends = state
-        number = number - 1
-        walk: Any = jax.tree.map(lambda a: a[number], book.starts)
-        # The last chapter is there. No `cond`: under `vmap` both its branches run; a walk without
-        # a step ahead takes none.
-        last = number == book.number - 1
-        rows, count = again(walk._replace(h=jnp.where(last, jnp.zeros_like(walk.h), walk.h)))
-        rows, count = jax.tree.map(
-            lambda a, b: jnp.where(last, a, b), (book.rows, book.length), (rows, count)
+        number, bars = state
+        on, number = number > 0, jnp.maximum(number - 1, 0)
+        rows, count = lax.cond(
+            anywhere(on & (number < book.number - 1)),
+            steps,
+            lambda _: (book.rows, book.length),
+            number,
         )
-        context = _Context(method, values, stops, rows, count)
-        bar, bars, ends = _back_through(context, given, cotangents.between, bar, bars, ends)
-        return number, bar, bars, ends
+        field = given.constants, fixed.rest
+        chapter = Chapter(on, stops, rows, count, *field, given.between, cotangents.between)
+        return number, back_through(method, chapter, bars)
 
-    begin = (book.number, cotangents.end, bars, ends)
-    _, bar, bars, ends = lax.while_loop(lambda state: state[0] > 0, chapter, begin)
-    bars = bars._replace(y0=bar, t0=ends[0], stops=ends[1:])
-    return bars, None
-
-
-class _Context(NamedTuple):
-    method: Method
-    values: Any
-    stops: Stops
-    rows: Rows
-    length: Array
-
-    def lanes(self, index: Array) -> linear.Lanes:
-        """The steps of these rows."""
-        t, h, code = self.rows.t[index], self.rows.h[index], self.rows.code[index]
-        late = jnp.where(code % 2 == 1, self.stops.end[code // 2], t + h)
-        return linear.Lanes(t, h, late, self.rows.y[index].T)
-
-
-def _back_through(
-    context: _Context, given: Given, seeds: Array, bar: Array, bars: Given, ends: Array
-) -> Any:
-    """From the end of a chapter to its start: `bar` (n,), the state's cotangent, and the others.
-
-    First from the states between steps (`seeds`) to the starts of their steps, then along these.
-    """
-    method, rows, count = context.method, context.rows, context.length
-    size, many = given.y0.shape[0], min(LANES, rows.t.shape[0])
-    first, last = _asked(context, given.between)
-    chain = (count + many - 1) // many
-    # The step is transposed before its cotangent is known: n of them, in each lane.
-    units = jnp.broadcast_to(jnp.eye(size, dtype=given.y0.dtype)[..., None], (size, size, many))
-
-    def batch(state: Any) -> Any:
-        number, bar, bars, ends, extra = state
-        number = number - 1
-        place = number * many + jnp.arange(many, dtype=jnp.int32)
-        # Lanes beyond the last step repeat it: their numbers must be good ones.
-        there, index = place < count, jnp.clip(place, 0, count - 1)
-        lanes = context.lanes(index)
-        linked, which = number < chain, place
-        if given.between.size:
-            asked = first + place - chain * many
-            which = jnp.clip(asked, 0, jnp.maximum(last - 1, 0))
-            row, short = _within(context.stops, rows, count, given.between[which])
-            lanes = jax.tree.map(lambda a, b: jnp.where(linked, a, b), lanes, short)
-            index = jnp.where(linked, index, row)
-            there = jnp.where(linked, there, (asked >= first) & (asked < last))
-        stages = linear.stages_of(method, context.values, lanes)
-        pull = linear.pulled(method, stages, lanes.h, units)
-
-        def back(bar: Array, step: Any) -> tuple[Array, Array]:
-            matrix, here, more = step
-            before = (matrix * bar[None]).sum(1) + more
-            return jnp.where(here, before, bar), jnp.where(here, bar, jnp.zeros_like(bar))
-
-        steps = (pull.start.transpose(2, 0, 1), there & linked, extra[index])
-        bar, after = lax.scan(back, bar, steps, reverse=True, unroll=8)
-        if given.between.size:
-            own = jnp.where((there & ~linked)[:, None], seeds[which], jnp.zeros_like(after))
-            extra = extra.at[index].add((pull.start * own.T[None]).sum(1).T)
-            after = after + own
-        slopes = (pull.slopes * after.T[None, None]).sum(2)
-        constants, times = linear.fed(method, context.values, stages, slopes)
-        bars = bars._replace(constants=jax.tree.map(jnp.add, bars.constants, constants))
-        lengths = linear.lengths(method, stages, lanes.h, slopes, times)
-        code = rows.code[index]
-        # A step that ends on a stop, or on a time asked for, is as long as from its start to there.
-        cut = jnp.where((code % 2 == 1) | ~linked, lengths, jnp.zeros_like(lengths))
-        ends = ends.at[code // 2].add(times.sum(0) - cut)
-        ends = ends.at[code // 2 + 1].add(jnp.where(linked, cut, jnp.zeros_like(cut)))
-        if given.between.size:
-            asked_for = jnp.where(linked, jnp.zeros_like(cut), cut)
-            bars = bars._replace(between=bars.between.at[which].add(asked_for))
-        return number, bar, bars, ends, extra
-
-    batches = chain + (last - first + many - 1) // many
-    begin = (batches, bar, bars, ends, jnp.zeros_like(rows.y))
-    _, bar, bars, ends, _ = lax.while_loop(lambda state: state[0] > 0, batch, begin)
-    return bar, bars, ends
-
-
-def _asked(context: _Context, between: Array) -> tuple[Array, Array]:
-    """The first of the times between in these rows, and the first after them."""
-    rows, final = context.rows, context.length - 1
-    cut = rows.code[final] % 2 == 1
-    reach = jnp.where(
-        cut, context.stops.begin[rows.code[final] // 2], rows.t[final] + rows.h[final]
-    )
-    first = jnp.sum(between <= rows.t[0], dtype=jnp.int32)
-    return first, jnp.sum(between <= reach, dtype=jnp.int32)
+    begin = (book.number, bars)
+    bars = lax.while_loop(lambda state: anywhere(state[0] > 0), chapter, begin)[1]
+    ends = {"t0": bars.ends[0], "stops": bars.ends[1:]}
+    return Given(bars.constants, between=bars.between, y0=bars.state, **ends), None
 
 
 def _look(
@@ -285,24 +207,12 @@ def _look(
         place = saved.known + jnp.arange(many, dtype=jnp.int32)
         late = between[jnp.minimum(place, between.shape[0] - 1)]
         ready = (place < between.shape[0]) & (late <= reach)
-        _, lanes = _within(stops, rows, count, jnp.where(ready, late, reach))
+        _, lanes = within(stops, rows, count, jnp.where(ready, late, reach))
         ys = linear.ends_of(method, values, lanes).T
         ys = lax.dynamic_update_slice_in_dim(saved.ys, ys, saved.known, 0)
         return Saved(ys, saved.known + jnp.sum(ready, dtype=jnp.int32))
 
-    return lax.while_loop(waiting, batch, saved)
-
-
-def _within(stops: Stops, rows: Rows, count: Array, late: Array) -> tuple[Array, linear.Lanes]:
-    """The rows that these times lie in, and the steps from their starts to there."""
-    written = jnp.arange(rows.t.shape[0], dtype=jnp.int32) < count
-    before = (rows.t[None] < late[:, None]) & written[None]
-    index = jnp.maximum(jnp.sum(before, axis=1, dtype=jnp.int32) - 1, 0)
-    t, h, code = rows.t[index], rows.h[index], rows.code[index]
-    limit = jnp.where(code % 2 == 1, stops.end[code // 2], t + h)
-    # The limit is the last moment before a jump: it moves nothing, and has no derivative here.
-    end = late + lax.stop_gradient(jnp.minimum(late, limit) - late)
-    return index, linear.Lanes(t, end - t, end, rows.y[index].T)
+    return lax.while_loop(lambda saved: anywhere(waiting(saved)), batch, saved)
 
 
 def _set_up(

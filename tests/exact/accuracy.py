@@ -141,15 +141,42 @@ def _measure(error, moved_q, moved_omega, size, eps):
 
 
 def _by_rounding(row, there, eps, count=8):
-    """How the result moves when each input is off by up to one rounding."""
+    """How the result moves when each input is off by up to one rounding.
+
+    Also where that can carry the body across the separatrix, which no random signs would find: on
+    the way there the period grows beyond all bounds.
+    """
     r, sizes = np.random.default_rng(5), _sizes(row)
     sizes[9:13] = 0.0
     moves = []
-    for signs in r.choice([-1.0, 1.0], (count, 14)):
+    for signs in [*r.choice([-1.0, 1.0], (count, 14)), *_towards_separatrix(row, sizes, eps)]:
         shifts = eps * signs * sizes
         off = [mp.mpf(a) + mp.mpf(b) for a, b in zip(row, shifts, strict=True)]
         moves.append(np.array([float(a - b) for a, b in zip(truth(off), there, strict=True)]))
     return moves
+
+
+def _towards_separatrix(row, sizes, eps):
+    """Roundings, as shares of one, that end a little before and a little beyond the separatrix."""
+    if row[3:6].any() or (np.diff(row[:3]) < 0).any():
+        return []
+
+    def gap(x):
+        (i1, i2, i3), (p1, _, p3) = x[:3], (a * b for a, b in zip(x[:3], x[6:9], strict=True))
+        return (1 / i2 - 1 / i3) * p3**2 - (1 / i1 - 1 / i2) * p1**2
+
+    x = _exact(row)
+    here, slopes = gap(x), np.zeros(14)
+    for k in (0, 1, 2, 6, 8):
+        h = mp.mpf("1e-25") * mp.mpf(float(sizes[k]))
+        slopes[k] = float(
+            (gap([a + h * (i == k) for i, a in enumerate(x)]) - here) / mp.mpf("1e-25")
+        )
+    reach = np.abs(slopes).sum() * eps
+    share = float(here) / reach if reach > 0 else np.inf
+    if not abs(share) <= 1:
+        return []
+    return [-f * share * np.sign(slopes) for f in (0.5, 0.9, 0.99, 0.999, 1.001, 1.01, 1.1)]
 
 
 def _exact(x):

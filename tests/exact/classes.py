@@ -71,6 +71,15 @@ def _modulus(u, w):
     return np.sqrt(big), np.minimum(p, q) / big
 
 
+def off_separatrix(u, w):
+    """|p − q|/max(p, q), p − q computed without subtracting them; moments in order."""
+    a, x = 1 / u.T, (u * w).T ** 2
+    d12, d13, d23 = a[0] - a[1], a[0] - a[2], a[1] - a[2]
+    p = d23 * (d12 * x[1] + d13 * x[2])
+    big = np.maximum(p, d12 * (d13 * x[0] + d23 * x[1]))
+    return np.abs(d13 * (d23 * x[2] - d12 * x[0])) / np.where(big > 0, big, 1.0)
+
+
 def _between_labels(u, w, r):
     """Rates with d₁₂A₁ = d₂₃A₃ within a few units of round-off, on both sides."""
     a, x = 1 / u.T, (u * w).T ** 2

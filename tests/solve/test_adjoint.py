@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import rigidjax as rj
-from rigidjax.solve import lean, travel
+from rigidjax.solve import abreast, backward, lean, travel
 
 Q = np.array([0.8, -0.2, 0.4, 0.4]) / np.linalg.norm([0.8, -0.2, 0.4, 0.4])
 TENSOR = np.array([[1.0, 0.05, -0.1], [0.05, 1.7, 0.2], [-0.1, 0.2, 2.2]])
@@ -128,9 +128,46 @@ def test_many_chapters_are_one(monkeypatch):
 
     whole = jax.jit(slope)(jnp.zeros(16))
     monkeypatch.setattr(travel, "CHAPTER", 7)
-    monkeypatch.setattr(travel, "LANES", 3)
+    monkeypatch.setattr(backward, "LANES", 3)
     chapters = jax.jit(lambda p: slope(p))(jnp.zeros(16))
     np.testing.assert_allclose(chapters, whole, rtol=1e-10, atol=1e-11)
+
+
+@pytest.mark.parametrize("groups", [pytest.param(True, marks=pytest.mark.slow), False])
+def test_bodies_abreast_are_bodies_alone(monkeypatch, groups):
+    # Steps of different number, jumps, saved times, a law of each body's own and one for all.
+    size = 10 if groups else 8
+    r = np.random.default_rng(5)
+    p = jnp.asarray(np.concatenate([0.02 * r.normal(size=(size, 13)), r.normal(size=(size, 3))], 1))
+    turn, shared = jnp.asarray(r.normal(size=p.shape)), jnp.zeros(3)
+    ts = jnp.array([0.0, 0.3, 1.1])
+
+    def slope(p, shared):
+        p = p.at[3:6].add(shared)
+        return jax.grad(lambda p: run("pulses", ts, travel.reverse, p, WEIGHTS, 300))(p)
+
+    def total(shared):
+        def one(p):
+            return run("pulses", ts, travel.reverse, p.at[3:6].add(shared), WEIGHTS, 300)
+
+        return jax.vmap(one)(p).sum()
+
+    alone = jax.jit(slope)
+    wanted = np.stack([alone(row, shared) for row in p])
+    if groups:
+        # Groups that overlap, and chapters that are run again.
+        monkeypatch.setattr(abreast, "_ABREAST", 4)
+        monkeypatch.setattr(travel, "CHAPTER", 7)
+
+    together = jax.vmap(lambda p: slope(p, shared))
+    found, by_shared = jax.jit(lambda p: (together(p), jax.grad(total)(shared)))(p)
+    np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-10 * np.abs(wanted).max())
+    np.testing.assert_allclose(by_shared, wanted[:, 3:6].sum(0), rtol=1e-9)
+    if groups:
+        bend = jax.jit(lambda p: jax.jvp(together, (p,), (turn,))[1])(p)
+        bent = jax.jit(lambda p, turn: jax.jvp(lambda p: slope(p, shared), (p,), (turn,))[1])
+        for k in (0, 9):
+            np.testing.assert_allclose(bend[k], bent(p[k], turn[k]), rtol=1e-8, atol=1e-8)
 
 
 def test_through_simulate_each_rung_and_what_is_refused():
