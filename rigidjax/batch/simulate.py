@@ -116,9 +116,9 @@ def simulate(
     if torque is None and method is None:
         how: Any = _Free()
     else:
-        rtol, atol = inputs.tolerances(rtol, atol, batch.dtype)
+        tolerances: Any = inputs.tolerances(rtol, atol, batch.dtype)
         solver = DormandPrince8() if method is None else method
-        how = _Adaptive(solver, rtol, atol, max_steps, adjoint)
+        how = _Adaptive(solver, *tolerances, max_steps, adjoint)
     mesh = mesh_of(devices)
     plan = _Plan(how, chunk_of(chunk, batch.dtype, batch.many), mesh)
     numbers = (batch.shared, batch.each, ts)

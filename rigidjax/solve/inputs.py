@@ -49,16 +49,21 @@ def require_fit(body: Any, state0: Any, torque: Any) -> None:
         )
 
 
-def tolerances(rtol: float | None, atol: float | None, dtype: Any) -> tuple[float, float]:
+def tolerances(rtol: Any, atol: Any, dtype: Any) -> tuple[Any, Any]:
     """`rtol` and `atol`, by default what `dtype` is good for; a warning where it cannot reach them.
+
+    Traced ones are taken as they are.
 
     >>> tolerances(None, 1e-10, jnp.float64)
     (1e-09, 1e-10)
     """
     double = dtype == jnp.float64
+    rtol = (1e-9 if double else 2e-5) if rtol is None else rtol
+    atol = (1e-12 if double else 1e-7) if atol is None else atol
+    if not _checks.known((rtol, atol)):
+        return jnp.asarray(rtol, dtype), jnp.asarray(atol, dtype)
     # Floats of Python: those of NumPy would lift a float32 run to float64.
-    rtol = float((1e-9 if double else 2e-5) if rtol is None else rtol)
-    atol = float((1e-12 if double else 1e-7) if atol is None else atol)
+    rtol, atol = float(rtol), float(atol)
     if not 0 < rtol < np.inf or not 0 <= atol < np.inf:
         raise ValueError(f"simulate: wanted rtol > 0 and atol >= 0, got rtol={rtol}, atol={atol}")
     floor = 100 * float(jnp.finfo(dtype).eps)

@@ -48,14 +48,33 @@ class Setup(eqx.Module):
 
 
 class Lean(eqx.Module):
-    """A solve of which nothing is asked but states and `jax.grad`: our own loop."""
+    """A solve of which nothing is asked but states and `jax.grad`: our own loop.
+
+    With the `adjoint` replaced by that for forward mode it is diffrax that solves it: there our
+    loop would be faster, but takes far longer to compile.
+    """
 
     body: Inertia | MassProperties | None
     torque: Any
     controller: dfx.AbstractStepSizeController
     dt0: Any
+    adjoint: dfx.AbstractAdjoint
     max_steps: int = eqx.field(static=True)
     throw: bool = eqx.field(static=True)
+
+    def in_diffrax(self) -> Setup:
+        """The same scene to the same tolerances."""
+        return Setup(
+            body=self.body,
+            torque=self.torque,
+            solver=SOLVER,
+            controller=self.controller,
+            dt0=self.dt0,
+            adjoint=self.adjoint,
+            progress_meter=NO_METER,
+            max_steps=self.max_steps,
+            throw=self.throw,
+        )
 
 
 @eqx.filter_jit
@@ -66,8 +85,10 @@ def solve(
     state0 = on_the_group(state0)
     if isinstance(setup, Free):
         return _free(setup, state0, ts)
-    if isinstance(setup, Lean):
+    if isinstance(setup, Lean) and setup.adjoint == ADJOINT:
         return _lean(setup, state0, ts)
+    if isinstance(setup, Lean):
+        setup = setup.in_diffrax()
     field = equations_of_motion(setup.body, state0, setup.torque)
     scene: Any = scene_of(setup.torque) if isinstance(state0, Point) else None
     watch = collision.event(scene)
@@ -183,20 +204,8 @@ class Flow(eqx.Module):
     setup: Free | Lean | Setup
 
     def __init__(self, setup: "Free | Lean | Setup"):
-        if isinstance(setup, Lean):
-            setup = Setup(
-                body=setup.body,
-                torque=setup.torque,
-                solver=SOLVER,
-                controller=setup.controller,
-                dt0=setup.dt0,
-                adjoint=ADJOINT,
-                progress_meter=NO_METER,
-                max_steps=setup.max_steps,
-                throw=False,
-            )
         setup = dataclasses.replace(setup, throw=False)
-        if isinstance(setup, Setup):
+        if not isinstance(setup, Free):
             setup = dataclasses.replace(setup, adjoint=dfx.ForwardMode())
         self.setup = setup
 

@@ -40,8 +40,8 @@ def simulate(
     torque: Law[State] = None,
     *,
     solver: dfx.AbstractSolver | None = None,
-    rtol: float | None = None,
-    atol: float | None = None,
+    rtol: ScalarLike | None = None,
+    atol: ScalarLike | None = None,
     dt0: ScalarLike | None = None,
     stepsize_controller: dfx.AbstractStepSizeController | None = None,
     adjoint: dfx.AbstractAdjoint | None = None,
@@ -65,23 +65,23 @@ def simulate(
       `Point` a scene of `rigidjax.scenes`, a `MovingFrame` to see it from, or a force per mass
       `(t, state, None) → (3,)`, m/s².
     - `solver`: `None` is the cheapest that is right: the closed form (`rigidjax.exact`) for a free
-      body, else `diffrax.Dopri8`. Any `diffrax.AbstractSolver` may be given; it is wrapped so that
-      attitudes stay unit quaternions, at every step and every saved time.
-      `rigidjax.solvers.DormandPrince8()` with nothing more asked (at most 32 times, no controller,
-      forward mode or meter, no `Point` that may collide) runs in a loop of our own: a third to four
-      fifths of the time for the value, some seconds more to compile; under `vmap` its gradient
-      takes twice as long or more. Below `rtol=1e-10` mind that Dopri8 is up
-      to 26 times `rtol` off between its steps (five times at most with `DormandPrince8`).
+      body, else order 8: `rigidjax.solvers.DormandPrince8` in a loop of our own for bodies and
+      at most 32 times, `diffrax.Dopri8` for more, for a `Point`, and where a controller, forward
+      mode or a meter is asked for. Our loop takes TODO of the time, and some seconds more to
+      compile a gradient. Any `diffrax.AbstractSolver` may be given; it is wrapped so that attitudes
+      stay unit quaternions, at every step and every saved time. Below `rtol=1e-10` mind that Dopri8
+      is up to 26 times `rtol` off between its steps (five times at most with `DormandPrince8`).
     - `rtol`, `atol`: tolerances of the adaptive steps; 1e-9 and 1e-12 in float64, 2e-5 and 1e-7 in
-      float32. Scale `atol` to the smallest number that matters: a flip about the middle axis grows
-      out of how far off the axis it starts, and where that is below `atol` its time is made up. The
-      closed form has no use for either.
+      float32. Traced ones are not checked, and others then compile nothing. Scale `atol` to the
+      smallest number that matters: a flip about the middle axis grows out of how far off the axis
+      it starts, and where that is below `atol` its time is made up. The closed form has no use for
+      either.
     - `dt0`, `stepsize_controller`: first step and controller where the tolerances are not enough,
       such as `dt0=0.01, stepsize_controller=diffrax.ConstantStepSize()`.
-    - `adjoint`: how gradients through a solver are taken. `None` is
-      `diffrax.RecursiveCheckpointAdjoint()`, for `jax.grad`, with 4096 checkpoints where `rtol` is
-      below 1e-10; pass `diffrax.ForwardMode()` for `jax.jacfwd` and least squares. The closed form
-      takes both.
+    - `adjoint`: how gradients through a solver are taken. `None` is reverse mode, for `jax.grad`:
+      `diffrax.RecursiveCheckpointAdjoint()`, with 4096 checkpoints where `rtol` is known to be
+      below 1e-10, or that of our loop; pass `diffrax.ForwardMode()` for `jax.jacfwd` and least
+      squares. The closed form takes both.
     - `max_steps`, `progress_meter`: as in `diffrax.diffeqsolve`.
     - `throw`: `False` never raises for numbers met on the way, or for a bad start inside a batch:
       `result` says what happened, states not reached are NaN, and other bodies of the batch get
@@ -111,7 +111,8 @@ def simulate(
     controller = stepsize_controller
     if controller is None:
         rtol, atol = inputs.tolerances(rtol, atol, dtype)
-        controller = _controller(rtol, atol)
+        known: Any = _controller if _checks.known((rtol, atol)) else _watched
+        controller = known(rtol, atol)
         if hasattr(torque, "jump_times") and jumps_of(torque).size:
             # An adaptive step passes over a short pulse without seeing it.
             jump_ts = jnp.sort(jumps_of(torque).astype(dtype))
@@ -123,14 +124,15 @@ def simulate(
     if torque is None and solver is None and stepsize_controller is None and body is not None:
         free = Free(body, throw)
         return Solution(times, *solve(free, state0, times), free)
-    ours = isinstance(solver, DormandPrince8)
+    # A point's gradient takes our loop 17 s to compile (Arenstorf; diffrax 3): only if asked for.
+    ours = isinstance(solver, DormandPrince8) or (solver is None and body is not None)
     plain = ours and stepsize_controller is None and progress_meter is None
     # Forward mode stays with diffrax: there our loop is faster, but takes far longer to compile.
     plain = plain and (adjoint is None or adjoint == ADJOINT) and max_steps is not None
     plain = plain and times.shape[0] <= _FEW_TIMES
     if plain and not _can_collide(state0, torque):
         first = inputs.first_step(dt0, times)
-        quick = Lean(body, torque, controller, first, max_steps, throw)  # pyright: ignore
+        quick = Lean(body, torque, controller, first, ADJOINT, max_steps, throw)  # pyright: ignore
         return Solution(times, *solve(quick, state0, times), quick)
     setup = Setup(
         body=body,
@@ -153,9 +155,11 @@ def _can_collide(state0: Any, torque: Any) -> bool:
     return isinstance(state0, Point) and collision.event(scene_of(torque)) is not None
 
 
-@functools.cache
-def _controller(rtol: float, atol: float) -> Watched:
+def _watched(rtol: Any, atol: Any) -> Watched:
     return Watched(dfx.PIDController(rtol=rtol, atol=atol))
+
+
+_controller = functools.cache(_watched)
 
 
 def _adjoint(controller: dfx.AbstractStepSizeController) -> dfx.AbstractAdjoint:

@@ -152,17 +152,18 @@ def _written(method: Method, max_steps: int, given: Given, fixed: Fixed) -> Any:
 def _back(method: Method, max_steps: int, kept: Any, cotangents: Answer) -> tuple[Given, None]:
     given, fixed, book = kept
     stops, control, values = _set_up(method, max_steps, given, fixed)
-    none = jax.tree.map(jnp.zeros_like, (book.rows, book.length))
+    empty: Rows = jax.tree.map(jnp.zeros_like, book.rows)
     # The start's time counts as a stop, the first.
     ends = jnp.zeros(stops.begin.shape[0] + 1, given.t0.dtype)
-    sums = jax.tree.map(jnp.zeros_like, (given.constants, given.between))
-    bars = Bars(cotangents.end, *sums, ends)
+    constants = jax.tree.map(jnp.zeros_like, given.constants)
+    bars = Bars(cotangents.end, constants, jnp.zeros_like(given.between), ends)
 
     def steps(number: Array) -> tuple[Rows, Array]:
         walk: Any = jax.tree.map(lambda a: a[number], book.starts)
         # Another form of the same step: slower, but quick to compile, and seldom needed.
         looped = partial(linear.looped_step, method, values)
-        _, *again = march.recorded(looped, control, stops, walk, *none)
+        none = jnp.zeros_like(book.length)
+        _, *again = march.recorded(looped, control, stops, walk, empty, none)
         last = number == book.number - 1
         kept = book.rows, book.length
         return jax.tree.map(lambda a, b: jnp.where(last, a, b), kept, tuple(again))

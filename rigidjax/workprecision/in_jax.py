@@ -69,11 +69,7 @@ def _closed(scene: Scene) -> Flow | None:
 
 
 def _simulate(scene: Scene, adjoint: Any = None) -> Flow | None:
-    """The front door with its defaults, but for the tolerance.
-
-    That is traced here, so that one compiled call does for all: `simulate` cannot see that it is
-    below 1e-10, where it would keep more checkpoints for `jax.grad`.
-    """
+    """The front door with its defaults, but for the tolerance: traced, so that one program does."""
     if scene.torque is None:
         return None
 
@@ -81,9 +77,7 @@ def _simulate(scene: Scene, adjoint: Any = None) -> Flow | None:
         body, start = scene.assembled(numbers)
         out = simulate(
             body, start, jnp.array([0.0, scene.end], numbers.dtype), scene.torque,
-            # The default controller, with tolerances that one compiled call can change.
-            stepsize_controller=dfx.PIDController(rtol=setting, atol=1e-3 * setting),
-            adjoint=adjoint, throw=False, max_steps=MOST,
+            rtol=setting, atol=1e-3 * setting, adjoint=adjoint, throw=False, max_steps=MOST,
         )  # fmt: skip
         end: Any = jax.tree.map(lambda leaf: leaf[-1], out.ys)
         return scene.flat(end), out.stats["num_steps"]
@@ -96,7 +90,7 @@ def _field(scene: Scene, body: Any, start: Any) -> Any:
 
 
 def _lean(scene: Scene, solver: Any, way: Any = travel.forward) -> Flow:
-    """What `simulate(…, solver=DormandPrince8())` runs in."""
+    """What `simulate` runs in under a torque, without its front door, in both modes."""
 
     def flow(numbers: Any, setting: Any) -> tuple[Any, Any]:
         body, start = scene.assembled(numbers)
@@ -216,7 +210,7 @@ def methods_in_jax() -> list[Method]:
                 "forward": partial(
                     _slope, partial(_simulate, adjoint=dfx.ForwardMode()), jax.jacfwd
                 ),
-                "checkpointed": partial(_slope, _simulate, jax.grad),
+                "reverse": partial(_slope, _simulate, jax.grad),
             },
         ),
         Method(

@@ -145,6 +145,17 @@ def test_spins_about_the_middle_axis_for_ever():
             np.testing.assert_allclose(out[4:], row[6:9], rtol=2 * eps)
 
 
+def test_a_decay_onto_the_middle_axis_that_becomes_a_growth():
+    # What starts the growth is 1 % of what decays: 3e-12 of it came out wrong, here it is 1e-13.
+    row = inputs("triaxial", 1, [20.0])[0]
+    row[:3] = 0.40454242603437207, 0.7100584275377957, 0.9938117298832398
+    row[6:9] = -2.5121542427936372e-08, 1.84637397256503, -1.6376381917721502e-08
+    for t in (5.0, 15.0, 20.0, 25.0):
+        row[13] = t
+        got, wanted = np.asarray(value(row[None]))[0], [float(c) for c in truth(row)]
+        np.testing.assert_allclose(got[4:], wanted[4:], rtol=2e-13)
+
+
 @pytest.mark.slow
 def test_flips_that_take_long():
     # Half way between two flips from within 1e-14 of the middle axis: e^{33} of growth behind it.

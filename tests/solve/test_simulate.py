@@ -173,6 +173,19 @@ def test_second_call_with_other_numbers_compiles_nothing(torque):
     assert len(compiled) == first
 
 
+def test_a_traced_tolerance_compiles_once():
+    # ω = ω0 exp(−c t / I), from ω0 = 2, c = 0.5, I = 2, for each tolerance as far off as it says.
+    body, law = rj.Inertia.from_principal(2.0, 2.0, 2.0), rj.torques.Damping([0.5, 0.5, 0.5])
+
+    @jax.jit
+    def end(rtol):
+        return rj.simulate(body, rj.Spin([0.0, 0.0, 2.0]), [0.0, 8.0], law, rtol=rtol).ys.omega[-1]
+
+    errors = [abs(float(end(jnp.asarray(rtol))[2]) - 2 * np.exp(-2.0)) for rtol in (1e-4, 1e-10)]
+    assert 1e-10 < errors[0] < 1e-4 and errors[1] < 1e-10
+    assert end._cache_size() == 1
+
+
 def test_vmap_over_bodies_states_and_torques():
     scales = jnp.linspace(0.5, 2.0, 5)
 
