@@ -118,7 +118,7 @@ def simulate(
     else:
         tolerances: Any = inputs.tolerances(rtol, atol, batch.dtype)
         solver = DormandPrince8() if method is None else method
-        how = _Adaptive(solver, *tolerances, max_steps, adjoint)
+        how = _Adaptive(solver, tolerances[0], tolerances[1], max_steps, adjoint)
     mesh = mesh_of(devices)
     plan = _Plan(how, chunk_of(chunk, batch.dtype, batch.many), mesh)
     numbers = (batch.shared, batch.each, ts)
