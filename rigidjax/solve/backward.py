@@ -18,7 +18,7 @@ from rigidjax.solve.scalarise import atoms_of, gathered
 from rigidjax.solve.together import anywhere
 
 # Steps and saved states that are worked on side by side.
-LANES = 64
+LANES = 32
 
 
 class Chapter(NamedTuple):
