@@ -17,7 +17,7 @@ gathered (`hosts.gather`) only if one process needs them all; else each writes i
 (`hosts.save`). *To be expected:* a run's time is that of the slowest share. Shares are equal
 in number, so equal steps scale with cores; adaptive steps are dealt between the devices of a
 process by speed, not between processes: shuffle bodies before `share`. An iteration of a fit adds
-one all-reduce of a few kilobytes, against some 40 ms for the gradient of 1000 bodies over 1000
+one all-reduce of a few kilobytes, against 35 to 55 ms for the gradient of 1000 bodies over 1000
 steps: with 1000 bodies a process it counts for little. *When one dies* all end within `patience`;
 shares written before the collective are recovered, the others run again.
 """

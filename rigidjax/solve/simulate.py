@@ -87,7 +87,8 @@ def simulate(
     - `max_steps`, `progress_meter`: as in `diffrax.diffeqsolve`.
     - `throw`: `False` never raises for numbers met on the way, or for a bad start inside a batch:
       `result` says what happened, states not reached are NaN, and other bodies of the batch get
-      what they would get without the bad one, to the last bit. Known numbers that are wrong are refused in any case.
+      what they would get without the bad one, to the last bit. Known numbers that are wrong are
+      refused in any case.
 
     **Returns** a `Solution`. A second call with other numbers of the same shapes compiles nothing.
 

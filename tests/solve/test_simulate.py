@@ -55,7 +55,11 @@ def test_basilisk_hub(torque):
     np.testing.assert_allclose(end.omega[-1], omega, atol=1e-9)
 
 
-@WAYS
+@pytest.mark.parametrize(
+    "torque",
+    # The closed form's have a test of their own in tests/exact.
+    [pytest.param(None, id="free", marks=pytest.mark.slow), pytest.param(Nothing(), id="solver")],
+)
 @pytest.mark.parametrize("mode", ["forward", "reverse"])
 def test_derivatives_against_fifty_digits(torque, mode):
     adjoint, jac = {
