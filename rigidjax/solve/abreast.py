@@ -2,7 +2,7 @@
 
 One body has to work out the derivatives of many steps side by side, for every cotangent that may
 come. Many bodies fill the lanes by themselves: here a step waits for its cotangent, and one vjp of
-the field at each stage is all there is to do: a quarter of the arithmetic, and it stays in cache.
+the field at each stage is all there is to do.
 """
 
 from functools import partial
@@ -20,8 +20,8 @@ from rigidjax.solve.march import Rows
 from rigidjax.solve.method import Method, spread
 from rigidjax.solve.scalarise import atoms_of, gathered
 
-# Bodies abreast, so that the stages of a step stay in the second cache; fewer than `_FEW` do not
-# pay for the many small loops over them.
+# Bodies abreast, so that on CPU the stages of a step stay in the second cache; fewer than `_FEW` do
+# not pay for the many small loops over them.
 _ABREAST, _FEW = 128, 8
 
 
@@ -48,7 +48,7 @@ def _batched(method: Method, size: int, batched: Any, *given: Any) -> tuple[Bars
 def _abreast(method: Method, chapter: Chapter, bars: Bars) -> Bars:
     """All bodies, some at a time."""
     size = chapter.length.shape[0]
-    some = min(_ABREAST, size)
+    some = min(_ABREAST, size) if jax.default_backend() == "cpu" else size
     bars0, one = bars, jax.tree.map(lambda a: a[0], chapter.constants)
     values = spread(eqx.combine(one, chapter.rest))
     _, replaced = atoms_of(values)

@@ -114,8 +114,8 @@ def simulate(
     controller = stepsize_controller
     if controller is None:
         rtol, atol = inputs.tolerances(rtol, atol, dtype)
-        known: Any = _controller if _checks.known((rtol, atol)) else _watched
-        controller = known(rtol, atol)
+        make: Any = _controller if _checks.known((rtol, atol)) else _watched
+        controller = make(rtol, atol)
         if hasattr(torque, "jump_times") and jumps_of(torque).size:
             # An adaptive step passes over a short pulse without seeing it.
             jump_ts = jnp.sort(jumps_of(torque).astype(dtype))
@@ -127,7 +127,7 @@ def simulate(
     if torque is None and solver is None and stepsize_controller is None and body is not None:
         free = Free(body, throw)
         return Solution(times, *solve(free, state0, times), free)
-    # A point's gradient takes our loop 17 s to compile (Arenstorf; diffrax 3): only if asked for.
+    # A point's gradient takes our loop 14 s to compile (Arenstorf; diffrax 3): only if asked for.
     ours = isinstance(solver, DormandPrince8) or (solver is None and body is not None)
     plain = ours and stepsize_controller is None and progress_meter is None
     # Forward mode stays with diffrax: there our loop is faster, but takes far longer to compile.
