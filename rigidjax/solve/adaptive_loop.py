@@ -17,6 +17,7 @@ from jax import lax
 from jaxtyping import Array
 
 from rigidjax.solve import runge_kutta
+from rigidjax.solve.components import lift
 from rigidjax.solve.runge_kutta import Field, Step
 from rigidjax.solve.tableaus import Tableau
 
@@ -217,13 +218,13 @@ def _attempt(
     after = Walk(
         jnp.where(accept, jnp.where(reached, begin, late), walk.t),
         following,
-        jnp.where(accept, y, walk.y),
-        walk.stop + (arrived | reached),
-        walk.steps + moving,
-        walk.rejected + (moving & ~accept),
+        jnp.where(lift(accept, y), y, walk.y),
+        walk.stop + (arrived | reached).astype(jnp.int32),
+        walk.steps + moving.astype(jnp.int32),
+        walk.rejected + (moving & ~accept).astype(jnp.int32),
     )
     taken = jnp.where(accept, h, jnp.zeros_like(h))
-    return after, (taken, 2 * walk.stop + reached)
+    return after, (taken, 2 * walk.stop + reached.astype(jnp.int32))
 
 
 def recorded(
@@ -349,12 +350,12 @@ def _saved(
 
     def batch(saved: Any) -> Any:
         ys, known = saved
-        place = known + each
+        place = lift(known, each) + each
         late = per_body(lambda a, i: a[i], bodies)(run.between, jnp.minimum(place, size - 1))
-        ready = (place < size) & (late <= reach)
-        _, _, step = within(run, rows, count, jnp.where(ready, late, reach))
+        ready = (place < size) & (late <= lift(reach, late))
+        _, _, step = within(run, rows, count, jnp.where(ready, late, lift(reach, late)))
         found = wide.project(runge_kutta.stages(wide.tableau, wide.field, constants, step).end)
-        found = jnp.where(ready, found, jnp.nan)
+        found = jnp.where(lift(ready, found), found, jnp.nan)
 
         def put(ys: Array, found: Array, known: Array) -> Array:
             return lax.dynamic_update_slice_in_dim(ys, found.T, known, 0)
@@ -371,13 +372,13 @@ def _kept(run: Run, saved: tuple[Array, Array]) -> Array:
 
 def _answer(run: Run, walk: Walk, between: Array) -> Answer:
     there = walk.stop >= run.stops.shape[0]
-    end = jnp.where(there, walk.y, jnp.nan)
+    end = jnp.where(lift(there, walk.y), walk.y, jnp.nan)
     return Answer(between, end, walk.t, walk.h, walk.steps, walk.rejected)
 
 
 def _size_of(error: Array, left: Array, right: Array, rtol: Array, atol: Array) -> Array:
     """Root mean square of error over tolerance, as `diffrax.PIDController` takes it."""
-    scale = atol + rtol * jnp.maximum(jnp.abs(left), jnp.abs(right))
+    scale = lift(atol, left) + lift(rtol, left) * jnp.maximum(jnp.abs(left), jnp.abs(right))
     tiny = float(jnp.finfo(error.dtype).tiny)
     return jnp.sqrt(jnp.mean((error / scale) ** 2, 0) + tiny)
 
@@ -385,7 +386,7 @@ def _size_of(error: Array, left: Array, right: Array, rtol: Array, atol: Array) 
 def _first_step(method: Method, constants: list[Array], run: Run, slope: Array) -> Array:
     """Hairer, Nørsett and Wanner (1993), II.4, algorithm for the starting step."""
     y0, t0 = run.y0, run.t0
-    scale = run.atol + run.rtol * jnp.abs(y0)
+    scale = lift(run.atol, y0) + lift(run.rtol, y0) * jnp.abs(y0)
 
     def norm(a: Array) -> Array:
         return jnp.sqrt(jnp.mean((a / scale) ** 2, 0))
@@ -393,7 +394,7 @@ def _first_step(method: Method, constants: list[Array], run: Run, slope: Array) 
     d0, d1 = norm(y0), norm(slope)
     small = (d0 < 1e-5) | (d1 < 1e-5)
     h = jnp.where(small, 1e-6, 0.01 * d0 / jnp.where(small, 1.0, d1)).astype(d0.dtype)
-    turned = method.field(constants, t0 + h.astype(t0.dtype), y0 + h * slope)
+    turned = method.field(constants, t0 + h.astype(t0.dtype), y0 + lift(h, y0) * slope)
     d2 = norm(turned - slope) / h
     largest = jnp.maximum(d1, d2)
     flat = largest <= 1e-15

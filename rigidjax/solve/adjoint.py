@@ -27,6 +27,7 @@ from rigidjax.solve.adaptive_loop import (
     side_by_side,
     within,
 )
+from rigidjax.solve.components import lift
 from rigidjax.solve.runge_kutta import Axes, Step
 
 _FEW = 8
@@ -100,7 +101,7 @@ def tangents(
                 method.tableau, method.field, constants, here, there, push, axes
             )
             after = project(method, there.end, after)
-            return jnp.where(here.h > 0, after, moved), path
+            return jnp.where(lift(here.h > 0, after), after, moved), path
 
         def some(group: Group, out: Array) -> Array:
             here, many = group.step, group.row.shape[0]
@@ -113,7 +114,7 @@ def tangents(
             after = runge_kutta.pushed(wide.tableau, wide.field, constants, here, there, push, axes)
             after = project(wide, there.end, after)
             old = _many_last(run, lax.dynamic_slice_in_dim(out, group.first, many, 0))
-            new = _many_first(run, jnp.where(group.ready, after, old))
+            new = _many_first(run, jnp.where(lift(group.ready, after), after, old))
             return lax.dynamic_update_slice_in_dim(out, new, group.first, 0)
 
         path = jnp.zeros((rows.shape[0], *moved.shape), moved.dtype)
@@ -155,7 +156,7 @@ def cotangents(
             extra, sums = both
             here, many = group.step, group.row.shape[0]
             bar = lax.dynamic_slice_in_dim(bars.between, group.first, many, 0)
-            bar = jnp.where(group.ready, _many_last(run, bar), 0.0)
+            bar = _where(group.ready, _many_last(run, bar))
             there = runge_kutta.stages(wide.tableau, wide.field, constants, here)
             bar = project(wide, there.end, bar)
             by_constants, by_t, by_h, by_y = runge_kutta.pulled(
@@ -164,7 +165,7 @@ def cotangents(
             # A body that is not there may be NaN, and its sum is shared with others.
             any_ready = jnp.any(group.ready, 0)
             total = _added(sums.constants, by_constants, any_ready)
-            by_t, by_h, by_y = (jnp.where(group.ready, by, 0.0) for by in (by_t, by_h, by_y))
+            by_t, by_h, by_y = (_where(group.ready, by) for by in (by_t, by_h, by_y))
             old = lax.dynamic_slice_in_dim(sums.between, group.first, many, 0)
             between = lax.dynamic_update_slice_in_dim(
                 sums.between, old + _many_first(run, by_h), group.first, 0
@@ -178,15 +179,15 @@ def cotangents(
             here, code = row_of(run, rows[i])
             there = runge_kutta.stages(method.tableau, method.field, constants, here)
             taken = here.h > 0
-            bar = jnp.where(taken, project(method, there.end, sums.y0), 0.0)
+            bar = _where(taken, project(method, there.end, sums.y0))
             by_constants, by_t, by_h, by_y = runge_kutta.pulled(
                 method.tableau, method.field, constants, here, there, bar, axes
             )
-            by_t, by_h = (jnp.where(taken, by, 0.0) for by in (by_t, by_h))
-            cut = jnp.where(code % 2 == 1, by_h, 0.0)
+            by_t, by_h = _where(taken, by_t), _where(taken, by_h)
+            cut = _where(code % 2 == 1, by_h)
             ends = _scattered(run, sums.ends, code // 2, by_t - cut)
             ends = _scattered(run, ends, code // 2 + 1, cut)
-            before = jnp.where(taken, by_y, sums.y0)
+            before = jnp.where(lift(taken, by_y), by_y, sums.y0)
             if extra is not None:
                 before = before + extra[i]
             return Inputs(_added(sums.constants, by_constants, taken), ends, sums.between, before)
@@ -216,7 +217,12 @@ def _own(run: Run, constant: Array) -> tuple[int, ...]:
 
 
 def _added(sums: list[Array], more: list[Array], there: Array) -> list[Array]:
-    return [a + jnp.where(there, b, 0.0) for a, b in zip(sums, more, strict=True)]
+    return [a + _where(there, b) for a, b in zip(sums, more, strict=True)]
+
+
+def _where(there: Array, a: Array) -> Array:
+    """`a` (…, *bodies), nothing where it is not `there`."""
+    return jnp.where(lift(there, a), a, jnp.zeros_like(a))
 
 
 def _segment(
@@ -236,7 +242,7 @@ def _segment(
 def _of_times(run: Run, code: Array, ends: Array) -> tuple[Array, Array]:
     """Tangents of a step's start and length, from those of the start's time and the stops."""
     of_t, of_stop = (_gathered(run, ends, i) for i in (code // 2, code // 2 + 1))
-    return of_t, jnp.where(code % 2 == 1, of_stop - of_t, 0.0)
+    return of_t, _where(code % 2 == 1, of_stop - of_t)
 
 
 def _gathered(run: Run, a: Array, index: Array) -> Array:
@@ -253,8 +259,8 @@ def _scattered(run: Run, a: Array, index: Array, by: Array) -> Array:
     """The transpose of `_gathered`, added to `a`."""
     if a.shape[0] <= _FEW and index.ndim == run.t0.ndim:
         # Few rows: to add to all of them is quicker than to look for one.
-        each = jnp.arange(a.shape[0]).reshape(-1, *[1] * by.ndim)
-        return a + jnp.where(each == index, by, 0.0)
+        each = jnp.arange(a.shape[0], dtype=jnp.int32).reshape(-1, *[1] * by.ndim)
+        return a + _where(lift(each == lift(index, each), a), jnp.broadcast_to(by[None], a.shape))
 
     def put(a: Array, index: Array, by: Array) -> Array:
         return a.at[index].add(jnp.moveaxis(by, -1, 0) if index.ndim else by)
@@ -283,16 +289,16 @@ def _over_groups(
     reach = jnp.where(code % 2 == 1, at(run.stops, code // 2), last.t + last.h)
     # Times that repeat the first one belong to the first segment.
     begin = jnp.where(begin <= run.t0, -jnp.inf, begin)
-    first = jnp.min(jnp.sum(run.between <= begin, 0))
-    most = jnp.max(jnp.sum(run.between <= reach, 0))
+    first = jnp.min(jnp.sum(run.between <= begin[None], 0, dtype=jnp.int32))
+    most = jnp.max(jnp.sum(run.between <= reach[None], 0, dtype=jnp.int32))
     each = jnp.arange(many, dtype=jnp.int32).reshape(-1, *[1] * run.t0.ndim)
 
     def group(number: Array, state: Any) -> Any:
         start = jnp.minimum(number * many, size - many)
         late = lax.dynamic_slice_in_dim(run.between, start, many, 0)
         # The last group begins early rather than ends late.
-        ready = (late > begin) & (late <= reach) & (start + each >= number * many)
-        row, code, step = within(run, rows, count, jnp.where(ready, late, reach))
+        ready = (late > begin[None]) & (late <= reach[None]) & (start + each >= number * many)
+        row, code, step = within(run, rows, count, jnp.where(ready, late, reach[None]))
         return function(Group(start, ready, row, code, step), state)
 
     return lax.fori_loop(first // many, (most + many - 1) // many, group, state)

@@ -78,3 +78,12 @@ def unflat(vector: Array, like: Any) -> Any:
         out.append(vector[begin : begin + math.prod(shape)].reshape(shape))
         begin += math.prod(shape)
     return jax.tree.unflatten(tree, out)
+
+
+def lift(a: Array, like: Array) -> Array:
+    """`a` with leading axes of length 1, as many axes as `like`: last axes are those they share.
+
+    >>> lift(jnp.zeros(3), jnp.zeros((5, 2, 3))).shape
+    (1, 1, 3)
+    """
+    return a.reshape((1,) * (like.ndim - a.ndim) + a.shape)

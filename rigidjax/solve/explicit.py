@@ -113,7 +113,8 @@ class Tsitouras5(AbstractExplicit):
 class DormandPrince8(AbstractExplicit):
     """The method DOP853 of order 8: twelve stages, estimates of orders 5 and 3.
 
-    For everything smooth, from 1e-4 to round-off. Projection as for `RungeKutta4`; dense output of degree 7, whose three more stages are computed only where it is asked for.
+    For everything smooth, from 1e-4 to round-off. Projection as for `RungeKutta4`; dense output of degree 7, whose three more stages are computed
+    only where it is asked for.
 
     Source: Hairer, Nørsett and Wanner (1993), II.5 and II.6, doi:10.1007/978-3-540-78862-1; after
     Prince and Dormand 1981, doi:10.1016/0771-050X(81)90010-3.
@@ -201,7 +202,7 @@ def _dense_rows(tableau: Tableau, field: Any, step: Step, end: Array, slopes: Ar
         nodes = jnp.asarray(tableau.extra_c, step.t.dtype)
 
         def extra(i: Array, slopes: Array) -> Array:
-            place = step.y + h * (weights[i] * slopes).sum(1)
+            place = step.y + h * (weights[i][None] * slopes).sum(1)
             slope = field([], step.t + nodes[i] * (step.end - step.t), place)
             return lax.dynamic_update_slice_in_dim(slopes, slope[:, None], begin + i, 1)
 
@@ -211,7 +212,7 @@ def _dense_rows(tableau: Tableau, field: Any, step: Step, end: Array, slopes: Ar
     for row in tableau.dense:
         weights = np.zeros(slopes.shape[1])
         weights[list(row)] = list(row.values())
-        out.append(h * (jnp.asarray(weights, end.dtype) * slopes).sum(1))
+        out.append(h * (jnp.asarray(weights, end.dtype)[None] * slopes).sum(1))
     return out
 
 

@@ -68,13 +68,11 @@ def in_lanes(
 
             def last(a: Any, is_batched: bool, has_bodies: bool) -> Any:
                 a = jnp.moveaxis(a, 0, -1) if is_batched else a[..., None]
-                if not has_bodies:
-                    a = a[..., None, :] if layout.bodies else a
-                shape = a.shape[: a.ndim - 2] + (count, size) if layout.bodies else None
-                if layout.bodies:
-                    a = jnp.broadcast_to(a, shape)
-                    return a.reshape(*a.shape[:-2], count * size)
-                return jnp.broadcast_to(a, (*a.shape[:-1], size))
+                if not layout.bodies:
+                    return jnp.broadcast_to(a, (*a.shape[:-1], size))
+                a = a if has_bodies else a[..., None, :]
+                a = jnp.broadcast_to(a, (*a.shape[:-2], count, size))
+                return a.reshape(*a.shape[:-2], count * size)
 
             constants = [
                 c if s else last(c, b, not before)

@@ -14,6 +14,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
+from rigidjax.solve.components import lift
 from rigidjax.solve.tableaus import Tableau
 
 # field(constants, t, y) → dy/dt, for t (*bodies), y (n, *bodies).
@@ -85,7 +86,7 @@ def stages(tableau: Tableau, field: Field, constants: list[Array], step: Step) -
     w = weights(tableau, step.y.dtype)
     count = w.b.shape[0]
     # Time may be kept in another precision than the state.
-    h = step.h.astype(step.y.dtype)
+    h = lift(step.h.astype(step.y.dtype), step.y)
 
     def stage(i: Array, both: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         times, places, slopes = both
@@ -109,8 +110,8 @@ def error_estimate(
     """The error of a step (n, *bodies).
 
     Two estimates e5, e3 make e5 |e5|/√(|e5|² + 0.01 |e3|²), which falls as h⁸ (Hairer, Nørsett and
-    Wanner 1993, II.10). The lengths are those of one array of the state, of `sizes` numbers, so that
-    no scale is mixed with another's.
+    Wanner 1993, II.10). The lengths are those of one array of the state, of `sizes` numbers: scales
+    are not mixed.
 
     **Arguments:** `slopes` (n, s, *bodies), `last` (n, *bodies) the slope at the end, if the
     tableau asks for it.
@@ -120,16 +121,16 @@ def error_estimate(
     # All sums at once: for one body each is a kernel of its own.
     rows = [_row({i: v for i, v in row.items() if i < count}, count) for row in tableau.errors]
     sums = jnp.asarray(np.stack(rows), dtype).reshape(len(rows), 1, count, *ones)
-    found = jnp.sum(sums * slopes, 2)
+    found = jnp.sum(sums * slopes[None], 2)
     if last is not None:
         ends = np.array([row.get(count, 0.0) for row in tableau.errors])
-        found = found + jnp.asarray(ends, dtype).reshape(-1, 1, *ones) * last
-    found = h.astype(dtype) * found
+        found = found + jnp.asarray(ends, dtype).reshape(-1, 1, *ones) * last[None]
+    found = lift(h.astype(dtype), found) * found
     if len(rows) == 1:
         return found[0]
     which = np.repeat(np.eye(len(sizes)), sizes, axis=1)
     which = jnp.asarray(which, dtype).reshape(*which.shape, *ones)
-    high, low = jnp.sum(which * (found * found)[:, None], 2)
+    high, low = jnp.sum(which[None] * (found * found)[:, None], 2)
     # The smallest normal number keeps 0/0 out; no real estimate is as small as its root.
     ratio = jnp.sqrt(high / (high + 0.01 * low + float(jnp.finfo(dtype).tiny)))
     return found[0] * jnp.sum(which * ratio[:, None], 0)
@@ -171,7 +172,7 @@ def pushed(
     """
     w = weights(tableau, step.y.dtype)
     of_constants, of_t, of_h, of_y = along
-    h, dh = step.h.astype(step.y.dtype), of_h.astype(step.y.dtype)
+    h, dh = (lift(a.astype(of_y.dtype), of_y) for a in (step.h, of_h))
     slopes = jnp.expand_dims(there.slopes, 2) if axes.directions else there.slopes
 
     def stage(i: Array, moved: Array) -> Array:
@@ -209,14 +210,16 @@ def pulled(
         below, seeds = both
         seed = w.b[m] * cotangent + _sum(w.a[:, m], below)
         pull = jax.vjp(lambda y: field(constants, there.times[m], y), there.places[:, m])[1]
-        return _put(below, axes.over(pull, 1, (1,))(h * seed)[0], m), _put(seeds, seed, m)
+        return _put(below, axes.over(pull, 1, (1,))(lift(h, seed) * seed)[0], m), _put(
+            seeds, seed, m
+        )
 
     none = jnp.zeros((cotangent.shape[0], count, *cotangent.shape[1:]), cotangent.dtype)
     below, seeds = lax.fori_loop(np.int32(0), np.int32(count), stage, (none, none))
     # The constants' share of all stages at once: it does not wait for the others.
     every = jax.vmap(field, (None, 0, 1), 1)
     pull = jax.vjp(lambda c, t: every(c, t, there.places), constants, there.times)[1]
-    by_constants, by_times = axes.over(pull, 2, (-1, 1))(h * seeds)
+    by_constants, by_times = axes.over(pull, 2, (-1, 1))(lift(h, seeds) * seeds)
     slopes = jnp.expand_dims(there.slopes, 2) if axes.directions else there.slopes
     by_length = jnp.sum(seeds * slopes, (0, 1)).astype(by_times.dtype)
     c = w.c.astype(by_times.dtype).reshape(-1, *[1] * (by_times.ndim - 1))
