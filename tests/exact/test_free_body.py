@@ -274,6 +274,22 @@ def test_first_derivatives_in_every_class():
         assert error < 1e-12, (GRADED[k // 2], error)
 
 
+def test_first_derivatives_at_any_size_and_rate():
+    # I → 2ᵏI, Ω → 2ʲΩ, t → 2⁻ʲt changes units only. As many rows as above: one program.
+    names = ("triaxial", "sphere", "plate", "axis 2", "rest")
+    x = np.concatenate([inputs(name, 1, [3.0]) for name in names])
+    units = ((0, 0), (700, -200), (-700, 200), (300, 350), (-1000, 0), (900, -20))
+    ins = [np.ldexp(1.0, [k] * 6 + [j] * 3 + [0] * 4 + [-j]) for k, j in units]
+    outs = [np.ldexp(1.0, [0] * 4 + [j] * 3) for _, j in units]
+    got = np.asarray(jacobian(jnp.asarray(np.concatenate([x * c for c in ins]))))
+    got = got.reshape(len(units), len(names), 7, 14)
+    for k, name in enumerate(names):
+        ref = true_jacobian(x[k], step="1e-22").astype(float)
+        for unit, c, out, j in zip(units, ins, outs, got[:, k], strict=True):
+            error = np.abs(j * c / out[:, None] - ref).max() / np.abs(ref).max()
+            assert error < 1e-12, (name, unit, error)
+
+
 @pytest.mark.slow
 def test_first_derivatives_of_full_tensors():
     names = ("triaxial", "sphere", "oblate", "near axis 2", "rest")
