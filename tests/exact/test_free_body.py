@@ -265,6 +265,7 @@ GRADED = [
 ]
 
 
+@pytest.mark.oldest
 def test_first_derivatives_in_every_class():
     x = np.concatenate([inputs(name, 2, [t]) for name, t in GRADED])
     got = np.asarray(jacobian(jnp.asarray(x)))
@@ -274,6 +275,7 @@ def test_first_derivatives_in_every_class():
         assert error < 1e-12, (GRADED[k // 2], error)
 
 
+@pytest.mark.oldest
 def test_first_derivatives_at_any_size_and_rate():
     # I → 2ᵏI, Ω → 2ʲΩ, t → 2⁻ʲt changes units only. As many rows as above: one program.
     names = ("triaxial", "sphere", "plate", "axis 2", "rest")
@@ -342,6 +344,7 @@ def _mean_precession(i, omega):
     return 2 * np.pi / (h * (m2 @ a[others] / m2.sum(1)).mean())
 
 
+@pytest.mark.oldest
 @pytest.mark.parametrize("omega", [(1.0, 0.5, 0.2), (0.3, 0.2, 0.9), (0.7, -0.3, 0.2)])
 def test_periods(omega):
     i = Inertia.from_principal(1.0, 3.0836, 3.235)

@@ -133,6 +133,7 @@ def test_many_chapters_are_one(monkeypatch):
     np.testing.assert_allclose(chapters, whole, rtol=1e-10, atol=1e-11)
 
 
+@pytest.mark.oldest
 @pytest.mark.parametrize("groups", [pytest.param(True, marks=pytest.mark.slow), False])
 def test_bodies_abreast_are_bodies_alone(monkeypatch, groups):
     # Steps of different number, jumps, saved times, a law of each body's own and one for all.
@@ -171,6 +172,7 @@ def test_bodies_abreast_are_bodies_alone(monkeypatch, groups):
             np.testing.assert_allclose(bend[k], bent(p[k], turn[k]), rtol=1e-8, atol=1e-8)
 
 
+@pytest.mark.oldest
 def test_through_simulate_each_rung_and_what_is_refused():
     ts = [0.0, 0.2, 1.0]
     damping = rj.torques.Damping([0.3, 0.3, 0.3])

@@ -34,6 +34,7 @@ def arrays(dtype):
     return xs, ns, np.array(products, dtype)
 
 
+@pytest.mark.oldest
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 def test_products_are_exact(dtype):
     xs, ns, want = arrays(dtype)
@@ -45,6 +46,7 @@ def test_products_are_exact(dtype):
     np.testing.assert_array_equal(np.array(known(xs)), want)
 
 
+@pytest.mark.oldest
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 def test_derivatives_are_exact(dtype):
     """Forward, reverse and second, of every x: 0 too, where those of `jnp.ldexp` were wrong."""
@@ -65,6 +67,7 @@ def test_derivatives_are_exact(dtype):
     )
 
 
+@pytest.mark.oldest
 def test_tangents_pass_where_the_power_is_out_of_range():
     """2ⁿ is no double, but its product with the tangent is."""
     for n, tangent in ((1030, 1e-5), (-1060, 1e300)):
@@ -72,6 +75,7 @@ def test_tangents_pass_where_the_power_is_out_of_range():
         assert moved == math.ldexp(tangent, n)
 
 
+@pytest.mark.oldest
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 def test_exponents(dtype):
     info = np.finfo(dtype)
