@@ -113,7 +113,8 @@ class Tsitouras5(AbstractExplicit):
 class DormandPrince8(AbstractExplicit):
     """The method DOP853 of order 8: twelve stages, estimates of orders 5 and 3.
 
-    For everything smooth, from 1e-4 to round-off. Projection as for `RungeKutta4`; dense output of degree 7, whose three more stages are computed
+    For everything smooth, from 1e-4 to round-off. Projection as for `RungeKutta4`; dense output of
+    degree 7, whose three more stages are computed
     only where it is asked for.
 
     Source: Hairer, Nørsett and Wanner (1993), II.5 and II.6, doi:10.1007/978-3-540-78862-1; after

@@ -142,6 +142,7 @@ def test_casimirs_are_kept_by_any_hamiltonian():
     np.testing.assert_allclose(rates, np.zeros(2), atol=1e-14)
 
 
+@pytest.mark.oldest
 def test_gradients_with_respect_to_the_numbers_of_a_lagrangian():
     start = lagrangian.Coordinates([0.3, 1.2, -0.4], [0.5, -0.2, 1.1])
     weights = jnp.array([0.3, -1.0, 0.7])

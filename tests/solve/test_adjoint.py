@@ -85,6 +85,7 @@ def test_reverse_is_forward_to_round_off_and_close_to_differences(name):
     np.testing.assert_allclose(back @ step, slope, rtol=1e-6)
 
 
+@pytest.mark.oldest
 @pytest.mark.parametrize(
     ("name", "ts"),
     [("wheel", (0.0, 0.6)), pytest.param("pulses", (0.0, 0.3, 1.1), marks=pytest.mark.slow)],
@@ -216,6 +217,7 @@ def test_bodies_in_lanes_are_bodies_alone(monkeypatch):
         np.testing.assert_allclose(bend[k], bent(p[k], turn[k]), rtol=1e-8, atol=1e-8)
 
 
+@pytest.mark.oldest
 def test_through_simulate_each_rung_and_what_is_refused():
     ts = [0.0, 0.2, 1.0]
     damping = rj.torques.Damping([0.3, 0.3, 0.3])

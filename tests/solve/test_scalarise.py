@@ -43,6 +43,7 @@ VECTOR = jnp.array([0.3, -0.7, 1.2])
 SQUARE = jnp.asarray(np.random.default_rng(1).normal(size=(3, 3)))
 
 
+@pytest.mark.oldest
 @pytest.mark.parametrize("function", list(FUNCTIONS.values()), ids=list(FUNCTIONS))
 def test_values_and_derivatives_are_the_same(function):
     def through(v, m):
