@@ -56,7 +56,8 @@ class Recording(eqx.Module):
         if t.ndim != 1 or t.size < 2:
             raise ValueError(f"t: wanted at least two times, shape (T,), got shape {t.shape}")
         if not np.isfinite(t).all():
-            raise ValueError(f"t: contains NaN at index {int(np.argmin(np.isfinite(t)))}")
+            index = int(np.argmin(np.isfinite(t)))
+            raise ValueError(f"t: contains NaN or infinity at index {index}")
         if (np.diff(t) <= 0).any():
             index = int(np.argmax(np.diff(t) <= 0)) + 1
             raise ValueError(f"t: wanted increasing times; t[{index}] is not above the one before")
