@@ -67,14 +67,16 @@ class Recording(eqx.Module):
         used = np.any([mask for _, _, mask in rows], axis=0)
         if used.sum() < 2:
             raise ValueError("Recording: wanted readings at two times at least; the rest is masked")
-        self.t = jnp.asarray(t[used])
+        # Told in reports, and no part of what a fit sees.
+        self.dropped = int((~used).sum())
+        # A long recording is not to be held once more than needed.
+        kept = used if self.dropped else slice(None)
+        self.t = jnp.asarray(t[kept])
         self.readings = tuple(
-            Reading(sensor, jnp.asarray(values[used]), jnp.asarray(mask[used]))
+            Reading(sensor, jnp.asarray(values[kept]), jnp.asarray(mask[kept]))
             for sensor, values, mask in rows
         )
         self.torque = torque
-        # Told in reports, and no part of what a fit sees.
-        self.dropped = int((~used).sum())
 
     @property
     def size(self) -> int:
@@ -115,8 +117,9 @@ def _reading(
     if not mask.any():
         raise ValueError(f"{name}: every reading is masked")
     # What is masked must not reach a derivative, for 0 · NaN is NaN: any reading will do instead.
-    shaped = mask.reshape(-1, *(1 for _ in across))
-    values = np.where(shaped, values, values[int(np.argmax(mask))])
+    if not mask.all():
+        shaped = mask.reshape(-1, *(1 for _ in across))
+        values = np.where(shaped, values, values[int(np.argmax(mask))])
     refusal = getattr(sensor, "refusal", None)
     if refusal is not None:
         wrong, why = refusal(values)
