@@ -33,14 +33,23 @@ class Position(NamedTuple):
     tried: Tried
 
 
+def require_folder(path: str | Path) -> None:
+    """Raise `ValueError` unless a file can be at `path`: before the search, not after a stride."""
+    path = Path(path)
+    if not path.parent.is_dir():
+        raise ValueError(f"checkpoint {path}: there is no folder {path.parent}")
+    if path.is_dir():
+        raise ValueError(f"checkpoint {path}: wanted a file, this is a folder")
+
+
 class Checkpoint:
     """What a long search has found so far, on disk after every stride of steps.
 
     **Arguments:** `path` of the file, or `None` to keep nothing; `like` a `Tried` of the right
     shapes; `print_of` a number that belongs to this problem alone.
 
-    **Raises:** `ValueError` for a file that is no checkpoint, is cut, or belongs to another problem
-    (it is not overwritten), and for a folder that does not exist.
+    **Raises:** `ValueError` for a file that is no checkpoint, is cut, or belongs to another problem;
+    it is not overwritten.
     """
 
     def __init__(self, path: str | Path | None, like: Tried, print_of: float):
@@ -48,14 +57,7 @@ class Checkpoint:
         self.print_of = print_of
         self.done: list[Tried] = []
         self.position = Position(0, 0, like)
-        if self.path is None:
-            return
-        # Now, not after the first stride.
-        if not self.path.parent.is_dir():
-            raise ValueError(f"checkpoint {self.path}: there is no folder {self.path.parent}")
-        if self.path.is_dir():
-            raise ValueError(f"checkpoint {self.path}: wanted a file, this is a folder")
-        if self.path.exists():
+        if self.path is not None and self.path.exists():
             self._read(self.path)
 
     def save(self, done: Sequence[Tried], position: Position) -> None:

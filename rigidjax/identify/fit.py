@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.identify import reported, uncertainty, words
-from rigidjax.identify.checkpoint import Checkpoint, Position, Tried
+from rigidjax.identify.checkpoint import Checkpoint, Position, Tried, require_folder
 from rigidjax.identify.descent import Descent, descend
 from rigidjax.identify.pieces import WIDTHS, joined, pieces as in_pieces, with_width
 from rigidjax.identify.problem import Parameters, Problem, all_errors
@@ -198,6 +198,8 @@ def fit(
         raise ValueError(f"fit: wanted at least one start, got {min(starts, together)}")
     if checkpoint is not None and together > 1:
         raise ValueError("fit: a checkpoint goes with together=1, one start after another")
+    if checkpoint is not None:
+        require_folder(checkpoint)
     points = starting_points(problem, starts, jax.random.key(0) if key is None else key)
     noise, solver = _first_noise(problem), solver_for(tolerance)
     if descent is not None and not isinstance(descent, Descent):
