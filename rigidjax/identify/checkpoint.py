@@ -48,8 +48,8 @@ class Checkpoint:
     **Arguments:** `path` of the file, or `None` to keep nothing; `like` a `Tried` of the right
     shapes; `print_of` a number that belongs to this problem alone.
 
-    **Raises:** `ValueError` for a file that is no checkpoint, is cut, or belongs to another problem;
-    it is not overwritten.
+    **Raises:** `ValueError` for a file that is no checkpoint, is cut, or belongs to another
+    problem; it is not overwritten.
     """
 
     def __init__(self, path: str | Path | None, like: Tried, print_of: float):

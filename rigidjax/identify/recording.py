@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from rigidjax import _checks
 from rigidjax.identify.sensors import AbstractSensor
 from rigidjax.motion.torques import Torque
 
@@ -38,8 +39,9 @@ class Recording(eqx.Module):
     `torque`, by keyword, is what turned this body besides its own spin: a wheel whose speed was
     logged, a law with coefficients that a `Free` may move; `None` for none.
 
-    **Raises** `ValueError` for times that do not increase, a wrong shape, an unmasked NaN (with its
-    index), or a quaternion that is not unit.
+    **Raises** `TypeError` for numbers that are traced (which times are kept depends on them) and
+    what is no sensor; `ValueError` for times that do not increase, a wrong shape, an unmasked NaN
+    (with its index), or a quaternion that is not unit.
 
     >>> import rigidjax as rj
     >>> Recording([0.0, 1.0], (rj.identify.Gyro(0.01), [[1.0, 0, 0], [1.0, 0, 0]])).t.shape
@@ -52,6 +54,11 @@ class Recording(eqx.Module):
     dropped: int = eqx.field(static=True)
 
     def __init__(self, t: Any, *readings: tuple, torque: Torque | None = None):
+        if not _checks.known((t, [reading[1:] for reading in readings])):
+            raise TypeError(
+                "Recording: wanted known numbers for t and the readings, got traced ones; make the "
+                "recording outside of jit, vmap and grad, and give it to them as an argument"
+            )
         t = np.asarray(t, float)
         if t.ndim != 1 or t.size < 2:
             raise ValueError(f"t: wanted at least two times, shape (T,), got shape {t.shape}")
