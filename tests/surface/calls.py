@@ -7,9 +7,9 @@ from typing import Any
 
 from surface import public
 
-ALL = ("same", "single", "whole", "shape", "kind", "size", "nan", "inf")
+ALL = ("same", "single", "whole", "shape", "stranger", "kind", "size", "nan", "inf")
 # For what is dear to run: only what is refused before anything is computed.
-KINDS = ("kind", "shape")
+KINDS = ("stranger", "kind", "shape")
 TRANSFORMS = ("jit", "vmap", "grad", "jacfwd", "hessian", "scan", "checkpoint")
 
 

@@ -21,7 +21,9 @@ row("identify.Gyro", dict(noise=0.1, **vectors, offset=0.01))
 row("identify.Accelerometer", dict(noise=0.1, place=Y, gravity=W, **vectors, offset=0.01))
 row("identify.Magnetometer", dict(noise=0.1, field=Y, **vectors, offset=0.01))
 row("identify.AttitudeSensor", dict(noise=np.array([0.1, 0.2, 0.3]), mounting=V, offset=0.01))
-row("identify.Direction", dict(world=Y, noise=np.array([0.1, 0.2]), mounting=V, offset=0.01), **HOST)
+row(
+    "identify.Direction", dict(world=Y, noise=np.array([0.1, 0.2]), mounting=V, offset=0.01), **HOST
+)
 row("identify.Marker", dict(place=Y, noise=0.1, origin=V, offset=0.01))
 row("identify.quaternions_from_matrices", dict(matrices=np.stack([M, N])), **HOST)
 row(
@@ -99,7 +101,7 @@ row("identify.expected", lambda: dict(problem=s.problem(), parameters=plan()), g
 row(
     "identify.best_first_rate",
     lambda: dict(problem=s.problem(), body=s.inertia(), omega=W, max_steps=2),
-    groups=KINDS,
+    groups=("stranger",),
     **HOST,
 )
 row(
@@ -108,7 +110,7 @@ row(
         problem=s.problem(), starts=1, initial=plan(), key=jax.random.key(0), tolerance=1e-4,
         max_steps=30, together=1, pieces=1,
     ),
-    groups=KINDS,
+    groups=("stranger",),
     **HOST,
 )  # fmt: skip
 row("identify.pieces", lambda: dict(problem=s.problem(), count=3, width=1e-3), **HOST)
@@ -121,7 +123,7 @@ row(
         recordings=[s.recording(), s.recording()],
     ),
     run=lambda build, recordings: rj.identify.cross_validate(build, recordings, starts=1),
-    groups=KINDS,
+    groups=("stranger",),
     transforms=(),
 )
 row("identify.Fit.interval", lambda: dict(self=s.found(), level=0.9), arguments=("level",), **HOST)
@@ -156,7 +158,12 @@ row(
 )
 row("identify.report.as_dict", lambda: dict(fit=s.found()), groups=KINDS, transforms=())
 row("identify.report.numbers", dict(value=1.0, low=0.9, high=1.2), transforms=())
-row("identify.report.rows", lambda: dict(fit=s.found(), rate_unit="rad/s"), groups=KINDS, transforms=())
+row(
+    "identify.report.rows",
+    lambda: dict(fit=s.found(), rate_unit="rad/s"),
+    groups=KINDS,
+    transforms=(),
+)
 row("identify.report.table", dict(lines=[("a", 1.0, 0.9, 1.1, "s")]), transforms=())
 row("identify.report.verdict", lambda: dict(fit=s.found()), groups=KINDS, transforms=())
 for name in ("write_html", "write_json"):
@@ -177,7 +184,11 @@ leave_out(
 # Pictures.
 states = lambda: s.motion().ys
 times = lambda: np.asarray(s.motion().ts)
-row("plot.motion", lambda: dict(ts=times(), states=states(), attitude="axes", time_unit="s", rate_unit="rad/s"), transforms=())
+row(
+    "plot.motion",
+    lambda: dict(ts=times(), states=states(), attitude="axes", time_unit="s", rate_unit="rad/s"),
+    transforms=(),
+)
 row("plot.polhode", lambda: dict(inertia=s.inertia(), states=states(), energies=2), transforms=())
 row("plot.herpolhode", lambda: dict(inertia=s.inertia(), states=states()), transforms=())
 row("plot.body_axes", lambda: dict(states=states()), transforms=())
@@ -202,7 +213,12 @@ row(
     transforms=(),
 )  # fmt: skip
 row("plot.fit", lambda: dict(found=s.found(), index=0, time_unit="s"), groups=KINDS, transforms=())
-row("plot.residuals", lambda: dict(found=s.found(), index=0, time_unit="s"), groups=KINDS, transforms=())
+row(
+    "plot.residuals",
+    lambda: dict(found=s.found(), index=0, time_unit="s"),
+    groups=KINDS,
+    transforms=(),
+)
 row(
     "plot.tumble",
     lambda: dict(body=s.body(), ts=times(), states=states(), pictures=2, seconds=0.1),
@@ -217,7 +233,12 @@ wp = rj.workprecision
 row(
     "workprecision.Scene",
     lambda: dict(
-        name="mine", title="words", body=s.inertia(), state0=s.attitude(), torque=s.damping(), end=1.0
+        name="mine",
+        title="words",
+        body=s.inertia(),
+        state0=s.attitude(),
+        torque=s.damping(),
+        end=1.0,
     ),
     arguments=("body", "state0", "end"),
     groups=("same", *KINDS, "nan"),
@@ -227,21 +248,36 @@ for name in ("choose", "front", "table"):
     lines = "lines" if name == "table" else "records"
     row(
         f"workprecision.{name}",
-        lambda lines=lines: {lines: list(wp.choose(s.records()) if lines == "lines" else s.records())},
+        lambda lines=lines: {
+            lines: list(wp.choose(s.records()) if lines == "lines" else s.records())
+        },
         groups=KINDS,
         transforms=(),
     )
-row("workprecision.moved", lambda: dict(records=list(s.records()), stored=list(s.records())), groups=KINDS, transforms=())
+row(
+    "workprecision.moved",
+    lambda: dict(records=list(s.records()), stored=list(s.records())),
+    groups=KINDS,
+    transforms=(),
+)
 row("workprecision.time_to", lambda: dict(records=list(s.records()[:3]), error=1e-5), transforms=())
 row("workprecision.draw", lambda: dict(records=list(s.records())), groups=KINDS, transforms=())
 row("workprecision.methods", dict(group="ours"), transforms=())
 row("workprecision.scenes", transforms=())
-row("workprecision.diffrax_method", lambda: dict(solver=__import__("diffrax").Tsit5()), transforms=())
+row(
+    "workprecision.diffrax_method",
+    lambda: dict(solver=__import__("diffrax").Tsit5()),
+    transforms=(),
+)
 leave_out(
     "minutes of measuring: tests/workprecision",
     *(f"workprecision.{name}" for name in ("measure", "worked_out", "long_drift")),
 )
-leave_out("files of our own records: tests/workprecision", "workprecision.read_csv", "workprecision.write_csv")
+leave_out(
+    "files of our own records: tests/workprecision",
+    "workprecision.read_csv",
+    "workprecision.write_csv",
+)
 leave_out(
     "a record that is filled as it comes",
     *(f"workprecision.{n}" for n in ("Choice", "Method", "Ready", "Record", "Reference", "Run")),

@@ -96,9 +96,15 @@ for name in ("act", "evaluate"):
         ),
     )
 row("motion.torques.in_precision", lambda: dict(tree=s.body(), dtype="float64"), groups=("same",))
-row("motion.torques.jumps_of", lambda: dict(source=rj.torques.Pulses(TS, np.stack([V, W, Y]))), groups=("same", "single"))
+row(
+    "motion.torques.jumps_of",
+    lambda: dict(source=rj.torques.Pulses(TS, np.stack([V, W, Y]))),
+    groups=("same", "single"),
+)
 row("motion.torques.require_rung", lambda: dict(torque=s.top(), state=s.attitude()), transforms=())
-leave_out("abstract: made by subclassing", "motion.torques.AbstractForce", "motion.torques.AbstractTorque")
+leave_out(
+    "abstract: made by subclassing", "motion.torques.AbstractForce", "motion.torques.AbstractTorque"
+)
 
 # Moving frames.
 row("frames.Uniform", dict(omega=W))
@@ -161,7 +167,9 @@ for name in ("to_inertial", "from_inertial"):
 row("frames.Instant.translation", lambda: dict(self=s.frame().at(0.3)), arguments=())
 row(
     "frames.InFrame",
-    lambda: dict(frame=s.frame(), inside=lambda t, state: -state.x, potential=lambda x: jnp.sum(x * x)),
+    lambda: dict(
+        frame=s.frame(), inside=lambda t, state: -state.x, potential=lambda x: jnp.sum(x * x)
+    ),
 )
 row("frames.BodyInFrame", lambda: dict(frame=s.frame(), torque=s.damping()))
 row("frames.Force", dict(force=lambda t, state, body: -state.x), transforms=())
@@ -198,7 +206,9 @@ for name, given in {
         f"frames.scenes.ThreeBody.{name}",
         lambda given=given: dict(self=rj.scenes.cr3bp(0.3), **given),
         arguments=tuple(given),
-        transforms=() if name == "exponents" else ("jit", "vmap", "grad", "jacfwd", "hessian", "scan", "checkpoint"),
+        transforms=()
+        if name == "exponents"
+        else ("jit", "vmap", "grad", "jacfwd", "hessian", "scan", "checkpoint"),
     )
 row(
     "frames.scenes.ThreeBody.jacobi_constant",
@@ -239,7 +249,11 @@ row(
     lambda: dict(self=pendulum(), state=s.point(), t=0.3),
     arguments=("state", "t"),
 )
-row("frames.scenes.Hoop.equilibrium_angle", lambda: dict(self=rj.scenes.hoop(1.0, 5.0)), arguments=())
+row(
+    "frames.scenes.Hoop.equilibrium_angle",
+    lambda: dict(self=rj.scenes.hoop(1.0, 5.0)),
+    arguments=(),
+)
 row(
     "frames.scenes.Hoop.side_push",
     lambda: dict(self=rj.scenes.hoop(1.0, 5.0), state=s.point()),
@@ -253,7 +267,11 @@ row(
 
 # Closed form.
 row("exact.free_body", lambda: dict(inertia=s.inertia(), state0=s.attitude(), t=0.7))
-row("exact.FreeBody", lambda: dict(inertia=s.inertia(), state0=s.attitude()), transforms=("jit", "vmap", "scan"))
+row(
+    "exact.FreeBody",
+    lambda: dict(inertia=s.inertia(), state0=s.attitude()),
+    transforms=("jit", "vmap", "scan"),
+)
 row("exact.body_period", lambda: dict(inertia=s.inertia(), omega0=W))
 row("exact.precession_period", lambda: dict(inertia=s.inertia(), omega0=W))
 leave_out("diffrax makes them", "exact.FreeInterpolation", "solve.GroupInterpolation")
@@ -297,12 +315,21 @@ row(
         bodies=rj.Inertia(SYMMETRIC), states0=s.attitudes(), ts_or_steps=TS, torque=s.top(),
         rtol=1e-6, atol=1e-8, max_steps=1000, chunk=2,
     ),
+    groups=(*KINDS, "nan", "inf"),
     transforms=("jit", "grad"),
     traced=("bodies", "states0"),
 )  # fmt: skip
 row("batch.compiler_options", transforms=())
 row("cpu_flags", transforms=())
 for name in ("share", "gather", "total"):
-    row(f"batch.hosts.{name}", lambda: dict(tree=s.attitudes()), host=True, groups=("same", "single", *KINDS))
-leave_out("joins other processes, or writes: tests/batch/test_devices.py", *(f"batch.hosts.{n}" for n in ("connect", "save", "recover")))
+    row(
+        f"batch.hosts.{name}",
+        lambda: dict(tree=s.attitudes()),
+        host=True,
+        groups=("same", "single", *KINDS),
+    )
+leave_out(
+    "joins other processes, or writes: tests/batch/test_devices.py",
+    *(f"batch.hosts.{n}" for n in ("connect", "save", "recover")),
+)
 leave_out("batch.simulate, cpu_flags return them", "batch.Batch", "batch.CpuFlags")

@@ -56,7 +56,16 @@ row(
 )
 
 # Quaternions.
-for name in ("log", "conjugate", "to_xyzw", "normalise", "canonical", "angle", "to_matrix", "check"):
+for name in (
+    "log",
+    "conjugate",
+    "to_xyzw",
+    "normalise",
+    "canonical",
+    "angle",
+    "to_matrix",
+    "check",
+):
     row(f"rotation.quaternion.{name}", dict(q=Q))
 row("rotation.quaternion.exp", dict(v=V))
 row("rotation.quaternion.from_xyzw", dict(xyzw=Q))
@@ -124,7 +133,10 @@ row("body.energy_ellipsoid", lambda: dict(inertia=s.inertia(), energy=1.5))
 row("body.momentum_ellipsoid", lambda: dict(inertia=s.inertia(), momentum=1.5))
 row("body.equal_ellipsoid", lambda: dict(body=s.body()))
 row("body.kinetic_energy_about", lambda: dict(body=s.body(), q=Q, velocity=V, omega=W))
-row("body.kinetic_energy_of_generator", dict(second_moment=SECOND, generator=np.cross(np.eye(3), -W)))
+row(
+    "body.kinetic_energy_of_generator",
+    dict(second_moment=SECOND, generator=np.cross(np.eye(3), -W)),
+)
 row("body.kinetic_energy_of_matrix_rate", dict(second_moment=SECOND, matrix_rate=N))
 row("body.kinetic_energy_of_moments", dict(second_moments=np.array([1.0, 2.0, 1.5]), omega=W))
 row("kinetic_energy", lambda: dict(body=s.body(), state=s.rigid()))
@@ -165,11 +177,17 @@ row(
 )
 row(
     "body.shapes.quadrature",
-    dict(density=lambda r: 1.0 + r[0] ** 2, place=lambda u: u * jnp.array([1.0, 2.0, 3.0]), order=3),
+    dict(
+        density=lambda r: 1.0 + r[0] ** 2, place=lambda u: u * jnp.array([1.0, 2.0, 3.0]), order=3
+    ),
     transforms=(),
 )
 CORNERS = np.array([[0.0, 0, 0], [1, 0.1, 0], [0, 1.2, 0], [0.2, 0, 1]])
 FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
-row("body.shapes.mesh", dict(vertices=CORNERS, faces=FACES, density=6.0), traced=("vertices", "density"))
+row(
+    "body.shapes.mesh",
+    dict(vertices=CORNERS, faces=FACES, density=6.0),
+    traced=("vertices", "density"),
+)
 leave_out("reads a file: tests/body/test_meshes.py", "body.shapes.mesh_file")
 leave_out("a Protocol, for isinstance and type checkers", "HasAttitude", "HasPose", "HasSpin")

@@ -8,7 +8,9 @@ Run in a process of its own, where nothing checks types: what a user sees.
 import argparse
 import collections
 import fnmatch
+import inspect
 import json
+import resource
 import sys
 import time
 import warnings
@@ -26,7 +28,9 @@ from surface.calls import TABLE, Call
 RTOL = {"same": 1e-12, "single": 1e-3, "whole": 1e-12}
 
 
-def failures_of(call: Call, counts: collections.Counter) -> Iterator[tuple[str, str]]:
+def failures_of(
+    call: Call, counts: collections.Counter, transforms: bool = True
+) -> Iterator[tuple[str, str]]:
     """What a user would call wrong, as (where, what)."""
     given = call.given()
     good = judge.outcome(lambda: call.run(**given))
@@ -36,21 +40,22 @@ def failures_of(call: Call, counts: collections.Counter) -> Iterator[tuple[str, 
         return
     if judge.has_nan(good):
         yield "good call", f"gave a NaN: {good}"
-    compiled = None
+    may_be_none = _may_be_none(call)
     for argument, value in given.items():
-        if call.arguments is not None and argument not in call.arguments:
-            continue
-        if value is None:
+        if argument == "self" or (call.arguments is not None and argument not in call.arguments):
             continue
         for other in replace.replacements(value):
-            if other.group not in call.groups or (value is None and other.value is None):
+            if other.group not in call.groups:
+                continue
+            if other.value is None and argument in may_be_none:
                 continue
             counts["calls"] += 1
             counts[other.group] += 1
             what = _judged(call, given, argument, value, other, good)
             if what:
                 yield f"{argument}: {other.name}", what
-    yield from _transforms(call, given, good, counts)
+    if transforms:
+        yield from _transforms(call, given, counts)
 
 
 def _judged(
@@ -78,14 +83,19 @@ def _judged(
         if judge.has_nan(result) or not judge.all_finite(result) or judge.same(result, good, 0.0):
             return None
         return f"infinity is lost: {result}"
+    if other.group == "stranger":
+        return f"taken without a word: {result}"
     if judge.has_nan(result):
         return f"a silent NaN: {result}"
     return None
 
 
-def _transforms(
-    call: Call, given: dict, good: Any, counts: collections.Counter
-) -> Iterator[tuple[str, str]]:
+def _may_be_none(call: Call) -> set[str]:
+    parameters = inspect.signature(call.run).parameters
+    return {name for name, p in parameters.items() if p.default is None}
+
+
+def _transforms(call: Call, given: dict, counts: collections.Counter) -> Iterator[tuple[str, str]]:
     held = {
         name: value
         for name, value in given.items()
@@ -105,7 +115,9 @@ def _transforms(
         counts["calls"] += 1
         result = judge.outcome(lambda: jax.jit(run)(floats))
         if result.error is not None:
-            why = judge.raw(result.error, {w for n in held for w in judge.words_for(call.name, n, given[n])})
+            why = judge.raw(
+                result.error, {w for n in held for w in judge.words_for(call.name, n, given[n])}
+            )
             if why:
                 yield "under jit", f"{why}: {result}"
         return
@@ -114,18 +126,22 @@ def _transforms(
     wanted = [name for name in programs if name in call.transforms]
     counts["calls"] += len(wanted)
     counts["transforms"] += len(wanted)
-    values = {}
-    for name in wanted:
+    for name in list(wanted):
         try:
-            values[name] = jax.eval_shape(programs[name], floats)
+            jax.eval_shape(programs[name], floats)
         except Exception as error:
+            wanted.remove(name)
             yield f"under {name}", str(judge.Outcome(error=error))
-    wanted = [name for name in wanted if name in values]
-    result = judge.outcome(lambda: jax.jit(lambda x: {n: programs[n](x) for n in wanted})(floats))
-    if result.error is not None:
-        yield "under transforms", str(result)
+    # One program of all: compiling is what this costs.
+    together = jax.jit(
+        lambda x: {name: programs[name](x) for name in wanted},
+        compiler_options={"xla_backend_optimization_level": 0},
+    )
+    try:
+        values = jax.block_until_ready(together(floats))
+    except Exception as error:
+        yield "under transforms", str(judge.Outcome(error=error))
         return
-    values = jax.jit(lambda x: {n: programs[n](x) for n in wanted})(floats)
     yield from _compared(values, run(floats))
 
 
@@ -198,7 +214,9 @@ def _numbers(value: Any) -> Any:
 
 
 def _holds_floats(value: Any) -> bool:
-    if isinstance(value, str | int | bool) or (callable(value) and not isinstance(value, eqx.Module)):
+    if isinstance(value, str | int | bool) or (
+        callable(value) and not isinstance(value, eqx.Module)
+    ):
         return False
     return any(
         eqx.is_inexact_array_like(leaf) and not isinstance(leaf, complex)
@@ -206,22 +224,27 @@ def _holds_floats(value: Any) -> bool:
     )
 
 
-def run(patterns: list[str], say: bool) -> dict[str, Any]:
+def run(patterns: list[str], say: bool, transforms: bool) -> dict[str, Any]:
     """Go through the table."""
     import surface.table  # noqa: F401
 
     counts: collections.Counter = collections.Counter()
     found, times = [], {}
-    for name, call in TABLE.items():
+    for name, call in sorted(TABLE.items()):
         if patterns and not any(fnmatch.fnmatch(name, p) for p in patterns):
             continue
         before = time.process_time()
-        for where, what in failures_of(call, counts):
+        for where, what in failures_of(call, counts, transforms):
             found.append([name, where, what])
             if say:
-                print(f"{name} | {where} | {what}", flush=True)
+                print(f"{name} | {where} | {what[:400]}", flush=True)
         times[name] = round(time.process_time() - before, 2)
         counts["rows"] += 1
+        if counts["rows"] % 20 == 0:
+            # Linux lets a process have 65530 memory maps, and every program takes some.
+            jax.clear_caches()
+        memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024
+        print(f"{name}: {times[name]} s, {memory} MB", file=sys.stderr)
     return dict(counts=dict(counts), failures=found, times=times)
 
 
@@ -229,10 +252,11 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser()
     parser.add_argument("--only", action="append", default=[])
     parser.add_argument("--json")
+    parser.add_argument("--no-transforms", action="store_true")
     arguments = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     warnings.simplefilter("ignore")
-    out = run(arguments.only, say=True)
+    out = run(arguments.only, say=True, transforms=not arguments.no_transforms)
     slow = sorted(out["times"].items(), key=lambda item: -item[1])[:12]
     print(out["counts"], "failures:", len(out["failures"]))
     print("slowest:", slow, "CPU s:", round(time.process_time(), 1), file=sys.stderr)

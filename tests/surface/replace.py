@@ -21,6 +21,7 @@ class Replacement:
     - `same`: the same numbers in another form; refused, or the result is that of the good call;
     - `single`: the same numbers in fewer digits; refused, or the result agrees to those;
     - `whole`: integers; refused, or the result is that of `like`, the same numbers as floats;
+    - `stranger`: what cannot be meant: refused;
     - `shape`, `kind`: another shape, another kind of thing; refused, or numbers that are no NaN;
     - `size`: finite numbers that are zero, negative, or as large or small as floats get; as before;
     - `nan`, `inf`: not to be lost: refused, or the result is not finite either.
@@ -81,7 +82,7 @@ def _numbers(value: Any) -> Iterator[Replacement]:
     for kind in half:
         yield Replacement(jnp.dtype(kind).name, jnp.asarray(a, kind), "kind")
     yield Replacement("bool", a > 0, "kind")
-    yield Replacement("complex", a + 0j, "kind")
+    yield Replacement("complex", a + 0j, "stranger")
     yield Replacement("longdouble", a.astype(np.longdouble), "same")
 
     yield Replacement("empty", np.zeros((0,)), "shape")
@@ -112,14 +113,14 @@ def _numbers(value: Any) -> Iterator[Replacement]:
 
     yield from _strangers()
     yield Replacement("ragged", [[1.0], [1.0, 2.0]], "kind")
-    yield Replacement("list of None", [None] * max(a.size, 1), "kind")
-    yield Replacement("list of strings", ["1.0"] * max(a.size, 1), "kind")
-    yield Replacement("strings", np.array(["1.0"] * max(a.size, 1)), "kind")
-    yield Replacement("objects", np.array([None] * max(a.size, 1), object), "kind")
-    yield Replacement("dates", np.array(["2020-01-01"], "datetime64[s]"), "kind")
-    yield Replacement("key", jax.random.key(0), "kind")
-    yield Replacement("function", lambda *args: 1.0, "kind")
-    yield Replacement("state", rj.Spin([0.0, 0.0, 1.0]), "kind")
+    yield Replacement("list of None", [None] * max(a.size, 1), "stranger")
+    yield Replacement("list of strings", ["1.0"] * max(a.size, 1), "stranger")
+    yield Replacement("strings", np.array(["1.0"] * max(a.size, 1)), "stranger")
+    yield Replacement("objects", np.array([None] * max(a.size, 1), object), "stranger")
+    yield Replacement("dates", np.array(["2020-01-01"], "datetime64[s]"), "stranger")
+    yield Replacement("key", jax.random.key(0), "stranger")
+    yield Replacement("function", lambda *args: 1.0, "stranger")
+    yield Replacement("state", rj.Spin([0.0, 0.0, 1.0]), "stranger")
 
 
 def _whole_numbers(a: np.ndarray) -> Iterator[Replacement]:
@@ -150,9 +151,9 @@ def _counts(value: int) -> Iterator[Replacement]:
 
 
 def _words() -> Iterator[Replacement]:
-    yield Replacement("nonsense", "nonsense", "kind")
-    yield Replacement("empty string", "", "kind")
-    yield Replacement("bytes", b"abc", "kind")
+    yield Replacement("nonsense", "nonsense", "stranger")
+    yield Replacement("empty string", "", "stranger")
+    yield Replacement("bytes", b"abc", "stranger")
     yield Replacement("array", np.ones(3), "kind")
     yield from _strangers(strings=False)
 
@@ -183,21 +184,22 @@ def _trees(value: Any) -> Iterator[Replacement]:
         yield Replacement("zero", _first(value, jnp.zeros_like), "size")
         yield Replacement("negative", _first(value, jnp.negative), "size")
         yield Replacement("its array", np.asarray(floats[0]), "kind")
-        yield Replacement("leaves are objects", _with(value, lambda a: object()), "kind")
-        yield Replacement("leaves are None", _with(value, lambda a: None), "kind")
+        yield Replacement("leaves are objects", _with(value, lambda a: object()), "stranger")
+        yield Replacement("leaves are None", _with(value, lambda a: None), "stranger")
     yield from _strangers()
-    yield Replacement("its class", type(value), "kind")
+    yield Replacement("its class", type(value), "stranger")
     yield Replacement("a list of it", [value], "kind")
-    yield Replacement("another Module", Wrong(), "kind")
+    yield Replacement("another Module", Wrong(), "stranger")
     for stranger in (rj.Point([1.0, 0, 0], [0.0, 1, 0]), rj.Spin([0.0, 0, 1.0])):
         if type(stranger) is not type(value):
             yield Replacement(type(stranger).__name__, stranger, "kind")
 
 
 def _several(value: Any) -> Iterator[Replacement]:
-    yield Replacement("nothing in it", type(value)(), "kind")
-    yield Replacement("list of None", [None], "kind")
-    yield Replacement("list of strings", ["a"], "kind")
+    if type(value) in (list, tuple, dict):
+        yield Replacement("nothing in it", type(value)(), "kind")
+    yield Replacement("list of None", [None], "stranger")
+    yield Replacement("list of strings", ["a"], "stranger")
     yield Replacement("array", np.ones(3), "kind")
     yield from _strangers()
 
@@ -213,16 +215,16 @@ def _functions() -> Iterator[Replacement]:
 
 
 def _strangers(strings: bool = True) -> Iterator[Replacement]:
-    yield Replacement("None", None, "kind")
+    yield Replacement("None", None, "stranger")
     if strings:
-        yield Replacement("string", "abc", "kind")
-        yield Replacement("number in words", "1.0", "kind")
-    yield Replacement("object", object(), "kind")
-    yield Replacement("dict", {}, "kind")
-    yield Replacement("class", dict, "kind")
-    yield Replacement("empty list", [], "kind")
+        yield Replacement("string", "abc", "stranger")
+        yield Replacement("number in words", "1.0", "stranger")
+    yield Replacement("object", object(), "stranger")
+    yield Replacement("dict", {}, "stranger")
+    yield Replacement("class", dict, "stranger")
+    yield Replacement("empty list", [], "stranger")
     if not strings:
-        yield Replacement("number", 3.0, "kind")
+        yield Replacement("number", 3.0, "stranger")
 
 
 def with_floats(value: Any, change: Callable[[Any], Any]) -> Any:

@@ -161,9 +161,13 @@ def act(
     >>> from rigidjax import Inertia, Spin, torques
     >>> act(torques.ConstantTorque([0.0, 0, 1]), 0.0, Spin([0.0, 0, 1]), Inertia(jnp.eye(3)))[0]
     """
+    require_law(law)
+    _checks.single(state, HasSpin, "state", wanted="a Spin, an Attitude or a Rigid")
+    _checks.single(body, (Inertia, MassProperties), "body")
     dtype = state.omega.dtype
+    t = _checks.floating(t, (), "t").astype(dtype)
     # A table in float64 must not lift a float32 solve, nor stop it under strict promotion.
-    found = in_precision(law, dtype)(jnp.asarray(t, dtype), state, in_precision(body, dtype))
+    found = in_precision(law, dtype)(t, state, in_precision(body, dtype))
     # Not by class: laws of the moving frames give one too, and know nothing of this floor.
     if hasattr(found, "force"):
         return found.force.astype(dtype), found.torque.astype(dtype)
