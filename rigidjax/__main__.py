@@ -2,6 +2,7 @@
 
 import argparse
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,9 @@ import jax
 
 import rigidjax as rj
 from rigidjax.workprecision import command
+
+# What the demo heeds as well; all else says how logs are to be read.
+_OF_ALL = ("starts", "checkpoint", "figure", "report", "json")
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -24,7 +28,19 @@ def main(arguments: list[str] | None = None) -> int:
         return command.run(options)
     if options.demo == bool(options.logs):
         parser.error("identify: give either log FILES or --demo")
-    return _demo(options) if options.demo else _logs(options)
+    for path in (options.figure, options.report, options.json):
+        # Now, not after the fit.
+        if path is not None and not path.parent.is_dir():
+            parser.error(f"{path}: there is no folder {path.parent}")
+    if options.demo:
+        plain = vars(parser.parse_args(["identify", "--demo"]))
+        given = [name for name, value in vars(options).items() if value != plain[name]]
+        odd = sorted(set(given) - set(_OF_ALL))
+        if odd:
+            names = ", ".join("--" + name.replace("_", "-") for name in odd)
+            parser.error(f"identify --demo: {names} is for log FILES only")
+        return _demo(options)
+    return _logs(options)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -112,17 +128,19 @@ def _demo(options: argparse.Namespace) -> int:
 
     print("4179 Toutatis, 17 radar observations, 2 to 18 December 1992")
     print(f"data: {toutatis.CITATION}\n")
-    found = rj.identify.fit(toutatis.problem(), starts=options.starts or 16, progress=_say)
+    found = _fit(toutatis.problem(), options, 16)
+    if found is None:
+        return 2
+    more = toutatis.rows(found)
     print()
-    print(
-        rj.identify.report.table(rj.identify.report.rows(found, "deg/day") + toutatis.rows(found))
-    )
+    print(rj.identify.report.table(rj.identify.report.rows(found, "deg/day") + more))
     print(f"\nrms of the attitudes: {toutatis.rms_degrees(found):.1f} deg")
     print(toutatis.remarks(found))
     print(rj.identify.report.verdict(found))
-    figure = options.figure or Path("toutatis.png")
-    _draw(found, figure, time_unit="day", rate_unit="deg/day", title="4179 Toutatis, December 1992")
-    return 0 if found.ok else 1
+    title = "4179 Toutatis, December 1992"
+    units = {"time_unit": "day", "rate_unit": "deg/day"}
+    _draw(found, options.figure or Path("toutatis.png"), title=title, **units)
+    return _write(found, options, title, [toutatis.CITATION], [title], units, more)
 
 
 def _logs(options: argparse.Namespace) -> int:
@@ -160,12 +178,8 @@ def _logs(options: argparse.Namespace) -> int:
     for path, record in zip(options.logs, records, strict=True):
         print(f"{path}: {_extent(record)}")
     print()
-    try:
-        found = rj.identify.fit(
-            problem, starts=options.starts or 8, progress=_say, checkpoint=options.checkpoint
-        )
-    except ValueError as error:
-        print(f"error: {error}", file=sys.stderr)
+    found = _fit(problem, options, 8)
+    if found is None:
         return 2
     rate_unit = next((c.unit for c in channels if c.kind == "gyro" and c.unit != "rpm"), "rad/s")
     print()
@@ -176,7 +190,25 @@ def _logs(options: argparse.Namespace) -> int:
         print(f"\nrms of the {type(sensor).__name__}: {rms * scale:.4g} {unit}", end="")
     print()
     print(rj.identify.report.verdict(found))
-    return _write(found, options, rate_unit)
+    names = [Path(path).name for path in options.logs]
+    if options.figure is not None:
+        _draw(found, options.figure, rate_unit=rate_unit, title=names[0])
+    title = f"Identification of {', '.join(names[:3])}{' …' if names[3:] else ''}"
+    return _write(found, options, title, names, names, {"rate_unit": rate_unit})
+
+
+def _fit(problem: rj.identify.Problem, options: argparse.Namespace, starts: int) -> Any:
+    """The fit, or `None` after a line on what is wrong."""
+    try:
+        return rj.identify.fit(
+            problem,
+            starts=options.starts or starts,
+            progress=_say,
+            checkpoint=options.checkpoint,
+        )
+    except (OSError, ValueError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return None
 
 
 def _extent(record: rj.identify.Recording) -> str:
@@ -186,23 +218,29 @@ def _extent(record: rj.identify.Recording) -> str:
     return f"{count} samples over {record.t[-1] - record.t[0]:.4g} s{told}"
 
 
-def _write(found: Any, options: argparse.Namespace, rate_unit: str) -> int:
-    names = [Path(path).name for path in options.logs]
-    if options.figure is not None:
-        _draw(found, options.figure, rate_unit=rate_unit, title=names[0])
+def _write(
+    found: Any,
+    options: argparse.Namespace,
+    title: str,
+    read: list[str],
+    names: list[str],
+    units: dict[str, str],
+    more: Sequence[tuple[str, float, float, float, str]] = (),
+) -> int:
+    """The report and the numbers, where asked for; the exit code."""
     try:
         if options.json is not None:
-            rj.identify.report.write_json(found, options.json, names)
+            rj.identify.report.write_json(found, options.json, read, more)
             print(f"numbers: {options.json}")
         if options.report is not None:
-            figures = _figures(found, names, rate_unit)
             rj.identify.report.write_html(
                 found,
                 options.report,
-                title=f"Identification of {', '.join(names[:3])}{' …' if names[3:] else ''}",
-                figures=figures,
-                rate_unit=rate_unit,
-                files=names,
+                title=title,
+                figures=_figures(found, names, units),
+                rate_unit=units["rate_unit"],
+                files=read,
+                more=more,
             )
             print(f"report: {options.report}")
     except OSError as error:
@@ -211,7 +249,7 @@ def _write(found: Any, options: argparse.Namespace, rate_unit: str) -> int:
     return 0 if found.ok else 1
 
 
-def _figures(found: Any, names: list[str], rate_unit: str) -> list[Any]:
+def _figures(found: Any, names: list[str], units: dict[str, str]) -> list[Any]:
     try:
         import matplotlib
     except ModuleNotFoundError:
@@ -219,10 +257,14 @@ def _figures(found: Any, names: list[str], rate_unit: str) -> list[Any]:
         return []
     matplotlib.use("Agg")
     figures = [
-        rj.plot.fit(found, index=index, rate_unit=rate_unit, title=name)
+        rj.plot.fit(found, index=index, title=name, **units)
         for index, name in enumerate(names[:12])
     ]
-    more = (rj.plot.residuals(found).flat[0], rj.plot.inertia_ellipsoid(found)[0])
+    time_unit = units.get("time_unit", "s")
+    more = (
+        rj.plot.residuals(found, time_unit=time_unit).flat[0],
+        rj.plot.inertia_ellipsoid(found)[0],
+    )
     return [*figures, *(axis.figure for axis in more)]
 
 

@@ -70,13 +70,31 @@ def numbers(value: Any, name: str) -> Array:
     return array
 
 
+def same_batch(**arrays: tuple[Array, int]) -> None:
+    """Refuse arrays whose leading axes, before the last `n` of each, differ.
+
+    **Arguments:** `name=(array, n)`, for each part of one container. A container of many bodies has
+    the same leading axes everywhere; one body has none.
+
+    **Raises:** `ValueError`.
+    """
+    leading = {name: a.shape[: a.ndim - n] for name, (a, n) in arrays.items()}
+    if len(set(leading.values())) > 1:
+        found = ", ".join(f"{name} {a.shape}" for name, (a, _) in arrays.items())
+        wanted = ", ".join(f"{name} {a.shape[a.ndim - n :]}" for name, (a, n) in arrays.items())
+        raise ValueError(
+            f"{', '.join(arrays)}: wanted one of each, {wanted}, or the same leading axes before "
+            f"all of them, got shapes {found}"
+        )
+
+
 @functools.cache
 def _warn_of_lost_digits() -> None:
     # Cached: once in a process.
     warnings.warn(
         "rigidjax: float64 numbers become float32, seven digits, because JAX's 64 bits are off; "
         "set jax.config.update('jax_enable_x64', True), or pass float32 if that is meant",
-        stacklevel=4,
+        stacklevel=5,
     )
 
 

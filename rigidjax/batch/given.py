@@ -127,9 +127,9 @@ def _positive(tensor: Array) -> None:
         bad = (a[:, 0, 0] <= 0) | (minor <= 0) | (whole <= 0)
     if bad.any():
         i = int(np.argmax(bad))
-        raise ValueError(
-            f"bodies: wanted positive moments, got {np.linalg.eigvalsh(a[i])} kg m² of body {i}"
-        )
+        # With a NaN beside the bad number there are no moments to show.
+        found = f"{np.linalg.eigvalsh(a[i])} kg m²" if np.isfinite(a[i]).all() else f"{a[i]}"
+        raise ValueError(f"bodies: wanted positive moments, got {found} of body {i}")
 
 
 def _unit(q: Array) -> None:
@@ -168,8 +168,12 @@ def step_of(step_size: Any, num_steps: Any, dtype: Any) -> tuple[Array, int]:
 
 
 def time_of(value: Any, dtype: Any) -> Array:
-    """A scalar time, s."""
-    return jnp.asarray(_checks.floating(value, (), "t0"), dtype)
+    """A scalar time, s.
+
+    **Raises:** `ValueError` for one that is known and not finite.
+    """
+    t0 = _checks.floating(value, (), "t0")
+    return (_checks.finite(t0, "t0") if _checks.known(t0) else t0).astype(dtype)
 
 
 def start_of(state0: Any) -> Any:

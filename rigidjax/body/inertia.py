@@ -173,8 +173,9 @@ class MassProperties(eqx.Module):
     eq 60). Values that are known (not traced) are checked; under `jit` call `checked`. Leading
     axes are allowed in a container of many bodies; methods take one.
 
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype, a mass that is not positive,
-    a second moment that is not symmetric and positive semi-definite.
+    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype, leading axes that differ (a
+    body has one mass, not one for each axis), a mass that is not positive, a centre of mass that is
+    not finite, a second moment that is not symmetric and positive semi-definite.
 
     >>> MassProperties(2.0, [0.0, 0, 0], [[1.0, 0, 0], [0, 1, 0], [0, 0, 1]]).inertia.moments
     Array([2., 2., 2.], dtype=float64)
@@ -193,9 +194,10 @@ class MassProperties(eqx.Module):
         mass = _checks.floating(mass, (), "mass", batched=True)
         com = _checks.floating(com, (3,), "com", batched=True)
         second_moment = _checks.floating(second_moment, (3, 3), "second_moment", batched=True)
+        _checks.same_batch(mass=(mass, 0), com=(com, 1), second_moment=(second_moment, 2))
         dtype = jnp.result_type(mass, com, second_moment)
         self.mass = physical.if_known(physical.real_mass, mass.astype(dtype))
-        self.com = com.astype(dtype)
+        self.com = physical.if_known(physical.real_place, com.astype(dtype))
         self.second_moment = physical.if_known(
             physical.real_second_moment, second_moment.astype(dtype)
         )
@@ -214,7 +216,9 @@ class MassProperties(eqx.Module):
         Array(1., dtype=float64)
         """
         return MassProperties(
-            physical.real_mass(self.mass), self.com, physical.real_second_moment(self.second_moment)
+            physical.real_mass(self.mass),
+            physical.real_place(self.com),
+            physical.real_second_moment(self.second_moment),
         )
 
     def invertible(self) -> "MassProperties":

@@ -29,8 +29,8 @@ def known(value: Float[Array, "..."]) -> bool:
 
 
 def if_known(check: Callable, value: Float[Array, "..."]) -> Float[Array, "..."]:
-    """`check(value)` if its numbers are known; otherwise `value` as it is."""
-    return check(value) if known(value) else value
+    """`check(value)` if its numbers are known; otherwise `value` as it is, as where it has none."""
+    return check(value) if known(value) and value.size else value
 
 
 def real_mass(mass: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
@@ -38,6 +38,11 @@ def real_mass(mass: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
     mass = _finite(mass, "mass")
     found = f", got {np.asarray(mass)}" if known(mass) else ""
     return _checks.refuse(mass, (mass <= 0).any(), f"mass: wanted a positive mass (kg){found}")
+
+
+def real_place(com: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3"]:
+    """Refuse a centre of mass that is not finite."""
+    return _finite(com, "com")
 
 
 def real_inertia(tensor: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3 3"]:
@@ -67,12 +72,18 @@ def real_second_moment(s: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3 
 
 
 def nonzero_moments(body: Any, tensor: Float[Array, "*batch 3 3"]) -> Any:
-    """Return `body` unless its inertia `tensor` has a moment that is zero to round-off."""
+    """Return `body` unless its inertia `tensor` has a moment that is zero to round-off, or NaN."""
+    if known(tensor):
+        _finite(tensor, "inertia tensor")
     moments = _eigenvalues(tensor)
-    found = f" {_show(moments)} kg m²" if known(tensor) else ""
+    bad = (moments[..., 0] <= _slack(tensor) * moments[..., 2]).any()
+    found = f" {_show(moments)} kg m²" if known(tensor) else ", or not a number"
+    if not known(tensor):
+        # The eigenvalues of a matrix with a NaN need not be NaN.
+        bad = bad | ~jnp.isfinite(tensor).all()
     return _checks.refuse(
         body,
-        (moments[..., 0] <= _slack(tensor) * moments[..., 2]).any(),
+        bad,
         f"inertia: a principal moment is zero{found}; the equations of motion divide by it. A "
         "thin rod or a point does not resist turning about that axis: give it a thickness",
     )

@@ -56,7 +56,7 @@ class FreeBody(eqx.Module):
         self.state0 = state0
 
     def __call__(self, t: ScalarLike) -> HasSpin:
-        return self._at(_checks.floating(t, (), "t"))
+        return self._at(_time(t))
 
     def _at(self, t: Scalar) -> HasSpin:
         t = t.astype(self.axes.dtype)
@@ -109,7 +109,7 @@ def free_body(inertia: Inertia, state0: State, t: ScalarLike) -> State:
     >>> free_body(rj.Inertia.from_principal(1.0, 2.0, 3.0), state0, 20.0).omega
     Array([-0.42522037, -0.90508985,  0.24550111], dtype=float64)
     """
-    return _evaluate(inertia, state0, _checks.floating(t, (), "t"))
+    return _evaluate(inertia, state0, _time(t))
 
 
 _jitted = jax.jit(lambda inertia, state0, t: FreeBody(inertia, state0)._at(t))
@@ -118,6 +118,11 @@ _jitted = jax.jit(lambda inertia, state0, t: FreeBody(inertia, state0)._at(t))
 def _evaluate(inertia, state0, t):
     _check(inertia, state0)
     return _jitted(inertia, state0, t)
+
+
+def _time(t: ScalarLike) -> Scalar:
+    t = _checks.floating(t, (), "t")
+    return _checks.finite(t, "t") if _checks.known(t) else t
 
 
 def _check(inertia: Inertia, state0: HasSpin) -> None:

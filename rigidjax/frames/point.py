@@ -14,7 +14,7 @@ class Point(eqx.Module):
     units of their own (the restricted three-body problem) say so. Leading axes are allowed in a
     container of many states; functions take one. Source: notes, eq 84 (x, and ẋ).
 
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
+    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype, or leading axes that differ.
 
     >>> Point([1.0, 0, 0], [0.0, 2, 0]).v.shape
     (3,)
@@ -27,5 +27,6 @@ class Point(eqx.Module):
         hint = "a plane problem has z = 0; functions take one particle, batch with jax.vmap"
         x = _checks.floating(x, (3,), "x", batched=True, hint=hint)
         v = _checks.floating(v, (3,), "v", batched=True, hint=hint)
+        _checks.same_batch(x=(x, 1), v=(v, 1))
         dtype = jnp.promote_types(x.dtype, v.dtype)
         self.x, self.v = x.astype(dtype), v.astype(dtype)

@@ -2,9 +2,10 @@
 
 import csv
 import math
-from collections.abc import Mapping, Sequence
+from array import array
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import numpy as np
 
@@ -28,19 +29,24 @@ UNITS = {
     "1": 1.0,
 }
 
+SEPARATORS = ",;\t"
+
 
 class LogError(ValueError):
     """A log that cannot be read; the message names the file and, where known, line and column."""
 
 
 def read_table(path: str | Path, columns: Sequence[str]) -> dict[str, np.ndarray]:
-    """Columns of a log by name: `.csv` with a header line, `.npz`, or `.mat` (MATLAB up to v7).
+    """Columns of a log by name: text with a header line, `.npz`, or `.mat` (MATLAB up to v7).
 
-    **Arguments:** `path`; `columns` the names that are wanted, others are ignored. **Returns** name
-    → (T,) numbers. An empty cell of a .csv is a gap and comes back as NaN.
+    **Arguments:** `path`; `columns` the names that are wanted, others are ignored. Text is
+    separated by commas, semicolons or tabs, whichever splits the header line into most names; its
+    decimals have a point. **Returns** name → (T,) numbers. An empty cell is a gap and comes back as
+    NaN. A text is read line by line: beside it, up to three times its numbers are held.
 
-    **Raises:** `LogError`, one line naming file, line and column, for a file that is missing or not
-    of its kind, a missing column, a cell that is not a number, columns of different lengths.
+    **Raises:** `LogError`, one line naming file, line and column, for a file that is missing, cut
+    or not of its kind, a missing column or two of its name, a cell that is not a number, a line
+    with more cells than the header, columns of different lengths.
 
     >>> read_table("missing.csv", ["t"])
     Traceback (most recent call last):
@@ -80,13 +86,18 @@ def read_gyro_csv(
     if unit not in ("rad/s", "deg/s"):
         raise LogError(f"unit: wanted one of rad/s, deg/s, got {unit!r}")
     table = read_table(path, columns)
-    data = np.stack([table[name] for name in columns], axis=1)
-    if not np.isfinite(data).all():
-        row, place = np.argwhere(~np.isfinite(data))[0]
-        raise LogError(f"{path}: column {columns[place]!r}: row {row + 1} is empty")
-    increasing(path, data[:, 0], columns[0])
+    for name in columns:
+        gap = np.isnan(table[name])
+        if gap.any():
+            raise LogError(f"{path}: column {name!r}: row {int(np.argmax(gap)) + 1} is empty")
+    t = table[columns[0]]
+    increasing(path, t, columns[0])
+    rates = np.stack([table[name] for name in columns[1:]], axis=1)
+    # A large log is not to be held twice.
+    del table
+    rates *= UNITS[unit]
     sensor = Gyro(None if noise is None else noise * UNITS[unit])
-    return Recording(data[:, 0], (sensor, data[:, 1:] * UNITS[unit]))
+    return Recording(t, (sensor, rates))
 
 
 def increasing(path: str | Path, t: np.ndarray, name: str) -> None:
@@ -108,69 +119,107 @@ def increasing(path: str | Path, t: np.ndarray, name: str) -> None:
 
 def _csv(path: Path, columns: Sequence[str]) -> dict[str, np.ndarray]:
     try:
-        text = path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise LogError(f"{path}: cannot be read as text ({type(error).__name__})") from None
-    reader = csv.reader(text.splitlines())
-    header = [name.strip() for name in next(reader, [])]
-    if not header:
+        # Line by line: what is held of a large file is its numbers.
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            return _rows(path, file, columns)
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        why = f"{type(error).__name__}: {error}".splitlines()[0]
+        raise LogError(f"{path}: cannot be read as text ({why})") from None
+
+
+def _rows(path: Path, file: TextIO, columns: Sequence[str]) -> dict[str, np.ndarray]:
+    first = file.readline()
+    separator = max(SEPARATORS, key=first.count)
+    header = [name.strip() for name in next(csv.reader([first], delimiter=separator), [])]
+    if not any(header):
         raise LogError(f"{path}: line 1: wanted a header with the columns {', '.join(columns)}")
     for name in columns:
         if name not in header:
-            raise LogError(
-                f"{path}: line 1: no column {name!r}; the columns are {', '.join(header)}"
-                " (name yours with --columns or --sensor)"
+            advice = (
+                "names and numbers are separated by commas, semicolons or tabs"
+                if len(header) == 1
+                else "name yours with --columns or --sensor"
             )
-    places = [header.index(name) for name in columns]
-    rows: list[list[float]] = []
+            raise LogError(
+                f"{path}: line 1: no column {name!r}; the columns are {', '.join(header)} "
+                f"({advice})"
+            )
+        if header.count(name) > 1:
+            raise LogError(
+                f"{path}: line 1: {header.count(name)} columns are called {name!r}: which one?"
+            )
+    wanted = [(name, header.index(name), array("d")) for name in columns]
+    reader = csv.reader(file, delimiter=separator)
     for cells in reader:
-        if not any(cell.strip() for cell in cells):
-            continue
-        line = reader.line_num
-        rows.append(
-            [_number(path, line, n, cells, p) for n, p in zip(columns, places, strict=True)]
-        )
-    data = np.asarray(rows, float).reshape(-1, len(columns))
-    return {name: data[:, index] for index, name in enumerate(columns)}
+        line = reader.line_num + 1
+        if len(cells) > len(header) and any(cell.strip() for cell in cells[len(header) :]):
+            raise LogError(
+                f"{path}: line {line}: {len(cells)} cells, but the header names {len(header)} "
+                "columns"
+            )
+        if any(cell.strip() for cell in cells):
+            for name, place, numbers in wanted:
+                if place >= len(cells):
+                    raise LogError(f"{path}: line {line}: column {name!r}: the line ends before it")
+                try:
+                    numbers.append(_number(cells[place].strip()))
+                except ValueError as error:
+                    raise LogError(f"{path}: line {line}: column {name!r}: {error}") from None
+    return {name: np.frombuffer(numbers, float) for name, _, numbers in wanted}
 
 
-def _number(path: Path, line: int, column: str, cells: list[str], place: int) -> float:
-    where = f"{path}: line {line}: column {column!r}"
-    if place >= len(cells):
-        raise LogError(f"{where}: the line ends before it")
-    cell = cells[place].strip()
+def _number(cell: str) -> float:
     if not cell:
         return math.nan
+    # Python's own spelling of numbers is wider than that of logs: 1_000, other alphabets' digits.
+    plain = cell.isascii() and "_" not in cell
     try:
-        value = float(cell)
+        value = float(cell if plain else "")
     except ValueError:
-        raise LogError(f"{where}: {cells[place]!r} is not a number") from None
+        comma = "; a decimal comma? wanted a point" if "," in cell else ""
+        raise ValueError(f"{cell!r} is not a number{comma}") from None
     if not math.isfinite(value):
-        raise LogError(f"{where}: {cell} is not a finite number; leave the cell empty for a gap")
+        raise ValueError(f"{cell} is not a finite number; leave the cell empty for a gap")
     return value
 
 
 def _arrays(path: Path, columns: Sequence[str]) -> dict[str, np.ndarray]:
-    held: Mapping[str, Any]
+    # Of an empty or a cut file the readers raise whatever they run into.
     try:
-        if path.suffix.lower() == ".mat":
-            from scipy.io import loadmat
-
-            held = {k: v for k, v in loadmat(path).items() if not k.startswith("__")}
-        else:
-            with np.load(path) as file:
-                held = {name: file[name] for name in file.files}
-    except (OSError, ValueError, NotImplementedError) as error:
-        raise LogError(f"{path}: cannot be read ({error})") from None
+        names, held = (_mat if path.suffix.lower() == ".mat" else _npz)(path, columns)
+    except Exception as error:
+        why = f"{type(error).__name__}: {error}".splitlines()[0]
+        raise LogError(
+            f"{path}: cannot be read; is it whole, and a {path.suffix} file? ({why})"
+        ) from None
     out = {}
     for name in columns:
         if name not in held:
-            raise LogError(f"{path}: no array {name!r}; the arrays are {', '.join(held)}")
-        try:
-            out[name] = np.asarray(held[name], float).reshape(-1)
-        except (TypeError, ValueError):
-            raise LogError(f"{path}: array {name!r} does not hold numbers") from None
+            raise LogError(f"{path}: no array {name!r}; the arrays are {', '.join(names)}")
+        if np.asarray(held[name]).dtype.kind not in "biuf":
+            raise LogError(f"{path}: array {name!r} does not hold real numbers")
+        out[name] = np.asarray(held[name], float).reshape(-1)
+        endless = np.isinf(out[name])
+        if endless.any():
+            raise LogError(
+                f"{path}: array {name!r}: row {int(np.argmax(endless)) + 1} is infinite; NaN marks "
+                "a gap"
+            )
     sizes = {name: array.size for name, array in out.items()}
     if len(set(sizes.values())) > 1:
         raise LogError(f"{path}: arrays of different lengths: {sizes}")
     return out
+
+
+def _npz(path: Path, columns: Sequence[str]) -> tuple[list[str], dict[str, Any]]:
+    # Of a file that it opened itself and cannot read NumPy leaves the handle open.
+    with path.open("rb") as raw, np.load(raw) as file:
+        return file.files, {name: file[name] for name in columns if name in file.files}
+
+
+def _mat(path: Path, columns: Sequence[str]) -> tuple[list[str], dict[str, Any]]:
+    from scipy.io import loadmat, whosmat
+
+    with path.open("rb") as raw:
+        names = [name for name, *_ in whosmat(raw)]
+        return names, loadmat(raw, variable_names=list(columns))

@@ -13,6 +13,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.identify import reported, uncertainty, words
+from rigidjax.identify.checkpoint import Checkpoint, Position, Tried, require_folder
 from rigidjax.identify.descent import Descent, descend
 from rigidjax.identify.pieces import WIDTHS, joined, pieces as in_pieces, with_width
 from rigidjax.identify.problem import Parameters, Problem, all_errors
@@ -20,8 +21,6 @@ from rigidjax.identify.propagate import Adaptive, FixedSteps
 from rigidjax.identify.residual import Noise
 from rigidjax.identify.search import (
     CAREFUL,
-    Checkpoint,
-    Tried,
     climb,
     climb_together,
     cost_of,
@@ -171,7 +170,8 @@ def fit(
     - `descent`: a `Descent(optimiser, steps=…, batch=…)` of optax walks each start down first, a
       few recordings at a time: for many recordings, where a step of least squares costs much.
     - `checkpoint`: a file that keeps what was found after every 25 steps; a second call with the
-      same problem and options goes on from there and ends at the same point. `together` = 1 only.
+      same problem and options goes on from there and, on the same machine and versions, ends at
+      the same point to the last bit, wherever the first was killed. `together` = 1 only.
     - `progress`: called with a line of text after each start, such as `print`.
 
     **Returns** a `Fit`. It always holds the best point that was reached; `fit.status` says in words
@@ -180,8 +180,8 @@ def fit(
 
     Levenberg–Marquardt of optimistix, Jacobians by forward mode through the motion.
 
-    **Raises:** `TypeError` for what is no `Problem`, `ValueError` for fewer than one start or a
-    checkpoint of another problem.
+    **Raises:** `TypeError` for what is no `Problem`, `ValueError` for fewer than one start, a
+    checkpoint that is damaged or of another problem, or one in a folder that does not exist.
 
     >>> import jax.numpy as jnp, rigidjax as rj
     >>> ts = jnp.linspace(0.0, 10.0, 60)
@@ -198,6 +198,8 @@ def fit(
         raise ValueError(f"fit: wanted at least one start, got {min(starts, together)}")
     if checkpoint is not None and together > 1:
         raise ValueError("fit: a checkpoint goes with together=1, one start after another")
+    if checkpoint is not None:
+        require_folder(checkpoint)
     points = starting_points(problem, starts, jax.random.key(0) if key is None else key)
     noise, solver = _first_noise(problem), solver_for(tolerance)
     if descent is not None and not isinstance(descent, Descent):
@@ -275,25 +277,25 @@ def _one_by_one(
     if checkpoint is not None:
         print_of = float(sum(cost_of(point, problem, noise) for point in points))
     keep = Checkpoint(checkpoint, like, print_of)
-    tried, latest = list(keep.done), [keep.current]
+    tried, latest = list(keep.done), [keep.position.tried]
     try:
         for number, point in enumerate(points, 1):
             if number <= len(keep.done):
                 continue
-            resumed = number == len(keep.done) + 1 and keep.stage > 0
+            resumed = number == len(keep.done) + 1 and keep.position.stage > 0
             latest = [like]
 
-            def look(stage: int, now: Tried) -> None:
+            def look(position: Position) -> None:
                 # A part of the record only: its misfit is no measure of the whole.
-                if np.isfinite(float(now.cost)):
-                    latest[0] = now  # noqa: B023
-                keep.save(tried, stage, now)
+                if np.isfinite(float(position.tried.cost)):
+                    latest[0] = position.tried  # noqa: B023
+                keep.save(tried, position)
 
-            at, stage = (keep.current, keep.stage) if resumed else (fresh(point), 0)
-            out = climb(at, problem, noise, solver, max_steps, first_stage=stage, look=look)
+            start = keep.position if resumed else Position(0, 0, fresh(point))
+            out = climb(start, problem, noise, solver, max_steps, look=look)
             latest = [like]
             tried.append(out)
-            keep.save(tried, 0, like)
+            keep.save(tried, Position(0, 0, like))
             _say(progress, number, len(points), tried)
     except KeyboardInterrupt:
         if np.isfinite(float(latest[0].cost)):

@@ -144,15 +144,20 @@ def read_log(
         inside = (t >= window[0] - 1e-12) & (t <= window[1] + 1e-12)
         if inside.sum() < 4:
             raise LogError(f"{path}: fewer than 4 samples between {window[0]} and {window[1]} s")
+    kept = slice(None) if inside.all() else inside
     readings = []
     for one in channels:
-        values = np.stack([table[name] for name in one.columns], axis=1) * UNITS[one.unit]
+        values = np.stack([table[name] for name in one.columns], axis=1)
+        values *= UNITS[one.unit]
         seen = np.isfinite(values).all(axis=1)
         noise = None if one.noise is None else one.noise * UNITS[one.unit]
         sensor, values = _sensor(one, values, noise, "bias" in free)
-        readings.append((sensor, values[inside], seen[inside]))
+        readings.append((sensor, values[kept], seen[kept]))
+    torque = _torque(path, t, table, wheels, free)
+    # A large log is not to be held twice.
+    del table
     try:
-        return Recording(t[inside], *readings, torque=_torque(path, t, table, wheels, free))
+        return Recording(t[kept], *readings, torque=torque)
     except ValueError as error:
         raise LogError(f"{path}: {error}") from None
 

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from rigidjax import _checks
 from rigidjax.identify.sensors import AbstractSensor
 from rigidjax.motion.torques import Torque
 
@@ -38,8 +39,9 @@ class Recording(eqx.Module):
     `torque`, by keyword, is what turned this body besides its own spin: a wheel whose speed was
     logged, a law with coefficients that a `Free` may move; `None` for none.
 
-    **Raises** `ValueError` for times that do not increase, a wrong shape, an unmasked NaN (with its
-    index), or a quaternion that is not unit.
+    **Raises** `TypeError` for numbers that are traced (which times are kept depends on them) and
+    what is no sensor; `ValueError` for times that do not increase, a wrong shape, an unmasked NaN
+    (with its index), or a quaternion that is not unit.
 
     >>> import rigidjax as rj
     >>> Recording([0.0, 1.0], (rj.identify.Gyro(0.01), [[1.0, 0, 0], [1.0, 0, 0]])).t.shape
@@ -52,11 +54,17 @@ class Recording(eqx.Module):
     dropped: int = eqx.field(static=True)
 
     def __init__(self, t: Any, *readings: tuple, torque: Torque | None = None):
+        if not _checks.known((t, [reading[1:] for reading in readings])):
+            raise TypeError(
+                "Recording: wanted known numbers for t and the readings, got traced ones; make the "
+                "recording outside of jit, vmap and grad, and give it to them as an argument"
+            )
         t = np.asarray(t, float)
         if t.ndim != 1 or t.size < 2:
             raise ValueError(f"t: wanted at least two times, shape (T,), got shape {t.shape}")
         if not np.isfinite(t).all():
-            raise ValueError(f"t: contains NaN at index {int(np.argmin(np.isfinite(t)))}")
+            index = int(np.argmin(np.isfinite(t)))
+            raise ValueError(f"t: contains NaN or infinity at index {index}")
         if (np.diff(t) <= 0).any():
             index = int(np.argmax(np.diff(t) <= 0)) + 1
             raise ValueError(f"t: wanted increasing times; t[{index}] is not above the one before")
@@ -66,14 +74,16 @@ class Recording(eqx.Module):
         used = np.any([mask for _, _, mask in rows], axis=0)
         if used.sum() < 2:
             raise ValueError("Recording: wanted readings at two times at least; the rest is masked")
-        self.t = jnp.asarray(t[used])
+        # Told in reports, and no part of what a fit sees.
+        self.dropped = int((~used).sum())
+        # A long recording is not to be held once more than needed.
+        kept = used if self.dropped else slice(None)
+        self.t = jnp.asarray(t[kept])
         self.readings = tuple(
-            Reading(sensor, jnp.asarray(values[used]), jnp.asarray(mask[used]))
+            Reading(sensor, jnp.asarray(values[kept]), jnp.asarray(mask[kept]))
             for sensor, values, mask in rows
         )
         self.torque = torque
-        # Told in reports, and no part of what a fit sees.
-        self.dropped = int((~used).sum())
 
     @property
     def size(self) -> int:
@@ -114,8 +124,9 @@ def _reading(
     if not mask.any():
         raise ValueError(f"{name}: every reading is masked")
     # What is masked must not reach a derivative, for 0 · NaN is NaN: any reading will do instead.
-    shaped = mask.reshape(-1, *(1 for _ in across))
-    values = np.where(shaped, values, values[int(np.argmax(mask))])
+    if not mask.all():
+        shaped = mask.reshape(-1, *(1 for _ in across))
+        values = np.where(shaped, values, values[int(np.argmax(mask))])
     refusal = getattr(sensor, "refusal", None)
     if refusal is not None:
         wrong, why = refusal(values)

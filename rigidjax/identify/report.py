@@ -75,8 +75,11 @@ def verdict(fit: "Fit") -> str:
     return "\n".join(lines)
 
 
-def as_dict(fit: "Fit", files: Sequence[str] = ()) -> dict[str, Any]:
-    """All that was found as plain numbers and text, for JSON. Infinity is written as `null`."""
+def as_dict(fit: "Fit", files: Sequence[str] = (), more: Sequence[Row] = ()) -> dict[str, Any]:
+    """All that was found as plain numbers and text, for JSON. Infinity is written as `null`.
+
+    **Arguments:** `fit`; `files` the names of what was read; `more` rows of further quantities.
+    """
 
     def plain(number: float) -> float | None:
         return float(number) if np.isfinite(number) else None
@@ -92,6 +95,10 @@ def as_dict(fit: "Fit", files: Sequence[str] = ()) -> dict[str, Any]:
                 "unit": quantity.unit,
             }
             for quantity in fit.quantities
+        }
+        | {
+            name: {"value": plain(value), "interval_95": [plain(low), plain(high)], "unit": unit}
+            for name, value, low, high, unit in more
         },
         "rms": {
             f"{index} {type(sensor).__name__}": {"value": plain(rms), "unit": sensor.unit}
@@ -111,9 +118,11 @@ def as_dict(fit: "Fit", files: Sequence[str] = ()) -> dict[str, Any]:
     }
 
 
-def write_json(fit: "Fit", path: str | Path, files: Sequence[str] = ()) -> None:
+def write_json(
+    fit: "Fit", path: str | Path, files: Sequence[str] = (), more: Sequence[Row] = ()
+) -> None:
     """`as_dict` to a file."""
-    text = json.dumps(as_dict(fit, files), indent=2, ensure_ascii=False, allow_nan=False)
+    text = json.dumps(as_dict(fit, files, more), indent=2, ensure_ascii=False, allow_nan=False)
     Path(path).write_text(text + "\n", encoding="utf-8")
 
 
@@ -125,15 +134,17 @@ def write_html(
     figures: Sequence[Any] = (),
     rate_unit: str = "rad/s",
     files: Sequence[str] = (),
+    more: Sequence[Row] = (),
 ) -> None:
     """A page that stands alone: verdict, table, words, figures inside it.
 
     **Arguments:** `fit`; `path`; `title`; `figures` of matplotlib, such as those of
-    `rigidjax.plot.fit`; `rate_unit` as for `rows`; `files` the names of what was read.
+    `rigidjax.plot.fit`; `rate_unit` as for `rows`; `files` the names of what was read; `more`
+    rows of further quantities.
     """
     good = fit.ok
     lines = []
-    for name, value, low, high, unit in rows(fit, rate_unit):
+    for name, value, low, high, unit in [*rows(fit, rate_unit), *more]:
         shown = numbers(value, low, high)
         cells = (name, shown[0], f"{shown[1]} … {shown[2]}", unit)
         lines.append("<tr>" + "".join(f"<td>{html.escape(c)}</td>" for c in cells) + "</tr>")

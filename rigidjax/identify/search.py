@@ -1,7 +1,6 @@
 """Where the misfit is least: Levenberg–Marquardt from several starts, the record from its start."""
 
-from collections.abc import Callable, Sequence
-from pathlib import Path
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -10,8 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
+from rigidjax.identify.checkpoint import Position, Tried
 from rigidjax.identify.problem import Parameters, Problem, with_blocks
 from rigidjax.identify.residual import Noise, assembled, residuals
 
@@ -28,14 +28,6 @@ CAREFUL, BOLD = 1.0 / 30.0, 30.0
 SETTLED = 1e-7
 # A part of the record may be fitted at the expense of the whole, but not by more than this factor.
 WILD = 100.0
-
-
-class Tried(eqx.Module):
-    """Where one start ended: its parameters, misfit (½ Σ of squares), and whether it converged."""
-
-    parameters: Parameters
-    cost: Float[Array, ""]
-    converged: Bool[Array, ""]
 
 
 def least_squares(
@@ -213,53 +205,6 @@ def horizons(problem: Problem) -> tuple[Float[Array, "records times"], ...]:
     return tuple((since <= part * length).astype(t.dtype) for part in HORIZONS)
 
 
-class Checkpoint:
-    """What a long search has found so far, on disk after every stride of steps.
-
-    **Arguments:** `path` of the file, or `None` to keep nothing; `like` a `Tried` of the right
-    shapes; `print_of` a number that belongs to this problem alone. A file of another problem is
-    refused with a `ValueError`, not overwritten.
-    """
-
-    def __init__(self, path: str | Path | None, like: Tried, print_of: float):
-        self.path, self.like = None if path is None else Path(path), like
-        self.print_of = print_of
-        self.done: list[Tried] = []
-        self.stage, self.current = 0, like
-        if self.path is not None and self.path.exists():
-            self._read(self.path)
-
-    def save(self, done: Sequence[Tried], stage: int, current: Tried) -> None:
-        """Write what is finished and where the search stands, replacing the file at once."""
-        if self.path is None:
-            return
-        leaves = [np.asarray(x) for item in (*done, current) for x in jax.tree.leaves(item)]
-        beside = self.path.with_name(self.path.name + ".new")
-        with beside.open("wb") as file:
-            held: dict[str, Any] = {f"leaf{i}": leaf for i, leaf in enumerate(leaves)}
-            np.savez(file, print_of=self.print_of, stage=stage, done=len(done), **held)
-        beside.replace(self.path)
-
-    def _read(self, path: Path) -> None:
-        try:
-            with np.load(path) as file:
-                held = {name: file[name] for name in file.files}
-            print_of, stage, done = (held[name] for name in ("print_of", "stage", "done"))
-        except (OSError, ValueError, KeyError) as error:
-            raise ValueError(f"{path}: no checkpoint of a fit ({type(error).__name__})") from None
-        structure = jax.tree.structure(self.like)
-        if float(print_of) != self.print_of:
-            raise ValueError(f"{path}: the checkpoint of another problem; name another file")
-        size = structure.num_leaves
-        items = []
-        for index in range(int(done) + 1):
-            leaves = [
-                jnp.asarray(held[f"leaf{i}"]) for i in range(index * size, (index + 1) * size)
-            ]
-            items.append(jax.tree.unflatten(structure, leaves))
-        self.done, self.current, self.stage = items[:-1], items[-1], int(stage)
-
-
 def settle(
     tried: Tried,
     problem: Problem,
@@ -267,32 +212,35 @@ def settle(
     weights: Float[Array, "records times"],
     solver: Any,
     max_steps: int,
-    look: Callable[[Tried], None] = lambda tried: None,
+    look: Callable[[Tried, int, bool], None] = lambda tried, strides, over: None,
     *,
     near: bool = False,
+    strides: int = 0,
 ) -> Tried:
     """Strides from where `tried` ended until one more of them changes nothing.
 
     A search that says it has converged may only have been damped too much: it has converged where a
     fresh start from there ends there. `tried.cost` is the misfit at its end, infinite if unknown;
-    `near` says that it is near the bottom already.
+    `near` says that it is near the bottom already; `strides` how many led to it. `look` is called
+    after each, with how many there are by then and whether that was the last.
     """
-    for first in range(0, max_steps, STRIDE):
+    for first in range(strides * STRIDE, max_steps, STRIDE):
         before = float(tried.cost)
         count = min(STRIDE, max_steps)
+        strides += 1
         bold = BOLD if first or near else CAREFUL
         after = least_squares(tried.parameters, problem, noise, weights, solver, count, bold)
         if not np.isfinite(float(after.cost)):
             # The motion was lost on the way: what is known is where this stride began.
             cost = jnp.asarray(cost_of(tried.parameters, problem, noise))
             tried = Tried(tried.parameters, cost, jnp.asarray(False))
-            look(tried)
+            look(tried, strides, True)
             break
         tried = after
         # At the very bottom round-off refuses every step: whether it moved is what counts.
         settled = before - float(tried.cost) < SETTLED * (1.0 + abs(before))
         tried = Tried(tried.parameters, tried.cost, jnp.asarray(settled))
-        look(tried)
+        look(tried, strides, settled or first + STRIDE >= max_steps)
         if settled:
             break
     return tried
@@ -304,18 +252,18 @@ def fresh(point: Parameters) -> Tried:
 
 
 def climb(
-    tried: Tried,
+    start: Position,
     problem: Problem,
     noise: Noise,
     solver: Any,
     max_steps: int,
     *,
-    first_stage: int = 0,
-    look: Callable[[int, Tried], None] = lambda stage, tried: None,
+    look: Callable[[Position], None] = lambda position: None,
 ) -> Tried:
     """One start through the horizons; `look` is called after each stride with where it stands."""
+    tried = start.tried
     for stage, seen in enumerate(horizons(problem)):
-        if stage < first_stage:
+        if stage < start.stage:
             continue
         if stage < len(HORIZONS) - 1:
             # A part of the record need not be fitted to the end, only to come near.
@@ -324,13 +272,14 @@ def climb(
             # What explains a part alone may be nonsense beyond it: a drag that drives.
             worse = cost_of(after, problem, noise) / max(cost_of(before, problem, noise), 1e-300)
             tried = fresh(after if worse < WILD else before)
-            look(stage + 1, tried)
+            look(Position(stage + 1, 0, tried))
             continue
 
-        def at_last(now: Tried, stage: int = stage) -> None:
-            look(stage, now)
+        def at_last(now: Tried, strides: int, over: bool, stage: int = stage) -> None:
+            look(Position(stage + over, strides, now))
 
-        tried = settle(tried, problem, noise, seen, solver, max_steps, at_last)
+        done = start.strides if stage == start.stage else 0
+        tried = settle(tried, problem, noise, seen, solver, max_steps, at_last, strides=done)
     return tried
 
 

@@ -24,8 +24,9 @@ class Attitude(eqx.Module):
     the notes, eq 8); `omega` (3,) Ω in the body frame, rad/s. Leading axes are allowed in a
     container of many states; functions take one.
 
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype. Whether `q` is a unit
-    quaternion is checked where it is used (`simulate`, `rigidjax.exact.free_body`).
+    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype, or leading axes that differ.
+    Whether `q` is a unit quaternion is checked where it is used (`simulate`,
+    `rigidjax.exact.free_body`).
 
     >>> Attitude([1.0, 0, 0, 0], [0.0, 0, 1]).q.shape
     (4,)
@@ -39,6 +40,7 @@ class Attitude(eqx.Module):
     ):
         self.q = _checks.floating(q, (4,), "q", batched=True, hint="a quaternion is (w, x, y, z)")
         self.omega = _checks.floating(omega, (3,), "omega", batched=True)
+        _checks.same_batch(q=(self.q, 1), omega=(self.omega, 1))
 
 
 class AttitudeEquations(eqx.Module):

@@ -40,7 +40,7 @@ class MomentumAndDirection(eqx.Module):
     **Arguments:** `pi` (3,) Π, N m s, body frame; `gamma` (3,) γ = Rᵀ d of a vector d that is fixed
     in the world, body frame. Any length and unit: for `HeavyTopHamiltonian` d = g, m/s².
 
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
+    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype, or leading axes that differ.
 
     >>> MomentumAndDirection([1.0, 0.0, 0.0], [0.0, 0.0, -9.81]).gamma.shape
     (3,)
@@ -52,6 +52,7 @@ class MomentumAndDirection(eqx.Module):
     def __init__(self, pi: Vectors, gamma: Vectors):
         self.pi = _checks.floating(pi, (3,), "pi", batched=True)
         self.gamma = _checks.floating(gamma, (3,), "gamma", batched=True)
+        _checks.same_batch(pi=(self.pi, 1), gamma=(self.gamma, 1))
 
 
 class LiePoisson(eqx.Module):
@@ -119,6 +120,8 @@ class RotationalHamiltonian(eqx.Module):
 
     **Arguments:** `inertia` about the centre of mass or a fixed point. Called with Π (3,), gives J.
 
+    **Raises:** `TypeError` for what is no `Inertia`.
+
     >>> import rigidjax as rj
     >>> RotationalHamiltonian(rj.Inertia.from_principal(1.0, 1.0, 2.0))([0.0, 0.0, 2.0])
     Array(1., dtype=float64)
@@ -127,7 +130,7 @@ class RotationalHamiltonian(eqx.Module):
     inverse: Mat3
 
     def __init__(self, inertia: _inertia.Inertia):
-        self.inverse = _inertia.inverse(inertia.tensor)
+        self.inverse = _inertia.inverse(_of_kind(inertia, _inertia.Inertia, "inertia").tensor)
 
     def __call__(self, pi: Float[ArrayLike, "3"] | list[float]) -> Scalar:
         pi = _checks.floating(pi, (3,), "pi")
@@ -139,6 +142,9 @@ class HeavyTopHamiltonian(eqx.Module):
 
     **Arguments:** `inertia` about the fixed point; `top` a `HeavyTop`, of which m and c are used.
     Called with Π (3,) and γ (3,), m/s², body frame, gives J. `start` makes the state.
+
+    **Raises:** `TypeError` for an `inertia` that is no `Inertia`, or a `top` that is no `HeavyTop`:
+    another torque has no such Hamiltonian.
 
     >>> import rigidjax as rj
     >>> top = rj.torques.HeavyTop(2.0, [0.0, 0, 0.5], [0.0, 0, -9.81])
@@ -152,7 +158,9 @@ class HeavyTopHamiltonian(eqx.Module):
     top: HeavyTop
 
     def __init__(self, inertia: _inertia.Inertia, top: HeavyTop):
-        self.inertia, self.inverse, self.top = inertia, _inertia.inverse(inertia.tensor), top
+        self.inertia = _of_kind(inertia, _inertia.Inertia, "inertia")
+        self.top = _of_kind(top, HeavyTop, "top", "; this Hamiltonian is that of gravity alone")
+        self.inverse = _inertia.inverse(inertia.tensor)
 
     def __call__(
         self, pi: Float[ArrayLike, "3"] | list[float], gamma: Float[ArrayLike, "3"] | list[float]
@@ -170,6 +178,12 @@ def _callable(hamiltonian):
     if not callable(hamiltonian):
         raise TypeError(f"hamiltonian: wanted a callable, got {type(hamiltonian).__name__}")
     return hamiltonian
+
+
+def _of_kind(value, kind, name, why=""):
+    if not isinstance(value, kind):
+        raise TypeError(f"{name}: wanted {kind.__name__}, got {type(value).__name__}{why}")
+    return value
 
 
 def _number(value):

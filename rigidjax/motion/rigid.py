@@ -20,7 +20,7 @@ class Rigid(eqx.Module):
     first, body → world; `omega` (3,) Ω in the body frame, rad/s. Leading axes are allowed in a
     container of many states; functions take one.
 
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
+    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype, or leading axes that differ.
 
     >>> Rigid([0.0, 0, 0], [1.0, 0, 0], [1.0, 0, 0, 0], [0.0, 0, 1]).v.shape
     (3,)
@@ -42,6 +42,7 @@ class Rigid(eqx.Module):
         self.v = _checks.floating(v, (3,), "v", batched=True)
         self.q = _checks.floating(q, (4,), "q", batched=True, hint="a quaternion is (w, x, y, z)")
         self.omega = _checks.floating(omega, (3,), "omega", batched=True)
+        _checks.same_batch(x=(self.x, 1), v=(self.v, 1), q=(self.q, 1), omega=(self.omega, 1))
 
 
 class NewtonEuler(eqx.Module):

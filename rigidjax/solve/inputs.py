@@ -39,14 +39,23 @@ def require_fit(body: Any, state0: Any, torque: Any) -> None:
             f"{type(state0).__name__} only turns: wanted Inertia, got {type(body).__name__}"
             + ("; pass body.inertia" if isinstance(body, MassProperties) else "")
         )
-    tensor = (
-        body.inertia.tensor if isinstance(body, MassProperties) else getattr(body, "tensor", None)
-    )
-    if tensor is not None and tensor.ndim != 2:
-        raise ValueError(
-            f"body: wanted one body, a tensor of shape (3, 3), got {tensor.shape}; batch with "
-            "jax.vmap"
-        )
+    if body is not None:
+        _one_body(body)
+
+
+def _one_body(body: Inertia | MassProperties) -> None:
+    """Raise `ValueError` unless every leaf of `body` has the shape of one body.
+
+    Constructors see to it that shapes agree; `jax.tree.map` and `eqx.tree_at` do not.
+    """
+    wanted = {"tensor": (3, 3), "mass": (), "com": (3,), "second_moment": (3, 3)}
+    for path, leaf in jax.tree.leaves_with_path(body):
+        name = str(path[-1]).lstrip(".")
+        if leaf.shape != wanted[name]:
+            raise ValueError(
+                f"body: wanted one body, {name} of shape {wanted[name]}, got {leaf.shape}; batch "
+                "with jax.vmap"
+            )
 
 
 def tolerances(rtol: Any, atol: Any, dtype: Any) -> tuple[Any, Any]:
@@ -143,11 +152,14 @@ def start(state0: Any, throw: bool) -> Any:
             "state0: wanted Spin, Attitude or Rigid, or Point without a body, got "
             f"{type(state0).__name__}"
         )
-    name, first = ("v", state0.v) if isinstance(state0, Point) else ("omega", state0.omega)
-    if first.ndim != 1:
-        raise ValueError(
-            f"state0: wanted one body, {name} of shape (3,), got {first.shape}; batch with jax.vmap"
-        )
+    for path, leaf in jax.tree.leaves_with_path(state0):
+        name = str(path[-1]).lstrip(".")
+        wanted = (4,) if name == "q" else (3,)
+        if leaf.shape != wanted:
+            raise ValueError(
+                f"state0: wanted one body, {name} of shape {wanted}, got {leaf.shape}; batch with "
+                "jax.vmap"
+            )
     names = [str(path[-1]).lstrip(".") for path, _ in jax.tree.leaves_with_path(state0)]
     leaves, tree = jax.tree.flatten(state0)
     leaves = [

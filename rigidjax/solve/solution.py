@@ -89,7 +89,7 @@ class Solution(eqx.Module, Generic[State]):
         **Raises:** `ValueError` (`EquinoxRuntimeError` under `jit`) where `t` is outside.
         """
         t = _checks.floating(t, (), "t").astype(self.ts.dtype)
-        outside = (t < self.ts[0]) | (t > self.ts[-1])
+        outside = ~((t >= self.ts[0]) & (t <= self.ts[-1]))
         t = _checks.refuse(t, outside, "evaluate: t lies outside the times that were simulated")
         index = jnp.clip(jnp.searchsorted(self.ts, t, side="right") - 1, 0, self.ts.shape[0] - 1)
         start = jax.tree.map(lambda leaf: leaf[index], self.ys)

@@ -184,6 +184,32 @@ REFUSED = {
         lambda: Inertia.from_principal(0.0, 1.0, 1.0).invertible(),
         r"principal moment is zero \(0, 1, 1\).*thin rod",
     ),
+    "a tensor of NaN in the equations": (
+        lambda: Inertia(GOOD * np.nan).invertible(),
+        r"inertia tensor: contains NaN or infinity at index \(0, 0\)",
+    ),
+    "a centre of mass of NaN": (
+        lambda: MassProperties(1.0, [0.0, np.nan, 0.0], GOOD),
+        r"com: contains NaN or infinity at index \(1,\)",
+    ),
+    "a mass for each axis": (
+        lambda: MassProperties([1.0, 2.0, 4.0], ORIGIN, GOOD),
+        r"wanted one of each, mass \(\), com \(3,\), second_moment \(3, 3\), or the same "
+        r"leading axes.*mass \(3,\), com",
+    ),
+    "no number for the mass": (
+        lambda: MassProperties([], ORIGIN, GOOD),
+        r"mass, com, second_moment: wanted one of each.*mass \(0,\)",
+    ),
+    "two masses": (lambda: MassProperties([1.0, 2.0], ORIGIN, GOOD), r"mass \(2,\), com \(3,\)"),
+    "two centres": (
+        lambda: MassProperties(1.0, np.zeros((2, 3)), GOOD),
+        r"com \(2, 3\), second_moment \(3, 3\)$",
+    ),
+    "two masses, three tensors": (
+        lambda: MassProperties(np.ones(2), np.zeros((2, 3)), np.stack([GOOD] * 3)),
+        r"mass \(2,\), com \(2, 3\), second_moment \(3, 3, 3\)$",
+    ),
     "shape": (lambda: Inertia.from_tensor(np.ones(3)), r"wanted shape \(3, 3\), got \(3,\)"),
     "batch": (lambda: Inertia.from_tensor(np.ones((5, 3, 3))), "jax.vmap"),
 }
@@ -210,6 +236,7 @@ def test_refusals_under_jit_say_the_same():
         (lambda a: Inertia.from_tensor(a), good.at[0, 1].set(1.0), "symmetric"),
         (lambda a: Inertia.from_second_moment(a), -good, "semi-definite"),
         (lambda a: Inertia(a).invertible(), jnp.diag(jnp.array([0.0, 1, 1])), "thin rod"),
+        (lambda a: Inertia(a).invertible(), good.at[1, 1].set(jnp.nan), "not a number"),
         (lambda a: MassProperties(a[0, 0], a[0], a).checked(), -good, "positive mass"),
     ]
     for make, value, words in cases:
@@ -257,3 +284,8 @@ def test_containers_carry_a_batch():
     bodies = MassProperties(np.ones(4), np.zeros((4, 3)), many.second_moment)
     assert bodies.inertia.tensor.shape == (4, 3, 3)
     np.testing.assert_allclose(bodies.inertia.tensor, many.tensor, atol=1e-15)
+    moments = many.second_moment
+    made = jax.vmap(lambda m, s: MassProperties(m, jnp.zeros(3), s))(jnp.arange(1.0, 5), moments)
+    assert [leaf.shape[0] for leaf in jax.tree.leaves(made)] == [4, 4, 4]
+    none = MassProperties(np.ones(0), np.zeros((0, 3)), np.zeros((0, 3, 3)))
+    assert none.mass.shape == (0,)

@@ -1,7 +1,11 @@
 """What a user reads when a log is wrong: one line with file, line and column, exit code 2."""
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
+from scipy.io import savemat
 
 import rigidjax as rj
 from rigidjax.__main__ import main
@@ -25,6 +29,14 @@ WRONG = {
     "short line": (_swap(6, "0.4,1"), "line 6: column 'wy': the line ends before it"),
     "time stands": (_swap(6, "0.3,1,1,1"), "line 6: column 't': time 0.3 is not above the 0.3"),
     "empty": ("", "line 1: wanted a header"),
+    "a thousand": (_swap(4, "0.2,1_000,1,1"), "line 4: column 'wx': '1_000' is not a number"),
+    "digits of another alphabet": (_swap(4, "0.2,١,1,1"), "line 4: column 'wx': '١' is not a number"),
+    "time without end": (_swap(4, "-inf,1,1,1"), "line 4: column 't': -inf is not a finite number"),
+    "surplus cell": (_swap(5, "0.3,1,1,1,7"), "line 5: 5 cells, but the header names 4 columns"),
+    "a decimal comma": (_swap(4, '0.2,"1,5",1,1'), "line 4: column 'wx': '1,5' is not a number; a decimal comma?"),
+    "a wanted name twice": (GOOD.replace("wy,wz", "wy,wz,wx", 1), "line 1: 2 columns are called 'wx': which one?"),
+    "blanks": (GOOD.replace(",", " "), "line 1: no column 't'; the columns are t wx wy wz (names and numbers are separated by commas, semicolons or tabs)"),
+    "a quote without end": (_swap(5, '0.3,"1,1,1' + 200_000 * "1"), "cannot be read as text (Error: field larger than field limit"),
     "too short": ("t,wx,wy,wz\n0,1,1,1\n1,1,1,1\n", "wanted at least 4 samples, got 2"),
 }  # fmt: skip
 
@@ -39,6 +51,86 @@ def test_a_bad_log_gets_one_clear_line(case, tmp_path, capsys):
     assert out.out == ""
     assert out.err.startswith(f"error: {path}: {words}"), out.err
     assert out.err.count("\n") == 1
+
+
+@pytest.mark.parametrize("separator", [",", ";", "\t"])
+def test_commas_semicolons_and_tabs(separator, tmp_path):
+    """Also a quoted cell, a cell of text in a column that is not wanted, and a last separator."""
+    path = tmp_path / "log.txt"
+    rows = [
+        ["t", "note", "wx", "wy", "wz"],
+        ["0", '"a"', "1", "", "3"],
+        ["1", "b", " 4", "5", "6", ""],
+    ]
+    path.write_text("\r\n".join(separator.join(row) for row in rows))
+    table = rj.identify.read_table(path, ["t", "wx", "wy", "wz"])
+    np.testing.assert_array_equal(table["t"], [0.0, 1.0])
+    np.testing.assert_array_equal(table["wy"], [np.nan, 5.0])
+    np.testing.assert_array_equal(table["wx"] + table["wz"], [4.0, 10.0])
+
+
+KINDS = ["empty", "cut", "text", "other"]
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".mat"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_damaged_file_gets_one_clear_line(kind, suffix, tmp_path, capsys):
+    path, columns = tmp_path / f"log{suffix}", ["t", "wx", "wy", "wz"]
+    arrays = {name: np.arange(500) * 0.1 for name in columns}
+    if suffix == ".npz":
+        np.savez_compressed(path, **arrays)
+    else:
+        savemat(path, arrays, do_compression=True)
+    assert rj.identify.read_table(path, columns)["t"].shape == (500,)
+    whole = path.read_bytes()
+    if kind == "other":
+        with path.open("wb") as file:
+            np.save(file, np.arange(3.0))
+    else:
+        path.write_bytes(
+            {"empty": b"", "cut": whole[: len(whole) // 2], "text": b"t,wx\n1,2\n"}[kind]
+        )
+    assert main(["identify", str(path)]) == 2
+    out = capsys.readouterr()
+    assert out.err.startswith(f"error: {path}: cannot be read; is it whole, and a {suffix} file?")
+    assert out.err.count("\n") == 1 and out.out == ""
+
+
+@pytest.mark.parametrize(
+    ("bad", "words"),
+    [
+        (np.array([0.0, 1.0, -np.inf]), "array 'wx': row 3 is infinite; NaN marks a gap"),
+        (np.array([0.0, 1.0, 2.0j]), "array 'wx' does not hold real numbers"),
+        (np.array(["0", "1", "2"]), "array 'wx' does not hold real numbers"),
+        (np.arange(4), "arrays of different lengths"),
+    ],
+)
+def test_arrays_that_are_no_readings(bad, words, tmp_path):
+    path = tmp_path / "log.npz"
+    np.savez(path, t=np.arange(3), wx=bad)
+    with pytest.raises(rj.identify.LogError, match=words):
+        rj.identify.read_table(path, ["t", "wx"])
+
+
+MEMORY = """
+import resource, sys
+from rigidjax.identify import read_table
+kilo = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+before = kilo()
+table = read_table(sys.argv[1], ["t", "wx", "wy", "wz"])
+print(1024 * (kilo() - before) / sum(column.nbytes for column in table.values()))
+"""
+
+
+@pytest.mark.slow
+def test_a_large_log_takes_memory_for_its_numbers(tmp_path):
+    path, rows = tmp_path / "log.csv", 40_000 * [("0.123456789,"[:11] + 3 * ",0.12345678") + "\n"]
+    with path.open("w") as file:
+        file.write("t,wx,wy,wz\n")
+        for _ in range(25):
+            file.writelines(rows)
+    out = subprocess.run([sys.executable, "-c", MEMORY, str(path)], capture_output=True, text=True)
+    assert float(out.stdout) < 1.5, out.stderr
 
 
 @pytest.mark.slow

@@ -142,7 +142,7 @@ MISTAKES = [
     (([0.0, 1.0], (rj.identify.Gyro(), [[1.0, 0, 0], [np.nan, 0, 0]])), "Gyro: the reading at index 1 contains NaN; mask it"),
     (([0.0, 1.0], (rj.identify.AttitudeSensor(), [[1.0, 0, 0, 0], [2.0, 0, 0, 0]])), "quaternion at index 1 is not unit.*scalar first"),
     (([1.0, 0.0], (rj.identify.Gyro(), np.zeros((2, 3)))), r"t\[1\] is not above"),
-    (([0.0, np.nan], (rj.identify.Gyro(), np.zeros((2, 3)))), "t: contains NaN at index 1"),
+    (([0.0, np.nan], (rj.identify.Gyro(), np.zeros((2, 3)))), "t: contains NaN or infinity at index 1"),
     (([0.0, 1.0],), "at least one pair"),
     (([0.0, 1.0], (rj.identify.Gyro(), np.zeros((2, 3)), [True])), r"mask of shape \(2,\), got \(1,\)"),
 ]  # fmt: skip

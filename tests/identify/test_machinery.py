@@ -15,6 +15,8 @@ import pytest
 import rigidjax as rj
 from rigidjax import identify
 from rigidjax.__main__ import main
+from rigidjax.identify import checkpoint, search
+from rigidjax.identify.checkpoint import Tried
 from rigidjax.identify.problem import errors_of_one, with_blocks
 from rigidjax.identify.stacking import one
 
@@ -223,30 +225,78 @@ def test_many_starts_in_one_vmap_end_where_they_do_one_by_one(free_record):
     np.testing.assert_allclose(at_once.parameters.body, alone.parameters.body, atol=1e-6)
 
 
-def test_a_fit_goes_on_from_its_checkpoint(free_record, tmp_path):
+def test_a_fit_killed_after_any_stride_ends_at_the_same_bits(free_record, tmp_path, monkeypatch):
+    """The damping of the strides to come depends on those that were, not on the process."""
+    # Steps in strides of three, so that one start has many of them.
+    monkeypatch.setattr(search, "STRIDE", 3)
     problem = identify.Problem(free_record, identify.PrincipalRatios())
-    path = tmp_path / "fit.npz"
-    whole = identify.fit(problem, starts=3)
+    path, save = tmp_path / "fit.npz", checkpoint.Checkpoint.save
+    places = []
 
-    class StopError(Exception):
+    class KillError(Exception):
         pass
 
-    def stop(line):
-        if line.startswith("start 2"):
-            raise StopError
+    def fit(last=None):
+        def killed(self, done, position):
+            save(self, done, position)
+            places.append(position[:2])
+            if len(places) == last:
+                raise KillError
 
-    with pytest.raises(StopError):
-        identify.fit(problem, starts=3, checkpoint=path, progress=stop)
-    lines = []
-    again = identify.fit(problem, starts=3, checkpoint=path, progress=lines.append)
-    assert len(lines) == 1
-    for a, b in zip(
-        jax.tree.leaves(again.parameters), jax.tree.leaves(whole.parameters), strict=True
-    ):
-        np.testing.assert_array_equal(a, b)
+        monkeypatch.setattr(checkpoint.Checkpoint, "save", killed)
+        places.clear()
+        return identify.fit(problem, starts=2, max_steps=30, checkpoint=path)
+
+    def bits(found):
+        return np.concatenate([np.ravel(x) for x in jax.tree.leaves(found.parameters)])
+
+    whole, count = bits(fit()), len(places)
+    # The last horizon took several strides: there is something to be lost.
+    assert (2, 2) in places and count > 8
+    for last in range(1, count + 1):
+        path.unlink()
+        with pytest.raises(KillError):
+            fit(last)
+        np.testing.assert_array_equal(bits(fit()), whole, err_msg=f"killed after {last}")
+        # Nothing is done twice.
+        assert len(places) == count - last
     other = identify.Problem(free_record, identify.PrincipalRatios(), loss=identify.Huber(0.5))
     with pytest.raises(ValueError, match="the checkpoint of another problem"):
-        identify.fit(other, starts=3, checkpoint=path)
+        identify.fit(other, starts=2, checkpoint=path)
+
+
+@pytest.mark.parametrize("kind", ["empty", "cut", "text", "table", "fewer"])
+def test_a_damaged_checkpoint_is_told_in_words(free_record, tmp_path, kind):
+    problem = identify.Problem(free_record, identify.PrincipalRatios())
+    path = tmp_path / "fit.npz"
+    like = Tried(problem.start(), jnp.asarray(1.0), jnp.asarray(True))
+    checkpoint.Checkpoint(path, like, 2.0).save([like], checkpoint.Position(1, 0, like))
+    whole = path.read_bytes()
+    if kind == "empty":
+        path.write_bytes(b"")
+    elif kind == "cut":
+        path.write_bytes(whole[: len(whole) // 2])
+    elif kind == "text":
+        path.write_text("t,wx,wy,wz")
+    elif kind == "table":
+        np.savez(path, t=np.arange(3))
+    else:
+        held = dict(np.load(path))
+        del held["leaf3"]
+        np.savez(path, **held)
+    words = "another problem" if kind == "fewer" else "no checkpoint of a fit, or a damaged one"
+    before = path.read_bytes()
+    with pytest.raises(ValueError, match=words):
+        checkpoint.Checkpoint(path, like, 2.0)
+    assert path.read_bytes() == before
+
+
+def test_a_checkpoint_needs_its_folder_before_the_search_begins(free_record, tmp_path):
+    problem = identify.Problem(free_record, identify.PrincipalRatios())
+    with pytest.raises(ValueError, match=r"there is no folder .*absent"):
+        identify.fit(problem, starts=1, checkpoint=tmp_path / "absent" / "fit.npz")
+    with pytest.raises(ValueError, match="wanted a file, this is a folder"):
+        identify.fit(problem, starts=1, checkpoint=tmp_path)
 
 
 KILLED = """

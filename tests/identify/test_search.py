@@ -6,7 +6,8 @@ import pytest
 
 from rigidjax import identify
 from rigidjax.identify import search
-from rigidjax.identify.search import Tried, climb, fresh, settle
+from rigidjax.identify.checkpoint import Position, Tried
+from rigidjax.identify.search import climb, fresh, settle
 
 TS = np.linspace(0.0, 1.0, 8)
 
@@ -33,9 +34,13 @@ def test_a_stride_that_is_lost_leaves_where_it_began_and_its_misfit(problem, mon
     monkeypatch.setattr(search, "least_squares", lost)
     monkeypatch.setattr(search, "cost_of", lambda point, *_: 7.0)
     seen = []
-    out = settle(fresh(at(problem, 2.0)), problem, (), jnp.ones((1, 8)), None, 100, seen.append)
+
+    def note(tried, strides, over):
+        seen.append((strides, over))
+
+    out = settle(fresh(at(problem, 2.0)), problem, (), jnp.ones((1, 8)), None, 100, note)
     assert place(out.parameters) == 2.0 and float(out.cost) == 7.0
-    assert not bool(out.converged) and len(seen) == 1
+    assert not bool(out.converged) and seen == [(1, True)]
 
 
 @pytest.mark.parametrize(("beyond", "kept"), [(np.nan, 0.0), (np.inf, 0.0), (1e4, 0.0), (2.0, 1.0)])
@@ -49,6 +54,6 @@ def test_a_part_is_not_fitted_at_the_cost_of_the_whole(problem, monkeypatch, bey
 
     monkeypatch.setattr(search, "least_squares", step)
     monkeypatch.setattr(search, "cost_of", lambda point, *_: 1.0 if place(point) == 0.0 else beyond)
-    climb(fresh(at(problem, 0.0)), problem, (), None, 25)
+    climb(Position(0, 0, fresh(at(problem, 0.0))), problem, (), None, 25)
     assert [shown for _, shown in begun] == [0.25, 0.5, 1.0]
     assert [start for start, _ in begun] == [0.0, kept, kept]

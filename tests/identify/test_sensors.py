@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.interpolate import CubicSpline
 
 import rigidjax as rj
 from rigidjax.identify.sensors.base import Moment
@@ -173,3 +174,50 @@ def test_a_wheel_follows_its_log():
     assert eqx.tree_equal(speed, rj.torques.Series(t, np.sin(3 * t)))
     with pytest.raises(ValueError, match="evenly spaced"):
         rj.torques.Series([0.0, 1.0, 2.0, 4.0], np.zeros(4))
+
+
+def test_a_series_is_scipys_spline():
+    rng = np.random.default_rng(0)
+    for n in (4, 5, 40):
+        t, v = 3.0 + 0.25 * np.arange(n), rng.normal(size=(n, 3))
+        series, spline = rj.torques.Series(t, v), CubicSpline(t, v)
+        at = rng.uniform(t[0], t[-1], 50)
+        np.testing.assert_allclose(jax.vmap(series)(at), spline(at), rtol=0, atol=1e-13)
+        slope = jax.vmap(jax.jacfwd(series))(at)
+        np.testing.assert_allclose(slope, spline(at, 1), rtol=0, atol=1e-12)
+
+
+def test_a_series_and_a_wheel_can_be_made_under_a_trace():
+    t, v = jnp.arange(6.0), jnp.asarray([0.0, 1.0, 0.5, -1.0, 2.0, 0.0])
+    read = lambda t, v, axis: rj.torques.Wheel(2.0, axis, rj.torques.Series(t, v))(2.3)[0]
+    axis = jnp.asarray([0.6, 0.0, 0.8])
+    wanted = read(t, v, axis)
+    np.testing.assert_allclose(eqx.filter_jit(read)(t, v, axis), wanted, rtol=1e-15)
+    many = jax.vmap(read, (None, 0, None))(t, jnp.stack([v, 2 * v]), axis)
+    np.testing.assert_allclose(many, [wanted, 2 * wanted], rtol=1e-14)
+    # Linear in the values; with the times the reading moves the other way.
+    slope = jax.jit(jax.grad(read, 1))(t, v, axis)
+    np.testing.assert_allclose(slope @ v, wanted, rtol=1e-13)
+    earlier = jax.grad(lambda shift: read(t + shift, v, axis))(0.0)
+    speed = jax.grad(lambda at: 2.0 * 0.6 * rj.torques.Series(t, v)(at))(2.3)
+    np.testing.assert_allclose(earlier, -speed, rtol=1e-12)
+    for bad, words in (
+        ((t.at[1].set(1.5), v), "evenly spaced"),
+        ((t, v * jnp.nan), "contains NaN"),
+    ):
+        with pytest.raises(RuntimeError, match=words):
+            eqx.filter_jit(read)(*bad, axis)
+    with pytest.raises(RuntimeError, match="wanted a unit vector"):
+        eqx.filter_jit(read)(t, v, 2 * axis)
+
+
+@pytest.mark.usefixtures("unhooked")
+def test_a_recording_under_a_trace_is_refused_in_words():
+    gyro, ts, values = rj.identify.Gyro(0.1), jnp.arange(4.0), jnp.ones((4, 3))
+    for traced in (
+        lambda x: rj.identify.Recording(ts + x, (gyro, values)).t,
+        lambda x: rj.identify.Recording(ts, (gyro, values + x)).t,
+        lambda x: rj.identify.Recording(ts, (gyro, values, values[:, 0] > x)).t,
+    ):
+        with pytest.raises(TypeError, match=r"Recording: wanted known numbers.*outside of jit"):
+            jax.jit(traced)(0.0)

@@ -1,11 +1,14 @@
 """The main job on real observations: 4179 Toutatis, and its intervals on simulated records."""
 
+import json
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import rigidjax as rj
+from rigidjax.__main__ import main
 from rigidjax.identify import toutatis
 
 
@@ -96,3 +99,48 @@ def test_intervals_hold_the_truth_in_ninety_of_a_hundred_records(found):
         held += (bounds[:, 0] <= truth) & (truth <= bounds[:, 1])
     assert (held >= 90).all(), held
     assert plain >= 90, plain
+
+
+def test_the_demo_heeds_report_json_and_checkpoint(found, tmp_path, monkeypatch, capsys):
+    asked = {}
+
+    def fit(problem, **how):
+        asked.update(how)
+        return found
+
+    monkeypatch.setattr(rj.identify, "fit", fit)
+    names = ("demo.png", "demo.html", "demo.json", "demo.npz")
+    figure, page, numbers, kept = (str(tmp_path / name) for name in names)
+    options = ["--figure", figure, "--report", page, "--json", numbers, "--checkpoint", kept]
+    assert main(["identify", "--demo", "--starts", "3", *options]) == 0
+    assert asked["starts"] == 3 and str(asked["checkpoint"]) == kept
+    out = capsys.readouterr().out
+    assert f"report: {page}" in out and f"numbers: {numbers}" in out
+    held = json.loads((tmp_path / "demo.json").read_text())
+    low, high = held["quantities"]["rotation about the long axis"]["interval_95"]
+    assert low < 5.41 < high
+    text = (tmp_path / "demo.html").read_text()
+    # Data and fit, what is left over, the body with its uncertainty.
+    assert text.count("data:image/png;base64,") == 3 and "precession of the long axis" in text
+    assert "deg/day" in text and toutatis.CITATION.replace("&", "&amp;") in text
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--model", "tensor", "--unit", "deg/s"], "--model, --unit is for log FILES only"),
+        (["--report", "absent/demo.html"], "there is no folder absent"),
+    ],
+)
+def test_what_the_demo_cannot_heed_is_refused(options, words, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(["identify", "--demo", *options])
+    assert ended.value.code == 2
+    assert words in capsys.readouterr().err
+
+
+def test_a_checkpoint_without_its_folder_is_one_line(capsys):
+    assert main(["identify", "--demo", "--checkpoint", "absent/demo.npz"]) == 2
+    out = capsys.readouterr().err
+    assert out.startswith("error: checkpoint absent/demo.npz: there is no folder")
+    assert out.count("\n") == 1

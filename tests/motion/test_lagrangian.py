@@ -175,6 +175,10 @@ def test_gradients_with_respect_to_the_numbers_of_a_lagrangian():
         (lambda: lagrangian.Coordinates([1.0, 2], [1.0]), r"rate: wanted shape \(2,\), got \(1,\); one rate"),
         (lambda: lagrangian.Coordinates(1.0, 2.0), r"got one number; give \[q\]"),
         (lambda: lagrangian.EulerAngleTop(INERTIA, torques.Damping([1.0, 1, 1])), "Damping has no potential.*generalised force"),
+        (lambda: lagrangian.HeavyTopHamiltonian(INERTIA, torques.Damping([1.0, 1, 1])), "top: wanted HeavyTop, got Damping; .*gravity alone"),
+        (lambda: lagrangian.HeavyTopHamiltonian(INERTIA, lambda t, state, body: state.omega), "top: wanted HeavyTop, got function"),
+        (lambda: lagrangian.HeavyTopHamiltonian(TENSOR, TOP), "inertia: wanted Inertia, got ndarray"),
+        (lambda: lagrangian.RotationalHamiltonian(TENSOR), "inertia: wanted Inertia, got ndarray"),
         (lambda: lagrangian.from_attitude(rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 1])), "sin θ = 0.*solve for an Attitude"),
     ],
 )  # fmt: skip

@@ -223,6 +223,10 @@ def test_float32_stays_float32_and_says_what_it_cannot_reach():
         rj.simulate(body, start, ts, Nothing(), rtol=1e-10)
 
 
+# What constructors refuse, but `tree_at` lets pass.
+MATTER = rj.MassProperties(1.0, np.zeros(3), np.eye(3))
+WIDE = eqx.tree_at(lambda body: body.mass, MATTER, jnp.array([1.0, 2.0, 4.0]))
+TALL = eqx.tree_at(lambda state: state.q, rj.Attitude(Q, OMEGA), jnp.stack([jnp.asarray(Q)] * 2))
 BAD = [
     (dict(ts=[0.0, 1.0, 1.0]), ValueError, r"increasing times; ts\[2\]"),
     (dict(ts=[0.0, np.nan, 1.0]), ValueError, r"ts: contains NaN or infinity at index \(1,\)"),
@@ -235,6 +239,10 @@ BAD = [
     (dict(body=np.eye(3)), TypeError, "only turns: wanted Inertia, got ndarray"),
     (dict(body=rj.MassProperties(1.0, np.zeros(3), np.eye(3))), TypeError, "pass body.inertia"),
     (dict(state0=rj.Rigid(OMEGA, OMEGA, Q, OMEGA)), TypeError, "wanted MassProperties, got Inertia"),
+    (dict(body=rj.Inertia(TENSOR * np.nan)), ValueError, r"inertia tensor: contains NaN or infinity at index \(0, 0\)"),
+    (dict(body=rj.Inertia(np.stack([TENSOR] * 2))), ValueError, r"one body, tensor of shape \(3, 3\), got \(2, 3, 3\)"),
+    (dict(body=WIDE, state0=rj.Rigid(OMEGA, OMEGA, Q, OMEGA)), ValueError, r"one body, mass of shape \(\), got \(3,\).*vmap"),
+    (dict(state0=TALL), ValueError, r"one body, q of shape \(4,\), got \(2, 4\)"),
     (dict(rtol=0.0), ValueError, "wanted rtol > 0"),
     (dict(rtol=1e-9, stepsize_controller=dfx.ConstantStepSize()), ValueError, "not both"),
     (dict(torque=lambda t, state, body: jnp.zeros(2)), ValueError, r"wanted shape \(3,\), got \(2,\); body-frame"),
@@ -247,6 +255,34 @@ def test_mistakes_are_named(change, error, words):
     given = dict(body=rj.Inertia(TENSOR), state0=rj.Attitude(Q, OMEGA), ts=[0.0, 1.0]) | change
     with pytest.raises(error, match=words):
         rj.simulate(**given)
+
+
+@pytest.mark.usefixtures("unhooked")
+def test_states_and_masses_of_several_shapes_are_refused():
+    five, shape = np.ones((5, 3)), r"wanted one of each.*q \(4,\), omega \(5, 3\)"
+    for make in (lambda: rj.Attitude(Q, five), lambda: rj.Rigid(OMEGA, OMEGA, Q, five)):
+        with pytest.raises(ValueError, match=shape):
+            make()
+    with pytest.raises(ValueError, match=r"x, v: wanted one of each.*x \(3,\), v \(5, 3\)"):
+        rj.Point(OMEGA, five)
+    with pytest.raises(ValueError, match=r"mass \(\).*got shapes mass \(3,\)"):
+        rj.MassProperties([1.0, 2.0, 4.0], np.zeros(3), np.eye(3))
+
+
+@pytest.mark.usefixtures("unhooked")
+def test_times_without_end_are_refused():
+    start = rj.Attitude(Q, OMEGA)
+    body, many = rj.Inertia(TENSOR), jax.tree.map(lambda leaf: leaf[None], start)
+    run = rj.simulate(body, start, [0.0, 1.0])
+    for t in (-np.inf, np.inf, np.nan):
+        with pytest.raises(ValueError, match="t: contains NaN or infinity"):
+            rj.exact.free_body(body, start, t)
+        with pytest.raises(ValueError, match="t: contains NaN or infinity"):
+            rj.exact.FreeBody(body, start)(t)
+        with pytest.raises(ValueError, match="t0: contains NaN or infinity"):
+            rj.batch.rollout(body, many, 0.01, 2, t0=t)
+        with pytest.raises(ValueError, match="evaluate: t lies outside"):
+            run.evaluate(t)
 
 
 class NeedsAttitude(rj.torques.AbstractTorque):

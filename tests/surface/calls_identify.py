@@ -4,14 +4,13 @@ import tempfile
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import optax
-
-import rigidjax as rj
 from surface import scenes as s
 from surface.calls import KINDS, leave_out, row
-from surface.scenes import TS, M, N, P, Q, V, W, Y
+from surface.scenes import TS, M, N, V, W, Y
+
+import rigidjax as rj
 
 HOST = dict(host=True, transforms=())
 vectors = dict(bias=V, scale=np.ones(3) + 0.1 * V, mounting=0.1 * W, limit=np.array([5.0, 6, 7]))

@@ -3,11 +3,11 @@
 import diffrax as dfx
 import jax.numpy as jnp
 import numpy as np
-
-import rigidjax as rj
 from surface import scenes as s
 from surface.calls import KINDS, leave_out, row
 from surface.scenes import DOWN, SYMMETRIC, TS, Q, V, W, Y
+
+import rigidjax as rj
 
 REVERSE = ("jit", "vmap", "grad", "scan", "checkpoint")
 

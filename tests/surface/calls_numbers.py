@@ -3,8 +3,6 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-
-import rigidjax as rj
 from surface import scenes as s
 from surface.calls import leave_out, row
 from surface.scenes import SECOND, SYMMETRIC, M, N, P, Q, V, W, Y

@@ -7,11 +7,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-
-import rigidjax as rj
 from surface import scenes as s
 from surface.scenes import DOWN, SECOND, SYMMETRIC, TS, P, Q, V, W, Y
 from surface.sweep import Case
+
+import rigidjax as rj
 
 q4, so3, mrp, rodrigues, euler = rj.quaternion, rj.so3, rj.mrp, rj.rodrigues, rj.euler
 ell = rj.elliptic

@@ -21,7 +21,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-
 from surface import judge, replace
 from surface.calls import TABLE, Call
 
@@ -146,7 +145,7 @@ def _transforms(call: Call, given: dict, counts: collections.Counter) -> Iterato
 
 
 def _programs(run: Any, floats: Any) -> dict[str, Any]:
-    flat, restore = jax.flatten_util.ravel_pytree(floats)
+    _flat, restore = jax.flatten_util.ravel_pytree(floats)
 
     def scalar(x: Any) -> Any:
         return _weighed(run(x))

@@ -6,9 +6,10 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jax.lax import linalg
 from jaxtyping import Array, ArrayLike, Float
-from scipy.interpolate import CubicSpline
 
+from rigidjax import _checks
 from rigidjax._types import Scalar, ScalarLike, Vec3
 
 Samples = Float[ArrayLike, "n *channels"] | Sequence[Any]
@@ -20,9 +21,14 @@ class Series(eqx.Module):
     Found by division, not by search, so that it costs little inside a solver; its derivative is
     continuous, so that a step may pass over a sample.
 
-    **Arguments:** `times` (n,) s, evenly spaced to 1e-6 of a step; `values` (n,) or (n, k).
+    **Arguments:** `times` (n,) s, evenly spaced to 1e-6 of a step; `values` (n,) or (n, k). Both
+    may be traced: it can be made under `jit`, `vmap` and `grad`.
 
-    **Raises:** `ValueError` for fewer than four samples, numbers that differ, NaN, uneven times.
+    The slopes at the samples are those of the spline whose third derivative does not jump at the
+    second and the last but one ("not a knot": de Boor, A Practical Guide to Splines, ch. IV).
+
+    **Raises:** `ValueError` (`equinox` error under `jit`) for fewer than four samples, numbers that
+    differ, NaN, uneven times; `TypeError` for what is no number.
 
     >>> Series([0.0, 1.0, 2.0, 3.0], [0.0, 1.0, 4.0, 9.0])(1.5)
     Array(2.25, dtype=float64)
@@ -34,23 +40,24 @@ class Series(eqx.Module):
     slopes: Float[Array, "n *channels"]
 
     def __init__(self, times: Float[ArrayLike, " n"] | Sequence[Any], values: Samples):
-        t, rows = np.asarray(times, float), np.asarray(values, float)
+        t, rows = _numbers(times, "times"), _numbers(values, "values")
         if t.ndim != 1 or t.size < 4 or rows.shape[:1] != t.shape:
             raise ValueError(
                 f"Series: wanted at least four times and as many rows, got shapes {t.shape} and "
                 f"{rows.shape}"
             )
-        if not (np.isfinite(t).all() and np.isfinite(rows).all()):
-            raise ValueError("Series: contains NaN or infinity")
+        t, rows = _finite(t, "times"), _finite(rows, "values")
         step = (t[-1] - t[0]) / (t.size - 1)
-        if not step > 0 or np.abs(np.diff(t) - step).max() > 1e-6 * step:
-            raise ValueError(
-                "Series: wanted evenly spaced, increasing times; resample, or use Linear"
-            )
+        uneven = ~((step > 0) & (abs(t[1:] - t[:-1] - step).max() <= 1e-6 * step))
+        step = _checks.refuse(
+            step,
+            uneven,
+            "Series: wanted evenly spaced, increasing times; resample, or use Linear",
+        )
         dtype = jnp.result_type(float)
         self.start, self.step = jnp.asarray(t[0], dtype), jnp.asarray(step, dtype)
         self.values = jnp.asarray(rows, dtype)
-        self.slopes = jnp.asarray(CubicSpline(t, rows)(t, 1) * step, dtype)
+        self.slopes = _slopes(self.values)
 
     def __call__(self, t: ScalarLike) -> Any:
         """The value at `t` (s), () or (k,)."""
@@ -66,6 +73,38 @@ class Series(eqx.Module):
         bend = 3.0 * (right - left) - 2.0 * out - into
         twist = 2.0 * (left - right) + out + into
         return left + s * (out + s * (bend + s * twist))
+
+
+def _numbers(value: Any, name: str) -> Any:
+    """NumPy's float64 where the numbers are known: times of a log have more than seven digits."""
+    try:
+        if _checks.known(value):
+            return np.asarray(value, float)
+        return jnp.asarray(value, jnp.result_type(float))
+    except (TypeError, ValueError) as error:
+        raise TypeError(
+            f"Series: {name}: wanted an array of numbers, got {type(value).__name__}"
+        ) from error
+
+
+def _finite(numbers: Any, name: str) -> Any:
+    bad = ~_checks.namespace(numbers).isfinite(numbers)
+    return _checks.refuse(numbers, bad.any(), f"Series: {name}: contains NaN or infinity")
+
+
+def _slopes(values: Float[Array, "n *channels"]) -> Float[Array, "n *channels"]:
+    """The change per step at each sample: s₋ + 4 s + s₊ = 3 (v₊ − v₋), at the ends not a knot."""
+    n = values.shape[0]
+    v = values.reshape(n, -1)
+    rise = v[1:] - v[:-1]
+    ends = (2.5 * rise[:1] + 0.5 * rise[1:2], 2.5 * rise[-1:] + 0.5 * rise[-2:-1])
+    sides = jnp.concatenate([ends[0], 3.0 * (rise[1:] + rise[:-1]), ends[1]])
+    one, middle = np.ones(n, v.dtype), np.full(n, 4.0, v.dtype)
+    below, above = one.copy(), one.copy()
+    middle[[0, -1]], above[0], below[-1] = 1.0, 2.0, 2.0
+    below[0], above[-1] = 0.0, 0.0
+    below, middle, above = (jnp.asarray(band) for band in (below, middle, above))
+    return linalg.tridiagonal_solve(below, middle, above, sides).reshape(values.shape)
 
 
 class Wheel(eqx.Module):
@@ -92,13 +131,18 @@ class Wheel(eqx.Module):
     def __init__(
         self, inertia: ScalarLike, axis: Any, speed: Any, *, delay: ScalarLike | None = None
     ):
-        direction = np.asarray(axis, float)
-        if direction.shape != (3,) or not abs(np.linalg.norm(direction) - 1) < 1e-6:
-            raise ValueError(f"axis: wanted a unit vector (3,), got {direction}")
+        axis = _checks.floating(axis, (3,), "axis")
+        x, y, z = _checks.namespace(axis).asarray(axis)
+        found = f", got {np.asarray(axis)}" if _checks.known(axis) else ""
+        axis = _checks.refuse(
+            axis,
+            ~(abs(x * x + y * y + z * z - 1) < 2e-6),
+            f"axis: wanted a unit vector (3,){found}",
+        )
         if not callable(speed):
             raise TypeError(f"speed: wanted a function of time, got {type(speed).__name__}")
         self.inertia = jnp.asarray(inertia, jnp.result_type(float))
-        self.axis = jnp.asarray(direction, jnp.result_type(float))
+        self.axis = axis.astype(jnp.result_type(float))
         self.speed = speed
         self.delay = None if delay is None else jnp.asarray(delay, jnp.result_type(float))
 

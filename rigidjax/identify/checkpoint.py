@@ -1,0 +1,99 @@
+"""Where a search stands, kept in a file, so that a killed one goes on from there."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from rigidjax.identify.problem import Parameters
+
+
+class Tried(eqx.Module):
+    """Where one start ended: its parameters, misfit (½ Σ of squares), and whether it converged."""
+
+    parameters: Parameters
+    cost: Float[Array, ""]
+    converged: Bool[Array, ""]
+
+
+class Position(NamedTuple):
+    """Where the search from one start stands, all that the rest of it depends on.
+
+    **Fields:** `stage` the index of the horizon that comes next, their number where it is over;
+    `strides` how many were taken there; `tried` what was found.
+    """
+
+    stage: int
+    strides: int
+    tried: Tried
+
+
+def require_folder(path: str | Path) -> None:
+    """Raise `ValueError` unless a file can be at `path`: before the search, not after a stride."""
+    path = Path(path)
+    if not path.parent.is_dir():
+        raise ValueError(f"checkpoint {path}: there is no folder {path.parent}")
+    if path.is_dir():
+        raise ValueError(f"checkpoint {path}: wanted a file, this is a folder")
+
+
+class Checkpoint:
+    """What a long search has found so far, on disk after every stride of steps.
+
+    **Arguments:** `path` of the file, or `None` to keep nothing; `like` a `Tried` of the right
+    shapes; `print_of` a number that belongs to this problem alone.
+
+    **Raises:** `ValueError` for a file that is no checkpoint, is cut, or belongs to another
+    problem; it is not overwritten.
+    """
+
+    def __init__(self, path: str | Path | None, like: Tried, print_of: float):
+        self.path, self.like = None if path is None else Path(path), like
+        self.print_of = print_of
+        self.done: list[Tried] = []
+        self.position = Position(0, 0, like)
+        if self.path is not None and self.path.exists():
+            self._read(self.path)
+
+    def save(self, done: Sequence[Tried], position: Position) -> None:
+        """Write what is finished and where the search stands, replacing the file at once."""
+        if self.path is None:
+            return
+        stage, strides, current = position
+        leaves = [np.asarray(x) for item in (*done, current) for x in jax.tree.leaves(item)]
+        beside = self.path.with_name(self.path.name + ".new")
+        with beside.open("wb") as file:
+            held: dict[str, Any] = {f"leaf{i}": leaf for i, leaf in enumerate(leaves)}
+            held |= dict(print_of=self.print_of, stage=stage, strides=strides, done=len(done))
+            np.savez(file, **held)
+        beside.replace(self.path)
+
+    def _read(self, path: Path) -> None:
+        # An empty file raises EOFError; a cut one BadZipFile, or zlib.error.
+        try:
+            # Of a file that it opened itself and cannot read NumPy leaves the handle open.
+            with path.open("rb") as raw, np.load(raw) as file:
+                held = {name: file[name] for name in file.files}
+            print_of, done = float(held["print_of"]), int(held["done"])
+            stage, strides = int(held["stage"]), int(held["strides"])
+        except Exception as error:
+            raise ValueError(
+                f"{path}: no checkpoint of a fit, or a damaged one ({type(error).__name__}); "
+                "delete it, or name another file"
+            ) from None
+        leaves, structure = jax.tree.flatten(self.like)
+        count = len(leaves)
+        found = [held.get(f"leaf{i}", np.zeros(0)) for i in range((done + 1) * count)]
+        shapes = [leaf.shape for leaf in leaves] * (done + 1)
+        if print_of != self.print_of or [leaf.shape for leaf in found] != shapes:
+            raise ValueError(f"{path}: the checkpoint of another problem; name another file")
+        items = [
+            jax.tree.unflatten(structure, map(jnp.asarray, found[i * count : (i + 1) * count]))
+            for i in range(done + 1)
+        ]
+        self.done, self.position = items[:-1], Position(stage, strides, items[-1])
