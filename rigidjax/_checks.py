@@ -1,8 +1,10 @@
 """Checks at public boundaries: what was wanted, what came, and the likely cause (floor 0)."""
 
 import functools
+import os
 import warnings
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import equinox as eqx
@@ -186,23 +188,32 @@ def function(value: Any, name: str, of: str, *, hint: str = "") -> Any:
 def whole(value: Any, name: str, least: int) -> int:
     """Return `value` as a whole number of at least `least`, known before anything is compiled."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer):
-        if not (isinstance(value, jax.Array) and known(value) and value.shape == ()):
-            raise TypeError(f"{name}: wanted a whole number, got {_shown(value)}")
-        if not jnp.issubdtype(value.dtype, jnp.integer):
-            raise TypeError(f"{name}: wanted a whole number, got {_shown(value)}")
+        raise TypeError(f"{name}: wanted a whole number of Python, got {_shown(value)}")
     if value < least:
-        raise ValueError(f"{name}: wanted a whole number of at least {least}, got {int(value)}")
+        raise ValueError(f"{name}: wanted a whole number of at least {least}, got {value}")
     return int(value)
+
+
+def number(value: Any, name: str) -> float:
+    """Return `value` as a number of Python, known before anything is compiled."""
+    array = on_host(value, name)
+    if array.shape != ():
+        raise ValueError(f"{name}: wanted one number, got shape {array.shape}")
+    return float(array)
 
 
 def positive(value: Any, name: str, what: str = "a positive number") -> float:
     """Return `value` as a positive, finite number of Python, known before anything is compiled."""
-    number = on_host(value, name)
-    if number.shape != ():
-        raise ValueError(f"{name}: wanted {what}, got shape {number.shape}")
-    if not 0 < number < np.inf:
-        raise ValueError(f"{name}: wanted {what}, got {float(number)}")
-    return float(number)
+    found = number(value, name)
+    if not 0 < found < np.inf:
+        raise ValueError(f"{name}: wanted {what}, got {found}")
+    return found
+
+
+def not_negative(value: Any, name: str) -> float:
+    """Return `value` as a finite number of Python ≥ 0, known before anything is compiled."""
+    found = number(value, name)
+    return 0.0 if found == 0 else positive(found, name, "a number ≥ 0")
 
 
 def on_host(value: Any, name: str) -> np.ndarray:
@@ -219,6 +230,17 @@ def on_host(value: Any, name: str) -> np.ndarray:
     if array.dtype.kind not in "iuf" and array.dtype != jnp.bfloat16:
         raise TypeError(f"{name}: wanted numbers, got {type(value).__name__} of {array.dtype}")
     return array.astype(float)
+
+
+def path(value: Any, name: str = "path") -> Path:
+    """Return the path of a file that `value` names."""
+    if (
+        not isinstance(value, str | os.PathLike)
+        or isinstance(os.fspath(value), bytes)
+        or value == ""
+    ):
+        raise TypeError(f"{name}: wanted the name of a file, got {_shown(value)}")
+    return Path(value)
 
 
 def word(value: Any, options: Sequence[str], name: str) -> str:

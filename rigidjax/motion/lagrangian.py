@@ -49,11 +49,14 @@ class Coordinates(eqx.Module):
     def __init__(
         self, q: Float[ArrayLike, "*batch n"] | object, rate: Float[ArrayLike, "*batch n"] | object
     ):
-        q = jnp.asarray(q)
-        if q.ndim == 0:
-            raise ValueError("q: wanted generalised coordinates (n,), got one number; give [q]")
-        self.q = _checks.floating(q, q.shape, "q")
-        self.rate = _checks.floating(rate, q.shape, "rate", hint="one rate for each coordinate")
+        self.q = _checks.numbers(q, "q")
+        if self.q.ndim == 0 or self.q.size == 0:
+            raise ValueError(
+                f"q: wanted generalised coordinates (n,), got shape {self.q.shape}; of one give [q]"
+            )
+        self.rate = _checks.floating(
+            rate, self.q.shape, "rate", hint="one rate for each coordinate"
+        )
 
 
 class LagrangeEquations(eqx.Module):

@@ -62,9 +62,9 @@ def wahba(
     >>> wahba(jnp.eye(3)[:2], jnp.eye(3)[:2]).round(12).tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
     """
-    body = _rows(body, (3,), "body")
+    body = _checks.rows(body, (3,), "body")
     world = _checks.floating(world, body.shape, "world")
-    w = jnp.ones_like(body[:, 0]) if weights is None else jnp.asarray(weights)
+    w = jnp.ones_like(body[:, 0]) if weights is None else weights
     w = _checks.floating(w, body.shape[:1], "weights")
     b = (w[:, None, None] * world[:, :, None] * body[:, None, :]).sum(0)
     best = _best(b)
@@ -112,7 +112,7 @@ def mean(matrices: Float[ArrayLike, "n 3 3"], weights: Float[ArrayLike, "n"] | N
     >>> mean(jnp.stack([jnp.eye(3), jnp.eye(3)])).round(12).tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
     """
-    matrices = _rows(matrices, (3, 3), "matrices")
+    matrices = _checks.rows(matrices, (3, 3), "matrices")
     return quaternion.to_matrix(mean_quaternion(jax.vmap(matrix_to_quaternion)(matrices), weights))
 
 
@@ -126,8 +126,8 @@ def mean_quaternion(
     >>> mean_quaternion(jnp.array([[1.0, 0, 0, 0], [-1.0, 0, 0, 0]])).tolist()
     [1.0, 0.0, 0.0, 0.0]
     """
-    q = _rows(quaternions, (4,), "quaternions")
-    w = jnp.ones_like(q[:, 0]) if weights is None else jnp.asarray(weights)
+    q = _checks.rows(quaternions, (4,), "quaternions")
+    w = jnp.ones_like(q[:, 0]) if weights is None else weights
     w = _checks.floating(w, q.shape[:1], "weights")
 
     def newton(_: Any, start: Quat, q: Array, w: Array) -> Quat:
@@ -144,15 +144,6 @@ def mean_quaternion(
     for i in range(2):
         start = newton(i, lax.stop_gradient(start) if i == 0 else start, q, w)
     return quaternion.canonical(quaternion.normalise(start))
-
-
-def _rows(values: Any, shape: tuple[int, ...], name: str) -> Array:
-    """Many of one shape, as one array (n, *shape)."""
-    array = _checks.floating(values, np.shape(values), name)
-    if array.ndim != len(shape) + 1 or array.shape[1:] != shape:
-        wanted = ", ".join(map(str, ("n", *shape)))
-        raise ValueError(f"{name}: wanted shape ({wanted}), got {array.shape}")
-    return array
 
 
 def _left_jacobian_inverse(v: Vec3) -> Mat3:

@@ -7,9 +7,9 @@ from typing import Any
 
 from surface import public
 
-ALL = ("same", "single", "whole", "shape", "stranger", "kind", "size", "nan", "inf")
+ALL = ("same", "single", "whole", "shape", "stranger", "kind", "function", "size", "nan", "inf")
 # For what is dear to run: only what is refused before anything is computed.
-KINDS = ("stranger", "kind", "shape")
+KINDS = ("stranger", "kind", "function", "shape")
 TRANSFORMS = ("jit", "vmap", "grad", "jacfwd", "hessian", "scan", "checkpoint")
 
 
@@ -20,7 +20,8 @@ class Call:
     **Fields:** `name` as in `public`; `run` what is called, with keywords; `given` makes the
     arguments; `groups` which replacements are tried, of which `arguments` (all of them); `traced`
     which arguments are traced (all that hold floats); `transforms` which are tried: none for what
-    works on the host, which under `jit` must then say so (`host`).
+    works on the host, which under `jit` must then say so (`host`); `says` other words by which a
+    message may name what is wrong.
     """
 
     name: str
@@ -31,6 +32,7 @@ class Call:
     traced: Sequence[str] | None = None
     transforms: Sequence[str] = TRANSFORMS
     host: bool = False
+    says: Sequence[str] = ()
 
 
 TABLE: dict[str, Call] = {}

@@ -94,9 +94,10 @@ row(
     "identify.fisher",
     lambda: dict(problem=s.problem(), parameters=plan()),
     traced=("parameters",),
+    groups=("stranger", "nan"),
     transforms=("jit", "grad"),
 )
-row("identify.expected", lambda: dict(problem=s.problem(), parameters=plan()), groups=KINDS, **HOST)
+row("identify.expected", lambda: dict(problem=s.problem(), parameters=plan()), groups=("stranger", "nan"), **HOST)
 row(
     "identify.best_first_rate",
     lambda: dict(problem=s.problem(), body=s.inertia(), omega=W, max_steps=2),
@@ -149,11 +150,13 @@ row(
     "identify.read_table",
     lambda: dict(path=str(log()), columns=["t", "wx"]),
     transforms=(),
+    says=("no such file",),
 )
 row(
     "identify.read_gyro_csv",
     lambda: dict(path=str(log()), unit="rad/s", noise=0.1),
     **HOST,
+    says=("no such file",),
 )
 row("identify.report.as_dict", lambda: dict(fit=s.found()), groups=KINDS, transforms=())
 row("identify.report.numbers", dict(value=1.0, low=0.9, high=1.2), transforms=())

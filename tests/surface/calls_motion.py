@@ -88,7 +88,7 @@ row(
 for name in ("act", "evaluate"):
     row(
         f"motion.torques.{name}",
-        lambda: dict(
+        lambda name=name: dict(
             **{"law" if name == "act" else "torque": s.top()},
             t=0.3,
             state=s.attitude(),

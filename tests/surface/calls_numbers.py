@@ -112,7 +112,7 @@ for name, given in {
 row("Inertia", dict(tensor=SYMMETRIC))
 row("MassProperties", dict(mass=2.0, com=V, second_moment=SECOND))
 row("Inertia.from_tensor", dict(tensor=SYMMETRIC))
-row("Inertia.from_principal", dict(i1=1.1, i2=2.2, i3=2.7))
+row("Inertia.from_principal", dict(i1=1.1, i2=2.2, i3=2.7), says=("principal moments",))
 row("Inertia.from_second_moment", dict(second_moment=SECOND))
 row("Inertia.shifted", lambda: dict(self=s.inertia(), r=V, mass=1.5))
 row("Inertia.rotated", lambda: dict(self=s.inertia(), q=Q))
@@ -143,11 +143,13 @@ row("spatial_angular_momentum", lambda: dict(body=s.body(), state=s.rigid()))
 row("body.parameters.pack", lambda: dict(body=s.body()))
 for name in ("pack_second_moment", "pack_shape"):
     row(f"body.parameters.{name}", dict(second_moment=SECOND))
-row("body.parameters.pack_moments", dict(moments=np.array([1.1, 2.2, 2.7])))
+row("body.parameters.pack_moments", dict(moments=np.array([1.1, 2.2, 2.7])), says=("second moment",))
 for name, count in {"": 10, "_second_moment": 6, "_shape": 5, "_moments": 3}.items():
-    row(f"body.parameters.unpack{name}", dict(vector=0.1 * np.arange(count) - 0.2))
+    row(f"body.parameters.unpack{name}", dict(vector=0.1 * np.arange(count) - 0.2), says=("mass", "second moment", "com"))
 
 # Solids.
+# What is too large for the dtype is named as what overflows.
+OVERFLOW = ("second moment", "mass")
 SOLIDS = {
     "box": dict(size=np.array([0.3, 0.7, 1.1])),
     "ellipsoid": dict(semi_axes=np.array([0.3, 0.7, 1.1])),
@@ -160,18 +162,20 @@ SOLIDS = {
     "torus": dict(major=0.7, minor=0.3),
 }
 for name, given in SOLIDS.items():
-    row(f"body.shapes.{name}", dict(mass=1.3, **given))
+    row(f"body.shapes.{name}", dict(mass=1.3, **given), says=OVERFLOW)
     row(f"body.volumes.{name}", given)
-row("body.shapes.shell", dict(mass=1.3, radius=0.7))
-row("body.shapes.rod", dict(mass=1.3, length=0.7))
-row("body.shapes.plate", dict(mass=1.3, size=np.array([0.3, 0.7])))
+row("body.shapes.shell", dict(mass=1.3, radius=0.7), says=OVERFLOW)
+row("body.shapes.rod", dict(mass=1.3, length=0.7), says=OVERFLOW)
+row("body.shapes.plate", dict(mass=1.3, size=np.array([0.3, 0.7])), says=OVERFLOW)
 row(
     "body.shapes.points",
     dict(masses=np.array([1.0, 2.0, 1.5, 0.7]), positions=np.stack([V, W, Y, -V])),
+    says=OVERFLOW,
 )
 row(
     "body.shapes.voxels",
     dict(density=1.0 + np.arange(8.0).reshape(2, 2, 2), spacing=np.abs(V), corner=W),
+    says=OVERFLOW,
 )
 row(
     "body.shapes.quadrature",

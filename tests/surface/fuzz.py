@@ -21,7 +21,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from surface import judge, replace
+from surface import accepted, judge, replace
 from surface.calls import TABLE, Call
 
 RTOL = {"same": 1e-12, "single": 1e-3, "whole": 1e-12}
@@ -52,7 +52,12 @@ def failures_of(
             counts[other.group] += 1
             what = _judged(call, given, argument, value, other, good)
             if what:
-                yield f"{argument}: {other.name}", what
+                counts["found"] += 1
+                reason = accepted.reason(call.name, f"{argument}: {other.name}", what)
+                if reason is None:
+                    yield f"{argument}: {other.name}", what
+                else:
+                    counts[f"accepted: {reason}"] += 1
     if transforms:
         yield from _transforms(call, given, counts)
 
@@ -62,7 +67,10 @@ def _judged(
 ) -> str | None:
     result = judge.outcome(lambda: call.run(**{**given, argument: other.value}))
     if result.error is not None:
-        why = judge.raw(result.error, judge.words_for(call.name, argument, value))
+        words = judge.words_for(call.name, argument, value) | set(call.says)
+        why = judge.raw(result.error, words)
+        if other.group == "function" and "positional argument" in str(result.error):
+            return None
         return None if why is None else f"{why}: {result}"
     if other.group in ("same", "single"):
         if judge.same(result, good, RTOL[other.group]):

@@ -11,6 +11,8 @@ import numpy as np
 
 import rigidjax as rj
 
+SIZES = {"huge": 1e308, "large": 1e100, "small": 1e-100, "tiny": 1e-308}
+
 
 @dataclasses.dataclass(frozen=True)
 class Replacement:
@@ -24,6 +26,7 @@ class Replacement:
     - `stranger`: what cannot be meant: refused;
     - `shape`, `kind`: another shape, another kind of thing; refused, or numbers that are no NaN;
     - `size`: finite numbers that are zero, negative, or as large or small as floats get; as before;
+    - `function`: a function of another kind: as `shape`, or Python says that it cannot be called so;
     - `nan`, `inf`: not to be lost: refused, or the result is not finite either.
     """
 
@@ -106,7 +109,7 @@ def _numbers(value: Any) -> Iterator[Replacement]:
     yield Replacement("inf", some.reshape(a.shape), "inf")
     yield Replacement("all -inf", np.full(a.shape, -np.inf), "inf")
     largest = np.abs(a).max() or 1.0
-    for name, size in (("huge", 1e308), ("tiny", 1e-308), ("subnormal", 5e-324)):
+    for name, size in (SIZES | {"subnormal": 5e-324}).items():
         yield Replacement(name, np.where(a == 0, 1.0, a / largest) * size, "size")
     yield Replacement("zero", np.zeros(a.shape), "size")
     yield Replacement("negative", -a, "size")
@@ -179,13 +182,11 @@ def _trees(value: Any) -> Iterator[Replacement]:
         yield Replacement("nan", _first(value, _with_nan), "nan")
         yield Replacement("all nan", _with(value, lambda a: jnp.full_like(a, jnp.nan)), "nan")
         yield Replacement("all inf", _with(value, lambda a: jnp.full_like(a, jnp.inf)), "inf")
-        for name, size in (("huge", 1e308), ("tiny", 1e-308)):
-            yield Replacement(name, _first(value, lambda a, size=size: _scaled(a, size)), "size")
-        yield Replacement("zero", _first(value, jnp.zeros_like), "size")
-        yield Replacement("negative", _first(value, jnp.negative), "size")
+        for name, size in SIZES.items():
+            yield from _made(name, _first(value, lambda a, size=size: _scaled(a, size)))
+        yield from _made("zero", _first(value, jnp.zeros_like))
+        yield from _made("negative", _first(value, jnp.negative))
         yield Replacement("its array", np.asarray(floats[0]), "kind")
-        yield Replacement("leaves are objects", _with(value, lambda a: object()), "stranger")
-        yield Replacement("leaves are None", _with(value, lambda a: None), "stranger")
     yield from _strangers()
     yield Replacement("its class", type(value), "stranger")
     yield Replacement("a list of it", [value], "kind")
@@ -193,6 +194,16 @@ def _trees(value: Any) -> Iterator[Replacement]:
     for stranger in (rj.Point([1.0, 0, 0], [0.0, 1, 0]), rj.Spin([0.0, 0, 1.0])):
         if type(stranger) is not type(value):
             yield Replacement(type(stranger).__name__, stranger, "kind")
+
+
+def _made(name: str, value: Any) -> Iterator[Replacement]:
+    """A body of other numbers, if its constructor makes one: what it refuses is its own row's."""
+    if isinstance(value, rj.MassProperties):
+        try:
+            value = rj.MassProperties(value.mass, value.com, value.second_moment)
+        except ValueError:
+            return
+    yield Replacement(name, value, "size")
 
 
 def _several(value: Any) -> Iterator[Replacement]:
@@ -205,12 +216,12 @@ def _several(value: Any) -> Iterator[Replacement]:
 
 
 def _functions() -> Iterator[Replacement]:
-    yield Replacement("takes nothing", lambda: 0.0, "kind")
-    yield Replacement("returns None", lambda *args: None, "kind")
-    yield Replacement("returns words", lambda *args: "abc", "kind")
-    yield Replacement("returns seven", lambda *args: jnp.ones(7), "kind")
-    yield Replacement("returns nan", lambda *args: jnp.full((3,), jnp.nan), "kind")
-    yield Replacement("array", np.ones(3), "kind")
+    yield Replacement("takes nothing", lambda: 0.0, "function")
+    yield Replacement("returns None", lambda *args: None, "function")
+    yield Replacement("returns words", lambda *args: "abc", "function")
+    yield Replacement("returns seven", lambda *args: jnp.ones(7), "function")
+    yield Replacement("returns nan", lambda *args: jnp.full((3,), jnp.nan), "function")
+    yield Replacement("array", np.ones(3), "stranger")
     yield from _strangers()
 
 

@@ -220,7 +220,9 @@ def stays(source: Any) -> Vec3 | None:
 
 def constant_or_callable(source: Any, name: str) -> Any:
     """`source` as it is if it can be called with a time; otherwise as a vector (3,)."""
-    return source if callable(source) else given(source, (3,), name)
+    if callable(source):
+        return _checks.function(source, name, "of time to (3,)")
+    return given(source, (3,), name)
 
 
 def jumps_of(source: object) -> Float[Array, " n"]:
