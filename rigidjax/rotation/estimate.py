@@ -64,8 +64,7 @@ def wahba(
     """
     body = _checks.rows(body, (3,), "body")
     world = _checks.floating(world, body.shape, "world")
-    w = jnp.ones_like(body[:, 0]) if weights is None else weights
-    w = _checks.floating(w, body.shape[:1], "weights")
+    w = _weights(weights, body[:, 0], "body")
     b = (w[:, None, None] * world[:, :, None] * body[:, None, :]).sum(0)
     best = _best(b)
     # (σ1 + σ2)(σ2 + σ3)(σ3 + σ1), σ3 with the sign of det b: 0 where a turn is free.
@@ -113,6 +112,7 @@ def mean(matrices: Float[ArrayLike, "n 3 3"], weights: Float[ArrayLike, "n"] | N
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
     """
     matrices = _checks.rows(matrices, (3, 3), "matrices")
+    _weights(weights, matrices[:, 0, 0], "matrices")
     return quaternion.to_matrix(mean_quaternion(jax.vmap(matrix_to_quaternion)(matrices), weights))
 
 
@@ -127,8 +127,7 @@ def mean_quaternion(
     [1.0, 0.0, 0.0, 0.0]
     """
     q = _checks.rows(quaternions, (4,), "quaternions")
-    w = jnp.ones_like(q[:, 0]) if weights is None else weights
-    w = _checks.floating(w, q.shape[:1], "weights")
+    w = _weights(weights, q[:, 0], "quaternions")
 
     def newton(_: Any, start: Quat, q: Array, w: Array) -> Quat:
         apart = jax.vmap(lambda each: quaternion.multiply(quaternion.conjugate(start), each))(q)
@@ -144,6 +143,20 @@ def mean_quaternion(
     for i in range(2):
         start = newton(i, lax.stop_gradient(start) if i == 0 else start, q, w)
     return quaternion.canonical(quaternion.normalise(start))
+
+
+def _weights(weights: Any, like: Array, of: str) -> Array:
+    """One weight for each, 1 if not given; refused where it is known that no mean has them."""
+    if like.shape[0] == 0:
+        raise ValueError(f"{of}: wanted at least one row, got none")
+    if weights is None:
+        return jnp.ones_like(like)
+    w = _checks.floating(weights, like.shape, "weights")
+    if not isinstance(w, Tracer):
+        _checks.finite(w, "weights")
+        bad = (w < 0).any() | ~(w > 0).any()
+        _checks.refuse(w, bad, "weights: wanted numbers ≥ 0, of which one at least is positive")
+    return w
 
 
 def _left_jacobian_inverse(v: Vec3) -> Mat3:
