@@ -41,7 +41,10 @@ WITHOUT: dict[str, str] = {}
 
 
 def row(name: str, given: Any = None, /, run: Callable | None = None, **more: Any) -> None:
-    """A row: `row("so3.exp", dict(v=V))`; `given` may be a function that makes the arguments."""
+    """A row: `row("so3.exp", dict(v=V))`; `given` may be a function that makes the arguments.
+
+    A second row of the same callable has something in brackets after its name.
+    """
     if name in TABLE or name in WITHOUT:
         raise ValueError(f"{name} is in the table already")
     made = given if callable(given) else (lambda: given or {})

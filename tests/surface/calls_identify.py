@@ -97,7 +97,12 @@ row(
     groups=("stranger", "nan"),
     transforms=("jit", "grad"),
 )
-row("identify.expected", lambda: dict(problem=s.problem(), parameters=plan()), groups=("stranger", "nan"), **HOST)
+row(
+    "identify.expected",
+    lambda: dict(problem=s.problem(), parameters=plan()),
+    groups=("stranger", "nan"),
+    **HOST,
+)
 row(
     "identify.best_first_rate",
     lambda: dict(problem=s.problem(), body=s.inertia(), omega=W, max_steps=2),

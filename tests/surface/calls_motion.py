@@ -25,7 +25,11 @@ row("motion.lagrangian.MomentumAndDirection", dict(pi=W, gamma=V))
 row("EulerEquations", lambda: dict(inertia=s.inertia(), torque=s.damping()))
 row("AttitudeEquations", lambda: dict(inertia=s.inertia(), torque=s.top()))
 row("NewtonEuler", lambda: dict(body=s.body(), torque=rj.torques.UniformGravity(DOWN)))
-row("equations_of_motion", lambda: dict(body=s.inertia(), state0=s.attitude(), torque=s.top()))
+row(
+    "equations_of_motion",
+    lambda: dict(body=s.inertia(), state0=s.attitude(), torque=s.top()),
+    says=("inertia",),
+)
 row(
     "motion.lagrangian.equations_of_motion",
     lambda: dict(lagrangian=s.Kinetic(jnp.asarray(9.8)), force=lambda t, q, rate: -0.1 * rate),
@@ -288,9 +292,22 @@ row(
         body=s.inertia(), state0=s.attitude(), ts=TS, torque=s.top(), rtol=1e-6, atol=1e-8, dt0=0.01,
         max_steps=1000,
     ),
+    arguments=("body", "state0", "ts", "torque", "dt0"),
+    says=("inertia",),
     # Forward mode through a forced run is being redone: issue K, item 3.
     transforms=REVERSE,
     traced=("body", "state0", "torque"),
+)  # fmt: skip
+row(
+    "simulate (options)",
+    lambda: dict(
+        body=s.inertia(), state0=s.attitude(), ts=TS, torque=s.top(), rtol=1e-6, atol=1e-8,
+        max_steps=1000,
+    ),
+    run=rj.simulate,
+    arguments=("rtol", "atol", "max_steps"),
+    groups=(*KINDS, "nan", "inf"),
+    transforms=(),
 )  # fmt: skip
 row("Solution.evaluate", lambda: dict(self=s.motion(), t=0.7), arguments=("t",), traced=("t",))
 leave_out("simulate returns it", "Solution")
@@ -309,16 +326,26 @@ row(
     ),
     traced=("bodies", "states0"),
 )  # fmt: skip
+forced = lambda: dict(
+    bodies=rj.Inertia(SYMMETRIC), states0=s.attitudes(), ts_or_steps=TS, torque=s.top(),
+    rtol=1e-6, atol=1e-8, max_steps=1000, chunk=2,
+)  # fmt: skip
 row(
     "batch.simulate",
-    lambda: dict(
-        bodies=rj.Inertia(SYMMETRIC), states0=s.attitudes(), ts_or_steps=TS, torque=s.top(),
-        rtol=1e-6, atol=1e-8, max_steps=1000, chunk=2,
-    ),
-    groups=(*KINDS, "nan", "inf"),
+    forced,
+    arguments=("bodies", "states0", "ts_or_steps", "torque"),
+    groups=("stranger", "nan", "inf"),
     transforms=("jit", "grad"),
     traced=("bodies", "states0"),
-)  # fmt: skip
+)
+row(
+    "batch.simulate (options)",
+    forced,
+    run=rj.batch.simulate,
+    arguments=("rtol", "atol", "max_steps", "chunk"),
+    groups=("stranger", "nan", "inf"),
+    transforms=(),
+)
 row("batch.compiler_options", transforms=())
 row("cpu_flags", transforms=())
 for name in ("share", "gather", "total"):

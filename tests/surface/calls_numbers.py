@@ -122,7 +122,7 @@ for name in ("checked", "invertible"):
     row(f"MassProperties.{name}", lambda: dict(self=s.body()), arguments=())
 for name in ("inertia_about", "second_moment_about"):
     row(f"MassProperties.{name}", lambda: dict(self=s.body(), point=Y), arguments=("point",))
-row("MassProperties.shifted", lambda: dict(self=s.body(), r=V), arguments=("r",))
+row("MassProperties.shifted", lambda: dict(self=s.body(), r=V), says=("com",))
 row("MassProperties.rotated", lambda: dict(self=s.body(), q=Q), arguments=("q",))
 row("body.principal", dict(tensor=SYMMETRIC))
 row("body.matrix_function", dict(function=jnp.sqrt, tensor=SYMMETRIC))
@@ -143,9 +143,15 @@ row("spatial_angular_momentum", lambda: dict(body=s.body(), state=s.rigid()))
 row("body.parameters.pack", lambda: dict(body=s.body()))
 for name in ("pack_second_moment", "pack_shape"):
     row(f"body.parameters.{name}", dict(second_moment=SECOND))
-row("body.parameters.pack_moments", dict(moments=np.array([1.1, 2.2, 2.7])), says=("second moment",))
+row(
+    "body.parameters.pack_moments", dict(moments=np.array([1.1, 2.2, 2.7])), says=("second moment",)
+)
 for name, count in {"": 10, "_second_moment": 6, "_shape": 5, "_moments": 3}.items():
-    row(f"body.parameters.unpack{name}", dict(vector=0.1 * np.arange(count) - 0.2), says=("mass", "second moment", "com"))
+    row(
+        f"body.parameters.unpack{name}",
+        dict(vector=0.1 * np.arange(count) - 0.2),
+        says=("mass", "second moment", "com"),
+    )
 
 # Solids.
 # What is too large for the dtype is named as what overflows.

@@ -68,6 +68,9 @@ def _judged(
     result = judge.outcome(lambda: call.run(**{**given, argument: other.value}))
     if result.error is not None:
         words = judge.words_for(call.name, argument, value) | set(call.says)
+        if other.group == "shape":
+            # Of two whose shapes do not agree a message may name either.
+            words |= set(given)
         why = judge.raw(result.error, words)
         if other.group == "function" and "positional argument" in str(result.error):
             return None

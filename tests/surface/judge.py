@@ -112,10 +112,12 @@ def _raises(file: Path) -> list[tuple[int, int]]:
 
 def words_for(name: str, argument: str, value: Any) -> set[str]:
     """What a message about this argument of this function may call it."""
-    parts = name.split(".")
+    parts = name.partition(" (")[0].split(".")
     words = {parts[-1], argument, argument.replace("_", " "), *argument.split("_or_")}
     if len(parts) > 1 and parts[-2][0].isupper():
         words.add(parts[-2])
+    if isinstance(value, rigidjax.Inertia | rigidjax.MassProperties):
+        words |= {"inertia", "mass", "second moment"}
     for path, _ in jax.tree_util.tree_leaves_with_path(value):
         for key in path:
             field = getattr(key, "name", None)
