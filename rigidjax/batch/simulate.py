@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Int
 
+from rigidjax import _checks
 from rigidjax._types import ScalarLike
 from rigidjax.batch.chunks import Compiled, chunk_of, mesh_of, over_bodies
 from rigidjax.batch.given import Bodies, bodies_of, start_of, step_of, time_of
@@ -114,6 +115,7 @@ def simulate(
     if torque is None and method is None:
         how: Any = _Free()
     else:
+        max_steps = _checks.whole(max_steps, "max_steps", 1)
         tolerances: Any = inputs.tolerances(rtol, atol, batch.dtype)
         solver = DormandPrince8() if method is None else method
         how = _Adaptive(solver, tolerances[0], tolerances[1], max_steps, adjoint)

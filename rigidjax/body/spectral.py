@@ -45,12 +45,14 @@ def matrix_function(function: Callable[[Scalar], Scalar], tensor: Mat3Like) -> M
     Array([2., 0., 0.], dtype=float64)
     """
     a = _checks.floating(tensor, (3, 3), "tensor")
+    _checks.function(function, "function", "number → number, written in jax.numpy")
     # In units of the largest entry (a power of two), so that no product leaves the dtype's range.
-    unit = times_power_of_two(jnp.ones((), a.dtype), exponent_of(a))
+    # One power less, so that it is a number for the largest of the dtype, too.
+    unit = times_power_of_two(jnp.ones((), a.dtype), exponent_of(a) - 1)
     a = 0.5 * (a + a.T) / unit
 
     def scaled(value):
-        return function(unit * value)
+        return _checks.floating(function(unit * value), (), "function(λ)", hint="one number")
 
     values, axes = eigensystem(stop_gradient(a))
     change = product(axes.T, product(a - stop_gradient(a), axes))

@@ -133,6 +133,7 @@ def _check(inertia: Inertia, state0: HasSpin) -> None:
             f"free_body: wanted a Spin or an Attitude, got {type(state0).__name__}; a body that "
             "also moves is free in both: add x + v t yourself, or use simulate"
         )
+    _checks.instance(inertia, Inertia, "inertia", hint="of MassProperties pass .inertia")
     tensor = _checks.floating(inertia.tensor, (3, 3), "inertia tensor")
     arrays = {"omega": _checks.floating(state0.omega, (3,), "omega")}
     if isinstance(state0, HasAttitude):

@@ -70,6 +70,7 @@ def precession_period(inertia: Inertia, omega0: Vec3Like) -> Scalar:
 
 
 def _scaled(inertia: Inertia, omega0):
+    _checks.instance(inertia, Inertia, "inertia", hint="of MassProperties pass .inertia")
     omega = _checks.floating(omega0, (3,), "omega0").astype(inertia.tensor.dtype)
     tensor = _checks.floating(inertia.tensor, (3, 3), "inertia tensor")
     exponent = exponent_of(omega)

@@ -165,6 +165,7 @@ def advance(q: QuatLike, omega: Vec3Like, dt: ScalarLike) -> Quat:
     >>> advance(jnp.array([1.0, 0, 0, 0]), jnp.array([0, 0, jnp.pi]), 1.0).round(12).tolist()
     [0.0, 0.0, 0.0, 1.0]
     """
+    q = _checks.floating(q, (4,), "q", hint=_HINT)
     omega = _checks.floating(omega, (3,), "omega")
     dt = _checks.floating(dt, (), "dt").astype(omega.dtype)
     return multiply(q, exp(dt * omega))
@@ -202,6 +203,7 @@ def interpolate(p: QuatLike, q: QuatLike, s: ScalarLike) -> Quat:
     >>> bool(abs(interpolate(p, q, 0.5) - exp(jnp.array([0, 0, 1.5]))).max() < 1e-15)
     True
     """
+    p = _checks.floating(p, (4,), "p", hint=_HINT)
     turn = log(multiply(conjugate(p), q))
     return multiply(p, exp(_checks.floating(s, (), "s").astype(turn.dtype) * turn))
 
@@ -214,7 +216,7 @@ def uniform(key: PRNGKeyArray, dtype: Any = float) -> Quat:
     >>> uniform(jax.random.key(0)).shape
     (4,)
     """
-    return normalise(jax.random.normal(key, (4,), dtype))
+    return normalise(jax.random.normal(_checks.key(key), (4,), _checks.float_type(dtype)))
 
 
 def normalise(q: QuatLike) -> Quat:
@@ -253,7 +255,7 @@ def angle(q: QuatLike) -> Scalar:
     w, *u = components(_checks.floating(q, (4,), "q", hint=_HINT))
     n2 = dot_components(u, u)
     # Both atan2 and the root see ones, not zeros, where their derivative would be 0/0.
-    there = n2 > 0
+    there = n2 != 0
     half = jnp.arctan2(jnp.sqrt(jnp.where(there, n2, 1)), jnp.abs(w))
     return jnp.where(there, 2 * half, 0)
 

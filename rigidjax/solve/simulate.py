@@ -101,6 +101,7 @@ def simulate(
     >>> bool(abs(rj.simulate(body, start, jnp.linspace(0.0, 9.43, 3)).ys.omega[-1, 1]) < 0.01)
     True
     """
+    max_steps = None if max_steps is None else _checks.whole(max_steps, "max_steps", 1)
     times = inputs.times(ts, throw)
     state0 = inputs.start(state0, throw)
     dtype = times.dtype
