@@ -202,7 +202,7 @@ def _recorded(
     answer, book = adaptive_loop.recording(method, chosen, run)
     book = book._replace(
         number=jnp.broadcast_to(book.number, run.t0.shape),
-        count=jnp.broadcast_to(book.count, run.t0.shape),
+        filled=jnp.broadcast_to(book.filled, run.t0.shape),
     )
     return [*answer, *jax.tree.leaves(book)], []
 

@@ -88,12 +88,12 @@ Rows = Array
 
 
 class Book(NamedTuple):
-    """A recorded run: the start of each segment, how many there are, the rows of the last."""
+    """A recorded run: the start of each segment, how many there are, the last one's rows."""
 
     starts: Walk
     number: Array
     rows: Rows
-    count: Array
+    filled: Array
 
 
 class Answer(NamedTuple):

@@ -123,7 +123,7 @@ def tangents(
         return moved, out, states, path, *_segment(method, constants, run, book, number + 1, rows)
 
     out = jnp.zeros((run.between.shape[0], *along.y0.shape), along.y0.dtype)
-    number, count = jnp.max(book.number), jnp.max(book.count)
+    number, count = jnp.max(book.number), jnp.max(book.filled)
     rows, again = _segment(
         method, constants, run, book, jnp.where(number > 1, 0, number), book.rows
     )
@@ -207,7 +207,7 @@ def cotangents(
         jnp.zeros((run.between.shape[0], *more), dtype),
         bars.end,
     )
-    state = (sums, book.rows, jnp.max(book.count))
+    state = (sums, book.rows, jnp.max(book.filled))
     return lax.fori_loop(0, jnp.max(book.number), segment, state)[0]
 
 

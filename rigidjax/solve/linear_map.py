@@ -11,11 +11,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
 Arrays = list[Any]
 Map = Callable[..., Arrays]
+_ZERO: Any = ad.Zero
 
 
 def linear_map(function: Map, transposed: Map, given: Arrays, tangents: Arrays) -> Arrays:
@@ -85,7 +87,7 @@ def _evaluated(*args: Any, function: Map, **_: Any) -> Arrays:
 
 @_linear_map.def_abstract_eval
 def _abstract(*_: Any, results: Any, **__: Any) -> Any:
-    return [jax.core.ShapedArray(*result) for result in results]
+    return [ShapedArray(*result) for result in results]
 
 
 def _differentiated(primals: Any, tangents: Any, **params: Any) -> Any:
@@ -117,7 +119,7 @@ def _differentiated(primals: Any, tangents: Any, **params: Any) -> Any:
         moved = [t for t, w in zip(tangents[:number], which, strict=True) if w]
         add(linear_map(push, _refuse, [*given, *along], moved))
     return out, [
-        ad.Zero.from_primal_value(o) if t is None else t for o, t in zip(out, total, strict=True)
+        _ZERO.from_primal_value(o) if t is None else t for o, t in zip(out, total, strict=True)
     ]
 
 

@@ -43,7 +43,7 @@ class Stages(NamedTuple):
 
 
 class Weights(NamedTuple):
-    """The tableau as arrays: `a` (s, s), `b`, `c` (s,)."""
+    """The tableau as arrays: `a` (s, s), `b`, `c` (s,); `last` whether c is 1."""
 
     a: Array
     b: Array
@@ -63,7 +63,8 @@ def weights(tableau: Tableau, dtype: Any) -> Weights:
     for i, row in enumerate(tableau.a):
         a[i + 1, :count] = _row(row, count)
     c = np.array([0.0, *tableau.c])
-    return Weights(*(jnp.asarray(w, dtype) for w in (a, b, c)), jnp.asarray(c == 1.0))
+    a, b, nodes = (jnp.asarray(w, dtype) for w in (a, b, c))
+    return Weights(a, b, nodes, jnp.asarray(c == 1.0))
 
 
 def _row(row: dict[int, float], count: int) -> np.ndarray:
