@@ -241,7 +241,6 @@ def _pulled(
 
 def _differentiated(program: _Program, primals: Arrays, tangents: Arrays) -> Any:
     number = len(program.smooth)
-
     smooth = [i for i, s in enumerate(program.smooth) if s]
 
     def record(*args: Any) -> Arrays:
@@ -260,9 +259,10 @@ def _differentiated(program: _Program, primals: Arrays, tangents: Arrays) -> Any
         head = number + _RUN
         given = [*args[:head], *args[head + _ANSWER : number + kept + _ANSWER]]
         moved = args[number + kept + _ANSWER :]
-        between, end, times, states, rows = mapped(_pushed, *given, *_linear(smooth, moved))
+        between, end, *record = mapped(_pushed, *given, *_linear(smooth, moved))
         answer = [between, end, jnp.zeros_like(args[head + 2]), jnp.zeros_like(args[head + 3])]
-        return [*answer, times, jnp.zeros_like(times), states, rows]
+        t, y, back_t, back_y, rows = record
+        return [*answer, t, jnp.zeros_like(t), y, back_t, back_y, rows]
 
     size = len(Walk._fields) + len(Book._fields) - 1
     kept = _RUN + size

@@ -1,8 +1,9 @@
 """Steps as long as the tolerances allow, for one body or many, with the states at any times.
 
 The steps do not look at the times that are asked for. A state between two steps is one more step,
-a shorter one, from the step's start: of the method's own order, on the group, with an error less
-than that of the step it lies in. All of them are computed side by side.
+a shorter one, from the step's start, taken as soon as the loop is past it: of the method's own
+order, on the group, with an error less than that of the step it lies in. Such a visit goes through
+the same stages as a step, so that it costs nothing to compile.
 
 For derivatives the steps are recorded in segments: the start of each is kept, and the steps of the
 last one; the others are run once more when they are needed.
@@ -23,15 +24,11 @@ from rigidjax.solve.tableaus import Tableau
 
 # What diffrax.PIDController does unless told: the same steps, so that figures can be compared.
 _SAFETY, _SMALLEST, _LARGEST = 0.9, 0.2, 10.0
-# Steps in a segment, rejected ones included.
+# Steps in a segment, rejected ones and visits included.
 SEGMENT = 512
-# The same where only states are asked for: less memory to touch.
-_SHORT = 256
 # XLA on CPU makes one kernel of a loop whose state is smaller than a kilobyte: steps are written
 # into a block that small, and blocks into the record.
-_BLOCK = 560
-# Saved states that are computed side by side.
-MANY = 32
+_BLOCK, _MOST = 560, 8
 
 
 class Method(NamedTuple):
@@ -72,7 +69,11 @@ class Run(NamedTuple):
 
 
 class Walk(NamedTuple):
-    """Where the loop is: time, next step, state, index of the next stop, counters."""
+    """Where the loop is.
+
+    **Fields:** time, next step, state, index of the next stop, counters; how many of the times
+    between are `known`; time, state and next stop where the last accepted step began.
+    """
 
     t: Array
     h: Array
@@ -80,11 +81,25 @@ class Walk(NamedTuple):
     stop: Array
     steps: Array
     rejected: Array
+    known: Array
+    back_t: Array
+    back_y: Array
+    back_stop: Array
 
 
-# A recorded step is one row (3 + n, *bodies): start; length, 0 if it was rejected or a body had no
-# need of it; twice the index of the stop ahead, and one more if it ends there; the state.
+# A recorded step is one row (4 + n, *bodies): start; length; kind; index of the stop ahead at the
+# start; state at the start. Kinds: none was taken, a step, a step that ends on the stop, and from
+# VISIT on a visit of one of the times between.
 Rows = Array
+HEAD = 4
+NONE, STEP, LAST, VISIT = range(4)
+
+
+class Until(NamedTuple):
+    """Where a segment that is run again ends: time, and number of known states."""
+
+    t: Array
+    known: Array
 
 
 class Book(NamedTuple):
@@ -114,42 +129,32 @@ def value(method: Method, constants: list[Array], run: Run) -> Answer:
     walk = start(method, constants, run)
     if not run.between.shape[0]:
         walk = lax.while_loop(
-            lambda walk: jnp.any(going(method, run, walk)),
+            lambda walk: jnp.any(going(method, run, walk, None)),
             lambda walk: _attempt(method, constants, run, walk, None)[0],
             walk,
         )
-        return _answer(run, walk, jnp.zeros((0, *run.y0.shape), run.y0.dtype))
-
-    def segment(state: Any) -> Any:
-        walk, saved, rows = state
-        walk, rows, count = recorded(method, constants, run, walk, rows, None)
-        saved = _saved(method, constants, run, walk.t, rows, count, saved)
-        return walk, saved, rows
-
-    state = (walk, _none_saved(run), empty_rows(run, _SHORT))
-    more = lambda state: jnp.any(going(method, run, state[0]))  # noqa: E731
-    walk, saved, _ = lax.while_loop(more, segment, state)
-    return _answer(run, walk, _kept(run, saved))
+        return _answer(run, walk, run.y0[None][:0])
+    walk, _, ys, _ = recorded(method, constants, run, walk, None, _none_saved(run), None)
+    return _answer(run, walk, ys)
 
 
 def recording(method: Method, constants: list[Array], run: Run) -> tuple[Answer, Book]:
     """The answer, and what derivatives need."""
     walk = start(method, constants, run)
-    most = -(-method.max_steps // SEGMENT) + run.stops.shape[0] // SEGMENT + 1
-    starts: Any = jax.tree.map(lambda a: jnp.zeros((most, *a.shape), a.dtype), walk)
+    most = method.max_steps + run.stops.shape[0] + run.between.shape[0]
+    starts: Any = jax.tree.map(lambda a: jnp.zeros((-(-most // SEGMENT), *a.shape), a.dtype), walk)
     zero = jnp.zeros((), jnp.int32)
 
     def segment(state: Any) -> Any:
-        walk, saved, book = state
+        walk, ys, book = state
         starts = jax.tree.map(lambda a, b: a.at[book.number].set(b), book.starts, walk)
-        walk, rows, count = recorded(method, constants, run, walk, book.rows, None)
-        saved = _saved(method, constants, run, walk.t, rows, count, saved)
-        return walk, saved, Book(starts, book.number + 1, rows, count)
+        walk, rows, ys, count = recorded(method, constants, run, walk, book.rows, ys, None)
+        return walk, ys, Book(starts, book.number + 1, rows, count)
 
-    state = (walk, _none_saved(run), Book(starts, zero, empty_rows(run, SEGMENT), zero))
-    more = lambda state: jnp.any(going(method, run, state[0]))  # noqa: E731
-    walk, saved, book = lax.while_loop(more, segment, state)
-    return _answer(run, walk, _kept(run, saved)), book
+    state = (walk, _none_saved(run), Book(starts, zero, empty_rows(run), zero))
+    more = lambda state: jnp.any(going(method, run, state[0], None))  # noqa: E731
+    walk, ys, book = lax.while_loop(more, segment, state)
+    return _answer(run, walk, ys), book
 
 
 def start(method: Method, constants: list[Array], run: Run) -> Walk:
@@ -162,41 +167,63 @@ def start(method: Method, constants: list[Array], run: Run) -> Walk:
     sound = sound & jnp.isfinite(t0) & jnp.isfinite(run.stops[-1])
     h = jnp.where(sound, jnp.where(jnp.isnan(run.h0), h, run.h0), jnp.nan)
     zero = jnp.zeros(t0.shape, jnp.int32)
-    return Walk(t0, h, y0, zero, zero, zero)
+    return Walk(t0, h, y0, zero, zero, zero, zero, t0, y0, zero)
 
 
-def going(method: Method, run: Run, walk: Walk) -> Array:
-    """Whether a body has not arrived, may still step, and has a step to take."""
+def going(method: Method, run: Run, walk: Walk, until: Until | None) -> Array:
+    """Whether a body has a step to take or a time to visit."""
+    return _stepping(method, run, walk, until) | _visiting(run, walk, until)
+
+
+def _stepping(method: Method, run: Run, walk: Walk, until: Until | None) -> Array:
     ahead = walk.stop < run.stops.shape[0]
-    return ahead & (walk.steps < method.max_steps) & (walk.h > 0)
+    on = ahead & (walk.steps < method.max_steps) & (walk.h > 0)
+    return on if until is None else on & (walk.t < until.t)
+
+
+def _visiting(run: Run, walk: Walk, until: Until | None) -> Array:
+    size = run.between.shape[0]
+    if not size:
+        return jnp.zeros(walk.t.shape, bool)
+    there = (walk.known < size) & (at(run.between, walk.known) <= walk.t)
+    return there if until is None else there & (walk.known < until.known)
 
 
 def _attempt(
-    method: Method, constants: list[Array], run: Run, walk: Walk, until: Array | None
-) -> tuple[Walk, tuple[Array, Array]]:
-    """One attempt at a step of every body; the length, 0 if there was none, and the code."""
-    on = going(method, run, walk)
+    method: Method, constants: list[Array], run: Run, walk: Walk, until: Until | None
+) -> tuple[Walk, Array, Array]:
+    """One attempt at a step, or a visit, of every body; its row, and the state at its end."""
+    visiting = _visiting(run, walk, until)
+    on = _stepping(method, run, walk, until) & ~visiting
     begin, end = at(run.stops, walk.stop), at(run.before, walk.stop)
     # A stop that is passed already, such as a jump before the start, needs no step.
     arrived = on & (walk.t >= begin)
+    moving = on & ~arrived
     cut = jnp.zeros_like(on)
     if until is not None:
         # A segment that is run again ends where it ended.
-        on = on & (walk.t < until)
-        cut = until < end
-        end = jnp.minimum(end, until)
-    moving = on & ~arrived
+        cut = until.t < end
+        end = jnp.minimum(end, until.t)
     left = end - walk.t
     # The step kept is the controller's own, not the one cut short at a stop.
     last = walk.h >= left
     h = jnp.where(moving, jnp.where(last, left, walk.h), jnp.zeros_like(walk.h))
     late = jnp.where(last, end, walk.t + h)
-    step = Step(walk.t, h, late, walk.y)
+    step, index = Step(walk.t, h, late, walk.y), walk.stop
+    if run.between.shape[0]:
+        step = visit_of(run, walk.known, walk.back_t, walk.back_stop, walk.back_y)
+        index = jnp.where(visiting, walk.back_stop, walk.stop)
+        step = Step(
+            jnp.where(visiting, step.t, walk.t),
+            jnp.where(visiting, step.h, h),
+            jnp.where(visiting, step.end, late),
+            jnp.where(lift(visiting, walk.y), step.y, walk.y),
+        )
     there = runge_kutta.stages(method.tableau, method.field, constants, step)
     y = method.project(there.end)
     slope = None
     if runge_kutta.needs_last_slope(method.tableau):
-        slope = method.field(constants, late, y)
+        slope = method.field(constants, step.end, y)
     error = runge_kutta.error_estimate(method.tableau, method.sizes, h, there.slopes, slope)
     size = _size_of(error, walk.y, y, run.rtol, run.atol)
     # NaN in a step too long says as little as infinity: try a shorter one.
@@ -215,16 +242,31 @@ def _attempt(
     following = jnp.where(moving & ~accept & ~(following > unit), why, following)
     reached = accept & last & ~cut
     following = jnp.where(moving, following, kept)
+    wide = lift(accept, y)
     after = Walk(
-        jnp.where(accept, jnp.where(reached, begin, late), walk.t),
-        following,
-        jnp.where(lift(accept, y), y, walk.y),
-        walk.stop + (arrived | reached).astype(jnp.int32),
-        walk.steps + moving.astype(jnp.int32),
-        walk.rejected + (moving & ~accept).astype(jnp.int32),
+        t=jnp.where(accept, jnp.where(reached, begin, late), walk.t),
+        h=following,
+        y=jnp.where(wide, y, walk.y),
+        stop=walk.stop + (arrived | reached).astype(jnp.int32),
+        steps=walk.steps + moving.astype(jnp.int32),
+        rejected=walk.rejected + (moving & ~accept).astype(jnp.int32),
+        known=walk.known + visiting.astype(jnp.int32),
+        back_t=jnp.where(accept, walk.t, walk.back_t),
+        back_y=jnp.where(wide, walk.y, walk.back_y),
+        back_stop=jnp.where(accept, walk.stop, walk.back_stop),
     )
-    taken = jnp.where(accept, h, jnp.zeros_like(h))
-    return after, (taken, 2 * walk.stop + reached.astype(jnp.int32))
+    kind = jnp.where(accept, jnp.where(reached, LAST, STEP), NONE)
+    kind = jnp.where(visiting, VISIT + walk.known, kind.astype(jnp.int32))
+    head = jnp.stack([step.t, step.h, kind.astype(h.dtype), index.astype(h.dtype)])
+    return after, jnp.concatenate([head, step.y]), y
+
+
+def visit_of(run: Run, number: Array, t: Array, stop: Array, y: Array) -> Step:
+    """The step from `t` to the time between of that number, with the stop ahead of `t`."""
+    late = at(run.between, number)
+    # The limit is the last moment before a jump: it moves nothing, and has no derivative here.
+    end = late + lax.stop_gradient(jnp.minimum(late, at(run.before, stop)) - late)
+    return Step(t, late - t, end, y)
 
 
 def recorded(
@@ -232,50 +274,81 @@ def recorded(
     constants: list[Array],
     run: Run,
     walk: Walk,
-    rows: Rows,
-    until: Array | None,
-) -> tuple[Walk, Rows, Array]:
-    """As many attempts from here on as there are rows, and how many there were."""
-    many = _block_size(run)
-    room = rows.shape[0] - many
+    rows: Rows | None,
+    ys: Array | None,
+    until: Until | None,
+) -> tuple[Walk, Any, Any, Array]:
+    """From here on, as far as there is room for rows; and how many there were.
+
+    **Arguments:** `rows` and `ys` the record and the states at the times between, `None` where they
+    are not wanted.
+    """
+    size = run.y0.shape[0]
+    columns = (0 if rows is None else HEAD + size) + (0 if ys is None else size)
+    many = max(1, min(_MOST, _BLOCK // (run.y0.dtype.itemsize * columns)))
+    bodies = run.t0.ndim
 
     def on(walk: Walk) -> Array:
-        here = going(method, run, walk)
-        return jnp.any(here if until is None else here & (walk.t < until))
+        return jnp.any(going(method, run, walk, until))
 
     def attempt(state: Any) -> Any:
-        walk, few, k = state
-        after, (h, code) = _attempt(method, constants, run, walk, until)
-        head = jnp.stack([walk.t, h, code.astype(h.dtype)])
-        row = jnp.concatenate([head, walk.y])
-        return after, lax.dynamic_update_slice_in_dim(few, row[None], k, 0), k + 1
+        walk, few, found, base, k = state
+        after, row, y = _attempt(method, constants, run, walk, until)
+        if few is not None:
+            few = lax.dynamic_update_slice_in_dim(few, row[None], k, 0)
+        if found is not None:
+            # What is no visit goes to the place beyond the last.
+            place = jnp.where(after.known > walk.known, walk.known - base, many)
+            found = per_body(_replaced, bodies)(found, y, place)
+        return after, few, found, base, k + 1
 
     def block(state: Any) -> Any:
-        walk, rows, count = state
-        few = jnp.zeros((many, *rows.shape[1:]), rows.dtype)
-        more = lambda s: on(s[0]) & (s[2] < many)  # noqa: E731
-        walk, few, k = lax.while_loop(more, attempt, (walk, few, jnp.zeros((), jnp.int32)))
-        return walk, lax.dynamic_update_slice_in_dim(rows, few, count, 0), count + k
+        walk, rows, ys, count = state
+        few = found = None
+        if rows is not None:
+            few = jnp.zeros((many, *rows.shape[1:]), rows.dtype)
+        if ys is not None:
+            found = jnp.zeros((many + 1, *ys.shape[1:]), ys.dtype)
+        base = walk.known
+        state = (walk, few, found, base, jnp.zeros((), jnp.int32))
+        more = lambda s: on(s[0]) & (s[-1] < many)  # noqa: E731
+        walk, few, found, _, k = lax.while_loop(more, attempt, state)
+        if few is not None:
+            rows = lax.dynamic_update_slice_in_dim(rows, few, count, 0)
+        if found is not None:
+            ys = per_body(_inserted, bodies)(ys, found[:many], base)
+        return walk, rows, ys, count + k
 
-    more = lambda s: on(s[0]) & (s[2] < room)  # noqa: E731
-    return lax.while_loop(more, block, (walk, rows, jnp.zeros((), jnp.int32)))
+    def more(state: Any) -> Array:
+        walk, rows, _, count = state
+        return on(walk) if rows is None else on(walk) & (count + many <= rows.shape[0])
+
+    return lax.while_loop(more, block, (walk, rows, ys, jnp.zeros((), jnp.int32)))
 
 
-def _block_size(run: Run) -> int:
-    size = run.y0.dtype.itemsize * (run.y0.shape[0] + 3)
-    return max(1, min(8, _BLOCK // size))
+def _replaced(a: Array, row: Array, index: Array) -> Array:
+    return lax.dynamic_update_index_in_dim(a, row, index, 0)
 
 
-def empty_rows(run: Run, room: int) -> Rows:
-    """Space for `room` steps at least."""
-    return jnp.zeros((room + _block_size(run), 3 + run.y0.shape[0], *run.t0.shape), run.y0.dtype)
+def _inserted(a: Array, rows: Array, index: Array) -> Array:
+    return lax.dynamic_update_slice_in_dim(a, rows, index, 0)
 
 
-def row_of(run: Run, row: Array) -> tuple[Step, Array]:
-    """A recorded step, and its code."""
-    t, h, code = row[0], row[1], row[2].astype(jnp.int32)
-    end = jnp.where(code % 2 == 1, at(run.before, code // 2), t + h)
-    return Step(t, h, end, row[3:]), code
+def empty_rows(run: Run) -> Rows:
+    """Space for the steps of a segment at least."""
+    room = SEGMENT + _MOST
+    return jnp.zeros((room, HEAD + run.y0.shape[0], *run.t0.shape), run.y0.dtype)
+
+
+def row_of(run: Run, row: Array) -> tuple[Step, Array, Array]:
+    """A recorded step, its kind, and the index of the stop ahead."""
+    t, h, y = row[0], row[1], row[HEAD:]
+    kind, stop = row[2].astype(jnp.int32), row[3].astype(jnp.int32)
+    end = jnp.where(kind == LAST, at(run.before, stop), t + h)
+    if run.between.shape[0]:
+        visit = visit_of(run, kind - VISIT, t, stop, y)
+        end = jnp.where(kind >= VISIT, visit.end, end)
+    return Step(t, h, end, y), kind, stop
 
 
 def at(a: Array, index: Array) -> Array:
@@ -293,84 +366,20 @@ def per_body(function: Callable[..., Any], bodies: int) -> Callable[..., Any]:
     return jax.vmap(function, in_axes=-1, out_axes=-1) if bodies else function
 
 
-def within(run: Run, rows: Rows, count: Array, late: Array) -> tuple[Array, Array, Step]:
-    """The rows that these times (many, *bodies) lie in, their codes, the steps to there."""
-    bodies = run.t0.ndim
-    there = jnp.arange(rows.shape[0], dtype=jnp.int32).reshape(-1, *[1] * bodies) < count
-    starts = jnp.where(there, rows[:, 0], jnp.inf)
-
-    def find(starts: Array, late: Array) -> Array:
-        return jnp.searchsorted(starts, late, side="left", method="scan_unrolled") - 1
-
-    index = jnp.maximum(per_body(find, bodies)(starts, late), 0)
-    found = per_body(lambda a, i: a[i].T, bodies)(rows, index)
-    t, h, code = found[0], found[1], found[2].astype(jnp.int32)
-    before = per_body(lambda a, i: a[i], bodies)(
-        run.before, jnp.minimum(code // 2, run.stops.shape[0] - 1)
-    )
-    limit = jnp.where(code % 2 == 1, before, t + h)
-    # The limit is the last moment before a jump: it moves nothing, and has no derivative here.
-    end = late + lax.stop_gradient(jnp.minimum(late, limit) - late)
-    return index, code, Step(t, end - t, end, found[3:])
-
-
-def side_by_side(method: Method) -> Method:
-    """The method for (n, many, *bodies), the constants as they were."""
-    field = jax.vmap(method.field, (None, 0, 1), 1)
-    return method._replace(field=field, project=jax.vmap(method.project, 1, 1))
-
-
-def _none_saved(run: Run) -> tuple[Array, Array]:
-    size = run.between.shape[0]
-    more = min(MANY, size)
-    ys = jnp.full((size + more, *run.y0.shape), jnp.nan, run.y0.dtype)
-    return ys, jnp.zeros(run.t0.shape, jnp.int32)
-
-
-def _saved(
-    method: Method,
-    constants: list[Array],
-    run: Run,
-    reach: Array,
-    rows: Rows,
-    count: Array,
-    saved: tuple[Array, Array],
-) -> tuple[Array, Array]:
-    """The states at the times between, as far as the run has come, and how many there are."""
+def _none_saved(run: Run) -> Array | None:
     size = run.between.shape[0]
     if not size:
-        return saved
-    many, bodies = min(MANY, size), run.t0.ndim
-    wide = side_by_side(method)
-    each = jnp.arange(many, dtype=jnp.int32).reshape(-1, *[1] * bodies)
-
-    def waiting(saved: Any) -> Array:
-        known = saved[1]
-        return jnp.any((known < size) & (at(run.between, known) <= reach))
-
-    def batch(saved: Any) -> Any:
-        ys, known = saved
-        place = lift(known, each) + each
-        late = per_body(lambda a, i: a[i], bodies)(run.between, jnp.minimum(place, size - 1))
-        ready = (place < size) & (late <= lift(reach, late))
-        _, _, step = within(run, rows, count, jnp.where(ready, late, lift(reach, late)))
-        found = wide.project(runge_kutta.stages(wide.tableau, wide.field, constants, step).end)
-        found = jnp.where(lift(ready, found), found, jnp.nan)
-
-        def put(ys: Array, found: Array, known: Array) -> Array:
-            return lax.dynamic_update_slice_in_dim(ys, found.T, known, 0)
-
-        ys = per_body(put, bodies)(ys, found, known)
-        return ys, known + jnp.sum(ready, 0, dtype=jnp.int32)
-
-    return lax.while_loop(waiting, batch, saved)
+        return None
+    return jnp.zeros((size + _MOST, *run.y0.shape), run.y0.dtype)
 
 
-def _kept(run: Run, saved: tuple[Array, Array]) -> Array:
-    return saved[0][: run.between.shape[0]]
-
-
-def _answer(run: Run, walk: Walk, between: Array) -> Answer:
+def _answer(run: Run, walk: Walk, ys: Array | None) -> Answer:
+    size = run.between.shape[0]
+    between = run.y0[None][:0]
+    if ys is not None and size:
+        number = jnp.arange(size, dtype=jnp.int32).reshape(-1, *[1] * run.t0.ndim)
+        there = (number < walk.known[None])[:, None]
+        between = jnp.where(there, ys[:size], jnp.nan)
     there = walk.stop >= run.stops.shape[0]
     end = jnp.where(lift(there, walk.y), walk.y, jnp.nan)
     return Answer(between, end, walk.t, walk.h, walk.steps, walk.rejected)

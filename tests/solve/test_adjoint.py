@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import rigidjax as rj
-from rigidjax.solve import adaptive_loop, adjoint, lanes, lean
+from rigidjax.solve import adaptive_loop, lanes, lean
 
 Q = np.array([0.8, -0.2, 0.4, 0.4]) / np.linalg.norm([0.8, -0.2, 0.4, 0.4])
 TENSOR = np.array([[1.0, 0.05, -0.1], [0.05, 1.7, 0.2], [-0.1, 0.2, 2.2]])
@@ -175,8 +175,6 @@ def test_many_segments_are_one(monkeypatch):
 
     whole = jax.jit(slopes)(jnp.zeros(16))
     monkeypatch.setattr(adaptive_loop, "SEGMENT", 7)
-    monkeypatch.setattr(adaptive_loop, "MANY", 2)
-    monkeypatch.setattr(adjoint, "MANY", 2)
     segments = jax.jit(lambda p: slopes(p))(jnp.zeros(16))
     for a, b in zip(segments, whole, strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-10 * np.abs(b).max())
