@@ -313,7 +313,7 @@ def recorded(
         state = (walk, few, found, base, jnp.zeros((), jnp.int32))
         more = lambda s: on(s[0]) & (s[-1] < many)  # noqa: E731
         walk, few, found, _, k = lax.while_loop(more, attempt, state)
-        if few is not None:
+        if rows is not None and few is not None:
             rows = lax.dynamic_update_slice_in_dim(rows, few, count, 0)
         if found is not None:
             ys = per_body(_inserted, bodies)(ys, found[:many], base)

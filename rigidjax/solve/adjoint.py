@@ -142,9 +142,8 @@ def cotangents(
             here, kind, stop = row_of(run, rows[count - 1 - i])
             visit, taken = kind >= VISIT, (kind != NONE) & (kind < VISIT)
             there = runge_kutta.stages(method.tableau, method.field, constants, here)
-            bar = sums.y0
+            bar, place = sums.y0, jnp.clip(kind - VISIT, 0, max(size - 1, 0))
             if size:
-                place = jnp.clip(kind - VISIT, 0, size - 1)
                 bar = jnp.where(lift(visit, bar), _gathered(run, seeds, place), bar)
             bar = axes.over(jax.vjp(method.project, there.end)[1], 1, (1,))(bar)[0]
             bar = _where(visit | taken, bar)
