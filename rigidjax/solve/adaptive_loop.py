@@ -319,9 +319,12 @@ def recorded(
             ys = per_body(_inserted, bodies)(ys, found[:many], base)
         return walk, rows, ys, count + k
 
+    # A segment that is run again may need as many rows as it had, in blocks of another size.
+    room = 0 if rows is None else rows.shape[0] - (2 if until is None else 1) * _MOST
+
     def more(state: Any) -> Array:
         walk, rows, _, count = state
-        return on(walk) if rows is None else on(walk) & (count + many <= rows.shape[0])
+        return on(walk) if rows is None else on(walk) & (count < room)
 
     return lax.while_loop(more, block, (walk, rows, ys, jnp.zeros((), jnp.int32)))
 
@@ -336,7 +339,7 @@ def _inserted(a: Array, rows: Array, index: Array) -> Array:
 
 def empty_rows(run: Run) -> Rows:
     """Space for the steps of a segment at least."""
-    room = SEGMENT + _MOST
+    room = SEGMENT + 2 * _MOST
     return jnp.zeros((room, HEAD + run.y0.shape[0], *run.t0.shape), run.y0.dtype)
 
 
