@@ -163,15 +163,20 @@ def test_times_batches_and_second_derivatives():
     np.testing.assert_allclose(second, bend, atol=1e-4 * np.abs(bend).max())
 
 
-@pytest.mark.slow
-def test_many_segments_are_one(monkeypatch):
-    ts = jnp.linspace(0.0, 1.5, 5)
+@pytest.mark.parametrize(
+    ("name", "second"), [("wheel", False), pytest.param("pulses", True, marks=pytest.mark.slow)]
+)
+def test_many_segments_are_one(monkeypatch, name, second):
+    ts = jnp.linspace(0.0, 1.5, 9)
+    weights = jnp.asarray(np.random.default_rng(1).normal(size=(9, 7)))
+    turn = jnp.asarray(np.random.default_rng(2).normal(size=16))
 
     def slopes(p):
         def value(p):
-            return run("pulses", ts, p, WEIGHTS, 300)
+            return run(name, ts, p, weights, 300)
 
-        return jax.grad(value)(p), jax.jacfwd(value)(p), jax.jacfwd(jax.grad(value))(p)
+        found = jax.grad(value)(p), jax.jvp(value, (p,), (turn,))[1]
+        return (*found, jax.jacfwd(jax.grad(value))(p)) if second else found
 
     whole = jax.jit(slopes)(jnp.zeros(16))
     monkeypatch.setattr(adaptive_loop, "SEGMENT", 7)
