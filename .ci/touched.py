@@ -1,7 +1,8 @@
 """A pytest plugin: the run fails unless every rule of differentiation of rigidjax was taken.
 
-The rules are those given to `defjvp`, `defvjp`, `def_jvp` and `def_vmap`. They are read from the
-source, and watched while the tests run: JAX takes a rule when it traces, hence once at least.
+The rules are those given to `defjvp`, `defvjp`, `def_jvp` and `def_vmap`, and to JAX's tables for
+primitives. They are read from the source, and watched while the tests run: JAX takes a rule when it
+traces, hence once at least.
 """
 
 import ast
@@ -12,8 +13,13 @@ from pathlib import Path
 import equinox as eqx
 import jax
 import pytest
+from jax.interpreters import ad
 
 GIVEN = {"defjvp", "defvjp", "def_jvp", "def_vmap"}
+TABLES = {
+    "primitive_jvps": ad.primitive_jvps,
+    "primitive_transposes": ad.primitive_transposes,
+}
 PACKAGE = Path(__file__).resolve().parents[1] / "rigidjax"
 taken: set[str] = set()
 
@@ -51,10 +57,12 @@ def _written():
         nodes = list(ast.walk(ast.parse(path.read_text())))
         functions = {node.name: node for node in nodes if isinstance(node, ast.FunctionDef)}
         names = [n for n, f in functions.items() if any(map(_gives, f.decorator_list))]
-        for call in nodes:
-            if isinstance(call, ast.Call) and _gives(call.func):
-                inside = [node for arg in call.args for node in ast.walk(arg)]
+        for node in nodes:
+            if isinstance(node, ast.Call) and _gives(node.func):
+                inside = [n for arg in node.args for n in ast.walk(arg)]
                 names += [n.id for n in inside if isinstance(n, ast.Name) and n.id in functions]
+            if isinstance(node, ast.Assign) and _is_entry(node.targets[0]):
+                names.append(node.value.id)
         yield from (f"{path}: {name}" for name in names)
 
 
@@ -62,11 +70,22 @@ def _gives(tree):
     return any(isinstance(n, ast.Attribute) and n.attr in GIVEN for n in ast.walk(tree))
 
 
+def _is_entry(tree):
+    return isinstance(tree, ast.Subscript) and getattr(tree.value, "attr", None) in TABLES
+
+
 # Now, not in a hook: conftest.py imports rigidjax before `pytest_configure`.
 _watch(jax.custom_jvp, "defjvp")
 _watch(jax.custom_vjp, "defvjp")
 _watch(jax.custom_batching.custom_vmap, "def_vmap")
 _watch(eqx.filter_custom_jvp, "def_jvp")
+
+
+def pytest_configure(config):
+    ours = [p for p in ad.primitive_jvps if p.name.startswith("rigidjax")]
+    for table in TABLES.values():
+        for primitive in ours:
+            table[primitive] = _watched(table[primitive])
 
 
 @pytest.hookimpl(optionalhook=True)

@@ -25,6 +25,7 @@ from rigidjax.solve.components import join, split
 from rigidjax.solve.explicit import AbstractExplicit, Atoms, RungeKutta4, advance
 from rigidjax.solve.magnus import Magnus4, require_blind, sees_attitude, turned
 from rigidjax.solve.scalarise import scalarise
+from rigidjax.special.barrier import barrier
 
 Torque = Callable[[Any, Atoms], Triple]
 
@@ -139,7 +140,7 @@ def _magnus(body: Inertia, state0: Attitude, torque: Any, t0: Array) -> Lane:
         q = y[:4]
 
         def slope(t: Any, p: Triple) -> Triple:
-            omega = lax.optimization_barrier(rate(p))
+            omega = barrier(rate(p))
             return _sum(cross(p, omega), law(t, (*q, *omega)))
 
         q, p = turned(slope, rate, t, end, h, q, y[4:])
@@ -161,7 +162,7 @@ def _explicit(method: AbstractExplicit, body: Inertia, state0: Any, torque: Any,
     def field(t: Any, y: Atoms) -> Atoms:
         q, p = y[:many], y[many:]
         # Shared by attitude and momentum; fenced, lest each of seven results work it out again.
-        omega = lax.optimization_barrier(times(weights, p))
+        omega = barrier(times(weights, p))
         slope = cross(p, omega)
         if law is not None:
             slope = _sum(slope, law(t, (*q, *omega)))
@@ -197,7 +198,7 @@ def _rigid(method: Any, body: Any, state0: Rigid, torque: Any, t0: Array) -> Lan
 def _law(torque: Any, body: Inertia, state0: Any, t0: Array) -> Torque:
     """The torque (3 numbers) of the time and the state's numbers."""
     numbers = scalarise(lambda t, y: evaluate(torque, t, y, body), t0, state0)
-    return lambda t, y: lax.optimization_barrier(numbers(t, *y))
+    return lambda t, y: barrier(numbers(t, *y))
 
 
 def _sum(a: Triple, b: Triple) -> Triple:

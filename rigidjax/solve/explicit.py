@@ -15,6 +15,7 @@ from rigidjax.motion import on_the_group
 from rigidjax.solve.components import flat, leaf_sizes, unflat
 from rigidjax.solve.runge_kutta import Step, error_estimate, needs_last_slope, stages
 from rigidjax.solve.tableaus import DORMAND_PRINCE8, KUTTA4, TSITOURAS5, Row, Tableau
+from rigidjax.special.barrier import barrier
 
 Atoms = tuple[Array, ...]
 
@@ -155,7 +156,7 @@ def _fence(numbers: Atoms) -> Atoms:
     Without it XLA makes of each result of a step one kernel, which repeats all stages before it. On
     one trajectory LLVM finds the copies; in a batch, or beside tangents, it cannot.
     """
-    return lax.optimization_barrier(numbers)
+    return barrier(numbers)
 
 
 def _diffrax_step(

@@ -10,7 +10,6 @@ from typing import Any, ClassVar
 import diffrax as dfx
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jax.extend import core
 from jaxtyping import Array
 
@@ -23,6 +22,7 @@ from rigidjax.solve.components import join, split
 from rigidjax.solve.explicit import NestedInterpolation, advance, cubic_rows
 from rigidjax.solve.scalarise import scalarise
 from rigidjax.solve.tableaus import KUTTA4
+from rigidjax.special.barrier import barrier
 
 
 def turned(
@@ -42,7 +42,7 @@ def turned(
     Nørsett and Zanna 2000, doi:10.1017/S0962492900002154, section 5.
     """
     after, slopes, _ = advance(KUTTA4, slope, t, h, p, end)
-    after = lax.optimization_barrier(after)
+    after = barrier(after)
     first, last = slopes[0], slope(end, after)
     middle = tuple(
         0.5 * (a + b) + 0.125 * h * (k - m)
@@ -54,7 +54,7 @@ def turned(
         third * (a + 4.0 * b + c) + square * d
         for a, b, c, d in zip(left, between, right, cross(left, right), strict=True)
     )
-    half = lax.optimization_barrier(half)
+    half = barrier(half)
     return _product(q, half), after
 
 
@@ -64,11 +64,11 @@ def _product(q: Four, half: Triple) -> Four:
     x = half[0] * half[0] + half[1] * half[1] + half[2] * half[2]
     c = 1.0 + x * (-1 / 2 + x * (1 / 24 + x * (-1 / 720 + x * (1 / 40320))))
     s = 1.0 + x * (-1 / 6 + x * (1 / 120 + x * (-1 / 5040 + x * (1 / 362880))))
-    c, x, y, z = lax.optimization_barrier((c, *(s * a for a in half)))
+    c, x, y, z = barrier((c, *(s * a for a in half)))
     out = product4(q, (c, x, y, z))
     # One of Newton's steps to length 1, which is near already.
     scale = 1.5 - 0.5 * square4(out)
-    return tuple(scale * a for a in lax.optimization_barrier(out))
+    return tuple(scale * a for a in barrier(out))
 
 
 class Magnus4(dfx.AbstractSolver):

@@ -301,6 +301,20 @@ def test_first_derivatives_of_full_tensors():
         assert np.abs(j - ref).max() < 1e-12 * np.abs(ref).max(), name
 
 
+@pytest.mark.oldest
+def test_second_derivatives_in_a_few_classes():
+    names = ("triaxial", "sphere", "axis 2", "rest")
+    x = np.concatenate([inputs(name, 1, [1.3]) for name in names])
+    r = np.random.default_rng(5)
+    v, c = r.normal(size=x.shape), r.normal(size=(len(x), 7))
+    _, curvature = gradient_and_curvature(*(jnp.asarray(a) for a in (x, v, c)))
+    with mp.workdps(90):
+        for k, name in enumerate(names):
+            ref = true_curvature(x[k], v[k], c[k])
+            error = np.abs(curvature[k] - ref).max() / np.abs(ref).max()
+            assert error < 1e-10, (name, error)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("turn", [False, True])
 @pytest.mark.parametrize("name", classes.NAMES)

@@ -168,7 +168,6 @@ def closes(scene, orbit, bar):
     np.testing.assert_allclose(end, start, rtol=0, atol=bar)
 
 
-@pytest.mark.oldest
 @pytest.mark.parametrize("point", [1, 2, 3])
 def test_lyapunov_family(point):
     @eqx.filter_jit
@@ -188,6 +187,24 @@ def test_lyapunov_family(point):
     rate = np.sqrt(0.5 * (b + np.sqrt(b * b - 4 * (u[0, 0] * u[1, 1] - u[0, 1] ** 2))))
     assert abs(periods[0] - 2 * np.pi / rate) < 1e-7
     assert periods[0] < periods[1] < periods[2]
+
+
+@pytest.mark.oldest
+def test_the_derivative_of_an_orbit_both_ways():
+    def period(p):
+        moon = scenes.cr3bp(p[0])
+        return moon.periodic_orbit(moon.lyapunov_guess(1, p[1])).period
+
+    @eqx.filter_jit
+    def all_of(p):
+        return period(p), jax.jacfwd(period)(p), jax.grad(period)(p)
+
+    p = jnp.array([PYKEP_MU, 0.01])
+    _, forward, reverse = all_of(p)
+    np.testing.assert_allclose(forward, reverse, rtol=1e-11)
+    for k, step in ((0, 1e-6), (1, 1e-4)):
+        up, down = (float(all_of(p.at[k].add(sign * step))[0]) for sign in (1, -1))
+        np.testing.assert_allclose(forward[k], (up - down) / (2 * step), rtol=1e-5)
 
 
 @pytest.mark.slow
