@@ -421,5 +421,5 @@ def test_other_mistakes_are_named(records, free_record):
         identify.Tensor(-1.0)
     with pytest.raises(ValueError, match="substeps: wanted a whole number of at least 1, got 0"):
         identify.FixedSteps(0)
-    with pytest.raises(ValueError, match="a positive scale, got 0"):
+    with pytest.raises(ValueError, match="a positive number, got 0"):
         identify.Free(lambda r: r, "x", scale=0.0)
