@@ -417,7 +417,7 @@ def test_other_mistakes_are_named(records, free_record):
         identify.Problem(marker, identify.Tensor(1.0))
     with pytest.raises(ValueError, match="wanted a positive moment of inertia"):
         identify.Tensor(-1.0)
-    with pytest.raises(ValueError, match="wanted at least one step, got 0"):
+    with pytest.raises(ValueError, match="substeps: wanted a whole number of at least 1, got 0"):
         identify.FixedSteps(0)
-    with pytest.raises(ValueError, match="a positive scale, got 0"):
+    with pytest.raises(ValueError, match="scale: wanted a positive number, got 0"):
         identify.Free(lambda r: r, "x", scale=0.0)
