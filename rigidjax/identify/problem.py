@@ -125,7 +125,7 @@ class Problem(eqx.Module):
                 f"got {type(body).__name__}"
             )
         if isinstance(free, str):
-            free = (free,)
+            free = (free,)  # pyright: ignore[reportAssignmentType]
         _checks.instance(free, Sequence, "free", wanted="a sequence of Free(where, name)")
         for name, value, kind in (
             ("loss", loss, AbstractLoss),
