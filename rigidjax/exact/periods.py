@@ -32,7 +32,7 @@ def body_period(inertia: Inertia, omega0: Vec3Like) -> Scalar:
     19.8.5; Landau and Lifshitz, Mechanics, eq 37.11). Its derivatives are right wherever it is
     finite, symmetric tops and principal axes included.
 
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
+    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype, or a moment known to be zero.
 
     >>> import rigidjax as rj, jax.numpy as jnp
     >>> top = rj.Inertia.from_principal(1.0, 2.0, 2.0)
@@ -58,7 +58,7 @@ def precession_period(inertia: Inertia, omega0: Vec3Like) -> Scalar:
     integral of the third kind (DLMF 19.8.7). Its derivative is `½ T δE₂ + ½ δK:∫ΠΠᵀ dt + E₂ δT`,
     over |Π|: see `rigidjax.exact.flow`.
 
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
+    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype, or a moment known to be zero.
 
     >>> import rigidjax as rj, jax.numpy as jnp
     >>> top = rj.Inertia.from_principal(1.0, 2.0, 2.0)
@@ -71,6 +71,8 @@ def precession_period(inertia: Inertia, omega0: Vec3Like) -> Scalar:
 
 def _scaled(inertia: Inertia, omega0):
     _checks.instance(inertia, Inertia, "inertia", hint="of MassProperties pass .inertia")
+    if _checks.known(inertia.tensor):
+        inertia = inertia.invertible()
     omega = _checks.floating(omega0, (3,), "omega0").astype(inertia.tensor.dtype)
     tensor = _checks.floating(inertia.tensor, (3, 3), "inertia tensor")
     exponent = exponent_of(omega)

@@ -11,7 +11,7 @@ from rigidjax._types import HasAttitude, HasPose, HasSpin, Scalar, ScalarLike, V
 from rigidjax.body.energy import angular_momentum, kinetic_energy
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.motion.torques import AbstractTorque, CentralGravity, Sum, Torque, in_precision
-from rigidjax.motion.torques.base import length_or_zero, require_law
+from rigidjax.motion.torques.base import length_or_zero, one_law, require_rung
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.algebra import cross, dot
 
@@ -132,6 +132,8 @@ def drift(
     True
     """
     ts = _checks.rows(ts, (), "ts")
+    if not ts.size:
+        raise ValueError("ts: wanted at least one time, got none")
     _checks.instance(ys, HasSpin, "ys", wanted="states with a leading time axis")
     for leaf in jax.tree.leaves(ys):
         if leaf.shape[:1] != ts.shape:
@@ -160,7 +162,9 @@ def _look(body: Any, state: Any, torque: Any) -> None:
     _checks.single(body, (Inertia, MassProperties), "body")
     _checks.single(state, HasSpin, "state", wanted="a Spin, an Attitude or a Rigid")
     if torque is not None:
-        require_law(torque)
+        require_rung(torque, state)
+    for part in _parts(torque):
+        one_law(part)
 
 
 def _parts(torque: Torque | None) -> tuple[Any, ...]:

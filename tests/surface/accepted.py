@@ -2,8 +2,48 @@
 
 import fnmatch
 
+OVERFLOW = (
+    "products of two to four numbers leave the dtype beyond 1e75, the range that rotation.algebra "
+    "states; what is large or small below that is tried as well, and must be right"
+)
+REACHED = "a body's status says what happened to it, and its states are NaN: documented"
+ANY_TREE = "a tree of whatever NumPy makes an array of"
+DOMAIN = "outside of the domain that the documentation states, where nothing is defined"
+LIMIT = "the right limit for an infinite argument"
+
 # (row, argument: replacement, what came of it, reason), as patterns; the first that fits counts.
-ACCEPTED: list[tuple[str, str, str, str]] = []
+ACCEPTED: list[tuple[str, str, str, str]] = [
+    # Polynomials of states and bodies.
+    ("body.divergence", "*: huge", "a silent NaN*", OVERFLOW),
+    ("body.kinetic_energy*", "*: huge", "a silent NaN*", OVERFLOW),
+    ("conserved", "state: huge", "a silent NaN*", OVERFLOW),
+    ("energy", "state: huge", "a silent NaN*", OVERFLOW),
+    ("drift", "*: huge", "a silent NaN*", OVERFLOW),
+    ("*Equations", "inertia: huge", "a silent NaN*", OVERFLOW),
+    ("equations_of_motion", "body: huge", "a silent NaN*", OVERFLOW),
+    ("motion.lagrangian.*Hamiltonian", "inertia: huge", "a silent NaN*", OVERFLOW),
+    ("motion.torques.*", "state: huge", "a silent NaN*", OVERFLOW),
+    ("frames.scenes.*", "state: huge", "a silent NaN*", OVERFLOW),
+    ("frames.scenes.ThreeBody.*", "*: huge", "a silent NaN*", OVERFLOW),
+    ("body.parameters.unpack_shape", "vector: huge", "a silent NaN*", OVERFLOW),
+    # Domains.
+    (
+        "body.matrix_function",
+        "tensor: *",
+        "a silent NaN*",
+        "the square root is not smooth at 0, has no real value below, and its second derivative "
+        "overflows below 1e-205: the function must be smooth on the spectrum",
+    ),
+    ("body.parameters.unpack_moments", "vector: all -inf", "infinity is lost*", LIMIT),
+    # Batches.
+    ("batch.rollout", "*", "a silent NaN*", REACHED),
+    ("batch.simulate*", "*", "a silent NaN*", REACHED),
+    ("batch.hosts.*", "tree: *", "taken without a word*", ANY_TREE),
+    # Others.
+    ("drift", "*: float32", "returned*", "drift is round-off itself, so that it has no digits"),
+    ("frames.Force", "force: None", "taken*", "None is documented: the particle is left to itself"),
+    ("frames.scene_of", "force: None", "taken*", "None is documented: no force at all"),
+]
 
 
 def reason(name: str, where: str, what: str) -> str | None:

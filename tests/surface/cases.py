@@ -1,6 +1,5 @@
 """What the sweep of derivatives goes through: functions of one vector, ordinary and degenerate points."""
 
-import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -770,9 +769,3 @@ GROUPS = dict(
     rotations=rotations, numbers=numbers, bodies=bodies, laws=laws, equations=equations, frames=frames,
     closed_form=closed_form, solved=solved, fits=fits,
 )  # fmt: skip
-
-
-@functools.cache
-def cases() -> dict[str, Case]:
-    """All of them, by name."""
-    return {case.name: case for make in GROUPS.values() for case in make()}

@@ -59,7 +59,7 @@ def failures_of(
                 else:
                     counts[f"accepted: {reason}"] += 1
     if transforms:
-        yield from _transforms(call, given, counts)
+        yield from transformed(call, counts)
 
 
 def _judged(
@@ -105,7 +105,9 @@ def _may_be_none(call: Call) -> set[str]:
     return {name for name, p in parameters.items() if p.default is None}
 
 
-def _transforms(call: Call, given: dict, counts: collections.Counter) -> Iterator[tuple[str, str]]:
+def transformed(call: Call, counts: collections.Counter) -> Iterator[tuple[str, str]]:
+    """What goes wrong with the good call under the transforms, as (where, what)."""
+    given = call.given()
     held = {
         name: value
         for name, value in given.items()

@@ -11,7 +11,8 @@ import numpy as np
 
 import rigidjax as rj
 
-SIZES = {"huge": 1e308, "large": 1e100, "small": 1e-100, "tiny": 1e-308}
+# Up to 1e75 every formula of the library must hold (rotation.algebra); beyond, most.
+SIZES = {"huge": 1e308, "large": 1e75, "small": 1e-75, "tiny": 1e-308}
 
 
 @dataclasses.dataclass(frozen=True)

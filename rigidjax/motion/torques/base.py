@@ -163,7 +163,7 @@ def act(
     >>> act(torques.ConstantTorque([0.0, 0, 1]), 0.0, Spin([0.0, 0, 1]), Inertia(jnp.eye(3)))[0]
     """
     require_law(law)
-    _one_law(law)
+    one_law(law)
     _checks.single(state, HasSpin, "state", wanted="a Spin, an Attitude or a Rigid")
     _checks.single(body, (Inertia, MassProperties), "body")
     dtype = state.omega.dtype
@@ -177,10 +177,13 @@ def act(
     return None, value.astype(dtype)
 
 
-def _one_law(law: Any) -> None:
+def one_law(law: Any) -> None:
     """Raise `ValueError` where an array of one of our laws has not the shape that its field says.
 
     Its constructor saw to that; `jax.vmap` and `jax.tree.map` make laws of many bodies.
+
+    >>> from rigidjax import torques
+    >>> one_law(torques.ConstantTorque([0.0, 0.0, 1.0]))
     """
     if not type(law).__module__.startswith(__package__ or ""):
         return
