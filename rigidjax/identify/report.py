@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from rigidjax._names import own_names
+
 if TYPE_CHECKING:
     from rigidjax.identify.fit import Fit
 
@@ -180,3 +182,6 @@ def _png(figure: Any) -> str:
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=110)
     return base64.b64encode(buffer.getvalue()).decode("ascii")
+
+
+__dir__ = own_names(__name__)
