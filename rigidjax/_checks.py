@@ -1,7 +1,10 @@
 """Checks at public boundaries: what was wanted, what came, and the likely cause (floor 0)."""
 
 import functools
+import os
 import warnings
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import equinox as eqx
@@ -24,19 +27,7 @@ def floating(
     **Raises:** `TypeError` for what is not a real number array, or is half precision (its 3 digits
     cannot hold a rotation); `ValueError` for a wrong shape.
     """
-    try:
-        array = jnp.asarray(value)
-    except (TypeError, ValueError) as error:
-        raise TypeError(
-            f"{name}: wanted an array of numbers, got {type(value).__name__}"
-        ) from error
-    if isinstance(value, np.ndarray) and value.dtype == np.float64 and array.dtype != np.float64:
-        _warn_of_lost_digits()
-    if jnp.issubdtype(array.dtype, jnp.integer):
-        array = array.astype(jnp.result_type(float))
-    if array.dtype not in (jnp.float32, jnp.float64):
-        reason = " (half precision cannot hold a rotation)" if array.dtype.itemsize == 2 else ""
-        raise TypeError(f"{name}: wanted float32 or float64, got {array.dtype}{reason}")
+    array = numbers(value, name)
     found = array.shape[array.ndim - len(shape) :] if batched else array.shape
     if found != shape:
         advice = hint or (
@@ -47,6 +38,37 @@ def floating(
         raise ValueError(
             f"{name}: wanted shape {shape}, got {array.shape}" + (f"; {advice}" if advice else "")
         )
+    return array
+
+
+def rows(value: Any, shape: tuple[int, ...], name: str, *, hint: str = "") -> Array:
+    """Return `value` as an array of any number of `shape`, (n, *shape), as `floating` does."""
+    array = numbers(value, name)
+    if array.ndim != len(shape) + 1 or array.shape[1:] != shape:
+        wanted = ", ".join(map(str, ("n", *shape))) + ("," if not shape else "")
+        raise ValueError(
+            f"{name}: wanted shape ({wanted}), got {array.shape}" + (f"; {hint}" if hint else "")
+        )
+    return array
+
+
+def numbers(value: Any, name: str) -> Array:
+    """Return `value` as a float32 or float64 array of any shape, as `floating` does."""
+    try:
+        array = jnp.asarray(value)
+    except (TypeError, ValueError) as error:
+        found = f" of {value.dtype}" if isinstance(value, np.ndarray) else ""
+        raise TypeError(
+            f"{name}: wanted an array of numbers, got {type(value).__name__}{found}"
+        ) from error
+    if isinstance(value, np.ndarray) and value.dtype == np.float64 and array.dtype != np.float64:
+        _warn_of_lost_digits()
+    if jnp.issubdtype(array.dtype, jnp.integer):
+        array = array.astype(jnp.result_type(float))
+    if array.dtype not in (jnp.float32, jnp.float64):
+        half = jnp.issubdtype(array.dtype, jnp.floating) and array.dtype.itemsize == 2
+        reason = " (half precision cannot hold a rotation)" if half else ""
+        raise TypeError(f"{name}: wanted float32 or float64, got {array.dtype}{reason}")
     return array
 
 
@@ -74,7 +96,7 @@ def _warn_of_lost_digits() -> None:
     warnings.warn(
         "rigidjax: float64 numbers become float32, seven digits, because JAX's 64 bits are off; "
         "set jax.config.update('jax_enable_x64', True), or pass float32 if that is meant",
-        stacklevel=4,
+        stacklevel=5,
     )
 
 
@@ -113,3 +135,147 @@ def finite(value: Float[Array, "..."], name: str) -> Float[Array, "..."]:
     if xp is np and bad.any():
         where = f" at index {tuple(int(i) for i in np.argwhere(bad)[0])}"
     return refuse(value, bad.any(), f"{name}: contains NaN or infinity{where}")
+
+
+def instance(
+    value: Any, kinds: type | tuple[type, ...], name: str, *, wanted: str = "", hint: str = ""
+) -> Any:
+    """Return `value` if it is one of `kinds`; else raise `TypeError` with what was wanted.
+
+    >>> instance(1.0, float, "speed")
+    1.0
+    """
+    if isinstance(value, kinds):
+        return value
+    if not wanted:
+        several = kinds if isinstance(kinds, tuple) else (kinds,)
+        wanted = " or ".join(kind.__name__ for kind in several)
+    found = f"the class {value.__name__}" if isinstance(value, type) else type(value).__name__
+    raise TypeError(f"{name}: wanted {wanted}, got {found}" + (f"; {hint}" if hint else ""))
+
+
+# The arrays of one body or one state, by the name of the field.
+_ONE = {
+    "tensor": (3, 3), "mass": (), "com": (3,), "second_moment": (3, 3),
+    "x": (3,), "v": (3,), "q": (4,), "omega": (3,),
+}  # fmt: skip
+
+
+def single(
+    value: Any, kinds: type | tuple[type, ...], name: str, *, wanted: str = "", hint: str = ""
+) -> Any:
+    """Return `value` if it is one of `kinds`, and one body or state: no leading axes.
+
+    A container of many is of the same type; without this its shape is met in the middle of the
+    arithmetic.
+    """
+    instance(value, kinds, name, wanted=wanted, hint=hint)
+    for field in _ONE.keys() & vars(value).keys():
+        part, shape = getattr(value, field), _ONE[field]
+        if getattr(part, "shape", None) != shape or part.dtype not in (jnp.float32, jnp.float64):
+            floating(part, shape, f"{name}.{field}")
+    return value
+
+
+def function(value: Any, name: str, of: str, *, hint: str = "") -> Any:
+    """Return `value` if it can be called, and is no class; `of` says what of: "t → (3,)"."""
+    if callable(value) and not isinstance(value, type):
+        return value
+    found = f"the class {value.__name__}" if isinstance(value, type) else type(value).__name__
+    raise TypeError(f"{name}: wanted a function {of}, got {found}" + (f"; {hint}" if hint else ""))
+
+
+def whole(value: Any, name: str, least: int) -> int:
+    """Return `value` as a whole number of at least `least`, known before anything is compiled."""
+    if isinstance(value, bool) or not isinstance(value, int | np.integer):
+        raise TypeError(f"{name}: wanted a whole number of Python, got {_shown(value)}")
+    if value < least:
+        raise ValueError(f"{name}: wanted a whole number of at least {least}, got {value}")
+    return int(value)
+
+
+def number(value: Any, name: str) -> float:
+    """Return `value` as a number of Python, known before anything is compiled."""
+    array = on_host(value, name)
+    if array.shape != ():
+        raise ValueError(f"{name}: wanted one number, got shape {array.shape}")
+    return float(array)
+
+
+def positive(value: Any, name: str, what: str = "a positive number") -> float:
+    """Return `value` as a positive, finite number of Python, known before anything is compiled."""
+    found = number(value, name)
+    if not 0 < found < np.inf:
+        raise ValueError(f"{name}: wanted {what}, got {found}")
+    return found
+
+
+def not_negative(value: Any, name: str) -> float:
+    """Return `value` as a finite number of Python ≥ 0, known before anything is compiled."""
+    found = number(value, name)
+    return 0.0 if found == 0 else positive(found, name, "a number ≥ 0")
+
+
+def on_host(value: Any, name: str) -> np.ndarray:
+    """Return known numbers as a NumPy array of floats; refuse what is traced, and what is none."""
+    if isinstance(value, Tracer):
+        raise TypeError(
+            f"{name}: wanted numbers that are known, got a traced array; this works on the host: "
+            "call it outside of jax.jit, jax.grad and jax.vmap"
+        )
+    try:
+        array = np.asarray(value)
+    except (TypeError, ValueError) as error:
+        raise TypeError(f"{name}: wanted numbers, got {type(value).__name__}") from error
+    if array.dtype.kind not in "iuf" and array.dtype != jnp.bfloat16:
+        raise TypeError(f"{name}: wanted numbers, got {type(value).__name__} of {array.dtype}")
+    return array.astype(float)
+
+
+def path(value: Any, name: str = "path") -> Path:
+    """Return the path of a file that `value` names."""
+    if (
+        not isinstance(value, str | os.PathLike)
+        or isinstance(os.fspath(value), bytes)
+        or value == ""
+    ):
+        raise TypeError(f"{name}: wanted the name of a file, got {_shown(value)}")
+    return Path(value)
+
+
+def word(value: Any, options: Sequence[str], name: str) -> str:
+    """Return `value` if it is one of `options`."""
+    if isinstance(value, str) and value in options:
+        return value
+    raise ValueError(f"{name}: wanted one of {', '.join(options)}, got {_shown(value)}")
+
+
+def _shown(value: Any) -> str:
+    return repr(value) if isinstance(value, int | float | str) else type(value).__name__
+
+
+def key(value: Any, name: str = "key") -> Any:
+    """Return `value` if it is one random key of JAX, new or old."""
+    array = isinstance(value, jax.Array)
+    if array and jnp.issubdtype(value.dtype, jax.dtypes.prng_key) and value.shape == ():
+        return value
+    if array and value.dtype == jnp.uint32 and value.ndim == 1:
+        return value
+    found = f"{value.dtype} of shape {value.shape}" if array else type(value).__name__
+    raise TypeError(
+        f"{name}: wanted one random key, such as jax.random.key(0), got {found}; for many use "
+        "jax.vmap over jax.random.split(key, n)"
+    )
+
+
+def float_type(value: Any, name: str = "dtype") -> Any:
+    """Return the dtype that `value` names, float32 or float64 (`float`: what JAX is set to)."""
+    if value is float:
+        return jnp.result_type(float)
+    try:
+        kind = None if value is None else np.dtype(value)
+    except (TypeError, ValueError):
+        kind = None
+    if kind not in (np.float32, np.float64):
+        raise TypeError(f"{name}: wanted float32 or float64, got {_shown(value)}")
+    return kind

@@ -62,7 +62,10 @@ def share(tree: Any) -> Any:
     (5,)
     """
     many, here = jax.process_count(), jax.process_index()
-    counts = {leaf.shape[0] for leaf in jax.tree.leaves(tree)}
+    leaves = jax.tree.leaves(tree)
+    if not all(np.ndim(leaf) > 0 and hasattr(leaf, "shape") for leaf in leaves):
+        raise TypeError("share: wanted a tree of arrays with a leading axis of bodies")
+    counts = {leaf.shape[0] for leaf in leaves}
     if len(counts) != 1:
         raise ValueError(f"share: wanted one number of bodies, got {sorted(counts)}")
     count = counts.pop()

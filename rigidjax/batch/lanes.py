@@ -24,7 +24,6 @@ from rigidjax.solve import equations_of_motion
 from rigidjax.solve.components import join, split
 from rigidjax.solve.explicit import AbstractExplicit, Atoms, RungeKutta4, advance
 from rigidjax.solve.magnus import Magnus4, require_blind, sees_attitude, turned
-from rigidjax.solve.method import method_of, spread
 from rigidjax.solve.scalarise import scalarise
 
 Torque = Callable[[Any, Atoms], Triple]
@@ -185,11 +184,12 @@ def _rigid(method: Any, body: Any, state0: Rigid, torque: Any, t0: Array) -> Lan
             "Tsitouras5 or DormandPrince8 of rigidjax.solvers"
         )
     field = equations_of_motion(body, state0, torque)
-    lean, constants = method_of(method, field, t0, state0)
-    values = spread(constants)
+    numbers = scalarise(lambda t, y: field(t, y, None), t0, state0)
+    project = scalarise(on_the_group, state0)
 
     def step(t: Any, end: Any, h: Any, y: Atoms) -> Atoms:
-        return lean.step(values, t, end, h, y)
+        raw, _, _ = advance(method.tableau, lambda t, y: numbers(t, *y), t, h, y, end)
+        return project(*raw)
 
     return Lane(split(state0), step, lambda y: join(y, state0))
 

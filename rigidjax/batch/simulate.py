@@ -7,9 +7,9 @@ import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, ArrayLike, Float, Int
 
+from rigidjax import _checks
 from rigidjax._types import ScalarLike
 from rigidjax.batch.chunks import Compiled, chunk_of, mesh_of, over_bodies
 from rigidjax.batch.given import Bodies, bodies_of, start_of, step_of, time_of
@@ -17,12 +17,11 @@ from rigidjax.batch.order import dealt, quickness
 from rigidjax.batch.rollout import rollout
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.motion import Attitude, Rigid, Spin
-from rigidjax.motion.torques import jumps_of
-from rigidjax.solve import equations_of_motion, inputs, lean, simulate as simulate_one, travel
-from rigidjax.solve.explicit import AbstractExplicit, DormandPrince8
+from rigidjax.solve import inputs, simulate as simulate_one
+from rigidjax.solve.explicit import DormandPrince8
 from rigidjax.solve.magnus import Magnus4
 from rigidjax.solve.run import free_motion
-from rigidjax.solve.watched import NONFINITE, finite
+from rigidjax.solve.step_control import NONFINITE, finite
 
 State = TypeVar("State", Spin, Attitude, Rigid)
 
@@ -116,6 +115,7 @@ def simulate(
     if torque is None and method is None:
         how: Any = _Free()
     else:
+        max_steps = _checks.whole(max_steps, "max_steps", 1)
         tolerances: Any = inputs.tolerances(rtol, atol, batch.dtype)
         solver = DormandPrince8() if method is None else method
         how = _Adaptive(solver, tolerances[0], tolerances[1], max_steps, adjoint)
@@ -184,10 +184,6 @@ def _free(body: Any, state0: Any, ts: Array) -> Any:
 
 
 def _adaptive(how: _Adaptive, body: Any, state0: Any, torque: Any, ts: Array) -> Any:
-    forward = isinstance(how.adjoint, dfx.ForwardMode)
-    if isinstance(how.solver, AbstractExplicit) and (how.adjoint is None or forward):
-        way = travel.forward if forward else travel.reverse
-        return _hops(how, way, body, state0, torque, ts)
     found = simulate_one(
         body,
         state0,
@@ -201,43 +197,6 @@ def _adaptive(how: _Adaptive, body: Any, state0: Any, torque: Any, ts: Array) ->
         throw=False,
     )
     return found.ys, found.result, jnp.asarray(found.stats["num_steps"], jnp.int32)
-
-
-def _hops(how: Any, way: Any, body: Any, state0: Any, torque: Any, ts: Array) -> Any:
-    """From each time to the next, with the step that the last hop found good.
-
-    Steps that end on every time cost a body alone more than states filled in between; but side by
-    side no body looks up its own steps, and going back one hop is kept at a time.
-    """
-    field = equations_of_motion(body, state0, torque)
-    jumps = jumps_of(torque)
-
-    @jax.checkpoint
-    def hop(carry: Any, ends: tuple[Array, Array]) -> Any:
-        y, h, result, steps = carry
-        out = lean.adaptive(
-            how.solver,
-            field,
-            jnp.stack(ends),
-            y,
-            rtol=how.rtol,
-            atol=how.atol,
-            dt0=h,
-            max_steps=how.max_steps,
-            jumps=jumps,
-            way=way,
-        )
-        y = jax.tree.map(lambda leaf: leaf[-1], out.ys)
-        taken = jnp.maximum(out.num_steps - out.num_rejected, 1).astype(h.dtype)
-        h = lax.stop_gradient((ends[1] - ends[0]) / taken)
-        result = dfx.RESULTS.where(result == dfx.RESULTS.successful, out.result, result)
-        return (y, h, result, steps + out.num_steps.astype(jnp.int32)), y
-
-    good = dfx.RESULTS.where(jnp.asarray(True), dfx.RESULTS.successful, NONFINITE)
-    begin = (state0, lax.stop_gradient(ts[1] - ts[0]), good, jnp.zeros((), jnp.int32))
-    (_, _, result, steps), later = lax.scan(hop, begin, (ts[:-1], ts[1:]))
-    ys = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), state0, later)
-    return ys, result, steps
 
 
 def _equal(

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from rigidjax import _checks
 from rigidjax._types import Mat3, Mat3Like, Quat, Vec3
 from rigidjax.body.symmetric import product
+from rigidjax.special.scaling import exponent_of, times_power_of_two
 
 # Moments closer than this many units of round-off of the largest count as equal.
 _EQUAL = 64.0
@@ -56,8 +57,8 @@ def eigensystem(a: Mat3) -> tuple[Vec3, Mat3]:
     axes lie along the body's keeps its relative accuracy.
     """
     # A power of two, so that scaling costs no digit.
-    _, exponent = jnp.frexp(jnp.max(jnp.abs(a)))
-    b = jnp.ldexp(0.5 * (a + a.T), -exponent)
+    exponent = exponent_of(a)
+    b = times_power_of_two(0.5 * (a + a.T), -exponent)
     one, nil = jnp.ones((), a.dtype), jnp.zeros((), a.dtype)
     start = (
         (b[0, 0], b[1, 1], b[2, 2]),
@@ -66,7 +67,7 @@ def eigensystem(a: Mat3) -> tuple[Vec3, Mat3]:
     )
     values, _, axes = jax.lax.fori_loop(0, _SWEEPS, _sweep, start)
     values, axes = _ascending(values, axes)
-    return jnp.ldexp(jnp.stack(values), exponent), _nearest_signs(axes)
+    return times_power_of_two(jnp.stack(values), exponent), _nearest_signs(axes)
 
 
 @eigensystem.defjvp

@@ -27,10 +27,13 @@ def points(
     >>> points([1.0, 1.0], [[1.0, 0, 0], [-1.0, 0, 0]]).inertia.moments
     Array([0., 2., 2.], dtype=float64)
     """
-    masses, positions = jnp.asarray(masses), jnp.asarray(positions)
-    n = masses.shape[0] if masses.ndim == 1 else 0
-    positions = _checks.floating(positions, (n, 3), "positions", hint="one row per mass")
-    masses = _checks.floating(masses, (n,), "masses")
+    masses = _checks.rows(masses, (), "masses")
+    n = masses.shape[0]
+    positions = _checks.floating(
+        positions, (n, 3), "positions", hint=f"{n} masses have as many rows"
+    )
+    if n == 0:
+        raise ValueError("masses: wanted at least one, got none")
     if physical.known(masses):
         _checks.finite(masses, "masses")
         _checks.refuse(masses, (masses < 0).any(), f"masses: wanted masses ≥ 0, got {masses.min()}")
@@ -54,14 +57,16 @@ def voxels(
     >>> voxels(jnp.ones((1, 2, 3)), [1.0, 1.0, 1.0], [0.0, 0.0, 0.0]).com
     Array([0.5, 1. , 1.5], dtype=float64)
     """
-    density = jnp.asarray(density)
-    density = _checks.floating(
-        density, density.shape if density.ndim == 3 else (0, 0, 0), "density", hint="(nx, ny, nz)"
-    )
+    density = _checks.numbers(density, "density")
+    if density.ndim != 3 or density.size == 0:
+        raise ValueError(f"density: wanted shape (nx, ny, nz), got {density.shape}")
     h, low = _checks.floating(spacing, (3,), "spacing"), _checks.floating(corner, (3,), "corner")
     if physical.known(density):
         _checks.finite(density, "density")
         _checks.refuse(density, (density < 0).any(), "density: wanted values ≥ 0 (kg/m³)")
+    if physical.known(h):
+        fine = ((h > 0) & jnp.isfinite(h)).all()
+        _checks.refuse(h, ~fine, f"spacing: wanted three positive edges of a cell, m, got {h}")
     axes = [(jnp.arange(n, dtype=density.dtype) + 0.5) * h[i] for i, n in enumerate(density.shape)]
     centres = jnp.stack(jnp.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     masses = density.reshape(-1) * (h[0] * h[1] * h[2])
@@ -90,8 +95,9 @@ def quadrature(
     >>> round(float(body.mass), 12), round(float(body.com[2]), 12)
     (6.0, 1.5)
     """
-    if order < 1:
-        raise ValueError(f"order: wanted at least 1 point in each direction, got {order}")
+    _checks.function(density, "density", "r (3,) → kg/m³")
+    _checks.function(place, "place", "u (3,) → r (3,), m")
+    order = _checks.whole(order, "order", 1)
     nodes, weights = np.polynomial.legendre.leggauss(order)
     nodes, weights = 0.5 * (nodes + 1.0), 0.5 * weights
     cube = np.stack(np.meshgrid(nodes, nodes, nodes, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -100,13 +106,14 @@ def quadrature(
     cube, weight = jnp.asarray(cube, dtype), jnp.asarray(weight, dtype)
 
     def at(u):
-        r, rate = place(u), jax.jacfwd(place)(u)
+        r = _checks.floating(place(u), (3,), "place(u)")
+        rate = jax.jacfwd(place)(u)
         volume = (
             rate[0, 0] * (rate[1, 1] * rate[2, 2] - rate[1, 2] * rate[2, 1])
             + rate[0, 1] * (rate[1, 2] * rate[2, 0] - rate[1, 0] * rate[2, 2])
             + rate[0, 2] * (rate[1, 0] * rate[2, 1] - rate[1, 1] * rate[2, 0])
         )
-        return density(r) * jnp.abs(volume), r
+        return _checks.floating(density(r), (), "density(r)") * jnp.abs(volume), r
 
     per_volume, positions = jax.vmap(at)(cube)
     return summed(per_volume * weight, positions)

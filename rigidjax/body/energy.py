@@ -61,6 +61,7 @@ def kinetic_energy_about(
     >>> kinetic_energy_about(ball, [1.0, 0, 0, 0], [0.0, 1, 0], [0.0, 0, 1])
     Array(2., dtype=float64)
     """
+    _checks.single(body, MassProperties, "body")
     velocity, omega = _vector(velocity, "velocity"), _vector(omega, "omega")
     about_origin = body.inertia_about(jnp.zeros_like(body.com)).tensor
     swing = quaternion.rotate(unit_quaternion(q), cross(omega, body.com))
@@ -146,6 +147,7 @@ def spatial_angular_momentum(body: Inertia | MassProperties, state: HasAttitude)
             f"spatial_angular_momentum: wanted a state with an attitude (.q), got "
             f"{type(state).__name__}; in the body frame use angular_momentum"
         )
+    _checks.single(state, HasAttitude, "state")
     momentum = quaternion.rotate(state.q, angular_momentum(body, state))
     if isinstance(body, MassProperties) and isinstance(state, HasPose):
         momentum = momentum + body.mass * cross(state.x, state.v)
@@ -161,11 +163,6 @@ def _vector(value, name):
 
 
 def _inertia_of(body: Inertia | MassProperties) -> Inertia:
-    if isinstance(body, Inertia):
-        return body
-    if isinstance(body, MassProperties):
-        return body.inertia
-    raise TypeError(
-        f"body: wanted an Inertia or MassProperties, got {type(body).__name__}; "
-        "Inertia.from_tensor makes one of a matrix"
-    )
+    hint = "Inertia.from_tensor makes one of a matrix"
+    _checks.single(body, (Inertia, MassProperties), "body", hint=hint)
+    return body if isinstance(body, Inertia) else body.inertia

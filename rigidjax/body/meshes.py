@@ -45,13 +45,17 @@ def mesh(
     >>> round(float(body.mass), 12), round(float(body.com[0]), 12)
     (1.0, 0.25)
     """
-    corners = jnp.asarray(vertices)
-    n = corners.shape[0] if corners.ndim == 2 else 0
-    corners = _checks.floating(corners, (n, 3), "vertices", hint="one row (x, y, z) per vertex")
+    corners = _checks.rows(vertices, (3,), "vertices", hint="one row (x, y, z) per vertex")
+    n = corners.shape[0]
+    if n == 0:
+        raise ValueError("vertices: wanted some, got none")
     if physical.known(corners):
         _checks.finite(corners, "vertices")
     faces = _faces(faces, n)
     density = _checks.floating(density, (), "density")
+    if physical.known(density):
+        fine = (density > 0) & jnp.isfinite(density)
+        _checks.refuse(density, ~fine, f"density: wanted a positive number, kg/m³, got {density}")
 
     centre = jax.lax.stop_gradient(corners.mean(axis=0))
     volume, com = _volume_and_centroid(corners - centre[None, :], faces)
@@ -139,7 +143,10 @@ def _outward(volume, corners, faces):
 def _faces(faces, n):
     if isinstance(faces, jax.core.Tracer):
         return faces
-    table = np.asarray(faces)
+    try:
+        table = np.asarray(faces)
+    except ValueError as error:
+        raise ValueError("faces: wanted shape (m, 3), got rows of different lengths") from error
     if not np.issubdtype(table.dtype, np.integer):
         raise TypeError(f"faces: wanted integers (vertex numbers), got {table.dtype}")
     if table.ndim != 2 or table.shape[1] != 3 or len(table) == 0:

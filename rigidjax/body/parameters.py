@@ -42,6 +42,7 @@ def pack(body: MassProperties) -> Float[Array, "10"]:
             f"pack: wanted MassProperties, got {type(body).__name__}; of an Inertia use "
             "pack_second_moment(body.second_moment), or pack_shape for its ratios alone"
         )
+    _checks.single(body, MassProperties, "body")
     half_log_mass = 0.5 * jnp.log(body.mass)
     shape = _factor(body.second_moment / body.mass)
     logs = _reach(half_log_mass + shape[:3]) - _reach(half_log_mass)

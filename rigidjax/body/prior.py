@@ -2,6 +2,7 @@
 
 import jax.numpy as jnp
 
+from rigidjax import _checks
 from rigidjax._types import Scalar
 from rigidjax.body.inertia import MassProperties
 from rigidjax.body.symmetric import inverse
@@ -27,6 +28,8 @@ def divergence(body: MassProperties, reference: MassProperties) -> Scalar:
     >>> abs(float(divergence(body, body))) < 1e-14
     True
     """
+    _checks.single(body, MassProperties, "body")
+    _checks.single(reference, MassProperties, "reference")
     ratio = body.mass / reference.mass
     spread = inverse(reference.second_moment / reference.mass)
     shape = body.second_moment / body.mass

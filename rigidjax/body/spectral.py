@@ -12,6 +12,7 @@ from rigidjax import _checks
 from rigidjax._types import Mat3, Mat3Like, Scalar
 from rigidjax.body.axes import eigensystem
 from rigidjax.body.symmetric import product
+from rigidjax.special.scaling import exponent_of, times_power_of_two
 
 # Eigenvalues within this fraction of the largest are handled by an integral, not a quotient.
 _CLOSE = 1.0 / 32.0
@@ -44,13 +45,14 @@ def matrix_function(function: Callable[[Scalar], Scalar], tensor: Mat3Like) -> M
     Array([2., 0., 0.], dtype=float64)
     """
     a = _checks.floating(tensor, (3, 3), "tensor")
+    _checks.function(function, "function", "number → number, written in jax.numpy")
     # In units of the largest entry (a power of two), so that no product leaves the dtype's range.
-    _, exponent = jnp.frexp(stop_gradient(jnp.max(jnp.abs(a))))
-    unit = jnp.ldexp(jnp.ones((), a.dtype), exponent)
+    # One power less, so that it is a number for the largest of the dtype, too.
+    unit = times_power_of_two(jnp.ones((), a.dtype), exponent_of(a) - 1)
     a = 0.5 * (a + a.T) / unit
 
     def scaled(value):
-        return function(unit * value)
+        return _checks.floating(function(unit * value), (), "function(λ)", hint="one number")
 
     values, axes = eigensystem(stop_gradient(a))
     change = product(axes.T, product(a - stop_gradient(a), axes))

@@ -27,7 +27,7 @@ def ellipsoid(semi_axes: Vector) -> Scalar:
     >>> round(float(ellipsoid([1.0, 1.0, 0.75])), 12)
     3.14159265359
     """
-    return (4.0 * jnp.pi / 3.0) * box(semi_axes)
+    return (4.0 * jnp.pi / 3.0) * box(_checks.floating(semi_axes, (3,), "semi_axes"))
 
 
 def sphere(radius: ScalarLike) -> Scalar:
@@ -75,7 +75,7 @@ def capsule(radius: ScalarLike, length: ScalarLike) -> Scalar:
     >>> round(float(capsule(1.0, 0.0)), 12)
     4.188790204786
     """
-    return sphere(radius) + cylinder(radius, length)
+    return sphere(radius) + cylinder(radius, _checks.floating(length, (), "length"))
 
 
 def cone(radius: ScalarLike, height: ScalarLike) -> Scalar:

@@ -18,6 +18,7 @@ from rigidjax.exact.frame import into, out_of, principal_frame
 from rigidjax.exact.triples import Six, Triple, adjugate, determinant, times
 from rigidjax.rotation.algebra import components
 from rigidjax.rotation.maps import product4
+from rigidjax.special.scaling import exponent_of, times_power_of_two
 
 State = TypeVar("State", bound=HasSpin)
 
@@ -46,12 +47,11 @@ class FreeBody(eqx.Module):
         _check(inertia, state0)
         omega = state0.omega
         # Powers of two, so that scaling costs no digit and no body is too large or small.
-        _, size = jnp.frexp(jax.lax.stop_gradient(jnp.max(jnp.abs(inertia.tensor))))
-        _, self.exponent = jnp.frexp(jax.lax.stop_gradient(jnp.max(jnp.abs(omega))))
-        tensor = jnp.ldexp(inertia.tensor, -size)
+        self.exponent = exponent_of(omega)
+        tensor = times_power_of_two(inertia.tensor, -exponent_of(inertia.tensor))
         one = opaque_one(tensor[0, 0])
         self.moments, self.axes = fence(principal_frame(tensor), one)
-        rate = into(self.axes, jnp.ldexp(omega, -self.exponent))
+        rate = into(self.axes, times_power_of_two(omega, -self.exponent))
         self.momentum = fence(times(self.moments, rate), one)
         self.state0 = state0
 
@@ -60,12 +60,14 @@ class FreeBody(eqx.Module):
 
     def _at(self, t: Scalar) -> HasSpin:
         t = t.astype(self.axes.dtype)
-        momentum, (w, *axis) = flow(self.moments, self.momentum, jnp.ldexp(t, self.exponent))
+        momentum, (w, *axis) = flow(
+            self.moments, self.momentum, times_power_of_two(t, self.exponent)
+        )
         one = opaque_one(t)
         momentum, w, axis = fence((momentum, w, axis), one)
         omega = out_of(self.axes, fence(_solve(self.moments, momentum), one))
         state = eqx.tree_at(
-            lambda s: s.omega, self.state0, jnp.ldexp(jnp.stack(omega), self.exponent)
+            lambda s: s.omega, self.state0, times_power_of_two(jnp.stack(omega), self.exponent)
         )
         if not isinstance(state, HasAttitude):
             return state
@@ -131,6 +133,7 @@ def _check(inertia: Inertia, state0: HasSpin) -> None:
             f"free_body: wanted a Spin or an Attitude, got {type(state0).__name__}; a body that "
             "also moves is free in both: add x + v t yourself, or use simulate"
         )
+    _checks.instance(inertia, Inertia, "inertia", hint="of MassProperties pass .inertia")
     tensor = _checks.floating(inertia.tensor, (3, 3), "inertia tensor")
     arrays = {"omega": _checks.floating(state0.omega, (3,), "omega")}
     if isinstance(state0, HasAttitude):

@@ -14,6 +14,7 @@ from rigidjax.exact.flow import first_order, reciprocal
 from rigidjax.exact.frame import into, principal_frame
 from rigidjax.exact.half_period import half_period
 from rigidjax.exact.triples import Six, Triple, times
+from rigidjax.special.scaling import exponent_of, times_power_of_two
 
 
 def body_period(inertia: Inertia, omega0: Vec3Like) -> Scalar:
@@ -39,7 +40,7 @@ def body_period(inertia: Inertia, omega0: Vec3Like) -> Scalar:
     True
     """
     moments, momentum, exponent = _scaled(inertia, omega0)
-    return jnp.ldexp(_periods(moments, momentum)[0], -exponent)
+    return times_power_of_two(_periods(moments, momentum)[0], -exponent)
 
 
 def precession_period(inertia: Inertia, omega0: Vec3Like) -> Scalar:
@@ -65,16 +66,17 @@ def precession_period(inertia: Inertia, omega0: Vec3Like) -> Scalar:
     8.885765876316732
     """
     moments, momentum, exponent = _scaled(inertia, omega0)
-    return jnp.ldexp(_periods(moments, momentum)[1], -exponent)
+    return times_power_of_two(_periods(moments, momentum)[1], -exponent)
 
 
 def _scaled(inertia: Inertia, omega0):
+    _checks.instance(inertia, Inertia, "inertia", hint="of MassProperties pass .inertia")
     omega = _checks.floating(omega0, (3,), "omega0").astype(inertia.tensor.dtype)
     tensor = _checks.floating(inertia.tensor, (3, 3), "inertia tensor")
-    _, size = jnp.frexp(jax.lax.stop_gradient(jnp.max(jnp.abs(tensor))))
-    _, exponent = jnp.frexp(jax.lax.stop_gradient(jnp.max(jnp.abs(omega))))
-    moments, axes = principal_frame(jnp.ldexp(tensor, -size))
-    return moments, times(moments, into(axes, jnp.ldexp(omega, -exponent))), exponent
+    exponent = exponent_of(omega)
+    moments, axes = principal_frame(times_power_of_two(tensor, -exponent_of(tensor)))
+    rate = into(axes, times_power_of_two(omega, -exponent))
+    return moments, times(moments, rate), exponent
 
 
 def _periods(moments: Six, momentum: Triple) -> tuple[Scalar, Scalar]:

@@ -13,7 +13,7 @@ from rigidjax.body.hints import Vector
 from rigidjax.frames import flow, lagrange, richardson
 from rigidjax.frames.mirrored import AbstractMirrored
 from rigidjax.frames.periodic import PeriodicOrbit
-from rigidjax.frames.point import Point
+from rigidjax.frames.point import Point, require_point
 from rigidjax.rotation.algebra import components
 
 
@@ -72,6 +72,7 @@ class ThreeBody(AbstractMirrored):
         >>> float(scenes.cr3bp(0.5).jacobi_constant(Point([0.0, 0, 0], [0.0, 0, 0])))
         4.0
         """
+        require_point(state)
         return self.speed_squared(state.x, 0.0) - jnp.sum(state.v * state.v)
 
     def speed_squared(self, x: Vector, jacobi: ScalarLike) -> Scalar:

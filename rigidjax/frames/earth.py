@@ -4,7 +4,7 @@ import jax.numpy as jnp
 
 from rigidjax import _checks
 from rigidjax._types import Scalar, ScalarLike, Vec3
-from rigidjax.frames.point import Point
+from rigidjax.frames.point import Point, require_point
 from rigidjax.frames.scene import AbstractScene
 from rigidjax.rotation.algebra import components
 
@@ -51,6 +51,7 @@ class Earth(AbstractScene):
 
     def jacobi_integral(self, state: Point) -> Scalar:
         """½|v'|² + g z − ½|Ω × x'|², m²/s², kept along the motion."""
+        require_point(state)
         x, v = components(state.x), components(state.v)
         dtype = state.x.dtype
         _, north, up = components(self.angular_velocity().astype(dtype))

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from rigidjax import _checks
 from rigidjax._types import Scalar, ScalarLike, Vec3
 from rigidjax.frames.earth import GRAVITY, RATE, Earth, checked
-from rigidjax.frames.point import Point
+from rigidjax.frames.point import Point, require_point
 from rigidjax.frames.scene import AbstractScene
 from rigidjax.rotation.algebra import components, dot_components
 
@@ -77,6 +77,7 @@ class Foucault(AbstractScene):
         >>> pendulum.small_swing(pendulum.start(0.1, 0.0), 0.0).x[0]
         Array(0.1, dtype=float64)
         """
+        require_point(state)
         t = _checks.floating(t, (), "t").astype(state.x.dtype)
         x, y, _ = components(state.x)
         vx, vy, _ = components(state.v)

@@ -7,7 +7,7 @@ from rigidjax import _checks
 from rigidjax._types import Scalar, ScalarLike, Vec3
 from rigidjax.frames import flow
 from rigidjax.frames.mirrored import AbstractMirrored
-from rigidjax.frames.point import Point
+from rigidjax.frames.point import Point, require_point
 from rigidjax.rotation.algebra import components
 
 
@@ -34,6 +34,7 @@ class Hill(AbstractMirrored):
         >>> float(Hill(jnp.asarray(0.0)).jacobi_constant(Point([1.0, 0, 0], [0.0, 0, 0])))
         5.0
         """
+        require_point(state)
         x, y, z = components(state.x)
         speed = jnp.sum(state.v * state.v)
         return 3 * x * x - z * z + 2 / jnp.sqrt(x * x + y * y + z * z) - speed

@@ -8,7 +8,7 @@ from rigidjax._types import Scalar, ScalarLike, Vec3
 from rigidjax.frames.earth import GRAVITY
 from rigidjax.frames.inside import InFrame
 from rigidjax.frames.moving import MovingFrame
-from rigidjax.frames.point import Point
+from rigidjax.frames.point import Point, require_point
 from rigidjax.frames.scene import AbstractScene, like
 from rigidjax.frames.turning import AboutAxis
 from rigidjax.rotation.algebra import components
@@ -47,6 +47,7 @@ class Hoop(AbstractScene):
         >>> float(hoop(1.0, 3.0).side_push(Point([0.0, 0, -1], [2.0, 0, 0])))
         12.0
         """
+        require_point(state)
         return 2 * like(state.x, self.rate)[0] * state.v[0]
 
     def state(self, angle: ScalarLike, speed: ScalarLike = 0.0) -> Point:

@@ -41,6 +41,11 @@ class InFrame(AbstractScene):
 
     def __check_init__(self) -> None:
         require_frame(self.frame, "InFrame")
+        for name, of in (("inside", "(t, state) → (3,)"), ("outside", "(t, state) → (3,)")):
+            if getattr(self, name) is not None:
+                _checks.function(getattr(self, name), name, of)
+        if self.potential is not None:
+            _checks.function(self.potential, "potential", "of a place (3,) to a number, m²/s²")
 
     def acceleration(self, t: ScalarLike, state: Any) -> Vec3:
         now = self.frame.at(t)
@@ -75,7 +80,7 @@ def scene_of(force: Any) -> AbstractScene:
         return force
     if isinstance(force, MovingFrame):
         return InFrame(force)
-    if force is None or callable(force):
+    if force is None or (callable(force) and not isinstance(force, type)):
         return Force(force)
     raise TypeError(
         "Point: wanted a scene (rigidjax.scenes), a MovingFrame or a force (t, state, body) → (3,) "
@@ -122,6 +127,8 @@ class BodyInFrame(eqx.Module):
 
     def __check_init__(self) -> None:
         require_frame(self.frame, "BodyInFrame")
+        if self.torque is not None:
+            _checks.function(self.torque, "torque", "(t, state, body) → (3,), N m, or a law")
 
     def __call__(self, t: ScalarLike, state: Any, body: Any) -> Vec3 | Push:
         now = self.frame.at(t)

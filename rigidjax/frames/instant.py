@@ -3,7 +3,6 @@
 from typing import Any
 
 import equinox as eqx
-from jaxtyping import Array, Float
 
 from rigidjax import _checks
 from rigidjax._types import Mat3, Vec3
@@ -92,7 +91,7 @@ class Instant(eqx.Module):
 
     def fictitious(self, x: Vector, v: Vector) -> Vec3:
         """All four terms that no force makes."""
-        x = _checks.floating(x, (3,), "x")
+        x, v = _checks.floating(x, (3,), "x"), _checks.floating(v, (3,), "v")
         turning = self.centrifugal(x) + self.coriolis(v) + self.euler_acceleration(x)
         return turning + self.translation().astype(x.dtype)
 
@@ -111,12 +110,12 @@ def _can_travel(state: Any) -> None:
             )
         )
     for name, size in (("x", 3), ("v", 3), ("q", 4), ("omega", 3)):
-        value: Float[Array, "..."] | None = getattr(state, name, None)
-        if value is not None and value.shape != (size,):
-            raise ValueError(
-                f"{name}: wanted shape ({size},), got {value.shape}; a frame carries one state at "
-                "one time, batch with jax.vmap(frame.to_inertial)(states, times)"
+        if hasattr(state, name):
+            hint = (
+                "a frame carries one state at one time, batch with "
+                "jax.vmap(frame.to_inertial)(states, times)"
             )
+            _checks.floating(getattr(state, name), (size,), name, hint=hint)
 
 
 def _replaced(state: Any, turned: dict[str, Any]) -> Any:

@@ -71,6 +71,8 @@ def libration_integral(state: Any, body: Any, rate: ScalarLike) -> Scalar:
     >>> float(libration_integral(at_rest, body, 2.0))
     1.0
     """
+    _checks.single(state, HasAttitude, "state", wanted="an Attitude in the orbital frame")
+    _checks.single(body, _inertia.Inertia, "body")
     axes = jnp.eye(3, dtype=state.q.dtype)
     n = _checks.floating(rate, (), "rate").astype(state.q.dtype)
     up, normal = (quaternion.rotate_inverse(state.q, axes[i]) for i in (0, 2))

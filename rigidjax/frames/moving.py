@@ -12,6 +12,7 @@ from rigidjax._types import Mat3, Scalar, ScalarLike, Vec3
 from rigidjax.body.hints import Vector
 from rigidjax.frames import turning
 from rigidjax.frames.instant import Instant
+from rigidjax.frames.point import require_point
 from rigidjax.rotation import algebra
 
 
@@ -51,18 +52,15 @@ class MovingFrame(eqx.Module):
         origin: Callable[[Any], Any] | None = None,
         rate: Callable[[Any], Any] | None = None,
     ):
-        if not callable(rotation) and not hasattr(rotation, "evaluate"):
-            raise TypeError(
-                "rotation: wanted a function of time or a solution of simulate, got "
-                f"{type(rotation).__name__}; for a uniform turn take frames.Uniform(omega)"
-            )
-        if origin is not None and not callable(origin):
-            raise TypeError(
-                f"origin: wanted a function of time to (3,), got {type(origin).__name__}; "
-                "for one at rest pass lambda t: point"
-            )
-        if rate is not None and not callable(rate):
-            raise TypeError(f"rate: wanted a function of time to (3,), got {type(rate).__name__}")
+        if isinstance(rotation, type) or not hasattr(rotation, "evaluate"):
+            wanted = "of time or a solution of simulate"
+            hint = "for a uniform turn take frames.Uniform(omega)"
+            _checks.function(rotation, "rotation", wanted, hint=hint)
+        if origin is not None:
+            hint = "for one at rest pass lambda t: point"
+            _checks.function(origin, "origin", "of time to (3,)", hint=hint)
+        if rate is not None:
+            _checks.function(rate, "rate", "of time to (3,)")
         self.rotation, self.origin = turning.differentiable(rotation), origin
         self.rate = getattr(rotation, "rate", None) if rate is None else rate
 
@@ -172,7 +170,7 @@ class MovingFrame(eqx.Module):
         >>> frame.acceleration([1.0, 0, 0], [0.0, -2, 0], 0.0).tolist()
         [-4.0, 0.0, 0.0]
         """
-        x = _checks.floating(x, (3,), "x")
+        x, v = _checks.floating(x, (3,), "x"), _checks.floating(v, (3,), "v")
         free = self.at(t).fictitious(x, v)
         return free if force is None else _checks.floating(force, (3,), "force") + free
 
@@ -198,6 +196,7 @@ class MovingFrame(eqx.Module):
         **Arguments:** `state` a `Point` in S'; `t` s; `potential` V per mass there, m²/s².
         Source: Goldstein, Mechanics, sec. 3.12 (as h = −C/2 in the three-body problem).
         """
+        require_point(state)
         speed = algebra.dot(state.v, state.v)
         moved = algebra.cross(self.at(t).rate.astype(state.x.dtype), state.x)
         v = _checks.floating(potential, (), "potential").astype(state.x.dtype)

@@ -35,6 +35,7 @@ class PeriodicOrbit(eqx.Module):
     def __init__(self, state: Point, period: ScalarLike):
         if not isinstance(state, Point):
             raise TypeError(f"state: wanted a Point(x, v), got {type(state).__name__}")
+        _checks.floating(state.x, (3,), "state.x", batched=True)
         self.state = state
         period = _checks.floating(period, (), "period", batched=True)
         self.period = period.astype(state.x.dtype)

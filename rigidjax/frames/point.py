@@ -1,5 +1,7 @@
 """The state of a particle: no body at all."""
 
+from typing import Any
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -30,3 +32,17 @@ class Point(eqx.Module):
         _checks.same_batch(x=(x, 1), v=(v, 1))
         dtype = jnp.promote_types(x.dtype, v.dtype)
         self.x, self.v = x.astype(dtype), v.astype(dtype)
+
+
+def require_point(state: Any, name: str = "state") -> Any:
+    """Return `state` if it has one place and one velocity; else raise in words.
+
+    >>> require_point(Point([1.0, 0, 0], [0.0, 2, 0])).v.shape
+    (3,)
+    """
+    if isinstance(state, type) or not (hasattr(state, "x") and hasattr(state, "v")):
+        found = f"the class {state.__name__}" if isinstance(state, type) else type(state).__name__
+        raise TypeError(f"{name}: wanted a Point(x, v), got {found}")
+    for part in ("x", "v"):
+        _checks.floating(getattr(state, part), (3,), f"{name}.{part}")
+    return state

@@ -61,11 +61,8 @@ class Force(AbstractScene):
     force: Callable[..., Any] | None
 
     def __check_init__(self) -> None:
-        if self.force is not None and not callable(self.force):
-            raise TypeError(
-                "force: wanted a function (t, state, body) → (3,) per mass, got "
-                f"{type(self.force).__name__}"
-            )
+        if self.force is not None:
+            _checks.function(self.force, "force", "(t, state, body) → (3,) per mass")
 
     def acceleration(self, t: ScalarLike, state: Any) -> Vec3:
         if self.force is None:

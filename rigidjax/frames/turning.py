@@ -51,11 +51,8 @@ class AboutAxis(eqx.Module):
 
     def __init__(self, axis: Float[Array, "3"] | object, angle: Callable[[Any], Any]):
         axis = _checks.finite(_checks.floating(axis, (3,), "axis"), "axis")
-        if not callable(angle):
-            raise TypeError(
-                f"angle: wanted a function of time to rad, got {type(angle).__name__}; for a "
-                "uniform turn take frames.Uniform(omega)"
-            )
+        hint = "for a uniform turn take frames.Uniform(omega)"
+        _checks.function(angle, "angle", "of time to rad", hint=hint)
         length = jnp.sqrt(algebra.dot(axis, axis))
         self.axis = _checks.refuse(axis, length == 0, "axis: wanted a direction, got zero") / length
         self.angle = angle

@@ -7,6 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from rigidjax import _checks
 from rigidjax.body import parameters as charts
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.body.symmetric import swap_trace
@@ -198,9 +199,7 @@ class Mass(AbstractBodyChart):
     unit: ClassVar[str] = "SI"
 
     def __init__(self, guess: MassProperties):
-        if not isinstance(guess, MassProperties):
-            raise TypeError(f"Mass: wanted MassProperties, got {type(guess).__name__}")
-        self.guess = guess
+        self.guess = _checks.single(guess, MassProperties, "guess")
 
     def body(self, vector: Float[Array, " chart"]) -> MassProperties:
         # Lengths in units of the body's own size: every number is of order one.
@@ -236,11 +235,7 @@ class Known(AbstractBodyChart):
     unit: ClassVar[str] = ""
 
     def __init__(self, known: Inertia | MassProperties):
-        if not isinstance(known, Inertia | MassProperties):
-            raise TypeError(
-                f"Known: wanted an Inertia or MassProperties, got {type(known).__name__}"
-            )
-        self.known = known
+        self.known = _checks.single(known, (Inertia, MassProperties), "known")
 
     def body(self, vector: Float[Array, " chart"]) -> Inertia | MassProperties:
         return self.known
@@ -262,6 +257,5 @@ def _diagonal(logs: Float[Array, "3"]) -> Inertia:
 
 
 def _typical(value: float) -> Array:
-    if not value > 0:
-        raise ValueError(f"typical: wanted a positive moment of inertia, kg m², got {value}")
-    return jnp.asarray(value, jnp.result_type(float))
+    size = _checks.positive(value, "typical", "a positive moment of inertia, kg m²")
+    return jnp.asarray(size, jnp.result_type(float))

@@ -6,6 +6,7 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
+from rigidjax import _checks
 from rigidjax.identify.bodies import Known
 from rigidjax.identify.fit import Fit, fit
 from rigidjax.identify.problem import Problem
@@ -43,6 +44,9 @@ def compare(fits: Mapping[str, Fit]) -> tuple[Comparison, ...]:
     Traceback (most recent call last):
     ValueError: compare: wanted at least one fit
     """
+    _checks.instance(fits, Mapping, "fits", wanted="a dict of name → Fit")
+    for name, found in fits.items():
+        _checks.instance(found, Fit, f"fits[{name!r}]")
     if not fits:
         raise ValueError("compare: wanted at least one fit")
     counts = {name: _counts(found) for name, found in fits.items()}
@@ -89,6 +93,10 @@ def cross_validate(
     Traceback (most recent call last):
     ValueError: cross_validate: wanted at least two recordings, got 0
     """
+    _checks.function(build, "build", "of a sequence of recordings → Problem")
+    _checks.instance(recordings, Sequence, "recordings", wanted="a sequence of Recording")
+    for item in recordings:
+        _checks.instance(item, Recording, "recordings")
     if len(recordings) < 2:
         raise ValueError(f"cross_validate: wanted at least two recordings, got {len(recordings)}")
     out = []

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from rigidjax import _checks
 from rigidjax.identify.problem import Parameters, Problem
 from rigidjax.identify.residual import Noise, residuals
 from rigidjax.identify.search import half_sum
@@ -51,9 +52,8 @@ class Descent(eqx.Module):
                 "Descent: wanted an optimiser of optax such as optax.adam(1e-2), got "
                 f"{type(optimiser).__name__}"
             )
-        if steps < 1 or batch < 1:
-            raise ValueError(f"Descent: wanted steps and batch of at least 1, got {steps}, {batch}")
-        self.optimiser, self.steps, self.batch = optimiser, steps, batch
+        self.optimiser = optimiser
+        self.steps, self.batch = _checks.whole(steps, "steps", 1), _checks.whole(batch, "batch", 1)
 
 
 def descend(

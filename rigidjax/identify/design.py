@@ -10,9 +10,11 @@ import optimistix as optx
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
+from rigidjax import _checks
 from rigidjax._types import Scalar, Vec3
+from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.identify import reported
-from rigidjax.identify.problem import Parameters, Problem, errors_of_one
+from rigidjax.identify.problem import Parameters, Problem, errors_of_one, fits
 from rigidjax.identify.stacking import one
 from rigidjax.identify.uncertainty import WEAKEST
 
@@ -36,6 +38,7 @@ def expected(problem: Problem, parameters: Parameters) -> tuple[reported.Quantit
     >>> bool(expected(problem, plan)[0].deviation < 0.05)
     True
     """
+    _look(problem, parameters)
     information = np.asarray(_fisher_jit(problem, parameters))
     size = np.sqrt(np.diag(information))
     size = np.maximum(size, max(WEAKEST * size.max(), 1e-300))
@@ -59,8 +62,10 @@ def plan_of(problem: Problem, body: Any, omega: Any) -> Parameters:
     >>> plan_of(problem, rj.Inertia.from_principal(2.0, 2.0, 2.0), [0.0, 0.0, 3.0]).own.spin
     Array([[0., 0., 3.]], dtype=float64)
     """
-    start = problem.start(body)
-    rates = jnp.broadcast_to(jnp.asarray(omega, start.own.spin.dtype), start.own.spin.shape)
+    _checks.instance(problem, Problem, "problem")
+    start = problem.start(_checks.single(body, (Inertia, MassProperties), "body"))
+    rates = _checks.floating(omega, (3,), "omega").astype(start.own.spin.dtype)
+    rates = jnp.broadcast_to(rates, start.own.spin.shape)
     spin = rates / problem.reference.rate[:, None]
     return eqx.tree_at(lambda p: p.own.spin, start, spin)
 
@@ -77,11 +82,7 @@ def fisher(problem: Problem, parameters: Parameters) -> Float[Array, "n n"]:
     >>> fisher(problem, problem.start()).shape
     (5, 5)
     """
-    for sensor in problem.records.sensors:
-        if sensor.noise is None:
-            raise ValueError(
-                f"design: wanted a {type(sensor).__name__} with known noise, got noise=None"
-            )
+    _look(problem, parameters)
     flat, restore = ravel_pytree(parameters)
 
     def predicted(vector: Array) -> Any:
@@ -100,6 +101,15 @@ def fisher(problem: Problem, parameters: Parameters) -> Float[Array, "n n"]:
 
     slopes = jax.jacfwd(predicted)(flat)
     return slopes.T @ slopes
+
+
+def _look(problem: Problem, parameters: Parameters) -> None:
+    fits(problem, parameters)
+    for sensor in problem.records.sensors:
+        if sensor.noise is None:
+            raise ValueError(
+                f"design: wanted a {type(sensor).__name__} with known noise, got noise=None"
+            )
 
 
 @eqx.filter_jit
@@ -125,7 +135,9 @@ def best_first_rate(
     >>> best_first_rate.__name__
     'best_first_rate'
     """
-    start = jnp.asarray(omega, problem.records.t.dtype)
+    max_steps = _checks.whole(max_steps, "max_steps", 1)
+    _look(problem, plan_of(problem, body, omega))
+    start = _checks.floating(omega, (3,), "omega").astype(problem.records.t.dtype)
     size = jnp.sqrt(jnp.sum(start**2))
     found = _search(problem, body, start / size, size, max_steps)
     rate = size * found / jnp.sqrt(jnp.sum(found**2))

@@ -9,6 +9,7 @@ from typing import Any, TextIO
 
 import numpy as np
 
+from rigidjax import _checks
 from rigidjax.identify.recording import Recording
 from rigidjax.identify.sensors import Gyro
 
@@ -52,7 +53,10 @@ def read_table(path: str | Path, columns: Sequence[str]) -> dict[str, np.ndarray
     Traceback (most recent call last):
     rigidjax.identify.files.LogError: missing.csv: no such file
     """
-    path = Path(path)
+    path = _checks.path(path)
+    _checks.instance(columns, Sequence, "columns", wanted="a sequence of names")
+    if isinstance(columns, str) or not columns or not all(isinstance(c, str) for c in columns):
+        raise TypeError(f"columns: wanted a sequence of names, got {columns!r}")
     if not path.exists():
         raise LogError(f"{path}: no such file")
     if path.is_dir():
@@ -83,8 +87,9 @@ def read_gyro_csv(
     Traceback (most recent call last):
     rigidjax.identify.files.LogError: missing.csv: no such file
     """
-    if unit not in ("rad/s", "deg/s"):
+    if not isinstance(unit, str) or unit not in ("rad/s", "deg/s"):
         raise LogError(f"unit: wanted one of rad/s, deg/s, got {unit!r}")
+    noise = None if noise is None else _checks.positive(noise, "noise")
     table = read_table(path, columns)
     for name in columns:
         gap = np.isnan(table[name])

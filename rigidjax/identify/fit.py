@@ -11,12 +11,13 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from rigidjax import _checks
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.identify import reported, uncertainty, words
 from rigidjax.identify.checkpoint import Checkpoint, Position, Tried, require_folder
 from rigidjax.identify.descent import Descent, descend
 from rigidjax.identify.pieces import WIDTHS, joined, pieces as in_pieces, with_width
-from rigidjax.identify.problem import Parameters, Problem, all_errors
+from rigidjax.identify.problem import Parameters, Problem, all_errors, fits
 from rigidjax.identify.propagate import Adaptive, FixedSteps
 from rigidjax.identify.residual import Noise
 from rigidjax.identify.search import (
@@ -192,10 +193,15 @@ def fit(
     ...                                 jnp.diag(jnp.array([1.0, 2.0, 2.5])), atol=1e-6))
     ('ok', True)
     """
-    if not isinstance(problem, Problem):
-        raise TypeError(f"fit: wanted a Problem, got {type(problem).__name__}")
-    if starts < 1 or together < 1:
-        raise ValueError(f"fit: wanted at least one start, got {min(starts, together)}")
+    _checks.instance(problem, Problem, "fit", wanted="a Problem")
+    starts, together = _checks.whole(starts, "starts", 1), _checks.whole(together, "together", 1)
+    pieces, max_steps = _checks.whole(pieces, "pieces", 1), _checks.whole(max_steps, "max_steps", 1)
+    tolerance = _checks.positive(tolerance, "tolerance")
+    key = None if key is None else _checks.key(key)
+    if initial is not None:
+        fits(problem, initial)
+    if progress is not None:
+        _checks.function(progress, "progress", "of a line of text, such as print")
     if checkpoint is not None and together > 1:
         raise ValueError("fit: a checkpoint goes with together=1, one start after another")
     if checkpoint is not None:

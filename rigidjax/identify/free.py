@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from rigidjax import _checks
 from rigidjax.identify.recording import Recording
 
 
@@ -46,16 +47,12 @@ class Free(eqx.Module):
         positive: bool = False,
         prior: float | None = None,
     ):
-        if not callable(where):
-            raise TypeError(
-                f"Free: wanted a function of a recording for where, got {type(where).__name__}"
-            )
-        if not scale > 0:
-            raise ValueError(f"Free {name!r}: wanted a positive scale, got {scale}")
-        if prior is not None and not prior > 0:
-            raise ValueError(f"Free {name!r}: wanted a positive prior, got {prior}")
-        self.where, self.name, self.scale = where, name, float(scale)
-        self.each, self.positive, self.prior = each, positive, prior
+        _checks.function(where, "where", "of a recording, such as lambda r: r.torque.coefficient")
+        _checks.instance(name, str, "name")
+        self.where, self.name = where, name
+        self.scale = _checks.positive(scale, f"Free {name!r}: scale")
+        self.each, self.positive = each, positive
+        self.prior = None if prior is None else _checks.positive(prior, f"Free {name!r}: prior")
 
 
 class Slot(eqx.Module):

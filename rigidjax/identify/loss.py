@@ -7,6 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from rigidjax import _checks
 from rigidjax._types import Scalar
 
 
@@ -30,7 +31,8 @@ class SoftL1(AbstractLoss):
 
     Convex, unlike Cauchy's, which has minima of its own making.
 
-    **Arguments:** `scale` c, where quadratic turns to linear, in standard deviations.
+    **Arguments:** `scale` c, where quadratic turns to linear, in standard deviations. **Raises:**
+    `ValueError` where it is not positive.
 
     Source: Charbonnier et al. 1997, doi:10.1109/83.551699 (as `soft_l1` in SciPy).
 
@@ -40,6 +42,9 @@ class SoftL1(AbstractLoss):
     """
 
     scale: float = 3.0
+
+    def __check_init__(self) -> None:
+        _checks.positive(self.scale, "scale")
 
     def shrink(self, error: Float[Array, " k"]) -> Float[Array, " k"]:
         s = jnp.sum(error**2) / self.scale**2
@@ -52,7 +57,8 @@ class SoftL1(AbstractLoss):
 class Huber(AbstractLoss):
     """Quadratic up to c, linear beyond: `ρ(s) = s` for s ≤ c², else `2c√s − c²`.
 
-    **Arguments:** `scale` c, in standard deviations.
+    **Arguments:** `scale` c, in standard deviations. **Raises:** `ValueError` where it is not
+    positive.
 
     Source: Huber 1964, doi:10.1214/aoms/1177703732.
 
@@ -62,6 +68,9 @@ class Huber(AbstractLoss):
     """
 
     scale: float = 3.0
+
+    def __check_init__(self) -> None:
+        _checks.positive(self.scale, "scale")
 
     def shrink(self, error: Float[Array, " k"]) -> Float[Array, " k"]:
         s = jnp.sum(error**2) / self.scale**2

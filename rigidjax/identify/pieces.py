@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from rigidjax import _checks
 from rigidjax.identify import stacking
 from rigidjax.identify.free import Slot
 from rigidjax.identify.problem import Links, Own, Parameters, Problem
@@ -37,11 +38,13 @@ def pieces(problem: Problem, count: int, *, width: float = WIDTHS[-1]) -> Proble
     >>> pieces(rj.identify.Problem(record, rj.identify.Ratios()), 4).count
     4
     """
+    _checks.instance(problem, Problem, "problem")
+    count, width = _checks.whole(count, "count", 2), _checks.positive(width, "width")
     if problem.count != 1:
         raise ValueError(f"pieces: wanted one recording, got {problem.count}")
     record = problem.recording
     size = int(record.t.shape[0])
-    if count < 2 or size < 4 * count:
+    if size < 4 * count:
         raise ValueError(
             f"pieces: wanted at least two pieces of four samples, got {count} of {size} samples"
         )

@@ -4,6 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from rigidjax import _checks
 from rigidjax._types import Scalar
 from rigidjax.body.inertia import Inertia, MassProperties
 
@@ -32,13 +33,9 @@ class Entropic(eqx.Module):
     weight: Scalar
 
     def __init__(self, guess: Inertia | MassProperties, weight: float):
-        if not isinstance(guess, Inertia | MassProperties):
-            raise TypeError(
-                f"Entropic: wanted an Inertia or MassProperties, got {type(guess).__name__}"
-            )
-        if not weight > 0:
-            raise ValueError(f"Entropic: wanted a positive weight, got {weight}")
-        self.guess, self.weight = guess, jnp.asarray(weight, jnp.result_type(float))
+        self.guess = _checks.single(guess, (Inertia, MassProperties), "guess")
+        weight = _checks.positive(weight, "weight")
+        self.weight = jnp.asarray(weight, jnp.result_type(float))
 
     def residuals(self, body: Inertia | MassProperties, scaled: bool = True) -> Float[Array, " n"]:
         """Numbers whose squares add up to `2 w D`; `scaled` false compares shapes alone."""

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
+from rigidjax import _checks
 from rigidjax._types import HasAttitude, HasPose, Scalar
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.identify import stacking
@@ -28,6 +29,7 @@ from rigidjax.identify.reference import Reference, reference_of
 from rigidjax.identify.sensors import Moment
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.torques import AbstractForce, Sum, Torque
+from rigidjax.motion.torques.base import require_law
 from rigidjax.rotation import quaternion
 from rigidjax.solve import equations_of_motion
 
@@ -122,7 +124,18 @@ class Problem(eqx.Module):
                 "Problem: wanted what of the body is free, such as Ratios() or PrincipalRatios(), "
                 f"got {type(body).__name__}"
             )
+        if isinstance(free, str):
+            free = (free,)  # pyright: ignore[reportAssignmentType]
+        _checks.instance(free, Sequence, "free", wanted="a sequence of Free(where, name)")
+        for name, value, kind in (
+            ("loss", loss, AbstractLoss),
+            ("prior", prior, Entropic),
+            ("integrator", integrator, AbstractIntegrator),
+        ):
+            if value is not None:
+                _checks.instance(value, kind, name)
         if torque is not None:
+            require_law(torque)
             recordings = [_with(item, torque) for item in recordings]
         self.records, self.counts = stacking.stack(recordings)
         self.body, self.loss, self.prior = body, loss, prior
@@ -165,6 +178,8 @@ class Problem(eqx.Module):
 
     def start(self, body: Inertia | None = None) -> Parameters:
         """The parameters of the recordings as they are given, with this body or a sphere."""
+        if body is not None:
+            _checks.single(body, (Inertia, MassProperties), "body")
         matter = Inertia(jnp.eye(3)) if body is None else body
         vector = self.body.vector(matter) if body is not None else jnp.zeros(self.body.size)
         moved = [jnp.zeros(jnp.shape(slot.read(self.recording))) for slot in self.slots]
@@ -192,6 +207,7 @@ class Problem(eqx.Module):
 
         With several recordings the states have a leading axis.
         """
+        fits(self, parameters)
         body = self.body.body(parameters.body)
         states = jax.vmap(lambda own, ref: first_state(self.rung, own, ref))(
             parameters.own, self.reference
@@ -200,6 +216,7 @@ class Problem(eqx.Module):
 
     def scenes(self, parameters: Parameters) -> Recording:
         """The recordings with the parameters' values in the slots, with a leading axis."""
+        fits(self, parameters)
         return jax.vmap(lambda own, record: filled(self, parameters.shared, own, record))(
             parameters.own, self.records
         )
@@ -218,6 +235,7 @@ class Problem(eqx.Module):
 
         With several recordings another axis leads.
         """
+        fits(self, parameters)
         states = jax.vmap(
             lambda own, record, ref: _states(
                 self, self.body.body(parameters.body), parameters.shared, own, record, ref
@@ -227,8 +245,48 @@ class Problem(eqx.Module):
 
     def errors(self, parameters: Parameters) -> tuple[Float[Array, "*records times _"], ...]:
         """Reading minus prediction for each sensor, in its unit; zero where masked."""
+        fits(self, parameters)
         out = all_errors(parameters, self)[0]
         return tuple(e[0] for e in out) if self.count == 1 else out
+
+
+def fits(problem: Problem, parameters: Parameters) -> Parameters:
+    """`parameters`, if they are of this problem.
+
+    **Raises:** `TypeError` for another kind of thing, `ValueError` for other shapes.
+
+    >>> import rigidjax as rj
+    >>> record = rj.identify.Recording([0.0, 1.0], (rj.identify.Gyro(), [[1.0, 0, 0]] * 2))
+    >>> problem = Problem(record, rj.identify.Ratios())
+    >>> fits(problem, problem.start()).body.shape
+    (5,)
+    """
+    _checks.instance(problem, Problem, "problem")
+    hint = "problem.start(body) makes them"
+    _checks.instance(parameters, Parameters, "parameters", hint=hint)
+    own, each = parameters.own, (problem.count, 3)
+    sizes = [jnp.shape(slot.read(problem.records))[1:] for slot in problem.slots]
+    apart = [slot.each for slot in problem.slots]
+    shared = [size for size, alone in zip(sizes, apart, strict=True) if not alone]
+    alone = [(problem.count, *size) for size, alone in zip(sizes, apart, strict=True) if alone]
+    wanted = {
+        "body": [(problem.body.size,)],
+        "shared": shared,
+        "own.spin": [each],
+        "own.turn": [] if problem.rung is Spin else [each],
+        "own.place": [each] if problem.rung is Rigid else [],
+        "own.speed": [each] if problem.rung is Rigid else [],
+        "own.each": alone,
+    }
+    found = (parameters.body, parameters.shared, own.spin, own.turn, own.place, own.speed, own.each)
+    for (name, shapes), part in zip(wanted.items(), found, strict=True):
+        numbers = [_checks.numbers(leaf, f"parameters.{name}") for leaf in jax.tree.leaves(part)]
+        if [leaf.shape for leaf in numbers] != shapes:
+            raise ValueError(
+                f"parameters.{name}: wanted arrays of shapes {shapes}, as this problem has, got "
+                f"{[leaf.shape for leaf in numbers]}; {hint}"
+            )
+    return parameters
 
 
 class Links(eqx.Module):

@@ -8,6 +8,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array
 
+from rigidjax import _checks
 from rigidjax.identify import reported
 from rigidjax.identify.fit import Fit
 from rigidjax.identify.problem import Parameters
@@ -34,8 +35,9 @@ def profile(fit: Fit, name: str, level: float = 0.95) -> tuple[float, float]:
     >>> profile.__name__
     'profile'
     """
+    _checks.instance(fit, Fit, "fit")
     names = [quantity.name for quantity in fit.quantities]
-    if name not in names:
+    if not isinstance(name, str) or name not in names:
         raise ValueError(f"profile: no quantity {name!r}; wanted one of {', '.join(names)}")
     reach = reported.quantile(fit, level)
     index = names.index(name)

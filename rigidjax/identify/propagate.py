@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from rigidjax import _checks
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.exact import FreeBody
 from rigidjax.motion import Attitude, Rigid
@@ -44,8 +45,7 @@ class FixedSteps(AbstractIntegrator):
     substeps: int = eqx.field(static=True, default=1)
 
     def __check_init__(self):
-        if self.substeps < 1:
-            raise ValueError(f"FixedSteps: wanted at least one step, got {self.substeps}")
+        _checks.whole(self.substeps, "substeps", 1)
 
     def states(self, body: Any, state0: Any, ts: Float[Array, " times"], torque: Torque) -> Any:
         field = equations_of_motion(body, state0, torque)
@@ -63,6 +63,10 @@ class Adaptive(AbstractIntegrator):
 
     rtol: float = eqx.field(static=True, default=1e-9)
     atol: float = eqx.field(static=True, default=1e-12)
+
+    def __check_init__(self):
+        _checks.positive(self.rtol, "rtol")
+        _checks.not_negative(self.atol, "atol")
 
     def states(self, body: Any, state0: Any, ts: Float[Array, " times"], torque: Torque) -> Any:
         # Times that repeat (the tail of a shorter record) are no times to a solver.

@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float
 from rigidjax import _checks
 from rigidjax.identify.sensors import AbstractSensor
 from rigidjax.motion.torques import Torque
+from rigidjax.motion.torques.base import require_law
 
 
 class Reading(eqx.Module):
@@ -59,7 +60,7 @@ class Recording(eqx.Module):
                 "Recording: wanted known numbers for t and the readings, got traced ones; make the "
                 "recording outside of jit, vmap and grad, and give it to them as an argument"
             )
-        t = np.asarray(t, float)
+        t = _checks.on_host(t, "t")
         if t.ndim != 1 or t.size < 2:
             raise ValueError(f"t: wanted at least two times, shape (T,), got shape {t.shape}")
         if not np.isfinite(t).all():
@@ -83,6 +84,8 @@ class Recording(eqx.Module):
             Reading(sensor, jnp.asarray(values[kept]), jnp.asarray(mask[kept]))
             for sensor, values, mask in rows
         )
+        if torque is not None:
+            require_law(torque)
         self.torque = torque
 
     @property
@@ -107,11 +110,11 @@ def _reading(
     name = type(sensor).__name__
     if not isinstance(sensor, AbstractSensor):
         raise TypeError(f"Recording: wanted pairs (sensor, values), got {name} for a sensor")
-    values = np.asarray(values, float)
+    values = _checks.on_host(values, f"{name}: readings")
     wanted = (t.size, *sensor.reading_shape)
     if values.shape != wanted:
         raise ValueError(f"{name}: wanted readings of shape {wanted}, got {values.shape}")
-    mask = np.ones(t.size, bool) if mask is None else np.asarray(mask, bool)
+    mask = np.ones(t.size, bool) if mask is None else _flags(mask, name)
     if mask.shape != t.shape:
         raise ValueError(f"{name}: wanted a mask of shape {t.shape}, got {mask.shape}")
     across = tuple(range(1, values.ndim))
@@ -133,3 +136,13 @@ def _reading(
         if wrong.any():
             raise ValueError(f"{name}: {why.format(index=int(np.argmax(wrong)))}")
     return sensor, values, mask
+
+
+def _flags(mask: Any, name: str) -> np.ndarray:
+    try:
+        flags = np.asarray(mask)
+    except ValueError as error:
+        raise ValueError(f"{name}: wanted a mask (T,), got rows of different lengths") from error
+    if flags.dtype.kind not in "biu":
+        raise TypeError(f"{name}: wanted a mask of true and false, got {flags.dtype}")
+    return flags.astype(bool)

@@ -6,24 +6,27 @@ import io
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from rigidjax import _checks
 from rigidjax._names import own_names
 
 if TYPE_CHECKING:
     from rigidjax.identify.fit import Fit
 
+_UNITS = {"rad/s": 1.0, "deg/s": 180 / np.pi, "deg/day": 86400 * 180 / np.pi}
 Row = tuple[str, float, float, float, str]
 
 
-def rows(fit: "Fit", rate_unit: str = "rad/s") -> list[Row]:
+def rows(fit: Fit, rate_unit: str = "rad/s") -> list[Row]:
     """All that was found as rows (name, value, low, high, unit), 95 % intervals.
 
     **Arguments:** `fit`; `rate_unit` of the first body rate: `rad/s`, `deg/s`, `deg/day`.
     """
-    scale = {"rad/s": 1.0, "deg/s": 180 / np.pi, "deg/day": 86400 * 180 / np.pi}[rate_unit]
+    _checks.instance(fit, Fit, "fit")
+    scale = _UNITS[_checks.word(rate_unit, tuple(_UNITS), "rate_unit")]
     bounds = fit.interval(0.95)
     out: list[Row] = []
     for quantity in fit.quantities:
@@ -39,6 +42,11 @@ def rows(fit: "Fit", rate_unit: str = "rad/s") -> list[Row]:
 
 def table(lines: list[Row]) -> str:
     """Rows of (name, value, low, high, unit) as text, digits as the interval allows."""
+    for line in _checks.instance(lines, (list, tuple), "lines", wanted="a list of rows"):
+        if not isinstance(line, tuple) or len(line) != 5:
+            raise TypeError(f"lines: wanted rows (name, value, low, high, unit), got {line!r}")
+    if not lines:
+        raise ValueError("lines: wanted at least one row, got none")
     wide = max(len(name) for name, *_ in lines)
     out = [f"{'':{wide}}  {'value':>14}  95 % interval"]
     for name, value, low, high, unit in lines:
@@ -49,6 +57,8 @@ def table(lines: list[Row]) -> str:
 
 def numbers(value: float, low: float, high: float) -> list[str]:
     """The three as text, with the digits that the interval allows."""
+    value = _checks.number(value, "value")
+    low, high = _checks.number(low, "low"), _checks.number(high, "high")
     width, size = high - low, max(abs(value), abs(low) if np.isfinite(low) else 0.0)
     if 0 < size < 1e-3 or size >= 1e6:
         digits = 3
@@ -65,8 +75,9 @@ def _decimals(width: float) -> int:
     return int(np.clip(2 - np.floor(np.log10(width)), 0, 12))
 
 
-def verdict(fit: "Fit") -> str:
+def verdict(fit: Fit) -> str:
     """What is well and what is weakly determined, and whether the starts agree, in words."""
+    _checks.instance(fit, Fit, "fit")
     good = [start for start in fit.starts if start.converged and start.fits]
     lines = [f"status: {fit.status}"]
     lines.append(
@@ -77,7 +88,7 @@ def verdict(fit: "Fit") -> str:
     return "\n".join(lines)
 
 
-def as_dict(fit: "Fit", files: Sequence[str] = (), more: Sequence[Row] = ()) -> dict[str, Any]:
+def as_dict(fit: Fit, files: Sequence[str] = (), more: Sequence[Row] = ()) -> dict[str, Any]:
     """All that was found as plain numbers and text, for JSON. Infinity is written as `null`.
 
     **Arguments:** `fit`; `files` the names of what was read; `more` rows of further quantities.
@@ -86,6 +97,7 @@ def as_dict(fit: "Fit", files: Sequence[str] = (), more: Sequence[Row] = ()) -> 
     def plain(number: float) -> float | None:
         return float(number) if np.isfinite(number) else None
 
+    _checks.instance(fit, Fit, "fit")
     bounds = fit.interval(0.95)
     return {
         "files": list(files),
@@ -121,7 +133,7 @@ def as_dict(fit: "Fit", files: Sequence[str] = (), more: Sequence[Row] = ()) -> 
 
 
 def write_json(
-    fit: "Fit", path: str | Path, files: Sequence[str] = (), more: Sequence[Row] = ()
+    fit: Fit, path: str | Path, files: Sequence[str] = (), more: Sequence[Row] = ()
 ) -> None:
     """`as_dict` to a file."""
     text = json.dumps(as_dict(fit, files, more), indent=2, ensure_ascii=False, allow_nan=False)
@@ -129,7 +141,7 @@ def write_json(
 
 
 def write_html(
-    fit: "Fit",
+    fit: Fit,
     path: str | Path,
     *,
     title: str = "Identification",
@@ -144,6 +156,7 @@ def write_html(
     `rigidjax.plot.fit`; `rate_unit` as for `rows`; `files` the names of what was read; `more`
     rows of further quantities.
     """
+    _checks.instance(fit, Fit, "fit")
     good = fit.ok
     lines = []
     for name, value, low, high, unit in [*rows(fit, rate_unit), *more]:

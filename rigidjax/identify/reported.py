@@ -10,6 +10,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
+from rigidjax import _checks
 from rigidjax.identify.problem import Parameters, Problem
 
 if TYPE_CHECKING:
@@ -113,12 +114,14 @@ def interval_of(
     fit: "Fit", of: Callable[[Any, Any], Any], level: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """See `Fit.interval_of`."""
+    _checks.function(of, "of", "(body, state0) → array")
     flat, restore = ravel_pytree(fit.parameters)
 
     def value(x: Array) -> Array:
-        return jnp.asarray(of(*fit.problem.unpack(restore(x))))
+        return _checks.numbers(of(*fit.problem.unpack(restore(x))), "of(body, state0)")
 
-    middle, slope = np.asarray(value(flat)), np.asarray(jax.jacfwd(value)(flat))
+    middle = np.asarray(_checks.finite(value(flat), "of(body, state0)"))
+    slope = np.asarray(jax.jacfwd(value)(flat))
     found = carried(slope, np.asarray(fit.seen), np.asarray(fit.null_directions))
     reach = quantile(fit, level) * found
     return np.asarray(middle - reach), np.asarray(middle + reach)
@@ -129,7 +132,8 @@ def quantile(fit: "Fit", level: float) -> float:
 
     Errors that hang together count as the fewer they are.
     """
-    if not 0 < level < 1:
+    level = _checks.positive(level, "level", "a level between 0 and 1")
+    if not level < 1:
         raise ValueError(f"interval: wanted a level between 0 and 1, got {level}")
     from scipy.special import ndtri, stdtrit
 

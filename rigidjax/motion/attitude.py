@@ -74,6 +74,7 @@ State = TypeVar("State")
 def on_the_group(state: State) -> State:
     """The same state with its quaternion, if it has one, scaled to length 1."""
     if isinstance(state, HasAttitude):
+        _checks.floating(state.q, (4,), "state.q")
         return eqx.tree_at(lambda s: s.q, state, _unit(state.q))
     return state
 

@@ -6,11 +6,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from rigidjax import _checks
 from rigidjax._types import HasAttitude, HasPose, HasSpin, Scalar, ScalarLike, Vec3
 from rigidjax.body.energy import angular_momentum, kinetic_energy
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.motion.torques import AbstractTorque, CentralGravity, Sum, Torque, in_precision
-from rigidjax.motion.torques.base import length_or_zero
+from rigidjax.motion.torques.base import length_or_zero, require_law
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.algebra import cross, dot
 
@@ -35,6 +36,8 @@ def energy(
     >>> energy(rj.Inertia.from_principal(1.0, 1.0, 1.0), start, top)
     Array(10.31, dtype=float64)
     """
+    _look(body, state, torque)
+    t = _checks.floating(t, (), "t")
     parts = _parts(torque)
     for part in parts:
         if not hasattr(part, "energy"):
@@ -77,6 +80,8 @@ def conserved(
     >>> sorted(conserved(body, rj.Spin([1.0, 0, 0])))
     ['energy', 'momentum_squared']
     """
+    _look(body, state, torque)
+    t = _checks.floating(t, (), "t")
     parts = _parts(torque)
     dtype = state.omega.dtype
     body = in_precision(body, dtype)
@@ -126,6 +131,13 @@ def drift(
     >>> bool(drift(ts, ys, body)["energy"] < 1e-8)
     True
     """
+    ts = _checks.rows(ts, (), "ts")
+    _checks.instance(ys, HasSpin, "ys", wanted="states with a leading time axis")
+    for leaf in jax.tree.leaves(ys):
+        if leaf.shape[:1] != ts.shape:
+            raise ValueError(
+                f"ys: wanted one row for each of {ts.shape[0]} times, got shape {leaf.shape}"
+            )
     at_all = jax.vmap(lambda t, y: conserved(body, y, torque, t))(ts, ys)
     kinetic = jax.vmap(lambda y: kinetic_energy(in_precision(body, y.omega.dtype), y))(ys)
     spin = jax.vmap(lambda t, y: _spin_size(body, y, torque, t))(ts, ys)
@@ -141,6 +153,14 @@ def drift(
         scale = jnp.max(scale)
         found[name] = jnp.max(away) / jnp.where(scale > 0, scale, 1)
     return found
+
+
+def _look(body: Any, state: Any, torque: Any) -> None:
+    """Raise in words unless these are a body, a state, and a law or none."""
+    _checks.single(body, (Inertia, MassProperties), "body")
+    _checks.single(state, HasSpin, "state", wanted="a Spin, an Attitude or a Rigid")
+    if torque is not None:
+        require_law(torque)
 
 
 def _parts(torque: Torque | None) -> tuple[Any, ...]:

@@ -130,7 +130,7 @@ class RotationalHamiltonian(eqx.Module):
     inverse: Mat3
 
     def __init__(self, inertia: _inertia.Inertia):
-        self.inverse = _inertia.inverse(_of_kind(inertia, _inertia.Inertia, "inertia").tensor)
+        self.inverse = _inertia.inverse(_checks.single(inertia, _inertia.Inertia, "inertia").tensor)
 
     def __call__(self, pi: Float[ArrayLike, "3"] | list[float]) -> Scalar:
         pi = _checks.floating(pi, (3,), "pi")
@@ -158,8 +158,10 @@ class HeavyTopHamiltonian(eqx.Module):
     top: HeavyTop
 
     def __init__(self, inertia: _inertia.Inertia, top: HeavyTop):
-        self.inertia = _of_kind(inertia, _inertia.Inertia, "inertia")
-        self.top = _of_kind(top, HeavyTop, "top", "; this Hamiltonian is that of gravity alone")
+        self.inertia = _checks.single(inertia, _inertia.Inertia, "inertia")
+        self.top = _checks.instance(
+            top, HeavyTop, "top", hint="this Hamiltonian is that of gravity alone"
+        )
         self.inverse = _inertia.inverse(inertia.tensor)
 
     def __call__(
@@ -175,9 +177,7 @@ class HeavyTopHamiltonian(eqx.Module):
 
 
 def _callable(hamiltonian):
-    if not callable(hamiltonian):
-        raise TypeError(f"hamiltonian: wanted a callable, got {type(hamiltonian).__name__}")
-    return hamiltonian
+    return _checks.function(hamiltonian, "hamiltonian", "of the momentum to H, J")
 
 
 def _of_kind(value, kind, name, why=""):

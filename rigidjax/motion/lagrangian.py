@@ -28,6 +28,7 @@ from rigidjax.motion.hamiltonian import (
     lie_poisson_with_direction as lie_poisson_with_direction,
 )
 from rigidjax.motion.torques import Torque
+from rigidjax.motion.torques.base import require_law
 from rigidjax.rotation import algebra, euler
 
 
@@ -49,11 +50,14 @@ class Coordinates(eqx.Module):
     def __init__(
         self, q: Float[ArrayLike, "*batch n"] | object, rate: Float[ArrayLike, "*batch n"] | object
     ):
-        q = jnp.asarray(q)
-        if q.ndim == 0:
-            raise ValueError("q: wanted generalised coordinates (n,), got one number; give [q]")
-        self.q = _checks.floating(q, q.shape, "q")
-        self.rate = _checks.floating(rate, q.shape, "rate", hint="one rate for each coordinate")
+        self.q = _checks.numbers(q, "q")
+        if self.q.ndim == 0 or self.q.size == 0:
+            raise ValueError(
+                f"q: wanted generalised coordinates (n,), got shape {self.q.shape}; of one give [q]"
+            )
+        self.rate = _checks.floating(
+            rate, self.q.shape, "rate", hint="one rate for each coordinate"
+        )
 
 
 class LagrangeEquations(eqx.Module):
@@ -104,9 +108,9 @@ def equations_of_motion(
     >>> pendulum(0.0, Coordinates([jnp.pi / 2], [0.0])).rate
     Array([-9.81], dtype=float64)
     """
-    for name, value in (("lagrangian", lagrangian), ("force", force)):
-        if not callable(value) and not (name == "force" and value is None):
-            raise TypeError(f"{name}: wanted a callable, got {type(value).__name__}")
+    _checks.function(lagrangian, "lagrangian", "(q, q̇) → L, J")
+    if force is not None:
+        _checks.function(force, "force", "(t, q, q̇) → Q")
     return LagrangeEquations(lagrangian, force)
 
 
@@ -131,6 +135,9 @@ class EulerAngleTop(eqx.Module):
     torque: Torque | None
 
     def __init__(self, inertia: Inertia, torque: Torque | None = None):
+        _checks.single(inertia, Inertia, "inertia")
+        if torque is not None:
+            require_law(torque)
         if torque is not None and not hasattr(torque, "energy"):
             raise TypeError(
                 f"{type(torque).__name__} has no potential (no method energy(t, state, body)): "
@@ -156,6 +163,8 @@ def to_attitude(y: Coordinates) -> Attitude:
     >>> to_attitude(Coordinates([0.0, 0.0, 0.0], [0.0, 0.0, 2.0])).omega.tolist()
     [0.0, 0.0, 2.0]
     """
+    _checks.instance(y, Coordinates, "y")
+    _checks.floating(y.q, (3,), "y.q", hint="three Euler angles")
     return Attitude(euler.to_quaternion(y.q), euler.rates_to_omega(y.q, y.rate))
 
 
@@ -171,6 +180,7 @@ def from_attitude(state: HasAttitude) -> Coordinates:
     >>> back.rate.round(12).tolist()
     [1.0, 2.0, 3.0]
     """
+    _checks.single(state, HasAttitude, "state", wanted="an Attitude")
     angles = euler.from_quaternion(state.q)
     angles = _checks.refuse(
         angles,

@@ -69,6 +69,7 @@ class NewtonEuler(eqx.Module):
     body: MassProperties
 
     def __init__(self, body: MassProperties, torque: Torque | None = None):
+        _checks.single(body, MassProperties, "body", hint="an Inertia has no mass")
         self.euler = EulerEquations(body.inertia, torque)
         self.body = body
 

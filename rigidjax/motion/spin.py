@@ -7,7 +7,10 @@ from rigidjax import _checks
 from rigidjax._types import HasSpin, Mat3, ScalarLike, Vec3
 from rigidjax.body import inertia as _inertia, physical
 from rigidjax.motion.torques import Torque, evaluate
+from rigidjax.motion.torques.base import require_law
 from rigidjax.rotation import algebra
+
+_HINT = "Inertia.from_tensor makes one of a matrix; of MassProperties pass .inertia"
 
 
 class Spin(eqx.Module):
@@ -51,6 +54,9 @@ class EulerEquations(eqx.Module):
     torque: Torque | None
 
     def __init__(self, inertia: _inertia.Inertia, torque: Torque | None = None):
+        _checks.single(inertia, _inertia.Inertia, "inertia", hint=_HINT)
+        if torque is not None:
+            require_law(torque)
         # Where the numbers are traced, `simulate` has looked at them before.
         self.inertia = inertia.invertible() if physical.known(inertia.tensor) else inertia
         # Once per solve: a division inside the field costs 25 times the rest of it.

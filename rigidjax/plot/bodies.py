@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
+from rigidjax import _checks
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.plot.style import AXES, COLOURS, row_of_axes
 
@@ -38,7 +39,9 @@ def inertia_ellipsoid(
     >>> [one.get_xlabel() for one in inertia_ellipsoid(rj.shapes.box(1.0, [1.0, 2.0, 3.0]))]
     ['x, m', 'x, m', 'y, m']
     """
+    samples = _checks.whole(samples, "samples", 0)
     if isinstance(body, Inertia | MassProperties):
+        _checks.single(body, (Inertia, MassProperties), "body")
         best, drawn = body, None
     elif hasattr(body, "parameters") and hasattr(body, "problem"):
         best, drawn = body.body, _drawn(body, samples)

@@ -10,6 +10,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import ArrayLike, Float
 
+from rigidjax import _checks
 from rigidjax._types import HasAttitude
 from rigidjax.body.axes import principal
 from rigidjax.body.inertia import Inertia, MassProperties
@@ -82,6 +83,8 @@ def tumble(
     >>> tumble(body, sol.ts, sol.ys, pictures=2).data[:6]
     b'GIF89a'
     """
+    seconds = _checks.positive(seconds, "seconds")
+    _checks.single(body, (Inertia, MassProperties), "body")
     times, q = evenly(ts, states, pictures)
     half, turn = box_of(body)
     pyplot()
@@ -133,11 +136,11 @@ def tumble(
 
 def evenly(ts: Any, states: Any, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Times evenly spaced, and the attitudes there (count, 4), along the shorter arc."""
-    q, t = attitudes(states), np.asarray(ts, dtype=float)
+    q, t, count = attitudes(states), _checks.on_host(ts, "ts"), _checks.whole(count, "pictures", 2)
     if t.shape != (q.shape[0],):
         raise ValueError(f"ts: wanted ({q.shape[0]},) as the states have, got {t.shape}")
-    if count < 2 or t.size < 2:
-        raise ValueError(f"wanted at least two pictures and times, got {count} and {t.size}")
+    if t.size < 2:
+        raise ValueError(f"ts: wanted at least two times, got {t.size}")
     # q and −q are one attitude: choose signs so that neighbours are near.
     signs = np.where(np.einsum("ti,ti->t", q[1:], q[:-1]) < 0, -1.0, 1.0)
     q = q * np.concatenate([[1.0], np.cumprod(signs)])[:, None]

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rigidjax.plot.style import COLOURS, pyplot
+from rigidjax.plot.style import COLOURS, RATES, TIMES, of_fit, pyplot, unit
 from rigidjax.rotation import quaternion
 from rigidjax.solve import simulate
 
@@ -28,8 +28,9 @@ def fit(
     **Raises** `ModuleNotFoundError` where matplotlib is missing (install the extra `view`).
     """
     plt = pyplot()
-    seconds = {"s": 1.0, "day": 86400.0}[time_unit]
-    rate = {"rad/s": 1.0, "deg/s": 180 / np.pi, "deg/day": 86400 * 180 / np.pi}[rate_unit]
+    seconds = unit(time_unit, TIMES, "time_unit")
+    rate = unit(rate_unit, RATES, "rate_unit")
+    index = of_fit(found, index)
     record = found.problem.recordings[index]
     left = [e if found.problem.count == 1 else e[index] for e in found.residuals]
     left = [np.asarray(e)[: record.t.shape[0]] for e in left]

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from rigidjax.plot.style import COLOURS, TIMES, pyplot, unit
+from rigidjax.plot.style import COLOURS, TIMES, of_fit, pyplot, unit
 
 
 def residuals(
@@ -23,6 +23,7 @@ def residuals(
     or axes of another shape; `IndexError` for a recording that is not there.
     """
     seconds = unit(time_unit, TIMES, "time_unit")
+    index = of_fit(found, index)
     record = found.problem.recordings[index]
     several = found.problem.count > 1
     count = len(record.readings)

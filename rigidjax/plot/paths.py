@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike, Float
 
+from rigidjax import _checks
 from rigidjax.frames import MovingFrame, Point
 from rigidjax.plot.style import AXES, COLOURS, row_of_axes, rows
 
@@ -39,11 +40,14 @@ def frames(
     >>> [one.get_title() for one in frames(turntable, ts, seen)]
     ['seen from the moving frame', 'seen from the inertial frame']
     """
-    if len(plane) != 2 or plane[0] == plane[1] or not set(plane) <= set(AXES):
+    _checks.instance(frame, MovingFrame, "frame")
+    _checks.instance(inside, Point, "inside")
+    known = isinstance(plane, str) and set(plane) <= set(AXES)
+    if not known or len(plane) != 2 or plane[0] == plane[1]:
         raise ValueError(f"plane: wanted two of x, y, z such as 'xz', got {plane!r}")
     i, j = (AXES.index(name) for name in plane)
     path = rows(inside.x, 3, "inside.x")
-    t = jnp.asarray(ts, jnp.asarray(inside.x).dtype)
+    t = _checks.numbers(ts, "ts").astype(_checks.numbers(inside.x, "inside.x").dtype)
     if t.shape != (path.shape[0],):
         raise ValueError(f"ts: wanted ({path.shape[0]},) as the path has, got {t.shape}")
     outside = np.asarray(jax.vmap(frame.to_inertial)(inside, t).x)

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from rigidjax import _checks
 from rigidjax._types import HasAttitude, HasSpin
 from rigidjax.body.energy import spatial_angular_momentum
 from rigidjax.body.inertia import Inertia
@@ -42,6 +43,9 @@ def polhode(
     >>> polhode(body, sol.ys).get_zlabel()
     'Π₃ / h'
     """
+    _checks.single(inertia, Inertia, "inertia")
+    _checks.instance(states, HasSpin, "states", wanted="a Spin, an Attitude or a Rigid")
+    energies = _checks.whole(energies, "energies", 0)
     moments, q = inertia.invertible().principal()
     i = np.asarray(moments, dtype=float)
     turn = matrices(np.asarray(q, dtype=float)[None])[0]

@@ -4,6 +4,8 @@ from typing import Any
 
 import numpy as np
 
+from rigidjax import _checks
+
 # Okabe and Ito's colours, told apart by everyone (Okabe and Ito 2008, "Color Universal Design").
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 AXES = "xyz"
@@ -32,9 +34,18 @@ def pyplot() -> Any:
 
 def unit(name: str, known: dict[str, float], what: str) -> float:
     """How many SI units, or SI in how many, by name; `ValueError` lists what is known."""
-    if name not in known:
-        raise ValueError(f"{what}: wanted one of {', '.join(known)}, got {name!r}")
-    return known[name]
+    return known[_checks.word(name, tuple(known), what)]
+
+
+def of_fit(found: Any, index: Any) -> int:
+    """Which recording of a fit; raises in words where it is no fit, or has none of that number."""
+    wanted = ("problem", "parameters", "residuals")
+    if isinstance(found, type) or not all(hasattr(found, name) for name in wanted):
+        raise TypeError(f"found: wanted a Fit of rigidjax.identify, got {type(found).__name__}")
+    index, count = _checks.whole(index, "index", 0), found.problem.count
+    if index >= count:
+        raise ValueError(f"index: wanted one of {count} recordings, from 0, got {index}")
+    return index
 
 
 def flat_axes(ax: Any, **how: Any) -> Any:
@@ -71,7 +82,7 @@ def rows(values: Any, width: int, name: str) -> np.ndarray:
 
     **Raises** `ValueError` for another shape: most often a batch, of which one is to be picked.
     """
-    out = np.asarray(values, dtype=float)
+    out = _checks.on_host(values, name)
     if out.ndim != 2 or out.shape[1] != width:
         hint = "; of a batch draw one body at a time" if out.ndim == 3 else ""
         raise ValueError(f"{name}: wanted shape (times, {width}), got {out.shape}{hint}")

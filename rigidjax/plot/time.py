@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import ArrayLike, Float
 
+from rigidjax import _checks
 from rigidjax._types import HasSpin
 from rigidjax.plot.style import COLOURS, RATES, TIMES, attitudes, matrices, pyplot, rows, unit
 
@@ -36,8 +37,9 @@ def motion(
     'body rate Ω, rad/s'
     """
     turned, seconds = unit(rate_unit, RATES, "rate_unit"), unit(time_unit, TIMES, "time_unit")
+    _checks.instance(states, HasSpin, "states", wanted="a Spin, an Attitude or a Rigid")
     omega = rows(states.omega, 3, "states.omega") * turned
-    t = np.asarray(ts, dtype=float) / seconds
+    t = _checks.on_host(ts, "ts") / seconds
     if t.shape != (omega.shape[0],):
         raise ValueError(f"ts: wanted ({omega.shape[0]},) as the states have, got {t.shape}")
     both = hasattr(states, "q")

@@ -129,7 +129,7 @@ def basis(dtype: Any = float) -> Float[Array, "3 3 3"]:
     >>> vee(basis()[2]).tolist()
     [0.0, 0.0, 1.0]
     """
-    e = jnp.eye(3, dtype=dtype)
+    e = jnp.eye(3, dtype=_checks.float_type(dtype))
     return jnp.stack([hat(e[0]), hat(e[1]), hat(e[2])])
 
 

@@ -65,10 +65,9 @@ def wahba(
     >>> wahba(jnp.eye(3)[:2], jnp.eye(3)[:2]).round(12).tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
     """
-    body = _rows(body, (3,), "body")
+    body = _checks.rows(body, (3,), "body")
     world = _checks.floating(world, body.shape, "world")
-    w = jnp.ones_like(body[:, 0]) if weights is None else jnp.asarray(weights)
-    w = _checks.floating(w, body.shape[:1], "weights")
+    w = _weights(weights, body[:, 0], "body")
     w, world, body = (_of_order_one(x) for x in (w, world, body))
     b = (w[:, None, None] * world[:, :, None] * body[:, None, :]).sum(0)
     best = _best(b)
@@ -118,7 +117,8 @@ def mean(matrices: Float[ArrayLike, "n 3 3"], weights: Float[ArrayLike, "n"] | N
     >>> mean(jnp.stack([jnp.eye(3), jnp.eye(3)])).round(12).tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
     """
-    matrices = _rows(matrices, (3, 3), "matrices")
+    matrices = _checks.rows(matrices, (3, 3), "matrices")
+    _weights(weights, matrices[:, 0, 0], "matrices")
     return quaternion.to_matrix(mean_quaternion(jax.vmap(matrix_to_quaternion)(matrices), weights))
 
 
@@ -132,10 +132,8 @@ def mean_quaternion(
     >>> mean_quaternion(jnp.array([[1.0, 0, 0, 0], [-1.0, 0, 0, 0]])).tolist()
     [1.0, 0.0, 0.0, 0.0]
     """
-    q = _rows(quaternions, (4,), "quaternions")
-    w = jnp.ones_like(q[:, 0]) if weights is None else jnp.asarray(weights)
-    w = _checks.floating(w, q.shape[:1], "weights")
-    w = _of_order_one(w)
+    q = _checks.rows(quaternions, (4,), "quaternions")
+    w = _of_order_one(_weights(weights, q[:, 0], "quaternions"))
 
     def newton(_: Any, start: Quat, q: Array, w: Array) -> Quat:
         apart = jax.vmap(lambda each: quaternion.multiply(quaternion.conjugate(start), each))(q)
@@ -158,13 +156,18 @@ def _of_order_one(x: Array) -> Array:
     return near_one(jnp.max(jnp.abs(x))) * x
 
 
-def _rows(values: Any, shape: tuple[int, ...], name: str) -> Array:
-    """Many of one shape, as one array (n, *shape)."""
-    array = _checks.floating(values, np.shape(values), name)
-    if array.ndim != len(shape) + 1 or array.shape[1:] != shape:
-        wanted = ", ".join(map(str, ("n", *shape)))
-        raise ValueError(f"{name}: wanted shape ({wanted}), got {array.shape}")
-    return array
+def _weights(weights: Any, like: Array, of: str) -> Array:
+    """One weight for each, 1 if not given; refused where it is known that no mean has them."""
+    if like.shape[0] == 0:
+        raise ValueError(f"{of}: wanted at least one row, got none")
+    if weights is None:
+        return jnp.ones_like(like)
+    w = _checks.floating(weights, like.shape, "weights")
+    if not isinstance(w, Tracer):
+        _checks.finite(w, "weights")
+        bad = (w < 0).any() | ~(w > 0).any()
+        _checks.refuse(w, bad, "weights: wanted numbers ≥ 0, of which one at least is positive")
+    return w
 
 
 def _left_jacobian_inverse(v: Vec3) -> Mat3:

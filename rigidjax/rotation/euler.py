@@ -143,6 +143,7 @@ def rates_to_omega(
     >>> rates_to_omega(jnp.array([0.1, 0.2, 0.3]), jnp.array([0.0, 0.0, 2.0])).tolist()
     [0.0, 0.0, 2.0]
     """
+    _checks.word(frame, ("body", "world"), "frame")
     axes, reverse = _axes(sequence)
     angles, rates = _angles(angles), _checks.floating(rates, (3,), "rates")
     first, second, third = _turning_axes(axes, _in_order(angles, reverse))
@@ -168,6 +169,7 @@ def omega_to_rates(
     >>> omega_to_rates(jnp.array([0.1, 0.2, 0.3]), jnp.array([0.0, 0.0, 2.0])).tolist()
     [0.0, 0.0, 2.0]
     """
+    _checks.word(frame, ("body", "world"), "frame")
     axes, reverse = _axes(sequence)
     angles, omega = _angles(angles), _checks.floating(omega, (3,), "omega")
     omega = _to_body(omega, angles, sequence, frame)
@@ -259,9 +261,7 @@ def _vanishing(middle: Scalar, axes: tuple[int, int, int]) -> tuple[Scalar, Bool
 def _from_body(omega: Vec3, angles: Vec3, sequence: str, frame: str) -> Vec3:
     if frame == "body":
         return omega
-    if frame == "world":
-        return apply(to_matrix(angles, sequence), omega)
-    raise ValueError(f"frame: wanted 'body' or 'world', got {frame!r}")
+    return apply(to_matrix(angles, sequence), omega)
 
 
 def _to_body(omega: Vec3, angles: Vec3, sequence: str, frame: str) -> Vec3:

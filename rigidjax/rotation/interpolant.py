@@ -38,10 +38,9 @@ class AttitudeInterpolant(eqx.Module):
         qs: Float[ArrayLike, "n 4"],
         omegas: Float[ArrayLike, "n 3"],
     ) -> None:
-        ts = jnp.asarray(ts)
-        if ts.ndim != 1 or ts.shape[0] < 2:
+        ts = _checks.rows(ts, (), "ts")
+        if ts.shape[0] < 2:
             raise ValueError(f"ts: wanted two times or more, got shape {ts.shape}")
-        ts = _checks.floating(ts, ts.shape, "ts")
         self.ts = _checks.refuse(ts, ~(ts[1:] > ts[:-1]).all(), "ts: wanted increasing times")
         self.qs = quaternion.check(_checks.floating(qs, (ts.shape[0], 4), "qs"), name="qs")
         self.omegas = _checks.floating(omegas, (ts.shape[0], 3), "omegas")

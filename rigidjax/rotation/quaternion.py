@@ -182,6 +182,7 @@ def advance(q: QuatLike, omega: Vec3Like, dt: ScalarLike) -> Quat:
     >>> advance(jnp.array([1.0, 0, 0, 0]), jnp.array([0, 0, jnp.pi]), 1.0).round(12).tolist()
     [0.0, 0.0, 0.0, 1.0]
     """
+    q = _checks.floating(q, (4,), "q", hint=_HINT)
     omega = _checks.floating(omega, (3,), "omega")
     dt = _checks.floating(dt, (), "dt").astype(omega.dtype)
     return multiply(q, vector_to_quaternion(turn(dt * omega, "dt * omega")))
@@ -219,6 +220,7 @@ def interpolate(p: QuatLike, q: QuatLike, s: ScalarLike) -> Quat:
     >>> bool(abs(interpolate(p, q, 0.5) - exp(jnp.array([0, 0, 1.5]))).max() < 1e-15)
     True
     """
+    p = _checks.floating(p, (4,), "p", hint=_HINT)
     v = log(multiply(conjugate(p), q))
     part = turn(_checks.floating(s, (), "s").astype(v.dtype) * v, "s times the turn")
     return multiply(p, vector_to_quaternion(part))
@@ -232,7 +234,7 @@ def uniform(key: PRNGKeyArray, dtype: Any = float) -> Quat:
     >>> uniform(jax.random.key(0)).shape
     (4,)
     """
-    return normalise(jax.random.normal(key, (4,), dtype))
+    return normalise(jax.random.normal(_checks.key(key), (4,), _checks.float_type(dtype)))
 
 
 def normalise(q: QuatLike) -> Quat:
@@ -272,7 +274,7 @@ def angle(q: QuatLike) -> Scalar:
     w, *u = components(near_one(*components(q)) * q)
     n2 = dot_components(u, u)
     # Both atan2 and the root see ones, not zeros, where their derivative would be 0/0.
-    there = n2 > 0
+    there = n2 != 0
     half = jnp.arctan2(jnp.sqrt(jnp.where(there, n2, 1)), jnp.abs(w))
     return jnp.where(there, 2 * half, 0)
 

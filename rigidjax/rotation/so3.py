@@ -159,7 +159,7 @@ def to_world(matrix: Mat3Like, y: Vec3Like) -> Vec3:
     >>> to_world(jnp.eye(3), jnp.array([1.0, 2.0, 3.0])).tolist()
     [1.0, 2.0, 3.0]
     """
-    return apply(matrix, y)
+    return apply(_checks.floating(matrix, (3, 3), "matrix"), y)
 
 
 def to_body(matrix: Mat3Like, y: Vec3Like) -> Vec3:
@@ -182,6 +182,7 @@ def conjugate(turn: Mat3Like, matrix: Mat3Like) -> Mat3:
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
     """
     matrix = _checks.floating(matrix, (3, 3), "matrix")
+    turn = _checks.floating(turn, (3, 3), "turn")
     return product(matrix, product(turn, matrix.T))
 
 
@@ -193,7 +194,8 @@ def rate(matrix: Mat3Like, omega: Vec3Like) -> Mat3:
     >>> rate(jnp.eye(3), jnp.array([0.0, 0.0, 2.0]))[1].tolist()
     [2.0, 0.0, 0.0]
     """
-    return product(matrix, hat(omega))
+    matrix = _checks.floating(matrix, (3, 3), "matrix")
+    return product(matrix, hat(_checks.floating(omega, (3,), "omega")))
 
 
 def body_rate(matrix: Mat3Like, rate: Mat3Like) -> Vec3:
@@ -205,6 +207,7 @@ def body_rate(matrix: Mat3Like, rate: Mat3Like) -> Vec3:
     >>> body_rate(jnp.eye(3), hat(jnp.array([1.0, 2.0, 3.0]))).tolist()
     [1.0, 2.0, 3.0]
     """
+    rate = _checks.floating(rate, (3, 3), "rate")
     return vee(product(_checks.floating(matrix, (3, 3), "matrix").T, rate))
 
 
@@ -217,6 +220,7 @@ def world_rate(matrix: Mat3Like, rate: Mat3Like) -> Vec3:
     >>> world_rate(jnp.eye(3), hat(jnp.array([1.0, 2.0, 3.0]))).tolist()
     [1.0, 2.0, 3.0]
     """
+    rate = _checks.floating(rate, (3, 3), "rate")
     return vee(product(rate, _checks.floating(matrix, (3, 3), "matrix").T))
 
 

@@ -1,4 +1,4 @@
-"""A state as a tuple of scalars, and back.
+"""A state as a tuple of scalars, or as one vector, and back.
 
 XLA on CPU runs a loop over a tuple of scalars as one kernel and, batched, over a tuple of (N,)
 arrays in vector instructions; of a loop over (7,) or (N, 7) arrays it makes many small kernels.
@@ -46,6 +46,44 @@ def join(parts: tuple[Array, ...], like: Any) -> Any:
 
 
 def leaf_sizes(like: Any) -> list[int]:
-    """How many parts `split` makes of each leaf, empty leaves left out."""
-    sizes = (math.prod(jnp.shape(leaf)) for leaf in jax.tree.leaves(like))
-    return [1 if size > FEW else size for size in sizes if size]
+    """How many numbers each array has.
+
+    >>> leaf_sizes((jnp.zeros((2, 3)), jnp.ones(())))
+    [6, 1]
+    """
+    return [math.prod(jnp.shape(leaf)) for leaf in jax.tree.leaves(like)]
+
+
+def flat(tree: Any) -> Array:
+    """The numbers of a tree of arrays of one dtype as a vector.
+
+    >>> flat((jnp.zeros(2), jnp.ones(())))
+    Array([0., 0., 1.], dtype=float64)
+    """
+    kinds = {jnp.result_type(leaf) for leaf in jax.tree.leaves(tree)}
+    if len(kinds) != 1:
+        raise TypeError(
+            f"wanted a state of one dtype, got {', '.join(sorted(map(str, kinds)))}; convert its "
+            "arrays to one, or use a solver of diffrax"
+        )
+    return jnp.concatenate([jnp.reshape(leaf, -1) for leaf in jax.tree.leaves(tree)])
+
+
+def unflat(vector: Array, like: Any) -> Any:
+    """The tree shaped as `like` whose numbers are those of `vector`."""
+    leaves, tree = jax.tree.flatten(like)
+    out, begin = [], 0
+    for leaf in leaves:
+        shape = jnp.shape(leaf)
+        out.append(vector[begin : begin + math.prod(shape)].reshape(shape))
+        begin += math.prod(shape)
+    return jax.tree.unflatten(tree, out)
+
+
+def lift(a: Array, like: Array) -> Array:
+    """`a` with leading axes of length 1, as many axes as `like`: last axes are those they share.
+
+    >>> lift(jnp.zeros(3), jnp.zeros((5, 2, 3))).shape
+    (1, 1, 3)
+    """
+    return a.reshape((1,) * (like.ndim - a.ndim) + a.shape)

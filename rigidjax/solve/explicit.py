@@ -1,4 +1,4 @@
-"""Explicit Runge–Kutta methods of orders 4, 5 and 8, every stage on scalar components."""
+"""Explicit Runge–Kutta methods of orders 4, 5 and 8 as solvers of diffrax."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
@@ -7,12 +7,13 @@ import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array
 
 from rigidjax.motion import on_the_group
-from rigidjax.solve.components import join, leaf_sizes, split
-from rigidjax.solve.scalarise import scalarise
+from rigidjax.solve.components import flat, leaf_sizes, unflat
+from rigidjax.solve.runge_kutta import Step, error_estimate, needs_last_slope, stages
 from rigidjax.solve.tableaus import DORMAND_PRINCE8, KUTTA4, TSITOURAS5, Row, Tableau
 
 Atoms = tuple[Array, ...]
@@ -53,7 +54,7 @@ def cubic_rows(rise: Any, h: Any, left: Any, right: Any) -> tuple[Any, Any, Any]
 
 
 class AbstractExplicit(dfx.AbstractAdaptiveSolver):
-    """All stages of `tableau` inside one step, on scalars; subclasses name the tableau."""
+    """All stages of `tableau` in a loop inside one step; subclasses name the tableau."""
 
     term_structure: ClassVar = dfx.ODETerm
     interpolation_cls: ClassVar = NestedInterpolation
@@ -77,9 +78,9 @@ class AbstractExplicit(dfx.AbstractAdaptiveSolver):
 class RungeKutta4(AbstractExplicit):
     """The classical Runge–Kutta method: order 4, four stages, an estimate of order 3.
 
-    For coarse tolerances (1e-3) and torques known to few digits. Every stage of a step is written
-    out on scalars, and a state with a quaternion `q` is scaled to |q| = 1 once per step, in dense
-    output too (cubic, as accurate as the steps themselves).
+    For coarse tolerances (1e-3) and torques known to few digits. A state with a quaternion `q` is
+    scaled to |q| = 1 once per step, in dense output too (cubic, as accurate as the steps
+    themselves).
 
     Source: Kutta 1901; Hairer, Nørsett and Wanner (1993), II.1, doi:10.1007/978-3-540-78862-1.
 
@@ -97,7 +98,7 @@ class RungeKutta4(AbstractExplicit):
 class Tsitouras5(AbstractExplicit):
     """Tsitouras' method of order 5, six stages, with an estimate of order 4.
 
-    For tolerances about 1e-4 to 1e-6. Stages, projection and dense output (quartic) as for
+    For tolerances about 1e-4 to 1e-6. Projection and dense output (quartic) as for
     `RungeKutta4`.
 
     Source: Tsitouras 2011, doi:10.1016/j.camwa.2011.06.002.
@@ -112,8 +113,9 @@ class Tsitouras5(AbstractExplicit):
 class DormandPrince8(AbstractExplicit):
     """The method DOP853 of order 8: twelve stages, estimates of orders 5 and 3.
 
-    For everything smooth, from 1e-4 to round-off. Stages and projection as for `RungeKutta4`;
-    dense output of degree 7, whose three more stages are computed only where it is asked for.
+    For everything smooth, from 1e-4 to round-off. Projection as for `RungeKutta4`; dense output of
+    degree 7, whose three more stages are computed
+    only where it is asked for.
 
     Source: Hairer, Nørsett and Wanner (1993), II.5 and II.6, doi:10.1007/978-3-540-78862-1; after
     Prince and Dormand 1981, doi:10.1016/0771-050X(81)90010-3.
@@ -156,76 +158,63 @@ def _fence(numbers: Atoms) -> Atoms:
     return lax.optimization_barrier(numbers)
 
 
-def error_estimate(tableau: Tableau, h: Any, slopes: Sequence[Atoms], like: Any) -> Atoms:
-    """The error of a step, component by component.
-
-    Two estimates e5, e3 make e5 |e5|/√(|e5|² + 0.01 |e3|²), which falls as h⁸ (Hairer, Nørsett and
-    Wanner 1993, II.10). The lengths are those of one leaf of the state `like`, so that no scale is
-    mixed with another's.
-    """
-    first = [_as(h, k) * k for k in _weighted(tableau.errors[0], slopes)]
-    if len(tableau.errors) == 1:
-        return tuple(first)
-    other = [_as(h, k) * k for k in _weighted(tableau.errors[1], slopes)]
-    out: list[Array] = []
-    for size in leaf_sizes(like):
-        here = slice(len(out), len(out) + size)
-        high = sum(jnp.sum(a * a) for a in first[here])
-        low = sum(jnp.sum(b * b) for b in other[here])
-        # The smallest normal number keeps 0/0 out; no real estimate is as small as its root.
-        tiny = float(jnp.finfo(first[here][0].dtype).tiny)
-        ratio = jnp.sqrt(high / (high + 0.01 * low + tiny))
-        out.extend(a * ratio for a in first[here])
-    return tuple(out)
-
-
 def _diffrax_step(
     tableau: Tableau, terms: Any, t0: Any, t1: Any, y0: Any, args: Any
 ) -> tuple[Any, Any, Any, None, dfx.RESULTS]:
-    numbers = scalarise(lambda t, y: terms.vf(t, y, args), t0, y0)
+    def field(_: Any, t: Any, y: Array) -> Array:
+        return flat(terms.vf(t, unflat(y, y0), args))
 
-    def field(t: Any, atoms: Atoms) -> Atoms:
-        return numbers(t, *atoms)
-
-    h = terms.contr(t0, t1)
-    start = split(y0)
-    end, slopes, _ = advance(tableau, field, t0, h, start)
+    start = flat(y0)
+    h = jnp.asarray(terms.contr(t0, t1))
+    step = Step(jnp.asarray(t0), h, jnp.asarray(t1), start)
+    there = stages(tableau, field, [], step)
     # Once, after the stages: inside them it changes the order (jaxsim#192).
-    end = split(on_the_group(join(end, y0)))
-    rows, slopes = _dense_rows(tableau, field, t0, t1, h, start, end, slopes)
+    y1 = on_the_group(unflat(there.end, y0))
+    end = flat(y1)
+    last = field([], t1, end)
+    slopes = jnp.concatenate([there.slopes, last[:, None]], 1)
     # Which steps are taken is not a thing to differentiate: their error is below the tolerance.
-    error = lax.stop_gradient(error_estimate(tableau, h, slopes, y0))
-    # Without a barrier XLA computes all stages again for each number that it stacks below. None for
-    # the rows: a barrier is kept, with all that it needs, even where nobody asks for its result.
-    end = lax.optimization_barrier(end)
-    error = lax.optimization_barrier(error)
-    coefficients = jax.tree.map(lambda *r: jnp.stack(r), *[join(row, y0) for row in rows])
+    error = error_estimate(
+        tableau,
+        leaf_sizes(y0),
+        h,
+        there.slopes,
+        last if needs_last_slope(tableau) else None,
+    )
+    error = unflat(lax.stop_gradient(error), y0)
+    rows = _dense_rows(tableau, field, step, end, slopes)
+    coefficients = jax.tree.map(
+        lambda *leaves: jnp.stack(leaves), *[unflat(row, y0) for row in rows]
+    )
     dense = dict(y0=y0, coefficients=coefficients)
-    return join(end, y0), join(error, y0), dense, None, dfx.RESULTS.successful
+    return y1, error, dense, None, dfx.RESULTS.successful
 
 
-def _dense_rows(
-    tableau: Tableau,
-    field: Callable[[Any, Atoms], Atoms],
-    t0: Any,
-    t1: Any,
-    h: Any,
-    start: Atoms,
-    end: Atoms,
-    slopes: list[Atoms],
-) -> tuple[list[Atoms], list[Atoms]]:
-    """The rows of `NestedInterpolation`, and the slopes with the one at the end of the step."""
-    slopes = [*slopes, field(t1, end)]
-    main = slopes
-    for node, row in zip(tableau.extra_c, tableau.extra_a, strict=True):
-        slopes = [*slopes, field(t0 + node * (t1 - t0), _along(start, h, row, slopes))]
-    left, right = slopes[0], slopes[len(tableau.a) + 1]
-    rise = tuple(b - a for a, b in zip(start, end, strict=True))
-    cubic = (cubic_rows(d, _as(h, d), k, m) for k, m, d in zip(left, right, rise, strict=True))
-    rows: list[Atoms] = list(zip(*cubic, strict=True))
+def _dense_rows(tableau: Tableau, field: Any, step: Step, end: Array, slopes: Array) -> list[Array]:
+    """The rows of `NestedInterpolation`, of all stages and the slope at the end."""
+    h = step.h.astype(end.dtype)
+    begin, more = slopes.shape[1], len(tableau.extra_c)
+    cubic = cubic_rows(end - step.y, h, slopes[:, 0], slopes[:, begin - 1])
+    if more:
+        matrix = np.zeros((more, begin + more))
+        for i, row in enumerate(tableau.extra_a):
+            matrix[i, list(row)] = list(row.values())
+        weights = jnp.asarray(matrix, end.dtype)
+        nodes = jnp.asarray(tableau.extra_c, step.t.dtype)
+
+        def extra(i: Array, slopes: Array) -> Array:
+            place = step.y + h * (weights[i][None] * slopes).sum(1)
+            slope = field([], step.t + nodes[i] * (step.end - step.t), place)
+            return lax.dynamic_update_slice_in_dim(slopes, slope[:, None], begin + i, 1)
+
+        slopes = jnp.concatenate([slopes, jnp.zeros((end.size, more), end.dtype)], 1)
+        slopes = lax.fori_loop(0, more, extra, slopes)
+    out = list(cubic)
     for row in tableau.dense:
-        rows.append(tuple(_as(h, k) * k for k in _weighted(row, slopes)))
-    return rows, main
+        weights = np.zeros(slopes.shape[1])
+        weights[list(row)] = list(row.values())
+        out.append(h * (jnp.asarray(weights, end.dtype)[None] * slopes).sum(1))
+    return out
 
 
 def _along(y: Atoms, h: Any, row: Row, slopes: Sequence[Atoms]) -> Atoms:

@@ -72,7 +72,7 @@ def tolerances(rtol: Any, atol: Any, dtype: Any) -> tuple[Any, Any]:
     if not _checks.known((rtol, atol)):
         return jnp.asarray(rtol, dtype), jnp.asarray(atol, dtype)
     # Floats of Python: those of NumPy would lift a float32 run to float64.
-    rtol, atol = float(rtol), float(atol)
+    rtol, atol = _checks.number(rtol, "rtol"), _checks.number(atol, "atol")
     if not 0 < rtol < np.inf or not 0 <= atol < np.inf:
         raise ValueError(f"simulate: wanted rtol > 0 and atol >= 0, got rtol={rtol}, atol={atol}")
     floor = 100 * float(jnp.finfo(dtype).eps)
@@ -126,7 +126,7 @@ def first_step(dt0: Any, times: Array) -> Array | None:
     """
     if dt0 is None:
         return None
-    step = jnp.asarray(dt0, times.dtype)
+    step = _checks.floating(dt0, (), "dt0").astype(times.dtype)
     if not _checks.known(step):
         return step
     if not 0 < float(step) < np.inf:

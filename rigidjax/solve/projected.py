@@ -6,8 +6,9 @@ import diffrax as dfx
 import equinox as eqx
 import jax.tree_util as jtu
 
+from rigidjax import _checks
 from rigidjax.motion import on_the_group
-from rigidjax.solve.watched import NONFINITE, finite
+from rigidjax.solve.step_control import NONFINITE, finite
 
 
 class GroupInterpolation(dfx.AbstractLocalInterpolation):
@@ -54,6 +55,9 @@ class Projected(dfx.AbstractWrappedSolver):
     """
 
     solver: dfx.AbstractSolver
+
+    def __check_init__(self) -> None:
+        _checks.instance(self.solver, dfx.AbstractSolver, "solver")
 
     @property
     def term_structure(self) -> Any:

@@ -14,11 +14,11 @@ from rigidjax.exact import FreeBody
 from rigidjax.frames import Point, collision, scene_of
 from rigidjax.motion import Attitude, Rigid, on_the_group
 from rigidjax.motion.torques import jumps_of
-from rigidjax.solve import lean, travel
-from rigidjax.solve.explicit import DormandPrince8
+from rigidjax.solve.adaptive import adaptive
+from rigidjax.solve.explicit import AbstractExplicit
 from rigidjax.solve.field import equations_of_motion
 from rigidjax.solve.projected import Projected
-from rigidjax.solve.watched import NONFINITE, finite
+from rigidjax.solve.step_control import NONFINITE, finite
 
 # Made once: building a Module costs as much as ten steps, and `jit` compares it leaf by leaf.
 SOLVER = Projected(dfx.Dopri8())
@@ -47,48 +47,28 @@ class Setup(eqx.Module):
     throw: bool = eqx.field(static=True)
 
 
-class Lean(eqx.Module):
-    """A solve of which nothing is asked but states and `jax.grad`: our own loop.
-
-    With the `adjoint` replaced by that for forward mode it is diffrax that solves it: there our
-    loop would be faster, but takes far longer to compile.
-    """
+class Loop(eqx.Module):
+    """A solve of which nothing is asked but states and derivatives: our own loop."""
 
     body: Inertia | MassProperties | None
     torque: Any
+    solver: AbstractExplicit
     controller: dfx.AbstractStepSizeController
     dt0: Any
-    adjoint: dfx.AbstractAdjoint
     max_steps: int = eqx.field(static=True)
     throw: bool = eqx.field(static=True)
-
-    def in_diffrax(self) -> Setup:
-        """The same scene to the same tolerances."""
-        return Setup(
-            body=self.body,
-            torque=self.torque,
-            solver=SOLVER,
-            controller=self.controller,
-            dt0=self.dt0,
-            adjoint=self.adjoint,
-            progress_meter=NO_METER,
-            max_steps=self.max_steps,
-            throw=self.throw,
-        )
 
 
 @eqx.filter_jit
 def solve(
-    setup: Free | Lean | Setup, state0: Any, ts: Array
+    setup: Free | Loop | Setup, state0: Any, ts: Array
 ) -> tuple[Any, dict[str, Any], dfx.RESULTS]:
     # One jit around everything: an operation outside of it costs as much as a hundred steps.
     state0 = on_the_group(state0)
     if isinstance(setup, Free):
         return _free(setup, state0, ts)
-    if isinstance(setup, Lean) and setup.adjoint == ADJOINT:
-        return _lean(setup, state0, ts)
-    if isinstance(setup, Lean):
-        setup = setup.in_diffrax()
+    if isinstance(setup, Loop):
+        return _loop(setup, state0, ts)
     field = equations_of_motion(setup.body, state0, setup.torque)
     scene: Any = scene_of(setup.torque) if isinstance(state0, Point) else None
     watch = collision.event(scene)
@@ -130,10 +110,10 @@ def solve(
     return ys, stats, result
 
 
-def _lean(setup: Lean, state0: Any, ts: Array) -> tuple[Any, dict[str, Any], dfx.RESULTS]:
+def _loop(setup: Loop, state0: Any, ts: Array) -> tuple[Any, dict[str, Any], dfx.RESULTS]:
     controller: Any = setup.controller
-    out = lean.adaptive(
-        DormandPrince8(),
+    out = adaptive(
+        setup.solver,
         equations_of_motion(setup.body, state0, setup.torque),
         ts,
         state0,
@@ -142,7 +122,6 @@ def _lean(setup: Lean, state0: Any, ts: Array) -> tuple[Any, dict[str, Any], dfx
         dt0=setup.dt0,
         max_steps=setup.max_steps,
         jumps=jumps_of(setup.torque),
-        way=travel.reverse,
     )
     ys = _raise(out.ys, out.result) if setup.throw else out.ys
     stats: dict[str, Any] = {
@@ -201,11 +180,11 @@ def free_motion(body: Inertia | MassProperties, state0: Any, since: Array) -> An
 class Flow(eqx.Module):
     """The same run from another start, as a function that forward mode goes through."""
 
-    setup: Free | Lean | Setup
+    setup: Free | Loop | Setup
 
-    def __init__(self, setup: "Free | Lean | Setup"):
+    def __init__(self, setup: "Free | Loop | Setup"):
         setup = dataclasses.replace(setup, throw=False)
-        if not isinstance(setup, Free):
+        if isinstance(setup, Setup):
             setup = dataclasses.replace(setup, adjoint=dfx.ForwardMode())
         self.setup = setup
 

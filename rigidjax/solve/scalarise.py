@@ -17,7 +17,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.extend import core
-from jaxtyping import Array
 
 from rigidjax.solve.components import FEW
 
@@ -47,23 +46,6 @@ def scalarise(function: Callable[..., Any], *like: Any) -> Callable[..., tuple[A
     >>> scalarise(lambda a, b: jnp.cross(a, b), jnp.zeros(3), jnp.zeros(3))(1.0, 0, 0, 0, 1.0, 0)[2]
     Array(1., dtype=float64)
     """
-    numbers, constants = opened(function, *like)
-    values = spread(constants)
-    return lambda *parts: numbers(values, *parts)
-
-
-def opened(
-    function: Callable[..., Any], *like: Any
-) -> tuple[Callable[..., tuple[Any, ...]], list[Any]]:
-    """`scalarise`, with what the function closes over taken out: for rules of differentiation.
-
-    **Returns** a function that takes first the constants, spread by `spread`, then the numbers;
-    and the constants as arrays.
-
-    >>> numbers, constants = opened(lambda a, b=jnp.ones(2): a * b, jnp.zeros(2))
-    >>> len(constants), len(numbers(spread(constants), 1.0, 2.0))
-    (1, 2)
-    """
     leaves, structure = jax.tree.flatten(like)
     shapes = [jax.ShapeDtypeStruct(jnp.shape(leaf), jnp.result_type(leaf)) for leaf in leaves]
 
@@ -72,7 +54,9 @@ def opened(
 
     closed: Any = jax.make_jaxpr(flat)(*shapes)
 
-    def numbers(constants: Sequence[Value], *parts: Any) -> tuple[Any, ...]:
+    constants = [_take(constant) for constant in closed.consts]
+
+    def numbers(*parts: Any) -> tuple[Any, ...]:
         queue = iter(parts)
         values: list[Value] = []
         for shape in shapes:
@@ -89,42 +73,7 @@ def opened(
             flattened.extend(jnp.asarray(scalar, variable.aval.dtype) for scalar in scalars)
         return tuple(flattened)
 
-    return numbers, list(closed.consts)
-
-
-def spread(constants: Sequence[Any]) -> list[Value]:
-    """Arrays as the scalars that `opened` works on, made once, outside of any loop."""
-    return [_take(constant) for constant in constants]
-
-
-def atoms_of(values: Sequence[Value]) -> tuple[list[Array], Callable[[Sequence[Any]], list[Value]]]:
-    """The real numbers among spread values as one list; and what puts others in their place."""
-    slots = [list(v.flat) if isinstance(v, np.ndarray) else [v] for v in values]
-    real = [[jnp.issubdtype(jnp.result_type(a), jnp.inexact) for a in slot] for slot in slots]
-
-    def replaced(atoms: Sequence[Any]) -> list[Value]:
-        queue, out = iter(atoms), []
-        for value, slot, which in zip(values, slots, real, strict=True):
-            new = [next(queue) if ours else a for a, ours in zip(slot, which, strict=True)]
-            out.append(_objects(new, value.shape) if isinstance(value, np.ndarray) else new[0])
-        return out
-
-    pairs = zip(itertools.chain(*slots), itertools.chain(*real), strict=True)
-    return [jnp.asarray(a) for a, ours in pairs if ours], replaced
-
-
-def gathered(values: Sequence[Value], atoms: Sequence[Array]) -> list[Array | None]:
-    """Arrays of `atoms` as they lie in the values they came from; `None` for whole numbers."""
-    queue, out = iter(atoms), []
-    for value in values:
-        slot = list(value.flat) if isinstance(value, np.ndarray) else [value]
-        real = bool(slot) and jnp.issubdtype(jnp.result_type(slot[0]), jnp.inexact)
-        parts = [next(queue) for _ in slot] if real else []
-        if not isinstance(value, np.ndarray):
-            out.append(parts[0] if real else None)
-        else:
-            out.append(jnp.stack(parts).reshape(value.shape) if real else None)
-    return out
+    return numbers
 
 
 def _evaluate(jaxpr: Any, constants: Sequence[Value], arguments: Sequence[Value]) -> list[Value]:

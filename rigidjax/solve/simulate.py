@@ -17,16 +17,16 @@ from rigidjax.motion.torques import jumps_of
 from rigidjax.solve import inputs
 from rigidjax.solve.explicit import AbstractExplicit, DormandPrince8
 from rigidjax.solve.projected import Projected
-from rigidjax.solve.run import ADJOINT, NO_METER, SOLVER, Free, Lean, Setup, solve
+from rigidjax.solve.run import ADJOINT, NO_METER, SOLVER, Free, Loop, Setup, solve
 from rigidjax.solve.solution import Solution, State
 from rigidjax.solve.splitting import AbstractSplitting
-from rigidjax.solve.watched import Watched
+from rigidjax.solve.step_control import Watched
 
 # A law must take the state that there is: gravity on a `Spin` is an error that type checkers see.
 Law = Callable[[Any, State, Any], Any] | AbstractScene | MovingFrame | None
 
-# Our loop takes a short step to each saved time, where diffrax has a polynomial to evaluate.
-_FEW_TIMES = 32
+# Our loop has both modes of differentiation: these adjoints of diffrax say no more than that.
+_EITHER_MODE = (type(None), dfx.ForwardMode, dfx.RecursiveCheckpointAdjoint)
 # A step that reverse mode runs again rounds differently. Where the tolerance is so near round-off
 # that its length then differs, too, the gradient is of no run at all (2e-4 off at 1e-13 under the
 # gravity gradient): keep the start of every step of all but the longest runs.
@@ -65,14 +65,12 @@ def simulate(
       `Point` a scene of `rigidjax.scenes`, a `MovingFrame` to see it from, or a force per mass
       `(t, state, None) → (3,)`, m/s².
     - `solver`: `None` is the cheapest that is right: the closed form (`rigidjax.exact`) for a free
-      body, else order 8: `rigidjax.solvers.DormandPrince8` in a loop of our own for bodies and
-      at most 32 times, `diffrax.Dopri8` for more, for a `Point`, and where a controller, forward
-      mode or a meter is asked for. Beside Dopri8 our loop takes 0.4 to 0.6 of the time for a value
-      and 0.5 to 0.9 for a gradient, under `vmap` 0.2 to 0.5 and 0.6 to 0.7, but half as long again
-      to compile one (asymmetric heavy top at 1e-9, 2 and 30 times). Any `diffrax.AbstractSolver`
-      may be given; it is wrapped so that attitudes stay unit quaternions, at every step and every
-      saved time. Below `rtol=1e-10` mind that Dopri8 is up to 26 times `rtol` off between its steps
-      (five times at most with `DormandPrince8`).
+      body, else `rigidjax.solvers.DormandPrince8` (order 8), however many times are saved. The
+      explicit methods of `rigidjax.solvers` run in a loop of our own; so does the default, unless a
+      controller, a meter or `max_steps=None` is asked for, or a `Point` can collide: then diffrax
+      runs it. Any `diffrax.AbstractSolver` may be given; it is wrapped so that attitudes stay unit
+      quaternions, at every step and every saved time. Below `rtol=1e-10` mind that Dopri8 is up to
+      26 times `rtol` off between its steps (five times at most with `DormandPrince8`).
     - `rtol`, `atol`: tolerances of the adaptive steps; 1e-9 and 1e-12 in float64, 2e-5 and 1e-7 in
       float32. Traced ones are not checked, and others then compile nothing. Scale `atol` to the
       smallest number that matters: a flip about the middle axis grows out of how far off the axis
@@ -80,10 +78,11 @@ def simulate(
       either.
     - `dt0`, `stepsize_controller`: first step and controller where the tolerances are not enough,
       such as `dt0=0.01, stepsize_controller=diffrax.ConstantStepSize()`.
-    - `adjoint`: how gradients through a solver are taken. `None` is reverse mode, for `jax.grad`:
-      `diffrax.RecursiveCheckpointAdjoint()`, with 4096 checkpoints where `rtol` is known to be
-      below 1e-10, or that of our loop; pass `diffrax.ForwardMode()` for `jax.jacfwd` and least
-      squares. The closed form takes both.
+    - `adjoint`: how derivatives through a solver of diffrax are taken, as there. `None` is
+      `diffrax.RecursiveCheckpointAdjoint()` for `jax.grad`, with 4096 checkpoints where `rtol` is
+      known to be below 1e-10; `diffrax.ForwardMode()` is for `jax.jacfwd`. Our loop and the closed
+      form need none: `jax.grad`, `jax.jacfwd`, `jax.jacrev` and `jax.hessian` (forward over
+      reverse) go through, and `jax.grad` of a `jax.grad` is refused.
     - `max_steps`, `progress_meter`: as in `diffrax.diffeqsolve`.
     - `throw`: `False` never raises for numbers met on the way, or for a bad start inside a batch:
       `result` says what happened, states not reached are NaN, and other bodies of the batch get
@@ -102,6 +101,7 @@ def simulate(
     >>> bool(abs(rj.simulate(body, start, jnp.linspace(0.0, 9.43, 3)).ys.omega[-1, 1]) < 0.01)
     True
     """
+    max_steps = None if max_steps is None else _checks.whole(max_steps, "max_steps", 1)
     times = inputs.times(ts, throw)
     state0 = inputs.start(state0, throw)
     dtype = times.dtype
@@ -127,16 +127,14 @@ def simulate(
     if torque is None and solver is None and stepsize_controller is None and body is not None:
         free = Free(body, throw)
         return Solution(times, *solve(free, state0, times), free)
-    # A point's gradient takes our loop 14 s to compile (Arenstorf; diffrax 3): only if asked for.
-    ours = isinstance(solver, DormandPrince8) or (solver is None and body is not None)
-    plain = ours and stepsize_controller is None and progress_meter is None
-    # Forward mode stays with diffrax: there our loop is faster, but takes far longer to compile.
-    plain = plain and (adjoint is None or adjoint == ADJOINT) and max_steps is not None
-    plain = plain and times.shape[0] <= _FEW_TIMES
-    if plain and not _can_collide(state0, torque):
+    method = DormandPrince8() if solver is None else solver
+    plain = isinstance(method, AbstractExplicit) and max_steps is not None
+    plain = plain and stepsize_controller is None and progress_meter is None
+    plain = plain and isinstance(adjoint, _EITHER_MODE) and not _can_collide(state0, torque)
+    if plain:
         first = inputs.first_step(dt0, times)
-        quick = Lean(body, torque, controller, first, ADJOINT, max_steps, throw)  # pyright: ignore
-        return Solution(times, *solve(quick, state0, times), quick)
+        loop = Loop(body, torque, method, controller, first, max_steps, throw)  # pyright: ignore
+        return Solution(times, *solve(loop, state0, times), loop)
     setup = Setup(
         body=body,
         torque=torque,

@@ -15,7 +15,7 @@ from rigidjax._types import ScalarLike
 from rigidjax.frames import Point
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.solve.growth import growth
-from rigidjax.solve.run import Flow, Free, Lean, Setup, solve
+from rigidjax.solve.run import Flow, Free, Loop, Setup, solve
 
 State = TypeVar("State", Spin, Attitude, Rigid, Point)
 
@@ -34,7 +34,7 @@ class Solution(eqx.Module, Generic[State]):
     ys: State
     stats: dict[str, Any]
     result: dfx.RESULTS
-    _setup: Free | Lean | Setup
+    _setup: Free | Loop | Setup
 
     @property
     def drift(self) -> dict[str, Array]:
@@ -98,6 +98,6 @@ class Solution(eqx.Module, Generic[State]):
 
 
 @eqx.filter_jit
-def _drift(setup: Free | Lean | Setup, ts: Array, ys: Any) -> dict[str, Array]:
+def _drift(setup: Free | Loop | Setup, ts: Array, ys: Any) -> dict[str, Array]:
     torque = None if isinstance(setup, Free) else setup.torque
     return motion.drift(ts, ys, setup.body, torque)  # pyright: ignore[reportArgumentType]

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from typing import Any
 
 from rigidjax.workprecision.pareto import front
-from rigidjax.workprecision.record import Record
+from rigidjax.workprecision.record import Record, listed
 
 _MARKS = "osv^<>DPX*hp8d"
 _COLOURS = {"ours": "tab20", "jax": "Set2", "peer": "Dark2"}
@@ -24,7 +24,7 @@ def draw(records: Iterable[Record], *, title: str | None = None) -> Any:
     **Raises:** `ModuleNotFoundError` where matplotlib is missing (`pip install 'rigidjax[view]'`);
     `ValueError` where there is nothing to draw.
     """
-    records = [r for r in records if r.error == r.error]
+    records = [r for r in listed(records) if r.error == r.error]
     if not records:
         raise ValueError("draw: wanted records with an error and a time, got none")
     import matplotlib.pyplot as plt

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from rigidjax.exact import FreeBody
-from rigidjax.solve import equations_of_motion, lean, simulate, solvers, travel
+from rigidjax.solve import equations_of_motion, lean, simulate, solvers
 from rigidjax.workprecision.method import Method, Ready, Run
 from rigidjax.workprecision.scene import Scene
 
@@ -89,7 +89,7 @@ def _field(scene: Scene, body: Any, start: Any) -> Any:
     return equations_of_motion(body, start, scene.torque)
 
 
-def _lean(scene: Scene, solver: Any, way: Any = travel.forward) -> Flow:
+def _lean(scene: Scene, solver: Any) -> Flow:
     """What `simulate` runs in under a torque, without its front door, in both modes."""
 
     def flow(numbers: Any, setting: Any) -> tuple[Any, Any]:
@@ -97,7 +97,7 @@ def _lean(scene: Scene, solver: Any, way: Any = travel.forward) -> Flow:
         ts = jnp.array([0.0, scene.end], numbers.dtype)
         out = lean.adaptive(
             solver, _field(scene, body, start), ts, start, rtol=setting, atol=1e-3 * setting,
-            max_steps=MOST, way=way,
+            max_steps=MOST,
         )  # fmt: skip
         end: Any = jax.tree.map(lambda leaf: leaf[-1], out.ys)
         return scene.flat(end), out.num_steps
@@ -207,9 +207,7 @@ def methods_in_jax() -> list[Method]:
             TOLERANCES,
             partial(_value, _simulate),
             {
-                "forward": partial(
-                    _slope, partial(_simulate, adjoint=dfx.ForwardMode()), jax.jacfwd
-                ),
+                "forward": partial(_slope, _simulate, jax.jacfwd),
                 "reverse": partial(_slope, _simulate, jax.grad),
             },
         ),
@@ -220,9 +218,7 @@ def methods_in_jax() -> list[Method]:
             partial(_value, partial(_lean, solver=eight)),
             {
                 "forward": partial(_slope, partial(_lean, solver=eight), jax.jacfwd),
-                "reverse": partial(
-                    _slope, partial(_lean, solver=eight, way=travel.reverse), jax.grad
-                ),
+                "reverse": partial(_slope, partial(_lean, solver=eight), jax.grad),
             },
         ),
         Method("Tsitouras5", "ours", TOLERANCES, partial(_value, partial(_lean, solver=five))),

@@ -1,5 +1,6 @@
 """All methods that can be compared here."""
 
+from rigidjax import _checks
 from rigidjax.workprecision.in_jax import methods_in_jax
 from rigidjax.workprecision.method import Method
 from rigidjax.workprecision.outside import methods_outside
@@ -13,5 +14,7 @@ def methods(group: str | None = None) -> list[Method]:
     >>> [method.name for method in methods("ours")][:2]
     ['closed form', 'simulate']
     """
+    if group is not None:
+        _checks.word(group, ("ours", "jax", "peer"), "group")
     found = [*methods_in_jax(), *methods_outside()]
     return [method for method in found if group in (None, method.group)]

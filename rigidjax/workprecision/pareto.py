@@ -5,7 +5,8 @@ import math
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
-from rigidjax.workprecision.record import Record
+from rigidjax import _checks
+from rigidjax.workprecision.record import Record, listed
 
 WANTED = (1e-4, 1e-7, 1e-10)
 
@@ -22,7 +23,7 @@ def front(records: Iterable[Record]) -> list[Record]:
     >>> [record.method for record in front([slow, quick])]
     ['quick']
     """
-    records = [r for r in records if r.error == r.error and r.time == r.time]
+    records = [r for r in listed(records) if r.error == r.error and r.time == r.time]
     kinds = {(r.scene, r.kind) for r in records}
     if len(kinds) > 1:
         raise ValueError(
@@ -46,7 +47,8 @@ def time_to(records: Iterable[Record], error: float) -> float:
     >>> round(time_to([rough, fine], 1e-3), 6)
     2.0
     """
-    rungs = sorted((r for r in records if r.error == r.error), key=lambda r: r.time)
+    error = _checks.positive(error, "error")
+    rungs = sorted((r for r in listed(records) if r.error == r.error), key=lambda r: r.time)
     # Errors need not fall with every setting: what counts is the least error up to a time.
     least, seen = math.inf, []
     for record in rungs:
@@ -93,7 +95,7 @@ def choose(records: Iterable[Record], wanted: Sequence[float] = WANTED) -> list[
     >>> choose([])
     []
     """
-    records = list(records)
+    records = listed(records)
     scenes = dict.fromkeys(r.scene for r in records)
     return [_choice([r for r in records if r.scene == s], s, e) for s in scenes for e in wanted]
 

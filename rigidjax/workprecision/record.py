@@ -5,6 +5,8 @@ import dataclasses
 from collections.abc import Iterable
 from pathlib import Path
 
+from rigidjax import _checks
+
 
 @dataclasses.dataclass(frozen=True)
 class Record:
@@ -50,6 +52,19 @@ class Record:
 
 
 _WORDS = ("scene", "method", "group", "kind", "adjoint")
+
+
+def listed(records: Iterable[Record], name: str = "records") -> list[Record]:
+    """The records as a list; `TypeError` where something else is among them.
+
+    >>> listed(())
+    []
+    """
+    _checks.instance(records, Iterable, name, wanted="records")
+    found = list(records)
+    for record in found:
+        _checks.instance(record, Record, name)
+    return found
 
 
 def write_csv(records: Iterable[Record], path: str | Path) -> None:

@@ -4,7 +4,7 @@ import dataclasses
 import math
 from collections.abc import Iterable
 
-from rigidjax.workprecision.record import Record
+from rigidjax.workprecision.record import Record, listed
 
 # Errors at round-off wander: nothing below this has moved.
 FLOOR = 1e-13
@@ -25,6 +25,7 @@ def moved(records: Iterable[Record], stored: Iterable[Record]) -> tuple[list[str
     >>> moved([was], [was])
     ([], [])
     """
+    records, stored = listed(records), listed(stored, "stored")
     now = {_key(r): r for r in records if r.group != "peer"}
     then = {_key(r): r for r in stored if r.group != "peer"}
     wrong, paced = [], []

@@ -91,6 +91,7 @@ def weighed(states):
     return jnp.sum(a * states.q**2) + jnp.sum(b * states.omega)
 
 
+@pytest.mark.oldest
 def test_derivatives_are_those_of_the_steps():
     # Reverse mode in pieces against plain forward mode through the loop of `solve`, h included.
     bodies, states = batch(2)
@@ -121,6 +122,7 @@ def test_derivatives_are_those_of_the_steps():
         assert jnp.abs(a - b).max() < 1e-13 * max(1.0, jnp.abs(b).max())
 
 
+@pytest.mark.oldest
 @pytest.mark.parametrize(
     "moments",
     [

@@ -85,6 +85,7 @@ def test_derivatives_are_finite_forward_and_reverse_at_every_scale(name, dtype):
             assert bool(jnp.isfinite(jacobian).all())
 
 
+@pytest.mark.oldest
 def test_derivatives_of_distinct_moments_agree_with_fifty_digits():
     a, e = BODIES["generic"], symmetric(5)
 
@@ -116,6 +117,7 @@ def test_derivatives_of_distinct_moments_agree_with_fifty_digits():
     np.testing.assert_allclose(bend, second, rtol=1e-10, atol=1e-10)
 
 
+@pytest.mark.oldest
 @pytest.mark.parametrize("name", ["sphere", "oblate", "prolate", "rotated oblate"])
 def test_what_depends_on_equal_moments_symmetrically_has_the_right_derivative(name):
     # Σ λ³ = Tr A³ and the eigenspace of the odd moment are smooth where moments meet.
@@ -166,6 +168,7 @@ def along(x, direction, scale):
     )
 
 
+@pytest.mark.oldest
 @pytest.mark.parametrize("name", BODIES)
 def test_exponential_and_its_derivatives_at_equal_moments_and_any_scale(name):
     a, e = BODIES[name], symmetric(3)

@@ -89,7 +89,10 @@ def test_a_cloud_weighs_the_same_in_any_order_and_frame():
 
 
 WRONG = {
-    "rows": (lambda: shapes.points([1.0, 2.0], np.zeros((3, 3))), r"positions: .*one row per mass"),
+    "rows": (
+        lambda: shapes.points([1.0, 2.0], np.zeros((3, 3))),
+        r"positions: wanted shape .*masses have as many rows",
+    ),
     "negative": (lambda: shapes.points([1.0, -2.0], np.zeros((2, 3))), "masses ≥ 0, got -2.0"),
     "massless": (lambda: shapes.points([0.0, 0.0], np.zeros((2, 3))), "mass"),
     "NaN": (lambda: shapes.points([1.0], [[0.0, np.nan, 0.0]]), r"positions: .*index \(0, 1\)"),
@@ -98,7 +101,10 @@ WRONG = {
         "density: wanted",
     ),
     "below zero": (lambda: shapes.voxels(-np.ones((2, 2, 2)), [1.0] * 3, [0.0] * 3), "≥ 0"),
-    "order": (lambda: shapes.quadrature(lambda r: r[0], lambda u: u, 0), "at least 1 point"),
+    "order": (
+        lambda: shapes.quadrature(lambda r: r[0], lambda u: u, 0),
+        "order: wanted a whole number of at least 1",
+    ),
 }
 
 

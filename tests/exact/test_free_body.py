@@ -265,6 +265,7 @@ GRADED = [
 ]
 
 
+@pytest.mark.oldest
 def test_first_derivatives_in_every_class():
     x = np.concatenate([inputs(name, 2, [t]) for name, t in GRADED])
     got = np.asarray(jacobian(jnp.asarray(x)))
@@ -272,6 +273,23 @@ def test_first_derivatives_in_every_class():
         ref = true_jacobian(row, step="1e-22").astype(float)
         error = np.abs(j - ref).max() / np.abs(ref).max()
         assert error < 1e-12, (GRADED[k // 2], error)
+
+
+@pytest.mark.oldest
+def test_first_derivatives_at_any_size_and_rate():
+    # I → 2ᵏI, Ω → 2ʲΩ, t → 2⁻ʲt changes units only. As many rows as above: one program.
+    names = ("triaxial", "sphere", "plate", "axis 2", "rest")
+    x = np.concatenate([inputs(name, 1, [3.0]) for name in names])
+    units = ((0, 0), (700, -200), (-700, 200), (300, 350), (-1000, 0), (900, -20))
+    ins = [np.ldexp(1.0, [k] * 6 + [j] * 3 + [0] * 4 + [-j]) for k, j in units]
+    outs = [np.ldexp(1.0, [0] * 4 + [j] * 3) for _, j in units]
+    got = np.asarray(jacobian(jnp.asarray(np.concatenate([x * c for c in ins]))))
+    got = got.reshape(len(units), len(names), 7, 14)
+    for k, name in enumerate(names):
+        ref = true_jacobian(x[k], step="1e-22").astype(float)
+        for unit, c, out, j in zip(units, ins, outs, got[:, k], strict=True):
+            error = np.abs(j * c / out[:, None] - ref).max() / np.abs(ref).max()
+            assert error < 1e-12, (name, unit, error)
 
 
 @pytest.mark.slow
@@ -326,6 +344,7 @@ def _mean_precession(i, omega):
     return 2 * np.pi / (h * (m2 @ a[others] / m2.sum(1)).mean())
 
 
+@pytest.mark.oldest
 @pytest.mark.parametrize("omega", [(1.0, 0.5, 0.2), (0.3, 0.2, 0.9), (0.7, -0.3, 0.2)])
 def test_periods(omega):
     i = Inertia.from_principal(1.0, 3.0836, 3.235)

@@ -1,13 +1,14 @@
 """Row D15: which derivative goes with which adjoint; what is read where it does not.
 
-The default is reverse mode. Forward mode through it is refused (diffrax#336), in words that name
-the way out; least squares of a forced recording, which wants forward mode, picks it itself.
+The default of `simulate` has both modes. Through a solver of diffrax the adjoint says which
+(diffrax#336); least squares of a forced recording, which wants forward mode, picks it itself.
 """
 
 import diffrax as dfx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix as optx
 import pytest
 from systems.tumble import BODY, OMEGA, TOP, Q
 
@@ -22,10 +23,19 @@ def end(omega, **how):
     return rj.simulate(BODY, rj.Attitude(Q, omega), TS, TOP, **how).ys.omega[-1]
 
 
-def test_d15_forward_through_the_default_is_refused():
-    with pytest.raises(TypeError, match=r"forward-mode|ForwardMode|custom_vjp"):
-        jax.jacfwd(end)(jnp.asarray(OMEGA))
-    assert "diffrax.ForwardMode()" in rj.simulate.__doc__
+def test_d15_both_modes_through_the_default():
+    omega = jnp.asarray(OMEGA)
+    forward, reverse = jax.jit(lambda w: (jax.jacfwd(end)(w), jax.jacrev(end)(w)))(omega)
+    np.testing.assert_allclose(forward, reverse, rtol=0, atol=1e-12)
+
+
+def test_d15_a_plain_least_squares_solver_through_the_default():
+    """optimistix's Levenberg–Marquardt with its own defaults: it takes forward mode."""
+    wanted = end(jnp.asarray(OMEGA))
+    solver = optx.LevenbergMarquardt(rtol=1e-10, atol=1e-10)
+    near = jnp.asarray(OMEGA) + 0.05
+    found = optx.least_squares(lambda w, _: end(w) - wanted, solver, near)
+    np.testing.assert_allclose(found.value, OMEGA, atol=1e-8)
 
 
 @pytest.mark.parametrize(

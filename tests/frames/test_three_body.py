@@ -168,6 +168,7 @@ def closes(scene, orbit, bar):
     np.testing.assert_allclose(end, start, rtol=0, atol=bar)
 
 
+@pytest.mark.oldest
 @pytest.mark.parametrize("point", [1, 2, 3])
 def test_lyapunov_family(point):
     @eqx.filter_jit

@@ -32,6 +32,7 @@ def problem():
 NOISE = (jnp.full((24, 3), SIGMA),)
 
 
+@pytest.mark.oldest
 def test_few_recordings_show_the_whole_misfit_without_bias(problem):
     # Every recording once in batches of one: their mean is the misfit of all.
     point = problem.start(rj.Inertia.from_principal(1.2, 1.5, 1.9))

@@ -168,7 +168,7 @@ def test_other_mistakes_are_named(tumble):
         rj.identify.Problem(problem, rj.identify.Ratios())
     with pytest.raises(TypeError, match="got ndarray for a sensor"):
         rj.identify.Recording(ts, (np.zeros(3), ys.omega))
-    with pytest.raises(ValueError, match="at least one start, got 0"):
+    with pytest.raises(ValueError, match="starts: wanted a whole number of at least 1, got 0"):
         rj.identify.fit(problem, starts=0)
     with pytest.raises(ValueError, match="positive standard deviation"):
         rj.identify.Gyro(noise=-1.0)

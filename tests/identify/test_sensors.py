@@ -148,7 +148,7 @@ MISTAKES = [
     (lambda: rj.identify.Direction([0.0, 0.0, 0.0]), "got a vector of length zero"),
     (lambda: rj.identify.Direction([0.0, 0, 1], [0.1, 0.1, 0.1]), r"one number or two, got shape \(3,\)"),
     (lambda: rj.identify.quaternions_from_matrices(np.diag([1.0, 1, -1])[None]), "index 0 is no rotation.*det = -1"),
-    (lambda: rj.identify.quaternions_from_euler([[0.0, 0, 0]], "ZYX", unit="grad"), "wanted rad or deg"),
+    (lambda: rj.identify.quaternions_from_euler([[0.0, 0, 0]], "ZYX", unit="grad"), "wanted one of rad, deg"),
     (lambda: rj.identify.Recording([0.0, 1.0], (rj.identify.Direction([0.0, 0, 1]), [[0.0, 0, 1], [0.0, 0, 2]])), "direction at index 1 is not of length 1"),
     (lambda: rj.identify.Recording([0.0, 1.0], (rj.identify.Gyro(), np.zeros((2, 3)), [False, False])), "it is masked|is masked"),
 ]  # fmt: skip

@@ -336,7 +336,7 @@ def test_energy_adds_up():
         (lambda: torques.require_rung(torques.Damping, SPIN), "torque: got the class Damping"),
         (lambda: torques.Damping([1.0, np.nan, 1.0]), "coefficient: contains NaN"),
         (lambda: torques.GravityGradient(1.0, np.zeros(3)), "position: .*got zero"),
-        (lambda: torques.FromPotential(3.0), "wanted a callable q → U, got float"),
+        (lambda: torques.FromPotential(3.0), "wanted a function q → U, J, got float"),
         (lambda: torques.require_rung(TOP, SPIN), "HeavyTop needs a state with HasAttitude.*climb"),
         (lambda: torques.require_rung(torques.Sum(WHEEL, TOP), SPIN), "Sum needs.*HasAttitude"),
         (lambda: torques.require_rung(FALL, ATTITUDE), "UniformGravity needs a state with HasPose"),

@@ -296,7 +296,7 @@ def test_words_on_mistakes(flip, monkeypatch):
             rj.Point(flip.ys.omega, flip.ys.omega),
             plane="xyz",
         )
-    with pytest.raises(ValueError, match="at least two pictures and times, got 1 and 101"):
+    with pytest.raises(ValueError, match="pictures: wanted a whole number of at least 2, got 1"):
         rj.plot.tumble(BODY, flip.ts, flip.ys, pictures=1)
     monkeypatch.setitem(sys.modules, "matplotlib.pyplot", None)
     with pytest.raises(ModuleNotFoundError, match=r"pip install 'rigidjax\[view\]'"):

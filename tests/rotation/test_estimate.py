@@ -19,6 +19,7 @@ def project_truth(a, e):
     return r, r @ solve_sylvester(p, p, r.T @ e - e.T @ r)
 
 
+@pytest.mark.oldest
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_projection_and_its_derivative(dtype):
     """R6: at 1, at rotations, 1e-9 and 1e-4 from them, and far: 1e-13 / 1e-6, jvp and vjp."""
@@ -73,6 +74,7 @@ def test_wahba_against_scipy_and_two_vectors():
     np.testing.assert_allclose(so3.wahba(body, body @ m.T), m, atol=1e-11)
 
 
+@pytest.mark.oldest
 def test_wahba_derivative():
     """Turning all world directions turns the answer; a general direction by differences."""
     rng = np.random.default_rng(3)

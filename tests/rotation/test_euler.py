@@ -127,7 +127,7 @@ def test_unknown_sequences(bad, unhooked):
 
 
 def test_bad_frame_and_degrees(unhooked):
-    with pytest.raises(ValueError, match="frame: wanted 'body' or 'world', got 'space'"):
+    with pytest.raises(ValueError, match="frame: wanted one of body, world, got 'space'"):
         euler.rates_to_omega(jnp.zeros(3), jnp.zeros(3), frame="space")
     with pytest.warns(UserWarning, match="are they degrees"):
         euler.to_matrix(jnp.array([90.0, 45.0, 0.0]))

@@ -40,6 +40,7 @@ ROUTES = {
 }
 
 
+@pytest.mark.oldest
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("route", list(ROUTES))
 def test_log_of_exp_is_one_with_its_jacobian_in_both_modes(route, dtype):
@@ -63,6 +64,7 @@ def test_log_of_exp_is_one_with_its_jacobian_in_both_modes(route, dtype):
         assert error[sure].max() < (1e-12 if dtype == np.float64 else 1e-5)
 
 
+@pytest.mark.oldest
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("route", list(ROUTES))
 def test_second_derivative_of_log_of_exp_is_zero(route, dtype):

@@ -1,4 +1,4 @@
-"""Gradients of our own loop: against forward mode of the same steps, closed forms and differences."""
+"""Derivatives of our own loop: each mode against the others, closed forms and differences."""
 
 import diffrax as dfx
 import equinox as eqx
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import rigidjax as rj
-from rigidjax.solve import abreast, backward, lean, travel
+from rigidjax.solve import adaptive_loop, lanes, lean
 
 Q = np.array([0.8, -0.2, 0.4, 0.4]) / np.linalg.norm([0.8, -0.2, 0.4, 0.4])
 TENSOR = np.array([[1.0, 0.05, -0.1], [0.05, 1.7, 0.2], [-0.1, 0.2, 2.2]])
@@ -36,7 +36,7 @@ def scenes(p):
     return {"pulses": rj.torques.Sum(pulses, top), "wheel": wheel}
 
 
-def run(name, ts, way, p, weights, max_steps=100_000):
+def run(name, ts, p, weights, max_steps=100_000):
     """A number made of all states at all times; `p` (3,) of the law, (6,) of the body, (7,) start."""
     law, body, start = p[:3], p[3:9], p[9:]
     tensor = jnp.asarray(TENSOR) + jnp.diag(body[:3])
@@ -46,7 +46,7 @@ def run(name, ts, way, p, weights, max_steps=100_000):
     y0 = rj.Attitude(jnp.asarray(Q) + start[:4], jnp.array([1.3, 0.7, -1.6]) + start[4:])
     jumps = rj.torques.jumps_of(torque)
     out = lean.adaptive(
-        rj.solvers.DormandPrince8(), field, ts, y0, rtol=1e-10, atol=1e-12, jumps=jumps, way=way,
+        rj.solvers.DormandPrince8(), field, ts, y0, rtol=1e-10, atol=1e-12, jumps=jumps,
         max_steps=max_steps,
     )  # fmt: skip
     flat = jnp.concatenate([out.ys.q, out.ys.omega], axis=1)
@@ -62,26 +62,22 @@ def _symmetric(off):
 WEIGHTS = jnp.asarray(np.random.default_rng(1).normal(size=(5, 7)))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", ["pulses", pytest.param("wheel", marks=pytest.mark.slow)])
 def test_reverse_is_forward_to_round_off_and_close_to_differences(name):
     p = jnp.zeros(16)
+    value = jax.jit(lambda p: run(name, TIMES, p, WEIGHTS))
 
     @jax.jit
     def both(p, direction):
-        back = jax.grad(lambda p: run(name, TIMES, travel.reverse, p, WEIGHTS))(p)
         # One tangent, in random directions: as telling as all of them, and quick to compile.
-        ahead = jax.jvp(lambda p: run(name, TIMES, travel.forward, p, WEIGHTS), (p,), (direction,))[
-            1
-        ]
-        return back, ahead
+        ahead = jax.jvp(lambda p: run(name, TIMES, p, WEIGHTS), (p,), (direction,))[1]
+        return jax.grad(lambda p: run(name, TIMES, p, WEIGHTS))(p), ahead
 
     rng = np.random.default_rng(2)
     for _ in range(3):
         direction = jnp.asarray(rng.normal(size=16))
         back, ahead = both(p, direction)
         np.testing.assert_allclose(back @ direction, ahead, rtol=1e-11)
-    value = jax.jit(lambda p: run(name, TIMES, travel.forward, p, WEIGHTS))
     step = 1e-4 * direction
     slope = (
         8 * (value(p + step) - value(p - step)) - value(p + 2 * step) + value(p - 2 * step)
@@ -89,24 +85,72 @@ def test_reverse_is_forward_to_round_off_and_close_to_differences(name):
     np.testing.assert_allclose(back @ step, slope, rtol=1e-6)
 
 
+@pytest.mark.oldest
+@pytest.mark.parametrize(
+    ("name", "ts"),
+    [("wheel", (0.0, 0.6)), pytest.param("pulses", (0.0, 0.3, 1.1), marks=pytest.mark.slow)],
+)
+def test_every_order_of_transformations(name, ts):
+    """Forward, reverse, forward over reverse, and batches of each."""
+    r, ts = np.random.default_rng(5), jnp.array(ts)
+    p = jnp.asarray(0.05 * r.normal(size=(3, 3)))
+    base = jnp.asarray(np.concatenate([np.zeros(13), r.normal(size=3)]))
+
+    def one(small):
+        # By the torque, the body and the start.
+        return run(name, ts, base.at[jnp.array([1, 5, 14])].add(small), WEIGHTS)
+
+    value, slope = jax.jit(one), jax.jit(jax.grad(one))
+    wanted = np.stack([slope(row) for row in p])
+    bend = np.zeros((3, 3))
+    for i in range(3):
+        h = 1e-4 * np.eye(3)[i]
+        rise = (value(p[0] + h) - value(p[0] - h)) / 2e-4
+        np.testing.assert_allclose(wanted[0][i], rise, atol=1e-6)
+        bend[i] = (slope(p[0] + h) - slope(p[0] - h)) / 2e-4
+    many = jax.jit(jax.vmap(jax.grad(one)))(p)
+    ahead = jax.jit(jax.vmap(jax.jacfwd(one)))(p)
+    scale = np.abs(wanted).max()
+    for found in (many, ahead):
+        np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-10 * scale)
+    second = jax.jit(jax.hessian(one))(p[0])
+    np.testing.assert_allclose(second, second.T, atol=1e-9 * np.abs(bend).max())
+    np.testing.assert_allclose(second, bend, atol=1e-5 * np.abs(bend).max())
+    if name == "pulses":
+        together = jax.jit(jax.grad(lambda p: jax.vmap(one)(p).sum()))(p)
+        np.testing.assert_allclose(together, wanted, rtol=1e-9, atol=1e-10 * scale)
+        seconds = jax.jit(jax.vmap(jax.hessian(one)))(p)
+        np.testing.assert_allclose(seconds[0], second, atol=1e-9 * np.abs(bend).max())
+
+
+def test_reverse_over_reverse_is_refused():
+    def one(c):
+        return run("wheel", TIMES[jnp.array([0, 2])], jnp.zeros(16).at[0].set(c), WEIGHTS)
+
+    with pytest.raises(TypeError, match=r"wanted jax\.jacfwd\(jax\.grad\(f\)\)"):
+        jax.jit(jax.grad(jax.grad(one))).lower(0.1)
+
+
 @pytest.mark.slow
 def test_times_batches_and_second_derivatives():
     p = jnp.zeros(16)
 
     def value(ts, p):
-        return run("pulses", ts, travel.reverse, p, WEIGHTS)
+        return run("pulses", ts, p, WEIGHTS)
 
     @jax.jit
     def all_of(ts, p, turn):
         by_time, _ = slopes = jax.grad(value, (0, 1))(ts, p)
+        ahead = jax.jacfwd(value, (0, 1))(ts, p)
         many = jax.vmap(jax.grad(value, (0, 1)), (None, 0))(ts, jnp.stack([p, p + 0.01 * turn]))
         second = jax.jvp(lambda p: jax.grad(value, 1)(ts, p), (p,), (turn,))[1]
-        return by_time, slopes, many, second
+        return by_time, slopes, ahead, many, second
 
     turn = jnp.asarray(np.random.default_rng(3).normal(size=16))
-    by_time, slopes, many, second = all_of(TIMES, p, turn)
-    for alone, lane in zip(slopes, many, strict=True):
+    by_time, slopes, ahead, many, second = all_of(TIMES, p, turn)
+    for alone, lane, forward in zip(slopes, many, ahead, strict=True):
         np.testing.assert_allclose(lane[0], alone, rtol=1e-10, atol=1e-10)
+        np.testing.assert_allclose(forward, alone, rtol=1e-10, atol=1e-10)
     plain, slope = jax.jit(value), jax.jit(jax.grad(value, 1))
     moved = slope(TIMES, p + 0.01 * turn)
     np.testing.assert_allclose(many[1][1], moved, rtol=1e-10, atol=1e-10)
@@ -119,24 +163,32 @@ def test_times_batches_and_second_derivatives():
     np.testing.assert_allclose(second, bend, atol=1e-4 * np.abs(bend).max())
 
 
+@pytest.mark.parametrize(
+    ("name", "second"), [("wheel", False), pytest.param("pulses", True, marks=pytest.mark.slow)]
+)
+def test_many_segments_are_one(monkeypatch, name, second):
+    ts = jnp.linspace(0.0, 1.5, 9)
+    weights = jnp.asarray(np.random.default_rng(1).normal(size=(9, 7)))
+    turn = jnp.asarray(np.random.default_rng(2).normal(size=16))
+
+    def slopes(p):
+        def value(p):
+            return run(name, ts, p, weights, 300)
+
+        found = jax.grad(value)(p), jax.jvp(value, (p,), (turn,))[1]
+        return (*found, jax.jacfwd(jax.grad(value))(p)) if second else found
+
+    whole = jax.jit(slopes)(jnp.zeros(16))
+    monkeypatch.setattr(adaptive_loop, "SEGMENT", 7)
+    segments = jax.jit(lambda p: slopes(p))(jnp.zeros(16))
+    for a, b in zip(segments, whole, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-10 * np.abs(b).max())
+
+
 @pytest.mark.slow
-def test_many_chapters_are_one(monkeypatch):
-    ts = jnp.linspace(0.0, 1.5, 5)
-
-    def slope(p):
-        return jax.grad(lambda p: run("pulses", ts, travel.reverse, p, WEIGHTS, 300))(p)
-
-    whole = jax.jit(slope)(jnp.zeros(16))
-    monkeypatch.setattr(travel, "CHAPTER", 7)
-    monkeypatch.setattr(backward, "LANES", 3)
-    chapters = jax.jit(lambda p: slope(p))(jnp.zeros(16))
-    np.testing.assert_allclose(chapters, whole, rtol=1e-10, atol=1e-11)
-
-
-@pytest.mark.parametrize("groups", [pytest.param(True, marks=pytest.mark.slow), False])
-def test_bodies_abreast_are_bodies_alone(monkeypatch, groups):
+def test_bodies_in_lanes_are_bodies_alone(monkeypatch):
     # Steps of different number, jumps, saved times, a law of each body's own and one for all.
-    size = 10 if groups else 8
+    size = 10
     r = np.random.default_rng(5)
     p = jnp.asarray(np.concatenate([0.02 * r.normal(size=(size, 13)), r.normal(size=(size, 3))], 1))
     turn, shared = jnp.asarray(r.normal(size=p.shape)), jnp.zeros(3)
@@ -144,33 +196,31 @@ def test_bodies_abreast_are_bodies_alone(monkeypatch, groups):
 
     def slope(p, shared):
         p = p.at[3:6].add(shared)
-        return jax.grad(lambda p: run("pulses", ts, travel.reverse, p, WEIGHTS, 300))(p)
+        return jax.grad(lambda p: run("pulses", ts, p, WEIGHTS, 300))(p)
 
     def total(shared):
         def one(p):
-            return run("pulses", ts, travel.reverse, p.at[3:6].add(shared), WEIGHTS, 300)
+            return run("pulses", ts, p.at[3:6].add(shared), WEIGHTS, 300)
 
         return jax.vmap(one)(p).sum()
 
     alone = jax.jit(slope)
     wanted = np.stack([alone(row, shared) for row in p])
-    if groups:
-        # Groups that overlap, and chapters that are run again.
-        monkeypatch.setattr(abreast, "_ABREAST", 4)
-        monkeypatch.setattr(travel, "CHAPTER", 7)
-
+    # Blocks with bodies left over, and segments that are run again.
+    monkeypatch.setattr(lanes, "BLOCK", 4)
+    monkeypatch.setattr(adaptive_loop, "SEGMENT", 7)
     together = jax.vmap(lambda p: slope(p, shared))
     found = jax.jit(together)(p)
     np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-10 * np.abs(wanted).max())
-    if groups:
-        by_shared = jax.jit(jax.grad(total))(shared)
-        np.testing.assert_allclose(by_shared, wanted[:, 3:6].sum(0), rtol=1e-9)
-        bend = jax.jit(lambda p: jax.jvp(together, (p,), (turn,))[1])(p)
-        bent = jax.jit(lambda p, turn: jax.jvp(lambda p: slope(p, shared), (p,), (turn,))[1])
-        for k in (0, 9):
-            np.testing.assert_allclose(bend[k], bent(p[k], turn[k]), rtol=1e-8, atol=1e-8)
+    by_shared = jax.jit(jax.grad(total))(shared)
+    np.testing.assert_allclose(by_shared, wanted[:, 3:6].sum(0), rtol=1e-9)
+    bend = jax.jit(lambda p: jax.jvp(together, (p,), (turn,))[1])(p)
+    bent = jax.jit(lambda p, turn: jax.jvp(lambda p: slope(p, shared), (p,), (turn,))[1])
+    for k in (0, 9):
+        np.testing.assert_allclose(bend[k], bent(p[k], turn[k]), rtol=1e-8, atol=1e-8)
 
 
+@pytest.mark.oldest
 def test_through_simulate_each_rung_and_what_is_refused():
     ts = [0.0, 0.2, 1.0]
     damping = rj.torques.Damping([0.3, 0.3, 0.3])
@@ -193,8 +243,8 @@ def test_through_simulate_each_rung_and_what_is_refused():
     end = 1.5 * np.exp(-0.15)
     np.testing.assert_allclose(by_c, -end / 2, rtol=1e-10)
     np.testing.assert_allclose(by_inertia, end * 0.3 / 4, rtol=1e-10)
-    with pytest.raises(TypeError, match="forward-mode"):
-        jax.jacfwd(rate)(jnp.asarray(0.3), jnp.asarray(2.0))
+    ahead = jax.jit(jax.jacfwd(rate, (0, 1)))(jnp.asarray(0.3), jnp.asarray(2.0))
+    np.testing.assert_allclose(ahead, [by_c, by_inertia], rtol=1e-12)
     start, ours = rj.Spin([0.0, 0.0, 1.5]), rj.solvers.DormandPrince8()
     late = rj.simulate(body, start, ts, damping, solver=ours, max_steps=2, throw=False)
     assert late.result == dfx.RESULTS.max_steps_reached

@@ -51,6 +51,7 @@ def test_order_of_the_attitude_of_a_free_tumble(method):
     assert abs(found - order) < LEEWAY[order], found
 
 
+@pytest.mark.oldest
 @METHODS
 def test_order_under_a_torque_that_depends_on_time(method):
     order = method.tableau.order
@@ -247,6 +248,7 @@ def test_every_derivative_agrees():
         np.testing.assert_allclose(sign * found, wanted, atol=2e-9)
 
 
+@pytest.mark.oldest
 def test_events_and_the_gradient_of_their_time():
     # The first zero of Ω2 (notes' flip); its time by differences of diffrax's own Dopri8.
     def flip(solver):

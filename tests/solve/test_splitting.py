@@ -58,6 +58,7 @@ def slope(method, field, right):
     return -np.polyfit(np.log(counts), np.log(gaps), 1)[0]
 
 
+@pytest.mark.oldest
 @pytest.mark.parametrize("name", list(FIELDS))
 @METHODS
 def test_order_of_the_attitude(method, name, reference):

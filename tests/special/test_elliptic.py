@@ -79,6 +79,7 @@ def moment(powers, arguments):
         return mp.quad(f, [-160, -20, -8, -3, 0, 3, 8, 20, 60])
 
 
+@pytest.mark.oldest
 @pytest.mark.parametrize(
     ("function", "factor", "powers"),
     [
@@ -208,6 +209,7 @@ FUNCTIONS = {
 }
 
 
+@pytest.mark.oldest
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_legendre_first_and_second_derivatives(name):
     ours, reference, point = FUNCTIONS[name]

@@ -105,6 +105,7 @@ def test_values_over_eight_quarter_periods_up_to_the_separatrix(dtype):
                 assert error < 6 * eps * (abs(want[j]) + moved / step), (u[i], m1[i], j)
 
 
+@pytest.mark.oldest
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 def test_first_and_second_derivatives(dtype):
     # In float32 the second derivatives leave the range below 1e-16.
@@ -123,6 +124,7 @@ def test_first_and_second_derivatives(dtype):
     check(dtype, u, m1, [np.asarray(part) for part in got], range(6), (6, 8, 10, 10, 10, 40))
 
 
+@pytest.mark.oldest
 def test_reverse_mode_and_the_parameter_alone():
     """Without m1 the derivative is that in m; reverse over forward agrees with forward twice."""
     u, m = jnp.asarray(2.3), jnp.asarray(0.35)

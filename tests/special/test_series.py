@@ -33,6 +33,7 @@ def exact(k, t, order=0):
     return total
 
 
+@pytest.mark.oldest
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 def test_values_and_derivatives_of_every_order(dtype):
     """Forward over forward over reverse; 1e-13 / 1e-5 of the size at zero, up to θ = 100."""

@@ -63,11 +63,7 @@ def noise_of(noise: Any, size: int = 3) -> Array | None:
     """A standard deviation (size,) of one number or as many, positive; or `None`."""
     if noise is None:
         return None
-    noise = jnp.asarray(noise, jnp.result_type(float))
-    if noise.shape not in ((), (size,)):
-        count = {1: "one", 2: "two", 3: "three"}.get(size, str(size))
-        raise ValueError(f"noise: wanted one number or {count}, got shape {noise.shape}")
-    noise = jnp.broadcast_to(noise, (size,))
+    noise = _one_or(noise, size, "noise")
     return _checks.refuse(noise, ~(noise > 0), "noise: wanted a positive standard deviation")
 
 
@@ -94,11 +90,17 @@ def limit_of(limit: Any) -> Vec3 | None:
     """Where the channels saturate (3,), one number or three, positive; or `None`."""
     if limit is None:
         return None
-    limit = jnp.asarray(limit, jnp.result_type(float))
-    if limit.shape not in ((), (3,)):
-        raise ValueError(f"limit: wanted one number or three, got shape {limit.shape}")
-    limit = jnp.broadcast_to(limit, (3,))
+    limit = _one_or(limit, 3, "limit")
     return _checks.refuse(limit, ~(limit > 0), "limit: wanted a positive full scale")
+
+
+def _one_or(value: Any, size: int, name: str) -> Array:
+    """One number or `size` of them, as (size,)."""
+    numbers = _checks.numbers(value, name).astype(jnp.result_type(float))
+    if numbers.shape not in ((), (size,)):
+        count = {1: "one", 2: "two", 3: "three"}.get(size, str(size))
+        raise ValueError(f"{name}: wanted one number or {count}, got shape {numbers.shape}")
+    return jnp.broadcast_to(numbers, (size,))
 
 
 def shown(truth: Vec3, bias: Vec3 | None, scale: Vec3 | None, mounting: Vec3 | None) -> Vec3:

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from rigidjax import _checks
 from rigidjax._types import HasAttitude, HasPose, Scalar, Vec3
 from rigidjax.identify.sensors.base import (
     AbstractSensor,
@@ -88,8 +89,8 @@ class Direction(AbstractSensor):
     def __init__(self, world: Any, noise: Any = None, *, mounting: Any = None, offset: Any = None):
         vector = place_of(world, "world")
         length = jnp.sqrt(dot(vector, vector))
-        if not float(length) > 0:
-            raise ValueError("world: wanted a direction, got a vector of length zero")
+        words = "world: wanted a direction, got a vector of length zero"
+        length = _checks.refuse(length, ~(length > 0), words)
         self.world, self.noise = vector / length, noise_of(noise, 2)
         self.mounting = vector_of(mounting, "mounting")
         self.offset = number_of(offset, "offset")
@@ -156,8 +157,8 @@ def quaternions_from_matrices(matrices: Any) -> Float[np.ndarray, "times 4"]:
     >>> quaternions_from_matrices(np.eye(3)[None])[0].tolist()
     [1.0, 0.0, 0.0, 0.0]
     """
-    matrices = np.asarray(matrices, float)
-    if matrices.ndim != 3 or matrices.shape[1:] != (3, 3):
+    matrices = _checks.on_host(matrices, "matrices")
+    if matrices.ndim != 3 or matrices.shape[1:] != (3, 3) or not len(matrices):
         raise ValueError(f"matrices: wanted shape (T, 3, 3), got {matrices.shape}")
     seen = np.isfinite(matrices).all(axis=(1, 2))
     filled = np.where(seen[:, None, None], matrices, np.eye(3))
@@ -187,11 +188,10 @@ def quaternions_from_euler(
     """
     from rigidjax.rotation import euler
 
-    angles = np.asarray(angles, float)
-    if angles.ndim != 2 or angles.shape[1] != 3:
+    angles = _checks.on_host(angles, "angles")
+    if angles.ndim != 2 or angles.shape[1] != 3 or not len(angles):
         raise ValueError(f"angles: wanted shape (T, 3), got {angles.shape}")
-    if unit not in ("rad", "deg"):
-        raise ValueError(f"unit: wanted rad or deg, got {unit!r}")
+    _checks.word(unit, ("rad", "deg"), "unit")
     turned = np.radians(angles) if unit == "deg" else angles
     seen = np.isfinite(turned).all(axis=1)
     rows = [

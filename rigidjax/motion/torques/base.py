@@ -1,6 +1,7 @@
 """What a torque or a force is, and how a field asks it for its value (floor 2)."""
 
 import abc
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -161,14 +162,36 @@ def act(
     >>> from rigidjax import Inertia, Spin, torques
     >>> act(torques.ConstantTorque([0.0, 0, 1]), 0.0, Spin([0.0, 0, 1]), Inertia(jnp.eye(3)))[0]
     """
+    require_law(law)
+    _one_law(law)
+    _checks.single(state, HasSpin, "state", wanted="a Spin, an Attitude or a Rigid")
+    _checks.single(body, (Inertia, MassProperties), "body")
     dtype = state.omega.dtype
+    t = _checks.floating(t, (), "t").astype(dtype)
     # A table in float64 must not lift a float32 solve, nor stop it under strict promotion.
-    found = in_precision(law, dtype)(jnp.asarray(t, dtype), state, in_precision(body, dtype))
+    found = in_precision(law, dtype)(t, state, in_precision(body, dtype))
     # Not by class: laws of the moving frames give one too, and know nothing of this floor.
     if hasattr(found, "force"):
         return found.force.astype(dtype), found.torque.astype(dtype)
     value = _checks.floating(found, (3,), f"torque {type(law).__name__}", hint="body-frame N m")
     return None, value.astype(dtype)
+
+
+def _one_law(law: Any) -> None:
+    """Raise `ValueError` where an array of one of our laws has not the shape that its field says.
+
+    Its constructor saw to that; `jax.vmap` and `jax.tree.map` make laws of many bodies.
+    """
+    if not type(law).__module__.startswith(__package__ or ""):
+        return
+    for field in dataclasses.fields(law):
+        value, kind = getattr(law, field.name), field.type
+        if eqx.is_array(value) and not isinstance(value, kind):  # pyright: ignore[reportArgumentType]
+            raise ValueError(
+                f"torque {type(law).__name__}: {field.name} has the shape {value.shape}, which is "
+                "not that of one law; for a law a body use jax.vmap, or torque_axes=0 in "
+                "rigidjax.batch"
+            )
 
 
 def in_precision(tree: Any, dtype: Any) -> Any:
@@ -216,7 +239,9 @@ def stays(source: Any) -> Vec3 | None:
 
 def constant_or_callable(source: Any, name: str) -> Any:
     """`source` as it is if it can be called with a time; otherwise as a vector (3,)."""
-    return source if callable(source) else given(source, (3,), name)
+    if callable(source):
+        return _checks.function(source, name, "of time to (3,)")
+    return given(source, (3,), name)
 
 
 def jumps_of(source: object) -> Float[Array, " n"]:

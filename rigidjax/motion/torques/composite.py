@@ -93,9 +93,7 @@ class FromPotential(AbstractTorque):
     potential: Callable[[Any], Any]
 
     def __init__(self, potential: Callable[[Any], Any]):
-        if not callable(potential):
-            raise TypeError(f"potential: wanted a callable q → U, got {type(potential).__name__}")
-        self.potential = potential
+        self.potential = _checks.function(potential, "potential", "q → U, J")
 
     @property
     def steady(self) -> bool:

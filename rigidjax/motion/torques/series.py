@@ -11,6 +11,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from rigidjax import _checks
 from rigidjax._types import Scalar, ScalarLike, Vec3
+from rigidjax.motion.torques.base import given
 
 Samples = Float[ArrayLike, "n *channels"] | Sequence[Any]
 
@@ -77,14 +78,9 @@ class Series(eqx.Module):
 
 def _numbers(value: Any, name: str) -> Any:
     """NumPy's float64 where the numbers are known: times of a log have more than seven digits."""
-    try:
-        if _checks.known(value):
-            return np.asarray(value, float)
-        return jnp.asarray(value, jnp.result_type(float))
-    except (TypeError, ValueError) as error:
-        raise TypeError(
-            f"Series: {name}: wanted an array of numbers, got {type(value).__name__}"
-        ) from error
+    if _checks.known(value):
+        return _checks.on_host(value, f"Series: {name}")
+    return _checks.numbers(value, f"Series: {name}").astype(jnp.result_type(float))
 
 
 def _finite(numbers: Any, name: str) -> Any:
@@ -139,12 +135,12 @@ class Wheel(eqx.Module):
             ~(abs(x * x + y * y + z * z - 1) < 2e-6),
             f"axis: wanted a unit vector (3,){found}",
         )
-        if not callable(speed):
-            raise TypeError(f"speed: wanted a function of time, got {type(speed).__name__}")
-        self.inertia = jnp.asarray(inertia, jnp.result_type(float))
+        _checks.function(speed, "speed", "of time to rad/s")
+        self.inertia = given(inertia, (), "inertia").astype(jnp.result_type(float))
         self.axis = axis.astype(jnp.result_type(float))
         self.speed = speed
-        self.delay = None if delay is None else jnp.asarray(delay, jnp.result_type(float))
+        kind = jnp.result_type(float)
+        self.delay = None if delay is None else given(delay, (), "delay").astype(kind)
 
     def __call__(self, t: ScalarLike) -> Vec3:
         when = t if self.delay is None else t + self.delay

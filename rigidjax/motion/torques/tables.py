@@ -34,7 +34,7 @@ class Linear(eqx.Module):
     values: Float[Array, "n 3"]
 
     def __init__(self, times: Times, values: Rows):
-        self.times, self.values = _rows(times, values, extra=0)
+        self.times, self.values = _rows(("times", times), ("values", values), extra=0)
 
     @property
     def jump_times(self) -> Float[Array, " n"]:
@@ -70,7 +70,7 @@ class Tabulated(AbstractTorque):
     torques: Float[Array, "n 3"]
 
     def __init__(self, times: Times, torques: Rows):
-        self.times, self.torques = _rows(times, torques, extra=0)
+        self.times, self.torques = _rows(("times", times), ("torques", torques), extra=0)
 
     @property
     def jump_times(self) -> Float[Array, " n"]:
@@ -107,7 +107,7 @@ class Pulses(AbstractTorque):
     torques: Float[Array, "n 3"]
 
     def __init__(self, edges: Times, torques: Rows):
-        self.edges, self.torques = _rows(edges, torques, extra=1)
+        self.edges, self.torques = _rows(("edges", edges), ("torques", torques), extra=1)
 
     @property
     def jump_times(self) -> Float[Array, " edges"]:
@@ -133,9 +133,11 @@ def _row(times: Float[Array, " n"], t: Scalar) -> Any:
     return jnp.searchsorted(times, t, side="right", method=method) - 1
 
 
-def _rows(times: Any, values: Any, extra: int) -> tuple[Array, Array]:
-    """Times and rows of one precision, checked."""
-    name, other = ("edges", "torques") if extra else ("times", "rows")
+def _rows(
+    named_times: tuple[str, Any], named_rows: tuple[str, Any], extra: int
+) -> tuple[Array, Array]:
+    """Times and rows of one precision, checked; each with its name."""
+    (name, times), (other, values) = named_times, named_rows
     count, least = _length(times), 2
     if count is None or count < least:
         raise ValueError(f"{name}: wanted at least {least} times, shape (n,), got {_shape(times)}")

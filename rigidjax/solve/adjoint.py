@@ -1,0 +1,245 @@
+"""Tangents along a recorded run, and cotangents back along it.
+
+The derivative is that of the steps that were taken, their lengths held but for those cut short at a
+stop, which follow it, as in `diffrax.RecursiveCheckpointAdjoint`. Both directions go through the
+segments of `rigidjax.solve.adaptive_loop`; all but the last are run once more.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array
+
+from rigidjax.solve import runge_kutta
+from rigidjax.solve.adaptive_loop import (
+    LAST,
+    NONE,
+    VISIT,
+    Book,
+    Method,
+    Rows,
+    Run,
+    Until,
+    per_body,
+    recorded,
+    row_of,
+)
+from rigidjax.solve.components import lift
+from rigidjax.solve.runge_kutta import Axes
+
+# So few rows that to add to all of them is quicker than to look for one.
+_FEW = 8
+
+
+class Inputs(NamedTuple):
+    """Tangents (or cotangents) of what an answer depends on.
+
+    **Fields:** of the `constants`; of `ends` (1 + J,), the start's time and the stops; of the times
+    `between` (K,); of `y0` (n,). Each with `*directions, *bodies` after its own axes.
+    """
+
+    constants: list[Array]
+    ends: Array
+    between: Array
+    y0: Array
+
+
+class Outputs(NamedTuple):
+    """Tangents (or cotangents) of an answer: states `between` (K, n) and at the `end` (n,)."""
+
+    between: Array
+    end: Array
+
+
+class BookTangents(NamedTuple):
+    """Tangents of a recorded run: times and states at the starts of segments, the last rows.
+
+    Of the times and states that the loop is at, and of those where its last step began.
+    """
+
+    t: Array
+    y: Array
+    back_t: Array
+    back_y: Array
+    rows: Array
+
+
+def tangents(
+    method: Method, constants: list[Array], run: Run, book: Book, along: Inputs, axes: Axes
+) -> tuple[Outputs, BookTangents]:
+    """The tangents of the answer and of the record."""
+    size, number = run.between.shape[0], jnp.max(book.number)
+
+    def segment(i: Array, state: Any) -> Any:
+        moved, back, out, starts, _, rows, count = state
+        starts = [
+            lax.dynamic_update_slice_in_dim(a, b[None], i, 0)
+            for a, b in zip(starts, (moved, back), strict=True)
+        ]
+
+        def step(i: Array, state: Any) -> Any:
+            moved, back, out, path = state
+            here, kind, stop = row_of(run, rows[i])
+            visit = lift(kind >= VISIT, moved)
+            before = jnp.where(visit, back, moved)
+            path = lax.dynamic_update_slice_in_dim(path, before[None], i, 0)
+            of_t, of_h = _of_times(run, kind, stop, along)
+            there = runge_kutta.stages(method.tableau, method.field, constants, here)
+            push = (along.constants, of_t, of_h, before)
+            after = runge_kutta.pushed(
+                method.tableau, method.field, constants, here, there, push, axes
+            )
+
+            def projected(tangent: Array) -> Array:
+                return jax.jvp(method.project, (there.end,), (tangent,))[1]
+
+            after = axes.over(projected, 1, 1)(after)
+            taken = lift((kind != NONE) & (kind < VISIT), moved)
+            if size:
+                # What is no visit goes to the place beyond the last.
+                place = jnp.where(kind >= VISIT, kind - VISIT, size)
+                out = per_body(_replaced, run.t0.ndim)(out, after, place)
+            return jnp.where(taken, after, moved), jnp.where(taken, moved, back), out, path
+
+        path = jnp.zeros((rows.shape[0], *moved.shape), moved.dtype)
+        moved, back, out, path = lax.fori_loop(0, count, step, (moved, back, out, path))
+        more = _segment(method, constants, run, book, i + 1, rows)
+        return moved, back, out, starts, path, *more
+
+    none = jnp.zeros((book.starts.t.shape[0], *along.y0.shape), along.y0.dtype)
+    out = jnp.zeros((size + 1, *along.y0.shape), along.y0.dtype)
+    path = jnp.zeros((book.rows.shape[0], *along.y0.shape), along.y0.dtype)
+    first = jnp.where(number > 1, 0, number)
+    rows, again = _segment(method, constants, run, book, first, book.rows)
+    count = jnp.where(number > 1, again, jnp.max(book.filled))
+    state = (along.y0, along.y0, out, [none, none], path, rows, count)
+    moved, _, out, (y, back_y), path, _, _ = lax.fori_loop(0, number, segment, state)
+    kind, stop = (book.rows[:, i].astype(jnp.int32) for i in (2, 3))
+    heads = jnp.stack([*_of_times(run, kind, stop, along)])
+    heads = _many_first(run, jnp.concatenate([heads, jnp.zeros_like(heads)]))
+    t, back_t = (
+        _many_first(run, _gathered(run, along.ends, i))
+        for i in (book.starts.stop, book.starts.back_stop)
+    )
+    record = BookTangents(t, y, back_t, back_y, jnp.concatenate([heads, path], 1))
+    return Outputs(out[:size], moved), record
+
+
+def cotangents(
+    method: Method, constants: list[Array], run: Run, book: Book, bars: Outputs, axes: Axes
+) -> Inputs:
+    """The transpose of `tangents`, but for the record."""
+    size, number = run.between.shape[0], jnp.max(book.number)
+    seeds = bars.between
+
+    def segment(i: Array, state: Any) -> Any:
+        sums, extra, rows, count = state
+
+        def step(i: Array, both: Any) -> Any:
+            sums, extra = both
+            here, kind, stop = row_of(run, rows[count - 1 - i])
+            visit, taken = kind >= VISIT, (kind != NONE) & (kind < VISIT)
+            there = runge_kutta.stages(method.tableau, method.field, constants, here)
+            bar, place = sums.y0, jnp.clip(kind - VISIT, 0, max(size - 1, 0))
+            if size:
+                bar = jnp.where(lift(visit, bar), _gathered(run, seeds, place), bar)
+            bar = axes.over(jax.vjp(method.project, there.end)[1], 1, (1,))(bar)[0]
+            bar = _where(visit | taken, bar)
+            by_constants, by_t, by_h, by_y = runge_kutta.pulled(
+                method.tableau, method.field, constants, here, there, bar, axes
+            )
+            # A body that has no step here may be NaN, and its sum is shared with others.
+            by_t, by_h, by_y = (_where(visit | taken, by) for by in (by_t, by_h, by_y))
+            held = kind != LAST
+            ends = _added(run, sums.ends, stop, by_t - _where(visit | ~held, by_h))
+            ends = _added(run, ends, stop + 1, _where(~held, by_h))
+            between = sums.between
+            if size:
+                between = _added(run, between, place, _where(visit, by_h))
+            # A visit begins where its step began, which comes next.
+            total = [
+                a + _where(visit | taken, b)
+                for a, b in zip(sums.constants, by_constants, strict=True)
+            ]
+            before = jnp.where(lift(taken, by_y), by_y + extra, sums.y0)
+            extra = jnp.where(lift(taken, by_y), jnp.zeros_like(extra), extra + _where(visit, by_y))
+            return Inputs(total, ends, between, before), extra
+
+        sums, extra = lax.fori_loop(0, count, step, (sums, extra))
+        return sums, extra, *_segment(method, constants, run, book, number - 2 - i, rows)
+
+    more = bars.end.shape[1:]
+    sums = Inputs(
+        [jnp.zeros((*c.shape[: c.ndim - run.t0.ndim], *more), c.dtype) for c in constants],
+        jnp.zeros((run.stops.shape[0] + 1, *more), run.t0.dtype),
+        jnp.zeros((size, *more), run.t0.dtype),
+        bars.end,
+    )
+    state = (sums, jnp.zeros_like(bars.end), book.rows, jnp.max(book.filled))
+    sums, extra, _, _ = lax.fori_loop(0, number, segment, state)
+    return sums._replace(y0=sums.y0 + extra)
+
+
+def _segment(
+    method: Method, constants: list[Array], run: Run, book: Book, number: Array, rows: Rows
+) -> tuple[Rows, Array]:
+    """A segment run once more; the rows as they are if there is none of that number."""
+    there = (number >= 0) & (number < jnp.max(book.number))
+    place = jnp.clip(number, 0, book.starts.t.shape[0] - 1)
+    walk: Any = jax.tree.map(lambda a: a[place], book.starts)
+    ahead = jnp.minimum(place + 1, book.starts.t.shape[0] - 1)
+    final = number + 1 >= jnp.max(book.number)
+    t = jnp.where(final, jnp.inf, book.starts.t[ahead])
+    known = jnp.where(final, run.between.shape[0], book.starts.known[ahead])
+    until = Until(jnp.where(there, t, -jnp.inf), jnp.where(there, known, 0))
+    _, rows, _, count = recorded(method, constants, run, walk, rows, None, until)
+    return rows, count
+
+
+def _of_times(run: Run, kind: Array, stop: Array, along: Inputs) -> tuple[Array, Array]:
+    """Tangents of a step's start and length; kind and stop (*many, *bodies)."""
+    of_t, of_stop = (_gathered(run, along.ends, i) for i in (stop, stop + 1))
+    of_h = _where(kind == LAST, of_stop - of_t)
+    size = run.between.shape[0]
+    if size:
+        asked = _gathered(run, along.between, jnp.clip(kind - VISIT, 0, size - 1))
+        of_h = jnp.where(lift(kind >= VISIT, of_h), asked - of_t, of_h)
+    return of_t, of_h
+
+
+def _where(there: Array, a: Array) -> Array:
+    """`a` (…, *bodies), nothing where it is not `there`."""
+    return jnp.where(lift(there, a), a, jnp.zeros_like(a))
+
+
+def _replaced(a: Array, row: Array, index: Array) -> Array:
+    return lax.dynamic_update_index_in_dim(a, row, index, 0)
+
+
+def _gathered(run: Run, a: Array, index: Array) -> Array:
+    """Rows of each body: a (R, …, *bodies), index (*many, *bodies) → (…, *many, *bodies)."""
+
+    def pick(a: Array, index: Array) -> Array:
+        found = a[index]
+        return jnp.moveaxis(found, 0, -1) if index.ndim else found
+
+    return per_body(pick, run.t0.ndim)(a, index)
+
+
+def _added(run: Run, a: Array, index: Array, by: Array) -> Array:
+    """`a` (R, …, *bodies) with `by` (…, *bodies) added to one row of each body."""
+    if a.shape[0] <= _FEW:
+        each = jnp.arange(a.shape[0], dtype=jnp.int32).reshape(-1, *[1] * by.ndim)
+        return a + _where(each == lift(index, each), jnp.broadcast_to(by[None], a.shape))
+
+    def put(a: Array, index: Array, by: Array) -> Array:
+        return a.at[index].add(by)
+
+    return per_body(put, run.t0.ndim)(a, index, by)
+
+
+def _many_first(run: Run, a: Array) -> Array:
+    """(…, many, *bodies) → (many, …, *bodies)."""
+    return jnp.moveaxis(a, -1 - run.t0.ndim, 0)

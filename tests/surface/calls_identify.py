@@ -1,0 +1,291 @@
+"""Good calls: sensors, recordings, fits, pictures, work and precision."""
+
+import tempfile
+from pathlib import Path
+
+import jax
+import numpy as np
+import optax
+from surface import scenes as s
+from surface.calls import KINDS, leave_out, row
+from surface.scenes import TS, M, N, V, W, Y
+
+import rigidjax as rj
+
+HOST = dict(host=True, transforms=())
+vectors = dict(bias=V, scale=np.ones(3) + 0.1 * V, mounting=0.1 * W, limit=np.array([5.0, 6, 7]))
+
+# Sensors.
+row("identify.Gyro", dict(noise=0.1, **vectors, offset=0.01))
+row("identify.Accelerometer", dict(noise=0.1, place=Y, gravity=W, **vectors, offset=0.01))
+row("identify.Magnetometer", dict(noise=0.1, field=Y, **vectors, offset=0.01))
+row("identify.AttitudeSensor", dict(noise=np.array([0.1, 0.2, 0.3]), mounting=V, offset=0.01))
+row(
+    "identify.Direction", dict(world=Y, noise=np.array([0.1, 0.2]), mounting=V, offset=0.01), **HOST
+)
+row("identify.Marker", dict(place=Y, noise=0.1, origin=V, offset=0.01))
+row("identify.quaternions_from_matrices", dict(matrices=np.stack([M, N])), **HOST)
+row(
+    "identify.quaternions_from_euler",
+    dict(angles=np.stack([V, W]), sequence="ZYX", unit="rad"),
+    **HOST,
+)
+row(
+    "identify.Recording",
+    lambda: dict(
+        t=TS,
+        sensor=rj.identify.Gyro(0.1),
+        values=np.stack([V, W, Y, V]),
+        mask=np.array([True, True, False, True]),
+        torque=s.damping(),
+    ),
+    run=lambda t, sensor, values, mask, torque: rj.identify.Recording(
+        t, (sensor, values, mask), torque=torque
+    ),
+    **HOST,
+)
+leave_out("Recording makes it", "identify.Reading")
+leave_out("a fit hands it to a sensor", "identify.Moment")
+abstract = ("AbstractBodyChart", "AbstractIntegrator", "AbstractLoss", "AbstractSensor")
+leave_out("abstract: made by subclassing", *(f"identify.{name}" for name in abstract))
+
+# What a fit is asked.
+for name in ("Ratios", "PrincipalRatios"):
+    row(f"identify.{name}", transforms=())
+for name in ("Tensor", "Principal"):
+    row(f"identify.{name}", dict(typical=2.0), **HOST)
+row("identify.Known", lambda: dict(known=s.inertia()))
+row("identify.Mass", lambda: dict(guess=s.body()))
+for name in ("Huber", "SoftL1"):
+    row(f"identify.{name}", dict(scale=3.0), **HOST)
+row("identify.Entropic", lambda: dict(guess=s.inertia(), weight=2.0), **HOST)
+row("identify.Adaptive", dict(rtol=1e-6, atol=1e-9), **HOST)
+row("identify.FixedSteps", dict(substeps=2), transforms=())
+row(
+    "identify.Free",
+    dict(where=lambda r: r.readings[0].sensor.noise, name="noise", scale=0.1, prior=0.5),
+    arguments=("where", "scale", "prior"),
+    **HOST,
+)
+row("identify.Descent", lambda: dict(optimiser=optax.adam(1e-2), steps=3, batch=1), transforms=())
+row(
+    "identify.Problem",
+    lambda: dict(
+        recording=s.recording(),
+        body=rj.identify.PrincipalRatios(),
+        torque=s.damping(),
+        loss=rj.identify.Huber(),
+        prior=rj.identify.Entropic(s.inertia(), 1.0),
+        integrator=rj.identify.FixedSteps(1),
+    ),
+    **HOST,
+)
+row("identify.Problem.start", lambda: dict(self=s.problem(), body=s.inertia()), arguments=("body",))
+row("identify.plan_of", lambda: dict(problem=s.problem(), body=s.inertia(), omega=W))
+plan = lambda: s.problem().start(s.inertia())
+for name in ("unpack", "values", "scenes", "motion", "errors"):
+    row(
+        f"identify.Problem.{name}",
+        lambda: dict(self=s.problem(), parameters=plan()),
+        arguments=("parameters",),
+        traced=("parameters",),
+    )
+row(
+    "identify.fisher",
+    lambda: dict(problem=s.problem(), parameters=plan()),
+    traced=("parameters",),
+    groups=("stranger", "nan"),
+    transforms=("jit", "grad"),
+)
+row(
+    "identify.expected",
+    lambda: dict(problem=s.problem(), parameters=plan()),
+    groups=("stranger", "nan"),
+    **HOST,
+)
+row(
+    "identify.best_first_rate",
+    lambda: dict(problem=s.problem(), body=s.inertia(), omega=W, max_steps=2),
+    groups=("stranger",),
+    **HOST,
+)
+row(
+    "identify.fit",
+    lambda: dict(
+        problem=s.problem(), starts=1, initial=plan(), key=jax.random.key(0), tolerance=1e-4,
+        max_steps=30, together=1, pieces=1,
+    ),
+    groups=("stranger",),
+    **HOST,
+)  # fmt: skip
+row("identify.pieces", lambda: dict(problem=s.problem(), count=3, width=1e-3), **HOST)
+row("identify.profile", lambda: dict(fit=s.found(), name="Ix/Iz", level=0.9), groups=KINDS, **HOST)
+row("identify.compare", lambda: dict(fits={"a": s.found(), "b": s.found()}), transforms=())
+row(
+    "identify.cross_validate",
+    lambda: dict(
+        build=lambda records: rj.identify.Problem(records, rj.identify.PrincipalRatios()),
+        recordings=[s.recording(), s.recording()],
+    ),
+    run=lambda build, recordings: rj.identify.cross_validate(build, recordings, starts=1),
+    groups=("stranger",),
+    transforms=(),
+)
+row("identify.Fit.interval", lambda: dict(self=s.found(), level=0.9), arguments=("level",), **HOST)
+row(
+    "identify.Fit.interval_of",
+    lambda: dict(self=s.found(), of=lambda body, state: state.omega, level=0.9),
+    arguments=("of", "level"),
+    **HOST,
+)
+records = ("Fit", "Start", "Quantity", "Comparison", "Own", "Parameters")
+leave_out("a record that the library fills", *(f"identify.{name}" for name in records))
+leave_out("an exception", "identify.LogError")
+
+
+# Reports and files.
+def log() -> Path:
+    path = Path(tempfile.mkdtemp()) / "log.csv"
+    rows = [f"{t},{t},1.0,{2 - t}" for t in (0.0, 0.5, 1.0, 1.5)]
+    path.write_text("\n".join(["t,wx,wy,wz", *rows]) + "\n")
+    return path
+
+
+row(
+    "identify.read_table",
+    lambda: dict(path=str(log()), columns=["t", "wx"]),
+    transforms=(),
+    says=("no such file",),
+)
+row(
+    "identify.read_gyro_csv",
+    lambda: dict(path=str(log()), unit="rad/s", noise=0.1),
+    **HOST,
+    says=("no such file",),
+)
+row("identify.report.as_dict", lambda: dict(fit=s.found()), groups=KINDS, transforms=())
+row("identify.report.numbers", dict(value=1.0, low=0.9, high=1.2), transforms=())
+row(
+    "identify.report.rows",
+    lambda: dict(fit=s.found(), rate_unit="rad/s"),
+    groups=KINDS,
+    transforms=(),
+)
+row("identify.report.table", dict(lines=[("a", 1.0, 0.9, 1.1, "s")]), transforms=())
+row("identify.report.verdict", lambda: dict(fit=s.found()), groups=KINDS, transforms=())
+for name in ("write_html", "write_json"):
+    row(
+        f"identify.report.{name}",
+        lambda: dict(fit=s.found(), path=Path(tempfile.mkdtemp()) / "report"),
+        arguments=("fit",),
+        groups=KINDS,
+        transforms=(),
+    )
+for name in ("problem", "recording"):
+    row(f"identify.toutatis.{name}", transforms=())
+leave_out(
+    "for the fit of one example: tests/identify/test_toutatis.py",
+    *(f"identify.toutatis.{name}" for name in ("remarks", "rms_degrees", "rows")),
+)
+
+# Pictures.
+states = lambda: s.motion().ys
+times = lambda: np.asarray(s.motion().ts)
+row(
+    "plot.motion",
+    lambda: dict(ts=times(), states=states(), attitude="axes", time_unit="s", rate_unit="rad/s"),
+    transforms=(),
+)
+row("plot.polhode", lambda: dict(inertia=s.inertia(), states=states(), energies=2), transforms=())
+row("plot.herpolhode", lambda: dict(inertia=s.inertia(), states=states()), transforms=())
+row("plot.body_axes", lambda: dict(states=states()), transforms=())
+row("plot.inertia_ellipsoid", lambda: dict(body=s.inertia(), samples=3), transforms=())
+row(
+    "plot.phase_portrait",
+    lambda: dict(
+        inertia=rj.Inertia.from_principal(0.4, 0.4, 0.1),
+        top=rj.torques.HeavyTop(1.0, [0.0, 0, 0.5], [0.0, 0, -9.81]),
+        states=states(),
+        levels=2,
+    ),
+    groups=KINDS,
+    transforms=(),
+)
+row(
+    "plot.frames",
+    lambda: dict(
+        frame=s.frame(), ts=TS, plane="xy",
+        inside=rj.Point(np.stack([V, W, Y, V]), np.stack([V, W, Y, V])),
+    ),
+    transforms=(),
+)  # fmt: skip
+row("plot.fit", lambda: dict(found=s.found(), index=0, time_unit="s"), groups=KINDS, transforms=())
+row(
+    "plot.residuals",
+    lambda: dict(found=s.found(), index=0, time_unit="s"),
+    groups=KINDS,
+    transforms=(),
+)
+row(
+    "plot.tumble",
+    lambda: dict(body=s.body(), ts=times(), states=states(), pictures=2, seconds=0.1),
+    groups=KINDS,
+    transforms=(),
+)
+leave_out("opens a server for a browser: tests/plot/test_pictures.py", "plot.player")
+leave_out("tumble and player return it", "plot.Film")
+
+# Work and precision.
+wp = rj.workprecision
+row(
+    "workprecision.Scene",
+    lambda: dict(
+        name="mine",
+        title="words",
+        body=s.inertia(),
+        state0=s.attitude(),
+        torque=s.damping(),
+        end=1.0,
+    ),
+    arguments=("body", "state0", "end"),
+    groups=("same", *KINDS, "nan"),
+    transforms=(),
+)
+for name in ("choose", "front", "table"):
+    lines = "lines" if name == "table" else "records"
+    row(
+        f"workprecision.{name}",
+        lambda lines=lines: {
+            lines: list(wp.choose(s.records()) if lines == "lines" else s.records())
+        },
+        groups=KINDS,
+        transforms=(),
+    )
+row(
+    "workprecision.moved",
+    lambda: dict(records=list(s.records()), stored=list(s.records())),
+    groups=KINDS,
+    transforms=(),
+)
+row("workprecision.time_to", lambda: dict(records=list(s.records()[:3]), error=1e-5), transforms=())
+row("workprecision.draw", lambda: dict(records=list(s.records())), groups=KINDS, transforms=())
+row("workprecision.methods", dict(group="ours"), transforms=())
+row("workprecision.scenes", transforms=())
+row(
+    "workprecision.diffrax_method",
+    lambda: dict(solver=__import__("diffrax").Tsit5()),
+    transforms=(),
+)
+leave_out(
+    "minutes of measuring: tests/workprecision",
+    *(f"workprecision.{name}" for name in ("measure", "worked_out", "long_drift")),
+)
+leave_out(
+    "files of our own records: tests/workprecision",
+    "workprecision.read_csv",
+    "workprecision.write_csv",
+)
+leave_out(
+    "a record that is filled as it comes",
+    *(f"workprecision.{n}" for n in ("Choice", "Method", "Ready", "Record", "Reference", "Run")),
+)
