@@ -12,9 +12,7 @@ import numpy as np
 
 from rigidjax import _checks
 from rigidjax._names import own_names
-
-if TYPE_CHECKING:
-    from rigidjax.identify.fit import Fit
+from rigidjax.identify.fit import Fit
 
 _UNITS = {"rad/s": 1.0, "deg/s": 180 / np.pi, "deg/day": 86400 * 180 / np.pi}
 Row = tuple[str, float, float, float, str]
