@@ -5,14 +5,20 @@ turns), `exact` and `solve` (answers), `identify`, `workprecision` and `plot` (u
 the front door.
 """
 
+import importlib
+from types import ModuleType
+from typing import TYPE_CHECKING
+
 from rigidjax import (
     batch as batch,
+    body as body,
     exact as exact,
     frames as frames,
     identify as identify,
-    plot as plot,
-    workprecision as workprecision,
+    rotation as rotation,
+    solve as solve,
 )
+from rigidjax._names import own_names
 from rigidjax._types import (
     HasAttitude as HasAttitude,
     HasPose as HasPose,
@@ -59,4 +65,19 @@ from rigidjax.solve import (
 )
 from rigidjax.special import elliptic as elliptic
 
+if TYPE_CHECKING:
+    from rigidjax import plot as plot, workprecision as workprecision
+
 __version__ = "0.1.0"
+
+# Loaded when first asked for: few programs draw, fewer compare methods.
+_LATER = ("plot", "workprecision")
+
+
+def __getattr__(name: str) -> ModuleType:
+    if name in _LATER:
+        return importlib.import_module(f"rigidjax.{name}")
+    raise AttributeError(f"module 'rigidjax' has no attribute {name!r}")
+
+
+__dir__ = own_names(__name__)

@@ -1,6 +1,7 @@
 """`python -m rigidjax`: identify a body from recordings; compare methods."""
 
 import argparse
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,11 +13,15 @@ import rigidjax as rj
 from rigidjax.workprecision import command
 
 # What the demo heeds as well; all else says how logs are to be read.
-_OF_ALL = ("starts", "checkpoint", "figure", "report", "json")
+_OF_ALL = ("starts", "checkpoint", "figure", "report", "json", "no_cache")
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command line; returns the exit code (0 good, 1 a fit not to trust, 2 bad input)."""
+    """Run the command line; returns the exit code (0 good, 1 a fit not to trust, 2 bad input).
+
+    **Arguments:** `arguments` those of the command line; `None` for the ones of this process. Only
+    then is the process all ours, and its compiled programs are kept for the next (`--no-cache`).
+    """
     parser = _parser()
     options = parser.parse_args(arguments)
     if options.command is None:
@@ -39,8 +44,37 @@ def main(arguments: list[str] | None = None) -> int:
         if odd:
             names = ", ".join("--" + name.replace("_", "-") for name in odd)
             parser.error(f"identify --demo: {names} is for log FILES only")
-        return _demo(options)
-    return _logs(options)
+    if arguments is None and not options.no_cache:
+        _keep_compiled()
+    return _demo(options) if options.demo else _logs(options)
+
+
+def _keep_compiled() -> None:
+    """Keep compiled programs in the user's cache folder: the next start takes seconds.
+
+    Not those of `workprecision`, which measures how long compiling takes.
+    """
+    if os.environ.get("JAX_COMPILATION_CACHE_DIR"):
+        return
+    try:
+        folder = _cache_folder()
+        folder.mkdir(parents=True, exist_ok=True)
+    except (OSError, RuntimeError):
+        # No home, or one that cannot be written to: a slower start, nothing else.
+        return
+    jax.config.update("jax_compilation_cache_dir", str(folder))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+
+
+def _cache_folder() -> Path:
+    """Where this platform has a user's caches: XDG, macOS, Windows."""
+    given = os.environ.get("XDG_CACHE_HOME")
+    if given:
+        return Path(given) / "rigidjax"
+    if sys.platform == "win32":
+        return Path(os.environ.get("LOCALAPPDATA") or Path.home()) / "rigidjax"
+    inside = "Library/Caches" if sys.platform == "darwin" else ".cache"
+    return Path.home() / inside / "rigidjax"
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -119,6 +153,11 @@ def _parser() -> argparse.ArgumentParser:
         "--figure", type=Path, metavar="FILE", help="where the figure goes (.png, .pdf, .svg)"
     )
     identify.add_argument("--report", type=Path, metavar="OUT.html", help="a page with all of it")
+    identify.add_argument(
+        "--no-cache",
+        action="store_true",
+        help="compile anew, and keep no compiled programs in the user's cache folder",
+    )
     identify.add_argument("--json", type=Path, metavar="OUT.json", help="the same as numbers")
     return parser
 

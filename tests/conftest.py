@@ -13,7 +13,9 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 
 with install_import_hook("rigidjax", "beartype.beartype"):
-    import rigidjax  # noqa: F401
+    import rigidjax
+    import rigidjax.plot
+    import rigidjax.workprecision  # noqa: F401
 
 
 _MAPS, _MANY, _TESTS = Path("/proc/self/maps"), 30_000, itertools.count()

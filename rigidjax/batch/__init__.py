@@ -22,8 +22,11 @@ steps: with 1000 bodies a process it counts for little. *When one dies* all end 
 shares written before the collective are recovered, the others run again.
 """
 
+from rigidjax._names import own_names
 from rigidjax.batch import hosts as hosts
 from rigidjax.batch.chunks import compiler_options as compiler_options
 from rigidjax.batch.flags import CpuFlags as CpuFlags, cpu_flags as cpu_flags
 from rigidjax.batch.rollout import rollout as rollout
 from rigidjax.batch.simulate import Batch as Batch, Steps as Steps, simulate as simulate
+
+__dir__ = own_names(__name__)

@@ -16,6 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.experimental import multihost_utils
 
+from rigidjax._names import own_names
+
 # Seconds without a sign of life after which a peer counts as dead.
 PATIENCE = 20
 
@@ -179,3 +181,6 @@ def _together(send: Callable[[], Any], checkpoint: Any) -> Any:
             f"process {jax.process_index()} of {jax.process_count()}: a peer did not answer, it "
             f"has most likely died; {kept}; end this process and start all of them again"
         ) from error
+
+
+__dir__ = own_names(__name__)

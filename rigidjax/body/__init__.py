@@ -1,5 +1,6 @@
 """What is turned: inertia, mass, second moments, shapes, and numbers that are always a body."""
 
+from rigidjax._names import own_names
 from rigidjax.body import (
     parameters as parameters,
     shapes as shapes,
@@ -23,3 +24,5 @@ from rigidjax.body.energy import (
 from rigidjax.body.inertia import Inertia as Inertia, MassProperties as MassProperties
 from rigidjax.body.prior import divergence as divergence
 from rigidjax.body.spectral import matrix_function as matrix_function
+
+__dir__ = own_names(__name__)

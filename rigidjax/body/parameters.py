@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from rigidjax import _checks
+from rigidjax._names import own_names
 from rigidjax._types import Mat3, Vec3
 from rigidjax.body.hints import Matrix, Numbers, Vector
 from rigidjax.body.inertia import MassProperties
@@ -214,3 +215,6 @@ def _reach(exponent: Float[Array, "*n"]) -> Float[Array, "*n"]:
     limit = _limit(exponent.dtype)
     beyond = jnp.maximum(jnp.abs(exponent) - limit, 0.0)
     return jnp.where(beyond > 0, jnp.sign(exponent) * (limit + jnp.expm1(beyond)), exponent)
+
+
+__dir__ = own_names(__name__)

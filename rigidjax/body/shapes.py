@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import ArrayLike, Float
 
 from rigidjax import _checks
+from rigidjax._names import own_names
 from rigidjax._types import ScalarLike
 from rigidjax.body import physical
 from rigidjax.body.clouds import (
@@ -221,3 +222,6 @@ def _round(across, along):
 def _centred(mass, per_mass):
     m = _checks.floating(mass, (), "mass")
     return MassProperties(m, jnp.zeros_like(per_mass), jnp.diag(m * per_mass))
+
+
+__dir__ = own_names(__name__)

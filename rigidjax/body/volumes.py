@@ -6,6 +6,7 @@
 import jax.numpy as jnp
 
 from rigidjax import _checks
+from rigidjax._names import own_names
 from rigidjax._types import Scalar, ScalarLike
 from rigidjax.body.hints import Vector
 
@@ -94,3 +95,6 @@ def torus(major: ScalarLike, minor: ScalarLike) -> Scalar:
     """
     R, r = _checks.floating(major, (), "major"), _checks.floating(minor, (), "minor")
     return 2.0 * jnp.pi**2 * R * r * r
+
+
+__dir__ = own_names(__name__)

@@ -1,5 +1,6 @@
 """Ready-made scenes: `rigidjax.simulate(None, Point(x, v), ts, scene)`, no body is needed."""
 
+from rigidjax._names import own_names
 from rigidjax.frames.cr3bp import ThreeBody as ThreeBody, cr3bp as cr3bp
 from rigidjax.frames.earth import Earth as Earth, earth as earth
 from rigidjax.frames.foucault import Foucault as Foucault, foucault as foucault
@@ -10,3 +11,5 @@ from rigidjax.frames.libration import (
     libration_integral as libration_integral,
 )
 from rigidjax.frames.periodic import PeriodicOrbit as PeriodicOrbit
+
+__dir__ = own_names(__name__)

@@ -1,5 +1,6 @@
 """From a recording to a body, and how sure that is."""
 
+from rigidjax._names import own_names
 from rigidjax.identify import report as report, toutatis as toutatis
 from rigidjax.identify.bodies import (
     AbstractBodyChart as AbstractBodyChart,
@@ -53,3 +54,5 @@ from rigidjax.identify.sensors import (
     quaternions_from_euler as quaternions_from_euler,
     quaternions_from_matrices as quaternions_from_matrices,
 )
+
+__dir__ = own_names(__name__)

@@ -1,19 +1,21 @@
 """Stochastic descent by optax, for more recordings than one step of least squares can look at."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from rigidjax import _checks
 from rigidjax.identify.problem import Parameters, Problem
 from rigidjax.identify.residual import Noise, residuals
 from rigidjax.identify.search import half_sum
+
+if TYPE_CHECKING:
+    import optax
 
 # Steps between two looks at the keyboard and at whether the misfit is still a number.
 STRIDE = 50
@@ -38,11 +40,13 @@ class Descent(eqx.Module):
     4
     """
 
-    optimiser: optax.GradientTransformation = eqx.field(static=True)
+    optimiser: "optax.GradientTransformation" = eqx.field(static=True)
     steps: int = eqx.field(static=True)
     batch: int = eqx.field(static=True)
 
-    def __init__(self, optimiser: optax.GradientTransformation, *, steps: int, batch: int):
+    def __init__(self, optimiser: "optax.GradientTransformation", *, steps: int, batch: int):
+        import optax
+
         if not isinstance(optimiser, optax.GradientTransformation):
             raise TypeError(
                 "Descent: wanted an optimiser of optax such as optax.adam(1e-2), got "

@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 from jaxtyping import Array
-from scipy.optimize import brentq
 
 from rigidjax import _checks
 from rigidjax.identify import reported
@@ -69,6 +68,8 @@ def profile(fit: Fit, name: str, level: float = 0.95) -> tuple[float, float]:
 def _end(
     growth: Any, reach: float, most: float, side: float, middle: float, deviation: float
 ) -> float:
+    from scipy.optimize import brentq
+
     inner, outer = 0.0, reach
     while growth(outer) < 0:
         inner, outer = outer, 2.0 * outer

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from rigidjax import _checks
+from rigidjax._names import own_names
 from rigidjax.identify.fit import Fit
 
 _UNITS = {"rad/s": 1.0, "deg/s": 180 / np.pi, "deg/day": 86400 * 180 / np.pi}
@@ -192,3 +193,6 @@ def _png(figure: Any) -> str:
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=110)
     return base64.b64encode(buffer.getvalue()).decode("ascii")
+
+
+__dir__ = own_names(__name__)

@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
-from scipy.special import ndtri, stdtrit
 
 from rigidjax import _checks
 from rigidjax.identify.problem import Parameters, Problem
@@ -136,6 +135,8 @@ def quantile(fit: "Fit", level: float) -> float:
     level = _checks.positive(level, "level", "a level between 0 and 1")
     if not level < 1:
         raise ValueError(f"interval: wanted a level between 0 and 1, got {level}")
+    from scipy.special import ndtri, stdtrit
+
     tail = 0.5 * (1 + level)
     sensors = fit.problem.records.sensors
     if all(sensor.noise is not None for sensor in sensors) and fit.correlation <= 1.5:

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array
 
 from rigidjax import exact
+from rigidjax._names import own_names
 from rigidjax.body import spatial_angular_momentum
 from rigidjax.identify.bodies import PrincipalRatios
 from rigidjax.identify.fit import Fit
@@ -132,3 +133,6 @@ def remarks(fit: Fit) -> str:
             "off (it counts linearly, not quadratically)"
         )
     return "\n".join(lines)
+
+
+__dir__ = own_names(__name__)

@@ -8,8 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
-from scipy.signal import lfilter
-from scipy.stats import chi2 as distribution
 
 from rigidjax.identify.problem import Parameters, Problem, along
 from rigidjax.identify.residual import Noise, beside, weights_of, whitened
@@ -161,8 +159,7 @@ def _sandwich(linear: Linearised, bread: np.ndarray, times: "Times") -> np.ndarr
             variance = np.sum(e**2) / max(np.sum(weight > 0), 1)
             # 1 + 2 Σ ρˡ = span for an exponential.
             rho = (span - 1.0) / (span + 1.0)
-            ahead = np.asarray(lfilter([1.0], [1.0, -rho], j, axis=1))
-            behind = np.asarray(lfilter([1.0], [1.0, -rho], j[:, ::-1], axis=1))[:, ::-1]
+            ahead, behind = _fading(j, rho), _fading(j[:, ::-1], rho)[:, ::-1]
             meat += variance * np.einsum("rti,rtj->ij", j, ahead + behind - j)
     meat *= times.independent / max(times.independent - n, 0.1 * times.independent)
     scores = linear.scores
@@ -177,6 +174,17 @@ def _sandwich(linear: Linearised, bread: np.ndarray, times: "Times") -> np.ndarr
     below = np.diag(out) < np.diag(bread)
     factor = np.sqrt(np.where(below, np.diag(bread) / np.maximum(np.diag(out), 1e-300), 1.0))
     return out * np.outer(factor, factor)
+
+
+def _fading(x: np.ndarray, rho: float) -> np.ndarray:
+    """The sums y_t = x_t + ρ y_{t−1} along the second axis of (R, T, n)."""
+    # Here and below SciPy is imported where it is used: it takes as long as all of rigidjax.
+    from scipy.linalg import solve_banded
+
+    x = np.moveaxis(x, 1, 0)
+    bands = np.array([[1.0], [-rho]]) * np.ones(x.shape[0])
+    y = solve_banded((1, 0), bands, x.reshape(x.shape[0], -1))
+    return np.moveaxis(y.reshape(x.shape), 0, 1)
 
 
 class Times(eqx.Module):
@@ -293,11 +301,21 @@ def goodness(
             count += size * many
             if problem.loss is not None and many:
                 middle = np.median(np.sum(e[seen] ** 2, axis=-1))
-                half = distribution.median(size)
+                half, density = _median_of_chi2(size)
                 # Of a sample's median: 1 / (2 f √n), f the density there.
-                wide = 0.5 / (distribution.pdf(half, size) * np.sqrt(many))
+                wide = 0.5 / (density * np.sqrt(many))
                 believable &= bool(middle <= half + 5 * wide)
     dof = max(count - free, 1)
     if count and problem.loss is None:
         believable &= bool(chi2 <= dof + 5 * np.sqrt(2 * dof))
     return chi2, dof, believable
+
+
+def _median_of_chi2(size: int) -> tuple[float, float]:
+    """The median of χ² with `size` degrees of freedom, and the density there."""
+    from scipy.special import gammaincinv, gammaln
+
+    freedom = 0.5 * size
+    half = float(gammaincinv(freedom, 0.5))
+    density = 0.5 * np.exp((freedom - 1) * np.log(half) - half - gammaln(freedom))
+    return 2 * half, float(density)

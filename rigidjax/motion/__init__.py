@@ -1,5 +1,6 @@
 """How it turns: climb only as far as the scene needs."""
 
+from rigidjax._names import own_names
 from rigidjax.motion import lagrangian as lagrangian, torques as torques
 from rigidjax.motion.attitude import (
     Attitude as Attitude,
@@ -13,3 +14,5 @@ from rigidjax.motion.conserved import (
 )
 from rigidjax.motion.rigid import NewtonEuler as NewtonEuler, Rigid as Rigid
 from rigidjax.motion.spin import EulerEquations as EulerEquations, Spin as Spin
+
+__dir__ = own_names(__name__)

@@ -15,6 +15,7 @@ import lineax as lx
 from jaxtyping import Array, ArrayLike, Float
 
 from rigidjax import _checks
+from rigidjax._names import own_names
 from rigidjax._types import HasAttitude, Scalar, ScalarLike
 from rigidjax.body.inertia import Inertia
 from rigidjax.motion.attitude import Attitude
@@ -202,3 +203,6 @@ def _solve(matrix: Float[Array, "n n"], push: Float[Array, " n"]) -> Float[Array
     if n == 3:
         return algebra.solve(matrix, push)
     return lx.linear_solve(lx.MatrixLinearOperator(matrix), push, lx.LU(), throw=False).value
+
+
+__dir__ = own_names(__name__)

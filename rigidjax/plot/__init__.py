@@ -4,6 +4,7 @@ Each function draws into axes of yours (`ax=`) or into new ones, and returns the
 Okabe and Ito's, told apart by everyone.
 """
 
+from rigidjax._names import own_names
 from rigidjax.plot.bodies import inertia_ellipsoid as inertia_ellipsoid
 from rigidjax.plot.film import Film as Film, tumble as tumble
 from rigidjax.plot.fits import fit as fit
@@ -15,3 +16,5 @@ from rigidjax.plot.sphere import body_axes as body_axes
 from rigidjax.plot.style import COLOURS as COLOURS
 from rigidjax.plot.time import motion as motion
 from rigidjax.plot.tops import phase_portrait as phase_portrait
+
+__dir__ = own_names(__name__)

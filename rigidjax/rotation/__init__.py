@@ -1,5 +1,6 @@
 """How a thing can be turned: matrices, quaternions, and charts."""
 
+from rigidjax._names import own_names
 from rigidjax.rotation import (
     euler as euler,
     mrp as mrp,
@@ -8,3 +9,5 @@ from rigidjax.rotation import (
     so3 as so3,
 )
 from rigidjax.rotation.interpolant import AttitudeInterpolant as AttitudeInterpolant
+
+__dir__ = own_names(__name__)

@@ -1,8 +1,13 @@
 """Vectors and 3×3 matrices, written on components (floor 1).
 
 `@` on 3×3 matrices is slow in gradients on CPU and runs in TF32 on some GPUs; these do neither.
+
+Range: the products that a formula has (two entries in `cross`, `dot`, `product` and `apply`, three
+in `determinant`, four in `solve`) must be numbers: entries from 1e-75 to 1e75 always are (float32:
+1e-9 to 1e9).
 """
 
+import functools
 from collections.abc import Sequence
 from typing import Any
 
@@ -72,6 +77,22 @@ def once(x: Scalar) -> Scalar:
     where it would repeat anything cheaper, with all that leads to it, for every component.
     """
     return x / jnp.where(x == x, 1, 2)
+
+
+def near_one(*parts: Scalar) -> Scalar:
+    """A power of two that brings the largest of some scalars near 1.
+
+    What it multiplies keeps all its digits and can be squared and summed: for formulas in which the
+    length of their argument drops out. Its derivative is taken as zero.
+
+    >>> 0.5 < 5e200 * float(near_one(jnp.asarray(-5e200), jnp.asarray(1.0))) < 2
+    True
+    """
+    sizes = [jnp.abs(lax.stop_gradient(part)) for part in parts]
+    info = jnp.finfo(sizes[0].dtype)
+    largest = functools.reduce(jnp.maximum, sizes)
+    safe = jnp.clip(largest, 2.0 ** (info.minexp + 2), 2.0 ** (info.maxexp - 2))
+    return 1 / lax.reduce_precision(safe, info.nexp, 0)
 
 
 def hat(w: Vec3Like) -> Mat3:

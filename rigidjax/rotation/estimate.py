@@ -18,7 +18,8 @@ from jaxtyping import Array, ArrayLike, Float
 from rigidjax import _checks
 from rigidjax._types import Mat3, Mat3Like, Quat, Scalar, Vec3, Vec3Like
 from rigidjax.rotation import quaternion
-from rigidjax.rotation.algebra import cross, determinant, dot, hat, product, solve, vee
+from rigidjax.rotation.algebra import cross, determinant, dot, hat, near_one, product, solve, vee
+from rigidjax.rotation.gate import direction
 from rigidjax.rotation.maps import matrix_to_quaternion
 from rigidjax.special.series import inverse_kernel
 
@@ -37,7 +38,9 @@ def project(matrix: Mat3Like) -> Mat3:
     matrix = _checks.floating(matrix, (3, 3), "matrix")
     if not isinstance(matrix, Tracer):
         _checks.finite(matrix, "matrix")
-        found = np.linalg.det(np.asarray(matrix))
+        size = np.max(np.abs(np.asarray(matrix))) or 1.0
+        # Of the matrix over its largest entry: that of itself may overflow.
+        found = np.linalg.det(np.asarray(matrix) / size)
         if found <= 0:
             raise ValueError(
                 f"matrix: left-handed frame or singular, det = {found:.3g}; no rotation is nearest"
@@ -65,6 +68,7 @@ def wahba(
     body = _checks.rows(body, (3,), "body")
     world = _checks.floating(world, body.shape, "world")
     w = _weights(weights, body[:, 0], "body")
+    w, world, body = (_of_order_one(x) for x in (w, world, body))
     b = (w[:, None, None] * world[:, :, None] * body[:, None, :]).sum(0)
     best = _best(b)
     # (σ1 + σ2)(σ2 + σ3)(σ3 + σ1), σ3 with the sign of det b: 0 where a turn is free.
@@ -79,7 +83,8 @@ def wahba(
 def align(a: Vec3Like, b: Vec3Like) -> Mat3:
     """The smallest rotation that takes the direction of a into that of b.
 
-    **Arguments:** `a`, `b` (3,), not zero, in one frame, any lengths. **Returns:** (3, 3), R a ∥ b.
+    **Arguments:** `a`, `b` (3,), in one frame, any lengths. **Returns:** (3, 3), R a ∥ b.
+    **Raises:** `ValueError` for zero or NaN where they are known.
     For exactly opposite directions: half a turn about the axis normal to a that is nearest to the
     basis vector along which a is smallest. No digits are lost near there: the quaternion is
     (½|m|, a × m/|m|), m = a + b, and m is small but exact.
@@ -88,6 +93,7 @@ def align(a: Vec3Like, b: Vec3Like) -> Mat3:
     [0.0, 1.0, 0.0]
     """
     a, b = _checks.floating(a, (3,), "a"), _checks.floating(b, (3,), "b")
+    a, b = (_of_order_one(direction(x, name)) for x, name in ((a, "a"), (b, "b")))
     a, b = a / jnp.sqrt(dot(a, a)), b / jnp.sqrt(dot(b, b))
     middle = a + b
     n2 = dot(middle, middle)
@@ -127,7 +133,7 @@ def mean_quaternion(
     [1.0, 0.0, 0.0, 0.0]
     """
     q = _checks.rows(quaternions, (4,), "quaternions")
-    w = _weights(weights, q[:, 0], "quaternions")
+    w = _of_order_one(_weights(weights, q[:, 0], "quaternions"))
 
     def newton(_: Any, start: Quat, q: Array, w: Array) -> Quat:
         apart = jax.vmap(lambda each: quaternion.multiply(quaternion.conjugate(start), each))(q)
@@ -143,6 +149,11 @@ def mean_quaternion(
     for i in range(2):
         start = newton(i, lax.stop_gradient(start) if i == 0 else start, q, w)
     return quaternion.canonical(quaternion.normalise(start))
+
+
+def _of_order_one(x: Array) -> Array:
+    """The same but for a power of two, where only ratios count: no product overflows."""
+    return near_one(jnp.max(jnp.abs(x))) * x
 
 
 def _weights(weights: Any, like: Array, of: str) -> Array:
@@ -192,6 +203,7 @@ def _curvature(r: Mat3, b: Mat3) -> Mat3:
 
 @jax.custom_jvp
 def _best(b: Mat3) -> Mat3:
+    b = _of_order_one(b)
     b = b / jnp.sqrt((b * b).sum())
     root, zeta = _quartic(b)
     kappa = 0.5 * (root * root - 1)
@@ -209,4 +221,7 @@ def _best(b: Mat3) -> Mat3:
 def _best_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
     (b,), (db,) = primals, tangents
     r = _best(b)
+    # Of any size: both are made smaller alike.
+    scale = near_one(jnp.max(jnp.abs(b)))
+    b, db = scale * b, scale * db
     return r, product(r, hat(solve(_curvature(r, b), 2 * vee(product(r.T, db)))))

@@ -21,9 +21,11 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool
 
 from rigidjax import _checks
+from rigidjax._names import own_names
 from rigidjax._types import Mat3, Mat3Like, Quat, QuatLike, Scalar, Vec3, Vec3Like
 from rigidjax.rotation import quaternion
-from rigidjax.rotation.algebra import apply, cross, dot
+from rigidjax.rotation.algebra import apply, components, cross, dot, near_one
+from rigidjax.rotation.gate import direction, turn
 
 _MANY_TURNS = 8 * np.pi
 
@@ -76,7 +78,8 @@ def from_matrix(matrix: Mat3Like, sequence: str = "ZXZ") -> Vec3:
 def from_quaternion(q: QuatLike, sequence: str = "ZXZ") -> Vec3:
     """The Euler angles of a quaternion, rad, in the order of `sequence`; same bits for q and −q.
 
-    **Arguments:** `q` (4,), not zero, body → world. Half the sum and half the difference of the
+    **Arguments:** `q` (4,) of any length, body → world. **Raises:** `ValueError` for zero or NaN,
+    and an unknown sequence. Half the sum and half the difference of the
     outer angles come from two atan2, so that near the singular case the matrix keeps all its digits
     (Bernardes & Viollet 2022, doi:10.1371/journal.pone.0276302).
 
@@ -84,7 +87,8 @@ def from_quaternion(q: QuatLike, sequence: str = "ZXZ") -> Vec3:
     [0.0, 0.0, 0.0]
     """
     (i, j, k), reverse = _axes(sequence)
-    q = quaternion.canonical(q)
+    q = quaternion.canonical(direction(_checks.floating(q, (4,), "q"), "q"))
+    q = near_one(*components(q)) * q
     symmetric = i == k
     last = 3 - i - j
     handed = _handed(i, j)
@@ -200,7 +204,7 @@ def _unknown(sequence: object, reason: str) -> str:
 
 
 def _angles(angles: Vec3Like) -> Vec3:
-    angles = _checks.floating(angles, (3,), "angles")
+    angles = turn(_checks.floating(angles, (3,), "angles"), "angles")
     if not isinstance(angles, Tracer) and bool(np.any(np.abs(np.asarray(angles)) > _MANY_TURNS)):
         warnings.warn(
             f"angles {angles.tolist()} rad are more than four turns: are they degrees? "
@@ -264,3 +268,6 @@ def _to_body(omega: Vec3, angles: Vec3, sequence: str, frame: str) -> Vec3:
     if frame == "world":
         return apply(to_matrix(angles, sequence).T, omega)
     return _from_body(omega, angles, sequence, frame)
+
+
+__dir__ = own_names(__name__)

@@ -18,13 +18,40 @@ def tolerance(dtype: object) -> float:
     return 1e-6 if dtype == jnp.float64 else 1e-3
 
 
+def direction(v: Float[Array, "n"], name: str) -> Float[Array, "n"]:
+    """Refuse, where the numbers are known, what has no direction: zero, NaN, infinity."""
+    if _checks.known(v) and not 0 < _largest(v) < np.inf:
+        _checks.finite(v, name)
+        raise ValueError(f"{name}: wanted a direction, got zero")
+    return v
+
+
+def turn(v: Float[Array, "*n"], name: str) -> Float[Array, "*n"]:
+    """Refuse, where it is known, a rotation vector or an angle of which no digit is left."""
+    if _checks.known(v) and not _largest(v) <= (limit := 1 / float(jnp.finfo(v.dtype).eps)):
+        _checks.finite(v, name)
+        raise ValueError(
+            f"{name}: a turn by {_largest(v):.3g} rad; beyond {limit:.2g} rad neighbouring "
+            f"{v.dtype} numbers are more than half a radian apart: the attitude is unknown"
+        )
+    return v
+
+
+def _largest(v: Float[Array, "*n"]) -> float:
+    # NaN where one of them is. One look only: this stands before every map that is called eagerly.
+    return float(np.abs(np.asarray(v)).max())
+
+
 def rotation_matrix(m: Float[Array, "*batch 3 3"], name: str) -> Float[Array, "*batch 3 3"]:
     """Refuse what is not a rotation matrix."""
     m = _checks.finite(m, name)
     known = not isinstance(m, Tracer)
     xp, values = (np, np.asarray(m)) if known else (jnp, m)
     rows = [values[..., i, :] for i in range(3)]
-    det = (rows[0] * xp.cross(rows[1], rows[2])).sum(-1)
+    # Entries of 1e200 are refused as any others, without NumPy's warning.
+    with np.errstate(over="ignore", invalid="ignore"):
+        det = (rows[0] * xp.cross(rows[1], rows[2])).sum(-1)
+        gram = (values[..., :, :, None] * values[..., :, None, :]).sum(-3)
     found = f", det = {det.min():.4g}" if known else ""
     m = _checks.refuse(
         m,
@@ -32,7 +59,6 @@ def rotation_matrix(m: Float[Array, "*batch 3 3"], name: str) -> Float[Array, "*
         f"{name}: left-handed frame{found}; a rotation has det = +1 (is an axis flipped, or are "
         "two swapped?)",
     )
-    gram = (values[..., :, :, None] * values[..., :, None, :]).sum(-3)
     error = abs(gram - xp.eye(3, dtype=values.dtype).reshape((1,) * (values.ndim - 2) + (3, 3)))
     limit = tolerance(values.dtype)
     found = f" is {error.max():.3g}" if known else " is too large"

@@ -17,6 +17,7 @@ from rigidjax.rotation.algebra import (
     cross_components,
     dot_components,
     entries,
+    near_one,
     once,
     square,
 )
@@ -68,7 +69,7 @@ def quaternion_to_vector(q: Quat) -> Vec3:
 
 @jax.custom_jvp
 def _log(q: Quat) -> Vec3:
-    w, x, y, z = parts = components(q)
+    w, x, y, z = parts = components(near_one(*components(q)) * q)
     n2 = x * x + y * y + z * z
     # tan of the half angle is n/|w|, of the quarter n/a, of the eighth n/b: nothing cancels.
     a = jnp.abs(w) + jnp.sqrt(n2 + w * w)
@@ -82,8 +83,10 @@ def _log(q: Quat) -> Vec3:
 def _log_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
     (q,), (dq,) = primals, tangents
     v = _log(q)
-    w, *u = parts = components(q)
-    dw, *du = components(dq)
+    # Of any length: both are made shorter alike.
+    scale = near_one(*components(q))
+    w, *u = parts = components(scale * q)
+    dw, *du = components(scale * dq)
     # The turn seen from the body, 2 vec(q̄ dq)/|q|², then the inverse right Jacobian.
     scale, aside = 2 / square4(parts), cross_components(u, du)
     turn = [scale * (w * du[i] - dw * u[i] - aside[i]) for i in range(3)]
@@ -92,6 +95,13 @@ def _log_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
     twice = cross_components(vs, across)
     g = inverse_kernel(dot_components(vs, vs))
     return v, jnp.stack([turn[i] + 0.5 * across[i] + g * twice[i] for i in range(3)])
+
+
+@_compiled
+def normalised(q: Quat) -> Quat:
+    """The quaternion of length 1 in the direction of q."""
+    q = near_one(*components(q)) * q
+    return q / jnp.sqrt(square4(components(q)))
 
 
 def hat_polynomial(v: Sequence[Scalar], a: Scalar, b: Scalar) -> Mat3:

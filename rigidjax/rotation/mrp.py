@@ -2,15 +2,18 @@
 
 Three numbers without a sine: regular up to a full turn, where σ runs to infinity. σ and its shadow
 −σ/|σ|² are the same rotation; switching at |σ| = 1 keeps to θ ≤ π. Source: Schaub & Junkins, 2018,
-Analytical Mechanics of Space Systems, sec. 3.5.2.
+Analytical Mechanics of Space Systems, sec. 3.5.2. Range: any σ, and up to 1e75 (float32:
+1e9) where it meets rates, which are as well.
 """
 
 import jax.numpy as jnp
 
 from rigidjax import _checks
+from rigidjax._names import own_names
 from rigidjax._types import Mat3, Mat3Like, Quat, QuatLike, Vec3, Vec3Like
 from rigidjax.rotation import quaternion
-from rigidjax.rotation.algebra import cross, dot
+from rigidjax.rotation.algebra import components, cross, dot, near_one
+from rigidjax.rotation.gate import direction
 
 
 def from_quaternion(q: QuatLike) -> Vec3:
@@ -34,8 +37,13 @@ def to_quaternion(sigma: Vec3Like) -> Quat:
     [0.0, 0.0, 0.0, 1.0]
     """
     sigma = _checks.floating(sigma, (3,), "sigma")
-    s = dot(sigma, sigma)
-    return jnp.concatenate([(1 - s)[None], 2 * sigma]) / (1 + s)
+    if _checks.known(sigma):
+        sigma = _checks.finite(sigma, "sigma")
+    # Both parts of the ratio by the square of a power of two: 1 is then `one`.
+    one = jnp.minimum(near_one(*components(sigma)), 1)
+    sigma = one * sigma
+    s, one2 = dot(sigma, sigma), one * one
+    return jnp.concatenate([(one2 - s)[None], 2 * one * sigma]) / (one2 + s)
 
 
 def from_matrix(matrix: Mat3Like) -> Vec3:
@@ -63,13 +71,13 @@ def to_matrix(sigma: Vec3Like) -> Mat3:
 def shadow(sigma: Vec3Like) -> Vec3:
     """The other parameters of the same rotation, −σ/|σ|² (Schaub & Junkins, eq 3.145).
 
-    **Arguments:** `sigma` (3,), not zero: the shadow of no rotation lies at infinity.
+    **Arguments:** `sigma` (3,), not zero: the shadow of no rotation lies at infinity. **Raises:**
+    `ValueError` for zero or NaN.
 
     >>> shadow(jnp.array([0.0, 0.5, 0.0])).tolist()
     [-0.0, -2.0, -0.0]
     """
-    sigma = _checks.floating(sigma, (3,), "sigma")
-    return -sigma / dot(sigma, sigma)
+    return _shadow(direction(_checks.floating(sigma, (3,), "sigma"), "sigma"))
 
 
 def switch(sigma: Vec3Like) -> Vec3:
@@ -81,8 +89,14 @@ def switch(sigma: Vec3Like) -> Vec3:
     [-0.0, -0.5, -0.0]
     """
     sigma = _checks.floating(sigma, (3,), "sigma")
-    s = dot(sigma, sigma)
-    return jnp.where(s > 1, -sigma / jnp.where(s > 1, s, 1), sigma)
+    beyond = dot(sigma, sigma) > 1
+    return jnp.where(beyond, _shadow(jnp.where(beyond, sigma, 1)), sigma)
+
+
+def _shadow(sigma: Vec3) -> Vec3:
+    scale = near_one(*components(sigma))
+    near = scale * sigma
+    return -scale * (near / dot(near, near))
 
 
 def omega_to_rates(sigma: Vec3Like, omega: Vec3Like) -> Vec3:
@@ -112,3 +126,6 @@ def rates_to_omega(sigma: Vec3Like, rates: Vec3Like) -> Vec3:
     s = dot(sigma, sigma)
     turned = (1 - s) * rates - 2 * cross(sigma, rates) + 2 * dot(sigma, rates) * sigma
     return 4 / (1 + s) ** 2 * turned
+
+
+__dir__ = own_names(__name__)

@@ -1,9 +1,15 @@
 """Unit quaternions (w, x, y, z), scalar first: q turns body vectors into world vectors (floor 1).
 
 q and −q are the same rotation. `log`, and every error built on it, gives the same bits for both.
-The maps here take one quaternion, look at no values and normalise nothing, so that they cost
-little in a vector field; `check` is the gate for data from outside. Only `from_matrix` looks at the
-values, and only if they are known (not traced).
+The maps here take one quaternion and normalise nothing, so that they cost little in a vector field;
+`check` is the gate for data from outside. Where one says that it refuses values, those are meant
+that are known (not traced).
+
+Range: what does not ask for the length of a quaternion or an axis (`normalise`, `log`, `angle`,
+`about_axis`) takes any, down to 1e-307 and up to 1e308 (float32: 1e-37 to 1e38). Of an angle beyond
+1/ε, 4.5e15 rad (float32: 8.4e6), no digit is left: `exp` and what is made of it refuse it; a traced
+one gives some rotation, and NaN beyond 1e150 (1e18). Where a unit quaternion is asked for,
+vectors and rates may have components up to 1e307 (1e37).
 """
 
 from collections.abc import Sequence
@@ -15,15 +21,22 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
 from rigidjax import _checks
+from rigidjax._names import own_names
 from rigidjax._types import Mat3, Mat3Like, Quat, QuatLike, Scalar, ScalarLike, Vec3, Vec3Like
-from rigidjax.rotation.algebra import components, cross_components, dot, dot_components
-from rigidjax.rotation.gate import rotation_matrix, unit_quaternion
+from rigidjax.rotation.algebra import (
+    components,
+    cross_components,
+    dot,
+    dot_components,
+    near_one,
+)
+from rigidjax.rotation.gate import direction, rotation_matrix, turn, unit_quaternion
 from rigidjax.rotation.maps import (
     flipped,
     matrix_to_quaternion,
+    normalised,
     product4,
     quaternion_to_vector,
-    square4,
     vector_to_quaternion,
 )
 
@@ -33,20 +46,21 @@ _HINT = "one quaternion is (w, x, y, z), scalar first; batch with jax.vmap"
 def exp(v: Vec3Like) -> Quat:
     """The quaternion of a rotation vector: (cos θ/2, ½ v sin(θ/2)/(θ/2)), θ = |v|.
 
-    **Arguments:** `v` (3,) rotation vector, rad (notes, eqs 17, 18, with v = γ y). Any length.
+    **Arguments:** `v` (3,) rotation vector, rad (notes, eqs 17, 18, with v = γ y). The angle is
+    known to ε|v|. **Raises:** `ValueError` for NaN, and beyond 1/ε (see the head of this module).
 
     **Returns:** (4,) of norm 1; value and derivatives are right at v = 0 too.
 
     >>> exp(jnp.array([0.0, 0.0, jnp.pi])).round(12).tolist()
     [0.0, 0.0, 0.0, 1.0]
     """
-    return vector_to_quaternion(_checks.floating(v, (3,), "v"))
+    return vector_to_quaternion(turn(_checks.floating(v, (3,), "v"), "v"))
 
 
 def log(q: QuatLike) -> Vec3:
     """The shortest rotation vector of a quaternion, rad, |v| ≤ π.
 
-    **Arguments:** `q` (4,), not zero; its length does not matter.
+    **Arguments:** `q` (4,); its length does not matter. **Raises:** `ValueError` for zero or NaN.
 
     **Returns:** v = 2 atan2(|q_v|, q_w) q_v/|q_v| (3,), from q or −q, whichever has q_w > 0; at
     q_w = 0 the one whose first nonzero component is positive. The derivative is that of
@@ -56,7 +70,7 @@ def log(q: QuatLike) -> Vec3:
     >>> abs(log(jnp.array([0.0, 0.0, 0.0, -1.0]))).round(6).tolist()
     [0.0, 0.0, 3.141593]
     """
-    return quaternion_to_vector(_checks.floating(q, (4,), "q", hint=_HINT))
+    return quaternion_to_vector(direction(_checks.floating(q, (4,), "q", hint=_HINT), "q"))
 
 
 def multiply(p: QuatLike, q: QuatLike) -> Quat:
@@ -146,13 +160,15 @@ def to_xyzw(q: QuatLike) -> Float[Array, "4"]:
 def about_axis(axis: Vec3Like, angle: ScalarLike) -> Quat:
     """The rotation by an angle about an axis (notes, eqs 17, 18).
 
-    **Arguments:** `axis` (3,), not zero, any length; `angle` rad, right-handed about it.
+    **Arguments:** `axis` (3,) of any length; `angle` rad, right-handed about it. **Raises:**
+    `ValueError` for an axis that is zero, for NaN, and for an angle as `exp`.
 
     >>> about_axis(jnp.array([0.0, 0.0, 2.0]), jnp.pi).round(12).tolist()
     [0.0, 0.0, 0.0, 1.0]
     """
-    axis = _checks.floating(axis, (3,), "axis")
-    half = 0.5 * _checks.floating(angle, (), "angle").astype(axis.dtype)
+    axis = direction(_checks.floating(axis, (3,), "axis"), "axis")
+    half = 0.5 * turn(_checks.floating(angle, (), "angle").astype(axis.dtype), "angle")
+    axis = near_one(*components(axis)) * axis
     unit = axis / jnp.sqrt(dot(axis, axis))
     return jnp.concatenate([jnp.cos(half)[None], jnp.sin(half) * unit])
 
@@ -161,6 +177,7 @@ def advance(q: QuatLike, omega: Vec3Like, dt: ScalarLike) -> Quat:
     """The attitude after a constant body rate for a time dt: q exp(Ω dt), exact.
 
     **Arguments:** `q` (4,) unit, body → world; `omega` (3,) rad/s, body frame; `dt` s.
+    **Raises:** as `exp`.
 
     >>> advance(jnp.array([1.0, 0, 0, 0]), jnp.array([0, 0, jnp.pi]), 1.0).round(12).tolist()
     [0.0, 0.0, 0.0, 1.0]
@@ -168,7 +185,7 @@ def advance(q: QuatLike, omega: Vec3Like, dt: ScalarLike) -> Quat:
     q = _checks.floating(q, (4,), "q", hint=_HINT)
     omega = _checks.floating(omega, (3,), "omega")
     dt = _checks.floating(dt, (), "dt").astype(omega.dtype)
-    return multiply(q, exp(dt * omega))
+    return multiply(q, vector_to_quaternion(turn(dt * omega, "dt * omega")))
 
 
 def rate(q: QuatLike, omega: Vec3Like) -> Quat:
@@ -204,8 +221,9 @@ def interpolate(p: QuatLike, q: QuatLike, s: ScalarLike) -> Quat:
     True
     """
     p = _checks.floating(p, (4,), "p", hint=_HINT)
-    turn = log(multiply(conjugate(p), q))
-    return multiply(p, exp(_checks.floating(s, (), "s").astype(turn.dtype) * turn))
+    v = log(multiply(conjugate(p), q))
+    part = turn(_checks.floating(s, (), "s").astype(v.dtype) * v, "s times the turn")
+    return multiply(p, vector_to_quaternion(part))
 
 
 def uniform(key: PRNGKeyArray, dtype: Any = float) -> Quat:
@@ -222,13 +240,12 @@ def uniform(key: PRNGKeyArray, dtype: Any = float) -> Quat:
 def normalise(q: QuatLike) -> Quat:
     """The quaternion of length 1 in the direction of q.
 
-    **Arguments:** `q` (4,), not zero. The sign is kept.
+    **Arguments:** `q` (4,). The sign is kept. **Raises:** `ValueError` for zero or NaN.
 
     >>> normalise(jnp.array([0.0, 4.0, 0.0, 0.0])).tolist()
     [0.0, 1.0, 0.0, 0.0]
     """
-    q = _checks.floating(q, (4,), "q", hint=_HINT)
-    return q / jnp.sqrt(square4(components(q)))
+    return normalised(direction(_checks.floating(q, (4,), "q", hint=_HINT), "q"))
 
 
 def canonical(q: QuatLike) -> Quat:
@@ -246,13 +263,15 @@ def canonical(q: QuatLike) -> Quat:
 def angle(q: QuatLike) -> Scalar:
     """The angle of a rotation, rad, in [0, π]; the same bits for q and −q.
 
-    **Arguments:** `q` (4,), not zero; its length does not matter. 2 atan2(|q_v|, |q_w|). At the
-    identity the derivative does not exist; 0 is returned, the shortest subgradient.
+    **Arguments:** `q` (4,); its length does not matter. 2 atan2(|q_v|, |q_w|). At the identity the
+    derivative does not exist; 0 is returned, the shortest subgradient. **Raises:** `ValueError` for
+    zero or NaN.
 
     >>> round(float(angle(exp(jnp.array([0.0, 1e-9, 0.0]))) * 1e9), 9)
     1.0
     """
-    w, *u = components(_checks.floating(q, (4,), "q", hint=_HINT))
+    q = direction(_checks.floating(q, (4,), "q", hint=_HINT), "q")
+    w, *u = components(near_one(*components(q)) * q)
     n2 = dot_components(u, u)
     # Both atan2 and the root see ones, not zeros, where their derivative would be 0/0.
     there = n2 != 0
@@ -310,3 +329,6 @@ def _turn(w: Scalar, u: Sequence[Scalar], y: Sequence[Scalar]) -> Vec3:
     t = [2 * part for part in cross_components(u, y)]
     again = cross_components(u, t)
     return jnp.stack([y[i] + (w * t[i] + again[i]) for i in range(3)])
+
+
+__dir__ = own_names(__name__)

@@ -2,16 +2,18 @@
 
 Rational in both directions, and without a double cover; a half turn lies at infinity, and
 `is_singular` tells. M = (1 + hat g)(1 − hat g)⁻¹ is Cayley's transform. Source: Schaub & Junkins,
-2018, Analytical Mechanics of Space Systems, sec. 3.5.1.
+2018, Analytical Mechanics of Space Systems, sec. 3.5.1. Range: any g, and up to 1e75 (float32:
+1e9) where it meets rates, which are as well.
 """
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
 from rigidjax import _checks
+from rigidjax._names import own_names
 from rigidjax._types import Mat3, Mat3Like, Quat, QuatLike, Vec3, Vec3Like
 from rigidjax.rotation import quaternion
-from rigidjax.rotation.algebra import cross, dot
+from rigidjax.rotation.algebra import components, cross, dot, near_one
 
 
 def from_quaternion(q: QuatLike) -> Vec3:
@@ -23,6 +25,8 @@ def from_quaternion(q: QuatLike) -> Vec3:
     [0.0, 0.0, 1.0]
     """
     q = quaternion.canonical(q)
+    # The derivative squares the denominator.
+    q = near_one(*components(q)) * q
     return q[1:] / q[0]
 
 
@@ -35,7 +39,9 @@ def to_quaternion(g: Vec3Like) -> Quat:
     [1.0, 0.0, 0.0, 0.0]
     """
     g = _checks.floating(g, (3,), "g")
-    return jnp.concatenate([jnp.ones_like(g[:1]), g]) / jnp.sqrt(1 + dot(g, g))
+    if _checks.known(g):
+        g = _checks.finite(g, "g")
+    return quaternion.normalise(jnp.concatenate([jnp.ones_like(g[:1]), g]))
 
 
 def from_matrix(matrix: Mat3Like) -> Vec3:
@@ -94,3 +100,6 @@ def rates_to_omega(g: Vec3Like, rates: Vec3Like) -> Vec3:
     """
     g, rates = _checks.floating(g, (3,), "g"), _checks.floating(rates, (3,), "rates")
     return 2 / (1 + dot(g, g)) * (rates - cross(g, rates))
+
+
+__dir__ = own_names(__name__)

@@ -1,7 +1,8 @@
 """Rotation matrices M, active, body → world, and their tangent vectors (floor 1).
 
 `exp` and `log` take and return one rotation; batch with `jax.vmap`. Every kernel is a smooth
-function of θ², so that values and derivatives of any order are right at θ = 0.
+function of θ², so that values and derivatives of any order are right at θ = 0. Range: as in
+`rigidjax.quaternion`.
 """
 
 from typing import Any
@@ -10,6 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
 from rigidjax import _checks
+from rigidjax._names import own_names
 from rigidjax._types import Mat3, Mat3Like, Scalar, ScalarLike, Vec3, Vec3Like
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.algebra import (
@@ -32,7 +34,7 @@ from rigidjax.rotation.estimate import (
     project as project,
     wahba as wahba,
 )
-from rigidjax.rotation.gate import rotation_matrix
+from rigidjax.rotation.gate import rotation_matrix, turn
 from rigidjax.rotation.maps import hat_polynomial, matrix_to_quaternion, vector_to_matrix
 from rigidjax.special.series import inverse_kernel, stumpff
 
@@ -40,13 +42,13 @@ from rigidjax.special.series import inverse_kernel, stumpff
 def exp(v: Vec3Like) -> Mat3:
     """The rotation by |v| about v: 1 + A hat v + B (hat v)² (notes, eqs 15, 17, 18).
 
-    **Arguments:** `v` (3,) rotation vector, rad, any length. A = sin θ/θ, B = (1 − cos θ)/θ²
-    (Rodrigues 1840), both from half the angle.
+    **Arguments:** `v` (3,) rotation vector, rad. A = sin θ/θ, B = (1 − cos θ)/θ² (Rodrigues 1840),
+    both from half the angle, known to ε|v|. **Raises:** as `quaternion.exp`.
 
     >>> exp(jnp.array([0.0, 0.0, jnp.pi / 2])).round(12)[0].tolist()
     [0.0, -1.0, 0.0]
     """
-    return vector_to_matrix(_checks.floating(v, (3,), "v"))
+    return vector_to_matrix(turn(_checks.floating(v, (3,), "v"), "v"))
 
 
 def log(matrix: Mat3Like) -> Vec3:
@@ -67,12 +69,12 @@ def left_jacobian(v: Vec3Like) -> Mat3:
     """J_l with exp(v + dv) = exp(J_l dv) exp(v): what dv turns, seen from the world.
 
     **Arguments:** `v` (3,) rotation vector, rad. J_l = 1 + B hat v + C (hat v)², C = (θ − sin θ)/θ³
-    (Chirikjian 2012, doi:10.1007/978-0-8176-4944-9; Solà 2018, eq 145).
+    (Chirikjian 2012, doi:10.1007/978-0-8176-4944-9; Solà 2018, eq 145). **Raises:** as `exp`.
 
     >>> left_jacobian(jnp.zeros(3)).tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
     """
-    parts = components(_checks.floating(v, (3,), "v"))
+    parts = components(turn(_checks.floating(v, (3,), "v"), "v"))
     t = square(parts)
     return hat_polynomial(parts, stumpff(2, t), stumpff(3, t))
 
@@ -96,7 +98,7 @@ def left_jacobian_inverse(v: Vec3Like) -> Mat3:
     >>> left_jacobian_inverse(jnp.zeros(3)).tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
     """
-    parts = components(_checks.floating(v, (3,), "v"))
+    parts = components(turn(_checks.floating(v, (3,), "v"), "v"))
     t = square(parts)
     return hat_polynomial(parts, jnp.full_like(t, -0.5), inverse_kernel(t))
 
@@ -129,7 +131,8 @@ def distance(a: Mat3Like, b: Mat3Like) -> Scalar:
 def about_axis(axis: Vec3Like, angle: ScalarLike) -> Mat3:
     """The rotation exp(γ J_y) by an angle γ about an axis y (notes, eqs 17, 18).
 
-    **Arguments:** `axis` (3,), not zero, any length; `angle` rad, right-handed about it.
+    **Arguments:** `axis` (3,) of any length; `angle` rad, right-handed about it. **Raises:** as
+    `quaternion.about_axis`.
 
     >>> about_axis(jnp.array([0.0, 0.0, 2.0]), jnp.pi / 2).round(12)[0].tolist()
     [0.0, -1.0, 0.0]
@@ -230,8 +233,9 @@ def interpolate(a: Mat3Like, b: Mat3Like, s: ScalarLike) -> Mat3:
     [0.540302, -0.841471, 0.0]
     """
     a, b = _checks.floating(a, (3, 3), "a"), _checks.floating(b, (3, 3), "b")
-    turn = quaternion.log(matrix_to_quaternion(product(a.T, b)))
-    return product(a, exp(_checks.floating(s, (), "s").astype(turn.dtype) * turn))
+    v = quaternion.log(matrix_to_quaternion(product(a.T, b)))
+    part = turn(_checks.floating(s, (), "s").astype(v.dtype) * v, "s times the turn")
+    return product(a, vector_to_matrix(part))
 
 
 def uniform(key: PRNGKeyArray, dtype: Any = float) -> Mat3:
@@ -259,3 +263,6 @@ def check(
     (3, 3)
     """
     return rotation_matrix(_checks.floating(matrix, (3, 3), name, batched=True), name)
+
+
+__dir__ = own_names(__name__)

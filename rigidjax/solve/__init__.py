@@ -1,5 +1,6 @@
 """Answers with a solver, all of them diffrax's."""
 
+from rigidjax._names import own_names
 from rigidjax.solve import lean as lean, solvers as solvers
 from rigidjax.solve.field import equations_of_motion as equations_of_motion
 from rigidjax.solve.projected import (
@@ -8,3 +9,5 @@ from rigidjax.solve.projected import (
 )
 from rigidjax.solve.simulate import simulate as simulate
 from rigidjax.solve.solution import Solution as Solution
+
+__dir__ = own_names(__name__)

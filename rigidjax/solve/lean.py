@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
+from rigidjax._names import own_names
 from rigidjax.motion import Attitude, AttitudeEquations, on_the_group
 from rigidjax.solve import splitting
 from rigidjax.solve.adaptive import adaptive as adaptive
@@ -107,3 +108,6 @@ def _stacked(start: Atoms, rest: Atoms, like: Any) -> Any:
         jnp.concatenate([first[None], later]) for first, later in zip(start, rest, strict=True)
     ]
     return jax.vmap(lambda *parts: join(parts, like))(*columns)
+
+
+__dir__ = own_names(__name__)

@@ -1,5 +1,6 @@
 """The methods, under one name: `rigidjax.solvers`."""
 
+from rigidjax._names import own_names
 from rigidjax.solve.explicit import (
     DormandPrince8 as DormandPrince8,
     RungeKutta4 as RungeKutta4,
@@ -11,3 +12,5 @@ from rigidjax.solve.splitting import (
     Splitting4 as Splitting4,
     Splitting6 as Splitting6,
 )
+
+__dir__ = own_names(__name__)

@@ -10,6 +10,7 @@ as functions of the same families; no iteration is differentiated, and all loops
 fixed by the dtype.
 """
 
+from rigidjax._names import own_names
 from rigidjax.special.carlson import rc as rc, rd as rd, rf as rf, rj_ as rj_
 from rigidjax.special.jacobi import am as am, sncndn as sncndn
 from rigidjax.special.legendre import (
@@ -20,3 +21,5 @@ from rigidjax.special.legendre import (
     ellippi as ellippi,
     ellippiinc as ellippiinc,
 )
+
+__dir__ = own_names(__name__)

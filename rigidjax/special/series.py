@@ -90,6 +90,8 @@ def _cosine_or_sinc(k: int, t: Float[Array, "..."]) -> Float[Array, "..."]:
     head, tail = _split_pi(t.dtype)
     # turns × head is exact (Cody & Waite 1980), so the remainder is as good as θ itself.
     remainder = (theta - turns * head) - turns * tail
+    # Of a θ beyond 1/ε nothing is left but its round-off: keep to where polynomials are good.
+    remainder = jnp.clip(remainder, -2.0, 2.0)
     value = _polynomial(k, jnp.where(far, remainder * remainder, t), limit)
     value = value * jnp.where(far, remainder, 1) if k else value
     # The sign goes into a division although a product would do: XLA on CPU computes a quotient

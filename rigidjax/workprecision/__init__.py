@@ -4,6 +4,7 @@
 chart, `choose` the short table. `python -m rigidjax workprecision` is all of it.
 """
 
+from rigidjax._names import own_names
 from rigidjax.workprecision.chart import draw as draw
 from rigidjax.workprecision.drift import long_drift as long_drift
 from rigidjax.workprecision.in_jax import diffrax_method as diffrax_method
@@ -29,3 +30,5 @@ from rigidjax.workprecision.reference import Reference as Reference
 from rigidjax.workprecision.regress import moved as moved
 from rigidjax.workprecision.scene import Scene as Scene
 from rigidjax.workprecision.standard import scenes as scenes
+
+__dir__ = own_names(__name__)

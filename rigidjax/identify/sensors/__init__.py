@@ -1,5 +1,6 @@
 """What a recording was read with."""
 
+from rigidjax._names import own_names
 from rigidjax.identify.sensors.base import AbstractSensor as AbstractSensor, Moment as Moment
 from rigidjax.identify.sensors.pointing import (
     AttitudeSensor as AttitudeSensor,
@@ -13,3 +14,5 @@ from rigidjax.identify.sensors.vectors import (
     Gyro as Gyro,
     Magnetometer as Magnetometer,
 )
+
+__dir__ = own_names(__name__)

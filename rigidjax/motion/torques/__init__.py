@@ -1,5 +1,6 @@
 """Torques and forces. Each names the lowest rung that can feel it, and feels nothing below."""
 
+from rigidjax._names import own_names
 from rigidjax.motion.torques.base import (
     AbstractForce as AbstractForce,
     AbstractTorque as AbstractTorque,
@@ -34,3 +35,5 @@ from rigidjax.motion.torques.tables import (
     Pulses as Pulses,
     Tabulated as Tabulated,
 )
+
+__dir__ = own_names(__name__)

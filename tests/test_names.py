@@ -1,0 +1,77 @@
+"""What a user sees with Tab: each public module shows its own names, and nothing that it works with."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+import rigidjax as rj
+
+ROOT = Path(__file__).parents[1]
+
+
+def public_modules():
+    found, left = {}, [("rj", rj)]
+    while left:
+        name, module = left.pop()
+        if module.__name__ not in found:
+            found[module.__name__] = module
+            things = ((f"{name}.{part}", getattr(module, part)) for part in dir(module))
+            left += [(path, thing) for path, thing in things if isinstance(thing, ModuleType)]
+    return found
+
+
+MODULES = public_modules()
+
+
+def test_the_modules_are_reached():
+    reached = {"body", "body.shapes", "rotation.quaternion", "identify.report", "motion.torques"}
+    assert {f"rigidjax.{name}" for name in reached} | {"rigidjax.plot"} <= set(MODULES)
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_a_module_shows_its_own_names_only(name):
+    module = MODULES[name]
+    shown = dir(module)
+    assert shown and not any(part.startswith("_") for part in shown)
+    strange = {
+        part
+        for part in shown
+        if not getattr(getattr(module, part), "__module__", "rigidjax").startswith("rigidjax")
+        and type(getattr(module, part)).__module__ not in ("typing", "types", "builtins")
+    }
+    assert not strange
+    assert not {"jax", "jnp", "np", "eqx", "dfx", "Array", "Any", "own_names"} & set(shown)
+
+
+def test_nothing_public_is_lost():
+    assert {"body", "rotation", "plot", "workprecision", "simulate", "Inertia"} <= set(dir(rj))
+    assert {"exp", "log", "normalise", "check"} <= set(dir(rj.quaternion))
+    assert {"box", "mesh_file"} <= set(dir(rj.shapes)) and "hat" in dir(rj.so3)
+    assert "sources" not in dir(rj)
+    with pytest.raises(AttributeError, match="module 'rigidjax' has no attribute 'sources'"):
+        rj.sources  # noqa: B018
+
+
+def test_readme_uses_what_is_shown():
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    used = set(re.findall(r"\brj\.([a-zA-Z_]\w*)", text))
+    assert "body" in used and not used - set(dir(rj)) - {"__version__"}
+
+
+LATER = """
+import sys, rigidjax
+heavy = "scipy.signal", "scipy.stats", "scipy.interpolate", "scipy.special", "scipy.optimize", "optax.contrib",
+heavy += "matplotlib", "rigidjax.plot", "rigidjax.workprecision"
+print([name for name in heavy if name in sys.modules])
+rigidjax.plot.fit, rigidjax.workprecision.measure
+"""
+
+
+def test_what_few_programs_need_is_loaded_when_it_is_asked_for():
+    out = subprocess.run([sys.executable, "-c", LATER], capture_output=True, text=True, cwd=ROOT)
+    assert out.stdout.strip() == "[]", out.stdout + out.stderr
+    assert out.returncode == 0, out.stderr
