@@ -9,7 +9,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from rigidjax import _checks
 from rigidjax._types import Mat3, Mat3Like, Scalar, Vec3, Vec3Like
-from rigidjax.rotation.algebra import apply as apply, product as product
+from rigidjax.rotation.algebra import apply as apply, entries, product as product
 
 
 def inverse(tensor: Mat3Like) -> Mat3:
@@ -47,15 +47,17 @@ def solve(tensor: Mat3Like, vector: Vec3Like) -> Vec3:
 
 def _relative_inverse(a: Mat3) -> tuple[Mat3, Scalar]:
     """The inverse of a divided by its trace, and the trace."""
-    scale = a[0, 0] + a[1, 1] + a[2, 2]
-    a = a / scale
-    c00 = a[1, 1] * a[2, 2] - a[1, 2] * a[2, 1]
-    c01 = a[1, 2] * a[2, 0] - a[1, 0] * a[2, 2]
-    c02 = a[1, 0] * a[2, 1] - a[1, 1] * a[2, 0]
-    c11 = a[0, 0] * a[2, 2] - a[0, 2] * a[2, 0]
-    c12 = a[0, 1] * a[2, 0] - a[0, 0] * a[2, 1]
-    c22 = a[0, 0] * a[1, 1] - a[0, 1] * a[1, 0]
-    determinant = a[0, 0] * c00 + a[0, 1] * c01 + a[0, 2] * c02
+    xx, _, _, _, yy, _, _, _, zz = entries(a)
+    scale = xx + yy + zz
+    # One split, and one concatenation in the gradient: indexed, each entry is a kernel.
+    xx, xy, xz, yx, yy, yz, zx, zy, zz = entries(a / scale)
+    c00 = yy * zz - yz * zy
+    c01 = yz * zx - yx * zz
+    c02 = yx * zy - yy * zx
+    c11 = xx * zz - xz * zx
+    c12 = xy * zx - xx * zy
+    c22 = xx * yy - xy * yx
+    determinant = xx * c00 + xy * c01 + xz * c02
     return from_components(c00, c11, c22, c01, c02, c12) / determinant, scale
 
 

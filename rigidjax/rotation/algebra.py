@@ -141,10 +141,8 @@ def product(a: Mat3Like, b: Mat3Like) -> Mat3:
     >>> product(jnp.eye(3), 2.0 * jnp.eye(3)).tolist()
     [[2.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 2.0]]
     """
-    m = entries(_checks.floating(a, (3, 3), "a"))
-    n = entries(_checks.floating(b, (3, 3), "b"))
-    rows, columns = (m[:3], m[3:6], m[6:]), (n[::3], n[1::3], n[2::3])
-    return jnp.stack([dot_components(r, c) for r in rows for c in columns]).reshape(3, 3)
+    a, b = _checks.floating(a, (3, 3), "a"), _checks.floating(b, (3, 3), "b")
+    return jnp.sum(a[:, :, None] * b[None], 1)
 
 
 def apply(a: Mat3Like, y: Vec3Like) -> Vec3:
@@ -155,9 +153,8 @@ def apply(a: Mat3Like, y: Vec3Like) -> Vec3:
     >>> apply(2.0 * jnp.eye(3), jnp.array([1.0, 2.0, 3.0])).tolist()
     [2.0, 4.0, 6.0]
     """
-    m = entries(_checks.floating(a, (3, 3), "a"))
-    parts = components(_checks.floating(y, (3,), "y"))
-    return jnp.stack([dot_components(row, parts) for row in (m[:3], m[3:6], m[6:])])
+    a, y = _checks.floating(a, (3, 3), "a"), _checks.floating(y, (3,), "y")
+    return jnp.sum(a * y[None], 1)
 
 
 def solve(a: Mat3Like, y: Vec3Like) -> Vec3:

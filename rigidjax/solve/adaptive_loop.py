@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array
 
@@ -160,8 +161,7 @@ def recording(method: Method, constants: list[Array], run: Run) -> tuple[Answer,
 def start(method: Method, constants: list[Array], run: Run) -> Walk:
     """A loop about to begin."""
     t0, y0 = run.t0, run.y0
-    f0 = method.field(constants, t0, y0)
-    h = lax.stop_gradient(_first_step(method, constants, run, f0))
+    h, f0 = lax.stop_gradient(_first_step(method, constants, run))
     # Where there is no slope to begin with, no step is short enough.
     sound = jnp.all(jnp.isfinite(f0), 0) & jnp.all(jnp.isfinite(y0), 0)
     sound = sound & jnp.isfinite(t0) & jnp.isfinite(run.stops[-1])
@@ -395,21 +395,32 @@ def _size_of(error: Array, left: Array, right: Array, rtol: Array, atol: Array) 
     return jnp.sqrt(jnp.mean((error / scale) ** 2, 0) + tiny)
 
 
-def _first_step(method: Method, constants: list[Array], run: Run, slope: Array) -> Array:
-    """Hairer, Nørsett and Wanner (1993), II.4, algorithm for the starting step."""
+def _first_step(method: Method, constants: list[Array], run: Run) -> tuple[Array, Array]:
+    """The starting step of Hairer, Nørsett and Wanner (1993), II.4; the slope at the start."""
     y0, t0 = run.y0, run.t0
     scale = lift(run.atol, y0) + lift(run.rtol, y0) * jnp.abs(y0)
 
     def norm(a: Array) -> Array:
         return jnp.sqrt(jnp.mean((a / scale) ** 2, 0))
 
-    d0, d1 = norm(y0), norm(slope)
-    small = (d0 < 1e-5) | (d1 < 1e-5)
-    h = jnp.where(small, 1e-6, 0.01 * d0 / jnp.where(small, 1.0, d1)).astype(d0.dtype)
-    turned = method.field(constants, t0 + h.astype(t0.dtype), y0 + lift(h, y0) * slope)
-    d2 = norm(turned - slope) / h
-    largest = jnp.maximum(d1, d2)
+    d0 = norm(y0)
+
+    def slope(_: Array, state: Any) -> Any:
+        # At the start, then after a short step of Euler's: one field to compile.
+        h, first, last = state
+        now = method.field(constants, t0 + h.astype(t0.dtype), y0 + lift(h, y0) * first)
+        d1 = norm(now)
+        small = (d0 < 1e-5) | (d1 < 1e-5)
+        short = jnp.where(small, 1e-6, 0.01 * d0 / jnp.where(small, 1.0, d1)).astype(d0.dtype)
+        begun = h != 0
+        return jnp.where(begun, h, short), jnp.where(lift(begun, y0), first, now), now
+
+    h = jnp.zeros_like(d0)
+    state = (h, jnp.zeros_like(y0), jnp.zeros_like(y0))
+    h, first, last = lax.fori_loop(np.int32(0), np.int32(2), slope, state)
+    d2 = norm(last - first) / h
+    largest = jnp.maximum(norm(first), d2)
     flat = largest <= 1e-15
     guess = (0.01 / jnp.where(flat, 1.0, largest)) ** (1 / method.tableau.order)
     h = jnp.minimum(100 * h, jnp.where(flat, jnp.maximum(1e-6, 1e-3 * h), guess))
-    return h.astype(t0.dtype)
+    return h.astype(t0.dtype), first

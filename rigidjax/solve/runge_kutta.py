@@ -217,10 +217,13 @@ def pulled(
 
     none = jnp.zeros((cotangent.shape[0], count, *cotangent.shape[1:]), cotangent.dtype)
     below, seeds = lax.fori_loop(np.int32(0), np.int32(count), stage, (none, none))
-    # The constants' share of all stages at once: it does not wait for the others.
-    every = jax.vmap(field, (None, 0, 1), 1)
-    pull = jax.vjp(lambda c, t: every(c, t, there.places), constants, there.times)[1]
-    by_constants, by_times = axes.over(pull, 2, (-1, 1))(lift(h, seeds) * seeds)
+    # The constants' share of all stages at once: it does not wait for the others. Each stage has
+    # constants of its own, and their shares are summed last: else each number is a kernel.
+    every = jax.vmap(lambda c, t, y: field(c, t, y), (0, 0, 1), 1)
+    own = [jnp.broadcast_to(c, (count, *c.shape)) for c in constants]
+    pull = jax.vjp(lambda c, t: every(c, t, there.places), own, there.times)[1]
+    by_own, by_times = axes.over(pull, 2, (-1, 1))(lift(h, seeds) * seeds)
+    by_constants = [jnp.sum(by, 0) for by in by_own]
     slopes = jnp.expand_dims(there.slopes, 2) if axes.directions else there.slopes
     by_length = jnp.sum(seeds * slopes, (0, 1)).astype(by_times.dtype)
     c = w.c.astype(by_times.dtype).reshape(-1, *[1] * (by_times.ndim - 1))
