@@ -13,7 +13,7 @@ from jaxtyping import Array
 
 from rigidjax.motion import on_the_group
 from rigidjax.solve import adaptive_loop, adjoint
-from rigidjax.solve.adaptive_loop import Answer, Book, Method, Run, Walk
+from rigidjax.solve.adaptive_loop import Answer, Book, Method, Run
 from rigidjax.solve.adjoint import Inputs, Outputs
 from rigidjax.solve.components import flat, leaf_sizes, unflat
 from rigidjax.solve.explicit import AbstractExplicit
@@ -204,21 +204,16 @@ def _recorded(
         number=jnp.broadcast_to(book.number, run.t0.shape),
         filled=jnp.broadcast_to(book.filled, run.t0.shape),
     )
-    return [*answer, *jax.tree.leaves(book)], []
+    return [*answer, *book], []
 
 
 _RUN, _ANSWER = len(Run._fields), len(Answer._fields)
 
 
-def _book(leaves: Arrays) -> Book:
-    size = len(Walk._fields)
-    return Book(Walk(*leaves[:size]), *leaves[size:])
-
-
 def _pushed(
     program: _Program, layout: Layout, constants: Arrays, each: Arrays, linear: Arrays
 ) -> tuple[Arrays, Arrays]:
-    run, book = Run(*each[:_RUN]), _book(each[_RUN:])
+    run, book = Run(*each[:_RUN]), Book(*each[_RUN:])
     layout, constants = program.spread(layout, constants, run)
     method, chosen = program.of(layout, constants)
     *of_constants, ends, between, y0 = linear
@@ -231,7 +226,7 @@ def _pushed(
 def _pulled(
     program: _Program, layout: Layout, constants: Arrays, each: Arrays, linear: Arrays
 ) -> tuple[Arrays, Arrays]:
-    run, book = Run(*each[:_RUN]), _book(each[_RUN:])
+    run, book = Run(*each[:_RUN]), Book(*each[_RUN:])
     layout, constants = program.spread(layout, constants, run)
     method, chosen = program.of(layout, constants)
     axes = Axes(int(layout.bodies), int(layout.directions))
@@ -261,11 +256,9 @@ def _differentiated(program: _Program, primals: Arrays, tangents: Arrays) -> Any
         moved = args[number + kept + _ANSWER :]
         between, end, *record = mapped(_pushed, *given, *_linear(smooth, moved))
         answer = [between, end, jnp.zeros_like(args[head + 2]), jnp.zeros_like(args[head + 3])]
-        t, y, back_t, back_y, rows = record
-        return [*answer, t, jnp.zeros_like(t), y, back_t, back_y, rows]
+        return [*answer, *record]
 
-    size = len(Walk._fields) + len(Book._fields) - 1
-    kept = _RUN + size
+    kept = _RUN + len(Book._fields)
     found = forward_only(record, push_record)(*primals)
     answer, book = found[:_ANSWER], found[_ANSWER:]
     moved = [tangents[i] for i in smooth] + tangents[number:]

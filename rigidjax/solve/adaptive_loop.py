@@ -96,6 +96,25 @@ HEAD = 4
 NONE, STEP, LAST, VISIT = range(4)
 
 
+# The start of a segment is one row, too (8 + 2 n, *bodies): what is one number, then both states.
+_NUMBERS = ("t", "h", "back_t", "stop", "steps", "rejected", "known", "back_stop")
+_WHOLE = 3
+
+
+def packed(walk: Walk) -> Array:
+    """A `Walk` as one row."""
+    numbers = [getattr(walk, name).astype(walk.y.dtype) for name in _NUMBERS]
+    return jnp.concatenate([jnp.stack(numbers), walk.y, walk.back_y])
+
+
+def unpacked(row: Array) -> Walk:
+    """What was `packed`."""
+    head, (y, back_y) = row[: len(_NUMBERS)], jnp.split(row[len(_NUMBERS) :], 2)
+    whole = head[_WHOLE:].astype(jnp.int32)
+    numbers = dict(zip(_NUMBERS, [*head[:_WHOLE], *whole], strict=True))
+    return Walk(y=y, back_y=back_y, **numbers)
+
+
 class Until(NamedTuple):
     """Where a segment that is run again ends: time, and number of known states."""
 
@@ -104,9 +123,11 @@ class Until(NamedTuple):
 
 
 class Book(NamedTuple):
-    """A recorded run: the start of each segment, how many there are, the last one's rows."""
+    """A recorded run: the start of each segment (S, 8 + 2 n, *bodies), how many there are, and the
+    last one's rows.
+    """
 
-    starts: Walk
+    starts: Array
     number: Array
     rows: Rows
     filled: Array
@@ -143,12 +164,13 @@ def recording(method: Method, constants: list[Array], run: Run) -> tuple[Answer,
     """The answer, and what derivatives need."""
     walk = start(method, constants, run)
     most = method.max_steps + run.stops.shape[0] + run.between.shape[0]
-    starts: Any = jax.tree.map(lambda a: jnp.zeros((-(-most // SEGMENT), *a.shape), a.dtype), walk)
+    first = packed(walk)
+    starts = jnp.zeros((-(-most // SEGMENT), *first.shape), first.dtype)
     zero = jnp.zeros((), jnp.int32)
 
     def segment(state: Any) -> Any:
         walk, ys, book = state
-        starts = jax.tree.map(lambda a, b: a.at[book.number].set(b), book.starts, walk)
+        starts = lax.dynamic_update_index_in_dim(book.starts, packed(walk), book.number, 0)
         walk, rows, ys, count = recorded(method, constants, run, walk, book.rows, ys, None)
         return walk, ys, Book(starts, book.number + 1, rows, count)
 

@@ -25,6 +25,7 @@ from rigidjax.solve.adaptive_loop import (
     per_body,
     recorded,
     row_of,
+    unpacked,
 )
 from rigidjax.solve.components import lift
 from rigidjax.solve.runge_kutta import Axes
@@ -54,15 +55,9 @@ class Outputs(NamedTuple):
 
 
 class BookTangents(NamedTuple):
-    """Tangents of a recorded run: times and states at the starts of segments, the last rows.
+    """Tangents of a recorded run, as in `Book`."""
 
-    Of the times and states that the loop is at, and of those where its last step began.
-    """
-
-    t: Array
-    y: Array
-    back_t: Array
-    back_y: Array
+    starts: Array
     rows: Array
 
 
@@ -108,7 +103,7 @@ def tangents(
         more = _segment(method, constants, run, book, i + 1, rows)
         return moved, back, out, starts, path, *more
 
-    none = jnp.zeros((book.starts.t.shape[0], *along.y0.shape), along.y0.dtype)
+    none = jnp.zeros((book.starts.shape[0], *along.y0.shape), along.y0.dtype)
     out = jnp.zeros((size + 1, *along.y0.shape), along.y0.dtype)
     path = jnp.zeros((book.rows.shape[0], *along.y0.shape), along.y0.dtype)
     first = jnp.where(number > 1, 0, number)
@@ -119,12 +114,14 @@ def tangents(
     kind, stop = (book.rows[:, i].astype(jnp.int32) for i in (2, 3))
     heads = jnp.stack([*_of_times(run, kind, stop, along)])
     heads = _many_first(run, jnp.concatenate([heads, jnp.zeros_like(heads)]))
+    starts = unpacked(jnp.moveaxis(book.starts, 1, 0))
+    zero = jnp.zeros_like(y[:, :1])
     t, back_t = (
-        _many_first(run, _gathered(run, along.ends, i))
-        for i in (book.starts.stop, book.starts.back_stop)
+        _many_first(run, _gathered(run, along.ends, i))[:, None]
+        for i in (starts.stop, starts.back_stop)
     )
-    record = BookTangents(t, y, back_t, back_y, jnp.concatenate([heads, path], 1))
-    return Outputs(out[:size], moved), record
+    starts = jnp.concatenate([t, zero, back_t, *[zero] * 5, y, back_y], 1)
+    return Outputs(out[:size], moved), BookTangents(starts, jnp.concatenate([heads, path], 1))
 
 
 def cotangents(
@@ -187,12 +184,11 @@ def _segment(
 ) -> tuple[Rows, Array]:
     """A segment run once more; the rows as they are if there is none of that number."""
     there = (number >= 0) & (number < jnp.max(book.number))
-    place = jnp.clip(number, 0, book.starts.t.shape[0] - 1)
-    walk: Any = jax.tree.map(lambda a: a[place], book.starts)
-    ahead = jnp.minimum(place + 1, book.starts.t.shape[0] - 1)
     final = number + 1 >= jnp.max(book.number)
-    t = jnp.where(final, jnp.inf, book.starts.t[ahead])
-    known = jnp.where(final, run.between.shape[0], book.starts.known[ahead])
+    last = book.starts.shape[0] - 1
+    walk, ahead = (unpacked(book.starts[jnp.clip(i, 0, last)]) for i in (number, number + 1))
+    t = jnp.where(final, jnp.inf, ahead.t)
+    known = jnp.where(final, run.between.shape[0], ahead.known)
     until = Until(jnp.where(there, t, -jnp.inf), jnp.where(there, known, 0))
     _, rows, _, count = recorded(method, constants, run, walk, rows, None, until)
     return rows, count
