@@ -4,6 +4,7 @@ Products are spelled out instead of `@`: on CPU the gradient of a 3×3 `@` insid
 loop costs fifty times its value, and on GPUs `@` may round to ten bits (TF32).
 """
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
@@ -25,8 +26,22 @@ def inverse(tensor: Mat3Like) -> Mat3:
     >>> inverse(jnp.diag(jnp.array([1.0, 2.0, 4.0])))[2, 2]
     Array(0.25, dtype=float64)
     """
-    relative, scale = _relative_inverse(_checks.floating(tensor, (3, 3), "tensor"))
+    return _inverse(_checks.floating(tensor, (3, 3), "tensor"))
+
+
+@jax.custom_jvp
+def _inverse(a: Mat3) -> Mat3:
+    relative, scale = _relative_inverse(a)
     return relative / scale
+
+
+@_inverse.defjvp
+def _inverse_jvp(primals: tuple[Mat3], tangents: tuple[Mat3]) -> tuple[Mat3, Mat3]:
+    # −A⁻¹ dA A⁻¹: two products, where the cofactors' own derivative is nine sums of nine.
+    (a,), (da,) = primals, tangents
+    out = _inverse(a)
+    scale = a[0, 0] + a[1, 1] + a[2, 2]
+    return out, -product(product(out * scale, da / scale), out)
 
 
 def solve(tensor: Mat3Like, vector: Vec3Like) -> Vec3:
