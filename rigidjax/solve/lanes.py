@@ -16,7 +16,7 @@ Arrays = list[Any]
 
 # Bodies that go through a loop together on CPU: few, so that one step's numbers stay in the first
 # cache and no body waits long for another.
-BLOCK = 32
+BLOCK = 16
 
 
 class Layout(NamedTuple):
