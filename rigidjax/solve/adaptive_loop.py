@@ -27,6 +27,8 @@ from rigidjax.solve.tableaus import Tableau
 _SAFETY, _SMALLEST, _LARGEST = 0.9, 0.2, 10.0
 # Steps in a segment, rejected ones and visits included.
 SEGMENT = 512
+# More rows for one that is run again: it may take a few steps more.
+_MORE = 64
 # XLA on CPU makes one kernel of a loop whose state is smaller than a kilobyte: steps are written
 # into a block that small, and blocks into the record.
 _BLOCK, _MOST = 560, 8
@@ -116,9 +118,14 @@ def unpacked(row: Array) -> Walk:
 
 
 class Until(NamedTuple):
-    """Where a segment that is run again ends: time, and number of known states."""
+    """Where a segment that is run again ends: time, and number of known states.
+
+    Another program rounds otherwise, and may take other steps. The last one is taken as it was,
+    from `back_t` on, because visits after the end begin there.
+    """
 
     t: Array
+    back_t: Array
     known: Array
 
 
@@ -221,14 +228,15 @@ def _attempt(
     # A stop that is passed already, such as a jump before the start, needs no step.
     arrived = on & (walk.t >= begin)
     moving = on & ~arrived
-    cut = jnp.zeros_like(on)
+    cut = forced = jnp.zeros_like(on)
     if until is not None:
-        # A segment that is run again ends where it ended.
-        cut = until.t < end
-        end = jnp.minimum(end, until.t)
+        forced = moving & (walk.t >= until.back_t)
+        goal = jnp.where(forced, until.t, until.back_t)
+        cut = goal < end
+        end = jnp.minimum(end, goal)
     left = end - walk.t
     # The step kept is the controller's own, not the one cut short at a stop.
-    last = walk.h >= left
+    last = (walk.h >= left) | forced
     h = jnp.where(moving, jnp.where(last, left, walk.h), jnp.zeros_like(walk.h))
     late = jnp.where(last, end, walk.t + h)
     step, index = Step(walk.t, h, late, walk.y), walk.stop
@@ -250,7 +258,7 @@ def _attempt(
     size = _size_of(error, walk.y, y, run.rtol, run.atol)
     # NaN in a step too long says as little as infinity: try a shorter one.
     size = lax.stop_gradient(jnp.where(jnp.isnan(size), jnp.inf, size))
-    accept = moving & (size < 1)
+    accept = moving & ((size < 1) | forced)
     order = method.tableau.order
     factor = jnp.clip(_SAFETY * size ** (-1 / order), _SMALLEST, _LARGEST)
     following = lax.stop_gradient(h) * factor.astype(h.dtype)
@@ -341,8 +349,7 @@ def recorded(
             ys = per_body(_inserted, bodies)(ys, found[:many], base)
         return walk, rows, ys, count + k
 
-    # A segment that is run again may need as many rows as it had, in blocks of another size.
-    room = 0 if rows is None else rows.shape[0] - (2 if until is None else 1) * _MOST
+    room = 0 if rows is None else rows.shape[0] - (_MORE if until is None else 0) - _MOST
 
     def more(state: Any) -> Array:
         walk, rows, _, count = state
@@ -361,7 +368,7 @@ def _inserted(a: Array, rows: Array, index: Array) -> Array:
 
 def empty_rows(run: Run) -> Rows:
     """Space for the steps of a segment at least."""
-    room = SEGMENT + 2 * _MOST
+    room = SEGMENT + _MORE + _MOST
     return jnp.zeros((room, HEAD + run.y0.shape[0], *run.t0.shape), run.y0.dtype)
 
 

@@ -22,6 +22,7 @@ from rigidjax.solve.adaptive_loop import (
     Rows,
     Run,
     Until,
+    going,
     per_body,
     recorded,
     row_of,
@@ -187,11 +188,14 @@ def _segment(
     final = number + 1 >= jnp.max(book.number)
     last = book.starts.shape[0] - 1
     walk, ahead = (unpacked(book.starts[jnp.clip(i, 0, last)]) for i in (number, number + 1))
-    t = jnp.where(final, jnp.inf, ahead.t)
+    t, back_t = (jnp.where(final, jnp.inf, a) for a in (ahead.t, ahead.back_t))
     known = jnp.where(final, run.between.shape[0], ahead.known)
-    until = Until(jnp.where(there, t, -jnp.inf), jnp.where(there, known, 0))
-    _, rows, _, count = recorded(method, constants, run, walk, rows, None, until)
-    return rows, count
+    t, known = jnp.where(there, t, -jnp.inf), jnp.where(there, known, 0)
+    until = Until(t, back_t, known)
+    walk, rows, _, count = recorded(method, constants, run, walk, rows, None, until)
+    # With too little room for its steps there would be wrong numbers: then there are none.
+    short = jnp.any(going(method, run, walk, until))
+    return rows.at[:, 1].add(jnp.where(short, jnp.nan, 0.0)), count
 
 
 def _of_times(run: Run, kind: Array, stop: Array, along: Inputs) -> tuple[Array, Array]:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import rigidjax as rj
-from rigidjax.solve import adaptive_loop, lanes, lean
+from rigidjax.solve import adaptive_loop, adjoint, lanes, lean
 
 Q = np.array([0.8, -0.2, 0.4, 0.4]) / np.linalg.norm([0.8, -0.2, 0.4, 0.4])
 TENSOR = np.array([[1.0, 0.05, -0.1], [0.05, 1.7, 0.2], [-0.1, 0.2, 2.2]])
@@ -183,6 +183,34 @@ def test_many_segments_are_one(monkeypatch, name, second):
     segments = jax.jit(lambda p: slopes(p))(jnp.zeros(16))
     for a, b in zip(segments, whole, strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-10 * np.abs(b).max())
+
+
+def test_a_segment_run_again_may_take_other_steps(monkeypatch):
+    # As where another program rounds otherwise; the times lie on both sides of each segment's end.
+    ts = jnp.linspace(0.0, 1.5, 9)
+    weights = jnp.asarray(np.random.default_rng(1).normal(size=(9, 7)))
+
+    def value(p):
+        return run("wheel", ts, p, weights, 300)
+
+    p, turn = jnp.zeros(16), jnp.asarray(np.random.default_rng(2).normal(size=16))
+    whole = jax.jit(jax.grad(value))(p)
+    once, factor = adaptive_loop.recorded, [1.3]
+
+    def otherwise(method, constants, run, *rest):
+        return once(method, constants, run._replace(rtol=factor[0] * run.rtol), *rest)
+
+    monkeypatch.setattr(adaptive_loop, "SEGMENT", 7)
+    monkeypatch.setattr(adjoint, "recorded", otherwise)
+    slopes = jax.jit(lambda p: (jax.grad(value)(p), jax.jvp(value, (p,), (turn,))[1]))
+    reverse, forward = slopes(p)
+    scale = float(jnp.abs(whole).max())
+    np.testing.assert_allclose(reverse, whole, rtol=0, atol=1e-6 * scale)
+    np.testing.assert_allclose(forward, whole @ turn, rtol=0, atol=1e-6 * scale)
+    # Without room for them there are no numbers, rather than wrong ones.
+    factor[0] = 1e-5
+    monkeypatch.setattr(adaptive_loop, "_MORE", 0)
+    assert np.isnan(jax.jit(lambda p: jax.grad(value)(p))(p)).any()
 
 
 @pytest.mark.slow
