@@ -436,7 +436,7 @@ def _first_step(method: Method, constants: list[Array], run: Run) -> tuple[Array
 
     def slope(_: Array, state: Any) -> Any:
         # At the start, then after a short step of Euler's: one field to compile.
-        h, first, last = state
+        h, first, _ = state
         now = method.field(constants, t0 + h.astype(t0.dtype), y0 + lift(h, y0) * first)
         d1 = norm(now)
         small = (d0 < 1e-5) | (d1 < 1e-5)

@@ -69,7 +69,8 @@ def tangents(
     size, number = run.between.shape[0], jnp.max(book.number)
 
     def segment(i: Array, state: Any) -> Any:
-        moved, back, out, starts, _, rows, count = state
+        moved, back, out, starts, _ = state
+        rows, count = _segment(method, constants, run, book, i)
         starts = [
             lax.dynamic_update_slice_in_dim(a, b[None], i, 0)
             for a, b in zip(starts, (moved, back), strict=True)
@@ -101,17 +102,13 @@ def tangents(
 
         path = jnp.zeros((rows.shape[0], *moved.shape), moved.dtype)
         moved, back, out, path = lax.fori_loop(0, count, step, (moved, back, out, path))
-        more = _segment(method, constants, run, book, i + 1, rows)
-        return moved, back, out, starts, path, *more
+        return moved, back, out, starts, path
 
     none = jnp.zeros((book.starts.shape[0], *along.y0.shape), along.y0.dtype)
     out = jnp.zeros((size + 1, *along.y0.shape), along.y0.dtype)
     path = jnp.zeros((book.rows.shape[0], *along.y0.shape), along.y0.dtype)
-    first = jnp.where(number > 1, 0, number)
-    rows, again = _segment(method, constants, run, book, first, book.rows)
-    count = jnp.where(number > 1, again, jnp.max(book.filled))
-    state = (along.y0, along.y0, out, [none, none], path, rows, count)
-    moved, _, out, (y, back_y), path, _, _ = lax.fori_loop(0, number, segment, state)
+    state = (along.y0, along.y0, out, [none, none], path)
+    moved, _, out, (y, back_y), path = lax.fori_loop(0, number, segment, state)
     kind, stop = (book.rows[:, i].astype(jnp.int32) for i in (2, 3))
     heads = jnp.stack([*_of_times(run, kind, stop, along)])
     heads = _many_first(run, jnp.concatenate([heads, jnp.zeros_like(heads)]))
@@ -133,7 +130,7 @@ def cotangents(
     seeds = bars.between
 
     def segment(i: Array, state: Any) -> Any:
-        sums, extra, rows, count = state
+        rows, count = _segment(method, constants, run, book, number - 1 - i)
 
         def step(i: Array, both: Any) -> Any:
             sums, extra = both
@@ -165,8 +162,7 @@ def cotangents(
             extra = jnp.where(lift(taken, by_y), jnp.zeros_like(extra), extra + _where(visit, by_y))
             return Inputs(total, ends, between, before), extra
 
-        sums, extra = lax.fori_loop(0, count, step, (sums, extra))
-        return sums, extra, *_segment(method, constants, run, book, number - 2 - i, rows)
+        return lax.fori_loop(0, count, step, state)
 
     more = bars.end.shape[1:]
     sums = Inputs(
@@ -175,27 +171,27 @@ def cotangents(
         jnp.zeros((size, *more), run.t0.dtype),
         bars.end,
     )
-    state = (sums, jnp.zeros_like(bars.end), book.rows, jnp.max(book.filled))
-    sums, extra, _, _ = lax.fori_loop(0, number, segment, state)
+    sums, extra = lax.fori_loop(0, number, segment, (sums, jnp.zeros_like(bars.end)))
     return sums._replace(y0=sums.y0 + extra)
 
 
 def _segment(
-    method: Method, constants: list[Array], run: Run, book: Book, number: Array, rows: Rows
+    method: Method, constants: list[Array], run: Run, book: Book, number: Array
 ) -> tuple[Rows, Array]:
-    """A segment run once more; the rows as they are if there is none of that number."""
-    there = (number >= 0) & (number < jnp.max(book.number))
-    final = number + 1 >= jnp.max(book.number)
+    """The rows of a segment, and how many they are: of the last as they are, else run once more."""
+    end = jnp.max(book.number) - 1
     last = book.starts.shape[0] - 1
     walk, ahead = (unpacked(book.starts[jnp.clip(i, 0, last)]) for i in (number, number + 1))
-    t, back_t = (jnp.where(final, jnp.inf, a) for a in (ahead.t, ahead.back_t))
-    known = jnp.where(final, run.between.shape[0], ahead.known)
-    t, known = jnp.where(there, t, -jnp.inf), jnp.where(there, known, 0)
-    until = Until(t, back_t, known)
-    walk, rows, _, count = recorded(method, constants, run, walk, rows, None, until)
+    again = number < end
+    # Nothing is left to do of the last one.
+    until = Until(
+        jnp.where(again, ahead.t, -jnp.inf), ahead.back_t, jnp.where(again, ahead.known, 0)
+    )
+    walk, rows, _, count = recorded(method, constants, run, walk, book.rows, None, until)
     # With too little room for its steps there would be wrong numbers: then there are none.
-    short = jnp.any(going(method, run, walk, until))
-    return rows.at[:, 1].add(jnp.where(short, jnp.nan, 0.0)), count
+    short = jnp.where(jnp.any(going(method, run, walk, until)), jnp.nan, 0.0)
+    count = jnp.where(again, count, jnp.max(book.filled))
+    return rows.at[:, 1].add(short.astype(rows.dtype)), count
 
 
 def _of_times(run: Run, kind: Array, stop: Array, along: Inputs) -> tuple[Array, Array]:
