@@ -38,7 +38,18 @@ def event(scene: Any) -> dfx.Event | None:
     >>> event(scenes.earth(0.5)) is None
     True
     """
-    return dfx.Event(TooClose(scene)) if hasattr(scene, "approach") else None
+    close = condition(scene)
+    return None if close is None else dfx.Event(close)
+
+
+def condition(scene: Any) -> TooClose | None:
+    """Whether a particle has collided, or `None` for scenes without bodies to hit.
+
+    >>> from rigidjax.frames import scenes
+    >>> condition(scenes.earth(0.5)) is None
+    True
+    """
+    return TooClose(scene) if hasattr(scene, "approach") else None
 
 
 def refuse(ys: Any, stats: dict[str, Any], ts: Any) -> Any:

@@ -28,13 +28,16 @@ class Found(NamedTuple):
     """What `adaptive` returns.
 
     **Fields:** `ys` the states, of the type of `y0`, with a leading time axis; `num_steps`,
-    `num_rejected` of the whole run; `result` a `diffrax.RESULTS`.
+    `num_rejected` of the whole run; `result` a `diffrax.RESULTS`; `last_time`, `last` where the run
+    ended.
     """
 
     ys: Any
     num_steps: Array
     num_rejected: Array
     result: dfx.RESULTS
+    last_time: Array
+    last: Any
 
 
 def adaptive(
@@ -48,6 +51,7 @@ def adaptive(
     dt0: Any = None,
     max_steps: int = 100_000,
     jumps: Array | None = None,
+    halt: Callable[..., Any] | None = None,
 ) -> Found:
     """The states at `ts`, with steps as long as the tolerances allow.
 
@@ -57,11 +61,12 @@ def adaptive(
     **Arguments:** `solver` an explicit method of this package; `field` a vector field
     `f(t, y, args)` such as `AttitudeEquations`; `ts` (T,) s; `y0` the state at `ts[0]`; `rtol`,
     `atol` scalars; `dt0` the first step, s, or `None`; `jumps` times, s, in any order, at which the
-    field jumps: steps end there. Derivatives are by all numbers of the field, `ts`, `jumps` and
+    field jumps: steps end there; `halt(t, y)` a condition, looked at after each step, that ends the
+    run. Derivatives are by all numbers of the field, `ts`, `jumps` and
     `y0`, lengths of steps held; not by tolerances.
 
-    **Returns** a `Found`. A run that needs more than `max_steps`, or meets a NaN that no shorter
-    step avoids, ends early: its `result` says so, and the states not reached are NaN.
+    **Returns** a `Found`. A run that needs more than `max_steps`, is halted, or meets a NaN that no
+    shorter step avoids, ends early: its `result` says so, and the states not reached are NaN.
 
     **Raises:** `TypeError` for a state of several dtypes, or of another than `ts`.
 
@@ -77,7 +82,7 @@ def adaptive(
         raise TypeError(
             f"adaptive: wanted times and state of one dtype, got {ts.dtype} and {numbers.dtype}"
         )
-    program, constants = _program(solver.tableau, field, ts[0], y0, max_steps)
+    program, constants = _program(solver.tableau, field, halt, ts[0], y0, max_steps)
     stops = ts[-1:]
     if jumps is not None and jumps.size:
         inside = jnp.clip(jnp.sort(jumps.astype(ts.dtype)), ts[0], ts[-1])
@@ -92,35 +97,37 @@ def adaptive(
         jnp.asarray(jnp.nan if dt0 is None else dt0, ts.dtype),
     )
     out = _solved(program, constants, run)
-    result = dfx.RESULTS.where(
-        out.t >= ts[-1],
-        dfx.RESULTS.successful,
-        dfx.RESULTS.where(
-            out.h > 0,
-            dfx.RESULTS.max_steps_reached,
-            dfx.RESULTS.where(jnp.isnan(out.h), NONFINITE, dfx.RESULTS.dt_min_reached),
-        ),
-    )
+    result = dfx.RESULTS.dt_min_reached
+    for there, word in (
+        (jnp.isnan(out.h), NONFINITE),
+        (out.h > 0, dfx.RESULTS.max_steps_reached),
+        (out.t >= ts[-1], dfx.RESULTS.successful),
+        (out.h == adaptive_loop.HALTED, dfx.RESULTS.event_occurred),
+    ):
+        result = dfx.RESULTS.where(there, word, result)
     rows = jnp.concatenate([numbers[None], out.between, out.end[None]])
     ys = jax.vmap(partial(unflat, like=y0))(rows)
-    return Found(ys, out.steps, out.rejected, result)
+    return Found(ys, out.steps, out.rejected, result, out.t, unflat(out.last, y0))
 
 
 class _Program(NamedTuple):
     """What is compiled: a method whose `field(constants, t, y)` is of one body.
 
-    **Fields:** `smooth` which of the constants have derivatives.
+    **Fields:** `halt(constants, t, y)` the condition that ends a run, or `None`; `smooth` which of
+    the constants have derivatives.
     """
 
     method: Method
+    halt: Callable[..., Any] | None
     smooth: tuple[bool, ...]
 
     def of(self, layout: Layout, constants: Arrays) -> tuple[Method, Arrays]:
         """The method on (n, *bodies), and those of the constants that have derivatives."""
-        method, field = self.method, self.method.field
+        method, field, halt = self.method, self.method.field, self.halt
         if layout.bodies:
             shared = [None if s else -1 for s in layout.shared]
             field = jax.vmap(field, (shared, -1, -1), -1)
+            halt = None if halt is None else jax.vmap(halt, (shared, -1, -1), -1)
             method = method._replace(project=jax.vmap(method.project, -1, -1))
 
         def of_smooth(chosen: Arrays, t: Array, y: Array) -> Array:
@@ -129,6 +136,8 @@ class _Program(NamedTuple):
             return field(both, t, y)
 
         chosen = [c for c, s in zip(constants, self.smooth, strict=True) if s]
+        if halt is not None:
+            method = method._replace(halt=partial(halt, constants))
         return method._replace(field=of_smooth), chosen
 
     def spread(self, layout: Layout, constants: Arrays, run: Run) -> tuple[Layout, Arrays]:
@@ -145,27 +154,49 @@ class _Program(NamedTuple):
 
 
 def _program(
-    tableau: Tableau, field: Callable[..., Any], t0: Array, y0: Any, max_steps: int
+    tableau: Tableau,
+    field: Callable[..., Any],
+    halt: Callable[..., Any] | None,
+    t0: Array,
+    y0: Any,
+    max_steps: int,
 ) -> tuple[_Program, Arrays]:
     like = jax.tree.map(lambda a: jax.ShapeDtypeStruct(jnp.shape(a), jnp.result_type(a)), y0)
 
     def flat_field(t: Array, y: Array) -> Array:
         return flat(field(t, unflat(y, like), None))
 
-    # What the field depends on, also what it closes over, is taken out of it.
-    converted = eqx.filter_closure_convert(flat_field, t0, flat(y0))
-    arrays, rest = eqx.partition(converted, eqx.is_array)
-    constants, tree = jax.tree.flatten(arrays)
-
-    def of_one(constants: Arrays, t: Array, y: Array) -> Array:
-        return eqx.combine(jax.tree.unflatten(tree, constants), rest)(t, y)
-
     def project(y: Array) -> Array:
         return flat(on_the_group(unflat(y, like)))
 
-    smooth = tuple(bool(jnp.issubdtype(c.dtype, jnp.inexact)) for c in constants)
-    method = Method(tableau, of_one, project, leaf_sizes(like), max_steps)
-    return _Program(method, smooth), constants
+    of_one, constants = _taken_out(flat_field, t0, flat(y0))
+    count, ended = len(constants), None
+    smooth = [bool(jnp.issubdtype(c.dtype, jnp.inexact)) for c in constants]
+    if halt is not None:
+        condition, more = _taken_out(lambda t, y: halt(t, unflat(y, like)), t0, flat(y0))
+        ended = lambda constants, t, y: condition(constants[count:], t, y)  # noqa: E731
+        constants, smooth = [*constants, *more], [*smooth, *[False] * len(more)]
+    method = Method(
+        tableau,
+        lambda constants, t, y: of_one(constants[:count], t, y),
+        project,
+        None,
+        leaf_sizes(like),
+        max_steps,
+    )
+    return _Program(method, ended, tuple(smooth)), constants
+
+
+def _taken_out(function: Callable[..., Any], *like: Any) -> tuple[Callable[..., Any], Arrays]:
+    """`f(constants, t, y)` and the constants: what a function depends on, also by closure."""
+    converted = eqx.filter_closure_convert(function, *like)
+    arrays, rest = eqx.partition(converted, eqx.is_array)
+    constants, tree = jax.tree.flatten(arrays)
+
+    def of_constants(constants: Arrays, t: Array, y: Array) -> Any:
+        return eqx.combine(jax.tree.unflatten(tree, constants), rest)(t, y)
+
+    return of_constants, constants
 
 
 def _solved(program: _Program, constants: Arrays, run: Run) -> Answer:
@@ -255,7 +286,8 @@ def _differentiated(program: _Program, primals: Arrays, tangents: Arrays) -> Any
         given = [*args[:head], *args[head + _ANSWER : number + kept + _ANSWER]]
         moved = args[number + kept + _ANSWER :]
         between, end, *record = mapped(_pushed, *given, *_linear(smooth, moved))
-        answer = [between, end, jnp.zeros_like(args[head + 2]), jnp.zeros_like(args[head + 3])]
+        still = [jnp.zeros_like(a) for a in args[head + 2 : head + 5]]
+        answer = [between, end, *still]
         return [*answer, *record]
 
     kept = _RUN + len(Book._fields)

@@ -37,13 +37,14 @@ _BLOCK, _MOST = 560, 8
 class Method(NamedTuple):
     """What a run is made of, beside its numbers.
 
-    **Fields:** `tableau`; `field` and `project`, on (n, *bodies); `sizes` how many numbers each
-    array of the state has; `max_steps`.
+    **Fields:** `tableau`; `field` and `project`, on (n, *bodies); `halt(t, y)` whether the run ends
+    here, or `None`; `sizes` how many numbers each array of the state has; `max_steps`.
     """
 
     tableau: Tableau
     field: Field
     project: Callable[[Array], Array]
+    halt: Callable[[Array, Array], Array] | None
     sizes: list[int]
     max_steps: int
 
@@ -96,6 +97,8 @@ class Walk(NamedTuple):
 Rows = Array
 HEAD = 4
 NONE, STEP, LAST, VISIT = range(4)
+# The next step of a run that has met the condition that ends it.
+HALTED = -1.0
 
 
 # The start of a segment is one row, too (8 + 2 n, *bodies): what is one number, then both states.
@@ -141,13 +144,15 @@ class Book(NamedTuple):
 
 
 class Answer(NamedTuple):
-    """States `between` (K, n, *bodies) and at the `end` (n, *bodies), NaN where not reached; last
-    time, next step and counters of the loop.
+    """States `between` (K, n, *bodies) and at the `end` (n, *bodies), NaN where not reached; time,
+    state and next step of the loop when it ended (0, NaN where none is left to try, `HALTED`), and
+    its counters.
     """
 
     between: Array
     end: Array
     t: Array
+    last: Array
     h: Array
     steps: Array
     rejected: Array
@@ -195,6 +200,7 @@ def start(method: Method, constants: list[Array], run: Run) -> Walk:
     sound = jnp.all(jnp.isfinite(f0), 0) & jnp.all(jnp.isfinite(y0), 0)
     sound = sound & jnp.isfinite(t0) & jnp.isfinite(run.stops[-1])
     h = jnp.where(sound, jnp.where(jnp.isnan(run.h0), h, run.h0), jnp.nan)
+    h = _unless_halted(method, t0, y0, h)
     zero = jnp.zeros(t0.shape, jnp.int32)
     return Walk(t0, h, y0, zero, zero, zero, zero, t0, y0, zero)
 
@@ -272,6 +278,9 @@ def _attempt(
     following = jnp.where(moving & ~accept & ~(following > unit), why, following)
     reached = accept & last & ~cut
     following = jnp.where(moving, following, kept)
+    if until is None:
+        ended = _unless_halted(method, late, y, following)
+        following = jnp.where(accept, ended, following)
     wide = lift(accept, y)
     after = Walk(
         t=jnp.where(accept, jnp.where(reached, begin, late), walk.t),
@@ -289,6 +298,12 @@ def _attempt(
     kind = jnp.where(visiting, VISIT + walk.known, kind.astype(jnp.int32))
     head = jnp.stack([step.t, step.h, kind.astype(h.dtype), index.astype(h.dtype)])
     return after, jnp.concatenate([head, step.y]), y
+
+
+def _unless_halted(method: Method, t: Array, y: Array, h: Array) -> Array:
+    if method.halt is None:
+        return h
+    return jnp.where(method.halt(t, y), jnp.full_like(h, HALTED), h)
 
 
 def visit_of(run: Run, number: Array, t: Array, stop: Array, y: Array) -> Step:
@@ -414,7 +429,7 @@ def _answer(run: Run, walk: Walk, ys: Array | None) -> Answer:
         between = jnp.where(there, ys[:size], jnp.nan)
     there = walk.stop >= run.stops.shape[0]
     end = jnp.where(lift(there, walk.y), walk.y, jnp.nan)
-    return Answer(between, end, walk.t, walk.h, walk.steps, walk.rejected)
+    return Answer(between, end, walk.t, walk.y, walk.h, walk.steps, walk.rejected)
 
 
 def _size_of(error: Array, left: Array, right: Array, rtol: Array, atol: Array) -> Array:

@@ -103,15 +103,15 @@ def solve(
     if scene is not None:
         if watch is not None:
             end, end_time = jax.tree.map(lambda leaf: leaf[0], (saved[1], times[1]))
-            stats["collided"] = out.result == dfx.RESULTS.event_occurred
-            stats["end_time"] = end_time
-            stats["end_distances"] = scene.approach(end_time, end)[0]
+            stats |= _collision(scene, out.result, end_time, end)
         stats["drift"] = scene.drift(ts, ys)
     return ys, stats, result
 
 
 def _loop(setup: Loop, state0: Any, ts: Array) -> tuple[Any, dict[str, Any], dfx.RESULTS]:
     controller: Any = setup.controller
+    scene: Any = scene_of(setup.torque) if isinstance(state0, Point) else None
+    watch = None if scene is None else collision.condition(scene)
     out = adaptive(
         setup.solver,
         equations_of_motion(setup.body, state0, setup.torque),
@@ -122,6 +122,7 @@ def _loop(setup: Loop, state0: Any, ts: Array) -> tuple[Any, dict[str, Any], dfx
         dt0=setup.dt0,
         max_steps=setup.max_steps,
         jumps=jumps_of(setup.torque),
+        halt=watch,
     )
     ys = _raise(out.ys, out.result) if setup.throw else out.ys
     stats: dict[str, Any] = {
@@ -129,9 +130,19 @@ def _loop(setup: Loop, state0: Any, ts: Array) -> tuple[Any, dict[str, Any], dfx
         "num_accepted_steps": out.num_steps - out.num_rejected,
         "num_rejected_steps": out.num_rejected,
     }
-    if isinstance(state0, Point):
-        stats["drift"] = scene_of(setup.torque).drift(ts, ys)
+    if scene is not None:
+        if watch is not None:
+            stats |= _collision(scene, out.result, out.last_time, out.last)
+        stats["drift"] = scene.drift(ts, ys)
     return ys, stats, out.result
+
+
+def _collision(scene: Any, result: dfx.RESULTS, time: Array, state: Any) -> dict[str, Any]:
+    return {
+        "collided": result == dfx.RESULTS.event_occurred,
+        "end_time": time,
+        "end_distances": scene.approach(time, state)[0],
+    }
 
 
 def _reached(ys: Any, times: Array) -> Any:

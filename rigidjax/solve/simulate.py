@@ -12,7 +12,7 @@ from jaxtyping import Array, ArrayLike, Float
 from rigidjax import _checks
 from rigidjax._types import ScalarLike
 from rigidjax.body.inertia import Inertia, MassProperties
-from rigidjax.frames import AbstractScene, MovingFrame, Point, collision, scene_of
+from rigidjax.frames import AbstractScene, MovingFrame, collision
 from rigidjax.motion.torques import jumps_of
 from rigidjax.solve import inputs
 from rigidjax.solve.explicit import AbstractExplicit, DormandPrince8
@@ -130,7 +130,7 @@ def simulate(
     method = DormandPrince8() if solver is None else solver
     plain = isinstance(method, AbstractExplicit) and max_steps is not None
     plain = plain and stepsize_controller is None and progress_meter is None
-    plain = plain and isinstance(adjoint, _EITHER_MODE) and not _can_collide(state0, torque)
+    plain = plain and isinstance(adjoint, _EITHER_MODE)
     if plain:
         first = inputs.first_step(dt0, times)
         loop = Loop(body, torque, method, controller, first, max_steps, throw)  # pyright: ignore
@@ -150,10 +150,6 @@ def simulate(
     if throw and "collided" in stats:
         ys = collision.refuse(ys, stats, times)
     return Solution(times, ys, stats, result, setup)
-
-
-def _can_collide(state0: Any, torque: Any) -> bool:
-    return isinstance(state0, Point) and collision.event(scene_of(torque)) is not None
 
 
 def _watched(rtol: Any, atol: Any) -> Watched:
