@@ -134,7 +134,7 @@ def simulate(
     if plain:
         first = inputs.first_step(dt0, times)
         loop = Loop(body, torque, method, controller, first, max_steps, throw)  # pyright: ignore
-        return Solution(times, *solve(loop, state0, times), loop)
+        return _solution(loop, state0, times)
     setup = Setup(
         body=body,
         torque=torque,
@@ -146,8 +146,12 @@ def simulate(
         max_steps=max_steps,
         throw=throw,
     )
+    return _solution(setup, state0, times)
+
+
+def _solution(setup: Loop | Setup, state0: Any, times: Array) -> Solution:
     ys, stats, result = solve(setup, state0, times)
-    if throw and "collided" in stats:
+    if setup.throw and "collided" in stats:
         ys = collision.refuse(ys, stats, times)
     return Solution(times, ys, stats, result, setup)
 
