@@ -2,8 +2,8 @@
 
 `python tests/solve/bench_loop.py [--quick]` prints, for the asymmetric heavy top at 1e-9 with 2 and
 with 30 saved times, CPU seconds to trace and compile and CPU time to run, each over that of a
-vector field written by hand under `diffrax.Dopri8`; then our solver inside `diffeqsolve`, the closed
-form, and a particle (Foucault, Arenstorf). Medians of interleaved repeats.
+vector field written by hand under `diffrax.Dopri8`; beside them our solver inside `diffeqsolve` and
+the closed form; then the same for a particle (Foucault, Arenstorf). Medians of interleaved repeats.
 """
 
 import sys
@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import rigidjax as rj
+from rigidjax.frames import scenes
 
 jax.config.update("jax_enable_x64", True)
 
@@ -26,8 +27,8 @@ WEIGHTS = np.arange(1.0, 4.0)
 
 
 def by_hand(t, y, p):
-    """What a user would write: principal moments, constants outside."""
-    q, w, c = y[:4], y[4:], (0.1, 0.2, 0.9)
+    """What a user would write: principal moments and the centre of mass, constants outside."""
+    q, w, c = y[:4], y[4:], p[3:] if len(p) == 6 else (0.1, 0.2, 0.9)
     g = tuple(
         -9.81 * r
         for r in (
@@ -53,14 +54,19 @@ def by_hand(t, y, p):
     return jnp.stack([*dq, *dw])
 
 
+def under_diffrax(field, start, p, ts, adjoint):
+    """The states of a field written by hand."""
+    return dfx.diffeqsolve(
+        dfx.ODETerm(field), dfx.Dopri8(), ts[0], ts[-1], None, start, p, saveat=dfx.SaveAt(ts=ts),
+        stepsize_controller=dfx.PIDController(rtol=RTOL, atol=ATOL), adjoint=adjoint,
+        max_steps=100_000,
+    ).ys  # fmt: skip
+
+
 def plain(ts, adjoint):
     def run(p, omega):
-        out = dfx.diffeqsolve(
-            dfx.ODETerm(by_hand), dfx.Dopri8(), ts[0], ts[-1], None, jnp.concatenate([Q, omega]), p,
-            saveat=dfx.SaveAt(ts=ts), stepsize_controller=dfx.PIDController(rtol=RTOL, atol=ATOL),
-            adjoint=adjoint, max_steps=100_000,
-        )  # fmt: skip
-        return out.ys[:, 4:]
+        start = jnp.concatenate([jnp.asarray(Q), omega])
+        return under_diffrax(by_hand, start, p, ts, adjoint)[:, 4:]
 
     return run
 
@@ -71,6 +77,73 @@ def ours(ts):
         return rj.simulate(body, rj.Attitude(Q, omega), ts, TOP, rtol=RTOL, atol=ATOL).ys.omega
 
     return run
+
+
+def plain_of_all(ts):
+    def run(x):
+        p, start = x[:6], jnp.concatenate([x[9:], x[6:9]])
+        return under_diffrax(by_hand, start, p, ts, dfx.ForwardMode())[:, 4:]
+
+    return run
+
+
+def ours_of_all(ts):
+    """Of all numbers that a fit would look for: moments, centre of mass, rate, attitude."""
+
+    def run(x):
+        body = rj.Inertia.from_principal(x[0], x[1], x[2])
+        top = rj.torques.HeavyTop(1.0, x[3:6], [0.0, 0.0, -9.81])
+        start = rj.Attitude(x[9:], x[6:9])
+        return rj.simulate(body, start, ts, top, rtol=RTOL, atol=ATOL).ys.omega
+
+    return run
+
+
+def foucault_by_hand(t, y, p):
+    """A pendulum on the turning Earth, axes east, north, up; p = g, Ω north, Ω up."""
+    g, n, u = p
+    (px, py, pz), (vx, vy, vz) = y[:3], y[3:]
+    along, square = n * py + u * pz, n * n + u * u
+    ax = square * px + 2 * (u * vy - n * vz)
+    ay = square * py - along * n - 2 * u * vx
+    az = square * pz - along * u + 2 * n * vx - g
+    pull = px * ax + py * ay + pz * az + vx * vx + vy * vy + vz * vz
+    pull = pull / (px * px + py * py + pz * pz)
+    return jnp.stack([vx, vy, vz, ax - pull * px, ay - pull * py, az - pull * pz])
+
+
+def three_body_by_hand(t, y, p):
+    (x, z, u), (vx, vy, vz), m = y[:3], y[3:], p[0]
+    near = ((x + m) ** 2 + z * z + u * u) ** 1.5
+    far = ((x - 1 + m) ** 2 + z * z + u * u) ** 1.5
+    pull, tide = (1 - m) / near, m / far
+    ax = x + 2 * vy - pull * (x + m) - tide * (x - 1 + m)
+    return jnp.stack([vx, vy, vz, ax, z - 2 * vx - (pull + tide) * z, -(pull + tide) * u])
+
+
+def particles(count):
+    """Name → functions by hand and ours of (start's velocity, constants), and arguments."""
+    law = scenes.foucault(0.85, 67.0)
+    start, (_, north, up) = law.start(3.0, 0.0), law.place.angular_velocity()
+    earth = jnp.array([law.place.gravity, north, up])
+    orbit, mu = jnp.array([0.994, 0.0, 0.0]), jnp.array([0.012277471])
+    speed = jnp.array([0.0, -2.00158510637908252240, 0.0])
+    found = {}
+    for name, field, x, v, p, end, scene in (
+        ("Foucault", foucault_by_hand, start.x, start.v, earth, 600.0, lambda p: law),
+        ("Arenstorf", three_body_by_hand, orbit, speed, mu, 17.0652, lambda p: scenes.cr3bp(p[0])),
+    ):
+        ts = jnp.linspace(0.0, end, count)
+
+        def hand(v, p, field=field, x=x, ts=ts):
+            adjoint = dfx.RecursiveCheckpointAdjoint()
+            return under_diffrax(field, jnp.concatenate([x, v]), p, ts, adjoint)[:, :3]
+
+        def mine(v, p, scene=scene, x=x, ts=ts):
+            return rj.simulate(None, rj.Point(x, v), ts, scene(p), rtol=RTOL, atol=ATOL).ys.x
+
+        found[name] = hand, mine, (v, p)
+    return found
 
 
 def inside_diffrax(ts):
@@ -108,10 +181,15 @@ def cases(ts):
     one = (jnp.asarray(MOMENTS), jnp.asarray(OMEGA))
     moments = jnp.asarray(MOMENTS * (1 + 0.1 * rng.uniform(size=(MANY, 3))))
     many = (moments, jnp.asarray(OMEGA + rng.normal(size=(MANY, 3))))
+    whole = jnp.concatenate([one[0], jnp.array([0.1, 0.2, 0.9]), one[1], jnp.asarray(Q)])
     hand, ahead = plain(ts, dfx.RecursiveCheckpointAdjoint()), plain(ts, dfx.ForwardMode())
     mine, both = ours(ts), (0, 1)
     return {
-        "value": {"diffrax": (hand, one), "ours": (mine, one)},
+        "value": {
+            "diffrax": (hand, one),
+            "ours": (mine, one),
+            "closed form": (closed_form(ts), one),
+        },
         "gradient": {
             "diffrax": (jax.grad(number(hand), both), one),
             "ours": (jax.grad(number(mine), both), one),
@@ -121,6 +199,10 @@ def cases(ts):
         "Jacobian by 6": {
             "diffrax": (jax.jacfwd(ahead, both), one),
             "ours": (jax.jacfwd(mine, both), one),
+        },
+        "Jacobian by 13": {
+            "diffrax": (jax.jacfwd(plain_of_all(ts)), (whole,)),
+            "ours": (jax.jacfwd(ours_of_all(ts)), (whole,)),
         },
         f"{MANY} values": {"diffrax": (jax.vmap(hand), many), "ours": (jax.vmap(mine), many)},
         f"{MANY} gradients": {
@@ -151,16 +233,24 @@ def main():
     repeats = 3 if "--quick" in sys.argv else 9
     print(f"jax {jax.__version__}, CPU time; in brackets over plain diffrax")
     for saved in (2, 30):
-        ts = jnp.linspace(0.0, END, saved)
-        for row, methods in cases(ts).items():
-            found = measured(methods, repeats)
-            compile0, run0 = found["diffrax"]
-            for name, (cpu, run) in found.items():
-                print(
-                    f"{saved:3d} times  {row:15s} {name:19s} compile {cpu:5.2f} s"
-                    f" ({cpu / compile0:.2f})  run {run * 1e6:8.0f} us ({run / run0:.2f})",
-                    flush=True,
-                )
+        for row, methods in cases(jnp.linspace(0.0, END, saved)).items():
+            shown(saved, row, measured(methods, repeats))
+        for name, (hand, mine, args) in particles(saved).items():
+            shown(saved, name, measured({"diffrax": (hand, args), "ours": (mine, args)}, repeats))
+            slopes = {
+                who: (jax.grad(number(f)), args) for who, f in (("diffrax", hand), ("ours", mine))
+            }
+            shown(saved, f"{name}, grad", measured(slopes, repeats))
+
+
+def shown(saved, row, found):
+    compile0, run0 = found["diffrax"]
+    for name, (cpu, run) in found.items():
+        print(
+            f"{saved:3d} times  {row:15s} {name:19s} compile {cpu:5.2f} s"
+            f" ({cpu / compile0:.2f})  run {run * 1e6:8.0f} us ({run / run0:.2f})",
+            flush=True,
+        )
 
 
 if __name__ == "__main__":
