@@ -312,8 +312,8 @@ row(
 row("Solution.evaluate", lambda: dict(self=s.motion(), t=0.7), arguments=("t",), traced=("t",))
 leave_out("simulate returns it", "Solution")
 leave_out(
-    "inner loops, to be replaced by one stepper (design.md); simulate and rollout run them",
-    *(f"solve.lean.{n}" for n in ("LeanSolution", "adaptive", "fixed", "split_fixed")),
+    "inner loops: simulate and rollout run them",
+    *(f"solve.lean.{n}" for n in ("adaptive", "fixed", "split_fixed")),
 )
 
 # Batches.
