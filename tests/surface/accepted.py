@@ -8,7 +8,11 @@ OVERFLOW = (
 )
 REACHED = "a body's status says what happened to it, and its states are NaN: documented"
 ANY_TREE = "a tree of whatever NumPy makes an array of"
-DOMAIN = "outside of the domain that the documentation states, where nothing is defined"
+BY_NUMBER = (
+    "a function of arrays, number by number, as SciPy's of the same names: outside of its domain, "
+    "which its docstring states, it gives NaN there and the right numbers beside"
+)
+NO_NUMBERS = "a function of arrays, number by number: of no numbers it makes none"
 LIMIT = "the right limit for an infinite argument"
 
 # (row, argument: replacement, what came of it, reason), as patterns; the first that fits counts.
@@ -34,6 +38,11 @@ ACCEPTED: list[tuple[str, str, str, str]] = [
         "the square root is not smooth at 0, has no real value below, and its second derivative "
         "overflows below 1e-205: the function must be smooth on the spectrum",
     ),
+    ("special.elliptic.r*", "*: negative", "a silent NaN*", BY_NUMBER),
+    ("special.elliptic.ellip* (no complement)", "[mn]: huge", "a silent NaN*", BY_NUMBER),
+    ("special.elliptic.ellip* (no complement)", "[mn]: large", "a silent NaN*", BY_NUMBER),
+    ("special.elliptic.ellipk (no complement)", "m: all -inf", "infinity is lost*", LIMIT),
+    ("special.elliptic.*", "*: empty list", "taken without a word*(0,)*", NO_NUMBERS),
     ("body.parameters.unpack_moments", "vector: all -inf", "infinity is lost*", LIMIT),
     # Batches.
     ("batch.rollout", "*", "a silent NaN*", REACHED),

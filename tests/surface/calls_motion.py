@@ -28,7 +28,7 @@ row("NewtonEuler", lambda: dict(body=s.body(), torque=rj.torques.UniformGravity(
 row(
     "equations_of_motion",
     lambda: dict(body=s.inertia(), state0=s.attitude(), torque=s.top()),
-    says=("inertia",),
+    says=("inertia", "needs a state"),
 )
 row(
     "motion.lagrangian.equations_of_motion",
@@ -270,14 +270,20 @@ row(
 )
 
 # Closed form.
-row("exact.free_body", lambda: dict(inertia=s.inertia(), state0=s.attitude(), t=0.7))
+# Minutes of compiling for the rest, which the sweep of derivatives goes through.
+EXACT = ("jit", "vmap", "grad", "scan")
+row(
+    "exact.free_body",
+    lambda: dict(inertia=s.inertia(), state0=s.attitude(), t=0.7),
+    transforms=EXACT,
+)
 row(
     "exact.FreeBody",
     lambda: dict(inertia=s.inertia(), state0=s.attitude()),
     transforms=("jit", "vmap", "scan"),
 )
-row("exact.body_period", lambda: dict(inertia=s.inertia(), omega0=W))
-row("exact.precession_period", lambda: dict(inertia=s.inertia(), omega0=W))
+for name in ("body_period", "precession_period"):
+    row(f"exact.{name}", lambda: dict(inertia=s.inertia(), omega0=W), transforms=EXACT)
 leave_out("diffrax makes them", "exact.FreeInterpolation", "solve.GroupInterpolation")
 
 # Solvers.
@@ -309,7 +315,13 @@ row(
     groups=(*KINDS, "nan", "inf"),
     transforms=(),
 )  # fmt: skip
-row("Solution.evaluate", lambda: dict(self=s.motion(), t=0.7), arguments=("t",), traced=("t",))
+row(
+    "Solution.evaluate",
+    lambda: dict(self=s.motion(), t=0.7),
+    arguments=("t",),
+    traced=("t",),
+    transforms=("jit", "vmap", "grad"),
+)
 leave_out("simulate returns it", "Solution")
 leave_out(
     "inner loops: simulate and rollout run them",
