@@ -120,10 +120,9 @@ _jitted = jax.jit(lambda inertia, state0, t: FreeBody(inertia, state0)._at(t))
 
 
 def _time(t: ScalarLike, omega: Array) -> Scalar:
-    t = _checks.floating(t, (), "t")
+    t = _checks.time(t)
     if not _checks.known((t, omega)):
         return t
-    _checks.finite(t, "t")
     dtype = jnp.promote_types(t.dtype, omega.dtype)
     with np.errstate(over="ignore"):
         angle = abs(float(t)) * np.abs(np.asarray(omega, dtype=np.float64)).max()

@@ -119,6 +119,12 @@ class Problem(eqx.Module):
         for item in recordings:
             if not isinstance(item, Recording):
                 raise TypeError(f"Problem: wanted a Recording, got {type(item).__name__}")
+            lengths = {item.t.shape, *(reading.mask.shape for reading in item.readings)}
+            if len(lengths) > 1 or item.t.ndim != 1:
+                raise ValueError(
+                    "recording: wanted one, as Recording(t, …) makes it, got times and masks of "
+                    f"shapes {sorted(lengths)}; of many give a sequence"
+                )
         if not isinstance(body, AbstractBodyChart):
             raise TypeError(
                 "Problem: wanted what of the body is free, such as Ratios() or PrincipalRatios(), "
@@ -177,11 +183,21 @@ class Problem(eqx.Module):
         return self.reference.rate[0]
 
     def start(self, body: Inertia | None = None) -> Parameters:
-        """The parameters of the recordings as they are given, with this body or a sphere."""
+        """The parameters of the recordings as they are given, with this body or a sphere.
+
+        **Raises:** `ValueError` for a body that the chart does not hold.
+        """
         if body is not None:
             _checks.single(body, (Inertia, MassProperties), "body")
         matter = Inertia(jnp.eye(3)) if body is None else body
         vector = self.body.vector(matter) if body is not None else jnp.zeros(self.body.size)
+        if _checks.known(vector):
+            _checks.refuse(
+                vector,
+                ~jnp.isfinite(vector).all(),
+                f"body: {type(self.body).__name__} has no finite numbers for it; wanted principal "
+                "moments above zero, the largest below the sum of the others",
+            )
         moved = [jnp.zeros(jnp.shape(slot.read(self.recording))) for slot in self.slots]
         shared = tuple(v for v, slot in zip(moved, self.slots, strict=True) if not slot.each)
         each = tuple(
@@ -236,11 +252,12 @@ class Problem(eqx.Module):
         With several recordings another axis leads.
         """
         fits(self, parameters)
-        states = jax.vmap(
-            lambda own, record, ref: _states(
-                self, self.body.body(parameters.body), parameters.shared, own, record, ref
-            )[2]
-        )(parameters.own, self.records, self.reference)
+
+        def of_one(own: Own, record: Recording, ref: Reference) -> Any:
+            body = self.body.body(parameters.body)
+            return _states(self, body, parameters.shared, own, record, ref)[2]
+
+        states = over_records(of_one, self, parameters.own, self.records, self.reference)
         return stacking.one(states, 0) if self.count == 1 else states
 
     def errors(self, parameters: Parameters) -> tuple[Float[Array, "*records times _"], ...]:
@@ -253,7 +270,8 @@ class Problem(eqx.Module):
 def fits(problem: Problem, parameters: Parameters) -> Parameters:
     """`parameters`, if they are of this problem.
 
-    **Raises:** `TypeError` for another kind of thing, `ValueError` for other shapes.
+    **Raises:** `TypeError` for another kind of thing or another dtype, `ValueError` for other
+    shapes, and for NaN where it is known.
 
     >>> import rigidjax as rj
     >>> record = rj.identify.Recording([0.0, 1.0], (rj.identify.Gyro(), [[1.0, 0, 0]] * 2))
@@ -286,6 +304,14 @@ def fits(problem: Problem, parameters: Parameters) -> Parameters:
                 f"parameters.{name}: wanted arrays of shapes {shapes}, as this problem has, got "
                 f"{[leaf.shape for leaf in numbers]}; {hint}"
             )
+        for leaf in numbers:
+            if leaf.dtype != problem.records.t.dtype:
+                raise TypeError(
+                    f"parameters.{name}: wanted {problem.records.t.dtype}, as the recordings have, "
+                    f"got {leaf.dtype}"
+                )
+            if _checks.known(leaf):
+                _checks.finite(leaf, f"parameters.{name}")
     return parameters
 
 

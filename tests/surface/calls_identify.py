@@ -42,6 +42,7 @@ row(
     run=lambda t, sensor, values, mask, torque: rj.identify.Recording(
         t, (sensor, values, mask), torque=torque
     ),
+    says=("reading",),
     **HOST,
 )
 leave_out("Recording makes it", "identify.Reading")
@@ -89,6 +90,7 @@ for name in ("unpack", "values", "scenes", "motion", "errors"):
         lambda: dict(self=s.problem(), parameters=plan()),
         arguments=("parameters",),
         traced=("parameters",),
+        says=("inertia",),
     )
 row(
     "identify.fisher",
