@@ -27,7 +27,7 @@ def expected(problem: Problem, parameters: Parameters) -> tuple[reported.Quantit
     quantities of `Fit.quantities` with the standard deviations of the Cramér–Rao bound, infinite
     where the motion would show nothing.
 
-    **Raises:** `ValueError` for a sensor whose noise is not given.
+    **Raises:** `ValueError` for a sensor whose noise is not given, or numbers that are not finite.
 
     >>> import rigidjax as rj
     >>> ts = jnp.linspace(0.0, 5.0, 50)
@@ -40,6 +40,11 @@ def expected(problem: Problem, parameters: Parameters) -> tuple[reported.Quantit
     """
     _look(problem, parameters)
     information = np.asarray(_fisher_jit(problem, parameters))
+    if not np.isfinite(information).all():
+        raise ValueError(
+            "expected: Fisher's information has NaN or infinity in it: problem holds NaN in its "
+            "recordings, or the motion of these parameters is beyond the dtype"
+        )
     size = np.sqrt(np.diag(information))
     size = np.maximum(size, max(WEAKEST * size.max(), 1e-300))
     values, vectors = np.linalg.eigh(information / np.outer(size, size))

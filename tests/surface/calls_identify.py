@@ -109,6 +109,7 @@ row(
     "identify.best_first_rate",
     lambda: dict(problem=s.problem(), body=s.inertia(), omega=W, max_steps=2),
     groups=("stranger",),
+    dear=True,
     **HOST,
 )
 row(
@@ -131,6 +132,7 @@ row(
     ),
     run=lambda build, recordings: rj.identify.cross_validate(build, recordings, starts=1),
     groups=("stranger",),
+    dear=True,
     transforms=(),
 )
 row("identify.Fit.interval", lambda: dict(self=s.found(), level=0.9), arguments=("level",), **HOST)

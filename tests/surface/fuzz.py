@@ -32,8 +32,8 @@ def failures_of(
 ) -> Iterator[tuple[str, str]]:
     """What a user would call wrong, as (where, what)."""
     given = call.given()
-    good = judge.outcome(lambda: call.run(**given))
-    counts["calls"] += 1
+    good = judge.Outcome({}) if call.dear else judge.outcome(lambda: call.run(**given))
+    counts["calls"] += not call.dear
     if good.error is not None:
         yield "good call", str(good)
         return
