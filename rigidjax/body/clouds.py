@@ -120,9 +120,7 @@ def quadrature(
     per_volume, positions = jax.vmap(at)(cube)
     for name, values in {"place(u)": positions, "density(r) |∂r/∂u|": per_volume}.items():
         if physical.known(values):
-            _checks.refuse(
-                values, ~jnp.isfinite(values).all(), f"{name}: contains NaN or infinity"
-            )
+            _checks.refuse(values, ~jnp.isfinite(values).all(), f"{name}: contains NaN or infinity")
     return summed(per_volume * weight, positions)
 
 

@@ -14,7 +14,7 @@ from rigidjax import _checks
 from rigidjax._types import Scalar, Vec3
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.identify import reported
-from rigidjax.identify.problem import Parameters, Problem, errors_of_one, fits
+from rigidjax.identify.problem import Parameters, Problem, errors_of_one, fits, one_problem
 from rigidjax.identify.stacking import one
 from rigidjax.identify.uncertainty import WEAKEST
 
@@ -67,8 +67,7 @@ def plan_of(problem: Problem, body: Any, omega: Any) -> Parameters:
     >>> plan_of(problem, rj.Inertia.from_principal(2.0, 2.0, 2.0), [0.0, 0.0, 3.0]).own.spin
     Array([[0., 0., 3.]], dtype=float64)
     """
-    _checks.instance(problem, Problem, "problem")
-    start = problem.start(_checks.single(body, (Inertia, MassProperties), "body"))
+    start = one_problem(problem).start(_checks.single(body, (Inertia, MassProperties), "body"))
     rates = _checks.floating(omega, (3,), "omega").astype(start.own.spin.dtype)
     rates = jnp.broadcast_to(rates, start.own.spin.shape)
     spin = rates / problem.reference.rate[:, None]

@@ -267,6 +267,29 @@ class Problem(eqx.Module):
         return tuple(e[0] for e in out) if self.count == 1 else out
 
 
+def one_problem(problem: Any) -> Problem:
+    """`problem`, if it is one as its constructor makes it.
+
+    **Raises:** `TypeError` for another kind of thing, `ValueError` for arrays of other shapes.
+
+    >>> import rigidjax as rj
+    >>> record = rj.identify.Recording([0.0, 1.0], (rj.identify.Gyro(), [[1.0, 0, 0]] * 2))
+    >>> one_problem(Problem(record, rj.identify.Ratios())).count
+    1
+    """
+    _checks.instance(problem, Problem, "problem")
+    records, rate = problem.records, problem.reference.rate
+    shapes = {records.t.shape, *(reading.mask.shape for reading in records.readings)}
+    if len(shapes) > 1 or records.t.ndim != 2 or rate.shape != records.t.shape[:1]:
+        raise ValueError(
+            "problem: wanted one, as Problem(recording, …) makes it, got times and masks of shapes "
+            f"{sorted(shapes)}; of many take them one by one"
+        )
+    if _checks.known(rate):
+        _checks.finite(rate, "problem: its typical rate")
+    return problem
+
+
 def fits(problem: Problem, parameters: Parameters) -> Parameters:
     """`parameters`, if they are of this problem.
 
@@ -279,7 +302,7 @@ def fits(problem: Problem, parameters: Parameters) -> Parameters:
     >>> fits(problem, problem.start()).body.shape
     (5,)
     """
-    _checks.instance(problem, Problem, "problem")
+    one_problem(problem)
     hint = "problem.start(body) makes them"
     _checks.instance(parameters, Parameters, "parameters", hint=hint)
     own, each = parameters.own, (problem.count, 3)

@@ -13,6 +13,8 @@ BY_NUMBER = (
     "which its docstring states, it gives NaN there and the right numbers beside"
 )
 NO_NUMBERS = "a function of arrays, number by number: of no numbers it makes none"
+OF_TIME = "a function of time is documented; its value is looked at where it is used"
+ANY_STATE = "what has no quaternion comes back as it is: a user's own state may be anything"
 LIMIT = "the right limit for an infinite argument"
 
 # (row, argument: replacement, what came of it, reason), as patterns; the first that fits counts.
@@ -51,6 +53,11 @@ ACCEPTED: list[tuple[str, str, str, str]] = [
     ("batch.simulate*", "*", "a silent NaN*", REACHED),
     ("batch.hosts.*", "tree: *", "taken without a word*", ANY_TREE),
     # Others.
+    ("motion.on_the_group", "state: *", "taken without a word*", ANY_STATE),
+    *(
+        (f"motion.torques.{law}", "*: function", "taken without a word*", OF_TIME)
+        for law in ("Flywheel", "GravityGradient", "InSpace", "MagneticDipole")
+    ),
     ("drift", "*: float32", "returned*", "drift is round-off itself, so that it has no digits"),
     ("frames.Force", "force: None", "taken*", "None is documented: the particle is left to itself"),
     ("identify.Recording", "mask: None", "taken*", "None is documented: nothing is masked"),

@@ -40,7 +40,11 @@ row("motion.lagrangian.RotationalHamiltonian", lambda: dict(inertia=s.inertia())
 row("motion.lagrangian.lie_poisson", dict(hamiltonian=lambda p: jnp.sum(p * p)))
 row("motion.lagrangian.lie_poisson_with_direction", dict(hamiltonian=lambda p, g: jnp.sum(p * g)))
 row("motion.lagrangian.from_attitude", lambda: dict(state=s.attitude()))
-row("motion.lagrangian.to_attitude", lambda: dict(y=rj.lagrangian.Coordinates(V, W)))
+row(
+    "motion.lagrangian.to_attitude",
+    lambda: dict(y=rj.lagrangian.Coordinates(V, W)),
+    says=("angles",),
+)
 leave_out("made by motion.lagrangian.equations_of_motion", "motion.lagrangian.LagrangeEquations")
 
 # What is conserved.
@@ -98,6 +102,7 @@ for name in ("act", "evaluate"):
             state=s.attitude(),
             body=s.inertia(),
         ),
+        says=("torque", "needs a state"),
     )
 row("motion.torques.in_precision", lambda: dict(tree=s.body(), dtype="float64"), groups=("same",))
 row(
