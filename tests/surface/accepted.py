@@ -15,6 +15,10 @@ BY_NUMBER = (
 NO_NUMBERS = "a function of arrays, number by number: of no numbers it makes none"
 OF_TIME = "a function of time is documented; its value is looked at where it is used"
 ANY_STATE = "what has no quaternion comes back as it is: a user's own state may be anything"
+CRAMER = (
+    "a well conditioned matrix is documented; it stands in the middle of vector fields, where the "
+    "quotient by a determinant of zero is told by what follows"
+)
 LIMIT = "the right limit for an infinite argument"
 
 # (row, argument: replacement, what came of it, reason), as patterns; the first that fits counts.
@@ -31,6 +35,16 @@ ACCEPTED: list[tuple[str, str, str, str]] = [
     ("motion.torques.*", "state: huge", "a silent NaN*", OVERFLOW),
     ("frames.scenes.*", "state: huge", "a silent NaN*", OVERFLOW),
     ("frames.scenes.ThreeBody.*", "*: huge", "a silent NaN*", OVERFLOW),
+    ("rotation.mrp.*", "sigma: huge", "a silent NaN*", OVERFLOW),
+    ("rotation.quaternion.rotate*", "q: huge", "a silent NaN*", OVERFLOW),
+    ("rotation.quaternion.to_matrix", "q: huge", "a silent NaN*", OVERFLOW),
+    ("rotation.so3.conjugate", "matrix: huge", "a silent NaN*", OVERFLOW),
+    *(
+        ("rotation.so3.solve", f"a: {size}", "a silent NaN*", OVERFLOW)
+        for size in ("huge", "tiny", "subnormal")
+    ),
+    ("rotation.so3.solve", "a: zero", "a silent NaN*", CRAMER),
+    ("rotation.so3.determinant", "a: huge", "a silent NaN*", OVERFLOW),
     ("body.parameters.unpack_shape", "vector: huge", "a silent NaN*", OVERFLOW),
     # Domains.
     (
