@@ -304,7 +304,7 @@ row(
         max_steps=1000,
     ),
     arguments=("body", "state0", "ts", "torque", "dt0"),
-    says=("inertia",),
+    says=("inertia", "needs a state"),
     # Forward mode through a forced run is being redone: issue K, item 3.
     transforms=REVERSE,
     traced=("body", "state0", "torque"),
