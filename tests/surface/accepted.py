@@ -19,6 +19,9 @@ CRAMER = (
     "a well conditioned matrix is documented; it stands in the middle of vector fields, where the "
     "quotient by a determinant of zero is told by what follows"
 )
+NOT_MEASURED = "NaN stands in a record for what was not measured: documented"
+NEVER = "NaN is documented where a method never gets to an error"
+NOTHING = "of no records there is nothing to say: an empty table"
 LIMIT = "the right limit for an infinite argument"
 
 # (row, argument: replacement, what came of it, reason), as patterns; the first that fits counts.
@@ -67,6 +70,17 @@ ACCEPTED: list[tuple[str, str, str, str]] = [
     ("batch.simulate*", "*", "a silent NaN*", REACHED),
     ("batch.hosts.*", "tree: *", "taken without a word*", ANY_TREE),
     # Others.
+    *(
+        (f"workprecision.{name}", *what, NOT_MEASURED)
+        for name in ("choose", "front")
+        for what in (("good call", "returned*"), ("*", "a silent NaN*"))
+    ),
+    ("workprecision.time_to", "*", "*returned =[[]nan[]]", NEVER),
+    *(
+        (f"workprecision.{name}", f"*: {empty}", "taken without a word*", NOTHING)
+        for name in ("choose", "front", "moved", "table")
+        for empty in ("dict", "empty list")
+    ),
     ("motion.on_the_group", "state: *", "taken without a word*", ANY_STATE),
     *(
         (f"motion.torques.{law}", "*: function", "taken without a word*", OF_TIME)
