@@ -26,23 +26,15 @@ def generator(w: Any) -> Any:
     return jnp.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
 
 
-def matrix_at(start: np.ndarray) -> Callable[[Any], Any]:
-    """Rotations near `start` by the series of the matrix exponential, for |x| < 0.2."""
-
-    def at(x: Any) -> Any:
-        h = generator(x)
-        total = jnp.eye(3)
-        for k in range(11, 0, -1):
-            total = jnp.eye(3) + h @ total / k
-        return jnp.asarray(start) @ total
-
-    return at
-
-
 def cayley(x: Any) -> Any:
-    """A rotation near 1 without a series: (1 + ½ hat x)(1 − ½ hat x)⁻¹, for what is cheap."""
-    half = 0.5 * generator(x)
-    return jnp.linalg.solve((jnp.eye(3) - half).T, (jnp.eye(3) + half).T).T
+    """A rotation near 1, (1 + ½ hat x)(1 − ½ hat x)⁻¹ multiplied out: neither series nor root."""
+    h = generator(x)
+    return jnp.eye(3) + (4 / (4 + jnp.sum(x * x))) * (h + 0.5 * h @ h)
+
+
+def matrix_at(start: np.ndarray) -> Callable[[Any], Any]:
+    """Rotations near `start`."""
+    return lambda x: jnp.asarray(start) @ cayley(x)
 
 
 def symmetric(x: Any) -> Any:

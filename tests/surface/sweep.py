@@ -124,7 +124,8 @@ def _stencil(case: Case, around: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _compiled(f: Callable) -> Callable:
-    return jax.jit(f, compiler_options={"xla_backend_optimization_level": 1})
+    # Compiling is what this costs.
+    return jax.jit(f, compiler_options={"xla_backend_optimization_level": 0})
 
 
 def _around(points: np.ndarray, step: float) -> np.ndarray:
