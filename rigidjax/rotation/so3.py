@@ -120,7 +120,7 @@ def distance(a: Mat3Like, b: Mat3Like) -> Scalar:
     **Arguments:** `a`, `b` (3, 3) rotations. By atan2 of the quaternion of aᵀb, right from 1e-12 to
     π (arccos of the trace is useless below 1e-8). Its derivative does not exist where a = b; 0 is
     returned there, the shortest subgradient. For a loss take |log(aᵀb)|², which is smooth.
-    **Raises:** `ValueError` for NaN.
+    **Raises:** `ValueError` for NaN, and for what is far from a rotation.
 
     >>> round(float(distance(jnp.eye(3), exp(jnp.array([0.0, 3e-9, 0.0]))) * 1e9), 9)
     3.0
@@ -131,7 +131,11 @@ def distance(a: Mat3Like, b: Mat3Like) -> Scalar:
 
 def _between(a: Mat3, b: Mat3) -> Mat3:
     between = product(a.T, b)
-    return _checks.finite(between, "aᵀb") if _checks.known(between) else between
+    if _checks.known(between):
+        _checks.finite(between, "aᵀb")
+        large = jnp.abs(between).max() > 2
+        _checks.refuse(between, large, "aᵀb: has entries above 1; wanted two rotations, a and b")
+    return between
 
 
 def about_axis(axis: Vec3Like, angle: ScalarLike) -> Mat3:
@@ -234,7 +238,7 @@ def interpolate(a: Mat3Like, b: Mat3Like, s: ScalarLike) -> Mat3:
     """The point at s of the shortest turn from a (s = 0) to b (s = 1): a exp(s log(aᵀb)).
 
     **Arguments:** `a`, `b` (3, 3) rotations; `s` dimensionless, may lie beyond [0, 1]. **Raises:**
-    `ValueError` for NaN.
+    as `distance`.
 
     >>> interpolate(jnp.eye(3), exp(jnp.array([0.0, 0.0, 2.0])), 0.5).round(6)[0].tolist()
     [0.540302, -0.841471, 0.0]

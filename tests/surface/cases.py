@@ -146,7 +146,7 @@ def rotations() -> list[Case]:
         found.append(
             Case(
                 f"matrices at {name}",
-                lambda x, at=at: (
+                lambda x, at=at, name=name: (
                     mrp.from_matrix(at(x)) if name != "a half turn" else (),
                     rodrigues.from_matrix(at(x)) if name != "a half turn" else (),
                     so3.adjoint(at(x)), so3.conjugate(at(x), s.N), so3.rate(at(x), W),
