@@ -25,7 +25,8 @@ class Case:
 
     **Fields:** `name`; `f` a function of one vector to anything of floats; `points` by name, all of
     one length; `step` of the differences, in units of x; `rtol` of the first derivative relative to
-    the larger of it and the value, `rtol2` of the second; `once` names of points where a second
+    the larger of it and the value, `rtol2` of the second; `atol` what the differences are off by
+    where all of these are zero; `once` names of points where a second
     derivative does not exist (the documentation says so); `first` whether only the first is looked
     at, `covers` the public names that this stands for.
     """
@@ -36,6 +37,7 @@ class Case:
     step: float = 0.02
     rtol: float = 1e-9
     rtol2: float = 1e-8
+    atol: float = 0.0
     once: tuple[str, ...] = ()
     first: bool = False
     covers: tuple[str, ...] = ()
@@ -54,7 +56,8 @@ def problems(case: Case) -> list[str]:
         size = np.abs(got["value"][i]).max(initial=0.0)
         right = by_difference[i]
         for way in ("forward", "reverse"):
-            found += _apart(f"{where}: {way}", got[way][i], right, case.rtol, size)
+            scale = max(size, case.atol / case.rtol)
+            found += _apart(f"{where}: {way}", got[way][i], right, case.rtol, scale)
         found += _apart(
             f"{where}: reverse against forward", got["reverse"][i], got["forward"][i], 1e-10, 0.0
         )
