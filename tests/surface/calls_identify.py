@@ -122,7 +122,13 @@ row(
     **HOST,
 )  # fmt: skip
 row("identify.pieces", lambda: dict(problem=s.problem(), count=3, width=1e-3), **HOST)
-row("identify.profile", lambda: dict(fit=s.found(), name="Ix/Iz", level=0.9), groups=KINDS, **HOST)
+row(
+    "identify.profile",
+    lambda: dict(fit=s.found(), name="Ix/Iz", level=0.9),
+    groups=("stranger", "shape"),
+    dear=True,
+    **HOST,
+)
 row("identify.compare", lambda: dict(fits={"a": s.found(), "b": s.found()}), transforms=())
 row(
     "identify.cross_validate",

@@ -404,7 +404,7 @@ def bodies() -> list[Case]:
                 "body.kinetic_energy_of_generator", "body.kinetic_energy_of_matrix_rate", "body.kinetic_energy_of_moments",
             ),
         ),
-        Case("body.divergence", lambda x: rj.body.divergence(body_of(x[:10]), body_of(x[10:])), {"ordinary": join(TEN, TEN_BALL), "the same": join(TEN, TEN), "balls": join(TEN_BALL, TEN_BALL)}, step=0.01),
+        Case("body.divergence", lambda x: rj.body.divergence(body_of(x[:10]), body_of(x[10:])), {"ordinary": join(TEN, TEN_BALL), "the same": join(TEN, TEN), "balls": join(TEN_BALL, TEN_BALL)}, step=0.01, atol=1e-12),
         Case("body.parameters.pack", lambda x: rj.parameters.pack(body_of(x)), {"ordinary": TEN, "ball": TEN_BALL}, step=0.01),
         Case("body.parameters.unpack", rj.parameters.unpack, {"ordinary": 0.1 * np.arange(10) - 0.2, "zero": np.zeros(10)}),
         Case("body.parameters.pack_second_moment", lambda x: (rj.parameters.pack_second_moment(symmetric(x)), rj.parameters.pack_shape(symmetric(x))), {"ordinary": six(SECOND), "ball": six(np.eye(3))}, step=0.01, covers=("body.parameters.pack_shape",)),
