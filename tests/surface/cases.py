@@ -378,7 +378,8 @@ def bodies() -> list[Case]:
             {k: join(t, V, 1.5, Q) for k, t in TENSORS.items()}, step=0.01,
             covers=("Inertia.rotated", "Inertia.from_tensor", "Inertia.from_second_moment"),
         ),
-        Case("Inertia.from_principal", lambda x: rj.Inertia.from_principal(*x), {"ordinary": [1.0, 2.0, 2.5], "plate": [1.0, 2.0, 3.0]}, step=1e-15, first=True, rtol=np.inf),
+        # The last moment is as large as a body's may be at 0, and less on both sides.
+        Case("Inertia.from_principal", lambda x: rj.Inertia.from_principal(x[0], x[1], x[0] + x[1] - x[2] * x[2]), {"ordinary": [1.0, 2.0, 0.7], "plate": [1.0, 2.0, 0.0]}, step=0.01),
         Case(
             "MassProperties",
             lambda x: (
@@ -404,7 +405,7 @@ def bodies() -> list[Case]:
                 "body.kinetic_energy_of_generator", "body.kinetic_energy_of_matrix_rate", "body.kinetic_energy_of_moments",
             ),
         ),
-        Case("body.divergence", lambda x: rj.body.divergence(body_of(x[:10]), body_of(x[10:])), {"ordinary": join(TEN, TEN_BALL), "the same": join(TEN, TEN), "balls": join(TEN_BALL, TEN_BALL)}, step=0.01, atol=1e-12),
+        Case("body.divergence", lambda x: rj.body.divergence(body_of(x[:10]), body_of(x[10:])), {"ordinary": join(TEN, TEN_BALL), "the same": join(TEN, TEN), "balls": join(TEN_BALL, TEN_BALL)}, step=0.01, atol=1e-11),
         Case("body.parameters.pack", lambda x: rj.parameters.pack(body_of(x)), {"ordinary": TEN, "ball": TEN_BALL}, step=0.01),
         Case("body.parameters.unpack", rj.parameters.unpack, {"ordinary": 0.1 * np.arange(10) - 0.2, "zero": np.zeros(10)}),
         Case("body.parameters.pack_second_moment", lambda x: (rj.parameters.pack_second_moment(symmetric(x)), rj.parameters.pack_shape(symmetric(x))), {"ordinary": six(SECOND), "ball": six(np.eye(3))}, step=0.01, covers=("body.parameters.pack_shape",)),
