@@ -137,6 +137,12 @@ def finite(value: Float[Array, "..."], name: str) -> Float[Array, "..."]:
     return refuse(value, bad.any(), f"{name}: contains NaN or infinity{where}")
 
 
+def time(value: Any, name: str = "t") -> Array:
+    """Return a time: one number, and where it is known a finite one."""
+    t = floating(value, (), name)
+    return finite(t, name) if known(t) else t
+
+
 def instance(
     value: Any, kinds: type | tuple[type, ...], name: str, *, wanted: str = "", hint: str = ""
 ) -> Any:

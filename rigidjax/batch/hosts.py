@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.experimental import multihost_utils
 
+from rigidjax import _checks
 from rigidjax._names import own_names
 
 # Seconds without a sign of life after which a peer counts as dead.
@@ -82,16 +83,17 @@ def gather(tree: Any, checkpoint: str | os.PathLike[str] | None = None) -> Any:
     folder: the rows are written there first, as `share-3.npz`, for `recover`.
     **Returns** the tree with the rows of all, in host memory.
 
-    **Raises:** `RuntimeError` where a peer has died. The process should end then: what JAX holds is
-    of no use any more.
+    **Raises:** `TypeError` for arrays that are traced; `RuntimeError` where a peer has died. The
+    process should end then: what JAX holds is of no use any more.
 
     >>> gather(jnp.arange(3)).tolist()
     [0, 1, 2]
     """
+    tree = _known(tree, "gather")
     if checkpoint is not None:
         save(tree, checkpoint)
     if jax.process_count() == 1:
-        return jax.tree.map(np.asarray, tree)
+        return tree
     return _together(lambda: jax.tree.map(_rows_of_all, tree), checkpoint)
 
 
@@ -106,10 +108,11 @@ def total(tree: Any, checkpoint: str | os.PathLike[str] | None = None) -> Any:
     >>> total(jnp.ones(2)).tolist()
     [1.0, 1.0]
     """
+    tree = _known(tree, "total")
     if checkpoint is not None:
         save(tree, checkpoint)
     if jax.process_count() == 1:
-        return jax.tree.map(np.asarray, tree)
+        return tree
     return _together(
         lambda: jax.tree.map(
             lambda leaf: multihost_utils.process_allgather(jnp.asarray(leaf)).sum(axis=0), tree
@@ -127,12 +130,12 @@ def save(tree: Any, folder: str | os.PathLike[str]) -> Path:
     ...     recover(jnp.zeros(2), folder)[0].tolist()
     [0, 1]
     """
-    folder = Path(folder)
+    folder = _checks.path(folder, "folder")
+    leaves: dict[str, Any] = {
+        f"leaf{i}": leaf for i, leaf in enumerate(jax.tree.leaves(_known(tree, "save")))
+    }
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"share-{jax.process_index()}.npz"
-    leaves: dict[str, Any] = {
-        f"leaf{i}": np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(tree))
-    }
     handle, name = tempfile.mkstemp(dir=folder, suffix=".part")
     with os.fdopen(handle, "wb") as file:
         np.savez(file, **leaves)
@@ -143,19 +146,38 @@ def save(tree: Any, folder: str | os.PathLike[str]) -> Path:
 def recover(like: Any, folder: str | os.PathLike[str]) -> list[Any]:
     """What `save` wrote, process by process; `like` a tree of the same structure.
 
-    **Raises:** `FileNotFoundError` for a folder without shares.
+    **Raises:** `FileNotFoundError` for a folder without shares; `ValueError` for a file that is
+    none of `save`'s, is cut short, or holds another number of arrays than `like`.
     """
-    paths = sorted(Path(folder).glob("share-*.npz"), key=lambda p: int(p.stem.split("-")[1]))
+    folder = _checks.path(folder, "folder")
+    paths = sorted(folder.glob("share-*.npz"), key=lambda p: int(p.stem.split("-")[1]))
     if not paths:
         raise FileNotFoundError(f"recover: no share-*.npz in {folder}")
     structure = jax.tree.structure(like)
     found = []
     for path in paths:
-        with np.load(path) as file:
-            found.append(
-                jax.tree.unflatten(structure, [file[f"leaf{i}"] for i in range(len(file.files))])
+        try:
+            with path.open("rb") as raw, np.load(raw) as file:
+                leaves = [file[f"leaf{i}"] for i in range(len(file.files))]
+        except Exception as error:
+            # An empty file raises EOFError; a cut one BadZipFile, or zlib.error.
+            raise ValueError(f"recover: {path} is no file of save, or is cut short") from error
+        if len(leaves) != structure.num_leaves:
+            raise ValueError(
+                f"recover: like has {structure.num_leaves} arrays, {path} holds {len(leaves)}"
             )
+        found.append(jax.tree.unflatten(structure, leaves))
     return found
+
+
+def _known(tree: Any, name: str) -> Any:
+    """The tree in host memory."""
+    if not _checks.known(tree):
+        raise TypeError(
+            f"{name}: wanted a tree of known arrays, got one that is traced; this sends between "
+            "processes: call it outside of jax.jit, jax.grad and jax.vmap"
+        )
+    return jax.tree.map(np.asarray, tree)
 
 
 def _rows_of_all(leaf: Any) -> np.ndarray:

@@ -51,7 +51,7 @@ def voxels(
     (nx, ny, nz) kg/m³, none negative, indexed x, y, z; `spacing` (3,) edges of a cell, m;
     `corner` (3,) of cell [0, 0, 0] with the smallest x, y, z, m, body frame.
 
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or a negative density.
+    **Raises:** `ValueError`, `TypeError` for a wrong shape, a negative density, or NaN.
 
     >>> import jax.numpy as jnp
     >>> voxels(jnp.ones((1, 2, 3)), [1.0, 1.0, 1.0], [0.0, 0.0, 0.0]).com
@@ -67,6 +67,8 @@ def voxels(
     if physical.known(h):
         fine = ((h > 0) & jnp.isfinite(h)).all()
         _checks.refuse(h, ~fine, f"spacing: wanted three positive edges of a cell, m, got {h}")
+    if physical.known(low):
+        _checks.finite(low, "corner")
     axes = [(jnp.arange(n, dtype=density.dtype) + 0.5) * h[i] for i, n in enumerate(density.shape)]
     centres = jnp.stack(jnp.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     masses = density.reshape(-1) * (h[0] * h[1] * h[2])
@@ -88,7 +90,7 @@ def quadrature(
     **Arguments:** `density` ρ, from r (3,) m to kg/m³; `place` from u (3,) in [0, 1]³ to r (3,) m,
     body frame, one to one inside; `order` points along each direction.
 
-    **Raises:** `ValueError` for an order below 1, or if the result is no body.
+    **Raises:** `ValueError` for an order below 1, NaN, or if the result is no body.
 
     >>> import jax.numpy as jnp
     >>> body = quadrature(lambda r: jnp.ones(()), lambda u: u * jnp.array([1.0, 2.0, 3.0]), 2)
@@ -116,6 +118,9 @@ def quadrature(
         return _checks.floating(density(r), (), "density(r)") * jnp.abs(volume), r
 
     per_volume, positions = jax.vmap(at)(cube)
+    for name, values in {"place(u)": positions, "density(r) |∂r/∂u|": per_volume}.items():
+        if physical.known(values):
+            _checks.refuse(values, ~jnp.isfinite(values).all(), f"{name}: contains NaN or infinity")
     return summed(per_volume * weight, positions)
 
 

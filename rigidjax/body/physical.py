@@ -73,6 +73,7 @@ def real_second_moment(s: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3 
 
 def nonzero_moments(body: Any, tensor: Float[Array, "*batch 3 3"]) -> Any:
     """Return `body` unless its inertia `tensor` has a moment that is zero to round-off, or NaN."""
+    _checks.numbers(tensor, "inertia tensor")
     if known(tensor):
         _finite(tensor, "inertia tensor")
     moments = _eigenvalues(tensor)

@@ -56,7 +56,7 @@ class FreeBody(eqx.Module):
         self.state0 = state0
 
     def __call__(self, t: ScalarLike) -> HasSpin:
-        return self._at(_time(t))
+        return self._at(_time(t, self.state0.omega))
 
     def _at(self, t: Scalar) -> HasSpin:
         t = t.astype(self.axes.dtype)
@@ -104,33 +104,40 @@ def free_body(inertia: Inertia, state0: State, t: ScalarLike) -> State:
 
     **Raises:** `TypeError`, `ValueError` for a wrong shape or dtype, dtypes that differ, a `Rigid`
     state; where values are known (not inside `jit`), also for NaN, a moment that is not positive,
-    and a quaternion whose length is off 1 by more than 1e-6 (float32: 1e-3).
+    a quaternion whose length is off 1 by more than 1e-6 (float32: 1e-3), and a time in which the
+    body turns by more than 1/eps rad, so that no digit of its attitude is left.
 
     >>> import rigidjax as rj
     >>> state0 = rj.Attitude([1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 1e-4])
     >>> free_body(rj.Inertia.from_principal(1.0, 2.0, 3.0), state0, 20.0).omega
     Array([-0.42522037, -0.90508985,  0.24550111], dtype=float64)
     """
-    return _evaluate(inertia, state0, _time(t))
+    _check(inertia, state0)
+    return _jitted(inertia, state0, _time(t, state0.omega))
 
 
 _jitted = jax.jit(lambda inertia, state0, t: FreeBody(inertia, state0)._at(t))
 
 
-def _evaluate(inertia, state0, t):
-    _check(inertia, state0)
-    return _jitted(inertia, state0, t)
-
-
-def _time(t: ScalarLike) -> Scalar:
-    t = _checks.floating(t, (), "t")
-    return _checks.finite(t, "t") if _checks.known(t) else t
+def _time(t: ScalarLike, omega: Array) -> Scalar:
+    t = _checks.time(t)
+    if not _checks.known((t, omega)):
+        return t
+    dtype = jnp.promote_types(t.dtype, omega.dtype)
+    with np.errstate(over="ignore"):
+        angle = abs(float(t)) * np.abs(np.asarray(omega, dtype=np.float64)).max()
+    if angle > 1 / jnp.finfo(dtype).eps:
+        raise ValueError(
+            f"t: in {float(t):.3g} s the body turns by {angle:.3g} rad, of which {dtype} holds no "
+            "digit within one turn; wanted a shorter time"
+        )
+    return t
 
 
 def _check(inertia: Inertia, state0: HasSpin) -> None:
     if isinstance(state0, HasPose) or not isinstance(state0, HasSpin):
         raise TypeError(
-            f"free_body: wanted a Spin or an Attitude, got {type(state0).__name__}; a body that "
+            f"state0: wanted a Spin or an Attitude, got {type(state0).__name__}; a body that "
             "also moves is free in both: add x + v t yourself, or use simulate"
         )
     _checks.instance(inertia, Inertia, "inertia", hint="of MassProperties pass .inertia")

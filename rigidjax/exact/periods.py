@@ -70,11 +70,11 @@ def precession_period(inertia: Inertia, omega0: Vec3Like) -> Scalar:
 
 
 def _scaled(inertia: Inertia, omega0):
-    _checks.instance(inertia, Inertia, "inertia", hint="of MassProperties pass .inertia")
+    _checks.single(inertia, Inertia, "inertia", hint="of MassProperties pass .inertia")
     if _checks.known(inertia.tensor):
         inertia = inertia.invertible()
     omega = _checks.floating(omega0, (3,), "omega0").astype(inertia.tensor.dtype)
-    tensor = _checks.floating(inertia.tensor, (3, 3), "inertia tensor")
+    tensor = inertia.tensor
     exponent = exponent_of(omega)
     moments, axes = principal_frame(times_power_of_two(tensor, -exponent_of(tensor)))
     rate = into(axes, times_power_of_two(omega, -exponent))

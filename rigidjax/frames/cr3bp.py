@@ -4,7 +4,6 @@ from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, ArrayLike, Complex, Float
 
 from rigidjax import _checks
@@ -98,9 +97,8 @@ class ThreeBody(AbstractMirrored):
         >>> scenes.cr3bp(0.5).zero_velocity([0.0], [0.0]).tolist()
         [[4.0]]
         """
-        columns = _checks.floating(xs, np.shape(xs), "xs")
-        rows = _checks.floating(ys, np.shape(ys), "ys")
-        if columns.ndim != 1 or rows.ndim != 1:
+        columns, rows = _checks.numbers(xs, "xs"), _checks.numbers(ys, "ys")
+        if columns.ndim != 1 or rows.ndim != 1 or 0 in (columns.size, rows.size):
             raise ValueError(
                 f"zero_velocity: wanted xs (N,) and ys (M,), got {columns.shape} and {rows.shape}; "
                 "give the axes, not a mesh"

@@ -66,7 +66,7 @@ class MovingFrame(eqx.Module):
 
     def matrix(self, t: ScalarLike) -> Mat3:
         """M(t) (3, 3), S' → S (notes, eq 85)."""
-        t = _checks.floating(t, (), "t")
+        t = _checks.time(t)
         return turning.matrix(self.rotation, t)
 
     def at(self, t: ScalarLike) -> Instant:
@@ -77,7 +77,7 @@ class MovingFrame(eqx.Module):
         >>> MovingFrame(turning.Uniform([0.0, 0.0, 2.0])).at(0.0).rate.tolist()
         [0.0, 0.0, 2.0]
         """
-        t = _checks.floating(t, (), "t")
+        t = _checks.time(t)
         one = jnp.ones_like(t)
         rate, rate_change = jax.jvp(self.angular_velocity, (t,), (one,))
         zero = jnp.zeros(3, t.dtype)
@@ -91,7 +91,7 @@ class MovingFrame(eqx.Module):
 
     def angular_velocity(self, t: ScalarLike) -> Vec3:
         """Ω(t) (3,), rad/s, axes of S': given, or vee(Mᵀ dM/dt) (notes, eqs 45–50)."""
-        t = _checks.floating(t, (), "t")
+        t = _checks.time(t)
         if self.rate is not None:
             return _checks.floating(self.rate(t), (3,), "rate").astype(t.dtype)
         state = turning.state_of(self.rotation, t)
@@ -218,7 +218,7 @@ class MovingFrame(eqx.Module):
 
     def place(self, t: ScalarLike) -> Vec3:
         """X(t) (3,), m, axes of S."""
-        t = _checks.floating(t, (), "t")
+        t = _checks.time(t)
         return jnp.zeros(3, t.dtype) if self.origin is None else _Place(self.origin)(t)
 
 

@@ -23,7 +23,8 @@ MAX_STEPS = 25
 class PeriodicOrbit(eqx.Module):
     """A start and the time after which it comes back.
 
-    **Arguments:** `state` a `Point`; `period` its period, in the scene's unit of time.
+    **Arguments:** `state` a `Point`; `period` its period, in the scene's unit of time. Many: the
+    same leading axes before both.
 
     >>> float(PeriodicOrbit(Point([0.9, 0, 0], [0.0, -0.5, 0]), 3.0).period)
     3.0
@@ -38,6 +39,7 @@ class PeriodicOrbit(eqx.Module):
         _checks.floating(state.x, (3,), "state.x", batched=True)
         self.state = state
         period = _checks.floating(period, (), "period", batched=True)
+        _checks.same_batch(state=(state.x, 1), period=(period, 0))
         self.period = period.astype(state.x.dtype)
 
 

@@ -29,12 +29,12 @@ class Uniform(eqx.Module):
         self.omega = _checks.finite(_checks.floating(omega, (3,), "omega"), "omega")
 
     def __call__(self, t: Any) -> Mat3:
-        t = _checks.floating(t, (), "t")
+        t = _checks.time(t)
         return so3.exp(t * self.omega.astype(t.dtype))
 
     def rate(self, t: Any) -> Vec3:
         """Ω, whatever the time."""
-        return self.omega.astype(_checks.floating(t, (), "t").dtype)
+        return self.omega.astype(_checks.time(t).dtype)
 
 
 class AboutAxis(eqx.Module):
@@ -58,12 +58,12 @@ class AboutAxis(eqx.Module):
         self.angle = angle
 
     def __call__(self, t: Any) -> Mat3:
-        t = _checks.floating(t, (), "t")
+        t = _checks.time(t)
         return so3.exp(_checks.floating(self.angle(t), (), "angle") * self.axis.astype(t.dtype))
 
     def rate(self, t: Any) -> Vec3:
         """Ω (3,), rad/s: the axis times the angle's derivative."""
-        t = _checks.floating(t, (), "t")
+        t = _checks.time(t)
         _, speed = jax.jvp(self.angle, (t,), (jnp.ones_like(t),))
         return speed * self.axis.astype(t.dtype)
 

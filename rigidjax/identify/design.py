@@ -14,7 +14,7 @@ from rigidjax import _checks
 from rigidjax._types import Scalar, Vec3
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.identify import reported
-from rigidjax.identify.problem import Parameters, Problem, errors_of_one, fits
+from rigidjax.identify.problem import Parameters, Problem, errors_of_one, fits, one_problem
 from rigidjax.identify.stacking import one
 from rigidjax.identify.uncertainty import WEAKEST
 
@@ -27,7 +27,7 @@ def expected(problem: Problem, parameters: Parameters) -> tuple[reported.Quantit
     quantities of `Fit.quantities` with the standard deviations of the Cramér–Rao bound, infinite
     where the motion would show nothing.
 
-    **Raises:** `ValueError` for a sensor whose noise is not given.
+    **Raises:** `ValueError` for a sensor whose noise is not given, or numbers that are not finite.
 
     >>> import rigidjax as rj
     >>> ts = jnp.linspace(0.0, 5.0, 50)
@@ -40,6 +40,11 @@ def expected(problem: Problem, parameters: Parameters) -> tuple[reported.Quantit
     """
     _look(problem, parameters)
     information = np.asarray(_fisher_jit(problem, parameters))
+    if not np.isfinite(information).all():
+        raise ValueError(
+            "expected: Fisher's information has NaN or infinity in it: problem holds NaN in its "
+            "recordings, or the motion of these parameters is beyond the dtype"
+        )
     size = np.sqrt(np.diag(information))
     size = np.maximum(size, max(WEAKEST * size.max(), 1e-300))
     values, vectors = np.linalg.eigh(information / np.outer(size, size))
@@ -62,8 +67,7 @@ def plan_of(problem: Problem, body: Any, omega: Any) -> Parameters:
     >>> plan_of(problem, rj.Inertia.from_principal(2.0, 2.0, 2.0), [0.0, 0.0, 3.0]).own.spin
     Array([[0., 0., 3.]], dtype=float64)
     """
-    _checks.instance(problem, Problem, "problem")
-    start = problem.start(_checks.single(body, (Inertia, MassProperties), "body"))
+    start = one_problem(problem).start(_checks.single(body, (Inertia, MassProperties), "body"))
     rates = _checks.floating(omega, (3,), "omega").astype(start.own.spin.dtype)
     rates = jnp.broadcast_to(rates, start.own.spin.shape)
     spin = rates / problem.reference.rate[:, None]

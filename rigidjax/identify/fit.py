@@ -139,6 +139,23 @@ class Fit(eqx.Module):
         return words.identifiability(self)
 
 
+def one_fit(found: Any, name: str = "fit") -> Fit:
+    """`found`, if it is one `Fit`, not many in one container.
+
+    **Raises:** `TypeError` for another kind of thing, `ValueError` for leading axes.
+
+    >>> one_fit.__name__
+    'one_fit'
+    """
+    _checks.instance(found, Fit, name)
+    if np.shape(found.chi2) != ():
+        raise ValueError(
+            f"{name}: wanted one Fit, as identify.fit returns it, got one with a chi2 of shape "
+            f"{np.shape(found.chi2)}; of many take them one by one"
+        )
+    return found
+
+
 def fit(
     problem: Problem,
     *,

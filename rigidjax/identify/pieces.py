@@ -10,7 +10,7 @@ import numpy as np
 from rigidjax import _checks
 from rigidjax.identify import stacking
 from rigidjax.identify.free import Slot
-from rigidjax.identify.problem import Links, Own, Parameters, Problem
+from rigidjax.identify.problem import Links, Own, Parameters, Problem, one_problem
 from rigidjax.identify.recording import Reading, Recording
 
 # How wide the gaps may be, in turn: first the pieces are nearly free, at the end they are one.
@@ -38,7 +38,7 @@ def pieces(problem: Problem, count: int, *, width: float = WIDTHS[-1]) -> Proble
     >>> pieces(rj.identify.Problem(record, rj.identify.Ratios()), 4).count
     4
     """
-    _checks.instance(problem, Problem, "problem")
+    one_problem(problem)
     count, width = _checks.whole(count, "count", 2), _checks.positive(width, "width")
     if problem.count != 1:
         raise ValueError(f"pieces: wanted one recording, got {problem.count}")
@@ -95,7 +95,7 @@ def _piece(record: Recording, first: int, last: int, ends: bool) -> Recording:
     rows = slice(first, last + 1)
     readings = []
     for reading in record.readings:
-        mask = reading.mask[rows]
+        mask = jnp.asarray(reading.mask[rows])
         if not ends:
             mask = mask.at[-1].set(False)
         readings.append(Reading(reading.sensor, reading.values[rows], mask))

@@ -119,6 +119,12 @@ class Problem(eqx.Module):
         for item in recordings:
             if not isinstance(item, Recording):
                 raise TypeError(f"Problem: wanted a Recording, got {type(item).__name__}")
+            lengths = {item.t.shape, *(reading.mask.shape for reading in item.readings)}
+            if len(lengths) > 1 or item.t.ndim != 1:
+                raise ValueError(
+                    "recording: wanted one, as Recording(t, …) makes it, got times and masks of "
+                    f"shapes {sorted(lengths)}; of many give a sequence"
+                )
         if not isinstance(body, AbstractBodyChart):
             raise TypeError(
                 "Problem: wanted what of the body is free, such as Ratios() or PrincipalRatios(), "
@@ -177,11 +183,21 @@ class Problem(eqx.Module):
         return self.reference.rate[0]
 
     def start(self, body: Inertia | None = None) -> Parameters:
-        """The parameters of the recordings as they are given, with this body or a sphere."""
+        """The parameters of the recordings as they are given, with this body or a sphere.
+
+        **Raises:** `ValueError` for a body that the chart does not hold.
+        """
         if body is not None:
             _checks.single(body, (Inertia, MassProperties), "body")
         matter = Inertia(jnp.eye(3)) if body is None else body
         vector = self.body.vector(matter) if body is not None else jnp.zeros(self.body.size)
+        if _checks.known(vector):
+            _checks.refuse(
+                vector,
+                ~jnp.isfinite(vector).all(),
+                f"body: {type(self.body).__name__} has no finite numbers for it; wanted principal "
+                "moments above zero, the largest below the sum of the others",
+            )
         moved = [jnp.zeros(jnp.shape(slot.read(self.recording))) for slot in self.slots]
         shared = tuple(v for v, slot in zip(moved, self.slots, strict=True) if not slot.each)
         each = tuple(
@@ -236,11 +252,12 @@ class Problem(eqx.Module):
         With several recordings another axis leads.
         """
         fits(self, parameters)
-        states = jax.vmap(
-            lambda own, record, ref: _states(
-                self, self.body.body(parameters.body), parameters.shared, own, record, ref
-            )[2]
-        )(parameters.own, self.records, self.reference)
+
+        def of_one(own: Own, record: Recording, ref: Reference) -> Any:
+            body = self.body.body(parameters.body)
+            return _states(self, body, parameters.shared, own, record, ref)[2]
+
+        states = over_records(of_one, self, parameters.own, self.records, self.reference)
         return stacking.one(states, 0) if self.count == 1 else states
 
     def errors(self, parameters: Parameters) -> tuple[Float[Array, "*records times _"], ...]:
@@ -250,10 +267,34 @@ class Problem(eqx.Module):
         return tuple(e[0] for e in out) if self.count == 1 else out
 
 
+def one_problem(problem: Any) -> Problem:
+    """`problem`, if it is one as its constructor makes it.
+
+    **Raises:** `TypeError` for another kind of thing, `ValueError` for arrays of other shapes.
+
+    >>> import rigidjax as rj
+    >>> record = rj.identify.Recording([0.0, 1.0], (rj.identify.Gyro(), [[1.0, 0, 0]] * 2))
+    >>> one_problem(Problem(record, rj.identify.Ratios())).count
+    1
+    """
+    _checks.instance(problem, Problem, "problem")
+    records, rate = problem.records, problem.reference.rate
+    shapes = {records.t.shape, *(reading.mask.shape for reading in records.readings)}
+    if len(shapes) > 1 or records.t.ndim != 2 or rate.shape != records.t.shape[:1]:
+        raise ValueError(
+            "problem: wanted one, as Problem(recording, …) makes it, got times and masks of shapes "
+            f"{sorted(shapes)}; of many take them one by one"
+        )
+    if _checks.known(rate):
+        _checks.finite(rate, "problem: its typical rate")
+    return problem
+
+
 def fits(problem: Problem, parameters: Parameters) -> Parameters:
     """`parameters`, if they are of this problem.
 
-    **Raises:** `TypeError` for another kind of thing, `ValueError` for other shapes.
+    **Raises:** `TypeError` for another kind of thing or another dtype, `ValueError` for other
+    shapes, and for NaN where it is known.
 
     >>> import rigidjax as rj
     >>> record = rj.identify.Recording([0.0, 1.0], (rj.identify.Gyro(), [[1.0, 0, 0]] * 2))
@@ -261,7 +302,7 @@ def fits(problem: Problem, parameters: Parameters) -> Parameters:
     >>> fits(problem, problem.start()).body.shape
     (5,)
     """
-    _checks.instance(problem, Problem, "problem")
+    one_problem(problem)
     hint = "problem.start(body) makes them"
     _checks.instance(parameters, Parameters, "parameters", hint=hint)
     own, each = parameters.own, (problem.count, 3)
@@ -286,6 +327,14 @@ def fits(problem: Problem, parameters: Parameters) -> Parameters:
                 f"parameters.{name}: wanted arrays of shapes {shapes}, as this problem has, got "
                 f"{[leaf.shape for leaf in numbers]}; {hint}"
             )
+        for leaf in numbers:
+            if leaf.dtype != problem.records.t.dtype:
+                raise TypeError(
+                    f"parameters.{name}: wanted {problem.records.t.dtype}, as the recordings have, "
+                    f"got {leaf.dtype}"
+                )
+            if _checks.known(leaf):
+                _checks.finite(leaf, f"parameters.{name}")
     return parameters
 
 

@@ -8,9 +8,8 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array
 
-from rigidjax import _checks
 from rigidjax.identify import reported
-from rigidjax.identify.fit import Fit
+from rigidjax.identify.fit import Fit, one_fit
 from rigidjax.identify.problem import Parameters
 from rigidjax.identify.residual import residuals
 from rigidjax.identify.search import cost_of, misfit, solver_for
@@ -35,7 +34,7 @@ def profile(fit: Fit, name: str, level: float = 0.95) -> tuple[float, float]:
     >>> profile.__name__
     'profile'
     """
-    _checks.instance(fit, Fit, "fit")
+    one_fit(fit)
     names = [quantity.name for quantity in fit.quantities]
     if not isinstance(name, str) or name not in names:
         raise ValueError(f"profile: no quantity {name!r}; wanted one of {', '.join(names)}")

@@ -12,7 +12,7 @@ import numpy as np
 
 from rigidjax import _checks
 from rigidjax._names import own_names
-from rigidjax.identify.fit import Fit
+from rigidjax.identify.fit import Fit, one_fit
 
 _UNITS = {"rad/s": 1.0, "deg/s": 180 / np.pi, "deg/day": 86400 * 180 / np.pi}
 Row = tuple[str, float, float, float, str]
@@ -23,7 +23,7 @@ def rows(fit: Fit, rate_unit: str = "rad/s") -> list[Row]:
 
     **Arguments:** `fit`; `rate_unit` of the first body rate: `rad/s`, `deg/s`, `deg/day`.
     """
-    _checks.instance(fit, Fit, "fit")
+    one_fit(fit)
     scale = _UNITS[_checks.word(rate_unit, tuple(_UNITS), "rate_unit")]
     bounds = fit.interval(0.95)
     out: list[Row] = []
@@ -75,7 +75,7 @@ def _decimals(width: float) -> int:
 
 def verdict(fit: Fit) -> str:
     """What is well and what is weakly determined, and whether the starts agree, in words."""
-    _checks.instance(fit, Fit, "fit")
+    one_fit(fit)
     good = [start for start in fit.starts if start.converged and start.fits]
     lines = [f"status: {fit.status}"]
     lines.append(
@@ -95,7 +95,7 @@ def as_dict(fit: Fit, files: Sequence[str] = (), more: Sequence[Row] = ()) -> di
     def plain(number: float) -> float | None:
         return float(number) if np.isfinite(number) else None
 
-    _checks.instance(fit, Fit, "fit")
+    one_fit(fit)
     bounds = fit.interval(0.95)
     return {
         "files": list(files),
@@ -154,7 +154,7 @@ def write_html(
     `rigidjax.plot.fit`; `rate_unit` as for `rows`; `files` the names of what was read; `more`
     rows of further quantities.
     """
-    _checks.instance(fit, Fit, "fit")
+    one_fit(fit)
     good = fit.ok
     lines = []
     for name, value, low, high, unit in [*rows(fit, rate_unit), *more]:

@@ -4,6 +4,7 @@ from typing import TypeVar
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
@@ -72,9 +73,15 @@ State = TypeVar("State")
 
 
 def on_the_group(state: State) -> State:
-    """The same state with its quaternion, if it has one, scaled to length 1."""
+    """The same state with its quaternion, if it has one, scaled to length 1.
+
+    **Raises:** `ValueError` for a quaternion known to be zero, or too short to have a direction.
+    """
     if isinstance(state, HasAttitude):
-        _checks.floating(state.q, (4,), "state.q")
+        q = _checks.floating(state.q, (4,), "state.q")
+        if _checks.known(q):
+            length = float(np.linalg.norm(np.asarray(q)))
+            _checks.refuse(q, length**2 == 0, f"state.q: wanted a length near 1, got {length:.3g}")
         return eqx.tree_at(lambda s: s.q, state, _unit(state.q))
     return state
 

@@ -115,12 +115,17 @@ def lie_poisson_with_direction(hamiltonian: Callable[[Any, Any], Any]) -> LiePoi
     return LiePoissonWithDirection(_callable(hamiltonian))
 
 
+def _invertible(inertia: Any) -> _inertia.Inertia:
+    _checks.single(inertia, _inertia.Inertia, "inertia")
+    return inertia.invertible() if _checks.known(inertia) else inertia
+
+
 class RotationalHamiltonian(eqx.Module):
     """H = ½ Π·I⁻¹Π, the energy of rotation.
 
     **Arguments:** `inertia` about the centre of mass or a fixed point. Called with Π (3,), gives J.
 
-    **Raises:** `TypeError` for what is no `Inertia`.
+    **Raises:** `TypeError` for what is no `Inertia`; `ValueError` for a moment known to be zero.
 
     >>> import rigidjax as rj
     >>> RotationalHamiltonian(rj.Inertia.from_principal(1.0, 1.0, 2.0))([0.0, 0.0, 2.0])
@@ -130,7 +135,7 @@ class RotationalHamiltonian(eqx.Module):
     inverse: Mat3
 
     def __init__(self, inertia: _inertia.Inertia):
-        self.inverse = _inertia.inverse(_checks.single(inertia, _inertia.Inertia, "inertia").tensor)
+        self.inverse = _inertia.inverse(_invertible(inertia).tensor)
 
     def __call__(self, pi: Float[ArrayLike, "3"] | list[float]) -> Scalar:
         pi = _checks.floating(pi, (3,), "pi")
@@ -144,7 +149,7 @@ class HeavyTopHamiltonian(eqx.Module):
     Called with Π (3,) and γ (3,), m/s², body frame, gives J. `start` makes the state.
 
     **Raises:** `TypeError` for an `inertia` that is no `Inertia`, or a `top` that is no `HeavyTop`:
-    another torque has no such Hamiltonian.
+    another torque has no such Hamiltonian; `ValueError` for a moment known to be zero.
 
     >>> import rigidjax as rj
     >>> top = rj.torques.HeavyTop(2.0, [0.0, 0, 0.5], [0.0, 0, -9.81])
@@ -158,11 +163,11 @@ class HeavyTopHamiltonian(eqx.Module):
     top: HeavyTop
 
     def __init__(self, inertia: _inertia.Inertia, top: HeavyTop):
-        self.inertia = _checks.single(inertia, _inertia.Inertia, "inertia")
+        self.inertia = _invertible(inertia)
         self.top = _checks.instance(
             top, HeavyTop, "top", hint="this Hamiltonian is that of gravity alone"
         )
-        self.inverse = _inertia.inverse(inertia.tensor)
+        self.inverse = _inertia.inverse(self.inertia.tensor)
 
     def __call__(
         self, pi: Float[ArrayLike, "3"] | list[float], gamma: Float[ArrayLike, "3"] | list[float]

@@ -39,6 +39,8 @@ def unit(name: str, known: dict[str, float], what: str) -> float:
 
 def of_fit(found: Any, index: Any) -> int:
     """Which recording of a fit; raises in words where it is no fit, or has none of that number."""
+    if np.shape(getattr(found, "chi2", 0.0)) != ():
+        raise ValueError("found: wanted one Fit, got one with leading axes; draw them one by one")
     wanted = ("problem", "parameters", "residuals")
     if isinstance(found, type) or not all(hasattr(found, name) for name in wanted):
         raise TypeError(f"found: wanted a Fit of rigidjax.identify, got {type(found).__name__}")

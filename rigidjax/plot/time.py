@@ -67,15 +67,14 @@ def motion(
 
 
 def _attitude(ax: Any, t: np.ndarray, q: np.ndarray, how: str) -> None:
+    _checks.word(how, ("quaternion", "axes", "angles"), "attitude")
     if how == "quaternion":
         names, lines, label = [f"q{n}" for n in "wxyz"], q.T, "attitude q"
     elif how == "axes":
         names = [f"{n}' · z" for n in "xyz"]
         lines, label = matrices(q)[:, 2, :].T, "body axes along world z"
-    elif how == "angles":
-        names, lines, label = ["φ", "θ", "ψ"], _angles(q).T, "3-1-3 angles, deg"
     else:
-        raise ValueError(f"attitude: wanted quaternion, axes or angles, got {how!r}")
+        names, lines, label = ["φ", "θ", "ψ"], _angles(q).T, "3-1-3 angles, deg"
     colours = (COLOURS[6], *COLOURS[:3]) if len(names) == 4 else COLOURS[:3]
     for values, name, colour in zip(lines, names, colours, strict=True):
         ax.plot(t, values, color=colour, label=name, lw=1.4)

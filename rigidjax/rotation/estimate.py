@@ -6,6 +6,7 @@ largest Tr(RᵀB), has the derivative dR = R hat(x), (Tr(S) 1 − S) x = 2 vee(R
 which is regular wherever the answer is unique.
 """
 
+from functools import partial
 from typing import Any
 
 import jax
@@ -19,7 +20,7 @@ from rigidjax import _checks
 from rigidjax._types import Mat3, Mat3Like, Quat, Scalar, Vec3, Vec3Like
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.algebra import cross, determinant, dot, hat, near_one, product, solve, vee
-from rigidjax.rotation.gate import direction
+from rigidjax.rotation.gate import direction, rotation_matrix, unit_quaternion
 from rigidjax.rotation.maps import matrix_to_quaternion
 from rigidjax.special.series import inverse_kernel
 
@@ -38,7 +39,8 @@ def project(matrix: Mat3Like) -> Mat3:
     matrix = _checks.floating(matrix, (3, 3), "matrix")
     if not isinstance(matrix, Tracer):
         _checks.finite(matrix, "matrix")
-        size = np.max(np.abs(np.asarray(matrix))) or 1.0
+        direction(matrix.reshape(9), "matrix")
+        size = np.max(np.abs(np.asarray(matrix)))
         # Of the matrix over its largest entry: that of itself may overflow.
         found = np.linalg.det(np.asarray(matrix) / size)
         if found <= 0:
@@ -60,7 +62,8 @@ def wahba(
     Markley 1993 (FOAM, J. Astronaut. Sci. 41, 261), then by Newton's method on the group.
 
     **Raises:** an error, under `jit` too, if the directions leave a turn free: fewer than two, or
-    all parallel (to 5e-4 rad in float64, 4° in float32, where half the digits would be gone).
+    all parallel (to 5e-4 rad in float64, 4° in float32, where half the digits would be gone);
+    `ValueError` for NaN, and for all zeros, where they are known.
 
     >>> wahba(jnp.eye(3)[:2], jnp.eye(3)[:2]).round(12).tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
@@ -68,6 +71,8 @@ def wahba(
     body = _checks.rows(body, (3,), "body")
     world = _checks.floating(world, body.shape, "world")
     w = _weights(weights, body[:, 0], "body")
+    for name, rows in (("body", body), ("world", world)):
+        direction(rows.reshape(-1), name)
     w, world, body = (_of_order_one(x) for x in (w, world, body))
     b = (w[:, None, None] * world[:, :, None] * body[:, None, :]).sum(0)
     best = _best(b)
@@ -113,11 +118,15 @@ def mean(matrices: Float[ArrayLike, "n 3 3"], weights: Float[ArrayLike, "n"] | N
     unique (Karcher 1977, doi:10.1002/cpa.3160300502); `weights` (n,), not negative.
 
     **Returns:** (3, 3), with first and second derivatives from the last two Newton steps alone.
+    **Raises:** as `so3.check`, if the matrices are known now; `ValueError` for weights that make no
+    mean.
 
     >>> mean(jnp.stack([jnp.eye(3), jnp.eye(3)])).round(12).tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
     """
     matrices = _checks.rows(matrices, (3, 3), "matrices")
+    if _checks.known(matrices) and matrices.size:
+        rotation_matrix(matrices, "matrices")
     _weights(weights, matrices[:, 0, 0], "matrices")
     return quaternion.to_matrix(mean_quaternion(jax.vmap(matrix_to_quaternion)(matrices), weights))
 
@@ -128,12 +137,20 @@ def mean_quaternion(
     """The Karcher mean of unit quaternions; each may have either sign.
 
     **Arguments:** `quaternions` (n, 4); `weights` (n,). See `mean`. **Returns:** (4,), w ≥ 0.
+    **Raises:** as `quaternion.check`, if they are known now.
 
     >>> mean_quaternion(jnp.array([[1.0, 0, 0, 0], [-1.0, 0, 0, 0]])).tolist()
     [1.0, 0.0, 0.0, 0.0]
     """
     q = _checks.rows(quaternions, (4,), "quaternions")
-    w = _of_order_one(_weights(weights, q[:, 0], "quaternions"))
+    if _checks.known(q) and q.size:
+        unit_quaternion(q, "quaternions")
+    return _karcher(q, _of_order_one(_weights(weights, q[:, 0], "quaternions")))
+
+
+# Compiled once: called from the prompt, the loop would be compiled anew each time.
+@partial(jax.jit, inline=True)
+def _karcher(q: Float[Array, "n 4"], w: Float[Array, "n"]) -> Quat:
 
     def newton(_: Any, start: Quat, q: Array, w: Array) -> Quat:
         apart = jax.vmap(lambda each: quaternion.multiply(quaternion.conjugate(start), each))(q)

@@ -19,10 +19,14 @@ def tolerance(dtype: object) -> float:
 
 
 def direction(v: Float[Array, "n"], name: str) -> Float[Array, "n"]:
-    """Refuse, where the numbers are known, what has no direction: zero, NaN, infinity."""
-    if _checks.known(v) and not 0 < _largest(v) < np.inf:
+    """Refuse, where the numbers are known, what has no direction: zero, NaN, infinity.
+
+    Below the least normal number, 2e-308, XLA takes a number for zero on some machines.
+    """
+    if _checks.known(v) and not (least := float(jnp.finfo(v.dtype).tiny)) <= _largest(v) < np.inf:
         _checks.finite(v, name)
-        raise ValueError(f"{name}: wanted a direction, got zero")
+        found = "zero" if _largest(v) == 0 else f"less than the least normal number, {least:.2g}"
+        raise ValueError(f"{name}: wanted a direction, got {found}")
     return v
 
 

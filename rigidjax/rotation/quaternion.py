@@ -215,13 +215,14 @@ def interpolate(p: QuatLike, q: QuatLike, s: ScalarLike) -> Quat:
 
     **Arguments:** `p`, `q` (4,) unit, either sign; `s` dimensionless, may lie beyond [0, 1]
     (Shoemake 1985, doi:10.1145/325334.325242; here p exp(s log(p̄ q)), regular at p = q).
+    **Raises:** `ValueError` where the product p̄ q is zero or NaN.
 
     >>> p, q = exp(jnp.array([0, 0, 1.0])), exp(jnp.array([0, 0, 2.0]))
     >>> bool(abs(interpolate(p, q, 0.5) - exp(jnp.array([0, 0, 1.5]))).max() < 1e-15)
     True
     """
     p = _checks.floating(p, (4,), "p", hint=_HINT)
-    v = log(multiply(conjugate(p), q))
+    v = quaternion_to_vector(direction(multiply(conjugate(p), q), "p̄ q"))
     part = turn(_checks.floating(s, (), "s").astype(v.dtype) * v, "s times the turn")
     return multiply(p, vector_to_quaternion(part))
 

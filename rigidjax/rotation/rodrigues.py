@@ -14,17 +14,19 @@ from rigidjax._names import own_names
 from rigidjax._types import Mat3, Mat3Like, Quat, QuatLike, Vec3, Vec3Like
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.algebra import components, cross, dot, near_one
+from rigidjax.rotation.gate import direction
 
 
 def from_quaternion(q: QuatLike) -> Vec3:
     """The parameters g = q_v/q_w; infinite at a half turn; the same bits for q and −q.
 
-    **Arguments:** `q` (4,), not zero, body → world. **Returns:** (3,) dimensionless.
+    **Arguments:** `q` (4,), not zero, body → world. **Returns:** (3,) dimensionless. **Raises:**
+    `ValueError` for zero or NaN.
 
     >>> from_quaternion(jnp.array([2.0, 0.0, 0.0, 2.0])).tolist()
     [0.0, 0.0, 1.0]
     """
-    q = quaternion.canonical(q)
+    q = direction(quaternion.canonical(q), "q")
     # The derivative squares the denominator.
     q = near_one(*components(q)) * q
     return q[1:] / q[0]

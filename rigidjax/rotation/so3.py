@@ -120,12 +120,22 @@ def distance(a: Mat3Like, b: Mat3Like) -> Scalar:
     **Arguments:** `a`, `b` (3, 3) rotations. By atan2 of the quaternion of aᵀb, right from 1e-12 to
     π (arccos of the trace is useless below 1e-8). Its derivative does not exist where a = b; 0 is
     returned there, the shortest subgradient. For a loss take |log(aᵀb)|², which is smooth.
+    **Raises:** `ValueError` for NaN, and for what is far from a rotation.
 
     >>> round(float(distance(jnp.eye(3), exp(jnp.array([0.0, 3e-9, 0.0]))) * 1e9), 9)
     3.0
     """
     a, b = _checks.floating(a, (3, 3), "a"), _checks.floating(b, (3, 3), "b")
-    return quaternion.angle(matrix_to_quaternion(product(a.T, b)))
+    return quaternion.angle(matrix_to_quaternion(_between(a, b)))
+
+
+def _between(a: Mat3, b: Mat3) -> Mat3:
+    between = product(a.T, b)
+    if _checks.known(between):
+        _checks.finite(between, "aᵀb")
+        large = jnp.abs(between).max() > 2
+        _checks.refuse(between, large, "aᵀb: has entries above 1; wanted two rotations, a and b")
+    return between
 
 
 def about_axis(axis: Vec3Like, angle: ScalarLike) -> Mat3:
@@ -227,13 +237,14 @@ def world_rate(matrix: Mat3Like, rate: Mat3Like) -> Vec3:
 def interpolate(a: Mat3Like, b: Mat3Like, s: ScalarLike) -> Mat3:
     """The point at s of the shortest turn from a (s = 0) to b (s = 1): a exp(s log(aᵀb)).
 
-    **Arguments:** `a`, `b` (3, 3) rotations; `s` dimensionless, may lie beyond [0, 1].
+    **Arguments:** `a`, `b` (3, 3) rotations; `s` dimensionless, may lie beyond [0, 1]. **Raises:**
+    as `distance`.
 
     >>> interpolate(jnp.eye(3), exp(jnp.array([0.0, 0.0, 2.0])), 0.5).round(6)[0].tolist()
     [0.540302, -0.841471, 0.0]
     """
     a, b = _checks.floating(a, (3, 3), "a"), _checks.floating(b, (3, 3), "b")
-    v = quaternion.log(matrix_to_quaternion(product(a.T, b)))
+    v = quaternion.log(matrix_to_quaternion(_between(a, b)))
     part = turn(_checks.floating(s, (), "s").astype(v.dtype) * v, "s times the turn")
     return product(a, vector_to_matrix(part))
 

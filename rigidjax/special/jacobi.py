@@ -37,10 +37,10 @@ def sncndn(
 ) -> tuple[Float[Array, "..."], Float[Array, "..."], Float[Array, "..."]]:
     """Jacobi's sn(u|m), cn(u|m), dn(u|m).
 
-    **Arguments:** `u` real, any size. `m` the parameter k², not the modulus: any real number,
-    also negative or above 1. `m1` = 1 − m given exactly, where m is so near 1 that 1 − m would
-    lose digits; then the functions are functions of m1 alone, value and derivative, and m only
-    lends its digits where it is small. Shapes broadcast.
+    **Arguments:** `u` real; the error grows as |u| eps. `m` the parameter k², not the modulus: any
+    real number, also negative or above 1. `m1` = 1 − m given exactly, where m is so near 1 that
+    1 − m would lose digits; then the functions are functions of m1 alone, value and derivative, and
+    m only lends its digits where it is small. Shapes broadcast.
 
     **Returns:** three arrays (DLMF 22.2.4–6). m = 0 gives sin, cos, 1; m = 1 gives tanh, sech,
     sech (DLMF 22.5.3–4); m < 0 and m > 1 by DLMF 22.17. Exact derivatives of every order in u

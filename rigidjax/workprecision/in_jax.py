@@ -9,6 +9,7 @@ import diffrax as dfx
 import jax
 import jax.numpy as jnp
 
+from rigidjax import _checks
 from rigidjax.exact import FreeBody
 from rigidjax.solve import equations_of_motion, lean, simulate, solvers
 from rigidjax.workprecision.method import Method, Ready, Run
@@ -168,6 +169,7 @@ def diffrax_method(solver: dfx.AbstractSolver, *, gradients: bool = False) -> Me
     >>> diffrax_method(dfx.Heun()).name
     'diffrax Heun'
     """
+    _checks.instance(solver, dfx.AbstractSolver, "solver", wanted="a solver of diffrax")
     ways = {
         "forward": (dfx.ForwardMode(), jax.jacfwd),
         "checkpointed": (dfx.RecursiveCheckpointAdjoint(), jax.grad),

@@ -146,7 +146,10 @@ def table(lines: Iterable[Choice]) -> str:
         "`simulate` as it stands, µs (gradient) | quicker elsewhere |"
     )
     rows = [head, "| --- | --- | --- | --- | --- | --- | --- | --- |"]
+    if isinstance(lines, str) or not isinstance(lines, Iterable):
+        raise TypeError(f"lines: wanted what choose returns, got {type(lines).__name__}")
     for c in lines:
+        _checks.instance(c, Choice, "lines", wanted="lines of choose")
         peer = f"{c.peer}, {_micro(c.peer_time)}" if c.peer else ""
         rows.append(
             f"| {c.scene} | {c.wanted:.0e} | {c.method or 'none'} | {_micro(c.time)} | "

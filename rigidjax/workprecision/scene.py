@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from rigidjax import _checks
 from rigidjax.body.inertia import Inertia
 from rigidjax.frames import Point
 from rigidjax.motion import Attitude
@@ -57,8 +58,9 @@ class Scene(eqx.Module):
                 f"Scene: wanted an Attitude or a Point, got {type(self.state0).__name__}: errors "
                 "are told as angles between attitudes, or as distances"
             )
-        if not self.end > 0:
-            raise ValueError(f"Scene: wanted an end > 0, s, got {self.end}")
+        if self.body is not None:
+            _checks.single(self.body, Inertia, "body", hint="or None with a Point")
+        _checks.positive(self.end, "end", "an end > 0, s")
 
     @property
     def numbers(self) -> Float[Array, " parameters"]:

@@ -8,7 +8,20 @@ OVERFLOW = (
 )
 REACHED = "a body's status says what happened to it, and its states are NaN: documented"
 ANY_TREE = "a tree of whatever NumPy makes an array of"
-DOMAIN = "outside of the domain that the documentation states, where nothing is defined"
+BY_NUMBER = (
+    "a function of arrays, number by number, as SciPy's of the same names: outside of its domain, "
+    "which its docstring states, it gives NaN there and the right numbers beside"
+)
+NO_NUMBERS = "a function of arrays, number by number: of no numbers it makes none"
+OF_TIME = "a function of time is documented; its value is looked at where it is used"
+ANY_STATE = "what has no quaternion comes back as it is: a user's own state may be anything"
+CRAMER = (
+    "a well conditioned matrix is documented; it stands in the middle of vector fields, where the "
+    "quotient by a determinant of zero is told by what follows"
+)
+NOT_MEASURED = "NaN stands in a record for what was not measured: documented"
+NEVER = "NaN is documented where a method never gets to an error"
+NOTHING = "of no records there is nothing to say: an empty table"
 LIMIT = "the right limit for an infinite argument"
 
 # (row, argument: replacement, what came of it, reason), as patterns; the first that fits counts.
@@ -25,6 +38,16 @@ ACCEPTED: list[tuple[str, str, str, str]] = [
     ("motion.torques.*", "state: huge", "a silent NaN*", OVERFLOW),
     ("frames.scenes.*", "state: huge", "a silent NaN*", OVERFLOW),
     ("frames.scenes.ThreeBody.*", "*: huge", "a silent NaN*", OVERFLOW),
+    ("rotation.mrp.*", "sigma: huge", "a silent NaN*", OVERFLOW),
+    ("rotation.quaternion.rotate*", "q: huge", "a silent NaN*", OVERFLOW),
+    ("rotation.quaternion.to_matrix", "q: huge", "a silent NaN*", OVERFLOW),
+    ("rotation.so3.conjugate", "matrix: huge", "a silent NaN*", OVERFLOW),
+    *(
+        ("rotation.so3.solve", f"a: {size}", "a silent NaN*", OVERFLOW)
+        for size in ("huge", "tiny", "subnormal")
+    ),
+    ("rotation.so3.solve", "a: zero", "a silent NaN*", CRAMER),
+    ("rotation.so3.determinant", "a: huge", "a silent NaN*", OVERFLOW),
     ("body.parameters.unpack_shape", "vector: huge", "a silent NaN*", OVERFLOW),
     # Domains.
     (
@@ -34,14 +57,40 @@ ACCEPTED: list[tuple[str, str, str, str]] = [
         "the square root is not smooth at 0, has no real value below, and its second derivative "
         "overflows below 1e-205: the function must be smooth on the spectrum",
     ),
+    ("special.elliptic.r*", "*: negative", "a silent NaN*", BY_NUMBER),
+    ("special.elliptic.ellip* (no complement)", "[mn]: huge", "a silent NaN*", BY_NUMBER),
+    ("special.elliptic.ellip* (no complement)", "[mn]: large", "a silent NaN*", BY_NUMBER),
+    ("special.elliptic.ellipk (no complement)", "m: all -inf", "infinity is lost*", LIMIT),
+    ("special.elliptic.*", "*: empty list", "taken without a word*(0,)*", NO_NUMBERS),
     ("body.parameters.unpack_moments", "vector: all -inf", "infinity is lost*", LIMIT),
+    ("frames.scenes.ThreeBody.potential", "x: inf", "infinity is lost*", LIMIT),
+    ("frames.scenes.ThreeBody.speed_squared", "x: inf", "infinity is lost*", LIMIT),
     # Batches.
     ("batch.rollout", "*", "a silent NaN*", REACHED),
     ("batch.simulate*", "*", "a silent NaN*", REACHED),
     ("batch.hosts.*", "tree: *", "taken without a word*", ANY_TREE),
     # Others.
+    *(
+        (f"workprecision.{name}", *what, NOT_MEASURED)
+        for name in ("choose", "front")
+        for what in (("good call", "returned*"), ("*", "a silent NaN*"))
+    ),
+    ("workprecision.time_to", "*", "*returned =[[]nan[]]", NEVER),
+    *(
+        (f"workprecision.{name}", f"*: {empty}", "taken without a word*", NOTHING)
+        for name in ("choose", "front", "moved", "table")
+        for empty in ("dict", "empty list")
+    ),
+    ("motion.on_the_group", "state: *", "taken without a word*", ANY_STATE),
+    *(
+        (f"motion.torques.{law}", "*: function", "taken without a word*", OF_TIME)
+        for law in ("Flywheel", "GravityGradient", "InSpace", "MagneticDipole")
+    ),
     ("drift", "*: float32", "returned*", "drift is round-off itself, so that it has no digits"),
     ("frames.Force", "force: None", "taken*", "None is documented: the particle is left to itself"),
+    ("identify.Recording", "mask: None", "taken*", "None is documented: nothing is masked"),
+    ("identify.Recording", "torque: None", "taken*", "None is documented: no torque at all"),
+    ("simulate (options)", "max_steps: None", "taken*", "None is documented: as many as it takes"),
     ("frames.scene_of", "force: None", "taken*", "None is documented: no force at all"),
 ]
 

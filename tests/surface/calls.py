@@ -21,7 +21,8 @@ class Call:
     arguments; `groups` which replacements are tried, of which `arguments` (all of them); `traced`
     which arguments are traced (all that hold floats); `transforms` which are tried: none for what
     works on the host, which under `jit` must then say so (`host`); `says` other words by which a
-    message may name what is wrong.
+    message may name what is wrong; `dear` a good call that takes a minute and is made in the tests
+    of its own: only what must be refused is tried.
     """
 
     name: str
@@ -33,6 +34,7 @@ class Call:
     transforms: Sequence[str] = TRANSFORMS
     host: bool = False
     says: Sequence[str] = ()
+    dear: bool = False
 
 
 TABLE: dict[str, Call] = {}

@@ -42,6 +42,7 @@ row(
     run=lambda t, sensor, values, mask, torque: rj.identify.Recording(
         t, (sensor, values, mask), torque=torque
     ),
+    says=("reading",),
     **HOST,
 )
 leave_out("Recording makes it", "identify.Reading")
@@ -89,6 +90,7 @@ for name in ("unpack", "values", "scenes", "motion", "errors"):
         lambda: dict(self=s.problem(), parameters=plan()),
         arguments=("parameters",),
         traced=("parameters",),
+        says=("inertia",),
     )
 row(
     "identify.fisher",
@@ -107,6 +109,7 @@ row(
     "identify.best_first_rate",
     lambda: dict(problem=s.problem(), body=s.inertia(), omega=W, max_steps=2),
     groups=("stranger",),
+    dear=True,
     **HOST,
 )
 row(
@@ -119,7 +122,13 @@ row(
     **HOST,
 )  # fmt: skip
 row("identify.pieces", lambda: dict(problem=s.problem(), count=3, width=1e-3), **HOST)
-row("identify.profile", lambda: dict(fit=s.found(), name="Ix/Iz", level=0.9), groups=KINDS, **HOST)
+row(
+    "identify.profile",
+    lambda: dict(fit=s.found(), name="Ix/Iz", level=0.9),
+    groups=("stranger", "shape"),
+    dear=True,
+    **HOST,
+)
 row("identify.compare", lambda: dict(fits={"a": s.found(), "b": s.found()}), transforms=())
 row(
     "identify.cross_validate",
@@ -129,6 +138,7 @@ row(
     ),
     run=lambda build, recordings: rj.identify.cross_validate(build, recordings, starts=1),
     groups=("stranger",),
+    dear=True,
     transforms=(),
 )
 row("identify.Fit.interval", lambda: dict(self=s.found(), level=0.9), arguments=("level",), **HOST)

@@ -26,23 +26,15 @@ def generator(w: Any) -> Any:
     return jnp.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
 
 
-def matrix_at(start: np.ndarray) -> Callable[[Any], Any]:
-    """Rotations near `start` by the series of the matrix exponential, for |x| < 0.2."""
-
-    def at(x: Any) -> Any:
-        h = generator(x)
-        total = jnp.eye(3)
-        for k in range(11, 0, -1):
-            total = jnp.eye(3) + h @ total / k
-        return jnp.asarray(start) @ total
-
-    return at
-
-
 def cayley(x: Any) -> Any:
-    """A rotation near 1 without a series: (1 + ½ hat x)(1 − ½ hat x)⁻¹, for what is cheap."""
-    half = 0.5 * generator(x)
-    return jnp.linalg.solve((jnp.eye(3) - half).T, (jnp.eye(3) + half).T).T
+    """A rotation near 1, (1 + ½ hat x)(1 − ½ hat x)⁻¹ multiplied out: neither series nor root."""
+    h = generator(x)
+    return jnp.eye(3) + (4 / (4 + jnp.sum(x * x))) * (h + 0.5 * h @ h)
+
+
+def matrix_at(start: np.ndarray) -> Callable[[Any], Any]:
+    """Rotations near `start`."""
+    return lambda x: jnp.asarray(start) @ cayley(x)
 
 
 def symmetric(x: Any) -> Any:
@@ -154,7 +146,7 @@ def rotations() -> list[Case]:
         found.append(
             Case(
                 f"matrices at {name}",
-                lambda x, at=at: (
+                lambda x, at=at, name=name: (
                     mrp.from_matrix(at(x)) if name != "a half turn" else (),
                     rodrigues.from_matrix(at(x)) if name != "a half turn" else (),
                     so3.adjoint(at(x)), so3.conjugate(at(x), s.N), so3.rate(at(x), W),
@@ -386,7 +378,8 @@ def bodies() -> list[Case]:
             {k: join(t, V, 1.5, Q) for k, t in TENSORS.items()}, step=0.01,
             covers=("Inertia.rotated", "Inertia.from_tensor", "Inertia.from_second_moment"),
         ),
-        Case("Inertia.from_principal", lambda x: rj.Inertia.from_principal(*x), {"ordinary": [1.0, 2.0, 2.5], "plate": [1.0, 2.0, 3.0]}, step=1e-15, first=True, rtol=np.inf),
+        # The last moment is as large as a body's may be at 0, and less on both sides.
+        Case("Inertia.from_principal", lambda x: rj.Inertia.from_principal(x[0], x[1], x[0] + x[1] - x[2] * x[2]), {"ordinary": [1.0, 2.0, 0.7], "plate": [1.0, 2.0, 0.0]}, step=0.01),
         Case(
             "MassProperties",
             lambda x: (
@@ -412,7 +405,7 @@ def bodies() -> list[Case]:
                 "body.kinetic_energy_of_generator", "body.kinetic_energy_of_matrix_rate", "body.kinetic_energy_of_moments",
             ),
         ),
-        Case("body.divergence", lambda x: rj.body.divergence(body_of(x[:10]), body_of(x[10:])), {"ordinary": join(TEN, TEN_BALL), "the same": join(TEN, TEN), "balls": join(TEN_BALL, TEN_BALL)}, step=0.01),
+        Case("body.divergence", lambda x: rj.body.divergence(body_of(x[:10]), body_of(x[10:])), {"ordinary": join(TEN, TEN_BALL), "the same": join(TEN, TEN), "balls": join(TEN_BALL, TEN_BALL)}, step=0.01, atol=1e-11),
         Case("body.parameters.pack", lambda x: rj.parameters.pack(body_of(x)), {"ordinary": TEN, "ball": TEN_BALL}, step=0.01),
         Case("body.parameters.unpack", rj.parameters.unpack, {"ordinary": 0.1 * np.arange(10) - 0.2, "zero": np.zeros(10)}),
         Case("body.parameters.pack_second_moment", lambda x: (rj.parameters.pack_second_moment(symmetric(x)), rj.parameters.pack_shape(symmetric(x))), {"ordinary": six(SECOND), "ball": six(np.eye(3))}, step=0.01, covers=("body.parameters.pack_shape",)),
@@ -490,11 +483,11 @@ def laws() -> list[Case]:
         law("ConstantTorque", lambda x: t.ConstantTorque(x), V),
         law("InSpace", lambda x: t.InSpace(x), V),
         law("Damping", lambda x: t.Damping(x), np.abs(V)),
-        law("QuadraticDamping", lambda x: t.QuadraticDamping(x), np.abs(V), once=("at rest, identity",), rtol=2e-2, step=1e-6, first=True),
+        law("QuadraticDamping", lambda x: t.QuadraticDamping(x), np.abs(V), once=("at rest, identity",), rtol=1e-6, atol=1e-6, step=1e-6, first=True),
         law("Flywheel", lambda x: t.Flywheel(x), V),
         law("UniformGravity", lambda x: t.UniformGravity(x), DOWN),
         law("CentralGravity", lambda x: t.CentralGravity(x[0]), [3.1], step=0.01, rtol2=1e-7),
-        law("Drag", lambda x: t.Drag(x[0], x[1:4], x[4:7]), join(0.2, V, np.zeros(3)), once=("at rest, identity",), rtol=2e-2, step=1e-6, first=True),
+        law("Drag", lambda x: t.Drag(x[0], x[1:4], x[4:7]), join(0.2, V, np.zeros(3)), once=("at rest, identity",), rtol=1e-6, atol=1e-6, step=1e-6, first=True),
         law("GravityGradient", lambda x: t.GravityGradient(x[0], x[1:]), join(3.1, Y), step=0.01, rtol2=1e-7),
         law("MagneticDipole", lambda x: t.MagneticDipole(x[:3], x[3:]), join(V, W)),
         law("FromPotential", lambda x: t.FromPotential(s.Spring(x[0])), [2.0]),
@@ -764,6 +757,10 @@ def fits() -> list[Case]:
         )
     return found
 
+
+# Made before anything is traced: what they keep must not be tracers.
+for made in (s.inertia, s.body, s.other_body, s.spin, s.attitude, s.top, s.damping):
+    made()
 
 GROUPS = dict(
     rotations=rotations, numbers=numbers, bodies=bodies, laws=laws, equations=equations, frames=frames,

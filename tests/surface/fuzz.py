@@ -32,12 +32,12 @@ def failures_of(
 ) -> Iterator[tuple[str, str]]:
     """What a user would call wrong, as (where, what)."""
     given = call.given()
-    good = judge.outcome(lambda: call.run(**given))
-    counts["calls"] += 1
+    good = judge.Outcome({}) if call.dear else judge.outcome(lambda: call.run(**given))
+    counts["calls"] += not call.dear
     if good.error is not None:
         yield "good call", str(good)
         return
-    if judge.has_nan(good):
+    if judge.has_nan(good) and accepted.reason(call.name, "good call", str(good)) is None:
         yield "good call", f"gave a NaN: {good}"
     may_be_none = _may_be_none(call)
     for argument, value in given.items():

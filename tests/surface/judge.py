@@ -78,7 +78,8 @@ def raw(error: BaseException, words: set[str]) -> str | None:
     """
     text = str(error)
     if isinstance(error, eqx.EquinoxRuntimeError):
-        text = text.split("\n")[0]
+        # Under `jit` the stack comes first, then the message, then advice on debugging.
+        text = text.partition("\n-----")[0].rpartition("EquinoxRuntimeError: ")[2].split("\n")[0]
     elif not isinstance(error, OUR_KINDS):
         return f"raised a raw {type(error).__name__}"
     elif not _raised_by_us(error):

@@ -162,9 +162,9 @@ def act(
     >>> from rigidjax import Inertia, Spin, torques
     >>> act(torques.ConstantTorque([0.0, 0, 1]), 0.0, Spin([0.0, 0, 1]), Inertia(jnp.eye(3)))[0]
     """
-    require_law(law)
-    one_law(law)
     _checks.single(state, HasSpin, "state", wanted="a Spin, an Attitude or a Rigid")
+    require_rung(law, state)
+    one_law(law)
     _checks.single(body, (Inertia, MassProperties), "body")
     dtype = state.omega.dtype
     t = _checks.floating(t, (), "t").astype(dtype)

@@ -58,7 +58,7 @@ class Series(eqx.Module):
         dtype = jnp.result_type(float)
         self.start, self.step = jnp.asarray(t[0], dtype), jnp.asarray(step, dtype)
         self.values = jnp.asarray(rows, dtype)
-        self.slopes = _slopes(self.values)
+        self.slopes = _finite(_slopes(self.values), "slopes of the values")
 
     def __call__(self, t: ScalarLike) -> Any:
         """The value at `t` (s), () or (k,)."""
