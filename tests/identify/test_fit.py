@@ -1,4 +1,7 @@
-"""Fits: exact data come back exactly, intervals cover, masks mask, mistakes are named."""
+"""Fits: exact data come back exactly, intervals cover, masks mask, mistakes are named.
+
+Fits of one chart to 80 readings of one gyro are one set of programs: compiling takes most of a fit.
+"""
 
 from pathlib import Path
 
@@ -81,13 +84,12 @@ def test_estimated_noise_is_the_noise(tumble):
     np.testing.assert_allclose(found.noise[1], 0.05, rtol=0.2)
 
 
-def test_a_wrong_motion_is_not_called_success(tumble):
+# The noise known, and estimated (another program).
+@pytest.mark.parametrize("noise", [0.01, pytest.param(None, marks=pytest.mark.slow)])
+def test_a_wrong_motion_is_not_called_success(tumble, noise):
     _, ts, _ = tumble
-    rng = np.random.default_rng(3)
-    record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), rng.normal(size=(80, 3))))
-    found = rj.identify.fit(rj.identify.Problem(record, rj.identify.Ratios()), starts=2)
-    assert found.status.startswith("poor fit")
-    record = rj.identify.Recording(ts, (rj.identify.Gyro(), rng.normal(size=(80, 3))))
+    readings = np.random.default_rng(3).normal(size=(80, 3))
+    record = rj.identify.Recording(ts, (rj.identify.Gyro(noise), readings))
     found = rj.identify.fit(rj.identify.Problem(record, rj.identify.Ratios()), starts=2)
     assert found.status.startswith("poor fit")
 
@@ -105,7 +107,7 @@ def test_a_wrong_motion_is_not_called_outliers(tumble, loss):
 def test_a_fit_that_stops_early_says_so_and_keeps_its_best(tumble):
     _, ts, ys = tumble
     record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), ys.omega))
-    problem = rj.identify.Problem(record, rj.identify.PrincipalRatios())
+    problem = rj.identify.Problem(record, rj.identify.Ratios())
     stopped = rj.identify.fit(problem, starts=1, max_steps=1)
     assert not stopped.ok
     assert np.isfinite(stopped.body.tensor).all()
@@ -124,14 +126,13 @@ def test_interrupting_keeps_what_was_found(tumble):
     assert len(found.starts) == 1
 
 
-def test_what_cannot_be_seen_is_said(tumble):
+def test_what_cannot_be_seen_is_said():
     # Spin about a principal axis: rates alone show nothing of the shape.
-    body = rj.Inertia.from_principal(*MOMENTS)
-    ts = jnp.linspace(0.0, 5.0, 30)
-    ys = rj.simulate(body, rj.Spin([0.0, 0.0, 1.0]), ts).ys
-    noisy = np.asarray(ys.omega) + 0.01 * np.random.default_rng(4).normal(size=(30, 3))
+    ts = jnp.linspace(0.0, 5.0, 80)
+    omega = np.broadcast_to([0.0, 0.0, 1.0], (80, 3))
+    noisy = omega + 0.01 * np.random.default_rng(4).normal(size=(80, 3))
     record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), noisy))
-    found = rj.identify.fit(rj.identify.Problem(record, rj.identify.PrincipalRatios()), starts=3)
+    found = rj.identify.fit(rj.identify.Problem(record, rj.identify.Ratios()), starts=3)
     words = " ".join(found.identifiability)
     assert "is not determined by these data" in words
     assert "cannot show the absolute inertia" in words

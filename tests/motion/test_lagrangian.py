@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from once import once
 from systems.marching import rk4
 
 import rigidjax as rj
@@ -74,7 +75,7 @@ def test_all_three_agree_along_a_trajectory(law):
     start = lagrangian.Coordinates([0.3, 1.2, -0.4], [0.5, -0.2, 1.1])
     state = lagrangian.to_attitude(start)
 
-    @jax.jit
+    @once
     def run(start, state):
         top = lagrangian.EulerAngleTop(INERTIA, law)
         angles = rk4(lagrangian.equations_of_motion(top), start, 0.5, 1000)

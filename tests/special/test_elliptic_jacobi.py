@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import mpmath as mp
 import numpy as np
 import pytest
+from once import once
 
 from rigidjax.special import elliptic
 
@@ -119,7 +120,7 @@ def test_first_and_second_derivatives(dtype):
         (uu, ub), (_, bb) = jax.jacfwd(first, (0, 2))(u, m, m1)
         return value, du, -db, uu, -ub, bb
 
-    got = jax.jit(jax.vmap(everything))(u, m1, m)
+    got = once(jax.vmap(everything))(u, m1, m)
     assert all(part.dtype == dtype for part in got)
     check(dtype, u, m1, [np.asarray(part) for part in got], range(6), (6, 8, 10, 10, 10, 40))
 
@@ -135,8 +136,8 @@ def test_reverse_mode_and_the_parameter_alone():
     def pair(u, m):
         return stacked(u, m, 1 - m)
 
-    one = jax.jit(jax.jacfwd(jax.jacrev(alone, (0, 1)), (0, 1)))(u, m)
-    two = jax.jit(jax.jacfwd(jax.jacfwd(pair, (0, 1)), (0, 1)))(u, m)
+    one = once(jax.jacfwd(jax.jacrev(alone, (0, 1)), (0, 1)))(u, m)
+    two = once(jax.jacfwd(jax.jacfwd(pair, (0, 1)), (0, 1)))(u, m)
     for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(two), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-13)
 

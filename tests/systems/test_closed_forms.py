@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from once import once
 from systems import tops_mp
 from systems.marching import rk4
 
@@ -32,7 +33,7 @@ def product(p, q):
 def check(run, formula, at, rtol):
     """Value and all first derivatives of `run` against a NumPy formula, differenced."""
     at = np.asarray(at, float)
-    value, gradient = jax.jit(lambda x: (run(x), jax.jacfwd(run)(x)))(jnp.asarray(at))
+    value, gradient = once(lambda x: (run(x), jax.jacfwd(run)(x)))(jnp.asarray(at))
     wanted = np.asarray(formula(at))
     np.testing.assert_allclose(value, wanted, rtol=rtol, atol=rtol * np.abs(wanted).max())
     # Six points: the difference is good to 1e-11.
@@ -321,7 +322,7 @@ def test_lagrange_top_against_quadrature(theta, rates):
         return 1 - 2 * (end.q[1] ** 2 + end.q[2] ** 2), end
 
     at = jnp.array([theta, *rates])
-    (value, end), slope = jax.jit(lambda p: (run(p), jax.jacfwd(lambda x: run(x)[0])(p)))(at)
+    (value, end), slope = once(lambda p: (run(p), jax.jacfwd(lambda x: run(x)[0])(p)))(at)
 
     phi, tilt, psi = (float(a) for a in tops_mp.lagrange_top(i1, i3, weight, theta, rates, t))
     np.testing.assert_allclose(value, np.cos(tilt), atol=1e-11)
