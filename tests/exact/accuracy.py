@@ -39,6 +39,8 @@ second_along = jax.jit(
     compiler_options=OPTIONS,
 )
 jacobian = jax.jit(jax.vmap(jax.jacfwd(attitude_and_rate)))
+# The same for a few rows.
+jacobian_once = jax.jit(jax.vmap(jax.jacfwd(attitude_and_rate)), compiler_options=OPTIONS)
 reverse_jacobian = jax.jit(jax.vmap(jax.jacrev(attitude_and_rate)))
 
 

@@ -27,6 +27,7 @@ from accuracy import (
     gradient_and_curvature,
     inputs,
     jacobian,
+    jacobian_once,
     rotated,
     second_along,
     true_curvature,
@@ -35,6 +36,7 @@ from accuracy import (
     truth,
     value as value_of_rows,
 )
+from once import filter_once, once
 
 mp.mp.dps = 50
 
@@ -285,7 +287,7 @@ GRADED = [
 @pytest.mark.oldest
 def test_first_derivatives_in_every_class():
     x = np.concatenate([inputs(name, 2, [t]) for name, t in GRADED])
-    got = np.asarray(jacobian(jnp.asarray(x)))
+    got = np.asarray(jacobian_once(jnp.asarray(x)))
     for k, (row, j) in enumerate(zip(x, got, strict=True)):
         ref = true_jacobian(row, step="1e-22").astype(float)
         error = np.abs(j - ref).max() / np.abs(ref).max()
@@ -300,7 +302,7 @@ def test_first_derivatives_at_any_size_and_rate():
     units = ((0, 0), (700, -200), (-700, 200), (300, 350), (-1000, 0), (900, -20))
     ins = [np.ldexp(1.0, [k] * 6 + [j] * 3 + [0] * 4 + [-j]) for k, j in units]
     outs = [np.ldexp(1.0, [0] * 4 + [j] * 3) for _, j in units]
-    got = np.asarray(jacobian(jnp.asarray(np.concatenate([x * c for c in ins]))))
+    got = np.asarray(jacobian_once(jnp.asarray(np.concatenate([x * c for c in ins]))))
     got = got.reshape(len(units), len(names), 7, 14)
     for k, name in enumerate(names):
         ref = true_jacobian(x[k], step="1e-22").astype(float)
@@ -359,8 +361,8 @@ def test_float32_derivatives():
     x = np.concatenate([inputs(n, 2, [3.0]) for n in ("triaxial", "oblate", "sphere", "rest")])
     # As many rows as above: one program.
     x = np.resize(x, (2 * len(GRADED), 14)).astype(np.float32)
-    ref = np.asarray(jacobian(jnp.asarray(x.astype(float))))
-    got = np.asarray(jacobian(jnp.asarray(x)))
+    ref = np.asarray(jacobian_once(jnp.asarray(x.astype(float))))
+    got = np.asarray(jacobian_once(jnp.asarray(x)))
     assert got.dtype == np.float32
     assert (np.abs(got - ref).max((1, 2)) / np.abs(ref).max((1, 2))).max() < 1e-4
 
@@ -395,7 +397,7 @@ def test_periods(omega):
 TURN = np.array([[0.1, 0.2, -0.1], [0.2, 0.3, 0.15], [-0.1, 0.15, -0.2]])
 
 
-@eqx.filter_jit
+@filter_once
 def _periods_along(i, omega, e):
     """Both periods and their derivatives as body and rate are moved by e."""
 
@@ -419,7 +421,7 @@ def test_periods_where_there_is_none():
     assert rotation == jnp.inf
     np.testing.assert_allclose(precession, 2 * np.pi, rtol=1e-15)
     top = Inertia.from_principal(1.0, 2.0, 2.0)
-    grad = jax.jit(jax.grad(lambda w: exact.body_period(top, w)))(jnp.array([1.0, 0.5, 0.0]))
+    grad = once(jax.grad(lambda w: exact.body_period(top, w)))(jnp.array([1.0, 0.5, 0.0]))
     np.testing.assert_allclose(grad, [-4 * np.pi, 0.0, 0.0], atol=1e-13)
 
 
@@ -434,7 +436,7 @@ def test_solver_is_exact_at_any_step_both_ways():
     ref = motion_of(BODY, START, jnp.linspace(0.0, 20.0, 2001))
     ref = jax.tree.map(lambda leaf: np.asarray(leaf)[::500], ref)
 
-    @jax.jit
+    @once
     def solve(first, last, step, start, ts, between):
         """States at `ts`, and by the interpolation."""
         saveat = diffrax.SaveAt(ts=ts, dense=True)
@@ -452,7 +454,8 @@ def test_solver_is_exact_at_any_step_both_ways():
 
 def test_solver_finds_an_event():
     event = diffrax.Event(lambda t, y, args, **_: y.omega[1], optx.Newton(1e-9, 1e-9))
-    sol = diffrax.diffeqsolve(TERM, exact.FreeSolver(), 0.0, 30.0, 1.0, START, event=event)
+    solve = diffrax.diffeqsolve
+    sol = filter_once(solve)(TERM, exact.FreeSolver(), 0.0, 30.0, 1.0, START, event=event)
     assert abs(float(sol.ts[0]) / 17.402483478546878418 - 1) < 1e-12
 
 

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from once import once
 from scipy.spatial.transform import Rotation
 
 from rigidjax.rotation import euler, quaternion, so3
@@ -73,13 +74,13 @@ def test_derivatives_at_and_near_the_singular_case(sequence):
         return euler.from_matrix(m, sequence)
 
     for mode in (jax.jacfwd, jax.jacrev):
-        assert np.isfinite(mode(f)(euler.to_matrix(singular, sequence))).all()
+        assert np.isfinite(once(mode(f))(euler.to_matrix(singular, sequence))).all()
     near = singular + jnp.array([0.0, 1e-3 if symmetric else -1e-3, 0.5])
 
     def trip(a):
         return f(euler.to_matrix(a, sequence))
 
-    np.testing.assert_allclose(jax.jacrev(trip)(near), np.eye(3), atol=1e-9)
+    np.testing.assert_allclose(once(jax.jacrev(trip))(near), np.eye(3), atol=1e-9)
     for middle in middles(sequence, np.float32):
         m = euler.to_matrix(jnp.array([1.0, middle, -2.0], jnp.float32), sequence)
         got = euler.to_matrix(f(m), sequence)
