@@ -23,7 +23,15 @@ with install_import_hook("rigidjax", "beartype.beartype"):
 gc.freeze()
 gc.set_threshold(100_000, 50, 50)
 
-_MAPS, _MANY, _TESTS = Path("/proc/self/maps"), 30_000, itertools.count()
+_MAPS, _MANY, _TESTS = Path("/proc/self/maps"), 45_000, itertools.count()
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config, log):
+    """Half of the tests each, in order: neighbours share compiled programs. Then help each other."""
+    from xdist.scheduler import WorkStealingScheduling
+
+    return WorkStealingScheduling(config, log) if config.getoption("dist") == "load" else None
 
 
 @pytest.fixture(autouse=True)
@@ -33,7 +41,7 @@ def room_for_programs():
     Beyond that XLA ends in a segmentation fault: so programs are forgotten in time.
     """
     yield
-    if next(_TESTS) % 10 == 0 and _MAPS.exists():
+    if next(_TESTS) % 5 == 0 and _MAPS.exists():
         with _MAPS.open() as lines:
             many = sum(1 for _ in lines)
         if many > _MANY:

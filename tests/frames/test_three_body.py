@@ -169,7 +169,7 @@ def closes(scene, orbit, bar):
     np.testing.assert_allclose(end, start, rtol=0, atol=bar)
 
 
-@pytest.mark.parametrize("point", [1, 2, 3])
+@pytest.mark.parametrize("point", [1, *(pytest.param(p, marks=pytest.mark.slow) for p in (2, 3))])
 def test_lyapunov_family(point):
     @filter_once
     def orbit(mu, amplitude):

@@ -307,7 +307,13 @@ def test_kovalevskaya_and_goryachev_chaplygin_integrals():
         assert abs(float(rate)) < 1e-12 * abs(float(value)) + 1e-12
 
 
-@pytest.mark.parametrize(("theta", "rates"), [(0.7, (0.4, 0.3, 5.0)), (2.0, (-0.8, -0.5, 1.0))])
+@pytest.mark.parametrize(
+    ("theta", "rates"),
+    [
+        (0.7, (0.4, 0.3, 5.0)),
+        pytest.param(2.0, (-0.8, -0.5, 1.0), marks=pytest.mark.slow),
+    ],
+)
 def test_lagrange_top_against_quadrature(theta, rates):
     i1, i3, weight, t = 1.3, 0.9, 2.0 * 0.5 * 9.81, 1.5
     law = torques.HeavyTop(2.0, [0.0, 0.0, 0.5], [0.0, 0.0, -9.81])
