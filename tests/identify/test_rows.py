@@ -101,9 +101,9 @@ def test_i3_no_start_is_called_right_that_is_wrong():
     assert right >= 30
 
 
-@pytest.mark.parametrize(
-    "loss", [identify.Huber(), pytest.param(identify.SoftL1(), marks=pytest.mark.slow)]
-)
+# In every run: an outlier among real observations (tests/identify/test_toutatis.py).
+@pytest.mark.slow
+@pytest.mark.parametrize("loss", [identify.Huber(), identify.SoftL1()])
 def test_i4_outliers(loss):
     clean = noisy(rates(), 0.01, 1)
     spoiled = clean.copy()

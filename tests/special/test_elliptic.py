@@ -220,10 +220,8 @@ def test_legendre_first_and_second_derivatives(name):
         return ours(*a)
 
     at = jnp.asarray(point)
-    gradient, hessian = jax.jit(lambda a: (jax.grad(whole)(a), jax.jacfwd(jax.jacrev(whole))(a)))(
-        at
-    )
-    backwards = jax.jit(jax.hessian(whole))(at) if size == 1 else hessian
+    gradient, hessian = once(lambda a: (jax.grad(whole)(a), jax.jacfwd(jax.jacrev(whole))(a)))(at)
+    backwards = once(jax.hessian(whole))(at) if size == 1 else hessian
     with mp.workdps(50):
         for i in range(size):
             for j in range(size):

@@ -202,7 +202,7 @@ def test_swings_against_elliptic_functions(name):
         end = rk4(rj.AttitudeEquations(body, law), rj.Attitude(q, np.zeros(3)), 1.3, 1500)
         return 2 * fold * jnp.arctan2(end.q[1], end.q[0])
 
-    value, slope = jax.jit(lambda p: (run(p), jax.jacfwd(run)(p)))(jnp.array([2.0, 1.0]))
+    value, slope = once(lambda p: (run(p), jax.jacfwd(run)(p)))(jnp.array([2.0, 1.0]))
 
     def exact(start, k):
         return tops_mp.pendulum(strength * k / moment, start, 1.3)
