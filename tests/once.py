@@ -1,6 +1,7 @@
 """`jax.jit` and `eqx.filter_jit` for large programs that run for a moment, as derivatives of runs do.
 
 The same program as a user's down to LLVM, whose optimisations take longer than all the rest here.
+Not for what is measured in units of round-off: LLVM chooses how sums are rounded.
 """
 
 import functools
