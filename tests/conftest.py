@@ -41,7 +41,7 @@ def room_for_programs():
     Beyond that XLA ends in a segmentation fault: so programs are forgotten in time.
     """
     yield
-    if next(_TESTS) % 5 == 0 and _MAPS.exists():
+    if next(_TESTS) % 10 == 0 and _MAPS.exists():
         with _MAPS.open() as lines:
             many = sum(1 for _ in lines)
         if many > _MANY:
