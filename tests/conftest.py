@@ -18,7 +18,20 @@ with install_import_hook("rigidjax", "beartype.beartype"):
     import rigidjax.workprecision  # noqa: F401
 
 
-_MAPS, _MANY, _TESTS = Path("/proc/self/maps"), 30_000, itertools.count()
+# Traced programs are millions of objects that all stay: to look through them again and again for
+# garbage is a tenth of the time.
+gc.freeze()
+gc.set_threshold(100_000, 50, 50)
+
+_MAPS, _MANY, _TESTS = Path("/proc/self/maps"), 45_000, itertools.count()
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config, log):
+    """Half of the tests each, in order: neighbours share compiled programs. Then help each other."""
+    from xdist.scheduler import WorkStealingScheduling
+
+    return WorkStealingScheduling(config, log) if config.getoption("dist") == "load" else None
 
 
 @pytest.fixture(autouse=True)

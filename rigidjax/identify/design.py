@@ -39,7 +39,7 @@ def expected(problem: Problem, parameters: Parameters) -> tuple[reported.Quantit
     True
     """
     _look(problem, parameters)
-    information = np.asarray(_fisher_jit(problem, parameters))
+    information = np.asarray(fisher(problem, parameters))
     if not np.isfinite(information).all():
         raise ValueError(
             "expected: Fisher's information has NaN or infinity in it: problem holds NaN in its "
@@ -81,12 +81,18 @@ def fisher(problem: Problem, parameters: Parameters) -> Float[Array, "n n"]:
     sensor whose noise is not given.
 
     >>> import rigidjax as rj
-    >>> record = rj.identify.Recording([0.0, 1.0], (rj.identify.Gyro(0.1), [[1.0, 0, 0]] * 2))
+    >>> ts = jnp.linspace(0.0, 5.0, 50)
+    >>> record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), jnp.zeros((50, 3))))
     >>> problem = rj.identify.Problem(record, rj.identify.PrincipalRatios())
     >>> fisher(problem, problem.start()).shape
     (5, 5)
     """
     _look(problem, parameters)
+    return _fisher(problem, parameters)
+
+
+@eqx.filter_jit
+def _fisher(problem: Problem, parameters: Parameters) -> Float[Array, "n n"]:
     flat, restore = ravel_pytree(parameters)
 
     def predicted(vector: Array) -> Any:
@@ -114,11 +120,6 @@ def _look(problem: Problem, parameters: Parameters) -> None:
             raise ValueError(
                 f"design: wanted a {type(sensor).__name__} with known noise, got noise=None"
             )
-
-
-@eqx.filter_jit
-def _fisher_jit(problem: Problem, parameters: Parameters) -> Array:
-    return fisher(problem, parameters)
 
 
 def best_first_rate(

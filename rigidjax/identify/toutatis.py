@@ -9,6 +9,7 @@ doi:10.1088/0004-6256/146/4/95; from the radar imaging of R. S. Hudson and S. J.
 from datetime import datetime
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
@@ -83,27 +84,30 @@ def problem() -> Problem:
     return Problem(recording(), PrincipalRatios(), loss=SoftL1())
 
 
+@jax.jit
+def _periods(body: Any, state: Any) -> Array:
+    turning = exact.body_period(body, state.omega)
+    precessing = exact.precession_period(body, state.omega)
+    return jnp.log(jnp.stack([turning, precessing]) / DAY)
+
+
+@jax.jit
+def _direction(body: Any, state: Any) -> Array:
+    momentum = spatial_angular_momentum(body, state)
+    flat = jnp.hypot(momentum[0], momentum[1])
+    return jnp.stack([jnp.arctan2(momentum[1], momentum[0]), jnp.arctan2(momentum[2], flat)])
+
+
 def rows(fit: Fit) -> list[Row]:
     """Periods and the direction of the angular momentum as rows for `report.table`."""
-
-    def periods(body: Any, state: Any) -> Array:
-        turning = exact.body_period(body, state.omega)
-        precessing = exact.precession_period(body, state.omega)
-        return jnp.log(jnp.stack([turning, precessing]) / DAY)
-
-    def direction(body: Any, state: Any) -> Array:
-        momentum = spatial_angular_momentum(body, state)
-        flat = jnp.hypot(momentum[0], momentum[1])
-        return jnp.stack([jnp.arctan2(momentum[1], momentum[0]), jnp.arctan2(momentum[2], flat)])
-
     out: list[Row] = []
-    middle = np.exp(np.asarray(periods(fit.body, fit.state0)))
-    low, high = (np.exp(bound) for bound in fit.interval_of(periods))
+    middle = np.exp(np.asarray(_periods(fit.body, fit.state0)))
+    low, high = (np.exp(bound) for bound in fit.interval_of(_periods))
     names = ("rotation about the long axis", "precession of the long axis")
     for name, *numbers in zip(names, middle, low, high, strict=True):
         out.append((name, *numbers, "day"))
-    middle = np.degrees(np.asarray(direction(fit.body, fit.state0)))
-    low, high = (np.degrees(bound) for bound in fit.interval_of(direction))
+    middle = np.degrees(np.asarray(_direction(fit.body, fit.state0)))
+    low, high = (np.degrees(bound) for bound in fit.interval_of(_direction))
     names = ("angular momentum, longitude", "angular momentum, latitude")
     for name, *numbers in zip(names, middle, low, high, strict=True):
         turn = 360.0 if "longitude" in name and numbers[0] < 0 else 0.0

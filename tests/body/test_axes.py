@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import mpmath
 import numpy as np
 import pytest
+from once import once
 
 from rigidjax.body.axes import principal
 from rigidjax.body.spectral import matrix_function
@@ -66,7 +67,7 @@ def test_axes_in_order_are_not_turned_and_others_are_the_nearest():
     np.testing.assert_allclose(jnp.abs(q), 0.5, rtol=1e-15)
 
 
-@jax.jit
+@once
 def jacobians(a, scale):
     def f(x):
         return principal(x * scale)
@@ -110,10 +111,10 @@ def test_derivatives_of_distinct_moments_agree_with_fifty_digits():
             [float((p - 2 * c + m) / h**2) for p, c, m in zip(plus, here, minus, strict=True)]
         )
     zero = jnp.zeros(())
-    slopes = jax.jit(lambda t: (jax.jacfwd(ours)(t), jax.jacrev(ours)(t)))(zero)
+    slopes = once(lambda t: (jax.jacfwd(ours)(t), jax.jacrev(ours)(t)))(zero)
     for slope in slopes:
         np.testing.assert_allclose(slope, first, rtol=1e-12, atol=1e-12)
-    bend = jax.jit(jax.jacfwd(jax.jacfwd(ours)))(zero)
+    bend = once(jax.jacfwd(jax.jacfwd(ours)))(zero)
     np.testing.assert_allclose(bend, second, rtol=1e-10, atol=1e-10)
 
 
@@ -151,7 +152,7 @@ def exponential_and_derivatives(a, e):
         return [np.array(x.tolist(), dtype=float) for x in (here, first, second)]
 
 
-@jax.jit
+@once
 def along(x, direction, scale):
     def f(y):
         return matrix_function(lambda m: jnp.exp(m / scale), y)
@@ -200,7 +201,7 @@ def test_a_function_may_depend_on_what_is_differentiated():
     # d/dp A^p = A^p log A; and at p = 2, d/dt A² = A E + E A, d²/dt² = 2 E².
     power = jax.jit(lambda x: matrix_function(lambda m: m**2.0 * jnp.log(m), x))(a)
 
-    @jax.jit
+    @once
     def slopes(p, t):
         by_t = jax.jacfwd(f, 1)
         return jax.jacfwd(f)(p, t), by_t(p, t), jax.jacfwd(by_t, 1)(p, t)

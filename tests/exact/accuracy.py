@@ -12,9 +12,10 @@ import rigidjax.exact as exact
 from rigidjax.body.inertia import Inertia
 from rigidjax.motion import Attitude
 
-sys.path[:0] = [str(Path(__file__).parent)]
+sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[1])]
 import classes
 import twin
+from once import OPTIONS
 
 PLACES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 Q0 = np.array([0.5, -0.1, 0.7, 0.5]) / np.linalg.norm([0.5, -0.1, 0.7, 0.5])
@@ -33,8 +34,18 @@ def attitude_and_rate(x):
 
 
 value = jax.jit(jax.vmap(attitude_and_rate))
+second_along = jax.jit(
+    lambda x, v: _along(lambda y: _along(attitude_and_rate, y, v), x, v),
+    compiler_options=OPTIONS,
+)
 jacobian = jax.jit(jax.vmap(jax.jacfwd(attitude_and_rate)))
+# The same for a few rows.
+jacobian_once = jax.jit(jax.vmap(jax.jacfwd(attitude_and_rate)), compiler_options=OPTIONS)
 reverse_jacobian = jax.jit(jax.vmap(jax.jacrev(attitude_and_rate)))
+
+
+def _along(function, x, direction):
+    return jax.jvp(function, (x,), (direction,))[1]
 
 
 @jax.jit
@@ -95,6 +106,16 @@ def true_curvature(x, direction, cotangent, step="1e-24", inner="1e-26"):
         for s in (1, -1)
     )
     return cotangent @ ((up - down) / (2 * h)).astype(float)
+
+
+def true_second_along(x, direction, step="1e-24"):
+    """Second derivative of q and Ω at x + s direction by s, at s = 0."""
+    h, x = mp.mpf(step), _exact(x)
+    down, here, up = (
+        truth([a + s * h * mp.mpf(b) for a, b in zip(x, direction, strict=True)])
+        for s in (-1, 0, 1)
+    )
+    return np.array([(a - 2 * b + c) / h**2 for a, b, c in zip(down, here, up, strict=True)])
 
 
 def moved(j, row, eps):

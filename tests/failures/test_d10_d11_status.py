@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from once import filter_once
 from systems.tumble import BODY, OMEGA, TOP, Q
 
 import rigidjax as rj
@@ -83,7 +84,7 @@ def test_a_bad_body_in_a_batch_is_alone(solver):
 def test_gradients_of_the_others_are_finite_and_the_same(solver):
     rates = OMEGA * np.linspace(0.5, 1.0, 3)[:, None]
 
-    @eqx.filter_jit
+    @filter_once
     @jax.grad
     def slope(rates):
         def one(omega):

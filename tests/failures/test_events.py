@@ -7,12 +7,12 @@ at the end of a step: its time is late by up to a step and its gradient is the s
 """
 
 import diffrax as dfx
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 import pytest
+from once import filter_once
 
 import rigidjax as rj
 
@@ -63,7 +63,7 @@ def test_time_and_state_at_a_flip_and_their_gradients(solver, mode):
         "reverse": (dfx.RecursiveCheckpointAdjoint(), jax.jacrev),
     }[mode]
 
-    @eqx.filter_jit
+    @filter_once
     def both(omega):
         found = flip(omega, solver, adjoint)
         return found, jac(lambda w: flip(w, solver, adjoint))(omega)

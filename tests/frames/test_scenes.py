@@ -1,11 +1,11 @@
 """The Earth, Foucault's pendulum, hoop, turntable and libration, against closed forms."""
 
 import diffrax as dfx
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from once import filter_once
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 from scipy.special import ellipj
@@ -169,7 +169,7 @@ def test_single_precision_stays():
 
 def covered(model, truth, scale, noise, draws):
     """z-scores of a fit to `draws` records with noise: estimate less truth, in its own sigmas."""
-    value, jacobian = eqx.filter_jit(model)(truth), jax.jacfwd(model)
+    value, jacobian = filter_once(model)(truth), jax.jacfwd(model)
     records = value[None] + noise * jax.random.normal(jax.random.key(0), (draws, *value.shape))
 
     def fit(record):
@@ -184,7 +184,7 @@ def covered(model, truth, scale, noise, draws):
         return found / sigma, jnp.max(steps[-1] / sigma)
 
     start = jnp.array([3.0, -3.0])[: truth.shape[0]]
-    z, last = eqx.filter_jit(lambda r: jax.lax.map(fit, r))(records)
+    z, last = filter_once(lambda r: jax.lax.map(fit, r))(records)
     assert float(last.max()) < 0.05
     return np.asarray(z)
 

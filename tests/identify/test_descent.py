@@ -39,7 +39,7 @@ def test_few_recordings_show_the_whole_misfit_without_bias(problem):
     point = jax.tree.map(lambda leaf: leaf + 0.1, point)
     of = eqx.filter_jit(_misfit_of)
     parts = [of(point, problem, NOISE, jnp.array([row])) for row in range(24)]
-    whole = misfit(point, (problem, NOISE, jnp.ones_like(problem.records.t)))
+    whole = eqx.filter_jit(misfit)(point, (problem, NOISE, jnp.ones_like(problem.records.t)))
     np.testing.assert_allclose(np.mean(parts), whole, rtol=1e-12)
 
 

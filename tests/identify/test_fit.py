@@ -1,4 +1,8 @@
-"""Fits: exact data come back exactly, intervals cover, masks mask, mistakes are named."""
+"""Fits: exact data come back exactly, intervals cover, masks mask, mistakes are named.
+
+Most of a fit is compiling. Fits of `PrincipalRatios` to 80 readings of a gyro of known noise, here
+and in other files, are one set of programs.
+"""
 
 from pathlib import Path
 
@@ -55,7 +59,7 @@ def test_a_masked_reading_is_an_absent_one(tumble):
     for filler in (np.nan, 1e6):
         values = np.where(mask[:, None], noisy, filler)
         record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), values, mask))
-        problem = rj.identify.Problem(record, rj.identify.Ratios())
+        problem = rj.identify.Problem(record, rj.identify.PrincipalRatios())
         results.append(rj.identify.fit(problem, starts=1))
     for a, b in zip(
         jax.tree.leaves(results[0].parameters), jax.tree.leaves(results[1].parameters), strict=True
@@ -81,14 +85,13 @@ def test_estimated_noise_is_the_noise(tumble):
     np.testing.assert_allclose(found.noise[1], 0.05, rtol=0.2)
 
 
-def test_a_wrong_motion_is_not_called_success(tumble):
+# The noise known, and estimated (another program).
+@pytest.mark.parametrize("noise", [0.01, pytest.param(None, marks=pytest.mark.slow)])
+def test_a_wrong_motion_is_not_called_success(tumble, noise):
     _, ts, _ = tumble
-    rng = np.random.default_rng(3)
-    record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), rng.normal(size=(80, 3))))
-    found = rj.identify.fit(rj.identify.Problem(record, rj.identify.Ratios()), starts=2)
-    assert found.status.startswith("poor fit")
-    record = rj.identify.Recording(ts, (rj.identify.Gyro(), rng.normal(size=(80, 3))))
-    found = rj.identify.fit(rj.identify.Problem(record, rj.identify.Ratios()), starts=2)
+    readings = np.random.default_rng(3).normal(size=(80, 3))
+    record = rj.identify.Recording(ts, (rj.identify.Gyro(noise), readings))
+    found = rj.identify.fit(rj.identify.Problem(record, rj.identify.PrincipalRatios()), starts=2)
     assert found.status.startswith("poor fit")
 
 
@@ -124,12 +127,11 @@ def test_interrupting_keeps_what_was_found(tumble):
     assert len(found.starts) == 1
 
 
-def test_what_cannot_be_seen_is_said(tumble):
+def test_what_cannot_be_seen_is_said():
     # Spin about a principal axis: rates alone show nothing of the shape.
-    body = rj.Inertia.from_principal(*MOMENTS)
-    ts = jnp.linspace(0.0, 5.0, 30)
-    ys = rj.simulate(body, rj.Spin([0.0, 0.0, 1.0]), ts).ys
-    noisy = np.asarray(ys.omega) + 0.01 * np.random.default_rng(4).normal(size=(30, 3))
+    ts = jnp.linspace(0.0, 5.0, 80)
+    omega = np.broadcast_to([0.0, 0.0, 1.0], (80, 3))
+    noisy = omega + 0.01 * np.random.default_rng(4).normal(size=(80, 3))
     record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), noisy))
     found = rj.identify.fit(rj.identify.Problem(record, rj.identify.PrincipalRatios()), starts=3)
     words = " ".join(found.identifiability)

@@ -167,6 +167,15 @@ def free_record():
     return identify.Recording(ts, (identify.Gyro(0.01), read))
 
 
+@pytest.fixture(scope="module")
+def short_record():
+    """As many readings as in other files: one set of programs."""
+    ts = jnp.linspace(0.0, 20.0, 80)
+    omega = rj.simulate(BODY, rj.Spin([0.4, 1.2, -0.3]), ts).ys.omega
+    read = np.asarray(omega) + 0.01 * np.random.default_rng(9).normal(size=omega.shape)
+    return identify.Recording(ts, (identify.Gyro(0.01), read))
+
+
 @pytest.mark.slow
 def test_pieces_meet_and_give_the_start(free_record):
     problem = identify.Problem(free_record, identify.PrincipalRatios())
@@ -197,13 +206,13 @@ def test_profile_agrees_with_the_covariance_where_the_misfit_is_quadratic(free_r
 
 
 @pytest.mark.oldest
-def test_a_design_expects_what_a_fit_then_finds(free_record):
-    problem = identify.Problem(free_record, identify.PrincipalRatios())
+def test_a_design_expects_what_a_fit_then_finds(short_record):
+    problem = identify.Problem(short_record, identify.PrincipalRatios())
     found = identify.fit(problem, starts=1)
     plan = identify.plan_of(problem, BODY, [0.4, 1.2, -0.3])
     for before, after in zip(identify.expected(problem, plan), found.quantities, strict=True):
         np.testing.assert_allclose(before.deviation, after.deviation, rtol=0.05)
-    silent = identify.Recording(free_record.t, (identify.Gyro(), free_record.readings[0].values))
+    silent = identify.Recording(short_record.t, (identify.Gyro(), short_record.readings[0].values))
     with pytest.raises(ValueError, match="a Gyro with known noise"):
         identify.expected(identify.Problem(silent, identify.PrincipalRatios()), plan)
 
@@ -227,11 +236,11 @@ def test_many_starts_in_one_vmap_end_where_they_do_one_by_one(free_record):
     np.testing.assert_allclose(at_once.parameters.body, alone.parameters.body, atol=1e-6)
 
 
-def test_a_fit_killed_after_any_stride_ends_at_the_same_bits(free_record, tmp_path, monkeypatch):
+def test_a_fit_killed_after_any_stride_ends_at_the_same_bits(short_record, tmp_path, monkeypatch):
     """The damping of the strides to come depends on those that were, not on the process."""
     # Steps in strides of three, so that one start has many of them.
     monkeypatch.setattr(search, "STRIDE", 3)
-    problem = identify.Problem(free_record, identify.PrincipalRatios())
+    problem = identify.Problem(short_record, identify.PrincipalRatios())
     path, save = tmp_path / "fit.npz", checkpoint.Checkpoint.save
     places = []
 
@@ -262,14 +271,14 @@ def test_a_fit_killed_after_any_stride_ends_at_the_same_bits(free_record, tmp_pa
         np.testing.assert_array_equal(bits(fit()), whole, err_msg=f"killed after {last}")
         # Nothing is done twice.
         assert len(places) == count - last
-    other = identify.Problem(free_record, identify.PrincipalRatios(), loss=identify.Huber(0.5))
+    other = identify.Problem(short_record, identify.PrincipalRatios(), loss=identify.Huber(0.5))
     with pytest.raises(ValueError, match="the checkpoint of another problem"):
         identify.fit(other, starts=2, checkpoint=path)
 
 
 @pytest.mark.parametrize("kind", ["empty", "cut", "text", "table", "fewer"])
-def test_a_damaged_checkpoint_is_told_in_words(free_record, tmp_path, kind):
-    problem = identify.Problem(free_record, identify.PrincipalRatios())
+def test_a_damaged_checkpoint_is_told_in_words(short_record, tmp_path, kind):
+    problem = identify.Problem(short_record, identify.PrincipalRatios())
     path = tmp_path / "fit.npz"
     like = Tried(problem.start(), jnp.asarray(1.0), jnp.asarray(True))
     checkpoint.Checkpoint(path, like, 2.0).save([like], checkpoint.Position(1, 0, like))
@@ -293,8 +302,8 @@ def test_a_damaged_checkpoint_is_told_in_words(free_record, tmp_path, kind):
     assert path.read_bytes() == before
 
 
-def test_a_checkpoint_needs_its_folder_before_the_search_begins(free_record, tmp_path):
-    problem = identify.Problem(free_record, identify.PrincipalRatios())
+def test_a_checkpoint_needs_its_folder_before_the_search_begins(short_record, tmp_path):
+    problem = identify.Problem(short_record, identify.PrincipalRatios())
     with pytest.raises(ValueError, match=r"there is no folder .*absent"):
         identify.fit(problem, starts=1, checkpoint=tmp_path / "absent" / "fit.npz")
     with pytest.raises(ValueError, match="wanted a file, this is a folder"):
@@ -332,9 +341,21 @@ def test_a_killed_fit_resumes_to_the_same_point(tmp_path):
     np.testing.assert_array_equal(np.load(tmp_path / "killed.npy"), np.load(tmp_path / "whole.npy"))
 
 
-def test_the_command_line_reads_wheels_and_writes_reports(records, tmp_path, capsys):
+# The fit of another test, or one of its own (another program).
+@pytest.mark.parametrize("own", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_the_command_line_reads_wheels_and_writes_reports(
+    records, joint, tmp_path, capsys, monkeypatch, own
+):
+    asked = []
+
+    def fit(problem, **how):
+        asked.append((problem, how))
+        return joint
+
+    if not own:
+        monkeypatch.setattr(identify, "fit", fit)
     paths = []
-    for index, record in enumerate(records[::2]):
+    for index, record in enumerate(records[::2] if own else records):
         speed = 3.0 * np.tanh(np.asarray(record.t))
         rows = np.column_stack([record.t, record.readings[0].values, speed])
         paths.append(str(tmp_path / f"throw{index}.csv"))
@@ -346,14 +367,30 @@ def test_the_command_line_reads_wheels_and_writes_reports(records, tmp_path, cap
     out = capsys.readouterr().out
     assert "status: ok" in out and "I3" in out and "drag x" in out
     held = json.loads(numbers.read_text())
-    assert held["status"] == "ok" and held["files"] == ["throw0.csv", "throw1.csv"]
+    assert held["status"] == "ok" and held["files"] == [f"throw{i}.csv" for i in range(len(paths))]
     low, high = held["quantities"]["I3"]["interval_95"]
     assert 0.9 * low < 2.1 < 1.1 * high
     text = page.read_text()
     # Data and fit of each throw, what is left over, the body with its uncertainty.
-    assert text.count("data:image/png;base64,") == 4
+    assert text.count("data:image/png;base64,") == len(paths) + 2
     assert "http" not in text
     assert "throw1.csv" in text and "95 % interval" in text
+    if not own:
+        _asks_for(asked, joint.problem)
+
+
+def _asks_for(asked, wanted):
+    """What was written is read: readings, wheel speeds, the model, what is free."""
+    ((problem, how),) = asked
+    assert how["starts"] == 1 and how["checkpoint"] is None
+    assert isinstance(problem.body, identify.Tensor) and problem.body.typical == 1.5
+    assert {slot.name: slot.each for slot in problem.slots} == {"drag": False, "gyro bias": True}
+    for found, given in zip(problem.recordings, wanted.recordings, strict=True):
+        np.testing.assert_array_equal(found.t, given.t)
+        np.testing.assert_array_equal(found.readings[0].values, given.readings[0].values)
+        np.testing.assert_array_equal(found.torque.parts[1].coefficient, np.zeros(3))
+        momentum = found.torque.parts[0].momentum(jnp.asarray(1.0))
+        np.testing.assert_allclose(momentum, [0.0, 0.0, 0.6 * np.tanh(1.0)], rtol=1e-15)
 
 
 WRONG = [
@@ -407,9 +444,9 @@ def test_what_is_free_is_checked(records, free, words):
 
 
 @pytest.mark.usefixtures("unhooked")
-def test_other_mistakes_are_named(records, free_record):
+def test_other_mistakes_are_named(records, short_record):
     with pytest.raises(ValueError, match="the one at index 1 differs from the first"):
-        identify.Problem([records[0], free_record], identify.Tensor(1.5))
+        identify.Problem([records[0], short_record], identify.Tensor(1.5))
     with pytest.raises(ValueError, match="at least one Recording, got an empty sequence"):
         identify.Problem([], identify.Tensor(1.5))
     with pytest.raises(ValueError, match="has a torque of its own; put both in it"):

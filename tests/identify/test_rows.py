@@ -101,23 +101,25 @@ def test_i3_no_start_is_called_right_that_is_wrong():
     assert right >= 30
 
 
-def test_i4_outliers():
+# In every run: an outlier among real observations (tests/identify/test_toutatis.py).
+@pytest.mark.slow
+@pytest.mark.parametrize("loss", [identify.Huber(), identify.SoftL1()])
+def test_i4_outliers(loss):
     clean = noisy(rates(), 0.01, 1)
     spoiled = clean.copy()
     rng = np.random.default_rng(2)
     for row in rng.choice(80, 3, replace=False):
         spoiled[row] += 5.0 * rng.normal(size=3)
     errors = {}
-    for name, loss in (("huber", identify.Huber()), ("soft", identify.SoftL1())):
-        for kind, values in (("clean", clean), ("spoiled", spoiled)):
-            found = identify.fit(gyro_problem(values, loss=loss), starts=1)
-            assert found.ok
-            errors[name, kind] = off(found)
+    for kind, values in (("clean", clean), ("spoiled", spoiled)):
+        found = identify.fit(gyro_problem(values, loss=loss), starts=1)
+        assert found.ok
+        errors[kind] = off(found)
     plain = off(identify.fit(gyro_problem(spoiled), starts=1))
     reach = 0.01
-    for name in ("huber", "soft"):
-        assert errors[name, "spoiled"] <= 2 * max(errors[name, "clean"], reach)
-    assert plain > 5 * errors["huber", "spoiled"]
+    assert errors["spoiled"] <= 2 * max(errors["clean"], reach)
+    if isinstance(loss, identify.Huber):
+        assert plain > 5 * errors["spoiled"]
 
 
 @pytest.mark.slow

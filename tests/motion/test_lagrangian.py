@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from once import once
 from systems.marching import rk4
 
 import rigidjax as rj
@@ -69,12 +70,14 @@ def test_lie_poisson_agrees_with_newton_euler_in_the_field(law):
     np.testing.assert_allclose(found, wanted, rtol=1e-12, atol=1e-12)
 
 
-@LAWS
+@pytest.mark.parametrize(
+    "law", [pytest.param(None, marks=pytest.mark.slow), TOP], ids=["free", "heavy"]
+)
 def test_all_three_agree_along_a_trajectory(law):
     start = lagrangian.Coordinates([0.3, 1.2, -0.4], [0.5, -0.2, 1.1])
     state = lagrangian.to_attitude(start)
 
-    @jax.jit
+    @once
     def run(start, state):
         top = lagrangian.EulerAngleTop(INERTIA, law)
         angles = rk4(lagrangian.equations_of_motion(top), start, 0.5, 1000)
@@ -106,7 +109,9 @@ class Pendulums:
         return 0.5 * jnp.sum(x**2 + y**2) + 9.81 * jnp.sum(jnp.cumsum(jnp.cos(q)))
 
 
-@pytest.mark.parametrize("n", [1, 2, 3, 5])
+@pytest.mark.parametrize(
+    "n", [1, pytest.param(2, marks=pytest.mark.slow), 3, pytest.param(5, marks=pytest.mark.slow)]
+)
 def test_a_chain_of_pendulums_by_hand(n):
     # Σ_j c_ij (cos(q_i−q_j) q̈_j + sin(q_i−q_j) q̇_j²) = −g (n−i) sin q_i, c_ij = n − max(i, j).
     rng = np.random.default_rng(n)

@@ -5,6 +5,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from once import once
 from systems.marching import rk4
 
 import rigidjax as rj
@@ -58,13 +59,13 @@ def test_a_pulse_is_not_stepped_over():
 def test_the_slope_by_the_times_of_the_jumps():
     """Of the switch time itself, which plain AD without the jumps says is zero."""
     edges = jnp.asarray(EDGES)
-    wanted = jax.jit(jax.jacfwd(exact))(edges)
+    wanted = once(jax.jacfwd(exact))(edges)
     tolerance = jnp.array(1e-9)
-    forward = jax.jacfwd(lambda e: solve(e, tolerance, dfx.ForwardMode()))(edges)
+    forward = once(jax.jacfwd(lambda e: solve(e, tolerance, dfx.ForwardMode())))(edges)
     np.testing.assert_allclose(forward, wanted, atol=1e-6)
     weights = jnp.array([0.3, -1.0, 0.7])
-    back = jax.grad(
-        lambda e: jnp.sum(weights * solve(e, tolerance, dfx.RecursiveCheckpointAdjoint()))
+    back = once(
+        jax.grad(lambda e: jnp.sum(weights * solve(e, tolerance, dfx.RecursiveCheckpointAdjoint())))
     )(edges)
     np.testing.assert_allclose(back, weights @ wanted, atol=1e-6)
     differences = [

@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.flatten_util import ravel_pytree
 from jax.test_util import check_grads
 
 import rigidjax as rj
@@ -211,13 +212,17 @@ def test_derivatives_of_first_and_second_order(law, state):
     """With respect to the state, and to every number of the laws and of the body."""
     body = BODY if isinstance(state, rj.Rigid) else INERTIA
 
+    # One vector: check_grads works number by number of it, not program by program of each leaf.
+    numbers, restore = ravel_pytree((law, state, body))
+
     @jax.jit
-    def value(law, state, body):
+    def value(numbers):
+        law, state, body = restore(numbers)
         force, torque = torques.act(law, 0.5, state, body)
         return torque if force is None else jnp.concatenate([force, torque])
 
-    check_grads(value, (law, state, body), order=2, modes=["fwd"], rtol=1e-5, atol=1e-6)
-    check_grads(value, (law, state, body), order=1, modes=["rev"], rtol=1e-5, atol=1e-6)
+    check_grads(value, (numbers,), order=2, modes=["fwd"], rtol=1e-5, atol=1e-6)
+    check_grads(value, (numbers,), order=1, modes=["rev"], rtol=1e-5, atol=1e-6)
 
 
 @pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from once import once
 from scipy.linalg import solve_sylvester
 from scipy.spatial.transform import Rotation
 
@@ -52,7 +53,7 @@ def test_second_derivative_of_projection():
     r = Rotation.random(random_state=rng).as_matrix()
     e, g = rng.normal(size=(2, 3, 3))
     first = jax.jit(lambda a: jax.jvp(so3.project, (a,), (e,))[1])
-    _, second = jax.jvp(first, (r,), (g,))
+    second = once(lambda r, g: jax.jvp(first, (r,), (g,))[1])(r, g)
     h = 1e-5
     np.testing.assert_allclose(second, (first(r + h * g) - first(r - h * g)) / (2 * h), atol=1e-8)
 
@@ -86,9 +87,9 @@ def test_wahba_derivative():
     def turned(v):
         return so3.log(so3.product(f(world @ so3.exp(v).T), m.T))
 
-    np.testing.assert_allclose(jax.jacrev(turned)(jnp.zeros(3)), np.eye(3), atol=1e-13)
+    np.testing.assert_allclose(once(jax.jacrev(turned))(jnp.zeros(3)), np.eye(3), atol=1e-13)
     h = 1e-6
-    _, slope = jax.jvp(f, (jnp.asarray(world),), (jnp.asarray(d),))
+    slope = once(lambda w, d: jax.jvp(f, (w,), (d,))[1])(world, d)
     np.testing.assert_allclose(slope, (f(world + h * d) - f(world - h * d)) / (2 * h), atol=1e-8)
 
 

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from once import once
 
 import rigidjax as rj
 from rigidjax.solve import adaptive_loop, adjoint, lanes, lean
@@ -65,9 +66,9 @@ WEIGHTS = jnp.asarray(np.random.default_rng(1).normal(size=(5, 7)))
 @pytest.mark.parametrize("name", ["pulses", pytest.param("wheel", marks=pytest.mark.slow)])
 def test_reverse_is_forward_to_round_off_and_close_to_differences(name):
     p = jnp.zeros(16)
-    value = jax.jit(lambda p: run(name, TIMES, p, WEIGHTS))
+    value = once(lambda p: run(name, TIMES, p, WEIGHTS))
 
-    @jax.jit
+    @once
     def both(p, direction):
         # One tangent, in random directions: as telling as all of them, and quick to compile.
         ahead = jax.jvp(lambda p: run(name, TIMES, p, WEIGHTS), (p,), (direction,))[1]
@@ -100,7 +101,7 @@ def test_every_order_of_transformations(name, ts):
         # By the torque, the body and the start.
         return run(name, ts, base.at[jnp.array([1, 5, 14])].add(small), WEIGHTS)
 
-    value, slope = jax.jit(one), jax.jit(jax.grad(one))
+    value, slope = once(one), once(jax.grad(one))
     wanted = np.stack([slope(row) for row in p])
     bend = np.zeros((3, 3))
     for i in range(3):
@@ -108,12 +109,12 @@ def test_every_order_of_transformations(name, ts):
         rise = (value(p[0] + h) - value(p[0] - h)) / 2e-4
         np.testing.assert_allclose(wanted[0][i], rise, atol=1e-6)
         bend[i] = (slope(p[0] + h) - slope(p[0] - h)) / 2e-4
-    many = jax.jit(jax.vmap(jax.grad(one)))(p)
-    ahead = jax.jit(jax.vmap(jax.jacfwd(one)))(p)
+    many = once(jax.vmap(jax.grad(one)))(p)
+    ahead = once(jax.vmap(jax.jacfwd(one)))(p)
     scale = np.abs(wanted).max()
     for found in (many, ahead):
         np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-10 * scale)
-    second = jax.jit(jax.hessian(one))(p[0])
+    second = once(jax.hessian(one))(p[0])
     np.testing.assert_allclose(second, second.T, atol=1e-9 * np.abs(bend).max())
     np.testing.assert_allclose(second, bend, atol=1e-5 * np.abs(bend).max())
     if name == "pulses":
@@ -178,9 +179,9 @@ def test_many_segments_are_one(monkeypatch, name, second):
         found = jax.grad(value)(p), jax.jvp(value, (p,), (turn,))[1]
         return (*found, jax.jacfwd(jax.grad(value))(p)) if second else found
 
-    whole = jax.jit(slopes)(jnp.zeros(16))
+    whole = once(slopes)(jnp.zeros(16))
     monkeypatch.setattr(adaptive_loop, "SEGMENT", 7)
-    segments = jax.jit(lambda p: slopes(p))(jnp.zeros(16))
+    segments = once(lambda p: slopes(p))(jnp.zeros(16))
     for a, b in zip(segments, whole, strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-10 * np.abs(b).max())
 
@@ -267,11 +268,11 @@ def test_through_simulate_each_rung_and_what_is_refused():
         return out.ys.omega[-1, 2]
 
     # ω = ω0 exp(−c t / I)
-    by_c, by_inertia = jax.jit(jax.grad(rate, (0, 1)))(jnp.asarray(0.3), jnp.asarray(2.0))
+    by_c, by_inertia = once(jax.grad(rate, (0, 1)))(jnp.asarray(0.3), jnp.asarray(2.0))
     end = 1.5 * np.exp(-0.15)
     np.testing.assert_allclose(by_c, -end / 2, rtol=1e-10)
     np.testing.assert_allclose(by_inertia, end * 0.3 / 4, rtol=1e-10)
-    ahead = jax.jit(jax.jacfwd(rate, (0, 1)))(jnp.asarray(0.3), jnp.asarray(2.0))
+    ahead = once(jax.jacfwd(rate, (0, 1)))(jnp.asarray(0.3), jnp.asarray(2.0))
     np.testing.assert_allclose(ahead, [by_c, by_inertia], rtol=1e-12)
     start, ours = rj.Spin([0.0, 0.0, 1.5]), rj.solvers.DormandPrince8()
     late = rj.simulate(body, start, ts, damping, solver=ours, max_steps=2, throw=False)

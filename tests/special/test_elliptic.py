@@ -6,6 +6,7 @@ import mpmath as mp
 import numpy as np
 import pytest
 from jax import test_util
+from once import once
 
 from rigidjax.special import elliptic
 
@@ -96,16 +97,16 @@ def test_carlson_first_and_second_derivatives_are_moments(function, factor, powe
     def whole(a):
         return function(*a)
 
-    gradient, hessian = jax.jit(lambda a: (jax.grad(whole)(a), jax.jacfwd(jax.jacrev(whole))(a)))(
+    gradient, hessian = once(lambda a: (jax.grad(whole)(a), jax.jacfwd(jax.jacrev(whole))(a)))(
         arguments
     )
     for i in range(n):
-        once = tuple(b + (k == i) for k, b in enumerate(powers))
-        first = -powers[i] * factor * moment(once, arguments)
+        first_powers = tuple(b + (k == i) for k, b in enumerate(powers))
+        first = -powers[i] * factor * moment(first_powers, arguments)
         assert gradient[i] == pytest.approx(float(first), rel=5e-14)
         for j in range(i, n):
-            twice = tuple(b + (k == j) for k, b in enumerate(once))
-            second = powers[i] * once[j] * factor * moment(twice, arguments)
+            twice = tuple(b + (k == j) for k, b in enumerate(first_powers))
+            second = powers[i] * first_powers[j] * factor * moment(twice, arguments)
             assert hessian[i, j] == pytest.approx(float(second), rel=1e-13)
             assert hessian[j, i] == pytest.approx(float(second), rel=1e-13)
 
@@ -219,10 +220,8 @@ def test_legendre_first_and_second_derivatives(name):
         return ours(*a)
 
     at = jnp.asarray(point)
-    gradient, hessian = jax.jit(lambda a: (jax.grad(whole)(a), jax.jacfwd(jax.jacrev(whole))(a)))(
-        at
-    )
-    backwards = jax.jit(jax.hessian(whole))(at) if size == 1 else hessian
+    gradient, hessian = once(lambda a: (jax.grad(whole)(a), jax.jacfwd(jax.jacrev(whole))(a)))(at)
+    backwards = once(jax.hessian(whole))(at) if size == 1 else hessian
     with mp.workdps(50):
         for i in range(size):
             for j in range(size):

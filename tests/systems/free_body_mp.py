@@ -14,32 +14,42 @@ def attitude_and_rate(inertia, q0, omega0, t, *, digits=50, order=32, longest=0.
         tensor = mp.matrix(inertia)
         inverse = tensor**-1
         length = mp.sqrt(sum(mp.mpf(c) ** 2 for c in q0))
-        q = [mp.mpf(c) / length for c in q0]
-        momentum = list(tensor * mp.matrix(omega0))
+        # Whole numbers of 2⁻ᵇ, 64 bits beyond the digits: a tenth of the time that mpf takes.
+        bits = mp.mp.prec + 64
+
+        def whole(numbers):
+            return [int(mp.nint(mp.ldexp(mp.mpf(c), bits))) for c in numbers]
+
+        def real(numbers):
+            return [mp.ldexp(mp.mpf(c), -bits) for c in numbers]
+
+        q = whole([mp.mpf(c) / length for c in q0])
+        momentum = whole(tensor * mp.matrix(omega0))
+        rows = [whole(inverse[i, :]) for i in range(3)]
         steps = max(1, int(mp.ceil(mp.mpf(t) / longest)))
-        h = mp.mpf(t) / steps
+        (h,) = whole([mp.mpf(t) / steps])
         for _ in range(steps):
-            q, momentum = _step(q, momentum, inverse, h, order)
-        return q, list(inverse * mp.matrix(momentum))
+            q, momentum = _step(q, momentum, rows, h, order, bits)
+        return real(q), list(inverse * mp.matrix(real(momentum)))
 
 
-def _step(q, momentum, inverse, h, order):
+def _step(q, momentum, inverse, h, order, bits):
     qs, ps, ws = [q], [momentum], []
     for k in range(order):
-        ws.append(list(inverse * mp.matrix(ps[k])))
-        turn, flow = [mp.mpf(0)] * 3, [mp.mpf(0)] * 4
+        ws.append([sum(a * b for a, b in zip(row, ps[k], strict=True)) >> bits for row in inverse])
+        turn, flow = [0] * 3, [0] * 4
         for j in range(k + 1):
             turn = [a + b for a, b in zip(turn, _cross(ps[j], ws[k - j]), strict=True)]
             flow = [a + b for a, b in zip(flow, _times(qs[j], ws[k - j]), strict=True)]
-        ps.append([c / (k + 1) for c in turn])
-        qs.append([c / (2 * (k + 1)) for c in flow])
-    return [_horner(qs, i, h) for i in range(4)], [_horner(ps, i, h) for i in range(3)]
+        ps.append([(c >> bits) // (k + 1) for c in turn])
+        qs.append([(c >> bits) // (2 * (k + 1)) for c in flow])
+    return [_horner(qs, i, h, bits) for i in range(4)], [_horner(ps, i, h, bits) for i in range(3)]
 
 
-def _horner(series, i, h):
-    total = mp.mpf(0)
+def _horner(series, i, h, bits):
+    total = 0
     for term in reversed(series):
-        total = total * h + term[i]
+        total = (total * h >> bits) + term[i]
     return total
 
 
