@@ -38,31 +38,31 @@ class Lane(NamedTuple):
     state: Callable[[Atoms], Any]
 
 
-def lane_of(body: Any, state0: Any, torque: Any, t0: Array, method: Any) -> Lane:
-    """The body's lane under `method`, or under the cheapest that is right.
+def lane_of(body: Any, state0: Any, torque: Any, t0: Array, solver: Any) -> Lane:
+    """The body's lane under `solver`, or under the cheapest that is right.
 
-    **Raises:** `TypeError` for a method that there is no lean step of.
+    **Raises:** `TypeError` for a solver that there is no lean step of.
     """
     state0 = start_of(state0)
     if isinstance(state0, Rigid):
-        return _rigid(RungeKutta4() if method is None else method, body, state0, torque, t0)
+        return _rigid(RungeKutta4() if solver is None else solver, body, state0, torque, t0)
     wide = Attitude([1.0, 0.0, 0.0, 0.0], state0.omega) if isinstance(state0, Spin) else state0
-    if method is None:
+    if solver is None:
         blind = torque is None or not sees_attitude(torque, t0, wide, body)
-        method = Magnus4() if blind and isinstance(state0, Attitude) else RungeKutta4()
-    if isinstance(method, Magnus4) and isinstance(state0, Attitude):
+        solver = Magnus4() if blind and isinstance(state0, Attitude) else RungeKutta4()
+    if isinstance(solver, Magnus4) and isinstance(state0, Attitude):
         require_blind(torque, t0, state0, body)
         if torque is None:
             return _free(body, state0)
         return _magnus(body, state0, torque, t0)
-    if not isinstance(method, AbstractExplicit):
+    if not isinstance(solver, AbstractExplicit):
         raise TypeError(
-            f"rollout: no lean step of {type(method).__name__} on {type(state0).__name__}; wanted "
+            f"rollout: no lean step of {type(solver).__name__} on {type(state0).__name__}; wanted "
             "RungeKutta4, Tsitouras5 or DormandPrince8 of rigidjax.solvers, or, for an Attitude, "
             "Magnus4 of rigidjax.solvers; for others use simulate with stepsize_controller="
             "diffrax.ConstantStepSize() under jax.vmap"
         )
-    return _explicit(method, body, state0, torque, t0)
+    return _explicit(solver, body, state0, torque, t0)
 
 
 def _free(body: Inertia, state0: Attitude) -> Lane:
@@ -152,7 +152,7 @@ def _magnus(body: Inertia, state0: Attitude, torque: Any, t0: Array) -> Lane:
     return Lane((*start[:4], *times(_entries(body.tensor), start[4:])), step, state)
 
 
-def _explicit(method: AbstractExplicit, body: Inertia, state0: Any, torque: Any, t0: Array) -> Lane:
+def _explicit(solver: AbstractExplicit, body: Inertia, state0: Any, torque: Any, t0: Array) -> Lane:
     weights = _entries(inverse(body.tensor))
     law = None if torque is None else _law(torque, body, state0, t0)
     project = scalarise(on_the_group, state0)
@@ -169,7 +169,7 @@ def _explicit(method: AbstractExplicit, body: Inertia, state0: Any, torque: Any,
         return (*half_product(q, omega), *slope) if many else slope
 
     def step(t: Any, end: Any, h: Any, y: Atoms) -> Atoms:
-        return project(*advance(method.tableau, field, t, h, y, end)[0])
+        return project(*advance(solver.tableau, field, t, h, y, end)[0])
 
     def state(y: Atoms) -> Any:
         return join((*y[:many], *times(weights, y[many:])), state0)
@@ -178,10 +178,10 @@ def _explicit(method: AbstractExplicit, body: Inertia, state0: Any, torque: Any,
     return Lane((*start[:many], *momentum), step, state)
 
 
-def _rigid(method: Any, body: Any, state0: Rigid, torque: Any, t0: Array) -> Lane:
-    if not isinstance(method, AbstractExplicit):
+def _rigid(solver: Any, body: Any, state0: Rigid, torque: Any, t0: Array) -> Lane:
+    if not isinstance(solver, AbstractExplicit):
         raise TypeError(
-            f"rollout: no lean step of {type(method).__name__} on Rigid; wanted RungeKutta4, "
+            f"rollout: no lean step of {type(solver).__name__} on Rigid; wanted RungeKutta4, "
             "Tsitouras5 or DormandPrince8 of rigidjax.solvers"
         )
     field = equations_of_motion(body, state0, torque)
@@ -189,7 +189,7 @@ def _rigid(method: Any, body: Any, state0: Rigid, torque: Any, t0: Array) -> Lan
     project = scalarise(on_the_group, state0)
 
     def step(t: Any, end: Any, h: Any, y: Atoms) -> Atoms:
-        raw, _, _ = advance(method.tableau, lambda t, y: numbers(t, *y), t, h, y, end)
+        raw, _, _ = advance(solver.tableau, lambda t, y: numbers(t, *y), t, h, y, end)
         return project(*raw)
 
     return Lane(split(state0), step, lambda y: join(y, state0))

@@ -24,7 +24,7 @@ State = TypeVar("State", Spin, Attitude, Rigid)
 Reduced = TypeVar("Reduced")
 # What `reduce` carries, the time, the state of one body → what it carries on.
 Reduce = Callable[[Any, Array, Any], Any]
-Method = AbstractExplicit | Magnus4 | None
+Solver = AbstractExplicit | Magnus4 | None
 # Bytes that reverse mode may keep of all chunks together.
 _KEPT = 2**23
 
@@ -37,7 +37,7 @@ def rollout(
     num_steps: int,
     torque: Any = None,
     *,
-    method: Method = None,
+    solver: Solver = None,
     save_every: int | None = None,
     reduce: None = None,
     initial: None = None,
@@ -58,7 +58,7 @@ def rollout(
     *,
     reduce: Reduce,
     initial: Reduced,
-    method: Method = None,
+    solver: Solver = None,
     save_every: int | None = None,
     t0: ScalarLike = 0.0,
     torque_axes: Any = None,
@@ -74,7 +74,7 @@ def rollout(
     num_steps: int,
     torque: Any = None,
     *,
-    method: Method = None,
+    solver: Solver = None,
     save_every: int | None = None,
     reduce: Reduce | None = None,
     initial: Any = None,
@@ -94,7 +94,7 @@ def rollout(
     - `torque`: `None`, or any law that `rigidjax.simulate` takes. Its arrays are shared by all
       bodies unless `torque_axes` is 0 (each array has a leading axis N: make one law a body with
       `jax.vmap`) or a tree of 0 and `None`, one for each array.
-    - `method`: `None` takes `Magnus4` for a free attitude, or a torque that does not look at the
+    - `solver`: `None` takes `Magnus4` for a free attitude, or a torque that does not look at the
       attitude, and `rigidjax.solvers.RungeKutta4` for all else. Any of `rigidjax.solvers` that is
       explicit may be given; the steps are those that `diffrax` takes with it, to round-off.
     - `save_every`: `None` returns the last states only; k those after k, 2k, … steps.
@@ -118,7 +118,7 @@ def rollout(
 
     Inside `jax.jit` of your own see `rigidjax.batch.compiler_options`.
 
-    **Raises:** `TypeError` where bodies, states, torque and method do not fit; `ValueError` for
+    **Raises:** `TypeError` where bodies, states, torque and solver do not fit; `ValueError` for
     shapes that do not agree, a step that is not positive, a `save_every` that does not divide
     `num_steps`, and, where numbers are known, no positive moments or no unit quaternion.
 
@@ -144,7 +144,7 @@ def rollout(
     start = jax.tree.map(jnp.asarray, initial)
     numbers = (batch.shared, batch.each, start, h, time_of(t0, batch.dtype))
     plan = _Plan(
-        method,
+        solver,
         count,
         every,
         save_every is not None and reduce is None,
@@ -157,7 +157,7 @@ def rollout(
 class _Plan(eqx.Module):
     """What is compiled."""
 
-    method: Any
+    solver: Any
     count: int = eqx.field(static=True)
     every: int = eqx.field(static=True)
     keep: bool = eqx.field(static=True)
@@ -171,7 +171,7 @@ def _run(plan: _Plan, reduce: Reduce | None, rest: Any, numbers: Any) -> Any:
     def one(given: Any, each: Any) -> Any:
         shared, initial, h, t0 = given
         body, state0, torque = Bodies.one(shared, each, rest)
-        lane = lane_of(body, state0, torque, t0, plan.method)
+        lane = lane_of(body, state0, torque, t0, plan.solver)
 
         def piece(carry: Any, first: Array) -> Any:
             y, carried = carry

@@ -314,7 +314,7 @@ def throughput(count, cpp):
     )
     rows += [
         ("rj.batch.rollout, free (Magnus4)", timed(run()), 1),
-        ("rj.batch.rollout, free (RungeKutta4)", timed(run(method=kutta)), 1),
+        ("rj.batch.rollout, free (RungeKutta4)", timed(run(solver=kutta)), 1),
         ("rj.batch.rollout, gyrostat with damping", timed(run(GYROSTAT)), 1),
         ("rj.batch.rollout, heavy top", timed(run(TOP)), 1),
     ]
@@ -342,7 +342,7 @@ def accuracy():
     truth = jax.jit(jax.vmap(lambda b, s: rj.exact.free_body(b, s, H * STEPS)))(*wide)
     print(f"\nError of the attitude at T = {H * STEPS:g}, rad (median, largest)")
     for name, method in (("Magnus4", None), ("RungeKutta4", rj.solvers.RungeKutta4())):
-        end = rj.batch.rollout(bodies, states, H, STEPS, method=method)
+        end = rj.batch.rollout(bodies, states, H, STEPS, solver=method)
         q = end.q.astype(jnp.float64)
         off = 2 * jnp.linalg.norm(q - truth.q, axis=1)
         print(f"  {name:44s} {jnp.median(off):10.1e} {off.max():10.1e}")

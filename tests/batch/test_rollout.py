@@ -59,7 +59,7 @@ def test_steps_are_diffraxs(torque, method):
         ).ys  # fmt: skip
 
     theirs = jax.tree.map(lambda a: a[:, 0], jax.jit(jax.vmap(one))(bodies, states))
-    ours = rj.batch.rollout(bodies, states, 0.1, 12, torque, method=method)
+    ours = rj.batch.rollout(bodies, states, 0.1, 12, torque, solver=method)
     assert far(ours, theirs) < 2e-15  # measured 7e-16
 
 
@@ -80,7 +80,7 @@ def test_error_of_the_free_body_is_below_kuttas():
 
 def test_magnus_order_under_a_torque_and_length():
     bodies, states = batch(4)
-    fine = rj.batch.rollout(bodies, states, 0.005, 400, GYROSTAT, method=KUTTA)
+    fine = rj.batch.rollout(bodies, states, 0.005, 400, GYROSTAT, solver=KUTTA)
     coarse = [far(rj.batch.rollout(bodies, states, 2.0 / n, n, GYROSTAT), fine) for n in (20, 40)]
     assert np.log2(coarse[0] / coarse[1]) == pytest.approx(4, abs=0.2)
     end = rj.batch.rollout(bodies, states, 0.5, 40, GYROSTAT)
@@ -100,7 +100,7 @@ def test_derivatives_are_those_of_the_steps():
     def ours(tensor, omega, com, h):
         law = eqx.tree_at(lambda law: law.com, TOP, com)
         start = rj.Attitude(states.q, omega)
-        return weighed(rj.batch.rollout(rj.Inertia(tensor), start, h, 6, law, method=KUTTA))
+        return weighed(rj.batch.rollout(rj.Inertia(tensor), start, h, 6, law, solver=KUTTA))
 
     def plain(tensor, omega, com, h):
         law = eqx.tree_at(lambda law: law.com, TOP, com)
@@ -204,8 +204,8 @@ def test_own_laws_and_shared_bodies():
 
 def test_other_rungs():
     bodies, states = batch(2)
-    spin = rj.batch.rollout(bodies, rj.Spin(states.omega), 0.05, 20, method=KUTTA)
-    turned = rj.batch.rollout(bodies, states, 0.05, 20, method=KUTTA)
+    spin = rj.batch.rollout(bodies, rj.Spin(states.omega), 0.05, 20, solver=KUTTA)
+    turned = rj.batch.rollout(bodies, states, 0.05, 20, solver=KUTTA)
     assert jnp.abs(spin.omega - turned.omega).max() < 1e-15
     matter = rj.MassProperties(
         jnp.ones(2), jnp.zeros((2, 3)), jax.vmap(lambda b: b.second_moment)(bodies)
@@ -265,9 +265,9 @@ def test_words(unhooked):
     with pytest.raises(ValueError, match="of body 2"):
         run(bodies, rj.Attitude(states.q.at[2].mul(2.0), states.omega), 0.1, 4)
     with pytest.raises(TypeError, match="depends on the attitude"):
-        run(bodies, states, 0.1, 4, TOP, method=rj.solvers.Magnus4())
+        run(bodies, states, 0.1, 4, TOP, solver=rj.solvers.Magnus4())
     with pytest.raises(TypeError, match="no lean step of Dopri8"):
-        run(bodies, states, 0.1, 4, TOP, method=dfx.Dopri8())
+        run(bodies, states, 0.1, 4, TOP, solver=dfx.Dopri8())
     with pytest.raises(TypeError, match="HasAttitude"):
         run(bodies, rj.Spin(states.omega), 0.1, 4, TOP)
     with pytest.raises(ValueError, match="3 rows in torque"):

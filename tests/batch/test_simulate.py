@@ -121,7 +121,7 @@ def test_gradients_are_those_of_single_bodies(mode):
 def test_other_solvers():
     bodies, states = batch(3)
     ours = rj.batch.simulate(bodies, states, TS, TOP)
-    other = rj.batch.simulate(bodies, states, TS, TOP, method=dfx.Tsit5())
+    other = rj.batch.simulate(bodies, states, TS, TOP, solver=dfx.Tsit5())
     assert jnp.abs(ours.ys.q - other.ys.q).max() < 1e-6
 
 
@@ -130,7 +130,7 @@ def test_words(unhooked):
     with pytest.raises(ValueError, match="increasing times"):
         rj.batch.simulate(bodies, states, [0.0, 2.0, 1.0])
     with pytest.raises(ValueError, match="Magnus4 takes equal steps"):
-        rj.batch.simulate(bodies, states, TS, method=rj.solvers.Magnus4())
+        rj.batch.simulate(bodies, states, TS, solver=rj.solvers.Magnus4())
     with pytest.raises(TypeError, match="wanted Spin, Attitude or Rigid"):
         rj.batch.simulate(bodies, states.omega, TS)
     with pytest.raises(TypeError, match="wanted Inertia"):
