@@ -295,6 +295,41 @@ def test_a_collision_is_named():
         rj.simulate(None, Point([0.05, 0, 0], [0.0, 0, 0]), ts, wide)
 
 
+def test_particles_side_by_side_collide_alone():
+    wide, ts = scenes.cr3bp(1e-14, radii=[0.1, 0.0]), jnp.array([0.0, 0.1, 0.6])
+    # Falls, starts inside, and a circle of radius 1/2 about the heavy body: v = √2 less the turning.
+    speeds = jnp.array([[0.0, -0.5, 0.0], [0.0, 0.0, 0.0], [0.0, np.sqrt(2.0) - 0.5, 0.0]])
+    places = jnp.array([[0.5, 0.0, 0.0], [0.05, 0.0, 0.0], [0.5, 0.0, 0.0]])
+
+    @eqx.filter_jit
+    def end(x, v, radius):
+        scene = eqx.tree_at(lambda s: s.radii, wide, jnp.stack([radius, jnp.zeros(())]))
+        out = rj.simulate(None, Point(x, v), ts, scene, throw=False)
+        return out.ys.x, out.stats["collided"], out.stats["end_time"]
+
+    radius = jnp.array(0.1)
+    x, hit, when = jax.vmap(end, (0, 0, None))(places, speeds, radius)
+    np.testing.assert_array_equal(hit, [True, True, False])
+    assert when[1] == 0 and np.pi / 16 < when[0] < np.pi / 8
+    reached = np.isfinite(np.asarray(x)).all(-1)
+    np.testing.assert_array_equal(reached, [[1, 1, 0], [1, 0, 0], [1, 1, 1]])
+    angle = (np.sqrt(8.0) - 1.0) * np.asarray(ts)
+    circle = 0.5 * np.stack([np.cos(angle), np.sin(angle), 0 * angle], 1)
+    np.testing.assert_allclose(x[2], circle, atol=1e-8)
+
+    # Where it is neither stopped nor changed by it, the radius has no derivative; the start has.
+    def last(v, radius):
+        return end(places[2], v, radius)[0][-1]
+
+    by_speed, by_radius = jax.jit(jax.jacrev(last, (0, 1)))(speeds[2], radius)
+    np.testing.assert_array_equal(by_radius, np.zeros(3))
+    forward = jax.jit(jax.jacfwd(last))(speeds[2], radius)
+    np.testing.assert_allclose(by_speed, forward, rtol=1e-10, atol=1e-12)
+    h = 1e-5 * np.eye(3)
+    far = jax.jit(jax.vmap(lambda h: last(speeds[2] + h, radius) - last(speeds[2] - h, radius)))
+    np.testing.assert_allclose(by_speed, np.asarray(far(jnp.asarray(h))).T / 2e-5, atol=1e-7)
+
+
 @pytest.mark.parametrize(
     ("call", "words"),
     [
