@@ -19,11 +19,11 @@ or p − q. Start from the Taylor series at `u/2^N` and apply the duplication fo
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
 from rigidjax._types import Scalar
-from rigidjax.exact.fence import repeat
 
 
 class Elliptic(NamedTuple):
@@ -144,7 +144,7 @@ def elliptic(u: Scalar, m: Modulus, mu: Scalar, turn: Scalar) -> Elliptic:
     n = limits(u.dtype).doublings
     f = series(u * 2.0**-n, m, mu, turn)
     # A loop, not nine copies: compiles eight times sooner.
-    return repeat(n, lambda g: duplicate(g, m, mu, turn), f)
+    return jax.lax.fori_loop(0, n, lambda _, g: duplicate(g, m, mu, turn), f)
 
 
 def _horner(terms):

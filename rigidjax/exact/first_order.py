@@ -18,7 +18,7 @@ import jax.numpy as jnp
 
 from rigidjax._types import Scalar
 from rigidjax.exact.doubling import Elliptic, Modulus, duplicate, growth, limits, series, until_rest
-from rigidjax.exact.fence import fence, opaque_one, repeat
+from rigidjax.exact.fence import fence, opaque_one
 from rigidjax.exact.half_period import half_period
 from rigidjax.exact.tensor_flow import Differences
 from rigidjax.exact.triples import Six, Triple
@@ -172,7 +172,7 @@ def _integrals(u: Scalar, m: Modulus, three) -> tuple[_Functions, _Functions]:
     # S²/D² and S²/C² are S²/(1 + μS²) for μ = −q and −p.
     low = jnp.where(three, -m.q, -m.p)
     f = _Functions(f0.S, f0.C, f0.D, growth(f0.S, m, jnp.zeros_like(u)), growth(f0.S, m, low))
-    before = repeat(n - 1, lambda g: _twice(g, m, three), f)
+    before = jax.lax.fori_loop(0, n - 1, lambda _, g: _twice(g, m, three), f)
     return before, _twice(before, m, three)
 
 

@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 
 from rigidjax._types import Mat3, Scalar, Vec3
-from rigidjax.exact.fence import repeat
 from rigidjax.exact.triples import Six, Triple
 
 # Cyclic Jacobi converges quadratically; 3×3 needs four or five sweeps from anywhere.
@@ -62,13 +61,13 @@ def _jacobi(m: Mat3) -> tuple[list[list[Scalar]], Triple]:
     o = tuple(0.5 * (m[i, j] + m[j, i]) for i, j in ((1, 2), (0, 2), (0, 1)))
     axes = ((one, zero, zero), (zero, one, zero), (zero, zero, one))
 
-    def rotate(state):
+    def rotate(_, state):
         # Always the last two; then the axes are counted on by one: one rotation to compile.
         d, o, axes = _rotate(*state)
         return tuple((x[1], x[2], x[0]) for x in (d, o, axes))
 
     # `axes` are columns: axes[i] is the i-th axis.
-    d, _, axes = repeat(3 * _SWEEPS, rotate, (d, o, axes))
+    d, _, axes = jax.lax.fori_loop(0, 3 * _SWEEPS, rotate, (d, o, axes))
     for i, j in ((0, 1), (1, 2), (0, 1)):
         d, axes = _order(d, axes, i, j)
     columns = _polished([[axes[j][i] for j in range(3)] for i in range(3)])

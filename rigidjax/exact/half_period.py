@@ -3,11 +3,12 @@
 import math
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
+from jaxtyping import Array
 
 from rigidjax._types import Scalar
 from rigidjax.exact.doubling import Modulus, is_endless, limits
-from rigidjax.exact.fence import repeat
 
 
 class HalfPeriod(NamedTuple):
@@ -43,14 +44,14 @@ def half_period(m: Modulus, mu: Scalar, turn: Scalar) -> HalfPeriod:
     # A loop: written out, eleven steps take as long to compile as the rest of the motion.
     point, half, one = jnp.sqrt(1.0 + mu / big), jnp.full_like(a, 0.5), jnp.ones_like(a)
     start = (a, b, c, ratio, half, point, one, one)
-    a, *_, total, _, _, sum_parts = repeat(limits(a.dtype).agm, _mean, start)
+    a, *_, total, _, _, sum_parts = jax.lax.fori_loop(0, limits(a.dtype).agm, _mean, start)
     time = math.pi / (a * jnp.sqrt(big))
     # turn = κμ h; over a quarter ξ = κ h (π/2a) ½ μ/(λ² + μ) Σ.
     phase = turn * time * 0.5 / (big + mu) * sum_parts
     return HalfPeriod(jnp.where(endless, jnp.inf, time), phase, total / big)
 
 
-def _mean(state: tuple[Scalar, ...]) -> tuple[Scalar, ...]:
+def _mean(_: Array, state: tuple[Scalar, ...]) -> tuple[Scalar, ...]:
     """A step of the arithmetic–geometric mean, and of what is summed along it.
 
     `ratio` carries 2^{n−1}.

@@ -37,7 +37,6 @@ import jax.numpy as jnp
 
 from rigidjax._types import Scalar
 from rigidjax.exact.doubling import Modulus, is_endless, limits, until_rest
-from rigidjax.exact.fence import repeat
 from rigidjax.exact.triples import Six, Triple, adjugate, determinant, product, times
 
 
@@ -223,7 +222,7 @@ def integral_about(body: Differences, v: Invariants, f: Sigma, k: Triple) -> Six
 def sigma_at(u: Scalar, v: Invariants) -> Sigma:
     n = limits(u.dtype).doublings + 3
     f = start(u * 2.0**-n, v)
-    return repeat(n, lambda g: double(g, v), f)
+    return jax.lax.fori_loop(0, n, lambda _, g: double(g, v), f)
 
 
 def period(v: Invariants) -> Scalar:
