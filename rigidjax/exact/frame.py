@@ -61,14 +61,13 @@ def _jacobi(m: Mat3) -> tuple[list[list[Scalar]], Triple]:
     o = tuple(0.5 * (m[i, j] + m[j, i]) for i, j in ((1, 2), (0, 2), (0, 1)))
     axes = ((one, zero, zero), (zero, one, zero), (zero, zero, one))
 
-    def sweep(_, state):
-        d, o, axes = state
-        for k, (i, j) in enumerate(((1, 2), (0, 2), (0, 1))):
-            d, o, axes = _rotate(d, o, axes, i, j, k)
-        return d, o, axes
+    def rotate(_, state):
+        # Always the last two; then the axes are counted on by one: one rotation to compile.
+        d, o, axes = _rotate(*state)
+        return tuple((x[1], x[2], x[0]) for x in (d, o, axes))
 
     # `axes` are columns: axes[i] is the i-th axis.
-    d, _, axes = jax.lax.fori_loop(0, _SWEEPS, sweep, (d, o, axes))
+    d, _, axes = jax.lax.fori_loop(0, 3 * _SWEEPS, rotate, (d, o, axes))
     for i, j in ((0, 1), (1, 2), (0, 1)):
         d, axes = _order(d, axes, i, j)
     columns = _polished([[axes[j][i] for j in range(3)] for i in range(3)])
@@ -90,26 +89,22 @@ def _polished(a):
     ]
 
 
-def _rotate(d, o, axes, i, j, k):
-    """Annihilate the entry i, j; o[k] is the one that does not touch axis k."""
-    x = o[k]
+def _rotate(d, o, axes):
+    """Annihilate the entry of the last two axes; o[k] is the one that does not touch axis k."""
+    (first, second, third), (x, y, z), (u, v, w) = d, o, axes
     none = x == 0
-    cot = 0.5 * (d[j] - d[i]) / jnp.where(none, 1.0, x)
+    cot = 0.5 * (third - second) / jnp.where(none, 1.0, x)
     size = jnp.abs(cot)
     # √(1 + cot²) overflows in float32 for tiny x: there t = 1/(2 cot).
     t = 1.0 / (size + jnp.where(size > 1e15, size, jnp.sqrt(1.0 + jnp.minimum(size, 1e15) ** 2)))
     t = jnp.where(none, 0.0, jnp.where(cot < 0, -t, t))
     c = 1.0 / jnp.sqrt(1.0 + t * t)
     s = t * c
-    d, o = list(d), list(o)
-    d[i], d[j], o[k] = d[i] - t * x, d[j] + t * x, jnp.zeros_like(x)
-    # Entry (i, k) is o[j], entry (j, k) is o[i].
-    o[j], o[i] = c * o[j] - s * o[i], s * o[j] + c * o[i]
-    a, b = axes[i], axes[j]
-    axes = list(axes)
-    axes[i] = tuple(c * x - s * y for x, y in zip(a, b, strict=True))
-    axes[j] = tuple(s * x + c * y for x, y in zip(a, b, strict=True))
-    return tuple(d), tuple(o), tuple(axes)
+    turned = [tuple(c * p - s * q for p, q in zip(v, w, strict=True))]
+    turned.append(tuple(s * p + c * q for p, q in zip(v, w, strict=True)))
+    d = (first, second - t * x, third + t * x)
+    # Entry (first, second) is z, entry (first, third) is y.
+    return d, (jnp.zeros_like(x), s * z + c * y, c * z - s * y), (u, *turned)
 
 
 def _order(d, axes, i, j):
