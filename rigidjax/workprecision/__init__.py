@@ -17,6 +17,7 @@ from rigidjax.workprecision.method import Method as Method, Ready as Ready, Run 
 from rigidjax.workprecision.pareto import (
     Choice as Choice,
     choose as choose,
+    first_answers as first_answers,
     front as front,
     table as table,
     time_to as time_to,

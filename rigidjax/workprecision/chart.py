@@ -3,7 +3,7 @@
 from collections.abc import Iterable
 from typing import Any
 
-from rigidjax.workprecision.pareto import front
+from rigidjax.workprecision.pareto import first_answers, front
 from rigidjax.workprecision.record import Record, listed
 
 _MARKS = "osv^<>DPX*hp8d"
@@ -13,7 +13,8 @@ _COLOURS = {"ours": "tab20", "jax": "Set2", "peer": "Dark2"}
 def draw(records: Iterable[Record], *, title: str | None = None) -> Any:
     """Error against time, log–log: values on the left, gradients on the right, the front marked.
 
-    One scene a row. The grey band is the front: what nothing beats in both error and time, peers
+    One scene a row. Beside the time of a run stands that of a first answer, compiling and one run,
+    where it is known. The grey band is the front: what nothing beats in both error and time, peers
     included; its points are ringed. The coloured band is the front of what runs in JAX. Error bars
     are quartiles of the time.
 
@@ -31,14 +32,18 @@ def draw(records: Iterable[Record], *, title: str | None = None) -> Any:
 
     names = list(dict.fromkeys(r.scene for r in records))
     kinds = [k for k in ("value", "gradient") if any(r.kind == k for r in records)]
+    runs = [("", records)]
+    if any(r.compile == r.compile for r in records):
+        runs.append((", first answer", first_answers(records)))
+    panels = [(kind, words, times) for words, times in runs for kind in kinds]
     figure, axes = plt.subplots(
-        len(names), len(kinds), figsize=(6.6 * len(kinds), 5.4 * len(names)), squeeze=False,
+        len(names), len(panels), figsize=(6.6 * len(panels), 5.4 * len(names)), squeeze=False,
         layout="constrained",
     )  # fmt: skip
     labels = list(dict.fromkeys((r.label, r.group) for r in records))
     for row, name in zip(axes, names, strict=True):
-        for axis, kind in zip(row, kinds, strict=True):
-            of = [r for r in records if (r.scene, r.kind) == (name, kind)]
+        for axis, (kind, words, times) in zip(row, panels, strict=True):
+            of = [r for r in times if (r.scene, r.kind) == (name, kind)]
             if not of:
                 axis.set_axis_off()
                 continue
@@ -47,8 +52,8 @@ def draw(records: Iterable[Record], *, title: str | None = None) -> Any:
             if name in ("foucault", "arenstorf") and kind == "value":
                 what = "relative error of the place"
             axis.set_xlabel(what)
-            axis.set_title(f"{name}: {kind}", fontsize=10)
-            axis.set_ylabel("time, ms")
+            axis.set_title(f"{name}: {kind}{words}", fontsize=10)
+            axis.set_ylabel("compile and run, ms" if words else "time, ms")
     if title:
         figure.suptitle(title)
     return figure

@@ -129,19 +129,49 @@ def _split(scene: Scene, solver: Any) -> Flow | None:
     return flow
 
 
-def _diffrax(scene: Scene, solver: Any, adjoint: Any = None) -> Flow:
+def _in_diffrax(scene: Scene, solver: Any, adjoint: Any = None) -> Flow:
+    """Our field and state in diffrax's loop."""
+
     def flow(numbers: Any, setting: Any) -> tuple[Any, Any]:
         body, start = scene.assembled(numbers)
-        out = dfx.diffeqsolve(
-            dfx.ODETerm(_field(scene, body, start)), solver, 0.0, scene.end, None, start,
-            stepsize_controller=dfx.PIDController(rtol=setting, atol=1e-3 * setting),
-            adjoint=dfx.RecursiveCheckpointAdjoint() if adjoint is None else adjoint,
-            max_steps=MOST, throw=False,
-        )  # fmt: skip
+        out = _solved(_field(scene, body, start), None, start, solver, adjoint, setting, scene.end)
         end: Any = jax.tree.map(lambda leaf: leaf[-1], out.ys)
         return scene.flat(end), out.stats["num_steps"]
 
     return flow
+
+
+def _diffrax(scene: Scene, solver: Any, adjoint: Any = None) -> Flow:
+    """What a user would have without us: equations written by hand, one array, constants once."""
+    plain = scene.plain
+    if plain is None:
+        return _in_diffrax(scene, solver, adjoint)
+
+    def flow(numbers: Any, setting: Any) -> tuple[Any, Any]:
+        start = scene.flat(scene.assembled(numbers)[1])
+        rates = plain(tuple(numbers), jnp.sin, jnp.cos, jnp.sqrt)
+        zero = jnp.zeros((), start.dtype)
+        by_hand, constants = jax.closure_convert(lambda t, y: jnp.stack(rates(t, y)), zero, start)
+
+        def field(t: Any, y: Any, constants: Any) -> Any:
+            return by_hand(t, y, *constants)
+
+        out = _solved(field, constants, start, solver, adjoint, setting, scene.end)
+        ys: Any = out.ys
+        return ys[-1], out.stats["num_steps"]
+
+    return flow
+
+
+def _solved(
+    field: Any, args: Any, start: Any, solver: Any, adjoint: Any, setting: Any, end: float
+) -> dfx.Solution:
+    return dfx.diffeqsolve(
+        dfx.ODETerm(field), solver, 0.0, end, None, start, args,
+        stepsize_controller=dfx.PIDController(rtol=setting, atol=1e-3 * setting),
+        adjoint=dfx.RecursiveCheckpointAdjoint() if adjoint is None else adjoint,
+        max_steps=MOST, throw=False,
+    )  # fmt: skip
 
 
 def _value(make: Callable[[Scene], Flow | None], scene: Scene) -> Ready | None:
@@ -161,7 +191,9 @@ def _slope(make: Callable[[Scene], Flow | None], take: Any, scene: Scene) -> Rea
 
 
 def diffrax_method(solver: dfx.AbstractSolver, *, gradients: bool = False) -> Method:
-    """Any `diffrax` solver as a method, on the plain field, with a step controller.
+    """Any `diffrax` solver as a method, with a step controller, on equations written by hand.
+
+    Where a scene has none (`plain`), on our vector field.
 
     **Arguments:** `solver` with an error estimate; `gradients` whether its adjoints are measured,
     too: `forward`, `checkpointed`, `backsolve`.
@@ -240,7 +272,10 @@ def methods_in_jax() -> list[Method]:
             "Splitting6, equal steps", "ours", EIGHT,
             partial(_value, partial(_split, solver=solvers.Splitting6())), equal=True,
         ),
-        diffrax_method(eight)._replace(name="DormandPrince8 in diffeqsolve", group="ours"),
+        Method(
+            "DormandPrince8 in diffeqsolve", "ours", TOLERANCES,
+            partial(_value, partial(_in_diffrax, solver=eight)),
+        ),
         diffrax_method(dfx.Tsit5()),
         diffrax_method(dfx.Dopri8(), gradients=True),
     ]  # fmt: skip

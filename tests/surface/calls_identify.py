@@ -261,7 +261,7 @@ row(
     groups=("same", *KINDS, "nan"),
     transforms=(),
 )
-for name in ("choose", "front", "table"):
+for name in ("choose", "first_answers", "front", "table"):
     lines = "lines" if name == "table" else "records"
     row(
         f"workprecision.{name}",

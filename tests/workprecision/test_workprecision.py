@@ -167,6 +167,10 @@ def test_the_front_and_the_table():
     assert [(r.method, r.error) for r in best] == [
         ("a", 1e-2), ("b", 1e-4), ("a", 1e-6), ("a", 1e-12),
     ]  # fmt: skip
+    # The curve of a passes 1e-9 at 4 s: what takes longer is not on the front, nor what is worse.
+    late, soon = line("c", 1e-9, 4.5, group="jax"), line("c", 1e-9, 3.9, group="jax")
+    assert "c" not in {r.method for r in front([*ladder, late])}
+    assert "c" in {r.method for r in front([*ladder, soon])}
     assert time_to(ladder, 1e-9) == pytest.approx(4.0)
     assert math.isnan(time_to(ladder, 1e-13))
     (choice,) = choose(ladder + other, [1e-4])
