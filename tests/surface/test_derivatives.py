@@ -10,7 +10,6 @@ from surface import cases, sweep
 # Short to compile, and each a kind of degenerate point.
 SAMPLE = {
     "quaternion.log": cases.rotations,
-    "so3.align": cases.rotations,
     "elliptic.rc": cases.numbers,
     "body.parameters.pack_moments": cases.bodies,
 }
