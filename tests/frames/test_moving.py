@@ -185,30 +185,23 @@ def test_gradient_with_the_rate_against_fifty_digits():
 
 
 def test_composition_and_inverse():
-    @once
-    def all_of(numbers, state, t):
-        outer, inner = wobbly(numbers), wobbly(-0.7 * numbers[::-1])
-        both, moved = outer.then(inner), outer.to_inertial(state, t)
-        return (
-            outer.to_inertial(inner.to_inertial(state, t), t),
-            both.to_inertial(state, t),
-            outer.inverse().to_inertial(moved, t),
-            outer.then(outer.inverse()).at(t),
-            MovingFrame(both.matrix).at(t),
-            both.at(t),
-        )
-
+    outer, inner, t = wobbly(NUMBERS), wobbly(-0.7 * NUMBERS[::-1]), 0.4
     state = Point(NUMBERS[21:24], NUMBERS[24:27])
-    step, whole, back, nothing, plain, given_rate = all_of(NUMBERS, state, 0.4)
+    step = outer.to_inertial(inner.to_inertial(state, t), t)
+    both = outer.then(inner)
     for name in ("x", "v"):
-        np.testing.assert_allclose(getattr(whole, name), getattr(step, name), rtol=0, atol=1e-12)
-        np.testing.assert_allclose(getattr(back, name), getattr(state, name), rtol=0, atol=1e-12)
+        whole = getattr(both.to_inertial(state, t), name)
+        np.testing.assert_allclose(whole, getattr(step, name), rtol=0, atol=1e-12)
+        back = getattr(outer.inverse().to_inertial(outer.to_inertial(state, t), t), name)
+        np.testing.assert_allclose(back, getattr(state, name), rtol=0, atol=1e-12)
+    nothing = outer.then(outer.inverse()).at(t)
     np.testing.assert_allclose(nothing.rotation, np.eye(3), atol=1e-14)
     for part in jax.tree.leaves(nothing)[1:]:
         np.testing.assert_allclose(part, np.zeros(3), atol=1e-12)
     # The given rate of a composed frame is that of its matrix.
-    np.testing.assert_allclose(plain.rate, given_rate.rate, atol=1e-13)
-    np.testing.assert_allclose(plain.rate_change, given_rate.rate_change, atol=1e-12)
+    plain = MovingFrame(both.matrix).at(t)
+    np.testing.assert_allclose(plain.rate, both.at(t).rate, atol=1e-13)
+    np.testing.assert_allclose(plain.rate_change, both.at(t).rate_change, atol=1e-12)
 
 
 @once
