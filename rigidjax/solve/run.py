@@ -171,10 +171,15 @@ def _free(setup: Free, state0: Any, ts: Array) -> tuple[Any, dict[str, Any], dfx
     ys = free_motion(setup.body, state0, ts - ts[0])
     none = jnp.zeros((), int)
     stats = {"num_steps": none, "num_accepted_steps": none, "num_rejected_steps": none}
-    result = dfx.RESULTS.successful
-    if not setup.throw:
-        result = dfx.RESULTS.where(finite(ys), result, NONFINITE)
-    return ys, stats, result
+    if setup.throw:
+        ys = eqx.error_if(
+            ys,
+            ~finite(ys),
+            "simulate: a state in closed form is NaN or infinite: after more turns than the dtype "
+            "can count, or from numbers beyond its range; throw=False keeps the others",
+        )
+        return ys, stats, dfx.RESULTS.successful
+    return ys, stats, dfx.RESULTS.where(finite(ys), dfx.RESULTS.successful, NONFINITE)
 
 
 def free_motion(body: Inertia | MassProperties, state0: Any, since: Array) -> Any:

@@ -354,3 +354,11 @@ def test_a_solver_that_is_projected_already_takes_every_adjoint():
 
     twice = jax.jacfwd(last)(1.0, rj.Projected(dfx.Dopri8()))
     np.testing.assert_allclose(twice, jax.jacfwd(last)(1.0, dfx.Dopri8()), rtol=1e-12)
+
+
+def test_a_time_of_more_turns_than_the_dtype_counts_is_refused():
+    body, start = rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([1.0, 1.0, 1.0])
+    with pytest.raises(Exception, match="after more turns than the dtype can count"):
+        rj.simulate(body, start, [0.0, 1e75])
+    kept = rj.simulate(body, start, [0.0, 1.0, 1e75], throw=False)
+    np.testing.assert_array_equal(np.isfinite(kept.ys.omega).all(-1), [True, True, False])
