@@ -24,9 +24,9 @@ shares written before the collective are recovered, the others run again.
 
 from rigidjax._names import own_names
 from rigidjax.batch import hosts as hosts
-from rigidjax.batch.chunks import compiler_options as compiler_options
-from rigidjax.batch.flags import CpuFlags as CpuFlags, cpu_flags as cpu_flags
 from rigidjax.batch.rollout import rollout as rollout
+from rigidjax.batch.sharding import compiler_options as compiler_options
 from rigidjax.batch.simulate import Batch as Batch, Steps as Steps, simulate as simulate
+from rigidjax.batch.xla_flags import CpuFlags as CpuFlags, cpu_flags as cpu_flags
 
 __dir__ = own_names(__name__)

@@ -12,9 +12,9 @@ from jax import lax
 from jaxtyping import Array
 
 from rigidjax._types import ScalarLike
-from rigidjax.batch.chunks import Compiled, chunk_of, mesh_of, over_bodies
-from rigidjax.batch.given import Bodies, bodies_of, step_of, time_of
-from rigidjax.batch.lanes import Lane, lane_of
+from rigidjax.batch.sharding import Compiled, chunk_of, mesh_of, over_bodies
+from rigidjax.batch.steppers import Lane, lane_of
+from rigidjax.batch.validation import Bodies, bodies_of, step_of, time_of
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.solve.explicit import AbstractExplicit, Atoms

@@ -11,13 +11,13 @@ from jaxtyping import Array, ArrayLike, Float, Int
 
 from rigidjax import _checks
 from rigidjax._types import ScalarLike
-from rigidjax.batch.chunks import Compiled, chunk_of, mesh_of, over_bodies
-from rigidjax.batch.given import Bodies, bodies_of, start_of, step_of, time_of
-from rigidjax.batch.order import dealt, quickness
 from rigidjax.batch.rollout import rollout
+from rigidjax.batch.scheduling import dealt, quickness
+from rigidjax.batch.sharding import Compiled, chunk_of, mesh_of, over_bodies
+from rigidjax.batch.validation import Bodies, bodies_of, start_of, step_of, time_of
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.motion import Attitude, Rigid, Spin
-from rigidjax.solve import inputs, simulate as simulate_one
+from rigidjax.solve import simulate as simulate_one, validation
 from rigidjax.solve.explicit import DormandPrince8
 from rigidjax.solve.magnus import Magnus4
 from rigidjax.solve.run import free_motion
@@ -108,12 +108,12 @@ def simulate(
     if isinstance(solver, Magnus4):
         raise ValueError("simulate: Magnus4 takes equal steps; give Steps(size, number), not times")
     batch = bodies_of(bodies, states0, torque, torque_axes)
-    ts = inputs.times(ts_or_steps, True).astype(batch.dtype)
+    ts = validation.times(ts_or_steps, True).astype(batch.dtype)
     if torque is None and solver is None:
         how: Any = _Free()
     else:
         max_steps = _checks.whole(max_steps, "max_steps", 1)
-        tolerances: Any = inputs.tolerances(rtol, atol, batch.dtype)
+        tolerances: Any = validation.tolerances(rtol, atol, batch.dtype)
         solver = DormandPrince8() if solver is None else solver
         how = _Adaptive(solver, tolerances[0], tolerances[1], max_steps, adjoint)
     mesh = mesh_of(devices)

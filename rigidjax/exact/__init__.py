@@ -1,11 +1,14 @@
 """Answers without a solver."""
 
 from rigidjax._names import own_names
+from rigidjax.exact.diffrax_solver import (
+    FreeInterpolation as FreeInterpolation,
+    FreeSolver as FreeSolver,
+)
 from rigidjax.exact.free_body import FreeBody as FreeBody, free_body as free_body
 from rigidjax.exact.periods import (
     body_period as body_period,
     precession_period as precession_period,
 )
-from rigidjax.exact.solver import FreeInterpolation as FreeInterpolation, FreeSolver as FreeSolver
 
 __dir__ = own_names(__name__)

@@ -12,10 +12,10 @@ from jaxtyping import Array
 from rigidjax import _checks
 from rigidjax._types import HasAttitude, HasPose, HasSpin, Mat3, Quat, Scalar, ScalarLike
 from rigidjax.body.inertia import Inertia
-from rigidjax.exact.fence import fence, opaque_one
-from rigidjax.exact.flow import flow
-from rigidjax.exact.frame import into, out_of, principal_frame
-from rigidjax.exact.triples import Six, Triple, adjugate, determinant, times
+from rigidjax.exact._xla import fence, opaque_one
+from rigidjax.exact.components3 import Six, Triple, adjugate, determinant, times
+from rigidjax.exact.derivatives import flow
+from rigidjax.exact.principal_axes import into, out_of, principal_frame
 from rigidjax.rotation.algebra import components
 from rigidjax.rotation.maps import product4
 from rigidjax.special.scaling import exponent_of, times_power_of_two
@@ -85,7 +85,7 @@ def free_body(inertia: Inertia, state0: State, t: ScalarLike) -> State:
     times or bodies; `FreeBody(inertia, state0)` keeps what does not depend on time.
 
     With Π = IΩ and axes 1, 2, 3 in order of their moments, S, C, D Jacobi's functions in a scaling
-    that is symmetric in the axes (`rigidjax.exact.doubling`) and `dᵢⱼ = 1/Iᵢ − 1/Iⱼ`,
+    that is symmetric in the axes (`rigidjax.exact.jacobi_duplication`) and `dᵢⱼ = 1/Iᵢ − 1/Iⱼ`,
 
         Π(t) ∝ (Π₁C − d₂₃Π₂Π₃SD, Π₂CD + d₁₃Π₁Π₃S, Π₃D − d₁₂Π₁Π₂SC)              S, C, D at t
         q(t) = q(0) ⊗ exp(½(t/I₁ − Ξ) Π) ⊗ (C, 0, −d₁₂SΠ₂(t/2)C, −d₁₃SΠ₃(t/2))/|…|   S, C, D at t/2
@@ -99,7 +99,7 @@ def free_body(inertia: Inertia, state0: State, t: ScalarLike) -> State:
 
     Derivatives with respect to all arguments are closed forms and right to second order at all
     those points: they are taken from the motion as a function of the whole tensor
-    (`rigidjax.exact.tensor_flow`), never from principal axes. On an unstable axis they grow with
+    (`rigidjax.exact.sigma_form`), never from principal axes. On an unstable axis they grow with
     e^{λt}, as the motion's do; beyond λt ≈ 150 (float32: 40) they stop growing.
 
     **Raises:** `TypeError`, `ValueError` for a wrong shape or dtype, dtypes that differ, a `Rigid`

@@ -8,12 +8,12 @@ import jax.numpy as jnp
 from rigidjax import _checks
 from rigidjax._types import Scalar, Vec3Like
 from rigidjax.body.inertia import Inertia
-from rigidjax.exact import tensor_flow
-from rigidjax.exact.doubling import Modulus, is_endless
-from rigidjax.exact.flow import first_order, reciprocal
-from rigidjax.exact.frame import into, principal_frame
-from rigidjax.exact.half_period import half_period
-from rigidjax.exact.triples import Six, Triple, times
+from rigidjax.exact import sigma_form
+from rigidjax.exact.complete_integrals import half_period
+from rigidjax.exact.components3 import Six, Triple, times
+from rigidjax.exact.derivatives import first_order, reciprocal
+from rigidjax.exact.jacobi_duplication import Modulus, is_endless
+from rigidjax.exact.principal_axes import into, principal_frame
 from rigidjax.special.scaling import exponent_of, times_power_of_two
 
 
@@ -28,7 +28,7 @@ def body_period(inertia: Inertia, omega0: Vec3Like) -> Scalar:
     **Arguments:** `inertia` of the body about its centre of mass (kg m²); `omega0` (3,) Ω at any
     moment, rad/s, body frame. **Returns** a scalar, s.
 
-    `T = 2π/agm(√(e₁ − e₂), √(e₁ − e₃))`, eᵢ the roots in `rigidjax.exact.tensor_flow` (DLMF
+    `T = 2π/agm(√(e₁ − e₂), √(e₁ − e₃))`, eᵢ the roots in `rigidjax.exact.sigma_form` (DLMF
     19.8.5; Landau and Lifshitz, Mechanics, eq 37.11). Its derivatives are right wherever it is
     finite, symmetric tops and principal axes included.
 
@@ -56,7 +56,7 @@ def precession_period(inertia: Inertia, omega0: Vec3Like) -> Scalar:
 
     The angle in one body period is `χ ∓ 2π`, χ the turn of the body about its momentum: a complete
     integral of the third kind (DLMF 19.8.7). Its derivative is `½ T δE₂ + ½ δK:∫ΠΠᵀ dt + E₂ δT`,
-    over |Π|: see `rigidjax.exact.flow`.
+    over |Π|: see `rigidjax.exact.derivatives`.
 
     **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype, or a moment known to be zero.
 
@@ -83,7 +83,7 @@ def _scaled(inertia: Inertia, omega0):
 
 def _periods(moments: Six, momentum: Triple) -> tuple[Scalar, Scalar]:
     body, _, _ = reciprocal(moments, momentum)
-    v = tensor_flow.invariants(body, momentum)
+    v = sigma_form.invariants(body, momentum)
     h = jnp.sqrt(sum(p * p for p in momentum))
     endless = is_endless(jax.lax.stop_gradient(Modulus(v.p, v.q, v.gap)))
     # A tame body stands in where there is no period, so that no derivative is NaN there.
@@ -91,7 +91,7 @@ def _periods(moments: Six, momentum: Triple) -> tuple[Scalar, Scalar]:
     safe_moments = _choose(endless, (one, 2 * one, 3 * one, zero, zero, zero), moments)
     safe_momentum = _choose(endless, (one, zero, zero), momentum)
     body, _, _ = reciprocal(safe_moments, safe_momentum)
-    period = tensor_flow.period(tensor_flow.invariants(body, safe_momentum))
+    period = sigma_form.period(sigma_form.invariants(body, safe_momentum))
     angle = _precession(safe_moments, safe_momentum, period)
     still = h == 0
     middle = 2.0 * math.pi * moments[1] / jnp.where(still, 1.0, h)

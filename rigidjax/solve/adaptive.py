@@ -15,9 +15,9 @@ from rigidjax.motion import on_the_group
 from rigidjax.solve import adaptive_loop, adjoint
 from rigidjax.solve.adaptive_loop import Answer, Book, Method, Run
 from rigidjax.solve.adjoint import Inputs, Outputs
+from rigidjax.solve.batching import Arrays, Layout, in_lanes, one
 from rigidjax.solve.components import flat, leaf_sizes, unflat
 from rigidjax.solve.explicit import AbstractExplicit
-from rigidjax.solve.lanes import Arrays, Layout, in_lanes, one
 from rigidjax.solve.linear_map import forward_only, linear_map
 from rigidjax.solve.runge_kutta import Axes
 from rigidjax.solve.step_control import NONFINITE

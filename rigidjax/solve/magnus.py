@@ -14,7 +14,7 @@ from jax.extend import core
 from jaxtyping import Array
 
 from rigidjax.body.inertia import Inertia
-from rigidjax.exact.triples import Four, Triple, cross
+from rigidjax.exact.components3 import Four, Triple, cross
 from rigidjax.motion import Attitude, AttitudeEquations
 from rigidjax.motion.torques import evaluate
 from rigidjax.rotation.maps import product4, square4

@@ -17,9 +17,9 @@ from rigidjax.motion import Attitude, Rigid, on_the_group
 from rigidjax.motion.torques import jumps_of
 from rigidjax.solve.adaptive import adaptive
 from rigidjax.solve.explicit import AbstractExplicit
-from rigidjax.solve.field import equations_of_motion
-from rigidjax.solve.projected import Projected
+from rigidjax.solve.projection import Projected
 from rigidjax.solve.step_control import NONFINITE, finite
+from rigidjax.solve.vector_field import equations_of_motion
 
 # Made once: building a Module costs as much as ten steps, and `jit` compares it leaf by leaf.
 SOLVER = Projected(dfx.Dopri8())

@@ -14,9 +14,9 @@ from rigidjax._types import ScalarLike
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.frames import AbstractScene, MovingFrame, collision
 from rigidjax.motion.torques import jumps_of
-from rigidjax.solve import inputs
+from rigidjax.solve import validation
 from rigidjax.solve.explicit import AbstractExplicit, DormandPrince8
-from rigidjax.solve.projected import Projected
+from rigidjax.solve.projection import Projected
 from rigidjax.solve.run import ADJOINT, NO_METER, SOLVER, Free, Loop, Setup, solve
 from rigidjax.solve.solution import Solution, State
 from rigidjax.solve.splitting import AbstractSplitting
@@ -102,18 +102,18 @@ def simulate(
     True
     """
     max_steps = None if max_steps is None else _checks.whole(max_steps, "max_steps", 1)
-    times = inputs.times(ts, throw)
-    state0 = inputs.start(state0, throw)
+    times = validation.times(ts, throw)
+    state0 = validation.start(state0, throw)
     dtype = times.dtype
     for leaf in jax.tree.leaves(state0):
         dtype = jnp.promote_types(dtype, leaf.dtype)
     times, state0 = jax.tree.map(lambda leaf: _as(leaf, dtype), (times, state0))
-    inputs.require_fit(body, state0, torque)
+    validation.require_fit(body, state0, torque)
     if body is not None and (throw or _checks.known(body)):
         body = body.invertible()
     controller = stepsize_controller
     if controller is None:
-        rtol, atol = inputs.tolerances(rtol, atol, dtype)
+        rtol, atol = validation.tolerances(rtol, atol, dtype)
         make: Any = _controller if _checks.known((rtol, atol)) else _watched
         controller = make(rtol, atol)
         if hasattr(torque, "jump_times") and jumps_of(torque).size:
@@ -132,7 +132,7 @@ def simulate(
     plain = plain and stepsize_controller is None and progress_meter is None
     plain = plain and isinstance(adjoint, _EITHER_MODE)
     if plain:
-        first = inputs.first_step(dt0, times)
+        first = validation.first_step(dt0, times)
         loop = Loop(body, torque, method, controller, first, max_steps, throw)  # pyright: ignore
         return _solution(loop, state0, times)
     setup = Setup(
@@ -140,7 +140,7 @@ def simulate(
         torque=torque,
         solver=_on_the_group(solver),
         controller=controller,
-        dt0=inputs.first_step(dt0, times),
+        dt0=validation.first_step(dt0, times),
         adjoint=_adjoint(controller) if adjoint is None else adjoint,
         progress_meter=NO_METER if progress_meter is None else progress_meter,
         max_steps=max_steps,

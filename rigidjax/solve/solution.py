@@ -14,8 +14,8 @@ from rigidjax import _checks, motion
 from rigidjax._types import ScalarLike
 from rigidjax.frames import Point
 from rigidjax.motion import Attitude, Rigid, Spin
-from rigidjax.solve.growth import growth
 from rigidjax.solve.run import Flow, Free, Loop, Setup, solve
+from rigidjax.solve.sensitivity import growth
 
 State = TypeVar("State", Spin, Attitude, Rigid, Point)
 

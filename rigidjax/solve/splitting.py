@@ -16,9 +16,9 @@ from jax import lax
 from jax.extend import core
 from jaxtyping import Array
 
-from rigidjax.exact.flow import flow
-from rigidjax.exact.frame import into, out_of, principal_frame
-from rigidjax.exact.triples import Six, Triple, times
+from rigidjax.exact.components3 import Six, Triple, times
+from rigidjax.exact.derivatives import flow
+from rigidjax.exact.principal_axes import into, out_of, principal_frame
 from rigidjax.motion import Attitude, AttitudeEquations
 from rigidjax.motion.torques import evaluate
 from rigidjax.rotation import quaternion

@@ -9,7 +9,7 @@ import pytest
 from once import once
 
 import rigidjax as rj
-from rigidjax.batch.chunks import over_bodies
+from rigidjax.batch.sharding import over_bodies
 from rigidjax.solve import lean
 
 KUTTA = rj.solvers.RungeKutta4()

@@ -36,7 +36,7 @@ from accuracy import (
     value,
 )
 
-from rigidjax.exact.doubling import limits
+from rigidjax.exact.jacobi_duplication import limits
 
 DIGITS, DERIVATIVE_DIGITS = 60, 90
 CHUNK = 2000

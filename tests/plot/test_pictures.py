@@ -273,7 +273,9 @@ def test_words_on_mistakes(flip, monkeypatch):
         rj.plot.polhode(BODY, batch(flip.ys))
     with pytest.raises(ValueError, match="wanted one of s, min, h, day, got 'days'"):
         rj.plot.motion(flip.ts, flip.ys, time_unit="days")
-    with pytest.raises(ValueError, match="attitude: wanted one of quaternion, axes, angles, got 'euler'"):
+    with pytest.raises(
+        ValueError, match="attitude: wanted one of quaternion, axes, angles, got 'euler'"
+    ):
         rj.plot.motion(flip.ts, flip.ys, attitude="euler")
     with pytest.raises(ValueError, match=r"ts: wanted \(101,\) as the states have, got \(100,\)"):
         rj.plot.motion(flip.ts[1:], flip.ys)

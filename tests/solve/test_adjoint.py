@@ -9,7 +9,7 @@ import pytest
 from once import once
 
 import rigidjax as rj
-from rigidjax.solve import adaptive_loop, adjoint, lanes, lean
+from rigidjax.solve import adaptive_loop, adjoint, batching, lean
 
 Q = np.array([0.8, -0.2, 0.4, 0.4]) / np.linalg.norm([0.8, -0.2, 0.4, 0.4])
 TENSOR = np.array([[1.0, 0.05, -0.1], [0.05, 1.7, 0.2], [-0.1, 0.2, 2.2]])
@@ -236,7 +236,7 @@ def test_bodies_in_lanes_are_bodies_alone(monkeypatch):
     alone = jax.jit(slope)
     wanted = np.stack([alone(row, shared) for row in p])
     # Blocks with bodies left over, and segments that are run again.
-    monkeypatch.setattr(lanes, "BLOCK", 4)
+    monkeypatch.setattr(batching, "BLOCK", 4)
     monkeypatch.setattr(adaptive_loop, "SEGMENT", 7)
     together = jax.vmap(lambda p: slope(p, shared))
     found = jax.jit(together)(p)

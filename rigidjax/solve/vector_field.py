@@ -7,7 +7,7 @@ from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.frames import AbstractScene, MovingFrame, Point, scene_of
 from rigidjax.motion import Attitude, AttitudeEquations, EulerEquations, NewtonEuler, Rigid, Spin
 from rigidjax.motion.torques import Torque
-from rigidjax.solve import inputs
+from rigidjax.solve import validation
 
 
 def equations_of_motion(
@@ -23,7 +23,7 @@ def equations_of_motion(
     >>> type(equations_of_motion(rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([1.0, 0, 0])))
     <class 'rigidjax.motion.spin.EulerEquations'>
     """
-    inputs.require_fit(body, state0, torque)
+    validation.require_fit(body, state0, torque)
     if isinstance(state0, Point):
         return scene_of(torque).field
     matter: Any = body

@@ -1,7 +1,7 @@
 """Principal axes as a fixed frame: chosen once by value, never differentiated.
 
 In this frame the inertia is diagonal in value; its off-diagonal entries are exact zeros that carry
-the tangents (and `tensor_flow` says what they do). So nothing is divided by a difference of
+the tangents (and `sigma_form` says what they do). So nothing is divided by a difference of
 moments, and no derivative of an axis is taken.
 """
 
@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from rigidjax._types import Mat3, Scalar, Vec3
-from rigidjax.exact.triples import Six, Triple
+from rigidjax.exact.components3 import Six, Triple
 
 # Cyclic Jacobi converges quadratically; 3×3 needs four or five sweeps from anywhere.
 _SWEEPS = 6

@@ -1,6 +1,6 @@
 """The free motion in principal axes: values only, in components.
 
-The derivatives are in `rigidjax.exact.flow`; nothing here is differentiated, so signs,
+The derivatives are in `rigidjax.exact.derivatives`; nothing here is differentiated, so signs,
 orderings and selections may be taken freely.
 """
 
@@ -10,11 +10,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rigidjax._types import Scalar
-from rigidjax.exact.doubling import Elliptic, Modulus, duplicate, elliptic, until_rest
-from rigidjax.exact.fence import fence, opaque_one
-from rigidjax.exact.half_period import HalfPeriod, half_period
+from rigidjax.exact._xla import fence, opaque_one
+from rigidjax.exact.complete_integrals import HalfPeriod, half_period
+from rigidjax.exact.components3 import Four, Triple
+from rigidjax.exact.jacobi_duplication import Elliptic, Modulus, duplicate, elliptic, until_rest
 from rigidjax.exact.sincos import sincos
-from rigidjax.exact.triples import Four, Triple
 
 
 class Orbit(NamedTuple):

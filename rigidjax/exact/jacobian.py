@@ -8,7 +8,7 @@ With f = S/E (E = D or C, whichever has no zero) and `Y₂ = ∫ S²`, `Y = ∫ 
 
 Both integrals double: `Y(2u) = 2Y(u) + f(u)² f(2u)`, and grow by their means over whole periods.
 Off-diagonal entries of K enter through the divided differences of T = diag(D, 1, C), which the last
-doubling gives without a quotient (see `tensor_flow`, whose derivatives these are).
+doubling gives without a quotient (see `sigma_form`, whose derivatives these are).
 """
 
 from typing import NamedTuple
@@ -17,11 +17,19 @@ import jax
 import jax.numpy as jnp
 
 from rigidjax._types import Scalar
-from rigidjax.exact.doubling import Elliptic, Modulus, duplicate, growth, limits, series, until_rest
-from rigidjax.exact.fence import fence, opaque_one
-from rigidjax.exact.half_period import half_period
-from rigidjax.exact.tensor_flow import Differences
-from rigidjax.exact.triples import Six, Triple
+from rigidjax.exact._xla import fence, opaque_one
+from rigidjax.exact.complete_integrals import half_period
+from rigidjax.exact.components3 import Six, Triple
+from rigidjax.exact.jacobi_duplication import (
+    Elliptic,
+    Modulus,
+    duplicate,
+    growth,
+    limits,
+    series,
+    until_rest,
+)
+from rigidjax.exact.sigma_form import Differences
 
 # Columns: d12, d23, k12, k13, k23, Π1, Π2, Π3, t.
 Row = tuple[Scalar, ...]

@@ -12,7 +12,7 @@ from rigidjax import _checks
 from rigidjax._types import HasAttitude
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.motion import Attitude, Rigid, Spin, on_the_group
-from rigidjax.solve.inputs import require_fit
+from rigidjax.solve.validation import require_fit
 
 
 class Bodies(NamedTuple):

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from rigidjax._types import Scalar
-from rigidjax.exact.doubling import Modulus, is_endless, limits
+from rigidjax.exact.jacobi_duplication import Modulus, is_endless, limits
 
 
 class HalfPeriod(NamedTuple):

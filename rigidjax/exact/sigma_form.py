@@ -36,8 +36,8 @@ import jax
 import jax.numpy as jnp
 
 from rigidjax._types import Scalar
-from rigidjax.exact.doubling import Modulus, is_endless, limits, until_rest
-from rigidjax.exact.triples import Six, Triple, adjugate, determinant, product, times
+from rigidjax.exact.components3 import Six, Triple, adjugate, determinant, product, times
+from rigidjax.exact.jacobi_duplication import Modulus, is_endless, limits, until_rest
 
 
 class Differences(NamedTuple):

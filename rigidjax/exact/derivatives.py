@@ -18,12 +18,10 @@ import jax
 import jax.numpy as jnp
 
 from rigidjax._types import Scalar
-from rigidjax.exact import tensor_flow
-from rigidjax.exact.fence import fence, opaque_one
-from rigidjax.exact.first_order import jacobian_and_integral
-from rigidjax.exact.principal_flow import momentum_and_turn, orbit
-from rigidjax.exact.tensor_flow import Differences
-from rigidjax.exact.triples import (
+from rigidjax.exact import sigma_form
+from rigidjax.exact._xla import fence, opaque_one
+from rigidjax.exact.closed_form import momentum_and_turn, orbit
+from rigidjax.exact.components3 import (
     Four,
     Six,
     Triple,
@@ -34,6 +32,8 @@ from rigidjax.exact.triples import (
     times,
     turned_back,
 )
+from rigidjax.exact.jacobian import jacobian_and_integral
+from rigidjax.exact.sigma_form import Differences
 
 # Below this turn (rad) the Taylor series, of this order, is right to round-off; above, what the
 # quotient by h² loses is round-off/turn in a first and round-off/turn² in a second derivative.
@@ -103,7 +103,7 @@ def _first_order_of_tensor(body, momentum, t):
     def of_inputs(x):
         d12, d23, k12, k13, k23, p1, p2, p3, time = x
         d13 = body.d13 + ((d12 - body.d12) + (d23 - body.d23))
-        return tensor_flow.momentum_and_integral(
+        return sigma_form.momentum_and_integral(
             Differences(d12, d13, d23, k12, k13, k23), (p1, p2, p3), time
         )
 

@@ -13,10 +13,18 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from rigidjax.batch.given import start_of
+from rigidjax.batch.validation import start_of
 from rigidjax.body.inertia import Inertia, inverse
-from rigidjax.exact.frame import into, out_of, principal_frame
-from rigidjax.exact.triples import Six, Triple, adjugate, cross, determinant, half_product, times
+from rigidjax.exact.components3 import (
+    Six,
+    Triple,
+    adjugate,
+    cross,
+    determinant,
+    half_product,
+    times,
+)
+from rigidjax.exact.principal_axes import into, out_of, principal_frame
 from rigidjax.motion import Attitude, Rigid, Spin, on_the_group
 from rigidjax.motion.torques import evaluate
 from rigidjax.rotation import quaternion
