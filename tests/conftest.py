@@ -24,6 +24,7 @@ with install_import_hook("rigidjax", "beartype.beartype"):
 gc.freeze()
 gc.set_threshold(100_000, 50, 50)
 
+
 def pytest_configure(config):
     """Compiled programs are kept beside pytest's own cache: the next run takes a third of the time.
 
