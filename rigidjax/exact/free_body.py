@@ -60,6 +60,9 @@ class FreeBody(eqx.Module):
 
     def _at(self, t: Scalar) -> HasSpin:
         t = t.astype(self.axes.dtype)
+        # Of so many turns the dtype holds no digit within one: then there is no state.
+        turned = jnp.abs(t) * jnp.max(jnp.abs(self.state0.omega))
+        t = jnp.where(turned <= 1 / jnp.finfo(t.dtype).eps, t, jnp.nan)
         momentum, (w, *axis) = flow(
             self.moments, self.momentum, times_power_of_two(t, self.exponent)
         )
@@ -96,6 +99,8 @@ def free_body(inertia: Inertia, state0: State, t: ScalarLike) -> State:
     about any axis, the separatrix and rest are ordinary points. The quaternion is continuous in t
     (it does not jump between q and −q), has length 1, and `R(q) I Ω` stays what
     it was to round-off.
+
+    A traced time in which the body turns by more than 1/eps rad gives NaN.
 
     Derivatives with respect to all arguments are closed forms and right to second order at all
     those points: they are taken from the motion as a function of the whole tensor

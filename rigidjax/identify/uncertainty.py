@@ -178,7 +178,8 @@ def _sandwich(linear: Linearised, bread: np.ndarray, times: "Times") -> np.ndarr
 
 def _fading(x: np.ndarray, rho: float) -> np.ndarray:
     """The sums y_t = x_t + ρ y_{t−1} along the second axis of (R, T, n)."""
-    # Here and below SciPy is imported where it is used: it takes as long as all of rigidjax.
+    # Imported where it is used; not `scipy.signal.lfilter`, nor `scipy.stats` below: to load each
+    # takes a second, which is as long as the rest of a first fit's imports.
     from scipy.linalg import solve_banded
 
     x = np.moveaxis(x, 1, 0)
@@ -313,9 +314,9 @@ def goodness(
 
 def _median_of_chi2(size: int) -> tuple[float, float]:
     """The median of χ² with `size` degrees of freedom, and the density there."""
-    from scipy.special import gammaincinv, gammaln
+    from scipy.special import chdtri, gammaln
 
-    freedom = 0.5 * size
-    half = float(gammaincinv(freedom, 0.5))
-    density = 0.5 * np.exp((freedom - 1) * np.log(half) - half - gammaln(freedom))
-    return 2 * half, float(density)
+    median = float(chdtri(size, 0.5))
+    power = 0.5 * size - 1
+    density = 0.5 * np.exp(power * np.log(0.5 * median) - 0.5 * median - gammaln(0.5 * size))
+    return median, float(density)

@@ -17,6 +17,7 @@ from jaxtyping import Array, Float
 
 from rigidjax import _checks
 from rigidjax._types import Mat3, Mat3Like, Scalar, Vec3, Vec3Like
+from rigidjax.special.barrier import once
 
 
 def components(v: Float[Array, "n"]) -> tuple[Scalar, ...]:
@@ -68,15 +69,6 @@ def dot_components(a: Sequence[Scalar], b: Sequence[Scalar]) -> Scalar:
 def square(v: Sequence[Scalar]) -> Scalar:
     """Squared length of a triple of scalars, to be fed to a costly function."""
     return once(dot_components(v, v))
-
-
-def once(x: Scalar) -> Scalar:
-    """The same number, computed once however often it is used.
-
-    A division by one (by 2 for NaN): XLA on CPU computes a quotient once, here and in the gradient,
-    where it would repeat anything cheaper, with all that leads to it, for every component.
-    """
-    return x / jnp.where(x == x, 1, 2)
 
 
 def near_one(*parts: Scalar) -> Scalar:

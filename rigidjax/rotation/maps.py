@@ -18,9 +18,9 @@ from rigidjax.rotation.algebra import (
     dot_components,
     entries,
     near_one,
-    once,
     square,
 )
+from rigidjax.special.barrier import once
 from rigidjax.special.series import arctan_ratio, inverse_kernel, stumpff
 
 # Inlined in whatever is being traced, so that XLA and `jax.grad` see no boundary.

@@ -13,12 +13,12 @@ from jaxtyping import Array
 
 from rigidjax.motion import on_the_group
 from rigidjax.solve import adaptive_loop, adjoint
-from rigidjax.solve.adaptive_loop import Answer, Book, Method, Run
 from rigidjax.solve.adjoint import Inputs, Outputs
 from rigidjax.solve.batching import Arrays, Layout, in_lanes, one
 from rigidjax.solve.components import flat, leaf_sizes, unflat
 from rigidjax.solve.explicit import AbstractExplicit
 from rigidjax.solve.linear_map import forward_only, linear_map
+from rigidjax.solve.record import HALTED, Answer, Method, Record, Run
 from rigidjax.solve.runge_kutta import Axes
 from rigidjax.solve.step_control import NONFINITE
 from rigidjax.solve.tableaus import Tableau
@@ -102,7 +102,7 @@ def adaptive(
         (jnp.isnan(out.h), NONFINITE),
         (out.h > 0, dfx.RESULTS.max_steps_reached),
         (out.t >= ts[-1], dfx.RESULTS.successful),
-        (out.h == adaptive_loop.HALTED, dfx.RESULTS.event_occurred),
+        (out.h == HALTED, dfx.RESULTS.event_occurred),
     ):
         result = dfx.RESULTS.where(there, word, result)
     rows = jnp.concatenate([numbers[None], out.between, out.end[None]])
@@ -230,12 +230,12 @@ def _recorded(
     del linear
     method, chosen = program.of(layout, constants)
     run = Run(*each)
-    answer, book = adaptive_loop.recording(method, chosen, run)
-    book = book._replace(
-        number=jnp.broadcast_to(book.number, run.t0.shape),
-        filled=jnp.broadcast_to(book.filled, run.t0.shape),
+    answer, record = adaptive_loop.recording(method, chosen, run)
+    record = record._replace(
+        number=jnp.broadcast_to(record.number, run.t0.shape),
+        filled=jnp.broadcast_to(record.filled, run.t0.shape),
     )
-    return [*answer, *book], []
+    return [*answer, *record], []
 
 
 _RUN, _ANSWER = len(Run._fields), len(Answer._fields)
@@ -244,24 +244,24 @@ _RUN, _ANSWER = len(Run._fields), len(Answer._fields)
 def _pushed(
     program: _Program, layout: Layout, constants: Arrays, each: Arrays, linear: Arrays
 ) -> tuple[Arrays, Arrays]:
-    run, book = Run(*each[:_RUN]), Book(*each[_RUN:])
+    run, record = Run(*each[:_RUN]), Record(*each[_RUN:])
     layout, constants = program.spread(layout, constants, run)
     method, chosen = program.of(layout, constants)
     *of_constants, ends, between, y0 = linear
     along = Inputs(of_constants, ends, between, y0)
     axes = Axes(int(layout.bodies), int(layout.directions))
-    answer, record = adjoint.tangents(method, chosen, run, book, along, axes)
-    return [], [*answer, *record]
+    answer, moved = adjoint.tangents(method, chosen, run, record, along, axes)
+    return [], [*answer, *moved]
 
 
 def _pulled(
     program: _Program, layout: Layout, constants: Arrays, each: Arrays, linear: Arrays
 ) -> tuple[Arrays, Arrays]:
-    run, book = Run(*each[:_RUN]), Book(*each[_RUN:])
+    run, record = Run(*each[:_RUN]), Record(*each[_RUN:])
     layout, constants = program.spread(layout, constants, run)
     method, chosen = program.of(layout, constants)
     axes = Axes(int(layout.bodies), int(layout.directions))
-    bars = adjoint.cotangents(method, chosen, run, book, Outputs(*linear), axes)
+    bars = adjoint.cotangents(method, chosen, run, record, Outputs(*linear), axes)
     return [], [*bars.constants, bars.ends, bars.between, bars.y0]
 
 
@@ -269,7 +269,7 @@ def _differentiated(program: _Program, primals: Arrays, tangents: Arrays) -> Any
     number = len(program.smooth)
     smooth = [i for i, s in enumerate(program.smooth) if s]
 
-    def record(*args: Any) -> Arrays:
+    def forward(*args: Any) -> Arrays:
         constants, each = list(args[:number]), list(args[number:])
         return in_lanes(partial(_recorded, program), one(constants), constants, each, [])[0]
 
@@ -281,21 +281,21 @@ def _differentiated(program: _Program, primals: Arrays, tangents: Arrays) -> Any
     def push(*args: Any) -> Arrays:
         return mapped(_pushed, *args)[:2]
 
-    def push_record(*args: Any) -> Arrays:
+    def push_forward(*args: Any) -> Arrays:
         head = number + _RUN
         given = [*args[:head], *args[head + _ANSWER : number + kept + _ANSWER]]
         moved = args[number + kept + _ANSWER :]
-        between, end, *record = mapped(_pushed, *given, *_linear(smooth, moved))
+        between, end, *moved_record = mapped(_pushed, *given, *_linear(smooth, moved))
         still = [jnp.zeros_like(a) for a in args[head + 2 : head + 5]]
         answer = [between, end, *still]
-        return [*answer, *record]
+        return [*answer, *moved_record]
 
-    kept = _RUN + len(Book._fields)
-    found = forward_only(record, push_record)(*primals)
-    answer, book = found[:_ANSWER], found[_ANSWER:]
+    kept = _RUN + len(Record._fields)
+    found = forward_only(forward, push_forward)(*primals)
+    answer, record = found[:_ANSWER], found[_ANSWER:]
     moved = [tangents[i] for i in smooth] + tangents[number:]
     between, end = linear_map(
-        push, partial(mapped, _pulled), [*primals, *book], _linear(smooth, moved)
+        push, partial(mapped, _pulled), [*primals, *record], _linear(smooth, moved)
     )
     rest = [
         jnp.zeros_like(a)

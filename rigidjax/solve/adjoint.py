@@ -2,7 +2,9 @@
 
 The derivative is that of the steps that were taken, their lengths held but for those cut short at a
 stop, which follow it, as in `diffrax.RecursiveCheckpointAdjoint`. Both directions go through the
-segments of `rigidjax.solve.adaptive_loop`; all but the last are run once more.
+segments of `rigidjax.solve.adaptive_loop`; all but the last are run once more. Where another
+program rounds otherwise, such a segment may take other steps between the same two ends: then the
+derivative is that of those, the same to the tolerance.
 """
 
 from typing import Any, NamedTuple
@@ -13,22 +15,22 @@ from jax import lax
 from jaxtyping import Array
 
 from rigidjax.solve import runge_kutta
-from rigidjax.solve.adaptive_loop import (
+from rigidjax.solve.adaptive_loop import going, recorded
+from rigidjax.solve.components import lift
+from rigidjax.solve.record import (
     LAST,
     NONE,
     VISIT,
-    Book,
     Method,
+    Record,
     Rows,
     Run,
-    Until,
-    going,
+    SegmentEnd,
     per_body,
-    recorded,
+    replaced,
     row_of,
     unpacked,
 )
-from rigidjax.solve.components import lift
 from rigidjax.solve.runge_kutta import Axes
 
 # So few rows that to add to all of them is quicker than to look for one.
@@ -55,22 +57,22 @@ class Outputs(NamedTuple):
     end: Array
 
 
-class BookTangents(NamedTuple):
-    """Tangents of a recorded run, as in `Book`."""
+class RecordTangents(NamedTuple):
+    """Tangents of a recorded run, as in `Record`."""
 
     starts: Array
     rows: Array
 
 
 def tangents(
-    method: Method, constants: list[Array], run: Run, book: Book, along: Inputs, axes: Axes
-) -> tuple[Outputs, BookTangents]:
+    method: Method, constants: list[Array], run: Run, record: Record, along: Inputs, axes: Axes
+) -> tuple[Outputs, RecordTangents]:
     """The tangents of the answer and of the record."""
-    size, number = run.between.shape[0], jnp.max(book.number)
+    size, number = run.between.shape[0], jnp.max(record.number)
 
     def segment(i: Array, state: Any) -> Any:
         moved, back, out, starts, _ = state
-        rows, count = _segment(method, constants, run, book, i)
+        rows, count = _segment(method, constants, run, record, i)
         starts = [
             lax.dynamic_update_slice_in_dim(a, b[None], i, 0)
             for a, b in zip(starts, (moved, back), strict=True)
@@ -97,40 +99,40 @@ def tangents(
             if size:
                 # What is no visit goes to the place beyond the last.
                 place = jnp.where(kind >= VISIT, kind - VISIT, size)
-                out = per_body(_replaced, run.t0.ndim)(out, after, place)
+                out = per_body(replaced, run.t0.ndim)(out, after, place)
             return jnp.where(taken, after, moved), jnp.where(taken, moved, back), out, path
 
         path = jnp.zeros((rows.shape[0], *moved.shape), moved.dtype)
         moved, back, out, path = lax.fori_loop(0, count, step, (moved, back, out, path))
         return moved, back, out, starts, path
 
-    none = jnp.zeros((book.starts.shape[0], *along.y0.shape), along.y0.dtype)
+    none = jnp.zeros((record.starts.shape[0], *along.y0.shape), along.y0.dtype)
     out = jnp.zeros((size + 1, *along.y0.shape), along.y0.dtype)
-    path = jnp.zeros((book.rows.shape[0], *along.y0.shape), along.y0.dtype)
+    path = jnp.zeros((record.rows.shape[0], *along.y0.shape), along.y0.dtype)
     state = (along.y0, along.y0, out, [none, none], path)
     moved, _, out, (y, back_y), path = lax.fori_loop(0, number, segment, state)
-    kind, stop = (book.rows[:, i].astype(jnp.int32) for i in (2, 3))
+    kind, stop = (record.rows[:, i].astype(jnp.int32) for i in (2, 3))
     heads = jnp.stack([*_of_times(run, kind, stop, along)])
     heads = _many_first(run, jnp.concatenate([heads, jnp.zeros_like(heads)]))
-    starts = unpacked(jnp.moveaxis(book.starts, 1, 0))
+    starts = unpacked(jnp.moveaxis(record.starts, 1, 0))
     zero = jnp.zeros_like(y[:, :1])
     t, back_t = (
         _many_first(run, _gathered(run, along.ends, i))[:, None]
         for i in (starts.stop, starts.back_stop)
     )
     starts = jnp.concatenate([t, zero, back_t, *[zero] * 5, y, back_y], 1)
-    return Outputs(out[:size], moved), BookTangents(starts, jnp.concatenate([heads, path], 1))
+    return Outputs(out[:size], moved), RecordTangents(starts, jnp.concatenate([heads, path], 1))
 
 
 def cotangents(
-    method: Method, constants: list[Array], run: Run, book: Book, bars: Outputs, axes: Axes
+    method: Method, constants: list[Array], run: Run, record: Record, bars: Outputs, axes: Axes
 ) -> Inputs:
     """The transpose of `tangents`, but for the record."""
-    size, number = run.between.shape[0], jnp.max(book.number)
+    size, number = run.between.shape[0], jnp.max(record.number)
     seeds = bars.between
 
     def segment(i: Array, state: Any) -> Any:
-        rows, count = _segment(method, constants, run, book, number - 1 - i)
+        rows, count = _segment(method, constants, run, record, number - 1 - i)
 
         def step(i: Array, both: Any) -> Any:
             sums, extra = both
@@ -176,21 +178,21 @@ def cotangents(
 
 
 def _segment(
-    method: Method, constants: list[Array], run: Run, book: Book, number: Array
+    method: Method, constants: list[Array], run: Run, record: Record, number: Array
 ) -> tuple[Rows, Array]:
     """The rows of a segment, and how many they are: of the last as they are, else run once more."""
-    end = jnp.max(book.number) - 1
-    last = book.starts.shape[0] - 1
-    walk, ahead = (unpacked(book.starts[jnp.clip(i, 0, last)]) for i in (number, number + 1))
+    end = jnp.max(record.number) - 1
+    last = record.starts.shape[0] - 1
+    loop, ahead = (unpacked(record.starts[jnp.clip(i, 0, last)]) for i in (number, number + 1))
     again = number < end
     # Nothing is left to do of the last one.
-    until = Until(
+    until = SegmentEnd(
         jnp.where(again, ahead.t, -jnp.inf), ahead.back_t, jnp.where(again, ahead.known, 0)
     )
-    walk, rows, _, count = recorded(method, constants, run, walk, book.rows, None, until)
+    loop, rows, _, count = recorded(method, constants, run, loop, record.rows, None, until)
     # With too little room for its steps there would be wrong numbers: then there are none.
-    short = jnp.where(jnp.any(going(method, run, walk, until)), jnp.nan, 0.0)
-    count = jnp.where(again, count, jnp.max(book.filled))
+    short = jnp.where(jnp.any(going(method, run, loop, until)), jnp.nan, 0.0)
+    count = jnp.where(again, count, jnp.max(record.filled))
     return rows.at[:, 1].add(short.astype(rows.dtype)), count
 
 
@@ -208,10 +210,6 @@ def _of_times(run: Run, kind: Array, stop: Array, along: Inputs) -> tuple[Array,
 def _where(there: Array, a: Array) -> Array:
     """`a` (…, *bodies), nothing where it is not `there`."""
     return jnp.where(lift(there, a), a, jnp.zeros_like(a))
-
-
-def _replaced(a: Array, row: Array, index: Array) -> Array:
-    return lax.dynamic_update_index_in_dim(a, row, index, 0)
 
 
 def _gathered(run: Run, a: Array, index: Array) -> Array:

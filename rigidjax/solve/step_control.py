@@ -1,11 +1,16 @@
-"""A run that cannot go on ends, and says so, instead of being ground out to the last step."""
+"""How long a step is: the norm of an error, the first step, and runs that stop on NaN."""
 
 from typing import Any
 
 import diffrax as dfx
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax import lax
 from jaxtyping import Array, Bool
+
+from rigidjax.solve.components import lift
+from rigidjax.solve.record import Method, Run
 
 # diffrax inherits it from optimistix, where type checkers do not follow.
 NONFINITE: Any = dfx.RESULTS.nonfinite
@@ -103,3 +108,41 @@ def finite(tree: Any) -> Bool[Array, ""]:
     for leaf in jax.tree.leaves(tree):
         good = good & jnp.all(jnp.isfinite(leaf))
     return good
+
+
+def error_norm(error: Array, left: Array, right: Array, rtol: Array, atol: Array) -> Array:
+    """Root mean square of error over tolerance, as `diffrax.PIDController` takes it."""
+    scale = lift(atol, left) + lift(rtol, left) * jnp.maximum(jnp.abs(left), jnp.abs(right))
+    tiny = float(jnp.finfo(error.dtype).tiny)
+    return jnp.sqrt(jnp.mean((error / scale) ** 2, 0) + tiny)
+
+
+def first_step(method: Method, constants: list[Array], run: Run) -> tuple[Array, Array]:
+    """The starting step of Hairer, Nørsett and Wanner (1993), II.4; the slope at the start."""
+    y0, t0 = run.y0, run.t0
+    scale = lift(run.atol, y0) + lift(run.rtol, y0) * jnp.abs(y0)
+
+    def norm(a: Array) -> Array:
+        return jnp.sqrt(jnp.mean((a / scale) ** 2, 0))
+
+    d0 = norm(y0)
+
+    def slope(_: Array, state: Any) -> Any:
+        # At the start, then after a short step of Euler's: one field to compile.
+        h, first, _ = state
+        now = method.field(constants, t0 + h.astype(t0.dtype), y0 + lift(h, y0) * first)
+        d1 = norm(now)
+        small = (d0 < 1e-5) | (d1 < 1e-5)
+        short = jnp.where(small, 1e-6, 0.01 * d0 / jnp.where(small, 1.0, d1)).astype(d0.dtype)
+        begun = h != 0
+        return jnp.where(begun, h, short), jnp.where(lift(begun, y0), first, now), now
+
+    h = jnp.zeros_like(d0)
+    state = (h, jnp.zeros_like(y0), jnp.zeros_like(y0))
+    h, first, last = lax.fori_loop(np.int32(0), np.int32(2), slope, state)
+    d2 = norm(last - first) / h
+    largest = jnp.maximum(norm(first), d2)
+    flat = largest <= 1e-15
+    guess = (0.01 / jnp.where(flat, 1.0, largest)) ** (1 / method.tableau.order)
+    h = jnp.minimum(100 * h, jnp.where(flat, jnp.maximum(1e-6, 1e-3 * h), guess))
+    return h.astype(t0.dtype), first
