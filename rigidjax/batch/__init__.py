@@ -1,6 +1,6 @@
 """From one body to a machine to many.
 
-    rollout     equal steps, the leanest loop; last states, thinned states, or reduced on the way
+    rollout     equal steps; last states, thinned states, or reduced on the way
     simulate    closed form, adaptive steps, or `Steps`, with a status for each body
     hosts       several processes: `connect`, `share`, `gather`, `total`
 

@@ -1,7 +1,5 @@
-"""Equal steps for a whole batch: the leanest loop, differentiable both ways in bounded memory."""
+"""Equal steps for a whole batch, differentiable in both modes in bounded memory."""
 
-import functools
-import math
 from collections.abc import Callable
 from typing import Any, TypeVar, overload
 
@@ -13,18 +11,21 @@ from jaxtyping import Array
 
 from rigidjax._types import ScalarLike
 from rigidjax.batch.sharding import Compiled, chunk_of, mesh_of, over_bodies
-from rigidjax.batch.steppers import Lane, lane_of
-from rigidjax.batch.validation import Bodies, bodies_of, step_of, time_of
+from rigidjax.batch.validation import Bodies, bodies_of, start_of, step_of, time_of
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.motion import Attitude, Rigid, Spin
-from rigidjax.solve.explicit import AbstractExplicit, Atoms
+from rigidjax.solve import equations_of_motion
+from rigidjax.solve.explicit import AbstractExplicit
+from rigidjax.solve.fixed_loop import march, piece_length
 from rigidjax.solve.magnus import Magnus4
+from rigidjax.solve.splitting import AbstractSplitting
+from rigidjax.solve.steppers import stepper_of
 
 State = TypeVar("State", Spin, Attitude, Rigid)
 Reduced = TypeVar("Reduced")
 # What `reduce` carries, the time, the state of one body → what it carries on.
 Reduce = Callable[[Any, Array, Any], Any]
-Solver = AbstractExplicit | Magnus4 | None
+Solver = AbstractExplicit | Magnus4 | AbstractSplitting | None
 # Bytes that reverse mode may keep of all chunks together.
 _KEPT = 2**23
 
@@ -171,17 +172,19 @@ def _run(plan: _Plan, reduce: Reduce | None, rest: Any, numbers: Any) -> Any:
     def one(given: Any, each: Any) -> Any:
         shared, initial, h, t0 = given
         body, state0, torque = Bodies.one(shared, each, rest)
-        lane = lane_of(body, state0, torque, t0, plan.solver)
+        state0 = start_of(state0)
+        field = equations_of_motion(body, state0, torque)
+        stepper = stepper_of(plan.solver, field, state0)
 
         def piece(carry: Any, first: Array) -> Any:
             y, carried = carry
-            y = march(lane, h, t0, first, plan.every, y)
+            y = march(stepper, h, t0, first, plan.every, y)
             if reduce is not None:
                 t = t0 + (first + plan.every).astype(h.dtype) * h
-                carried = reduce(carried, t, lane.state(y))
-            return (y, carried), lane.state(y) if plan.keep else None
+                carried = reduce(carried, t, stepper.state(y))
+            return (y, carried), stepper.state(y) if plan.keep else None
 
-        begin = (lane.start, initial)
+        begin = (stepper.start, initial)
         if plan.every == plan.count:
             (y, carried), kept = piece(begin, jnp.zeros((), jnp.int32))
             kept = jax.tree.map(lambda leaf: leaf[None], kept)
@@ -189,8 +192,8 @@ def _run(plan: _Plan, reduce: Reduce | None, rest: Any, numbers: Any) -> Any:
             firsts = jnp.arange(0, plan.count, plan.every, dtype=jnp.int32)
             (y, carried), kept = lax.scan(piece, begin, firsts)
         if reduce is not None:
-            return lane.state(y), carried
-        return kept if plan.keep else lane.state(y)
+            return stepper.state(y), carried
+        return kept if plan.keep else stepper.state(y)
 
     size = sum(leaf.size for leaf in jax.tree.leaves(each)) * h.dtype.itemsize
     if size * (plan.count // plan.every) * (plan.every // piece_length(plan.every) + 1) > _KEPT:
@@ -200,42 +203,3 @@ def _run(plan: _Plan, reduce: Reduce | None, rest: Any, numbers: Any) -> Any:
 
 
 _compiled = Compiled(_run)
-
-
-def march(lane: Lane, h: Array, t0: Array, first: Array, count: int, y: Atoms) -> Atoms:
-    """`count` steps from number `first` on.
-
-    In reverse mode the states at the starts of √count pieces are kept, and those in one piece.
-    """
-
-    def at(i: Array) -> Array:
-        # Not t + h again and again: round-off would add up (a million steps, 1e-3 in float32).
-        return t0 + i.astype(h.dtype) * h
-
-    @functools.partial(jax.checkpoint, prevent_cse=False)
-    def step(y: Atoms, i: Array) -> tuple[Atoms, None]:
-        return lane.step(at(i), at(i + 1), h, y), None
-
-    @functools.partial(jax.checkpoint, prevent_cse=False, static_argnums=2)
-    def some(y: Atoms, begin: Array, many: int) -> Atoms:
-        return lax.scan(step, y, begin + jnp.arange(many, dtype=jnp.int32))[0]
-
-    length = piece_length(count)
-    pieces, left = divmod(count, length)
-    if pieces > 1:
-        starts = first + length * jnp.arange(pieces, dtype=jnp.int32)
-        y, _ = lax.scan(lambda y, begin: (some(y, begin, length), None), y, starts)
-    else:
-        y = some(y, first, length)
-    return some(y, first + pieces * length, left) if left else y
-
-
-def piece_length(count: int) -> int:
-    """About √count steps; a divisor of count where there is one near, for less to compile.
-
-    >>> piece_length(1000), piece_length(997)
-    (40, 32)
-    """
-    root = math.isqrt(count - 1) + 1
-    near = [d for d in range(root, min(2 * root, count) + 1) if count % d == 0]
-    return near[0] if near else root

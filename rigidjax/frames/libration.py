@@ -29,6 +29,7 @@ class Tide(eqx.Module):
     """
 
     feels: ClassVar[type] = HasAttitude
+    rate_free: ClassVar[bool] = True
     rate: Scalar
 
     def __call__(self, t: ScalarLike, state: Any, body: Any) -> Vec3:

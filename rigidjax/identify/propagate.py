@@ -16,7 +16,7 @@ from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.exact import FreeBody
 from rigidjax.motion import Attitude, Rigid
 from rigidjax.motion.torques import Torque
-from rigidjax.solve import equations_of_motion, lean, simulate, solvers
+from rigidjax.solve import equations_of_motion, fixed, simulate, solvers
 
 # Radians turned in a step: a fifth-order method then errs by 1e-9 a radian.
 TURN_A_STEP = 0.1
@@ -49,7 +49,7 @@ class FixedSteps(AbstractIntegrator):
 
     def states(self, body: Any, state0: Any, ts: Float[Array, " times"], torque: Torque) -> Any:
         field = equations_of_motion(body, state0, torque)
-        return lean.fixed(solvers.Tsitouras5(), field, ts, state0, self.substeps)
+        return fixed(solvers.Tsitouras5(), field, ts, state0, self.substeps)
 
 
 class Adaptive(AbstractIntegrator):

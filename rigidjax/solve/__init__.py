@@ -1,7 +1,9 @@
-"""Answers with a solver, all of them diffrax's."""
+"""Answers with a solver: by our own loops, or by diffrax."""
 
 from rigidjax._names import own_names
-from rigidjax.solve import lean as lean, solvers as solvers
+from rigidjax.solve import solvers as solvers
+from rigidjax.solve.adaptive import adaptive as adaptive
+from rigidjax.solve.fixed_loop import fixed as fixed
 from rigidjax.solve.projection import (
     GroupInterpolation as GroupInterpolation,
     Projected as Projected,

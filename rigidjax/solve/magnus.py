@@ -10,17 +10,14 @@ from typing import Any, ClassVar
 import diffrax as dfx
 import jax
 import jax.numpy as jnp
-from jax.extend import core
 from jaxtyping import Array
 
-from rigidjax.body.inertia import Inertia
 from rigidjax.exact.components3 import Four, Triple, cross
 from rigidjax.motion import Attitude, AttitudeEquations
-from rigidjax.motion.torques import evaluate
+from rigidjax.motion.torques.base import sees_attitude
 from rigidjax.rotation.maps import product4, square4
 from rigidjax.solve.components import join, split
 from rigidjax.solve.explicit import NestedInterpolation, advance, cubic_rows
-from rigidjax.solve.scalarise import scalarise
 from rigidjax.solve.tableaus import KUTTA4
 from rigidjax.special.barrier import barrier
 
@@ -105,18 +102,19 @@ class Magnus4(dfx.AbstractSolver):
                 "Magnus4: wanted AttitudeEquations and an Attitude state, got "
                 f"{type(field).__name__} and {type(y0).__name__}; use RungeKutta4"
             )
-        require_blind(field.euler.torque, jnp.asarray(t0), y0, field.euler.inertia)
+        require_blind(field.euler.torque)
 
     def step(
         self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Any, made_jump: Any
     ) -> Any:
-        numbers = scalarise(lambda t, y: terms.vf(t, y, args), t0, y0)
         start = split(y0)
         q, omega = start[:4], start[4:]
         h = jnp.asarray(terms.contr(t0, t1), y0.omega.dtype)
+        # A law that looks at the attitude against its word gets none.
+        nowhere = jnp.full_like(y0.q, jnp.nan)
 
         def slope(t: Any, omega: Triple) -> Triple:
-            return numbers(t, *q, *omega)[4:]
+            return split(terms.vf(t, Attitude(nowhere, jnp.stack(omega)), args).omega)
 
         q1, omega1 = turned(slope, lambda omega: omega, t0, t1, h, q, omega)
         y1: Any = join((*q1, *omega1), y0)
@@ -132,31 +130,11 @@ class Magnus4(dfx.AbstractSolver):
         return terms.vf(t0, y0, args)
 
 
-def require_blind(law: Any, t: Array, state: Attitude, body: Inertia) -> None:
-    """Raise `TypeError` if the law's value is computed from the attitude."""
-    if law is not None and sees_attitude(law, t, state, body):
+def require_blind(law: Any) -> None:
+    """Raise `TypeError` unless the law says, by its rung, that it does not look at the attitude."""
+    if sees_attitude(law):
         raise TypeError(
-            f"Magnus4: the torque {type(law).__name__} depends on the attitude; only time and body "
-            "rate may enter it; use rigidjax.solvers.RungeKutta4"
+            f"Magnus4: the torque {type(law).__name__} depends on the attitude, or does not say "
+            "what it feels; only time and body rate may enter it: a law of your own says so by "
+            "feels = rigidjax.HasSpin; for others use rigidjax.solvers.RungeKutta4"
         )
-
-
-def sees_attitude(law: Any, t: Array, state: Attitude, body: Inertia) -> bool:
-    """Whether the law's value is computed from the attitude, read off its operations.
-
-    >>> import rigidjax as rj
-    >>> body = rj.Inertia.from_principal(1.0, 2.0, 3.0)
-    >>> state = rj.Attitude([1.0, 0, 0, 0], [1.0, 0.0, 0.0])
-    >>> sees_attitude(rj.torques.Damping([1.0, 1, 1]), jnp.zeros(()), state, body)
-    False
-    """
-
-    def torque(q: Array, t: Array, omega: Array) -> Array:
-        return evaluate(law, t, Attitude(q, omega), body)
-
-    jaxpr = jax.make_jaxpr(torque)(state.q, t, state.omega).jaxpr
-    reached = {jaxpr.invars[0]}
-    for equation in jaxpr.eqns:
-        if any(not isinstance(a, core.Literal) and a in reached for a in equation.invars):
-            reached.update(equation.outvars)
-    return any(not isinstance(a, core.Literal) and a in reached for a in jaxpr.outvars)

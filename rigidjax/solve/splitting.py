@@ -13,7 +13,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jax.extend import core
 from jaxtyping import Array
 
 from rigidjax.exact.components3 import Six, Triple, times
@@ -21,6 +20,7 @@ from rigidjax.exact.derivatives import flow
 from rigidjax.exact.principal_axes import into, out_of, principal_frame
 from rigidjax.motion import Attitude, AttitudeEquations
 from rigidjax.motion.torques import evaluate
+from rigidjax.motion.torques.base import sees_rate
 from rigidjax.rotation import quaternion
 from rigidjax.solve.explicit import NestedInterpolation, cubic_rows
 
@@ -90,7 +90,7 @@ class AbstractSplitting(dfx.AbstractSolver):
         return self.composition.order
 
     def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> Frame:
-        return frame_of(_field_of(terms)[0], t0, y0)
+        return frame_of(_field_of(terms)[0], y0)
 
     def step(
         self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Frame, made_jump: Any
@@ -148,7 +148,7 @@ class Splitting6(AbstractSplitting):
     composition: ClassVar[Composition] = SRKN11
 
 
-def frame_of(field: Any, t0: Any, y0: Any) -> Frame:
+def frame_of(field: Any, y0: Any) -> Frame:
     """The principal frame of the field's body.
 
     **Raises:** `TypeError` for another field than `AttitudeEquations`, or a torque that feels the
@@ -160,10 +160,11 @@ def frame_of(field: Any, t0: Any, y0: Any) -> Frame:
             f"{type(field).__name__} and {type(y0).__name__}; use DormandPrince8"
         )
     torque = field.euler.torque
-    if _feels_rate(field, t0, y0):
+    if sees_rate(torque):
         raise TypeError(
             f"Splitting: the torque {type(torque).__name__} depends on the body rate (damping, a "
-            "flywheel); only time and attitude may enter a kick; use DormandPrince8"
+            "flywheel), or does not say that it does not; only time and attitude may enter a kick: "
+            "a law of your own says so by rate_free = True; for others use DormandPrince8"
         )
     return Frame(*principal_frame(field.euler.inertia.tensor.astype(y0.omega.dtype)))
 
@@ -188,8 +189,8 @@ def compose(
     def kicked(t: Any, weight: Any, q: Array, momentum: Triple) -> Triple:
         if field.euler.torque is None:
             return momentum
-        # The torque has been seen not to look at the rate.
-        at = Attitude(q, jnp.zeros(3, dtype))
+        # A torque that looks at the rate against its word gets none.
+        at = Attitude(q, jnp.full(3, jnp.nan, dtype))
         a, b, c = into(frame.axes, evaluate(field.euler.torque, t, at, field.euler.inertia))
         x, y, z = momentum
         return x + weight * a, y + weight * b, z + weight * c
@@ -258,20 +259,3 @@ def _field_of(terms: Any) -> tuple[Any, Any]:
     if isinstance(terms, dfx.ODETerm):
         return terms.vector_field, 1
     return terms.term.vector_field, terms.direction
-
-
-def _feels_rate(field: AttitudeEquations, t0: Any, y0: Attitude) -> bool:
-    """Whether the torque's value is computed from the body rate, read off its operations."""
-    law = field.euler.torque
-    if law is None:
-        return False
-
-    def torque(omega: Array, t: Any, q: Array) -> Array:
-        return evaluate(law, t, Attitude(q, omega), field.euler.inertia)
-
-    jaxpr = jax.make_jaxpr(torque)(y0.omega, t0, y0.q).jaxpr
-    reached = {jaxpr.invars[0]}
-    for equation in jaxpr.eqns:
-        if any(not isinstance(a, core.Literal) and a in reached for a in equation.invars):
-            reached.update(equation.outvars)
-    return any(not isinstance(a, core.Literal) and a in reached for a in jaxpr.outvars)

@@ -11,7 +11,7 @@ import numpy as np
 from rigidjax.body.inertia import Inertia
 from rigidjax.motion import Attitude, AttitudeEquations, drift
 from rigidjax.motion.torques import HeavyTop
-from rigidjax.solve import lean, solvers
+from rigidjax.solve import fixed, solvers
 from rigidjax.workprecision.record import Record
 
 STEPS = 1_000_000
@@ -45,18 +45,15 @@ def long_drift(
     law = HeavyTop(1.0, [0.05, 0.1, 0.3], [0.0, 0.0, -1.0])
     field = AttitudeEquations(body, law)
 
-    def split(solver: Any) -> Callable[..., Any]:
-        return lambda ts, n: lean.split_fixed(solver, field, ts, start, n)
-
-    def explicit(solver: Any) -> Callable[..., Any]:
-        return lambda ts, n: lean.fixed(solver, field, ts, start, n)
+    def equal(solver: Any) -> Callable[..., Any]:
+        return lambda ts, n: fixed(solver, field, ts, start, n)
 
     runs: dict[str, tuple[float, Callable[..., Any]]] = {
-        "Splitting2": (0.1, split(solvers.Splitting2())),
-        "Splitting4": (0.1, split(solvers.Splitting4())),
-        "Splitting6": (0.2, split(solvers.Splitting6())),
-        "DormandPrince8": (0.1, explicit(solvers.DormandPrince8())),
-        "RungeKutta4": (0.02, explicit(solvers.RungeKutta4())),
+        "Splitting2": (0.1, equal(solvers.Splitting2())),
+        "Splitting4": (0.1, equal(solvers.Splitting4())),
+        "Splitting6": (0.2, equal(solvers.Splitting6())),
+        "DormandPrince8": (0.1, equal(solvers.DormandPrince8())),
+        "RungeKutta4": (0.02, equal(solvers.RungeKutta4())),
     }
     unknown = sorted(set(only or ()) - set(runs))
     if unknown:

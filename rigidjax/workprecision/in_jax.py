@@ -11,7 +11,7 @@ import jax.numpy as jnp
 
 from rigidjax import _checks
 from rigidjax.exact import FreeBody
-from rigidjax.solve import equations_of_motion, lean, simulate, solvers
+from rigidjax.solve import adaptive, equations_of_motion, fixed, simulate, solvers
 from rigidjax.workprecision.method import Method, Ready, Run
 from rigidjax.workprecision.scene import Scene
 
@@ -90,13 +90,13 @@ def _field(scene: Scene, body: Any, start: Any) -> Any:
     return equations_of_motion(body, start, scene.torque)
 
 
-def _lean(scene: Scene, solver: Any) -> Flow:
+def _adaptive(scene: Scene, solver: Any) -> Flow:
     """What `simulate` runs in under a torque, without its front door, in both modes."""
 
     def flow(numbers: Any, setting: Any) -> tuple[Any, Any]:
         body, start = scene.assembled(numbers)
         ts = jnp.array([0.0, scene.end], numbers.dtype)
-        out = lean.adaptive(
+        out = adaptive(
             solver, _field(scene, body, start), ts, start, rtol=setting, atol=1e-3 * setting,
             max_steps=MOST,
         )  # fmt: skip
@@ -110,23 +110,14 @@ def _equal(scene: Scene, solver: Any) -> Flow:
     def flow(numbers: Any, setting: Any) -> tuple[Any, Any]:
         body, start = scene.assembled(numbers)
         ts, count = jnp.array([0.0, scene.end], numbers.dtype), setting.astype(int)
-        ys = lean.fixed(solver, _field(scene, body, start), ts, start, count)
+        ys = fixed(solver, _field(scene, body, start), ts, start, count)
         return scene.flat(jax.tree.map(lambda leaf: leaf[-1], ys)), count
 
     return flow
 
 
 def _split(scene: Scene, solver: Any) -> Flow | None:
-    if scene.body is None:
-        return None
-
-    def flow(numbers: Any, setting: Any) -> tuple[Any, Any]:
-        body, start = scene.assembled(numbers)
-        ts, count = jnp.array([0.0, scene.end], numbers.dtype), setting.astype(int)
-        ys: Any = lean.split_fixed(solver, _field(scene, body, start), ts, start, count)
-        return scene.flat(jax.tree.map(lambda leaf: leaf[-1], ys)), count
-
-    return flow
+    return None if scene.body is None else _equal(scene, solver)
 
 
 def _in_diffrax(scene: Scene, solver: Any, adjoint: Any = None) -> Flow:
@@ -249,13 +240,13 @@ def methods_in_jax() -> list[Method]:
             "DormandPrince8",
             "ours",
             TOLERANCES,
-            partial(_value, partial(_lean, solver=eight)),
+            partial(_value, partial(_adaptive, solver=eight)),
             {
-                "forward": partial(_slope, partial(_lean, solver=eight), jax.jacfwd),
-                "reverse": partial(_slope, partial(_lean, solver=eight), jax.grad),
+                "forward": partial(_slope, partial(_adaptive, solver=eight), jax.jacfwd),
+                "reverse": partial(_slope, partial(_adaptive, solver=eight), jax.grad),
             },
         ),
-        Method("Tsitouras5", "ours", TOLERANCES, partial(_value, partial(_lean, solver=five))),
+        Method("Tsitouras5", "ours", TOLERANCES, partial(_value, partial(_adaptive, solver=five))),
         Method(
             "DormandPrince8, equal steps", "ours", EIGHT,
             partial(_value, partial(_equal, solver=eight)), equal=True,

@@ -11,7 +11,7 @@ import numpy as np
 
 from rigidjax.frames import scene_of
 from rigidjax.motion import Attitude, conserved
-from rigidjax.solve import equations_of_motion, lean, solvers
+from rigidjax.solve import equations_of_motion, fixed, solvers
 from rigidjax.workprecision import known
 from rigidjax.workprecision.method import Method, Ready, Run
 from rigidjax.workprecision.record import Record
@@ -94,7 +94,7 @@ def worked_out(scene: Scene, gradients: bool = True) -> Reference:
     def flow(numbers: Any, count: Any) -> Any:
         body, start = scene.assembled(numbers)
         field = equations_of_motion(body, start, scene.torque)
-        ys = lean.fixed(solvers.DormandPrince8(), field, ts, start, count)
+        ys = fixed(solvers.DormandPrince8(), field, ts, start, count)
         return scene.flat(jax.tree.map(lambda leaf: leaf[-1], ys))
 
     scale = max(1.0, _turn(scene) / 50)

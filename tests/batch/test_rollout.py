@@ -10,7 +10,7 @@ from once import once
 
 import rigidjax as rj
 from rigidjax.batch.sharding import over_bodies
-from rigidjax.solve import lean
+from rigidjax.solve import fixed
 
 KUTTA = rj.solvers.RungeKutta4()
 TOP = rj.torques.HeavyTop(1.0, [0.1, 0.2, 1.0], [0.0, 0.0, -1.0])
@@ -108,9 +108,7 @@ def test_derivatives_are_those_of_the_steps():
         def one(tensor, q, omega):
             field = rj.AttitudeEquations(rj.Inertia(tensor), law)
             ts = jnp.stack([0.0 * h, 6 * h])
-            return jax.tree.map(
-                lambda a: a[1], lean.fixed(KUTTA, field, ts, rj.Attitude(q, omega), 6)
-            )
+            return jax.tree.map(lambda a: a[1], fixed(KUTTA, field, ts, rj.Attitude(q, omega), 6))
 
         return weighed(jax.vmap(one)(tensor, states.q, omega))
 
@@ -266,7 +264,7 @@ def test_words(unhooked):
         run(bodies, rj.Attitude(states.q.at[2].mul(2.0), states.omega), 0.1, 4)
     with pytest.raises(TypeError, match="depends on the attitude"):
         run(bodies, states, 0.1, 4, TOP, solver=rj.solvers.Magnus4())
-    with pytest.raises(TypeError, match="no lean step of Dopri8"):
+    with pytest.raises(TypeError, match="no equal steps of Dopri8"):
         run(bodies, states, 0.1, 4, TOP, solver=dfx.Dopri8())
     with pytest.raises(TypeError, match="HasAttitude"):
         run(bodies, rj.Spin(states.omega), 0.1, 4, TOP)

@@ -15,7 +15,7 @@ import numpy as np
 jax.config.update("jax_enable_x64", True)
 
 import rigidjax as rj
-from rigidjax.solve import lean
+from rigidjax.solve import fixed
 
 EQUAL = dfx.ConstantStepSize()
 
@@ -40,11 +40,11 @@ def large_steps(axis):
     size = float(jnp.linalg.norm(start.omega))
     steps = np.logspace(-1.5, 1, 22) / size
     runs = {
-        "RungeKutta4": lambda ts: lean.fixed(rj.solvers.RungeKutta4(), field, ts, start, 2),
-        "Tsitouras5": lambda ts: lean.fixed(rj.solvers.Tsitouras5(), field, ts, start, 2),
-        "DormandPrince8": lambda ts: lean.fixed(rj.solvers.DormandPrince8(), field, ts, start, 2),
-        "Splitting2": lambda ts: lean.split_fixed(rj.solvers.Splitting2(), field, ts, start, 2),
-        "Splitting4": lambda ts: lean.split_fixed(rj.solvers.Splitting4(), field, ts, start, 2),
+        "RungeKutta4": lambda ts: fixed(rj.solvers.RungeKutta4(), field, ts, start, 2),
+        "Tsitouras5": lambda ts: fixed(rj.solvers.Tsitouras5(), field, ts, start, 2),
+        "DormandPrince8": lambda ts: fixed(rj.solvers.DormandPrince8(), field, ts, start, 2),
+        "Splitting2": lambda ts: fixed(rj.solvers.Splitting2(), field, ts, start, 2),
+        "Splitting4": lambda ts: fixed(rj.solvers.Splitting4(), field, ts, start, 2),
     }
     for name, run in runs.items():
         ready = jax.jit(lambda ts, run=run: rj.drift(ts, run(ts), body, law)["energy"])

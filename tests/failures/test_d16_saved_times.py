@@ -11,7 +11,7 @@ import pytest
 from systems.tumble import BODY, START, TOP
 
 import rigidjax as rj
-from rigidjax.solve import lean
+from rigidjax.solve import fixed
 
 FIELD = rj.AttitudeEquations(BODY, TOP)
 TS = jnp.linspace(0.0, 20.0, 301)
@@ -20,7 +20,7 @@ TS = jnp.linspace(0.0, 20.0, 301)
 @jax.jit
 @jax.vmap
 def carried(t0, y, t):
-    ys = lean.fixed(rj.solvers.Tsitouras5(), FIELD, jnp.stack([t0, t]), y, 40)
+    ys = fixed(rj.solvers.Tsitouras5(), FIELD, jnp.stack([t0, t]), y, 40)
     return jax.tree.map(lambda leaf: leaf[-1], ys)
 
 

@@ -9,7 +9,7 @@ import pytest
 from once import once
 
 import rigidjax as rj
-from rigidjax.solve import adaptive_loop, adjoint, batching, lean
+from rigidjax.solve import adaptive, adaptive_loop, adjoint, batching
 
 Q = np.array([0.8, -0.2, 0.4, 0.4]) / np.linalg.norm([0.8, -0.2, 0.4, 0.4])
 TENSOR = np.array([[1.0, 0.05, -0.1], [0.05, 1.7, 0.2], [-0.1, 0.2, 2.2]])
@@ -46,7 +46,7 @@ def run(name, ts, p, weights, max_steps=100_000):
     field = rj.AttitudeEquations(rj.Inertia(tensor), torque)
     y0 = rj.Attitude(jnp.asarray(Q) + start[:4], jnp.array([1.3, 0.7, -1.6]) + start[4:])
     jumps = rj.torques.jumps_of(torque)
-    out = lean.adaptive(
+    out = adaptive(
         rj.solvers.DormandPrince8(), field, ts, y0, rtol=1e-10, atol=1e-12, jumps=jumps,
         max_steps=max_steps,
     )  # fmt: skip

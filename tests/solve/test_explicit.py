@@ -13,7 +13,7 @@ from once import filter_once, once
 from systems import driven, free_body_mp
 
 import rigidjax as rj
-from rigidjax.solve import lean, tableaus
+from rigidjax.solve import adaptive, fixed, tableaus
 from rigidjax.solve.explicit import DormandPrince8, RungeKutta4, Tsitouras5
 
 # Steps over the span of the slope: errors between the round-off and what is not yet asymptotic.
@@ -30,7 +30,7 @@ LATE = 3.0
 
 @eqx.filter_jit
 def run(solver, field, y0, t0, t1, steps):
-    ys = lean.fixed(solver, field, jnp.stack([t0, t1]), y0, steps)
+    ys = fixed(solver, field, jnp.stack([t0, t1]), y0, steps)
     return jax.tree.map(lambda leaf: leaf[-1], ys)
 
 
@@ -197,7 +197,7 @@ def test_adaptive_loops_and_diffrax_controllers_agree():
 
     @filter_once
     def both(tol):
-        ours = lean.adaptive(Tsitouras5(), driven.field(), ts, y0, rtol=tol, atol=tol)
+        ours = adaptive(Tsitouras5(), driven.field(), ts, y0, rtol=tol, atol=tol)
         theirs = dfx.diffeqsolve(
             dfx.ODETerm(driven.field()), Tsitouras5(), ts[0], ts[-1], None, y0,
             stepsize_controller=dfx.PIDController(rtol=tol, atol=tol), saveat=dfx.SaveAt(ts=ts),
@@ -227,13 +227,11 @@ def test_every_derivative_agrees():
             return end
 
         def fixed(w):
-            return lean.fixed(RungeKutta4(), FREE, jnp.array([0.0, 1.0]), rj.Attitude(Q, w), 400).q[
-                -1
-            ]
+            return fixed(RungeKutta4(), FREE, jnp.array([0.0, 1.0]), rj.Attitude(Q, w), 400).q[-1]
 
         def adaptive(w):
             y0, ts = rj.Attitude(Q, w), jnp.array([0.0, 1.0])
-            return lean.adaptive(Tsitouras5(), FREE, ts, y0, rtol=1e-11, atol=1e-11).ys.q[-1]
+            return adaptive(Tsitouras5(), FREE, ts, y0, rtol=1e-11, atol=1e-11).ys.q[-1]
 
         return [
             jax.jacfwd(plain(dfx.ForwardMode()))(omega),
@@ -296,7 +294,7 @@ def test_backwards_rigid_spin_and_batches():
     euler = rj.EulerEquations(BODY)
 
     def end(w):
-        return lean.adaptive(Tsitouras5(), euler, ts, rj.Spin(w), rtol=1e-9, atol=1e-9).ys.omega[-1]
+        return adaptive(Tsitouras5(), euler, ts, rj.Spin(w), rtol=1e-9, atol=1e-9).ys.omega[-1]
 
     together = once(jax.vmap(end))(rates)
     wanted = [rj.exact.free_body(BODY, rj.Spin(w), 1.0).omega for w in rates]
@@ -307,17 +305,17 @@ def test_single_precision_stays_single():
     single = lambda x: jnp.asarray(x, jnp.float32)
     field, y0 = driven.field(jnp.float32), driven.start(single(0.0))
     ts = single([0.0, LATE])
-    end = lean.fixed(Tsitouras5(), field, ts, y0, 1000).q[-1]
+    end = fixed(Tsitouras5(), field, ts, y0, 1000).q[-1]
     assert end.dtype == jnp.float32
     assert float(driven.error(end, ts[1])) < 1e-5
 
 
 def test_failures_are_results_not_numbers():
     ts = jnp.array([0.0, 1.0, 20.0])
-    out = lean.adaptive(Tsitouras5(), FREE, ts, START, rtol=1e-9, atol=1e-9, max_steps=60)
+    out = adaptive(Tsitouras5(), FREE, ts, START, rtol=1e-9, atol=1e-9, max_steps=60)
     assert out.result == dfx.RESULTS.max_steps_reached
     assert np.all(np.isfinite(out.ys.q[1])) and np.all(np.isnan(out.ys.q[2]))
     bad = rj.Attitude(Q, [jnp.nan, 0.0, 1.0])
-    out = lean.adaptive(Tsitouras5(), FREE, ts, bad, rtol=1e-9, atol=1e-9)
+    out = adaptive(Tsitouras5(), FREE, ts, bad, rtol=1e-9, atol=1e-9)
     assert out.result != dfx.RESULTS.successful
     assert int(out.num_steps) <= 2

@@ -11,7 +11,7 @@ import pytest
 from systems import driven
 
 import rigidjax as rj
-from rigidjax.solve import lean, splitting
+from rigidjax.solve import fixed, splitting
 from rigidjax.solve.solvers import DormandPrince8, Splitting2, Splitting4, Splitting6
 
 LADDER = {Splitting2: (40, 80, 160), Splitting4: (40, 80, 160), Splitting6: (10, 16, 24)}
@@ -28,6 +28,7 @@ class Swaying(rj.torques.AbstractTorque):
     """A top whose pivot is shaken: a torque of time and attitude."""
 
     feels = rj.HasAttitude
+    rate_free = True
 
     def __call__(self, t, state, body):
         return (1 + 0.5 * jnp.sin(3 * t)) * TOP(t, state, body)
@@ -38,14 +39,14 @@ FIELDS = {"top": rj.AttitudeEquations(BODY, TOP), "swaying": rj.AttitudeEquation
 
 @eqx.filter_jit
 def run(solver, field, y0, t1, steps):
-    return lean.split_fixed(solver, field, jnp.stack([jnp.zeros_like(t1), t1]), y0, steps)
+    return fixed(solver, field, jnp.stack([jnp.zeros_like(t1), t1]), y0, steps)
 
 
 @pytest.fixture(scope="module")
 def reference():
     ts = jnp.array([0.0, LATE])
     return {
-        name: np.asarray(lean.fixed(DormandPrince8(), field, ts, START, 400).q[-1])
+        name: np.asarray(fixed(DormandPrince8(), field, ts, START, 400).q[-1])
         for name, field in FIELDS.items()
     }
 
@@ -91,7 +92,7 @@ def test_invariants_over_a_hundred_thousand_steps():
 
     @eqx.filter_jit
     def long(n):
-        return lean.split_fixed(Splitting2(), free, ts, START, n)
+        return fixed(Splitting2(), free, ts, START, n)
 
     ys = long(jnp.asarray(10_000))
     assert float(jnp.abs(jnp.linalg.norm(ys.q, axis=1) - 1).max()) < 1e-15
@@ -108,7 +109,7 @@ def test_energy_of_a_top_is_bounded_without_trend():
 
     @eqx.filter_jit
     def long(n):
-        ys = lean.split_fixed(Splitting4(), FIELDS["top"], ts, START, n)
+        ys = fixed(Splitting4(), FIELDS["top"], ts, START, n)
         return jax.vmap(energy)(ys)
 
     drift = np.abs(np.asarray(long(jnp.asarray(50))) / float(energy(START)) - 1)
@@ -148,7 +149,7 @@ def test_diffrax_saves_on_the_group_with_the_methods_error(method):
             dfx.ODETerm(FIELDS["top"]), method(), 0.0, LATE, dt, START, saveat=dfx.SaveAt(ts=ts)
         ).ys.q  # fmt: skip
 
-    exact = lean.fixed(DormandPrince8(), FIELDS["top"], ts, START, 12).q
+    exact = fixed(DormandPrince8(), FIELDS["top"], ts, START, 12).q
     gaps = []
     for n in (steps // 2, steps):
         inside = solve(jnp.asarray(LATE / n))
@@ -161,14 +162,12 @@ def test_diffrax_saves_on_the_group_with_the_methods_error(method):
 @pytest.mark.slow
 def test_derivatives_of_a_run():
     def end(w):
-        ys = lean.split_fixed(
-            Splitting6(), FIELDS["top"], jnp.array([0.0, 0.5]), rj.Attitude(Q, w), 8
-        )
+        ys = fixed(Splitting6(), FIELDS["top"], jnp.array([0.0, 0.5]), rj.Attitude(Q, w), 8)
         return ys.q[-1]
 
     def right(w):
         ts = jnp.array([0.0, 0.5])
-        return lean.fixed(DormandPrince8(), FIELDS["top"], ts, rj.Attitude(Q, w), 8).q[-1]
+        return fixed(DormandPrince8(), FIELDS["top"], ts, rj.Attitude(Q, w), 8).q[-1]
 
     w = jnp.asarray(START.omega)
     np.testing.assert_allclose(
@@ -192,7 +191,7 @@ def test_what_it_cannot_do_is_refused(field, start, words):
 def test_driven_body_in_single_precision():
     y0 = driven.start(jnp.zeros((), jnp.float32))
     ts = jnp.asarray([0.0, 1.0], jnp.float32)
-    q = lean.split_fixed(Splitting4(), driven.field(jnp.float32), ts, y0, 50).q[-1]
+    q = fixed(Splitting4(), driven.field(jnp.float32), ts, y0, 50).q[-1]
     assert q.dtype == jnp.float32
     assert float(driven.error(q, ts[1])) < 2e-5
 
@@ -204,7 +203,7 @@ def test_a_million_steps_of_a_top():
 
     @eqx.filter_jit
     def long(n):
-        ys = lean.split_fixed(Splitting4(), FIELDS["top"], ts, START, n)
+        ys = fixed(Splitting4(), FIELDS["top"], ts, START, n)
         world = jax.vmap(lambda q, w: rj.spatial_angular_momentum(BODY, rj.Attitude(q, w)))(
             ys.q, ys.omega
         )

@@ -330,7 +330,7 @@ row(
 leave_out("simulate returns it", "Solution")
 leave_out(
     "inner loops: simulate and rollout run them",
-    *(f"solve.lean.{n}" for n in ("adaptive", "fixed", "split_fixed")),
+    *(f"solve.{n}" for n in ("adaptive", "fixed")),
 )
 
 # Batches.

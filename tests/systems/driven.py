@@ -47,6 +47,7 @@ def attitude(t):
 
 class Driver(rj.torques.AbstractTorque):
     feels = rj.HasSpin
+    rate_free = True
     moments: jax.Array
 
     def __call__(self, t, state, body):

@@ -49,11 +49,13 @@ class AbstractTorque(eqx.Module):
     you read from the state: `HasSpin` (`.omega`), `HasAttitude` (also `.q`) or `HasPose` (also
     `.x`, `.v`). `body` is what `simulate` was given: an `Inertia`, or `MassProperties` for `Rigid`.
 
-    Optional members say what is conserved (see `rigidjax.conserved`): a method
-    `energy(t, state, body)`, J, if the law has a potential; a property `steady`, whether the law
-    is free of explicit time; a property `axis` (3,), world frame, about which it has no torque; a
-    method `internal_momentum(t)` (3,), N m s, body frame, if nothing outside turns the body: what
-    the law holds inside; a property `jump_times` (n,), s, where it jumps or has a kink.
+    Optional members. A property `rate_free`, whether the law does not look at the body rate: then
+    `rigidjax.solvers.Splitting4` and its like can be used. What is conserved (see
+    `rigidjax.conserved`): a method `energy(t, state, body)`, J, if the law has a potential; a
+    property `steady`, whether the law is free of explicit time; a property `axis` (3,), world
+    frame, about which it has no torque; a method `internal_momentum(t)` (3,), N m s, body frame, if
+    nothing outside turns the body: what the law holds inside; a property `jump_times` (n,), s,
+    where it jumps or has a kink.
     """
 
     feels: eqx.AbstractVar[type]
@@ -113,6 +115,28 @@ def require_law(torque: object, name: str = "torque") -> None:
             f"{name}: wanted a torque or force of rigidjax.torques, or a callable (t, state, "
             f"body), got {type(torque).__name__}{advice}"
         )
+
+
+def sees_attitude(torque: Torque | None) -> bool:
+    """Whether a law may look at the attitude: it says so by its rung, or has named no rung.
+
+    >>> from rigidjax import torques
+    >>> sees_attitude(torques.Damping([1.0, 1.0, 1.0]))
+    False
+    """
+    if hasattr(torque, "parts"):
+        return any(sees_attitude(part) for part in torque.parts)  # pyright: ignore
+    return torque is not None and getattr(torque, "feels", None) is not HasSpin
+
+
+def sees_rate(torque: Torque | None) -> bool:
+    """Whether a law may look at the body rate: it has not said that it is `rate_free`.
+
+    >>> from rigidjax import torques
+    >>> sees_rate(torques.HeavyTop(1.0, [0.0, 0.0, 1.0], [0.0, 0.0, -9.81]))
+    False
+    """
+    return torque is not None and not getattr(torque, "rate_free", False)
 
 
 def require_rung(torque: Torque, state: object) -> None:

@@ -18,6 +18,7 @@ from rigidjax.motion.torques.base import (
     act,
     jumps_of,
     require_law,
+    sees_rate,
 )
 
 
@@ -47,6 +48,11 @@ class Sum(eqx.Module):
         """The highest rung that a part feels."""
         rungs = [getattr(part, "feels", LADDER[0]) for part in self.parts]
         return max(rungs, key=lambda r: LADDER.index(r) if r in LADDER else len(LADDER))
+
+    @property
+    def rate_free(self) -> bool:
+        """Whether no part looks at the body rate."""
+        return all(not sees_rate(part) for part in self.parts)
 
     @property
     def jump_times(self) -> Float[Array, " n"]:
@@ -90,6 +96,7 @@ class FromPotential(AbstractTorque):
     """
 
     feels: ClassVar[type] = HasAttitude
+    rate_free: ClassVar[bool] = True
     potential: Callable[[Any], Any]
 
     def __init__(self, potential: Callable[[Any], Any]):

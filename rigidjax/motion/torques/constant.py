@@ -30,6 +30,7 @@ class ConstantTorque(AbstractTorque):
     """
 
     feels: ClassVar[type] = HasSpin
+    rate_free: ClassVar[bool] = True
     torque: Float[Array, "3"]
 
     def __init__(self, torque: Vector):
@@ -59,6 +60,7 @@ class InSpace(AbstractTorque):
     """
 
     feels: ClassVar[type] = HasAttitude
+    rate_free: ClassVar[bool] = True
     torque: eqx.Module | Float[Array, "3"]
 
     def __init__(self, torque: object):

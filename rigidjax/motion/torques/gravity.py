@@ -45,6 +45,7 @@ class HeavyTop(AbstractTorque):
     """
 
     feels: ClassVar[type] = HasAttitude
+    rate_free: ClassVar[bool] = True
     mass: Float[Array, ""]
     com: Float[Array, "3"]
     gravity: Float[Array, "3"]
@@ -98,6 +99,7 @@ class GravityGradient(AbstractTorque):
     """
 
     feels: ClassVar[type] = HasAttitude
+    rate_free: ClassVar[bool] = True
     mu: Float[Array, ""]
     position: eqx.Module | Float[Array, "3"]
 

@@ -34,6 +34,7 @@ class MagneticDipole(AbstractTorque):
     """
 
     feels: ClassVar[type] = HasAttitude
+    rate_free: ClassVar[bool] = True
     moment: Float[Array, "3"]
     field: eqx.Module | Float[Array, "3"]
 

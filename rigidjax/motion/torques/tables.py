@@ -66,6 +66,7 @@ class Tabulated(AbstractTorque):
     """
 
     feels: ClassVar[type] = HasSpin
+    rate_free: ClassVar[bool] = True
     times: Float[Array, " n"]
     torques: Float[Array, "n 3"]
 
@@ -103,6 +104,7 @@ class Pulses(AbstractTorque):
     """
 
     feels: ClassVar[type] = HasSpin
+    rate_free: ClassVar[bool] = True
     edges: Float[Array, " edges"]
     torques: Float[Array, "n 3"]
 

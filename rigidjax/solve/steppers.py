@@ -1,0 +1,245 @@
+"""A step of equal length of a method, a body and a torque: all that a loop has to know of them.
+
+The numbers are carried one by one: XLA on CPU runs a loop over a tuple of scalars as one kernel
+and, batched, over a tuple of (N,) arrays in vector instructions; of a loop over (7,) or (N, 7)
+arrays it makes many small kernels. Torques are called on arrays all the same: XLA sees through the
+stacks and slices between.
+
+A body that turns carries the momentum Π = IΩ in the place of Ω. Runge–Kutta methods do not notice a
+constant linear change of variables, so these are the steps that `diffrax` takes with the same
+solver, to round-off; and each of their stages is a third cheaper.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array
+
+from rigidjax.body.inertia import Inertia
+from rigidjax.exact.components3 import (
+    Six,
+    Triple,
+    adjugate,
+    cross,
+    determinant,
+    half_product,
+    times,
+)
+from rigidjax.exact.principal_axes import into, out_of, principal_frame
+from rigidjax.motion import Attitude, AttitudeEquations, EulerEquations, Spin, on_the_group
+from rigidjax.motion.torques import evaluate
+from rigidjax.motion.torques.base import sees_attitude
+from rigidjax.rotation import quaternion
+from rigidjax.solve import splitting
+from rigidjax.solve.components import join, split
+from rigidjax.solve.explicit import AbstractExplicit, Atoms, RungeKutta4, advance
+from rigidjax.solve.magnus import Magnus4, require_blind, turned
+from rigidjax.solve.splitting import AbstractSplitting
+from rigidjax.special.barrier import barrier
+
+
+class Stepper(NamedTuple):
+    """Numbers to start from, `step(t, end, h, y)`, and `state(y)` of such numbers."""
+
+    start: Any
+    step: Callable[[Any, Any, Any, Any], Any]
+    state: Callable[[Any], Any]
+
+
+def stepper_of(solver: Any, field: Callable[..., Any], y0: Any) -> Stepper:
+    """The stepper of a vector field under `solver`, or under the cheapest that is right.
+
+    **Arguments:** `solver` of `rigidjax.solvers`, or `None`; `field` such as `AttitudeEquations`;
+    `y0` a state. **Raises:** `TypeError` for a solver that has no such step.
+
+    >>> import rigidjax as rj
+    >>> field = rj.EulerEquations(rj.Inertia.from_principal(1.0, 2.0, 4.0))
+    >>> stepper = stepper_of(None, field, rj.Spin([1.0, 0.0, 0.0]))
+    >>> [float(number) for number in stepper.start]
+    [1.0, 0.0, 0.0]
+    """
+    turning = _turning(field, y0)
+    if solver is None:
+        attitude = isinstance(field, AttitudeEquations)
+        blind = attitude and not sees_attitude(field.euler.torque)
+        solver = Magnus4() if blind else RungeKutta4()
+    if isinstance(solver, Magnus4) and isinstance(y0, Attitude) and turning is not None:
+        require_blind(turning.torque)
+        return _free(turning.inertia, y0) if turning.torque is None else _magnus(turning, y0)
+    if isinstance(solver, AbstractSplitting):
+        return _split(solver, field, y0)
+    if not isinstance(solver, AbstractExplicit):
+        raise TypeError(
+            f"no equal steps of {type(solver).__name__} on {type(y0).__name__}; wanted "
+            "RungeKutta4, Tsitouras5 or DormandPrince8 of rigidjax.solvers, or, for an Attitude, "
+            "Magnus4 or a Splitting of rigidjax.solvers; for others use simulate with "
+            "stepsize_controller=diffrax.ConstantStepSize() under jax.vmap"
+        )
+    if turning is None:
+        return _general(solver, field, y0)
+    return _explicit(solver, turning, y0)
+
+
+class _Turning(NamedTuple):
+    """Inertia, its inverse (six numbers each) and the torque, in the precision of the state."""
+
+    inertia: Inertia
+    weights: Six
+    torque: Any
+
+
+def _turning(field: Any, y0: Any) -> _Turning | None:
+    euler = field.euler if isinstance(field, AttitudeEquations) else field
+    if not isinstance(euler, EulerEquations) or not isinstance(y0, Spin | Attitude):
+        return None
+    dtype = y0.omega.dtype
+    inertia = jax.tree.map(lambda a: a.astype(dtype), euler.inertia)
+    return _Turning(inertia, _entries(euler.inverse.astype(dtype)), euler.torque)
+
+
+def _free(body: Inertia, state0: Attitude) -> Stepper:
+    """Principal axes, held fixed in derivatives: the off-diagonal entries carry only tangents."""
+    six, axes = principal_frame(body.tensor)
+    # Relative to the trace first: the cube of 1e37 kg m² is no number.
+    size = six[0] + six[1] + six[2]
+    unit: Six = tuple(i / size for i in six)
+    scale = determinant(unit)
+    weights: Six = tuple(c / scale / size for c in adjugate(unit))
+    a, b, c, *_ = lax.stop_gradient(weights)
+    gaps = (c - b, a - c, b - a)
+    momentum = times(six, into(axes, state0.omega))
+    one, none = jnp.ones_like(a), jnp.zeros_like(a)
+
+    def step(t: Any, end: Any, h: Any, y: Atoms) -> Atoms:
+        q, p = turned(
+            lambda _, p: _free_slope(weights, gaps, p),
+            lambda p: _free_rate(weights, p),
+            t, end, h, y[:4], y[4:],
+        )  # fmt: skip
+        return (*q, *p)
+
+    def state(y: Atoms) -> Attitude:
+        # The numbers are the turn since the start, seen from the axes: Aᵀ…A turns its vector.
+        omega = jnp.stack(out_of(axes, _free_rate(weights, y[4:])))
+        turn = jnp.stack([y[0], *out_of(axes, y[1:4])])
+        return Attitude(quaternion.multiply(state0.q, turn), omega)
+
+    return Stepper((one, none, none, none, *momentum), step, state)
+
+
+@jax.custom_jvp
+def _free_rate(weights: Six, p: Triple) -> Triple:
+    """Ω of Π in principal axes."""
+    return weights[0] * p[0], weights[1] * p[1], weights[2] * p[2]
+
+
+@_free_rate.defjvp
+def _free_rate_jvp(primals, tangents):
+    (weights, p), (dw, dp) = primals, tangents
+    moved = zip(_free_rate(weights, dp), times(dw, p), strict=True)
+    return _free_rate(weights, p), tuple(a + b for a, b in moved)
+
+
+@jax.custom_jvp
+def _free_slope(weights: Six, gaps: Triple, p: Triple) -> Triple:
+    """Π × Ω in principal axes."""
+    return gaps[0] * (p[1] * p[2]), gaps[1] * (p[2] * p[0]), gaps[2] * (p[0] * p[1])
+
+
+@_free_slope.defjvp
+def _free_slope_jvp(primals, tangents):
+    (weights, gaps, p), (dw, _, dp) = primals, tangents
+    rate, turning = _free_rate_jvp((weights, p), (dw, dp))
+    moved = zip(cross(dp, rate), cross(p, turning), strict=True)
+    return _free_slope(weights, gaps, p), tuple(a + b for a, b in moved)
+
+
+def _entries(a: Array) -> Six:
+    # Both halves, so that the derivative is symmetric as the matrix is.
+    off = [0.5 * (a[i, j] + a[j, i]) for i, j in ((0, 1), (0, 2), (1, 2))]
+    return a[0, 0], a[1, 1], a[2, 2], *off
+
+
+def _magnus(turning: _Turning, state0: Attitude) -> Stepper:
+    body, weights, torque = turning
+    start = split(state0)
+
+    def rate(p: Triple) -> Triple:
+        return times(weights, p)
+
+    def slope(t: Any, p: Triple) -> Triple:
+        omega = barrier(rate(p))
+        # It gets no attitude that it could look at.
+        value = evaluate(torque, t, Spin(jnp.stack(omega)), body)
+        return _sum(cross(p, omega), split(value))
+
+    def step(t: Any, end: Any, h: Any, y: Atoms) -> Atoms:
+        q, p = turned(slope, rate, t, end, h, y[:4], y[4:])
+        return (*q, *p)
+
+    def state(y: Atoms) -> Attitude:
+        return Attitude(jnp.stack(y[:4]), jnp.stack(rate(y[4:])))
+
+    return Stepper((*start[:4], *times(_entries(body.tensor), start[4:])), step, state)
+
+
+def _explicit(solver: AbstractExplicit, turning: _Turning, state0: Any) -> Stepper:
+    body, weights, torque = turning
+    start = split(state0)
+    many = len(start) - 3
+
+    def field(t: Any, y: Atoms) -> Atoms:
+        q, p = y[:many], y[many:]
+        # Shared by attitude and momentum; fenced, lest each of seven results work it out again.
+        omega = barrier(times(weights, p))
+        slope = cross(p, omega)
+        if torque is not None:
+            value = evaluate(torque, t, join((*q, *omega), state0), body)
+            slope = _sum(slope, split(value))
+        return (*half_product(q, omega), *slope) if many else slope
+
+    def step(t: Any, end: Any, h: Any, y: Atoms) -> Atoms:
+        return _projected(advance(solver.tableau, field, t, h, y, end)[0], state0)
+
+    def state(y: Atoms) -> Any:
+        return join((*y[:many], *times(weights, y[many:])), state0)
+
+    momentum = times(_entries(body.tensor), start[many:])
+    return Stepper((*start[:many], *momentum), step, state)
+
+
+def _general(solver: AbstractExplicit, field: Callable[..., Any], state0: Any) -> Stepper:
+    def slope(t: Any, y: Atoms) -> Atoms:
+        return split(field(t, join(y, state0), None))
+
+    def step(t: Any, end: Any, h: Any, y: Atoms) -> Atoms:
+        return _projected(advance(solver.tableau, slope, t, h, y, end)[0], state0)
+
+    return Stepper(split(state0), step, lambda y: join(y, state0))
+
+
+def _split(solver: AbstractSplitting, field: Any, state0: Any) -> Stepper:
+    """The attitude and the momentum in principal axes.
+
+    No step goes through Ω = I⁻¹Π and back, so that |Π| drifts by round-off of the flow alone.
+    """
+    frame = splitting.frame_of(field, state0)
+
+    def step(t: Any, end: Any, h: Any, y: Any) -> Any:
+        return splitting.compose(solver.composition, field, frame, t, h, y)
+
+    def state(y: Any) -> Attitude:
+        return Attitude(y[0], splitting.leave(frame, y[1]))
+
+    return Stepper((state0.q, splitting.enter(frame, state0.omega)), step, state)
+
+
+def _projected(y: Atoms, like: Any) -> Atoms:
+    return split(on_the_group(join(y, like)))
+
+
+def _sum(a: Triple, b: Triple) -> Triple:
+    return tuple(x + y for x, y in zip(a, b, strict=True))
