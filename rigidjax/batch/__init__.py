@@ -2,19 +2,19 @@
 
     rollout     equal steps; last states, thinned states, or reduced on the way
     simulate    closed form, adaptive steps, or `Steps`, with a status for each body
-    hosts       several processes: `connect`, `share`, `gather`, `total`
+    distributed several processes: `connect`, `share`, `gather`, `total`
 
 One call takes N bodies; `chunk` of them go side by side, so that memory does not grow with N beyond
 what goes in and comes out; `devices="all"` cuts N into shares for the devices of a process, and
-`hosts.share` into shares for processes. Bodies do not see one another: no step sends anything.
+`distributed.share` into shares for processes. Bodies do not see one another: no step sends anything.
 
 **On a cluster** (a plan; two processes on one machine is what is tested). *Sharded:* bodies,
-starts, recordings, all along their first axis: processes first (`hosts.share`), then the devices of
+starts, recordings, all along their first axis: processes first (`distributed.share`), then the devices of
 each, then chunks. Shared numbers (one inertia, one law) are copied to all. *Reduced:* a fit's loss,
-gradient and normal equations, once an iteration, by `hosts.total`: some hundred numbers; histograms
-and moments of a large batch by `reduce=` on the way and `hosts.total` at the end. States are
-gathered (`hosts.gather`) only if one process needs them all; else each writes its own
-(`hosts.save`). *To be expected:* a run's time is that of the slowest share. Shares are equal
+gradient and normal equations, once an iteration, by `distributed.total`: some hundred numbers; histograms
+and moments of a large batch by `reduce=` on the way and `distributed.total` at the end. States are
+gathered (`distributed.gather`) only if one process needs them all; else each writes its own
+(`distributed.save`). *To be expected:* a run's time is that of the slowest share. Shares are equal
 in number, so equal steps scale with cores; adaptive steps are dealt between the devices of a
 process by speed, not between processes: shuffle bodies before `share`. An iteration of a fit adds
 one all-reduce of a few kilobytes, against 35 to 55 ms for the gradient of 1000 bodies over 1000
@@ -23,7 +23,7 @@ shares written before the collective are recovered, the others run again.
 """
 
 from rigidjax._names import own_names
-from rigidjax.batch import hosts as hosts
+from rigidjax.batch import distributed as distributed
 from rigidjax.batch.rollout import rollout as rollout
 from rigidjax.batch.sharding import compiler_options as compiler_options
 from rigidjax.batch.simulate import Batch as Batch, Steps as Steps, simulate as simulate

@@ -80,7 +80,7 @@ def mesh_of(devices: Any) -> Mesh | None:
     if foreign:
         raise ValueError(
             f"devices: {foreign[0]} is not of this process; each process works on its own share of "
-            "the bodies (rigidjax.batch.hosts)"
+            "the bodies (rigidjax.batch.distributed)"
         )
     # Auto: under Explicit the types of arrays inside would carry the sharding, and lax.map refuses.
     return Mesh(np.array(devices), (AXIS,), axis_types=(AxisType.Auto,))

@@ -9,6 +9,7 @@ For derivatives the steps are recorded in segments: the start of each is kept, a
 last one; the others are run once more when they are needed.
 """
 
+from functools import partial
 from typing import Any
 
 import jax.numpy as jnp
@@ -222,28 +223,44 @@ def recorded(
     def on(loop: LoopState) -> Array:
         return jnp.any(going(method, run, loop, until))
 
-    def attempt(state: Any) -> Any:
-        loop, few, found, base, k = state
-        after, row, y = _attempt(method, constants, run, loop, until)
-        if few is not None:
-            few = lax.dynamic_update_slice_in_dim(few, row[None], k, 0)
-        if found is not None:
-            # What is no visit goes to the place beyond the last.
-            place = jnp.where(after.known > loop.known, loop.known - base, many)
-            found = per_body(replaced, bodies)(found, y, place)
-        return after, few, found, base, k + 1
+    beyond = jnp.full((many + 1, *run.t0.shape), jnp.inf, run.t0.dtype)
+    later = jnp.concatenate([run.between, beyond])
 
     def block(state: Any) -> Any:
         loop, rows, ys, count = state
         few = found = None
+        base, here, until_here = loop.known, run, until
+        if run.between.shape[0]:
+            # Only the times that this block can come to: all of them would make its state large.
+            few_times = partial(lax.dynamic_slice_in_dim, slice_size=many + 1)
+            here = run._replace(between=per_body(few_times, bodies)(later, base))
+            loop = loop._replace(known=jnp.zeros_like(base))
+            if until is not None:
+                until_here = until._replace(known=until.known - base)
+
+        def attempt(state: Any) -> Any:
+            loop, few, found, k = state
+            after, row, y = _attempt(method, constants, here, loop, until_here)
+            if few is not None:
+                few = lax.dynamic_update_slice_in_dim(few, row[None], k, 0)
+            if found is not None:
+                # What is no visit goes to the place beyond the last.
+                place = jnp.where(after.known > loop.known, loop.known, many)
+                found = per_body(replaced, bodies)(found, y, place)
+            return after, few, found, k + 1
+
         if rows is not None:
             few = jnp.zeros((many, *rows.shape[1:]), rows.dtype)
         if ys is not None:
             found = jnp.zeros((many + 1, *ys.shape[1:]), ys.dtype)
-        base = loop.known
-        state = (loop, few, found, base, jnp.zeros((), jnp.int32))
-        more = lambda s: on(s[0]) & (s[-1] < many)  # noqa: E731
-        loop, few, found, _, k = lax.while_loop(more, attempt, state)
+        state = (loop, few, found, jnp.zeros((), jnp.int32))
+        more = lambda s: jnp.any(going(method, here, s[0], until_here)) & (s[-1] < many)  # noqa: E731
+        loop, few, found, k = lax.while_loop(more, attempt, state)
+        if run.between.shape[0]:
+            loop = loop._replace(known=loop.known + base)
+            if few is not None:
+                visits = jnp.where(few[:, 2] >= VISIT, base, 0)
+                few = few.at[:, 2].add(visits.astype(few.dtype))
         if rows is not None and few is not None:
             rows = lax.dynamic_update_slice_in_dim(rows, few, count, 0)
         if found is not None:

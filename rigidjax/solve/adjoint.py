@@ -154,7 +154,9 @@ def cotangents(
             ends = _added(run, ends, stop + 1, _where(~held, by_h))
             between = sums.between
             if size:
-                between = _added(run, between, place, _where(visit, by_h))
+                # Each is visited once; what is no visit goes to the place beyond the last.
+                where = jnp.where(visit, place, size)
+                between = per_body(replaced, run.t0.ndim)(between, by_h, where)
             # A visit begins where its step began, which comes next.
             total = [
                 a + _where(visit | taken, b)
@@ -170,11 +172,11 @@ def cotangents(
     sums = Inputs(
         [jnp.zeros((*c.shape[: c.ndim - run.t0.ndim], *more), c.dtype) for c in constants],
         jnp.zeros((run.stops.shape[0] + 1, *more), run.t0.dtype),
-        jnp.zeros((size, *more), run.t0.dtype),
+        jnp.zeros((size + 1, *more), run.t0.dtype),
         bars.end,
     )
     sums, extra = lax.fori_loop(0, number, segment, (sums, jnp.zeros_like(bars.end)))
-    return sums._replace(y0=sums.y0 + extra)
+    return sums._replace(between=sums.between[:size], y0=sums.y0 + extra)
 
 
 def _segment(

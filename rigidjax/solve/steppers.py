@@ -56,7 +56,7 @@ def stepper_of(solver: Any, field: Callable[..., Any], y0: Any) -> Stepper:
     `y0` a state. **Raises:** `TypeError` for a solver that has no such step.
 
     >>> import rigidjax as rj
-    >>> field = rj.EulerEquations(rj.Inertia.from_principal(1.0, 2.0, 4.0))
+    >>> field = rj.EulerEquations(rj.Inertia.from_principal(1.0, 2.0, 2.5))
     >>> stepper = stepper_of(None, field, rj.Spin([1.0, 0.0, 0.0]))
     >>> [float(number) for number in stepper.start]
     [1.0, 0.0, 0.0]

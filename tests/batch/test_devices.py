@@ -77,18 +77,18 @@ def test_two_devices_adaptive_and_reverse():
 
 JOIN = """
 port, here = sys.argv[1:3]
-rj.batch.hosts.connect(f"localhost:{port}", 2, int(here), patience=10)
+rj.batch.distributed.connect(f"localhost:{port}", 2, int(here), patience=10)
 """
 
 
 def test_two_processes():
     code = """
-    mine = rj.batch.hosts.share((bodies, states))
+    mine = rj.batch.distributed.share((bodies, states))
     assert mine[1].q.shape[0] in (10, 11)
     run = lambda b, s: rj.batch.rollout(b, s, 0.05, 9, top, chunk=4)
-    found = rj.batch.hosts.gather(run(*mine))
+    found = rj.batch.distributed.gather(run(*mine))
     assert same(found, run(bodies, states)), "gathered"
-    assert rj.batch.hosts.total(jnp.asarray(float(jax.process_index()))) == 1.0
+    assert rj.batch.distributed.total(jnp.asarray(float(jax.process_index()))) == 1.0
     print("equal")
     """
     at = port()
@@ -112,13 +112,13 @@ def _joined(code, at, here):
 @pytest.mark.slow
 def test_a_dead_peer_ends_the_run(tmp_path):
     code = f"""
-    mine = rj.batch.hosts.share(states)
-    rj.batch.hosts.gather(mine)
+    mine = rj.batch.distributed.share(states)
+    rj.batch.distributed.gather(mine)
     print("ready", flush=True)
     if int(here) == 1:
         import os, signal
         os.kill(os.getpid(), signal.SIGKILL)
-    rj.batch.hosts.gather(mine, checkpoint={str(tmp_path)!r})
+    rj.batch.distributed.gather(mine, checkpoint={str(tmp_path)!r})
     print("gathered")
     """
     at = port()

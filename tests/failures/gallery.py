@@ -26,6 +26,7 @@ def angle(a, b):
 
 class Nothing(rj.torques.AbstractTorque):
     feels = rj.HasSpin
+    rate_free = True
 
     def __call__(self, t, state, body):
         return jnp.zeros_like(state.omega)

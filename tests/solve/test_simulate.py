@@ -21,6 +21,7 @@ class Nothing(rj.torques.AbstractTorque):
     """A torque of zero: the same motion, but through the solver."""
 
     feels = rj.HasSpin
+    rate_free = True
 
     def __call__(self, t, state, body):
         return jnp.zeros_like(state.omega)

@@ -68,7 +68,7 @@ ACCEPTED: list[tuple[str, str, str, str]] = [
     # Batches.
     ("batch.rollout", "*", "a silent NaN*", REACHED),
     ("batch.simulate*", "*", "a silent NaN*", REACHED),
-    ("batch.hosts.*", "tree: *", "taken without a word*", ANY_TREE),
+    ("batch.distributed.*", "tree: *", "taken without a word*", ANY_TREE),
     # Others.
     *(
         (f"workprecision.{name}", *what, NOT_MEASURED)

@@ -367,13 +367,13 @@ row("batch.compiler_options", transforms=())
 row("cpu_flags", transforms=())
 for name in ("share", "gather", "total"):
     row(
-        f"batch.hosts.{name}",
+        f"batch.distributed.{name}",
         lambda: dict(tree=s.attitudes()),
         host=True,
         groups=("same", "single", *KINDS),
     )
 leave_out(
     "joins other processes, or writes: tests/batch/test_devices.py",
-    *(f"batch.hosts.{n}" for n in ("connect", "save", "recover")),
+    *(f"batch.distributed.{n}" for n in ("connect", "save", "recover")),
 )
 leave_out("batch.simulate, cpu_flags return them", "batch.Batch", "batch.CpuFlags")

@@ -17,6 +17,7 @@ class Nothing(rj.torques.AbstractTorque):
     """No torque, but through a solver."""
 
     feels = rj.HasSpin
+    rate_free = True
 
     def __call__(self, t, state, body):
         return jnp.zeros_like(state.omega)

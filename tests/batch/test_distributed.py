@@ -4,27 +4,27 @@ import jax
 import numpy as np
 import pytest
 
-from rigidjax.batch import hosts
+from rigidjax.batch import distributed
 
 
 @pytest.mark.parametrize("name", ["gather", "total"])
 def test_traced_arrays_are_refused_in_words(name):
     with pytest.raises(TypeError, match=f"{name}: wanted a tree of known arrays"):
-        jax.jit(getattr(hosts, name))(np.ones(2))
+        jax.jit(getattr(distributed, name))(np.ones(2))
 
 
 @pytest.mark.parametrize("cut", [0, 40, -30])
 def test_a_damaged_share_is_named(tmp_path, cut):
-    path = hosts.save(np.arange(3.0), tmp_path)
-    assert hosts.recover(np.zeros(3), tmp_path)[0].tolist() == [0.0, 1.0, 2.0]
+    path = distributed.save(np.arange(3.0), tmp_path)
+    assert distributed.recover(np.zeros(3), tmp_path)[0].tolist() == [0.0, 1.0, 2.0]
     path.write_bytes(path.read_bytes()[:cut])
     with pytest.raises(ValueError, match=r"recover: .*share-0.npz is no file of save"):
-        hosts.recover(np.zeros(3), tmp_path)
+        distributed.recover(np.zeros(3), tmp_path)
 
 
 def test_a_share_of_another_tree_is_named(tmp_path):
-    hosts.save(np.arange(3.0), tmp_path)
+    distributed.save(np.arange(3.0), tmp_path)
     with pytest.raises(ValueError, match=r"like has 2 arrays, .*share-0.npz holds 1"):
-        hosts.recover((np.zeros(3), np.zeros(3)), tmp_path)
+        distributed.recover((np.zeros(3), np.zeros(3)), tmp_path)
     with pytest.raises(FileNotFoundError, match="no share"):
-        hosts.recover(np.zeros(3), tmp_path / "none")
+        distributed.recover(np.zeros(3), tmp_path / "none")
