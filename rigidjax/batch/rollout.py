@@ -11,7 +11,7 @@ from jaxtyping import Array
 
 from rigidjax._types import ScalarLike
 from rigidjax.batch.sharding import Compiled, chunk_of, mesh_of, over_bodies
-from rigidjax.batch.validation import Bodies, bodies_of, start_of, step_of, time_of
+from rigidjax.batch.validation import Bodies, bodies_of, driven_by, start_of, step_of, time_of
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.solve import equations_of_motion
@@ -25,6 +25,8 @@ State = TypeVar("State", Spin, Attitude, Rigid)
 Reduced = TypeVar("Reduced")
 # What `reduce` carries, the time, the state of one body → what it carries on.
 Reduce = Callable[[Any, Array, Any], Any]
+# By name, samples of each body (N, steps, *k), held through a step.
+Inputs = Any
 Solver = AbstractExplicit | Magnus4 | AbstractSplitting | None
 # Bytes that reverse mode may keep of all chunks together.
 _KEPT = 2**23
@@ -43,6 +45,7 @@ def rollout(
     reduce: None = None,
     initial: None = None,
     t0: ScalarLike = 0.0,
+    inputs: Inputs = None,
     torque_axes: Any = None,
     chunk: int | None = None,
     devices: Any = None,
@@ -62,6 +65,7 @@ def rollout(
     solver: Solver = None,
     save_every: int | None = None,
     t0: ScalarLike = 0.0,
+    inputs: Inputs = None,
     torque_axes: Any = None,
     chunk: int | None = None,
     devices: Any = None,
@@ -80,6 +84,7 @@ def rollout(
     reduce: Reduce | None = None,
     initial: Any = None,
     t0: ScalarLike = 0.0,
+    inputs: Inputs = None,
     torque_axes: Any = None,
     chunk: int | None = None,
     devices: Any = None,
@@ -103,6 +108,8 @@ def rollout(
       every `save_every` steps (one, by default), and what it begins with. States are not kept then.
       A function made anew for each call compiles anew: define it once, best as a Module.
     - `t0` s, when the first step begins.
+    - `inputs`: what drives the law, by the names of its `rigidjax.torques.Input`s: arrays
+      (N, num_steps, *k) whose row i is held exactly through step i of that body.
     - `chunk`: how many bodies go side by side. `None` is what fits the first cache, 128 in float64.
       Bodies are independent: chunks change results in the last digits at most.
     - `devices`: `None` for one, `"all"` of this process, or a sequence of them; N is cut into
@@ -120,7 +127,8 @@ def rollout(
     Inside `jax.jit` of your own see `rigidjax.batch.compiler_options`.
 
     **Raises:** `TypeError` where bodies, states, torque and solver do not fit; `ValueError` for
-    shapes that do not agree, a step that is not positive, a `save_every` that does not divide
+    shapes that do not agree, an input that is missing or that no law reads, a step that is not
+    positive, a `save_every` that does not divide
     `num_steps`, and, where numbers are known, no positive moments or no unit quaternion.
 
     >>> import rigidjax as rj
@@ -131,6 +139,7 @@ def rollout(
     """
     batch = bodies_of(bodies, states0, torque, torque_axes)
     h, count = step_of(step_size, num_steps, batch.dtype)
+    driven = driven_by(inputs, torque, states0, count)
     if reduce is None and initial is not None:
         raise ValueError("rollout: initial is what reduce begins with; no reduce was given")
     if reduce is not None and not callable(reduce):
@@ -143,7 +152,7 @@ def rollout(
             f"save_every: wanted a whole part of num_steps = {count}, got {save_every!r}"
         )
     start = jax.tree.map(jnp.asarray, initial)
-    numbers = (batch.shared, batch.each, start, h, time_of(t0, batch.dtype))
+    numbers = (batch.shared, (batch.each, driven), start, h, time_of(t0, batch.dtype))
     plan = _Plan(
         solver,
         count,
@@ -171,14 +180,15 @@ def _run(plan: _Plan, reduce: Reduce | None, rest: Any, numbers: Any) -> Any:
 
     def one(given: Any, each: Any) -> Any:
         shared, initial, h, t0 = given
-        body, state0, torque = Bodies.one(shared, each, rest)
+        own, inputs = each
+        body, state0, torque = Bodies.one(shared, own, rest)
         state0 = start_of(state0)
         field = equations_of_motion(body, state0, torque)
         stepper = stepper_of(plan.solver, field, state0)
 
         def piece(carry: Any, first: Array) -> Any:
             y, carried = carry
-            y = march(stepper, h, t0, first, plan.every, y)
+            y = march(stepper, h, t0, first, plan.every, y, inputs)
             if reduce is not None:
                 t = t0 + (first + plan.every).astype(h.dtype) * h
                 carried = reduce(carried, t, stepper.state(y))
@@ -195,7 +205,7 @@ def _run(plan: _Plan, reduce: Reduce | None, rest: Any, numbers: Any) -> Any:
             return stepper.state(y), carried
         return kept if plan.keep else stepper.state(y)
 
-    size = sum(leaf.size for leaf in jax.tree.leaves(each)) * h.dtype.itemsize
+    size = sum(leaf.size for leaf in jax.tree.leaves(each[0])) * h.dtype.itemsize
     if size * (plan.count // plan.every) * (plan.every // piece_length(plan.every) + 1) > _KEPT:
         # Going back, a chunk is worked out anew: else every chunk's pieces would be kept.
         one = jax.checkpoint(one)

@@ -11,7 +11,7 @@ from jaxtyping import Array, ArrayLike, Float, Int
 
 from rigidjax import _checks
 from rigidjax._types import ScalarLike
-from rigidjax.batch.rollout import rollout
+from rigidjax.batch.rollout import Inputs, rollout
 from rigidjax.batch.scheduling import dealt, quickness
 from rigidjax.batch.sharding import Compiled, chunk_of, mesh_of, over_bodies
 from rigidjax.batch.validation import Bodies, bodies_of, start_of, step_of, time_of
@@ -67,6 +67,7 @@ def simulate(
     atol: float | None = None,
     max_steps: int = 100_000,
     adjoint: dfx.AbstractAdjoint | None = None,
+    inputs: Inputs = None,
     torque_axes: Any = None,
     chunk: int | None = None,
     devices: Any = None,
@@ -75,8 +76,8 @@ def simulate(
 
     **Arguments:**
 
-    - `bodies`, `states0`, `torque`, `torque_axes`, `chunk`, `devices`: as for
-      `rigidjax.batch.rollout`.
+    - `bodies`, `states0`, `torque`, `torque_axes`, `chunk`, `devices`, and for `Steps` `inputs`: as
+      for `rigidjax.batch.rollout`.
     - `ts_or_steps`: (T,) increasing times, s, the first of them the start; or `Steps(size, number)`
       for equal steps.
     - `solver`: `None` takes the closed form for free bodies, `rigidjax.solvers.DormandPrince8`
@@ -103,7 +104,12 @@ def simulate(
     if isinstance(ts_or_steps, Steps):
         equal_solver: Any = solver
         return _equal(
-            bodies, states0, ts_or_steps, torque, equal_solver, torque_axes, chunk, devices
+            bodies, states0, ts_or_steps, torque, equal_solver, inputs, torque_axes, chunk, devices
+        )
+    if inputs is not None:
+        raise ValueError(
+            "simulate: inputs are for Steps(size, number); with times put torques.Held(times, "
+            "values) in the law"
         )
     if isinstance(solver, Magnus4):
         raise ValueError("simulate: Magnus4 takes equal steps; give Steps(size, number), not times")
@@ -202,6 +208,7 @@ def _equal(
     steps: Steps,
     torque: Any,
     solver: Any,
+    inputs: Any,
     torque_axes: Any,
     chunk: Any,
     devices: Any,
@@ -216,6 +223,7 @@ def _equal(
         solver=solver,
         save_every=every,
         t0=steps.t0,
+        inputs=inputs,
         torque_axes=torque_axes,
         chunk=chunk,
         devices=devices,

@@ -1,5 +1,6 @@
 """What a batch is given, looked at before anything runs: shapes, kinds, and known numbers."""
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -12,6 +13,7 @@ from rigidjax import _checks
 from rigidjax._types import HasAttitude
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.motion import Attitude, Rigid, Spin, on_the_group
+from rigidjax.motion.torques.inputs import inputs_of
 from rigidjax.solve.validation import require_fit
 
 
@@ -93,6 +95,42 @@ def bodies_of(bodies: Any, states0: Any, torque: Any, torque_axes: Any) -> Bodie
     matter = isinstance(bodies, MassProperties)
     first = jax.tree.map((lambda a: a[0]) if matter else shape, each)
     require_fit(*Bodies.one(shared, first, rest))
+    return found
+
+
+def driven_by(inputs: Any, torque: Any, states0: Any, count: int) -> Any:
+    """The inputs of each body, by name (N, steps, *k), in the precision of the states.
+
+    **Raises:** `ValueError` for an input that is missing, or that the law does not read, for
+    another number of bodies or steps, NaN; `TypeError` for what is no mapping.
+    """
+    read = inputs_of(torque)
+    if inputs is None:
+        if read:
+            raise ValueError(
+                f"rollout: the law reads the input {read[0]!r}: give inputs={{{read[0]!r}: …}}, an "
+                "array (N, num_steps, *k)"
+            )
+        return None
+    if not isinstance(inputs, Mapping):
+        raise TypeError(f"inputs: wanted arrays by name, got {type(inputs).__name__}")
+    for name in [*read, *inputs]:
+        if name not in inputs or name not in read:
+            raise ValueError(
+                f"inputs: the law reads {', '.join(map(repr, read)) or 'none'}, got "
+                f"{', '.join(map(repr, inputs)) or 'none'}"
+            )
+    wanted = (*states0.omega.shape[:1], count)
+    found = {}
+    for name, value in inputs.items():
+        rows = _checks.numbers(value, f"inputs[{name!r}]")
+        if rows.shape[:2] != wanted:
+            raise ValueError(
+                f"inputs[{name!r}]: wanted (N, num_steps, *k) = {wanted} and more, got shape "
+                f"{rows.shape}"
+            )
+        rows = _checks.finite(rows.astype(states0.omega.dtype), f"inputs[{name!r}]")
+        found[name] = jnp.asarray(rows)
     return found
 
 

@@ -60,25 +60,28 @@ def fixed(
     return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), y0, later)
 
 
-def step(stepper: Stepper, h: Array, t0: Array, i: Array, y: Any) -> Any:
-    """Step number `i` since `t0`."""
+def step(stepper: Stepper, h: Array, t0: Array, i: Array, y: Any, inputs: Any = None) -> Any:
+    """Step number `i` since `t0`; `inputs` by name (steps, …), of which this step has row `i`."""
 
     def at(i: Array) -> Array:
         # Not t + h again and again: round-off would add up (a million steps, 1e-3 in float32).
         return t0 + i.astype(h.dtype) * h
 
-    return stepper.step(at(i), at(i + 1), h, y)
+    now = jax.tree.map(lambda a: lax.dynamic_index_in_dim(a, i, 0, keepdims=False), inputs)
+    return stepper.step(at(i), at(i + 1), h, y, now)
 
 
-def march(stepper: Stepper, h: Array, t0: Array, first: Array, count: int, y: Any) -> Any:
-    """`count` steps from number `first` on.
+def march(
+    stepper: Stepper, h: Array, t0: Array, first: Array, count: int, y: Any, inputs: Any = None
+) -> Any:
+    """`count` steps from number `first` on; `inputs` as for `step`.
 
     In reverse mode the states at the starts of √count pieces are kept, and those in one piece.
     """
 
     @functools.partial(jax.checkpoint, prevent_cse=False)
     def one(y: Any, i: Array) -> tuple[Any, None]:
-        return step(stepper, h, t0, i, y), None
+        return step(stepper, h, t0, i, y, inputs), None
 
     @functools.partial(jax.checkpoint, prevent_cse=False, static_argnums=2)
     def some(y: Any, begin: Array, many: int) -> Any:

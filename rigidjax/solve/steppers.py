@@ -32,6 +32,7 @@ from rigidjax.exact.principal_axes import into, out_of, principal_frame
 from rigidjax.motion import Attitude, AttitudeEquations, EulerEquations, Spin, on_the_group
 from rigidjax.motion.torques import evaluate
 from rigidjax.motion.torques.base import sees_attitude
+from rigidjax.motion.torques.inputs import bind
 from rigidjax.rotation import quaternion
 from rigidjax.solve import splitting
 from rigidjax.solve.components import join, split
@@ -42,10 +43,13 @@ from rigidjax.special.barrier import barrier
 
 
 class Stepper(NamedTuple):
-    """Numbers to start from, `step(t, end, h, y)`, and `state(y)` of such numbers."""
+    """Numbers to start from, `step(t, end, h, y, inputs)`, and `state(y)` of such numbers.
+
+    `inputs` are those of the law by name, the same through the whole step, or `None`.
+    """
 
     start: Any
-    step: Callable[[Any, Any, Any, Any], Any]
+    step: Callable[[Any, Any, Any, Any, Any], Any]
     state: Callable[[Any], Any]
 
 
@@ -113,7 +117,7 @@ def _free(body: Inertia, state0: Attitude) -> Stepper:
     momentum = times(six, into(axes, state0.omega))
     one, none = jnp.ones_like(a), jnp.zeros_like(a)
 
-    def step(t: Any, end: Any, h: Any, y: Atoms) -> Atoms:
+    def step(t: Any, end: Any, h: Any, y: Atoms, inputs: Any) -> Atoms:
         q, p = turned(
             lambda _, p: _free_slope(weights, gaps, p),
             lambda p: _free_rate(weights, p),
@@ -170,13 +174,15 @@ def _magnus(turning: _Turning, state0: Attitude) -> Stepper:
     def rate(p: Triple) -> Triple:
         return times(weights, p)
 
-    def slope(t: Any, p: Triple) -> Triple:
-        omega = barrier(rate(p))
-        # It gets no attitude that it could look at.
-        value = evaluate(torque, t, Spin(jnp.stack(omega)), body)
-        return _sum(cross(p, omega), split(value))
+    def step(t: Any, end: Any, h: Any, y: Atoms, inputs: Any) -> Atoms:
+        law = bind(torque, inputs)
 
-    def step(t: Any, end: Any, h: Any, y: Atoms) -> Atoms:
+        def slope(t: Any, p: Triple) -> Triple:
+            omega = barrier(rate(p))
+            # It gets no attitude that it could look at.
+            value = evaluate(law, t, Spin(jnp.stack(omega)), body)
+            return _sum(cross(p, omega), split(value))
+
         q, p = turned(slope, rate, t, end, h, y[:4], y[4:])
         return (*q, *p)
 
@@ -191,17 +197,19 @@ def _explicit(solver: AbstractExplicit, turning: _Turning, state0: Any) -> Stepp
     start = split(state0)
     many = len(start) - 3
 
-    def field(t: Any, y: Atoms) -> Atoms:
-        q, p = y[:many], y[many:]
-        # Shared by attitude and momentum; fenced, lest each of seven results work it out again.
-        omega = barrier(times(weights, p))
-        slope = cross(p, omega)
-        if torque is not None:
-            value = evaluate(torque, t, join((*q, *omega), state0), body)
-            slope = _sum(slope, split(value))
-        return (*half_product(q, omega), *slope) if many else slope
+    def step(t: Any, end: Any, h: Any, y: Atoms, inputs: Any) -> Atoms:
+        law = bind(torque, inputs)
 
-    def step(t: Any, end: Any, h: Any, y: Atoms) -> Atoms:
+        def field(t: Any, y: Atoms) -> Atoms:
+            q, p = y[:many], y[many:]
+            # Shared by attitude and momentum; fenced, lest each of seven results work it out again.
+            omega = barrier(times(weights, p))
+            slope = cross(p, omega)
+            if law is not None:
+                value = evaluate(law, t, join((*q, *omega), state0), body)
+                slope = _sum(slope, split(value))
+            return (*half_product(q, omega), *slope) if many else slope
+
         return _projected(advance(solver.tableau, field, t, h, y, end)[0], state0)
 
     def state(y: Atoms) -> Any:
@@ -212,10 +220,12 @@ def _explicit(solver: AbstractExplicit, turning: _Turning, state0: Any) -> Stepp
 
 
 def _general(solver: AbstractExplicit, field: Callable[..., Any], state0: Any) -> Stepper:
-    def slope(t: Any, y: Atoms) -> Atoms:
-        return split(field(t, join(y, state0), None))
+    def step(t: Any, end: Any, h: Any, y: Atoms, inputs: Any) -> Atoms:
+        here = bind(field, inputs)
 
-    def step(t: Any, end: Any, h: Any, y: Atoms) -> Atoms:
+        def slope(t: Any, y: Atoms) -> Atoms:
+            return split(here(t, join(y, state0), None))
+
         return _projected(advance(solver.tableau, slope, t, h, y, end)[0], state0)
 
     return Stepper(split(state0), step, lambda y: join(y, state0))
@@ -228,8 +238,8 @@ def _split(solver: AbstractSplitting, field: Any, state0: Any) -> Stepper:
     """
     frame = splitting.frame_of(field, state0)
 
-    def step(t: Any, end: Any, h: Any, y: Any) -> Any:
-        return splitting.compose(solver.composition, field, frame, t, h, y)
+    def step(t: Any, end: Any, h: Any, y: Any, inputs: Any) -> Any:
+        return splitting.compose(solver.composition, bind(field, inputs), frame, t, h, y)
 
     def state(y: Any) -> Attitude:
         return Attitude(y[0], splitting.leave(frame, y[1]))

@@ -73,6 +73,16 @@ LAWS = {
     "Tabulated": dict(times=TS, torques=np.stack([V, W, Y, V])),
     "Pulses": dict(edges=TS, torques=np.stack([V, W, Y])),
     "Wrench": dict(force=V, torque=W),
+    "BodyDrag": dict(linear=np.abs(V), quadratic=np.abs(W), centre=Y, wind=V),
+    "Held": dict(times=TS, values=np.stack([V, W, Y, V])),
+    "Rotors": dict(
+        positions=np.stack([V, W]),
+        directions=np.eye(3)[:2],
+        spins=np.array([1.0, -1.0]),
+        thrust=0.1,
+        drag=np.array([0.2, 0.3]),
+        speeds=np.array([2.0, 3.0]),
+    ),
 }
 for name, given in LAWS.items():
     row(f"motion.torques.{name}", given)
@@ -87,6 +97,7 @@ row(
     lambda: dict(inertia=0.2, axis=np.eye(3)[2], speed=s.Quadratic(jnp.asarray(3.0)), delay=0.1),
     traced=("inertia", "speed", "delay"),
 )
+leave_out("a name, and no number", "motion.torques.Input", "motion.torques.bind")
 row("motion.torques.FromPotential", lambda: dict(potential=s.Spring(jnp.asarray(2.0))))
 row(
     "motion.torques.Sum",

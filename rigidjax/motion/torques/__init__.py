@@ -18,6 +18,7 @@ from rigidjax.motion.torques.damping import (
     Damping as Damping,
     QuadraticDamping as QuadraticDamping,
 )
+from rigidjax.motion.torques.flying import BodyDrag as BodyDrag, Rotors as Rotors
 from rigidjax.motion.torques.flywheel import Flywheel as Flywheel
 from rigidjax.motion.torques.forces import (
     CentralGravity as CentralGravity,
@@ -28,6 +29,7 @@ from rigidjax.motion.torques.gravity import (
     GravityGradient as GravityGradient,
     HeavyTop as HeavyTop,
 )
+from rigidjax.motion.torques.inputs import Held as Held, Input as Input, bind as bind
 from rigidjax.motion.torques.magnetic import MagneticDipole as MagneticDipole
 from rigidjax.motion.torques.series import Series as Series, Wheel as Wheel
 from rigidjax.motion.torques.tables import (
