@@ -54,5 +54,12 @@ from rigidjax.identify.sensors import (
     quaternions_from_euler as quaternions_from_euler,
     quaternions_from_matrices as quaternions_from_matrices,
 )
+from rigidjax.identify.windows import (
+    Horizons as Horizons,
+    WindowFit as WindowFit,
+    Windows as Windows,
+    fit_windows as fit_windows,
+    windows as windows,
+)
 
 __dir__ = own_names(__name__)

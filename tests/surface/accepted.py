@@ -13,6 +13,7 @@ BY_NUMBER = (
     "which its docstring states, it gives NaN there and the right numbers beside"
 )
 NO_NUMBERS = "a function of arrays, number by number: of no numbers it makes none"
+SCENE = "the scene is a function of the user's: it takes the guess that it takes, and refuses"
 OF_TIME = "a function of time is documented; its value is looked at where it is used"
 ANY_STATE = "what has no quaternion comes back as it is: a user's own state may be anything"
 CRAMER = (
@@ -81,6 +82,11 @@ ACCEPTED: list[tuple[str, str, str, str]] = [
         for name in ("choose", "front", "moved", "table")
         for empty in ("dict", "empty list")
     ),
+    ("identify.windows", "inputs: dict", "taken*", "no input at all is documented: none is read"),
+    ("identify.fit_windows", "windows: huge", "*", SCENE),
+    ("identify.fit_windows", "windows: large", "*", SCENE),
+    ("identify.fit_windows", "guess: *", "was not raised by the library*", SCENE),
+    ("identify.fit_windows", "guess: *", "names none of*", SCENE),
     ("motion.on_the_group", "state: *", "taken without a word*", ANY_STATE),
     *(
         (f"motion.torques.{law}", "*: function", "taken without a word*", OF_TIME)

@@ -151,6 +151,40 @@ row(
 records = ("Fit", "Start", "Quantity", "Comparison", "Own", "Parameters")
 leave_out("a record that the library fills", *(f"identify.{name}" for name in records))
 leave_out("an exception", "identify.LogError")
+leave_out(
+    "a record that windows and fit_windows fill: tests/identify/test_windows.py",
+    *(f"identify.{name}" for name in ("Horizons", "WindowFit", "Windows")),
+)
+
+
+def cut() -> rj.identify.Windows:
+    t = np.arange(7.0) / 8
+    spins = rj.Spin(np.stack([0 * t, 0 * t, np.exp(-0.5 * t)], 1))
+    return rj.identify.windows(t, spins, length=3, stride=3)
+
+
+row(
+    "identify.windows",
+    lambda: dict(
+        t=np.arange(7.0) / 8,
+        states=rj.Spin(np.arange(21.0).reshape(7, 3)),
+        inputs={"u": np.ones((7, 2))},
+        length=3,
+        stride=2,
+    ),
+    **HOST,
+)
+row(
+    "identify.fit_windows",
+    lambda: dict(
+        windows=cut(),
+        scene=lambda k: (s.inertia(), rj.torques.Damping(k * np.ones(3))),
+        guess=np.array(0.1),
+        noise={"omega": 0.1},
+        max_steps=3,
+    ),
+    **HOST,
+)
 
 
 # Reports and files.

@@ -1,0 +1,145 @@
+"""Fits of many short open-loop runs: numbers known beforehand come back, mistakes are named."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import rigidjax as rj
+from rigidjax import identify, torques
+
+H, T = 0.02, 81
+BODY = rj.Inertia.from_principal(1.0, 2.0, 2.5)
+
+
+class Push(torques.AbstractTorque):
+    """A driven torque along an axis of the body, and damping."""
+
+    feels = rj.HasSpin
+    gain: jax.Array
+    source: torques.Input = torques.Input("u")
+
+    def __call__(self, t, state, body):
+        return self.gain * self.source(t)
+
+
+def scene(free):
+    law = torques.Sum(Push(free["gain"]), torques.Damping(free["damping"] * jnp.ones(3)))
+    return BODY, law
+
+
+TRUE = {"gain": np.array([0.5, -0.3, 0.8]), "damping": np.array(0.2)}
+GUESS = {"gain": jnp.array([1.0, 0.0, 0.0]), "damping": jnp.asarray(0.0)}
+
+
+def recorded(sigma=0.0, seed=0):
+    """Attitudes and rates of one run through diffrax's tight steps, with noise; and the inputs."""
+    rng = np.random.default_rng(seed)
+    t, u = H * np.arange(T), np.cos(0.3 * np.arange(T)) + rng.normal(size=T)
+    law = torques.bind(scene(jax.tree.map(jnp.asarray, TRUE))[1], {"u": torques.Held(t, u)})
+    start = rj.Attitude([1.0, 0, 0, 0], [0.5, 1.0, -0.4])
+
+    class Whole(eqx.Module):
+        law: object
+        feels = rj.HasSpin
+        jump_times: jax.Array
+
+        def __call__(self, t, state, body):
+            return self.law(t, state, body)
+
+    whole = Whole(law, jnp.asarray(t))
+    ys = rj.simulate(BODY, start, t, whole, rtol=1e-11, atol=1e-13).ys
+    q = np.asarray(ys.q) + sigma * rng.normal(size=(T, 4))
+    q /= np.linalg.norm(q, axis=1)[:, None]
+    return t, rj.Attitude(q, np.asarray(ys.omega) + sigma * rng.normal(size=(T, 3))), u
+
+
+def test_known_numbers_come_back():
+    t, states, u = recorded()
+    cut = identify.windows(t, states, {"u": u}, length=8, stride=8)
+    assert (cut.count, cut.length, cut.step) == (10, 8, H)
+    found = identify.fit_windows(cut, scene, GUESS)
+    assert found.converged
+    assert found.message == ""
+    # Equal steps of order 4 stand against a tight solver: 1e-7 of the numbers is theirs.
+    for name, value in TRUE.items():
+        np.testing.assert_allclose(found.value[name], value, rtol=0, atol=1e-6)
+    ahead = found.predict(cut)
+    assert ahead.steps.tolist() == list(range(1, 9))
+    assert max(e.max() for e in ahead.mean_absolute.values()) < 1e-7
+    held = cut.held()
+    rise = np.abs(np.asarray(states.omega)[1::8] - np.asarray(states.omega)[:-1:8]).mean()
+    np.testing.assert_allclose(held.mean_absolute["omega"][0], rise, rtol=1e-12)
+
+
+def test_deviations_say_how_far_off_the_numbers_are():
+    """Ten records with noise: of forty numbers as many within two deviations as there should be."""
+    inside = []
+    for seed in range(10):
+        t, states, u = recorded(2e-3, seed)
+        cut = identify.windows(t, states, {"u": u}, length=8, stride=8)
+        found = identify.fit_windows(cut, scene, {k: jnp.asarray(v) for k, v in TRUE.items()})
+        for name, value in TRUE.items():
+            off = np.abs(np.asarray(found.value[name]) - value)
+            inside += list(np.ravel(off < 2 * np.asarray(found.deviation[name])))
+    # 95 % of 40 are expected; of ten windows a record somewhat fewer.
+    assert sum(inside) >= 32
+
+
+def test_no_window_goes_across_a_gap():
+    t = np.concatenate([np.arange(6.0), 20.0 + np.arange(4.0)])
+    spins = rj.Spin(np.arange(30.0).reshape(10, 3))
+    cut = identify.windows(t, spins, length=3)
+    assert np.asarray(cut.starts.omega)[:, 0].tolist() == [0.0, 3.0, 6.0, 18.0]
+    both = identify.Windows.joined(cut, cut)
+    assert both.count == 8
+    assert identify.Windows.joined(cut) is cut
+
+
+def test_a_fit_that_is_stopped_returns_its_best_point():
+    t, states, u = recorded()
+    cut = identify.windows(t, states, {"u": u}, length=8, stride=8)
+    found = identify.fit_windows(cut, scene, GUESS, max_steps=1)
+    assert not found.converged
+    assert found.message == "stopped after 1 steps: its best point"
+
+
+SPINS = rj.Spin(np.ones((10, 3)))
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda: identify.windows(np.arange(10.0), SPINS, length=10), r"length \+ 1 = 11 times"),
+        (lambda: identify.windows(np.arange(9.0), SPINS, length=2), "omega: wanted a row for each of 9 times"),
+        (lambda: identify.windows(np.arange(10.0), rj.Spin(np.full((10, 3), np.nan)), length=2), "omega: NaN or infinity in row 0"),
+        (lambda: identify.windows(np.arange(10.0), SPINS, {"u": np.ones(9)}, length=2), r"inputs\['u'\]: wanted a row"),
+        (lambda: identify.windows(np.arange(10.0) ** 1.1, SPINS, length=2), "t: wanted even times"),
+        (lambda: identify.windows(10.0 * np.arange(10.0) // 15, SPINS, length=2), "t: wanted even times"),
+        (lambda: identify.Windows.joined(), "wanted at least one"),
+        (lambda: identify.Windows.joined(*(identify.windows(np.arange(10.0), SPINS, length=k) for k in (2, 3))), "wanted one step, length"),
+        (lambda: identify.fit_windows(identify.windows(np.arange(10.0), SPINS, length=2), scene, GUESS), "the law reads 'u', the windows have none"),
+        (lambda: identify.fit_windows(identify.windows(np.arange(10.0), SPINS, length=2), lambda x: (BODY, None), jnp.ones(1), noise={"q": 1.0}), "noise: wanted a number for each of"),
+        (lambda: identify.fit_windows(identify.windows(np.arange(10.0), SPINS, length=2), lambda x: (BODY, None), ()), "guess: wanted a tree of floating numbers"),
+        (lambda: identify.fit_windows(identify.windows(np.arange(10.0), SPINS, length=2), lambda x: (BODY, rj.torques.Damping(-1e200 * x * jnp.ones(3))), jnp.ones(1)), "guess: the runs from it are not finite"),
+    ],
+)  # fmt: skip
+def test_mistakes_are_named(call, words):
+    with pytest.raises(ValueError, match=words):
+        call()
+
+
+def test_numbers_of_no_real_body_are_said():
+    """A body whose moments a fit drives beyond the triangle inequality."""
+    t = H * np.arange(30)
+    law = rj.torques.ConstantTorque([0.1, 0.1, 0.1])
+    rates = np.outer(t, 0.1 / np.array([1.0, 1.0, 3.0]))
+    cut = identify.windows(t, rj.Spin(rates), length=4, stride=4)
+
+    def scene(log):
+        moments = jnp.exp(log)
+        return rj.Inertia(jnp.diag(moments)), law
+
+    found = identify.fit_windows(cut, scene, jnp.log(jnp.array([1.0, 1.2, 1.5])))
+    assert "no real body has these numbers" in found.message
