@@ -1,10 +1,12 @@
 """Strict JAX, and every public signature checked at run time (jaxtyping + beartype)."""
 
 import gc
+import importlib
 import itertools
 import os
 from pathlib import Path
 
+import equinox
 import jax
 import pytest
 from jaxtyping import config, install_import_hook
@@ -13,10 +15,15 @@ jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 
+# Fits and searches for orbits are the largest programs, and are not measured in round-off: in a
+# default run they are compiled as `once` does, in a long run as users compile them.
+once = importlib.import_module("once")
+usual = once.library_programs(("rigidjax.identify", "rigidjax.frames"))
 with install_import_hook("rigidjax", "beartype.beartype"):
     import rigidjax
     import rigidjax.plot
     import rigidjax.workprecision  # noqa: F401
+equinox.filter_jit = usual
 
 
 # Traced programs are millions of objects that all stay: to look through them again and again for
@@ -30,6 +37,7 @@ def pytest_configure(config):
 
     By the environment, so that processes which tests start find them, too.
     """
+    once.ask(config.option.markexpr == "not slow")
     if hasattr(config, "cache") and "JAX_COMPILATION_CACHE_DIR" not in os.environ:
         folder = str(config.cache.mkdir("jax"))
         os.environ["JAX_COMPILATION_CACHE_DIR"] = folder
