@@ -1,28 +1,12 @@
 """Strict JAX, and every public signature checked at run time (jaxtyping + beartype)."""
 
 import gc
+import importlib
 import itertools
 import os
 from pathlib import Path
 
-import jax
 import pytest
-from jaxtyping import config, install_import_hook
-
-jax.config.update("jax_enable_x64", True)
-jax.config.update("jax_numpy_rank_promotion", "raise")
-jax.config.update("jax_numpy_dtype_promotion", "strict")
-
-with install_import_hook("rigidjax", "beartype.beartype"):
-    import rigidjax
-    import rigidjax.plot
-    import rigidjax.workprecision  # noqa: F401
-
-
-# Traced programs are millions of objects that all stay: to look through them again and again for
-# garbage is a tenth of the time.
-gc.freeze()
-gc.set_threshold(100_000, 50, 50)
 
 
 def pytest_configure(config):
@@ -31,11 +15,41 @@ def pytest_configure(config):
     By the environment, so that processes which tests start find them, too.
     """
     if hasattr(config, "cache") and "JAX_COMPILATION_CACHE_DIR" not in os.environ:
-        folder = str(config.cache.mkdir("jax"))
-        os.environ["JAX_COMPILATION_CACHE_DIR"] = folder
+        os.environ["JAX_COMPILATION_CACHE_DIR"] = str(config.cache.mkdir("jax"))
         os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
+    # The process that shares tests out to others runs none, and they wait for it.
+    if not config.getoption("numprocesses", None) or hasattr(config, "workerinput"):
+        _load(config.option.markexpr == "not slow")
+
+
+def _load(default_run):
+    import equinox
+    import jax
+    from jaxtyping import install_import_hook
+
+    jax.config.update("jax_enable_x64", True)
+    jax.config.update("jax_numpy_rank_promotion", "raise")
+    jax.config.update("jax_numpy_dtype_promotion", "strict")
+    # A plugin may have imported JAX before its environment was set.
+    if folder := os.environ.get("JAX_COMPILATION_CACHE_DIR"):
         jax.config.update("jax_compilation_cache_dir", folder)
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+        seconds = os.environ.get("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "1")
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", float(seconds))
+
+    # Fits and searches for orbits are the largest programs, and are not measured in round-off: in a
+    # default run they are compiled as `once` does, in a long run as users compile them.
+    once = importlib.import_module("once")
+    once.ask(default_run)
+    usual = once.library_programs(("rigidjax.identify", "rigidjax.frames"))
+    with install_import_hook("rigidjax", "beartype.beartype"):
+        for name in ("rigidjax", "rigidjax.plot", "rigidjax.workprecision"):
+            importlib.import_module(name)
+    equinox.filter_jit = usual
+
+    # Traced programs are millions of objects that all stay: to look through them again and again
+    # for garbage is a tenth of the time.
+    gc.freeze()
+    gc.set_threshold(100_000, 50, 50)
 
 
 _MAPS, _MANY, _TESTS = Path("/proc/self/maps"), 45_000, itertools.count()
@@ -55,6 +69,8 @@ def room_for_programs():
 
     Beyond that XLA ends in a segmentation fault: so programs are forgotten in time.
     """
+    import jax
+
     yield
     if next(_TESTS) % 10 == 0 and _MAPS.exists():
         with _MAPS.open() as lines:
@@ -67,6 +83,8 @@ def room_for_programs():
 @pytest.fixture
 def unhooked():
     """Users run without the jaxtyping hook: so do the tests of what they read on a mistake."""
+    from jaxtyping import config
+
     config.update("jaxtyping_disable", True)
     yield
     config.update("jaxtyping_disable", False)

@@ -90,9 +90,9 @@ def align(a: Vec3Like, b: Vec3Like) -> Mat3:
 
     **Arguments:** `a`, `b` (3,), in one frame, any lengths. **Returns:** (3, 3), R a ∥ b.
     **Raises:** `ValueError` for zero or NaN where they are known.
-    For exactly opposite directions: half a turn about the axis normal to a that is nearest to the
-    basis vector along which a is smallest. No digits are lost near there: the quaternion is
-    (½|m|, a × m/|m|), m = a + b, and m is small but exact.
+    For directions that are opposite to round-off: half a turn about the axis normal to a that is
+    nearest to the basis vector along which a is smallest. No digits are lost near there: the
+    quaternion is (½|m|, a × m/|m|), m = a + b, and m is small but exact.
 
     >>> align(jnp.array([1.0, 0, 0]), jnp.array([0, 2.0, 0])).round(12)[:, 0].tolist()
     [0.0, 1.0, 0.0]
@@ -101,12 +101,14 @@ def align(a: Vec3Like, b: Vec3Like) -> Mat3:
     a, b = (_of_order_one(direction(x, name)) for x, name in ((a, "a"), (b, "b")))
     a, b = a / jnp.sqrt(dot(a, a)), b / jnp.sqrt(dot(b, b))
     middle = a + b
-    n2 = dot(middle, middle)
-    opposite = n2 == 0
+    n2, normal = dot(middle, middle), cross(a, middle)
+    # Both lengths are 1 to round-off only: what is left of m may lie along a.
+    least = 2 * float(jnp.finfo(a.dtype).eps)
+    opposite = (n2 < 1) & (dot(normal, normal) <= least * least)
     length = jnp.sqrt(jnp.where(opposite, 1, n2))
     smallest = jnp.eye(3, dtype=a.dtype)[jnp.argmin(jnp.abs(a))]
     across = smallest - dot(smallest, a) * a
-    axis = jnp.where(opposite, across / jnp.sqrt(dot(across, across)), cross(a, middle) / length)
+    axis = jnp.where(opposite, across / jnp.sqrt(dot(across, across)), normal / length)
     w = jnp.where(opposite, 0, 0.5 * length)
     return quaternion.to_matrix(quaternion.normalise(jnp.concatenate([w[None], axis])))
 

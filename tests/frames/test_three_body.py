@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import mpmath as mp
 import numpy as np
 import pytest
-from once import filter_once
+from once import filter_once, once
 
 import rigidjax as rj
 from rigidjax.frames import Point, scenes
@@ -301,14 +301,13 @@ def test_particles_side_by_side_collide_alone():
     speeds = jnp.array([[0.0, -0.5, 0.0], [0.0, 0.0, 0.0], [0.0, np.sqrt(2.0) - 0.5, 0.0]])
     places = jnp.array([[0.5, 0.0, 0.0], [0.05, 0.0, 0.0], [0.5, 0.0, 0.0]])
 
-    @eqx.filter_jit
     def end(x, v, radius):
         scene = eqx.tree_at(lambda s: s.radii, wide, jnp.stack([radius, jnp.zeros(())]))
         out = rj.simulate(None, Point(x, v), ts, scene, throw=False)
         return out.ys.x, out.stats["collided"], out.stats["end_time"]
 
     radius = jnp.array(0.1)
-    x, hit, when = jax.vmap(end, (0, 0, None))(places, speeds, radius)
+    x, hit, when = once(jax.vmap(end, (0, 0, None)))(places, speeds, radius)
     np.testing.assert_array_equal(hit, [True, True, False])
     assert when[1] == 0 and np.pi / 16 < when[0] < np.pi / 8
     reached = np.isfinite(np.asarray(x)).all(-1)
@@ -321,12 +320,12 @@ def test_particles_side_by_side_collide_alone():
     def last(v, radius):
         return end(places[2], v, radius)[0][-1]
 
-    by_speed, by_radius = jax.jit(jax.jacrev(last, (0, 1)))(speeds[2], radius)
+    by_speed, by_radius = once(jax.jacrev(last, (0, 1)))(speeds[2], radius)
     np.testing.assert_array_equal(by_radius, np.zeros(3))
-    forward = jax.jit(jax.jacfwd(last))(speeds[2], radius)
+    forward = once(jax.jacfwd(last))(speeds[2], radius)
     np.testing.assert_allclose(by_speed, forward, rtol=1e-10, atol=1e-12)
     h = 1e-5 * np.eye(3)
-    far = jax.jit(jax.vmap(lambda h: last(speeds[2] + h, radius) - last(speeds[2] - h, radius)))
+    far = once(jax.vmap(lambda h: last(speeds[2] + h, radius) - last(speeds[2] - h, radius)))
     np.testing.assert_allclose(by_speed, np.asarray(far(jnp.asarray(h))).T / 2e-5, atol=1e-7)
 
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
 from jax.test_util import check_grads
+from once import once
 
 import rigidjax as rj
 from rigidjax import torques
@@ -215,7 +216,7 @@ def test_derivatives_of_first_and_second_order(law, state):
     # One vector: check_grads works number by number of it, not program by program of each leaf.
     numbers, restore = ravel_pytree((law, state, body))
 
-    @jax.jit
+    @once
     def value(numbers):
         law, state, body = restore(numbers)
         force, torque = torques.act(law, 0.5, state, body)

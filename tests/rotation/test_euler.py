@@ -75,7 +75,7 @@ def test_a_sequence(sequence):
 
 @pytest.mark.parametrize("sequence", ["ZXZ", "xyz"])
 def test_derivatives_at_and_near_the_singular_case(sequence):
-    """Finite there; right 1e-3 from it; float32 keeps the matrix to 1e-6."""
+    """Finite there; right 1e-3 from it."""
     symmetric = sequence[0] == sequence[2]
     singular = jnp.array([0.4, 0.0 if symmetric else np.pi / 2, 0.0])
 
@@ -90,11 +90,6 @@ def test_derivatives_at_and_near_the_singular_case(sequence):
         return f(euler.to_matrix(a, sequence))
 
     np.testing.assert_allclose(once(jax.jacrev(trip))(near), np.eye(3), atol=1e-9)
-    for middle in middles(sequence, np.float32):
-        m = euler.to_matrix(jnp.array([1.0, middle, -2.0], jnp.float32), sequence)
-        got = euler.to_matrix(f(m), sequence)
-        assert got.dtype == jnp.float32
-        assert abs(np.asarray(got) - m).max() < 1e-6
 
 
 @some("ZYX", "ZXZ", "xyz", "yzy")
@@ -104,9 +99,11 @@ def test_float32_keeps_the_matrix_in_every_sequence(sequence):
     ends = (0.0, np.pi) if symmetric else (-np.pi / 2, np.pi / 2)
     away = [0.0, 1e-7, 1e-5, 1e-3, 0.7]
     middle = np.array([ends[0] + d for d in away] + [ends[1] - d for d in away])
+    middle = np.concatenate([middle, middles(sequence, np.float32)])
     angles = np.stack([np.full_like(middle, 1.0), middle, np.full_like(middle, -2.0)], axis=1)
     trip = jax.jit(jax.vmap(lambda m: euler.to_matrix(euler.from_matrix(m, sequence), sequence)))
-    m = jax.vmap(lambda a: euler.to_matrix(a, sequence))(jnp.asarray(angles, jnp.float32))
+    placed = jax.jit(jax.vmap(lambda a: euler.to_matrix(a, sequence)))
+    m = placed(jnp.asarray(angles, jnp.float32))
     assert trip(m).dtype == jnp.float32
     assert np.abs(np.asarray(trip(m)) - np.asarray(m)).max() < 1e-6
 

@@ -113,13 +113,19 @@ def test_round_trips_between_every_pair_of_charts(v):
 def test_slerp_turns_at_a_constant_rate_and_is_regular_at_equal_ends():
     p = quaternion.exp(jnp.array([0.2, 0.3, -1.0]))
     q = -quaternion.multiply(p, quaternion.exp(jnp.array([1.0, -1.0, 2.0])))
-    at = jax.vmap(lambda s: quaternion.interpolate(p, q, s))(jnp.linspace(0, 1, 5))
-    step = jax.vmap(lambda a, b: quaternion.log(quaternion.multiply(quaternion.conjugate(a), b)))
-    np.testing.assert_allclose(
-        step(at[:-1], at[1:]), np.tile([0.25, -0.25, 0.5], (4, 1)), atol=1e-15
-    )
-    slope = jax.jacfwd(
-        lambda v: quaternion.log(quaternion.interpolate(jnp.eye(4)[0], quaternion.exp(v), 0.3))
+
+    @jax.jit
+    def steps(p, q, s):
+        at = jax.vmap(lambda s: quaternion.interpolate(p, q, s))(s)
+        step = lambda a, b: quaternion.log(quaternion.multiply(quaternion.conjugate(a), b))
+        return jax.vmap(step)(at[:-1], at[1:])
+
+    found = steps(p, q, np.linspace(0, 1, 5))
+    np.testing.assert_allclose(found, np.tile([0.25, -0.25, 0.5], (4, 1)), atol=1e-15)
+    slope = jax.jit(
+        jax.jacfwd(
+            lambda v: quaternion.log(quaternion.interpolate(jnp.eye(4)[0], quaternion.exp(v), 0.3))
+        )
     )
     np.testing.assert_allclose(slope(jnp.zeros(3)), 0.3 * np.eye(3), atol=1e-16)
 
@@ -151,13 +157,13 @@ def test_mrp_shadow_switch_and_rates():
     """σ and its shadow are one rotation; the switch keeps |σ| ≤ 1; rates are dσ/dt, both ways."""
     rng = np.random.default_rng(0)
     sigma, omega = rng.normal(size=(2, 50, 3))
-    both = jax.vmap(mrp.to_matrix)
-    np.testing.assert_allclose(both(jax.vmap(mrp.shadow)(sigma)), both(sigma), atol=2e-15)
-    kept = jax.vmap(mrp.switch)(sigma)
+    both = jax.jit(jax.vmap(mrp.to_matrix))
+    np.testing.assert_allclose(both(jax.jit(jax.vmap(mrp.shadow))(sigma)), both(sigma), atol=2e-15)
+    kept = jax.jit(jax.vmap(mrp.switch))(sigma)
     assert (np.linalg.norm(kept, axis=1) <= 1 + 1e-15).all()
     np.testing.assert_allclose(both(kept), both(sigma), atol=2e-15)
     np.testing.assert_array_equal(mrp.switch(jnp.zeros(3)), np.zeros(3))
-    np.testing.assert_array_equal(jax.jacrev(mrp.switch)(jnp.zeros(3)), np.eye(3))
+    np.testing.assert_array_equal(jax.jit(jax.jacrev(mrp.switch))(jnp.zeros(3)), np.eye(3))
     _check_rates(mrp, sigma, omega)
 
 

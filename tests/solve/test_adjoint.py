@@ -195,15 +195,15 @@ def test_a_segment_run_again_may_take_other_steps(monkeypatch):
         return run("wheel", ts, p, weights, 300)
 
     p, turn = jnp.zeros(16), jnp.asarray(np.random.default_rng(2).normal(size=16))
-    whole = jax.jit(jax.grad(value))(p)
-    once, factor = adaptive_loop.recorded, [1.3]
+    whole = once(jax.grad(value))(p)
+    recorded, factor = adaptive_loop.recorded, [1.3]
 
     def otherwise(method, constants, run, *rest):
-        return once(method, constants, run._replace(rtol=factor[0] * run.rtol), *rest)
+        return recorded(method, constants, run._replace(rtol=factor[0] * run.rtol), *rest)
 
     monkeypatch.setattr(adaptive_loop, "SEGMENT", 7)
     monkeypatch.setattr(adjoint, "recorded", otherwise)
-    slopes = jax.jit(lambda p: (jax.grad(value)(p), jax.jvp(value, (p,), (turn,))[1]))
+    slopes = once(lambda p: (jax.grad(value)(p), jax.jvp(value, (p,), (turn,))[1]))
     reverse, forward = slopes(p)
     scale = float(jnp.abs(whole).max())
     np.testing.assert_allclose(reverse, whole, rtol=0, atol=1e-6 * scale)
@@ -211,7 +211,7 @@ def test_a_segment_run_again_may_take_other_steps(monkeypatch):
     # Without room for them there are no numbers, rather than wrong ones.
     factor[0] = 1e-5
     monkeypatch.setattr(adaptive_loop, "_MORE", 0)
-    assert np.isnan(jax.jit(lambda p: jax.grad(value)(p))(p)).any()
+    assert np.isnan(once(lambda p: jax.grad(value)(p))(p)).any()
 
 
 @pytest.mark.slow

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import equinox as eqx
-import jax.core
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
@@ -152,10 +151,11 @@ def _rows(
         raise ValueError(f"{other}: wanted {count - extra} rows of 3, got {_shape(values)}{advice}")
     times = _checks.finite(_checks.floating(times, (count,), name), name)
     values = _checks.finite(_checks.floating(values, (count - extra, 3), other), other)
-    falling = times[1:] <= times[:-1]
+    ordered = np.asarray(times) if _checks.known(times) else times
+    falling = ordered[1:] <= ordered[:-1]
     where = ""
-    if not isinstance(falling, jax.core.Tracer) and bool(falling.any()):
-        where = f"; {name}[{int(np.argmax(np.asarray(falling))) + 1}] is not above the one before"
+    if isinstance(falling, np.ndarray) and falling.any():
+        where = f"; {name}[{int(np.argmax(falling)) + 1}] is not above the one before"
     times = _checks.refuse(times, falling.any(), f"{name}: wanted increasing times, s{where}")
     dtype = jnp.result_type(times, values)
     return times.astype(dtype), values.astype(dtype)
