@@ -1,0 +1,19 @@
+"""Unknown torques: what a recording says of a motion that nobody can predict.
+
+`filter`, `step` and `smooth` give states, torques and sensor errors with their deviations;
+`log_likelihood` what readings say of anything else, the unknown torques integrated out; `sample` a
+motion under random torques.
+"""
+
+from rigidjax._names import own_names
+from rigidjax.estimate.belief import Belief as Belief, start as start
+from rigidjax.estimate.filter import (
+    Filtered as Filtered,
+    filter as filter,
+    log_likelihood as log_likelihood,
+    step as step,
+)
+from rigidjax.estimate.sample import Sampled as Sampled, sample as sample
+from rigidjax.estimate.scene import Model as Model, Walk as Walk
+
+__dir__ = own_names(__name__)
