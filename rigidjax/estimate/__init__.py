@@ -13,6 +13,12 @@ from rigidjax.estimate.filter import (
     log_likelihood as log_likelihood,
     step as step,
 )
+from rigidjax.estimate.linear import (
+    LinearEstimate as LinearEstimate,
+    LinearModel as LinearModel,
+    linear_filter as linear_filter,
+    linear_smooth as linear_smooth,
+)
 from rigidjax.estimate.sample import Sampled as Sampled, sample as sample
 from rigidjax.estimate.scene import Model as Model, Walk as Walk
 

@@ -4,16 +4,13 @@ import math
 from typing import NamedTuple
 
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from rigidjax._types import Scalar
 
-# Beyond this many rows a loop written out takes long to compile.
-_WRITTEN_OUT = 16
-
-
 def triangular(a: Float[Array, "n m"]) -> Float[Array, "n n"]:
-    """The lower triangular root L of `a aᵀ`, its diagonal ≥ 0; m ≥ n.
+    """The lower triangular root L of `a aᵀ`, its diagonal ≥ 0.
 
     By the modified Gram–Schmidt process on the rows, whose triangular factor is as good as
     Householder's (Björck 1967, doi:10.1007/BF01934122). A row that depends on those before it
@@ -23,19 +20,17 @@ def triangular(a: Float[Array, "n m"]) -> Float[Array, "n n"]:
     [[5.0, 0.0], [5.0, 0.0]]
     """
     n = a.shape[0]
-    if n > _WRITTEN_OUT:
-        root = jnp.linalg.qr(a.T, mode="reduced")[1].T
-        return root * jnp.where(jnp.diagonal(root) < 0, -1.0, 1.0).astype(a.dtype)[None]
-    columns = []
-    for k in range(n):
-        square = jnp.sum(a[0] * a[0])
+    below = jnp.arange(n)
+
+    def take(a: Array, k: Array) -> tuple[Array, Array]:
+        row = lax.dynamic_index_in_dim(a, k, keepdims=False)
+        square = jnp.sum(row * row)
         there = square > 0
-        inverse = jnp.where(there, 1 / jnp.sqrt(jnp.where(there, square, 1)), 0)
-        unit = a[0] * inverse
-        column = jnp.sum(a * unit[None], 1)
-        columns.append(jnp.concatenate([jnp.zeros(k, a.dtype), column]))
-        a = a[1:] - column[1:, None] * unit[None]
-    return jnp.stack(columns, 1)
+        unit = row * jnp.where(there, 1 / jnp.sqrt(jnp.where(there, square, 1)), 0)
+        column = jnp.where(below >= k, jnp.sum(a * unit[None], 1), 0)
+        return a - column[:, None] * unit[None], column
+
+    return lax.scan(take, a, below)[1].T
 
 
 def product(a: Float[Array, "n m"], b: Float[Array, "m k"]) -> Float[Array, "n k"]:
@@ -103,11 +98,21 @@ def divide(lower: Float[Array, "n n"], right: Float[Array, "n m"]) -> Float[Arra
     >>> divide(2.0 * jnp.eye(2), jnp.eye(2)).tolist()
     [[0.5, 0.0], [0.0, 0.5]]
     """
-    rows: list[Array] = []
-    for k in range(lower.shape[0]):
-        left = right[k]
-        if k:
-            left = left - jnp.sum(lower[k, :k, None] * jnp.stack(rows), 0)
-        there = lower[k, k] > 0
-        rows.append(jnp.where(there, left / jnp.where(there, lower[k, k], 1), 0))
-    return jnp.stack(rows)
+
+    def take(right: Array, k: Array) -> tuple[Array, Array]:
+        column = lax.dynamic_index_in_dim(lower, k, 1, keepdims=False)
+        there = column[k] > 0
+        row = right[k] * jnp.where(there, 1 / jnp.where(there, column[k], 1), 0)
+        return right - column[:, None] * row[None], row
+
+    return lax.scan(take, right, jnp.arange(lower.shape[0]))[1]
+
+
+def divide_right(left: Float[Array, "m n"], lower: Float[Array, "n n"]) -> Float[Array, "m n"]:
+    """`left lower⁻¹`; where the diagonal is zero, zero.
+
+    >>> divide_right(jnp.eye(2), 2.0 * jnp.eye(2)).tolist()
+    [[0.5, 0.0], [0.0, 0.5]]
+    """
+    turned = divide(lower[::-1, ::-1].T, left[:, ::-1].T)
+    return turned.T[:, ::-1]

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from rigidjax import _checks
@@ -173,16 +174,20 @@ def absorb_all(
     row: Sequence[Row], step: Array, root: Array
 ) -> tuple[Array, Array, tuple[Read, ...]]:
     """Potter's update by all numbers of all sensors, one by one."""
-    out = []
-    for error, matrix, variance, seen in row:
-        innovations, variances = [], []
-        for k in range(error.shape[0]):
-            step, root, innovation, total = roots.absorb(
-                step, root, matrix[k], error[k], variance[k], seen[k]
-            )
-            innovations.append(innovation)
-            variances.append(total)
-        out.append(Read(jnp.stack(innovations), jnp.stack(variances), seen))
+    stacked = Row(*(jnp.concatenate(parts) for parts in zip(*row, strict=True)))
+
+    def one(carry: tuple[Array, Array], number: Row) -> tuple[Any, Any]:
+        found = roots.absorb(
+            *carry, number.matrix, number.error, number.variance, number.seen
+        )
+        return (found.step, found.root), (found.innovation, found.variance)
+
+    (step, root), (innovation, variance) = lax.scan(one, (step, root), stacked)
+    out, at = [], 0
+    for part in row:
+        here = slice(at, at + part.error.shape[0])
+        out.append(Read(innovation[here], variance[here], part.seen))
+        at = here.stop
     return step, root, tuple(out)
 
 
