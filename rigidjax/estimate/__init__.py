@@ -21,5 +21,6 @@ from rigidjax.estimate.linear import (
 )
 from rigidjax.estimate.sample import Sampled as Sampled, sample as sample
 from rigidjax.estimate.scene import Model as Model, Walk as Walk
+from rigidjax.estimate.smoother import Push as Push, Smoothed as Smoothed, smooth as smooth
 
 __dir__ = own_names(__name__)

@@ -105,7 +105,7 @@ def filter(
     >>> found.states.omega.shape, found.words
     ((2, 3), 'followed')
     """
-    sensors = _looked_at(model, recording, first)
+    sensors = looked_at(model, recording, first)
     grid = grid_of(model, recording, first, substeps)
     out = _filter(bare(model), sensors, recording, first, grid)
     if not throw:
@@ -141,7 +141,7 @@ def log_likelihood(
     >>> log_likelihood(model, record, first).round(6)
     Array(-5.513631, dtype=float64)
     """
-    sensors = _looked_at(model, recording, first)
+    sensors = looked_at(model, recording, first)
     grid = grid_of(model, recording, first, substeps)
     return _log_likelihood(bare(model), sensors, recording, first, grid)
 
@@ -218,25 +218,28 @@ def _one(
     return Belief(t, retract(x, e), reset(x, e, root)), read
 
 
-class _Stops(NamedTuple):
+class Stops(NamedTuple):
+    """Where the filter stops, and what was read there."""
+
     t: Array
     values: tuple[Array, ...]
     masks: tuple[Array, ...]
 
 
-def _scan(
+def scan_filter(
     model: Model,
     sensors: Sensors,
     recording: Recording,
     first: Belief,
     grid: Grid | None,
     keep: Any,
-) -> tuple[Any, Any]:
+) -> tuple[Stops, Any]:
+    """All stops, and `lax.scan` of the filter over them, which keeps `keep(belief, read)`."""
     dtype = first.root.dtype
     dynamics = Dynamics(model, first.x, sensors.densities)
-    stops = _Stops(*gathered(grid, recording.t.astype(dtype), *values_of(recording, dtype)))
+    stops = Stops(*gathered(grid, recording.t.astype(dtype), *values_of(recording, dtype)))
 
-    def body(carry: tuple[Belief, Array], stop: _Stops) -> tuple[Any, Any]:
+    def body(carry: tuple[Belief, Array], stop: Stops) -> tuple[Any, Any]:
         belief, total = carry
         belief, read = _one(model, dynamics, sensors, belief, *stop)
         total = total + sum(r.log_density for r in read)
@@ -244,19 +247,19 @@ def _scan(
 
     # What a reverse pass needs of a step is made again: a step holds some thousand numbers.
     body = jax.checkpoint(body)  # pyright: ignore[reportPrivateImportUsage]
-    return lax.scan(body, (first, jnp.zeros((), dtype)), stops)
+    return stops, lax.scan(body, (first, jnp.zeros((), dtype)), stops)
 
 
 @eqx.filter_jit
 def _filter(
     model: Model, sensors: Sensors, recording: Recording, first: Belief, grid: Grid | None
 ) -> Filtered:
-    (_, total), (beliefs, reads) = _scan(
+    _, ((_, total), (beliefs, reads)) = scan_filter(
         model, sensors, recording, first, grid, lambda belief, read: (belief, read)
     )
     if grid is not None:
         beliefs, reads = jax.tree.map(lambda leaf: leaf[grid.rows], (beliefs, reads))
-    status, lost_at = _status(beliefs, reads, first.t)
+    status, lost_at = status_of(beliefs, reads, first.t)
     return Filtered(beliefs, reads, total, status, lost_at)
 
 
@@ -264,10 +267,13 @@ def _filter(
 def _log_likelihood(
     model: Model, sensors: Sensors, recording: Recording, first: Belief, grid: Grid | None
 ) -> Scalar:
-    return _scan(model, sensors, recording, first, grid, lambda belief, read: None)[0][1]
+    _, ((_, total), _) = scan_filter(
+        model, sensors, recording, first, grid, lambda belief, read: None
+    )
+    return total
 
 
-def _status(beliefs: Belief, reads: tuple[Read, ...], t0: Array) -> tuple[Array, Array]:
+def status_of(beliefs: Belief, reads: tuple[Read, ...], t0: Array) -> tuple[Array, Array]:
     t, times = beliefs.t, jnp.arange(beliefs.t.shape[0])
     lost = jnp.zeros(t.shape, bool)
     for read in reads:
@@ -285,7 +291,7 @@ def _status(beliefs: Belief, reads: tuple[Read, ...], t0: Array) -> tuple[Array,
     return status, jnp.where(lost.any(), t[jnp.argmax(lost)], jnp.nan)
 
 
-def _looked_at(model: Model, recording: Recording, first: Belief) -> Sensors:
+def looked_at(model: Model, recording: Recording, first: Belief) -> Sensors:
     _checks.instance(model, Model, "model")
     _checks.instance(recording, Recording, "recording")
     _checks.instance(first, Belief, "first", hint="estimate.start makes it")

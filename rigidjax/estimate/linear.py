@@ -219,9 +219,7 @@ def _given(model: LinearModel, readings: Any, mean: Any, root: Any, seen: Any) -
     ):
         part = getattr(model, name)
         if part is not None and part.ndim > base and part.shape[0] != wanted:
-            raise ValueError(
-                f"{name}: wanted {wanted} rows for {times} times, got {part.shape[0]}"
-            )
+            raise ValueError(f"{name}: wanted {wanted} rows for {times} times, got {part.shape[0]}")
     return readings, mean, root, seen
 
 
@@ -255,9 +253,7 @@ def _split(parts: tuple, base: tuple[int, ...]) -> tuple[tuple, Any]:
     )
 
     def whole(now: tuple) -> tuple:
-        return tuple(
-            p if m is None else n for p, m, n in zip(parts, moving, now, strict=True)
-        )
+        return tuple(p if m is None else n for p, m, n in zip(parts, moving, now, strict=True))
 
     return moving, whole
 

@@ -9,6 +9,7 @@ from jaxtyping import Array, Bool, Float
 
 from rigidjax._types import Scalar
 
+
 def triangular(a: Float[Array, "n m"]) -> Float[Array, "n n"]:
     """The lower triangular root L of `a aᵀ`, its diagonal ≥ 0.
 

@@ -264,24 +264,34 @@ def coordinates(x: Extended, moved: Extended) -> Float[Array, " n"]:
     return jnp.concatenate(parts)
 
 
-def reset(x: Extended, e: Float[Array, " n"], root: Float[Array, "n n"]) -> Float[Array, "n n"]:
+def reset(x: Extended, e: Float[Array, " n"], root: Float[Array, "n m"]) -> Float[Array, "n m"]:
     """The root of the errors about `retract(x, e)` where `root` is of those about x.
 
     `log(exp(−e) exp(e + δ)) ≈ J_r(e) δ`, to second order in the turn e: Mueller, Hehn and D'Andrea
     2017, doi:10.2514/1.G000848.
     """
+    return _turned(x, e, root, -0.5, 1 / 6)
+
+
+def reset_inverse(x: Extended, e: Float[Array, " n"], a: Float[Array, "n m"]) -> Array:
+    """`J_r(e)⁻¹ a`: how `log(exp(e) exp(δ))` moves where δ moves by a; to third order in e."""
+    return _turned(x, e, a, 0.5, 1 / 12)
+
+
+def _turned(x: Extended, e: Array, a: Array, first: float, second: float) -> Array:
+    """The rows of the attitude times `1 + first hat(e) + second hat(e)²`."""
     if not isinstance(x.motion, HasAttitude):
-        return root
+        return a
     at = 6 if isinstance(x.motion, HasPose) else 0
-    a, b, c = e[at], e[at + 1], e[at + 2]
-    rows = root[at : at + 3]
+    p, q, r = e[at], e[at + 1], e[at + 2]
+    mine = a[at : at + 3]
 
     def across(m: Array) -> Array:
-        return jnp.stack([b * m[2] - c * m[1], c * m[0] - a * m[2], a * m[1] - b * m[0]])
+        return jnp.stack([q * m[2] - r * m[1], r * m[0] - p * m[2], p * m[1] - q * m[0]])
 
-    once = across(rows)
-    turned = rows - 0.5 * once + across(once) / 6.0
-    return jnp.concatenate([root[:at], turned, root[at + 3 :]])
+    once = across(mine)
+    turned = mine + first * once + second * across(once)
+    return jnp.concatenate([a[:at], turned, a[at + 3 :]])
 
 
 def _split(x: Extended, e: Array) -> tuple[dict[str, Array], Extended]:

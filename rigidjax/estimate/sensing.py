@@ -177,9 +177,7 @@ def absorb_all(
     stacked = Row(*(jnp.concatenate(parts) for parts in zip(*row, strict=True)))
 
     def one(carry: tuple[Array, Array], number: Row) -> tuple[Any, Any]:
-        found = roots.absorb(
-            *carry, number.matrix, number.error, number.variance, number.seen
-        )
+        found = roots.absorb(*carry, number.matrix, number.error, number.variance, number.seen)
         return (found.step, found.root), (found.innovation, found.variance)
 
     (step, root), (innovation, variance) = lax.scan(one, (step, root), stacked)
