@@ -41,8 +41,8 @@ def grid_of(model: Model, recording: Recording, first: Belief, substeps: int | N
         _checks.refuse(
             t,
             early,
-            f"recording: readings are out of order: the first is at {np.asarray(t)[0]:g} s, before the "
-            f"time of the belief it starts from, {np.asarray(t0):g} s",
+            f"recording: readings are out of order: the first is at {np.asarray(t)[0]:g} s, before "
+            f"the time of the belief it starts from, {np.asarray(t0):g} s",
         )
     if substeps is not None:
         pieces = _checks.whole(substeps, "substeps", 1)

@@ -179,13 +179,15 @@ class Dynamics(eqx.Module):
         return Extended(motion, torques, x.walks)
 
     def predict(
-        self, t: Scalar, h: Scalar, x: Extended
+        self, t: Scalar, h: Scalar, x: Extended, kicks: Array | None = None
     ) -> tuple[Extended, Float[Array, "n n"], Float[Array, "n m"]]:
-        """`x` a time `h` later, how errors grow, F (n, n), and the root of the noise, G (n, m)."""
+        """`x` a time `h` later, how errors grow, F (n, n), and the root of the noise, G (n, m).
+
+        Linearised about `kicks` (kicks,), `None` for none; drifts of walks come last in G.
+        """
         dtype = x.motion.omega.dtype
-        after, push = jax.linearize(
-            lambda y, k: self.advance(t, h, y, k), x, jnp.zeros(self.kicks, dtype)
-        )
+        kicks = jnp.zeros(self.kicks, dtype) if kicks is None else kicks
+        after, push = jax.linearize(lambda y, k: self.advance(t, h, y, k), x, kicks)
         moving = Extended(x.motion, x.torques, ())
         size, drifting = size_of(moving), size_of(x) - size_of(moving)
         count = size + self.kicks

@@ -31,8 +31,8 @@ from rigidjax.identify.recording import Recording
 class Push(NamedTuple):
     """A white torque as the readings show it, averaged over the step that ends at each time.
 
-    **Fields:** `mean`, `deviation` (N, 3) N m, body frame. At first sight both are wide: white noise
-    has no value at a time.
+    **Fields:** `mean`, `deviation` (N, 3) N m, body frame; wide where steps are short, for white
+    noise has no value at a time.
     """
 
     mean: Float[Array, "stops 3"]
@@ -117,8 +117,8 @@ def smooth(
     if not throw:
         return out
     words = (
-        "smooth: the motion still moves by a standard deviation after the last iteration; give more "
-        "iterations, a better first state, or a model that the readings fit; throw=False returns it"
+        "smooth: the motion still moves by a standard deviation after the last iteration; give "
+        "more iterations, a better first state, or a model that the readings fit; throw=False returns it"
     )
     return _checks.refuse(told(out), out.change > 1, words)
 
@@ -129,6 +129,15 @@ class _Kept(NamedTuple):
     mean: Array
     noise: Array
     read: tuple[Read, ...]
+
+
+class _Solved(NamedTuple):
+    root: Array
+    read: tuple[Read, ...]
+    total: Array
+    kicks: Array
+    kick_covariance: Array
+    change: Array
 
 
 @eqx.filter_jit
@@ -151,55 +160,63 @@ def _smooth(
     path = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first.x, beliefs.x)
     dynamics = Dynamics(model, first.x, sensors.densities)
 
-    def once(path: Extended) -> tuple[Extended, Any]:
-        return _iterate(model, dynamics, sensors, first, stops, path)
+    def once(path: Extended, kicks: Array) -> tuple[Extended, Any]:
+        return _iterate(model, dynamics, sensors, first, stops, path, kicks)
 
     def more(state: tuple) -> Array:
-        path, _, change, count = state
-        return (count < iterations) & (change > tolerance)
+        return (state[2] < iterations) & (state[1].change > tolerance)
 
     def again(state: tuple) -> tuple:
-        path, out = once(state[0])
-        return path, out, out[-1], state[3] + 1
+        path, out = once(state[0], state[1].kicks[:, : dynamics.kicks])
+        return path, out, state[2] + 1
 
-    path, out = once(path)
-    path, out, change, count = lax.while_loop(more, again, (path, out, out[-1], jnp.asarray(1)))
-    spread, read, total, kicks, kick_covariance, _ = out
+    still = jnp.zeros((stops.t.shape[0], dynamics.kicks), first.root.dtype)
+    path, out, count = lax.while_loop(more, again, (*once(path, still), jnp.asarray(1)))
     x = jax.tree.map(lambda leaf: leaf[1:], path)
     h = jnp.diff(jnp.concatenate([first.t[None], stops.t]))
     pushes = []
     for index, root in enumerate(dynamics.white):
         mine = slice(6 * index, 6 * index + 3)
         size = jnp.where(h > 0, 1 / jnp.sqrt(jnp.where(h > 0, h, 1)), 0)[:, None] * root[None]
-        variance = jnp.diagonal(kick_covariance, axis1=1, axis2=2)[:, mine]
-        pushes.append(Push(size * kicks[:, mine], size * jnp.sqrt(jnp.maximum(variance, 0))))
+        variance = jnp.diagonal(out.kick_covariance, axis1=1, axis2=2)[:, mine]
+        pushes.append(Push(size * out.kicks[:, mine], size * jnp.sqrt(jnp.maximum(variance, 0))))
     return Smoothed(
-        Belief(stops.t, x, spread[1:]),
+        Belief(stops.t, x, out.root[1:]),
         here,
         tuple(pushes),
-        read,
-        total,
-        change,
+        out.read,
+        out.total,
+        out.change,
         count,
-        jnp.where(jnp.isfinite(change), status, 2),
+        jnp.where(jnp.isfinite(out.change), status, 2),
         lost_at,
     )
 
 
 def _iterate(
-    model: Model, dynamics: Dynamics, sensors: Sensors, first: Belief, stops: Stops, path: Extended
-) -> tuple[Extended, Any]:
-    """One linearisation about `path`, at the first time and each stop, and its exact solution."""
+    model: Model,
+    dynamics: Dynamics,
+    sensors: Sensors,
+    first: Belief,
+    stops: Stops,
+    path: Extended,
+    kicks: Array,
+) -> tuple[Extended, _Solved]:
+    """One linearisation about `path`, at the first time and each stop, and its exact solution.
+
+    Also about the `kicks` between them, in which the motion is not linear either.
+    """
     before = jnp.concatenate([first.t[None], stops.t[:-1]])
     x0, off = _at(path, 0), between(first.x, _at(path, 0))
     start = (-off, reset(x0, off, first.root))
 
     def forward(carry: tuple[Array, Array], now: Any) -> tuple[Any, _Kept]:
         mean, root = carry
-        t0, stop, x, y = now
-        after, grown, noise = dynamics.predict(t0, stop.t - t0, x)
+        t0, stop, x, y, kick = now
+        after, grown, noise = dynamics.predict(t0, stop.t - t0, x, kick)
         push = between(y, after)
         grown, noise = reset_inverse(y, push, grown), reset_inverse(y, push, noise)
+        push = push - jnp.sum(noise[:, : dynamics.kicks] * kick[None], 1)
         kept = linear.joint(grown, noise, root)
         predicted = jnp.sum(grown * mean[None], 1) + push
         found = rows(model, dynamics, sensors, stop.t, y, stop.values, stop.masks)
@@ -208,7 +225,7 @@ def _iterate(
 
     earlier = jax.tree.map(lambda leaf: leaf[:-1], path)
     later = jax.tree.map(lambda leaf: leaf[1:], path)
-    end, kept = lax.scan(forward, start, (before, stops, earlier, later))
+    end, kept = lax.scan(forward, start, (before, stops, earlier, later, kicks))
 
     def backward(carry: tuple[Array, Array], now: _Kept) -> tuple[Any, Any]:
         mean, root = carry
@@ -224,7 +241,7 @@ def _iterate(
     change = jnp.max(jnp.where(sure, jnp.abs(means) / jnp.where(sure, deviation, 1), 0))
     total = sum(read.log_density for read in kept.read)
     moved = jax.vmap(retract)(path, means)
-    return moved, (spread, kept.read, total, kicks, kick_covariance, change)
+    return moved, _Solved(spread, kept.read, total, kicks, kick_covariance, change)
 
 
 def _at(tree: Any, index: int) -> Any:

@@ -26,8 +26,14 @@ def model_of(rng, changing):
 
 def dense(model, readings, seen, mean, root):
     """Everything as one normal distribution of (x₀, u₁ … u_{T−1}), conditioned at once."""
-    f, g, d = (np.broadcast_to(a, (T - 1, *a.shape[-b:])) for a, b in ((model.transition, 2), (model.noise, 2), (model.push, 1)))
-    h, r, c = (np.broadcast_to(a, (T, *a.shape[-b:])) for a, b in ((model.matrix, 2), (model.deviation, 1), (model.offset, 1)))
+    f, g, d = (
+        np.broadcast_to(a, (T - 1, *a.shape[-b:]))
+        for a, b in ((model.transition, 2), (model.noise, 2), (model.push, 1))
+    )
+    h, r, c = (
+        np.broadcast_to(a, (T, *a.shape[-b:]))
+        for a, b in ((model.matrix, 2), (model.deviation, 1), (model.offset, 1))
+    )
     count = N + M * (T - 1)
     rows, shifts = [np.hstack([root, np.zeros((N, count - N))])], [mean]
     for k in range(T - 1):

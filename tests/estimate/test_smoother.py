@@ -79,7 +79,8 @@ def test_it_is_the_most_probable_motion(short):
 def test_it_knows_more_than_the_filter(short):
     model, record, first, found = short
     passed = estimate.filter(model, record, first, substeps=1)
-    assert (found.belief.deviation[0] < passed.belief.deviation[0]).all()
+    sizes = [np.linalg.slogdet(run.belief.root[0])[1] for run in (found, passed)]
+    assert sizes[0] < sizes[1] - 1
     assert found.change < 1e-9 and found.words == "followed"
     assert isinstance(found.belief.x, Extended)
 
@@ -88,8 +89,7 @@ def test_a_torque_that_is_not_in_the_equations_is_seen():
     # A constant torque about one axis for a while; the model knows only that torques last some 0.5 s.
     ts = 0.02 * np.arange(150)
     push = np.where((ts > 1) & (ts < 2), 0.5, 0.0)
-    table = rj.torques.Linear(ts, np.stack([0 * push, push, 0 * push], axis=1))
-    law = rj.torques.Tabulated(table)
+    law = rj.torques.Tabulated(ts, np.stack([0 * push, push, 0 * push], axis=1))
     real = rj.simulate(records.BODY, rj.Spin(records.START.omega), ts, law).ys
     noisy = records.gyro(jax.random.key(0), real.omega, 0.01)
     model = estimate.Model(records.BODY, rj.torques.CorrelatedTorque(0.05, 0.5))
@@ -110,5 +110,5 @@ def test_a_motion_that_does_not_settle_is_told(short):
     model, record, _, _ = short
     wrong = rj.Attitude(rj.quaternion.exp(jnp.array([2.5, 0.0, 0.0])), records.START.omega)
     first = estimate.start(model, record, wrong, rate=0.3, attitude=0.3)
-    with pytest.raises(ValueError, match="smooth: the motion still moves|lost"):
+    with pytest.raises(ValueError, match=r"smooth: the motion still moves|lost"):
         estimate.smooth(model, record, first, substeps=1, iterations=1)
