@@ -29,7 +29,7 @@ class Sampled(eqx.Module):
 
 
 def sample(
-    key: PRNGKeyArray, model: Model, state0: Any, ts: Any, *, substeps: int | None = None
+    key: Any, model: Model, state0: Any, ts: Any, *, substeps: int | None = None
 ) -> Sampled:
     """One motion that the model's random torques could have made.
 

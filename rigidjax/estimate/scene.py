@@ -68,7 +68,7 @@ class Model(eqx.Module):
         body: Inertia | MassProperties,
         torque: Torque | None = None,
         *,
-        walks: Sequence[Walk] = (),
+        walks: Any = (),
     ):
         self.body = _checks.single(body, (Inertia, MassProperties), "body")
         parts = [] if torque is None else _parts(torque)

@@ -118,7 +118,8 @@ def smooth(
         return out
     words = (
         "smooth: the motion still moves by a standard deviation after the last iteration; give "
-        "more iterations, a better first state, or a model that the readings fit; throw=False returns it"
+        "more iterations, a better first state, or a model that the readings fit; throw=False "
+        "returns it"
     )
     return _checks.refuse(told(out), out.change > 1, words)
 
@@ -171,7 +172,12 @@ def _smooth(
         return path, out, state[2] + 1
 
     still = jnp.zeros((stops.t.shape[0], dynamics.kicks), first.root.dtype)
-    path, out, count = lax.while_loop(more, again, (*once(path, still), jnp.asarray(1)))
+    # Nothing is solved yet: one copy of an iteration is compiled, not two.
+    blank = jax.tree.map(
+        lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(once, path, still)[1]
+    )
+    blank = blank._replace(change=jnp.full_like(blank.change, jnp.inf))
+    path, out, count = lax.while_loop(more, again, (path, blank, jnp.asarray(0)))
     x = jax.tree.map(lambda leaf: leaf[1:], path)
     h = jnp.diff(jnp.concatenate([first.t[None], stops.t]))
     pushes = []
