@@ -7,6 +7,7 @@ motion under random torques.
 
 from rigidjax._names import own_names
 from rigidjax.estimate.belief import Belief as Belief, start as start
+from rigidjax.estimate.density import LogDensity as LogDensity, Point as Point
 from rigidjax.estimate.filter import (
     Filtered as Filtered,
     filter as filter,
@@ -18,6 +19,11 @@ from rigidjax.estimate.linear import (
     LinearModel as LinearModel,
     linear_filter as linear_filter,
     linear_smooth as linear_smooth,
+)
+from rigidjax.estimate.posterior import (
+    Nuts as Nuts,
+    Posterior as Posterior,
+    posterior as posterior,
 )
 from rigidjax.estimate.sample import Sampled as Sampled, sample as sample
 from rigidjax.estimate.scene import Model as Model, Walk as Walk

@@ -182,20 +182,20 @@ def step(model: Model, belief: Belief, t: ScalarLike, *readings: tuple) -> Belie
         mask = jnp.asarray(seen[0] if seen else True)
         if _checks.known((value, mask)) and bool(mask):
             _checks.finite(value, f"{name}: reading; give (sensor, value, False) for a gap; it")
-        values.append(jnp.where(mask, value, _harmless(sensor, value)).astype(dtype))
+        values.append(value)
         masks.append(mask)
     return _step(bare(model), sensors, belief, when, tuple(values), tuple(masks))
-
-
-def _harmless(sensor: Any, value: Array) -> Array:
-    """A reading that no derivative is lost on."""
-    return jnp.zeros_like(value).at[0].set(1)
 
 
 @eqx.filter_jit
 def _step(
     model: Model, sensors: Sensors, belief: Belief, t: Array, values: tuple, masks: tuple
 ) -> Belief:
+    # A reading that no derivative is lost on, where there is none.
+    values = tuple(
+        jnp.where(mask, value, jnp.zeros_like(value).at[0].set(1)).astype(belief.root.dtype)
+        for value, mask in zip(values, masks, strict=True)
+    )
     return _one(
         model, Dynamics(model, belief.x, sensors.densities), sensors, belief, t, values, masks
     )[0]
@@ -261,6 +261,15 @@ def _filter(
         beliefs, reads = jax.tree.map(lambda leaf: leaf[grid.rows], (beliefs, reads))
     status, lost_at = status_of(beliefs, reads, first.t)
     return Filtered(beliefs, reads, total, status, lost_at)
+
+
+def log_likelihood_of(
+    model: Model, sensors: Sensors, recording: Recording, first: Belief, substeps: int
+) -> Scalar:
+    """`log_likelihood` of what has been looked at."""
+    return _log_likelihood(
+        model, sensors, recording, first, grid_of(model, recording, first, substeps)
+    )
 
 
 @eqx.filter_jit

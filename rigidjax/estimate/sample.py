@@ -28,9 +28,7 @@ class Sampled(eqx.Module):
     torques: tuple[Float[Array, "times 3"], ...]
 
 
-def sample(
-    key: Any, model: Model, state0: Any, ts: Any, *, substeps: int | None = None
-) -> Sampled:
+def sample(key: Any, model: Model, state0: Any, ts: Any, *, substeps: int | None = None) -> Sampled:
     """One motion that the model's random torques could have made.
 
     Each step draws the white noise's integral and its first moment, which are all of it that counts

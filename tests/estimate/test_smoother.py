@@ -38,7 +38,6 @@ def short():
 def test_it_is_the_most_probable_motion(short):
     model, record, first, found = short
     dynamics = Dynamics(model, first.x)
-    gyro, sun = (r.sensor for r in record.readings)
 
     def residuals(z):
         """Of the first error and all kicks, in unit normal numbers."""
