@@ -9,7 +9,7 @@ seasons force turns of a year and half a year, either way, whose amplitudes may 
 pole walks. All of it is a `LinearModel`; whatever is unknown is fitted to the likelihood of the
 innovations.
 
-The numbers are fitted to every 30th day: the published series is smoothed over some weeks in its
+The numbers are fitted to every 15th day: the published series is smoothed over some weeks in its
 first years, and what a filter sees of it day by day is that smoothing, not the Earth. Its own errors
 are believed.
 """
@@ -23,7 +23,7 @@ import scipy.optimize
 
 from rigidjax import estimate
 
-YEAR, STEP, SPARSE = 365.25, 5, 6
+YEAR, STEP, SPARSE = 365.25, 5, 3
 # Chandler and what excites it, turns of the seasons, mean pole: two real numbers each.
 SEASONS = (1.0, -1.0, 2.0, -2.0)
 SIZE = 4 + 2 * len(SEASONS) + 2

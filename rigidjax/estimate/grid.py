@@ -20,14 +20,14 @@ MEMORY_A_STEP = 0.25
 
 
 class Grid(NamedTuple):
-    """**Fields:** `t` (N,) s; `index` (N,) which row of the recording is next; `real` (N,) whether
-    it is of this time; `rows` (T,) where each time of the recording is; `None`: each is the next.
+    """**Fields:** `t` (N,) s; `source` (N,) which row of the recording is next; `real` (N,) whether
+    it is of this time; `rows` (T,) where each time of the recording is.
     """
 
     t: Float[Array, " n"]
-    index: Int[Array, " n"]
+    source: Int[Array, " n"]
     real: Bool[Array, " n"]
-    rows: Int[Array, " t"] | None
+    rows: Int[Array, " t"]
 
 
 def grid_of(model: Model, recording: Recording, first: Belief, substeps: int | None) -> Grid | None:
@@ -94,6 +94,6 @@ def gathered(grid: Grid | None, t: Array, values: Any, masks: Any) -> tuple[Arra
         return t, values, masks
     return (
         grid.t,
-        tuple(v[grid.index] for v in values),
-        tuple(m[grid.index] & grid.real for m in masks),
+        tuple(v[grid.source] for v in values),
+        tuple(m[grid.source] & grid.real for m in masks),
     )

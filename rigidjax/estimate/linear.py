@@ -94,8 +94,8 @@ class LinearEstimate(eqx.Module):
     innovation: Float[Array, "times k"]
     variance: Float[Array, "times k"]
     log_likelihood: Scalar
-    kicks: Float[Array, "steps m"] | None = None
-    kick_covariance: Float[Array, "steps m m"] | None = None
+    kicks: Float[Array, "steps m"] | None
+    kick_covariance: Float[Array, "steps m m"] | None
 
     @property
     def covariance(self) -> Float[Array, "times n n"]:
@@ -294,7 +294,9 @@ def _filter(
         return roots.triangular(moved), None
 
     passed, _, _, total = _pass(model, readings, mean, root, seen, step)
-    return LinearEstimate(*passed, total)
+    return LinearEstimate(
+        passed.mean, passed.root, passed.innovation, passed.variance, total, None, None
+    )
 
 
 @jax.jit

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 from rigidjax import _checks
 from rigidjax._types import HasAttitude, HasPose, Mat3, Scalar
 from rigidjax.body.inertia import Inertia, MassProperties, inverse
+from rigidjax.motion import Rigid
 from rigidjax.motion.torques import CorrelatedTorque, RandomTorque, Sum, Torque, in_precision
 from rigidjax.motion.torques.base import require_law, tensor_of
 from rigidjax.rotation import quaternion
@@ -116,7 +117,7 @@ class Dynamics(eqx.Module):
     def __init__(self, model: Model, x: Extended, densities: Sequence[Array] = ()):
         dtype = x.motion.omega.dtype
         body = in_precision(model.body, dtype)
-        if isinstance(body, MassProperties) and not isinstance(x.motion, HasPose):
+        if isinstance(body, MassProperties) and type(x.motion) is not Rigid:
             body = body.inertia
         self.field = equations_of_motion(body, x.motion, in_precision(model.torque, dtype))
         self.inverse = inverse(tensor_of(body))

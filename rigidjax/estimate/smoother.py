@@ -155,9 +155,8 @@ def _smooth(
         model, sensors, recording, first, grid, lambda belief, read: (belief, read)
     )
     here = jnp.arange(stops.t.shape[0]) if grid is None else grid.rows
-    status, lost_at = status_of(
-        *jax.tree.map(lambda leaf: leaf[here], (beliefs, filtered)), first.t
-    )
+    seen: Any = jax.tree.map(lambda leaf: leaf[here], (beliefs, filtered))
+    status, lost_at = status_of(seen[0], seen[1], first.t)
     path = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first.x, beliefs.x)
     dynamics = Dynamics(model, first.x, sensors.densities)
 
@@ -245,7 +244,7 @@ def _iterate(
     deviation = jnp.sqrt(jnp.sum(spread**2, -1))
     sure = deviation > 0
     change = jnp.max(jnp.where(sure, jnp.abs(means) / jnp.where(sure, deviation, 1), 0))
-    total = sum(read.log_density for read in kept.read)
+    total = jnp.sum(jnp.stack([read.log_density for read in kept.read]))
     moved = jax.vmap(retract)(path, means)
     return moved, _Solved(spread, kept.read, total, kicks, kick_covariance, change)
 
