@@ -34,7 +34,7 @@ MODELS = {
 }
 # Where a fit starts: d; 1/(2Q); mas/√d; mas; d; mas; mas/√d; mas/√d.
 START = {
-    "period": 433.0, "damping": 0.004, "white": 0.5, "red": 8.0, "memory": 30.0,
+    "period": 433.0, "damping": 0.004, "white": 0.9, "red": 20.0, "memory": 12.0,
     "floor": 0.2, "season": 0.1, "mean": 0.1,
 }  # fmt: skip
 
@@ -109,10 +109,14 @@ def fit(names, readings, errors):
 
     slope = jax.jit(jax.jacfwd(loss))
     value = jax.jit(loss)
+    # Where a trial step is beyond what the exponential holds, it is no step.
     best = scipy.optimize.minimize(
-        lambda x: float(value(x)), np.zeros(len(names)), jac=lambda x: np.asarray(slope(x)),
-        method="BFGS", options={"gtol": 1e-2},
-    )  # fmt: skip
+        lambda x: np.nan_to_num(float(value(x)), nan=1e9, posinf=1e9),
+        np.zeros(len(names)),
+        jac=lambda x: np.nan_to_num(np.asarray(slope(x))),
+        method="L-BFGS-B",
+        bounds=[(-2.5, 2.5) if name == "memory" else (-4.0, 4.0) for name in names],
+    )
     steps = 1e-3 * np.eye(len(names))
     curve = np.stack([(slope(best.x + h) - slope(best.x - h)) / 2e-3 for h in steps])
     covariance = np.linalg.inv(0.5 * (curve + curve.T))

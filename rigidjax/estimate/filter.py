@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
@@ -181,7 +182,8 @@ def step(model: Model, belief: Belief, t: ScalarLike, *readings: tuple) -> Belie
         value = _checks.floating(value, sensor.reading_shape, f"{name}: reading")
         mask = jnp.asarray(seen[0] if seen else True)
         if _checks.known((value, mask)) and bool(mask):
-            _checks.finite(value, f"{name}: reading; give (sensor, value, False) for a gap; it")
+            words = f"{name}: the reading contains NaN; give (sensor, value, False) if it is a gap"
+            _checks.refuse(value, not np.isfinite(np.asarray(value)).all(), words)
         values.append(value)
         masks.append(mask)
     return _step(bare(model), sensors, belief, when, tuple(values), tuple(masks))

@@ -93,9 +93,7 @@ row(
 for name in ("linear_filter", "linear_smooth"):
     row(
         f"estimate.{name}",
-        lambda: dict(
-            model=linear(), readings=np.ones((4, 2)), mean=np.zeros(2), root=np.eye(2)
-        ),
+        lambda: dict(model=linear(), readings=np.ones((4, 2)), mean=np.zeros(2), root=np.eye(2)),
         groups=("stranger", "shape"),
         transforms=("jit", "grad"),
     )
