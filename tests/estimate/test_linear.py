@@ -102,7 +102,7 @@ def test_a_million_to_one_in_single_precision():
 
 def test_what_is_refused():
     eye = np.eye(2)
-    with pytest.raises(ValueError, match="deviation: wanted positive.*singular"):
+    with pytest.raises(ValueError, match=r"deviation: wanted positive.*singular"):
         LinearModel(eye, eye, eye, [1.0, 0.0])
     with pytest.raises(ValueError, match="matrix: wanted shape"):
         LinearModel(eye, eye, np.ones((1, 3)), [1.0])
@@ -110,5 +110,5 @@ def test_what_is_refused():
     with pytest.raises(ValueError, match="transition: wanted 2 rows for 3 times, got 4"):
         linear_filter(model, np.zeros((3, 2)), np.zeros(2), eye)
     good = LinearModel(eye, eye, eye, [1.0, 1.0])
-    with pytest.raises(ValueError, match="readings: contains NaN.*mask it"):
+    with pytest.raises(ValueError, match=r"readings: contains NaN.*mask it"):
         linear_filter(good, np.full((3, 2), np.nan), np.zeros(2), eye)
