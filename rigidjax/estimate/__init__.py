@@ -25,6 +25,7 @@ from rigidjax.estimate.posterior import (
     Posterior as Posterior,
     posterior as posterior,
 )
+from rigidjax.estimate.refit import Refit as Refit, refit as refit
 from rigidjax.estimate.sample import Sampled as Sampled, sample as sample
 from rigidjax.estimate.scene import Model as Model, Walk as Walk
 from rigidjax.estimate.smoother import Push as Push, Smoothed as Smoothed, smooth as smooth

@@ -133,11 +133,11 @@ class LogDensity(eqx.Module):
 
         @jax.custom_vjp
         def value(x: Array) -> Array:
-            return self._value(x)
+            return self.value(x)
 
         def forward(x: Array) -> tuple[Array, Array]:
             def twice(x: Array) -> tuple[Array, Array]:
-                out = self._value(x)
+                out = self.value(x)
                 return out, out
 
             slope, out = jax.jacfwd(twice, has_aux=True)(x)
@@ -167,7 +167,8 @@ class LogDensity(eqx.Module):
             process = jax.tree.unflatten(structure, grown)
         return parameters, noises, process, logs
 
-    def _value(self, x: Array) -> Scalar:
+    def value(self, x: Float[Array, " n"]) -> Scalar:
+        """The same number without a rule for its gradient: for derivatives in forward mode."""
         problem = self.problem
         parameters, noises, process, logs = self._read(x)
         if process is None:

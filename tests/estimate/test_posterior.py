@@ -98,6 +98,46 @@ def test_what_is_refused(fitted):
             estimate.posterior(estimate.LogDensity(fitted), jax.random.key(0))
 
 
+def test_a_fit_of_what_is_well_determined_is_found_again(fitted):
+    found = estimate.refit(estimate.LogDensity(fitted))
+    assert found.converged
+    deviation = np.sqrt(np.diagonal(fitted.covariance))
+    np.testing.assert_allclose(found.x, found.density.x0, atol=1e-2 * deviation.min())
+    np.testing.assert_allclose(np.sqrt(np.diagonal(found.covariance)), deviation, rtol=0.05)
+    low, high = found.interval_of(shape)
+    wanted = np.log([fitted.interval()[name] for name in ("Ix/Iz", "Iy/Iz")]).T
+    # The fit's reach is Student's.
+    np.testing.assert_allclose([low, high], wanted, atol=0.1 * (high - low).max())
+
+
+def shape(point):
+    """Logarithms of the two ratios of moments."""
+    i = jnp.diagonal(point.body.tensor)
+    return jnp.log(jnp.stack([i[0] / i[2], i[1] / i[2]]))
+
+
+@pytest.mark.slow
+def test_a_torque_that_the_fit_knows_nothing_of():
+    # Nine tenths of the misfit is the torque's: the plain fit is refused, this one holds the truth.
+    model = estimate.Model(records.BODY, rj.torques.RandomTorque(1e-3))
+    ts = jnp.linspace(0.0, 4.0, 80)
+    made = []
+    for k in range(3):
+        keys = jax.random.split(jax.random.key(k), 2)
+        spin = rj.Spin(records.START.omega + 0.3 * k)
+        real = records.truth(keys[0], model, spin, ts, 2)
+        omega = records.gyro(keys[1], real.states.omega, 0.02)
+        made.append(identify.Recording(ts, (identify.Gyro(0.02), omega)))
+    plain = identify.fit(identify.Problem(made, identify.PrincipalRatios()), starts=2)
+    assert not plain.ok
+    found = estimate.refit(estimate.LogDensity(plain, rj.torques.RandomTorque(1e-4)))
+    assert found.converged
+
+    low, high = found.interval_of(shape, 0.999)
+    wanted = np.log([1 / 2.5, 2 / 2.5])
+    assert (low < wanted).all() and (wanted < high).all()
+
+
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 def test_nuts_agrees_with_the_fit_where_it_is_well_determined(fitted):

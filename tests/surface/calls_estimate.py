@@ -105,4 +105,7 @@ leave_out(
     "estimate.LinearEstimate",
 )
 leave_out("made of a fit, which takes long; see tests/estimate", "estimate.LogDensity")
-leave_out("draws for a minute; see tests/estimate", "estimate.posterior", "estimate.Posterior")
+leave_out(
+    "takes a LogDensity, and long; see tests/estimate",
+    *(f"estimate.{name}" for name in ("posterior", "Posterior", "refit", "Refit")),
+)
