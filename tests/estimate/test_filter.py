@@ -252,6 +252,7 @@ AT = jnp.array([1.0, 2.0, np.log(1e-2)])
 
 
 def test_derivatives_of_the_likelihood_are_right():
+    records.spinning()  # made outside of the trace, and kept
     step = 1e-5
     run = filter_once(likelihood)
     wanted = [(run(AT.at[i].add(step)) - run(AT.at[i].add(-step))) / (2 * step) for i in range(3)]
@@ -260,6 +261,7 @@ def test_derivatives_of_the_likelihood_are_right():
 
 @pytest.mark.slow
 def test_forward_and_reverse_mode_agree_to_second_order():
+    records.spinning()
     forward = once(jax.jacfwd(likelihood))(AT)
     np.testing.assert_allclose(once(jax.grad(likelihood))(AT), forward, rtol=1e-9)
     hessians = [
