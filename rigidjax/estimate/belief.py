@@ -117,7 +117,7 @@ def start(
         _spread(walk.density, value.shape, "density", dtype)
     torques = tuple(jnp.zeros(3, dtype) for _ in model.coloured)
     x = Extended(state, torques, tuple(walks))
-    return Belief(recording.t[0].astype(dtype), x, jnp.diag(jnp.concatenate(parts)))
+    return Belief(recording.t[0], x, jnp.diag(jnp.concatenate(parts)))
 
 
 def _spread(value: Any, shape: tuple[int, ...], name: str, dtype: Any) -> Array:

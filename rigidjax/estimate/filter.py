@@ -170,8 +170,7 @@ def step(model: Model, belief: Belief, t: ScalarLike, *readings: tuple) -> Belie
     """
     _checks.instance(model, Model, "model")
     _checks.instance(belief, Belief, "belief")
-    dtype = belief.root.dtype
-    when = _checks.time(t).astype(dtype)
+    when = _checks.time(t).astype(belief.t.dtype)
     if _checks.known((when, belief.t)):
         words = f"t: readings are out of order: {float(when):g} s is before {float(belief.t):g} s"
         _checks.refuse(when, when < belief.t, words)
@@ -212,10 +211,13 @@ def _one(
     values: Sequence[Array],
     masks: Sequence[Array],
 ) -> tuple[Belief, tuple[Read, ...]]:
-    x, grown, noise = dynamics.predict(belief.t, t - belief.t, belief.x)
+    dtype = belief.root.dtype
+    # Times may have more digits than the state: after a thousand seconds seven are too few.
+    since = (t - belief.t).astype(dtype)
+    x, grown, noise = dynamics.predict(belief.t.astype(dtype), since, belief.x)
     moved = jnp.concatenate([roots.product(grown, belief.root), noise], 1)
     root = roots.triangular(moved)
-    found = rows(model, dynamics, sensors, t, x, values, masks)
+    found = rows(model, dynamics, sensors, t.astype(dtype), x, values, masks)
     e, root, read = absorb_all(found, jnp.zeros(root.shape[0], root.dtype), root)
     return Belief(t, retract(x, e), reset(x, e, root)), read
 
@@ -239,7 +241,7 @@ def scan_filter(
     """All stops, and `lax.scan` of the filter over them, which keeps `keep(belief, read)`."""
     dtype = first.root.dtype
     dynamics = Dynamics(model, first.x, sensors.densities)
-    stops = Stops(*gathered(grid, recording.t.astype(dtype), *values_of(recording, dtype)))
+    stops = Stops(*gathered(grid, recording.t, *values_of(recording, dtype)))
 
     def body(carry: tuple[Belief, Array], stop: Stops) -> tuple[Any, Any]:
         belief, total = carry

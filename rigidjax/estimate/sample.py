@@ -71,7 +71,7 @@ def sample(key: Any, model: Model, state0: Any, ts: Any, *, substeps: int | None
         pieces = max(1, int(pieces))
     else:
         pieces = 1
-    return _sample(key, model, on_the_group(state0), times.astype(state0.omega.dtype), pieces)
+    return _sample(key, model, on_the_group(state0), times, pieces)
 
 
 @eqx.filter_jit
@@ -89,7 +89,9 @@ def _sample(key: PRNGKeyArray, model: Model, state0: Any, ts: Array, pieces: int
 
     def span(x: Extended, given: tuple[Array, Array, Array]) -> tuple[Extended, Extended]:
         left, right, one = given
-        h = (right - left) / pieces
+        # Times may have more digits than the state.
+        h = ((right - left) / pieces).astype(dtype)
+        left = left.astype(dtype)
         kicks = jax.random.normal(one, (pieces, dynamics.kicks), dtype)
 
         def move(x: Extended, now: tuple[Array, Array]) -> tuple[Extended, None]:

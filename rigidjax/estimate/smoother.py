@@ -178,7 +178,7 @@ def _smooth(
     blank = blank._replace(change=jnp.full_like(blank.change, jnp.inf))
     path, out, count = lax.while_loop(more, again, (path, blank, jnp.asarray(0)))
     x = jax.tree.map(lambda leaf: leaf[1:], path)
-    h = jnp.diff(jnp.concatenate([first.t[None], stops.t]))
+    h = jnp.diff(jnp.concatenate([first.t[None], stops.t])).astype(first.root.dtype)
     pushes = []
     for index, root in enumerate(dynamics.white):
         mine = slice(6 * index, 6 * index + 3)
@@ -212,19 +212,21 @@ def _iterate(
     Also about the `kicks` between them, in which the motion is not linear either.
     """
     before = jnp.concatenate([first.t[None], stops.t[:-1]])
+    dtype = first.root.dtype
     x0, off = _at(path, 0), between(first.x, _at(path, 0))
     start = (-off, reset(x0, off, first.root))
 
     def forward(carry: tuple[Array, Array], now: Any) -> tuple[Any, _Kept]:
         mean, root = carry
         t0, stop, x, y, kick = now
-        after, grown, noise = dynamics.predict(t0, stop.t - t0, x, kick)
+        since = (stop.t - t0).astype(dtype)
+        after, grown, noise = dynamics.predict(t0.astype(dtype), since, x, kick)
         push = between(y, after)
         grown, noise = reset_inverse(y, push, grown), reset_inverse(y, push, noise)
         push = push - jnp.sum(noise[:, : dynamics.kicks] * kick[None], 1)
         kept = linear.joint(grown, noise, root)
         predicted = jnp.sum(grown * mean[None], 1) + push
-        found = rows(model, dynamics, sensors, stop.t, y, stop.values, stop.masks)
+        found = rows(model, dynamics, sensors, stop.t.astype(dtype), y, stop.values, stop.masks)
         later, root, read = absorb_all(found, predicted, kept.predicted)
         return (later, root), _Kept(kept, predicted, mean, noise, read)
 
