@@ -137,7 +137,8 @@ def _agreement(x: Float[Array, "chains samples n"]) -> tuple[Array, Array]:
     size = 2 * half
     power = jnp.abs(jnp.fft.rfft(off, n=size, axis=1)) ** 2
     auto = jnp.mean(jnp.fft.irfft(power, n=size, axis=1)[:, :half], 0) / half
-    rho = 1 - (within * (half - 1) / half - auto * half / (half - 1)) / total
+    rho = 1 - (within * (half - 1) / half)[None] / total[None]
+    rho = rho + auto * (half / (half - 1)) / total[None]
     rho = rho.at[0].set(1.0)
     pairs = rho[: half // 2 * 2].reshape(half // 2, 2, -1).sum(1)
     pairs = jnp.where(jnp.cumprod(pairs > 0, axis=0), pairs, 0)
