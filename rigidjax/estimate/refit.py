@@ -1,6 +1,7 @@
 """The most probable numbers of a problem, with the unknown torque integrated out."""
 
 from collections.abc import Callable
+from statistics import NormalDist
 from typing import Any
 
 import equinox as eqx
@@ -8,7 +9,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-import scipy.stats
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
@@ -56,7 +56,7 @@ class Refit(eqx.Module):
 
         centre, slope = value(self.x), jax.jacfwd(value)(self.x)
         spread = jnp.sqrt(jnp.einsum("...i,ij,...j->...", slope, self.covariance, slope))
-        reach = float(scipy.stats.norm.ppf(0.5 + 0.5 * level)) * spread
+        reach = NormalDist().inv_cdf(0.5 + 0.5 * level) * spread
         return np.asarray(centre - reach), np.asarray(centre + reach)
 
 

@@ -14,19 +14,20 @@ def triangular(a: Float[Array, "n m"]) -> Float[Array, "n n"]:
     """The lower triangular root L of `a aᵀ`, its diagonal ≥ 0.
 
     By the modified Gram–Schmidt process on the rows, whose triangular factor is as good as
-    Householder's (Björck 1967, doi:10.1007/BF01934122). A row that depends on those before it
-    leaves a zero on the diagonal, and derivatives there are taken as zero.
+    Householder's (Björck 1967, doi:10.1007/BF01934122). A row that depends on those before it,
+    to a few units of round-off, leaves a zero on the diagonal; derivatives there are zero.
 
     >>> triangular(jnp.array([[3.0, 4.0], [3.0, 4.0]])).tolist()
     [[5.0, 0.0], [5.0, 0.0]]
     """
     n = a.shape[0]
     below = jnp.arange(n)
+    least = (4 * float(jnp.finfo(a.dtype).eps)) ** 2 * jnp.sum(a * a, 1)
 
     def take(a: Array, k: Array) -> tuple[Array, Array]:
         row = lax.dynamic_index_in_dim(a, k, keepdims=False)
         square = jnp.sum(row * row)
-        there = square > 0
+        there = square > least[k]
         unit = row * jnp.where(there, 1 / jnp.sqrt(jnp.where(there, square, 1)), 0)
         column = jnp.where(below >= k, jnp.sum(a * unit[None], 1), 0)
         return a - column[:, None] * unit[None], column

@@ -106,8 +106,8 @@ def smooth(
     >>> body = rj.Inertia.from_principal(1.0, 2.0, 2.5)
     >>> model = estimate.Model(body, rj.torques.RandomTorque(1.0))
     >>> found = estimate.smooth(model, record, estimate.start(model, record, rate=1.0))
-    >>> found.states.omega.shape, found.pushes[0].mean.shape
-    ((2, 3), (2, 3))
+    >>> found.states.omega.shape, found.pushes[0].mean.shape  # one stop between
+    ((2, 3), (3, 3))
     """
     _checks.whole(iterations, "iterations", 1)
     _checks.positive(tolerance, "tolerance")

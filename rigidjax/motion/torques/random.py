@@ -92,6 +92,6 @@ def density_of(value: Any, name: str = "density", size: int = 3) -> Array:
     density = _checks.numbers(value, name)
     if density.shape not in ((), (size,)):
         raise ValueError(f"{name}: wanted one number or {size}, got shape {density.shape}")
-    density = jnp.broadcast_to(density, (size,))
+    density = jnp.broadcast_to(density, (size,)).astype(density.dtype)
     words = f"{name}: wanted a finite number that is not below zero"
     return _checks.refuse(density, ~((density >= 0) & jnp.isfinite(density)).all(), words)
