@@ -32,7 +32,8 @@ MODELS = {
     "red": ("period", "damping", "red", "memory", "floor", "season", "mean"),
     "white and red": ("period", "damping", "white", "red", "memory", "floor", "season", "mean"),
 }
-# Where a fit starts: d; 1/(2Q); mas/√d; mas; d; mas; mas/√d; mas/√d.
+# Where a fit starts: d; 1/(2Q); mas/√d by which white excitation kicks the pole, |σ| times its own;
+# mas of the red one; d; mas; mas/√d; mas/√d.
 START = {
     "period": 433.0, "damping": 0.004, "white": 0.9, "red": 20.0, "memory": 12.0,
     "floor": 0.2, "season": 0.1, "mean": 0.1,
