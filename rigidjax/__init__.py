@@ -1,8 +1,8 @@
 """Differentiable rigid-body and rotating-frame mechanics for JAX.
 
 Floors, from below: `special` (numbers), `rotation` and `body` (what turns), `motion` (how it
-turns), `exact` and `solve` (answers), `identify`, `workprecision` and `plot` (uses). `simulate` is
-the front door.
+turns), `exact` and `solve` (answers), `identify`, `estimate`, `workprecision` and `plot` (uses).
+`simulate` is the front door.
 """
 
 import importlib
@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from rigidjax import (
     batch as batch,
     body as body,
+    estimate as estimate,
     exact as exact,
     frames as frames,
     identify as identify,

@@ -31,6 +31,10 @@ from rigidjax.motion.torques.gravity import (
 )
 from rigidjax.motion.torques.inputs import Held as Held, Input as Input, bind as bind
 from rigidjax.motion.torques.magnetic import MagneticDipole as MagneticDipole
+from rigidjax.motion.torques.random import (
+    CorrelatedTorque as CorrelatedTorque,
+    RandomTorque as RandomTorque,
+)
 from rigidjax.motion.torques.series import Series as Series, Wheel as Wheel
 from rigidjax.motion.torques.tables import (
     Linear as Linear,

@@ -1,0 +1,33 @@
+"""Unknown torques: what a recording says of a motion that nobody can predict.
+
+`filter`, `step` and `smooth` give states, torques and sensor errors with their deviations;
+`log_likelihood` what readings say of anything else, the unknown torques integrated out; `sample` a
+motion under random torques.
+"""
+
+from rigidjax._names import own_names
+from rigidjax.estimate.belief import Belief as Belief, start as start
+from rigidjax.estimate.density import LogDensity as LogDensity, Point as Point
+from rigidjax.estimate.filter import (
+    Filtered as Filtered,
+    filter as filter,
+    log_likelihood as log_likelihood,
+    step as step,
+)
+from rigidjax.estimate.linear import (
+    LinearEstimate as LinearEstimate,
+    LinearModel as LinearModel,
+    linear_filter as linear_filter,
+    linear_smooth as linear_smooth,
+)
+from rigidjax.estimate.posterior import (
+    Nuts as Nuts,
+    Posterior as Posterior,
+    posterior as posterior,
+)
+from rigidjax.estimate.refit import Refit as Refit, refit as refit
+from rigidjax.estimate.sample import Sampled as Sampled, sample as sample
+from rigidjax.estimate.scene import Model as Model, Walk as Walk
+from rigidjax.estimate.smoother import Push as Push, Smoothed as Smoothed, smooth as smooth
+
+__dir__ = own_names(__name__)

@@ -1,0 +1,222 @@
+"""The posterior density of a problem in unconstrained numbers, for any sampler."""
+
+import math
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float
+
+from rigidjax import _checks
+from rigidjax._types import HasSpin, Scalar
+from rigidjax.body.inertia import MassProperties
+from rigidjax.estimate.belief import Belief
+from rigidjax.estimate.filter import log_likelihood_of
+from rigidjax.estimate.grid import TURN_A_STEP
+from rigidjax.estimate.scene import Extended, Model, size_of
+from rigidjax.estimate.sensing import sensors_of
+from rigidjax.identify.fit import Fit
+from rigidjax.identify.problem import (
+    Parameters,
+    Problem,
+    all_errors,
+    filled,
+    first_state,
+    over_records,
+)
+from rigidjax.identify.residual import beside, whitened
+from rigidjax.motion import Rigid
+from rigidjax.motion.torques import CorrelatedTorque, RandomTorque, Sum
+
+
+class Point(eqx.Module):
+    """What a vector of unconstrained numbers stands for.
+
+    **Fields:** `parameters` of the problem, `body` and `state0` as `Problem.unpack` gives them,
+    `values` of the `Free`s by name, `noise` (R, k) of each sensor, `process` the random torque or
+    `None`.
+    """
+
+    parameters: Parameters
+    body: Any
+    state0: Any
+    values: dict[str, Array]
+    noise: tuple[Array, ...]
+    process: RandomTorque | CorrelatedTorque | None
+
+
+class LogDensity(eqx.Module):
+    """The logarithm of the posterior density of a fitted problem, of one vector x.
+
+    Call it with x (n,), real numbers without bounds: those of the problem's `Parameters` (body
+    chart, `Free`s, first states), the logarithms of the factors by which unknown noises differ from
+    the fit's, and of those of the process. `unpack(x)` is what x stands for, `x0` the fit,
+    `covariance` Laplace's, a start and a mass matrix for a sampler.
+
+    With a `process` the unknown torque is integrated out by the filter, from the first state that x
+    holds; without, the readings are normal about the motion. Priors are the problem's: `Free`s
+    with a prior, an `Entropic` one; all else is flat in x.
+
+    **Arguments:** `fit` of `identify.fit`; `process` a `RandomTorque` or `CorrelatedTorque` or
+    `None`; `deviation` of the normal prior of the logarithms of its density and time about those
+    given, `None` for a process that is known.
+
+    **Raises:** `TypeError` for arguments of another kind; `ValueError` for a robust loss, which is
+    no density, and for directions that neither data nor a prior see.
+
+    For numpyro: `numpyro.infer.MCMC(NUTS(potential_fn=lambda x: -density(x)), …)`; for blackjax:
+    `blackjax.nuts(density, …)`, or `estimate.posterior`. Gradients are taken in forward mode.
+    """
+
+    problem: Problem
+    process: RandomTorque | CorrelatedTorque | None
+    deviation: Scalar | None
+    x0: Float[Array, " n"]
+    covariance: Float[Array, "n n"]
+    noises: tuple[Array, ...]
+    like: Any
+    substeps: int = eqx.field(static=True)
+
+    def __init__(
+        self,
+        fit: Fit,
+        process: RandomTorque | CorrelatedTorque | None = None,
+        *,
+        deviation: float | None = 2.0,
+    ):
+        _checks.instance(fit, Fit, "fit")
+        problem = fit.problem
+        if process is not None:
+            _checks.instance(process, (RandomTorque, CorrelatedTorque), "process")
+        if problem.loss is not None:
+            raise ValueError("fit: its problem has a robust loss, which is no density; fit without")
+        if not np.isfinite(np.asarray(fit.covariance)).all():
+            raise ValueError(
+                "fit: neither the data nor a prior see some direction (see fit.identifiability), "
+                "so that there is no posterior; give a prior or fewer free numbers"
+            )
+        self.problem, self.process, self.noises = problem, process, fit.noises
+        spread = None if process is None or deviation is None else deviation
+        self.deviation = (
+            None if spread is None else jnp.asarray(_checks.positive(spread, "deviation"))
+        )
+        factors = tuple(
+            jnp.zeros(noise.shape[1:]) if reading.sensor.noise is None else None
+            for noise, reading in zip(fit.noises, problem.records.readings, strict=True)
+        )
+        logs = None
+        if self.deviation is not None:
+            logs = jnp.zeros(len(jax.tree.leaves(process)))
+        self.like = (fit.parameters, factors, logs)
+        self.x0 = ravel_pytree(self.like)[0]
+        seen = np.asarray(fit.covariance)
+        covariance = np.zeros((self.x0.size, self.x0.size))
+        covariance[: len(seen), : len(seen)] = seen
+        count = sum(int(reading.seen.sum()) for reading in problem.records.readings)
+        rest = np.arange(len(seen), self.x0.size)
+        covariance[rest, rest] = 1 / math.sqrt(count)
+        self.covariance = jnp.asarray(covariance)
+        rate = 1.5 * float(jnp.max(problem.reference.rate))
+        widest = max(float(jnp.max(jnp.diff(r.t))) for r in problem.recordings)
+        self.substeps = max(1, math.ceil(widest * rate / TURN_A_STEP))
+
+    @property
+    def size(self) -> int:
+        """How many numbers x has."""
+        return self.x0.size
+
+    def __call__(self, x: Float[Array, " n"]) -> Scalar:
+        x = _checks.floating(x, self.x0.shape, "x")
+
+        @jax.custom_vjp
+        def value(x: Array) -> Array:
+            return self.value(x)
+
+        def forward(x: Array) -> tuple[Array, Array]:
+            def twice(x: Array) -> tuple[Array, Array]:
+                out = self.value(x)
+                return out, out
+
+            slope, out = jax.jacfwd(twice, has_aux=True)(x)
+            return out, slope
+
+        # A dozen numbers and one long loop: forward mode is cheaper to compile and to run.
+        value.defvjp(forward, lambda slope, g: (g * slope,))
+        return value(x)
+
+    def unpack(self, x: Float[Array, " n"]) -> Point:
+        """What x stands for."""
+        x = _checks.floating(x, self.x0.shape, "x")
+        parameters, noises, process, _ = self._read(x)
+        body, state0 = self.problem.unpack(parameters)
+        return Point(parameters, body, state0, self.problem.values(parameters), noises, process)
+
+    def _read(self, x: Array) -> tuple[Parameters, tuple[Array, ...], Any, Array | None]:
+        parameters, factors, logs = ravel_pytree(self.like)[1](x)
+        noises = tuple(
+            noise if factor is None else noise * jnp.exp(factor)[None]
+            for noise, factor in zip(self.noises, factors, strict=True)
+        )
+        process = self.process
+        if logs is not None:
+            leaves, structure = jax.tree.flatten(process)
+            grown = [leaf * jnp.exp(log) for leaf, log in zip(leaves, logs, strict=True)]
+            process = jax.tree.unflatten(structure, grown)
+        return parameters, noises, process, logs
+
+    def value(self, x: Float[Array, " n"]) -> Scalar:
+        """The same number without a rule for its gradient: for derivatives in forward mode."""
+        problem = self.problem
+        parameters, noises, process, logs = self._read(x)
+        if process is None:
+            errors, ends = all_errors(parameters, problem)
+            total = jnp.zeros((), x.dtype)
+            scaled = whitened(problem, errors, noises)
+            for e, noise, reading in zip(scaled, noises, problem.records.readings, strict=True):
+                each = -0.5 * e**2 - jnp.log(noise)[:, None] - 0.5 * math.log(2 * math.pi)
+                limit = getattr(reading.sensor, "limit", None)
+                if limit is not None:
+                    # What a channel at its limit counts is a probability, not a density.
+                    full = jnp.abs(reading.values) >= limit[:, None] * (1 - 1e-6)
+                    each = jnp.where(full, -0.5 * e**2, each)
+                total = total + jnp.sum(jnp.where(reading.mask[..., None], each, 0))
+        else:
+            ends = None
+            total = jnp.sum(self._integrated(parameters, noises, process))
+        for extra in beside(parameters, problem, ends):
+            total = total - 0.5 * jnp.sum(extra**2)
+        if logs is not None and self.deviation is not None:
+            total = total - 0.5 * jnp.sum((logs / self.deviation) ** 2)
+        return total
+
+    def _integrated(self, parameters: Parameters, noises: tuple, process: Any) -> Array:
+        """The likelihood of each recording, the unknown torque integrated out."""
+        problem = self.problem
+        body = problem.body.body(parameters.body)
+        if problem.rung is not Rigid and isinstance(body, MassProperties):
+            body = body.inertia
+
+        def of_one(own: Any, record: Any, ref: Any, sigma: tuple) -> Array:
+            record = filled(problem, parameters.shared, own, record)
+            state: HasSpin = first_state(problem.rung, own, ref)
+            law = process if record.torque is None else Sum(record.torque, process)
+            model = Model(body, law)
+            sensors = [
+                eqx.tree_at(lambda s: s.noise, r.sensor, each, is_leaf=lambda node: node is None)
+                for r, each in zip(record.readings, sigma, strict=True)
+            ]
+            torques = tuple(jnp.zeros(3, state.omega.dtype) for _ in model.coloured)
+            x = Extended(state, torques, ())
+            known = jnp.zeros(size_of(x) - 3 * len(torques), state.omega.dtype)
+            spread = jnp.concatenate([known, *(law.deviation for law in model.coloured)])
+            first = Belief(record.t[0], x, jnp.diag(spread))
+            return log_likelihood_of(
+                model, sensors_of(sensors, model), record, first, self.substeps
+            )
+
+        return over_records(
+            of_one, problem, parameters.own, problem.records, problem.reference, noises
+        )

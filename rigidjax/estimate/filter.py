@@ -1,0 +1,320 @@
+"""The extended Kalman filter on the manifold, in square-root form."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float, Int
+
+from rigidjax import _checks
+from rigidjax._types import Scalar, ScalarLike
+from rigidjax.estimate import roots
+from rigidjax.estimate.belief import Belief
+from rigidjax.estimate.grid import Grid, gathered, grid_of
+from rigidjax.estimate.scene import Dynamics, Model, bare, reset, retract
+from rigidjax.estimate.sensing import Read, Sensors, absorb_all, rows, sensors_of, values_of
+from rigidjax.identify.recording import Recording
+
+# A filter is lost when for so long, s, and so many readings, none was within so many deviations.
+LOST_AFTER, LOST_READINGS, LOST_BEYOND = 1.0, 3, 6.0
+WORDS = (
+    "followed",
+    "lost: for more than a second no reading was within six deviations of what was expected",
+    "broken off: an estimate is NaN or infinite",
+)
+
+
+class Filtered(eqx.Module):
+    """What `filter` returns.
+
+    **Fields:** `belief` a `Belief` at each time of the recording, after its readings; `readings`,
+    for each sensor, a `Read`: `innovation`, `variance` and `seen`, (T, k); `log_likelihood` of all
+    readings; `status` 0 followed, 1 lost, 2 broken off (`words` says it); `lost_at` s, NaN unless
+    lost.
+    """
+
+    belief: Belief
+    readings: tuple[Read, ...]
+    log_likelihood: Scalar
+    status: Int[Array, ""]
+    lost_at: Scalar
+
+    @property
+    def t(self) -> Float[Array, " times"]:
+        """The times of the recording, s."""
+        return self.belief.t
+
+    @property
+    def states(self) -> Any:
+        """The estimates, with a leading time axis."""
+        return self.belief.state
+
+    @property
+    def words(self) -> str:
+        """The status in words."""
+        return WORDS[int(self.status)]
+
+    @property
+    def nis(self) -> tuple[Float[Array, " times"], ...]:
+        """Normalised innovations squared of each sensor, and how many numbers each holds.
+
+        Where the model is right they follow χ² with as many degrees of freedom (Bar-Shalom, Li and
+        Kirubarajan, Estimation (2001), §5.4).
+        """
+        return tuple(
+            jnp.sum(jnp.where(r.seen, r.innovation**2 / r.variance, 0), -1) for r in self.readings
+        )
+
+
+def filter(
+    model: Model,
+    recording: Recording,
+    first: Belief,
+    *,
+    substeps: int | None = None,
+    throw: bool = True,
+) -> Filtered:
+    """Attitude, rate, unknown torque and sensor errors from the readings so far, at each time.
+
+    The multiplicative extended Kalman filter: the estimate is a state on the group, its error a
+    rotation vector and numbers (Lefferts, Markley and Shuster 1982, doi:10.2514/3.56190). Between
+    readings both follow the equations of motion, by the classical method of order 4 and its exact
+    derivative. The covariance is kept as a root: by Gram–Schmidt from step to step, by Potter's
+    formula at each number read.
+
+    **Arguments:** `model`; `recording` a `Recording` whose sensors have their noise; masked
+    readings are gaps, channels at their full scale are left out, a sensor's `offset` is a delay;
+    `first` of `start`; `substeps` equal steps from one time to the next, `None` as many as the rate
+    asks for where the numbers are known, else one. `throw`: `False` never raises for what is met on
+    the way; `status` tells.
+
+    **Returns** a `Filtered`. It may be jitted, differentiated, and batched over any argument.
+
+    **Raises:** `ValueError` for a sensor without noise, readings before `first`; where `throw`, a
+    filter that is lost: for a second and three readings none was within 6 deviations of what was
+    expected.
+
+    >>> import rigidjax as rj
+    >>> from rigidjax import estimate
+    >>> record = rj.identify.Recording([0.0, 0.1], (rj.identify.Gyro(0.1), [[1.0, 0, 0]] * 2))
+    >>> model = estimate.Model(rj.Inertia.from_principal(1.0, 2.0, 2.5))
+    >>> found = estimate.filter(model, record, estimate.start(model, record, rate=1.0))
+    >>> found.states.omega.shape, found.words
+    ((2, 3), 'followed')
+    """
+    sensors = looked_at(model, recording, first)
+    grid = grid_of(model, recording, first, substeps)
+    out = _filter(bare(model), sensors, recording, first, grid)
+    if not throw:
+        return out
+    return told(out)
+
+
+def told(out: Any) -> Any:
+    """The same, unless it is lost or broken off: then raise in words."""
+    status = out.status
+    at = f" (at {float(out.lost_at):g} s)" if _checks.known(out.lost_at) else ""
+    advice = "; is the noise or density too small, or the start far off? throw=False returns it"
+    out = _checks.refuse(out, status == 1, f"filter: {WORDS[1]}{at}{advice}")
+    return _checks.refuse(out, status == 2, f"filter: {WORDS[2]}{advice}")
+
+
+def log_likelihood(
+    model: Model, recording: Recording, first: Belief, *, substeps: int | None = None
+) -> Scalar:
+    """The logarithm of the density of all readings, the unknown torques integrated out.
+
+    `Σ log N(ν; 0, s)` over innovations (Schweppe 1965, doi:10.1109/TIT.1965.1053737). To be made
+    large in whatever is unknown: moments, a density, a noise, a first state. With no noise and a
+    first state that is known it is the likelihood of a deterministic fit.
+
+    **Arguments** and **raises** as for `filter`; differentiable in forward and reverse mode.
+
+    >>> import rigidjax as rj
+    >>> from rigidjax import estimate
+    >>> record = rj.identify.Recording([0.0, 0.1], (rj.identify.Gyro(1.0), [[1.0, 0, 0]] * 2))
+    >>> model = estimate.Model(rj.Inertia.from_principal(1.0, 1.0, 1.0))
+    >>> first = estimate.start(model, record, rj.Spin([1.0, 0, 0]), rate=0.0)
+    >>> log_likelihood(model, record, first).round(6)
+    Array(-5.513631, dtype=float64)
+    """
+    sensors = looked_at(model, recording, first)
+    grid = grid_of(model, recording, first, substeps)
+    return _log_likelihood(bare(model), sensors, recording, first, grid)
+
+
+def step(model: Model, belief: Belief, t: ScalarLike, *readings: tuple) -> Belief:
+    """The belief at `t`, with what was read then: for use while the body moves.
+
+    **Arguments:** `model`; `belief` of `start` or the last `step`; `t` s, not before it; `readings`
+    pairs `(sensor, value)` or triples `(sensor, value, seen)`, `seen` a truth value. The walks'
+    `where` finds the sensors as `r.readings[i].sensor`, in this order, so each call gives them all.
+
+    One step of the classical method: the time between readings must be short against a turn.
+
+    **Raises:** `ValueError` where numbers are known and `t` lies before the belief, or a reading
+    holds NaN.
+
+    >>> import jax, rigidjax as rj
+    >>> from rigidjax import estimate
+    >>> gyro = rj.identify.Gyro(0.1)
+    >>> record = rj.identify.Recording([0.0, 0.1], (gyro, [[1.0, 0, 0]] * 2))
+    >>> model = estimate.Model(rj.Inertia.from_principal(1.0, 2.0, 2.5))
+    >>> belief = estimate.start(model, record, rate=1.0)
+    >>> estimate.step(model, belief, 0.1, (gyro, jnp.array([1.0, 0.0, 0.0]))).t
+    Array(0.1, dtype=float64)
+    """
+    _checks.instance(model, Model, "model")
+    _checks.instance(belief, Belief, "belief")
+    when = _checks.time(t).astype(belief.t.dtype)
+    if _checks.known((when, belief.t)):
+        words = f"t: readings are out of order: {float(when):g} s is before {float(belief.t):g} s"
+        _checks.refuse(when, when < belief.t, words)
+    sensors = sensors_of([reading[0] for reading in readings], model)
+    values, masks = [], []
+    for sensor, value, *seen in readings:
+        name = type(sensor).__name__
+        value = _checks.floating(value, sensor.reading_shape, f"{name}: reading")
+        mask = jnp.asarray(seen[0] if seen else True)
+        if _checks.known((value, mask)) and bool(mask):
+            words = f"{name}: the reading contains NaN; give (sensor, value, False) if it is a gap"
+            _checks.refuse(value, not np.isfinite(np.asarray(value)).all(), words)
+        values.append(value)
+        masks.append(mask)
+    return _step(bare(model), sensors, belief, when, tuple(values), tuple(masks))
+
+
+@eqx.filter_jit
+def _step(
+    model: Model, sensors: Sensors, belief: Belief, t: Array, values: tuple, masks: tuple
+) -> Belief:
+    # A reading that no derivative is lost on, where there is none.
+    values = tuple(
+        jnp.where(mask, value, jnp.zeros_like(value).at[0].set(1)).astype(belief.root.dtype)
+        for value, mask in zip(values, masks, strict=True)
+    )
+    return _one(
+        model, Dynamics(model, belief.x, sensors.densities), sensors, belief, t, values, masks
+    )[0]
+
+
+def _one(
+    model: Model,
+    dynamics: Dynamics,
+    sensors: Sensors,
+    belief: Belief,
+    t: Array,
+    values: Sequence[Array],
+    masks: Sequence[Array],
+) -> tuple[Belief, tuple[Read, ...]]:
+    dtype = belief.root.dtype
+    # Times may have more digits than the state: after a thousand seconds seven are too few.
+    since = (t - belief.t).astype(dtype)
+    x, grown, noise = dynamics.predict(belief.t.astype(dtype), since, belief.x)
+    moved = jnp.concatenate([roots.product(grown, belief.root), noise], 1)
+    root = roots.triangular(moved)
+    found = rows(model, dynamics, sensors, t.astype(dtype), x, values, masks)
+    e, root, read = absorb_all(found, jnp.zeros(root.shape[0], root.dtype), root)
+    return Belief(t, retract(x, e), reset(x, e, root)), read
+
+
+class Stops(NamedTuple):
+    """Where the filter stops, and what was read there."""
+
+    t: Array
+    values: tuple[Array, ...]
+    masks: tuple[Array, ...]
+
+
+def scan_filter(
+    model: Model,
+    sensors: Sensors,
+    recording: Recording,
+    first: Belief,
+    grid: Grid | None,
+    keep: Any,
+) -> tuple[Stops, Any]:
+    """All stops, and `lax.scan` of the filter over them, which keeps `keep(belief, read)`."""
+    dtype = first.root.dtype
+    dynamics = Dynamics(model, first.x, sensors.densities)
+    stops = Stops(*gathered(grid, recording.t, *values_of(recording, dtype)))
+
+    def body(carry: tuple[Belief, Array], stop: Stops) -> tuple[Any, Any]:
+        belief, total = carry
+        belief, read = _one(model, dynamics, sensors, belief, *stop)
+        total = total + sum(r.log_density for r in read)
+        return (belief, total), keep(belief, read)
+
+    # What a reverse pass needs of a step is made again: a step holds some thousand numbers.
+    body = jax.checkpoint(body)  # pyright: ignore[reportPrivateImportUsage]
+    return stops, lax.scan(body, (first, jnp.zeros((), dtype)), stops)
+
+
+@eqx.filter_jit
+def _filter(
+    model: Model, sensors: Sensors, recording: Recording, first: Belief, grid: Grid | None
+) -> Filtered:
+    _, ((_, total), (beliefs, reads)) = scan_filter(
+        model, sensors, recording, first, grid, lambda belief, read: (belief, read)
+    )
+    if grid is not None:
+        beliefs, reads = jax.tree.map(lambda leaf: leaf[grid.rows], (beliefs, reads))
+    status, lost_at = status_of(beliefs, reads, first.t)
+    return Filtered(beliefs, reads, total, status, lost_at)
+
+
+def log_likelihood_of(
+    model: Model, sensors: Sensors, recording: Recording, first: Belief, substeps: int
+) -> Scalar:
+    """`log_likelihood` of what has been looked at."""
+    return _log_likelihood(
+        model, sensors, recording, first, grid_of(model, recording, first, substeps)
+    )
+
+
+@eqx.filter_jit
+def _log_likelihood(
+    model: Model, sensors: Sensors, recording: Recording, first: Belief, grid: Grid | None
+) -> Scalar:
+    _, ((_, total), _) = scan_filter(
+        model, sensors, recording, first, grid, lambda belief, read: None
+    )
+    return total
+
+
+def status_of(beliefs: Belief, reads: tuple[Read, ...], t0: Array) -> tuple[Array, Array]:
+    t, times = beliefs.t, jnp.arange(beliefs.t.shape[0])
+    lost = jnp.zeros(t.shape, bool)
+    for read in reads:
+        size = jnp.where(read.seen, read.innovation**2, 0) > LOST_BEYOND**2 * read.variance
+        seen = read.seen.any(-1)
+        bad = seen & size.any(-1)
+        good = seen & ~bad
+        since = lax.cummax(jnp.where(good, t, jnp.where(times == 0, t0, -jnp.inf)))
+        count = jnp.cumsum(bad)
+        before = lax.cummax(jnp.where(good, count, 0))
+        many = count - before >= LOST_READINGS
+        lost = lost | (bad & (t - since >= LOST_AFTER) & many)
+    whole = jnp.isfinite(beliefs.root).all() & jnp.isfinite(beliefs.x.motion.omega).all()
+    status = jnp.where(whole, jnp.where(lost.any(), 1, 0), 2)
+    return status, jnp.where(lost.any(), t[jnp.argmax(lost)], jnp.nan)
+
+
+def looked_at(model: Model, recording: Recording, first: Belief) -> Sensors:
+    _checks.instance(model, Model, "model")
+    _checks.instance(recording, Recording, "recording")
+    _checks.instance(first, Belief, "first", hint="estimate.start makes it")
+    if recording.torque is not None:
+        raise ValueError("recording: it has a torque of its own; put it into the model instead")
+    felt = [sensor.feels for sensor in recording.sensors]
+    for kind in felt:
+        if not isinstance(first.x.motion, kind):
+            raise TypeError(
+                f"first: a sensor needs a state with {kind.__name__}, got a "
+                f"{type(first.x.motion).__name__}"
+            )
+    return sensors_of(recording.sensors, model)

@@ -1,0 +1,325 @@
+"""Any linear model with normal noise: the Kalman filter and smoother, in square-root form."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+from rigidjax import _checks
+from rigidjax._types import Scalar
+from rigidjax.estimate import roots
+
+
+class LinearModel(eqx.Module):
+    """`x' = F x + d + G u`, `y = H x + c + r v`: u and v of unit variance, independent.
+
+    **Arguments:** `transition` F (n, n); `noise` G (n, m), a root of the covariance that is added;
+    `matrix` H (k, n); `deviation` r (k,) of the noise of each number read; then, `None` for zero,
+    `push` d (n,) and `offset` c (k,). Each may have a leading axis: F, G, d over the steps between
+    T times (T − 1), H, r, c over the times (T). A noise whose numbers are correlated is made
+    independent first: divide y, H, c by the Cholesky factor of its covariance.
+
+    **Raises:** `ValueError` for shapes that do not fit and a deviation that is not positive.
+
+    >>> walk = LinearModel(jnp.eye(1), 0.1 * jnp.eye(1), jnp.eye(1), jnp.ones(1))
+    >>> walk.size
+    1
+    """
+
+    transition: Float[Array, "*steps n n"]
+    noise: Float[Array, "*steps n m"]
+    matrix: Float[Array, "*times k n"]
+    deviation: Float[Array, "*times k"]
+    push: Float[Array, "*steps n"] | None
+    offset: Float[Array, "*times k"] | None
+
+    def __init__(
+        self,
+        transition: Any,
+        noise: Any,
+        matrix: Any,
+        deviation: Any,
+        *,
+        push: Any = None,
+        offset: Any = None,
+    ):
+        self.transition = _checks.numbers(transition, "transition")
+        self.noise, self.matrix = _checks.numbers(noise, "noise"), _checks.numbers(matrix, "matrix")
+        spread = _checks.numbers(deviation, "deviation")
+        words = (
+            "deviation: wanted positive standard deviations; a measurement without noise is "
+            "singular: leave what it fixes out of the state"
+        )
+        self.deviation = _checks.refuse(spread, ~(spread > 0).all(), words)
+        self.push = None if push is None else _checks.numbers(push, "push")
+        self.offset = None if offset is None else _checks.numbers(offset, "offset")
+        n, k = self.transition.shape[-1], self.matrix.shape[-2:-1]
+        for name, wanted in {
+            "transition": (n, n),
+            "noise": (n, self.noise.shape[-1] if self.noise.ndim else 1),
+            "matrix": (*k, n),
+            "deviation": k,
+            "push": (n,),
+            "offset": k,
+        }.items():
+            part = getattr(self, name)
+            if part is None:
+                continue
+            extra = part.ndim - len(wanted)
+            if extra not in (0, 1) or part.shape[extra:] != wanted:
+                raise ValueError(
+                    f"{name}: wanted shape {wanted}, with one leading axis of times or none, got "
+                    f"{part.shape}"
+                )
+
+    @property
+    def size(self) -> int:
+        """How many numbers the state has."""
+        return self.transition.shape[-1]
+
+
+class LinearEstimate(eqx.Module):
+    """Means (T, n) and roots (T, n, n) of the covariances of a state at each time.
+
+    **Fields:** also `innovation`, `variance` (T, k) of each number read given those before it, and
+    `log_likelihood` of all; of a smoother `kicks` (T − 1, m), the means of the noise u, and
+    `kick_covariance` (T − 1, m, m), else `None`.
+    """
+
+    mean: Float[Array, "times n"]
+    root: Float[Array, "times n n"]
+    innovation: Float[Array, "times k"]
+    variance: Float[Array, "times k"]
+    log_likelihood: Scalar
+    kicks: Float[Array, "steps m"] | None
+    kick_covariance: Float[Array, "steps m m"] | None
+
+    @property
+    def covariance(self) -> Float[Array, "times n n"]:
+        """The covariances."""
+        return self.root @ jnp.swapaxes(self.root, -1, -2)
+
+    @property
+    def deviation(self) -> Float[Array, "times n"]:
+        """The standard deviations."""
+        return jnp.sqrt(jnp.sum(self.root**2, -1))
+
+
+class Joint(NamedTuple):
+    """What one step forward keeps for the way back: see `joint`."""
+
+    predicted: Float[Array, "n n"]
+    gain: Float[Array, "n n"]
+    rest: Float[Array, "n n"]
+
+
+def joint(grown: Array, noise: Array, root: Array) -> Joint:
+    """The root of the predicted covariance, the smoother's gain, and the root of what is left.
+
+    From one triangularisation of `[[F S, G], [S, 0]]`: Park and Kailath 1995,
+    doi:10.1080/00207179508921582.
+    """
+    n = root.shape[0]
+    upper = jnp.concatenate([roots.product(grown, root), noise], 1)
+    lower = jnp.concatenate([root, jnp.zeros((n, noise.shape[1]), root.dtype)], 1)
+    whole = jnp.concatenate([upper, lower])
+    missing = 2 * n - whole.shape[1]
+    if missing > 0:
+        whole = jnp.concatenate([whole, jnp.zeros((2 * n, missing), root.dtype)], 1)
+    whole = roots.triangular(whole)
+    predicted, cross = whole[:n, :n], whole[n:, :n]
+    return Joint(predicted, roots.divide_right(cross, predicted), whole[n:, n:])
+
+
+def backward(
+    kept: Joint, mean: Array, predicted: Array, later: Array, root: Array
+) -> tuple[Array, Array]:
+    """The smoothed mean and root before a step from those after it (Rauch, Tung, Striebel 1965)."""
+    mean = mean + jnp.sum(kept.gain * (later - predicted)[None], 1)
+    moved = jnp.concatenate([kept.rest, roots.product(kept.gain, root)], 1)
+    return mean, roots.triangular(moved)
+
+
+def kick(noise: Array, kept: Joint, off: Array, root: Array) -> tuple[Array, Array]:
+    """Mean and covariance (m, m) of the unit noise of a step, all readings known.
+
+    `1 − ZᵀZ + (Zᵀ L⁻¹ S)(Zᵀ L⁻¹ S)ᵀ` with `Z = L⁻¹ G`, L the predicted root.
+
+    **Arguments:** `noise` G; `kept`; `off` (n,) how far the smoothed mean after the step is from
+    the predicted one; `root` (n, n) of its smoothed covariance.
+    """
+    whitened = roots.divide(kept.predicted, noise)
+    mean = roots.divide(kept.predicted, off[:, None])[:, 0]
+    mean = jnp.sum(whitened * mean[:, None], 0)
+    spread = roots.divide(kept.predicted, root)
+    left = jnp.eye(noise.shape[1], dtype=noise.dtype) - roots.product(whitened.T, whitened)
+    known = roots.product(whitened.T, spread)
+    total = left + roots.product(known, known.T)
+    return mean, total
+
+
+def linear_filter(
+    model: LinearModel, readings: Any, mean: Any, root: Any, seen: Any = None
+) -> LinearEstimate:
+    """The Kalman filter of a `LinearModel`: the state at each time from the readings so far.
+
+    **Arguments:** `readings` y (T, k); `mean` (n,) and `root` (n, n), a root of the covariance, at
+    the first time before its reading; `seen` (T, k) which numbers count, `None` all.
+
+    **Raises:** `ValueError` for shapes that do not fit, NaN that is not masked.
+
+    >>> walk = LinearModel(jnp.eye(1), 0.1 * jnp.eye(1), jnp.eye(1), jnp.ones(1))
+    >>> linear_filter(walk, jnp.ones((3, 1)), jnp.zeros(1), jnp.eye(1)).mean[0]
+    Array([0.5], dtype=float64)
+    """
+    return _filter(model, *_given(model, readings, mean, root, seen))
+
+
+def linear_smooth(
+    model: LinearModel, readings: Any, mean: Any, root: Any, seen: Any = None
+) -> LinearEstimate:
+    """The state at each time, and the noise of each step, from all readings.
+
+    Rauch, Tung and Striebel 1965, doi:10.2514/3.3166, on roots of the covariances.
+
+    **Arguments** and **raises** as `linear_filter`.
+
+    >>> walk = LinearModel(jnp.eye(1), 0.1 * jnp.eye(1), jnp.eye(1), jnp.ones(1))
+    >>> found = linear_smooth(walk, jnp.ones((3, 1)), jnp.zeros(1), jnp.eye(1))
+    >>> bool(found.mean[0, 0] > 0.5), found.kicks.shape
+    (True, (2, 1))
+    """
+    return _smooth(model, *_given(model, readings, mean, root, seen))
+
+
+def _given(model: LinearModel, readings: Any, mean: Any, root: Any, seen: Any) -> tuple:
+    _checks.instance(model, LinearModel, "model")
+    n, k = model.size, model.deviation.shape[-1]
+    readings = _checks.rows(readings, (k,), "readings")
+    mean, root = _checks.floating(mean, (n,), "mean"), _checks.floating(root, (n, n), "root")
+    times = readings.shape[0]
+    if seen is None:
+        seen = jnp.ones(readings.shape, bool)
+    seen = jnp.asarray(seen)
+    if seen.dtype != bool or seen.shape != readings.shape:
+        raise ValueError(f"seen: wanted truth values {readings.shape}, got {seen.shape}")
+    bad = seen & ~jnp.isfinite(readings)
+    words = "readings: contains NaN or infinity; mask it by `seen` if it is a gap"
+    readings = jnp.where(seen, _checks.refuse(readings, bad.any(), words), 0)
+    for name, base, wanted in (
+        ("transition", 2, times - 1),
+        ("noise", 2, times - 1),
+        ("push", 1, times - 1),
+        ("matrix", 2, times),
+        ("deviation", 1, times),
+        ("offset", 1, times),
+    ):
+        part = getattr(model, name)
+        if part is not None and part.ndim > base and part.shape[0] != wanted:
+            raise ValueError(f"{name}: wanted {wanted} rows for {times} times, got {part.shape[0]}")
+    return readings, mean, root, seen
+
+
+class _Passed(NamedTuple):
+    mean: Array
+    root: Array
+    innovation: Array
+    variance: Array
+
+
+def _read(row: Any, y: Array, seen: Array, mean: Array, root: Array) -> _Passed:
+    """The update by one row of readings."""
+
+    def one(carry: tuple[Array, Array], number: tuple) -> tuple[Any, Any]:
+        h, error, variance, there = number
+        found = roots.absorb(*carry, h, error, variance, there)
+        return (found.step, found.root), (found.innovation, found.variance)
+
+    matrix, deviation, offset = row
+    error = y if offset is None else y - offset
+    (mean, root), (innovation, variance) = lax.scan(
+        one, (mean, root), (matrix, error, deviation**2, seen)
+    )
+    return _Passed(mean, root, innovation, variance)
+
+
+def _split(parts: tuple, base: tuple[int, ...]) -> tuple[tuple, Any]:
+    """What changes with time, and a function that puts it beside what does not."""
+    moving = tuple(
+        p if p is not None and p.ndim > b else None for p, b in zip(parts, base, strict=True)
+    )
+
+    def whole(now: tuple) -> tuple:
+        return tuple(p if m is None else n for p, m, n in zip(parts, moving, now, strict=True))
+
+    return moving, whole
+
+
+def _pass(model: LinearModel, readings: Array, mean: Array, root: Array, seen: Array, step: Any):
+    """Forward through all times; `step(F, G, root)` gives the predicted root and what is kept."""
+    steps, at_step = _split((model.transition, model.noise, model.push), (2, 2, 1))
+    times, at_time = _split((model.matrix, model.deviation, model.offset), (2, 1, 1))
+    first = _read(
+        at_time(jax.tree.map(lambda leaf: leaf[0], times)), readings[0], seen[0], mean, root
+    )
+
+    def body(carry: tuple[Array, Array], now: Any) -> tuple[Any, Any]:
+        grown, noise, push = at_step(now[0])
+        mean, root = carry
+        predicted = jnp.sum(grown * mean[None], 1)
+        if push is not None:
+            predicted = predicted + push
+        before, kept = step(grown, noise, root)
+        passed = _read(at_time(now[1]), now[2], now[3], predicted, before)
+        return (passed.mean, passed.root), (passed, predicted, kept)
+
+    later = jax.tree.map(lambda leaf: leaf[1:], times)
+    _, (rest, predicted, kept) = lax.scan(
+        body, (first.mean, first.root), (steps, later, readings[1:], seen[1:])
+    )
+    passed = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first, rest)
+    total = jnp.sum(roots.log_normal(passed.innovation, passed.variance, seen))
+    return passed, predicted, kept, total
+
+
+@jax.jit
+def _filter(
+    model: LinearModel, readings: Array, mean: Array, root: Array, seen: Bool[Array, "..."]
+) -> LinearEstimate:
+    def step(grown: Array, noise: Array, root: Array) -> tuple[Array, None]:
+        moved = jnp.concatenate([roots.product(grown, root), noise], 1)
+        return roots.triangular(moved), None
+
+    passed, _, _, total = _pass(model, readings, mean, root, seen, step)
+    return LinearEstimate(
+        passed.mean, passed.root, passed.innovation, passed.variance, total, None, None
+    )
+
+
+@jax.jit
+def _smooth(
+    model: LinearModel, readings: Array, mean: Array, root: Array, seen: Bool[Array, "..."]
+) -> LinearEstimate:
+    def step(grown: Array, noise: Array, root: Array) -> tuple[Array, Joint]:
+        kept = joint(grown, noise, root)
+        return kept.predicted, kept
+
+    passed, predicted, kept, total = _pass(model, readings, mean, root, seen, step)
+    _, (means, spreads) = lax.scan(
+        lambda later, now: (lambda out: (out, out))(backward(now[0], now[1], now[2], *later)),
+        (passed.mean[-1], passed.root[-1]),
+        (kept, passed.mean[:-1], predicted),
+        reverse=True,
+    )
+    means = jnp.concatenate([means, passed.mean[-1:]])
+    spreads = jnp.concatenate([spreads, passed.root[-1:]])
+    axis = 0 if model.noise.ndim > 2 else None
+    kicks, spread_of_kicks = jax.vmap(kick, (axis, 0, 0, 0))(
+        model.noise, kept, means[1:] - predicted, spreads[1:]
+    )
+    return LinearEstimate(
+        means, spreads, passed.innovation, passed.variance, total, kicks, spread_of_kicks
+    )

@@ -1,0 +1,157 @@
+"""Draws from a posterior density, by samplers that others keep."""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from rigidjax import _checks
+from rigidjax.estimate.density import LogDensity, Point
+
+# A sampler: key, log-density of z, a first z (n,) → draws (samples, n).
+Sampler = Callable[[Any, Callable[[Array], Array], Array], Array]
+
+
+class Nuts(eqx.Module):
+    """The no-U-turn sampler of blackjax, its step and mass matrix adapted first.
+
+    **Arguments:** `samples` kept, `warmup` before them, of each chain. It needs blackjax:
+    `pip install rigidjax[posterior]`. Hoffman and Gelman 2014, JMLR 15:1593.
+
+    >>> Nuts(samples=500).samples
+    500
+    """
+
+    samples: int = eqx.field(static=True, default=1000)
+    warmup: int = eqx.field(static=True, default=500)
+
+    def __check_init__(self):
+        _checks.whole(self.samples, "samples", 1)
+        _checks.whole(self.warmup, "warmup", 1)
+
+    def __call__(self, key: Any, density: Callable[[Array], Array], start: Array) -> Array:
+        """Draws (samples, n) of one chain."""
+        blackjax = _blackjax()
+        first, later = jax.random.split(key)
+        adapt = blackjax.window_adaptation(
+            blackjax.nuts, density, is_mass_matrix_diagonal=True, target_acceptance_rate=0.85
+        )
+        (state, tuned), _ = adapt.run(first, start, num_steps=self.warmup)
+        step = blackjax.nuts(density, **tuned).step
+
+        def body(state: Any, key: Any) -> tuple[Any, Array]:
+            state, _ = step(key, state)
+            return state, state.position
+
+        _, draws = jax.lax.scan(body, state, jax.random.split(later, self.samples))
+        return draws
+
+
+class Posterior(eqx.Module):
+    """What `posterior` returns.
+
+    **Fields:** `x` (chains, samples, n) draws of the vector that `density` takes; `rhat` and `ess`
+    (n,): the potential scale reduction between chains, near 1 where they agree, and how many
+    independent draws they are worth (Gelman et al., Bayesian Data Analysis (2013), §11.4, 11.5).
+    """
+
+    density: LogDensity
+    x: Float[Array, "chains samples n"]
+    rhat: Float[Array, " n"]
+    ess: Float[Array, " n"]
+
+    @property
+    def points(self) -> Point:
+        """What the draws stand for, with leading axes of chains and samples."""
+        return jax.vmap(jax.vmap(self.density.unpack))(self.x)
+
+    def to_arviz(self) -> Any:
+        """The draws as ArviZ takes them: body, values, first states, noises, process."""
+        import arviz  # pyright: ignore[reportMissingImports]
+
+        points = self.points
+        out = dict(points.values)
+        out["omega0"] = points.state0.omega
+        body = points.body
+        out["inertia"] = body.tensor if hasattr(body, "tensor") else body.inertia.tensor
+        if points.process is not None:
+            out["density"] = points.process.density
+        return arviz.from_dict({"posterior": {k: jnp.asarray(v) for k, v in out.items()}})
+
+
+def posterior(
+    density: LogDensity, key: Any, *, sampler: Sampler | None = None, chains: int = 4
+) -> Posterior:
+    """Draws of body, first states, whatever is free, noise and process, given all readings.
+
+    **Arguments:** `density` a `LogDensity`; `key` of `jax.random`; `sampler` a function of a key,
+    a log-density and a first vector to draws (samples, n), `Nuts()` unless given; it works in
+    numbers whose covariance by Laplace's method is the identity, and starts from a draw of it.
+    `chains` run side by side under `vmap`.
+
+    **Returns** a `Posterior`.
+
+    **Raises:** `TypeError` for arguments of another kind, `ImportError` where blackjax is missing.
+
+    >>> posterior.__name__
+    'posterior'
+    """
+    _checks.instance(density, LogDensity, "density", hint="estimate.LogDensity(fit) makes one")
+    _checks.key(key)
+    chains = _checks.whole(chains, "chains", 2)
+    sampler = Nuts() if sampler is None else _checks.function(sampler, "sampler", "of a key")
+    if isinstance(sampler, Nuts):
+        _blackjax()
+    root = jnp.linalg.cholesky(density.covariance)
+    x = _draw(density, root, jax.random.split(key, chains), sampler)
+    return Posterior(density, x, *_agreement(x))
+
+
+@eqx.filter_jit
+def _draw(density: LogDensity, root: Array, keys: Array, sampler: Any) -> Array:
+    def of(z: Array) -> Array:
+        return density.x0 + jnp.sum(root * z[None], 1)
+
+    def chain(key: Any) -> Array:
+        first, later = jax.random.split(key)
+        start = 0.5 * jax.random.normal(first, density.x0.shape, density.x0.dtype)
+        return jax.vmap(of)(sampler(later, lambda z: density(of(z)), start))
+
+    return jax.vmap(chain)(keys)
+
+
+@jax.jit
+def _agreement(x: Float[Array, "chains samples n"]) -> tuple[Array, Array]:
+    """Split R̂ and the effective number of draws, by autocovariances summed in pairs (Geyer)."""
+    half = x.shape[1] // 2
+    parts = jnp.concatenate([x[:, :half], x[:, half : 2 * half]])
+    within = jnp.mean(jnp.var(parts, axis=1, ddof=1), 0)
+    between = jnp.var(jnp.mean(parts, 1), axis=0, ddof=1)
+    total = within * (half - 1) / half + between
+    rhat = jnp.sqrt(total / within)
+    off = parts - jnp.mean(parts, 1, keepdims=True)
+    size = 2 * half
+    power = jnp.abs(jnp.fft.rfft(off, n=size, axis=1)) ** 2
+    auto = jnp.mean(jnp.fft.irfft(power, n=size, axis=1)[:, :half], 0) / half
+    rho = 1 - (within * (half - 1) / half)[None] / total[None]
+    rho = rho + auto * (half / (half - 1)) / total[None]
+    rho = rho.at[0].set(1.0)
+    pairs = rho[: half // 2 * 2].reshape(half // 2, 2, -1).sum(1)
+    pairs = jnp.where(jnp.cumprod(pairs > 0, axis=0), pairs, 0)
+    pairs = jax.lax.cummin(pairs, axis=0)
+    time = jnp.maximum(2 * jnp.sum(pairs, 0) - 1, 1 / math.log10(parts.shape[0] * half))
+    return rhat, parts.shape[0] * half / time
+
+
+def _blackjax() -> Any:
+    try:
+        import blackjax  # pyright: ignore[reportMissingImports]
+    except ImportError as error:
+        raise ImportError(
+            "posterior: blackjax is missing; pip install 'rigidjax[posterior]', or give a sampler"
+        ) from error
+    return blackjax

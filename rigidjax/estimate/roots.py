@@ -1,0 +1,120 @@
+"""Covariances by their square roots: P = S Sᵀ, which no rounding makes indefinite."""
+
+import math
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+from rigidjax._types import Scalar
+
+
+def triangular(a: Float[Array, "n m"]) -> Float[Array, "n n"]:
+    """The lower triangular root L of `a aᵀ`, its diagonal ≥ 0.
+
+    By the modified Gram–Schmidt process on the rows, whose triangular factor is as good as
+    Householder's (Björck 1967, doi:10.1007/BF01934122). A row that depends on those before it,
+    to a few units of round-off, leaves a zero on the diagonal; derivatives there are zero.
+
+    >>> triangular(jnp.array([[3.0, 4.0], [3.0, 4.0]])).tolist()
+    [[5.0, 0.0], [5.0, 0.0]]
+    """
+    n = a.shape[0]
+    below = jnp.arange(n)
+    least = (4 * float(jnp.finfo(a.dtype).eps)) ** 2 * jnp.sum(a * a, 1)
+
+    def take(a: Array, k: Array) -> tuple[Array, Array]:
+        row = lax.dynamic_index_in_dim(a, k, keepdims=False)
+        square = jnp.sum(row * row)
+        there = square > least[k]
+        unit = row * jnp.where(there, 1 / jnp.sqrt(jnp.where(there, square, 1)), 0)
+        column = jnp.where(below >= k, jnp.sum(a * unit[None], 1), 0)
+        return a - column[:, None] * unit[None], column
+
+    return lax.scan(take, a, below)[1].T
+
+
+def product(a: Float[Array, "n m"], b: Float[Array, "m k"]) -> Float[Array, "n k"]:
+    """`a b`, in full precision and cheap for a few rows.
+
+    >>> product(jnp.eye(2), 2 * jnp.eye(2)).tolist()
+    [[2.0, 0.0], [0.0, 2.0]]
+    """
+    return jnp.sum(a[:, :, None] * b[None], 1)
+
+
+class Absorbed(NamedTuple):
+    """What one number read does: the mean's step, the root after it, and how far off it was.
+
+    **Fields:** `step` (n,); `root` (n, n); `innovation` ν, what was read minus what was expected;
+    `variance` s of ν; both of a masked number are such that it counts for nothing (0 and 1).
+    """
+
+    step: Float[Array, " n"]
+    root: Float[Array, "n n"]
+    innovation: Scalar
+    variance: Scalar
+
+
+def absorb(
+    step: Float[Array, " n"],
+    root: Float[Array, "n n"],
+    row: Float[Array, " n"],
+    error: Scalar,
+    variance: Scalar,
+    seen: Bool[Array, ""],
+) -> Absorbed:
+    """Potter's update by one number `error = row · e + noise`, of an e of mean `step`.
+
+    `s = |Sᵀh|² + r`, `S ← S − S v vᵀ/(s + √(rs))` with `v = Sᵀh`: Potter, in Battin, Astronautical
+    Guidance (1964), §9.6; Bierman, Factorization Methods (1977), §II.4.
+
+    >>> one = jnp.array(1.0)
+    >>> absorb(jnp.zeros(1), jnp.eye(1), jnp.ones(1), one, one, jnp.array(True)).step.tolist()
+    [0.5]
+    """
+    across = jnp.where(seen, jnp.sum(row[:, None] * root, 0), 0)
+    variance = jnp.where(seen, variance, 1)
+    total = jnp.sum(across * across) + variance
+    innovation = jnp.where(seen, error - jnp.sum(row * step), 0)
+    along = jnp.sum(root * across[None], 1)
+    step = step + along * (innovation / total)
+    shrink = 1 / (total + jnp.sqrt(total * variance))
+    return Absorbed(step, root - (along * shrink)[:, None] * across[None], innovation, total)
+
+
+def log_normal(innovation: Array, variance: Array, seen: Array) -> Array:
+    """The logarithm of a normal density, zero where nothing was seen.
+
+    >>> round(float(log_normal(jnp.array(0.0), jnp.array(1.0), jnp.array(True))), 6)
+    -0.918939
+    """
+    value = -0.5 * (innovation * innovation / variance + jnp.log(variance) + math.log(2 * math.pi))
+    return jnp.where(seen, value, 0)
+
+
+def divide(lower: Float[Array, "n n"], right: Float[Array, "n m"]) -> Float[Array, "n m"]:
+    """`lower⁻¹ right` by substitution; where the diagonal is zero, zero.
+
+    >>> divide(2.0 * jnp.eye(2), jnp.eye(2)).tolist()
+    [[0.5, 0.0], [0.0, 0.5]]
+    """
+
+    def take(right: Array, k: Array) -> tuple[Array, Array]:
+        column = lax.dynamic_index_in_dim(lower, k, 1, keepdims=False)
+        there = column[k] > 0
+        row = right[k] * jnp.where(there, 1 / jnp.where(there, column[k], 1), 0)
+        return right - column[:, None] * row[None], row
+
+    return lax.scan(take, right, jnp.arange(lower.shape[0]))[1]
+
+
+def divide_right(left: Float[Array, "m n"], lower: Float[Array, "n n"]) -> Float[Array, "m n"]:
+    """`left lower⁻¹`; where the diagonal is zero, zero.
+
+    >>> divide_right(jnp.eye(2), 2.0 * jnp.eye(2)).tolist()
+    [[0.5, 0.0], [0.0, 0.5]]
+    """
+    turned = divide(lower[::-1, ::-1].T, left[:, ::-1].T)
+    return turned.T[:, ::-1]

@@ -1,0 +1,106 @@
+"""A motion under random torques, drawn."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from rigidjax import _checks
+from rigidjax._types import HasSpin
+from rigidjax.estimate.grid import MEMORY_A_STEP, TURN_A_STEP
+from rigidjax.estimate.scene import Dynamics, Extended, Model
+from rigidjax.motion import on_the_group
+
+
+class Sampled(eqx.Module):
+    """What `sample` returns.
+
+    **Fields:** `t` (T,) s; `states` with a leading time axis; `torques` the value (T, 3) of each
+    `CorrelatedTorque`, N m, body frame.
+    """
+
+    t: Float[Array, " times"]
+    states: Any
+    torques: tuple[Float[Array, "times 3"], ...]
+
+
+def sample(key: Any, model: Model, state0: Any, ts: Any, *, substeps: int | None = None) -> Sampled:
+    """One motion that the model's random torques could have made.
+
+    Each step draws the white noise's integral and its first moment, which are all of it that counts
+    to order 1.5 where the noise does not depend on the state, and follows the equations of motion
+    under the polynomial with these by the classical method of order 4; the quaternion is made unit.
+    So a step is exact for a body at rest, and no Brownian path need be stored (that is what
+    diffrax's solvers for additive noise draw from: Foster, Lyons and Oberhauser 2020,
+    doi:10.1137/19M1261912). A `CorrelatedTorque` starts from its stationary distribution.
+
+    **Arguments:** `key` of `jax.random`; `model`; `state0` a `Spin`, `Attitude` or `Rigid`; `ts`
+    (T,) increasing times, s, the first is of `state0`; `substeps` equal steps between two of them,
+    `None` as many as the rate asks for where it is known, else one.
+
+    **Raises:** `ValueError` for times that do not increase, `TypeError` for another kind of thing.
+
+    >>> import jax, rigidjax as rj
+    >>> from rigidjax import estimate
+    >>> body = rj.Inertia.from_principal(1.0, 2.0, 2.5)
+    >>> model = estimate.Model(body, rj.torques.RandomTorque(0.01))
+    >>> drawn = sample(jax.random.key(0), model, rj.Spin([0.0, 0.0, 1.0]), [0.0, 0.5, 1.0])
+    >>> drawn.states.omega.shape
+    (3, 3)
+    """
+    _checks.key(key)
+    _checks.instance(model, Model, "model")
+    _checks.single(state0, HasSpin, "state0", wanted="a Spin, an Attitude or a Rigid")
+    times = _checks.rows(ts, (), "ts")
+    if times.shape[0] < 2:
+        raise ValueError(f"ts: wanted at least two times, got {times.shape[0]}")
+    if _checks.known(times):
+        words = "ts: wanted increasing times"
+        _checks.refuse(times, not (np.diff(np.asarray(times)) > 0).all(), words)
+    if substeps is not None:
+        pieces = _checks.whole(substeps, "substeps", 1)
+    elif _checks.known((times, state0.omega, model.coloured)):
+        widest = float(np.diff(np.asarray(times)).max())
+        pieces = np.ceil(widest * float(np.linalg.norm(np.asarray(state0.omega))) / TURN_A_STEP)
+        for law in model.coloured:
+            pieces = max(pieces, np.ceil(widest / (MEMORY_A_STEP * float(law.time))))
+        pieces = max(1, int(pieces))
+    else:
+        pieces = 1
+    return _sample(key, model, on_the_group(state0), times, pieces)
+
+
+@eqx.filter_jit
+def _sample(key: PRNGKeyArray, model: Model, state0: Any, ts: Array, pieces: int) -> Sampled:
+    dtype = state0.omega.dtype
+    first, later = jax.random.split(key)
+    torques = tuple(
+        law.deviation.astype(dtype) * jax.random.normal(one, (3,), dtype)
+        for law, one in zip(
+            model.coloured, jax.random.split(first, len(model.coloured)), strict=True
+        )
+    )
+    x0 = Extended(state0, torques, ())
+    dynamics = Dynamics(model, x0)
+
+    def span(x: Extended, given: tuple[Array, Array, Array]) -> tuple[Extended, Extended]:
+        left, right, one = given
+        # Times may have more digits than the state.
+        h = ((right - left) / pieces).astype(dtype)
+        left = left.astype(dtype)
+        kicks = jax.random.normal(one, (pieces, dynamics.kicks), dtype)
+
+        def move(x: Extended, now: tuple[Array, Array]) -> tuple[Extended, None]:
+            return dynamics.advance(left + now[0] * h, h, x, now[1]), None
+
+        x, _ = lax.scan(move, x, (jnp.arange(pieces, dtype=dtype), kicks))
+        return x, x
+
+    keys = jax.random.split(later, ts.shape[0] - 1)
+    _, rest = lax.scan(span, x0, (ts[:-1], ts[1:], keys))
+    xs = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), x0, rest)
+    return Sampled(ts, xs.motion, xs.torques)

@@ -1,0 +1,334 @@
+"""What moves the state of a filter: the motion, torques with a memory, drifting sensor errors."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from rigidjax import _checks
+from rigidjax._types import HasAttitude, HasPose, Mat3, Scalar
+from rigidjax.body.inertia import Inertia, MassProperties, inverse
+from rigidjax.motion import Rigid
+from rigidjax.motion.torques import CorrelatedTorque, RandomTorque, Sum, Torque, in_precision
+from rigidjax.motion.torques.base import require_law, tensor_of
+from rigidjax.rotation import quaternion
+from rigidjax.rotation.maps import normalised
+from rigidjax.solve import equations_of_motion
+
+
+class Walk(eqx.Module):
+    """A sensor's error that is unknown and drifts: `dx = √density dW`, a random walk.
+
+    **Arguments:** `where` picks it as a `Free` does: `lambda r: r.readings[0].sensor.bias`, whose
+    value in the recording is where it starts; `deviation` of that start, one number or as many, in
+    its unit; `density` how fast it drifts, unit² / s, ≥ 0: zero for one that stays.
+
+    **Raises** `ValueError` for a deviation or density below zero.
+
+    >>> Walk(lambda r: r.readings[0].sensor.bias, 0.01).density.tolist()
+    0.0
+    """
+
+    where: Callable[[Any], Any] = eqx.field(static=True)
+    deviation: Array
+    density: Array
+
+    def __init__(self, where: Callable[[Any], Any], deviation: Any, density: Any = 0.0):
+        words = "of a recording, such as lambda r: r.readings[0].sensor.bias"
+        self.where = _checks.function(where, "where", words)
+        self.deviation = not_negative(deviation, "deviation")
+        self.density = not_negative(density, "density")
+
+
+class Model(eqx.Module):
+    """A body, what turns it, known and unknown, and which errors of its sensors drift.
+
+    **Arguments:** `body` an `Inertia`, or `MassProperties` for a `Rigid` state; `torque` any
+    torques, among them `RandomTorque` and `CorrelatedTorque`, several in a `Sum`; `None` for a free
+    body without noise; `walks` the `Walk`s.
+
+    **Raises:** `TypeError` for arguments of another kind.
+
+    >>> import rigidjax as rj
+    >>> model = Model(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.torques.RandomTorque(1e-4))
+    >>> len(model.white), len(model.coloured), model.torque
+    (1, 0, None)
+    """
+
+    body: Inertia | MassProperties
+    torque: Torque | None
+    white: tuple[RandomTorque, ...]
+    coloured: tuple[CorrelatedTorque, ...]
+    walks: tuple[Walk, ...]
+
+    def __init__(
+        self,
+        body: Inertia | MassProperties,
+        torque: Torque | None = None,
+        *,
+        walks: Any = (),
+    ):
+        self.body = _checks.single(body, (Inertia, MassProperties), "body")
+        parts = [] if torque is None else _parts(torque)
+        self.white = tuple(part for part in parts if isinstance(part, RandomTorque))
+        self.coloured = tuple(part for part in parts if isinstance(part, CorrelatedTorque))
+        noise = (RandomTorque, CorrelatedTorque)
+        known: list[Any] = [part for part in parts if not isinstance(part, noise)]
+        self.torque = Sum(*known) if len(known) > 1 else (known[0] if known else None)
+        walks = (walks,) if isinstance(walks, Walk) else tuple(walks)
+        for walk in walks:
+            _checks.instance(walk, Walk, "walks", wanted="a sequence of Walk(where, deviation)")
+        self.walks = walks
+
+
+def bare(model: Model) -> Model:
+    """The model without its walks, whose functions would have each new one compiled again."""
+    return eqx.tree_at(lambda m: m.walks, model, ())
+
+
+class Extended(eqx.Module):
+    """All that a filter follows.
+
+    **Fields:** `motion` a `Spin`, `Attitude` or `Rigid`; `torques` the value (3,) of each
+    `CorrelatedTorque`, N m, body frame; `walks` the value of each `Walk`.
+
+    Errors of it are counted as numbers e: first, for a `Rigid`, of x and v (world frame); of the
+    attitude, where there is one, as the rotation vector δθ with `q = q̂ exp(δθ)`, rad, body frame;
+    of Ω; then of torques and walks.
+    """
+
+    motion: Any
+    torques: tuple[Array, ...]
+    walks: tuple[Array, ...]
+
+
+class Dynamics(eqx.Module):
+    """A model made ready for one dtype and one rung: what does not change is worked out once."""
+
+    field: Callable[..., Any]
+    inverse: Mat3
+    white: tuple[Array, ...]
+    coloured: tuple[tuple[Array, Scalar], ...]
+    walks: tuple[Array, ...]
+
+    def __init__(self, model: Model, x: Extended, densities: Sequence[Array] = ()):
+        dtype = x.motion.omega.dtype
+        body = in_precision(model.body, dtype)
+        if isinstance(body, MassProperties) and type(x.motion) is not Rigid:
+            body = body.inertia
+        self.field = equations_of_motion(body, x.motion, in_precision(model.torque, dtype))
+        self.inverse = inverse(tensor_of(body))
+        self.white = tuple(jnp.sqrt(law.density.astype(dtype)) for law in model.white)
+        self.coloured = tuple(
+            (jnp.sqrt(law.density.astype(dtype)), law.time.astype(dtype)) for law in model.coloured
+        )
+        self.walks = tuple(
+            jnp.broadcast_to(jnp.sqrt(density.astype(dtype)), value.shape)
+            for density, value in zip(densities, x.walks, strict=True)
+        )
+
+    @property
+    def kicks(self) -> int:
+        """How many unit normal numbers push motion and torques in one step."""
+        return 6 * (len(self.white) + len(self.coloured))
+
+    def advance(self, t: Scalar, h: Scalar, x: Extended, kicks: Array) -> Extended:
+        """`x` a time `h` later, pushed by noise; `kicks` (kicks,) of unit variance.
+
+        White noise within the step is replaced by its first two Legendre polynomials,
+        `√(density/h) (k₀ + √3 (1 − 2s/h) k₁)`, which give its effect on rate and angle their exact
+        joint covariance for a body at rest (Foster, Lyons and Oberhauser 2020,
+        doi:10.1137/19M1261912); the step is the classical one of order 4.
+        """
+        safe = jnp.where(h > 0, h, 1)
+        rest = jnp.where(h > 0, 1 / jnp.sqrt(safe), 0)
+        pairs = kicks.reshape(-1, 2, 3) * rest
+
+        def push(pair: Array, share: float) -> Array:
+            return pair[0] + 3.0**0.5 * share * pair[1]
+
+        def rate(when: Scalar, share: float, motion: Any, torques: tuple) -> tuple[Any, tuple]:
+            change = self.field(when, motion, None)
+            total = None
+            for root, pair in zip(self.white, pairs, strict=False):
+                more = root * push(pair, share)
+                total = more if total is None else total + more
+            slopes = []
+            later = pairs[len(self.white) :]
+            for (root, memory), pair, torque in zip(self.coloured, later, torques, strict=True):
+                total = torque if total is None else total + torque
+                slopes.append((root * push(pair, share) - torque) / memory)
+            if total is not None:
+                spin = change.omega + jnp.sum(self.inverse * total[None], 1)
+                change = eqx.tree_at(lambda s: s.omega, change, spin)
+            return change, tuple(slopes)
+
+        def plus(k: Any, part: Scalar) -> Any:
+            return jax.tree.map(lambda a, b: a + part * b, (x.motion, x.torques), k)
+
+        k1 = rate(t, 1.0, x.motion, x.torques)
+        k2 = rate(t + 0.5 * h, 0.0, *plus(k1, 0.5 * h))
+        k3 = rate(t + 0.5 * h, 0.0, *plus(k2, 0.5 * h))
+        k4 = rate(t + h, -1.0, *plus(k3, h))
+        slope = jax.tree.map(lambda a, b, c, d: (a + 2.0 * b + 2.0 * c + d) / 6.0, k1, k2, k3, k4)
+        motion, torques = plus(slope, h)
+        if isinstance(motion, HasAttitude):
+            motion = eqx.tree_at(lambda s: s.q, motion, normalised(motion.q))
+        return Extended(motion, torques, x.walks)
+
+    def predict(
+        self, t: Scalar, h: Scalar, x: Extended, kicks: Array | None = None
+    ) -> tuple[Extended, Float[Array, "n n"], Float[Array, "n m"]]:
+        """`x` a time `h` later, how errors grow, F (n, n), and the root of the noise, G (n, m).
+
+        Linearised about `kicks` (kicks,), `None` for none; drifts of walks come last in G.
+        """
+        dtype = x.motion.omega.dtype
+        kicks = jnp.zeros(self.kicks, dtype) if kicks is None else kicks
+        after, push = jax.linearize(lambda y, k: self.advance(t, h, y, k), x, kicks)
+        moving = Extended(x.motion, x.torques, ())
+        size, drifting = size_of(moving), size_of(x) - size_of(moving)
+        count = size + self.kicks
+        eye = jnp.eye(count, dtype=dtype)
+        still = tuple(jnp.zeros_like(w) for w in x.walks)
+
+        def column(unit: Array) -> Array:
+            tangent = tangent_of(moving, unit[:size])
+            moved = push(Extended(tangent.motion, tangent.torques, still), unit[size:])
+            return coordinates(after, moved)[:size]
+
+        both = jax.vmap(column, out_axes=1)(eye)
+        grown, noise = both[:, :size], both[:, size:]
+        if not drifting:
+            return after, grown, noise
+        strewn = jnp.concatenate([w.reshape(-1) for w in self.walks]) * jnp.sqrt(h)
+        return after, _block(grown, jnp.eye(drifting, dtype=dtype)), _block(noise, jnp.diag(strewn))
+
+
+def size_of(x: Extended) -> int:
+    """How many numbers an error of it has."""
+    motion = 12 if isinstance(x.motion, HasPose) else 6 if isinstance(x.motion, HasAttitude) else 3
+    return motion + 3 * len(x.torques) + sum(w.size for w in x.walks)
+
+
+def retract(x: Extended, e: Float[Array, " n"]) -> Extended:
+    """The state that lies e from `x`."""
+    parts, rest = _split(x, e)
+    motion = x.motion
+    if isinstance(motion, HasAttitude):
+        q = quaternion.multiply(motion.q, quaternion.exp(parts["turn"]))
+        motion = eqx.tree_at(lambda s: s.q, motion, q)
+    if isinstance(motion, HasPose):
+        moved = (motion.x + parts["x"], motion.v + parts["v"])
+        motion = eqx.tree_at(lambda s: (s.x, s.v), motion, moved)
+    motion = eqx.tree_at(lambda s: s.omega, motion, motion.omega + parts["spin"])
+    torques = tuple(a + b for a, b in zip(x.torques, rest.torques, strict=True))
+    return Extended(motion, torques, tuple(a + b for a, b in zip(x.walks, rest.walks, strict=True)))
+
+
+def between(x: Extended, y: Extended) -> Float[Array, " n"]:
+    """The error e with `retract(x, e) = y`."""
+    parts = []
+    if isinstance(x.motion, HasPose):
+        parts += [y.motion.x - x.motion.x, y.motion.v - x.motion.v]
+    if isinstance(x.motion, HasAttitude):
+        turn = quaternion.multiply(quaternion.conjugate(x.motion.q), y.motion.q)
+        parts.append(quaternion.log(turn))
+    parts.append(y.motion.omega - x.motion.omega)
+    parts += [b - a for a, b in zip(x.torques, y.torques, strict=True)]
+    parts += [(b - a).reshape(-1) for a, b in zip(x.walks, y.walks, strict=True)]
+    return jnp.concatenate(parts)
+
+
+def tangent_of(x: Extended, e: Float[Array, " n"]) -> Extended:
+    """The derivative of `retract(x, ·)` at zero along e."""
+    parts, rest = _split(x, e)
+    motion = x.motion
+    if isinstance(motion, HasAttitude):
+        motion = eqx.tree_at(lambda s: s.q, motion, quaternion.rate(motion.q, parts["turn"]))
+    if isinstance(motion, HasPose):
+        motion = eqx.tree_at(lambda s: (s.x, s.v), motion, (parts["x"], parts["v"]))
+    motion = eqx.tree_at(lambda s: s.omega, motion, parts["spin"])
+    return Extended(motion, rest.torques, rest.walks)
+
+
+def coordinates(x: Extended, moved: Extended) -> Float[Array, " n"]:
+    """The inverse of `tangent_of`: a small change of the state `x` as numbers."""
+    parts = []
+    if isinstance(x.motion, HasPose):
+        parts += [moved.motion.x, moved.motion.v]
+    if isinstance(x.motion, HasAttitude):
+        turned = quaternion.multiply(quaternion.conjugate(x.motion.q), moved.motion.q)
+        parts.append(2.0 * turned[1:])
+    parts += [moved.motion.omega, *moved.torques, *(w.reshape(-1) for w in moved.walks)]
+    return jnp.concatenate(parts)
+
+
+def reset(x: Extended, e: Float[Array, " n"], root: Float[Array, "n m"]) -> Float[Array, "n m"]:
+    """The root of the errors about `retract(x, e)` where `root` is of those about x.
+
+    `log(exp(−e) exp(e + δ)) ≈ J_r(e) δ`, to second order in the turn e: Mueller, Hehn and D'Andrea
+    2017, doi:10.2514/1.G000848.
+    """
+    return _turned(x, e, root, -0.5, 1 / 6)
+
+
+def reset_inverse(x: Extended, e: Float[Array, " n"], a: Float[Array, "n m"]) -> Array:
+    """`J_r(e)⁻¹ a`: how `log(exp(e) exp(δ))` moves where δ moves by a; to third order in e."""
+    return _turned(x, e, a, 0.5, 1 / 12)
+
+
+def _turned(x: Extended, e: Array, a: Array, first: float, second: float) -> Array:
+    """The rows of the attitude times `1 + first hat(e) + second hat(e)²`."""
+    if not isinstance(x.motion, HasAttitude):
+        return a
+    at = 6 if isinstance(x.motion, HasPose) else 0
+    p, q, r = e[at], e[at + 1], e[at + 2]
+    mine = a[at : at + 3]
+
+    def across(m: Array) -> Array:
+        return jnp.stack([q * m[2] - r * m[1], r * m[0] - p * m[2], p * m[1] - q * m[0]])
+
+    once = across(mine)
+    turned = mine + first * once + second * across(once)
+    return jnp.concatenate([a[:at], turned, a[at + 3 :]])
+
+
+def _split(x: Extended, e: Array) -> tuple[dict[str, Array], Extended]:
+    at, parts = 0, {}
+    names = ["x", "v"] if isinstance(x.motion, HasPose) else []
+    names += ["turn"] if isinstance(x.motion, HasAttitude) else []
+    for name in [*names, "spin"]:
+        parts[name], at = e[at : at + 3], at + 3
+    torques, walks = [], []
+    for _ in x.torques:
+        torques.append(e[at : at + 3])
+        at += 3
+    for w in x.walks:
+        walks.append(e[at : at + w.size].reshape(w.shape))
+        at += w.size
+    return parts, Extended(None, tuple(torques), tuple(walks))
+
+
+def _block(a: Array, b: Array) -> Array:
+    upper = jnp.concatenate([a, jnp.zeros((a.shape[0], b.shape[1]), a.dtype)], 1)
+    lower = jnp.concatenate([jnp.zeros((b.shape[0], a.shape[1]), a.dtype), b], 1)
+    return jnp.concatenate([upper, lower])
+
+
+def _parts(torque: Torque) -> list[Any]:
+    """The laws in a sum, and in sums within it."""
+    require_law(torque)
+    if isinstance(torque, Sum):
+        return [inner for part in torque.parts for inner in _parts(part)]
+    return [torque]
+
+
+def not_negative(value: Any, name: str) -> Array:
+    """Finite numbers, none below zero."""
+    array = _checks.numbers(value, name)
+    words = f"{name}: wanted a finite number that is not below zero"
+    return _checks.refuse(array, ~((array >= 0) & jnp.isfinite(array)).all(), words)

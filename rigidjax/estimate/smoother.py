@@ -1,0 +1,255 @@
+"""The iterated smoother: the most probable motion, given all readings."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float, Int
+
+from rigidjax import _checks
+from rigidjax._types import Scalar
+from rigidjax.estimate import linear
+from rigidjax.estimate.belief import Belief
+from rigidjax.estimate.filter import WORDS, Stops, looked_at, scan_filter, status_of, told
+from rigidjax.estimate.grid import Grid, grid_of
+from rigidjax.estimate.scene import (
+    Dynamics,
+    Extended,
+    Model,
+    bare,
+    between,
+    reset,
+    reset_inverse,
+    retract,
+)
+from rigidjax.estimate.sensing import Read, Sensors, absorb_all, rows
+from rigidjax.identify.recording import Recording
+
+
+class Push(NamedTuple):
+    """A white torque as the readings show it, averaged over the step that ends at each time.
+
+    **Fields:** `mean`, `deviation` (N, 3) N m, body frame; wide where steps are short, for white
+    noise has no value at a time.
+    """
+
+    mean: Float[Array, "stops 3"]
+    deviation: Float[Array, "stops 3"]
+
+
+class Smoothed(eqx.Module):
+    """What `smooth` returns.
+
+    **Fields:** `belief` a `Belief` at each stop: the times of the recording and, where these are
+    far apart, some between; `rows` (T,) which of them are of the recording; `pushes` a `Push` for
+    each `RandomTorque` (a `CorrelatedTorque` is in `belief.torques`); `readings` a `Read` for each
+    sensor, of the last linearisation, (N, k); `log_likelihood` of all readings, by Laplace's method
+    about this motion; `change` how far the last iteration moved it, in standard deviations at most;
+    `iterations`; `status`, `lost_at` as of `Filtered`.
+    """
+
+    belief: Belief
+    rows: Int[Array, " times"]
+    pushes: tuple[Push, ...]
+    readings: tuple[Read, ...]
+    log_likelihood: Scalar
+    change: Scalar
+    iterations: Int[Array, ""]
+    status: Int[Array, ""]
+    lost_at: Scalar
+
+    @property
+    def words(self) -> str:
+        """The status in words."""
+        return WORDS[int(self.status)]
+
+    @property
+    def t(self) -> Float[Array, " stops"]:
+        """The times of all stops, s."""
+        return self.belief.t
+
+    @property
+    def states(self) -> Any:
+        """The most probable states at the times of the recording, with a leading time axis."""
+        return jax.tree.map(lambda leaf: leaf[self.rows], self.belief.state)
+
+
+def smooth(
+    model: Model,
+    recording: Recording,
+    first: Belief,
+    *,
+    iterations: int = 10,
+    tolerance: float = 1e-4,
+    substeps: int | None = None,
+    throw: bool = True,
+) -> Smoothed:
+    """Attitude, rate, unknown torque and sensor errors from all readings, with their deviations.
+
+    The motion of largest posterior density, by Gauss and Newton's method: each iteration linearises
+    dynamics and sensors about the last motion and solves exactly by a Kalman filter and Rauch, Tung
+    and Striebel's pass back, on roots of covariances (Bell 1994, doi:10.1137/0804035). It starts
+    from what `filter` finds.
+
+    **Arguments:** as for `filter`; `iterations` at most; it ends when no number moved by more than
+    `tolerance` of its standard deviation.
+
+    **Returns** a `Smoothed`. It may be jitted, differentiated in forward mode, and batched.
+
+    **Raises:** as `filter`; where `throw`, also for a motion that still moves by a deviation.
+
+    >>> import rigidjax as rj
+    >>> from rigidjax import estimate
+    >>> record = rj.identify.Recording([0.0, 0.1], (rj.identify.Gyro(0.1), [[1.0, 0, 0]] * 2))
+    >>> body = rj.Inertia.from_principal(1.0, 2.0, 2.5)
+    >>> model = estimate.Model(body, rj.torques.RandomTorque(1.0))
+    >>> found = estimate.smooth(model, record, estimate.start(model, record, rate=1.0))
+    >>> found.states.omega.shape, found.pushes[0].mean.shape  # one stop between
+    ((2, 3), (3, 3))
+    """
+    _checks.whole(iterations, "iterations", 1)
+    _checks.positive(tolerance, "tolerance")
+    sensors = looked_at(model, recording, first)
+    grid = grid_of(model, recording, first, substeps)
+    out = _smooth(bare(model), sensors, recording, first, grid, iterations, tolerance)
+    if not throw:
+        return out
+    words = (
+        "smooth: the motion still moves by a standard deviation after the last iteration; give "
+        "more iterations, a better first state, or a model that the readings fit; throw=False "
+        "returns it"
+    )
+    return _checks.refuse(told(out), out.change > 1, words)
+
+
+class _Kept(NamedTuple):
+    joint: linear.Joint
+    before: Array
+    mean: Array
+    noise: Array
+    read: tuple[Read, ...]
+
+
+class _Solved(NamedTuple):
+    root: Array
+    read: tuple[Read, ...]
+    total: Array
+    kicks: Array
+    kick_covariance: Array
+    change: Array
+
+
+@eqx.filter_jit
+def _smooth(
+    model: Model,
+    sensors: Sensors,
+    recording: Recording,
+    first: Belief,
+    grid: Grid | None,
+    iterations: int,
+    tolerance: float,
+) -> Smoothed:
+    stops, (_, (beliefs, filtered)) = scan_filter(
+        model, sensors, recording, first, grid, lambda belief, read: (belief, read)
+    )
+    here = jnp.arange(stops.t.shape[0]) if grid is None else grid.rows
+    seen: Any = jax.tree.map(lambda leaf: leaf[here], (beliefs, filtered))
+    status, lost_at = status_of(seen[0], seen[1], first.t)
+    path = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first.x, beliefs.x)
+    dynamics = Dynamics(model, first.x, sensors.densities)
+
+    def once(path: Extended, kicks: Array) -> tuple[Extended, Any]:
+        return _iterate(model, dynamics, sensors, first, stops, path, kicks)
+
+    def more(state: tuple) -> Array:
+        return (state[2] < iterations) & (state[1].change > tolerance)
+
+    def again(state: tuple) -> tuple:
+        path, out = once(state[0], state[1].kicks[:, : dynamics.kicks])
+        return path, out, state[2] + 1
+
+    still = jnp.zeros((stops.t.shape[0], dynamics.kicks), first.root.dtype)
+    # Nothing is solved yet: one copy of an iteration is compiled, not two.
+    blank = jax.tree.map(
+        lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(once, path, still)[1]
+    )
+    blank = blank._replace(change=jnp.full_like(blank.change, jnp.inf))
+    path, out, count = lax.while_loop(more, again, (path, blank, jnp.asarray(0)))
+    x = jax.tree.map(lambda leaf: leaf[1:], path)
+    h = jnp.diff(jnp.concatenate([first.t[None], stops.t])).astype(first.root.dtype)
+    pushes = []
+    for index, root in enumerate(dynamics.white):
+        mine = slice(6 * index, 6 * index + 3)
+        size = jnp.where(h > 0, 1 / jnp.sqrt(jnp.where(h > 0, h, 1)), 0)[:, None] * root[None]
+        variance = jnp.diagonal(out.kick_covariance, axis1=1, axis2=2)[:, mine]
+        pushes.append(Push(size * out.kicks[:, mine], size * jnp.sqrt(jnp.maximum(variance, 0))))
+    return Smoothed(
+        Belief(stops.t, x, out.root[1:]),
+        here,
+        tuple(pushes),
+        out.read,
+        out.total,
+        out.change,
+        count,
+        jnp.where(jnp.isfinite(out.change), status, 2),
+        lost_at,
+    )
+
+
+def _iterate(
+    model: Model,
+    dynamics: Dynamics,
+    sensors: Sensors,
+    first: Belief,
+    stops: Stops,
+    path: Extended,
+    kicks: Array,
+) -> tuple[Extended, _Solved]:
+    """One linearisation about `path`, at the first time and each stop, and its exact solution.
+
+    Also about the `kicks` between them, in which the motion is not linear either.
+    """
+    before = jnp.concatenate([first.t[None], stops.t[:-1]])
+    dtype = first.root.dtype
+    x0, off = _at(path, 0), between(first.x, _at(path, 0))
+    start = (-off, reset(x0, off, first.root))
+
+    def forward(carry: tuple[Array, Array], now: Any) -> tuple[Any, _Kept]:
+        mean, root = carry
+        t0, stop, x, y, kick = now
+        since = (stop.t - t0).astype(dtype)
+        after, grown, noise = dynamics.predict(t0.astype(dtype), since, x, kick)
+        push = between(y, after)
+        grown, noise = reset_inverse(y, push, grown), reset_inverse(y, push, noise)
+        push = push - jnp.sum(noise[:, : dynamics.kicks] * kick[None], 1)
+        kept = linear.joint(grown, noise, root)
+        predicted = jnp.sum(grown * mean[None], 1) + push
+        found = rows(model, dynamics, sensors, stop.t.astype(dtype), y, stop.values, stop.masks)
+        later, root, read = absorb_all(found, predicted, kept.predicted)
+        return (later, root), _Kept(kept, predicted, mean, noise, read)
+
+    earlier = jax.tree.map(lambda leaf: leaf[:-1], path)
+    later = jax.tree.map(lambda leaf: leaf[1:], path)
+    end, kept = lax.scan(forward, start, (before, stops, earlier, later, kicks))
+
+    def backward(carry: tuple[Array, Array], now: _Kept) -> tuple[Any, Any]:
+        mean, root = carry
+        kicks = linear.kick(now.noise, now.joint, mean - now.before, root)
+        out = linear.backward(now.joint, now.mean, now.before, mean, root)
+        return out, (out, kicks)
+
+    _, ((means, spread), (kicks, kick_covariance)) = lax.scan(backward, end, kept, reverse=True)
+    means = jnp.concatenate([means, end[0][None]])
+    spread = jnp.concatenate([spread, end[1][None]])
+    deviation = jnp.sqrt(jnp.sum(spread**2, -1))
+    sure = deviation > 0
+    change = jnp.max(jnp.where(sure, jnp.abs(means) / jnp.where(sure, deviation, 1), 0))
+    total = jnp.sum(jnp.stack([read.log_density for read in kept.read]))
+    moved = jax.vmap(retract)(path, means)
+    return moved, _Solved(spread, kept.read, total, kicks, kick_covariance, change)
+
+
+def _at(tree: Any, index: int) -> Any:
+    return jax.tree.map(lambda leaf: leaf[index], tree)

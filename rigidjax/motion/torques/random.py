@@ -1,0 +1,97 @@
+"""Torques that nobody can write down: known by their statistics alone."""
+
+from typing import Any, ClassVar
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from rigidjax import _checks
+from rigidjax._types import HasSpin, Scalar, ScalarLike, Vec3
+from rigidjax.motion.torques.base import AbstractTorque
+
+
+class RandomTorque(AbstractTorque):
+    """White torque noise: `E[τᵢ(t) τᵢ(s)] = density δ(t − s)`, independent along the body axes.
+
+    **Arguments:** `density` N² m² s, one number or one for each body axis (3,), ≥ 0: about an axis
+    of moment I the angular momentum then strays by √(density · t) in a time t.
+
+    Its mean is zero, and that is what `simulate` and a fit of `rigidjax.identify` see. What makes
+    use of the noise is `rigidjax.estimate`: `sample` draws a motion, `filter`, `smooth` and
+    `log_likelihood` allow for it. Add it to other torques by `Sum`. Gelb, Applied Optimal
+    Estimation (1974), §3.6.
+
+    **Raises:** `ValueError` for a density below zero, NaN or a wrong shape.
+
+    >>> RandomTorque(1e-4).density
+    Array([0.0001, 0.0001, 0.0001], dtype=float64)
+    """
+
+    feels: ClassVar[type] = HasSpin
+    density: Float[Array, "3"]
+
+    def __init__(self, density: Any):
+        self.density = density_of(density)
+
+    @property
+    def steady(self) -> bool:
+        """Its mean does not depend on time."""
+        return True
+
+    def __call__(self, t: ScalarLike, state: HasSpin, body: object) -> Vec3:
+        return jnp.zeros_like(self.density)
+
+
+class CorrelatedTorque(AbstractTorque):
+    """Torque noise with a memory (Ornstein–Uhlenbeck): `T dτ/dt = −τ + white noise`.
+
+    **Arguments:** `density` N² m² s of the white noise that drives it, one number or (3,), ≥ 0;
+    `time` T, s, positive: over which the torque keeps its value. `E[τ(t) τ(s)] = density/(2T)
+    exp(−|t − s|/T)` about each body axis: for T → 0 a `RandomTorque` of the same density.
+
+    Its mean is zero, and that is what `simulate` and a fit see; see `RandomTorque`. A filter holds
+    the torque itself as part of its state. Uhlenbeck and Ornstein 1930, doi:10.1103/PhysRev.36.823.
+
+    **Raises:** `ValueError` for a density below zero, a time that is not positive, NaN or a wrong
+    shape.
+
+    >>> CorrelatedTorque(2e-4, 0.5).deviation
+    Array([0.01414214, 0.01414214, 0.01414214], dtype=float64)
+    """
+
+    feels: ClassVar[type] = HasSpin
+    density: Float[Array, "3"]
+    time: Scalar
+
+    def __init__(self, density: Any, time: Any):
+        self.density = density_of(density)
+        number = jnp.asarray(_checks.floating(time, (), "time")).astype(self.density.dtype)
+        words = "time: wanted a positive correlation time, s"
+        self.time = _checks.refuse(number, ~((number > 0) & jnp.isfinite(number)), words)
+
+    @property
+    def steady(self) -> bool:
+        """Its mean does not depend on time."""
+        return True
+
+    @property
+    def deviation(self) -> Vec3:
+        """The standard deviation (3,) of the torque at any time, N m."""
+        return jnp.sqrt(0.5 * self.density / self.time)
+
+    def __call__(self, t: ScalarLike, state: HasSpin, body: object) -> Vec3:
+        return jnp.zeros_like(self.density)
+
+
+def density_of(value: Any, name: str = "density", size: int = 3) -> Array:
+    """A spectral density (size,) of one number or as many, none below zero.
+
+    >>> density_of(2.0, size=2).tolist()
+    [2.0, 2.0]
+    """
+    density = _checks.numbers(value, name)
+    if density.shape not in ((), (size,)):
+        raise ValueError(f"{name}: wanted one number or {size}, got shape {density.shape}")
+    density = jnp.broadcast_to(density, (size,)).astype(density.dtype)
+    words = f"{name}: wanted a finite number that is not below zero"
+    return _checks.refuse(density, ~((density >= 0) & jnp.isfinite(density)).all(), words)

@@ -1,0 +1,407 @@
+"""The filter against dense linear algebra, against itself, and on what it must refuse."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+import scipy.stats
+from estimate import records
+from once import filter_once, once
+
+import rigidjax as rj
+from rigidjax import estimate, identify
+
+DT, COUNT = 0.1, 12
+
+
+def van_loan(a, b, h):
+    """exp(a h) and the covariance that white noise through b gathers in h: Van Loan 1978."""
+    n = a.shape[0]
+    big = np.block([[-a, b @ b.T], [np.zeros((n, n)), a.T]])
+    e = scipy.linalg.expm(big * h)
+    grown = e[n:, n:].T
+    return grown, grown @ e[:n, n:]
+
+
+def dense(grown, strewn, matrix, variance, cov0, mean0, readings):
+    """Means and covariances of all states given all readings, and the log-density: no recursion."""
+    n, count = len(mean0), len(readings)
+    means, blocks = [mean0], [cov0]
+    for _ in range(count - 1):
+        means.append(grown @ means[-1])
+        blocks.append(grown @ blocks[-1] @ grown.T + strewn)
+    cov = np.zeros((count * n, count * n))
+    for i in range(count):
+        for j in range(i + 1):
+            c = np.linalg.matrix_power(grown, i - j) @ blocks[j]
+            cov[i * n : i * n + n, j * n : j * n + n] = c
+            cov[j * n : j * n + n, i * n : i * n + n] = c.T
+    h = np.kron(np.eye(count), matrix)
+    mean, y = np.concatenate(means), readings.reshape(-1)
+    s = h @ cov @ h.T + np.kron(np.eye(count), np.diag(variance))
+    gain = np.linalg.solve(s, h @ cov).T
+    after = mean + gain @ (y - h @ mean)
+    spread = cov - gain @ h @ cov
+    logp = scipy.stats.multivariate_normal(h @ mean, s).logpdf(y)
+    return after.reshape(count, n), spread, logp
+
+
+def test_a_sphere_with_a_torque_that_remembers_and_a_bias_that_drifts_is_a_linear_model():
+    # Ω, τ, bias in one number about each axis, then the three axes side by side.
+    moment, density, memory, drift, noise = 2.0, 0.4, 0.8, 0.01, 0.3
+    a = np.array([[0.0, 1 / moment, 0.0], [0.0, -1 / memory, 0.0], [0.0, 0.0, 0.0]])
+    b = np.diag([0.0, np.sqrt(density) / memory, np.sqrt(drift)])
+    h = DT / 8
+    grown, strewn = van_loan(a, b, h)
+    for _ in range(3):
+        strewn = grown @ strewn @ grown.T + strewn
+        grown = grown @ grown
+    cov0 = np.diag([0.5**2, density / (2 * memory), 0.2**2])
+    rng = np.random.default_rng(0)
+    readings = rng.normal(size=(COUNT, 3))
+    matrix = np.array([[1.0, 0.0, 1.0]])
+    model = estimate.Model(
+        rj.Inertia.from_principal(moment, moment, moment),
+        rj.torques.CorrelatedTorque(density, memory),
+        walks=[estimate.Walk(lambda r: r.readings[0].sensor.bias, 0.2, drift)],
+    )
+    record = identify.Recording(
+        DT * np.arange(COUNT), (identify.Gyro(noise, bias=[0.0, 0.0, 0.0]), readings)
+    )
+    first = estimate.start(model, record, rj.Spin([0.1, 0.2, 0.3]), rate=0.5)
+    found = estimate.filter(model, record, first, substeps=8)
+    total = 0.0
+    for axis in range(3):
+        mean0 = np.array([0.1 * (axis + 1), 0.0, 0.0])
+        mean, cov, logp = dense(
+            grown, strewn, matrix, [noise**2], cov0, mean0, readings[:, axis : axis + 1]
+        )
+        total += logp
+        last = [found.states.omega[-1, axis], found.belief.torques[0][-1, axis]]
+        last.append(found.belief.walks[0][-1, axis])
+        # Two Legendre polynomials of the noise a step: (h/T)⁴/720.
+        np.testing.assert_allclose(np.array(last), mean[-1], rtol=0, atol=1e-6)
+        pick = np.ix_([axis, 3 + axis, 6 + axis], [axis, 3 + axis, 6 + axis])
+        np.testing.assert_allclose(
+            np.asarray(found.belief.covariance[-1])[pick], cov[-3:, -3:], rtol=0, atol=1e-6
+        )
+    assert abs(float(found.log_likelihood) - total) < 1e-5
+
+
+def test_a_spin_near_an_axis_is_a_linear_model():
+    # dΩ₁ = (I₂−I₃)/I₁ Ω₃ Ω₂, dΩ₂ = (I₃−I₁)/I₂ Ω₃ Ω₁, and δθ' = δΩ − Ω × δθ.
+    i1, i2, i3 = 1.0, 2.0, 2.5
+    spin, density, small = 1.3, 1e-14, 1e-6
+    a = np.zeros((4, 4))
+    a[0, 1], a[1, 0] = (i2 - i3) / i1 * spin, (i3 - i1) / i2 * spin
+    a[2, 0], a[3, 1] = 1.0, 1.0
+    a[2, 3], a[3, 2] = spin, -spin
+    b = np.zeros((4, 2))
+    b[0, 0], b[1, 1] = np.sqrt(density) / i1, np.sqrt(density) / i2
+    grown, strewn = van_loan(a, b, DT)
+    model = estimate.Model(rj.Inertia.from_principal(i1, i2, i3), rj.torques.RandomTorque(density))
+    rng = np.random.default_rng(1)
+    readings = small * rng.normal(size=(COUNT, 2))
+    # Along the axis a rate and angle that are known; across it small ones.
+    omega = np.column_stack([readings, np.full(COUNT, spin)])
+    record = identify.Recording(DT * np.arange(COUNT), (identify.Gyro([small, small, 1e3]), omega))
+    state = rj.Attitude([1.0, 0, 0, 0], [0.0, 0.0, spin])
+    first = estimate.start(
+        model, record, state, rate=[small, small, 0.0], attitude=[small, small, 0.0]
+    )
+    found = estimate.filter(model, record, first, substeps=8)
+    matrix = np.array([[1.0, 0, 0, 0], [0, 1.0, 0, 0]])
+    mean, cov, _ = dense(
+        grown, strewn, matrix, [small**2] * 2, small**2 * np.eye(4), np.zeros(4), readings
+    )
+    last = found.belief
+    np.testing.assert_allclose(last.state.omega[-1, :2] / small, mean[-1, :2] / small, atol=1e-5)
+    pick = np.ix_([3, 4, 0, 1], [3, 4, 0, 1])
+    got = np.asarray(last.covariance[-1])[pick] / small**2
+    np.testing.assert_allclose(got, cov[-4:, -4:] / small**2, atol=1e-5)
+    # The turn across the axis, seen from a body that only spun about it.
+    spun = rj.quaternion.about_axis(jnp.array([0.0, 0, 1]), spin * DT * (COUNT - 1))
+    turn = rj.quaternion.log(
+        rj.quaternion.multiply(rj.quaternion.conjugate(spun), last.state.q[-1])
+    )
+    np.testing.assert_allclose(turn[:2] / small, mean[-1, 2:] / small, atol=1e-5)
+
+
+@pytest.fixture(scope="module")
+def tumbling():
+    model, record, real = records.tumble()
+    first = estimate.start(model, record, records.START, rate=0.3, attitude=0.3)
+    return model, record, real, first, estimate.filter(model, record, first)
+
+
+def test_errors_and_innovations_are_as_large_as_the_filter_says(tumbling):
+    _, record, real, _, found = tumbling
+    error = jax.vmap(
+        lambda q, p: rj.quaternion.log(rj.quaternion.multiply(rj.quaternion.conjugate(q), p))
+    )(found.states.q, real.states.q)
+    e = np.concatenate([error, real.states.omega - found.states.omega], axis=1)
+    nees = np.einsum("ti,ti->t", e, np.linalg.solve(found.belief.covariance, e[..., None])[..., 0])
+    # Errors at neighbouring times are alike: 200 of them count as some 20.
+    assert (
+        scipy.stats.chi2.ppf(0.001, 120) / 20 < nees.mean() < scipy.stats.chi2.ppf(0.999, 120) / 20
+    )
+    for nis, size in zip(found.nis, (3, 2), strict=True):
+        count = size * len(record.t)
+        low, high = scipy.stats.chi2.ppf([0.001, 0.999], count)
+        assert low < float(nis.sum()) < high
+    assert found.words == "followed"
+
+
+def test_steps_one_by_one_are_the_filter(tumbling):
+    model, record, _, first, found = tumbling
+    belief = first
+    for k in range(3):
+        belief = estimate.step(
+            model, belief, record.t[k], *((r.sensor, r.values[k]) for r in record.readings)
+        )
+    np.testing.assert_allclose(belief.state.q, found.states.q[2], rtol=0, atol=1e-13)
+    np.testing.assert_allclose(belief.covariance, found.belief.covariance[2], rtol=0, atol=1e-13)
+
+
+@pytest.mark.slow
+def test_more_steps_between_readings_change_little(tumbling):
+    model, record, _, first, found = tumbling
+    finer = estimate.filter(model, record, first, substeps=3)
+    np.testing.assert_allclose(finer.states.q, found.states.q, atol=1e-7)
+    assert abs(float(finer.log_likelihood - found.log_likelihood)) < 1e-4
+
+
+def test_a_gap_is_followed_in_steps_that_the_rate_asks_for():
+    model, record, _ = records.tumble()
+    seen = np.ones(len(record.t), bool)
+    seen[20:90] = False
+    gapped = identify.Recording(record.t, *((r.sensor, r.values, seen) for r in record.readings))
+    assert gapped.t.shape == (130,)
+    first = estimate.start(model, record, records.START, rate=0.3, attitude=0.3)
+    found = estimate.filter(model, gapped, first)
+    # The same as steps through the times that were dropped.
+    masked = [(r.sensor, r.values, r.mask & seen) for r in record.readings]
+    belief = first
+    for k in range(0, 92):
+        belief = estimate.step(
+            model, belief, record.t[k], *((s, v[k], bool(m[k])) for s, v, m in masked)
+        )
+    np.testing.assert_allclose(found.states.q[21], belief.state.q, atol=1e-7)
+    np.testing.assert_allclose(found.belief.deviation[21], belief.deviation, rtol=1e-5)
+
+
+def test_what_a_masked_reading_holds_does_not_matter(tumbling):
+    model, record, _, first, _ = tumbling
+    seen = np.arange(len(record.t)) % 3 != 1
+    readings = [(r.sensor, np.array(r.values)) for r in record.readings]
+    other = np.where(seen[:, None], readings[0][1], np.nan)
+    runs = [
+        estimate.filter(
+            model,
+            identify.Recording(record.t, (readings[0][0], values, seen), *readings[1:]),
+            first,
+        )
+        for values in (readings[0][1], other)
+    ]
+    np.testing.assert_array_equal(runs[0].belief.root, runs[1].belief.root)
+    np.testing.assert_array_equal(runs[0].states.q, runs[1].states.q)
+
+
+def test_a_channel_at_its_full_scale_is_left_out(tumbling):
+    model, record, _, first, _ = tumbling
+    clipped = np.clip(np.asarray(record.readings[0].values), -0.9, 0.9)
+    full = np.abs(clipped) >= 0.9
+    assert 0.05 < full.mean() < 0.9
+    gyro = identify.Gyro(0.02, limit=0.9)
+    rest = [(r.sensor, r.values) for r in record.readings[1:]]
+    found = estimate.filter(model, identify.Recording(record.t, (gyro, clipped), *rest), first)
+    np.testing.assert_array_equal(found.readings[0].seen, ~full)
+    assert found.words == "followed"
+    told = identify.Recording(record.t, (identify.Gyro(1e-4), clipped), *rest)
+    with pytest.raises(ValueError, match=r"lost|broken"):
+        estimate.filter(model, told, first)
+
+
+@pytest.mark.slow
+def test_a_sensor_that_is_late_is_seen_where_it_was():
+    model = estimate.Model(records.BODY)
+    ts = 0.05 * jnp.arange(40, dtype=float)
+    late = 0.03
+    real = rj.simulate(records.BODY, records.START, jnp.concatenate([ts, ts[-1:] + 1])).ys
+    moved = jax.vmap(rj.exact.FreeBody(records.BODY, records.START))(ts - late)
+    gyro = identify.Gyro(0.01, offset=-late)
+    record = identify.Recording(ts, (gyro, moved.omega))
+    first = estimate.start(model, record, rj.Spin(records.START.omega), rate=0.0)
+    found = estimate.filter(model, record, first)
+    assert float(jnp.abs(found.readings[0].innovation).max()) < 1e-7
+    np.testing.assert_allclose(found.states.omega, real.omega[:-1], atol=1e-7)
+
+
+def likelihood(x):
+    """Of two moments and a density, on the smallest program."""
+    body = rj.Inertia.from_principal(x[0], x[1], 2.5)
+    model = estimate.Model(body, rj.torques.RandomTorque(jnp.exp(x[2])))
+    short = records.spinning()
+    first = estimate.start(model, short, rj.Spin(records.START.omega), rate=0.3)
+    return estimate.log_likelihood(model, short, first, substeps=1)
+
+
+AT = jnp.array([1.0, 2.0, np.log(1e-2)])
+
+
+def test_derivatives_of_the_likelihood_are_right():
+    records.spinning()  # made outside of the trace, and kept
+    step = 1e-5
+    run = filter_once(likelihood)
+    wanted = [(run(AT.at[i].add(step)) - run(AT.at[i].add(-step))) / (2 * step) for i in range(3)]
+    np.testing.assert_allclose(once(jax.jacfwd(likelihood))(AT), wanted, rtol=1e-6, atol=1e-7)
+
+
+@pytest.mark.slow
+def test_forward_and_reverse_mode_agree_to_second_order():
+    records.spinning()
+    forward = once(jax.jacfwd(likelihood))(AT)
+    np.testing.assert_allclose(once(jax.grad(likelihood))(AT), forward, rtol=1e-9)
+    hessians = [
+        once(jax.jacfwd(jax.jacfwd(likelihood)))(AT),
+        once(jax.jacfwd(jax.grad(likelihood)))(AT),
+    ]
+    np.testing.assert_allclose(hessians[1], hessians[0], rtol=1e-8, atol=1e-8)
+
+
+@pytest.mark.parametrize("density", [0.0, 1e-24])
+def test_without_noise_it_is_the_likelihood_of_the_fit(density):
+    short = records.spinning()
+    state0 = rj.Spin(records.START.omega + 0.01)
+    turned = jax.vmap(rj.exact.FreeBody(records.BODY, state0))(short.t - short.t[0])
+    wanted = scipy.stats.norm.logpdf(short.readings[0].values - turned.omega, scale=0.02).sum()
+    model = estimate.Model(records.BODY, rj.torques.RandomTorque(density))
+    first = estimate.start(model, short, state0, rate=0.0)
+    got = estimate.log_likelihood(model, short, first, substeps=8)
+    assert abs(float(got) / wanted - 1) < 1e-9
+
+
+@pytest.mark.slow
+def test_covariances_stay_positive_in_single_precision(tumbling):
+    _, record, _, _, found = tumbling
+    model = estimate.Model(records.BODY, rj.torques.RandomTorque(1e-4))
+    start = rj.Attitude(
+        jnp.array([1.0, 0, 0, 0], jnp.float32), jnp.asarray(records.START.omega, jnp.float32)
+    )
+    first = estimate.start(model, record, start, rate=0.3, attitude=0.3)
+    single = estimate.filter(model, record, first)
+    assert single.belief.root.dtype == jnp.float32
+    np.testing.assert_allclose(single.states.q, found.states.q, atol=2e-5)
+    np.testing.assert_allclose(single.belief.deviation, found.belief.deviation, rtol=2e-4)
+
+
+@pytest.mark.slow
+def test_a_batch_of_records_is_each_of_them():
+    made = [records.tumble(count=20, seed=seed) for seed in (0, 1)]
+    model = made[0][0]
+    first = estimate.start(model, made[0][1], records.START, rate=0.3, attitude=0.3)
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(record for _, record, _ in made))
+    both = jax.vmap(lambda r: estimate.log_likelihood(model, r, first, substeps=1))(stacked)
+    each = [estimate.log_likelihood(model, record, first, substeps=1) for _, record, _ in made]
+    np.testing.assert_allclose(both, jnp.stack(each), rtol=1e-12)
+
+
+@pytest.mark.slow
+def test_a_million_steps_in_single_precision_leave_a_positive_covariance():
+    count = 1_000_000
+    ts = np.arange(count) * 1e-3
+    key = jax.random.key(0)
+    omega = jnp.tile(jnp.array([0.0, 0.0, 1.0]), (count, 1)) + 0.01 * jax.random.normal(
+        key, (count, 3)
+    )
+    model = estimate.Model(records.BODY, rj.torques.RandomTorque(1e-8))
+    record = identify.Recording(ts, (identify.Gyro(0.01), omega))
+    start = rj.Attitude(jnp.array([1.0, 0, 0, 0], jnp.float32), jnp.array([0.0, 0, 1], jnp.float32))
+    first = estimate.start(model, record, start, rate=1.0, attitude=1e-3)
+    found = estimate.filter(model, record, first)
+    cov = np.asarray(found.belief.root[-1], float)
+    values = np.linalg.eigvalsh(cov @ cov.T)
+    assert values.min() > 0 and found.words == "followed"
+    exact = rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 1])
+    double = estimate.filter(
+        model, record, estimate.start(model, record, exact, rate=1.0, attitude=1e-3)
+    )
+    np.testing.assert_allclose(
+        found.belief.deviation[-1, 3:], double.belief.deviation[-1, 3:], rtol=1e-2
+    )
+
+
+class TestBadInput:
+    record = identify.Recording([0.0, 0.1], (identify.Gyro(0.1), [[1.0, 0, 0]] * 2))
+    model = estimate.Model(records.BODY)
+
+    def start(self):
+        return estimate.start(self.model, self.record, rate=0.1)
+
+    def test_densities(self):
+        with pytest.raises(ValueError, match="density: wanted a finite number that is not below"):
+            rj.torques.RandomTorque(-1.0)
+        with pytest.raises(ValueError, match="density: wanted one number or 3"):
+            rj.torques.RandomTorque([1.0, 2.0])
+        with pytest.raises(ValueError, match="time: wanted a positive correlation time"):
+            rj.torques.CorrelatedTorque(1.0, 0.0)
+        with pytest.raises(ValueError, match="density: wanted a finite"):
+            estimate.Walk(lambda r: r.readings[0].sensor.bias, 1.0, -1.0)
+
+    def test_readings_out_of_order(self):
+        with pytest.raises(ValueError, match="out of order"):
+            estimate.filter(
+                self.model, self.record, eqx.tree_at(lambda b: b.t, self.start(), jnp.array(1.0))
+            )
+        later = eqx.tree_at(lambda b: b.t, self.start(), jnp.array(1.0))
+        with pytest.raises(ValueError, match="out of order"):
+            estimate.step(self.model, later, 0.5, (identify.Gyro(0.1), jnp.zeros(3)))
+
+    def test_a_sensor_without_noise(self):
+        record = identify.Recording([0.0, 0.1], (identify.Gyro(), [[1.0, 0, 0]] * 2))
+        with pytest.raises(ValueError, match=r"wanted its noise.*Gyro\(noise="):
+            estimate.filter(self.model, record, self.start())
+
+    def test_nan(self):
+        with pytest.raises(ValueError, match=r"contains NaN; give .* if it is a gap"):
+            estimate.step(self.model, self.start(), 0.1, (identify.Gyro(0.1), jnp.full(3, jnp.nan)))
+
+    def test_a_walk_that_finds_nothing(self):
+        model = estimate.Model(
+            records.BODY, walks=[estimate.Walk(lambda r: r.readings[0].sensor.bias, 1.0)]
+        )
+        with pytest.raises(ValueError, match="None is there; give the sensor a starting value"):
+            estimate.start(model, self.record, rate=0.1)
+        model = estimate.Model(
+            records.BODY, walks=[estimate.Walk(lambda r: r.readings[3].sensor, 1.0)]
+        )
+        with pytest.raises(ValueError, match="nothing is there"):
+            estimate.start(model, self.record, rate=0.1)
+
+    def test_a_start_without_a_deviation(self):
+        with pytest.raises(ValueError, match="attitude: wanted the standard deviation"):
+            estimate.start(self.model, self.record, records.START, rate=0.1)
+        with pytest.raises(ValueError, match="rate: wanted a finite"):
+            estimate.start(self.model, self.record, rate=-1.0)
+
+    def test_a_state_that_the_sensor_cannot_see(self):
+        record = identify.Recording(
+            [0.0, 0.1], (identify.Direction([0.0, 0, 1], 0.1), [[0.0, 0, 1]] * 2)
+        )
+        with pytest.raises(TypeError, match="needs a state with HasAttitude"):
+            estimate.filter(self.model, record, self.start())
+
+    def test_a_lost_filter(self):
+        t = np.arange(0, 3, 0.1)
+        omega = np.tile([0.0, 0.0, 1.0], (t.size, 1))
+        omega[t > 1] = [0.0, 0.0, -1.0]
+        record = identify.Recording(t, (identify.Gyro(0.01), omega))
+        model = estimate.Model(records.BODY, rj.torques.RandomTorque(1e-12))
+        first = estimate.start(model, record, rate=0.1)
+        with pytest.raises(ValueError, match=r"lost: for more than a second.*at 2 s"):
+            estimate.filter(model, record, first)
+        found = estimate.filter(model, record, first, throw=False)
+        assert int(found.status) == 1 and "lost" in found.words
+        assert abs(float(found.lost_at) - 2.0) < 1e-9

@@ -1,0 +1,177 @@
+"""The posterior density, its transforms and its draws."""
+
+import functools
+import importlib.util
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.stats
+from estimate import records
+
+import rigidjax as rj
+from rigidjax import estimate, identify
+
+
+@functools.cache
+def problem():
+    ts = jnp.linspace(0.0, 6.0, 60)
+    real = jax.vmap(rj.exact.FreeBody(records.BODY, rj.Spin(records.START.omega)))(ts)
+    omega = records.gyro(jax.random.key(3), real.omega, 0.02)
+    record = identify.Recording(ts, (identify.Gyro(0.02), omega))
+    return identify.Problem(record, identify.PrincipalRatios())
+
+
+@pytest.fixture(scope="module")
+def fitted():
+    """A fit as it might be, for a fit compiles long: the truth, and some covariance."""
+    at = problem().start(records.BODY)
+    spin = records.START.omega[None] / problem().typical_rate
+    at = eqx.tree_at(lambda p: p.own.spin, at, spin)
+    root = np.tril(np.random.default_rng(0).normal(size=(5, 5)))
+    covariance = 1e-4 * (jnp.eye(5) + root @ root.T)
+    nothing = jnp.zeros((0, 5))
+    return identify.Fit(
+        problem(), at, covariance, covariance, "", (jnp.full((1, 3), 0.02),), (), 0.0, 1, 1.0, 1.0,
+        jnp.ones(5), nothing, (), "ok",
+    )  # fmt: skip
+
+
+@functools.cache
+def whole_fit():
+    return identify.fit(problem(), starts=1)
+
+
+def test_without_a_process_it_is_normal_about_the_motion(fitted):
+    density = estimate.LogDensity(fitted)
+    assert density.size == 5
+    x = density.x0 + 0.01
+    errors = fitted.problem.errors(density.unpack(x).parameters)
+    wanted = sum(scipy.stats.norm.logpdf(e, scale=0.02).sum() for e in errors)
+    assert abs(float(density(x)) / wanted - 1) < 1e-12
+    np.testing.assert_allclose(density.covariance, fitted.covariance)
+    np.testing.assert_allclose(density.unpack(density.x0).body.tensor, fitted.body.tensor)
+
+
+@pytest.mark.slow
+def test_a_process_of_no_density_changes_nothing(fitted):
+    plain = estimate.LogDensity(fitted)
+    with_one = estimate.LogDensity(fitted, rj.torques.RandomTorque(0.0), deviation=None)
+    x = plain.x0 + 0.01
+    # Equal steps of the classical method against the closed form.
+    assert abs(float(with_one(x) / plain(x)) - 1) < 1e-6
+    step = 1e-6
+    slope = jax.grad(with_one)(x)
+    up, down = (with_one(x.at[0].add(sign * step)) for sign in (1, -1))
+    np.testing.assert_allclose(slope[0], (up - down) / (2 * step), rtol=1e-4)
+
+
+def test_a_density_that_is_unknown_is_one_number_more(fitted):
+    density = estimate.LogDensity(fitted, rj.torques.RandomTorque(1e-4), deviation=2.0)
+    assert density.size == 6
+    x = density.x0.at[-1].set(jnp.log(3.0))
+    np.testing.assert_allclose(density.unpack(x).process.density, 3e-4)
+    known = estimate.LogDensity(fitted, rj.torques.RandomTorque(3e-4), deviation=None)
+    prior = -0.5 * (np.log(3.0) / 2.0) ** 2
+    np.testing.assert_allclose(density(x), known(x[:-1]) + prior, rtol=1e-12)
+
+
+def test_any_sampler_will_do(fitted):
+    def laplace(key, density, start):
+        """Independent draws of the normal distribution that the numbers are scaled to."""
+        assert np.isfinite(jax.eval_shape(density, start).size)
+        return jax.random.normal(key, (500, start.size))
+
+    density = estimate.LogDensity(fitted)
+    drawn = estimate.posterior(density, jax.random.key(0), sampler=laplace)
+    assert drawn.x.shape == (4, 500, 5)
+    np.testing.assert_allclose(drawn.x.mean((0, 1)), density.x0, atol=5e-3)
+    spread = np.cov(np.asarray(drawn.x).reshape(-1, 5).T)
+    np.testing.assert_allclose(np.diagonal(spread), np.diagonal(fitted.covariance), rtol=0.2)
+    # Independent draws are worth about what they are.
+    assert (drawn.rhat < 1.01).all() and (np.abs(drawn.ess / 2000 - 1) < 0.3).all()
+    assert drawn.points.body.tensor.shape == (4, 500, 3, 3)
+
+
+def test_draws_that_depend_on_the_last_are_worth_less(fitted):
+    rho = 0.8
+
+    def slow(key, density, start):
+        def step(z, key):
+            z = rho * z + np.sqrt(1 - rho**2) * jax.random.normal(key, z.shape)
+            return z, z
+
+        return jax.lax.scan(step, start, jax.random.split(key, 4000))[1]
+
+    drawn = estimate.posterior(estimate.LogDensity(fitted), jax.random.key(1), sampler=slow)
+    wanted = 16000 * (1 - rho) / (1 + rho)
+    assert (np.abs(drawn.ess / wanted - 1) < 0.3).all()
+
+
+@pytest.mark.usefixtures("unhooked")
+def test_what_is_refused(fitted):
+    with pytest.raises(TypeError, match="density: wanted LogDensity"):
+        estimate.posterior(fitted, jax.random.key(0))
+    with pytest.raises(TypeError, match="process: wanted RandomTorque or CorrelatedTorque"):
+        estimate.LogDensity(fitted, records.BODY)
+    if importlib.util.find_spec("blackjax") is None:
+        with pytest.raises(ImportError, match="blackjax is missing"):
+            estimate.posterior(estimate.LogDensity(fitted), jax.random.key(0))
+
+
+@pytest.mark.slow
+def test_a_fit_of_what_is_well_determined_is_found_again():
+    fitted = whole_fit()
+    found = estimate.refit(estimate.LogDensity(fitted))
+    assert found.converged
+    deviation = np.sqrt(np.diagonal(fitted.covariance))
+    np.testing.assert_allclose(found.x, found.density.x0, atol=1e-2 * deviation.min())
+    np.testing.assert_allclose(np.sqrt(np.diagonal(found.covariance)), deviation, rtol=0.05)
+    low, high = found.interval_of(shape)
+    wanted = np.log([fitted.interval()[name] for name in ("Ix/Iz", "Iy/Iz")]).T
+    # The fit's reach is Student's.
+    np.testing.assert_allclose([low, high], wanted, atol=0.1 * (high - low).max())
+
+
+def shape(point):
+    """Logarithms of the two ratios of moments."""
+    i = jnp.diagonal(point.body.tensor)
+    return jnp.log(jnp.stack([i[0] / i[2], i[1] / i[2]]))
+
+
+@pytest.mark.slow
+def test_a_torque_that_the_fit_knows_nothing_of():
+    # Nine tenths of the misfit is the torque's: the plain fit is refused, this one holds the truth.
+    model = estimate.Model(records.BODY, rj.torques.RandomTorque(1e-3))
+    ts = jnp.linspace(0.0, 4.0, 80)
+    made = []
+    for k in range(3):
+        keys = jax.random.split(jax.random.key(k), 2)
+        spin = rj.Spin(records.START.omega + 0.3 * k)
+        real = records.truth(keys[0], model, spin, ts, 2)
+        omega = records.gyro(keys[1], real.states.omega, 0.02)
+        made.append(identify.Recording(ts, (identify.Gyro(0.02), omega)))
+    plain = identify.fit(identify.Problem(made, identify.PrincipalRatios()), starts=2)
+    assert not plain.ok
+    found = estimate.refit(estimate.LogDensity(plain, rj.torques.RandomTorque(1e-4)))
+    assert found.converged
+
+    low, high = found.interval_of(shape, 0.999)
+    wanted = np.log([1 / 2.5, 2 / 2.5])
+    assert (low < wanted).all() and (wanted < high).all()
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+def test_nuts_agrees_with_the_fit_where_it_is_well_determined():
+    fitted = whole_fit()
+    pytest.importorskip("blackjax")
+    density = estimate.LogDensity(fitted)
+    drawn = estimate.posterior(density, jax.random.key(0), sampler=estimate.Nuts(500, 300))
+    assert (drawn.rhat < 1.01).all() and (drawn.ess > 500).all()
+    x = np.asarray(drawn.x).reshape(-1, density.size)
+    deviation = np.sqrt(np.diagonal(fitted.covariance))
+    np.testing.assert_allclose(x.mean(axis=0), density.x0, atol=0.3 * deviation.max())
+    np.testing.assert_allclose(x.std(axis=0), deviation, rtol=0.15)
