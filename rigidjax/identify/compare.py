@@ -1,5 +1,6 @@
 """Which model do the data ask for: information criteria, and prediction of what was left out."""
 
+import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -112,7 +113,19 @@ def _with_shared(problem: Problem, found: Fit) -> Problem:
     here = problem.start()
     here = eqx.tree_at(lambda p: p.shared, here, found.parameters.shared)
     records = problem.scenes(here)
-    own = tuple(slot for slot in problem.slots if slot.each)
+    own = []
+    for slot in problem.slots:
+        if slot.each:
+            own.append(slot)
+        elif slot.spread is not None:
+            own.append(
+                eqx.tree_at(
+                    lambda s: (s.prior, s.spread),
+                    dataclasses.replace(slot, each=True),
+                    (slot.spread, None),
+                    is_leaf=lambda node: node is None,
+                )
+            )
     return eqx.tree_at(
-        lambda p: (p.body, p.records, p.slots), problem, (Known(found.body), records, own)
+        lambda p: (p.body, p.records, p.slots), problem, (Known(found.body), records, tuple(own))
     )

@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from rigidjax import _checks
-from rigidjax.identify.problem import Parameters, Problem
+from rigidjax.identify.parameters import Parameters
+from rigidjax.identify.problem import Problem
 from rigidjax.identify.residual import Noise, residuals
 from rigidjax.identify.search import half_sum
 
@@ -129,11 +130,11 @@ def only(problem: Problem, rows: Array) -> Problem:
 
     For misfits alone: its `recordings` are not cut to their own lengths.
     """
-    return eqx.tree_at(
-        lambda p: (p.records, p.reference),
-        problem,
-        (_rows(problem.records, rows), _rows(problem.reference, rows)),
-    )
+    def parts(p: Problem) -> Any:
+        return p.records, p.reference, p.which, [slot.groups for slot in p.slots]
+
+    some = tuple(_rows(part, rows) for part in parts(problem))
+    return eqx.tree_at(parts, problem, some, is_leaf=lambda node: node is None)
 
 
 def _rows(tree: Any, rows: Array) -> Any:

@@ -12,13 +12,14 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from rigidjax import _checks
-from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.identify import reported, uncertainty, words
 from rigidjax.identify.checkpoint import Checkpoint, Position, Tried, require_folder
 from rigidjax.identify.descent import Descent, descend
+from rigidjax.identify.jacobian import all_errors
+from rigidjax.identify.parameters import Parameters
 from rigidjax.identify.pieces import WIDTHS, joined, pieces as in_pieces, with_width
-from rigidjax.identify.problem import Parameters, Problem, all_errors, fits
-from rigidjax.identify.propagate import Adaptive, FixedSteps
+from rigidjax.identify.problem import Problem, fits
+from rigidjax.identify.propagate import AbstractIntegrator, Adaptive, FixedSteps
 from rigidjax.identify.residual import Noise
 from rigidjax.identify.search import (
     CAREFUL,
@@ -28,9 +29,12 @@ from rigidjax.identify.search import (
     fresh,
     least_squares,
     settle,
-    solver_for,
 )
 from rigidjax.identify.start import starting_points
+
+
+# More equal steps than this between two samples cost more than steps chosen as they are needed.
+FINEST = 32
 
 
 class Start(eqx.Module):
@@ -77,8 +81,8 @@ class Fit(eqx.Module):
         return self.status == "ok"
 
     @property
-    def body(self) -> Inertia | MassProperties:
-        """The body; up to scale where the chart has none."""
+    def body(self) -> Any:
+        """The body, up to scale where the chart has none; of several bodies a dict of them by name."""
         return self.problem.unpack(self.parameters)[0]
 
     @property
@@ -196,7 +200,7 @@ def fit(
     when that is not to be trusted: not converged, or far above the noise. Interrupting (Ctrl-C)
     ends the search and keeps what was found.
 
-    Levenberg–Marquardt of optimistix, Jacobians by forward mode through the motion.
+    Levenberg–Marquardt on normal equations, Jacobians by forward mode through the motion.
 
     **Raises:** `TypeError` for what is no `Problem`, `ValueError` for fewer than one start, a
     checkpoint that is damaged or of another problem, or one in a folder that does not exist.
@@ -224,13 +228,13 @@ def fit(
     if checkpoint is not None:
         require_folder(checkpoint)
     points = starting_points(problem, starts, jax.random.key(0) if key is None else key)
-    noise, solver = _first_noise(problem), solver_for(tolerance)
+    noise = _first_noise(problem)
     if descent is not None and not isinstance(descent, Descent):
         raise TypeError(
             f"fit: wanted a Descent(optimiser, …) or None, got {type(descent).__name__}"
         )
     if pieces > 1:
-        points = [_from_pieces(problem, pieces, solver, max_steps), *points][:starts]
+        points = [_from_pieces(problem, pieces, tolerance, max_steps), *points][:starts]
     if initial is not None:
         points = [initial, *points][:starts]
     if descent is not None:
@@ -240,25 +244,25 @@ def fit(
             for point, own in zip(points, keys, strict=True)
         ]
     if together > 1:
-        tried = _together(points, problem, noise, solver, max_steps, together, progress)
+        tried = _together(points, problem, noise, tolerance, max_steps, together, progress)
     else:
-        tried = _one_by_one(points, problem, noise, solver, max_steps, checkpoint, progress)
+        tried = _one_by_one(points, problem, noise, tolerance, max_steps, checkpoint, progress)
     best = min(
         tried, key=lambda item: float(item.cost) if np.isfinite(float(item.cost)) else np.inf
     )
     lowest = float(best.cost)
-    best, noise = _with_noise(problem, best, noise, solver, max_steps)
-    if _too_coarse(problem, best.parameters, noise):
-        problem = eqx.tree_at(lambda p: p.integrator, problem, Adaptive())
+    best, noise = _with_noise(problem, best, noise, tolerance, max_steps)
+    while (finer := _finer(problem, best.parameters, noise)) is not None:
+        problem = eqx.tree_at(lambda p: p.integrator, problem, finer)
         whole = jnp.ones_like(problem.records.t)
         near = fresh(best.parameters)
-        best = settle(near, problem, noise, whole, solver, max_steps, near=True)
-        best, noise = _with_noise(problem, best, noise, solver, max_steps)
+        best = settle(near, problem, noise, whole, tolerance, max_steps, near=True)
+        best, noise = _with_noise(problem, best, noise, tolerance, max_steps)
     return _assess(problem, best.parameters, bool(best.converged), noise, tried, lowest)
 
 
 def _with_noise(
-    problem: Problem, best: Tried, noise: Noise, solver: Any, max_steps: int
+    problem: Problem, best: Tried, noise: Noise, tolerance: float, max_steps: int
 ) -> tuple[Tried, Noise]:
     """The best point and the noise that belong together, where some noise is to be estimated."""
     if all(sensor.noise is not None for sensor in problem.records.sensors):
@@ -272,17 +276,17 @@ def _with_noise(
     # Twice: the weights of the channels and the robust loss both depend on the noise.
     for _ in range(2):
         noise, near = estimated(noise), fresh(best.parameters)
-        best = settle(near, problem, noise, whole, solver, max_steps, near=True)
+        best = settle(near, problem, noise, whole, tolerance, max_steps, near=True)
     return best, estimated(noise)
 
 
-def _from_pieces(problem: Problem, count: int, solver: Any, max_steps: int) -> Parameters:
+def _from_pieces(problem: Problem, count: int, tolerance: float, max_steps: int) -> Parameters:
     cut = in_pieces(problem, count)
     noise, whole = _first_noise(cut), jnp.ones_like(cut.records.t)
     point = starting_points(cut, 1, jax.random.key(0))[0]
     for width in WIDTHS:
         narrowed = with_width(cut, width)
-        point = least_squares(point, narrowed, noise, whole, solver, max_steps, CAREFUL).parameters
+        point = least_squares(point, narrowed, noise, whole, tolerance, max_steps, CAREFUL).parameters
     return joined(problem, cut, point)
 
 
@@ -290,7 +294,7 @@ def _one_by_one(
     points: list[Parameters],
     problem: Problem,
     noise: Noise,
-    solver: Any,
+    tolerance: float,
     max_steps: int,
     checkpoint: str | Path | None,
     progress: Callable[[str], Any] | None,
@@ -315,7 +319,7 @@ def _one_by_one(
                 keep.save(tried, position)
 
             start = keep.position if resumed else Position(0, 0, fresh(point))
-            out = climb(start, problem, noise, solver, max_steps, look=look)
+            out = climb(start, problem, noise, tolerance, max_steps, look=look)
             latest = [like]
             tried.append(out)
             keep.save(tried, Position(0, 0, like))
@@ -332,7 +336,7 @@ def _together(
     points: list[Parameters],
     problem: Problem,
     noise: Noise,
-    solver: Any,
+    tolerance: float,
     max_steps: int,
     together: int,
     progress: Callable[[str], Any] | None,
@@ -342,7 +346,7 @@ def _together(
         for first in range(0, len(points), together):
             batch = points[first : first + together]
             stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *batch)
-            tried += climb_together(stacked, problem, noise, solver, max_steps)
+            tried += climb_together(stacked, problem, noise, tolerance, max_steps)
             _say(progress, len(tried), len(points), tried)
     except KeyboardInterrupt:
         if not tried:
@@ -362,17 +366,30 @@ def _errors_alone(parameters: Parameters, problem: Problem) -> tuple[Float[Array
     return all_errors(parameters, problem)[0]
 
 
-def _too_coarse(problem: Problem, parameters: Parameters, noise: Noise) -> bool:
-    """Whether adaptive steps predict otherwise than fixed ones, by a twentieth of the noise."""
-    if not isinstance(problem.integrator, FixedSteps):
-        return False
-    finer = eqx.tree_at(lambda p: p.integrator, problem, Adaptive())
-    coarse, exact = (_errors_alone(parameters, p) for p in (problem, finer))
-    apart = max(
-        float(jnp.max(jnp.abs(a - b) / sigma[:, None]))
-        for a, b, sigma in zip(coarse, exact, noise, strict=True)
-    )
-    return apart > 0.05
+def _finer(
+    problem: Problem, parameters: Parameters, noise: Noise
+) -> AbstractIntegrator | None:
+    """Where twice as many fixed steps predict otherwise, by a twentieth of the noise: those that
+    do not, or adaptive ones; else `None`.
+    """
+    steps = problem.integrator
+    if not isinstance(steps, FixedSteps):
+        return None
+    count = steps.substeps
+    coarse = _errors_alone(parameters, problem)
+    while count <= FINEST:
+        finer: AbstractIntegrator = FixedSteps(2 * count)
+        exact = _errors_alone(
+            parameters, eqx.tree_at(lambda p: p.integrator, problem, finer)
+        )
+        apart = max(
+            float(jnp.max(jnp.abs(a - b) / sigma[:, None]))
+            for a, b, sigma in zip(coarse, exact, noise, strict=True)
+        )
+        if apart <= 0.05:
+            return None if count == steps.substeps else FixedSteps(count)
+        count, coarse = 2 * count, exact
+    return Adaptive()
 
 
 def _first_noise(problem: Problem) -> Noise:

@@ -10,7 +10,7 @@ from jaxtyping import Array
 
 from rigidjax.identify import reported
 from rigidjax.identify.fit import Fit, one_fit
-from rigidjax.identify.problem import Parameters
+from rigidjax.identify.parameters import Parameters
 from rigidjax.identify.residual import residuals
 from rigidjax.identify.search import cost_of, misfit, solver_for
 

@@ -10,10 +10,12 @@ from jaxtyping import PRNGKeyArray
 
 from rigidjax._types import HasSpin
 from rigidjax.body.inertia import Inertia
-from rigidjax.identify.problem import Parameters, Problem
+from rigidjax.identify.parameters import Parameters
+from rigidjax.identify.problem import Problem
 from rigidjax.identify.recording import Recording
 from rigidjax.identify.reference import first_rate
 from rigidjax.identify.sensors import Gyro
+from rigidjax.identify.several import Bodies
 from rigidjax.identify.sightings import rates
 from rigidjax.motion import Spin
 from rigidjax.motion.torques import Torque, evaluate
@@ -32,8 +34,16 @@ def starting_points(problem: Problem, count: int, key: PRNGKeyArray) -> list[Par
     shape over the whole chart and the rate by a tenth. What a `Free` moves starts as it is given.
     """
     recordings = problem.recordings
-    regressed = regress_inertia(recordings)
-    start = problem.start(regressed)
+    if isinstance(problem.body, Bodies):
+        found = {}
+        for name in problem.body.names:
+            mine = [r for r, of in zip(recordings, problem.of, strict=True) if of == name]
+            found[name] = regress_inertia(tuple(mine))
+        known = {name: body for name, body in found.items() if body is not None}
+        regressed, start = known or None, problem.start(known)
+    else:
+        regressed = regress_inertia(recordings)
+        start = problem.start(regressed)
     rates = np.stack([first_rate(recording) for recording in recordings])
     rates = rates / np.asarray(problem.reference.rate)[:, None]
     centre = np.asarray(start.body)

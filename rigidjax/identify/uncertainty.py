@@ -9,8 +9,10 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from rigidjax.identify.problem import Parameters, Problem, along
-from rigidjax.identify.residual import Noise, beside, weights_of, whitened
+from rigidjax.identify.levenberg_marquardt import beside_rows
+from rigidjax.identify.parameters import Parameters, places
+from rigidjax.identify.problem import Problem
+from rigidjax.identify.residual import Noise, weights_of, whitened
 from rigidjax.identify.search import evaluate
 
 # A direction whose singular value is below this share of the largest is not seen at all.
@@ -22,59 +24,79 @@ WEAKEST = 1e-6
 class Linearised(eqx.Module):
     """A problem about its best point: whitened errors, their derivatives, their weights.
 
-    **Fields:** for each sensor `errors` (R, T, k), `slopes` (R, T, k, n), `weights` (R, T); `extra`
-    (m,) and `extra_slopes` (m, n) of priors and joints.
+    **Fields:** for each sensor `errors` (R, T, k), `slopes` (R, T, k, m) in the m numbers that a
+    recording depends on, `weights` (R, T); `places` (R, m) where these are among the n free
+    numbers, n for none; `extra` (j,) and `extra_slopes` (j, n) of priors and joints.
     """
 
     errors: tuple[np.ndarray, ...]
     slopes: tuple[np.ndarray, ...]
     weights: tuple[np.ndarray, ...]
+    places: np.ndarray
     extra: np.ndarray
     extra_slopes: np.ndarray
 
     @property
+    def size(self) -> int:
+        """How many numbers are free."""
+        return int(self.extra_slopes.shape[-1])
+
+    @property
     def rows(self) -> np.ndarray:
-        """The Jacobian (N, n), each row times the root of its weight."""
-        n = self.extra_slopes.shape[-1]
-        parts = [
-            (slope * np.sqrt(weight)[..., None, None]).reshape(-1, n)
-            for slope, weight in zip(self.slopes, self.weights, strict=True)
-        ]
-        return np.concatenate([*parts, self.extra_slopes])
+        """Rows (N, n) whose Gram matrix is that of the Jacobian, each row weighted.
+
+        Those of a recording are brought to a triangle: as many as the numbers it depends on.
+        """
+        out = []
+        for record, where in enumerate(self.places):
+            parts = [
+                (slope[record] * np.sqrt(weight[record])[..., None, None]).reshape(
+                    -1, slope.shape[-1]
+                )
+                for slope, weight in zip(self.slopes, self.weights, strict=True)
+            ]
+            dense = np.concatenate(parts)
+            if not np.isfinite(dense).all():
+                return np.full((1, self.size), np.nan)
+            out.append(self.spread(np.linalg.qr(dense, mode="r"), where))
+        return np.concatenate([*out, self.extra_slopes])
+
+    def spread(self, block: np.ndarray, where: np.ndarray) -> np.ndarray:
+        """A recording's columns (…, m) as columns of all numbers (…, n)."""
+        wide = np.zeros((*block.shape[:-1], self.size + 1))
+        np.add.at(wide, (..., where), block)
+        return wide[..., :-1]
+
+    def gathered(self, squares: np.ndarray) -> np.ndarray:
+        """Matrices (R, m, m) of the recordings, added up as one (n, n)."""
+        total = np.zeros((self.size + 1, self.size + 1))
+        np.add.at(total, (self.places[:, :, None], self.places[:, None, :]), squares)
+        return total[:-1, :-1]
 
     @property
     def scores(self) -> np.ndarray:
-        """What each time adds to the gradient of the misfit, (R, T, n)."""
-        parts = [
-            np.einsum("rtk,rtkn,rt->rtn", error, slope, weight)
+        """What each recording adds to the gradient of the misfit, (R, n)."""
+        total: Any = sum(
+            np.einsum("rtk,rtkm,rt->rm", error, slope, weight)
             for error, slope, weight in zip(self.errors, self.slopes, self.weights, strict=True)
-        ]
-        return np.sum(parts, axis=0)
+        )
+        rows = [self.spread(mine, where) for mine, where in zip(total, self.places, strict=True)]
+        return np.stack(rows)
 
 
 @eqx.filter_jit
 def _linearised(problem: Problem, parameters: Parameters, noise: Noise, found: Any) -> Any:
-    (errors, ends), blocks = found
+    (errors, ends), (blocks, end_blocks) = found
+
+    def of(errors: tuple) -> tuple[Array, ...]:
+        return whitened(problem, errors, noise)
+
+    out, push = jax.linearize(of, errors)
+    slopes = jax.vmap(push, in_axes=-1, out_axes=-1)(blocks)
     flat, restore = ravel_pytree(parameters)
-
-    @jax.custom_jvp
-    def all_errors(here: Parameters) -> Any:
-        return errors, ends
-
-    @all_errors.defjvp
-    def _(primals: Any, tangents: Any) -> Any:
-        return (errors, ends), along(problem, blocks, tangents[0])
-
-    def value(vector: Array) -> Any:
-        here = restore(vector)
-        errors, ends = all_errors(here)
-        extra = [leaf.reshape(-1) for leaf in beside(here, problem, ends)]
-        joined = jnp.concatenate(extra) if extra else jnp.zeros(0, vector.dtype)
-        out = (whitened(problem, errors, noise), joined)
-        return out, (out, weights_of(problem, errors, noise))
-
-    slopes, (out, weights) = jax.jacfwd(value, has_aux=True)(flat)
-    return out, slopes, weights
+    extra, extra_slopes = beside_rows(problem, flat, restore, ends, end_blocks)
+    weights = weights_of(problem, errors, noise)
+    return (out, slopes, weights), places(problem, parameters), extra, extra_slopes
 
 
 def errors_at(parameters: Parameters, problem: Problem) -> tuple[Float[Array, "..."], ...]:
@@ -85,10 +107,10 @@ def errors_at(parameters: Parameters, problem: Problem) -> tuple[Float[Array, ".
 def linearise(problem: Problem, parameters: Parameters, noise: Noise) -> Linearised:
     """Errors, derivatives and weights at these parameters, as NumPy arrays."""
     found = evaluate(parameters, problem)
-    (errors, extra), (slopes, extra_slopes), weights = jax.tree.map(
+    (errors, slopes, weights), where, extra, extra_slopes = jax.tree.map(
         np.asarray, _linearised(problem, parameters, noise, found)
     )
-    return Linearised(errors, slopes, weights, extra, extra_slopes)
+    return Linearised(errors, slopes, weights, where, extra, extra_slopes)
 
 
 class Spread(eqx.Module):
@@ -149,7 +171,7 @@ def spread(linear: Linearised, times: "Times") -> Spread:
 
 def _sandwich(linear: Linearised, bread: np.ndarray, times: "Times") -> np.ndarray:
     n = bread.shape[0]
-    meat = np.zeros((n, n))
+    meat: Any = 0.0
     for error, slope, weight, spans in zip(
         linear.errors, linear.slopes, linear.weights, times.spans, strict=True
     ):
@@ -160,14 +182,14 @@ def _sandwich(linear: Linearised, bread: np.ndarray, times: "Times") -> np.ndarr
             # 1 + 2 Σ ρˡ = span for an exponential.
             rho = (span - 1.0) / (span + 1.0)
             ahead, behind = _fading(j, rho), _fading(j[:, ::-1], rho)[:, ::-1]
-            meat += variance * np.einsum("rti,rtj->ij", j, ahead + behind - j)
+            squares = j.transpose(0, 2, 1) @ (ahead + behind - j)
+            meat = meat + variance * linear.gathered(squares)
     meat *= times.independent / max(times.independent - n, 0.1 * times.independent)
     scores = linear.scores
     records = scores.shape[0]
     if records > n // 2 and records > 5:
         # Many recordings: what differs between them shows without any model of their errors.
-        total = scores.sum(axis=1)
-        apart = total.T @ total * records / (records - 1)
+        apart = scores.T @ scores * records / (records - 1)
         meat = apart if np.trace(bread @ apart) > np.trace(bread @ meat) else meat
     out = bread @ meat @ bread
     # Never narrower than white errors would have it.
@@ -250,12 +272,16 @@ def _channel_time(e: np.ndarray, seen: np.ndarray) -> tuple[float, float]:
 def estimate_noise(problem: Problem, errors: tuple, noise: Noise, parameters: Parameters) -> Noise:
     """Noise (R, k) of each sensor: as given, or the weighted scatter of its errors.
 
-    One figure for all channels and recordings of a sensor. The number of free parameters is taken
+    One figure for all channels of a sensor and all recordings of a group. The number of free parameters is taken
     off the number of errors.
     """
     free = ravel_pytree(parameters)[0].size
     total = sum(int(r.seen.sum()) * r.sensor.components for r in problem.records.readings)
     weights = weights_of(problem, errors, noise)
+    share = max(1.0 - free / total, 0.1)
+    count = problem.count
+    groups = np.zeros(count, int) if problem.noise_groups is None else problem.noise_groups
+    groups = np.asarray(groups)
     out = []
     for reading, error, sigma, weight in zip(
         problem.records.readings, errors, noise, weights, strict=True
@@ -263,12 +289,13 @@ def estimate_noise(problem: Problem, errors: tuple, noise: Noise, parameters: Pa
         if reading.sensor.noise is not None:
             out.append(sigma)
             continue
-        squares = float(np.sum(np.asarray(weight)[..., None] * np.asarray(error) ** 2))
-        share = max(1.0 - free / total, 0.1)
-        variance = squares / (reading.sensor.components * reading.seen.sum() * share)
+        squares = np.sum(np.asarray(weight)[..., None] * np.asarray(error) ** 2, axis=(1, 2))
+        seen = reading.sensor.components * reading.seen.sum(axis=1)
+        variance = np.bincount(groups, squares) / np.maximum(np.bincount(groups, seen), 1) / share
         # Data without noise must not divide by zero: round-off is the least that is believed.
         floor = 1e-15 * float(jnp.abs(reading.values).max() + 1e-300)
-        out.append(jnp.full_like(sigma, max(float(np.sqrt(variance)), floor)))
+        found = np.maximum(np.sqrt(variance), floor)[groups]
+        out.append(jnp.broadcast_to(jnp.asarray(found, sigma.dtype)[:, None], sigma.shape))
     return tuple(out)
 
 

@@ -8,7 +8,8 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from rigidjax.body.inertia import MassProperties
-from rigidjax.identify.reported import quantile
+from rigidjax.identify.reported import Quantity, charts, quantile, recording_names
+from rigidjax.identify.several import Bodies
 
 if TYPE_CHECKING:
     from rigidjax.identify.fit import Fit
@@ -18,8 +19,7 @@ def identifiability(fit: "Fit") -> tuple[str, ...]:
     """What the data fix, what they fix weakly, what they cannot see."""
     reach = quantile(fit, 0.95)
     out = []
-    chart = fit.problem.body
-    for quantity in fit.quantities[: len(chart.log_names)]:
+    for quantity in _moments(fit):
         wide = reach * quantity.deviation
         # Half-width over value where narrow; a factor where wide.
         if not np.isfinite(wide) or wide > 1.5:
@@ -48,9 +48,17 @@ def identifiability(fit: "Fit") -> tuple[str, ...]:
     return tuple(out)
 
 
+def _moments(fit: "Fit") -> list[Quantity]:
+    """The positive quantities of the bodies."""
+    out, first = [], 0
+    for _, chart in charts(fit.problem):
+        out += fit.quantities[first : first + len(chart.log_names)]
+        first += len(chart.log_names) + len(chart.plain_names)
+    return out
+
+
 def _rate(fit: "Fit", reach: float) -> str:
-    chart = fit.problem.body
-    first = len(chart.log_names) + len(chart.plain_names)
+    first = sum(len(c.log_names) + len(c.plain_names) for _, c in charts(fit.problem))
     rates = fit.quantities[first : first + 3 * fit.problem.count]
     shares = []
     for index in range(fit.problem.count):
@@ -86,8 +94,11 @@ def scale_is_unseen(fit: "Fit") -> bool:
     if not len(null):
         return False
 
+    if isinstance(fit.problem.body, Bodies):
+        return False
+
     def tensor(x: jax.Array) -> jax.Array:
-        body = fit.problem.body.body(restore(x).body)
+        body = fit.problem.bodies(restore(x))
         inertia = body.inertia if isinstance(body, MassProperties) else body
         return inertia.tensor.reshape(-1)
 
@@ -121,16 +132,24 @@ def correlations(fit: "Fit") -> list[str]:
 
 def names_of(fit: "Fit") -> list[str]:
     """A name for each free number, in the order of the flattened parameters."""
-    shared = [slot.name for slot in fit.problem.slots if not slot.each]
-    each = [slot.name for slot in fit.problem.slots if slot.each]
-    out = [f"body[{i}]" for i in range(fit.parameters.body.size)]
-    for name, leaf in zip(shared, fit.parameters.shared, strict=True):
-        out += [f"{name}[{i}]" if leaf.size > 1 else name for i in range(leaf.size)]
-    own = fit.parameters.own
+    problem, own = fit.problem, fit.parameters.own
+    out = []
+    for name, chart in charts(problem):
+        out += [f"body{name}[{i}]" for i in range(chart.size)]
+    shared, each = [], []
+    names = recording_names(problem)
+    for slot in problem.slots:
+        shape = np.shape(slot.read(problem.records))[1:]
+        parts = [f"[{i}]" for i in range(int(np.prod(shape)))] if shape else [""]
+        if not slot.each:
+            groups = [f" [{label}]" for label in slot.labels] or [""]
+            shared += [f"{slot.name}{where}{part}" for where in groups for part in parts]
+        if slot.each or slot.spread is not None:
+            kind = slot.name if slot.each else f"{slot.name}, own"
+            each += [f"{kind}{where}{part}" for where in names for part in parts]
+    out += shared
     for name in ("spin", "turn", "place", "speed"):
         leaf = getattr(own, name)
         if leaf is not None:
             out += [f"{name}[{i}]" for i in range(leaf.size)]
-    for name, leaf in zip(each, own.each, strict=True):
-        out += [f"{name}[{i}]" for i in range(leaf.size)]
-    return out
+    return out + each
