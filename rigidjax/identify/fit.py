@@ -182,7 +182,7 @@ def fit(
     - `starts`: how many starting points to try (regression first, then scattered ones). Each is
       fitted to a quarter, a half and then the whole of the record.
     - `initial`: a starting point of your own, tried first.
-    - `key`: random key of the scattered starts; `jax.random.key(0)` unless given.
+    - `key`: random key of the scattered starts; the same ones each time unless given.
     - `tolerance`, `max_steps`: where Levenberg–Marquardt stops: at steps of so many standard
       deviations (of each parameter with all others at rest), and misfits that change as little;
       after so many steps.
@@ -227,7 +227,7 @@ def fit(
         raise ValueError("fit: a checkpoint goes with together=1, one start after another")
     if checkpoint is not None:
         require_folder(checkpoint)
-    points = starting_points(problem, starts, jax.random.key(0) if key is None else key)
+    points = starting_points(problem, starts, key)
     noise = _first_noise(problem)
     if descent is not None and not isinstance(descent, Descent):
         raise TypeError(
@@ -283,7 +283,7 @@ def _with_noise(
 def _from_pieces(problem: Problem, count: int, tolerance: float, max_steps: int) -> Parameters:
     cut = in_pieces(problem, count)
     noise, whole = _first_noise(cut), jnp.ones_like(cut.records.t)
-    point = starting_points(cut, 1, jax.random.key(0))[0]
+    point = starting_points(cut, 1, None)[0]
     for width in WIDTHS:
         narrowed = with_width(cut, width)
         point = least_squares(point, narrowed, noise, whole, tolerance, max_steps, CAREFUL).parameters

@@ -9,7 +9,7 @@ from jax import lax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
-from rigidjax.identify.jacobian import along, with_blocks
+from rigidjax.identify.jacobian import along, first_state, with_blocks
 from rigidjax.identify.parameters import Parameters, places
 from rigidjax.identify.problem import Problem
 from rigidjax.identify.residual import Noise, beside, seen_rows
@@ -123,12 +123,12 @@ def descend(
         matrix = gram / (root[:, None] * root[None, :]) + jnp.diag(damping * scale / root**2)
         factor = jax.scipy.linalg.cho_factor(matrix, lower=True)
         move = -jax.scipy.linalg.cho_solve(factor, slope / root) / root
-        far = jnp.max(jnp.abs(move) * (made > 0))
+        far = jnp.max(jnp.abs(move) * made)
         move = move * jnp.minimum(1.0, LONGEST / jnp.maximum(far, 1e-300))
         sound = jnp.isfinite(move).all()
         move = jnp.where(sound, move, 0.0)
         hoped = -(slope @ move) - 0.5 * move @ (gram @ move)
-        small = (jnp.max(jnp.abs(move) * root) < now_tolerance) & (damping <= FREE)
+        small = (jnp.max(jnp.abs(move) * root) < settings.tolerance) & (damping <= FREE)
         # At the very bottom round-off refuses every step.
         bottom = hoped <= 1e-14 * cost
         converged = sound & (small | (bottom & ~better & ~first))
@@ -149,11 +149,7 @@ def descend(
             found,
         )
 
-    now_tolerance = settings.tolerance
-    nothing = jax.tree.map(
-        lambda leaf: jnp.zeros(leaf.shape, leaf.dtype),
-        eqx.filter_eval_shape(lambda p: with_blocks(restore(p), problem), flat),
-    )
+    nothing = _nothing(problem, start, where.shape[1], kind)
     begun = Search(
         flat,
         jnp.asarray(jnp.inf, kind),
@@ -169,6 +165,25 @@ def descend(
     )
     end = lax.while_loop(lambda now: ~now.done & (now.taken <= settings.steps), step, begun)
     return restore(end.point), end
+
+
+def _nothing(problem: Problem, start: Parameters, columns: int, kind: Any) -> Any:
+    """Zeros of the shapes that `with_blocks` returns: to trace it once more takes seconds."""
+    count, times = problem.records.t.shape
+    errors = tuple(
+        jnp.zeros((count, times, reading.sensor.components), kind)
+        for reading in problem.records.readings
+    )
+    ends = jax.tree.map(
+        lambda leaf: jnp.zeros(leaf.shape, kind),
+        eqx.filter_eval_shape(
+            jax.vmap(lambda own, ref: first_state(problem.rung, own, ref)),
+            start.own,
+            problem.reference,
+        ),
+    )
+    blocks = jax.tree.map(lambda leaf: jnp.zeros((*leaf.shape, columns), kind), (errors, ends))
+    return (errors, ends), blocks
 
 
 def _made(parameters: Parameters) -> Float[Array, " n"]:

@@ -28,7 +28,7 @@ from rigidjax.identify.propagate import AbstractIntegrator, integrator_for
 from rigidjax.identify.recording import Recording
 from rigidjax.identify.reference import Reference, reference_of
 from rigidjax.identify.several import Bodies, has_mass
-from rigidjax.motion import Rigid, Spin
+from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.torques import AbstractForce, Sum, Torque
 from rigidjax.motion.torques.base import require_law
 
