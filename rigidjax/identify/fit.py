@@ -15,6 +15,8 @@ from rigidjax import _checks
 from rigidjax.identify import reported, uncertainty, words
 from rigidjax.identify.checkpoint import Checkpoint, Position, Tried, require_folder
 from rigidjax.identify.descent import Descent, descend
+from rigidjax.identify.full_scale import at_limit
+from rigidjax.identify.goodness import goodness
 from rigidjax.identify.jacobian import all_errors
 from rigidjax.identify.parameters import Parameters
 from rigidjax.identify.pieces import WIDTHS, joined, pieces as in_pieces, with_width
@@ -53,10 +55,11 @@ class Fit(eqx.Module):
     flattened in order, infinite where the data are blind, `seen` the same within what they see,
     `covariance_kind` what it rests on; `noises` (R, k) for each sensor; `starts` what came of each
     start; `chi2` and `dof` of the whitened errors of the sensors whose noise was given;
-    `correlation` over how many samples the errors hang together, 1 for white ones, and
-    `independent` how many of them that leaves; `singular_values` (n,) of the whitened Jacobian,
+    `correlation` over how many samples the errors are autocorrelated, 1 for white ones, and
+    `independent` how many independent ones that leaves; `singular_values` (n,) of the whitened Jacobian,
     its columns of length one; `null_directions` (k, n) that leave no trace in the data;
-    `quantities` all that is reported, by name; `status` one line: `ok`, or what is wrong.
+    `quantities` all that is reported, by name; `status` one line: `ok`, or
+    `doubtful`, `ambiguous`, `poor`, `failed`, a colon and the reasons.
     """
 
     problem: Problem
@@ -77,7 +80,7 @@ class Fit(eqx.Module):
 
     @property
     def ok(self) -> bool:
-        """Whether the fit converged and explains the data."""
+        """Whether the fit converged, explains the data, and is the only one that does."""
         return self.status == "ok"
 
     @property
@@ -111,11 +114,13 @@ class Fit(eqx.Module):
 
     @property
     def rms(self) -> tuple[float, ...]:
-        """Root mean square length of each sensor's error, in its unit."""
+        """Root mean square length of each sensor's error, in its unit; without full scale."""
         out = []
+        readings = self.problem.records.readings
         errors = uncertainty.errors_at(self.parameters, self.problem)
-        for error, reading in zip(errors, self.problem.records.readings, strict=True):
-            lengths = np.sum(np.asarray(error) ** 2, axis=-1)[reading.seen]
+        for error, reading, full in zip(errors, readings, at_limit(readings), strict=True):
+            kept = reading.seen & ~full.any(axis=-1)
+            lengths = np.sum(np.asarray(error) ** 2, axis=-1)[kept if kept.any() else reading.seen]
             out.append(float(np.sqrt(lengths.mean())))
         return tuple(out)
 
@@ -197,7 +202,9 @@ def fit(
     - `progress`: called with a line of text after each start, such as `print`.
 
     **Returns** a `Fit`. It always holds the best point that was reached; `fit.status` says in words
-    when that is not to be trusted: not converged, or far above the noise. Interrupting (Ctrl-C)
+    when that is not to be trusted: `doubtful` (errors that are autocorrelated, above the noise, or
+    a large share of the readings), `ambiguous` (another motion fits as well), `poor` (this is not
+    the motion), `failed` (not converged). Interrupting (Ctrl-C)
     ends the search and keeps what was found.
 
     Levenberg–Marquardt on normal equations, Jacobians by forward mode through the motion.
@@ -415,17 +422,21 @@ def _assess(
     best_cost: float,
 ) -> Fit:
     linear = uncertainty.linearise(problem, value, noise)
-    times = uncertainty.correlation_times(linear)
+    cut = at_limit(problem.records.readings)
+    times = uncertainty.correlation_times(linear, cut)
     spread = uncertainty.spread(linear, times)
     free = ravel_pytree(value)[0].size
     errors = uncertainty.errors_at(value, problem)
-    chi2, dof, believable = uncertainty.goodness(problem, errors, linear, free, times.closeness)
+    seen = goodness(problem, errors, linear, times, free)
+    believable = not seen.poor
     # Ten units of log-likelihood: a point further above the best is e¹⁰ times less likely. Where
     # the noise is estimated from the best point, its cost is half the number of readings.
     margin = 10.0
     if any(sensor.noise is None for sensor in problem.records.sensors):
         count = sum(r.sensor.components * int(r.seen.sum()) for r in problem.records.readings)
         margin *= 2 * best_cost / count
+    # Of autocorrelated errors there are the fewer.
+    margin *= max(times.longest, 1.0)
 
     def elsewhere(other: Parameters) -> bool:
         # In one flat valley searches end apart, where no reading would tell them apart.
@@ -441,14 +452,20 @@ def _assess(
         for s in starts
         if s.fits and s.converged and s.cost > best_cost + 0.01 * margin and elsewhere(s.parameters)
     ]
+    doubts = list(seen.doubts)
+    if not any(start.fits for start in starts):
+        doubts.append("no start by itself came near the best point")
     if not np.isfinite(best_cost):
         status = "failed: no start gave a finite misfit"
+    elif believable and not done:
+        status = "failed: not converged, max_steps reached; this is the best point found"
     elif not believable:
-        status = "poor fit: the errors are far above the noise; this is not the motion"
-    elif not done:
-        status = "not converged: max_steps reached; this is the best point found"
+        status = "poor: " + "; ".join((*seen.poor, "this is not the motion"))
     elif rivals:
-        status = f"ambiguous: {len(rivals)} of {len(starts)} starts fit as well elsewhere"
+        rival = f"{len(rivals)} of {len(starts)} starts fit as well elsewhere"
+        status = "ambiguous: " + "; ".join((rival, *doubts))
+    elif doubts:
+        status = "doubtful: " + "; ".join(doubts)
     else:
         status = "ok"
     return Fit(
@@ -459,8 +476,8 @@ def _assess(
         spread.kind,
         noise,
         tuple(starts),
-        chi2,
-        dof,
+        seen.chi2,
+        seen.dof,
         times.longest,
         times.independent,
         jnp.asarray(spread.singular_values),

@@ -14,6 +14,7 @@ from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.identify import stacking
 from rigidjax.identify.bodies import AbstractBodyChart
 from rigidjax.identify.free import Free, Slot, find, grouped
+from rigidjax.identify.full_scale import with_limits
 from rigidjax.identify.jacobian import (
     all_errors,
     filled,
@@ -54,6 +55,9 @@ class Problem(eqx.Module):
       how finely it was sampled. A free body is followed by the closed form.
     - `noise_each`: where a sensor's noise is estimated, one figure for all recordings (`False`),
       for each (`True`), for each body (`"body"`), or for those of the same label (a sequence).
+
+    Channels that were cut off at full scale are found, and their readings there count as "at least
+    that much", as with a sensor's `limit`.
 
     The motion starts at the first time of each recording. The state climbs only as far as the
     sensors and the torque need: `Spin`, `Attitude`, `Rigid`.
@@ -125,6 +129,7 @@ class Problem(eqx.Module):
         if torque is not None:
             require_law(torque)
             recordings = [_with(item, torque) for item in recordings]
+        recordings = with_limits(recordings)
         self.records, self.counts = stacking.stack(recordings)
         self.body, self.loss, self.prior = body, loss, prior
         self.of, self.which, self.noise_groups = of, None, None

@@ -9,6 +9,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
+from rigidjax.identify.full_scale import at_limit
 from rigidjax.identify.levenberg_marquardt import beside_rows
 from rigidjax.identify.parameters import Parameters, places
 from rigidjax.identify.problem import Problem
@@ -228,20 +229,23 @@ class Times(eqx.Module):
         return max(span for sensor in self.spans for span in sensor)
 
 
-def correlation_times(linear: Linearised) -> Times:
+def correlation_times(linear: Linearised, cut: tuple[np.ndarray, ...] | None = None) -> Times:
     """The integrated autocorrelation time `1 + 2 Σ ρ_l` of each channel.
 
-    Summed up to the first lag at which ρ falls below twice its own scatter.
+    Summed up to the first lag at which ρ falls below twice its own scatter. Readings at full scale
+    (`cut`, (R, T, k) for each sensor) take no part.
     """
+    cut = tuple(np.zeros(e.shape, bool) for e in linear.errors) if cut is None else cut
     spans, longest, closest, independent = [], 1.0, 0.0, 0.0
-    for error, weight in zip(linear.errors, linear.weights, strict=True):
+    for error, weight, full in zip(linear.errors, linear.weights, cut, strict=True):
         kept, found = error * np.sqrt(weight)[..., None], []
         for channel in range(error.shape[-1]):
-            span, first = _channel_time(kept[..., channel], weight > 0)
+            seen = (weight > 0) & ~full[..., channel]
+            span, first = _channel_time(kept[..., channel], seen)
             if span > longest:
                 longest, closest = span, first
             found.append(span)
-            independent += float(np.sum(weight > 0)) / span
+            independent += float(np.sum(seen)) / span
         spans.append(tuple(found))
     return Times(tuple(spans), closest, independent)
 
@@ -283,67 +287,21 @@ def estimate_noise(problem: Problem, errors: tuple, noise: Noise, parameters: Pa
     groups = np.zeros(count, int) if problem.noise_groups is None else problem.noise_groups
     groups = np.asarray(groups)
     out = []
-    for reading, error, sigma, weight in zip(
-        problem.records.readings, errors, noise, weights, strict=True
+    cut = at_limit(problem.records.readings)
+    for reading, error, sigma, weight, full in zip(
+        problem.records.readings, errors, noise, weights, cut, strict=True
     ):
         if reading.sensor.noise is not None:
             out.append(sigma)
             continue
-        squares = np.sum(np.asarray(weight)[..., None] * np.asarray(error) ** 2, axis=(1, 2))
-        seen = reading.sensor.components * reading.seen.sum(axis=1)
+        # What a reading at full scale is off by is no noise.
+        kept = reading.seen[..., None] & ~full
+        squares = np.asarray(weight)[..., None] * np.asarray(error) ** 2
+        squares = np.sum(np.where(kept, squares, 0.0), axis=(1, 2))
+        seen = kept.sum(axis=(1, 2))
         variance = np.bincount(groups, squares) / np.maximum(np.bincount(groups, seen), 1) / share
         # Data without noise must not divide by zero: round-off is the least that is believed.
         floor = 1e-15 * float(jnp.abs(reading.values).max() + 1e-300)
         found = np.maximum(np.sqrt(variance), floor)[groups]
         out.append(jnp.broadcast_to(jnp.asarray(found, sigma.dtype)[:, None], sigma.shape))
     return tuple(out)
-
-
-def goodness(
-    problem: Problem, errors: tuple, linear: Linearised, free: int, closeness: float
-) -> tuple[float, int, bool]:
-    """χ² of the sensors with a given noise, its degrees of freedom, and whether to believe the fit.
-
-    Believed where χ² is within five standard deviations of its mean and, for a sensor whose noise
-    was estimated, where the motion explains at least half of the variance of its readings and what
-    is left over in one piece (`closeness`, the correlation from one sample to the next, of it) is
-    less than a tenth. Under a robust loss outliers are expected, and χ² is theirs: there the median
-    of the squared errors counts, as long as it is that of readings without outliers to five
-    standard deviations.
-    """
-    chi2, count, believable = 0.0, 0, True
-    for reading, error, e, weight in zip(
-        problem.records.readings, errors, linear.errors, linear.weights, strict=True
-    ):
-        seen = reading.seen
-        if reading.sensor.noise is None:
-            values = np.asarray(reading.values)[seen]
-            spread_of_values = np.sum((values - values.mean(axis=0)) ** 2)
-            left = np.sum(np.asarray(error)[seen] ** 2)
-            tiny = 1e-12 * np.sum(values**2)
-            believable &= bool(left <= 0.5 * spread_of_values + tiny)
-            believable &= bool(max(closeness, 0.0) * left <= 0.1 * spread_of_values + tiny)
-        else:
-            size, many = reading.sensor.components, int(seen.sum())
-            chi2 += float(np.sum(weight[..., None] * e**2))
-            count += size * many
-            if problem.loss is not None and many:
-                middle = np.median(np.sum(e[seen] ** 2, axis=-1))
-                half, density = _median_of_chi2(size)
-                # Of a sample's median: 1 / (2 f √n), f the density there.
-                wide = 0.5 / (density * np.sqrt(many))
-                believable &= bool(middle <= half + 5 * wide)
-    dof = max(count - free, 1)
-    if count and problem.loss is None:
-        believable &= bool(chi2 <= dof + 5 * np.sqrt(2 * dof))
-    return chi2, dof, believable
-
-
-def _median_of_chi2(size: int) -> tuple[float, float]:
-    """The median of χ² with `size` degrees of freedom, and the density there."""
-    from scipy.special import chdtri, gammaln
-
-    median = float(chdtri(size, 0.5))
-    power = 0.5 * size - 1
-    density = 0.5 * np.exp(power * np.log(0.5 * median) - 0.5 * median - gammaln(0.5 * size))
-    return median, float(density)

@@ -8,6 +8,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from rigidjax.body.inertia import MassProperties
+from rigidjax.identify.full_scale import in_words
 from rigidjax.identify.reported import Quantity, charts, quantile, recording_names
 from rigidjax.identify.several import Bodies
 
@@ -39,11 +40,11 @@ def identifiability(fit: "Fit") -> tuple[str, ...]:
             "Free motion cannot show the absolute inertia: only ratios; mass and centre of mass "
             "leave no trace at all."
         )
+    out += in_words(fit.problem.records.readings)
     if fit.correlation > 1.5:
         out.append(
-            f"The errors are not white: they hang together over {fit.correlation:.0f} samples, so "
-            "something is missing in the model or the data were filtered; the intervals allow for "
-            "it (sandwich)."
+            f"The errors are autocorrelated over {fit.correlation:.0f} samples, so something is "
+            "missing in the model or the data were filtered; the intervals allow for it."
         )
     return tuple(out)
 

@@ -6,8 +6,9 @@ import pytest
 
 import rigidjax as rj
 from rigidjax import identify
-from rigidjax.identify.jacobian import with_blocks
 from rigidjax.identify.parameters import local, places
+from rigidjax.identify.search import evaluate
+from rigidjax.identify.uncertainty import estimate_noise
 
 BODIES = {
     "box": rj.Inertia.from_principal(1.0, 1.6, 2.1),
@@ -101,34 +102,39 @@ def test_each_recording_depends_on_its_own_body_and_group(found):
     np.testing.assert_array_equal(mine.steps[0][0], at.shared[0][0])
     np.testing.assert_array_equal(mine.steps[0][3], at.shared[0][1])
     # A shared value and a deviation have the same derivative.
-    blocks = np.asarray(with_blocks(at, problem)[1][0][0])
+    blocks = np.asarray(evaluate(at, problem)[1][0][0])
     np.testing.assert_array_equal(blocks[..., 9:12], blocks[..., 18:21])
 
 
-def test_noise_is_estimated_by_group(records):
-    rough = []
-    for index, record in enumerate([*records["box"], *records["rod"]]):
-        values = np.asarray(record.readings[0].values)
-        rng = np.random.default_rng(index)
-        wide = (0.02, 0.05)[index % 2] if index < 2 else 0.1
-        gyro = identify.Gyro(bias=[0.0] * 3, skew=[0.0] * 3)
-        rough.append(
-            identify.Recording(
-                TS, (gyro, values + wide * rng.normal(size=values.shape)), torque=record.torque
-            )
-        )
-    given = {"box": rough[:2], "rod": rough[2:]}
-    charts = {"box": identify.Tensor(1.5), "rod": identify.Known(BODIES["rod"])}
-    labels = ["fine", "coarse", "rough", "rough"]
-    problem = identify.Problem(given, charts, free=FREE, noise_each=labels)
-    noise = identify.fit(problem, starts=1).noise[0]
-    np.testing.assert_allclose(noise[:, 0], [0.02, 0.05, 0.1, 0.1], rtol=0.2)
-    assert noise[2, 0] == noise[3, 0]
+@pytest.mark.parametrize(
+    ("each", "wanted"),
+    [
+        (["fine", "coarse", "rough", "rough"], [0.02, 0.05, 0.1, 0.1]),
+        (True, [0.02, 0.05, 0.1, 0.1]),
+        ("body", [0.0381, 0.0381, 0.1, 0.1]),
+        (False, [0.0757] * 4),
+    ],
+)
+def test_noise_is_estimated_by_group(records, each, wanted):
+    silent = {
+        name: [
+            identify.Recording(r.t, (identify.Gyro(), r.readings[0].values), torque=r.torque)
+            for r in rows
+        ]
+        for name, rows in records.items()
+    }
+    charts = {name: identify.Known(body) for name, body in BODIES.items()}
+    problem = identify.Problem(silent, charts, noise_each=each)
+    rng = np.random.default_rng(3)
+    errors = (np.array([0.02, 0.05, 0.1, 0.1])[:, None, None] * rng.normal(size=(4, 60, 3)),)
+    first = (jnp.ones((4, 3)),)
+    (noise,) = estimate_noise(problem, errors, first, problem.start())
+    np.testing.assert_allclose(noise[:, 0], wanted, rtol=0.15)
 
 
 def test_the_skew_of_a_sensor_and_the_tilt_of_a_wheel():
     state = rj.Spin([1.0, 2.0, 3.0])
-    moment = identify.Moment(jnp.zeros(()), state, None, None)
+    moment = identify.Moment(jnp.zeros(()), state, None, lambda t, y, args: y)
     gyro = identify.Gyro(bias=[0.1, 0, 0], scale=[2.0, 1, 1], skew=[0.01, 0.02, 0.03])
     np.testing.assert_allclose(gyro.error(moment, jnp.zeros(3)), [-2.26, -2.09, -3.0], rtol=1e-12)
     wheel = rj.torques.Wheel(2.0, [0.0, 0.0, 1.0], lambda t: t, tilt=[0.3, 0.4])
