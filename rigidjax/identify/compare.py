@@ -18,7 +18,7 @@ class Comparison(eqx.Module):
     """One model among others of the same data.
 
     **Fields:** `name`; `free` how many numbers are free; `rms` of each sensor; `correlation` over
-    how many samples its errors hang together; `information` its Bayesian information criterion
+    how many samples its errors are autocorrelated; `information` its Bayesian information criterion
     less the best one's: 0 for the best, 10 and more is strong evidence against.
     """
 
@@ -34,7 +34,7 @@ def compare(fits: Mapping[str, Fit]) -> tuple[Comparison, ...]:
 
     `N log s² + p log N` with s² the mean square of each sensor's errors and N the number of
     independent readings: the number of readings over how many samples the errors of the best
-    fitting model hang together, the same for all.
+    fitting model are autocorrelated, the same for all.
 
     **Arguments:** `fits` name → `Fit`, all of the same readings. **Raises** `ValueError` for none,
     or for fits of other readings.

@@ -38,7 +38,7 @@ def plateau(values: np.ndarray) -> float | None:
             continue
         beside = [steps[first - 1]] if first > 0 else []
         beside += [steps[end - 1]] if end < values.size else []
-        if max(beside, default=0.0) > 0.2 * typical:
+        if max(beside, default=0.0) > max(0.2 * typical, 1.5 * digit):
             return top
     return None
 

@@ -159,7 +159,7 @@ def interval_of(
 def quantile(fit: "Fit", level: float) -> float:
     """Half-width of an interval in standard deviations: Student's where the noise is estimated.
 
-    Errors that hang together count as the fewer they are.
+    Autocorrelated errors count as the fewer they are.
     """
     level = _checks.positive(level, "level", "a level between 0 and 1")
     if not level < 1:

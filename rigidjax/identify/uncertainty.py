@@ -132,12 +132,14 @@ class Spread(eqx.Module):
 def spread(linear: Linearised, times: "Times") -> Spread:
     """`(JᵀWJ)⁻¹` where the errors are white, else the sandwich `H⁻¹ M H⁻¹`.
 
-    `M = Jᵀ C J` with C the errors' own covariance in time: each channel its variance and an
-    exponential of its correlation time. Fitted errors are smaller than true ones, the more so the
-    fewer of them are independent: M is scaled up by n/(n − p) for n independent errors. With many
-    recordings, what differs between them is taken instead where it is more.
+    `M = Jᵀ C J` with C the errors' own covariance in time: of each channel the part that its second
+    differences show is white, the rest fades exponentially. Over which time it fades fitted errors
+    do not tell well, for a fit takes the slow part of them away: of all times from two samples to
+    half a record that one counts which makes a number least sure. Fitted errors are smaller than
+    true ones, the more so the fewer of them are independent: M is scaled up by n/(n − p) for n
+    independent errors. With many recordings, what differs between them is taken where it is more.
 
-    **Arguments:** `linear`; `times` how long the errors hang together.
+    **Arguments:** `linear`; `times` over how long the errors are autocorrelated.
 
     Source: White 1980, doi:10.2307/1912934; Liang and Zeger 1986, doi:10.1093/biomet/73.1.13.
 
@@ -161,7 +163,7 @@ def spread(linear: Linearised, times: "Times") -> Spread:
     kind = "Gauss–Newton"
     if times.longest > 1.5:
         covariance = _sandwich(linear, covariance, times)
-        kind = f"sandwich: the errors hang together over {times.longest:.0f} samples"
+        kind = f"sandwich: the errors are autocorrelated over {times.longest:.0f} samples"
     null = directions[~seen] / size
     null = null / np.linalg.norm(null, axis=1, keepdims=True)
     shown = covariance.copy()
@@ -171,32 +173,50 @@ def spread(linear: Linearised, times: "Times") -> Spread:
 
 
 def _sandwich(linear: Linearised, bread: np.ndarray, times: "Times") -> np.ndarray:
+    longest = max(int(np.median((linear.weights[0] > 0).sum(axis=1))) // 2, 2)
+    spans = 2.0 ** np.arange(1, np.log2(longest) + 1)
     n = bread.shape[0]
-    meat: Any = 0.0
-    for error, slope, weight, spans in zip(
-        linear.errors, linear.slopes, linear.weights, times.spans, strict=True
-    ):
-        root = np.sqrt(weight)
-        for channel, span in enumerate(spans):
-            e, j = error[..., channel] * root, slope[..., channel, :] * root[..., None]
-            variance = np.sum(e**2) / max(np.sum(weight > 0), 1)
-            # 1 + 2 Σ ρˡ = span for an exponential.
-            rho = (span - 1.0) / (span + 1.0)
-            ahead, behind = _fading(j, rho), _fading(j[:, ::-1], rho)[:, ::-1]
-            squares = j.transpose(0, 2, 1) @ (ahead + behind - j)
-            meat = meat + variance * linear.gathered(squares)
-    meat *= times.independent / max(times.independent - n, 0.1 * times.independent)
+    grown = times.independent / max(times.independent - n, 0.1 * times.independent)
+    found = [grown * bread @ _meat(linear, span) @ bread for span in spans]
     scores = linear.scores
     records = scores.shape[0]
     if records > n // 2 and records > 5:
         # Many recordings: what differs between them shows without any model of their errors.
-        apart = scores.T @ scores * records / (records - 1)
-        meat = apart if np.trace(bread @ apart) > np.trace(bread @ meat) else meat
-    out = bread @ meat @ bread
+        found.append(bread @ (scores.T @ scores) @ bread * records / (records - 1))
     # Never narrower than white errors would have it.
-    below = np.diag(out) < np.diag(bread)
-    factor = np.sqrt(np.where(below, np.diag(bread) / np.maximum(np.diag(out), 1e-300), 1.0))
+    all_ = np.maximum(np.stack([np.diag(bread), *(np.diag(c) for c in found)]), 0.0)
+    least = np.maximum(np.diag(bread), 1e-300)
+    out = found[int(np.argmax((all_[1:] / least).mean(axis=1)))]
+    own = np.maximum(np.diag(out), 1e-300)
+    factor = np.sqrt(np.maximum(all_.max(axis=0) / own, 1.0))
     return out * np.outer(factor, factor)
+
+
+def _meat(linear: Linearised, time: float) -> np.ndarray:
+    """`Jᵀ C J` with C the scatter of each channel and a part that fades over `time` samples."""
+    meat: Any = 0.0
+    fade = float(np.exp(-1.0 / time))
+    for error, slope, weight in zip(linear.errors, linear.slopes, linear.weights, strict=True):
+        root = np.sqrt(weight)
+        for channel in range(error.shape[-1]):
+            e, j = error[..., channel] * root, slope[..., channel, :] * root[..., None]
+            variance = np.sum(e**2) / max(np.sum(weight > 0), 1)
+            share = smooth_share(e, weight > 0)
+            ahead, behind = _fading(j, fade), _fading(j[:, ::-1], fade)[:, ::-1]
+            spread = share * (ahead + behind - j) + (1.0 - share) * j
+            meat = meat + variance * linear.gathered(j.transpose(0, 2, 1) @ spread)
+    return meat
+
+
+def smooth_share(e: np.ndarray, seen: np.ndarray) -> float:
+    """The share of the variance of errors (R, T) that second differences do not show."""
+    rows = [x[kept] for x, kept in zip(e, seen, strict=True)]
+    total = sum(float(row @ row) for row in rows) / max(sum(row.size for row in rows), 1)
+    bends = np.concatenate([row[2:] - 2.0 * row[1:-1] + row[:-2] for row in rows])
+    if not bends.size or not total > 0:
+        return 1.0
+    # The second difference of white noise has six times its variance.
+    return float(np.clip(1.0 - np.mean(bends**2) / 6.0 / total, 0.0, 1.0))
 
 
 def _fading(x: np.ndarray, rho: float) -> np.ndarray:
@@ -212,7 +232,7 @@ def _fading(x: np.ndarray, rho: float) -> np.ndarray:
 
 
 class Times(eqx.Module):
-    """How many samples the errors hang together, for each channel of each sensor.
+    """Over how many samples the errors are autocorrelated, for each channel of each sensor.
 
     **Fields:** `spans` one tuple for each sensor, 1 for white errors; `closeness` the correlation
     from one sample to the next in the channel of the longest; `independent` how many errors that

@@ -6,7 +6,8 @@ The recipe. All throws together: each group has a body of its own (six numbers) 
 own; all share the gyro (bias, scale an axis, three skew terms) and the wheel's tilt; each throw has
 a first rate, a delay of the wheel's log, and a bias that deviates from the shared one by 0.02
 rad/s. Noise is estimated for each body. No object's truth enters: the proof body's moments fix the
-scale of the wheel. Then each throw alone, with the sensor as it was found.
+scale of the wheel. Then each throw alone, with the sensor as it was found. Intervals: the fit's,
+and what the lever arms (regression on the accelerometer) scatter from throw to throw.
 
 EVERY keeps each so many samples (default 1: 1 kHz), END is the last time, s (default 0.53).
 """
@@ -103,7 +104,7 @@ def shift(mass, d):
 
 def moments(name, total, device, factor, levers):
     """Principal moments, kg mm², of what was measured with the device, ascending."""
-    between = jnp.asarray(levers[name] - levers[DEVICE])
+    between = levers[name] - levers[DEVICE]
     other = -(MASSES[DEVICE] / MASSES[name]) * between
     tensor = factor * (total - device) - shift(MASSES[DEVICE], between)
     return jnp.linalg.eigvalsh(tensor - shift(MASSES[name], other)) * 1e6
@@ -111,63 +112,98 @@ def moments(name, total, device, factor, levers):
 
 def factor_of(bodies, levers):
     """By what factor the wheel's inertia is off: the least squares of the proof body's moments."""
-    factor = 1.0
-    for _ in range(8):
+    factor = jnp.asarray(1.0)
+    for _ in range(5):
 
         def off(f):
             found = moments(PROOF, bodies[PROOF].tensor, bodies[DEVICE].tensor, f, levers)
             return found / jnp.asarray(TRUTH[PROOF]) - 1.0
 
-        error, slope = off(factor), jax.jacfwd(off)(jnp.asarray(factor))
+        error, slope = off(factor), jax.jacfwd(off)(factor)
         factor = factor - jnp.sum(error * slope) / jnp.sum(slope * slope)
     return factor
 
 
+def of_levers(function, levers):
+    """Covariance of `function(levers)` by the scatter of the levers from throw to throw."""
+    total = 0.0
+    for name in levers:
+        slope = np.asarray(jax.jacfwd(lambda d, name=name: function(levers | {name: d}))(levers[name]))
+        rows = throws.levers(name)
+        # The variance of a median is π/2 times that of a mean.
+        total = total + slope @ (np.cov(rows.T) / len(rows) * np.pi / 2) @ slope.T
+    return total
+
+
+def shared(joint, levers, name, total):
+    """Variance of the log moments of a tensor by what it takes from the joint fit."""
+
+    def of(bodies, levers):
+        factor = factor_of(bodies, levers)
+        return jnp.log(moments(name, jnp.asarray(total), bodies[DEVICE].tensor, factor, levers))
+
+    low, high = joint.interval_of(lambda bodies, _: of(bodies, levers))
+    of_fit = ((high - low) / 2 / identify.reported.quantile(joint, 0.95)) ** 2
+    return of_fit + np.diag(of_levers(lambda d: of(joint.body, d), levers))
+
+
+def show(name, errors, reach):
+    held = np.abs(errors) <= reach
+    size = 100 * np.abs(errors)
+    print(
+        f"{name}: mean |error| {size.mean():.2f} %, worst {size.max():.2f} %; 95 % intervals (mean "
+        f"±{100 * reach.mean():.2f} %) hold {held.sum()} of {held.size}"
+    )
+    return held
+
+
 def main(every=1, end=0.53):
-    levers = {name: throws.lever(name) for name in MASSES}
-    records = {
-        name: [record(path, every, end) for path in throws.paths(name)] for name in MASSES
-    }
+    levers = {name: jnp.asarray(throws.lever(name)) for name in MASSES}
+    records = {name: [record(path, every, end) for path in throws.paths(name)] for name in MASSES}
     began = time.perf_counter()
     joint = together(records)
-    print(f"{joint.problem.count} throws: {time.perf_counter() - began:.1f} s, {joint.status}")
+    print(f"{joint.problem.count} throws together: {time.perf_counter() - began:.1f} s")
+    print(f"status: {joint.status}")
     for name, value in joint.values.items():
         if name in ("bias", "scale", "skew", "tilt"):
             print(f"  {name}", np.array2string(np.asarray(value), precision=4))
-    factor = float(factor_of(joint.body, levers))
-    device = joint.body[DEVICE].tensor
+    factor = factor_of(joint.body, levers)
     print(f"  the wheel's inertia times {factor:.4f}; noise {np.unique(joint.noise[0]).round(4)}")
-    held = []
-    for name in TRUTH:
+    together_held, alone_held, all_errors = [], [], []
+    for name, truth in TRUTH.items():
 
-        def joint_moments(bodies, _, name=name):
+        def log_moments(bodies, levers, name=name):
             f = factor_of(bodies, levers)
             return jnp.log(moments(name, bodies[name].tensor, bodies[DEVICE].tensor, f, levers))
 
-        low, high = joint.interval_of(joint_moments)
-        found = np.exp(0.5 * (low + high))
-        inside = (np.exp(low) <= TRUTH[name]) & (np.exp(high) >= TRUTH[name])
-        print(
-            f"{name}: together, error % {np.round(100 * (found / TRUTH[name] - 1), 2)}, 95 % ±% "
-            f"{np.round(50 * (high - low), 2)}, hold {inside.sum()} of 3"
-        )
-        errors = []
+        low, high = joint.interval_of(lambda bodies, _, of=log_moments: of(bodies, levers))
+        known = np.diag(of_levers(lambda d, of=log_moments: of(joint.body, d), levers))
+        reach = np.hypot((high - low) / 2, 1.96 * np.sqrt(known))
+        error = 0.5 * (low + high) - np.log(truth)
+        together_held.append(show(f"{name}, together", error, reach))
+        print(f"  errors % {np.round(100 * error, 2)}, 95 % ±% {np.round(100 * reach, 2)}")
+        errors, reaches, words = [], [], []
         for row in range(len(records[name])):
             one = alone(name, row, joint)
 
             def own(bodies, _, name=name):
                 total = bodies[name].tensor
-                return jnp.log(moments(name, total, device, factor, levers))
+                return jnp.log(moments(name, total, joint.body[DEVICE].tensor, factor, levers))
 
             low, high = one.interval_of(own)
-            errors.append(np.exp(0.5 * (low + high)) / TRUTH[name] - 1)
-            held.append((np.exp(low) <= TRUTH[name]) & (np.exp(high) >= TRUTH[name]))
-        errors = 100 * np.abs(errors)
-        print(
-            f"  {len(errors)} throws alone: mean {errors.mean():.2f} %, worst {errors.max():.2f} %, "
-            f"intervals that hold {np.mean(held[-len(errors) :]):.0%}"
-        )
-    print(f"all throws alone: intervals that hold {np.mean(held):.0%}")
+            beside = shared(joint, levers, name, one.body[name].tensor)
+            errors.append(0.5 * (low + high) - np.log(truth))
+            reaches.append(np.hypot((high - low) / 2, 1.96 * np.sqrt(beside)))
+            words.append(one.status.split(":")[0])
+        print("  status:", ", ".join(f"{words.count(word)} {word}" for word in sorted(set(words))))
+        alone_held.append(show(f"{name}, {len(errors)} throws", np.array(errors), np.array(reaches)))
+        all_errors += list(np.abs(errors))
+    held = np.concatenate([x.ravel() for x in alone_held])
+    print(
+        f"in all: mean {100 * np.mean(all_errors):.2f} %, worst {100 * np.max(all_errors):.2f} %; "
+        f"intervals of single throws that hold {held.mean():.0%}, of the joint fit "
+        f"{np.sum(together_held)} of {np.size(together_held)}"
+    )
 
 
 if __name__ == "__main__":
