@@ -130,6 +130,7 @@ def only(problem: Problem, rows: Array) -> Problem:
 
     For misfits alone: its `recordings` are not cut to their own lengths.
     """
+
     def pick(at: Any, whole: Any) -> Any:
         return whole if at(whole) is None else eqx.tree_at(at, whole, _rows(at(whole), rows))
 

@@ -34,7 +34,6 @@ from rigidjax.identify.search import (
 )
 from rigidjax.identify.start import starting_points
 
-
 # More equal steps than this between two samples cost more than steps chosen as they are needed.
 FINEST = 32
 
@@ -56,10 +55,10 @@ class Fit(eqx.Module):
     `covariance_kind` what it rests on; `noises` (R, k) for each sensor; `starts` what came of each
     start; `chi2` and `dof` of the whitened errors of the sensors whose noise was given;
     `correlation` over how many samples the errors are autocorrelated, 1 for white ones, and
-    `independent` how many independent ones that leaves; `singular_values` (n,) of the whitened Jacobian,
-    its columns of length one; `null_directions` (k, n) that leave no trace in the data;
-    `quantities` all that is reported, by name; `status` one line: `ok`, or
-    `doubtful`, `ambiguous`, `poor`, `failed`, a colon and the reasons.
+    `independent` how many independent ones that leaves; `singular_values` (n,) of the whitened
+    Jacobian, its columns of length one; `null_directions` (k, n) that leave no trace in the data;
+    `quantities` all that is reported, by name; `status` one line: `ok`, or `doubtful`, `ambiguous`,
+    `poor`, `failed`, a colon and the reasons.
     """
 
     problem: Problem
@@ -85,7 +84,7 @@ class Fit(eqx.Module):
 
     @property
     def body(self) -> Any:
-        """The body, up to scale where the chart has none; of several bodies a dict of them by name."""
+        """The body, up to scale where the chart has none; of several a dict of them by name."""
         return self.problem.unpack(self.parameters)[0]
 
     @property
@@ -293,7 +292,9 @@ def _from_pieces(problem: Problem, count: int, tolerance: float, max_steps: int)
     point = starting_points(cut, 1, None)[0]
     for width in WIDTHS:
         narrowed = with_width(cut, width)
-        point = least_squares(point, narrowed, noise, whole, tolerance, max_steps, CAREFUL).parameters
+        point = least_squares(
+            point, narrowed, noise, whole, tolerance, max_steps, CAREFUL
+        ).parameters
     return joined(problem, cut, point)
 
 
@@ -373,9 +374,7 @@ def _errors_alone(parameters: Parameters, problem: Problem) -> tuple[Float[Array
     return all_errors(parameters, problem)[0]
 
 
-def _finer(
-    problem: Problem, parameters: Parameters, noise: Noise
-) -> AbstractIntegrator | None:
+def _finer(problem: Problem, parameters: Parameters, noise: Noise) -> AbstractIntegrator | None:
     """Where twice as many fixed steps predict otherwise, by a twentieth of the noise: those that
     do not, or adaptive ones; else `None`.
     """
@@ -386,9 +385,7 @@ def _finer(
     coarse = _errors_alone(parameters, problem)
     while count <= FINEST:
         finer: AbstractIntegrator = FixedSteps(2 * count)
-        exact = _errors_alone(
-            parameters, eqx.tree_at(lambda p: p.integrator, problem, finer)
-        )
+        exact = _errors_alone(parameters, eqx.tree_at(lambda p: p.integrator, problem, finer))
         apart = max(
             float(jnp.max(jnp.abs(a - b) / sigma[:, None]))
             for a, b, sigma in zip(coarse, exact, noise, strict=True)

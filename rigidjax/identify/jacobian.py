@@ -56,9 +56,7 @@ def states_of_one(
     record = filled(problem, mine, record)
     body = matter(problem.body, mine.body, which)
     state0 = first_state(problem.rung, mine, ref)
-    states = states_at(
-        problem.integrator, _turned(problem, body), state0, record.t, record.torque
-    )
+    states = states_at(problem.integrator, _turned(problem, body), state0, record.t, record.torque)
     return record, body, state0, states
 
 

@@ -6,6 +6,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from rigidjax import _checks
@@ -86,9 +87,7 @@ class Problem(eqx.Module):
 
     def __init__(
         self,
-        recording: Recording
-        | Sequence[Recording]
-        | Mapping[str, Recording | Sequence[Recording]],
+        recording: Recording | Sequence[Recording] | Mapping[str, Recording | Sequence[Recording]],
         body: AbstractBodyChart | Mapping[str, AbstractBodyChart],
         *,
         free: Sequence[Free] = (),
@@ -145,8 +144,8 @@ class Problem(eqx.Module):
         self.rung = _rung(recordings[0], body)
         self.reference = reference_of(recordings, self.rung)
         if integrator is None and self.records.torque is not None:
-            widest = max(float(jnp.max(jnp.diff(r.t))) for r in recordings)
-            integrator = integrator_for(widest, 1.5 * float(jnp.max(self.reference.rate)))
+            widest = max(float(np.diff(r.t).max()) for r in recordings)
+            integrator = integrator_for(widest, 1.5 * float(np.max(self.reference.rate)))
         self.integrator = integrator
         self.links = None
 
@@ -197,13 +196,13 @@ class Problem(eqx.Module):
             vector = _numbers(self.body, body)
         shared, each = [], []
         for slot in self.slots:
-            nothing = jnp.zeros(jnp.shape(slot.read(self.records))[1:])
+            size = jnp.shape(slot.read(self.records))[1:]
             if not slot.each:
                 some = () if slot.groups is None else (len(slot.labels),)
-                shared.append(jnp.zeros((*some, *nothing.shape)))
+                shared.append(_zeros(*some, *size))
             if slot.each or slot.spread is not None:
-                each.append(jnp.zeros((self.count, *nothing.shape)))
-        nothing = jnp.zeros((self.count, 3))
+                each.append(_zeros(self.count, *size))
+        nothing = _zeros(self.count, 3)
         return Parameters(
             vector,
             tuple(shared),
@@ -399,17 +398,27 @@ def _sorted(recording: Any, body: Any) -> tuple[list[Recording], Any, tuple[str,
 def _numbers(chart: AbstractBodyChart, body: Any) -> Float[Array, " chart"]:
     """The chart's numbers of a guess, or where it starts."""
     if body is None:
-        return jnp.zeros(chart.size)
+        return _zeros(chart.size)
     _checks.single(body, (Inertia, MassProperties), "body")
-    vector = chart.vector(body)
+    vector = _vector(chart, body)
     if _checks.known(vector):
         _checks.refuse(
             vector,
-            ~jnp.isfinite(vector).all(),
+            not np.isfinite(vector).all(),
             f"body: {type(chart).__name__} has no finite numbers for it; wanted principal "
             "moments above zero, the largest below the sum of the others",
         )
     return vector
+
+
+@eqx.filter_jit
+def _vector(chart: AbstractBodyChart, body: Any) -> Float[Array, " chart"]:
+    return chart.vector(body)
+
+
+def _zeros(*shape: int) -> Array:
+    """Zeros by NumPy: JAX compiles a program for each shape."""
+    return jnp.asarray(np.zeros(shape, jnp.result_type(float)))
 
 
 def _firsts(slot: Slot) -> Array:

@@ -127,6 +127,12 @@ def quantities(
     return tuple(out)
 
 
+def covariance(fit: "Fit") -> np.ndarray:
+    """Covariance of the reported quantities, of the logarithms of those that are positive."""
+    _, slope = (np.asarray(x) for x in _value_and_slope(fit.problem, fit.parameters))
+    return slope @ np.asarray(fit.seen) @ slope.T
+
+
 def carried(slope: np.ndarray, covariance: np.ndarray, null: np.ndarray) -> np.ndarray:
     """Standard deviations of functions with this derivative (…, n).
 

@@ -141,6 +141,9 @@ def settle(
     `near` says that it is near the bottom already; `strides` how many led to it. `look` is called
     after each, with how many there are by then and whether that was the last.
     """
+    if strides and bool(tried.converged):
+        look(tried, strides, True)
+        return tried
     for first in range(strides * STRIDE, max_steps, STRIDE):
         before = float(tried.cost)
         count = min(STRIDE, max_steps)
@@ -178,8 +181,12 @@ def climb(
     *,
     look: Callable[[Position], None] = lambda position: None,
 ) -> Tried:
-    """One start through the horizons; `look` is called after each stride with where it stands."""
-    tried = start.tried
+    """One start down to the bottom; `look` is called after each stride with where it stands.
+
+    The whole record at once, where that explains it; else through the horizons.
+    """
+    tried, start = _at_once(start, problem, noise, tolerance, max_steps)
+    level = np.inf
     for stage, seen in enumerate(horizons(problem)):
         if stage < start.stage:
             continue
@@ -189,8 +196,10 @@ def climb(
             found = least_squares(before, problem, noise, seen, tolerance, count, CAREFUL)
             after = found.parameters
             # What explains a part alone may be nonsense beyond it: a drag that drives.
-            worse = cost_of(after, problem, noise) / max(cost_of(before, problem, noise), 1e-300)
-            tried = fresh(after if worse < WILD else before)
+            first = cost_of(before, problem, noise) if stage == start.stage else level
+            level = cost_of(after, problem, noise)
+            kept = level < WILD * max(first, 1e-300)
+            tried, level = fresh(after if kept else before), level if kept else first
             look(Position(stage + 1, 0, tried))
             continue
 
@@ -200,6 +209,31 @@ def climb(
         done = start.strides if stage == start.stage else 0
         tried = settle(tried, problem, noise, seen, tolerance, max_steps, at_last, strides=done)
     return tried
+
+
+def _at_once(
+    start: Position, problem: Problem, noise: Noise, tolerance: float, max_steps: int
+) -> tuple[Tried, Position]:
+    """The start fitted to the whole record, if that explains it; else as it is."""
+    if start.stage or start.strides:
+        return start.tried, start
+    whole = jnp.ones_like(problem.records.t)
+    count = min(STRIDE, max_steps)
+    found = least_squares(start.tried.parameters, problem, noise, whole, tolerance, count, CAREFUL)
+    if not bool(found.converged) or float(found.cost) > _enough(problem):
+        return start.tried, start
+    return found, Position(len(HORIZONS) - 1, 1, found)
+
+
+def _enough(problem: Problem) -> float:
+    """A misfit that only the motion has: of χ² twice its mean; of a noise that was guessed at a
+    tenth of the signal, errors of a hundredth.
+    """
+    total = 0.0
+    for reading in problem.records.readings:
+        share = 0.01 if reading.sensor.noise is None else 1.0
+        total += share * reading.sensor.components * int(reading.seen.sum())
+    return total
 
 
 def climb_together(

@@ -28,10 +28,11 @@ for _k, (_i, _j) in enumerate([(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)]):
 def starting_points(problem: Problem, count: int, key: PRNGKeyArray | None) -> list[Parameters]:
     """`count` starting points, the most informed first.
 
-    **Arguments:** `problem`; `count` ≥ 1; `key` a JAX random key, or `None`. The first body rate is the first
-    reading (or the turn between attitudes over its time). The inertia is the regression on Euler's
-    equations where it was sampled finely enough, else a sphere; further starts scatter the
-    shape over the whole chart and the rate by a tenth. What a `Free` moves starts as it is given.
+    **Arguments:** `problem`; `count` ≥ 1; `key` a JAX random key, or `None`. The first body rate is
+    the first reading (or the turn between attitudes over its time). The inertia is the regression
+    on Euler's equations where it was sampled finely enough, else a sphere; further starts scatter
+    the shape over the whole chart and the rate by a tenth. What a `Free` moves starts as it is
+    given.
     """
     recordings = problem.recordings
     if isinstance(problem.body, Bodies):
@@ -56,10 +57,8 @@ def starting_points(problem: Problem, count: int, key: PRNGKeyArray | None) -> l
         body = middle + wide * rng.normal(size=centre.shape)
         spin = rates + (0.0 if index == 0 else 0.1) * rng.normal(size=rates.shape)
         kind = start.own.spin.dtype
-        point = eqx.tree_at(
-            lambda p: (p.body, p.own.spin), start, (jnp.asarray(body, kind), jnp.asarray(spin, kind))
-        )
-        out.append(point)
+        moved = jnp.asarray(body, kind), jnp.asarray(spin, kind)
+        out.append(eqx.tree_at(lambda p: (p.body, p.own.spin), start, moved))
     return out
 
 

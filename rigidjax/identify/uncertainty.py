@@ -296,8 +296,8 @@ def _channel_time(e: np.ndarray, seen: np.ndarray) -> tuple[float, float]:
 def estimate_noise(problem: Problem, errors: tuple, noise: Noise, parameters: Parameters) -> Noise:
     """Noise (R, k) of each sensor: as given, or the weighted scatter of its errors.
 
-    One figure for all channels of a sensor and all recordings of a group. The number of free parameters is taken
-    off the number of errors.
+    One figure for all channels of a sensor and all recordings of a group. The number of free
+    parameters is taken off the number of errors.
     """
     free = ravel_pytree(parameters)[0].size
     total = sum(int(r.seen.sum()) * r.sensor.components for r in problem.records.readings)

@@ -9,7 +9,7 @@ from jax.flatten_util import ravel_pytree
 
 from rigidjax.body.inertia import MassProperties
 from rigidjax.identify.full_scale import in_words
-from rigidjax.identify.reported import Quantity, charts, quantile, recording_names
+from rigidjax.identify.reported import Quantity, charts, covariance as reported_covariance, quantile
 from rigidjax.identify.several import Bodies
 
 if TYPE_CHECKING:
@@ -111,13 +111,18 @@ def scale_is_unseen(fit: "Fit") -> bool:
 
 
 def correlations(fit: "Fit") -> list[str]:
-    """Pairs of free numbers whose errors go together (|ρ| > 0.95)."""
-    covariance = np.asarray(fit.covariance)
-    deviation = np.sqrt(np.diag(covariance))
+    """Pairs of reported quantities whose errors go together (|ρ| > 0.95).
+
+    Of an inertia tensor its principal moments, not its components, which follow from them.
+    """
+    covariance = reported_covariance(fit)
+    deviation = np.array([quantity.deviation for quantity in fit.quantities])
     good = np.isfinite(deviation) & (deviation > 0)
+    follow = {f"{plain}{name}" for name, c in charts(fit.problem) for plain in c.plain_names}
+    names = [quantity.name for quantity in fit.quantities]
+    good &= np.array([name not in follow or name.startswith("com") for name in names])
     scaled = np.where(good, deviation, 1.0)
     rho = np.where(np.outer(good, good), covariance / np.outer(scaled, scaled), 0.0)
-    names = names_of(fit)
     pairs = [
         (i, j)
         for i in range(len(rho))
@@ -129,28 +134,3 @@ def correlations(fit: "Fit") -> list[str]:
         f"{names[j]} and {names[i]} go together (correlation {rho[i, j]:+.3f})."
         for i, j in pairs[:5]
     ]
-
-
-def names_of(fit: "Fit") -> list[str]:
-    """A name for each free number, in the order of the flattened parameters."""
-    problem, own = fit.problem, fit.parameters.own
-    out = []
-    for name, chart in charts(problem):
-        out += [f"body{name}[{i}]" for i in range(chart.size)]
-    shared, each = [], []
-    names = recording_names(problem)
-    for slot in problem.slots:
-        shape = np.shape(slot.read(problem.records))[1:]
-        parts = [f"[{i}]" for i in range(int(np.prod(shape)))] if shape else [""]
-        if not slot.each:
-            groups = [f" [{label}]" for label in slot.labels] or [""]
-            shared += [f"{slot.name}{where}{part}" for where in groups for part in parts]
-        if slot.each or slot.spread is not None:
-            kind = slot.name if slot.each else f"{slot.name}, own"
-            each += [f"{kind}{where}{part}" for where in names for part in parts]
-    out += shared
-    for name in ("spin", "turn", "place", "speed"):
-        leaf = getattr(own, name)
-        if leaf is not None:
-            out += [f"{name}[{i}]" for i in range(leaf.size)]
-    return out + each

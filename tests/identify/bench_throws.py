@@ -128,7 +128,9 @@ def of_levers(function, levers):
     """Covariance of `function(levers)` by the scatter of the levers from throw to throw."""
     total = 0.0
     for name in levers:
-        slope = np.asarray(jax.jacfwd(lambda d, name=name: function(levers | {name: d}))(levers[name]))
+        slope = np.asarray(
+            jax.jacfwd(lambda d, name=name: function(levers | {name: d}))(levers[name])
+        )
         rows = throws.levers(name)
         # The variance of a median is π/2 times that of a mean.
         total = total + slope @ (np.cov(rows.T) / len(rows) * np.pi / 2) @ slope.T
@@ -196,7 +198,9 @@ def main(every=1, end=0.53):
             reaches.append(np.hypot((high - low) / 2, 1.96 * np.sqrt(beside)))
             words.append(one.status.split(":")[0])
         print("  status:", ", ".join(f"{words.count(word)} {word}" for word in sorted(set(words))))
-        alone_held.append(show(f"{name}, {len(errors)} throws", np.array(errors), np.array(reaches)))
+        alone_held.append(
+            show(f"{name}, {len(errors)} throws", np.array(errors), np.array(reaches))
+        )
         all_errors += list(np.abs(errors))
     held = np.concatenate([x.ravel() for x in alone_held])
     print(

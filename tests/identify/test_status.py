@@ -108,7 +108,7 @@ WRONG = {
     "a bias left out": lambda: gyro(tumble()[0] + BIAS),
     "random readings": lambda: gyro(np.random.default_rng(1).normal(size=(80, 3)), noise=None),
     "the wheel not named": lambda: gyro(tumble(law=WHEEL)[0], noise=None),
-    "the wheel's speed in rpm": lambda: wheel(tumble(law=WHEEL)[0], law(0.6 * 9.55)),
+    "the wheel the other way": lambda: wheel(tumble(law=WHEEL)[0], law(-0.6)),
     "the wheel about x": lambda: wheel(tumble(law=WHEEL)[0], law(axis=(1.0, 0.0, 0.0))),
     "the wheel's log late": lambda: wheel(tumble(law=WHEEL)[0], law(late=0.5)),
     "drag left out": lambda: wheel(tumble(law=WHEEL)[0], law(drag=(0.0,) * 3), free=False),

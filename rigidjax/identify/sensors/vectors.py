@@ -26,8 +26,9 @@ class Gyro(AbstractSensor):
     estimated from the residuals. Then, `None` unless the sensor has it (give a value to let a
     `Free` move it): `bias` (3,) rad/s; `scale` (3,) per channel; `mounting` (3,) rotation vector
     from the body's axes to the sensor's, rad; `skew` (3,) what its x axis shows of y, x of z, and y
-    of z, where they are not orthogonal: `S = [[1, a, b], [0, 1, c], [0, 0, 1]]`; `limit` full scale, rad/s, one number or (3,): a
-    reading at it counts as "at least that much"; `offset` s: it shows at t what was at t + offset.
+    of z, where they are not orthogonal: `S = [[1, a, b], [0, 1, c], [0, 0, 1]]`; `limit` full
+    scale, rad/s, one number or (3,): a reading at it counts as "at least that much", `None` has it
+    found; `offset` s: it shows at t what was at t + offset.
 
     **Raises** `ValueError` for a noise or limit that is not positive, a wrong shape, NaN.
 
