@@ -99,6 +99,7 @@ def _fisher(problem: Problem, parameters: Parameters) -> Float[Array, "n n"]:
     for block, reading in zip(
         with_blocks(parameters, problem)[1][0], problem.records.readings, strict=True
     ):
+        assert reading.sensor.noise is not None
         rows = block / reading.sensor.noise[:, None, :, None]
         squares = jnp.einsum("rtki,rtkj->rij", rows, rows)
         total = total.at[where[:, :, None], where[:, None, :]].add(squares)

@@ -12,6 +12,7 @@ from rigidjax.identify import stacking
 from rigidjax.identify.parameters import Own, Parameters
 from rigidjax.identify.problem import Links, Problem, one_problem
 from rigidjax.identify.recording import Reading, Recording
+from rigidjax.identify.several import Bodies
 
 # How wide the gaps may be, in turn: first the pieces are nearly free, at the end they are one.
 WIDTHS = (1.0, 1e-1, 1e-2, 1e-3)
@@ -53,7 +54,8 @@ def pieces(problem: Problem, count: int, *, width: float = WIDTHS[-1]) -> Proble
         _piece(record, int(first), int(last), index == count - 1)
         for index, (first, last) in enumerate(itertools.pairwise(edges))
     ]
-    cut = Problem(parts, problem.body, loss=problem.loss, prior=problem.prior)
+    chart = problem.body.charts[0] if isinstance(problem.body, Bodies) else problem.body
+    cut = Problem(parts, chart, loss=problem.loss, prior=problem.prior)
     # One rate for all, so that a gap is the same number at every joint.
     rate = jnp.broadcast_to(problem.reference.rate[0], (count,))
     slots = tuple(slot.alone() for slot in problem.slots)

@@ -97,7 +97,7 @@ class Problem(eqx.Module):
         integrator: AbstractIntegrator | None = None,
         noise_each: bool | str | Sequence[Any] = False,
     ):
-        recordings, body, of = _sorted(recording, body)
+        recordings, chart, of = _sorted(recording, body)
         if not recordings:
             raise ValueError("Problem: wanted at least one Recording, got an empty sequence")
         for item in recordings:
@@ -109,11 +109,11 @@ class Problem(eqx.Module):
                     "recording: wanted one, as Recording(t, …) makes it, got times and masks of "
                     f"shapes {sorted(lengths)}; of many give a sequence"
                 )
-        for chart in body.charts if isinstance(body, Bodies) else (body,):
-            if not isinstance(chart, AbstractBodyChart):
+        for one in chart.charts if isinstance(chart, Bodies) else (chart,):
+            if not isinstance(one, AbstractBodyChart):
                 raise TypeError(
                     "Problem: wanted what of the body is free, such as Ratios() or "
-                    f"PrincipalRatios(), got {type(chart).__name__}"
+                    f"PrincipalRatios(), got {type(one).__name__}"
                 )
         if isinstance(free, str):
             free = (free,)  # pyright: ignore[reportAssignmentType]
@@ -130,10 +130,10 @@ class Problem(eqx.Module):
             recordings = [_with(item, torque) for item in recordings]
         recordings = with_limits(recordings)
         self.records, self.counts = stacking.stack(recordings)
-        self.body, self.loss, self.prior = body, loss, prior
+        self.body, self.loss, self.prior = chart, loss, prior
         self.of, self.which, self.noise_groups = of, None, None
-        if isinstance(body, Bodies):
-            self.which = jnp.asarray([body.names.index(name) for name in of], jnp.int32)
+        if isinstance(chart, Bodies):
+            self.which = jnp.asarray([chart.names.index(name) for name in of], jnp.int32)
             if prior is not None:
                 raise ValueError("Problem: a prior is about one body, got several; give None")
         if noise_each is True:
@@ -141,7 +141,7 @@ class Problem(eqx.Module):
         elif noise_each is not False:
             self.noise_groups, _ = grouped(noise_each, of, "noise_each")
         self.slots = find(free, recordings[0], of)
-        self.rung = _rung(recordings[0], body)
+        self.rung = _rung(recordings[0], chart)
         self.reference = reference_of(recordings, self.rung)
         if integrator is None and self.records.torque is not None:
             widest = max(float(np.diff(r.t).max()) for r in recordings)

@@ -10,6 +10,7 @@ from rigidjax.identify.jacobian import all_errors, first_state
 from rigidjax.identify.loss import shrink, weight
 from rigidjax.identify.parameters import Parameters
 from rigidjax.identify.problem import Problem
+from rigidjax.identify.several import Bodies
 from rigidjax.motion import Attitude, Rigid
 from rigidjax.rotation import quaternion
 
@@ -98,6 +99,7 @@ def beside(parameters: Parameters, problem: Problem, ends: Any) -> tuple[Array, 
         if slot.spread is not None:
             out.append(next(each) / slot.spread)
     if problem.prior is not None:
+        assert not isinstance(problem.body, Bodies)
         body = problem.body.body(parameters.body)
         out.append(problem.prior.residuals(body, scaled=problem.body.unit != ""))
     if problem.links is not None:

@@ -65,7 +65,7 @@ class Linearised(eqx.Module):
     def spread(self, block: np.ndarray, where: np.ndarray) -> np.ndarray:
         """A recording's columns (…, m) as columns of all numbers (…, n)."""
         wide = np.zeros((*block.shape[:-1], self.size + 1))
-        np.add.at(wide, (..., where), block)
+        np.add.at(wide.T, where, block.T)
         return wide[..., :-1]
 
     def gathered(self, squares: np.ndarray) -> np.ndarray:
