@@ -89,10 +89,8 @@ def alone(name, row, joint):
     )
     shared = joint.values["bias"]
     scene = eqx.tree_at(lambda r: r.readings[0].sensor.bias, scene, shared)
-    problem = identify.Problem(
-        {name: scene}, {name: identify.Tensor(3e-4)}, free=free({"prior": OWN_BIAS})
-    )
-    start = problem.start({name: joint.body[name]})
+    problem = identify.Problem(scene, identify.Tensor(3e-4), free=free({"prior": OWN_BIAS}))
+    start = problem.start(joint.body[name])
     spin = joint.parameters.own.spin[index][None]
     start = eqx.tree_at(lambda p: p.own.spin, start, spin)
     return identify.fit(problem, starts=1, initial=start)
@@ -185,15 +183,15 @@ def main(every=1, end=0.53):
         together_held.append(show(f"{name}, together", error, reach))
         print(f"  errors % {np.round(100 * error, 2)}, 95 % ±% {np.round(100 * reach, 2)}")
         errors, reaches, words = [], [], []
+        beside = shared(joint, levers, name, joint.body[name].tensor)
         for row in range(len(records[name])):
             one = alone(name, row, joint)
 
-            def own(bodies, _, name=name):
-                total = bodies[name].tensor
-                return jnp.log(moments(name, total, joint.body[DEVICE].tensor, factor, levers))
+            def own(body, _, name=name):
+                device = joint.body[DEVICE].tensor
+                return jnp.log(moments(name, body.tensor, device, factor, levers))
 
             low, high = one.interval_of(own)
-            beside = shared(joint, levers, name, one.body[name].tensor)
             errors.append(0.5 * (low + high) - np.log(truth))
             reaches.append(np.hypot((high - low) / 2, 1.96 * np.sqrt(beside)))
             words.append(one.status.split(":")[0])
