@@ -6,8 +6,9 @@ The recipe. All throws together: each group has a body of its own (six numbers) 
 own; all share the gyro (bias, scale an axis, three skew terms) and the wheel's tilt; each throw has
 a first rate, a delay of the wheel's log, and a bias that deviates from the shared one by 0.02
 rad/s. Noise is estimated for each body. No object's truth enters: the proof body's moments fix the
-scale of the wheel. Then each throw alone, with the sensor as it was found. Intervals: the fit's,
-and what the lever arms (regression on the accelerometer) scatter from throw to throw.
+scale of the wheel. Then each throw alone, with the sensor as it was found and the drag of its body
+as sure as it was found. Intervals: the fit's, and what the lever arms (regression on the
+accelerometer) scatter from throw to throw.
 
 EVERY keeps each so many samples (default 1: 1 kHz), END is the last time, s (default 0.53).
 """
@@ -57,11 +58,11 @@ def record(path, every, end):
     return identify.Recording(log["t"][kept], (gyro, rates[kept]), torque=law)
 
 
-def free(own_bias):
+def free(own_bias, drag):
     return [
         identify.Free(lambda r: r.readings[0].sensor.bias, "bias", scale=0.05, **own_bias),
         identify.Free(lambda r: r.torque.parts[0].momentum.delay, "delay", scale=1e-3, each=True),
-        identify.Free(lambda r: r.torque.parts[1].coefficient, "drag", scale=1e-5, each="body"),
+        identify.Free(lambda r: r.torque.parts[1].coefficient, "drag", scale=1e-5, **drag),
     ]
 
 
@@ -74,14 +75,13 @@ SENSOR = [
 
 def together(records):
     charts = {name: identify.Tensor(3e-4) for name in records}
-    problem = identify.Problem(
-        records, charts, free=[*free({"spread": OWN_BIAS}), *SENSOR], noise_each="body"
-    )
+    moves = [*free({"spread": OWN_BIAS}, {"each": "body"}), *SENSOR]
+    problem = identify.Problem(records, charts, free=moves, noise_each="body")
     return identify.fit(problem, starts=1)
 
 
 def alone(name, row, joint):
-    """One throw with the sensor of the joint fit; its own bias about the shared one."""
+    """One throw with the sensor of the joint fit; its bias and drag about the shared ones."""
     index = row + joint.problem.of.index(name)
     scene = jax.tree.map(
         lambda leaf: leaf[index] if eqx.is_array(leaf) else leaf,
@@ -89,7 +89,12 @@ def alone(name, row, joint):
     )
     shared = joint.values["bias"]
     scene = eqx.tree_at(lambda r: r.readings[0].sensor.bias, scene, shared)
-    problem = identify.Problem(scene, identify.Tensor(3e-4), free=free({"prior": OWN_BIAS}))
+    # As sure as the joint fit is of the drag, of all axes the one that it is least sure of.
+    drag = max(
+        q.deviation for q in joint.quantities if q.name in [f"drag {a} [{name}]" for a in "xyz"]
+    )
+    moves = free({"prior": OWN_BIAS}, {"prior": drag})
+    problem = identify.Problem(scene, identify.Tensor(3e-4), free=moves)
     start = problem.start(joint.body[name])
     spin = joint.parameters.own.spin[index][None]
     start = eqx.tree_at(lambda p: p.own.spin, start, spin)
