@@ -57,7 +57,7 @@ class Free(eqx.Module):
         _checks.instance(name, str, "name")
         self.where, self.name = where, name
         self.scale = _checks.positive(scale, f"Free {name!r}: scale")
-        self.each = each if isinstance(each, bool | str) else tuple(each)
+        self.each = shares(each, f"Free {name!r}: each")
         self.positive = positive
         self.prior = None if prior is None else _checks.positive(prior, f"Free {name!r}: prior")
         self.spread = None if spread is None else _checks.positive(spread, f"Free {name!r}: spread")
@@ -65,6 +65,20 @@ class Free(eqx.Module):
             raise ValueError(
                 f"Free {name!r}: spread is about a shared value, each=True has none; give prior"
             )
+
+
+def shares(each: Any, name: str) -> bool | str | tuple[Any, ...]:
+    """`each` if it says who shares a number. **Raises** `TypeError`, `ValueError` for others.
+
+    >>> shares(["heavy", "light", "heavy"], "each")
+    ('heavy', 'light', 'heavy')
+    """
+    if isinstance(each, bool):
+        return each
+    if isinstance(each, str):
+        return _checks.word(each, ("body",), name)
+    wanted = 'True, False, "body", or a sequence of labels, one for each recording'
+    return tuple(_checks.instance(each, Sequence, name, wanted=wanted))
 
 
 class Slot(eqx.Module):
@@ -109,23 +123,21 @@ class Slot(eqx.Module):
 
 
 def grouped(
-    each: str | Sequence[Any], of: Sequence[str], name: str
+    each: str | tuple[Any, ...], of: Sequence[str], name: str
 ) -> tuple[Array, tuple[str, ...]]:
     """The index of each recording's group, and the groups' labels.
 
     **Arguments:** `each` `"body"`, or one label for each recording; `of` the name of each
-    recording's body; `name` for messages. **Raises** `ValueError` for another word or number.
+    recording's body; `name` for messages. **Raises** `ValueError` for another number of labels.
     """
-    if isinstance(each, str):
-        _checks.word(each, ("body",), f"{name}: each")
-        each = of
-    if len(each) != len(of):
+    row = list(of) if isinstance(each, str) else list(each)
+    if len(row) != len(of):
         raise ValueError(
-            f"{name}: wanted one label for each of {len(of)} recordings, got {len(each)}"
+            f"{name}: wanted one label for each of {len(of)} recordings, got {len(row)}"
         )
-    labels = list(dict.fromkeys(each))
-    rows = [labels.index(label) for label in each]
-    return jnp.asarray(rows, jnp.int32), tuple(str(label) for label in labels)
+    labels = list(dict.fromkeys(map(str, row)))
+    rows = [labels.index(str(label)) for label in row]
+    return jnp.asarray(rows, jnp.int32), tuple(labels)
 
 
 def find(free: Sequence[Free], recording: Recording, of: Sequence[str] = ("",)) -> tuple[Slot, ...]:

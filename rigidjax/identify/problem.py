@@ -14,7 +14,7 @@ from rigidjax._types import HasAttitude, HasPose, Scalar
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.identify import stacking
 from rigidjax.identify.bodies import AbstractBodyChart
-from rigidjax.identify.free import Free, Slot, find, grouped
+from rigidjax.identify.free import Free, Slot, find, grouped, shares
 from rigidjax.identify.full_scale import with_limits
 from rigidjax.identify.jacobian import (
     all_errors,
@@ -136,10 +136,11 @@ class Problem(eqx.Module):
             self.which = jnp.asarray([chart.names.index(name) for name in of], jnp.int32)
             if prior is not None:
                 raise ValueError("Problem: a prior is about one body, got several; give None")
-        if noise_each is True:
+        apart = shares(noise_each, "noise_each")
+        if apart is True:
             self.noise_groups = jnp.arange(len(of), dtype=jnp.int32)
-        elif noise_each is not False:
-            self.noise_groups, _ = grouped(noise_each, of, "noise_each")
+        elif not isinstance(apart, bool):
+            self.noise_groups, _ = grouped(apart, of, "noise_each")
         self.slots = find(free, recordings[0], of)
         self.rung = _rung(recordings[0], chart)
         self.reference = reference_of(recordings, self.rung)

@@ -163,6 +163,7 @@ def show(name, errors, reach):
 
 
 def main(every=1, end=0.53):
+    """Print the figures; returns them: errors of single throws, which intervals hold."""
     levers = {name: jnp.asarray(throws.lever(name)) for name in MASSES}
     records = {name: [record(path, every, end) for path in throws.paths(name)] for name in MASSES}
     began = time.perf_counter()
@@ -211,6 +212,7 @@ def main(every=1, end=0.53):
         f"intervals of single throws that hold {held.mean():.0%}, of the joint fit "
         f"{np.sum(together_held)} of {np.size(together_held)}"
     )
+    return np.concatenate([np.ravel(x) for x in all_errors]), held, np.ravel(together_held)
 
 
 if __name__ == "__main__":

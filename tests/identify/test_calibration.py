@@ -177,4 +177,4 @@ def test_intervals_of_what_is_shared_or_cut_off_hold(make, truth):
 @pytest.mark.slow
 def test_intervals_hold_where_errors_are_not_white():
     # Sixty readings do not tell well over which time errors are correlated: wider, not narrower.
-    assert 0.92 <= coverage(slow_errors, MOMENTS) <= 0.99
+    assert 0.93 <= coverage(slow_errors, MOMENTS) <= 0.995
