@@ -22,6 +22,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.special import stdtrit
 
 jax.config.update("jax_enable_x64", True)
 
@@ -165,6 +166,8 @@ def show(name, errors, reach):
 def main(every=1, end=0.53):
     """Print the figures; returns them: errors of single throws, which intervals hold."""
     levers = {name: jnp.asarray(throws.lever(name)) for name in MASSES}
+    # The scatter of the levers is itself known from a few throws only.
+    few = stdtrit(min(len(throws.paths(name)) for name in MASSES) - 1, 0.975)
     records = {name: [record(path, every, end) for path in throws.paths(name)] for name in MASSES}
     began = time.perf_counter()
     joint = together(records)
@@ -184,7 +187,7 @@ def main(every=1, end=0.53):
 
         low, high = joint.interval_of(lambda bodies, _, of=log_moments: of(bodies, levers))
         known = np.diag(of_levers(lambda d, of=log_moments: of(joint.body, d), levers))
-        reach = np.hypot((high - low) / 2, 1.96 * np.sqrt(known))
+        reach = np.hypot((high - low) / 2, few * np.sqrt(known))
         error = 0.5 * (low + high) - np.log(truth)
         together_held.append(show(f"{name}, together", error, reach))
         print(f"  errors % {np.round(100 * error, 2)}, 95 % ±% {np.round(100 * reach, 2)}")
@@ -199,7 +202,7 @@ def main(every=1, end=0.53):
 
             low, high = one.interval_of(own)
             errors.append(0.5 * (low + high) - np.log(truth))
-            reaches.append(np.hypot((high - low) / 2, 1.96 * np.sqrt(beside)))
+            reaches.append(np.hypot((high - low) / 2, few * np.sqrt(beside)))
             words.append(one.status.split(":")[0])
         print("  status:", ", ".join(f"{words.count(word)} {word}" for word in sorted(set(words))))
         alone_held.append(

@@ -148,7 +148,7 @@ MISTAKES = [
     (lambda r: dict(body=identify.Tensor(1.0)), TypeError, "both recordings and charts by name"),
     (lambda r: dict(body={"box": identify.Tensor(1.0)}), ValueError, r"recordings of \['box', 'rod'\]"),
     (lambda r: dict(free=[identify.Free(lambda x: x.readings[0].sensor.bias, "b", each=["a"])]), ValueError, "one label for each of 4 recordings, got 1"),
-    (lambda r: dict(free=[identify.Free(lambda x: x.readings[0].sensor.bias, "b", each="throw")]), ValueError, "each"),
+    (lambda r: dict(noise_each=3), TypeError, "noise_each: wanted True, False, .body., or a sequence of labels"),
     (lambda r: dict(recording=r | {"rod": []}), ValueError, "no recording of 'rod'"),
     (lambda r: dict(prior=identify.Entropic(BODIES["box"], 1.0)), ValueError, "a prior is about one body"),
 ]  # fmt: skip
@@ -167,3 +167,7 @@ def test_mistakes_are_named(records, change, kind, words):
 def test_a_spread_needs_a_shared_value():
     with pytest.raises(ValueError, match="each=True has none; give prior"):
         identify.Free(lambda r: r.readings[0].sensor.bias, "b", each=True, spread=0.1)
+    with pytest.raises(ValueError, match="each: wanted .*body.*got .*throw"):
+        identify.Free(lambda r: r.readings[0].sensor.bias, "b", each="throw")
+    with pytest.raises(TypeError, match="each: wanted True, False"):
+        identify.Free(lambda r: r.readings[0].sensor.bias, "b", each=None)
