@@ -423,8 +423,7 @@ def _assess(
     times = uncertainty.correlation_times(linear, cut)
     spread = uncertainty.spread(linear, times)
     free = ravel_pytree(value)[0].size
-    errors = uncertainty.errors_at(value, problem)
-    seen = goodness(problem, errors, linear, times, free)
+    seen = goodness(problem, linear, times, free)
     believable = not seen.poor
     # Ten units of log-likelihood: a point further above the best is e¹⁰ times less likely. Where
     # the noise is estimated from the best point, its cost is half the number of readings.

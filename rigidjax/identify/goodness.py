@@ -32,18 +32,16 @@ class Goodness(eqx.Module):
     doubts: tuple[str, ...]
 
 
-def goodness(
-    problem: Problem, errors: tuple, linear: Linearised, times: Times, free: int
-) -> Goodness:
+def goodness(problem: Problem, linear: Linearised, times: Times, free: int) -> Goodness:
     """χ² of the sensors with a given noise, and what speaks against the fit.
 
     For each sensor: the size of its errors against the noise, where that was given (five standard
     deviations of χ², or under a robust loss of the median of the squared errors), and against what
-    varies in its readings; and whether its errors are white (Ljung and Box's test, which is exact
-    for no one but errs rarely at one in 1e5). Readings at full scale take no part.
+    varies in its readings; and whether its errors are white (Ljung and Box's test,
+    at one wrong alarm in 1e5). Readings at full scale take no part.
 
-    **Arguments:** `errors` (R, T, k) of each sensor; `linear` the problem at its best point;
-    `times` the errors' correlation; `free` how many numbers are free.
+    **Arguments:** `linear` the problem at its best point; `times` the errors' correlation; `free`
+    how many numbers are free.
 
     Source: Ljung and Box 1978, doi:10.1093/biomet/65.2.297.
     """
@@ -52,7 +50,7 @@ def goodness(
     doubts: list[str] = []
     cut = at_limit(problem.records.readings)
     for reading, error, e, weight, full in zip(
-        problem.records.readings, errors, linear.errors, linear.weights, cut, strict=True
+        problem.records.readings, linear.raw, linear.errors, linear.weights, cut, strict=True
     ):
         name = f"the errors of the {type(reading.sensor).__name__}"
         kept = (weight > 0)[..., None] & ~full

@@ -25,11 +25,13 @@ WEAKEST = 1e-6
 class Linearised(eqx.Module):
     """A problem about its best point: whitened errors, their derivatives, their weights.
 
-    **Fields:** for each sensor `errors` (R, T, k), `slopes` (R, T, k, m) in the m numbers that a
-    recording depends on, `weights` (R, T); `places` (R, m) where these are among the n free
-    numbers, n for none; `extra` (j,) and `extra_slopes` (j, n) of priors and joints.
+    **Fields:** for each sensor `raw` errors (R, T, k) in its unit, whitened `errors` (R, T, k),
+    `slopes` (R, T, k, m) in the m numbers that a recording depends on, `weights` (R, T); `places`
+    (R, m) where these are among the n free numbers, n for none; `extra` (j,) and `extra_slopes`
+    (j, n) of priors and joints.
     """
 
+    raw: tuple[np.ndarray, ...]
     errors: tuple[np.ndarray, ...]
     slopes: tuple[np.ndarray, ...]
     weights: tuple[np.ndarray, ...]
@@ -111,7 +113,8 @@ def linearise(problem: Problem, parameters: Parameters, noise: Noise) -> Lineari
     (errors, slopes, weights), where, extra, extra_slopes = jax.tree.map(
         np.asarray, _linearised(problem, parameters, noise, found)
     )
-    return Linearised(errors, slopes, weights, where, extra, extra_slopes)
+    raw = tuple(np.asarray(error) for error in found[0][0])
+    return Linearised(raw, errors, slopes, weights, where, extra, extra_slopes)
 
 
 class Spread(eqx.Module):

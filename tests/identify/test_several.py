@@ -167,7 +167,7 @@ def test_mistakes_are_named(records, change, kind, words):
 def test_a_spread_needs_a_shared_value():
     with pytest.raises(ValueError, match="each=True has none; give prior"):
         identify.Free(lambda r: r.readings[0].sensor.bias, "b", each=True, spread=0.1)
-    with pytest.raises(ValueError, match="each: wanted .*body.*got .*throw"):
+    with pytest.raises(ValueError, match=r"each: wanted .*body.*got .*throw"):
         identify.Free(lambda r: r.readings[0].sensor.bias, "b", each="throw")
     with pytest.raises(TypeError, match="each: wanted True, False"):
         identify.Free(lambda r: r.readings[0].sensor.bias, "b", each=None)
