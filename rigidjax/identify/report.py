@@ -116,7 +116,7 @@ def as_dict(fit: Fit, files: Sequence[str] = (), more: Sequence[Row] = ()) -> di
         "rms": {
             f"{index} {name}": {"value": plain(rms), "axes": list(map(plain, axes)), "unit": unit}
             for index, ((name, axes, unit), rms) in enumerate(
-                zip(rms_of_axes(fit), fit.rms, strict=True)
+                zip(_rms_of_axes(fit), fit.rms, strict=True)
             )
         },
         "noise": [np.asarray(noise).tolist() for noise in fit.noise],
@@ -131,7 +131,7 @@ def as_dict(fit: Fit, files: Sequence[str] = (), more: Sequence[Row] = ()) -> di
     }
 
 
-def rms_of_axes(fit: Fit) -> list[tuple[str, list[float], str]]:
+def _rms_of_axes(fit: Fit) -> list[tuple[str, list[float], str]]:
     """Root mean square error of each component of each sensor, without readings at full scale.
 
     **Returns** for each sensor its name, the figures, and their unit.
@@ -183,7 +183,7 @@ def write_html(
     sizes = "".join(
         f"<tr><td>{html.escape(name)}</td><td>{' '.join(f'{x:.3g}' for x in axes)}</td>"
         f"<td>{html.escape(unit)}</td></tr>"
-        for name, axes, unit in rms_of_axes(fit)
+        for name, axes, unit in _rms_of_axes(fit)
     )
     starts = "".join(
         f"<tr><td>{number}</td><td>{start.cost:.6g}</td>"
