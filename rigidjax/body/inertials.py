@@ -56,12 +56,14 @@ def write_inertials(
     **Raises:** `ValueError` as `read_inertials`, and for a name that the file has not; `TypeError`
     for what is no `MassProperties`.
 
-    >>> write_inertials("new.urdf", {}, "missing.urdf")
+    >>> write_inertials("new.urdf", {}, "old.urdf")
     Traceback (most recent call last):
-    ValueError: missing.urdf: no such file
+    ValueError: bodies: wanted at least one name → MassProperties, got none
     """
     path, source = _checks.path(path), _checks.path(source, "source")
     _checks.instance(bodies, Mapping, "bodies", wanted="a dict of name → MassProperties")
+    if not bodies:
+        raise ValueError("bodies: wanted at least one name → MassProperties, got none")
     root = _parsed(source)
     urdf = _is_urdf(source, root)
     nodes = dict(_bodies(source, root))

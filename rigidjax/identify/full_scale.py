@@ -18,8 +18,8 @@ MOST = 0.7
 def plateau(values: np.ndarray) -> float | None:
     """The full scale (> 0) of one channel (T,) whose largest readings are cut off, or `None`.
 
-    The largest magnitude, where at least three readings in a row have it and the record goes
-    into them or out of them steeply: not the flat top of a slow wave, nor a coarse last digit.
+    The largest magnitude, where more readings in a row have it than the top of a smooth wave in so
+    many digits would: with the last digit d and second differences a that is `2 √(2d/a)` of them.
     """
     size = np.abs(values)
     top = float(size.max(initial=0.0))
@@ -27,20 +27,14 @@ def plateau(values: np.ndarray) -> float | None:
     if not top > 0 or at.sum() < RUN or at.mean() > MOST:
         return None
     steps = np.abs(np.diff(values))
-    moving = steps[steps > 0]
-    if moving.size < 4:
+    bends = np.abs(np.diff(values, 2))[~at[1:-1]]
+    bend = float(np.median(bends)) if bends.size else 0.0
+    if not (steps > 0).any() or not bend > 0:
         return None
-    typical, digit = float(np.median(moving)), float(moving.min())
+    smooth = 1.0 + 2.0 * np.sqrt(2.0 * steps[steps > 0].min() / bend)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], at, [False]]).astype(int)))
-    for first, end in edges.reshape(-1, 2):
-        # With few digits equal neighbours are no news.
-        if end - first < (RUN if digit < 0.2 * typical else 3 * RUN):
-            continue
-        beside = [steps[first - 1]] if first > 0 else []
-        beside += [steps[end - 1]] if end < values.size else []
-        if max(beside, default=0.0) > max(0.2 * typical, 1.5 * digit):
-            return top
-    return None
+    longest = max(end - first for first, end in edges.reshape(-1, 2))
+    return top if longest >= max(RUN, 2.0 * smooth) else None
 
 
 def with_limits(recordings: Sequence[Recording]) -> list[Recording]:

@@ -70,7 +70,8 @@ def goodness(problem: Problem, linear: Linearised, times: Times, free: int) -> G
                 poor.append(f"{name} are {factor:.1f} times the noise")
             elif factor > 1.0:
                 doubts.append(f"{name} are {factor:.2f} times the noise")
-        if not _white(e * np.sqrt(weight)[..., None], kept) and left > tiny:
+        given = reading.sensor.noise is not None
+        if not _white(e * np.sqrt(weight)[..., None], kept, given) and left > tiny:
             size = _over_scatter(np.asarray(error), kept)
             doubts.append(
                 f"{name} are autocorrelated over {times.longest:.0f} samples, {size:.1f} times "
@@ -121,8 +122,11 @@ def median_of_chi2(size: int) -> tuple[float, float]:
     return median, float(density)
 
 
-def _white(e: np.ndarray, kept: np.ndarray) -> bool:
-    """Whether errors (R, T, k) are white, in all channels together."""
+def _white(e: np.ndarray, kept: np.ndarray, given: bool) -> bool:
+    """Whether whitened errors (R, T, k) are white, in all channels together.
+
+    Where the noise is `given`, what is far below it cannot make a fit doubtful.
+    """
     from scipy.special import chdtrc
 
     total, degrees = 0.0, 0
@@ -131,6 +135,7 @@ def _white(e: np.ndarray, kept: np.ndarray) -> bool:
         rows = [row - row.mean() for row in rows if row.size >= 2 * LAGS]
         size = sum(row.size for row in rows)
         squares = sum(float(row @ row) for row in rows)
+        squares = max(squares, float(size)) if given else squares
         if not squares > 0:
             continue
         for lag in range(1, LAGS + 1):
