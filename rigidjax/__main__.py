@@ -109,7 +109,23 @@ def _parser() -> argparse.ArgumentParser:
         "--unit", choices=("rad/s", "deg/s"), default="rad/s", help="of the rates (default: rad/s)"
     )
     identify.add_argument(
-        "--noise", type=float, help="standard deviation of a rate, in --unit (default: estimated)"
+        "--noise",
+        nargs="+",
+        type=float,
+        help="standard deviation of a rate, in --unit, one number or one for each axis "
+        "(default: estimated)",
+    )
+    identify.add_argument(
+        "--limit",
+        type=float,
+        help="full scale of the rates, in --unit: a reading at it counts as at least that much "
+        "(default: found where the log shows a plateau)",
+    )
+    identify.add_argument(
+        "--loss",
+        choices=("soft-l1", "huber", "none"),
+        default="soft-l1",
+        help="how an outlier counts: linearly, or squared (none; default: soft-l1)",
     )
     identify.add_argument(
         "--sensor",
@@ -190,7 +206,12 @@ def _logs(options: argparse.Namespace) -> int:
         if options.sensor:
             channels = [logs.channel(text) for text in options.sensor]
         else:
-            channels = [logs.Channel("gyro", tuple(rates), options.unit, options.noise)]
+            noise = None if options.noise is None else logs.noises(options.noise, "--noise")
+            if options.limit is not None and not options.limit > 0:
+                raise rj.identify.LogError(
+                    f"--limit: wanted a positive number, got {options.limit}"
+                )
+            channels = [logs.Channel("gyro", tuple(rates), options.unit, noise, options.limit)]
         wheels = [logs.wheel(text) for text in options.wheel]
         if options.model in ("tensor", "principal") and not wheels:
             raise rj.identify.LogError(
@@ -209,7 +230,11 @@ def _logs(options: argparse.Namespace) -> int:
             for path in options.logs
         ]
         problem = logs.problem_of(
-            records, options.model, typical=options.typical, free=options.free
+            records,
+            options.model,
+            typical=options.typical,
+            free=options.free,
+            loss=options.loss,
         )
     except ValueError as error:
         print(f"error: {error}", file=sys.stderr)

@@ -22,6 +22,10 @@ from rigidjax.body.energy import (
     spatial_angular_momentum as spatial_angular_momentum,
 )
 from rigidjax.body.inertia import Inertia as Inertia, MassProperties as MassProperties
+from rigidjax.body.inertials import (
+    read_inertials as read_inertials,
+    write_inertials as write_inertials,
+)
 from rigidjax.body.prior import divergence as divergence
 from rigidjax.body.spectral import matrix_function as matrix_function
 

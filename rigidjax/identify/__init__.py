@@ -31,9 +31,10 @@ from rigidjax.identify.files import (
 from rigidjax.identify.fit import Fit as Fit, Start as Start, fit as fit
 from rigidjax.identify.free import Free as Free
 from rigidjax.identify.loss import AbstractLoss as AbstractLoss, Huber as Huber, SoftL1 as SoftL1
+from rigidjax.identify.parameters import Own as Own, Parameters as Parameters
 from rigidjax.identify.pieces import pieces as pieces
 from rigidjax.identify.prior import Entropic as Entropic
-from rigidjax.identify.problem import Own as Own, Parameters as Parameters, Problem as Problem
+from rigidjax.identify.problem import Problem as Problem
 from rigidjax.identify.profile import profile as profile
 from rigidjax.identify.propagate import (
     AbstractIntegrator as AbstractIntegrator,

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from rigidjax.identify.problem import Parameters
+from rigidjax.identify.parameters import Parameters
 
 
 class Tried(eqx.Module):

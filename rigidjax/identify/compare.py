@@ -1,5 +1,6 @@
 """Which model do the data ask for: information criteria, and prediction of what was left out."""
 
+import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -17,7 +18,7 @@ class Comparison(eqx.Module):
     """One model among others of the same data.
 
     **Fields:** `name`; `free` how many numbers are free; `rms` of each sensor; `correlation` over
-    how many samples its errors hang together; `information` its Bayesian information criterion
+    how many samples its errors are autocorrelated; `information` its Bayesian information criterion
     less the best one's: 0 for the best, 10 and more is strong evidence against.
     """
 
@@ -33,7 +34,7 @@ def compare(fits: Mapping[str, Fit]) -> tuple[Comparison, ...]:
 
     `N log s² + p log N` with s² the mean square of each sensor's errors and N the number of
     independent readings: the number of readings over how many samples the errors of the best
-    fitting model hang together, the same for all.
+    fitting model are autocorrelated, the same for all.
 
     **Arguments:** `fits` name → `Fit`, all of the same readings. **Raises** `ValueError` for none,
     or for fits of other readings.
@@ -112,7 +113,19 @@ def _with_shared(problem: Problem, found: Fit) -> Problem:
     here = problem.start()
     here = eqx.tree_at(lambda p: p.shared, here, found.parameters.shared)
     records = problem.scenes(here)
-    own = tuple(slot for slot in problem.slots if slot.each)
+    own = []
+    for slot in problem.slots:
+        if slot.each:
+            own.append(slot)
+        elif slot.spread is not None:
+            own.append(
+                eqx.tree_at(
+                    lambda s: (s.prior, s.spread),
+                    dataclasses.replace(slot, each=True),
+                    (slot.spread, None),
+                    is_leaf=lambda node: node is None,
+                )
+            )
     return eqx.tree_at(
-        lambda p: (p.body, p.records, p.slots), problem, (Known(found.body), records, own)
+        lambda p: (p.body, p.records, p.slots), problem, (Known(found.body), records, tuple(own))
     )

@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from rigidjax import _checks
-from rigidjax.identify.problem import Parameters, Problem
+from rigidjax.identify.parameters import Parameters
+from rigidjax.identify.problem import Problem
 from rigidjax.identify.residual import Noise, residuals
 from rigidjax.identify.search import half_sum
 
@@ -129,11 +130,14 @@ def only(problem: Problem, rows: Array) -> Problem:
 
     For misfits alone: its `recordings` are not cut to their own lengths.
     """
-    return eqx.tree_at(
-        lambda p: (p.records, p.reference),
-        problem,
-        (_rows(problem.records, rows), _rows(problem.reference, rows)),
-    )
+
+    def pick(at: Any, whole: Any) -> Any:
+        return whole if at(whole) is None else eqx.tree_at(at, whole, _rows(at(whole), rows))
+
+    for at in (lambda p: p.records, lambda p: p.reference, lambda p: p.which):
+        problem = pick(at, problem)
+    slots = tuple(pick(lambda slot: slot.groups, slot) for slot in problem.slots)
+    return eqx.tree_at(lambda p: p.slots, problem, slots) if slots else problem
 
 
 def _rows(tree: Any, rows: Array) -> Any:

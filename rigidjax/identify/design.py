@@ -3,7 +3,6 @@
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
@@ -14,8 +13,9 @@ from rigidjax import _checks
 from rigidjax._types import Scalar, Vec3
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.identify import reported
-from rigidjax.identify.problem import Parameters, Problem, errors_of_one, fits, one_problem
-from rigidjax.identify.stacking import one
+from rigidjax.identify.jacobian import with_blocks
+from rigidjax.identify.parameters import Parameters, places
+from rigidjax.identify.problem import Problem, fits, one_problem
 from rigidjax.identify.uncertainty import WEAKEST
 
 
@@ -93,24 +93,17 @@ def fisher(problem: Problem, parameters: Parameters) -> Float[Array, "n n"]:
 
 @eqx.filter_jit
 def _fisher(problem: Problem, parameters: Parameters) -> Float[Array, "n n"]:
-    flat, restore = ravel_pytree(parameters)
-
-    def predicted(vector: Array) -> Any:
-        here = restore(vector)
-        parts = []
-        for index in range(problem.count):
-            own, record, ref = (
-                one(x, index) for x in (here.own, problem.records, problem.reference)
-            )
-            errors, _ = errors_of_one(problem, here.body, here.shared, own, record, ref)
-            parts += [
-                (e / reading.sensor.noise[None]).reshape(-1)
-                for e, reading in zip(errors, record.readings, strict=True)
-            ]
-        return jnp.concatenate(parts)
-
-    slopes = jax.jacfwd(predicted)(flat)
-    return slopes.T @ slopes
+    size = ravel_pytree(parameters)[0].size
+    where = places(problem, parameters)
+    total = jnp.zeros((size + 1, size + 1), parameters.own.spin.dtype)
+    for block, reading in zip(
+        with_blocks(parameters, problem)[1][0], problem.records.readings, strict=True
+    ):
+        assert reading.sensor.noise is not None
+        rows = block / reading.sensor.noise[:, None, :, None]
+        squares = jnp.einsum("rtki,rtkj->rij", rows, rows)
+        total = total.at[where[:, :, None], where[:, None, :]].add(squares)
+    return total[:-1, :-1]
 
 
 def _look(problem: Problem, parameters: Parameters) -> None:

@@ -12,13 +12,16 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from rigidjax import _checks
-from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.identify import reported, uncertainty, words
 from rigidjax.identify.checkpoint import Checkpoint, Position, Tried, require_folder
 from rigidjax.identify.descent import Descent, descend
+from rigidjax.identify.full_scale import at_limit
+from rigidjax.identify.goodness import goodness
+from rigidjax.identify.jacobian import all_errors
+from rigidjax.identify.parameters import Parameters
 from rigidjax.identify.pieces import WIDTHS, joined, pieces as in_pieces, with_width
-from rigidjax.identify.problem import Parameters, Problem, all_errors, fits
-from rigidjax.identify.propagate import Adaptive, FixedSteps
+from rigidjax.identify.problem import Problem, fits
+from rigidjax.identify.propagate import AbstractIntegrator, Adaptive, FixedSteps
 from rigidjax.identify.residual import Noise
 from rigidjax.identify.search import (
     CAREFUL,
@@ -28,9 +31,11 @@ from rigidjax.identify.search import (
     fresh,
     least_squares,
     settle,
-    solver_for,
 )
 from rigidjax.identify.start import starting_points
+
+# More equal steps than this between two samples cost more than steps chosen as they are needed.
+FINEST = 32
 
 
 class Start(eqx.Module):
@@ -49,10 +54,11 @@ class Fit(eqx.Module):
     flattened in order, infinite where the data are blind, `seen` the same within what they see,
     `covariance_kind` what it rests on; `noises` (R, k) for each sensor; `starts` what came of each
     start; `chi2` and `dof` of the whitened errors of the sensors whose noise was given;
-    `correlation` over how many samples the errors hang together, 1 for white ones, and
-    `independent` how many of them that leaves; `singular_values` (n,) of the whitened Jacobian,
-    its columns of length one; `null_directions` (k, n) that leave no trace in the data;
-    `quantities` all that is reported, by name; `status` one line: `ok`, or what is wrong.
+    `correlation` over how many samples the errors are autocorrelated, 1 for white ones, and
+    `independent` how many independent ones that leaves; `singular_values` (n,) of the whitened
+    Jacobian, its columns of length one; `null_directions` (k, n) that leave no trace in the data;
+    `quantities` all that is reported, by name; `status` one line: `ok`, or `doubtful`, `ambiguous`,
+    `poor`, `failed`, a colon and the reasons.
     """
 
     problem: Problem
@@ -73,12 +79,12 @@ class Fit(eqx.Module):
 
     @property
     def ok(self) -> bool:
-        """Whether the fit converged and explains the data."""
+        """Whether the fit converged, explains the data, and is the only one that does."""
         return self.status == "ok"
 
     @property
-    def body(self) -> Inertia | MassProperties:
-        """The body; up to scale where the chart has none."""
+    def body(self) -> Any:
+        """The body, up to scale where the chart has none; of several a dict of them by name."""
         return self.problem.unpack(self.parameters)[0]
 
     @property
@@ -107,11 +113,13 @@ class Fit(eqx.Module):
 
     @property
     def rms(self) -> tuple[float, ...]:
-        """Root mean square length of each sensor's error, in its unit."""
+        """Root mean square length of each sensor's error, in its unit; without full scale."""
         out = []
+        readings = self.problem.records.readings
         errors = uncertainty.errors_at(self.parameters, self.problem)
-        for error, reading in zip(errors, self.problem.records.readings, strict=True):
-            lengths = np.sum(np.asarray(error) ** 2, axis=-1)[reading.seen]
+        for error, reading, full in zip(errors, readings, at_limit(readings), strict=True):
+            kept = reading.seen & ~full.any(axis=-1)
+            lengths = np.sum(np.asarray(error) ** 2, axis=-1)[kept if kept.any() else reading.seen]
             out.append(float(np.sqrt(lengths.mean())))
         return tuple(out)
 
@@ -178,7 +186,7 @@ def fit(
     - `starts`: how many starting points to try (regression first, then scattered ones). Each is
       fitted to a quarter, a half and then the whole of the record.
     - `initial`: a starting point of your own, tried first.
-    - `key`: random key of the scattered starts; `jax.random.key(0)` unless given.
+    - `key`: random key of the scattered starts; the same ones each time unless given.
     - `tolerance`, `max_steps`: where Levenberg–Marquardt stops: at steps of so many standard
       deviations (of each parameter with all others at rest), and misfits that change as little;
       after so many steps.
@@ -193,10 +201,12 @@ def fit(
     - `progress`: called with a line of text after each start, such as `print`.
 
     **Returns** a `Fit`. It always holds the best point that was reached; `fit.status` says in words
-    when that is not to be trusted: not converged, or far above the noise. Interrupting (Ctrl-C)
+    when that is not to be trusted: `doubtful` (errors that are autocorrelated, above the noise, or
+    a large share of the readings), `ambiguous` (another motion fits as well), `poor` (this is not
+    the motion), `failed` (not converged). Interrupting (Ctrl-C)
     ends the search and keeps what was found.
 
-    Levenberg–Marquardt of optimistix, Jacobians by forward mode through the motion.
+    Levenberg–Marquardt on normal equations, Jacobians by forward mode through the motion.
 
     **Raises:** `TypeError` for what is no `Problem`, `ValueError` for fewer than one start, a
     checkpoint that is damaged or of another problem, or one in a folder that does not exist.
@@ -223,14 +233,14 @@ def fit(
         raise ValueError("fit: a checkpoint goes with together=1, one start after another")
     if checkpoint is not None:
         require_folder(checkpoint)
-    points = starting_points(problem, starts, jax.random.key(0) if key is None else key)
-    noise, solver = _first_noise(problem), solver_for(tolerance)
+    points = starting_points(problem, starts, key)
+    noise = _first_noise(problem)
     if descent is not None and not isinstance(descent, Descent):
         raise TypeError(
             f"fit: wanted a Descent(optimiser, …) or None, got {type(descent).__name__}"
         )
     if pieces > 1:
-        points = [_from_pieces(problem, pieces, solver, max_steps), *points][:starts]
+        points = [_from_pieces(problem, pieces, tolerance, max_steps), *points][:starts]
     if initial is not None:
         points = [initial, *points][:starts]
     if descent is not None:
@@ -240,25 +250,25 @@ def fit(
             for point, own in zip(points, keys, strict=True)
         ]
     if together > 1:
-        tried = _together(points, problem, noise, solver, max_steps, together, progress)
+        tried = _together(points, problem, noise, tolerance, max_steps, together, progress)
     else:
-        tried = _one_by_one(points, problem, noise, solver, max_steps, checkpoint, progress)
+        tried = _one_by_one(points, problem, noise, tolerance, max_steps, checkpoint, progress)
     best = min(
         tried, key=lambda item: float(item.cost) if np.isfinite(float(item.cost)) else np.inf
     )
     lowest = float(best.cost)
-    best, noise = _with_noise(problem, best, noise, solver, max_steps)
-    if _too_coarse(problem, best.parameters, noise):
-        problem = eqx.tree_at(lambda p: p.integrator, problem, Adaptive())
+    best, noise = _with_noise(problem, best, noise, tolerance, max_steps)
+    while (finer := _finer(problem, best.parameters, noise)) is not None:
+        problem = eqx.tree_at(lambda p: p.integrator, problem, finer)
         whole = jnp.ones_like(problem.records.t)
         near = fresh(best.parameters)
-        best = settle(near, problem, noise, whole, solver, max_steps, near=True)
-        best, noise = _with_noise(problem, best, noise, solver, max_steps)
+        best = settle(near, problem, noise, whole, tolerance, max_steps, near=True)
+        best, noise = _with_noise(problem, best, noise, tolerance, max_steps)
     return _assess(problem, best.parameters, bool(best.converged), noise, tried, lowest)
 
 
 def _with_noise(
-    problem: Problem, best: Tried, noise: Noise, solver: Any, max_steps: int
+    problem: Problem, best: Tried, noise: Noise, tolerance: float, max_steps: int
 ) -> tuple[Tried, Noise]:
     """The best point and the noise that belong together, where some noise is to be estimated."""
     if all(sensor.noise is not None for sensor in problem.records.sensors):
@@ -272,17 +282,19 @@ def _with_noise(
     # Twice: the weights of the channels and the robust loss both depend on the noise.
     for _ in range(2):
         noise, near = estimated(noise), fresh(best.parameters)
-        best = settle(near, problem, noise, whole, solver, max_steps, near=True)
+        best = settle(near, problem, noise, whole, tolerance, max_steps, near=True)
     return best, estimated(noise)
 
 
-def _from_pieces(problem: Problem, count: int, solver: Any, max_steps: int) -> Parameters:
+def _from_pieces(problem: Problem, count: int, tolerance: float, max_steps: int) -> Parameters:
     cut = in_pieces(problem, count)
     noise, whole = _first_noise(cut), jnp.ones_like(cut.records.t)
-    point = starting_points(cut, 1, jax.random.key(0))[0]
+    point = starting_points(cut, 1, None)[0]
     for width in WIDTHS:
         narrowed = with_width(cut, width)
-        point = least_squares(point, narrowed, noise, whole, solver, max_steps, CAREFUL).parameters
+        point = least_squares(
+            point, narrowed, noise, whole, tolerance, max_steps, CAREFUL
+        ).parameters
     return joined(problem, cut, point)
 
 
@@ -290,7 +302,7 @@ def _one_by_one(
     points: list[Parameters],
     problem: Problem,
     noise: Noise,
-    solver: Any,
+    tolerance: float,
     max_steps: int,
     checkpoint: str | Path | None,
     progress: Callable[[str], Any] | None,
@@ -315,7 +327,7 @@ def _one_by_one(
                 keep.save(tried, position)
 
             start = keep.position if resumed else Position(0, 0, fresh(point))
-            out = climb(start, problem, noise, solver, max_steps, look=look)
+            out = climb(start, problem, noise, tolerance, max_steps, look=look)
             latest = [like]
             tried.append(out)
             keep.save(tried, Position(0, 0, like))
@@ -332,7 +344,7 @@ def _together(
     points: list[Parameters],
     problem: Problem,
     noise: Noise,
-    solver: Any,
+    tolerance: float,
     max_steps: int,
     together: int,
     progress: Callable[[str], Any] | None,
@@ -342,7 +354,7 @@ def _together(
         for first in range(0, len(points), together):
             batch = points[first : first + together]
             stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *batch)
-            tried += climb_together(stacked, problem, noise, solver, max_steps)
+            tried += climb_together(stacked, problem, noise, tolerance, max_steps)
             _say(progress, len(tried), len(points), tried)
     except KeyboardInterrupt:
         if not tried:
@@ -362,17 +374,26 @@ def _errors_alone(parameters: Parameters, problem: Problem) -> tuple[Float[Array
     return all_errors(parameters, problem)[0]
 
 
-def _too_coarse(problem: Problem, parameters: Parameters, noise: Noise) -> bool:
-    """Whether adaptive steps predict otherwise than fixed ones, by a twentieth of the noise."""
-    if not isinstance(problem.integrator, FixedSteps):
-        return False
-    finer = eqx.tree_at(lambda p: p.integrator, problem, Adaptive())
-    coarse, exact = (_errors_alone(parameters, p) for p in (problem, finer))
-    apart = max(
-        float(jnp.max(jnp.abs(a - b) / sigma[:, None]))
-        for a, b, sigma in zip(coarse, exact, noise, strict=True)
-    )
-    return apart > 0.05
+def _finer(problem: Problem, parameters: Parameters, noise: Noise) -> AbstractIntegrator | None:
+    """Where twice as many fixed steps predict otherwise, by a twentieth of the noise: those that
+    do not, or adaptive ones; else `None`.
+    """
+    steps = problem.integrator
+    if not isinstance(steps, FixedSteps):
+        return None
+    count = steps.substeps
+    coarse = _errors_alone(parameters, problem)
+    while count <= FINEST:
+        finer: AbstractIntegrator = FixedSteps(2 * count)
+        exact = _errors_alone(parameters, eqx.tree_at(lambda p: p.integrator, problem, finer))
+        apart = max(
+            float(jnp.max(jnp.abs(a - b) / sigma[:, None]))
+            for a, b, sigma in zip(coarse, exact, noise, strict=True)
+        )
+        if apart <= 0.05:
+            return None if count == steps.substeps else FixedSteps(count)
+        count, coarse = 2 * count, exact
+    return Adaptive()
 
 
 def _first_noise(problem: Problem) -> Noise:
@@ -398,17 +419,20 @@ def _assess(
     best_cost: float,
 ) -> Fit:
     linear = uncertainty.linearise(problem, value, noise)
-    times = uncertainty.correlation_times(linear)
+    cut = at_limit(problem.records.readings)
+    times = uncertainty.correlation_times(linear, cut)
     spread = uncertainty.spread(linear, times)
     free = ravel_pytree(value)[0].size
-    errors = uncertainty.errors_at(value, problem)
-    chi2, dof, believable = uncertainty.goodness(problem, errors, linear, free, times.closeness)
+    seen = goodness(problem, linear, times, free)
+    believable = not seen.poor
     # Ten units of log-likelihood: a point further above the best is e¹⁰ times less likely. Where
     # the noise is estimated from the best point, its cost is half the number of readings.
     margin = 10.0
     if any(sensor.noise is None for sensor in problem.records.sensors):
         count = sum(r.sensor.components * int(r.seen.sum()) for r in problem.records.readings)
         margin *= 2 * best_cost / count
+    # Of autocorrelated errors there are the fewer.
+    margin *= max(times.longest, 1.0)
 
     def elsewhere(other: Parameters) -> bool:
         # In one flat valley searches end apart, where no reading would tell them apart.
@@ -424,14 +448,20 @@ def _assess(
         for s in starts
         if s.fits and s.converged and s.cost > best_cost + 0.01 * margin and elsewhere(s.parameters)
     ]
+    doubts = list(seen.doubts)
+    if not any(start.fits for start in starts):
+        doubts.append("no start by itself came near the best point")
     if not np.isfinite(best_cost):
         status = "failed: no start gave a finite misfit"
+    elif believable and not done:
+        status = "failed: not converged, max_steps reached; this is the best point found"
     elif not believable:
-        status = "poor fit: the errors are far above the noise; this is not the motion"
-    elif not done:
-        status = "not converged: max_steps reached; this is the best point found"
+        status = "poor: " + "; ".join((*seen.poor, "this is not the motion"))
     elif rivals:
-        status = f"ambiguous: {len(rivals)} of {len(starts)} starts fit as well elsewhere"
+        rival = f"{len(rivals)} of {len(starts)} starts fit as well elsewhere"
+        status = "ambiguous: " + "; ".join((rival, *doubts))
+    elif doubts:
+        status = "doubtful: " + "; ".join(doubts)
     else:
         status = "ok"
     return Fit(
@@ -442,8 +472,8 @@ def _assess(
         spread.kind,
         noise,
         tuple(starts),
-        chi2,
-        dof,
+        seen.chi2,
+        seen.dof,
         times.longest,
         times.independent,
         jnp.asarray(spread.singular_values),

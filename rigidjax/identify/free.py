@@ -14,28 +14,33 @@ from rigidjax.identify.recording import Recording
 
 
 class Free(eqx.Module):
-    """A number or array inside the recording's torque or sensors that the fit may move.
+    """A number or array inside the recordings' torque or sensors that the fit may move.
 
     **Arguments:** `where` picks it: `lambda r: r.readings[0].sensor.bias`, or
     `lambda r: r.torque.coefficient`; what the recording holds there is the starting value. `name`
     for reports. `scale` its natural size: a step of one in the fit is one `scale`, in its unit.
-    `each`: one value for each recording, instead of one for all. `positive`: moved through its
-    logarithm, so that it keeps its sign. `prior` a standard deviation around the starting value (a
-    Gaussian prior, in its unit; relative for `positive`), or `None`.
+    `each`: `False` for one value for all recordings, `True` for one for each, `"body"` for one for
+    each body, or a sequence of labels, one for each recording: those of the same label share one.
+    `positive`: moved through its logarithm, so that it keeps its sign. `prior` a standard deviation
+    around the starting value (a Gaussian prior, in its unit; relative for `positive`), or `None`.
+    `spread`: each recording deviates from the shared value by a number of its own, with this
+    standard deviation (in its unit; relative for `positive`); `None` for no deviations.
 
-    **Raises** `ValueError` for a scale or prior that is not positive.
+    **Raises** `ValueError` for a scale, prior or spread that is not positive, a spread where each
+    recording has its own value already.
 
     >>> import rigidjax as rj
-    >>> Free(lambda r: r.readings[0].sensor.bias, "gyro bias", scale=0.01).name
+    >>> Free(lambda r: r.readings[0].sensor.bias, "gyro bias", scale=0.01, spread=0.02).name
     'gyro bias'
     """
 
     where: Callable[[Recording], Any]
     name: str
     scale: float
-    each: bool
+    each: bool | str | tuple[Any, ...]
     positive: bool
     prior: float | None
+    spread: float | None
 
     def __init__(
         self,
@@ -43,29 +48,56 @@ class Free(eqx.Module):
         name: str,
         *,
         scale: float = 1.0,
-        each: bool = False,
+        each: bool | str | Sequence[Any] = False,
         positive: bool = False,
         prior: float | None = None,
+        spread: float | None = None,
     ):
         _checks.function(where, "where", "of a recording, such as lambda r: r.torque.coefficient")
         _checks.instance(name, str, "name")
         self.where, self.name = where, name
         self.scale = _checks.positive(scale, f"Free {name!r}: scale")
-        self.each, self.positive = each, positive
+        self.each = shares(each, f"Free {name!r}: each")
+        self.positive = positive
         self.prior = None if prior is None else _checks.positive(prior, f"Free {name!r}: prior")
+        self.spread = None if spread is None else _checks.positive(spread, f"Free {name!r}: spread")
+        if each is True and spread is not None:
+            raise ValueError(
+                f"Free {name!r}: spread is about a shared value, each=True has none; give prior"
+            )
+
+
+def shares(each: Any, name: str) -> bool | str | tuple[Any, ...]:
+    """`each` if it says who shares a number. **Raises** `TypeError`, `ValueError` for others.
+
+    >>> shares(["heavy", "light", "heavy"], "each")
+    ('heavy', 'light', 'heavy')
+    """
+    if isinstance(each, bool):
+        return each
+    if isinstance(each, str):
+        return _checks.word(each, ("body",), name)
+    wanted = 'True, False, "body", or a sequence of labels, one for each recording'
+    return tuple(_checks.instance(each, Sequence, name, wanted=wanted))
 
 
 class Slot(eqx.Module):
     """A `Free` found in the recordings: which leaf it is. No function is kept, so that a second
     problem of the same form does not compile again.
+
+    **Fields:** `each` whether every recording has its own; `groups` (R,) the index of each
+    recording's value where a group shares one, `labels` of the groups; `prior`, `spread` in steps.
     """
 
     leaf: int = eqx.field(static=True)
     name: str = eqx.field(static=True)
     each: bool = eqx.field(static=True)
     positive: bool = eqx.field(static=True)
+    labels: tuple[str, ...] = eqx.field(static=True)
+    groups: Array | None
     scale: Array
     prior: Array | None
+    spread: Array | None
 
     def read(self, recording: Recording) -> Array:
         """Its value in a recording."""
@@ -83,9 +115,33 @@ class Slot(eqx.Module):
             return jnp.log(value / start) / self.scale
         return (value - start) / self.scale
 
+    def alone(self) -> "Slot":
+        """The same in a problem of one recording."""
+        return Slot(
+            self.leaf, self.name, False, self.positive, (), None, self.scale, self.prior, None
+        )
 
-def find(free: Sequence[Free], recording: Recording) -> tuple[Slot, ...]:
-    """Where each `Free` is among the recording's leaves.
+
+def grouped(
+    each: str | tuple[Any, ...], of: Sequence[str], name: str
+) -> tuple[Array, tuple[str, ...]]:
+    """The index of each recording's group, and the groups' labels.
+
+    **Arguments:** `each` `"body"`, or one label for each recording; `of` the name of each
+    recording's body; `name` for messages. **Raises** `ValueError` for another number of labels.
+    """
+    row = list(of) if isinstance(each, str) else list(each)
+    if len(row) != len(of):
+        raise ValueError(
+            f"{name}: wanted one label for each of {len(of)} recordings, got {len(row)}"
+        )
+    labels = list(dict.fromkeys(map(str, row)))
+    rows = [labels.index(str(label)) for label in row]
+    return jnp.asarray(rows, jnp.int32), tuple(labels)
+
+
+def find(free: Sequence[Free], recording: Recording, of: Sequence[str] = ("",)) -> tuple[Slot, ...]:
+    """Where each `Free` is among the recording's leaves; `of` the name of each recording's body.
 
     **Raises** `ValueError` where it picks nothing, something that is no number, or the same twice.
     """
@@ -117,7 +173,13 @@ def find(free: Sequence[Free], recording: Recording) -> tuple[Slot, ...]:
             raise ValueError(f"Free {item.name!r}: wanted a positive starting value, got {value}")
         scale = jnp.asarray(item.scale)
         prior = None if item.prior is None else jnp.asarray(item.prior / item.scale)
-        slots.append(Slot(index, item.name, item.each, item.positive, scale, prior))
+        wide = None if item.spread is None else jnp.asarray(item.spread / item.scale)
+        alone, groups, labels = item.each is True, None, ()
+        if not isinstance(item.each, bool):
+            groups, labels = grouped(item.each, of, f"Free {item.name!r}")
+        slots.append(
+            Slot(index, item.name, alone, item.positive, labels, groups, scale, prior, wide)
+        )
     return tuple(slots)
 
 

@@ -16,7 +16,7 @@ from rigidjax.identify.bodies import (
 )
 from rigidjax.identify.files import UNITS, LogError, increasing, read_table
 from rigidjax.identify.free import Free
-from rigidjax.identify.loss import SoftL1
+from rigidjax.identify.loss import Huber, SoftL1
 from rigidjax.identify.problem import Problem
 from rigidjax.identify.recording import Recording
 from rigidjax.identify.sensors import (
@@ -30,16 +30,20 @@ from rigidjax.motion.torques import Damping, Flywheel, Series, Sum, Torque, Whee
 
 MODELS = ("ratios", "principal-ratios", "tensor", "principal")
 FREE = ("bias", "drag", "delay")
+LOSSES = ("soft-l1", "huber", "none")
 DEFAULT_UNITS = {"gyro": "rad/s", "accelerometer": "m/s2", "quaternion": "1"}
 
 
 class Channel(eqx.Module):
-    """One sensor of a log: what kind, which columns, in which unit, how noisy (in that unit)."""
+    """One sensor of a log: what kind, which columns, in which unit, how noisy (in that unit; one
+    figure or one for each axis), and its full scale (in that unit).
+    """
 
     kind: str
     columns: tuple[str, ...]
     unit: str
-    noise: float | None
+    noise: tuple[float, ...] | None
+    limit: float | None = None
 
 
 class WheelColumn(eqx.Module):
@@ -55,7 +59,8 @@ def channel(text: str) -> Channel:
     """A sensor written `KIND=COLUMNS[:UNIT[:NOISE]]`, such as `gyro=wx,wy,wz:deg/s:0.1`.
 
     KIND is `gyro`, `accelerometer`, `quaternion` (w, x, y, z) or `euler-ZXZ` (any sequence; body →
-    world). **Raises** `LogError` in words.
+    world); NOISE one number or three, one for each axis, as in `0.1,0.1,0.2`. **Raises**
+    `LogError` in words.
 
     >>> channel("gyro=p,q,r:deg/s").unit
     'deg/s'
@@ -82,14 +87,21 @@ def channel(text: str) -> Channel:
     return Channel(kind, columns, unit, _noise(text, more[1]) if len(more) > 1 else None)
 
 
-def _noise(text: str, cell: str) -> float:
+def _noise(text: str, cell: str) -> tuple[float, ...]:
     try:
-        noise = float(cell)
+        noise = tuple(float(part) for part in cell.split(","))
     except ValueError:
         raise LogError(f"sensor {text!r}: wanted a number for the noise, got {cell!r}") from None
-    if not noise > 0:
-        raise LogError(f"sensor {text!r}: wanted a positive noise, got {noise}")
-    return noise
+    return noises(noise, f"sensor {text!r}")
+
+
+def noises(noise: Sequence[float], where: str) -> tuple[float, ...]:
+    """One positive noise, or one for each of three axes. **Raises** `LogError` for others."""
+    if len(noise) not in (1, 3):
+        raise LogError(f"{where}: wanted one noise or three, got {len(noise)}")
+    if not all(0 < part < np.inf for part in noise):
+        raise LogError(f"{where}: wanted a positive noise, got {min(noise):g}")
+    return tuple(noise)
 
 
 def wheel(text: str) -> WheelColumn:
@@ -150,7 +162,10 @@ def read_log(
         values = np.stack([table[name] for name in one.columns], axis=1)
         values *= UNITS[one.unit]
         seen = np.isfinite(values).all(axis=1)
-        noise = None if one.noise is None else one.noise * UNITS[one.unit]
+        noise = None
+        if one.noise is not None:
+            figures = one.noise if len(one.noise) > 1 else 3 * one.noise
+            noise = UNITS[one.unit] * np.array(figures)
         sensor, values = _sensor(one, values, noise, "bias" in free)
         readings.append((sensor, values[kept], seen[kept]))
     torque = _torque(path, t, table, wheels, free)
@@ -163,13 +178,14 @@ def read_log(
 
 
 def _sensor(
-    one: Channel, values: np.ndarray, noise: float | None, bias: bool
+    one: Channel, values: np.ndarray, noise: np.ndarray | None, bias: bool
 ) -> tuple[AbstractSensor, np.ndarray]:
     zero = [0.0, 0.0, 0.0] if bias else None
+    limit = None if one.limit is None else one.limit * UNITS[one.unit]
     if one.kind == "gyro":
-        return Gyro(noise, bias=zero), values
+        return Gyro(noise, bias=zero, limit=limit), values
     if one.kind == "accelerometer":
-        return Accelerometer(noise, place=[0.0, 0.0, 0.0], bias=zero), values
+        return Accelerometer(noise, place=[0.0, 0.0, 0.0], bias=zero, limit=limit), values
     if one.kind == "quaternion":
         return AttitudeSensor(noise), values
     try:
@@ -206,12 +222,14 @@ def problem_of(
     *,
     typical: float = 1.0,
     free: Sequence[str] = (),
+    loss: str = "soft-l1",
 ) -> Problem:
-    """The problem of these recordings, outliers counted linearly.
+    """The problem of these recordings.
 
     **Arguments:** `recordings` of `read_log`; `model` one of `ratios`, `principal-ratios`,
     `tensor`, `principal`; `typical` kg m², about how large the moments are; `free` as `read_log`
-    was given: a drag coefficient for all, a bias and a delay for each recording.
+    was given: a drag coefficient for all, a bias and a delay for each recording; `loss` how an
+    outlier counts: `soft-l1`, `huber` (both linearly), `none` (squared).
 
     **Raises** `LogError` for an unknown model or a scale that nothing can show.
     """
@@ -223,8 +241,11 @@ def problem_of(
     }
     if model not in charts:
         raise LogError(f"model: wanted one of {', '.join(MODELS)}, got {model!r}")
+    if loss not in LOSSES:
+        raise LogError(f"loss: wanted one of {', '.join(LOSSES)}, got {loss!r}")
+    counts = {"soft-l1": SoftL1(), "huber": Huber(), "none": None}[loss]
     return Problem(
-        list(recordings), charts[model], free=_free(recordings[0], typical, free), loss=SoftL1()
+        list(recordings), charts[model], free=_free(recordings[0], typical, free), loss=counts
     )
 
 

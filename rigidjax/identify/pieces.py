@@ -9,9 +9,10 @@ import numpy as np
 
 from rigidjax import _checks
 from rigidjax.identify import stacking
-from rigidjax.identify.free import Slot
-from rigidjax.identify.problem import Links, Own, Parameters, Problem, one_problem
+from rigidjax.identify.parameters import Own, Parameters
+from rigidjax.identify.problem import Links, Problem, one_problem
 from rigidjax.identify.recording import Reading, Recording
+from rigidjax.identify.several import Bodies
 
 # How wide the gaps may be, in turn: first the pieces are nearly free, at the end they are one.
 WIDTHS = (1.0, 1e-1, 1e-2, 1e-3)
@@ -53,10 +54,11 @@ def pieces(problem: Problem, count: int, *, width: float = WIDTHS[-1]) -> Proble
         _piece(record, int(first), int(last), index == count - 1)
         for index, (first, last) in enumerate(itertools.pairwise(edges))
     ]
-    cut = Problem(parts, problem.body, loss=problem.loss, prior=problem.prior)
+    chart = problem.body.charts[0] if isinstance(problem.body, Bodies) else problem.body
+    cut = Problem(parts, chart, loss=problem.loss, prior=problem.prior)
     # One rate for all, so that a gap is the same number at every joint.
     rate = jnp.broadcast_to(problem.reference.rate[0], (count,))
-    slots = tuple(Slot(s.leaf, s.name, False, s.positive, s.scale, s.prior) for s in problem.slots)
+    slots = tuple(slot.alone() for slot in problem.slots)
     links = Links(jnp.ones(count).at[-1].set(0.0), jnp.asarray(float(width)))
     return eqx.tree_at(
         lambda p: (p.reference.rate, p.slots, p.integrator, p.links),
@@ -83,8 +85,10 @@ def joined(problem: Problem, cut: Problem, found: Parameters) -> Parameters:
         value = next(values)
         if slot.each:
             each.append(value[None])
-        else:
-            shared.append(value)
+            continue
+        shared.append(value if slot.groups is None else value[None])
+        if slot.spread is not None:
+            each.append(jnp.zeros((1, *value.shape)))
     own = Own(spin, first.turn, first.place, first.speed, ())
     own = eqx.tree_at(lambda o: o.each, jax.tree.map(lambda leaf: leaf[None], own), tuple(each))
     return eqx.tree_at(lambda p: (p.body, p.shared, p.own), whole, (found.body, tuple(shared), own))

@@ -1,65 +1,38 @@
 """What is known, what is free, and how far a guess is from the data."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Array, Float, Int
 
 from rigidjax import _checks
 from rigidjax._types import HasAttitude, HasPose, Scalar
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.identify import stacking
 from rigidjax.identify.bodies import AbstractBodyChart
-from rigidjax.identify.free import Free, Slot, find, put
-from rigidjax.identify.loss import AbstractLoss
-from rigidjax.identify.prior import Entropic
-from rigidjax.identify.propagate import (
-    AbstractIntegrator,
-    free_states,
-    integrator_for,
-    shifted,
-    states_at,
+from rigidjax.identify.free import Free, Slot, find, grouped, shares
+from rigidjax.identify.full_scale import with_limits
+from rigidjax.identify.jacobian import (
+    all_errors,
+    filled,
+    first_state,
+    over_records,
+    states_of_one,
 )
+from rigidjax.identify.loss import AbstractLoss
+from rigidjax.identify.parameters import Own, Parameters, local
+from rigidjax.identify.prior import Entropic
+from rigidjax.identify.propagate import AbstractIntegrator, integrator_for
 from rigidjax.identify.recording import Recording
 from rigidjax.identify.reference import Reference, reference_of
-from rigidjax.identify.sensors import Moment
+from rigidjax.identify.several import Bodies, has_mass
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.torques import AbstractForce, Sum, Torque
 from rigidjax.motion.torques.base import require_law
-from rigidjax.rotation import quaternion
-from rigidjax.solve import equations_of_motion
-
-
-class Own(eqx.Module):
-    """The free numbers that belong to one recording, of order one.
-
-    **Fields:** `spin` (3,) the first body rate over the typical rate; `turn` (3,) the rotation
-    vector from the reference attitude to the first one (body frame, rad), or `None` where nothing
-    feels the attitude; `place`, `speed` (3,) the first position and velocity from the reference, in
-    typical lengths and speeds, or `None`; `each` the steps of the `Free`s with one value for each.
-    """
-
-    spin: Float[Array, "*records 3"]
-    turn: Float[Array, "*records 3"] | None
-    place: Float[Array, "*records 3"] | None
-    speed: Float[Array, "*records 3"] | None
-    each: tuple[Array, ...]
-
-
-class Parameters(eqx.Module):
-    """The free numbers of a fit, all unconstrained and of order one.
-
-    **Fields:** `body` the chart's numbers; `shared` the steps of the `Free`s with one value for
-    all; `own` what belongs to each recording, with a leading axis.
-    """
-
-    body: Float[Array, " chart"]
-    shared: tuple[Array, ...]
-    own: Own
 
 
 class Problem(eqx.Module):
@@ -72,12 +45,20 @@ class Problem(eqx.Module):
     - `body`: the chart of the body: `Ratios()` (the full tensor up to scale), `PrincipalRatios()`
       (body axes known to be principal), `Tensor()`, `Principal()` (with the scale), `Mass(guess)`
       (all ten numbers), `Known(body)`.
-    - `free`: what else is free, a sequence of `Free(where, name, …)`.
+      Of several bodies: recordings and charts by the bodies' names, as in
+      `Problem({"proof": [a, b], "box": [c]}, {"proof": Known(body), "box": Tensor(1e-3)})`.
+    - `free`: what else is free, a sequence of `Free(where, name, …)`: one value for all, for each
+      body, group or recording.
     - `torque`: what turns the body besides its own spin, for the recordings that have none.
     - `loss`: how an outlier counts: `SoftL1()`, `Huber()`, or `None` for plain least squares.
     - `prior`: `Entropic(guess, weight)`, a pull towards a body that is roughly known, or `None`.
     - `integrator`: `FixedSteps(n)` or `Adaptive(rtol, atol)` for a forced motion; `None` chooses by
       how finely it was sampled. A free body is followed by the closed form.
+    - `noise_each`: where a sensor's noise is estimated, one figure for all recordings (`False`),
+      for each (`True`), for each body (`"body"`), or for those of the same label (a sequence).
+
+    Channels that were cut off at full scale are found, and their readings there count as "at least
+    that much", as with a sensor's `limit`.
 
     The motion starts at the first time of each recording. The state climbs only as far as the
     sensors and the torque need: `Spin`, `Attitude`, `Rigid`.
@@ -92,7 +73,10 @@ class Problem(eqx.Module):
 
     records: Recording
     counts: tuple[int, ...] = eqx.field(static=True)
-    body: AbstractBodyChart
+    body: AbstractBodyChart | Bodies
+    of: tuple[str, ...] = eqx.field(static=True)
+    which: Int[Array, " records"] | None
+    noise_groups: Int[Array, " records"] | None
     slots: tuple[Slot, ...]
     loss: AbstractLoss | None
     prior: Entropic | None
@@ -103,17 +87,17 @@ class Problem(eqx.Module):
 
     def __init__(
         self,
-        recording: Recording | Sequence[Recording],
-        body: AbstractBodyChart,
+        recording: Recording | Sequence[Recording] | Mapping[str, Recording | Sequence[Recording]],
+        body: AbstractBodyChart | Mapping[str, AbstractBodyChart],
         *,
         free: Sequence[Free] = (),
         torque: Torque | None = None,
         loss: AbstractLoss | None = None,
         prior: Entropic | None = None,
         integrator: AbstractIntegrator | None = None,
+        noise_each: bool | str | Sequence[Any] = False,
     ):
-        recordings = [recording] if isinstance(recording, Recording) else recording
-        recordings = list(recordings) if isinstance(recordings, Sequence) else [recordings]
+        recordings, chart, of = _sorted(recording, body)
         if not recordings:
             raise ValueError("Problem: wanted at least one Recording, got an empty sequence")
         for item in recordings:
@@ -125,11 +109,12 @@ class Problem(eqx.Module):
                     "recording: wanted one, as Recording(t, …) makes it, got times and masks of "
                     f"shapes {sorted(lengths)}; of many give a sequence"
                 )
-        if not isinstance(body, AbstractBodyChart):
-            raise TypeError(
-                "Problem: wanted what of the body is free, such as Ratios() or PrincipalRatios(), "
-                f"got {type(body).__name__}"
-            )
+        for one in chart.charts if isinstance(chart, Bodies) else (chart,):
+            if not isinstance(one, AbstractBodyChart):
+                raise TypeError(
+                    "Problem: wanted what of the body is free, such as Ratios() or "
+                    f"PrincipalRatios(), got {type(one).__name__}"
+                )
         if isinstance(free, str):
             free = (free,)  # pyright: ignore[reportAssignmentType]
         _checks.instance(free, Sequence, "free", wanted="a sequence of Free(where, name)")
@@ -143,14 +128,25 @@ class Problem(eqx.Module):
         if torque is not None:
             require_law(torque)
             recordings = [_with(item, torque) for item in recordings]
+        recordings = with_limits(recordings)
         self.records, self.counts = stacking.stack(recordings)
-        self.body, self.loss, self.prior = body, loss, prior
-        self.slots = find(free, recordings[0])
-        self.rung = _rung(recordings[0], body)
+        self.body, self.loss, self.prior = chart, loss, prior
+        self.of, self.which, self.noise_groups = of, None, None
+        if isinstance(chart, Bodies):
+            self.which = jnp.asarray([chart.names.index(name) for name in of], jnp.int32)
+            if prior is not None:
+                raise ValueError("Problem: a prior is about one body, got several; give None")
+        apart = shares(noise_each, "noise_each")
+        if apart is True:
+            self.noise_groups = jnp.arange(len(of), dtype=jnp.int32)
+        elif not isinstance(apart, bool):
+            self.noise_groups, _ = grouped(apart, of, "noise_each")
+        self.slots = find(free, recordings[0], of)
+        self.rung = _rung(recordings[0], chart)
         self.reference = reference_of(recordings, self.rung)
         if integrator is None and self.records.torque is not None:
-            widest = max(float(jnp.max(jnp.diff(r.t))) for r in recordings)
-            integrator = integrator_for(widest, 1.5 * float(jnp.max(self.reference.rate)))
+            widest = max(float(np.diff(r.t).max()) for r in recordings)
+            integrator = integrator_for(widest, 1.5 * float(np.max(self.reference.rate)))
         self.integrator = integrator
         self.links = None
 
@@ -182,39 +178,41 @@ class Problem(eqx.Module):
         """The size of the body rate in the first recording, rad/s: the unit of `Own.spin`."""
         return self.reference.rate[0]
 
-    def start(self, body: Inertia | None = None) -> Parameters:
+    def start(self, body: Any = None) -> Parameters:
         """The parameters of the recordings as they are given, with this body or a sphere.
+
+        Of several bodies give a dict of those that are known about.
 
         **Raises:** `ValueError` for a body that the chart does not hold.
         """
-        if body is not None:
-            _checks.single(body, (Inertia, MassProperties), "body")
-        matter = Inertia(jnp.eye(3)) if body is None else body
-        vector = self.body.vector(matter) if body is not None else jnp.zeros(self.body.size)
-        if _checks.known(vector):
-            _checks.refuse(
-                vector,
-                ~jnp.isfinite(vector).all(),
-                f"body: {type(self.body).__name__} has no finite numbers for it; wanted principal "
-                "moments above zero, the largest below the sum of the others",
+        if isinstance(self.body, Bodies):
+            given = dict(body) if isinstance(body, Mapping) else {}
+            names, charts = self.body.names, self.body.charts
+            if not isinstance(body, Mapping | None) or set(given) - set(names):
+                raise ValueError(f"body: wanted bodies by name, of {', '.join(names)}, or None")
+            vector = jnp.concatenate(
+                [_numbers(chart, given.get(n)) for n, chart in zip(names, charts, strict=True)]
             )
-        moved = [jnp.zeros(jnp.shape(slot.read(self.recording))) for slot in self.slots]
-        shared = tuple(v for v, slot in zip(moved, self.slots, strict=True) if not slot.each)
-        each = tuple(
-            jnp.zeros((self.count, *v.shape))
-            for v, slot in zip(moved, self.slots, strict=True)
-            if slot.each
-        )
-        nothing = jnp.zeros((self.count, 3))
+        else:
+            vector = _numbers(self.body, body)
+        shared, each = [], []
+        for slot in self.slots:
+            size = jnp.shape(slot.read(self.records))[1:]
+            if not slot.each:
+                some = () if slot.groups is None else (len(slot.labels),)
+                shared.append(_zeros(*some, *size))
+            if slot.each or slot.spread is not None:
+                each.append(_zeros(self.count, *size))
+        nothing = _zeros(self.count, 3)
         return Parameters(
             vector,
-            shared,
+            tuple(shared),
             Own(
                 nothing,
                 None if self.rung is Spin else nothing,
                 nothing if self.rung is Rigid else None,
                 nothing if self.rung is Rigid else None,
-                each,
+                tuple(each),
             ),
         )
 
@@ -224,26 +222,43 @@ class Problem(eqx.Module):
         With several recordings the states have a leading axis.
         """
         fits(self, parameters)
-        body = self.body.body(parameters.body)
+        body = self.bodies(parameters)
         states = jax.vmap(lambda own, ref: first_state(self.rung, own, ref))(
             parameters.own, self.reference
         )
         return body, stacking.one(states, 0) if self.count == 1 else states
 
+    def bodies(self, parameters: Parameters) -> Any:
+        """The body that the parameters stand for; of several, a dict of them by name."""
+        if isinstance(self.body, Bodies):
+            return self.body.all(parameters.body)
+        return self.body.body(parameters.body)
+
     def scenes(self, parameters: Parameters) -> Recording:
         """The recordings with the parameters' values in the slots, with a leading axis."""
         fits(self, parameters)
-        return jax.vmap(lambda own, record: filled(self, parameters.shared, own, record))(
-            parameters.own, self.records
-        )
+        mine = local(self, parameters)
+        return jax.vmap(lambda one, record: filled(self, one, record))(mine, self.records)
 
     def values(self, parameters: Parameters) -> dict[str, Array]:
-        """The value of each `Free`, by name, in its unit; (R, …) for those with one for each."""
+        """The value of each `Free`, by name, in its unit.
+
+        (R, …) for those with one for each recording, (groups, …) for those with one for each group;
+        of those with a `spread` the shared value, and each recording's under "its name, own".
+        """
         scenes = self.scenes(parameters)
+        of_all = iter(parameters.shared)
         out = {}
         for slot in self.slots:
             value = slot.read(scenes)
-            out[slot.name] = value if slot.each else value[0]
+            if slot.each:
+                out[slot.name] = value
+                continue
+            step, start = next(of_all), slot.read(self.records)
+            first = 0 if slot.groups is None else _firsts(slot)
+            out[slot.name] = slot.move(start[first], step)
+            if slot.spread is not None:
+                out[f"{slot.name}, own"] = value
         return out
 
     def motion(self, parameters: Parameters) -> Any:
@@ -253,11 +268,10 @@ class Problem(eqx.Module):
         """
         fits(self, parameters)
 
-        def of_one(own: Own, record: Recording, ref: Reference) -> Any:
-            body = self.body.body(parameters.body)
-            return _states(self, body, parameters.shared, own, record, ref)[2]
+        def of_one(*trees: Any) -> Any:
+            return states_of_one(self, *trees)[3]
 
-        states = over_records(of_one, self, parameters.own, self.records, self.reference)
+        states = over_records(of_one, self, local(self, parameters))
         return stacking.one(states, 0) if self.count == 1 else states
 
     def errors(self, parameters: Parameters) -> tuple[Float[Array, "*records times _"], ...]:
@@ -306,10 +320,13 @@ def fits(problem: Problem, parameters: Parameters) -> Parameters:
     hint = "problem.start(body) makes them"
     _checks.instance(parameters, Parameters, "parameters", hint=hint)
     own, each = parameters.own, (problem.count, 3)
-    sizes = [jnp.shape(slot.read(problem.records))[1:] for slot in problem.slots]
-    apart = [slot.each for slot in problem.slots]
-    shared = [size for size, alone in zip(sizes, apart, strict=True) if not alone]
-    alone = [(problem.count, *size) for size, alone in zip(sizes, apart, strict=True) if alone]
+    shared, alone = [], []
+    for slot in problem.slots:
+        size = jnp.shape(slot.read(problem.records))[1:]
+        if not slot.each:
+            shared.append(size if slot.groups is None else (len(slot.labels), *size))
+        if slot.each or slot.spread is not None:
+            alone.append((problem.count, *size))
     wanted = {
         "body": [(problem.body.size,)],
         "shared": shared,
@@ -349,149 +366,67 @@ class Links(eqx.Module):
     width: Scalar
 
 
-def first_state(rung: type, own: Own, ref: Reference) -> Any:
-    """The first state of one recording."""
-    omega = own.spin * ref.rate
-    if rung is Spin:
-        return Spin(omega)
-    assert ref.q is not None and own.turn is not None
-    q = quaternion.multiply(ref.q, quaternion.exp(own.turn))
-    if rung is Attitude:
-        return Attitude(q, omega)
-    assert ref.x is not None and ref.v is not None
-    assert own.place is not None and own.speed is not None
-    x = ref.x + ref.length * own.place
-    return Rigid(x, ref.v + ref.length * ref.rate * own.speed, q, omega)
+def _sorted(recording: Any, body: Any) -> tuple[list[Recording], Any, tuple[str, ...]]:
+    """The recordings in a row, the chart or charts, and the name of each recording's body."""
+    if isinstance(recording, Mapping) or isinstance(body, Mapping):
+        if not (isinstance(recording, Mapping) and isinstance(body, Mapping)):
+            raise TypeError(
+                "Problem: of several bodies wanted both recordings and charts by name, got "
+                f"{type(recording).__name__} and {type(body).__name__}"
+            )
+        if set(recording) != set(body) or not body:
+            raise ValueError(
+                f"Problem: wanted a chart for each body, got recordings of {sorted(recording)} and "
+                f"charts of {sorted(body)}"
+            )
+        for chart in body.values():
+            _checks.instance(chart, AbstractBodyChart, "body", wanted="a chart such as Tensor()")
+        rows, of = [], []
+        for name in body:
+            found = recording[name]
+            some = [found] if isinstance(found, Recording) else list(found)
+            if not some:
+                raise ValueError(f"Problem: no recording of {name!r}")
+            rows += some
+            of += [name] * len(some)
+        return rows, Bodies(body), tuple(of)
+    if isinstance(recording, Recording):
+        return [recording], body, ("",)
+    rows = list(recording) if isinstance(recording, Sequence) else [recording]
+    return rows, body, ("",) * len(rows)
 
 
-def filled(problem: Problem, shared: tuple, own: Own, record: Recording) -> Recording:
-    """One recording with the values of the free numbers in it."""
-    of_all, of_each = iter(shared), iter(own.each)
-    values = [
-        slot.move(slot.read(record), next(of_each if slot.each else of_all))
-        for slot in problem.slots
-    ]
-    return put(record, problem.slots, values)
-
-
-def _states(
-    problem: Problem, body: Any, shared: tuple, own: Own, record: Recording, ref: Reference
-) -> tuple[Recording, Any, Any]:
-    """One recording with its values filled in, its first state and its states."""
-    record = filled(problem, shared, own, record)
-    state0 = first_state(problem.rung, own, ref)
-    matter = body
-    if problem.rung is not Rigid and isinstance(body, MassProperties):
-        matter = body.inertia
-    states = states_at(problem.integrator, matter, state0, record.t, record.torque)
-    return record, state0, states
-
-
-def errors_of_one(
-    problem: Problem, vector: Array, shared: tuple, own: Own, record: Recording, ref: Reference
-) -> tuple[tuple[Array, ...], Any]:
-    """The errors (T, k) of each sensor in one recording, and the last state."""
-    body = problem.body.body(vector)
-    record, state0, states = _states(problem, body, shared, own, record, ref)
-    matter = (
-        body.inertia if isinstance(body, MassProperties) and problem.rung is not Rigid else body
-    )
-    field = equations_of_motion(matter, state0, record.torque)
-    out = []
-    for reading in record.readings:
-        sensor = reading.sensor
-        offset = getattr(sensor, "offset", None)
-        seen, times = states, record.t
-        if offset is not None:
-            times = record.t + offset
-            if record.torque is None:
-                seen = free_states(body, state0, times - record.t[0])
-            else:
-                seen = jax.vmap(lambda t, s, by=offset: shifted(field, t, s, by))(record.t, states)
-
-        def error(t: Array, state: Any, value: Array, sensor: Any = sensor) -> Array:
-            return sensor.error(Moment(t, state, body, field), value)
-
-        errors = jax.vmap(error)(times, seen, reading.values)
-        out.append(jnp.where(reading.mask[:, None], errors, 0.0))
-    return tuple(out), jax.tree.map(lambda leaf: leaf[-1], states)
-
-
-def _all(parameters: Parameters, problem: Problem) -> tuple[tuple[Array, ...], Any]:
-    def of_one(own: Own, record: Recording, ref: Reference) -> Any:
-        return errors_of_one(problem, parameters.body, parameters.shared, own, record, ref)
-
-    return over_records(of_one, problem, parameters.own, problem.records, problem.reference)
-
-
-def over_records(function: Any, problem: Problem, *trees: Any) -> Any:
-    """`vmap` over the recordings; a single one is left alone, its loop compiles to less."""
-    if problem.count > 1:
-        return jax.vmap(function)(*trees)
-    out = function(*(stacking.one(tree, 0) for tree in trees))
-    return jax.tree.map(lambda leaf: leaf[None], out)
-
-
-@eqx.filter_custom_jvp
-def all_errors(parameters: Parameters, problem: Problem) -> tuple[tuple[Array, ...], Any]:
-    """The errors (R, T, k) of each sensor, and the last states (R, …).
-
-    Its derivative is taken recording by recording: the Jacobian has a block for what all share and
-    one for what each has of its own, and no zeros are carried through the motion.
-    """
-    return _all(parameters, problem)
-
-
-@all_errors.def_jvp
-def _all_errors_jvp(primals: Any, tangents: Any) -> Any:
-    parameters, problem = primals
-    step, beside = tangents
-    if jax.tree.leaves(beside):
-        raise TypeError(
-            "all_errors: only derivatives in the parameters are taken block by block; use "
-            "errors_of_one for those in the problem"
+def _numbers(chart: AbstractBodyChart, body: Any) -> Float[Array, " chart"]:
+    """The chart's numbers of a guess, or where it starts."""
+    if body is None:
+        return _zeros(chart.size)
+    _checks.single(body, (Inertia, MassProperties), "body")
+    vector = _vector(chart, body)
+    if _checks.known(vector):
+        _checks.refuse(
+            vector,
+            not np.isfinite(vector).all(),
+            f"body: {type(chart).__name__} has no finite numbers for it; wanted principal "
+            "moments above zero, the largest below the sum of the others",
         )
-    out, blocks = with_blocks(parameters, problem)
-    zeros = jax.tree.map(
-        lambda p, s: jnp.zeros_like(p) if s is None and p is not None else s,
-        parameters,
-        step,
-        is_leaf=lambda node: node is None,
-    )
-    return out, along(problem, blocks, zeros)
+    return vector
 
 
-def along(problem: Problem, blocks: Any, step: Parameters) -> Any:
-    """The derivatives of `with_blocks` along a step of all parameters."""
-
-    def flat(tree: Any, axes: int) -> Array:
-        leaves = [leaf.reshape(*leaf.shape[:axes], -1) for leaf in jax.tree.leaves(tree)]
-        return jnp.concatenate(leaves, axis=-1)
-
-    common = flat((step.body, step.shared), 0)
-    common = jnp.broadcast_to(common, (problem.count, common.shape[0]))
-    moved = jnp.concatenate([common, flat(step.own, 1)], axis=1)
-    return jax.tree.map(lambda block: jnp.einsum("r...n,rn->r...", block, moved), blocks)
+@eqx.filter_jit
+def _vector(chart: AbstractBodyChart, body: Any) -> Float[Array, " chart"]:
+    return chart.vector(body)
 
 
-def with_blocks(parameters: Parameters, problem: Problem) -> tuple[Any, Any]:
-    """The errors and last states, and their derivatives (…, n) in what each recording depends on.
+def _zeros(*shape: int) -> Array:
+    """Zeros by NumPy: JAX compiles a program for each shape."""
+    return jnp.asarray(np.zeros(shape, jnp.result_type(float)))
 
-    The n numbers are the body's, the shared ones, then the recording's own, each flattened.
-    """
 
-    def of_one(own: Own, record: Recording, ref: Reference) -> Any:
-        flat, restore = ravel_pytree((parameters.body, parameters.shared, own))
-
-        def value(vector: Array) -> Any:
-            body, shared, mine = restore(vector)
-            out = errors_of_one(problem, body, shared, mine, record, ref)
-            return out, out
-
-        blocks, out = jax.jacfwd(value, has_aux=True)(flat)
-        return out, blocks
-
-    return over_records(of_one, problem, parameters.own, problem.records, problem.reference)
+def _firsts(slot: Slot) -> Array:
+    """The first recording of each group."""
+    assert slot.groups is not None
+    rows = jnp.arange(len(slot.labels), dtype=slot.groups.dtype)
+    return jnp.argmax(slot.groups[None, :] == rows[:, None], axis=1)
 
 
 def _with(recording: Recording, torque: Torque) -> Recording:
@@ -502,7 +437,7 @@ def _with(recording: Recording, torque: Torque) -> Recording:
     return eqx.tree_at(lambda r: r.torque, recording, torque, is_leaf=lambda node: node is None)
 
 
-def _rung(recording: Recording, body: AbstractBodyChart) -> type:
+def _rung(recording: Recording, body: AbstractBodyChart | Bodies) -> type:
     felt = [reading.sensor.feels for reading in recording.readings]
     law: Any = recording.torque
     if law is not None:
@@ -510,11 +445,12 @@ def _rung(recording: Recording, body: AbstractBodyChart) -> type:
     parts = law.parts if isinstance(law, Sum) else (law,)
     forced = any(isinstance(part, AbstractForce) for part in parts)
     if HasPose in felt or forced:
-        sample: Any = eqx.filter_eval_shape(body.body, jnp.zeros(body.size))
-        if not isinstance(sample, MassProperties):
-            raise ValueError(
-                "Problem: a sensor or force needs a body that moves, whose mass is known or free: "
-                f"wanted Mass(guess) or Known(MassProperties), got {type(body).__name__}"
-            )
+        for chart in body.charts if isinstance(body, Bodies) else (body,):
+            if not has_mass(chart):
+                raise ValueError(
+                    "Problem: a sensor or force needs a body that moves, whose mass is known or "
+                    "free: wanted Mass(guess) or Known(MassProperties), got "
+                    f"{type(chart).__name__}"
+                )
         return Rigid
     return Attitude if HasAttitude in felt else Spin

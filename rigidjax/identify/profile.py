@@ -10,7 +10,7 @@ from jaxtyping import Array
 
 from rigidjax.identify import reported
 from rigidjax.identify.fit import Fit, one_fit
-from rigidjax.identify.problem import Parameters
+from rigidjax.identify.parameters import Parameters
 from rigidjax.identify.residual import residuals
 from rigidjax.identify.search import cost_of, misfit, solver_for
 
@@ -21,7 +21,7 @@ def profile(fit: Fit, name: str, level: float = 0.95) -> tuple[float, float]:
     All else is fitted anew with the quantity held at a value; the ends are where twice the misfit
     has grown by the square of the quantile, `t²`. Where the misfit is not quadratic (a quantity
     that the data see weakly, or near a boundary) this is the interval to trust. Where the errors
-    hang together the growth is divided by how many samples they do, as `Fit.interval` does.
+    are autocorrelated the growth is divided by over how many samples, as `Fit.interval` does.
 
     **Arguments:** `fit`; `name` as in `fit.interval()`; `level` the probability. **Returns** the
     interval, infinite or 0 on a side where the misfit never grows that far within a factor of 1e3

@@ -13,6 +13,7 @@ import numpy as np
 from rigidjax import _checks
 from rigidjax._names import own_names
 from rigidjax.identify.fit import Fit, one_fit
+from rigidjax.identify.full_scale import at_limit
 
 _UNITS = {"rad/s": 1.0, "deg/s": 180 / np.pi, "deg/day": 86400 * 180 / np.pi}
 Row = tuple[str, float, float, float, str]
@@ -113,9 +114,9 @@ def as_dict(fit: Fit, files: Sequence[str] = (), more: Sequence[Row] = ()) -> di
             for name, value, low, high, unit in more
         },
         "rms": {
-            f"{index} {type(sensor).__name__}": {"value": plain(rms), "unit": sensor.unit}
-            for index, (sensor, rms) in enumerate(
-                zip(fit.problem.records.sensors, fit.rms, strict=True)
+            f"{index} {name}": {"value": plain(rms), "axes": list(map(plain, axes)), "unit": unit}
+            for index, ((name, axes, unit), rms) in enumerate(
+                zip(_rms_of_axes(fit), fit.rms, strict=True)
             )
         },
         "noise": [np.asarray(noise).tolist() for noise in fit.noise],
@@ -128,6 +129,23 @@ def as_dict(fit: Fit, files: Sequence[str] = (), more: Sequence[Row] = ()) -> di
         ],
         "identifiability": list(fit.identifiability),
     }
+
+
+def _rms_of_axes(fit: Fit) -> list[tuple[str, list[float], str]]:
+    """Root mean square error of each component of each sensor, without readings at full scale.
+
+    **Returns** for each sensor its name, the figures, and their unit.
+    """
+    one_fit(fit)
+    readings = fit.problem.records.readings
+    out = []
+    for error, reading, full in zip(fit.residuals, readings, at_limit(readings), strict=True):
+        kept = reading.seen[..., None] & ~full
+        squares = np.where(kept, np.asarray(error).reshape(kept.shape) ** 2, 0.0)
+        mean = squares.sum(axis=(0, 1)) / np.maximum(kept.sum(axis=(0, 1)), 1)
+        sensor = reading.sensor
+        out.append((type(sensor).__name__, [float(x) for x in np.sqrt(mean)], sensor.unit))
+    return out
 
 
 def write_json(
@@ -148,7 +166,7 @@ def write_html(
     files: Sequence[str] = (),
     more: Sequence[Row] = (),
 ) -> None:
-    """A page that stands alone: verdict, table, words, figures inside it.
+    """A page that stands alone: status, table, words, errors, starts, figures inside it.
 
     **Arguments:** `fit`; `path`; `title`; `figures` of matplotlib, such as those of
     `rigidjax.plot.fit`; `rate_unit` as for `rows`; `files` the names of what was read; `more`
@@ -162,6 +180,17 @@ def write_html(
         cells = (name, shown[0], f"{shown[1]} … {shown[2]}", unit)
         lines.append("<tr>" + "".join(f"<td>{html.escape(c)}</td>" for c in cells) + "</tr>")
     words = "".join(f"<li>{html.escape(line)}</li>" for line in fit.identifiability)
+    sizes = "".join(
+        f"<tr><td>{html.escape(name)}</td><td>{' '.join(f'{x:.3g}' for x in axes)}</td>"
+        f"<td>{html.escape(unit)}</td></tr>"
+        for name, axes, unit in _rms_of_axes(fit)
+    )
+    starts = "".join(
+        f"<tr><td>{number}</td><td>{start.cost:.6g}</td>"
+        f"<td>{'converged' if start.converged else 'not converged'}</td>"
+        f"<td>{'explains the data' if start.fits else 'does not explain the data'}</td></tr>"
+        for number, start in enumerate(fit.starts, 1)
+    )
     pictures = "".join(
         f'<img alt="figure {index}" src="data:image/png;base64,{_png(figure)}">'
         for index, figure in enumerate(figures, 1)
@@ -183,6 +212,8 @@ img {{ max-width: 100%; margin: 1rem 0 }} .status {{ color: {colour}; font-weigh
 <table><tr><th></th><th>value</th><th>95 % interval</th><th>unit</th></tr>{"".join(lines)}</table>
 <p>Covariance: {html.escape(fit.covariance_kind)}.</p>
 <ul>{words}</ul>
+<table><tr><th>sensor</th><th>rms error an axis</th><th>unit</th></tr>{sizes}</table>
+<table><tr><th>start</th><th>misfit</th><th></th><th></th></tr>{starts}</table>
 {pictures}
 </html>
 """

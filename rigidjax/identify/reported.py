@@ -11,7 +11,10 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
 from rigidjax import _checks
-from rigidjax.identify.problem import Parameters, Problem
+from rigidjax.identify.bodies import AbstractBodyChart
+from rigidjax.identify.parameters import Parameters
+from rigidjax.identify.problem import Problem
+from rigidjax.identify.several import Bodies
 
 if TYPE_CHECKING:
     from rigidjax.identify.fit import Fit
@@ -38,18 +41,40 @@ class Quantity(eqx.Module):
 
 def labels(problem: Problem) -> list[tuple[str, str, bool]]:
     """Name, unit and whether positive, in the order of `vector`."""
-    chart = problem.body
-    out = [(name, chart.unit, True) for name in chart.log_names]
-    out += [(name, chart.unit, False) for name in chart.plain_names]
-    for record in range(problem.count):
-        where = "" if problem.count == 1 else f" [{record}]"
+    out = []
+    for name, chart in charts(problem):
+        out += [(f"{log}{name}", chart.unit, True) for log in chart.log_names]
+        out += [(f"{plain}{name}", chart.unit, False) for plain in chart.plain_names]
+    names = recording_names(problem)
+    for where in names:
         out += [(f"Ω{axis}{where}", "rad/s", False) for axis in "xyz"]
     for slot in problem.slots:
         shape = np.shape(slot.read(problem.records))[1:]
         parts = [""] if not shape else [f" {_place(i)}" for i in np.ndindex(shape)]
-        for record in range(problem.count if slot.each else 1):
-            where = f" [{record}]" if slot.each and problem.count > 1 else ""
+        groups = names if slot.each else [f" [{label}]" for label in slot.labels] or [""]
+        for where in groups:
             out += [(f"{slot.name}{part}{where}", "", slot.positive) for part in parts]
+        if slot.spread is not None:
+            for where in names:
+                out += [(f"{slot.name}{part}, own{where}", "", slot.positive) for part in parts]
+    return out
+
+
+def charts(problem: Problem) -> list[tuple[str, AbstractBodyChart]]:
+    """The chart of each body, and what is added to the names of its quantities."""
+    if not isinstance(problem.body, Bodies):
+        return [("", problem.body)]
+    return [(f" [{n}]", c) for n, c in zip(problem.body.names, problem.body.charts, strict=True)]
+
+
+def recording_names(problem: Problem) -> list[str]:
+    """What is added to the names of a recording's quantities: its number, among its body's."""
+    if problem.count == 1:
+        return [""]
+    out: list[str] = []
+    for index, name in enumerate(problem.of):
+        number = problem.of[:index].count(name)
+        out.append(f" [{name} {number}]" if name else f" [{number}]")
     return out
 
 
@@ -59,14 +84,18 @@ def _place(index: tuple[int, ...]) -> str:
 
 def vector(problem: Problem, parameters: Parameters) -> Array:
     """The reported quantities, logarithms of those that are positive."""
-    chart = problem.body
-    body = chart.body(parameters.body)
     rates = parameters.own.spin * problem.reference.rate[:, None]
-    parts = [chart.logs(body), chart.plain(body), rates.reshape(-1)]
+    found = problem.bodies(parameters)
+    bodies = found.values() if isinstance(found, dict) else (found,)
+    parts = []
+    for (_, chart), body in zip(charts(problem), bodies, strict=True):
+        parts += [chart.logs(body), chart.plain(body)]
+    parts.append(rates.reshape(-1))
     values = problem.values(parameters)
     for slot in problem.slots:
-        value = values[slot.name].reshape(-1)
-        parts.append(jnp.log(value) if slot.positive else value)
+        for name in (slot.name, f"{slot.name}, own")[: 1 + (slot.spread is not None)]:
+            value = values[name].reshape(-1)
+            parts.append(jnp.log(value) if slot.positive else value)
     return jnp.concatenate([part.astype(rates.dtype) for part in parts])
 
 
@@ -96,6 +125,12 @@ def quantities(
         shown = float(np.exp(value)) if positive else float(value)
         out.append(Quantity(name, shown, float(deviation), unit, positive))
     return tuple(out)
+
+
+def covariance(fit: "Fit") -> np.ndarray:
+    """Covariance of the reported quantities, of the logarithms of those that are positive."""
+    _, slope = (np.asarray(x) for x in _value_and_slope(fit.problem, fit.parameters))
+    return slope @ np.asarray(fit.seen) @ slope.T
 
 
 def carried(slope: np.ndarray, covariance: np.ndarray, null: np.ndarray) -> np.ndarray:
@@ -130,7 +165,7 @@ def interval_of(
 def quantile(fit: "Fit", level: float) -> float:
     """Half-width of an interval in standard deviations: Student's where the noise is estimated.
 
-    Errors that hang together count as the fewer they are.
+    Autocorrelated errors count as the fewer they are.
     """
     level = _checks.positive(level, "level", "a level between 0 and 1")
     if not level < 1:

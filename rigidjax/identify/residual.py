@@ -6,8 +6,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from rigidjax.identify.jacobian import all_errors, first_state
 from rigidjax.identify.loss import shrink, weight
-from rigidjax.identify.problem import Parameters, Problem, all_errors, first_state
+from rigidjax.identify.parameters import Parameters
+from rigidjax.identify.problem import Problem
+from rigidjax.identify.several import Bodies
 from rigidjax.motion import Attitude, Rigid
 from rigidjax.rotation import quaternion
 
@@ -57,11 +60,32 @@ def residuals(parameters: Parameters, args: Any) -> Any:
 def assembled(parameters: Parameters, args: Any, errors: tuple, ends: Any) -> Any:
     """`residuals` of errors and last states that are known."""
     problem, noise, weights = args
+    return seen(problem, errors, noise, weights), beside(parameters, problem, ends)
+
+
+def seen(problem: Problem, errors: tuple, noise: Noise, weights: Array) -> tuple[Array, ...]:
+    """The readings' residuals (R, T, k) as least squares is to see them."""
     read = []
     for scaled in whitened(problem, errors, noise):
-        shrunk = jax.vmap(jax.vmap(lambda e: shrink(problem.loss, e)))(scaled)
+        shrunk = scaled
+        if problem.loss is not None:
+            shrunk = jax.vmap(jax.vmap(lambda e: shrink(problem.loss, e)))(scaled)
         read.append(shrunk * weights[..., None])
-    return tuple(read), beside(parameters, problem, ends)
+    return tuple(read)
+
+
+def seen_rows(
+    problem: Problem, errors: tuple, blocks: tuple, noise: Noise, weights: Array
+) -> list[tuple[Array, Array]]:
+    """For each sensor, `seen` and its derivatives (R, T, k, n), of those of the errors."""
+
+    def of(errors: tuple) -> tuple[Array, ...]:
+        return seen(problem, errors, noise, weights)
+
+    # What each reading says depends on its own error alone: a product of small matrices.
+    read, push = jax.linearize(of, errors)
+    rows = jax.vmap(push, in_axes=-1, out_axes=-1)(blocks)
+    return list(zip(read, rows, strict=True))
 
 
 def beside(parameters: Parameters, problem: Problem, ends: Any) -> tuple[Array, ...]:
@@ -72,7 +96,10 @@ def beside(parameters: Parameters, problem: Problem, ends: Any) -> tuple[Array, 
         step = next(each if slot.each else shared)
         if slot.prior is not None:
             out.append(step / slot.prior)
+        if slot.spread is not None:
+            out.append(next(each) / slot.spread)
     if problem.prior is not None:
+        assert not isinstance(problem.body, Bodies)
         body = problem.body.body(parameters.body)
         out.append(problem.prior.residuals(body, scaled=problem.body.unit != ""))
     if problem.links is not None:

@@ -8,22 +8,25 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from rigidjax.identify.checkpoint import Position, Tried
-from rigidjax.identify.problem import Parameters, Problem, with_blocks
-from rigidjax.identify.residual import Noise, assembled, residuals
+from rigidjax.identify.levenberg_marquardt import (
+    BOLD as BOLD,
+    CAREFUL as CAREFUL,
+    Search,
+    Settings,
+    descend,
+)
+from rigidjax.identify.parameters import Parameters
+from rigidjax.identify.problem import Problem
+from rigidjax.identify.residual import Noise, residuals
 
 # The record is fitted from its beginning first: a long one is a forest of wrong minima (the phase
 # slips by whole turns), a short one is not.
 HORIZONS = (0.25, 0.5, 1.0)
 # Steps between two looks at the clock, the keyboard and the checkpoint.
 STRIDE = 25
-# How many standard deviations (all else at rest) a unit of the search is. Levenberg's damping
-# starts at 1, the curvature is this squared in every direction: small steps far away, whole ones
-# near the bottom, which a narrow valley needs.
-CAREFUL, BOLD = 1.0 / 30.0, 30.0
 # A stride that lowers the misfit by less than this share has come to the bottom.
 SETTLED = 1e-7
 # A part of the record may be fitted at the expense of the whole, but not by more than this factor.
@@ -35,81 +38,33 @@ def least_squares(
     problem: Problem,
     noise: Noise,
     weights: Float[Array, "records times"],
-    solver: Any,
+    tolerance: float,
     max_steps: int,
-    bold: float,
+    damping: float,
 ) -> Tried:
-    """At most `max_steps` steps of the solver from `start`."""
-    # By the program that everything else runs as well: less to compile.
-    sizes = _sizes(start, problem, noise, weights, evaluate(start, problem)[1], jnp.asarray(bold))
-    value, done = _solve(start, sizes, problem, noise, weights, solver, max_steps)
-    cost = _cost(value, problem, noise, weights, evaluate(value, problem)[0])
-    return _safe(start, value, cost, done)
+    """At most `max_steps` steps from `start`."""
+    settings = Settings(tolerance, damping, max_steps)
+    value, end = _descend(start, problem, noise, weights, settings)
+    return _safe(start, value, end.cost, end.converged)
 
 
-@eqx.filter_jit
-def _sizes(
-    parameters: Parameters,
-    problem: Problem,
-    noise: Noise,
-    weights: Any,
-    blocks: Any,
-    bold: Array,
-) -> Parameters:
-    """The step of each parameter that the data feel alike, all else at rest.
-
-    Levenberg's damping is the same for all parameters: in these units it is Marquardt's
-    (Moré 1978, doi:10.1007/BFb0067700).
-    """
-    first = jax.tree.map(lambda leaf: leaf[0], parameters.own)
-    _, restore = ravel_pytree((parameters.body, parameters.shared, first))
-    squares = jnp.zeros((problem.count, 1), weights.dtype)
-    for block, sigma in zip(blocks[0], noise, strict=True):
-        felt = (block / sigma[:, None, :, None] * weights[..., None, None]) ** 2
-        squares = squares + felt.sum(axis=(1, 2))
-    body, shared, own = jax.vmap(restore)(squares)
-    found = Parameters(body.sum(axis=0), jax.tree.map(lambda leaf: leaf.sum(axis=0), shared), own)
-    of_all, of_each = iter(found.shared), iter(found.own.each)
-    moved = {True: [], False: []}
-    for slot in problem.slots:
-        felt = next(of_each if slot.each else of_all)
-        held = 0.0 if slot.prior is None else 1.0 / slot.prior**2
-        moved[slot.each].append(felt + held)
-    found = eqx.tree_at(
-        lambda p: (p.shared, p.own.each), found, (tuple(moved[False]), tuple(moved[True]))
-    )
-    most = ravel_pytree(found)[0].max()
-    floor = jnp.where(most > 0, 1e-12 * most, 1.0)
-
-    def size(felt: Array) -> Array:
-        return bold / jnp.sqrt(jnp.maximum(felt, floor))
-
-    good = jnp.isfinite(most)
-    units = jax.tree.map(lambda felt: jnp.where(good, size(felt), 1.0), found)
-
-    # What the data hardly feel must not be flung about: of the numbers that are of order one by
-    # their making (the unit of a `Free` is a user's guess) none moves faster than that.
-    def made(p: Parameters) -> tuple[Any, ...]:
-        return p.body, p.own.spin, p.own.turn, p.own.place, p.own.speed
-
-    slow = tuple(None if unit is None else jnp.minimum(unit, 1.0) for unit in made(units))
-    return eqx.tree_at(made, units, slow, is_leaf=lambda leaf: leaf is None)
+_descend = eqx.filter_jit(descend)
 
 
-@eqx.filter_jit
 def evaluate(parameters: Parameters, problem: Problem) -> Any:
     """Errors and last states with their derivatives (see `with_blocks`).
 
-    The one program outside the search that follows the motion: all else is made of it.
+    By the program of the search, which is the only one that follows the motion.
     """
-    return with_blocks(parameters, problem)
+    noise = tuple(
+        jnp.ones((problem.count, reading.sensor.components), problem.records.t.dtype)
+        for reading in problem.records.readings
+    )
+    return _at(parameters, problem, noise, jnp.ones_like(problem.records.t)).found
 
 
-@eqx.filter_jit
-def _cost(
-    parameters: Parameters, problem: Problem, noise: Noise, weights: Any, found: Any
-) -> Float[Array, ""]:
-    return half_sum(assembled(parameters, (problem, noise, weights), *found))
+def _at(parameters: Parameters, problem: Problem, noise: Noise, weights: Array) -> Search:
+    return _descend(parameters, problem, noise, weights, Settings(0.0, 1.0, 0))[1]
 
 
 @eqx.filter_jit
@@ -118,52 +73,15 @@ def many(
     problem: Problem,
     noise: Noise,
     weights: Float[Array, "records times"],
-    solver: Any,
-    max_steps: int,
+    settings: Settings,
 ) -> Tried:
     """`least_squares` from many starts at once (a leading axis on `starts`)."""
 
     def one(start: Parameters) -> Tried:
-        blocks = with_blocks(start, problem)[1]
-        sizes = _sizes(start, problem, noise, weights, blocks, jnp.asarray(CAREFUL))
-        value, done = _one(start, sizes, problem, noise, weights, solver, max_steps)
-        return _safe(start, value, misfit(value, (problem, noise, weights)), done)
+        value, end = descend(start, problem, noise, weights, settings)
+        return _safe(start, value, end.cost, end.converged)
 
     return jax.vmap(one)(starts)
-
-
-def _one(
-    start: Parameters,
-    sizes: Parameters,
-    problem: Problem,
-    noise: Noise,
-    weights: Any,
-    solver: Any,
-    max_steps: int,
-) -> tuple[Parameters, Array]:
-    least: Any = optx.least_squares
-    out = least(
-        _in_units,
-        solver,
-        jax.tree.map(jnp.zeros_like, start),
-        (start, sizes, (problem, noise, weights)),
-        options={"jac": "fwd"} if isinstance(solver, optx.AbstractLeastSquaresSolver) else {},
-        max_steps=max_steps,
-        throw=False,
-    )
-    return _stepped(start, sizes, out.value), out.result == optx.RESULTS.successful
-
-
-_solve = eqx.filter_jit(_one)
-
-
-def _stepped(start: Parameters, sizes: Parameters, steps: Parameters) -> Parameters:
-    return jax.tree.map(lambda p, size, step: p + size * step, start, sizes, steps)
-
-
-def _in_units(steps: Parameters, args: Any) -> Any:
-    start, sizes, rest = args
-    return residuals(_stepped(start, sizes, steps), rest)
 
 
 def _safe(start: Parameters, value: Parameters, cost: Array, done: Array) -> Tried:
@@ -175,8 +93,7 @@ def _safe(start: Parameters, value: Parameters, cost: Array, done: Array) -> Tri
 
 def cost_of(parameters: Parameters, problem: Problem, noise: Noise) -> float:
     """The misfit over the whole of the records."""
-    whole = jnp.ones_like(problem.records.t)
-    return float(_cost(parameters, problem, noise, whole, evaluate(parameters, problem)[0]))
+    return float(_at(parameters, problem, noise, jnp.ones_like(problem.records.t)).cost)
 
 
 def misfit(parameters: Parameters, args: Any) -> Float[Array, ""]:
@@ -210,7 +127,7 @@ def settle(
     problem: Problem,
     noise: Noise,
     weights: Float[Array, "records times"],
-    solver: Any,
+    tolerance: float,
     max_steps: int,
     look: Callable[[Tried, int, bool], None] = lambda tried, strides, over: None,
     *,
@@ -224,12 +141,15 @@ def settle(
     `near` says that it is near the bottom already; `strides` how many led to it. `look` is called
     after each, with how many there are by then and whether that was the last.
     """
+    if strides and bool(tried.converged):
+        look(tried, strides, True)
+        return tried
     for first in range(strides * STRIDE, max_steps, STRIDE):
         before = float(tried.cost)
         count = min(STRIDE, max_steps)
         strides += 1
         bold = BOLD if first or near else CAREFUL
-        after = least_squares(tried.parameters, problem, noise, weights, solver, count, bold)
+        after = least_squares(tried.parameters, problem, noise, weights, tolerance, count, bold)
         if not np.isfinite(float(after.cost)):
             # The motion was lost on the way: what is known is where this stride began.
             cost = jnp.asarray(cost_of(tried.parameters, problem, noise))
@@ -238,7 +158,8 @@ def settle(
             break
         tried = after
         # At the very bottom round-off refuses every step: whether it moved is what counts.
-        settled = before - float(tried.cost) < SETTLED * (1.0 + abs(before))
+        stands = before - float(tried.cost) < SETTLED * (1.0 + abs(before))
+        settled = bool(tried.converged) or stands
         tried = Tried(tried.parameters, tried.cost, jnp.asarray(settled))
         look(tried, strides, settled or first + STRIDE >= max_steps)
         if settled:
@@ -255,23 +176,30 @@ def climb(
     start: Position,
     problem: Problem,
     noise: Noise,
-    solver: Any,
+    tolerance: float,
     max_steps: int,
     *,
     look: Callable[[Position], None] = lambda position: None,
 ) -> Tried:
-    """One start through the horizons; `look` is called after each stride with where it stands."""
-    tried = start.tried
+    """One start down to the bottom; `look` is called after each stride with where it stands.
+
+    The whole record at once, where that explains it; else through the horizons.
+    """
+    tried, start = _at_once(start, problem, noise, tolerance, max_steps)
+    level = np.inf
     for stage, seen in enumerate(horizons(problem)):
         if stage < start.stage:
             continue
         if stage < len(HORIZONS) - 1:
             # A part of the record need not be fitted to the end, only to come near.
             count, before = min(STRIDE, max_steps), tried.parameters
-            after = least_squares(before, problem, noise, seen, solver, count, CAREFUL).parameters
+            found = least_squares(before, problem, noise, seen, tolerance, count, CAREFUL)
+            after = found.parameters
             # What explains a part alone may be nonsense beyond it: a drag that drives.
-            worse = cost_of(after, problem, noise) / max(cost_of(before, problem, noise), 1e-300)
-            tried = fresh(after if worse < WILD else before)
+            first = cost_of(before, problem, noise) if stage == start.stage else level
+            level = cost_of(after, problem, noise)
+            kept = level < WILD * max(first, 1e-300)
+            tried, level = fresh(after if kept else before), level if kept else first
             look(Position(stage + 1, 0, tried))
             continue
 
@@ -279,18 +207,42 @@ def climb(
             look(Position(stage + over, strides, now))
 
         done = start.strides if stage == start.stage else 0
-        tried = settle(tried, problem, noise, seen, solver, max_steps, at_last, strides=done)
+        tried = settle(tried, problem, noise, seen, tolerance, max_steps, at_last, strides=done)
     return tried
 
 
+def _at_once(
+    start: Position, problem: Problem, noise: Noise, tolerance: float, max_steps: int
+) -> tuple[Tried, Position]:
+    """The start fitted to the whole record, if that explains it; else as it is."""
+    if start.stage or start.strides:
+        return start.tried, start
+    whole = jnp.ones_like(problem.records.t)
+    count = min(STRIDE, max_steps)
+    found = least_squares(start.tried.parameters, problem, noise, whole, tolerance, count, CAREFUL)
+    if not bool(found.converged) or float(found.cost) > _enough(problem):
+        return start.tried, start
+    return found, Position(len(HORIZONS) - 1, 1, found)
+
+
+def _enough(problem: Problem) -> float:
+    """A misfit that only the motion has: of χ² twice its mean; of a noise that was guessed at a
+    tenth of the signal, errors of a hundredth.
+    """
+    total = 0.0
+    for reading in problem.records.readings:
+        share = 0.01 if reading.sensor.noise is None else 1.0
+        total += share * reading.sensor.components * int(reading.seen.sum())
+    return total
+
+
 def climb_together(
-    points: Parameters, problem: Problem, noise: Noise, solver: Any, max_steps: int
+    points: Parameters, problem: Problem, noise: Noise, tolerance: float, max_steps: int
 ) -> list[Tried]:
     """Many starts through the horizons in one `vmap` (a leading axis on `points`)."""
-    tried = None
-    stages = horizons(problem)
-    for seen in stages:
-        tried = many(points, problem, noise, seen, solver, max_steps)
+    tried, settings = None, Settings(tolerance, CAREFUL, max_steps)
+    for seen in horizons(problem):
+        tried = many(points, problem, noise, seen, settings)
         points = tried.parameters
     assert tried is not None
     count = int(tried.cost.shape[0])

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from rigidjax import _checks
 from rigidjax.identify.recording import Reading, Recording
 from rigidjax.motion.torques import Linear, Series
 
@@ -30,16 +31,31 @@ def stack(recordings: Sequence[Recording]) -> tuple[Recording, tuple[int, ...]]:
                 "its torque; give all of them the same kinds in the same order, with the same "
                 "options"
             )
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *alike), counts
+    return jax.tree.map(_stacked, *alike), counts
+
+
+def _stacked(*leaves: Any) -> Any:
+    # By NumPy where the numbers are known: JAX compiles a program for each shape.
+    if _checks.known(leaves):
+        return jnp.asarray(np.stack([np.asarray(leaf) for leaf in leaves]))
+    return jnp.stack(leaves)
 
 
 def one(records: Any, index: int) -> Any:
     """The tree at an index of the leading axis."""
-    return jax.tree.map(lambda leaf: leaf[index] if eqx.is_array(leaf) else leaf, records)
+
+    def pick(leaf: Any) -> Any:
+        if not eqx.is_array(leaf):
+            return leaf
+        return jnp.asarray(np.asarray(leaf)[index]) if _checks.known(leaf) else leaf[index]
+
+    return jax.tree.map(pick, records)
 
 
 def cut(recording: Recording, count: int) -> Recording:
     """A recording without what `stack` appended."""
+    if recording.t.shape[0] == count:
+        return recording
     readings = tuple(
         Reading(r.sensor, r.values[:count], r.mask[:count]) for r in recording.readings
     )

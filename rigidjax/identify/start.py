@@ -10,10 +10,12 @@ from jaxtyping import PRNGKeyArray
 
 from rigidjax._types import HasSpin
 from rigidjax.body.inertia import Inertia
-from rigidjax.identify.problem import Parameters, Problem
+from rigidjax.identify.parameters import Parameters
+from rigidjax.identify.problem import Problem
 from rigidjax.identify.recording import Recording
 from rigidjax.identify.reference import first_rate
 from rigidjax.identify.sensors import Gyro
+from rigidjax.identify.several import Bodies
 from rigidjax.identify.sightings import rates
 from rigidjax.motion import Spin
 from rigidjax.motion.torques import Torque, evaluate
@@ -23,31 +25,40 @@ for _k, (_i, _j) in enumerate([(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)]):
     BASIS[_k, _i, _j] = BASIS[_k, _j, _i] = 1.0
 
 
-def starting_points(problem: Problem, count: int, key: PRNGKeyArray) -> list[Parameters]:
+def starting_points(problem: Problem, count: int, key: PRNGKeyArray | None) -> list[Parameters]:
     """`count` starting points, the most informed first.
 
-    **Arguments:** `problem`; `count` ≥ 1; `key` a JAX random key. The first body rate is the first
-    reading (or the turn between attitudes over its time). The inertia is the regression on Euler's
-    equations where it was sampled finely enough, else a sphere; further starts scatter the
-    shape over the whole chart and the rate by a tenth. What a `Free` moves starts as it is given.
+    **Arguments:** `problem`; `count` ≥ 1; `key` a JAX random key, or `None`. The first body rate is
+    the first reading (or the turn between attitudes over its time). The inertia is the regression
+    on Euler's equations where it was sampled finely enough, else a sphere; further starts scatter
+    the shape over the whole chart and the rate by a tenth. What a `Free` moves starts as it is
+    given.
     """
     recordings = problem.recordings
-    regressed = regress_inertia(recordings)
-    start = problem.start(regressed)
+    if isinstance(problem.body, Bodies):
+        found = {}
+        for name in problem.body.names:
+            mine = [r for r, of in zip(recordings, problem.of, strict=True) if of == name]
+            found[name] = regress_inertia(tuple(mine))
+        known = {name: body for name, body in found.items() if body is not None}
+        regressed, start = known or None, problem.start(known)
+    else:
+        regressed = regress_inertia(recordings)
+        start = problem.start(regressed)
     rates = np.stack([first_rate(recording) for recording in recordings])
     rates = rates / np.asarray(problem.reference.rate)[:, None]
     centre = np.asarray(start.body)
+    # NumPy's generator: that of JAX takes seconds to compile.
+    rng = np.random.default_rng(np.asarray(jax.random.key_data(key)) if key is not None else 0)
     out = []
     for index in range(count):
-        shape_key, rate_key, key = jax.random.split(key, 3)
         wide = 0.0 if index == 0 else (0.5 if regressed is not None and index % 2 else 1.5)
         middle = centre if (index == 0 or wide < 1) else 0 * centre
-        body = middle + wide * jax.random.normal(shape_key, centre.shape)
-        spin = rates + (0.0 if index == 0 else 0.1) * jax.random.normal(rate_key, rates.shape)
-        point = eqx.tree_at(
-            lambda p: (p.body, p.own.spin), start, (jnp.asarray(body), jnp.asarray(spin))
-        )
-        out.append(point)
+        body = middle + wide * rng.normal(size=centre.shape)
+        spin = rates + (0.0 if index == 0 else 0.1) * rng.normal(size=rates.shape)
+        kind = start.own.spin.dtype
+        moved = jnp.asarray(body, kind), jnp.asarray(spin, kind)
+        out.append(eqx.tree_at(lambda p: (p.body, p.own.spin), start, moved))
     return out
 
 

@@ -9,8 +9,11 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from rigidjax.identify.problem import Parameters, Problem, along
-from rigidjax.identify.residual import Noise, beside, weights_of, whitened
+from rigidjax.identify.full_scale import at_limit
+from rigidjax.identify.levenberg_marquardt import beside_rows
+from rigidjax.identify.parameters import Parameters, places
+from rigidjax.identify.problem import Problem
+from rigidjax.identify.residual import Noise, weights_of, whitened
 from rigidjax.identify.search import evaluate
 
 # A direction whose singular value is below this share of the largest is not seen at all.
@@ -22,59 +25,81 @@ WEAKEST = 1e-6
 class Linearised(eqx.Module):
     """A problem about its best point: whitened errors, their derivatives, their weights.
 
-    **Fields:** for each sensor `errors` (R, T, k), `slopes` (R, T, k, n), `weights` (R, T); `extra`
-    (m,) and `extra_slopes` (m, n) of priors and joints.
+    **Fields:** for each sensor `raw` errors (R, T, k) in its unit, whitened `errors` (R, T, k),
+    `slopes` (R, T, k, m) in the m numbers that a recording depends on, `weights` (R, T); `places`
+    (R, m) where these are among the n free numbers, n for none; `extra` (j,) and `extra_slopes`
+    (j, n) of priors and joints.
     """
 
+    raw: tuple[np.ndarray, ...]
     errors: tuple[np.ndarray, ...]
     slopes: tuple[np.ndarray, ...]
     weights: tuple[np.ndarray, ...]
+    places: np.ndarray
     extra: np.ndarray
     extra_slopes: np.ndarray
 
     @property
+    def size(self) -> int:
+        """How many numbers are free."""
+        return int(self.extra_slopes.shape[-1])
+
+    @property
     def rows(self) -> np.ndarray:
-        """The Jacobian (N, n), each row times the root of its weight."""
-        n = self.extra_slopes.shape[-1]
-        parts = [
-            (slope * np.sqrt(weight)[..., None, None]).reshape(-1, n)
-            for slope, weight in zip(self.slopes, self.weights, strict=True)
-        ]
-        return np.concatenate([*parts, self.extra_slopes])
+        """Rows (N, n) whose Gram matrix is that of the Jacobian, each row weighted.
+
+        Those of a recording are brought to a triangle: as many as the numbers it depends on.
+        """
+        out = []
+        for record, where in enumerate(self.places):
+            parts = [
+                (slope[record] * np.sqrt(weight[record])[..., None, None]).reshape(
+                    -1, slope.shape[-1]
+                )
+                for slope, weight in zip(self.slopes, self.weights, strict=True)
+            ]
+            dense = np.concatenate(parts)
+            if not np.isfinite(dense).all():
+                return np.full((1, self.size), np.nan)
+            out.append(self.spread(np.linalg.qr(dense, mode="r"), where))
+        return np.concatenate([*out, self.extra_slopes])
+
+    def spread(self, block: np.ndarray, where: np.ndarray) -> np.ndarray:
+        """A recording's columns (…, m) as columns of all numbers (…, n)."""
+        wide = np.zeros((*block.shape[:-1], self.size + 1))
+        np.add.at(wide.T, where, block.T)
+        return wide[..., :-1]
+
+    def gathered(self, squares: np.ndarray) -> np.ndarray:
+        """Matrices (R, m, m) of the recordings, added up as one (n, n)."""
+        total = np.zeros((self.size + 1, self.size + 1))
+        np.add.at(total, (self.places[:, :, None], self.places[:, None, :]), squares)
+        return total[:-1, :-1]
 
     @property
     def scores(self) -> np.ndarray:
-        """What each time adds to the gradient of the misfit, (R, T, n)."""
-        parts = [
-            np.einsum("rtk,rtkn,rt->rtn", error, slope, weight)
+        """What each recording adds to the gradient of the misfit, (R, n)."""
+        total: Any = sum(
+            np.einsum("rtk,rtkm,rt->rm", error, slope, weight)
             for error, slope, weight in zip(self.errors, self.slopes, self.weights, strict=True)
-        ]
-        return np.sum(parts, axis=0)
+        )
+        rows = [self.spread(mine, where) for mine, where in zip(total, self.places, strict=True)]
+        return np.stack(rows)
 
 
 @eqx.filter_jit
 def _linearised(problem: Problem, parameters: Parameters, noise: Noise, found: Any) -> Any:
-    (errors, ends), blocks = found
+    (errors, ends), (blocks, end_blocks) = found
+
+    def of(errors: tuple) -> tuple[Array, ...]:
+        return whitened(problem, errors, noise)
+
+    out, push = jax.linearize(of, errors)
+    slopes = jax.vmap(push, in_axes=-1, out_axes=-1)(blocks)
     flat, restore = ravel_pytree(parameters)
-
-    @jax.custom_jvp
-    def all_errors(here: Parameters) -> Any:
-        return errors, ends
-
-    @all_errors.defjvp
-    def _(primals: Any, tangents: Any) -> Any:
-        return (errors, ends), along(problem, blocks, tangents[0])
-
-    def value(vector: Array) -> Any:
-        here = restore(vector)
-        errors, ends = all_errors(here)
-        extra = [leaf.reshape(-1) for leaf in beside(here, problem, ends)]
-        joined = jnp.concatenate(extra) if extra else jnp.zeros(0, vector.dtype)
-        out = (whitened(problem, errors, noise), joined)
-        return out, (out, weights_of(problem, errors, noise))
-
-    slopes, (out, weights) = jax.jacfwd(value, has_aux=True)(flat)
-    return out, slopes, weights
+    extra, extra_slopes = beside_rows(problem, flat, restore, ends, end_blocks)
+    weights = weights_of(problem, errors, noise)
+    return (out, slopes, weights), places(problem, parameters), extra, extra_slopes
 
 
 def errors_at(parameters: Parameters, problem: Problem) -> tuple[Float[Array, "..."], ...]:
@@ -85,10 +110,11 @@ def errors_at(parameters: Parameters, problem: Problem) -> tuple[Float[Array, ".
 def linearise(problem: Problem, parameters: Parameters, noise: Noise) -> Linearised:
     """Errors, derivatives and weights at these parameters, as NumPy arrays."""
     found = evaluate(parameters, problem)
-    (errors, extra), (slopes, extra_slopes), weights = jax.tree.map(
+    (errors, slopes, weights), where, extra, extra_slopes = jax.tree.map(
         np.asarray, _linearised(problem, parameters, noise, found)
     )
-    return Linearised(errors, slopes, weights, extra, extra_slopes)
+    raw = tuple(np.asarray(error) for error in found[0][0])
+    return Linearised(raw, errors, slopes, weights, where, extra, extra_slopes)
 
 
 class Spread(eqx.Module):
@@ -109,12 +135,14 @@ class Spread(eqx.Module):
 def spread(linear: Linearised, times: "Times") -> Spread:
     """`(JᵀWJ)⁻¹` where the errors are white, else the sandwich `H⁻¹ M H⁻¹`.
 
-    `M = Jᵀ C J` with C the errors' own covariance in time: each channel its variance and an
-    exponential of its correlation time. Fitted errors are smaller than true ones, the more so the
-    fewer of them are independent: M is scaled up by n/(n − p) for n independent errors. With many
-    recordings, what differs between them is taken instead where it is more.
+    `M = Jᵀ C J` with C the errors' own covariance in time: of each channel the part that its second
+    differences show is white, the rest fades exponentially. Over which time it fades fitted errors
+    do not tell well, for a fit takes the slow part of them away: of all times from two samples to
+    half a record that one counts which makes a number least sure. Fitted errors are smaller than
+    true ones, the more so the fewer of them are independent: M is scaled up by n/(n − p) for n
+    independent errors. With many recordings, what differs between them is taken where it is more.
 
-    **Arguments:** `linear`; `times` how long the errors hang together.
+    **Arguments:** `linear`; `times` over how long the errors are autocorrelated.
 
     Source: White 1980, doi:10.2307/1912934; Liang and Zeger 1986, doi:10.1093/biomet/73.1.13.
 
@@ -138,7 +166,7 @@ def spread(linear: Linearised, times: "Times") -> Spread:
     kind = "Gauss–Newton"
     if times.longest > 1.5:
         covariance = _sandwich(linear, covariance, times)
-        kind = f"sandwich: the errors hang together over {times.longest:.0f} samples"
+        kind = f"sandwich: the errors are autocorrelated over {times.longest:.0f} samples"
     null = directions[~seen] / size
     null = null / np.linalg.norm(null, axis=1, keepdims=True)
     shown = covariance.copy()
@@ -148,32 +176,50 @@ def spread(linear: Linearised, times: "Times") -> Spread:
 
 
 def _sandwich(linear: Linearised, bread: np.ndarray, times: "Times") -> np.ndarray:
+    longest = max(int(np.median((linear.weights[0] > 0).sum(axis=1))) // 2, 2)
+    spans = 2.0 ** np.arange(1, np.log2(longest) + 1)
     n = bread.shape[0]
-    meat = np.zeros((n, n))
-    for error, slope, weight, spans in zip(
-        linear.errors, linear.slopes, linear.weights, times.spans, strict=True
-    ):
-        root = np.sqrt(weight)
-        for channel, span in enumerate(spans):
-            e, j = error[..., channel] * root, slope[..., channel, :] * root[..., None]
-            variance = np.sum(e**2) / max(np.sum(weight > 0), 1)
-            # 1 + 2 Σ ρˡ = span for an exponential.
-            rho = (span - 1.0) / (span + 1.0)
-            ahead, behind = _fading(j, rho), _fading(j[:, ::-1], rho)[:, ::-1]
-            meat += variance * np.einsum("rti,rtj->ij", j, ahead + behind - j)
-    meat *= times.independent / max(times.independent - n, 0.1 * times.independent)
+    grown = times.independent / max(times.independent - n, 0.1 * times.independent)
+    found = [grown * bread @ _meat(linear, span) @ bread for span in spans]
     scores = linear.scores
     records = scores.shape[0]
     if records > n // 2 and records > 5:
         # Many recordings: what differs between them shows without any model of their errors.
-        total = scores.sum(axis=1)
-        apart = total.T @ total * records / (records - 1)
-        meat = apart if np.trace(bread @ apart) > np.trace(bread @ meat) else meat
-    out = bread @ meat @ bread
+        found.append(bread @ (scores.T @ scores) @ bread * records / (records - 1))
     # Never narrower than white errors would have it.
-    below = np.diag(out) < np.diag(bread)
-    factor = np.sqrt(np.where(below, np.diag(bread) / np.maximum(np.diag(out), 1e-300), 1.0))
+    all_ = np.maximum(np.stack([np.diag(bread), *(np.diag(c) for c in found)]), 0.0)
+    least = np.maximum(np.diag(bread), 1e-300)
+    out = found[int(np.argmax((all_[1:] / least).mean(axis=1)))]
+    own = np.maximum(np.diag(out), 1e-300)
+    factor = np.sqrt(np.maximum(all_.max(axis=0) / own, 1.0))
     return out * np.outer(factor, factor)
+
+
+def _meat(linear: Linearised, time: float) -> np.ndarray:
+    """`Jᵀ C J` with C the scatter of each channel and a part that fades over `time` samples."""
+    meat: Any = 0.0
+    fade = float(np.exp(-1.0 / time))
+    for error, slope, weight in zip(linear.errors, linear.slopes, linear.weights, strict=True):
+        root = np.sqrt(weight)
+        for channel in range(error.shape[-1]):
+            e, j = error[..., channel] * root, slope[..., channel, :] * root[..., None]
+            variance = np.sum(e**2) / max(np.sum(weight > 0), 1)
+            share = smooth_share(e, weight > 0)
+            ahead, behind = _fading(j, fade), _fading(j[:, ::-1], fade)[:, ::-1]
+            spread = share * (ahead + behind - j) + (1.0 - share) * j
+            meat = meat + variance * linear.gathered(j.transpose(0, 2, 1) @ spread)
+    return meat
+
+
+def smooth_share(e: np.ndarray, seen: np.ndarray) -> float:
+    """The share of the variance of errors (R, T) that second differences do not show."""
+    rows = [x[kept] for x, kept in zip(e, seen, strict=True)]
+    total = sum(float(row @ row) for row in rows) / max(sum(row.size for row in rows), 1)
+    bends = np.concatenate([row[2:] - 2.0 * row[1:-1] + row[:-2] for row in rows])
+    if not bends.size or not total > 0:
+        return 1.0
+    # The second difference of white noise has six times its variance.
+    return float(np.clip(1.0 - np.mean(bends**2) / 6.0 / total, 0.0, 1.0))
 
 
 def _fading(x: np.ndarray, rho: float) -> np.ndarray:
@@ -189,7 +235,7 @@ def _fading(x: np.ndarray, rho: float) -> np.ndarray:
 
 
 class Times(eqx.Module):
-    """How many samples the errors hang together, for each channel of each sensor.
+    """Over how many samples the errors are autocorrelated, for each channel of each sensor.
 
     **Fields:** `spans` one tuple for each sensor, 1 for white errors; `closeness` the correlation
     from one sample to the next in the channel of the longest; `independent` how many errors that
@@ -206,20 +252,23 @@ class Times(eqx.Module):
         return max(span for sensor in self.spans for span in sensor)
 
 
-def correlation_times(linear: Linearised) -> Times:
+def correlation_times(linear: Linearised, cut: tuple[np.ndarray, ...] | None = None) -> Times:
     """The integrated autocorrelation time `1 + 2 Σ ρ_l` of each channel.
 
-    Summed up to the first lag at which ρ falls below twice its own scatter.
+    Summed up to the first lag at which ρ falls below twice its own scatter. Readings at full scale
+    (`cut`, (R, T, k) for each sensor) take no part.
     """
+    cut = tuple(np.zeros(e.shape, bool) for e in linear.errors) if cut is None else cut
     spans, longest, closest, independent = [], 1.0, 0.0, 0.0
-    for error, weight in zip(linear.errors, linear.weights, strict=True):
+    for error, weight, full in zip(linear.errors, linear.weights, cut, strict=True):
         kept, found = error * np.sqrt(weight)[..., None], []
         for channel in range(error.shape[-1]):
-            span, first = _channel_time(kept[..., channel], weight > 0)
+            seen = (weight > 0) & ~full[..., channel]
+            span, first = _channel_time(kept[..., channel], seen)
             if span > longest:
                 longest, closest = span, first
             found.append(span)
-            independent += float(np.sum(weight > 0)) / span
+            independent += float(np.sum(seen)) / span
         spans.append(tuple(found))
     return Times(tuple(spans), closest, independent)
 
@@ -250,73 +299,32 @@ def _channel_time(e: np.ndarray, seen: np.ndarray) -> tuple[float, float]:
 def estimate_noise(problem: Problem, errors: tuple, noise: Noise, parameters: Parameters) -> Noise:
     """Noise (R, k) of each sensor: as given, or the weighted scatter of its errors.
 
-    One figure for all channels and recordings of a sensor. The number of free parameters is taken
-    off the number of errors.
+    One figure for all channels of a sensor and all recordings of a group. The number of free
+    parameters is taken off the number of errors.
     """
     free = ravel_pytree(parameters)[0].size
     total = sum(int(r.seen.sum()) * r.sensor.components for r in problem.records.readings)
     weights = weights_of(problem, errors, noise)
+    share = max(1.0 - free / total, 0.1)
+    count = problem.count
+    groups = np.zeros(count, int) if problem.noise_groups is None else problem.noise_groups
+    groups = np.asarray(groups)
     out = []
-    for reading, error, sigma, weight in zip(
-        problem.records.readings, errors, noise, weights, strict=True
+    cut = at_limit(problem.records.readings)
+    for reading, error, sigma, weight, full in zip(
+        problem.records.readings, errors, noise, weights, cut, strict=True
     ):
         if reading.sensor.noise is not None:
             out.append(sigma)
             continue
-        squares = float(np.sum(np.asarray(weight)[..., None] * np.asarray(error) ** 2))
-        share = max(1.0 - free / total, 0.1)
-        variance = squares / (reading.sensor.components * reading.seen.sum() * share)
+        # What a reading at full scale is off by is no noise.
+        kept = reading.seen[..., None] & ~full
+        squares = np.asarray(weight)[..., None] * np.asarray(error) ** 2
+        squares = np.sum(np.where(kept, squares, 0.0), axis=(1, 2))
+        seen = kept.sum(axis=(1, 2))
+        variance = np.bincount(groups, squares) / np.maximum(np.bincount(groups, seen), 1) / share
         # Data without noise must not divide by zero: round-off is the least that is believed.
         floor = 1e-15 * float(jnp.abs(reading.values).max() + 1e-300)
-        out.append(jnp.full_like(sigma, max(float(np.sqrt(variance)), floor)))
+        found = np.maximum(np.sqrt(variance), floor)[groups]
+        out.append(jnp.broadcast_to(jnp.asarray(found, sigma.dtype)[:, None], sigma.shape))
     return tuple(out)
-
-
-def goodness(
-    problem: Problem, errors: tuple, linear: Linearised, free: int, closeness: float
-) -> tuple[float, int, bool]:
-    """χ² of the sensors with a given noise, its degrees of freedom, and whether to believe the fit.
-
-    Believed where χ² is within five standard deviations of its mean and, for a sensor whose noise
-    was estimated, where the motion explains at least half of the variance of its readings and what
-    is left over in one piece (`closeness`, the correlation from one sample to the next, of it) is
-    less than a tenth. Under a robust loss outliers are expected, and χ² is theirs: there the median
-    of the squared errors counts, as long as it is that of readings without outliers to five
-    standard deviations.
-    """
-    chi2, count, believable = 0.0, 0, True
-    for reading, error, e, weight in zip(
-        problem.records.readings, errors, linear.errors, linear.weights, strict=True
-    ):
-        seen = reading.seen
-        if reading.sensor.noise is None:
-            values = np.asarray(reading.values)[seen]
-            spread_of_values = np.sum((values - values.mean(axis=0)) ** 2)
-            left = np.sum(np.asarray(error)[seen] ** 2)
-            tiny = 1e-12 * np.sum(values**2)
-            believable &= bool(left <= 0.5 * spread_of_values + tiny)
-            believable &= bool(max(closeness, 0.0) * left <= 0.1 * spread_of_values + tiny)
-        else:
-            size, many = reading.sensor.components, int(seen.sum())
-            chi2 += float(np.sum(weight[..., None] * e**2))
-            count += size * many
-            if problem.loss is not None and many:
-                middle = np.median(np.sum(e[seen] ** 2, axis=-1))
-                half, density = _median_of_chi2(size)
-                # Of a sample's median: 1 / (2 f √n), f the density there.
-                wide = 0.5 / (density * np.sqrt(many))
-                believable &= bool(middle <= half + 5 * wide)
-    dof = max(count - free, 1)
-    if count and problem.loss is None:
-        believable &= bool(chi2 <= dof + 5 * np.sqrt(2 * dof))
-    return chi2, dof, believable
-
-
-def _median_of_chi2(size: int) -> tuple[float, float]:
-    """The median of χ² with `size` degrees of freedom, and the density there."""
-    from scipy.special import chdtri, gammaln
-
-    median = float(chdtri(size, 0.5))
-    power = 0.5 * size - 1
-    density = 0.5 * np.exp(power * np.log(0.5 * median) - 0.5 * median - gammaln(0.5 * size))
-    return median, float(density)

@@ -8,7 +8,9 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from rigidjax.body.inertia import MassProperties
-from rigidjax.identify.reported import quantile
+from rigidjax.identify.full_scale import in_words
+from rigidjax.identify.reported import Quantity, charts, covariance as reported_covariance, quantile
+from rigidjax.identify.several import Bodies
 
 if TYPE_CHECKING:
     from rigidjax.identify.fit import Fit
@@ -18,8 +20,7 @@ def identifiability(fit: "Fit") -> tuple[str, ...]:
     """What the data fix, what they fix weakly, what they cannot see."""
     reach = quantile(fit, 0.95)
     out = []
-    chart = fit.problem.body
-    for quantity in fit.quantities[: len(chart.log_names)]:
+    for quantity in _moments(fit):
         wide = reach * quantity.deviation
         # Half-width over value where narrow; a factor where wide.
         if not np.isfinite(wide) or wide > 1.5:
@@ -39,18 +40,26 @@ def identifiability(fit: "Fit") -> tuple[str, ...]:
             "Free motion cannot show the absolute inertia: only ratios; mass and centre of mass "
             "leave no trace at all."
         )
+    out += in_words(fit.problem.records.readings)
     if fit.correlation > 1.5:
         out.append(
-            f"The errors are not white: they hang together over {fit.correlation:.0f} samples, so "
-            "something is missing in the model or the data were filtered; the intervals allow for "
-            "it (sandwich)."
+            f"The errors are autocorrelated over {fit.correlation:.0f} samples, so something is "
+            "missing in the model or the data were filtered; the intervals allow for it."
         )
     return tuple(out)
 
 
+def _moments(fit: "Fit") -> list[Quantity]:
+    """The positive quantities of the bodies."""
+    out, first = [], 0
+    for _, chart in charts(fit.problem):
+        out += fit.quantities[first : first + len(chart.log_names)]
+        first += len(chart.log_names) + len(chart.plain_names)
+    return out
+
+
 def _rate(fit: "Fit", reach: float) -> str:
-    chart = fit.problem.body
-    first = len(chart.log_names) + len(chart.plain_names)
+    first = sum(len(c.log_names) + len(c.plain_names) for _, c in charts(fit.problem))
     rates = fit.quantities[first : first + 3 * fit.problem.count]
     shares = []
     for index in range(fit.problem.count):
@@ -86,8 +95,11 @@ def scale_is_unseen(fit: "Fit") -> bool:
     if not len(null):
         return False
 
+    if isinstance(fit.problem.body, Bodies):
+        return False
+
     def tensor(x: jax.Array) -> jax.Array:
-        body = fit.problem.body.body(restore(x).body)
+        body = fit.problem.bodies(restore(x))
         inertia = body.inertia if isinstance(body, MassProperties) else body
         return inertia.tensor.reshape(-1)
 
@@ -99,13 +111,18 @@ def scale_is_unseen(fit: "Fit") -> bool:
 
 
 def correlations(fit: "Fit") -> list[str]:
-    """Pairs of free numbers whose errors go together (|ρ| > 0.95)."""
-    covariance = np.asarray(fit.covariance)
-    deviation = np.sqrt(np.diag(covariance))
+    """Pairs of reported quantities whose errors go together (|ρ| > 0.95).
+
+    Of an inertia tensor its principal moments, not its components, which follow from them.
+    """
+    covariance = reported_covariance(fit)
+    deviation = np.array([quantity.deviation for quantity in fit.quantities])
     good = np.isfinite(deviation) & (deviation > 0)
+    follow = {f"{plain}{name}" for name, c in charts(fit.problem) for plain in c.plain_names}
+    names = [quantity.name for quantity in fit.quantities]
+    good &= np.array([name not in follow or name.startswith("com") for name in names])
     scaled = np.where(good, deviation, 1.0)
     rho = np.where(np.outer(good, good), covariance / np.outer(scaled, scaled), 0.0)
-    names = names_of(fit)
     pairs = [
         (i, j)
         for i in range(len(rho))
@@ -117,20 +134,3 @@ def correlations(fit: "Fit") -> list[str]:
         f"{names[j]} and {names[i]} go together (correlation {rho[i, j]:+.3f})."
         for i, j in pairs[:5]
     ]
-
-
-def names_of(fit: "Fit") -> list[str]:
-    """A name for each free number, in the order of the flattened parameters."""
-    shared = [slot.name for slot in fit.problem.slots if not slot.each]
-    each = [slot.name for slot in fit.problem.slots if slot.each]
-    out = [f"body[{i}]" for i in range(fit.parameters.body.size)]
-    for name, leaf in zip(shared, fit.parameters.shared, strict=True):
-        out += [f"{name}[{i}]" if leaf.size > 1 else name for i in range(leaf.size)]
-    own = fit.parameters.own
-    for name in ("spin", "turn", "place", "speed"):
-        leaf = getattr(own, name)
-        if leaf is not None:
-            out += [f"{name}[{i}]" for i in range(leaf.size)]
-    for name, leaf in zip(each, own.each, strict=True):
-        out += [f"{name}[{i}]" for i in range(leaf.size)]
-    return out

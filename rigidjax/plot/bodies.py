@@ -44,6 +44,10 @@ def inertia_ellipsoid(
         _checks.single(body, (Inertia, MassProperties), "body")
         best, drawn = body, None
     elif hasattr(body, "parameters") and hasattr(body, "problem"):
+        if isinstance(body.body, dict):
+            raise ValueError(
+                "inertia_ellipsoid: wanted one body, got a Fit of several: give fit.body[name]"
+            )
         best, drawn = body.body, _drawn(body, samples)
     else:
         raise TypeError(

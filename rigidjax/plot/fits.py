@@ -69,7 +69,10 @@ def _between(found: Any, index: int) -> tuple[np.ndarray, Any] | None:
     if problem.count > 1:
         state0 = jax.tree.map(lambda leaf: leaf[index], state0)
     dense = jnp.linspace(record.t[0], record.t[-1], 800)
-    return np.asarray(dense), simulate(found.body, state0, dense).ys
+    body = found.body
+    if isinstance(body, dict):
+        body = body[problem.of[index]]
+    return np.asarray(dense), simulate(body, state0, dense).ys
 
 
 def _one_sensor(

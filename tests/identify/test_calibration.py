@@ -100,3 +100,81 @@ def test_intervals_hold_the_truth_as_often_as_they_say(scene):
     print(scene.__name__, dict(zip(truth, np.mean(held, axis=0), strict=True)), share)
     # 200 records, about five numbers each that are not independent: one standard deviation is 1 %.
     assert 0.93 <= share <= 0.97
+
+
+def coverage(make, truth, records=RECORDS):
+    """Share of 95 % intervals that hold, of `make(rng)` → fit, by name; `truth` name → value."""
+    rng, held = np.random.default_rng(12), []
+    for _ in range(records):
+        bounds = make(rng).interval(0.95)
+        held.append([bounds[k][0] <= v <= bounds[k][1] for k, v in truth.items()])
+    print(make.__name__, dict(zip(truth, np.mean(held, axis=0), strict=True)), np.mean(held))
+    return np.mean(held)
+
+
+CLEAN = np.asarray(rj.simulate(BODY, rj.Spin(OMEGA), TS).ys.omega)
+MOMENTS = {"Ix/Iz": 1.0 / 2.1, "Iy/Iz": 1.6 / 2.1}
+
+
+def cut_off(rng):
+    read = (CLEAN + 0.02 * rng.normal(size=(60, 3))).clip(-0.95, 0.95)
+    record = identify.Recording(TS, (identify.Gyro(0.02), read))
+    return identify.fit(identify.Problem(record, identify.PrincipalRatios()), starts=1)
+
+
+def slow_errors(rng):
+    """Errors that are correlated over six samples, as what a model leaves out is."""
+    steps = 0.02 * rng.normal(size=(160, 3))
+    slow = np.zeros((160, 3))
+    for k in range(1, 160):
+        slow[k] = 0.85 * slow[k - 1] + np.sqrt(1 - 0.85**2) * steps[k]
+    read = CLEAN + slow[100:] + 0.005 * rng.normal(size=(60, 3))
+    record = identify.Recording(TS, (identify.Gyro(), read))
+    return identify.fit(identify.Problem(record, identify.PrincipalRatios()), starts=1)
+
+
+SKEW = np.array([0.02, -0.01, 0.03])
+THROWS = [
+    np.asarray(rj.simulate(BODY, rj.Spin(omega), TS).ys.omega)
+    for omega in (OMEGA, [1.0, 0.2, 0.5], [-0.3, 0.9, 1.1])
+]
+
+
+def skew_and_own_biases(rng):
+    """A known body, two throws of another; noise of two sizes; biases about a shared one."""
+    matrix = np.eye(3) + np.array([[0, SKEW[0], SKEW[1]], [0, 0, SKEW[2]], [0, 0, 0]])
+    shared = np.array([0.03, 0.0, -0.02])
+    records = []
+    for clean, sigma in zip(THROWS, (0.01, 0.02, 0.02), strict=True):
+        bias = shared + 0.02 * rng.normal(size=3)
+        read = clean @ matrix.T + bias + sigma * rng.normal(size=clean.shape)
+        gyro = identify.Gyro(bias=[0.0] * 3, skew=[0.0] * 3)
+        records.append(identify.Recording(TS, (gyro, read)))
+    free = [
+        identify.Free(lambda r: r.readings[0].sensor.skew, "skew", scale=0.02),
+        identify.Free(lambda r: r.readings[0].sensor.bias, "bias", scale=0.05, spread=0.02),
+    ]
+    problem = identify.Problem(
+        {"known": records[:1], "new": records[1:]},
+        {"known": identify.Known(BODY), "new": identify.PrincipalRatios()},
+        free=free,
+        noise_each="body",
+    )
+    return identify.fit(problem, starts=1)
+
+
+SHARED = {f"skew {a}": v for a, v in zip("xyz", SKEW, strict=True)}
+SHARED |= {f"bias {a}": v for a, v in zip("xyz", (0.03, 0.0, -0.02), strict=True)}
+SHARED |= {f"{name} [new]": v for name, v in MOMENTS.items()}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("make", "truth"), [(cut_off, MOMENTS), (skew_and_own_biases, SHARED)])
+def test_intervals_of_what_is_shared_or_cut_off_hold(make, truth):
+    assert 0.93 <= coverage(make, truth) <= 0.97
+
+
+@pytest.mark.slow
+def test_intervals_hold_where_errors_are_not_white():
+    # Sixty readings do not tell well over which time errors are correlated: wider, not narrower.
+    assert 0.93 <= coverage(slow_errors, MOMENTS) <= 0.995

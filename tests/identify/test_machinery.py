@@ -11,13 +11,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.flatten_util import ravel_pytree
 
 import rigidjax as rj
 from rigidjax import identify
 from rigidjax.__main__ import main
 from rigidjax.identify import checkpoint, search
 from rigidjax.identify.checkpoint import Tried
-from rigidjax.identify.problem import errors_of_one, with_blocks
+from rigidjax.identify.jacobian import errors_of_one, with_blocks
+from rigidjax.identify.parameters import local, places
 from rigidjax.identify.stacking import one
 
 BODY = rj.Inertia.from_principal(1.0, 1.6, 2.1)
@@ -85,15 +87,18 @@ def test_three_throws_of_different_lengths_give_one_body_with_its_scale(joint):
 def test_the_blocks_are_the_derivative(joint):
     problem, at = joint.problem, joint.parameters
     (errors, _), (blocks, _) = with_blocks(at, problem)
+    where = np.asarray(places(problem, at))
+    flat, restore = ravel_pytree(at)
     for index in range(3):
-        own, record, ref = (one(x, index) for x in (at.own, problem.records, problem.reference))
+        record, ref = (one(x, index) for x in (problem.records, problem.reference))
 
-        def body(vector, own=own, record=record, ref=ref):
-            return errors_of_one(problem, vector, at.shared, own, record, ref)[0][0]
+        def moved(step, index=index, record=record, ref=ref):
+            mine = one(local(problem, restore(flat + step)), index)
+            return errors_of_one(problem, mine, record, ref, None)[0][0]
 
-        for column in range(2):
-            step = jnp.zeros(6).at[column].set(1e-5)
-            slope = (body(at.body + step) - body(at.body - step)) / 2e-5
+        for column in (0, 1, 6, 10, 13):
+            step = jnp.zeros(flat.size).at[where[index, column]].set(1e-5)
+            slope = (moved(step) - moved(-step)) / 2e-5
             np.testing.assert_allclose(blocks[0][index, ..., column], slope, atol=1e-7)
     assert errors[0].shape == (3, 60, 3)
 
@@ -398,6 +403,9 @@ WRONG = [
     (["--sensor", "compass=a,b,c"], "wanted gyro, accelerometer, quaternion or euler-SEQUENCE"),
     (["--sensor", "gyro=wx,wy,wz:km/h"], "wanted the unit rad/s or deg/s or rpm, got 'km/h'"),
     (["--sensor", "gyro=wx,wy,wz:rad/s:-1"], "wanted a positive noise"),
+    (["--sensor", "gyro=wx,wy,wz:rad/s:1,2"], "wanted one noise or three, got 2"),
+    (["--noise", "0.1", "0.0", "0.1"], "--noise: wanted a positive noise, got 0"),
+    (["--limit", "-2"], "--limit: wanted a positive number, got -2.0"),
     (["--wheel", "s"], "wanted COLUMN:INERTIA"),
     (["--wheel", "s:1:w"], "wanted an axis x, y or z"),
     (["--model", "tensor"], "free motion shows ratios only; a scale needs a --wheel"),

@@ -97,7 +97,7 @@ def test_i3_no_start_is_called_right_that_is_wrong():
             assert off(found) < 0.05
             right += 1
         else:
-            assert found.status.startswith(("poor fit", "not converged"))
+            assert found.status.startswith(("poor", "doubtful", "failed"))
     assert right >= 30
 
 
@@ -150,10 +150,10 @@ def test_i6_saturation_is_a_censored_reading(share):
     censored = identify.fit(gyro_problem(values, identify.Gyro(0.01, limit=limit)), starts=2)
     assert censored.ok
     assert off(censored) <= 5 * max(clean, 0.004)
-    ignored = identify.fit(gyro_problem(values), starts=2)
-    # What is clipped a little hides in the noise; what is clipped more is told by χ².
-    assert ignored.chi2 > censored.chi2
-    assert share < 0.2 or not ignored.ok
+    # Nobody need say so: the plateau is found, and told.
+    found = identify.fit(gyro_problem(values), starts=2)
+    assert found.ok and off(found) == off(censored)
+    assert any(f"at {limit:.4g} rad/s" in line for line in found.identifiability)
 
 
 @pytest.mark.slow

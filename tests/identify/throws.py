@@ -77,7 +77,12 @@ def preference(group, found):
 
 
 def lever(group):
-    """From the centre of mass to the accelerometer (3,), m: the median over a group's throws.
+    """From the centre of mass to the accelerometer (3,), m: the median over a group's throws."""
+    return np.median(levers(group), axis=0)
+
+
+def levers(group):
+    """From the centre of mass to the accelerometer (throws, 3), m, as each throw shows it.
 
     Linear regression of the specific force on dΩ/dt × r + Ω × (Ω × r) + bias, away from the
     wheel's jerks.
@@ -96,7 +101,7 @@ def lever(group):
         rows = np.concatenate([turning + spin @ spin, np.broadcast_to(np.eye(3), spin.shape)], 2)
         rows, side = rows[quiet].reshape(-1, 6), a[quiet].reshape(-1)
         found.append(np.linalg.lstsq(rows, side, rcond=None)[0][:3])
-    return np.median(found, axis=0)
+    return np.array(found)
 
 
 def shifted(mass, d):

@@ -207,6 +207,23 @@ row(
     **HOST,
     says=("no such file",),
 )
+
+
+def robot() -> str:
+    path = Path(tempfile.mkdtemp()) / "robot.urdf"
+    inertia = '<mass value="2"/><inertia ixx="3" iyy="2.5" izz="1.5"/>'
+    path.write_text(f'<robot><link name="arm"><inertial>{inertia}</inertial></link></robot>')
+    return str(path)
+
+
+row("body.read_inertials", lambda: dict(path=robot()), transforms=(), says=("no such file",))
+row(
+    "body.write_inertials",
+    lambda: dict(path=robot() + ".new", bodies={"arm": s.body()}, source=robot()),
+    arguments=("bodies", "source"),
+    transforms=(),
+    says=("no such file",),
+)
 row("identify.report.as_dict", lambda: dict(fit=s.found()), groups=KINDS, transforms=())
 row("identify.report.numbers", dict(value=1.0, low=0.9, high=1.2), transforms=())
 row(

@@ -103,15 +103,27 @@ def _one_or(value: Any, size: int, name: str) -> Array:
     return jnp.broadcast_to(numbers, (size,))
 
 
-def shown(truth: Vec3, bias: Vec3 | None, scale: Vec3 | None, mounting: Vec3 | None) -> Vec3:
-    """What a vector sensor shows of a vector in the body frame: `scale · exp(−mounting) v + bias`.
+def shown(
+    truth: Vec3,
+    bias: Vec3 | None,
+    scale: Vec3 | None,
+    mounting: Vec3 | None,
+    skew: Vec3 | None = None,
+) -> Vec3:
+    """What a vector sensor shows: `scale · S exp(−mounting) v + bias`.
 
-    **Arguments:** `truth` (3,) body frame; `bias` (3,) in the sensor's unit; `scale` (3,) per
-    channel; `mounting` (3,) rotation vector that turns the body's axes onto the sensor's, rad.
+    Its axes need not be orthogonal: `S = [[1, a, b], [0, 1, c], [0, 0, 1]]` of the skew (a, b, c).
+
+    **Arguments:** `truth` v (3,) body frame; `bias` (3,) in the sensor's unit; `scale` (3,) per
+    channel; `mounting` (3,) rotation vector that turns the body's axes onto the sensor's, rad;
+    `skew` (3,) what x shows of y, x of z, and y of z.
     """
     seen = truth
     if mounting is not None:
         seen = quaternion.rotate(quaternion.exp(-mounting), seen)
+    if skew is not None:
+        x, y, z = seen[0], seen[1], seen[2]
+        seen = jnp.stack([x + skew[0] * y + skew[1] * z, y + skew[2] * z, z])
     if scale is not None:
         seen = scale * seen
     return seen if bias is None else seen + bias

@@ -20,13 +20,15 @@ from rigidjax.rotation.algebra import cross
 
 
 class Gyro(AbstractSensor):
-    """Reads the body rate: `scale · exp(−mounting) Ω + bias`, rad/s.
+    """Reads the body rate: `scale · S exp(−mounting) Ω + bias`, rad/s.
 
     **Arguments:** `noise` standard deviation of a reading, rad/s, one number or (3,); `None` has it
     estimated from the residuals. Then, `None` unless the sensor has it (give a value to let a
     `Free` move it): `bias` (3,) rad/s; `scale` (3,) per channel; `mounting` (3,) rotation vector
-    from the body's axes to the sensor's, rad; `limit` full scale, rad/s, one number or (3,): a
-    reading at it counts as "at least that much"; `offset` s: it shows at t what was at t + offset.
+    from the body's axes to the sensor's, rad; `skew` (3,) what its x axis shows of y, x of z, and y
+    of z, where they are not orthogonal: `S = [[1, a, b], [0, 1, c], [0, 0, 1]]`; `limit` full
+    scale, rad/s, one number or (3,): a reading at it counts as "at least that much", `None` has it
+    found; `offset` s: it shows at t what was at t + offset.
 
     **Raises** `ValueError` for a noise or limit that is not positive, a wrong shape, NaN.
 
@@ -42,6 +44,7 @@ class Gyro(AbstractSensor):
     bias: Float[Array, "3"] | None
     scale: Float[Array, "3"] | None
     mounting: Float[Array, "3"] | None
+    skew: Float[Array, "3"] | None
     limit: Float[Array, "3"] | None
     offset: Scalar | None
 
@@ -52,20 +55,22 @@ class Gyro(AbstractSensor):
         bias: Any = None,
         scale: Any = None,
         mounting: Any = None,
+        skew: Any = None,
         limit: Any = None,
         offset: Any = None,
     ):
         self.noise = noise_of(noise)
         self.bias, self.scale = vector_of(bias, "bias"), vector_of(scale, "scale")
-        self.mounting, self.limit = vector_of(mounting, "mounting"), limit_of(limit)
+        self.mounting, self.skew = vector_of(mounting, "mounting"), vector_of(skew, "skew")
+        self.limit = limit_of(limit)
         self.offset = number_of(offset, "offset")
 
     def error(self, moment: Moment, reading: Array) -> Vec3:
-        return reading - shown(moment.state.omega, self.bias, self.scale, self.mounting)
+        return reading - shown(moment.state.omega, self.bias, self.scale, self.mounting, self.skew)
 
 
 class Accelerometer(AbstractSensor):
-    """Reads the specific force where it sits: `scale · exp(−mounting) f + bias`, m/s².
+    """Reads the specific force where it sits: `scale · S exp(−mounting) f + bias`, m/s².
 
     `f = Rᵀ(a − g) + dΩ/dt × r + Ω × (Ω × r)` in the body frame (notes, eq 88, seen from the body),
     with r the lever arm from the centre of mass, or from the fixed point of a body on a pivot. A
@@ -74,8 +79,8 @@ class Accelerometer(AbstractSensor):
     **Arguments:** `noise` m/s², one number or (3,), `None` to have it estimated; `place` (3,) where
     it sits, m, body frame: from the point that the `Inertia` is about, or in the frame of the
     `MassProperties`; `gravity` (3,) m/s², world frame: `None` for a body in free fall (`Spin`,
-    `Attitude`), needed by a body on a pivot and by a `Rigid`; `bias`, `scale`, `mounting`, `limit`,
-    `offset` as for `Gyro`.
+    `Attitude`), needed by a body on a pivot and by a `Rigid`; `bias`, `scale`, `mounting`, `skew`,
+    `limit`, `offset` as for `Gyro`.
 
     **Raises** `ValueError` as `Gyro`.
 
@@ -92,6 +97,7 @@ class Accelerometer(AbstractSensor):
     bias: Float[Array, "3"] | None
     scale: Float[Array, "3"] | None
     mounting: Float[Array, "3"] | None
+    skew: Float[Array, "3"] | None
     limit: Float[Array, "3"] | None
     offset: Scalar | None
 
@@ -104,13 +110,15 @@ class Accelerometer(AbstractSensor):
         bias: Any = None,
         scale: Any = None,
         mounting: Any = None,
+        skew: Any = None,
         limit: Any = None,
         offset: Any = None,
     ):
         self.place, self.noise = place_of(place, "place"), noise_of(noise)
         self.gravity = vector_of(gravity, "gravity")
         self.bias, self.scale = vector_of(bias, "bias"), vector_of(scale, "scale")
-        self.mounting, self.limit = vector_of(mounting, "mounting"), limit_of(limit)
+        self.mounting, self.skew = vector_of(mounting, "mounting"), vector_of(skew, "skew")
+        self.limit = limit_of(limit)
         self.offset = number_of(offset, "offset")
 
     @property
@@ -126,15 +134,15 @@ class Accelerometer(AbstractSensor):
             carried = rate.v if isinstance(state, HasPose) else 0.0
             world = carried - self.gravity
             force = force + quaternion.rotate(quaternion.conjugate(state.q), world)
-        return reading - shown(force, self.bias, self.scale, self.mounting)
+        return reading - shown(force, self.bias, self.scale, self.mounting, self.skew)
 
 
 class Magnetometer(AbstractSensor):
-    """Reads a field that is known in the world: `scale · exp(−mounting) Rᵀ b + bias`.
+    """Reads a field that is known in the world: `scale · S exp(−mounting) Rᵀ b + bias`.
 
     **Arguments:** `noise` in the field's unit, one number or (3,), `None` to have it estimated;
     `field` (3,) b, world frame, any unit; `bias` (the body's own magnetism), `scale`, `mounting`,
-    `limit`, `offset` as for `Gyro`. For a direction without a strength use `Direction`.
+    `skew`, `limit`, `offset` as for `Gyro`. For a direction without a strength use `Direction`.
 
     **Raises** `ValueError` as `Gyro`.
 
@@ -151,6 +159,7 @@ class Magnetometer(AbstractSensor):
     bias: Float[Array, "3"] | None
     scale: Float[Array, "3"] | None
     mounting: Float[Array, "3"] | None
+    skew: Float[Array, "3"] | None
     limit: Float[Array, "3"] | None
     offset: Scalar | None
 
@@ -162,14 +171,16 @@ class Magnetometer(AbstractSensor):
         bias: Any = None,
         scale: Any = None,
         mounting: Any = None,
+        skew: Any = None,
         limit: Any = None,
         offset: Any = None,
     ):
         self.field, self.noise = place_of(field, "field"), noise_of(noise)
         self.bias, self.scale = vector_of(bias, "bias"), vector_of(scale, "scale")
-        self.mounting, self.limit = vector_of(mounting, "mounting"), limit_of(limit)
+        self.mounting, self.skew = vector_of(mounting, "mounting"), vector_of(skew, "skew")
+        self.limit = limit_of(limit)
         self.offset = number_of(offset, "offset")
 
     def error(self, moment: Moment, reading: Array) -> Vec3:
         seen = quaternion.rotate(quaternion.conjugate(moment.state.q), self.field)
-        return reading - shown(seen, self.bias, self.scale, self.mounting)
+        return reading - shown(seen, self.bias, self.scale, self.mounting, self.skew)

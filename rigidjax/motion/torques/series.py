@@ -12,6 +12,7 @@ from jaxtyping import Array, ArrayLike, Float
 from rigidjax import _checks
 from rigidjax._types import Scalar, ScalarLike, Vec3
 from rigidjax.motion.torques.base import given
+from rigidjax.rotation.algebra import cross, dot
 
 Samples = Float[ArrayLike, "n *channels"] | Sequence[Any]
 
@@ -110,7 +111,9 @@ class Wheel(eqx.Module):
 
     **Arguments:** `inertia` J, kg m², about the axis; `axis` (3,) a, body frame, unit; `speed`
     rad/s relative to the body, a callable Module of time such as `Series(times, speeds)`; `delay`
-    s: the log shows at t what was at t − delay; `None` for none.
+    s: the log shows at t what was at t − delay; `None` for none; `tilt` (2,) rad, how far the axis
+    leans towards two directions across it (about x, y and z: the next two axes in turn, y and z, z
+    and x, x and y); `None` for none.
 
     **Raises:** `ValueError` for an axis that is not a unit vector.
 
@@ -123,9 +126,16 @@ class Wheel(eqx.Module):
     axis: Vec3
     speed: Any
     delay: Scalar | None
+    tilt: Float[Array, "2"] | None
 
     def __init__(
-        self, inertia: ScalarLike, axis: Any, speed: Any, *, delay: ScalarLike | None = None
+        self,
+        inertia: ScalarLike,
+        axis: Any,
+        speed: Any,
+        *,
+        delay: ScalarLike | None = None,
+        tilt: Any = None,
     ):
         axis = _checks.floating(axis, (3,), "axis")
         x, y, z = _checks.namespace(axis).asarray(axis)
@@ -141,7 +151,22 @@ class Wheel(eqx.Module):
         self.speed = speed
         kind = jnp.result_type(float)
         self.delay = None if delay is None else given(delay, (), "delay").astype(kind)
+        self.tilt = None if tilt is None else given(tilt, (2,), "tilt").astype(kind)
+
+    @property
+    def direction(self) -> Vec3:
+        """The axis with its tilt, unit."""
+        if self.tilt is None:
+            return self.axis
+        # The axis that is nearest to ±x, ±y or ±z says which two are across it.
+        next_one = jnp.roll(jnp.eye(3, dtype=self.axis.dtype), 1, axis=1)
+        first = next_one[jnp.argmax(jnp.abs(self.axis))]
+        first = first - dot(first, self.axis) * self.axis
+        first = first / jnp.sqrt(dot(first, first))
+        second = cross(self.axis, first)
+        a, b = self.tilt[0], self.tilt[1]
+        return (self.axis + a * first + b * second) / jnp.sqrt(1.0 + a * a + b * b)
 
     def __call__(self, t: ScalarLike) -> Vec3:
         when = t if self.delay is None else t + self.delay
-        return self.inertia * self.axis * self.speed(when)
+        return self.inertia * self.direction * self.speed(when)

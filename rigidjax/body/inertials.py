@@ -1,0 +1,208 @@
+"""Mass, centre of mass and inertia from and to robot descriptions: URDF and MuJoCo's XML."""
+
+import xml.etree.ElementTree as Tree
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rigidjax import _checks
+from rigidjax.body.inertia import MassProperties
+from rigidjax.rotation import so3
+
+# How far a sum of two moments may fall below the third, for files are rounded.
+ROUNDED = 1e-6
+
+
+def read_inertials(path: str | Path) -> dict[str, MassProperties]:
+    """The bodies of a URDF or MuJoCo XML file that state their inertia, by name.
+
+    In the frame of the link or body. URDF: `<inertial>` with `origin` (`xyz`, `rpy`), `mass`,
+    `inertia`. MuJoCo: `<inertial>` with `mass`, `pos`, `quat`, `diaginertia` or `fullinertia`;
+    what a file leaves to be computed from its geometry is not read.
+
+    **Arguments:** `path` of the file. **Returns** name → `MassProperties`, in order.
+
+    **Raises:** `ValueError`, naming file and body, for a file that is missing or no such XML, a
+    number that is none, an orientation stated otherwise, an inertia that no body has.
+
+    >>> read_inertials("missing.urdf")
+    Traceback (most recent call last):
+    ValueError: missing.urdf: no such file
+    """
+    path = _checks.path(path)
+    root = _parsed(path)
+    urdf = _is_urdf(path, root)
+    out: dict[str, MassProperties] = {}
+    for name, node in _bodies(path, root):
+        inertial = node.find("inertial")
+        if inertial is not None:
+            try:
+                out[name] = _from_urdf(inertial) if urdf else _from_mujoco(inertial)
+            except ValueError as error:
+                raise ValueError(f"{path}: body {name!r}: {error}") from None
+    return out
+
+
+def write_inertials(
+    path: str | Path, bodies: Mapping[str, MassProperties], source: str | Path
+) -> None:
+    """A copy of a URDF or MuJoCo XML file with the inertials of these bodies in it.
+
+    **Arguments:** `path` of the new file; `bodies` name → `MassProperties`, in the frames of the
+    file's links or bodies; `source` the file to copy; all else in it stays.
+
+    **Raises:** `ValueError` as `read_inertials`, and for a name that the file has not; `TypeError`
+    for what is no `MassProperties`.
+
+    >>> write_inertials("new.urdf", {}, "old.urdf")
+    Traceback (most recent call last):
+    ValueError: bodies: wanted at least one name → MassProperties, got none
+    """
+    path, source = _checks.path(path), _checks.path(source, "source")
+    _checks.instance(bodies, Mapping, "bodies", wanted="a dict of name → MassProperties")
+    if not bodies:
+        raise ValueError("bodies: wanted at least one name → MassProperties, got none")
+    root = _parsed(source)
+    urdf = _is_urdf(source, root)
+    nodes = dict(_bodies(source, root))
+    for name, body in bodies.items():
+        _checks.single(body, MassProperties, f"bodies[{name!r}]")
+        if name not in nodes:
+            raise ValueError(f"{source}: no body {name!r}; there are {', '.join(nodes)}")
+        inertial = nodes[name].find("inertial")
+        if inertial is None:
+            inertial = Tree.SubElement(nodes[name], "inertial")
+        inertial.clear()
+        (_to_urdf if urdf else _to_mujoco)(inertial, body)
+    Tree.ElementTree(root).write(path, encoding="utf-8", xml_declaration=True)
+
+
+def _parsed(path: Path) -> Tree.Element:
+    if not path.exists():
+        raise ValueError(f"{path}: no such file")
+    try:
+        return Tree.parse(path).getroot()
+    except (Tree.ParseError, OSError, ValueError) as error:
+        raise ValueError(f"{path}: cannot be read as XML ({error})") from None
+
+
+def _is_urdf(path: Path, root: Tree.Element) -> bool:
+    if root.tag not in ("robot", "mujoco"):
+        raise ValueError(f"{path}: wanted a URDF (robot) or MuJoCo file, got <{root.tag}>")
+    return root.tag == "robot"
+
+
+def _bodies(path: Path, root: Tree.Element) -> list[tuple[str, Tree.Element]]:
+    tag = "link" if root.tag == "robot" else "body"
+    nodes = root.findall("link") if tag == "link" else list(root.iter("body"))
+    names = [node.get("name", f"{tag} {index}") for index, node in enumerate(nodes)]
+    twice = [name for name in names if names.count(name) > 1]
+    if twice:
+        raise ValueError(f"{path}: two bodies are called {twice[0]!r}")
+    return list(zip(names, nodes, strict=True))
+
+
+def _from_urdf(inertial: Tree.Element) -> MassProperties:
+    origin, mass, inertia = (inertial.find(tag) for tag in ("origin", "mass", "inertia"))
+    if mass is None or inertia is None:
+        raise ValueError("wanted a <mass> and an <inertia>")
+    place = _numbers(origin, "xyz", 3, [0.0] * 3)
+    roll, pitch, yaw = _numbers(origin, "rpy", 3, [0.0] * 3)
+    parts = {key: _numbers(inertia, key, 1)[0] for key in ("ixx", "iyy", "izz")}
+    parts |= {key: _numbers(inertia, key, 1, [0.0])[0] for key in ("ixy", "ixz", "iyz")}
+    tensor = np.array(
+        [
+            [parts["ixx"], parts["ixy"], parts["ixz"]],
+            [parts["ixy"], parts["iyy"], parts["iyz"]],
+            [parts["ixz"], parts["iyz"], parts["izz"]],
+        ]
+    )
+    # Fixed axes: roll about x, then pitch about y, then yaw about z.
+    turn = _turn(2, yaw) @ _turn(1, pitch) @ _turn(0, roll)
+    return _body(_numbers(mass, "value", 1)[0], place, turn @ tensor @ turn.T)
+
+
+def _from_mujoco(inertial: Tree.Element) -> MassProperties:
+    other = [key for key in ("axisangle", "xyaxes", "zaxis", "euler") if key in inertial.attrib]
+    if other:
+        raise ValueError(f"its inertial is turned by {other[0]}; wanted quat")
+    turn = np.eye(3)
+    if "quat" in inertial.attrib:
+        w, x, y, z = _numbers(inertial, "quat", 4)
+        size = np.sqrt(w * w + x * x + y * y + z * z)
+        if not size > 0:
+            raise ValueError("its quat is zero")
+        half = np.array([x, y, z]) / size
+        length = np.linalg.norm(half)
+        angle = 2.0 * np.arctan2(length, w / size)
+        turn = _exp(angle * half / length) if length > 0 else turn
+    if "fullinertia" in inertial.attrib:
+        xx, yy, zz, xy, xz, yz = _numbers(inertial, "fullinertia", 6)
+        tensor = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    else:
+        tensor = np.diag(_numbers(inertial, "diaginertia", 3))
+    place = _numbers(inertial, "pos", 3, [0.0] * 3)
+    return _body(_numbers(inertial, "mass", 1)[0], place, turn @ tensor @ turn.T)
+
+
+def _body(mass: float, place: np.ndarray, tensor: np.ndarray) -> MassProperties:
+    if not mass > 0:
+        raise ValueError(f"wanted a positive mass, got {mass:g}")
+    second = 0.5 * np.trace(tensor) * np.eye(3) - tensor
+    least = np.linalg.eigvalsh(second)[0]
+    moments = np.linalg.eigvalsh(tensor)
+    if not moments[2] > 0 or least < -ROUNDED * moments[2]:
+        shown = ", ".join(f"{moment:.6g}" for moment in moments)
+        raise ValueError(
+            f"no body has the moments {shown}: the largest is more than the sum of the others, or "
+            "one is not positive"
+        )
+    if least < 0:
+        second = second - least * np.eye(3)
+    return MassProperties(mass, place, second)
+
+
+def _numbers(node: Any, key: str, count: int, otherwise: Any = None) -> np.ndarray:
+    text = None if node is None else node.get(key)
+    if text is None:
+        if otherwise is None:
+            raise ValueError(f"wanted {key}")
+        return np.array(otherwise)
+    try:
+        numbers = np.array([float(part) for part in text.split()])
+    except ValueError:
+        raise ValueError(f"{key}: {text!r} are no numbers") from None
+    if numbers.size != count or not np.isfinite(numbers).all():
+        raise ValueError(f"{key}: wanted {count} finite numbers, got {text!r}")
+    return numbers
+
+
+def _turn(axis: int, angle: float) -> np.ndarray:
+    return _exp(angle * np.eye(3)[axis])
+
+
+def _exp(vector: np.ndarray) -> np.ndarray:
+    return np.asarray(so3.exp(vector), float)
+
+
+def _text(numbers: Any) -> str:
+    return " ".join(repr(float(number)) for number in np.ravel(numbers))
+
+
+def _to_urdf(inertial: Tree.Element, body: MassProperties) -> None:
+    tensor = np.asarray(body.inertia.tensor)
+    Tree.SubElement(inertial, "origin", xyz=_text(body.com), rpy="0 0 0")
+    Tree.SubElement(inertial, "mass", value=_text(body.mass))
+    places = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2)}
+    places["izz"] = (2, 2)
+    Tree.SubElement(inertial, "inertia", {key: _text(tensor[at]) for key, at in places.items()})
+
+
+def _to_mujoco(inertial: Tree.Element, body: MassProperties) -> None:
+    tensor = np.asarray(body.inertia.tensor)
+    inertial.set("mass", _text(body.mass))
+    inertial.set("pos", _text(body.com))
+    order = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+    inertial.set("fullinertia", _text([tensor[at] for at in order]))

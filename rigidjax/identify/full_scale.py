@@ -1,0 +1,104 @@
+"""Readings at full scale: found in a record, counted as "at least that much", told."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from rigidjax.identify.recording import Recording
+
+# So many readings in a row at the largest value are a plateau.
+RUN = 3
+# A record that is at its largest value for a larger share than this stands still, or was cut.
+MOST = 0.7
+
+
+def plateau(values: np.ndarray) -> float | None:
+    """The full scale (> 0) of one channel (T,) whose largest readings are cut off, or `None`.
+
+    The largest magnitude, where more readings in a row have it than the top of a smooth wave in so
+    many digits would: with the last digit d and second differences a that is `2 √(2d/a)` of them.
+    """
+    size = np.abs(values)
+    top = float(size.max(initial=0.0))
+    at = size >= top * (1 - 1e-9)
+    if not top > 0 or at.sum() < RUN or at.mean() > MOST:
+        return None
+    steps = np.abs(np.diff(values))
+    bends = np.abs(np.diff(values, 2))[~at[1:-1]]
+    bend = float(np.median(bends)) if bends.size else 0.0
+    if not (steps > 0).any() or not bend > 0:
+        return None
+    smooth = 1.0 + 2.0 * np.sqrt(2.0 * steps[steps > 0].min() / bend)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], at, [False]]).astype(int)))
+    longest = max(end - first for first, end in edges.reshape(-1, 2))
+    return top if longest >= max(RUN, 2.0 * smooth) else None
+
+
+def with_limits(recordings: Sequence[Recording]) -> list[Recording]:
+    """The recordings, the sensors that were cut off with the full scale that shows.
+
+    Where a sensor has a `limit` already, that stands.
+    """
+    found = [[_limits(reading) for reading in r.readings] for r in recordings]
+    out = list(recordings)
+    for index in range(len(found[0])):
+        column = [row[index] if index < len(row) else None for row in found]
+        if not any(limits is not None and np.isfinite(limits).any() for limits in column):
+            continue
+        for place, limits in enumerate(column):
+            if limits is None:
+                continue
+            out[place] = eqx.tree_at(
+                lambda r, i=index: r.readings[i].sensor.limit,
+                out[place],
+                jnp.asarray(limits, out[place].t.dtype),
+                is_leaf=lambda node: node is None,
+            )
+    return out
+
+
+def _limits(reading: Any) -> np.ndarray | None:
+    """The full scale of each channel, infinite where none shows; `None` where none is asked for."""
+    sensor = reading.sensor
+    if getattr(sensor, "limit", 0) is not None or sensor.reading_shape != (sensor.components,):
+        return None
+    values = np.asarray(reading.values)[reading.seen]
+    found = [plateau(values[:, channel]) for channel in range(values.shape[1])]
+    return np.array([np.inf if level is None else level for level in found])
+
+
+def at_limit(readings: Sequence[Any]) -> tuple[np.ndarray, ...]:
+    """Which readings of each sensor are at full scale, (R, T, k); of a problem's stacked ones."""
+    out = []
+    for reading in readings:
+        limit = getattr(reading.sensor, "limit", None)
+        if limit is None:
+            out.append(np.zeros((*reading.mask.shape, reading.sensor.components), bool))
+            continue
+        full = np.abs(np.asarray(reading.values)) >= np.asarray(limit)[:, None] * (1 - 1e-6)
+        out.append(full & reading.seen[..., None])
+    return tuple(out)
+
+
+def in_words(readings: Sequence[Any]) -> list[str]:
+    """What was at full scale, for a report."""
+    out = []
+    for reading, full in zip(readings, at_limit(readings), strict=True):
+        count = full.sum(axis=(0, 1))
+        if not count.any():
+            continue
+        sensor = reading.sensor
+        level = np.asarray(sensor.limit)
+        parts = []
+        for channel in np.flatnonzero(count):
+            sizes = level[:, channel][np.isfinite(level[:, channel])]
+            name = "xyz"[channel] if channel < 3 else str(channel)
+            parts.append(f"{count[channel]} of {name} at {sizes.min():.4g} {sensor.unit}")
+        out.append(
+            f"Readings of the {type(sensor).__name__} at full scale ({', '.join(parts)}) count as "
+            "at least that much."
+        )
+    return out

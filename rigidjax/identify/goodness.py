@@ -1,0 +1,161 @@
+"""Whether a fit explains its readings: the size of the errors, and whether they are white."""
+
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+
+from rigidjax.identify.full_scale import at_limit
+from rigidjax.identify.problem import Problem
+from rigidjax.identify.uncertainty import Linearised, Times
+
+# Errors are called autocorrelated where white ones would look so once in so many fits.
+RARE = 1e-5
+# Lags that the test for whiteness looks at.
+LAGS = 10
+# Errors above this share of what varies in the readings (their variance) explain too little.
+HALF, QUARTER = 0.5, 0.25
+# Above the noise by more than this factor the motion is another one.
+FAR = 3.0
+
+
+class Goodness(eqx.Module):
+    """How well the errors agree with what the sensors can do.
+
+    **Fields:** `chi2`, `dof` of the sensors whose noise was given; `poor` and `doubts` in words:
+    what shows that this is not the motion, and what makes it doubtful.
+    """
+
+    chi2: float
+    dof: int
+    poor: tuple[str, ...]
+    doubts: tuple[str, ...]
+
+
+def goodness(problem: Problem, linear: Linearised, times: Times, free: int) -> Goodness:
+    """χ² of the sensors with a given noise, and what speaks against the fit.
+
+    For each sensor: the size of its errors against the noise, where that was given (five standard
+    deviations of χ², or under a robust loss of the median of the squared errors), and against what
+    varies in its readings; and whether its errors are white (Ljung and Box's test,
+    at one wrong alarm in 1e5). Readings at full scale take no part.
+
+    **Arguments:** `linear` the problem at its best point; `times` the errors' correlation; `free`
+    how many numbers are free.
+
+    Source: Ljung and Box 1978, doi:10.1093/biomet/65.2.297.
+    """
+    chi2, count = 0.0, 0
+    poor: list[str] = []
+    doubts: list[str] = []
+    cut = at_limit(problem.records.readings)
+    for reading, error, e, weight, full in zip(
+        problem.records.readings, linear.raw, linear.errors, linear.weights, cut, strict=True
+    ):
+        name = f"the errors of the {type(reading.sensor).__name__}"
+        kept = (weight > 0)[..., None] & ~full
+        left, varies, tiny = _sizes(reading, np.asarray(error), kept)
+        if reading.sensor.noise is None:
+            if left > HALF * varies + tiny:
+                poor.append(f"{name} are as large as what it read")
+            elif left > QUARTER * varies + tiny:
+                doubts.append(f"{name} are {np.sqrt(left / varies):.0%} of what varies in it")
+            elif max(times.closeness, 0.0) * left > 0.1 * varies + tiny:
+                poor.append(f"{name} are in one piece and large")
+        else:
+            own, many = float(np.sum((weight[..., None] * e**2)[kept])), int(kept.sum())
+            chi2, count = chi2 + own, count + many
+            factor = _above(problem, e, weight, kept, own, many, free)
+            if factor > FAR:
+                poor.append(f"{name} are {factor:.1f} times the noise")
+            elif factor > 1.0:
+                doubts.append(f"{name} are {factor:.2f} times the noise")
+        given = reading.sensor.noise is not None
+        if not _white(e * np.sqrt(weight)[..., None], kept, given) and left > tiny:
+            size = _over_scatter(np.asarray(error), kept)
+            doubts.append(
+                f"{name} are autocorrelated over {times.longest:.0f} samples, {size:.1f} times "
+                "their scatter from one reading to the next (something is missing in the model, "
+                "or the data were filtered)"
+            )
+    return Goodness(chi2, max(count - free, 1), tuple(poor), tuple(doubts))
+
+
+def _sizes(reading: Any, error: np.ndarray, kept: np.ndarray) -> tuple[float, float, float]:
+    """Sums of squares: of the errors, of what varies in the readings, and of round-off."""
+    values = np.asarray(reading.values)[reading.seen]
+    varies = float(np.sum((values - values.mean(axis=0)) ** 2))
+    return float(np.sum(error[kept] ** 2)), varies, 1e-12 * float(np.sum(values**2))
+
+
+def _above(
+    problem: Problem,
+    e: np.ndarray,
+    weight: np.ndarray,
+    kept: np.ndarray,
+    own: float,
+    many: int,
+    free: int,
+) -> float:
+    """How many times the noise the errors are; one where they agree with it."""
+    if problem.loss is None or not many:
+        dof = max(many - free, 1)
+        return float(np.sqrt(own / dof)) if own > dof + 5 * np.sqrt(2 * dof) else 1.0
+    # Outliers are expected, and χ² is theirs: the median is that of readings without outliers.
+    rows = kept.all(axis=-1) & (weight > 0)
+    if not rows.any():
+        return 1.0
+    middle = float(np.median(np.sum(e[rows] ** 2, axis=-1)))
+    half, density = median_of_chi2(e.shape[-1])
+    # Of a sample's median: 1 / (2 f √n), f the density there.
+    wide = 0.5 / (density * np.sqrt(rows.sum()))
+    return float(np.sqrt(middle / half)) if middle > half + 5 * wide else 1.0
+
+
+def median_of_chi2(size: int) -> tuple[float, float]:
+    """The median of χ² with `size` degrees of freedom, and the density there."""
+    from scipy.special import chdtri, gammaln
+
+    median = float(chdtri(size, 0.5))
+    power = 0.5 * size - 1
+    density = 0.5 * np.exp(power * np.log(0.5 * median) - 0.5 * median - gammaln(0.5 * size))
+    return median, float(density)
+
+
+def _white(e: np.ndarray, kept: np.ndarray, given: bool) -> bool:
+    """Whether whitened errors (R, T, k) are white, in all channels together.
+
+    Where the noise is `given`, what is far below it cannot make a fit doubtful.
+    """
+    from scipy.special import chdtrc
+
+    total, degrees = 0.0, 0
+    for channel in range(e.shape[-1]):
+        rows = [x[seen] for x, seen in zip(e[..., channel], kept[..., channel], strict=True)]
+        rows = [row - row.mean() for row in rows if row.size >= 2 * LAGS]
+        size = sum(row.size for row in rows)
+        squares = sum(float(row @ row) for row in rows)
+        squares = max(squares, float(size)) if given else squares
+        if not squares > 0:
+            continue
+        for lag in range(1, LAGS + 1):
+            pairs = size - lag * len(rows)
+            rho = sum(float(row[lag:] @ row[:-lag]) for row in rows) / squares
+            total += size * (size + 2.0) * rho**2 / pairs
+            degrees += 1
+    return degrees == 0 or bool(chdtrc(degrees, total) > RARE)
+
+
+def _over_scatter(error: np.ndarray, kept: np.ndarray) -> float:
+    """The errors over what their second differences say is their scatter."""
+    all_, apart, count, triples = 0.0, 0.0, 0, 0
+    for channel in range(error.shape[-1]):
+        for x, seen in zip(error[..., channel], kept[..., channel], strict=True):
+            row = x[seen]
+            bend = row[2:] - 2.0 * row[1:-1] + row[:-2]
+            all_, count = all_ + float(row @ row), count + row.size
+            apart, triples = apart + float(bend @ bend), triples + bend.size
+    if not apart > 0:
+        return np.inf
+    # The second difference of white noise has six times its variance.
+    return float(np.sqrt(all_ / count / (apart / triples / 6.0)))

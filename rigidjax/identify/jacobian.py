@@ -1,0 +1,172 @@
+"""The errors of all readings, and their derivatives recording by recording."""
+
+from typing import TYPE_CHECKING, Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array
+
+from rigidjax.body.inertia import MassProperties
+from rigidjax.identify import stacking
+from rigidjax.identify.free import put
+from rigidjax.identify.parameters import Local, Parameters, columns, local, places
+from rigidjax.identify.propagate import free_states, shifted, states_at
+from rigidjax.identify.recording import Recording
+from rigidjax.identify.reference import Reference
+from rigidjax.identify.sensors import Moment
+from rigidjax.identify.several import matter
+from rigidjax.motion import Attitude, Rigid, Spin
+from rigidjax.rotation import quaternion
+from rigidjax.solve import equations_of_motion
+
+if TYPE_CHECKING:
+    from rigidjax.identify.problem import Problem
+
+
+def first_state(rung: type, own: Any, ref: Reference) -> Any:
+    """The first state of one recording; `own` an `Own` or a `Local`."""
+    omega = own.spin * ref.rate
+    if rung is Spin:
+        return Spin(omega)
+    assert ref.q is not None and own.turn is not None
+    q = quaternion.multiply(ref.q, quaternion.exp(own.turn))
+    if rung is Attitude:
+        return Attitude(q, omega)
+    assert ref.x is not None and ref.v is not None
+    assert own.place is not None and own.speed is not None
+    x = ref.x + ref.length * own.place
+    return Rigid(x, ref.v + ref.length * ref.rate * own.speed, q, omega)
+
+
+def filled(problem: "Problem", mine: Local, record: Recording) -> Recording:
+    """One recording with the values of the free numbers in it."""
+    values = [
+        slot.move(slot.read(record), step)
+        for slot, step in zip(problem.slots, mine.steps, strict=True)
+    ]
+    return put(record, problem.slots, values)
+
+
+def states_of_one(
+    problem: "Problem", mine: Local, record: Recording, ref: Reference, which: Array | None
+) -> tuple[Recording, Any, Any, Any]:
+    """One recording with its values filled in, its body, its first state and its states."""
+    record = filled(problem, mine, record)
+    body = matter(problem.body, mine.body, which)
+    state0 = first_state(problem.rung, mine, ref)
+    states = states_at(problem.integrator, _turned(problem, body), state0, record.t, record.torque)
+    return record, body, state0, states
+
+
+def _turned(problem: "Problem", body: Any) -> Any:
+    """What turns: a body that does not move needs no mass."""
+    return body.inertia if isinstance(body, MassProperties) and problem.rung is not Rigid else body
+
+
+def errors_of_one(
+    problem: "Problem", mine: Local, record: Recording, ref: Reference, which: Array | None
+) -> tuple[tuple[Array, ...], Any]:
+    """The errors (T, k) of each sensor in one recording, and the last state.
+
+    **Arguments:** `mine` the numbers it depends on; `record`, `ref`; `which` the index of its body
+    among several.
+    """
+    record, body, state0, states = states_of_one(problem, mine, record, ref, which)
+    field = equations_of_motion(_turned(problem, body), state0, record.torque)
+    out = []
+    for reading in record.readings:
+        sensor = reading.sensor
+        offset = getattr(sensor, "offset", None)
+        seen, times = states, record.t
+        if offset is not None:
+            times = record.t + offset
+            if record.torque is None:
+                seen = free_states(body, state0, times - record.t[0])
+            else:
+                seen = jax.vmap(lambda t, s, by=offset: shifted(field, t, s, by))(record.t, states)
+
+        def error(t: Array, state: Any, value: Array, sensor: Any = sensor) -> Array:
+            return sensor.error(Moment(t, state, body, field), value)
+
+        errors = jax.vmap(error)(times, seen, reading.values)
+        out.append(jnp.where(reading.mask[:, None], errors, 0.0))
+    return tuple(out), jax.tree.map(lambda leaf: leaf[-1], states)
+
+
+def over_records(function: Any, problem: "Problem", mine: Local) -> Any:
+    """`function(mine, record, reference, which)` of every recording, by `vmap`.
+
+    A single one is left alone: its loop compiles to less.
+    """
+    trees = mine, problem.records, problem.reference, problem.which
+    if problem.count > 1:
+        return jax.vmap(function)(*trees)
+    out = function(*(stacking.one(tree, 0) for tree in trees))
+    return jax.tree.map(lambda leaf: leaf[None], out)
+
+
+@eqx.filter_custom_jvp
+def all_errors(parameters: Parameters, problem: "Problem") -> tuple[tuple[Array, ...], Any]:
+    """The errors (R, T, k) of each sensor, and the last states (R, …).
+
+    Its derivative is taken recording by recording: each has a block for the numbers that it depends
+    on, and no zeros are carried through the motion.
+    """
+
+    def of_one(*trees: Any) -> Any:
+        return errors_of_one(problem, *trees)
+
+    return over_records(of_one, problem, local(problem, parameters))
+
+
+@all_errors.def_jvp
+def _all_errors_jvp(primals: Any, tangents: Any) -> Any:
+    parameters, problem = primals
+    step, beside = tangents
+    if jax.tree.leaves(beside):
+        raise TypeError(
+            "all_errors: only derivatives in the parameters are taken block by block; use "
+            "errors_of_one for those in the problem"
+        )
+    out, blocks = with_blocks(parameters, problem)
+    zeros = jax.tree.map(
+        lambda p, s: jnp.zeros_like(p) if s is None and p is not None else s,
+        parameters,
+        step,
+        is_leaf=lambda node: node is None,
+    )
+    return out, along(problem, blocks, zeros)
+
+
+def along(problem: "Problem", blocks: Any, step: Parameters) -> Any:
+    """The derivatives of `with_blocks` along a step of all parameters."""
+    flat = ravel_pytree(step)[0]
+    where = places(problem, step)
+    moved = jnp.concatenate([flat, jnp.zeros(1, flat.dtype)])[where]
+    return jax.tree.map(lambda block: jnp.einsum("r...n,rn->r...", block, moved), blocks)
+
+
+def with_blocks(parameters: Parameters, problem: "Problem") -> tuple[Any, Any]:
+    """The errors and last states, and their derivatives (…, n) in what each recording depends on.
+
+    `places` says which of the flattened parameters each of the n columns is for.
+    """
+    mine = local(problem, parameters)
+    single = stacking.one(mine, 0)
+    twice = columns(problem, single)
+
+    def of_one(one: Local, record: Recording, ref: Reference, which: Array | None) -> Any:
+        flat, restore = ravel_pytree(one)
+
+        def value(vector: Array) -> Any:
+            out = errors_of_one(problem, restore(vector), record, ref, which)
+            return out, out
+
+        blocks, out = jax.jacfwd(value, has_aux=True)(flat)
+        if twice.size > flat.size:
+            blocks = jax.tree.map(lambda block: block[..., twice], blocks)
+        return out, blocks
+
+    return over_records(of_one, problem, mine)

@@ -1,0 +1,219 @@
+"""Levenberg–Marquardt on normal equations that are added up recording by recording."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Bool, Float, Int
+
+from rigidjax.identify.jacobian import along, first_state, with_blocks
+from rigidjax.identify.parameters import Parameters, places
+from rigidjax.identify.problem import Problem
+from rigidjax.identify.residual import Noise, beside, seen_rows
+
+# Damping is in units of the diagonal of the normal equations (Marquardt's): one is a step half as
+# long as Gauss and Newton's.
+CAREFUL, BOLD = 1.0, 1e-3
+# Numbers of order one by their making go no further than this in a step.
+LONGEST = 2.0
+# A step this little damped is one of Gauss and Newton.
+FREE = 1e-2
+# Damping beyond which nothing moves.
+STUCK = 1e12
+
+
+class Settings(eqx.Module):
+    """How a search goes: arrays, so as not to compile again.
+
+    **Fields:** `tolerance` steps of so many standard deviations (of each parameter with all others
+    at rest) end it; `damping` at the start; `steps` how many at most.
+    """
+
+    tolerance: Float[Array, ""]
+    damping: Float[Array, ""]
+    steps: Int[Array, ""]
+
+    def __init__(self, tolerance: float, damping: float, steps: int):
+        kind = jnp.result_type(float)
+        self.tolerance = jnp.asarray(tolerance, kind)
+        self.damping = jnp.asarray(damping, kind)
+        self.steps = jnp.asarray(steps, jnp.int32)
+
+
+class Search(eqx.Module):
+    """Where a search stands.
+
+    **Fields:** `point` (n,) the best so far, its `cost`, the normal matrix `gram` (n, n) and the
+    gradient `slope` (n,) there; `trial` (n,) what is to be tried next, `hoped` how much lower it
+    ought to be; `damping`; `taken` evaluations; `done`, `converged`; `found` what the last
+    evaluation gave (see `with_blocks`).
+    """
+
+    point: Float[Array, " n"]
+    cost: Float[Array, ""]
+    gram: Float[Array, "n n"]
+    slope: Float[Array, " n"]
+    trial: Float[Array, " n"]
+    hoped: Float[Array, ""]
+    damping: Float[Array, ""]
+    taken: Int[Array, ""]
+    done: Bool[Array, ""]
+    converged: Bool[Array, ""]
+    found: Any
+
+
+def descend(
+    start: Parameters,
+    problem: Problem,
+    noise: Noise,
+    weights: Float[Array, "records times"],
+    settings: Settings,
+) -> tuple[Parameters, Search]:
+    """At most `settings.steps` steps down from `start`; with none, `start` is evaluated.
+
+    Source: Marquardt 1963, doi:10.1137/0111030; the damping by the ratio of what a step gained to
+    what it was to gain, Madsen, Nielsen and Tingleff 2004, Methods for non-linear least squares
+    problems, section 3.2.
+    """
+    flat, restore = ravel_pytree(start)
+    where, made = places(problem, start), _made(start)
+    number, kind = flat.size, flat.dtype
+
+    def evaluated(point: Array) -> tuple[Any, Array, Array, Array]:
+        here = restore(point)
+        found = with_blocks(here, problem)
+        (errors, ends), (slopes, end_slopes) = found
+        total, gram = jnp.zeros((), kind), jnp.zeros((number + 1, number + 1), kind)
+        slope = jnp.zeros(number + 1, kind)
+        for e, rows in seen_rows(problem, errors, slopes, noise, weights):
+            total = total + jnp.sum(e**2)
+            gram = gram.at[where[:, :, None], where[:, None, :]].add(
+                jnp.einsum("rtki,rtkj->rij", rows, rows)
+            )
+            slope = slope.at[where].add(jnp.einsum("rtki,rtk->ri", rows, e))
+        gram, slope = gram[:-1, :-1], slope[:-1]
+        e, rows = beside_rows(problem, point, restore, ends, end_slopes)
+        if e.size:
+            total = total + jnp.sum(e**2)
+            gram, slope = gram + rows.T @ rows, slope + e @ rows
+        return found, 0.5 * total, gram, slope
+
+    def step(now: Search) -> Search:
+        found, cost, gram, slope = evaluated(now.trial)
+        finite = jnp.isfinite(cost) & jnp.isfinite(slope).all() & jnp.isfinite(gram).all()
+        first = now.taken == 0
+        better = finite & ((cost < now.cost) | first)
+        ratio = (now.cost - cost) / jnp.where(now.hoped > 0, now.hoped, 1.0)
+        grown = jnp.where(ratio > 0.75, 0.1, jnp.where(ratio > 0.25, 0.5, 2.0))
+        damping = now.damping * jnp.where(first, 1.0, jnp.where(better, grown, 8.0))
+        damping = jnp.maximum(damping, 1e-12)
+        point, cost, gram, slope = jax.tree.map(
+            lambda new, old: jnp.where(better, new, old),
+            (now.trial, cost, gram, slope),
+            (now.point, now.cost, now.gram, now.slope),
+        )
+        felt = jnp.diagonal(gram)
+        floor = jnp.maximum(1e-12 * jnp.max(felt), 1e-300)
+        scale = jnp.maximum(jnp.maximum(felt, floor), made)
+        # Columns of length one: the factor of Cholesky loses no digits to units.
+        root = jnp.sqrt(jnp.maximum(felt, floor))
+        matrix = gram / (root[:, None] * root[None, :]) + jnp.diag(damping * scale / root**2)
+        factor = jax.scipy.linalg.cho_factor(matrix, lower=True)
+        move = -jax.scipy.linalg.cho_solve(factor, slope / root) / root
+        far = jnp.max(jnp.abs(move) * made)
+        move = move * jnp.minimum(1.0, LONGEST / jnp.maximum(far, 1e-300))
+        sound = jnp.isfinite(move).all()
+        move = jnp.where(sound, move, 0.0)
+        hoped = -(slope @ move) - 0.5 * move @ (gram @ move)
+        small = (jnp.max(jnp.abs(move) * root) < settings.tolerance) & (damping <= FREE)
+        # At the very bottom round-off refuses every step.
+        bottom = hoped <= 1e-14 * cost
+        converged = sound & (small | (bottom & ~better & ~first))
+        lost = ~finite & first
+        done = converged | lost | (damping > STUCK) | (~sound & (damping > 1.0))
+        damping = jnp.where(sound, damping, 8.0 * damping)
+        return Search(
+            point,
+            cost,
+            gram,
+            slope,
+            point + move,
+            hoped,
+            damping,
+            now.taken + 1,
+            done,
+            converged,
+            found,
+        )
+
+    nothing = _nothing(problem, start, where.shape[1], kind)
+    begun = Search(
+        flat,
+        jnp.asarray(jnp.inf, kind),
+        jnp.zeros((number, number), kind),
+        jnp.zeros(number, kind),
+        flat,
+        jnp.zeros((), kind),
+        settings.damping.astype(kind),
+        jnp.zeros((), jnp.int32),
+        jnp.asarray(False),
+        jnp.asarray(False),
+        nothing,
+    )
+    end = lax.while_loop(lambda now: ~now.done & (now.taken <= settings.steps), step, begun)
+    return restore(end.point), end
+
+
+def _nothing(problem: Problem, start: Parameters, columns: int, kind: Any) -> Any:
+    """Zeros of the shapes that `with_blocks` returns: to trace it once more takes seconds."""
+    count, times = problem.records.t.shape
+    errors = tuple(
+        jnp.zeros((count, times, reading.sensor.components), kind)
+        for reading in problem.records.readings
+    )
+    ends = jax.tree.map(
+        lambda leaf: jnp.zeros(leaf.shape, kind),
+        eqx.filter_eval_shape(
+            jax.vmap(lambda own, ref: first_state(problem.rung, own, ref)),
+            start.own,
+            problem.reference,
+        ),
+    )
+    blocks = jax.tree.map(lambda leaf: jnp.zeros((*leaf.shape, columns), kind), (errors, ends))
+    return (errors, ends), blocks
+
+
+def _made(parameters: Parameters) -> Float[Array, " n"]:
+    """One for the numbers that are of order one by their making, zero for those of a `Free`.
+
+    The unit of a `Free` is a user's guess; of the others none is to be flung about by data that
+    hardly feel it.
+    """
+    ones, zeros = (jax.tree.map(of, parameters) for of in (jnp.ones_like, jnp.zeros_like))
+    marked = eqx.tree_at(lambda p: (p.shared, p.own.each), ones, (zeros.shared, zeros.own.each))
+    return ravel_pytree(marked)[0]
+
+
+def beside_rows(
+    problem: Problem, point: Array, restore: Any, ends: Any, end_slopes: Any
+) -> tuple[Array, Array]:
+    """Priors and joints between pieces as one vector, and its Jacobian (m, n)."""
+
+    @jax.custom_jvp
+    def last(vector: Array) -> Any:
+        return ends
+
+    @last.defjvp
+    def _(primals: Any, tangents: Any) -> Any:
+        return ends, along(problem, end_slopes, restore(tangents[0]))
+
+    def value(vector: Array) -> Any:
+        parts = [leaf.reshape(-1) for leaf in beside(restore(vector), problem, last(vector))]
+        joined = jnp.concatenate(parts) if parts else jnp.zeros(0, vector.dtype)
+        return joined, joined
+
+    rows, e = jax.jacfwd(value, has_aux=True)(point)
+    return e, rows

@@ -1,0 +1,133 @@
+"""The free numbers of a fit, those that one recording depends on, and where each of them is."""
+
+from typing import TYPE_CHECKING, Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float, Int
+
+from rigidjax.identify.several import spread
+
+if TYPE_CHECKING:
+    from rigidjax.identify.problem import Problem
+
+
+class Own(eqx.Module):
+    """The free numbers that belong to one recording, of order one.
+
+    **Fields:** `spin` (3,) the first body rate over the typical rate; `turn` (3,) the rotation
+    vector from the reference attitude to the first one (body frame, rad), or `None` where nothing
+    feels the attitude; `place`, `speed` (3,) the first position and velocity from the reference, in
+    typical lengths and speeds, or `None`; `each` the steps of the `Free`s with one value for each
+    recording, and the deviations of those with a `spread`.
+    """
+
+    spin: Float[Array, "*records 3"]
+    turn: Float[Array, "*records 3"] | None
+    place: Float[Array, "*records 3"] | None
+    speed: Float[Array, "*records 3"] | None
+    each: tuple[Array, ...]
+
+
+class Parameters(eqx.Module):
+    """The free numbers of a fit, all unconstrained and of order one.
+
+    **Fields:** `body` the chart's numbers, of several bodies one after another; `shared` the steps
+    of the `Free`s with one value for all, or (groups, …) for one in each group; `own` what belongs
+    to each recording, with a leading axis.
+    """
+
+    body: Float[Array, " chart"]
+    shared: tuple[Array, ...]
+    own: Own
+
+
+class Local(eqx.Module):
+    """The free numbers that one recording depends on.
+
+    **Fields:** `body` (K,) of its body, padded to the largest chart; `steps` one for each `Free`;
+    `spin`, `turn`, `place`, `speed` as in `Own`.
+    """
+
+    body: Float[Array, "*records chart"]
+    steps: tuple[Array, ...]
+    spin: Float[Array, "*records 3"]
+    turn: Float[Array, "*records 3"] | None
+    place: Float[Array, "*records 3"] | None
+    speed: Float[Array, "*records 3"] | None
+
+
+def local(problem: "Problem", parameters: Parameters) -> Local:
+    """What each recording depends on, with a leading axis over recordings."""
+    own = parameters.own
+    of_all, of_each = iter(parameters.shared), iter(own.each)
+    steps = []
+    for slot in problem.slots:
+        if slot.each:
+            steps.append(next(of_each))
+            continue
+        shared = next(of_all)
+        if slot.groups is None:
+            step = jnp.broadcast_to(shared, (problem.count, *shared.shape))
+        else:
+            step = shared[slot.groups]
+        steps.append(step if slot.spread is None else step + next(of_each))
+    body = spread(problem.body, parameters.body, problem.which, problem.count)
+    return Local(body, tuple(steps), own.spin, own.turn, own.place, own.speed)
+
+
+def columns(problem: "Problem", one: Local) -> np.ndarray:
+    """Which of a recording's numbers each column of its block is for.
+
+    All in order; then once more those that are a shared value and a deviation.
+    """
+    numbered = _numbered(one)
+    twice = [
+        np.ravel(step)
+        for slot, step in zip(problem.slots, numbered.steps, strict=True)
+        if slot.spread is not None
+    ]
+    size = sum(np.size(leaf) for leaf in jax.tree.leaves(one))
+    return np.concatenate([np.arange(size), *twice]).astype(int)
+
+
+def places(problem: "Problem", parameters: Parameters) -> Int[Array, "records columns"]:
+    """Where in the flattened parameters the number of each column is; n for those of no number."""
+    count, size = problem.count, ravel_pytree(parameters)[0].size
+    numbered = _numbered(parameters)
+    of_all, of_each = iter(numbered.shared), iter(numbered.own.each)
+    parts, deviations = [], []
+
+    def rows(leaf: Any) -> Array:
+        return jnp.asarray(leaf, jnp.int32).reshape(count, -1)
+
+    for slot in problem.slots:
+        if slot.each:
+            parts.append(rows(next(of_each)))
+            continue
+        shared = next(of_all)
+        if slot.groups is None:
+            parts.append(rows(np.broadcast_to(shared, (count, *shared.shape))))
+        else:
+            parts.append(rows(jnp.asarray(shared, jnp.int32)[slot.groups]))
+        if slot.spread is not None:
+            deviations.append(rows(next(of_each)))
+    own = numbered.own
+    firsts = [rows(leaf) for leaf in (own.spin, own.turn, own.place, own.speed) if leaf is not None]
+    numbers = jnp.asarray(numbered.body, jnp.int32)
+    body = spread(problem.body, numbers, problem.which, count, fill=size)
+    return jnp.concatenate([body, *parts, *firsts, *deviations], axis=1)
+
+
+def _numbered(tree: Any) -> Any:
+    """The same tree with its numbers counted from zero in the order of `ravel_pytree`."""
+    leaves, structure = jax.tree.flatten(tree)
+    ends = np.cumsum([np.size(leaf) for leaf in leaves])
+    counted = [
+        np.arange(end - np.size(leaf), end).reshape(np.shape(leaf))
+        for leaf, end in zip(leaves, ends, strict=True)
+    ]
+    return jax.tree.unflatten(structure, counted)

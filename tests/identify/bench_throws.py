@@ -1,0 +1,222 @@
+"""The throws of `shared/data/tudelft_throw` as one problem of four bodies with one sensor.
+
+    python tests/identify/bench_throws.py [EVERY] [END]
+
+The recipe. All throws together: each group has a body of its own (six numbers) and a drag of its
+own; all share the gyro (bias, scale an axis, three skew terms) and the wheel's tilt; each throw has
+a first rate, a delay of the wheel's log, and a bias that deviates from the shared one by 0.02
+rad/s. Noise is estimated for each body. No object's truth enters: the proof body's moments fix the
+scale of the wheel. Then each throw alone, with the sensor as it was found and the drag of its body
+as sure as it was found. Intervals: the fit's, and what the lever arms (regression on the
+accelerometer) scatter from throw to throw.
+
+EVERY keeps each so many samples (default 1: 1 kHz), END is the last time, s (default 0.53).
+"""
+
+import importlib.util
+import sys
+import time
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.special import stdtrit
+
+jax.config.update("jax_enable_x64", True)
+
+import rigidjax as rj
+from rigidjax import identify
+
+_spec = importlib.util.spec_from_file_location("throws", Path(__file__).with_name("throws.py"))
+throws = importlib.util.module_from_spec(_spec)
+_spec.loader.exec_module(throws)
+
+DEVICE, PROOF, *OBJECTS = (
+    "calibration_device_only",
+    "calibration_proof_body",
+    "object_empty",
+    "object_a",
+)
+MASSES = {DEVICE: throws.DEVICE, PROOF: throws.PROOF} | {
+    name: throws.OBJECTS[name][0] for name in OBJECTS
+}
+TRUTH = {PROOF: throws.PROOF_MOMENTS} | {name: throws.OBJECTS[name][1] for name in OBJECTS}
+# How far a throw's bias is from the sensor's, rad/s.
+OWN_BIAS = 0.02
+
+
+def record(path, every, end):
+    wide = throws.columns(path, throws.WINDOW[0] - 0.02)
+    log = throws.columns(path, throws.WINDOW[0])
+    speed = rj.torques.Series(wide["t"], wide["flywheel"])
+    wheel = rj.torques.Wheel(throws.WHEEL, [0.0, 0.0, 1.0], speed, delay=0.0, tilt=[0.0, 0.0])
+    law = rj.torques.Sum(rj.torques.Flywheel(wheel), rj.torques.Damping([0.0, 0.0, 0.0]))
+    gyro = identify.Gyro(bias=[0.0] * 3, scale=[1.0] * 3, skew=[0.0] * 3)
+    rates = np.stack([log["wx"], log["wy"], log["wz"]], axis=1)
+    kept = np.flatnonzero(log["t"] <= end + 1e-9)[::every]
+    return identify.Recording(log["t"][kept], (gyro, rates[kept]), torque=law)
+
+
+def free(own_bias, drag):
+    return [
+        identify.Free(lambda r: r.readings[0].sensor.bias, "bias", scale=0.05, **own_bias),
+        identify.Free(lambda r: r.torque.parts[0].momentum.delay, "delay", scale=1e-3, each=True),
+        identify.Free(lambda r: r.torque.parts[1].coefficient, "drag", scale=1e-5, **drag),
+    ]
+
+
+SENSOR = [
+    identify.Free(lambda r: r.readings[0].sensor.scale, "scale", scale=0.01),
+    identify.Free(lambda r: r.readings[0].sensor.skew, "skew", scale=0.01),
+    identify.Free(lambda r: r.torque.parts[0].momentum.tilt, "tilt", scale=0.01),
+]
+
+
+def together(records):
+    charts = {name: identify.Tensor(3e-4) for name in records}
+    moves = [*free({"spread": OWN_BIAS}, {"each": "body"}), *SENSOR]
+    problem = identify.Problem(records, charts, free=moves, noise_each="body")
+    return identify.fit(problem, starts=1)
+
+
+def alone(name, row, joint):
+    """One throw with the sensor of the joint fit; its bias and drag about the shared ones."""
+    index = row + joint.problem.of.index(name)
+    scene = jax.tree.map(
+        lambda leaf: leaf[index] if eqx.is_array(leaf) else leaf,
+        joint.problem.scenes(joint.parameters),
+    )
+    shared = joint.values["bias"]
+    scene = eqx.tree_at(lambda r: r.readings[0].sensor.bias, scene, shared)
+    # As sure as the joint fit is of the drag, of all axes the one that it is least sure of.
+    drag = max(
+        q.deviation for q in joint.quantities if q.name in [f"drag {a} [{name}]" for a in "xyz"]
+    )
+    moves = free({"prior": OWN_BIAS}, {"prior": drag})
+    problem = identify.Problem(scene, identify.Tensor(3e-4), free=moves)
+    start = problem.start(joint.body[name])
+    spin = joint.parameters.own.spin[index][None]
+    start = eqx.tree_at(lambda p: p.own.spin, start, spin)
+    return identify.fit(problem, starts=1, initial=start)
+
+
+def shift(mass, d):
+    return mass * (jnp.sum(d * d) * jnp.eye(3) - d[:, None] * d[None, :])
+
+
+def moments(name, total, device, factor, levers):
+    """Principal moments, kg mm², of what was measured with the device, ascending."""
+    between = levers[name] - levers[DEVICE]
+    other = -(MASSES[DEVICE] / MASSES[name]) * between
+    tensor = factor * (total - device) - shift(MASSES[DEVICE], between)
+    return jnp.linalg.eigvalsh(tensor - shift(MASSES[name], other)) * 1e6
+
+
+def factor_of(bodies, levers):
+    """By what factor the wheel's inertia is off: the least squares of the proof body's moments."""
+    factor = jnp.asarray(1.0)
+    for _ in range(5):
+
+        def off(f):
+            found = moments(PROOF, bodies[PROOF].tensor, bodies[DEVICE].tensor, f, levers)
+            return found / jnp.asarray(TRUTH[PROOF]) - 1.0
+
+        error, slope = off(factor), jax.jacfwd(off)(factor)
+        factor = factor - jnp.sum(error * slope) / jnp.sum(slope * slope)
+    return factor
+
+
+def of_levers(function, levers):
+    """Covariance of `function(levers)` by the scatter of the levers from throw to throw."""
+    total = 0.0
+    for name in levers:
+        slope = np.asarray(
+            jax.jacfwd(lambda d, name=name: function(levers | {name: d}))(levers[name])
+        )
+        rows = throws.levers(name)
+        # The variance of a median is π/2 times that of a mean.
+        total = total + slope @ (np.cov(rows.T) / len(rows) * np.pi / 2) @ slope.T
+    return total
+
+
+def shared(joint, levers, name, total):
+    """Variance of the log moments of a tensor by what it takes from the joint fit."""
+
+    def of(bodies, levers):
+        factor = factor_of(bodies, levers)
+        return jnp.log(moments(name, jnp.asarray(total), bodies[DEVICE].tensor, factor, levers))
+
+    low, high = joint.interval_of(lambda bodies, _: of(bodies, levers))
+    of_fit = ((high - low) / 2 / identify.reported.quantile(joint, 0.95)) ** 2
+    return of_fit + np.diag(of_levers(lambda d: of(joint.body, d), levers))
+
+
+def show(name, errors, reach):
+    held = np.abs(errors) <= reach
+    size = 100 * np.abs(errors)
+    print(
+        f"{name}: mean |error| {size.mean():.2f} %, worst {size.max():.2f} %; 95 % intervals (mean "
+        f"±{100 * reach.mean():.2f} %) hold {held.sum()} of {held.size}"
+    )
+    return held
+
+
+def main(every=1, end=0.53):
+    """Print the figures; returns them: errors of single throws, which intervals hold."""
+    levers = {name: jnp.asarray(throws.lever(name)) for name in MASSES}
+    # The scatter of the levers is itself known from a few throws only.
+    few = stdtrit(min(len(throws.paths(name)) for name in MASSES) - 1, 0.975)
+    records = {name: [record(path, every, end) for path in throws.paths(name)] for name in MASSES}
+    began = time.perf_counter()
+    joint = together(records)
+    print(f"{joint.problem.count} throws together: {time.perf_counter() - began:.1f} s")
+    print(f"status: {joint.status}")
+    for name, value in joint.values.items():
+        if name in ("bias", "scale", "skew", "tilt"):
+            print(f"  {name}", np.array2string(np.asarray(value), precision=4))
+    factor = factor_of(joint.body, levers)
+    print(f"  the wheel's inertia times {factor:.4f}; noise {np.unique(joint.noise[0]).round(4)}")
+    together_held, alone_held, all_errors = [], [], []
+    for name, truth in TRUTH.items():
+
+        def log_moments(bodies, levers, name=name):
+            f = factor_of(bodies, levers)
+            return jnp.log(moments(name, bodies[name].tensor, bodies[DEVICE].tensor, f, levers))
+
+        low, high = joint.interval_of(lambda bodies, _, of=log_moments: of(bodies, levers))
+        known = np.diag(of_levers(lambda d, of=log_moments: of(joint.body, d), levers))
+        reach = np.hypot((high - low) / 2, few * np.sqrt(known))
+        error = 0.5 * (low + high) - np.log(truth)
+        together_held.append(show(f"{name}, together", error, reach))
+        print(f"  errors % {np.round(100 * error, 2)}, 95 % ±% {np.round(100 * reach, 2)}")
+        errors, reaches, words = [], [], []
+        beside = shared(joint, levers, name, joint.body[name].tensor)
+        for row in range(len(records[name])):
+            one = alone(name, row, joint)
+
+            def own(body, _, name=name):
+                device = joint.body[DEVICE].tensor
+                return jnp.log(moments(name, body.tensor, device, factor, levers))
+
+            low, high = one.interval_of(own)
+            errors.append(0.5 * (low + high) - np.log(truth))
+            reaches.append(np.hypot((high - low) / 2, few * np.sqrt(beside)))
+            words.append(one.status.split(":")[0])
+        print("  status:", ", ".join(f"{words.count(word)} {word}" for word in sorted(set(words))))
+        alone_held.append(
+            show(f"{name}, {len(errors)} throws", np.array(errors), np.array(reaches))
+        )
+        all_errors += list(np.abs(errors))
+    held = np.concatenate([x.ravel() for x in alone_held])
+    print(
+        f"in all: mean {100 * np.mean(all_errors):.2f} %, worst {100 * np.max(all_errors):.2f} %; "
+        f"intervals of single throws that hold {held.mean():.0%}, of the joint fit "
+        f"{np.sum(together_held)} of {np.size(together_held)}"
+    )
+    return np.concatenate([np.ravel(x) for x in all_errors]), held, np.ravel(together_held)
+
+
+if __name__ == "__main__":
+    main(*(kind(text) for kind, text in zip((int, float), sys.argv[1:], strict=False)))

@@ -1,0 +1,182 @@
+"""What a fit says of itself: of wrong set-ups none is `ok`, of right ones all are."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import rigidjax as rj
+from rigidjax import identify
+from rigidjax.identify.full_scale import plateau
+
+BODY = rj.Inertia.from_principal(1.0, 1.6, 2.1)
+PLATE = rj.Inertia.from_principal(0.7, 1.3, 1.95)
+TS = np.linspace(0.0, 10.0, 80)
+OMEGA = (0.4, 1.2, -0.3)
+SIGMA = 0.01
+
+
+def tumble(body=BODY, omega=OMEGA, sigma=SIGMA, seed=0, ts=TS, law=None):
+    """Rates with noise, quaternions with noise."""
+    ys = rj.simulate(body, rj.Attitude([1.0, 0, 0, 0], list(omega)), jnp.asarray(ts), law).ys
+    rng = np.random.default_rng(seed)
+    rates = np.asarray(ys.omega) + sigma * rng.normal(size=(ts.size, 3))
+    steps = jnp.asarray(sigma * rng.normal(size=(ts.size, 3)))
+    turned = jax.vmap(lambda q, e: rj.quaternion.multiply(q, rj.quaternion.exp(e)))(ys.q, steps)
+    return rates, np.asarray(turned)
+
+
+def law(inertia=0.6, axis=(0.0, 0.0, 1.0), drag=(0.06, 0.05, 0.04), late=0.0):
+    times = np.linspace(-1.0, 11.0, 120)
+    speed = rj.torques.Series(times, 1.5 * np.tanh(times - 3.0 - late))
+    wheel = rj.torques.Flywheel(rj.torques.Wheel(inertia, list(axis), speed))
+    return rj.torques.Sum(wheel, rj.torques.Damping(list(drag)))
+
+
+def gyro(rates, noise=SIGMA, chart=None, ts=TS, starts=2, **options):
+    """A gyro alone."""
+    record = identify.Recording(ts, (identify.Gyro(noise), rates), **options)
+    return identify.fit(
+        identify.Problem(record, chart or identify.PrincipalRatios()), starts=starts
+    )
+
+
+def both(rates, turns, ts=TS, **sensor):
+    """A gyro and a star tracker of unknown noise."""
+    record = identify.Recording(
+        ts, (identify.Gyro(**sensor), rates), (identify.AttitudeSensor(), turns)
+    )
+    return identify.fit(identify.Problem(record, identify.PrincipalRatios()), starts=2)
+
+
+def wheel(rates, named, free=True):
+    """A gyro on a body with a wheel and drag."""
+    moves = [identify.Free(lambda r: r.torque.parts[1].coefficient, "drag", scale=0.05)]
+    record = identify.Recording(TS, (identify.Gyro(), rates), torque=named)
+    problem = identify.Problem(record, identify.Principal(1.5), free=moves if free else [])
+    return identify.fit(problem, starts=2)
+
+
+def together(*readings):
+    """Throws of one body."""
+    records = [identify.Recording(TS, (identify.Gyro(SIGMA), r)) for r in readings]
+    return identify.fit(identify.Problem(records, identify.PrincipalRatios()), starts=2)
+
+
+def unlike(rates):
+    """Gyro axes that are three degrees off a right angle."""
+    a = np.radians(3.0)
+    return rates @ np.array([[1.0, a, -a], [0.0, 1.0, a], [0.0, 0.0, 1.0]]).T
+
+
+def hit(sigma=SIGMA):
+    """Another motion from the middle on."""
+    rates = tumble(sigma=sigma)[0]
+    rates[40:] = tumble(omega=(0.9, -0.5, 0.8), seed=1, sigma=sigma)[0][:40]
+    return rates
+
+
+def drifting():
+    rates, turns = tumble()
+    return rates + 0.01 * TS[:, None] * np.array([1.0, -1.0, 0.5]), turns
+
+
+BIAS = np.array([0.05, -0.04, 0.06])
+WHEEL = law()
+TURN = rj.quaternion.exp(jnp.array([0.15, -0.2, 0.1]))
+
+FEW_WRONG = {
+    "skew of 3 degrees": lambda: gyro(unlike(tumble()[0])),
+    "axes that are not principal": lambda: gyro(tumble(BODY.rotated(TURN))[0]),
+    "a hit in the middle": lambda: gyro(hit()),
+}
+WRONG = {
+    "deg/s read as rad/s": lambda: both(np.degrees(tumble()[0]), tumble()[1]),
+    "rad/s read as deg/s": lambda: both(np.radians(tumble()[0]), tumble()[1]),
+    "signs of all axes": lambda: both(-tumble()[0], tumble()[1]),
+    "sign of one axis": lambda: both(tumble()[0] * [1, 1, -1], tumble()[1]),
+    "two axes swapped": lambda: both(tumble()[0][:, [1, 0, 2]], tumble()[1]),
+    "axes in another order": lambda: both(tumble()[0][:, [1, 2, 0]], tumble()[1]),
+    "a clock that is 5 % fast": lambda: both(*tumble(), ts=1.05 * TS),
+    "scalar last": lambda: both(tumble()[0], np.roll(tumble()[1], -1, axis=1)),
+    "world to body": lambda: both(tumble()[0], tumble()[1] * [1, -1, -1, -1]),
+    "gyro turned by 6 degrees": lambda: both(
+        tumble()[0] @ np.asarray(rj.so3.exp(jnp.array([0.0, 0.1, 0.0]))), tumble()[1]
+    ),
+    "one scale 5 % off": lambda: both(tumble()[0] * [1.05, 1, 1], tumble()[1]),
+    "a bias that drifts": lambda: both(*drifting()),
+    "a bias left out": lambda: gyro(tumble()[0] + BIAS),
+    "random readings": lambda: gyro(np.random.default_rng(1).normal(size=(80, 3)), noise=None),
+    "the wheel not named": lambda: gyro(tumble(law=WHEEL)[0], noise=None),
+    "the wheel the other way": lambda: wheel(tumble(law=WHEEL)[0], law(-0.6)),
+    "the wheel about x": lambda: wheel(tumble(law=WHEEL)[0], law(axis=(1.0, 0.0, 0.0))),
+    "the wheel's log late": lambda: wheel(tumble(law=WHEEL)[0], law(late=0.5)),
+    "drag left out": lambda: wheel(tumble(law=WHEEL)[0], law(drag=(0.0,) * 3), free=False),
+    "two bodies mixed": lambda: together(tumble()[0], tumble(PLATE, seed=1)[0]),
+    "cut off, then smoothed": lambda: gyro(
+        tumble(sigma=0.0)[0].clip(-0.9, 0.9) + tumble()[0] - tumble(sigma=0.0)[0]
+    ),
+}
+
+
+def right(seed):
+    """A body, a first rate and a noise drawn at random."""
+    rng = np.random.default_rng(100 + seed)
+    # A triangle of moments that is no plate and no ball; never near the middle axis.
+    s = np.sort(rng.uniform(0.3, 1.0, 3)) * [1.0, 1.3, 1.7]
+    body = rj.Inertia.from_principal(s[1] + s[2], s[0] + s[2], s[0] + s[1])
+    return dict(
+        body=body,
+        omega=rng.choice([-1.0, 1.0], 3) * rng.uniform(0.4, 1.2, 3),
+        sigma=10 ** rng.uniform(-3, -1.5),
+        seed=seed,
+    )
+
+
+def cut(seed):
+    rates = tumble(**right(seed))[0]
+    limit = 0.85 * np.abs(rates).max()
+    return gyro(rates.clip(-limit, limit), noise=right(seed)["sigma"])
+
+
+FEW_RIGHT = {"noise given": lambda: gyro(tumble(**right(0))[0], noise=right(0)["sigma"])}
+RIGHT = (
+    {f"noise given {k}": lambda k=k: gyro(tumble(**right(k))[0], noise=right(k)["sigma"]) for k in range(1, 6)}
+    | {f"noise unknown {k}": lambda k=k: gyro(tumble(**right(k))[0], noise=None) for k in range(6, 10)}
+    | {f"two sensors {k}": lambda k=k: both(*tumble(**right(k))) for k in range(10, 14)}
+    | {f"a wheel and drag {k}": lambda k=k: wheel(tumble(**right(k), law=WHEEL)[0], law(drag=(0.0,) * 3)) for k in range(14, 17)}
+    | {f"two throws {k}": lambda k=k: together(tumble(omega=right(k)["omega"], seed=k)[0], tumble(seed=k + 50)[0]) for k in (17, 18)}
+    | {f"cut off at full scale {k}": lambda k=k: cut(k) for k in (19, 20)}
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "name", [*FEW_WRONG, *(pytest.param(name, marks=pytest.mark.slow) for name in WRONG)]
+)
+def test_no_wrong_set_up_is_called_ok(name):
+    found = (FEW_WRONG | WRONG)[name]()
+    print(f"{name}: {found.status}")
+    assert found.status.split(":")[0] in ("doubtful", "ambiguous", "poor", "failed")
+    assert not found.ok
+
+
+@pytest.mark.parametrize(
+    "name", [*FEW_RIGHT, *(pytest.param(name, marks=pytest.mark.slow) for name in RIGHT)]
+)
+def test_every_right_set_up_is_called_ok(name):
+    found = (FEW_RIGHT | RIGHT)[name]()
+    print(f"{name}: {found.status}")
+    assert found.ok
+
+
+def test_a_plateau_is_one_only_where_readings_are_cut_off():
+    t = np.linspace(0.0, 10.0, 200)
+    wave = np.sin(2 * t) + 0.3 * np.sin(5 * t)
+    assert plateau(wave) is None
+    assert plateau(wave.clip(-0.9, 0.9)) == 0.9
+    assert plateau((wave - 0.5).clip(-0.9, 0.9)) == 0.9
+    # A slow wave in few digits is flat at its top.
+    assert plateau(np.round(np.sin(0.7 * t), 3)) is None
+    assert plateau(np.round(np.sin(0.7 * t) * 8) / 8) is None
+    assert plateau(np.full(200, 2.0)) is None
+    assert plateau(np.zeros(200)) is None
