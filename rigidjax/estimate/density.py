@@ -19,15 +19,11 @@ from rigidjax.estimate.grid import TURN_A_STEP
 from rigidjax.estimate.scene import Extended, Model, size_of
 from rigidjax.estimate.sensing import sensors_of
 from rigidjax.identify.fit import Fit
-from rigidjax.identify.problem import (
-    Parameters,
-    Problem,
-    all_errors,
-    filled,
-    first_state,
-    over_records,
-)
+from rigidjax.identify.jacobian import all_errors, filled, first_state, over_records
+from rigidjax.identify.parameters import Parameters, local
+from rigidjax.identify.problem import Problem
 from rigidjax.identify.residual import beside, whitened
+from rigidjax.identify.several import matter
 from rigidjax.motion import Rigid
 from rigidjax.motion.torques import CorrelatedTorque, RandomTorque, Sum
 
@@ -194,20 +190,17 @@ class LogDensity(eqx.Module):
 
     def _integrated(self, parameters: Parameters, noises: tuple, process: Any) -> Array:
         """The likelihood of each recording, the unknown torque integrated out."""
-        problem = self.problem
-        body = problem.body.body(parameters.body)
-        if problem.rung is not Rigid and isinstance(body, MassProperties):
-            body = body.inertia
+        problem = _with_noises(self.problem, noises)
 
-        def of_one(own: Any, record: Any, ref: Any, sigma: tuple) -> Array:
-            record = filled(problem, parameters.shared, own, record)
-            state: HasSpin = first_state(problem.rung, own, ref)
+        def of_one(mine: Any, record: Any, ref: Any, which: Any) -> Array:
+            record = filled(problem, mine, record)
+            body = matter(problem.body, mine.body, which)
+            if problem.rung is not Rigid and isinstance(body, MassProperties):
+                body = body.inertia
+            state: HasSpin = first_state(problem.rung, mine, ref)
             law = process if record.torque is None else Sum(record.torque, process)
             model = Model(body, law)
-            sensors = [
-                eqx.tree_at(lambda s: s.noise, r.sensor, each, is_leaf=lambda node: node is None)
-                for r, each in zip(record.readings, sigma, strict=True)
-            ]
+            sensors = [reading.sensor for reading in record.readings]
             torques = tuple(jnp.zeros(3, state.omega.dtype) for _ in model.coloured)
             x = Extended(state, torques, ())
             known = jnp.zeros(size_of(x) - 3 * len(torques), state.omega.dtype)
@@ -217,6 +210,14 @@ class LogDensity(eqx.Module):
                 model, sensors_of(sensors, model), record, first, self.substeps
             )
 
-        return over_records(
-            of_one, problem, parameters.own, problem.records, problem.reference, noises
-        )
+        return over_records(of_one, problem, local(problem, parameters))
+
+
+def _with_noises(problem: Problem, noises: tuple[Array, ...]) -> Problem:
+    """The problem whose sensors have these noises (R, k)."""
+    return eqx.tree_at(
+        lambda p: [reading.sensor.noise for reading in p.records.readings],
+        problem,
+        list(noises),
+        is_leaf=lambda node: node is None,
+    )
