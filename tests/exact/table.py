@@ -51,7 +51,7 @@ class Values(NamedTuple):
     largest: float
     worst: np.ndarray
     length: float  # largest ||q| − 1|
-    finite: bool
+    finite: bool  # all, but for turns beyond 1/eps rad
 
 
 def values(name, count, dtype, turn=False) -> Values:
@@ -71,14 +71,21 @@ def values(name, count, dtype, turn=False) -> Values:
             units.append(error_in_units(row, out, eps, j, reference(row)))
             rows.append(row)
     units = np.array(units or [np.nan])
+    # Of more turns than the dtype can count there is no state, and that is what NaN says.
+    turned = np.abs(wide[:, 13]) * np.abs(wide[:, 6:9]).max(axis=1)
+    within = turned <= 1 / np.finfo(dtype).eps
     return Values(
         len(rows),
         count - len(rows),
         float(np.median(units)),
         float(np.max(units)),
         rows[int(np.argmax(units))] if rows else wide[0],
-        float(np.abs(np.linalg.norm(got[:, HEAD], axis=1) - 1).max()),
-        bool(np.isfinite(got).all() and np.isfinite(slopes).all()),
+        float(np.abs(np.linalg.norm(got[within][:, HEAD], axis=1) - 1).max()),
+        bool(
+            np.isfinite(got[within]).all()
+            and np.isnan(got[~within]).all()
+            and np.isfinite(slopes).all()
+        ),
     )
 
 
