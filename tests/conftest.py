@@ -19,7 +19,7 @@ def pytest_configure(config):
         os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
     # The process that shares tests out to others runs none, and they wait for it.
     if not config.getoption("numprocesses", None) or hasattr(config, "workerinput"):
-        _load(config.option.markexpr == "not slow")
+        _load(config.option.markexpr in ("not slow and not long", "long and not slow"))
 
 
 def _load(default_run):
@@ -50,6 +50,17 @@ def _load(default_run):
     # for garbage is a tenth of the time.
     gc.freeze()
     gc.set_threshold(100_000, 50, 50)
+
+
+# Tests that took five seconds or more in a default run; of those with many cases the shortest stays.
+LONG = frozenset((Path(__file__).parent / "long.txt").read_text(encoding="utf-8").splitlines())
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items):
+    for item in items:
+        if item.nodeid in LONG:
+            item.add_marker("long")
 
 
 _MAPS, _MANY, _TESTS = Path("/proc/self/maps"), 45_000, itertools.count()

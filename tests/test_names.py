@@ -75,3 +75,12 @@ def test_what_few_programs_need_is_loaded_when_it_is_asked_for():
     out = subprocess.run([sys.executable, "-c", LATER], capture_output=True, text=True, cwd=ROOT)
     assert out.stdout.strip() == "[]", out.stdout + out.stderr
     assert out.returncode == 0, out.stderr
+
+
+def test_the_tests_that_a_default_run_is_spared_are_there():
+    lines = (ROOT / "tests" / "long.txt").read_text(encoding="utf-8").splitlines()
+    assert lines == sorted(set(lines))
+    for line in lines:
+        path, _, name = line.partition("::")
+        source = (ROOT / path).read_text(encoding="utf-8")
+        assert f"def {name.partition('[')[0]}(" in source, line
