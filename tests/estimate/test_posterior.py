@@ -55,6 +55,17 @@ def test_without_a_process_it_is_normal_about_the_motion(fitted):
     np.testing.assert_allclose(density.unpack(density.x0).body.tensor, fitted.body.tensor)
 
 
+@pytest.mark.oldest
+def test_its_gradient_is_right(fitted):
+    """Through its own rule and that of the errors, recording by recording: central differences."""
+    density = estimate.LogDensity(fitted)
+    x, h = np.asarray(density.x0) + 0.01, 1e-5
+    value = jax.jit(lambda x: density(x))
+    slope = jax.jit(jax.grad(lambda x: density(x)))(x)
+    far = [(float(value(x + d)) - float(value(x - d))) / (2 * h) for d in h * np.eye(x.size)]
+    np.testing.assert_allclose(slope, far, rtol=1e-5, atol=1e-5 * np.abs(far).max())
+
+
 @pytest.mark.slow
 def test_a_process_of_no_density_changes_nothing(fitted):
     plain = estimate.LogDensity(fitted)
