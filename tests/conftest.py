@@ -52,7 +52,7 @@ def _load(default_run):
     gc.set_threshold(100_000, 50, 50)
 
 
-# Tests that took five seconds or more in a default run; of those with many cases the shortest stays.
+# Tests that took four seconds or more of a run beside others; of many cases the shortest stays.
 LONG = frozenset((Path(__file__).parent / "long.txt").read_text(encoding="utf-8").splitlines())
 
 
