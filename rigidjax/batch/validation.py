@@ -1,6 +1,5 @@
 """What a batch is given, looked at before anything runs: shapes, kinds, and known numbers."""
 
-from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -13,7 +12,7 @@ from rigidjax import _checks
 from rigidjax._types import HasAttitude
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.motion import Attitude, Rigid, Spin, on_the_group
-from rigidjax.motion.torques.inputs import inputs_of
+from rigidjax.motion.torques.inputs import require_inputs
 from rigidjax.solve.validation import require_fit
 
 
@@ -104,25 +103,9 @@ def driven_by(inputs: Any, torque: Any, states0: Any, count: int) -> Any:
     **Raises:** `ValueError` for an input that is missing, or that the law does not read, for
     another number of bodies or steps, NaN; `TypeError` for what is no mapping.
     """
-    read = inputs_of(torque)
-    if inputs is None:
-        if read:
-            raise ValueError(
-                f"rollout: the law reads the input {read[0]!r}: give inputs={{{read[0]!r}: …}}, an "
-                "array (N, num_steps, *k)"
-            )
-        return None
-    if not isinstance(inputs, Mapping):
-        raise TypeError(f"inputs: wanted arrays by name, got {type(inputs).__name__}")
-    for name in [*read, *inputs]:
-        if name not in inputs or name not in read:
-            raise ValueError(
-                f"inputs: the law reads {', '.join(map(repr, read)) or 'none'}, got "
-                f"{', '.join(map(repr, inputs)) or 'none'}"
-            )
     wanted = (*states0.omega.shape[:1], count)
     found = {}
-    for name, value in inputs.items():
+    for name, value in require_inputs(torque, inputs).items():
         rows = _checks.numbers(value, f"inputs[{name!r}]")
         if rows.shape[:2] != wanted:
             raise ValueError(
@@ -131,7 +114,7 @@ def driven_by(inputs: Any, torque: Any, states0: Any, count: int) -> Any:
             )
         rows = _checks.finite(rows.astype(states0.omega.dtype), f"inputs[{name!r}]")
         found[name] = jnp.asarray(rows)
-    return found
+    return found or None
 
 
 def _own_torque(torque: Any, axes: Any, count: int) -> Any:

@@ -1,5 +1,6 @@
 """Levenberg–Marquardt on normal equations that are added up recording by recording."""
 
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -72,12 +73,7 @@ def descend(
     weights: Float[Array, "records times"],
     settings: Settings,
 ) -> tuple[Parameters, Search]:
-    """At most `settings.steps` steps down from `start`; with none, `start` is evaluated.
-
-    Source: Marquardt 1963, doi:10.1137/0111030; the damping by the ratio of what a step gained to
-    what it was to gain, Madsen, Nielsen and Tingleff 2004, Methods for non-linear least squares
-    problems, section 3.2.
-    """
+    """`search` for the free numbers of a problem."""
     flat, restore = ravel_pytree(start)
     where, made = places(problem, start), _made(start)
     number, kind = flat.size, flat.dtype
@@ -100,6 +96,31 @@ def descend(
             total = total + jnp.sum(e**2)
             gram, slope = gram + rows.T @ rows, slope + e @ rows
         return found, 0.5 * total, gram, slope
+
+    nothing = _nothing(problem, start, where.shape[1], kind)
+    end = search(evaluated, flat, made, settings, nothing)
+    return restore(end.point), end
+
+
+def search(
+    evaluated: Callable[[Array], tuple[Any, Array, Array, Array]],
+    start: Float[Array, " n"],
+    made: Float[Array, " n"],
+    settings: Settings,
+    nothing: Any,
+) -> Search:
+    """At most `settings.steps` steps down from `start`; with none, `start` is evaluated.
+
+    **Arguments:** `evaluated` point (n,) → whatever is to be kept of the last evaluation, half the
+    sum of squares, the normal matrix (n, n), the gradient (n,); `made` (n,) one for the numbers
+    that are of order one by their making, which no step moves far, else zero; `nothing` zeros of
+    the shapes of what is to be kept.
+
+    Source: Marquardt 1963, doi:10.1137/0111030; the damping by the ratio of what a step gained to
+    what it was to gain, Madsen, Nielsen and Tingleff 2004, Methods for non-linear least squares
+    problems, section 3.2.
+    """
+    number, kind = start.size, start.dtype
 
     def step(now: Search) -> Search:
         found, cost, gram, slope = evaluated(now.trial)
@@ -149,13 +170,12 @@ def descend(
             found,
         )
 
-    nothing = _nothing(problem, start, where.shape[1], kind)
     begun = Search(
-        flat,
+        start,
         jnp.asarray(jnp.inf, kind),
         jnp.zeros((number, number), kind),
         jnp.zeros(number, kind),
-        flat,
+        start,
         jnp.zeros((), kind),
         settings.damping.astype(kind),
         jnp.zeros((), jnp.int32),
@@ -163,8 +183,7 @@ def descend(
         jnp.asarray(False),
         nothing,
     )
-    end = lax.while_loop(lambda now: ~now.done & (now.taken <= settings.steps), step, begun)
-    return restore(end.point), end
+    return lax.while_loop(lambda now: ~now.done & (now.taken <= settings.steps), step, begun)
 
 
 def _nothing(problem: Problem, start: Parameters, columns: int, kind: Any) -> Any:

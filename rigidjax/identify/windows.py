@@ -18,8 +18,9 @@ from jaxtyping import Array, ArrayLike, Float
 from rigidjax import _checks
 from rigidjax._types import HasAttitude
 from rigidjax.body.inertia import Inertia, MassProperties
+from rigidjax.identify.levenberg_marquardt import BOLD, Search, Settings, search
 from rigidjax.motion import Attitude, Rigid, Spin
-from rigidjax.motion.torques.inputs import inputs_of
+from rigidjax.motion.torques.inputs import require_inputs
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.algebra import components
 from rigidjax.solve import equations_of_motion
@@ -30,8 +31,8 @@ from rigidjax.solve.validation import require_fit
 Value = TypeVar("Value")
 # Windows side by side: with their tangents they fill the first cache.
 _SIDE_BY_SIDE = 8
-# Marquardt's factor for the damping, where a fit has come to its end, and where it gives up.
-_FACTOR, _SETTLED, _LOST = 10.0, 1e-8, 1e12
+# A step of so many standard deviations, if errors were as large as `noise`, is the last.
+_SETTLED = 1e-5
 
 
 class Windows(eqx.Module):
@@ -204,9 +205,8 @@ def fit_windows(
     `noise` by kind (`x`, `v`, `q`, `omega`) what an error is measured in: by default the rms of a
     prediction that holds the state at the start. Steps are those of `RungeKutta4`, one a sample.
 
-    Levenberg–Marquardt with Marquardt's scaling on normal equations that are summed window by
-    window, so that memory does not grow with their number. Source: Marquardt 1963,
-    doi:10.1137/0111030.
+    Levenberg–Marquardt (`rigidjax.identify.levenberg_marquardt`) on normal equations that are
+    summed window by window, so that memory does not grow with their number.
 
     **Returns** a `WindowFit`; a fit that ends early returns its best point and says so.
 
@@ -237,48 +237,29 @@ def fit_windows(
     body, law = made
     start = jax.tree.map(lambda a: a[0], windows.starts)
     require_fit(body, start, law)
-    read = inputs_of(law)
-    if set(read) != set(windows.inputs):
-        raise ValueError(
-            f"inputs: the law reads {', '.join(map(repr, read)) or 'none'}, the windows have "
-            f"{', '.join(map(repr, windows.inputs)) or 'none'}"
-        )
+    require_inputs(law, windows.inputs)
     scales = _scales(windows, noise)
-
-    def normal(x: Any) -> tuple[Any, ...]:
-        found = _summed(scene, windows.step, guess, jnp.asarray(x), windows, scales)
-        return tuple(np.asarray(a) for a in found)
-
-    cost, slope, curve, spread = normal(x)
-    if not np.isfinite(cost):
+    settings = Settings(_SETTLED, BOLD, max_steps)
+    end = _searched(scene, windows.step, guess, windows, scales, settings)
+    if not np.isfinite(end.cost):
         raise ValueError("guess: the runs from it are not finite; is the scene right?")
-    damping, taken, converged = 1e-3, 0, False
-    while taken < max_steps and damping < _LOST and not converged:
-        size = np.diag(curve)
-        # A number that nothing depends on stays where it is.
-        size = np.where(size > 0, size, 1.0)
-        move = np.linalg.solve(curve + damping * np.diag(size), -slope)
-        taken += 1
-        tried = normal(x + move)
-        if np.isfinite(tried[0]) and tried[0] < cost:
-            converged = bool(cost - tried[0] <= _SETTLED * cost)
-            x, (cost, slope, curve, spread) = x + move, tried
-            damping /= _FACTOR
-        else:
-            converged = bool(-slope @ move <= _SETTLED * cost)
-            damping *= _FACTOR
-    inverse = np.linalg.pinv(curve)
-    deviation = np.sqrt(np.clip(np.diag(inverse @ spread @ inverse), 0, None))
+    value, taken = back(end.point), int(end.taken) - 1
+    # Once more where it ended: the last that was tried may have been no better.
+    there = _searched(scene, windows.step, value, windows, scales, Settings(_SETTLED, BOLD, 0))
+    inverse = np.linalg.pinv(np.asarray(there.gram))
+    spread = inverse @ np.asarray(there.found) @ inverse
+    deviation = np.sqrt(np.clip(np.diag(spread), 0, None))
+    converged = bool(end.converged)
     message = [] if converged else [f"stopped after {taken} steps: its best point"]
     try:
-        _require_real(scene(back(x))[0])
+        _require_real(scene(value)[0])
     except ValueError as refused:
         message.append(f"no real body has these numbers: {refused}")
     kinds = {k: float(v) for k, v in scales.items()}
     return WindowFit(
-        back(x),
+        value,
         back(jnp.asarray(deviation)),
-        float(cost) / (windows.count * windows.length),
+        float(end.cost) / (windows.count * windows.length),
         kinds,
         taken,
         converged,
@@ -392,11 +373,14 @@ def _all_errors(scene: Any, h: float, value: Any, windows: Windows, scales: Any)
 
 
 @eqx.filter_jit
-def _summed(scene: Any, h: float, guess: Any, x: Array, windows: Windows, scales: Any) -> Any:
-    """Half the sum of squares, its gradient, the normal matrix, and the spread of gradients."""
-    back = ravel_pytree(guess)[1]
+def _searched(
+    scene: Any, h: float, guess: Any, windows: Windows, scales: Any, settings: Settings
+) -> Search:
+    """The search from `guess`; what it keeps is the spread of the windows' gradients (n, n)."""
+    x, back = ravel_pytree(guess)
+    parts = (windows.starts, windows.wanted, windows.inputs)
 
-    def one(window: Any) -> Any:
+    def of_one(x: Array, window: Any) -> Any:
         start, wanted, inputs = window
 
         def residual(x: Array) -> tuple[Array, Array]:
@@ -406,8 +390,11 @@ def _summed(scene: Any, h: float, guess: Any, x: Array, windows: Windows, scales
 
         jacobian, flat = jax.jacfwd(residual, has_aux=True)(x)
         slope = jacobian.T @ flat
-        return 0.5 * flat @ flat, slope, jacobian.T @ jacobian, slope[:, None] * slope[None]
+        return slope[:, None] * slope[None], 0.5 * flat @ flat, jacobian.T @ jacobian, slope
 
-    parts = (windows.starts, windows.wanted, windows.inputs)
-    found = lax.map(one, parts, batch_size=min(_SIDE_BY_SIDE, windows.count))
-    return jax.tree.map(lambda a: jnp.sum(a, 0), found)
+    def evaluated(x: Array) -> Any:
+        few = min(_SIDE_BY_SIDE, windows.count)
+        found = lax.map(lambda window: of_one(x, window), parts, batch_size=few)
+        return jax.tree.map(lambda a: jnp.sum(a, 0), found)
+
+    return search(evaluated, x, jnp.zeros_like(x), settings, jnp.zeros((x.size, x.size), x.dtype))

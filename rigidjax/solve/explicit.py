@@ -135,19 +135,18 @@ def advance(
     h: Any,
     y: Atoms,
     end: Any = None,
-) -> tuple[Atoms, list[Atoms], list[Atoms]]:
-    """One step from `y`, not projected; the slopes at its stages, and the states there.
+) -> tuple[Atoms, list[Atoms]]:
+    """One step from `y`, not projected, and the slopes at its stages.
 
     **Arguments:** `field(t, y)` on tuples of arrays, which `y` is; `t`, `h` scalars; `end` the time
     of the stages at the end of the step, where it is not to be `t + h` rounded.
     """
     end = t + h if end is None else end
-    places, slopes = [y], [_fence(field(t, y))]
+    slopes = [_fence(field(t, y))]
     for node, row in zip(tableau.c, tableau.a, strict=True):
         place = _fence(_along(y, h, row, slopes))
-        places.append(place)
         slopes.append(_fence(field(end if node == 1 else t + node * h, place)))
-    return _along(y, h, tableau.b, slopes), slopes, places
+    return _along(y, h, tableau.b, slopes), slopes
 
 
 def _fence(numbers: Atoms) -> Atoms:

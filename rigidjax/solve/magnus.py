@@ -38,7 +38,7 @@ def turned(
     cubic through both ends. Source: Magnus 1954, doi:10.1002/cpa.3160070404; Iserles, Munthe-Kaas,
     Nørsett and Zanna 2000, doi:10.1017/S0962492900002154, section 5.
     """
-    after, slopes, _ = advance(KUTTA4, slope, t, h, p, end)
+    after, slopes = advance(KUTTA4, slope, t, h, p, end)
     after = barrier(after)
     first, last = slopes[0], slope(end, after)
     middle = tuple(

@@ -119,7 +119,7 @@ SPINS = rj.Spin(np.ones((10, 3)))
         (lambda: identify.windows(10.0 * np.arange(10.0) // 15, SPINS, length=2), "t: wanted even times"),
         (lambda: identify.Windows.joined(), "wanted at least one"),
         (lambda: identify.Windows.joined(*(identify.windows(np.arange(10.0), SPINS, length=k) for k in (2, 3))), "wanted one step, length"),
-        (lambda: identify.fit_windows(identify.windows(np.arange(10.0), SPINS, length=2), scene, GUESS), "the law reads 'u', the windows have none"),
+        (lambda: identify.fit_windows(identify.windows(np.arange(10.0), SPINS, length=2), scene, GUESS), "the law reads 'u', got none"),
         (lambda: identify.fit_windows(identify.windows(np.arange(10.0), SPINS, length=2), lambda x: (BODY, None), jnp.ones(1), noise={"q": 1.0}), "noise: wanted a number for each of"),
         (lambda: identify.fit_windows(identify.windows(np.arange(10.0), SPINS, length=2), lambda x: (BODY, None), ()), "guess: wanted a tree of floating numbers"),
         (lambda: identify.fit_windows(identify.windows(np.arange(10.0), SPINS, length=2), lambda x: (BODY, rj.torques.Damping(-1e200 * x * jnp.ones(3))), jnp.ones(1)), "guess: the runs from it are not finite"),

@@ -69,7 +69,7 @@ def test_by_attitude_by_magnus_and_by_sensitivity():
 @pytest.mark.parametrize(
     ("change", "kind", "words"),
     [
-        ({"inputs": None}, ValueError, r"the law reads the input 'u': give inputs=\{'u'"),
+        ({"inputs": None}, ValueError, "inputs: the law reads 'u', got none"),
         ({"inputs": {"v": RAMP}}, ValueError, "the law reads 'u', got 'v'"),
         ({"inputs": {"u": RAMP, "v": RAMP}}, ValueError, "the law reads 'u', got 'u', 'v'"),
         ({"inputs": [RAMP]}, TypeError, "wanted arrays by name, got list"),
@@ -94,9 +94,9 @@ def test_other_mistakes_are_named():
         rj.batch.simulate(BODY, spins(2), [0.0, 1.0], law, inputs={"u": RAMP})
     with pytest.raises(ValueError, match="inputs: the law reads 'u', got none"):
         torques.bind(law, {})
-    with pytest.raises(ValueError, match="Held: wanted increasing times"):
+    with pytest.raises(ValueError, match="times: wanted increasing times"):
         torques.Held([0.0, 0.0], [1.0, 2.0])
-    with pytest.raises(ValueError, match=r"Held: wanted a time for each row.*\(2,\) and \(3,\)"):
+    with pytest.raises(ValueError, match=r"values: wanted a row for each of 2 times, got \(3,\)"):
         torques.Held([0.0, 1.0], [1.0, 2.0, 3.0])
     with pytest.raises(ValueError, match="values: contains NaN"):
         torques.Held([0.0, 1.0], [1.0, np.nan])

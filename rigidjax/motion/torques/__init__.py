@@ -29,7 +29,7 @@ from rigidjax.motion.torques.gravity import (
     GravityGradient as GravityGradient,
     HeavyTop as HeavyTop,
 )
-from rigidjax.motion.torques.inputs import Held as Held, Input as Input, bind as bind
+from rigidjax.motion.torques.inputs import Input as Input, bind as bind
 from rigidjax.motion.torques.magnetic import MagneticDipole as MagneticDipole
 from rigidjax.motion.torques.random import (
     CorrelatedTorque as CorrelatedTorque,
@@ -37,6 +37,7 @@ from rigidjax.motion.torques.random import (
 )
 from rigidjax.motion.torques.series import Series as Series, Wheel as Wheel
 from rigidjax.motion.torques.tables import (
+    Held as Held,
     Linear as Linear,
     Pulses as Pulses,
     Tabulated as Tabulated,

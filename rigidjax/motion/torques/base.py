@@ -246,13 +246,13 @@ def tensor_of(body: Inertia | MassProperties) -> Float[Array, "3 3"]:
     return body.tensor if isinstance(body, Inertia) else body.inertia.tensor
 
 
-def vector_at(source: Any, t: ScalarLike, name: str) -> Vec3:
+def vector_at(source: Any, t: ScalarLike, name: str, size: int = 3) -> Float[Array, " size"]:
     """A vector that is constant, or the value at `t` of a callable Module of time.
 
     >>> vector_at(jnp.ones(3), 0.0, "field")
     Array([1., 1., 1.], dtype=float64)
     """
-    return _checks.floating(source(t), (3,), f"{name}(t)") if callable(source) else source
+    return _checks.floating(source(t), (size,), f"{name}(t)") if callable(source) else source
 
 
 def stays(source: Any) -> Vec3 | None:
@@ -264,11 +264,11 @@ def stays(source: Any) -> Vec3 | None:
     return None if callable(source) else source
 
 
-def constant_or_callable(source: Any, name: str) -> Any:
-    """`source` as it is if it can be called with a time; otherwise as a vector (3,)."""
+def constant_or_callable(source: Any, name: str, size: int = 3) -> Any:
+    """`source` as it is if it can be called with a time; otherwise as a vector (size,)."""
     if callable(source):
-        return _checks.function(source, name, "of time to (3,)")
-    return given(source, (3,), name)
+        return _checks.function(source, name, f"of time to ({size},)")
+    return given(source, (size,), name)
 
 
 def jumps_of(source: object) -> Float[Array, " n"]:

@@ -12,8 +12,14 @@ from rigidjax._types import HasPose, ScalarLike
 from rigidjax.body import physical
 from rigidjax.body.hints import Vector
 from rigidjax.body.inertia import MassProperties
-from rigidjax.motion.torques.base import AbstractForce, Wrench, given, jumps_of
-from rigidjax.motion.torques.inputs import at, channel
+from rigidjax.motion.torques.base import (
+    AbstractForce,
+    Wrench,
+    constant_or_callable,
+    given,
+    jumps_of,
+    vector_at,
+)
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.algebra import cross
 
@@ -73,7 +79,7 @@ class Rotors(AbstractForce):
         alone = _checks.numbers(thrust, "thrust").ndim, _checks.numbers(drag, "drag").ndim
         self.thrust = given(thrust, (count,) if alone[0] else (), "thrust")
         self.drag = given(drag, (count,) if alone[1] else (), "drag")
-        self.speeds = channel(speeds, "speeds", count)
+        self.speeds = constant_or_callable(speeds, "speeds", count)
 
     @property
     def jump_times(self) -> Float[Array, " n"]:
@@ -81,7 +87,7 @@ class Rotors(AbstractForce):
         return jumps_of(self.speeds)
 
     def __call__(self, t: ScalarLike, state: HasPose, body: MassProperties) -> Wrench:
-        n = at(self.speeds, t, "speeds", self.spins.shape[0]).astype(self.spins.dtype)
+        n = vector_at(self.speeds, t, "speeds", self.spins.shape[0]).astype(self.spins.dtype)
         square = n * n
         lift, twist = self.thrust * square, self.spins * self.drag * square
         # Written out, rotor by rotor: few, and sums of arrays are slow in a batch.
@@ -94,10 +100,10 @@ class Rotors(AbstractForce):
 
 
 class BodyDrag(AbstractForce):
-    """Drag along the axes of the body: `F = −R (a ∘ u + b ∘ |u| u)`, `u = Rᵀ (v − wind)`.
+    """Drag along the body's axes: `F = −R (a ∘ u + b ∘ |u| u)`, `τ = c × RᵀF`, `u = Rᵀ (v − wind)`.
 
     **Arguments:** `linear` a (3,) kg/s, such as of rotors in a cross-flow; `quadratic` b (3,) kg/m;
-    `centre` (3,) the point where it acts, m, body frame, from the centre of mass; `wind` (3,) the
+    `centre` c (3,) the point where it acts, m, body frame, from the centre of mass; `wind` (3,) the
     air's velocity, m/s, world frame. For a sphere see `Drag`.
 
     Source: Faessler, Franchi and Scaramuzza 2018, eq 5, doi:10.1109/LRA.2017.2776353, for the

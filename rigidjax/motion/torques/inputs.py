@@ -1,62 +1,16 @@
-"""Quantities that a law is driven by: held from sample to sample, or named and given by a loop."""
+"""Quantities that drive a law, by name: given by a loop at each step, or as functions of time."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array
 
-from rigidjax import _checks
 from rigidjax._types import ScalarLike
-from rigidjax.motion.torques.base import given
 
 Law = TypeVar("Law")
-
-
-class Held(eqx.Module):
-    """A function of time, t → (*k), that holds each sample until the next one (zero-order hold).
-
-    **Arguments:** `times` (n,) s, increasing; `values` (n, *k), row i from time i on, the first
-    also before it. Both may be traced.
-
-    The value jumps at `times`: a law that reads it hands its `jump_times` on, and adaptive steps
-    end there. For equal steps give the samples to `rigidjax.batch.rollout` as `inputs`.
-
-    **Raises:** `ValueError` for numbers of rows that differ, times that do not increase, NaN.
-
-    >>> Held([0.0, 1.0, 2.0], [[5.0], [6.0], [7.0]])(1.5)
-    Array([6.], dtype=float64)
-    """
-
-    times: Float[Array, " n"]
-    values: Float[Array, "n *k"]
-
-    def __init__(
-        self, times: Float[ArrayLike, " n"] | Sequence[Any], values: Float[ArrayLike, "n *k"] | Any
-    ):
-        t, rows = _checks.numbers(times, "times"), _checks.numbers(values, "values")
-        if t.ndim != 1 or not t.shape[0] or rows.shape[:1] != t.shape:
-            raise ValueError(
-                f"Held: wanted a time for each row, got shapes {t.shape} and {rows.shape}"
-            )
-        kind = jnp.result_type(float)
-        self.times = _checks.finite(t.astype(kind), "times")
-        self.values = _checks.finite(rows.astype(kind), "values")
-        falling = ~(_checks.namespace(t).diff(t) > 0)
-        self.times = _checks.refuse(self.times, falling.any(), "Held: wanted increasing times")
-
-    @property
-    def jump_times(self) -> Float[Array, " n"]:
-        """The times of the samples, s: the value jumps at each."""
-        return self.times
-
-    def __call__(self, t: ScalarLike) -> Array:
-        """The value at `t` (s), (*k)."""
-        t = jnp.asarray(t, self.times.dtype)
-        i = jnp.searchsorted(self.times, t, side="right").astype(jnp.int32) - 1
-        return self.values[jnp.clip(i, 0, self.times.shape[0] - 1)]
 
 
 class Input(eqx.Module):
@@ -128,16 +82,21 @@ def inputs_of(law: Any) -> list[str]:
     return list(dict.fromkeys(node.name for node in nodes if isinstance(node, Input)))
 
 
-def channel(value: Any, name: str, size: int) -> Any:
-    """A law's input as it is if it can be called with a time; otherwise as a vector (size,)."""
-    if callable(value):
-        return _checks.function(value, name, f"of time to ({size},)")
-    return given(value, (size,), name)
+def require_inputs(law: Any, inputs: Any) -> Mapping[str, Any]:
+    """`inputs` (none: empty), if they are those that the law reads.
 
+    **Raises:** `ValueError` for one that is missing, or that the law does not read; `TypeError` for
+    what is no mapping.
 
-def at(source: Any, t: ScalarLike, name: str, size: int) -> Array:
-    """The value of a `channel` at `t`."""
-    if not callable(source):
-        return source
-    found: Callable[[Any], Any] = source
-    return _checks.floating(found(t), (size,), f"{name}(t)")
+    >>> sorted(require_inputs(Input("u"), {"u": 1.0}))
+    ['u']
+    """
+    read, found = inputs_of(law), {} if inputs is None else inputs
+    if not isinstance(found, Mapping):
+        raise TypeError(f"inputs: wanted arrays by name, got {type(found).__name__}")
+    if set(read) != set(found):
+        raise ValueError(
+            f"inputs: the law reads {', '.join(map(repr, read)) or 'none'}, got "
+            f"{', '.join(map(repr, found)) or 'none'}"
+        )
+    return found

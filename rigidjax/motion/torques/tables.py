@@ -48,6 +48,39 @@ class Linear(eqx.Module):
         return self.values[i] + part * (self.values[i + 1] - self.values[i])
 
 
+class Held(eqx.Module):
+    """A function of time, t → (*k), that holds each sample until the next one (zero-order hold).
+
+    **Arguments:** `times` (n,) s, increasing; `values` (n, *k), row i from time i on, the first
+    also before it. Both may be traced.
+
+    The value jumps at `times`: a law that reads it hands its `jump_times` on, and adaptive steps
+    end there. For equal steps give the samples to `rigidjax.batch.rollout` as `inputs`.
+
+    **Raises:** `ValueError` for fewer than two rows, numbers of rows that differ, times that do not
+    increase, NaN.
+
+    >>> Held([0.0, 1.0, 2.0], [[5.0], [6.0], [7.0]])(1.5)
+    Array([6.], dtype=float64)
+    """
+
+    times: Float[Array, " n"]
+    values: Float[Array, "n *k"]
+
+    def __init__(self, times: Times, values: Float[ArrayLike, "rows *k"] | Sequence[Any]):
+        self.times, self.values = _rows(("times", times), ("values", values), extra=0, shape=None)
+
+    @property
+    def jump_times(self) -> Float[Array, " n"]:
+        """The times of the samples, s: the value jumps at each."""
+        return self.times
+
+    def __call__(self, t: ScalarLike) -> Array:
+        """The value at `t` (s), (*k)."""
+        i = _row(self.times, jnp.asarray(t, self.times.dtype))
+        return self.values[jnp.clip(i, 0, self.times.shape[0] - 1)]
+
+
 class Tabulated(AbstractTorque):
     """A torque from a table: straight lines between rows, none before the first or after the last.
 
@@ -135,14 +168,17 @@ def _row(times: Float[Array, " n"], t: Scalar) -> Any:
 
 
 def _rows(
-    named_times: tuple[str, Any], named_rows: tuple[str, Any], extra: int
+    named_times: tuple[str, Any],
+    named_rows: tuple[str, Any],
+    extra: int,
+    shape: tuple[int, ...] | None = (3,),
 ) -> tuple[Array, Array]:
-    """Times and rows of one precision, checked; each with its name."""
+    """Times and rows of one precision, checked; each with its name. `shape` of a row, if known."""
     (name, times), (other, values) = named_times, named_rows
     count, least = _length(times), 2
     if count is None or count < least:
         raise ValueError(f"{name}: wanted at least {least} times, shape (n,), got {_shape(times)}")
-    if _length(values) != count - extra:
+    if _length(values) != count - extra and shape is not None:
         advice = (
             "; n constant pieces have n + 1 edges (Tabulated draws lines between n rows)"
             if extra
@@ -150,7 +186,11 @@ def _rows(
         )
         raise ValueError(f"{other}: wanted {count - extra} rows of 3, got {_shape(values)}{advice}")
     times = _checks.finite(_checks.floating(times, (count,), name), name)
-    values = _checks.finite(_checks.floating(values, (count - extra, 3), other), other)
+    rows = _checks.numbers(values, other)
+    if shape is None and rows.shape[:1] != (count,):
+        raise ValueError(f"{other}: wanted a row for each of {count} times, got {rows.shape}")
+    shape = rows.shape[1:] if shape is None else shape
+    values = _checks.finite(_checks.floating(values, (count - extra, *shape), other), other)
     ordered = np.asarray(times) if _checks.known(times) else times
     falling = ordered[1:] <= ordered[:-1]
     where = ""
