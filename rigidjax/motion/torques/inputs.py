@@ -53,7 +53,7 @@ def bind(law: Law, inputs: Mapping[str, Any] | None) -> Law:
 
     **Raises:** `ValueError` for an input that is not among them.
 
-    >>> bind(Input("u"), {"u": Held([0.0, 1.0], [2.0, 4.0])})(1.0)
+    >>> bind(Input("u"), {"u": rj.torques.Held([0.0, 1.0], [2.0, 4.0])})(1.0)
     Array(4., dtype=float64)
     """
     if inputs is None:
