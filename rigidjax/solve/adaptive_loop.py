@@ -1,9 +1,7 @@
 """Steps as long as the tolerances allow, for one body or many, with the states at any times.
 
-The steps do not look at the times that are asked for. A state between two steps is one more step,
-a shorter one, from the step's start, taken as soon as the loop is past it: of the method's own
-order, on the group, with an error less than that of the step it lies in. Such a visit goes through
-the same stages as a step, so that it costs nothing to compile.
+The steps do not look at the times that are asked for. The state between two steps is that of the
+method's dense output, whose stages are taken only in steps with such a time in them.
 
 For derivatives the steps are recorded in segments: the start of each is kept, and the steps of the
 last one; the others are run once more when they are needed.
@@ -16,35 +14,32 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from rigidjax.solve import runge_kutta
+from rigidjax.solve import dense_output, runge_kutta
 from rigidjax.solve.components import lift
 from rigidjax.solve.record import (
+    AGAIN,
     HALTED,
     HEAD,
-    LAST,
     NONE,
     STEP,
-    VISIT,
     Answer,
     LoopState,
     Method,
     Record,
     Rows,
     Run,
-    SegmentEnd,
     at,
     inserted,
     packed,
     per_body,
-    replaced,
-    visit_of,
+    window,
 )
 from rigidjax.solve.runge_kutta import Step
 from rigidjax.solve.step_control import error_norm, first_step
 
 # What diffrax.PIDController does unless told: the same steps, so that figures can be compared.
 _SAFETY, _SMALLEST, _LARGEST = 0.9, 0.2, 10.0
-# Steps in a segment, rejected ones and visits included.
+# Steps in a segment, rejected ones included.
 SEGMENT = 512
 # More rows for one that is run again: it may take a few steps more.
 _MORE = 64
@@ -59,7 +54,7 @@ def value(method: Method, constants: list[Array], run: Run) -> Answer:
     if not run.between.shape[0]:
         loop = lax.while_loop(
             lambda loop: jnp.any(going(method, run, loop, None)),
-            lambda loop: _attempt(method, constants, run, loop, None)[0],
+            lambda loop: _attempt(method, constants, run, loop, None, None, None)[0],
             loop,
         )
         return _answer(run, loop, run.y0[None][:0])
@@ -97,71 +92,76 @@ def start(method: Method, constants: list[Array], run: Run) -> LoopState:
     h = jnp.where(sound, jnp.where(jnp.isnan(run.h0), h, run.h0), jnp.nan)
     h = _unless_halted(method, t0, y0, h)
     zero = jnp.zeros(t0.shape, jnp.int32)
-    return LoopState(t0, h, y0, zero, zero, zero, zero, t0, y0, zero)
+    return LoopState(t0, h, y0, zero, zero, zero, zero)
 
 
-def going(method: Method, run: Run, loop: LoopState, until: SegmentEnd | None) -> Array:
-    """Whether a body has a step to take or a time to visit."""
-    return _stepping(method, run, loop, until) | _visiting(run, loop, until)
-
-
-def _stepping(method: Method, run: Run, loop: LoopState, until: SegmentEnd | None) -> Array:
+def going(method: Method, run: Run, loop: LoopState, until: LoopState | None) -> Array:
+    """Whether a body has a step to take, until the state `until` at which a segment ends."""
     ahead = loop.stop < run.stops.shape[0]
     on = ahead & (loop.steps < method.max_steps) & (loop.h > 0)
-    return on if until is None else on & (loop.t < until.t)
-
-
-def _visiting(run: Run, loop: LoopState, until: SegmentEnd | None) -> Array:
-    size = run.between.shape[0]
-    if not size:
-        return jnp.zeros(loop.t.shape, bool)
-    there = (loop.known < size) & (at(run.between, loop.known) <= loop.t)
-    return there if until is None else there & (loop.known < until.known)
+    if until is None:
+        return on
+    return on & ((loop.t < until.t) | (loop.known < until.known))
 
 
 def _attempt(
-    method: Method, constants: list[Array], run: Run, loop: LoopState, until: SegmentEnd | None
-) -> tuple[LoopState, Array, Array]:
-    """One attempt at a step, or a visit, of every body; its row, and the state at its end."""
-    visiting = _visiting(run, loop, until)
-    on = _stepping(method, run, loop, until) & ~visiting
+    method: Method,
+    constants: list[Array],
+    run: Run,
+    loop: LoopState,
+    until: LoopState | None,
+    next_ts: tuple[Array, Array] | None,
+    found: Array | None,
+) -> tuple[LoopState, Array, Array | None]:
+    """One attempt at a step of every body, its row, and `found` with the states at times in it.
+
+    A step with more times in it than are looked at together is taken once more for the others.
+
+    **Arguments:** `next_ts` the number of a time between and the times from there (W, *bodies);
+    `found` their states, `None` where they are not wanted.
+    """
+    on = going(method, run, loop, until)
+    if next_ts is not None:
+        on = on & _looking(loop, next_ts)
     begin, end = at(run.stops, loop.stop), at(run.before, loop.stop)
     # A stop that is passed already, such as a jump before the start, needs no step.
     arrived = on & (loop.t >= begin)
     moving = on & ~arrived
-    cut = forced = jnp.zeros_like(on)
+    cut = over = jnp.zeros_like(on)
+    own = loop.h
     if until is not None:
-        forced = moving & (loop.t >= until.back_t)
-        goal = jnp.where(forced, until.t, until.back_t)
-        cut = goal < end
-        end = jnp.minimum(end, goal)
+        # At its end a segment may have looked at some times in the step that is the next one's.
+        over = loop.t >= until.t
+        own = jnp.where(over, until.h, own)
+        cut = ~over & (until.t < end)
+        end = jnp.where(cut, until.t, end)
     left = end - loop.t
     # The step kept is the controller's own, not the one cut short at a stop.
-    last = (loop.h >= left) | forced
-    h = jnp.where(moving, jnp.where(last, left, loop.h), jnp.zeros_like(loop.h))
+    last = own >= left
+    h = jnp.where(moving, jnp.where(last, left, own), jnp.zeros_like(own))
     late = jnp.where(last, end, loop.t + h)
-    step, index = Step(loop.t, h, late, loop.y), loop.stop
-    if run.between.shape[0]:
-        step = visit_of(run, loop.known, loop.back_t, loop.back_stop, loop.back_y)
-        index = jnp.where(visiting, loop.back_stop, loop.stop)
-        step = Step(
-            jnp.where(visiting, step.t, loop.t),
-            jnp.where(visiting, step.h, h),
-            jnp.where(visiting, step.end, late),
-            jnp.where(lift(visiting, loop.y), step.y, loop.y),
-        )
-    there = runge_kutta.stages(method.tableau, method.field, constants, step)
+    step = Step(loop.t, h, late, loop.y)
+    reach = jnp.where(last & ~cut, begin, late)
+    inside, dense, ts, number = None, None, loop.t, loop.known
+    if next_ts is not None:
+        first, ts = next_ts
+        number = jnp.arange(ts.shape[0], dtype=jnp.int32).reshape(-1, *[1] * loop.t.ndim)
+        inside = (number >= (loop.known - first)[None]) & (ts <= reach[None]) & moving[None]
+        if until is not None:
+            inside = inside & (number < (until.known - first)[None])
+        dense = None if found is None else jnp.any(inside)
+    there = runge_kutta.stages(method.tableau, method.field, constants, step, dense)
     y = method.project(there.end)
-    slope = None
-    if runge_kutta.needs_last_slope(method.tableau):
-        slope = method.field(constants, step.end, y)
-    error = runge_kutta.error_estimate(method.tableau, method.sizes, h, there.slopes, slope)
-    size = error_norm(error, loop.y, y, run.rtol, run.atol)
+    error = runge_kutta.error_estimate(method.tableau, method.sizes, h, there.slopes)
+    norm = error_norm(error, loop.y, y, run.rtol, run.atol)
     # NaN in a step too long says as little as infinity: try a shorter one.
-    size = lax.stop_gradient(jnp.where(jnp.isnan(size), jnp.inf, size))
-    accept = moving & ((size < 1) | forced)
+    norm = lax.stop_gradient(jnp.where(jnp.isnan(norm), jnp.inf, norm))
+    good = moving & ((norm < 1) | over)
+    accept = good & ~over
+    if inside is not None:
+        accept = accept & ~inside[-1]
     order = method.tableau.order
-    factor = jnp.clip(_SAFETY * size ** (-1 / order), _SMALLEST, _LARGEST)
+    factor = jnp.clip(_SAFETY * norm ** (-1 / order), _SMALLEST, _LARGEST)
     following = lax.stop_gradient(h) * factor.astype(h.dtype)
     kept = lax.stop_gradient(loop.h)
     following = jnp.where(last & accept, jnp.maximum(following, kept), following)
@@ -169,30 +169,42 @@ def _attempt(
     # round-off is, too: then that of the run's length counts.
     least = jnp.finfo(h.dtype).eps * (run.stops[-1] - run.t0)
     unit = 8 * jnp.finfo(h.dtype).eps * jnp.maximum(jnp.abs(loop.t), least)
-    why = jnp.where(jnp.isfinite(size), 0.0, jnp.nan).astype(h.dtype)
-    following = jnp.where(moving & ~accept & ~(following > unit), why, following)
+    why = jnp.where(jnp.isfinite(norm), 0.0, jnp.nan).astype(h.dtype)
+    following = jnp.where(moving & ~good & ~(following > unit), why, following)
     reached = accept & last & ~cut
-    following = jnp.where(moving, following, kept)
+    following = jnp.where(moving & (accept | ~good), following, kept)
     if until is None:
         ended = _unless_halted(method, late, y, following)
         following = jnp.where(accept, ended, following)
-    wide = lift(accept, y)
+    count = jnp.zeros_like(loop.known)
+    if inside is not None:
+        inside = inside & good[None]
+        count = jnp.sum(inside, 0, dtype=jnp.int32)
+        if found is not None:
+            rows = runge_kutta.dense_rows(method.tableau, h, there.slopes)
+            ts = jnp.where(inside, ts, loop.t[None])
+            states = dense_output.states(method.project, ts, loop.t, h, loop.y, rows)
+            found = jnp.where(jnp.expand_dims(inside, 1), states, found)
     after = LoopState(
         t=jnp.where(accept, jnp.where(reached, begin, late), loop.t),
         h=following,
-        y=jnp.where(wide, y, loop.y),
+        y=jnp.where(lift(accept, y), y, loop.y),
         stop=loop.stop + (arrived | reached).astype(jnp.int32),
-        steps=loop.steps + moving.astype(jnp.int32),
-        rejected=loop.rejected + (moving & ~accept).astype(jnp.int32),
-        known=loop.known + visiting.astype(jnp.int32),
-        back_t=jnp.where(accept, loop.t, loop.back_t),
-        back_y=jnp.where(wide, loop.y, loop.back_y),
-        back_stop=jnp.where(accept, loop.stop, loop.back_stop),
+        steps=loop.steps + (moving & (accept | ~good)).astype(jnp.int32),
+        rejected=loop.rejected + (moving & ~good).astype(jnp.int32),
+        known=loop.known + count,
     )
-    kind = jnp.where(accept, jnp.where(reached, LAST, STEP), NONE)
-    kind = jnp.where(visiting, VISIT + loop.known, kind.astype(jnp.int32))
-    head = jnp.stack([step.t, step.h, kind.astype(h.dtype), index.astype(h.dtype)])
-    return after, jnp.concatenate([head, step.y]), y
+    kind = jnp.where(accept, STEP, jnp.where(good, AGAIN, NONE)).astype(jnp.int32)
+    # Each kind that ends on the stop is the next number.
+    kind = kind + (good & last & ~cut).astype(jnp.int32)
+    head = [a.astype(h.dtype) for a in (loop.t, h, kind, loop.stop, loop.known, count)]
+    return after, jnp.concatenate([jnp.stack(head), loop.y]), found
+
+
+def _looking(loop: LoopState, next_ts: tuple[Array, Array]) -> Array:
+    """Whether there may be more times in the step than those that were looked at."""
+    first, ts = next_ts
+    return loop.known < first + ts.shape[0]
 
 
 def _unless_halted(method: Method, t: Array, y: Array, h: Array) -> Array:
@@ -208,70 +220,63 @@ def recorded(
     loop: LoopState,
     rows: Rows | None,
     ys: Array | None,
-    until: SegmentEnd | None,
+    until: LoopState | None,
 ) -> tuple[LoopState, Any, Any, Array]:
     """From here on, as far as there is room for rows; and how many there were.
 
     **Arguments:** `rows` and `ys` the record and the states at the times between, `None` where they
     are not wanted.
     """
-    size = run.y0.shape[0]
-    columns = (0 if rows is None else HEAD + size) + (0 if ys is None else size)
-    many = max(1, min(_MOST, _BLOCK // (run.y0.dtype.itemsize * columns)))
-    bodies = run.t0.ndim
+    bodies, numbers, width = run.t0.ndim, run.y0.shape[0], dense_output.width(run.between.shape[0])
+    columns = (0 if rows is None else HEAD + numbers) or 1
+    left = _BLOCK // run.y0.dtype.itemsize - (0 if ys is None else width * numbers)
+    many = max(1, min(_MOST, left // columns))
+
+    beyond = jnp.full((width, *run.t0.shape), jnp.inf, run.t0.dtype)
+    later = jnp.concatenate([run.between, beyond])
 
     def on(loop: LoopState) -> Array:
-        return jnp.any(going(method, run, loop, until))
-
-    beyond = jnp.full((many + 1, *run.t0.shape), jnp.inf, run.t0.dtype)
-    later = jnp.concatenate([run.between, beyond])
+        return going(method, run, loop, until)
 
     def block(state: Any) -> Any:
         loop, rows, ys, count = state
-        few = found = None
-        base, here, until_here = loop.known, run, until
-        if run.between.shape[0]:
-            # Only the times that this block can come to: all of them would make its state large.
-            few_times = partial(lax.dynamic_slice_in_dim, slice_size=many + 1)
-            here = run._replace(between=per_body(few_times, bodies)(later, base))
-            loop = loop._replace(known=jnp.zeros_like(base))
-            if until is not None:
-                until_here = until._replace(known=until.known - base)
+        few = found = next_ts = None
+        base = loop.known
+        if width:
+            # Only the next times: all of them would make the state of this loop large.
+            next_ts = (base, per_body(partial(window, size=width), bodies)(later, base))
 
         def attempt(state: Any) -> Any:
             loop, few, found, k = state
-            after, row, y = _attempt(method, constants, here, loop, until_here)
+            loop, row, found = _attempt(method, constants, run, loop, until, next_ts, found)
             if few is not None:
                 few = lax.dynamic_update_slice_in_dim(few, row[None], k, 0)
-            if found is not None:
-                # What is no visit goes to the place beyond the last.
-                place = jnp.where(after.known > loop.known, loop.known, many)
-                found = per_body(replaced, bodies)(found, y, place)
-            return after, few, found, k + 1
+            return loop, few, found, k + 1
+
+        def more(state: Any) -> Array:
+            more = on(state[0])
+            if next_ts is not None:
+                more = more & _looking(state[0], next_ts)
+            return jnp.any(more) & (state[-1] < many)
 
         if rows is not None:
             few = jnp.zeros((many, *rows.shape[1:]), rows.dtype)
         if ys is not None:
-            found = jnp.zeros((many + 1, *ys.shape[1:]), ys.dtype)
+            found = jnp.zeros((width, *ys.shape[1:]), ys.dtype)
         state = (loop, few, found, jnp.zeros((), jnp.int32))
-        more = lambda s: jnp.any(going(method, here, s[0], until_here)) & (s[-1] < many)  # noqa: E731
         loop, few, found, k = lax.while_loop(more, attempt, state)
-        if run.between.shape[0]:
-            loop = loop._replace(known=loop.known + base)
-            if few is not None:
-                visits = jnp.where(few[:, 2] >= VISIT, base, 0)
-                few = few.at[:, 2].add(visits.astype(few.dtype))
         if rows is not None and few is not None:
             rows = lax.dynamic_update_slice_in_dim(rows, few, count, 0)
         if found is not None:
-            ys = per_body(inserted, bodies)(ys, found[:many], base)
+            # Those behind the known ones are written over.
+            ys = per_body(inserted, bodies)(ys, found, base)
         return loop, rows, ys, count + k
 
     room = 0 if rows is None else rows.shape[0] - (_MORE if until is None else 0) - _MOST
 
     def more(state: Any) -> Array:
         loop, rows, _, count = state
-        return on(loop) if rows is None else on(loop) & (count < room)
+        return jnp.any(on(loop)) & (True if rows is None else count < room)
 
     return lax.while_loop(more, block, (loop, rows, ys, jnp.zeros((), jnp.int32)))
 
@@ -286,7 +291,7 @@ def _none_saved(run: Run) -> Array | None:
     size = run.between.shape[0]
     if not size:
         return None
-    return jnp.zeros((size + _MOST, *run.y0.shape), run.y0.dtype)
+    return jnp.zeros((size + dense_output.width(size), *run.y0.shape), run.y0.dtype)
 
 
 def _answer(run: Run, loop: LoopState, ys: Array | None) -> Answer:

@@ -7,6 +7,7 @@ program rounds otherwise, such a segment may take other steps between the same t
 derivative is that of those, the same to the tolerance.
 """
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -14,22 +15,23 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from rigidjax.solve import runge_kutta
+from rigidjax.solve import dense_output, runge_kutta
 from rigidjax.solve.adaptive_loop import going, recorded
 from rigidjax.solve.components import lift
 from rigidjax.solve.record import (
-    LAST,
     NONE,
-    VISIT,
+    STEP,
     Method,
     Record,
     Rows,
     Run,
-    SegmentEnd,
+    Taken,
+    at_stop,
+    inserted,
     per_body,
-    replaced,
     row_of,
     unpacked,
+    window,
 )
 from rigidjax.solve.runge_kutta import Axes
 
@@ -68,59 +70,65 @@ def tangents(
     method: Method, constants: list[Array], run: Run, record: Record, along: Inputs, axes: Axes
 ) -> tuple[Outputs, RecordTangents]:
     """The tangents of the answer and of the record."""
-    size, number = run.between.shape[0], jnp.max(record.number)
+    number, width = jnp.max(record.number), dense_output.width(run.between.shape[0])
+    later, next_ts = _and_more(along.between, width), _and_more(run.between, width)
 
     def segment(i: Array, state: Any) -> Any:
-        moved, back, out, starts, _ = state
+        moved, out, starts, _ = state
         rows, count = _segment(method, constants, run, record, i)
-        starts = [
-            lax.dynamic_update_slice_in_dim(a, b[None], i, 0)
-            for a, b in zip(starts, (moved, back), strict=True)
-        ]
+        starts = lax.dynamic_update_slice_in_dim(starts, moved[None], i, 0)
 
         def step(i: Array, state: Any) -> Any:
-            moved, back, out, path = state
-            here, kind, stop = row_of(run, rows[i])
-            visit = lift(kind >= VISIT, moved)
-            before = jnp.where(visit, back, moved)
-            path = lax.dynamic_update_slice_in_dim(path, before[None], i, 0)
-            of_t, of_h = _of_times(run, kind, stop, along)
-            there = runge_kutta.stages(method.tableau, method.field, constants, here)
-            push = (along.constants, of_t, of_h, before)
-            after = runge_kutta.pushed(
-                method.tableau, method.field, constants, here, there, push, axes
+            moved, out, path = state
+            taken = row_of(run, rows[i])
+            here = taken.step
+            path = lax.dynamic_update_slice_in_dim(path, moved[None], i, 0)
+            of_t, of_h = _of_times(run, taken.kind, taken.stop, along)
+            ts, inside, dense = _asked(run, taken, next_ts, width)
+            there = runge_kutta.stages(method.tableau, method.field, constants, here, dense)
+            push = (along.constants, of_t, of_h, moved)
+            after, slopes = runge_kutta.pushed(
+                method.tableau, method.field, constants, here, there, push, axes, dense
             )
+            if ts is not None:
+                of_ts = _windows(run, later, taken.known, width)
+                # What is not inside stands at the start of the step.
+                of_ts = jnp.where(_across(axes, inside), of_ts, of_t[None])
+
+                def states() -> Array:
+                    dense = runge_kutta.dense_rows(method.tableau, here.h, there.slopes)
+                    of_dense = runge_kutta.dense_rows(method.tableau, here.h, slopes)
+                    of_dense = of_dense + _by_length(here.h, of_h, dense, axes)
+                    inside_step = (ts, here.t, here.h, here.y, dense)
+                    push = (of_ts, of_t, of_h, moved, of_dense)
+                    return dense_output.moved_states(method.project, inside_step, push, axes)
+
+                none = jnp.zeros((width, *moved.shape), moved.dtype)
+                found = lax.cond(dense, states, lambda: none)
+                out = per_body(inserted, run.t0.ndim)(out, found, taken.known)
 
             def projected(tangent: Array) -> Array:
                 return jax.jvp(method.project, (there.end,), (tangent,))[1]
 
             after = axes.over(projected, 1, 1)(after)
-            taken = lift((kind != NONE) & (kind < VISIT), moved)
-            if size:
-                # What is no visit goes to the place beyond the last.
-                place = jnp.where(kind >= VISIT, kind - VISIT, size)
-                out = per_body(replaced, run.t0.ndim)(out, after, place)
-            return jnp.where(taken, after, moved), jnp.where(taken, moved, back), out, path
+            return jnp.where(lift(taken.kind >= STEP, moved), after, moved), out, path
 
         path = jnp.zeros((rows.shape[0], *moved.shape), moved.dtype)
-        moved, back, out, path = lax.fori_loop(0, count, step, (moved, back, out, path))
-        return moved, back, out, starts, path
+        moved, out, path = lax.fori_loop(0, count, step, (moved, out, path))
+        return moved, out, starts, path
 
+    size = run.between.shape[0]
     none = jnp.zeros((record.starts.shape[0], *along.y0.shape), along.y0.dtype)
-    out = jnp.zeros((size + 1, *along.y0.shape), along.y0.dtype)
+    out = jnp.zeros((size + width, *along.y0.shape), along.y0.dtype)
     path = jnp.zeros((record.rows.shape[0], *along.y0.shape), along.y0.dtype)
-    state = (along.y0, along.y0, out, [none, none], path)
-    moved, _, out, (y, back_y), path = lax.fori_loop(0, number, segment, state)
+    moved, out, y, path = lax.fori_loop(0, number, segment, (along.y0, out, none, path))
     kind, stop = (record.rows[:, i].astype(jnp.int32) for i in (2, 3))
     heads = jnp.stack([*_of_times(run, kind, stop, along)])
-    heads = _many_first(run, jnp.concatenate([heads, jnp.zeros_like(heads)]))
+    heads = _many_first(run, jnp.concatenate([heads, *[jnp.zeros_like(heads[:1])] * 4]))
     starts = unpacked(jnp.moveaxis(record.starts, 1, 0))
     zero = jnp.zeros_like(y[:, :1])
-    t, back_t = (
-        _many_first(run, _gathered(run, along.ends, i))[:, None]
-        for i in (starts.stop, starts.back_stop)
-    )
-    starts = jnp.concatenate([t, zero, back_t, *[zero] * 5, y, back_y], 1)
+    t = _many_first(run, _gathered(run, along.ends, starts.stop))[:, None]
+    starts = jnp.concatenate([t, *[zero] * 5, y], 1)
     return Outputs(out[:size], moved), RecordTangents(starts, jnp.concatenate([heads, path], 1))
 
 
@@ -128,68 +136,108 @@ def cotangents(
     method: Method, constants: list[Array], run: Run, record: Record, bars: Outputs, axes: Axes
 ) -> Inputs:
     """The transpose of `tangents`, but for the record."""
-    size, number = run.between.shape[0], jnp.max(record.number)
-    seeds = bars.between
+    number, width = jnp.max(record.number), dense_output.width(run.between.shape[0])
+    seeds, next_ts = _and_more(bars.between, width), _and_more(run.between, width)
 
-    def segment(i: Array, state: Any) -> Any:
+    def segment(i: Array, sums: Inputs) -> Inputs:
         rows, count = _segment(method, constants, run, record, number - 1 - i)
 
-        def step(i: Array, both: Any) -> Any:
-            sums, extra = both
-            here, kind, stop = row_of(run, rows[count - 1 - i])
-            visit, taken = kind >= VISIT, (kind != NONE) & (kind < VISIT)
-            there = runge_kutta.stages(method.tableau, method.field, constants, here)
-            bar, place = sums.y0, jnp.clip(kind - VISIT, 0, max(size - 1, 0))
-            if size:
-                bar = jnp.where(lift(visit, bar), _gathered(run, seeds, place), bar)
-            bar = axes.over(jax.vjp(method.project, there.end)[1], 1, (1,))(bar)[0]
-            bar = _where(visit | taken, bar)
-            by_constants, by_t, by_h, by_y = runge_kutta.pulled(
-                method.tableau, method.field, constants, here, there, bar, axes
-            )
-            # A body that has no step here may be NaN, and its sum is shared with others.
-            by_t, by_h, by_y = (_where(visit | taken, by) for by in (by_t, by_h, by_y))
-            held = kind != LAST
-            ends = _added(run, sums.ends, stop, by_t - _where(visit | ~held, by_h))
-            ends = _added(run, ends, stop + 1, _where(~held, by_h))
-            between = sums.between
-            if size:
-                # Each is visited once; what is no visit goes to the place beyond the last.
-                where = jnp.where(visit, place, size)
-                between = per_body(replaced, run.t0.ndim)(between, by_h, where)
-            # A visit begins where its step began, which comes next.
-            total = [
-                a + _where(visit | taken, b)
-                for a, b in zip(sums.constants, by_constants, strict=True)
-            ]
-            before = jnp.where(lift(taken, by_y), by_y + extra, sums.y0)
-            extra = jnp.where(lift(taken, by_y), jnp.zeros_like(extra), extra + _where(visit, by_y))
-            return Inputs(total, ends, between, before), extra
+        def step(i: Array, sums: Inputs) -> Inputs:
+            taken = row_of(run, rows[count - 1 - i])
+            here = taken.step
+            ts, inside, dense = _asked(run, taken, next_ts, width)
+            there = runge_kutta.stages(method.tableau, method.field, constants, here, dense)
+            on, held = taken.kind >= STEP, ~at_stop(taken.kind)
+            bar = axes.over(jax.vjp(method.project, there.end)[1], 1, (1,))(sums.y0)[0]
+            bar, more, between = _where(on, bar), None, sums.between
+            if ts is not None and dense is not None:
 
-        return lax.fori_loop(0, count, step, state)
+                def states(ts: Array, t: Array, h: Array, y: Array, slopes: Array) -> Array:
+                    rows_there = runge_kutta.dense_rows(method.tableau, h, slopes)
+                    return dense_output.states(method.project, ts, t, h, y, rows_there)
+
+                mask, given = _across(axes, inside), (ts, here.t, here.h, here.y, there.slopes)
+                asks = _windows(run, seeds, taken.known, width)
+                asks = jnp.where(jnp.expand_dims(mask, 1), asks, 0)
+
+                def back() -> tuple[Array, ...]:
+                    return axes.over(jax.vjp(states, *given)[1], 2, (1, 0, 0, 1, 2))(asks)
+
+                none = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(back))
+                by_ts, *more, by_slopes = lax.cond(dense, back, lambda: none)
+                between = per_body(_put_in, run.t0.ndim)(between, by_ts, mask, taken.known)
+                dense = (dense, by_slopes)
+            by_constants, by_t, by_h, by_y = runge_kutta.pulled(
+                method.tableau, method.field, constants, here, there, bar, axes, dense
+            )
+            if more is not None:
+                by_t, by_h, by_y = (a + b for a, b in zip((by_t, by_h, by_y), more, strict=True))
+            # A body that has no step here may be NaN, and its sum is shared with others.
+            used = taken.kind != NONE
+            by_t, by_h, by_y = (_where(used, by) for by in (by_t, by_h, by_y))
+            ends = _added(run, sums.ends, taken.stop, by_t - _where(~held, by_h))
+            ends = _added(run, ends, taken.stop + 1, _where(~held, by_h))
+            total = [a + _where(used, b) for a, b in zip(sums.constants, by_constants, strict=True)]
+            before = by_y + _where(~on, sums.y0)
+            return Inputs(total, ends, between, before)
+
+        return lax.fori_loop(0, count, step, sums)
 
     more = bars.end.shape[1:]
     sums = Inputs(
         [jnp.zeros((*c.shape[: c.ndim - run.t0.ndim], *more), c.dtype) for c in constants],
         jnp.zeros((run.stops.shape[0] + 1, *more), run.t0.dtype),
-        jnp.zeros((size + 1, *more), run.t0.dtype),
+        jnp.zeros((run.between.shape[0] + width, *more), run.t0.dtype),
         bars.end,
     )
-    sums, extra = lax.fori_loop(0, number, segment, (sums, jnp.zeros_like(bars.end)))
-    return sums._replace(between=sums.between[:size], y0=sums.y0 + extra)
+    sums = lax.fori_loop(0, number, segment, sums)
+    return sums._replace(between=sums.between[: run.between.shape[0]])
+
+
+def _asked(run: Run, taken: Taken, next_ts: Array, width: int) -> tuple[Any, Any, Any]:
+    """The times in a step (W, *bodies), which of them there are, whether any; or `None`."""
+    if not width:
+        return None, None, None
+    ts, here = _windows(run, next_ts, taken.known, width), taken.step
+    number = jnp.arange(width, dtype=jnp.int32).reshape(-1, *[1] * run.t0.ndim)
+    inside = number < taken.inside[None]
+    return jnp.where(inside, ts, here.t[None]), inside, jnp.any(inside)
+
+
+def _by_length(h: Array, of_h: Array, rows: Array, axes: Axes) -> Array:
+    """Tangents of the rows of dense output by the length of the step."""
+    rows = jnp.expand_dims(rows, 2) if axes.directions else rows
+    return lift((of_h / jnp.where(h == 0, 1, h)).astype(rows.dtype), rows) * rows
+
+
+def _across(axes: Axes, there: Array) -> Array:
+    """(W, *bodies), the same for all directions."""
+    return jnp.expand_dims(there, 1) if axes.directions else there
+
+
+def _and_more(a: Array, width: int) -> Array:
+    return jnp.concatenate([a, jnp.zeros((width, *a.shape[1:]), a.dtype)])
+
+
+def _windows(run: Run, a: Array, first: Array, width: int) -> Array:
+    return per_body(partial(window, size=width), run.t0.ndim)(a, first)
+
+
+def _put_in(a: Array, rows: Array, there: Array, first: Array) -> Array:
+    """`a` with those rows that are there put in."""
+    return inserted(a, jnp.where(there, rows, window(a, first, len(rows))), first)
 
 
 def _segment(
     method: Method, constants: list[Array], run: Run, record: Record, number: Array
 ) -> tuple[Rows, Array]:
     """The rows of a segment, and how many they are: of the last as they are, else run once more."""
-    end = jnp.max(record.number) - 1
-    last = record.starts.shape[0] - 1
-    loop, ahead = (unpacked(record.starts[jnp.clip(i, 0, last)]) for i in (number, number + 1))
+    end, last = jnp.max(record.number) - 1, record.starts.shape[0] - 1
+    loop, after = (unpacked(record.starts[jnp.clip(i, 0, last)]) for i in (number, number + 1))
     again = number < end
     # Nothing is left to do of the last one.
-    until = SegmentEnd(
-        jnp.where(again, ahead.t, -jnp.inf), ahead.back_t, jnp.where(again, ahead.known, 0)
+    until = after._replace(
+        t=jnp.where(again, after.t, -jnp.inf), known=jnp.where(again, after.known, 0)
     )
     loop, rows, _, count = recorded(method, constants, run, loop, record.rows, None, until)
     # With too little room for its steps there would be wrong numbers: then there are none.
@@ -201,12 +249,7 @@ def _segment(
 def _of_times(run: Run, kind: Array, stop: Array, along: Inputs) -> tuple[Array, Array]:
     """Tangents of a step's start and length; kind and stop (*many, *bodies)."""
     of_t, of_stop = (_gathered(run, along.ends, i) for i in (stop, stop + 1))
-    of_h = _where(kind == LAST, of_stop - of_t)
-    size = run.between.shape[0]
-    if size:
-        asked = _gathered(run, along.between, jnp.clip(kind - VISIT, 0, size - 1))
-        of_h = jnp.where(lift(kind >= VISIT, of_h), asked - of_t, of_h)
-    return of_t, of_h
+    return of_t, _where(at_stop(kind), of_stop - of_t)
 
 
 def _where(there: Array, a: Array) -> Array:

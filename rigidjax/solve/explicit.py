@@ -7,13 +7,20 @@ import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 from jaxtyping import Array
 
 from rigidjax.motion import on_the_group
 from rigidjax.solve.components import flat, leaf_sizes, unflat
-from rigidjax.solve.runge_kutta import Step, error_estimate, needs_last_slope, stages
+from rigidjax.solve.runge_kutta import (
+    Stages,
+    Step,
+    dense_rows,
+    error_estimate,
+    stage_counts,
+    stages,
+    weights,
+)
 from rigidjax.solve.tableaus import DORMAND_PRINCE8, KUTTA4, TSITOURAS5, Row, Tableau
 from rigidjax.special.barrier import barrier
 
@@ -170,51 +177,29 @@ def _diffrax_step(
     there = stages(tableau, field, [], step)
     # Once, after the stages: inside them it changes the order (jaxsim#192).
     y1 = on_the_group(unflat(there.end, y0))
-    end = flat(y1)
-    last = field([], t1, end)
-    slopes = jnp.concatenate([there.slopes, last[:, None]], 1)
     # Which steps are taken is not a thing to differentiate: their error is below the tolerance.
-    error = error_estimate(
-        tableau,
-        leaf_sizes(y0),
-        h,
-        there.slopes,
-        last if needs_last_slope(tableau) else None,
-    )
-    error = unflat(lax.stop_gradient(error), y0)
-    rows = _dense_rows(tableau, field, step, end, slopes)
-    coefficients = jax.tree.map(
-        lambda *leaves: jnp.stack(leaves), *[unflat(row, y0) for row in rows]
-    )
+    error = lax.stop_gradient(error_estimate(tableau, leaf_sizes(y0), h, there.slopes))
+    rows = _dense(tableau, field, step, there)
+    coefficients = jax.tree.map(lambda *leaves: jnp.stack(leaves), *[unflat(r, y0) for r in rows])
     dense = dict(y0=y0, coefficients=coefficients)
-    return y1, error, dense, None, dfx.RESULTS.successful
+    return y1, unflat(error, y0), dense, None, dfx.RESULTS.successful
 
 
-def _dense_rows(tableau: Tableau, field: Any, step: Step, end: Array, slopes: Array) -> list[Array]:
-    """The rows of `NestedInterpolation`, of all stages and the slope at the end."""
-    h = step.h.astype(end.dtype)
-    begin, more = slopes.shape[1], len(tableau.extra_c)
-    cubic = cubic_rows(end - step.y, h, slopes[:, 0], slopes[:, begin - 1])
-    if more:
-        matrix = np.zeros((more, begin + more))
-        for i, row in enumerate(tableau.extra_a):
-            matrix[i, list(row)] = list(row.values())
-        weights = jnp.asarray(matrix, end.dtype)
-        nodes = jnp.asarray(tableau.extra_c, step.t.dtype)
+def _dense(tableau: Tableau, field: Any, step: Step, there: Stages) -> Array:
+    """The rows of `NestedInterpolation`; what only they need is worked out apart."""
+    (count, whole), slopes = stage_counts(tableau), there.slopes
+    w = weights(tableau, slopes.dtype, whole)
+    h = step.h.astype(slopes.dtype)
 
-        def extra(i: Array, slopes: Array) -> Array:
-            place = step.y + h * (weights[i][None] * slopes).sum(1)
-            slope = field([], step.t + nodes[i] * (step.end - step.t), place)
-            return lax.dynamic_update_slice_in_dim(slopes, slope[:, None], begin + i, 1)
+    def extra(i: Array, slopes: Array) -> Array:
+        place = step.y + h * (w.a[i][None] * slopes).sum(1)
+        t = step.t + w.c[i].astype(step.t.dtype) * step.h
+        slope = field([], jnp.where(w.last[i], step.end, t), place)
+        return lax.dynamic_update_slice_in_dim(slopes, slope[:, None], i, 1)
 
-        slopes = jnp.concatenate([slopes, jnp.zeros((end.size, more), end.dtype)], 1)
-        slopes = lax.fori_loop(0, more, extra, slopes)
-    out = list(cubic)
-    for row in tableau.dense:
-        weights = np.zeros(slopes.shape[1])
-        weights[list(row)] = list(row.values())
-        out.append(h * (jnp.asarray(weights, end.dtype)[None] * slopes).sum(1))
-    return out
+    room = jnp.zeros((slopes.shape[0], whole - count), slopes.dtype)
+    slopes = jnp.concatenate([slopes, room], 1)
+    return dense_rows(tableau, step.h, lax.fori_loop(count, whole, extra, slopes))
 
 
 def _along(y: Atoms, h: Any, row: Row, slopes: Sequence[Atoms]) -> Atoms:

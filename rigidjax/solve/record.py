@@ -54,7 +54,7 @@ class LoopState(NamedTuple):
     """Where the loop is.
 
     **Fields:** time, next step, state, index of the next stop, counters; how many of the times
-    between are `known`; time, state and next stop where the last accepted step began.
+    between are `known`.
     """
 
     t: Array
@@ -64,55 +64,40 @@ class LoopState(NamedTuple):
     steps: Array
     rejected: Array
     known: Array
-    back_t: Array
-    back_y: Array
-    back_stop: Array
 
 
-# A recorded step is one row (4 + n, *bodies): start; length; kind; index of the stop ahead at the
-# start; state at the start. Kinds: none was taken, a step, a step that ends on the stop, and from
-# VISIT on a visit of one of the times between.
+# A recorded step is one row (6 + n, *bodies): start; length; kind; index of the stop ahead, and how
+# many times between were known, at the start; how many are in it; state at the start. Kinds: none
+# was taken; one that gave states at times in it only, and is taken again for more of them; a step;
+# each of these two also with its end on the stop.
 Rows = Array
-HEAD = 4
-NONE, STEP, LAST, VISIT = range(4)
+HEAD = 6
+NONE, AGAIN, AGAIN_LAST, STEP, LAST = range(5)
 # The next step of a run that has met the condition that ends it.
 HALTED = -1.0
 
 
-# The start of a segment is one row, too (8 + 2 n, *bodies): what is one number, then both states.
-# Whole numbers are exact in it up to 2²⁴ in float32.
-_NUMBERS = ("t", "h", "back_t", "stop", "steps", "rejected", "known", "back_stop")
-_WHOLE = 3
+# The start of a segment is one row, too (6 + n, *bodies): what is one number, then the state. Whole
+# numbers are exact in it up to 2²⁴ in float32.
+_NUMBERS = ("t", "h", "stop", "steps", "rejected", "known")
+_WHOLE = 2
 
 
 def packed(loop: LoopState) -> Array:
     """A `LoopState` as one row."""
     numbers = [getattr(loop, name).astype(loop.y.dtype) for name in _NUMBERS]
-    return jnp.concatenate([jnp.stack(numbers), loop.y, loop.back_y])
+    return jnp.concatenate([jnp.stack(numbers), loop.y])
 
 
 def unpacked(row: Array) -> LoopState:
     """What was `packed`."""
-    head, (y, back_y) = row[: len(_NUMBERS)], jnp.split(row[len(_NUMBERS) :], 2)
+    head, y = row[: len(_NUMBERS)], row[len(_NUMBERS) :]
     whole = head[_WHOLE:].astype(jnp.int32)
-    numbers = dict(zip(_NUMBERS, [*head[:_WHOLE], *whole], strict=True))
-    return LoopState(y=y, back_y=back_y, **numbers)
-
-
-class SegmentEnd(NamedTuple):
-    """Where a segment that is run again ends: time, and number of known states.
-
-    Another program rounds otherwise, and may take other steps. The last one is taken as it was,
-    from `back_t` on, because visits after the end begin there.
-    """
-
-    t: Array
-    back_t: Array
-    known: Array
+    return LoopState(y=y, **dict(zip(_NUMBERS, [*head[:_WHOLE], *whole], strict=True)))
 
 
 class Record(NamedTuple):
-    """A recorded run: the start of each segment (S, 8 + 2 n, *bodies), how many there are, and the
+    """A recorded run: the start of each segment (S, 6 + n, *bodies), how many there are, and the
     last one's rows.
     """
 
@@ -137,23 +122,29 @@ class Answer(NamedTuple):
     rejected: Array
 
 
-def visit_of(run: Run, number: Array, t: Array, stop: Array, y: Array) -> Step:
-    """The step from `t` to the time between of that number, with the stop ahead of `t`."""
-    late = at(run.between, number)
-    # The limit is the last moment before a jump: it moves nothing, and has no derivative here.
-    end = late + lax.stop_gradient(jnp.minimum(late, at(run.before, stop)) - late)
-    return Step(t, late - t, end, y)
+def at_stop(kind: Array) -> Array:
+    """Whether a step ends on the stop."""
+    return (kind == LAST) | (kind == AGAIN_LAST)
 
 
-def row_of(run: Run, row: Array) -> tuple[Step, Array, Array]:
-    """A recorded step, its kind, and the index of the stop ahead."""
+class Taken(NamedTuple):
+    """A recorded step: its `kind`, the index of the stop ahead, how many times between were known
+    before it, how many are in it.
+    """
+
+    step: Step
+    kind: Array
+    stop: Array
+    known: Array
+    inside: Array
+
+
+def row_of(run: Run, row: Array) -> Taken:
+    """A recorded step."""
     t, h, y = row[0], row[1], row[HEAD:]
-    kind, stop = row[2].astype(jnp.int32), row[3].astype(jnp.int32)
-    end = jnp.where(kind == LAST, at(run.before, stop), t + h)
-    if run.between.shape[0]:
-        visit = visit_of(run, kind - VISIT, t, stop, y)
-        end = jnp.where(kind >= VISIT, visit.end, end)
-    return Step(t, h, end, y), kind, stop
+    kind, stop, known, inside = (row[i].astype(jnp.int32) for i in range(2, HEAD))
+    end = jnp.where(at_stop(kind), at(run.before, stop), t + h)
+    return Taken(Step(t, h, end, y), kind, stop, known, inside)
 
 
 def at(a: Array, index: Array) -> Array:
@@ -171,9 +162,9 @@ def per_body(function: Callable[..., Any], bodies: int) -> Callable[..., Any]:
     return jax.vmap(function, in_axes=-1, out_axes=-1) if bodies else function
 
 
-def replaced(a: Array, row: Array, index: Array) -> Array:
-    return lax.dynamic_update_index_in_dim(a, row, index, 0)
-
-
 def inserted(a: Array, rows: Array, index: Array) -> Array:
     return lax.dynamic_update_slice_in_dim(a, rows, index, 0)
+
+
+def window(a: Array, index: Array, size: int) -> Array:
+    return lax.dynamic_slice_in_dim(a, index, size, 0)

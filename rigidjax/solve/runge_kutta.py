@@ -43,28 +43,54 @@ class Stages(NamedTuple):
 
 
 class Weights(NamedTuple):
-    """The tableau as arrays: `a` (s, s), `b`, `c` (s,); `last` whether c is 1."""
+    """The tableau as arrays: `a` (s, s), `b`, `c` (s,); `last` whether c is 1; `dense` (r, s) the
+    rows of dense output.
+    """
 
     a: Array
     b: Array
     c: Array
     last: Array
+    dense: Array
 
 
-def weights(tableau: Tableau, dtype: Any) -> Weights:
-    """The weights of a tableau.
+def stage_counts(tableau: Tableau) -> tuple[int, int]:
+    """How many stages a step has, and how many with those that dense output needs.
+
+    >>> from rigidjax.solve.tableaus import DORMAND_PRINCE8
+    >>> stage_counts(DORMAND_PRINCE8)
+    (12, 16)
+    """
+    whole = len(tableau.a) + 2 + len(tableau.extra_a)
+    return max(len(tableau.a), *tableau.errors[0]) + 1, whole
+
+
+def dense_size(tableau: Tableau) -> int:
+    """How many rows dense output has.
+
+    >>> from rigidjax.solve.tableaus import DORMAND_PRINCE8
+    >>> dense_size(DORMAND_PRINCE8)
+    7
+    """
+    return 3 + len(tableau.dense)
+
+
+def weights(tableau: Tableau, dtype: Any, count: int) -> Weights:
+    """The weights of the first `count` stages of a tableau.
 
     >>> from rigidjax.solve.tableaus import KUTTA4
-    >>> weights(KUTTA4, jnp.float64).a[3].tolist()
+    >>> weights(KUTTA4, jnp.float64, 4).a[3].tolist()
     [0.0, 0.0, 1.0, 0.0]
     """
-    count = len(tableau.a) + 1
-    a, b = np.zeros((count, count)), _row(tableau.b, count)
-    for i, row in enumerate(tableau.a):
-        a[i + 1, :count] = _row(row, count)
-    c = np.array([0.0, *tableau.c])
-    a, b, nodes = (jnp.asarray(w, dtype) for w in (a, b, c))
-    return Weights(a, b, nodes, jnp.asarray(c == 1.0))
+    rows = [{}, *tableau.a, tableau.b, *tableau.extra_a]
+    c = np.array([0.0, *tableau.c, 1.0, *tableau.extra_c])[:count]
+    whole = len(rows)
+    a, b = np.stack([_row(row, whole) for row in rows]), _row(tableau.b, whole)
+    first, last = np.eye(whole)[0], np.eye(whole)[len(tableau.a) + 1]
+    more = [_row(row, whole) for row in tableau.dense]
+    dense = np.stack([b, first - b, 2 * b - first - last, *more])[:, :count]
+    a, b, nodes, dense = (jnp.asarray(w, dtype) for w in (a[:count, :count], b[:count], c, dense))
+    return Weights(a, b, nodes, jnp.asarray(c == 1.0), dense)
 
 
 def _row(row: dict[int, float], count: int) -> np.ndarray:
@@ -82,10 +108,17 @@ def _put(record: Array, row: Array, i: Array) -> Array:
     return lax.dynamic_update_slice_in_dim(record, row[:, None], i, 1)
 
 
-def stages(tableau: Tableau, field: Field, constants: list[Array], step: Step) -> Stages:
-    """All stages of a step; `end` is not projected."""
-    w = weights(tableau, step.y.dtype)
-    count = w.b.shape[0]
+def stages(
+    tableau: Tableau, field: Field, constants: list[Array], step: Step, dense: Array | None = None
+) -> Stages:
+    """All stages of a step; `end` is not projected.
+
+    **Arguments:** `dense` whether the stages of dense output are wanted (else they are the state at
+    the start, their slopes 0); `None` where they never are.
+    """
+    plain, whole = stage_counts(tableau)
+    count = plain if dense is None else whole
+    w = weights(tableau, step.y.dtype, count)
     # Time may be kept in another precision than the state.
     h = lift(step.h.astype(step.y.dtype), step.y)
 
@@ -98,34 +131,55 @@ def stages(tableau: Tableau, field: Field, constants: list[Array], step: Step) -
         return times, _put(places, y, i), _put(slopes, slope, i)
 
     empty = jnp.zeros((step.y.shape[0], count, *step.y.shape[1:]), step.y.dtype)
-    times = jnp.zeros((count, *step.t.shape), step.t.dtype)
+    times, places = jnp.zeros((count, *step.t.shape), step.t.dtype), empty
+    if dense is not None:
+        # Where a field may have no value at 0, a stage that is left out must be somewhere else.
+        times, places = times + step.t[None], places + step.y[:, None]
     times, places, slopes = lax.fori_loop(
-        np.int32(0), np.int32(count), stage, (times, empty, empty)
+        np.int32(0), last_stage(tableau, dense), stage, (times, places, empty)
     )
     return Stages(times, places, slopes, step.y + h * _sum(w.b, slopes))
 
 
-def error_estimate(
-    tableau: Tableau, sizes: list[int], h: Array, slopes: Array, last: Array | None
-) -> Array:
+def last_stage(tableau: Tableau, dense: Array | None) -> Any:
+    """How many stages are taken, if dense output is wanted or not."""
+    plain, whole = stage_counts(tableau)
+    if dense is None:
+        return np.int32(plain)
+    return jnp.where(dense, np.int32(whole), np.int32(plain))
+
+
+def dense_rows(tableau: Tableau, h: Array, slopes: Array) -> Array:
+    """The rows (r, n, *bodies) of dense output: of a step of length `h`, from all its slopes.
+
+    The state at θ is y0 + θ (F0 + (1−θ) (F1 + θ (F2 + (1−θ) (F3 + …)))), Hairer, Nørsett and Wanner
+    (1993), II.6.
+    """
+    w = weights(tableau, slopes.dtype, slopes.shape[1]).dense
+    if slopes.ndim == 2:
+        found = jnp.sum(w[:, None] * slopes[None], 2)
+    else:
+        # In a batch XLA makes vector instructions of a product of matrices, not of the sum; for one
+        # body the product would be a kernel of its own.
+        found = jnp.einsum("rs,nsb->rnb", w, slopes)
+    return lift(h.astype(found.dtype), found) * found
+
+
+def error_estimate(tableau: Tableau, sizes: list[int], h: Array, slopes: Array) -> Array:
     """The error of a step (n, *bodies).
 
     Two estimates e5, e3 make e5 |e5|/√(|e5|² + 0.01 |e3|²), which falls as h⁸ (Hairer, Nørsett and
     Wanner 1993, II.10). The lengths are those of one array of the state, of `sizes` numbers: scales
     are not mixed.
 
-    **Arguments:** `slopes` (n, s, *bodies), `last` (n, *bodies) the slope at the end, if the
-    tableau asks for it.
+    **Arguments:** `slopes` (n, s, *bodies).
     """
     count, dtype = slopes.shape[1], slopes.dtype
     ones = [1] * (slopes.ndim - 2)
     # All sums at once: for one body each is a kernel of its own.
-    rows = [_row({i: v for i, v in row.items() if i < count}, count) for row in tableau.errors]
+    rows = [_row(row, count) for row in tableau.errors]
     sums = jnp.asarray(np.stack(rows), dtype).reshape(len(rows), 1, count, *ones)
     found = jnp.sum(sums * slopes[None], 2)
-    if last is not None:
-        ends = np.array([row.get(count, 0.0) for row in tableau.errors])
-        found = found + jnp.asarray(ends, dtype).reshape(-1, 1, *ones) * last[None]
     found = lift(h.astype(dtype), found) * found
     if len(rows) == 1:
         return found[0]
@@ -135,11 +189,6 @@ def error_estimate(
     # The smallest normal number keeps 0/0 out; no real estimate is as small as its root.
     ratio = jnp.sqrt(high / (high + 0.01 * low + float(jnp.finfo(dtype).tiny)))
     return found[0] * jnp.sum(which * ratio[:, None], 0)
-
-
-def needs_last_slope(tableau: Tableau) -> bool:
-    """Whether the error estimate uses the slope at the end of the step."""
-    return max(tableau.errors[0]) > len(tableau.a)
 
 
 class Axes(NamedTuple):
@@ -166,12 +215,14 @@ def pushed(
     there: Stages,
     along: tuple[list[Array], Array, Array, Array],
     axes: Axes,
-) -> Array:
-    """The tangent (n, *directions, *bodies) of the state at the end, not projected.
+    dense: Array | None = None,
+) -> tuple[Array, Array]:
+    """Tangents of the state at the end (n, *directions, *bodies), not projected, and of the slopes
+    (n, s, *directions, *bodies).
 
     **Arguments:** `along` tangents of the constants, of the step's time and length, of its state.
     """
-    w = weights(tableau, step.y.dtype)
+    w = weights(tableau, step.y.dtype, there.slopes.shape[1])
     of_constants, of_t, of_h, of_y = along
     h, dh = (lift(a.astype(of_y.dtype), of_y) for a in (step.h, of_h))
     slopes = jnp.expand_dims(there.slopes, 2) if axes.directions else there.slopes
@@ -188,8 +239,8 @@ def pushed(
 
     count = w.b.shape[0]
     none = jnp.zeros((of_y.shape[0], count, *of_y.shape[1:]), of_y.dtype)
-    moved = lax.fori_loop(np.int32(0), np.int32(count), stage, none)
-    return of_y + dh * _sum(w.b, slopes) + h * _sum(w.b, moved)
+    moved = lax.fori_loop(np.int32(0), last_stage(tableau, dense), stage, none)
+    return of_y + dh * _sum(w.b, slopes) + h * _sum(w.b, moved), moved
 
 
 def pulled(
@@ -200,29 +251,39 @@ def pulled(
     there: Stages,
     cotangent: Array,
     axes: Axes,
+    dense: tuple[Array, Array] | None = None,
 ) -> tuple[list[Array], Array, Array, Array]:
-    """The transpose of `pushed`: cotangents of the constants, of time, of length, of the state."""
-    w = weights(tableau, step.y.dtype)
+    """The transpose of `pushed`: cotangents of the constants, of time, of length, of the state.
+
+    **Arguments:** `cotangent` of the state at the end; `dense` whether dense output is used, and
+    its cotangents of the slopes (n, s, *directions, *bodies).
+    """
+    w = weights(tableau, step.y.dtype, there.slopes.shape[1])
     count = w.b.shape[0]
     h = step.h.astype(step.y.dtype)
+    wanted, more = (None, None) if dense is None else dense
+    upper = last_stage(tableau, wanted)
 
     def stage(i: Array, both: tuple[Array, Array]) -> tuple[Array, Array]:
-        m = count - 1 - i
+        m = upper - 1 - i
         below, seeds = both
         seed = w.b[m] * cotangent + _sum(w.a[:, m], below)
+        bar = lift(h, seed) * seed
+        if more is not None:
+            bar = bar + more[:, m]
         pull = jax.vjp(lambda y: field(constants, there.times[m], y), there.places[:, m])[1]
-        return _put(below, axes.over(pull, 1, (1,))(lift(h, seed) * seed)[0], m), _put(
-            seeds, seed, m
-        )
+        return _put(below, axes.over(pull, 1, (1,))(bar)[0], m), _put(seeds, seed, m)
 
     none = jnp.zeros((cotangent.shape[0], count, *cotangent.shape[1:]), cotangent.dtype)
-    below, seeds = lax.fori_loop(np.int32(0), np.int32(count), stage, (none, none))
+    below, seeds = lax.fori_loop(np.int32(0), upper, stage, (none, none))
     # The constants' share of all stages at once: it does not wait for the others. Each stage has
     # constants of its own, and their shares are summed last: else each number is a kernel.
     every = jax.vmap(lambda c, t, y: field(c, t, y), (0, 0, 1), 1)
     own = [jnp.broadcast_to(c, (count, *c.shape)) for c in constants]
     pull = jax.vjp(lambda c, t: every(c, t, there.places), own, there.times)[1]
-    by_own, by_times = axes.over(pull, 2, (-1, 1))(lift(h, seeds) * seeds)
+    bars = lift(h, seeds) * seeds
+    bars = bars if more is None else bars + more
+    by_own, by_times = axes.over(pull, 2, (-1, 1))(bars)
     by_constants = [jnp.sum(by, 0) for by in by_own]
     slopes = jnp.expand_dims(there.slopes, 2) if axes.directions else there.slopes
     by_length = jnp.sum(seeds * slopes, (0, 1)).astype(by_times.dtype)

@@ -186,6 +186,47 @@ def test_many_segments_are_one(monkeypatch, name, second):
         np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-10 * np.abs(b).max())
 
 
+def test_more_times_in_a_step_than_it_looks_at(monkeypatch):
+    # A loose tolerance: about eight steps for 60 times, four of which are looked at together; the
+    # rows of some steps, taken again for the rest, lie on both sides of a segment's end.
+    ts = jnp.sort(jnp.concatenate([TIMES, jnp.linspace(0.001, 1.2, 55)]))
+    weights = jnp.asarray(np.random.default_rng(1).normal(size=(60, 7)))
+    turn = jnp.asarray(np.random.default_rng(2).normal(size=16))
+    monkeypatch.setattr(adaptive_loop, "SEGMENT", 7)
+
+    def value(ts, p):
+        torque = scenes(p[:3])["pulses"]
+        field = rj.AttitudeEquations(rj.Inertia(jnp.asarray(TENSOR) + jnp.diag(p[3:6])), torque)
+        y0 = rj.Attitude(jnp.asarray(Q) + p[9:13], jnp.array([1.3, 0.7, -1.6]) + p[13:])
+        out = adaptive(
+            rj.solvers.DormandPrince8(), field, ts, y0, rtol=1e-4, atol=1e-6,
+            jumps=rj.torques.jumps_of(torque), max_steps=300,
+        )  # fmt: skip
+        return (weights * jnp.sin(jnp.concatenate([out.ys.q, out.ys.omega], 1))).sum(), out
+
+    @once
+    def of_all(ts, p):
+        (_, out), (by_ts, by_p) = jax.value_and_grad(value, (0, 1), has_aux=True)(ts, p)
+        push = jnp.sin(3 * ts), turn
+        ahead = jax.jvp(lambda ts, p: value(ts, p)[0], (ts, p), push)[1]
+        return out, by_ts @ push[0] + by_p @ turn, ahead, by_ts
+
+    p = jnp.zeros(16)
+    out, back, ahead, by_ts = of_all(ts, p)
+    assert out.num_steps < 15
+    np.testing.assert_allclose(back, ahead, rtol=1e-12)
+    # Against the state at each time from a run that stops there, and the slope of the state.
+    best = rj.simulate(
+        rj.Inertia(TENSOR), rj.Attitude(Q, [1.3, 0.7, -1.6]), ts[jnp.diff(ts, prepend=-1.0) > 0],
+        scenes(p)["pulses"], rtol=1e-12, atol=1e-14,
+    )  # fmt: skip
+    found = out.ys.omega[jnp.diff(ts, prepend=-1.0) > 0]
+    np.testing.assert_allclose(found, best.ys.omega, rtol=0, atol=5e-4)
+    step = 1e-6
+    moved = [once(lambda ts, p: value(ts, p)[0])(ts.at[30].add(s), p) for s in (step, -step)]
+    np.testing.assert_allclose(by_ts[30], (moved[0] - moved[1]) / (2 * step), atol=1e-7)
+
+
 def test_a_segment_run_again_may_take_other_steps(monkeypatch):
     # As where another program rounds otherwise; the times lie on both sides of each segment's end.
     ts = jnp.linspace(0.0, 1.5, 9)

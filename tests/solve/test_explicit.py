@@ -226,18 +226,18 @@ def test_every_derivative_agrees():
 
             return end
 
-        def fixed(w):
+        def equal_steps(w):
             return fixed(RungeKutta4(), FREE, jnp.array([0.0, 1.0]), rj.Attitude(Q, w), 400).q[-1]
 
-        def adaptive(w):
+        def long_steps(w):
             y0, ts = rj.Attitude(Q, w), jnp.array([0.0, 1.0])
             return adaptive(Tsitouras5(), FREE, ts, y0, rtol=1e-11, atol=1e-11).ys.q[-1]
 
         return [
             jax.jacfwd(plain(dfx.ForwardMode()))(omega),
             jax.jacrev(plain(dfx.RecursiveCheckpointAdjoint()))(omega),
-            jax.jacrev(fixed)(omega),
-            jax.jacfwd(adaptive)(omega),
+            jax.jacrev(equal_steps)(omega),
+            jax.jacfwd(long_steps)(omega),
         ]
 
     scene = (tuple(map(tuple, BODY.tensor.tolist())), tuple(Q.tolist()), tuple(OMEGA.tolist()), 1.0)
