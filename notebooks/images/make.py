@@ -1,0 +1,73 @@
+"""The pictures of README and the guide: python notebooks/images/make.py"""
+
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+
+import rigidjax as rj
+from rigidjax import identify
+
+jax.config.update("jax_enable_x64", True)
+HERE = Path(__file__).parent
+
+
+def save(figure, name):
+    figure.savefig(HERE / name, dpi=72)
+    plt.close(figure)
+
+
+def frames():
+    """Body frame and world frame before and after a quarter turn about z."""
+    figure = plt.figure(figsize=(7.0, 3.4), layout="constrained")
+    turns = (("q = (1, 0, 0, 0)", [0.0, 0, 0]), ("after a quarter turn about z", [0.0, 0, jnp.pi / 2]))
+    for place, (title, vector) in enumerate(turns, 1):
+        q = rj.quaternion.exp(jnp.array(vector))
+        ax = figure.add_subplot(1, 2, place, projection="3d", computed_zorder=False)
+        for axis, colour, name in zip(jnp.eye(3), rj.plot.COLOURS, "xyz", strict=False):
+            ax.plot(*zip([0, 0, 0], 1.35 * axis, strict=True), color="0.6", lw=1.2, ls="--")
+            ax.text(*(1.5 * axis), name, color="0.45", ha="center", va="center")
+            end = rj.quaternion.rotate(q, axis)
+            ax.plot(*zip([0, 0, 0], end, strict=True), color=colour, lw=3)
+            ax.text(*(end + jnp.array([0.12, 0.12, 0.12])), f"{name}′", color=colour, weight="bold")
+        ax.set(title=title, xlim=(-1, 1), ylim=(-1, 1), zlim=(-0.6, 1.4))
+        ax.set_axis_off()
+        ax.view_init(24, 35)
+    figure.suptitle("dashed: world axes x, y, z;  full: body axes x′, y′, z′", fontsize=9)
+    save(figure, "frames.png")
+
+
+def flip():
+    """README's simulation."""
+    body = rj.shapes.box(1.0, [0.30, 0.20, 0.08])
+    start = rj.Attitude(q=[1.0, 0, 0, 0], omega=[0.02, 6.0, 0.02])
+    sol = rj.simulate(body.inertia, start, jnp.linspace(0.0, 9.0, 301))
+    figure = plt.figure(figsize=(8.0, 3.4), layout="constrained")
+    rj.plot.polhode(body.inertia, sol.ys, ax=figure.add_subplot(1, 2, 1, projection="3d"))
+    ax = figure.add_subplot(1, 2, 2)
+    for index, colour in enumerate(rj.plot.COLOURS[:3]):
+        ax.plot(sol.ts, sol.ys.omega[:, index], color=colour, label=f"Ω{'₁₂₃'[index]}")
+    ax.set(xlabel="time, s", ylabel="body rate, rad/s", title="the flip about the middle axis")
+    ax.legend(loc="upper right", fontsize=8)
+    ax.grid(alpha=0.3)
+    save(figure, "flip.png")
+
+
+def fit():
+    """README's fit."""
+    truth = rj.Inertia.from_principal(1.0, 1.6, 2.2)
+    t = jnp.linspace(0.0, 10.0, 101)
+    motion = rj.simulate(truth, rj.Spin([1.0, 0.5, 1.2]), t).ys
+    rates = motion.omega + 0.05 * jax.random.normal(jax.random.key(0), (101, 3))
+    record = identify.Recording(t, (identify.Gyro(noise=0.05), rates))
+    found = identify.fit(identify.Problem(record, identify.PrincipalRatios()), starts=1)
+    save(rj.plot.fit(found), "fit.png")
+
+
+if __name__ == "__main__":
+    for draw in (frames, flip, fit):
+        draw()
