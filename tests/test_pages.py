@@ -1,0 +1,152 @@
+"""README and the guide tell the truth: their Python blocks run, their links lead somewhere."""
+
+import json
+import re
+from pathlib import Path
+from urllib.parse import unquote
+
+import pytest
+
+import rigidjax as rj
+
+ROOT = Path(__file__).parents[1]
+README = ROOT / "README.md"
+RUN = (README, *sorted((ROOT / "notebooks").rglob("*.md")))
+LISTS = (ROOT / "CHANGELOG.md", ROOT / "tests" / "failures" / "README.md")
+_FENCE = re.compile(r"^(```+)(\S*)[^\n]*\n(.*?)^\1", re.S | re.M)
+_LINK = re.compile(r"!?\[[^\]\n]*\]\(([^)\s]+)\)")
+
+
+def text_of(path):
+    return path.read_text(encoding="utf-8")
+
+
+def name_of(path):
+    return path.relative_to(ROOT).as_posix()
+
+
+def blocks(path):
+    """Python of a page, each block behind as many empty lines that a traceback names its line."""
+    text = text_of(path)
+    return [
+        "\n" * (text.count("\n", 0, found.start()) + 1) + found[3]
+        for found in _FENCE.finditer(text)
+        if found[2] == "python"
+    ]
+
+
+def prose(path):
+    """The page without its blocks and `code`."""
+    return re.sub(r"`[^`\n]+`", "", _FENCE.sub("", text_of(path)))
+
+
+def anchors(path):
+    """The headings of a page as links name them."""
+    if path.suffix != ".md":
+        return set()
+    titles = re.findall(r"^#+ (.+)$", _FENCE.sub("", text_of(path)), re.M)
+    return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
+
+
+@pytest.mark.parametrize("path", [path for path in RUN if blocks(path)], ids=name_of)
+def test_blocks_run_as_printed(path, tmp_path, monkeypatch, capsys):
+    pytest.importorskip("matplotlib").use("Agg")
+    import jax
+    import matplotlib.pyplot as plt
+
+    monkeypatch.chdir(tmp_path)
+    cache = jax.config.values["jax_compilation_cache_dir"]
+    namespace = {"__name__": "__main__"}
+    try:
+        for block in blocks(path):
+            exec(compile(block, name_of(path), "exec"), namespace)
+    finally:
+        jax.config.update("jax_compilation_cache_dir", cache)
+        plt.close("all")
+    assert "nan" not in capsys.readouterr().out
+
+
+def test_what_readme_computes(capsys):
+    """The body of README flips; its slope is that of a difference quotient."""
+    namespace = {}
+    for block in blocks(README)[:2]:
+        exec(compile(block, "README.md", "exec"), namespace)
+    assert float(namespace["sol"].ys.omega[:, 1].min()) < -5.9
+    rate, h = namespace["rate"], 1e-7
+    quotient = float(rate(0.008 + h) - rate(0.008 - h)) / (2 * h)
+    assert float(capsys.readouterr().out.split()[-1]) == pytest.approx(quotient, rel=1e-5)
+
+
+def test_readme_is_short():
+    assert len(text_of(README).splitlines()) <= 180
+
+
+@pytest.mark.parametrize("path", RUN, ids=name_of)
+def test_a_page_says_first_what_one_learns(path):
+    if path != README:
+        lines = text_of(path).splitlines()
+        assert lines[0].startswith("# ")
+        assert lines[2].startswith("*You learn: ")
+
+
+@pytest.mark.parametrize("path", (*RUN, *LISTS), ids=name_of)
+def test_links_lead_to_files(path):
+    for link in _LINK.findall(prose(path)):
+        place, _, heading = unquote(link).partition("#")
+        if re.match(r"[a-z]+:", place):
+            continue
+        there = (path.parent / place) if place else path
+        assert there.exists(), link
+        assert not heading or heading in anchors(there), link
+
+
+def test_every_page_can_be_found():
+    """README names each page of the guide, the site's contents each page there is."""
+    named = {(ROOT / link.partition("#")[0]).resolve() for link in _LINK.findall(prose(README))}
+    assert named >= set((ROOT / "notebooks" / "guide").glob("*.md"))
+
+
+@pytest.mark.parametrize("path", (*RUN, *LISTS), ids=name_of)
+def test_tables_are_rectangular(path):
+    rows = []
+    for line in [*_FENCE.sub("", text_of(path)).splitlines(), ""]:
+        if line.startswith("|"):
+            rows.append(len(re.findall(r"(?<!\\)\|", line)))
+        else:
+            assert len(set(rows)) <= 1, line or path
+            rows = []
+
+
+@pytest.mark.parametrize("path", RUN, ids=name_of)
+def test_names_exist(path):
+    missing = []
+    for name in sorted(set(re.findall(r"`rj\.([a-zA-Z_][\w.]*)", text_of(path)))):
+        thing = rj
+        for part in name.rstrip(".").split("."):
+            thing = getattr(thing, part, None)
+        if thing is None:
+            missing.append(name)
+    assert not missing
+
+
+def test_tests_and_files_that_pages_mention_exist():
+    tests = ROOT / "tests"
+    sources = "\n".join(text_of(path) for path in tests.rglob("test_*.py"))
+    text = "\n".join(text_of(path) for path in RUN)
+    for name in re.findall(r"`(?:[\w/]+\.py::)?(test_\w+)…?`", text):
+        assert f"def {name}" in sources, name
+    files = re.findall(r"\b((?:tests|notebooks)/[\w/]+\.(?:py|md|ipynb))\b", text)
+    assert len(files) > 20
+    for path in files:
+        assert (ROOT / path).exists(), path
+
+
+def test_pictures_are_small():
+    pictures = sorted((ROOT / "notebooks" / "images").glob("*.png"))
+    assert pictures and all(path.stat().st_size <= 60_000 for path in pictures)
+
+
+def test_a_notebook_opens_with_its_title():
+    for path in (ROOT / "notebooks").glob("*.ipynb"):
+        first = json.loads(text_of(path))["cells"][0]
+        assert first["cell_type"] == "markdown" and first["source"][0].startswith("# ")
