@@ -86,7 +86,9 @@ def homes(
         full = [f"{short[place.__name__]}.{other}" for place, other in where]
         best = min(full, key=lambda one: (one.count("."), len(one), one))
         found[module].append((best, getattr(module, name)))
-    return {module: sorted(entries, key=lambda e: e[0].lower()) for module, entries in found.items()}
+    return {
+        module: sorted(entries, key=lambda e: e[0].lower()) for module, entries in found.items()
+    }
 
 
 def _key(module: types.ModuleType, name: str, thing: Any) -> tuple[str, Any]:
@@ -98,10 +100,7 @@ def _key(module: types.ModuleType, name: str, thing: Any) -> tuple[str, Any]:
 
 def index(pages: dict[types.ModuleType, str], short: dict[str, str]) -> str:
     """The list of modules, each with its first line."""
-    rows = [
-        f"| [{short[m.__name__]}]({m.__name__}.md) | {first_line(m)} |"
-        for m in pages
-    ]
+    rows = [f"| [{short[m.__name__]}]({m.__name__}.md) | {first_line(m)} |" for m in pages]
     listed = "\n".join(module.__name__ for module in pages)
     return (
         "# Reference\n\nEvery public name, by module; `rj` is `import rigidjax as rj`. Arguments' "
@@ -156,7 +155,9 @@ def _members(cls: type, names: dict[int, str]) -> Iterator[str]:
         if isinstance(plain, property):
             yield directive("property", name, body_of(plain), _INNER)
         elif inspect.isfunction(plain) and inspect.getdoc(plain):
-            yield directive("method", name + arguments(plain, names, bound=True), body_of(plain), _INNER)
+            yield directive(
+                "method", name + arguments(plain, names, bound=True), body_of(plain), _INNER
+            )
 
 
 def arguments(thing: Any, names: dict[int, str], bound: bool = False) -> str:

@@ -5,13 +5,17 @@ import re
 from pathlib import Path
 from urllib.parse import unquote
 
+import numpy as np
 import pytest
+import scipy.integrate
 
 import rigidjax as rj
 
 ROOT = Path(__file__).parents[1]
 README = ROOT / "README.md"
-RUN = (README, *sorted((ROOT / "notebooks").rglob("*.md")))
+# `notebooks/reference` is made from the docstrings, whose examples run in `test_doctests.py`.
+PAGES = sorted((ROOT / "notebooks").glob("*.md")) + sorted((ROOT / "notebooks/guide").glob("*.md"))
+RUN = (README, *PAGES)
 LISTS = (ROOT / "CHANGELOG.md", ROOT / "tests" / "failures" / "README.md")
 _FENCE = re.compile(r"^(```+)(\S*)[^\n]*\n(.*?)^\1", re.S | re.M)
 _LINK = re.compile(r"!?\[[^\]\n]*\]\(([^)\s]+)\)")
@@ -48,13 +52,13 @@ def anchors(path):
     return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
 
 
-@pytest.mark.parametrize("path", [path for path in RUN if blocks(path)], ids=name_of)
-def test_blocks_run_as_printed(path, tmp_path, monkeypatch, capsys):
+def run(path, folder, monkeypatch):
+    """The names that a page has made at its end."""
     pytest.importorskip("matplotlib").use("Agg")
     import jax
     import matplotlib.pyplot as plt
 
-    monkeypatch.chdir(tmp_path)
+    monkeypatch.chdir(folder)
     cache = jax.config.values["jax_compilation_cache_dir"]
     namespace = {"__name__": "__main__"}
     try:
@@ -63,33 +67,57 @@ def test_blocks_run_as_printed(path, tmp_path, monkeypatch, capsys):
     finally:
         jax.config.update("jax_compilation_cache_dir", cache)
         plt.close("all")
+    return namespace
+
+
+@pytest.mark.parametrize("path", [path for path in PAGES if blocks(path)], ids=name_of)
+def test_blocks_run_as_printed(path, tmp_path, monkeypatch, capsys):
+    run(path, tmp_path, monkeypatch)
     assert "nan" not in capsys.readouterr().out
 
 
-def test_what_readme_computes(capsys):
-    """The body of README flips; its slope is that of a difference quotient."""
-    namespace = {}
-    for block in blocks(README)[:2]:
-        exec(compile(block, "README.md", "exec"), namespace)
-    assert float(namespace["sol"].ys.omega[:, 1].min()) < -5.9
-    rate, h = namespace["rate"], 1e-7
-    quotient = float(rate(0.008 + h) - rate(0.008 - h)) / (2 * h)
-    assert float(capsys.readouterr().out.split()[-1]) == pytest.approx(quotient, rel=1e-5)
+def spun(moments, ts):
+    """README's body by SciPy: Euler's equations without torque."""
+    moments = np.asarray(moments)
+
+    def change(_, w):
+        return np.cross(moments * w, w) / moments
+
+    start = [0.02, 6.0, 0.02]
+    found = scipy.integrate.solve_ivp(
+        change, ts[[0, -1]], start, "DOP853", ts, rtol=1e-12, atol=1e-14
+    )
+    return found.y.T
+
+
+def test_readme_computes_what_it_says(tmp_path, monkeypatch, capsys):
+    names = run(README, tmp_path, monkeypatch)
+    body, sol = names["body"], names["sol"]
+    np.testing.assert_allclose(
+        sol.ys.omega, spun(np.diag(body.inertia.tensor), np.asarray(sol.ts)), atol=1e-7
+    )
+    assert sol.ys.omega[:, 1].min() < -5.9
+    h, ends = 1e-7, np.array([0.0, 3.0])
+    over, under = (spun([0.004, 0.008 + step, 0.011], ends)[-1, 1] for step in (h, -h))
+    slope = next(float(x) for x in capsys.readouterr().out.splitlines() if "[" not in x)
+    assert slope == pytest.approx((over - under) / (2 * h), rel=1e-4)
+    assert names["found"].status == "ok"
+    low, high = names["found"].interval(0.95)["Iy/Iz"]
+    assert low < 1.6 / 2.2 < high
 
 
 def test_readme_is_short():
     assert len(text_of(README).splitlines()) <= 180
 
 
-@pytest.mark.parametrize("path", RUN, ids=name_of)
+@pytest.mark.parametrize("path", PAGES, ids=name_of)
 def test_a_page_says_first_what_one_learns(path):
-    if path != README:
-        lines = text_of(path).splitlines()
-        assert lines[0].startswith("# ")
-        assert lines[2].startswith("*You learn: ")
+    lines = text_of(path).splitlines()
+    assert lines[0].startswith("# ")
+    assert lines[2].startswith("*You learn: ")
 
 
-@pytest.mark.parametrize("path", (*RUN, *LISTS), ids=name_of)
+@pytest.mark.parametrize("path", [*RUN, *LISTS], ids=name_of)
 def test_links_lead_to_files(path):
     for link in _LINK.findall(prose(path)):
         place, _, heading = unquote(link).partition("#")
@@ -102,11 +130,17 @@ def test_links_lead_to_files(path):
 
 def test_every_page_can_be_found():
     """README names each page of the guide, the site's contents each page there is."""
+    contents = "\n".join(
+        found[3] for found in _FENCE.finditer(text_of(ROOT / "notebooks/index.md"))
+    )
+    for path in PAGES:
+        page = path.relative_to(ROOT / "notebooks").with_suffix("").as_posix()
+        assert page == "index" or page in contents.split(), page
     named = {(ROOT / link.partition("#")[0]).resolve() for link in _LINK.findall(prose(README))}
     assert named >= set((ROOT / "notebooks" / "guide").glob("*.md"))
 
 
-@pytest.mark.parametrize("path", (*RUN, *LISTS), ids=name_of)
+@pytest.mark.parametrize("path", [*RUN, *LISTS], ids=name_of)
 def test_tables_are_rectangular(path):
     rows = []
     for line in [*_FENCE.sub("", text_of(path)).splitlines(), ""]:

@@ -29,7 +29,10 @@ def save(figure, name):
 def frames():
     """Body frame and world frame before and after a quarter turn about z."""
     figure = plt.figure(figsize=(7.0, 3.0), layout="constrained")
-    turns = (("q = (1, 0, 0, 0)", [0.0, 0, 0]), ("after a quarter turn about z", [0.0, 0, jnp.pi / 2]))
+    turns = (
+        ("q = (1, 0, 0, 0)", [0.0, 0, 0]),
+        ("after a quarter turn about z", [0.0, 0, jnp.pi / 2]),
+    )
     for place, (title, vector) in enumerate(turns, 1):
         q = rj.quaternion.exp(jnp.array(vector))
         ax = figure.add_subplot(1, 2, place, projection="3d", computed_zorder=False)
@@ -38,7 +41,9 @@ def frames():
             ax.text(*(1.5 * axis), name, color="0.45", ha="center", va="center")
             end = rj.quaternion.rotate(q, axis)
             ax.plot(*zip([0, 0, 0], end, strict=True), color=colour, lw=3)
-            ax.text(*(0.85 * end + jnp.array([0, 0, 0.16 * (1 - end[2])])), f" {name}′", color=colour)
+            ax.text(
+                *(0.85 * end + jnp.array([0, 0, 0.16 * (1 - end[2])])), f" {name}′", color=colour
+            )
         ax.set(xlim=(-0.8, 1.2), ylim=(-0.8, 1.2), zlim=(-0.6, 1.4))
         ax.set_title(title, fontsize=10)
         ax.set_axis_off()
@@ -56,8 +61,9 @@ def flip():
     figure = plt.figure(figsize=(8.4, 3.5), layout="constrained")
     ax = figure.add_subplot(1, 2, 1, projection="3d")
     rj.plot.polhode(body.inertia, sol.ys, ax=ax, title="the polhode")
-    handles = ax.get_legend().legend_handles
-    ax.legend(handles=handles, loc="center left", bbox_to_anchor=(-0.45, 0.8), fontsize=8)
+    legend = ax.get_legend()
+    words = [text.get_text() for text in legend.get_texts()]
+    ax.legend(legend.legend_handles, words, bbox_to_anchor=(0.12, 1.0), fontsize=8)
     ax = figure.add_subplot(1, 2, 2)
     for index, colour in enumerate(rj.plot.COLOURS[:3]):
         ax.plot(sol.ts, sol.ys.omega[:, index], color=colour, label=f"Ω{'₁₂₃'[index]}")
