@@ -44,12 +44,12 @@ def frames():
             ax.text(
                 *(0.85 * end + jnp.array([0, 0, 0.16 * (1 - end[2])])), f" {name}′", color=colour
             )
-        ax.set(xlim=(-0.8, 1.2), ylim=(-0.8, 1.2), zlim=(-0.6, 1.4))
+        ax.set(xlim=(-0.8, 1.2), ylim=(-0.8, 1.2), zlim=(-0.3, 1.7))
         ax.set_title(title, fontsize=10)
         ax.set_axis_off()
         ax.view_init(24, 35)
-        ax.set_box_aspect((1, 1, 1), zoom=1.7)
-    figure.suptitle("dashed: world axes x, y, z;  full: body axes x′, y′, z′", fontsize=9)
+        ax.set_box_aspect((1, 1, 1), zoom=1.5)
+    figure.supxlabel("dashed: world axes x, y, z;  full: body axes x′, y′, z′", fontsize=9)
     save(figure, "frames.png")
 
 
