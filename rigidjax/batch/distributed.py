@@ -124,6 +124,9 @@ def total(tree: Any, checkpoint: str | os.PathLike[str] | None = None) -> Any:
 def save(tree: Any, folder: str | os.PathLike[str]) -> Path:
     """Write this process's rows to `folder/share-<process>.npz`; whole or not at all.
 
+    **Arguments:** `tree` of arrays, whose first axis is this process's share; `folder` that all
+    processes see. **Returns** the path of the file.
+
     >>> import tempfile
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     _ = save(jnp.arange(2), folder)

@@ -166,8 +166,8 @@ def linear_filter(
 ) -> LinearEstimate:
     """The Kalman filter of a `LinearModel`: the state at each time from the readings so far.
 
-    **Arguments:** `readings` y (T, k); `mean` (n,) and `root` (n, n), a root of the covariance, at
-    the first time before its reading; `seen` (T, k) which numbers count, `None` all.
+    **Arguments:** `model`; `readings` y (T, k); `mean` (n,) and `root` (n, n), a root of the
+    covariance, at the first time before its reading; `seen` (T, k) which numbers count, `None` all.
 
     **Raises:** `ValueError` for shapes that do not fit, NaN that is not masked.
 

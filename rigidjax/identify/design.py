@@ -57,9 +57,10 @@ def expected(problem: Problem, parameters: Parameters) -> tuple[reported.Quantit
 
 
 def plan_of(problem: Problem, body: Any, omega: Any) -> Parameters:
-    """The parameters of a planned motion: this body, this first rate (3,), rad/s, body frame.
+    """The parameters of a planned motion: this body, this first rate.
 
-    What else is free stays as the recordings give it.
+    **Arguments:** `problem`; `body` an `Inertia` or `MassProperties`; `omega` (3,) first rate,
+    rad/s, body frame. What else is free stays as the recordings give it.
 
     >>> import rigidjax as rj
     >>> record = rj.identify.Recording([0.0, 1.0], (rj.identify.Gyro(), [[1.0, 0, 0]] * 2))
@@ -77,7 +78,8 @@ def plan_of(problem: Problem, body: Any, omega: Any) -> Parameters:
 def fisher(problem: Problem, parameters: Parameters) -> Float[Array, "n n"]:
     """Fisher's information (n, n) of the free numbers: `Jᵀ Σ⁻¹ J` of the predictions.
 
-    Differentiable in the parameters: a design follows its gradient. **Raises** `ValueError` for a
+    **Arguments:** `problem` with known noises; `parameters` the motion. Differentiable in the
+    parameters: a design follows its gradient. **Raises** `ValueError` for a
     sensor whose noise is not given.
 
     >>> import rigidjax as rj

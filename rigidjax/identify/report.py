@@ -40,7 +40,16 @@ def rows(fit: Fit, rate_unit: str = "rad/s") -> list[Row]:
 
 
 def table(lines: list[Row]) -> str:
-    """Rows of (name, value, low, high, unit) as text, digits as the interval allows."""
+    """Rows as text, with the digits that the interval allows.
+
+    **Arguments:** `lines` rows of (name, value, low, high, unit), such as `rows` gives.
+
+    **Raises:** `TypeError` for what is no row; `ValueError` for none.
+
+    >>> print(table([("I1", 1.23456, 1.2, 1.27, "kg m²")]))  # doctest: +NORMALIZE_WHITESPACE
+                 value  95 % interval
+    I1           1.235  1.200 … 1.270 kg m²
+    """
     for line in _checks.instance(lines, (list, tuple), "lines", wanted="a list of rows"):
         if not isinstance(line, tuple) or len(line) != 5:
             raise TypeError(f"lines: wanted rows (name, value, low, high, unit), got {line!r}")
@@ -55,7 +64,15 @@ def table(lines: list[Row]) -> str:
 
 
 def numbers(value: float, low: float, high: float) -> list[str]:
-    """The three as text, with the digits that the interval allows."""
+    """The three as text, with the digits that the interval allows.
+
+    **Arguments:** `value`; `low` and `high`, the ends of its interval, in the same unit.
+
+    **Raises:** `TypeError`, `ValueError` for what is no number.
+
+    >>> numbers(1.23456, 1.2, 1.27)
+    ['1.235', '1.200', '1.270']
+    """
     value = _checks.number(value, "value")
     low, high = _checks.number(low, "low"), _checks.number(high, "high")
     width, size = high - low, max(abs(value), abs(low) if np.isfinite(low) else 0.0)
@@ -75,7 +92,10 @@ def _decimals(width: float) -> int:
 
 
 def verdict(fit: Fit) -> str:
-    """What is well and what is weakly determined, and whether the starts agree, in words."""
+    """What is well and what is weakly determined, and whether the starts agree, in words.
+
+    **Arguments:** `fit` what `rigidjax.identify.fit` returned. **Raises** `TypeError` for another.
+    """
     one_fit(fit)
     good = [start for start in fit.starts if start.converged and start.fits]
     lines = [f"status: {fit.status}"]
@@ -151,7 +171,10 @@ def _rms_of_axes(fit: Fit) -> list[tuple[str, list[float], str]]:
 def write_json(
     fit: Fit, path: str | Path, files: Sequence[str] = (), more: Sequence[Row] = ()
 ) -> None:
-    """`as_dict` to a file."""
+    """What was found as JSON in a file: `as_dict`, written to `path`.
+
+    **Arguments:** `fit`; `path` of the file, written over; `files` and `more` as for `as_dict`.
+    """
     text = json.dumps(as_dict(fit, files, more), indent=2, ensure_ascii=False, allow_nan=False)
     Path(path).write_text(text + "\n", encoding="utf-8")
 

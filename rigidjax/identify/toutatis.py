@@ -99,7 +99,11 @@ def _direction(body: Any, state: Any) -> Array:
 
 
 def rows(fit: Fit) -> list[Row]:
-    """Periods and the direction of the angular momentum as rows for `report.table`."""
+    """Periods and the direction of the angular momentum as rows for `report.table`.
+
+    **Arguments:** `fit` of `problem()`. **Returns** rows (name, value, low, high, unit): days, and
+    degrees of ecliptic longitude and latitude (J2000), with 95 % intervals.
+    """
     out: list[Row] = []
     middle = np.exp(np.asarray(_periods(fit.body, fit.state0)))
     low, high = (np.exp(bound) for bound in fit.interval_of(_periods))
@@ -116,7 +120,10 @@ def rows(fit: Fit) -> list[Row]:
 
 
 def rms_degrees(fit: Fit) -> float:
-    """Root mean square angle between the observed and the fitted attitudes, degrees."""
+    """Root mean square angle between the observed and the fitted attitudes, degrees.
+
+    **Arguments:** `fit` of `problem()`, whose first sensor gives attitudes.
+    """
     return float(np.degrees(fit.rms[0]))
 
 

@@ -203,7 +203,8 @@ def fit_windows(
     **Arguments:** `windows`; `scene` a function of the free numbers → (body, torque), whose torque
     reads the inputs of the windows; `guess` the free numbers to begin with, any tree of arrays;
     `noise` by kind (`x`, `v`, `q`, `omega`) what an error is measured in: by default the rms of a
-    prediction that holds the state at the start. Steps are those of `RungeKutta4`, one a sample.
+    prediction that holds the state at the start; `max_steps` of the search. Steps of the motion
+    are those of `RungeKutta4`, one a sample.
 
     Levenberg–Marquardt (`rigidjax.identify.levenberg_marquardt`) on normal equations that are
     summed window by window, so that memory does not grow with their number.

@@ -76,6 +76,10 @@ def on_the_group(state: State) -> State:
     """The same state with its quaternion, if it has one, scaled to length 1.
 
     **Raises:** `ValueError` for a quaternion known to be zero, or too short to have a direction.
+
+    >>> import rigidjax as rj
+    >>> on_the_group(rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 1])).q.tolist()
+    [1.0, 0.0, 0.0, 0.0]
     """
     if isinstance(state, HasAttitude):
         q = _checks.floating(state.q, (4,), "state.q")

@@ -17,7 +17,8 @@ def equations_of_motion(
 ) -> Callable[..., Any]:
     """The vector field for this body on the rung of `state0`, for plain `diffrax.ODETerm`.
 
-    **Arguments** as for `simulate`. **Raises** `TypeError` where they do not fit.
+    **Arguments** `body`, `state0`, `torque` as for `simulate`. **Raises** `TypeError` where
+    they do not fit.
 
     >>> import rigidjax as rj
     >>> type(equations_of_motion(rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([1.0, 0, 0])))

@@ -70,6 +70,8 @@ def listed(records: Iterable[Record], name: str = "records") -> list[Record]:
 def write_csv(records: Iterable[Record], path: str | Path) -> None:
     """Keep records in a file, one line each under a header; NaN is left empty.
 
+    **Arguments:** `records`; `path` of the file, written over.
+
     **Raises:** `OSError` where the file cannot be written.
 
     >>> import tempfile
@@ -87,6 +89,8 @@ def write_csv(records: Iterable[Record], path: str | Path) -> None:
 
 def read_csv(path: str | Path) -> list[Record]:
     """The records of a file that `write_csv` wrote.
+
+    **Arguments:** `path` of the file.
 
     **Raises:** `ValueError` for another file, with what it lacks; `OSError` where there is none.
     """

@@ -272,7 +272,9 @@ def constant_or_callable(source: Any, name: str, size: int = 3) -> Any:
 
 
 def jumps_of(source: object) -> Float[Array, " n"]:
-    """The `jump_times` of a law or of a function of time, s; empty if it has none.
+    """The times at which a law or a function of time jumps, s; empty if it has none.
+
+    **Arguments:** `source` a law, or a function of time, with or without `jump_times`.
 
     >>> from rigidjax import torques
     >>> jumps_of(torques.Pulses([1.0, 2.0], [[0.0, 0.0, 1.0]]))
