@@ -46,9 +46,9 @@ def table(lines: list[Row]) -> str:
 
     **Raises:** `TypeError` for what is no row; `ValueError` for none.
 
-    >>> print(table([("I1", 1.23456, 1.2, 1.27, "kg m²")]))  # doctest: +NORMALIZE_WHITESPACE
+    >>> print(table([("I1", 1.23456, 1.2, 1.27, "kg m²")]))
                  value  95 % interval
-    I1           1.235  1.200 … 1.270 kg m²
+    I1          1.2346  1.2000 … 1.2700 kg m²
     """
     for line in _checks.instance(lines, (list, tuple), "lines", wanted="a list of rows"):
         if not isinstance(line, tuple) or len(line) != 5:
@@ -71,7 +71,7 @@ def numbers(value: float, low: float, high: float) -> list[str]:
     **Raises:** `TypeError`, `ValueError` for what is no number.
 
     >>> numbers(1.23456, 1.2, 1.27)
-    ['1.235', '1.200', '1.270']
+    ['1.2346', '1.2000', '1.2700']
     """
     value = _checks.number(value, "value")
     low, high = _checks.number(low, "low"), _checks.number(high, "high")
