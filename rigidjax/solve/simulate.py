@@ -15,6 +15,7 @@ from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.frames import AbstractScene, MovingFrame, collision
 from rigidjax.motion.torques import jumps_of
 from rigidjax.solve import validation
+from rigidjax.solve.direction import direction
 from rigidjax.solve.explicit import AbstractExplicit, DormandPrince8
 from rigidjax.solve.projection import Projected
 from rigidjax.solve.run import ADJOINT, NO_METER, SOLVER, Free, Loop, Setup, solve
@@ -59,7 +60,7 @@ def simulate(
       says what is solved for: take the lowest that the question needs. One body; for many,
       `jax.vmap(lambda body, state: rj.simulate(body, state, ts).ys)`, and with `throw=False` take
       `.result` along: one for each body.
-    - `ts`: (T,) increasing times, s. The first is the start.
+    - `ts`: (T,) increasing times, s, or decreasing ones, to go back. The first is the start.
     - `torque`: a law of `rigidjax.torques` (the jumps of a schedule are given to the stepper), or
       any callable Module `(t, state, body) → (3,)`, N m, body frame; `None` for a free body. For a
       `Point` a scene of `rigidjax.scenes`, a `MovingFrame` to see it from, or a force per mass
@@ -93,8 +94,8 @@ def simulate(
 
     Source: `AttitudeEquations`, `EulerEquations`, `NewtonEuler` (notes, eqs 50, 79, 84).
 
-    **Raises:** `TypeError` where body, state and torque do not fit; `ValueError` for times that do
-    not increase, NaN, or a quaternion that is not unit (`EquinoxRuntimeError` under `jit`).
+    **Raises:** `TypeError` where body, state and torque do not fit; `ValueError` for times that
+    neither increase nor decrease, NaN, or a quaternion that is not unit (`EquinoxRuntimeError` under `jit`).
 
     >>> import rigidjax as rj
     >>> body, start = rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([0.0, 1.0, 0.01])
@@ -133,14 +134,15 @@ def simulate(
     plain = plain and isinstance(adjoint, _EITHER_MODE)
     if plain:
         first = validation.first_step(dt0, times)
-        loop = Loop(body, torque, method, controller, first, max_steps, throw)  # pyright: ignore
+        way = direction(times)
+        loop = Loop(body, torque, method, controller, first, way, max_steps, throw)  # pyright: ignore
         return _solution(loop, state0, times)
     setup = Setup(
         body=body,
         torque=torque,
         solver=_on_the_group(solver),
         controller=controller,
-        dt0=validation.first_step(dt0, times),
+        dt0=validation.signed_step(dt0, times),
         adjoint=_adjoint(controller) if adjoint is None else adjoint,
         progress_meter=NO_METER if progress_meter is None else progress_meter,
         max_steps=max_steps,

@@ -89,9 +89,12 @@ class Solution(eqx.Module, Generic[State]):
         **Raises:** `ValueError` (`EquinoxRuntimeError` under `jit`) where `t` is outside.
         """
         t = _checks.floating(t, (), "t").astype(self.ts.dtype)
-        outside = ~((t >= self.ts[0]) & (t <= self.ts[-1]))
+        way = jnp.sign(self.ts[-1] - self.ts[0])
+        along, since = way * self.ts, way * t
+        outside = ~((since >= along[0]) & (since <= along[-1]))
         t = _checks.refuse(t, outside, "evaluate: t lies outside the times that were simulated")
-        index = jnp.clip(jnp.searchsorted(self.ts, t, side="right") - 1, 0, self.ts.shape[0] - 1)
+        index = jnp.searchsorted(along, since, side="right") - 1
+        index = jnp.clip(index, 0, self.ts.shape[0] - 1)
         start = jax.tree.map(lambda leaf: leaf[index], self.ys)
         ys, _, _ = solve(self._setup, start, jnp.stack([self.ts[index], t]))
         return jax.tree.map(lambda leaf: leaf[-1], ys)
