@@ -95,7 +95,8 @@ def simulate(
     Source: `AttitudeEquations`, `EulerEquations`, `NewtonEuler` (notes, eqs 50, 79, 84).
 
     **Raises:** `TypeError` where body, state and torque do not fit; `ValueError` for times that
-    neither increase nor decrease, NaN, or a quaternion that is not unit (`EquinoxRuntimeError` under `jit`).
+    neither increase nor decrease, NaN, or a quaternion that is not unit (`EquinoxRuntimeError`
+    under `jit`).
 
     >>> import rigidjax as rj
     >>> body, start = rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([0.0, 1.0, 0.01])
