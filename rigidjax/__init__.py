@@ -58,8 +58,11 @@ from rigidjax.rotation import (
     so3 as so3,
 )
 from rigidjax.solve import (
+    Crossings as Crossings,
+    Event as Event,
     Projected as Projected,
     Solution as Solution,
+    crossings as crossings,
     equations_of_motion as equations_of_motion,
     simulate as simulate,
     solvers as solvers,

@@ -27,7 +27,9 @@ class Solution(eqx.Module, Generic[State]):
     with a leading time axis, NaN where the run did not get to; `stats` a dict with `num_steps`,
     `num_accepted_steps`, `num_rejected_steps`, for a `Point` also `drift` of what its scene
     conserves; `result` a `diffrax.RESULTS`: `successful`, or why the run ended early, such as
-    `max_steps_reached`, `nonfinite`, `dt_min_reached`.
+    `max_steps_reached`, `nonfinite`, `dt_min_reached`; `event_occurred` where the event was met.
+    `event_time` s, `event_state` of the type of `state0`: NaN where it was not met, `None` where
+    there is no event.
     """
 
     ts: Float[Array, " times"]
@@ -35,6 +37,8 @@ class Solution(eqx.Module, Generic[State]):
     stats: dict[str, Any]
     result: dfx.RESULTS
     _setup: Free | Loop | Setup
+    event_time: Float[Array, ""] | None = None
+    event_state: Any = None
 
     @property
     def drift(self) -> dict[str, Array]:
