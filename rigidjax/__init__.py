@@ -60,10 +60,12 @@ from rigidjax.rotation import (
 from rigidjax.solve import (
     Crossings as Crossings,
     Event as Event,
+    Exponents as Exponents,
     Projected as Projected,
     Solution as Solution,
     crossings as crossings,
     equations_of_motion as equations_of_motion,
+    lyapunov_exponents as lyapunov_exponents,
     simulate as simulate,
     solvers as solvers,
 )

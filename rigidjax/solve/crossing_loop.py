@@ -46,8 +46,8 @@ class Search(NamedTuple):
 
 
 class Located(NamedTuple):
-    """Times (K, *bodies), NaN beyond the last, states (K, n, *bodies), their number (*bodies), where
-    each body is at the end, its next step (NaN where it met one), and steps.
+    """Times (K, *bodies), NaN beyond the last, states (K, n, *bodies), their number (*bodies),
+    where each body is at the end, its next step (NaN where it met one), and steps.
     """
 
     times: Array

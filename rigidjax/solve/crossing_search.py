@@ -274,8 +274,11 @@ def correction(rates: Callable[..., Any], t: Array, y: Array, there: Array) -> t
 
     **Arguments:** `rates(t, y) → (g, dg/dt, dy/dt)`.
     """
-    _, _, slope = rates(t, y)
-    (g, rate, slope), (_, second, turn) = jax.jvp(rates, (t, y), (jnp.ones_like(t), slope))
+    g, rate, slope = rates(t, y)
+    # These two meet only the square of what is zero: their derivatives are not wanted.
+    here = lax.stop_gradient((t, y))
+    _, moved = jax.jvp(rates, here, (jnp.ones_like(t), lax.stop_gradient(slope)))
+    _, second, turn = lax.stop_gradient(moved)
     rate = jnp.where(there, rate, jnp.ones_like(rate))
     newton = -g / rate
     move = jnp.where(there, newton * (1 - 0.5 * newton * second / rate), jnp.zeros_like(newton))

@@ -83,9 +83,9 @@ def crossings(
     - `max_crossings`: K, the length of what is returned; the run ends with the last of them.
     - `max_step`: the longest step, s, for a condition that is much faster than the motion: two
       zeros in one step are seen, three are not.
-    - `solver`: `None` is the closed form for a free body, else `rigidjax.solvers.DormandPrince8`; an
-      explicit method of `rigidjax.solvers`. `rtol`, `atol` as for `simulate`; a crossing is as
-      accurate as a step, that of a free body to round-off.
+    - `solver`: `None` is the closed form for a free body, else `rigidjax.solvers.DormandPrince8`;
+      or an explicit method of `rigidjax.solvers`. `rtol`, `atol` as for `simulate`; a crossing is
+      as accurate as a step, that of a free body to round-off.
     - `max_steps`: parts of steps included.
 
     A start on the section does not count, and a touch need not. Many bodies:
@@ -130,7 +130,7 @@ def crossings(
             solver, AbstractExplicit, "solver", wanted="an explicit method of rigidjax.solvers"
         )
         rtol, atol = validation.tolerances(rtol, atol, dtype)
-        control = Watched(dfx.PIDController(rtol=rtol, atol=atol))
+        control = Watched(dfx.PIDController(rtol=rtol, atol=atol))  # pyright: ignore
         way = direction_of(times)
         setup = Loop(body, torque, solver, control, None, way, max_steps, False)
     what = Search(require_direction(direction), many, max_steps)

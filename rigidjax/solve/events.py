@@ -136,7 +136,7 @@ def found_by(
     whole = lax.stop_gradient(along[1] - along[0])
     longest = whole if max_step is None else jnp.asarray(max_step, ts.dtype)
     dtype = ts.dtype
-    if flow is not None:
+    if isinstance(setup, Free):
         longest = jnp.minimum(longest, _spacing(setup.body, state0, whole))
         rtol = atol = jnp.zeros((), dtype)
         h0, solver = longest, None

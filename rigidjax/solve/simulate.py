@@ -86,10 +86,10 @@ def simulate(
       known to be below 1e-10; `diffrax.ForwardMode()` is for `jax.jacfwd`. Our loop and the closed
       form need none: `jax.grad`, `jax.jacfwd`, `jax.jacrev` and `jax.hessian` (forward over
       reverse) go through, and `jax.grad` of a `jax.grad` is refused.
-    - `event`: `(t, state, body) → scalar`, or an `Event` of it: the run ends where it is first zero.
-      `event_time` and `event_state` of the solution are exact to the tolerances, with first and
-      second derivatives by everything, the condition's own numbers, too; `ys` beyond are NaN, and
-      `result` is `event_occurred`. Where it is not met they are NaN and the run goes on to the end.
+    - `event`: `(t, state, body) → scalar`, or an `Event` of it: the run ends where it is first
+      zero. `event_time` and `event_state` of the solution are exact to the tolerances, with first
+      and second derivatives by everything, the condition's own numbers, too; `ys` beyond are NaN,
+      and `result` is `event_occurred`. Where it is not met they are NaN and the run goes on.
       In our own loop and the closed form; for a solver of diffrax give `diffrax.Event` there.
     - `max_steps`, `progress_meter`: as in `diffrax.diffeqsolve`.
     - `throw`: `False` never raises for numbers met on the way, or for a bad start inside a batch:

@@ -15,7 +15,7 @@ from rigidjax._types import ScalarLike
 from rigidjax.frames import Point
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.solve.run import Flow, Free, Loop, Setup, solve
-from rigidjax.solve.sensitivity import growth
+from rigidjax.solve.sensitivity import growth, transition
 
 State = TypeVar("State", Spin, Attitude, Rigid, Point)
 
@@ -83,6 +83,21 @@ class Solution(eqx.Module, Generic[State]):
                     stacklevel=2,
                 )
         return found
+
+    def transition_matrix(self) -> Float[Array, "times n n"]:
+        """∂ state(t) / ∂ state(t₀) at each of `ts`, on the tangent spaces of the states.
+
+        Rows and columns are small changes: Ω for a `Spin` (n = 3); δθ, Ω for an `Attitude` (6);
+        x, v, δθ, Ω for a `Rigid` (12); x, v for a `Point` (6). δθ, rad, is a turn in body axes,
+        q ⊗ exp(½δθ): three numbers. The columns are forward-mode derivatives, NaN where the run
+        did not get to. An event does not end this run.
+
+        >>> import rigidjax as rj
+        >>> body, start = rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([0.0, 0.0, 1.0])
+        >>> rj.simulate(body, start, [0.0, 2.0]).transition_matrix()[1, 2].tolist()
+        [0.0, 0.0, 1.0]
+        """
+        return transition(Flow(self._setup), self.ts, self.ys)
 
     def evaluate(self, t: ScalarLike) -> State:
         """The state at any `t` between the first and the last of `ts`, s.
