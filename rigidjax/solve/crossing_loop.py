@@ -52,7 +52,7 @@ class Located(NamedTuple):
 
     times: Array
     states: Array
-    count: Array
+    number: Array
     t: Array
     h: Array
     steps: Array

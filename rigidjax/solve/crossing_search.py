@@ -70,7 +70,7 @@ class Found(NamedTuple):
 
     times: Array
     states: Any
-    count: Array
+    number: Array
     result: dfx.RESULTS
     steps: Array
 
@@ -116,11 +116,11 @@ def _found(scene: Scene, what: Search, numbers: Numbers, out: Located) -> Found:
         (jnp.isnan(out.h), NONFINITE),
         (out.h > 0, dfx.RESULTS.max_steps_reached),
         (out.t >= numbers.stops[-1], dfx.RESULTS.successful),
-        (out.count >= what.many, dfx.RESULTS.event_occurred),
+        (out.number >= what.many, dfx.RESULTS.event_occurred),
     ):
         result = dfx.RESULTS.where(there, word, result)
     states = jax.vmap(partial(unflat, like=scene.like))(out.states)
-    return Found(out.times, states, out.count, result, out.steps)
+    return Found(out.times, states, out.number, result, out.steps)
 
 
 def _no_tangent(a: Array) -> Any:
@@ -234,7 +234,7 @@ def _corrected(
     found: Located,
 ) -> tuple[Array, Array]:
     """The times and states found as functions of all numbers."""
-    there = jnp.arange(what.many, dtype=jnp.int32) < found.count
+    there = jnp.arange(what.many, dtype=jnp.int32) < found.number
     last = jnp.max(jnp.where(there, found.times, lax.stop_gradient(numbers.t0)))
     ts = lax.stop_gradient(jnp.where(there, found.times, last))
     if scene.solver is None:

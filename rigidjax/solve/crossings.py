@@ -144,4 +144,4 @@ def _solved(
     state0 = on_the_group(state0)
     step = None if step is None else lax.stop_gradient(step)
     found = found_by(search, setup, asked, step, what, state0, ts)
-    return Crossings(found.times, found.states, found.count, found.result, found.steps)
+    return Crossings(found.times, found.states, found.number, found.result, found.steps)

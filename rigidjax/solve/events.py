@@ -201,7 +201,7 @@ def solve_until(
     steps = setup.max_steps if isinstance(setup, Loop) else 1_000_000
     what = Search(event.direction, 1, steps)
     found = found_by(only_found, setup, asked, event.max_step, what, state0, ts)
-    met = found.count > 0
+    met = found.number > 0
     end = jnp.where(met, found.times[0], lax.stop_gradient(ts[-1]))
     way = jnp.sign(ts[-1] - ts[0])
     before = ~(way * ts > way * end)

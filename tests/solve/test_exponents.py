@@ -52,6 +52,7 @@ def test_a_heavy_top_has_pairs_and_four_zeros():
     assert np.abs(tame.values).max() < 0.02 < 0.1 * values[0]
 
 
+@pytest.mark.long
 def test_a_damped_sphere_is_exact():
     # δΩ decays at c/I, and turns stay; q has three directions, not four.
     body = rj.Inertia.from_principal(2.0, 2.0, 2.0)
