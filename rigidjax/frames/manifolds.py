@@ -191,7 +191,7 @@ def bifurcation(
     low, high = (_index(scene, one, index) - value for one in (left, right))
     if not low * high <= 0:
         raise ValueError(
-            f"bifurcation: the index is {low + value:.6g} at one orbit and {high + value:.6g} at the "
+            f"bifurcation: the index is {low + value:.6g} at one orbit, {high + value:.6g} at the "
             f"other: {value:g} does not lie between"
         )
     a, b = float(ends[0][place]), float(ends[1][place])

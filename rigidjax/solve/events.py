@@ -92,18 +92,18 @@ class Asked(eqx.Module):
     body: Any
 
     def __call__(self, t: Any, y: Any) -> Array:
-        return jnp.asarray(self.condition(t, y, self.body))
+        value = self.condition(t, y, self.body)
+        if jnp.issubdtype(getattr(value, "dtype", type(value)), jnp.bool_):
+            raise TypeError(
+                "condition: wanted one real number, zero at the event, got whether it is so; give "
+                "the difference, not whether it is positive"
+            )
+        return _checks.floating(value, (), "condition", hint="one real number, zero at the event")
 
 
 def require_condition(asked: Asked, t: Array, state0: Any) -> None:
-    """Raise `TypeError` unless a condition gives one real number."""
-    found = eqx.filter_eval_shape(asked, t, state0)
-    if found.shape != () or not jnp.issubdtype(found.dtype, jnp.floating):
-        raise TypeError(
-            "condition: wanted one real number, zero at the event, got "
-            f"{found.dtype} of shape {found.shape}"
-            + ("; give the difference, not whether it is positive" if found.dtype == bool else "")
-        )
+    """Raise in words unless a condition gives one real number."""
+    eqx.filter_eval_shape(asked, t, state0)
 
 
 def found_by(

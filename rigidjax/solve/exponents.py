@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
+import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -27,7 +28,8 @@ class Exponents(eqx.Module):
 
     **Fields:** `values` (k,) 1/s, the largest first; `errors` (k,) one standard deviation of them,
     from how much the means of twenty parts of the run differ; `times` (N,) the ends of the
-    intervals, s; `running` (N, k) what the values would have been by then; `state` at the end.
+    intervals, s; `running` (N, k) what the values would have been by then; `state` at the end;
+    `result` a `diffrax.RESULTS`: `successful`, or why a run failed.
     """
 
     values: Float[Array, " k"]
@@ -35,6 +37,7 @@ class Exponents(eqx.Module):
     times: Float[Array, " N"]
     running: Float[Array, "N k"]
     state: Any
+    result: dfx.RESULTS
 
 
 def lyapunov_exponents(
@@ -73,7 +76,7 @@ def lyapunov_exponents(
     (log t)/t, and `errors` does not know of such a drift: look at `running`. In a Hamiltonian
     system the exponents come in pairs ±λ, and their sum is the mean divergence of `field` always.
 
-    **Returns** `Exponents`. Where a run fails they are NaN.
+    **Returns** `Exponents`. Where a run fails they are NaN, and `result` says why.
 
     Source: Benettin et al. 1980, doi:10.1007/BF02128236; Shimada and Nagashima 1979,
     doi:10.1143/PTP.61.1605.
@@ -94,14 +97,17 @@ def lyapunov_exponents(
             f"intervals: wanted at least {_PARTS} after the transient, got {intervals} in all and "
             f"a transient of {transient}"
         )
+    if not isinstance(state0, eqx.Module):
+        state0 = _checks.numbers(state0, "state0")
+    for leaf in jax.tree.leaves(state0):
+        _checks.finite(_checks.numbers(leaf, "state0"), "state0")
     size = dimension(state0)
+    if not size:
+        raise ValueError("state0: wanted an array or a state of numbers, got none")
     many = size if number is None else _checks.whole(number, "number", 1)
     if many > size:
         raise ValueError(f"number: wanted at most {size}, one for each direction, got {many}")
     start = flat(state0)
-    if not jnp.issubdtype(start.dtype, jnp.floating):
-        raise TypeError(f"state0: wanted real numbers, got {start.dtype}")
-    _checks.finite(start, "state0")
     length = _checks.time(time, "time").astype(start.dtype)
     length = _checks.refuse(length, ~(length > 0), "time: wanted a positive time, s")
     rtol, atol = validation.tolerances(rtol, atol, start.dtype)
@@ -109,9 +115,23 @@ def lyapunov_exponents(
     _checks.instance(
         solver, AbstractExplicit, "solver", wanted="an explicit method of rigidjax.solvers"
     )
+    _require_slope(field, state0)
     how = _How(solver, many, intervals, transient, max_steps)
     begin = _checks.time(t0, "t0").astype(start.dtype)
     return _solved(how, field, state0, begin, length, rtol, atol)
+
+
+def _require_slope(field: Any, state0: Any) -> None:
+    time = jnp.zeros((), flat(state0).dtype)
+    found = eqx.filter_eval_shape(lambda t, y: field(t, y, None), time, state0)
+    wanted = jax.tree.map(jnp.shape, state0)
+    shapes = jax.tree.map(jnp.shape, found)
+    same = jax.tree.structure(found) == jax.tree.structure(state0) and shapes == wanted
+    if not same:
+        raise TypeError(
+            f"field: wanted dy/dt of the shape of state0, {wanted}, got {shapes}; it is called as "
+            "f(t, y, None)"
+        )
 
 
 class _How(eqx.Module):
@@ -134,15 +154,15 @@ def _solved(
         state, frame = carry
         ts = t0 + jnp.stack([i, i + 1]).astype(t0.dtype) * step
 
-        def end(change: Array) -> Array:
+        def end(change: Array) -> Any:
             run = adaptive(
                 how.solver, field, ts, moved(state, change), rtol=rtol, atol=atol,
                 max_steps=how.max_steps,
             )  # fmt: skip
-            return flat(jax.tree.map(lambda leaf: leaf[-1], run.ys))
+            return flat(jax.tree.map(lambda leaf: leaf[-1], run.ys)), run.result
 
         still = jnp.zeros(size, t0.dtype)
-        flow, push = jax.linearize(end, still)
+        flow, push, result = jax.linearize(end, still, has_aux=True)
         there = unflat(flow, state)
 
         def along(direction: Array) -> Array:
@@ -151,11 +171,13 @@ def _solved(
 
         grown = jax.vmap(along, -1, -1)(frame)
         frame, triangle = jnp.linalg.qr(grown)
-        return (there, frame), jnp.log(jnp.abs(jnp.diagonal(triangle)))
+        logs = jnp.log(jnp.abs(jnp.diagonal(triangle)))
+        good = result == dfx.RESULTS.successful
+        return (there, frame), (jnp.where(good, logs, jnp.nan), result)
 
     frame = jnp.eye(size, how.many, dtype=t0.dtype)
     numbers = jnp.arange(how.intervals, dtype=jnp.int32)
-    (state, _), logs = lax.scan(interval, (state0, frame), numbers)
+    (state, _), (logs, results) = lax.scan(interval, (state0, frame), numbers)
     rates = logs[how.transient :] / step
     count = rates.shape[0]
     times = t0 + jnp.arange(how.transient + 1, how.intervals + 1).astype(t0.dtype) * step
@@ -164,4 +186,6 @@ def _solved(
     whole = count // _PARTS * _PARTS
     means = jnp.mean(rates[count - whole :].reshape(_PARTS, -1, how.many), axis=1)
     errors = jnp.std(means, axis=0, ddof=1) / jnp.sqrt(jnp.asarray(_PARTS, t0.dtype))
-    return Exponents(running[-1], errors, times, running, state)
+    first = jnp.argmax(jax.vmap(lambda result: result != dfx.RESULTS.successful)(results))
+    result = jax.tree.map(lambda leaf: leaf[first], results)
+    return Exponents(running[-1], errors, times, running, state, result)

@@ -127,7 +127,8 @@ def test_words(unhooked):
         (dict(time=-1.0), ValueError, "time: wanted a positive time"),
         (dict(field=1.0), TypeError, "field: wanted a function f"),
         (dict(state0=jnp.array([np.nan, 0.0])), ValueError, "state0: contains NaN"),
-        (dict(state0=jnp.array([1, 2])), TypeError, "state0: wanted real numbers, got int"),
+        (dict(state0=jnp.array([True, False])), TypeError, "state0"),
+        (dict(field=lambda t, y, args: y[0]), TypeError, "field: wanted dy/dt of the shape of"),
         (dict(solver="RK4"), TypeError, "solver: wanted an explicit method"),
         (dict(rtol=0.0), ValueError, "wanted rtol > 0"),
     ):
