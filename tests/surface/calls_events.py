@@ -37,7 +37,7 @@ row(
     arguments=(
         "body", "state0", "t0", "t1", "condition", "torque", "direction", "max_crossings", "max_step"
     ),
-    groups=(*KINDS, "size", "nan", "inf"),
+    groups=(*KINDS, "nan", "inf"),
     traced=("state0",),
     transforms=SOME,
     says=("inertia", "needs a state", "ts"),
