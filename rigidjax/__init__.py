@@ -58,9 +58,14 @@ from rigidjax.rotation import (
     so3 as so3,
 )
 from rigidjax.solve import (
+    Crossings as Crossings,
+    Event as Event,
+    Exponents as Exponents,
     Projected as Projected,
     Solution as Solution,
+    crossings as crossings,
     equations_of_motion as equations_of_motion,
+    lyapunov_exponents as lyapunov_exponents,
     simulate as simulate,
     solvers as solvers,
 )

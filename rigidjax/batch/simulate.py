@@ -78,8 +78,8 @@ def simulate(
 
     - `bodies`, `states0`, `torque`, `torque_axes`, `chunk`, `devices`, and for `Steps` `inputs`: as
       for `rigidjax.batch.rollout`.
-    - `ts_or_steps`: (T,) increasing times, s, the first of them the start; or `Steps(size, number)`
-      for equal steps.
+    - `ts_or_steps`: (T,) increasing times, s, or decreasing ones, the first of them the start; or
+      `Steps(size, number)` for equal steps.
     - `solver`: `None` takes the closed form for free bodies, `rigidjax.solvers.DormandPrince8`
       under a torque, and what `rollout` takes for `Steps`. With times any `diffrax.AbstractSolver`
       may be given; the explicit ones of `rigidjax.solvers` run in our own loop (256 heavy tops at
@@ -93,7 +93,7 @@ def simulate(
 
     **Returns** a `Batch`. Nothing is raised for what a body meets on its way: look at `result`.
 
-    **Raises:** as `rollout`; `ValueError` for times that do not increase.
+    **Raises:** as `rollout`; `ValueError` for times that neither increase nor decrease.
 
     >>> import rigidjax as rj
     >>> bodies = rj.Inertia(jnp.diag(jnp.array([1.0, 2.0, 3.0])))

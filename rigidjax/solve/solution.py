@@ -15,7 +15,7 @@ from rigidjax._types import ScalarLike
 from rigidjax.frames import Point
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.solve.run import Flow, Free, Loop, Setup, solve
-from rigidjax.solve.sensitivity import growth
+from rigidjax.solve.sensitivity import growth, transition
 
 State = TypeVar("State", Spin, Attitude, Rigid, Point)
 
@@ -27,7 +27,9 @@ class Solution(eqx.Module, Generic[State]):
     with a leading time axis, NaN where the run did not get to; `stats` a dict with `num_steps`,
     `num_accepted_steps`, `num_rejected_steps`, for a `Point` also `drift` of what its scene
     conserves; `result` a `diffrax.RESULTS`: `successful`, or why the run ended early, such as
-    `max_steps_reached`, `nonfinite`, `dt_min_reached`.
+    `max_steps_reached`, `nonfinite`, `dt_min_reached`; `event_occurred` where the event was met.
+    `event_time` s, `event_state` of the type of `state0`: NaN where it was not met, `None` where
+    there is no event.
     """
 
     ts: Float[Array, " times"]
@@ -35,6 +37,8 @@ class Solution(eqx.Module, Generic[State]):
     stats: dict[str, Any]
     result: dfx.RESULTS
     _setup: Free | Loop | Setup
+    event_time: Float[Array, ""] | None = None
+    event_state: Any = None
 
     @property
     def drift(self) -> dict[str, Array]:
@@ -80,6 +84,21 @@ class Solution(eqx.Module, Generic[State]):
                 )
         return found
 
+    def transition_matrix(self) -> Float[Array, "times n n"]:
+        """∂ state(t) / ∂ state(t₀) at each of `ts`, on the tangent spaces of the states.
+
+        Rows and columns are small changes: Ω for a `Spin` (n = 3); δθ, Ω for an `Attitude` (6);
+        x, v, δθ, Ω for a `Rigid` (12); x, v for a `Point` (6). δθ, rad, is a turn in body axes,
+        q ⊗ exp(½δθ): three numbers. The columns are forward-mode derivatives, NaN where the run
+        did not get to. An event does not end this run.
+
+        >>> import rigidjax as rj
+        >>> body, start = rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([0.0, 0.0, 1.0])
+        >>> rj.simulate(body, start, [0.0, 2.0]).transition_matrix()[1, 2].tolist()
+        [0.0, 0.0, 1.0]
+        """
+        return transition(Flow(self._setup), self.ts, self.ys)
+
     def evaluate(self, t: ScalarLike) -> State:
         """The state at any `t` between the first and the last of `ts`, s.
 
@@ -89,9 +108,12 @@ class Solution(eqx.Module, Generic[State]):
         **Raises:** `ValueError` (`EquinoxRuntimeError` under `jit`) where `t` is outside.
         """
         t = _checks.floating(t, (), "t").astype(self.ts.dtype)
-        outside = ~((t >= self.ts[0]) & (t <= self.ts[-1]))
+        way = jnp.sign(self.ts[-1] - self.ts[0])
+        along, since = way * self.ts, way * t
+        outside = ~((since >= along[0]) & (since <= along[-1]))
         t = _checks.refuse(t, outside, "evaluate: t lies outside the times that were simulated")
-        index = jnp.clip(jnp.searchsorted(self.ts, t, side="right") - 1, 0, self.ts.shape[0] - 1)
+        index = jnp.searchsorted(along, since, side="right") - 1
+        index = jnp.clip(index, 0, self.ts.shape[0] - 1)
         start = jax.tree.map(lambda leaf: leaf[index], self.ys)
         ys, _, _ = solve(self._setup, start, jnp.stack([self.ts[index], t]))
         return jax.tree.map(lambda leaf: leaf[-1], ys)

@@ -2,6 +2,7 @@
 
 from surface import (
     calls_estimate as calls_estimate,
+    calls_events as calls_events,
     calls_identify as calls_identify,
     calls_motion as calls_motion,
     calls_numbers as calls_numbers,
