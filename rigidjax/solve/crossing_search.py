@@ -197,10 +197,8 @@ def _located(
 
     def a_step(t: Array, h: Array, end: Array, y: Array) -> tuple[Array, Array, Array]:
         there = runge_kutta.stages(tableau, field, constants, Step(t, h, end, y))
-        after, last = project(there.end), None
-        if runge_kutta.needs_last_slope(tableau):
-            last = field(constants, end, after)
-        error = runge_kutta.error_estimate(tableau, sizes, h, there.slopes, last)
+        after = project(there.end)
+        error = runge_kutta.error_estimate(tableau, sizes, h, there.slopes)
         size = error_norm(error, y, after, numbers.rtol, numbers.atol)
         size = jnp.where(jnp.isnan(size), jnp.inf, size)
         factor = jnp.clip(_SAFETY * size ** (-1 / tableau.order), _SMALLEST, _LARGEST)
