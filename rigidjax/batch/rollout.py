@@ -14,6 +14,8 @@ from rigidjax.batch.sharding import Compiled, chunk_of, mesh_of, over_bodies
 from rigidjax.batch.validation import Bodies, bodies_of, driven_by, start_of, step_of, time_of
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.motion import Attitude, Rigid, Spin
+from rigidjax.motion.coupled import started
+from rigidjax.motion.torques import bind
 from rigidjax.solve import equations_of_motion
 from rigidjax.solve.explicit import AbstractExplicit
 from rigidjax.solve.fixed_loop import march, piece_length
@@ -117,7 +119,8 @@ def rollout(
       order products in another way, which is one rounding.
 
     **Returns** the states, of the type of `states0`, with leading axes (N,) or, with `save_every`,
-    (N, num_steps // save_every); with `reduce` the pair (last states, carried).
+    (N, num_steps // save_every); with `reduce` the pair (last states, carried). Under a torque with
+    states of its own they are `rigidjax.Coupled(motion, own)`.
 
     Memory: the inputs, what is returned, and a chunk. Derivatives are those of the steps as taken,
     in forward mode and in reverse; reverse mode goes back in pieces of √`num_steps` steps and
@@ -183,6 +186,8 @@ def _run(plan: _Plan, reduce: Reduce | None, rest: Any, numbers: Any) -> Any:
         own, inputs = each
         body, state0, torque = Bodies.one(shared, own, rest)
         state0 = start_of(state0)
+        first = jax.tree.map(lambda rows: rows[0], inputs)
+        state0 = started(body, state0, bind(torque, first), t0)
         field = equations_of_motion(body, state0, torque)
         stepper = stepper_of(plan.solver, field, state0)
 

@@ -20,7 +20,8 @@ from rigidjax._types import HasAttitude
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.identify.levenberg_marquardt import BOLD, Search, Settings, search
 from rigidjax.motion import Attitude, Rigid, Spin
-from rigidjax.motion.torques.inputs import require_inputs
+from rigidjax.motion.coupled import motion_of, started
+from rigidjax.motion.torques.inputs import bind, require_inputs
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.algebra import components
 from rigidjax.solve import equations_of_motion
@@ -310,12 +311,14 @@ def _errors(
 ) -> dict[str, Array]:
     """The errors of one window, by kind (L, 3), in units of `scales`."""
     body, law = scene(value)
+    first = jax.tree.map(lambda rows: rows[0], inputs)
+    start = started(body, start, bind(law, first), 0.0)
     stepper = stepper_of(None, equations_of_motion(body, start, law), start)
-    size = jnp.asarray(h, start.omega.dtype)
+    size = jnp.asarray(h, wanted.omega.dtype)
 
     def one(y: Any, i: Array) -> tuple[Any, Any]:
         y = step(stepper, size, jnp.zeros_like(size), i, y, inputs or None)
-        return y, stepper.state(y)
+        return y, motion_of(stepper.state(y))
 
     length = wanted.omega.shape[0]
     _, states = lax.scan(one, stepper.start, jnp.arange(length, dtype=jnp.int32))

@@ -13,6 +13,7 @@ from rigidjax import _checks
 from rigidjax._types import ScalarLike
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.frames import AbstractScene, MovingFrame, collision
+from rigidjax.motion.coupled import Coupled
 from rigidjax.motion.torques import jumps_of
 from rigidjax.solve import validation
 from rigidjax.solve.explicit import AbstractExplicit, DormandPrince8
@@ -61,7 +62,8 @@ def simulate(
       `.result` along: one for each body.
     - `ts`: (T,) increasing times, s. The first is the start.
     - `torque`: a law of `rigidjax.torques` (the jumps of a schedule are given to the stepper), or
-      any callable Module `(t, state, body) → (3,)`, N m, body frame; `None` for a free body. For a
+      any callable Module `(t, state, body) → (3,)`, N m, body frame; `None` for a free body. The
+      states of a law that has some (`rigidjax.torques.AbstractTorque`) are in `own`. For a
       `Point` a scene of `rigidjax.scenes`, a `MovingFrame` to see it from, or a force per mass
       `(t, state, None) → (3,)`, m/s².
     - `solver`: `None` is the cheapest that is right: the closed form (`rigidjax.exact`) for a free
@@ -153,6 +155,8 @@ def _solution(setup: Loop | Setup, state0: Any, times: Array) -> Solution:
     ys, stats, result = solve(setup, state0, times)
     if setup.throw and "collided" in stats:
         ys = collision.refuse(ys, stats, times)
+    if isinstance(ys, Coupled):
+        return Solution(times, ys.motion, stats, result, setup, ys.own)
     return Solution(times, ys, stats, result, setup)
 
 

@@ -14,6 +14,7 @@ from rigidjax import _checks, motion
 from rigidjax._types import ScalarLike
 from rigidjax.frames import Point
 from rigidjax.motion import Attitude, Rigid, Spin
+from rigidjax.motion.coupled import Coupled, motion_of
 from rigidjax.solve.run import Flow, Free, Loop, Setup, solve
 from rigidjax.solve.sensitivity import growth
 
@@ -27,7 +28,8 @@ class Solution(eqx.Module, Generic[State]):
     with a leading time axis, NaN where the run did not get to; `stats` a dict with `num_steps`,
     `num_accepted_steps`, `num_rejected_steps`, for a `Point` also `drift` of what its scene
     conserves; `result` a `diffrax.RESULTS`: `successful`, or why the run ended early, such as
-    `max_steps_reached`, `nonfinite`, `dt_min_reached`.
+    `max_steps_reached`, `nonfinite`, `dt_min_reached`; `own` a tuple of the states of the laws that
+    have some, as `ys` with a leading time axis (see `rigidjax.torques.freeze`), or `None`.
     """
 
     ts: Float[Array, " times"]
@@ -35,6 +37,7 @@ class Solution(eqx.Module, Generic[State]):
     stats: dict[str, Any]
     result: dfx.RESULTS
     _setup: Free | Loop | Setup
+    own: Any = None
 
     @property
     def drift(self) -> dict[str, Array]:
@@ -45,7 +48,7 @@ class Solution(eqx.Module, Generic[State]):
         """
         if "drift" in self.stats:
             return self.stats["drift"]
-        return _drift(self._setup, self.ts, self.ys)
+        return _drift(self._setup, self.ts, self._states)
 
     @property
     def growth(self) -> Float[Array, " times"]:
@@ -64,7 +67,7 @@ class Solution(eqx.Module, Generic[State]):
         Source: the largest finite-time Lyapunov exponent is its logarithm over t (Eckmann and
         Ruelle 1985, doi:10.1103/RevModPhys.57.617).
         """
-        found = growth(Flow(self._setup), self.ts, self.ys)
+        found = growth(Flow(self._setup), self.ts, self._states)
         rtol = getattr(getattr(self._setup, "controller", None), "rtol", None)
         if rtol is None:
             rtol = 100 * float(jnp.finfo(self.ts.dtype).eps)
@@ -92,9 +95,13 @@ class Solution(eqx.Module, Generic[State]):
         outside = ~((t >= self.ts[0]) & (t <= self.ts[-1]))
         t = _checks.refuse(t, outside, "evaluate: t lies outside the times that were simulated")
         index = jnp.clip(jnp.searchsorted(self.ts, t, side="right") - 1, 0, self.ts.shape[0] - 1)
-        start = jax.tree.map(lambda leaf: leaf[index], self.ys)
+        start = jax.tree.map(lambda leaf: leaf[index], self._states)
         ys, _, _ = solve(self._setup, start, jnp.stack([self.ts[index], t]))
-        return jax.tree.map(lambda leaf: leaf[-1], ys)
+        return motion_of(jax.tree.map(lambda leaf: leaf[-1], ys))
+
+    @property
+    def _states(self) -> Any:
+        return self.ys if self.own is None else Coupled(self.ys, self.own)
 
 
 @eqx.filter_jit
