@@ -18,7 +18,7 @@ from rigidjax.motion.coupled import started
 from rigidjax.motion.torques import bind
 from rigidjax.solve import equations_of_motion
 from rigidjax.solve.explicit import AbstractExplicit
-from rigidjax.solve.fixed_loop import march, piece_length
+from rigidjax.solve.fixed_loop import first_row, march, piece_length
 from rigidjax.solve.magnus import Magnus4
 from rigidjax.solve.splitting import AbstractSplitting
 from rigidjax.solve.steppers import stepper_of
@@ -111,7 +111,8 @@ def rollout(
       A function made anew for each call compiles anew: define it once, best as a Module.
     - `t0` s, when the first step begins.
     - `inputs`: what drives the law, by the names of its `rigidjax.torques.Input`s: arrays
-      (N, num_steps, *k) whose row i is held exactly through step i of that body.
+      (N, num_steps, *k) whose row i is held exactly through step i of that body; those of a
+      `rigidjax.torques.Delayed` input come later.
     - `chunk`: how many bodies go side by side. `None` is what fits the first cache, 128 in float64.
       Bodies are independent: chunks change results in the last digits at most.
     - `devices`: `None` for one, `"all"` of this process, or a sequence of them; N is cut into
@@ -142,7 +143,7 @@ def rollout(
     """
     batch = bodies_of(bodies, states0, torque, torque_axes)
     h, count = step_of(step_size, num_steps, batch.dtype)
-    driven = driven_by(inputs, torque, states0, count)
+    driven = driven_by(inputs, torque, states0, count, h)
     if reduce is None and initial is not None:
         raise ValueError("rollout: initial is what reduce begins with; no reduce was given")
     if reduce is not None and not callable(reduce):
@@ -186,8 +187,7 @@ def _run(plan: _Plan, reduce: Reduce | None, rest: Any, numbers: Any) -> Any:
         own, inputs = each
         body, state0, torque = Bodies.one(shared, own, rest)
         state0 = start_of(state0)
-        first = jax.tree.map(lambda rows: rows[0], inputs)
-        state0 = started(body, state0, bind(torque, first), t0)
+        state0 = started(body, state0, bind(torque, first_row(torque, h, inputs)), t0)
         field = equations_of_motion(body, state0, torque)
         stepper = stepper_of(plan.solver, field, state0)
 

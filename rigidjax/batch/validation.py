@@ -12,7 +12,7 @@ from rigidjax import _checks
 from rigidjax._types import HasAttitude
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.motion import Attitude, Rigid, Spin, on_the_group
-from rigidjax.motion.torques.inputs import require_inputs
+from rigidjax.motion.torques.inputs import delays_of, require_inputs
 from rigidjax.solve.validation import require_fit
 
 
@@ -97,12 +97,19 @@ def bodies_of(bodies: Any, states0: Any, torque: Any, torque_axes: Any) -> Bodie
     return found
 
 
-def driven_by(inputs: Any, torque: Any, states0: Any, count: int) -> Any:
+def driven_by(inputs: Any, torque: Any, states0: Any, count: int, h: Array) -> Any:
     """The inputs of each body, by name (N, steps, *k), in the precision of the states.
 
     **Raises:** `ValueError` for an input that is missing, or that the law does not read, for
-    another number of bodies or steps, NaN; `TypeError` for what is no mapping.
+    another number of bodies or steps, NaN, a delay as long as the run; `TypeError` for what is no
+    mapping.
     """
+    for name, delay in delays_of(torque):
+        if _checks.known((delay, h)) and (np.abs(np.asarray(delay)) >= count * float(h)).any():
+            raise ValueError(
+                f"inputs[{name!r}]: a delay of {np.abs(np.asarray(delay)).max():.6g} s, and a run of "
+                f"{count * float(h):.6g} s: none of it would be seen"
+            )
     wanted = (*states0.omega.shape[:1], count)
     found = {}
     for name, value in require_inputs(torque, inputs).items():

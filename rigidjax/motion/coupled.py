@@ -7,6 +7,7 @@ import equinox as eqx
 
 from rigidjax import _checks
 from rigidjax._types import HasSpin, ScalarLike
+from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.motion.torques.base import in_precision
 from rigidjax.motion.torques.states import first_states, freeze, has_states, rates_of
 
@@ -22,9 +23,9 @@ class Coupled(eqx.Module):
     law that has some, see `rigidjax.torques.freeze`.
 
     >>> from rigidjax import Inertia, Spin, torques
-    >>> spin_up = torques.Flywheel(torques.Lagged(lambda t: jnp.ones(3), 0.1))
-    >>> Coupled.start(Inertia.from_principal(1.0, 2.0, 3.0), Spin([0.0, 0, 0]), spin_up).own
-    (Array([1., 1., 1.], dtype=float64),)
+    >>> wheel = torques.ReactionWheels([[0.0, 0, 1]], [0.1], [30.0])
+    >>> Coupled.start(Inertia.from_principal(1.0, 2.0, 3.0), Spin([0.0, 0, 2.0]), wheel).own
+    (Array([3.2], dtype=float64),)
     """
 
     motion: Any
@@ -33,7 +34,8 @@ class Coupled(eqx.Module):
     @staticmethod
     def start(body: Any, state0: Any, torque: Any, t: ScalarLike = 0.0) -> "Coupled":
         """The start of `state0` and of the laws in `torque` (see `rigidjax.simulate`) at `t`, s."""
-        _checks.instance(state0, HasSpin, "state0", wanted="a Spin, an Attitude or a Rigid")
+        _checks.single(body, (Inertia, MassProperties), "body")
+        _checks.single(state0, HasSpin, "state0", wanted="a Spin, an Attitude or a Rigid")
         dtype = state0.omega.dtype
         t = _checks.floating(t, (), "t").astype(dtype)
         own = first_states(in_precision(torque, dtype), t, state0, in_precision(body, dtype))

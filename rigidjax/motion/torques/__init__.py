@@ -30,14 +30,14 @@ from rigidjax.motion.torques.gravity import (
     GravityGradient as GravityGradient,
     HeavyTop as HeavyTop,
 )
-from rigidjax.motion.torques.inputs import Input as Input, bind as bind
+from rigidjax.motion.torques.inputs import Delayed as Delayed, Input as Input, bind as bind
 from rigidjax.motion.torques.magnetic import MagneticDipole as MagneticDipole
 from rigidjax.motion.torques.random import (
     CorrelatedTorque as CorrelatedTorque,
     RandomTorque as RandomTorque,
 )
 from rigidjax.motion.torques.series import Series as Series, Wheel as Wheel
-from rigidjax.motion.torques.signals import Delayed as Delayed, Lagged as Lagged
+from rigidjax.motion.torques.signals import Lagged as Lagged
 from rigidjax.motion.torques.states import freeze as freeze
 from rigidjax.motion.torques.tables import (
     Held as Held,

@@ -1,4 +1,4 @@
-"""What lies between a command and what it does: a delay, and a lag of first order (floor 2)."""
+"""What lies between a command and what it does: a lag of first order (floor 2)."""
 
 from typing import Any
 
@@ -11,49 +11,6 @@ from rigidjax import _checks
 from rigidjax._types import ScalarLike
 from rigidjax.body import physical
 from rigidjax.motion.torques.base import given, jumps_of
-from rigidjax.motion.torques.states import has_states
-
-
-class Delayed(eqx.Module):
-    """A function of time that comes later: `t → source(t − delay)`.
-
-    **Arguments:** `source` a function of time such as `Held(times, values)`, or `Input("u")`;
-    `delay` s, one number, which may be free in a fit; negative for what comes earlier.
-
-    Its `jump_times` move with the delay, and so does a run of `simulate`: the derivative by the
-    delay is right although the source jumps. In `rigidjax.batch.rollout` and
-    `identify.fit_windows`, whose samples are held through a step, a delayed input changes inside
-    a step: that step is then taken in two, up to the change and from it on, which is exact, too.
-    Before the first sample the first one holds, after the last the last.
-
-    **Raises:** `TypeError` for a source that cannot be called, or that has states: delay what goes
-    into it, `Lagged(Delayed(u, d), T)`; `ValueError` for a delay that is not finite.
-
-    >>> from rigidjax.torques import Held
-    >>> float(Delayed(Held([0.0, 1.0, 2.0], [5.0, 6.0, 7.0]), 0.7)(1.5))
-    5.0
-    """
-
-    source: Any
-    delay: Float[Array, ""]
-
-    def __init__(self, source: Any, delay: ScalarLike):
-        self.source = _checks.function(source, "source", "of time")
-        if has_states(source):
-            raise TypeError(
-                f"Delayed: {type(source).__name__} has states, whose past is not kept; delay what "
-                "goes into it: Lagged(Delayed(source, delay), time)"
-            )
-        self.delay = given(delay, (), "delay").astype(jnp.result_type(float))
-
-    @property
-    def jump_times(self) -> Float[Array, " n"]:
-        """Times, s, where the value jumps: those of the source, later by the delay."""
-        times = jumps_of(self.source)
-        return times + self.delay.astype(times.dtype)
-
-    def __call__(self, t: ScalarLike) -> Any:
-        return self.source(t - self.delay.astype(jnp.result_type(t)))
 
 
 class Lagged(eqx.Module):
@@ -87,11 +44,15 @@ class Lagged(eqx.Module):
         self.source = _checks.function(source, "source", "of time")
         kind = jnp.result_type(float)
         array = _checks.numbers(time, "time")
+        if not array.size:
+            raise ValueError("time: wanted one number, s, or one a channel, got none")
         self.time = given(time, array.shape, "time").astype(kind)
         if physical.known(array) and not (np.asarray(array) > 0).all():
             raise ValueError(f"time: wanted a positive time, s, got {np.asarray(array)}")
         if start is not None:
             start = given(start, _checks.numbers(start, "start").shape, "start").astype(kind)
+            if not start.size:
+                raise ValueError("start: wanted one number, or one a channel, got none")
         self.start = start
 
     @property

@@ -64,7 +64,7 @@ def has_states(law: Any) -> bool:
     """Whether a law, or anything inside it, has states of its own.
 
     >>> from rigidjax import torques
-    >>> has_states(torques.Flywheel(torques.Lagged(torques.Input("u"), 0.1)))
+    >>> has_states(torques.InSpace(torques.Lagged(torques.Input("u"), 0.1)))
     True
     """
     return any(map(has_own, jax.tree.leaves(law, is_leaf=_stop)))

@@ -144,16 +144,18 @@ class ReactionWheels(AbstractTorque):
 
     def speeds_of(self, own: Array, state: HasSpin) -> Float[Array, " wheels"]:
         """The speeds (R,) relative to the body, rad/s, of the momenta `own` and the state."""
-        omega = state.omega
+        own = _checks.floating(own, self.inertia.shape, "own")
+        omega = _checks.single(state, HasSpin, "state", wanted="a Spin, Attitude or Rigid").omega
         along = jnp.stack([a[0] * omega[0] + a[1] * omega[1] + a[2] * omega[2] for a in self.axes])
         return own / self.inertia - along
 
     def torques_of(self, t: ScalarLike, own: Array, state: HasSpin) -> Float[Array, " wheels"]:
         """What motor and bearing put on each wheel about its axis, (R,), N m."""
         speeds = self.speeds_of(own, state)
-        count, total = self.inertia.shape[0], jnp.zeros_like(own)
+        t = _checks.floating(t, (), "t")
+        count, total = self.inertia.shape[0], jnp.zeros_like(speeds)
         if self.motor is not None:
-            total = total + vector_at(self.motor, t, "motor", count).astype(own.dtype)
+            total = total + vector_at(self.motor, t, "motor", count).astype(total.dtype)
         if self.feedback is not None:
             found = self.feedback(t, state, speeds)
             total = total + _checks.floating(found, (count,), "feedback(t, state, speeds)")
