@@ -107,8 +107,8 @@ def driven_by(inputs: Any, torque: Any, states0: Any, count: int, h: Array) -> A
     for name, delay in delays_of(torque):
         if _checks.known((delay, h)) and (np.abs(np.asarray(delay)) >= count * float(h)).any():
             raise ValueError(
-                f"inputs[{name!r}]: a delay of {np.abs(np.asarray(delay)).max():.6g} s, and a run of "
-                f"{count * float(h):.6g} s: none of it would be seen"
+                f"inputs[{name!r}]: a delay of {np.abs(np.asarray(delay)).max():.6g} s, and a run "
+                f"of {count * float(h):.6g} s: none of it would be seen"
             )
     wanted = (*states0.omega.shape[:1], count)
     found = {}

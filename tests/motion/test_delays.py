@@ -33,7 +33,7 @@ def exact(rows, delay, t):
     edges = np.append(-np.inf, H * np.arange(1, rows.size))
     ends = np.append(edges[1:], np.inf)
     inside = np.clip(t - delay, edges, ends) - np.clip(-delay, edges, ends)
-    at = lambda s: rows[np.searchsorted(H * np.arange(1, rows.size), s, side="right")] ** 2  # noqa: E731
+    at = lambda s: rows[np.searchsorted(H * np.arange(1, rows.size), s, side="right")] ** 2
     return np.sum(np.where(rows**2 > 0, rows**2 * inside, 0.0)) / 2.5, (
         at(-delay) - at(t - delay)
     ) / 2.5
@@ -47,7 +47,7 @@ DELAYS = [0.013, 0.12, 0.0, -0.07]
 
 
 def test_a_delayed_input_is_exact_at_every_step():
-    law = lambda d: Turn(torques.Delayed(torques.Input("u"), d))  # noqa: E731
+    law = lambda d: Turn(torques.Delayed(torques.Input("u"), d))
 
     def last(delay, rows):
         found = rj.batch.rollout(

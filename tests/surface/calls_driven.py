@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 from surface import scenes as s
 from surface.calls import row
-from surface.scenes import TS, V, W
+from surface.scenes import V
 
 import rigidjax as rj
 

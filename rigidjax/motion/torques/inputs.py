@@ -84,7 +84,8 @@ class Delayed(eqx.Module):
             source, self.delay = source.source, self.delay + source.delay
         if not isinstance(source, Input) and inputs_of(source):
             raise TypeError(
-                f"Delayed: {type(source).__name__} reads an Input; delay the Input itself, inside it"
+                f"Delayed: {type(source).__name__} reads an Input; delay the Input itself, inside "
+                "it"
             )
         self.source = source
         times = getattr(source, "times", None)
