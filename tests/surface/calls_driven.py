@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 from surface import scenes as s
 from surface.calls import row
-from surface.scenes import V
+from surface.scenes import V, W
 
 import rigidjax as rj
 
@@ -43,6 +43,9 @@ for name, given in {
     "torques_of": dict(t=0.3, own=V[:2], state=s.attitude()),
 }.items():
     row(f"motion.torques.ReactionWheels.{name}", lambda given=given: dict(self=wheels(), **given))
+row("identify.Position", dict(noise=0.1, bias=V, offset=0.01))
+row("identify.Velocity", dict(noise=0.1, place=V, mounting=0.1 * W, bias=V, offset=0.01))
+row("identify.Range", dict(station=V, noise=0.1, place=W, bias=0.2, offset=0.01))
 row(
     "motion.torques.Lagged",
     lambda: dict(source=s.Quadratic(jnp.asarray(3.0)), time=0.2, start=0.5),
