@@ -101,7 +101,8 @@ def rollout(
     - `step_size` s, the same for all; `num_steps` a whole number, part of what is compiled.
     - `torque`: `None`, or any law that `rigidjax.simulate` takes. Its arrays are shared by all
       bodies unless `torque_axes` is 0 (each array has a leading axis N: make one law a body with
-      `jax.vmap`) or a tree of 0 and `None`, one for each array.
+      `jax.vmap`), a function that picks those that have (`lambda law: law.speed`, of a `Sum`
+      `lambda law: law.parts[1]`, several in a tuple), or a tree of 0 and `None`, one for each.
     - `solver`: `None` takes `Magnus4` for a free attitude, or a torque that does not look at the
       attitude, and `rigidjax.solvers.RungeKutta4` for all else. Any of `rigidjax.solvers` that is
       explicit may be given; the steps are those that `diffrax` takes with it, to round-off.

@@ -126,10 +126,16 @@ def driven_by(inputs: Any, torque: Any, states0: Any, count: int, h: Array) -> A
 
 def _own_torque(torque: Any, axes: Any, count: int) -> Any:
     """Which arrays of the torque have a row for each body."""
-    for axis in jax.tree.leaves(axes):
-        if not isinstance(axis, int) or axis != 0:
-            raise ValueError(f"torque_axes: wanted 0 and None, got {axis!r}")
-    prefix = jax.tree.map(lambda axis: axis is not None, axes, is_leaf=lambda a: a is None)
+    if callable(axes) and not isinstance(axes, eqx.Module):
+        prefix = _selected(torque, axes)
+    else:
+        for axis in jax.tree.leaves(axes):
+            if not isinstance(axis, int) or axis != 0:
+                raise ValueError(
+                    "torque_axes: wanted 0 and None, or a function that picks the arrays, such as "
+                    f"lambda law: law.speed, got {axis!r}"
+                )
+        prefix = jax.tree.map(lambda axis: axis is not None, axes, is_leaf=lambda a: a is None)
     own, _ = eqx.partition(torque, prefix)
     for path, leaf in jax.tree.leaves_with_path(own):
         if leaf.ndim == 0 or leaf.shape[0] != count:
@@ -138,6 +144,22 @@ def _own_torque(torque: Any, axes: Any, count: int) -> Any:
                 f"shape {leaf.shape}; make one law a body with jax.vmap"
             )
     return prefix
+
+
+def _selected(torque: Any, pick: Any) -> Any:
+    """True for each array that `pick(law)` gives, alone, in a tuple, or in a part of the law."""
+    leaves, structure = jax.tree.flatten(torque)
+    numbered = jax.tree.unflatten(structure, list(range(len(leaves))))
+    try:
+        found = jax.tree.leaves(pick(numbered))
+    except (AttributeError, IndexError, KeyError, TypeError) as error:
+        raise ValueError(f"torque_axes: nothing is there ({error})") from None
+    if not found or not all(type(index) is int for index in found):
+        raise ValueError(
+            "torque_axes: wanted a function that picks arrays of the law, or parts of it, such as "
+            f"lambda law: law.parts[0], got {found or 'none'}"
+        )
+    return jax.tree.unflatten(structure, [i in found for i in range(len(leaves))])
 
 
 def _positive(tensor: Array) -> None:

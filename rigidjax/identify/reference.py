@@ -1,6 +1,7 @@
 """Where the first states of a fit are counted from: the first readings of each recording."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -98,7 +99,8 @@ def _read_place(recording: Recording) -> tuple[np.ndarray, np.ndarray, float] | 
         when, x = t[positions[0].seen], np.asarray(positions[0].values)[positions[0].seen]
     elif ranges:
         seen = np.all([r.seen for r in ranges], axis=0)
-        stations = np.stack([np.asarray(r.sensor.station) for r in ranges])
+        sensors: list[Any] = [r.sensor for r in ranges]
+        stations = np.stack([np.asarray(sensor.station) for sensor in sensors])
         lengths = np.stack([np.asarray(r.values) for r in ranges], axis=1)[seen]
         when, x = t[seen], _from_ranges(stations, lengths)
     if not when.size and not speeds:

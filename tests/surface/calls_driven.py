@@ -43,6 +43,11 @@ for name, given in {
     "torques_of": dict(t=0.3, own=V[:2], state=s.attitude()),
 }.items():
     row(f"motion.torques.ReactionWheels.{name}", lambda given=given: dict(self=wheels(), **given))
+row(
+    "identify.Mass (some of it)",
+    lambda: dict(guess=s.body(), free=("com", "mass")),
+    run=rj.identify.Mass,
+)
 row("identify.Position", dict(noise=0.1, bias=V, offset=0.01))
 row("identify.Velocity", dict(noise=0.1, place=V, mounting=0.1 * W, bias=V, offset=0.01))
 row("identify.Range", dict(station=V, noise=0.1, place=W, bias=0.2, offset=0.01))
