@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 from surface import scenes as s
-from surface.calls import row
+from surface.calls import KINDS, row
 from surface.scenes import V, W
 
 import rigidjax as rj
@@ -13,6 +13,11 @@ AXES = np.eye(3)[:2]
 
 def wheels() -> rj.torques.ReactionWheels:
     return rj.torques.ReactionWheels(AXES, [0.1, 0.2], [3.0, -2.0], [0.01, 0.02], viscous=0.01)
+
+
+def held() -> rj.identify.Horizons:
+    t = np.arange(8.0)
+    return rj.identify.windows(t, rj.Spin(np.outer(t, V)), length=3).held()
 
 
 def coupled() -> rj.Coupled:
@@ -73,4 +78,10 @@ row(
     run=rj.Coupled.start,
     arguments=("body", "state0", "t"),
     says=("own", "inertia"),
+)
+row(
+    "plot.horizons",
+    lambda: dict(found=held(), step=0.1, measure="rms"),
+    groups=KINDS,
+    transforms=(),
 )
