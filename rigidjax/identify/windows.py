@@ -1,4 +1,4 @@
-"""Many short open-loop runs whose starts are known: how driven machines are identified.
+"""Many short open-loop runs from measured starts: how driven machines are identified.
 
 A record of measured states is cut into windows; from the start of each the model runs on its own,
 driven by the recorded inputs, and is compared with what was measured at every step.
@@ -19,6 +19,7 @@ from rigidjax import _checks
 from rigidjax._types import HasAttitude
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.identify.levenberg_marquardt import BOLD, Search, Settings, search
+from rigidjax.identify.window_starts import eliminated, moved, precisions
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.coupled import Coupled, motion_of, started
 from rigidjax.motion.torques.inputs import bind, delays_of, require_inputs
@@ -211,6 +212,7 @@ def fit_windows(
     guess: Value,
     *,
     noise: Mapping[str, float] | None = None,
+    starts: Mapping[str, float] | None = None,
     max_steps: int = 50,
 ) -> WindowFit[Value]:
     """The free numbers with which open-loop runs of all windows come nearest to what was measured.
@@ -218,10 +220,14 @@ def fit_windows(
     **Arguments:** `windows`; `scene` a function of the free numbers → (body, torque), whose torque
     reads the inputs of the windows; `guess` the free numbers to begin with, any tree of arrays;
     `noise` by kind (`x`, `v`, `q`, `omega`) what an error is measured in: by default the rms of a
-    prediction that holds the state at the start. Steps are those of `RungeKutta4`, one a sample.
+    prediction that holds the state at the start; `starts` by kind how far the measured starts may
+    be off (a standard deviation, beside the `noise` of the readings, which must be given with it;
+    `np.inf`: the start is free); `None` takes them as they were measured. Steps are those of
+    `RungeKutta4`, one a sample.
 
     Levenberg–Marquardt (`rigidjax.identify.levenberg_marquardt`) on normal equations that are
-    summed window by window, so that memory does not grow with their number.
+    summed window by window, so that memory does not grow with their number. Starts that may be off
+    are found window by window, and taken out of the normal equations (variable projection).
 
     **Returns** a `WindowFit`; a fit that ends early returns its best point and says so.
 
@@ -255,13 +261,15 @@ def fit_windows(
     require_inputs(law, windows.inputs)
     _require_delays(windows, law)
     scales = _scales(windows, noise)
+    firm = precisions(starts, _kinds(windows.starts), noise)
     settings = Settings(_SETTLED, BOLD, max_steps)
-    end = _searched(scene, windows.step, guess, windows, scales, settings)
+    end = _searched(scene, windows.step, guess, windows, scales, firm, settings)
     if not np.isfinite(end.cost):
         raise ValueError("guess: the runs from it are not finite; is the scene right?")
     value, taken = back(end.point), int(end.taken) - 1
     # Once more where it ended: the last that was tried may have been no better.
-    there = _searched(scene, windows.step, value, windows, scales, Settings(_SETTLED, BOLD, 0))
+    still = Settings(_SETTLED, BOLD, 0)
+    there = _searched(scene, windows.step, value, windows, scales, firm, still)
     inverse = np.linalg.pinv(np.asarray(there.gram))
     spread = inverse @ np.asarray(there.found) @ inverse
     deviation = np.sqrt(np.clip(np.diag(spread), 0, None))
@@ -414,7 +422,7 @@ def _all_errors(scene: Any, h: float, value: Any, windows: Windows, scales: Any)
 
 @eqx.filter_jit
 def _searched(
-    scene: Any, h: float, guess: Any, windows: Windows, scales: Any, settings: Settings
+    scene: Any, h: float, guess: Any, windows: Windows, scales: Any, firm: Any, settings: Settings
 ) -> Search:
     """The search from `guess`; what it keeps is the spread of the windows' gradients (n, n)."""
     x, back = ravel_pytree(guess)
@@ -423,9 +431,18 @@ def _searched(
     def of_one(x: Array, window: Any) -> Any:
         start, wanted, inputs = window
 
+        def errors(x: Array, start: Any) -> Array:
+            return ravel_pytree(_errors(scene, h, back(x), start, wanted, inputs, scales))[0]
+
+        if firm is not None:
+            held = jnp.repeat(jnp.stack([firm[kind] for kind in scales]), 3)
+            cost, gram, slope = eliminated(
+                lambda x, step: errors(x, moved(start, step, scales)), x, held
+            )
+            return slope[:, None] * slope[None], cost, gram, slope
+
         def residual(x: Array) -> tuple[Array, Array]:
-            found = _errors(scene, h, back(x), start, wanted, inputs, scales)
-            flat = ravel_pytree(found)[0]
+            flat = errors(x, start)
             return flat, flat
 
         jacobian, flat = jax.jacfwd(residual, has_aux=True)(x)
