@@ -40,6 +40,7 @@ from rigidjax.frames import Point as Point, scenes as scenes
 from rigidjax.motion import (
     Attitude as Attitude,
     AttitudeEquations as AttitudeEquations,
+    Coupled as Coupled,
     EulerEquations as EulerEquations,
     NewtonEuler as NewtonEuler,
     Rigid as Rigid,

@@ -52,6 +52,9 @@ from rigidjax.identify.sensors import (
     Magnetometer as Magnetometer,
     Marker as Marker,
     Moment as Moment,
+    Position as Position,
+    Range as Range,
+    Velocity as Velocity,
     quaternions_from_euler as quaternions_from_euler,
     quaternions_from_matrices as quaternions_from_matrices,
 )

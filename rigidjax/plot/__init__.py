@@ -5,6 +5,7 @@ Okabe and Ito's, told apart by everyone.
 """
 
 from rigidjax._names import own_names
+from rigidjax.plot.ahead import horizons as horizons
 from rigidjax.plot.bodies import inertia_ellipsoid as inertia_ellipsoid
 from rigidjax.plot.film import Film as Film, tumble as tumble
 from rigidjax.plot.fits import fit as fit

@@ -15,6 +15,7 @@ from rigidjax._types import ScalarLike
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.frames import Point
 from rigidjax.motion import Attitude, Rigid, Spin, on_the_group
+from rigidjax.motion.torques.states import require_stateless
 from rigidjax.solve import validation
 from rigidjax.solve.crossing_loop import Search
 from rigidjax.solve.crossing_search import search
@@ -116,6 +117,7 @@ def crossings(
         dtype = jnp.promote_types(dtype, leaf.dtype)
     times, state0 = jax.tree.map(lambda leaf: leaf.astype(dtype), (times, state0))
     validation.require_fit(body, state0, torque)
+    require_stateless(torque, "crossings")
     if body is not None and _checks.known(body):
         body = body.invertible()
     asked = Asked(condition, body)

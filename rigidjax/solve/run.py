@@ -13,6 +13,7 @@ from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.exact import FreeBody
 from rigidjax.frames import Point, collision, scene_of
 from rigidjax.motion import Attitude, Rigid, on_the_group
+from rigidjax.motion.coupled import started
 from rigidjax.motion.torques import jumps_of
 from rigidjax.solve.adaptive import adaptive
 from rigidjax.solve.direction import Directed, DirectedCondition, DirectedJumps
@@ -72,6 +73,8 @@ def solve(
     state0 = on_the_group(state0)
     if isinstance(setup, Free):
         return _free(setup, state0, ts)
+    # With the states of the torque, where it has some.
+    state0 = started(setup.body, state0, setup.torque, ts[0])
     if isinstance(setup, Loop):
         return _loop(setup, state0, ts)
     field = equations_of_motion(setup.body, state0, setup.torque)

@@ -48,5 +48,5 @@ def transition(flow: Callable[[Any, Array], Any], ts: Array, ys: Any) -> Float[A
 
 def _size(leaf: Array) -> Array:
     # A run that ended early has NaN in the rows that it did not reach.
-    size = jnp.sqrt(jnp.nanmax(jnp.sum(leaf * leaf, axis=1)))
+    size = jnp.sqrt(jnp.nanmax(jnp.sum((leaf * leaf).reshape(leaf.shape[0], -1), axis=1)))
     return jnp.where(size > 0, size, jnp.ones_like(size))

@@ -14,6 +14,8 @@ from rigidjax import _checks, motion
 from rigidjax._types import ScalarLike
 from rigidjax.frames import Point
 from rigidjax.motion import Attitude, Rigid, Spin
+from rigidjax.motion.coupled import Coupled, motion_of
+from rigidjax.motion.torques.states import require_stateless
 from rigidjax.solve.run import Flow, Free, Loop, Setup, solve
 from rigidjax.solve.sensitivity import growth, transition
 
@@ -29,7 +31,8 @@ class Solution(eqx.Module, Generic[State]):
     conserves; `result` a `diffrax.RESULTS`: `successful`, or why the run ended early, such as
     `max_steps_reached`, `nonfinite`, `dt_min_reached`; `event_occurred` where the event was met.
     `event_time` s, `event_state` of the type of `state0`: NaN where it was not met, `None` where
-    there is no event.
+    there is no event. `own` a tuple of the states of the laws that have some, as `ys` with a
+    leading time axis (see `rigidjax.torques.freeze`), or `None`.
     """
 
     ts: Float[Array, " times"]
@@ -39,6 +42,7 @@ class Solution(eqx.Module, Generic[State]):
     _setup: Free | Loop | Setup
     event_time: Float[Array, ""] | None = None
     event_state: Any = None
+    own: Any = None
 
     @property
     def drift(self) -> dict[str, Array]:
@@ -49,7 +53,7 @@ class Solution(eqx.Module, Generic[State]):
         """
         if "drift" in self.stats:
             return self.stats["drift"]
-        return _drift(self._setup, self.ts, self.ys)
+        return _drift(self._setup, self.ts, self._states)
 
     @property
     def growth(self) -> Float[Array, " times"]:
@@ -68,7 +72,7 @@ class Solution(eqx.Module, Generic[State]):
         Source: the largest finite-time Lyapunov exponent is its logarithm over t (Eckmann and
         Ruelle 1985, doi:10.1103/RevModPhys.57.617).
         """
-        found = growth(Flow(self._setup), self.ts, self.ys)
+        found = growth(Flow(self._setup), self.ts, self._states)
         rtol = getattr(getattr(self._setup, "controller", None), "rtol", None)
         if rtol is None:
             rtol = 100 * float(jnp.finfo(self.ts.dtype).eps)
@@ -97,6 +101,7 @@ class Solution(eqx.Module, Generic[State]):
         >>> rj.simulate(body, start, [0.0, 2.0]).transition_matrix()[1, 2].tolist()
         [0.0, 0.0, 1.0]
         """
+        require_stateless(getattr(self._setup, "torque", None), "transition_matrix")
         return transition(Flow(self._setup), self.ts, self.ys)
 
     def evaluate(self, t: ScalarLike) -> State:
@@ -114,9 +119,13 @@ class Solution(eqx.Module, Generic[State]):
         t = _checks.refuse(t, outside, "evaluate: t lies outside the times that were simulated")
         index = jnp.searchsorted(along, since, side="right") - 1
         index = jnp.clip(index, 0, self.ts.shape[0] - 1)
-        start = jax.tree.map(lambda leaf: leaf[index], self.ys)
+        start = jax.tree.map(lambda leaf: leaf[index], self._states)
         ys, _, _ = solve(self._setup, start, jnp.stack([self.ts[index], t]))
-        return jax.tree.map(lambda leaf: leaf[-1], ys)
+        return motion_of(jax.tree.map(lambda leaf: leaf[-1], ys))
+
+    @property
+    def _states(self) -> Any:
+        return self.ys if self.own is None else Coupled(self.ys, self.own)
 
 
 @eqx.filter_jit

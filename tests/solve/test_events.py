@@ -290,3 +290,29 @@ def test_words(unhooked):
         rj.crossings(BODY, FLIPPING, 1.0, 1.0, middle)
     with pytest.raises(TypeError, match="solver: wanted an explicit method"):
         rj.crossings(BODY, FLIPPING, 0.0, 1.0, middle, solver=dfx.Tsit5())
+
+
+def test_laws_with_states_of_their_own_are_refused():
+    body, start = rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([0.0, 1.0, 0.01])
+    wheels = rj.torques.ReactionWheels([[0.0, 0, 1]], [0.1], [30.0])
+    zero = lambda t, state, body: state.omega[1]
+    with pytest.raises(ValueError, match=r"simulate\(event=…\): wanted a torque without states"):
+        rj.simulate(body, start, [0.0, 1.0], wheels, event=zero)
+    with pytest.raises(ValueError, match="crossings: wanted a torque without states"):
+        rj.crossings(body, start, 0.0, 1.0, zero, wheels)
+    with pytest.raises(ValueError, match="transition_matrix: wanted a torque without states"):
+        rj.simulate(body, start, [0.0, 1.0], wheels).transition_matrix()
+
+
+def test_back_in_time_with_wheels():
+    body, start = rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([0.4, 1.0, 0.1])
+
+    def wheels(speed):
+        return rj.torques.ReactionWheels([[0.0, 0, 1]], [0.1], [speed], viscous=1e-3)
+
+    there = rj.simulate(body, start, [0.0, 2.0], wheels(30.0))
+    omega, momentum = there.ys.omega[-1], there.own[0][-1, 0]
+    speed = momentum / 0.1 - omega[2]
+    back = rj.simulate(body, rj.Spin(omega), [2.0, 0.0], wheels(speed))
+    np.testing.assert_allclose(back.ys.omega[-1], start.omega, atol=1e-8)
+    np.testing.assert_allclose(back.own[0][-1, 0], 0.1 * (30.0 + 0.1), rtol=1e-8)

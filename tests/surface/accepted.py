@@ -90,7 +90,14 @@ ACCEPTED: list[tuple[str, str, str, str]] = [
     ("motion.on_the_group", "state: *", "taken without a word*", ANY_STATE),
     *(
         (f"motion.torques.{law}", "*: function", "taken without a word*", OF_TIME)
-        for law in ("Flywheel", "GravityGradient", "InSpace", "Rotors", "MagneticDipole")
+        for law in (
+            "Flywheel",
+            "GravityGradient",
+            "InSpace",
+            "Rotors",
+            "MagneticDipole",
+            "ReactionWheels",
+        )
     ),
     ("drift", "*: float32", "returned*", "drift is round-off itself, so that it has no digits"),
     ("frames.Force", "force: None", "taken*", "None is documented: the particle is left to itself"),
