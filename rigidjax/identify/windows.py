@@ -19,7 +19,7 @@ from rigidjax import _checks
 from rigidjax._types import HasAttitude
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.identify.levenberg_marquardt import BOLD, Search, Settings, search
-from rigidjax.identify.window_starts import eliminated, moved, precisions
+from rigidjax.identify.window_starts import eliminated, moved, precisions, with_jacobian
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.coupled import Coupled, motion_of, started
 from rigidjax.motion.torques.inputs import bind, delays_of, require_inputs
@@ -441,11 +441,7 @@ def _searched(
             )
             return slope[:, None] * slope[None], cost, gram, slope
 
-        def residual(x: Array) -> tuple[Array, Array]:
-            flat = errors(x, start)
-            return flat, flat
-
-        jacobian, flat = jax.jacfwd(residual, has_aux=True)(x)
+        jacobian, flat = with_jacobian(lambda x: errors(x, start), x)
         slope = jacobian.T @ flat
         return slope[:, None] * slope[None], 0.5 * flat @ flat, jacobian.T @ jacobian, slope
 

@@ -37,7 +37,7 @@ class ChangingInertia(eqx.Module):
     momentum of a `Flywheel` to `torque`. Fuel that is thrown out takes its share of İΩ along: then
     add İΩ to `torque`.
 
-    Source: Hughes 1986, Spacecraft Attitude Dynamics, §3.6; without τ the momentum `R I(t) Ω` is
+    Source: Hughes 1986, Spacecraft Attitude Dynamics, ch. 3; without τ the momentum `R I(t) Ω` is
     kept.
 
     **Raises:** `TypeError` for what cannot be called; `ValueError` for a value that is not (3, 3).

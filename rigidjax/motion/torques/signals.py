@@ -24,7 +24,7 @@ class Lagged(eqx.Module):
     `None` for u there.
 
     For a u that jumps from 0 to 1 it is `1 − exp(−t/T)`. Source: any text on control, such as
-    Åström and Murray, Feedback Systems, §6.3.
+    Åström and Murray, Feedback Systems.
 
     **Raises:** `TypeError` for a source that cannot be called; `ValueError` for a time that is
     known and not positive, or wrong shapes.

@@ -54,7 +54,7 @@ class ReactionWheels(AbstractTorque):
     `R (IΩ + Σ h a)` is kept, whatever the motors do; `½ Ω·IΩ + Σ h²/2J` changes by `Σ u s`.
 
     Source: Markley and Crassidis 2014, Fundamentals of Spacecraft Attitude Determination and
-    Control, §3.3.5, doi:10.1007/978-1-4939-0802-8; friction: §4.8.3 there, after Bialke 1998, with
+    Control, §3.3.5, doi:10.1007/978-1-4939-0802-8; friction: §4.8 there, after Bialke 1998, with
     tanh in the place of sign (Andersson, Söderberg and Björklund 2007,
     doi:10.1016/j.triboint.2005.11.014).
 
