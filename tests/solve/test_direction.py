@@ -16,7 +16,7 @@ START = rj.Attitude([0.8, -0.2, 0.4, 0.4], [0.9, -1.1, 0.4])
 TIGHT = dict(rtol=1e-12, atol=1e-14)
 TOP_BODY = rj.Inertia.from_principal(1.3, 1.3, 0.9)
 TOP = torques.HeavyTop(2.0, [0.0, 0.0, 0.5], [0.0, 0.0, -9.81])
-FORTH, BACK = np.linspace(0.0, 3.0, 7), np.linspace(3.0, 0.0, 7)
+FORTH, BACK = np.linspace(0.0, 3.0, 8), np.linspace(3.0, 0.0, 8)
 
 
 WAYS = pytest.mark.parametrize(
