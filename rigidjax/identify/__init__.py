@@ -47,6 +47,7 @@ from rigidjax.identify.sensors import (
     AbstractSensor as AbstractSensor,
     Accelerometer as Accelerometer,
     AttitudeSensor as AttitudeSensor,
+    Brightness as Brightness,
     Direction as Direction,
     Gyro as Gyro,
     Magnetometer as Magnetometer,
