@@ -18,14 +18,16 @@ from rigidjax.identify.fit import Fit, fit
 from rigidjax.identify.levenberg_marquardt import CAREFUL, Settings, search
 from rigidjax.identify.parameters import Parameters
 from rigidjax.identify.problem import Problem, one_problem
+from rigidjax.identify.reported import carried
 from rigidjax.identify.sensors import Brightness
 from rigidjax.identify.two_frequencies import BLOCK, TwoFrequencies, two_frequencies
 from rigidjax.motion.torques.base import vector_at
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.algebra import apply, dot
 
-# Motions are the same where periods and ratios of moments differ by less than that.
-PERIODS, RATIOS = 1e-3, 0.05
+# Motions are the same where both periods and both ratios of moments differ by less than that, or
+# by less than so many of their standard deviations.
+SAME, REACH = np.array([1e-3, 1e-3, 0.05, 0.05]), 5.0
 # Log-likelihood within which a rival explains the data nearly as well: e¹⁰ to one.
 MARGIN = 10.0
 # Starts of the first round, its steps; those that go on, and how far.
@@ -64,13 +66,15 @@ class Alias(eqx.Module):
 class LightCurve(eqx.Module):
     """What `fit_light_curve` returns.
 
-    **Fields:** `fit` of the best motion; `aliases` all motions that were found, by their misfit,
-    the best first; `pairs` the frequencies that they came from; `status` one line: that of the fit,
-    or `ambiguous` where another of the aliases explains the data nearly as well.
+    **Fields:** `fit` of the best motion; `aliases` all motions that were found, the best first,
+    then by their misfit; `deviations` (4,) relative standard deviations of the best one's rotation,
+    precession and two ratios; `pairs` the frequencies that they came from; `status` one line: that
+    of the fit, or `ambiguous` where another of the aliases explains the data nearly as well.
     """
 
     fit: Fit
     aliases: tuple[Alias, ...]
+    deviations: Float[np.ndarray, "4"]
     pairs: TwoFrequencies
     status: str
 
@@ -325,21 +329,32 @@ def _levelled(starts: Parameters, problem: Problem) -> Parameters:
 
 
 @eqx.filter_jit
-def _read(parameters: Parameters, problem: Problem) -> tuple[Array, Array, Array, Array]:
+def _read(parameters: Parameters, problem: Problem) -> tuple[Array, Array]:
+    """Logarithms (4,) of both periods and both ratios, and h²/2T over the middle moment."""
     body = problem.body.body(parameters.body)
     inertia = body.inertia if isinstance(body, MassProperties) else body
     omega = parameters.own.spin[0] * problem.reference.rate[0]
+    moments, momentum = inertia.moments, apply(inertia.tensor, omega)
     rotation, precession = (
         of(inertia, omega) for of in (exact.body_period, exact.precession_period)
     )
-    moments = inertia.moments
-    momentum = apply(inertia.tensor, omega)
-    twice = dot(omega, momentum)
-    return (
-        rotation,
-        precession,
-        moments[:2] / moments[2],
-        dot(momentum, momentum) / twice / moments[1],
+    ratios = moments[:2] / moments[2]
+    numbers = jnp.log(jnp.stack([rotation, precession, ratios[0], ratios[1]]))
+    return numbers, dot(momentum, momentum) / dot(omega, momentum) / moments[1]
+
+
+@eqx.filter_jit
+def _slopes(parameters: Parameters, problem: Problem) -> Float[Array, "4 n"]:
+    flat, restore = ravel_pytree(parameters)
+    return jax.jacfwd(lambda x: _read(restore(x), problem)[0])(flat)
+
+
+def _alias(problem: Problem, parameters: Parameters, cost: float) -> Alias:
+    numbers, middle = (np.asarray(v) for v in _read(parameters, problem))
+    rotation, precession, *ratios = np.exp(numbers)
+    mode = "long" if middle < 1 else "short"
+    return Alias(
+        parameters, cost, float(rotation), float(precession), mode, np.array(ratios), False
     )
 
 
@@ -349,45 +364,39 @@ def _aliases(problem: Problem, ends: list[Tried]) -> list[Alias]:
     for end in sorted(ends, key=lambda one: float(one.cost)):
         if not np.isfinite(float(end.cost)):
             continue
-        rotation, precession, ratios, middle = (
-            np.asarray(v) for v in _read(end.parameters, problem)
-        )
-        alias = Alias(
-            end.parameters,
-            float(end.cost),
-            float(rotation),
-            float(precession),
-            "long" if middle < 1 else "short",
-            ratios,
-            False,
-        )
-        if not any(_same(alias, other) for other in out):
+        alias = _alias(problem, end.parameters, float(end.cost))
+        if not any(_same(alias, other, SAME) for other in out):
             out.append(alias)
     if not out:
         raise ValueError("fit_light_curve: no start gave a finite misfit")
     return out
 
 
-def _same(a: Alias, b: Alias) -> bool:
-    times = (a.rotation / b.rotation, a.precession / b.precession)
-    return (
-        a.mode == b.mode
-        and all(abs(np.log(ratio)) < PERIODS for ratio in times)
-        and bool(np.abs(np.log(a.ratios / b.ratios)).max() < RATIOS)
-    )
+def _numbers(alias: Alias) -> np.ndarray:
+    return np.log([alias.rotation, alias.precession, *alias.ratios])
+
+
+def _same(a: Alias, b: Alias, near: np.ndarray) -> bool:
+    return a.mode == b.mode and bool((np.abs(_numbers(a) - _numbers(b)) < near).all())
 
 
 def _told(best: Fit, aliases: list[Alias], found: TwoFrequencies) -> LightCurve:
-    lowest = aliases[0].cost
+    slopes = np.asarray(_slopes(best.parameters, best.problem))
+    deviations = carried(slopes, np.asarray(best.seen), np.asarray(best.null_directions))
+    # The misfits of a search that stopped on its way to the same motion are no rival's.
+    near = np.maximum(SAME, REACH * deviations)
+    cost = min(start.cost for start in best.starts)
+    first = _alias(best.problem, best.parameters, min(cost, aliases[0].cost))
+    others = [alias for alias in aliases if not _same(alias, first, near)]
     # Where the noise is larger than was said, misfits count for less.
-    free = max(best.dof, 1)
-    margin = MARGIN * max(1.0, 2.0 * lowest / free) * max(best.correlation, 1.0)
+    margin = MARGIN * max(1.0, 2.0 * first.cost / max(best.dof, 1)) * max(best.correlation, 1.0)
     marked = tuple(
-        eqx.tree_at(lambda a: a.explains, alias, alias.cost <= lowest + margin) for alias in aliases
+        eqx.tree_at(lambda a: a.explains, alias, alias.cost <= first.cost + margin)
+        for alias in (first, *others)
     )
     rivals = sum(alias.explains for alias in marked) - 1
     status = best.status
     if rivals and not status.startswith(("failed", "poor")):
-        others = "another motion explains" if rivals == 1 else f"{rivals} other motions explain"
-        status = f"ambiguous: {others} the light curve nearly as well"
-    return LightCurve(best, marked, found, status)
+        some = "another motion explains" if rivals == 1 else f"{rivals} other motions explain"
+        status = f"ambiguous: {some} the light curve nearly as well"
+    return LightCurve(best, marked, deviations, found, status)
