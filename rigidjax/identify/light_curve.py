@@ -31,7 +31,7 @@ SAME, REACH = np.array([1e-3, 1e-3, 0.05, 0.05]), 5.0
 # Log-likelihood within which a rival explains the data nearly as well: e¹⁰ to one.
 MARGIN = 10.0
 # Starts of the first round, its steps; those that go on, and how far.
-FIRST, STEPS, SECOND, MORE = 48, 12, 12, 60
+FIRST, STEPS, SECOND, MORE = 96, 12, 16, 60
 # Step of the differences, of numbers of order one.
 DIFFERENCE = 1e-6
 # Magnitudes to the logarithm of a flux.
@@ -199,10 +199,16 @@ def _starts(
         axes = np.asarray(sensor.semi_axes)
         order = np.argsort(-axes)
         areas = (np.prod(axes) / axes[order]) ** 2
-    all_of = []
+    best_of, others = [], []
     for pair in found.frequencies:
-        all_of += tumbling_starts.candidates(pair, light, half_way, areas, 3)
-    all_of.sort(key=lambda one: one.misfit)
+        for mode in tumbling_starts.MODES:
+            some = tumbling_starts.candidates(pair, mode, light, half_way, areas, 3)
+            # Of each reading of each pair one: which of them is true a grid alone cannot tell.
+            best_of += some[: len(tumbling_starts.ABOUT)]
+            others += some[len(tumbling_starts.ABOUT) :]
+    best_of.sort(key=lambda one: one.misfit)
+    others.sort(key=lambda one: one.misfit)
+    all_of = best_of + others
     turn = _turn(order)
     return [_parameters(problem, one, turn) for one in all_of[:FIRST]]
 

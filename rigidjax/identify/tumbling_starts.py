@@ -55,14 +55,20 @@ def moments_of(semi_axes: np.ndarray) -> np.ndarray:
 
 
 def candidates(
-    pair: np.ndarray, light: Any, half_way: np.ndarray, areas: np.ndarray | None, count: int
+    pair: np.ndarray,
+    mode: str,
+    light: Any,
+    half_way: np.ndarray,
+    areas: np.ndarray | None,
+    count: int,
 ) -> list[Candidate]:
-    """The best of the grid whose precession and rotation have these frequencies, in both modes.
+    """The best of the grid whose precession and rotation have these frequencies, the best first.
 
-    **Arguments:** `pair` (2,) of the mean precession and of twice the rotation, 1/s; `light` times
-    since the first, s, squared fluxes and ones over their noise, and zeros where there is none;
-    `half_way` (3,) the direction half way, world frame; `areas` M (3,) of a known ellipsoid,
-    or `None` for the uniform one of each body; `count` how many of each mode.
+    **Arguments:** `pair` (2,) of the mean precession and of twice the rotation, 1/s; `mode` of
+    `MODES`: the axis that is circulated; `light` times since the first, s, squared fluxes and ones
+    over their noise, and zeros where there is none; `half_way` (3,) the direction half way, world
+    frame; `areas` M (3,) of a known ellipsoid, or `None` for the uniform one of each body; `count`
+    how many bodies, each with all turns of `ABOUT`.
     """
     semi_axes = shapes_of_grid()
     moments = moments_of(semi_axes)
@@ -70,22 +76,19 @@ def candidates(
     if areas is not None:
         forms = np.broadcast_to(areas, forms.shape)
     forms = forms / forms.mean(axis=1, keepdims=True)
+    arrays = jnp.asarray(moments), jnp.asarray(forms), jnp.asarray(pair), *light
+    found = _grid(jnp.asarray(mode == "long"), *arrays)
+    misfits, sides, q, omega = (np.asarray(v) for v in found)
+    # The best phase of each body.
+    phase, least = misfits.argmin(axis=1), misfits.min(axis=1)
     out = []
-    for mode in MODES:
-        arrays = jnp.asarray(moments), jnp.asarray(forms), jnp.asarray(pair), *light
-        found = _grid(jnp.asarray(mode == "long"), *arrays)
-        misfits, sides, q, omega = (np.asarray(v) for v in found)
-        # The best phase of each body.
-        phase = misfits.argmin(axis=1)
-        least = misfits.min(axis=1)
-        for k in np.argsort(least)[:count]:
-            if not np.isfinite(least[k]):
-                continue
-            at = k, phase[k]
-            turns = _placed(sides[at], half_way)
-            for q0 in turns:
-                placed = np.asarray(_times(q0, q[at]))
-                out.append(Candidate(moments[k], placed, omega[at], float(least[k])))
+    for k in np.argsort(least)[:count]:
+        if not np.isfinite(least[k]):
+            continue
+        at = k, phase[k]
+        for q0 in _placed(sides[at], half_way):
+            placed = _times(q0, q[at])
+            out.append(Candidate(moments[k], placed, omega[at], float(least[k])))
     return out
 
 

@@ -42,7 +42,8 @@ def main(count: int, first: int) -> None:
         print(
             f"{seed:3d} {one.mode:5s} {one.rotation / HOUR:7.2f} h {one.precession / HOUR:7.2f} h "
             f"{one.phase:5.0f} {one.amplitude:9.3f} | {times:.1e} {ratios:7.4f}  {what:9s} {status} "
-            f"{found.fit.chi2:.0f}/{found.fit.dof}",
+            f"{found.fit.chi2:.0f}/{found.fit.dof}, deviation of the periods "
+            f"{found.deviations[:2].max():.1e}",
             flush=True,
         )
     spent = time.process_time() - began

@@ -10,7 +10,7 @@ import rigidjax as rj
 from rigidjax import exact, identify
 from rigidjax.identify import Brightness, Moment
 
-HOUR, NOISE, COUNT = 3600.0, 0.02, 400
+HOUR, NOISE, COUNT = 3600.0, 0.02, 480
 
 
 class Tumbler(NamedTuple):
@@ -45,8 +45,8 @@ def brightness(sensor, moments, state, ts):
 
 
 def nights(rng):
-    """Times of readings, s: 7 to 10 nights of 6 to 9 hours, some lost, some with a cloud."""
-    out, last = [], int(rng.integers(7, 11))
+    """Times of readings, s: 9 to 12 nights of 6 to 9 hours, some lost, some with a cloud."""
+    out, last = [], int(rng.integers(9, 13))
     for night in range(last):
         if night not in (0, 1, 2, last - 2, last - 1) and rng.uniform() < 0.2:
             continue
