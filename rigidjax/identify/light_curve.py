@@ -31,7 +31,9 @@ SAME, REACH = np.array([1e-3, 1e-3, 0.05, 0.05]), 5.0
 # Log-likelihood within which a rival explains the data nearly as well: e¹⁰ to one.
 MARGIN = 10.0
 # Starts of the first round, its steps; those that go on, and how far.
-FIRST, STEPS, SECOND, MORE = 96, 12, 16, 60
+FIRST, STEPS, SECOND, MORE = 96, 12, 24, 60
+# Pairs that are tried in any case, and beyond them those with χ² so much above the best.
+LEAST, ABOVE = 12, 40.0
 # Step of the differences, of numbers of order one.
 DIFFERENCE = 1e-6
 # Magnitudes to the logarithm of a flux.
@@ -99,7 +101,7 @@ def fit_light_curve(
     problem: Problem,
     *,
     shortest: float | None = None,
-    count: int = 12,
+    count: int = 48,
     tolerance: float = 1e-4,
     progress: Callable[[str], Any] | None = None,
 ) -> LightCurve:
@@ -115,7 +117,8 @@ def fit_light_curve(
     **Arguments:** `problem` of one recording with one `Brightness` sensor and no torque; let a
     `Free` move the sensor's `level` unless it is known. `shortest` period of a line in the
     spectrum, s, `None` for four times the median distance of the samples; `count` pairs of
-    frequencies; `tolerance` as of `fit`; `progress` is called with a line of text.
+    frequencies at most: fewer are tried where the others fit worse, and where more of them fit the
+    status is `ambiguous`; `tolerance` as of `fit`; `progress` is called with a line of text.
 
     Sources: Pravec et al. 2005, Icarus 173:108, doi:10.1016/j.icarus.2004.07.021; Kaasalainen 2001,
     A&A 376:302, doi:10.1051/0004-6361:20010935.
@@ -123,22 +126,30 @@ def fit_light_curve(
     **Raises:** `ValueError` for a problem with other sensors, several recordings or a torque.
     """
     reading = _only(problem)
-    _checks.whole(count, "count", 1), _checks.positive(tolerance, "tolerance")
+    _checks.whole(count, "count", 1)
+    _checks.positive(tolerance, "tolerance")
     if progress is not None:
         _checks.function(progress, "progress", "of a line of text, such as print")
     say = progress if progress is not None else _silent
     t, flux, noise = _flux(problem, reading)
     squares, spread = flux**2, None if noise is None else 2.0 * flux * noise
     found = two_frequencies(t, squares, spread, shortest=shortest, count=count)
-    say(f"{len(found.misfits)} pairs of frequencies, χ² {found.misfits[0]:.0f} of {found.dof}")
-    starts = _starts(problem, reading, t, squares, spread, found)
+    used = _used(found)
+    starts = _starts(problem, reading, t, squares, spread, found, used)
+    say(f"{used} pairs of frequencies, χ² {found.misfits[0]:.0f} of {found.dof}")
     say(f"{len(starts)} starts")
     sigma = _noise(problem, reading, flux, found)
     ends = _descended(problem, starts, sigma, tolerance)
     aliases = _aliases(problem, ends)
     say(f"{len(aliases)} motions, misfit {aliases[0].cost:.1f}")
     best = fit(problem, starts=1, initial=aliases[0].parameters, tolerance=tolerance)
-    return _told(best, aliases, found)
+    return _told(best, aliases, found, used >= count)
+
+
+def _used(found: TwoFrequencies) -> int:
+    """How many of the pairs fit well enough to be tried."""
+    above = ABOVE * max(1.0, float(found.misfits[0]) / found.dof)
+    return max(LEAST, int((found.misfits <= found.misfits[0] + above).sum()))
 
 
 def _silent(line: str) -> None:
@@ -184,6 +195,7 @@ def _starts(
     squares: np.ndarray,
     spread: np.ndarray | None,
     found: TwoFrequencies,
+    used: int,
 ) -> list[Parameters]:
     """The best starting points over all pairs of frequencies."""
     sensor = reading.sensor
@@ -200,7 +212,7 @@ def _starts(
         order = np.argsort(-axes)
         areas = (np.prod(axes) / axes[order]) ** 2
     best_of, others = [], []
-    for pair in found.frequencies:
+    for pair in found.frequencies[:used]:
         for mode in tumbling_starts.MODES:
             some = tumbling_starts.candidates(pair, mode, light, half_way, areas, 3)
             # Of each reading of each pair one: which of them is true a grid alone cannot tell.
@@ -208,9 +220,10 @@ def _starts(
             others += some[len(tumbling_starts.ABOUT) :]
     best_of.sort(key=lambda one: one.misfit)
     others.sort(key=lambda one: one.misfit)
-    all_of = best_of + others
+    chunks = max(1, -(-len(best_of) // FIRST))
+    all_of = (best_of + others)[: chunks * FIRST]
     turn = _turn(order)
-    return [_parameters(problem, one, turn) for one in all_of[:FIRST]]
+    return [_parameters(problem, one, turn) for one in all_of]
 
 
 def _turn(order: np.ndarray) -> np.ndarray:
@@ -252,22 +265,27 @@ def _descended(
     problem: Problem, starts: list[Parameters], noise: Any, tolerance: float
 ) -> list[Tried]:
     """All starts a little way down, then the best of them to the end."""
-    # Always as many: one program.
-    starts = [starts[k % len(starts)] for k in range(FIRST)]
-    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *starts)
-    stacked = _levelled(stacked, problem)
-    first = _many(stacked, problem, noise, Settings(tolerance, CAREFUL, STEPS))
-    order = np.argsort(np.asarray(first.cost))
+    parameters, costs = [], []
+    for first in range(0, len(starts), FIRST):
+        # Always as many: one program.
+        some = [starts[first + k % len(starts[first:])] for k in range(FIRST)]
+        stacked = _levelled(jax.tree.map(lambda *leaves: jnp.stack(leaves), *some), problem)
+        found = _many(stacked, problem, noise, Settings(tolerance, CAREFUL, STEPS))
+        parameters.append(found.parameters)
+        costs.append(np.asarray(found.cost))
+    all_of = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parameters)
+    cost_of = np.concatenate(costs)
+    order = np.argsort(cost_of)
     kept, seen = [], []
     for index in order:
-        cost = float(first.cost[index])
+        cost = float(cost_of[index])
         if all(abs(cost - other) > 1e-3 * (1.0 + other) for other in seen):
             kept.append(int(index))
             seen.append(cost)
         if len(kept) == SECOND:
             break
     rows = jnp.asarray(np.resize(kept, FIRST))
-    nearer = jax.tree.map(lambda leaf: leaf[rows], first.parameters)
+    nearer = jax.tree.map(lambda leaf: leaf[rows], all_of)
     count = jnp.asarray(len(kept))
     last = _many(nearer, problem, noise, Settings(tolerance, 1e-2, MORE), count)
     return [jax.tree.map(lambda leaf, k=k: leaf[k], last) for k in range(len(kept))]
@@ -324,7 +342,7 @@ def _levelled(starts: Parameters, problem: Problem) -> Parameters:
         error = problem.errors(start)[0][:, 0]
         seen = reading.mask[0]
         if sensor.unit == "mag":
-            better = level + jnp.sum(error) / jnp.sum(seen)
+            better = level + jnp.sum(error) / jnp.sum(seen.astype(error.dtype))
         else:
             shape = jnp.where(seen, reading.values[0] - error, 0.0)
             better = level * jnp.sum(shape * reading.values[0]) / jnp.sum(shape * shape)
@@ -341,9 +359,8 @@ def _read(parameters: Parameters, problem: Problem) -> tuple[Array, Array]:
     inertia = body.inertia if isinstance(body, MassProperties) else body
     omega = parameters.own.spin[0] * problem.reference.rate[0]
     moments, momentum = inertia.moments, apply(inertia.tensor, omega)
-    rotation, precession = (
-        of(inertia, omega) for of in (exact.body_period, exact.precession_period)
-    )
+    rotation = exact.body_period(inertia, omega)
+    precession = exact.precession_period(inertia, omega)
     ratios = moments[:2] / moments[2]
     numbers = jnp.log(jnp.stack([rotation, precession, ratios[0], ratios[1]]))
     return numbers, dot(momentum, momentum) / dot(omega, momentum) / moments[1]
@@ -386,7 +403,7 @@ def _same(a: Alias, b: Alias, near: np.ndarray) -> bool:
     return a.mode == b.mode and bool((np.abs(_numbers(a) - _numbers(b)) < near).all())
 
 
-def _told(best: Fit, aliases: list[Alias], found: TwoFrequencies) -> LightCurve:
+def _told(best: Fit, aliases: list[Alias], found: TwoFrequencies, cut: bool) -> LightCurve:
     slopes = np.asarray(_slopes(best.parameters, best.problem))
     deviations = carried(slopes, np.asarray(best.seen), np.asarray(best.null_directions))
     # The misfits of a search that stopped on its way to the same motion are no rival's.
@@ -405,4 +422,6 @@ def _told(best: Fit, aliases: list[Alias], found: TwoFrequencies) -> LightCurve:
     if rivals and not status.startswith(("failed", "poor")):
         some = "another motion explains" if rivals == 1 else f"{rivals} other motions explain"
         status = f"ambiguous: {some} the light curve nearly as well"
+    elif cut and status == "ok":
+        status = "ambiguous: more pairs of frequencies fit than were tried"
     return LightCurve(best, marked, deviations, found, status)

@@ -59,12 +59,11 @@ def _rate_of_light(recording: Recording) -> float:
             values = np.asarray(reading.values)[reading.seen][:1000]
             if t.size < 10 or np.ptp(values) == 0:
                 return 0.0
-            from scipy.signal import lombscargle
-
             span = t[-1] - t[0]
-            highest = min(0.25 / np.median(np.diff(t)), 1000.0 / span)
+            highest = min(0.25 / np.median(np.diff(t)), 500.0 / span)
             turns = 2.0 * np.pi * np.arange(0.5 / span, max(highest, 1.0 / span), 0.25 / span)
-            power = lombscargle(t - t[0], values - values.mean(), turns)
+            waves = np.exp(1j * turns[:, None] * (t - t[0]))
+            power = np.abs(waves @ (values - values.mean()))
             return 0.5 * float(turns[np.argmax(power)])
     return 0.0
 

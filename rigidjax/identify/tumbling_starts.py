@@ -210,7 +210,7 @@ def _grid(
                 twice = (2 * entry(0, 1), 2 * entry(0, 2), 2 * entry(1, 2))
                 return jnp.stack([entry(0, 0), entry(1, 1), entry(2, 2), *twice])
 
-            rows = jax.vmap(row)(t).T * weights
+            rows = jax.vmap(row)(t).T * weights[None, :]
             gram = rows @ rows.T
             gram = gram + 1e-9 * jnp.trace(gram) * jnp.eye(6, dtype=t.dtype)
             side = rows @ z

@@ -20,8 +20,8 @@ LINES, STEP = 3, 0.1
 NEAR = 0.25
 # How many pairs are refined for each that is wanted.
 TRIED = 2
-# Programs are compiled for times in multiples of so many, and for so many pairs at once.
-BLOCK, BATCH = 256, 32
+# Programs are compiled for times in multiples of so many, and for so many pairs at a time.
+BLOCK, BATCH, FEW, MANY = 256, 32, 256, 2048
 
 
 class TwoFrequencies(eqx.Module):
@@ -41,8 +41,8 @@ class TwoFrequencies(eqx.Module):
 
 def two_frequencies(
     t: Float[ArrayLike, " times"],
-    values: Float[ArrayLike, " times"],
-    noise: float | Float[ArrayLike, " times"] | None = None,
+    values: Float[ArrayLike, " values"],
+    noise: float | Float[ArrayLike, " noises"] | None = None,
     *,
     order: int = 1,
     shortest: float | None = None,
@@ -129,7 +129,7 @@ def _spectrum(grid: Array, x: ArrayLike, z: ArrayLike, w: ArrayLike) -> tuple[Ar
     def one(f: Array) -> tuple[Array, Array]:
         angle = 2.0 * math.pi * f * x
         plain = jnp.stack([jnp.ones_like(x), jnp.cos(angle), jnp.sin(angle)])
-        rows = plain * w
+        rows = plain * w[None, :]
         gram = rows @ rows.T
         gram = gram + 1e-9 * jnp.trace(gram) * jnp.eye(3, dtype=x.dtype)
         side = rows @ z
@@ -155,10 +155,11 @@ def lattice_misfits(pairs: Array, light: Any, order: int) -> Float[Array, " pair
     js, ks = js.ravel(), ks.ravel()
     dj, dk = js[None, :] - js[:, None] + 2 * FIRST, ks[None, :] - ks[:, None] + 2 * order
     total = jnp.sum(z * z)
+    squares, sides = (jax.lax.complex(v, jnp.zeros_like(v)) for v in (w * w, w * z))
 
     def powers(f: Array, most: int) -> Array:
         angle = 2.0 * math.pi * jnp.mod(f * x, 1.0)
-        turn = jnp.cos(angle) + 1j * jnp.sin(angle)
+        turn = jax.lax.complex(jnp.cos(angle), jnp.sin(angle))
         up = [jnp.ones_like(turn), turn]
         for _ in range(most - 1):
             up.append(up[-1] * turn)
@@ -166,10 +167,10 @@ def lattice_misfits(pairs: Array, light: Any, order: int) -> Float[Array, " pair
 
     def one(pair: Array) -> Array:
         first, second = powers(pair[0], 2 * FIRST), powers(pair[1], 2 * order)
-        window = (first * (w * w)) @ second.T
-        seen = (first[FIRST : 3 * FIRST + 1] * (w * z)) @ second[order : 3 * order + 1].T
+        window = (first * squares[None, :]) @ second.T
+        seen = (first[FIRST : 3 * FIRST + 1] * sides[None, :]) @ second[order : 3 * order + 1].T
         gram = window[dj, dk]
-        gram = gram + 1e-7 * window[2 * FIRST, 2 * order].real * jnp.eye(js.size, dtype=x.dtype)
+        gram = gram + 1e-7 * window[2 * FIRST, 2 * order] * jnp.eye(js.size, dtype=gram.dtype)
         side = jnp.conj(seen.ravel())
         factor = jax.scipy.linalg.cho_factor(gram, lower=True)
         c = jax.scipy.linalg.cho_solve(factor, side)
@@ -179,15 +180,15 @@ def lattice_misfits(pairs: Array, light: Any, order: int) -> Float[Array, " pair
 
 
 def _filled(rows: np.ndarray) -> np.ndarray:
-    """Rows repeated up to a power of two of them: fewer programs to compile."""
-    size = max(1 << (len(rows) - 1).bit_length(), 64)
+    """Rows repeated up to one of few lengths: fewer programs to compile."""
+    size = FEW if len(rows) <= FEW else -(-len(rows) // MANY) * MANY
     return np.concatenate([rows, np.repeat(rows[:1], size - len(rows), axis=0)])
 
 
 def _misfits(light: Any, pairs: np.ndarray, order: int) -> np.ndarray:
     out = []
-    for first in range(0, len(pairs), 4096):
-        some = pairs[first : first + 4096]
+    for first in range(0, len(pairs), MANY):
+        some = pairs[first : first + MANY]
         found = lattice_misfits(jnp.asarray(_filled(some)), light, order)
         out.append(np.asarray(found)[: len(some)])
     return np.concatenate(out)

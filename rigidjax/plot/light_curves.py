@@ -15,7 +15,7 @@ _MAP = "viridis"
 
 def light_curve(
     ts: Float[ArrayLike, " times"],
-    values: Float[ArrayLike, " times"],
+    values: Float[ArrayLike, " values"],
     periods: float | Sequence[float] = (),
     *,
     model: Any = None,
@@ -81,7 +81,8 @@ def _against(ax: Any, t: np.ndarray, read: np.ndarray, predicted: np.ndarray | N
         # No line over a gap: nothing is known of the motion's light there.
         wide = np.append(np.diff(t) > 10 * np.median(np.diff(t)), False)
         ax.plot(t, np.where(wide, np.nan, predicted), color=COLOURS[1], lw=1.0, label="motion")
-        ax.legend(loc="upper right", frameon=False, ncols=2)
+        # Beside the picture: inside it would lie on some night.
+        ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
 
 
 def _folded(ax: Any, turns: np.ndarray, read: np.ndarray, predicted: np.ndarray | None) -> None:

@@ -29,7 +29,7 @@ def main(count: int, first: int) -> None:
         found = identify.fit_light_curve(problem(one.recording))
         times, ratios = off(one, found.aliases[0])
         right = times < 1e-3 and ratios < 0.05
-        # The same motion, less precisely: within a hundredth of a turn of the whole record's.
+        # The same motion, less precisely.
         near = found.aliases[0].mode == one.mode and times < 2e-2 and ratios < 0.3
         what = "right" if right else ("imprecise" if near else "WRONG")
         listed = any(
