@@ -22,6 +22,7 @@ from rigidjax.body.scattering import (
     direction,
     law_of,
 )
+from rigidjax.special.scaling import exponent_of, times_power_of_two
 
 
 def ellipsoid(
@@ -44,7 +45,10 @@ def ellipsoid(
     a = _checks.finite(_checks.floating(semi_axes, (3,), "semi_axes"), "semi_axes")
     a = _checks.refuse(a, (~(a > 0)).any(), "semi_axes: wanted three positive lengths, m")
     s, o = direction(sun, "sun").astype(a.dtype), direction(observer, "observer").astype(a.dtype)
-    return law.of_ellipsoid(jnp.diag(a * a), s, o)
+    # The fourth power of the axes is taken: a power of two keeps it in range.
+    size = exponent_of(a)
+    a = times_power_of_two(a, -size)
+    return times_power_of_two(law.of_ellipsoid(jnp.diag(a * a), s, o), 2 * size)
 
 
 def mesh(

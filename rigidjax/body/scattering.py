@@ -17,6 +17,7 @@ from rigidjax import _checks
 from rigidjax._types import Mat3, Scalar, Vec3, Vec3Like
 from rigidjax.body.hints import Numbers
 from rigidjax.rotation.algebra import cross, dot, entries
+from rigidjax.special.scaling import exponent_of, times_power_of_two
 
 # Below it the function of Lommel and Seeliger's law is a series, of so many terms.
 _SMALL, _TERMS = 0.1, 16
@@ -109,12 +110,11 @@ def law_of(scattering: AbstractScattering | None) -> AbstractScattering:
 def direction(value: Vec3Like | Numbers, name: str) -> Vec3:
     """A vector (3,) of length one along `value`. **Raises** for length zero, NaN, a wrong shape."""
     v = _checks.finite(_checks.floating(value, (3,), name), name)
-    # By its largest component: of a star's 1e200 m the square would overflow.
-    size = jnp.max(jnp.abs(v))
-    size = _checks.refuse(
-        size, ~(size > 0), f"{name}: wanted a direction, got a vector of length zero"
+    v = _checks.refuse(
+        v, ~(jnp.abs(v) > 0).any(), f"{name}: wanted a direction, got a vector of length zero"
     )
-    v = v / size
+    # Of a star's 1e200 m the square would overflow.
+    v = times_power_of_two(v, -exponent_of(v))
     return v / jnp.sqrt(dot(v, v))
 
 

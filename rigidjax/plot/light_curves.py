@@ -16,7 +16,7 @@ _MAP = "viridis"
 def light_curve(
     ts: Float[ArrayLike, " times"],
     values: Float[ArrayLike, " values"],
-    periods: float | Sequence[float] = (),
+    periods: float | Sequence[float] | Float[ArrayLike, " periods"] = (),
     *,
     model: Any = None,
     quantity: str = "mag",
@@ -51,8 +51,10 @@ def light_curve(
     predicted = None if model is None else _checks.on_host(model, "model")
     if predicted is not None and predicted.shape != t.shape:
         raise ValueError(f"model: wanted (T,) as ts has, got {predicted.shape}")
-    folds = [periods] if np.ndim(periods) == 0 else list(periods)  # pyright: ignore
-    folds = [_checks.positive(period, "periods", "positive periods, s") for period in folds]
+    several = np.atleast_1d(_checks.on_host(periods, "periods"))
+    if several.ndim != 1:
+        raise ValueError(f"periods: wanted one or a row of them, s, got shape {several.shape}")
+    folds = [_checks.positive(period, "periods", "positive periods, s") for period in several]
     count = 1 + len(folds)
     if ax is None:
         ax = pyplot().subplots(count, 1, figsize=(7.2, 2.5 * count), layout="constrained")[1]

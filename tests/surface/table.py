@@ -1,6 +1,7 @@
 """All rows: importing this fills the table."""
 
 from surface import (
+    calls_brightness as calls_brightness,
     calls_estimate as calls_estimate,
     calls_identify as calls_identify,
     calls_motion as calls_motion,
