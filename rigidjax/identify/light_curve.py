@@ -20,6 +20,7 @@ from rigidjax.identify.parameters import Parameters
 from rigidjax.identify.problem import Problem, one_problem
 from rigidjax.identify.reported import carried
 from rigidjax.identify.sensors import Brightness
+from rigidjax.identify.several import Bodies
 from rigidjax.identify.two_frequencies import BLOCK, TwoFrequencies, two_frequencies
 from rigidjax.motion.torques.base import vector_at
 from rigidjax.rotation import quaternion
@@ -168,6 +169,8 @@ def _only(problem: Problem) -> Any:
             f"fit_light_curve: wanted one recording, got {problem.count}; fit the longest, then "
             "all of them with rigidjax.identify.fit from what it found"
         )
+    if isinstance(problem.body, Bodies):
+        raise ValueError("fit_light_curve: wanted one body, got several by name")
     if problem.records.torque is not None:
         raise ValueError("fit_light_curve: wanted a free body, got a torque")
     return stacking.one(readings[0], 0)
@@ -355,7 +358,7 @@ def _levelled(starts: Parameters, problem: Problem) -> Parameters:
 @eqx.filter_jit
 def _read(parameters: Parameters, problem: Problem) -> tuple[Array, Array]:
     """Logarithms (4,) of both periods and both ratios, and h²/2T over the middle moment."""
-    body = problem.body.body(parameters.body)
+    body: Any = problem.bodies(parameters)
     inertia = body.inertia if isinstance(body, MassProperties) else body
     omega = parameters.own.spin[0] * problem.reference.rate[0]
     moments, momentum = inertia.moments, apply(inertia.tensor, omega)
