@@ -411,11 +411,12 @@ def _told(best: Fit, aliases: list[Alias], found: TwoFrequencies, cut: bool) -> 
     deviations = carried(slopes, np.asarray(best.seen), np.asarray(best.null_directions))
     # The misfits of a search that stopped on its way to the same motion are no rival's.
     near = np.maximum(SAME, REACH * deviations)
-    cost = min(start.cost for start in best.starts)
-    first = _alias(best.problem, best.parameters, min(cost, aliases[0].cost))
+    # Costs of the search, all with one noise: a fit may have estimated another.
+    first = _alias(best.problem, best.parameters, aliases[0].cost)
     others = [alias for alias in aliases if not _same(alias, first, near)]
     # Where the noise is larger than was said, misfits count for less.
-    margin = MARGIN * max(1.0, 2.0 * first.cost / max(best.dof, 1)) * max(best.correlation, 1.0)
+    count = int(best.problem.records.readings[0].seen.sum())
+    margin = MARGIN * max(1.0, 2.0 * first.cost / count) * max(best.correlation, 1.0)
     marked = tuple(
         eqx.tree_at(lambda a: a.explains, alias, alias.cost <= first.cost + margin)
         for alias in (first, *others)
