@@ -1,6 +1,7 @@
 """All rows: importing this fills the table."""
 
 from surface import (
+    calls_brightness as calls_brightness,
     calls_driven as calls_driven,
     calls_estimate as calls_estimate,
     calls_events as calls_events,
