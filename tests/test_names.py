@@ -56,8 +56,10 @@ def test_nothing_public_is_lost():
         rj.sources  # noqa: B018
 
 
-def test_readme_uses_what_is_shown():
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
+def test_readme_and_guide_use_what_is_shown():
+    pages = [ROOT / "README.md", *(ROOT / "notebooks").glob("*.md")]
+    pages += (ROOT / "notebooks" / "guide").glob("*.md")
+    text = "\n".join(page.read_text(encoding="utf-8") for page in pages)
     used = set(re.findall(r"\brj\.([a-zA-Z_]\w*)", text))
     assert "body" in used and not used - set(dir(rj)) - {"__version__"}
 

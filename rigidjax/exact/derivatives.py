@@ -79,7 +79,7 @@ def _flow_jvp(primals, tangents):
     along, across = fence((along, across), one)
     theta = tuple(r * (a + b * along) for a, b in zip(across, out, strict=True))
 
-    # Away from small turns the series sees a harmless one.
+    # Away from small turns the series, which is not used there, gets zero: nothing overflows.
     safe = jnp.where(small, t, 0.0)
     _, d_series = jax.jvp(_series, (k, momentum, safe), (d_k, d_momentum, d_t))
     d_turn = tuple(

@@ -86,7 +86,7 @@ def _periods(moments: Six, momentum: Triple) -> tuple[Scalar, Scalar]:
     v = sigma_form.invariants(body, momentum)
     h = jnp.sqrt(sum(p * p for p in momentum))
     endless = is_endless(jax.lax.stop_gradient(Modulus(v.p, v.q, v.gap)))
-    # A tame body stands in where there is no period, so that no derivative is NaN there.
+    # Where there is no period the branch not taken gets other inputs: no derivative is NaN.
     one, zero = jnp.ones_like(h), jnp.zeros_like(h)
     safe_moments = _choose(endless, (one, 2 * one, 3 * one, zero, zero, zero), moments)
     safe_momentum = _choose(endless, (one, zero, zero), momentum)

@@ -1,4 +1,4 @@
-"""A collision is named, with its time and distance, instead of being ground out step by step."""
+"""A collision is named, with its time and distance, instead of ever smaller steps."""
 
 from typing import Any
 

@@ -77,7 +77,7 @@ def descend(
             f"Descent: wanted a batch of at most {problem.count} recordings, got {how.batch}"
         )
     if problem.links is not None:
-        raise ValueError("Descent: pieces of one recording hang together; fit them at once")
+        raise ValueError("Descent: pieces of one recording depend on one another; fit them at once")
     init: Any = how.optimiser.init
     point, memory = start, init(start)
     try:

@@ -208,8 +208,8 @@ def _nothing(problem: Problem, start: Parameters, columns: int, kind: Any) -> An
 def _made(parameters: Parameters) -> Float[Array, " n"]:
     """One for the numbers that are of order one by their making, zero for those of a `Free`.
 
-    The unit of a `Free` is a user's guess; of the others none is to be flung about by data that
-    hardly feel it.
+    The unit of a `Free` is a user's guess. The scale of the others is at most one, so that a
+    weakly observed number takes no large steps.
     """
     ones, zeros = (jax.tree.map(of, parameters) for of in (jnp.ones_like, jnp.zeros_like))
     marked = eqx.tree_at(lambda p: (p.shared, p.own.each), ones, (zeros.shared, zeros.own.each))

@@ -151,7 +151,7 @@ def settle(
         bold = BOLD if first or near else CAREFUL
         after = least_squares(tried.parameters, problem, noise, weights, tolerance, count, bold)
         if not np.isfinite(float(after.cost)):
-            # The motion was lost on the way: what is known is where this stride began.
+            # The residuals are no longer finite: go back to the point before these iterations.
             cost = jnp.asarray(cost_of(tried.parameters, problem, noise))
             tried = Tried(tried.parameters, cost, jnp.asarray(False))
             look(tried, strides, True)

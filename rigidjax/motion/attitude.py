@@ -94,8 +94,8 @@ def _unit(q: Quat) -> Quat:
 
     Where it can, XLA makes q/√n a product with 1/√n, and whether it can depends on the program.
     Reverse mode runs steps again in another program than the first: a last digit that differs there
-    moves the error estimate, at tight tolerances the lengths of steps with it, and the gradient is
-    that of no run at all (7e-6 off at a tolerance of 1e-11). Root and quotient by themselves are
-    exact to the last digit in every program, and in every lane of a batch.
+    moves the error estimate, at tight tolerances the lengths of steps with it, and the gradient
+    belongs to another discretisation (7e-6 off at a tolerance of 1e-11). Root and quotient by
+    themselves are exact to the last digit in every program, and for every body of a batch.
     """
     return q / lax.optimization_barrier(jnp.sqrt(square4(components(q))))

@@ -32,8 +32,8 @@ Law = Callable[[Any, State, Any], Any] | AbstractScene | MovingFrame | None
 # Our loop has both modes of differentiation: these adjoints of diffrax say no more than that.
 _EITHER_MODE = (type(None), dfx.ForwardMode, dfx.RecursiveCheckpointAdjoint)
 # A step that reverse mode runs again rounds differently. Where the tolerance is so near round-off
-# that its length then differs, too, the gradient is of no run at all (2e-4 off at 1e-13 under the
-# gravity gradient): keep the start of every step of all but the longest runs.
+# that its length then differs, too, the gradient belongs to other steps (2e-4 off at 1e-13 under
+# the gravity gradient): keep the start of every step of all but the longest runs.
 _TIGHT, _EVERY_STEP = 1e-10, dfx.RecursiveCheckpointAdjoint(checkpoints=4096)
 
 
@@ -79,9 +79,9 @@ def simulate(
       ten times `rtol` off (7 was the most that was met), Dopri8 up to 26 times below `rtol=1e-10`.
     - `rtol`, `atol`: tolerances of the adaptive steps; 1e-9 and 1e-12 in float64, 2e-5 and 1e-7 in
       float32. Traced ones are not checked, and others then compile nothing. Scale `atol` to the
-      smallest number that matters: a flip about the middle axis grows out of how far off the axis
-      it starts, and where that is below `atol` its time is made up. The closed form has no use for
-      either.
+      smallest number that matters: the time of a flip about the middle axis depends on the rate off
+      the axis at the start; where this is below `atol`, it has no meaning. The closed form has no
+      use for either.
     - `dt0`, `stepsize_controller`: first step and controller where the tolerances are not enough,
       such as `dt0=0.01, stepsize_controller=diffrax.ConstantStepSize()`.
     - `adjoint`: how derivatives through a solver of diffrax are taken, as there. `None` is

@@ -63,9 +63,9 @@ class Watched(dfx.AbstractAdaptiveStepSizeController):
         error_order: Any,
     ) -> tuple[Any, Any]:
         first, inner = self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
-        # Where t is nought its own round-off is, too: then that of the run's length counts.
+        # At t = 0 the round-off of t vanishes: that of the length of the run is taken.
         least = jnp.finfo(t0.dtype).eps * jnp.abs(t1 - t0)
-        # Where there is no slope to begin with, no step is short enough.
+        # Where the first derivative is not finite the run ends at once.
         return first, (inner, least, ~finite((y0, func(terms, t0, y0, args))))
 
     def adapt_step_size(

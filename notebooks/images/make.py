@@ -1,0 +1,91 @@
+"""The pictures of README and the guide: python notebooks/images/make.py"""
+
+import io
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import matplotlib
+from PIL import Image
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+
+import rigidjax as rj
+from rigidjax import identify
+
+jax.config.update("jax_enable_x64", True)
+HERE = Path(__file__).parent
+
+
+def save(figure, name):
+    """With a palette of colours: a third of the bytes."""
+    drawn = io.BytesIO()
+    figure.savefig(drawn, dpi=90)
+    plt.close(figure)
+    Image.open(drawn).convert("RGB").quantize(96).save(HERE / name, optimize=True)
+
+
+def frames():
+    """Body frame and world frame before and after a quarter turn about z."""
+    figure = plt.figure(figsize=(7.0, 3.0), layout="constrained")
+    turns = (
+        ("q = (1, 0, 0, 0)", [0.0, 0, 0]),
+        ("after a quarter turn about z", [0.0, 0, jnp.pi / 2]),
+    )
+    for place, (title, vector) in enumerate(turns, 1):
+        q = rj.quaternion.exp(jnp.array(vector))
+        ax = figure.add_subplot(1, 2, place, projection="3d", computed_zorder=False)
+        for axis, colour, name in zip(jnp.eye(3), rj.plot.COLOURS, "xyz", strict=False):
+            ax.plot(*zip([0, 0, 0], 1.35 * axis, strict=True), color="0.6", lw=1.2, ls="--")
+            ax.text(*(1.5 * axis), name, color="0.45", ha="center", va="center")
+            end = rj.quaternion.rotate(q, axis)
+            ax.plot(*zip([0, 0, 0], end, strict=True), color=colour, lw=3)
+            ax.text(
+                *(0.85 * end + jnp.array([0, 0, 0.16 * (1 - end[2])])), f" {name}′", color=colour
+            )
+        ax.set(xlim=(-0.8, 1.2), ylim=(-0.8, 1.2), zlim=(-0.3, 1.7))
+        ax.set_title(title, fontsize=10)
+        ax.set_axis_off()
+        ax.view_init(24, 35)
+        ax.set_box_aspect((1, 1, 1), zoom=1.5)
+    figure.supxlabel("dashed: world axes x, y, z;  full: body axes x′, y′, z′", fontsize=9)
+    save(figure, "frames.png")
+
+
+def flip():
+    """README's simulation."""
+    body = rj.shapes.box(1.0, [0.30, 0.20, 0.08])
+    start = rj.Attitude(q=[1.0, 0, 0, 0], omega=[0.02, 6.0, 0.02])
+    sol = rj.simulate(body.inertia, start, jnp.linspace(0.0, 9.0, 301))
+    figure = plt.figure(figsize=(8.4, 3.5), layout="constrained")
+    ax = figure.add_subplot(1, 2, 1, projection="3d")
+    rj.plot.polhode(body.inertia, sol.ys, ax=ax, title="the polhode")
+    legend = ax.get_legend()
+    words = [text.get_text() for text in legend.get_texts()]
+    ax.legend(legend.legend_handles, words, bbox_to_anchor=(0.12, 1.0), fontsize=8)
+    ax = figure.add_subplot(1, 2, 2)
+    for index, colour in enumerate(rj.plot.COLOURS[:3]):
+        ax.plot(sol.ts, sol.ys.omega[:, index], color=colour, label=f"Ω{'₁₂₃'[index]}")
+    ax.set(xlabel="time, s", ylabel="body rate, rad/s", title="the flip about the middle axis")
+    ax.legend(loc="upper right", fontsize=8)
+    ax.grid(alpha=0.3)
+    save(figure, "flip.png")
+
+
+def fit():
+    """README's fit."""
+    truth = rj.Inertia.from_principal(1.0, 1.6, 2.2)
+    t = jnp.linspace(0.0, 10.0, 101)
+    motion = rj.simulate(truth, rj.Spin([1.0, 0.5, 1.2]), t).ys
+    rates = motion.omega + 0.05 * jax.random.normal(jax.random.key(0), (101, 3))
+    record = identify.Recording(t, (identify.Gyro(noise=0.05), rates))
+    found = identify.fit(identify.Problem(record, identify.PrincipalRatios()), starts=1)
+    figure = rj.plot.fit(found)
+    figure.set_size_inches(7.6, 4.8)
+    save(figure, "fit.png")
+
+
+if __name__ == "__main__":
+    for draw in (frames, flip, fit):
+        draw()

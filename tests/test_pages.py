@@ -1,0 +1,192 @@
+"""README and the guide tell the truth: their Python blocks run, their links lead somewhere."""
+
+import json
+import re
+from pathlib import Path
+from urllib.parse import unquote
+
+import numpy as np
+import pytest
+import scipy.integrate
+
+import rigidjax as rj
+
+ROOT = Path(__file__).parents[1]
+README = ROOT / "README.md"
+# `notebooks/reference` is made from the docstrings, whose examples run in `test_doctests.py`.
+PAGES = sorted((ROOT / "notebooks").glob("*.md")) + sorted((ROOT / "notebooks/guide").glob("*.md"))
+RUN = (README, *PAGES)
+LISTS = (ROOT / "CHANGELOG.md", ROOT / "tests" / "failures" / "README.md")
+_FENCE = re.compile(r"^(```+)(\S*)[^\n]*\n(.*?)^\1", re.S | re.M)
+_LINK = re.compile(r"!?\[[^\]\n]*\]\(([^)\s]+)\)")
+
+
+def text_of(path):
+    return path.read_text(encoding="utf-8")
+
+
+def name_of(path):
+    return path.relative_to(ROOT).as_posix()
+
+
+def blocks(path):
+    """Python of a page, each block behind as many empty lines that a traceback names its line."""
+    text = text_of(path)
+    return [
+        "\n" * (text.count("\n", 0, found.start()) + 1) + found[3]
+        for found in _FENCE.finditer(text)
+        if found[2] == "python"
+    ]
+
+
+def prose(path):
+    """The page without its blocks and `code`."""
+    return re.sub(r"`[^`\n]+`", "", _FENCE.sub("", text_of(path)))
+
+
+def anchors(path):
+    """The headings of a page as links name them."""
+    if path.suffix != ".md":
+        return set()
+    titles = re.findall(r"^#+ (.+)$", _FENCE.sub("", text_of(path)), re.M)
+    return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
+
+
+def run(path, folder, monkeypatch, parts=slice(None)):
+    """The names that a page has made at its end, or at that of some of its first blocks."""
+    pytest.importorskip("matplotlib").use("Agg")
+    import jax
+    import matplotlib.pyplot as plt
+
+    monkeypatch.chdir(folder)
+    cache = jax.config.values["jax_compilation_cache_dir"]
+    namespace = {"__name__": "__main__"}
+    try:
+        for block in blocks(path)[parts]:
+            exec(compile(block, name_of(path), "exec"), namespace)
+    finally:
+        jax.config.update("jax_compilation_cache_dir", cache)
+        plt.close("all")
+    return namespace
+
+
+@pytest.mark.parametrize("path", [path for path in PAGES if blocks(path)], ids=name_of)
+def test_blocks_run_as_printed(path, tmp_path, monkeypatch, capsys):
+    run(path, tmp_path, monkeypatch)
+    assert "nan" not in capsys.readouterr().out
+
+
+def spun(moments, ts):
+    """README's body by SciPy: Euler's equations without torque."""
+    moments = np.asarray(moments)
+
+    def change(_, w):
+        return np.cross(moments * w, w) / moments
+
+    start = [0.02, 6.0, 0.02]
+    found = scipy.integrate.solve_ivp(
+        change, ts[[0, -1]], start, "DOP853", ts, rtol=1e-12, atol=1e-14
+    )
+    return found.y.T
+
+
+def test_readme_simulates_what_it_says(tmp_path, monkeypatch, capsys):
+    names = run(README, tmp_path, monkeypatch, slice(2))
+    body, sol = names["body"], names["sol"]
+    np.testing.assert_allclose(
+        sol.ys.omega, spun(np.diag(body.inertia.tensor), np.asarray(sol.ts)), atol=1e-7
+    )
+    assert sol.ys.omega[:, 1].min() < -5.9
+    h, ends = 1e-7, np.array([0.0, 3.0])
+    over, under = (spun([0.004, 0.008 + step, 0.011], ends)[-1, 1] for step in (h, -h))
+    slope = next(float(x) for x in capsys.readouterr().out.splitlines() if "[" not in x)
+    assert slope == pytest.approx((over - under) / (2 * h), rel=1e-4)
+
+
+@pytest.mark.long
+def test_readme_fits_what_it_says(tmp_path, monkeypatch):
+    found = run(README, tmp_path, monkeypatch)["found"]
+    assert found.status == "ok"
+    for name, ratio in (("Ix/Iz", 1.0 / 2.2), ("Iy/Iz", 1.6 / 2.2)):
+        low, high = found.interval(0.95)[name]
+        assert low < ratio < high
+
+
+def test_readme_is_short():
+    assert len(text_of(README).splitlines()) <= 180
+
+
+@pytest.mark.parametrize("path", PAGES, ids=name_of)
+def test_a_page_says_first_what_one_learns(path):
+    lines = text_of(path).splitlines()
+    assert lines[0].startswith("# ")
+    assert lines[2].startswith("*You learn: ")
+
+
+@pytest.mark.parametrize("path", [*RUN, *LISTS], ids=name_of)
+def test_links_lead_to_files(path):
+    for link in _LINK.findall(prose(path)):
+        place, _, heading = unquote(link).partition("#")
+        if re.match(r"[a-z]+:", place):
+            continue
+        there = (path.parent / place) if place else path
+        assert there.exists(), link
+        assert not heading or heading in anchors(there), link
+
+
+def test_every_page_can_be_found():
+    """README names each page of the guide, the site's contents each page there is."""
+    contents = "\n".join(
+        found[3] for found in _FENCE.finditer(text_of(ROOT / "notebooks/index.md"))
+    )
+    for path in PAGES:
+        page = path.relative_to(ROOT / "notebooks").with_suffix("").as_posix()
+        assert page == "index" or page in contents.split(), page
+    named = {(ROOT / link.partition("#")[0]).resolve() for link in _LINK.findall(prose(README))}
+    assert named >= set((ROOT / "notebooks" / "guide").glob("*.md"))
+
+
+@pytest.mark.parametrize("path", [*RUN, *LISTS], ids=name_of)
+def test_tables_are_rectangular(path):
+    rows = []
+    for line in [*_FENCE.sub("", text_of(path)).splitlines(), ""]:
+        if line.startswith("|"):
+            rows.append(len(re.findall(r"(?<!\\)\|", line)))
+        else:
+            assert len(set(rows)) <= 1, line or path
+            rows = []
+
+
+@pytest.mark.parametrize("path", RUN, ids=name_of)
+def test_names_exist(path):
+    missing = []
+    for name in sorted(set(re.findall(r"`rj\.([a-zA-Z_][\w.]*)", text_of(path)))):
+        thing = rj
+        for part in name.rstrip(".").split("."):
+            thing = getattr(thing, part, None)
+        if thing is None:
+            missing.append(name)
+    assert not missing
+
+
+def test_tests_and_files_that_pages_mention_exist():
+    tests = ROOT / "tests"
+    sources = "\n".join(text_of(path) for path in tests.rglob("test_*.py"))
+    text = "\n".join(text_of(path) for path in RUN)
+    for name in re.findall(r"`(?:[\w/]+\.py::)?(test_\w+)…?`", text):
+        assert f"def {name}" in sources, name
+    files = re.findall(r"\b((?:tests|notebooks)/[\w/]+\.(?:py|md|ipynb))\b", text)
+    assert len(files) > 20
+    for path in files:
+        assert (ROOT / path).exists(), path
+
+
+def test_pictures_are_small():
+    pictures = sorted((ROOT / "notebooks" / "images").glob("*.png"))
+    assert pictures and all(path.stat().st_size <= 60_000 for path in pictures)
+
+
+def test_a_notebook_opens_with_its_title():
+    for path in (ROOT / "notebooks").glob("*.ipynb"):
+        first = json.loads(text_of(path))["cells"][0]
+        assert first["cell_type"] == "markdown" and first["source"][0].startswith("# ")

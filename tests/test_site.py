@@ -1,0 +1,70 @@
+"""The reference of the site has every public name, with its signature and its examples."""
+
+import importlib.util
+import operator
+import re
+from pathlib import Path
+
+import pytest
+from surface import public
+
+import rigidjax as rj
+
+NOTEBOOKS = Path(__file__).parents[1] / "notebooks"
+
+
+@pytest.fixture(scope="module")
+def reference():
+    spec = importlib.util.spec_from_file_location("docs_reference", NOTEBOOKS / "docs_reference.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def written(reference, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("reference")
+    names = reference.write(folder)
+    return names, {path.stem: path.read_text(encoding="utf-8") for path in folder.glob("*.md")}
+
+
+def test_every_public_name_is_there_once(written):
+    names, pages = written
+    assert len(names) == len(set(names))
+    shown = {id(operator.attrgetter(name.removeprefix("rj."))(rj)) for name in names}
+    assert not [name for name, thing in public.functions().items() if id(thing) not in shown]
+    assert set(pages) == {"index", *(module.__name__ for module in public.modules())}
+    text = "\n".join(pages.values())
+    for name in names:
+        assert re.search(rf"^:::+\{{py:\w+\}} {re.escape(name)}(\(|$)", text, re.M), name
+
+
+def test_a_signature_is_the_sources(written):
+    _, pages = written
+    assert "{py:function} rj.so3.exp(v: Vec3Like) -> Mat3\n" in pages["rigidjax.rotation.so3"]
+    nuts = "{py:class} rj.estimate.Nuts(samples: int = 1000, warmup: int = 500)\n"
+    assert nuts in pages["rigidjax.estimate"]
+    # A name that is documented is a link, by its full name.
+    assert "inertia: rj.Inertia" in pages["rigidjax.exact"]
+
+
+def test_examples_are_blocks(reference):
+    def thing():
+        """One line.
+
+        Say it so.
+
+        >>> 1 + 1
+        2
+
+        And so.
+        """
+
+    text = "One line.\n\nSay it so.\n\n\n```pycon\n>>> 1 + 1\n2\n```\n\nAnd so."
+    assert reference.body_of(thing) == text
+
+
+def test_a_page_that_is_gone_is_removed(reference, tmp_path):
+    (tmp_path / "rigidjax.gone.md").write_text("# gone")
+    reference.write(tmp_path)
+    assert not (tmp_path / "rigidjax.gone.md").exists()
