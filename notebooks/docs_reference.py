@@ -152,9 +152,11 @@ def _members(cls: type, names: dict[int, str]) -> Iterator[str]:
             continue
         plain = value.__func__ if isinstance(value, staticmethod | classmethod) else value
         plain = getattr(plain, "__wrapped__", plain)
+        if not inspect.getdoc(plain) or not getattr(plain, "__doc__", None):
+            continue
         if isinstance(plain, property):
             yield directive("property", name, body_of(plain), _INNER)
-        elif inspect.isfunction(plain) and inspect.getdoc(plain):
+        elif inspect.isfunction(plain):
             yield directive(
                 "method", name + arguments(plain, names, bound=True), body_of(plain), _INNER
             )

@@ -40,6 +40,7 @@ from rigidjax.frames import Point as Point, scenes as scenes
 from rigidjax.motion import (
     Attitude as Attitude,
     AttitudeEquations as AttitudeEquations,
+    Coupled as Coupled,
     EulerEquations as EulerEquations,
     NewtonEuler as NewtonEuler,
     Rigid as Rigid,
@@ -58,9 +59,14 @@ from rigidjax.rotation import (
     so3 as so3,
 )
 from rigidjax.solve import (
+    Crossings as Crossings,
+    Event as Event,
+    Exponents as Exponents,
     Projected as Projected,
     Solution as Solution,
+    crossings as crossings,
     equations_of_motion as equations_of_motion,
+    lyapunov_exponents as lyapunov_exponents,
     simulate as simulate,
     solvers as solvers,
 )

@@ -14,9 +14,11 @@ from rigidjax.batch.sharding import Compiled, chunk_of, mesh_of, over_bodies
 from rigidjax.batch.validation import Bodies, bodies_of, driven_by, start_of, step_of, time_of
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.motion import Attitude, Rigid, Spin
+from rigidjax.motion.coupled import started
+from rigidjax.motion.torques import bind
 from rigidjax.solve import equations_of_motion
 from rigidjax.solve.explicit import AbstractExplicit
-from rigidjax.solve.fixed_loop import march, piece_length
+from rigidjax.solve.fixed_loop import first_row, march, piece_length
 from rigidjax.solve.magnus import Magnus4
 from rigidjax.solve.splitting import AbstractSplitting
 from rigidjax.solve.steppers import stepper_of
@@ -99,7 +101,8 @@ def rollout(
     - `step_size` s, the same for all; `num_steps` a whole number, part of what is compiled.
     - `torque`: `None`, or any law that `rigidjax.simulate` takes. Its arrays are shared by all
       bodies unless `torque_axes` is 0 (each array has a leading axis N: make one law a body with
-      `jax.vmap`) or a tree of 0 and `None`, one for each array.
+      `jax.vmap`), a function that picks those that have (`lambda law: law.speed`, of a `Sum`
+      `lambda law: law.parts[1]`, several in a tuple), or a tree of 0 and `None`, one for each.
     - `solver`: `None` takes `Magnus4` for a free attitude, or a torque that does not look at the
       attitude, and `rigidjax.solvers.RungeKutta4` for all else. Any of `rigidjax.solvers` that is
       explicit may be given; the steps are those that `diffrax` takes with it, to round-off.
@@ -109,7 +112,8 @@ def rollout(
       A function made anew for each call compiles anew: define it once, best as a Module.
     - `t0` s, when the first step begins.
     - `inputs`: what drives the law, by the names of its `rigidjax.torques.Input`s: arrays
-      (N, num_steps, *k) whose row i is held exactly through step i of that body.
+      (N, num_steps, *k) whose row i is held exactly through step i of that body; those of a
+      `rigidjax.torques.Delayed` input come later.
     - `chunk`: how many bodies go side by side. `None` is what fits the first cache, 128 in float64.
       Bodies are independent: chunks change results in the last digits at most.
     - `devices`: `None` for one, `"all"` of this process, or a sequence of them; N is cut into
@@ -117,7 +121,8 @@ def rollout(
       order products in another way, which is one rounding.
 
     **Returns** the states, of the type of `states0`, with leading axes (N,) or, with `save_every`,
-    (N, num_steps // save_every); with `reduce` the pair (last states, carried).
+    (N, num_steps // save_every); with `reduce` the pair (last states, carried). Under a torque with
+    states of its own they are `rigidjax.Coupled(motion, own)`.
 
     Memory: the inputs, what is returned, and a chunk. Derivatives are those of the steps as taken,
     in forward mode and in reverse; reverse mode goes back in pieces of √`num_steps` steps and
@@ -139,7 +144,7 @@ def rollout(
     """
     batch = bodies_of(bodies, states0, torque, torque_axes)
     h, count = step_of(step_size, num_steps, batch.dtype)
-    driven = driven_by(inputs, torque, states0, count)
+    driven = driven_by(inputs, torque, states0, count, h)
     if reduce is None and initial is not None:
         raise ValueError("rollout: initial is what reduce begins with; no reduce was given")
     if reduce is not None and not callable(reduce):
@@ -183,6 +188,7 @@ def _run(plan: _Plan, reduce: Reduce | None, rest: Any, numbers: Any) -> Any:
         own, inputs = each
         body, state0, torque = Bodies.one(shared, own, rest)
         state0 = start_of(state0)
+        state0 = started(body, state0, bind(torque, first_row(torque, h, inputs)), t0)
         field = equations_of_motion(body, state0, torque)
         stepper = stepper_of(plan.solver, field, state0)
 

@@ -7,6 +7,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
+from rigidjax.motion.coupled import motion_of, started
 from rigidjax.solve import equations_of_motion
 
 
@@ -15,7 +16,8 @@ def quickness(body: Any, state0: Any, torque: Any, t0: Array) -> Array:
 
     **Returns** a scalar, `|Ω| + √|dΩ/dt|`; NaN where there is no slope.
     """
-    slope = equations_of_motion(body, state0, torque)(t0, state0, None)
+    y0 = started(body, state0, torque, t0)
+    slope = motion_of(equations_of_motion(body, y0, torque)(t0, y0, None))
     rate, change = jnp.sum(state0.omega**2), jnp.sum(slope.omega**2)
     return lax.stop_gradient(jnp.sqrt(rate) + jnp.sqrt(jnp.sqrt(change)))
 

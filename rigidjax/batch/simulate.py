@@ -17,6 +17,7 @@ from rigidjax.batch.sharding import Compiled, chunk_of, mesh_of, over_bodies
 from rigidjax.batch.validation import Bodies, bodies_of, start_of, step_of, time_of
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.motion import Attitude, Rigid, Spin
+from rigidjax.motion.coupled import Coupled
 from rigidjax.solve import simulate as simulate_one, validation
 from rigidjax.solve.explicit import DormandPrince8
 from rigidjax.solve.magnus import Magnus4
@@ -47,13 +48,15 @@ class Batch(eqx.Module, Generic[State]):
     **Fields:** `ts` (T,) s; `ys` the states there, of the type of `states0`, with leading axes
     (N, T), in the order that the bodies were given; NaN where a body did not get to. `result` a
     `diffrax.RESULTS` for each body: `successful`, `nonfinite`, `max_steps_reached`,
-    `dt_min_reached`. `num_steps` (N,) taken and refused, 0 for the closed form.
+    `dt_min_reached`. `num_steps` (N,) taken and refused, 0 for the closed form. `own` a tuple
+    of the states of the laws that have some, as `ys`, or `None`.
     """
 
     ts: Float[Array, " times"]
     ys: State
     result: dfx.RESULTS
     num_steps: Int[Array, " bodies"]
+    own: Any = None
 
 
 def simulate(
@@ -78,8 +81,8 @@ def simulate(
 
     - `bodies`, `states0`, `torque`, `torque_axes`, `chunk`, `devices`, and for `Steps` `inputs`: as
       for `rigidjax.batch.rollout`.
-    - `ts_or_steps`: (T,) increasing times, s, the first of them the start; or `Steps(size, number)`
-      for equal steps.
+    - `ts_or_steps`: (T,) increasing times, s, or decreasing ones, the first of them the start; or
+      `Steps(size, number)` for equal steps.
     - `solver`: `None` takes the closed form for free bodies, `rigidjax.solvers.DormandPrince8`
       under a torque, and what `rollout` takes for `Steps`. With times any `diffrax.AbstractSolver`
       may be given; the explicit ones of `rigidjax.solvers` run in our own loop (256 heavy tops at
@@ -93,7 +96,7 @@ def simulate(
 
     **Returns** a `Batch`. Nothing is raised for what a body meets on its way: look at `result`.
 
-    **Raises:** as `rollout`; `ValueError` for times that do not increase.
+    **Raises:** as `rollout`; `ValueError` for times that neither increase nor decrease.
 
     >>> import rigidjax as rj
     >>> bodies = rj.Inertia(jnp.diag(jnp.array([1.0, 2.0, 3.0])))
@@ -125,8 +128,8 @@ def simulate(
     mesh = mesh_of(devices)
     plan = _Plan(how, chunk_of(chunk, batch.dtype, batch.many), mesh)
     numbers = (batch.shared, batch.each, ts)
-    ys, result, steps = _compiled(plan, batch.rest, numbers)
-    return Batch(ts, ys, result, steps)
+    ys, result, steps, own = _compiled(plan, batch.rest, numbers)
+    return Batch(ts, ys, result, steps, own)
 
 
 class _Free(eqx.Module):
@@ -183,7 +186,7 @@ def _free(body: Any, state0: Any, ts: Array) -> Any:
     later = free_motion(body, state0, ts[1:] - ts[0])
     ys = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), state0, later)
     result = dfx.RESULTS.where(finite(ys), dfx.RESULTS.successful, NONFINITE)
-    return ys, result, jnp.zeros((), jnp.int32)
+    return ys, result, jnp.zeros((), jnp.int32), None
 
 
 def _adaptive(how: _Adaptive, body: Any, state0: Any, torque: Any, ts: Array) -> Any:
@@ -199,7 +202,8 @@ def _adaptive(how: _Adaptive, body: Any, state0: Any, torque: Any, ts: Array) ->
         adjoint=how.adjoint,
         throw=False,
     )
-    return found.ys, found.result, jnp.asarray(found.stats["num_steps"], jnp.int32)
+    steps = jnp.asarray(found.stats["num_steps"], jnp.int32)
+    return found.ys, found.result, steps, found.own
 
 
 def _equal(
@@ -232,7 +236,10 @@ def _equal(
     h, count = step_of(steps.size, steps.number, dtype)
     ts = time_of(steps.t0, dtype) + h * jnp.arange(every, count + 1, every).astype(dtype)
     result = _statuses(ys)
-    return Batch(ts, ys, result, jnp.full(states0.omega.shape[:1], count, jnp.int32))
+    steps_taken = jnp.full(states0.omega.shape[:1], count, jnp.int32)
+    if isinstance(ys, Coupled):
+        return Batch(ts, ys.motion, result, steps_taken, ys.own)
+    return Batch(ts, ys, result, steps_taken)
 
 
 @jax.jit

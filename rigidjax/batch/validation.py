@@ -12,7 +12,7 @@ from rigidjax import _checks
 from rigidjax._types import HasAttitude
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.motion import Attitude, Rigid, Spin, on_the_group
-from rigidjax.motion.torques.inputs import require_inputs
+from rigidjax.motion.torques.inputs import delays_of, require_inputs
 from rigidjax.solve.validation import require_fit
 
 
@@ -97,12 +97,19 @@ def bodies_of(bodies: Any, states0: Any, torque: Any, torque_axes: Any) -> Bodie
     return found
 
 
-def driven_by(inputs: Any, torque: Any, states0: Any, count: int) -> Any:
+def driven_by(inputs: Any, torque: Any, states0: Any, count: int, h: Array) -> Any:
     """The inputs of each body, by name (N, steps, *k), in the precision of the states.
 
     **Raises:** `ValueError` for an input that is missing, or that the law does not read, for
-    another number of bodies or steps, NaN; `TypeError` for what is no mapping.
+    another number of bodies or steps, NaN, a delay as long as the run; `TypeError` for what is no
+    mapping.
     """
+    for name, delay in delays_of(torque):
+        if _checks.known((delay, h)) and (np.abs(np.asarray(delay)) >= count * float(h)).any():
+            raise ValueError(
+                f"inputs[{name!r}]: a delay of {np.abs(np.asarray(delay)).max():.6g} s, and a run "
+                f"of {count * float(h):.6g} s: none of it would be seen"
+            )
     wanted = (*states0.omega.shape[:1], count)
     found = {}
     for name, value in require_inputs(torque, inputs).items():
@@ -119,10 +126,16 @@ def driven_by(inputs: Any, torque: Any, states0: Any, count: int) -> Any:
 
 def _own_torque(torque: Any, axes: Any, count: int) -> Any:
     """Which arrays of the torque have a row for each body."""
-    for axis in jax.tree.leaves(axes):
-        if not isinstance(axis, int) or axis != 0:
-            raise ValueError(f"torque_axes: wanted 0 and None, got {axis!r}")
-    prefix = jax.tree.map(lambda axis: axis is not None, axes, is_leaf=lambda a: a is None)
+    if callable(axes) and not isinstance(axes, eqx.Module):
+        prefix = _selected(torque, axes)
+    else:
+        for axis in jax.tree.leaves(axes):
+            if not isinstance(axis, int) or axis != 0:
+                raise ValueError(
+                    "torque_axes: wanted 0 and None, or a function that picks the arrays, such as "
+                    f"lambda law: law.speed, got {axis!r}"
+                )
+        prefix = jax.tree.map(lambda axis: axis is not None, axes, is_leaf=lambda a: a is None)
     own, _ = eqx.partition(torque, prefix)
     for path, leaf in jax.tree.leaves_with_path(own):
         if leaf.ndim == 0 or leaf.shape[0] != count:
@@ -131,6 +144,22 @@ def _own_torque(torque: Any, axes: Any, count: int) -> Any:
                 f"shape {leaf.shape}; make one law a body with jax.vmap"
             )
     return prefix
+
+
+def _selected(torque: Any, pick: Any) -> Any:
+    """True for each array that `pick(law)` gives, alone, in a tuple, or in a part of the law."""
+    leaves, structure = jax.tree.flatten(torque)
+    numbered = jax.tree.unflatten(structure, list(range(len(leaves))))
+    try:
+        found = jax.tree.leaves(pick(numbered))
+    except (AttributeError, IndexError, KeyError, TypeError) as error:
+        raise ValueError(f"torque_axes: nothing is there ({error})") from None
+    if not found or not all(type(index) is int for index in found):
+        raise ValueError(
+            "torque_axes: wanted a function that picks arrays of the law, or parts of it, such as "
+            f"lambda law: law.parts[0], got {found or 'none'}"
+        )
+    return jax.tree.unflatten(structure, [i in found for i in range(len(leaves))])
 
 
 def _positive(tensor: Array) -> None:

@@ -2,6 +2,7 @@
 
 from rigidjax._names import own_names
 from rigidjax.body import (
+    brightness as brightness,
     parameters as parameters,
     shapes as shapes,
     volumes as volumes,

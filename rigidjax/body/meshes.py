@@ -51,7 +51,7 @@ def mesh(
         raise ValueError("vertices: wanted some, got none")
     if physical.known(corners):
         _checks.finite(corners, "vertices")
-    faces = _faces(faces, n)
+    faces = faces_of(faces, n)
     density = _checks.floating(density, (), "density")
     if physical.known(density):
         fine = (density > 0) & jnp.isfinite(density)
@@ -140,7 +140,8 @@ def _outward(volume, corners, faces):
     )
 
 
-def _faces(faces, n):
+def faces_of(faces, n):
+    """The faces as an array (m, 3) of vertex numbers below n, checked where they are known."""
     if isinstance(faces, jax.core.Tracer):
         return faces
     try:

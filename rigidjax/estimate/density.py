@@ -64,7 +64,8 @@ class LogDensity(eqx.Module):
     no density, and for directions that neither data nor a prior see.
 
     For numpyro: `numpyro.infer.MCMC(NUTS(potential_fn=lambda x: -density(x)), …)`; for blackjax:
-    `blackjax.nuts(density, …)`, or `estimate.posterior`. Gradients are taken in forward mode.
+    `blackjax.nuts(density, …)`, or `estimate.posterior`. Gradients are taken in forward mode. It is
+    a Module of arrays: compile it by `equinox.filter_jit(density)`.
     """
 
     problem: Problem

@@ -1,6 +1,5 @@
 """Draws from a posterior density, by samplers that others keep."""
 
-import math
 from collections.abc import Callable
 from typing import Any
 
@@ -54,15 +53,22 @@ class Nuts(eqx.Module):
 class Posterior(eqx.Module):
     """What `posterior` returns.
 
-    **Fields:** `x` (chains, samples, n) draws of the vector that `density` takes; `rhat` and `ess`
-    (n,): the potential scale reduction between chains, near 1 where they agree, and how many
-    independent draws they are worth (Gelman et al., Bayesian Data Analysis (2013), §11.4, 11.5).
+    **Fields:** `density`; `x` (chains, samples, n) draws of the vector that it takes. `rhat` and
+    `ess` as in Gelman et al., Bayesian Data Analysis (2013), §11.4, 11.5.
     """
 
     density: LogDensity
     x: Float[Array, "chains samples n"]
-    rhat: Float[Array, " n"]
-    ess: Float[Array, " n"]
+
+    @property
+    def rhat(self) -> Float[Array, " n"]:
+        """Potential scale reduction between the chains, near 1 where they agree (blackjax)."""
+        return _blackjax().diagnostics.potential_scale_reduction(self.x)
+
+    @property
+    def ess(self) -> Float[Array, " n"]:
+        """How many independent draws they are worth (blackjax)."""
+        return _blackjax().diagnostics.effective_sample_size(self.x)
 
     @property
     def points(self) -> Point:
@@ -70,9 +76,16 @@ class Posterior(eqx.Module):
         return jax.vmap(jax.vmap(self.density.unpack))(self.x)
 
     def to_arviz(self) -> Any:
-        """The draws as ArviZ takes them: body, values, first states, noises, process."""
-        import arviz  # pyright: ignore[reportMissingImports]
+        """The draws as ArviZ takes them: body, values, first states, process.
 
+        **Raises:** `ImportError` without arviz (it needs Python 3.12).
+        """
+        try:
+            import arviz  # pyright: ignore[reportMissingImports]
+        except ImportError as error:
+            raise ImportError(
+                "to_arviz: arviz is missing; pip install 'rigidjax[posterior]' (Python 3.12)"
+            ) from error
         points = self.points
         out = dict(points.values)
         out["omega0"] = points.state0.omega
@@ -108,7 +121,7 @@ def posterior(
         _blackjax()
     root = jnp.linalg.cholesky(density.covariance)
     x = _draw(density, root, jax.random.split(key, chains), sampler)
-    return Posterior(density, x, *_agreement(x))
+    return Posterior(density, x)
 
 
 @eqx.filter_jit
@@ -124,34 +137,11 @@ def _draw(density: LogDensity, root: Array, keys: Array, sampler: Any) -> Array:
     return jax.vmap(chain)(keys)
 
 
-@jax.jit
-def _agreement(x: Float[Array, "chains samples n"]) -> tuple[Array, Array]:
-    """Split R̂ and the effective number of draws, by autocovariances summed in pairs (Geyer)."""
-    half = x.shape[1] // 2
-    parts = jnp.concatenate([x[:, :half], x[:, half : 2 * half]])
-    within = jnp.mean(jnp.var(parts, axis=1, ddof=1), 0)
-    between = jnp.var(jnp.mean(parts, 1), axis=0, ddof=1)
-    total = within * (half - 1) / half + between
-    rhat = jnp.sqrt(total / within)
-    off = parts - jnp.mean(parts, 1, keepdims=True)
-    size = 2 * half
-    power = jnp.abs(jnp.fft.rfft(off, n=size, axis=1)) ** 2
-    auto = jnp.mean(jnp.fft.irfft(power, n=size, axis=1)[:, :half], 0) / half
-    rho = 1 - (within * (half - 1) / half)[None] / total[None]
-    rho = rho + auto * (half / (half - 1)) / total[None]
-    rho = rho.at[0].set(1.0)
-    pairs = rho[: half // 2 * 2].reshape(half // 2, 2, -1).sum(1)
-    pairs = jnp.where(jnp.cumprod(pairs > 0, axis=0), pairs, 0)
-    pairs = jax.lax.cummin(pairs, axis=0)
-    time = jnp.maximum(2 * jnp.sum(pairs, 0) - 1, 1 / math.log10(parts.shape[0] * half))
-    return rhat, parts.shape[0] * half / time
-
-
 def _blackjax() -> Any:
     try:
         import blackjax  # pyright: ignore[reportMissingImports]
     except ImportError as error:
         raise ImportError(
-            "posterior: blackjax is missing; pip install 'rigidjax[posterior]', or give a sampler"
+            "posterior: blackjax is missing; pip install 'rigidjax[posterior]'"
         ) from error
     return blackjax

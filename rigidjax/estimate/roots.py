@@ -15,7 +15,8 @@ def triangular(a: Float[Array, "n m"]) -> Float[Array, "n n"]:
 
     By the modified Gram–Schmidt process on the rows, whose triangular factor is as good as
     Householder's (Björck 1967, doi:10.1007/BF01934122). A row that depends on those before it,
-    to a few units of round-off, leaves a zero on the diagonal; derivatives there are zero.
+    to a few units of round-off, leaves a zero on the diagonal; derivatives there are zero, where
+    those of `jnp.linalg.qr` are NaN: a state known without error has such rows.
 
     >>> triangular(jnp.array([[3.0, 4.0], [3.0, 4.0]])).tolist()
     [[5.0, 0.0], [5.0, 0.0]]

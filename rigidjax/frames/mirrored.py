@@ -4,8 +4,10 @@ from collections.abc import Sequence
 
 from jaxtyping import Array, ArrayLike, Complex, Float
 
+from rigidjax import _checks
 from rigidjax._types import ScalarLike
-from rigidjax.frames import families, flow, periodic
+from rigidjax.frames import families, flow, manifolds, periodic
+from rigidjax.frames.manifolds import Manifold
 from rigidjax.frames.periodic import PeriodicOrbit
 from rigidjax.frames.point import Point
 from rigidjax.frames.scene import AbstractScene
@@ -130,3 +132,92 @@ class AbstractMirrored(AbstractScene):
         how many members it was lost.
         """
         return families.follow(self, orbit, step, count, rising)
+
+    def manifold(
+        self,
+        orbit: PeriodicOrbit,
+        which: str,
+        *,
+        time: ScalarLike | None = None,
+        side: int = 1,
+        count: int = 40,
+        samples: int = 200,
+        distance: ScalarLike = 1e-5,
+    ) -> Manifold:
+        """Motions that leave an unstable periodic orbit, or come to it: its invariant manifolds.
+
+        **Arguments:** `orbit` as of `periodic_orbit`; `which` `"unstable"` (they leave it) or
+        `"stable"` (they come to it: the times go back); `time` how far to follow them, two periods
+        unless given; `side` 1 for the branch that goes to larger x at the orbit's start, −1 for the
+        other; `count` N motions, from equal phases of the orbit; `samples` T times of each;
+        `distance` of the starts from the orbit, in (x, v): its square is what they are off.
+
+        The direction is the eigenvector of the monodromy whose multiplier is the largest, carried
+        along the orbit by the transition matrix; the stable manifold is the mirror image, in
+        y → −y, of the unstable one.
+
+        **Returns** a `Manifold`. Source: Koon, Lo, Marsden and Ross 2011, Dynamical Systems, the
+        Three-Body Problem and Space Mission Design, sec. 7.4.
+
+        **Raises:** `ValueError` where the orbit has no such multiplier; for another word.
+
+        >>> from rigidjax.frames import scenes
+        >>> moon = scenes.cr3bp(0.0121505856)
+        >>> orbit = moon.periodic_orbit(moon.lyapunov_guess(1, 0.01))
+        >>> moon.manifold(orbit, "unstable", count=3, samples=5).states.x.shape
+        (3, 5, 3)
+        """
+        return manifolds.manifold(self, orbit, which, time, side, count, samples, distance)
+
+    def manifold_start(
+        self,
+        orbit: PeriodicOrbit,
+        phase: ScalarLike,
+        which: str,
+        *,
+        side: int = 1,
+        distance: ScalarLike = 1e-5,
+    ) -> Point:
+        """Where the motion of a manifold begins that belongs to a phase of the orbit.
+
+        **Arguments:** `phase` in periods from the orbit's start, of any size; others as for
+        `manifold`. Derivatives, by `phase`, by the orbit and by the scene's numbers, are in
+        forward mode: connections between orbits are found with them by Newton's method.
+
+        >>> from rigidjax.frames import scenes
+        >>> moon = scenes.cr3bp(0.0121505856)
+        >>> orbit = moon.periodic_orbit(moon.lyapunov_guess(1, 0.01))
+        >>> start = moon.manifold_start(orbit, 0.0, "stable")
+        >>> bool(abs(start.x[0] - orbit.state.x[0]) < 1e-5)
+        True
+        """
+        dtype = orbit.state.x.dtype if isinstance(orbit, PeriodicOrbit) else None
+        where = _checks.floating(phase, (), "phase").astype(dtype)
+        away = _checks.floating(distance, (), "distance").astype(dtype)
+        return manifolds.branch(self, orbit, where, which, side, away)[0]
+
+    def bifurcation(
+        self,
+        orbit: PeriodicOrbit,
+        other: PeriodicOrbit,
+        *,
+        index: int = 1,
+        value: float = 1.0,
+        hold: str = "x",
+    ) -> PeriodicOrbit:
+        """The member of a family between two others at which a stability index takes a value.
+
+        At 1 a family of the same period branches off, or the family turns; at −1 one of twice the
+        period; at cos(2πp/q) one of q times the period. `index` 1 of planar Lyapunov orbits is that
+        across the plane, and 1 is where the halo orbits begin.
+
+        **Arguments:** `orbit`, `other` two members near each other, between which the index passes
+        the value; `index` 0 or 1 of `stability_indices`; `value` of it; `hold` the number of the
+        family that is searched in, `"x"`, `"z"`, `"vy"` or `"period"`. Works on the host.
+
+        Source: Howell 1984, doi:10.1007/BF01358403; Robin and Markellos 1980,
+        doi:10.1007/BF01231183.
+
+        **Raises:** `ValueError` where the value does not lie between, or the indices are complex.
+        """
+        return manifolds.bifurcation(self, orbit, other, index, value, hold)

@@ -10,6 +10,7 @@ from rigidjax.frames.libration import (
     libration as libration,
     libration_integral as libration_integral,
 )
+from rigidjax.frames.manifolds import Manifold as Manifold
 from rigidjax.frames.periodic import PeriodicOrbit as PeriodicOrbit
 
 __dir__ = own_names(__name__)

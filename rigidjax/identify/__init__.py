@@ -30,6 +30,11 @@ from rigidjax.identify.files import (
 )
 from rigidjax.identify.fit import Fit as Fit, Start as Start, fit as fit
 from rigidjax.identify.free import Free as Free
+from rigidjax.identify.light_curve import (
+    Alias as Alias,
+    LightCurve as LightCurve,
+    fit_light_curve as fit_light_curve,
+)
 from rigidjax.identify.loss import AbstractLoss as AbstractLoss, Huber as Huber, SoftL1 as SoftL1
 from rigidjax.identify.parameters import Own as Own, Parameters as Parameters
 from rigidjax.identify.pieces import pieces as pieces
@@ -47,13 +52,21 @@ from rigidjax.identify.sensors import (
     AbstractSensor as AbstractSensor,
     Accelerometer as Accelerometer,
     AttitudeSensor as AttitudeSensor,
+    Brightness as Brightness,
     Direction as Direction,
     Gyro as Gyro,
     Magnetometer as Magnetometer,
     Marker as Marker,
     Moment as Moment,
+    Position as Position,
+    Range as Range,
+    Velocity as Velocity,
     quaternions_from_euler as quaternions_from_euler,
     quaternions_from_matrices as quaternions_from_matrices,
+)
+from rigidjax.identify.two_frequencies import (
+    TwoFrequencies as TwoFrequencies,
+    two_frequencies as two_frequencies,
 )
 from rigidjax.identify.windows import (
     Horizons as Horizons,

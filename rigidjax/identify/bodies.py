@@ -1,10 +1,12 @@
 """Unconstrained numbers ↔ the body, as a fit needs them. Every point is a real body."""
 
 import abc
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from rigidjax import _checks
@@ -12,6 +14,12 @@ from rigidjax.body import parameters as charts
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.body.symmetric import swap_trace
 
+# What of a `MassProperties` may be free: in words, and its places among the numbers of `pack`.
+_PARTS = {
+    "mass": ("mass", (0,)),
+    "com": ("centre of mass", (7, 8, 9)),
+    "inertia": ("inertia tensor", (1, 2, 3, 4, 5, 6)),
+}
 COMPONENTS = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))
 
 
@@ -180,41 +188,84 @@ class Principal(AbstractBodyChart):
 
 
 class Mass(AbstractBodyChart):
-    """Mass, centre of mass and inertia: all ten numbers, where forces show them.
+    """Mass, centre of mass and inertia: all ten numbers, where forces show them, or some of them.
 
     The log-Cholesky chart of the 4 × 4 pseudo-inertia around a `guess`, which is where it starts.
 
-    **Arguments:** `guess` a `MassProperties`, about the right size.
+    **Arguments:** `guess` a `MassProperties`, about the right size, and right in all that is not
+    free; `free` which of it a fit may move: `"mass"` (the second moment follows it, its ratio to
+    the mass being known, unless it is free, too), `"inertia"` about the centre of mass, `"com"`. So
+    `free=["inertia"]` is for a body that was weighed and balanced, `["mass"]` for a load of known
+    shape, `["com"]` for a centre that moved.
+
+    **Raises:** `TypeError` for a guess of another kind; `ValueError` for another word, or none.
 
     >>> import rigidjax as rj
-    >>> float(Mass(rj.shapes.box(2.0, [1.0, 1.0, 1.0])).body(jnp.zeros(10)).mass)
-    2.0
+    >>> box = rj.shapes.box(2.0, [1.0, 1.0, 1.0])
+    >>> float(Mass(box).body(jnp.zeros(10)).mass), Mass(box, ["inertia"]).log_names
+    (2.0, ('I1', 'I2', 'I3'))
     """
 
     guess: MassProperties
-    size: ClassVar[int] = 10
-    in_words: ClassVar[str] = "mass, centre of mass and inertia tensor"
-    log_names: ClassVar[tuple[str, ...]] = ("mass", "I1", "I2", "I3")
-    plain_names: ClassVar[tuple[str, ...]] = ("com x", "com y", "com z")
+    free: tuple[str, ...] = eqx.field(static=True)
     unit: ClassVar[str] = "SI"
 
-    def __init__(self, guess: MassProperties):
+    def __init__(self, guess: MassProperties, free: Sequence[str] = tuple(_PARTS)):
         self.guess = _checks.single(guess, MassProperties, "guess")
+        wanted = "some of mass, inertia, com"
+        _checks.instance(free, Sequence, "free", wanted=wanted)
+        chosen = [free] if isinstance(free, str) else list(free)
+        for name in chosen:
+            _checks.word(name, tuple(_PARTS), "free")
+        if not chosen:
+            raise ValueError("free: wanted mass, inertia or com, got none; see Known")
+        self.free = tuple(name for name in _PARTS if name in chosen)
+
+    @property
+    def size(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """How many numbers are free."""
+        return len(self._places)
+
+    @property
+    def in_words(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """What is free."""
+        *most, last = [_PARTS[name][0] for name in self.free]
+        return f"{', '.join(most)} and {last}" if most else last
+
+    @property
+    def log_names(self) -> tuple[str, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """The positive quantities."""
+        mass = ("mass",) if "mass" in self.free else ()
+        return (*mass, "I1", "I2", "I3") if "inertia" in self.free else mass
+
+    @property
+    def plain_names(self) -> tuple[str, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """The others."""
+        return ("com x", "com y", "com z") if "com" in self.free else ()
+
+    @property
+    def _places(self) -> list[int]:
+        return [place for name in self.free for place in _PARTS[name][1]]
 
     def body(self, vector: Float[Array, " chart"]) -> MassProperties:
         # Lengths in units of the body's own size: every number is of order one.
         size = jnp.sqrt(jnp.trace(self.guess.second_moment) / self.guess.mass)
+        if self.size < 10:
+            vector = jnp.zeros(10, vector.dtype).at[np.array(self._places)].set(vector)
         step = jnp.concatenate([vector[:4], size * vector[4:]])
         return charts.unpack(charts.pack(self.guess) + step)
 
     def vector(self, body: Inertia) -> Float[Array, " chart"]:
-        return jnp.zeros(10, self.guess.mass.dtype)
+        return jnp.zeros(self.size, self.guess.mass.dtype)
 
-    def logs(self, body: MassProperties) -> Float[Array, "4"]:
-        return jnp.log(jnp.concatenate([body.mass[None], body.inertia.moments]))
+    def logs(self, body: MassProperties) -> Float[Array, " logs"]:
+        mass, moments = body.mass[None], body.inertia.moments
+        kept = [mass] if "mass" in self.free else []
+        kept += [moments] if "inertia" in self.free else []
+        return jnp.log(jnp.concatenate(kept)) if kept else jnp.zeros(0, mass.dtype)
 
-    def plain(self, body: MassProperties) -> Float[Array, "3"]:
-        return body.com
+    def plain(self, body: MassProperties) -> Float[Array, " plain"]:
+        return body.com if "com" in self.free else jnp.zeros(0, body.com.dtype)
 
 
 class Known(AbstractBodyChart):

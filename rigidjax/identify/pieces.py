@@ -13,6 +13,7 @@ from rigidjax.identify.parameters import Own, Parameters
 from rigidjax.identify.problem import Links, Problem, one_problem
 from rigidjax.identify.recording import Reading, Recording
 from rigidjax.identify.several import Bodies
+from rigidjax.motion.torques.states import has_states
 
 # How wide the gaps may be, in turn: first the pieces are nearly free, at the end they are one.
 WIDTHS = (1.0, 1e-1, 1e-2, 1e-3)
@@ -44,6 +45,11 @@ def pieces(problem: Problem, count: int, *, width: float = WIDTHS[-1]) -> Proble
     if problem.count != 1:
         raise ValueError(f"pieces: wanted one recording, got {problem.count}")
     record = problem.recording
+    if has_states(record.torque):
+        raise ValueError(
+            "pieces: the torque has states of its own, whose values at the joints are not unknowns "
+            "of the problem; fit the recording in one piece, or its windows (identify.fit_windows)"
+        )
     size = int(record.t.shape[0])
     if size < 4 * count:
         raise ValueError(

@@ -15,6 +15,7 @@ from rigidjax import _checks
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.exact import FreeBody
 from rigidjax.motion import Attitude, Rigid
+from rigidjax.motion.coupled import motion_of, started
 from rigidjax.motion.torques import Torque
 from rigidjax.solve import equations_of_motion, fixed, simulate, solvers
 
@@ -48,8 +49,9 @@ class FixedSteps(AbstractIntegrator):
         _checks.whole(self.substeps, "substeps", 1)
 
     def states(self, body: Any, state0: Any, ts: Float[Array, " times"], torque: Torque) -> Any:
-        field = equations_of_motion(body, state0, torque)
-        return fixed(solvers.Tsitouras5(), field, ts, state0, self.substeps)
+        y0 = started(body, state0, torque, ts[0])
+        field = equations_of_motion(body, y0, torque)
+        return motion_of(fixed(solvers.Tsitouras5(), field, ts, y0, self.substeps))
 
 
 class Adaptive(AbstractIntegrator):

@@ -1,6 +1,7 @@
 """Where the first states of a fit are counted from: the first readings of each recording."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -9,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from rigidjax.identify.recording import Recording
-from rigidjax.identify.sensors import Gyro, Marker
+from rigidjax.identify.sensors import Brightness, Gyro, Marker, Position, Range, Velocity
 from rigidjax.identify.sightings import attitudes, place_of, rates
 from rigidjax.motion import Rigid, Spin
 from rigidjax.rotation import quaternion
@@ -47,8 +48,25 @@ def _typical_rate(recording: Recording) -> float:
             rate = float(np.sqrt(np.mean(np.sum(values**2, axis=1))))
             break
     else:
-        rate = float(np.linalg.norm(first_rate(recording)))
+        rate = float(np.linalg.norm(first_rate(recording))) or _rate_of_light(recording)
     return rate if rate > 0 else 1.0
+
+
+def _rate_of_light(recording: Recording) -> float:
+    """About how fast a body turns whose brightness varies, rad/s: half the strongest frequency."""
+    for reading in recording.readings:
+        if isinstance(reading.sensor, Brightness):
+            t = np.asarray(recording.t)[reading.seen][:1000]
+            values = np.asarray(reading.values)[reading.seen][:1000]
+            if t.size < 10 or np.ptp(values) == 0:
+                return 0.0
+            span = t[-1] - t[0]
+            highest = min(0.25 / np.median(np.diff(t)), 500.0 / span)
+            turns = 2.0 * np.pi * np.arange(0.5 / span, max(highest, 1.0 / span), 0.25 / span)
+            waves = np.exp(1j * turns[:, None] * (t - t[0]))
+            power = np.abs(waves @ (values - values.mean()))
+            return 0.5 * float(turns[np.argmax(power)])
+    return 0.0
 
 
 def _first_attitude(recording: Recording) -> np.ndarray:
@@ -59,8 +77,12 @@ def _first_attitude(recording: Recording) -> np.ndarray:
 def _first_place(recording: Recording) -> tuple[np.ndarray, np.ndarray, float]:
     """First position and velocity of the body's frame, m and m/s, and a typical length, m.
 
-    Of the frame's origin where attitudes tell how far the markers are from it.
+    Of the frame's origin where attitudes tell how far the markers are from it; of the centre of
+    mass where its position, or ranges to it, were read.
     """
+    direct = _read_place(recording)
+    if direct is not None:
+        return direct
     markers = [r for r in recording.readings if isinstance(r.sensor, Marker)]
     if not markers:
         return np.zeros(3), np.zeros(3), 1.0
@@ -79,6 +101,49 @@ def _first_place(recording: Recording) -> tuple[np.ndarray, np.ndarray, float]:
     v = np.polyfit(t[few] - t[0], x[few], 1)[0] if t.size > 1 else np.zeros(3)
     length = float(np.linalg.norm(x - x.mean(axis=0), axis=1).max())
     return x[0], v, length if length > 0 else 1.0
+
+
+def _read_place(recording: Recording) -> tuple[np.ndarray, np.ndarray, float] | None:
+    """As `_first_place`, from what reads positions, ranges and velocities; `None` without them."""
+    t, readings = np.asarray(recording.t), recording.readings
+    positions = [r for r in readings if isinstance(r.sensor, Position)]
+    ranges = [r for r in readings if isinstance(r.sensor, Range)]
+    speeds = [r for r in readings if isinstance(r.sensor, Velocity) and r.sensor.mounting is None]
+    if any(isinstance(r.sensor, Marker) for r in readings) and not positions:
+        return None
+    when, x = np.zeros(0), np.zeros((0, 3))
+    if positions:
+        when, x = t[positions[0].seen], np.asarray(positions[0].values)[positions[0].seen]
+    elif ranges:
+        seen = np.all([r.seen for r in ranges], axis=0)
+        sensors: list[Any] = [r.sensor for r in ranges]
+        stations = np.stack([np.asarray(sensor.station) for sensor in sensors])
+        lengths = np.stack([np.asarray(r.values) for r in ranges], axis=1)[seen]
+        when, x = t[seen], _from_ranges(stations, lengths)
+    if not when.size and not speeds:
+        return None
+    v = np.zeros(3)
+    if speeds:
+        v = np.asarray(speeds[0].values)[speeds[0].seen][0]
+    elif when.size > 1:
+        few = slice(0, max(2, min(5, when.size)))
+        v = np.polyfit(when[few] - when[0], x[few], 1)[0]
+    x = x if when.size else np.zeros((1, 3))
+    length = float(np.linalg.norm(x - x.mean(axis=0), axis=1).max())
+    return x[0], v, length if length > 0 else 1.0
+
+
+def _from_ranges(stations: np.ndarray, lengths: np.ndarray) -> np.ndarray:
+    """Places (n, 3) that distances (n, k) to stations (k, 3) show.
+
+    The differences of `|x|² − 2 s·x + |s|² = d²` from their mean are linear in x; along what they
+    do not show (fewer than four stations, or in a plane) it is the stations' centre.
+    """
+    centre = stations.mean(axis=0)
+    s = stations - centre
+    sides = (s * s).sum(axis=1)[None] - lengths**2
+    sides = 0.5 * (sides - sides.mean(axis=1, keepdims=True))
+    return centre + np.linalg.lstsq(s, sides.T, rcond=1e-9)[0].T
 
 
 def first_rate(recording: Recording) -> np.ndarray:

@@ -21,7 +21,7 @@ def stack(recordings: Sequence[Recording]) -> tuple[Recording, tuple[int, ...]]:
     """
     counts = tuple(int(r.t.shape[0]) for r in recordings)
     longest = max(counts)
-    rows = max((_rows(r.torque) for r in recordings), default=0)
+    rows = max((_rows(_tabled(r)) for r in recordings), default=0)
     alike = [_lengthen(r, longest, rows) for r in recordings]
     first = jax.tree.structure(alike[0])
     for index, other in enumerate(alike):
@@ -70,8 +70,13 @@ def _is_table(node: Any) -> bool:
     return isinstance(node, Linear | Series)
 
 
-def _rows(torque: Any) -> int:
-    tables = [n for n in jax.tree.leaves(torque, is_leaf=_is_table) if _is_table(n)]
+def _tabled(recording: Recording) -> Any:
+    """What may hold tables of time: the torque, and sensors that look at what moves."""
+    return recording.torque, recording.sensors
+
+
+def _rows(tree: Any) -> int:
+    tables = [n for n in jax.tree.leaves(tree, is_leaf=_is_table) if _is_table(n)]
     return max((int(n.values.shape[0]) for n in tables), default=0)
 
 
@@ -88,12 +93,22 @@ def _lengthen(recording: Recording, count: int, rows: int) -> Recording:
             for r in recording.readings
         )
         recording = eqx.tree_at(lambda r: (r.t, r.readings), recording, (t, readings))
-    torque = jax.tree.map(
+    longer = jax.tree.map(
         lambda node: _table(node, rows) if _is_table(node) else node,
-        recording.torque,
+        _tabled(recording),
         is_leaf=_is_table,
     )
-    return eqx.tree_at(lambda r: r.torque, recording, torque, is_leaf=lambda node: node is None)
+    torque, sensors = longer
+    readings = tuple(
+        Reading(sensor, r.values, r.mask)
+        for sensor, r in zip(sensors, recording.readings, strict=True)
+    )
+    return eqx.tree_at(
+        lambda r: (r.torque, r.readings),
+        recording,
+        (torque, readings),
+        is_leaf=lambda node: node is None,
+    )
 
 
 def _table(table: Any, rows: int) -> Any:

@@ -19,6 +19,7 @@ from rigidjax.identify.several import Bodies
 from rigidjax.identify.sightings import rates
 from rigidjax.motion import Spin
 from rigidjax.motion.torques import Torque, evaluate
+from rigidjax.motion.torques.states import has_states
 
 BASIS = np.zeros((6, 3, 3))
 for _k, (_i, _j) in enumerate([(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)]):
@@ -70,7 +71,7 @@ def regress_inertia(recordings: tuple[Recording, ...]) -> Inertia | None:
     of all such rows is the answer, else (the torque at its starting values, along the measured
     rates) the least squares solution. Then moved to the nearest second moment whose eigenvalues are
     positive. `None` where there was no gyro and no attitude, they came too seldom, or the torque
-    needs more than a rate.
+    needs more than a rate, or has states of its own.
     """
     rows, sides = [], []
     for recording in recordings:
@@ -108,7 +109,7 @@ def _equations(recording: Recording) -> tuple[np.ndarray, np.ndarray] | None:
     pushed = np.zeros((t.size, 3))
     if recording.torque is not None:
         felt: Any = getattr(recording.torque, "feels", None)
-        if felt is not HasSpin:
+        if felt is not HasSpin or has_states(recording.torque):
             return None
         pushed = np.asarray(_torques(recording.torque, jnp.asarray(t), jnp.asarray(w)))
     stride = max(1, t.size // 60)

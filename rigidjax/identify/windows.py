@@ -1,4 +1,4 @@
-"""Many short open-loop runs whose starts are known: how driven machines are identified.
+"""Many short open-loop runs from measured starts: how driven machines are identified.
 
 A record of measured states is cut into windows; from the start of each the model runs on its own,
 driven by the recorded inputs, and is compared with what was measured at every step.
@@ -19,12 +19,15 @@ from rigidjax import _checks
 from rigidjax._types import HasAttitude
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.identify.levenberg_marquardt import BOLD, Search, Settings, search
+from rigidjax.identify.window_starts import eliminated, moved, precisions, with_jacobian
 from rigidjax.motion import Attitude, Rigid, Spin
-from rigidjax.motion.torques.inputs import require_inputs
+from rigidjax.motion.coupled import Coupled, motion_of, started
+from rigidjax.motion.torques.inputs import bind, delays_of, require_inputs
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.algebra import components
 from rigidjax.solve import equations_of_motion
-from rigidjax.solve.fixed_loop import step
+from rigidjax.solve.components import split
+from rigidjax.solve.fixed_loop import first_row, step
 from rigidjax.solve.steppers import stepper_of
 from rigidjax.solve.validation import require_fit
 
@@ -39,13 +42,15 @@ class Windows(eqx.Module):
     """Short runs of one length. `windows` makes them; `Windows.joined` puts some together.
 
     **Fields:** `step` s between samples; `starts` N states; `wanted` the L states that follow each
-    start, with leading axes (N, L); `inputs` by name (N, L, *k), row i held through step i.
+    start, with leading axes (N, L); `inputs` by name (N, before + L, *k), row before + i held
+    through step i, where no delay is asked for; `before` how many rows come before the start.
     """
 
     step: float = eqx.field(static=True)
     starts: Any
     wanted: Any
     inputs: dict[str, Array]
+    before: int = eqx.field(static=True, default=0)
 
     @property
     def count(self) -> int:
@@ -72,11 +77,15 @@ class Windows(eqx.Module):
         """
         if not parts:
             raise ValueError("Windows.joined: wanted at least one Windows")
-        kinds = {(p.step, p.length, tuple(sorted(p.inputs)), type(p.starts)) for p in parts}
+        kinds = {
+            (p.step, p.length, tuple(sorted(p.inputs)), type(p.starts), p.before) for p in parts
+        }
         if len(kinds) > 1:
             raise ValueError(
                 "Windows.joined: wanted one step, length, kind of state and the same inputs, got "
-                + "; ".join(f"{k[0]:g} s, {k[1]}, {k[3].__name__}, {k[2]}" for k in kinds)
+                + "; ".join(
+                    f"{k[0]:g} s, {k[1]}, {k[3].__name__}, {k[2]}, before={k[4]}" for k in kinds
+                )
             )
         first, *rest = parts
         if not rest:
@@ -92,12 +101,16 @@ def windows(
     *,
     length: int,
     stride: int = 1,
+    before: int = 0,
 ) -> Windows:
     """Cut a record of measured states into windows of `length` steps, one every `stride` samples.
 
     **Arguments:** `t` (T,) s, evenly spaced but for gaps; `states` a `Spin`, `Attitude` or `Rigid`
     with a leading axis (T,); `inputs` by name (T, *k), each held until the next sample, for the
-    `rigidjax.torques.Input`s of a law. No window goes across a gap.
+    `rigidjax.torques.Input`s of a law; `before` how many samples of the inputs are kept before each
+    start, for a law that delays them (`rigidjax.torques.Delayed`) or has states of its own, as
+    `Lagged` has: these begin there, and follow the inputs up to the start while the body is held as
+    it was measured at the start. No window, with what is before it, goes across a gap.
 
     **Raises:** `ValueError` for shapes that do not agree, NaN, times that are uneven, a record
     without a window of this length; `TypeError` for other states.
@@ -108,6 +121,7 @@ def windows(
     """
     times = _checks.on_host(t, "t")
     length, stride = _checks.whole(length, "length", 1), _checks.whole(stride, "stride", 1)
+    before = _checks.whole(before, "before", 0)
     if not isinstance(states, Spin | Attitude | Rigid):
         raise TypeError(f"states: wanted Spin, Attitude or Rigid, got {type(states).__name__}")
     if times.ndim != 1 or times.size < length + 1:
@@ -139,10 +153,11 @@ def windows(
             f"others are {h:.6g} s apart; resample first"
         )
     broken = np.concatenate([[0], np.cumsum(~even)])
-    begin = np.arange(0, times.size - length, stride)
-    begin = begin[broken[begin + length] == broken[begin]]
+    begin = np.arange(before, times.size - length, stride)
+    begin = begin[broken[begin + length] == broken[begin - before]]
     if not begin.size:
-        raise ValueError(f"windows: no stretch of {length} steps without a gap")
+        raise ValueError(f"windows: no stretch of {before + length} steps without a gap")
+    rows_of = begin[:, None] + np.arange(-before, length)
     follow = begin[:, None] + 1 + np.arange(length)
     kind = jnp.result_type(float)
     arrays = jax.tree.map(lambda a: np.asarray(a, kind), states)
@@ -151,7 +166,8 @@ def windows(
         round(h, 12),
         jax.tree.map(lambda a: jnp.asarray(a[begin]), arrays),
         jax.tree.map(lambda a: jnp.asarray(a[follow]), arrays),
-        {k: jnp.asarray(v[follow - 1]) for k, v in samples.items()},
+        {k: jnp.asarray(v[rows_of]) for k, v in samples.items()},
+        before,
     )
 
 
@@ -196,6 +212,7 @@ def fit_windows(
     guess: Value,
     *,
     noise: Mapping[str, float] | None = None,
+    starts: Mapping[str, float] | None = None,
     max_steps: int = 50,
 ) -> WindowFit[Value]:
     """The free numbers with which open-loop runs of all windows come nearest to what was measured.
@@ -203,11 +220,14 @@ def fit_windows(
     **Arguments:** `windows`; `scene` a function of the free numbers → (body, torque), whose torque
     reads the inputs of the windows; `guess` the free numbers to begin with, any tree of arrays;
     `noise` by kind (`x`, `v`, `q`, `omega`) what an error is measured in: by default the rms of a
-    prediction that holds the state at the start; `max_steps` of the search. Steps of the motion
-    are those of `RungeKutta4`, one a sample.
+    prediction that holds the state at the start; `starts` by kind how far the measured starts may
+    be off (a standard deviation, beside the `noise` of the readings, which must be given with it;
+    `np.inf`: the start is free); `None` takes them as they were measured; `max_steps` of the
+    search. Steps of the motion are those of `RungeKutta4`, one a sample.
 
     Levenberg–Marquardt (`rigidjax.identify.levenberg_marquardt`) on normal equations that are
-    summed window by window, so that memory does not grow with their number.
+    summed window by window, so that memory does not grow with their number. Starts that may be off
+    are found window by window, and taken out of the normal equations (variable projection).
 
     **Returns** a `WindowFit`; a fit that ends early returns its best point and says so.
 
@@ -239,14 +259,17 @@ def fit_windows(
     start = jax.tree.map(lambda a: a[0], windows.starts)
     require_fit(body, start, law)
     require_inputs(law, windows.inputs)
+    _require_delays(windows, law)
     scales = _scales(windows, noise)
+    firm = precisions(starts, _kinds(windows.starts), noise)
     settings = Settings(_SETTLED, BOLD, max_steps)
-    end = _searched(scene, windows.step, guess, windows, scales, settings)
+    end = _searched(scene, windows.step, guess, windows, scales, firm, settings)
     if not np.isfinite(end.cost):
         raise ValueError("guess: the runs from it are not finite; is the scene right?")
     value, taken = back(end.point), int(end.taken) - 1
     # Once more where it ended: the last that was tried may have been no better.
-    there = _searched(scene, windows.step, value, windows, scales, Settings(_SETTLED, BOLD, 0))
+    still = Settings(_SETTLED, BOLD, 0)
+    there = _searched(scene, windows.step, value, windows, scales, firm, still)
     inverse = np.linalg.pinv(np.asarray(there.gram))
     spread = inverse @ np.asarray(there.found) @ inverse
     deviation = np.sqrt(np.clip(np.diag(spread), 0, None))
@@ -256,6 +279,10 @@ def fit_windows(
         _require_real(scene(value)[0])
     except ValueError as refused:
         message.append(f"no real body has these numbers: {refused}")
+    try:
+        _require_delays(windows, scene(value)[1])
+    except ValueError as refused:
+        message.append(str(refused))
     kinds = {k: float(v) for k, v in scales.items()}
     return WindowFit(
         value,
@@ -278,6 +305,17 @@ def _require_windows(windows: Any) -> None:
                     f"windows: wanted a row for each of N windows in {name}, got {leaf.shape}"
                 )
             _checks.finite(leaf, f"windows: {name}")
+
+
+def _require_delays(windows: Windows, law: Any) -> None:
+    """Raise `ValueError` for a delay beyond the inputs that the windows know."""
+    known = windows.before * windows.step
+    for name, delay in delays_of(law):
+        if float(delay) > known:
+            raise ValueError(
+                f"inputs[{name!r}]: a delay of {float(delay):.6g} s, and inputs that are known "
+                f"{known:.6g} s before a window: cut them with windows(…, before=k)"
+            )
 
 
 def _require_real(body: Any) -> None:
@@ -311,15 +349,24 @@ def _errors(
 ) -> dict[str, Array]:
     """The errors of one window, by kind (L, 3), in units of `scales`."""
     body, law = scene(value)
+    size, length = jnp.asarray(h, wanted.omega.dtype), wanted.omega.shape[0]
+    before = next(iter(inputs.values())).shape[0] - length if inputs else 0
+    start = started(body, start, bind(law, first_row(law, size, inputs)), 0.0)
     stepper = stepper_of(None, equations_of_motion(body, start, law), start)
-    size = jnp.asarray(h, start.omega.dtype)
 
     def one(y: Any, i: Array) -> tuple[Any, Any]:
-        y = step(stepper, size, jnp.zeros_like(size), i, y, inputs or None)
-        return y, stepper.state(y)
+        y = step(stepper, size, jnp.zeros_like(size), i, y, inputs or None, before)
+        return y, motion_of(stepper.state(y))
 
-    length = wanted.omega.shape[0]
-    _, states = lax.scan(one, stepper.start, jnp.arange(length, dtype=jnp.int32))
+    def ahead(y: Any, i: Array) -> tuple[Any, None]:
+        # The law's own states follow the inputs; the body stays as it was measured.
+        y = step(stepper, size, jnp.zeros_like(size), i, y, inputs, before)
+        return split(Coupled(start.motion, stepper.state(y).own)), None
+
+    y0 = stepper.start
+    if before and isinstance(start, Coupled):
+        y0, _ = lax.scan(ahead, y0, jnp.arange(-before, 0, dtype=jnp.int32))
+    _, states = lax.scan(one, y0, jnp.arange(length, dtype=jnp.int32))
     return {k: v / scales[k] for k, v in _between(states, wanted).items()}
 
 
@@ -375,7 +422,7 @@ def _all_errors(scene: Any, h: float, value: Any, windows: Windows, scales: Any)
 
 @eqx.filter_jit
 def _searched(
-    scene: Any, h: float, guess: Any, windows: Windows, scales: Any, settings: Settings
+    scene: Any, h: float, guess: Any, windows: Windows, scales: Any, firm: Any, settings: Settings
 ) -> Search:
     """The search from `guess`; what it keeps is the spread of the windows' gradients (n, n)."""
     x, back = ravel_pytree(guess)
@@ -384,12 +431,17 @@ def _searched(
     def of_one(x: Array, window: Any) -> Any:
         start, wanted, inputs = window
 
-        def residual(x: Array) -> tuple[Array, Array]:
-            found = _errors(scene, h, back(x), start, wanted, inputs, scales)
-            flat = ravel_pytree(found)[0]
-            return flat, flat
+        def errors(x: Array, start: Any) -> Array:
+            return ravel_pytree(_errors(scene, h, back(x), start, wanted, inputs, scales))[0]
 
-        jacobian, flat = jax.jacfwd(residual, has_aux=True)(x)
+        if firm is not None:
+            held = jnp.repeat(jnp.stack([firm[kind] for kind in scales]), 3)
+            cost, gram, slope = eliminated(
+                lambda x, step: errors(x, moved(start, step, scales)), x, held
+            )
+            return slope[:, None] * slope[None], cost, gram, slope
+
+        jacobian, flat = with_jacobian(lambda x: errors(x, start), x)
         slope = jacobian.T @ flat
         return slope[:, None] * slope[None], 0.5 * flat @ flat, jacobian.T @ jacobian, slope
 

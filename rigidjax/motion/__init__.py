@@ -12,6 +12,7 @@ from rigidjax.motion.conserved import (
     drift as drift,
     energy as energy,
 )
+from rigidjax.motion.coupled import Coupled as Coupled
 from rigidjax.motion.rigid import NewtonEuler as NewtonEuler, Rigid as Rigid
 from rigidjax.motion.spin import EulerEquations as EulerEquations, Spin as Spin
 

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 from rigidjax import _checks
 from rigidjax._types import HasAttitude, Quat, ScalarLike
 from rigidjax.body.inertia import Inertia
+from rigidjax.motion.coupled import Coupled
 from rigidjax.motion.spin import EulerEquations
 from rigidjax.motion.torques import Torque
 from rigidjax.rotation import quaternion
@@ -81,6 +82,8 @@ def on_the_group(state: State) -> State:
     >>> on_the_group(rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 1])).q.tolist()
     [1.0, 0.0, 0.0, 0.0]
     """
+    if isinstance(state, Coupled):
+        return eqx.tree_at(lambda s: s.motion, state, on_the_group(state.motion))
     if isinstance(state, HasAttitude):
         q = _checks.floating(state.q, (4,), "state.q")
         if _checks.known(q):

@@ -10,15 +10,24 @@ from rigidjax import _checks
 from rigidjax._types import HasAttitude, HasPose, HasSpin, Scalar, ScalarLike, Vec3
 from rigidjax.body.energy import angular_momentum, kinetic_energy
 from rigidjax.body.inertia import Inertia, MassProperties
-from rigidjax.motion.torques import AbstractTorque, CentralGravity, Sum, Torque, in_precision
+from rigidjax.motion.coupled import Coupled, motion_of
+from rigidjax.motion.torques import (
+    AbstractTorque,
+    CentralGravity,
+    Sum,
+    Torque,
+    freeze,
+    in_precision,
+)
 from rigidjax.motion.torques.base import length_or_zero, one_law, require_rung
+from rigidjax.motion.torques.states import Frozen, require_frozen
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.algebra import cross, dot
 
 
 def energy(
     body: Inertia | MassProperties,
-    state: HasSpin,
+    state: HasSpin | Coupled,
     torque: Torque | None = None,
     t: ScalarLike = 0.0,
 ) -> Scalar:
@@ -26,7 +35,8 @@ def energy(
 
     **Arguments:** `body`, `state`, `torque` as for `simulate`; `t` s, for what depends on time.
 
-    `T + U`, `T = ½ m |v|² + ½ Ω·IΩ` (notes, eq 79). Wheels inside count as no energy.
+    `T + U`, `T = ½ m |v|² + ½ Ω·IΩ` (notes, eq 79). Wheels inside count as no energy, but for
+    `ReactionWheels`. Under a torque with states of its own `state` is a `Coupled`.
 
     **Raises:** `TypeError` for a torque without a potential.
 
@@ -36,24 +46,25 @@ def energy(
     >>> energy(rj.Inertia.from_principal(1.0, 1.0, 1.0), start, top)
     Array(10.31, dtype=float64)
     """
-    _look(body, state, torque)
+    turning, law = _plain(state, torque)
+    _look(body, turning, law)
     t = _checks.floating(t, (), "t")
-    parts = _parts(torque)
+    parts = _parts(law)
     for part in parts:
         if not hasattr(part, "energy"):
             raise TypeError(
                 f"energy: {type(part).__name__} has no potential (no method energy(t, state, "
                 "body)), so there is no energy that it conserves; see kinetic_energy"
             )
-    total = kinetic_energy(in_precision(body, state.omega.dtype), state)
+    total = kinetic_energy(in_precision(body, turning.omega.dtype), turning)
     for part in parts:
-        total = total + _energy_of(part, t, state, body)
+        total = total + _energy_of(part, t, turning, body)
     return total
 
 
 def conserved(
     body: Inertia | MassProperties,
-    state: HasSpin,
+    state: HasSpin | Coupled,
     torque: Torque | None = None,
     t: ScalarLike = 0.0,
 ) -> dict[str, Float[Array, "..."]]:
@@ -80,21 +91,22 @@ def conserved(
     >>> sorted(conserved(body, rj.Spin([1.0, 0, 0])))
     ['energy', 'momentum_squared']
     """
-    _look(body, state, torque)
+    turning, law = _plain(state, torque)
+    _look(body, turning, law)
     t = _checks.floating(t, (), "t")
-    parts = _parts(torque)
-    dtype = state.omega.dtype
+    parts = _parts(law)
+    dtype = turning.omega.dtype
     body = in_precision(body, dtype)
     found: dict[str, Float[Array, "..."]] = {}
     if all(hasattr(part, "energy") and getattr(part, "steady", False) for part in parts):
-        found["energy"] = energy(body, state, torque, t)
+        found["energy"] = energy(body, turning, law, t)
     inside = [part for part in parts if hasattr(part, "internal_momentum")]
     outside = [part for part in parts if not hasattr(part, "internal_momentum")]
-    momentum = _momentum(body, state, inside, t)
+    momentum = _momentum(body, turning, inside, t)
     if not outside:
         found["momentum_squared"] = dot(momentum, momentum)
-    if isinstance(state, HasAttitude):
-        momentum = quaternion.rotate(state.q, momentum)
+    if isinstance(turning, HasAttitude):
+        momentum = quaternion.rotate(turning.q, momentum)
         axis = getattr(outside[0], "axis", None) if len(outside) == 1 else None
         if not outside:
             found["momentum"] = momentum
@@ -102,12 +114,12 @@ def conserved(
             axis = axis.astype(dtype)
             length = length_or_zero(axis)
             found["momentum_along_axis"] = dot(momentum, axis) / jnp.where(length > 0, length, 1)
-    if isinstance(state, HasPose) and isinstance(body, MassProperties):
-        pushed = [part for part in parts if not isinstance(part, AbstractTorque)]
+    if isinstance(turning, HasPose) and isinstance(body, MassProperties):
+        pushed = [part for part in parts if not isinstance(_itself(part), AbstractTorque)]
         if not pushed:
-            found["linear_momentum"] = body.mass * state.v
+            found["linear_momentum"] = body.mass * turning.v
         if all(isinstance(part, CentralGravity) for part in [*outside, *pushed]):
-            found["momentum_about_origin"] = body.mass * cross(state.x, state.v) + momentum
+            found["momentum_about_origin"] = body.mass * cross(turning.x, turning.v) + momentum
     return found
 
 
@@ -119,8 +131,8 @@ def drift(
 ) -> dict[str, Scalar]:
     """By how much each conserved quantity moved during a run, relative to its size.
 
-    **Arguments:** `ts` (T,) s; `ys` states with a leading time axis; `body`, `torque` as for
-    `simulate`.
+    **Arguments:** `ts` (T,) s; `ys` states with a leading time axis, a `Coupled` of them under a
+    torque with states of its own; `body`, `torque` as for `simulate`.
 
     **Returns** for each name of `conserved` the largest distance from its value at `ts[0]`, divided
     by the largest kinetic energy, momentum, or momentum squared of the run. Zero is perfect.
@@ -134,14 +146,15 @@ def drift(
     ts = _checks.rows(ts, (), "ts")
     if not ts.size:
         raise ValueError("ts: wanted at least one time, got none")
-    _checks.instance(ys, HasSpin, "ys", wanted="states with a leading time axis")
+    turning = motion_of(ys)
+    _checks.instance(turning, HasSpin, "ys", wanted="states with a leading time axis")
     for leaf in jax.tree.leaves(ys):
         if leaf.shape[:1] != ts.shape:
             raise ValueError(
                 f"ys: wanted one row for each of {ts.shape[0]} times, got shape {leaf.shape}"
             )
     at_all = jax.vmap(lambda t, y: conserved(body, y, torque, t))(ts, ys)
-    kinetic = jax.vmap(lambda y: kinetic_energy(in_precision(body, y.omega.dtype), y))(ys)
+    kinetic = jax.vmap(lambda y: kinetic_energy(in_precision(body, y.omega.dtype), y))(turning)
     spin = jax.vmap(lambda t, y: _spin_size(body, y, torque, t))(ts, ys)
     found = {}
     for name, values in at_all.items():
@@ -157,6 +170,17 @@ def drift(
     return found
 
 
+def _plain(state: Any, torque: Any) -> tuple[Any, Any]:
+    """The body's state, and the torque with its own states put in."""
+    if not isinstance(state, Coupled):
+        return state, torque
+    return state.motion, freeze(torque, state.own)
+
+
+def _itself(part: Any) -> Any:
+    return part.law if isinstance(part, Frozen) else part
+
+
 def _look(body: Any, state: Any, torque: Any) -> None:
     """Raise in words unless these are a body, a state, and a law or none."""
     _checks.single(body, (Inertia, MassProperties), "body")
@@ -164,7 +188,8 @@ def _look(body: Any, state: Any, torque: Any) -> None:
     if torque is not None:
         require_rung(torque, state)
     for part in _parts(torque):
-        one_law(part)
+        require_frozen(part)
+        one_law(_itself(part))
 
 
 def _parts(torque: Torque | None) -> tuple[Any, ...]:
@@ -192,7 +217,8 @@ def _momentum(body: Any, state: HasSpin, inside: list[Any], t: ScalarLike) -> Ve
     return momentum
 
 
-def _spin_size(body: Any, state: HasSpin, torque: Torque | None, t: ScalarLike) -> Scalar:
+def _spin_size(body: Any, state: Any, torque: Torque | None, t: ScalarLike) -> Scalar:
+    state, torque = _plain(state, torque)
     inside = [part for part in _parts(torque) if hasattr(part, "internal_momentum")]
     return length_or_zero(_momentum(in_precision(body, state.omega.dtype), state, inside, t))
 

@@ -5,10 +5,12 @@ Okabe and Ito's, told apart by everyone.
 """
 
 from rigidjax._names import own_names
+from rigidjax.plot.ahead import horizons as horizons
 from rigidjax.plot.bodies import inertia_ellipsoid as inertia_ellipsoid
 from rigidjax.plot.film import Film as Film, tumble as tumble
 from rigidjax.plot.fits import fit as fit
 from rigidjax.plot.leftover import residuals as residuals
+from rigidjax.plot.light_curves import light_curve as light_curve
 from rigidjax.plot.paths import frames as frames
 from rigidjax.plot.player import player as player
 from rigidjax.plot.poinsot import herpolhode as herpolhode, polhode as polhode

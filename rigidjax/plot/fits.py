@@ -87,8 +87,8 @@ def _one_sensor(
     rate_unit: str,
 ) -> None:
     seen, sensor = reading.seen, reading.sensor
-    values = np.asarray(reading.values)
-    names: tuple[str, ...] = ("x", "y", "z")
+    values = np.asarray(reading.values).reshape(len(t), -1)
+    names: tuple[str, ...] = ("x", "y", "z")[: values.shape[1]]
     scale, unit, line_t = 1.0, sensor.unit, t
     if sensor.reading_shape == (4,):
         read, scale = _long_axis(values), 180 / np.pi
@@ -113,7 +113,7 @@ def _one_sensor(
     lower.set_ylabel(f"error, {unit}")
     many = seen.sum() > 100
     mark: dict[str, Any] = {"marker": "." if many else "o", "ls": "", "ms": 2 if many else 5}
-    for axis, (name, colour) in enumerate(zip(names, COLOURS[:3], strict=True)):
+    for axis, (name, colour) in enumerate(zip(names, COLOURS, strict=False)):
         if line is not None:
             whole = slice(None) if line_t is not t else seen
             upper.plot(line_t[whole], line[whole, axis], color=colour, lw=1.2, label=name)

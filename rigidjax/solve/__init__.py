@@ -3,6 +3,12 @@
 from rigidjax._names import own_names
 from rigidjax.solve import solvers as solvers
 from rigidjax.solve.adaptive import adaptive as adaptive
+from rigidjax.solve.crossings import Crossings as Crossings, crossings as crossings
+from rigidjax.solve.events import Event as Event
+from rigidjax.solve.exponents import (
+    Exponents as Exponents,
+    lyapunov_exponents as lyapunov_exponents,
+)
 from rigidjax.solve.fixed_loop import fixed as fixed
 from rigidjax.solve.projection import (
     GroupInterpolation as GroupInterpolation,

@@ -169,11 +169,11 @@ def _program(
     def project(y: Array) -> Array:
         return flat(on_the_group(unflat(y, like)))
 
-    of_one, constants = _taken_out(flat_field, t0, flat(y0))
+    of_one, constants = taken_out(flat_field, t0, flat(y0))
     count, ended = len(constants), None
     smooth = [bool(jnp.issubdtype(c.dtype, jnp.inexact)) for c in constants]
     if halt is not None:
-        condition, more = _taken_out(lambda t, y: halt(t, unflat(y, like)), t0, flat(y0))
+        condition, more = taken_out(lambda t, y: halt(t, unflat(y, like)), t0, flat(y0))
         ended = lambda constants, t, y: condition(constants[count:], t, y)  # noqa: E731
         constants, smooth = [*constants, *more], [*smooth, *[False] * len(more)]
     method = Method(
@@ -187,7 +187,7 @@ def _program(
     return _Program(method, ended, tuple(smooth)), constants
 
 
-def _taken_out(function: Callable[..., Any], *like: Any) -> tuple[Callable[..., Any], Arrays]:
+def taken_out(function: Callable[..., Any], *like: Any) -> tuple[Callable[..., Any], Arrays]:
     """`f(constants, t, y)` and the constants: what a function depends on, also by closure."""
     converted = eqx.filter_closure_convert(function, *like)
     arrays, rest = eqx.partition(converted, eqx.is_array)

@@ -207,7 +207,8 @@ def _asked(run: Run, taken: Taken, next_ts: Array, width: int) -> tuple[Any, Any
 def _by_length(h: Array, of_h: Array, rows: Array, axes: Axes) -> Array:
     """Tangents of the rows of dense output by the length of the step."""
     rows = jnp.expand_dims(rows, 2) if axes.directions else rows
-    return lift((of_h / jnp.where(h == 0, 1, h)).astype(rows.dtype), rows) * rows
+    share = of_h / lift(jnp.where(h == 0, 1, h), of_h)
+    return lift(share.astype(rows.dtype), rows) * rows
 
 
 def _across(axes: Axes, there: Array) -> Array:

@@ -6,7 +6,7 @@ times, too, the error is the method's own.
 
 import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+from rigidjax.motion.torques.inputs import Row, delays_of
 from rigidjax.solve.explicit import AbstractExplicit
 from rigidjax.solve.magnus import Magnus4
 from rigidjax.solve.splitting import AbstractSplitting
@@ -60,15 +61,64 @@ def fixed(
     return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), y0, later)
 
 
-def step(stepper: Stepper, h: Array, t0: Array, i: Array, y: Any, inputs: Any = None) -> Any:
-    """Step number `i` since `t0`; `inputs` by name (steps, …), of which this step has row `i`."""
+def step(
+    stepper: Stepper, h: Array, t0: Array, i: Array, y: Any, inputs: Any = None, before: int = 0
+) -> Any:
+    """Step number `i` since `t0`; `inputs` by name (before + steps, …), of which this step has row
+    `before + i`: the first `before` rows are those before `t0`.
+    """
 
     def at(i: Array) -> Array:
         # Not t + h again and again: round-off would add up (a million steps, 1e-3 in float32).
         return t0 + i.astype(h.dtype) * h
 
-    now = jax.tree.map(lambda a: lax.dynamic_index_in_dim(a, i, 0, keepdims=False), inputs)
-    return stepper.step(at(i), at(i + 1), h, y, now)
+    now = jax.tree.map(lambda a: _row(a, before + i), inputs)
+    if not stepper.delays:
+        return stepper.step(at(i), at(i + 1), h, y, now)
+    # A delayed input changes inside the step: one part up to each change, one to the end.
+    parts, early, late = delayed_rows(stepper.delays, h, i, inputs, before)
+    edges = jnp.concatenate([jnp.zeros(1, h.dtype), jnp.sort(parts), jnp.ones(1, h.dtype)])
+
+    def part(y: Any, ends: tuple[Array, Array]) -> tuple[Any, None]:
+        left, right = ends
+        values = [jnp.where(left < p, a, b) for p, a, b in zip(parts, early, late, strict=True)]
+        t, end = at(i) + left * h, jnp.where(right == 1, at(i + 1), at(i) + right * h)
+        return stepper.step(t, end, (right - left) * h, y, Row(now, tuple(values))), None
+
+    return lax.scan(part, y, (edges[:-1], edges[1:]))[0]
+
+
+def delayed_rows(
+    delays: Sequence[tuple[str, Array]], h: Array, i: Array, inputs: Any, before: int
+) -> tuple[Array, list[Array], list[Array]]:
+    """Where in step `i` each delayed input changes (m,), from 0 to 1, and its values on both sides.
+
+    Beyond the rows that there are the first, or the last, holds.
+    """
+    parts, early, late = [], [], []
+    for name, delay in delays:
+        steps = delay.astype(h.dtype) / h
+        whole = lax.stop_gradient(jnp.floor(steps))
+        parts.append(steps - whole)
+        last = before + i - whole.astype(jnp.int32)
+        early.append(_row(inputs[name], last - 1))
+        late.append(_row(inputs[name], last))
+    return jnp.stack(parts), early, late
+
+
+def first_row(law: Any, h: Array, inputs: Any) -> Any:
+    """What the inputs of a law are when the first of their rows begins, for `bind`."""
+    delays = delays_of(law)
+    now = jax.tree.map(lambda a: a[0], inputs)
+    if not delays:
+        return now
+    parts, early, late = delayed_rows(delays, h, jnp.zeros((), jnp.int32), inputs, 0)
+    values = [jnp.where(p > 0, a, b) for p, a, b in zip(parts, early, late, strict=True)]
+    return Row(now, tuple(values))
+
+
+def _row(a: Array, i: Any) -> Array:
+    return lax.dynamic_index_in_dim(a, jnp.clip(i, 0, a.shape[0] - 1), 0, keepdims=False)
 
 
 def march(

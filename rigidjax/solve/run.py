@@ -13,8 +13,10 @@ from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.exact import FreeBody
 from rigidjax.frames import Point, collision, scene_of
 from rigidjax.motion import Attitude, Rigid, on_the_group
+from rigidjax.motion.coupled import started
 from rigidjax.motion.torques import jumps_of
 from rigidjax.solve.adaptive import adaptive
+from rigidjax.solve.direction import Directed, DirectedCondition, DirectedJumps
 from rigidjax.solve.explicit import AbstractExplicit
 from rigidjax.solve.projection import Projected
 from rigidjax.solve.step_control import NONFINITE, finite
@@ -48,13 +50,17 @@ class Setup(eqx.Module):
 
 
 class Loop(eqx.Module):
-    """A solve of which nothing is asked but states and derivatives: our own loop."""
+    """A solve of which nothing is asked but states and derivatives: our own loop.
+
+    `sign` of the direction of time; `None` where it is known to go forwards.
+    """
 
     body: Inertia | MassProperties | None
     torque: Any
     solver: AbstractExplicit
     controller: dfx.AbstractStepSizeController
     dt0: Any
+    sign: Array | None
     max_steps: int = eqx.field(static=True)
     throw: bool = eqx.field(static=True)
 
@@ -67,6 +73,8 @@ def solve(
     state0 = on_the_group(state0)
     if isinstance(setup, Free):
         return _free(setup, state0, ts)
+    # With the states of the torque, where it has some.
+    state0 = started(setup.body, state0, setup.torque, ts[0])
     if isinstance(setup, Loop):
         return _loop(setup, state0, ts)
     field = equations_of_motion(setup.body, state0, setup.torque)
@@ -112,18 +120,26 @@ def _loop(setup: Loop, state0: Any, ts: Array) -> tuple[Any, dict[str, Any], dfx
     controller: Any = setup.controller
     scene: Any = scene_of(setup.torque) if isinstance(state0, Point) else None
     watch = None if scene is None else collision.condition(scene)
+    field, jumps = equations_of_motion(setup.body, state0, setup.torque), jumps_of(setup.torque)
+    sign, along = setup.sign, ts
+    if sign is not None:
+        field = DirectedJumps(field, sign) if jumps.size else Directed(field, sign)
+        watch = None if watch is None else DirectedCondition(watch, sign)
+        along, jumps = sign.astype(ts.dtype) * ts, sign.astype(jumps.dtype) * jumps
     out = adaptive(
         setup.solver,
-        equations_of_motion(setup.body, state0, setup.torque),
-        ts,
+        field,
+        along,
         state0,
         rtol=controller.rtol,
         atol=controller.atol,
         dt0=setup.dt0,
         max_steps=setup.max_steps,
-        jumps=jumps_of(setup.torque),
+        jumps=jumps,
         halt=watch,
     )
+    if sign is not None:
+        out = out._replace(last_time=sign.astype(ts.dtype) * out.last_time)
     ys = _raise(out.ys, out.result) if setup.throw else out.ys
     stats: dict[str, Any] = {
         "num_steps": out.num_steps,

@@ -161,7 +161,7 @@ def dense_rows(tableau: Tableau, h: Array, slopes: Array) -> Array:
     else:
         # In a batch XLA makes vector instructions of a product of matrices, not of the sum; for one
         # body the product would be a kernel of its own.
-        found = jnp.einsum("rs,nsb->rnb", w, slopes)
+        found = jnp.einsum("rs,ns...->rn...", w, slopes)
     return lift(h.astype(found.dtype), found) * found
 
 

@@ -9,6 +9,8 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
+from rigidjax.solve.tangent import between, dimension, moved
+
 
 @eqx.filter_jit
 def growth(flow: Callable[[Any, Array], Any], ts: Array, ys: Any) -> Float[Array, " times"]:
@@ -30,7 +32,21 @@ def growth(flow: Callable[[Any, Array], Any], ts: Array, ys: Any) -> Float[Array
     return jnp.linalg.norm(jax.jacfwd(end)(numbers), ord=2, axis=(1, 2))
 
 
+@eqx.filter_jit
+def transition(flow: Callable[[Any, Array], Any], ts: Array, ys: Any) -> Float[Array, "times n n"]:
+    """∂y(t)/∂y(t0) at each of `ts` between tangent spaces: see `Solution.transition_matrix`.
+
+    **Arguments:** as for `growth`.
+    """
+    start = jax.tree.map(lambda leaf: leaf[0], ys)
+
+    def changes(change: Array) -> Array:
+        return jax.vmap(between)(ys, flow(moved(start, change), ts))
+
+    return jax.jacfwd(changes)(jnp.zeros(dimension(start), ts.dtype))
+
+
 def _size(leaf: Array) -> Array:
     # A run that ended early has NaN in the rows that it did not reach.
-    size = jnp.sqrt(jnp.nanmax(jnp.sum(leaf * leaf, axis=1)))
+    size = jnp.sqrt(jnp.nanmax(jnp.sum((leaf * leaf).reshape(leaf.shape[0], -1), axis=1)))
     return jnp.where(size > 0, size, jnp.ones_like(size))

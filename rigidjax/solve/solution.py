@@ -14,8 +14,10 @@ from rigidjax import _checks, motion
 from rigidjax._types import ScalarLike
 from rigidjax.frames import Point
 from rigidjax.motion import Attitude, Rigid, Spin
+from rigidjax.motion.coupled import Coupled, motion_of
+from rigidjax.motion.torques.states import require_stateless
 from rigidjax.solve.run import Flow, Free, Loop, Setup, solve
-from rigidjax.solve.sensitivity import growth
+from rigidjax.solve.sensitivity import growth, transition
 
 State = TypeVar("State", Spin, Attitude, Rigid, Point)
 
@@ -27,7 +29,10 @@ class Solution(eqx.Module, Generic[State]):
     with a leading time axis, NaN where the run did not get to; `stats` a dict with `num_steps`,
     `num_accepted_steps`, `num_rejected_steps`, for a `Point` also `drift` of what its scene
     conserves; `result` a `diffrax.RESULTS`: `successful`, or why the run ended early, such as
-    `max_steps_reached`, `nonfinite`, `dt_min_reached`.
+    `max_steps_reached`, `nonfinite`, `dt_min_reached`; `event_occurred` where the event was met.
+    `event_time` s, `event_state` of the type of `state0`: NaN where it was not met, `None` where
+    there is no event. `own` a tuple of the states of the laws that have some, as `ys` with a
+    leading time axis (see `rigidjax.torques.freeze`), or `None`.
     """
 
     ts: Float[Array, " times"]
@@ -35,6 +40,9 @@ class Solution(eqx.Module, Generic[State]):
     stats: dict[str, Any]
     result: dfx.RESULTS
     _setup: Free | Loop | Setup
+    event_time: Float[Array, ""] | None = None
+    event_state: Any = None
+    own: Any = None
 
     @property
     def drift(self) -> dict[str, Array]:
@@ -45,7 +53,7 @@ class Solution(eqx.Module, Generic[State]):
         """
         if "drift" in self.stats:
             return self.stats["drift"]
-        return _drift(self._setup, self.ts, self.ys)
+        return _drift(self._setup, self.ts, self._states)
 
     @property
     def growth(self) -> Float[Array, " times"]:
@@ -64,7 +72,7 @@ class Solution(eqx.Module, Generic[State]):
         Source: the largest finite-time Lyapunov exponent is its logarithm over t (Eckmann and
         Ruelle 1985, doi:10.1103/RevModPhys.57.617).
         """
-        found = growth(Flow(self._setup), self.ts, self.ys)
+        found = growth(Flow(self._setup), self.ts, self._states)
         rtol = getattr(getattr(self._setup, "controller", None), "rtol", None)
         if rtol is None:
             rtol = 100 * float(jnp.finfo(self.ts.dtype).eps)
@@ -80,6 +88,22 @@ class Solution(eqx.Module, Generic[State]):
                 )
         return found
 
+    def transition_matrix(self) -> Float[Array, "times n n"]:
+        """∂ state(t) / ∂ state(t₀) at each of `ts`, on the tangent spaces of the states.
+
+        Rows and columns are small changes: Ω for a `Spin` (n = 3); δθ, Ω for an `Attitude` (6);
+        x, v, δθ, Ω for a `Rigid` (12); x, v for a `Point` (6). δθ, rad, is a turn in body axes,
+        q ⊗ exp(½δθ): three numbers. The columns are forward-mode derivatives, NaN where the run
+        did not get to. An event does not end this run.
+
+        >>> import rigidjax as rj
+        >>> body, start = rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([0.0, 0.0, 1.0])
+        >>> rj.simulate(body, start, [0.0, 2.0]).transition_matrix()[1, 2].tolist()
+        [0.0, 0.0, 1.0]
+        """
+        require_stateless(getattr(self._setup, "torque", None), "transition_matrix")
+        return transition(Flow(self._setup), self.ts, self.ys)
+
     def evaluate(self, t: ScalarLike) -> State:
         """The state at any `t` between the first and the last of `ts`, s.
 
@@ -89,12 +113,19 @@ class Solution(eqx.Module, Generic[State]):
         **Raises:** `ValueError` (`EquinoxRuntimeError` under `jit`) where `t` is outside.
         """
         t = _checks.floating(t, (), "t").astype(self.ts.dtype)
-        outside = ~((t >= self.ts[0]) & (t <= self.ts[-1]))
+        way = jnp.sign(self.ts[-1] - self.ts[0])
+        along, since = way * self.ts, way * t
+        outside = ~((since >= along[0]) & (since <= along[-1]))
         t = _checks.refuse(t, outside, "evaluate: t lies outside the times that were simulated")
-        index = jnp.clip(jnp.searchsorted(self.ts, t, side="right") - 1, 0, self.ts.shape[0] - 1)
-        start = jax.tree.map(lambda leaf: leaf[index], self.ys)
+        index = jnp.searchsorted(along, since, side="right") - 1
+        index = jnp.clip(index, 0, self.ts.shape[0] - 1)
+        start = jax.tree.map(lambda leaf: leaf[index], self._states)
         ys, _, _ = solve(self._setup, start, jnp.stack([self.ts[index], t]))
-        return jax.tree.map(lambda leaf: leaf[-1], ys)
+        return motion_of(jax.tree.map(lambda leaf: leaf[-1], ys))
+
+    @property
+    def _states(self) -> Any:
+        return self.ys if self.own is None else Coupled(self.ys, self.own)
 
 
 @eqx.filter_jit

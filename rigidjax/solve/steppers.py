@@ -32,7 +32,7 @@ from rigidjax.exact.principal_axes import into, out_of, principal_frame
 from rigidjax.motion import Attitude, AttitudeEquations, EulerEquations, Spin, on_the_group
 from rigidjax.motion.torques import evaluate
 from rigidjax.motion.torques.base import sees_attitude
-from rigidjax.motion.torques.inputs import bind
+from rigidjax.motion.torques.inputs import bind, delays_of
 from rigidjax.rotation import quaternion
 from rigidjax.solve import splitting
 from rigidjax.solve.components import join, split
@@ -45,12 +45,14 @@ from rigidjax.special.barrier import barrier
 class Stepper(NamedTuple):
     """Numbers to start from, `step(t, end, h, y, inputs)`, and `state(y)` of such numbers.
 
-    `inputs` are those of the law by name, the same through the whole step, or `None`.
+    `inputs` are those of the law by name, the same through the whole step, or `None`; `delays` name
+    and delay, s, of each delayed one.
     """
 
     start: Any
     step: Callable[[Any, Any, Any, Any, Any], Any]
     state: Callable[[Any], Any]
+    delays: tuple[tuple[str, Array], ...] = ()
 
 
 def stepper_of(solver: Any, field: Callable[..., Any], y0: Any) -> Stepper:
@@ -65,6 +67,10 @@ def stepper_of(solver: Any, field: Callable[..., Any], y0: Any) -> Stepper:
     >>> [float(number) for number in stepper.start]
     [1.0, 0.0, 0.0]
     """
+    return _stepper_of(solver, field, y0)._replace(delays=tuple(delays_of(field)))
+
+
+def _stepper_of(solver: Any, field: Callable[..., Any], y0: Any) -> Stepper:
     turning = _turning(field, y0)
     if solver is None:
         attitude = isinstance(field, AttitudeEquations)

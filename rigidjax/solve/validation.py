@@ -89,7 +89,8 @@ def tolerances(rtol: Any, atol: Any, dtype: Any) -> tuple[Any, Any]:
 
 
 def times(ts: Any, throw: bool) -> Array:
-    """`ts` as an array of increasing times; poisoned where it is not, is traced and may not throw.
+    """`ts` as an array of times that increase, or decrease; poisoned where they do neither, are
+    traced and may not throw.
 
     >>> times([0, 1, 2], True).shape
     (3,)
@@ -105,21 +106,27 @@ def times(ts: Any, throw: bool) -> Array:
         found = _checks.finite(found, "ts")
     xp = _checks.namespace(found)
     numbers = xp.asarray(found)
-    falling = ~(numbers[1:] > numbers[:-1])
+    back = numbers[-1] < numbers[0]
+    ahead = xp.where(back, numbers[:-1] > numbers[1:], numbers[1:] > numbers[:-1])
+    if xp is not np:
+        words = "ts: wanted increasing times, or decreasing ones throughout"
+        return _guard(found, ~ahead.all(), words, throw)
     where = ""
-    if xp is np and falling.any():
-        i = int(np.argmax(falling)) + 1
-        where = f"; ts[{i}] is not above the one before"
-        if _checks.known(ts) and float(ts[i]) > float(ts[i - 1]):
+    if not ahead.all():
+        i = int(np.argmin(ahead)) + 1
+        where = f"; ts[{i}] is not {'below' if back else 'above'} the one before"
+        if _checks.known(ts) and (float(ts[i]) - float(ts[i - 1])) * (-1 if back else 1) > 0:
             where += (
                 f" in {found.dtype}, which cannot tell {ts[i - 1]!r} from {ts[i]!r}: count time "
                 "from nearer by, or use float64"
             )
-    return _guard(found, falling.any(), f"ts: wanted increasing times{where}", throw)
+    kind = "decreasing" if back else "increasing"
+    return _guard(found, ~ahead.all(), f"ts: wanted {kind} times{where}", throw)
 
 
 def first_step(dt0: Any, times: Array) -> Array | None:
-    """`dt0` in the precision of `times`; refused where it is no step, or too short to count.
+    """The length of `dt0` in the precision of `times`; refused where it is no step, goes against
+    them, or is too short to count.
 
     >>> first_step(0.5, jnp.array([0.0, 1.0]))
     Array(0.5, dtype=float64)
@@ -127,22 +134,29 @@ def first_step(dt0: Any, times: Array) -> Array | None:
     if dt0 is None:
         return None
     step = _checks.floating(dt0, (), "dt0").astype(times.dtype)
+    known = _checks.known(times)
     if not _checks.known(step):
-        return step
-    if not 0 < float(step) < np.inf:
+        return jnp.abs(step)
+    back = not known or bool(times[-1] < times[0])
+    if not 0 < abs(float(step)) < np.inf or (float(step) < 0 and not back):
         raise ValueError(
-            f"dt0: wanted a positive step, s, got {dt0}; times run forwards, and to go back in "
-            "time negate Ω (v too) and the torque's time"
+            f"dt0: wanted a positive step, s, got {dt0}; to go back in time give decreasing ts"
         )
-    if _checks.known(times):
+    if known:
         gap = float(np.spacing(np.abs(np.asarray(times)).max()))
-        if float(step) < 8 * gap:
+        if abs(float(step)) < 8 * gap:
             raise ValueError(
                 f"dt0: steps of {dt0} s are too short for {times.dtype}, whose times near "
                 f"{float(np.abs(np.asarray(times)).max()):g} s are {gap:.2g} s apart; count time "
                 "from nearer by, or use float64"
             )
-    return step
+    return abs(step)
+
+
+def signed_step(dt0: Any, times: Array) -> Array | None:
+    """`first_step` with the sign of the direction of time, as diffrax wants it."""
+    step = first_step(dt0, times)
+    return step if step is None else step * jnp.sign(times[-1] - times[0])
 
 
 def start(state0: Any, throw: bool) -> Any:

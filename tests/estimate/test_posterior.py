@@ -1,7 +1,7 @@
 """The posterior density, its transforms and its draws."""
 
 import functools
-import importlib.util
+import sys
 
 import equinox as eqx
 import jax
@@ -121,15 +121,43 @@ def test_draws_that_depend_on_the_last_are_worth_less(fitted):
     assert (np.abs(drawn.ess / wanted - 1) < 0.3).all()
 
 
+def test_nuts_draws_from_a_normal_distribution():
+    root = np.array([[1.0, 0.0], [1.5, 0.5]])
+    inverse = np.linalg.inv(root @ root.T)
+    sampler = estimate.Nuts(samples=2000, warmup=300)
+    draw = jax.jit(lambda key: sampler(key, lambda z: -0.5 * z @ inverse @ z, jnp.zeros(2)))
+    # blackjax leans on the promotions that our tests forbid.
+    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
+        drawn = np.asarray(draw(jax.random.key(0)))
+    assert drawn.shape == (2000, 2)
+    np.testing.assert_allclose(drawn.mean(0), 0.0, atol=0.2)
+    np.testing.assert_allclose(np.cov(drawn.T), root @ root.T, atol=0.35)
+
+
+@pytest.mark.filterwarnings("ignore:invalid value:RuntimeWarning")  # entries that are constant
+def test_draws_go_to_arviz(fitted):
+    arviz = pytest.importorskip("arviz")
+    density = estimate.LogDensity(fitted, rj.torques.RandomTorque(1e-4), deviation=2.0)
+    x = density.x0[None, None] + 0.01 * jax.random.normal(jax.random.key(0), (4, 50, density.size))
+    drawn = estimate.Posterior(density, x)
+    table = drawn.to_arviz()
+    assert {"inertia[0, 0]", "density[0]"} <= set(arviz.summary(table).index)
+    assert table["posterior"]["omega0"].shape[:2] == (4, 50)
+    np.testing.assert_allclose(table["posterior"]["density"], drawn.points.process.density)
+
+
 @pytest.mark.usefixtures("unhooked")
 def test_what_is_refused(fitted):
     with pytest.raises(TypeError, match="density: wanted LogDensity"):
         estimate.posterior(fitted, jax.random.key(0))
     with pytest.raises(TypeError, match="process: wanted RandomTorque or CorrelatedTorque"):
         estimate.LogDensity(fitted, records.BODY)
-    if importlib.util.find_spec("blackjax") is None:
-        with pytest.raises(ImportError, match="blackjax is missing"):
-            estimate.posterior(estimate.LogDensity(fitted), jax.random.key(0))
+
+
+def test_without_blackjax_it_says_what_is_missing(fitted, monkeypatch):
+    monkeypatch.setitem(sys.modules, "blackjax", None)
+    with pytest.raises(ImportError, match="blackjax is missing"):
+        estimate.posterior(estimate.LogDensity(fitted), jax.random.key(0))
 
 
 @pytest.mark.slow

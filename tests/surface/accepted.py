@@ -27,6 +27,13 @@ LIMIT = "the right limit for an infinite argument"
 
 # (row, argument: replacement, what came of it, reason), as patterns; the first that fits counts.
 ACCEPTED: list[tuple[str, str, str, str]] = [
+    # Light: directions of time, no period to fold with, no motion to draw.
+    *(
+        ("identify.Brightness", f"{name}: function", "taken without a word*", OF_TIME)
+        for name in ("sun", "observer")
+    ),
+    ("plot.light_curve", "periods: empty list", "*", "no period is documented: nothing is folded"),
+    ("plot.light_curve", "model: None", "*", "None is documented: no motion is drawn"),
     # Polynomials of states and bodies.
     ("body.divergence", "*: huge", "a silent NaN*", OVERFLOW),
     ("body.kinetic_energy*", "*: huge", "a silent NaN*", OVERFLOW),
@@ -90,7 +97,14 @@ ACCEPTED: list[tuple[str, str, str, str]] = [
     ("motion.on_the_group", "state: *", "taken without a word*", ANY_STATE),
     *(
         (f"motion.torques.{law}", "*: function", "taken without a word*", OF_TIME)
-        for law in ("Flywheel", "GravityGradient", "InSpace", "Rotors", "MagneticDipole")
+        for law in (
+            "Flywheel",
+            "GravityGradient",
+            "InSpace",
+            "Rotors",
+            "MagneticDipole",
+            "ReactionWheels",
+        )
     ),
     ("drift", "*: float32", "returned*", "drift is round-off itself, so that it has no digits"),
     ("frames.Force", "force: None", "taken*", "None is documented: the particle is left to itself"),

@@ -719,6 +719,20 @@ def fits() -> list[Case]:
         ),
         "Marker": (identify.Marker(Y, 0.1, origin=V), W),
     }
+    moving = {
+        "Position": (identify.Position(0.1, bias=V), W),
+        "Velocity": (identify.Velocity(0.1, place=Y, mounting=0.1 * W), V),
+        "Range": (identify.Range(2.0 * Y, 0.1, place=V), 1.3),
+    }
+    for name, (sensor, reading) in moving.items():
+
+        def missed(x: Any, sensor: Any = sensor, reading: Any = reading) -> Any:
+            state = rj.Rigid(x[:3], x[3:6], unit(x[6:10]), x[10:13])
+            moment = identify.Moment(jnp.asarray(0.0), state, s.body(), None)
+            return sensor.error(moment, jnp.asarray(reading))
+
+        both = {"ordinary": RIGID, "identity, at rest": RESTING}
+        found.append(Case(f"identify.{name}", missed, both, step=0.01, rtol2=1e-7))
     for name, (sensor, reading) in sensors.items():
 
         def error(x: Any, sensor: Any = sensor, reading: Any = reading) -> Any:

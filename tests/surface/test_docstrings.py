@@ -24,6 +24,7 @@ WITHOUT_EXAMPLE = {
     *(f"identify.toutatis.{name}" for name in ("rows", "rms_degrees", "remarks")),
     *(f"plot.{name}" for name in ("fit", "residuals", "player")),
     *(f"workprecision.{name}" for name in ("draw", "measure", "worked_out", "read_csv")),
+    "identify.fit_light_curve",
     "batch.distributed.recover",  # in that of `save`
     "body.shapes.mesh_file",
 }

@@ -2,6 +2,12 @@
 
 from rigidjax._names import own_names
 from rigidjax.identify.sensors.base import AbstractSensor as AbstractSensor, Moment as Moment
+from rigidjax.identify.sensors.brightness import Brightness as Brightness
+from rigidjax.identify.sensors.places import (
+    Position as Position,
+    Range as Range,
+    Velocity as Velocity,
+)
 from rigidjax.identify.sensors.pointing import (
     AttitudeSensor as AttitudeSensor,
     Direction as Direction,

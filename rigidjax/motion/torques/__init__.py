@@ -12,6 +12,7 @@ from rigidjax.motion.torques.base import (
     jumps_of as jumps_of,
     require_rung as require_rung,
 )
+from rigidjax.motion.torques.changing import ChangingInertia as ChangingInertia
 from rigidjax.motion.torques.composite import FromPotential as FromPotential, Sum as Sum
 from rigidjax.motion.torques.constant import ConstantTorque as ConstantTorque, InSpace as InSpace
 from rigidjax.motion.torques.damping import (
@@ -29,18 +30,21 @@ from rigidjax.motion.torques.gravity import (
     GravityGradient as GravityGradient,
     HeavyTop as HeavyTop,
 )
-from rigidjax.motion.torques.inputs import Input as Input, bind as bind
+from rigidjax.motion.torques.inputs import Delayed as Delayed, Input as Input, bind as bind
 from rigidjax.motion.torques.magnetic import MagneticDipole as MagneticDipole
 from rigidjax.motion.torques.random import (
     CorrelatedTorque as CorrelatedTorque,
     RandomTorque as RandomTorque,
 )
 from rigidjax.motion.torques.series import Series as Series, Wheel as Wheel
+from rigidjax.motion.torques.signals import Lagged as Lagged
+from rigidjax.motion.torques.states import freeze as freeze
 from rigidjax.motion.torques.tables import (
     Held as Held,
     Linear as Linear,
     Pulses as Pulses,
     Tabulated as Tabulated,
 )
+from rigidjax.motion.torques.wheels import ReactionWheels as ReactionWheels
 
 __dir__ = own_names(__name__)

@@ -16,6 +16,7 @@ from rigidjax._types import HasAttitude, HasPose, HasSpin, Scalar, ScalarLike, V
 from rigidjax.body import physical
 from rigidjax.body.hints import Vector
 from rigidjax.body.inertia import Inertia, MassProperties
+from rigidjax.motion.torques.states import Frozen, require_frozen
 
 
 class Wrench(eqx.Module):
@@ -56,6 +57,24 @@ class AbstractTorque(eqx.Module):
     frame, about which it has no torque; a method `internal_momentum(t)` (3,), N m s, body frame, if
     nothing outside turns the body: what the law holds inside; a property `jump_times` (n,), s,
     where it jumps or has a kink.
+
+    **States of its own** (a motor's speed, a wheel, a bias that drifts): a law that has `state0`,
+    an array or a tree of arrays, or a method `(t, state, body)` that gives it, and a method
+    `rate(t, own, state, body)`, their derivative, is called as `(t, state, body, own)`. Loops
+    integrate them with the body's state: `simulate` (`sol.own`), `batch.rollout`, `batch.simulate`
+    and `identify.fit_windows`. A function of time inside a law may have some, too (`Lagged`), and
+    is called as `(t, own)`. No base class is needed:
+
+    >>> import equinox as eqx, jax.numpy as jnp, rigidjax as rj
+    >>> class Fading(eqx.Module):
+    ...     state0: jnp.ndarray
+    ...     def rate(self, t, own, state, body):
+    ...         return -own
+    ...     def __call__(self, t, state, body, own):
+    ...         return jnp.stack([0.0, 0.0, 1.0]) * own
+    >>> body, start = rj.Inertia.from_principal(1.0, 1.0, 1.0), rj.Spin([0.0, 0.0, 0.0])
+    >>> rj.simulate(body, start, [0.0, 1.0], Fading(jnp.asarray(1.0))).ys.omega[-1, 2]  # 1 − 1/e
+    Array(0.63212056, dtype=float64)
     """
 
     feels: eqx.AbstractVar[type]
@@ -188,7 +207,8 @@ def act(
     """
     _checks.single(state, HasSpin, "state", wanted="a Spin, an Attitude or a Rigid")
     require_rung(law, state)
-    one_law(law)
+    require_frozen(law)
+    one_law(law.law if isinstance(law, Frozen) else law)
     _checks.single(body, (Inertia, MassProperties), "body")
     dtype = state.omega.dtype
     t = _checks.floating(t, (), "t").astype(dtype)

@@ -20,6 +20,7 @@ from rigidjax.motion.torques.base import (
     require_law,
     sees_rate,
 )
+from rigidjax.motion.torques.changing import ChangingInertia
 
 
 class Sum(eqx.Module):
@@ -41,6 +42,11 @@ class Sum(eqx.Module):
             raise ValueError("Sum: wanted at least one torque; for a free body give torque=None")
         for part in parts:
             require_law(part, "Sum")
+            if isinstance(part, ChangingInertia) and len(parts) > 1:
+                raise TypeError(
+                    "Sum: ChangingInertia divides all torques by the inertia at their time: put "
+                    "the others inside it, ChangingInertia(inertia, Sum(a, b))"
+                )
         self.parts = parts
 
     @property

@@ -14,6 +14,7 @@ from rigidjax.motion.torques.base import (
     jumps_of,
     vector_at,
 )
+from rigidjax.motion.torques.states import has_states
 from rigidjax.rotation.algebra import cross
 
 
@@ -42,6 +43,11 @@ class Flywheel(AbstractTorque):
 
     def __init__(self, momentum: object):
         self.momentum = constant_or_callable(momentum, "momentum")
+        if has_states(momentum):
+            raise TypeError(
+                "Flywheel: wanted a momentum whose derivative by time is known, got one with "
+                "states of its own; see ReactionWheels"
+            )
 
     @property
     def steady(self) -> bool:

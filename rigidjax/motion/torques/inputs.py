@@ -1,14 +1,17 @@
 """Quantities that drive a law, by name: given by a loop at each step, or as functions of time."""
 
 from collections.abc import Mapping
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
+from rigidjax import _checks
 from rigidjax._types import ScalarLike
+from rigidjax.motion.torques.base import given, jumps_of
+from rigidjax.motion.torques.states import has_states
 
 Law = TypeVar("Law")
 
@@ -44,7 +47,77 @@ class _Now(eqx.Module):
         return self.value
 
 
-def bind(law: Law, inputs: Mapping[str, Any] | None) -> Law:
+class Delayed(eqx.Module):
+    """A function of time that comes later: `t → source(t − delay)`.
+
+    **Arguments:** `source` a function of time such as `Held(times, values)`, or `Input("u")`;
+    `delay` s, one number, which may be free in a fit; negative for what comes earlier.
+
+    Its `jump_times` move with the delay, and so does a run of `simulate`: the derivative by the
+    delay is right although the source jumps. In `rigidjax.batch.rollout` and
+    `identify.fit_windows`, whose samples are held through a step, a delayed input changes inside
+    a step: that step is then taken in two, up to the change and from it on, which is exact, too.
+    Before the first sample the first one holds, after the last the last. (`Linear` and `Series`
+    are smooth enough to be delayed anywhere.)
+
+    **Raises:** `TypeError` for a source that cannot be called, or that has states: delay what goes
+    into it, `Lagged(Delayed(u, d), T)`; `ValueError` for a delay that is not finite, or is as
+    long as the record.
+
+    >>> from rigidjax import torques
+    >>> float(Delayed(torques.Held([0.0, 1.0, 2.0], [5.0, 6.0, 7.0]), 0.7)(1.5))
+    5.0
+    """
+
+    source: Any
+    delay: Float[Array, ""]
+
+    def __init__(self, source: Any, delay: ScalarLike):
+        source = _checks.function(source, "source", "of time")
+        if has_states(source):
+            raise TypeError(
+                f"Delayed: {type(source).__name__} has states, whose past is not kept; delay what "
+                "goes into it: Lagged(Delayed(source, delay), time)"
+            )
+        self.delay = given(delay, (), "delay").astype(jnp.result_type(float))
+        if isinstance(source, Delayed):
+            source, self.delay = source.source, self.delay + source.delay
+        if not isinstance(source, Input) and inputs_of(source):
+            raise TypeError(
+                f"Delayed: {type(source).__name__} reads an Input; delay the Input itself, inside "
+                "it"
+            )
+        self.source = source
+        times = getattr(source, "times", None)
+        if times is not None and _checks.known((times, self.delay)):
+            length = float(times[-1] - times[0])
+            if abs(float(self.delay)) >= length:
+                raise ValueError(
+                    f"delay: {float(self.delay):.6g} s is as long as the record of {length:.6g} s "
+                    "and more; is it in seconds?"
+                )
+
+    @property
+    def jump_times(self) -> Float[Array, " n"]:
+        """Times, s, where the value jumps: those of the source, later by the delay."""
+        times = jumps_of(self.source)
+        return times + self.delay.astype(times.dtype)
+
+    def __call__(self, t: ScalarLike) -> Any:
+        return self.source(t - self.delay.astype(jnp.result_type(t)))
+
+
+class Row(NamedTuple):
+    """What the inputs are through a step, or a part of one.
+
+    **Fields:** `values` by name; `delayed` of each `Delayed` input, as they stand in the law.
+    """
+
+    values: Mapping[str, Any]
+    delayed: tuple[Any, ...]
+
+
+def bind(law: Law, inputs: Mapping[str, Any] | Row | None) -> Law:
     """The law with values in the place of its `Input`s.
 
     **Arguments:** `law` a torque, a force, or anything that holds them; `inputs` by name an array,
@@ -59,17 +132,41 @@ def bind(law: Law, inputs: Mapping[str, Any] | None) -> Law:
     if inputs is None:
         return law
 
+    values, later = inputs if isinstance(inputs, Row) else (inputs, None)
+    queue = list(later or ())
+
     def value(node: Any) -> Any:
+        if _is_delayed(node):
+            if later is not None:
+                return _Now(jnp.asarray(queue.pop(0)))
+            found = value(node.source)
+            return found if isinstance(found, _Now) else Delayed(found, node.delay)
         if not isinstance(node, Input):
             return node
-        if node.name not in inputs:
+        if node.name not in values:
             raise ValueError(
-                f"inputs: the law reads {node.name!r}, got {', '.join(map(repr, inputs)) or 'none'}"
+                f"inputs: the law reads {node.name!r}, got {', '.join(map(repr, values)) or 'none'}"
             )
-        found = inputs[node.name]
+        found = values[node.name]
         return found if callable(found) else _Now(jnp.asarray(found))
 
-    return jax.tree.map(value, law, is_leaf=lambda node: isinstance(node, Input))
+    return jax.tree.map(
+        value, law, is_leaf=lambda node: isinstance(node, Input) or _is_delayed(node)
+    )
+
+
+def _is_delayed(node: Any) -> bool:
+    return isinstance(node, Delayed) and isinstance(node.source, Input)
+
+
+def delays_of(law: Any) -> list[tuple[str, Array]]:
+    """The name and the delay of each delayed input, as they stand in the law.
+
+    >>> [(name, float(delay)) for name, delay in delays_of((Delayed(Input("u"), 0.1), Input("v")))]
+    [('u', 0.1)]
+    """
+    nodes = jax.tree.leaves(law, is_leaf=_is_delayed)
+    return [(node.source.name, node.delay) for node in nodes if _is_delayed(node)]
 
 
 def inputs_of(law: Any) -> list[str]:

@@ -17,10 +17,12 @@ Rows = Float[ArrayLike, "rows 3"] | Sequence[Any]
 
 
 class Linear(eqx.Module):
-    """A vector function of time, t → (3,): straight lines between rows, constant beyond the ends.
+    """A function of time, t → (*k): straight lines between rows, constant beyond the ends.
 
-    **Arguments:** `times` (n,) s, increasing; `values` (n, 3). For `InSpace`, `Flywheel`,
-    `MagneticDipole`, `GravityGradient`. At a row the derivative is that of the line after it.
+    **Arguments:** `times` (n,) s, increasing; `values` (n, *k), any number of channels: (n, 3) for
+    `InSpace`, `Flywheel`, `MagneticDipole`, `GravityGradient`, (n, R) for `Rotors`, (n, 3, 3) for
+    `ChangingInertia`. Both may be traced. At a row the derivative is that of the line after it.
+    For a cubic spline through evenly spaced rows, which has no kinks, see `Series`.
 
     **Raises:** `ValueError` for fewer than two rows, numbers of rows that differ, times that do not
     increase, NaN.
@@ -30,17 +32,18 @@ class Linear(eqx.Module):
     """
 
     times: Float[Array, " n"]
-    values: Float[Array, "n 3"]
+    values: Float[Array, "n *k"]
 
-    def __init__(self, times: Times, values: Rows):
-        self.times, self.values = _rows(("times", times), ("values", values), extra=0)
+    def __init__(self, times: Times, values: Float[ArrayLike, "rows *k"] | Sequence[Any]):
+        self.times, self.values = _rows(("times", times), ("values", values), extra=0, shape=None)
 
     @property
     def jump_times(self) -> Float[Array, " n"]:
         """The times of the rows, s: the function has a kink at each."""
         return self.times
 
-    def __call__(self, t: ScalarLike) -> Vec3:
+    def __call__(self, t: ScalarLike) -> Array:
+        """The value at `t` (s), (*k)."""
         t = jnp.asarray(t, self.times.dtype)
         i = jnp.clip(_row(self.times, t), 0, self.times.shape[0] - 2)
         low, high = self.times[i], self.times[i + 1]

@@ -1,0 +1,431 @@
+"""A tumbling body from its brightness alone: every motion that explains it, none left out."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float
+
+from rigidjax import _checks, exact
+from rigidjax.body.inertia import Inertia, MassProperties
+from rigidjax.identify import stacking, tumbling_starts
+from rigidjax.identify.checkpoint import Tried
+from rigidjax.identify.fit import Fit, fit
+from rigidjax.identify.levenberg_marquardt import CAREFUL, Settings, search
+from rigidjax.identify.parameters import Parameters
+from rigidjax.identify.problem import Problem, one_problem
+from rigidjax.identify.reported import carried
+from rigidjax.identify.sensors import Brightness
+from rigidjax.identify.several import Bodies
+from rigidjax.identify.two_frequencies import BLOCK, TwoFrequencies, two_frequencies
+from rigidjax.motion.torques.base import vector_at
+from rigidjax.rotation import quaternion
+from rigidjax.rotation.algebra import apply, dot
+
+# Motions are the same where both periods and both ratios of moments differ by less than that, or
+# by less than so many of their standard deviations.
+SAME, REACH = np.array([1e-3, 1e-3, 0.05, 0.05]), 5.0
+# Log-likelihood within which a rival explains the data nearly as well: e¹⁰ to one.
+MARGIN = 10.0
+# Starts of the first round, its steps; those that go on, and how far.
+FIRST, STEPS, SECOND, MORE = 96, 12, 24, 60
+# Pairs that are tried in any case, and beyond them those with χ² so much above the best.
+LEAST, ABOVE = 12, 40.0
+# Step of the differences, of numbers of order one.
+DIFFERENCE = 1e-6
+# Magnitudes to the logarithm of a flux.
+MAGNITUDE = 0.4 * np.log(10.0)
+
+
+class Alias(eqx.Module):
+    """A motion that a search ended at.
+
+    **Fields:** `parameters`; `cost` half of χ²; `rotation` the body period, s, `precession` the
+    mean precession period, s (`rigidjax.exact.body_period`, `precession_period`); `mode` `"long"`
+    or `"short"`: the axis that is circulated; `ratios` (2,) the two smaller moments over the
+    largest; `explains` whether it does so nearly as well as the best.
+    """
+
+    parameters: Parameters
+    cost: float
+    rotation: float
+    precession: float
+    mode: str
+    ratios: np.ndarray
+    explains: bool
+
+    def __str__(self) -> str:
+        return (
+            f"{self.mode}-axis mode, rotation {self.rotation:.6g} s, precession "
+            f"{self.precession:.6g} s, moments {self.ratios[0]:.3f} : {self.ratios[1]:.3f} : 1, "
+            f"misfit {self.cost:.1f}"
+        )
+
+
+class LightCurve(eqx.Module):
+    """What `fit_light_curve` returns.
+
+    **Fields:** `fit` of the best motion; `aliases` all motions that were found, the best first,
+    then by their misfit; `deviations` (4,) relative standard deviations of the best one's rotation,
+    precession and two ratios; `pairs` the frequencies that they came from; `status` one line: that
+    of the fit, or `ambiguous` where another of the aliases explains the data nearly as well.
+    """
+
+    fit: Fit
+    aliases: tuple[Alias, ...]
+    deviations: Float[np.ndarray, "4"]
+    pairs: TwoFrequencies
+    status: str
+
+    @property
+    def ok(self) -> bool:
+        """Whether the fit is, and no other motion explains the data nearly as well."""
+        return self.status == "ok"
+
+    @property
+    def rivals(self) -> tuple[Alias, ...]:
+        """The other motions that explain the data nearly as well."""
+        return tuple(alias for alias in self.aliases[1:] if alias.explains)
+
+    def __str__(self) -> str:
+        lines = [self.status]
+        for alias in self.aliases:
+            lines.append(f"{'*' if alias.explains else ' '} {alias}")
+        return "\n".join(lines)
+
+
+def fit_light_curve(
+    problem: Problem,
+    *,
+    shortest: float | None = None,
+    count: int = 48,
+    tolerance: float = 1e-4,
+    progress: Callable[[str], Any] | None = None,
+) -> LightCurve:
+    """The motion of a free tumbler from one light curve, without a guess.
+
+    Pairs of frequencies from the squared flux (`two_frequencies`); each read as precession and
+    twice the rotation, in long- and short-axis mode (Kaasalainen 2001), over a grid of bodies and
+    phases; the best of them fitted with the sensor itself; the best of these fitted to the end. All
+    that were found are listed. What brightness leaves free by symmetry (half turns of the world,
+    see `Brightness`, and of the body about its axes) is not told apart: periods, moments and mode
+    are the same.
+
+    **Arguments:** `problem` of one recording with one `Brightness` sensor and no torque; let a
+    `Free` move the sensor's `level` unless it is known. `shortest` period of a line in the
+    spectrum, s, `None` for four times the median distance of the samples; `count` pairs of
+    frequencies at most: fewer are tried where the others fit worse, and where more of them fit the
+    status is `ambiguous`; `tolerance` as of `fit`; `progress` is called with a line of text.
+
+    Sources: Pravec et al. 2005, Icarus 173:108, doi:10.1016/j.icarus.2004.07.021; Kaasalainen 2001,
+    A&A 376:302, doi:10.1051/0004-6361:20010935.
+
+    **Raises:** `ValueError` for a problem with other sensors, several recordings or a torque.
+    """
+    reading = _only(problem)
+    _checks.whole(count, "count", 1)
+    _checks.positive(tolerance, "tolerance")
+    if progress is not None:
+        _checks.function(progress, "progress", "of a line of text, such as print")
+    say = progress if progress is not None else _silent
+    t, flux, noise = _flux(problem, reading)
+    squares, spread = flux**2, None if noise is None else 2.0 * flux * noise
+    found = two_frequencies(t, squares, spread, shortest=shortest, count=count)
+    used = _used(found)
+    starts = _starts(problem, reading, t, squares, spread, found, used)
+    say(f"{used} pairs of frequencies, χ² {found.misfits[0]:.0f} of {found.dof}")
+    say(f"{len(starts)} starts")
+    sigma = _noise(problem, reading, flux, found)
+    ends = _descended(problem, starts, sigma, tolerance)
+    aliases = _aliases(problem, ends)
+    say(f"{len(aliases)} motions, misfit {aliases[0].cost:.1f}")
+    best = fit(problem, starts=1, initial=aliases[0].parameters, tolerance=tolerance)
+    return _told(best, aliases, found, used >= count)
+
+
+def _used(found: TwoFrequencies) -> int:
+    """How many of the pairs fit well enough to be tried."""
+    above = ABOVE * max(1.0, float(found.misfits[0]) / found.dof)
+    return max(LEAST, int((found.misfits <= found.misfits[0] + above).sum()))
+
+
+def _silent(line: str) -> None:
+    pass
+
+
+def _only(problem: Problem) -> Any:
+    """The reading of the only sensor, one light curve of a free body."""
+    one_problem(problem)
+    readings = problem.records.readings
+    kinds = ", ".join(type(r.sensor).__name__ for r in readings)
+    if len(readings) != 1 or not isinstance(readings[0].sensor, Brightness):
+        raise ValueError(f"fit_light_curve: wanted one Brightness sensor, got {kinds}")
+    if problem.count != 1:
+        raise ValueError(
+            f"fit_light_curve: wanted one recording, got {problem.count}; fit the longest, then "
+            "all of them with rigidjax.identify.fit from what it found"
+        )
+    if isinstance(problem.body, Bodies):
+        raise ValueError("fit_light_curve: wanted one body, got several by name")
+    if problem.records.torque is not None:
+        raise ValueError("fit_light_curve: wanted a free body, got a torque")
+    return stacking.one(readings[0], 0)
+
+
+def _flux(problem: Problem, reading: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    """Times since the first, s, fluxes relative to their mean and their noise."""
+    t = np.asarray(problem.records.t[0])
+    keep, sensor = reading.seen, reading.sensor
+    values = np.asarray(reading.values, float)[keep]
+    noise = None if sensor.noise is None else float(np.asarray(sensor.noise)[0])
+    if sensor.unit == "mag":
+        flux = np.exp(-MAGNITUDE * (values - np.median(values)))
+        spread = None if noise is None else MAGNITUDE * noise * flux
+    else:
+        flux = np.maximum(values, 1e-3 * np.median(values)) / np.median(values)
+        spread = None if noise is None else np.full(flux.shape, noise / np.median(values))
+    return t[keep] - t[0], flux, spread
+
+
+def _starts(
+    problem: Problem,
+    reading: Any,
+    t: np.ndarray,
+    squares: np.ndarray,
+    spread: np.ndarray | None,
+    found: TwoFrequencies,
+    used: int,
+) -> list[Parameters]:
+    """The best starting points over all pairs of frequencies."""
+    sensor = reading.sensor
+    sigma = np.ones(t.shape) if spread is None else spread
+    more = -t.size % BLOCK
+    light = tuple(jnp.asarray(np.pad(v, (0, more))) for v in (t, squares, 1.0 / sigma))
+    middle = problem.records.t[0][0] + 0.5 * t[-1]
+    sides = [np.asarray(vector_at(s, middle, "")) for s in (sensor.sun, sensor.observer)]
+    half_way = sum(v / np.linalg.norm(v) for v in sides)
+    half_way = half_way / np.linalg.norm(half_way)
+    order, areas = np.arange(3), None
+    if sensor.semi_axes is not None:
+        axes = np.asarray(sensor.semi_axes)
+        order = np.argsort(-axes)
+        areas = (np.prod(axes) / axes[order]) ** 2
+    best_of, others = [], []
+    for pair in found.frequencies[:used]:
+        for mode in tumbling_starts.MODES:
+            some = tumbling_starts.candidates(pair, mode, light, half_way, areas, 3)
+            # Of each reading of each pair one: which of them is true a grid alone cannot tell.
+            best_of += some[: len(tumbling_starts.ABOUT)]
+            others += some[len(tumbling_starts.ABOUT) :]
+    best_of.sort(key=lambda one: one.misfit)
+    others.sort(key=lambda one: one.misfit)
+    chunks = max(1, -(-len(best_of) // FIRST))
+    all_of = (best_of + others)[: chunks * FIRST]
+    turn = _turn(order)
+    return [_parameters(problem, one, turn) for one in all_of]
+
+
+def _turn(order: np.ndarray) -> np.ndarray:
+    """The rotation whose columns are the body's axes of ascending moments."""
+    turn = np.eye(3)[:, order]
+    return turn * np.array([1.0, 1.0, np.linalg.det(turn)])
+
+
+def _parameters(problem: Problem, one: tumbling_starts.Candidate, turn: np.ndarray) -> Parameters:
+    moments = turn @ np.diag(one.moments) @ turn.T
+    start = problem.start(Inertia(jnp.asarray(moments)))
+    reference = problem.reference
+    assert reference.q is not None
+    q = _place(jnp.asarray(one.q), jnp.asarray(turn), reference.q[0])
+    spin = jnp.asarray(turn @ one.omega)[None] / reference.rate[:, None]
+    return eqx.tree_at(lambda p: (p.own.spin, p.own.turn), start, (spin, q[None]))
+
+
+@jax.jit
+def _place(q: Array, turn: Array, reference: Array) -> Array:
+    back = quaternion.conjugate(quaternion.from_matrix(turn))
+    q = quaternion.multiply(q, back)
+    return quaternion.log(quaternion.multiply(quaternion.conjugate(reference), q))
+
+
+def _noise(
+    problem: Problem, reading: Any, flux: np.ndarray, found: TwoFrequencies
+) -> tuple[Float[Array, "1 1"], ...]:
+    """The noise (1, 1) in the sensor's unit; where it is not known what the series leave over."""
+    sensor = reading.sensor
+    if sensor.noise is not None:
+        return (sensor.noise[None],)
+    left = found.scatter / (2.0 * np.median(flux))
+    unit = 1.0 / MAGNITUDE if sensor.unit == "mag" else np.median(np.asarray(reading.values))
+    return (jnp.full((1, 1), max(left * unit, 1e-12)),)
+
+
+def _descended(
+    problem: Problem, starts: list[Parameters], noise: Any, tolerance: float
+) -> list[Tried]:
+    """All starts a little way down, then the best of them to the end."""
+    parameters, costs = [], []
+    for first in range(0, len(starts), FIRST):
+        # Always as many: one program.
+        some = [starts[first + k % len(starts[first:])] for k in range(FIRST)]
+        stacked = _levelled(jax.tree.map(lambda *leaves: jnp.stack(leaves), *some), problem)
+        found = _many(stacked, problem, noise, Settings(tolerance, CAREFUL, STEPS))
+        parameters.append(found.parameters)
+        costs.append(np.asarray(found.cost))
+    all_of = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parameters)
+    cost_of = np.concatenate(costs)
+    order = np.argsort(cost_of)
+    kept, seen = [], []
+    for index in order:
+        cost = float(cost_of[index])
+        if all(abs(cost - other) > 1e-3 * (1.0 + other) for other in seen):
+            kept.append(int(index))
+            seen.append(cost)
+        if len(kept) == SECOND:
+            break
+    rows = jnp.asarray(np.resize(kept, FIRST))
+    nearer = jax.tree.map(lambda leaf: leaf[rows], all_of)
+    count = jnp.asarray(len(kept))
+    last = _many(nearer, problem, noise, Settings(tolerance, 1e-2, MORE), count)
+    return [jax.tree.map(lambda leaf, k=k: leaf[k], last) for k in range(len(kept))]
+
+
+@eqx.filter_jit
+def _many(
+    starts: Parameters, problem: Problem, noise: Any, settings: Settings, count: Any = FIRST
+) -> Tried:
+    """The first `count` of the starts (a leading axis) down, one after another.
+
+    By differences of the errors: the closed form of the motion alone takes a hundredth of the time
+    that it takes with its derivatives, and here they need not be right to the last digit.
+    """
+
+    def one(given: tuple[Parameters, Array]) -> Tried:
+        start, number = given
+        flat, restore = ravel_pytree(start)
+
+        def errors(point: Array) -> Array:
+            return problem.errors(restore(point))[0][:, 0] / noise[0][0, 0]
+
+        def evaluated(point: Array) -> tuple[Any, Array, Array, Array]:
+            moved = point[None] + DIFFERENCE * jnp.concatenate(
+                [jnp.zeros((1, flat.size)), jnp.eye(flat.size)]
+            )
+            e = jax.lax.map(errors, moved)
+            rows = (e[1:] - e[:1]) / DIFFERENCE
+            return (), 0.5 * jnp.sum(e[0] ** 2), rows @ rows.T, rows @ e[0]
+
+        steps = jnp.where(number < count, settings.steps, 0)
+        mine = eqx.tree_at(lambda s: s.steps, settings, steps)
+        end = search(evaluated, flat, jnp.ones_like(flat), mine, ())
+        return Tried(restore(end.point), end.cost, end.converged)
+
+    return jax.lax.map(one, (starts, jnp.arange(FIRST)))
+
+
+@eqx.filter_jit
+def _levelled(starts: Parameters, problem: Problem) -> Parameters:
+    """Starts with the level at which they fit best, where it is free."""
+    leaves, structure = jax.tree.flatten(problem.records)
+    numbered: Any = jax.tree.unflatten(structure, list(range(len(leaves))))
+    at = numbered.readings[0].sensor.level
+    mine = [k for k, slot in enumerate(problem.slots) if slot.leaf == at and not slot.each]
+    if not mine:
+        return starts
+    which = sum(1 for slot in problem.slots[: mine[0]] if not slot.each)
+    slot, reading = problem.slots[mine[0]], problem.records.readings[0]
+    sensor: Any = reading.sensor
+    level = sensor.level[0]
+
+    def one(start: Parameters) -> Parameters:
+        error = problem.errors(start)[0][:, 0]
+        seen = reading.mask[0]
+        if sensor.unit == "mag":
+            better = level + jnp.sum(error) / jnp.sum(seen.astype(error.dtype))
+        else:
+            shape = jnp.where(seen, reading.values[0] - error, 0.0)
+            better = level * jnp.sum(shape * reading.values[0]) / jnp.sum(shape * shape)
+        step = slot.step(level, better).reshape(start.shared[which].shape)
+        return eqx.tree_at(lambda p: p.shared[which], start, step)
+
+    return jax.vmap(one)(starts)
+
+
+@eqx.filter_jit
+def _read(parameters: Parameters, problem: Problem) -> tuple[Array, Array]:
+    """Logarithms (4,) of both periods and both ratios, and h²/2T over the middle moment."""
+    body: Any = problem.bodies(parameters)
+    inertia = body.inertia if isinstance(body, MassProperties) else body
+    omega = parameters.own.spin[0] * problem.reference.rate[0]
+    moments, momentum = inertia.moments, apply(inertia.tensor, omega)
+    rotation = exact.body_period(inertia, omega)
+    precession = exact.precession_period(inertia, omega)
+    ratios = moments[:2] / moments[2]
+    numbers = jnp.log(jnp.stack([rotation, precession, ratios[0], ratios[1]]))
+    return numbers, dot(momentum, momentum) / dot(omega, momentum) / moments[1]
+
+
+@eqx.filter_jit
+def _slopes(parameters: Parameters, problem: Problem) -> Float[Array, "4 n"]:
+    flat, restore = ravel_pytree(parameters)
+    return jax.jacfwd(lambda x: _read(restore(x), problem)[0])(flat)
+
+
+def _alias(problem: Problem, parameters: Parameters, cost: float) -> Alias:
+    numbers, middle = (np.asarray(v) for v in _read(parameters, problem))
+    rotation, precession, *ratios = np.exp(numbers)
+    mode = "long" if middle < 1 else "short"
+    return Alias(
+        parameters, cost, float(rotation), float(precession), mode, np.array(ratios), False
+    )
+
+
+def _aliases(problem: Problem, ends: list[Tried]) -> list[Alias]:
+    """The different motions, the best first."""
+    out: list[Alias] = []
+    for end in sorted(ends, key=lambda one: float(one.cost)):
+        if not np.isfinite(float(end.cost)):
+            continue
+        alias = _alias(problem, end.parameters, float(end.cost))
+        if not any(_same(alias, other, SAME) for other in out):
+            out.append(alias)
+    if not out:
+        raise ValueError("fit_light_curve: no start gave a finite misfit")
+    return out
+
+
+def _numbers(alias: Alias) -> np.ndarray:
+    return np.log([alias.rotation, alias.precession, *alias.ratios])
+
+
+def _same(a: Alias, b: Alias, near: np.ndarray) -> bool:
+    return a.mode == b.mode and bool((np.abs(_numbers(a) - _numbers(b)) < near).all())
+
+
+def _told(best: Fit, aliases: list[Alias], found: TwoFrequencies, cut: bool) -> LightCurve:
+    slopes = np.asarray(_slopes(best.parameters, best.problem))
+    deviations = carried(slopes, np.asarray(best.seen), np.asarray(best.null_directions))
+    # The misfits of a search that stopped on its way to the same motion are no rival's.
+    near = np.maximum(SAME, REACH * deviations)
+    # Costs of the search, all with one noise: a fit may have estimated another.
+    first = _alias(best.problem, best.parameters, aliases[0].cost)
+    others = [alias for alias in aliases if not _same(alias, first, near)]
+    # Where the noise is larger than was said, misfits count for less.
+    count = int(best.problem.records.readings[0].seen.sum())
+    margin = MARGIN * max(1.0, 2.0 * first.cost / count) * max(best.correlation, 1.0)
+    marked = tuple(
+        eqx.tree_at(lambda a: a.explains, alias, alias.cost <= first.cost + margin)
+        for alias in (first, *others)
+    )
+    rivals = sum(alias.explains for alias in marked) - 1
+    status = best.status
+    if rivals and not status.startswith(("failed", "poor")):
+        some = "another motion explains" if rivals == 1 else f"{rivals} other motions explain"
+        status = f"ambiguous: {some} the light curve nearly as well"
+    elif cut and status == "ok":
+        status = "ambiguous: more pairs of frequencies fit than were tried"
+    return LightCurve(best, marked, deviations, found, status)

@@ -1,0 +1,225 @@
+"""From two frequencies of a light curve to motions that may be behind it: a grid of bodies.
+
+Squared, the brightness of an ellipsoid is nearly a quadratic form of the direction n half way
+between sun and observer (at zero phase, under the law of projected areas, it is one):
+`F² ∝ Σ_k M_k (n·r_k)²`, r_k the body's axes in the world and `M = (bc)², (ca)², (ab)²`. So for a
+body, an energy and a phase it is linear in the six numbers of n nᵀ, seen from a frame along the
+angular momentum: least squares finds the direction of the momentum, the first angle and the level
+at once, and what is left for a grid is the shape and the phase in the rotation.
+"""
+
+import math
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from rigidjax import exact
+from rigidjax.body.inertia import Inertia
+from rigidjax.motion import Attitude
+from rigidjax.rotation.algebra import cross
+
+# Semi-axes of the grid: b/a and c/b; phases in half a rotation.
+MIDDLE, SHORT, PHASES = (0.4, 0.5, 0.6, 0.7, 0.8, 0.9), (0.5, 0.65, 0.8, 0.93), 12
+# Turns about the direction half way that a start is tried with: brightness hardly sees them.
+ABOUT = (0.0, math.pi / 3, 2 * math.pi / 3)
+MODES = ("long", "short")
+
+
+class Candidate(NamedTuple):
+    """A motion to start from.
+
+    **Fields:** `moments` (3,) ascending, the largest one; `q` (4,), `omega` (3,) at the first time,
+    in principal axes; `misfit` χ².
+    """
+
+    moments: np.ndarray
+    q: np.ndarray
+    omega: np.ndarray
+    misfit: float
+
+
+def shapes_of_grid() -> np.ndarray:
+    """Semi-axes (S, 3), descending, the longest one."""
+    b, ratio = np.meshgrid(MIDDLE, SHORT, indexing="ij")
+    return np.stack([np.ones(b.size), b.ravel(), (b * ratio).ravel()], axis=1)
+
+
+def moments_of(semi_axes: np.ndarray) -> np.ndarray:
+    """Principal moments (S, 3) of uniform ellipsoids, the largest one."""
+    second = semi_axes**2
+    moments = second.sum(axis=1, keepdims=True) - second
+    return moments / moments[:, 2:]
+
+
+def candidates(
+    pair: np.ndarray,
+    mode: str,
+    light: Any,
+    half_way: np.ndarray,
+    areas: np.ndarray | None,
+    count: int,
+) -> list[Candidate]:
+    """The best of the grid whose precession and rotation have these frequencies, the best first.
+
+    **Arguments:** `pair` (2,) of the mean precession and of twice the rotation, 1/s; `mode` of
+    `MODES`: the axis that is circulated; `light` times since the first, s, squared fluxes and ones
+    over their noise, and zeros where there is none; `half_way` (3,) the direction half way, world
+    frame; `areas` M (3,) of a known ellipsoid, or `None` for the uniform one of each body; `count`
+    how many bodies, each with all turns of `ABOUT`.
+    """
+    semi_axes = shapes_of_grid()
+    moments = moments_of(semi_axes)
+    forms = (np.prod(semi_axes, axis=1, keepdims=True) / semi_axes) ** 2
+    if areas is not None:
+        forms = np.broadcast_to(areas, forms.shape)
+    forms = forms / forms.mean(axis=1, keepdims=True)
+    arrays = jnp.asarray(moments), jnp.asarray(forms), jnp.asarray(pair), *light
+    found = _grid(jnp.asarray(mode == "long"), *arrays)
+    misfits, sides, q, omega = (np.asarray(v) for v in found)
+    # The best phase of each body.
+    phase, least = misfits.argmin(axis=1), misfits.min(axis=1)
+    out = []
+    for k in np.argsort(least)[:count]:
+        if not np.isfinite(least[k]):
+            continue
+        at = k, phase[k]
+        for q0 in _placed(sides[at], half_way):
+            placed = _times(q0, q[at])
+            out.append(Candidate(moments[k], placed, omega[at], float(least[k])))
+    return out
+
+
+def _placed(side: np.ndarray, half_way: np.ndarray) -> list[np.ndarray]:
+    """Turns (4,) that take the frame of the momentum to the world.
+
+    Of the symmetric matrix that least squares found the nearest of rank one.
+    """
+    xx, yy, zz, xy, xz, yz = side
+    _, axes = np.linalg.eigh(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
+    n = axes[:, -1]
+    turns = []
+    for angle in ABOUT:
+        first = _between(n, half_way)
+        half = 0.5 * angle
+        about = np.concatenate([[np.cos(half)], np.sin(half) * half_way])
+        turns.append(_times(about, first))
+    return turns
+
+
+def _between(u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """The shortest turn that takes u to v or to −v, whichever is nearer."""
+    v = v if u @ v >= 0 else -v
+    q = np.concatenate([[1.0 + u @ v], np.cross(u, v)])
+    return q / np.linalg.norm(q)
+
+
+def _times(p: np.ndarray, q: np.ndarray) -> np.ndarray:
+    w, v = p[0] * q[0] - p[1:] @ q[1:], p[0] * q[1:] + q[0] * p[1:] + np.cross(p[1:], q[1:])
+    return np.concatenate([[w], v])
+
+
+def _rate(moments: Array, d: Array) -> Float[Array, "3"]:
+    """The rate of momentum one and h²/2T = d that has no part along the middle axis."""
+    a, _, c = (1.0 / moments[k] for k in range(3))
+    x = jnp.clip((1.0 / d - c) / (a - c), 0.0, 1.0)
+    return jnp.stack([jnp.sqrt(x), jnp.zeros_like(x), jnp.sqrt(1.0 - x)]) / moments
+
+
+def _along_z(momentum: Array) -> Float[Array, "4"]:
+    """An attitude in which the momentum (3,), body frame, is along z."""
+    u = momentum / jnp.sqrt(jnp.sum(momentum * momentum))
+    # Never opposite: the parts of `_rate` are positive.
+    z = jnp.zeros_like(u).at[2].set(1.0)
+    q = jnp.concatenate([1.0 + u[2:], cross(u, z)])
+    return q / jnp.sqrt(jnp.sum(q * q))
+
+
+def periods(moments: Array, omega: Array) -> tuple[Array, Array]:
+    """Body period and mean precession period, s, of principal moments (3,)."""
+    body = Inertia(jnp.diag(moments))
+    return exact.body_period(body, omega), exact.precession_period(body, omega)
+
+
+def _energy(moments: Array, ratio: Array, long: Array) -> tuple[Array, Array]:
+    """A rate whose periods have this ratio, precession over rotation, and whether there is one.
+
+    From a spin about the axis of the mode, where it is largest, to the separatrix, where it is 0.
+    """
+    pure = jnp.where(long, moments[0], moments[2])
+
+    def rate(part: Array) -> Array:
+        return _rate(moments, pure + part * (moments[1] - pure))
+
+    def quotient(part: Array) -> Array:
+        rotation, precession = periods(moments, rate(part))
+        return precession / rotation
+
+    def halved(_: Any, between: tuple[Array, Array]) -> tuple[Array, Array]:
+        low, high = between
+        middle = 0.5 * (low + high)
+        above = quotient(middle) > ratio
+        return jnp.where(above, middle, low), jnp.where(above, high, middle)
+
+    kind = moments.dtype
+    ends = jnp.asarray(1e-4, kind), jnp.asarray(1.0 - 1e-7, kind)
+    low, high = jax.lax.fori_loop(0, 32, halved, ends)
+    part = 0.5 * (low + high)
+    return rate(part), jnp.abs(quotient(part) / ratio - 1.0) < 1e-3
+
+
+@jax.jit
+def _grid(
+    long: Array,
+    moments: Array,
+    forms: Array,
+    pair: Array,
+    t: Array,
+    squares: Array,
+    weights: Array,
+) -> tuple[Array, Array, Array, Array]:
+    """Misfits (S, phases), n nᵀ times the level (…, 6), attitudes (…, 4) and rates (…, 3)."""
+    ratio = 0.5 * pair[1] / pair[0]
+    z = squares * weights
+    total = jnp.sum(z * z)
+
+    def shape(given: tuple[Array, Array]) -> Any:
+        body, form = given
+        omega, exists = _energy(body, ratio, long)
+        _, precession = periods(body, omega)
+        omega = omega * (precession * pair[0])
+        motion = exact.FreeBody(Inertia(jnp.diag(body)), Attitude(_along_z(body * omega), omega))
+
+        def phase(part: Array) -> Any:
+            since = part / pair[1]
+
+            def row(time: Array) -> Array:
+                state: Any = motion(time + since)
+                w, x, y, u = (state.q[k] for k in range(4))
+                m = form
+                # Body axes in the world, written out.
+                a = (1 - 2 * (y * y + u * u), 2 * (x * y + w * u), 2 * (x * u - w * y))
+                b = (2 * (x * y - w * u), 1 - 2 * (x * x + u * u), 2 * (y * u + w * x))
+                c = (2 * (x * u + w * y), 2 * (y * u - w * x), 1 - 2 * (x * x + y * y))
+
+                def entry(i: int, j: int) -> Array:
+                    return m[0] * a[i] * a[j] + m[1] * b[i] * b[j] + m[2] * c[i] * c[j]
+
+                twice = (2 * entry(0, 1), 2 * entry(0, 2), 2 * entry(1, 2))
+                return jnp.stack([entry(0, 0), entry(1, 1), entry(2, 2), *twice])
+
+            rows = jax.vmap(row)(t).T * weights[None, :]
+            gram = rows @ rows.T
+            gram = gram + 1e-9 * jnp.trace(gram) * jnp.eye(6, dtype=t.dtype)
+            side = rows @ z
+            n = jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(gram), side)
+            start: Any = motion(since)
+            misfit = jnp.where(exists, total - side @ n, jnp.inf)
+            return misfit, n, start.q, start.omega
+
+        parts = jnp.arange(PHASES, dtype=t.dtype) / PHASES
+        return jax.lax.map(phase, parts)
+
+    return jax.lax.map(shape, (moments, forms))

@@ -1,0 +1,239 @@
+"""Two frequencies behind a light curve: the Fourier series in both that fits best."""
+
+import functools
+import math
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+from rigidjax import _checks
+
+# Multiples of the first frequency: a brightness squared is of second order in directions.
+FIRST = 2
+# Lines through which pairs are laid, and the grid of the first frequency, in 1/span.
+LINES, STEP = 3, 0.1
+# Pairs nearer than that, in 1/span, are one.
+NEAR = 0.25
+# How many pairs are refined for each that is wanted.
+TRIED = 2
+# Programs are compiled for times in multiples of so many, and for so many pairs at a time.
+BLOCK, BATCH, FEW, MANY = 256, 32, 256, 2048
+
+
+class TwoFrequencies(eqx.Module):
+    """What `two_frequencies` returns, the best first.
+
+    **Fields:** `frequencies` (n, 2) in 1/s; `misfits` (n,) χ² of each pair's series, and `dof`;
+    `scatter` the standard deviation that the best leaves over, in the unit of the values; `lines`
+    (m,) the strongest lines of the spectrum, 1/s.
+    """
+
+    frequencies: Float[np.ndarray, "n 2"]
+    misfits: Float[np.ndarray, " n"]
+    dof: int
+    scatter: float
+    lines: Float[np.ndarray, " m"]
+
+
+def two_frequencies(
+    t: Float[ArrayLike, " times"],
+    values: Float[ArrayLike, " values"],
+    noise: float | Float[ArrayLike, " noises"] | None = None,
+    *,
+    order: int = 1,
+    shortest: float | None = None,
+    count: int = 12,
+) -> TwoFrequencies:
+    """Pairs (f₁, f₂) whose Fourier series fit best: `Σ c_jk exp 2πi (j f₁ + k f₂) t`, |j| ≤ 2.
+
+    Where the spectrum has its three strongest lines one of them must be j f₁ + k f₂; along these
+    curves all pairs are tried, then the best ones are refined. A set of lines has several pairs
+    that make it: all that fit are returned, for a motion to choose among them.
+
+    **Arguments:** `t` (T,) increasing times, s, gaps allowed; `values` (T,) fluxes or their
+    squares; `noise` their standard deviation, one or (T,), `None` if it is not known; `order` k up
+    to which multiples of f₂ are taken; `shortest` period that a line may have, s, `None` for four
+    times the median distance of the times; `count` how many pairs are returned at most.
+
+    Source: Pravec et al. 2005, Icarus 173:108, doi:10.1016/j.icarus.2004.07.021 (with all |j| and
+    |k| up to one order); the linear fit is that of Lomb 1976, doi:10.1007/BF00648343, for many
+    lines.
+
+    **Raises:** `ValueError`, `TypeError` for wrong shapes, times that do not increase, NaN, too few
+    values.
+
+    >>> t = np.linspace(0.0, 60.0, 300)
+    >>> y = 1 + np.cos(2 * np.pi * 0.4 * t) + 0.5 * np.cos(2 * np.pi * 0.7 * t + 1.0)
+    >>> found = two_frequencies(t, y, 0.1)
+    >>> bool(found.misfits[0] < 0.1)
+    True
+    """
+    t, y = _checks.on_host(t, "t"), _checks.on_host(values, "values")
+    order, count = _checks.whole(order, "order", 1), _checks.whole(count, "count", 1)
+    unknowns = (2 * FIRST + 1) * (2 * order + 1) + 2
+    if t.ndim != 1 or y.shape != t.shape:
+        raise ValueError(f"values: wanted (T,) as t has, got shapes {t.shape} and {y.shape}")
+    if t.size <= unknowns:
+        raise ValueError(f"t: wanted more than {unknowns} times, as the series has, got {t.size}")
+    if not (np.isfinite(t).all() and np.isfinite(y).all()):
+        raise ValueError("two_frequencies: t or values contain NaN or infinity; leave gaps out")
+    if not (np.diff(t) > 0).all():
+        raise ValueError("t: wanted increasing times")
+    sigma = np.ones(t.shape)
+    if noise is not None:
+        sigma = np.broadcast_to(_checks.on_host(noise, "noise"), t.shape)
+        if not (sigma > 0).all():
+            raise ValueError("noise: wanted positive standard deviations")
+    span = float(t[-1] - t[0])
+    typical = float(np.median(np.diff(t)))
+    least = 4.0 * typical if shortest is None else _checks.positive(shortest, "shortest")
+    light = _padded((t - t[0]) / span, y / sigma, 1.0 / sigma)
+    lines = strongest(light, span / least, 2 * LINES)
+    pairs = _apart(*_scan(light, lines, order), count * TRIED)
+    pairs, misfits = _refined(light, pairs, order)
+    keep = _distinct(pairs, misfits, count)
+    dof = t.size - unknowns
+    best = max(float(misfits[keep[0]]), 1e-300)
+    scatter = float(np.sqrt(best / dof / np.mean(1.0 / sigma**2)))
+    scale = 1.0 if noise is not None else dof / best
+    return TwoFrequencies(pairs[keep] / span, misfits[keep] * scale, dof, scatter, lines / span)
+
+
+def _padded(x: np.ndarray, z: np.ndarray, w: np.ndarray) -> tuple[Array, Array, Array]:
+    """Times over the span, values and ones over the noise, with zeros up to a whole block."""
+    more = -x.size % BLOCK
+    return tuple(jnp.asarray(np.pad(v, (0, more))) for v in (x, z, w))  # pyright: ignore
+
+
+def strongest(light: Any, highest: float, count: int) -> np.ndarray:
+    """The strongest lines, one after another taken away, in 1/span."""
+    grid = np.arange(0.5, max(highest, 2.0), 0.2)
+    x, z, w = (np.asarray(v) for v in light)
+    found = []
+    for _ in range(count):
+        line, curve = (np.asarray(v) for v in _spectrum(jnp.asarray(_filled(grid)), x, z, w))
+        found.append(float(line))
+        z = z - w * curve
+    return np.array(found)
+
+
+@jax.jit
+def _spectrum(grid: Array, x: ArrayLike, z: ArrayLike, w: ArrayLike) -> tuple[Array, Array]:
+    """The frequency of the strongest line, and its curve with a constant."""
+    x, z, w = jnp.asarray(x), jnp.asarray(z), jnp.asarray(w)
+
+    def one(f: Array) -> tuple[Array, Array]:
+        angle = 2.0 * math.pi * f * x
+        plain = jnp.stack([jnp.ones_like(x), jnp.cos(angle), jnp.sin(angle)])
+        rows = plain * w[None, :]
+        gram = rows @ rows.T
+        gram = gram + 1e-9 * jnp.trace(gram) * jnp.eye(3, dtype=x.dtype)
+        side = rows @ z
+        c = jnp.linalg.solve(gram, side)
+        return jnp.sum(z * z) - side @ c, c
+
+    left, c = jax.lax.map(one, grid, batch_size=BATCH)
+    best = jnp.argmin(left)
+    angle = 2.0 * math.pi * grid[best] * x
+    curve = c[best, 0] + c[best, 1] * jnp.cos(angle) + c[best, 2] * jnp.sin(angle)
+    return grid[best], curve
+
+
+@functools.partial(jax.jit, static_argnums=2)
+def lattice_misfits(pairs: Array, light: Any, order: int) -> Float[Array, " pairs"]:
+    """χ² of the series of each pair (P, 2), in 1/span.
+
+    The normal matrix of all exponentials has but few different entries: the sums of
+    `w² exp 2πi (m f₁ + n f₂) t` over the times.
+    """
+    x, z, w = light
+    js, ks = np.meshgrid(np.arange(-FIRST, FIRST + 1), np.arange(-order, order + 1), indexing="ij")
+    js, ks = js.ravel(), ks.ravel()
+    dj, dk = js[None, :] - js[:, None] + 2 * FIRST, ks[None, :] - ks[:, None] + 2 * order
+    total = jnp.sum(z * z)
+    squares, sides = (jax.lax.complex(v, jnp.zeros_like(v)) for v in (w * w, w * z))
+
+    def powers(f: Array, most: int) -> Array:
+        angle = 2.0 * math.pi * jnp.mod(f * x, 1.0)
+        turn = jax.lax.complex(jnp.cos(angle), jnp.sin(angle))
+        up = [jnp.ones_like(turn), turn]
+        for _ in range(most - 1):
+            up.append(up[-1] * turn)
+        return jnp.stack([jnp.conj(v) for v in reversed(up[1:])] + up)
+
+    def one(pair: Array) -> Array:
+        first, second = powers(pair[0], 2 * FIRST), powers(pair[1], 2 * order)
+        window = (first * squares[None, :]) @ second.T
+        seen = (first[FIRST : 3 * FIRST + 1] * sides[None, :]) @ second[order : 3 * order + 1].T
+        gram = window[dj, dk]
+        gram = gram + 1e-7 * window[2 * FIRST, 2 * order] * jnp.eye(js.size, dtype=gram.dtype)
+        side = jnp.conj(seen.ravel())
+        factor = jax.scipy.linalg.cho_factor(gram, lower=True)
+        c = jax.scipy.linalg.cho_solve(factor, side)
+        return total - jnp.real(jnp.conj(side) @ c)
+
+    return jax.lax.map(one, pairs, batch_size=BATCH)
+
+
+def _filled(rows: np.ndarray) -> np.ndarray:
+    """Rows repeated up to one of few lengths: fewer programs to compile."""
+    size = FEW if len(rows) <= FEW else -(-len(rows) // MANY) * MANY
+    return np.concatenate([rows, np.repeat(rows[:1], size - len(rows), axis=0)])
+
+
+def _misfits(light: Any, pairs: np.ndarray, order: int) -> np.ndarray:
+    out = []
+    for first in range(0, len(pairs), MANY):
+        some = pairs[first : first + MANY]
+        found = lattice_misfits(jnp.asarray(_filled(some)), light, order)
+        out.append(np.asarray(found)[: len(some)])
+    return np.concatenate(out)
+
+
+def _scan(light: Any, lines: np.ndarray, order: int) -> tuple[np.ndarray, np.ndarray]:
+    """All pairs of which one of the lines is made, and their misfits."""
+    highest = float(lines[:LINES].max())
+    grid = np.arange(0.5, 0.8 * highest + 0.5, STEP)
+    rows = []
+    for line in lines[:LINES]:
+        rows.append(np.stack([grid, np.full(grid.shape, line)], axis=1))
+        for j in (1, 2):
+            rows.append(np.stack([np.full(grid.shape, line / j), grid], axis=1))
+            for second in (line - j * grid, j * grid - line, line + j * grid):
+                rows.append(np.stack([grid, second], axis=1))
+    pairs = np.concatenate(rows)
+    pairs = pairs[(pairs[:, 1] > 0.5) & (pairs[:, 1] < 1.5 * highest)]
+    return pairs, _misfits(light, pairs, order)
+
+
+def _apart(pairs: np.ndarray, misfits: np.ndarray, count: int) -> np.ndarray:
+    return pairs[_distinct(pairs, misfits, count)]
+
+
+def _distinct(pairs: np.ndarray, misfits: np.ndarray, count: int) -> list[int]:
+    kept: list[int] = []
+    for index in np.argsort(misfits)[:20_000]:
+        if not kept or np.abs(pairs[kept] - pairs[index]).max(axis=1).min() > NEAR:
+            kept.append(int(index))
+        if len(kept) == count:
+            break
+    return kept
+
+
+def _refined(light: Any, pairs: np.ndarray, order: int) -> tuple[np.ndarray, np.ndarray]:
+    """Downhill from neighbour to neighbour, the steps shorter where none is lower."""
+    steps = np.array([(a, b) for a in (-1, 0, 1) for b in (-1, 0, 1)], float)
+    size = np.full(len(pairs), 0.08)
+    least = np.full(len(pairs), np.inf)
+    for _ in range(9):
+        around = pairs[:, None] + size[:, None, None] * steps
+        found = _misfits(light, around.reshape(-1, 2), order).reshape(len(pairs), -1)
+        best = found.argmin(axis=1)
+        least = found.min(axis=1)
+        pairs = pairs + size[:, None] * steps[best]
+        size = np.where(best == 4, 0.4 * size, size)
+    return pairs, least

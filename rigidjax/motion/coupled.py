@@ -1,0 +1,82 @@
+"""A body's state and those of the laws that turn it, integrated together (floor 2)."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+
+from rigidjax import _checks
+from rigidjax._types import HasSpin, ScalarLike
+from rigidjax.body.inertia import Inertia, MassProperties
+from rigidjax.motion.torques.base import in_precision
+from rigidjax.motion.torques.states import first_states, freeze, has_states, rates_of
+
+
+class Coupled(eqx.Module):
+    """The state of a body whose torque has states of its own: what the loops integrate.
+
+    `simulate` makes it by itself, and gives its parts back: `sol.ys` and `sol.own`. It is what
+    `rigidjax.batch.rollout` returns under such a law, and what `rigidjax.conserved` and `energy`
+    take there.
+
+    **Arguments:** `motion` a `Spin`, `Attitude` or `Rigid`; `own` a tuple of the states of each
+    law that has some, see `rigidjax.torques.freeze`.
+
+    >>> from rigidjax import Inertia, Spin, torques
+    >>> wheel = torques.ReactionWheels([[0.0, 0, 1]], [0.1], [30.0])
+    >>> Coupled.start(Inertia.from_principal(1.0, 2.0, 3.0), Spin([0.0, 0, 2.0]), wheel).own
+    (Array([3.2], dtype=float64),)
+    """
+
+    motion: Any
+    own: tuple[Any, ...]
+
+    @staticmethod
+    def start(body: Any, state0: Any, torque: Any, t: ScalarLike = 0.0) -> "Coupled":
+        """The start of `state0` and of the laws in `torque` (see `rigidjax.simulate`) at `t`, s."""
+        _checks.single(body, (Inertia, MassProperties), "body")
+        _checks.single(state0, HasSpin, "state0", wanted="a Spin, an Attitude or a Rigid")
+        dtype = state0.omega.dtype
+        t = _checks.floating(t, (), "t").astype(dtype)
+        own = first_states(in_precision(torque, dtype), t, state0, in_precision(body, dtype))
+        return Coupled(state0, own)
+
+
+class CoupledEquations(eqx.Module):
+    """The equations of a body and of the laws that turn it as a vector field `f(t, y, args)`.
+
+    **Arguments:** `field` the body's own, such as `AttitudeEquations`, whose torque has states;
+    `body`. `rigidjax.equations_of_motion` makes it of a `Coupled`.
+    """
+
+    field: Callable[..., Any]
+    body: Any
+
+    def __call__(self, t: ScalarLike, y: Coupled, args: object = None) -> Coupled:
+        dtype = y.motion.omega.dtype
+        time = _checks.floating(t, (), "t").astype(dtype)
+        law, body = in_precision(self.field, dtype), in_precision(self.body, dtype)
+        own = rates_of(law, time, y.own, y.motion, body)
+        return Coupled(freeze(self.field, y.own)(t, y.motion, args), own)
+
+
+def started(body: Any, state0: Any, torque: Any, t: ScalarLike) -> Any:
+    """`state0`, `Coupled` with the states of the torque where it has some.
+
+    >>> from rigidjax import Spin
+    >>> started(None, Spin([0.0, 0.0, 1.0]), None, 0.0)
+    Spin(omega=f64[3])
+    """
+    if isinstance(state0, Coupled) or not has_states(torque):
+        return state0
+    return Coupled.start(body, state0, torque, t)
+
+
+def motion_of(y: Any) -> Any:
+    """The body's part of a state.
+
+    >>> from rigidjax import Spin
+    >>> motion_of(Coupled(Spin([0.0, 0.0, 1.0]), ()))
+    Spin(omega=f64[3])
+    """
+    return y.motion if isinstance(y, Coupled) else y

@@ -1,0 +1,191 @@
+"""Lyapunov exponents: how fast small errors grow in the long run, in every direction."""
+
+from collections.abc import Callable
+from typing import Any
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
+
+from rigidjax import _checks
+from rigidjax._types import ScalarLike
+from rigidjax.motion import on_the_group
+from rigidjax.solve import validation
+from rigidjax.solve.adaptive import adaptive
+from rigidjax.solve.components import flat, unflat
+from rigidjax.solve.explicit import AbstractExplicit, DormandPrince8
+from rigidjax.solve.tangent import between, dimension, moved
+
+# Neighbouring intervals are not independent: the error is that of the means of so many parts.
+_PARTS = 20
+
+
+class Exponents(eqx.Module):
+    """What `lyapunov_exponents` returns.
+
+    **Fields:** `values` (k,) 1/s, the largest first; `errors` (k,) one standard deviation of them,
+    from how much the means of twenty parts of the run differ; `times` (N,) the ends of the
+    intervals, s; `running` (N, k) what the values would have been by then; `state` at the end;
+    `result` a `diffrax.RESULTS`: `successful`, or why a run failed.
+    """
+
+    values: Float[Array, " k"]
+    errors: Float[Array, " k"]
+    times: Float[Array, " N"]
+    running: Float[Array, "N k"]
+    state: Any
+    result: dfx.RESULTS
+
+
+def lyapunov_exponents(
+    field: Callable[..., Any],
+    state0: Any,
+    time: ScalarLike,
+    *,
+    number: int | None = None,
+    intervals: int = 1000,
+    transient: int = 100,
+    t0: ScalarLike = 0.0,
+    solver: AbstractExplicit | None = None,
+    rtol: ScalarLike | None = None,
+    atol: ScalarLike | None = None,
+    max_steps: int = 100_000,
+) -> Exponents:
+    """The spectrum of Lyapunov exponents along a motion, the largest first.
+
+    Tangents are solved along with the motion and made orthonormal after each interval (QR); the
+    exponents are the means of the logarithms of what they have grown by. Those of an attitude are
+    small turns in body axes, three numbers: |q| is no direction.
+
+    **Arguments:**
+
+    - `field`: f(t, y, args), such as `rj.equations_of_motion(body, state0, torque)`, `scene.field`,
+      or your own on any array or Module of one dtype.
+    - `state0`: the state at `t0`; `time`: how long, s.
+    - `number`: k, how many exponents; `None` for all, 6 for an `Attitude`.
+    - `intervals`: N, how often the tangents are made orthonormal. In one of them no error may grow
+      so much that the others are lost: `time/intervals` up to a few times 1/exponent.
+    - `transient`: intervals at the beginning that are not counted: the state comes to its
+      attractor, and the tangents to their directions.
+    - `solver`, `rtol`, `atol`, `max_steps` (in an interval): as for `simulate`.
+
+    Each conserved quantity, and the direction of the motion itself, gives a zero; it comes down as
+    (log t)/t, and `errors` does not know of such a drift: look at `running`. In a Hamiltonian
+    system the exponents come in pairs ±λ, and their sum is the mean divergence of `field` always.
+
+    **Returns** `Exponents`. Where a run fails they are NaN, and `result` says why.
+
+    Source: Benettin et al. 1980, doi:10.1007/BF02128236; Shimada and Nagashima 1979,
+    doi:10.1143/PTP.61.1605.
+
+    **Raises:** `TypeError`, `ValueError` for numbers that are none.
+
+    >>> still = lambda t, y, args: jnp.array([0.5, -1.0]) * y
+    >>> found = lyapunov_exponents(still, jnp.zeros(2), 10.0, intervals=40, transient=20)
+    >>> [round(float(value), 9) for value in found.values]
+    [0.5, -1.0]
+    """
+    _checks.function(field, "field", "f(t, y, args)")
+    intervals = _checks.whole(intervals, "intervals", _PARTS)
+    transient = _checks.whole(transient, "transient", 0)
+    max_steps = _checks.whole(max_steps, "max_steps", 1)
+    if intervals - transient < _PARTS:
+        raise ValueError(
+            f"intervals: wanted at least {_PARTS} after the transient, got {intervals} in all and "
+            f"a transient of {transient}"
+        )
+    if not isinstance(state0, eqx.Module):
+        state0 = _checks.numbers(state0, "state0")
+    for leaf in jax.tree.leaves(state0):
+        _checks.finite(_checks.numbers(leaf, "state0"), "state0")
+    size = dimension(state0)
+    if not size:
+        raise ValueError("state0: wanted an array or a state of numbers, got none")
+    many = size if number is None else _checks.whole(number, "number", 1)
+    if many > size:
+        raise ValueError(f"number: wanted at most {size}, one for each direction, got {many}")
+    start = flat(state0)
+    length = _checks.time(time, "time").astype(start.dtype)
+    length = _checks.refuse(length, ~(length > 0), "time: wanted a positive time, s")
+    rtol, atol = validation.tolerances(rtol, atol, start.dtype)
+    solver = DormandPrince8() if solver is None else solver
+    _checks.instance(
+        solver, AbstractExplicit, "solver", wanted="an explicit method of rigidjax.solvers"
+    )
+    _require_slope(field, state0)
+    how = _How(solver, many, intervals, transient, max_steps)
+    begin = _checks.time(t0, "t0").astype(start.dtype)
+    return _solved(how, field, state0, begin, length, rtol, atol)
+
+
+def _require_slope(field: Any, state0: Any) -> None:
+    time = jnp.zeros((), flat(state0).dtype)
+    found = eqx.filter_eval_shape(lambda t, y: field(t, y, None), time, state0)
+    wanted = jax.tree.map(jnp.shape, state0)
+    shapes = jax.tree.map(jnp.shape, found)
+    same = jax.tree.structure(found) == jax.tree.structure(state0) and shapes == wanted
+    if not same:
+        raise TypeError(
+            f"field: wanted dy/dt of the shape of state0, {wanted}, got {shapes}; it is called as "
+            "f(t, y, None)"
+        )
+
+
+class _How(eqx.Module):
+    solver: AbstractExplicit
+    many: int = eqx.field(static=True)
+    intervals: int = eqx.field(static=True)
+    transient: int = eqx.field(static=True)
+    max_steps: int = eqx.field(static=True)
+
+
+@eqx.filter_jit
+def _solved(
+    how: _How, field: Any, state0: Any, t0: Array, length: Array, rtol: Any, atol: Any
+) -> Exponents:
+    state0 = on_the_group(state0)
+    step = length / how.intervals
+    size = dimension(state0)
+
+    def interval(carry: Any, i: Array) -> Any:
+        state, frame = carry
+        ts = t0 + jnp.stack([i, i + 1]).astype(t0.dtype) * step
+
+        def end(change: Array) -> Any:
+            run = adaptive(
+                how.solver, field, ts, moved(state, change), rtol=rtol, atol=atol,
+                max_steps=how.max_steps,
+            )  # fmt: skip
+            return flat(jax.tree.map(lambda leaf: leaf[-1], run.ys)), run.result
+
+        still = jnp.zeros(size, t0.dtype)
+        flow, push, result = jax.linearize(end, still, has_aux=True)
+        there = unflat(flow, state)
+
+        def along(direction: Array) -> Array:
+            ahead = push(direction)
+            return jax.jvp(lambda y: between(there, unflat(y, state)), (flow,), (ahead,))[1]
+
+        grown = jax.vmap(along, -1, -1)(frame)
+        frame, triangle = jnp.linalg.qr(grown)
+        logs = jnp.log(jnp.abs(jnp.diagonal(triangle)))
+        good = result == dfx.RESULTS.successful
+        return (there, frame), (jnp.where(good, logs, jnp.nan), result)
+
+    frame = jnp.eye(size, how.many, dtype=t0.dtype)
+    numbers = jnp.arange(how.intervals, dtype=jnp.int32)
+    (state, _), (logs, results) = lax.scan(interval, (state0, frame), numbers)
+    rates = logs[how.transient :] / step
+    count = rates.shape[0]
+    times = t0 + jnp.arange(how.transient + 1, how.intervals + 1).astype(t0.dtype) * step
+    index = jnp.arange(1, count + 1).astype(t0.dtype)
+    running = jnp.cumsum(rates, axis=0) / index[:, None]
+    whole = count // _PARTS * _PARTS
+    means = jnp.mean(rates[count - whole :].reshape(_PARTS, -1, how.many), axis=1)
+    errors = jnp.std(means, axis=0, ddof=1) / jnp.sqrt(jnp.asarray(_PARTS, t0.dtype))
+    first = jnp.argmax(jax.vmap(lambda result: result != dfx.RESULTS.successful)(results))
+    result = jax.tree.map(lambda leaf: leaf[first], results)
+    return Exponents(running[-1], errors, times, running, state, result)

@@ -1,0 +1,124 @@
+"""Tumblers from brightness alone; the oracle is the motion that the light curve was made with."""
+
+import importlib.util
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rigidjax import identify
+from rigidjax.identify import Brightness, Gyro, two_frequencies
+
+_spec: Any = importlib.util.spec_from_file_location(
+    "tumblers", Path(__file__).with_name("tumblers.py")
+)
+tumblers = importlib.util.module_from_spec(_spec)
+sys.modules["tumblers"] = tumblers
+_spec.loader.exec_module(tumblers)
+
+TS = np.linspace(0.0, 1e5, 300)
+RNG = np.random.default_rng(3)
+
+
+def series(pair, order=1):
+    """A random series in two frequencies."""
+    rng = np.random.default_rng(7)
+    total = np.full(TS.shape, 5.0)
+    for j in range(3):
+        for k in range(-order, order + 1):
+            a, b = rng.normal(size=2)
+            angle = 2 * np.pi * (j * pair[0] + k * pair[1]) * TS
+            total = total + a * np.cos(angle) + b * np.sin(angle)
+    return total
+
+
+def test_a_series_in_two_frequencies_is_found():
+    pair = np.array([8.3e-5, 1.31e-4])
+    found = two_frequencies(TS, series(pair) + 0.1 * RNG.normal(size=TS.size), 0.1, shortest=4000.0)
+    best = np.abs(found.frequencies[0] - pair).max()
+    assert best < 0.05 / TS[-1]
+    # χ² of as many readings as are left over.
+    assert abs(found.misfits[0] - found.dof) < 5 * np.sqrt(2 * found.dof)
+    assert found.misfits[1] > 2 * found.misfits[0]
+
+
+def test_its_misfit_is_that_of_dense_least_squares():
+    import jax.numpy as jnp
+
+    from rigidjax.identify.two_frequencies import lattice_misfits
+
+    t, y = np.sort(RNG.uniform(0, 1, 100)), RNG.normal(size=100)
+    sigma = RNG.uniform(0.5, 2.0, 100)
+    pairs = np.array([[7.3, 4.1], [3.2, 9.9]])
+    light = tuple(jnp.asarray(v) for v in (t, y / sigma, 1 / sigma))
+    found = np.asarray(lattice_misfits(jnp.asarray(pairs), light, 2))
+    for pair, misfit in zip(pairs, found, strict=True):
+        columns = [np.ones_like(t)]
+        for j in range(3):
+            for k in range(-2, 3):
+                if j > 0 or k > 0:
+                    angle = 2 * np.pi * (j * pair[0] + k * pair[1]) * t
+                    columns += [np.cos(angle), np.sin(angle)]
+        rows = np.stack(columns, axis=1) / sigma[:, None]
+        _, left, *_ = np.linalg.lstsq(rows, y / sigma, rcond=None)
+        np.testing.assert_allclose(misfit, left[0], rtol=1e-5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("seed", "mode"), [(2, "long"), (7, "short")])
+def test_a_tumbler_is_found_blind(seed, mode):
+    one = tumblers.tumbler(seed, mode)
+    found = identify.fit_light_curve(tumblers.problem(one.recording))
+    times, ratios = tumblers.off(one, found.aliases[0])
+    assert found.ok and times < 1e-3 and ratios < 0.05
+    assert found.aliases[0].mode == mode and not found.rivals
+    truth = np.log([one.rotation, one.precession, *one.moments[:2]])
+    best = found.aliases[0]
+    numbers = np.log([best.rotation, best.precession, *best.ratios])
+    assert (np.abs(numbers - truth) < 5 * found.deviations).all()
+    # The others are listed, and said not to explain it.
+    assert len(found.aliases) > 1 and f"{mode}-axis mode" in str(found)
+
+
+@pytest.mark.slow
+def test_a_light_curve_of_something_else_is_not_called_ok():
+    one = tumblers.tumbler(2, "long")
+    t = np.asarray(one.recording.t)
+    two_spots = 12.0 + 0.3 * np.sin(2 * np.pi * t / 21000.0) ** 3 + 0.3 * np.sin(t / 9000.0) ** 5
+    sensor = one.recording.readings[0].sensor
+    found = identify.fit_light_curve(tumblers.problem(identify.Recording(t, (sensor, two_spots))))
+    assert not found.ok
+
+
+def problem(*readings, torque=None, count=1):
+    t = np.linspace(0.0, 10.0, 60)
+    record = identify.Recording(t, *readings, torque=torque)
+    rows: Any = record if count == 1 else [record] * count
+    return identify.Problem(rows, identify.PrincipalRatios())
+
+
+def test_what_is_refused():
+    light = Brightness([1.0, 0, 0], [0, 1.0, 0], noise=0.1), 2 + np.sin(np.linspace(0, 9, 60))
+    gyro = Gyro(0.1), np.ones((60, 3))
+    with pytest.raises(ValueError, match="wanted one Brightness sensor, got Gyro"):
+        identify.fit_light_curve(problem(gyro))
+    with pytest.raises(ValueError, match="wanted one recording, got 2"):
+        identify.fit_light_curve(problem(light, count=2))
+    with pytest.raises(ValueError, match="times, as the series has, got 5"):
+        two_frequencies(TS[:5], TS[:5])
+    with pytest.raises(ValueError, match="wanted increasing times"):
+        two_frequencies(TS[::-1], TS)
+    with pytest.raises(ValueError, match="contain NaN or infinity; leave gaps out"):
+        two_frequencies(TS, np.nan * TS)
+    with pytest.raises(ValueError, match="noise: wanted positive"):
+        two_frequencies(TS, TS, 0.0)
+
+
+def test_the_typical_rate_is_half_the_strongest_frequency():
+    t = np.sort(RNG.uniform(0, 1e5, 200))
+    values = 5 + np.sin(2 * np.pi * t / 8000.0)
+    sensor = Brightness([1.0, 0, 0], [0, 1.0, 0], noise=0.1)
+    found = identify.Problem(identify.Recording(t, (sensor, values)), identify.PrincipalRatios())
+    np.testing.assert_allclose(found.typical_rate, np.pi / 8000.0, rtol=0.05)

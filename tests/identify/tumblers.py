@@ -1,0 +1,116 @@
+"""Simulated tumblers: light curves of lit ellipsoids, read on some nights with 2 % noise."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import rigidjax as rj
+from rigidjax import exact, identify
+from rigidjax.identify import Brightness, Moment
+
+HOUR, NOISE, COUNT = 3600.0, 0.02, 480
+
+
+class Tumbler(NamedTuple):
+    """The truth: moments over the largest, first state, periods in s; and the recording."""
+
+    mode: str
+    semi_axes: np.ndarray
+    moments: np.ndarray
+    state: rj.Attitude
+    rotation: float
+    precession: float
+    phase: float
+    amplitude: float
+    recording: identify.Recording
+
+
+@jax.jit
+def periods(moments, omega):
+    body = rj.Inertia(jnp.diag(moments))
+    return exact.body_period(body, omega), exact.precession_period(body, omega)
+
+
+@jax.jit
+def brightness(sensor, moments, state, ts):
+    body = rj.Inertia(jnp.diag(moments))
+    motion = exact.FreeBody(body, state)
+
+    def at(t):
+        return sensor.predicted(Moment(t, motion(t), body, lambda t, y, args: y))
+
+    return jax.vmap(at)(ts)
+
+
+def nights(rng):
+    """Times of readings, s: 9 to 12 nights of 6 to 9 hours, some lost, some with a cloud."""
+    out, last = [], int(rng.integers(9, 13))
+    for night in range(last):
+        if night not in (0, 1, 2, last - 2, last - 1) and rng.uniform() < 0.2:
+            continue
+        start = 24 * night + rng.uniform(0, 1)
+        t = np.arange(start, start + rng.uniform(6, 9), 0.1)
+        if rng.uniform() < 0.3:
+            cloud = rng.uniform(t[0], t[-1])
+            t = t[(t < cloud) | (t > cloud + 1.0)]
+        out.append(t)
+    t = np.concatenate(out)
+    # Always as many: one program for all.
+    t = np.sort(rng.choice(t, min(COUNT, t.size), replace=False))
+    return (t - t[0]) * HOUR
+
+
+def tumbler(seed: int, mode: str) -> Tumbler:
+    """One tumbler in long- or short-axis mode, of 4 to 16 hours of precession."""
+    rng = np.random.default_rng(1000 + seed)
+    while True:
+        b = rng.uniform(0.5, 0.9)
+        c = b * rng.uniform(0.6, 0.95)
+        second = np.array([1.0, b * b, c * c])
+        moments = second.sum() - second
+        moments = moments / moments[2]
+        # h²/2T from a spin about the axis of the mode (0) to the separatrix (1).
+        part = rng.uniform(0.15, 0.85)
+        pure = moments[0] if mode == "long" else moments[2]
+        d = pure + part * (moments[1] - pure)
+        x = (1 / d - 1 / moments[2]) / (1 / moments[0] - 1 / moments[2])
+        omega = np.array([np.sqrt(x), 0.0, np.sqrt(1 - x)]) * rng.choice([-1, 1], 3) / moments
+        rotation, precession = map(float, periods(moments, omega))
+        wanted = np.exp(rng.uniform(np.log(4), np.log(16))) * HOUR
+        rotation, omega = rotation * wanted / precession, omega * precession / wanted
+        if rotation < 60 * HOUR:
+            break
+    q = rng.normal(size=4)
+    state = rj.Attitude(q / np.linalg.norm(q), omega)
+    body = rj.Inertia(jnp.diag(jnp.asarray(moments)))
+    state = exact.free_body(body, state, rng.uniform(0, rotation))
+    phase = rng.uniform(10, 50)
+    observer = [np.cos(np.radians(phase)), np.sin(np.radians(phase)), 0.0]
+    sensor = Brightness([1.0, 0.0, 0.0], observer, noise=1.0857 * NOISE, unit="mag")
+    ts = nights(rng)
+    clean = np.asarray(brightness(sensor, jnp.asarray(moments), state, jnp.asarray(ts)))
+    flux = 10 ** (-0.4 * clean)
+    level = rng.uniform(10.0, 20.0)
+    read = level - 2.5 * np.log10(flux * (1 + NOISE * rng.normal(size=ts.size)))
+    amplitude = float(flux.std() / flux.mean())
+    recording = identify.Recording(ts, (sensor, read))
+    semi_axes = np.array([1.0, b, c])
+    return Tumbler(mode, semi_axes, moments, state, rotation, wanted, phase, amplitude, recording)
+
+
+def level(recording: Any) -> Any:
+    return recording.readings[0].sensor.level
+
+
+def problem(recording: identify.Recording) -> identify.Problem:
+    free = [identify.Free(level, "level")]
+    return identify.Problem(recording, identify.PrincipalRatios(), free=free)
+
+
+def off(one: Tumbler, alias: identify.Alias) -> tuple[float, float]:
+    """The largest relative errors of both periods and of both ratios of moments."""
+    times = alias.rotation / one.rotation - 1, alias.precession / one.precession - 1
+    ratios = alias.ratios / one.moments[:2] - 1
+    return max(abs(time) for time in times), float(np.abs(ratios).max())
