@@ -127,7 +127,8 @@ def test_a_page_says_first_what_one_learns(path):
 def test_links_lead_to_files(path):
     for link in _LINK.findall(prose(path)):
         place, _, heading = unquote(link).partition("#")
-        if re.match(r"[a-z]+:", place):
+        # The reference is made by the build of the site, which checks links to it.
+        if re.match(r"[a-z]+:|reference/", place):
             continue
         there = (path.parent / place) if place else path
         assert there.exists(), link
