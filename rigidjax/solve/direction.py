@@ -56,8 +56,10 @@ class DirectedJumps(eqx.Module):
 
     def __call__(self, s: Any, y: Any, args: Any = None) -> Any:
         t = self.sign.astype(s.dtype) * s
-        before = jnp.nextafter(t, jnp.full_like(t, -jnp.inf))
-        shift = lax.stop_gradient(jnp.where(self.sign < 0, before - t, 0))
+        # The oldest JAX has no derivative of `nextafter`, not even one to be stopped.
+        still = lax.stop_gradient(t)
+        before = jnp.nextafter(still, jnp.full_like(still, -jnp.inf))
+        shift = jnp.where(self.sign < 0, before - still, jnp.zeros_like(still))
         slope = self.field(t + shift, y, args)
         return jax.tree.map(lambda leaf: self.sign.astype(leaf.dtype) * leaf, slope)
 

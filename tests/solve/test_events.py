@@ -230,6 +230,22 @@ def test_derivatives_of_an_event(torque):
         np.testing.assert_allclose(second[:, i], wanted, rtol=1e-7, atol=1e-7)
 
 
+@pytest.mark.oldest
+def test_the_slope_of_a_crossing_is_that_of_its_closed_form():
+    # About a principal axis Ω = 1 + τ t/I: 2 at t = I/τ.
+    def time(torque, moment):
+        body = rj.Inertia.from_principal(2.0, 3.0, moment)
+        law = torques.ConstantTorque(jnp.array([0.0, 0.0, 1.0]) * torque)
+        two = lambda t, state, body: state.omega[2] - 2.0
+        return rj.crossings(body, rj.Spin([0.0, 0, 1]), 0.0, 9.0, two, law, max_crossings=1).times[
+            0
+        ]
+
+    value, slopes = once(jax.value_and_grad(time, (0, 1)))(jnp.asarray(0.8), jnp.asarray(4.0))
+    np.testing.assert_allclose([value, *slopes], [5.0, -4.0 / 0.64, 1 / 0.8], rtol=1e-11)
+
+
+@pytest.mark.oldest
 def test_jumps_are_stops_and_have_derivatives():
     # About a principal axis Ω = 1 + (t − edge)/2 from the edge on: 2 at edge + 2.
     body = rj.Inertia.from_principal(2.0, 3.0, 4.0)
