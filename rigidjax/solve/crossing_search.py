@@ -6,8 +6,9 @@ motion give the time and the state by one step of Chebyshev's method,
 
     τ = −(g/ġ)(1 + ½ g g̈/ġ²),   y = y* + f τ + ½ (df/dt) τ².
 
-τ is zero but for round-off, and its first and second derivatives are those of the crossing (the
-error is of third order in what moves). At a touch, ġ = 0, there is none.
+τ is zero but for the error of dense output, and its first and second derivatives are those of the
+crossing (the error is of third order in what moves). At a touch, ġ = 0, there is none. The values
+are those that were found, whether there are derivatives or not.
 """
 
 from collections.abc import Callable
@@ -242,6 +243,10 @@ def _corrected(
     shift = partial(correction, partial(_rates, rules, constants))
     times, states = jax.vmap(shift)(ts, ys, there)
     states = jax.vmap(lambda y: flat(on_the_group(unflat(y, scene.like))))(states)
+    times, states = (
+        value + (a - lax.stop_gradient(a))
+        for value, a in ((ts, times), (lax.stop_gradient(found.states), states))
+    )
     return jnp.where(there, times, jnp.nan), jnp.where(there[:, None], states, jnp.nan)
 
 

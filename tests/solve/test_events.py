@@ -178,6 +178,8 @@ def test_derivatives_of_crossings():
     for a, b in zip(forward, reverse, strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9)
     run = once(numbers)
+    both = once(lambda *at: jax.jvp(lambda level: numbers(*at[:2], level), at[2:], at[2:])[0])
+    np.testing.assert_allclose(both(*at), run(*at), rtol=1e-12, atol=1e-12)
     moves = [*([e, 0.0, 0.0] for e in np.eye(3)), [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
     found = np.column_stack([forward[0], forward[1], forward[2]])
     for column, move in zip(found.T, moves, strict=True):
