@@ -18,7 +18,11 @@ Project = Callable[[Array], Array]
 
 
 def width(number: int) -> int:
-    """How many times a step looks at together, of that number in a run."""
+    """How many times a step looks at together, of that number in a run.
+
+    One step's share of them where there are fifty steps: each costs a step some work, there or not,
+    and a step with more in it is taken again. Between 4 and 16 was measured to be quickest.
+    """
     return min(number, max(4, min(number // 50, 16)))
 
 

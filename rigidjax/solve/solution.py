@@ -107,8 +107,8 @@ class Solution(eqx.Module, Generic[State]):
     def evaluate(self, t: ScalarLike) -> State:
         """The state at any `t` between the first and the last of `ts`, s.
 
-        The motion is worked out again from the last saved state before `t`, so the error is that of
-        the method, not of an interpolation, and the attitude is on the group.
+        The motion is worked out again from the last saved state before `t`, with steps of its own,
+        and the attitude is on the group.
 
         **Raises:** `ValueError` (`EquinoxRuntimeError` under `jit`) where `t` is outside.
         """

@@ -81,7 +81,7 @@ def tolerances(rtol: Any, atol: Any, dtype: Any) -> tuple[Any, Any]:
         advice = "" if double else "; set jax.config.update('jax_enable_x64', True) for float64"
         warnings.warn(
             f"simulate: {np.dtype(dtype).name} cannot reach rtol={rtol:g}; "
-            f"using {floor:.1g}{advice}",
+            f"using {floor:.2g}{advice}",
             stacklevel=3,
         )
         rtol = floor

@@ -68,6 +68,20 @@ def test_what_simulate_saves_is_as_good_as_where_it_ends():
     np.testing.assert_allclose(jnp.linalg.norm(fine.q, axis=1), 1.0, rtol=0, atol=1e-14)
 
 
+def test_saved_states_beside_a_closed_form():
+    # About a principal axis Ω = Ω₀ exp(−c t/I): few long steps, 300 times between them.
+    ts, law = jnp.linspace(0.0, 10.0, 301), rj.torques.Damping([0.3, 0.2, 0.5])
+    body = rj.Inertia.from_principal(1.6, 2.0, 3.0)
+    for solver in (rj.solvers.RungeKutta4(), rj.solvers.Tsitouras5(), rj.solvers.DormandPrince8()):
+        for rtol in (1e-5, 1e-9):
+            ys = rj.simulate(
+                body, rj.Spin([0.0, 0.0, 3.0]), ts, law, solver=solver, rtol=jnp.asarray(rtol),
+                atol=1e-3 * rtol,
+            ).ys  # fmt: skip
+            error = jnp.abs(ys.omega[:, 2] - 3.0 * jnp.exp(-0.5 * ts / 3.0)).max()
+            assert error < 10 * rtol * 3.0
+
+
 def test_single_precision_is_on_the_group():
     single = lambda tree: jax.tree.map(lambda leaf: leaf.astype(jnp.float32), tree)
     q = rj.simulate(single(BODY), single(START), TS.astype(jnp.float32), TOP).ys.q

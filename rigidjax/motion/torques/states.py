@@ -78,8 +78,8 @@ def require_stateless(law: Any, what: str) -> None:
     if has_states(law):
         raise ValueError(
             f"{what}: wanted a torque without states of its own, got one that has some (such as "
-            "ReactionWheels or Lagged); integrate rigidjax.equations_of_motion under diffrax with "
-            "an event of its, or freeze the states (rigidjax.torques.freeze)"
+            "ReactionWheels or Lagged); integrate rigidjax.equations_of_motion with "
+            "diffrax.diffeqsolve and diffrax.Event, or freeze the states (rigidjax.torques.freeze)"
         )
 
 
