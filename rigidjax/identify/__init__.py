@@ -30,6 +30,7 @@ from rigidjax.identify.files import (
 )
 from rigidjax.identify.fit import Fit as Fit, Start as Start, fit as fit
 from rigidjax.identify.free import Free as Free
+from rigidjax.identify.horizons import Horizons as Horizons
 from rigidjax.identify.light_curve import (
     Alias as Alias,
     LightCurve as LightCurve,
@@ -68,12 +69,7 @@ from rigidjax.identify.two_frequencies import (
     TwoFrequencies as TwoFrequencies,
     two_frequencies as two_frequencies,
 )
-from rigidjax.identify.windows import (
-    Horizons as Horizons,
-    WindowFit as WindowFit,
-    Windows as Windows,
-    fit_windows as fit_windows,
-    windows as windows,
-)
+from rigidjax.identify.window_fit import WindowFit as WindowFit, fit_windows as fit_windows
+from rigidjax.identify.windows import Windows as Windows, windows as windows
 
 __dir__ = own_names(__name__)

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from motion.drive import Drive
 from once import filter_once, once
 
 import rigidjax as rj
@@ -14,15 +15,8 @@ BODY = rj.Inertia.from_principal(1.0, 2.0, 2.5)
 ROWS = np.random.default_rng(0).normal(size=(2, STEPS))
 
 
-class Turn(torques.AbstractTorque):
-    """A torque about the third axis, the square of what is given: what is held must not be mixed."""
-
-    feels = rj.HasSpin
-    source: object
-
-    @property
-    def jump_times(self):
-        return getattr(self.source, "jump_times", jnp.zeros(0))
+class Turn(Drive):
+    """The square of what is given: what is held must not be mixed."""
 
     def __call__(self, t, state, body):
         return jnp.stack([0.0, 0.0, 1.0]) * self.source(t) ** 2

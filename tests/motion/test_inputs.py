@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from motion.drive import Drive
 
 import rigidjax as rj
 from rigidjax import torques
@@ -11,20 +12,6 @@ from rigidjax import torques
 H, STEPS = 0.05, 12
 MOMENTS = np.array([1.0, 2.0, 2.5])
 BODY = rj.Inertia(np.diag(MOMENTS))
-
-
-class Drive(torques.AbstractTorque):
-    """A torque about the third axis, as given."""
-
-    feels = rj.HasSpin
-    source: object
-
-    @property
-    def jump_times(self):
-        return getattr(self.source, "jump_times", jnp.zeros(0))
-
-    def __call__(self, t, state, body):
-        return jnp.stack([0.0, 0.0, 1.0]) * self.source(t)
 
 
 def spins(many):

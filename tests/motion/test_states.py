@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from motion.drive import Drive
 from once import filter_once, once
 from scipy.integrate import solve_ivp
 
@@ -175,20 +176,6 @@ def test_derivatives_are_those_of_differences():
         )
 
 
-class Turn(torques.AbstractTorque):
-    """A torque about the third axis."""
-
-    feels = rj.HasSpin
-    source: object
-
-    @property
-    def jump_times(self):
-        return getattr(self.source, "jump_times", jnp.zeros(0))
-
-    def __call__(self, t, state, body):
-        return jnp.stack([0.0, 0.0, 1.0]) * self.source(t)
-
-
 def lagged(t, lag):
     """∫ of 1 − exp(−t/T), and its derivative by T."""
     fade = np.exp(-t / lag)
@@ -202,7 +189,7 @@ def test_a_lag_in_closed_form():
     body = rj.Inertia.from_principal(2.0, 2.0, 2.0)
 
     def end(lag):
-        law = Turn(torques.Lagged(torques.Held([0.0, 9.0], [1.0, 1.0]), lag, 0.0))
+        law = Drive(torques.Lagged(torques.Held([0.0, 9.0], [1.0, 1.0]), lag, 0.0))
         sol = rj.simulate(body, rj.Spin([0.0, 0, 0]), [0.0, 0.7], law)
         return sol.ys.omega[-1, 2], sol.own[0][-1]
 
@@ -214,7 +201,7 @@ def test_a_lag_in_closed_form():
     np.testing.assert_allclose(value, 1 - np.exp(-0.7 / 0.3), rtol=1e-10)
     np.testing.assert_allclose(slope, by_lag / 2, rtol=1e-8)
     twice = torques.Lagged(torques.Lagged(lambda t: jnp.ones(()), 0.3, 0.0), 0.3, 0.0)
-    sol = rj.simulate(body, rj.Spin([0.0, 0, 0]), [0.0, 0.7], Turn(twice))
+    sol = rj.simulate(body, rj.Spin([0.0, 0, 0]), [0.0, 0.7], Drive(twice))
     x = 0.7 / 0.3
     np.testing.assert_allclose(
         [sol.own[0][-1], sol.own[1][-1]], [1 - np.exp(-x), 1 - np.exp(-x) * (1 + x)], rtol=1e-9
@@ -225,7 +212,7 @@ def test_a_lag_of_inputs_in_a_batch():
     """Samples of each body through a lag, held: the exact lag of a staircase, to the steps' order."""
     h, lag = 0.01, 0.2
     rows = np.random.default_rng(1).normal(size=(2, 40))
-    law = Turn(torques.Lagged(torques.Input("u"), lag))
+    law = Drive(torques.Lagged(torques.Input("u"), lag))
     found = rj.batch.rollout(
         rj.Inertia.from_principal(1.0, 1.0, 1.0), rj.Spin(np.zeros((2, 3))), h, 40, law,
         inputs={"u": rows}, save_every=1,
@@ -329,7 +316,7 @@ def made(**change):
         (lambda: torques.Flywheel(torques.Lagged(lambda t: jnp.ones(3), 1.0)), TypeError, "see ReactionWheels"),
         (lambda: torques.Lagged(1.0, 1.0), TypeError, "source: wanted a function of time"),
         (lambda: torques.Lagged(lambda t: t, 0.0), ValueError, "time: wanted a positive time"),
-        (lambda: rj.simulate(BODY, START, TS, Turn(torques.Lagged(lambda t: t, 0.1, [1.0, 2.0]))), ValueError, r"start has the shape \(2,\)"),
+        (lambda: rj.simulate(BODY, START, TS, Drive(torques.Lagged(lambda t: t, 0.1, [1.0, 2.0]))), ValueError, r"start has the shape \(2,\)"),
         (lambda: torques.Delayed(torques.Lagged(lambda t: t, 1.0), 0.1), TypeError, "delay what goes into it"),
         (lambda: rj.batch.rollout(BODY, rj.Attitude(START.q[None], START.omega[None]), 0.1, 2, WHEELS, solver=rj.solvers.Magnus4()), TypeError, "no equal steps of Magnus4 on Coupled"),
         (lambda: rj.simulate(BODY, START, TS, WHEELS, solver=rj.solvers.Splitting4()), TypeError, "Splitting: wanted AttitudeEquations"),

@@ -1,0 +1,68 @@
+"""Open-loop runs of a model from the starts of windows, and their errors."""
+
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array
+
+from rigidjax.identify.horizons import Horizons, between, by_horizon, kinds_of
+from rigidjax.identify.windows import Windows
+from rigidjax.motion.coupled import Coupled, motion_of, started
+from rigidjax.motion.torques.inputs import bind
+from rigidjax.solve import equations_of_motion
+from rigidjax.solve.components import split
+from rigidjax.solve.fixed_loop import first_row, step
+from rigidjax.solve.steppers import stepper_of
+
+Value = TypeVar("Value")
+
+
+def errors_by_horizon(
+    windows: Windows, scene: Callable[[Value], tuple[Any, Any]], value: Value
+) -> Horizons:
+    """The open-loop errors of a model with these numbers, step by step.
+
+    **Arguments:** as for `fit_windows`, with the free numbers `value`.
+    """
+    ones = {kind: jnp.ones(()) for kind in kinds_of(windows.starts)}
+    found = _all_errors(scene, windows.step, value, windows, ones)
+    return by_horizon(found)
+
+
+def open_loop_errors(
+    scene: Any, h: float, value: Any, start: Any, wanted: Any, inputs: Any, scales: Any
+) -> dict[str, Array]:
+    """The errors of one window, by kind (L, 3), in units of `scales`."""
+    body, law = scene(value)
+    size, length = jnp.asarray(h, wanted.omega.dtype), wanted.omega.shape[0]
+    before = next(iter(inputs.values())).shape[0] - length if inputs else 0
+    start = started(body, start, bind(law, first_row(law, size, inputs)), 0.0)
+    stepper = stepper_of(None, equations_of_motion(body, start, law), start)
+
+    def one(y: Any, i: Array) -> tuple[Any, Any]:
+        y = step(stepper, size, jnp.zeros_like(size), i, y, inputs or None, before)
+        return y, motion_of(stepper.state(y))
+
+    def ahead(y: Any, i: Array) -> tuple[Any, None]:
+        # The law's own states follow the inputs; the body stays as it was measured.
+        y = step(stepper, size, jnp.zeros_like(size), i, y, inputs, before)
+        return split(Coupled(start.motion, stepper.state(y).own)), None
+
+    y0 = stepper.start
+    if before and isinstance(start, Coupled):
+        y0, _ = lax.scan(ahead, y0, jnp.arange(-before, 0, dtype=jnp.int32))
+    _, states = lax.scan(one, y0, jnp.arange(length, dtype=jnp.int32))
+    return {k: v / scales[k] for k, v in between(states, wanted).items()}
+
+
+@eqx.filter_jit
+def _all_errors(scene: Any, h: float, value: Any, windows: Windows, scales: Any) -> Any:
+    def one(window: Any) -> Any:
+        start, wanted, inputs = window
+        return open_loop_errors(scene, h, value, start, wanted, inputs, scales)
+
+    parts = (windows.starts, windows.wanted, windows.inputs)
+    return lax.map(one, parts, batch_size=min(128, windows.count))

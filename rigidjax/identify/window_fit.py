@@ -1,0 +1,221 @@
+"""The fit of a model to many short open-loop runs: Gauss and Newton over windows."""
+
+from collections.abc import Callable, Mapping
+from typing import Any, Generic, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array
+
+from rigidjax import _checks
+from rigidjax.body.inertia import Inertia, MassProperties
+from rigidjax.identify.horizons import Horizons, between, kinds_of
+from rigidjax.identify.levenberg_marquardt import BOLD, Search, Settings, search
+from rigidjax.identify.open_loop import errors_by_horizon, open_loop_errors
+from rigidjax.identify.window_starts import eliminated, moved, precisions, with_jacobian
+from rigidjax.identify.windows import Windows
+from rigidjax.motion.torques.inputs import delays_of, require_inputs
+from rigidjax.solve.validation import require_fit
+
+Value = TypeVar("Value")
+# Windows side by side: with their tangents they fill the first cache.
+_SIDE_BY_SIDE = 8
+# A step of so many standard deviations, if errors were as large as `noise`, is the last.
+_SETTLED = 1e-5
+
+
+class WindowFit(eqx.Module, Generic[Value]):
+    """What `fit_windows` returns.
+
+    **Fields:** `value` the free numbers, of the type of the guess; `deviation` their standard
+    deviations, from how the windows differ (sandwich; of windows that overlap they are too small);
+    `cost` half the mean square, errors in units of `noise`; `noise` by kind; `steps` taken;
+    `converged`; `message` what there is to say.
+    """
+
+    value: Value
+    deviation: Value
+    cost: float
+    noise: dict[str, float]
+    steps: int
+    converged: bool
+    message: str
+    scene: Callable[[Value], tuple[Any, Any]]
+
+    def predict(self, windows: Windows) -> Horizons:
+        """The errors at every horizon, of these windows or of others."""
+        return errors_by_horizon(windows, self.scene, self.value)
+
+
+def fit_windows(
+    windows: Windows,
+    scene: Callable[[Value], tuple[Any, Any]],
+    guess: Value,
+    *,
+    noise: Mapping[str, float] | None = None,
+    starts: Mapping[str, float] | None = None,
+    max_steps: int = 50,
+) -> WindowFit[Value]:
+    """The free numbers with which open-loop runs of all windows come nearest to what was measured.
+
+    **Arguments:** `windows`; `scene` a function of the free numbers → (body, torque), whose torque
+    reads the inputs of the windows; `guess` the free numbers to begin with, any tree of arrays;
+    `noise` by kind (`x`, `v`, `q`, `omega`) what an error is measured in: by default the rms of a
+    prediction that holds the state at the start; `starts` by kind how far the measured starts may
+    be off (a standard deviation, beside the `noise` of the readings, which must be given with it;
+    `np.inf`: the start is free); `None` takes them as they were measured; `max_steps` of the
+    search. Steps of the motion are those of `RungeKutta4`, one a sample.
+
+    Levenberg–Marquardt (`rigidjax.identify.levenberg_marquardt`) on normal equations that are
+    summed window by window, so that memory does not grow with their number. Starts that may be off
+    are found window by window, and taken out of the normal equations (variable projection).
+
+    **Returns** a `WindowFit`; a fit that ends early returns its best point and says so.
+
+    **Raises:** `ValueError` for inputs that are missing, kinds that there are not, a guess whose
+    runs are not finite; `TypeError` where body, states and torque do not fit.
+
+    >>> import rigidjax as rj
+    >>> t = np.linspace(0.0, 1.0, 11)
+    >>> spin = rj.Spin(np.stack([0 * t, 0 * t, np.exp(-0.5 * t)], 1))
+    >>> body = rj.Inertia.from_principal(1.0, 1.0, 1.0)
+    >>> scene = lambda k: (body, rj.torques.Damping(k * jnp.ones(3)))
+    >>> found = fit_windows(rj.identify.windows(t, spin, length=5), scene, jnp.asarray(0.1))
+    >>> round(float(found.value), 6)
+    0.5
+    """
+    max_steps = _checks.whole(max_steps, "max_steps", 1)
+    _require_windows(windows)
+    _checks.function(scene, "scene", "of the free numbers to (body, torque)")
+    leaves, tree = jax.tree.flatten(guess)
+    leaves = [_checks.finite(_checks.numbers(leaf, "guess"), "guess") for leaf in leaves]
+    x, back = ravel_pytree(jax.tree.unflatten(tree, leaves))
+    if not x.size:
+        raise ValueError("guess: wanted a tree of floating numbers, at least one")
+    guess = back(x)
+    made: Any = scene(guess)
+    if not isinstance(made, tuple) or len(made) != 2:
+        raise TypeError(f"scene: wanted (body, torque), got {type(made).__name__}")
+    body, law = made
+    start = jax.tree.map(lambda a: a[0], windows.starts)
+    require_fit(body, start, law)
+    require_inputs(law, windows.inputs)
+    _require_delays(windows, law)
+    scales = _scales(windows, noise)
+    firm = precisions(starts, kinds_of(windows.starts), noise)
+    settings = Settings(_SETTLED, BOLD, max_steps)
+    end = _searched(scene, windows.step, guess, windows, scales, firm, settings)
+    if not np.isfinite(end.cost):
+        raise ValueError("guess: the runs from it are not finite; is the scene right?")
+    value, taken = back(end.point), int(end.taken) - 1
+    # Once more where it ended: the last that was tried may have been no better.
+    still = Settings(_SETTLED, BOLD, 0)
+    there = _searched(scene, windows.step, value, windows, scales, firm, still)
+    inverse = np.linalg.pinv(np.asarray(there.gram))
+    spread = inverse @ np.asarray(there.found) @ inverse
+    deviation = np.sqrt(np.clip(np.diag(spread), 0, None))
+    converged = bool(end.converged)
+    message = [] if converged else [f"stopped after {taken} steps: its best point"]
+    try:
+        _require_real(scene(value)[0])
+    except ValueError as refused:
+        message.append(f"no real body has these numbers: {refused}")
+    try:
+        _require_delays(windows, scene(value)[1])
+    except ValueError as refused:
+        message.append(str(refused))
+    kinds = {k: float(v) for k, v in scales.items()}
+    return WindowFit(
+        value,
+        back(jnp.asarray(deviation)),
+        float(end.cost) / (windows.count * windows.length),
+        kinds,
+        taken,
+        converged,
+        "; ".join(message),
+        scene,
+    )
+
+
+def _require_windows(windows: Any) -> None:
+    _checks.instance(windows, Windows, "windows", wanted="what identify.windows returns")
+    for name in ("starts", "wanted"):
+        for leaf in jax.tree.leaves(getattr(windows, name)):
+            if leaf.ndim != (2 if name == "starts" else 3) or not leaf.shape[0]:
+                raise ValueError(
+                    f"windows: wanted a row for each of N windows in {name}, got {leaf.shape}"
+                )
+            _checks.finite(leaf, f"windows: {name}")
+
+
+def _require_delays(windows: Windows, law: Any) -> None:
+    """Raise `ValueError` for a delay beyond the inputs that the windows know."""
+    known = windows.before * windows.step
+    for name, delay in delays_of(law):
+        if float(delay) > known:
+            raise ValueError(
+                f"inputs[{name!r}]: a delay of {float(delay):.6g} s, and inputs that are known "
+                f"{known:.6g} s before a window: cut them with windows(…, before=k)"
+            )
+
+
+def _require_real(body: Any) -> None:
+    """Raise `ValueError` for numbers that no body has: inside a trace nobody looked."""
+    if isinstance(body, MassProperties):
+        MassProperties(body.mass, body.com, body.second_moment)
+    else:
+        Inertia.from_tensor(body.tensor)
+
+
+def _scales(windows: Windows, noise: Mapping[str, float] | None) -> dict[str, Array]:
+    kinds = kinds_of(windows.starts)
+    if noise is not None:
+        if not isinstance(noise, Mapping):
+            raise TypeError(f"noise: wanted numbers by kind, got {type(noise).__name__}")
+        if set(noise) != set(kinds):
+            raise ValueError(f"noise: wanted a number for each of {kinds}, got {tuple(noise)}")
+        return {k: jnp.asarray(_checks.positive(noise[k], f"noise[{k!r}]")) for k in kinds}
+    held = jax.tree.map(
+        lambda a, b: jnp.broadcast_to(a[:, None], b.shape), windows.starts, windows.wanted
+    )
+    rms = {k: jnp.sqrt(jnp.mean(v * v)) for k, v in between(held, windows.wanted).items()}
+    return {k: jnp.where(v > 0, v, 1.0) for k, v in rms.items()}
+
+
+@eqx.filter_jit
+def _searched(
+    scene: Any, h: float, guess: Any, windows: Windows, scales: Any, firm: Any, settings: Settings
+) -> Search:
+    """The search from `guess`; what it keeps is the spread of the windows' gradients (n, n)."""
+    x, back = ravel_pytree(guess)
+    parts = (windows.starts, windows.wanted, windows.inputs)
+
+    def of_one(x: Array, window: Any) -> Any:
+        start, wanted, inputs = window
+
+        def errors(x: Array, start: Any) -> Array:
+            return ravel_pytree(open_loop_errors(scene, h, back(x), start, wanted, inputs, scales))[
+                0
+            ]
+
+        if firm is not None:
+            held = jnp.repeat(jnp.stack([firm[kind] for kind in scales]), 3)
+            cost, gram, slope = eliminated(
+                lambda x, step: errors(x, moved(start, step, scales)), x, held
+            )
+            return slope[:, None] * slope[None], cost, gram, slope
+
+        jacobian, flat = with_jacobian(lambda x: errors(x, start), x)
+        slope = jacobian.T @ flat
+        return slope[:, None] * slope[None], 0.5 * flat @ flat, jacobian.T @ jacobian, slope
+
+    def evaluated(x: Array) -> Any:
+        few = min(_SIDE_BY_SIDE, windows.count)
+        found = lax.map(lambda window: of_one(x, window), parts, batch_size=few)
+        return jax.tree.map(lambda a: jnp.sum(a, 0), found)
+
+    return search(evaluated, x, jnp.zeros_like(x), settings, jnp.zeros((x.size, x.size), x.dtype))
