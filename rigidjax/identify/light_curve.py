@@ -116,7 +116,8 @@ def fit_light_curve(
     Sources: Pravec et al. 2005, Icarus 173:108, doi:10.1016/j.icarus.2004.07.021; Kaasalainen 2001,
     A&A 376:302, doi:10.1051/0004-6361:20010935.
 
-    **Raises:** `ValueError` for a problem with other sensors, several recordings or a torque.
+    **Raises:** `ValueError` for a problem with other sensors, several recordings or a torque;
+    `TypeError` under a trace.
     """
     reading = _only(problem)
     _checks.whole(count, "count", 1)
@@ -152,6 +153,11 @@ def _silent(line: str) -> None:
 def _only(problem: Problem) -> Any:
     """The reading of the only sensor, one light curve of a free body."""
     one_problem(problem)
+    if not _checks.known(problem):
+        raise TypeError(
+            "problem: wanted known numbers, got traced ones; a search works on the host: call it "
+            "outside of jax.jit, jax.grad and jax.vmap"
+        )
     readings = problem.records.readings
     kinds = ", ".join(type(r.sensor).__name__ for r in readings)
     if len(readings) != 1 or not isinstance(readings[0].sensor, Brightness):

@@ -20,6 +20,8 @@ LINES, STEP = 3, 0.1
 NEAR = 0.25
 # How many pairs are refined for each that is wanted.
 TRIED = 2
+# Squares of what is larger may overflow; a spectrum of more lines takes hours.
+LARGEST, MOST = 1e100, 1e5
 # Programs are compiled for times in multiples of so many, and for so many pairs at a time.
 BLOCK, BATCH, FEW, MANY = 256, 32, 256, 2048
 
@@ -85,12 +87,27 @@ def two_frequencies(
         raise ValueError("t: wanted increasing times")
     sigma = np.ones(t.shape)
     if noise is not None:
-        sigma = np.broadcast_to(_checks.on_host(noise, "noise"), t.shape)
-        if not (sigma > 0).all():
+        given = _checks.on_host(noise, "noise")
+        if given.shape not in ((), t.shape):
+            raise ValueError(f"noise: wanted one number or (T,) as t has, got shape {given.shape}")
+        if not (np.isfinite(given) & (given > 0)).all():
             raise ValueError("noise: wanted positive standard deviations")
+        sigma = np.broadcast_to(given, t.shape)
+    with np.errstate(over="ignore"):
+        worst = max(np.abs(y).max() / sigma.min(), 1 / sigma.min(), sigma.max())
+    if worst > LARGEST:
+        raise ValueError(
+            f"values: wanted numbers, noise and their ratios up to {LARGEST:.0e}, since their "
+            f"squares are added, got {worst:.3g}; give both in another unit"
+        )
     span = float(t[-1] - t[0])
     typical = float(np.median(np.diff(t)))
     least = 4.0 * typical if shortest is None else _checks.positive(shortest, "shortest")
+    if span / least > MOST:
+        raise ValueError(
+            f"shortest: {least:.3g} s, and a light curve of {span:.3g} s: wanted at most "
+            f"{MOST:.0e} periods in it"
+        )
     light = _padded((t - t[0]) / span, y / sigma, 1.0 / sigma)
     lines = strongest(light, span / least, 2 * LINES)
     pairs = _apart(*_scan(light, lines, order), count * TRIED)

@@ -114,6 +114,12 @@ def test_what_is_refused():
         two_frequencies(TS, np.nan * TS)
     with pytest.raises(ValueError, match="noise: wanted positive"):
         two_frequencies(TS, TS, 0.0)
+    with pytest.raises(ValueError, match=r"noise: wanted one number or \(T,\)"):
+        two_frequencies(TS, TS, np.ones(2))
+    with pytest.raises(ValueError, match="their squares are added, got inf; give both in another"):
+        two_frequencies(TS, TS, 1e-320)
+    with pytest.raises(ValueError, match="wanted at most 1e.05 periods in it"):
+        two_frequencies(TS, TS, 0.1, shortest=1e-9)
 
 
 def test_the_typical_rate_is_half_the_strongest_frequency():
