@@ -118,7 +118,7 @@ def test_what_is_refused():
         two_frequencies(TS, TS, np.ones(2))
     with pytest.raises(ValueError, match="their squares are added, got inf; give both in another"):
         two_frequencies(TS, TS, 1e-320)
-    with pytest.raises(ValueError, match="wanted at most 1e.05 periods in it"):
+    with pytest.raises(ValueError, match=r"wanted at most 1e.05 periods in it"):
         two_frequencies(TS, TS, 0.1, shortest=1e-9)
 
 
