@@ -1,5 +1,6 @@
 """What of a recording's torque and sensors a fit may move."""
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -18,9 +19,11 @@ class Free(eqx.Module):
 
     **Arguments:** `where` picks it: `lambda r: r.readings[0].sensor.bias`, or
     `lambda r: r.torque.coefficient`; what the recording holds there is the starting value. `name`
-    for reports. `scale` its natural size: a step of one in the fit is one `scale`, in its unit.
-    `each`: `False` for one value for all recordings, `True` for one for each, `"body"` for one for
-    each body, or a sequence of labels, one for each recording: those of the same label share one.
+    for reports, `unit` too; `None` names that of a bias, a delay or a clock offset, a mounting or
+    tilt, and a place. `scale` its natural size: a step of one in the fit is one `scale`, in its
+    unit. `each`: `False` for one value for all recordings, `True` for one for each, `"body"` for
+    one for each body, or a sequence of labels, one for each recording: those of the same label
+    share one.
     `positive`: moved through its logarithm, so that it keeps its sign. `prior` a standard deviation
     around the starting value (a Gaussian prior, in its unit; relative for `positive`), or `None`.
     `spread`: each recording deviates from the shared value by a number of its own, with this
@@ -41,6 +44,7 @@ class Free(eqx.Module):
     positive: bool
     prior: float | None
     spread: float | None
+    unit: str | None
 
     def __init__(
         self,
@@ -52,10 +56,12 @@ class Free(eqx.Module):
         positive: bool = False,
         prior: float | None = None,
         spread: float | None = None,
+        unit: str | None = None,
     ):
         _checks.function(where, "where", "of a recording, such as lambda r: r.torque.coefficient")
         _checks.instance(name, str, "name")
         self.where, self.name = where, name
+        self.unit = None if unit is None else _checks.instance(unit, str, f"Free {name!r}: unit")
         self.scale = _checks.positive(scale, f"Free {name!r}: scale")
         self.each = shares(each, f"Free {name!r}: each")
         self.positive = positive
@@ -91,6 +97,7 @@ class Slot(eqx.Module):
 
     leaf: int = eqx.field(static=True)
     name: str = eqx.field(static=True)
+    unit: str = eqx.field(static=True)
     each: bool = eqx.field(static=True)
     positive: bool = eqx.field(static=True)
     labels: tuple[str, ...] = eqx.field(static=True)
@@ -117,9 +124,7 @@ class Slot(eqx.Module):
 
     def alone(self) -> "Slot":
         """The same in a problem of one recording."""
-        return Slot(
-            self.leaf, self.name, False, self.positive, (), None, self.scale, self.prior, None
-        )
+        return dataclasses.replace(self, each=False, labels=(), groups=None, spread=None)
 
 
 def grouped(
@@ -177,10 +182,27 @@ def find(free: Sequence[Free], recording: Recording, of: Sequence[str] = ("",)) 
         alone, groups, labels = item.each is True, None, ()
         if not isinstance(item.each, bool):
             groups, labels = grouped(item.each, of, f"Free {item.name!r}")
+        unit = _unit_of(recording, index) if item.unit is None else item.unit
         slots.append(
-            Slot(index, item.name, alone, item.positive, labels, groups, scale, prior, wide)
+            Slot(index, item.name, unit, alone, item.positive, labels, groups, scale, prior, wide)
         )
     return tuple(slots)
+
+
+_UNITS = {"offset": "s", "delay": "s", "mounting": "rad", "tilt": "rad", "place": "m"}
+
+
+def _unit_of(recording: Recording, index: int) -> str:
+    """The unit of a leaf of a recording, as far as its name says."""
+    path, _ = jax.tree.leaves_with_path(recording)[index]
+    *way, last = path
+    name = getattr(last, "name", "")
+    if name != "bias":
+        return _UNITS.get(name, "")
+    holder: Any = recording
+    for key in way:
+        holder = getattr(holder, key.name) if hasattr(key, "name") else holder[key.idx]
+    return getattr(holder, "unit", "")
 
 
 def put(recording: Recording, slots: Sequence[Slot], values: Sequence[Array]) -> Recording:

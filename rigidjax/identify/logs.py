@@ -273,7 +273,7 @@ def _free(first: Recording, typical: float, free: Sequence[str]) -> list[Free]:
         if isinstance(sensor, Accelerometer):
             items.append(Free(place(index), f"{name} place", scale=0.01))
     if "drag" in free:
-        items.append(Free(drag, "drag", scale=0.1 * typical))
+        items.append(Free(drag, "drag", scale=0.1 * typical, unit="N m s"))
     if "delay" in free and isinstance(first.torque, Sum):
         wheels = len(first.torque.parts) - ("drag" in free)
         items += [Free(delay(i), "wheel delay", scale=1e-3, each=True) for i in range(wheels)]

@@ -53,10 +53,12 @@ def labels(problem: Problem) -> list[tuple[str, str, bool]]:
         parts = [""] if not shape else [f" {_place(i)}" for i in np.ndindex(shape)]
         groups = names if slot.each else [f" [{label}]" for label in slot.labels] or [""]
         for where in groups:
-            out += [(f"{slot.name}{part}{where}", "", slot.positive) for part in parts]
+            out += [(f"{slot.name}{part}{where}", slot.unit, slot.positive) for part in parts]
         if slot.spread is not None:
             for where in names:
-                out += [(f"{slot.name}{part}, own{where}", "", slot.positive) for part in parts]
+                out += [
+                    (f"{slot.name}{part}, own{where}", slot.unit, slot.positive) for part in parts
+                ]
     return out
 
 

@@ -6,18 +6,23 @@ import numpy as np
 
 from rigidjax.plot.style import COLOURS, TIMES, of_fit, pyplot, unit
 
+# Frequencies of an uneven record, at most.
+_MOST = 2000
+
 
 def residuals(
     found: Any, *, index: int = 0, time_unit: str = "s", title: str = "", ax: Any = None
 ) -> Any:
-    """Residuals of each sensor over its noise: against time, their spread, their memory.
+    """Residuals of each sensor over its noise: in time, histogram, autocorrelation, spectrum.
 
-    Left: they should scatter evenly within ±2 (what lies beyond ±8 is counted, not drawn).
-    Middle: their histogram against the normal curve. Right: the correlation of each with a later
-    one; white noise stays inside the band ±2/√N.
+    From left to right: they should scatter evenly within ±2 (what lies beyond ±8 is counted, not
+    drawn); their histogram against the normal curve; the correlation of each with a later one,
+    which for white noise stays inside the band ±2/√N; their power spectrum, which for white noise
+    of the given size is 1 at all frequencies (Welch's estimate; Lomb's where times are uneven).
+    A line in the spectrum is a motion or a torque that the model lacks.
 
     **Arguments:** `found` a `rigidjax.identify.Fit`; `index` which of its recordings; `time_unit`
-    `s`, `min`, `h` or `day`; `title`; `ax` axes of yours (sensors, 3). **Returns** the axes.
+    `s`, `min`, `h` or `day`; `title`; `ax` axes of yours (sensors, 4). **Returns** the axes.
 
     **Raises** `ModuleNotFoundError` where matplotlib is missing; `ValueError` for an unknown unit
     or axes of another shape; `IndexError` for a recording that is not there.
@@ -29,11 +34,11 @@ def residuals(
     count = len(record.readings)
     if ax is None:
         ax = pyplot().subplots(
-            count, 3, figsize=(11, 3.1 * count), squeeze=False, layout="constrained"
+            count, 4, figsize=(14, 3.1 * count), squeeze=False, layout="constrained"
         )[1]
     ax = np.asarray(ax, dtype=object)
-    if ax.shape != (count, 3):
-        raise ValueError(f"ax: wanted ({count}, 3) axes, a row a sensor, got {ax.shape}")
+    if ax.shape != (count, 4):
+        raise ValueError(f"ax: wanted ({count}, 4) axes, a row a sensor, got {ax.shape}")
     t = np.asarray(record.t) / seconds
     for row, reading, errors, noise in zip(
         ax, record.readings, found.residuals, found.noise, strict=True
@@ -43,12 +48,13 @@ def residuals(
         _one_sensor(row, t, one / sigma, np.asarray(reading.seen))
         row[0].set_ylabel(f"{type(reading.sensor).__name__}\nerror / noise")
         row[0].set_xlabel(f"time, {time_unit}")
+        row[3].set_xlabel(f"frequency, {'Hz' if time_unit == 's' else f'1/{time_unit}'}")
     ax[0, 1].set_title(title or "what the fit leaves over")
     return ax
 
 
 def _one_sensor(row: Any, t: np.ndarray, scaled: np.ndarray, seen: np.ndarray) -> None:
-    over_time, spread, memory = row
+    over_time, spread, memory, spectrum = row
     colours, names = COLOURS[: scaled.shape[1]], "xyz"[: scaled.shape[1]]
     everything = scaled[seen].ravel()
     # One wild reading must not press all others into a line: what lies beyond is counted.
@@ -80,6 +86,32 @@ def _one_sensor(row: Any, t: np.ndarray, scaled: np.ndarray, seen: np.ndarray) -
     memory.axhspan(-band, band, color="0.9", zorder=0)
     memory.axhline(0, color="0.6", lw=0.8)
     memory.set(xlabel="lag, samples", ylabel="correlation", ylim=(-1, 1))
+
+    for values, colour in zip(scaled[seen].T, colours, strict=True):
+        spectrum.plot(*power(t[seen], values), color=colour, lw=1)
+    spectrum.axhline(1, color="0.6", lw=0.8)
+    spectrum.set(yscale="log", ylabel="power / that of the noise")
+
+
+def power(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Frequencies and power (F,) of residuals over their noise: white noise has power 1."""
+    from scipy.signal import lombscargle, welch
+
+    gaps = np.diff(t)
+    if t.size < 8:
+        return np.zeros(0), np.zeros(0)
+    gap = float(np.median(gaps))
+    if (np.abs(gaps - gap) <= 1e-3 * gap).all():
+        frequencies, density = welch(values, 1 / gap, nperseg=_segment(t.size))
+        return frequencies[1:], density[1:] / (2 * gap)
+    span = float(t[-1] - t[0])
+    frequencies = np.arange(1, min(_MOST, max(2, int(span / (2 * gap))))) / span
+    return frequencies, lombscargle(t, values - values.mean(), 2 * np.pi * frequencies)
+
+
+def _segment(samples: int) -> int:
+    """The length of Welch's segments: some of them, so that the noise of the estimate is small."""
+    return min(samples, max(64, min(samples // 4, 512)))
 
 
 def _correlation(values: np.ndarray, lags: np.ndarray) -> np.ndarray:

@@ -16,7 +16,7 @@ from jax.flatten_util import ravel_pytree
 import rigidjax as rj
 from rigidjax import identify
 from rigidjax.__main__ import main
-from rigidjax.identify import checkpoint, search
+from rigidjax.identify import checkpoint, reported, search
 from rigidjax.identify.checkpoint import Tried
 from rigidjax.identify.jacobian import errors_of_one, with_blocks
 from rigidjax.identify.parameters import local, places
@@ -468,3 +468,22 @@ def test_other_mistakes_are_named(records, short_record):
         identify.FixedSteps(0)
     with pytest.raises(ValueError, match="a positive number, got 0"):
         identify.Free(lambda r: r, "x", scale=0.0)
+
+
+def test_free_numbers_are_reported_with_their_units():
+    ts = jnp.linspace(0.0, 1.0, 20)
+    speed = rj.torques.Series(ts, 100.0 + ts)
+    wheel = rj.torques.Wheel(1e-6, [0, 0, 1], speed, delay=0.0, tilt=[0.0, 0.0])
+    law = rj.torques.Sum(rj.torques.Flywheel(wheel), rj.torques.Damping([1e-6, 1e-6, 1e-6]))
+    gyro = rj.identify.Gyro(0.01, bias=[0, 0, 0], scale=[1, 1, 1], offset=0.0)
+    record = rj.identify.Recording(ts, (gyro, jnp.ones((20, 3))), torque=law)
+    sensor = lambda name: lambda r: getattr(r.readings[0].sensor, name)
+    free = [rj.identify.Free(sensor(name), name) for name in ("bias", "scale", "offset")]
+    free += [
+        rj.identify.Free(lambda r: r.torque.parts[0].momentum.tilt, "tilt"),
+        rj.identify.Free(lambda r: r.torque.parts[1].coefficient, "drag", unit="N m s"),
+    ]
+    problem = rj.identify.Problem(record, rj.identify.Principal(1e-3), free=free)
+    units = {name.split()[0]: unit for name, unit, _ in reported.labels(problem)}
+    wanted = {"bias": "rad/s", "scale": "", "offset": "s", "tilt": "rad", "drag": "N m s"}
+    assert {name: units[name] for name in wanted} == wanted

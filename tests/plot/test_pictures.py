@@ -15,6 +15,8 @@ import rigidjax as rj
 mpl.use("Agg")
 import matplotlib.pyplot as plt
 
+from rigidjax.plot.leftover import power
+
 BODY = rj.Inertia.from_principal(1.0, 2.0, 3.0)
 SOLID = rj.Inertia.from_principal(1.0, 2.0, 2.5)
 TS = jnp.linspace(0.0, 20.0, 101)
@@ -157,12 +159,33 @@ def stand_in():
 
 
 def test_a_wild_reading_is_counted_and_does_not_press_the_others():
-    over_time, spread, _ = rj.plot.residuals(stand_in())[0]
+    over_time, spread, *_ = rj.plot.residuals(stand_in())[0]
     assert over_time.get_ylim()[0] == -8.0
     assert np.isnan(over_time.lines[0].get_ydata()).sum() == 1
     assert spread.get_legend().get_texts()[0].get_text() == "3 beyond"
     area = sum(bar.get_width() * bar.get_height() for bar in spread.patches)
     np.testing.assert_allclose(area, 300 / 303)
+
+
+@pytest.mark.parametrize("jitter", [0.0, 0.3])
+def test_the_spectrum_of_white_noise_is_one_and_a_line_stands_out(jitter):
+    random = np.random.default_rng(0)
+    t = 0.01 * (np.arange(2000) + random.uniform(-jitter, jitter, 2000))
+    noise = random.standard_normal(2000)
+    frequencies, level = power(t, noise)
+    # 2000 readings, about 1000 independent powers, each with a relative spread of one.
+    np.testing.assert_allclose(level.mean(), 1.0, atol=0.1)
+    np.testing.assert_allclose(frequencies[-1], 50.0, rtol=0.05)
+    frequencies, lined = power(t, noise + np.sin(2 * np.pi * 7.0 * t))
+    assert abs(frequencies[lined.argmax()] - 7.0) < 0.25
+    assert lined.max() > 20
+    # As much power as the sine's variance, 1/2, more: over all frequencies up to 50 Hz it is 1.
+    gained = (lined - level).sum() * (frequencies[1] - frequencies[0]) / 50.0
+    np.testing.assert_allclose(gained, 0.5, atol=0.15)
+
+
+def test_a_short_record_has_no_spectrum():
+    assert power(np.arange(5.0), np.ones(5))[0].size == 0
 
 
 def test_the_cloud_of_outlines_is_as_wide_as_the_covariance_says():
@@ -193,7 +216,7 @@ def test_the_pictures_of_a_fit(found):
     cloud = np.stack([one.get_data() for one in ax[0].lines if one.get_alpha() == 0.25])
     assert cloud.shape[0] == 50
     assert 1e-4 < np.abs(cloud - best).max() < 0.05
-    over_time, spread, memory = rj.plot.residuals(found)[0]
+    over_time, spread, memory, _ = rj.plot.residuals(found)[0]
     shown = np.stack([one.get_ydata() for one in over_time.lines], axis=-1)
     np.testing.assert_allclose(shown, np.asarray(found.residuals[0]) / 0.01)
     area = sum(bar.get_width() * bar.get_height() for bar in spread.patches)
