@@ -89,8 +89,8 @@ def _parser() -> argparse.ArgumentParser:
         "identify",
         help="fit a body and its motion to recordings",
         description="Fit a body's inertia and motion to logs (.csv with a header line, .npz, "
-        ".mat), several together if several are given; or, with --demo, to the radar observations "
-        "of asteroid 4179 Toutatis.",
+        ".mat, Blackbox's .bbl and .bfl), several together if several are given; or, with --demo, "
+        "to the radar observations of asteroid 4179 Toutatis.",
         epilog="A throw with a gyro and a flywheel whose inertia is known: identify throw1.csv "
         "throw2.csv --wheel flywheel:1.2e-6:z --model tensor --typical 3e-4 --free drag bias "
         "--report throws.html",
@@ -102,11 +102,11 @@ def _parser() -> argparse.ArgumentParser:
         "--columns",
         nargs=4,
         metavar=("T", "WX", "WY", "WZ"),
-        default=("t", "wx", "wy", "wz"),
-        help="names of the time column and of the three body rates (default: t wx wy wz)",
+        help="names of the time column and of the three body rates (default: t wx wy wz; those of "
+        "phyphox and Blackbox are known)",
     )
     identify.add_argument(
-        "--unit", choices=("rad/s", "deg/s"), default="rad/s", help="of the rates (default: rad/s)"
+        "--unit", choices=("rad/s", "deg/s"), help="of the rates (default: rad/s; Blackbox deg/s)"
     )
     identify.add_argument(
         "--noise",
@@ -135,7 +135,9 @@ def _parser() -> argparse.ArgumentParser:
         "quaternion=qw,qx,qy,qz, euler-ZYX=yaw,pitch,roll:deg (body to world); may be repeated",
     )
     identify.add_argument(
-        "--time-unit", choices=("s", "ms", "us"), default="s", help="of the time column"
+        "--time-unit",
+        choices=("s", "ms", "us"),
+        help="of the time column (default: s; Blackbox us)",
     )
     identify.add_argument(
         "--window", nargs=2, type=float, metavar=("FROM", "TO"), help="use these seconds only"
@@ -201,7 +203,9 @@ def _demo(options: argparse.Namespace) -> int:
 def _logs(options: argparse.Namespace) -> int:
     from rigidjax.identify import logs
 
-    time, *rates = options.columns
+    layout = logs.layout_of(options.logs[0]) if options.columns is None else logs.USUAL
+    time, *rates = options.columns or layout.columns
+    unit, time_unit = options.unit or layout.unit, options.time_unit or layout.time_unit
     try:
         if options.sensor:
             channels = [logs.channel(text) for text in options.sensor]
@@ -211,7 +215,7 @@ def _logs(options: argparse.Namespace) -> int:
                 raise rj.identify.LogError(
                     f"--limit: wanted a positive number, got {options.limit}"
                 )
-            channels = [logs.Channel("gyro", tuple(rates), options.unit, noise, options.limit)]
+            channels = [logs.Channel("gyro", tuple(rates), unit, noise, options.limit)]
         wheels = [logs.wheel(text) for text in options.wheel]
         if options.model in ("tensor", "principal") and not wheels:
             raise rj.identify.LogError(
@@ -222,7 +226,7 @@ def _logs(options: argparse.Namespace) -> int:
                 path,
                 channels,
                 time=time,
-                time_unit=options.time_unit,
+                time_unit=time_unit,
                 window=options.window,
                 wheels=wheels,
                 free=options.free,

@@ -10,6 +10,8 @@ from typing import Any, TextIO
 import numpy as np
 
 from rigidjax import _checks
+from rigidjax.identify import blackbox
+from rigidjax.identify.layouts import split_header
 from rigidjax.identify.recording import Recording
 from rigidjax.identify.sensors import Gyro
 
@@ -30,15 +32,14 @@ UNITS = {
     "1": 1.0,
 }
 
-SEPARATORS = ",;\t"
-
 
 class LogError(ValueError):
     """A log that cannot be read; the message names the file and, where known, line and column."""
 
 
 def read_table(path: str | Path, columns: Sequence[str]) -> dict[str, np.ndarray]:
-    """Columns of a log by name: text with a header line, `.npz`, or `.mat` (MATLAB up to v7).
+    """Columns of a log by name: text with a header line, `.npz`, `.mat` (MATLAB up to v7), or a
+    Blackbox log of a flight controller, `.bbl` or `.bfl` (with the extra `blackbox`).
 
     **Arguments:** `path`; `columns` the names that are wanted, others are ignored. Text is
     separated by commas, semicolons or tabs, whichever splits the header line into most names; its
@@ -61,7 +62,7 @@ def read_table(path: str | Path, columns: Sequence[str]) -> dict[str, np.ndarray
         raise LogError(f"{path}: no such file")
     if path.is_dir():
         raise LogError(f"{path}: is a folder, not a log")
-    if path.suffix.lower() in (".npz", ".mat"):
+    if path.suffix.lower() in (".npz", ".mat", *blackbox.SUFFIXES):
         return _arrays(path, columns)
     return _csv(path, columns)
 
@@ -133,9 +134,7 @@ def _csv(path: Path, columns: Sequence[str]) -> dict[str, np.ndarray]:
 
 
 def _rows(path: Path, file: TextIO, columns: Sequence[str]) -> dict[str, np.ndarray]:
-    first = file.readline()
-    separator = max(SEPARATORS, key=first.count)
-    header = [name.strip() for name in next(csv.reader([first], delimiter=separator), [])]
+    header, separator = split_header(file.readline())
     if not any(header):
         raise LogError(f"{path}: line 1: wanted a header with the columns {', '.join(columns)}")
     for name in columns:
@@ -191,7 +190,9 @@ def _number(cell: str) -> float:
 def _arrays(path: Path, columns: Sequence[str]) -> dict[str, np.ndarray]:
     # Of an empty or a cut file the readers raise whatever they run into.
     try:
-        names, held = (_mat if path.suffix.lower() == ".mat" else _npz)(path, columns)
+        names, held = _readers[path.suffix.lower()](path, columns)
+    except ModuleNotFoundError as error:
+        raise LogError(str(error)) from None
     except Exception as error:
         why = f"{type(error).__name__}: {error}".splitlines()[0]
         raise LogError(
@@ -228,3 +229,6 @@ def _mat(path: Path, columns: Sequence[str]) -> tuple[list[str], dict[str, Any]]
     with path.open("rb") as raw:
         names = [name for name, *_ in whosmat(raw)]
         return names, loadmat(raw, variable_names=list(columns))
+
+
+_readers = {".npz": _npz, ".mat": _mat} | dict.fromkeys(blackbox.SUFFIXES, blackbox.read_blackbox)

@@ -16,6 +16,7 @@ from rigidjax.identify.bodies import (
 )
 from rigidjax.identify.files import UNITS, LogError, increasing, read_table
 from rigidjax.identify.free import Free
+from rigidjax.identify.layouts import USUAL as USUAL, layout_of as layout_of
 from rigidjax.identify.loss import Huber, SoftL1
 from rigidjax.identify.problem import Problem
 from rigidjax.identify.recording import Recording
