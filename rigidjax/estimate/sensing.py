@@ -73,6 +73,11 @@ def sensors_of(sensors: Sequence[AbstractSensor], model: Model) -> Sensors:
                 f"{name}: wanted its noise, a filter weighs each reading by it; give "
                 f"{name}(noise=…), such as identify.fit estimates it"
             )
+        if getattr(sensor, "lowpass", None) is not None:
+            raise ValueError(
+                f"{type(sensor).__name__}: a lowpass has a memory of its own, which the filter "
+                "does not estimate; leave it out, and give its lag as offset"
+            )
     readings = tuple(Mounted(sensor) for sensor in sensors)
     leaves = tuple(_leaf(walk.where, readings) for walk in model.walks)
     return Sensors(readings, leaves, tuple(walk.density for walk in model.walks))

@@ -56,6 +56,7 @@ from rigidjax.identify.sensors import (
     Brightness as Brightness,
     Direction as Direction,
     Gyro as Gyro,
+    LowPass as LowPass,
     Magnetometer as Magnetometer,
     Marker as Marker,
     Moment as Moment,

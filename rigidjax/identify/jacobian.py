@@ -90,7 +90,13 @@ def errors_of_one(
         def error(t: Array, state: Any, value: Array, sensor: Any = sensor) -> Array:
             return sensor.error(Moment(t, state, body, field), value)
 
-        errors = jax.vmap(error)(times, seen, reading.values)
+        lowpass = getattr(sensor, "lowpass", None)
+        if lowpass is None:
+            errors = jax.vmap(error)(times, seen, reading.values)
+        else:
+            # The error of a reading of zero is what the sensor shows, but for its sign.
+            shown = jax.vmap(error)(times, seen, jnp.zeros_like(reading.values))
+            errors = reading.values + lowpass(times, shown)
         out.append(jnp.where(reading.mask[:, None], errors, 0.0))
     return tuple(out), jax.tree.map(lambda leaf: leaf[-1], states)
 

@@ -3,6 +3,7 @@
 from rigidjax._names import own_names
 from rigidjax.identify.sensors.base import AbstractSensor as AbstractSensor, Moment as Moment
 from rigidjax.identify.sensors.brightness import Brightness as Brightness
+from rigidjax.identify.sensors.lowpass import LowPass as LowPass
 from rigidjax.identify.sensors.places import (
     Position as Position,
     Range as Range,

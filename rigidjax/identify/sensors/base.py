@@ -79,11 +79,11 @@ def vector_of(value: Any, name: str) -> Vec3 | None:
     return None if value is None else place_of(value, name)
 
 
-def place_of(value: Any, name: str) -> Vec3:
-    """Three finite numbers, as an array that a fit may move."""
+def place_of(value: Any, name: str, shape: tuple[int, ...] = (3,)) -> Any:
+    """Three finite numbers, or others of a shape, as an array that a fit may move."""
     if value is None:
         raise ValueError(f"{name}: wanted three numbers, got None")
-    return jnp.asarray(_checks.finite(_checks.floating(value, (3,), name), name))
+    return jnp.asarray(_checks.finite(_checks.floating(value, shape, name), name))
 
 
 def limit_of(limit: Any) -> Vec3 | None:

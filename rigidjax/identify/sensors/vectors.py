@@ -15,12 +15,13 @@ from rigidjax.identify.sensors.base import (
     shown,
     vector_of,
 )
+from rigidjax.identify.sensors.lowpass import LowPass, lowpass_of
 from rigidjax.rotation import quaternion
-from rigidjax.rotation.algebra import cross
+from rigidjax.rotation.algebra import apply, cross
 
 
 class Gyro(AbstractSensor):
-    """Reads the body rate: `scale · S exp(−mounting) Ω + bias`, rad/s.
+    """Reads the body rate: `scale · S exp(−mounting) Ω + bias + G f`, rad/s.
 
     **Arguments:** `noise` standard deviation of a reading, rad/s, one number or (3,); `None` has it
     estimated from the residuals. Then, `None` unless the sensor has it (give a value to let a
@@ -28,7 +29,10 @@ class Gyro(AbstractSensor):
     from the body's axes to the sensor's, rad; `skew` (3,) what its x axis shows of y, x of z, and y
     of z, where they are not orthogonal: `S = [[1, a, b], [0, 1, c], [0, 0, 1]]`; `limit` full
     scale, rad/s, one number or (3,): a reading at it counts as "at least that much", `None` has it
-    found; `offset` s: it shows at t what was at t + offset.
+    found; `offset` s: it shows at t what was at t + offset; `lowpass` a `LowPass` that the readings
+    went through; `g_sensitivity` G (3, 3), rad/s per m/s²: what each channel shows of the specific
+    force f, in the body's axes, where the gyro sits: `place` (3,) m and `gravity` (3,) m/s² as for
+    `Accelerometer`, the centre of mass and `None` unless given.
 
     **Raises** `ValueError` for a noise or limit that is not positive, a wrong shape, NaN.
 
@@ -38,7 +42,6 @@ class Gyro(AbstractSensor):
 
     reading_shape: ClassVar[tuple[int, ...]] = (3,)
     components: ClassVar[int] = 3
-    feels: ClassVar[type] = HasSpin
     unit: ClassVar[str] = "rad/s"
     noise: Float[Array, "3"] | None
     bias: Float[Array, "3"] | None
@@ -47,6 +50,10 @@ class Gyro(AbstractSensor):
     skew: Float[Array, "3"] | None
     limit: Float[Array, "3"] | None
     offset: Scalar | None
+    lowpass: LowPass | None
+    g_sensitivity: Float[Array, "3 3"] | None
+    place: Float[Array, "3"] | None
+    gravity: Float[Array, "3"] | None
 
     def __init__(
         self,
@@ -58,15 +65,47 @@ class Gyro(AbstractSensor):
         skew: Any = None,
         limit: Any = None,
         offset: Any = None,
+        lowpass: Any = None,
+        g_sensitivity: Any = None,
+        place: Any = None,
+        gravity: Any = None,
     ):
         self.noise = noise_of(noise)
         self.bias, self.scale = vector_of(bias, "bias"), vector_of(scale, "scale")
         self.mounting, self.skew = vector_of(mounting, "mounting"), vector_of(skew, "skew")
         self.limit = limit_of(limit)
-        self.offset = number_of(offset, "offset")
+        self.offset, self.lowpass = number_of(offset, "offset"), lowpass_of(lowpass)
+        self.g_sensitivity = self.place = self.gravity = None
+        if g_sensitivity is not None:
+            self.g_sensitivity = place_of(g_sensitivity, "g_sensitivity", (3, 3))
+            self.place = place_of([0.0, 0.0, 0.0] if place is None else place, "place")
+            self.gravity = vector_of(gravity, "gravity")
+        elif place is not None or gravity is not None:
+            raise ValueError("Gyro: place and gravity say something only beside a g_sensitivity")
+
+    @property
+    def feels(self) -> type:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Only gravity needs the attitude."""
+        return HasSpin if self.gravity is None else HasAttitude
 
     def error(self, moment: Moment, reading: Array) -> Vec3:
-        return reading - shown(moment.state.omega, self.bias, self.scale, self.mounting, self.skew)
+        seen = shown(moment.state.omega, self.bias, self.scale, self.mounting, self.skew)
+        if self.g_sensitivity is not None:
+            assert self.place is not None
+            force = specific_force(moment, self.place, self.gravity)
+            seen = seen + apply(self.g_sensitivity, force)
+        return reading - seen
+
+
+def specific_force(moment: Moment, place: Vec3, gravity: Vec3 | None) -> Vec3:
+    """`Rᵀ(a − g) + dΩ/dt × r + Ω × (Ω × r)` at a place of the body, m/s², body frame."""
+    state, rate = moment.state, moment.rate
+    r = moment.lever(place)
+    force = cross(rate.omega, r) + cross(state.omega, cross(state.omega, r))
+    if gravity is None:
+        return force
+    carried = rate.v if isinstance(state, HasPose) else 0.0
+    return force + quaternion.rotate(quaternion.conjugate(state.q), carried - gravity)
 
 
 class Accelerometer(AbstractSensor):
@@ -80,7 +119,7 @@ class Accelerometer(AbstractSensor):
     it sits, m, body frame: from the point that the `Inertia` is about, or in the frame of the
     `MassProperties`; `gravity` (3,) m/s², world frame: `None` for a body in free fall (`Spin`,
     `Attitude`), needed by a body on a pivot and by a `Rigid`; `bias`, `scale`, `mounting`, `skew`,
-    `limit`, `offset` as for `Gyro`.
+    `limit`, `offset`, `lowpass` as for `Gyro`.
 
     **Raises** `ValueError` as `Gyro`.
 
@@ -100,6 +139,7 @@ class Accelerometer(AbstractSensor):
     skew: Float[Array, "3"] | None
     limit: Float[Array, "3"] | None
     offset: Scalar | None
+    lowpass: LowPass | None
 
     def __init__(
         self,
@@ -113,13 +153,14 @@ class Accelerometer(AbstractSensor):
         skew: Any = None,
         limit: Any = None,
         offset: Any = None,
+        lowpass: Any = None,
     ):
         self.place, self.noise = place_of(place, "place"), noise_of(noise)
         self.gravity = vector_of(gravity, "gravity")
         self.bias, self.scale = vector_of(bias, "bias"), vector_of(scale, "scale")
         self.mounting, self.skew = vector_of(mounting, "mounting"), vector_of(skew, "skew")
         self.limit = limit_of(limit)
-        self.offset = number_of(offset, "offset")
+        self.offset, self.lowpass = number_of(offset, "offset"), lowpass_of(lowpass)
 
     @property
     def feels(self) -> type:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -127,13 +168,7 @@ class Accelerometer(AbstractSensor):
         return HasSpin if self.gravity is None else HasAttitude
 
     def error(self, moment: Moment, reading: Array) -> Vec3:
-        state, rate = moment.state, moment.rate
-        r = moment.lever(self.place)
-        force = cross(rate.omega, r) + cross(state.omega, cross(state.omega, r))
-        if self.gravity is not None:
-            carried = rate.v if isinstance(state, HasPose) else 0.0
-            world = carried - self.gravity
-            force = force + quaternion.rotate(quaternion.conjugate(state.q), world)
+        force = specific_force(moment, self.place, self.gravity)
         return reading - shown(force, self.bias, self.scale, self.mounting, self.skew)
 
 
@@ -142,7 +177,8 @@ class Magnetometer(AbstractSensor):
 
     **Arguments:** `noise` in the field's unit, one number or (3,), `None` to have it estimated;
     `field` (3,) b, world frame, any unit; `bias` (the body's own magnetism), `scale`, `mounting`,
-    `skew`, `limit`, `offset` as for `Gyro`. For a direction without a strength use `Direction`.
+    `skew`, `limit`, `offset`, `lowpass` as for `Gyro`. For a direction without a strength use
+    `Direction`.
 
     **Raises** `ValueError` as `Gyro`.
 
@@ -162,6 +198,7 @@ class Magnetometer(AbstractSensor):
     skew: Float[Array, "3"] | None
     limit: Float[Array, "3"] | None
     offset: Scalar | None
+    lowpass: LowPass | None
 
     def __init__(
         self,
@@ -174,12 +211,13 @@ class Magnetometer(AbstractSensor):
         skew: Any = None,
         limit: Any = None,
         offset: Any = None,
+        lowpass: Any = None,
     ):
         self.field, self.noise = place_of(field, "field"), noise_of(noise)
         self.bias, self.scale = vector_of(bias, "bias"), vector_of(scale, "scale")
         self.mounting, self.skew = vector_of(mounting, "mounting"), vector_of(skew, "skew")
         self.limit = limit_of(limit)
-        self.offset = number_of(offset, "offset")
+        self.offset, self.lowpass = number_of(offset, "offset"), lowpass_of(lowpass)
 
     def error(self, moment: Moment, reading: Array) -> Vec3:
         seen = quaternion.rotate(quaternion.conjugate(moment.state.q), self.field)

@@ -1,0 +1,177 @@
+"""A filter that readings went through before they were logged."""
+
+import math
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
+
+from rigidjax import _checks
+from rigidjax._types import Scalar, ScalarLike
+
+# After a gap of so many usual intervals what was before it says nothing.
+_GAP = 3.0
+# Third powers of numbers and of intervals stay within float32, too.
+_LARGEST = 1e12
+
+
+class LowPass(eqx.Module):
+    """A low-pass filter of first or second order (Butterworth), as the chips of gyros have them.
+
+    Give it to a sensor (`Gyro(0.01, lowpass=LowPass(40.0))`): then what the model shows goes
+    through the same filter as the readings did. Without it the filter's lag is taken for an offset
+    of the clock, and what it takes away from faster rates for another motion.
+
+    `ẏ = w(u − y)`, or `ÿ + √2 w ẏ + w² y = w² u`, with w = 2π · cutoff; solved exactly, from sample
+    to sample, for a cubic between samples of u. Before the first sample u is taken to be the cubic
+    through the first four of them, after a gap of more than three intervals a straight line.
+
+    **Arguments:** `cutoff` Hz, where the gain is 1/√2 (a `Free` may move it); `order` 1 or 2.
+
+    Source: Butterworth 1930, Experimental Wireless 7:536.
+
+    **Raises** `ValueError` for a cutoff that is not positive, another order.
+
+    >>> slow = LowPass(0.5)(jnp.arange(4.0), jnp.ones((4, 1)))
+    >>> bool(jnp.allclose(slow, 1.0))
+    True
+    """
+
+    cutoff: Scalar
+    order: int = eqx.field(static=True)
+
+    def __init__(self, cutoff: ScalarLike, order: int = 1):
+        cutoff = _checks.floating(cutoff, (), "cutoff")
+        found = f", got {float(cutoff):g}" if _checks.known(cutoff) else ""
+        self.cutoff = _checks.refuse(
+            cutoff,
+            ~((cutoff > 0) & jnp.isfinite(cutoff)),
+            f"cutoff: wanted a positive frequency, Hz{found}",
+        ).astype(jnp.result_type(float))
+        if _checks.whole(order, "order", 1) > 2:
+            raise ValueError(f"order: wanted 1 or 2, got {order}")
+        self.order = order
+
+    def __call__(
+        self, t: Float[Array, " times"], values: Float[Array, "times k"]
+    ) -> Float[Array, "times k"]:
+        """What the filter makes of samples.
+
+        **Arguments:** `t` (T,) increasing times, s; `values` (T, k), of any unit.
+
+        **Raises** `ValueError` for shapes that do not agree; where numbers are known, for times
+        that do not increase, NaN, numbers whose cubes overflow.
+        """
+        values = _checks.numbers(values, "values")
+        if values.ndim != 2:
+            raise ValueError(f"values: wanted (T, k), got shape {values.shape}")
+        t = _checks.floating(
+            t, (values.shape[0],), "t", hint="a time for each row of values"
+        ).astype(values.dtype)
+        if _checks.known((t, values)):
+            _within(np.asarray(t, float), np.asarray(values, float))
+        if values.shape[0] < 2:
+            return values
+        w = 2 * math.pi * self.cutoff.astype(values.dtype)
+        gaps = jnp.diff(t)
+        usual = jnp.median(gaps)
+        fresh = gaps > _GAP * usual
+        before, after = _slopes(gaps, jnp.diff(values, axis=0), fresh)
+        # On each interval u = u₀ + b s + c s² + d s³.
+        h = gaps[:, None]
+        chord = jnp.diff(values, axis=0) / h
+        c, d = (3 * chord - 2 * before - after) / h, (before + after - 2 * chord) / h**2
+        ends = (before, 2 * c, 6 * d), (after, 2 * c + 6 * d * h, 6 * d)
+        own = _first if self.order == 1 else _second
+        y0, y1, decay = own(w, values[:-1], ends[0], values[1:], ends[1])
+        begin = y0[0]
+        if gaps.size > 2:
+            first = own(w, values[:1], _begin(gaps, chord), values[:1], ends[1])[0][0]
+            begin = jnp.where(jnp.any(fresh[:3]), begin, first)
+        return _along(begin, y0, y1, decay, gaps, fresh)
+
+
+def lowpass_of(given: Any) -> LowPass | None:
+    """`given` if it is a `LowPass` or `None`. **Raises** `TypeError` for others."""
+    if given is not None and not isinstance(given, LowPass):
+        raise TypeError(
+            f"lowpass: wanted LowPass(cutoff in Hz) or None, got {type(given).__name__}"
+        )
+    return given
+
+
+def _within(t: np.ndarray, values: np.ndarray) -> None:
+    if not np.isfinite(values).all() or np.abs(values).max(initial=0.0) > _LARGEST:
+        raise ValueError(f"values: wanted finite numbers up to {_LARGEST:g}, got NaN or more")
+    if not (np.isfinite(t).all() and np.abs(t).max(initial=0.0) <= _LARGEST):
+        raise ValueError(f"t: wanted finite times up to {_LARGEST:g} s, got NaN or more")
+    if not (np.diff(t) > 1 / _LARGEST).all():
+        raise ValueError("t: wanted increasing times")
+
+
+def _slopes(gaps: Array, steps: Array, fresh: Array) -> tuple[Array, Array]:
+    """du/dt at both ends of each interval, of the parabola through the three nearest samples; of
+    the chord beside a gap.
+    """
+    h, chord = gaps[:, None], steps / gaps[:, None]
+    apart = (fresh[1:] | fresh[:-1])[:, None]
+    bend = jnp.where(apart, 0.0, jnp.diff(chord, axis=0) / (h[1:] + h[:-1]))
+    begin = jnp.concatenate([bend[:1] * h[:1], bend * h[1:]]) if bend.shape[0] else 0.0 * chord
+    end = jnp.concatenate([bend * h[:-1], bend[-1:] * h[-1:]]) if bend.shape[0] else 0.0 * chord
+    return chord - begin, chord + end
+
+
+def _begin(gaps: Array, chord: Array) -> tuple[Array, Array, Array]:
+    """The derivatives at the first sample of the cubic through the first four."""
+    a, b = gaps[0], gaps[0] + gaps[1]
+    one = (chord[1] - chord[0]) / b
+    two = ((chord[2] - chord[1]) / (gaps[1] + gaps[2]) - one) / (b + gaps[2])
+    rate = chord[0] - one * a + two * (a * b)
+    return rate[None], 2 * (one - two * (a + b))[None], 6 * two[None]
+
+
+def _first(w: Array, u0: Array, du0: Any, u1: Array, du1: Any) -> tuple[Any, Any, Any]:
+    """The filter's answer to the cubic itself at both ends of each interval, and how what differs
+    from it decays.
+    """
+
+    def own(u: Array, du: Any) -> Array:
+        return (u - du[0] / w + du[1] / w**2 - du[2] / w**3)[..., None]
+
+    def decay(h: Array) -> Array:
+        return jnp.exp(-w * h)[None, None]
+
+    return own(u0, du0), own(u1, du1), decay
+
+
+def _second(w: Array, u0: Array, du0: Any, u1: Array, du1: Any) -> tuple[Any, Any, Any]:
+    # 1/(1 + √2 x + x²) = 1 − √2 x + x² + 0 x³ …
+    root = math.sqrt(2.0)
+
+    def own(u: Array, du: Any) -> Array:
+        y = u - root * du[0] / w + du[1] / w**2
+        return jnp.stack([y, (du[0] - root * du[1] / w + du[2] / w**2) / w], axis=-1)
+
+    def decay(h: Array) -> Array:
+        a = w * h / root
+        c, s, e = jnp.cos(a), jnp.sin(a), jnp.exp(-a)
+        return e * jnp.stack([jnp.stack([c + s, root * s]), jnp.stack([-root * s, c - s])])
+
+    return own(u0, du0), own(u1, du1), decay
+
+
+def _along(begin: Array, y0: Array, y1: Array, decay: Any, gaps: Array, fresh: Array) -> Array:
+    """From interval to interval: what differs from the cubic's own answer is carried over."""
+
+    def step(state: Array, row: Any) -> tuple[Array, Array]:
+        own0, own1, following, h, gap = row
+        carried = own1 + (state - own0) @ decay(h).T
+        state = jnp.where(gap, following, carried)
+        return state, state[:, 0]
+
+    following = jnp.concatenate([y0[1:], y1[-1:]])
+    _, rest = lax.scan(step, begin, (y0, y1, following, gaps, fresh))
+    return jnp.concatenate([begin[None, :, 0], rest])
