@@ -33,6 +33,7 @@ from rigidjax.identify.search import (
     settle,
 )
 from rigidjax.identify.start import starting_points
+from rigidjax.identify.widths import widths, with_widths
 
 # More equal steps than this between two samples cost more than steps chosen as they are needed.
 FINEST = 32
@@ -96,6 +97,11 @@ class Fit(eqx.Module):
     def values(self) -> dict[str, Array]:
         """The value of each `Free` by name, in its unit."""
         return self.problem.values(self.parameters)
+
+    @property
+    def spreads(self) -> dict[str, Array]:
+        """The spread of each `Free` that has one, by name, in its unit: given or estimated."""
+        return widths(self.problem)
 
     @property
     def noise(self) -> tuple[Float[Array, "*records _"], ...]:
@@ -258,6 +264,7 @@ def fit(
     )
     lowest = float(best.cost)
     best, noise = _with_noise(problem, best, noise, tolerance, max_steps)
+    problem, best = with_widths(problem, best, noise, tolerance, max_steps)
     while (finer := _finer(problem, best.parameters, noise)) is not None:
         problem = eqx.tree_at(lambda p: p.integrator, problem, finer)
         whole = jnp.ones_like(problem.records.t)

@@ -27,7 +27,8 @@ class Free(eqx.Module):
     `positive`: moved through its logarithm, so that it keeps its sign. `prior` a standard deviation
     around the starting value (a Gaussian prior, in its unit; relative for `positive`), or `None`.
     `spread`: each recording deviates from the shared value by a number of its own, with this
-    standard deviation (in its unit; relative for `positive`); `None` for no deviations.
+    standard deviation (in its unit; relative for `positive`), or `"estimated"` from the deviations
+    of three recordings or more, beginning with one `scale`; `None` for no deviations.
 
     **Raises** `ValueError` for a scale, prior or spread that is not positive, a spread where each
     recording has its own value already.
@@ -43,7 +44,7 @@ class Free(eqx.Module):
     each: bool | str | tuple[Any, ...]
     positive: bool
     prior: float | None
-    spread: float | None
+    spread: float | str | None
     unit: str | None
 
     def __init__(
@@ -55,7 +56,7 @@ class Free(eqx.Module):
         each: bool | str | Sequence[Any] = False,
         positive: bool = False,
         prior: float | None = None,
-        spread: float | None = None,
+        spread: float | str | None = None,
         unit: str | None = None,
     ):
         _checks.function(where, "where", "of a recording, such as lambda r: r.torque.coefficient")
@@ -66,7 +67,11 @@ class Free(eqx.Module):
         self.each = shares(each, f"Free {name!r}: each")
         self.positive = positive
         self.prior = None if prior is None else _checks.positive(prior, f"Free {name!r}: prior")
-        self.spread = None if spread is None else _checks.positive(spread, f"Free {name!r}: spread")
+        if spread is not None and spread != "estimated":
+            spread = _checks.positive(
+                spread, f"Free {name!r}: spread", 'a positive number or "estimated"'
+            )
+        self.spread = spread
         if each is True and spread is not None:
             raise ValueError(
                 f"Free {name!r}: spread is about a shared value, each=True has none; give prior"
@@ -92,7 +97,8 @@ class Slot(eqx.Module):
     problem of the same form does not compile again.
 
     **Fields:** `each` whether every recording has its own; `groups` (R,) the index of each
-    recording's value where a group shares one, `labels` of the groups; `prior`, `spread` in steps.
+    recording's value where a group shares one, `labels` of the groups; `prior`, `spread` in steps,
+    `estimated` whether the spread is only a first guess.
     """
 
     leaf: int = eqx.field(static=True)
@@ -105,6 +111,7 @@ class Slot(eqx.Module):
     scale: Array
     prior: Array | None
     spread: Array | None
+    estimated: bool = eqx.field(static=True, default=False)
 
     def read(self, recording: Recording) -> Array:
         """Its value in a recording."""
@@ -124,7 +131,9 @@ class Slot(eqx.Module):
 
     def alone(self) -> "Slot":
         """The same in a problem of one recording."""
-        return dataclasses.replace(self, each=False, labels=(), groups=None, spread=None)
+        return dataclasses.replace(
+            self, each=False, labels=(), groups=None, spread=None, estimated=False
+        )
 
 
 def grouped(
@@ -178,14 +187,20 @@ def find(free: Sequence[Free], recording: Recording, of: Sequence[str] = ("",)) 
             raise ValueError(f"Free {item.name!r}: wanted a positive starting value, got {value}")
         scale = jnp.asarray(item.scale)
         prior = None if item.prior is None else jnp.asarray(item.prior / item.scale)
-        wide = None if item.spread is None else jnp.asarray(item.spread / item.scale)
+        guessed = isinstance(item.spread, str)
+        if guessed and len(of) < 3:
+            raise ValueError(
+                f"Free {item.name!r}: a spread is estimated from three recordings or more, got "
+                f"{len(of)}; give it"
+            )
+        first = item.scale if isinstance(item.spread, str) else item.spread
+        wide = None if first is None else jnp.asarray(first / item.scale)
         alone, groups, labels = item.each is True, None, ()
         if not isinstance(item.each, bool):
             groups, labels = grouped(item.each, of, f"Free {item.name!r}")
         unit = _unit_of(recording, index) if item.unit is None else item.unit
-        slots.append(
-            Slot(index, item.name, unit, alone, item.positive, labels, groups, scale, prior, wide)
-        )
+        own = (item.positive, labels, groups, scale, prior, wide, guessed)
+        slots.append(Slot(index, item.name, unit, alone, *own))
     return tuple(slots)
 
 

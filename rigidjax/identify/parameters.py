@@ -84,10 +84,10 @@ def columns(problem: "Problem", one: Local) -> np.ndarray:
 
     All in order; then once more those that are a shared value and a deviation.
     """
-    numbered = _numbered(one)
+    counted = numbered(one)
     twice = [
         np.ravel(step)
-        for slot, step in zip(problem.slots, numbered.steps, strict=True)
+        for slot, step in zip(problem.slots, counted.steps, strict=True)
         if slot.spread is not None
     ]
     size = sum(np.size(leaf) for leaf in jax.tree.leaves(one))
@@ -97,8 +97,8 @@ def columns(problem: "Problem", one: Local) -> np.ndarray:
 def places(problem: "Problem", parameters: Parameters) -> Int[Array, "records columns"]:
     """Where in the flattened parameters the number of each column is; n for those of no number."""
     count, size = problem.count, ravel_pytree(parameters)[0].size
-    numbered = _numbered(parameters)
-    of_all, of_each = iter(numbered.shared), iter(numbered.own.each)
+    counted = numbered(parameters)
+    of_all, of_each = iter(counted.shared), iter(counted.own.each)
     parts, deviations = [], []
 
     def rows(leaf: Any) -> Array:
@@ -115,14 +115,14 @@ def places(problem: "Problem", parameters: Parameters) -> Int[Array, "records co
             parts.append(rows(jnp.asarray(shared, jnp.int32)[slot.groups]))
         if slot.spread is not None:
             deviations.append(rows(next(of_each)))
-    own = numbered.own
+    own = counted.own
     firsts = [rows(leaf) for leaf in (own.spin, own.turn, own.place, own.speed) if leaf is not None]
-    numbers = jnp.asarray(numbered.body, jnp.int32)
+    numbers = jnp.asarray(counted.body, jnp.int32)
     body = spread(problem.body, numbers, problem.which, count, fill=size)
     return jnp.concatenate([body, *parts, *firsts, *deviations], axis=1)
 
 
-def _numbered(tree: Any) -> Any:
+def numbered(tree: Any) -> Any:
     """The same tree with its numbers counted from zero in the order of `ravel_pytree`."""
     leaves, structure = jax.tree.flatten(tree)
     ends = np.cumsum([np.size(leaf) for leaf in leaves])

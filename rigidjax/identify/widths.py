@@ -1,0 +1,71 @@
+"""How much recordings deviate from a shared number, estimated from their deviations.
+
+The width σ of the deviations d_r maximises the marginal likelihood, the deviations and all else
+integrated out about the best point (Laplace). By expectation and maximisation: σ² is the mean of
+d_r² and of what is not known of d_r (Dempster, Laird and Rubin 1977, section 4.5; Laird and Ware
+1982, doi:10.2307/2529876).
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from rigidjax.identify import uncertainty
+from rigidjax.identify.checkpoint import Tried
+from rigidjax.identify.parameters import Parameters, numbered
+from rigidjax.identify.problem import Problem
+from rigidjax.identify.residual import Noise
+from rigidjax.identify.search import fresh, settle
+
+# Rounds, and the relative change at which they end; a width that falls below so much of the first
+# one is zero.
+_ROUNDS, _SETTLED, _LEAST = 40, 0.01, 1e-4
+_WHITE = uncertainty.Times(((1.0,),), 0.0, 1.0)
+
+
+def with_widths(
+    problem: Problem, best: Tried, noise: Noise, tolerance: float, max_steps: int
+) -> tuple[Problem, Tried]:
+    """The problem with the widths that are to be estimated, and its best point near `best`."""
+    wanted = [index for index, slot in enumerate(problem.slots) if slot.estimated]
+    if not wanted:
+        return problem, best
+    whole = jnp.ones_like(problem.records.t)
+    least = _LEAST * _widths(problem)[wanted]
+    for _ in range(_ROUNDS):
+        before = _widths(problem)[wanted]
+        found = np.maximum(_expected(problem, best.parameters, noise)[wanted], least)
+        new = [jnp.asarray(width) for width in found]
+        problem = eqx.tree_at(lambda p: [p.slots[i].spread for i in wanted], problem, new)
+        near = fresh(best.parameters)
+        best = settle(near, problem, noise, whole, tolerance, max_steps, near=True)
+        if (np.abs(found - before) < _SETTLED * before).all() or (found <= least).all():
+            break
+    return problem, best
+
+
+def _widths(problem: Problem) -> np.ndarray:
+    """Of each `Free`, in steps; 1 for those that have none."""
+    return np.array([1.0 if s.spread is None else float(s.spread) for s in problem.slots])
+
+
+def _expected(problem: Problem, parameters: Parameters, noise: Noise) -> np.ndarray:
+    """The root mean square of each one's deviations, what is not known of them included."""
+    linear = uncertainty.linearise(problem, parameters, noise)
+    variance = np.diag(uncertainty.spread(linear, _WHITE).seen)
+    values, places = iter(parameters.own.each), iter(numbered(parameters).own.each)
+    out = np.ones(len(problem.slots))
+    for index, slot in enumerate(problem.slots):
+        if slot.each:
+            next(values)
+            next(places)
+        if slot.spread is not None:
+            deviation, where = np.asarray(next(values)), np.ravel(next(places)).astype(int)
+            out[index] = np.sqrt(np.mean(deviation**2) + np.mean(variance[where]))
+    return out
+
+
+def widths(problem: Problem) -> dict[str, jax.Array]:
+    """The spread of each `Free` that has one, by name, in its unit."""
+    return {s.name: s.spread * s.scale for s in problem.slots if s.spread is not None}
