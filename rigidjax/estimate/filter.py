@@ -170,6 +170,10 @@ def step(model: Model, belief: Belief, t: ScalarLike, *readings: tuple) -> Belie
     """
     _checks.instance(model, Model, "model")
     _checks.instance(belief, Belief, "belief")
+    if belief.t.shape != ():
+        raise ValueError(
+            f"belief: wanted one, got times of shape {belief.t.shape}; of many use jax.vmap"
+        )
     when = _checks.time(t).astype(belief.t.dtype)
     if _checks.known((when, belief.t)):
         words = f"t: readings are out of order: {float(when):g} s is before {float(belief.t):g} s"

@@ -56,6 +56,10 @@ class LinearModel(eqx.Module):
         self.deviation = _checks.refuse(spread, ~(spread > 0).all(), words)
         self.push = None if push is None else _checks.numbers(push, "push")
         self.offset = None if offset is None else _checks.numbers(offset, "offset")
+        if self.transition.ndim < 2:
+            raise ValueError(
+                f"transition: wanted a matrix (n, n), got shape {self.transition.shape}"
+            )
         n, k = self.transition.shape[-1], self.matrix.shape[-2:-1]
         for name, wanted in {
             "transition": (n, n),
@@ -201,6 +205,8 @@ def _given(model: LinearModel, readings: Any, mean: Any, root: Any, seen: Any) -
     readings = _checks.rows(readings, (k,), "readings")
     mean, root = _checks.floating(mean, (n,), "mean"), _checks.floating(root, (n, n), "root")
     times = readings.shape[0]
+    if not times:
+        raise ValueError("readings: wanted at least one row, got none")
     if seen is None:
         seen = jnp.ones(readings.shape, bool)
     seen = jnp.asarray(seen)

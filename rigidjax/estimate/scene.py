@@ -331,4 +331,6 @@ def not_negative(value: Any, name: str) -> Array:
     """Finite numbers, none below zero."""
     array = _checks.numbers(value, name)
     words = f"{name}: wanted a finite number that is not below zero"
+    if not array.size:
+        raise ValueError(f"{words}, got none")
     return _checks.refuse(array, ~((array >= 0) & jnp.isfinite(array)).all(), words)

@@ -38,6 +38,7 @@ def expected(problem: Problem, parameters: Parameters) -> tuple[reported.Quantit
     >>> bool(expected(problem, plan)[0].deviation < 0.05)
     True
     """
+    _on_host(problem, parameters)
     _look(problem, parameters)
     information = np.asarray(fisher(problem, parameters))
     if not np.isfinite(information).all():
@@ -117,6 +118,14 @@ def _look(problem: Problem, parameters: Parameters) -> None:
             )
 
 
+def _on_host(problem: Problem, motion: Any) -> None:
+    if not _checks.known((problem, motion)):
+        raise TypeError(
+            "problem, parameters, body, omega: wanted known numbers, got traced ones; this works "
+            "on the host: call it outside of jax.jit, and differentiate fisher"
+        )
+
+
 def best_first_rate(
     problem: Problem, body: Any, omega: Any, *, max_steps: int = 60
 ) -> tuple[Vec3, tuple[reported.Quantity, ...]]:
@@ -136,6 +145,7 @@ def best_first_rate(
     'best_first_rate'
     """
     max_steps = _checks.whole(max_steps, "max_steps", 1)
+    _on_host(problem, (body, omega))
     _look(problem, plan_of(problem, body, omega))
     start = _checks.floating(omega, (3,), "omega").astype(problem.records.t.dtype)
     size = jnp.sqrt(jnp.sum(start**2))

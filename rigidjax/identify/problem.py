@@ -103,6 +103,11 @@ class Problem(eqx.Module):
         for item in recordings:
             if not isinstance(item, Recording):
                 raise TypeError(f"Problem: wanted a Recording, got {type(item).__name__}")
+            if not _checks.known((item.t, [reading.values for reading in item.readings])):
+                raise TypeError(
+                    "recording: wanted known readings, got traced ones; make the Problem outside "
+                    "of jax.jit, jax.grad and jax.vmap, and give it to them as an argument"
+                )
             lengths = {item.t.shape, *(reading.mask.shape for reading in item.readings)}
             if len(lengths) > 1 or item.t.ndim != 1:
                 raise ValueError(

@@ -152,6 +152,11 @@ def interval_of(
 ) -> tuple[np.ndarray, np.ndarray]:
     """See `Fit.interval_of`."""
     _checks.function(of, "of", "(body, state0) → array")
+    if not _checks.known(fit.parameters):
+        raise TypeError(
+            "Fit: wanted known numbers, got traced ones; intervals are made on the host: call "
+            "interval_of outside of jax.jit, jax.grad and jax.vmap"
+        )
     flat, restore = ravel_pytree(fit.parameters)
 
     def value(x: Array) -> Array:

@@ -92,7 +92,9 @@ def fit_windows(
     _require_windows(windows)
     _checks.function(scene, "scene", "of the free numbers to (body, torque)")
     leaves, tree = jax.tree.flatten(guess)
+    kind = windows.starts.omega.dtype
     leaves = [_checks.finite(_checks.numbers(leaf, "guess"), "guess") for leaf in leaves]
+    leaves = [jnp.asarray(leaf).astype(kind) for leaf in leaves]
     x, back = ravel_pytree(jax.tree.unflatten(tree, leaves))
     if not x.size:
         raise ValueError("guess: wanted a tree of floating numbers, at least one")
