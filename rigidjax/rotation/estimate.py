@@ -22,7 +22,7 @@ from rigidjax.rotation import quaternion
 from rigidjax.rotation.algebra import cross, determinant, dot, hat, near_one, product, solve, vee
 from rigidjax.rotation.gate import direction, rotation_matrix, unit_quaternion
 from rigidjax.rotation.maps import matrix_to_quaternion
-from rigidjax.special.series import inverse_kernel
+from rigidjax.special.stumpff import inverse_kernel
 
 
 def project(matrix: Mat3Like) -> Mat3:

@@ -21,7 +21,7 @@ from rigidjax.rotation.algebra import (
     square,
 )
 from rigidjax.special.barrier import once
-from rigidjax.special.series import arctan_ratio, inverse_kernel, stumpff
+from rigidjax.special.stumpff import arctan_ratio, inverse_kernel, stumpff
 
 # Inlined in whatever is being traced, so that XLA and `jax.grad` see no boundary.
 _compiled = partial(jax.jit, inline=True)

@@ -36,7 +36,7 @@ from rigidjax.rotation.estimate import (
 )
 from rigidjax.rotation.gate import rotation_matrix, turn
 from rigidjax.rotation.maps import hat_polynomial, matrix_to_quaternion, vector_to_matrix
-from rigidjax.special.series import inverse_kernel, stumpff
+from rigidjax.special.stumpff import inverse_kernel, stumpff
 
 
 def exp(v: Vec3Like) -> Mat3:

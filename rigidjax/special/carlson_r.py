@@ -1,9 +1,9 @@
-"""Integrals of products of powers over the half line: elliptic integrals and all their derivatives.
+"""Carlson's multivariate R without its factor: elliptic integrals and all their derivatives.
 
-    H(b; a) = ∫₀^∞ ∏ (t + aᵢ)^(−bᵢ) dt
+    H(b; a) = ∫₀^∞ ∏ (t + aᵢ)^(−bᵢ) dt = R_{1−Σb}(b; a) / (Σb − 1)        (DLMF 19.16.9)
 
-Carlson's R_F, R_D, R_J are of this form (DLMF 19.16.1, 19.16.2, 19.16.5), and the family is closed
-under differentiation: ∂H/∂aᵢ = −bᵢ H(b + eᵢ; a). The integrand is positive, so nothing cancels,
+R_F, R_D, R_J are of this form (DLMF 19.16.1, 19.16.2, 19.16.5), and the family is closed under
+differentiation: ∂H/∂aᵢ = −bᵢ H(b + eᵢ; a). The integrand is positive, so nothing cancels,
 whatever the order. In s = ln t it is analytic for |Im s| < π and decays exponentially: the plain
 trapezoidal rule converges like exp(−2π²/h) (Trefethen & Weideman 2014, doi 10.1137/130932132), and
 a number of nodes fixed by the dtype reaches round-off for arguments of very different sizes.
@@ -26,7 +26,7 @@ _UNIT = {np.dtype("float64"): 1.0, np.dtype("float32"): 2.0**24}
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def half_line(
+def r_integral(
     powers: tuple[float, ...], arguments: tuple[Float[Array, "..."], ...]
 ) -> Float[Array, "..."]:
     """∫₀^∞ ∏ (t + aᵢ)^(−bᵢ) dt for aᵢ ≥ 0, to a few units of round-off.
@@ -39,7 +39,7 @@ def half_line(
     the same rule; an argument that is not differentiated costs nothing and may be 0. Full accuracy
     for ratios of the aᵢ up to 1e35; 1e-13 at 1e60.
 
-    >>> round(float(half_line((2.0,), (jnp.asarray(4.0),))), 12)
+    >>> round(float(r_integral((2.0,), (jnp.asarray(4.0),))), 12)
     0.25
     """
     largest = arguments[0]
@@ -77,15 +77,15 @@ def half_line(
     return jnp.where(negative, jnp.nan, value)
 
 
-@partial(half_line.defjvp, symbolic_zeros=True)
-def _half_line_jvp(powers: Any, primals: Any, tangents: Any) -> tuple[Any, Any]:
+@partial(r_integral.defjvp, symbolic_zeros=True)
+def _r_integral_jvp(powers: Any, primals: Any, tangents: Any) -> tuple[Any, Any]:
     (arguments,), (directions,) = primals, tangents
     tangent = jnp.zeros_like(arguments[0])
     for i, direction in enumerate(directions):
         if powers[i] and not isinstance(direction, SymbolicZero):
             raised = (*powers[:i], powers[i] + 1, *powers[i + 1 :])
-            tangent = tangent - powers[i] * half_line(raised, arguments) * direction
-    return half_line(powers, arguments), tangent
+            tangent = tangent - powers[i] * r_integral(raised, arguments) * direction
+    return r_integral(powers, arguments), tangent
 
 
 def _divide(value: Any, x: Any, power: float) -> Any:

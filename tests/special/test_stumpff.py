@@ -6,7 +6,7 @@ import mpmath as mp
 import numpy as np
 import pytest
 
-from rigidjax.special import series
+from rigidjax.special import stumpff
 
 mp.mp.dps = 50
 TS = np.concatenate(
@@ -43,7 +43,7 @@ def test_values_and_derivatives_of_every_order(dtype):
     def everything(t):
         table = []
         for k in range(4):
-            one = lambda t, k=k: series.stumpff(k, t)
+            one = lambda t, k=k: stumpff.stumpff(k, t)
             two = lambda t, one=one: jax.jvp(one, (t,), (jnp.ones_like(t),))[1]
             three = lambda t, two=two: jax.jvp(two, (t,), (jnp.ones_like(t),))[1]
             table.append(jnp.stack([one(t), jax.grad(one)(t), jax.grad(two)(t), three(t)]))
@@ -68,8 +68,8 @@ def test_inverse_kernel(dtype):
         half = mp.sqrt(t) / 2
         return (1 - half * mp.cot(half)) / t if t > 1e-30 else mp.mpf(1) / 12 + t / 720
 
-    got = jax.jit(jax.vmap(series.inverse_kernel))(ts)
-    slope = jax.jit(jax.vmap(jax.grad(series.inverse_kernel)))(ts)
+    got = jax.jit(jax.vmap(stumpff.inverse_kernel))(ts)
+    slope = jax.jit(jax.vmap(jax.grad(stumpff.inverse_kernel)))(ts)
     values = np.array([float(want(mp.mpf(float(t)))) for t in ts])
     slopes = np.array([float(mp.diff(want, mp.mpf(float(t)))) if t > 1e-3 else 1 / 720 for t in ts])
     eps = np.finfo(dtype).eps
@@ -81,6 +81,6 @@ def test_inverse_kernel(dtype):
 def test_arctan_ratio(dtype):
     z = np.linspace(0, np.tan(np.pi / 8) ** 2, 50).astype(dtype)
     root = np.sqrt(z.astype(np.float64)[1:])
-    got = np.asarray(series.arctan_ratio(jnp.asarray(z)))
+    got = np.asarray(stumpff.arctan_ratio(jnp.asarray(z)))
     assert got[0] == 1
     np.testing.assert_allclose(got[1:], np.arctan(root) / root, rtol=2 * np.finfo(dtype).eps)
