@@ -15,8 +15,8 @@ from jaxtyping import Array, Float
 
 from rigidjax import _checks
 from rigidjax._types import Mat3, Scalar, Vec3, Vec3Like
-from rigidjax.body.hints import Numbers
-from rigidjax.rotation.algebra import cross, dot, entries
+from rigidjax.body._types import Numbers
+from rigidjax.rotation.linalg3 import cross, dot, entries
 from rigidjax.special.scaling import exponent_of, times_power_of_two
 
 # Below it the function of Lommel and Seeliger's law is a series, of so many terms.

@@ -15,7 +15,7 @@ from rigidjax.motion import Rigid
 from rigidjax.motion.torques import CorrelatedTorque, RandomTorque, Sum, Torque, in_precision
 from rigidjax.motion.torques.base import require_law, tensor_of
 from rigidjax.rotation import quaternion
-from rigidjax.rotation.maps import normalised
+from rigidjax.rotation.kernels import normalised
 from rigidjax.solve import equations_of_motion
 
 

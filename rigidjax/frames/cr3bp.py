@@ -8,12 +8,12 @@ from jaxtyping import Array, ArrayLike, Complex, Float
 
 from rigidjax import _checks
 from rigidjax._types import Mat3, Scalar, ScalarLike, Vec3
-from rigidjax.body.hints import Vector
+from rigidjax.body._types import Vector
 from rigidjax.frames import flow, lagrange, richardson
 from rigidjax.frames.mirrored import AbstractMirrored
 from rigidjax.frames.periodic import PeriodicOrbit
 from rigidjax.frames.point import Point, require_point
-from rigidjax.rotation.algebra import components
+from rigidjax.rotation.linalg3 import components
 
 
 class ThreeBody(AbstractMirrored):

@@ -6,7 +6,7 @@ from rigidjax import _checks
 from rigidjax._types import Scalar, ScalarLike, Vec3
 from rigidjax.frames.point import Point, require_point
 from rigidjax.frames.scene import AbstractScene
-from rigidjax.rotation.algebra import components
+from rigidjax.rotation.linalg3 import components
 
 # NIMA TR8350.2 (WGS84), table 3.1; ISO 80000-3 for the standard fall.
 RATE = 7.292115e-5

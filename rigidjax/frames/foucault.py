@@ -7,7 +7,7 @@ from rigidjax._types import Scalar, ScalarLike, Vec3
 from rigidjax.frames.earth import GRAVITY, RATE, Earth, checked
 from rigidjax.frames.point import Point, require_point
 from rigidjax.frames.scene import AbstractScene
-from rigidjax.rotation.algebra import components, dot_components
+from rigidjax.rotation.linalg3 import components, dot_components
 
 
 class Foucault(AbstractScene):

@@ -8,7 +8,7 @@ from rigidjax._types import Scalar, ScalarLike, Vec3
 from rigidjax.frames import flow
 from rigidjax.frames.mirrored import AbstractMirrored
 from rigidjax.frames.point import Point, require_point
-from rigidjax.rotation.algebra import components
+from rigidjax.rotation.linalg3 import components
 
 
 class Hill(AbstractMirrored):

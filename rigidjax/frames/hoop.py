@@ -11,7 +11,7 @@ from rigidjax.frames.moving import MovingFrame
 from rigidjax.frames.point import Point, require_point
 from rigidjax.frames.scene import AbstractScene, like
 from rigidjax.frames.turning import AboutAxis
-from rigidjax.rotation.algebra import components
+from rigidjax.rotation.linalg3 import components
 
 
 class Hoop(AbstractScene):

@@ -13,7 +13,7 @@ from rigidjax.body import inertia as _inertia
 from rigidjax.frames.moving import MovingFrame, require_frame
 from rigidjax.frames.scene import AbstractScene, Force, per_mass
 from rigidjax.frames.turning import Uniform
-from rigidjax.rotation import algebra, quaternion
+from rigidjax.rotation import linalg3, quaternion
 
 
 class InFrame(AbstractScene):
@@ -137,9 +137,9 @@ class BodyInFrame(eqx.Module):
         carried = quaternion.rotate_inverse(state.q, now.rate.astype(omega.dtype))
         change = quaternion.rotate_inverse(state.q, now.rate_change.astype(omega.dtype))
         total = omega + carried
-        gyroscopic = algebra.cross(_inertia.apply(tensor, total), total)
-        relative = algebra.cross(_inertia.apply(tensor, omega), omega)
-        needed = _inertia.apply(tensor, change - algebra.cross(omega, carried))
+        gyroscopic = linalg3.cross(_inertia.apply(tensor, total), total)
+        relative = linalg3.cross(_inertia.apply(tensor, omega), omega)
+        needed = _inertia.apply(tensor, change - linalg3.cross(omega, carried))
         torque = gyroscopic - relative - needed
         moves = hasattr(state, "x")
         force = body.mass.astype(omega.dtype) * now.fictitious(state.x, state.v) if moves else None

@@ -6,8 +6,8 @@ import equinox as eqx
 
 from rigidjax import _checks
 from rigidjax._types import Mat3, Vec3
-from rigidjax.body.hints import Vector
-from rigidjax.rotation import algebra, quaternion
+from rigidjax.body._types import Vector
+from rigidjax.rotation import linalg3, quaternion
 
 
 class Instant(eqx.Module):
@@ -32,7 +32,7 @@ class Instant(eqx.Module):
         if hasattr(state, "x"):
             x, rate = state.x, self.rate.astype(state.x.dtype)
             turned["x"] = self.origin.astype(x.dtype) + self.outward(x)
-            velocity = state.v + algebra.cross(rate, x)
+            velocity = state.v + linalg3.cross(rate, x)
             turned["v"] = self.origin_velocity.astype(x.dtype) + self.outward(velocity)
         if hasattr(state, "q"):
             q = quaternion.from_matrix(self.rotation).astype(state.q.dtype)
@@ -49,7 +49,7 @@ class Instant(eqx.Module):
             dtype = state.x.dtype
             x = self.inward(state.x - self.origin.astype(dtype))
             v = self.inward(state.v - self.origin_velocity.astype(dtype))
-            turned["x"], turned["v"] = x, v - algebra.cross(self.rate.astype(dtype), x)
+            turned["x"], turned["v"] = x, v - linalg3.cross(self.rate.astype(dtype), x)
         if hasattr(state, "q"):
             back = quaternion.from_matrix(self.rotation.T).astype(state.q.dtype)
             rate = quaternion.rotate_inverse(
@@ -62,28 +62,28 @@ class Instant(eqx.Module):
     def outward(self, y: Vector) -> Vec3:
         """Components in S' → components in S, M y' (notes, eq 85): forces, directions."""
         y = _checks.floating(y, (3,), "y")
-        return algebra.apply(self.rotation.astype(y.dtype), y)
+        return linalg3.apply(self.rotation.astype(y.dtype), y)
 
     def inward(self, y: Vector) -> Vec3:
         """Components in S → components in S', Mᵀ y (notes, eq 86; f = MᵀF of eq 91)."""
         y = _checks.floating(y, (3,), "y")
-        return algebra.apply(self.rotation.T.astype(y.dtype), y)
+        return linalg3.apply(self.rotation.T.astype(y.dtype), y)
 
     def centrifugal(self, x: Vector) -> Vec3:
         """Centrifugal acceleration −Ω × (Ω × x')."""
         x = _checks.floating(x, (3,), "x")
         rate = self.rate.astype(x.dtype)
-        return algebra.cross(algebra.cross(rate, x), rate)
+        return linalg3.cross(linalg3.cross(rate, x), rate)
 
     def coriolis(self, v: Vector) -> Vec3:
         """Coriolis acceleration −2 Ω × v'."""
         v = _checks.floating(v, (3,), "v")
-        return 2 * algebra.cross(v, self.rate.astype(v.dtype))
+        return 2 * linalg3.cross(v, self.rate.astype(v.dtype))
 
     def euler_acceleration(self, x: Vector) -> Vec3:
         """Euler acceleration −dΩ/dt × x'."""
         x = _checks.floating(x, (3,), "x")
-        return algebra.cross(x, self.rate_change.astype(x.dtype))
+        return linalg3.cross(x, self.rate_change.astype(x.dtype))
 
     def translation(self) -> Vec3:
         """Acceleration −Mᵀ d²X/dt²: what an accelerated origin adds."""

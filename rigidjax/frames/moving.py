@@ -9,11 +9,11 @@ import jax.numpy as jnp
 
 from rigidjax import _checks
 from rigidjax._types import Mat3, Scalar, ScalarLike, Vec3
-from rigidjax.body.hints import Vector
+from rigidjax.body._types import Vector
 from rigidjax.frames import turning
 from rigidjax.frames.instant import Instant
 from rigidjax.frames.point import require_point
-from rigidjax.rotation import algebra
+from rigidjax.rotation import linalg3
 
 
 class MovingFrame(eqx.Module):
@@ -98,7 +98,7 @@ class MovingFrame(eqx.Module):
         if hasattr(state, "omega"):
             return state.omega.astype(t.dtype)
         m, m_dot = jax.jvp(self.matrix, (t,), (jnp.ones_like(t),))
-        return algebra.vee(algebra.product(m.T, m_dot))
+        return linalg3.vee(linalg3.product(m.T, m_dot))
 
     def to_inertial(self, state: Any, t: ScalarLike) -> Any:
         """What S sees of a state that S' sees, of the same type.
@@ -184,11 +184,11 @@ class MovingFrame(eqx.Module):
 
     def force_from_inertial(self, force: Vector, t: ScalarLike) -> Vec3:
         """Force f = MᵀF (3,): a force, or any direction, in the axes of S' (notes, eq 91)."""
-        return algebra.apply(self.matrix(t).T, _checks.floating(force, (3,), "force"))
+        return linalg3.apply(self.matrix(t).T, _checks.floating(force, (3,), "force"))
 
     def force_to_inertial(self, force: Vector, t: ScalarLike) -> Vec3:
         """Force F = M f (3,): a force, or any direction, in the axes of S (notes, eq 85)."""
-        return algebra.apply(self.matrix(t), _checks.floating(force, (3,), "force"))
+        return linalg3.apply(self.matrix(t), _checks.floating(force, (3,), "force"))
 
     def jacobi_integral(self, state: Any, t: ScalarLike, potential: ScalarLike = 0.0) -> Scalar:
         """½|v'|² − ½|Ω × x'|² + V, m²/s²: kept where Ω and V(x') do not depend on time.
@@ -197,10 +197,10 @@ class MovingFrame(eqx.Module):
         Source: Goldstein, Mechanics, sec. 3.12 (as h = −C/2 in the three-body problem).
         """
         require_point(state)
-        speed = algebra.dot(state.v, state.v)
-        moved = algebra.cross(self.at(t).rate.astype(state.x.dtype), state.x)
+        speed = linalg3.dot(state.v, state.v)
+        moved = linalg3.cross(self.at(t).rate.astype(state.x.dtype), state.x)
         v = _checks.floating(potential, (), "potential").astype(state.x.dtype)
-        return 0.5 * (speed - algebra.dot(moved, moved)) + v
+        return 0.5 * (speed - linalg3.dot(moved, moved)) + v
 
     def then(self, inner: "MovingFrame") -> "MovingFrame":
         """The frame that moves as `inner` does **within this one**: M = M₁M₂, X = X₁ + M₁X₂.
@@ -248,11 +248,11 @@ class _ComposedRotation(eqx.Module):
     inner: MovingFrame
 
     def __call__(self, t: Any) -> Any:
-        return algebra.product(self.outer.matrix(t), self.inner.matrix(t))
+        return linalg3.product(self.outer.matrix(t), self.inner.matrix(t))
 
     def rate(self, t: Any) -> Any:
         # Rates add in one set of axes, which saves one derivative of the product.
-        carried = algebra.apply(self.inner.matrix(t).T, self.outer.angular_velocity(t))
+        carried = linalg3.apply(self.inner.matrix(t).T, self.outer.angular_velocity(t))
         return carried + self.inner.angular_velocity(t)
 
 
@@ -261,7 +261,7 @@ class _ComposedOrigin(eqx.Module):
     inner: MovingFrame
 
     def __call__(self, t: Any) -> Any:
-        return self.outer.place(t) + algebra.apply(self.outer.matrix(t), self.inner.place(t))
+        return self.outer.place(t) + linalg3.apply(self.outer.matrix(t), self.inner.place(t))
 
 
 class _InverseRotation(eqx.Module):
@@ -271,11 +271,11 @@ class _InverseRotation(eqx.Module):
         return self.frame.matrix(t).T
 
     def rate(self, t: Any) -> Any:
-        return -algebra.apply(self.frame.matrix(t), self.frame.angular_velocity(t))
+        return -linalg3.apply(self.frame.matrix(t), self.frame.angular_velocity(t))
 
 
 class _InverseOrigin(eqx.Module):
     frame: MovingFrame
 
     def __call__(self, t: Any) -> Any:
-        return -algebra.apply(self.frame.matrix(t).T, self.frame.place(t))
+        return -linalg3.apply(self.frame.matrix(t).T, self.frame.place(t))

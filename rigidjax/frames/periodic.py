@@ -14,7 +14,7 @@ from rigidjax import _checks
 from rigidjax._types import Scalar, ScalarLike
 from rigidjax.frames.flow import attempt
 from rigidjax.frames.point import Point
-from rigidjax.rotation.algebra import components
+from rigidjax.rotation.linalg3 import components
 
 _NAMES = ("x", "z", "vy", "period")
 MAX_STEPS = 25

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from rigidjax import _checks
 from rigidjax._types import Mat3, Vec3
-from rigidjax.rotation import algebra, quaternion, so3
+from rigidjax.rotation import linalg3, quaternion, so3
 
 
 class Uniform(eqx.Module):
@@ -53,7 +53,7 @@ class AboutAxis(eqx.Module):
         axis = _checks.finite(_checks.floating(axis, (3,), "axis"), "axis")
         hint = "for a uniform turn take frames.Uniform(omega)"
         _checks.function(angle, "angle", "of time to rad", hint=hint)
-        length = jnp.sqrt(algebra.dot(axis, axis))
+        length = jnp.sqrt(linalg3.dot(axis, axis))
         self.axis = _checks.refuse(axis, length == 0, "axis: wanted a direction, got zero") / length
         self.angle = angle
 
@@ -102,8 +102,8 @@ def matrix(rotation: Any, t: Array) -> Mat3:
     m = _checks.floating(value, (3, 3), "rotation", hint="wanted a matrix or a quaternion (4,)")
     if _checks.known(m):
         tolerance = 1e-6 if m.dtype == jnp.float64 else 1e-3
-        off = jnp.max(jnp.abs(algebra.product(m.T, m) - jnp.eye(3, dtype=m.dtype)))
+        off = jnp.max(jnp.abs(linalg3.product(m.T, m) - jnp.eye(3, dtype=m.dtype)))
         _checks.refuse(m, ~(off < tolerance), "rotation: Mᵀ M is not 1, so this is no rotation")
-        left = algebra.determinant(m) < 0
+        left = linalg3.determinant(m) < 0
         _checks.refuse(m, left, "rotation: left-handed axes, det = −1 (notes, eq 10)")
     return m.astype(t.dtype)

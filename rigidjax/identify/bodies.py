@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from rigidjax import _checks
 from rigidjax.body import parameters as charts
 from rigidjax.body.inertia import Inertia, MassProperties
-from rigidjax.body.symmetric import swap_trace
+from rigidjax.body.symmetric3 import swap_trace
 
 # What of a `MassProperties` may be free: in words, and its places among the numbers of `pack`.
 _PARTS = {

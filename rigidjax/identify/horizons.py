@@ -10,7 +10,7 @@ from jaxtyping import Array
 from rigidjax._types import HasAttitude
 from rigidjax.motion import Rigid
 from rigidjax.rotation import quaternion
-from rigidjax.rotation.algebra import components
+from rigidjax.rotation.linalg3 import components
 
 
 class Horizons(NamedTuple):

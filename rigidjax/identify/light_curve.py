@@ -22,7 +22,7 @@ from rigidjax.identify.sensors import Brightness
 from rigidjax.identify.several import Bodies
 from rigidjax.identify.tumbling_search import descended, noise_of, relative_flux, starts_of
 from rigidjax.identify.two_frequencies import TwoFrequencies, two_frequencies
-from rigidjax.rotation.algebra import apply, dot
+from rigidjax.rotation.linalg3 import apply, dot
 
 # Motions are the same where both periods and both ratios of moments differ by less than that, or
 # by less than so many of their standard deviations.

@@ -15,8 +15,8 @@ from rigidjax.motion.coupled import Coupled
 from rigidjax.motion.spin import EulerEquations
 from rigidjax.motion.torques import Torque
 from rigidjax.rotation import quaternion
-from rigidjax.rotation.algebra import components
-from rigidjax.rotation.maps import square4
+from rigidjax.rotation.kernels import square4
+from rigidjax.rotation.linalg3 import components
 
 
 class Attitude(eqx.Module):

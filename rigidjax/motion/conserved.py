@@ -22,7 +22,7 @@ from rigidjax.motion.torques import (
 from rigidjax.motion.torques.base import length_or_zero, one_law, require_rung
 from rigidjax.motion.torques.states import Frozen, require_frozen
 from rigidjax.rotation import quaternion
-from rigidjax.rotation.algebra import cross, dot
+from rigidjax.rotation.linalg3 import cross, dot
 
 
 def energy(

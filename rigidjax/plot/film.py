@@ -12,8 +12,8 @@ from jaxtyping import ArrayLike, Float
 
 from rigidjax import _checks
 from rigidjax._types import HasAttitude
-from rigidjax.body.axes import principal
 from rigidjax.body.inertia import Inertia, MassProperties
+from rigidjax.body.principal_axes import principal
 from rigidjax.plot.style import COLOURS, attitudes, cube, matrices, pyplot
 
 # Corners of the cube, and its faces in pairs across x, y, z, seen from outside counter-clockwise.

@@ -23,15 +23,7 @@ from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 from rigidjax import _checks
 from rigidjax._names import own_names
 from rigidjax._types import Mat3, Mat3Like, Quat, QuatLike, Scalar, ScalarLike, Vec3, Vec3Like
-from rigidjax.rotation.algebra import (
-    components,
-    cross_components,
-    dot,
-    dot_components,
-    near_one,
-)
-from rigidjax.rotation.gate import direction, rotation_matrix, turn, unit_quaternion
-from rigidjax.rotation.maps import (
+from rigidjax.rotation.kernels import (
     flipped,
     matrix_to_quaternion,
     normalised,
@@ -39,6 +31,14 @@ from rigidjax.rotation.maps import (
     quaternion_to_vector,
     vector_to_quaternion,
 )
+from rigidjax.rotation.linalg3 import (
+    components,
+    cross_components,
+    dot,
+    dot_components,
+    near_one,
+)
+from rigidjax.rotation.validation import direction, rotation_matrix, turn, unit_quaternion
 
 _HINT = "one quaternion is (w, x, y, z), scalar first; batch with jax.vmap"
 

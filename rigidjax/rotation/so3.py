@@ -14,7 +14,9 @@ from rigidjax import _checks
 from rigidjax._names import own_names
 from rigidjax._types import Mat3, Mat3Like, Scalar, ScalarLike, Vec3, Vec3Like
 from rigidjax.rotation import quaternion
-from rigidjax.rotation.algebra import (
+from rigidjax.rotation.averaging import mean as mean, mean_quaternion as mean_quaternion
+from rigidjax.rotation.kernels import hat_polynomial, matrix_to_quaternion, vector_to_matrix
+from rigidjax.rotation.linalg3 import (
     apply as apply,
     basis as basis,
     components,
@@ -27,15 +29,8 @@ from rigidjax.rotation.algebra import (
     square,
     vee as vee,
 )
-from rigidjax.rotation.estimate import (
-    align as align,
-    mean as mean,
-    mean_quaternion as mean_quaternion,
-    project as project,
-    wahba as wahba,
-)
-from rigidjax.rotation.gate import rotation_matrix, turn
-from rigidjax.rotation.maps import hat_polynomial, matrix_to_quaternion, vector_to_matrix
+from rigidjax.rotation.validation import rotation_matrix, turn
+from rigidjax.rotation.wahba import align as align, project as project, wahba as wahba
 from rigidjax.special.stumpff import inverse_kernel, stumpff
 
 

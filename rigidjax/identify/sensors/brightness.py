@@ -15,7 +15,7 @@ from rigidjax.body.scattering import direction, law_of
 from rigidjax.identify.sensors.base import AbstractSensor, Moment, noise_of, number_of
 from rigidjax.motion.torques.base import vector_at
 from rigidjax.rotation import quaternion
-from rigidjax.rotation.algebra import dot, entries
+from rigidjax.rotation.linalg3 import dot, entries
 
 UNITS = ("flux", "mag")
 

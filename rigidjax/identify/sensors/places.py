@@ -16,7 +16,7 @@ from rigidjax.identify.sensors.base import (
     vector_of,
 )
 from rigidjax.rotation import quaternion
-from rigidjax.rotation.algebra import cross, dot
+from rigidjax.rotation.linalg3 import cross, dot
 
 
 class Position(AbstractSensor):

@@ -13,8 +13,8 @@ from jaxtyping import Array, Float
 
 from rigidjax import _checks
 from rigidjax._types import HasAttitude, HasPose, HasSpin, Scalar, ScalarLike, Vec3, Vec3Like
-from rigidjax.body import physical
-from rigidjax.body.hints import Vector
+from rigidjax.body import validation
+from rigidjax.body._types import Vector
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.motion.torques.states import Frozen, require_frozen
 
@@ -112,7 +112,7 @@ def given(value: Any, shape: tuple[int, ...], name: str, *, hint: str = "") -> A
     """
     array = _checks.floating(value, shape, name, hint=hint)
     # NumPy: inside a trace a check with jax would become part of the program.
-    if physical.known(array) and not np.isfinite(np.asarray(array)).all():
+    if validation.known(array) and not np.isfinite(np.asarray(array)).all():
         raise ValueError(f"{name}: contains NaN or infinity, got {np.asarray(array)}")
     return array
 

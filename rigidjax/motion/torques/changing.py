@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from rigidjax import _checks
 from rigidjax._types import HasSpin, Mat3, ScalarLike, Vec3
 from rigidjax.body.inertia import Inertia, MassProperties
-from rigidjax.body.symmetric import apply, inverse
+from rigidjax.body.symmetric3 import apply, inverse
 from rigidjax.motion.torques.base import (
     Torque,
     Wrench,
@@ -20,7 +20,7 @@ from rigidjax.motion.torques.base import (
     require_law,
     tensor_of,
 )
-from rigidjax.rotation.algebra import cross
+from rigidjax.rotation.linalg3 import cross
 
 
 class ChangingInertia(eqx.Module):

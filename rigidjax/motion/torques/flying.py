@@ -9,8 +9,8 @@ from jaxtyping import Array, ArrayLike, Float
 
 from rigidjax import _checks
 from rigidjax._types import HasPose, ScalarLike
-from rigidjax.body import physical
-from rigidjax.body.hints import Vector
+from rigidjax.body import validation
+from rigidjax.body._types import Vector
 from rigidjax.body.inertia import MassProperties
 from rigidjax.motion.torques.base import (
     AbstractForce,
@@ -21,7 +21,7 @@ from rigidjax.motion.torques.base import (
     vector_at,
 )
 from rigidjax.rotation import quaternion
-from rigidjax.rotation.algebra import cross
+from rigidjax.rotation.linalg3 import cross
 
 
 class Rotors(AbstractForce):
@@ -70,11 +70,11 @@ class Rotors(AbstractForce):
         self.positions = given(positions, (count, 3), "positions")
         self.directions = given(directions, (count, 3), "directions")
         self.spins = given(spins, (count,), "spins")
-        if physical.known(self.directions):
+        if validation.known(self.directions):
             lengths = np.linalg.norm(np.asarray(self.directions, float), axis=1)
             if abs(lengths - 1).max() > 1e-6:
                 raise ValueError(f"directions: wanted unit vectors, got lengths {lengths}")
-        if physical.known(self.spins) and (abs(np.asarray(self.spins)) != 1).any():
+        if validation.known(self.spins) and (abs(np.asarray(self.spins)) != 1).any():
             raise ValueError(f"spins: wanted 1 or -1 for each rotor, got {np.asarray(self.spins)}")
         alone = _checks.numbers(thrust, "thrust").ndim, _checks.numbers(drag, "drag").ndim
         self.thrust = given(thrust, (count,) if alone[0] else (), "thrust")

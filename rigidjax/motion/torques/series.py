@@ -12,7 +12,7 @@ from jaxtyping import Array, ArrayLike, Float
 from rigidjax import _checks
 from rigidjax._types import Scalar, ScalarLike, Vec3
 from rigidjax.motion.torques.base import given
-from rigidjax.rotation.algebra import cross, dot
+from rigidjax.rotation.linalg3 import cross, dot
 
 Samples = Float[ArrayLike, "n *channels"] | Sequence[Any]
 

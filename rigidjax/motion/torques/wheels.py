@@ -10,9 +10,9 @@ from jaxtyping import Array, ArrayLike, Float
 
 from rigidjax import _checks
 from rigidjax._types import HasSpin, Scalar, ScalarLike, Vec3
-from rigidjax.body import physical
+from rigidjax.body import validation
 from rigidjax.body.inertia import Inertia, MassProperties
-from rigidjax.body.symmetric import outer
+from rigidjax.body.symmetric3 import outer
 from rigidjax.motion.torques.base import (
     AbstractTorque,
     constant_or_callable,
@@ -20,7 +20,7 @@ from rigidjax.motion.torques.base import (
     jumps_of,
     vector_at,
 )
-from rigidjax.rotation.algebra import cross
+from rigidjax.rotation.linalg3 import cross
 
 Body = TypeVar("Body", Inertia, MassProperties)
 Numbers = Float[ArrayLike, "*wheels"] | Any
@@ -100,7 +100,7 @@ class ReactionWheels(AbstractTorque):
             raise ValueError(f"axes: wanted (R, 3), one row a wheel, got shape {shape}")
         count = shape[0]
         self.axes = given(axes, (count, 3), "axes")
-        if physical.known(self.axes):
+        if validation.known(self.axes):
             lengths = np.linalg.norm(np.asarray(self.axes, float), axis=1)
             if abs(lengths - 1).max() > 1e-6:
                 raise ValueError(f"axes: wanted unit vectors, got lengths {lengths}")
@@ -213,7 +213,7 @@ def _each(value: Any, count: int, name: str, *, zero: bool = False) -> Array | N
 
 
 def _positive(value: Array, name: str, *, zero: bool = False) -> Array:
-    if physical.known(value):
+    if validation.known(value):
         numbers = np.asarray(value)
         if not ((numbers >= 0) if zero else (numbers > 0)).all():
             raise ValueError(f"{name}: wanted {'≥ 0' if zero else '> 0'}, got {numbers}")

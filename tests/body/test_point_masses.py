@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rigidjax.body import shapes
-from rigidjax.body.symmetric import swap_trace
+from rigidjax.body.symmetric3 import swap_trace
 
 
 @pytest.mark.parametrize(("dtype", "offset"), [(jnp.float64, 2.0**20), (jnp.float32, 2.0**10)])

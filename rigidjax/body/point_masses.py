@@ -8,10 +8,10 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from rigidjax import _checks
-from rigidjax.body import physical
-from rigidjax.body.hints import Numbers, Vector
+from rigidjax.body import validation
+from rigidjax.body._types import Numbers, Vector
 from rigidjax.body.inertia import MassProperties
-from rigidjax.body.symmetric import from_components
+from rigidjax.body.symmetric3 import from_components
 
 
 def points(
@@ -34,10 +34,10 @@ def points(
     )
     if n == 0:
         raise ValueError("masses: wanted at least one, got none")
-    if physical.known(masses):
+    if validation.known(masses):
         _checks.finite(masses, "masses")
         _checks.refuse(masses, (masses < 0).any(), f"masses: wanted masses ≥ 0, got {masses.min()}")
-    if physical.known(positions):
+    if validation.known(positions):
         _checks.finite(positions, "positions")
     return summed(masses, positions)
 
@@ -61,13 +61,13 @@ def voxels(
     if density.ndim != 3 or density.size == 0:
         raise ValueError(f"density: wanted shape (nx, ny, nz), got {density.shape}")
     h, low = _checks.floating(spacing, (3,), "spacing"), _checks.floating(corner, (3,), "corner")
-    if physical.known(density):
+    if validation.known(density):
         _checks.finite(density, "density")
         _checks.refuse(density, (density < 0).any(), "density: wanted values ≥ 0 (kg/m³)")
-    if physical.known(h):
+    if validation.known(h):
         fine = ((h > 0) & jnp.isfinite(h)).all()
         _checks.refuse(h, ~fine, f"spacing: wanted three positive edges of a cell, m, got {h}")
-    if physical.known(low):
+    if validation.known(low):
         _checks.finite(low, "corner")
     axes = [(jnp.arange(n, dtype=density.dtype) + 0.5) * h[i] for i, n in enumerate(density.shape)]
     centres = jnp.stack(jnp.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -119,7 +119,7 @@ def quadrature(
 
     per_volume, positions = jax.vmap(at)(cube)
     for name, values in {"place(u)": positions, "density(r) |∂r/∂u|": per_volume}.items():
-        if physical.known(values):
+        if validation.known(values):
             _checks.refuse(values, ~jnp.isfinite(values).all(), f"{name}: contains NaN or infinity")
     return summed(per_volume * weight, positions)
 

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 
 from rigidjax import _checks
 from rigidjax._types import Quat
-from rigidjax.body.hints import Quaternion
+from rigidjax.body._types import Quaternion
 from rigidjax.rotation import quaternion
 
 # Units of round-off, of the largest entry. A product R I Rᵀ is off by about ten.

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from rigidjax._types import Mat3, Quat, Scalar, Vec3
-from rigidjax.rotation.algebra import (
+from rigidjax.rotation.linalg3 import (
     components,
     cross_components,
     dot_components,

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 
 from rigidjax import _checks
 from rigidjax._types import Mat3, Mat3Like, Quat, Vec3
-from rigidjax.body.symmetric import product
+from rigidjax.body.symmetric3 import product
 from rigidjax.special.scaling import exponent_of, times_power_of_two
 
 # Moments closer than this many units of round-off of the largest count as equal.
@@ -33,7 +33,7 @@ def principal(tensor: Mat3Like) -> tuple[Vec3, Quat]:
     entries. That is the right derivative of whatever depends on the moments symmetrically and on
     the eigenspaces only. What mixes axes inside an eigenspace is not seen by any finite tangent
     of an axis: for a smooth function of the whole matrix, such as a square root, use
-    `rigidjax.body.spectral.matrix_function`; to solve, use the matrix itself.
+    `rigidjax.body.matrix_functions.matrix_function`; to solve, use the matrix itself.
 
     Source: notes, eqs 71–72; first-order perturbation theory, Kato 1966, II.2.
 

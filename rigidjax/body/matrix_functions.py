@@ -10,8 +10,8 @@ from jax.lax import stop_gradient
 
 from rigidjax import _checks
 from rigidjax._types import Mat3, Mat3Like, Scalar
-from rigidjax.body.axes import eigensystem
-from rigidjax.body.symmetric import product
+from rigidjax.body.principal_axes import eigensystem
+from rigidjax.body.symmetric3 import product
 from rigidjax.special.scaling import exponent_of, times_power_of_two
 
 # Eigenvalues within this fraction of the largest are handled by an integral, not a quotient.

@@ -1,4 +1,4 @@
-"""The rotation that fits best: projection, alignment, Wahba's problem, mean (floor 1).
+"""The rotation that fits best: projection, alignment, Wahba's problem (floor 1).
 
 No singular value decomposition and no eigenvectors: their derivatives are NaN at every rotation,
 where all three singular values are 1. The best rotation R of a 3×3 matrix B, the one with the
@@ -6,7 +6,6 @@ largest Tr(RᵀB), has the derivative dR = R hat(x), (Tr(S) 1 − S) x = 2 vee(R
 which is regular wherever the answer is unique.
 """
 
-from functools import partial
 from typing import Any
 
 import jax
@@ -17,12 +16,11 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
 from rigidjax import _checks
-from rigidjax._types import Mat3, Mat3Like, Quat, Scalar, Vec3, Vec3Like
+from rigidjax._types import Mat3, Mat3Like, Scalar, Vec3Like
 from rigidjax.rotation import quaternion
-from rigidjax.rotation.algebra import cross, determinant, dot, hat, near_one, product, solve, vee
-from rigidjax.rotation.gate import direction, rotation_matrix, unit_quaternion
-from rigidjax.rotation.maps import matrix_to_quaternion
-from rigidjax.special.stumpff import inverse_kernel
+from rigidjax.rotation.kernels import matrix_to_quaternion
+from rigidjax.rotation.linalg3 import cross, determinant, dot, hat, near_one, product, solve, vee
+from rigidjax.rotation.validation import direction
 
 
 def project(matrix: Mat3Like) -> Mat3:
@@ -47,7 +45,7 @@ def project(matrix: Mat3Like) -> Mat3:
             raise ValueError(
                 f"matrix: left-handed frame or singular, det = {found:.3g}; no rotation is nearest"
             )
-    return _best(matrix)
+    return nearest(matrix)
 
 
 def wahba(
@@ -70,12 +68,12 @@ def wahba(
     """
     body = _checks.rows(body, (3,), "body")
     world = _checks.floating(world, body.shape, "world")
-    w = _weights(weights, body[:, 0], "body")
+    w = weights_of(weights, body[:, 0], "body")
     for name, rows in (("body", body), ("world", world)):
         direction(rows.reshape(-1), name)
-    w, world, body = (_of_order_one(x) for x in (w, world, body))
+    w, world, body = (of_order_one(x) for x in (w, world, body))
     b = (w[:, None, None] * world[:, :, None] * body[:, None, :]).sum(0)
-    best = _best(b)
+    best = nearest(b)
     # (σ1 + σ2)(σ2 + σ3)(σ3 + σ1), σ3 with the sign of det b: 0 where a turn is free.
     firmness = determinant(_curvature(best, b / jnp.sqrt((b * b).sum())))
     return _checks.refuse(
@@ -98,7 +96,7 @@ def align(a: Vec3Like, b: Vec3Like) -> Mat3:
     [0.0, 1.0, 0.0]
     """
     a, b = _checks.floating(a, (3,), "a"), _checks.floating(b, (3,), "b")
-    a, b = (_of_order_one(direction(x, name)) for x, name in ((a, "a"), (b, "b")))
+    a, b = (of_order_one(direction(x, name)) for x, name in ((a, "a"), (b, "b")))
     a, b = a / jnp.sqrt(dot(a, a)), b / jnp.sqrt(dot(b, b))
     middle = a + b
     n2, normal = dot(middle, middle), cross(a, middle)
@@ -113,69 +111,12 @@ def align(a: Vec3Like, b: Vec3Like) -> Mat3:
     return quaternion.to_matrix(quaternion.normalise(jnp.concatenate([w[None], axis])))
 
 
-def mean(matrices: Float[ArrayLike, "n 3 3"], weights: Float[ArrayLike, "n"] | None = None) -> Mat3:
-    """The Karcher mean: the rotation least in Σ w_i |angle to R_i|².
-
-    **Arguments:** `matrices` (n, 3, 3) rotations, within a quarter turn of the mean, where it is
-    unique (Karcher 1977, doi:10.1002/cpa.3160300502); `weights` (n,), not negative.
-
-    **Returns:** (3, 3), with first and second derivatives from the last two Newton steps alone.
-    **Raises:** as `so3.check`, if the matrices are known now; `ValueError` for weights that make no
-    mean.
-
-    >>> mean(jnp.stack([jnp.eye(3), jnp.eye(3)])).round(12).tolist()
-    [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
-    """
-    matrices = _checks.rows(matrices, (3, 3), "matrices")
-    if _checks.known(matrices) and matrices.size:
-        rotation_matrix(matrices, "matrices")
-    _weights(weights, matrices[:, 0, 0], "matrices")
-    return quaternion.to_matrix(mean_quaternion(jax.vmap(matrix_to_quaternion)(matrices), weights))
-
-
-def mean_quaternion(
-    quaternions: Float[ArrayLike, "n 4"], weights: Float[ArrayLike, "n"] | None = None
-) -> Quat:
-    """The Karcher mean of unit quaternions; each may have either sign.
-
-    **Arguments:** `quaternions` (n, 4); `weights` (n,). See `mean`. **Returns:** (4,), w ≥ 0.
-    **Raises:** as `quaternion.check`, if they are known now.
-
-    >>> mean_quaternion(jnp.array([[1.0, 0, 0, 0], [-1.0, 0, 0, 0]])).tolist()
-    [1.0, 0.0, 0.0, 0.0]
-    """
-    q = _checks.rows(quaternions, (4,), "quaternions")
-    if _checks.known(q) and q.size:
-        unit_quaternion(q, "quaternions")
-    return _karcher(q, _of_order_one(_weights(weights, q[:, 0], "quaternions")))
-
-
-# Compiled once: called from the prompt, the loop would be compiled anew each time.
-@partial(jax.jit, inline=True)
-def _karcher(q: Float[Array, "n 4"], w: Float[Array, "n"]) -> Quat:
-
-    def newton(_: Any, start: Quat, q: Array, w: Array) -> Quat:
-        apart = jax.vmap(lambda each: quaternion.multiply(quaternion.conjugate(start), each))(q)
-        v = jax.vmap(quaternion.log)(apart)
-        slope = (w[:, None, None] * jax.vmap(_left_jacobian_inverse)(v)).sum(0)
-        return quaternion.multiply(start, quaternion.exp(solve(slope, (w[:, None] * v).sum(0))))
-
-    fixed_q, fixed_w = lax.stop_gradient((q, w))
-    chord = (fixed_w[:, None, None] * jax.vmap(quaternion.to_matrix)(fixed_q)).sum(0)
-    start = matrix_to_quaternion(_best(chord))
-    start = lax.fori_loop(0, 6, lambda i, s: newton(i, s, fixed_q, fixed_w), start)
-    # Each Newton step from the solution doubles the order to which derivatives are right.
-    for i in range(2):
-        start = newton(i, lax.stop_gradient(start) if i == 0 else start, q, w)
-    return quaternion.canonical(quaternion.normalise(start))
-
-
-def _of_order_one(x: Array) -> Array:
+def of_order_one(x: Array) -> Array:
     """The same but for a power of two, where only ratios count: no product overflows."""
     return near_one(jnp.max(jnp.abs(x))) * x
 
 
-def _weights(weights: Any, like: Array, of: str) -> Array:
+def weights_of(weights: Any, like: Array, of: str) -> Array:
     """One weight for each, 1 if not given; refused where it is known that no mean has them."""
     if like.shape[0] == 0:
         raise ValueError(f"{of}: wanted at least one row, got none")
@@ -187,11 +128,6 @@ def _weights(weights: Any, like: Array, of: str) -> Array:
         bad = (w < 0).any() | ~(w > 0).any()
         _checks.refuse(w, bad, "weights: wanted numbers ≥ 0, of which one at least is positive")
     return w
-
-
-def _left_jacobian_inverse(v: Vec3) -> Mat3:
-    h = hat(v)
-    return jnp.eye(3, dtype=v.dtype) - 0.5 * h + inverse_kernel(dot(v, v)) * product(h, h)
 
 
 def _quartic(b: Mat3) -> tuple[Scalar, Scalar]:
@@ -221,8 +157,9 @@ def _curvature(r: Mat3, b: Mat3) -> Mat3:
 
 
 @jax.custom_jvp
-def _best(b: Mat3) -> Mat3:
-    b = _of_order_one(b)
+def nearest(b: Mat3) -> Mat3:
+    """The rotation R with the largest Tr(Rᵀb), of a matrix of any size."""
+    b = of_order_one(b)
     b = b / jnp.sqrt((b * b).sum())
     root, zeta = _quartic(b)
     kappa = 0.5 * (root * root - 1)
@@ -236,10 +173,10 @@ def _best(b: Mat3) -> Mat3:
     return quaternion.to_matrix(q)
 
 
-@_best.defjvp
+@nearest.defjvp
 def _best_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
     (b,), (db,) = primals, tangents
-    r = _best(b)
+    r = nearest(b)
     # Of any size: both are made smaller alike.
     scale = near_one(jnp.max(jnp.abs(b)))
     b, db = scale * b, scale * db

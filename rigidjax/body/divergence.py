@@ -5,8 +5,8 @@ import jax.numpy as jnp
 from rigidjax import _checks
 from rigidjax._types import Scalar
 from rigidjax.body.inertia import MassProperties
-from rigidjax.body.symmetric import inverse
-from rigidjax.rotation.algebra import apply, determinant, dot, product
+from rigidjax.body.symmetric3 import inverse
+from rigidjax.rotation.linalg3 import apply, determinant, dot, product
 
 
 def divergence(body: MassProperties, reference: MassProperties) -> Scalar:

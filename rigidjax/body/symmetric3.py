@@ -10,7 +10,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from rigidjax import _checks
 from rigidjax._types import Mat3, Mat3Like, Scalar, Vec3, Vec3Like
-from rigidjax.rotation.algebra import apply as apply, entries, product as product
+from rigidjax.rotation.linalg3 import apply as apply, entries, product as product
 
 
 def inverse(tensor: Mat3Like) -> Mat3:

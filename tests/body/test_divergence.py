@@ -8,7 +8,7 @@ import pytest
 from once import once
 
 from rigidjax.body import parameters
-from rigidjax.body.prior import divergence
+from rigidjax.body.divergence import divergence
 
 
 def body(seed):
