@@ -12,8 +12,8 @@ from rigidjax import _checks
 from rigidjax._types import HasAttitude, HasPose, Mat3, Scalar
 from rigidjax.body.inertia import Inertia, MassProperties, inverse
 from rigidjax.motion import Rigid
-from rigidjax.motion.torques import CorrelatedTorque, RandomTorque, Sum, Torque, in_precision
-from rigidjax.motion.torques.base import require_law, tensor_of
+from rigidjax.motion.torques import CorrelatedTorque, RandomTorque, Sum, Torque
+from rigidjax.motion.torques.base import in_precision, require_law, tensor_of
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.kernels import normalised
 from rigidjax.solve import equations_of_motion

@@ -18,7 +18,7 @@ from rigidjax.identify.propagate import shifted
 from rigidjax.identify.recording import Reading, Recording
 from rigidjax.identify.sensors import AbstractSensor, Moment
 from rigidjax.motion import Rigid
-from rigidjax.motion.torques import in_precision
+from rigidjax.motion.torques.base import in_precision
 
 
 class Row(NamedTuple):

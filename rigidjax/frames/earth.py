@@ -4,8 +4,8 @@ import jax.numpy as jnp
 
 from rigidjax import _checks
 from rigidjax._types import Scalar, ScalarLike, Vec3
+from rigidjax.frames.base import AbstractScene
 from rigidjax.frames.point import Point, require_point
-from rigidjax.frames.scene import AbstractScene
 from rigidjax.rotation.linalg3 import components
 
 # NIMA TR8350.2 (WGS84), table 3.1; ISO 80000-3 for the standard fall.

@@ -4,9 +4,9 @@ import jax.numpy as jnp
 
 from rigidjax import _checks
 from rigidjax._types import Scalar, ScalarLike, Vec3
+from rigidjax.frames.base import AbstractScene
 from rigidjax.frames.earth import GRAVITY, RATE, Earth, checked
 from rigidjax.frames.point import Point, require_point
-from rigidjax.frames.scene import AbstractScene
 from rigidjax.rotation.linalg3 import components, dot_components
 
 

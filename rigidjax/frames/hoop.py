@@ -5,12 +5,12 @@ import jax.numpy as jnp
 
 from rigidjax import _checks
 from rigidjax._types import Scalar, ScalarLike, Vec3
+from rigidjax.frames.base import AbstractScene, like
 from rigidjax.frames.earth import GRAVITY
-from rigidjax.frames.inside import InFrame
+from rigidjax.frames.frame_dynamics import InFrame
 from rigidjax.frames.moving import MovingFrame
 from rigidjax.frames.point import Point, require_point
-from rigidjax.frames.scene import AbstractScene, like
-from rigidjax.frames.turning import AboutAxis
+from rigidjax.frames.rotation_models import AboutAxis
 from rigidjax.rotation.linalg3 import components
 
 

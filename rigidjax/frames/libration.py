@@ -8,9 +8,9 @@ import jax.numpy as jnp
 from rigidjax import _checks
 from rigidjax._types import HasAttitude, Scalar, ScalarLike, Vec3
 from rigidjax.body import inertia as _inertia
-from rigidjax.frames.inside import BodyInFrame
+from rigidjax.frames.frame_dynamics import BodyInFrame
 from rigidjax.frames.moving import MovingFrame
-from rigidjax.frames.turning import Uniform
+from rigidjax.frames.rotation_models import Uniform
 from rigidjax.rotation import linalg3, quaternion
 
 

@@ -10,8 +10,8 @@ import jax.numpy as jnp
 from rigidjax import _checks
 from rigidjax._types import Mat3, Scalar, ScalarLike, Vec3
 from rigidjax.body._types import Vector
-from rigidjax.frames import turning
-from rigidjax.frames.instant import Instant
+from rigidjax.frames import rotation_models
+from rigidjax.frames.frame_kinematics import Instant
 from rigidjax.frames.point import require_point
 from rigidjax.rotation import linalg3
 
@@ -37,7 +37,7 @@ class MovingFrame(eqx.Module):
     **Raises:** `TypeError` for a `rotation` that is neither; when used, `ValueError` for a value
     that is no rotation (checked where the value is known, that is outside `jit`).
 
-    >>> turntable = MovingFrame(turning.Uniform([0.0, 0.0, 2.0]))
+    >>> turntable = MovingFrame(rj.frames.Uniform([0.0, 0.0, 2.0]))
     >>> turntable.centrifugal([1.0, 0.0, 0.0], 0.3).tolist()
     [4.0, 0.0, 0.0]
     """
@@ -61,20 +61,20 @@ class MovingFrame(eqx.Module):
             _checks.function(origin, "origin", "of time to (3,)", hint=hint)
         if rate is not None:
             _checks.function(rate, "rate", "of time to (3,)")
-        self.rotation, self.origin = turning.differentiable(rotation), origin
+        self.rotation, self.origin = rotation_models.differentiable(rotation), origin
         self.rate = getattr(rotation, "rate", None) if rate is None else rate
 
     def matrix(self, t: ScalarLike) -> Mat3:
         """M(t) (3, 3), S' → S (notes, eq 85)."""
         t = _checks.time(t)
-        return turning.matrix(self.rotation, t)
+        return rotation_models.matrix(self.rotation, t)
 
     def at(self, t: ScalarLike) -> Instant:
         """The frame at time `t`, s: M, Ω, dΩ/dt, and the origin with two derivatives.
 
         Take it once where several of the methods below are wanted at the same time.
 
-        >>> MovingFrame(turning.Uniform([0.0, 0.0, 2.0])).at(0.0).rate.tolist()
+        >>> MovingFrame(rj.frames.Uniform([0.0, 0.0, 2.0])).at(0.0).rate.tolist()
         [0.0, 0.0, 2.0]
         """
         t = _checks.time(t)
@@ -94,7 +94,7 @@ class MovingFrame(eqx.Module):
         t = _checks.time(t)
         if self.rate is not None:
             return _checks.floating(self.rate(t), (3,), "rate").astype(t.dtype)
-        state = turning.state_of(self.rotation, t)
+        state = rotation_models.state_of(self.rotation, t)
         if hasattr(state, "omega"):
             return state.omega.astype(t.dtype)
         m, m_dot = jax.jvp(self.matrix, (t,), (jnp.ones_like(t),))
@@ -112,7 +112,7 @@ class MovingFrame(eqx.Module):
         Many: `jax.vmap(frame.to_inertial)(states, times)`.
 
         >>> import rigidjax as rj
-        >>> frame = MovingFrame(turning.Uniform([0.0, 0.0, 2.0]))
+        >>> frame = MovingFrame(rj.frames.Uniform([0.0, 0.0, 2.0]))
         >>> frame.to_inertial(rj.frames.Point([1.0, 0, 0], [0.0, 0, 0]), 0.0).v.tolist()
         [0.0, 2.0, 0.0]
         """
@@ -124,7 +124,7 @@ class MovingFrame(eqx.Module):
         **Arguments:** as there. x' = Mᵀ(x − X), v' = Mᵀ(v − dX/dt) − Ω × x' (notes, eqs 86–88).
 
         >>> import rigidjax as rj
-        >>> frame = MovingFrame(turning.Uniform([0.0, 0.0, 2.0]))
+        >>> frame = MovingFrame(rj.frames.Uniform([0.0, 0.0, 2.0]))
         >>> frame.from_inertial(rj.frames.Point([1.0, 0, 0], [0.0, 2, 0]), 0.0).v.tolist()
         [0.0, 0.0, 0.0]
         """
@@ -166,7 +166,7 @@ class MovingFrame(eqx.Module):
         **Arguments:** `x`, `v` (3,) in S', m and m/s; `t` s; `force` f = MᵀF (3,) per mass, m/s²,
         **axes of S'** (`force_from_inertial` makes it from F), `None` for a free particle.
 
-        >>> frame = MovingFrame(turning.Uniform([0.0, 0.0, 2.0]))
+        >>> frame = MovingFrame(rj.frames.Uniform([0.0, 0.0, 2.0]))
         >>> frame.acceleration([1.0, 0, 0], [0.0, -2, 0], 0.0).tolist()
         [-4.0, 0.0, 0.0]
         """
@@ -205,7 +205,7 @@ class MovingFrame(eqx.Module):
     def then(self, inner: "MovingFrame") -> "MovingFrame":
         """The frame that moves as `inner` does **within this one**: M = M₁M₂, X = X₁ + M₁X₂.
 
-        >>> half = MovingFrame(turning.Uniform([0.0, 0.0, 1.0]))
+        >>> half = MovingFrame(rj.frames.Uniform([0.0, 0.0, 1.0]))
         >>> half.then(half).at(0.0).rate.tolist()
         [0.0, 0.0, 2.0]
         """
@@ -225,7 +225,7 @@ class MovingFrame(eqx.Module):
 def require_frame(frame: Any, name: str) -> None:
     """Raise `TypeError` unless `frame` is a `MovingFrame`.
 
-    >>> require_frame(MovingFrame(turning.Uniform([0.0, 0.0, 1.0])), "frame")
+    >>> require_frame(MovingFrame(rj.frames.Uniform([0.0, 0.0, 1.0])), "frame")
     """
     if not isinstance(frame, MovingFrame):
         raise TypeError(

@@ -18,7 +18,8 @@ from rigidjax.identify.sensors import Gyro
 from rigidjax.identify.several import Bodies
 from rigidjax.identify.sightings import rates
 from rigidjax.motion import Spin
-from rigidjax.motion.torques import Torque, evaluate
+from rigidjax.motion.torques import Torque
+from rigidjax.motion.torques.base import evaluate
 from rigidjax.motion.torques.states import has_states
 
 BASIS = np.zeros((6, 3, 3))

@@ -11,15 +11,8 @@ from rigidjax._types import HasAttitude, HasPose, HasSpin, Scalar, ScalarLike, V
 from rigidjax.body.energy import angular_momentum, kinetic_energy
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.motion.coupled import Coupled, motion_of
-from rigidjax.motion.torques import (
-    AbstractTorque,
-    CentralGravity,
-    Sum,
-    Torque,
-    freeze,
-    in_precision,
-)
-from rigidjax.motion.torques.base import length_or_zero, one_law, require_rung
+from rigidjax.motion.torques import AbstractTorque, CentralGravity, Sum, Torque, freeze
+from rigidjax.motion.torques.base import in_precision, length_or_zero, one_law, require_rung
 from rigidjax.motion.torques.states import Frozen, require_frozen
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.linalg3 import cross, dot

@@ -8,7 +8,8 @@ from rigidjax import _checks
 from rigidjax._types import HasPose, ScalarLike
 from rigidjax.body.inertia import MassProperties
 from rigidjax.motion.spin import EulerEquations
-from rigidjax.motion.torques import Torque, act
+from rigidjax.motion.torques import Torque
+from rigidjax.motion.torques.base import act
 from rigidjax.rotation import quaternion
 
 

@@ -6,8 +6,8 @@ from jaxtyping import Array, Float
 from rigidjax import _checks
 from rigidjax._types import HasSpin, Mat3, ScalarLike, Vec3
 from rigidjax.body import inertia as _inertia, validation
-from rigidjax.motion.torques import Torque, evaluate
-from rigidjax.motion.torques.base import require_law
+from rigidjax.motion.torques import Torque
+from rigidjax.motion.torques.base import evaluate, require_law
 from rigidjax.rotation import linalg3
 
 _HINT = "Inertia.from_tensor makes one of a matrix; of MassProperties pass .inertia"

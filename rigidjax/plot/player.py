@@ -7,7 +7,7 @@ from jaxtyping import ArrayLike, Float
 
 from rigidjax._types import HasAttitude
 from rigidjax.body.inertia import Inertia, MassProperties
-from rigidjax.plot.film import CORNERS, FACES, Film, box_of, evenly
+from rigidjax.plot.animation import CORNERS, FACES, Film, box_of, evenly
 from rigidjax.plot.style import COLOURS, matrices
 
 

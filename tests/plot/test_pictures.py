@@ -234,7 +234,7 @@ def test_a_film_has_its_pictures(flip, tmp_path):
 
 
 def test_the_box_of_a_box_is_itself():
-    from rigidjax.plot.film import box_of
+    from rigidjax.plot.animation import box_of
 
     half, turn = box_of(rj.shapes.box(3.0, [0.2, 0.6, 0.4]))
     np.testing.assert_allclose(half, [0.1, 0.2, 0.3])
@@ -242,7 +242,7 @@ def test_the_box_of_a_box_is_itself():
 
 
 def test_between_saved_times_a_film_stays_on_the_group():
-    from rigidjax.plot.film import evenly
+    from rigidjax.plot.animation import evenly
 
     ts = jnp.linspace(0.0, 6.0, 40)
     turning = jax.vmap(lambda t: rj.quaternion.exp(jnp.array([0.0, 0.0, 1.0]) * t))(ts)

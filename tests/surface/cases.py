@@ -499,7 +499,7 @@ def laws() -> list[Case]:
                 rj.conserved(s.inertia(), attitude_of(x[7:]), t.HeavyTop(x[0], x[1:4], x[4:7])),
             ),
             {"ordinary": join(2.0, V, DOWN, Q, W), "hanging": join(2.0, 0, 0, 1, DOWN, ONE, np.zeros(3))},
-            covers=("energy", "conserved", "torques.act", "torques.evaluate"),
+            covers=("energy", "conserved"),
         ),
         # In time and in the table; knots are where a derivative is that of one side.
         Case("torques.Linear", lambda x: t.Linear(jnp.asarray(TS), x[:12].reshape(4, 3))(x[12]), {"between": join(tables, 0.6), "before": join(tables, -1.0)}),

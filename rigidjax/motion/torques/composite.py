@@ -20,7 +20,7 @@ from rigidjax.motion.torques.base import (
     require_law,
     sees_rate,
 )
-from rigidjax.motion.torques.changing import ChangingInertia
+from rigidjax.motion.torques.changing_inertia import ChangingInertia
 
 
 class Sum(eqx.Module):

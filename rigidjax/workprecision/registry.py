@@ -1,9 +1,9 @@
 """All methods that can be compared here."""
 
 from rigidjax import _checks
-from rigidjax.workprecision.in_jax import methods_in_jax
+from rigidjax.workprecision.jax_methods import methods_in_jax
 from rigidjax.workprecision.method import Method
-from rigidjax.workprecision.outside import methods_outside
+from rigidjax.workprecision.peers import methods_outside
 
 
 def methods(group: str | None = None) -> list[Method]:

@@ -106,7 +106,7 @@ def methods_outside() -> list[Method]:
     >>> methods_outside()[0].name
     'scipy DOP853'
     """
-    from rigidjax.workprecision.taylor import heyoka_method
+    from rigidjax.workprecision.heyoka import heyoka_method
 
     found = [Method("scipy DOP853", "peer", TOLERANCES, _scipy)]
     if _there("numba"):

@@ -10,9 +10,9 @@ import jax.numpy as jnp
 from rigidjax import _checks
 from rigidjax._types import HasAttitude, Scalar, ScalarLike, Vec3
 from rigidjax.body import inertia as _inertia
+from rigidjax.frames.base import AbstractScene, Force, per_mass
 from rigidjax.frames.moving import MovingFrame, require_frame
-from rigidjax.frames.scene import AbstractScene, Force, per_mass
-from rigidjax.frames.turning import Uniform
+from rigidjax.frames.rotation_models import Uniform
 from rigidjax.rotation import linalg3, quaternion
 
 

@@ -9,7 +9,7 @@ import pytest
 from frames.three_body_series import solve
 from once import filter_once
 
-from rigidjax.frames import Point, periodic, scenes
+from rigidjax.frames import Point, differential_correction, scenes
 from rigidjax.frames.scenes import PeriodicOrbit
 
 MU = 0.01215058560962404
@@ -37,8 +37,8 @@ def orbit_of(row):
 @eqx.filter_jit
 def left(scene, orbits):
     """What the orbits miss at the half period, and their stability."""
-    numbers = jax.vmap(periodic.crossing)(orbits)
-    missed = jax.vmap(lambda n: periodic.miss(scene, n))(numbers)
+    numbers = jax.vmap(differential_correction.crossing)(orbits)
+    missed = jax.vmap(lambda n: differential_correction.miss(scene, n))(numbers)
     return jnp.max(jnp.abs(missed)), jax.vmap(scene.stability_indices)(orbits)
 
 
@@ -47,7 +47,7 @@ def test_published_halo_orbits_and_their_stability():
     scene = scenes.cr3bp(0.04)
     correct = eqx.filter_jit(jax.vmap(lambda row: scene.periodic_orbit(orbit_of(row), hold="z")))
     found = correct(jnp.asarray(HOWELL))
-    numbers = jax.vmap(periodic.crossing)(found)
+    numbers = jax.vmap(differential_correction.crossing)(found)
     # Half a unit of the last digit printed, and of that of z carried along the family.
     slopes = jax.vmap(lambda orbit: scene.family_slope(orbit, hold="z"))(found)
     carried = np.stack(
@@ -115,7 +115,7 @@ def test_following_a_family_past_its_turn():
     assert float(missed) <= 1e-12
     turns = np.diff(np.append(float(first.state.x[0]), found.state.x[:, 0]))
     assert turns[0] < 0 < turns[-1] and (np.diff(found.state.x[:, 2]) > 0).all()
-    numbers = np.asarray(jax.vmap(periodic.crossing)(found))
+    numbers = np.asarray(jax.vmap(differential_correction.crossing)(found))
     chords = np.sqrt(np.square(np.diff(numbers, axis=0)).sum(axis=1))
     np.testing.assert_allclose(chords, 0.03, rtol=0.02)
     # The same members by another road.

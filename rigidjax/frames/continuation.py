@@ -11,7 +11,7 @@ from jaxtyping import Array, Complex, Float
 
 from rigidjax import _checks
 from rigidjax._types import Scalar
-from rigidjax.frames.periodic import (
+from rigidjax.frames.differential_correction import (
     MAX_STEPS,
     PeriodicOrbit,
     corrected,

@@ -10,8 +10,8 @@ from jaxtyping import Array, Float
 
 from rigidjax import _checks
 from rigidjax._types import ScalarLike
+from rigidjax.frames.base import AbstractScene
 from rigidjax.frames.point import Point
-from rigidjax.frames.scene import AbstractScene
 
 
 @eqx.filter_jit
@@ -86,7 +86,7 @@ def _transition(scene: Any, numbers: Array, t: Any, rtol: float, atol: float) ->
 def smallest_distance(dtype: Any) -> float:
     """The distance, of a unit, below which an attraction has lost its digits: eps^0.4.
 
-    x − x₁ is then known to eps/r = eps^0.6 only (4e-10 in float64), and adaptive steps would grind.
+    x − x₁ is then known to eps/r = eps^0.6 only (4e-10 in float64); adaptive steps become tiny.
 
     >>> smallest_distance(jnp.float64) < 1e-6
     True

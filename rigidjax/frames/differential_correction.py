@@ -12,8 +12,8 @@ from jaxtyping import Array, Float
 
 from rigidjax import _checks
 from rigidjax._types import Scalar, ScalarLike
-from rigidjax.frames.flow import attempt
 from rigidjax.frames.point import Point
+from rigidjax.frames.state_transition import attempt
 from rigidjax.rotation.linalg3 import components
 
 _NAMES = ("x", "z", "vy", "period")

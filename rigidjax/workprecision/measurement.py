@@ -9,10 +9,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rigidjax.frames import scene_of
+from rigidjax.frames.frame_dynamics import scene_of
 from rigidjax.motion import Attitude, conserved
 from rigidjax.solve import equations_of_motion, fixed, solvers
-from rigidjax.workprecision import known
+from rigidjax.workprecision import registry
 from rigidjax.workprecision.method import Method, Ready, Run
 from rigidjax.workprecision.record import Record
 from rigidjax.workprecision.reference import Reference
@@ -58,7 +58,7 @@ def measure(
             f"measure: wanted a Scene, got {type(scene).__name__}; standard ones are made by "
             'rj.workprecision.scenes()["heavy-top"]()'
         )
-    chosen = [*(known.methods() if methods is None else methods), *peers]
+    chosen = [*(registry.methods() if methods is None else methods), *peers]
     for method in chosen:
         if not isinstance(method, Method):
             raise TypeError(f"measure: wanted Methods, got {type(method).__name__}")

@@ -1,4 +1,4 @@
-"""Scenes whose motion has a mirror: their symmetric periodic orbits, families and stability."""
+"""Scenes that are symmetric under time reversal: their periodic orbits, families, stability."""
 
 from collections.abc import Sequence
 
@@ -6,15 +6,15 @@ from jaxtyping import Array, ArrayLike, Complex, Float
 
 from rigidjax import _checks
 from rigidjax._types import ScalarLike
-from rigidjax.frames import families, flow, manifolds, periodic
+from rigidjax.frames import continuation, differential_correction, manifolds, state_transition
+from rigidjax.frames.base import AbstractScene
+from rigidjax.frames.differential_correction import PeriodicOrbit
 from rigidjax.frames.manifolds import Manifold
-from rigidjax.frames.periodic import PeriodicOrbit
 from rigidjax.frames.point import Point
-from rigidjax.frames.scene import AbstractScene
 
 
-class AbstractMirrored(AbstractScene):
-    """A scene that time run backwards shows in the mirror y → −y: `ThreeBody` and `Hill`.
+class AbstractReversible(AbstractScene):
+    """A scene that does not change under (t, y) → (−t, −y): `ThreeBody` and `Hill`.
 
     An orbit that crosses the xz-plane at a right angle twice is then periodic (Roy and Ovenden
     1955, doi:10.1093/mnras/115.3.296).
@@ -27,7 +27,7 @@ class AbstractMirrored(AbstractScene):
 
         **Arguments:** `state` the start; `t` when. Its determinant is 1.
         """
-        return flow.transition(self, state, t, rtol=rtol, atol=atol)
+        return state_transition.transition(self, state, t, rtol=rtol, atol=atol)
 
     def monodromy(self, orbit: PeriodicOrbit) -> Float[Array, "6 6"]:
         """The transition matrix over one period; its eigenvalues say whether the orbit is stable.
@@ -45,7 +45,7 @@ class AbstractMirrored(AbstractScene):
         Source: Howell 1984, doi:10.1007/BF01358403; from traces: Bray and Goudas 1967, Adv.
         Astron. Astrophys. 5, 71.
         """
-        return families.stability_indices(self.monodromy(orbit))
+        return continuation.stability_indices(self.monodromy(orbit))
 
     def periodic_orbit(
         self, guess: PeriodicOrbit, *, hold: str = "x", tolerance: float | None = None
@@ -74,7 +74,7 @@ class AbstractMirrored(AbstractScene):
         >>> round(float(orbit.period), 4)
         2.712
         """
-        return periodic.correct(self, guess, hold, tolerance)
+        return differential_correction.correct(self, guess, hold, tolerance)
 
     def family(
         self,
@@ -103,7 +103,7 @@ class AbstractMirrored(AbstractScene):
         >>> [round(float(p), 3) for p in found.period]
         [2.712, 2.811]
         """
-        return families.at_values(self, orbit, values, hold)
+        return continuation.at_values(self, orbit, values, hold)
 
     def family_slope(self, orbit: PeriodicOrbit, *, hold: str = "x") -> PeriodicOrbit:
         """How start and period of an orbit change along its family, per unit of `hold`.
@@ -113,7 +113,7 @@ class AbstractMirrored(AbstractScene):
 
         **Raises:** `ValueError` where the family turns back in `hold`.
         """
-        return families.slope(self, orbit, hold)
+        return continuation.slope(self, orbit, hold)
 
     def follow(
         self, orbit: PeriodicOrbit, step: ScalarLike, count: int, *, rising: str = "x"
@@ -131,7 +131,7 @@ class AbstractMirrored(AbstractScene):
         `periodic_orbit`. **Raises:** `ValueError` (`EquinoxRuntimeError` under `jit`) saying after
         how many members it was lost.
         """
-        return families.follow(self, orbit, step, count, rising)
+        return continuation.follow(self, orbit, step, count, rising)
 
     def manifold(
         self,
