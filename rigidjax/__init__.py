@@ -73,12 +73,16 @@ from rigidjax.solve import (
 from rigidjax.special import elliptic as elliptic
 
 if TYPE_CHECKING:
-    from rigidjax import plot as plot, workprecision as workprecision
+    from rigidjax import (
+        datasets as datasets,
+        plot as plot,
+        workprecision as workprecision,
+    )
 
 __version__ = "0.1.0"
 
 # Loaded when first asked for: few programs draw, fewer compare methods.
-_LATER = ("plot", "workprecision")
+_LATER = ("datasets", "plot", "workprecision")
 
 
 def __getattr__(name: str) -> ModuleType:

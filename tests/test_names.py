@@ -72,6 +72,10 @@ TORQUES = {
 RENAMED = {
     "frames": {"scene_of": "frames.frame_dynamics.scene_of"},
     "motion.torques": TORQUES,
+    "identify": {"Moment": "identify.SensorInput", "toutatis": "datasets.toutatis"},
+    "identify.sensors": {"Moment": "identify.SensorInput"},
+    "exact": {"FreeInterpolation": "exact.diffrax_solver.FreeInterpolation"},
+    "solve": {"GroupInterpolation": "solve.projection.GroupInterpolation"},
 }
 
 

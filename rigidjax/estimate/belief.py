@@ -12,9 +12,9 @@ from rigidjax import _checks
 from rigidjax._types import HasAttitude, HasPose, HasSpin
 from rigidjax.estimate.scene import Extended, Model, not_negative
 from rigidjax.estimate.sensing import sensors_of
+from rigidjax.identify.direct_estimates import attitudes
 from rigidjax.identify.recording import Recording
-from rigidjax.identify.reference import first_rate
-from rigidjax.identify.sightings import attitudes
+from rigidjax.identify.reference_states import first_rate
 from rigidjax.motion import Attitude, Spin, on_the_group
 
 

@@ -23,7 +23,7 @@ from rigidjax.identify.jacobian import all_errors, filled, first_state, over_rec
 from rigidjax.identify.parameters import Parameters, local
 from rigidjax.identify.problem import Problem
 from rigidjax.identify.residual import beside, whitened
-from rigidjax.identify.several import matter
+from rigidjax.identify.several_bodies import matter
 from rigidjax.motion import Rigid
 from rigidjax.motion.torques import CorrelatedTorque, RandomTorque, Sum
 

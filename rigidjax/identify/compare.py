@@ -8,7 +8,7 @@ import equinox as eqx
 import numpy as np
 
 from rigidjax import _checks
-from rigidjax.identify.bodies import Known
+from rigidjax.identify.body_charts import Known
 from rigidjax.identify.fit import Fit, fit
 from rigidjax.identify.problem import Problem
 from rigidjax.identify.recording import Recording

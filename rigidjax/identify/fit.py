@@ -12,16 +12,22 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from rigidjax import _checks
-from rigidjax.identify import reported, uncertainty, words
+from rigidjax.identify import identifiability, uncertainty
 from rigidjax.identify.checkpoint import Checkpoint, Position, Tried, require_folder
-from rigidjax.identify.descent import Descent, descend
 from rigidjax.identify.full_scale import at_limit
 from rigidjax.identify.goodness import goodness
+from rigidjax.identify.initial_guess import starting_points
 from rigidjax.identify.jacobian import all_errors
+from rigidjax.identify.multiple_shooting import WIDTHS, joined, pieces as in_pieces, with_width
 from rigidjax.identify.parameters import Parameters
-from rigidjax.identify.pieces import WIDTHS, joined, pieces as in_pieces, with_width
 from rigidjax.identify.problem import Problem, fits
-from rigidjax.identify.propagate import AbstractIntegrator, Adaptive, FixedSteps
+from rigidjax.identify.propagation import AbstractIntegrator, Adaptive, FixedSteps
+from rigidjax.identify.quantities import (
+    Quantity,
+    interval_of,
+    quantile,
+    quantities as quantities_of,
+)
 from rigidjax.identify.residual import Noise
 from rigidjax.identify.search import (
     CAREFUL,
@@ -32,7 +38,7 @@ from rigidjax.identify.search import (
     least_squares,
     settle,
 )
-from rigidjax.identify.start import starting_points
+from rigidjax.identify.stochastic_gradient import Descent, descend
 
 # More equal steps than this between two samples cost more than steps chosen as they are needed.
 FINEST = 32
@@ -74,7 +80,7 @@ class Fit(eqx.Module):
     independent: float
     singular_values: Float[Array, " n"]
     null_directions: Float[Array, "unseen n"]
-    quantities: tuple[reported.Quantity, ...]
+    quantities: tuple[Quantity, ...]
     status: str
 
     @property
@@ -129,7 +135,7 @@ class Fit(eqx.Module):
         What is positive goes through its logarithm. **Arguments:** `level` the probability with
         which each holds the truth. **Raises** `ValueError` outside (0, 1).
         """
-        reach = reported.quantile(self, level)
+        reach = quantile(self, level)
         return {quantity.name: quantity.interval(reach) for quantity in self.quantities}
 
     def interval_of(
@@ -139,12 +145,12 @@ class Fit(eqx.Module):
 
         The covariance is carried by the function's derivative. **Raises** as `interval`.
         """
-        return reported.interval_of(self, of, level)
+        return interval_of(self, of, level)
 
     @property
     def identifiability(self) -> tuple[str, ...]:
         """In words: what the data fix, what they fix weakly, what they cannot see."""
-        return words.identifiability(self)
+        return identifiability.identifiability(self)
 
 
 def one_fit(found: Any, name: str = "fit") -> Fit:
@@ -478,6 +484,6 @@ def _assess(
         times.independent,
         jnp.asarray(spread.singular_values),
         jnp.asarray(spread.null_directions),
-        reported.quantities(problem, value, spread.seen, spread.null_directions),
+        quantities_of(problem, value, spread.seen, spread.null_directions),
         status,
     )

@@ -12,14 +12,14 @@ from jaxtyping import Array, Float
 
 from rigidjax import _checks, exact
 from rigidjax.body.inertia import MassProperties
-from rigidjax.identify import stacking
+from rigidjax.identify import padding
 from rigidjax.identify.checkpoint import Tried
 from rigidjax.identify.fit import Fit, fit
 from rigidjax.identify.parameters import Parameters
 from rigidjax.identify.problem import Problem, one_problem
-from rigidjax.identify.reported import carried
+from rigidjax.identify.quantities import carried
 from rigidjax.identify.sensors import Brightness
-from rigidjax.identify.several import Bodies
+from rigidjax.identify.several_bodies import Bodies
 from rigidjax.identify.tumbling_search import descended, noise_of, relative_flux, starts_of
 from rigidjax.identify.two_frequencies import TwoFrequencies, two_frequencies
 from rigidjax.rotation.linalg3 import apply, dot
@@ -165,7 +165,7 @@ def _only(problem: Problem) -> Any:
         raise ValueError("fit_light_curve: wanted one body, got several by name")
     if problem.records.torque is not None:
         raise ValueError("fit_light_curve: wanted a free body, got a torque")
-    return stacking.one(readings[0], 0)
+    return padding.one(readings[0], 0)
 
 
 @eqx.filter_jit

@@ -9,7 +9,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
-from rigidjax.identify.several import spread
+from rigidjax.identify.several_bodies import spread
 
 if TYPE_CHECKING:
     from rigidjax.identify.problem import Problem

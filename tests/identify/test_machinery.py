@@ -19,8 +19,8 @@ from rigidjax.__main__ import main
 from rigidjax.identify import checkpoint, search
 from rigidjax.identify.checkpoint import Tried
 from rigidjax.identify.jacobian import errors_of_one, with_blocks
+from rigidjax.identify.padding import one
 from rigidjax.identify.parameters import local, places
-from rigidjax.identify.stacking import one
 
 BODY = rj.Inertia.from_principal(1.0, 1.6, 2.1)
 DRAG = [0.05, 0.08, 0.02]

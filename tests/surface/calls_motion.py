@@ -286,7 +286,6 @@ row(
 )
 for name in ("body_period", "precession_period"):
     row(f"exact.{name}", lambda: dict(inertia=s.inertia(), omega0=W), transforms=EXACT)
-leave_out("diffrax makes them", "exact.FreeInterpolation", "solve.GroupInterpolation")
 
 # Solvers.
 for name in ("DormandPrince8", "Magnus4", "RungeKutta4", "Splitting2", "Splitting4", "Splitting6"):

@@ -21,7 +21,7 @@ WITHOUT_EXAMPLE = {
         f"identify.report.{name}"
         for name in ("rows", "verdict", "as_dict", "write_json", "write_html")
     ),
-    *(f"identify.toutatis.{name}" for name in ("rows", "rms_degrees", "remarks")),
+    *(f"datasets.toutatis.{name}" for name in ("rows", "rms_degrees", "remarks")),
     *(f"plot.{name}" for name in ("fit", "residuals", "player")),
     *(f"workprecision.{name}" for name in ("draw", "measure", "worked_out", "read_csv")),
     "identify.fit_light_curve",

@@ -1,4 +1,4 @@
-"""What a sensor is: what it reads of a moment of a motion, and how far a reading is from that."""
+"""What a sensor is: what it reads of a motion at one time, and how far a reading is from that."""
 
 import abc
 from collections.abc import Callable
@@ -14,8 +14,8 @@ from rigidjax.body.inertia import MassProperties
 from rigidjax.rotation import quaternion
 
 
-class Moment(eqx.Module):
-    """One moment of a motion, as a sensor meets it.
+class SensorInput(eqx.Module):
+    """What a sensor reads: a motion at one time.
 
     **Fields:** `t` s; `state` on the rung that the problem needs; `body` the `Inertia` or
     `MassProperties`; `field` the equations of motion `f(t, state, args)`.
@@ -55,7 +55,7 @@ class AbstractSensor(eqx.Module):
     noise: eqx.AbstractVar[Array | None]
 
     @abc.abstractmethod
-    def error(self, moment: Moment, reading: Array) -> Float[Array, " k"]:
+    def error(self, now: SensorInput, reading: Array) -> Float[Array, " k"]:
         """Reading minus prediction (k,), in the sensor's unit."""
 
 

@@ -7,7 +7,7 @@ from jaxtyping import Array, Float
 from rigidjax._types import HasAttitude, HasPose, HasSpin, Scalar, Vec3
 from rigidjax.identify.sensors.base import (
     AbstractSensor,
-    Moment,
+    SensorInput,
     limit_of,
     noise_of,
     number_of,
@@ -65,8 +65,8 @@ class Gyro(AbstractSensor):
         self.limit = limit_of(limit)
         self.offset = number_of(offset, "offset")
 
-    def error(self, moment: Moment, reading: Array) -> Vec3:
-        return reading - shown(moment.state.omega, self.bias, self.scale, self.mounting, self.skew)
+    def error(self, now: SensorInput, reading: Array) -> Vec3:
+        return reading - shown(now.state.omega, self.bias, self.scale, self.mounting, self.skew)
 
 
 class Accelerometer(AbstractSensor):
@@ -126,9 +126,9 @@ class Accelerometer(AbstractSensor):
         """Only gravity needs the attitude."""
         return HasSpin if self.gravity is None else HasAttitude
 
-    def error(self, moment: Moment, reading: Array) -> Vec3:
-        state, rate = moment.state, moment.rate
-        r = moment.lever(self.place)
+    def error(self, now: SensorInput, reading: Array) -> Vec3:
+        state, rate = now.state, now.rate
+        r = now.lever(self.place)
         force = cross(rate.omega, r) + cross(state.omega, cross(state.omega, r))
         if self.gravity is not None:
             carried = rate.v if isinstance(state, HasPose) else 0.0
@@ -181,6 +181,6 @@ class Magnetometer(AbstractSensor):
         self.limit = limit_of(limit)
         self.offset = number_of(offset, "offset")
 
-    def error(self, moment: Moment, reading: Array) -> Vec3:
-        seen = quaternion.rotate(quaternion.conjugate(moment.state.q), self.field)
+    def error(self, now: SensorInput, reading: Array) -> Vec3:
+        seen = quaternion.rotate(quaternion.conjugate(now.state.q), self.field)
         return reading - shown(seen, self.bias, self.scale, self.mounting, self.skew)

@@ -9,8 +9,13 @@ from jax.flatten_util import ravel_pytree
 
 from rigidjax.body.inertia import MassProperties
 from rigidjax.identify.full_scale import in_words
-from rigidjax.identify.reported import Quantity, charts, covariance as reported_covariance, quantile
-from rigidjax.identify.several import Bodies
+from rigidjax.identify.quantities import (
+    Quantity,
+    charts,
+    covariance as reported_covariance,
+    quantile,
+)
+from rigidjax.identify.several_bodies import Bodies
 
 if TYPE_CHECKING:
     from rigidjax.identify.fit import Fit

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from rigidjax._types import HasPose, Scalar, Vec3
 from rigidjax.identify.sensors.base import (
     AbstractSensor,
-    Moment,
+    SensorInput,
     noise_of,
     number_of,
     place_of,
@@ -43,8 +43,8 @@ class Position(AbstractSensor):
         self.noise, self.bias = noise_of(noise), vector_of(bias, "bias")
         self.offset = number_of(offset, "offset")
 
-    def error(self, moment: Moment, reading: Array) -> Vec3:
-        place = moment.state.x
+    def error(self, now: SensorInput, reading: Array) -> Vec3:
+        place = now.state.x
         return reading - (place if self.bias is None else place + self.bias)
 
 
@@ -89,11 +89,11 @@ class Velocity(AbstractSensor):
         self.mounting, self.bias = vector_of(mounting, "mounting"), vector_of(bias, "bias")
         self.offset = number_of(offset, "offset")
 
-    def error(self, moment: Moment, reading: Array) -> Vec3:
-        state = moment.state
+    def error(self, now: SensorInput, reading: Array) -> Vec3:
+        state = now.state
         seen = state.v
         if self.place is not None:
-            arm = moment.lever(self.place)
+            arm = now.lever(self.place)
             seen = seen + quaternion.rotate(state.q, cross(state.omega, arm))
         if self.mounting is not None:
             turn = quaternion.multiply(state.q, quaternion.exp(self.mounting))
@@ -137,11 +137,11 @@ class Range(AbstractSensor):
         self.place = vector_of(place, "place")
         self.bias, self.offset = number_of(bias, "bias"), number_of(offset, "offset")
 
-    def error(self, moment: Moment, reading: Array) -> Float[Array, "1"]:
-        state = moment.state
+    def error(self, now: SensorInput, reading: Array) -> Float[Array, "1"]:
+        state = now.state
         line = state.x - self.station
         if self.place is not None:
-            line = line + quaternion.rotate(state.q, moment.lever(self.place))
+            line = line + quaternion.rotate(state.q, now.lever(self.place))
         # At the station itself there is no direction, and no derivative: it is taken as 0.
         square = dot(line, line)
         length = jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)

@@ -11,10 +11,10 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
 from rigidjax import _checks
-from rigidjax.identify.bodies import AbstractBodyChart
+from rigidjax.identify.body_charts import AbstractBodyChart
 from rigidjax.identify.parameters import Parameters
 from rigidjax.identify.problem import Problem
-from rigidjax.identify.several import Bodies
+from rigidjax.identify.several_bodies import Bodies
 
 if TYPE_CHECKING:
     from rigidjax.identify.fit import Fit

@@ -9,7 +9,7 @@ import pytest
 
 import rigidjax as rj
 from rigidjax.__main__ import main
-from rigidjax.identify import toutatis
+from rigidjax.datasets import toutatis
 
 
 @pytest.fixture(scope="module")

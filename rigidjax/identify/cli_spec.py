@@ -7,15 +7,15 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
-from rigidjax.identify.bodies import (
+from rigidjax.identify.body_charts import (
     AbstractBodyChart,
     Principal,
     PrincipalRatios,
     Ratios,
     Tensor,
 )
-from rigidjax.identify.files import UNITS, LogError, increasing, read_table
-from rigidjax.identify.free import Free
+from rigidjax.identify.csv_io import UNITS, LogError, increasing, read_table
+from rigidjax.identify.free_parameters import Free
 from rigidjax.identify.loss import Huber, SoftL1
 from rigidjax.identify.problem import Problem
 from rigidjax.identify.recording import Recording
@@ -145,7 +145,7 @@ def read_log(
 
     >>> read_log("missing.csv", [channel("gyro=wx,wy,wz")])
     Traceback (most recent call last):
-    rigidjax.identify.files.LogError: missing.csv: no such file
+    rigidjax.identify.csv_io.LogError: missing.csv: no such file
     """
     names = [time, *(c for one in channels for c in one.columns), *(w.column for w in wheels)]
     table = read_table(path, names)

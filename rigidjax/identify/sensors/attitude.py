@@ -10,7 +10,7 @@ from rigidjax import _checks
 from rigidjax._types import HasAttitude, HasPose, Scalar, Vec3
 from rigidjax.identify.sensors.base import (
     AbstractSensor,
-    Moment,
+    SensorInput,
     noise_of,
     number_of,
     place_of,
@@ -48,8 +48,8 @@ class AttitudeSensor(AbstractSensor):
         self.noise, self.mounting = noise_of(noise), vector_of(mounting, "mounting")
         self.offset = number_of(offset, "offset")
 
-    def error(self, moment: Moment, reading: Array) -> Vec3:
-        q = moment.state.q
+    def error(self, now: SensorInput, reading: Array) -> Vec3:
+        q = now.state.q
         if self.mounting is not None:
             q = quaternion.multiply(q, quaternion.exp(self.mounting))
         return quaternion.log(quaternion.multiply(quaternion.conjugate(q), reading))
@@ -95,8 +95,8 @@ class Direction(AbstractSensor):
         self.mounting = vector_of(mounting, "mounting")
         self.offset = number_of(offset, "offset")
 
-    def error(self, moment: Moment, reading: Array) -> Float[Array, "2"]:
-        seen = quaternion.rotate(quaternion.conjugate(moment.state.q), self.world)
+    def error(self, now: SensorInput, reading: Array) -> Float[Array, "2"]:
+        seen = quaternion.rotate(quaternion.conjugate(now.state.q), self.world)
         if self.mounting is not None:
             seen = quaternion.rotate(quaternion.exp(-self.mounting), seen)
         # Two axes across the reading, which is data: no derivative passes through them.
@@ -142,10 +142,10 @@ class Marker(AbstractSensor):
         """A body on a pivot need not move."""
         return HasPose if self.origin is None else HasAttitude
 
-    def error(self, moment: Moment, reading: Array) -> Vec3:
-        state = moment.state
+    def error(self, now: SensorInput, reading: Array) -> Vec3:
+        state = now.state
         start = state.x if self.origin is None else self.origin
-        return reading - (start + quaternion.rotate(state.q, moment.lever(self.place)))
+        return reading - (start + quaternion.rotate(state.q, now.lever(self.place)))
 
 
 def quaternions_from_matrices(matrices: Any) -> Float[np.ndarray, "times 4"]:

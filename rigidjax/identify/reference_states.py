@@ -9,14 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from rigidjax.identify.direct_estimates import attitudes, place_of, rates
 from rigidjax.identify.recording import Recording
 from rigidjax.identify.sensors import Brightness, Gyro, Marker, Position, Range, Velocity
-from rigidjax.identify.sightings import attitudes, place_of, rates
 from rigidjax.motion import Rigid, Spin
 from rigidjax.rotation import quaternion
 
 
-class Reference(eqx.Module):
+class ReferenceStates(eqx.Module):
     """Where the first state of a recording is counted from, and in which units."""
 
     q: Float[Array, "*records 4"] | None
@@ -26,13 +26,13 @@ class Reference(eqx.Module):
     length: Float[Array, "*records"]
 
 
-def reference_of(recordings: Sequence[Recording], rung: type) -> Reference:
+def reference_of(recordings: Sequence[Recording], rung: type) -> ReferenceStates:
     """From the first readings of each recording, as far as the rung needs it."""
     turns = [_first_attitude(r) for r in recordings]
     places = [_first_place(r) for r in recordings]
     dtype = recordings[0].t.dtype
     # Arrays, not floats: another recording must not compile again.
-    return Reference(
+    return ReferenceStates(
         None if rung is Spin else jnp.asarray(np.stack(turns), dtype),
         jnp.asarray(np.stack([x for x, _, _ in places]), dtype) if rung is Rigid else None,
         jnp.asarray(np.stack([v for _, v, _ in places]), dtype) if rung is Rigid else None,

@@ -10,13 +10,13 @@ from jaxtyping import PRNGKeyArray
 
 from rigidjax._types import HasSpin
 from rigidjax.body.inertia import Inertia
+from rigidjax.identify.direct_estimates import rates
 from rigidjax.identify.parameters import Parameters
 from rigidjax.identify.problem import Problem
 from rigidjax.identify.recording import Recording
-from rigidjax.identify.reference import first_rate
+from rigidjax.identify.reference_states import first_rate
 from rigidjax.identify.sensors import Gyro
-from rigidjax.identify.several import Bodies
-from rigidjax.identify.sightings import rates
+from rigidjax.identify.several_bodies import Bodies
 from rigidjax.motion import Spin
 from rigidjax.motion.torques import Torque
 from rigidjax.motion.torques.base import evaluate

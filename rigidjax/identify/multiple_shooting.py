@@ -8,11 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from rigidjax import _checks
-from rigidjax.identify import stacking
+from rigidjax.identify import padding
 from rigidjax.identify.parameters import Own, Parameters
 from rigidjax.identify.problem import Links, Problem, one_problem
 from rigidjax.identify.recording import Reading, Recording
-from rigidjax.identify.several import Bodies
+from rigidjax.identify.several_bodies import Bodies
 from rigidjax.motion.torques.states import has_states
 
 # How wide the gaps may be, in turn: first the pieces are nearly free, at the end they are one.
@@ -82,7 +82,7 @@ def with_width(problem: Problem, width: float) -> Problem:
 
 def joined(problem: Problem, cut: Problem, found: Parameters) -> Parameters:
     """The parameters of the uncut problem that the pieces point to: the first piece's."""
-    first = stacking.one(found.own, 0)
+    first = padding.one(found.own, 0)
     spin = first.spin * cut.reference.rate[0] / problem.reference.rate[0]
     whole = problem.start()
     values = iter(found.shared)

@@ -17,7 +17,7 @@ from jaxtyping import Array
 from rigidjax import exact
 from rigidjax._names import own_names
 from rigidjax.body import spatial_angular_momentum
-from rigidjax.identify.bodies import PrincipalRatios
+from rigidjax.identify.body_charts import PrincipalRatios
 from rigidjax.identify.fit import Fit
 from rigidjax.identify.loss import SoftL1
 from rigidjax.identify.problem import Problem

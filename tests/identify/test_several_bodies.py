@@ -134,7 +134,7 @@ def test_noise_is_estimated_by_group(records, each, wanted):
 
 def test_the_skew_of_a_sensor_and_the_tilt_of_a_wheel():
     state = rj.Spin([1.0, 2.0, 3.0])
-    moment = identify.Moment(jnp.zeros(()), state, None, lambda t, y, args: y)
+    moment = identify.SensorInput(jnp.zeros(()), state, None, lambda t, y, args: y)
     gyro = identify.Gyro(bias=[0.1, 0, 0], scale=[2.0, 1, 1], skew=[0.01, 0.02, 0.03])
     np.testing.assert_allclose(gyro.error(moment, jnp.zeros(3)), [-2.26, -2.09, -3.0], rtol=1e-12)
     wheel = rj.torques.Wheel(2.0, [0.0, 0.0, 1.0], lambda t: t, tilt=[0.3, 0.4])

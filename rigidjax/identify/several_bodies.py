@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from rigidjax.body.inertia import Inertia, MassProperties
-from rigidjax.identify.bodies import AbstractBodyChart
+from rigidjax.identify.body_charts import AbstractBodyChart
 
 
 class Bodies(eqx.Module):

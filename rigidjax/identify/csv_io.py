@@ -51,7 +51,7 @@ def read_table(path: str | Path, columns: Sequence[str]) -> dict[str, np.ndarray
 
     >>> read_table("missing.csv", ["t"])
     Traceback (most recent call last):
-    rigidjax.identify.files.LogError: missing.csv: no such file
+    rigidjax.identify.csv_io.LogError: missing.csv: no such file
     """
     path = _checks.path(path)
     _checks.instance(columns, Sequence, "columns", wanted="a sequence of names")
@@ -85,7 +85,7 @@ def read_gyro_csv(
 
     >>> read_gyro_csv("missing.csv")
     Traceback (most recent call last):
-    rigidjax.identify.files.LogError: missing.csv: no such file
+    rigidjax.identify.csv_io.LogError: missing.csv: no such file
     """
     if not isinstance(unit, str) or unit not in ("rad/s", "deg/s"):
         raise LogError(f"unit: wanted one of rad/s, deg/s, got {unit!r}")
