@@ -151,6 +151,12 @@ def recover(like: Any, folder: str | os.PathLike[str]) -> list[Any]:
 
     **Raises:** `FileNotFoundError` for a folder without shares; `ValueError` for a file that is
     none of `save`'s, is cut short, or holds another number of arrays than `like`.
+
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     _ = save(jnp.arange(2), folder)
+    ...     recover(jnp.zeros(2), folder)[0].tolist()
+    [0, 1]
     """
     folder = _checks.path(folder, "folder")
     paths = sorted(folder.glob("share-*.npz"), key=lambda p: int(p.stem.split("-")[1]))

@@ -76,6 +76,15 @@ def mesh_file(
     STL files are in millimetres: 1e-3).
 
     **Raises:** `FileNotFoundError`; `ImportError` without trimesh; otherwise as `mesh`.
+
+    >>> import tempfile
+    >>> corner = "v 0 0 0;v 1 0 0;v 0 1 0;v 0 0 1;f 1 3 2;f 1 2 4;f 1 4 3;f 2 3 4"
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = folder + "/corner.obj"
+    ...     with open(path, "w") as file:
+    ...         print(*corner.split(";"), sep=chr(10), file=file)
+    ...     round(float(mesh_file(path, density=6.0).mass), 12)
+    1.0
     """
     path = os.fspath(path)
     if not os.path.isfile(path):

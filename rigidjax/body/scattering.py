@@ -26,7 +26,16 @@ _ACROSS, _ALONG = 12, 24
 
 
 class AbstractScattering(eqx.Module):
-    """A law of scattering: what a piece of surface sends, and a whole ellipsoid."""
+    """A law of scattering: what a piece of surface sends, and a whole ellipsoid.
+
+    >>> class Flat(AbstractScattering):  # all that is lit and seen is equally bright
+    ...     def per_area(self, incidence, emission):
+    ...         return emission
+    ...     def of_ellipsoid(self, shape, sun, observer):
+    ...         return Geometric().of_ellipsoid(shape, sun, observer)
+    >>> float(Flat().per_area(jnp.asarray(0.5), jnp.asarray(0.25)))
+    0.25
+    """
 
     @abc.abstractmethod
     def per_area(

@@ -34,6 +34,15 @@ class Point(eqx.Module):
     **Fields:** `parameters` of the problem, `body` and `state0` as `Problem.unpack` gives them,
     `values` of the `Free`s by name, `noise` (R, k) of each sensor, `process` the random torque or
     `None`.
+
+    >>> import rigidjax as rj
+    >>> ts = jnp.linspace(0.0, 10.0, 80)
+    >>> motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1, 0.1, 1.0]), ts)
+    >>> record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), motion.ys.omega))
+    >>> found = rj.identify.fit(rj.identify.Problem(record, rj.identify.PrincipalRatios()))
+    >>> density = LogDensity(found)
+    >>> density.unpack(density.x0).state0.omega.round(6).tolist()
+    [1.0, 0.1, 1.0]
     """
 
     parameters: Parameters
@@ -66,6 +75,15 @@ class LogDensity(eqx.Module):
     For numpyro: `numpyro.infer.MCMC(NUTS(potential_fn=lambda x: -density(x)), …)`; for blackjax:
     `blackjax.nuts(density, …)`, or `estimate.posterior`. Gradients are taken in forward mode. It is
     a Module of arrays: compile it by `equinox.filter_jit(density)`.
+
+    >>> import rigidjax as rj
+    >>> ts = jnp.linspace(0.0, 10.0, 80)
+    >>> motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1, 0.1, 1.0]), ts)
+    >>> record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), motion.ys.omega))
+    >>> found = rj.identify.fit(rj.identify.Problem(record, rj.identify.PrincipalRatios()))
+    >>> density = LogDensity(found)
+    >>> density.size, bool(density(density.x0) > density(density.x0 + 0.1))
+    (5, True)
     """
 
     problem: Problem

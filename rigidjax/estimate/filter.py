@@ -35,6 +35,14 @@ class Filtered(eqx.Module):
     for each sensor, a `Read`: `innovation`, `variance` and `seen`, (T, k); `log_likelihood` of all
     readings; `status` 0 followed, 1 lost, 2 broken off (`words` says it); `lost_at` s, NaN unless
     lost.
+
+    >>> import rigidjax as rj
+    >>> from rigidjax import estimate
+    >>> record = rj.identify.Recording([0.0, 0.1], (rj.identify.Gyro(0.1), [[1.0, 0, 0]] * 2))
+    >>> model = estimate.Model(rj.Inertia.from_principal(1.0, 2.0, 2.5))
+    >>> found = estimate.filter(model, record, estimate.start(model, record, rate=1.0))
+    >>> found.readings[0].innovation.shape, int(found.status)
+    ((2, 3), 0)
     """
 
     belief: Belief

@@ -19,6 +19,14 @@ class AbstractScene(eqx.Module):
 
     `rigidjax.simulate(None, Point(x, v), ts, scene)` solves it; `diffrax.ODETerm(scene.field)` is
     the same in plain diffrax.
+
+    >>> class Spring(AbstractScene):
+    ...     def acceleration(self, t, state):
+    ...         return -state.x
+    ...     def conserved(self, t, state):
+    ...         return {"energy": 0.5 * (state.x @ state.x + state.v @ state.v)}
+    >>> float(Spring().conserved(0.0, Point([1.0, 0, 0], [0.0, 2, 0]))["energy"])
+    2.5
     """
 
     @abc.abstractmethod

@@ -25,6 +25,10 @@ class ThreeBody(AbstractReversible):
     angular rate); a period of theirs is 2π.
 
     **Fields:** `mu` μ, scalar; `radii` (2,) of the bodies, at which a particle has collided.
+
+    >>> scene = cr3bp(0.5)
+    >>> [float(r) for r in scene.distances(jnp.array([0.0, 0.0, 0.0]))]
+    [0.5, 0.5]
     """
 
     mu: Scalar

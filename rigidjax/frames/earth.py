@@ -20,6 +20,10 @@ class Earth(AbstractScene):
     acceleration at the origin; what changes of it with x' is added apart.
 
     **Fields:** `latitude` rad, `gravity` m/s², `rate` rad/s.
+
+    >>> scene = earth(0.5)
+    >>> float(scene.latitude), float(scene.gravity)
+    (0.5, 9.80665)
     """
 
     latitude: Scalar

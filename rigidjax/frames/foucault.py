@@ -18,6 +18,10 @@ class Foucault(AbstractScene):
     `drift` reports it.
 
     **Fields:** `place` the `Earth` scene it hangs in; `length` m.
+
+    >>> pendulum = foucault(0.85, 67.0)
+    >>> float(pendulum.length), float(pendulum.place.latitude)
+    (67.0, 0.85)
     """
 
     place: Earth

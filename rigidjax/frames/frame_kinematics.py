@@ -16,6 +16,11 @@ class Instant(eqx.Module):
     **Fields:** `rotation` M (3, 3), S' → S; `rate` Ω (3,), rad/s, and `rate_change` dΩ/dt (3,),
     rad/s², both in the axes of S'; `origin`, `origin_velocity`, `origin_acceleration` of S', (3,),
     in the axes of S. `MovingFrame.at(t)` makes one. x', v' below are what S' sees.
+
+    >>> import rigidjax as rj
+    >>> now = rj.frames.MovingFrame(rj.frames.Uniform([0.0, 0.0, 2.0])).at(0.0)
+    >>> now.rate.tolist(), now.coriolis([1.0, 0.0, 0.0]).tolist()
+    ([0.0, 0.0, 2.0], [0.0, -4.0, 0.0])
     """
 
     rotation: Mat3

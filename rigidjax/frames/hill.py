@@ -16,6 +16,10 @@ class Hill(AbstractReversible):
 
     Rotating axes centred on the small body, x away from the large one. Units: μ^{1/3} of the
     bodies' distance, and 1/(their angular rate). **Field:** `radius` of the small body.
+
+    >>> scene = hill()
+    >>> float(scene.acceleration(0.0, Point([1.0, 0, 0], [0.0, 0, 0]))[0])  # 3 x − x/r³
+    2.0
     """
 
     radius: Scalar

@@ -20,6 +20,10 @@ class Hoop(AbstractScene):
     Axes of the hoop: x in its plane, y across it, z up; the centre is the origin.
 
     **Fields:** `radius` m, `rate` rad/s, `gravity` m/s².
+
+    >>> scene = hoop(2.0, 0.0)
+    >>> float(scene.radius), float(scene.gravity)
+    (2.0, 9.80665)
     """
 
     radius: Scalar

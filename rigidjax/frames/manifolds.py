@@ -31,6 +31,12 @@ class Manifold(eqx.Module):
     manifold; `states` a `Point` with axes (N, T): one motion for each phase, NaN after a collision;
     `phases` (N,) where on the orbit each begins, in periods; `multiplier` λ by which a small
     distance along it changes in a period.
+
+    >>> from rigidjax.frames import scenes
+    >>> ts, phases = jnp.array([0.0, 0.1]), jnp.array([0.0])
+    >>> states = Point(jnp.zeros((1, 2, 3)), jnp.zeros((1, 2, 3)))
+    >>> scenes.Manifold(ts, states, phases, jnp.asarray(2.5)).states.x.shape
+    (1, 2, 3)
     """
 
     ts: Float[Array, " T"]

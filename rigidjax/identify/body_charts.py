@@ -28,6 +28,20 @@ class AbstractBodyChart(eqx.Module):
 
     `log_names`, `unit` and `logs(body)` are the positive quantities that are reported, through
     their logarithms; `plain_names` and `plain(body)` those that may have either sign.
+
+    >>> class Spheres(AbstractBodyChart):  # one number: the logarithm of the moment
+    ...     size, in_words, unit = 1, "the moment of a sphere", "kg m²"
+    ...     log_names, plain_names = ("I",), ()
+    ...     def body(self, vector):
+    ...         return Inertia.from_principal(*jnp.exp(vector[0]) * jnp.ones(3))
+    ...     def vector(self, body):
+    ...         return self.logs(body)
+    ...     def logs(self, body):
+    ...         return jnp.log(body.tensor[0, 0])[None]
+    ...     def plain(self, body):
+    ...         return jnp.zeros(0)
+    >>> Spheres().body(jnp.zeros(1)).tensor[0].tolist()
+    [1.0, 0.0, 0.0]
     """
 
     size: eqx.AbstractVar[int]

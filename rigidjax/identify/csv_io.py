@@ -34,7 +34,11 @@ SEPARATORS = ",;\t"
 
 
 class LogError(ValueError):
-    """A log that cannot be read; the message names the file and, where known, line and column."""
+    """A log that cannot be read; the message names the file and, where known, line and column.
+
+    >>> issubclass(LogError, ValueError)
+    True
+    """
 
 
 def read_table(path: str | Path, columns: Sequence[str]) -> dict[str, np.ndarray]:

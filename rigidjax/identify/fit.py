@@ -45,7 +45,16 @@ FINEST = 32
 
 
 class Start(eqx.Module):
-    """What came of one start: where it ended and whether that can be believed."""
+    """What came of one start: where it ended and whether that can be believed.
+
+    >>> import jax.numpy as jnp, rigidjax as rj
+    >>> ts = jnp.linspace(0.0, 10.0, 80)
+    >>> motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1, 0.1, 1.0]), ts)
+    >>> record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), motion.ys.omega))
+    >>> found = rj.identify.fit(rj.identify.Problem(record, rj.identify.PrincipalRatios()))
+    >>> len(found.starts), all(start.cost < 1e-6 for start in found.starts)
+    (8, True)
+    """
 
     parameters: Parameters
     cost: float
@@ -65,6 +74,14 @@ class Fit(eqx.Module):
     Jacobian, its columns of length one; `null_directions` (k, n) that leave no trace in the data;
     `quantities` all that is reported, by name; `status` one line: `ok`, or `doubtful`, `ambiguous`,
     `poor`, `failed`, a colon and the reasons.
+
+    >>> import jax.numpy as jnp, rigidjax as rj
+    >>> ts = jnp.linspace(0.0, 10.0, 80)
+    >>> motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1, 0.1, 1.0]), ts)
+    >>> record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), motion.ys.omega))
+    >>> found = rj.identify.fit(rj.identify.Problem(record, rj.identify.PrincipalRatios()))
+    >>> [quantity.name for quantity in found.quantities[:2]], found.covariance.shape
+    (['Ix/Iz', 'Iy/Iz'], (5, 5))
     """
 
     problem: Problem

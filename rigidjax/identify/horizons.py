@@ -18,6 +18,12 @@ class Horizons(NamedTuple):
 
     **Fields:** `steps` (L,) how many steps ahead; `mean_absolute` of a component, and `rms` of the
     vector, each by kind (L,).
+
+    >>> import rigidjax as rj
+    >>> t = np.arange(6.0)
+    >>> spin = rj.Spin(np.stack([t, 0 * t, 0 * t], 1))
+    >>> rj.identify.windows(t, spin, length=2).held().rms["omega"].tolist()  # it grows by 1 a step
+    [1.0, 2.0]
     """
 
     steps: Any

@@ -15,6 +15,15 @@ class AbstractLoss(eqx.Module):
     """`ρ(s)` of the squared length s of a sensor's error in units of its noise.
 
     A reading counts as a whole, so that the loss does not depend on the frame.
+
+    >>> import jax.numpy as jnp
+    >>> class Squares(AbstractLoss):  # no outliers: ρ(s) = s
+    ...     def shrink(self, error):
+    ...         return error
+    ...     def weight(self, error):
+    ...         return jnp.ones(())
+    >>> float(Squares().weight(jnp.array([6.0, 0.0, 0.0])))
+    1.0
     """
 
     @abc.abstractmethod

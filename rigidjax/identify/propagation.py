@@ -24,7 +24,14 @@ TURN_A_STEP = 0.1
 
 
 class AbstractIntegrator(eqx.Module):
-    """How a forced motion is followed inside a fit, differentiable in forward mode."""
+    """How a forced motion is followed inside a fit, differentiable in forward mode.
+
+    >>> class Halves(AbstractIntegrator):  # two equal steps from one sample to the next
+    ...     def states(self, body, state0, ts, torque):
+    ...         return FixedSteps(2).states(body, state0, ts, torque)
+    >>> issubclass(Halves, AbstractIntegrator)
+    True
+    """
 
     @abc.abstractmethod
     def states(self, body: Any, state0: Any, ts: Float[Array, " times"], torque: Torque) -> Any:

@@ -21,7 +21,13 @@ if TYPE_CHECKING:
 
 
 class Quantity(eqx.Module):
-    """A number with a name: its value, standard deviation (of the log where positive), unit."""
+    """A number with a name: its value, standard deviation (of the log where positive), unit.
+
+    >>> mass = Quantity("mass", 2.0, 0.01, "kg", True)
+    >>> low, high = mass.interval(1.96)
+    >>> round(low, 3), round(high, 3)
+    (1.961, 2.04)
+    """
 
     name: str
     value: float

@@ -61,7 +61,12 @@ class Coordinates(eqx.Module):
 
 
 class LagrangeEquations(eqx.Module):
-    """Lagrange's equations as a vector field; made by `equations_of_motion`."""
+    """Lagrange's equations as a vector field; made by `equations_of_motion`.
+
+    >>> pendulum = equations_of_motion(lambda q, v: 0.5 * v[0] ** 2 + 9.81 * jnp.cos(q[0]))
+    >>> round(float(pendulum.energy(Coordinates([0.0], [2.0]))), 6)  # ½ v² − 9.81 cos q
+    -7.81
+    """
 
     lagrangian: Callable[[Any, Any], Any]
     force: Callable[[Any, Any, Any], Any] | None

@@ -61,7 +61,7 @@ def inertia_ellipsoid(
             raise ValueError("inertia_ellipsoid: the body has no extension, its 𝔖 is zero")
     unit = "relative size" if isinstance(best, Inertia) else "m"
     ax = row_of_axes(ax, 3, figsize=(10.5, 3.9))
-    middle = _shape(best) / size
+    middle = np.asarray(_shape(best)) / size
     cloud = None if drawn is None else np.asarray(jax.vmap(_shape)(drawn)) / size
     other = None
     if truth is not None:
@@ -69,15 +69,29 @@ def inertia_ellipsoid(
         # A body known up to scale only is compared in shape.
         own = isinstance(best, MassProperties) and isinstance(truth, MassProperties)
         other = other / (1.0 if own else float(np.trace(other)))
+    # The outline reaches √A_ii along axis i. One scale for all three: the panels can be compared.
+    shown = [
+        s for s in (middle[None], cloud, None if other is None else other[None]) if s is not None
+    ]
+    reach = 1.1 * max(float(np.sqrt(np.einsum("nii->ni", s).max())) for s in shown)
+    told = "within the uncertainty"
+    if cloud is not None:
+        apart = np.sqrt(np.einsum("nii->ni", cloud)) - np.sqrt(np.diag(middle))
+        told = (
+            told
+            if np.abs(apart).max(initial=0.0) > 0.01 * reach
+            else "uncertainty: below a line's width"
+        )
     for one, (i, j) in zip(ax, _PLANES, strict=True):
         if cloud is not None:
             for shape in cloud:
                 one.plot(*_outline(shape, i, j), color=COLOURS[5], lw=0.5, alpha=0.25)
-            one.plot([], [], color=COLOURS[5], lw=1, label="within the uncertainty")
-        one.plot(*_outline(np.asarray(middle), i, j), color=COLOURS[0], lw=2, label="body")
+            one.plot([], [], color=COLOURS[5], lw=1, label=told)
+        one.plot(*_outline(middle, i, j), color=COLOURS[0], lw=2, label="body")
         if other is not None:
             one.plot(*_outline(other, i, j), color=COLOURS[1], lw=1.6, ls="--", label="truth")
         one.set_aspect("equal")
+        one.set(xlim=(-reach, reach), ylim=(-reach, reach))
         one.grid(alpha=0.3)
         one.set(xlabel=f"{AXES[i]}, {unit}", ylabel=f"{AXES[j]}, {unit}")
     if cloud is not None or other is not None:

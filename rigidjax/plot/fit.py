@@ -26,6 +26,14 @@ def fit(
     figure.
 
     **Raises** `ModuleNotFoundError` where matplotlib is missing (install the extra `view`).
+
+    >>> import jax.numpy as jnp, rigidjax as rj
+    >>> ts = jnp.linspace(0.0, 10.0, 80)
+    >>> motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1, 0.1, 1.0]), ts)
+    >>> record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), motion.ys.omega))
+    >>> found = rj.identify.fit(rj.identify.Problem(record, rj.identify.PrincipalRatios()))
+    >>> len(fit(found)[0].figure.axes)
+    3
     """
     plt = pyplot()
     seconds = unit(time_unit, TIMES, "time_unit")

@@ -21,6 +21,14 @@ def residuals(
 
     **Raises** `ModuleNotFoundError` where matplotlib is missing; `ValueError` for an unknown unit
     or axes of another shape; `IndexError` for a recording that is not there.
+
+    >>> import jax.numpy as jnp, rigidjax as rj
+    >>> ts = jnp.linspace(0.0, 10.0, 80)
+    >>> motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1, 0.1, 1.0]), ts)
+    >>> record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), motion.ys.omega))
+    >>> found = rj.identify.fit(rj.identify.Problem(record, rj.identify.PrincipalRatios()))
+    >>> residuals(found)[0].get_ylabel() != ""
+    True
     """
     seconds = unit(time_unit, TIMES, "time_unit")
     index = of_fit(found, index)
@@ -63,7 +71,13 @@ def _one_sensor(row: Any, t: np.ndarray, scaled: np.ndarray, seen: np.ndarray) -
     over_time.axhspan(-2, 2, color="0.9", zorder=0)
     over_time.legend(loc="upper right", ncols=3, fontsize=8, markerscale=2)
     over_time.set_ylim(-reach, 1.35 * reach)
-    bins = np.linspace(-reach, reach, int(np.clip(2 * np.sqrt(everything.size), 9, 41)))
+    # As wide as the data: errors far smaller than their noise would all lie in two or three bins.
+    inside = everything[np.abs(everything) <= reach]
+    low, high = (inside.min(), inside.max()) if inside.size else (-1.0, 1.0)
+    middle, half = 0.5 * (low + high), max(0.5 * (high - low), 1e-3 * reach)
+    bins = np.linspace(
+        middle - half, middle + half, int(np.clip(2 * np.sqrt(everything.size), 9, 41))
+    )
     told = f"{beyond} beyond" if beyond else None
     weights = np.full(everything.size, 1 / (everything.size * (bins[1] - bins[0])))
     spread.hist(everything, bins=bins, weights=weights, color=COLOURS[5], alpha=0.8, label=told)

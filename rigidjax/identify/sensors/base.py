@@ -19,6 +19,12 @@ class SensorInput(eqx.Module):
 
     **Fields:** `t` s; `state` on the rung that the problem needs; `body` the `Inertia` or
     `MassProperties`; `field` the equations of motion `f(t, state, args)`.
+
+    >>> import rigidjax as rj
+    >>> body, state = rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([0.0, 0.0, 1.0])
+    >>> now = SensorInput(jnp.asarray(0.0), state, body, rj.equations_of_motion(body, state, None))
+    >>> rj.identify.Gyro(0.1).error(now, jnp.array([0.0, 0.0, 1.5])).tolist()
+    [0.0, 0.0, 0.5]
     """
 
     t: Scalar
@@ -46,6 +52,15 @@ class AbstractSensor(eqx.Module):
     Optional members: `offset`, s: the sensor's clock is behind, it shows at t what was at
     t + offset; `limit` (k,): where a channel saturates, in the unit of the error; a method
     `refusal(values)`: which rows cannot be readings, (T,) true where wrong, and why.
+
+    >>> import rigidjax as rj
+    >>> class Tachometer(AbstractSensor):  # the size of the body rate, rad/s
+    ...     reading_shape, components, unit = (), 1, "rad/s"
+    ...     feels, noise = rj.HasSpin, None
+    ...     def error(self, now, reading):
+    ...         return (reading - jnp.sqrt(jnp.sum(now.state.omega**2)))[None]
+    >>> rj.identify.Recording([0.0, 1.0], (Tachometer(), [3.0, 3.0])).readings[0].values.shape
+    (2,)
     """
 
     reading_shape: eqx.AbstractClassVar[tuple[int, ...]]

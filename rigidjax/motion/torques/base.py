@@ -88,6 +88,16 @@ class AbstractForce(eqx.Module):
     """A force on a body that moves: as `AbstractTorque`, but returns a `Wrench`.
 
     Only `Rigid` feels it; `body` is a `MassProperties`.
+
+    >>> import rigidjax as rj
+    >>> class Thrust(AbstractForce):  # 2 N along world z through the centre of mass
+    ...     feels = rj.HasPose
+    ...     def __call__(self, t, state, body):
+    ...         return Wrench(force=[0.0, 0.0, 2.0])
+    >>> body = rj.MassProperties(4.0, [0.0, 0, 0], jnp.eye(3))
+    >>> start = rj.Rigid([0.0, 0, 0], [0.0, 0, 0], [1.0, 0, 0, 0], [0.0, 0, 1])
+    >>> rj.simulate(body, start, [0.0, 2.0], Thrust()).ys.v[-1].round(9).tolist()
+    [0.0, 0.0, 1.0]
     """
 
     feels: eqx.AbstractVar[type]
