@@ -79,7 +79,7 @@ if TYPE_CHECKING:
         workprecision as workprecision,
     )
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 # Loaded when first asked for: few programs draw, fewer compare methods.
 _LATER = ("datasets", "plot", "workprecision")
