@@ -1,8 +1,9 @@
 """Differentiable rigid-body and rotating-frame mechanics for JAX.
 
-Floors, from below: `special` (numbers), `rotation` and `body` (what turns), `motion` (how it
-turns), `exact` and `solve` (answers), `identify`, `estimate`, `workprecision` and `plot` (uses).
-`simulate` is the front door.
+From the ground up: `special` (functions), `rotation` and `body`, `motion` (states, equations,
+torques) and `frames`, `exact` and `solve` (the motion in closed form, or by a solver), and what
+uses them: `identify`, `estimate`, `batch`, `workprecision`, `plot`. Most programs begin with
+`simulate`.
 """
 
 import importlib

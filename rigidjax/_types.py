@@ -21,7 +21,7 @@ QuatLike = Float[ArrayLike, "4"]
 
 @runtime_checkable
 class HasSpin(Protocol):
-    """Whatever turns: it has a body rate `omega` (rad/s, body frame).
+    """A state with a body rate `omega` (rad/s, body frame).
 
     >>> import rigidjax as rj
     >>> isinstance(rj.Spin([0.0, 0.0, 1.0]), HasSpin), isinstance(rj.Inertia(jnp.eye(3)), HasSpin)
@@ -34,7 +34,7 @@ class HasSpin(Protocol):
 
 @runtime_checkable
 class HasAttitude(HasSpin, Protocol):
-    """Whatever turns and knows which way it points: `q` (w, x, y, z), body → world.
+    """A state with a body rate and an attitude `q` (w, x, y, z), body → world.
 
     >>> import rigidjax as rj
     >>> isinstance(rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 1]), HasAttitude)
@@ -47,7 +47,7 @@ class HasAttitude(HasSpin, Protocol):
 
 @runtime_checkable
 class HasPose(HasAttitude, Protocol):
-    """Whatever turns, points and moves: `x`, `v` of the centre of mass (m, m/s, world frame).
+    """A state with a rate, an attitude, and `x`, `v` of the centre of mass (m, m/s, world frame).
 
     >>> import rigidjax as rj
     >>> isinstance(rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 1]), HasPose)  # it has no position

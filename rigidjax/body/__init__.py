@@ -1,4 +1,4 @@
-"""What is turned: inertia, mass, second moments, shapes, and numbers that are always a body."""
+"""Bodies: inertia, mass, second moments, shapes, charts by unconstrained numbers."""
 
 from rigidjax._names import own_names
 from rigidjax.body import (

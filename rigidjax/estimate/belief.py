@@ -77,7 +77,7 @@ def start(
     """What is known before the first reading.
 
     **Arguments:** `model`; `recording`, whose first time it is of and whose sensors the walks start
-    from; `state` a `Spin`, `Attitude` or `Rigid`: the rung that is followed; `None` reads a first
+    from; `state` a `Spin`, `Attitude` or `Rigid`: the kind that is followed; `None` reads a first
     attitude and rate off the recording (`Spin` where nothing shows an attitude). Then standard
     deviations, one number or three, zero for what is known: `rate` of Ω, rad/s; `attitude` rad;
     `position` m and `velocity` m/s of a `Rigid`. Torques start from their law's own distribution.

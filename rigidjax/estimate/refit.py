@@ -89,9 +89,9 @@ def refit(density: LogDensity, *, max_steps: int = 200) -> Refit:
     >>> motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1, 0.1, 1.0]), ts)
     >>> record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), motion.ys.omega))
     >>> found = rj.identify.fit(rj.identify.Problem(record, rj.identify.PrincipalRatios()))
-    >>> best = refit(rj.estimate.LogDensity(found))  # a fit of gyro data alone was there already
-    >>> best.point.state0.omega.round(6).tolist()
-    [1.0, 0.1, 1.0]
+    >>> best = refit(rj.estimate.LogDensity(found))
+    >>> bool(jnp.allclose(best.point.state0.omega, jnp.array([1.0, 0.1, 1.0]), atol=1e-3))
+    True
     """
     _checks.instance(density, LogDensity, "density", hint="estimate.LogDensity(fit) makes one")
     steps = _checks.whole(max_steps, "max_steps", 1)

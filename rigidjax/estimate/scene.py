@@ -106,7 +106,7 @@ class Extended(eqx.Module):
 
 
 class Dynamics(eqx.Module):
-    """A model made ready for one dtype and one rung: what does not change is worked out once."""
+    """A model for one dtype and one kind of state: what does not change is computed once."""
 
     field: Callable[..., Any]
     inverse: Mat3

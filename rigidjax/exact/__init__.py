@@ -1,4 +1,4 @@
-"""Answers without a solver."""
+"""Motions in closed form, without a solver."""
 
 from rigidjax._names import own_names, renamed
 from rigidjax.exact.diffrax_solver import FreeSolver as FreeSolver

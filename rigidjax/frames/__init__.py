@@ -1,4 +1,4 @@
-"""Who watches: moving frames, and scenes of particles seen from them. No body is needed."""
+"""Moving frames, and scenes of particles seen from them. No body is needed."""
 
 from rigidjax._names import own_names, renamed
 from rigidjax.frames import scenes as scenes

@@ -1,4 +1,4 @@
-"""Families of periodic orbits: walked by the derivatives of the orbit, and how stable they are."""
+"""Families of periodic orbits, continued by the derivatives of the orbit; their stability."""
 
 from typing import Any
 
@@ -53,7 +53,7 @@ def at_values(scene: Any, orbit: PeriodicOrbit, values: Any, hold: str) -> Perio
         numbers,
         lost.any(),
         f"family: lost{where}; take smaller steps, or the family turns back there: hold another of "
-        "x, z, vy, period, or walk with follow",
+        "x, z, vy, period, or use follow",
     )
     return jax.vmap(orbit_of)(numbers)
 

@@ -75,7 +75,7 @@ def correct(
     found = _checks.refuse(
         found,
         ~((ratio > 0.5) & (ratio < 2)),
-        "periodic_orbit: Newton's method slid from the guess to an orbit of less than half or more "
+        "periodic_orbit: Newton's method went from the guess to an orbit of less than half or more "
         "than twice its period; start nearer",
     )
     return orbit_of(found)

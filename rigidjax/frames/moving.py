@@ -25,7 +25,7 @@ class MovingFrame(eqx.Module):
 
     - `rotation`: a function of time, s, to M (3, 3) or to its unit quaternion (4,), S' → S; or
       what gives a state with `q` and `omega`, such as a solution of `simulate` (its `evaluate` is
-      called) or a `FreeBody`: then the frame rides on the body, and derivatives through a solved
+      called) or a `FreeBody`: then the frame is fixed in the body, and derivatives through a solved
       motion are in forward mode only. A Module (`frames.Uniform`) does
       not compile again for other numbers, a fresh `lambda` does.
     - `origin`: a function of time to X (3,), m, axes of S; `None` where the origins coincide.

@@ -1,4 +1,4 @@
-"""From a recording to a body, and how sure that is."""
+"""Identification: from recordings to a body, with its uncertainty."""
 
 from rigidjax._names import own_names, renamed
 from rigidjax.identify import report as report

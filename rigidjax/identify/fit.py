@@ -45,7 +45,7 @@ FINEST = 32
 
 
 class Start(eqx.Module):
-    """What came of one start: where it ended and whether that can be believed.
+    """The result of one start: where the search ended, and whether that explains the data.
 
     >>> import jax.numpy as jnp, rigidjax as rj
     >>> ts = jnp.linspace(0.0, 10.0, 80)
@@ -66,12 +66,13 @@ class Fit(eqx.Module):
     """What `fit` returns: the best point and how sure it is.
 
     **Fields:** `parameters` the free numbers at the best point; `covariance` (n, n) of them,
-    flattened in order, infinite where the data are blind, `seen` the same within what they see,
-    `covariance_kind` what it rests on; `noises` (R, k) for each sensor; `starts` what came of each
-    start; `chi2` and `dof` of the whitened errors of the sensors whose noise was given;
+    flattened in order, infinite where the data do not determine them, `seen` the same within
+    what they determine, `covariance_kind` what it rests on; `noises` (R, k) for each sensor;
+    `starts` a `Start` each; `chi2` and `dof` of the whitened errors of the sensors whose noise was
+    given;
     `correlation` over how many samples the errors are autocorrelated, 1 for white ones, and
     `independent` how many independent ones that leaves; `singular_values` (n,) of the whitened
-    Jacobian, its columns of length one; `null_directions` (k, n) that leave no trace in the data;
+    Jacobian, its columns of length one; `null_directions` (k, n) that the data do not determine;
     `quantities` all that is reported, by name; `status` one line: `ok`, or `doubtful`, `ambiguous`,
     `poor`, `failed`, a colon and the reasons.
 
@@ -473,7 +474,7 @@ def _assess(
     ]
     doubts = list(seen.doubts)
     if not any(start.fits for start in starts):
-        doubts.append("no start by itself came near the best point")
+        doubts.append("no single start came near the best point")
     if not np.isfinite(best_cost):
         status = "failed: no start gave a finite misfit"
     elif believable and not done:

@@ -1,4 +1,4 @@
-"""What a fit found, in words."""
+"""Which numbers a fit determines and which not, in words."""
 
 from typing import TYPE_CHECKING
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 def identifiability(fit: "Fit") -> tuple[str, ...]:
-    """What the data fix, what they fix weakly, what they cannot see."""
+    """What the data determine, what they determine weakly, what not at all."""
     reach = quantile(fit, 0.95)
     out = []
     for quantity in _moments(fit):
@@ -42,8 +42,8 @@ def identifiability(fit: "Fit") -> tuple[str, ...]:
     out += correlations(fit)
     if fit.problem.torque is None:
         out.append(
-            "Free motion cannot show the absolute inertia: only ratios; mass and centre of mass "
-            "leave no trace at all."
+            "Free motion cannot show the absolute inertia, only ratios of moments; nor the mass or "
+            "the centre of mass."
         )
     out += in_words(fit.problem.records.readings)
     if fit.correlation > 1.5:
@@ -83,11 +83,11 @@ def _unseen(fit: "Fit") -> list[str]:
         return []
     out = []
     if scale_is_unseen(fit):
-        out.append("The data fix the inertia only up to scale: its size leaves no trace.")
+        out.append("The data determine the inertia only up to scale.")
     one = count == 1
     out.append(
-        f"{count} combination{'' if one else 's'} of the free numbers leave{'s' if one else ''} no "
-        "trace in these data; intervals that depend on "
+        f"{count} combination{'' if one else 's'} of the free numbers {'is' if one else 'are'} not "
+        "determined by these data; intervals that depend on "
         f"{'it' if one else 'them'} are infinite."
     )
     return out
@@ -116,7 +116,7 @@ def scale_is_unseen(fit: "Fit") -> bool:
 
 
 def correlations(fit: "Fit") -> list[str]:
-    """Pairs of reported quantities whose errors go together (|ρ| > 0.95).
+    """Pairs of reported quantities whose errors are correlated (|ρ| > 0.95).
 
     Of an inertia tensor its principal moments, not its components, which follow from them.
     """
@@ -136,6 +136,6 @@ def correlations(fit: "Fit") -> list[str]:
     ]
     pairs.sort(key=lambda pair: -abs(rho[pair]))
     return [
-        f"{names[j]} and {names[i]} go together (correlation {rho[i, j]:+.3f})."
+        f"{names[j]} and {names[i]} are strongly correlated (ρ = {rho[i, j]:+.3f})."
         for i, j in pairs[:5]
     ]

@@ -104,7 +104,7 @@ def fit_light_curve(
     twice the rotation, in long- and short-axis mode (Kaasalainen 2001), over a grid of bodies and
     phases; the best of them fitted with the sensor itself; the best of these fitted to the end. All
     that were found are listed. What brightness leaves free by symmetry (half turns of the world,
-    see `Brightness`, and of the body about its axes) is not told apart: periods, moments and mode
+    see `Brightness`, and of the body about its axes) is one motion here: periods, moments and mode
     are the same.
 
     **Arguments:** `problem` of one recording with one `Brightness` sensor and no torque; let a

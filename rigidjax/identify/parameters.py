@@ -20,9 +20,9 @@ class Own(eqx.Module):
 
     **Fields:** `spin` (3,) the first body rate over the typical rate; `turn` (3,) the rotation
     vector from the reference attitude to the first one (body frame, rad), or `None` where nothing
-    feels the attitude; `place`, `speed` (3,) the first position and velocity from the reference, in
-    typical lengths and speeds, or `None`; `each` the steps of the `Free`s with one value for each
-    recording, and the deviations of those with a `spread`.
+    depends on the attitude; `place`, `speed` (3,) the first position and velocity from the
+    reference, in typical lengths and speeds, or `None`; `each` the steps of the `Free`s with one
+    value for each recording, and the deviations of those with a `spread`.
 
     >>> import rigidjax as rj
     >>> record = rj.identify.Recording([0.0, 1.0], (rj.identify.Gyro(), [[1.0, 0, 0]] * 2))

@@ -60,8 +60,8 @@ class Problem(eqx.Module):
     Channels that were cut off at full scale are found, and their readings there count as "at least
     that much", as with a sensor's `limit`.
 
-    The motion starts at the first time of each recording. The state climbs only as far as the
-    sensors and the torque need: `Spin`, `Attitude`, `Rigid`.
+    The motion starts at the first time of each recording. Its state is the lowest that sensors
+    and torque can do with: `Spin`, `Attitude`, `Rigid`.
 
     **Raises:** `TypeError` for arguments of another kind; `ValueError` where they do not fit.
 

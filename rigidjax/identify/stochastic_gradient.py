@@ -23,7 +23,7 @@ STRIDE = 50
 
 
 class Descent(eqx.Module):
-    """How a fit first walks down on a few recordings at a time.
+    """How a fit first descends on a few recordings at a time.
 
     Each step draws `batch` recordings, differentiates their misfit (exactly, by forward mode within
     each recording) and hands the gradient of all parameters to `optimiser`. The parameters of a

@@ -1,4 +1,4 @@
-"""Rung 2: a body that turns and knows which way it points."""
+"""The state `Attitude`: a body that turns, with its attitude."""
 
 from typing import TypeVar
 
@@ -20,7 +20,7 @@ from rigidjax.rotation.linalg3 import components
 
 
 class Attitude(eqx.Module):
-    """The state of rung 2: attitude and body rate.
+    """Attitude and body rate: a body that turns.
 
     **Arguments:** `q` (4,) unit quaternion (w, x, y, z), **scalar first**, body → world (the `M` of
     the notes, eq 8); `omega` (3,) Ω in the body frame, rad/s. Leading axes are allowed in a

@@ -1,4 +1,4 @@
-"""Rung 1: a body that turns, seen from itself. Euler's equations in the body frame."""
+"""The state `Spin`: the body rate alone. Euler's equations in the body frame."""
 
 import equinox as eqx
 from jaxtyping import Array, Float
@@ -14,7 +14,7 @@ _HINT = "Inertia.from_tensor makes one of a matrix; of MassProperties pass .iner
 
 
 class Spin(eqx.Module):
-    """The state of rung 1: a body rate and nothing else.
+    """A body rate and nothing else: a body that turns, its attitude left out.
 
     **Arguments:** `omega` (3,) angular velocity Ω in the body frame, rad/s (notes, eq 49). Leading
     axes are allowed in a container of many states; functions take one.

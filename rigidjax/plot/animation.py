@@ -1,4 +1,4 @@
-"""A tumbling body as moving pictures."""
+"""A tumbling body as an animation."""
 
 import base64
 import html
@@ -22,7 +22,7 @@ FACES = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (
 
 
 class Film(eqx.Module):
-    """Moving pictures in memory: a notebook shows them, `save` writes them.
+    """An animation in memory: a notebook shows it, `save` writes it.
 
     **Fields:** `data` the file; `kind` `gif` or `html`; `height` px in a notebook.
 

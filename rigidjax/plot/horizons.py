@@ -1,4 +1,4 @@
-"""How far predictions go astray, by how far ahead they look."""
+"""Errors of predictions, by how far ahead they look."""
 
 from collections.abc import Mapping
 from typing import Any

@@ -1,4 +1,4 @@
-"""A tumbling body to turn with the mouse: viser's recorded scene, one page without a network."""
+"""A tumbling body on a page of its own, turned with the mouse: viser's recorded scene, offline."""
 
 from typing import Any
 

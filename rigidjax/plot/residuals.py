@@ -1,4 +1,4 @@
-"""What a fit leaves over: is it noise?"""
+"""Residuals of a fit: are they noise?"""
 
 from typing import Any
 
@@ -10,7 +10,7 @@ from rigidjax.plot.style import COLOURS, TIMES, of_fit, pyplot, unit
 def residuals(
     found: Any, *, index: int = 0, time_unit: str = "s", title: str = "", ax: Any = None
 ) -> Any:
-    """Residuals of each sensor over its noise: against time, their spread, their memory.
+    """Residuals of each sensor over its noise: against time, histogram, autocorrelation.
 
     Left: they should scatter evenly within ±2 (what lies beyond ±8 is counted, not drawn).
     Middle: their histogram against the normal curve. Right: the correlation of each with a later
@@ -27,8 +27,8 @@ def residuals(
     >>> motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1, 0.1, 1.0]), ts)
     >>> record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), motion.ys.omega))
     >>> found = rj.identify.fit(rj.identify.Problem(record, rj.identify.PrincipalRatios()))
-    >>> residuals(found)[0].get_ylabel() != ""
-    True
+    >>> residuals(found)[0, 2].get_xlabel()
+    'lag, samples'
     """
     seconds = unit(time_unit, TIMES, "time_unit")
     index = of_fit(found, index)
@@ -51,7 +51,7 @@ def residuals(
         _one_sensor(row, t, one / sigma, np.asarray(reading.seen))
         row[0].set_ylabel(f"{type(reading.sensor).__name__}\nerror / noise")
         row[0].set_xlabel(f"time, {time_unit}")
-    ax[0, 1].set_title(title or "what the fit leaves over")
+    ax[0, 1].set_title(title or "residuals of the fit")
     return ax
 
 

@@ -2,7 +2,7 @@
 
 q and −q are the same rotation. `log`, and every error built on it, gives the same bits for both.
 The maps here take one quaternion and normalise nothing, so that they cost little in a vector field;
-`check` is the gate for data from outside. Where one says that it refuses values, those are meant
+`check` is for data from outside. Where one says that it refuses values, those are meant
 that are known (not traced).
 
 Range: what does not ask for the length of a quaternion or an axis (`normalise`, `log`, `angle`,
@@ -123,7 +123,7 @@ def rotate_inverse(q: QuatLike, y: Vec3Like) -> Vec3:
 
 
 def check(q: Float[ArrayLike, "*batch 4"], *, name: str = "q") -> Float[Array, "*batch 4"]:
-    """The gate for quaternions from outside: normalised, or refused.
+    """Check a quaternion that comes from outside: normalised, or refused.
 
     **Arguments:** `q` (..., 4), scalar first; `name` how messages call it. **Returns:** it, with
     length 1 to round-off. **Raises:** for NaN, a zero quaternion, and a length off by more than

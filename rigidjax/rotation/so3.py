@@ -259,7 +259,7 @@ def uniform(key: PRNGKeyArray, dtype: Any = float) -> Mat3:
 def check(
     matrix: Float[ArrayLike, "*batch 3 3"], *, name: str = "matrix"
 ) -> Float[Array, "*batch 3 3"]:
-    """The gate for matrices from outside: returned as they are, or refused.
+    """Check a matrix that comes from outside: returned as it is, or refused.
 
     **Arguments:** `matrix` (..., 3, 3); `name` how messages call it. **Raises:** for NaN, a
     left-handed frame (det < 0), and |MᵀM − 1| above 1e-6 (float32: 1e-3); a `ValueError`, or under

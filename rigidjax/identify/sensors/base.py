@@ -17,7 +17,7 @@ from rigidjax.rotation import quaternion
 class SensorInput(eqx.Module):
     """What a sensor reads: a motion at one time.
 
-    **Fields:** `t` s; `state` on the rung that the problem needs; `body` the `Inertia` or
+    **Fields:** `t` s; `state` of the kind that the problem needs; `body` the `Inertia` or
     `MassProperties`; `field` the equations of motion `f(t, state, args)`.
 
     >>> import rigidjax as rj
@@ -43,7 +43,7 @@ class SensorInput(eqx.Module):
 
 
 class AbstractSensor(eqx.Module):
-    """A sensor: what shape its readings have, which rung it sees, and the error of a reading.
+    """A sensor: the shape of its readings, the state it needs, and the error of a reading.
 
     Subclass it for your own: say `reading_shape`, `feels` (`HasSpin`, `HasAttitude` or `HasPose`),
     how many `components` the error has and in which `unit`, `noise` (k,) the standard deviation of

@@ -1,4 +1,4 @@
-"""Torques and forces. Each names the lowest rung that can feel it, and feels nothing below."""
+"""Torques and forces. Each names the lowest state that it acts on."""
 
 from rigidjax._names import own_names, renamed
 from rigidjax.motion.torques.base import (

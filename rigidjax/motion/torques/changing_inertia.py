@@ -60,7 +60,7 @@ class ChangingInertia(eqx.Module):
 
     @property
     def feels(self) -> type:
-        """What the torque inside feels."""
+        """The lowest state that the torque inside acts on."""
         return getattr(self.torque, "feels", HasSpin)
 
     @property
