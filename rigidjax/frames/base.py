@@ -15,7 +15,7 @@ from rigidjax.frames.point import Point
 
 
 class AbstractScene(eqx.Module):
-    """Where a particle moves: subclass it, give `acceleration` and `conserved`.
+    """The equations of motion of a particle: subclass it, give `acceleration` and `conserved`.
 
     `rigidjax.simulate(None, Point(x, v), ts, scene)` solves it; `diffrax.ODETerm(scene.field)` is
     the same in plain diffrax.

@@ -117,7 +117,7 @@ def _slope(scene: Any, numbers: Array, index: int) -> PeriodicOrbit:
 
 
 def follow(scene: Any, orbit: PeriodicOrbit, step: Any, count: int, rising: str) -> PeriodicOrbit:
-    """Members of a family at equal steps of arclength, past its turns: see `ThreeBody.follow`.
+    """Members of a family at equal steps of arclength, past its folds: see `ThreeBody.follow`.
 
     **Raises:** `ValueError` (`EquinoxRuntimeError` under `jit`) where a member is not found.
 

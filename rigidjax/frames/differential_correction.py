@@ -21,7 +21,7 @@ MAX_STEPS = 25
 
 
 class PeriodicOrbit(eqx.Module):
-    """A start and the time after which it comes back.
+    """A periodic orbit: a state on it, and its period.
 
     **Arguments:** `state` a `Point`; `period` its period, in the scene's unit of time. Many: the
     same leading axes before both.

@@ -1,4 +1,4 @@
-"""Hill's problem: the three-body problem looked at closely around the small body."""
+"""Hill's problem: the limit of the three-body problem near the small body."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float

@@ -1,4 +1,4 @@
-"""The five points at which the restricted three-body problem stands still."""
+"""The five equilibrium points of the restricted three-body problem."""
 
 import jax.numpy as jnp
 from jax import lax

@@ -118,7 +118,7 @@ class AbstractReversible(AbstractScene):
     def follow(
         self, orbit: PeriodicOrbit, step: ScalarLike, count: int, *, rising: str = "x"
     ) -> PeriodicOrbit:
-        """The next `count` members of a family, at equal steps of arclength, past its turns.
+        """The next `count` members of a family, at equal steps of arclength, past its folds.
 
         Pseudo-arclength continuation in (x, z, v_y, T/2): each start lies at `step` along the
         tangent, and Newton's method goes back across it (Keller 1977, in

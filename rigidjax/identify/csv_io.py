@@ -1,4 +1,4 @@
-"""Reading logs from files. What is wrong is said with file, line and column."""
+"""Reading logs from files. Errors name file, line and column."""
 
 import csv
 import math

@@ -1,4 +1,4 @@
-"""Least squares from several starts, and what came of it."""
+"""Least squares from several starts, and its result."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -167,7 +167,7 @@ class Fit(eqx.Module):
 
     @property
     def identifiability(self) -> tuple[str, ...]:
-        """In words: what the data fix, what they fix weakly, what they cannot see."""
+        """In words: what the data determine, what only weakly, and what not."""
         return identifiability.identifiability(self)
 
 
@@ -216,8 +216,8 @@ def fit(
       after so many steps.
     - `together`: how many starts go through one `vmap` at once.
     - `pieces`: where more than one, the record is first fitted in so many pieces whose ends are
-      drawn together (see `pieces`), and what they agree on is the first start.
-    - `descent`: a `Descent(optimiser, steps=…, batch=…)` of optax walks each start down first, a
+      joined (see `pieces`), and the result is the first start.
+    - `descent`: a `Descent(optimiser, steps=…, batch=…)` of optax first improves each start on a
       few recordings at a time: for many recordings, where a step of least squares costs much.
     - `checkpoint`: a file that keeps what was found after every 25 steps; a second call with the
       same problem and options goes on from there and, on the same machine and versions, ends at

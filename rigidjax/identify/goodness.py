@@ -38,7 +38,7 @@ def goodness(problem: Problem, linear: Linearised, times: Times, free: int) -> G
     For each sensor: the size of its errors against the noise, where that was given (five standard
     deviations of χ², or under a robust loss of the median of the squared errors), and against what
     varies in its readings; and whether its errors are white (Ljung and Box's test,
-    at one wrong alarm in 1e5). Readings at full scale take no part.
+    with one false alarm in 1e5). Readings at full scale take no part.
 
     **Arguments:** `linear` the problem at its best point; `times` the errors' correlation; `free`
     how many numbers are free.

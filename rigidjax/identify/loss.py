@@ -38,7 +38,7 @@ class AbstractLoss(eqx.Module):
 class SoftL1(AbstractLoss):
     """Quadratic for ordinary errors, linear for large ones: `ρ(s) = 2c²(√(1 + s/c²) − 1)`.
 
-    Convex, unlike Cauchy's, which has minima of its own making.
+    Convex, unlike Cauchy's, which can add local minima.
 
     **Arguments:** `scale` c, where quadratic turns to linear, in standard deviations. **Raises:**
     `ValueError` where it is not positive.

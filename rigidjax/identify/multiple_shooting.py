@@ -22,8 +22,8 @@ WIDTHS = (1.0, 1e-1, 1e-2, 1e-3)
 def pieces(problem: Problem, count: int, *, width: float = WIDTHS[-1]) -> Problem:
     """The problem with its recording cut into pieces, each with a first state of its own.
 
-    Where errors grow along the record, a fit from one first state has a forest of minima and a
-    derivative that nothing can follow; over a piece it has not. The end of each piece is held to
+    Where errors grow along the record, the misfit of one first state has many local minima and very
+    large derivatives; over a short piece it has not. The end of each piece is held to
     the start of the next as a reading of standard deviation `width` would.
 
     **Arguments:** `problem` with one recording; `count` ≥ 2 pieces of about as many samples each;

@@ -51,7 +51,7 @@ class Problem(eqx.Module):
       body, group or recording.
     - `torque`: what turns the body besides its own spin, for the recordings that have none.
     - `loss`: how an outlier counts: `SoftL1()`, `Huber()`, or `None` for plain least squares.
-    - `prior`: `Entropic(guess, weight)`, a pull towards a body that is roughly known, or `None`.
+    - `prior`: `Entropic(guess, weight)`, a prior around a body that is roughly known, or `None`.
     - `integrator`: `FixedSteps(n)` or `Adaptive(rtol, atol)` for a forced motion; `None` chooses by
       how finely it was sampled. A free body is followed by the closed form.
     - `noise_each`: where a sensor's noise is estimated, one figure for all recordings (`False`),

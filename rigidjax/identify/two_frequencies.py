@@ -28,7 +28,7 @@ class TwoFrequencies(eqx.Module):
     """What `two_frequencies` returns, the best first.
 
     **Fields:** `frequencies` (n, 2) in 1/s; `misfits` (n,) χ² of each pair's series, and `dof`;
-    `scatter` the standard deviation that the best leaves over, in the unit of the values; `lines`
+    `scatter` the standard deviation of the best one's residuals, in the unit of the values; `lines`
     (m,) the strongest lines of the spectrum, 1/s.
 
     >>> t = np.linspace(0.0, 60.0, 300)

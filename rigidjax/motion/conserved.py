@@ -72,7 +72,7 @@ def conserved(
     - `momentum` (3,), kg m²/s, world frame, `R(IΩ + h)`, and `momentum_squared`, the Casimir
       `|IΩ + h|²`: nothing outside turns the body (h is the wheels' momentum);
     - `momentum_along_axis`, kg m²/s: one law turns it, but not about this axis (gravity, a field);
-    - `linear_momentum` (3,), kg m/s, world frame: nothing pushes it;
+    - `linear_momentum` (3,), kg m/s, world frame: no force acts on it;
     - `momentum_about_origin` (3,), kg m²/s, world frame, `m x × v + R(IΩ + h)`: free, or attracted
       by the origin.
 

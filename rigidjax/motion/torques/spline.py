@@ -20,8 +20,8 @@ Samples = Float[ArrayLike, "n *channels"] | Sequence[Any]
 class Series(eqx.Module):
     """A cubic spline through evenly spaced samples; beyond the ends, the last value.
 
-    Found by division, not by search, so that it costs little inside a solver; its derivative is
-    continuous, so that a step may pass over a sample.
+    The interval of a time is found by division, not by search, so that it costs little in a solver;
+    its derivative is continuous, so that a step may pass over a sample.
 
     **Arguments:** `times` (n,) s, evenly spaced to 1e-6 of a step; `values` (n,) or (n, k). Both
     may be traced: it can be made under `jit`, `vmap` and `grad`.
@@ -112,8 +112,8 @@ class Wheel(eqx.Module):
     **Arguments:** `inertia` J, kg m², about the axis; `axis` (3,) a, body frame, unit; `speed`
     rad/s relative to the body, a callable Module of time such as `Series(times, speeds)`; `delay`
     s: the log shows at t what was at t − delay; `None` for none; `tilt` (2,) rad, how far the axis
-    leans towards two directions across it (about x, y and z: the next two axes in turn, y and z, z
-    and x, x and y); `None` for none.
+    is tilted towards two directions across it (about x, y and z: the next two axes in turn, y and
+    z, z and x, x and y); `None` for none.
 
     **Raises:** `ValueError` for an axis that is not a unit vector.
 

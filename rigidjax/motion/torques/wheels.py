@@ -39,9 +39,10 @@ class ReactionWheels(AbstractTorque):
       constant, a function of time such as `Held(times, values)`, `Input("motor")`, or `None`.
     - `feedback`: a function `(t, state, speeds) → (R,)`, N m, added to `motor`; or `None`.
     - `max_torque` N m, `max_speed` rad/s, each one number, (R,), or `None` for no limit: the
-      motors' torque is cut off at the one; what would bring a wheel beyond the other falls to
-      nothing over the last 5 % below it, as 6 x⁵ − 15 x⁴ + 10 x³, so that derivatives of runs that
-      meet it are right to their tolerance (along a straight line: to 1e-4 at `rtol=1e-9`).
+      motors' torque is limited to `max_torque`; a torque that would bring a wheel beyond
+      `max_speed` decreases to zero over the last 5 % below it, as 6 x⁵ − 15 x⁴ + 10 x³, so that
+      derivatives of runs that meet it are right to their tolerance (along a straight line: to 1e-4
+      at `rtol=1e-9`).
     - `viscous` c, N m s/rad, and `coulomb` d, N m, of the bearings, each one number, (R,), or
       `None`: the friction `−c s − d tanh(s/s₀)`; `turn_over` s₀, rad/s, over which Coulomb friction
       changes its sign, smooth so that it can be differentiated and met by long steps.
