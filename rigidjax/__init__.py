@@ -1,8 +1,9 @@
 """Differentiable rigid-body and rotating-frame mechanics for JAX.
 
-Floors, from below: `special` (numbers), `rotation` and `body` (what turns), `motion` (how it
-turns), `exact` and `solve` (answers), `identify`, `estimate`, `workprecision` and `plot` (uses).
-`simulate` is the front door.
+From the ground up: `special` (functions), `rotation` and `body`, `motion` (states, equations,
+torques) and `frames`, `exact` and `solve` (the motion in closed form, or by a solver), and what
+uses them: `identify`, `estimate`, `batch`, `workprecision`, `plot`. Most programs begin with
+`simulate`.
 """
 
 import importlib
@@ -73,12 +74,16 @@ from rigidjax.solve import (
 from rigidjax.special import elliptic as elliptic
 
 if TYPE_CHECKING:
-    from rigidjax import plot as plot, workprecision as workprecision
+    from rigidjax import (
+        datasets as datasets,
+        plot as plot,
+        workprecision as workprecision,
+    )
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 # Loaded when first asked for: few programs draw, fewer compare methods.
-_LATER = ("plot", "workprecision")
+_LATER = ("datasets", "plot", "workprecision")
 
 
 def __getattr__(name: str) -> ModuleType:

@@ -181,7 +181,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _demo(options: argparse.Namespace) -> int:
-    from rigidjax.identify import toutatis
+    from rigidjax.datasets import toutatis
 
     print("4179 Toutatis, 17 radar observations, 2 to 18 December 1992")
     print(f"data: {toutatis.CITATION}\n")
@@ -201,28 +201,28 @@ def _demo(options: argparse.Namespace) -> int:
 
 
 def _logs(options: argparse.Namespace) -> int:
-    from rigidjax.identify import logs
+    from rigidjax.identify import cli_spec
 
-    layout = logs.layout_of(options.logs[0]) if options.columns is None else logs.USUAL
+    layout = cli_spec.layout_of(options.logs[0]) if options.columns is None else cli_spec.USUAL
     time, *rates = options.columns or layout.columns
     unit, time_unit = options.unit or layout.unit, options.time_unit or layout.time_unit
     try:
         if options.sensor:
-            channels = [logs.channel(text) for text in options.sensor]
+            channels = [cli_spec.channel(text) for text in options.sensor]
         else:
-            noise = None if options.noise is None else logs.noises(options.noise, "--noise")
+            noise = None if options.noise is None else cli_spec.noises(options.noise, "--noise")
             if options.limit is not None and not options.limit > 0:
                 raise rj.identify.LogError(
                     f"--limit: wanted a positive number, got {options.limit}"
                 )
-            channels = [logs.Channel("gyro", tuple(rates), unit, noise, options.limit)]
-        wheels = [logs.wheel(text) for text in options.wheel]
+            channels = [cli_spec.Channel("gyro", tuple(rates), unit, noise, options.limit)]
+        wheels = [cli_spec.wheel(text) for text in options.wheel]
         if options.model in ("tensor", "principal") and not wheels:
             raise rj.identify.LogError(
                 f"--model {options.model}: free motion shows ratios only; a scale needs a --wheel"
             )
         records = [
-            logs.read_log(
+            cli_spec.read_log(
                 path,
                 channels,
                 time=time,
@@ -233,7 +233,7 @@ def _logs(options: argparse.Namespace) -> int:
             )
             for path in options.logs
         ]
-        problem = logs.problem_of(
+        problem = cli_spec.problem_of(
             records,
             options.model,
             typical=options.typical,

@@ -1,10 +1,13 @@
-"""What `dir` shows of a public module: its own names, not those that it works with (floor 0)."""
+"""The names of public modules: what `dir` shows, and old names (floor 0)."""
 
 import ast
 import functools
+import importlib
 import inspect
 import sys
+import warnings
 from collections.abc import Callable, Iterator
+from typing import Any
 
 
 def own_names(module: str) -> Callable[[], list[str]]:
@@ -48,3 +51,32 @@ def _public(body: list[ast.stmt]) -> Iterator[str]:
         elif isinstance(node, ast.If):
             # What is imported for type checkers only is loaded when first asked for.
             yield from _public(node.body)
+
+
+def renamed(module: str, names: dict[str, str]) -> Callable[[str], Any]:
+    """A `__getattr__` for a public module some of whose names are now others.
+
+    The old name gives the new thing and a `DeprecationWarning` that says where it is now. It is
+    kept for one release.
+
+    **Arguments:** `module` the module's `__name__`; `names` old name → new full name, which is
+    imported when the old one is asked for.
+
+    >>> get = renamed("rigidjax.plot", {"pose": "rigidjax.plot.motion"})
+    >>> get("other")
+    Traceback (most recent call last):
+    AttributeError: module 'rigidjax.plot' has no attribute 'other'
+    """
+
+    def look_up(name: str) -> Any:
+        if name not in names:
+            raise AttributeError(f"module {module!r} has no attribute {name!r}")
+        warnings.warn(
+            f"{module}.{name} is now {names[name]}; the old name will be removed in 0.3",
+            DeprecationWarning,
+            stacklevel=2,
+        )
+        place, _, inner = names[name].rpartition(".")
+        return getattr(importlib.import_module(place), inner)
+
+    return look_up

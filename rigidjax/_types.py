@@ -21,7 +21,12 @@ QuatLike = Float[ArrayLike, "4"]
 
 @runtime_checkable
 class HasSpin(Protocol):
-    """Whatever turns: it has a body rate `omega` (rad/s, body frame)."""
+    """A state with a body rate `omega` (rad/s, body frame).
+
+    >>> import rigidjax as rj
+    >>> isinstance(rj.Spin([0.0, 0.0, 1.0]), HasSpin), isinstance(rj.Inertia(jnp.eye(3)), HasSpin)
+    (True, False)
+    """
 
     @property
     def omega(self) -> Float[Array, "*batch 3"]: ...
@@ -29,7 +34,12 @@ class HasSpin(Protocol):
 
 @runtime_checkable
 class HasAttitude(HasSpin, Protocol):
-    """Whatever turns and knows which way it points: `q` (w, x, y, z), body → world."""
+    """A state with a body rate and an attitude `q` (w, x, y, z), body → world.
+
+    >>> import rigidjax as rj
+    >>> isinstance(rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 1]), HasAttitude)
+    True
+    """
 
     @property
     def q(self) -> Float[Array, "*batch 4"]: ...
@@ -37,7 +47,12 @@ class HasAttitude(HasSpin, Protocol):
 
 @runtime_checkable
 class HasPose(HasAttitude, Protocol):
-    """Whatever turns, points and moves: `x`, `v` of the centre of mass (m, m/s, world frame)."""
+    """A state with a rate, an attitude, and `x`, `v` of the centre of mass (m, m/s, world frame).
+
+    >>> import rigidjax as rj
+    >>> isinstance(rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 1]), HasPose)  # it has no position
+    False
+    """
 
     @property
     def x(self) -> Float[Array, "*batch 3"]: ...

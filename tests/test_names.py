@@ -1,5 +1,6 @@
 """What a user sees with Tab: each public module shows its own names, and nothing that it works with."""
 
+import importlib
 import re
 import subprocess
 import sys
@@ -62,6 +63,33 @@ def test_readme_and_guide_use_what_is_shown():
     text = "\n".join(page.read_text(encoding="utf-8") for page in pages)
     used = set(re.findall(r"\brj\.([a-zA-Z_]\w*)", text))
     assert "body" in used and not used - set(dir(rj)) - {"__version__"}
+
+
+TORQUES = {
+    name: f"motion.torques.base.{name}"
+    for name in ("act", "evaluate", "in_precision", "require_rung")
+}
+RENAMED = {
+    "frames": {"scene_of": "frames.frame_dynamics.scene_of"},
+    "motion.torques": TORQUES,
+    "identify": {"Moment": "identify.SensorInput", "toutatis": "datasets.toutatis"},
+    "identify.sensors": {"Moment": "identify.SensorInput"},
+    "exact": {"FreeInterpolation": "exact.diffrax_solver.FreeInterpolation"},
+    "solve": {"GroupInterpolation": "solve.projection.GroupInterpolation"},
+}
+
+
+@pytest.mark.parametrize(
+    ("module", "old", "new"),
+    [(m, old, new) for m, names in RENAMED.items() for old, new in names.items()],
+)
+def test_an_old_name_gives_the_new_thing_and_says_where_it_is(module, old, new):
+    place, _, name = f"rigidjax.{new}".rpartition(".")
+    thing = getattr(importlib.import_module(place), name)
+    module = importlib.import_module(f"rigidjax.{module}")
+    assert old not in dir(module)
+    with pytest.warns(DeprecationWarning, match=f"{old} is now rigidjax.{new}; the old name will"):
+        assert getattr(module, old) is thing
 
 
 LATER = """

@@ -1,13 +1,12 @@
-"""From one body to a machine to many.
+"""Many bodies: on one device, on several, on several hosts.
 
     rollout     equal steps; last states, thinned states, or reduced on the way
     simulate    closed form, adaptive steps, or `Steps`, with a status for each body
     distributed several processes: `connect`, `share`, `gather`, `total`
 
-One call takes N bodies; `chunk` of them go side by side, so that memory does not grow with N beyond
-what goes in and comes out; `devices="all"` cuts N into shares for the devices of a process, and
-`distributed.share` into shares for processes. Bodies do not see one another: no step sends
-anything.
+One call takes N bodies; `chunk` of them are computed at a time, so that memory beyond the inputs
+and results does not grow with N; `devices="all"` cuts N into shares for the devices of a process,
+and `distributed.share` into shares for processes. Bodies are independent: no step sends anything.
 
 **On a cluster** (a plan; two processes on one machine is what is tested). *Sharded:* bodies,
 starts, recordings, all along their first axis: processes first (`distributed.share`), then the
@@ -16,11 +15,12 @@ fit's loss, gradient and normal equations, once an iteration, by `distributed.to
 numbers; histograms and moments of a large batch by `reduce=` on the way and `distributed.total` at
 the end. States are gathered (`distributed.gather`) only if one process needs them all; else each
 writes its own (`distributed.save`). *To be expected:* a run's time is that of the slowest share.
-Shares are equal in number, so equal steps scale with cores; adaptive steps are dealt between the
-devices of a process by speed, not between processes: shuffle bodies before `share`. An iteration of
-a fit adds one all-reduce of a few kilobytes, against 35 to 55 ms for the gradient of 1000 bodies
-over 1000 steps: with 1000 bodies a process it counts for little. *When one dies* all end within
-`patience`; shares written before the collective are recovered, the others run again.
+Shares are equal in number, so equal steps scale with cores; bodies with adaptive steps are
+distributed over the devices of a process by speed, not over processes: shuffle them before `share`.
+An iteration of a fit adds one all-reduce of a few kilobytes, against 35 to 55 ms for the gradient
+of 1000 bodies over 1000 steps: with 1000 bodies per process it counts for little. *When one process
+ends* all end within `patience`; shares written before the collective are recovered, the others run
+again.
 """
 
 from rigidjax._names import own_names

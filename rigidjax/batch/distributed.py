@@ -1,8 +1,9 @@
-"""Several hosts: each works on its own share of the bodies; only what they found is sent.
+"""Several hosts: each works on its own share of the bodies; only results are sent.
 
-Bodies do not see one another, so a run itself sends nothing, and a process gets for its share what
-one process alone would get, bit for bit. What can fail is the gathering: where a peer has died
-there is nothing to wait for. So a share is written down first, and the run then ends with an error.
+Bodies are independent, so a run itself sends nothing, and a process gets for its share what
+one process alone would get, bit for bit. What can fail is the gathering: where another process has
+ended there is nothing to wait for. So a share is written to disk first, and the run then ends with
+an error.
 """
 
 import os
@@ -27,8 +28,8 @@ def connect(address: str, processes: int, process: int, *, patience: int = PATIE
     """Join the other processes; to be called before anything else of JAX.
 
     **Arguments:** `address` "host:port" of process 0; `processes` how many there are; `process`
-    which of them this is, from 0; `patience` s after which a silent peer counts as dead: every
-    process then ends, with a message and a non-zero exit code.
+    which of them this is, from 0; `patience` s after which a process that does not answer is given
+    up: every process then ends, with a message and a non-zero exit code.
 
     **Raises:** `ValueError` for a number that is none of theirs; `RuntimeError` where JAX is in use
     already or the others do not come.
@@ -83,8 +84,8 @@ def gather(tree: Any, checkpoint: str | os.PathLike[str] | None = None) -> Any:
     folder: the rows are written there first, as `share-3.npz`, for `recover`.
     **Returns** the tree with the rows of all, in host memory.
 
-    **Raises:** `TypeError` for arrays that are traced; `RuntimeError` where a peer has died. The
-    process should end then: what JAX holds is of no use any more.
+    **Raises:** `TypeError` for arrays that are traced; `RuntimeError` where another process has
+    ended. The process should end then: what JAX holds is of no use any more.
 
     >>> gather(jnp.arange(3)).tolist()
     [0, 1, 2]
@@ -151,6 +152,12 @@ def recover(like: Any, folder: str | os.PathLike[str]) -> list[Any]:
 
     **Raises:** `FileNotFoundError` for a folder without shares; `ValueError` for a file that is
     none of `save`'s, is cut short, or holds another number of arrays than `like`.
+
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     _ = save(jnp.arange(2), folder)
+    ...     recover(jnp.zeros(2), folder)[0].tolist()
+    [0, 1]
     """
     folder = _checks.path(folder, "folder")
     paths = sorted(folder.glob("share-*.npz"), key=lambda p: int(p.stem.split("-")[1]))
@@ -203,8 +210,8 @@ def _together(send: Callable[[], Any], checkpoint: Any) -> Any:
             else "give checkpoint= a folder to keep each share"
         )
         raise RuntimeError(
-            f"process {jax.process_index()} of {jax.process_count()}: a peer did not answer, it "
-            f"has most likely died; {kept}; end this process and start all of them again"
+            f"process {jax.process_index()} of {jax.process_count()}: another process did not "
+            f"answer, it has most likely ended; {kept}; end this process and start them all again"
         ) from error
 
 

@@ -95,27 +95,27 @@ def rollout(
 
     **Arguments:**
 
-    - `bodies`: one `Inertia` (3, 3) for all, or one a body (N, 3, 3), kg m², body frame;
+    - `bodies`: one `Inertia` (3, 3) for all, or one per body (N, 3, 3), kg m², body frame;
       `MassProperties` likewise for `Rigid`.
     - `states0`: `Spin`, `Attitude` or `Rigid` whose arrays have a leading axis N, at `t0`.
     - `step_size` s, the same for all; `num_steps` a whole number, part of what is compiled.
     - `torque`: `None`, or any law that `rigidjax.simulate` takes. Its arrays are shared by all
-      bodies unless `torque_axes` is 0 (each array has a leading axis N: make one law a body with
+      bodies unless `torque_axes` is 0 (each array has a leading axis N: make one law per body with
       `jax.vmap`), a function that picks those that have (`lambda law: law.speed`, of a `Sum`
       `lambda law: law.parts[1]`, several in a tuple), or a tree of 0 and `None`, one for each.
-    - `solver`: `None` takes `Magnus4` for a free attitude, or a torque that does not look at the
+    - `solver`: `None` takes `Magnus4` for a free attitude, or a torque that does not depend on the
       attitude, and `rigidjax.solvers.RungeKutta4` for all else. Any of `rigidjax.solvers` that is
       explicit may be given; the steps are those that `diffrax` takes with it, to round-off.
     - `save_every`: `None` returns the last states only; k those after k, 2k, … steps.
     - `reduce`, `initial`: a function `(carried, t, state) → carried` of one body, called after
-      every `save_every` steps (one, by default), and what it begins with. States are not kept then.
-      A function made anew for each call compiles anew: define it once, best as a Module.
+      every `save_every` steps (one, by default), and its first value. States are not kept then.
+      A new function for each call compiles again: define it once, best as a Module.
     - `t0` s, when the first step begins.
     - `inputs`: what drives the law, by the names of its `rigidjax.torques.Input`s: arrays
       (N, num_steps, *k) whose row i is held exactly through step i of that body; those of a
       `rigidjax.torques.Delayed` input come later.
-    - `chunk`: how many bodies go side by side. `None` is what fits the first cache, 128 in float64.
-      Bodies are independent: chunks change results in the last digits at most.
+    - `chunk`: how many bodies are computed at a time. `None` is what fits the first cache, 128 in
+      float64. Bodies are independent: chunks change results in the last digits at most.
     - `devices`: `None` for one, `"all"` of this process, or a sequence of them; N is cut into
       equal shares. Free bodies get the same bits; with a torque whose numbers are shared XLA may
       order products in another way, which is one rounding.
@@ -127,7 +127,7 @@ def rollout(
     Memory: the inputs, what is returned, and a chunk. Derivatives are those of the steps as taken,
     in forward mode and in reverse; reverse mode goes back in pieces of √`num_steps` steps and
     holds one chunk's at a time, five to ten times the time of the value. A body that becomes NaN
-    stays NaN and touches no other.
+    stays NaN and changes no other.
 
     Inside `jax.jit` of your own see `rigidjax.batch.compiler_options`.
 

@@ -1,4 +1,4 @@
-"""The front door for many bodies: closed form, equal steps, or adaptive steps that do not wait."""
+"""The motion of many bodies: closed form, equal steps, or adaptive steps."""
 
 from collections.abc import Sequence
 from typing import Any, Generic, NamedTuple, TypeVar
@@ -48,8 +48,15 @@ class Batch(eqx.Module, Generic[State]):
     **Fields:** `ts` (T,) s; `ys` the states there, of the type of `states0`, with leading axes
     (N, T), in the order that the bodies were given; NaN where a body did not get to. `result` a
     `diffrax.RESULTS` for each body: `successful`, `nonfinite`, `max_steps_reached`,
-    `dt_min_reached`. `num_steps` (N,) taken and refused, 0 for the closed form. `own` a tuple
+    `dt_min_reached`. `num_steps` (N,) accepted and rejected, 0 for the closed form. `own` a tuple
     of the states of the laws that have some, as `ys`, or `None`.
+
+    >>> import rigidjax as rj
+    >>> bodies = rj.Inertia(jnp.diag(jnp.array([1.0, 2.0, 3.0])))
+    >>> states = rj.Attitude(jnp.tile(jnp.eye(4)[0], (5, 1)), jnp.tile(jnp.eye(3)[2], (5, 1)))
+    >>> found = rj.batch.simulate(bodies, states, [0.0, 1.0])
+    >>> found.ys.q.shape, found.num_steps.tolist()
+    ((5, 2, 4), [0, 0, 0, 0, 0])
     """
 
     ts: Float[Array, " times"]
@@ -89,12 +96,12 @@ def simulate(
       1e-9 take a seventh of the time that `jax.vmap` of plain `diffrax.Dopri8` takes).
     - `rtol`, `atol`, `max_steps`, `adjoint`: as for `rigidjax.simulate`.
 
-    Adaptive steps of bodies side by side go on until the slowest has arrived. So bodies are put in
-    the order of how fast they turn at the start, and only those of a chunk wait for each other. A
+    Bodies that are computed together take steps until the last of them has arrived. So bodies are
+    ordered by how fast they turn at the start, and only those of a chunk wait for each other. A
     body that becomes NaN ends within two steps. Whatever happens to a body, the others get the same
     bits.
 
-    **Returns** a `Batch`. Nothing is raised for what a body meets on its way: look at `result`.
+    **Returns** a `Batch`. Nothing is raised for what happens during a run: look at `result`.
 
     **Raises:** as `rollout`; `ValueError` for times that neither increase nor decrease.
 

@@ -1,4 +1,4 @@
-"""What is turned: inertia, mass, second moments, shapes, and numbers that are always a body."""
+"""Bodies: inertia, mass, second moments, shapes, charts by unconstrained numbers."""
 
 from rigidjax._names import own_names
 from rigidjax.body import (
@@ -7,7 +7,7 @@ from rigidjax.body import (
     shapes as shapes,
     volumes as volumes,
 )
-from rigidjax.body.axes import principal as principal
+from rigidjax.body.divergence import divergence as divergence
 from rigidjax.body.ellipsoids import (
     energy_ellipsoid as energy_ellipsoid,
     equal_ellipsoid as equal_ellipsoid,
@@ -27,7 +27,7 @@ from rigidjax.body.inertials import (
     read_inertials as read_inertials,
     write_inertials as write_inertials,
 )
-from rigidjax.body.prior import divergence as divergence
-from rigidjax.body.spectral import matrix_function as matrix_function
+from rigidjax.body.matrix_functions import matrix_function as matrix_function
+from rigidjax.body.principal_axes import principal as principal
 
 __dir__ = own_names(__name__)

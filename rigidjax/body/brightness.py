@@ -11,8 +11,8 @@ from jaxtyping import ArrayLike, Float, Int
 from rigidjax import _checks
 from rigidjax._names import own_names
 from rigidjax._types import Scalar
-from rigidjax.body import physical
-from rigidjax.body.hints import Numbers, Vector
+from rigidjax.body import validation
+from rigidjax.body._types import Numbers, Vector
 from rigidjax.body.meshes import faces_of
 from rigidjax.body.scattering import (
     AbstractScattering as AbstractScattering,
@@ -77,7 +77,7 @@ def mesh(
     """
     law = law_of(scattering)
     corners = _checks.rows(vertices, (3,), "vertices", hint="one row (x, y, z) per vertex")
-    if physical.known(corners):
+    if validation.known(corners):
         _checks.finite(corners, "vertices")
     table = faces_of(faces, corners.shape[0])
     s, o = (

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 
 from rigidjax import _checks
 from rigidjax._types import Quat, Scalar, ScalarLike, Vec3
-from rigidjax.body.axes import principal
 from rigidjax.body.inertia import Inertia, MassProperties
+from rigidjax.body.principal_axes import principal
 
 
 def energy_ellipsoid(inertia: Inertia, energy: ScalarLike) -> tuple[Vec3, Quat]:

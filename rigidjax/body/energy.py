@@ -14,11 +14,11 @@ from rigidjax._types import (
     Scalar,
     Vec3,
 )
-from rigidjax.body.hints import Matrix, Quaternion, Vector
+from rigidjax.body._types import Matrix, Quaternion, Vector
 from rigidjax.body.inertia import Inertia, MassProperties
-from rigidjax.body.physical import unit_quaternion
+from rigidjax.body.validation import unit_quaternion
 from rigidjax.rotation import quaternion
-from rigidjax.rotation.algebra import apply, cross, dot, product
+from rigidjax.rotation.linalg3 import apply, cross, dot, product
 
 
 def kinetic_energy(body: Inertia | MassProperties, state: HasSpin | Vector) -> Scalar:

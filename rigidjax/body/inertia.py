@@ -11,10 +11,10 @@ from jaxtyping import Array, Float
 
 from rigidjax import _checks
 from rigidjax._types import Mat3, Quat, ScalarLike, Vec3
-from rigidjax.body import physical
-from rigidjax.body.axes import eigensystem, principal
-from rigidjax.body.hints import Matrices, Matrix, Quaternion, Scalars, Vector, Vectors
-from rigidjax.body.symmetric import (
+from rigidjax.body import validation
+from rigidjax.body._types import Matrices, Matrix, Quaternion, Scalars, Vector, Vectors
+from rigidjax.body.principal_axes import eigensystem, principal
+from rigidjax.body.symmetric3 import (
     apply as apply,
     inverse as inverse,
     outer,
@@ -60,7 +60,7 @@ class Inertia(eqx.Module):
         (3, 3)
         """
         a = _checks.floating(tensor, (3, 3), "inertia tensor")
-        return Inertia(physical.real_inertia(a))
+        return Inertia(validation.real_inertia(a))
 
     @staticmethod
     def from_principal(i1: ScalarLike, i2: ScalarLike, i3: ScalarLike) -> "Inertia":
@@ -75,7 +75,7 @@ class Inertia(eqx.Module):
         """
         moments = [_checks.floating(i, (), f"i{k + 1}") for k, i in enumerate((i1, i2, i3))]
         moments = jnp.stack([m.astype(jnp.result_type(*moments)) for m in moments])
-        return Inertia(jnp.diag(physical.real_moments(moments)))
+        return Inertia(jnp.diag(validation.real_moments(moments)))
 
     @staticmethod
     def from_second_moment(second_moment: Matrix) -> "Inertia":
@@ -92,7 +92,7 @@ class Inertia(eqx.Module):
         Array([1., 2., 3.], dtype=float64)
         """
         s = _checks.floating(second_moment, (3, 3), "second moment")
-        return Inertia(swap_trace(physical.real_second_moment(s)))
+        return Inertia(swap_trace(validation.real_second_moment(s)))
 
     @property
     def second_moment(self) -> Float[Array, "*batch 3 3"]:
@@ -113,7 +113,7 @@ class Inertia(eqx.Module):
 
         **Returns** `(moments, q)`, (3,) kg m² and (4,), with `I = R(q) diag(moments) R(q)ᵀ`.
         Derivatives are finite for any body, also at equal moments: see
-        `rigidjax.body.axes.principal` for what they mean there.
+        `rigidjax.body.principal_axes.principal` for what they mean there.
 
         >>> Inertia.from_principal(3.0, 2.0, 2.5).principal()[0]
         Array([2. , 2.5, 3. ], dtype=float64)
@@ -143,7 +143,7 @@ class Inertia(eqx.Module):
         >>> Inertia.from_principal(1.0, 2.0, 2.5).rotated([half, 0, 0, half]).tensor[0, 0]
         Array(2., dtype=float64)
         """
-        m = quaternion.to_matrix(physical.unit_quaternion(q))
+        m = quaternion.to_matrix(validation.unit_quaternion(q))
         return Inertia(product(m, product(self.tensor, m.T)))
 
     def invertible(self) -> "Inertia":
@@ -154,7 +154,7 @@ class Inertia(eqx.Module):
         >>> Inertia.from_principal(1.0, 2.0, 2.5).invertible().moments
         Array([1. , 2. , 2.5], dtype=float64)
         """
-        return physical.nonzero_moments(self, self.tensor)
+        return validation.nonzero_moments(self, self.tensor)
 
     def __add__(self, other: "Inertia") -> "Inertia":
         """Two bodies turning as one about the same point, in the same axes."""
@@ -196,10 +196,10 @@ class MassProperties(eqx.Module):
         second_moment = _checks.floating(second_moment, (3, 3), "second_moment", batched=True)
         _checks.same_batch(mass=(mass, 0), com=(com, 1), second_moment=(second_moment, 2))
         dtype = jnp.result_type(mass, com, second_moment)
-        self.mass = physical.if_known(physical.real_mass, mass.astype(dtype))
-        self.com = physical.if_known(physical.real_place, com.astype(dtype))
-        self.second_moment = physical.if_known(
-            physical.real_second_moment, second_moment.astype(dtype)
+        self.mass = validation.if_known(validation.real_mass, mass.astype(dtype))
+        self.com = validation.if_known(validation.real_place, com.astype(dtype))
+        self.second_moment = validation.if_known(
+            validation.real_second_moment, second_moment.astype(dtype)
         )
 
     @property
@@ -216,9 +216,9 @@ class MassProperties(eqx.Module):
         Array(1., dtype=float64)
         """
         return MassProperties(
-            physical.real_mass(self.mass),
-            physical.real_place(self.com),
-            physical.real_second_moment(self.second_moment),
+            validation.real_mass(self.mass),
+            validation.real_place(self.com),
+            validation.real_second_moment(self.second_moment),
         )
 
     def invertible(self) -> "MassProperties":
@@ -229,7 +229,7 @@ class MassProperties(eqx.Module):
         >>> MassProperties(1.0, [0.0, 0, 0], [[1.0, 0, 0], [0, 1, 0], [0, 0, 1]]).invertible().mass
         Array(1., dtype=float64)
         """
-        return physical.nonzero_moments(self, self.inertia.tensor)
+        return validation.nonzero_moments(self, self.inertia.tensor)
 
     def second_moment_about(self, point: Vector) -> Mat3:
         """𝔖 about another point: `𝔖 + m d dᵀ`, `d = c − point`.
@@ -275,7 +275,7 @@ class MassProperties(eqx.Module):
         >>> body.rotated([0.0, 0, 0, 1]).com
         Array([-1.,  0.,  0.], dtype=float64)
         """
-        m = quaternion.to_matrix(physical.unit_quaternion(q))
+        m = quaternion.to_matrix(validation.unit_quaternion(q))
         return MassProperties(
             self.mass, apply(m, self.com), product(m, product(self.second_moment, m.T))
         )

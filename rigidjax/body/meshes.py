@@ -17,10 +17,10 @@ from jaxtyping import ArrayLike, Float, Int
 
 from rigidjax import _checks
 from rigidjax._types import ScalarLike
-from rigidjax.body import physical
-from rigidjax.body.hints import Numbers
+from rigidjax.body import validation
+from rigidjax.body._types import Numbers
 from rigidjax.body.inertia import MassProperties
-from rigidjax.body.symmetric import from_components
+from rigidjax.body.symmetric3 import from_components
 
 
 def mesh(
@@ -49,11 +49,11 @@ def mesh(
     n = corners.shape[0]
     if n == 0:
         raise ValueError("vertices: wanted some, got none")
-    if physical.known(corners):
+    if validation.known(corners):
         _checks.finite(corners, "vertices")
     faces = faces_of(faces, n)
     density = _checks.floating(density, (), "density")
-    if physical.known(density):
+    if validation.known(density):
         fine = (density > 0) & jnp.isfinite(density)
         _checks.refuse(density, ~fine, f"density: wanted a positive number, kg/m³, got {density}")
 
@@ -76,6 +76,15 @@ def mesh_file(
     STL files are in millimetres: 1e-3).
 
     **Raises:** `FileNotFoundError`; `ImportError` without trimesh; otherwise as `mesh`.
+
+    >>> import tempfile
+    >>> corner = "v 0 0 0;v 1 0 0;v 0 1 0;v 0 0 1;f 1 3 2;f 1 2 4;f 1 4 3;f 2 3 4"
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = folder + "/corner.obj"
+    ...     with open(path, "w") as file:
+    ...         print(*corner.split(";"), sep=chr(10), file=file)
+    ...     round(float(mesh_file(path, density=6.0).mass), 12)
+    1.0
     """
     path = os.fspath(path)
     if not os.path.isfile(path):
@@ -128,7 +137,7 @@ def _outward(volume, corners, faces):
     longest = jnp.ptp(corners, axis=0).max()
     area = 0.5 * jnp.sqrt((jnp.cross(b - a, c - a) ** 2).sum(axis=1)).sum()
     slack = 4.0 * jnp.finfo(corners.dtype).eps * jax.lax.stop_gradient(longest) * area
-    found = f" (volume {float(volume):.6g} m³)" if physical.known(volume) else ""
+    found = f" (volume {float(volume):.6g} m³)" if validation.known(volume) else ""
     volume = _checks.refuse(
         volume,
         volume < -slack,

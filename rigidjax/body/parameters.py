@@ -15,10 +15,10 @@ from jaxtyping import Array, ArrayLike, Float
 from rigidjax import _checks
 from rigidjax._names import own_names
 from rigidjax._types import Mat3, Vec3
-from rigidjax.body.hints import Matrix, Numbers, Vector
+from rigidjax.body._types import Matrix, Numbers, Vector
 from rigidjax.body.inertia import MassProperties
-from rigidjax.body.physical import real_moments
-from rigidjax.body.symmetric import from_components
+from rigidjax.body.symmetric3 import from_components
+from rigidjax.body.validation import real_moments
 
 
 def pack(body: MassProperties) -> Float[Array, "10"]:

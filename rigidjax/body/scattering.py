@@ -15,8 +15,8 @@ from jaxtyping import Array, Float
 
 from rigidjax import _checks
 from rigidjax._types import Mat3, Scalar, Vec3, Vec3Like
-from rigidjax.body.hints import Numbers
-from rigidjax.rotation.algebra import cross, dot, entries
+from rigidjax.body._types import Numbers
+from rigidjax.rotation.linalg3 import cross, dot, entries
 from rigidjax.special.scaling import exponent_of, times_power_of_two
 
 # Below it the function of Lommel and Seeliger's law is a series, of so many terms.
@@ -26,7 +26,16 @@ _ACROSS, _ALONG = 12, 24
 
 
 class AbstractScattering(eqx.Module):
-    """A law of scattering: what a piece of surface sends, and a whole ellipsoid."""
+    """A law of scattering: what a piece of surface sends, and a whole ellipsoid.
+
+    >>> class Flat(AbstractScattering):  # all that is lit and seen is equally bright
+    ...     def per_area(self, incidence, emission):
+    ...         return emission
+    ...     def of_ellipsoid(self, shape, sun, observer):
+    ...         return Geometric().of_ellipsoid(shape, sun, observer)
+    >>> float(Flat().per_area(jnp.asarray(0.5), jnp.asarray(0.25)))
+    0.25
+    """
 
     @abc.abstractmethod
     def per_area(

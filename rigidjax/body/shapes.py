@@ -15,15 +15,15 @@ from jaxtyping import ArrayLike, Float
 from rigidjax import _checks
 from rigidjax._names import own_names
 from rigidjax._types import ScalarLike
-from rigidjax.body import physical
-from rigidjax.body.clouds import (
+from rigidjax.body import validation
+from rigidjax.body._types import Numbers, Vector
+from rigidjax.body.inertia import MassProperties
+from rigidjax.body.meshes import mesh as mesh, mesh_file as mesh_file
+from rigidjax.body.point_masses import (
     points as points,
     quadrature as quadrature,
     voxels as voxels,
 )
-from rigidjax.body.hints import Numbers, Vector
-from rigidjax.body.inertia import MassProperties
-from rigidjax.body.meshes import mesh as mesh, mesh_file as mesh_file
 
 
 def box(mass: ScalarLike, size: Vector) -> MassProperties:
@@ -200,7 +200,7 @@ def plate(mass: ScalarLike, size: Float[ArrayLike, "2"] | Numbers) -> MassProper
 
 def _lengths(value, shape, name):
     lengths = _checks.floating(value, shape, name)
-    if physical.known(lengths):
+    if validation.known(lengths):
         _checks.finite(lengths, name)
         _checks.refuse(
             lengths, (lengths < 0).any(), f"{name}: wanted lengths ≥ 0 (m), got {lengths}"
@@ -210,7 +210,7 @@ def _lengths(value, shape, name):
 
 def _nested(inner, outer, names=("inner", "outer")):
     r, R = _lengths(inner, (), names[0]), _lengths(outer, (), names[1])
-    if physical.known(r) and physical.known(R):
+    if validation.known(r) and validation.known(R):
         _checks.refuse(r, r > R, f"{names[0]}: wanted {names[0]} ≤ {names[1]}, got {r} and {R} (m)")
     return r, R
 

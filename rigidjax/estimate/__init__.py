@@ -1,4 +1,4 @@
-"""Unknown torques: what a recording says of a motion that nobody can predict.
+"""Unknown torques: the motion, the torques and the body from a recording.
 
 `filter`, `step` and `smooth` give states, torques and sensor errors with their deviations;
 `log_likelihood` what readings say of anything else, the unknown torques integrated out; `sample` a

@@ -12,9 +12,9 @@ from rigidjax import _checks
 from rigidjax._types import HasAttitude, HasPose, HasSpin
 from rigidjax.estimate.scene import Extended, Model, not_negative
 from rigidjax.estimate.sensing import sensors_of
+from rigidjax.identify.direct_estimates import attitudes
 from rigidjax.identify.recording import Recording
-from rigidjax.identify.reference import first_rate
-from rigidjax.identify.sightings import attitudes
+from rigidjax.identify.reference_states import first_rate
 from rigidjax.motion import Attitude, Spin, on_the_group
 
 
@@ -25,6 +25,13 @@ class Belief(eqx.Module):
     `Spin` the errors of Ω; for an `Attitude` δθ (body frame, rad) and Ω; for a `Rigid` x, v, δθ, Ω;
     then 3 for each `CorrelatedTorque`, then the walks. After `filter` all with a leading time axis.
     `start` makes the first one.
+
+    >>> import rigidjax as rj
+    >>> record = rj.identify.Recording([0.0, 1.0], (rj.identify.Gyro(0.1), [[1.0, 0, 0]] * 2))
+    >>> model = Model(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.torques.RandomTorque(1e-4))
+    >>> first = start(model, record, rate=0.1)
+    >>> float(first.t), first.root.shape
+    (0.0, (3, 3))
     """
 
     t: Float[Array, "*times"]
@@ -70,7 +77,7 @@ def start(
     """What is known before the first reading.
 
     **Arguments:** `model`; `recording`, whose first time it is of and whose sensors the walks start
-    from; `state` a `Spin`, `Attitude` or `Rigid`: the rung that is followed; `None` reads a first
+    from; `state` a `Spin`, `Attitude` or `Rigid`: the kind that is followed; `None` reads a first
     attitude and rate off the recording (`Spin` where nothing shows an attitude). Then standard
     deviations, one number or three, zero for what is known: `rate` of Ω, rad/s; `attitude` rad;
     `position` m and `velocity` m/s of a `Rigid`. Torques start from their law's own distribution.

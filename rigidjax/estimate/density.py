@@ -23,7 +23,7 @@ from rigidjax.identify.jacobian import all_errors, filled, first_state, over_rec
 from rigidjax.identify.parameters import Parameters, local
 from rigidjax.identify.problem import Problem
 from rigidjax.identify.residual import beside, whitened
-from rigidjax.identify.several import matter
+from rigidjax.identify.several_bodies import matter
 from rigidjax.motion import Rigid
 from rigidjax.motion.torques import CorrelatedTorque, RandomTorque, Sum
 
@@ -34,6 +34,15 @@ class Point(eqx.Module):
     **Fields:** `parameters` of the problem, `body` and `state0` as `Problem.unpack` gives them,
     `values` of the `Free`s by name, `noise` (R, k) of each sensor, `process` the random torque or
     `None`.
+
+    >>> import rigidjax as rj
+    >>> ts = jnp.linspace(0.0, 10.0, 80)
+    >>> motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1, 0.1, 1.0]), ts)
+    >>> record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), motion.ys.omega))
+    >>> found = rj.identify.fit(rj.identify.Problem(record, rj.identify.PrincipalRatios()))
+    >>> density = LogDensity(found)
+    >>> bool(jnp.allclose(density.unpack(density.x0).state0.omega, jnp.array([1.0, 0.1, 1.0])))
+    True
     """
 
     parameters: Parameters
@@ -61,11 +70,20 @@ class LogDensity(eqx.Module):
     given, `None` for a process that is known.
 
     **Raises:** `TypeError` for arguments of another kind; `ValueError` for a robust loss, which is
-    no density, and for directions that neither data nor a prior see.
+    no density, and for directions that neither data nor a prior determine.
 
     For numpyro: `numpyro.infer.MCMC(NUTS(potential_fn=lambda x: -density(x)), …)`; for blackjax:
     `blackjax.nuts(density, …)`, or `estimate.posterior`. Gradients are taken in forward mode. It is
     a Module of arrays: compile it by `equinox.filter_jit(density)`.
+
+    >>> import rigidjax as rj
+    >>> ts = jnp.linspace(0.0, 10.0, 80)
+    >>> motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1, 0.1, 1.0]), ts)
+    >>> record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), motion.ys.omega))
+    >>> found = rj.identify.fit(rj.identify.Problem(record, rj.identify.PrincipalRatios()))
+    >>> density = LogDensity(found)
+    >>> density.size, bool(density(density.x0) > density(density.x0 + 0.1))
+    (5, True)
     """
 
     problem: Problem
@@ -92,8 +110,8 @@ class LogDensity(eqx.Module):
             raise ValueError("fit: its problem has a robust loss, which is no density; fit without")
         if not np.isfinite(np.asarray(fit.covariance)).all():
             raise ValueError(
-                "fit: neither the data nor a prior see some direction (see fit.identifiability), "
-                "so that there is no posterior; give a prior or fewer free numbers"
+                "fit: neither the data nor a prior determine some direction (see "
+                "fit.identifiability), so there is no posterior; give a prior or fewer free numbers"
             )
         self.problem, self.process, self.noises = problem, process, fit.noises
         spread = None if process is None or deviation is None else deviation

@@ -24,7 +24,7 @@ LOST_AFTER, LOST_READINGS, LOST_BEYOND = 1.0, 3, 6.0
 WORDS = (
     "followed",
     "lost: for more than a second no reading was within six deviations of what was expected",
-    "broken off: an estimate is NaN or infinite",
+    "stopped: an estimate is NaN or infinite",
 )
 
 
@@ -33,8 +33,16 @@ class Filtered(eqx.Module):
 
     **Fields:** `belief` a `Belief` at each time of the recording, after its readings; `readings`,
     for each sensor, a `Read`: `innovation`, `variance` and `seen`, (T, k); `log_likelihood` of all
-    readings; `status` 0 followed, 1 lost, 2 broken off (`words` says it); `lost_at` s, NaN unless
+    readings; `status` 0 followed, 1 lost, 2 stopped (`words` says it); `lost_at` s, NaN unless
     lost.
+
+    >>> import rigidjax as rj
+    >>> from rigidjax import estimate
+    >>> record = rj.identify.Recording([0.0, 0.1], (rj.identify.Gyro(0.1), [[1.0, 0, 0]] * 2))
+    >>> model = estimate.Model(rj.Inertia.from_principal(1.0, 2.0, 2.5))
+    >>> found = estimate.filter(model, record, estimate.start(model, record, rate=1.0))
+    >>> found.readings[0].innovation.shape, int(found.status)
+    ((2, 3), 0)
     """
 
     belief: Belief
@@ -115,7 +123,7 @@ def filter(
 
 
 def told(out: Any) -> Any:
-    """The same, unless it is lost or broken off: then raise in words."""
+    """The same, unless it is lost or stopped: then raise in words."""
     status = out.status
     at = f" (at {float(out.lost_at):g} s)" if _checks.known(out.lost_at) else ""
     advice = "; is the noise or density too small, or the start far off? throw=False returns it"

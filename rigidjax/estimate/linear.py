@@ -91,6 +91,11 @@ class LinearEstimate(eqx.Module):
     **Fields:** also `innovation`, `variance` (T, k) of each number read given those before it, and
     `log_likelihood` of all; of a smoother `kicks` (T − 1, m), the means of the noise u, and
     `kick_covariance` (T − 1, m, m), else `None`.
+
+    >>> walk = LinearModel(jnp.eye(1), 0.1 * jnp.eye(1), jnp.eye(1), jnp.ones(1))
+    >>> found = linear_filter(walk, jnp.ones((3, 1)), jnp.zeros(1), jnp.eye(1))
+    >>> found.mean.shape, found.root.shape, found.innovation[0].tolist()
+    ((3, 1), (3, 1, 1), [1.0])
     """
 
     mean: Float[Array, "times n"]

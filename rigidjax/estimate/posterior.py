@@ -55,6 +55,16 @@ class Posterior(eqx.Module):
 
     **Fields:** `density`; `x` (chains, samples, n) draws of the vector that it takes. `rhat` and
     `ess` as in Gelman et al., Bayesian Data Analysis (2013), §11.4, 11.5.
+
+    >>> import jax, rigidjax as rj
+    >>> ts = jnp.linspace(0.0, 10.0, 80)
+    >>> motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1, 0.1, 1.0]), ts)
+    >>> record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), motion.ys.omega))
+    >>> found = rj.identify.fit(rj.identify.Problem(record, rj.identify.PrincipalRatios()))
+    >>> density = rj.estimate.LogDensity(found)
+    >>> draws = density.x0 + 0.01 * jax.random.normal(jax.random.key(0), (4, 200, density.size))
+    >>> bool((Posterior(density, draws).rhat < 1.05).all())  # four chains that agree
+    True
     """
 
     density: LogDensity
@@ -110,8 +120,16 @@ def posterior(
 
     **Raises:** `TypeError` for arguments of another kind, `ImportError` where blackjax is missing.
 
-    >>> posterior.__name__
-    'posterior'
+    >>> import jax, rigidjax as rj
+    >>> ts = jnp.linspace(0.0, 10.0, 80)
+    >>> motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1, 0.1, 1.0]), ts)
+    >>> record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), motion.ys.omega))
+    >>> found = rj.identify.fit(rj.identify.Problem(record, rj.identify.PrincipalRatios()))
+    >>> density = rj.estimate.LogDensity(found)
+    >>> # Instead of Nuts(), a sampler of one's own: normal draws, which is Laplace's method.
+    >>> normal = lambda key, log_density, start: jax.random.normal(key, (200, start.size))
+    >>> posterior(density, jax.random.key(0), sampler=normal).x.shape
+    (4, 200, 5)
     """
     _checks.instance(density, LogDensity, "density", hint="estimate.LogDensity(fit) makes one")
     _checks.key(key)

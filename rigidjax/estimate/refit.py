@@ -25,6 +25,16 @@ class Refit(eqx.Module):
 
     **Fields:** `density`; `x` (n,) where it is largest, `log_density` there; `covariance` (n, n) of
     x by the curvature there; `converged`.
+
+    >>> import rigidjax as rj
+    >>> ts = jnp.linspace(0.0, 10.0, 80)
+    >>> motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1, 0.1, 1.0]), ts)
+    >>> record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), motion.ys.omega))
+    >>> found = rj.identify.fit(rj.identify.Problem(record, rj.identify.PrincipalRatios()))
+    >>> best = refit(rj.estimate.LogDensity(found))
+    >>> low, high = best.interval_of(lambda point: point.state0.omega)
+    >>> bool((low < high).all())
+    True
     """
 
     density: LogDensity
@@ -74,8 +84,14 @@ def refit(density: LogDensity, *, max_steps: int = 200) -> Refit:
 
     **Raises:** `TypeError` for another kind of thing.
 
-    >>> refit.__name__
-    'refit'
+    >>> import rigidjax as rj
+    >>> ts = jnp.linspace(0.0, 10.0, 80)
+    >>> motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1, 0.1, 1.0]), ts)
+    >>> record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), motion.ys.omega))
+    >>> found = rj.identify.fit(rj.identify.Problem(record, rj.identify.PrincipalRatios()))
+    >>> best = refit(rj.estimate.LogDensity(found))
+    >>> bool(jnp.allclose(best.point.state0.omega, jnp.array([1.0, 0.1, 1.0]), atol=1e-3))
+    True
     """
     _checks.instance(density, LogDensity, "density", hint="estimate.LogDensity(fit) makes one")
     steps = _checks.whole(max_steps, "max_steps", 1)

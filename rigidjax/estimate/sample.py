@@ -21,6 +21,14 @@ class Sampled(eqx.Module):
 
     **Fields:** `t` (T,) s; `states` with a leading time axis; `torques` the value (T, 3) of each
     `CorrelatedTorque`, N m, body frame.
+
+    >>> import jax, rigidjax as rj
+    >>> from rigidjax import estimate
+    >>> body = rj.Inertia.from_principal(1.0, 2.0, 2.5)
+    >>> model = estimate.Model(body, rj.torques.RandomTorque(0.01))
+    >>> drawn = sample(jax.random.key(0), model, rj.Spin([0.0, 0.0, 1.0]), [0.0, 0.5, 1.0])
+    >>> drawn.t.shape, drawn.torques  # white noise has no value at a time
+    ((3,), ())
     """
 
     t: Float[Array, " times"]

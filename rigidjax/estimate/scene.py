@@ -12,10 +12,10 @@ from rigidjax import _checks
 from rigidjax._types import HasAttitude, HasPose, Mat3, Scalar
 from rigidjax.body.inertia import Inertia, MassProperties, inverse
 from rigidjax.motion import Rigid
-from rigidjax.motion.torques import CorrelatedTorque, RandomTorque, Sum, Torque, in_precision
-from rigidjax.motion.torques.base import require_law, tensor_of
+from rigidjax.motion.torques import CorrelatedTorque, RandomTorque, Sum, Torque
+from rigidjax.motion.torques.base import in_precision, require_law, tensor_of
 from rigidjax.rotation import quaternion
-from rigidjax.rotation.maps import normalised
+from rigidjax.rotation.kernels import normalised
 from rigidjax.solve import equations_of_motion
 
 
@@ -106,7 +106,7 @@ class Extended(eqx.Module):
 
 
 class Dynamics(eqx.Module):
-    """A model made ready for one dtype and one rung: what does not change is worked out once."""
+    """A model for one dtype and one kind of state: what does not change is computed once."""
 
     field: Callable[..., Any]
     inverse: Mat3

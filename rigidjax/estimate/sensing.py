@@ -14,11 +14,11 @@ from rigidjax._types import Mat3, Scalar
 from rigidjax.body.inertia import MassProperties
 from rigidjax.estimate import roots
 from rigidjax.estimate.scene import Dynamics, Extended, Model, size_of, tangent_of
-from rigidjax.identify.propagate import shifted
+from rigidjax.identify.propagation import shifted
 from rigidjax.identify.recording import Reading, Recording
-from rigidjax.identify.sensors import AbstractSensor, Moment
+from rigidjax.identify.sensors import AbstractSensor, SensorInput
 from rigidjax.motion import Rigid
-from rigidjax.motion.torques import in_precision
+from rigidjax.motion.torques.base import in_precision
 
 
 class Row(NamedTuple):
@@ -145,7 +145,7 @@ def rows(
             offset = getattr(seeing, "offset", None)
             if offset is not None:
                 motion, when = shifted(field, t, motion, offset), t + offset
-            return seeing.error(Moment(when, motion, body, field), value)
+            return seeing.error(SensorInput(when, motion, body, field), value)
 
         found, push = jax.linearize(error, x)
         matrix = -jax.vmap(push, out_axes=1)(basis)

@@ -33,6 +33,15 @@ class Push(NamedTuple):
 
     **Fields:** `mean`, `deviation` (N, 3) N m, body frame; wide where steps are short, for white
     noise has no value at a time.
+
+    >>> import rigidjax as rj
+    >>> from rigidjax import estimate
+    >>> record = rj.identify.Recording([0.0, 0.1], (rj.identify.Gyro(0.1), [[1.0, 0, 0]] * 2))
+    >>> body = rj.Inertia.from_principal(1.0, 2.0, 2.5)
+    >>> model = estimate.Model(body, rj.torques.RandomTorque(1.0))
+    >>> found = estimate.smooth(model, record, estimate.start(model, record, rate=1.0))
+    >>> found.pushes[0].mean.shape, bool((found.pushes[0].deviation > 0).all())
+    ((3, 3), True)
     """
 
     mean: Float[Array, "stops 3"]
@@ -48,6 +57,15 @@ class Smoothed(eqx.Module):
     sensor, of the last linearisation, (N, k); `log_likelihood` of all readings, by Laplace's method
     about this motion; `change` how far the last iteration moved it, in standard deviations at most;
     `iterations`; `status`, `lost_at` as of `Filtered`.
+
+    >>> import rigidjax as rj
+    >>> from rigidjax import estimate
+    >>> record = rj.identify.Recording([0.0, 0.1], (rj.identify.Gyro(0.1), [[1.0, 0, 0]] * 2))
+    >>> body = rj.Inertia.from_principal(1.0, 2.0, 2.5)
+    >>> model = estimate.Model(body, rj.torques.RandomTorque(1.0))
+    >>> found = estimate.smooth(model, record, estimate.start(model, record, rate=1.0))
+    >>> found.words, found.rows.tolist()  # of three stops the first and last are readings
+    ('followed', [0, 2])
     """
 
     belief: Belief

@@ -1,14 +1,14 @@
-"""Answers without a solver."""
+"""Motions in closed form, without a solver."""
 
-from rigidjax._names import own_names
-from rigidjax.exact.diffrax_solver import (
-    FreeInterpolation as FreeInterpolation,
-    FreeSolver as FreeSolver,
-)
+from rigidjax._names import own_names, renamed
+from rigidjax.exact.diffrax_solver import FreeSolver as FreeSolver
 from rigidjax.exact.free_body import FreeBody as FreeBody, free_body as free_body
 from rigidjax.exact.periods import (
     body_period as body_period,
     precession_period as precession_period,
 )
 
+__getattr__ = renamed(
+    __name__, {"FreeInterpolation": "rigidjax.exact.diffrax_solver.FreeInterpolation"}
+)
 __dir__ = own_names(__name__)

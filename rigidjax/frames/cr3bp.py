@@ -8,15 +8,16 @@ from jaxtyping import Array, ArrayLike, Complex, Float
 
 from rigidjax import _checks
 from rigidjax._types import Mat3, Scalar, ScalarLike, Vec3
-from rigidjax.body.hints import Vector
-from rigidjax.frames import flow, lagrange, richardson
-from rigidjax.frames.mirrored import AbstractMirrored
-from rigidjax.frames.periodic import PeriodicOrbit
+from rigidjax.body._types import Vector
+from rigidjax.frames import lagrange_points, richardson
+from rigidjax.frames.differential_correction import PeriodicOrbit
 from rigidjax.frames.point import Point, require_point
-from rigidjax.rotation.algebra import components
+from rigidjax.frames.reversible_scene import AbstractReversible
+from rigidjax.frames.state_transition import smallest_distance
+from rigidjax.rotation.linalg3 import components
 
 
-class ThreeBody(AbstractMirrored):
+class ThreeBody(AbstractReversible):
     """A particle under two bodies that circle each other: make one with `scenes.cr3bp(mu)`.
 
     Rotating axes, origin at the common centre of mass, the first body (mass 1 − μ) at (−μ, 0, 0),
@@ -24,6 +25,10 @@ class ThreeBody(AbstractMirrored):
     angular rate); a period of theirs is 2π.
 
     **Fields:** `mu` μ, scalar; `radii` (2,) of the bodies, at which a particle has collided.
+
+    >>> scene = cr3bp(0.5)
+    >>> [float(r) for r in scene.distances(jnp.array([0.0, 0.0, 0.0]))]
+    [0.5, 0.5]
     """
 
     mu: Scalar
@@ -117,12 +122,12 @@ class ThreeBody(AbstractMirrored):
         """Distances from the two bodies, and those at which a run ends, named as a collision."""
         first, second = self.distances(state.x)
         gaps = jnp.stack([first, second])
-        return gaps, jnp.maximum(self.radii.astype(gaps.dtype), flow.smallest_distance(gaps.dtype))
+        return gaps, jnp.maximum(self.radii.astype(gaps.dtype), smallest_distance(gaps.dtype))
 
     @property
     def lagrange_points(self) -> Float[Array, "5 3"]:
-        """L1 … L5 (5, 3): see `rigidjax.frames.lagrange.points`."""
-        return lagrange.points(self.mu)
+        """L1 … L5 (5, 3): see `rigidjax.frames.lagrange_points.points`."""
+        return lagrange_points.points(self.mu)
 
     def hessian(self, x: Vector) -> Mat3:
         """The second derivatives of U (3, 3) at a place."""

@@ -4,9 +4,9 @@ import jax.numpy as jnp
 
 from rigidjax import _checks
 from rigidjax._types import Scalar, ScalarLike, Vec3
+from rigidjax.frames.base import AbstractScene
 from rigidjax.frames.point import Point, require_point
-from rigidjax.frames.scene import AbstractScene
-from rigidjax.rotation.algebra import components
+from rigidjax.rotation.linalg3 import components
 
 # NIMA TR8350.2 (WGS84), table 3.1; ISO 80000-3 for the standard fall.
 RATE = 7.292115e-5
@@ -20,6 +20,10 @@ class Earth(AbstractScene):
     acceleration at the origin; what changes of it with x' is added apart.
 
     **Fields:** `latitude` rad, `gravity` m/s², `rate` rad/s.
+
+    >>> scene = earth(0.5)
+    >>> float(scene.latitude), float(scene.gravity)
+    (0.5, 9.80665)
     """
 
     latitude: Scalar

@@ -4,10 +4,10 @@ import jax.numpy as jnp
 
 from rigidjax import _checks
 from rigidjax._types import Scalar, ScalarLike, Vec3
+from rigidjax.frames.base import AbstractScene
 from rigidjax.frames.earth import GRAVITY, RATE, Earth, checked
 from rigidjax.frames.point import Point, require_point
-from rigidjax.frames.scene import AbstractScene
-from rigidjax.rotation.algebra import components, dot_components
+from rigidjax.rotation.linalg3 import components, dot_components
 
 
 class Foucault(AbstractScene):
@@ -18,6 +18,10 @@ class Foucault(AbstractScene):
     `drift` reports it.
 
     **Fields:** `place` the `Earth` scene it hangs in; `length` m.
+
+    >>> pendulum = foucault(0.85, 67.0)
+    >>> float(pendulum.length), float(pendulum.place.latitude)
+    (67.0, 0.85)
     """
 
     place: Earth

@@ -1,21 +1,25 @@
-"""Hill's problem: the three-body problem looked at closely around the small body."""
+"""Hill's problem: the limit of the three-body problem near the small body."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rigidjax import _checks
 from rigidjax._types import Scalar, ScalarLike, Vec3
-from rigidjax.frames import flow
-from rigidjax.frames.mirrored import AbstractMirrored
 from rigidjax.frames.point import Point, require_point
-from rigidjax.rotation.algebra import components
+from rigidjax.frames.reversible_scene import AbstractReversible
+from rigidjax.frames.state_transition import smallest_distance
+from rigidjax.rotation.linalg3 import components
 
 
-class Hill(AbstractMirrored):
+class Hill(AbstractReversible):
     """A particle near a small body that circles a large one: make one with `scenes.hill()`.
 
     Rotating axes centred on the small body, x away from the large one. Units: μ^{1/3} of the
     bodies' distance, and 1/(their angular rate). **Field:** `radius` of the small body.
+
+    >>> scene = hill()
+    >>> float(scene.acceleration(0.0, Point([1.0, 0, 0], [0.0, 0, 0]))[0])  # 3 x − x/r³
+    2.0
     """
 
     radius: Scalar
@@ -45,7 +49,7 @@ class Hill(AbstractMirrored):
     def approach(self, t: ScalarLike, state: Point) -> tuple[Float[Array, "1"], Float[Array, "1"]]:
         """Distance from the small body, and that at which a run ends, named as a collision."""
         gap = jnp.sqrt(jnp.sum(state.x * state.x, keepdims=True))
-        least = jnp.maximum(self.radius.astype(gap.dtype), flow.smallest_distance(gap.dtype))
+        least = jnp.maximum(self.radius.astype(gap.dtype), smallest_distance(gap.dtype))
         return gap, least.reshape(1)
 
     @property

@@ -5,13 +5,13 @@ import jax.numpy as jnp
 
 from rigidjax import _checks
 from rigidjax._types import Scalar, ScalarLike, Vec3
+from rigidjax.frames.base import AbstractScene, like
 from rigidjax.frames.earth import GRAVITY
-from rigidjax.frames.inside import InFrame
+from rigidjax.frames.frame_dynamics import InFrame
 from rigidjax.frames.moving import MovingFrame
 from rigidjax.frames.point import Point, require_point
-from rigidjax.frames.scene import AbstractScene, like
-from rigidjax.frames.turning import AboutAxis
-from rigidjax.rotation.algebra import components
+from rigidjax.frames.rotation_models import AboutAxis
+from rigidjax.rotation.linalg3 import components
 
 
 class Hoop(AbstractScene):
@@ -20,6 +20,10 @@ class Hoop(AbstractScene):
     Axes of the hoop: x in its plane, y across it, z up; the centre is the origin.
 
     **Fields:** `radius` m, `rate` rad/s, `gravity` m/s².
+
+    >>> scene = hoop(2.0, 0.0)
+    >>> float(scene.radius), float(scene.gravity)
+    (2.0, 9.80665)
     """
 
     radius: Scalar

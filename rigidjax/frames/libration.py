@@ -8,10 +8,10 @@ import jax.numpy as jnp
 from rigidjax import _checks
 from rigidjax._types import HasAttitude, Scalar, ScalarLike, Vec3
 from rigidjax.body import inertia as _inertia
-from rigidjax.frames.inside import BodyInFrame
+from rigidjax.frames.frame_dynamics import BodyInFrame
 from rigidjax.frames.moving import MovingFrame
-from rigidjax.frames.turning import Uniform
-from rigidjax.rotation import algebra, quaternion
+from rigidjax.frames.rotation_models import Uniform
+from rigidjax.rotation import linalg3, quaternion
 
 
 class Tide(eqx.Module):
@@ -35,7 +35,7 @@ class Tide(eqx.Module):
     def __call__(self, t: ScalarLike, state: Any, body: Any) -> Vec3:
         up = quaternion.rotate_inverse(state.q, jnp.eye(3, dtype=state.q.dtype)[0])
         n = self.rate.astype(up.dtype)
-        return 3 * n * n * algebra.cross(up, _inertia.apply(body.tensor, up))
+        return 3 * n * n * linalg3.cross(up, _inertia.apply(body.tensor, up))
 
 
 def libration(rate: ScalarLike) -> BodyInFrame:
@@ -79,6 +79,6 @@ def libration_integral(state: Any, body: Any, rate: ScalarLike) -> Scalar:
     up, normal = (quaternion.rotate_inverse(state.q, axes[i]) for i in (0, 2))
 
     def weighed(y: Vec3) -> Scalar:
-        return algebra.dot(y, _inertia.apply(body.tensor, y))
+        return linalg3.dot(y, _inertia.apply(body.tensor, y))
 
     return 0.5 * (weighed(state.omega) + n * n * (3 * weighed(up) - weighed(normal)))

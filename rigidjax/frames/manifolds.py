@@ -12,8 +12,8 @@ from jaxtyping import Array, Float
 
 from rigidjax import _checks
 from rigidjax._types import Scalar, ScalarLike
-from rigidjax.frames import collision, families, flow
-from rigidjax.frames.periodic import PeriodicOrbit, crossing, named
+from rigidjax.frames import collision, continuation, state_transition
+from rigidjax.frames.differential_correction import PeriodicOrbit, crossing, named
 from rigidjax.frames.point import Point
 
 # Time run backwards is seen in the mirror y → −y: x, y, z, vx, vy, vz.
@@ -31,6 +31,12 @@ class Manifold(eqx.Module):
     manifold; `states` a `Point` with axes (N, T): one motion for each phase, NaN after a collision;
     `phases` (N,) where on the orbit each begins, in periods; `multiplier` λ by which a small
     distance along it changes in a period.
+
+    >>> from rigidjax.frames import scenes
+    >>> ts, phases = jnp.array([0.0, 0.1]), jnp.array([0.0])
+    >>> states = Point(jnp.zeros((1, 2, 3)), jnp.zeros((1, 2, 3)))
+    >>> scenes.Manifold(ts, states, phases, jnp.asarray(2.5)).states.x.shape
+    (1, 2, 3)
     """
 
     ts: Float[Array, " T"]
@@ -49,7 +55,7 @@ def unstable(monodromy: Float[Array, "6 6"]) -> tuple[Scalar, Float[Array, "6"]]
     >>> round(float(value), 12), round(float(vector[0]), 12)
     (4.0, 1.0)
     """
-    index = families.stability_indices(monodromy)
+    index = continuation.stability_indices(monodromy)
     real = jnp.abs(index.imag) <= 1e-6 * jnp.abs(index)
     size = jnp.where(real, jnp.abs(index.real), 0.0)
     index = jnp.where(size[0] >= size[1], index.real[0], index.real[1])
@@ -82,7 +88,7 @@ def unstable(monodromy: Float[Array, "6 6"]) -> tuple[Scalar, Float[Array, "6"]]
 def branch(
     scene: Any, orbit: PeriodicOrbit, phase: Scalar, which: str, side: int, distance: Scalar
 ) -> tuple[Point, Scalar]:
-    """The start at `phase`, and the multiplier: see `AbstractMirrored.manifold_start`."""
+    """The start at `phase`, and the multiplier: see `AbstractReversible.manifold_start`."""
     _checks.word(which, ("stable", "unstable"), "which")
     if isinstance(side, bool) or side not in (1, -1):
         raise ValueError(f"side: wanted 1, to larger x at the orbit's start, or -1, got {side!r}")
@@ -101,7 +107,7 @@ def _branch(
 
     def later(numbers: Array) -> Array:
         start = Point(numbers[:3], numbers[3:])
-        end = flow.flow(scene, start, turned * orbit.period, **_TIGHT)
+        end = state_transition.flow(scene, start, turned * orbit.period, **_TIGHT)
         return jnp.concatenate([end.x, end.v])
 
     start = jnp.concatenate([orbit.state.x, orbit.state.v])
@@ -123,7 +129,7 @@ def manifold(
     samples: int,
     distance: ScalarLike,
 ) -> Manifold:
-    """See `AbstractMirrored.manifold`."""
+    """See `AbstractReversible.manifold`."""
     count, samples = _checks.whole(count, "count", 1), _checks.whole(samples, "samples", 2)
     dtype = orbit.state.x.dtype if isinstance(orbit, PeriodicOrbit) else None
     distance = _positive(distance, "distance", dtype)
@@ -181,7 +187,7 @@ def _paths(scene: Any, starts: Point, ts: Array, which: str) -> Point:
 def bifurcation(
     scene: Any, orbit: PeriodicOrbit, other: PeriodicOrbit, index: int, value: float, hold: str
 ) -> PeriodicOrbit:
-    """See `AbstractMirrored.bifurcation`: the Illinois method between two members, on the host."""
+    """`AbstractReversible.bifurcation`: the Illinois method between two members, on the host."""
     place = named(hold)
     if isinstance(index, bool) or index not in (0, 1):
         raise ValueError(f"index: wanted 0 or 1, which of the two stability indices, got {index!r}")

@@ -9,11 +9,11 @@ import jax.numpy as jnp
 
 from rigidjax import _checks
 from rigidjax._types import Mat3, Scalar, ScalarLike, Vec3
-from rigidjax.body.hints import Vector
-from rigidjax.frames import turning
-from rigidjax.frames.instant import Instant
+from rigidjax.body._types import Vector
+from rigidjax.frames import rotation_models
+from rigidjax.frames.frame_kinematics import Instant
 from rigidjax.frames.point import require_point
-from rigidjax.rotation import algebra
+from rigidjax.rotation import linalg3
 
 
 class MovingFrame(eqx.Module):
@@ -25,7 +25,7 @@ class MovingFrame(eqx.Module):
 
     - `rotation`: a function of time, s, to M (3, 3) or to its unit quaternion (4,), S' → S; or
       what gives a state with `q` and `omega`, such as a solution of `simulate` (its `evaluate` is
-      called) or a `FreeBody`: then the frame rides on the body, and derivatives through a solved
+      called) or a `FreeBody`: then the frame is fixed in the body, and derivatives through a solved
       motion are in forward mode only. A Module (`frames.Uniform`) does
       not compile again for other numbers, a fresh `lambda` does.
     - `origin`: a function of time to X (3,), m, axes of S; `None` where the origins coincide.
@@ -37,7 +37,7 @@ class MovingFrame(eqx.Module):
     **Raises:** `TypeError` for a `rotation` that is neither; when used, `ValueError` for a value
     that is no rotation (checked where the value is known, that is outside `jit`).
 
-    >>> turntable = MovingFrame(turning.Uniform([0.0, 0.0, 2.0]))
+    >>> turntable = MovingFrame(rj.frames.Uniform([0.0, 0.0, 2.0]))
     >>> turntable.centrifugal([1.0, 0.0, 0.0], 0.3).tolist()
     [4.0, 0.0, 0.0]
     """
@@ -61,20 +61,20 @@ class MovingFrame(eqx.Module):
             _checks.function(origin, "origin", "of time to (3,)", hint=hint)
         if rate is not None:
             _checks.function(rate, "rate", "of time to (3,)")
-        self.rotation, self.origin = turning.differentiable(rotation), origin
+        self.rotation, self.origin = rotation_models.differentiable(rotation), origin
         self.rate = getattr(rotation, "rate", None) if rate is None else rate
 
     def matrix(self, t: ScalarLike) -> Mat3:
         """M(t) (3, 3), S' → S (notes, eq 85)."""
         t = _checks.time(t)
-        return turning.matrix(self.rotation, t)
+        return rotation_models.matrix(self.rotation, t)
 
     def at(self, t: ScalarLike) -> Instant:
         """The frame at time `t`, s: M, Ω, dΩ/dt, and the origin with two derivatives.
 
         Take it once where several of the methods below are wanted at the same time.
 
-        >>> MovingFrame(turning.Uniform([0.0, 0.0, 2.0])).at(0.0).rate.tolist()
+        >>> MovingFrame(rj.frames.Uniform([0.0, 0.0, 2.0])).at(0.0).rate.tolist()
         [0.0, 0.0, 2.0]
         """
         t = _checks.time(t)
@@ -94,11 +94,11 @@ class MovingFrame(eqx.Module):
         t = _checks.time(t)
         if self.rate is not None:
             return _checks.floating(self.rate(t), (3,), "rate").astype(t.dtype)
-        state = turning.state_of(self.rotation, t)
+        state = rotation_models.state_of(self.rotation, t)
         if hasattr(state, "omega"):
             return state.omega.astype(t.dtype)
         m, m_dot = jax.jvp(self.matrix, (t,), (jnp.ones_like(t),))
-        return algebra.vee(algebra.product(m.T, m_dot))
+        return linalg3.vee(linalg3.product(m.T, m_dot))
 
     def to_inertial(self, state: Any, t: ScalarLike) -> Any:
         """What S sees of a state that S' sees, of the same type.
@@ -112,7 +112,7 @@ class MovingFrame(eqx.Module):
         Many: `jax.vmap(frame.to_inertial)(states, times)`.
 
         >>> import rigidjax as rj
-        >>> frame = MovingFrame(turning.Uniform([0.0, 0.0, 2.0]))
+        >>> frame = MovingFrame(rj.frames.Uniform([0.0, 0.0, 2.0]))
         >>> frame.to_inertial(rj.frames.Point([1.0, 0, 0], [0.0, 0, 0]), 0.0).v.tolist()
         [0.0, 2.0, 0.0]
         """
@@ -124,7 +124,7 @@ class MovingFrame(eqx.Module):
         **Arguments:** as there. x' = Mᵀ(x − X), v' = Mᵀ(v − dX/dt) − Ω × x' (notes, eqs 86–88).
 
         >>> import rigidjax as rj
-        >>> frame = MovingFrame(turning.Uniform([0.0, 0.0, 2.0]))
+        >>> frame = MovingFrame(rj.frames.Uniform([0.0, 0.0, 2.0]))
         >>> frame.from_inertial(rj.frames.Point([1.0, 0, 0], [0.0, 2, 0]), 0.0).v.tolist()
         [0.0, 0.0, 0.0]
         """
@@ -166,7 +166,7 @@ class MovingFrame(eqx.Module):
         **Arguments:** `x`, `v` (3,) in S', m and m/s; `t` s; `force` f = MᵀF (3,) per mass, m/s²,
         **axes of S'** (`force_from_inertial` makes it from F), `None` for a free particle.
 
-        >>> frame = MovingFrame(turning.Uniform([0.0, 0.0, 2.0]))
+        >>> frame = MovingFrame(rj.frames.Uniform([0.0, 0.0, 2.0]))
         >>> frame.acceleration([1.0, 0, 0], [0.0, -2, 0], 0.0).tolist()
         [-4.0, 0.0, 0.0]
         """
@@ -184,11 +184,11 @@ class MovingFrame(eqx.Module):
 
     def force_from_inertial(self, force: Vector, t: ScalarLike) -> Vec3:
         """Force f = MᵀF (3,): a force, or any direction, in the axes of S' (notes, eq 91)."""
-        return algebra.apply(self.matrix(t).T, _checks.floating(force, (3,), "force"))
+        return linalg3.apply(self.matrix(t).T, _checks.floating(force, (3,), "force"))
 
     def force_to_inertial(self, force: Vector, t: ScalarLike) -> Vec3:
         """Force F = M f (3,): a force, or any direction, in the axes of S (notes, eq 85)."""
-        return algebra.apply(self.matrix(t), _checks.floating(force, (3,), "force"))
+        return linalg3.apply(self.matrix(t), _checks.floating(force, (3,), "force"))
 
     def jacobi_integral(self, state: Any, t: ScalarLike, potential: ScalarLike = 0.0) -> Scalar:
         """½|v'|² − ½|Ω × x'|² + V, m²/s²: kept where Ω and V(x') do not depend on time.
@@ -197,15 +197,15 @@ class MovingFrame(eqx.Module):
         Source: Goldstein, Mechanics, sec. 3.12 (as h = −C/2 in the three-body problem).
         """
         require_point(state)
-        speed = algebra.dot(state.v, state.v)
-        moved = algebra.cross(self.at(t).rate.astype(state.x.dtype), state.x)
+        speed = linalg3.dot(state.v, state.v)
+        moved = linalg3.cross(self.at(t).rate.astype(state.x.dtype), state.x)
         v = _checks.floating(potential, (), "potential").astype(state.x.dtype)
-        return 0.5 * (speed - algebra.dot(moved, moved)) + v
+        return 0.5 * (speed - linalg3.dot(moved, moved)) + v
 
     def then(self, inner: "MovingFrame") -> "MovingFrame":
         """The frame that moves as `inner` does **within this one**: M = M₁M₂, X = X₁ + M₁X₂.
 
-        >>> half = MovingFrame(turning.Uniform([0.0, 0.0, 1.0]))
+        >>> half = MovingFrame(rj.frames.Uniform([0.0, 0.0, 1.0]))
         >>> half.then(half).at(0.0).rate.tolist()
         [0.0, 0.0, 2.0]
         """
@@ -225,7 +225,7 @@ class MovingFrame(eqx.Module):
 def require_frame(frame: Any, name: str) -> None:
     """Raise `TypeError` unless `frame` is a `MovingFrame`.
 
-    >>> require_frame(MovingFrame(turning.Uniform([0.0, 0.0, 1.0])), "frame")
+    >>> require_frame(MovingFrame(rj.frames.Uniform([0.0, 0.0, 1.0])), "frame")
     """
     if not isinstance(frame, MovingFrame):
         raise TypeError(
@@ -248,11 +248,11 @@ class _ComposedRotation(eqx.Module):
     inner: MovingFrame
 
     def __call__(self, t: Any) -> Any:
-        return algebra.product(self.outer.matrix(t), self.inner.matrix(t))
+        return linalg3.product(self.outer.matrix(t), self.inner.matrix(t))
 
     def rate(self, t: Any) -> Any:
         # Rates add in one set of axes, which saves one derivative of the product.
-        carried = algebra.apply(self.inner.matrix(t).T, self.outer.angular_velocity(t))
+        carried = linalg3.apply(self.inner.matrix(t).T, self.outer.angular_velocity(t))
         return carried + self.inner.angular_velocity(t)
 
 
@@ -261,7 +261,7 @@ class _ComposedOrigin(eqx.Module):
     inner: MovingFrame
 
     def __call__(self, t: Any) -> Any:
-        return self.outer.place(t) + algebra.apply(self.outer.matrix(t), self.inner.place(t))
+        return self.outer.place(t) + linalg3.apply(self.outer.matrix(t), self.inner.place(t))
 
 
 class _InverseRotation(eqx.Module):
@@ -271,11 +271,11 @@ class _InverseRotation(eqx.Module):
         return self.frame.matrix(t).T
 
     def rate(self, t: Any) -> Any:
-        return -algebra.apply(self.frame.matrix(t), self.frame.angular_velocity(t))
+        return -linalg3.apply(self.frame.matrix(t), self.frame.angular_velocity(t))
 
 
 class _InverseOrigin(eqx.Module):
     frame: MovingFrame
 
     def __call__(self, t: Any) -> Any:
-        return -algebra.apply(self.frame.matrix(t).T, self.frame.place(t))
+        return -linalg3.apply(self.frame.matrix(t).T, self.frame.place(t))

@@ -10,7 +10,7 @@ from rigidjax import _checks
 
 
 class Point(eqx.Module):
-    """Where a particle is and how it moves, in the frame that watches it.
+    """Position and velocity of a particle, in the frame of its scene.
 
     **Arguments:** `x` (3,) position, m; `v` (3,) its velocity **in that frame**, m/s. Scenes with
     units of their own (the restricted three-body problem) say so. Leading axes are allowed in a

@@ -6,8 +6,8 @@ import jax.numpy as jnp
 
 from rigidjax import _checks
 from rigidjax._types import Scalar, ScalarLike
-from rigidjax.frames.lagrange import distances, points
-from rigidjax.frames.periodic import PeriodicOrbit
+from rigidjax.frames.differential_correction import PeriodicOrbit
+from rigidjax.frames.lagrange_points import distances, points
 from rigidjax.frames.point import Point
 
 

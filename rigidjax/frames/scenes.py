@@ -2,6 +2,7 @@
 
 from rigidjax._names import own_names
 from rigidjax.frames.cr3bp import ThreeBody as ThreeBody, cr3bp as cr3bp
+from rigidjax.frames.differential_correction import PeriodicOrbit as PeriodicOrbit
 from rigidjax.frames.earth import Earth as Earth, earth as earth
 from rigidjax.frames.foucault import Foucault as Foucault, foucault as foucault
 from rigidjax.frames.hill import Hill as Hill, hill as hill
@@ -11,6 +12,5 @@ from rigidjax.frames.libration import (
     libration_integral as libration_integral,
 )
 from rigidjax.frames.manifolds import Manifold as Manifold
-from rigidjax.frames.periodic import PeriodicOrbit as PeriodicOrbit
 
 __dir__ = own_names(__name__)

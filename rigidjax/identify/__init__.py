@@ -1,8 +1,8 @@
-"""From a recording to a body, and how sure that is."""
+"""Identification: from recordings to a body, with its uncertainty."""
 
-from rigidjax._names import own_names
-from rigidjax.identify import report as report, toutatis as toutatis
-from rigidjax.identify.bodies import (
+from rigidjax._names import own_names, renamed
+from rigidjax.identify import report as report
+from rigidjax.identify.body_charts import (
     AbstractBodyChart as AbstractBodyChart,
     Known as Known,
     Mass as Mass,
@@ -16,20 +16,19 @@ from rigidjax.identify.compare import (
     compare as compare,
     cross_validate as cross_validate,
 )
-from rigidjax.identify.descent import Descent as Descent
+from rigidjax.identify.csv_io import (
+    LogError as LogError,
+    read_gyro_csv as read_gyro_csv,
+    read_table as read_table,
+)
 from rigidjax.identify.design import (
     best_first_rate as best_first_rate,
     expected as expected,
     fisher as fisher,
     plan_of as plan_of,
 )
-from rigidjax.identify.files import (
-    LogError as LogError,
-    read_gyro_csv as read_gyro_csv,
-    read_table as read_table,
-)
 from rigidjax.identify.fit import Fit as Fit, Start as Start, fit as fit
-from rigidjax.identify.free import Free as Free
+from rigidjax.identify.free_parameters import Free as Free
 from rigidjax.identify.horizons import Horizons as Horizons
 from rigidjax.identify.light_curve import (
     Alias as Alias,
@@ -37,18 +36,18 @@ from rigidjax.identify.light_curve import (
     fit_light_curve as fit_light_curve,
 )
 from rigidjax.identify.loss import AbstractLoss as AbstractLoss, Huber as Huber, SoftL1 as SoftL1
+from rigidjax.identify.multiple_shooting import pieces as pieces
 from rigidjax.identify.parameters import Own as Own, Parameters as Parameters
-from rigidjax.identify.pieces import pieces as pieces
 from rigidjax.identify.prior import Entropic as Entropic
 from rigidjax.identify.problem import Problem as Problem
 from rigidjax.identify.profile import profile as profile
-from rigidjax.identify.propagate import (
+from rigidjax.identify.propagation import (
     AbstractIntegrator as AbstractIntegrator,
     Adaptive as Adaptive,
     FixedSteps as FixedSteps,
 )
+from rigidjax.identify.quantities import Quantity as Quantity
 from rigidjax.identify.recording import Reading as Reading, Recording as Recording
-from rigidjax.identify.reported import Quantity as Quantity
 from rigidjax.identify.sensors import (
     AbstractSensor as AbstractSensor,
     Accelerometer as Accelerometer,
@@ -59,13 +58,14 @@ from rigidjax.identify.sensors import (
     LowPass as LowPass,
     Magnetometer as Magnetometer,
     Marker as Marker,
-    Moment as Moment,
     Position as Position,
     Range as Range,
+    SensorInput as SensorInput,
     Velocity as Velocity,
     quaternions_from_euler as quaternions_from_euler,
     quaternions_from_matrices as quaternions_from_matrices,
 )
+from rigidjax.identify.stochastic_gradient import Descent as Descent
 from rigidjax.identify.two_frequencies import (
     TwoFrequencies as TwoFrequencies,
     two_frequencies as two_frequencies,
@@ -73,4 +73,11 @@ from rigidjax.identify.two_frequencies import (
 from rigidjax.identify.window_fit import WindowFit as WindowFit, fit_windows as fit_windows
 from rigidjax.identify.windows import Windows as Windows, windows as windows
 
+__getattr__ = renamed(
+    __name__,
+    {
+        "Moment": "rigidjax.identify.SensorInput",
+        "toutatis": "rigidjax.datasets.toutatis",
+    },
+)
 __dir__ = own_names(__name__)

@@ -12,14 +12,14 @@ from jaxtyping import Array, Float
 from rigidjax import _checks
 from rigidjax._types import Scalar, Vec3
 from rigidjax.body.inertia import Inertia, MassProperties
-from rigidjax.identify import reported
 from rigidjax.identify.jacobian import with_blocks
 from rigidjax.identify.parameters import Parameters, places
 from rigidjax.identify.problem import Problem, fits, one_problem
+from rigidjax.identify.quantities import Quantity, quantities
 from rigidjax.identify.uncertainty import WEAKEST
 
 
-def expected(problem: Problem, parameters: Parameters) -> tuple[reported.Quantity, ...]:
+def expected(problem: Problem, parameters: Parameters) -> tuple[Quantity, ...]:
     """What a fit of such a recording would report, and how sure it would be.
 
     **Arguments:** `problem` whose recordings give times, sensors with known noise, and torques (the
@@ -54,7 +54,7 @@ def expected(problem: Problem, parameters: Parameters) -> tuple[reported.Quantit
     covariance = (vectors * inverse) @ vectors.T / np.outer(size, size)
     null = vectors[:, ~seen].T / size
     null = null / np.linalg.norm(null, axis=1, keepdims=True)
-    return reported.quantities(problem, parameters, covariance, null)
+    return quantities(problem, parameters, covariance, null)
 
 
 def plan_of(problem: Problem, body: Any, omega: Any) -> Parameters:
@@ -128,7 +128,7 @@ def _on_host(problem: Problem, motion: Any) -> None:
 
 def best_first_rate(
     problem: Problem, body: Any, omega: Any, *, max_steps: int = 60
-) -> tuple[Vec3, tuple[reported.Quantity, ...]]:
+) -> tuple[Vec3, tuple[Quantity, ...]]:
     """The direction of the first rate that shows most of the body, its length kept.
 
     Makes the mean logarithm of the standard deviations of the body's free numbers small

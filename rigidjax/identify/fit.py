@@ -1,4 +1,4 @@
-"""Least squares from several starts, and what came of it."""
+"""Least squares from several starts, and its result."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -12,16 +12,22 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from rigidjax import _checks
-from rigidjax.identify import reported, uncertainty, words
+from rigidjax.identify import identifiability, uncertainty
 from rigidjax.identify.checkpoint import Checkpoint, Position, Tried, require_folder
-from rigidjax.identify.descent import Descent, descend
 from rigidjax.identify.full_scale import at_limit
 from rigidjax.identify.goodness import goodness
+from rigidjax.identify.initial_guess import starting_points
 from rigidjax.identify.jacobian import all_errors
+from rigidjax.identify.multiple_shooting import WIDTHS, joined, pieces as in_pieces, with_width
 from rigidjax.identify.parameters import Parameters
-from rigidjax.identify.pieces import WIDTHS, joined, pieces as in_pieces, with_width
 from rigidjax.identify.problem import Problem, fits
-from rigidjax.identify.propagate import AbstractIntegrator, Adaptive, FixedSteps
+from rigidjax.identify.propagation import AbstractIntegrator, Adaptive, FixedSteps
+from rigidjax.identify.quantities import (
+    Quantity,
+    interval_of,
+    quantile,
+    quantities as quantities_of,
+)
 from rigidjax.identify.residual import Noise
 from rigidjax.identify.search import (
     CAREFUL,
@@ -32,7 +38,7 @@ from rigidjax.identify.search import (
     least_squares,
     settle,
 )
-from rigidjax.identify.start import starting_points
+from rigidjax.identify.stochastic_gradient import Descent, descend
 from rigidjax.identify.widths import widths, with_widths
 
 # More equal steps than this between two samples cost more than steps chosen as they are needed.
@@ -40,7 +46,16 @@ FINEST = 32
 
 
 class Start(eqx.Module):
-    """What came of one start: where it ended and whether that can be believed."""
+    """The result of one start: where the search ended, and whether that explains the data.
+
+    >>> import jax.numpy as jnp, rigidjax as rj
+    >>> ts = jnp.linspace(0.0, 10.0, 80)
+    >>> motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1, 0.1, 1.0]), ts)
+    >>> record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), motion.ys.omega))
+    >>> found = rj.identify.fit(rj.identify.Problem(record, rj.identify.PrincipalRatios()))
+    >>> len(found.starts), all(start.cost < 1e-6 for start in found.starts)
+    (8, True)
+    """
 
     parameters: Parameters
     cost: float
@@ -52,14 +67,23 @@ class Fit(eqx.Module):
     """What `fit` returns: the best point and how sure it is.
 
     **Fields:** `parameters` the free numbers at the best point; `covariance` (n, n) of them,
-    flattened in order, infinite where the data are blind, `seen` the same within what they see,
-    `covariance_kind` what it rests on; `noises` (R, k) for each sensor; `starts` what came of each
-    start; `chi2` and `dof` of the whitened errors of the sensors whose noise was given;
+    flattened in order, infinite where the data do not determine them, `seen` the same within
+    what they determine, `covariance_kind` what it rests on; `noises` (R, k) for each sensor;
+    `starts` a `Start` each; `chi2` and `dof` of the whitened errors of the sensors whose noise was
+    given;
     `correlation` over how many samples the errors are autocorrelated, 1 for white ones, and
     `independent` how many independent ones that leaves; `singular_values` (n,) of the whitened
-    Jacobian, its columns of length one; `null_directions` (k, n) that leave no trace in the data;
+    Jacobian, its columns of length one; `null_directions` (k, n) that the data do not determine;
     `quantities` all that is reported, by name; `status` one line: `ok`, or `doubtful`, `ambiguous`,
     `poor`, `failed`, a colon and the reasons.
+
+    >>> import jax.numpy as jnp, rigidjax as rj
+    >>> ts = jnp.linspace(0.0, 10.0, 80)
+    >>> motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1, 0.1, 1.0]), ts)
+    >>> record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), motion.ys.omega))
+    >>> found = rj.identify.fit(rj.identify.Problem(record, rj.identify.PrincipalRatios()))
+    >>> [quantity.name for quantity in found.quantities[:2]], found.covariance.shape
+    (['Ix/Iz', 'Iy/Iz'], (5, 5))
     """
 
     problem: Problem
@@ -75,7 +99,7 @@ class Fit(eqx.Module):
     independent: float
     singular_values: Float[Array, " n"]
     null_directions: Float[Array, "unseen n"]
-    quantities: tuple[reported.Quantity, ...]
+    quantities: tuple[Quantity, ...]
     status: str
 
     @property
@@ -135,7 +159,7 @@ class Fit(eqx.Module):
         What is positive goes through its logarithm. **Arguments:** `level` the probability with
         which each holds the truth. **Raises** `ValueError` outside (0, 1).
         """
-        reach = reported.quantile(self, level)
+        reach = quantile(self, level)
         return {quantity.name: quantity.interval(reach) for quantity in self.quantities}
 
     def interval_of(
@@ -145,12 +169,12 @@ class Fit(eqx.Module):
 
         The covariance is carried by the function's derivative. **Raises** as `interval`.
         """
-        return reported.interval_of(self, of, level)
+        return interval_of(self, of, level)
 
     @property
     def identifiability(self) -> tuple[str, ...]:
-        """In words: what the data fix, what they fix weakly, what they cannot see."""
-        return words.identifiability(self)
+        """In words: what the data determine, what only weakly, and what not."""
+        return identifiability.identifiability(self)
 
 
 def one_fit(found: Any, name: str = "fit") -> Fit:
@@ -198,8 +222,8 @@ def fit(
       after so many steps.
     - `together`: how many starts go through one `vmap` at once.
     - `pieces`: where more than one, the record is first fitted in so many pieces whose ends are
-      drawn together (see `pieces`), and what they agree on is the first start.
-    - `descent`: a `Descent(optimiser, steps=…, batch=…)` of optax walks each start down first, a
+      joined (see `pieces`), and the result is the first start.
+    - `descent`: a `Descent(optimiser, steps=…, batch=…)` of optax first improves each start on a
       few recordings at a time: for many recordings, where a step of least squares costs much.
     - `checkpoint`: a file that keeps what was found after every 25 steps; a second call with the
       same problem and options goes on from there and, on the same machine and versions, ends at
@@ -457,7 +481,7 @@ def _assess(
     ]
     doubts = list(seen.doubts)
     if not any(start.fits for start in starts):
-        doubts.append("no start by itself came near the best point")
+        doubts.append("no single start came near the best point")
     if not np.isfinite(best_cost):
         status = "failed: no start gave a finite misfit"
     elif believable and not done:
@@ -485,6 +509,6 @@ def _assess(
         times.independent,
         jnp.asarray(spread.singular_values),
         jnp.asarray(spread.null_directions),
-        reported.quantities(problem, value, spread.seen, spread.null_directions),
+        quantities_of(problem, value, spread.seen, spread.null_directions),
         status,
     )

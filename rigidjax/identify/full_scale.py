@@ -1,4 +1,4 @@
-"""Readings at full scale: found in a record, counted as "at least that much", told."""
+"""Readings at full scale: found in a record, counted as "at least that much", reported."""
 
 from collections.abc import Sequence
 from typing import Any

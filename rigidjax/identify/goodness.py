@@ -38,7 +38,7 @@ def goodness(problem: Problem, linear: Linearised, times: Times, free: int) -> G
     For each sensor: the size of its errors against the noise, where that was given (five standard
     deviations of χ², or under a robust loss of the median of the squared errors), and against what
     varies in its readings; and whether its errors are white (Ljung and Box's test,
-    at one wrong alarm in 1e5). Readings at full scale take no part.
+    with one false alarm in 1e5). Readings at full scale take no part.
 
     **Arguments:** `linear` the problem at its best point; `times` the errors' correlation; `free`
     how many numbers are free.
@@ -57,11 +57,13 @@ def goodness(problem: Problem, linear: Linearised, times: Times, free: int) -> G
         left, varies, tiny = _sizes(reading, np.asarray(error), kept)
         if reading.sensor.noise is None:
             if left > HALF * varies + tiny:
-                poor.append(f"{name} are as large as what it read")
+                poor.append(f"{name} are as large as the variation of its readings")
             elif left > QUARTER * varies + tiny:
-                doubts.append(f"{name} are {np.sqrt(left / varies):.0%} of what varies in it")
+                doubts.append(
+                    f"{name} are {np.sqrt(left / varies):.0%} of the variation of its readings"
+                )
             elif max(times.closeness, 0.0) * left > 0.1 * varies + tiny:
-                poor.append(f"{name} are in one piece and large")
+                poor.append(f"{name} are large and autocorrelated")
         else:
             own, many = float(np.sum((weight[..., None] * e**2)[kept])), int(kept.sum())
             chi2, count = chi2 + own, count + many

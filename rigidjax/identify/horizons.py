@@ -10,7 +10,7 @@ from jaxtyping import Array
 from rigidjax._types import HasAttitude
 from rigidjax.motion import Rigid
 from rigidjax.rotation import quaternion
-from rigidjax.rotation.algebra import components
+from rigidjax.rotation.linalg3 import components
 
 
 class Horizons(NamedTuple):
@@ -18,6 +18,12 @@ class Horizons(NamedTuple):
 
     **Fields:** `steps` (L,) how many steps ahead; `mean_absolute` of a component, and `rms` of the
     vector, each by kind (L,).
+
+    >>> import rigidjax as rj
+    >>> t = np.arange(6.0)
+    >>> spin = rj.Spin(np.stack([t, 0 * t, 0 * t], 1))
+    >>> rj.identify.windows(t, spin, length=2).held().rms["omega"].tolist()  # it grows by 1 a step
+    [1.0, 2.0]
     """
 
     steps: Any

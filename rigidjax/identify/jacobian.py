@@ -9,14 +9,14 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
 from rigidjax.body.inertia import MassProperties
-from rigidjax.identify import stacking
-from rigidjax.identify.free import put
+from rigidjax.identify import padding
+from rigidjax.identify.free_parameters import put
 from rigidjax.identify.parameters import Local, Parameters, columns, local, places
-from rigidjax.identify.propagate import free_states, shifted, states_at
+from rigidjax.identify.propagation import free_states, shifted, states_at
 from rigidjax.identify.recording import Recording
-from rigidjax.identify.reference import Reference
-from rigidjax.identify.sensors import Moment
-from rigidjax.identify.several import matter
+from rigidjax.identify.reference_states import ReferenceStates
+from rigidjax.identify.sensors import SensorInput
+from rigidjax.identify.several_bodies import matter
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.rotation import quaternion
 from rigidjax.solve import equations_of_motion
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from rigidjax.identify.problem import Problem
 
 
-def first_state(rung: type, own: Any, ref: Reference) -> Any:
+def first_state(rung: type, own: Any, ref: ReferenceStates) -> Any:
     """The first state of one recording; `own` an `Own` or a `Local`."""
     omega = own.spin * ref.rate
     if rung is Spin:
@@ -50,7 +50,7 @@ def filled(problem: "Problem", mine: Local, record: Recording) -> Recording:
 
 
 def states_of_one(
-    problem: "Problem", mine: Local, record: Recording, ref: Reference, which: Array | None
+    problem: "Problem", mine: Local, record: Recording, ref: ReferenceStates, which: Array | None
 ) -> tuple[Recording, Any, Any, Any]:
     """One recording with its values filled in, its body, its first state and its states."""
     record = filled(problem, mine, record)
@@ -66,7 +66,7 @@ def _turned(problem: "Problem", body: Any) -> Any:
 
 
 def errors_of_one(
-    problem: "Problem", mine: Local, record: Recording, ref: Reference, which: Array | None
+    problem: "Problem", mine: Local, record: Recording, ref: ReferenceStates, which: Array | None
 ) -> tuple[tuple[Array, ...], Any]:
     """The errors (T, k) of each sensor in one recording, and the last state.
 
@@ -88,7 +88,7 @@ def errors_of_one(
                 seen = jax.vmap(lambda t, s, by=offset: shifted(field, t, s, by))(record.t, states)
 
         def error(t: Array, state: Any, value: Array, sensor: Any = sensor) -> Array:
-            return sensor.error(Moment(t, state, body, field), value)
+            return sensor.error(SensorInput(t, state, body, field), value)
 
         lowpass = getattr(sensor, "lowpass", None)
         if lowpass is None:
@@ -109,7 +109,7 @@ def over_records(function: Any, problem: "Problem", mine: Local) -> Any:
     trees = mine, problem.records, problem.reference, problem.which
     if problem.count > 1:
         return jax.vmap(function)(*trees)
-    out = function(*(stacking.one(tree, 0) for tree in trees))
+    out = function(*(padding.one(tree, 0) for tree in trees))
     return jax.tree.map(lambda leaf: leaf[None], out)
 
 
@@ -160,10 +160,10 @@ def with_blocks(parameters: Parameters, problem: "Problem") -> tuple[Any, Any]:
     `places` says which of the flattened parameters each of the n columns is for.
     """
     mine = local(problem, parameters)
-    single = stacking.one(mine, 0)
+    single = padding.one(mine, 0)
     twice = columns(problem, single)
 
-    def of_one(one: Local, record: Recording, ref: Reference, which: Array | None) -> Any:
+    def of_one(one: Local, record: Recording, ref: ReferenceStates, which: Array | None) -> Any:
         flat, restore = ravel_pytree(one)
 
         def value(vector: Array) -> Any:

@@ -12,17 +12,17 @@ from jaxtyping import Array, Float
 
 from rigidjax import _checks, exact
 from rigidjax.body.inertia import MassProperties
-from rigidjax.identify import stacking
+from rigidjax.identify import padding
 from rigidjax.identify.checkpoint import Tried
 from rigidjax.identify.fit import Fit, fit
 from rigidjax.identify.parameters import Parameters
 from rigidjax.identify.problem import Problem, one_problem
-from rigidjax.identify.reported import carried
+from rigidjax.identify.quantities import carried
 from rigidjax.identify.sensors import Brightness
-from rigidjax.identify.several import Bodies
+from rigidjax.identify.several_bodies import Bodies
 from rigidjax.identify.tumbling_search import descended, noise_of, relative_flux, starts_of
 from rigidjax.identify.two_frequencies import TwoFrequencies, two_frequencies
-from rigidjax.rotation.algebra import apply, dot
+from rigidjax.rotation.linalg3 import apply, dot
 
 # Motions are the same where both periods and both ratios of moments differ by less than that, or
 # by less than so many of their standard deviations.
@@ -104,7 +104,7 @@ def fit_light_curve(
     twice the rotation, in long- and short-axis mode (Kaasalainen 2001), over a grid of bodies and
     phases; the best of them fitted with the sensor itself; the best of these fitted to the end. All
     that were found are listed. What brightness leaves free by symmetry (half turns of the world,
-    see `Brightness`, and of the body about its axes) is not told apart: periods, moments and mode
+    see `Brightness`, and of the body about its axes) is one motion here: periods, moments and mode
     are the same.
 
     **Arguments:** `problem` of one recording with one `Brightness` sensor and no torque; let a
@@ -171,7 +171,7 @@ def _only(problem: Problem) -> Any:
         raise ValueError("fit_light_curve: wanted one body, got several by name")
     if problem.records.torque is not None:
         raise ValueError("fit_light_curve: wanted a free body, got a torque")
-    return stacking.one(readings[0], 0)
+    return padding.one(readings[0], 0)
 
 
 @eqx.filter_jit

@@ -15,6 +15,15 @@ class AbstractLoss(eqx.Module):
     """`ρ(s)` of the squared length s of a sensor's error in units of its noise.
 
     A reading counts as a whole, so that the loss does not depend on the frame.
+
+    >>> import jax.numpy as jnp
+    >>> class Squares(AbstractLoss):  # no outliers: ρ(s) = s
+    ...     def shrink(self, error):
+    ...         return error
+    ...     def weight(self, error):
+    ...         return jnp.ones(())
+    >>> float(Squares().weight(jnp.array([6.0, 0.0, 0.0])))
+    1.0
     """
 
     @abc.abstractmethod
@@ -29,7 +38,7 @@ class AbstractLoss(eqx.Module):
 class SoftL1(AbstractLoss):
     """Quadratic for ordinary errors, linear for large ones: `ρ(s) = 2c²(√(1 + s/c²) − 1)`.
 
-    Convex, unlike Cauchy's, which has minima of its own making.
+    Convex, unlike Cauchy's, which can add local minima.
 
     **Arguments:** `scale` c, where quadratic turns to linear, in standard deviations. **Raises:**
     `ValueError` where it is not positive.

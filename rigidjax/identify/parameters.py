@@ -9,7 +9,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
-from rigidjax.identify.several import spread
+from rigidjax.identify.several_bodies import spread
 
 if TYPE_CHECKING:
     from rigidjax.identify.problem import Problem
@@ -20,9 +20,16 @@ class Own(eqx.Module):
 
     **Fields:** `spin` (3,) the first body rate over the typical rate; `turn` (3,) the rotation
     vector from the reference attitude to the first one (body frame, rad), or `None` where nothing
-    feels the attitude; `place`, `speed` (3,) the first position and velocity from the reference, in
-    typical lengths and speeds, or `None`; `each` the steps of the `Free`s with one value for each
-    recording, and the deviations of those with a `spread`.
+    depends on the attitude; `place`, `speed` (3,) the first position and velocity from the
+    reference, in typical lengths and speeds, or `None`; `each` the steps of the `Free`s with one
+    value for each recording, and the deviations of those with a `spread`.
+
+    >>> import rigidjax as rj
+    >>> record = rj.identify.Recording([0.0, 1.0], (rj.identify.Gyro(), [[1.0, 0, 0]] * 2))
+    >>> problem = rj.identify.Problem(record, rj.identify.PrincipalRatios())
+    >>> plan = rj.identify.plan_of(problem, rj.Inertia.from_principal(2.0, 2.0, 2.0), [0.0, 0, 3])
+    >>> plan.own.spin.tolist(), plan.own.turn  # a gyro does not show the attitude
+    ([[0.0, 0.0, 3.0]], None)
     """
 
     spin: Float[Array, "*records 3"]
@@ -38,6 +45,13 @@ class Parameters(eqx.Module):
     **Fields:** `body` the chart's numbers, of several bodies one after another; `shared` the steps
     of the `Free`s with one value for all, or (groups, …) for one in each group; `own` what belongs
     to each recording, with a leading axis.
+
+    >>> import rigidjax as rj
+    >>> record = rj.identify.Recording([0.0, 1.0], (rj.identify.Gyro(), [[1.0, 0, 0]] * 2))
+    >>> problem = rj.identify.Problem(record, rj.identify.PrincipalRatios())
+    >>> plan = rj.identify.plan_of(problem, rj.Inertia.from_principal(2.0, 2.0, 2.0), [0.0, 0, 3])
+    >>> plan.body.shape, plan.shared
+    ((2,), ())
     """
 
     body: Float[Array, " chart"]

@@ -1,4 +1,4 @@
-"""A pull towards a body that is roughly known, the same in every frame and unit."""
+"""A prior around a body that is roughly known, the same in every frame and unit."""
 
 import equinox as eqx
 import jax.numpy as jnp

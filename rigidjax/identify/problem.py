@@ -12,9 +12,9 @@ from jaxtyping import Array, Float, Int
 from rigidjax import _checks
 from rigidjax._types import HasAttitude, HasPose, Scalar
 from rigidjax.body.inertia import Inertia, MassProperties
-from rigidjax.identify import stacking
-from rigidjax.identify.bodies import AbstractBodyChart
-from rigidjax.identify.free import Free, Slot, find, grouped, shares
+from rigidjax.identify import padding
+from rigidjax.identify.body_charts import AbstractBodyChart
+from rigidjax.identify.free_parameters import Free, Slot, find, grouped, shares
 from rigidjax.identify.full_scale import with_limits
 from rigidjax.identify.jacobian import (
     all_errors,
@@ -26,10 +26,10 @@ from rigidjax.identify.jacobian import (
 from rigidjax.identify.loss import AbstractLoss
 from rigidjax.identify.parameters import Own, Parameters, local
 from rigidjax.identify.prior import Entropic
-from rigidjax.identify.propagate import AbstractIntegrator, integrator_for
+from rigidjax.identify.propagation import AbstractIntegrator, integrator_for
 from rigidjax.identify.recording import Recording
-from rigidjax.identify.reference import Reference, reference_of
-from rigidjax.identify.several import Bodies, has_mass
+from rigidjax.identify.reference_states import ReferenceStates, reference_of
+from rigidjax.identify.several_bodies import Bodies, has_mass
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.torques import AbstractForce, Sum, Torque
 from rigidjax.motion.torques.base import require_law
@@ -51,7 +51,7 @@ class Problem(eqx.Module):
       body, group or recording.
     - `torque`: what turns the body besides its own spin, for the recordings that have none.
     - `loss`: how an outlier counts: `SoftL1()`, `Huber()`, or `None` for plain least squares.
-    - `prior`: `Entropic(guess, weight)`, a pull towards a body that is roughly known, or `None`.
+    - `prior`: `Entropic(guess, weight)`, a prior around a body that is roughly known, or `None`.
     - `integrator`: `FixedSteps(n)` or `Adaptive(rtol, atol)` for a forced motion; `None` chooses by
       how finely it was sampled. A free body is followed by the closed form.
     - `noise_each`: where a sensor's noise is estimated, one figure for all recordings (`False`),
@@ -60,8 +60,8 @@ class Problem(eqx.Module):
     Channels that were cut off at full scale are found, and their readings there count as "at least
     that much", as with a sensor's `limit`.
 
-    The motion starts at the first time of each recording. The state climbs only as far as the
-    sensors and the torque need: `Spin`, `Attitude`, `Rigid`.
+    The motion starts at the first time of each recording. Its state is the lowest that sensors
+    and torque can do with: `Spin`, `Attitude`, `Rigid`.
 
     **Raises:** `TypeError` for arguments of another kind; `ValueError` where they do not fit.
 
@@ -82,7 +82,7 @@ class Problem(eqx.Module):
     prior: Entropic | None
     integrator: AbstractIntegrator | None
     rung: type = eqx.field(static=True)
-    reference: Reference
+    reference: ReferenceStates
     links: "Links | None"
 
     def __init__(
@@ -134,7 +134,7 @@ class Problem(eqx.Module):
             require_law(torque)
             recordings = [_with(item, torque) for item in recordings]
         recordings = with_limits(recordings)
-        self.records, self.counts = stacking.stack(recordings)
+        self.records, self.counts = padding.stack(recordings)
         self.body, self.loss, self.prior = chart, loss, prior
         self.of, self.which, self.noise_groups = of, None, None
         if isinstance(chart, Bodies):
@@ -164,7 +164,7 @@ class Problem(eqx.Module):
     def recordings(self) -> tuple[Recording, ...]:
         """The recordings, one by one."""
         return tuple(
-            stacking.cut(stacking.one(self.records, index), count)
+            padding.cut(padding.one(self.records, index), count)
             for index, count in enumerate(self.counts)
         )
 
@@ -231,7 +231,7 @@ class Problem(eqx.Module):
         states = jax.vmap(lambda own, ref: first_state(self.rung, own, ref))(
             parameters.own, self.reference
         )
-        return body, stacking.one(states, 0) if self.count == 1 else states
+        return body, padding.one(states, 0) if self.count == 1 else states
 
     def bodies(self, parameters: Parameters) -> Any:
         """The body that the parameters stand for; of several, a dict of them by name."""
@@ -277,7 +277,7 @@ class Problem(eqx.Module):
             return states_of_one(self, *trees)[3]
 
         states = over_records(of_one, self, local(self, parameters))
-        return stacking.one(states, 0) if self.count == 1 else states
+        return padding.one(states, 0) if self.count == 1 else states
 
     def errors(self, parameters: Parameters) -> tuple[Float[Array, "*records times _"], ...]:
         """Reading minus prediction for each sensor, in its unit; zero where masked."""

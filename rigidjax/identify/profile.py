@@ -8,7 +8,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array
 
-from rigidjax.identify import reported
+from rigidjax.identify import quantities
 from rigidjax.identify.fit import Fit, one_fit
 from rigidjax.identify.parameters import Parameters
 from rigidjax.identify.residual import residuals
@@ -38,7 +38,7 @@ def profile(fit: Fit, name: str, level: float = 0.95) -> tuple[float, float]:
     names = [quantity.name for quantity in fit.quantities]
     if not isinstance(name, str) or name not in names:
         raise ValueError(f"profile: no quantity {name!r}; wanted one of {', '.join(names)}")
-    reach = reported.quantile(fit, level)
+    reach = quantities.quantile(fit, level)
     index = names.index(name)
     quantity = fit.quantities[index]
     middle = np.log(quantity.value) if quantity.positive else quantity.value
@@ -89,7 +89,7 @@ def _held(
     args = (fit.problem, fit.noises, whole)
 
     def held(parameters: Parameters, _: Any) -> Any:
-        value = reported.vector(fit.problem, parameters)[index]
+        value = quantities.vector(fit.problem, parameters)[index]
         return residuals(parameters, args), (value - target) / width
 
     least: Any = optx.least_squares

@@ -17,6 +17,11 @@ class Reading(eqx.Module):
     """What one sensor read: `values` (T, …) and `mask` (T,), true where there is a reading.
 
     Inside a `Problem` all arrays have a leading axis over recordings.
+
+    >>> import rigidjax as rj
+    >>> record = Recording([0.0, 1.0], (rj.identify.Gyro(0.01), [[1.0, 0, 0], [1.0, 0, 0]]))
+    >>> record.readings[0].values.shape, record.readings[0].mask.tolist()
+    ((2, 3), [True, True])
     """
 
     sensor: AbstractSensor

@@ -23,6 +23,15 @@ def rows(fit: Fit, rate_unit: str = "rad/s") -> list[Row]:
     """All that was found as rows (name, value, low, high, unit), 95 % intervals.
 
     **Arguments:** `fit`; `rate_unit` of the first body rate: `rad/s`, `deg/s`, `deg/day`.
+
+    >>> import jax.numpy as jnp, rigidjax as rj
+    >>> ts = jnp.linspace(0.0, 10.0, 80)
+    >>> motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1, 0.1, 1.0]), ts)
+    >>> record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), motion.ys.omega))
+    >>> found = rj.identify.fit(rj.identify.Problem(record, rj.identify.PrincipalRatios()))
+    >>> name, value, low, high, unit = rows(found)[0]
+    >>> name, round(value, 6), low < value < high
+    ('Ix/Iz', 0.4, True)
     """
     one_fit(fit)
     scale = _UNITS[_checks.word(rate_unit, tuple(_UNITS), "rate_unit")]
@@ -95,6 +104,14 @@ def verdict(fit: Fit) -> str:
     """What is well and what is weakly determined, and whether the starts agree, in words.
 
     **Arguments:** `fit` what `rigidjax.identify.fit` returned. **Raises** `TypeError` for another.
+
+    >>> import jax.numpy as jnp, rigidjax as rj
+    >>> ts = jnp.linspace(0.0, 10.0, 80)
+    >>> motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1, 0.1, 1.0]), ts)
+    >>> record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), motion.ys.omega))
+    >>> found = rj.identify.fit(rj.identify.Problem(record, rj.identify.PrincipalRatios()))
+    >>> verdict(found).splitlines()[0]
+    'status: ok'
     """
     one_fit(fit)
     good = [start for start in fit.starts if start.converged and start.fits]
@@ -111,6 +128,14 @@ def as_dict(fit: Fit, files: Sequence[str] = (), more: Sequence[Row] = ()) -> di
     """All that was found as plain numbers and text, for JSON. Infinity is written as `null`.
 
     **Arguments:** `fit`; `files` the names of what was read; `more` rows of further quantities.
+
+    >>> import jax.numpy as jnp, rigidjax as rj
+    >>> ts = jnp.linspace(0.0, 10.0, 80)
+    >>> motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1, 0.1, 1.0]), ts)
+    >>> record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), motion.ys.omega))
+    >>> found = rj.identify.fit(rj.identify.Problem(record, rj.identify.PrincipalRatios()))
+    >>> as_dict(found)["status"]
+    'ok'
     """
 
     def plain(number: float) -> float | None:
@@ -174,6 +199,16 @@ def write_json(
     """What was found as JSON in a file: `as_dict`, written to `path`.
 
     **Arguments:** `fit`; `path` of the file, written over; `files` and `more` as for `as_dict`.
+
+    >>> import json, tempfile, jax.numpy as jnp, rigidjax as rj
+    >>> ts = jnp.linspace(0.0, 10.0, 80)
+    >>> motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1, 0.1, 1.0]), ts)
+    >>> record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), motion.ys.omega))
+    >>> found = rj.identify.fit(rj.identify.Problem(record, rj.identify.PrincipalRatios()))
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     write_json(found, folder + "/fit.json")
+    ...     json.loads(Path(folder, "fit.json").read_text())["status"]
+    'ok'
     """
     text = json.dumps(as_dict(fit, files, more), indent=2, ensure_ascii=False, allow_nan=False)
     Path(path).write_text(text + "\n", encoding="utf-8")
@@ -194,6 +229,16 @@ def write_html(
     **Arguments:** `fit`; `path`; `title`; `figures` of matplotlib, such as those of
     `rigidjax.plot.fit`; `rate_unit` as for `rows`; `files` the names of what was read; `more`
     rows of further quantities.
+
+    >>> import tempfile, jax.numpy as jnp, rigidjax as rj
+    >>> ts = jnp.linspace(0.0, 10.0, 80)
+    >>> motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1, 0.1, 1.0]), ts)
+    >>> record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), motion.ys.omega))
+    >>> found = rj.identify.fit(rj.identify.Problem(record, rj.identify.PrincipalRatios()))
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     write_html(found, folder + "/fit.html")
+    ...     Path(folder, "fit.html").read_text(encoding="utf-8")[:15].lower()
+    '<!doctype html>'
     """
     one_fit(fit)
     good = fit.ok

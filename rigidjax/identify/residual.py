@@ -10,7 +10,7 @@ from rigidjax.identify.jacobian import all_errors, first_state
 from rigidjax.identify.loss import shrink, weight
 from rigidjax.identify.parameters import Parameters
 from rigidjax.identify.problem import Problem
-from rigidjax.identify.several import Bodies
+from rigidjax.identify.several_bodies import Bodies
 from rigidjax.motion import Attitude, Rigid
 from rigidjax.rotation import quaternion
 

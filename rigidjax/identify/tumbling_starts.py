@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 from rigidjax import exact
 from rigidjax.body.inertia import Inertia
 from rigidjax.motion import Attitude
-from rigidjax.rotation.algebra import cross
+from rigidjax.rotation.linalg3 import cross
 
 # Semi-axes of the grid: b/a and c/b; phases in half a rotation.
 MIDDLE, SHORT, PHASES = (0.4, 0.5, 0.6, 0.7, 0.8, 0.9), (0.5, 0.65, 0.8, 0.93), 12

@@ -30,8 +30,14 @@ class TwoFrequencies(eqx.Module):
     """What `two_frequencies` returns, the best first.
 
     **Fields:** `frequencies` (n, 2) in 1/s; `misfits` (n,) χ² of each pair's series, and `dof`;
-    `scatter` the standard deviation that the best leaves over, in the unit of the values; `lines`
+    `scatter` the standard deviation of the best one's residuals, in the unit of the values; `lines`
     (m,) the strongest lines of the spectrum, 1/s.
+
+    >>> t = np.linspace(0.0, 60.0, 300)
+    >>> y = 1 + np.cos(2 * np.pi * 0.4 * t) + 0.5 * np.cos(2 * np.pi * 0.7 * t + 1.0)
+    >>> found = two_frequencies(t, y, 0.1)
+    >>> sorted(found.lines[:2].round(2).tolist())
+    [0.4, 0.7]
     """
 
     frequencies: Float[np.ndarray, "n 2"]

@@ -122,7 +122,7 @@ class Spread(eqx.Module):
 
     **Fields:** `covariance` (n, n), infinite where a number depends on what is not seen; `seen`
     (n, n) the same within what is seen; `kind` in words; `singular_values` (n,) of the weighted
-    Jacobian, its columns of length one; `null_directions` (k, n) that leave no trace in the data.
+    Jacobian, its columns of length one; `null_directions` (k, n) that the data do not determine.
     """
 
     covariance: np.ndarray

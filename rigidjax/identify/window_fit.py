@@ -35,6 +35,15 @@ class WindowFit(eqx.Module, Generic[Value]):
     deviations, from how the windows differ (sandwich; of windows that overlap they are too small);
     `cost` half the mean square, errors in units of `noise`; `noise` by kind; `steps` taken;
     `converged`; `message` what there is to say.
+
+    >>> import rigidjax as rj
+    >>> t = np.linspace(0.0, 1.0, 11)
+    >>> spin = rj.Spin(np.stack([0 * t, 0 * t, np.exp(-0.5 * t)], 1))
+    >>> body = rj.Inertia.from_principal(1.0, 1.0, 1.0)
+    >>> scene = lambda k: (body, rj.torques.Damping(k * jnp.ones(3)))
+    >>> found = fit_windows(rj.identify.windows(t, spin, length=5), scene, jnp.asarray(0.1))
+    >>> bool(found.converged), bool(found.cost < 1e-9)
+    (True, True)
     """
 
     value: Value

@@ -24,6 +24,10 @@ class Windows(eqx.Module):
     **Fields:** `step` s between samples; `starts` N states; `wanted` the L states that follow each
     start, with leading axes (N, L); `inputs` by name (N, before + L, *k), row before + i held
     through step i, where no delay is asked for; `before` how many rows come before the start.
+
+    >>> found = windows(np.arange(6.0), Spin(np.ones((6, 3))), length=2, stride=2)
+    >>> found.count, found.length, found.wanted.omega.shape
+    (2, 2, (2, 2, 3))
     """
 
     step: float = eqx.field(static=True)

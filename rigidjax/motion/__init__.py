@@ -1,4 +1,4 @@
-"""How it turns: climb only as far as the scene needs."""
+"""States, their equations of motion, torques: model no more than the scene needs."""
 
 from rigidjax._names import own_names
 from rigidjax.motion import lagrangian as lagrangian, torques as torques

@@ -1,4 +1,4 @@
-"""Rung 2: a body that turns and knows which way it points."""
+"""The state `Attitude`: a body that turns, with its attitude."""
 
 from typing import TypeVar
 
@@ -15,12 +15,12 @@ from rigidjax.motion.coupled import Coupled
 from rigidjax.motion.spin import EulerEquations
 from rigidjax.motion.torques import Torque
 from rigidjax.rotation import quaternion
-from rigidjax.rotation.algebra import components
-from rigidjax.rotation.maps import square4
+from rigidjax.rotation.kernels import square4
+from rigidjax.rotation.linalg3 import components
 
 
 class Attitude(eqx.Module):
-    """The state of rung 2: attitude and body rate.
+    """Attitude and body rate: a body that turns.
 
     **Arguments:** `q` (4,) unit quaternion (w, x, y, z), **scalar first**, body → world (the `M` of
     the notes, eq 8); `omega` (3,) Ω in the body frame, rad/s. Leading axes are allowed in a

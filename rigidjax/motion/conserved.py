@@ -11,18 +11,11 @@ from rigidjax._types import HasAttitude, HasPose, HasSpin, Scalar, ScalarLike, V
 from rigidjax.body.energy import angular_momentum, kinetic_energy
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.motion.coupled import Coupled, motion_of
-from rigidjax.motion.torques import (
-    AbstractTorque,
-    CentralGravity,
-    Sum,
-    Torque,
-    freeze,
-    in_precision,
-)
-from rigidjax.motion.torques.base import length_or_zero, one_law, require_rung
+from rigidjax.motion.torques import AbstractTorque, CentralGravity, Sum, Torque, freeze
+from rigidjax.motion.torques.base import in_precision, length_or_zero, one_law, require_rung
 from rigidjax.motion.torques.states import Frozen, require_frozen
 from rigidjax.rotation import quaternion
-from rigidjax.rotation.algebra import cross, dot
+from rigidjax.rotation.linalg3 import cross, dot
 
 
 def energy(
@@ -79,7 +72,7 @@ def conserved(
     - `momentum` (3,), kg m²/s, world frame, `R(IΩ + h)`, and `momentum_squared`, the Casimir
       `|IΩ + h|²`: nothing outside turns the body (h is the wheels' momentum);
     - `momentum_along_axis`, kg m²/s: one law turns it, but not about this axis (gravity, a field);
-    - `linear_momentum` (3,), kg m/s, world frame: nothing pushes it;
+    - `linear_momentum` (3,), kg m/s, world frame: no force acts on it;
     - `momentum_about_origin` (3,), kg m²/s, world frame, `m x × v + R(IΩ + h)`: free, or attracted
       by the origin.
 

@@ -10,10 +10,10 @@ from jaxtyping import Array, ArrayLike, Float
 from rigidjax import _checks
 from rigidjax._types import HasAttitude, Mat3, Scalar, ScalarLike, Vec3
 from rigidjax.body import inertia as _inertia
-from rigidjax.body.hints import Vectors
+from rigidjax.body._types import Vectors
 from rigidjax.motion.torques import HeavyTop
 from rigidjax.rotation import quaternion
-from rigidjax.rotation.algebra import apply, cross, dot
+from rigidjax.rotation.linalg3 import apply, cross, dot
 
 
 class Momentum(eqx.Module):

@@ -29,7 +29,7 @@ from rigidjax.motion.hamiltonian import (
 )
 from rigidjax.motion.torques import Torque
 from rigidjax.motion.torques.base import require_law
-from rigidjax.rotation import algebra, euler
+from rigidjax.rotation import euler, linalg3
 
 
 class Coordinates(eqx.Module):
@@ -61,7 +61,12 @@ class Coordinates(eqx.Module):
 
 
 class LagrangeEquations(eqx.Module):
-    """Lagrange's equations as a vector field; made by `equations_of_motion`."""
+    """Lagrange's equations as a vector field; made by `equations_of_motion`.
+
+    >>> pendulum = equations_of_motion(lambda q, v: 0.5 * v[0] ** 2 + 9.81 * jnp.cos(q[0]))
+    >>> round(float(pendulum.energy(Coordinates([0.0], [2.0]))), 6)  # ½ v² − 9.81 cos q
+    -7.81
+    """
 
     lagrangian: Callable[[Any, Any], Any]
     force: Callable[[Any, Any, Any], Any] | None
@@ -147,7 +152,7 @@ class EulerAngleTop(eqx.Module):
 
     def __call__(self, q: Float[ArrayLike, "3"], rate: Float[ArrayLike, "3"]) -> Scalar:
         omega = euler.rates_to_omega(q, rate)
-        kinetic = 0.5 * algebra.dot(omega, algebra.apply(self.inertia.tensor, omega))
+        kinetic = 0.5 * linalg3.dot(omega, linalg3.apply(self.inertia.tensor, omega))
         if self.torque is None:
             return kinetic
         state = Attitude(euler.to_quaternion(q), omega)
@@ -201,7 +206,7 @@ def _solve(matrix: Float[Array, "n n"], push: Float[Array, " n"]) -> Float[Array
         x, y = push
         return jnp.stack([d * x - b * y, a * y - c * x]) / (a * d - b * c)
     if n == 3:
-        return algebra.solve(matrix, push)
+        return linalg3.solve(matrix, push)
     return lx.linear_solve(lx.MatrixLinearOperator(matrix), push, lx.LU(), throw=False).value
 
 

@@ -1,4 +1,4 @@
-"""Rung 3: a body that turns, points and moves. Newton–Euler about the centre of mass."""
+"""The state `Rigid`: a body that turns and moves. Newton–Euler about the centre of mass."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -8,12 +8,13 @@ from rigidjax import _checks
 from rigidjax._types import HasPose, ScalarLike
 from rigidjax.body.inertia import MassProperties
 from rigidjax.motion.spin import EulerEquations
-from rigidjax.motion.torques import Torque, act
+from rigidjax.motion.torques import Torque
+from rigidjax.motion.torques.base import act
 from rigidjax.rotation import quaternion
 
 
 class Rigid(eqx.Module):
-    """The state of rung 3: where the centre of mass is and goes, attitude, body rate.
+    """Position and velocity of the centre of mass, attitude, body rate: a body that moves.
 
     **Arguments:** `x` (3,) position of the centre of mass, m, world frame (the `X` of the notes,
     eq 1); `v` (3,) its velocity, m/s, world frame; `q` (4,) unit quaternion (w, x, y, z), scalar

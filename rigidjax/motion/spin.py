@@ -1,20 +1,20 @@
-"""Rung 1: a body that turns, seen from itself. Euler's equations in the body frame."""
+"""The state `Spin`: the body rate alone. Euler's equations in the body frame."""
 
 import equinox as eqx
 from jaxtyping import Array, Float
 
 from rigidjax import _checks
 from rigidjax._types import HasSpin, Mat3, ScalarLike, Vec3
-from rigidjax.body import inertia as _inertia, physical
-from rigidjax.motion.torques import Torque, evaluate
-from rigidjax.motion.torques.base import require_law
-from rigidjax.rotation import algebra
+from rigidjax.body import inertia as _inertia, validation
+from rigidjax.motion.torques import Torque
+from rigidjax.motion.torques.base import evaluate, require_law
+from rigidjax.rotation import linalg3
 
 _HINT = "Inertia.from_tensor makes one of a matrix; of MassProperties pass .inertia"
 
 
 class Spin(eqx.Module):
-    """The state of rung 1: a body rate and nothing else.
+    """A body rate and nothing else: a body that turns, its attitude left out.
 
     **Arguments:** `omega` (3,) angular velocity Ω in the body frame, rad/s (notes, eq 49). Leading
     axes are allowed in a container of many states; functions take one.
@@ -58,7 +58,7 @@ class EulerEquations(eqx.Module):
         if torque is not None:
             require_law(torque)
         # Where the numbers are traced, `simulate` has looked at them before.
-        self.inertia = inertia.invertible() if physical.known(inertia.tensor) else inertia
+        self.inertia = inertia.invertible() if validation.known(inertia.tensor) else inertia
         # Once per solve: a division inside the field costs 25 times the rest of it.
         self.inverse = _inertia.inverse(inertia.tensor)
         self.torque = torque
@@ -77,7 +77,7 @@ class EulerEquations(eqx.Module):
         """dΩ/dt (3,), rad/s², body frame, under a torque (3,), N m, body frame, that is known."""
         dtype = state.omega.dtype
         momentum = _inertia.apply(self.inertia.tensor.astype(dtype), state.omega)
-        turning = algebra.cross(momentum, state.omega)
+        turning = linalg3.cross(momentum, state.omega)
         if torque is not None:
             turning = turning + torque
         return _inertia.apply(self.inverse.astype(dtype), turning)

@@ -5,18 +5,18 @@ Okabe and Ito's, told apart by everyone.
 """
 
 from rigidjax._names import own_names
-from rigidjax.plot.ahead import horizons as horizons
-from rigidjax.plot.bodies import inertia_ellipsoid as inertia_ellipsoid
-from rigidjax.plot.film import Film as Film, tumble as tumble
-from rigidjax.plot.fits import fit as fit
-from rigidjax.plot.leftover import residuals as residuals
+from rigidjax.plot.animation import Film as Film, tumble as tumble
+from rigidjax.plot.body_axes import body_axes as body_axes
+from rigidjax.plot.ellipsoids import inertia_ellipsoid as inertia_ellipsoid
+from rigidjax.plot.fit import fit as fit
+from rigidjax.plot.frames import frames as frames
+from rigidjax.plot.horizons import horizons as horizons
 from rigidjax.plot.light_curves import light_curve as light_curve
-from rigidjax.plot.paths import frames as frames
+from rigidjax.plot.phase_portrait import phase_portrait as phase_portrait
 from rigidjax.plot.player import player as player
 from rigidjax.plot.poinsot import herpolhode as herpolhode, polhode as polhode
-from rigidjax.plot.sphere import body_axes as body_axes
+from rigidjax.plot.residuals import residuals as residuals
 from rigidjax.plot.style import COLOURS as COLOURS
-from rigidjax.plot.time import motion as motion
-from rigidjax.plot.tops import phase_portrait as phase_portrait
+from rigidjax.plot.time_series import motion as motion
 
 __dir__ = own_names(__name__)

@@ -1,4 +1,4 @@
-"""A tumbling body to turn with the mouse: viser's recorded scene, one page without a network."""
+"""A tumbling body on a page of its own, turned with the mouse: viser's recorded scene, offline."""
 
 from typing import Any
 
@@ -7,7 +7,7 @@ from jaxtyping import ArrayLike, Float
 
 from rigidjax._types import HasAttitude
 from rigidjax.body.inertia import Inertia, MassProperties
-from rigidjax.plot.film import CORNERS, FACES, Film, box_of, evenly
+from rigidjax.plot.animation import CORNERS, FACES, Film, box_of, evenly
 from rigidjax.plot.style import COLOURS, matrices
 
 

@@ -14,6 +14,7 @@ from rigidjax.plot.style import (
     COLOURS,
     around_ball,
     attitudes,
+    cage,
     cube,
     flat_axes,
     globe,
@@ -30,7 +31,9 @@ def polhode(
 
     Drawn along the principal axes (ascending moments), in units of h = |Π| of the first state.
     Thin lines are other energies at the same h; the broken ones the separatrix through the middle
-    axis. Source: Landau and Lifshitz, Mechanics, § 37.
+    axis. What lies behind the sphere is dotted (this motion) or faint (the others).
+
+    Source: Landau and Lifshitz, Mechanics, § 37.
 
     **Arguments:** `inertia`; `states` of one body with a leading time axis; `energies` how many
     thin lines; `title`; `ax` 3-D axes of yours. **Returns** the axes.
@@ -58,19 +61,24 @@ def polhode(
     twice_energy = float(np.sum(pi[0] ** 2 / i))
 
     ax = solid_axes(ax)
-    globe(ax, (1.0, 1.0, 1.0), COLOURS[5], 0.10)
-    globe(ax, np.sqrt(twice_energy * i), COLOURS[4], 0.14)
+    # By what is said here, not by depth, which matplotlib takes of a whole surface: the path would
+    # be lost under the sphere.
+    ax.computed_zorder = False
+    globe(ax, (1.0, 1.0, 1.0), COLOURS[5], 0.15)
+    cage(ax, np.sqrt(twice_energy * i), COLOURS[4], lw=0.5, alpha=0.8, zorder=2)
     # Where all moments are equal every energy is the same one: there are no lines to draw.
     if i[2] - i[0] > 1e-9 * i[2]:
         _others(ax, i, energies)
-    around_ball(ax, pi, pi, color=COLOURS[1], lw=2.6, label="this motion")
-    ax.plot(*pi[:1].T, color=COLOURS[1], marker="o", ms=6, ls="")
+    hidden = {"alpha": 1.0, "ls": (0, (1, 1)), "lw": 1.8}
+    around_ball(ax, pi, pi, behind=hidden, color=COLOURS[1], lw=2.6, label="this motion", zorder=5)
+    ax.plot(*pi[:1].T, color=COLOURS[1], marker="o", ms=6, ls="", label="start", zorder=6)
     reach = max(1.0, float(np.sqrt(twice_energy * i).max()))
     cube(ax, reach, ("Π₁ / h", "Π₂ / h", "Π₃ / h"))
     handles, names = ax.get_legend_handles_labels()
+    from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    handles += [Patch(color=COLOURS[5], alpha=0.4), Patch(color=COLOURS[4], alpha=0.5)]
+    handles += [Patch(color=COLOURS[5], alpha=0.4), Line2D([], [], color=COLOURS[4], lw=0.8)]
     names += ["momentum sphere", "energy ellipsoid"]
     ax.legend(handles, names, loc="upper left", fontsize=8)
     ax.set_title(title or "polhode, principal axes of the body")
@@ -94,10 +102,12 @@ def _others(ax: Any, i: np.ndarray, energies: int) -> None:
     level = np.einsum("i,ijk->jk", inverse, ball**2)
     lines = contourpy.contour_generator(around, down, level)
     for value in np.linspace(inverse[2], inverse[0], energies + 2)[1:-1]:
-        _curves(ax, lines.lines(value), lw=0.6, color="0.35")
+        _curves(ax, lines.lines(value), lw=0.6, color="0.35", zorder=3)
     distinct = min(i[1] - i[0], i[2] - i[1]) > 1e-9 * i[2]
     if distinct:
-        _curves(ax, lines.lines(inverse[1]), lw=1.2, color="0.1", ls="--", label="separatrix")
+        _curves(
+            ax, lines.lines(inverse[1]), lw=1.2, color="0.1", ls="--", label="separatrix", zorder=4
+        )
 
 
 def _curves(ax: Any, curves: Any, **how: Any) -> None:

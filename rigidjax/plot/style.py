@@ -121,24 +121,44 @@ def towards_viewer(ax: Any) -> np.ndarray:
     return np.array([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)])
 
 
-def around_ball(ax: Any, path: np.ndarray, centre_free: np.ndarray, **how: Any) -> None:
-    """A line on a ball: drawn in full where it faces the eye, faintly where the ball hides it.
+def around_ball(
+    ax: Any,
+    path: np.ndarray,
+    centre_free: np.ndarray,
+    *,
+    behind: dict[str, Any] | None = None,
+    **how: Any,
+) -> None:
+    """A line on a ball: drawn in full where it faces the eye, otherwise where the ball hides it.
 
-    **Arguments:** `path` (T, 3); `centre_free` (T, 3) the outward normals there.
+    **Arguments:** `path` (T, 3); `centre_free` (T, 3) the outward normals there; `behind` how the
+    hidden part differs, faint unless said otherwise; `how` of matplotlib's lines.
     """
     front = centre_free @ towards_viewer(ax) > 0
     label = how.pop("label", None)
     alpha = how.pop("alpha", 1.0)
-    for seen, strength, name in ((front, alpha, label), (~front, 0.25 * alpha, None)):
+    hidden = {"alpha": 0.25 * alpha, **(behind or {})}
+    for seen, more in ((front, {"alpha": alpha, "label": label}), (~front, hidden)):
         # One point over the edge on both sides, so that no gap opens between the two.
         wide = seen | np.roll(seen, 1) | np.roll(seen, -1)
         wide[0], wide[-1] = seen[0], seen[-1]
         line = np.where(wide[:, None], path, np.nan)
-        ax.plot(*line.T, alpha=strength, label=name, **how)
+        ax.plot(*line.T, **{**how, **more})
 
 
 def globe(ax: Any, semi_axes: Any, colour: str, alpha: float) -> None:
-    """An ellipsoid along the axes, translucent, with meridians."""
+    """An ellipsoid along the axes, translucent."""
+    shape = _ellipsoid(semi_axes)
+    ax.plot_surface(*shape, color=colour, alpha=alpha, linewidth=0, rstride=1, cstride=1)
+
+
+def cage(ax: Any, semi_axes: Any, colour: str, **how: Any) -> None:
+    """An ellipsoid along the axes by meridians and parallels: what is inside stays visible."""
+    shape = _ellipsoid(semi_axes)
+    ax.plot_wireframe(*shape, color=colour, rstride=4, cstride=4, **how)
+
+
+def _ellipsoid(semi_axes: Any) -> np.ndarray:
     u, v = np.linspace(0, 2 * np.pi, 49), np.linspace(0, np.pi, 25)
     ball = np.stack(
         [
@@ -147,8 +167,7 @@ def globe(ax: Any, semi_axes: Any, colour: str, alpha: float) -> None:
             np.outer(u * 0 + 1, np.cos(v)),
         ]
     )
-    shape = np.asarray(semi_axes)[:, None, None] * ball
-    ax.plot_surface(*shape, color=colour, alpha=alpha, linewidth=0, rstride=1, cstride=1)
+    return np.asarray(semi_axes)[:, None, None] * ball
 
 
 def cube(ax: Any, reach: float, labels: tuple[str, str, str]) -> None:

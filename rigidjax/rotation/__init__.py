@@ -1,4 +1,4 @@
-"""How a thing can be turned: matrices, quaternions, and charts."""
+"""Rotations: matrices, quaternions, Euler angles, Rodrigues parameters."""
 
 from rigidjax._names import own_names
 from rigidjax.rotation import (

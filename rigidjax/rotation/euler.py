@@ -24,8 +24,8 @@ from rigidjax import _checks
 from rigidjax._names import own_names
 from rigidjax._types import Mat3, Mat3Like, Quat, QuatLike, Scalar, Vec3, Vec3Like
 from rigidjax.rotation import quaternion
-from rigidjax.rotation.algebra import apply, components, cross, dot, near_one
-from rigidjax.rotation.gate import direction, turn
+from rigidjax.rotation.linalg3 import apply, components, cross, dot, near_one
+from rigidjax.rotation.validation import direction, turn
 
 _MANY_TURNS = 8 * np.pi
 

@@ -2,7 +2,7 @@
 
 q and −q are the same rotation. `log`, and every error built on it, gives the same bits for both.
 The maps here take one quaternion and normalise nothing, so that they cost little in a vector field;
-`check` is the gate for data from outside. Where one says that it refuses values, those are meant
+`check` is for data from outside. Where one says that it refuses values, those are meant
 that are known (not traced).
 
 Range: what does not ask for the length of a quaternion or an axis (`normalise`, `log`, `angle`,
@@ -23,15 +23,7 @@ from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 from rigidjax import _checks
 from rigidjax._names import own_names
 from rigidjax._types import Mat3, Mat3Like, Quat, QuatLike, Scalar, ScalarLike, Vec3, Vec3Like
-from rigidjax.rotation.algebra import (
-    components,
-    cross_components,
-    dot,
-    dot_components,
-    near_one,
-)
-from rigidjax.rotation.gate import direction, rotation_matrix, turn, unit_quaternion
-from rigidjax.rotation.maps import (
+from rigidjax.rotation.kernels import (
     flipped,
     matrix_to_quaternion,
     normalised,
@@ -39,6 +31,14 @@ from rigidjax.rotation.maps import (
     quaternion_to_vector,
     vector_to_quaternion,
 )
+from rigidjax.rotation.linalg3 import (
+    components,
+    cross_components,
+    dot,
+    dot_components,
+    near_one,
+)
+from rigidjax.rotation.validation import direction, rotation_matrix, turn, unit_quaternion
 
 _HINT = "one quaternion is (w, x, y, z), scalar first; batch with jax.vmap"
 
@@ -123,7 +123,7 @@ def rotate_inverse(q: QuatLike, y: Vec3Like) -> Vec3:
 
 
 def check(q: Float[ArrayLike, "*batch 4"], *, name: str = "q") -> Float[Array, "*batch 4"]:
-    """The gate for quaternions from outside: normalised, or refused.
+    """Check a quaternion that comes from outside: normalised, or refused.
 
     **Arguments:** `q` (..., 4), scalar first; `name` how messages call it. **Returns:** it, with
     length 1 to round-off. **Raises:** for NaN, a zero quaternion, and a length off by more than

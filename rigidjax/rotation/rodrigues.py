@@ -13,8 +13,8 @@ from rigidjax import _checks
 from rigidjax._names import own_names
 from rigidjax._types import Mat3, Mat3Like, Quat, QuatLike, Vec3, Vec3Like
 from rigidjax.rotation import quaternion
-from rigidjax.rotation.algebra import components, cross, dot, near_one
-from rigidjax.rotation.gate import direction
+from rigidjax.rotation.linalg3 import components, cross, dot, near_one
+from rigidjax.rotation.validation import direction
 
 
 def from_quaternion(q: QuatLike) -> Vec3:

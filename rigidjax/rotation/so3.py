@@ -14,7 +14,9 @@ from rigidjax import _checks
 from rigidjax._names import own_names
 from rigidjax._types import Mat3, Mat3Like, Scalar, ScalarLike, Vec3, Vec3Like
 from rigidjax.rotation import quaternion
-from rigidjax.rotation.algebra import (
+from rigidjax.rotation.averaging import mean as mean, mean_quaternion as mean_quaternion
+from rigidjax.rotation.kernels import hat_polynomial, matrix_to_quaternion, vector_to_matrix
+from rigidjax.rotation.linalg3 import (
     apply as apply,
     basis as basis,
     components,
@@ -27,16 +29,9 @@ from rigidjax.rotation.algebra import (
     square,
     vee as vee,
 )
-from rigidjax.rotation.estimate import (
-    align as align,
-    mean as mean,
-    mean_quaternion as mean_quaternion,
-    project as project,
-    wahba as wahba,
-)
-from rigidjax.rotation.gate import rotation_matrix, turn
-from rigidjax.rotation.maps import hat_polynomial, matrix_to_quaternion, vector_to_matrix
-from rigidjax.special.series import inverse_kernel, stumpff
+from rigidjax.rotation.validation import rotation_matrix, turn
+from rigidjax.rotation.wahba import align as align, project as project, wahba as wahba
+from rigidjax.special.stumpff import inverse_kernel, stumpff
 
 
 def exp(v: Vec3Like) -> Mat3:
@@ -264,7 +259,7 @@ def uniform(key: PRNGKeyArray, dtype: Any = float) -> Mat3:
 def check(
     matrix: Float[ArrayLike, "*batch 3 3"], *, name: str = "matrix"
 ) -> Float[Array, "*batch 3 3"]:
-    """The gate for matrices from outside: returned as they are, or refused.
+    """Check a matrix that comes from outside: returned as it is, or refused.
 
     **Arguments:** `matrix` (..., 3, 3); `name` how messages call it. **Raises:** for NaN, a
     left-handed frame (det < 0), and |MᵀM − 1| above 1e-6 (float32: 1e-3); a `ValueError`, or under

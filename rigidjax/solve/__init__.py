@@ -1,6 +1,6 @@
 """Answers with a solver: by our own loops, or by diffrax."""
 
-from rigidjax._names import own_names
+from rigidjax._names import own_names, renamed
 from rigidjax.solve import solvers as solvers
 from rigidjax.solve.adaptive import adaptive as adaptive
 from rigidjax.solve.crossings import Crossings as Crossings, crossings as crossings
@@ -10,12 +10,12 @@ from rigidjax.solve.exponents import (
     lyapunov_exponents as lyapunov_exponents,
 )
 from rigidjax.solve.fixed_loop import fixed as fixed
-from rigidjax.solve.projection import (
-    GroupInterpolation as GroupInterpolation,
-    Projected as Projected,
-)
+from rigidjax.solve.projection import Projected as Projected
 from rigidjax.solve.simulate import simulate as simulate
 from rigidjax.solve.solution import Solution as Solution
 from rigidjax.solve.vector_field import equations_of_motion as equations_of_motion
 
+__getattr__ = renamed(
+    __name__, {"GroupInterpolation": "rigidjax.solve.projection.GroupInterpolation"}
+)
 __dir__ = own_names(__name__)

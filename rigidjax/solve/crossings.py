@@ -41,6 +41,12 @@ class Crossings(eqx.Module, Generic[State]):
     type of `state0`, with a leading axis; `count` how many; `result` a `diffrax.RESULTS`:
     `successful` where the run came to `t1`, `event_occurred` where it ended with `max_crossings` of
     them, or why it ended early; `num_steps` of the method, partial ones included.
+
+    >>> import rigidjax as rj
+    >>> body, start = rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([0.0, 1.0, 0.01])
+    >>> flips = rj.crossings(body, start, 0.0, 40.0, lambda t, state, body: state.omega[1])
+    >>> [round(float(t), 3) for t in flips.times[: flips.count]]
+    [9.426, 28.277]
     """
 
     times: Float[Array, " crossings"]

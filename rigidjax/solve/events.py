@@ -16,7 +16,7 @@ from rigidjax._types import ScalarLike
 from rigidjax.body.inertia import Inertia
 from rigidjax.exact import FreeBody
 from rigidjax.motion import Attitude, Rigid, on_the_group
-from rigidjax.motion.torques import jumps_of
+from rigidjax.motion.torques.base import jumps_of
 from rigidjax.solve.components import flat, unflat
 from rigidjax.solve.crossing_loop import Search
 from rigidjax.solve.crossing_search import Found, Numbers, Scene, correction, only_found

@@ -30,6 +30,11 @@ class Exponents(eqx.Module):
     from how much the means of twenty parts of the run differ; `times` (N,) the ends of the
     intervals, s; `running` (N, k) what the values would have been by then; `state` at the end;
     `result` a `diffrax.RESULTS`: `successful`, or why a run failed.
+
+    >>> still = lambda t, y, args: jnp.array([0.5, -1.0]) * y
+    >>> found = lyapunov_exponents(still, jnp.zeros(2), 10.0, intervals=40, transient=20)
+    >>> found.running.shape, bool(found.errors.max() < 1e-12)
+    ((20, 2), True)
     """
 
     values: Float[Array, " k"]

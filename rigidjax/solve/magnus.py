@@ -15,7 +15,7 @@ from jaxtyping import Array
 from rigidjax.exact.components3 import Four, Triple, cross
 from rigidjax.motion import Attitude, AttitudeEquations
 from rigidjax.motion.torques.base import sees_attitude
-from rigidjax.rotation.maps import product4, square4
+from rigidjax.rotation.kernels import product4, square4
 from rigidjax.solve.components import join, split
 from rigidjax.solve.explicit import NestedInterpolation, advance, cubic_rows
 from rigidjax.solve.tableaus import KUTTA4

@@ -11,10 +11,11 @@ from jaxtyping import Array
 
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.exact import FreeBody
-from rigidjax.frames import Point, collision, scene_of
+from rigidjax.frames import Point, collision
+from rigidjax.frames.frame_dynamics import scene_of
 from rigidjax.motion import Attitude, Rigid, on_the_group
 from rigidjax.motion.coupled import started
-from rigidjax.motion.torques import jumps_of
+from rigidjax.motion.torques.base import jumps_of
 from rigidjax.solve.adaptive import adaptive
 from rigidjax.solve.direction import Directed, DirectedCondition, DirectedJumps
 from rigidjax.solve.explicit import AbstractExplicit

@@ -14,7 +14,7 @@ from rigidjax._types import ScalarLike
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.frames import AbstractScene, MovingFrame, collision
 from rigidjax.motion.coupled import Coupled
-from rigidjax.motion.torques import jumps_of
+from rigidjax.motion.torques.base import jumps_of
 from rigidjax.motion.torques.states import require_stateless
 from rigidjax.solve import validation
 from rigidjax.solve.direction import direction

@@ -33,6 +33,12 @@ class Solution(eqx.Module, Generic[State]):
     `event_time` s, `event_state` of the type of `state0`: NaN where it was not met, `None` where
     there is no event. `own` a tuple of the states of the laws that have some, as `ys` with a
     leading time axis (see `rigidjax.torques.freeze`), or `None`.
+
+    >>> import rigidjax as rj
+    >>> body, start = rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([0.0, 0.0, 1.0])
+    >>> sol = rj.simulate(body, start, [0.0, 1.0, 2.0])
+    >>> sol.ys.omega.shape, sol.event_time
+    ((3, 3), None)
     """
 
     ts: Float[Array, " times"]

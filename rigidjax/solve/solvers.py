@@ -1,6 +1,7 @@
-"""The methods, under one name: `rigidjax.solvers`."""
+"""Every solver of ours, in one module: `rigidjax.solvers`."""
 
 from rigidjax._names import own_names
+from rigidjax.exact.diffrax_solver import FreeSolver as FreeSolver
 from rigidjax.solve.explicit import (
     DormandPrince8 as DormandPrince8,
     RungeKutta4 as RungeKutta4,

@@ -19,8 +19,7 @@ from rigidjax.exact.components3 import Six, Triple, times
 from rigidjax.exact.derivatives import flow
 from rigidjax.exact.principal_axes import into, out_of, principal_frame
 from rigidjax.motion import Attitude, AttitudeEquations
-from rigidjax.motion.torques import evaluate
-from rigidjax.motion.torques.base import sees_rate
+from rigidjax.motion.torques.base import evaluate, sees_rate
 from rigidjax.rotation import quaternion
 from rigidjax.solve.explicit import NestedInterpolation, cubic_rows
 

@@ -30,8 +30,7 @@ from rigidjax.exact.components3 import (
 )
 from rigidjax.exact.principal_axes import into, out_of, principal_frame
 from rigidjax.motion import Attitude, AttitudeEquations, EulerEquations, Spin, on_the_group
-from rigidjax.motion.torques import evaluate
-from rigidjax.motion.torques.base import sees_attitude
+from rigidjax.motion.torques.base import evaluate, sees_attitude
 from rigidjax.motion.torques.inputs import bind, delays_of
 from rigidjax.rotation import quaternion
 from rigidjax.solve import splitting

@@ -12,9 +12,10 @@ from jaxtyping import Array
 from rigidjax import _checks
 from rigidjax._types import HasAttitude
 from rigidjax.body.inertia import Inertia, MassProperties
-from rigidjax.frames import AbstractScene, MovingFrame, Point, scene_of
+from rigidjax.frames import AbstractScene, MovingFrame, Point
+from rigidjax.frames.frame_dynamics import scene_of
 from rigidjax.motion import Attitude, Rigid, Spin
-from rigidjax.motion.torques import require_rung
+from rigidjax.motion.torques.base import require_rung
 
 
 def require_fit(body: Any, state0: Any, torque: Any) -> None:

@@ -4,7 +4,8 @@ from collections.abc import Callable
 from typing import Any
 
 from rigidjax.body.inertia import Inertia, MassProperties
-from rigidjax.frames import AbstractScene, MovingFrame, Point, scene_of
+from rigidjax.frames import AbstractScene, MovingFrame, Point
+from rigidjax.frames.frame_dynamics import scene_of
 from rigidjax.motion import Attitude, AttitudeEquations, EulerEquations, NewtonEuler, Rigid, Spin
 from rigidjax.motion.coupled import Coupled, CoupledEquations
 from rigidjax.motion.torques import Torque

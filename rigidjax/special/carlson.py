@@ -16,7 +16,7 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, ArrayLike, Float
 
 from rigidjax.special.arguments import common
-from rigidjax.special.half_line import half_line
+from rigidjax.special.carlson_r import r_integral
 
 # Steps after which the series is exact for ratios over the whole range of the dtype.
 _STEPS = {np.dtype("float64"): 13, np.dtype("float32"): 8}
@@ -80,7 +80,7 @@ def rj_(
     >>> round(float(rj_(4.0, 4.0, 4.0, 4.0)), 14)
     0.125
     """
-    return 1.5 * half_line((0.5, 0.5, 0.5, 1.0), common(x=x, y=y, z=z, p=p))
+    return 1.5 * r_integral((0.5, 0.5, 0.5, 1.0), common(x=x, y=y, z=z, p=p))
 
 
 def rc(x: Float[ArrayLike, "..."], y: Float[ArrayLike, "..."]) -> Float[Array, "..."]:
@@ -166,7 +166,7 @@ def _rd_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
     for i, direction in enumerate(directions):
         if not isinstance(direction, SymbolicZero):
             raised = (*powers[:i], powers[i] + 1, *powers[i + 1 :])
-            tangent = tangent - 1.5 * powers[i] * half_line(raised, arguments) * direction
+            tangent = tangent - 1.5 * powers[i] * r_integral(raised, arguments) * direction
     return _rd(arguments), tangent
 
 

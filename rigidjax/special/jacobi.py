@@ -9,7 +9,7 @@ Derivatives: with φ = am(u|m) and u = F(φ|m), keeping u fixed gives ∂φ/∂m
 
 The integrand is positive: X has all its digits at m = 0 and as m → 1, where the textbook formulas
 (Byrd & Friedman 1971, 710.51–53) divide a small difference by m m1. The second derivative in m
-comes from X too for m ≤ 0.9 or |u| ≤ 1; elsewhere from a sum over images (`images.py`).
+comes from X too for m ≤ 0.9 or |u| ≤ 1; elsewhere from a sum over images (`jacobi_near_one.py`).
 """
 
 import math
@@ -23,7 +23,7 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, ArrayLike, Float
 
 from rigidjax.special.arguments import common, complementary, exact_complement
-from rigidjax.special.images import LARGEST_M1, near_one
+from rigidjax.special.jacobi_near_one import LARGEST_M1, near_one
 from rigidjax.special.legendre import MEAN_STEPS, complete, half_turns, integral
 
 # Below this cn and dn, integrals over sd² depend on their ratio only (to the floor squared).

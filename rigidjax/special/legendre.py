@@ -21,7 +21,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from rigidjax.special.arguments import common, complementary
 from rigidjax.special.carlson import rd, rf
-from rigidjax.special.half_line import half_line
+from rigidjax.special.carlson_r import r_integral
 
 # Steps after which a and b agree to √eps for b/a down to the square root of the least number.
 MEAN_STEPS = {np.dtype("float64"): 11, np.dtype("float32"): 8}
@@ -185,7 +185,7 @@ def integral(orders: tuple[int, int, int], sine: Any, cosine: Any, m1: Any, n1: 
     powers, values = [j - k - last + 0.5, 0.5, k + 0.5], [one, c2, delta2]
     if last:
         powers, values = [*powers, float(last)], [*values, c2 + n1 * s * s]
-    return 0.5 * s ** (2 * j + 1) * half_line(tuple(powers), tuple(values))
+    return 0.5 * s ** (2 * j + 1) * r_integral(tuple(powers), tuple(values))
 
 
 @partial(integral.defjvp, symbolic_zeros=True)

@@ -5,14 +5,14 @@ chart, `choose` the short table. `python -m rigidjax workprecision` is all of it
 """
 
 from rigidjax._names import own_names
+from rigidjax.workprecision.baseline import moved as moved
 from rigidjax.workprecision.chart import draw as draw
 from rigidjax.workprecision.drift import long_drift as long_drift
-from rigidjax.workprecision.in_jax import diffrax_method as diffrax_method
-from rigidjax.workprecision.interleaved import (
+from rigidjax.workprecision.jax_methods import diffrax_method as diffrax_method
+from rigidjax.workprecision.measurement import (
     measure as measure,
     worked_out as worked_out,
 )
-from rigidjax.workprecision.known import methods as methods
 from rigidjax.workprecision.method import Method as Method, Ready as Ready, Run as Run
 from rigidjax.workprecision.pareto import (
     Choice as Choice,
@@ -28,8 +28,8 @@ from rigidjax.workprecision.record import (
     write_csv as write_csv,
 )
 from rigidjax.workprecision.reference import Reference as Reference
-from rigidjax.workprecision.regress import moved as moved
+from rigidjax.workprecision.registry import methods as methods
 from rigidjax.workprecision.scene import Scene as Scene
-from rigidjax.workprecision.standard import scenes as scenes
+from rigidjax.workprecision.standard_scenes import scenes as scenes
 
 __dir__ = own_names(__name__)

@@ -8,13 +8,13 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from rigidjax.workprecision import chart, pareto, regress
+from rigidjax.workprecision import baseline, chart, pareto
 from rigidjax.workprecision.drift import long_drift
-from rigidjax.workprecision.interleaved import measure
-from rigidjax.workprecision.known import methods
+from rigidjax.workprecision.measurement import measure
 from rigidjax.workprecision.method import Method
 from rigidjax.workprecision.record import Record, read_csv, write_csv
-from rigidjax.workprecision.standard import scenes
+from rigidjax.workprecision.registry import methods
+from rigidjax.workprecision.standard_scenes import scenes
 
 STORED = Path("tests/workprecision/record.csv")
 QUICK = ("free-top", "heavy-top", "damped-gyrostat")
@@ -98,7 +98,7 @@ def run(options: argparse.Namespace) -> int:
             write_csv(records, options.csv)
             print(f"records: {options.csv}")
         if options.keep is not None:
-            write_csv(regress.kept(records), options.keep)
+            write_csv(baseline.kept(records), options.keep)
             print(f"kept: {options.keep}")
         print(summary(records))
         if options.choose:
@@ -199,7 +199,7 @@ def _draw(records: list[Record], path: Path) -> None:
 
 
 def _compared(records: list[Record], before: list[Record]) -> int:
-    wrong, paced = regress.moved(records, before)
+    wrong, paced = baseline.moved(records, before)
     for line in wrong:
         print(f"moved: {line}")
     for line in paced:

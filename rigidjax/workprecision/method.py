@@ -7,7 +7,11 @@ from rigidjax.workprecision.scene import Scene
 
 
 class Run(NamedTuple):
-    """What one run gives: the last state (or the gradient) as one vector, and the steps taken."""
+    """What one run gives: the last state (or the gradient) as one vector, and the steps taken.
+
+    >>> float(Run([0.0, 1.0], 12).steps)
+    12.0
+    """
 
     numbers: Any
     steps: float
@@ -18,6 +22,10 @@ class Ready(NamedTuple):
 
     **Fields:** `run` setting → `Run`, complete when it returns; `compile` s that making it took,
     `memory` bytes of temporaries, each NaN where unknown.
+
+    >>> ready = Ready(lambda setting: Run([0.0, 1.0], 1 / setting))
+    >>> ready.run(1e-2).steps, ready.compile
+    (100.0, nan)
     """
 
     run: Callable[[float], Run]

@@ -95,6 +95,9 @@ class Choice(NamedTuple):
     the way to the `gradient` at the same relative error and its `gradient_time`; `default` and
     `default_gradient`, times of `simulate` as it stands; `peer`, `peer_time`: who is quicker than
     ours, if anyone.
+
+    >>> Choice._fields[:2]
+    ('scene', 'wanted')
     """
 
     scene: str

@@ -93,6 +93,12 @@ def read_csv(path: str | Path) -> list[Record]:
     **Arguments:** `path` of the file.
 
     **Raises:** `ValueError` for another file, with what it lacks; `OSError` where there is none.
+
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     write_csv([], folder + "/records.csv")
+    ...     read_csv(folder + "/records.csv")
+    []
     """
     with Path(path).open(newline="") as file:
         rows = csv.DictReader(file)

@@ -12,6 +12,10 @@ class Reference(NamedTuple):
     **Fields:** `end` the state as one tuple; `error` of its largest number, as estimated by the
     method that made it; `gradient`, `gradient_error` the same, empty where there is none;
     `source` words.
+
+    >>> top = stored("heavy top")
+    >>> top is None or top.error < 1e-12
+    True
     """
 
     end: tuple[float, ...]

@@ -10,7 +10,7 @@ from once import once
 
 from rigidjax.body import parameters
 from rigidjax.body.inertia import Inertia, MassProperties
-from rigidjax.body.physical import real_mass, real_second_moment
+from rigidjax.body.validation import real_mass, real_second_moment
 
 CHARTS = {
     "R6": (6, parameters.unpack_second_moment, parameters.pack_second_moment),

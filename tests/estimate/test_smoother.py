@@ -47,7 +47,7 @@ def test_it_is_the_most_probable_motion(short):
             if k:
                 kicks = z[6 * k : 6 * k + 6]
                 x = dynamics.advance(record.t[k - 1], record.t[k] - record.t[k - 1], x, kicks)
-            moment = identify.Moment(record.t[k], x.motion, records.BODY, dynamics.field)
+            moment = identify.SensorInput(record.t[k], x.motion, records.BODY, dynamics.field)
             for reading in record.readings:
                 sensor = reading.sensor
                 out.append(sensor.error(moment, reading.values[k]) / sensor.noise)

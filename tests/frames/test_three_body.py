@@ -341,7 +341,7 @@ def test_particles_side_by_side_collide_alone():
         (lambda: MOON.periodic_orbit(PeriodicOrbit(PYKEP, 1.0)), "at a right angle"),
         (
             lambda: MOON.periodic_orbit(PeriodicOrbit(Point([0.5, 0, 0], [0.0, 30.0, 0]), 1.0)),
-            "slid from the guess",
+            "went from the guess",
         ),
         (
             lambda: MOON.periodic_orbit(ARENSTORF, tolerance=1e-30),

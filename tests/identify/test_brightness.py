@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 import rigidjax as rj
 from rigidjax import identify
 from rigidjax.body import brightness
-from rigidjax.identify import Brightness, Moment
+from rigidjax.identify import Brightness, SensorInput
 
 AXES = np.array([2.0, 1.3, 1.0])
 SUN, OBSERVER = [1.0, 0.0, 0.0], [0.8, 0.6, 0.3]
@@ -22,7 +22,7 @@ BODY = rj.shapes.ellipsoid(1.0, AXES).inertia
 
 
 def moment(q, body=BODY, t=0.0):
-    return Moment(jnp.asarray(t), rj.Attitude(q, [0.0, 0.0, 1.0]), body, lambda t, y, args: y)
+    return SensorInput(jnp.asarray(t), rj.Attitude(q, [0.0, 0.0, 1.0]), body, lambda t, y, args: y)
 
 
 @pytest.mark.parametrize("unit", ["flux", "mag"])
@@ -63,7 +63,9 @@ def tumbling(unit="mag"):
     sensor = Brightness(SUN, OBSERVER, noise=0.02, unit=unit)
     state = rj.Attitude([1.0, 0.0, 0.0, 0.0], [0.3, 1.0, 0.4])
     motion = rj.simulate(BODY, state, TS).ys
-    clean = once(jax.vmap(lambda t, y: sensor.predicted(Moment(t, y, BODY, lambda t, y, args: y))))
+    clean = once(
+        jax.vmap(lambda t, y: sensor.predicted(SensorInput(t, y, BODY, lambda t, y, args: y)))
+    )
     values = np.asarray(clean(jnp.asarray(TS), motion))
     return sensor, values + 0.02 * np.random.default_rng(0).normal(size=TS.size)
 

@@ -10,9 +10,9 @@ from scipy import signal
 import rigidjax as rj
 from rigidjax import identify
 from rigidjax.identify.jacobian import errors_of_one
+from rigidjax.identify.padding import one
 from rigidjax.identify.parameters import local
-from rigidjax.identify.sensors import Moment
-from rigidjax.identify.stacking import one
+from rigidjax.identify.sensors import SensorInput
 
 BODY = rj.Inertia.from_principal(1.0, 2.0, 2.7)
 
@@ -122,7 +122,7 @@ def test_a_gyro_that_feels_acceleration():
     place, gravity = [0.1, 0.0, -0.05], [0.0, 0.0, -9.81]
     gyro = identify.Gyro(0.01, g_sensitivity=matrix, place=place, gravity=gravity)
     felt = identify.Accelerometer(0.1, place=place, gravity=gravity)
-    moment = Moment(jnp.asarray(0.0), state, BODY, field)
+    moment = SensorInput(jnp.asarray(0.0), state, BODY, field)
     force = -felt.error(moment, jnp.zeros(3))
     np.testing.assert_allclose(
         -gyro.error(moment, jnp.zeros(3)), state.omega + matrix @ force, rtol=1e-14

@@ -16,11 +16,11 @@ from jax.flatten_util import ravel_pytree
 import rigidjax as rj
 from rigidjax import identify
 from rigidjax.__main__ import main
-from rigidjax.identify import checkpoint, reported, search
+from rigidjax.identify import checkpoint, quantities, search
 from rigidjax.identify.checkpoint import Tried
 from rigidjax.identify.jacobian import errors_of_one, with_blocks
+from rigidjax.identify.padding import one
 from rigidjax.identify.parameters import local, places
-from rigidjax.identify.stacking import one
 
 BODY = rj.Inertia.from_principal(1.0, 1.6, 2.1)
 DRAG = [0.05, 0.08, 0.02]
@@ -146,7 +146,7 @@ def test_priors_hold_what_the_data_cannot_see(records):
     low, high = found.interval(0.95)["wheel"]
     # The scale of everything hangs on the wheel: its prior is all that is known of it.
     np.testing.assert_allclose(np.log(high / low) / (2 * 1.96), 0.1, rtol=0.1)
-    assert any("go together" in line for line in found.identifiability)
+    assert any("are strongly correlated" in line for line in found.identifiability)
 
 
 def test_the_entropic_prior_is_the_divergence():
@@ -484,6 +484,6 @@ def test_free_numbers_are_reported_with_their_units():
         rj.identify.Free(lambda r: r.torque.parts[1].coefficient, "drag", unit="N m s"),
     ]
     problem = rj.identify.Problem(record, rj.identify.Principal(1e-3), free=free)
-    units = {name.split()[0]: unit for name, unit, _ in reported.labels(problem)}
+    units = {name.split()[0]: unit for name, unit, _ in quantities.labels(problem)}
     wanted = {"bias": "rad/s", "scale": "", "offset": "s", "tilt": "rad", "drag": "N m s"}
     assert {name: units[name] for name in wanted} == wanted

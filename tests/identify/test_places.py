@@ -6,13 +6,13 @@ import pytest
 
 import rigidjax as rj
 from rigidjax import identify
-from rigidjax.identify.reference import reference_of
+from rigidjax.identify.reference_states import reference_of
 
 Q = np.array([0.8, 0.4, -0.4, 0.2])
 BODY = rj.MassProperties(2.0, [0.1, -0.2, 0.3], np.diag([0.2, 0.3, 0.4]))
 STATE = rj.Rigid([1.0, 2.0, -0.5], [0.3, 0.1, -0.2], Q, [0.7, 0.1, -0.4])
 PLACE = np.array([0.5, 0.1, -0.2])
-HERE = identify.Moment(jnp.asarray(0.0), STATE, BODY, lambda t, y, args: y)
+HERE = identify.SensorInput(jnp.asarray(0.0), STATE, BODY, lambda t, y, args: y)
 
 
 def test_errors_against_points_moved_by_hand():

@@ -8,7 +8,7 @@ import pytest
 import rigidjax as rj
 from rigidjax import identify
 from rigidjax.identify import uncertainty
-from rigidjax.identify.reported import carried
+from rigidjax.identify.quantities import carried
 
 TS = jnp.linspace(0.0, 10.0, 80)
 BODY = rj.Inertia.from_principal(1.0, 1.6, 2.1)
@@ -101,7 +101,7 @@ def test_i3_no_start_is_called_right_that_is_wrong():
     assert right >= 30
 
 
-# In every run: an outlier among real observations (tests/identify/test_toutatis.py).
+# In every run: an outlier among real observations (tests/datasets/test_toutatis.py).
 @pytest.mark.slow
 @pytest.mark.parametrize("loss", [identify.Huber(), identify.SoftL1()])
 def test_i4_outliers(loss):

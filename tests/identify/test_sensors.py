@@ -8,7 +8,7 @@ import pytest
 from scipy.interpolate import CubicSpline
 
 import rigidjax as rj
-from rigidjax.identify.sensors.base import Moment
+from rigidjax.identify.sensors.base import SensorInput
 
 BODY = rj.shapes.box(1.3, [0.1, 0.2, 0.3])
 GRAVITY = jnp.array([0.0, 0.0, -9.81])
@@ -18,7 +18,7 @@ PLACE = jnp.array([0.05, -0.02, 0.08])
 
 
 def moment(state, body, torque=None):
-    return Moment(jnp.asarray(0.3), state, body, rj.equations_of_motion(body, state, torque))
+    return SensorInput(jnp.asarray(0.3), state, body, rj.equations_of_motion(body, state, torque))
 
 
 def along(state, body, point, torque=None):

@@ -8,7 +8,7 @@ import numpy as np
 
 import rigidjax as rj
 from rigidjax import exact, identify
-from rigidjax.identify import Brightness, Moment
+from rigidjax.identify import Brightness, SensorInput
 
 HOUR, NOISE, COUNT = 3600.0, 0.02, 480
 
@@ -39,7 +39,7 @@ def brightness(sensor, moments, state, ts):
     motion = exact.FreeBody(body, state)
 
     def at(t):
-        return sensor.predicted(Moment(t, motion(t), body, lambda t, y, args: y))
+        return sensor.predicted(SensorInput(t, motion(t), body, lambda t, y, args: y))
 
     return jax.vmap(at)(ts)
 

@@ -13,6 +13,7 @@ from scipy.integrate import solve_ivp
 
 import rigidjax as rj
 from rigidjax import torques
+from rigidjax.motion.torques import base
 
 LOCKED = rj.Inertia(np.array([[3.0, 0.1, -0.2], [0.1, 2.5, 0.3], [-0.2, 0.3, 2.0]]))
 AXES = np.array([[1.0, 0, 0], [0, 0.6, 0.8], [0, 0, 1.0]])
@@ -309,7 +310,7 @@ def made(**change):
         (lambda: rj.simulate(BODY, START, TS, Wrong("no")), TypeError, "state0 of Wrong: wanted an array"),
         (lambda: rj.simulate(BODY, START, TS, Wrong(())), ValueError, "state0 of Wrong: wanted a tree of arrays, got none"),
         (lambda: WHEELS(0.0, START, BODY), TypeError, "own"),
-        (lambda: torques.evaluate(WHEELS, 0.0, START, BODY), TypeError, r"ReactionWheels has states of its own.*torques.freeze"),
+        (lambda: base.evaluate(WHEELS, 0.0, START, BODY), TypeError, r"ReactionWheels has states of its own.*torques.freeze"),
         (lambda: rj.conserved(BODY, START, WHEELS), TypeError, "has states of its own"),
         (lambda: torques.freeze(WHEELS, ()), ValueError, "own: no states for ReactionWheels"),
         (lambda: torques.freeze(WHEELS, (1.0, 2.0)), ValueError, "own: the law has 1 with states, got 2"),

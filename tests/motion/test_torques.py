@@ -12,6 +12,7 @@ from once import once
 import rigidjax as rj
 from rigidjax import torques
 from rigidjax.motion import conserved, drift, energy
+from rigidjax.motion.torques import base
 
 TENSOR = np.array([[1.0, 0.1, -0.05], [0.1, 1.6, 0.2], [-0.05, 0.2, 2.1]])
 INERTIA = rj.Inertia(TENSOR)
@@ -90,15 +91,15 @@ def _drag_by_hand():
     ],
 )  # fmt: skip
 def test_values_by_hand(law, state, wanted):
-    torques.require_rung(law, state)
-    found = torques.evaluate(law, 0.5, state, INERTIA)
+    base.require_rung(law, state)
+    found = base.evaluate(law, 0.5, state, INERTIA)
     np.testing.assert_allclose(found, wanted, rtol=1e-14, atol=1e-15)
 
 
 def test_a_gravity_gradient_follows_its_orbit():
     moving, still = torques.GravityGradient(5.0, ORBIT), torques.GravityGradient(5.0, ORBIT(0.5))
-    found = torques.evaluate(moving, 0.5, ATTITUDE, INERTIA)
-    np.testing.assert_allclose(found, torques.evaluate(still, 0.5, ATTITUDE, INERTIA), rtol=1e-14)
+    found = base.evaluate(moving, 0.5, ATTITUDE, INERTIA)
+    np.testing.assert_allclose(found, base.evaluate(still, 0.5, ATTITUDE, INERTIA), rtol=1e-14)
     assert moving.axis is None and not moving.steady and still.steady
 
 
@@ -126,7 +127,7 @@ def test_a_torque_and_force_are_minus_the_slope_of_the_energy(law, state):
         return law.energy(0.0, at, body)
 
     turn, shift = jax.grad(moved, argnums=(0, 1))(jnp.zeros(3), jnp.zeros(3))
-    force, torque = torques.act(law, 0.0, state, body)
+    force, torque = base.act(law, 0.0, state, body)
     np.testing.assert_allclose(torque, -turn, rtol=1e-12, atol=1e-14)
     if force is not None:
         np.testing.assert_allclose(force, -shift, rtol=1e-12, atol=1e-14)
@@ -219,7 +220,7 @@ def test_derivatives_of_first_and_second_order(law, state):
     @once
     def value(numbers):
         law, state, body = restore(numbers)
-        force, torque = torques.act(law, 0.5, state, body)
+        force, torque = base.act(law, 0.5, state, body)
         return torque if force is None else jnp.concatenate([force, torque])
 
     check_grads(value, (numbers,), order=2, modes=["fwd"], rtol=1e-5, atol=1e-6)
@@ -229,12 +230,12 @@ def test_derivatives_of_first_and_second_order(law, state):
 @pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
 def test_at_rest_the_first_derivative_of_quadratic_laws_is_zero_not_nan(mode):
     law = torques.QuadraticDamping([0.3, 0.1, 0.2])
-    at_rest = mode(lambda w: torques.evaluate(law, 0.0, rj.Spin(w), INERTIA))(jnp.zeros(3))
+    at_rest = mode(lambda w: base.evaluate(law, 0.0, rj.Spin(w), INERTIA))(jnp.zeros(3))
     np.testing.assert_array_equal(at_rest, np.zeros((3, 3)))
     drag = torques.Drag(0.5, [0.1, 0.2, 0.3])
 
     def push(v):
-        return torques.act(drag, 0.0, rj.Rigid(np.zeros(3), v, Q, OMEGA), BODY)[0]
+        return base.act(drag, 0.0, rj.Rigid(np.zeros(3), v, Q, OMEGA), BODY)[0]
 
     np.testing.assert_array_equal(mode(push)(jnp.zeros(3)), np.zeros((3, 3)))
 
@@ -338,17 +339,17 @@ def test_energy_adds_up():
         (lambda: torques.Sum(), "at least one torque"),
         (lambda: torques.Sum([TOP, WHEEL]), r"got list; several go in a Sum: Sum\(a, b\)"),
         (lambda: torques.Sum(TOP, torques.Damping), r"got the class Damping, wanted one.*Damping\(\.\.\.\)"),
-        (lambda: torques.require_rung([TOP], ATTITUDE), r"torque: wanted a torque.*got list"),
-        (lambda: torques.require_rung(torques.Damping, SPIN), "torque: got the class Damping"),
+        (lambda: base.require_rung([TOP], ATTITUDE), r"torque: wanted a torque.*got list"),
+        (lambda: base.require_rung(torques.Damping, SPIN), "torque: got the class Damping"),
         (lambda: torques.Damping([1.0, np.nan, 1.0]), "coefficient: contains NaN"),
         (lambda: torques.GravityGradient(1.0, np.zeros(3)), "position: .*got zero"),
         (lambda: torques.FromPotential(3.0), "wanted a function q → U, J, got float"),
-        (lambda: torques.require_rung(TOP, SPIN), "HeavyTop needs a state with HasAttitude.*climb"),
-        (lambda: torques.require_rung(torques.Sum(WHEEL, TOP), SPIN), "Sum needs.*HasAttitude"),
-        (lambda: torques.require_rung(FALL, ATTITUDE), "UniformGravity needs a state with HasPose"),
+        (lambda: base.require_rung(TOP, SPIN), "HeavyTop needs a state with HasAttitude, got Spin; take Attitude"),
+        (lambda: base.require_rung(torques.Sum(WHEEL, TOP), SPIN), "Sum needs.*HasAttitude"),
+        (lambda: base.require_rung(FALL, ATTITUDE), "UniformGravity needs a state with HasPose"),
         (lambda: rj.NewtonEuler(BODY, TOP)(0.0, RIGID), "fixed point.*use UniformGravity"),
-        (lambda: torques.evaluate(lambda t, s, b: torques.Wrench([0.0, 0, 1]), 0.0, SPIN, INERTIA), "needs a Rigid"),
-        (lambda: torques.evaluate(lambda t, s, b: s.omega[:2], 0.0, SPIN, INERTIA), "body-frame N m"),
+        (lambda: base.evaluate(lambda t, s, b: torques.Wrench([0.0, 0, 1]), 0.0, SPIN, INERTIA), "needs a Rigid"),
+        (lambda: base.evaluate(lambda t, s, b: s.omega[:2], 0.0, SPIN, INERTIA), "body-frame N m"),
         (lambda: energy(INERTIA, SPIN, torques.Damping([1.0, 1, 1])), "Damping has no potential"),
         (lambda: rj.EulerEquations(rj.Inertia.from_principal(1.0, 1.0, 0.0)), "a principal moment is zero.*rod"),
         (lambda: rj.NewtonEuler(rj.MassProperties(1.0, np.zeros(3), np.diag([0.0, 0, 1.0]))), "moment is zero"),

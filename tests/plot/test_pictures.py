@@ -15,7 +15,7 @@ import rigidjax as rj
 mpl.use("Agg")
 import matplotlib.pyplot as plt
 
-from rigidjax.plot.leftover import power
+from rigidjax.plot.residuals import power
 
 BODY = rj.Inertia.from_principal(1.0, 2.0, 3.0)
 SOLID = rj.Inertia.from_principal(1.0, 2.0, 2.5)
@@ -257,7 +257,7 @@ def test_a_film_has_its_pictures(flip, tmp_path):
 
 
 def test_the_box_of_a_box_is_itself():
-    from rigidjax.plot.film import box_of
+    from rigidjax.plot.animation import box_of
 
     half, turn = box_of(rj.shapes.box(3.0, [0.2, 0.6, 0.4]))
     np.testing.assert_allclose(half, [0.1, 0.2, 0.3])
@@ -265,7 +265,7 @@ def test_the_box_of_a_box_is_itself():
 
 
 def test_between_saved_times_a_film_stays_on_the_group():
-    from rigidjax.plot.film import evenly
+    from rigidjax.plot.animation import evenly
 
     ts = jnp.linspace(0.0, 6.0, 40)
     turning = jax.vmap(lambda t: rj.quaternion.exp(jnp.array([0.0, 0.0, 1.0]) * t))(ts)

@@ -122,7 +122,6 @@ ACCEPTED: list[tuple[str, str, str, str]] = [
     ("identify.Recording", "mask: None", "taken*", "None is documented: nothing is masked"),
     ("identify.Recording", "torque: None", "taken*", "None is documented: no torque at all"),
     ("simulate (options)", "max_steps: None", "taken*", "None is documented: as many as it takes"),
-    ("frames.scene_of", "force: None", "taken*", "None is documented: no force at all"),
 ]
 
 

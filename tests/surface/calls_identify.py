@@ -56,7 +56,7 @@ row(
     **HOST,
 )
 leave_out("Recording makes it", "identify.Reading")
-leave_out("a fit hands it to a sensor", "identify.Moment")
+leave_out("a fit hands it to a sensor", "identify.SensorInput")
 abstract = ("AbstractBodyChart", "AbstractIntegrator", "AbstractLoss", "AbstractSensor")
 leave_out("abstract: made by subclassing", *(f"identify.{name}" for name in abstract))
 
@@ -253,10 +253,10 @@ for name in ("write_html", "write_json"):
         transforms=(),
     )
 for name in ("problem", "recording"):
-    row(f"identify.toutatis.{name}", transforms=())
+    row(f"datasets.toutatis.{name}", transforms=())
 leave_out(
-    "for the fit of one example: tests/identify/test_toutatis.py",
-    *(f"identify.toutatis.{name}" for name in ("remarks", "rms_degrees", "rows")),
+    "for the fit of one example: tests/datasets/test_toutatis.py",
+    *(f"datasets.toutatis.{name}" for name in ("remarks", "rms_degrees", "rows")),
 )
 
 # Pictures.

@@ -104,24 +104,11 @@ row(
     lambda: dict(one=s.damping(), other=s.top()),
     run=lambda one, other: rj.torques.Sum(one, other),
 )
-for name in ("act", "evaluate"):
-    row(
-        f"motion.torques.{name}",
-        lambda name=name: dict(
-            **{"law" if name == "act" else "torque": s.top()},
-            t=0.3,
-            state=s.attitude(),
-            body=s.inertia(),
-        ),
-        says=("torque", "needs a state"),
-    )
-row("motion.torques.in_precision", lambda: dict(tree=s.body(), dtype="float64"), groups=("same",))
 row(
     "motion.torques.jumps_of",
     lambda: dict(source=rj.torques.Pulses(TS, np.stack([V, W, Y]))),
     groups=("same", "single"),
 )
-row("motion.torques.require_rung", lambda: dict(torque=s.top(), state=s.attitude()), transforms=())
 leave_out(
     "abstract: made by subclassing", "motion.torques.AbstractForce", "motion.torques.AbstractTorque"
 )
@@ -193,7 +180,6 @@ row(
 )
 row("frames.BodyInFrame", lambda: dict(frame=s.frame(), torque=s.damping()))
 row("frames.Force", dict(force=lambda t, state, body: -state.x), transforms=())
-row("frames.scene_of", lambda: dict(force=s.frame()))
 leave_out("made by MovingFrame.at", "frames.Instant")
 leave_out("abstract: made by subclassing", "frames.AbstractScene")
 
@@ -300,7 +286,6 @@ row(
 )
 for name in ("body_period", "precession_period"):
     row(f"exact.{name}", lambda: dict(inertia=s.inertia(), omega0=W), transforms=EXACT)
-leave_out("diffrax makes them", "exact.FreeInterpolation", "solve.GroupInterpolation")
 
 # Solvers.
 for name in ("DormandPrince8", "Magnus4", "RungeKutta4", "Splitting2", "Splitting4", "Splitting6"):

@@ -499,7 +499,7 @@ def laws() -> list[Case]:
                 rj.conserved(s.inertia(), attitude_of(x[7:]), t.HeavyTop(x[0], x[1:4], x[4:7])),
             ),
             {"ordinary": join(2.0, V, DOWN, Q, W), "hanging": join(2.0, 0, 0, 1, DOWN, ONE, np.zeros(3))},
-            covers=("energy", "conserved", "torques.act", "torques.evaluate"),
+            covers=("energy", "conserved"),
         ),
         # In time and in the table; knots are where a derivative is that of one side.
         Case("torques.Linear", lambda x: t.Linear(jnp.asarray(TS), x[:12].reshape(4, 3))(x[12]), {"between": join(tables, 0.6), "before": join(tables, -1.0)}),
@@ -728,7 +728,7 @@ def fits() -> list[Case]:
 
         def missed(x: Any, sensor: Any = sensor, reading: Any = reading) -> Any:
             state = rj.Rigid(x[:3], x[3:6], unit(x[6:10]), x[10:13])
-            moment = identify.Moment(jnp.asarray(0.0), state, s.body(), None)
+            moment = identify.SensorInput(jnp.asarray(0.0), state, s.body(), None)
             return sensor.error(moment, jnp.asarray(reading))
 
         both = {"ordinary": RIGID, "identity, at rest": RESTING}
@@ -738,7 +738,7 @@ def fits() -> list[Case]:
         def error(x: Any, sensor: Any = sensor, reading: Any = reading) -> Any:
             state = attitude_of(x)
             field = rj.AttitudeEquations(s.inertia(), s.top())
-            moment = identify.Moment(jnp.asarray(0.0), state, s.inertia(), field)
+            moment = identify.SensorInput(jnp.asarray(0.0), state, s.inertia(), field)
             return sensor.error(moment, jnp.asarray(reading))
 
         found.append(Case(f"identify.{name}", error, states, step=0.01, rtol2=1e-7))
@@ -746,7 +746,9 @@ def fits() -> list[Case]:
     found.append(
         Case(
             "identify.AttitudeSensor, no error",
-            lambda x: exact.error(identify.Moment(0.0, attitude_of(x), None, None), jnp.asarray(Q)),
+            lambda x: exact.error(
+                identify.SensorInput(0.0, attitude_of(x), None, None), jnp.asarray(Q)
+            ),
             {"read as it is": join(Q, W)},
         )
     )

@@ -1,20 +1,23 @@
 """What a recording was read with."""
 
-from rigidjax._names import own_names
-from rigidjax.identify.sensors.base import AbstractSensor as AbstractSensor, Moment as Moment
-from rigidjax.identify.sensors.brightness import Brightness as Brightness
-from rigidjax.identify.sensors.lowpass import LowPass as LowPass
-from rigidjax.identify.sensors.places import (
-    Position as Position,
-    Range as Range,
-    Velocity as Velocity,
-)
-from rigidjax.identify.sensors.pointing import (
+from rigidjax._names import own_names, renamed
+from rigidjax.identify.sensors.attitude import (
     AttitudeSensor as AttitudeSensor,
     Direction as Direction,
     Marker as Marker,
     quaternions_from_euler as quaternions_from_euler,
     quaternions_from_matrices as quaternions_from_matrices,
+)
+from rigidjax.identify.sensors.base import (
+    AbstractSensor as AbstractSensor,
+    SensorInput as SensorInput,
+)
+from rigidjax.identify.sensors.brightness import Brightness as Brightness
+from rigidjax.identify.sensors.lowpass import LowPass as LowPass
+from rigidjax.identify.sensors.position import (
+    Position as Position,
+    Range as Range,
+    Velocity as Velocity,
 )
 from rigidjax.identify.sensors.vectors import (
     Accelerometer as Accelerometer,
@@ -22,4 +25,5 @@ from rigidjax.identify.sensors.vectors import (
     Magnetometer as Magnetometer,
 )
 
+__getattr__ = renamed(__name__, {"Moment": "rigidjax.identify.SensorInput"})
 __dir__ = own_names(__name__)

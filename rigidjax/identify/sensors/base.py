@@ -1,4 +1,4 @@
-"""What a sensor is: what it reads of a moment of a motion, and how far a reading is from that."""
+"""What a sensor is: what it reads of a motion at one time, and how far a reading is from that."""
 
 import abc
 from collections.abc import Callable
@@ -14,11 +14,17 @@ from rigidjax.body.inertia import MassProperties
 from rigidjax.rotation import quaternion
 
 
-class Moment(eqx.Module):
-    """One moment of a motion, as a sensor meets it.
+class SensorInput(eqx.Module):
+    """What a sensor reads: a motion at one time.
 
-    **Fields:** `t` s; `state` on the rung that the problem needs; `body` the `Inertia` or
+    **Fields:** `t` s; `state` of the kind that the problem needs; `body` the `Inertia` or
     `MassProperties`; `field` the equations of motion `f(t, state, args)`.
+
+    >>> import rigidjax as rj
+    >>> body, state = rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([0.0, 0.0, 1.0])
+    >>> now = SensorInput(jnp.asarray(0.0), state, body, rj.equations_of_motion(body, state, None))
+    >>> rj.identify.Gyro(0.1).error(now, jnp.array([0.0, 0.0, 1.5])).tolist()
+    [0.0, 0.0, 0.5]
     """
 
     t: Scalar
@@ -37,7 +43,7 @@ class Moment(eqx.Module):
 
 
 class AbstractSensor(eqx.Module):
-    """A sensor: what shape its readings have, which rung it sees, and the error of a reading.
+    """A sensor: the shape of its readings, the state it needs, and the error of a reading.
 
     Subclass it for your own: say `reading_shape`, `feels` (`HasSpin`, `HasAttitude` or `HasPose`),
     how many `components` the error has and in which `unit`, `noise` (k,) the standard deviation of
@@ -46,6 +52,15 @@ class AbstractSensor(eqx.Module):
     Optional members: `offset`, s: the sensor's clock is behind, it shows at t what was at
     t + offset; `limit` (k,): where a channel saturates, in the unit of the error; a method
     `refusal(values)`: which rows cannot be readings, (T,) true where wrong, and why.
+
+    >>> import rigidjax as rj
+    >>> class Tachometer(AbstractSensor):  # the size of the body rate, rad/s
+    ...     reading_shape, components, unit = (), 1, "rad/s"
+    ...     feels, noise = rj.HasSpin, None
+    ...     def error(self, now, reading):
+    ...         return (reading - jnp.sqrt(jnp.sum(now.state.omega**2)))[None]
+    >>> rj.identify.Recording([0.0, 1.0], (Tachometer(), [3.0, 3.0])).readings[0].values.shape
+    (2,)
     """
 
     reading_shape: eqx.AbstractClassVar[tuple[int, ...]]
@@ -55,7 +70,7 @@ class AbstractSensor(eqx.Module):
     noise: eqx.AbstractVar[Array | None]
 
     @abc.abstractmethod
-    def error(self, moment: Moment, reading: Array) -> Float[Array, " k"]:
+    def error(self, now: SensorInput, reading: Array) -> Float[Array, " k"]:
         """Reading minus prediction (k,), in the sensor's unit."""
 
 

@@ -12,10 +12,10 @@ from rigidjax import _checks
 from rigidjax._types import HasAttitude, Scalar, Vec3
 from rigidjax.body.brightness import AbstractScattering
 from rigidjax.body.scattering import direction, law_of
-from rigidjax.identify.sensors.base import AbstractSensor, Moment, noise_of, number_of
+from rigidjax.identify.sensors.base import AbstractSensor, SensorInput, noise_of, number_of
 from rigidjax.motion.torques.base import vector_at
 from rigidjax.rotation import quaternion
-from rigidjax.rotation.algebra import dot, entries
+from rigidjax.rotation.linalg3 import dot, entries
 
 UNITS = ("flux", "mag")
 
@@ -85,20 +85,20 @@ class Brightness(AbstractSensor):
         self.semi_axes = None if semi_axes is None else _lengths(semi_axes)
         self.offset = number_of(offset, "offset")
 
-    def error(self, moment: Moment, reading: Array) -> Float[Array, "1"]:
-        return (reading - self.predicted(moment))[None]
+    def error(self, now: SensorInput, reading: Array) -> Float[Array, "1"]:
+        return (reading - self.predicted(now))[None]
 
-    def predicted(self, moment: Moment) -> Scalar:
-        """The reading that this moment of a motion would have, without noise."""
-        shape = moment.body.second_moment
+    def predicted(self, now: SensorInput) -> Scalar:
+        """The reading of this state without noise."""
+        shape = now.body.second_moment
         if self.semi_axes is not None:
             shape = jnp.diag(self.semi_axes * self.semi_axes)
         shape = shape / jnp.trace(shape)
         xx, xy, xz, _, yy, yz, _, _, zz = entries(shape)
         volume = xx * (yy * zz - yz * yz) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz)
-        back = quaternion.conjugate(moment.state.q)
+        back = quaternion.conjugate(now.state.q)
         sun, observer = (
-            quaternion.rotate(back, _unit(vector_at(source, moment.t, name).astype(back.dtype)))
+            quaternion.rotate(back, _unit(vector_at(source, now.t, name).astype(back.dtype)))
             for source, name in ((self.sun, "sun"), (self.observer, "observer"))
         )
         seen = self.scattering.of_ellipsoid(shape, sun, observer)

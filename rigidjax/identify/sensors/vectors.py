@@ -7,7 +7,7 @@ from jaxtyping import Array, Float
 from rigidjax._types import HasAttitude, HasPose, HasSpin, Scalar, Vec3
 from rigidjax.identify.sensors.base import (
     AbstractSensor,
-    Moment,
+    SensorInput,
     limit_of,
     noise_of,
     number_of,
@@ -17,7 +17,7 @@ from rigidjax.identify.sensors.base import (
 )
 from rigidjax.identify.sensors.lowpass import LowPass, lowpass_of
 from rigidjax.rotation import quaternion
-from rigidjax.rotation.algebra import apply, cross
+from rigidjax.rotation.linalg3 import apply, cross
 
 
 class Gyro(AbstractSensor):
@@ -88,19 +88,19 @@ class Gyro(AbstractSensor):
         """Only gravity needs the attitude."""
         return HasSpin if self.gravity is None else HasAttitude
 
-    def error(self, moment: Moment, reading: Array) -> Vec3:
-        seen = shown(moment.state.omega, self.bias, self.scale, self.mounting, self.skew)
+    def error(self, now: SensorInput, reading: Array) -> Vec3:
+        seen = shown(now.state.omega, self.bias, self.scale, self.mounting, self.skew)
         if self.g_sensitivity is not None:
             assert self.place is not None
-            force = specific_force(moment, self.place, self.gravity)
+            force = specific_force(now, self.place, self.gravity)
             seen = seen + apply(self.g_sensitivity, force)
         return reading - seen
 
 
-def specific_force(moment: Moment, place: Vec3, gravity: Vec3 | None) -> Vec3:
+def specific_force(now: SensorInput, place: Vec3, gravity: Vec3 | None) -> Vec3:
     """`Rᵀ(a − g) + dΩ/dt × r + Ω × (Ω × r)` at a place of the body, m/s², body frame."""
-    state, rate = moment.state, moment.rate
-    r = moment.lever(place)
+    state, rate = now.state, now.rate
+    r = now.lever(place)
     force = cross(rate.omega, r) + cross(state.omega, cross(state.omega, r))
     if gravity is None:
         return force
@@ -167,8 +167,8 @@ class Accelerometer(AbstractSensor):
         """Only gravity needs the attitude."""
         return HasSpin if self.gravity is None else HasAttitude
 
-    def error(self, moment: Moment, reading: Array) -> Vec3:
-        force = specific_force(moment, self.place, self.gravity)
+    def error(self, now: SensorInput, reading: Array) -> Vec3:
+        force = specific_force(now, self.place, self.gravity)
         return reading - shown(force, self.bias, self.scale, self.mounting, self.skew)
 
 
@@ -219,6 +219,6 @@ class Magnetometer(AbstractSensor):
         self.limit = limit_of(limit)
         self.offset, self.lowpass = number_of(offset, "offset"), lowpass_of(lowpass)
 
-    def error(self, moment: Moment, reading: Array) -> Vec3:
-        seen = quaternion.rotate(quaternion.conjugate(moment.state.q), self.field)
+    def error(self, now: SensorInput, reading: Array) -> Vec3:
+        seen = quaternion.rotate(quaternion.conjugate(now.state.q), self.field)
         return reading - shown(seen, self.bias, self.scale, self.mounting, self.skew)

@@ -1,25 +1,20 @@
-"""Torques and forces. Each names the lowest rung that can feel it, and feels nothing below."""
+"""Torques and forces. Each names the lowest state that it acts on."""
 
-from rigidjax._names import own_names
+from rigidjax._names import own_names, renamed
 from rigidjax.motion.torques.base import (
     AbstractForce as AbstractForce,
     AbstractTorque as AbstractTorque,
     Torque as Torque,
     Wrench as Wrench,
-    act as act,
-    evaluate as evaluate,
-    in_precision as in_precision,
     jumps_of as jumps_of,
-    require_rung as require_rung,
 )
-from rigidjax.motion.torques.changing import ChangingInertia as ChangingInertia
+from rigidjax.motion.torques.changing_inertia import ChangingInertia as ChangingInertia
 from rigidjax.motion.torques.composite import FromPotential as FromPotential, Sum as Sum
 from rigidjax.motion.torques.constant import ConstantTorque as ConstantTorque, InSpace as InSpace
 from rigidjax.motion.torques.damping import (
     Damping as Damping,
     QuadraticDamping as QuadraticDamping,
 )
-from rigidjax.motion.torques.flying import BodyDrag as BodyDrag, Rotors as Rotors
 from rigidjax.motion.torques.flywheel import Flywheel as Flywheel
 from rigidjax.motion.torques.forces import (
     CentralGravity as CentralGravity,
@@ -32,19 +27,23 @@ from rigidjax.motion.torques.gravity import (
 )
 from rigidjax.motion.torques.inputs import Delayed as Delayed, Input as Input, bind as bind
 from rigidjax.motion.torques.magnetic import MagneticDipole as MagneticDipole
-from rigidjax.motion.torques.random import (
-    CorrelatedTorque as CorrelatedTorque,
-    RandomTorque as RandomTorque,
-)
-from rigidjax.motion.torques.series import Series as Series, Wheel as Wheel
-from rigidjax.motion.torques.signals import Lagged as Lagged
-from rigidjax.motion.torques.states import freeze as freeze
-from rigidjax.motion.torques.tables import (
+from rigidjax.motion.torques.piecewise import (
     Held as Held,
     Linear as Linear,
     Pulses as Pulses,
     Tabulated as Tabulated,
 )
+from rigidjax.motion.torques.random import (
+    CorrelatedTorque as CorrelatedTorque,
+    RandomTorque as RandomTorque,
+)
+from rigidjax.motion.torques.rotorcraft import BodyDrag as BodyDrag, Rotors as Rotors
+from rigidjax.motion.torques.signals import Lagged as Lagged
+from rigidjax.motion.torques.spline import Series as Series, Wheel as Wheel
+from rigidjax.motion.torques.states import freeze as freeze
 from rigidjax.motion.torques.wheels import ReactionWheels as ReactionWheels
 
+# What laws are evaluated with, not for users.
+_INNER = ("act", "evaluate", "in_precision", "require_rung")
+__getattr__ = renamed(__name__, {name: f"rigidjax.motion.torques.base.{name}" for name in _INNER})
 __dir__ = own_names(__name__)

@@ -13,8 +13,8 @@ from jaxtyping import Array, Float
 
 from rigidjax import _checks
 from rigidjax._types import HasAttitude, HasPose, HasSpin, Scalar, ScalarLike, Vec3, Vec3Like
-from rigidjax.body import physical
-from rigidjax.body.hints import Vector
+from rigidjax.body import validation
+from rigidjax.body._types import Vector
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.motion.torques.states import Frozen, require_frozen
 
@@ -46,7 +46,7 @@ class Wrench(eqx.Module):
 class AbstractTorque(eqx.Module):
     """A torque on a body: called with the time, the state and the body, gives N m in body axes.
 
-    Subclass it for your own, or give any callable Module. `feels` is the lowest rung that has what
+    Subclass it for your own, or give any callable Module. `feels` is the lowest state that has what
     you read from the state: `HasSpin` (`.omega`), `HasAttitude` (also `.q`) or `HasPose` (also
     `.x`, `.v`). `body` is what `simulate` was given: an `Inertia`, or `MassProperties` for `Rigid`.
 
@@ -87,7 +87,17 @@ class AbstractTorque(eqx.Module):
 class AbstractForce(eqx.Module):
     """A force on a body that moves: as `AbstractTorque`, but returns a `Wrench`.
 
-    Only `Rigid` feels it; `body` is a `MassProperties`.
+    It acts on `Rigid` states only; `body` is a `MassProperties`.
+
+    >>> import rigidjax as rj
+    >>> class Thrust(AbstractForce):  # 2 N along world z through the centre of mass
+    ...     feels = rj.HasPose
+    ...     def __call__(self, t, state, body):
+    ...         return Wrench(force=[0.0, 0.0, 2.0])
+    >>> body = rj.MassProperties(4.0, [0.0, 0, 0], jnp.eye(3))
+    >>> start = rj.Rigid([0.0, 0, 0], [0.0, 0, 0], [1.0, 0, 0, 0], [0.0, 0, 1])
+    >>> rj.simulate(body, start, [0.0, 2.0], Thrust()).ys.v[-1].round(9).tolist()
+    [0.0, 0.0, 1.0]
     """
 
     feels: eqx.AbstractVar[type]
@@ -100,7 +110,7 @@ class AbstractForce(eqx.Module):
 # A user's own callable Module need not subclass anything.
 Torque = AbstractTorque | AbstractForce | Callable[[Any, Any, Any], Any]
 
-# From below: what a torque may feel.
+# From the lowest: the states that a torque may act on.
 LADDER = (HasSpin, HasAttitude, HasPose)
 
 
@@ -112,7 +122,7 @@ def given(value: Any, shape: tuple[int, ...], name: str, *, hint: str = "") -> A
     """
     array = _checks.floating(value, shape, name, hint=hint)
     # NumPy: inside a trace a check with jax would become part of the program.
-    if physical.known(array) and not np.isfinite(np.asarray(array)).all():
+    if validation.known(array) and not np.isfinite(np.asarray(array)).all():
         raise ValueError(f"{name}: contains NaN or infinity, got {np.asarray(array)}")
     return array
 
@@ -137,7 +147,7 @@ def require_law(torque: object, name: str = "torque") -> None:
 
 
 def sees_attitude(torque: Torque | None) -> bool:
-    """Whether a law may look at the attitude: it says so by its rung, or has named no rung.
+    """Whether a law may look at the attitude: it says so by `feels`, or has none.
 
     >>> from rigidjax import torques
     >>> sees_attitude(torques.Damping([1.0, 1.0, 1.0]))
@@ -168,8 +178,8 @@ def require_rung(torque: Torque, state: object) -> None:
     feels = getattr(torque, "feels", None)
     if feels is not None and not isinstance(state, feels):
         raise TypeError(
-            f"{type(torque).__name__} needs a state with {feels.__name__} (see rigidjax's ladder "
-            f"of states), got {type(state).__name__}; climb to the rung that can feel this torque"
+            f"{type(torque).__name__} needs a state with {feels.__name__}, got "
+            f"{type(state).__name__}; take Attitude, or Rigid for what depends on the position"
         )
 
 
@@ -177,8 +187,8 @@ def evaluate(torque: Torque, t: ScalarLike, state: HasSpin, body: Inertia | Mass
     """The torque's value (3,), N m, body frame, its shape checked.
 
     **Arguments:** `torque` any law; `t` s; `state`; `body`. The law is taken in the precision of
-    `state.omega`. **Raises:** `TypeError` for a force, which only `Rigid` feels; `ValueError` for a
-    wrong shape.
+    `state.omega`. **Raises:** `TypeError` for a force, which acts on `Rigid` only; `ValueError` for
+    a wrong shape.
 
     >>> from rigidjax import Inertia, Spin, torques
     >>> body = Inertia.from_principal(1.0, 2.0, 3.0)

@@ -20,11 +20,11 @@ from rigidjax.motion.torques.base import (
     require_law,
     sees_rate,
 )
-from rigidjax.motion.torques.changing import ChangingInertia
+from rigidjax.motion.torques.changing_inertia import ChangingInertia
 
 
 class Sum(eqx.Module):
-    """Several torques and forces at once; it feels the highest rung of its parts.
+    """Several torques and forces at once; it needs the highest state that a part needs.
 
     **Arguments:** `*parts` torques, forces, your own callables.
 
@@ -51,7 +51,7 @@ class Sum(eqx.Module):
 
     @property
     def feels(self) -> type:
-        """The highest rung that a part feels."""
+        """The highest state that a part needs."""
         rungs = [getattr(part, "feels", LADDER[0]) for part in self.parts]
         return max(rungs, key=lambda r: LADDER.index(r) if r in LADDER else len(LADDER))
 

@@ -6,7 +6,7 @@ import equinox as eqx
 from jaxtyping import Array, Float
 
 from rigidjax._types import HasAttitude, HasSpin, ScalarLike, Vec3
-from rigidjax.body.hints import Vector
+from rigidjax.body._types import Vector
 from rigidjax.motion.torques.base import (
     AbstractTorque,
     constant_or_callable,

@@ -5,7 +5,7 @@ from typing import ClassVar
 from jaxtyping import Array, Float
 
 from rigidjax._types import HasSpin, ScalarLike, Vec3
-from rigidjax.body.hints import Vector
+from rigidjax.body._types import Vector
 from rigidjax.motion.torques.base import AbstractTorque, given, length_or_zero
 
 

@@ -15,7 +15,7 @@ from rigidjax.motion.torques.base import (
     vector_at,
 )
 from rigidjax.motion.torques.states import has_states
-from rigidjax.rotation.algebra import cross
+from rigidjax.rotation.linalg3 import cross
 
 
 class Flywheel(AbstractTorque):

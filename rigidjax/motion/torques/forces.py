@@ -6,11 +6,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rigidjax._types import HasPose, Scalar, ScalarLike, Vec3
-from rigidjax.body.hints import Vector
+from rigidjax.body._types import Vector
 from rigidjax.body.inertia import MassProperties
 from rigidjax.motion.torques.base import AbstractForce, Wrench, given, length_or_zero
 from rigidjax.rotation import quaternion
-from rigidjax.rotation.algebra import apply, cross, dot
+from rigidjax.rotation.linalg3 import apply, cross, dot
 
 
 class UniformGravity(AbstractForce):

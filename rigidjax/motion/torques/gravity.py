@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from rigidjax._types import HasAttitude, HasPose, Scalar, ScalarLike, Vec3
-from rigidjax.body import physical
-from rigidjax.body.hints import Vector
+from rigidjax.body import validation
+from rigidjax.body._types import Vector
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.motion.torques.base import (
     AbstractTorque,
@@ -21,7 +21,7 @@ from rigidjax.motion.torques.base import (
     vector_at,
 )
 from rigidjax.rotation import quaternion
-from rigidjax.rotation.algebra import apply, cross, dot
+from rigidjax.rotation.linalg3 import apply, cross, dot
 
 
 class HeavyTop(AbstractTorque):
@@ -107,7 +107,7 @@ class GravityGradient(AbstractTorque):
         self.mu = given(mu, (), "mu")
         self.position = constant_or_callable(position, "position")
         at: Any = self.position
-        if not callable(at) and physical.known(at) and not np.asarray(at).any():
+        if not callable(at) and validation.known(at) and not np.asarray(at).any():
             raise ValueError(
                 "position: wanted the vector between the body and the central body, got zero"
             )

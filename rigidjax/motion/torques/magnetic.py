@@ -6,7 +6,7 @@ import equinox as eqx
 from jaxtyping import Array, Float
 
 from rigidjax._types import HasAttitude, Scalar, ScalarLike, Vec3
-from rigidjax.body.hints import Vector
+from rigidjax.body._types import Vector
 from rigidjax.motion.torques.base import (
     AbstractTorque,
     constant_or_callable,
@@ -16,7 +16,7 @@ from rigidjax.motion.torques.base import (
     vector_at,
 )
 from rigidjax.rotation import quaternion
-from rigidjax.rotation.algebra import cross, dot
+from rigidjax.rotation.linalg3 import cross, dot
 
 
 class MagneticDipole(AbstractTorque):

@@ -1,4 +1,4 @@
-"""Torques that nobody can write down: known by their statistics alone."""
+"""Random torques, known by their statistics only."""
 
 from typing import Any, ClassVar
 
@@ -14,7 +14,7 @@ class RandomTorque(AbstractTorque):
     """White torque noise: `E[τᵢ(t) τᵢ(s)] = density δ(t − s)`, independent along the body axes.
 
     **Arguments:** `density` N² m² s, one number or one for each body axis (3,), ≥ 0: about an axis
-    of moment I the angular momentum then strays by √(density · t) in a time t.
+    of moment I the angular momentum then changes by about √(density · t) in a time t.
 
     Its mean is zero, and that is what `simulate` and a fit of `rigidjax.identify` see. What makes
     use of the noise is `rigidjax.estimate`: `sample` draws a motion, `filter`, `smooth` and
@@ -43,7 +43,7 @@ class RandomTorque(AbstractTorque):
 
 
 class CorrelatedTorque(AbstractTorque):
-    """Torque noise with a memory (Ornstein–Uhlenbeck): `T dτ/dt = −τ + white noise`.
+    """Correlated torque noise (Ornstein–Uhlenbeck): `T dτ/dt = −τ + white noise`.
 
     **Arguments:** `density` N² m² s of the white noise that drives it, one number or (3,), ≥ 0;
     `time` T, s, positive: over which the torque keeps its value. `E[τ(t) τ(s)] = density/(2T)

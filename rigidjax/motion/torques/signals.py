@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from rigidjax import _checks
 from rigidjax._types import ScalarLike
-from rigidjax.body import physical
+from rigidjax.body import validation
 from rigidjax.motion.torques.base import given, jumps_of
 
 
@@ -47,7 +47,7 @@ class Lagged(eqx.Module):
         if not array.size:
             raise ValueError("time: wanted one number, s, or one a channel, got none")
         self.time = given(time, array.shape, "time").astype(kind)
-        if physical.known(array) and not (np.asarray(array) > 0).all():
+        if validation.known(array) and not (np.asarray(array) > 0).all():
             raise ValueError(f"time: wanted a positive time, s, got {np.asarray(array)}")
         if start is not None:
             start = given(start, _checks.numbers(start, "start").shape, "start").astype(kind)

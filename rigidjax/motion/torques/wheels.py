@@ -10,9 +10,9 @@ from jaxtyping import Array, ArrayLike, Float
 
 from rigidjax import _checks
 from rigidjax._types import HasSpin, Scalar, ScalarLike, Vec3
-from rigidjax.body import physical
+from rigidjax.body import validation
 from rigidjax.body.inertia import Inertia, MassProperties
-from rigidjax.body.symmetric import outer
+from rigidjax.body.symmetric3 import outer
 from rigidjax.motion.torques.base import (
     AbstractTorque,
     constant_or_callable,
@@ -20,7 +20,7 @@ from rigidjax.motion.torques.base import (
     jumps_of,
     vector_at,
 )
-from rigidjax.rotation.algebra import cross
+from rigidjax.rotation.linalg3 import cross
 
 Body = TypeVar("Body", Inertia, MassProperties)
 Numbers = Float[ArrayLike, "*wheels"] | Any
@@ -39,9 +39,10 @@ class ReactionWheels(AbstractTorque):
       constant, a function of time such as `Held(times, values)`, `Input("motor")`, or `None`.
     - `feedback`: a function `(t, state, speeds) → (R,)`, N m, added to `motor`; or `None`.
     - `max_torque` N m, `max_speed` rad/s, each one number, (R,), or `None` for no limit: the
-      motors' torque is cut off at the one; what would bring a wheel beyond the other falls to
-      nothing over the last 5 % below it, as 6 x⁵ − 15 x⁴ + 10 x³, so that derivatives of runs that
-      meet it are right to their tolerance (along a straight line: to 1e-4 at `rtol=1e-9`).
+      motors' torque is limited to `max_torque`; a torque that would bring a wheel beyond
+      `max_speed` decreases to zero over the last 5 % below it, as 6 x⁵ − 15 x⁴ + 10 x³, so that
+      derivatives of runs that meet it are right to their tolerance (along a straight line: to 1e-4
+      at `rtol=1e-9`).
     - `viscous` c, N m s/rad, and `coulomb` d, N m, of the bearings, each one number, (R,), or
       `None`: the friction `−c s − d tanh(s/s₀)`; `turn_over` s₀, rad/s, over which Coulomb friction
       changes its sign, smooth so that it can be differentiated and met by long steps.
@@ -100,7 +101,7 @@ class ReactionWheels(AbstractTorque):
             raise ValueError(f"axes: wanted (R, 3), one row a wheel, got shape {shape}")
         count = shape[0]
         self.axes = given(axes, (count, 3), "axes")
-        if physical.known(self.axes):
+        if validation.known(self.axes):
             lengths = np.linalg.norm(np.asarray(self.axes, float), axis=1)
             if abs(lengths - 1).max() > 1e-6:
                 raise ValueError(f"axes: wanted unit vectors, got lengths {lengths}")
@@ -213,7 +214,7 @@ def _each(value: Any, count: int, name: str, *, zero: bool = False) -> Array | N
 
 
 def _positive(value: Array, name: str, *, zero: bool = False) -> Array:
-    if physical.known(value):
+    if validation.known(value):
         numbers = np.asarray(value)
         if not ((numbers >= 0) if zero else (numbers > 0)).all():
             raise ValueError(f"{name}: wanted {'≥ 0' if zero else '> 0'}, got {numbers}")

@@ -1,0 +1,102 @@
+"""Symmetric 3×3 matrices written out in components (floor 1).
+
+Products are spelled out instead of `@`: on CPU the gradient of a 3×3 `@` inside a differentiated
+loop costs fifty times its value, and on GPUs `@` may round to ten bits (TF32).
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float
+
+from rigidjax import _checks
+from rigidjax._types import Mat3, Mat3Like, Scalar, Vec3, Vec3Like
+from rigidjax.rotation.linalg3 import apply as apply, entries, product as product
+
+
+def inverse(tensor: Mat3Like) -> Mat3:
+    """The inverse of a symmetric 3×3 matrix, by cofactors.
+
+    **Arguments:** `tensor` (3, 3) symmetric, trace > 0, such as an inertia tensor (kg m²).
+    **Returns** (3, 3), reciprocal units. The matrix is divided by its trace first, so that a
+    body of 1e-20 or of 1e37 kg m² neither underflows nor overflows. A zero moment gives
+    infinities: `Inertia.invertible` refuses it in words.
+
+    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
+
+    >>> inverse(jnp.diag(jnp.array([1.0, 2.0, 4.0])))[2, 2]
+    Array(0.25, dtype=float64)
+    """
+    return _inverse(_checks.floating(tensor, (3, 3), "tensor"))
+
+
+@jax.custom_jvp
+def _inverse(a: Mat3) -> Mat3:
+    relative, scale = _relative_inverse(a)
+    return relative / scale
+
+
+@_inverse.defjvp
+def _inverse_jvp(primals: tuple[Mat3], tangents: tuple[Mat3]) -> tuple[Mat3, Mat3]:
+    # −A⁻¹ dA A⁻¹: two products, where the cofactors' own derivative is nine sums of nine.
+    (a,), (da,) = primals, tangents
+    out = _inverse(a)
+    scale = a[0, 0] + a[1, 1] + a[2, 2]
+    return out, -product(product(out * scale, da / scale), out)
+
+
+def solve(tensor: Mat3Like, vector: Vec3Like) -> Vec3:
+    """The `x` with `A x = v`, for a symmetric 3×3 matrix.
+
+    **Arguments:** `tensor` (3, 3) symmetric, trace > 0; `vector` (3,), the same frame.
+    **Returns** (3,). To solve with one matrix many times, keep `inverse`.
+
+    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
+
+    >>> solve(jnp.diag(jnp.array([1.0, 2.0, 4.0])), jnp.array([1.0, 1.0, 1.0]))
+    Array([1.  , 0.5 , 0.25], dtype=float64)
+    """
+    relative, scale = _relative_inverse(_checks.floating(tensor, (3, 3), "tensor"))
+    # v/scale first: 1/1e37 has only half its digits in float32.
+    return apply(relative, _checks.floating(vector, (3,), "vector") / scale)
+
+
+def _relative_inverse(a: Mat3) -> tuple[Mat3, Scalar]:
+    """The inverse of a divided by its trace, and the trace."""
+    xx, _, _, _, yy, _, _, _, zz = entries(a)
+    scale = xx + yy + zz
+    # One split, and one concatenation in the gradient: indexed, each entry is a kernel.
+    xx, xy, xz, yx, yy, yz, zx, zy, zz = entries(a / scale)
+    c00 = yy * zz - yz * zy
+    c01 = yz * zx - yx * zz
+    c02 = yx * zy - yy * zx
+    c11 = xx * zz - xz * zx
+    c12 = xy * zx - xx * zy
+    c22 = xx * yy - xy * yx
+    determinant = xx * c00 + xy * c01 + xz * c02
+    return from_components(c00, c11, c22, c01, c02, c12) / determinant, scale
+
+
+def from_components(
+    xx: Float[ArrayLike, ""],
+    yy: Float[ArrayLike, ""],
+    zz: Float[ArrayLike, ""],
+    xy: Float[ArrayLike, ""],
+    xz: Float[ArrayLike, ""],
+    yz: Float[ArrayLike, ""],
+) -> Mat3:
+    """The symmetric matrix of six components: the diagonal first, then xy, xz, yz."""
+    return jnp.stack([jnp.stack([xx, xy, xz]), jnp.stack([xy, yy, yz]), jnp.stack([xz, yz, zz])])
+
+
+def outer(a: Float[Array, "3"], b: Float[Array, "3"]) -> Mat3:
+    """The matrix `a bᵀ`."""
+    return a[:, None] * b[None, :]
+
+
+def swap_trace(a: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3 3"]:
+    """`Tr(A) 1 − A` without the cancellation: `[A22 + A33, −A12, …]` (notes, eqs 76–78)."""
+    x, y, z = a[..., 0, 0], a[..., 1, 1], a[..., 2, 2]
+    diagonal = jnp.stack([y + z, z + x, x + y], axis=-1)
+    eye = jnp.eye(3, dtype=bool)
+    eye = jnp.broadcast_to(eye, a.shape)
+    return jnp.where(eye, jnp.broadcast_to(diagonal[..., None], a.shape), 0.0 - a)

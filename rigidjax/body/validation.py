@@ -1,0 +1,165 @@
+"""Is there a body with these numbers? Checks that name what is wrong (floor 1).
+
+Each returns its argument, refused where no real body has it. They work on known values (plain
+exceptions, with the numbers) and under `jit` (`equinox.error_if`, without them). A few units of
+round-off are forgiven, so that plates, rods and points, which lie on the boundary, pass.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax.core
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
+
+from rigidjax import _checks
+from rigidjax._types import Quat
+from rigidjax.body._types import Quaternion
+from rigidjax.rotation import quaternion
+
+# Units of round-off, of the largest entry. A product R I Rᵀ is off by about ten.
+_FORGIVEN = 64.0
+
+
+def known(value: Float[Array, "..."]) -> bool:
+    """Whether the numbers can be looked at now (they are not being traced)."""
+    return not isinstance(value, jax.core.Tracer)
+
+
+def if_known(check: Callable, value: Float[Array, "..."]) -> Float[Array, "..."]:
+    """`check(value)` if its numbers are known; otherwise `value` as it is, as where it has none."""
+    return check(value) if known(value) and value.size else value
+
+
+def real_mass(mass: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+    """Refuse a mass that is not positive and finite."""
+    mass = _finite(mass, "mass")
+    found = f", got {np.asarray(mass)}" if known(mass) else ""
+    return _checks.refuse(mass, (mass <= 0).any(), f"mass: wanted a positive mass (kg){found}")
+
+
+def real_place(com: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3"]:
+    """Refuse a centre of mass that is not finite."""
+    return _finite(com, "com")
+
+
+def real_inertia(tensor: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3 3"]:
+    """Refuse an inertia tensor that is not symmetric or whose moments no body has."""
+    tensor = _symmetric(_finite(tensor, "inertia tensor"), "inertia tensor")
+    return _moments_of_a_body(tensor, _eigenvalues(tensor))
+
+
+def real_moments(moments: Float[Array, "3"]) -> Float[Array, "3"]:
+    """Refuse principal moments, in any order, that no body has."""
+    moments = _finite(moments, "principal moments")
+    xp = np if known(moments) else jnp
+    return _moments_of_a_body(moments, xp.sort(_values(moments)))
+
+
+def real_second_moment(s: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3 3"]:
+    """Refuse a second moment that is not symmetric and positive semi-definite."""
+    s = _symmetric(_finite(s, "second moment"), "second moment")
+    least, largest = (e := _eigenvalues(s))[..., 0], e[..., 2]
+    found = f", got principal second moments {_show(e)} kg m²" if known(s) else ""
+    return _checks.refuse(
+        s,
+        (least < -_slack(s) * largest).any() | (largest < 0).any(),
+        "second moment 𝔖 = ∫ r rᵀ dm: wanted a positive semi-definite matrix (mass is not "
+        f"negative){found}; is this an inertia tensor I? then use from_tensor (I = Tr(𝔖) 1 − 𝔖)",
+    )
+
+
+def nonzero_moments(body: Any, tensor: Float[Array, "*batch 3 3"]) -> Any:
+    """Return `body` unless its inertia `tensor` has a moment that is zero to round-off, or NaN."""
+    _checks.numbers(tensor, "inertia tensor")
+    if known(tensor):
+        _finite(tensor, "inertia tensor")
+    moments = _eigenvalues(tensor)
+    bad = (moments[..., 0] <= _slack(tensor) * moments[..., 2]).any()
+    found = f" {_show(moments)} kg m²" if known(tensor) else ", or not a number"
+    if not known(tensor):
+        # The eigenvalues of a matrix with a NaN need not be NaN.
+        bad = bad | ~jnp.isfinite(tensor).all()
+    return _checks.refuse(
+        body,
+        bad,
+        f"inertia: a principal moment is zero{found}; the equations of motion divide by it. A "
+        "thin rod or a point does not resist turning about that axis: give it a thickness",
+    )
+
+
+def unit_quaternion(q: Quaternion) -> Quat:
+    """A unit quaternion (w, x, y, z): normalised if off by round-off, refused if by more."""
+    q = _checks.floating(q, (4,), "q", hint="a quaternion is (w, x, y, z)")
+    if known(q):
+        _checks.finite(q, "q")
+        length = float(np.linalg.norm(np.asarray(q)))
+        _checks.refuse(
+            q,
+            abs(length - 1.0) > (1e-3 if q.dtype == jnp.float32 else 1e-6),
+            f"q: wanted a unit quaternion (w, x, y, z), got one of length {length:.6g}; "
+            "rigidjax.quaternion.normalise makes it one",
+        )
+    return quaternion.normalise(q)
+
+
+def _moments_of_a_body(value, moments):
+    m1, m2, m3 = moments[..., 0], moments[..., 1], moments[..., 2]
+    found = f" {_show(moments)} kg m²" if known(value) else ""
+    slack = _slack(value) * abs(m3)
+    value = _checks.refuse(
+        value,
+        (m1 < -slack).any() | (m3 < 0).any(),
+        f"inertia: wanted moments that are not negative, got{found or ' a negative one'}; "
+        "an inside-out mesh or a product of inertia with the wrong sign gives this",
+    )
+    short = f" ({float(np.max(m3 - m1 - m2)):.3g} too large)" if known(value) else ""
+    return _checks.refuse(
+        value,
+        (m3 - m1 - m2 > slack).any(),
+        f"inertia: the moments{found} break the triangle inequality I1 + I2 ≥ I3: the largest may "
+        f"not exceed the sum of the other two{short}; no distribution of mass has such moments. "
+        "Is this a second moment 𝔖? then use from_second_moment",
+    )
+
+
+def _symmetric(a, name):
+    difference = abs(_values(a) - _values(a).swapaxes(-1, -2)).max(axis=(-1, -2))
+    largest = abs(_values(a)).max(axis=(-1, -2))
+    found = f" (largest difference {float(difference.max()):.3g})" if known(a) else ""
+    return _checks.refuse(
+        a,
+        (difference > _slack(a) * largest).any(),
+        f"{name}: wanted a symmetric matrix, got A ≠ Aᵀ{found}; a product of inertia is missing "
+        "or mistyped; if it is noise, give 0.5 * (A + A.T)",
+    )
+
+
+def _finite(a, name):
+    return _checks.finite(a, name)
+
+
+def _values(a):
+    """The numbers, without derivatives: NumPy if known, so that a check costs microseconds."""
+    return np.asarray(a) if known(a) else lax.stop_gradient(a)
+
+
+def _eigenvalues(a):
+    if known(a):
+        return np.linalg.eigvalsh(np.asarray(a))
+    scale = jnp.abs(a).max(axis=(-1, -2), keepdims=True)
+    scale = lax.stop_gradient(jnp.where(scale > 0, scale, 1))
+    return jnp.linalg.eigvalsh(lax.stop_gradient(a) / scale) * scale[..., 0]
+
+
+def _slack(a) -> float:
+    return float(_FORGIVEN * jnp.finfo(a.dtype).eps)
+
+
+def _show(moments) -> str:
+    return "; ".join(
+        "(" + ", ".join(f"{float(x):.6g}" for x in row) + ")"
+        for row in np.asarray(moments).reshape(-1, 3)[:3]
+    )

@@ -1,0 +1,92 @@
+"""What every scene of a particle offers: a vector field, and what it conserves."""
+
+import abc
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from rigidjax import _checks
+from rigidjax._types import Scalar, ScalarLike, Vec3
+from rigidjax.frames.point import Point
+
+
+class AbstractScene(eqx.Module):
+    """The equations of motion of a particle: subclass it, give `acceleration` and `conserved`.
+
+    `rigidjax.simulate(None, Point(x, v), ts, scene)` solves it; `diffrax.ODETerm(scene.field)` is
+    the same in plain diffrax.
+
+    >>> class Spring(AbstractScene):
+    ...     def acceleration(self, t, state):
+    ...         return -state.x
+    ...     def conserved(self, t, state):
+    ...         return {"energy": 0.5 * (state.x @ state.x + state.v @ state.v)}
+    >>> float(Spring().conserved(0.0, Point([1.0, 0, 0], [0.0, 2, 0]))["energy"])
+    2.5
+    """
+
+    @abc.abstractmethod
+    def acceleration(self, t: ScalarLike, state: Any) -> Vec3:
+        """d²x/dt² (3,), in the frame of the scene: forces per mass (notes, eq 84)."""
+
+    @abc.abstractmethod
+    def conserved(self, t: ScalarLike, state: Any) -> dict[str, Scalar]:
+        """What the exact motion keeps, by name; empty where there is nothing."""
+
+    def field(self, t: ScalarLike, y: Any, args: object = None) -> Any:
+        """The vector field `(dx/dt, dv/dt)` as a `Point`, for `diffrax.ODETerm`."""
+        return Point(y.v, self.acceleration(t, y))
+
+    def drift(self, ts: Float[Array, " times"], ys: Any) -> dict[str, Scalar]:
+        """The largest departure of each conserved quantity from its first value.
+
+        **Arguments:** `ts` (T,), `ys` states with a leading time axis, as in `simulate`'s solution.
+
+        >>> from rigidjax.frames import scenes
+        >>> still = Point(jnp.zeros((2, 3)), jnp.zeros((2, 3)))
+        >>> float(scenes.earth(0.8).drift(jnp.arange(2.0), still)["jacobi"])
+        0.0
+        """
+        values = jax.vmap(self.conserved)(ts, ys)
+        return {name: jnp.max(jnp.abs(q - q[0])) for name, q in values.items()}
+
+
+class Force(AbstractScene):
+    """A user's own force per mass as a scene, in an inertial frame (notes, eq 84).
+
+    **Arguments:** `force` a callable Module `(t, state, body) → (3,)`, m/s²; `body` is `None`. A
+    `force` of `None` leaves the particle to itself.
+
+    >>> fall = Force(lambda t, state, body: jnp.array([0.0, 0.0, -9.8]))
+    >>> fall.field(0.0, Point([0.0, 0, 0], [1.0, 0, 0])).v.tolist()
+    [0.0, 0.0, -9.8]
+    """
+
+    force: Callable[..., Any] | None
+
+    def __check_init__(self) -> None:
+        if self.force is not None:
+            _checks.function(self.force, "force", "(t, state, body) → (3,) per mass")
+
+    def acceleration(self, t: ScalarLike, state: Any) -> Vec3:
+        if self.force is None:
+            return jnp.zeros_like(state.x)
+        return per_mass(self.force(t, state, None), self.force)
+
+    def conserved(self, t: ScalarLike, state: Any) -> dict[str, Scalar]:
+        return {}
+
+
+def per_mass(value: Any, force: object) -> Vec3:
+    """A force's value, its shape checked: a user's own may return anything."""
+    name = getattr(force, "__name__", type(force).__name__)
+    return _checks.floating(value, (3,), f"force {name}", hint="force per mass, m/s²")
+
+
+def like(x: Array, *values: Array) -> tuple[Array, ...]:
+    """The constants of a scene in the dtype of the state, so that float32 stays float32."""
+    return tuple(value.astype(x.dtype) for value in values)

@@ -1,0 +1,157 @@
+"""Integrate inside a moving frame: a particle, or the attitude of a body."""
+
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from rigidjax import _checks
+from rigidjax._types import HasAttitude, Scalar, ScalarLike, Vec3
+from rigidjax.body import inertia as _inertia
+from rigidjax.frames.base import AbstractScene, Force, per_mass
+from rigidjax.frames.moving import MovingFrame, require_frame
+from rigidjax.frames.rotation_models import Uniform
+from rigidjax.rotation import linalg3, quaternion
+
+
+class InFrame(AbstractScene):
+    """A particle seen and solved in a moving frame: eq 91 of the notes, corrected.
+
+    **Arguments:**
+
+    - `frame`: the `MovingFrame` S'; states are what it sees.
+    - `inside`: force per mass in S', `(t, Point in S') → (3,)`, m/s², axes of S'.
+    - `outside`: force per mass in S, `(t, Point in S) → (3,)`, m/s², axes of S.
+    - `potential`: V(x') per mass, `(3,) → ()`, m²/s²; its force −∇V is taken by automatic
+      differentiation. In a uniformly turning frame, with no other force, `conserved` then has the
+      Jacobi integral.
+
+    >>> import rigidjax as rj
+    >>> scene = InFrame(MovingFrame(rj.frames.Uniform([0.0, 0.0, 1.0])))
+    >>> scene.acceleration(0.0, rj.frames.Point([2.0, 0, 0], [0.0, 0, 0])).tolist()
+    [2.0, 0.0, 0.0]
+    """
+
+    frame: MovingFrame
+    inside: Callable[..., Any] | None = None
+    outside: Callable[..., Any] | None = None
+    potential: Callable[..., Any] | None = None
+
+    def __check_init__(self) -> None:
+        require_frame(self.frame, "InFrame")
+        for name, of in (("inside", "(t, state) → (3,)"), ("outside", "(t, state) → (3,)")):
+            if getattr(self, name) is not None:
+                _checks.function(getattr(self, name), name, of)
+        if self.potential is not None:
+            _checks.function(self.potential, "potential", "of a place (3,) to a number, m²/s²")
+
+    def acceleration(self, t: ScalarLike, state: Any) -> Vec3:
+        now = self.frame.at(t)
+        total = now.fictitious(state.x, state.v)
+        if self.inside is not None:
+            total = total + per_mass(self.inside(t, state), self.inside).astype(total.dtype)
+        if self.outside is not None:
+            outer = per_mass(self.outside(t, now.to_inertial(state)), self.outside)
+            total = total + now.inward(outer).astype(total.dtype)
+        if self.potential is not None:
+            total = total - jax.grad(self.potential)(state.x)
+        return total
+
+    def conserved(self, t: ScalarLike, state: Any) -> dict[str, Scalar]:
+        frame = self.frame
+        steady = isinstance(frame.rotation, Uniform) and frame.origin is None
+        if not steady or self.inside is not None or self.outside is not None:
+            return {}
+        v = jnp.zeros((), state.x.dtype) if self.potential is None else self.potential(state.x)
+        return {"jacobi": frame.jacobi_integral(state, t, v)}
+
+
+def scene_of(force: Any) -> AbstractScene:
+    """The scene that `simulate` solves: a scene, a frame seen from inside, or a plain force.
+
+    **Raises:** `TypeError` for anything else.
+
+    >>> type(scene_of(None)).__name__
+    'Force'
+    """
+    if isinstance(force, AbstractScene):
+        return force
+    if isinstance(force, MovingFrame):
+        return InFrame(force)
+    if force is None or (callable(force) and not isinstance(force, type)):
+        return Force(force)
+    raise TypeError(
+        "Point: wanted a scene (rigidjax.scenes), a MovingFrame or a force (t, state, body) → (3,) "
+        f"per mass, got {type(force).__name__}"
+    )
+
+
+class Push(eqx.Module):
+    """A force on the centre of mass, N, axes of S', and a torque about it, N m, body axes, (3,)."""
+
+    force: Vec3
+    torque: Vec3
+
+
+class BodyInFrame(eqx.Module):
+    """The torque, and for `Rigid` the force, that make a body's equations right in a moving frame.
+
+    Give it to `simulate` as the torque of an `Attitude` or `Rigid` state that S' sees: q' body →
+    S', and Ω' the rate relative to S', as ever in body axes; x', v' of the centre of mass.
+
+    With W = Q'ᵀ Ω the frame's rate in body axes, Ω' = Ω_abs − W, and from I dΩ_abs/dt =
+    IΩ_abs × Ω_abs + τ follows
+
+    I dΩ'/dt = IΩ' × Ω' + [τ + IΩ_abs × Ω_abs − IΩ' × Ω' − I(Q'ᵀ dΩ/dt − Ω' × W)].
+
+    and the centre of mass moves as a `Point` does (eq 91).
+
+    **Arguments:** `frame` the `MovingFrame` S'; `torque` the real τ, `(t, state in S', body) →
+    (3,)`, N m, body axes, or a law that gives a `Wrench`, its force in the axes of S'; or `None`.
+
+    Source: notes, eqs 50, 91, for a body instead of a point. **Raises:** `TypeError` for a force on
+    a state that only turns.
+
+    >>> import rigidjax as rj
+    >>> frame = MovingFrame(rj.frames.Uniform([0.0, 0.0, 1.0]))
+    >>> still = rj.Attitude([1.0, 0, 0, 0], [0.0, 0, -1.0])
+    >>> BodyInFrame(frame)(0.0, still, rj.Inertia.from_principal(1.0, 2.0, 3.0)).tolist()
+    [0.0, 0.0, 0.0]
+    """
+
+    feels: ClassVar[type] = HasAttitude
+    frame: MovingFrame
+    torque: Callable[..., Any] | None = None
+
+    def __check_init__(self) -> None:
+        require_frame(self.frame, "BodyInFrame")
+        if self.torque is not None:
+            _checks.function(self.torque, "torque", "(t, state, body) → (3,), N m, or a law")
+
+    def __call__(self, t: ScalarLike, state: Any, body: Any) -> Vec3 | Push:
+        now = self.frame.at(t)
+        # `MassProperties` hold an inertia, about the centre of mass.
+        tensor, omega = getattr(body, "inertia", body).tensor, state.omega
+        carried = quaternion.rotate_inverse(state.q, now.rate.astype(omega.dtype))
+        change = quaternion.rotate_inverse(state.q, now.rate_change.astype(omega.dtype))
+        total = omega + carried
+        gyroscopic = linalg3.cross(_inertia.apply(tensor, total), total)
+        relative = linalg3.cross(_inertia.apply(tensor, omega), omega)
+        needed = _inertia.apply(tensor, change - linalg3.cross(omega, carried))
+        torque = gyroscopic - relative - needed
+        moves = hasattr(state, "x")
+        force = body.mass.astype(omega.dtype) * now.fictitious(state.x, state.v) if moves else None
+        if self.torque is not None:
+            real = self.torque(t, state, body)
+            if hasattr(real, "force"):
+                if force is None:
+                    raise TypeError(
+                        f"BodyInFrame: {type(self.torque).__name__} gives a force, got a state "
+                        f"{type(state).__name__} that only turns; a force needs a Rigid state"
+                    )
+                force, real = force + real.force.astype(omega.dtype), real.torque
+            real = _checks.floating(real, (3,), "torque", hint="body-frame N m")
+            torque = torque + real.astype(omega.dtype)
+        return torque if force is None else Push(force, torque)

@@ -1,0 +1,128 @@
+"""A moving frame at one instant: the kinematics of section 3 of the notes, on plain numbers."""
+
+from typing import Any
+
+import equinox as eqx
+
+from rigidjax import _checks
+from rigidjax._types import Mat3, Vec3
+from rigidjax.body._types import Vector
+from rigidjax.rotation import linalg3, quaternion
+
+
+class Instant(eqx.Module):
+    """Where a moving frame S' is, how it turns and how it moves, at one time.
+
+    **Fields:** `rotation` M (3, 3), S' → S; `rate` Ω (3,), rad/s, and `rate_change` dΩ/dt (3,),
+    rad/s², both in the axes of S'; `origin`, `origin_velocity`, `origin_acceleration` of S', (3,),
+    in the axes of S. `MovingFrame.at(t)` makes one. x', v' below are what S' sees.
+
+    >>> import rigidjax as rj
+    >>> now = rj.frames.MovingFrame(rj.frames.Uniform([0.0, 0.0, 2.0])).at(0.0)
+    >>> now.rate.tolist(), now.coriolis([1.0, 0.0, 0.0]).tolist()
+    ([0.0, 0.0, 2.0], [0.0, -4.0, 0.0])
+    """
+
+    rotation: Mat3
+    rate: Vec3
+    rate_change: Vec3
+    origin: Vec3
+    origin_velocity: Vec3
+    origin_acceleration: Vec3
+
+    def to_inertial(self, state: Any) -> Any:
+        """What S sees of a state seen by S' (notes, eqs 85, 88): see `MovingFrame.to_inertial`."""
+        _can_travel(state)
+        turned = {}
+        if hasattr(state, "x"):
+            x, rate = state.x, self.rate.astype(state.x.dtype)
+            turned["x"] = self.origin.astype(x.dtype) + self.outward(x)
+            velocity = state.v + linalg3.cross(rate, x)
+            turned["v"] = self.origin_velocity.astype(x.dtype) + self.outward(velocity)
+        if hasattr(state, "q"):
+            q = quaternion.from_matrix(self.rotation).astype(state.q.dtype)
+            rate = quaternion.rotate_inverse(state.q, self.rate.astype(state.q.dtype))
+            turned["q"] = quaternion.multiply(q, state.q)
+            turned["omega"] = state.omega + rate
+        return _replaced(state, turned)
+
+    def from_inertial(self, state: Any) -> Any:
+        """What S' sees of a state seen by S (notes, eqs 86, 88): `MovingFrame.from_inertial`."""
+        _can_travel(state)
+        turned = {}
+        if hasattr(state, "x"):
+            dtype = state.x.dtype
+            x = self.inward(state.x - self.origin.astype(dtype))
+            v = self.inward(state.v - self.origin_velocity.astype(dtype))
+            turned["x"], turned["v"] = x, v - linalg3.cross(self.rate.astype(dtype), x)
+        if hasattr(state, "q"):
+            back = quaternion.from_matrix(self.rotation.T).astype(state.q.dtype)
+            rate = quaternion.rotate_inverse(
+                quaternion.multiply(back, state.q), self.rate.astype(state.q.dtype)
+            )
+            turned["q"] = quaternion.multiply(back, state.q)
+            turned["omega"] = state.omega - rate
+        return _replaced(state, turned)
+
+    def outward(self, y: Vector) -> Vec3:
+        """Components in S' → components in S, M y' (notes, eq 85): forces, directions."""
+        y = _checks.floating(y, (3,), "y")
+        return linalg3.apply(self.rotation.astype(y.dtype), y)
+
+    def inward(self, y: Vector) -> Vec3:
+        """Components in S → components in S', Mᵀ y (notes, eq 86; f = MᵀF of eq 91)."""
+        y = _checks.floating(y, (3,), "y")
+        return linalg3.apply(self.rotation.T.astype(y.dtype), y)
+
+    def centrifugal(self, x: Vector) -> Vec3:
+        """Centrifugal acceleration −Ω × (Ω × x')."""
+        x = _checks.floating(x, (3,), "x")
+        rate = self.rate.astype(x.dtype)
+        return linalg3.cross(linalg3.cross(rate, x), rate)
+
+    def coriolis(self, v: Vector) -> Vec3:
+        """Coriolis acceleration −2 Ω × v'."""
+        v = _checks.floating(v, (3,), "v")
+        return 2 * linalg3.cross(v, self.rate.astype(v.dtype))
+
+    def euler_acceleration(self, x: Vector) -> Vec3:
+        """Euler acceleration −dΩ/dt × x'."""
+        x = _checks.floating(x, (3,), "x")
+        return linalg3.cross(x, self.rate_change.astype(x.dtype))
+
+    def translation(self) -> Vec3:
+        """Acceleration −Mᵀ d²X/dt²: what an accelerated origin adds."""
+        return -self.inward(self.origin_acceleration)
+
+    def fictitious(self, x: Vector, v: Vector) -> Vec3:
+        """All four terms that no force makes."""
+        x, v = _checks.floating(x, (3,), "x"), _checks.floating(v, (3,), "v")
+        turning = self.centrifugal(x) + self.coriolis(v) + self.euler_acceleration(x)
+        return turning + self.translation().astype(x.dtype)
+
+
+def _can_travel(state: Any) -> None:
+    point = hasattr(state, "x") and hasattr(state, "v")
+    attitude = hasattr(state, "q") and hasattr(state, "omega")
+    if not (point or attitude):
+        raise TypeError(
+            "a moving frame carries states with x and v (Point), with q and omega (Attitude), or "
+            f"with all four (Rigid), got {type(state).__name__}"
+            + (
+                "; a rate alone has no direction in another frame"
+                if hasattr(state, "omega")
+                else ""
+            )
+        )
+    for name, size in (("x", 3), ("v", 3), ("q", 4), ("omega", 3)):
+        if hasattr(state, name):
+            hint = (
+                "a frame carries one state at one time, batch with "
+                "jax.vmap(frame.to_inertial)(states, times)"
+            )
+            _checks.floating(getattr(state, name), (size,), name, hint=hint)
+
+
+def _replaced(state: Any, turned: dict[str, Any]) -> Any:
+    names = list(turned)
+    return eqx.tree_at(lambda s: [getattr(s, n) for n in names], state, [turned[n] for n in names])

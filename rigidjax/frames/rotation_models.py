@@ -1,0 +1,109 @@
+"""Ways of turning, as functions of time: uniform, about one axis, or read off something else."""
+
+from collections.abc import Callable
+from typing import Any
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from rigidjax import _checks
+from rigidjax._types import Mat3, Vec3
+from rigidjax.rotation import linalg3, quaternion, so3
+
+
+class Uniform(eqx.Module):
+    """A uniform turn M(t) = exp(t hat Ω), which is 1 at t = 0 (notes, eqs 17, 18).
+
+    **Arguments:** `omega` Ω (3,), rad/s: the same numbers in S and in S'.
+
+    >>> Uniform([0.0, 0.0, 1.0])(jnp.pi).round(12)[0].tolist()
+    [-1.0, -0.0, 0.0]
+    """
+
+    omega: Float[Array, "3"]
+
+    def __init__(self, omega: Float[Array, "3"] | object):
+        self.omega = _checks.finite(_checks.floating(omega, (3,), "omega"), "omega")
+
+    def __call__(self, t: Any) -> Mat3:
+        t = _checks.time(t)
+        return so3.exp(t * self.omega.astype(t.dtype))
+
+    def rate(self, t: Any) -> Vec3:
+        """Ω, whatever the time."""
+        return self.omega.astype(_checks.time(t).dtype)
+
+
+class AboutAxis(eqx.Module):
+    """A turn about a fixed axis by any angle(t): turntables that speed up, pendula that swing.
+
+    **Arguments:** `axis` (3,), of any length but zero; `angle` a function of time to rad.
+
+    >>> float(AboutAxis([0.0, 0.0, 2.0], lambda t: 3.0 * t**2).rate(1.0)[2])
+    6.0
+    """
+
+    axis: Float[Array, "3"]
+    angle: Callable[[Any], Any]
+
+    def __init__(self, axis: Float[Array, "3"] | object, angle: Callable[[Any], Any]):
+        axis = _checks.finite(_checks.floating(axis, (3,), "axis"), "axis")
+        hint = "for a uniform turn take frames.Uniform(omega)"
+        _checks.function(angle, "angle", "of time to rad", hint=hint)
+        length = jnp.sqrt(linalg3.dot(axis, axis))
+        self.axis = _checks.refuse(axis, length == 0, "axis: wanted a direction, got zero") / length
+        self.angle = angle
+
+    def __call__(self, t: Any) -> Mat3:
+        t = _checks.time(t)
+        return so3.exp(_checks.floating(self.angle(t), (), "angle") * self.axis.astype(t.dtype))
+
+    def rate(self, t: Any) -> Vec3:
+        """Ω (3,), rad/s: the axis times the angle's derivative."""
+        t = _checks.time(t)
+        _, speed = jax.jvp(self.angle, (t,), (jnp.ones_like(t),))
+        return speed * self.axis.astype(t.dtype)
+
+
+def differentiable(rotation: Any) -> Any:
+    """`rotation`; the solves that it does itself made ready for forward differentiation.
+
+    A frame needs dΩ/dt, and the default adjoint of a solution of `simulate` refuses that.
+
+    >>> differentiable({"adjoint": dfx.RecursiveCheckpointAdjoint()})["adjoint"]
+    ForwardMode()
+    """
+
+    def reverse(part: Any) -> bool:
+        return isinstance(part, dfx.RecursiveCheckpointAdjoint)
+
+    return jax.tree.map(lambda p: dfx.ForwardMode() if reverse(p) else p, rotation, is_leaf=reverse)
+
+
+def state_of(rotation: Any, t: Array) -> Any:
+    """What `rotation` gives at `t`: a matrix, a quaternion, or a state with `q` and `omega`."""
+    return rotation.evaluate(t) if hasattr(rotation, "evaluate") else rotation(t)
+
+
+def matrix(rotation: Any, t: Array) -> Mat3:
+    """M(t) of whatever a frame was given: a function to (3, 3) or (4,), or a solution."""
+    value = state_of(rotation, t)
+    value = getattr(value, "q", value)
+    shape = jnp.shape(value)
+    if shape == (4,):
+        q = _checks.floating(value, (4,), "rotation").astype(t.dtype)
+        if _checks.known(q):
+            far = ~(jnp.abs(jnp.sqrt(jnp.sum(q * q)) - 1) < 1e-3)
+            _checks.refuse(q, far, "rotation: wanted a unit quaternion (w, x, y, z)")
+        return quaternion.to_matrix(quaternion.normalise(q))
+    m = _checks.floating(value, (3, 3), "rotation", hint="wanted a matrix or a quaternion (4,)")
+    if _checks.known(m):
+        tolerance = 1e-6 if m.dtype == jnp.float64 else 1e-3
+        off = jnp.max(jnp.abs(linalg3.product(m.T, m) - jnp.eye(3, dtype=m.dtype)))
+        _checks.refuse(m, ~(off < tolerance), "rotation: Mᵀ M is not 1, so this is no rotation")
+        left = linalg3.determinant(m) < 0
+        _checks.refuse(m, left, "rotation: left-handed axes, det = −1 (notes, eq 10)")
+    return m.astype(t.dtype)

@@ -1,0 +1,326 @@
+"""Unconstrained numbers ↔ the body, as a fit needs them. Every point is a real body."""
+
+import abc
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from rigidjax import _checks
+from rigidjax.body import parameters as charts
+from rigidjax.body.inertia import Inertia, MassProperties
+from rigidjax.body.symmetric3 import swap_trace
+
+# What of a `MassProperties` may be free: in words, and its places among the numbers of `pack`.
+_PARTS = {
+    "mass": ("mass", (0,)),
+    "com": ("centre of mass", (7, 8, 9)),
+    "inertia": ("inertia tensor", (1, 2, 3, 4, 5, 6)),
+}
+COMPONENTS = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))
+
+
+class AbstractBodyChart(eqx.Module):
+    """A chart of bodies: `size` numbers → an `Inertia` or `MassProperties`, and back.
+
+    `log_names`, `unit` and `logs(body)` are the positive quantities that are reported, through
+    their logarithms; `plain_names` and `plain(body)` those that may have either sign.
+
+    >>> class Spheres(AbstractBodyChart):  # one number: the logarithm of the moment
+    ...     size, in_words, unit = 1, "the moment of a sphere", "kg m²"
+    ...     log_names, plain_names = ("I",), ()
+    ...     def body(self, vector):
+    ...         return Inertia.from_principal(*jnp.exp(vector[0]) * jnp.ones(3))
+    ...     def vector(self, body):
+    ...         return self.logs(body)
+    ...     def logs(self, body):
+    ...         return jnp.log(body.tensor[0, 0])[None]
+    ...     def plain(self, body):
+    ...         return jnp.zeros(0)
+    >>> Spheres().body(jnp.zeros(1)).tensor[0].tolist()
+    [1.0, 0.0, 0.0]
+    """
+
+    size: eqx.AbstractVar[int]
+    in_words: eqx.AbstractClassVar[str]
+    log_names: eqx.AbstractClassVar[tuple[str, ...]]
+    plain_names: eqx.AbstractClassVar[tuple[str, ...]]
+    unit: eqx.AbstractClassVar[str]
+
+    @abc.abstractmethod
+    def body(self, vector: Float[Array, " chart"]) -> Inertia | MassProperties:
+        """The body of these numbers."""
+
+    @abc.abstractmethod
+    def vector(self, body: Inertia) -> Float[Array, " chart"]:
+        """The numbers of a body with this inertia, a guess where a fit starts."""
+
+    @abc.abstractmethod
+    def logs(self, body: Any) -> Float[Array, " logs"]:
+        """Logarithms of the positive quantities that are reported."""
+
+    @abc.abstractmethod
+    def plain(self, body: Any) -> Float[Array, " plain"]:
+        """The other quantities that are reported."""
+
+
+class Ratios(AbstractBodyChart):
+    """The whole inertia tensor up to scale: two ratios of moments and the principal axes.
+
+    Five numbers: the log-Cholesky factor of the second moment 𝔖, its scale fixed
+    (Rucker and Wensing 2022, IEEE RA-L 7:2771, doi:10.1109/LRA.2022.3144517). For free motion,
+    which cannot show the scale.
+
+    >>> Ratios().logs(Ratios().body(jnp.zeros(5)))
+    Array([0., 0.], dtype=float64)
+    """
+
+    size: ClassVar[int] = 5
+    in_words: ClassVar[str] = "the inertia tensor up to scale"
+    log_names: ClassVar[tuple[str, ...]] = ("I1/I3", "I2/I3")
+    plain_names: ClassVar[tuple[str, ...]] = ()
+    unit: ClassVar[str] = ""
+
+    def body(self, vector: Float[Array, " chart"]) -> Inertia:
+        return Inertia(swap_trace(charts.unpack_shape(vector)))
+
+    def vector(self, body: Inertia) -> Float[Array, " chart"]:
+        return charts.pack_shape(body.second_moment)
+
+    def logs(self, body: Inertia) -> Float[Array, "2"]:
+        moments = jnp.log(body.moments)
+        return moments[:2] - moments[2]
+
+    def plain(self, body: Inertia) -> Float[Array, "0"]:
+        return jnp.zeros(0, body.tensor.dtype)
+
+
+class PrincipalRatios(AbstractBodyChart):
+    """Two ratios of moments, where the body axes are known to be principal.
+
+    Two numbers: the logarithms of λ1/λ3 and λ2/λ3, the second moments along the axes (notes,
+    eqs 72, 76–78), so that every pair of numbers obeys the triangle inequalities.
+
+    >>> PrincipalRatios().body(jnp.zeros(2)).tensor[0, 0]
+    Array(2., dtype=float64)
+    """
+
+    size: ClassVar[int] = 2
+    in_words: ClassVar[str] = "two ratios of moments, the body axes being principal"
+    log_names: ClassVar[tuple[str, ...]] = ("Ix/Iz", "Iy/Iz")
+    plain_names: ClassVar[tuple[str, ...]] = ()
+    unit: ClassVar[str] = ""
+
+    def body(self, vector: Float[Array, " chart"]) -> Inertia:
+        return _diagonal(jnp.stack([vector[0], vector[1], jnp.zeros((), vector.dtype)]))
+
+    def vector(self, body: Inertia) -> Float[Array, " chart"]:
+        s = body.second_moment
+        return jnp.log(jnp.stack([s[0, 0], s[1, 1]]) / s[2, 2])
+
+    def logs(self, body: Inertia) -> Float[Array, "2"]:
+        i = body.tensor
+        return jnp.log(jnp.stack([i[0, 0], i[1, 1]]) / i[2, 2])
+
+    def plain(self, body: Inertia) -> Float[Array, "0"]:
+        return jnp.zeros(0, body.tensor.dtype)
+
+
+class Tensor(AbstractBodyChart):
+    """The whole inertia tensor with its scale, which a known torque or momentum inside shows.
+
+    Six numbers: the log-Cholesky factor of 𝔖 (as `Ratios`), in units of `typical`.
+
+    **Arguments:** `typical` kg m², about how large the moments are: a fit starts there. **Raises**
+    `ValueError` where it is not positive.
+
+    >>> Tensor(1e-3).body(jnp.zeros(6)).tensor[0, 0]
+    Array(0.001, dtype=float64)
+    """
+
+    typical: Float[Array, ""]
+    size: ClassVar[int] = 6
+    in_words: ClassVar[str] = "the inertia tensor"
+    log_names: ClassVar[tuple[str, ...]] = ("I1", "I2", "I3")
+    plain_names: ClassVar[tuple[str, ...]] = ("Ixx", "Iyy", "Izz", "Iyz", "Ixz", "Ixy")
+    unit: ClassVar[str] = "kg m²"
+
+    def __init__(self, typical: float = 1.0):
+        self.typical = _typical(typical)
+
+    def body(self, vector: Float[Array, " chart"]) -> Inertia:
+        s = charts.unpack_second_moment(vector) * (0.5 * self.typical)
+        return Inertia(swap_trace(s))
+
+    def vector(self, body: Inertia) -> Float[Array, " chart"]:
+        return charts.pack_second_moment(body.second_moment / (0.5 * self.typical))
+
+    def logs(self, body: Inertia) -> Float[Array, "3"]:
+        return jnp.log(body.moments)
+
+    def plain(self, body: Inertia) -> Float[Array, "6"]:
+        return jnp.stack([body.tensor[i, j] for i, j in COMPONENTS])
+
+
+class Principal(AbstractBodyChart):
+    """Three principal moments with their scale, where the body axes are known to be principal.
+
+    Three numbers: ½ log of the second moments along the axes, in units of `typical`.
+
+    **Arguments:** as for `Tensor`.
+
+    >>> Principal(2.0).body(jnp.zeros(3)).tensor[0, 0]
+    Array(2., dtype=float64)
+    """
+
+    typical: Float[Array, ""]
+    size: ClassVar[int] = 3
+    in_words: ClassVar[str] = "three moments, the body axes being principal"
+    log_names: ClassVar[tuple[str, ...]] = ("Ix", "Iy", "Iz")
+    plain_names: ClassVar[tuple[str, ...]] = ()
+    unit: ClassVar[str] = "kg m²"
+
+    def __init__(self, typical: float = 1.0):
+        self.typical = _typical(typical)
+
+    def body(self, vector: Float[Array, " chart"]) -> Inertia:
+        return Inertia(_diagonal(2.0 * vector).tensor * (0.5 * self.typical))
+
+    def vector(self, body: Inertia) -> Float[Array, " chart"]:
+        s = body.second_moment / (0.5 * self.typical)
+        return 0.5 * jnp.log(jnp.stack([s[0, 0], s[1, 1], s[2, 2]]))
+
+    def logs(self, body: Inertia) -> Float[Array, "3"]:
+        i = body.tensor
+        return jnp.log(jnp.stack([i[0, 0], i[1, 1], i[2, 2]]))
+
+    def plain(self, body: Inertia) -> Float[Array, "0"]:
+        return jnp.zeros(0, body.tensor.dtype)
+
+
+class Mass(AbstractBodyChart):
+    """Mass, centre of mass and inertia: all ten numbers, where forces show them, or some of them.
+
+    The log-Cholesky chart of the 4 × 4 pseudo-inertia around a `guess`, which is where it starts.
+
+    **Arguments:** `guess` a `MassProperties`, about the right size, and right in all that is not
+    free; `free` which of it a fit may move: `"mass"` (the second moment follows it, its ratio to
+    the mass being known, unless it is free, too), `"inertia"` about the centre of mass, `"com"`. So
+    `free=["inertia"]` is for a body that was weighed and balanced, `["mass"]` for a load of known
+    shape, `["com"]` for a centre that moved.
+
+    **Raises:** `TypeError` for a guess of another kind; `ValueError` for another word, or none.
+
+    >>> import rigidjax as rj
+    >>> box = rj.shapes.box(2.0, [1.0, 1.0, 1.0])
+    >>> float(Mass(box).body(jnp.zeros(10)).mass), Mass(box, ["inertia"]).log_names
+    (2.0, ('I1', 'I2', 'I3'))
+    """
+
+    guess: MassProperties
+    free: tuple[str, ...] = eqx.field(static=True)
+    unit: ClassVar[str] = "SI"
+
+    def __init__(self, guess: MassProperties, free: Sequence[str] = tuple(_PARTS)):
+        self.guess = _checks.single(guess, MassProperties, "guess")
+        wanted = "some of mass, inertia, com"
+        _checks.instance(free, Sequence, "free", wanted=wanted)
+        chosen = [free] if isinstance(free, str) else list(free)
+        for name in chosen:
+            _checks.word(name, tuple(_PARTS), "free")
+        if not chosen:
+            raise ValueError("free: wanted mass, inertia or com, got none; see Known")
+        self.free = tuple(name for name in _PARTS if name in chosen)
+
+    @property
+    def size(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """How many numbers are free."""
+        return len(self._places)
+
+    @property
+    def in_words(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """What is free."""
+        *most, last = [_PARTS[name][0] for name in self.free]
+        return f"{', '.join(most)} and {last}" if most else last
+
+    @property
+    def log_names(self) -> tuple[str, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """The positive quantities."""
+        mass = ("mass",) if "mass" in self.free else ()
+        return (*mass, "I1", "I2", "I3") if "inertia" in self.free else mass
+
+    @property
+    def plain_names(self) -> tuple[str, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """The others."""
+        return ("com x", "com y", "com z") if "com" in self.free else ()
+
+    @property
+    def _places(self) -> list[int]:
+        return [place for name in self.free for place in _PARTS[name][1]]
+
+    def body(self, vector: Float[Array, " chart"]) -> MassProperties:
+        # Lengths in units of the body's own size: every number is of order one.
+        size = jnp.sqrt(jnp.trace(self.guess.second_moment) / self.guess.mass)
+        if self.size < 10:
+            vector = jnp.zeros(10, vector.dtype).at[np.array(self._places)].set(vector)
+        step = jnp.concatenate([vector[:4], size * vector[4:]])
+        return charts.unpack(charts.pack(self.guess) + step)
+
+    def vector(self, body: Inertia) -> Float[Array, " chart"]:
+        return jnp.zeros(self.size, self.guess.mass.dtype)
+
+    def logs(self, body: MassProperties) -> Float[Array, " logs"]:
+        mass, moments = body.mass[None], body.inertia.moments
+        kept = [mass] if "mass" in self.free else []
+        kept += [moments] if "inertia" in self.free else []
+        return jnp.log(jnp.concatenate(kept)) if kept else jnp.zeros(0, mass.dtype)
+
+    def plain(self, body: MassProperties) -> Float[Array, " plain"]:
+        return body.com if "com" in self.free else jnp.zeros(0, body.com.dtype)
+
+
+class Known(AbstractBodyChart):
+    """A body that is known: only states, torques and sensors are fitted.
+
+    **Arguments:** `known` an `Inertia` or `MassProperties`.
+
+    >>> import rigidjax as rj
+    >>> Known(rj.Inertia.from_principal(1.0, 2.0, 3.0)).size
+    0
+    """
+
+    known: Inertia | MassProperties
+    size: ClassVar[int] = 0
+    in_words: ClassVar[str] = "nothing of the body"
+    log_names: ClassVar[tuple[str, ...]] = ()
+    plain_names: ClassVar[tuple[str, ...]] = ()
+    unit: ClassVar[str] = ""
+
+    def __init__(self, known: Inertia | MassProperties):
+        self.known = _checks.single(known, (Inertia, MassProperties), "known")
+
+    def body(self, vector: Float[Array, " chart"]) -> Inertia | MassProperties:
+        return self.known
+
+    def vector(self, body: Inertia) -> Float[Array, " chart"]:
+        return jnp.zeros(0, body.tensor.dtype)
+
+    def logs(self, body: Any) -> Float[Array, "0"]:
+        return jnp.zeros(0)
+
+    def plain(self, body: Any) -> Float[Array, "0"]:
+        return jnp.zeros(0)
+
+
+def _diagonal(logs: Float[Array, "3"]) -> Inertia:
+    """The body whose second moments along the axes have these logarithms."""
+    a, b, c = jnp.exp(logs[0]), jnp.exp(logs[1]), jnp.exp(logs[2])
+    return Inertia(jnp.diag(jnp.stack([b + c, c + a, a + b])))
+
+
+def _typical(value: float) -> Array:
+    size = _checks.positive(value, "typical", "a positive moment of inertia, kg m²")
+    return jnp.asarray(size, jnp.result_type(float))

@@ -1,0 +1,281 @@
+"""From a description in words, as the command line gives it, to recordings and a problem."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+
+from rigidjax.identify.body_charts import (
+    AbstractBodyChart,
+    Principal,
+    PrincipalRatios,
+    Ratios,
+    Tensor,
+)
+from rigidjax.identify.csv_io import UNITS, LogError, increasing, read_table
+from rigidjax.identify.free_parameters import Free
+from rigidjax.identify.layouts import USUAL as USUAL, layout_of as layout_of
+from rigidjax.identify.loss import Huber, SoftL1
+from rigidjax.identify.problem import Problem
+from rigidjax.identify.recording import Recording
+from rigidjax.identify.sensors import (
+    AbstractSensor,
+    Accelerometer,
+    AttitudeSensor,
+    Gyro,
+    quaternions_from_euler,
+)
+from rigidjax.motion.torques import Damping, Flywheel, Series, Sum, Torque, Wheel
+
+MODELS = ("ratios", "principal-ratios", "tensor", "principal")
+FREE = ("bias", "drag", "delay")
+LOSSES = ("soft-l1", "huber", "none")
+DEFAULT_UNITS = {"gyro": "rad/s", "accelerometer": "m/s2", "quaternion": "1"}
+
+
+class Channel(eqx.Module):
+    """One sensor of a log: what kind, which columns, in which unit, how noisy (in that unit; one
+    figure or one for each axis), and its full scale (in that unit).
+    """
+
+    kind: str
+    columns: tuple[str, ...]
+    unit: str
+    noise: tuple[float, ...] | None
+    limit: float | None = None
+
+
+class WheelColumn(eqx.Module):
+    """A wheel whose speed was logged: column, unit, inertia (kg m²), axis."""
+
+    column: str
+    unit: str
+    inertia: float
+    axis: tuple[float, float, float]
+
+
+def channel(text: str) -> Channel:
+    """A sensor written `KIND=COLUMNS[:UNIT[:NOISE]]`, such as `gyro=wx,wy,wz:deg/s:0.1`.
+
+    KIND is `gyro`, `accelerometer`, `quaternion` (w, x, y, z) or `euler-ZXZ` (any sequence; body →
+    world); NOISE one number or three, one for each axis, as in `0.1,0.1,0.2`. **Raises**
+    `LogError` in words.
+
+    >>> channel("gyro=p,q,r:deg/s").unit
+    'deg/s'
+    """
+    kind, _, rest = text.partition("=")
+    names, *more = rest.split(":")
+    columns = tuple(name.strip() for name in names.split(","))
+    if kind not in DEFAULT_UNITS and not kind.startswith("euler-"):
+        raise LogError(
+            f"sensor {text!r}: wanted gyro, accelerometer, quaternion or euler-SEQUENCE, as in "
+            "gyro=wx,wy,wz:deg/s"
+        )
+    wanted = 4 if kind == "quaternion" else 3
+    if len(columns) != wanted or not all(columns):
+        raise LogError(f"sensor {text!r}: wanted {wanted} columns, got {names!r}")
+    unit = more[0] if more and more[0] else DEFAULT_UNITS.get(kind, "rad")
+    allowed = {
+        "gyro": ("rad/s", "deg/s", "rpm"),
+        "accelerometer": ("m/s2", "g"),
+        "quaternion": ("1",),
+    }.get(kind, ("rad", "deg"))
+    if unit not in allowed:
+        raise LogError(f"sensor {text!r}: wanted the unit {' or '.join(allowed)}, got {unit!r}")
+    return Channel(kind, columns, unit, _noise(text, more[1]) if len(more) > 1 else None)
+
+
+def _noise(text: str, cell: str) -> tuple[float, ...]:
+    try:
+        noise = tuple(float(part) for part in cell.split(","))
+    except ValueError:
+        raise LogError(f"sensor {text!r}: wanted a number for the noise, got {cell!r}") from None
+    return noises(noise, f"sensor {text!r}")
+
+
+def noises(noise: Sequence[float], where: str) -> tuple[float, ...]:
+    """One positive noise, or one for each of three axes. **Raises** `LogError` for others."""
+    if len(noise) not in (1, 3):
+        raise LogError(f"{where}: wanted one noise or three, got {len(noise)}")
+    if not all(0 < part < np.inf for part in noise):
+        raise LogError(f"{where}: wanted a positive noise, got {min(noise):g}")
+    return tuple(noise)
+
+
+def wheel(text: str) -> WheelColumn:
+    """A wheel written `COLUMN:INERTIA[:AXIS[:UNIT]]`, such as `flywheel:5.2e-7:z:rad/s`.
+
+    INERTIA in kg m² about its axis, AXIS `x`, `y` or `z` of the body. **Raises** `LogError`.
+
+    >>> wheel("speed:1e-6").axis
+    (0.0, 0.0, 1.0)
+    """
+    name, *more = text.split(":")
+    axis = more[1] if len(more) > 1 else "z"
+    unit = more[2] if len(more) > 2 else "rad/s"
+    try:
+        inertia = float(more[0])
+    except (IndexError, ValueError):
+        raise LogError(f"wheel {text!r}: wanted COLUMN:INERTIA, as in flywheel:5.2e-7:z") from None
+    if axis not in ("x", "y", "z") or unit not in ("rad/s", "rpm"):
+        raise LogError(f"wheel {text!r}: wanted an axis x, y or z and a unit rad/s or rpm")
+    directions = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
+    return WheelColumn(name, unit, inertia, directions[axis])
+
+
+def read_log(
+    path: str | Path,
+    channels: Sequence[Channel],
+    *,
+    time: str = "t",
+    time_unit: str = "s",
+    window: tuple[float, float] | None = None,
+    wheels: Sequence[WheelColumn] = (),
+    free: Sequence[str] = (),
+) -> Recording:
+    """One recording from a file, with the sensors and wheels that are described.
+
+    **Arguments:** `path`; `channels`; `time`, `time_unit` the time column; `window` (from, to), s,
+    or `None` for all; `wheels`; `free` of `bias`, `drag`, `delay`: what the sensors and the torque
+    are to have so that a fit can move it. An empty cell is a gap.
+
+    **Raises** `LogError` as `read_table`.
+
+    >>> read_log("missing.csv", [channel("gyro=wx,wy,wz")])
+    Traceback (most recent call last):
+    rigidjax.identify.csv_io.LogError: missing.csv: no such file
+    """
+    names = [time, *(c for one in channels for c in one.columns), *(w.column for w in wheels)]
+    table = read_table(path, names)
+    t = table[time] * UNITS[time_unit]
+    increasing(path, t, time)
+    inside = np.ones(t.shape, bool)
+    if window is not None:
+        inside = (t >= window[0] - 1e-12) & (t <= window[1] + 1e-12)
+        if inside.sum() < 4:
+            raise LogError(f"{path}: fewer than 4 samples between {window[0]} and {window[1]} s")
+    kept = slice(None) if inside.all() else inside
+    readings = []
+    for one in channels:
+        values = np.stack([table[name] for name in one.columns], axis=1)
+        values *= UNITS[one.unit]
+        seen = np.isfinite(values).all(axis=1)
+        noise = None
+        if one.noise is not None:
+            figures = one.noise if len(one.noise) > 1 else 3 * one.noise
+            noise = UNITS[one.unit] * np.array(figures)
+        sensor, values = _sensor(one, values, noise, "bias" in free)
+        readings.append((sensor, values[kept], seen[kept]))
+    torque = _torque(path, t, table, wheels, free)
+    # A large log is not to be held twice.
+    del table
+    try:
+        return Recording(t[kept], *readings, torque=torque)
+    except ValueError as error:
+        raise LogError(f"{path}: {error}") from None
+
+
+def _sensor(
+    one: Channel, values: np.ndarray, noise: np.ndarray | None, bias: bool
+) -> tuple[AbstractSensor, np.ndarray]:
+    zero = [0.0, 0.0, 0.0] if bias else None
+    limit = None if one.limit is None else one.limit * UNITS[one.unit]
+    if one.kind == "gyro":
+        return Gyro(noise, bias=zero, limit=limit), values
+    if one.kind == "accelerometer":
+        return Accelerometer(noise, place=[0.0, 0.0, 0.0], bias=zero, limit=limit), values
+    if one.kind == "quaternion":
+        return AttitudeSensor(noise), values
+    try:
+        return AttitudeSensor(noise), quaternions_from_euler(
+            values, one.kind.removeprefix("euler-")
+        )
+    except ValueError as error:
+        raise LogError(f"sensor {one.kind}: {error}") from None
+
+
+def _torque(
+    path: str | Path,
+    t: np.ndarray,
+    table: dict[str, np.ndarray],
+    wheels: Sequence[WheelColumn],
+    free: Sequence[str],
+) -> Torque | None:
+    parts: list[Torque] = []
+    for one in wheels:
+        try:
+            speed = Series(t, table[one.column] * UNITS[one.unit])
+        except ValueError as error:
+            raise LogError(f"{path}: column {one.column!r}: {error}") from None
+        delay = 0.0 if "delay" in free else None
+        parts.append(Flywheel(Wheel(one.inertia, one.axis, speed, delay=delay)))
+    if "drag" in free:
+        parts.append(Damping([0.0, 0.0, 0.0]))
+    return Sum(*parts) if parts else None
+
+
+def problem_of(
+    recordings: Sequence[Recording],
+    model: str,
+    *,
+    typical: float = 1.0,
+    free: Sequence[str] = (),
+    loss: str = "soft-l1",
+) -> Problem:
+    """The problem of these recordings.
+
+    **Arguments:** `recordings` of `read_log`; `model` one of `ratios`, `principal-ratios`,
+    `tensor`, `principal`; `typical` kg m², about how large the moments are; `free` as `read_log`
+    was given: a drag coefficient for all, a bias and a delay for each recording; `loss` how an
+    outlier counts: `soft-l1`, `huber` (both linearly), `none` (squared).
+
+    **Raises** `LogError` for an unknown model or a scale that nothing can show.
+    """
+    charts: dict[str, AbstractBodyChart] = {
+        "ratios": Ratios(),
+        "principal-ratios": PrincipalRatios(),
+        "tensor": Tensor(typical),
+        "principal": Principal(typical),
+    }
+    if model not in charts:
+        raise LogError(f"model: wanted one of {', '.join(MODELS)}, got {model!r}")
+    if loss not in LOSSES:
+        raise LogError(f"loss: wanted one of {', '.join(LOSSES)}, got {loss!r}")
+    counts = {"soft-l1": SoftL1(), "huber": Huber(), "none": None}[loss]
+    return Problem(
+        list(recordings), charts[model], free=_free(recordings[0], typical, free), loss=counts
+    )
+
+
+def _free(first: Recording, typical: float, free: Sequence[str]) -> list[Free]:
+    """What of the sensors and the torque is free, as `read_log` laid them out."""
+
+    def sensor_bias(index: int) -> Callable[[Any], Any]:
+        return lambda r: r.readings[index].sensor.bias
+
+    def place(index: int) -> Callable[[Any], Any]:
+        return lambda r: r.readings[index].sensor.place
+
+    def delay(index: int) -> Callable[[Any], Any]:
+        return lambda r: r.torque.parts[index].momentum.delay
+
+    def drag(r: Any) -> Any:
+        return r.torque.parts[-1].coefficient
+
+    items: list[Free] = []
+    for index, sensor in enumerate(first.sensors):
+        name = type(sensor).__name__.lower()
+        if getattr(sensor, "bias", None) is not None:
+            size = 0.05 if isinstance(sensor, Gyro) else 0.5
+            items.append(Free(sensor_bias(index), f"{name} bias", scale=size, each=True))
+        if isinstance(sensor, Accelerometer):
+            items.append(Free(place(index), f"{name} place", scale=0.01))
+    if "drag" in free:
+        items.append(Free(drag, "drag", scale=0.1 * typical, unit="N m s"))
+    if "delay" in free and isinstance(first.torque, Sum):
+        wheels = len(first.torque.parts) - ("drag" in free)
+        items += [Free(delay(i), "wheel delay", scale=1e-3, each=True) for i in range(wheels)]
+    return items

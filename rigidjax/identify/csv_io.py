@@ -1,0 +1,238 @@
+"""Reading logs from files. Errors name file, line and column."""
+
+import csv
+import math
+from array import array
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, TextIO
+
+import numpy as np
+
+from rigidjax import _checks
+from rigidjax.identify import blackbox
+from rigidjax.identify.layouts import split_header
+from rigidjax.identify.recording import Recording
+from rigidjax.identify.sensors import Gyro
+
+# Everything is turned into SI.
+UNITS = {
+    "s": 1.0,
+    "ms": 1e-3,
+    "us": 1e-6,
+    "rad/s": 1.0,
+    "deg/s": math.pi / 180,
+    "rpm": math.pi / 30,
+    "m/s2": 1.0,
+    "g": 9.80665,
+    "rad": 1.0,
+    "deg": math.pi / 180,
+    "m": 1.0,
+    "mm": 1e-3,
+    "1": 1.0,
+}
+
+
+class LogError(ValueError):
+    """A log that cannot be read; the message names the file and, where known, line and column.
+
+    >>> issubclass(LogError, ValueError)
+    True
+    """
+
+
+def read_table(path: str | Path, columns: Sequence[str]) -> dict[str, np.ndarray]:
+    """Columns of a log by name: text with a header line, `.npz`, `.mat` (MATLAB up to v7), or a
+    Blackbox log of a flight controller, `.bbl` or `.bfl` (with the extra `blackbox`).
+
+    **Arguments:** `path`; `columns` the names that are wanted, others are ignored. Text is
+    separated by commas, semicolons or tabs, whichever splits the header line into most names; its
+    decimals have a point. **Returns** name → (T,) numbers. An empty cell is a gap and comes back as
+    NaN. A text is read line by line: beside it, up to three times its numbers are held.
+
+    **Raises:** `LogError`, one line naming file, line and column, for a file that is missing, cut
+    or not of its kind, a missing column or two of its name, a cell that is not a number, a line
+    with more cells than the header, columns of different lengths.
+
+    >>> read_table("missing.csv", ["t"])
+    Traceback (most recent call last):
+    rigidjax.identify.csv_io.LogError: missing.csv: no such file
+    """
+    path = _checks.path(path)
+    _checks.instance(columns, Sequence, "columns", wanted="a sequence of names")
+    if isinstance(columns, str) or not columns or not all(isinstance(c, str) for c in columns):
+        raise TypeError(f"columns: wanted a sequence of names, got {columns!r}")
+    if not path.exists():
+        raise LogError(f"{path}: no such file")
+    if path.is_dir():
+        raise LogError(f"{path}: is a folder, not a log")
+    if path.suffix.lower() in (".npz", ".mat", *blackbox.SUFFIXES):
+        return _arrays(path, columns)
+    return _csv(path, columns)
+
+
+def read_gyro_csv(
+    path: str | Path,
+    *,
+    columns: tuple[str, str, str, str] = ("t", "wx", "wy", "wz"),
+    unit: str = "rad/s",
+    noise: float | None = None,
+) -> Recording:
+    """A recording of body rates from a CSV file with a header line.
+
+    **Arguments:** `path` the file; `columns` the names of the time column (s) and of the three rate
+    columns (body frame); `unit` of the rates, `rad/s` or `deg/s`; `noise` standard deviation of a
+    reading in that unit, or `None` to have it estimated. Other columns are ignored. For other
+    sensors and files: `read_table`, then `Recording`.
+
+    **Raises:** `LogError`, one line naming file, line and column, for a file that is missing or not
+    text, a missing column, a cell that is not a finite number, or times that do not increase.
+
+    >>> read_gyro_csv("missing.csv")
+    Traceback (most recent call last):
+    rigidjax.identify.csv_io.LogError: missing.csv: no such file
+    """
+    if not isinstance(unit, str) or unit not in ("rad/s", "deg/s"):
+        raise LogError(f"unit: wanted one of rad/s, deg/s, got {unit!r}")
+    noise = None if noise is None else _checks.positive(noise, "noise")
+    table = read_table(path, columns)
+    for name in columns:
+        gap = np.isnan(table[name])
+        if gap.any():
+            raise LogError(f"{path}: column {name!r}: row {int(np.argmax(gap)) + 1} is empty")
+    t = table[columns[0]]
+    increasing(path, t, columns[0])
+    rates = np.stack([table[name] for name in columns[1:]], axis=1)
+    # A large log is not to be held twice.
+    del table
+    rates *= UNITS[unit]
+    sensor = Gyro(None if noise is None else noise * UNITS[unit])
+    return Recording(t, (sensor, rates))
+
+
+def increasing(path: str | Path, t: np.ndarray, name: str) -> None:
+    """Raise `LogError` unless there are four times at least and each is above the one before."""
+    if t.size < 4:
+        raise LogError(f"{path}: wanted at least 4 samples, got {t.size}")
+    if not np.isfinite(t).all():
+        raise LogError(
+            f"{path}: column {name!r}: row {int(np.argmin(np.isfinite(t))) + 1} is empty"
+        )
+    falling = np.flatnonzero(np.diff(t) <= 0)
+    if falling.size:
+        row = int(falling[0]) + 1
+        raise LogError(
+            f"{path}: line {row + 2}: column {name!r}: time {t[row]:g} is not above the "
+            f"{t[row - 1]:g} before it"
+        )
+
+
+def _csv(path: Path, columns: Sequence[str]) -> dict[str, np.ndarray]:
+    try:
+        # Line by line: what is held of a large file is its numbers.
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            return _rows(path, file, columns)
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        why = f"{type(error).__name__}: {error}".splitlines()[0]
+        raise LogError(f"{path}: cannot be read as text ({why})") from None
+
+
+def _rows(path: Path, file: TextIO, columns: Sequence[str]) -> dict[str, np.ndarray]:
+    header, separator = split_header(file.readline())
+    if not any(header):
+        raise LogError(f"{path}: line 1: wanted a header with the columns {', '.join(columns)}")
+    for name in columns:
+        if name not in header:
+            advice = (
+                "names and numbers are separated by commas, semicolons or tabs"
+                if len(header) == 1
+                else "name yours with --columns or --sensor"
+            )
+            raise LogError(
+                f"{path}: line 1: no column {name!r}; the columns are {', '.join(header)} "
+                f"({advice})"
+            )
+        if header.count(name) > 1:
+            raise LogError(
+                f"{path}: line 1: {header.count(name)} columns are called {name!r}: which one?"
+            )
+    wanted = [(name, header.index(name), array("d")) for name in columns]
+    reader = csv.reader(file, delimiter=separator)
+    for cells in reader:
+        line = reader.line_num + 1
+        if len(cells) > len(header) and any(cell.strip() for cell in cells[len(header) :]):
+            raise LogError(
+                f"{path}: line {line}: {len(cells)} cells, but the header names {len(header)} "
+                "columns"
+            )
+        if any(cell.strip() for cell in cells):
+            for name, place, numbers in wanted:
+                if place >= len(cells):
+                    raise LogError(f"{path}: line {line}: column {name!r}: the line ends before it")
+                try:
+                    numbers.append(_number(cells[place].strip()))
+                except ValueError as error:
+                    raise LogError(f"{path}: line {line}: column {name!r}: {error}") from None
+    return {name: np.frombuffer(numbers, float) for name, _, numbers in wanted}
+
+
+def _number(cell: str) -> float:
+    if not cell:
+        return math.nan
+    # Python's own spelling of numbers is wider than that of logs: 1_000, other alphabets' digits.
+    plain = cell.isascii() and "_" not in cell
+    try:
+        value = float(cell if plain else "")
+    except ValueError:
+        comma = "; a decimal comma? wanted a point" if "," in cell else ""
+        raise ValueError(f"{cell!r} is not a number{comma}") from None
+    if not math.isfinite(value):
+        raise ValueError(f"{cell} is not a finite number; leave the cell empty for a gap")
+    return value
+
+
+def _arrays(path: Path, columns: Sequence[str]) -> dict[str, np.ndarray]:
+    # Of an empty or a cut file the readers raise whatever they run into.
+    try:
+        names, held = _readers[path.suffix.lower()](path, columns)
+    except ModuleNotFoundError as error:
+        raise LogError(str(error)) from None
+    except Exception as error:
+        why = f"{type(error).__name__}: {error}".splitlines()[0]
+        raise LogError(
+            f"{path}: cannot be read; is it whole, and a {path.suffix} file? ({why})"
+        ) from None
+    out = {}
+    for name in columns:
+        if name not in held:
+            raise LogError(f"{path}: no array {name!r}; the arrays are {', '.join(names)}")
+        if np.asarray(held[name]).dtype.kind not in "biuf":
+            raise LogError(f"{path}: array {name!r} does not hold real numbers")
+        out[name] = np.asarray(held[name], float).reshape(-1)
+        endless = np.isinf(out[name])
+        if endless.any():
+            raise LogError(
+                f"{path}: array {name!r}: row {int(np.argmax(endless)) + 1} is infinite; NaN marks "
+                "a gap"
+            )
+    sizes = {name: array.size for name, array in out.items()}
+    if len(set(sizes.values())) > 1:
+        raise LogError(f"{path}: arrays of different lengths: {sizes}")
+    return out
+
+
+def _npz(path: Path, columns: Sequence[str]) -> tuple[list[str], dict[str, Any]]:
+    # Of a file that it opened itself and cannot read NumPy leaves the handle open.
+    with path.open("rb") as raw, np.load(raw) as file:
+        return file.files, {name: file[name] for name in columns if name in file.files}
+
+
+def _mat(path: Path, columns: Sequence[str]) -> tuple[list[str], dict[str, Any]]:
+    from scipy.io import loadmat, whosmat
+
+    with path.open("rb") as raw:
+        names = [name for name, *_ in whosmat(raw)]
+        return names, loadmat(raw, variable_names=list(columns))
+
+
+_readers = {".npz": _npz, ".mat": _mat} | dict.fromkeys(blackbox.SUFFIXES, blackbox.read_blackbox)

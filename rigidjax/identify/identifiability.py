@@ -1,0 +1,141 @@
+"""Which numbers a fit determines and which not, in words."""
+
+from typing import TYPE_CHECKING
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+
+from rigidjax.body.inertia import MassProperties
+from rigidjax.identify.full_scale import in_words
+from rigidjax.identify.quantities import (
+    Quantity,
+    charts,
+    covariance as reported_covariance,
+    quantile,
+)
+from rigidjax.identify.several_bodies import Bodies
+
+if TYPE_CHECKING:
+    from rigidjax.identify.fit import Fit
+
+
+def identifiability(fit: "Fit") -> tuple[str, ...]:
+    """What the data determine, what they determine weakly, what not at all."""
+    reach = quantile(fit, 0.95)
+    out = []
+    for quantity in _moments(fit):
+        wide = reach * quantity.deviation
+        # Half-width over value where narrow; a factor where wide.
+        if not np.isfinite(wide) or wide > 1.5:
+            out.append(f"{quantity.name} is not determined by these data.")
+        elif wide > 0.05:
+            out.append(
+                f"{quantity.name} is weakly determined: its 95 % interval is "
+                f"{2 * np.sinh(wide):.0%} of its value."
+            )
+        else:
+            out.append(f"{quantity.name} is well determined, to ±{wide:.2g} of its value.")
+    out.append(_rate(fit, reach))
+    out += _unseen(fit)
+    out += correlations(fit)
+    if fit.problem.torque is None:
+        out.append(
+            "Free motion cannot show the absolute inertia, only ratios of moments; nor the mass or "
+            "the centre of mass."
+        )
+    out += in_words(fit.problem.records.readings)
+    if fit.correlation > 1.5:
+        out.append(
+            f"The errors are autocorrelated over {fit.correlation:.0f} samples, so something is "
+            "missing in the model or the data were filtered; the intervals allow for it."
+        )
+    return tuple(out)
+
+
+def _moments(fit: "Fit") -> list[Quantity]:
+    """The positive quantities of the bodies."""
+    out, first = [], 0
+    for _, chart in charts(fit.problem):
+        out += fit.quantities[first : first + len(chart.log_names)]
+        first += len(chart.log_names) + len(chart.plain_names)
+    return out
+
+
+def _rate(fit: "Fit", reach: float) -> str:
+    first = sum(len(c.log_names) + len(c.plain_names) for _, c in charts(fit.problem))
+    rates = fit.quantities[first : first + 3 * fit.problem.count]
+    shares = []
+    for index in range(fit.problem.count):
+        three = rates[3 * index : 3 * index + 3]
+        length = np.linalg.norm([q.value for q in three])
+        shares.append(reach * max(q.deviation for q in three) / length)
+    grade = "well" if max(shares) < 0.1 else "weakly"
+    what = "The first body rate is" if fit.problem.count == 1 else "The first body rates are"
+    its = "its length" if fit.problem.count == 1 else "their lengths"
+    return f"{what} {grade} determined, to ±{max(shares):.2g} of {its}."
+
+
+def _unseen(fit: "Fit") -> list[str]:
+    count = fit.null_directions.shape[0]
+    if not count:
+        return []
+    out = []
+    if scale_is_unseen(fit):
+        out.append("The data determine the inertia only up to scale.")
+    one = count == 1
+    out.append(
+        f"{count} combination{'' if one else 's'} of the free numbers {'is' if one else 'are'} not "
+        "determined by these data; intervals that depend on "
+        f"{'it' if one else 'them'} are infinite."
+    )
+    return out
+
+
+def scale_is_unseen(fit: "Fit") -> bool:
+    """Whether some unseen direction is the body grown as a whole, all else at rest."""
+    flat, restore = ravel_pytree(fit.parameters)
+    null = np.asarray(fit.null_directions)
+    if not len(null):
+        return False
+
+    if isinstance(fit.problem.body, Bodies):
+        return False
+
+    def tensor(x: jax.Array) -> jax.Array:
+        body = fit.problem.bodies(restore(x))
+        inertia = body.inertia if isinstance(body, MassProperties) else body
+        return inertia.tensor.reshape(-1)
+
+    here = np.asarray(tensor(flat))
+    slopes = np.stack([np.asarray(jax.jvp(tensor, (flat,), (jnp.asarray(v),))[1]) for v in null])
+    wanted, *_ = np.linalg.lstsq(slopes.T, here, rcond=None)
+    left = np.linalg.norm(slopes.T @ wanted - here) / np.linalg.norm(here)
+    return bool(left < 1e-3)
+
+
+def correlations(fit: "Fit") -> list[str]:
+    """Pairs of reported quantities whose errors are correlated (|ρ| > 0.95).
+
+    Of an inertia tensor its principal moments, not its components, which follow from them.
+    """
+    covariance = reported_covariance(fit)
+    deviation = np.array([quantity.deviation for quantity in fit.quantities])
+    good = np.isfinite(deviation) & (deviation > 0)
+    follow = {f"{plain}{name}" for name, c in charts(fit.problem) for plain in c.plain_names}
+    names = [quantity.name for quantity in fit.quantities]
+    good &= np.array([name not in follow or name.startswith("com") for name in names])
+    scaled = np.where(good, deviation, 1.0)
+    rho = np.where(np.outer(good, good), covariance / np.outer(scaled, scaled), 0.0)
+    pairs = [
+        (i, j)
+        for i in range(len(rho))
+        for j in range(i)
+        if np.isfinite(rho[i, j]) and abs(rho[i, j]) > 0.95
+    ]
+    pairs.sort(key=lambda pair: -abs(rho[pair]))
+    return [
+        f"{names[j]} and {names[i]} are strongly correlated (ρ = {rho[i, j]:+.3f})."
+        for i, j in pairs[:5]
+    ]

@@ -1,0 +1,134 @@
+"""Where a fit starts: a linear regression where the data allow it, and scattered points around."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import PRNGKeyArray
+
+from rigidjax._types import HasSpin
+from rigidjax.body.inertia import Inertia
+from rigidjax.identify.direct_estimates import rates
+from rigidjax.identify.parameters import Parameters
+from rigidjax.identify.problem import Problem
+from rigidjax.identify.recording import Recording
+from rigidjax.identify.reference_states import first_rate
+from rigidjax.identify.sensors import Gyro
+from rigidjax.identify.several_bodies import Bodies
+from rigidjax.motion import Spin
+from rigidjax.motion.torques import Torque
+from rigidjax.motion.torques.base import evaluate
+from rigidjax.motion.torques.states import has_states
+
+BASIS = np.zeros((6, 3, 3))
+for _k, (_i, _j) in enumerate([(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)]):
+    BASIS[_k, _i, _j] = BASIS[_k, _j, _i] = 1.0
+
+
+def starting_points(problem: Problem, count: int, key: PRNGKeyArray | None) -> list[Parameters]:
+    """`count` starting points, the most informed first.
+
+    **Arguments:** `problem`; `count` ≥ 1; `key` a JAX random key, or `None`. The first body rate is
+    the first reading (or the turn between attitudes over its time). The inertia is the regression
+    on Euler's equations where it was sampled finely enough, else a sphere; further starts scatter
+    the shape over the whole chart and the rate by a tenth. What a `Free` moves starts as it is
+    given.
+    """
+    recordings = problem.recordings
+    if isinstance(problem.body, Bodies):
+        found = {}
+        for name in problem.body.names:
+            mine = [r for r, of in zip(recordings, problem.of, strict=True) if of == name]
+            found[name] = regress_inertia(tuple(mine))
+        known = {name: body for name, body in found.items() if body is not None}
+        regressed, start = known or None, problem.start(known)
+    else:
+        regressed = regress_inertia(recordings)
+        start = problem.start(regressed)
+    rates = np.stack([first_rate(recording) for recording in recordings])
+    rates = rates / np.asarray(problem.reference.rate)[:, None]
+    centre = np.asarray(start.body)
+    # NumPy's generator: that of JAX takes seconds to compile.
+    rng = np.random.default_rng(np.asarray(jax.random.key_data(key)) if key is not None else 0)
+    out = []
+    for index in range(count):
+        wide = 0.0 if index == 0 else (0.5 if regressed is not None and index % 2 else 1.5)
+        middle = centre if (index == 0 or wide < 1) else 0 * centre
+        body = middle + wide * rng.normal(size=centre.shape)
+        spin = rates + (0.0 if index == 0 else 0.1) * rng.normal(size=rates.shape)
+        kind = start.own.spin.dtype
+        moved = jnp.asarray(body, kind), jnp.asarray(spin, kind)
+        out.append(eqx.tree_at(lambda p: (p.body, p.own.spin), start, moved))
+    return out
+
+
+def regress_inertia(recordings: tuple[Recording, ...]) -> Inertia | None:
+    """The inertia that Euler's equations in integral form fit best; without torque up to scale.
+
+    Between two samples `I ΔΩ + ∫ Ω × IΩ dt = ∫ τ dt` is linear in the six components of I: without
+    a torque, or with one that starts at nothing as a drag does, the smallest right singular vector
+    of all such rows is the answer, else (the torque at its starting values, along the measured
+    rates) the least squares solution. Then moved to the nearest second moment whose eigenvalues are
+    positive. `None` where there was no gyro and no attitude, they came too seldom, or the torque
+    needs more than a rate, or has states of its own.
+    """
+    rows, sides = [], []
+    for recording in recordings:
+        found = _equations(recording)
+        if found is None:
+            return None
+        rows.append(found[0])
+        sides.append(found[1])
+    matrix, side = np.concatenate(rows), np.concatenate(sides)
+    if not np.abs(side).max() > 0:
+        components = np.linalg.svd(matrix, full_matrices=False)[2][-1]
+        components = components * np.sign(components[:3].sum())
+        components = components / components[:3].sum()
+    else:
+        components = np.linalg.lstsq(matrix, side, rcond=None)[0]
+        if not components[:3].sum() > 0:
+            return None
+    tensor = np.einsum("k,kij->ij", components, BASIS)
+    values, axes = np.linalg.eigh(0.5 * np.trace(tensor) * np.eye(3) - tensor)
+    values = np.maximum(values, 1e-2 * values.max())
+    second_moment = (axes * values) @ axes.T
+    return Inertia(jnp.asarray(np.trace(second_moment) * np.eye(3) - second_moment))
+
+
+def _equations(recording: Recording) -> tuple[np.ndarray, np.ndarray] | None:
+    """Rows (n, 6) and right sides (n,) of the integral of Euler's equations over one recording."""
+    gyro = [r for r in recording.readings if isinstance(r.sensor, Gyro)]
+    if gyro:
+        seen = gyro[0].seen
+        t, w = np.asarray(recording.t)[seen], np.asarray(gyro[0].values)[seen]
+    else:
+        t, w = rates(recording)
+    if t.size < 10 or np.median(np.diff(t)) * np.linalg.norm(w, axis=1).max() > 0.5:
+        return None
+    pushed = np.zeros((t.size, 3))
+    if recording.torque is not None:
+        felt: Any = getattr(recording.torque, "feels", None)
+        if felt is not HasSpin or has_states(recording.torque):
+            return None
+        pushed = np.asarray(_torques(recording.torque, jnp.asarray(t), jnp.asarray(w)))
+    stride = max(1, t.size // 60)
+    momenta = np.einsum("kij,tj->tki", BASIS, w)
+    flux = np.cross(w[:, None, :], momenta)
+    total = momenta + _integral(flux, t)
+    # What is conserved is constant: compare with its mean over the record.
+    impulse = _integral(pushed[:, None, :], t)[:, 0]
+    rows = (total - total.mean(axis=0))[::stride].transpose(0, 2, 1).reshape(-1, 6)
+    return rows, (impulse - impulse.mean(axis=0))[::stride].reshape(-1)
+
+
+@eqx.filter_jit
+def _torques(torque: Torque, t: Any, w: Any) -> Any:
+    body = Inertia(jnp.eye(3))
+    return jax.vmap(lambda time, omega: evaluate(torque, time, Spin(omega), body))(t, w)
+
+
+def _integral(values: np.ndarray, t: np.ndarray) -> np.ndarray:
+    steps = 0.5 * (values[1:] + values[:-1]) * np.diff(t)[:, None, None]
+    return np.concatenate([np.zeros((1, *values.shape[1:])), np.cumsum(steps, axis=0)])

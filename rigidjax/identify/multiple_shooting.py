@@ -1,0 +1,112 @@
+"""Multiple shooting: a long or chaotic recording as pieces whose ends must meet."""
+
+import itertools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from rigidjax import _checks
+from rigidjax.identify import padding
+from rigidjax.identify.parameters import Own, Parameters
+from rigidjax.identify.problem import Links, Problem, one_problem
+from rigidjax.identify.recording import Reading, Recording
+from rigidjax.identify.several_bodies import Bodies
+from rigidjax.motion.torques.states import has_states
+
+# How wide the gaps may be, in turn: first the pieces are nearly free, at the end they are one.
+WIDTHS = (1.0, 1e-1, 1e-2, 1e-3)
+
+
+def pieces(problem: Problem, count: int, *, width: float = WIDTHS[-1]) -> Problem:
+    """The problem with its recording cut into pieces, each with a first state of its own.
+
+    Where errors grow along the record, the misfit of one first state has many local minima and very
+    large derivatives; over a short piece it has not. The end of each piece is held to
+    the start of the next as a reading of standard deviation `width` would.
+
+    **Arguments:** `problem` with one recording; `count` ≥ 2 pieces of about as many samples each;
+    `width` of the gaps, in typical rates and rad. **Returns** a problem with `count` recordings:
+    `fit` takes it like any other (its `state0` then has a leading axis); or call
+    `fit(problem, pieces=count)`, which goes on to one first state.
+
+    Source: Bock 1983, doi:10.1007/978-1-4684-7324-7_8.
+
+    **Raises:** `ValueError` for several recordings, or fewer than four samples in a piece.
+
+    >>> import rigidjax as rj
+    >>> record = rj.identify.Recording(range(20), (rj.identify.Gyro(), [[1.0, 0, 0]] * 20))
+    >>> pieces(rj.identify.Problem(record, rj.identify.Ratios()), 4).count
+    4
+    """
+    one_problem(problem)
+    count, width = _checks.whole(count, "count", 2), _checks.positive(width, "width")
+    if problem.count != 1:
+        raise ValueError(f"pieces: wanted one recording, got {problem.count}")
+    record = problem.recording
+    if has_states(record.torque):
+        raise ValueError(
+            "pieces: the torque has states of its own, whose values at the joints are not unknowns "
+            "of the problem; fit the recording in one piece, or its windows (identify.fit_windows)"
+        )
+    size = int(record.t.shape[0])
+    if size < 4 * count:
+        raise ValueError(
+            f"pieces: wanted at least two pieces of four samples, got {count} of {size} samples"
+        )
+    edges = np.linspace(0, size - 1, count + 1).round().astype(int)
+    parts = [
+        _piece(record, int(first), int(last), index == count - 1)
+        for index, (first, last) in enumerate(itertools.pairwise(edges))
+    ]
+    chart = problem.body.charts[0] if isinstance(problem.body, Bodies) else problem.body
+    cut = Problem(parts, chart, loss=problem.loss, prior=problem.prior)
+    # One rate for all, so that a gap is the same number at every joint.
+    rate = jnp.broadcast_to(problem.reference.rate[0], (count,))
+    slots = tuple(slot.alone() for slot in problem.slots)
+    links = Links(jnp.ones(count).at[-1].set(0.0), jnp.asarray(float(width)))
+    return eqx.tree_at(
+        lambda p: (p.reference.rate, p.slots, p.integrator, p.links),
+        cut,
+        (rate, slots, problem.integrator, links),
+        is_leaf=lambda node: node is None,
+    )
+
+
+def with_width(problem: Problem, width: float) -> Problem:
+    """The same pieces with another width of the gaps."""
+    assert problem.links is not None
+    return eqx.tree_at(lambda p: p.links.width, problem, jnp.asarray(float(width)))
+
+
+def joined(problem: Problem, cut: Problem, found: Parameters) -> Parameters:
+    """The parameters of the uncut problem that the pieces point to: the first piece's."""
+    first = padding.one(found.own, 0)
+    spin = first.spin * cut.reference.rate[0] / problem.reference.rate[0]
+    whole = problem.start()
+    values = iter(found.shared)
+    shared, each = [], []
+    for slot in problem.slots:
+        value = next(values)
+        if slot.each:
+            each.append(value[None])
+            continue
+        shared.append(value if slot.groups is None else value[None])
+        if slot.spread is not None:
+            each.append(jnp.zeros((1, *value.shape)))
+    own = Own(spin, first.turn, first.place, first.speed, ())
+    own = eqx.tree_at(lambda o: o.each, jax.tree.map(lambda leaf: leaf[None], own), tuple(each))
+    return eqx.tree_at(lambda p: (p.body, p.shared, p.own), whole, (found.body, tuple(shared), own))
+
+
+def _piece(record: Recording, first: int, last: int, ends: bool) -> Recording:
+    """Samples `first` to `last`; the last only as a time, where the next piece reads it."""
+    rows = slice(first, last + 1)
+    readings = []
+    for reading in record.readings:
+        mask = jnp.asarray(reading.mask[rows])
+        if not ends:
+            mask = mask.at[-1].set(False)
+        readings.append(Reading(reading.sensor, reading.values[rows], mask))
+    return eqx.tree_at(lambda r: (r.t, r.readings), record, (record.t[rows], tuple(readings)))

@@ -1,0 +1,192 @@
+"""The quantities that a fit reports by name, their values, deviations and intervals."""
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array
+
+from rigidjax import _checks
+from rigidjax.identify.body_charts import AbstractBodyChart
+from rigidjax.identify.parameters import Parameters
+from rigidjax.identify.problem import Problem
+from rigidjax.identify.several_bodies import Bodies
+
+if TYPE_CHECKING:
+    from rigidjax.identify.fit import Fit
+
+
+class Quantity(eqx.Module):
+    """A number with a name: its value, standard deviation (of the log where positive), unit.
+
+    >>> mass = Quantity("mass", 2.0, 0.01, "kg", True)
+    >>> low, high = mass.interval(1.96)
+    >>> round(low, 3), round(high, 3)
+    (1.961, 2.04)
+    """
+
+    name: str
+    value: float
+    deviation: float
+    unit: str
+    positive: bool
+
+    def interval(self, reach: float) -> tuple[float, float]:
+        """Low and high, `reach` standard deviations away; through the log where positive."""
+        if self.positive:
+            with np.errstate(over="ignore"):
+                low, high = self.value * np.exp(np.array([-1.0, 1.0]) * reach * self.deviation)
+        else:
+            low, high = self.value - reach * self.deviation, self.value + reach * self.deviation
+        return float(low), float(high)
+
+
+def labels(problem: Problem) -> list[tuple[str, str, bool]]:
+    """Name, unit and whether positive, in the order of `vector`."""
+    out = []
+    for name, chart in charts(problem):
+        out += [(f"{log}{name}", chart.unit, True) for log in chart.log_names]
+        out += [(f"{plain}{name}", chart.unit, False) for plain in chart.plain_names]
+    names = recording_names(problem)
+    for where in names:
+        out += [(f"Ω{axis}{where}", "rad/s", False) for axis in "xyz"]
+    for slot in problem.slots:
+        shape = np.shape(slot.read(problem.records))[1:]
+        parts = [""] if not shape else [f" {_place(i)}" for i in np.ndindex(shape)]
+        groups = names if slot.each else [f" [{label}]" for label in slot.labels] or [""]
+        for where in groups:
+            out += [(f"{slot.name}{part}{where}", slot.unit, slot.positive) for part in parts]
+        if slot.spread is not None:
+            for where in names:
+                out += [
+                    (f"{slot.name}{part}, own{where}", slot.unit, slot.positive) for part in parts
+                ]
+    return out
+
+
+def charts(problem: Problem) -> list[tuple[str, AbstractBodyChart]]:
+    """The chart of each body, and what is added to the names of its quantities."""
+    if not isinstance(problem.body, Bodies):
+        return [("", problem.body)]
+    return [(f" [{n}]", c) for n, c in zip(problem.body.names, problem.body.charts, strict=True)]
+
+
+def recording_names(problem: Problem) -> list[str]:
+    """What is added to the names of a recording's quantities: its number, among its body's."""
+    if problem.count == 1:
+        return [""]
+    out: list[str] = []
+    for index, name in enumerate(problem.of):
+        number = problem.of[:index].count(name)
+        out.append(f" [{name} {number}]" if name else f" [{number}]")
+    return out
+
+
+def _place(index: tuple[int, ...]) -> str:
+    return "xyz"[index[0]] if len(index) == 1 and index[0] < 3 else str(index)
+
+
+def vector(problem: Problem, parameters: Parameters) -> Array:
+    """The reported quantities, logarithms of those that are positive."""
+    rates = parameters.own.spin * problem.reference.rate[:, None]
+    found = problem.bodies(parameters)
+    bodies = found.values() if isinstance(found, dict) else (found,)
+    parts = []
+    for (_, chart), body in zip(charts(problem), bodies, strict=True):
+        parts += [chart.logs(body), chart.plain(body)]
+    parts.append(rates.reshape(-1))
+    values = problem.values(parameters)
+    for slot in problem.slots:
+        for name in (slot.name, f"{slot.name}, own")[: 1 + (slot.spread is not None)]:
+            value = values[name].reshape(-1)
+            parts.append(jnp.log(value) if slot.positive else value)
+    return jnp.concatenate([part.astype(rates.dtype) for part in parts])
+
+
+@eqx.filter_jit
+def _value_and_slope(problem: Problem, parameters: Parameters) -> tuple[Array, Array]:
+    flat, restore = ravel_pytree(parameters)
+
+    def value(x: Array) -> Array:
+        return vector(problem, restore(x))
+
+    return value(flat), jax.jacfwd(value)(flat)
+
+
+def quantities(
+    problem: Problem, parameters: Parameters, covariance: np.ndarray, null: np.ndarray
+) -> tuple[Quantity, ...]:
+    """Every reported quantity with its standard deviation.
+
+    **Arguments:** `covariance` (n, n) within what is seen; `null` (k, n) what is not.
+    """
+    values, slope = (np.asarray(x) for x in _value_and_slope(problem, parameters))
+    deviations = carried(slope, covariance, null)
+    out = []
+    for (name, unit, positive), value, deviation in zip(
+        labels(problem), values, deviations, strict=True
+    ):
+        shown = float(np.exp(value)) if positive else float(value)
+        out.append(Quantity(name, shown, float(deviation), unit, positive))
+    return tuple(out)
+
+
+def covariance(fit: "Fit") -> np.ndarray:
+    """Covariance of the reported quantities, of the logarithms of those that are positive."""
+    _, slope = (np.asarray(x) for x in _value_and_slope(fit.problem, fit.parameters))
+    return slope @ np.asarray(fit.seen) @ slope.T
+
+
+def carried(slope: np.ndarray, covariance: np.ndarray, null: np.ndarray) -> np.ndarray:
+    """Standard deviations of functions with this derivative (…, n).
+
+    Infinite where the function changes along a direction of `null` (k, n).
+    """
+    size = np.abs(slope).max(axis=-1, initial=1e-300)
+    along = np.abs(slope @ null.T).max(axis=-1, initial=0.0)
+    touched = along > 1e-6 * size
+    variance = np.einsum("...i,ij,...j->...", slope, covariance, slope)
+    return np.where(touched, np.inf, np.sqrt(np.maximum(variance, 0.0)))
+
+
+def interval_of(
+    fit: "Fit", of: Callable[[Any, Any], Any], level: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """See `Fit.interval_of`."""
+    _checks.function(of, "of", "(body, state0) → array")
+    if not _checks.known(fit.parameters):
+        raise TypeError(
+            "Fit: wanted known numbers, got traced ones; intervals are made on the host: call "
+            "interval_of outside of jax.jit, jax.grad and jax.vmap"
+        )
+    flat, restore = ravel_pytree(fit.parameters)
+
+    def value(x: Array) -> Array:
+        return _checks.numbers(of(*fit.problem.unpack(restore(x))), "of(body, state0)")
+
+    middle = np.asarray(_checks.finite(value(flat), "of(body, state0)"))
+    slope = np.asarray(jax.jacfwd(value)(flat))
+    found = carried(slope, np.asarray(fit.seen), np.asarray(fit.null_directions))
+    reach = quantile(fit, level) * found
+    return np.asarray(middle - reach), np.asarray(middle + reach)
+
+
+def quantile(fit: "Fit", level: float) -> float:
+    """Half-width of an interval in standard deviations: Student's where the noise is estimated.
+
+    Autocorrelated errors count as the fewer they are.
+    """
+    level = _checks.positive(level, "level", "a level between 0 and 1")
+    if not level < 1:
+        raise ValueError(f"interval: wanted a level between 0 and 1, got {level}")
+    from scipy.special import ndtri, stdtrit
+
+    tail = 0.5 * (1 + level)
+    sensors = fit.problem.records.sensors
+    if all(sensor.noise is not None for sensor in sensors) and fit.correlation <= 1.5:
+        return float(ndtri(tail))
+    return float(stdtrit(max(fit.independent - fit.covariance.shape[0], 2.0), tail))

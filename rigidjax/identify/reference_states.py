@@ -1,0 +1,155 @@
+"""Where the first states of a fit are counted from: the first readings of each recording."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from rigidjax.identify.direct_estimates import attitudes, place_of, rates
+from rigidjax.identify.recording import Recording
+from rigidjax.identify.sensors import Brightness, Gyro, Marker, Position, Range, Velocity
+from rigidjax.motion import Rigid, Spin
+from rigidjax.rotation import quaternion
+
+
+class ReferenceStates(eqx.Module):
+    """Where the first state of a recording is counted from, and in which units."""
+
+    q: Float[Array, "*records 4"] | None
+    x: Float[Array, "*records 3"] | None
+    v: Float[Array, "*records 3"] | None
+    rate: Float[Array, "*records"]
+    length: Float[Array, "*records"]
+
+
+def reference_of(recordings: Sequence[Recording], rung: type) -> ReferenceStates:
+    """From the first readings of each recording, as far as the rung needs it."""
+    turns = [_first_attitude(r) for r in recordings]
+    places = [_first_place(r) for r in recordings]
+    dtype = recordings[0].t.dtype
+    # Arrays, not floats: another recording must not compile again.
+    return ReferenceStates(
+        None if rung is Spin else jnp.asarray(np.stack(turns), dtype),
+        jnp.asarray(np.stack([x for x, _, _ in places]), dtype) if rung is Rigid else None,
+        jnp.asarray(np.stack([v for _, v, _ in places]), dtype) if rung is Rigid else None,
+        jnp.asarray([_typical_rate(r) for r in recordings], dtype),
+        jnp.asarray([length for _, _, length in places], dtype),
+    )
+
+
+def _typical_rate(recording: Recording) -> float:
+    for reading in recording.readings:
+        if isinstance(reading.sensor, Gyro):
+            values = np.asarray(reading.values)[reading.seen]
+            rate = float(np.sqrt(np.mean(np.sum(values**2, axis=1))))
+            break
+    else:
+        rate = float(np.linalg.norm(first_rate(recording))) or _rate_of_light(recording)
+    return rate if rate > 0 else 1.0
+
+
+def _rate_of_light(recording: Recording) -> float:
+    """About how fast a body turns whose brightness varies, rad/s: half the strongest frequency."""
+    for reading in recording.readings:
+        if isinstance(reading.sensor, Brightness):
+            t = np.asarray(recording.t)[reading.seen][:1000]
+            values = np.asarray(reading.values)[reading.seen][:1000]
+            if t.size < 10 or np.ptp(values) == 0:
+                return 0.0
+            span = t[-1] - t[0]
+            highest = min(0.25 / np.median(np.diff(t)), 500.0 / span)
+            turns = 2.0 * np.pi * np.arange(0.5 / span, max(highest, 1.0 / span), 0.25 / span)
+            waves = np.exp(1j * turns[:, None] * (t - t[0]))
+            power = np.abs(waves @ (values - values.mean()))
+            return 0.5 * float(turns[np.argmax(power)])
+    return 0.0
+
+
+def _first_attitude(recording: Recording) -> np.ndarray:
+    _, q = attitudes(recording)
+    return q[0] if len(q) else np.array([1.0, 0.0, 0.0, 0.0])
+
+
+def _first_place(recording: Recording) -> tuple[np.ndarray, np.ndarray, float]:
+    """First position and velocity of the body's frame, m and m/s, and a typical length, m.
+
+    Of the frame's origin where attitudes tell how far the markers are from it; of the centre of
+    mass where its position, or ranges to it, were read.
+    """
+    direct = _read_place(recording)
+    if direct is not None:
+        return direct
+    markers = [r for r in recording.readings if isinstance(r.sensor, Marker)]
+    if not markers:
+        return np.zeros(3), np.zeros(3), 1.0
+    seen = np.all([r.seen for r in markers], axis=0)
+    if not seen.any():
+        markers, seen = markers[:1], markers[0].seen
+    t = np.asarray(recording.t)[seen]
+    x = np.mean([np.asarray(r.values)[seen] for r in markers], axis=0)
+    place = np.mean([place_of(r) for r in markers], axis=0)
+    known, q = attitudes(recording)
+    there = np.isin(t, known)
+    if there.all():
+        arms = jax.vmap(lambda turn: quaternion.rotate(turn, place))(q[np.isin(known, t)])
+        x = x - np.asarray(arms)
+    few = slice(0, max(2, min(5, t.size)))
+    v = np.polyfit(t[few] - t[0], x[few], 1)[0] if t.size > 1 else np.zeros(3)
+    length = float(np.linalg.norm(x - x.mean(axis=0), axis=1).max())
+    return x[0], v, length if length > 0 else 1.0
+
+
+def _read_place(recording: Recording) -> tuple[np.ndarray, np.ndarray, float] | None:
+    """As `_first_place`, from what reads positions, ranges and velocities; `None` without them."""
+    t, readings = np.asarray(recording.t), recording.readings
+    positions = [r for r in readings if isinstance(r.sensor, Position)]
+    ranges = [r for r in readings if isinstance(r.sensor, Range)]
+    speeds = [r for r in readings if isinstance(r.sensor, Velocity) and r.sensor.mounting is None]
+    if any(isinstance(r.sensor, Marker) for r in readings) and not positions:
+        return None
+    when, x = np.zeros(0), np.zeros((0, 3))
+    if positions:
+        when, x = t[positions[0].seen], np.asarray(positions[0].values)[positions[0].seen]
+    elif ranges:
+        seen = np.all([r.seen for r in ranges], axis=0)
+        sensors: list[Any] = [r.sensor for r in ranges]
+        stations = np.stack([np.asarray(sensor.station) for sensor in sensors])
+        lengths = np.stack([np.asarray(r.values) for r in ranges], axis=1)[seen]
+        when, x = t[seen], _from_ranges(stations, lengths)
+    if not when.size and not speeds:
+        return None
+    v = np.zeros(3)
+    if speeds:
+        v = np.asarray(speeds[0].values)[speeds[0].seen][0]
+    elif when.size > 1:
+        few = slice(0, max(2, min(5, when.size)))
+        v = np.polyfit(when[few] - when[0], x[few], 1)[0]
+    x = x if when.size else np.zeros((1, 3))
+    length = float(np.linalg.norm(x - x.mean(axis=0), axis=1).max())
+    return x[0], v, length if length > 0 else 1.0
+
+
+def _from_ranges(stations: np.ndarray, lengths: np.ndarray) -> np.ndarray:
+    """Places (n, 3) that distances (n, k) to stations (k, 3) show.
+
+    The differences of `|x|² − 2 s·x + |s|² = d²` from their mean are linear in x; along what they
+    do not show (fewer than four stations, or in a plane) it is the stations' centre.
+    """
+    centre = stations.mean(axis=0)
+    s = stations - centre
+    sides = (s * s).sum(axis=1)[None] - lengths**2
+    sides = 0.5 * (sides - sides.mean(axis=1, keepdims=True))
+    return centre + np.linalg.lstsq(s, sides.T, rcond=1e-9)[0].T
+
+
+def first_rate(recording: Recording) -> np.ndarray:
+    """A first body rate (3,), rad/s: a gyro's, or between attitudes; zero without either."""
+    for reading in recording.readings:
+        if isinstance(reading.sensor, Gyro):
+            return np.asarray(reading.values[int(np.argmax(reading.seen))])
+    _, w = rates(recording)
+    return w[0] if len(w) else np.zeros(3)

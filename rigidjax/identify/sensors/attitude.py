@@ -1,0 +1,201 @@
+"""Sensors that see which way the body points or where its parts are."""
+
+from typing import Any, ClassVar
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from rigidjax import _checks
+from rigidjax._types import HasAttitude, HasPose, Scalar, Vec3
+from rigidjax.identify.sensors.base import (
+    AbstractSensor,
+    SensorInput,
+    noise_of,
+    number_of,
+    place_of,
+    vector_of,
+)
+from rigidjax.rotation import quaternion
+from rigidjax.rotation.linalg3 import cross, dot
+
+
+class AttitudeSensor(AbstractSensor):
+    """Reads the attitude as a quaternion (w, x, y, z), body → world; q and −q read the same.
+
+    The error is the rotation vector, in the sensor's axes, that takes the predicted attitude to the
+    reading, `log((q exp(mounting))⁻¹ q_read)`: its length is the angle between them. Readings as
+    matrices or Euler angles: `quaternions_from_matrices`, `quaternions_from_euler`.
+
+    **Arguments:** `noise` standard deviation of each component of that vector, rad, one number or
+    (3,); `None` has it estimated; `mounting` (3,) rotation vector from the body's axes to the
+    sensor's, rad, or `None`; `offset` s as for `Gyro`. **Raises** `ValueError` for a noise that is
+    not positive, a wrong shape, NaN.
+
+    >>> AttitudeSensor(noise=0.01).reading_shape
+    (4,)
+    """
+
+    reading_shape: ClassVar[tuple[int, ...]] = (4,)
+    components: ClassVar[int] = 3
+    feels: ClassVar[type] = HasAttitude
+    unit: ClassVar[str] = "rad"
+    noise: Float[Array, "3"] | None
+    mounting: Float[Array, "3"] | None
+    offset: Scalar | None
+
+    def __init__(self, noise: Any = None, *, mounting: Any = None, offset: Any = None):
+        self.noise, self.mounting = noise_of(noise), vector_of(mounting, "mounting")
+        self.offset = number_of(offset, "offset")
+
+    def error(self, now: SensorInput, reading: Array) -> Vec3:
+        q = now.state.q
+        if self.mounting is not None:
+            q = quaternion.multiply(q, quaternion.exp(self.mounting))
+        return quaternion.log(quaternion.multiply(quaternion.conjugate(q), reading))
+
+    def refusal(self, values: np.ndarray) -> tuple[np.ndarray, str]:
+        wrong = np.abs(np.linalg.norm(values, axis=1) - 1) > 1e-6
+        return wrong, (
+            "the quaternion at index {index} is not unit; wanted (w, x, y, z) with the scalar first"
+        )
+
+
+class Direction(AbstractSensor):
+    """Reads the direction, in its own axes, of something whose direction in the world is known.
+
+    A sun sensor, a star, the vertical. The error is the chord from the prediction to the reading,
+    taken in the plane across the reading (two numbers, rad for small errors, 2 at most).
+
+    **Arguments:** `world` (3,) the direction in the world frame, any length; `noise` rad across the
+    line of sight, one number or (2,), `None` to have it estimated; `mounting`, `offset` as for
+    `AttitudeSensor`. Readings (T, 3) are unit vectors.
+
+    **Raises** `ValueError` for a direction of length zero, a noise that is not positive, NaN.
+
+    >>> Direction([0.0, 0.0, 2.0], noise=0.01).world
+    Array([0., 0., 1.], dtype=float64)
+    """
+
+    reading_shape: ClassVar[tuple[int, ...]] = (3,)
+    components: ClassVar[int] = 2
+    feels: ClassVar[type] = HasAttitude
+    unit: ClassVar[str] = "rad"
+    world: Float[Array, "3"]
+    noise: Float[Array, "2"] | None
+    mounting: Float[Array, "3"] | None
+    offset: Scalar | None
+
+    def __init__(self, world: Any, noise: Any = None, *, mounting: Any = None, offset: Any = None):
+        vector = place_of(world, "world")
+        length = jnp.sqrt(dot(vector, vector))
+        words = "world: wanted a direction, got a vector of length zero"
+        length = _checks.refuse(length, ~(length > 0), words)
+        self.world, self.noise = vector / length, noise_of(noise, 2)
+        self.mounting = vector_of(mounting, "mounting")
+        self.offset = number_of(offset, "offset")
+
+    def error(self, now: SensorInput, reading: Array) -> Float[Array, "2"]:
+        seen = quaternion.rotate(quaternion.conjugate(now.state.q), self.world)
+        if self.mounting is not None:
+            seen = quaternion.rotate(quaternion.exp(-self.mounting), seen)
+        # Two axes across the reading, which is data: no derivative passes through them.
+        least = jnp.eye(3, dtype=reading.dtype)[jnp.argmin(jnp.abs(reading))]
+        first = cross(reading, least)
+        first = first / jnp.sqrt(dot(first, first))
+        second = cross(reading, first)
+        # sin θ / cos ½θ = 2 sin ½θ, the chord; guarded where the two are opposite.
+        half = jnp.sqrt(jnp.maximum(0.5 * (1.0 + dot(seen, reading)), 1e-12))
+        return -jnp.stack([dot(first, seen), dot(second, seen)]) / half
+
+    def refusal(self, values: np.ndarray) -> tuple[np.ndarray, str]:
+        wrong = np.abs(np.linalg.norm(values, axis=1) - 1) > 1e-6
+        return wrong, "the direction at index {index} is not of length 1"
+
+
+class Marker(AbstractSensor):
+    """Reads the position, in the world, of a point that is fixed in the body: `x + R r`, m.
+
+    **Arguments:** `place` (3,) where on the body, m, body frame; `noise` m, one number or (3,),
+    `None` to have it estimated; `origin` (3,) m, world frame: where the fixed point of a body on a
+    pivot is; `None` for a body that moves (`Rigid`, with `MassProperties`, whose frame `place` is
+    then in); `offset` s as for `Gyro`. **Raises** `ValueError` as `Gyro`.
+
+    >>> Marker([0.1, 0.0, 0.0], noise=1e-3).feels.__name__
+    'HasPose'
+    """
+
+    reading_shape: ClassVar[tuple[int, ...]] = (3,)
+    components: ClassVar[int] = 3
+    unit: ClassVar[str] = "m"
+    place: Float[Array, "3"]
+    noise: Float[Array, "3"] | None
+    origin: Float[Array, "3"] | None
+    offset: Scalar | None
+
+    def __init__(self, place: Any, noise: Any = None, *, origin: Any = None, offset: Any = None):
+        self.place, self.noise = place_of(place, "place"), noise_of(noise)
+        self.origin, self.offset = vector_of(origin, "origin"), number_of(offset, "offset")
+
+    @property
+    def feels(self) -> type:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """A body on a pivot need not move."""
+        return HasPose if self.origin is None else HasAttitude
+
+    def error(self, now: SensorInput, reading: Array) -> Vec3:
+        state = now.state
+        start = state.x if self.origin is None else self.origin
+        return reading - (start + quaternion.rotate(state.q, now.lever(self.place)))
+
+
+def quaternions_from_matrices(matrices: Any) -> Float[np.ndarray, "times 4"]:
+    """Readings (T, 4) for an `AttitudeSensor` of rotation matrices (T, 3, 3), body → world.
+
+    **Raises** `ValueError` for a wrong shape or a matrix that is no rotation, with its index. A row
+    that holds NaN stays NaN, to be masked.
+
+    >>> quaternions_from_matrices(np.eye(3)[None])[0].tolist()
+    [1.0, 0.0, 0.0, 0.0]
+    """
+    matrices = _checks.on_host(matrices, "matrices")
+    if matrices.ndim != 3 or matrices.shape[1:] != (3, 3) or not len(matrices):
+        raise ValueError(f"matrices: wanted shape (T, 3, 3), got {matrices.shape}")
+    seen = np.isfinite(matrices).all(axis=(1, 2))
+    filled = np.where(seen[:, None, None], matrices, np.eye(3))
+    off = np.abs(filled @ filled.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+    wrong = (off > 1e-6) | (np.linalg.det(filled) < 0)
+    if wrong.any():
+        index = int(np.argmax(wrong))
+        raise ValueError(
+            f"matrices: the one at index {index} is no rotation: R Rᵀ − 1 is {off[index]:.2g}, "
+            f"det = {np.linalg.det(filled[index]):.3g}"
+        )
+    out = np.stack([np.asarray(quaternion.from_matrix(jnp.asarray(m))) for m in filled])
+    return np.where(seen[:, None], out, np.nan)
+
+
+def quaternions_from_euler(
+    angles: Any, sequence: str, *, unit: str = "rad"
+) -> Float[np.ndarray, "times 4"]:
+    """Readings (T, 4) for an `AttitudeSensor` of Euler angles (T, 3), body → world.
+
+    **Arguments:** `angles`; `sequence` as in `rigidjax.euler`, such as `"ZXZ"` (the 3-1-3 of the
+    notes, eq 31) or `"ZYX"` (yaw, pitch, roll); `unit` `rad` or `deg`. **Raises** `ValueError` for
+    a wrong shape, sequence or unit. A row that holds NaN stays NaN, to be masked.
+
+    >>> quaternions_from_euler([[0.0, 0.0, 0.0]], "ZXZ")[0].tolist()
+    [1.0, 0.0, 0.0, 0.0]
+    """
+    from rigidjax.rotation import euler
+
+    angles = _checks.on_host(angles, "angles")
+    if angles.ndim != 2 or angles.shape[1] != 3 or not len(angles):
+        raise ValueError(f"angles: wanted shape (T, 3), got {angles.shape}")
+    _checks.word(unit, ("rad", "deg"), "unit")
+    turned = np.radians(angles) if unit == "deg" else angles
+    seen = np.isfinite(turned).all(axis=1)
+    rows = [
+        np.asarray(euler.to_quaternion(jnp.asarray(row), sequence=sequence))
+        for row in np.where(seen[:, None], turned, 0.0)
+    ]
+    return np.where(seen[:, None], np.stack(rows), np.nan)

@@ -1,0 +1,154 @@
+"""Sensors that see where the body is and how fast it moves."""
+
+from typing import Any, ClassVar
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from rigidjax._types import HasPose, Scalar, Vec3
+from rigidjax.identify.sensors.base import (
+    AbstractSensor,
+    SensorInput,
+    noise_of,
+    number_of,
+    place_of,
+    vector_of,
+)
+from rigidjax.rotation import quaternion
+from rigidjax.rotation.linalg3 import cross, dot
+
+
+class Position(AbstractSensor):
+    """Reads where the centre of mass is, in the world: `x + bias`, m. Another point: `Marker`.
+
+    **Arguments:** `noise` m, one number or (3,), `None` to have it estimated; `bias` (3,) m, world
+    frame, or `None`; `offset` s as for `Gyro`. For a `Rigid`.
+
+    **Raises** `ValueError` as `Gyro`.
+
+    >>> Position(noise=0.01).unit
+    'm'
+    """
+
+    reading_shape: ClassVar[tuple[int, ...]] = (3,)
+    components: ClassVar[int] = 3
+    feels: ClassVar[type] = HasPose
+    unit: ClassVar[str] = "m"
+    noise: Float[Array, "3"] | None
+    bias: Float[Array, "3"] | None
+    offset: Scalar | None
+
+    def __init__(self, noise: Any = None, *, bias: Any = None, offset: Any = None):
+        self.noise, self.bias = noise_of(noise), vector_of(bias, "bias")
+        self.offset = number_of(offset, "offset")
+
+    def error(self, now: SensorInput, reading: Array) -> Vec3:
+        place = now.state.x
+        return reading - (place if self.bias is None else place + self.bias)
+
+
+class Velocity(AbstractSensor):
+    """Reads the velocity of a point of the body: `v + R (Ω × r)`, in the world or in its own axes.
+
+    **Arguments:** `noise` m/s, one number or (3,), `None` to have it estimated; `place` (3,) where
+    it sits, m, in the frame of the `MassProperties`, from which r is counted from the centre of
+    mass; `None` for the centre of mass itself; `mounting` (3,) rotation vector that turns the
+    body's axes onto the sensor's, rad, for one that moves along, such as a Doppler log (zeros for
+    the body's axes); `None` for the world's axes, such as of satellite navigation; `bias` (3,) m/s
+    or `None`; `offset` s as for `Gyro`. For a `Rigid`.
+
+    Source: velocity of a point of a rigid body, Landau and Lifshitz, Mechanics, eq 31.2.
+
+    **Raises** `ValueError` as `Gyro`.
+
+    >>> Velocity(noise=0.1, mounting=[0.0, 0.0, 0.0]).unit
+    'm/s'
+    """
+
+    reading_shape: ClassVar[tuple[int, ...]] = (3,)
+    components: ClassVar[int] = 3
+    feels: ClassVar[type] = HasPose
+    unit: ClassVar[str] = "m/s"
+    noise: Float[Array, "3"] | None
+    place: Float[Array, "3"] | None
+    mounting: Float[Array, "3"] | None
+    bias: Float[Array, "3"] | None
+    offset: Scalar | None
+
+    def __init__(
+        self,
+        noise: Any = None,
+        *,
+        place: Any = None,
+        mounting: Any = None,
+        bias: Any = None,
+        offset: Any = None,
+    ):
+        self.noise, self.place = noise_of(noise), vector_of(place, "place")
+        self.mounting, self.bias = vector_of(mounting, "mounting"), vector_of(bias, "bias")
+        self.offset = number_of(offset, "offset")
+
+    def error(self, now: SensorInput, reading: Array) -> Vec3:
+        state = now.state
+        seen = state.v
+        if self.place is not None:
+            arm = now.lever(self.place)
+            seen = seen + quaternion.rotate(state.q, cross(state.omega, arm))
+        if self.mounting is not None:
+            turn = quaternion.multiply(state.q, quaternion.exp(self.mounting))
+            seen = quaternion.rotate_inverse(turn, seen)
+        return reading - (seen if self.bias is None else seen + self.bias)
+
+
+class Range(AbstractSensor):
+    """Reads the distance from a station to a point of the body: `|x + R r − s| + bias`, m.
+
+    **Arguments:** `station` s (3,) m, world frame; `noise` m, `None` to have it estimated; `place`
+    (3,) the point, m, in the frame of the `MassProperties`; `None` for the centre of mass; `bias`
+    m, or `None`; `offset` s as for `Gyro`. Readings (T,). For a `Rigid`.
+
+    **Raises** `ValueError` as `Gyro`, for a reading below zero, too.
+
+    >>> Range([0.0, 0.0, 100.0], noise=0.05).reading_shape
+    ()
+    """
+
+    reading_shape: ClassVar[tuple[int, ...]] = ()
+    components: ClassVar[int] = 1
+    feels: ClassVar[type] = HasPose
+    unit: ClassVar[str] = "m"
+    station: Float[Array, "3"]
+    noise: Float[Array, "1"] | None
+    place: Float[Array, "3"] | None
+    bias: Scalar | None
+    offset: Scalar | None
+
+    def __init__(
+        self,
+        station: Any,
+        noise: Any = None,
+        *,
+        place: Any = None,
+        bias: Any = None,
+        offset: Any = None,
+    ):
+        self.station, self.noise = place_of(station, "station"), noise_of(noise, 1)
+        self.place = vector_of(place, "place")
+        self.bias, self.offset = number_of(bias, "bias"), number_of(offset, "offset")
+
+    def error(self, now: SensorInput, reading: Array) -> Float[Array, "1"]:
+        state = now.state
+        line = state.x - self.station
+        if self.place is not None:
+            line = line + quaternion.rotate(state.q, now.lever(self.place))
+        # At the station itself there is no direction, and no derivative: it is taken as 0.
+        square = dot(line, line)
+        length = jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)
+        found = length if self.bias is None else length + self.bias
+        return (reading - found)[None]
+
+    def refusal(self, values: np.ndarray) -> tuple[np.ndarray, str]:
+        if self.bias is not None:
+            return np.zeros(values.shape, bool), ""
+        return values < 0, "the distance at index {index} is below zero"

@@ -1,0 +1,100 @@
+"""A body whose inertia changes in time: booms that go out, fuel that is spent (floor 2)."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from rigidjax import _checks
+from rigidjax._types import HasSpin, Mat3, ScalarLike, Vec3
+from rigidjax.body.inertia import Inertia, MassProperties
+from rigidjax.body.symmetric3 import apply, inverse
+from rigidjax.motion.torques.base import (
+    Torque,
+    Wrench,
+    act,
+    jumps_of,
+    require_law,
+    tensor_of,
+)
+from rigidjax.rotation.linalg3 import cross
+
+
+class ChangingInertia(eqx.Module):
+    """What a changing inertia does to a body: `I(t) dΩ/dt = I(t)Ω × Ω − İΩ + τ`.
+
+    **Arguments:** `inertia` a function of time, t → (3, 3), kg m², body frame, about the point that
+    the body turns about (the centre of mass of a `Rigid`), whose derivative is taken: such as
+    `Linear(times, tensors)`; `torque` all else that acts, or `None`: it stands inside, not beside
+    in a `Sum`, because its τ turns I(t), and it is given the body as it is at t.
+
+    The body that `simulate` is given only sets the state's units: its inertia is replaced. What is
+    moved about inside is symmetric enough to have no momentum of its own in the body frame (Σ m r ×
+    ṙ = 0), as booms that go out in a straight line from the centre have none; else add it as the
+    momentum of a `Flywheel` to `torque`. Fuel that is thrown out takes its share of İΩ along: then
+    add İΩ to `torque`.
+
+    Source: Hughes 1986, Spacecraft Attitude Dynamics, ch. 3; without τ the momentum `R I(t) Ω` is
+    kept.
+
+    **Raises:** `TypeError` for what cannot be called; `ValueError` for a value that is not (3, 3).
+
+    >>> import rigidjax as rj
+    >>> grows = ChangingInertia(lambda t: (1.0 + t) * jnp.eye(3))
+    >>> body = rj.Inertia(jnp.eye(3))
+    >>> rj.simulate(body, rj.Spin([0.0, 0, 1.0]), [0.0, 1.0], grows).ys.omega[-1, 2]
+    Array(0.5, dtype=float64)
+    """
+
+    inertia: Callable[[Any], Any]
+    torque: Any
+
+    def __init__(self, inertia: Callable[[Any], Any], torque: Torque | None = None):
+        self.inertia = _checks.function(inertia, "inertia", "of time to (3, 3), kg m²")
+        if torque is not None:
+            require_law(torque)
+        self.torque = torque
+
+    @property
+    def feels(self) -> type:
+        """The lowest state that the torque inside acts on."""
+        return getattr(self.torque, "feels", HasSpin)
+
+    @property
+    def jump_times(self) -> Float[Array, " n"]:
+        """Times, s, where the inertia has a kink, or the torque jumps."""
+        times = [jumps_of(self.inertia), jumps_of(self.torque)]
+        dtype = jnp.result_type(*times)
+        return jnp.sort(jnp.concatenate([found.astype(dtype) for found in times]))
+
+    def tensor(self, t: ScalarLike) -> Mat3:
+        """I(t), (3, 3), kg m²."""
+        found = self.inertia(t)
+        found = found.tensor if isinstance(found, Inertia) else found
+        return _checks.floating(found, (3, 3), "inertia(t)")
+
+    def __call__(self, t: ScalarLike, state: HasSpin, body: Any) -> Vec3 | Wrench:
+        omega = state.omega
+        t = jnp.asarray(t, omega.dtype)
+        now, rate = jax.jvp(self.tensor, (t,), (jnp.ones_like(t),))
+        now, rate = now.astype(omega.dtype), rate.astype(omega.dtype)
+        turning = cross(apply(now, omega), omega) - apply(rate, omega)
+        force = None
+        if self.torque is not None:
+            force, torque = act(self.torque, t, state, _as_it_is(body, now))
+            turning = turning + torque
+        # The body's own equations have its own inertia: the torque that brings them to this.
+        fixed = tensor_of(body)
+        slope = apply(inverse(now), turning)
+        torque = apply(fixed, slope) - cross(apply(fixed, omega), omega)
+        return torque if force is None else Wrench(force, torque)
+
+
+def _as_it_is(body: Any, tensor: Mat3) -> Any:
+    now = Inertia(tensor)
+    if isinstance(body, MassProperties):
+        return eqx.tree_at(lambda b: b.second_moment, body, now.second_moment)
+    return now

@@ -1,0 +1,172 @@
+"""A logged quantity as a smooth function of time: a cubic spline through evenly spaced samples."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax.lax import linalg
+from jaxtyping import Array, ArrayLike, Float
+
+from rigidjax import _checks
+from rigidjax._types import Scalar, ScalarLike, Vec3
+from rigidjax.motion.torques.base import given
+from rigidjax.rotation.linalg3 import cross, dot
+
+Samples = Float[ArrayLike, "n *channels"] | Sequence[Any]
+
+
+class Series(eqx.Module):
+    """A cubic spline through evenly spaced samples; beyond the ends, the last value.
+
+    The interval of a time is found by division, not by search, so that it costs little in a solver;
+    its derivative is continuous, so that a step may pass over a sample.
+
+    **Arguments:** `times` (n,) s, evenly spaced to 1e-6 of a step; `values` (n,) or (n, k). Both
+    may be traced: it can be made under `jit`, `vmap` and `grad`.
+
+    The slopes at the samples are those of the spline whose third derivative does not jump at the
+    second and the last but one ("not a knot": de Boor, A Practical Guide to Splines, ch. IV).
+
+    **Raises:** `ValueError` (`equinox` error under `jit`) for fewer than four samples, numbers that
+    differ, NaN, uneven times; `TypeError` for what is no number.
+
+    >>> Series([0.0, 1.0, 2.0, 3.0], [0.0, 1.0, 4.0, 9.0])(1.5)
+    Array(2.25, dtype=float64)
+    """
+
+    start: Scalar
+    step: Scalar
+    values: Float[Array, "n *channels"]
+    slopes: Float[Array, "n *channels"]
+
+    def __init__(self, times: Float[ArrayLike, " n"] | Sequence[Any], values: Samples):
+        t, rows = _numbers(times, "times"), _numbers(values, "values")
+        if t.ndim != 1 or t.size < 4 or rows.shape[:1] != t.shape:
+            raise ValueError(
+                f"Series: wanted at least four times and as many rows, got shapes {t.shape} and "
+                f"{rows.shape}"
+            )
+        t, rows = _finite(t, "times"), _finite(rows, "values")
+        step = (t[-1] - t[0]) / (t.size - 1)
+        uneven = ~((step > 0) & (abs(t[1:] - t[:-1] - step).max() <= 1e-6 * step))
+        step = _checks.refuse(
+            step,
+            uneven,
+            "Series: wanted evenly spaced, increasing times; resample, or use Linear",
+        )
+        dtype = jnp.result_type(float)
+        self.start, self.step = jnp.asarray(t[0], dtype), jnp.asarray(step, dtype)
+        self.values = jnp.asarray(rows, dtype)
+        self.slopes = _finite(_slopes(self.values), "slopes of the values")
+
+    def __call__(self, t: ScalarLike) -> Any:
+        """The value at `t` (s), () or (k,)."""
+        n = self.values.shape[0]
+        place = (jnp.asarray(t, self.start.dtype) - self.start) / self.step
+        # Not clip: at an end itself it has half the derivative.
+        place = jnp.where(place < 0.0, 0.0, jnp.where(place > n - 1.0, n - 1.0, place))
+        i = jnp.clip(jnp.floor(place).astype(jnp.int32), 0, n - 2)
+        s = place - i.astype(place.dtype)
+        left, right = self.values[i], self.values[i + 1]
+        out, into = self.slopes[i], self.slopes[i + 1]
+        # Cubic Hermite form, from the left value.
+        bend = 3.0 * (right - left) - 2.0 * out - into
+        twist = 2.0 * (left - right) + out + into
+        return left + s * (out + s * (bend + s * twist))
+
+
+def _numbers(value: Any, name: str) -> Any:
+    """NumPy's float64 where the numbers are known: times of a log have more than seven digits."""
+    if _checks.known(value):
+        return _checks.on_host(value, f"Series: {name}")
+    return _checks.numbers(value, f"Series: {name}").astype(jnp.result_type(float))
+
+
+def _finite(numbers: Any, name: str) -> Any:
+    bad = ~_checks.namespace(numbers).isfinite(numbers)
+    return _checks.refuse(numbers, bad.any(), f"Series: {name}: contains NaN or infinity")
+
+
+def _slopes(values: Float[Array, "n *channels"]) -> Float[Array, "n *channels"]:
+    """The change per step at each sample: s₋ + 4 s + s₊ = 3 (v₊ − v₋), at the ends not a knot."""
+    n = values.shape[0]
+    v = values.reshape(n, -1)
+    rise = v[1:] - v[:-1]
+    ends = (2.5 * rise[:1] + 0.5 * rise[1:2], 2.5 * rise[-1:] + 0.5 * rise[-2:-1])
+    sides = jnp.concatenate([ends[0], 3.0 * (rise[1:] + rise[:-1]), ends[1]])
+    one, middle = np.ones(n, v.dtype), np.full(n, 4.0, v.dtype)
+    below, above = one.copy(), one.copy()
+    middle[[0, -1]], above[0], below[-1] = 1.0, 2.0, 2.0
+    below[0], above[-1] = 0.0, 0.0
+    below, middle, above = (jnp.asarray(band) for band in (below, middle, above))
+    return linalg.tridiagonal_solve(below, middle, above, sides).reshape(values.shape)
+
+
+class Wheel(eqx.Module):
+    """The momentum of a wheel about a fixed axis whose speed was logged: `h = J s(t) a`.
+
+    Give it to `Flywheel`: a known momentum inside is what shows the absolute inertia of a body.
+
+    **Arguments:** `inertia` J, kg m², about the axis; `axis` (3,) a, body frame, unit; `speed`
+    rad/s relative to the body, a callable Module of time such as `Series(times, speeds)`; `delay`
+    s: the log shows at t what was at t − delay; `None` for none; `tilt` (2,) rad, how far the axis
+    is tilted towards two directions across it (about x, y and z: the next two axes in turn, y and
+    z, z and x, x and y); `None` for none.
+
+    **Raises:** `ValueError` for an axis that is not a unit vector.
+
+    >>> speed = Series([0.0, 1.0, 2.0, 3.0], [0.0, 10.0, 20.0, 30.0])
+    >>> bool(abs(Wheel(2.0, [0.0, 0.0, 1.0], speed)(0.5)[2] - 10.0) < 1e-12)
+    True
+    """
+
+    inertia: Scalar
+    axis: Vec3
+    speed: Any
+    delay: Scalar | None
+    tilt: Float[Array, "2"] | None
+
+    def __init__(
+        self,
+        inertia: ScalarLike,
+        axis: Any,
+        speed: Any,
+        *,
+        delay: ScalarLike | None = None,
+        tilt: Any = None,
+    ):
+        axis = _checks.floating(axis, (3,), "axis")
+        x, y, z = _checks.namespace(axis).asarray(axis)
+        found = f", got {np.asarray(axis)}" if _checks.known(axis) else ""
+        axis = _checks.refuse(
+            axis,
+            ~(abs(x * x + y * y + z * z - 1) < 2e-6),
+            f"axis: wanted a unit vector (3,){found}",
+        )
+        _checks.function(speed, "speed", "of time to rad/s")
+        self.inertia = given(inertia, (), "inertia").astype(jnp.result_type(float))
+        self.axis = axis.astype(jnp.result_type(float))
+        self.speed = speed
+        kind = jnp.result_type(float)
+        self.delay = None if delay is None else given(delay, (), "delay").astype(kind)
+        self.tilt = None if tilt is None else given(tilt, (2,), "tilt").astype(kind)
+
+    @property
+    def direction(self) -> Vec3:
+        """The axis with its tilt, unit."""
+        if self.tilt is None:
+            return self.axis
+        # The axis that is nearest to ±x, ±y or ±z says which two are across it.
+        next_one = jnp.roll(jnp.eye(3, dtype=self.axis.dtype), 1, axis=1)
+        first = next_one[jnp.argmax(jnp.abs(self.axis))]
+        first = first - dot(first, self.axis) * self.axis
+        first = first / jnp.sqrt(dot(first, first))
+        second = cross(self.axis, first)
+        a, b = self.tilt[0], self.tilt[1]
+        return (self.axis + a * first + b * second) / jnp.sqrt(1.0 + a * a + b * b)
+
+    def __call__(self, t: ScalarLike) -> Vec3:
+        when = t if self.delay is None else t + self.delay
+        return self.inertia * self.direction * self.speed(when)

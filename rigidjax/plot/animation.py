@@ -1,0 +1,167 @@
+"""A tumbling body as an animation."""
+
+import base64
+import html
+import io
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import ArrayLike, Float
+
+from rigidjax import _checks
+from rigidjax._types import HasAttitude
+from rigidjax.body.inertia import Inertia, MassProperties
+from rigidjax.body.principal_axes import principal
+from rigidjax.plot.style import COLOURS, attitudes, cube, matrices, pyplot
+
+# Corners of the cube, and its faces in pairs across x, y, z, seen from outside counter-clockwise.
+CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
+FACES = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
+
+
+class Film(eqx.Module):
+    """An animation in memory: a notebook shows it, `save` writes it.
+
+    **Fields:** `data` the file; `kind` `gif` or `html`; `height` px in a notebook.
+
+    >>> Film(b"<p>hello</p>", "html", 100)._repr_html_()[:7]
+    '<iframe'
+    """
+
+    data: bytes = eqx.field(static=True)
+    kind: str = eqx.field(static=True)
+    height: int = eqx.field(static=True)
+
+    def __repr__(self) -> str:
+        return f"Film({self.kind}, {len(self.data) // 1024} kB)"
+
+    def save(self, path: str | Path) -> Path:
+        """Write the file; **returns** its path. **Raises** `ValueError` for another suffix."""
+        path = Path(path)
+        if path.suffix.lower() != f".{self.kind}":
+            raise ValueError(f"save: wanted a name that ends in .{self.kind}, got {path.name}")
+        path.write_bytes(self.data)
+        return path
+
+    def _repr_html_(self) -> str:
+        if self.kind == "gif":
+            picture = base64.b64encode(self.data).decode("ascii")
+            return f'<img alt="tumbling body" src="data:image/gif;base64,{picture}">'
+        page = html.escape(self.data.decode("utf-8"), quote=True)
+        return (
+            f'<iframe srcdoc="{page}" width="100%" height="{self.height}" '
+            'style="border:1px solid #ddd"></iframe>'
+        )
+
+
+def tumble(
+    body: Inertia | MassProperties,
+    ts: Float[ArrayLike, " times"],
+    states: HasAttitude,
+    *,
+    pictures: int = 60,
+    seconds: float = 6.0,
+    title: str = "",
+) -> Film:
+    """A GIF of the body's box as it tumbles, with the path of its longest axis.
+
+    The box is the uniform solid one with the same 𝔖: it moves exactly as the body does. Faces
+    across its principal axes are blue, orange and green, shortest first; the origin is held still.
+
+    **Arguments:** `body`; `ts` (T,) s; `states` of one body with a leading time axis, close enough
+    together that it turns by less than a quarter turn from one to the next; `pictures` how many;
+    `seconds` the film takes; `title`. **Returns** a `Film`, shown by a notebook; `.save(path)`.
+
+    **Raises** `ValueError` for a batch, other lengths or fewer than two pictures; `TypeError` for
+    states without an attitude.
+
+    >>> import rigidjax as rj
+    >>> body = rj.shapes.box(1.0, [0.1, 0.2, 0.3])
+    >>> sol = rj.simulate(body.inertia, rj.Attitude([1.0, 0, 0, 0], [0, 1, 0.1]), [0.0, 0.5, 1.0])
+    >>> tumble(body, sol.ts, sol.ys, pictures=2).data[:6]
+    b'GIF89a'
+    """
+    seconds = _checks.positive(seconds, "seconds")
+    _checks.single(body, (Inertia, MassProperties), "body")
+    times, q = evenly(ts, states, pictures)
+    half, turn = box_of(body)
+    pyplot()
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+    from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+    from PIL import Image
+
+    # Not pyplot's: a film must not leave a figure behind, nor open a window.
+    figure = Figure(figsize=(3.6, 3.6), dpi=80)
+    canvas = FigureCanvasAgg(figure)
+    ax: Any = figure.add_axes((0.0, 0.08, 0.86, 0.84), projection="3d")
+    corners = (CORNERS * half) @ turn.T
+    m = matrices(q)
+    longest = np.argmax(half)
+    # At every state that was given: at the pictures alone the path would be a zigzag.
+    when = np.asarray(ts, dtype=float)
+    tips = matrices(attitudes(states)) @ turn[:, longest] * half[longest]
+    reach = float(np.linalg.norm(half))
+    unit = ", m" if isinstance(body, MassProperties) else ""
+    cube(ax, reach, (f"x{unit}", f"y{unit}", f"z{unit}"))
+    solid = Poly3DCollection([], edgecolor="0.2", linewidths=0.8, alpha=0.85)
+    ax.add_collection3d(solid)
+    (trail,) = ax.plot([], [], [], color="0.3", lw=0.9)
+    colours = [COLOURS[axis] for axis in (0, 0, 1, 1, 2, 2)]
+    shots = []
+    for moment, rotation in zip(times, m, strict=True):
+        placed = corners @ rotation.T
+        solid.set_verts([placed[list(face)] for face in FACES])
+        solid.set_facecolor(colours)
+        trail.set_data_3d(*tips[when <= moment].T)
+        ax.set_title(f"{title}  t = {moment:.3g} s".strip(), fontsize=10)
+        canvas.draw()
+        shots.append(Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB"))
+    # One palette for all, or the grey of the panes flickers.
+    palette = shots[0].quantize(48)
+    shots = [shot.quantize(48, palette=palette, dither=Image.Dither.NONE) for shot in shots]
+    out = io.BytesIO()
+    shots[0].save(
+        out,
+        "GIF",
+        save_all=True,
+        append_images=shots[1:],
+        duration=int(1000 * seconds / pictures),
+        loop=0,
+    )
+    return Film(out.getvalue(), "gif", 288)
+
+
+def evenly(ts: Any, states: Any, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Times evenly spaced, and the attitudes there (count, 4), along the shorter arc."""
+    q, t, count = attitudes(states), _checks.on_host(ts, "ts"), _checks.whole(count, "pictures", 2)
+    if t.shape != (q.shape[0],):
+        raise ValueError(f"ts: wanted ({q.shape[0]},) as the states have, got {t.shape}")
+    if t.size < 2:
+        raise ValueError(f"ts: wanted at least two times, got {t.size}")
+    # q and −q are one attitude: choose signs so that neighbours are near.
+    signs = np.where(np.einsum("ti,ti->t", q[1:], q[:-1]) < 0, -1.0, 1.0)
+    q = q * np.concatenate([[1.0], np.cumprod(signs)])[:, None]
+    times = np.linspace(t[0], t[-1], count)
+    between = np.stack([np.interp(times, t, column) for column in q.T], axis=-1)
+    return times, between / np.linalg.norm(between, axis=1, keepdims=True)
+
+
+def box_of(body: Inertia | MassProperties) -> tuple[np.ndarray, np.ndarray]:
+    """Half-lengths (3,) of the uniform box with the body's 𝔖, and its axes (3, 3) in the body.
+
+    A box of half-length a has λ = m a²/3. In m for a `MassProperties`; for an `Inertia` the longest
+    is 1.
+    """
+    second, q = principal(body.second_moment)
+    size = np.sqrt(np.maximum(np.asarray(second, dtype=float), 0.0))
+    if not size.max() > 0:
+        raise ValueError("the body has no extension, its 𝔖 is zero: there is no box to draw")
+    if isinstance(body, MassProperties):
+        size = size * np.sqrt(3 / float(body.mass))
+    else:
+        size = size / size.max()
+    # A plate or rod is given a little thickness, to be seen.
+    return np.maximum(size, 0.02 * size.max()), matrices(np.asarray(q, dtype=float)[None])[0]

@@ -1,0 +1,134 @@
+"""A fit beside its data."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from rigidjax.plot.style import COLOURS, RATES, TIMES, of_fit, pyplot, unit
+from rigidjax.rotation import quaternion
+from rigidjax.solve import simulate
+
+
+def fit(
+    found: Any,
+    *,
+    index: int = 0,
+    time_unit: str = "s",
+    rate_unit: str = "rad/s",
+    title: str = "",
+) -> Any:
+    """Data and fit of each sensor above, the residuals below.
+
+    **Arguments:** `found` a `rigidjax.identify.Fit`; `index` which of its recordings; `time_unit`
+    `s` or `day`; `rate_unit` `rad/s`, `deg/s` or `deg/day`; `title`. **Returns** the matplotlib
+    figure.
+
+    **Raises** `ModuleNotFoundError` where matplotlib is missing (install the extra `view`).
+
+    >>> import jax.numpy as jnp, rigidjax as rj
+    >>> ts = jnp.linspace(0.0, 10.0, 80)
+    >>> motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1, 0.1, 1.0]), ts)
+    >>> record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), motion.ys.omega))
+    >>> found = rj.identify.fit(rj.identify.Problem(record, rj.identify.PrincipalRatios()))
+    >>> fit(found).axes[-1].get_xlabel()
+    'time, s'
+    """
+    plt = pyplot()
+    seconds = unit(time_unit, TIMES, "time_unit")
+    rate = unit(rate_unit, RATES, "rate_unit")
+    index = of_fit(found, index)
+    record = found.problem.recordings[index]
+    left = [e if found.problem.count == 1 else e[index] for e in found.residuals]
+    left = [np.asarray(e)[: record.t.shape[0]] for e in left]
+    t = np.asarray(record.t) / seconds
+    count = len(record.readings)
+    figure, axes = plt.subplots(
+        2,
+        count,
+        figsize=(max(6.2 * count, 7.5), 6),
+        sharex=True,
+        squeeze=False,
+        height_ratios=(2, 1),
+        layout="constrained",
+    )
+    dense = _between(found, index)
+    for column, (reading, errors) in enumerate(zip(record.readings, left, strict=True)):
+        upper, lower = axes[:, column]
+        _one_sensor(upper, lower, t, reading, errors, dense, seconds, rate, rate_unit)
+        lower.axhline(0, color="0.6", lw=0.8)
+        lower.set_xlabel(f"time, {time_unit}")
+        upper.margins(x=0.02, y=0.2)
+        upper.legend(loc="upper right", ncols=3, fontsize="small")
+        upper.set_title(f"{type(reading.sensor).__name__}: points read, lines fitted", fontsize=10)
+    if title:
+        figure.suptitle(title)
+    return figure
+
+
+def _between(found: Any, index: int) -> tuple[np.ndarray, Any] | None:
+    """Times and states between sparse samples of a free body, for a smooth line; else `None`."""
+    problem = found.problem
+    record = problem.recordings[index]
+    if problem.torque is not None or record.t.shape[0] > 300:
+        return None
+    state0 = found.state0
+    if problem.count > 1:
+        state0 = jax.tree.map(lambda leaf: leaf[index], state0)
+    dense = jnp.linspace(record.t[0], record.t[-1], 800)
+    body = found.body
+    if isinstance(body, dict):
+        body = body[problem.of[index]]
+    return np.asarray(dense), simulate(body, state0, dense).ys
+
+
+def _one_sensor(
+    upper: Any,
+    lower: Any,
+    t: np.ndarray,
+    reading: Any,
+    errors: np.ndarray,
+    dense: tuple[np.ndarray, Any] | None,
+    seconds: float,
+    rate: float,
+    rate_unit: str,
+) -> None:
+    seen, sensor = reading.seen, reading.sensor
+    values = np.asarray(reading.values).reshape(len(t), -1)
+    names: tuple[str, ...] = ("x", "y", "z")[: values.shape[1]]
+    scale, unit, line_t = 1.0, sensor.unit, t
+    if sensor.reading_shape == (4,):
+        read, scale = _long_axis(values), 180 / np.pi
+        # The reading turned back by its error is the prediction.
+        back = jax.vmap(lambda q, e: quaternion.multiply(q, quaternion.exp(-e)))
+        line = _long_axis(back(jnp.asarray(values), jnp.asarray(errors)))
+        names = tuple(f"{axis} of body z" for axis in "xyz")
+        upper.set_ylabel("body z axis in world axes")
+        unit = "deg (body axes)"
+        if dense is not None:
+            line_t, line = dense[0] / seconds, _long_axis(dense[1].q)
+    else:
+        if sensor.unit == "rad/s":
+            scale, unit, names = rate, rate_unit, ("Ωx", "Ωy", "Ωz")
+        whole = errors.shape == values.shape
+        read = values * scale if sensor.unit != "rad" else values
+        line = (values - errors) * scale if whole else None
+        upper.set_ylabel("body rate, " + unit if sensor.unit == "rad/s" else f"reading, {unit}")
+        bare = getattr(sensor, "bias", None) is None and getattr(sensor, "scale", None) is None
+        if dense is not None and sensor.unit == "rad/s" and bare:
+            line_t, line = dense[0] / seconds, np.asarray(dense[1].omega) * scale
+    lower.set_ylabel(f"error, {unit}")
+    many = seen.sum() > 100
+    mark: dict[str, Any] = {"marker": "." if many else "o", "ls": "", "ms": 2 if many else 5}
+    for axis, (name, colour) in enumerate(zip(names, COLOURS, strict=False)):
+        if line is not None:
+            whole = slice(None) if line_t is not t else seen
+            upper.plot(line_t[whole], line[whole, axis], color=colour, lw=1.2, label=name)
+        upper.plot(t[seen], read[seen, axis], color=colour, alpha=0.6, **mark)
+        if axis < errors.shape[1]:
+            lower.plot(t[seen], errors[seen, axis] * scale, color=colour, alpha=0.7, **mark)
+
+
+def _long_axis(q: Any) -> np.ndarray:
+    return np.asarray(jax.vmap(lambda one: quaternion.rotate(one, jnp.eye(3)[2]))(jnp.asarray(q)))

@@ -1,0 +1,79 @@
+"""Errors of predictions, by how far ahead they look."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from rigidjax import _checks
+from rigidjax.plot.style import COLOURS, row_of_axes
+
+_KINDS = {
+    "x": "position, m",
+    "v": "velocity, m/s",
+    "q": "attitude, rad",
+    "omega": "body rate, rad/s",
+}
+_MEASURES = {"mean_absolute": "mean |error| of a component", "rms": "rms error"}
+
+
+def horizons(
+    found: Any,
+    *,
+    step: float | None = None,
+    measure: str = "mean_absolute",
+    title: str = "",
+    ax: Any = None,
+) -> Any:
+    """Open-loop errors against how far ahead they are, a picture for each kind of state.
+
+    **Arguments:** `found` a `rigidjax.identify.Horizons`, as `WindowFit.predict` and `Windows.held`
+    return them, or several by name, to be compared: of a model, of a prediction that holds the
+    start, of other windows; `step` s between samples, for a scale of time in the place of steps;
+    `measure` `mean_absolute` (of a component) or `rms` (of the vector); `title`; `ax` as many axes
+    of yours as there are kinds, else new ones. Errors start at nothing: both scales are linear.
+    **Returns** the axes, one for each of position, velocity, attitude, body rate that there is.
+
+    **Raises** `TypeError` for what are no errors by horizon; `ValueError` for none, for kinds that
+    differ, an unknown measure, a step that is not positive, another number of axes.
+
+    >>> import rigidjax as rj
+    >>> t = np.arange(8.0)
+    >>> cut = rj.identify.windows(t, rj.Spin(np.ones((8, 3)) * t[:, None]), length=3)
+    >>> horizons({"held": cut.held()})[0].get_ylabel()
+    'body rate, rad/s'
+    """
+    named = dict(found) if isinstance(found, Mapping) else {"": found}
+    if not named:
+        raise ValueError("found: wanted at least one Horizons, got none")
+    for one in named.values():
+        if not all(hasattr(one, name) for name in ("steps", *_MEASURES)) or isinstance(one, type):
+            raise TypeError(
+                "found: wanted a Horizons of rigidjax.identify, or several by name, got "
+                f"{one.__name__ if isinstance(one, type) else type(one).__name__}"
+            )
+    _checks.word(measure, tuple(_MEASURES), "measure")
+    scale = 1.0 if step is None else _checks.positive(step, "step", "a positive time, s")
+    kinds = [kind for kind in _KINDS if kind in getattr(next(iter(named.values())), measure)]
+    for name, one in named.items():
+        if sorted(getattr(one, measure)) != sorted(kinds):
+            raise ValueError(
+                f"found: wanted the same kinds of errors, got {kinds} and {name!r} with "
+                f"{sorted(getattr(one, measure))}"
+            )
+    ax = row_of_axes(ax, len(kinds), figsize=(3.4 * len(kinds) + 0.6, 3.2))
+    for one_ax, kind in zip(ax, kinds, strict=True):
+        for (name, one), colour in zip(named.items(), COLOURS * len(named), strict=False):
+            errors = _checks.on_host(getattr(one, measure)[kind], f"found: {kind}")
+            ahead = np.concatenate([[0.0], scale * _checks.on_host(one.steps, "found: steps")])
+            line = np.concatenate([[0.0], errors])
+            one_ax.plot(ahead, line, color=colour, lw=1.4, label=name or None)
+        one_ax.set(xlabel="steps ahead" if step is None else "time ahead, s", ylabel=_KINDS[kind])
+        one_ax.margins(x=0)
+        one_ax.set_ylim(bottom=0.0)
+        one_ax.grid(alpha=0.3)
+    if any(named):
+        ax[-1].legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
+    said = _MEASURES[measure]
+    ax[0].set_title(f"{title}: {said}" if title else said, loc="left")
+    return ax

@@ -1,0 +1,136 @@
+"""Residuals of a fit: are they noise?"""
+
+from typing import Any
+
+import numpy as np
+
+from rigidjax.plot.style import COLOURS, TIMES, of_fit, pyplot, unit
+
+# Frequencies of an uneven record, at most.
+_MOST = 2000
+
+
+def residuals(
+    found: Any, *, index: int = 0, time_unit: str = "s", title: str = "", ax: Any = None
+) -> Any:
+    """Residuals of each sensor over its noise: in time, histogram, autocorrelation, spectrum.
+
+    From left to right: they should scatter evenly within ±2 (what lies beyond ±8 is counted, not
+    drawn); their histogram against the normal curve; the correlation of each with a later one,
+    which for white noise stays inside the band ±2/√N; their power spectrum, which for white noise
+    of the given size is 1 at all frequencies (Welch's estimate; Lomb's where times are uneven).
+    A line in the spectrum is a motion or a torque that the model lacks.
+
+    **Arguments:** `found` a `rigidjax.identify.Fit`; `index` which of its recordings; `time_unit`
+    `s`, `min`, `h` or `day`; `title`; `ax` axes of yours (sensors, 4). **Returns** the axes.
+
+    **Raises** `ModuleNotFoundError` where matplotlib is missing; `ValueError` for an unknown unit
+    or axes of another shape; `IndexError` for a recording that is not there.
+
+    >>> import jax.numpy as jnp, rigidjax as rj
+    >>> ts = jnp.linspace(0.0, 10.0, 80)
+    >>> motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1, 0.1, 1.0]), ts)
+    >>> record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), motion.ys.omega))
+    >>> found = rj.identify.fit(rj.identify.Problem(record, rj.identify.PrincipalRatios()))
+    >>> residuals(found)[0, 2].get_xlabel()
+    'lag, samples'
+    """
+    seconds = unit(time_unit, TIMES, "time_unit")
+    index = of_fit(found, index)
+    record = found.problem.recordings[index]
+    several = found.problem.count > 1
+    count = len(record.readings)
+    if ax is None:
+        ax = pyplot().subplots(
+            count, 4, figsize=(14, 3.1 * count), squeeze=False, layout="constrained"
+        )[1]
+    ax = np.asarray(ax, dtype=object)
+    if ax.shape != (count, 4):
+        raise ValueError(f"ax: wanted ({count}, 4) axes, a row a sensor, got {ax.shape}")
+    t = np.asarray(record.t) / seconds
+    for row, reading, errors, noise in zip(
+        ax, record.readings, found.residuals, found.noise, strict=True
+    ):
+        one = np.asarray(errors[index] if several else errors)[: t.size]
+        sigma = np.asarray(noise[index] if several else noise)
+        _one_sensor(row, t, one / sigma, np.asarray(reading.seen))
+        row[0].set_ylabel(f"{type(reading.sensor).__name__}\nerror / noise")
+        row[0].set_xlabel(f"time, {time_unit}")
+        row[3].set_xlabel(f"frequency, {'Hz' if time_unit == 's' else f'1/{time_unit}'}")
+    ax[0, 1].set_title(title or "residuals of the fit")
+    return ax
+
+
+def _one_sensor(row: Any, t: np.ndarray, scaled: np.ndarray, seen: np.ndarray) -> None:
+    over_time, spread, memory, spectrum = row
+    colours, names = COLOURS[: scaled.shape[1]], "xyz"[: scaled.shape[1]]
+    everything = scaled[seen].ravel()
+    # One wild reading must not press all others into a line: what lies beyond is counted.
+    reach = float(np.clip(np.abs(everything).max(initial=0.0) * 1.1, 4.0, 8.0))
+    beyond = int((np.abs(everything) > reach).sum())
+    many = seen.sum() > 100
+    shown = np.where(np.abs(scaled[seen]) <= reach, scaled[seen], np.nan)
+    for values, colour, name in zip(shown.T, colours, names, strict=True):
+        over_time.plot(
+            t[seen], values, ".", ms=2.5 if many else 5, color=colour, alpha=0.7, label=name
+        )
+    over_time.axhspan(-2, 2, color="0.9", zorder=0)
+    over_time.legend(loc="upper right", ncols=3, fontsize=8, markerscale=2)
+    over_time.set_ylim(-reach, 1.35 * reach)
+    # As wide as the data: errors far smaller than their noise would all lie in two or three bins.
+    inside = everything[np.abs(everything) <= reach]
+    low, high = (inside.min(), inside.max()) if inside.size else (-1.0, 1.0)
+    middle, half = 0.5 * (low + high), max(0.5 * (high - low), 1e-3 * reach)
+    bins = np.linspace(
+        middle - half, middle + half, int(np.clip(2 * np.sqrt(everything.size), 9, 41))
+    )
+    told = f"{beyond} beyond" if beyond else None
+    weights = np.full(everything.size, 1 / (everything.size * (bins[1] - bins[0])))
+    spread.hist(everything, bins=bins, weights=weights, color=COLOURS[5], alpha=0.8, label=told)
+    x = np.linspace(-reach, reach, 200)
+    spread.plot(x, np.exp(-0.5 * x**2) / np.sqrt(2 * np.pi), color="0.2", lw=1.4, label="normal")
+    spread.set(xlabel="error / noise", ylabel="density")
+    spread.legend(loc="upper right", fontsize=8)
+
+    number = int(seen.sum())
+    lags = np.arange(1, max(2, min(40, number // 2)))
+    for values, colour in zip(scaled[seen].T, colours, strict=True):
+        memory.plot(lags, _correlation(values, lags), ".-", color=colour, ms=4, lw=0.8)
+    band = 2 / np.sqrt(max(number, 1))
+    memory.axhspan(-band, band, color="0.9", zorder=0)
+    memory.axhline(0, color="0.6", lw=0.8)
+    memory.set(xlabel="lag, samples", ylabel="correlation", ylim=(-1, 1))
+
+    for values, colour in zip(scaled[seen].T, colours, strict=True):
+        spectrum.plot(*power(t[seen], values), color=colour, lw=1)
+    spectrum.axhline(1, color="0.6", lw=0.8)
+    spectrum.set(yscale="log", ylabel="power / that of the noise")
+
+
+def power(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Frequencies and power (F,) of residuals over their noise: white noise has power 1."""
+    from scipy.signal import lombscargle, welch
+
+    gaps = np.diff(t)
+    if t.size < 8:
+        return np.zeros(0), np.zeros(0)
+    gap = float(np.median(gaps))
+    if (np.abs(gaps - gap) <= 1e-3 * gap).all():
+        frequencies, density = welch(values, 1 / gap, nperseg=_segment(t.size))
+        return frequencies[1:], density[1:] / (2 * gap)
+    span = float(t[-1] - t[0])
+    frequencies = np.arange(1, min(_MOST, max(2, int(span / (2 * gap))))) / span
+    return frequencies, lombscargle(t, values - values.mean(), 2 * np.pi * frequencies)
+
+
+def _segment(samples: int) -> int:
+    """The length of Welch's segments: some of them, so that the noise of the estimate is small."""
+    return min(samples, max(64, min(samples // 4, 512)))
+
+
+def _correlation(values: np.ndarray, lags: np.ndarray) -> np.ndarray:
+    centred = values - values.mean()
+    whole = float(centred @ centred)
+    if not whole > 0:
+        return np.zeros(lags.size)
+    return np.array([centred[:-lag] @ centred[lag:] for lag in lags]) / whole

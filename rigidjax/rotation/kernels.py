@@ -1,0 +1,138 @@
+"""The costly maps without their checks, compiled once also when called from the prompt (floor 1).
+
+`quaternion` and `so3` are the public face of these; nothing here looks at shapes or values.
+"""
+
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from rigidjax._types import Mat3, Quat, Scalar, Vec3
+from rigidjax.rotation.linalg3 import (
+    components,
+    cross_components,
+    dot_components,
+    entries,
+    near_one,
+    square,
+)
+from rigidjax.special.barrier import once
+from rigidjax.special.stumpff import arctan_ratio, inverse_kernel, stumpff
+
+# Inlined in whatever is being traced, so that XLA and `jax.grad` see no boundary.
+_compiled = partial(jax.jit, inline=True)
+
+
+@_compiled
+def vector_to_quaternion(v: Vec3) -> Quat:
+    """The unit quaternion (cos θ/2, ½ v sin(θ/2)/(θ/2))."""
+    x, y, z = parts = components(v)
+    s = 0.25 * square(parts)
+    half = 0.5 * stumpff(1, s)
+    return jnp.stack([stumpff(0, s), half * x, half * y, half * z])
+
+
+@_compiled
+def vector_to_matrix(v: Vec3) -> Mat3:
+    """The rotation matrix 1 + A hat v + B (hat v)²."""
+    parts = components(v)
+    s = 0.25 * square(parts)
+    half = stumpff(1, s)
+    return hat_polynomial(parts, once(stumpff(0, s) * half), once(0.5 * half * half))
+
+
+@_compiled
+def matrix_to_quaternion(m: Mat3) -> Quat:
+    """The canonical unit quaternion, by the largest row of 4 q qᵀ."""
+    a, b, c, d, e, f, g, h, i = entries(m)
+    w, x, y, z = 1 + a + e + i, 1 + a - e - i, 1 - a + e - i, 1 - a - e + i
+    wx, wy, wz, xy, yz, zx = h - f, c - g, d - b, b + d, f + h, c + g
+    rows = (w, wx, wy, wz), (wx, x, xy, zx), (wy, xy, y, yz), (wz, zx, yz, z)
+    upper = [jnp.where(x > w, one, other) for one, other in zip(rows[1], rows[0], strict=True)]
+    lower = [jnp.where(z > y, one, other) for one, other in zip(rows[3], rows[2], strict=True)]
+    down = jnp.maximum(y, z) > jnp.maximum(w, x)
+    row = [jnp.where(down, one, other) for one, other in zip(lower, upper, strict=True)]
+    scale = 1 / jnp.sqrt(row[0] ** 2 + row[1] ** 2 + row[2] ** 2 + row[3] ** 2)
+    scale = jnp.where(flipped(row), -scale, scale)
+    return jnp.stack([scale * part for part in row])
+
+
+@_compiled
+def quaternion_to_vector(q: Quat) -> Vec3:
+    """The shortest rotation vector of either sign of q."""
+    return _log(q)
+
+
+@jax.custom_jvp
+def _log(q: Quat) -> Vec3:
+    w, x, y, z = parts = components(near_one(*components(q)) * q)
+    n2 = x * x + y * y + z * z
+    # tan of the half angle is n/|w|, of the quarter n/a, of the eighth n/b: nothing cancels.
+    a = jnp.abs(w) + jnp.sqrt(n2 + w * w)
+    inverse = 1 / (a + jnp.sqrt(n2 + a * a))
+    scale = 8 * inverse * arctan_ratio(n2 * inverse * inverse)
+    scale = jnp.where(flipped(parts), -scale, scale)
+    return jnp.stack([scale * x, scale * y, scale * z])
+
+
+@_log.defjvp
+def _log_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
+    (q,), (dq,) = primals, tangents
+    v = _log(q)
+    # Of any length: both are made shorter alike.
+    scale = near_one(*components(q))
+    w, *u = parts = components(scale * q)
+    dw, *du = components(scale * dq)
+    # The turn seen from the body, 2 vec(q̄ dq)/|q|², then the inverse right Jacobian.
+    scale, aside = 2 / square4(parts), cross_components(u, du)
+    turn = [scale * (w * du[i] - dw * u[i] - aside[i]) for i in range(3)]
+    vs = components(v)
+    across = cross_components(vs, turn)
+    twice = cross_components(vs, across)
+    g = inverse_kernel(dot_components(vs, vs))
+    return v, jnp.stack([turn[i] + 0.5 * across[i] + g * twice[i] for i in range(3)])
+
+
+@_compiled
+def normalised(q: Quat) -> Quat:
+    """The quaternion of length 1 in the direction of q."""
+    q = near_one(*components(q)) * q
+    return q / jnp.sqrt(square4(components(q)))
+
+
+def hat_polynomial(v: Sequence[Scalar], a: Scalar, b: Scalar) -> Mat3:
+    """The matrix 1 + a hat v + b (hat v)²."""
+    x, y, z = v
+    xx, yy, zz = b * x * x, b * y * y, b * z * z
+    xy, yz, zx = b * x * y, b * y * z, b * z * x
+    ax, ay, az = a * x, a * y, a * z
+    rows = [1 - yy - zz, xy - az, zx + ay], [xy + az, 1 - zz - xx, yz - ax]
+    return jnp.stack([*rows[0], *rows[1], zx - ay, yz + ax, 1 - xx - yy]).reshape(3, 3)
+
+
+def square4(q: Sequence[Scalar]) -> Scalar:
+    """Squared length of four scalars."""
+    return q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]
+
+
+def product4(p: Sequence[Scalar], q: Sequence[Scalar]) -> tuple[Scalar, ...]:
+    """The quaternion product p q of four scalars each."""
+    a, b, c, d = p
+    e, f, g, h = q
+    return (
+        a * e - b * f - c * g - d * h,
+        a * f + b * e + c * h - d * g,
+        a * g - b * h + c * e + d * f,
+        a * h + b * g - c * f + d * e,
+    )
+
+
+def flipped(q: Sequence[Scalar]) -> Array:
+    """Whether −q, not q, is canonical."""
+    w, x, y, z = q
+    lead = jnp.where(w != 0, w, jnp.where(x != 0, x, jnp.where(y != 0, y, z)))
+    return lead < 0

@@ -1,0 +1,183 @@
+"""The rotation that fits best: projection, alignment, Wahba's problem (floor 1).
+
+No singular value decomposition and no eigenvectors: their derivatives are NaN at every rotation,
+where all three singular values are 1. The best rotation R of a 3×3 matrix B, the one with the
+largest Tr(RᵀB), has the derivative dR = R hat(x), (Tr(S) 1 − S) x = 2 vee(Rᵀ dB), S = sym(RᵀB),
+which is regular wherever the answer is unique.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.core import Tracer
+from jaxtyping import Array, ArrayLike, Float
+
+from rigidjax import _checks
+from rigidjax._types import Mat3, Mat3Like, Scalar, Vec3Like
+from rigidjax.rotation import quaternion
+from rigidjax.rotation.kernels import matrix_to_quaternion
+from rigidjax.rotation.linalg3 import cross, determinant, dot, hat, near_one, product, solve, vee
+from rigidjax.rotation.validation import direction
+
+
+def project(matrix: Mat3Like) -> Mat3:
+    """The rotation nearest to a matrix (Frobenius norm), with the right derivative on SO(3) too.
+
+    **Arguments:** `matrix` (3, 3), det > 0. **Returns:** (3, 3) with RᵀR = 1 to round-off.
+
+    **Raises:** `ValueError` if a matrix known now is left-handed (a mirror image has no nearest
+    rotation), singular, or not finite; under `jit` put `so3.check` or a test of your own before.
+
+    >>> project(2.0 * jnp.eye(3)).round(12).tolist()
+    [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+    """
+    matrix = _checks.floating(matrix, (3, 3), "matrix")
+    if not isinstance(matrix, Tracer):
+        _checks.finite(matrix, "matrix")
+        direction(matrix.reshape(9), "matrix")
+        size = np.max(np.abs(np.asarray(matrix)))
+        # Of the matrix over its largest entry: that of itself may overflow.
+        found = np.linalg.det(np.asarray(matrix) / size)
+        if found <= 0:
+            raise ValueError(
+                f"matrix: left-handed frame or singular, det = {found:.3g}; no rotation is nearest"
+            )
+    return nearest(matrix)
+
+
+def wahba(
+    body: Float[ArrayLike, "n 3"],
+    world: Float[ArrayLike, "n 3"],
+    weights: Float[ArrayLike, "n"] | None = None,
+) -> Mat3:
+    """The rotation M, body → world, least in Σ w_i |world_i − M body_i|² (Wahba 1965).
+
+    **Arguments:** `body`, `world` (n, 3), n ≥ 2: the same directions in both frames, any units;
+    `weights` (n,), not negative, 1 if not given. Solved for the largest root of the quartic of
+    Markley 1993 (FOAM, J. Astronaut. Sci. 41, 261), then by Newton's method on the group.
+
+    **Raises:** an error, under `jit` too, if the directions leave a turn free: fewer than two, or
+    all parallel (to 5e-4 rad in float64, 4° in float32, where half the digits would be gone);
+    `ValueError` for NaN, and for all zeros, where they are known.
+
+    >>> wahba(jnp.eye(3)[:2], jnp.eye(3)[:2]).round(12).tolist()
+    [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+    """
+    body = _checks.rows(body, (3,), "body")
+    world = _checks.floating(world, body.shape, "world")
+    w = weights_of(weights, body[:, 0], "body")
+    for name, rows in (("body", body), ("world", world)):
+        direction(rows.reshape(-1), name)
+    w, world, body = (of_order_one(x) for x in (w, world, body))
+    b = (w[:, None, None] * world[:, :, None] * body[:, None, :]).sum(0)
+    best = nearest(b)
+    # (σ1 + σ2)(σ2 + σ3)(σ3 + σ1), σ3 with the sign of det b: 0 where a turn is free.
+    firmness = determinant(_curvature(best, b / jnp.sqrt((b * b).sum())))
+    return _checks.refuse(
+        best,
+        ~(firmness > 4 * np.sqrt(jnp.finfo(b.dtype).eps)),
+        "wahba: these directions do not fix the attitude; two that are not parallel are needed",
+    )
+
+
+def align(a: Vec3Like, b: Vec3Like) -> Mat3:
+    """The smallest rotation that takes the direction of a into that of b.
+
+    **Arguments:** `a`, `b` (3,), in one frame, any lengths. **Returns:** (3, 3), R a ∥ b.
+    **Raises:** `ValueError` for zero or NaN where they are known.
+    For directions that are opposite to round-off: half a turn about the axis normal to a that is
+    nearest to the basis vector along which a is smallest. No digits are lost near there: the
+    quaternion is (½|m|, a × m/|m|), m = a + b, and m is small but exact.
+
+    >>> align(jnp.array([1.0, 0, 0]), jnp.array([0, 2.0, 0])).round(12)[:, 0].tolist()
+    [0.0, 1.0, 0.0]
+    """
+    a, b = _checks.floating(a, (3,), "a"), _checks.floating(b, (3,), "b")
+    a, b = (of_order_one(direction(x, name)) for x, name in ((a, "a"), (b, "b")))
+    a, b = a / jnp.sqrt(dot(a, a)), b / jnp.sqrt(dot(b, b))
+    middle = a + b
+    n2, normal = dot(middle, middle), cross(a, middle)
+    # Both lengths are 1 to round-off only: what is left of m may lie along a.
+    least = 2 * float(jnp.finfo(a.dtype).eps)
+    opposite = (n2 < 1) & (dot(normal, normal) <= least * least)
+    length = jnp.sqrt(jnp.where(opposite, 1, n2))
+    smallest = jnp.eye(3, dtype=a.dtype)[jnp.argmin(jnp.abs(a))]
+    across = smallest - dot(smallest, a) * a
+    axis = jnp.where(opposite, across / jnp.sqrt(dot(across, across)), normal / length)
+    w = jnp.where(opposite, 0, 0.5 * length)
+    return quaternion.to_matrix(quaternion.normalise(jnp.concatenate([w[None], axis])))
+
+
+def of_order_one(x: Array) -> Array:
+    """The same but for a power of two, where only ratios count: no product overflows."""
+    return near_one(jnp.max(jnp.abs(x))) * x
+
+
+def weights_of(weights: Any, like: Array, of: str) -> Array:
+    """One weight for each, 1 if not given; refused where it is known that no mean has them."""
+    if like.shape[0] == 0:
+        raise ValueError(f"{of}: wanted at least one row, got none")
+    if weights is None:
+        return jnp.ones_like(like)
+    w = _checks.floating(weights, like.shape, "weights")
+    if not isinstance(w, Tracer):
+        _checks.finite(w, "weights")
+        bad = (w < 0).any() | ~(w > 0).any()
+        _checks.refuse(w, bad, "weights: wanted numbers ≥ 0, of which one at least is positive")
+    return w
+
+
+def _quartic(b: Mat3) -> tuple[Scalar, Scalar]:
+    """The sum of the singular values λ (signed by det), and ζ, of a matrix of Frobenius norm 1."""
+    det, adjugate = determinant(b), _cofactors(b)
+    flat = 4 * (adjugate * adjugate).sum()
+
+    def newton(_: Any, root: Scalar) -> Scalar:
+        excess = root * root - 1
+        slope = 4 * root * excess - 8 * det
+        return root - (excess * excess - 8 * det * root - flat) / jnp.where(slope > 0, slope, 1)
+
+    # From above the largest root, Newton's method comes down to it without overshooting.
+    root = lax.fori_loop(0, 24, newton, jnp.full_like(det, np.sqrt(3)))
+    return root, 0.5 * (root * root - 1) * root - det
+
+
+def _cofactors(b: Mat3) -> Mat3:
+    return jnp.stack([cross(b[1], b[2]), cross(b[2], b[0]), cross(b[0], b[1])])
+
+
+def _curvature(r: Mat3, b: Mat3) -> Mat3:
+    """Tr(S) 1 − S, S = sym(Rᵀb): how sharply the gain Tr(Rᵀb) falls off around R."""
+    m = product(r.T, b)
+    s = 0.5 * (m + m.T)
+    return (s[0, 0] + s[1, 1] + s[2, 2]) * jnp.eye(3, dtype=r.dtype) - s
+
+
+@jax.custom_jvp
+def nearest(b: Mat3) -> Mat3:
+    """The rotation R with the largest Tr(Rᵀb), of a matrix of any size."""
+    b = of_order_one(b)
+    b = b / jnp.sqrt((b * b).sum())
+    root, zeta = _quartic(b)
+    kappa = 0.5 * (root * root - 1)
+    rough = ((kappa + 1) * b + root * _cofactors(b) - product(b, product(b.T, b))) / zeta
+    q = matrix_to_quaternion(rough)
+    # The root of the quartic may have half its digits; Newton steps on the group mend that.
+    for _ in range(3):
+        r = quaternion.to_matrix(q)
+        turn = solve(_curvature(r, b), 2 * vee(product(r.T, b)))
+        q = quaternion.normalise(quaternion.multiply(q, quaternion.exp(turn)))
+    return quaternion.to_matrix(q)
+
+
+@nearest.defjvp
+def _best_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
+    (b,), (db,) = primals, tangents
+    r = nearest(b)
+    # Of any size: both are made smaller alike.
+    scale = near_one(jnp.max(jnp.abs(b)))
+    b, db = scale * b, scale * db
+    return r, product(r, hat(solve(_curvature(r, b), 2 * vee(product(r.T, db)))))

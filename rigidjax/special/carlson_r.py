@@ -1,0 +1,102 @@
+"""Carlson's multivariate R without its factor: elliptic integrals and all their derivatives.
+
+    H(b; a) = ∫₀^∞ ∏ (t + aᵢ)^(−bᵢ) dt = R_{1−Σb}(b; a) / (Σb − 1)        (DLMF 19.16.9)
+
+R_F, R_D, R_J are of this form (DLMF 19.16.1, 19.16.2, 19.16.5), and the family is closed under
+differentiation: ∂H/∂aᵢ = −bᵢ H(b + eᵢ; a). The integrand is positive, so nothing cancels,
+whatever the order. In s = ln t it is analytic for |Im s| < π and decays exponentially: the plain
+trapezoidal rule converges like exp(−2π²/h) (Trefethen & Weideman 2014, doi 10.1137/130932132), and
+a number of nodes fixed by the dtype reaches round-off for arguments of very different sizes.
+"""
+
+import math
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.custom_derivatives import SymbolicZero
+from jaxtyping import Array, Float
+
+# Enough that h < 0.5 (float64) or 0.9 (float32) for arguments in ratios of 1e35.
+_NODES = {np.dtype("float64"): 512, np.dtype("float32"): 160}
+# What the largest argument is scaled to: float32 has no room below 1e-30 for the tail at t → 0.
+_UNIT = {np.dtype("float64"): 1.0, np.dtype("float32"): 2.0**24}
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def r_integral(
+    powers: tuple[float, ...], arguments: tuple[Float[Array, "..."], ...]
+) -> Float[Array, "..."]:
+    """∫₀^∞ ∏ (t + aᵢ)^(−bᵢ) dt for aᵢ ≥ 0, to a few units of round-off.
+
+    **Arguments:** `powers` the bᵢ, multiples of ½ with Σ bᵢ > 1 (negative ones may be among them).
+    `arguments` the aᵢ, of one shape and dtype, dimensionless or of one unit.
+
+    **Returns:** an array of that shape. Infinite where the integral diverges at 0 (zero arguments
+    whose powers add up to 1 or more); NaN for a negative argument. Derivatives of every order by
+    the same rule; an argument that is not differentiated costs nothing and may be 0. Full accuracy
+    for ratios of the aᵢ up to 1e35; 1e-13 at 1e60.
+
+    >>> round(float(r_integral((2.0,), (jnp.asarray(4.0),))), 12)
+    0.25
+    """
+    largest = arguments[0]
+    for a in arguments[1:]:
+        largest = jnp.maximum(largest, a)
+    scale = jnp.where(largest > 0, largest, 1)
+    dtype = np.dtype(arguments[0].dtype)
+    unit = _UNIT[dtype]
+    scaled = [a / scale * unit for a in arguments]
+
+    smallest, at_zero = jnp.full_like(scale, unit), jnp.ones_like(scale)
+    for a, power in zip(scaled, powers, strict=True):
+        smallest = jnp.where(a > 0, jnp.minimum(smallest, a), smallest)
+        at_zero = jnp.where(a == 0, at_zero - power, at_zero)
+    digits = -math.log(float(jnp.finfo(dtype).eps) / 8)
+    low = jnp.log(smallest) - digits / jnp.maximum(at_zero, 0.5)
+    low = jnp.maximum(low, 0.99 * math.log(float(jnp.finfo(dtype).tiny)))
+    high = math.log(unit) + digits / (sum(powers) - 1)
+    nodes = _NODES[dtype]
+    step = (high - low) / nodes
+    count = (jnp.arange(nodes, dtype=dtype) + 0.5).reshape((nodes,) + (1,) * scale.ndim)
+    t = jnp.exp(low[None] + step[None] * count)
+
+    # t first: then the running product stays between the sizes of its neighbours.
+    product = t
+    for a, power in zip(scaled, powers, strict=True):
+        product = _divide(product, t + a[None], power)
+    excess = sum(powers) - 1
+    value = product.sum(0) * step * unit**excess
+    value = _divide(value, scale, excess)
+    value = jnp.where(at_zero > 0, value, jnp.inf)
+    negative = jnp.isnan(largest)
+    for a in arguments:
+        negative = negative | ~(a >= 0)
+    return jnp.where(negative, jnp.nan, value)
+
+
+@partial(r_integral.defjvp, symbolic_zeros=True)
+def _r_integral_jvp(powers: Any, primals: Any, tangents: Any) -> tuple[Any, Any]:
+    (arguments,), (directions,) = primals, tangents
+    tangent = jnp.zeros_like(arguments[0])
+    for i, direction in enumerate(directions):
+        if powers[i] and not isinstance(direction, SymbolicZero):
+            raised = (*powers[:i], powers[i] + 1, *powers[i + 1 :])
+            tangent = tangent - powers[i] * r_integral(raised, arguments) * direction
+    return r_integral(powers, arguments), tangent
+
+
+def _divide(value: Any, x: Any, power: float) -> Any:
+    """`value` times x^(−power) for multiples of ½, factor by factor."""
+    whole = math.floor(power)
+    if power > whole:
+        factor = jax.lax.rsqrt(x)
+        for _ in range(abs(round(2 * power))):
+            value = value * (factor if power > 0 else factor * x)
+        return value
+    factor = 1 / x if power > 0 else x
+    for _ in range(abs(whole)):
+        value = value * factor
+    return value

@@ -1,0 +1,217 @@
+"""The measurement: every method on a scene made ready, then timed in turn, round after round."""
+
+import dataclasses
+import time
+from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from rigidjax.frames.frame_dynamics import scene_of
+from rigidjax.motion import Attitude, conserved
+from rigidjax.solve import equations_of_motion, fixed, solvers
+from rigidjax.workprecision import registry
+from rigidjax.workprecision.method import Method, Ready, Run
+from rigidjax.workprecision.record import Record
+from rigidjax.workprecision.reference import Reference
+from rigidjax.workprecision.scene import Scene, distance
+
+# Runs longer than this, s, are timed three times, those shorter than SHORT thrice as often.
+LONG, SHORT = 0.5, 0.02
+# Short runs are timed so many seconds at a stretch.
+BURST = 3e-3
+WRONG = 0.5
+
+
+class _Job(NamedTuple):
+    record: Record
+    ready: Ready
+    times: list[float]
+
+
+def measure(
+    scene: Scene,
+    methods: Iterable[Method] | None = None,
+    *,
+    peers: Iterable[Method] = (),
+    gradients: bool = True,
+    thin: int = 1,
+    rounds: int = 5,
+    progress: Callable[[str], None] | None = None,
+) -> list[Record]:
+    """Error and cost of each method at each of its settings, of the value and of its gradient.
+
+    All in this process, in turn, round after round; compilation apart. A method that cannot do the
+    scene is left out; a run that is wrong by more than half a radian (or itself) is kept out of
+    the records.
+
+    **Arguments:** `scene`; `methods` (all of `methods()` by default); `peers` more of them;
+    `gradients` whether gradients are measured, too; `thin` take every `thin`-th setting; `rounds`
+    how often each run is timed at least; `progress` is told a line now and then.
+
+    **Raises:** `TypeError` for something that is no `Scene` or `Method`.
+    """
+    if not isinstance(scene, Scene):
+        raise TypeError(
+            f"measure: wanted a Scene, got {type(scene).__name__}; standard ones are made by "
+            'rj.workprecision.scenes()["heavy-top"]()'
+        )
+    chosen = [*(registry.methods() if methods is None else methods), *peers]
+    for method in chosen:
+        if not isinstance(method, Method):
+            raise TypeError(f"measure: wanted Methods, got {type(method).__name__}")
+    right = scene.reference if scene.reference is not None else worked_out(scene, gradients)
+    jobs: list[_Job] = []
+    for method in chosen:
+        for adjoint, make in {"": method.value, **(method.gradients if gradients else {})}.items():
+            if adjoint and not right.gradient:
+                continue
+            ready = make(scene)
+            if ready is None:
+                continue
+            if progress is not None:
+                progress(f"{scene.name}: {method.name} {adjoint or 'value'}")
+            for setting in _settings(scene, method, thin * (2 if adjoint else 1)):
+                jobs += _looked_at(scene, method, adjoint, setting, ready, right)
+    _timed(jobs, rounds)
+    return [_finished(job) for job in jobs]
+
+
+def worked_out(scene: Scene, gradients: bool = True) -> Reference:
+    """A reference for a scene that has none: order 8 at equal steps, and at half as many.
+
+    Its error is their difference, no less than a hundred units of round-off: far above what the
+    stored references have.
+
+    **Arguments:** `scene`; `gradients` whether the gradient is worked out, too.
+    """
+    counts = (4000, 2000)
+    numbers = scene.numbers
+    ts = jnp.array([0.0, scene.end], numbers.dtype)
+
+    def flow(numbers: Any, count: Any) -> Any:
+        body, start = scene.assembled(numbers)
+        field = equations_of_motion(body, start, scene.torque)
+        ys = fixed(solvers.DormandPrince8(), field, ts, start, count)
+        return scene.flat(jax.tree.map(lambda leaf: leaf[-1], ys))
+
+    scale = max(1.0, _turn(scene) / 50)
+    run = jax.jit(flow)
+    take = jax.jit(jax.jacfwd(lambda p, count: scene.loss(flow(p, count))))
+    ends, slopes = [], []
+    for count in (jnp.asarray(round(c * scale)) for c in counts):
+        ends.append(np.asarray(run(numbers, count)))
+        if gradients:
+            slopes.append(np.asarray(take(numbers, count)))
+    floor = 100 * float(np.finfo(ends[0].dtype).eps)
+    error = max(float(np.abs(ends[0] - ends[1]).max()), floor)
+    slope = tuple(map(float, slopes[0])) if gradients else ()
+    off = max(float(np.abs(slopes[0] - slopes[1]).max()), floor) if gradients else float("nan")
+    source = f"order 8 at {round(counts[0] * scale)} equal steps"
+    return Reference(tuple(map(float, ends[0])), error, slope, off, source)
+
+
+def _turn(scene: Scene) -> float:
+    """About how many radians the scene turns through; of a point, nothing is known."""
+    return 50.0 if scene.body is None else max(50.0, scene.size[1] * scene.end)
+
+
+def _settings(scene: Scene, method: Method, thin: int) -> list[float]:
+    found = list(method.settings)[::-1][::thin][::-1]
+    if method.equal:
+        return [float(round(s * _turn(scene) / 50)) for s in found]
+    return [float(s) for s in found]
+
+
+def _looked_at(
+    scene: Scene, method: Method, adjoint: str, setting: float, ready: Ready, right: Reference
+) -> list[_Job]:
+    run = ready.run(setting)
+    begin = time.perf_counter()
+    run = ready.run(setting)
+    first = time.perf_counter() - begin
+    errors = (_gradient_errors if adjoint else _errors)(scene, run, right)
+    if not errors["error"] < WRONG:
+        return []
+    record = Record(
+        scene.name, method.name, method.group, "gradient" if adjoint else "value", adjoint,
+        setting, steps=float(run.steps), compile=ready.compile, memory=ready.memory, **errors,
+    )  # fmt: skip
+    return [_Job(record, ready, [first])]
+
+
+def _errors(scene: Scene, run: Run, right: Reference) -> dict[str, float]:
+    error, rate = distance(scene, run.numbers, right.end)
+    energy, momentum = drifts(scene, np.asarray(run.numbers))
+    return {"error": error, "error_rate": rate, "energy": energy, "momentum": momentum}
+
+
+def _gradient_errors(scene: Scene, run: Run, right: Reference) -> dict[str, float]:
+    found, wanted = np.asarray(run.numbers, float), np.asarray(right.gradient)
+
+    def off(part: slice) -> float:
+        return float(
+            np.linalg.norm(found[part] - wanted[part]) / max(np.linalg.norm(wanted[part]), 1e-300)
+        )
+
+    blocks = scene.blocks
+    names = ("inertia", "omega0", "q0") if scene.body is not None else ("", "v0", "x0")
+    parts = {
+        key: off(blocks[name]) if name else float("nan")
+        for key, name in zip(("by_inertia", "by_rate", "by_attitude"), names, strict=True)
+    }
+    return {"error": off(slice(None)), **parts}
+
+
+def drifts(scene: Scene, end: Any) -> tuple[float, float]:
+    """How far energy and momentum (of a point its integral, and nothing) moved, relative."""
+    if scene.body is None:
+        law: Any = scene_of(scene.torque)
+        state: Any = scene.state0
+        last = type(state)(end[:3], end[3:])
+        kept = law.conserved(0.0, state), law.conserved(scene.end, last)
+        name = next(iter(kept[0]), None)
+        if name is None:
+            return float("nan"), float("nan")
+        a, b = (float(values[name]) for values in kept)
+        return abs(b - a) / max(abs(a), 0.5 * scene.size[1] ** 2), float("nan")
+    first: Any = scene.state0
+    last = Attitude(end[:4] / np.linalg.norm(end[:4]), end[4:])
+    kept = (
+        conserved(scene.body, first, scene.torque, 0.0),
+        conserved(scene.body, last, scene.torque, scene.end),
+    )
+    spin = float(jnp.linalg.norm(scene.body.tensor @ first.omega))
+    kinetic = 0.5 * float(first.omega @ scene.body.tensor @ first.omega)
+    away = {
+        name: float(np.linalg.norm(np.asarray(kept[1][name]) - np.asarray(value)))
+        for name, value in kept[0].items()
+    }
+    energy = away["energy"] / kinetic if "energy" in away else float("nan")
+    momenta = [away[n] / spin for n in ("momentum", "momentum_along_axis") if n in away]
+    return energy, max(momenta, default=float("nan"))
+
+
+def _timed(jobs: list[_Job], rounds: int) -> None:
+    for turn in range(3 * rounds):
+        for job in jobs:
+            first = job.times[0]
+            if turn >= (3 if first > LONG else rounds if first > SHORT else 3 * rounds):
+                continue
+            # The first call finds the processor's caches full of the method before: a long program
+            # such as the closed form's takes fifteen times as long then.
+            job.ready.run(job.record.setting)
+            many = max(1, int(BURST / first))
+            begin = time.perf_counter()
+            for _ in range(many):
+                job.ready.run(job.record.setting)
+            job.times.append((time.perf_counter() - begin) / many)
+
+
+def _finished(job: _Job) -> Record:
+    low, middle, high = np.percentile(job.times[1:], [25, 50, 75])
+    return dataclasses.replace(
+        job.record, time=float(middle), time_low=float(low), time_high=float(high)
+    )

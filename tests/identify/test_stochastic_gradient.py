@@ -1,0 +1,106 @@
+"""Stochastic descent: what a few recordings at a time reach, and what it refuses."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+import rigidjax as rj
+from rigidjax import identify
+from rigidjax.identify.search import misfit
+from rigidjax.identify.stochastic_gradient import _misfit_of, descend, only
+
+TS = jnp.linspace(0.0, 4.0, 25)
+BODY = rj.Inertia.from_principal(1.0, 1.6, 2.1)
+SIGMA = 0.02
+
+
+@pytest.fixture(scope="module")
+def problem():
+    rng = np.random.default_rng(2)
+    records = []
+    for _ in range(24):
+        omega = rng.normal(size=3)
+        clean = rj.simulate(BODY, rj.Spin(omega), TS).ys.omega
+        read = clean + SIGMA * rng.normal(size=clean.shape)
+        records.append(identify.Recording(TS, (identify.Gyro(SIGMA), read)))
+    return identify.Problem(records, identify.PrincipalRatios())
+
+
+NOISE = (jnp.full((24, 3), SIGMA),)
+
+
+@pytest.mark.oldest
+def test_few_recordings_show_the_whole_misfit_without_bias(problem):
+    # Every recording once in batches of one: their mean is the misfit of all.
+    point = problem.start(rj.Inertia.from_principal(1.2, 1.5, 1.9))
+    point = jax.tree.map(lambda leaf: leaf + 0.1, point)
+    of = eqx.filter_jit(_misfit_of)
+    parts = [of(point, problem, NOISE, jnp.array([row])) for row in range(24)]
+    whole = eqx.filter_jit(misfit)(point, (problem, NOISE, jnp.ones_like(problem.records.t)))
+    np.testing.assert_allclose(np.mean(parts), whole, rtol=1e-12)
+
+
+@pytest.mark.slow
+def test_the_slope_is_that_of_differences(problem):
+    point = jax.tree.map(lambda leaf: leaf + 0.1, problem.start(BODY))
+    rows = jnp.array([3, 7])
+    slope = eqx.filter_jit(jax.grad(_misfit_of))(point, problem, NOISE, rows)
+    of = eqx.filter_jit(_misfit_of)
+    for index in range(2):
+        step = jnp.zeros(2).at[index].set(1e-5)
+
+        def at(sign, step=step):
+            moved = problem.start(BODY)
+            moved = jax.tree.map(lambda leaf: leaf + 0.1, moved)
+            moved = type(point)(moved.body + sign * step, moved.shared, moved.own)
+            return float(of(moved, problem, NOISE, rows))
+
+        np.testing.assert_allclose(slope.body[index], (at(1) - at(-1)) / 2e-5, rtol=1e-6)
+
+
+def test_a_batch_holds_the_recordings_it_names(problem):
+    few = only(problem, jnp.array([5, 2]))
+    assert few.count == 2
+    np.testing.assert_array_equal(
+        few.records.readings[0].values[1], problem.records.readings[0].values[2]
+    )
+
+
+@pytest.mark.slow
+def test_descent_alone_comes_near_and_a_fit_ends_at_the_bottom(problem):
+    how = identify.Descent(optax.adam(optax.cosine_decay_schedule(3e-2, 4000)), steps=4000, batch=6)
+    start = identify.fit(problem, starts=1, descent=how, max_steps=50)
+    assert start.ok
+    plain = identify.fit(problem, starts=1)
+    np.testing.assert_allclose(start.body.moments, plain.body.moments, rtol=1e-6)
+    blind = problem.start()
+    blind = type(blind)(blind.body + 0.8, blind.shared, blind.own)
+    said = []
+    near = descend(blind, problem, NOISE, how, jax.random.key(3), said.append)
+    whole = jnp.ones_like(problem.records.t)
+    before, after = (float(misfit(p, (problem, NOISE, whole))) for p in (blind, near))
+    # 1800 readings: the bottom is at 900; descent in noise of its own stays a little above.
+    assert after < 1.5 * 900 < 0.01 * before
+    assert said[-1].startswith("descent 4000/4000")
+
+
+@pytest.mark.slow
+def test_where_the_misfit_is_lost_the_point_before_is_kept(problem):
+    how = identify.Descent(optax.sgd(1e300), steps=100, batch=2)
+    start = problem.start(BODY)
+    kept = descend(start, problem, NOISE, how, jax.random.key(0))
+    assert all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(kept))
+
+
+def test_mistakes_are_told(problem):
+    with pytest.raises(TypeError, match="optimiser"):
+        identify.Descent("adam", steps=1, batch=1)
+    with pytest.raises(ValueError, match="at least 1"):
+        identify.Descent(optax.sgd(1.0), steps=0, batch=1)
+    with pytest.raises(ValueError, match="at most 24 recordings, got 25"):
+        identify.fit(problem, starts=1, descent=identify.Descent(optax.sgd(1.0), steps=1, batch=25))
+    with pytest.raises(TypeError, match="Descent"):
+        identify.fit(problem, starts=1, descent=optax.sgd(1.0))
