@@ -15,7 +15,7 @@ from rigidjax._types import ScalarLike
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.frames import Point
 from rigidjax.motion import Attitude, Rigid, Spin, on_the_group
-from rigidjax.motion.torques.states import require_stateless
+from rigidjax.motion.coupled import Coupled, started
 from rigidjax.solve import validation
 from rigidjax.solve.crossing_loop import Search
 from rigidjax.solve.crossing_search import search
@@ -31,7 +31,7 @@ from rigidjax.solve.explicit import AbstractExplicit, DormandPrince8
 from rigidjax.solve.run import Free, Loop
 from rigidjax.solve.step_control import Watched
 
-State = TypeVar("State", Spin, Attitude, Rigid, Point)
+State = TypeVar("State", Spin, Attitude, Rigid, Point, Coupled)
 
 
 class Crossings(eqx.Module, Generic[State]):
@@ -84,7 +84,8 @@ def crossings(
     - `body`, `state0`, `torque`: as for `simulate`; `state0` at `t0`.
     - `t0`, `t1`: s; `t1 < t0` goes back in time.
     - `condition`: a Module or function `(t, state, body) → scalar`, smooth along the motion. It may
-      hold traced numbers, and look at the time (a stroboscopic section is `sin(½(t − t₀)ω)`).
+      hold traced numbers, and look at the time (a stroboscopic section is `sin(½(t − t₀)ω)`). Under
+      a law with states of its own the state is a `Coupled`, as in what is returned.
     - `direction`: 1 for zeros on the way up, −1 on the way down, 0 for both, in the order of the
       run.
     - `max_crossings`: K, the length of what is returned; the run ends with the last of them.
@@ -123,10 +124,10 @@ def crossings(
         dtype = jnp.promote_types(dtype, leaf.dtype)
     times, state0 = jax.tree.map(lambda leaf: leaf.astype(dtype), (times, state0))
     validation.require_fit(body, state0, torque)
-    require_stateless(torque, "crossings")
     if body is not None and _checks.known(body):
         body = body.invertible()
     asked = Asked(condition, body)
+    state0 = started(body, state0, torque, times[0])
     require_condition(asked, times[0], state0)
     step = None if max_step is None else require_step(max_step)
     setup: Free | Loop

@@ -13,9 +13,8 @@ from rigidjax import _checks
 from rigidjax._types import ScalarLike
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.frames import AbstractScene, MovingFrame, collision
-from rigidjax.motion.coupled import Coupled
+from rigidjax.motion.coupled import Coupled, started
 from rigidjax.motion.torques.base import jumps_of
-from rigidjax.motion.torques.states import require_stateless
 from rigidjax.solve import validation
 from rigidjax.solve.direction import direction
 from rigidjax.solve.events import Asked, Event, require_condition, solve_until
@@ -183,11 +182,13 @@ def _solution(setup: Loop | Setup, state0: Any, times: Array) -> Solution:
 
 def _until(event: Any, setup: Free | Loop, state0: Any, times: Array) -> Solution:
     event = event if isinstance(event, Event) else Event(event)
-    require_stateless(getattr(setup, "torque", None), "simulate(event=…)")
+    state0 = started(setup.body, state0, getattr(setup, "torque", None), times[0])
     require_condition(Asked(event.condition, setup.body), times[0], state0)
     ys, stats, result, time, state = solve_until(setup, event, state0, times)
     if setup.throw and "collided" in stats:
         ys = collision.refuse(ys, stats, times)
+    if isinstance(ys, Coupled):
+        return Solution(times, ys.motion, stats, result, setup, time, state, ys.own)
     return Solution(times, ys, stats, result, setup, time, state)
 
 

@@ -318,16 +318,33 @@ def test_words(unhooked):
         rj.crossings(BODY, FLIPPING, 0.0, 1.0, middle, solver=dfx.Tsit5())
 
 
-def test_laws_with_states_of_their_own_are_refused():
-    body, start = rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([0.0, 1.0, 0.01])
-    wheels = rj.torques.ReactionWheels([[0.0, 0, 1]], [0.1], [30.0])
-    zero = lambda t, state, body: state.omega[1]
-    with pytest.raises(ValueError, match=r"simulate\(event=…\): wanted a torque without states"):
-        rj.simulate(body, start, [0.0, 1.0], wheels, event=zero)
-    with pytest.raises(ValueError, match="crossings: wanted a torque without states"):
-        rj.crossings(body, start, 0.0, 1.0, zero, wheels)
+def test_events_under_laws_with_states_of_their_own():
+    """One wheel about the axis of the turn: Ω = Ω₀ − u t/I, the wheel's momentum h = h₀ + u t."""
+    body = rj.Inertia.from_principal(1.0, 2.0, 3.0)
+
+    def still(omega, motor):
+        wheel = rj.torques.ReactionWheels([[0.0, 0, 1]], [0.1], [30.0], motor[None])
+        start = rj.Spin(jnp.stack([0.0 * omega, 0.0 * omega, omega]))
+        stops = rj.Event(lambda t, state, body: state.motion.omega[2])
+        sol = rj.simulate(body, start, [0.0, 4.0, 8.0], wheel, event=stops)
+        return sol.event_time, (sol, wheel, start)
+
+    at = jnp.asarray(1.0), jnp.asarray(0.5)
+    time, (sol, wheel, start) = still(*at)
+    np.testing.assert_allclose(time, 6.0, rtol=1e-9)
+    np.testing.assert_allclose(sol.event_state.own[0], [0.1 * 31.0 + 3.0], rtol=1e-9)
+    np.testing.assert_allclose(sol.own[0][1], [0.1 * 31.0 + 2.0], rtol=1e-9)
+    assert np.isnan(sol.own[0][2]).all() and np.isnan(sol.ys.omega[2]).all()
+    when = lambda *numbers: still(*numbers)[0]
+    slopes = jax.jacfwd(when, argnums=(0, 1))(*at)
+    np.testing.assert_allclose(slopes, [6.0, -12.0], rtol=1e-7)
+    np.testing.assert_allclose(jax.grad(when)(*at), 6.0, rtol=1e-7)
+    full = lambda t, state, body: state.own[0][0] - 3.6
+    found = rj.crossings(body, start, 0.0, 8.0, full, wheel, max_crossings=2)
+    np.testing.assert_allclose(found.times, [1.0, np.nan], rtol=1e-9)
+    np.testing.assert_allclose(found.states.motion.omega[0, 2], 1 - 0.5 / 3, rtol=1e-9)
     with pytest.raises(ValueError, match="transition_matrix: wanted a torque without states"):
-        rj.simulate(body, start, [0.0, 1.0], wheels).transition_matrix()
+        rj.simulate(body, start, [0.0, 1.0], wheel).transition_matrix()
 
 
 def test_back_in_time_with_wheels():
