@@ -34,11 +34,14 @@ ACCEPTED: list[tuple[str, str, str, str]] = [
     ),
     ("plot.light_curve", "periods: empty list", "*", "no period is documented: nothing is folded"),
     ("plot.light_curve", "model: None", "*", "None is documented: no motion is drawn"),
-    (
-        "identify.report.*",
-        "fit: float16",
-        "names none of*",
-        "the words name the first number in the fit that is of half precision",
+    *(
+        (
+            name,
+            "f*: float16",
+            "names none of*",
+            "the words name the first number in the fit that is of half precision",
+        )
+        for name in ("identify.report.*", "plot.fit", "plot.residuals")
     ),
     # Estimates.
     *(
