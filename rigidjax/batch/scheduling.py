@@ -1,4 +1,4 @@
-"""Which bodies go side by side: those that need about as many steps."""
+"""Which bodies are computed together: those that need about as many steps."""
 
 from typing import Any
 

@@ -87,7 +87,7 @@ def mesh_of(devices: Any) -> Mesh | None:
 
 
 def chunk_of(chunk: int | None, dtype: Any, count: int) -> int:
-    """How many bodies go side by side: what fits the cache on CPU, all of them elsewhere."""
+    """How many bodies are computed at a time: what fits the cache on CPU, all of them elsewhere."""
     if chunk is None:
         small = _ROW // np.dtype(dtype).itemsize
         chunk = small if jax.default_backend() == "cpu" else count
@@ -102,7 +102,7 @@ def over_bodies(
     """`one(shared, a body's part of each)` for all bodies, stacked along a new first axis.
 
     **Arguments:** `shared`, `each` trees of arrays, those of `each` with a leading axis of bodies.
-    Bodies do not see one another: nothing is sent between devices.
+    Bodies are independent: nothing is sent between devices.
     """
     count = jax.tree.leaves(each)[0].shape[0]
     parts = 1 if mesh is None else mesh.devices.size

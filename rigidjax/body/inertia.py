@@ -113,7 +113,7 @@ class Inertia(eqx.Module):
 
         **Returns** `(moments, q)`, (3,) kg m² and (4,), with `I = R(q) diag(moments) R(q)ᵀ`.
         Derivatives are finite for any body, also at equal moments: see
-        `rigidjax.body.principal_axes.principal` for what they mean there.
+        `rigidjax.body.principal` for what they mean there.
 
         >>> Inertia.from_principal(3.0, 2.0, 2.5).principal()[0]
         Array([2. , 2.5, 3. ], dtype=float64)

@@ -53,8 +53,8 @@ def unpack(vector: Float[ArrayLike, "10"] | Numbers) -> MassProperties:
     """The body of ten unconstrained numbers: any ten.
 
     **Arguments:** `vector` (10,) as `pack` returns them. Exponents beyond what the dtype can hold
-    (|α|, |α + d| over 330 in float64, 31 in float32) grow logarithmically instead, so that a wild
-    step of an optimiser gives a large body and not an infinity.
+    (|α|, |α + d| over 330 in float64, 31 in float32) grow logarithmically instead, so that a far
+    too long step of an optimiser gives a large body and not an infinity.
 
     **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
 

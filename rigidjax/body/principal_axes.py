@@ -33,7 +33,7 @@ def principal(tensor: Mat3Like) -> tuple[Vec3, Quat]:
     entries. That is the right derivative of whatever depends on the moments symmetrically and on
     the eigenspaces only. What mixes axes inside an eigenspace is not seen by any finite tangent
     of an axis: for a smooth function of the whole matrix, such as a square root, use
-    `rigidjax.body.matrix_functions.matrix_function`; to solve, use the matrix itself.
+    `rigidjax.body.matrix_function`; to solve, use the matrix itself.
 
     Source: notes, eqs 71–72; first-order perturbation theory, Kato 1966, II.2.
 

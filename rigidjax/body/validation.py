@@ -2,7 +2,7 @@
 
 Each returns its argument, refused where no real body has it. They work on known values (plain
 exceptions, with the numbers) and under `jit` (`equinox.error_if`, without them). A few units of
-round-off are forgiven, so that plates, rods and points, which lie on the boundary, pass.
+round-off are tolerated, so that plates, rods and points, which lie on the boundary, pass.
 """
 
 from collections.abc import Callable

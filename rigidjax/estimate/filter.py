@@ -97,8 +97,8 @@ def filter(
     **Arguments:** `model`; `recording` a `Recording` whose sensors have their noise; masked
     readings are gaps, channels at their full scale are left out, a sensor's `offset` is a delay;
     `first` of `start`; `substeps` equal steps from one time to the next, `None` as many as the rate
-    asks for where the numbers are known, else one. `throw`: `False` never raises for what is met on
-    the way; `status` tells.
+    asks for where the numbers are known, else one. `throw`: `False` never raises for what happens
+    during the run: see `status`.
 
     **Returns** a `Filtered`. It may be jitted, differentiated, and batched over any argument.
 

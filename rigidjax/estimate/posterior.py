@@ -1,4 +1,4 @@
-"""Draws from a posterior density, by samplers that others keep."""
+"""Draws from a posterior density, by samplers of other libraries."""
 
 from collections.abc import Callable
 from typing import Any
@@ -114,7 +114,7 @@ def posterior(
     **Arguments:** `density` a `LogDensity`; `key` of `jax.random`; `sampler` a function of a key,
     a log-density and a first vector to draws (samples, n), `Nuts()` unless given; it works in
     numbers whose covariance by Laplace's method is the identity, and starts from a draw of it.
-    `chains` run side by side under `vmap`.
+    `chains` run together under `vmap`.
 
     **Returns** a `Posterior`.
 

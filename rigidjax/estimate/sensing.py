@@ -159,7 +159,7 @@ def rows(
 
 
 class Read(NamedTuple):
-    """What came of one sensor's readings.
+    """What one sensor's readings gave.
 
     **Fields:** `innovation` (k,) what was read minus what was expected of all read before, the
     sensor's earlier components among them; `variance` (k,) of it; `seen` (k,).

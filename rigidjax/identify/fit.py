@@ -182,8 +182,9 @@ def one_fit(found: Any, name: str = "fit") -> Fit:
 
     **Raises:** `TypeError` for another kind of thing, `ValueError` for leading axes.
 
-    >>> one_fit.__name__
-    'one_fit'
+    >>> one_fit(3)
+    Traceback (most recent call last):
+    TypeError: ...
     """
     _checks.instance(found, Fit, name)
     if np.shape(found.chi2) != ():

@@ -155,7 +155,7 @@ def globe(ax: Any, semi_axes: Any, colour: str, alpha: float) -> None:
 def cage(ax: Any, semi_axes: Any, colour: str, **how: Any) -> None:
     """An ellipsoid along the axes by meridians and parallels: what is inside stays visible."""
     shape = _ellipsoid(semi_axes)
-    ax.plot_wireframe(*shape, color=colour, rstride=4, cstride=4, **how)
+    ax.plot_wireframe(*shape, color=colour, rstride=4, cstride=6, **how)
 
 
 def _ellipsoid(semi_axes: Any) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Answers with a solver: by our own loops, or by diffrax."""
+"""Motions by a solver: in our own loops, or by diffrax."""
 
 from rigidjax._names import own_names, renamed
 from rigidjax.solve import solvers as solvers

@@ -37,7 +37,7 @@ from rigidjax.solve.record import (
 from rigidjax.solve.runge_kutta import Step
 from rigidjax.solve.step_control import error_norm, first_step
 
-# What diffrax.PIDController does unless told: the same steps, so that figures can be compared.
+# The defaults of diffrax.PIDController: the same steps, so that figures can be compared.
 _SAFETY, _SMALLEST, _LARGEST = 0.9, 0.2, 10.0
 # Steps in a segment, rejected ones included.
 SEGMENT = 512
@@ -86,7 +86,7 @@ def start(method: Method, constants: list[Array], run: Run) -> LoopState:
     """A loop about to begin."""
     t0, y0 = run.t0, run.y0
     h, f0 = lax.stop_gradient(first_step(method, constants, run))
-    # Where there is no slope to begin with, no step is short enough.
+    # Where f(t0) is not finite, no step is short enough.
     sound = jnp.all(jnp.isfinite(f0), 0) & jnp.all(jnp.isfinite(y0), 0)
     sound = sound & jnp.isfinite(t0) & jnp.isfinite(run.stops[-1])
     h = jnp.where(sound, jnp.where(jnp.isnan(run.h0), h, run.h0), jnp.nan)

@@ -84,24 +84,24 @@ def crossings(
     - `body`, `state0`, `torque`: as for `simulate`; `state0` at `t0`.
     - `t0`, `t1`: s; `t1 < t0` goes back in time.
     - `condition`: a Module or function `(t, state, body) → scalar`, smooth along the motion. It may
-      hold traced numbers, and look at the time (a stroboscopic section is `sin(½(t − t₀)ω)`). Under
+      hold traced numbers, and depend on the time (a stroboscopic section is `sin(½(t − t₀)ω)`). Under
       a law with states of its own the state is a `Coupled`, as in what is returned.
     - `direction`: 1 for zeros on the way up, −1 on the way down, 0 for both, in the order of the
       run.
     - `max_crossings`: K, the length of what is returned; the run ends with the last of them.
     - `max_step`: the longest step, s, for a condition that is much faster than the motion: two
-      zeros in one step are seen, three are not.
+      zeros in one step are found, three are not.
     - `solver`: `None` is the closed form for a free body, else `rigidjax.solvers.DormandPrince8`;
       or an explicit method of `rigidjax.solvers`. `rtol`, `atol` as for `simulate`; a crossing is
       as accurate as a step, that of a free body to round-off.
     - `max_steps`: parts of steps included.
 
-    A start on the section does not count, and a touch need not. Many bodies:
+    A start on the section does not count, and a tangential contact may be missed. Many bodies:
     `jax.vmap(lambda start: rj.crossings(body, start, …))`.
 
-    **Returns** `Crossings`. Times and states have first and second derivatives by all numbers of
-    the scene, of `condition` and of `state0`, forward and reverse; near a touch they grow beyond
-    bounds, as they should.
+    **Returns** `Crossings`. Times and states have first and second derivatives with respect to all
+    numbers of the scene, of `condition` and of `state0`, forward and reverse; near a tangential
+    contact they grow without bound, as the true ones do.
 
     Source: Newton's method on the step from the last accepted state, in the place of Hénon's change
     of variable (Hénon 1982, doi:10.1016/0167-2789(82)90034-3): two to three parts of a step.

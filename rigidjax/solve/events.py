@@ -38,8 +38,8 @@ class Event(eqx.Module):
       `rigidjax.Coupled`: `state.motion.omega`, `state.own`.
     - `direction`: 1 for a zero on the way up, −1 on the way down, 0 for both (as in SciPy), in the
       order in which the run meets them.
-    - `max_step`: the longest step, s. Zeros are seen where the condition has changed its sign at
-      the end of a step, or turns back once within it; a condition that is much faster than the
+    - `max_step`: the longest step, s. Zeros are found where the condition has changed its sign at
+      the end of a step, or has one extremum within it; a condition that is much faster than the
       motion needs shorter steps.
 
     A start at a zero does not count.

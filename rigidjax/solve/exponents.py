@@ -73,12 +73,12 @@ def lyapunov_exponents(
     - `number`: k, how many exponents; `None` for all, 6 for an `Attitude`.
     - `intervals`: N, how often the tangents are made orthonormal. In one of them no error may grow
       so much that the others are lost: `time/intervals` up to a few times 1/exponent.
-    - `transient`: intervals at the beginning that are not counted: the state comes to its
+    - `transient`: intervals at the beginning that are not counted: the state approaches its
       attractor, and the tangents to their directions.
     - `solver`, `rtol`, `atol`, `max_steps` (in an interval): as for `simulate`.
 
-    Each conserved quantity, and the direction of the motion itself, gives a zero; it comes down as
-    (log t)/t, and `errors` does not know of such a drift: look at `running`. In a Hamiltonian
+    Each conserved quantity, and the direction of the motion itself, gives a zero; it decreases as
+    (log t)/t, and `errors` does not include such a trend: look at `running`. In a Hamiltonian
     system the exponents come in pairs ±λ, and their sum is the mean divergence of `field` always.
 
     **Returns** `Exponents`. Where a run fails they are NaN, and `result` says why.

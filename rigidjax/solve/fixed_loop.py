@@ -1,6 +1,6 @@
 """Equal steps: nothing carried but a time, a step and the state's numbers.
 
-`diffrax.diffeqsolve` can do more, and pays for it at each step. There is no interpolation: at saved
+`diffrax.diffeqsolve` can do more, at some cost in each step. There is no interpolation: at saved
 times, too, the error is the method's own.
 """
 

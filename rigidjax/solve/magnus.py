@@ -1,4 +1,4 @@
-"""A step of order 4 for torques that do not look at the attitude: Runge–Kutta, then one rotation.
+"""A step of order 4 for torques that do not depend on the attitude: Runge–Kutta, then one rotation.
 
 Euler's equations are then closed in the body rate. So the four stages carry three numbers instead
 of seven, and the attitude is turned once a step, by the exponential of Magnus' series.
@@ -110,7 +110,7 @@ class Magnus4(dfx.AbstractSolver):
         start = split(y0)
         q, omega = start[:4], start[4:]
         h = jnp.asarray(terms.contr(t0, t1), y0.omega.dtype)
-        # A law that looks at the attitude against its word gets none.
+        # A law that says that it does not depend on the attitude gets none.
         nowhere = jnp.full_like(y0.q, jnp.nan)
 
         def slope(t: Any, omega: Triple) -> Triple:
@@ -131,7 +131,7 @@ class Magnus4(dfx.AbstractSolver):
 
 
 def require_blind(law: Any) -> None:
-    """Raise `TypeError` unless the law says, by its rung, that it does not look at the attitude."""
+    """Raise `TypeError` unless the law says by `feels` that it does not read the attitude."""
     if sees_attitude(law):
         raise TypeError(
             f"Magnus4: the torque {type(law).__name__} depends on the attitude, or does not say "

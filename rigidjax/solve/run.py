@@ -177,7 +177,7 @@ def _raise(ys: Any, result: dfx.RESULTS) -> Any:
         ys,
         result == NONFINITE,
         "simulate: the motion became NaN or infinite. Is the torque finite at every time and state "
-        "that it meets? With equal steps: are they short enough for this spin? throw=False keeps "
+        "of the run? With equal steps: are they short enough for this spin? throw=False keeps "
         "what came before",
     )
     ill = (result != dfx.RESULTS.successful) & (result != dfx.RESULTS.event_occurred)
@@ -200,7 +200,7 @@ def _free(setup: Free, state0: Any, ts: Array) -> tuple[Any, dict[str, Any], dfx
 
 
 def free_motion(body: Inertia | MassProperties, state0: Any, since: Array) -> Any:
-    """The states of a free body (T, …) at times (T,) since its start, s, on any rung."""
+    """The states of a free body (T, …) at times (T,) since its start, s, of any kind of state."""
     inertia = body if isinstance(body, Inertia) else body.inertia
     turning = Attitude(state0.q, state0.omega) if isinstance(state0, Rigid) else state0
     ys: Any = jax.vmap(FreeBody(inertia, turning))(since)

@@ -1,4 +1,4 @@
-"""The one front door: a body, where it starts, when to look, and what turns it."""
+"""`simulate`: the motion of a body or a particle, saved at given times."""
 
 import functools
 from collections.abc import Callable, Sequence
@@ -59,8 +59,8 @@ def simulate(
 
     - `body`: `Inertia` for `Spin` and `Attitude`, about the point that the body turns about;
       `MassProperties` for `Rigid`; `None` for a `Point`.
-    - `state0`: `Spin(omega)`, `Attitude(q, omega)` or `Rigid(x, v, q, omega)` at `ts[0]`. The rung
-      says what is solved for: take the lowest that the question needs. One body; for many,
+    - `state0`: `Spin(omega)`, `Attitude(q, omega)` or `Rigid(x, v, q, omega)` at `ts[0]`. Take the
+      first of these that has what is asked for. One body; for many,
       `jax.vmap(lambda body, state: rj.simulate(body, state, ts).ys)`, and with `throw=False` take
       `.result` along: one for each body.
     - `ts`: (T,) increasing times, s, or decreasing ones, to go back. The first is the start.
@@ -72,15 +72,15 @@ def simulate(
     - `solver`: `None` is the cheapest that is right: the closed form (`rigidjax.exact`) for a free
       body, else `rigidjax.solvers.DormandPrince8` (order 8), however many times are saved. The
       explicit methods of `rigidjax.solvers` run in a loop of our own; so does the default, unless a
-      controller, a meter or `max_steps=None` is asked for, or a `Point` can collide: then diffrax
-      runs it. Any `diffrax.AbstractSolver` may be given; it is wrapped so that attitudes stay unit
-      quaternions, at every step and every saved time. Between its steps `DormandPrince8` is up to
-      ten times `rtol` off (7 was the most that was met), Dopri8 up to 26 times below `rtol=1e-10`.
+      controller, a progress meter or `max_steps=None` is asked for: then diffrax runs it. Any
+      `diffrax.AbstractSolver` may be given; it is wrapped so that attitudes stay unit quaternions,
+      at every step and every saved time. Between its steps the error of `DormandPrince8` is up to
+      ten times `rtol` (7 was the largest found), that of Dopri8 up to 26 times below `rtol=1e-10`.
     - `rtol`, `atol`: tolerances of the adaptive steps; 1e-9 and 1e-12 in float64, 2e-5 and 1e-7 in
-      float32. Traced ones are not checked, and others then compile nothing. Scale `atol` to the
-      smallest number that matters: the time of a flip about the middle axis depends on the rate off
-      the axis at the start; where this is below `atol`, it has no meaning. The closed form has no
-      use for either.
+      float32. Traced ones are not checked, and other values do not compile again. Scale `atol` to
+      the smallest number that matters: the time of a flip about the middle axis depends on the rate
+      off the axis at the start; where this is below `atol`, it has no meaning. The closed form uses
+      neither.
     - `dt0`, `stepsize_controller`: first step and controller where the tolerances are not enough,
       such as `dt0=0.01, stepsize_controller=diffrax.ConstantStepSize()`.
     - `adjoint`: how derivatives through a solver of diffrax are taken, as there. `None` is
@@ -90,16 +90,18 @@ def simulate(
       reverse) go through, and `jax.grad` of a `jax.grad` is refused.
     - `event`: `(t, state, body) → scalar`, or an `Event` of it: the run ends where it is first
       zero. `event_time` and `event_state` of the solution are exact to the tolerances, with first
-      and second derivatives by everything, the condition's own numbers, too; `ys` beyond are NaN,
-      and `result` is `event_occurred`. Where it is not met they are NaN and the run goes on.
-      In our own loop and the closed form; for a solver of diffrax give `diffrax.Event` there.
+      and second derivatives with respect to everything, the condition's own numbers, too; `ys`
+      beyond are NaN, and `result` is `event_occurred`. Where it is not met they are NaN and the run
+      goes on. In our own loop and the closed form; for a solver of diffrax give `diffrax.Event`
+      there.
     - `max_steps`, `progress_meter`: as in `diffrax.diffeqsolve`.
-    - `throw`: `False` never raises for numbers met on the way, or for a bad start inside a batch:
+    - `throw`: `False` never raises for what happens during the run, or for a bad start in a batch:
       `result` says what happened, states not reached are NaN, and other bodies of the batch get
       what they would get without the bad one, to the last bit. Known numbers that are wrong are
       refused in any case.
 
-    **Returns** a `Solution`. A second call with other numbers of the same shapes compiles nothing.
+    **Returns** a `Solution`. A second call with other numbers of the same shapes does not compile
+    again.
 
     Source: `AttitudeEquations`, `EulerEquations`, `NewtonEuler` (notes, eqs 50, 79, 84).
 

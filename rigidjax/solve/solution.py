@@ -1,4 +1,4 @@
-"""What a run gives back."""
+"""The result of a run."""
 
 import warnings
 from typing import Any, Generic, TypeVar
@@ -56,7 +56,7 @@ class Solution(eqx.Module, Generic[State]):
         """How far each quantity that the scene conserves moved, relative to its size.
 
         See `rigidjax.drift`: energy, angular momentum in the world, its component along gravity…,
-        whichever this scene keeps; for a `Point` what its scene says. Zero is perfect.
+        whichever this scene conserves; for a `Point` what its scene says. Zero is best.
         """
         if "drift" in self.stats:
             return self.stats["drift"]
@@ -71,8 +71,8 @@ class Solution(eqx.Module, Generic[State]):
         is the largest singular value.
 
         A solver's own errors grow as much. Where `growth * rtol` exceeds 1, the states there are
-        not known to a single digit and every gradient through them means nothing, however finite it
-        looks, whatever the adjoint: a `UserWarning` names the first such time. So look at it once
+        not known to a single digit and gradients through them have no meaning, finite or not,
+        whatever the adjoint: a `UserWarning` names the first such time. So look at it once
         before differentiating through a long run; then end the run earlier, or fit it in pieces
         (multiple shooting).
 
@@ -114,7 +114,7 @@ class Solution(eqx.Module, Generic[State]):
     def evaluate(self, t: ScalarLike) -> State:
         """The state at any `t` between the first and the last of `ts`, s.
 
-        The motion is worked out again from the last saved state before `t`, with steps of its own,
+        The motion is computed again from the last saved state before `t`, with steps of its own,
         and the attitude is on the group.
 
         **Raises:** `ValueError` (`EquinoxRuntimeError` under `jit`) where `t` is outside.

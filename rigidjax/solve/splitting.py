@@ -188,7 +188,7 @@ def compose(
     def kicked(t: Any, weight: Any, q: Array, momentum: Triple) -> Triple:
         if field.euler.torque is None:
             return momentum
-        # A torque that looks at the rate against its word gets none.
+        # A torque that says that it does not depend on the rate gets none.
         at = Attitude(q, jnp.full(3, jnp.nan, dtype))
         a, b, c = into(frame.axes, evaluate(field.euler.torque, t, at, field.euler.inertia))
         x, y, z = momentum

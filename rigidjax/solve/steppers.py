@@ -207,7 +207,7 @@ def _explicit(solver: AbstractExplicit, turning: _Turning, state0: Any) -> Stepp
 
         def field(t: Any, y: Atoms) -> Atoms:
             q, p = y[:many], y[many:]
-            # Shared by attitude and momentum; fenced, lest each of seven results work it out again.
+            # Shared by attitude and momentum; fenced: else each of seven results computes it again.
             omega = barrier(times(weights, p))
             slope = cross(p, omega)
             if law is not None:

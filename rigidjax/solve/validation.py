@@ -1,4 +1,4 @@
-"""What `simulate` is given, looked at before anything is integrated."""
+"""Checks of what `simulate` is given, before anything is integrated."""
 
 import warnings
 from typing import Any
@@ -19,7 +19,7 @@ from rigidjax.motion.torques.base import require_rung
 
 
 def require_fit(body: Any, state0: Any, torque: Any) -> None:
-    """Raise `TypeError` unless body, state and torque belong on one rung."""
+    """Raise `TypeError` unless body, state and torque fit."""
     if isinstance(state0, Point) and body is not None:
         raise TypeError(f"Point is no body: wanted None in its place, got {type(body).__name__}")
     if isinstance(torque, AbstractScene | MovingFrame) and not isinstance(state0, Point):
@@ -119,7 +119,7 @@ def times(ts: Any, throw: bool) -> Array:
         if _checks.known(ts) and (float(ts[i]) - float(ts[i - 1])) * (-1 if back else 1) > 0:
             where += (
                 f" in {found.dtype}, which cannot tell {ts[i - 1]!r} from {ts[i]!r}: count time "
-                "from nearer by, or use float64"
+                "from a later origin, or use float64"
             )
     kind = "decreasing" if back else "increasing"
     return _guard(found, ~ahead.all(), f"ts: wanted {kind} times{where}", throw)
@@ -149,7 +149,7 @@ def first_step(dt0: Any, times: Array) -> Array | None:
             raise ValueError(
                 f"dt0: steps of {dt0} s are too short for {times.dtype}, whose times near "
                 f"{float(np.abs(np.asarray(times)).max()):g} s are {gap:.2g} s apart; count time "
-                "from nearer by, or use float64"
+                "from a later origin, or use float64"
             )
     return abs(step)
 

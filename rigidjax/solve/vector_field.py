@@ -1,4 +1,4 @@
-"""The vector field of a scene: which equations move this body on this rung."""
+"""The vector field of a scene: the equations of motion of a body, by the kind of its state."""
 
 from collections.abc import Callable
 from typing import Any
@@ -17,7 +17,7 @@ def equations_of_motion(
     state0: Spin | Attitude | Rigid | Point | Coupled,
     torque: Torque | AbstractScene | MovingFrame | None = None,
 ) -> Callable[..., Any]:
-    """The vector field for this body on the rung of `state0`, for plain `diffrax.ODETerm`.
+    """The vector field of this body for states like `state0`, for plain `diffrax.ODETerm`.
 
     **Arguments** `body`, `state0`, `torque` as for `simulate`; under a torque with states of its
     own `state0` is a `rigidjax.Coupled`. **Raises** `TypeError` where they do not fit.

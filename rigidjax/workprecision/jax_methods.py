@@ -70,7 +70,7 @@ def _closed(scene: Scene) -> Flow | None:
 
 
 def _simulate(scene: Scene, adjoint: Any = None) -> Flow | None:
-    """The front door with its defaults, but for the tolerance: traced, so that one program does."""
+    """`simulate` with its defaults, but for the tolerance: traced, so that one program does."""
     if scene.torque is None:
         return None
 
@@ -91,7 +91,7 @@ def _field(scene: Scene, body: Any, start: Any) -> Any:
 
 
 def _adaptive(scene: Scene, solver: Any) -> Flow:
-    """What `simulate` runs in under a torque, without its front door, in both modes."""
+    """The loop that `simulate` runs in under a torque, in both modes."""
 
     def flow(numbers: Any, setting: Any) -> tuple[Any, Any]:
         body, start = scene.assembled(numbers)

@@ -50,6 +50,6 @@ def test_every_function_and_class_has_an_example():
     assert missing == set(WITHOUT_EXAMPLE)
 
 
-def test_no_example_is_a_mere_name():
+def test_no_example_shows_only_a_name():
     shown = {name: inspect.getdoc(thing).partition(">>>")[2] for name, thing in PUBLIC.items()}
-    assert not [name for name, text in shown.items() if "__name__\n" in text.partition("\n\n")[0]]
+    assert not [name for name, text in shown.items() if "__name__" in text]

@@ -121,8 +121,12 @@ class Marker(AbstractSensor):
     pivot is; `None` for a body that moves (`Rigid`, with `MassProperties`, whose frame `place` is
     then in); `offset` s as for `Gyro`. **Raises** `ValueError` as `Gyro`.
 
-    >>> Marker([0.1, 0.0, 0.0], noise=1e-3).feels.__name__
-    'HasPose'
+    >>> import rigidjax as rj
+    >>> body = rj.MassProperties(1.0, [0.0, 0, 0], jnp.eye(3))
+    >>> state = rj.Rigid([2.0, 0, 0], [0.0, 0, 0], [1.0, 0, 0, 0], [0.0, 0, 0])
+    >>> now = rj.identify.SensorInput(jnp.asarray(0.0), state, body, lambda t, y, args: y)
+    >>> Marker([0.5, 0.0, 0.0]).error(now, jnp.array([2.75, 0.0, 0.0])).tolist()
+    [0.25, 0.0, 0.0]
     """
 
     reading_shape: ClassVar[tuple[int, ...]] = (3,)

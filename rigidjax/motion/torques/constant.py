@@ -25,8 +25,9 @@ class ConstantTorque(AbstractTorque):
 
     **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
 
-    >>> ConstantTorque([0.0, 0.0, 1.0]).feels.__name__
-    'HasSpin'
+    >>> import rigidjax as rj
+    >>> ConstantTorque([0.0, 0.0, 1.0])(0.0, rj.Spin([0.0, 0.0, 5.0]), None).tolist()
+    [0.0, 0.0, 1.0]
     """
 
     feels: ClassVar[type] = HasSpin
@@ -55,8 +56,10 @@ class InSpace(AbstractTorque):
 
     **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
 
-    >>> InSpace([0.0, 0.0, 1.0]).feels.__name__
-    'HasAttitude'
+    >>> import rigidjax as rj
+    >>> turned = rj.Attitude([0.0, 1.0, 0.0, 0.0], [0.0, 0, 0])  # half a turn about x
+    >>> InSpace([0.0, 0.0, 1.0])(0.0, turned, None).tolist()  # in body axes
+    [0.0, 0.0, -1.0]
     """
 
     feels: ClassVar[type] = HasAttitude

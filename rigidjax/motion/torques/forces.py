@@ -22,8 +22,11 @@ class UniformGravity(AbstractForce):
 
     **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
 
-    >>> UniformGravity([0.0, 0.0, -9.81]).feels.__name__
-    'HasPose'
+    >>> import rigidjax as rj
+    >>> body = rj.MassProperties(2.0, [0.0, 0, 0], jnp.eye(3))
+    >>> state = rj.Rigid([0.0, 0, 0], [0.0, 0, 0], [1.0, 0, 0, 0], [0.0, 0, 0])
+    >>> UniformGravity([0.0, 0.0, -9.8])(0.0, state, body).force.tolist()  # N
+    [0.0, 0.0, -19.6]
     """
 
     feels: ClassVar[type] = HasPose
@@ -61,8 +64,11 @@ class CentralGravity(AbstractForce):
 
     **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
 
-    >>> CentralGravity(3.986e14).feels.__name__
-    'HasPose'
+    >>> import rigidjax as rj
+    >>> body = rj.MassProperties(2.0, [0.0, 0, 0], 1e-9 * jnp.eye(3))
+    >>> state = rj.Rigid([2.0, 0, 0], [0.0, 0, 0], [1.0, 0, 0, 0], [0.0, 0, 0])
+    >>> round(float(CentralGravity(8.0)(0.0, state, body).force[0]), 6)  # N, −m μ/r²
+    -4.0
     """
 
     feels: ClassVar[type] = HasPose
@@ -109,8 +115,11 @@ class Drag(AbstractForce):
 
     **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
 
-    >>> Drag(0.01).feels.__name__
-    'HasPose'
+    >>> import rigidjax as rj
+    >>> body = rj.MassProperties(2.0, [0.0, 0, 0], jnp.eye(3))
+    >>> state = rj.Rigid([0.0, 0, 0], [3.0, 0, 0], [1.0, 0, 0, 0], [0.0, 0, 0])
+    >>> float(Drag(0.5)(0.0, state, body).force[0])  # N, −0.5 · 3²
+    -4.5
     """
 
     feels: ClassVar[type] = HasPose

@@ -94,8 +94,11 @@ class GravityGradient(AbstractTorque):
 
     **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype; `ValueError` for no distance.
 
-    >>> GravityGradient(3.986e14, [7.0e6, 0.0, 0.0]).feels.__name__
-    'HasAttitude'
+    >>> import rigidjax as rj
+    >>> law, body = GravityGradient(1.0, [1.0, 1.0, 0.0]), rj.Inertia.from_principal(1.0, 2.0, 2.5)
+    >>> state = rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 0])
+    >>> round(float(law(0.0, state, body)[2]), 6)  # 3/r³ · ½ (I₂ − I₁), r = √2
+    0.53033
     """
 
     feels: ClassVar[type] = HasAttitude

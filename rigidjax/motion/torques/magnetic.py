@@ -29,8 +29,10 @@ class MagneticDipole(AbstractTorque):
 
     **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
 
-    >>> MagneticDipole([0.0, 0.0, 1.0], [3e-5, 0.0, 0.0]).feels.__name__
-    'HasAttitude'
+    >>> import rigidjax as rj
+    >>> state = rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 0])
+    >>> MagneticDipole([0.0, 0.0, 2.0], [3.0, 0.0, 0.0])(0.0, state, None).tolist()  # z × x = y
+    [0.0, 6.0, 0.0]
     """
 
     feels: ClassVar[type] = HasAttitude
