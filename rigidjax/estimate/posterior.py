@@ -15,6 +15,10 @@ from rigidjax.estimate.density import LogDensity, Point
 Sampler = Callable[[Any, Callable[[Array], Array], Array], Array]
 
 
+# Draws that the first mass matrix is worth: it is good already where Laplace's method is.
+_WORTH = 50.0
+
+
 class Nuts(eqx.Module):
     """The no-U-turn sampler of blackjax, its step and mass matrix adapted first.
 
@@ -37,7 +41,11 @@ class Nuts(eqx.Module):
         blackjax = _blackjax()
         first, later = jax.random.split(key)
         adapt = blackjax.window_adaptation(
-            blackjax.nuts, density, is_mass_matrix_diagonal=True, target_acceptance_rate=0.85
+            blackjax.nuts,
+            density,
+            is_mass_matrix_diagonal=True,
+            imm_shrinkage_to_previous=_WORTH,
+            target_acceptance_rate=0.8,
         )
         (state, tuned), _ = adapt.run(first, start, num_steps=self.warmup)
         step = blackjax.nuts(density, **tuned).step

@@ -1,5 +1,6 @@
 """The posterior density, its transforms and its draws."""
 
+import dataclasses
 import functools
 import sys
 
@@ -53,6 +54,34 @@ def test_without_a_process_it_is_normal_about_the_motion(fitted):
     assert abs(float(density(x)) / wanted - 1) < 1e-12
     np.testing.assert_allclose(density.covariance, fitted.covariance)
     np.testing.assert_allclose(density.unpack(density.x0).body.tensor, fitted.body.tensor)
+
+
+def test_its_width_is_that_of_white_errors_whatever_the_intervals_allow_for(fitted):
+    wide = dataclasses.replace(fitted, covariance_kind="sandwich: the errors are autocorrelated")
+    density = estimate.LogDensity(wide)
+    columns, h = [], 1e-5
+    for step in h * np.eye(5):
+        up, down = (density.unpack(density.x0 + s * step).parameters for s in (1, -1))
+        apart = problem().errors(up)[0] - problem().errors(down)[0]
+        columns.append(np.ravel(apart) / (2 * h * 0.02))
+    wanted = np.linalg.inv(np.array(columns) @ np.array(columns).T)
+    np.testing.assert_allclose(density.covariance, wanted, rtol=1e-4, atol=1e-4 * np.max(wanted))
+    # A torque that is integrated out makes it wide again: there the sandwich is nearer.
+    integrated = estimate.LogDensity(wide, rj.torques.RandomTorque(1e-4), deviation=None)
+    np.testing.assert_allclose(integrated.covariance, fitted.covariance)
+
+
+def test_a_noise_that_is_unknown_is_one_number_as_in_the_fit(fitted):
+    record = problem().recordings[0]
+    unknown = (identify.Gyro(), record.readings[0].values)
+    other = identify.Problem(identify.Recording(record.t, unknown), identify.PrincipalRatios())
+    density = estimate.LogDensity(dataclasses.replace(fitted, problem=other))
+    assert density.size == 6
+    np.testing.assert_allclose(density.covariance[-1, -1], 1 / (2 * 180))
+    x = density.x0.at[-1].set(np.log(2.0))
+    wanted = scipy.stats.norm.logpdf(problem().errors(fitted.parameters)[0], scale=0.04).sum()
+    np.testing.assert_allclose(density(x), wanted, rtol=1e-12)
+    np.testing.assert_allclose(density.unpack(x).noise[0], 0.04)
 
 
 @pytest.mark.oldest
