@@ -97,8 +97,11 @@ class Posterior(eqx.Module):
         points = self.points
         out = dict(points.values)
         out["omega0"] = points.state0.omega
-        body = points.body
-        out["inertia"] = body.tensor if hasattr(body, "tensor") else body.inertia.tensor
+        several = isinstance(points.body, dict)
+        bodies = points.body if several else {"": points.body}
+        for name, body in bodies.items():
+            word = f"inertia [{name}]" if several else "inertia"
+            out[word] = body.tensor if hasattr(body, "tensor") else body.inertia.tensor
         if points.process is not None:
             out["density"] = points.process.density
         return arviz.from_dict({"posterior": {k: jnp.asarray(v) for k, v in out.items()}})

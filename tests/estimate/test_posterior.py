@@ -175,6 +175,27 @@ def test_draws_go_to_arviz(fitted):
     np.testing.assert_allclose(table["posterior"]["density"], drawn.points.process.density)
 
 
+@pytest.mark.filterwarnings("ignore:invalid value:RuntimeWarning")
+def test_several_bodies_go_to_arviz_by_name(fitted):
+    arviz = pytest.importorskip("arviz")
+    record = problem().recordings[0]
+    chart = identify.PrincipalRatios()
+    both = identify.Problem({"a": record, "b": record}, {"a": chart, "b": chart})
+    at = both.start({"a": records.BODY, "b": records.BODY})
+    size = sum(leaf.size for leaf in jax.tree.leaves(at))
+    covariance = 1e-4 * jnp.eye(size)
+    noises = (jnp.full((2, 3), 0.02),)
+    found = dataclasses.replace(
+        fitted, problem=both, parameters=at, covariance=covariance, seen=covariance, noises=noises,
+        singular_values=jnp.ones(size), null_directions=jnp.zeros((0, size)),
+    )  # fmt: skip
+    density = estimate.LogDensity(found)
+    x = density.x0[None, None] + 0.01 * jax.random.normal(jax.random.key(0), (2, 8, size))
+    table = estimate.Posterior(density, x).to_arviz()
+    assert {"inertia [a]", "inertia [b]"} <= set(table["posterior"].data_vars)
+    assert "inertia [a][0, 0]" in arviz.summary(table).index
+
+
 @pytest.mark.usefixtures("unhooked")
 def test_what_is_refused(fitted):
     with pytest.raises(TypeError, match="density: wanted LogDensity"):
