@@ -6,6 +6,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Float
 
 from rigidjax import _checks
@@ -17,6 +18,9 @@ Sampler = Callable[[Any, Callable[[Array], Array], Array], Array]
 
 # Draws that the first mass matrix is worth: it is good already where Laplace's method is.
 _WORTH = 50.0
+
+# As many recordings keep a core busy: gradients of four chains at once take as long as one by one.
+_FULL = 8
 
 
 class Nuts(eqx.Module):
@@ -54,7 +58,7 @@ class Nuts(eqx.Module):
             state, _ = step(key, state)
             return state, state.position
 
-        _, draws = jax.lax.scan(body, state, jax.random.split(later, self.samples))
+        _, draws = lax.scan(body, state, jax.random.split(later, self.samples))
         return draws
 
 
@@ -115,7 +119,7 @@ def posterior(
     **Arguments:** `density` a `LogDensity`; `key` of `jax.random`; `sampler` a function of a key,
     a log-density and a first vector to draws (samples, n), `Nuts()` unless given; it works in
     numbers whose covariance by Laplace's method is the identity, and starts from a draw of it.
-    `chains` run side by side under `vmap`.
+    `chains` run side by side under `vmap`, of eight recordings and more one after another.
 
     **Returns** a `Posterior`.
 
@@ -145,6 +149,9 @@ def _draw(density: LogDensity, root: Array, keys: Array, sampler: Any) -> Array:
         start = 0.5 * jax.random.normal(first, density.x0.shape, density.x0.dtype)
         return jax.vmap(of)(sampler(later, lambda z: density(of(z)), start))
 
+    # One after another no chain waits for the longest step of the others.
+    if density.problem.count >= _FULL:
+        return lax.map(chain, keys)
     return jax.vmap(chain)(keys)
 
 

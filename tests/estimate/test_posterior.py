@@ -135,6 +135,25 @@ def test_any_sampler_will_do(fitted):
     assert drawn.points.body.tensor.shape == (4, 500, 3, 3)
 
 
+def test_chains_of_many_recordings_are_those_of_their_keys_too(fitted):
+    many = identify.Problem([problem().recordings[0]] * 8, identify.PrincipalRatios())
+    at = many.start(records.BODY)
+    covariance = jnp.diag(jnp.linspace(1e-4, 1e-2, 26))
+    found = dataclasses.replace(
+        fitted, problem=many, parameters=at, covariance=covariance, seen=covariance,
+        noises=(jnp.full((8, 3), 0.02),), singular_values=jnp.ones(26),
+        null_directions=jnp.zeros((0, 26)),
+    )  # fmt: skip
+
+    def laplace(key, density, start):
+        return jax.random.normal(key, (500, start.size))
+
+    drawn = estimate.posterior(estimate.LogDensity(found), jax.random.key(0), sampler=laplace)
+    assert drawn.x.shape == (4, 500, 26)
+    np.testing.assert_allclose(drawn.x.var((0, 1)), np.diagonal(covariance), rtol=0.2)
+    assert len(np.unique(np.asarray(drawn.x[:, 0, 0]))) == 4
+
+
 def test_draws_that_depend_on_the_last_are_worth_less(fitted):
     rho = 0.8
 
