@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from rigidjax import _checks
 from rigidjax._types import HasSpin, Scalar
@@ -18,6 +18,7 @@ from rigidjax.estimate.filter import log_likelihood_of
 from rigidjax.estimate.grid import TURN_A_STEP
 from rigidjax.estimate.scene import Extended, Model, size_of
 from rigidjax.estimate.sensing import sensors_of
+from rigidjax.identify import uncertainty
 from rigidjax.identify.fit import Fit
 from rigidjax.identify.jacobian import all_errors, filled, first_state, over_records
 from rigidjax.identify.parameters import Parameters, local
@@ -58,12 +59,14 @@ class LogDensity(eqx.Module):
 
     Call it with x (n,), real numbers without bounds: those of the problem's `Parameters` (body
     chart, `Free`s, first states), the logarithms of the factors by which unknown noises differ from
-    the fit's, and of those of the process. `unpack(x)` is what x stands for, `x0` the fit,
-    `covariance` Laplace's, a start and a mass matrix for a sampler.
+    the fit's (one for each that the fit estimates), and of those of the process. `unpack(x)` is
+    what x stands for, `x0` the fit, `covariance` Laplace's, a start and a mass matrix for a
+    sampler: where errors are autocorrelated, smaller than the fit's.
 
     With a `process` the unknown torque is integrated out by the filter, from the first state that x
-    holds; without, the readings are normal about the motion. Priors are the problem's: `Free`s
-    with a prior, an `Entropic` one; all else is flat in x.
+    holds; without, the readings are normal about the motion and independent: where a fit says that
+    its errors are autocorrelated this is too narrow; keep fewer readings, or give a process. Priors
+    are the problem's: `Free`s with a prior, an `Entropic` one; all else is flat in x.
 
     **Arguments:** `fit` of `identify.fit`; `process` a `RandomTorque` or `CorrelatedTorque` or
     `None`; `deviation` of the normal prior of the logarithms of its density and time about those
@@ -118,9 +121,10 @@ class LogDensity(eqx.Module):
         self.deviation = (
             None if spread is None else jnp.asarray(_checks.positive(spread, "deviation"))
         )
+        groups = np.asarray(_groups(problem))
         factors = tuple(
-            jnp.zeros(noise.shape[1:]) if reading.sensor.noise is None else None
-            for noise, reading in zip(fit.noises, problem.records.readings, strict=True)
+            jnp.zeros(groups.max() + 1) if reading.sensor.noise is None else None
+            for reading in problem.records.readings
         )
         logs = None
         if self.deviation is not None:
@@ -128,12 +132,20 @@ class LogDensity(eqx.Module):
         self.like = (fit.parameters, factors, logs)
         self.x0 = ravel_pytree(self.like)[0]
         seen = np.asarray(fit.covariance)
-        covariance = np.zeros((self.x0.size, self.x0.size))
-        covariance[: len(seen), : len(seen)] = seen
-        count = sum(int(reading.seen.sum()) for reading in problem.records.readings)
-        rest = np.arange(len(seen), self.x0.size)
-        covariance[rest, rest] = 1 / math.sqrt(count)
-        self.covariance = jnp.asarray(covariance)
+        if process is None and fit.covariance_kind.startswith("sandwich"):
+            # The density takes errors for white: its own width is less than the fit's intervals.
+            linear = uncertainty.linearise(problem, fit.parameters, fit.noises)
+            seen = uncertainty.of_white_errors(linear)
+        rest, total = [], 0
+        for factor, reading in zip(factors, problem.records.readings, strict=True):
+            rows = np.bincount(groups, np.asarray(reading.seen.sum(axis=1)))
+            total += int(rows.sum())
+            if factor is not None:
+                # The logarithm of a standard deviation is known to 1/√(2n).
+                rest.append(0.5 / np.maximum(rows * reading.sensor.components, 1))
+        if logs is not None:
+            rest.append(np.full(logs.shape, 1 / math.sqrt(total)))
+        self.covariance = jax.scipy.linalg.block_diag(seen, *(np.diag(part) for part in rest))
         rate = 1.5 * float(jnp.max(problem.reference.rate))
         widest = max(float(jnp.max(jnp.diff(r.t))) for r in problem.recordings)
         self.substeps = max(1, math.ceil(widest * rate / TURN_A_STEP))
@@ -172,7 +184,7 @@ class LogDensity(eqx.Module):
     def _read(self, x: Array) -> tuple[Parameters, tuple[Array, ...], Any, Array | None]:
         parameters, factors, logs = ravel_pytree(self.like)[1](x)
         noises = tuple(
-            noise if factor is None else noise * jnp.exp(factor)[None]
+            noise if factor is None else noise * jnp.exp(factor)[_groups(self.problem), None]
             for noise, factor in zip(self.noises, factors, strict=True)
         )
         process = self.process
@@ -230,6 +242,12 @@ class LogDensity(eqx.Module):
             )
 
         return over_records(of_one, problem, local(problem, parameters))
+
+
+def _groups(problem: Problem) -> Int[Array, " records"]:
+    """Which noise each recording has, as the fit estimates it: all the same unless `noise_each`."""
+    groups = problem.noise_groups
+    return jnp.zeros(problem.count, jnp.int32) if groups is None else groups
 
 
 def _with_noises(problem: Problem, noises: tuple[Array, ...]) -> Problem:

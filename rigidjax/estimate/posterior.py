@@ -6,6 +6,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Float
 
 from rigidjax import _checks
@@ -13,6 +14,13 @@ from rigidjax.estimate.density import LogDensity, Point
 
 # A sampler: key, log-density of z, a first z (n,) → draws (samples, n).
 Sampler = Callable[[Any, Callable[[Array], Array], Array], Array]
+
+
+# Draws that the first mass matrix is worth: it is good already where Laplace's method is.
+_WORTH = 50.0
+
+# As many recordings keep a core busy: gradients of four chains at once take as long as one by one.
+_FULL = 8
 
 
 class Nuts(eqx.Module):
@@ -37,7 +45,11 @@ class Nuts(eqx.Module):
         blackjax = _blackjax()
         first, later = jax.random.split(key)
         adapt = blackjax.window_adaptation(
-            blackjax.nuts, density, is_mass_matrix_diagonal=True, target_acceptance_rate=0.85
+            blackjax.nuts,
+            density,
+            is_mass_matrix_diagonal=True,
+            imm_shrinkage_to_previous=_WORTH,
+            target_acceptance_rate=0.8,
         )
         (state, tuned), _ = adapt.run(first, start, num_steps=self.warmup)
         step = blackjax.nuts(density, **tuned).step
@@ -46,7 +58,7 @@ class Nuts(eqx.Module):
             state, _ = step(key, state)
             return state, state.position
 
-        _, draws = jax.lax.scan(body, state, jax.random.split(later, self.samples))
+        _, draws = lax.scan(body, state, jax.random.split(later, self.samples))
         return draws
 
 
@@ -99,8 +111,11 @@ class Posterior(eqx.Module):
         points = self.points
         out = dict(points.values)
         out["omega0"] = points.state0.omega
-        body = points.body
-        out["inertia"] = body.tensor if hasattr(body, "tensor") else body.inertia.tensor
+        several = isinstance(points.body, dict)
+        bodies = points.body if several else {"": points.body}
+        for name, body in bodies.items():
+            word = f"inertia [{name}]" if several else "inertia"
+            out[word] = body.tensor if hasattr(body, "tensor") else body.inertia.tensor
         if points.process is not None:
             out["density"] = points.process.density
         return arviz.from_dict({"posterior": {k: jnp.asarray(v) for k, v in out.items()}})
@@ -114,7 +129,7 @@ def posterior(
     **Arguments:** `density` a `LogDensity`; `key` of `jax.random`; `sampler` a function of a key,
     a log-density and a first vector to draws (samples, n), `Nuts()` unless given; it works in
     numbers whose covariance by Laplace's method is the identity, and starts from a draw of it.
-    `chains` run together under `vmap`.
+    `chains` run together under `vmap`; those of eight recordings and more one after another.
 
     **Returns** a `Posterior`.
 
@@ -152,6 +167,9 @@ def _draw(density: LogDensity, root: Array, keys: Array, sampler: Any) -> Array:
         start = 0.5 * jax.random.normal(first, density.x0.shape, density.x0.dtype)
         return jax.vmap(of)(sampler(later, lambda z: density(of(z)), start))
 
+    # One after another no chain waits for the longest step of the others.
+    if density.problem.count >= _FULL:
+        return lax.map(chain, keys)
     return jax.vmap(chain)(keys)
 
 

@@ -415,7 +415,8 @@ def _finer(problem: Problem, parameters: Parameters, noise: Noise) -> AbstractIn
         return None
     count = steps.substeps
     coarse = _errors_alone(parameters, problem)
-    while count <= FINEST:
+    # Steps that were asked for are tried in any case.
+    while count <= max(FINEST, steps.substeps):
         finer: AbstractIntegrator = FixedSteps(2 * count)
         exact = _errors_alone(parameters, eqx.tree_at(lambda p: p.integrator, problem, finer))
         apart = max(

@@ -175,6 +175,11 @@ def spread(linear: Linearised, times: "Times") -> Spread:
     return Spread(shown, covariance, kind, singular, null)
 
 
+def of_white_errors(linear: Linearised) -> np.ndarray:
+    """`(JᵀWJ)⁻¹` (n, n) whether the errors are white or not: what Laplace's method gives."""
+    return spread(linear, Times(((1.0,),), 0.0, float(linear.size))).covariance
+
+
 def _sandwich(linear: Linearised, bread: np.ndarray, times: "Times") -> np.ndarray:
     longest = max(int(np.median((linear.weights[0] > 0).sum(axis=1))) // 2, 2)
     spans = 2.0 ** np.arange(1, np.log2(longest) + 1)

@@ -1,5 +1,6 @@
 """The posterior density, its transforms and its draws."""
 
+import dataclasses
 import functools
 import sys
 
@@ -55,6 +56,34 @@ def test_without_a_process_it_is_normal_about_the_motion(fitted):
     np.testing.assert_allclose(density.unpack(density.x0).body.tensor, fitted.body.tensor)
 
 
+def test_its_width_is_that_of_white_errors_whatever_the_intervals_allow_for(fitted):
+    wide = dataclasses.replace(fitted, covariance_kind="sandwich: the errors are autocorrelated")
+    density = estimate.LogDensity(wide)
+    columns, h = [], 1e-5
+    for step in h * np.eye(5):
+        up, down = (density.unpack(density.x0 + s * step).parameters for s in (1, -1))
+        apart = problem().errors(up)[0] - problem().errors(down)[0]
+        columns.append(np.ravel(apart) / (2 * h * 0.02))
+    wanted = np.linalg.inv(np.array(columns) @ np.array(columns).T)
+    np.testing.assert_allclose(density.covariance, wanted, rtol=1e-4, atol=1e-4 * np.max(wanted))
+    # A torque that is integrated out makes it wide again: there the sandwich is nearer.
+    integrated = estimate.LogDensity(wide, rj.torques.RandomTorque(1e-4), deviation=None)
+    np.testing.assert_allclose(integrated.covariance, fitted.covariance)
+
+
+def test_a_noise_that_is_unknown_is_one_number_as_in_the_fit(fitted):
+    record = problem().recordings[0]
+    unknown = (identify.Gyro(), record.readings[0].values)
+    other = identify.Problem(identify.Recording(record.t, unknown), identify.PrincipalRatios())
+    density = estimate.LogDensity(dataclasses.replace(fitted, problem=other))
+    assert density.size == 6
+    np.testing.assert_allclose(density.covariance[-1, -1], 1 / (2 * 180))
+    x = density.x0.at[-1].set(np.log(2.0))
+    wanted = scipy.stats.norm.logpdf(problem().errors(fitted.parameters)[0], scale=0.04).sum()
+    np.testing.assert_allclose(density(x), wanted, rtol=1e-12)
+    np.testing.assert_allclose(density.unpack(x).noise[0], 0.04)
+
+
 @pytest.mark.oldest
 def test_its_gradient_is_right(fitted):
     """Through its own rule and that of the errors, recording by recording: central differences."""
@@ -106,6 +135,25 @@ def test_any_sampler_will_do(fitted):
     assert drawn.points.body.tensor.shape == (4, 500, 3, 3)
 
 
+def test_chains_of_many_recordings_are_those_of_their_keys_too(fitted):
+    many = identify.Problem([problem().recordings[0]] * 8, identify.PrincipalRatios())
+    at = many.start(records.BODY)
+    covariance = jnp.diag(jnp.linspace(1e-4, 1e-2, 26))
+    found = dataclasses.replace(
+        fitted, problem=many, parameters=at, covariance=covariance, seen=covariance,
+        noises=(jnp.full((8, 3), 0.02),), singular_values=jnp.ones(26),
+        null_directions=jnp.zeros((0, 26)),
+    )  # fmt: skip
+
+    def laplace(key, density, start):
+        return jax.random.normal(key, (500, start.size))
+
+    drawn = estimate.posterior(estimate.LogDensity(found), jax.random.key(0), sampler=laplace)
+    assert drawn.x.shape == (4, 500, 26)
+    np.testing.assert_allclose(drawn.x.var((0, 1)), np.diagonal(covariance), rtol=0.2)
+    assert len(np.unique(np.asarray(drawn.x[:, 0, 0]))) == 4
+
+
 def test_draws_that_depend_on_the_last_are_worth_less(fitted):
     rho = 0.8
 
@@ -144,6 +192,27 @@ def test_draws_go_to_arviz(fitted):
     assert {"inertia[0, 0]", "density[0]"} <= set(arviz.summary(table).index)
     assert table["posterior"]["omega0"].shape[:2] == (4, 50)
     np.testing.assert_allclose(table["posterior"]["density"], drawn.points.process.density)
+
+
+@pytest.mark.filterwarnings("ignore:invalid value:RuntimeWarning")
+def test_several_bodies_go_to_arviz_by_name(fitted):
+    arviz = pytest.importorskip("arviz")
+    record = problem().recordings[0]
+    chart = identify.PrincipalRatios()
+    both = identify.Problem({"a": record, "b": record}, {"a": chart, "b": chart})
+    at = both.start({"a": records.BODY, "b": records.BODY})
+    size = sum(leaf.size for leaf in jax.tree.leaves(at))
+    covariance = 1e-4 * jnp.eye(size)
+    noises = (jnp.full((2, 3), 0.02),)
+    found = dataclasses.replace(
+        fitted, problem=both, parameters=at, covariance=covariance, seen=covariance, noises=noises,
+        singular_values=jnp.ones(size), null_directions=jnp.zeros((0, size)),
+    )  # fmt: skip
+    density = estimate.LogDensity(found)
+    x = density.x0[None, None] + 0.01 * jax.random.normal(jax.random.key(0), (2, 8, size))
+    table = estimate.Posterior(density, x).to_arviz()
+    assert {"inertia [a]", "inertia [b]"} <= set(table["posterior"].data_vars)
+    assert "inertia [a][0, 0]" in arviz.summary(table).index
 
 
 @pytest.mark.usefixtures("unhooked")
