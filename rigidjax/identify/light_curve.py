@@ -29,6 +29,9 @@ from rigidjax.rotation.linalg3 import apply, dot
 SAME, REACH = np.array([1e-3, 1e-3, 0.05, 0.05]), 5.0
 # Log-likelihood within which a rival explains the data nearly as well: e¹⁰ to one.
 MARGIN = 10.0
+# χ² of the best above its mean by so many deviations is not believed: with a wrong alias the errors
+# may be hardly larger than the noise, and a fit by itself is content with five.
+CONTENT = 3.0
 # Pairs that are tried in any case, and beyond them those with χ² so much above the best.
 LEAST, ABOVE = 12, 40.0
 
@@ -64,7 +67,8 @@ class LightCurve(eqx.Module):
     **Fields:** `fit` of the best motion; `aliases` all motions that were found, the best first,
     then by their misfit; `deviations` (4,) relative standard deviations of the best one's rotation,
     precession and two ratios; `pairs` the frequencies that they came from; `status` one line: that
-    of the fit, or `ambiguous` where another of the aliases explains the data nearly as well.
+    of the fit, or `ambiguous` where another of the aliases explains the data nearly as well, or
+    `doubtful` where χ² is three deviations above what the given noise makes.
     """
 
     fit: Fit
@@ -247,4 +251,11 @@ def _told(best: Fit, aliases: list[Alias], found: TwoFrequencies, cut: bool) -> 
         status = f"ambiguous: {some} the light curve nearly as well"
     elif cut and status == "ok":
         status = "ambiguous: more pairs of frequencies fit than were tried"
+    # Under a robust loss χ² is the outliers'.
+    above = best.chi2 - best.dof if best.problem.loss is None else 0.0
+    if status == "ok" and above > CONTENT * np.sqrt(2.0 * best.dof):
+        status = (
+            f"doubtful: χ² is {best.chi2:.0f} of {best.dof}: another motion that was not found, or "
+            "more noise than was said"
+        )
     return LightCurve(best, marked, deviations, found, status)

@@ -84,8 +84,8 @@ def crossings(
     - `body`, `state0`, `torque`: as for `simulate`; `state0` at `t0`.
     - `t0`, `t1`: s; `t1 < t0` goes back in time.
     - `condition`: a Module or function `(t, state, body) → scalar`, smooth along the motion. It may
-      hold traced numbers, and depend on the time (a stroboscopic section is `sin(½(t − t₀)ω)`). Under
-      a law with states of its own the state is a `Coupled`, as in what is returned.
+      hold traced numbers, and depend on the time (a stroboscopic section is `sin(½(t − t₀)ω)`).
+      Under a law with states of its own the state is a `Coupled`, as in what is returned.
     - `direction`: 1 for zeros on the way up, −1 on the way down, 0 for both, in the order of the
       run.
     - `max_crossings`: K, the length of what is returned; the run ends with the last of them.

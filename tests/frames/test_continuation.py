@@ -1,5 +1,7 @@
 """Families of periodic orbits: published members, slopes, stability, turns."""
 
+import itertools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -8,6 +10,7 @@ import numpy as np
 import pytest
 from frames.three_body_series import solve
 from once import filter_once
+from scipy.integrate import solve_ivp
 
 from rigidjax.frames import Point, differential_correction, scenes
 from rigidjax.frames.scenes import PeriodicOrbit
@@ -26,6 +29,21 @@ HOWELL = np.array(
         [0.817724, 0.313788, 0.271306, 0.978635],
     ]
 )
+
+
+# JPL's catalogue of three-body periodic orbits, Earth and Moon, halo orbits about L2, southern,
+# near-rectilinear: x, z, v_y at apolune (rows as a public program quotes them). The first has about
+# the period of the Gateway's (9:2 with the synodic month).
+JPL = np.array(
+    [
+        [1.0213448959167291, -0.18162633785360355, -0.10177771593237860],
+        [1.0311112407855418, -0.18772287481683392, -0.12222545055005253],
+        [1.0410413863429402, -0.19270725388017840, -0.14112595315877385],
+        [1.0510246802643324, -0.19671629109317987, -0.15829051257176247],
+        [1.0608510547453884, -0.19970484051930923, -0.17342665527688911],
+    ]
+)
+JPL_PERIOD = 1.5021912429136250
 
 
 def orbit_of(row):
@@ -67,6 +85,54 @@ def test_published_halo_orbits_and_their_stability():
         mean = np.sort((0.5 * (whole + 1 / whole)).real)
         wanted = np.sort(np.concatenate([nu[k].real, nu[k].real, [1.0, 1.0]]))
         np.testing.assert_allclose(mean, wanted, rtol=1e-5)
+
+
+@pytest.mark.long
+def test_jpls_near_rectilinear_halo_orbits():
+    # x, v_y and the period at the catalogue's z. Its digits are good to 1e-12: its start leaves 9e-11
+    # in v_z half a period on, at perilune, which changes of less than 1e-12 mend.
+    whole = jnp.asarray([*JPL[0], JPL_PERIOD / 2])
+    orbit = filter_once(lambda row: MOON.periodic_orbit(orbit_of(row), hold="z"))(whole)
+    found = np.array([orbit.state.x[0], orbit.state.v[1], orbit.period])
+    np.testing.assert_allclose(found, [JPL[0, 0], JPL[0, 2], JPL_PERIOD], rtol=0, atol=2e-12)
+    # Stability from SciPy's variational equations, written down here, and LAPACK.
+    numbers = np.concatenate([orbit.state.x, orbit.state.v, np.eye(6).ravel()])
+    end = solve_ivp(
+        variations, (0, float(orbit.period)), numbers, "DOP853", rtol=1e-13, atol=1e-13
+    ).y[:, -1]
+    np.testing.assert_allclose(end[:6], numbers[:6], atol=1e-12)
+    values = np.linalg.eigvals(end[6:].reshape(6, 6))
+    wanted = np.sort((0.5 * (values + 1 / values)).real)[[0, 2]]
+    np.testing.assert_allclose(np.sort(MOON.stability_indices(orbit).real), wanted, atol=1e-9)
+    # Nearly stable, which is why one stays there for little fuel: |ν| within 1.3.
+    assert abs(wanted).max() < 1.31
+
+
+@pytest.mark.slow
+def test_jpls_near_rectilinear_family():
+    # Along x from each orbit of the catalogue to the next, in quarters of the way.
+    quarters = [np.linspace(a, b, 5)[1:] for a, b in itertools.pairwise(JPL[:, 0])]
+    values = np.concatenate([JPL[:1, 0], *quarters])
+    first = orbit_of(jnp.asarray([*JPL[0], JPL_PERIOD / 2]))
+    found = eqx.filter_jit(lambda orbit: MOON.family(orbit, values))(first)
+    numbers = np.stack([found.state.x[:, 0], found.state.x[:, 2], found.state.v[:, 1]], 1)
+    np.testing.assert_allclose(numbers[::4], JPL, rtol=0, atol=2e-12)
+    assert (np.diff(found.period) > 0).all()
+
+
+def variations(t, y):
+    """The restricted three-body problem and its variational equations."""
+    x, v, matrix = y[:3], y[3:6], y[6:].reshape(6, 6)
+    a = np.array([x[0] + 2 * v[1], x[1] - 2 * v[0], 0.0])
+    slope = np.diag([1.0, 1.0, 0.0])
+    for mass, place in ((1 - MU, -MU), (MU, 1 - MU)):
+        r = x - np.array([place, 0, 0])
+        d = np.linalg.norm(r)
+        a -= mass * r / d**3
+        slope -= mass * (np.eye(3) / d**3 - 3 * np.outer(r, r) / d**5)
+    turn = np.array([[0.0, 2, 0], [-2, 0, 0], [0, 0, 0]])
+    field = np.block([[np.zeros((3, 3)), np.eye(3)], [slope, turn]])
+    return np.concatenate([v, a, (field @ matrix).ravel()])
 
 
 @pytest.mark.slow
