@@ -94,13 +94,13 @@ ACCEPTED: list[tuple[str, str, str, str]] = [
     # Others.
     *(
         (f"workprecision.{name}", *what, NOT_MEASURED)
-        for name in ("choose", "front")
+        for name in ("choose", "first_answers", "front")
         for what in (("good call", "returned*"), ("*", "a silent NaN*"))
     ),
     ("workprecision.time_to", "*", "*returned =[[]nan[]]", NEVER),
     *(
         (f"workprecision.{name}", f"*: {empty}", "taken without a word*", NOTHING)
-        for name in ("choose", "front", "moved", "table")
+        for name in ("choose", "first_answers", "front", "moved", "table")
         for empty in ("dict", "empty list")
     ),
     ("identify.windows", "inputs: dict", "taken*", "no input at all is documented: none is read"),
