@@ -95,7 +95,20 @@ class Posterior(eqx.Module):
     @property
     def points(self) -> Point:
         """What the draws stand for, with leading axes of chains and samples."""
-        return jax.vmap(jax.vmap(self.density.unpack))(self.x)
+        return self.of(_itself)
+
+    def of(self, function: Callable[[Point], Any]) -> Any:
+        """`function(point)` of each draw, with leading axes of chains and samples.
+
+        Such as `drawn.of(lambda point: point.body.moments)`. **Raises** `TypeError` for what is no
+        function.
+        """
+        _checks.function(function, "function", "of a Point, such as lambda point: point.body")
+
+        def value(x: Array) -> Any:
+            return function(self.density.unpack(x))
+
+        return eqx.filter_jit(jax.vmap(jax.vmap(value)))(self.x)
 
     def to_arviz(self) -> Any:
         """The draws as ArviZ takes them: body, values, first states, process.
@@ -119,6 +132,10 @@ class Posterior(eqx.Module):
         if points.process is not None:
             out["density"] = points.process.density
         return arviz.from_dict({"posterior": {k: jnp.asarray(v) for k, v in out.items()}})
+
+
+def _itself(point: Point) -> Point:
+    return point
 
 
 def posterior(

@@ -133,6 +133,10 @@ def test_any_sampler_will_do(fitted):
     # Independent draws are worth about what they are.
     assert (drawn.rhat < 1.01).all() and (np.abs(drawn.ess / 2000 - 1) < 0.3).all()
     assert drawn.points.body.tensor.shape == (4, 500, 3, 3)
+    # A draw's moments are roots of its own tensor, which those of a batch of bodies are not.
+    moments = drawn.of(lambda point: point.body.moments)
+    one = np.linalg.eigvalsh(drawn.points.body.tensor[2, 7])
+    np.testing.assert_allclose(moments[2, 7], one, rtol=1e-9)
 
 
 def test_chains_of_many_recordings_are_those_of_their_keys_too(fitted):

@@ -487,3 +487,15 @@ def test_free_numbers_are_reported_with_their_units():
     units = {name.split()[0]: unit for name, unit, _ in quantities.labels(problem)}
     wanted = {"bias": "rad/s", "scale": "", "offset": "s", "tilt": "rad", "drag": "N m s"}
     assert {name: units[name] for name in wanted} == wanted
+
+
+def test_steps_that_were_asked_for_are_kept_where_they_do():
+    body, ts = rj.Inertia.from_principal(1.0, 2.0, 2.5), jnp.linspace(0.0, 2.0, 6)
+    law = rj.torques.Damping([0.1, 0.2, 0.1])
+    omega = rj.simulate(body, rj.Spin([0.3, 1.0, 0.2]), ts, law).ys.omega
+    record = identify.Recording(ts, (identify.Gyro(0.01), omega), torque=law)
+    # More than a fit would take by itself before it goes on with steps as they are needed.
+    steps = identify.FixedSteps(40)
+    found = identify.fit(identify.Problem(record, identify.Known(body), integrator=steps), starts=1)
+    assert found.problem.integrator == steps
+    np.testing.assert_allclose(found.state0.omega, omega[0], atol=1e-6)
