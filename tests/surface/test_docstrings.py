@@ -25,6 +25,7 @@ WITHOUT_EXAMPLE = {
         (f"workprecision.{name}" for name in ("draw", "measure", "worked_out")),
         "compiles and times many solvers: `python -m rigidjax workprecision` is it",
     ),
+    "identify.best_first_rate": "compiles for most of a minute, second derivatives of a motion",
     "plot.player": "viser writes a page of megabytes: the notebook on the Dzhanibekov effect has it",
 }
 
