@@ -86,11 +86,11 @@ class LinearModel(eqx.Module):
 
 
 class LinearEstimate(eqx.Module):
-    """Means (T, n) and roots (T, n, n) of the covariances of a state at each time.
+    """The means of a state at each time, and roots of its covariances.
 
-    **Fields:** also `innovation`, `variance` (T, k) of each number read given those before it, and
-    `log_likelihood` of all; of a smoother `kicks` (T − 1, m), the means of the noise u, and
-    `kick_covariance` (T − 1, m, m), else `None`.
+    **Fields:** `mean` (T, n), `root` (T, n, n), `innovation`, `variance` (T, k) of each number read
+    given those before it, and `log_likelihood` of all; of a smoother `kicks` (T − 1, m), the means
+    of the noise u, and `kick_covariance` (T − 1, m, m), else `None`.
 
     >>> walk = LinearModel(jnp.eye(1), 0.1 * jnp.eye(1), jnp.eye(1), jnp.ones(1))
     >>> found = linear_filter(walk, jnp.ones((3, 1)), jnp.zeros(1), jnp.eye(1))

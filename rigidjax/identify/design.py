@@ -140,15 +140,6 @@ def best_first_rate(
     what to expect from it (`expected`).
 
     **Raises:** as `fisher`.
-
-    >>> import rigidjax as rj
-    >>> ts = jnp.linspace(0.0, 5.0, 50)
-    >>> record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), jnp.zeros((50, 3))))
-    >>> problem = rj.identify.Problem(record, rj.identify.PrincipalRatios())
-    >>> body = rj.Inertia.from_principal(1.0, 2.0, 2.5)
-    >>> rate, report = best_first_rate(problem, body, [1.0, 0.1, 1.0], max_steps=3)
-    >>> report[0].name, round(float(jnp.linalg.norm(rate)), 6)  # as fast as it was
-    ('Ix/Iz', 1.417745)
     """
     max_steps = _checks.whole(max_steps, "max_steps", 1)
     _on_host(problem, (body, omega))

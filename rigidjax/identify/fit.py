@@ -48,6 +48,9 @@ FINEST = 32
 class Start(eqx.Module):
     """The result of one start: where the search ended, and whether that explains the data.
 
+    **Fields:** `parameters` where it ended; `cost` half of the sum of squares there; `converged`
+    whether the search did; `fits` whether it explains the data as well as the best point does.
+
     >>> import jax.numpy as jnp, rigidjax as rj
     >>> ts = jnp.linspace(0.0, 10.0, 80)
     >>> motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1, 0.1, 1.0]), ts)
@@ -66,16 +69,15 @@ class Start(eqx.Module):
 class Fit(eqx.Module):
     """What `fit` returns: the best point and how sure it is.
 
-    **Fields:** `parameters` the free numbers at the best point; `covariance` (n, n) of them,
-    flattened in order, infinite where the data do not determine them, `seen` the same within
-    what they determine, `covariance_kind` what it rests on; `noises` (R, k) for each sensor;
-    `starts` a `Start` each; `chi2` and `dof` of the whitened errors of the sensors whose noise was
-    given;
-    `correlation` over how many samples the errors are autocorrelated, 1 for white ones, and
-    `independent` how many independent ones that leaves; `singular_values` (n,) of the whitened
-    Jacobian, its columns of length one; `null_directions` (k, n) that the data do not determine;
-    `quantities` all that is reported, by name; `status` one line: `ok`, or `doubtful`, `ambiguous`,
-    `poor`, `failed`, a colon and the reasons.
+    **Fields:** `problem` that was fitted; `parameters` the free numbers at the best point;
+    `covariance` (n, n) of them, flattened in order, infinite where the data do not determine them,
+    `seen` the same within what they determine, `covariance_kind` what it rests on; `noises` (R, k)
+    for each sensor; `starts` a `Start` each; `chi2` and `dof` of the whitened errors of the sensors
+    whose noise was given; `correlation` over how many samples the errors are autocorrelated, 1 for
+    white ones, and `independent` how many independent ones that leaves; `singular_values` (n,) of
+    the whitened Jacobian, its columns of length one; `null_directions` (k, n) that the data do not
+    determine; `quantities` all that is reported, by name; `status` one line: `ok`, or `doubtful`,
+    `ambiguous`, `poor`, `failed`, a colon and the reasons.
 
     >>> import jax.numpy as jnp, rigidjax as rj
     >>> ts = jnp.linspace(0.0, 10.0, 80)

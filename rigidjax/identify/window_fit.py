@@ -34,7 +34,7 @@ class WindowFit(eqx.Module, Generic[Value]):
     **Fields:** `value` the free numbers, of the type of the guess; `deviation` their standard
     deviations, from how the windows differ (sandwich; of windows that overlap they are too small);
     `cost` half the mean square, errors in units of `noise`; `noise` by kind; `steps` taken;
-    `converged`; `message` what there is to say.
+    `converged`; `message` what there is to say; `scene` as given.
 
     >>> import rigidjax as rj
     >>> t = np.linspace(0.0, 1.0, 11)

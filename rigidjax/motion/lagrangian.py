@@ -63,6 +63,8 @@ class Coordinates(eqx.Module):
 class LagrangeEquations(eqx.Module):
     """Lagrange's equations as a vector field; made by `equations_of_motion`.
 
+    **Fields:** `lagrangian` and `force` as given there.
+
     >>> pendulum = equations_of_motion(lambda q, v: 0.5 * v[0] ** 2 + 9.81 * jnp.cos(q[0]))
     >>> round(float(pendulum.energy(Coordinates([0.0], [2.0]))), 6)  # ½ v² − 9.81 cos q
     -7.81

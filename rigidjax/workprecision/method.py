@@ -7,7 +7,9 @@ from rigidjax.workprecision.scene import Scene
 
 
 class Run(NamedTuple):
-    """What one run gives: the last state (or the gradient) as one vector, and the steps taken.
+    """What one run gives.
+
+    **Fields:** `numbers` the last state (or the gradient) as one vector; `steps` taken.
 
     >>> float(Run([0.0, 1.0], 12).steps)
     12.0
