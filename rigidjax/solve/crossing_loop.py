@@ -4,7 +4,8 @@ A pass through the loop is one step of the method from where a body is: an attem
 or a part of it, up to where the crossing is looked for. So a crossing is as accurate as a step, and
 costs about three passes. It is the start of the next step: two crossings in one step are nothing
 special. Where g turns back towards where it came from within a step, the turn is looked for, until
-the tangents at both ends show that g does not get to zero, or g has another sign there.
+the tangents at both ends show that g does not get to zero, or g has another sign there. Where the
+cubic through both ends has more zeros than their signs tell, the step is taken again, shorter.
 
 Nothing here is differentiated.
 """
@@ -167,16 +168,21 @@ def _pass(motion: Motion, search: Search, stops: Array, before: Array, body: _Bo
     good = step & (size < 1)
     start = _End(jnp.zeros_like(length), body.g, body.rate)
     turns = good & ~other & ~body.sure & _may_touch(side, start, here)
+    # Further crossings within the step: a shorter one, up to where the first is alone.
+    hidden, share = _hidden(side, start, here)
+    eps = jnp.finfo(h.dtype).eps
+    floor = 8 * eps * jnp.maximum(jnp.abs(t), eps * jnp.abs(stops[-1]))
+    shorter = good & hidden & ~turns & ~body.sure & (share * length > floor)
+    good = good & ~shorter
     # A crossing the other way is not looked for, but for where it ended.
     passed = good & other & ~asked
     crossed = good & other & asked
     accept = good & ~crossed & ~turns
-    eps = jnp.finfo(h.dtype).eps
-    floor = 8 * eps * jnp.maximum(jnp.abs(t), eps * jnp.abs(stops[-1]))
     why = jnp.where(jnp.isfinite(size), 0.0, jnp.nan).astype(h.dtype)
-    stuck = step & ~good & ~(following > floor)
+    stuck = step & ~good & ~shorter & ~(following > floor)
     shown = jnp.where(last & accept, jnp.maximum(following, h), following)
     next_h = jnp.where(accept | (step & ~good), jnp.where(stuck, why, shown), h)
+    next_h = jnp.where(shorter, share.astype(h.dtype) * length, next_h)
 
     # Newton's method between two ends of which one is on either side.
     refine = on & refining
@@ -262,6 +268,35 @@ def _may_touch(side: Array, low: _End, high: _End) -> Array:
     gap = low.rate - high.rate
     place = (high.g - high.rate * width - low.g) / jnp.where(gap == 0, 1, gap)
     return turns & (side * (low.g + low.rate * place) <= 0)
+
+
+def _hidden(side: Array, low: _End, high: _End) -> tuple[Array, Array]:
+    """Whether the cubic in the offset through both ends with their slopes has more zeros between
+    them than their signs tell, and where from 0 to 1 it is first on the other side of zero.
+    """
+    width = (high.x - low.x).astype(low.g.dtype)
+    a, b = side * low.rate * width, side * high.rate * width
+    first, last = side * low.g, side * high.g
+    rise = last - first
+    # Its slope is a + c x + d x².
+    c, d = 2 * (3 * rise - 2 * a - b), 3 * (a + b - 2 * rise)
+    root = jnp.sqrt(jnp.maximum(c * c - 4 * a * d, 0))
+    q = -0.5 * (c + jnp.where(c < 0, -root, root))
+    u = q / jnp.where(d == 0, 1, d)
+    v = a / jnp.where(q == 0, 1, q)
+    early, late = jnp.minimum(u, v), jnp.maximum(u, v)
+
+    def value(x: Array) -> Array:
+        return first + x * (a + x * (0.5 * c + x * d / 3))
+
+    def within(x: Array) -> Array:
+        return (x > 0) & (x < 1)
+
+    flat = (d == 0) | (q == 0) | (root == 0)
+    below, above = within(early) & (value(early) < 0), within(late) & (value(late) > 0)
+    back = within(late) & (value(late) < 0)
+    three, two = (last <= 0) & below & above, (last > 0) & (below | back)
+    return ~flat & (three | two), jnp.where(below, early, late)
 
 
 def _first_guess(side: Array, low: _End, high: _End) -> Array:

@@ -89,8 +89,8 @@ def crossings(
     - `direction`: 1 for zeros on the way up, −1 on the way down, 0 for both, in the order of the
       run.
     - `max_crossings`: K, the length of what is returned; the run ends with the last of them.
-    - `max_step`: the longest step, s, for a condition that is much faster than the motion: two
-      zeros in one step are found, three are not.
+    - `max_step`: the longest step, s, for a condition that is much faster than the motion: several
+      zeros in one step are found where the cubic through its ends, with their slopes, shows them.
     - `solver`: `None` is the closed form for a free body, else `rigidjax.solvers.DormandPrince8`;
       or an explicit method of `rigidjax.solvers`. `rtol`, `atol` as for `simulate`; a crossing is
       as accurate as a step, that of a free body to round-off.

@@ -118,13 +118,12 @@ def test_a_zero_that_is_a_touch_beside_one_that_is_not():
         assert np.isnan(passes(jnp.asarray(2.0), jnp.asarray(ceiling))).all()
 
 
-@pytest.mark.long
-@pytest.mark.xfail(
-    strict=True, reason="g has one sign change and rises at both ends of the step: one is found"
-)
-def test_three_in_one_step():
-    found = cubic(jnp.array([1.0, 2.0, 3.0]))
-    np.testing.assert_allclose(found.times[:3], [1.0, 2.0, 3.0], atol=1e-11)
+@pytest.mark.parametrize("roots", [[1.0, 2.0, 3.0], [1.0, 1.1, 1.2], [0.5, 3.0, 3.3]])
+def test_three_in_one_step(roots):
+    run = once(lambda roots: cubic(roots).times)
+    np.testing.assert_allclose(run(jnp.array(roots))[:4], [*roots, np.nan], atol=1e-11)
+    down = once(lambda roots: cubic(roots, direction=-1).times)
+    np.testing.assert_allclose(down(jnp.array(roots))[:2], [roots[1], np.nan], atol=1e-11)
 
 
 def test_a_start_on_the_section_does_not_count():
