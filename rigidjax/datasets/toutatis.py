@@ -18,11 +18,11 @@ from rigidjax import exact
 from rigidjax._names import own_names
 from rigidjax.body import spatial_angular_momentum
 from rigidjax.identify.body_charts import PrincipalRatios
-from rigidjax.identify.fit import Fit
 from rigidjax.identify.loss import SoftL1
 from rigidjax.identify.problem import Problem
 from rigidjax.identify.recording import Recording
 from rigidjax.identify.report import Row
+from rigidjax.identify.result import Fit
 from rigidjax.identify.sensors import AttitudeSensor, Gyro
 from rigidjax.rotation import euler
 

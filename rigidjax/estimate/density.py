@@ -19,11 +19,11 @@ from rigidjax.estimate.grid import TURN_A_STEP
 from rigidjax.estimate.scene import Extended, Model, size_of
 from rigidjax.estimate.sensing import sensors_of
 from rigidjax.identify import uncertainty
-from rigidjax.identify.fit import Fit
 from rigidjax.identify.jacobian import all_errors, filled, first_state, over_records
 from rigidjax.identify.parameters import Parameters, local
 from rigidjax.identify.problem import Problem
 from rigidjax.identify.residual import beside, whitened
+from rigidjax.identify.result import Fit
 from rigidjax.identify.several_bodies import matter
 from rigidjax.motion import Rigid
 from rigidjax.motion.torques import CorrelatedTorque, RandomTorque, Sum

@@ -27,7 +27,7 @@ from rigidjax.identify.design import (
     fisher as fisher,
     plan_of as plan_of,
 )
-from rigidjax.identify.fit import Fit as Fit, Start as Start, fit as fit
+from rigidjax.identify.fit import fit as fit
 from rigidjax.identify.free_parameters import Free as Free
 from rigidjax.identify.horizons import Horizons as Horizons
 from rigidjax.identify.light_curve import (
@@ -48,6 +48,7 @@ from rigidjax.identify.propagation import (
 )
 from rigidjax.identify.quantities import Quantity as Quantity
 from rigidjax.identify.recording import Reading as Reading, Recording as Recording
+from rigidjax.identify.result import Fit as Fit, Start as Start
 from rigidjax.identify.sensors import (
     AbstractSensor as AbstractSensor,
     Accelerometer as Accelerometer,

@@ -9,9 +9,10 @@ import numpy as np
 
 from rigidjax import _checks
 from rigidjax.identify.body_charts import Known
-from rigidjax.identify.fit import Fit, fit
+from rigidjax.identify.fit import fit
 from rigidjax.identify.problem import Problem
 from rigidjax.identify.recording import Recording
+from rigidjax.identify.result import Fit
 
 
 class Comparison(eqx.Module):

@@ -1,4 +1,4 @@
-"""Least squares from several starts, and its result."""
+"""Least squares from several starts."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -8,27 +8,20 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from rigidjax import _checks
-from rigidjax.identify import identifiability, uncertainty
+from rigidjax.identify import uncertainty
+from rigidjax.identify.assessment import assess
 from rigidjax.identify.checkpoint import Checkpoint, Position, Tried, require_folder
-from rigidjax.identify.full_scale import at_limit
-from rigidjax.identify.goodness import goodness
 from rigidjax.identify.initial_guess import starting_points
 from rigidjax.identify.jacobian import all_errors
 from rigidjax.identify.multiple_shooting import WIDTHS, joined, pieces as in_pieces, with_width
 from rigidjax.identify.parameters import Parameters
 from rigidjax.identify.problem import Problem, fits
 from rigidjax.identify.propagation import AbstractIntegrator, Adaptive, FixedSteps
-from rigidjax.identify.quantities import (
-    Quantity,
-    interval_of,
-    quantile,
-    quantities as quantities_of,
-)
 from rigidjax.identify.residual import Noise
+from rigidjax.identify.result import Fit
 from rigidjax.identify.search import (
     CAREFUL,
     climb,
@@ -39,162 +32,10 @@ from rigidjax.identify.search import (
     settle,
 )
 from rigidjax.identify.stochastic_gradient import Descent, descend
-from rigidjax.identify.widths import widths, with_widths
+from rigidjax.identify.widths import with_widths
 
 # More equal steps than this between two samples cost more than steps chosen as they are needed.
 FINEST = 32
-
-
-class Start(eqx.Module):
-    """The result of one start: where the search ended, and whether that explains the data.
-
-    **Fields:** `parameters` where it ended; `cost` half of the sum of squares there; `converged`
-    whether the search did; `fits` whether it explains the data as well as the best point does.
-
-    >>> import jax.numpy as jnp, rigidjax as rj
-    >>> ts = jnp.linspace(0.0, 10.0, 80)
-    >>> motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1, 0.1, 1.0]), ts)
-    >>> record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), motion.ys.omega))
-    >>> found = rj.identify.fit(rj.identify.Problem(record, rj.identify.PrincipalRatios()))
-    >>> len(found.starts), all(start.cost < 1e-6 for start in found.starts)
-    (8, True)
-    """
-
-    parameters: Parameters
-    cost: float
-    converged: bool
-    fits: bool
-
-
-class Fit(eqx.Module):
-    """What `fit` returns: the best point and how sure it is.
-
-    **Fields:** `problem` that was fitted; `parameters` the free numbers at the best point;
-    `covariance` (n, n) of them, flattened in order, infinite where the data do not determine them,
-    `seen` the same within what they determine, `covariance_kind` what it rests on; `noises` (R, k)
-    for each sensor; `starts` a `Start` each; `chi2` and `dof` of the whitened errors of the sensors
-    whose noise was given; `correlation` over how many samples the errors are autocorrelated, 1 for
-    white ones, and `independent` how many independent ones that leaves; `singular_values` (n,) of
-    the whitened Jacobian, its columns of length one; `null_directions` (k, n) that the data do not
-    determine; `quantities` all that is reported, by name; `status` one line: `ok`, or `doubtful`,
-    `ambiguous`, `poor`, `failed`, a colon and the reasons.
-
-    >>> import jax.numpy as jnp, rigidjax as rj
-    >>> ts = jnp.linspace(0.0, 10.0, 80)
-    >>> motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1, 0.1, 1.0]), ts)
-    >>> record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), motion.ys.omega))
-    >>> found = rj.identify.fit(rj.identify.Problem(record, rj.identify.PrincipalRatios()))
-    >>> [quantity.name for quantity in found.quantities[:2]], found.covariance.shape
-    (['Ix/Iz', 'Iy/Iz'], (5, 5))
-    """
-
-    problem: Problem
-    parameters: Parameters
-    covariance: Float[Array, "n n"]
-    seen: Float[Array, "n n"]
-    covariance_kind: str
-    noises: Noise
-    starts: tuple[Start, ...]
-    chi2: float
-    dof: int
-    correlation: float
-    independent: float
-    singular_values: Float[Array, " n"]
-    null_directions: Float[Array, "unseen n"]
-    quantities: tuple[Quantity, ...]
-    status: str
-
-    @property
-    def ok(self) -> bool:
-        """Whether the fit converged, explains the data, and is the only one that does."""
-        return self.status == "ok"
-
-    @property
-    def body(self) -> Any:
-        """The body, up to scale where the chart has none; of several a dict of them by name."""
-        return self.problem.unpack(self.parameters)[0]
-
-    @property
-    def state0(self) -> Any:
-        """The state at the first time; with several recordings, one for each (leading axis)."""
-        return self.problem.unpack(self.parameters)[1]
-
-    @property
-    def values(self) -> dict[str, Array]:
-        """The value of each `Free` by name, in its unit."""
-        return self.problem.values(self.parameters)
-
-    @property
-    def spreads(self) -> dict[str, Array]:
-        """The spread of each `Free` that has one, by name, in its unit: given or estimated."""
-        return widths(self.problem)
-
-    @property
-    def noise(self) -> tuple[Float[Array, "*records _"], ...]:
-        """One (k,) standard deviation per sensor, given or estimated; (R, k) of R recordings."""
-        return tuple(n[0] for n in self.noises) if self.problem.count == 1 else self.noises
-
-    @property
-    def residuals(self) -> tuple[Float[Array, "*records times _"], ...]:
-        """Reading minus prediction for each sensor, in its unit; zero where masked.
-
-        With several recordings a leading axis.
-        """
-        errors = uncertainty.errors_at(self.parameters, self.problem)
-        return tuple(e[0] for e in errors) if self.problem.count == 1 else errors
-
-    @property
-    def rms(self) -> tuple[float, ...]:
-        """Root mean square length of each sensor's error, in its unit; without full scale."""
-        out = []
-        readings = self.problem.records.readings
-        errors = uncertainty.errors_at(self.parameters, self.problem)
-        for error, reading, full in zip(errors, readings, at_limit(readings), strict=True):
-            kept = reading.seen & ~full.any(axis=-1)
-            lengths = np.sum(np.asarray(error) ** 2, axis=-1)[kept if kept.any() else reading.seen]
-            out.append(float(np.sqrt(lengths.mean())))
-        return tuple(out)
-
-    def interval(self, level: float = 0.95) -> dict[str, tuple[float, float]]:
-        """Intervals of everything that is reported, name → (low, high).
-
-        What is positive goes through its logarithm. **Arguments:** `level` the probability with
-        which each holds the truth. **Raises** `ValueError` outside (0, 1).
-        """
-        reach = quantile(self, level)
-        return {quantity.name: quantity.interval(reach) for quantity in self.quantities}
-
-    def interval_of(
-        self, of: Callable[[Any, Any], Any], level: float = 0.95
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Interval (low, high) of any differentiable function `of(body, state0) → array`.
-
-        The covariance is carried by the function's derivative. **Raises** as `interval`.
-        """
-        return interval_of(self, of, level)
-
-    @property
-    def identifiability(self) -> tuple[str, ...]:
-        """In words: what the data determine, what only weakly, and what not."""
-        return identifiability.identifiability(self)
-
-
-def one_fit(found: Any, name: str = "fit") -> Fit:
-    """`found`, if it is one `Fit`, not many in one container.
-
-    **Raises:** `TypeError` for another kind of thing, `ValueError` for leading axes.
-
-    >>> one_fit(3)
-    Traceback (most recent call last):
-    TypeError: ...
-    """
-    _checks.instance(found, Fit, name)
-    if np.shape(found.chi2) != ():
-        raise ValueError(
-            f"{name}: wanted one Fit, as identify.fit returns it, got one with a chi2 of shape "
-            f"{np.shape(found.chi2)}; of many take them one by one"
-        )
-    return found
 
 
 def fit(
@@ -298,7 +139,7 @@ def fit(
         near = fresh(best.parameters)
         best = settle(near, problem, noise, whole, tolerance, max_steps, near=True)
         best, noise = _with_noise(problem, best, noise, tolerance, max_steps)
-    return _assess(problem, best.parameters, bool(best.converged), noise, tried, lowest)
+    return assess(problem, best.parameters, bool(best.converged), noise, tried, lowest)
 
 
 def _with_noise(
@@ -443,76 +284,3 @@ def _first_noise(problem: Problem) -> Noise:
             size = jnp.sqrt(jnp.mean(jnp.sum(values**2, axis=-1)) + 1e-300)
             out.append(jnp.full((problem.count, sensor.components), 0.1) * size)
     return tuple(out)
-
-
-def _assess(
-    problem: Problem,
-    value: Parameters,
-    done: bool,
-    noise: Noise,
-    tried: list[Tried],
-    best_cost: float,
-) -> Fit:
-    linear = uncertainty.linearise(problem, value, noise)
-    cut = at_limit(problem.records.readings)
-    times = uncertainty.correlation_times(linear, cut)
-    spread = uncertainty.spread(linear, times)
-    free = ravel_pytree(value)[0].size
-    seen = goodness(problem, linear, times, free)
-    believable = not seen.poor
-    # Ten units of log-likelihood: a point further above the best is e¹⁰ times less likely. Where
-    # the noise is estimated from the best point, its cost is half the number of readings.
-    margin = 10.0
-    if any(sensor.noise is None for sensor in problem.records.sensors):
-        count = sum(r.sensor.components * int(r.seen.sum()) for r in problem.records.readings)
-        margin *= 2 * best_cost / count
-    # Of autocorrelated errors there are the fewer.
-    margin *= max(times.longest, 1.0)
-
-    def elsewhere(other: Parameters) -> bool:
-        # In one flat valley searches end apart, where no reading would tell them apart.
-        away = ravel_pytree(other)[0] - ravel_pytree(value)[0]
-        return float(np.sum((linear.rows @ np.asarray(away)) ** 2)) > 2 * margin
-
-    starts = []
-    for item in tried:
-        fits = believable and float(item.cost) <= best_cost + margin
-        starts.append(Start(item.parameters, float(item.cost), bool(item.converged), fits))
-    rivals = [
-        s
-        for s in starts
-        if s.fits and s.converged and s.cost > best_cost + 0.01 * margin and elsewhere(s.parameters)
-    ]
-    doubts = list(seen.doubts)
-    if not any(start.fits for start in starts):
-        doubts.append("no single start came near the best point")
-    if not np.isfinite(best_cost):
-        status = "failed: no start gave a finite misfit"
-    elif believable and not done:
-        status = "failed: not converged, max_steps reached; this is the best point found"
-    elif not believable:
-        status = "poor: " + "; ".join((*seen.poor, "this is not the motion"))
-    elif rivals:
-        rival = f"{len(rivals)} of {len(starts)} starts fit as well elsewhere"
-        status = "ambiguous: " + "; ".join((rival, *doubts))
-    elif doubts:
-        status = "doubtful: " + "; ".join(doubts)
-    else:
-        status = "ok"
-    return Fit(
-        problem,
-        value,
-        jnp.asarray(spread.covariance),
-        jnp.asarray(spread.seen),
-        spread.kind,
-        noise,
-        tuple(starts),
-        seen.chi2,
-        seen.dof,
-        times.longest,
-        times.independent,
-        jnp.asarray(spread.singular_values),
-        jnp.asarray(spread.null_directions),
-        quantities_of(problem, value, spread.seen, spread.null_directions),
-        status,
-    )

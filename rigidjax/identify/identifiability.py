@@ -18,7 +18,7 @@ from rigidjax.identify.quantities import (
 from rigidjax.identify.several_bodies import Bodies
 
 if TYPE_CHECKING:
-    from rigidjax.identify.fit import Fit
+    from rigidjax.identify.result import Fit
 
 
 def identifiability(fit: "Fit") -> tuple[str, ...]:

@@ -14,10 +14,11 @@ from rigidjax import _checks, exact
 from rigidjax.body.inertia import MassProperties
 from rigidjax.identify import padding
 from rigidjax.identify.checkpoint import Tried
-from rigidjax.identify.fit import Fit, fit
+from rigidjax.identify.fit import fit
 from rigidjax.identify.parameters import Parameters
 from rigidjax.identify.problem import Problem, one_problem
 from rigidjax.identify.quantities import carried
+from rigidjax.identify.result import Fit
 from rigidjax.identify.sensors import Brightness
 from rigidjax.identify.several_bodies import Bodies
 from rigidjax.identify.tumbling_search import descended, noise_of, relative_flux, starts_of

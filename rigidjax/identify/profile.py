@@ -9,9 +9,9 @@ import optimistix as optx
 from jaxtyping import Array
 
 from rigidjax.identify import quantities
-from rigidjax.identify.fit import Fit, one_fit
 from rigidjax.identify.parameters import Parameters
 from rigidjax.identify.residual import residuals
+from rigidjax.identify.result import Fit, one_fit
 from rigidjax.identify.search import cost_of, misfit, solver_for
 
 

@@ -17,7 +17,7 @@ from rigidjax.identify.problem import Problem
 from rigidjax.identify.several_bodies import Bodies
 
 if TYPE_CHECKING:
-    from rigidjax.identify.fit import Fit
+    from rigidjax.identify.result import Fit
 
 
 class Quantity(eqx.Module):

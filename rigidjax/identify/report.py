@@ -12,8 +12,8 @@ import numpy as np
 
 from rigidjax import _checks
 from rigidjax._names import own_names
-from rigidjax.identify.fit import Fit, one_fit
 from rigidjax.identify.full_scale import at_limit
+from rigidjax.identify.result import Fit, one_fit
 
 _UNITS = {"rad/s": 1.0, "deg/s": 180 / np.pi, "deg/day": 86400 * 180 / np.pi}
 Row = tuple[str, float, float, float, str]

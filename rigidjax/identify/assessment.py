@@ -1,0 +1,89 @@
+"""How good a fit is: covariance, status, and whether other starts explain the data as well."""
+
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+
+from rigidjax.identify import uncertainty
+from rigidjax.identify.checkpoint import Tried
+from rigidjax.identify.full_scale import at_limit
+from rigidjax.identify.goodness import goodness
+from rigidjax.identify.parameters import Parameters
+from rigidjax.identify.problem import Problem
+from rigidjax.identify.quantities import quantities as quantities_of
+from rigidjax.identify.residual import Noise
+from rigidjax.identify.result import Fit, Start
+
+
+def assess(
+    problem: Problem,
+    value: Parameters,
+    done: bool,
+    noise: Noise,
+    tried: list[Tried],
+    best_cost: float,
+) -> Fit:
+    """The `Fit` of the best point `value`, reached or not (`done`), among all that were tried."""
+    linear = uncertainty.linearise(problem, value, noise)
+    cut = at_limit(problem.records.readings)
+    times = uncertainty.correlation_times(linear, cut)
+    spread = uncertainty.spread(linear, times)
+    free = ravel_pytree(value)[0].size
+    seen = goodness(problem, linear, times, free)
+    believable = not seen.poor
+    # Ten units of log-likelihood: a point further above the best is e¹⁰ times less likely. Where
+    # the noise is estimated from the best point, its cost is half the number of readings.
+    margin = 10.0
+    if any(sensor.noise is None for sensor in problem.records.sensors):
+        count = sum(r.sensor.components * int(r.seen.sum()) for r in problem.records.readings)
+        margin *= 2 * best_cost / count
+    # Of autocorrelated errors there are the fewer.
+    margin *= max(times.longest, 1.0)
+
+    def elsewhere(other: Parameters) -> bool:
+        # In one flat valley searches end apart, where no reading would tell them apart.
+        away = ravel_pytree(other)[0] - ravel_pytree(value)[0]
+        return float(np.sum((linear.rows @ np.asarray(away)) ** 2)) > 2 * margin
+
+    starts = []
+    for item in tried:
+        fits = believable and float(item.cost) <= best_cost + margin
+        starts.append(Start(item.parameters, float(item.cost), bool(item.converged), fits))
+    rivals = [
+        s
+        for s in starts
+        if s.fits and s.converged and s.cost > best_cost + 0.01 * margin and elsewhere(s.parameters)
+    ]
+    doubts = list(seen.doubts)
+    if not any(start.fits for start in starts):
+        doubts.append("no single start came near the best point")
+    if not np.isfinite(best_cost):
+        status = "failed: no start gave a finite misfit"
+    elif believable and not done:
+        status = "failed: not converged, max_steps reached; this is the best point found"
+    elif not believable:
+        status = "poor: " + "; ".join((*seen.poor, "this is not the motion"))
+    elif rivals:
+        rival = f"{len(rivals)} of {len(starts)} starts fit as well elsewhere"
+        status = "ambiguous: " + "; ".join((rival, *doubts))
+    elif doubts:
+        status = "doubtful: " + "; ".join(doubts)
+    else:
+        status = "ok"
+    return Fit(
+        problem,
+        value,
+        jnp.asarray(spread.covariance),
+        jnp.asarray(spread.seen),
+        spread.kind,
+        noise,
+        tuple(starts),
+        seen.chi2,
+        seen.dof,
+        times.longest,
+        times.independent,
+        jnp.asarray(spread.singular_values),
+        jnp.asarray(spread.null_directions),
+        quantities_of(problem, value, spread.seen, spread.null_directions),
+        status,
+    )
