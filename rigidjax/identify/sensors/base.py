@@ -50,8 +50,9 @@ class AbstractSensor(eqx.Module):
     each component, or `None` to have it estimated; and write `error`.
 
     Optional members: `offset`, s: the sensor's clock is behind, it shows at t what was at
-    t + offset; `limit` (k,): where a channel saturates, in the unit of the error; a method
-    `refusal(values)`: which rows cannot be readings, (T,) true where wrong, and why.
+    t + offset; `limit` (k,): where a channel saturates, in the unit of the error; `lowpass` a
+    `LowPass`, where the error is reading minus prediction; a method `refusal(values)`: which rows
+    cannot be readings, (T,) true where wrong, and why.
 
     >>> import rigidjax as rj
     >>> class Tachometer(AbstractSensor):  # the size of the body rate, rad/s
