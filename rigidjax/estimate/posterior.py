@@ -74,7 +74,8 @@ class Posterior(eqx.Module):
     >>> record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), motion.ys.omega))
     >>> found = rj.identify.fit(rj.identify.Problem(record, rj.identify.PrincipalRatios()))
     >>> density = rj.estimate.LogDensity(found)
-    >>> draws = density.x0 + 0.01 * jax.random.normal(jax.random.key(0), (4, 200, density.size))
+    >>> noise = jax.random.normal(jax.random.key(0), (4, 200, density.size))
+    >>> draws = density.x0[None, None] + 0.01 * noise
     >>> bool((Posterior(density, draws).rhat < 1.05).all())  # four chains that agree
     True
     """

@@ -2,6 +2,7 @@
 
 from typing import Any, ClassVar
 
+import equinox as eqx
 from jaxtyping import Array, Float
 
 from rigidjax._types import HasAttitude, HasPose, HasSpin, Scalar, Vec3
@@ -54,6 +55,8 @@ class Gyro(AbstractSensor):
     g_sensitivity: Float[Array, "3 3"] | None
     place: Float[Array, "3"] | None
     gravity: Float[Array, "3"] | None
+    # Only gravity needs the attitude.
+    feels: type = eqx.field(static=True, default=HasSpin)
 
     def __init__(
         self,
@@ -76,17 +79,14 @@ class Gyro(AbstractSensor):
         self.limit = limit_of(limit)
         self.offset, self.lowpass = number_of(offset, "offset"), lowpass_of(lowpass)
         self.g_sensitivity = self.place = self.gravity = None
+        self.feels = HasSpin
         if g_sensitivity is not None:
             self.g_sensitivity = place_of(g_sensitivity, "g_sensitivity", (3, 3))
             self.place = place_of([0.0, 0.0, 0.0] if place is None else place, "place")
             self.gravity = vector_of(gravity, "gravity")
+            self.feels = HasSpin if gravity is None else HasAttitude
         elif place is not None or gravity is not None:
             raise ValueError("Gyro: place and gravity say something only beside a g_sensitivity")
-
-    @property
-    def feels(self) -> type:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Only gravity needs the attitude."""
-        return HasSpin if self.gravity is None else HasAttitude
 
     def error(self, now: SensorInput, reading: Array) -> Vec3:
         seen = shown(now.state.omega, self.bias, self.scale, self.mounting, self.skew)
