@@ -44,7 +44,8 @@ class Inertia(eqx.Module):
     tensor: Float[Array, "*batch 3 3"]
 
     def __init__(self, tensor: Matrices):
-        self.tensor = _checks.floating(tensor, (3, 3), "tensor", batched=True)
+        hint = "of principal moments Inertia.from_principal makes one"
+        self.tensor = _checks.floating(tensor, (3, 3), "tensor", batched=True, hint=hint)
 
     @staticmethod
     def from_tensor(tensor: Matrix) -> "Inertia":

@@ -105,7 +105,7 @@ class LogDensity(eqx.Module):
         *,
         deviation: float | None = 2.0,
     ):
-        _checks.instance(fit, Fit, "fit")
+        _checks.instance(fit, Fit, "LogDensity: fit", wanted="what identify.fit returns")
         problem = fit.problem
         if process is not None:
             _checks.instance(process, (RandomTorque, CorrelatedTorque), "process")

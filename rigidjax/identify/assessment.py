@@ -62,7 +62,8 @@ def assess(
     elif believable and not done:
         status = "failed: not converged, max_steps reached; this is the best point found"
     elif not believable:
-        status = "poor: " + "; ".join((*seen.poor, "this is not the motion"))
+        units = "this is not the motion, or a unit is wrong (rad/s, m/s², m, s)"
+        status = "poor: " + "; ".join((*seen.poor, units))
     elif rivals:
         rival = f"{len(rivals)} of {len(starts)} starts fit as well elsewhere"
         status = "ambiguous: " + "; ".join((rival, *doubts))

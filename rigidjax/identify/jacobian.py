@@ -88,7 +88,7 @@ def errors_of_one(
                 seen = jax.vmap(lambda t, s, by=offset: shifted(field, t, s, by))(record.t, states)
 
         def error(t: Array, state: Any, value: Array, sensor: Any = sensor) -> Array:
-            return sensor.error(SensorInput(t, state, body, field), value)
+            return _error_of(sensor, SensorInput(t, state, body, field), value)
 
         lowpass = getattr(sensor, "lowpass", None)
         if lowpass is None:
@@ -99,6 +99,27 @@ def errors_of_one(
             errors = reading.values + lowpass(times, shown)
         out.append(jnp.where(reading.mask[:, None], errors, 0.0))
     return tuple(out), jax.tree.map(lambda leaf: leaf[-1], states)
+
+
+def _error_of(sensor: Any, now: SensorInput, value: Array) -> Array:
+    """What a sensor's `error` returns, looked at: a user may have written it."""
+    name = type(sensor).__name__
+    try:
+        found = sensor.error(now, value)
+    except AttributeError as wrong:
+        if type(now.state).__name__ not in str(wrong):
+            raise
+        raise TypeError(
+            f"{name}.error: {wrong}; it says feels = {sensor.feels.__name__}, and what it looks at "
+            "needs more: say feels = rj.HasAttitude, or rj.HasPose"
+        ) from wrong
+    wanted = (sensor.components,)
+    if jnp.shape(found) != wanted:
+        raise ValueError(
+            f"{name}.error: wanted reading minus prediction of shape {wanted}, as components = "
+            f"{sensor.components} says, got {jnp.shape(found)}"
+        )
+    return found
 
 
 def over_records(function: Any, problem: "Problem", mine: Local) -> Any:

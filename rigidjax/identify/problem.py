@@ -118,7 +118,7 @@ class Problem(eqx.Module):
             if not isinstance(one, AbstractBodyChart):
                 raise TypeError(
                     "Problem: wanted what of the body is free, such as Ratios() or "
-                    f"PrincipalRatios(), got {type(one).__name__}"
+                    f"PrincipalRatios(), got {_named(one)}"
                 )
         if isinstance(free, str):
             free = (free,)  # pyright: ignore[reportAssignmentType]
@@ -432,6 +432,12 @@ def _firsts(slot: Slot) -> Array:
     assert slot.groups is not None
     rows = jnp.arange(len(slot.labels), dtype=slot.groups.dtype)
     return jnp.argmax(slot.groups[None, :] == rows[:, None], axis=1)
+
+
+def _named(thing: Any) -> str:
+    if isinstance(thing, type):
+        return f"the class {thing.__name__}; was () forgotten?"
+    return type(thing).__name__
 
 
 def _with(recording: Recording, torque: Torque) -> Recording:

@@ -60,6 +60,12 @@ class Recording(eqx.Module):
     dropped: int = eqx.field(static=True)
 
     def __init__(self, t: Any, *readings: tuple, torque: Torque | None = None):
+        for pair in readings:
+            if not isinstance(pair, tuple) or len(pair) not in (2, 3):
+                raise TypeError(
+                    "Recording: wanted pairs (sensor, values) or (sensor, values, mask) after the "
+                    f"times, got {type(pair).__name__}; as in Recording(t, (sensor, values))"
+                )
         if not _checks.known((t, [reading[1:] for reading in readings])):
             raise TypeError(
                 "Recording: wanted known numbers for t and the readings, got traced ones; make the "
@@ -115,10 +121,17 @@ def _reading(
     name = type(sensor).__name__
     if not isinstance(sensor, AbstractSensor):
         raise TypeError(f"Recording: wanted pairs (sensor, values), got {name} for a sensor")
+    if sensor.noise is not None and np.shape(sensor.noise) != (sensor.components,):
+        raise ValueError(
+            f"{name}: noise: wanted an array of shape ({sensor.components},), a standard deviation "
+            f"for each component of the error, or None, got shape {np.shape(sensor.noise)}"
+        )
     values = _checks.on_host(values, f"{name}: readings")
     wanted = (t.size, *sensor.reading_shape)
     if values.shape != wanted:
-        raise ValueError(f"{name}: wanted readings of shape {wanted}, got {values.shape}")
+        turned = "; transposed?" if values.shape == wanted[::-1] else ""
+        many = f"; t has {t.size} times" if values.shape[1:] == wanted[1:] else turned
+        raise ValueError(f"{name}: wanted readings of shape {wanted}, got {values.shape}{many}")
     mask = np.ones(t.size, bool) if mask is None else _flags(mask, name)
     if mask.shape != t.shape:
         raise ValueError(f"{name}: wanted a mask of shape {t.shape}, got {mask.shape}")

@@ -47,7 +47,8 @@ def energy(
         if not hasattr(part, "energy"):
             raise TypeError(
                 f"energy: {type(part).__name__} has no potential (no method energy(t, state, "
-                "body)), so there is no energy that it conserves; see kinetic_energy"
+                "body)), so there is no energy that it conserves; give only the laws "
+                "that have one, or see kinetic_energy"
             )
     total = kinetic_energy(in_precision(body, turning.omega.dtype), turning)
     for part in parts:

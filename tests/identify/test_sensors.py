@@ -140,7 +140,36 @@ def test_a_sensor_of_ones_own():
         np.testing.assert_allclose(error, 0, atol=1e-12)
 
 
+def test_mistakes_in_a_sensor_of_ones_own_are_named():
+    class Scalar(Tachometer):
+        def error(self, moment, reading):
+            return super(Scalar, self).error(moment, reading)[0]  # noqa: UP008
+
+    class Pointing(Tachometer):
+        def error(self, moment, reading):
+            return reading - moment.state.q[:1]
+
+    ts, body = jnp.linspace(0.0, 6.0, 40), rj.Inertia.from_principal(1.0, 1.6, 2.1)
+    readings = jnp.ones((40, 1))
+
+    def errors(sensor):
+        gyro = (rj.identify.Gyro(1e-4), jnp.ones((40, 3)))
+        record = rj.identify.Recording(ts, (sensor, readings), gyro)
+        problem = rj.identify.Problem(record, rj.identify.PrincipalRatios())
+        return problem.errors(rj.identify.plan_of(problem, body, [1.0, 1.0, 1.0]))
+
+    with pytest.raises(ValueError, match=r"Scalar.error: wanted .* of shape \(1,\), .*got \(\)"):
+        errors(Scalar())
+    with pytest.raises(TypeError, match=r"Pointing.error: 'Spin' .*say feels = rj.HasAttitude"):
+        errors(Pointing())
+    with pytest.raises(ValueError, match=r"Tachometer: noise: wanted an array of shape \(1,\)"):
+        errors(Tachometer(0.01))
+
+
 MISTAKES = [
+    (lambda: rj.identify.Recording([0.0, 1.0], rj.identify.Gyro(), np.ones((2, 3))), r"got Gyro; as in Recording\(t, "),
+    (lambda: rj.identify.Recording([0.0, 1.0], (rj.identify.Gyro(), np.ones((3, 2)))), "transposed"),
+    (lambda: rj.identify.Recording([0.0, 1.0], (rj.identify.Gyro(), np.ones((4, 3)))), "t has 2 times"),
     (lambda: rj.identify.Gyro(bias=[0.0, 0.0]), r"bias: wanted shape \(3,\)"),
     (lambda: rj.identify.Gyro(limit=-1.0), "limit: wanted a positive full scale"),
     (lambda: rj.identify.Gyro(scale=[1.0, np.nan, 1.0]), "scale.*NaN"),
@@ -157,7 +186,7 @@ MISTAKES = [
 @pytest.mark.parametrize(("call", "words"), MISTAKES)
 @pytest.mark.usefixtures("unhooked")
 def test_mistakes_are_named(call, words):
-    with pytest.raises(ValueError, match=words):
+    with pytest.raises((TypeError, ValueError), match=words):
         call()
 
 
