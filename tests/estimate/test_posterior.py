@@ -173,10 +173,11 @@ def test_draws_that_depend_on_the_last_are_worth_less(fitted):
     assert (np.abs(drawn.ess / wanted - 1) < 0.3).all()
 
 
-def test_nuts_draws_from_a_normal_distribution():
+@pytest.mark.parametrize("acceptance", [0.8, 0.65])
+def test_nuts_draws_from_a_normal_distribution(acceptance):
     root = np.array([[1.0, 0.0], [1.5, 0.5]])
     inverse = np.linalg.inv(root @ root.T)
-    sampler = estimate.Nuts(samples=2000, warmup=300)
+    sampler = estimate.Nuts(samples=2000, warmup=300, acceptance=acceptance)
     draw = jax.jit(lambda key: sampler(key, lambda z: -0.5 * z @ inverse @ z, jnp.zeros(2)))
     # blackjax leans on the promotions that our tests forbid.
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
@@ -223,6 +224,9 @@ def test_several_bodies_go_to_arviz_by_name(fitted):
 def test_what_is_refused(fitted):
     with pytest.raises(TypeError, match="density: wanted LogDensity"):
         estimate.posterior(fitted, jax.random.key(0))
+    for wrong in (0.0, 1.0, -0.5):
+        with pytest.raises(ValueError, match="acceptance: wanted"):
+            estimate.Nuts(acceptance=wrong)
     with pytest.raises(TypeError, match="process: wanted RandomTorque or CorrelatedTorque"):
         estimate.LogDensity(fitted, records.BODY)
 

@@ -97,7 +97,12 @@ for name in ("linear_filter", "linear_smooth"):
         groups=("stranger", "shape"),
         transforms=("jit", "grad"),
     )
-row("estimate.Nuts", dict(samples=10, warmup=10), groups=("stranger",), transforms=())
+row(
+    "estimate.Nuts",
+    dict(samples=10, warmup=10, acceptance=0.8),
+    groups=("stranger",),
+    transforms=(),
+)
 leave_out("made by start and by each filter", "estimate.Belief")
 leave_out(
     "what a function returns",
