@@ -62,16 +62,30 @@ def orbit(moments: Triple, momentum: Triple) -> Orbit:
     return Orbit(a, d12, d13, d23, (p1, p2, p3), h, m, mu, turn, half, swap)
 
 
-def reduced(o: Orbit, u: Scalar) -> tuple[Elliptic, Scalar]:
-    """S, C, D at u, reduced by whole half periods; and the phase of what is left out."""
+class Reduced(NamedTuple):
+    """A time less whole half periods.
+
+    `count` half periods, `rest` what is left, `near` the same but for the separatrix, which comes
+    to rest and is not followed beyond.
+    """
+
+    count: Scalar
+    rest: Scalar
+    near: Scalar
+
+
+def reduced(u: Scalar, half: Scalar, m: Modulus) -> Reduced:
+    count = jnp.round(u / half)
+    rest = u - jnp.where(count == 0, 0.0, count) * jnp.where(count == 0, 0.0, half)
+    return Reduced(count, rest, until_rest(rest, m))
+
+
+def restored(o: Orbit, f: Elliptic, u: Reduced) -> tuple[Elliptic, Scalar]:
+    """S, C, D at the whole time from those at `near`; and the phase of what was left out."""
     big = jnp.maximum(o.modulus.p, o.modulus.q)
-    count = jnp.round(u / o.half.time)
-    whole = jnp.where(count == 0, 0.0, count)
-    r = u - whole * jnp.where(count == 0, 0.0, o.half.time)
-    near = until_rest(r, o.modulus)
-    f = elliptic(near, o.modulus, o.mu, o.turn)
+    whole = jnp.where(u.count == 0, 0.0, u.count)
     # From then on the momentum rests on the middle axis, S² = 1/max(p, q): a steady spin.
-    spin = (r - near) * o.turn / jnp.where(big > 0, big + o.mu, 1.0)
+    spin = (u.rest - u.near) * o.turn / jnp.where(big > 0, big + o.mu, 1.0)
     odd = jnp.abs(whole - 2.0 * jnp.round(0.5 * whole)) > 0.5
     sign = jnp.where(odd, -1.0, 1.0)
     around_three = o.modulus.gap > 0
@@ -81,7 +95,7 @@ def reduced(o: Orbit, u: Scalar) -> tuple[Elliptic, Scalar]:
             C=jnp.where(around_three, sign, 1.0) * f.C,
             D=jnp.where(around_three, 1.0, sign) * f.D,
         ),
-        whole * jnp.where(count == 0, 0.0, o.half.phase) + spin,
+        whole * jnp.where(u.count == 0, 0.0, o.half.phase) + spin,
     )
 
 
@@ -116,8 +130,14 @@ def momentum_at(o: Orbit, f: Elliptic) -> Triple:
 
 def momentum_and_turn(o: Orbit, t: Scalar) -> tuple[Triple, Four]:
     """Body momentum at t, and the quaternion of the turn since t = 0, in principal axes."""
+    u = reduced(0.5 * t, o.half.time, o.modulus)
+    return from_functions(o, elliptic(u.near, o.modulus, o.mu, o.turn), u, t)
+
+
+def from_functions(o: Orbit, f: Elliptic, u: Reduced, t: Scalar) -> tuple[Triple, Four]:
+    """Momentum and turn from the elliptic functions at `u.near`."""
     one = opaque_one(t)
-    f, phase = fence(reduced(o, 0.5 * t), one)
+    f, phase = fence(restored(o, f, u), one)
     full = fence(duplicate(f, o.modulus, o.mu, o.turn), one)
     _, k2, k3 = fence(momentum_at(o, f), one)
     m1, m2, m3 = fence(momentum_at(o, full), one)

@@ -17,8 +17,6 @@ import jax
 import jax.numpy as jnp
 
 from rigidjax._types import Scalar
-from rigidjax.exact._xla import fence, opaque_one
-from rigidjax.exact.complete_integrals import half_period
 from rigidjax.exact.components3 import Six, Triple
 from rigidjax.exact.jacobi_duplication import (
     Elliptic,
@@ -27,7 +25,6 @@ from rigidjax.exact.jacobi_duplication import (
     growth,
     limits,
     series,
-    until_rest,
 )
 from rigidjax.exact.sigma_form import Differences
 
@@ -35,18 +32,29 @@ from rigidjax.exact.sigma_form import Differences
 Row = tuple[Scalar, ...]
 
 
-class _Functions(NamedTuple):
-    S: Scalar
-    C: Scalar
-    D: Scalar
+class Integrals(NamedTuple):
+    """The elliptic functions at some time, and Y₂ and Y until then."""
+
+    f: Elliptic
     y2: Scalar
     y: Scalar
 
 
-def jacobian_and_integral(body: Differences, momentum: Triple, t: Scalar) -> tuple[tuple, Six]:
+class Halfway(NamedTuple):
+    """At half of a time that was reduced by whole periods, `whole` in all; the mean of S²."""
+
+    at: Integrals
+    count: Scalar
+    whole: Scalar
+    mean: Scalar
+
+
+def jacobian_and_integral(
+    body: Differences, momentum: Triple, t: Scalar, halfway: Halfway
+) -> tuple[tuple, Six]:
     """dΠ(t)/d(d12, d23, k12, k13, k23, Π(0), t) as three rows, and G = ∫ Π Πᵀ dt.
 
-    Takes off-diagonal entries as zero. Regular at rest.
+    Takes off-diagonal entries as zero. Regular at rest. C and D of `halfway` as in `body`.
     """
     d12, d13, d23 = body.d12, body.d13, body.d23
     p1, p2, p3 = momentum
@@ -57,19 +65,15 @@ def jacobian_and_integral(body: Differences, momentum: Triple, t: Scalar) -> tup
     m = Modulus(p, q, gap)
     three = gap > 0
     top = jnp.where(three, p, q)
-    zero = jnp.zeros_like(t)
-    half = half_period(m, zero, zero)
-    count = jnp.where(jnp.isfinite(half.time), jnp.round(t / (2.0 * half.time)), 0.0)
-    whole = count * jnp.where(count == 0, 0.0, 2.0 * half.time)
-    r = 2.0 * until_rest(0.5 * (t - whole), m)
-    before, f = _integrals(r, m, three)
-    S, C, D = f.S, f.C, f.D
-    grown2 = f.y2 + whole * half.mean
-    grown = f.y + whole * (1.0 - top * half.mean) / jnp.where(count == 0, 1.0, jnp.abs(gap))
+    before, count, whole, mean = halfway
+    after = twice(before, m, jnp.zeros_like(t), jnp.zeros_like(t))
+    S, C, D, *_ = after.f
+    grown2 = after.y2 + whole * mean
+    grown = after.y + whole * (1.0 - top * mean) / jnp.where(count == 0, 1.0, jnp.abs(gap))
 
     # Divided differences of T = diag(D, 1, C) by k12, k13, k23.
-    s = before.S * before.S
-    cc, dd = before.C * before.C, before.D * before.D
+    s = before.f.S * before.f.S
+    cc, dd = before.f.C * before.f.C, before.f.D * before.f.D
     g = 2.0 * s / (cc + p * s * dd)
     t12, t13, t23 = -g * cc * A3, g * A2, g * dd * A1
 
@@ -79,10 +83,6 @@ def jacobian_and_integral(body: Differences, momentum: Triple, t: Scalar) -> tup
     ss, tt = S * S, jnp.where(three, D, C)
     rw = 1.0 / (tt * tt + ss * z)
     m1, m2, m3 = y1 * rw, y2 * rw, y3 * rw
-    one = opaque_one(t)
-    shared = (A1, A2, A3, p, q, S, C, D, grown, grown2, ss, tt, z, rw)
-    A1, A2, A3, p, q, S, C, D, grown, grown2, ss, tt, z, rw = fence(shared, one)
-    t12, t13, t23, u1, u2, u3, m1, m2, m3 = fence((t12, t13, t23, u1, u2, u3, m1, m2, m3), one)
     rc, rd = 0.5 * ss / jnp.where(three, 1.0, C), 0.5 * ss / jnp.where(three, D, 1.0)
 
     def tangent(e12, e23, o12, o13, o23, e1, e2, e3, et):
@@ -96,11 +96,9 @@ def jacobian_and_integral(body: Differences, momentum: Triple, t: Scalar) -> tup
         dgap, dtop = jnp.where(three, dgap, -dgap), jnp.where(three, dp, dq)
         theta = et + 0.5 * (dgap * grown + dtop * grown2)
         shrink = 0.5 * ss * dtop
-        theta, shrink, dgap = fence((theta, shrink, dgap), one)
         dS = C * D * theta - S * shrink
         dC = -p * S * D * theta - C * shrink + jnp.where(three, 0.0, rc * dgap)
         dD = -q * S * C * theta - D * shrink + jnp.where(three, rd * dgap, 0.0)
-        dS, dC, dD = fence((dS, dC, dD), one)
         x12, x13, x23 = o12 * t12, o13 * t13, o23 * t23
         du1 = (
             -e23 * (p2 * p3)
@@ -154,7 +152,6 @@ def jacobian_and_integral(body: Differences, momentum: Triple, t: Scalar) -> tup
             (e13 * d23 + d13 * e23) * (p3 * p3)
             + 2.0 * p3 * (d13 * d23 * e3 - d23 * o13 * p1 - d13 * o23 * p2),
         )
-        dy1, dy2, dy3 = fence((dy1, dy2, dy3), one)
         dw = 2.0 * (tt * jnp.where(three, dD, dC) + S * dS * z) + ss * dz
         return (dy1 - m1 * dw) * rw, (dy2 - m2 * dw) * rw, (dy3 - m3 * dw) * rw
 
@@ -172,20 +169,18 @@ def jacobian_and_integral(body: Differences, momentum: Triple, t: Scalar) -> tup
     return rows, (g11, g22, g33, g12, g13, g23)
 
 
-def _integrals(u: Scalar, m: Modulus, three) -> tuple[_Functions, _Functions]:
-    """The functions at u/2 and at u."""
-    n = limits(u.dtype).doublings + 1
-    h = u * 2.0**-n
-    f0 = series(h, m, jnp.zeros_like(u), jnp.zeros_like(u))
+def integrals(u: Scalar, m: Modulus, mu: Scalar, turn: Scalar) -> Integrals:
+    """As `elliptic`, with Y₂ and Y."""
+    n = limits(u.dtype).doublings
+    f = series(u * 2.0**-n, m, mu, turn)
     # S²/D² and S²/C² are S²/(1 + μS²) for μ = −q and −p.
-    low = jnp.where(three, -m.q, -m.p)
-    f = _Functions(f0.S, f0.C, f0.D, growth(f0.S, m, jnp.zeros_like(u)), growth(f0.S, m, low))
-    before = jax.lax.fori_loop(0, n - 1, lambda _, g: _twice(g, m, three), f)
-    return before, _twice(before, m, three)
+    low = jnp.where(m.gap > 0, -m.q, -m.p)
+    first = Integrals(f, growth(f.S, m, jnp.zeros_like(u)), growth(f.S, m, low))
+    return jax.lax.fori_loop(0, n, lambda _, g: twice(g, m, mu, turn), first)
 
 
-def _twice(f: _Functions, m: Modulus, three) -> _Functions:
-    zero, one = jnp.zeros_like(f.S), jnp.ones_like(f.S)
-    g = duplicate(Elliptic(f.S, f.C, f.D, one, zero), m, zero, zero)
-    a, b = f.S / jnp.where(three, f.D, f.C), g.S / jnp.where(three, g.D, g.C)
-    return _Functions(g.S, g.C, g.D, 2.0 * f.y2 + f.S * f.S * g.S, 2.0 * f.y + a * a * b)
+def twice(g: Integrals, m: Modulus, mu: Scalar, turn: Scalar) -> Integrals:
+    f, three = g.f, m.gap > 0
+    after = duplicate(f, m, mu, turn)
+    a, b = f.S / jnp.where(three, f.D, f.C), after.S / jnp.where(three, after.D, after.C)
+    return Integrals(after, 2.0 * g.y2 + f.S * f.S * after.S, 2.0 * g.y + a * a * b)

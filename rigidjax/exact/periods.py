@@ -119,8 +119,8 @@ def _precession(moments: Six, momentum: Triple, period: Scalar) -> Scalar:
 @_precession.defjvp
 def _precession_jvp(primals, tangents):
     moments, momentum, period = primals
-    (body, _, energy2), (_, d_k, d_energy2) = jax.jvp(reciprocal, (moments, momentum), tangents[:2])
-    _, g = first_order(body, momentum, period)
+    (_, _, energy2), (_, d_k, d_energy2) = jax.jvp(reciprocal, (moments, momentum), tangents[:2])
+    _, _, g = first_order(moments, momentum, period)
     along = 0.5 * period * d_energy2 + energy2 * tangents[2]
     along = (
         along + 0.5 * sum(g[i] * d_k[i] for i in range(3)) + sum(g[i] * d_k[i] for i in range(3, 6))
