@@ -70,7 +70,8 @@ class LogDensity(eqx.Module):
 
     **Arguments:** `fit` of `identify.fit`; `process` a `RandomTorque` or `CorrelatedTorque` or
     `None`; `deviation` of the normal prior of the logarithms of its density and time about those
-    given, `None` for a process that is known.
+    given, `None` for a process that is known. Where only ratios of moments are determined, as by a
+    gyro alone, the density is so to the square of a moment: compare `density / moment**2`.
 
     **Raises:** `TypeError` for arguments of another kind; `ValueError` for a robust loss, which is
     no density, and for directions that neither data nor a prior determine.
