@@ -59,15 +59,16 @@ def _at(table: Array, f: Array) -> Array:
     first = jnp.floor(place)
     part = place - first
     index = first.astype(jnp.int32) + 1
-    value = jnp.zeros(f.shape, table.dtype)
+    real = imaginary = jnp.zeros(f.shape, part.dtype)
     nodes = np.arange(NEAR) - NEAR // 2 + 1
     for k in range(NEAR):
         others = np.delete(nodes, k)
-        weight = float(1 / np.prod(nodes[k] - others)) * jnp.ones_like(part)
+        weight = jnp.full_like(part, 1 / np.prod(nodes[k] - others))
         for other in others:
             weight = weight * (part - float(other))
-        value = value + weight * table[index + k]
-    return jnp.where(f < 0, jnp.conj(value), value)
+        entry = table[index + k]
+        real, imaginary = real + weight * entry.real, imaginary + weight * entry.imag
+    return jax.lax.complex(real, jnp.where(f < 0, -imaginary, imaginary))
 
 
 @functools.partial(jax.jit, static_argnums=2)
@@ -91,6 +92,7 @@ def lattice_misfits(pairs: Array, table: Sums, order: int) -> Float[Array, " pai
         window = rows(table.window, pair, 2 * FIRST, 2 * order)
         side = jnp.conj(rows(table.data, pair, FIRST, order).ravel())
         gram = window[dj, dk]
+        # Columns that the times do not tell apart.
         gram = gram + 1e-7 * window[2 * FIRST, 2 * order] * jnp.eye(js.size, dtype=gram.dtype)
         factor = jax.scipy.linalg.cho_factor(gram, lower=True)
         c = jax.scipy.linalg.cho_solve(factor, side)

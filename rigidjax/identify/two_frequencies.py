@@ -10,26 +10,15 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from rigidjax import _checks
-from rigidjax.identify.lattice_series import (
-    BATCH,
-    FIRST,
-    Sums,
-    filled,
-    misfits_of,
-    side_peaks,
-    sums,
-)
+from rigidjax.identify.frequency_aliases import apart, distinct, refined, with_aliases
+from rigidjax.identify.lattice_series import BATCH, FIRST, Sums, filled, misfits_of, sums
 
 # Lines through which pairs are laid, and the grid of the first frequency, in 1/span.
 LINES, STEP = 3, 0.1
 # How far up the second frequency is looked for, over the highest of these lines.
 SECOND = 1.5
-# Pairs nearer than that, in 1/span, are one.
-NEAR = 0.25
 # How many pairs are refined for each that is wanted.
 TRIED = 2
-# Pairs whose aliases are tried, in at most so many rounds.
-SEEDS, ROUNDS = 16, 3
 # Squares of what is larger may overflow; a spectrum of more lines takes hours.
 LARGEST, MOST = 1e100, 1e5
 # Programs are compiled for times in multiples of so many.
@@ -131,10 +120,10 @@ def two_frequencies(
     highest = SECOND * float(lines[:LINES].max())
     # All multiples of a pair, and what a step of the refinement adds.
     table = sums(light, 2 * (FIRST + order) * (highest + 1.0))
-    pairs = _apart(*_scan(table, lines, order), count * TRIED)
-    pairs, misfits = _refined(table, pairs, order)
-    pairs, misfits = _with_aliases(table, pairs, misfits, highest, order)
-    keep = _distinct(pairs, misfits, count)
+    pairs = apart(*_scan(table, lines, order), count * TRIED)
+    pairs, misfits = refined(table, pairs, order)
+    pairs, misfits = with_aliases(table, pairs, misfits, highest, order)
+    keep = distinct(pairs, misfits, count)
     dof = t.size - unknowns
     best = max(float(misfits[keep[0]]), 1e-300)
     scatter = float(np.sqrt(best / dof / np.mean(1.0 / sigma**2)))
@@ -197,70 +186,3 @@ def _scan(table: Sums, lines: np.ndarray, order: int) -> tuple[np.ndarray, np.nd
     pairs = np.concatenate(rows)
     pairs = pairs[(pairs[:, 1] > 0.5) & (pairs[:, 1] < SECOND * highest)]
     return pairs, misfits_of(table, pairs, order)
-
-
-def aliases_of(pairs: np.ndarray, peaks: np.ndarray) -> np.ndarray:
-    """Pairs (M, 2) that may be behind the same readings: moved by side peaks, and related ones.
-
-    A line of 2 f₁ that is off by a peak means an f₁ that is off by half of it.
-    """
-    moves = np.unique(np.concatenate([[0.0], *((p, -p, p / 2, -p / 2) for p in peaks)]))
-    first, second = pairs.T[:, :, None]
-    moved = [
-        np.stack([first + a, second + b], axis=-1) for a in moves for b in moves if a != 0 or b != 0
-    ]
-    related = ((first / 2, second), (2 * first, second), (first, second / 2), (first, 2 * second))
-    related += ((first, second + first), (first, second - first))
-    rows = [*moved, *(np.stack(one, axis=-1) for one in related)]
-    # (f₁, −f₂) makes the same lines.
-    return np.abs(np.concatenate(rows).reshape(-1, 2))
-
-
-def _with_aliases(
-    table: Sums, pairs: np.ndarray, misfits: np.ndarray, highest: float, order: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """The pairs, and aliases of the best of them: in rounds, as long as a better one is found."""
-    peaks = side_peaks(table, highest)
-    around = 0.2 * np.array([(a, b) for a in (-1, 0, 1) for b in (-1, 0, 1)], float)
-    for _ in range(ROUNDS):
-        seeds = pairs[_distinct(pairs, misfits, SEEDS)]
-        more = aliases_of(seeds, peaks)
-        more = (more[:, None] + around).reshape(-1, 2)
-        more = more[((more > 0.5) & (more < highest)).all(axis=1)]
-        if not len(more):
-            break
-        more, new = _refined(table, _apart(more, misfits_of(table, more, order), 2 * SEEDS), order)
-        before = misfits.min()
-        pairs, misfits = np.concatenate([pairs, more]), np.concatenate([misfits, new])
-        if not new.min() < before * (1 - 1e-3):
-            break
-    return pairs, misfits
-
-
-def _apart(pairs: np.ndarray, misfits: np.ndarray, count: int) -> np.ndarray:
-    return pairs[_distinct(pairs, misfits, count)]
-
-
-def _distinct(pairs: np.ndarray, misfits: np.ndarray, count: int) -> list[int]:
-    kept: list[int] = []
-    for index in np.argsort(misfits)[:20_000]:
-        if not kept or np.abs(pairs[kept] - pairs[index]).max(axis=1).min() > NEAR:
-            kept.append(int(index))
-        if len(kept) == count:
-            break
-    return kept
-
-
-def _refined(table: Sums, pairs: np.ndarray, order: int) -> tuple[np.ndarray, np.ndarray]:
-    """Downhill from neighbour to neighbour, the steps shorter where none is lower."""
-    steps = np.array([(a, b) for a in (-1, 0, 1) for b in (-1, 0, 1)], float)
-    size = np.full(len(pairs), 0.08)
-    least = np.full(len(pairs), np.inf)
-    for _ in range(9):
-        around = pairs[:, None] + size[:, None, None] * steps
-        found = misfits_of(table, around.reshape(-1, 2), order).reshape(len(pairs), -1)
-        best = found.argmin(axis=1)
-        least = found.min(axis=1)
-        pairs = pairs + size[:, None] * steps[best]
-        size = np.where(best == 4, 0.4 * size, size)
-    return pairs, least
