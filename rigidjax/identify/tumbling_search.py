@@ -19,11 +19,8 @@ from rigidjax.identify.two_frequencies import BLOCK, TwoFrequencies
 from rigidjax.motion.torques.base import vector_at
 from rigidjax.rotation import quaternion
 
-# Starts of the first round at a time, how many times at least, and steps; those that go on, and how
-# far. With fewer the right pair of a round body ends in a minimum of another shape.
-FIRST, TIMES, STEPS, SECOND, MORE = 96, 2, 16, 60, 60
-# Bodies of the grid for each reading of each pair.
-BODIES = 6
+# Starts of the first round, its steps; those that go on, and how far.
+FIRST, STEPS, SECOND, MORE = 96, 12, 24, 60
 # Step of the differences, of numbers of order one.
 DIFFERENCE = 1e-6
 # Magnitudes to the logarithm of a flux.
@@ -73,13 +70,13 @@ def starts_of(
     best_of, others = [], []
     for pair in found.frequencies[:used]:
         for mode in tumbling_starts.MODES:
-            some = tumbling_starts.candidates(pair, mode, light, half_way, areas, BODIES)
+            some = tumbling_starts.candidates(pair, mode, light, half_way, areas, 3)
             # Of each reading of each pair one: which of them is true a grid alone cannot tell.
             best_of += some[: len(tumbling_starts.ABOUT)]
             others += some[len(tumbling_starts.ABOUT) :]
     best_of.sort(key=lambda one: one.misfit)
     others.sort(key=lambda one: one.misfit)
-    chunks = max(TIMES, -(-len(best_of) // FIRST))
+    chunks = max(1, -(-len(best_of) // FIRST))
     all_of = (best_of + others)[: chunks * FIRST]
     turn = _turn(order)
     return [_parameters(problem, one, turn) for one in all_of]
