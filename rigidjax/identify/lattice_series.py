@@ -31,7 +31,7 @@ class Sums(NamedTuple):
     total: Float[Array, ""]
 
 
-def sums(light: tuple[Array, Array, Array], highest: float) -> Sums:
+def sums(light: tuple[Array, ...], highest: float) -> Sums:
     """The table up to a frequency, 1/span.
 
     **Arguments:** `light` times over the span, from 0 to 1, values over the noise, and ones over
@@ -40,7 +40,8 @@ def sums(light: tuple[Array, Array, Array], highest: float) -> Sums:
     size = math.ceil(highest * DENSE) + 2 * NEAR
     grid = (np.arange(-(-size // ROWS) * ROWS) - NEAR // 2) / DENSE
     x, z, w = light
-    return Sums(*_table(jnp.asarray(grid, x.dtype), x, z, w), jnp.sum(z * z))
+    window, data = _table(jnp.asarray(grid, x.dtype), x, z, w)
+    return Sums(window, data, jnp.sum(z * z))
 
 
 @jax.jit
@@ -48,7 +49,11 @@ def _table(grid: Array, x: Array, z: Array, w: Array) -> tuple[Array, Array]:
     def one(f: Array) -> tuple[Array, Array]:
         angle = 2.0 * math.pi * f * (x - 0.5)
         cos, sin = jnp.cos(angle), jnp.sin(angle)
-        return tuple(jax.lax.complex(jnp.sum(v * cos), jnp.sum(v * sin)) for v in (w * w, w * z))  # pyright: ignore
+        squares, values = w * w, w * z
+        return (
+            jax.lax.complex(jnp.sum(squares * cos), jnp.sum(squares * sin)),
+            jax.lax.complex(jnp.sum(values * cos), jnp.sum(values * sin)),
+        )
 
     return jax.lax.map(one, grid, batch_size=BATCH)
 
@@ -85,7 +90,8 @@ def lattice_misfits(pairs: Array, table: Sums, order: int) -> Float[Array, " pai
     def rows(values: Array, pair: Array, first: int, second: int) -> Array:
         """Sums (2 first + 1, 2 second + 1) of all multiples; half of them are conjugates."""
         m, n = np.arange(first + 1.0), np.arange(-second, second + 1.0)
-        half = _at(values, m[:, None] * pair[0] + n[None, :] * pair[1])
+        f = jnp.asarray(m[:, None]) * pair[0] + jnp.asarray(n[None, :]) * pair[1]
+        half = _at(values, f)
         return jnp.concatenate([jnp.conj(half[:0:-1, ::-1]), half])
 
     def one(pair: Array) -> Array:

@@ -66,7 +66,7 @@ def daily(seed):
 
 def test_daily_aliases_of_a_pair_are_tried():
     t, y, pair, day = daily(0)
-    found = two_frequencies(t, y, 0.1)
+    found = two_frequencies(t, y, 0.1, shortest=2 * tumblers.HOUR)
     fits = found.misfits < found.misfits[0] + 5.0
     near = np.abs(found.frequencies - pair).max(axis=1) < 0.05 / t[-1]
     assert (near & fits).any() and abs(found.misfits[0] - found.dof) < 5 * np.sqrt(2 * found.dof)

@@ -18,7 +18,7 @@ from rigidjax import identify
 from rigidjax.identify import Brightness, two_frequencies
 
 sys.path.insert(0, str(Path(__file__).parent))
-import tumblers  # noqa: E402
+import tumblers
 
 MINUTE, HOUR, DAY = 60.0, 3600.0, 86400.0
 NOISE = 0.02
