@@ -1,7 +1,9 @@
 """Checks at public boundaries: what was wanted, what came, and the likely cause (floor 0)."""
 
 import functools
+import inspect
 import os
+import re
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
@@ -184,11 +186,32 @@ def single(
 
 
 def function(value: Any, name: str, of: str, *, hint: str = "") -> Any:
-    """Return `value` if it can be called, and is no class; `of` says what of: "t → (3,)"."""
+    """Return `value` if it can be called, and is no class; `of` says what of: "t → (3,)".
+
+    Where `of` begins with a list of arguments, "(t, state, body) → scalar", as many are wanted.
+    """
     if callable(value) and not isinstance(value, type):
+        listed = re.match(r"\w*\(([^()]*)\)", of)
+        if listed is not None and not _takes(value, len(listed[1].split(","))):
+            raise TypeError(
+                f"{name}: wanted a function {of}, got one with other arguments: "
+                f"{inspect.signature(value)}" + (f"; {hint}" if hint else "")
+            )
         return value
     found = f"the class {value.__name__}" if isinstance(value, type) else type(value).__name__
     raise TypeError(f"{name}: wanted a function {of}, got {found}" + (f"; {hint}" if hint else ""))
+
+
+def _takes(value: Any, count: int) -> bool:
+    """Whether a function can be called with so many arguments, as far as it says."""
+    try:
+        inspect.signature(value).bind(*[None] * count)
+    except TypeError:
+        return False
+    except ValueError:
+        # Some functions written in C have no signature.
+        return True
+    return True
 
 
 def whole(value: Any, name: str, least: int) -> int:

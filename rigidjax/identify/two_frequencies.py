@@ -1,6 +1,5 @@
 """Two frequencies behind a light curve: the Fourier series in both that fits best."""
 
-import functools
 import math
 from typing import Any
 
@@ -11,19 +10,19 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from rigidjax import _checks
+from rigidjax.identify.frequency_aliases import apart, distinct, refined, with_aliases
+from rigidjax.identify.lattice_series import BATCH, FIRST, Sums, filled, misfits_of, sums
 
-# Multiples of the first frequency: a brightness squared is of second order in directions.
-FIRST = 2
 # Lines through which pairs are laid, and the grid of the first frequency, in 1/span.
 LINES, STEP = 3, 0.1
-# Pairs nearer than that, in 1/span, are one.
-NEAR = 0.25
+# How far up the second frequency is looked for, over the highest of these lines.
+SECOND = 1.5
 # How many pairs are refined for each that is wanted.
 TRIED = 2
 # Squares of what is larger may overflow; a spectrum of more lines takes hours.
 LARGEST, MOST = 1e100, 1e5
-# Programs are compiled for times in multiples of so many, and for so many pairs at a time.
-BLOCK, BATCH, FEW, MANY = 256, 32, 256, 2048
+# Programs are compiled for times in multiples of so many.
+BLOCK = 256
 
 
 class TwoFrequencies(eqx.Module):
@@ -59,8 +58,10 @@ def two_frequencies(
     """Pairs (f₁, f₂) whose Fourier series fit best: `Σ c_jk exp 2πi (j f₁ + k f₂) t`, |j| ≤ 2.
 
     Where the spectrum has its three strongest lines one of them must be j f₁ + k f₂; along these
-    curves all pairs are tried, then the best ones are refined. A set of lines has several pairs
-    that make it: all that fit are returned, for a motion to choose among them.
+    curves all pairs are tried, then the best ones are refined. Then their aliases are tried: either
+    frequency, or both, moved by a side peak of the spectral window (readings at night have such
+    peaks at one and two a day) or by half of it, halved, doubled, or f₂ by f₁. A set of lines has
+    several pairs that make it: all that fit are returned, for a motion to choose among them.
 
     **Arguments:** `t` (T,) increasing times, s, gaps allowed; `values` (T,) fluxes or their
     squares; `noise` their standard deviation, one or (T,), `None` if it is not known; `order` k up
@@ -116,9 +117,13 @@ def two_frequencies(
         )
     light = _padded((t - t[0]) / span, y / sigma, 1.0 / sigma)
     lines = strongest(light, span / least, 2 * LINES)
-    pairs = _apart(*_scan(light, lines, order), count * TRIED)
-    pairs, misfits = _refined(light, pairs, order)
-    keep = _distinct(pairs, misfits, count)
+    highest = SECOND * float(lines[:LINES].max())
+    # All multiples of a pair, and what a step of the refinement adds.
+    table = sums(light, 2 * (FIRST + order) * (highest + 1.0))
+    pairs = apart(*_scan(table, lines, order), count * TRIED)
+    pairs, misfits = refined(table, pairs, order)
+    pairs, misfits = with_aliases(table, pairs, misfits, highest, order)
+    keep = distinct(pairs, misfits, count)
     dof = t.size - unknowns
     best = max(float(misfits[keep[0]]), 1e-300)
     scatter = float(np.sqrt(best / dof / np.mean(1.0 / sigma**2)))
@@ -138,7 +143,7 @@ def strongest(light: Any, highest: float, count: int) -> np.ndarray:
     x, z, w = (np.asarray(v) for v in light)
     found = []
     for _ in range(count):
-        line, curve = (np.asarray(v) for v in _spectrum(jnp.asarray(_filled(grid)), x, z, w))
+        line, curve = (np.asarray(v) for v in _spectrum(jnp.asarray(filled(grid)), x, z, w))
         found.append(float(line))
         z = z - w * curve
     return np.array(found)
@@ -166,97 +171,18 @@ def _spectrum(grid: Array, x: ArrayLike, z: ArrayLike, w: ArrayLike) -> tuple[Ar
     return grid[best], curve
 
 
-@functools.partial(jax.jit, static_argnums=2)
-def lattice_misfits(pairs: Array, light: Any, order: int) -> Float[Array, " pairs"]:
-    """χ² of the series of each pair (P, 2), in 1/span.
-
-    The normal matrix of all exponentials has but few different entries: the sums of
-    `w² exp 2πi (m f₁ + n f₂) t` over the times.
-    """
-    x, z, w = light
-    js, ks = np.meshgrid(np.arange(-FIRST, FIRST + 1), np.arange(-order, order + 1), indexing="ij")
-    js, ks = js.ravel(), ks.ravel()
-    dj, dk = js[None, :] - js[:, None] + 2 * FIRST, ks[None, :] - ks[:, None] + 2 * order
-    total = jnp.sum(z * z)
-    squares, sides = (jax.lax.complex(v, jnp.zeros_like(v)) for v in (w * w, w * z))
-
-    def powers(f: Array, most: int) -> Array:
-        angle = 2.0 * math.pi * jnp.mod(f * x, 1.0)
-        turn = jax.lax.complex(jnp.cos(angle), jnp.sin(angle))
-        up = [jnp.ones_like(turn), turn]
-        for _ in range(most - 1):
-            up.append(up[-1] * turn)
-        return jnp.stack([jnp.conj(v) for v in reversed(up[1:])] + up)
-
-    def one(pair: Array) -> Array:
-        first, second = powers(pair[0], 2 * FIRST), powers(pair[1], 2 * order)
-        window = (first * squares[None, :]) @ second.T
-        seen = (first[FIRST : 3 * FIRST + 1] * sides[None, :]) @ second[order : 3 * order + 1].T
-        gram = window[dj, dk]
-        gram = gram + 1e-7 * window[2 * FIRST, 2 * order] * jnp.eye(js.size, dtype=gram.dtype)
-        side = jnp.conj(seen.ravel())
-        factor = jax.scipy.linalg.cho_factor(gram, lower=True)
-        c = jax.scipy.linalg.cho_solve(factor, side)
-        return total - jnp.real(jnp.conj(side) @ c)
-
-    return jax.lax.map(one, pairs, batch_size=BATCH)
-
-
-def _filled(rows: np.ndarray) -> np.ndarray:
-    """Rows repeated up to one of few lengths: fewer programs to compile."""
-    size = FEW if len(rows) <= FEW else -(-len(rows) // MANY) * MANY
-    return np.concatenate([rows, np.repeat(rows[:1], size - len(rows), axis=0)])
-
-
-def _misfits(light: Any, pairs: np.ndarray, order: int) -> np.ndarray:
-    out = []
-    for first in range(0, len(pairs), MANY):
-        some = pairs[first : first + MANY]
-        found = lattice_misfits(jnp.asarray(_filled(some)), light, order)
-        out.append(np.asarray(found)[: len(some)])
-    return np.concatenate(out)
-
-
-def _scan(light: Any, lines: np.ndarray, order: int) -> tuple[np.ndarray, np.ndarray]:
+def _scan(table: Sums, lines: np.ndarray, order: int) -> tuple[np.ndarray, np.ndarray]:
     """All pairs of which one of the lines is made, and their misfits."""
     highest = float(lines[:LINES].max())
     grid = np.arange(0.5, 0.8 * highest + 0.5, STEP)
+    whole = np.arange(0.5, SECOND * highest, STEP)
     rows = []
     for line in lines[:LINES]:
         rows.append(np.stack([grid, np.full(grid.shape, line)], axis=1))
         for j in (1, 2):
-            rows.append(np.stack([np.full(grid.shape, line / j), grid], axis=1))
+            rows.append(np.stack([np.full(whole.shape, line / j), whole], axis=1))
             for second in (line - j * grid, j * grid - line, line + j * grid):
                 rows.append(np.stack([grid, second], axis=1))
     pairs = np.concatenate(rows)
-    pairs = pairs[(pairs[:, 1] > 0.5) & (pairs[:, 1] < 1.5 * highest)]
-    return pairs, _misfits(light, pairs, order)
-
-
-def _apart(pairs: np.ndarray, misfits: np.ndarray, count: int) -> np.ndarray:
-    return pairs[_distinct(pairs, misfits, count)]
-
-
-def _distinct(pairs: np.ndarray, misfits: np.ndarray, count: int) -> list[int]:
-    kept: list[int] = []
-    for index in np.argsort(misfits)[:20_000]:
-        if not kept or np.abs(pairs[kept] - pairs[index]).max(axis=1).min() > NEAR:
-            kept.append(int(index))
-        if len(kept) == count:
-            break
-    return kept
-
-
-def _refined(light: Any, pairs: np.ndarray, order: int) -> tuple[np.ndarray, np.ndarray]:
-    """Downhill from neighbour to neighbour, the steps shorter where none is lower."""
-    steps = np.array([(a, b) for a in (-1, 0, 1) for b in (-1, 0, 1)], float)
-    size = np.full(len(pairs), 0.08)
-    least = np.full(len(pairs), np.inf)
-    for _ in range(9):
-        around = pairs[:, None] + size[:, None, None] * steps
-        found = _misfits(light, around.reshape(-1, 2), order).reshape(len(pairs), -1)
-        best = found.argmin(axis=1)
-        least = found.min(axis=1)
-        pairs = pairs + size[:, None] * steps[best]
-        size = np.where(best == 4, 0.4 * size, size)
-    return pairs, least
+    pairs = pairs[(pairs[:, 1] > 0.5) & (pairs[:, 1] < SECOND * highest)]
+    return pairs, misfits_of(table, pairs, order)
