@@ -15,7 +15,7 @@ from rigidjax import _checks
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.exact import FreeBody
 from rigidjax.motion import Attitude, Rigid
-from rigidjax.motion.coupled import motion_of, started
+from rigidjax.motion.coupled import Coupled, started
 from rigidjax.motion.torques import Torque
 from rigidjax.solve import equations_of_motion, fixed, simulate, solvers
 
@@ -35,7 +35,10 @@ class AbstractIntegrator(eqx.Module):
 
     @abc.abstractmethod
     def states(self, body: Any, state0: Any, ts: Float[Array, " times"], torque: Torque) -> Any:
-        """The states at `ts`, with a leading time axis."""
+        """The states at `ts`, with a leading time axis.
+
+        Under a law with states of its own a `rigidjax.Coupled` of them, where a sensor needs them.
+        """
 
 
 class FixedSteps(AbstractIntegrator):
@@ -58,7 +61,7 @@ class FixedSteps(AbstractIntegrator):
     def states(self, body: Any, state0: Any, ts: Float[Array, " times"], torque: Torque) -> Any:
         y0 = started(body, state0, torque, ts[0])
         field = equations_of_motion(body, y0, torque)
-        return motion_of(fixed(solvers.Tsitouras5(), field, ts, y0, self.substeps))
+        return fixed(solvers.Tsitouras5(), field, ts, y0, self.substeps)
 
 
 class Adaptive(AbstractIntegrator):
@@ -89,7 +92,7 @@ class Adaptive(AbstractIntegrator):
             adjoint=dfx.ForwardMode(),
             throw=False,
         )
-        return out.ys
+        return out.ys if out.own is None else Coupled(out.ys, out.own)
 
 
 def integrator_for(widest: float, rate: float) -> AbstractIntegrator:
