@@ -17,14 +17,14 @@ from rigidjax.identify.result import Fit, Start
 
 def assess(
     problem: Problem,
-    value: Parameters,
-    done: bool,
+    best: Tried,
     noise: Noise,
     tried: list[Tried],
     best_cost: float,
 ) -> Fit:
-    """The `Fit` of the best point `value`, reached or not (`done`), among all that were tried."""
-    linear = uncertainty.linearise(problem, value, noise)
+    """The `Fit` of the best point, converged or not, among all that were tried."""
+    value, done = best.parameters, bool(best.converged)
+    linear = uncertainty.linearise(problem, value, noise, best.found)
     cut = at_limit(problem.records.readings)
     times = uncertainty.correlation_times(linear, cut)
     spread = uncertainty.spread(linear, times)

@@ -6,6 +6,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
@@ -22,6 +23,8 @@ CAREFUL, BOLD = 1.0, 1e-3
 LONGEST = 2.0
 # A step this little damped is one of Gauss and Newton.
 FREE = 1e-2
+# How near one the ratio of what a step gained to what it was to gain is where a problem is linear.
+LINEAR = 0.05
 # Damping beyond which nothing moves.
 STUCK = 1e12
 
@@ -33,15 +36,16 @@ class Settings(eqx.Module):
     at rest) end it; `damping` at the start; `steps` how many at most.
     """
 
-    tolerance: Float[Array, ""]
-    damping: Float[Array, ""]
-    steps: Int[Array, ""]
+    tolerance: Any
+    damping: Any
+    steps: Any
 
     def __init__(self, tolerance: float, damping: float, steps: int):
+        # NumPy's: outside of a trace each conversion of JAX costs as much as a run of 100 steps.
         kind = jnp.result_type(float)
-        self.tolerance = jnp.asarray(tolerance, kind)
-        self.damping = jnp.asarray(damping, kind)
-        self.steps = jnp.asarray(steps, jnp.int32)
+        self.tolerance = np.asarray(tolerance, kind)
+        self.damping = np.asarray(damping, kind)
+        self.steps = np.asarray(steps, np.int32)
 
 
 class Search(eqx.Module):
@@ -50,7 +54,7 @@ class Search(eqx.Module):
     **Fields:** `point` (n,) the best so far, its `cost`, the normal matrix `gram` (n, n) and the
     gradient `slope` (n,) there; `trial` (n,) what is to be tried next, `hoped` how much lower it
     ought to be; `damping`; `taken` evaluations; `done`, `converged`; `found` what the last
-    evaluation gave (see `with_blocks`).
+    evaluation gave (see `with_blocks`), `here` whether that was at `point`.
     """
 
     point: Float[Array, " n"]
@@ -64,6 +68,7 @@ class Search(eqx.Module):
     done: Bool[Array, ""]
     converged: Bool[Array, ""]
     found: Any
+    here: Bool[Array, ""]
 
 
 def descend(
@@ -129,6 +134,8 @@ def search(
         better = finite & ((cost < now.cost) | first)
         ratio = (now.cost - cost) / jnp.where(now.hoped > 0, now.hoped, 1.0)
         grown = jnp.where(ratio > 0.75, 0.1, jnp.where(ratio > 0.25, 0.5, 2.0))
+        # Where the misfit falls as the linear problem's does, damping only makes steps short.
+        grown = jnp.where(jnp.abs(ratio - 1.0) < LINEAR, 0.01, grown)
         damping = now.damping * jnp.where(first, 1.0, jnp.where(better, grown, 8.0))
         damping = jnp.maximum(damping, 1e-12)
         point, cost, gram, slope = jax.tree.map(
@@ -168,6 +175,7 @@ def search(
             done,
             converged,
             found,
+            better,
         )
 
     begun = Search(
@@ -177,11 +185,12 @@ def search(
         jnp.zeros(number, kind),
         start,
         jnp.zeros((), kind),
-        settings.damping.astype(kind),
+        jnp.asarray(settings.damping, kind),
         jnp.zeros((), jnp.int32),
         jnp.asarray(False),
         jnp.asarray(False),
         nothing,
+        jnp.asarray(False),
     )
     return lax.while_loop(lambda now: ~now.done & (now.taken <= settings.steps), step, begun)
 

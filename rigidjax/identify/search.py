@@ -1,5 +1,6 @@
 """Where the misfit is least: Levenberg–Marquardt from several starts, the record from its start."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -44,11 +45,16 @@ def least_squares(
 ) -> Tried:
     """At most `max_steps` steps from `start`."""
     settings = Settings(tolerance, damping, max_steps)
-    value, end = _descend(start, problem, noise, weights, settings)
-    return _safe(start, value, end.cost, end.converged)
+    tried, end = _descend(start, problem, noise, weights, settings)
+    return dataclasses.replace(tried, found=end.found) if bool(end.here) else tried
 
 
-_descend = eqx.filter_jit(descend)
+@eqx.filter_jit
+def _descend(
+    start: Parameters, problem: Problem, noise: Noise, weights: Array, settings: Settings
+) -> tuple[Tried, Search]:
+    value, end = descend(start, problem, noise, weights, settings)
+    return _safe(start, value, end.cost, end.converged), end
 
 
 def evaluate(parameters: Parameters, problem: Problem) -> Any:
@@ -56,11 +62,12 @@ def evaluate(parameters: Parameters, problem: Problem) -> Any:
 
     By the program of the search, which is the only one that follows the motion.
     """
+    kind = problem.records.t.dtype
     noise = tuple(
-        jnp.ones((problem.count, reading.sensor.components), problem.records.t.dtype)
+        jnp.asarray(np.ones((problem.count, reading.sensor.components), kind))
         for reading in problem.records.readings
     )
-    return _at(parameters, problem, noise, jnp.ones_like(problem.records.t)).found
+    return _at(parameters, problem, noise, whole(problem)).found
 
 
 def _at(parameters: Parameters, problem: Problem, noise: Noise, weights: Array) -> Search:
@@ -93,7 +100,7 @@ def _safe(start: Parameters, value: Parameters, cost: Array, done: Array) -> Tri
 
 def cost_of(parameters: Parameters, problem: Problem, noise: Noise) -> float:
     """The misfit over the whole of the records."""
-    return float(_at(parameters, problem, noise, jnp.ones_like(problem.records.t)).cost)
+    return float(_at(parameters, problem, noise, whole(problem)).cost)
 
 
 def misfit(parameters: Parameters, args: Any) -> Float[Array, ""]:
@@ -115,11 +122,17 @@ def solver_for(tolerance: float) -> optx.LevenbergMarquardt:
     return optx.LevenbergMarquardt(rtol=jnp.asarray(1e-12), atol=limit)  # pyright: ignore
 
 
-def horizons(problem: Problem) -> tuple[Float[Array, "records times"], ...]:
-    """Weights that show the first quarter, the first half and the whole of each record."""
-    t = problem.records.t
+def whole(problem: Problem) -> Float[Array, "records times"]:
+    """Weights that show all of each record."""
+    # By NumPy: outside of a trace each operation of JAX costs as much as a run of 100 steps.
+    return jnp.asarray(np.ones(problem.records.t.shape, problem.records.t.dtype))
+
+
+def horizon(problem: Problem, part: float) -> Float[Array, "records times"]:
+    """Weights that show this part of each record, from its beginning."""
+    t = np.asarray(problem.records.t)
     since, length = t - t[:, :1], t[:, -1:] - t[:, :1]
-    return tuple((since <= part * length).astype(t.dtype) for part in HORIZONS)
+    return jnp.asarray((since <= part * length).astype(t.dtype))
 
 
 def settle(
@@ -160,7 +173,7 @@ def settle(
         # At the very bottom round-off refuses every step: whether it moved is what counts.
         stands = before - float(tried.cost) < SETTLED * (1.0 + abs(before))
         settled = bool(tried.converged) or stands
-        tried = Tried(tried.parameters, tried.cost, jnp.asarray(settled))
+        tried = dataclasses.replace(tried, converged=jnp.asarray(settled))
         look(tried, strides, settled or first + STRIDE >= max_steps)
         if settled:
             break
@@ -187,9 +200,8 @@ def climb(
     """
     tried, start = _at_once(start, problem, noise, tolerance, max_steps)
     level = np.inf
-    for stage, seen in enumerate(horizons(problem)):
-        if stage < start.stage:
-            continue
+    for stage in range(start.stage, len(HORIZONS)):
+        seen = horizon(problem, HORIZONS[stage])
         if stage < len(HORIZONS) - 1:
             # A part of the record need not be fitted to the end, only to come near.
             count, before = min(STRIDE, max_steps), tried.parameters
@@ -217,9 +229,8 @@ def _at_once(
     """The start fitted to the whole record, if that explains it; else as it is."""
     if start.stage or start.strides:
         return start.tried, start
-    whole = jnp.ones_like(problem.records.t)
-    count = min(STRIDE, max_steps)
-    found = least_squares(start.tried.parameters, problem, noise, whole, tolerance, count, CAREFUL)
+    seen, count = whole(problem), min(STRIDE, max_steps)
+    found = least_squares(start.tried.parameters, problem, noise, seen, tolerance, count, CAREFUL)
     if not bool(found.converged) or float(found.cost) > _enough(problem):
         return start.tried, start
     return found, Position(len(HORIZONS) - 1, 1, found)
@@ -241,7 +252,8 @@ def climb_together(
 ) -> list[Tried]:
     """Many starts through the horizons in one `vmap` (a leading axis on `points`)."""
     tried, settings = None, Settings(tolerance, CAREFUL, max_steps)
-    for seen in horizons(problem):
+    for part in HORIZONS:
+        seen = horizon(problem, part)
         tried = many(points, problem, noise, seen, settings)
         points = tried.parameters
     assert tried is not None
