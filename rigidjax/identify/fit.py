@@ -27,6 +27,7 @@ from rigidjax.identify.search import (
     climb,
     climb_together,
     cost_of,
+    enough,
     fresh,
     least_squares,
     settle,
@@ -203,7 +204,10 @@ def _one_by_one(
                 keep.save(tried, position)
 
             start = keep.position if resumed else Position(0, 0, fresh(point))
-            out = climb(start, problem, noise, tolerance, max_steps, look=look)
+            # Once a start explains the record, others are only to show whether that is the one.
+            aim = min((float(item.cost) for item in tried if bool(item.converged)), default=np.inf)
+            aim = aim if aim <= enough(problem) else 0.0
+            out = climb(start, problem, noise, tolerance, max_steps, look=look, aim=aim)
             latest = [like]
             tried[:] = _with_one_found([*tried, out])
             keep.save(tried, Position(0, 0, like))
