@@ -144,7 +144,8 @@ def search(
         ratio = (now.cost - cost) / jnp.where(now.hoped > 0, now.hoped, 1.0)
         grown = jnp.where(ratio > 0.75, 0.1, jnp.where(ratio > 0.25, 0.5, 2.0))
         # Where the misfit falls as the linear problem's does, damping only makes steps short.
-        grown = jnp.where(jnp.abs(ratio - 1.0) < LINEAR, 0.01, grown)
+        linear = (jnp.abs(ratio - 1.0) < LINEAR) & (now.damping > FREE)
+        grown = jnp.where(linear, 0.01, grown)
         damping = now.damping * jnp.where(first, 1.0, jnp.where(better, grown, 8.0))
         damping = jnp.maximum(damping, 1e-12)
         fell = jnp.where(better & ~first, jnp.log(now.cost) - jnp.log(cost), 0.0)
