@@ -12,10 +12,10 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
 from rigidjax import _checks
-from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.identify.horizons import Horizons, between, kinds_of
 from rigidjax.identify.levenberg_marquardt import BOLD, Search, Settings, search
 from rigidjax.identify.open_loop import errors_by_horizon, open_loop_errors
+from rigidjax.identify.real_bodies import unreal
 from rigidjax.identify.window_starts import eliminated, moved, precisions, with_jacobian
 from rigidjax.identify.windows import Windows
 from rigidjax.motion.torques.inputs import delays_of, require_inputs
@@ -134,10 +134,8 @@ def fit_windows(
     deviation = np.sqrt(np.clip(np.diag(spread), 0, None))
     converged = bool(end.converged)
     message = [] if converged else [f"stopped after {taken} steps: its best point"]
-    try:
-        _require_real(scene(value)[0])
-    except ValueError as refused:
-        message.append(f"no real body has these numbers: {refused}")
+    wrong = unreal(scene(value)[0])
+    message += [] if wrong is None else [wrong]
     try:
         _require_delays(windows, scene(value)[1])
     except ValueError as refused:
@@ -168,21 +166,18 @@ def _require_windows(windows: Any) -> None:
 
 def _require_delays(windows: Windows, law: Any) -> None:
     """Raise `ValueError` for a delay beyond the inputs that the windows know."""
-    known = windows.before * windows.step
+    known, length = windows.before * windows.step, windows.length * windows.step
     for name, delay in delays_of(law):
+        if -float(delay) > length:
+            raise ValueError(
+                f"inputs[{name!r}]: a delay of {float(delay):.6g} s reaches beyond the end of "
+                f"windows of {length:.6g} s; is it in seconds?"
+            )
         if float(delay) > known:
             raise ValueError(
                 f"inputs[{name!r}]: a delay of {float(delay):.6g} s, and inputs that are known "
                 f"{known:.6g} s before a window: cut them with windows(…, before=k)"
             )
-
-
-def _require_real(body: Any) -> None:
-    """Raise `ValueError` for numbers that no body has: inside a trace nobody looked."""
-    if isinstance(body, MassProperties):
-        MassProperties(body.mass, body.com, body.second_moment)
-    else:
-        Inertia.from_tensor(body.tensor)
 
 
 def _scales(windows: Windows, noise: Mapping[str, float] | None) -> dict[str, Array]:
