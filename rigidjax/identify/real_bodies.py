@@ -22,7 +22,7 @@ def of_charts(charts: list[tuple[str, AbstractBodyChart]], bodies: list[Any]) ->
     """`unreal` of the bodies of charts that users wrote: every point of ours is a real body."""
     out = []
     for (name, chart), body in zip(charts, bodies, strict=True):
-        ours = type(chart).__module__.split(".")[0] == __package__.split(".")[0]
+        ours = type(chart).__module__ == AbstractBodyChart.__module__
         wrong = None if ours else unreal(body)
         if wrong is not None:
             out.append(wrong + name)
