@@ -1,6 +1,6 @@
 """How long fits of throws take, beside SciPy with numba and beside `mujoco.sysid`.
 
-    python tests/identify/bench_fit.py [--repeats 9] [--joint]
+    python tests/identify/bench_fit.py [--repeats 9] [--joint] [--many]
 
 One throw: 0.7 s at 1 kHz with a wheel inside, twelve free numbers (`Tensor`, rates, drag). All
 from the same start but where it says otherwise, times of the processor, medians of interleaved
@@ -9,9 +9,9 @@ repeats in one process, other readings each time; compile apart.
 - ours: `identify.fit` whole, with its assessment, intervals and the check of its steps;
 - SciPy: `least_squares` (method lm) with finite differences through a Runge–Kutta of order 4 at
   the same steps, its loop compiled by numba;
-- `mujoco.sysid.optimize` (its optimiser "scipy"; "mujoco" stops far away) on a smaller problem that MuJoCo has, too: a known torque in body axes,
-  nine numbers (inertia, rates), `mujoco.rollout` with its Runge–Kutta of order 4 at the same steps,
-  one thread; ours on the same.
+- `mujoco.sysid.optimize` (its optimiser "scipy"; "mujoco" stops far away from two of three starts)
+  on a smaller problem that MuJoCo has, too: a known torque in body axes, nine numbers (inertia,
+  rates), `mujoco.rollout` with its Runge–Kutta of order 4 at the same steps; ours on the same.
 
 What is not installed is left out. `--joint` adds all throws of the data beside the checkout as one
 problem (see `bench_throws.py`; minutes to compile), warm.
@@ -247,6 +247,16 @@ def cold():
         print(f"{kind}: {shown}; from nothing to the first fit {parts[4]:.1f}")
 
 
+def many(readings):
+    print("\n1000 starts in one vmap, 70 samples, free motion")
+    short = identify.Recording(T[::10], (identify.Gyro(SIGMA), readings[::10]))
+    ratios = identify.Problem(short, identify.PrincipalRatios())
+    for name in ("first call", "warm"):
+        begun = time.process_time()
+        identify.fit(ratios, starts=1000, together=1000)
+        print(f"{name}: {time.process_time() - begun:.1f} CPU s")
+
+
 def joint():
     """All throws of the data beside the checkout as one problem, twice."""
     places = Path(__file__).parent
@@ -270,6 +280,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--repeats", type=int, default=9)
     parser.add_argument("--joint", action="store_true")
+    parser.add_argument("--many", action="store_true")
     options = parser.parse_args()
     print("load of the machine:", os.getloadavg())
     body, count = rj.Inertia(MOMENTS), options.repeats + 2
@@ -306,14 +317,9 @@ def main():
     tasks["ours from the same start"] = same(driven)
     pushed = draws_of(body, rj.torques.ConstantTorque(TORQUE), min(count, 7), 1)
     table("a known torque, nine numbers", tasks, pushed, "mujoco.sysid")
-    print("\n1000 starts in one vmap, 70 samples, free motion")
-    short = identify.Recording(T[::10], (identify.Gyro(SIGMA), draws[0][::10]))
-    ratios = identify.Problem(short, identify.PrincipalRatios())
-    for name in ("first call", "warm"):
-        begun = time.process_time()
-        identify.fit(ratios, starts=1000, together=1000)
-        print(f"{name}: {time.process_time() - begun:.1f} CPU s")
     cold()
+    if options.many:
+        many(draws[0])
     if options.joint:
         joint()
 
