@@ -10,21 +10,22 @@ from rigidjax.identify.full_scale import at_limit
 from rigidjax.identify.goodness import goodness
 from rigidjax.identify.parameters import Parameters
 from rigidjax.identify.problem import Problem
-from rigidjax.identify.quantities import quantities as quantities_of
+from rigidjax.identify.quantities import charts, quantities as quantities_of
+from rigidjax.identify.real_bodies import of_charts
 from rigidjax.identify.residual import Noise
 from rigidjax.identify.result import Fit, Start
 
 
 def assess(
     problem: Problem,
-    value: Parameters,
-    done: bool,
+    best: Tried,
     noise: Noise,
     tried: list[Tried],
     best_cost: float,
 ) -> Fit:
-    """The `Fit` of the best point `value`, reached or not (`done`), among all that were tried."""
-    linear = uncertainty.linearise(problem, value, noise)
+    """The `Fit` of the best point, converged or not, among all that were tried."""
+    value, done = best.parameters, bool(best.converged)
+    linear = uncertainty.linearise(problem, value, noise, best.found)
     cut = at_limit(problem.records.readings)
     times = uncertainty.correlation_times(linear, cut)
     spread = uncertainty.spread(linear, times)
@@ -55,15 +56,20 @@ def assess(
         if s.fits and s.converged and s.cost > best_cost + 0.01 * margin and elsewhere(s.parameters)
     ]
     doubts = list(seen.doubts)
+    found = problem.bodies(value)
+    bodies = list(found.values()) if isinstance(found, dict) else [found]
+    unreal = of_charts(charts(problem), bodies)
+    doubts += unreal
     if not any(start.fits for start in starts):
         doubts.append("no single start came near the best point")
     if not np.isfinite(best_cost):
         status = "failed: no start gave a finite misfit"
     elif believable and not done:
-        status = "failed: not converged, max_steps reached; this is the best point found"
+        ended = "not converged, max_steps reached; this is the best point found"
+        status = "failed: " + "; ".join((ended, *unreal))
     elif not believable:
         units = "this is not the motion, or a unit is wrong (rad/s, m/s², m, s)"
-        status = "poor: " + "; ".join((*seen.poor, units))
+        status = "poor: " + "; ".join((*seen.poor, *unreal, units))
     elif rivals:
         rival = f"{len(rivals)} of {len(starts)} starts fit as well elsewhere"
         status = "ambiguous: " + "; ".join((rival, *doubts))

@@ -1,5 +1,6 @@
 """Where a search stands, kept in a file, so that a killed one goes on from there."""
 
+import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,11 +15,20 @@ from rigidjax.identify.parameters import Parameters
 
 
 class Tried(eqx.Module):
-    """Where one start ended: its parameters, misfit (½ Σ of squares), and whether it converged."""
+    """Where one start ended: its parameters, misfit (½ Σ of squares), and whether it converged.
+
+    `found` is what `with_blocks` gives at the parameters, where the search has just been there.
+    """
 
     parameters: Parameters
     cost: Float[Array, ""]
     converged: Bool[Array, ""]
+    found: Any = None
+
+
+def bare(tried: Tried) -> Tried:
+    """Without what takes room."""
+    return tried if tried.found is None else dataclasses.replace(tried, found=None)
 
 
 class Position(NamedTuple):
@@ -65,7 +75,8 @@ class Checkpoint:
         if self.path is None:
             return
         stage, strides, current = position
-        leaves = [np.asarray(x) for item in (*done, current) for x in jax.tree.leaves(item)]
+        items = [bare(item) for item in (*done, current)]
+        leaves = [np.asarray(x) for item in items for x in jax.tree.leaves(item)]
         beside = self.path.with_name(self.path.name + ".new")
         with beside.open("wb") as file:
             held: dict[str, Any] = {f"leaf{i}": leaf for i, leaf in enumerate(leaves)}

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from rigidjax import _checks
 from rigidjax.identify import uncertainty
 from rigidjax.identify.assessment import assess
-from rigidjax.identify.checkpoint import Checkpoint, Position, Tried, require_folder
+from rigidjax.identify.checkpoint import Checkpoint, Position, Tried, bare, require_folder
 from rigidjax.identify.initial_guess import starting_points
 from rigidjax.identify.jacobian import all_errors
 from rigidjax.identify.multiple_shooting import WIDTHS, joined, pieces as in_pieces, with_width
@@ -27,6 +27,7 @@ from rigidjax.identify.search import (
     climb,
     climb_together,
     cost_of,
+    enough,
     fresh,
     least_squares,
     settle,
@@ -107,7 +108,8 @@ def fit(
         raise ValueError("fit: a checkpoint goes with together=1, one start after another")
     if checkpoint is not None:
         require_folder(checkpoint)
-    points = starting_points(problem, starts, key)
+    given = (initial is not None) + (pieces > 1)
+    points = starting_points(problem, starts - given, key) if starts > given else []
     noise = _first_noise(problem)
     if descent is not None and not isinstance(descent, Descent):
         raise TypeError(
@@ -139,7 +141,7 @@ def fit(
         near = fresh(best.parameters)
         best = settle(near, problem, noise, whole, tolerance, max_steps, near=True)
         best, noise = _with_noise(problem, best, noise, tolerance, max_steps)
-    return assess(problem, best.parameters, bool(best.converged), noise, tried, lowest)
+    return assess(problem, best, noise, tried, lowest)
 
 
 def _with_noise(
@@ -202,9 +204,12 @@ def _one_by_one(
                 keep.save(tried, position)
 
             start = keep.position if resumed else Position(0, 0, fresh(point))
-            out = climb(start, problem, noise, tolerance, max_steps, look=look)
+            # Once a start explains the record, others are only to show whether that is the one.
+            aim = min((float(item.cost) for item in tried if bool(item.converged)), default=np.inf)
+            aim = aim if aim <= enough(problem) else 0.0
+            out = climb(start, problem, noise, tolerance, max_steps, look=look, aim=aim)
             latest = [like]
-            tried.append(out)
+            tried[:] = _with_one_found([*tried, out])
             keep.save(tried, Position(0, 0, like))
             _say(progress, number, len(points), tried)
     except KeyboardInterrupt:
@@ -213,6 +218,13 @@ def _one_by_one(
         if not tried:
             raise
     return tried
+
+
+def _with_one_found(tried: list[Tried]) -> list[Tried]:
+    """The same; only the lowest keeps its derivatives, which take room."""
+    costs = [float(item.cost) for item in tried]
+    lowest = int(np.argmin([cost if np.isfinite(cost) else np.inf for cost in costs]))
+    return [item if index == lowest else bare(item) for index, item in enumerate(tried)]
 
 
 def _together(
@@ -260,14 +272,14 @@ def _finer(problem: Problem, parameters: Parameters, noise: Noise) -> AbstractIn
     coarse = _errors_alone(parameters, problem)
     # Steps that were asked for are tried in any case.
     while count <= max(FINEST, steps.substeps):
-        finer: AbstractIntegrator = FixedSteps(2 * count)
+        finer: AbstractIntegrator = FixedSteps(2 * count, steps.solver)
         exact = _errors_alone(parameters, eqx.tree_at(lambda p: p.integrator, problem, finer))
         apart = max(
-            float(jnp.max(jnp.abs(a - b) / sigma[:, None]))
+            float(np.max(np.abs(np.asarray(a) - np.asarray(b)) / np.asarray(sigma)[:, None]))
             for a, b, sigma in zip(coarse, exact, noise, strict=True)
         )
         if apart <= 0.05:
-            return None if count == steps.substeps else FixedSteps(count)
+            return None if count == steps.substeps else FixedSteps(count, steps.solver)
         count, coarse = 2 * count, exact
     return Adaptive()
 

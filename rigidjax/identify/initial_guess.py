@@ -10,6 +10,7 @@ from jaxtyping import PRNGKeyArray
 
 from rigidjax._types import HasSpin
 from rigidjax.body.inertia import Inertia
+from rigidjax.identify import padding
 from rigidjax.identify.direct_estimates import rates
 from rigidjax.identify.parameters import Parameters
 from rigidjax.identify.problem import Problem
@@ -36,7 +37,7 @@ def starting_points(problem: Problem, count: int, key: PRNGKeyArray | None) -> l
     the shape over the whole chart and the rate by a tenth. What a `Free` moves starts as it is
     given.
     """
-    recordings = problem.recordings
+    recordings = padding.on_host(problem.records, problem.counts)
     if isinstance(problem.body, Bodies):
         found = {}
         for name in problem.body.names:
@@ -112,7 +113,7 @@ def _equations(recording: Recording) -> tuple[np.ndarray, np.ndarray] | None:
         felt: Any = getattr(recording.torque, "feels", None)
         if felt is not HasSpin or has_states(recording.torque):
             return None
-        pushed = np.asarray(_torques(recording.torque, jnp.asarray(t), jnp.asarray(w)))
+        pushed = np.asarray(_torques(recording.torque, t, w))
     stride = max(1, t.size // 60)
     momenta = np.einsum("kij,tj->tki", BASIS, w)
     flux = np.cross(w[:, None, :], momenta)

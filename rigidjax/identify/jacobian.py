@@ -18,6 +18,8 @@ from rigidjax.identify.reference_states import ReferenceStates
 from rigidjax.identify.sensors import SensorInput
 from rigidjax.identify.several_bodies import matter
 from rigidjax.motion import Attitude, Rigid, Spin
+from rigidjax.motion.coupled import Coupled, CoupledEquations, motion_of
+from rigidjax.motion.torques.states import freeze
 from rigidjax.rotation import quaternion
 from rigidjax.solve import equations_of_motion
 
@@ -52,7 +54,10 @@ def filled(problem: "Problem", mine: Local, record: Recording) -> Recording:
 def states_of_one(
     problem: "Problem", mine: Local, record: Recording, ref: ReferenceStates, which: Array | None
 ) -> tuple[Recording, Any, Any, Any]:
-    """One recording with its values filled in, its body, its first state and its states."""
+    """One recording with its values filled in, its body, its first state and its states.
+
+    Under a law with states of its own these are `Coupled`.
+    """
     record = filled(problem, mine, record)
     body = matter(problem.body, mine.body, which)
     state0 = first_state(problem.rung, mine, ref)
@@ -74,7 +79,9 @@ def errors_of_one(
     among several.
     """
     record, body, state0, states = states_of_one(problem, mine, record, ref, which)
-    field = equations_of_motion(_turned(problem, body), state0, record.torque)
+    turned = _turned(problem, body)
+    field = equations_of_motion(turned, state0, record.torque)
+    coupled = CoupledEquations(field, turned) if isinstance(states, Coupled) else field
     out = []
     for reading in record.readings:
         sensor = reading.sensor
@@ -85,10 +92,16 @@ def errors_of_one(
             if record.torque is None:
                 seen = free_states(body, state0, times - record.t[0])
             else:
-                seen = jax.vmap(lambda t, s, by=offset: shifted(field, t, s, by))(record.t, states)
+                seen = jax.vmap(lambda t, s, by=offset: shifted(coupled, t, s, by))(
+                    record.t, states
+                )
 
         def error(t: Array, state: Any, value: Array, sensor: Any = sensor) -> Array:
-            return _error_of(sensor, SensorInput(t, state, body, field), value)
+            if not isinstance(state, Coupled):
+                return _error_of(sensor, SensorInput(t, state, body, field), value)
+            own = state.own
+            now = SensorInput(t, state.motion, body, freeze(field, own), own)
+            return _error_of(sensor, now, value)
 
         lowpass = getattr(sensor, "lowpass", None)
         if lowpass is None:
@@ -98,7 +111,7 @@ def errors_of_one(
             shown = jax.vmap(error)(times, seen, jnp.zeros_like(reading.values))
             errors = reading.values + lowpass(times, shown)
         out.append(jnp.where(reading.mask[:, None], errors, 0.0))
-    return tuple(out), jax.tree.map(lambda leaf: leaf[-1], states)
+    return tuple(out), jax.tree.map(lambda leaf: leaf[-1], motion_of(states))
 
 
 def _error_of(sensor: Any, now: SensorInput, value: Array) -> Array:

@@ -6,6 +6,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
@@ -22,6 +23,11 @@ CAREFUL, BOLD = 1.0, 1e-3
 LONGEST = 2.0
 # A step this little damped is one of Gauss and Newton.
 FREE = 1e-2
+# How near one the ratio of what a step gained to what it was to gain is where a problem is linear.
+LINEAR = 0.05
+# Steps that a search may still be away from where another one ended; its pace is by how much the
+# logarithm of the misfit falls in a step, of the last ones half as much each as the one after it.
+PATIENCE, FIRST_PACE = 25.0, 4.0
 # Damping beyond which nothing moves.
 STUCK = 1e12
 
@@ -30,18 +36,23 @@ class Settings(eqx.Module):
     """How a search goes: arrays, so as not to compile again.
 
     **Fields:** `tolerance` steps of so many standard deviations (of each parameter with all others
-    at rest) end it; `damping` at the start; `steps` how many at most.
+    at rest) end it; `damping` at the start; `steps` how many at most; `aim` a misfit that was
+    reached elsewhere: the search ends where at its pace it would take more than `PATIENCE` steps
+    to come there; 0 for none.
     """
 
-    tolerance: Float[Array, ""]
-    damping: Float[Array, ""]
-    steps: Int[Array, ""]
+    tolerance: Any
+    damping: Any
+    steps: Any
+    aim: Any
 
-    def __init__(self, tolerance: float, damping: float, steps: int):
+    def __init__(self, tolerance: float, damping: float, steps: int, aim: float = 0.0):
+        # NumPy's: outside of a trace each conversion of JAX costs as much as a run of 100 steps.
         kind = jnp.result_type(float)
-        self.tolerance = jnp.asarray(tolerance, kind)
-        self.damping = jnp.asarray(damping, kind)
-        self.steps = jnp.asarray(steps, jnp.int32)
+        self.tolerance = np.asarray(tolerance, kind)
+        self.damping = np.asarray(damping, kind)
+        self.steps = np.asarray(steps, np.int32)
+        self.aim = np.asarray(aim, kind)
 
 
 class Search(eqx.Module):
@@ -49,8 +60,9 @@ class Search(eqx.Module):
 
     **Fields:** `point` (n,) the best so far, its `cost`, the normal matrix `gram` (n, n) and the
     gradient `slope` (n,) there; `trial` (n,) what is to be tried next, `hoped` how much lower it
-    ought to be; `damping`; `taken` evaluations; `done`, `converged`; `found` what the last
-    evaluation gave (see `with_blocks`).
+    ought to be; `damping`; `pace` by how much the logarithm of the cost falls in a step; `taken`
+    evaluations; `done`, `converged`; `found` what the last
+    evaluation gave (see `with_blocks`), `here` whether that was at `point`.
     """
 
     point: Float[Array, " n"]
@@ -60,10 +72,12 @@ class Search(eqx.Module):
     trial: Float[Array, " n"]
     hoped: Float[Array, ""]
     damping: Float[Array, ""]
+    pace: Float[Array, ""]
     taken: Int[Array, ""]
     done: Bool[Array, ""]
     converged: Bool[Array, ""]
     found: Any
+    here: Bool[Array, ""]
 
 
 def descend(
@@ -129,8 +143,13 @@ def search(
         better = finite & ((cost < now.cost) | first)
         ratio = (now.cost - cost) / jnp.where(now.hoped > 0, now.hoped, 1.0)
         grown = jnp.where(ratio > 0.75, 0.1, jnp.where(ratio > 0.25, 0.5, 2.0))
+        # Where the misfit falls as the linear problem's does, damping only makes steps short.
+        linear = (jnp.abs(ratio - 1.0) < LINEAR) & (now.damping > FREE)
+        grown = jnp.where(linear, 0.01, grown)
         damping = now.damping * jnp.where(first, 1.0, jnp.where(better, grown, 8.0))
         damping = jnp.maximum(damping, 1e-12)
+        fell = jnp.where(better & ~first, jnp.log(now.cost) - jnp.log(cost), 0.0)
+        pace = jnp.where(first, now.pace, 0.5 * (now.pace + fell))
         point, cost, gram, slope = jax.tree.map(
             lambda new, old: jnp.where(better, new, old),
             (now.trial, cost, gram, slope),
@@ -155,6 +174,7 @@ def search(
         converged = sound & (small | (bottom & ~better & ~first))
         lost = ~finite & first
         done = converged | lost | (damping > STUCK) | (~sound & (damping > 1.0))
+        done = done | ((settings.aim > 0) & (cost > settings.aim * jnp.exp(PATIENCE * pace)))
         damping = jnp.where(sound, damping, 8.0 * damping)
         return Search(
             point,
@@ -164,10 +184,12 @@ def search(
             point + move,
             hoped,
             damping,
+            pace,
             now.taken + 1,
             done,
             converged,
             found,
+            better,
         )
 
     begun = Search(
@@ -177,11 +199,13 @@ def search(
         jnp.zeros(number, kind),
         start,
         jnp.zeros((), kind),
-        settings.damping.astype(kind),
+        jnp.asarray(settings.damping, kind),
+        jnp.asarray(FIRST_PACE, kind),
         jnp.zeros((), jnp.int32),
         jnp.asarray(False),
         jnp.asarray(False),
         nothing,
+        jnp.asarray(False),
     )
     return lax.while_loop(lambda now: ~now.done & (now.taken <= settings.steps), step, begun)
 

@@ -52,14 +52,28 @@ def one(records: Any, index: int) -> Any:
     return jax.tree.map(pick, records)
 
 
+def on_host(records: Recording, counts: Sequence[int]) -> tuple[Recording, ...]:
+    """The recordings one by one, of NumPy's arrays: to be looked at, at no cost of JAX's."""
+    known = jax.tree.map(lambda leaf: np.asarray(leaf) if eqx.is_array(leaf) else leaf, records)
+
+    def pick(leaf: Any, index: int) -> Any:
+        return leaf[index] if isinstance(leaf, np.ndarray) else leaf
+
+    return tuple(
+        cut(jax.tree.map(lambda leaf, i=i: pick(leaf, i), known), count)
+        for i, count in enumerate(counts)
+    )
+
+
 def cut(recording: Recording, count: int) -> Recording:
     """A recording without what `stack` appended."""
     if recording.t.shape[0] == count:
         return recording
-    readings = tuple(
-        Reading(r.sensor, r.values[:count], r.mask[:count]) for r in recording.readings
-    )
-    return eqx.tree_at(lambda r: (r.t, r.readings), recording, (recording.t[:count], readings))
+
+    def long(r: Recording) -> list[Any]:
+        return [r.t, *(part for reading in r.readings for part in (reading.values, reading.mask))]
+
+    return eqx.tree_at(long, recording, [leaf[:count] for leaf in long(recording)])
 
 
 def _shapes(tree: Any) -> list[tuple[int, ...]]:

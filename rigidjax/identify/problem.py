@@ -31,6 +31,7 @@ from rigidjax.identify.recording import Recording
 from rigidjax.identify.reference_states import ReferenceStates, reference_of
 from rigidjax.identify.several_bodies import Bodies, has_mass
 from rigidjax.motion import Attitude, Rigid, Spin
+from rigidjax.motion.coupled import motion_of
 from rigidjax.motion.torques import AbstractForce, Sum, Torque
 from rigidjax.motion.torques.base import require_law
 
@@ -274,7 +275,7 @@ class Problem(eqx.Module):
         fits(self, parameters)
 
         def of_one(*trees: Any) -> Any:
-            return states_of_one(self, *trees)[3]
+            return motion_of(states_of_one(self, *trees)[3])
 
         states = over_records(of_one, self, local(self, parameters))
         return padding.one(states, 0) if self.count == 1 else states

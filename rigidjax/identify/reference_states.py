@@ -150,6 +150,6 @@ def first_rate(recording: Recording) -> np.ndarray:
     """A first body rate (3,), rad/s: a gyro's, or between attitudes; zero without either."""
     for reading in recording.readings:
         if isinstance(reading.sensor, Gyro):
-            return np.asarray(reading.values[int(np.argmax(reading.seen))])
+            return np.asarray(reading.values)[int(np.argmax(reading.seen))]
     _, w = rates(recording)
     return w[0] if len(w) else np.zeros(3)

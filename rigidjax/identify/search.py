@@ -1,5 +1,6 @@
 """Where the misfit is least: Levenberg–Marquardt from several starts, the record from its start."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -41,14 +42,20 @@ def least_squares(
     tolerance: float,
     max_steps: int,
     damping: float,
+    aim: float = 0.0,
 ) -> Tried:
-    """At most `max_steps` steps from `start`."""
-    settings = Settings(tolerance, damping, max_steps)
-    value, end = _descend(start, problem, noise, weights, settings)
-    return _safe(start, value, end.cost, end.converged)
+    """At most `max_steps` steps from `start`; fewer where they do not lead to an `aim`."""
+    settings = Settings(tolerance, damping, max_steps, aim)
+    tried, end = _descend(start, problem, noise, weights, settings)
+    return dataclasses.replace(tried, found=end.found) if bool(end.here) else tried
 
 
-_descend = eqx.filter_jit(descend)
+@eqx.filter_jit
+def _descend(
+    start: Parameters, problem: Problem, noise: Noise, weights: Array, settings: Settings
+) -> tuple[Tried, Search]:
+    value, end = descend(start, problem, noise, weights, settings)
+    return _safe(start, value, end.cost, end.converged), end
 
 
 def evaluate(parameters: Parameters, problem: Problem) -> Any:
@@ -56,11 +63,12 @@ def evaluate(parameters: Parameters, problem: Problem) -> Any:
 
     By the program of the search, which is the only one that follows the motion.
     """
+    kind = problem.records.t.dtype
     noise = tuple(
-        jnp.ones((problem.count, reading.sensor.components), problem.records.t.dtype)
+        jnp.asarray(np.ones((problem.count, reading.sensor.components), kind))
         for reading in problem.records.readings
     )
-    return _at(parameters, problem, noise, jnp.ones_like(problem.records.t)).found
+    return _at(parameters, problem, noise, whole(problem)).found
 
 
 def _at(parameters: Parameters, problem: Problem, noise: Noise, weights: Array) -> Search:
@@ -93,7 +101,7 @@ def _safe(start: Parameters, value: Parameters, cost: Array, done: Array) -> Tri
 
 def cost_of(parameters: Parameters, problem: Problem, noise: Noise) -> float:
     """The misfit over the whole of the records."""
-    return float(_at(parameters, problem, noise, jnp.ones_like(problem.records.t)).cost)
+    return float(_at(parameters, problem, noise, whole(problem)).cost)
 
 
 def misfit(parameters: Parameters, args: Any) -> Float[Array, ""]:
@@ -115,11 +123,17 @@ def solver_for(tolerance: float) -> optx.LevenbergMarquardt:
     return optx.LevenbergMarquardt(rtol=jnp.asarray(1e-12), atol=limit)  # pyright: ignore
 
 
-def horizons(problem: Problem) -> tuple[Float[Array, "records times"], ...]:
-    """Weights that show the first quarter, the first half and the whole of each record."""
-    t = problem.records.t
+def whole(problem: Problem) -> Float[Array, "records times"]:
+    """Weights that show all of each record."""
+    # By NumPy: outside of a trace each operation of JAX costs as much as a run of 100 steps.
+    return jnp.asarray(np.ones(problem.records.t.shape, problem.records.t.dtype))
+
+
+def horizon(problem: Problem, part: float) -> Float[Array, "records times"]:
+    """Weights that show this part of each record, from its beginning."""
+    t = np.asarray(problem.records.t)
     since, length = t - t[:, :1], t[:, -1:] - t[:, :1]
-    return tuple((since <= part * length).astype(t.dtype) for part in HORIZONS)
+    return jnp.asarray((since <= part * length).astype(t.dtype))
 
 
 def settle(
@@ -133,13 +147,15 @@ def settle(
     *,
     near: bool = False,
     strides: int = 0,
+    aim: float = 0.0,
 ) -> Tried:
     """Strides from where `tried` ended until one more of them changes nothing.
 
     A search that says it has converged may only have been damped too much: it has converged where a
     fresh start from there ends there. `tried.cost` is the misfit at its end, infinite if unknown;
-    `near` says that it is near the bottom already; `strides` how many led to it. `look` is called
-    after each, with how many there are by then and whether that was the last.
+    `near` says that it is near the bottom already; `strides` how many led to it; `aim` see
+    `Settings`. `look` is called after each, with how many there are by then and whether that was
+    the last.
     """
     if strides and bool(tried.converged):
         look(tried, strides, True)
@@ -149,7 +165,9 @@ def settle(
         count = min(STRIDE, max_steps)
         strides += 1
         bold = BOLD if first or near else CAREFUL
-        after = least_squares(tried.parameters, problem, noise, weights, tolerance, count, bold)
+        after = least_squares(
+            tried.parameters, problem, noise, weights, tolerance, count, bold, aim
+        )
         if not np.isfinite(float(after.cost)):
             # The residuals are no longer finite: go back to the point before these iterations.
             cost = jnp.asarray(cost_of(tried.parameters, problem, noise))
@@ -160,9 +178,12 @@ def settle(
         # At the very bottom round-off refuses every step: whether it moved is what counts.
         stands = before - float(tried.cost) < SETTLED * (1.0 + abs(before))
         settled = bool(tried.converged) or stands
-        tried = Tried(tried.parameters, tried.cost, jnp.asarray(settled))
-        look(tried, strides, settled or first + STRIDE >= max_steps)
-        if settled:
+        # As much again would not lead to the aim.
+        hopeless = aim > 0 and not settled and float(tried.cost) ** 2 > aim * before
+        over = settled or hopeless or first + STRIDE >= max_steps
+        tried = dataclasses.replace(tried, converged=jnp.asarray(settled))
+        look(tried, strides, over)
+        if over:
             break
     return tried
 
@@ -180,26 +201,33 @@ def climb(
     max_steps: int,
     *,
     look: Callable[[Position], None] = lambda position: None,
+    aim: float = 0.0,
 ) -> Tried:
     """One start down to the bottom; `look` is called after each stride with where it stands.
 
-    The whole record at once, where that explains it; else through the horizons.
+    The whole record at once, where that explains it; else through the horizons. `aim` is the misfit
+    of another start that explains the record: a search that does not lead there ends early.
     """
-    tried, start = _at_once(start, problem, noise, tolerance, max_steps)
+    tried, start = _at_once(start, problem, noise, tolerance, max_steps, aim)
     level = np.inf
-    for stage, seen in enumerate(horizons(problem)):
-        if stage < start.stage:
-            continue
+    for stage in range(start.stage, len(HORIZONS)):
+        seen = horizon(problem, HORIZONS[stage])
         if stage < len(HORIZONS) - 1:
             # A part of the record need not be fitted to the end, only to come near.
             count, before = min(STRIDE, max_steps), tried.parameters
-            found = least_squares(before, problem, noise, seen, tolerance, count, CAREFUL)
+            part = aim * HORIZONS[stage]
+            found = least_squares(before, problem, noise, seen, tolerance, count, CAREFUL, part)
             after = found.parameters
             # What explains a part alone may be nonsense beyond it: a drag that drives.
             first = cost_of(before, problem, noise) if stage == start.stage else level
             level = cost_of(after, problem, noise)
             kept = level < WILD * max(first, 1e-300)
             tried, level = fresh(after if kept else before), level if kept else first
+            if part > 0 and not bool(found.converged) and float(found.cost) > WILD * part:
+                # Not even this part, which another start explains.
+                tried = Tried(tried.parameters, jnp.asarray(level), tried.converged)
+                look(Position(len(HORIZONS), 0, tried))
+                break
             look(Position(stage + 1, 0, tried))
             continue
 
@@ -207,25 +235,32 @@ def climb(
             look(Position(stage + over, strides, now))
 
         done = start.strides if stage == start.stage else 0
-        tried = settle(tried, problem, noise, seen, tolerance, max_steps, at_last, strides=done)
+        tried = settle(
+            tried, problem, noise, seen, tolerance, max_steps, at_last, strides=done, aim=aim
+        )
     return tried
 
 
 def _at_once(
-    start: Position, problem: Problem, noise: Noise, tolerance: float, max_steps: int
+    start: Position,
+    problem: Problem,
+    noise: Noise,
+    tolerance: float,
+    max_steps: int,
+    aim: float,
 ) -> tuple[Tried, Position]:
     """The start fitted to the whole record, if that explains it; else as it is."""
     if start.stage or start.strides:
         return start.tried, start
-    whole = jnp.ones_like(problem.records.t)
-    count = min(STRIDE, max_steps)
-    found = least_squares(start.tried.parameters, problem, noise, whole, tolerance, count, CAREFUL)
-    if not bool(found.converged) or float(found.cost) > _enough(problem):
+    seen, count = whole(problem), min(STRIDE, max_steps)
+    here = start.tried.parameters
+    found = least_squares(here, problem, noise, seen, tolerance, count, CAREFUL, aim)
+    if not bool(found.converged) or float(found.cost) > enough(problem):
         return start.tried, start
     return found, Position(len(HORIZONS) - 1, 1, found)
 
 
-def _enough(problem: Problem) -> float:
+def enough(problem: Problem) -> float:
     """A misfit that only the motion has: of χ² twice its mean; of a noise that was guessed at a
     tenth of the signal, errors of a hundredth.
     """
@@ -241,7 +276,8 @@ def climb_together(
 ) -> list[Tried]:
     """Many starts through the horizons in one `vmap` (a leading axis on `points`)."""
     tried, settings = None, Settings(tolerance, CAREFUL, max_steps)
-    for seen in horizons(problem):
+    for part in HORIZONS:
+        seen = horizon(problem, part)
         tried = many(points, problem, noise, seen, settings)
         points = tried.parameters
     assert tried is not None

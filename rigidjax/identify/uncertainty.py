@@ -107,9 +107,14 @@ def errors_at(parameters: Parameters, problem: Problem) -> tuple[Float[Array, ".
     return evaluate(parameters, problem)[0][0]
 
 
-def linearise(problem: Problem, parameters: Parameters, noise: Noise) -> Linearised:
-    """Errors, derivatives and weights at these parameters, as NumPy arrays."""
-    found = evaluate(parameters, problem)
+def linearise(
+    problem: Problem, parameters: Parameters, noise: Noise, found: Any = None
+) -> Linearised:
+    """Errors, derivatives and weights at these parameters, as NumPy arrays.
+
+    `found` is what `evaluate` gives there, where that is known.
+    """
+    found = evaluate(parameters, problem) if found is None else found
     (errors, slopes, weights), where, extra, extra_slopes = jax.tree.map(
         np.asarray, _linearised(problem, parameters, noise, found)
     )

@@ -12,10 +12,10 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
 from rigidjax import _checks
-from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.identify.horizons import Horizons, between, kinds_of
 from rigidjax.identify.levenberg_marquardt import BOLD, Search, Settings, search
 from rigidjax.identify.open_loop import errors_by_horizon, open_loop_errors
+from rigidjax.identify.real_bodies import unreal
 from rigidjax.identify.window_starts import eliminated, moved, precisions, with_jacobian
 from rigidjax.identify.windows import Windows
 from rigidjax.motion.torques.inputs import delays_of, require_inputs
@@ -118,23 +118,24 @@ def fit_windows(
     _require_delays(windows, law)
     scales = _scales(windows, noise)
     firm = precisions(starts, kinds_of(windows.starts), noise)
-    settings = Settings(_SETTLED, BOLD, max_steps)
-    end = _searched(scene, windows.step, guess, windows, scales, firm, settings)
+    padded, count = _padded(windows), np.asarray(windows.count, np.int32)
+
+    def searched(value: Any, settings: Settings) -> Search:
+        return _searched(scene, windows.step, value, padded, count, scales, firm, settings)
+
+    end = searched(guess, Settings(_SETTLED, BOLD, max_steps))
     if not np.isfinite(end.cost):
         raise ValueError("guess: the runs from it are not finite; is the scene right?")
     value, taken = back(end.point), int(end.taken) - 1
-    # Once more where it ended: the last that was tried may have been no better.
-    still = Settings(_SETTLED, BOLD, 0)
-    there = _searched(scene, windows.step, value, windows, scales, firm, still)
+    # Once more where it ended, if the last that was tried was no better.
+    there = end if end.here else searched(value, Settings(_SETTLED, BOLD, 0))
     inverse = np.linalg.pinv(np.asarray(there.gram))
     spread = inverse @ np.asarray(there.found) @ inverse
     deviation = np.sqrt(np.clip(np.diag(spread), 0, None))
     converged = bool(end.converged)
     message = [] if converged else [f"stopped after {taken} steps: its best point"]
-    try:
-        _require_real(scene(value)[0])
-    except ValueError as refused:
-        message.append(f"no real body has these numbers: {refused}")
+    wrong = unreal(scene(value)[0])
+    message += [] if wrong is None else [wrong]
     try:
         _require_delays(windows, scene(value)[1])
     except ValueError as refused:
@@ -165,21 +166,18 @@ def _require_windows(windows: Any) -> None:
 
 def _require_delays(windows: Windows, law: Any) -> None:
     """Raise `ValueError` for a delay beyond the inputs that the windows know."""
-    known = windows.before * windows.step
+    known, length = windows.before * windows.step, windows.length * windows.step
     for name, delay in delays_of(law):
+        if -float(delay) > length:
+            raise ValueError(
+                f"inputs[{name!r}]: a delay of {float(delay):.6g} s reaches beyond the end of "
+                f"windows of {length:.6g} s; is it in seconds?"
+            )
         if float(delay) > known:
             raise ValueError(
                 f"inputs[{name!r}]: a delay of {float(delay):.6g} s, and inputs that are known "
                 f"{known:.6g} s before a window: cut them with windows(…, before=k)"
             )
-
-
-def _require_real(body: Any) -> None:
-    """Raise `ValueError` for numbers that no body has: inside a trace nobody looked."""
-    if isinstance(body, MassProperties):
-        MassProperties(body.mass, body.com, body.second_moment)
-    else:
-        Inertia.from_tensor(body.tensor)
 
 
 def _scales(windows: Windows, noise: Mapping[str, float] | None) -> dict[str, Array]:
@@ -197,13 +195,33 @@ def _scales(windows: Windows, noise: Mapping[str, float] | None) -> dict[str, Ar
     return {k: jnp.where(v > 0, v, 1.0) for k, v in rms.items()}
 
 
+def _padded(windows: Windows) -> tuple[Any, Any, Any]:
+    """Starts, states and inputs of the windows, the last one repeated so that their number is a
+    multiple of those that go side by side: a remainder would be a program of its own to compile.
+    """
+    order = np.minimum(
+        np.arange(-(-windows.count // _SIDE_BY_SIDE) * _SIDE_BY_SIDE), windows.count - 1
+    )
+    parts = (windows.starts, windows.wanted, windows.inputs)
+    return jax.tree.map(lambda a: jnp.asarray(np.asarray(a)[order]), parts)
+
+
 @eqx.filter_jit
 def _searched(
-    scene: Any, h: float, guess: Any, windows: Windows, scales: Any, firm: Any, settings: Settings
+    scene: Any,
+    h: float,
+    guess: Any,
+    windows: tuple[Any, Any, Any],
+    count: Any,
+    scales: Any,
+    firm: Any,
+    settings: Settings,
 ) -> Search:
-    """The search from `guess`; what it keeps is the spread of the windows' gradients (n, n)."""
+    """The search from `guess`; what it keeps is the spread of the windows' gradients (n, n).
+
+    `count` of the windows, the first ones, take part.
+    """
     x, back = ravel_pytree(guess)
-    parts = (windows.starts, windows.wanted, windows.inputs)
 
     def of_one(x: Array, window: Any) -> Any:
         start, wanted, inputs = window
@@ -225,8 +243,22 @@ def _searched(
         return slope[:, None] * slope[None], 0.5 * flat @ flat, jacobian.T @ jacobian, slope
 
     def evaluated(x: Array) -> Any:
-        few = min(_SIDE_BY_SIDE, windows.count)
-        found = lax.map(lambda window: of_one(x, window), parts, batch_size=few)
-        return jax.tree.map(lambda a: jnp.sum(a, 0), found)
+        def side_by_side(i: Array, total: Any) -> Any:
+            rows = i * _SIDE_BY_SIDE + jnp.arange(_SIDE_BY_SIDE, dtype=jnp.int32)
+            some = jax.tree.map(
+                lambda a: lax.dynamic_slice_in_dim(a, rows[0], _SIDE_BY_SIDE), windows
+            )
+            found = jax.vmap(lambda window: of_one(x, window))(some)
+            kept = rows < count
+
+            def add(sum_: Array, part: Array) -> Array:
+                seen = kept.reshape(-1, *(1 for _ in part.shape[1:]))
+                return sum_ + jnp.sum(jnp.where(seen, part, 0.0), 0)
+
+            return jax.tree.map(add, total, found)
+
+        square, line = jnp.zeros((x.size, x.size), x.dtype), jnp.zeros_like(x)
+        rounds = (count + _SIDE_BY_SIDE - 1) // _SIDE_BY_SIDE
+        return lax.fori_loop(0, rounds, side_by_side, (square, jnp.sum(line), square, line))
 
     return search(evaluated, x, jnp.zeros_like(x), settings, jnp.zeros((x.size, x.size), x.dtype))

@@ -126,6 +126,13 @@ def windows(
                 f"{name}: NaN or infinity in row {int(np.argmax(bad))}; leave such rows out: a "
                 "window does not go across the gap"
             )
+    if isinstance(states, Attitude | Rigid):
+        off = np.abs(np.linalg.norm(np.asarray(states.q, float), axis=-1) - 1.0)
+        if off.max() > 0.01:
+            raise ValueError(
+                f"q: wanted quaternions of length 1, scalar first, got another in row "
+                f"{int(np.argmax(off))}: {np.asarray(states.q)[int(np.argmax(off))]}"
+            )
     gaps = np.diff(times)
     h = float(np.median(gaps))
     even = np.abs(gaps - h) <= 1e-3 * h
@@ -139,7 +146,11 @@ def windows(
     begin = np.arange(before, times.size - length, stride)
     begin = begin[broken[begin + length] == broken[begin - before]]
     if not begin.size:
-        raise ValueError(f"windows: no stretch of {before + length} steps without a gap")
+        longest = int(np.bincount(broken).max()) - 1
+        raise ValueError(
+            f"windows: no stretch of {before + length} steps (before + length) without a gap; the "
+            f"longest has {longest}"
+        )
     rows_of = begin[:, None] + np.arange(-before, length)
     follow = begin[:, None] + 1 + np.arange(length)
     kind = jnp.result_type(float)

@@ -1,16 +1,34 @@
-"""How long a fit takes: one throw, 0.7 s at 1 kHz, twelve free numbers; beside SciPy with numba.
+"""How long fits of throws take, beside SciPy with numba and beside `mujoco.sysid`.
 
-    python tests/identify/bench_fit.py
+    python tests/identify/bench_fit.py [--repeats 9] [--joint] [--many]
 
-Ours: Levenberg–Marquardt with exact Jacobians, warm (compiled once, other readings each time). The
-peer: `scipy.optimize.least_squares` (method lm) with finite differences through a Runge–Kutta of
-order 4 at the same steps, its loop compiled by numba where that is installed, else not timed.
-Medians of seven interleaved repeats. Also: compile time, and many starts in one vmap.
+One throw: 0.7 s at 1 kHz with a wheel inside, twelve free numbers (`Tensor`, rates, drag). All
+from the same start but where it says otherwise, times of the processor, medians of interleaved
+repeats in one process, other readings each time; compile apart.
+
+- ours: `identify.fit` whole, with its assessment, intervals and the check of its steps;
+- SciPy: `least_squares` (method lm) with finite differences through a Runge–Kutta of order 4 at
+  the same steps, its loop compiled by numba;
+- `mujoco.sysid.optimize` (its optimiser "scipy"; "mujoco" stops far away from two of three starts)
+  on a smaller problem that MuJoCo has, too: a known torque in body axes, nine numbers (inertia,
+  rates), `mujoco.rollout` with its Runge–Kutta of order 4 at the same steps; ours on the same.
+
+What is not installed is left out. `--joint` adds all throws of the data beside the checkout as one
+problem (see `bench_throws.py`; minutes to compile), warm.
 """
 
+import argparse
+import contextlib
+import importlib.util
+import os
+import subprocess
+import sys
 import time
+from pathlib import Path
 
+import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import least_squares
 
@@ -25,6 +43,27 @@ SPEED = -1300.0 * 0.5 * (np.tanh((T - 0.2) / 0.03) - np.tanh((T - 0.45) / 0.05))
 MOMENTS = np.diag([4.1e-4, 1.3e-4, 4.6e-4]) + 1e-5 * (np.ones((3, 3)) - np.eye(3))
 DRAG, OMEGA = np.array([2e-5, 1e-5, 3e-5]), np.array([11.0, 1.5, -2.0])
 RATE = np.gradient(SPEED, STEP)
+TORQUE, UNIT = np.array([2e-3, -1e-3, 1.5e-3]), 3e-4
+# Where all begin: diagonal moments a tenth too large, no drag, the first reading.
+GUESS = np.diag(np.diag(MOMENTS) * 1.1)
+COLD = """
+import time, jax, numpy as np
+jax.config.update("jax_enable_x64", True)
+import rigidjax as rj
+from rigidjax import identify
+imported = time.process_time()
+t = np.arange(200) * 1e-2
+motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1.0, 0.1, 1.0]), t, LAW)
+read = motion.ys.omega + 0.01 * np.random.default_rng(0).normal(size=(200, 3))
+def fitted(read):
+    record = identify.Recording(t, (identify.Gyro(0.01), read), torque=LAW)
+    return identify.fit(identify.Problem(record, identify.CHART), starts=1)
+begun = time.process_time()
+fitted(read)
+first = time.process_time()
+fitted(read + 0.001)
+print(imported, begun - imported, first - begun, time.process_time() - first, first)
+"""
 
 
 def law(drag):
@@ -37,10 +76,23 @@ def law(drag):
 def problem(readings):
     record = identify.Recording(T, (identify.Gyro(SIGMA), readings), torque=law([0.0, 0.0, 0.0]))
     free = [identify.Free(lambda r: r.torque.parts[1].coefficient, "drag", scale=1e-5)]
-    return identify.Problem(record, identify.Tensor(3e-4), free=free)
+    return identify.Problem(record, identify.Tensor(UNIT), free=free)
 
 
-def peer():
+def driven(readings):
+    push = rj.torques.ConstantTorque(TORQUE)
+    record = identify.Recording(T, (identify.Gyro(SIGMA), readings), torque=push)
+    return identify.Problem(record, identify.Tensor(UNIT))
+
+
+def start(of, readings):
+    """The parameters of the common start."""
+    here = of.start(rj.Inertia(GUESS))
+    spin = jnp.asarray(readings[0] / np.asarray(of.typical_rate))[None]
+    return eqx.tree_at(lambda p: p.own.spin, here, spin)
+
+
+def with_numba():
     """`least_squares` on the same twelve numbers, or None without numba."""
     try:
         import numba
@@ -78,50 +130,198 @@ def peer():
         return out
 
     def residual(x, readings):
-        inertia = 3e-4 * np.array([[x[0], x[3], x[4]], [x[3], x[1], x[5]], [x[4], x[5], x[2]]])
+        inertia = UNIT * symmetric(x)
         inverse = np.linalg.inv(inertia)
         w = motion(10 * x[6:9], inertia, inverse, 1e-5 * x[9:], WHEEL * SPEED, WHEEL * RATE, STEP)
         return ((w - readings) / SIGMA).ravel()
 
-    def fit(readings, start):
-        return least_squares(residual, start, args=(readings,), method="lm")
+    def fit(readings):
+        begin = np.r_[np.diag(GUESS) / UNIT, np.zeros(3), readings[0] / 10, np.zeros(3)]
+        return least_squares(residual, begin, args=(readings,), method="lm").cost
 
     return fit
 
 
-def main():
-    body = rj.Inertia(MOMENTS)
-    clean = np.asarray(rj.simulate(body, rj.Spin(OMEGA), T, law(DRAG)).ys.omega)
-    rng = np.random.default_rng(0)
-    draws = [clean + SIGMA * rng.normal(size=clean.shape) for _ in range(8)]
-    began = time.perf_counter()
-    first = identify.fit(problem(draws[0]), starts=1)
-    print(f"first call, with compiling: {time.perf_counter() - began:.1f} s, {first.status}")
-    other = peer()
-    start = np.r_[np.diag(MOMENTS) * 1.1 / 3e-4, 0.0, 0.0, 0.0, draws[0][0] / 10, 0.0, 0.0, 0.0]
-    if other is not None:
-        other(draws[0], start)
-    ours, theirs = [], []
-    for readings in draws[1:]:
-        began = time.perf_counter()
-        found = identify.fit(problem(readings), starts=1)
-        ours.append(time.perf_counter() - began)
-        if other is not None:
-            began = time.perf_counter()
-            out = other(readings, start)
-            theirs.append(time.perf_counter() - began)
-    print(f"warm fit: {np.median(ours) * 1e3:.0f} ms, {found.status}, moments {found.body.moments}")
-    if theirs:
-        print(
-            f"scipy + numba: {np.median(theirs) * 1e3:.0f} ms ({out.nfev} evaluations), cost {out.cost}"
+def symmetric(x):
+    return np.array([[x[0], x[3], x[4]], [x[3], x[1], x[5]], [x[4], x[5], x[2]]])
+
+
+def with_mujoco():
+    """`mujoco.sysid.optimize` on nine numbers of `driven`, or None without it."""
+    try:
+        import mujoco
+        from mujoco import rollout, sysid
+
+        empty = sysid.ParameterDict
+    except (ModuleNotFoundError, ImportError, AttributeError):
+        return None
+    motors = "".join(
+        f'<motor joint="j" gear="{gear} 0 0 0"/>' for gear in ("1 0 0", "0 1 0", "0 0 1")
+    )
+    xml = f"""<mujoco><compiler balanceinertia="false"/>
+    <option timestep="{STEP}" integrator="RK4" gravity="0 0 0"><flag contact="disable"/></option>
+    <worldbody><body><joint name="j" type="ball"/><site name="s"/>
+    <inertial pos="0 0 0" mass="1" fullinertia="4e-4 4e-4 4e-4 0 0 0"/></body></worldbody>
+    <actuator>{motors}</actuator><sensor><gyro site="s"/></sensor></mujoco>"""
+    data = mujoco.MjData(mujoco.MjSpec.from_string(xml).compile())
+    control = np.tile(TORQUE, (COUNT, 1))
+
+    def rates(x):
+        tensor = UNIT * symmetric(x)
+        # Anew each time: a specification that was once refused stays so.
+        spec = mujoco.MjSpec.from_string(xml)
+        spec.bodies[1].fullinertia = tensor[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
+        try:
+            model = spec.compile()
+        except ValueError:
+            # No real body: its optimiser is to turn back.
+            return np.full((COUNT, 3), 1e3)
+        begin = np.r_[0.0, 1.0, 0.0, 0.0, 0.0, 10 * x[6:9]]
+        states, _ = rollout.rollout(model, data, begin, control)
+        # The state's rates are those after each step.
+        return np.concatenate([begin[None, 5:8], states[0, :-1, 5:8]])
+
+    def fit(readings):
+        begin = np.r_[np.diag(GUESS) / UNIT, np.zeros(3), readings[0] / 10]
+        low, high = np.r_[0.1 * np.ones(3), -np.ones(6)], np.r_[np.full(9, 5.0)]
+        made = empty()
+        made.add(sysid.Parameter("x", begin, low, high))
+
+        def residual(x, params, **_):
+            columns = [((rates(c) - readings) / SIGMA).ravel() for c in np.atleast_2d(x.T)]
+            return [columns[0] if x.ndim == 1 else np.stack(columns, 1)], None, None
+
+        with contextlib.redirect_stdout(None):
+            found, _ = sysid.optimize(made, residual, "scipy", verbose=False)
+        return 0.5 * float(np.sum(residual(found.as_vector(), None)[0][0] ** 2))
+
+    return fit
+
+
+def compared(tasks, draws):
+    """Medians of times of the processor, ms, of interleaved repeats, and the last results."""
+    taken, last = {name: [] for name in tasks}, {}
+    for readings in draws:
+        for name, task in tasks.items():
+            begun = time.process_time()
+            last[name] = task(readings)
+            taken[name].append(time.process_time() - begun)
+    return {name: 1e3 * float(np.median(some)) for name, some in taken.items()}, last
+
+
+def first_time(name, task, readings):
+    begun = time.process_time()
+    task(readings)
+    print(f"{name}, first call: {time.process_time() - begun:.1f} CPU s")
+
+
+def draws_of(body, torque, count, seed):
+    clean = np.asarray(rj.simulate(body, rj.Spin(OMEGA), T, torque).ys.omega)
+    rng = np.random.default_rng(seed)
+    return [clean + SIGMA * rng.normal(size=clean.shape) for _ in range(count)]
+
+
+def table(title, tasks, draws, beside):
+    print(f"\n{title}")
+    for name, task in tasks.items():
+        first_time(name, task, draws[0])
+        task(draws[1])
+    median, last = compared(tasks, draws[2:])
+    for name, value in median.items():
+        ratio = f"{value / median[beside]:.2f} of {beside}" if beside in median else ""
+        print(f"{name}: {value:.1f} ms, {ratio}; misfit {last[name]:.6f}")
+
+
+def cold():
+    """A process of its own: import, a first run, a first fit, a second one."""
+    print("\na new process: CPU s of import, a first simulation, a first small fit, the next fit")
+    torque = "rj.torques.Damping([0.01, 0.02, 0.01])"
+    for law_text, chart in (("None", "PrincipalRatios()"), (torque, "Principal(1.5)")):
+        code = COLD.replace("LAW", law_text).replace("CHART", chart)
+        done = subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, text=True, check=True, env=os.environ
         )
-        print(f"ratio theirs / ours: {np.median(theirs) / np.median(ours):.2f}")
-    free = identify.Recording(T[::10], (identify.Gyro(SIGMA), draws[0][::10]))
-    ratios = identify.Problem(free, identify.PrincipalRatios())
-    identify.fit(ratios, starts=1000, together=1000)
-    began = time.perf_counter()
-    identify.fit(ratios, starts=1000, together=1000)
-    print(f"1000 starts in one vmap, 70 samples, free motion: {time.perf_counter() - began:.1f} s")
+        parts = [float(word) for word in done.stdout.split()]
+        kind = "free body" if law_text == "None" else "damped body"
+        shown = ", ".join(f"{part:.2f}" for part in parts[:4])
+        print(f"{kind}: {shown}; from nothing to the first fit {parts[4]:.1f}")
+
+
+def many(readings):
+    print("\n1000 starts in one vmap, 70 samples, free motion")
+    short = identify.Recording(T[::10], (identify.Gyro(SIGMA), readings[::10]))
+    ratios = identify.Problem(short, identify.PrincipalRatios())
+    for name in ("first call", "warm"):
+        begun = time.process_time()
+        identify.fit(ratios, starts=1000, together=1000)
+        print(f"{name}: {time.process_time() - begun:.1f} CPU s")
+
+
+def joint():
+    """All throws of the data beside the checkout as one problem, twice."""
+    places = Path(__file__).parent
+    loaded = importlib.util.spec_from_file_location("bench_throws", places / "bench_throws.py")
+    bench = importlib.util.module_from_spec(loaded)
+    loaded.loader.exec_module(bench)
+    names = bench.MASSES
+    records = {n: [bench.record(p, 1, 0.53) for p in bench.throws.paths(n)] for n in names}
+    count = sum(map(len, records.values()))
+    for name in ("first call", "warm", "warm"):
+        begun = time.process_time(), time.perf_counter()
+        found = bench.together(records)
+        size = found.covariance.shape[0]
+        print(
+            f"{count} throws together, {size} numbers, 11 shared by all, {name}: "
+            f"{time.process_time() - begun[0]:.1f} CPU s, {time.perf_counter() - begun[1]:.1f} s"
+        )
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--repeats", type=int, default=9)
+    parser.add_argument("--joint", action="store_true")
+    parser.add_argument("--many", action="store_true")
+    options = parser.parse_args()
+    print("load of the machine:", os.getloadavg())
+    body, count = rj.Inertia(MOMENTS), options.repeats + 2
+
+    def ours(of, **more):
+        return lambda readings: identify.fit(of(readings), **more).starts[0].cost
+
+    def same(of):
+        def fit(readings):
+            made = of(readings)
+            return identify.fit(made, starts=1, initial=start(made, readings)).starts[0].cost
+
+        return fit
+
+    draws = draws_of(body, law(DRAG), count, 0)
+    peer = with_numba()
+    tasks = {} if peer is None else {"SciPy and numba": peer}
+    built = [problem(readings) for readings in draws]
+    ready = {id(r): (p, start(p, r)) for p, r in zip(built, draws, strict=True)}
+
+    def prepared(readings):
+        made, begin = ready[id(readings)]
+        return identify.fit(made, starts=1, initial=begin).starts[0].cost
+
+    tasks |= {
+        "ours from the same start": prepared,
+        "ours from the same start, with making the problem": same(problem),
+        "ours from where it begins by itself": ours(problem, starts=1),
+        "ours blind (8 starts)": ours(problem),
+    }
+    table("one throw, 0.7 s, twelve numbers", tasks, draws, "SciPy and numba")
+    other = with_mujoco()
+    tasks = {} if other is None else {"mujoco.sysid": other}
+    tasks["ours from the same start"] = same(driven)
+    pushed = draws_of(body, rj.torques.ConstantTorque(TORQUE), min(count, 7), 1)
+    table("a known torque, nine numbers", tasks, pushed, "mujoco.sysid")
+    cold()
+    if options.many:
+        many(draws[0])
+    if options.joint:
+        joint()
 
 
 if __name__ == "__main__":

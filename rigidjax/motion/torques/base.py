@@ -61,9 +61,9 @@ class AbstractTorque(eqx.Module):
     **States of its own** (a motor's speed, a wheel, a bias that drifts): a law that has `state0`,
     an array or a tree of arrays, or a method `(t, state, body)` that gives it, and a method
     `rate(t, own, state, body)`, their derivative, is called as `(t, state, body, own)`. Loops
-    integrate them with the body's state: `simulate` (`sol.own`), `batch.rollout`, `batch.simulate`
-    and `identify.fit_windows`. A function of time inside a law may have some, too (`Lagged`), and
-    is called as `(t, own)`. No base class is needed:
+    integrate them with the body's state: `simulate` (`sol.own`), `batch.rollout`, `batch.simulate`,
+    `identify.fit` and `identify.fit_windows`. A function of time inside a law may have some, too
+    (`Lagged`), and is called as `(t, own)`. No base class is needed:
 
     >>> import equinox as eqx, jax.numpy as jnp, rigidjax as rj
     >>> class Fading(eqx.Module):
