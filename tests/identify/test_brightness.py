@@ -117,7 +117,7 @@ def test_derivatives_by_the_attitude():
     [
         (([0.0, 0, 0], OBSERVER), {}, ValueError, "sun: wanted a direction, got a vector of len"),
         ((SUN, [1.0, 2.0]), {}, ValueError, r"observer: wanted shape \(3,\)"),
-        ((np.ones((5, 3)), OBSERVER), {}, ValueError, r"sun: wanted .* torques.Linear\(times"),
+        ((np.ones((5, 3)), OBSERVER), {}, ValueError, r"sun: wanted .*torques.Linear\(times"),
         ((SUN, OBSERVER), {"unit": "magnitude"}, ValueError, "unit: wanted one of flux, mag"),
         ((SUN, OBSERVER), {"noise": 0.0}, ValueError, "noise: wanted a positive"),
         ((SUN, OBSERVER), {"level": -1.0}, ValueError, "level: wanted a positive flux"),

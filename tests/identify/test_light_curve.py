@@ -64,6 +64,7 @@ def daily(seed):
     return t, y + 0.1 * rng.normal(size=t.size), pair, day
 
 
+@pytest.mark.long
 def test_daily_aliases_of_a_pair_are_tried():
     t, y, pair, day = daily(0)
     found = two_frequencies(t, y, 0.1, shortest=2 * tumblers.HOUR)
