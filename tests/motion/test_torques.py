@@ -358,3 +358,23 @@ def test_energy_adds_up():
 def test_mistakes_are_told_in_words(make, words):
     with pytest.raises((TypeError, ValueError), match=words):
         make()
+
+
+def test_a_law_that_looks_at_what_the_state_has_not_is_named():
+    def brake(t, state, body):
+        return -rj.quaternion.rotate_inverse(state.q, state.omega)
+
+    def spring(t, state, body):
+        return -state.x
+
+    def wrong(t, state, body):
+        return state.banana
+
+    words = r"torque function looks at state.q, the attitude, and Spin has none: start from Att"
+    for law in (brake, rj.torques.Sum(brake, rj.torques.Damping([0.1, 0.1, 0.1]))):
+        with pytest.raises(TypeError, match=words):
+            base.act(law, 0.0, SPIN, BODY)
+    with pytest.raises(TypeError, match=r"state\.x, the position, and Attitude has none"):
+        base.act(spring, 0.0, ATTITUDE, BODY)
+    with pytest.raises(AttributeError, match="banana"):
+        base.act(wrong, 0.0, SPIN, BODY)
