@@ -84,6 +84,8 @@ def simulate_readings(
     >>> simulate_readings(gyro, body, start, [0.0, 1.0], key=jax.random.key(0)).shape
     (2, 3)
     """
+    order = "the order is sensor, body, state0, ts"
+    _checks.instance(state0, (Spin, Attitude, Rigid), "state0", hint=order)
     several = isinstance(sensor, Sequence)
     sensors = tuple(sensor) if several else (sensor,)
     for one in sensors:
