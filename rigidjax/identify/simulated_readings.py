@@ -88,12 +88,15 @@ def simulate_readings(
     _checks.instance(state0, (Spin, Attitude, Rigid), "state0", hint=order)
     several = isinstance(sensor, Sequence)
     sensors = tuple(sensor) if several else (sensor,)
+    if not sensors:
+        raise ValueError("sensor: wanted a sensor or several, got none")
     for one in sensors:
         _fits(one, state0, key)
     turned = (
         body.inertia if isinstance(body, MassProperties) and type(state0) is not Rigid else body
     )
-    sol = simulate(turned, state0, ts, torque)
+    start: Any = state0
+    sol = simulate(turned, start, ts, torque)
     states = sol.ys if sol.own is None else Coupled(sol.ys, sol.own)
     keys = (
         [None] * len(sensors) if key is None else jax.random.split(_checks.key(key), len(sensors))
@@ -168,6 +171,11 @@ def _fits(sensor: Any, state0: Any, key: Any) -> None:
         raise TypeError(
             f"{name} needs a state with {sensor.feels.__name__}, got {type(state0).__name__}; take "
             "Attitude, or Rigid for what depends on the position"
+        )
+    if sensor.noise is not None and jnp.shape(sensor.noise) != (sensor.components,):
+        raise ValueError(
+            f"sensor: {name}: noise: wanted shape ({sensor.components},), of one sensor, got "
+            f"{jnp.shape(sensor.noise)}; of many use jax.vmap"
         )
     if key is not None and sensor.noise is None:
         raise ValueError(

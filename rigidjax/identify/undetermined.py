@@ -1,6 +1,6 @@
 """Which combinations of numbers the data do not determine, by the user's names."""
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
@@ -159,10 +159,8 @@ def _slopes(problem: Problem, parameters: Parameters) -> tuple[Array, Array]:
     velocities; the attitudes in the world's axes, then in the body's.
     """
     flat, restore = ravel_pytree(parameters)
-    own, reference = parameters.own, problem.reference
-    q = None
-    if own.turn is not None:
-        q = jax.vmap(quaternion.multiply)(reference.q, jax.vmap(quaternion.exp)(own.turn))
+    reference = problem.reference
+    q = None if parameters.own.turn is None else _attitudes(reference, parameters.own)
 
     def value(x: Array) -> Array:
         moved = restore(x)
@@ -174,9 +172,7 @@ def _slopes(problem: Problem, parameters: Parameters) -> tuple[Array, Array]:
             parts.append(jnp.stack([tensor[place] for place in TENSOR.values()]))
         before, beyond = list(parts), []
         if q is not None:
-            now = jax.vmap(quaternion.multiply)(
-                reference.q, jax.vmap(quaternion.exp)(moved.own.turn)
-            )
+            now = _attitudes(reference, moved.own)
             back = jax.vmap(quaternion.conjugate)(q)
             turned = jax.vmap(lambda a, b: quaternion.log(quaternion.multiply(a, b)))
             before.append(turned(now, back).reshape(-1))
@@ -189,6 +185,11 @@ def _slopes(problem: Problem, parameters: Parameters) -> tuple[Array, Array]:
         return jnp.stack(list(both))
 
     return jax.jacfwd(value)(flat), value(flat)[1]
+
+
+def _attitudes(reference: Any, own: Any) -> Array:
+    """The first attitudes (R, 4)."""
+    return jax.vmap(quaternion.multiply)(reference.q, jax.vmap(quaternion.exp)(own.turn))
 
 
 def _kept(fit: "Fit", names: list[str], changes: np.ndarray) -> np.ndarray:

@@ -291,6 +291,7 @@ def test_containers_carry_a_batch():
     assert none.mass.shape == (0,)
 
 
+@pytest.mark.usefixtures("unhooked")
 def test_an_inertia_in_place_of_its_second_moment_is_named():
     with pytest.raises(TypeError, match=r"got an Inertia; give its \.second_moment"):
         MassProperties(1.0, ORIGIN, Inertia.from_principal(1.0, 1.6, 2.2))

@@ -92,6 +92,7 @@ class Compass(identify.AbstractSensor):
         return jnp.stack([reading, reading])
 
 
+@pytest.mark.usefixtures("unhooked")
 def test_mistakes_are_named():
     spin = rj.Spin([0.0, 0.0, 1.0])
     with pytest.raises(TypeError, match="AttitudeSensor needs a state with HasAttitude, got Spin"):
@@ -100,3 +101,10 @@ def test_mistakes_are_named():
         simulate_readings(identify.Gyro(), TOP, spin, TS, key=jax.random.key(0))
     with pytest.raises(ValueError, match=r"Compass: .*write a method reading_of"):
         simulate_readings(Compass(), TOP, STEADY, TS)
+    with pytest.raises(TypeError, match=r"state0: wanted .* got Inertia; the order is sensor, b"):
+        simulate_readings(identify.Gyro(), spin, TOP, TS)
+    with pytest.raises(TypeError, match=r"got Inertia; a body that is known is Known\(body\)"):
+        record = identify.Recording([0.0, 1.0], (identify.Gyro(), np.ones((2, 3))))
+        identify.Problem(record, TOP)
+    with pytest.raises(TypeError, match=r"typical: .*one number, kg m², got Inertia; a body that"):
+        identify.Principal(TOP)
