@@ -103,8 +103,8 @@ def test_mistakes_are_named():
         simulate_readings(Compass(), TOP, STEADY, TS)
     with pytest.raises(TypeError, match=r"state0: wanted .* got Inertia; the order is sensor, b"):
         simulate_readings(identify.Gyro(), spin, TOP, TS)
+    record = identify.Recording([0.0, 1.0], (identify.Gyro(), np.ones((2, 3))))
     with pytest.raises(TypeError, match=r"got Inertia; a body that is known is Known\(body\)"):
-        record = identify.Recording([0.0, 1.0], (identify.Gyro(), np.ones((2, 3))))
         identify.Problem(record, TOP)
     with pytest.raises(TypeError, match=r"typical: .*one number, kg m², got Inertia; a body that"):
         identify.Principal(TOP)
