@@ -20,7 +20,7 @@ from rigidjax import (
     rotation as rotation,
     solve as solve,
 )
-from rigidjax._names import own_names
+from rigidjax._names import missing, own_names
 from rigidjax._types import (
     HasAttitude as HasAttitude,
     HasPose as HasPose,
@@ -89,7 +89,7 @@ _LATER = ("datasets", "plot", "workprecision")
 def __getattr__(name: str) -> ModuleType:
     if name in _LATER:
         return importlib.import_module(f"rigidjax.{name}")
-    raise AttributeError(f"module 'rigidjax' has no attribute {name!r}")
+    raise missing(__name__, name)
 
 
 __dir__ = own_names(__name__)

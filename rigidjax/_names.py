@@ -1,12 +1,15 @@
-"""The names of public modules: what `dir` shows, and old names (floor 0)."""
+"""The names of public modules: what `dir` shows, old names, and what was meant (floor 0)."""
 
 import ast
+import difflib
 import functools
 import importlib
 import inspect
 import sys
 import warnings
 from collections.abc import Callable, Iterator
+from importlib.util import find_spec
+from types import ModuleType
 from typing import Any
 
 
@@ -63,14 +66,14 @@ def renamed(module: str, names: dict[str, str]) -> Callable[[str], Any]:
     imported when the old one is asked for.
 
     >>> get = renamed("rigidjax.plot", {"pose": "rigidjax.plot.motion"})
-    >>> get("other")
+    >>> get("other_thing")
     Traceback (most recent call last):
-    AttributeError: module 'rigidjax.plot' has no attribute 'other'
+    AttributeError: module 'rigidjax.plot' has no attribute 'other_thing'
     """
 
     def look_up(name: str) -> Any:
         if name not in names:
-            raise AttributeError(f"module {module!r} has no attribute {name!r}")
+            raise missing(module, name)
         warnings.warn(
             f"{module}.{name} is now {names[name]}; the old name will be removed in 0.3",
             DeprecationWarning,
@@ -80,3 +83,76 @@ def renamed(module: str, names: dict[str, str]) -> Callable[[str], Any]:
         return getattr(importlib.import_module(place), inner)
 
     return look_up
+
+
+def suggests(module: str) -> Callable[[str], Any]:
+    """A `__getattr__` for a public module: a wrong name is answered with what may be meant.
+
+    **Arguments:** `module` the module's `__name__`.
+
+    >>> suggests("rigidjax.body")("heavytop")
+    Traceback (most recent call last):
+    AttributeError: module 'rigidjax.body' has no attribute 'heavytop'; did you mean \
+rj.torques.HeavyTop?
+    """
+
+    def look_up(name: str) -> Any:
+        raise missing(module, name)
+
+    return look_up
+
+
+def missing(module: str, name: str) -> AttributeError:
+    """The error for a name that a public module does not have, with the nearest that exist.
+
+    >>> str(missing("rigidjax", "HeavyTop"))
+    "module 'rigidjax' has no attribute 'HeavyTop'; did you mean rj.torques.HeavyTop?"
+    """
+    words = f"module {module!r} has no attribute {name!r}"
+    # Tools ask for hidden names, and the import system for modules that are not loaded yet.
+    if not (name.startswith("_") or _is_module(module, name)):
+        found = _nearest(name, module)
+        words += f"; did you mean {' or '.join(found)}?" if found else ""
+    return AttributeError(words, name=name)
+
+
+def _is_module(package: str, name: str) -> bool:
+    within = hasattr(sys.modules[package], "__path__")
+    return within and find_spec(f"{package}.{name}") is not None
+
+
+def _nearest(name: str, module: str) -> list[str]:
+    """At most two full names like `name`: the same in another case, else the most alike."""
+    table, wanted = _directory(), name.lower()
+    here = module.replace("rigidjax", "rj", 1) + "."
+    keys = [wanted] if wanted in table else []
+    keys = keys or difflib.get_close_matches(wanted, table, n=2, cutoff=0.75)
+    if not keys and len(name) > 2:
+        begin = (key for key in table if key.startswith(wanted))
+        keys = [key for key in begin if any(one.startswith(here) for one in table[key])]
+
+    def unlike(one: str) -> tuple[bool, bool]:
+        return not one.endswith(f".{name}"), not one.startswith(here)
+
+    return [min(table[key], key=unlike) for key in keys[:2]]
+
+
+@functools.cache
+def _directory() -> dict[str, list[str]]:
+    """All public names in lower case, and where each is: the shortest way first."""
+    root = importlib.import_module("rigidjax")
+    queue: list[tuple[str, ModuleType]] = [("rj", root)]
+    seen, out = {root.__name__}, {}
+    while queue:
+        way, module = queue.pop(0)
+        for name in dir(module):
+            try:
+                value = getattr(module, name)
+            except ImportError:
+                continue
+            out.setdefault(name.lower(), []).append(f"{way}.{name}")
+            own = isinstance(value, ModuleType) and value.__name__.startswith("rigidjax")
+            if own and value.__name__ not in seen:
+                seen.add(value.__name__)
+                queue.append((f"{way}.{name}", value))
+    return out

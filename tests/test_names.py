@@ -57,6 +57,35 @@ def test_nothing_public_is_lost():
         rj.sources  # noqa: B018
 
 
+@pytest.mark.parametrize(
+    ("module", "name", "meant"),
+    [
+        (rj, "HeavyTop", "rj.torques.HeavyTop"),
+        (rj, "fit", "rj.identify.fit"),
+        (rj, "Simulate", "rj.simulate"),
+        (rj.identify, "HeavyTop", "rj.torques.HeavyTop"),
+        (rj.torques, "heavytop", "rj.torques.HeavyTop"),
+        (rj.torques, "Dampning", "rj.torques.Damping"),
+        (rj.body, "Sphere", "rj.shapes.sphere"),
+        (rj.plot, "polhodes", "rj.plot.polhode or rj.plot.herpolhode"),
+        (rj.frames, "CR3BP", "rj.scenes.cr3bp"),
+    ],
+)
+def test_a_wrong_name_is_answered_with_what_is_meant(module, name, meant):
+    with pytest.raises(AttributeError) as caught:
+        getattr(module, name)
+    assert str(caught.value).endswith(f"did you mean {meant}?")
+
+
+def test_what_is_like_nothing_gets_no_answer_and_hidden_names_no_search():
+    for name in ("banana", "__wrapped__", "_simulate"):
+        with pytest.raises(AttributeError) as caught:
+            getattr(rj, name)
+        assert "did you mean" not in str(caught.value)
+    # A module that is not loaded yet: the import system asks the package first.
+    assert importlib.import_module("rigidjax.identify.blackbox")
+
+
 def test_readme_and_guide_use_what_is_shown():
     pages = [ROOT / "README.md", *(ROOT / "notebooks").glob("*.md")]
     pages += (ROOT / "notebooks" / "guide").glob("*.md")

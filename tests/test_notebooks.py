@@ -1,10 +1,14 @@
 """Every notebook runs, in its short form, without an error or a warning; what is committed is light."""
 
+import ast
 import json
 import os
 from pathlib import Path
+from types import ModuleType
 
 import pytest
+
+import rigidjax as rj
 
 FOLDER = Path(__file__).parents[1] / "notebooks"
 NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
@@ -41,6 +45,36 @@ def test_committed_with_outputs_and_light(path):
     text = path.read_text(encoding="utf-8")
     assert "/tmp/" not in text
     assert "site-packages" not in text
+
+
+def chains(source):
+    """The dotted names of a program that begin at a name, such as `rj.body.principal`."""
+    for node in ast.walk(ast.parse(source)):
+        names = []
+        while isinstance(node, ast.Attribute):
+            names.append(node.attr)
+            node = node.value
+        if isinstance(node, ast.Name) and names:
+            yield node.id, names[::-1]
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_names_of_the_library_exist(path):
+    known = {"rj": rj} | {part: getattr(rj, part) for part in ("identify", "estimate", "torques")}
+    notebook = json.loads(path.read_text(encoding="utf-8"))
+    count = 0
+    for cell in notebook["cells"]:
+        if cell["cell_type"] != "code":
+            continue
+        for first, names in chains("".join(cell["source"])):
+            here = known.get(first)
+            for name in names:
+                if not isinstance(here, ModuleType):
+                    break
+                # An old name warns, and warnings are errors here.
+                here = getattr(here, name)
+                count += 1
+    assert count > 5 or path.stem == "13_polar_motion"  # its code is in `polar_motion.py`
 
 
 @pytest.mark.slow

@@ -1,6 +1,8 @@
 """Bodies: inertia, mass, second moments, shapes, charts by unconstrained numbers."""
 
-from rigidjax._names import own_names
+from typing import TYPE_CHECKING
+
+from rigidjax._names import own_names, suggests
 from rigidjax.body import (
     brightness as brightness,
     parameters as parameters,
@@ -30,4 +32,6 @@ from rigidjax.body.inertials import (
 from rigidjax.body.matrix_functions import matrix_function as matrix_function
 from rigidjax.body.principal_axes import principal as principal
 
+if not TYPE_CHECKING:
+    __getattr__ = suggests(__name__)
 __dir__ = own_names(__name__)

@@ -194,6 +194,11 @@ class MassProperties(eqx.Module):
     ):
         mass = _checks.floating(mass, (), "mass", batched=True)
         com = _checks.floating(com, (3,), "com", batched=True)
+        if isinstance(second_moment, Inertia):
+            raise TypeError(
+                "second_moment: wanted 𝔖 = ∫ r rᵀ dm about the centre of mass, (3, 3), got an "
+                "Inertia; give its .second_moment"
+            )
         second_moment = _checks.floating(second_moment, (3, 3), "second_moment", batched=True)
         _checks.same_batch(mass=(mass, 0), com=(com, 1), second_moment=(second_moment, 2))
         dtype = jnp.result_type(mass, com, second_moment)

@@ -106,7 +106,9 @@ def rows(fit: Fit) -> list[Row]:
     """
     out: list[Row] = []
     middle = np.exp(np.asarray(_periods(fit.body, fit.state0)))
-    low, high = (np.exp(bound) for bound in fit.interval_of(_periods))
+    # What the data do not determine has an end at infinity.
+    with np.errstate(over="ignore"):
+        low, high = (np.exp(bound) for bound in fit.interval_of(_periods))
     names = ("rotation about the long axis", "precession of the long axis")
     for name, *numbers in zip(names, middle, low, high, strict=True):
         out.append((name, *numbers, "day"))

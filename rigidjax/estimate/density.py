@@ -32,9 +32,10 @@ from rigidjax.motion.torques import CorrelatedTorque, RandomTorque, Sum
 class Point(eqx.Module):
     """What a vector of unconstrained numbers stands for.
 
-    **Fields:** `parameters` of the problem, `body` and `state0` as `Problem.unpack` gives them,
-    `values` of the `Free`s by name, `noise` (R, k) of each sensor, `process` the random torque or
-    `None`.
+    **Fields:** `parameters` of the problem; `body`, of several bodies a dict by name, and `state0`,
+    of several recordings with a leading axis, as `Problem.unpack` gives them; `values` of the
+    `Free`s by name, in their units; `noise` (R, k) of each sensor, in its unit; `process` the
+    random torque or `None`.
 
     >>> import rigidjax as rj
     >>> ts = jnp.linspace(0.0, 10.0, 80)
@@ -176,7 +177,10 @@ class LogDensity(eqx.Module):
         return value(x)
 
     def unpack(self, x: Float[Array, " n"]) -> Point:
-        """What x stands for."""
+        """What x (n,) stands for: a `Point` with `body`, `state0`, `values`, `noise`, `process`.
+
+        `values` are those of the `Free`s by name; `parameters` the problem's own numbers.
+        """
         x = _checks.floating(x, self.x0.shape, "x")
         parameters, noises, process, _ = self._read(x)
         body, state0 = self.problem.unpack(parameters)

@@ -72,8 +72,10 @@ class Nuts(eqx.Module):
 class Posterior(eqx.Module):
     """What `posterior` returns.
 
-    **Fields:** `density`; `x` (chains, samples, n) draws of the vector that it takes. `rhat` and
-    `ess` as in Gelman et al., Bayesian Data Analysis (2013), §11.4, 11.5.
+    **Fields:** `density`; `x` (chains, samples, n) draws of the vector that it takes. `points` are
+    what they stand for, `of(function)` anything computed of each. `rhat` (n,), below 1.01 where the
+    chains agree, and `ess` (n,), how many independent draws they are worth, as in Gelman et al.,
+    Bayesian Data Analysis (2013), §11.4, 11.5.
 
     >>> import jax, rigidjax as rj
     >>> ts = jnp.linspace(0.0, 10.0, 80)

@@ -1,6 +1,8 @@
 """Ready-made scenes: `rigidjax.simulate(None, Point(x, v), ts, scene)`, no body is needed."""
 
-from rigidjax._names import own_names
+from typing import TYPE_CHECKING
+
+from rigidjax._names import own_names, suggests
 from rigidjax.frames.cr3bp import ThreeBody as ThreeBody, cr3bp as cr3bp
 from rigidjax.frames.differential_correction import PeriodicOrbit as PeriodicOrbit
 from rigidjax.frames.earth import Earth as Earth, earth as earth
@@ -13,4 +15,6 @@ from rigidjax.frames.libration import (
 )
 from rigidjax.frames.manifolds import Manifold as Manifold
 
+if not TYPE_CHECKING:
+    __getattr__ = suggests(__name__)
 __dir__ = own_names(__name__)

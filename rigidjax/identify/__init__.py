@@ -66,11 +66,13 @@ from rigidjax.identify.sensors import (
     quaternions_from_euler as quaternions_from_euler,
     quaternions_from_matrices as quaternions_from_matrices,
 )
+from rigidjax.identify.simulated_readings import simulate_readings as simulate_readings
 from rigidjax.identify.stochastic_gradient import Descent as Descent
 from rigidjax.identify.two_frequencies import (
     TwoFrequencies as TwoFrequencies,
     two_frequencies as two_frequencies,
 )
+from rigidjax.identify.undetermined import Combination as Combination
 from rigidjax.identify.window_fit import WindowFit as WindowFit, fit_windows as fit_windows
 from rigidjax.identify.windows import Windows as Windows, windows as windows
 

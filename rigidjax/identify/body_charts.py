@@ -321,6 +321,12 @@ def _diagonal(logs: Float[Array, "3"]) -> Inertia:
     return Inertia(jnp.diag(jnp.stack([b + c, c + a, a + b])))
 
 
-def _typical(value: float) -> Array:
+def _typical(value: Any) -> Array:
+    if isinstance(value, Inertia | MassProperties):
+        raise TypeError(
+            "typical: wanted about how large the moments are, one number, kg m², got "
+            f"{type(value).__name__}; a body that is known is Known(body), one to begin with goes "
+            "to fit(initial=problem.start(body))"
+        )
     size = _checks.positive(value, "typical", "a positive moment of inertia, kg m²")
     return jnp.asarray(size, jnp.result_type(float))

@@ -16,13 +16,27 @@ from rigidjax.identify.quantities import (
     quantile,
 )
 from rigidjax.identify.several_bodies import Bodies
+from rigidjax.identify.undetermined import SEVERAL, undetermined
 
 if TYPE_CHECKING:
     from rigidjax.identify.result import Fit
 
 
 def identifiability(fit: "Fit") -> tuple[str, ...]:
-    """What the data determine, what they determine weakly, what not at all."""
+    """What the data determine, what they determine weakly, what not at all.
+
+    Of a fit that does not explain them, or did not end, nothing is called determined.
+    """
+    word = fit.status.partition(":")[0]
+    if word in ("poor", "failed"):
+        why = "does not explain the data" if word == "poor" else "did not end in a minimum"
+        out = [
+            f"This fit {why}, so that nothing is determined by it: its numbers and intervals are "
+            "those of the best point found, and say nothing about the body."
+        ]
+        # A search that did not end may have wandered along what the data do not determine.
+        out += _unseen(fit) if word == "failed" else []
+        return (*out, *in_words(fit.problem.records.readings))
     reach = quantile(fit, 0.95)
     out = []
     for quantity in _moments(fit):
@@ -78,18 +92,16 @@ def _rate(fit: "Fit", reach: float) -> str:
 
 
 def _unseen(fit: "Fit") -> list[str]:
-    count = fit.null_directions.shape[0]
-    if not count:
+    found = undetermined(fit)
+    if not found:
         return []
     out = []
     if scale_is_unseen(fit):
         out.append("The data determine the inertia only up to scale.")
-    one = count == 1
-    out.append(
-        f"{count} combination{'' if one else 's'} of the free numbers {'is' if one else 'are'} not "
-        "determined by these data; intervals that depend on "
-        f"{'it' if one else 'them'} are infinite."
-    )
+    out += [one.in_words for one in found[:SEVERAL]]
+    if len(found) > SEVERAL:
+        out.append(f"{len(found) - SEVERAL} more combinations of numbers are not determined.")
+    out.append("Intervals that depend on what is not determined are infinite.")
     return out
 
 

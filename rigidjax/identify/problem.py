@@ -436,6 +436,8 @@ def _firsts(slot: Slot) -> Array:
 
 
 def _named(thing: Any) -> str:
+    if isinstance(thing, Inertia | MassProperties):
+        return f"{type(thing).__name__}; a body that is known is Known(body)"
     if isinstance(thing, type):
         return f"the class {thing.__name__}; was () forgotten?"
     return type(thing).__name__

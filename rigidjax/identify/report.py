@@ -173,6 +173,18 @@ def as_dict(fit: Fit, files: Sequence[str] = (), more: Sequence[Row] = ()) -> di
             {"misfit": plain(s.cost), "converged": s.converged, "fits": s.fits} for s in fit.starts
         ],
         "identifiability": list(fit.identifiability),
+        "undetermined": [
+            {
+                "words": one.in_words,
+                "changes": {
+                    name: {"change": change, "unit": "relative" if ratio else unit}
+                    for name, change, unit, ratio in zip(
+                        one.names, one.changes, one.units, one.relative, strict=True
+                    )
+                },
+            }
+            for one in fit.undetermined
+        ],
     }
 
 

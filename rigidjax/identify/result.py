@@ -14,6 +14,7 @@ from rigidjax.identify.parameters import Parameters
 from rigidjax.identify.problem import Problem
 from rigidjax.identify.quantities import Quantity, interval_of, quantile
 from rigidjax.identify.residual import Noise
+from rigidjax.identify.undetermined import Combination, undetermined
 from rigidjax.identify.widths import widths
 
 
@@ -144,6 +145,14 @@ class Fit(eqx.Module):
         The covariance is carried by the function's derivative. **Raises** as `interval`.
         """
         return interval_of(self, of, level)
+
+    @property
+    def undetermined(self) -> tuple[Combination, ...]:
+        """The combinations of numbers that the data do not determine at all, by name.
+
+        Empty where they determine all. Each says `names`, `changes` and `in_words`.
+        """
+        return undetermined(self)
 
     @property
     def identifiability(self) -> tuple[str, ...]:

@@ -1,6 +1,8 @@
 """States, their equations of motion, torques: model no more than the scene needs."""
 
-from rigidjax._names import own_names
+from typing import TYPE_CHECKING
+
+from rigidjax._names import own_names, suggests
 from rigidjax.motion import lagrangian as lagrangian, torques as torques
 from rigidjax.motion.attitude import (
     Attitude as Attitude,
@@ -16,4 +18,6 @@ from rigidjax.motion.coupled import Coupled as Coupled
 from rigidjax.motion.rigid import NewtonEuler as NewtonEuler, Rigid as Rigid
 from rigidjax.motion.spin import EulerEquations as EulerEquations, Spin as Spin
 
+if not TYPE_CHECKING:
+    __getattr__ = suggests(__name__)
 __dir__ = own_names(__name__)

@@ -289,3 +289,9 @@ def test_containers_carry_a_batch():
     assert [leaf.shape[0] for leaf in jax.tree.leaves(made)] == [4, 4, 4]
     none = MassProperties(np.ones(0), np.zeros((0, 3)), np.zeros((0, 3, 3)))
     assert none.mass.shape == (0,)
+
+
+@pytest.mark.usefixtures("unhooked")
+def test_an_inertia_in_place_of_its_second_moment_is_named():
+    with pytest.raises(TypeError, match=r"got an Inertia; give its \.second_moment"):
+        MassProperties(1.0, ORIGIN, Inertia.from_principal(1.0, 1.6, 2.2))

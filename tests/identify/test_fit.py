@@ -93,6 +93,7 @@ def test_a_wrong_motion_is_not_called_success(tumble, noise):
     record = rj.identify.Recording(ts, (rj.identify.Gyro(noise), readings))
     found = rj.identify.fit(rj.identify.Problem(record, rj.identify.PrincipalRatios()), starts=2)
     assert found.status.startswith("poor")
+    assert not any("well determined" in words for words in found.identifiability)
 
 
 @pytest.mark.slow
@@ -103,6 +104,7 @@ def test_a_wrong_motion_is_not_called_outliers(tumble, loss):
     record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), rng.normal(size=(80, 3))))
     found = rj.identify.fit(rj.identify.Problem(record, rj.identify.Ratios(), loss=loss), starts=2)
     assert found.status.startswith("poor")
+    assert not any("well determined" in words for words in found.identifiability)
 
 
 def test_a_fit_that_stops_early_says_so_and_keeps_its_best(tumble):

@@ -71,6 +71,13 @@ def test_without_a_force_that_feels_it_the_mass_is_said_to_be_unseen():
     assert low == 0.0 and np.isinf(high)
     assert found.ok
     assert "mass is not determined by these data." in found.identifiability
+    words = "mass, I1, I2 and I3 rise together: only their ratios are determined."
+    assert words in found.identifiability
+    (told,) = identify.report.as_dict(found)["undetermined"]
+    assert told["words"] == words
+    assert {name: round(c["change"], 6) for name, c in told["changes"].items()} == dict.fromkeys(
+        ("mass", "I1", "I2", "I3"), 0.01
+    )
     # What the motion does show is found all the same.
     for name, value in zip(("com x", "com y", "com z"), TRUTH.com, strict=True):
         low, high = found.interval(0.99)[name]

@@ -340,6 +340,7 @@ def test_energy_adds_up():
         (lambda: torques.Sum([TOP, WHEEL]), r"got list; several go in a Sum: Sum\(a, b\)"),
         (lambda: torques.Sum(TOP, torques.Damping), r"got the class Damping, wanted one.*Damping\(\.\.\.\)"),
         (lambda: base.require_rung([TOP], ATTITUDE), r"torque: wanted a torque.*got list"),
+        (lambda: base.require_law([0.0, 0.0, 1.0]), r"got list; one that stays the same is ConstantTorque\(\["),
         (lambda: base.require_rung(torques.Damping, SPIN), "torque: got the class Damping"),
         (lambda: torques.Damping([1.0, np.nan, 1.0]), "coefficient: contains NaN"),
         (lambda: torques.GravityGradient(1.0, np.zeros(3)), "position: .*got zero"),
@@ -358,3 +359,23 @@ def test_energy_adds_up():
 def test_mistakes_are_told_in_words(make, words):
     with pytest.raises((TypeError, ValueError), match=words):
         make()
+
+
+def test_a_law_that_looks_at_what_the_state_has_not_is_named():
+    def brake(t, state, body):
+        return -rj.quaternion.rotate_inverse(state.q, state.omega)
+
+    def spring(t, state, body):
+        return -state.x
+
+    def wrong(t, state, body):
+        return state.banana
+
+    words = r"torque function looks at state.q, the attitude, and Spin has none: start from Att"
+    for law in (brake, rj.torques.Sum(brake, rj.torques.Damping([0.1, 0.1, 0.1]))):
+        with pytest.raises(TypeError, match=words):
+            base.act(law, 0.0, SPIN, BODY)
+    with pytest.raises(TypeError, match=r"state\.x, the position, and Attitude has none"):
+        base.act(spring, 0.0, ATTITUDE, BODY)
+    with pytest.raises(AttributeError, match="banana"):
+        base.act(wrong, 0.0, SPIN, BODY)

@@ -55,7 +55,18 @@ row(
     says=("reading",),
     **HOST,
 )
+row(
+    "identify.simulate_readings",
+    lambda: dict(
+        sensor=rj.identify.Gyro(0.1, bias=V), body=s.inertia(), state0=s.spin(), ts=TS,
+        torque=s.damping(), key=jax.random.key(0),
+    ),
+    groups=("stranger", "shape", "nan"),
+    traced=("body", "state0"),
+    transforms=("jit", "vmap", "jacfwd"),
+)  # fmt: skip
 leave_out("Recording makes it", "identify.Reading")
+leave_out("a fit makes it", "identify.Combination")
 leave_out("a fit hands it to a sensor", "identify.SensorInput")
 abstract = ("AbstractBodyChart", "AbstractIntegrator", "AbstractLoss", "AbstractSensor")
 leave_out("abstract: made by subclassing", *(f"identify.{name}" for name in abstract))

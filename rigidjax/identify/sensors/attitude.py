@@ -54,6 +54,13 @@ class AttitudeSensor(AbstractSensor):
             q = quaternion.multiply(q, quaternion.exp(self.mounting))
         return quaternion.log(quaternion.multiply(quaternion.conjugate(q), reading))
 
+    def reading_of(self, now: SensorInput, error: Vec3) -> Float[Array, "4"]:
+        """The reading (4,) whose error (3,) rad is this one."""
+        q = now.state.q
+        if self.mounting is not None:
+            q = quaternion.multiply(q, quaternion.exp(self.mounting))
+        return quaternion.multiply(q, quaternion.exp(error))
+
     def refusal(self, values: np.ndarray) -> tuple[np.ndarray, str]:
         wrong = np.abs(np.linalg.norm(values, axis=1) - 1) > 1e-6
         return wrong, (
@@ -96,21 +103,42 @@ class Direction(AbstractSensor):
         self.offset = number_of(offset, "offset")
 
     def error(self, now: SensorInput, reading: Array) -> Float[Array, "2"]:
-        seen = quaternion.rotate(quaternion.conjugate(now.state.q), self.world)
-        if self.mounting is not None:
-            seen = quaternion.rotate(quaternion.exp(-self.mounting), seen)
+        seen = self._seen(now)
         # Two axes across the reading, which is data: no derivative passes through them.
-        least = jnp.eye(3, dtype=reading.dtype)[jnp.argmin(jnp.abs(reading))]
-        first = cross(reading, least)
-        first = first / jnp.sqrt(dot(first, first))
-        second = cross(reading, first)
+        first, second = _across(reading)
         # sin θ / cos ½θ = 2 sin ½θ, the chord; guarded where the two are opposite.
         half = jnp.sqrt(jnp.maximum(0.5 * (1.0 + dot(seen, reading)), 1e-12))
         return -jnp.stack([dot(first, seen), dot(second, seen)]) / half
 
+    def reading_of(self, now: SensorInput, error: Float[Array, "2"]) -> Vec3:
+        """A reading (3,) whose error is as long as this one (2,), and for small ones is this one.
+
+        The two axes across the prediction are those across the reading but for the angle between.
+        """
+        seen = self._seen(now)
+        first, second = _across(seen)
+        # |error| is a chord: cos θ = 1 − ½ |error|², sin θ = |error| cos ½θ.
+        square = jnp.minimum(error[0] * error[0] + error[1] * error[1], 4.0)
+        half = jnp.sqrt(1.0 - 0.25 * square)
+        return (1.0 - 0.5 * square) * seen + half * (error[0] * first + error[1] * second)
+
+    def _seen(self, now: SensorInput) -> Vec3:
+        seen = quaternion.rotate(quaternion.conjugate(now.state.q), self.world)
+        if self.mounting is not None:
+            seen = quaternion.rotate(quaternion.exp(-self.mounting), seen)
+        return seen
+
     def refusal(self, values: np.ndarray) -> tuple[np.ndarray, str]:
         wrong = np.abs(np.linalg.norm(values, axis=1) - 1) > 1e-6
         return wrong, "the direction at index {index} is not of length 1"
+
+
+def _across(line: Vec3) -> tuple[Vec3, Vec3]:
+    """Two unit vectors across a unit vector, and each other."""
+    least = jnp.eye(3, dtype=line.dtype)[jnp.argmin(jnp.abs(line))]
+    first = cross(line, least)
+    first = first / jnp.sqrt(dot(first, first))
+    return first, cross(line, first)
 
 
 class Marker(AbstractSensor):

@@ -138,8 +138,11 @@ def require_law(torque: object, name: str = "torque") -> None:
             f"{torque.__name__}(...)"
         )
     if not callable(torque):
-        several = isinstance(torque, list | tuple)
-        advice = "; several go in a Sum: Sum(a, b)" if several else ""
+        advice = ""
+        if isinstance(torque, list | tuple) and any(callable(part) for part in torque):
+            advice = "; several go in a Sum: Sum(a, b)"
+        elif isinstance(torque, list | tuple | np.ndarray | jax.Array):
+            advice = "; one that stays the same is ConstantTorque([x, y, z])"
         raise TypeError(
             f"{name}: wanted a torque or force of rigidjax.torques, or a callable (t, state, "
             f"body), got {type(torque).__name__}{advice}"
@@ -223,12 +226,31 @@ def act(
     dtype = state.omega.dtype
     t = _checks.floating(t, (), "t").astype(dtype)
     # A table in float64 must not lift a float32 solve, nor stop it under strict promotion.
-    found = in_precision(law, dtype)(t, state, in_precision(body, dtype))
+    try:
+        found = in_precision(law, dtype)(t, state, in_precision(body, dtype))
+    except AttributeError as wrong:
+        if wrong.obj is not state or wrong.name not in _HIGHER:
+            raise
+        raise _lacking(law, state, wrong.name) from wrong
     # Not by class: laws of the moving frames give one too, and know nothing of this floor.
     if hasattr(found, "force"):
         return found.force.astype(dtype), found.torque.astype(dtype)
     value = _checks.floating(found, (3,), f"torque {type(law).__name__}", hint="body-frame N m")
     return None, value.astype(dtype)
+
+
+# What a state of the next rung has, and which that is.
+_HIGHER = {"q": "Attitude(q, omega)", "x": "Rigid(x, v, q, omega)", "v": "Rigid(x, v, q, omega)"}
+
+
+def _lacking(law: Any, state: Any, name: str) -> TypeError:
+    """The error for a law, of a user's own, that looks at what the state does not have."""
+    what = {"q": "attitude", "x": "position", "v": "velocity"}[name]
+    return TypeError(
+        f"torque {type(law).__name__} looks at state.{name}, the {what}, and "
+        f"{type(state).__name__} has none: start from {_HIGHER[name]}; a subclass of "
+        "AbstractTorque says what it looks at by feels"
+    )
 
 
 def one_law(law: Any) -> None:

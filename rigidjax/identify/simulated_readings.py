@@ -1,0 +1,192 @@
+"""What sensors would read of a motion that is known: simulated data."""
+
+from collections.abc import Sequence
+from typing import Any, overload
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float
+
+from rigidjax import _checks
+from rigidjax.body.inertia import Inertia, MassProperties
+from rigidjax.identify.propagation import free_states, shifted
+from rigidjax.identify.sensors import AbstractSensor, SensorInput
+from rigidjax.motion import Attitude, Rigid, Spin
+from rigidjax.motion.coupled import Coupled
+from rigidjax.motion.torques import Torque
+from rigidjax.motion.torques.states import freeze
+from rigidjax.solve import equations_of_motion, simulate
+
+Readings = Float[Array, "times ..."]
+Body = Inertia | MassProperties
+State = Spin | Attitude | Rigid
+Times = Float[ArrayLike, " times"] | Sequence[float]
+
+
+@overload
+def simulate_readings(
+    sensor: AbstractSensor,
+    body: Body,
+    state0: State,
+    ts: Times,
+    torque: Torque | None = None,
+    *,
+    key: Any = None,
+) -> Readings: ...
+
+
+@overload
+def simulate_readings(
+    sensor: Sequence[AbstractSensor],
+    body: Body,
+    state0: State,
+    ts: Times,
+    torque: Torque | None = None,
+    *,
+    key: Any = None,
+) -> tuple[Readings, ...]: ...
+
+
+def simulate_readings(
+    sensor: AbstractSensor | Sequence[AbstractSensor],
+    body: Body,
+    state0: State,
+    ts: Times,
+    torque: Torque | None = None,
+    *,
+    key: Any = None,
+) -> Readings | tuple[Readings, ...]:
+    """What a sensor would read of a known motion, with noise: data for trying out a fit.
+
+    The motion is that of `rigidjax.simulate`; bias, scale, mounting, clock offset, low-pass filter
+    and full scale are those of the sensor. A fit of the readings with the same sensor leaves
+    residuals that are the noise. It is differentiable, and works under `jax.jit` and `jax.vmap`.
+
+    **Arguments:** `sensor` an `AbstractSensor`, or a sequence of them, which then see one motion;
+    `body`, `state0`, `ts` (T,) s, `torque` as for `rigidjax.simulate`; `MassProperties` are allowed
+    for all states (a sensor's `place` is then in their frame). `key` of `jax.random`: normal noise
+    of the sensor's standard deviation `noise` is added; `None` for readings without noise.
+
+    **Returns** readings (T, …) as the sensor's `reading_shape` says, in its unit, for
+    `Recording(ts, (sensor, readings), torque=torque)`; of a sequence a tuple of them.
+
+    **Raises:** `TypeError` for what is no sensor, and a state without what the sensor feels;
+    `ValueError` for a key where the sensor's noise is `None`, and for a sensor of one's own whose
+    readings have another shape than its error and that has no method `reading_of`; as
+    `rigidjax.simulate`.
+
+    >>> import rigidjax as rj
+    >>> body, start = rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([0.0, 0.0, 2.0])
+    >>> gyro = rj.identify.Gyro(noise=0.01, bias=[0.0, 0.0, 0.5])
+    >>> simulate_readings(gyro, body, start, [0.0, 1.0])[1].tolist()
+    [0.0, 0.0, 2.5]
+    >>> simulate_readings(gyro, body, start, [0.0, 1.0], key=jax.random.key(0)).shape
+    (2, 3)
+    """
+    order = "the order is sensor, body, state0, ts"
+    _checks.instance(state0, (Spin, Attitude, Rigid), "state0", hint=order)
+    several = isinstance(sensor, Sequence)
+    sensors = tuple(sensor) if several else (sensor,)
+    if not sensors:
+        raise ValueError("sensor: wanted a sensor or several, got none")
+    for one in sensors:
+        _fits(one, state0, key)
+    turned = (
+        body.inertia if isinstance(body, MassProperties) and type(state0) is not Rigid else body
+    )
+    start: Any = state0
+    sol = simulate(turned, start, ts, torque)
+    states = sol.ys if sol.own is None else Coupled(sol.ys, sol.own)
+    keys = (
+        [None] * len(sensors) if key is None else jax.random.split(_checks.key(key), len(sensors))
+    )
+    out = tuple(
+        _readings(one, turned, body, torque, sol.ts, states, each)
+        for one, each in zip(sensors, keys, strict=True)
+    )
+    return out if several else out[0]
+
+
+@eqx.filter_jit
+def _readings(
+    sensor: AbstractSensor,
+    turned: Body,
+    body: Body,
+    torque: Torque | None,
+    ts: Array,
+    states: Any,
+    key: Any,
+) -> Readings:
+    first = jax.tree.map(lambda leaf: leaf[0], states)
+    field = equations_of_motion(turned, first, torque)
+    offset, times = getattr(sensor, "offset", None), ts
+    if offset is not None:
+        times = ts + offset
+        if torque is None:
+            states = free_states(turned, first, times - ts[0])
+        else:
+            states = jax.vmap(lambda t, y: shifted(field, t, y, offset))(ts, states)
+
+    def now(t: Array, state: Any) -> SensorInput:
+        if not isinstance(state, Coupled):
+            return SensorInput(t, state, body, field)
+        inner = equations_of_motion(turned, state.motion, torque)
+        return SensorInput(t, state.motion, body, freeze(inner, state.own))
+
+    error = jnp.zeros((ts.shape[0], sensor.components), ts.dtype)
+    if key is not None:
+        assert sensor.noise is not None
+        error = sensor.noise[None] * jax.random.normal(key, error.shape, ts.dtype)
+    lowpass = getattr(sensor, "lowpass", None)
+    if lowpass is not None:
+        nothing = jnp.zeros(sensor.reading_shape, ts.dtype)
+        shown = jax.vmap(lambda t, y: -sensor.error(now(t, y), nothing))(times, states)
+        values = lowpass(times, shown) + error
+    else:
+        reading = getattr(sensor, "reading_of", None) or _Plain(sensor)
+        values = jax.vmap(lambda t, y, e: reading(now(t, y), e))(times, states, error)
+    limit = getattr(sensor, "limit", None)
+    return values if limit is None else jnp.clip(values, -limit[None], limit[None])
+
+
+class _Plain(eqx.Module):
+    """Prediction plus error, of a sensor whose error is reading minus prediction."""
+
+    sensor: AbstractSensor
+
+    def __call__(self, now: SensorInput, error: Array) -> Array:
+        shape = self.sensor.reading_shape
+        nothing = jnp.zeros(shape, error.dtype)
+        return (error - self.sensor.error(now, nothing)).reshape(shape)
+
+
+def _fits(sensor: Any, state0: Any, key: Any) -> None:
+    """Refuse what is no sensor, and one that needs more than there is."""
+    name = type(sensor).__name__
+    _checks.instance(
+        sensor, AbstractSensor, "sensor", wanted="a sensor such as Gyro(0.01), or several"
+    )
+    if not isinstance(state0, sensor.feels):
+        raise TypeError(
+            f"{name} needs a state with {sensor.feels.__name__}, got {type(state0).__name__}; take "
+            "Attitude, or Rigid for what depends on the position"
+        )
+    if sensor.noise is not None and jnp.shape(sensor.noise) != (sensor.components,):
+        raise ValueError(
+            f"sensor: {name}: noise: wanted shape ({sensor.components},), of one sensor, got "
+            f"{jnp.shape(sensor.noise)}; of many use jax.vmap"
+        )
+    if key is not None and sensor.noise is None:
+        raise ValueError(
+            f"{name}: noise=None says no size of the noise to draw; give noise, or key=None"
+        )
+    size = 1
+    for length in sensor.reading_shape:
+        size *= length
+    if not hasattr(sensor, "reading_of") and size != sensor.components:
+        raise ValueError(
+            f"{name}: its readings of shape {sensor.reading_shape} are not its error of "
+            f"{sensor.components} numbers plus a prediction; write a method reading_of(now, "
+            "error), the reading whose error is this one"
+        )

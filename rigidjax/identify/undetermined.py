@@ -1,0 +1,243 @@
+"""Which combinations of numbers the data do not determine, by the user's names."""
+
+from typing import TYPE_CHECKING, Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array
+
+from rigidjax.body.inertia import MassProperties
+from rigidjax.identify.parameters import Parameters
+from rigidjax.identify.problem import Problem
+from rigidjax.identify.quantities import charts, labels, recording_names, vector
+from rigidjax.rotation import quaternion
+
+if TYPE_CHECKING:
+    from rigidjax.identify.result import Fit
+
+# A number takes part where it changes by more than this share of the largest change.
+PART = 1e-3
+# What is left of a direction below this share is round-off.
+ROUND_OFF = 1e-5
+# Changes by the same factor differ by less than this share.
+EVEN = 0.01
+# So many numbers of one combination are written out, so many combinations.
+MOST, SEVERAL = 6, 5
+
+
+class Combination(eqx.Module):
+    """Numbers that may change together without changing a reading.
+
+    **Fields:** `names`; small `changes` of each: relative where `relative` says so, else in its
+    `units`.
+
+    >>> Combination(("I1", "I2"), (0.01, 0.01), ("", ""), (True, True)).in_words
+    'I1 and I2 rise together: only I1/I2 is determined.'
+    >>> Combination(("Ωx", "bias x"), (0.1, -0.1), ("rad/s", "rad/s"), (False, False)).in_words
+    'No reading changes where these change together: Ωx by +0.1 rad/s, bias x by −0.1 rad/s.'
+    """
+
+    names: tuple[str, ...] = eqx.field(static=True)
+    changes: tuple[float, ...] = eqx.field(static=True)
+    units: tuple[str, ...] = eqx.field(static=True)
+    relative: tuple[bool, ...] = eqx.field(static=True)
+
+    @property
+    def in_words(self) -> str:
+        """One sentence."""
+        names, sizes = self.names, np.array(self.changes)
+        if len(names) == 1:
+            name = names[0][0].upper() + names[0][1:]
+            return f"{name} is not determined: no reading changes with it."
+        even = all(self.relative) and np.ptp(np.abs(sizes)) < EVEN * np.abs(sizes).max()
+        if even and (sizes > 0).all():
+            listed = f"{', '.join(names[:-1])} and {names[-1]}"
+            only = f"{names[0]}/{names[1]} is" if len(names) == 2 else "their ratios are"
+            return f"{listed} rise together: only {only} determined."
+        if even and len(names) == 2:
+            return (
+                f"{names[0]} rises as {names[1]} falls: only {names[0]}·{names[1]} is determined."
+            )
+        parts = [
+            f"{name} by {_signed(100 * size if ratio else size)} {'%' if ratio else unit}".rstrip()
+            for name, size, unit, ratio in zip(
+                names, self.changes, self.units, self.relative, strict=True
+            )
+        ]
+        more = "" if len(parts) <= MOST else f", and {len(parts) - MOST} more"
+        return f"No reading changes where these change together: {', '.join(parts[:MOST])}{more}."
+
+
+# Components of a tensor in the order of its names.
+TENSOR = {"Ixx": (0, 0), "Iyy": (1, 1), "Izz": (2, 2), "Iyz": (1, 2), "Ixz": (0, 2), "Ixy": (0, 1)}
+
+
+def undetermined(fit: "Fit") -> tuple[Combination, ...]:
+    """The combinations that the data do not determine at all, each of few numbers.
+
+    The rows of `Fit.null_directions` are any basis; here each has a number that no other has (the
+    reduced echelon form), in the axes, the world's or the body's, in which the first attitudes
+    take fewer numbers.
+    """
+    null = np.asarray(fit.null_directions)
+    if not null.size:
+        return ()
+    best = None
+    slopes, values = map(np.asarray, _slopes(fit.problem, fit.parameters))
+    for slope, names in zip(slopes, _names(fit.problem), strict=True):
+        # The free numbers are of order one: a number's largest derivative is its own size.
+        size = np.abs(slope).max(axis=1)
+        first, many = len(labels(fit.problem)), len(charts(fit.problem))
+        tensors = size[first : first + 6 * many].reshape(many, 6)
+        tensors[:] = tensors.max(axis=1, keepdims=True)
+        relative = np.array([one[2] for one in names])
+        size = np.where(relative | (size == 0), 1.0, size)
+        changes = null @ slope.T / size
+        kept = _kept(fit, [one[0] for one in names], changes)
+        rows = _reduced(np.where(kept, changes, 0.0))
+        if best is None or np.count_nonzero(rows) < np.count_nonzero(best[0]):
+            best = rows, names, size
+    assert best is not None
+    rows, names, size = best
+    return tuple(_combination(row, names, size, values) for row in rows if row.any())
+
+
+def _combination(
+    row: np.ndarray, names: list[tuple[str, str, bool]], size: np.ndarray, values: np.ndarray
+) -> Combination:
+    order = np.flatnonzero(row)
+    # The largest change: a hundredth of the number, or of its size; the first number goes up.
+    changes = 0.01 * np.sign(row[order[0]]) * row / np.abs(row).max() * size
+    relative = np.array([name[2] for name in names])
+    # Numbers that only have the same factor are better told so.
+    shares = np.where(relative, changes, changes / np.where(values == 0, np.inf, values))[order]
+    if np.ptp(np.abs(shares)) < EVEN * np.abs(shares).max():
+        changes[order] = 0.01 * shares / np.abs(shares).max()
+        relative[order] = True
+    return Combination(
+        tuple(names[i][0] for i in order),
+        tuple(float(changes[i]) for i in order),
+        tuple("" if relative[i] else names[i][1] for i in order),
+        tuple(bool(relative[i]) for i in order),
+    )
+
+
+def _names(problem: Problem) -> list[list[tuple[str, str, bool]]]:
+    """Name, unit, whether relative, of what `_numbers` gives; for the world's axes, the body's."""
+    of_all = labels(problem)
+    for name, chart in charts(problem):
+        unit = chart.unit.replace("SI", "kg m²")
+        of_all += [(f"{part}{name}", unit, False) for part in TENSOR]
+    own, out = problem.start().own, []
+    for axes in ("the world's", "the body's"):
+        rows = list(of_all)
+        for where in recording_names(problem):
+            if own.turn is not None:
+                rows += [
+                    (f"the first attitude about {axes} {k}{where}", "rad", False) for k in "xyz"
+                ]
+        for part, name, unit in ((own.place, "position", "m"), (own.speed, "velocity", "m/s")):
+            if part is not None:
+                rows += [
+                    (f"the first {name} {k}{where}", unit, False)
+                    for where in recording_names(problem)
+                    for k in "xyz"
+                ]
+        out.append(rows)
+    return out
+
+
+@eqx.filter_jit
+def _slopes(problem: Problem, parameters: Parameters) -> tuple[Array, Array]:
+    """The derivatives (2, M, n) of the numbers by which directions are named, in the free ones,
+    and their values (M,).
+
+    All that is reported, the tensors of the bodies, and the first attitudes, positions and
+    velocities; the attitudes in the world's axes, then in the body's.
+    """
+    flat, restore = ravel_pytree(parameters)
+    reference = problem.reference
+    q = None if parameters.own.turn is None else _attitudes(reference, parameters.own)
+
+    def value(x: Array) -> Array:
+        moved = restore(x)
+        bodies = problem.bodies(moved)
+        rows = bodies.values() if isinstance(bodies, dict) else (bodies,)
+        parts = [vector(problem, moved)]
+        for body in rows:
+            tensor = (body.inertia if isinstance(body, MassProperties) else body).tensor
+            parts.append(jnp.stack([tensor[place] for place in TENSOR.values()]))
+        before, beyond = list(parts), []
+        if q is not None:
+            now = _attitudes(reference, moved.own)
+            back = jax.vmap(quaternion.conjugate)(q)
+            turned = jax.vmap(lambda a, b: quaternion.log(quaternion.multiply(a, b)))
+            before.append(turned(now, back).reshape(-1))
+            parts.append(turned(back, now).reshape(-1))
+        if moved.own.place is not None:
+            length, rate = reference.length[:, None], reference.rate[:, None]
+            beyond = [length * moved.own.place, length * rate * moved.own.speed]
+        beyond = [part.reshape(-1) for part in beyond]
+        both = (jnp.concatenate([*some, *beyond]) for some in (before, parts))
+        return jnp.stack(list(both))
+
+    return jax.jacfwd(value)(flat), value(flat)[1]
+
+
+def _attitudes(reference: Any, own: Any) -> Array:
+    """The first attitudes (R, 4)."""
+    return jax.vmap(quaternion.multiply)(reference.q, jax.vmap(quaternion.exp)(own.turn))
+
+
+def _kept(fit: "Fit", names: list[str], changes: np.ndarray) -> np.ndarray:
+    """Which numbers name the changes (k, M): of each body its moments; where the principal axes
+    turn, the components of its tensor.
+    """
+    bodies = fit.problem.bodies(fit.parameters)
+    rows = bodies.values() if isinstance(bodies, dict) else (bodies,)
+    kept = np.ones(len(names), bool)
+    for (where, chart), body in zip(charts(fit.problem), rows, strict=True):
+        inertia = body.inertia if isinstance(body, MassProperties) else body
+        # A chart may report these components, too: the last are those of all charts.
+        every = [[i for i, one in enumerate(names) if one == f"{part}{where}"] for part in TENSOR]
+        places = [some[-1] for some in every]
+        kept[[i for some in every for i in some]] = False
+        moments = [names.index(f"{log}{where}") for log in chart.log_names if log != "mass"]
+        if moments and _turns(np.asarray(inertia.tensor), changes[:, places]):
+            kept[moments], kept[places] = False, True
+    return kept
+
+
+def _turns(tensor: np.ndarray, changes: np.ndarray) -> bool:
+    """Whether some change (k, 6) of a tensor (3, 3) turns its principal axes."""
+    steps = np.zeros((len(changes), 3, 3))
+    for column, (i, j) in zip(changes.T, TENSOR.values(), strict=True):
+        steps[:, i, j] = steps[:, j, i] = column
+    _, axes = np.linalg.eigh(tensor)
+    along = np.einsum("ia,kij,jb->kab", axes, steps, axes)
+    across = along - along * np.eye(3)
+    return bool(np.abs(across).max() > PART * max(np.abs(along).max(), 1e-6))
+
+
+def _reduced(rows: np.ndarray) -> np.ndarray:
+    """The reduced row echelon form of rows (k, M), by complete pivoting; small parts are 0."""
+    rows = np.array(rows)
+    size, done = np.abs(rows).max(), 0
+    while done < len(rows):
+        i, j = np.unravel_index(np.argmax(np.abs(rows[done:])), rows[done:].shape)
+        if np.abs(rows[done + i, j]) <= ROUND_OFF * size:
+            break
+        rows[[done, done + i]] = rows[[done + i, done]]
+        rows[done] /= rows[done, j]
+        others = np.arange(len(rows)) != done
+        rows[others] -= np.outer(rows[others, j], rows[done])
+        done += 1
+    rows = rows[:done]
+    return np.where(np.abs(rows) > PART * np.abs(rows).max(axis=1, keepdims=True), rows, 0.0)
+
+
+def _signed(number: float) -> str:
+    return f"{number:+.2g}".replace("-", "−")

@@ -1,0 +1,111 @@
+"""What data do not determine is named: made-up singular vectors whose meaning is known."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.flatten_util import ravel_pytree
+
+import rigidjax as rj
+from rigidjax import identify
+from rigidjax.identify.undetermined import Combination
+
+TS = np.linspace(0.0, 1.0, 5)
+BODY = rj.Inertia.from_principal(1.0, 1.6, 2.1)
+
+
+def fit_with(chart, directions, status="ok", mix=None):
+    """A fit of which only the directions that its data do not determine matter.
+
+    **Arguments:** `directions` functions of zeroed `Parameters` to changed ones.
+    """
+    gyro = identify.Gyro(0.01, bias=[0.0, 0.0, 0.0])
+    turned = np.tile([0.8, 0.0, 0.6, 0.0], (5, 1))
+    record = identify.Recording(
+        TS, (gyro, np.ones((5, 3))), (identify.AttitudeSensor(0.01), turned)
+    )
+    bias = identify.Free(lambda r: r.readings[0].sensor.bias, "bias", scale=0.05)
+    problem = identify.Problem(record, chart, free=[bias])
+    here = problem.start(BODY)
+    nothing = jax.tree.map(jnp.zeros_like, here)
+    null = np.stack([np.asarray(ravel_pytree(make(nothing))[0]) for make in directions])
+    null = null if mix is None else mix @ null
+    n = null.shape[1]
+    like = jnp.eye(n)
+    return identify.Fit(
+        problem, here, like, like, "none", tuple(jnp.ones((1, k)) for k in (3, 3)), (), 1.0, 1,
+        1.0, 1.0, jnp.ones(n), jnp.asarray(null), (), status,
+    )  # fmt: skip
+
+
+def grown(step):
+    """The body by 1 %: half the logarithms of the second moments."""
+    return at(step, "body", jnp.full(step.body.shape, 0.005))
+
+
+def at(tree, name, value):
+    return eqx.tree_at(lambda p: getattr(p, name), tree, value)
+
+
+def test_combinations_are_told_apart_and_named():
+    def heading(step):
+        # About the world's vertical, in the axes of the body.
+        axis = rj.quaternion.rotate_inverse(first, jnp.array([0.0, 0.0, 1.0]))
+        return eqx.tree_at(lambda p: p.own.turn, step, axis[None])
+
+    def spun(step):
+        # The rate up, the bias down: in units of the typical rate and of 0.05 rad/s.
+        rate = step_rate * jnp.array([[0.0, 0.0, 1.0]])
+        moved = eqx.tree_at(lambda p: p.own.spin, step, rate)
+        return eqx.tree_at(lambda p: p.shared, moved, (jnp.array([0.0, 0.0, -20.0]),))
+
+    probe = fit_with(identify.Principal(1.5), [grown])
+    first, step_rate = probe.problem.unpack(probe.parameters)[1].q, 1 / probe.problem.typical_rate
+    assert rj.quaternion.angle(first) > 0.1  # so that the world's axes are not the body's
+    mix = np.random.default_rng(0).normal(size=(3, 3))
+    found = fit_with(identify.Principal(1.5), [grown, heading, spun], mix=mix).undetermined
+    assert sorted(one.in_words for one in found) == [
+        "Ix, Iy and Iz rise together: only their ratios are determined.",
+        "No reading changes where these change together: Ωz by +0.0005 rad/s, bias z by "
+        "−0.0005 rad/s.",
+        "The first attitude about the world's z is not determined: no reading changes with it.",
+    ]
+
+
+def test_axes_that_turn_are_named_by_the_tensor():
+    chart = identify.Tensor(1.0)
+
+    def tilted(step):
+        def vector(angle):
+            turned = BODY.rotated(rj.quaternion.exp(angle * jnp.array([0.0, 0.0, 1.0])))
+            return chart.vector(turned)
+
+        return at(step, "body", (vector(1e-6) - vector(0.0)) / 1e-6)
+
+    (one,) = fit_with(chart, [tilted]).undetermined
+    assert one.names == ("Ixy",)
+    assert one.in_words == "Ixy is not determined: no reading changes with it."
+
+
+def test_a_fit_that_explains_nothing_calls_nothing_determined():
+    poor = fit_with(identify.Principal(1.5), [grown], "poor: the errors are 9.0 times the noise")
+    (line,) = poor.identifiability
+    assert "does not explain the data, so that nothing is determined by it" in line
+    failed = fit_with(identify.Principal(1.5), [grown], "failed: not converged").identifiability
+    assert "did not end in a minimum" in failed[0]
+    assert "Ix, Iy and Iz rise together: only their ratios are determined." in failed
+    assert not any("well determined" in line for line in failed)
+
+
+@pytest.mark.parametrize(
+    ("changes", "relative", "words"),
+    [
+        ((0.01, -0.01), (True, True), "A rises as B falls: only A·B is determined."),
+        ((0.01, 0.01), (True, True), "A and B rise together: only A/B is determined."),
+        ((0.01, 0.02), (True, False), "No reading changes where these change together: A by +1 %, B by +0.02 m."),
+    ],
+)  # fmt: skip
+def test_words(changes, relative, words):
+    units = tuple("" if ratio else "m" for ratio in relative)
+    assert Combination(("A", "B"), changes, units, relative).in_words == words
