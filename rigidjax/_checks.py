@@ -129,6 +129,17 @@ def refuse(value: Any, bad: Bool[ArrayLike, "..."], message: str) -> Any:
     return eqx.error_if(value, bad, message)
 
 
+def bare(error: RuntimeError) -> RuntimeError:
+    """The same error with its own sentence alone, without the long text that Equinox puts around.
+
+    >>> long = "Above is the stack.\\n\\nequinox.EquinoxRuntimeError: ts: too few\\n\\n-----\\n\\nAn error"
+    >>> bare(RuntimeError(long))
+    RuntimeError('ts: too few')
+    """
+    found = re.search(r"^\S*EquinoxRuntimeError: (.+?)\n\n-+$", str(error), re.M | re.S)
+    return type(error)(found[1]) if found else error
+
+
 def finite(value: Float[Array, "..."], name: str) -> Float[Array, "..."]:
     """Return `value` unless it holds a NaN or an infinity."""
     xp = namespace(value)

@@ -114,9 +114,10 @@ class LogDensity(eqx.Module):
         if problem.loss is not None:
             raise ValueError("fit: its problem has a robust loss, which is no density; fit without")
         if not np.isfinite(np.asarray(fit.covariance)).all():
+            what = " ".join(one.in_words for one in fit.undetermined)
             raise ValueError(
-                "fit: neither the data nor a prior determine some direction (see "
-                "fit.identifiability), so there is no posterior; give a prior or fewer free numbers"
+                "fit: neither the data nor a prior determine some direction, so there is no "
+                f"posterior; give a prior or fewer free numbers. {what}".rstrip()
             )
         self.problem, self.process, self.noises = problem, process, fit.noises
         spread = None if process is None or deviation is None else deviation

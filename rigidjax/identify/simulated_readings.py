@@ -132,7 +132,7 @@ def _readings(
         if not isinstance(state, Coupled):
             return SensorInput(t, state, body, field)
         inner = equations_of_motion(turned, state.motion, torque)
-        return SensorInput(t, state.motion, body, freeze(inner, state.own))
+        return SensorInput(t, state.motion, body, freeze(inner, state.own), state.own)
 
     error = jnp.zeros((ts.shape[0], sensor.components), ts.dtype)
     if key is not None:

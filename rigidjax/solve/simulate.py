@@ -141,7 +141,7 @@ def simulate(
         free = Free(body, throw)
         if event is not None:
             return _until(event, free, state0, times)
-        return Solution(times, *solve(free, state0, times), free)
+        return _solution(free, state0, times)
     method = DormandPrince8() if solver is None else solver
     plain = isinstance(method, AbstractExplicit) and max_steps is not None
     plain = plain and stepsize_controller is None and progress_meter is None
@@ -173,8 +173,11 @@ def simulate(
     return _solution(setup, state0, times)
 
 
-def _solution(setup: Loop | Setup, state0: Any, times: Array) -> Solution:
-    ys, stats, result = solve(setup, state0, times)
+def _solution(setup: Free | Loop | Setup, state0: Any, times: Array) -> Solution:
+    try:
+        ys, stats, result = solve(setup, state0, times)
+    except RuntimeError as error:
+        raise _checks.bare(error) from None
     if setup.throw and "collided" in stats:
         ys = collision.refuse(ys, stats, times)
     if isinstance(ys, Coupled):
@@ -186,7 +189,10 @@ def _until(event: Any, setup: Free | Loop, state0: Any, times: Array) -> Solutio
     event = event if isinstance(event, Event) else Event(event)
     state0 = started(setup.body, state0, getattr(setup, "torque", None), times[0])
     require_condition(Asked(event.condition, setup.body), times[0], state0)
-    ys, stats, result, time, state = solve_until(setup, event, state0, times)
+    try:
+        ys, stats, result, time, state = solve_until(setup, event, state0, times)
+    except RuntimeError as error:
+        raise _checks.bare(error) from None
     if setup.throw and "collided" in stats:
         ys = collision.refuse(ys, stats, times)
     if isinstance(ys, Coupled):

@@ -363,3 +363,13 @@ def test_a_time_of_more_turns_than_the_dtype_counts_is_refused():
         rj.simulate(body, start, [0.0, 1e75])
     kept = rj.simulate(body, start, [0.0, 1.0, 1e75], throw=False)
     np.testing.assert_array_equal(np.isfinite(kept.ys.omega).all(-1), [True, True, False])
+
+
+def test_a_torque_of_nan_is_told_in_one_sentence_outside_of_jit():
+    law = lambda t, state, body: jnp.log(0.5 - t) * state.omega
+    body = rj.Inertia.from_principal(1.0, 1.6, 2.2)
+    with pytest.raises(RuntimeError) as caught:
+        rj.simulate(body, rj.Spin([1.0, 0.0, 0.0]), [0.0, 1.0], law)
+    words = str(caught.value)
+    assert words.startswith("simulate: the motion became NaN or infinite.")
+    assert "\n" not in words and caught.value.__suppress_context__
