@@ -130,9 +130,9 @@ def refuse(value: Any, bad: Bool[ArrayLike, "..."], message: str) -> Any:
 
 
 def bare(error: RuntimeError) -> RuntimeError:
-    """The same error with its own sentence alone, without the long text that Equinox puts around.
+    r"""The same error with its own sentence alone, without the long text that Equinox puts around.
 
-    >>> long = "Above is the stack.\\n\\nequinox.EquinoxRuntimeError: ts: too few\\n\\n-----\\n\\nAn error"
+    >>> long = "Above is the stack.\n\nequinox.EquinoxRuntimeError: ts: too few\n\n-----\n\nError"
     >>> bare(RuntimeError(long))
     RuntimeError('ts: too few')
     """

@@ -65,11 +65,11 @@ def orbit(moments: Triple, momentum: Triple) -> Orbit:
 class Reduced(NamedTuple):
     """A time less whole half periods.
 
-    `count` half periods, `rest` what is left, `near` the same but for the separatrix, which comes
+    `halves` half periods, `rest` what is left, `near` the same but for the separatrix, which comes
     to rest and is not followed beyond.
     """
 
-    count: Scalar
+    halves: Scalar
     rest: Scalar
     near: Scalar
 
@@ -83,7 +83,7 @@ def reduced(u: Scalar, half: Scalar, m: Modulus) -> Reduced:
 def restored(o: Orbit, f: Elliptic, u: Reduced) -> tuple[Elliptic, Scalar]:
     """S, C, D at the whole time from those at `near`; and the phase of what was left out."""
     big = jnp.maximum(o.modulus.p, o.modulus.q)
-    whole = jnp.where(u.count == 0, 0.0, u.count)
+    whole = jnp.where(u.halves == 0, 0.0, u.halves)
     # From then on the momentum rests on the middle axis, S² = 1/max(p, q): a steady spin.
     spin = (u.rest - u.near) * o.turn / jnp.where(big > 0, big + o.mu, 1.0)
     odd = jnp.abs(whole - 2.0 * jnp.round(0.5 * whole)) > 0.5
@@ -95,7 +95,7 @@ def restored(o: Orbit, f: Elliptic, u: Reduced) -> tuple[Elliptic, Scalar]:
             C=jnp.where(around_three, sign, 1.0) * f.C,
             D=jnp.where(around_three, 1.0, sign) * f.D,
         ),
-        whole * jnp.where(u.count == 0, 0.0, o.half.phase) + spin,
+        whole * jnp.where(u.halves == 0, 0.0, o.half.phase) + spin,
     )
 
 

@@ -105,8 +105,10 @@ def first_order(moments: Six, momentum: Triple, t: Scalar):
     f = at.f._replace(
         C=jnp.where(o.swapped, at.f.D, at.f.C), D=jnp.where(o.swapped, at.f.C, at.f.D)
     )
-    whole = jnp.where(u.count == 0, 0.0, 2.0 * u.count) * jnp.where(u.count == 0, 0.0, o.half.time)
-    halfway = Halfway(at._replace(f=f), u.count, whole, o.half.mean)
+    whole = jnp.where(u.halves == 0, 0.0, 2.0 * u.halves) * jnp.where(
+        u.halves == 0, 0.0, o.half.time
+    )
+    halfway = Halfway(at._replace(f=f), u.halves, whole, o.half.mean)
     body, _, _ = reciprocal(moments, momentum)
     rows, g = jacobian_and_integral(body, momentum, t, halfway)
     return from_functions(o, at.f, u, t), rows, g
@@ -170,7 +172,7 @@ def _small_turn(k: Six, momentum: Triple, t: Scalar) -> tuple[Array, ...]:
     for n in range(_ORDER):
         ws.append(fence(times(k, ps[n]), one))
         if n < _ORDER - 1:
-            ps.append(fence(_mean([cross(ps[j], ws[n - j]) for j in range(n + 1)]), one))
+            ps.append(fence(_mean([cross(ps[j], ws[n - j]) for j in range(n + 1)], n + 1), one))
 
     def column(unit: Array) -> Triple:
         d_k, d_ps = tuple(unit[:6]), [tuple(c * t for c in unit[6:])]
@@ -180,15 +182,16 @@ def _small_turn(k: Six, momentum: Triple, t: Scalar) -> tuple[Array, ...]:
             slope = zip(times(k, d_ps[n]), times(d_k, ps[n]), strict=True)
             d_ws.append(fence(tuple(a + b for a, b in slope), one))
             turns = [cross(thetas[j], ws[n - 1 - j]) for j in range(n)]
-            thetas.append(tuple(sum(c) / (n + 1) for c in zip(d_ws[n], *turns, strict=True)))
+            thetas.append(_mean([d_ws[n], *turns], n + 1))
             if n < _ORDER - 1:
                 turns = [cross(d_ps[j], ws[n - j]) for j in range(n + 1)]
                 turns += [cross(ps[j], d_ws[n - j]) for j in range(n + 1)]
-                d_ps.append(fence(tuple(sum(c) / (n + 1) for c in zip(*turns, strict=True)), one))
-        return fence(tuple(sum(c[::-1]) for c in zip(*thetas, strict=True)), one)
+                d_ps.append(fence(_mean(turns, n + 1), one))
+        return fence(_mean(thetas[::-1], 1), one)
 
     return jax.vmap(column)(jnp.eye(9, dtype=t.dtype))
 
 
-def _mean(terms: list[Triple]) -> Triple:
-    return tuple(sum(c) / len(terms) for c in zip(*terms, strict=True))
+def _mean(terms: list[Triple], count: int) -> Triple:
+    """Their sum over `count`."""
+    return tuple(sum(c[1:], c[0]) / count for c in zip(*terms, strict=True))

@@ -44,7 +44,7 @@ class Halfway(NamedTuple):
     """At half of a time that was reduced by whole periods, `whole` in all; the mean of S²."""
 
     at: Integrals
-    count: Scalar
+    halves: Scalar
     whole: Scalar
     mean: Scalar
 
@@ -65,11 +65,11 @@ def jacobian_and_integral(
     m = Modulus(p, q, gap)
     three = gap > 0
     top = jnp.where(three, p, q)
-    before, count, whole, mean = halfway
+    before, halves, whole, mean = halfway
     after = twice(before, m, jnp.zeros_like(t), jnp.zeros_like(t))
     S, C, D, *_ = after.f
     grown2 = after.y2 + whole * mean
-    grown = after.y + whole * (1.0 - top * mean) / jnp.where(count == 0, 1.0, jnp.abs(gap))
+    grown = after.y + whole * (1.0 - top * mean) / jnp.where(halves == 0, 1.0, jnp.abs(gap))
 
     # Divided differences of T = diag(D, 1, C) by k12, k13, k23.
     s = before.f.S * before.f.S
