@@ -194,4 +194,5 @@ def _small_turn(k: Six, momentum: Triple, t: Scalar) -> tuple[Array, ...]:
 
 def _mean(terms: list[Triple], count: int) -> Triple:
     """Their sum over `count`."""
-    return tuple(sum(c[1:], c[0]) / count for c in zip(*terms, strict=True))
+    columns: Any = zip(*terms, strict=True)
+    return tuple(sum(c[1:], c[0]) / count for c in columns)
