@@ -194,5 +194,5 @@ def _small_turn(k: Six, momentum: Triple, t: Scalar) -> tuple[Array, ...]:
 
 def _mean(terms: list[Triple], count: int) -> Triple:
     """Their sum over `count`."""
-    columns: Any = zip(*terms, strict=True)
-    return tuple(sum(c[1:], c[0]) / count for c in columns)
+    totals: Any = [sum(c[1:], c[0]) for c in zip(*terms, strict=True)]
+    return tuple(total / count for total in totals)

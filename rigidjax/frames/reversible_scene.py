@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 
+import numpy as np
 from jaxtyping import Array, ArrayLike, Complex, Float
 
 from rigidjax import _checks
@@ -192,7 +193,10 @@ class AbstractReversible(AbstractScene):
         True
         """
         dtype = orbit.state.x.dtype if isinstance(orbit, PeriodicOrbit) else None
-        where = _checks.floating(phase, (), "phase").astype(dtype)
+        where = _checks.floating(phase, (), "phase")
+        if _checks.known(where):
+            where = _checks.finite(where, "phase")
+        where = where.astype(dtype)
         away = _checks.floating(distance, (), "distance").astype(dtype)
         return manifolds.branch(self, orbit, where, which, side, away)[0]
 
@@ -220,4 +224,7 @@ class AbstractReversible(AbstractScene):
 
         **Raises:** `ValueError` where the value does not lie between, or the indices are complex.
         """
+        value = _checks.number(value, "value")
+        if not np.isfinite(value):
+            raise ValueError(f"value: wanted a finite number, got {value}")
         return manifolds.bifurcation(self, orbit, other, index, value, hold)

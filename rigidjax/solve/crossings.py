@@ -117,7 +117,10 @@ def crossings(
     many = _checks.whole(max_crossings, "max_crossings", 1)
     max_steps = _checks.whole(max_steps, "max_steps", 1)
     _checks.function(condition, "condition", "(t, state, body) → scalar")
-    times = validation.times(jnp.stack([_checks.time(t0, "t0"), _checks.time(t1, "t1")]), False)
+    begin, end = _checks.time(t0, "t0"), _checks.time(t1, "t1")
+    if _checks.known((begin, end)) and float(begin) == float(end):
+        raise ValueError(f"t1: wanted another time than t0, got {float(end):g} for both")
+    times = validation.times(jnp.stack([begin, end]), False)
     state0 = validation.start(state0, False)
     dtype = times.dtype
     for leaf in jax.tree.leaves(state0):

@@ -12,7 +12,7 @@ from jax import lax
 from jaxtyping import Array
 
 from rigidjax import _checks
-from rigidjax._types import ScalarLike
+from rigidjax._types import HasSpin, ScalarLike
 from rigidjax.body.inertia import Inertia
 from rigidjax.exact import FreeBody
 from rigidjax.motion import Attitude, Rigid, on_the_group
@@ -103,8 +103,25 @@ class Asked(eqx.Module):
 
 
 def require_condition(asked: Asked, t: Array, state0: Any) -> None:
-    """Raise in words unless a condition gives one real number."""
-    eqx.filter_eval_shape(asked, t, state0)
+    """Raise in words unless a condition gives one real number, which is not NaN at the start."""
+    try:
+        eqx.filter_eval_shape(asked, t, state0)
+    except AttributeError as wrong:
+        if wrong.name not in ("q", "x", "v") or not isinstance(wrong.obj, HasSpin):
+            raise
+        kind = "Attitude(q, omega)" if wrong.name == "q" else "Rigid(x, v, q, omega)"
+        raise TypeError(
+            f"condition: it looks at state.{wrong.name}, and {type(wrong.obj).__name__} has none: "
+            f"start from {kind}"
+        ) from wrong
+    if _checks.known((asked, t, state0)) and bool(jnp.isnan(_jitted(asked, t, state0))):
+        raise ValueError(
+            f"condition: wanted a number wherever the motion goes, got NaN at the start, t = "
+            f"{float(t):g}"
+        )
+
+
+_jitted = eqx.filter_jit(lambda asked, t, state0: asked(t, state0))
 
 
 def found_by(

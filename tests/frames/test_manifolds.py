@@ -205,6 +205,10 @@ def test_words(unhooked):
         MOON.bifurcation(orbit, orbit, index=2)
     with pytest.raises(ValueError, match="hold: wanted one of"):
         MOON.bifurcation(orbit, orbit, hold="q")
+    with pytest.raises(ValueError, match="value: wanted a finite number, got nan"):
+        MOON.bifurcation(orbit, orbit, value=np.nan)
+    with pytest.raises(ValueError, match="phase: contains NaN"):
+        MOON.manifold_start(orbit, np.nan, "stable")
     # Long after the end of Hill's family g is a stable orbit: the retrograde ones.
     hill = scenes.hill()
     stable = scenes.PeriodicOrbit(rj.Point([0.3, 0, 0], [0.0, -2.2, 0]), 0.8)

@@ -345,8 +345,17 @@ def test_words(unhooked):
         rj.Event(middle, max_step=0.0)
     with pytest.raises(ValueError, match="max_crossings: wanted a whole number of at least 1"):
         rj.crossings(BODY, FLIPPING, 0.0, 1.0, middle, max_crossings=0)
-    with pytest.raises(ValueError, match="wanted increasing times"):
+    with pytest.raises(ValueError, match="t1: wanted another time than t0, got 1 for both"):
         rj.crossings(BODY, FLIPPING, 1.0, 1.0, middle)
+    with pytest.raises(
+        TypeError, match=r"condition: it looks at state.q, and Spin has none: start"
+    ):
+        spin = rj.Spin([0.0, 1.0, 0.01])
+        rj.simulate(BODY, spin, [0.0, 1.0], event=lambda t, state, body: state.q[1])
+    with pytest.raises(
+        ValueError, match=r"condition: wanted a number .*got NaN at the start, t = 0"
+    ):
+        run(event=lambda t, state, body: jnp.log(-1.0 - t))
     with pytest.raises(TypeError, match="solver: wanted an explicit method"):
         rj.crossings(BODY, FLIPPING, 0.0, 1.0, middle, solver=dfx.Tsit5())
 
