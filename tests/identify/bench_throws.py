@@ -149,7 +149,7 @@ def shared(joint, levers, name, total):
         return jnp.log(moments(name, jnp.asarray(total), bodies[DEVICE].tensor, factor, levers))
 
     low, high = joint.interval_of(lambda bodies, _: of(bodies, levers))
-    of_fit = ((high - low) / 2 / identify.reported.quantile(joint, 0.95)) ** 2
+    of_fit = ((high - low) / 2 / identify.quantities.quantile(joint, 0.95)) ** 2
     return of_fit + np.diag(of_levers(lambda d: of(joint.body, d), levers))
 
 
