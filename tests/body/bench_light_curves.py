@@ -13,7 +13,7 @@ jax.config.update("jax_enable_x64", True)
 import jax.numpy as jnp
 
 import rigidjax as rj
-from rigidjax.identify import Brightness, Moment
+from rigidjax.identify import Brightness, SensorInput
 
 BODIES, TIMES = (int(a) for a in (*sys.argv[1:], *("5000", "1000")[len(sys.argv) - 1 :]))
 
@@ -24,7 +24,7 @@ def curve(moments, omega, ts):
     sensor = Brightness([1.0, 0, 0], [0.8, 0.6, 0.0], noise=0.02)
 
     def at(t):
-        return sensor.predicted(Moment(t, motion(t), body, lambda t, y, args: y))
+        return sensor.predicted(SensorInput(t, motion(t), body, lambda t, y, args: y))
 
     return jax.vmap(at)(ts)
 
