@@ -347,11 +347,9 @@ def test_words(unhooked):
         rj.crossings(BODY, FLIPPING, 0.0, 1.0, middle, max_crossings=0)
     with pytest.raises(ValueError, match="t1: wanted another time than t0, got 1 for both"):
         rj.crossings(BODY, FLIPPING, 1.0, 1.0, middle)
-    with pytest.raises(
-        TypeError, match=r"condition: it looks at state.q, and Spin has none: start"
-    ):
-        spin = rj.Spin([0.0, 1.0, 0.01])
-        rj.simulate(BODY, spin, [0.0, 1.0], event=lambda t, state, body: state.q[1])
+    spin, turned = rj.Spin([0.0, 1.0, 0.01]), lambda t, state, body: state.q[1]
+    with pytest.raises(TypeError, match=r"condition: it looks at state.q, and Spin has none"):
+        rj.simulate(BODY, spin, [0.0, 1.0], event=turned)
     with pytest.raises(
         ValueError, match=r"condition: wanted a number .*got NaN at the start, t = 0"
     ):
