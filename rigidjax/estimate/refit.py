@@ -54,7 +54,9 @@ class Refit(eqx.Module):
         """Interval (low, high) of any differentiable function of a `Point` to an array.
 
         The covariance is carried by the function's derivative; take the logarithm of what is
-        positive. **Raises** `ValueError` for a level outside (0, 1).
+        positive. The torque's density is held at its mode, so that intervals are too narrow where a
+        record is short: of 80 readings, 87 to 94 of 100 at 95 % contained the truth. **Raises**
+        `ValueError` for a level outside (0, 1).
         """
         level = _checks.positive(level, "level")
         if level >= 1:

@@ -14,20 +14,19 @@ from estimate import records
 import rigidjax as rj
 from rigidjax import estimate, identify
 
-MANY, COUNT, DT, NOISE = 200, 80, 0.05, 0.02
+MANY, DT, NOISE = 200, 0.05, 0.02
 WHITE = rj.torques.RandomTorque(2e-3)
-REMEMBERS = rj.torques.CorrelatedTorque(0.02, 1.0)
 AXES = (records.SUN, np.array([1.0, 0.0, 0.0]))
 
 
-def made(key, law, directions):
+def made(key, law, directions, count):
     """What sensors read of one motion under a random torque, and its first state."""
     keys = jax.random.split(key, 3 + len(directions))
     # All as fast, so that all are followed in the same number of steps and may be stacked.
     omega = jnp.array([0.6, 2.0, 0.8]) + 0.3 * jax.random.normal(keys[0], (3,))
     omega = 2.4 * omega / jnp.linalg.norm(omega)
     start = rj.Attitude(records.START.q, omega) if directions else rj.Spin(omega)
-    ts = DT * jnp.arange(COUNT, dtype=float)
+    ts = DT * jnp.arange(count, dtype=float)
     if law is None:
         states = rj.simulate(records.BODY, start, ts).ys
     else:
@@ -42,9 +41,9 @@ def stacked(trees):
     return jax.tree.map(lambda *leaf: jnp.stack(leaf) if eqx.is_array(leaf[0]) else leaf[0], *trees)
 
 
-def densities(law, directions, process):
+def densities(law, directions, process, count):
     """The densities of all records, with a leading axis, and the first states."""
-    make = eqx.filter_jit(lambda key: made(key, law, directions))
+    make = eqx.filter_jit(lambda key: made(key, law, directions, count))
     found, starts = [], []
     for key in jax.random.split(jax.random.key(7), MANY):
         ts, read, start = make(key)
@@ -75,13 +74,15 @@ def compared(point, start):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("law", "directions"),
-    [(WHITE, ()), (WHITE, AXES), (REMEMBERS, ())],
-    ids=["gyro, white", "gyro and directions, white", "gyro, correlated"],
+@pytest.mark.xfail(
+    strict=True,
+    raises=AssertionError,
+    reason="Laplace's method holds the torque's density at its mode: of 95 % intervals 87 to 91 "
+    "contain the ratios and the density, 93 to 94 the rates and turns",
 )
-def test_intervals_contain_the_truth_as_often_as_they_say(law, directions):
-    density, starts = densities(law, directions, law)
+@pytest.mark.parametrize("directions", [(), AXES], ids=["gyro", "gyro and directions"])
+def test_intervals_contain_the_truth_as_often_as_they_say(directions):
+    density, starts = densities(WHITE, directions, WHITE, 80)
     found = eqx.filter_jit(eqx.filter_vmap(estimate.refit))(density)
     assert np.mean(found.converged) > 0.97
 
@@ -95,13 +96,15 @@ def test_intervals_contain_the_truth_as_often_as_they_say(law, directions):
         return value(one.x), jax.tree.map(deviation, jax.jacfwd(value)(one.x))
 
     value, deviation = eqx.filter_jit(eqx.filter_vmap(errors))(found, starts)
-    true = np.log([np.ravel(leaf)[0] for leaf in jax.tree.leaves(law)])
+    true = np.log([np.ravel(leaf)[0] for leaf in jax.tree.leaves(WHITE)])
     value["process"] = value["process"] - true[None]
     reach = scipy.stats.norm.ppf(0.975)
     whole = np.asarray(found.converged)
-    for name, error in value.items():
-        inside = np.abs(error)[whole] < reach * deviation[name][whole]
-        print(f"{name}: {100 * np.mean(inside):.1f} % of 95 % intervals; {np.mean(inside, 0)}")
+    held = {
+        name: float(np.mean(np.abs(error)[whole] < reach * deviation[name][whole]))
+        for name, error in value.items()
+    }
+    assert all(0.93 <= part <= 0.97 for part in held.values()), held
 
 
 @pytest.mark.slow
@@ -109,7 +112,7 @@ def test_intervals_contain_the_truth_as_often_as_they_say(law, directions):
 def test_ranks_of_the_truth_among_draws_are_uniform():
     """Simulation-based calibration (Talts et al. 2018, arXiv:1804.06788)."""
     pytest.importorskip("blackjax")
-    density, starts = densities(None, (), None)
+    density, starts = densities(None, (), None, 80)
     sampler = estimate.Nuts(samples=200, warmup=100)
 
     def draws(one, key):
