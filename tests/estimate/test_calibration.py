@@ -27,10 +27,7 @@ def made(key, law, directions, count):
     omega = 2.4 * omega / jnp.linalg.norm(omega)
     start = rj.Attitude(records.START.q, omega) if directions else rj.Spin(omega)
     ts = DT * jnp.arange(count, dtype=float)
-    if law is None:
-        states = rj.simulate(records.BODY, start, ts).ys
-    else:
-        states = records.truth(keys[1], estimate.Model(records.BODY, law), start, ts, 2).states
+    states = records.truth(keys[1], estimate.Model(records.BODY, law), start, ts, 2).states
     read = [records.gyro(keys[2], states.omega, NOISE)]
     for world, one in zip(directions, keys[3:], strict=True):
         read.append(records.direction(one, states.q, world, NOISE))
@@ -66,10 +63,9 @@ def compared(point, start):
     if isinstance(start, rj.Attitude):
         between = rj.quaternion.multiply(rj.quaternion.conjugate(start.q), point.state0.q)
         out["turn"] = rj.quaternion.log(between)
-    if point.process is not None:
-        # A gyro shows accelerations: of a density, its ratio to the square of a moment.
-        leaves = [jnp.log(leaf.ravel()[0]) for leaf in jax.tree.leaves(point.process)]
-        out["process"] = jnp.stack([leaves[0] - 2 * jnp.log(i[2] / true[2]), *leaves[1:]])
+    # A gyro shows accelerations: of a density, its ratio to the square of a moment.
+    leaves = [jnp.log(leaf.ravel()[0]) for leaf in jax.tree.leaves(point.process)]
+    out["process"] = jnp.stack([leaves[0] - 2 * jnp.log(i[2] / true[2]), *leaves[1:]])
     return out
 
 
@@ -105,31 +101,3 @@ def test_intervals_contain_the_truth_as_often_as_they_say(directions):
         for name, error in value.items()
     }
     assert all(0.93 <= part <= 0.97 for part in held.values()), held
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore")  # of blackjax
-def test_ranks_of_the_truth_among_draws_are_uniform():
-    """Simulation-based calibration (Talts et al. 2018, arXiv:1804.06788)."""
-    pytest.importorskip("blackjax")
-    density, starts = densities(None, (), None, 80)
-    sampler = estimate.Nuts(samples=200, warmup=100)
-
-    def draws(one, key):
-        return estimate.posterior(one, key, sampler=sampler, chains=2).x
-
-    keys = jax.random.split(jax.random.key(11), MANY)
-    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
-        x = eqx.filter_jit(eqx.filter_vmap(draws))(density, keys)
-
-    def errors(one, x, start):
-        return jax.vmap(lambda x: compared(one.unpack(x), start))(x.reshape(-1, one.size)[:390:10])
-
-    for name, error in eqx.filter_jit(eqx.filter_vmap(errors))(density, x, starts).items():
-        # Of 39 draws each, nearly independent: 40 ranks, in ten classes.
-        ranks = np.sum(np.asarray(error) < 0, axis=1)
-        for one in ranks.T:
-            count = np.bincount(one // 4, minlength=10)
-            p = scipy.stats.chisquare(count).pvalue
-            print(name, count, p)
-            assert p > 0.01
