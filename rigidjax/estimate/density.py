@@ -12,7 +12,6 @@ from jaxtyping import Array, Float, Int
 
 from rigidjax import _checks
 from rigidjax._types import HasSpin, Scalar
-from rigidjax.body.inertia import MassProperties
 from rigidjax.estimate.belief import Belief
 from rigidjax.estimate.filter import log_likelihood_of
 from rigidjax.estimate.grid import TURN_A_STEP
@@ -24,8 +23,8 @@ from rigidjax.identify.parameters import Parameters, local
 from rigidjax.identify.problem import Problem
 from rigidjax.identify.residual import beside, whitened
 from rigidjax.identify.result import Fit
+from rigidjax.identify.sensor_inputs import what_turns
 from rigidjax.identify.several_bodies import matter
-from rigidjax.motion import Rigid
 from rigidjax.motion.torques import CorrelatedTorque, RandomTorque, Sum
 
 
@@ -231,9 +230,7 @@ class LogDensity(eqx.Module):
 
         def of_one(mine: Any, record: Any, ref: Any, which: Any) -> Array:
             record = filled(problem, mine, record)
-            body = matter(problem.body, mine.body, which)
-            if problem.rung is not Rigid and isinstance(body, MassProperties):
-                body = body.inertia
+            body = what_turns(matter(problem.body, mine.body, which), problem.rung)
             state: HasSpin = first_state(problem.rung, mine, ref)
             law = process if record.torque is None else Sum(record.torque, process)
             model = Model(body, law)

@@ -172,7 +172,7 @@ def _small_turn(k: Six, momentum: Triple, t: Scalar) -> tuple[Array, ...]:
     for n in range(_ORDER):
         ws.append(fence(times(k, ps[n]), one))
         if n < _ORDER - 1:
-            ps.append(fence(_mean([cross(ps[j], ws[n - j]) for j in range(n + 1)], n + 1), one))
+            ps.append(fence(_total([cross(ps[j], ws[n - j]) for j in range(n + 1)], n + 1), one))
 
     def column(unit: Array) -> Triple:
         d_k, d_ps = tuple(unit[:6]), [tuple(c * t for c in unit[6:])]
@@ -182,17 +182,17 @@ def _small_turn(k: Six, momentum: Triple, t: Scalar) -> tuple[Array, ...]:
             slope = zip(times(k, d_ps[n]), times(d_k, ps[n]), strict=True)
             d_ws.append(fence(tuple(a + b for a, b in slope), one))
             turns = [cross(thetas[j], ws[n - 1 - j]) for j in range(n)]
-            thetas.append(_mean([d_ws[n], *turns], n + 1))
+            thetas.append(_total([d_ws[n], *turns], n + 1))
             if n < _ORDER - 1:
                 turns = [cross(d_ps[j], ws[n - j]) for j in range(n + 1)]
                 turns += [cross(ps[j], d_ws[n - j]) for j in range(n + 1)]
-                d_ps.append(fence(_mean(turns, n + 1), one))
-        return fence(_mean(thetas[::-1], 1), one)
+                d_ps.append(fence(_total(turns, n + 1), one))
+        return fence(_total(thetas[::-1], 1), one)
 
     return jax.vmap(column)(jnp.eye(9, dtype=t.dtype))
 
 
-def _mean(terms: list[Triple], count: int) -> Triple:
+def _total(terms: list[Triple], count: int) -> Triple:
     """Their sum over `count`."""
     totals: Any = [sum(c[1:], c[0]) for c in zip(*terms, strict=True)]
     return tuple(total / count for total in totals)

@@ -8,20 +8,18 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
-from rigidjax.body.inertia import MassProperties
 from rigidjax.identify import padding
 from rigidjax.identify.free_parameters import put
 from rigidjax.identify.parameters import Local, Parameters, columns, local, places
-from rigidjax.identify.propagation import free_states, shifted, states_at
+from rigidjax.identify.propagation import states_at
 from rigidjax.identify.recording import Recording
 from rigidjax.identify.reference_states import ReferenceStates
+from rigidjax.identify.sensor_inputs import sensor_inputs, what_turns
 from rigidjax.identify.sensors import SensorInput
 from rigidjax.identify.several_bodies import matter
 from rigidjax.motion import Attitude, Rigid, Spin
-from rigidjax.motion.coupled import Coupled, CoupledEquations, motion_of
-from rigidjax.motion.torques.states import freeze
+from rigidjax.motion.coupled import motion_of
 from rigidjax.rotation import quaternion
-from rigidjax.solve import equations_of_motion
 
 if TYPE_CHECKING:
     from rigidjax.identify.problem import Problem
@@ -61,13 +59,9 @@ def states_of_one(
     record = filled(problem, mine, record)
     body = matter(problem.body, mine.body, which)
     state0 = first_state(problem.rung, mine, ref)
-    states = states_at(problem.integrator, _turned(problem, body), state0, record.t, record.torque)
+    turned = what_turns(body, problem.rung)
+    states = states_at(problem.integrator, turned, state0, record.t, record.torque)
     return record, body, state0, states
-
-
-def _turned(problem: "Problem", body: Any) -> Any:
-    """What turns: a body that does not move needs no mass."""
-    return body.inertia if isinstance(body, MassProperties) and problem.rung is not Rigid else body
 
 
 def errors_of_one(
@@ -79,29 +73,14 @@ def errors_of_one(
     among several.
     """
     record, body, state0, states = states_of_one(problem, mine, record, ref, which)
-    turned = _turned(problem, body)
-    field = equations_of_motion(turned, state0, record.torque)
-    coupled = CoupledEquations(field, turned) if isinstance(states, Coupled) else field
     out = []
     for reading in record.readings:
         sensor = reading.sensor
-        offset = getattr(sensor, "offset", None)
-        seen, times = states, record.t
-        if offset is not None:
-            times = record.t + offset
-            if record.torque is None:
-                seen = free_states(body, state0, times - record.t[0])
-            else:
-                seen = jax.vmap(lambda t, s, by=offset: shifted(coupled, t, s, by))(
-                    record.t, states
-                )
+        times, seen, now = sensor_inputs(sensor, body, record.torque, record.t, state0, states)
 
-        def error(t: Array, state: Any, value: Array, sensor: Any = sensor) -> Array:
-            if not isinstance(state, Coupled):
-                return _error_of(sensor, SensorInput(t, state, body, field), value)
-            own = state.own
-            now = SensorInput(t, state.motion, body, freeze(field, own), own)
-            return _error_of(sensor, now, value)
+        def error(t: Array, state: Any, value: Array, of: Any = (sensor, now)) -> Array:
+            sensor, now = of
+            return _error_of(sensor, now(t, state), value)
 
         lowpass = getattr(sensor, "lowpass", None)
         if lowpass is None:

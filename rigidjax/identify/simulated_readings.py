@@ -10,13 +10,12 @@ from jaxtyping import Array, ArrayLike, Float
 
 from rigidjax import _checks
 from rigidjax.body.inertia import Inertia, MassProperties
-from rigidjax.identify.propagation import free_states, shifted
+from rigidjax.identify.sensor_inputs import sensor_inputs, what_turns
 from rigidjax.identify.sensors import AbstractSensor, SensorInput
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.coupled import Coupled
 from rigidjax.motion.torques import Torque
-from rigidjax.motion.torques.states import freeze
-from rigidjax.solve import equations_of_motion, simulate
+from rigidjax.solve import simulate
 
 Readings = Float[Array, "times ..."]
 Body = Inertia | MassProperties
@@ -92,17 +91,14 @@ def simulate_readings(
         raise ValueError("sensor: wanted a sensor or several, got none")
     for one in sensors:
         _fits(one, state0, key)
-    turned = (
-        body.inertia if isinstance(body, MassProperties) and type(state0) is not Rigid else body
-    )
     start: Any = state0
-    sol = simulate(turned, start, ts, torque)
+    sol = simulate(what_turns(body, type(state0)), start, ts, torque)
     states = sol.ys if sol.own is None else Coupled(sol.ys, sol.own)
     keys = (
         [None] * len(sensors) if key is None else jax.random.split(_checks.key(key), len(sensors))
     )
     out = tuple(
-        _readings(one, turned, body, torque, sol.ts, states, each)
+        _readings(one, body, torque, sol.ts, start, states, each)
         for one, each in zip(sensors, keys, strict=True)
     )
     return out if several else out[0]
@@ -111,29 +107,14 @@ def simulate_readings(
 @eqx.filter_jit
 def _readings(
     sensor: AbstractSensor,
-    turned: Body,
     body: Body,
     torque: Torque | None,
     ts: Array,
+    state0: Any,
     states: Any,
     key: Any,
 ) -> Readings:
-    first = jax.tree.map(lambda leaf: leaf[0], states)
-    field = equations_of_motion(turned, first, torque)
-    offset, times = getattr(sensor, "offset", None), ts
-    if offset is not None:
-        times = ts + offset
-        if torque is None:
-            states = free_states(turned, first, times - ts[0])
-        else:
-            states = jax.vmap(lambda t, y: shifted(field, t, y, offset))(ts, states)
-
-    def now(t: Array, state: Any) -> SensorInput:
-        if not isinstance(state, Coupled):
-            return SensorInput(t, state, body, field)
-        inner = equations_of_motion(turned, state.motion, torque)
-        return SensorInput(t, state.motion, body, freeze(inner, state.own), state.own)
-
+    times, states, now = sensor_inputs(sensor, body, torque, ts, state0, states)
     error = jnp.zeros((ts.shape[0], sensor.components), ts.dtype)
     if key is not None:
         assert sensor.noise is not None

@@ -106,7 +106,8 @@ def crossings(
     Source: Newton's method on the step from the last accepted state, in the place of Hénon's change
     of variable (Hénon 1982, doi:10.1016/0167-2789(82)90034-3): two to three parts of a step.
 
-    **Raises:** `TypeError`, `ValueError` as `simulate`, and for a condition that is no number.
+    **Raises:** `TypeError`, `ValueError` as `simulate`, for times that are equal, and for a
+    condition that is no number, is NaN at the start, or looks at what the state has not.
 
     >>> import rigidjax as rj
     >>> body, start = rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([0.0, 1.0, 0.01])

@@ -12,11 +12,11 @@ from jax import lax
 from jaxtyping import Array
 
 from rigidjax import _checks
-from rigidjax._types import HasSpin, ScalarLike
+from rigidjax._types import ScalarLike
 from rigidjax.body.inertia import Inertia
 from rigidjax.exact import FreeBody
 from rigidjax.motion import Attitude, Rigid, on_the_group
-from rigidjax.motion.torques.base import jumps_of
+from rigidjax.motion.torques.base import jumps_of, lacking
 from rigidjax.solve.components import flat, unflat
 from rigidjax.solve.crossing_loop import Search
 from rigidjax.solve.crossing_search import Found, Numbers, Scene, correction, only_found
@@ -107,21 +107,18 @@ def require_condition(asked: Asked, t: Array, state0: Any) -> None:
     try:
         eqx.filter_eval_shape(asked, t, state0)
     except AttributeError as wrong:
-        if wrong.name not in ("q", "x", "v") or not isinstance(wrong.obj, HasSpin):
+        told = lacking("condition", wrong)
+        if told is None:
             raise
-        kind = "Attitude(q, omega)" if wrong.name == "q" else "Rigid(x, v, q, omega)"
-        raise TypeError(
-            f"condition: it looks at state.{wrong.name}, and {type(wrong.obj).__name__} has none: "
-            f"start from {kind}"
-        ) from wrong
-    if _checks.known((asked, t, state0)) and bool(jnp.isnan(_jitted(asked, t, state0))):
+        raise TypeError(told) from wrong
+    if _checks.known((asked, t, state0)) and bool(jnp.isnan(_value(asked, t, state0))):
         raise ValueError(
             f"condition: wanted a number wherever the motion goes, got NaN at the start, t = "
             f"{float(t):g}"
         )
 
 
-_jitted = eqx.filter_jit(lambda asked, t, state0: asked(t, state0))
+_value = eqx.filter_jit(lambda asked, t, state0: asked(t, state0))
 
 
 def found_by(

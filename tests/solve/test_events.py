@@ -348,7 +348,9 @@ def test_words(unhooked):
     with pytest.raises(ValueError, match="t1: wanted another time than t0, got 1 for both"):
         rj.crossings(BODY, FLIPPING, 1.0, 1.0, middle)
     spin, turned = rj.Spin([0.0, 1.0, 0.01]), lambda t, state, body: state.q[1]
-    with pytest.raises(TypeError, match=r"condition: it looks at state.q, and Spin has none"):
+    with pytest.raises(
+        TypeError, match=r"condition looks at state.q, the attitude, and Spin has none"
+    ):
         rj.simulate(BODY, spin, [0.0, 1.0], event=turned)
     with pytest.raises(
         ValueError, match=r"condition: wanted a number .*got NaN at the start, t = 0"

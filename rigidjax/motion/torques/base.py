@@ -229,9 +229,11 @@ def act(
     try:
         found = in_precision(law, dtype)(t, state, in_precision(body, dtype))
     except AttributeError as wrong:
-        if wrong.obj is not state or wrong.name not in _HIGHER:
+        told = lacking(f"torque {type(law).__name__}", wrong)
+        if told is None:
             raise
-        raise _lacking(law, state, wrong.name) from wrong
+        hint = "; a subclass of AbstractTorque says what it looks at by feels"
+        raise TypeError(told + hint) from wrong
     # Not by class: laws of the moving frames give one too, and know nothing of this floor.
     if hasattr(found, "force"):
         return found.force.astype(dtype), found.torque.astype(dtype)
@@ -243,13 +245,22 @@ def act(
 _HIGHER = {"q": "Attitude(q, omega)", "x": "Rigid(x, v, q, omega)", "v": "Rigid(x, v, q, omega)"}
 
 
-def _lacking(law: Any, state: Any, name: str) -> TypeError:
-    """The error for a law, of a user's own, that looks at what the state does not have."""
-    what = {"q": "attitude", "x": "position", "v": "velocity"}[name]
-    return TypeError(
-        f"torque {type(law).__name__} looks at state.{name}, the {what}, and "
-        f"{type(state).__name__} has none: start from {_HIGHER[name]}; a subclass of "
-        "AbstractTorque says what it looks at by feels"
+def lacking(who: str, wrong: AttributeError) -> str | None:
+    """What to say of a user's function that looks at what its state does not have, if that is it.
+
+    >>> import rigidjax as rj
+    >>> try:
+    ...     rj.Spin([0.0, 0.0, 1.0]).q
+    ... except AttributeError as wrong:
+    ...     lacking("condition", wrong)
+    'condition looks at state.q, the attitude, and Spin has none: start from Attitude(q, omega)'
+    """
+    if wrong.name not in _HIGHER or not isinstance(wrong.obj, HasSpin):
+        return None
+    what = {"q": "attitude", "x": "position", "v": "velocity"}[wrong.name]
+    return (
+        f"{who} looks at state.{wrong.name}, the {what}, and {type(wrong.obj).__name__} has none: "
+        f"start from {_HIGHER[wrong.name]}"
     )
 
 
