@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from rigidjax import _checks
-from rigidjax._types import Scalar, Vec3Like
+from rigidjax._types import Mat3, Scalar, Vec3, Vec3Like
 from rigidjax.body.inertia import Inertia
 from rigidjax.exact import sigma_form
 from rigidjax.exact.complete_integrals import half_period
@@ -39,8 +39,7 @@ def body_period(inertia: Inertia, omega0: Vec3Like) -> Scalar:
     >>> bool(abs(body_period(top, jnp.array([1.0, 0.5, 0.0])) - 4 * jnp.pi) < 1e-14)
     True
     """
-    moments, momentum, exponent = _scaled(inertia, omega0)
-    return times_power_of_two(_periods(moments, momentum)[0], -exponent)
+    return _both(*_checked(inertia, omega0))[0]
 
 
 def precession_period(inertia: Inertia, omega0: Vec3Like) -> Scalar:
@@ -65,20 +64,25 @@ def precession_period(inertia: Inertia, omega0: Vec3Like) -> Scalar:
     >>> float(precession_period(top, jnp.array([1.0, 0.5, 0.0])))  # 2π I₂/|L|
     8.885765876316732
     """
-    moments, momentum, exponent = _scaled(inertia, omega0)
-    return times_power_of_two(_periods(moments, momentum)[1], -exponent)
+    return _both(*_checked(inertia, omega0))[1]
 
 
-def _scaled(inertia: Inertia, omega0):
+def _checked(inertia: Inertia, omega0: Vec3Like) -> tuple[Mat3, Vec3]:
     _checks.single(inertia, Inertia, "inertia", hint="of MassProperties pass .inertia")
     if _checks.known(inertia.tensor):
         inertia = inertia.invertible()
-    omega = _checks.floating(omega0, (3,), "omega0").astype(inertia.tensor.dtype)
     tensor = inertia.tensor
+    return tensor, _checks.floating(omega0, (3,), "omega0").astype(tensor.dtype)
+
+
+@jax.jit
+def _both(tensor: Mat3, omega: Vec3) -> tuple[Scalar, Scalar]:
+    """Both periods: one program, since outside of a trace each operation would be compiled."""
     exponent = exponent_of(omega)
     moments, axes = principal_frame(times_power_of_two(tensor, -exponent_of(tensor)))
     rate = into(axes, times_power_of_two(omega, -exponent))
-    return moments, times(moments, rate), exponent
+    periods = _periods(moments, times(moments, rate))
+    return tuple(times_power_of_two(period, -exponent) for period in periods)
 
 
 def _periods(moments: Six, momentum: Triple) -> tuple[Scalar, Scalar]:

@@ -126,7 +126,7 @@ def descended(
         # Always as many: one program.
         some = [starts[first + k % len(starts[first:])] for k in range(FIRST)]
         stacked = _levelled(jax.tree.map(lambda *leaves: jnp.stack(leaves), *some), problem)
-        found = _many(stacked, problem, noise, Settings(tolerance, CAREFUL, STEPS))
+        found = _many(stacked, problem, noise, Settings(tolerance, CAREFUL, STEPS), np.int32(FIRST))
         parameters.append(found.parameters)
         costs.append(np.asarray(found.cost))
     all_of = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parameters)
@@ -142,14 +142,13 @@ def descended(
             break
     rows = jnp.asarray(np.resize(kept, FIRST))
     nearer = jax.tree.map(lambda leaf: leaf[rows], all_of)
-    count = jnp.asarray(len(kept))
-    last = _many(nearer, problem, noise, Settings(tolerance, 1e-2, MORE), count)
+    last = _many(nearer, problem, noise, Settings(tolerance, 1e-2, MORE), np.int32(len(kept)))
     return [jax.tree.map(lambda leaf, k=k: leaf[k], last) for k in range(len(kept))]
 
 
 @eqx.filter_jit
 def _many(
-    starts: Parameters, problem: Problem, noise: Any, settings: Settings, count: Any = FIRST
+    starts: Parameters, problem: Problem, noise: Any, settings: Settings, count: Any
 ) -> Tried:
     """The first `count` of the starts (a leading axis) down, one after another.
 

@@ -143,31 +143,29 @@ def periods(moments: Array, omega: Array) -> tuple[Array, Array]:
     return exact.body_period(body, omega), exact.precession_period(body, omega)
 
 
-def _energy(moments: Array, ratio: Array, long: Array) -> tuple[Array, Array]:
-    """A rate whose periods have this ratio, precession over rotation, and whether there is one.
+def _energy(moments: Array, ratio: Array, long: Array) -> tuple[Array, Array, Array]:
+    """A rate whose periods have this ratio, its precession period, and whether there is one.
 
     From a spin about the axis of the mode, where it is largest, to the separatrix, where it is 0.
     """
     pure = jnp.where(long, moments[0], moments[2])
 
-    def rate(part: Array) -> Array:
-        return _rate(moments, pure + part * (moments[1] - pure))
-
-    def quotient(part: Array) -> Array:
-        rotation, precession = periods(moments, rate(part))
-        return precession / rotation
-
-    def halved(_: Any, between: tuple[Array, Array]) -> tuple[Array, Array]:
-        low, high = between
-        middle = 0.5 * (low + high)
-        above = quotient(middle) > ratio
-        return jnp.where(above, middle, low), jnp.where(above, high, middle)
+    def halved(_: Any, tried: tuple[Array, ...]) -> tuple[Array, ...]:
+        low, high, *_ = tried
+        part = 0.5 * (low + high)
+        omega = _rate(moments, pure + part * (moments[1] - pure))
+        rotation, precession = periods(moments, omega)
+        quotient = precession / rotation / ratio
+        low, high = jnp.where(quotient > 1, part, low), jnp.where(quotient > 1, high, part)
+        return low, high, omega, precession, quotient
 
     kind = moments.dtype
+    zero = jnp.zeros((), kind)
     ends = jnp.asarray(1e-4, kind), jnp.asarray(1.0 - 1e-7, kind)
-    low, high = jax.lax.fori_loop(0, 32, halved, ends)
-    part = 0.5 * (low + high)
-    return rate(part), jnp.abs(quotient(part) / ratio - 1.0) < 1e-3
+    # What the last try gave goes along: written out after the loop it would be compiled again.
+    tried = (*ends, jnp.zeros_like(moments), zero, zero)
+    _, _, omega, precession, quotient = jax.lax.fori_loop(0, 33, halved, tried)
+    return omega, precession, jnp.abs(quotient - 1.0) < 1e-3
 
 
 @jax.jit
@@ -187,17 +185,15 @@ def _grid(
 
     def shape(given: tuple[Array, Array]) -> Any:
         body, form = given
-        omega, exists = _energy(body, ratio, long)
-        _, precession = periods(body, omega)
+        omega, precession, exists = _energy(body, ratio, long)
         omega = omega * (precession * pair[0])
         motion = exact.FreeBody(Inertia(jnp.diag(body)), Attitude(_along_z(body * omega), omega))
 
         def phase(part: Array) -> Any:
             since = part / pair[1]
 
-            def row(time: Array) -> Array:
-                state: Any = motion(time + since)
-                w, x, y, u = (state.q[k] for k in range(4))
+            def row(q: Array) -> Array:
+                w, x, y, u = (q[k] for k in range(4))
                 m = form
                 # Body axes in the world, written out.
                 a = (1 - 2 * (y * y + u * u), 2 * (x * y + w * u), 2 * (x * u - w * y))
@@ -210,14 +206,15 @@ def _grid(
                 twice = (2 * entry(0, 1), 2 * entry(0, 2), 2 * entry(1, 2))
                 return jnp.stack([entry(0, 0), entry(1, 1), entry(2, 2), *twice])
 
-            rows = jax.vmap(row)(t).T * weights[None, :]
+            # The first state beside the others: by itself the motion would be compiled again.
+            states: Any = jax.vmap(motion)(since + jnp.concatenate([jnp.zeros(1, t.dtype), t]))
+            rows = jax.vmap(row)(states.q[1:]).T * weights[None, :]
             gram = rows @ rows.T
             gram = gram + 1e-9 * jnp.trace(gram) * jnp.eye(6, dtype=t.dtype)
             side = rows @ z
             n = jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(gram), side)
-            start: Any = motion(since)
             misfit = jnp.where(exists, total - side @ n, jnp.inf)
-            return misfit, n, start.q, start.omega
+            return misfit, n, states.q[0], states.omega[0]
 
         parts = jnp.arange(PHASES, dtype=t.dtype) / PHASES
         return jax.lax.map(phase, parts)
