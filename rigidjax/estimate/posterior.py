@@ -50,23 +50,45 @@ class Nuts(eqx.Module):
     def __call__(self, key: Any, density: Callable[[Array], Array], start: Array) -> Array:
         """Draws (samples, n) of one chain."""
         blackjax = _blackjax()
-        first, later = jax.random.split(key)
-        adapt = blackjax.window_adaptation(
-            blackjax.nuts,
-            density,
-            is_mass_matrix_diagonal=True,
-            imm_shrinkage_to_previous=_WORTH,
-            target_acceptance_rate=self.acceptance,
-        )
-        (state, tuned), _ = adapt.run(first, start, num_steps=self.warmup)
-        step = blackjax.nuts(density, **tuned).step
+        adaptation = blackjax.adaptation
+        # The warm-up of `blackjax.window_adaptation` in one loop with the draws: in a loop of its
+        # own the density is compiled once more, which takes longer than to draw.
+        begin, tune, settle = adaptation.step_size.dual_averaging_adaptation(self.acceptance)
+        metric = adaptation.mass_matrix.mass_matrix_adaptation(True, _WORTH)
+        metric_begin, metric_add, metric_end = metric
+        kernel = blackjax.nuts.build_kernel()
 
-        def body(state: Any, key: Any) -> tuple[Any, Array]:
-            state, _ = step(key, state)
-            return state, state.position
+        def warm(tuning: tuple, state: Any, accepted: Array, slow: Array, ends: Array) -> tuple:
+            steps, scale, _ = tuning
+            steps = tune(steps, accepted)
+            scale = lax.cond(slow, lambda: metric_add(scale, state.position), lambda: scale)
 
-        _, draws = lax.scan(body, state, jax.random.split(later, self.samples))
-        return draws
+            def end() -> tuple:
+                again = begin(settle(steps))
+                return again, metric_end(scale), jnp.exp(again.log_step_size)
+
+            return lax.cond(ends, end, lambda: (steps, scale, jnp.exp(steps.log_step_size)))
+
+        def body(carry: tuple, now: tuple) -> tuple[tuple, Array]:
+            state, (steps, scale, size) = carry
+            key, drawing, slow, ends = now
+            size = jnp.where(drawing, settle(steps), size)
+            state, info = kernel(key, state, density, size, scale.inverse_mass_matrix)
+            tuning = lax.cond(
+                drawing,
+                lambda: (steps, scale, size),
+                lambda: warm((steps, scale, size), state, info.acceptance_rate, slow, ends),
+            )
+            return (state, tuning), state.position
+
+        schedule = adaptation.staged_adaptation.build_schedule(self.warmup)
+        slow, ends = jnp.pad(jnp.asarray(schedule) == 1, ((0, self.samples), (0, 0))).T
+        drawing = jnp.arange(self.warmup + self.samples) >= self.warmup
+        first = (begin(1.0), metric_begin(start.size), jnp.ones((), start.dtype))
+        state = blackjax.nuts.init(start, density)
+        xs = (jax.random.split(key, drawing.size), drawing, slow, ends)
+        _, draws = lax.scan(body, (state, first), xs)
+        return draws[self.warmup :]
 
 
 class Posterior(eqx.Module):
