@@ -27,6 +27,12 @@ from rigidjax.identify.sensor_inputs import what_turns
 from rigidjax.identify.several_bodies import matter
 from rigidjax.motion.torques import CorrelatedTorque, RandomTorque, Sum
 
+# What to say where a fit without the torque ended far from the body.
+_GUESS = (
+    ", or begin from a first guess, fit(problem, starts=1, max_steps=1): the torque may be too "
+    "strong for a fit without it"
+)
+
 
 class Point(eqx.Module):
     """What a vector of unconstrained numbers stands for.
@@ -68,9 +74,11 @@ class LogDensity(eqx.Module):
     its errors are autocorrelated this is too narrow; keep fewer readings, or give a process. Priors
     are the problem's: `Free`s with a prior, an `Entropic` one; all else is flat in x.
 
-    **Arguments:** `fit` of `identify.fit`; `process` a `RandomTorque` or `CorrelatedTorque` or
-    `None`; `deviation` of the normal prior of the logarithms of its density and time about those
-    given, `None` for a process that is known. Where only ratios of moments are determined, as by a
+    **Arguments:** `fit` of `identify.fit`, with a process also a first guess,
+    `fit(problem, starts=1, max_steps=1)`: without the torque there may be no motion that explains
+    the readings; `process` a `RandomTorque` or `CorrelatedTorque` or `None`; `deviation` of the
+    normal prior of the logarithms of its density and time about those given, `None` for a process
+    that is known. Where only ratios of moments are determined, as by a
     gyro alone, the density is so to the square of a moment: compare `density / moment**2`.
 
     **Raises:** `TypeError` for arguments of another kind; `ValueError` for a robust loss, which is
@@ -114,9 +122,10 @@ class LogDensity(eqx.Module):
             raise ValueError("fit: its problem has a robust loss, which is no density; fit without")
         if not np.isfinite(np.asarray(fit.covariance)).all():
             what = " ".join(one.in_words for one in fit.undetermined)
+            hint = "" if process is None else _GUESS
             raise ValueError(
                 "fit: neither the data nor a prior determine some direction, so there is no "
-                f"posterior; give a prior or fewer free numbers. {what}".rstrip()
+                f"posterior; give a prior or fewer free numbers{hint}. {what}".rstrip()
             )
         self.problem, self.process, self.noises = problem, process, fit.noises
         spread = None if process is None or deviation is None else deviation

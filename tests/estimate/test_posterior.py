@@ -291,3 +291,43 @@ def test_nuts_agrees_with_the_fit_where_it_is_well_determined():
     deviation = np.sqrt(np.diagonal(fitted.covariance))
     np.testing.assert_allclose(x.mean(axis=0), density.x0, atol=0.3 * deviation.max())
     np.testing.assert_allclose(x.std(axis=0), deviation, rtol=0.15)
+
+
+def test_weighted_draws_stand_for_the_density(fitted):
+    # Nearly normal here: the draws have the mean and the covariance of the curvature.
+    density = estimate.LogDensity(fitted)
+    found = estimate.refit(density, draws=4000, key=jax.random.key(1))
+    assert found.draws.shape == (4000, density.size) and found.effective > 1500
+    np.testing.assert_allclose(found.weights.sum(), 1.0)
+    # Each weight is as large as the density over that of the t, whose logarithm is written out.
+    root = 1.2 * np.linalg.cholesky(found.covariance)
+    far = np.linalg.solve(root, (np.asarray(found.draws) - np.asarray(found.x)).T)
+    proposed = scipy.stats.multivariate_t.logpdf(far.T, df=6, shape=np.eye(density.size))
+    logs = np.asarray([density(x) for x in found.draws[:5]]) - proposed[:5]
+    np.testing.assert_allclose(np.diff(np.log(found.weights[:5])), np.diff(logs), atol=1e-8)
+    deviation = np.sqrt(np.diagonal(found.covariance))
+    draws, weights = np.asarray(found.draws), np.asarray(found.weights)
+    mean = weights @ draws
+    np.testing.assert_allclose((mean - np.asarray(found.x)) / deviation, 0.0, atol=0.15)
+    apart = (draws - mean) / deviation
+    spread = (weights[:, None] * apart).T @ apart
+    wanted = np.asarray(found.covariance) / np.outer(deviation, deviation)
+    np.testing.assert_allclose(spread, wanted, atol=0.15)
+    # Where the draws are worth nothing the curvature is taken: what is linear in x is normal.
+    one = jnp.zeros_like(found.weights).at[0].set(1.0)
+    poor = eqx.tree_at(lambda f: f.weights, found, one)
+    low, high = poor.interval_of(lambda point: point.parameters.own.spin)
+    at = poor.point.parameters.own.spin
+    np.testing.assert_allclose(0.5 * (low + high), at, atol=1e-12)
+    low2, high2 = found.interval_of(lambda point: point.parameters.own.spin)
+    np.testing.assert_allclose(high2 - low2, high - low, rtol=0.15)
+    with pytest.raises(ValueError, match="draws: wanted"):
+        estimate.refit(density, draws=0)
+
+
+def test_a_fit_that_failed_without_the_torque_is_refused_with_the_way_out(fitted):
+    lost = dataclasses.replace(fitted, covariance=jnp.full((5, 5), jnp.inf))
+    with pytest.raises(ValueError, match=r"fewer free numbers\. *"):
+        estimate.LogDensity(lost)
+    with pytest.raises(ValueError, match="begin from a first guess"):
+        estimate.LogDensity(lost, rj.torques.RandomTorque(1e-4))
