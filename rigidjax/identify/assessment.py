@@ -15,6 +15,9 @@ from rigidjax.identify.real_bodies import of_charts
 from rigidjax.identify.residual import Noise
 from rigidjax.identify.result import Fit, Start
 
+# A point so near to the least misfit, in standard deviations, is where a search was to end.
+AT_THE_END = 0.05
+
 
 def assess(
     problem: Problem,
@@ -24,8 +27,10 @@ def assess(
     best_cost: float,
 ) -> Fit:
     """The `Fit` of the best point, converged or not, among all that were tried."""
-    value, done = best.parameters, bool(best.converged)
+    value = best.parameters
     linear = uncertainty.linearise(problem, value, noise, best.found)
+    # In a long curved valley steps stay short, although hardly anything is left to gain.
+    done = bool(best.converged) or uncertainty.distance(linear) < AT_THE_END
     cut = at_limit(problem.records.readings)
     times = uncertainty.correlation_times(linear, cut)
     spread = uncertainty.spread(linear, times)

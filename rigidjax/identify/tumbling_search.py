@@ -176,7 +176,7 @@ def _many(
         end = search(evaluated, flat, jnp.ones_like(flat), mine, ())
         return Tried(restore(end.point), end.cost, end.converged)
 
-    return jax.lax.map(one, (starts, jnp.arange(FIRST)))
+    return jax.lax.map(one, (starts, jnp.arange(FIRST, dtype=jnp.int32)))
 
 
 @eqx.filter_jit

@@ -180,6 +180,17 @@ def spread(linear: Linearised, times: "Times") -> Spread:
     return Spread(shown, covariance, kind, singular, null)
 
 
+def distance(linear: Linearised) -> float:
+    """How many standard deviations of white errors away the least misfit is, √(gᵀ(JᵀWJ)⁻¹g).
+
+    As the linear problem has it, within what is seen: the criterion of MINUIT (James and Roos 1975,
+    doi:10.1016/0010-4655(75)90039-9).
+    """
+    slope = linear.scores.sum(axis=0) + linear.extra @ linear.extra_slopes
+    white = spread(linear, Times(((1.0,),), 0.0, float(linear.size))).seen
+    return float(np.sqrt(max(slope @ white @ slope, 0.0)))
+
+
 def of_white_errors(linear: Linearised) -> np.ndarray:
     """`(JᵀWJ)⁻¹` (n, n) whether the errors are white or not: what Laplace's method gives."""
     return spread(linear, Times(((1.0,),), 0.0, float(linear.size))).covariance

@@ -60,7 +60,6 @@ def test_mass_centre_and_shape_where_a_known_drag_shows_the_scale():
     assert bounds["mass"][1] - bounds["mass"][0] < 0.2 * truth["mass"]
 
 
-@pytest.mark.slow
 def test_without_a_force_that_feels_it_the_mass_is_said_to_be_unseen():
     problem = identify.Problem(
         identify.Recording(TS, *seen(FREE_FALL), torque=FREE_FALL),
@@ -71,12 +70,16 @@ def test_without_a_force_that_feels_it_the_mass_is_said_to_be_unseen():
     assert low == 0.0 and np.isinf(high)
     assert found.ok
     assert "mass is not determined by these data." in found.identifiability
-    words = "mass, I1, I2 and I3 rise together: only their ratios are determined."
-    assert words in found.identifiability
-    (told,) = identify.report.as_dict(found)["undetermined"]
-    assert told["words"] == words
-    assert {name: round(c["change"], 6) for name, c in told["changes"].items()} == dict.fromkeys(
-        ("mass", "I1", "I2", "I3"), 0.01
+    # Neither the fall nor the turning of a free body depends on the scale of mass or inertia.
+    words = (
+        "Mass is not determined: no reading changes with it.",
+        "I1, I2 and I3 rise together: only their ratios are determined.",
+    )
+    assert set(words) <= set(found.identifiability)
+    told = identify.report.as_dict(found)["undetermined"]
+    assert tuple(one["words"] for one in told) == words
+    assert {name: round(c["change"], 6) for name, c in told[1]["changes"].items()} == dict.fromkeys(
+        ("I1", "I2", "I3"), 0.01
     )
     # What the motion does show is found all the same.
     for name, value in zip(("com x", "com y", "com z"), TRUTH.com, strict=True):

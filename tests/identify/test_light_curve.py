@@ -91,7 +91,6 @@ def test_from_any_alias_alone_the_right_pair_is_found(shift):
     assert np.abs(best - pair).max(axis=1).min() < 0.05 / span
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("seed", "mode"), [(2, "long"), (7, "short")])
 def test_a_tumbler_is_found_blind(seed, mode):
     one = tumblers.tumbler(seed, mode)
@@ -107,7 +106,6 @@ def test_a_tumbler_is_found_blind(seed, mode):
     assert len(found.aliases) > 1 and f"{mode}-axis mode" in str(found)
 
 
-@pytest.mark.slow
 def test_a_light_curve_of_something_else_is_not_called_ok():
     one = tumblers.tumbler(2, "long")
     t = np.asarray(one.recording.t)
@@ -117,7 +115,6 @@ def test_a_light_curve_of_something_else_is_not_called_ok():
     assert not found.ok
 
 
-@pytest.mark.slow
 def test_a_daily_alias_is_not_taken_for_the_rotation():
     # Once its pair of frequencies was not among those tried, and one off by one a day fitted with
     # errors of 1.12 times the noise.
