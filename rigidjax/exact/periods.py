@@ -81,8 +81,8 @@ def _both(tensor: Mat3, omega: Vec3) -> tuple[Scalar, Scalar]:
     exponent = exponent_of(omega)
     moments, axes = principal_frame(times_power_of_two(tensor, -exponent_of(tensor)))
     rate = into(axes, times_power_of_two(omega, -exponent))
-    periods = _periods(moments, times(moments, rate))
-    return tuple(times_power_of_two(period, -exponent) for period in periods)
+    body, precession = _periods(moments, times(moments, rate))
+    return times_power_of_two(body, -exponent), times_power_of_two(precession, -exponent)
 
 
 def _periods(moments: Six, momentum: Triple) -> tuple[Scalar, Scalar]:
