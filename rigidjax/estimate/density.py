@@ -78,8 +78,9 @@ class LogDensity(eqx.Module):
     `fit(problem, starts=1, max_steps=1)`: without the torque there may be no motion that explains
     the readings; `process` a `RandomTorque` or `CorrelatedTorque` or `None`; `deviation` of the
     normal prior of the logarithms of its density and time about those given, `None` for a process
-    that is known. Where only ratios of moments are determined, as by a
-    gyro alone, the density is so to the square of a moment: compare `density / moment**2`.
+    that is known. Where only ratios of moments are determined, as by a gyro alone, the density is
+    so to the square of a moment: compare `density / moment**2`, and give the prior in the fit's own
+    unit of inertia (`fit.body`).
 
     **Raises:** `TypeError` for arguments of another kind; `ValueError` for a robust loss, which is
     no density, and for directions that neither data nor a prior determine.

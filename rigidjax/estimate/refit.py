@@ -25,6 +25,7 @@ from rigidjax.estimate.density import LogDensity, Point
 _STEP = 1e-2
 # Draws are of Student's t, wider than Laplace's method: tails that it misses get their weight.
 _FREEDOM, _WIDER = 6.0, 1.2
+# Draws that go side by side.
 _BLOCK = 32
 # Fewer independent draws do not give the ends of an interval.
 _LEAST = 100.0

@@ -187,13 +187,16 @@ def distance(linear: Linearised) -> float:
     doi:10.1016/0010-4655(75)90039-9).
     """
     slope = linear.scores.sum(axis=0) + linear.extra @ linear.extra_slopes
-    white = spread(linear, Times(((1.0,),), 0.0, float(linear.size))).seen
-    return float(np.sqrt(max(slope @ white @ slope, 0.0)))
+    return float(np.sqrt(max(slope @ _of_white(linear).seen @ slope, 0.0)))
 
 
 def of_white_errors(linear: Linearised) -> np.ndarray:
     """`(JᵀWJ)⁻¹` (n, n) whether the errors are white or not: what Laplace's method gives."""
-    return spread(linear, Times(((1.0,),), 0.0, float(linear.size))).covariance
+    return _of_white(linear).covariance
+
+
+def _of_white(linear: Linearised) -> Spread:
+    return spread(linear, Times(((1.0,),), 0.0, float(linear.size)))
 
 
 def _sandwich(linear: Linearised, bread: np.ndarray, times: "Times") -> np.ndarray:

@@ -106,7 +106,7 @@ def test_the_truth_lies_anywhere_among_the_draws_and_in_as_many_intervals_as_sai
     p = {name: [chance(one) for one in r.T] for name, r in ranks.items()}
     print(held, p)
     assert all(0.93 <= part <= 0.97 for part in held.values()), held
-    # Of so many ranks one is below 0.01 by chance.
+    # The least of so many is below 0.01 more often: Bonferroni's bound.
     each = [value for values in p.values() for value in values]
     assert min(each) > 0.01 / len(each), p
 
