@@ -23,6 +23,8 @@ CAREFUL, BOLD = 1.0, 1e-3
 LONGEST = 2.0
 # A step this little damped is one of Gauss and Newton.
 FREE = 1e-2
+# The least ratio of what a step gained to what it was to gain that speaks for its model.
+FAIR = 0.25
 # How near one the ratio of what a step gained to what it was to gain is where a problem is linear.
 LINEAR = 0.05
 # Steps that a search may still be away from where another one ended; its pace is by how much the
@@ -38,21 +40,26 @@ class Settings(eqx.Module):
     **Fields:** `tolerance` steps of so many standard deviations (of each parameter with all others
     at rest) end it; `damping` at the start; `steps` how many at most; `aim` a misfit that was
     reached elsewhere: the search ends where at its pace it would take more than `PATIENCE` steps
-    to come there; 0 for none.
+    to come there; 0 for none; `level` a step about as good as hoped whose gain is less than this
+    part of what noise alone lets a fit gain (see `search`) ends it, too.
     """
 
     tolerance: Any
     damping: Any
     steps: Any
     aim: Any
+    level: Any
 
-    def __init__(self, tolerance: float, damping: float, steps: int, aim: float = 0.0):
+    def __init__(
+        self, tolerance: float, damping: float, steps: int, aim: float = 0.0, level: float = 0.0
+    ):
         # NumPy's: outside of a trace each conversion of JAX costs as much as a run of 100 steps.
         kind = jnp.result_type(float)
         self.tolerance = np.asarray(tolerance, kind)
         self.damping = np.asarray(damping, kind)
         self.steps = np.asarray(steps, np.int32)
         self.aim = np.asarray(aim, kind)
+        self.level = np.asarray(level, kind)
 
 
 class Search(eqx.Module):
@@ -122,13 +129,15 @@ def search(
     made: Float[Array, " n"],
     settings: Settings,
     nothing: Any,
+    by_noise: Callable[[Any, Array], Array] | None = None,
 ) -> Search:
     """At most `settings.steps` steps down from `start`; with none, `start` is evaluated.
 
     **Arguments:** `evaluated` point (n,) → whatever is to be kept of the last evaluation, half the
     sum of squares, the normal matrix (n, n), the gradient (n,); `made` (n,) one for the numbers
     that are of order one by their making, which no step moves far, else zero; `nothing` zeros of
-    the shapes of what is to be kept.
+    the shapes of what is to be kept; `by_noise` what was kept, the normal matrix → by how much the
+    cost at the truth is expected to be above the least, for `settings.level`.
 
     Source: Marquardt 1963, doi:10.1137/0111030; the damping by the ratio of what a step gained to
     what it was to gain, Madsen, Nielsen and Tingleff 2004, Methods for non-linear least squares
@@ -142,7 +151,7 @@ def search(
         first = now.taken == 0
         better = finite & ((cost < now.cost) | first)
         ratio = (now.cost - cost) / jnp.where(now.hoped > 0, now.hoped, 1.0)
-        grown = jnp.where(ratio > 0.75, 0.1, jnp.where(ratio > 0.25, 0.5, 2.0))
+        grown = jnp.where(ratio > 0.75, 0.1, jnp.where(ratio > FAIR, 0.5, 2.0))
         # Where the misfit falls as the linear problem's does, damping only makes steps short.
         linear = (jnp.abs(ratio - 1.0) < LINEAR) & (now.damping > FREE)
         grown = jnp.where(linear, 0.01, grown)
@@ -150,6 +159,9 @@ def search(
         damping = jnp.maximum(damping, 1e-12)
         fell = jnp.where(better & ~first, jnp.log(now.cost) - jnp.log(cost), 0.0)
         pace = jnp.where(first, now.pace, 0.5 * (now.pace + fell))
+        level = better & ~first & (ratio > FAIR) & (now.damping <= FREE)
+        if by_noise is not None:
+            level = level & (now.cost - cost < settings.level * by_noise(found, gram))
         point, cost, gram, slope = jax.tree.map(
             lambda new, old: jnp.where(better, new, old),
             (now.trial, cost, gram, slope),
@@ -171,7 +183,8 @@ def search(
         small = (jnp.max(jnp.abs(move) * root) < settings.tolerance) & (damping <= FREE)
         # At the very bottom round-off refuses every step.
         bottom = hoped <= 1e-14 * cost
-        converged = sound & (small | (bottom & ~better & ~first))
+        ended = small if by_noise is None else small | level
+        converged = sound & (ended | (bottom & ~better & ~first))
         lost = ~finite & first
         done = converged | lost | (damping > STUCK) | (~sound & (damping > 1.0))
         done = done | ((settings.aim > 0) & (cost > settings.aim * jnp.exp(PATIENCE * pace)))

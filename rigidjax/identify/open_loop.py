@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
@@ -14,8 +15,9 @@ from rigidjax.motion.coupled import Coupled, motion_of, started
 from rigidjax.motion.torques.inputs import bind
 from rigidjax.solve import equations_of_motion
 from rigidjax.solve.components import split
+from rigidjax.solve.explicit import RolledKutta4, RungeKutta4
 from rigidjax.solve.fixed_loop import first_row, step
-from rigidjax.solve.steppers import stepper_of
+from rigidjax.solve.steppers import cheapest, stepper_of
 
 Value = TypeVar("Value")
 
@@ -33,18 +35,34 @@ def errors_by_horizon(
 
 
 def open_loop_errors(
-    scene: Any, h: float, value: Any, start: Any, wanted: Any, inputs: Any, scales: Any
+    scene: Any,
+    h: float,
+    value: Any,
+    start: Any,
+    wanted: Any,
+    inputs: Any,
+    scales: Any,
+    steps: Any = None,
 ) -> dict[str, Array]:
-    """The errors of one window, by kind (L, 3), in units of `scales`."""
+    """The errors of one window, by kind (L, 3), in units of `scales`.
+
+    Of the first `steps` of the window alone, where given (a traced number: no reverse mode); the
+    others are zero.
+    """
     body, law = scene(value)
     size, length = jnp.asarray(h, wanted.omega.dtype), wanted.omega.shape[0]
     before = next(iter(inputs.values())).shape[0] - length if inputs else 0
     start = started(body, start, bind(law, first_row(law, size, inputs)), 0.0)
-    stepper = stepper_of(None, equations_of_motion(body, start, law), start)
+    field = equations_of_motion(body, start, law)
+    solver = cheapest(field)
+    solver = RolledKutta4() if isinstance(solver, RungeKutta4) else solver
+    stepper = stepper_of(solver, field, start)
 
-    def one(y: Any, i: Array) -> tuple[Any, Any]:
+    def one(i: Array, now: tuple[Any, Any]) -> tuple[Any, Any]:
+        y, states = now
         y = step(stepper, size, jnp.zeros_like(size), i, y, inputs or None, before)
-        return y, motion_of(stepper.state(y))
+        there = motion_of(stepper.state(y))
+        return y, jax.tree.map(lambda all_, one: all_.at[i].set(one), states, there)
 
     def ahead(y: Any, i: Array) -> tuple[Any, None]:
         # The law's own states follow the inputs; the body stays as it was measured.
@@ -54,7 +72,8 @@ def open_loop_errors(
     y0 = stepper.start
     if before and isinstance(start, Coupled):
         y0, _ = lax.scan(ahead, y0, jnp.arange(-before, 0, dtype=jnp.int32))
-    _, states = lax.scan(one, y0, jnp.arange(length, dtype=jnp.int32))
+    last = jnp.asarray(length if steps is None else steps, jnp.int32)
+    _, states = lax.fori_loop(jnp.zeros((), jnp.int32), last, one, (y0, wanted))
     return {k: v / scales[k] for k, v in between(states, wanted).items()}
 
 

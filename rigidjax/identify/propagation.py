@@ -18,7 +18,7 @@ from rigidjax.motion import Attitude, Rigid
 from rigidjax.motion.coupled import Coupled, started
 from rigidjax.motion.torques import Torque
 from rigidjax.solve import equations_of_motion, fixed, simulate, solvers
-from rigidjax.solve.explicit import AbstractExplicit
+from rigidjax.solve.explicit import AbstractExplicit, RolledKutta4
 
 # Radians turned in a step: a fifth-order method then errs by 1e-9 a radian; and one of order 4 in
 # steps of so much less, at two thirds of the cost.
@@ -103,7 +103,7 @@ class Adaptive(AbstractIntegrator):
 def integrator_for(widest: float, rate: float) -> AbstractIntegrator:
     """The integrator for samples at most `widest` s apart of a body that turns at `rate` rad/s."""
     if widest * rate <= TURN_OF_ORDER_4:
-        return FixedSteps(1, solvers.RungeKutta4())
+        return FixedSteps(1, RolledKutta4())
     substeps = max(1, math.ceil(widest * rate / TURN_A_STEP))
     return FixedSteps(substeps) if substeps <= 20 else Adaptive()
 

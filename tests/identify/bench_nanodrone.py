@@ -108,22 +108,15 @@ if __name__ == "__main__":
     parser.add_argument("--stride", type=int, default=40)
     options = parser.parse_args()
     runs = {path.stem: path for path in sorted(options.folder.glob("*.csv"))}
-    value = GUESS
-    # Short windows first: over half a second a poor guess has lost its way.
-    for length in (5, 15, 50):
-        train = identify.Windows.joined(
-            *(cut(p, length, options.stride) for n, p in runs.items() if n not in HELD_OUT)
-        )
-        begin = time.process_time()
-        found = identify.fit_windows(train, scene, value)
-        value = found.value
-        print(
-            f"{train.count} windows of {length}: {found.steps} steps, cost {found.cost:.4f}, "
-            f"{time.process_time() - begin:.1f} CPU s; converged {found.converged} {found.message}"
-        )
+    train = identify.Windows.joined(
+        *(cut(p, 50, options.stride) for n, p in runs.items() if n not in HELD_OUT)
+    )
     begin = time.process_time()
-    identify.fit_windows(train, scene, value, max_steps=1)
-    print(f"one Jacobian, warm: {(time.process_time() - begin) / 2:.2f} CPU s")
+    found = identify.fit_windows(train, scene, GUESS)
+    print(
+        f"{train.count} windows: {found.steps} steps, cost {found.cost:.4f}, "
+        f"{time.process_time() - begin:.1f} CPU s; converged {found.converged} {found.message}"
+    )
     for name in found.value.__dataclass_fields__:
         value, deviation = (np.asarray(getattr(c, name)) for c in (found.value, found.deviation))
         print(name, np.round(value, 3), "±", np.round(deviation, 3))

@@ -6,7 +6,7 @@ FOLDER with the csv files of the nano-drone benchmark (see `bench_nanodrone.py`;
 project). 1359 windows of 50 steps, 25 free numbers: errors and their derivatives, summed to normal
 equations. Times of the processor, one thread each, medians of interleaved repeats, compile apart.
 
-- ours: one evaluation inside of `identify.fit_windows`;
+- ours: one evaluation of the errors and their derivatives, as `identify.fit_windows` takes it;
 - numba: the same equations written out as loops, Runge–Kutta of order 4, forward differences;
 - `--fit`: whole fits from the same start: `fit_windows`; SciPy's `least_squares` on numba's errors;
 - `--mjx`: the runs alone, without derivatives, of MuJoCo's XLA version with its Runge–Kutta.
@@ -27,6 +27,8 @@ jax.config.update("jax_enable_x64", True)
 
 import rigidjax as rj
 from rigidjax import identify, torques
+from rigidjax.identify import open_loop, window_fit
+from rigidjax.identify.levenberg_marquardt import Settings
 
 _spec = importlib.util.spec_from_file_location(
     "nanodrone", Path(__file__).with_name("bench_nanodrone.py")
@@ -36,23 +38,25 @@ _spec.loader.exec_module(nanodrone)
 
 LENGTH, MASS = 50, 0.045
 SPINS = np.array([1.0, -1, 1, -1])
-# A root of the second moment, centre, thrust, drag of rotors, drag, damping, twist: 25 numbers.
+# A root of the second moment, centre, thrust, drag of rotors, drag, damping, torque by velocity,
+# by how much of a sample the speeds come before they are logged: 25 numbers.
 GUESS = np.concatenate(
-    [[1.6, 0, 1.4, 0, 0, 1.4], np.zeros(3), np.ones(8), np.ones(3), np.ones(3), np.zeros(2)]
+    [[1.6, 0, 1.4, 0, 0, 1.4], np.zeros(2), np.ones(8), np.ones(3), np.ones(3), np.zeros(2), [0.5]]
 )
 
 
 def scene(x):
     root = jnp.zeros((3, 3)).at[np.tril_indices(3)].set(x[:6])
     body = rj.MassProperties(MASS, np.zeros(3), 1e-5 * root @ root.T)
-    twist = jnp.concatenate([x[23:], jnp.zeros(1)])
+    centre = jnp.concatenate([x[6:8], jnp.zeros(1)])
+    flap = jnp.zeros((3, 3)).at[0, 1].set(x[22]).at[1, 0].set(x[23])
     law = torques.Sum(
         torques.UniformGravity([0.0, 0.0, -9.81]),
-        torques.Rotors(nanodrone.PLACES - 1e-3 * x[6:9], nanodrone.UP, SPINS,
-                       3.4e-8 * x[9:13], 2e-10 * x[13:17], torques.Input("now")),
-        torques.BodyDrag(1e-2 * x[17:20]),
-        torques.Damping(1e-6 * x[20:23]),
-        torques.ConstantTorque(1e-5 * twist),
+        torques.Rotors(nanodrone.PLACES - 1e-3 * centre, nanodrone.UP, SPINS,
+                       3.4e-8 * x[8:12], 2e-10 * x[12:16], nanodrone.Between(x[24])),
+        torques.BodyDrag(1e-2 * x[16:19]),
+        torques.Damping(1e-6 * x[19:22]),
+        nanodrone.Flapping(1e-5 * flap),
     )  # fmt: skip
     return body, law
 
@@ -65,8 +69,8 @@ def cut(folder, count):
             break
     # Evenly chosen where there are more.
     rows = np.linspace(0, found.count - 1, count).round().astype(int)
-    parts = jax.tree.map(lambda a: a[rows], (found.starts, found.wanted, found.inputs["now"]))
-    return identify.Windows(found.step, parts[0], parts[1], {"now": parts[2]})
+    parts = jax.tree.map(lambda a: a[rows], (found.starts, found.wanted, found.inputs))
+    return identify.Windows(found.step, *parts)
 
 
 def with_numba(windows, scales):
@@ -78,11 +82,11 @@ def with_numba(windows, scales):
     h, places = windows.step, nanodrone.PLACES
     starts = np.concatenate([np.asarray(getattr(windows.starts, k)) for k in _KINDS], 1)
     wanted = np.concatenate([np.asarray(getattr(windows.wanted, k)) for k in _KINDS], 2)
-    speeds = np.asarray(windows.inputs["now"])
+    logged, later = (np.asarray(windows.inputs[k]) for k in ("now", "soon"))
     units = np.repeat([float(scales[k]) for k in _KINDS], 3)
 
     @numba.njit(fastmath=True)
-    def slope(y, lift, tx, ty, tz, drag, damping, inertia, inverse, out):
+    def slope(y, lift, tx, ty, tz, drag, damping, flap, inertia, inverse, out):
         w, a, b, c = y[6], y[7], y[8], y[9]
         p, q, r = y[10], y[11], y[12]
         xx, yy, zz = 1 - 2 * (b * b + c * c), 1 - 2 * (a * a + c * c), 1 - 2 * (a * a + b * b)
@@ -105,32 +109,33 @@ def with_numba(windows, scales):
         lx = i[0, 0] * p + i[0, 1] * q + i[0, 2] * r
         ly = i[1, 0] * p + i[1, 1] * q + i[1, 2] * r
         lz = i[2, 0] * p + i[2, 1] * q + i[2, 2] * r
-        mx = ly * r - lz * q + tx - damping[0] * p
-        my = lz * p - lx * r + ty - damping[1] * q
+        mx = ly * r - lz * q + tx - damping[0] * p + flap[0] * v
+        my = lz * p - lx * r + ty - damping[1] * q + flap[1] * u
         mz = lx * q - ly * p + tz - damping[2] * r
         for k in range(3):
             out[10 + k] = j[k, 0] * mx + j[k, 1] * my + j[k, 2] * mz
 
     @numba.njit(fastmath=True)
     def run(x, inertia, inverse, out):
-        drag, damping = 1e-2 * x[17:20], 1e-6 * x[20:23]
+        drag, damping, flap = 1e-2 * x[16:19], 1e-6 * x[19:22], 1e-5 * x[22:24]
         y, at, k = np.empty(13), np.empty(13), np.empty((4, 13))
         for n in range(starts.shape[0]):
             y[:] = starts[n]
             for m in range(LENGTH):
-                lift, tx, ty, tz = 0.0, 1e-5 * x[23], 1e-5 * x[24], 0.0
+                lift, tx, ty, tz = 0.0, 0.0, 0.0, 0.0
                 for i in range(4):
-                    square = speeds[n, m, i] ** 2
-                    one = 3.4e-8 * x[9 + i] * square
+                    early, late = logged[n, m, i], later[n, m, i]
+                    square = (early + x[24] * (late - early)) ** 2
+                    one = 3.4e-8 * x[8 + i] * square
                     lift += one
                     tx += one * (places[i, 1] - 1e-3 * x[7])
                     ty -= one * (places[i, 0] - 1e-3 * x[6])
-                    tz -= SPINS[i] * 2e-10 * x[13 + i] * square
+                    tz -= SPINS[i] * 2e-10 * x[12 + i] * square
                 for stage in range(4):
                     part = 0.0 if stage == 0 else (h if stage == 3 else 0.5 * h)
                     for d in range(13):
                         at[d] = y[d] + (part * k[stage - 1, d] if stage else 0.0)
-                    slope(at, lift, tx, ty, tz, drag, damping, inertia, inverse, k[stage])
+                    slope(at, lift, tx, ty, tz, drag, damping, flap, inertia, inverse, k[stage])
                 for d in range(13):
                     y[d] += h / 6.0 * (k[0, d] + 2.0 * k[1, d] + 2.0 * k[2, d] + k[3, d])
                 y[6:10] /= np.sqrt(np.sum(y[6:10] ** 2))
@@ -227,22 +232,34 @@ def main():
     options = parser.parse_args()
     windows = cut(options.folder, options.count)
     print(f"{windows.count} windows of {LENGTH} steps, {GUESS.size} numbers; {os.getloadavg()}")
-    found = {}
+    found, scales = {}, window_fit._scales(windows, None)
+    padded, count = window_fit._padded(windows), np.asarray(windows.count, np.int32)
 
-    def ours(steps):
-        found[steps] = identify.fit_windows(windows, scene, jnp.asarray(GUESS), max_steps=steps)
+    def ours():
+        found["fit"] = identify.fit_windows(windows, scene, jnp.asarray(GUESS))
 
-    # A fit of one step is two evaluations, or three where the step was no better.
-    once = timed("ours, a fit of one step", lambda: ours(1), options.repeats)
-    print(f"ours, errors and derivatives: about {once / 2:.2f} CPU s")
-    errors = with_numba(windows, found[1].noise)
+    def evaluated():
+        # A search of no steps, the inside of the fit.
+        jax.block_until_ready(
+            window_fit._searched(
+                scene, windows.step, jnp.asarray(GUESS), padded, count, scales, None,
+                Settings(0.0, 1.0, 0), np.int32(LENGTH),
+            )
+        )  # fmt: skip
+
+    def alone():
+        open_loop.errors_by_horizon(windows, scene, jnp.asarray(GUESS))
+
+    timed("ours, errors alone and their means", alone, options.repeats)
+    once = timed("ours, errors and derivatives", evaluated, options.repeats)
+    errors = with_numba(windows, scales)
     if errors is not None:
         other = timed("numba, errors alone", lambda: errors(GUESS), options.repeats)
         other = timed("numba, differences", lambda: by_differences(errors, GUESS), options.repeats)
-        print(f"ours / numba: {once / 2 / other:.2f}")
+        print(f"ours / numba: {once / other:.2f}")
     if options.fit:
-        timed("ours, whole fit", lambda: ours(50), 2)
-        best = found[50]
+        timed("ours, whole fit", ours, 2)
+        best = found["fit"]
         print(f"steps {best.steps}, cost {best.cost:.6f}, converged {best.converged}")
         if errors is not None:
             count = windows.count * LENGTH

@@ -1,13 +1,18 @@
 """Fits of many short open-loop runs: numbers known beforehand come back, mistakes are named."""
 
+import functools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.flatten_util import ravel_pytree
 
 import rigidjax as rj
 from rigidjax import identify, torques
+from rigidjax.identify import window_fit
+from rigidjax.identify.open_loop import open_loop_errors
 
 H, T = 0.02, 81
 BODY = rj.Inertia.from_principal(1.0, 2.0, 2.5)
@@ -85,6 +90,60 @@ def test_deviations_say_how_far_off_the_numbers_are():
             inside += list(np.ravel(off < 2 * np.asarray(found.deviation[name])))
     # 95 % of 40 are expected; of ten windows a record somewhat fewer.
     assert sum(inside) >= 32
+
+
+def test_the_true_numbers_cost_as_much_more_as_is_expected_of_noise():
+    """Twenty records: what a fit gains from noise, on the average, is what ends its search."""
+    gained, expected = [], []
+    true = {k: jnp.asarray(v) for k, v in TRUE.items()}
+    (t, states, u), rng = recorded(), np.random.default_rng(7)
+    noise = {"q": 1.0, "omega": 1.0}
+    ones = {kind: jnp.ones(()) for kind in noise}
+
+    @jax.jit
+    @functools.partial(jax.vmap, in_axes=(None, 0))
+    def linear(x, one):
+        flat, back = ravel_pytree(x)
+
+        def errors(flat):
+            return ravel_pytree(open_loop_errors(scene, H, back(flat), *one, ones))[0]
+
+        rows, e = jax.jacfwd(errors)(flat), errors(flat)
+        return rows.T @ rows, jnp.outer(e @ rows, e @ rows), 0.5 * e @ e
+
+    for _ in range(20):
+        q = np.asarray(states.q) + 2e-3 * rng.normal(size=(T, 4))
+        q /= np.linalg.norm(q, axis=1)[:, None]
+        noisy = rj.Attitude(q, np.asarray(states.omega) + 2e-3 * rng.normal(size=(T, 3)))
+        cut = identify.windows(t, noisy, {"u": u}, length=8, stride=8)
+        found = identify.fit_windows(cut, scene, true, noise=noise)
+        one = (cut.starts, cut.wanted, cut.inputs)
+        gram, spread, cost = (np.asarray(a).sum(0) for a in linear(found.value, one))
+        gained.append(np.sum(linear(true, one)[2]) - cost)
+        expected.append(0.5 * np.trace(np.linalg.solve(gram, spread)))
+        level = window_fit._by_noise(jnp.asarray(spread), jnp.asarray(gram))
+        np.testing.assert_allclose(level, expected[-1], rtol=1e-9)
+    ratio = np.mean(gained) / np.mean(expected)
+    assert 0.5 < ratio < 2.0, ratio
+
+
+def test_long_windows_lead_to_the_truth_from_a_poor_guess():
+    """A dipole in a field, three turns to and fro a window: by its whole length alone the search
+    ends in another minimum of the cost.
+    """
+    body = rj.Inertia.from_principal(1.0, 1.2, 1.5)
+    t = 0.05 * np.arange(241)
+
+    def scene(log):
+        return body, torques.MagneticDipole([jnp.exp(log), 0.0, 0.0], [0.0, 1.0, 0.0])
+
+    start = rj.Attitude([1.0, 0, 0, 0], [0.0, 0.0, 0.0])
+    ys = rj.simulate(body, start, t, scene(jnp.log(9.0))[1], rtol=1e-10, atol=1e-12).ys
+    cut = identify.windows(t, ys, length=120, stride=40)
+    guess = jnp.log(jnp.asarray(3.0))
+    found = identify.fit_windows(cut, scene, guess)
+    np.testing.assert_allclose(np.exp(found.value), 9.0, rtol=1e-4)
+    assert found.converged
 
 
 def test_no_window_goes_across_a_gap():

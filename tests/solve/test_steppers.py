@@ -9,7 +9,7 @@ import pytest
 
 import rigidjax as rj
 from rigidjax.motion.torques.base import sees_attitude, sees_rate
-from rigidjax.solve import components, fixed
+from rigidjax.solve import components, explicit, fixed
 from rigidjax.solve.steppers import stepper_of
 
 BODY = rj.Inertia([[1.6, 0.1, 0.0], [0.1, 2.0, 0.2], [0.0, 0.2, 3.0]])
@@ -113,6 +113,35 @@ def test_derivatives_of_equal_steps(law):
     back, forward, far = jax.jit(all_of)(jnp.zeros(6))
     np.testing.assert_allclose(back, forward, rtol=0, atol=1e-12)
     np.testing.assert_allclose(back, far, rtol=0, atol=1e-8)
+
+
+@pytest.mark.oldest
+@pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
+@pytest.mark.parametrize("law", [TOP, Unsaid()], ids=["top", "by time"])
+def test_stages_in_a_loop_take_the_steps_of_those_written_out(law, dtype):
+    """Values and derivatives by the rate, in both modes."""
+    rolled = explicit.RolledKutta4()
+    body, start, ts, law = jax.tree.map(
+        lambda a: jnp.asarray(a, dtype), (BODY, START, np.array([0.3, 0.5, 0.9]), law)
+    )
+    start = rj.Attitude(start.q / jnp.linalg.norm(start.q), start.omega)
+
+    def run(omega, solver):
+        ys = fixed(solver, rj.AttitudeEquations(body, law), ts, rj.Attitude(start.q, omega), 3)
+        return jnp.concatenate([ys.q[-1], ys.omega[-1]])
+
+    def all_of(omega, solver):
+        forward = jax.jacfwd(run)(omega, solver)
+        return run(omega, solver), forward, jax.jacrev(run)(omega, solver)
+
+    found, wanted = (
+        jax.jit(lambda w, s=s: all_of(w, s))(start.omega) for s in (rolled, explicit.RungeKutta4())
+    )
+    rounding = 30 * float(jnp.finfo(dtype).eps)
+    for a, b in zip(found, wanted, strict=True):
+        assert a.dtype == b.dtype == dtype
+        np.testing.assert_allclose(a, b, rtol=0, atol=rounding)
+    np.testing.assert_allclose(found[1], found[2], rtol=0, atol=rounding)
 
 
 def test_trees_come_back_as_they_were():
