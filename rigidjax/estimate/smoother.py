@@ -100,7 +100,7 @@ def smooth(
     first: Belief,
     *,
     iterations: int = 10,
-    tolerance: float = 1e-4,
+    tolerance: float = 1e-2,
     substeps: int | None = None,
     throw: bool = True,
 ) -> Smoothed:
@@ -112,7 +112,7 @@ def smooth(
     from what `filter` finds.
 
     **Arguments:** as for `filter`; `iterations` at most; it ends when no number moved by more than
-    `tolerance` of its standard deviation.
+    `tolerance` of its standard deviation (what is then left is about the square of it).
 
     **Returns** a `Smoothed`. It may be jitted, differentiated in forward mode, and batched.
 
