@@ -18,9 +18,10 @@ from rigidjax.estimate.grid import TURN_A_STEP
 from rigidjax.estimate.scene import Extended, Model, size_of
 from rigidjax.estimate.sensing import sensors_of
 from rigidjax.identify import uncertainty
-from rigidjax.identify.jacobian import all_errors, filled, first_state, over_records
+from rigidjax.identify.jacobian import all_errors, first_state, over_records
 from rigidjax.identify.parameters import Parameters, local
 from rigidjax.identify.problem import Problem
+from rigidjax.identify.recording import Recording
 from rigidjax.identify.residual import beside, whitened
 from rigidjax.identify.result import Fit
 from rigidjax.identify.sensor_inputs import what_turns
@@ -236,10 +237,11 @@ class LogDensity(eqx.Module):
 
     def _integrated(self, parameters: Parameters, noises: tuple, process: Any) -> Array:
         """The likelihood of each recording, the unknown torque integrated out."""
-        problem = _with_noises(self.problem, noises)
+        # Values first: a noise in the place of `None` moves the leaves that the slots count.
+        scenes = self.problem.scenes(parameters)
+        problem = eqx.tree_at(lambda p: p.records, self.problem, _with_noises(scenes, noises))
 
         def of_one(mine: Any, record: Any, ref: Any, which: Any) -> Array:
-            record = filled(problem, mine, record)
             body = what_turns(matter(problem.body, mine.body, which), problem.rung)
             state: HasSpin = first_state(problem.rung, mine, ref)
             law = process if record.torque is None else Sum(record.torque, process)
@@ -263,11 +265,11 @@ def _groups(problem: Problem) -> Int[Array, " records"]:
     return jnp.zeros(problem.count, jnp.int32) if groups is None else groups
 
 
-def _with_noises(problem: Problem, noises: tuple[Array, ...]) -> Problem:
-    """The problem whose sensors have these noises (R, k)."""
+def _with_noises(records: Recording, noises: tuple[Array, ...]) -> Recording:
+    """The recordings whose sensors have these noises (R, k)."""
     return eqx.tree_at(
-        lambda p: [reading.sensor.noise for reading in p.records.readings],
-        problem,
+        lambda r: [reading.sensor.noise for reading in r.readings],
+        records,
         list(noises),
         is_leaf=lambda node: node is None,
     )

@@ -118,6 +118,28 @@ def test_a_density_that_is_unknown_is_one_number_more(fitted):
     np.testing.assert_allclose(density(x), known(x[:-1]) + prior, rtol=1e-12)
 
 
+def test_a_noise_that_is_unknown_moves_no_other_number(fitted):
+    # Inside the filter the sensor has a noise, and with it one leaf more than in the problem.
+    record = problem().recordings[0]
+    bias = identify.Free(lambda r: r.readings[0].sensor.bias, "bias", scale=0.1, prior=0.1)
+    values = []
+    for noise in (None, 0.02):
+        gyro = identify.Gyro(noise, bias=[0.01, -0.02, 0.03])
+        seen = identify.Recording(record.t, (gyro, record.readings[0].values))
+        other = identify.Problem(seen, identify.PrincipalRatios(), free=[bias])
+        at = other.start(records.BODY)
+        at = eqx.tree_at(lambda p: p.own.spin, at, fitted.parameters.own.spin)
+        at = eqx.tree_at(lambda p: p.shared[0], at, jnp.array([1.0, -1.0, 0.5]))
+        covariance = 1e-4 * jnp.eye(8)
+        found = dataclasses.replace(
+            fitted, problem=other, parameters=at, covariance=covariance, seen=covariance,
+            singular_values=jnp.ones(8), null_directions=jnp.zeros((0, 8)),
+        )  # fmt: skip
+        with_one = estimate.LogDensity(found, rj.torques.RandomTorque(1e-4), deviation=None)
+        values.append(float(with_one(with_one.x0)))
+    np.testing.assert_allclose(values[0], values[1], rtol=1e-12)
+
+
 def test_any_sampler_will_do(fitted):
     def laplace(key, density, start):
         """Independent draws of the normal distribution that the numbers are scaled to."""
