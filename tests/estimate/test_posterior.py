@@ -140,6 +140,34 @@ def test_a_noise_that_is_unknown_moves_no_other_number(fitted):
     np.testing.assert_allclose(values[0], values[1], rtol=1e-12)
 
 
+def test_the_gradient_with_a_process_is_right_recording_by_recording(fitted):
+    """Noise, a shared bias with deviations and the process: central differences."""
+    record = problem().recordings[0]
+    reading = identify.Gyro(bias=[0.0, 0.0, 0.0]), record.readings[0].values
+    cut = [
+        identify.Recording(record.t[k : k + 12], (reading[0], reading[1][k : k + 12]))
+        for k in (0, 20)
+    ]
+    bias = identify.Free(lambda r: r.readings[0].sensor.bias, "bias", scale=0.1, spread=0.1)
+    both = identify.Problem(cut, identify.PrincipalRatios(), free=[bias], noise_each=True)
+    at = both.start(records.BODY)
+    size = sum(leaf.size for leaf in jax.tree.leaves(at))
+    covariance = 1e-4 * jnp.eye(size)
+    found = dataclasses.replace(
+        fitted, problem=both, parameters=at, covariance=covariance, seen=covariance,
+        noises=(jnp.full((2, 3), 0.02),), singular_values=jnp.ones(size),
+        null_directions=jnp.zeros((0, size)),
+    )  # fmt: skip
+    density = estimate.LogDensity(found, rj.torques.RandomTorque(1e-3))
+    assert density.size == size + 2 + 1
+    x, h = np.asarray(density.x0) + 0.01, 1e-5
+    slope = jax.jit(jax.jacfwd(density.value))(x)
+    steps = h * jnp.eye(x.size)
+    moved = jax.jit(jax.vmap(density.value))(jnp.concatenate([x[None] + steps, x[None] - steps]))
+    far = (moved[: x.size] - moved[x.size :]) / (2 * h)
+    np.testing.assert_allclose(slope, far, rtol=1e-5, atol=1e-6 * np.abs(far).max())
+
+
 def test_any_sampler_will_do(fitted):
     def laplace(key, density, start):
         """Independent draws of the normal distribution that the numbers are scaled to."""
