@@ -146,8 +146,10 @@ class LogDensity(eqx.Module):
         self.like = (fit.parameters, factors, logs)
         self.x0 = ravel_pytree(self.like)[0]
         seen = np.asarray(fit.covariance)
-        if process is None and fit.covariance_kind.startswith("sandwich"):
+        sandwich = fit.covariance_kind.startswith("sandwich")
+        if sandwich and (process is None or not _definite(seen)):
             # The density takes errors for white: its own width is less than the fit's intervals.
+            # Of many recordings the sandwich may be singular, and no scale for a search.
             linear = uncertainty.linearise(problem, fit.parameters, fit.noises)
             seen = uncertainty.of_white_errors(linear)
         rest, total = [], 0
@@ -306,6 +308,12 @@ class LogDensity(eqx.Module):
 def of_draws(function: Callable[[Point], Any], density: LogDensity, x: Float[Array, "m n"]) -> Any:
     """`function(point)` of each draw; compiled once for a function and densities of one form."""
     return jax.vmap(lambda one: function(density.unpack(one)))(x)
+
+
+def _definite(covariance: np.ndarray) -> bool:
+    """Whether a covariance has a Cholesky factor that round-off does not decide."""
+    size = np.sqrt(np.diagonal(covariance))
+    return bool(np.linalg.eigvalsh(covariance / np.outer(size, size)).min() > 1e-10)
 
 
 def _groups(problem: Problem) -> Int[Array, " records"]:

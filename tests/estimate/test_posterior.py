@@ -69,6 +69,10 @@ def test_its_width_is_that_of_white_errors_whatever_the_intervals_allow_for(fitt
     # A torque that is integrated out makes it wide again: there the sandwich is nearer.
     integrated = estimate.LogDensity(wide, rj.torques.RandomTorque(1e-4), deviation=None)
     np.testing.assert_allclose(integrated.covariance, fitted.covariance)
+    # Unless it is singular, which has no root.
+    flat = dataclasses.replace(wide, covariance=1e-4 * jnp.ones((5, 5)))
+    integrated = estimate.LogDensity(flat, rj.torques.RandomTorque(1e-4), deviation=None)
+    np.testing.assert_allclose(integrated.covariance, density.covariance)
 
 
 def test_a_noise_that_is_unknown_is_one_number_as_in_the_fit(fitted):
