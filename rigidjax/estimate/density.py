@@ -1,6 +1,7 @@
 """The posterior density of a problem in unconstrained numbers, for any sampler."""
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -17,10 +18,11 @@ from rigidjax.estimate.filter import log_likelihood_of
 from rigidjax.estimate.grid import TURN_A_STEP
 from rigidjax.estimate.scene import Extended, Model, size_of
 from rigidjax.estimate.sensing import sensors_of
-from rigidjax.identify import uncertainty
+from rigidjax.identify import padding, uncertainty
 from rigidjax.identify.jacobian import all_errors, filled, first_state, over_records
 from rigidjax.identify.parameters import Parameters, local
 from rigidjax.identify.problem import Problem
+from rigidjax.identify.recording import Recording
 from rigidjax.identify.residual import beside, whitened
 from rigidjax.identify.result import Fit
 from rigidjax.identify.sensor_inputs import what_turns
@@ -144,8 +146,10 @@ class LogDensity(eqx.Module):
         self.like = (fit.parameters, factors, logs)
         self.x0 = ravel_pytree(self.like)[0]
         seen = np.asarray(fit.covariance)
-        if process is None and fit.covariance_kind.startswith("sandwich"):
+        sandwich = fit.covariance_kind.startswith("sandwich")
+        if sandwich and (process is None or not _definite(seen)):
             # The density takes errors for white: its own width is less than the fit's intervals.
+            # Of many recordings the sandwich may be singular, and no scale for a search.
             linear = uncertainty.linearise(problem, fit.parameters, fit.noises)
             seen = uncertainty.of_white_errors(linear)
         rest, total = [], 0
@@ -192,28 +196,32 @@ class LogDensity(eqx.Module):
         `values` are those of the `Free`s by name; `parameters` the problem's own numbers.
         """
         x = _checks.floating(x, self.x0.shape, "x")
-        parameters, noises, process, _ = self._read(x)
+        parameters, factors, logs = ravel_pytree(self.like)[1](x)
+        noises, process = self._grown_noises(factors), self._grown(logs)
         body, state0 = self.problem.unpack(parameters)
         return Point(parameters, body, state0, self.problem.values(parameters), noises, process)
 
-    def _read(self, x: Array) -> tuple[Parameters, tuple[Array, ...], Any, Array | None]:
-        parameters, factors, logs = ravel_pytree(self.like)[1](x)
-        noises = tuple(
+    def _grown_noises(self, factors: tuple) -> tuple[Array, ...]:
+        """The noises (R, k) of the sensors by the logarithms of their factors."""
+        return tuple(
             noise if factor is None else noise * jnp.exp(factor)[_groups(self.problem), None]
             for noise, factor in zip(self.noises, factors, strict=True)
         )
-        process = self.process
-        if logs is not None:
-            leaves, structure = jax.tree.flatten(process)
-            grown = [leaf * jnp.exp(log) for leaf, log in zip(leaves, logs, strict=True)]
-            process = jax.tree.unflatten(structure, grown)
-        return parameters, noises, process, logs
+
+    def _grown(self, logs: Array | None) -> Any:
+        """The process by the logarithms of the factors of its numbers."""
+        if logs is None:
+            return self.process
+        leaves, structure = jax.tree.flatten(self.process)
+        grown = [leaf * jnp.exp(log) for leaf, log in zip(leaves, logs, strict=True)]
+        return jax.tree.unflatten(structure, grown)
 
     def value(self, x: Float[Array, " n"]) -> Scalar:
         """The same number without a rule for its gradient: for derivatives in forward mode."""
         problem = self.problem
-        parameters, noises, process, logs = self._read(x)
-        if process is None:
+        parameters, factors, logs = ravel_pytree(self.like)[1](x)
+        if self.process is None:
+            noises = self._grown_noises(factors)
             errors, ends = all_errors(parameters, problem)
             total = jnp.zeros((), x.dtype)
             scaled = whitened(problem, errors, noises)
@@ -227,21 +235,36 @@ class LogDensity(eqx.Module):
                 total = total + jnp.sum(jnp.where(reading.mask[..., None], each, 0))
         else:
             ends = None
-            total = jnp.sum(self._integrated(parameters, noises, process))
+            total = jnp.sum(self._integrated(parameters, factors, logs))
         for extra in beside(parameters, problem, ends):
             total = total - 0.5 * jnp.sum(extra**2)
         if logs is not None and self.deviation is not None:
             total = total - 0.5 * jnp.sum((logs / self.deviation) ** 2)
         return total
 
-    def _integrated(self, parameters: Parameters, noises: tuple, process: Any) -> Array:
-        """The likelihood of each recording, the unknown torque integrated out."""
-        problem = _with_noises(self.problem, noises)
+    def _integrated(self, parameters: Parameters, factors: tuple, logs: Array | None) -> Array:
+        """The likelihood of each recording, the unknown torque integrated out.
 
-        def of_one(mine: Any, record: Any, ref: Any, which: Any) -> Array:
-            record = filled(problem, mine, record)
+        Its derivative is taken recording by recording, by the numbers that each depends on.
+        """
+        problem = self.problem
+        groups = _groups(problem)
+        steps = tuple(None if factor is None else factor[groups] for factor in factors)
+        laws = None if logs is None else jnp.broadcast_to(logs, (problem.count, logs.size))
+        own = (local(problem, parameters), steps, laws)
+        restore = ravel_pytree(padding.one(own, 0))[1]
+
+        def of_one(row: Array, noises: Any, record: Any, ref: Any, which: Any) -> Array:
+            mine, steps, logs = restore(row)
+            noises = tuple(
+                noise if step is None else noise * jnp.exp(step)
+                for noise, step in zip(noises, steps, strict=True)
+            )
+            # Values first: a noise in the place of `None` moves the leaves that the slots count.
+            record = _with_noises(filled(problem, mine, record), noises)
             body = what_turns(matter(problem.body, mine.body, which), problem.rung)
             state: HasSpin = first_state(problem.rung, mine, ref)
+            process = self._grown(logs)
             law = process if record.torque is None else Sum(record.torque, process)
             model = Model(body, law)
             sensors = [reading.sensor for reading in record.readings]
@@ -254,7 +277,43 @@ class LogDensity(eqx.Module):
                 model, sensors_of(sensors, model), record, first, self.substeps
             )
 
-        return over_records(of_one, problem, local(problem, parameters))
+        def each(function: Any, rows: Array) -> Any:
+            def of(mine: Any, *rest: Any) -> Any:
+                row, noises = mine
+                return function(row, noises, *rest)
+
+            return over_records(of, problem, (rows, self.noises))
+
+        @jax.custom_jvp
+        def values(rows: Array) -> Array:
+            return each(of_one, rows)
+
+        @values.defjvp
+        def _(rows: tuple, step: tuple) -> tuple[Array, Array]:
+            def value_and_slope(row: Array, *rest: Any) -> tuple[Array, Array]:
+                def twice(row: Array) -> tuple[Array, Array]:
+                    out = of_one(row, *rest)
+                    return out, out
+
+                slope, out = jax.jacfwd(twice, has_aux=True)(row)
+                return out, slope
+
+            out, slope = each(value_and_slope, rows[0])
+            return out, jnp.sum(slope * step[0], axis=-1)
+
+        return values(jax.vmap(lambda one: ravel_pytree(one)[0])(own))
+
+
+@eqx.filter_jit
+def of_draws(function: Callable[[Point], Any], density: LogDensity, x: Float[Array, "m n"]) -> Any:
+    """`function(point)` of each draw; compiled once for a function and densities of one form."""
+    return jax.vmap(lambda one: function(density.unpack(one)))(x)
+
+
+def _definite(covariance: np.ndarray) -> bool:
+    """Whether a covariance has a Cholesky factor that round-off does not decide."""
+    size = np.sqrt(np.diagonal(covariance))
+    return bool(np.linalg.eigvalsh(covariance / np.outer(size, size)).min() > 1e-10)
 
 
 def _groups(problem: Problem) -> Int[Array, " records"]:
@@ -263,11 +322,11 @@ def _groups(problem: Problem) -> Int[Array, " records"]:
     return jnp.zeros(problem.count, jnp.int32) if groups is None else groups
 
 
-def _with_noises(problem: Problem, noises: tuple[Array, ...]) -> Problem:
-    """The problem whose sensors have these noises (R, k)."""
+def _with_noises(record: Recording, noises: tuple[Array, ...]) -> Recording:
+    """The recording whose sensors have these noises (k,)."""
     return eqx.tree_at(
-        lambda p: [reading.sensor.noise for reading in p.records.readings],
-        problem,
+        lambda r: [reading.sensor.noise for reading in r.readings],
+        record,
         list(noises),
         is_leaf=lambda node: node is None,
     )

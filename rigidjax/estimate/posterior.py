@@ -10,7 +10,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from rigidjax import _checks
-from rigidjax.estimate.density import LogDensity, Point
+from rigidjax.estimate.density import LogDensity, Point, of_draws
 
 # A sampler: key, log-density of z, a first z (n,) → draws (samples, n).
 Sampler = Callable[[Any, Callable[[Array], Array], Array], Array]
@@ -136,11 +136,8 @@ class Posterior(eqx.Module):
         function.
         """
         _checks.function(function, "function", "of a Point, such as lambda point: point.body")
-
-        def value(x: Array) -> Any:
-            return function(self.density.unpack(x))
-
-        return eqx.filter_jit(jax.vmap(jax.vmap(value)))(self.x)
+        found = of_draws(function, self.density, self.x.reshape(-1, self.x.shape[-1]))
+        return jax.tree.map(lambda leaf: leaf.reshape(*self.x.shape[:2], *leaf.shape[1:]), found)
 
     def to_arviz(self) -> Any:
         """The draws as ArviZ takes them: body, values, first states, process.

@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float
 
 from rigidjax import _checks
 from rigidjax._types import Scalar
-from rigidjax.estimate.density import LogDensity, Point
+from rigidjax.estimate.density import LogDensity, Point, of_draws
 
 # Of a standard deviation by Laplace's method: over this the gradient is differenced.
 _STEP = 1e-2
@@ -83,14 +83,15 @@ class Refit(eqx.Module):
             raise ValueError(f"level: wanted a probability between 0 and 1, got {level}")
         _checks.function(of, "of", "of a Point to an array")
 
-        def value(x: Array) -> Array:
-            return jnp.asarray(of(self.density.unpack(x)))
-
         if float(self.effective) >= _LEAST:
-            each = np.asarray(eqx.filter_jit(jax.vmap(value))(self.draws))
+            each = np.asarray(of_draws(of, self.density, self.draws))
             tails = np.array([0.5 - 0.5 * level, 0.5 + 0.5 * level])
             ends = np.apply_along_axis(_quantiles, 0, each, np.asarray(self.weights), tails)
             return ends[0], ends[1]
+
+        def value(x: Array) -> Array:
+            return jnp.asarray(of(self.density.unpack(x)))
+
         centre, slope = value(self.x), jax.jacfwd(value)(self.x)
         spread = jnp.sqrt(jnp.einsum("...i,ij,...j->...", slope, self.covariance, slope))
         reach = NormalDist().inv_cdf(0.5 + 0.5 * level) * spread

@@ -114,7 +114,7 @@ def _error_of(sensor: Any, now: SensorInput, value: Array) -> Array:
     return found
 
 
-def over_records(function: Any, problem: "Problem", mine: Local) -> Any:
+def over_records(function: Any, problem: "Problem", mine: Any) -> Any:
     """`function(mine, record, reference, which)` of every recording, by `vmap`.
 
     A single one is left alone: its loop compiles to less.

@@ -69,6 +69,10 @@ def test_its_width_is_that_of_white_errors_whatever_the_intervals_allow_for(fitt
     # A torque that is integrated out makes it wide again: there the sandwich is nearer.
     integrated = estimate.LogDensity(wide, rj.torques.RandomTorque(1e-4), deviation=None)
     np.testing.assert_allclose(integrated.covariance, fitted.covariance)
+    # Unless it is singular, which has no root.
+    flat = dataclasses.replace(wide, covariance=1e-4 * jnp.ones((5, 5)))
+    integrated = estimate.LogDensity(flat, rj.torques.RandomTorque(1e-4), deviation=None)
+    np.testing.assert_allclose(integrated.covariance, density.covariance)
 
 
 def test_a_noise_that_is_unknown_is_one_number_as_in_the_fit(fitted):
@@ -116,6 +120,56 @@ def test_a_density_that_is_unknown_is_one_number_more(fitted):
     known = estimate.LogDensity(fitted, rj.torques.RandomTorque(3e-4), deviation=None)
     prior = -0.5 * (np.log(3.0) / 2.0) ** 2
     np.testing.assert_allclose(density(x), known(x[:-1]) + prior, rtol=1e-12)
+
+
+def test_a_noise_that_is_unknown_moves_no_other_number(fitted):
+    # Inside the filter the sensor has a noise, and with it one leaf more than in the problem.
+    record = problem().recordings[0]
+    bias = identify.Free(lambda r: r.readings[0].sensor.bias, "bias", scale=0.1, prior=0.1)
+    values = []
+    for noise in (None, 0.02):
+        gyro = identify.Gyro(noise, bias=[0.01, -0.02, 0.03])
+        seen = identify.Recording(record.t, (gyro, record.readings[0].values))
+        other = identify.Problem(seen, identify.PrincipalRatios(), free=[bias])
+        at = other.start(records.BODY)
+        at = eqx.tree_at(lambda p: p.own.spin, at, fitted.parameters.own.spin)
+        at = eqx.tree_at(lambda p: p.shared[0], at, jnp.array([1.0, -1.0, 0.5]))
+        covariance = 1e-4 * jnp.eye(8)
+        found = dataclasses.replace(
+            fitted, problem=other, parameters=at, covariance=covariance, seen=covariance,
+            singular_values=jnp.ones(8), null_directions=jnp.zeros((0, 8)),
+        )  # fmt: skip
+        with_one = estimate.LogDensity(found, rj.torques.RandomTorque(1e-4), deviation=None)
+        values.append(float(with_one(with_one.x0)))
+    np.testing.assert_allclose(values[0], values[1], rtol=1e-12)
+
+
+def test_the_gradient_with_a_process_is_right_recording_by_recording(fitted):
+    """Noise, a shared bias with deviations and the process: central differences."""
+    record = problem().recordings[0]
+    reading = identify.Gyro(bias=[0.0, 0.0, 0.0]), record.readings[0].values
+    cut = [
+        identify.Recording(record.t[k : k + 12], (reading[0], reading[1][k : k + 12]))
+        for k in (0, 20)
+    ]
+    bias = identify.Free(lambda r: r.readings[0].sensor.bias, "bias", scale=0.1, spread=0.1)
+    both = identify.Problem(cut, identify.PrincipalRatios(), free=[bias], noise_each=True)
+    at = both.start(records.BODY)
+    size = sum(leaf.size for leaf in jax.tree.leaves(at))
+    covariance = 1e-4 * jnp.eye(size)
+    found = dataclasses.replace(
+        fitted, problem=both, parameters=at, covariance=covariance, seen=covariance,
+        noises=(jnp.full((2, 3), 0.02),), singular_values=jnp.ones(size),
+        null_directions=jnp.zeros((0, size)),
+    )  # fmt: skip
+    density = estimate.LogDensity(found, rj.torques.RandomTorque(1e-3))
+    assert density.size == size + 2 + 1
+    x, h = np.asarray(density.x0) + 0.01, 1e-5
+    slope = jax.jit(jax.jacfwd(density.value))(x)
+    steps = h * jnp.eye(x.size)
+    moved = jax.jit(jax.vmap(density.value))(jnp.concatenate([x[None] + steps, x[None] - steps]))
+    far = (moved[: x.size] - moved[x.size :]) / (2 * h)
+    np.testing.assert_allclose(slope, far, rtol=1e-5, atol=1e-6 * np.abs(far).max())
 
 
 def test_any_sampler_will_do(fitted):

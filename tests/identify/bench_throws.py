@@ -1,6 +1,6 @@
 """The throws of `shared/data/tudelft_throw` as one problem of four bodies with one sensor.
 
-    python tests/identify/bench_throws.py [EVERY] [END]
+    python tests/identify/bench_throws.py [EVERY] [END] [--white | --correlated]
 
 The recipe. All throws together: each group has a body of its own (six numbers) and a drag of its
 own; all share the gyro (bias, scale an axis, three skew terms) and the wheel's tilt; each throw has
@@ -11,6 +11,10 @@ as sure as it was found. Intervals: the fit's, and what the lever arms (regressi
 accelerometer) scatter from throw to throw.
 
 EVERY keeps each so many samples (default 1: 1 kHz), END is the last time, s (default 0.53).
+
+--white and --correlated: then each throw alone also has an unknown torque of that kind, its numbers
+free (`estimate.refit`). Device, wheel and objects are then all of such fits: the device and the
+proof body are the means of theirs.
 """
 
 import importlib.util
@@ -27,7 +31,7 @@ from scipy.special import stdtrit
 jax.config.update("jax_enable_x64", True)
 
 import rigidjax as rj
-from rigidjax import identify
+from rigidjax import estimate, identify
 
 _spec = importlib.util.spec_from_file_location("throws", Path(__file__).with_name("throws.py"))
 throws = importlib.util.module_from_spec(_spec)
@@ -102,6 +106,92 @@ def alone(name, row, joint):
     return identify.fit(problem, starts=1, initial=start)
 
 
+def with_torque(found, law):
+    """The fit of one throw, an unknown torque integrated out; nothing else is new."""
+    ts = found.problem.recording.t
+    # First guesses: all of the misfit is what the torque does to the rate in the time of the throw,
+    # and the torque lasts as long as the errors are autocorrelated.
+    momentum = jnp.mean(found.noise[0]) * jnp.trace(found.body.tensor) / 3
+    density = momentum**2 / (ts[-1] - ts[0])
+    process = {
+        "white": lambda: rj.torques.RandomTorque(density),
+        "correlated": lambda: rj.torques.CorrelatedTorque(
+            density, found.correlation * (ts[1] - ts[0])
+        ),
+    }[law]()
+    return estimate.refit(estimate.LogDensity(found, process))
+
+
+def drawn(best, key, count=1000):
+    """Tensors (count, 3, 3) drawn from the posterior of one throw."""
+    if best.effective >= 100:
+        x = jax.random.choice(key, best.draws, (count,), p=best.weights)
+    else:
+        x = jax.random.multivariate_normal(key, best.x, best.covariance, (count,))
+    return jax.vmap(lambda one: best.density.unpack(one).body.tensor)(x)
+
+
+def throws_with_torque(law, joint, records, levers, few):
+    """Print the figures of throws with an unknown torque: each alone, and the mean of a body's."""
+    keys = iter(jax.random.split(jax.random.key(0), joint.problem.count))
+    totals = {}
+    for name, rows in records.items():
+        found = [with_torque(alone(name, row, joint), law) for row in range(len(rows))]
+        totals[name] = jnp.stack([drawn(best, next(keys)) for best in found])
+        densities = [float(best.point.process.density[0]) for best in found]
+        evidence = sum(evidence_of(best) for best in found)
+        print(
+            f"{name}, {law} torque: {sum(bool(best.converged) for best in found)} of {len(found)} "
+            f"converged, independent draws {min(float(best.effective) for best in found):.0f} and "
+            f"more, log evidence {evidence:.0f}, density {np.median(densities):.1e} N² m² s"
+        )
+        if law == "correlated":
+            print(f"  time {np.median([float(best.point.process.time) for best in found]):.4f} s")
+    device, proof = (jnp.mean(totals[name], axis=0) for name in (DEVICE, PROOF))
+
+    def log_moments(name, total, device, proof, levers):
+        factor = factor_of(proof, device, levers)
+        return jnp.log(moments(name, total, device, factor, levers))
+
+    factors = jax.vmap(lambda p, d: factor_of(p, d, levers))(proof, device)
+    print(f"  the wheel's inertia times {factors.mean():.4f} ± {1.96 * factors.std():.4f}")
+
+    def judge(name, total):
+        """Errors and reaches (3,) of log moments of draws (m, 3, 3) of a tensor."""
+        of = jax.vmap(lambda *parts: log_moments(name, *parts, levers))
+        low, high = np.quantile(np.asarray(of(total, device, proof)), (0.025, 0.975), axis=0)
+        means = [jnp.mean(part, axis=0) for part in (total, device, proof)]
+        known = np.diag(of_levers(lambda d: log_moments(name, *means, d), levers))
+        reach = np.hypot((high - low) / 2, few * np.sqrt(known))
+        return 0.5 * (low + high) - np.log(TRUTH[name]), reach
+
+    all_errors, alone_held, mean_held = [], [], []
+    for name in TRUTH:
+        error, reach = judge(name, jnp.mean(totals[name], axis=0))
+        mean_held.append(show(f"{name}, mean of its throws", error, reach))
+        print(f"  errors % {np.round(100 * error, 2)}, 95 % ±% {np.round(100 * reach, 2)}")
+        errors, reaches = map(np.array, zip(*(judge(name, t) for t in totals[name]), strict=True))
+        alone_held.append(show(f"{name}, {len(errors)} throws", errors, reaches).ravel())
+        print(f"  mean errors % {np.round(100 * errors.mean(axis=0), 2)}")
+        all_errors.append(np.abs(errors).ravel())
+    summary(all_errors, alone_held, mean_held, "the means")
+
+
+def evidence_of(best):
+    """The logarithm of the integral of the posterior density, by Laplace's method."""
+    return float(best.log_density) + 0.5 * np.linalg.slogdet(2 * np.pi * best.covariance)[1]
+
+
+def summary(errors, alone_held, together_held, together):
+    errors, held = np.concatenate(errors), np.concatenate(alone_held)
+    print(
+        f"in all: mean {100 * errors.mean():.2f} %, worst {100 * errors.max():.2f} %; intervals of "
+        f"single throws that hold {held.sum()} of {held.size}, of {together} "
+        f"{np.sum(together_held)} of {np.size(together_held)}"
+    )
+    return errors, held, np.ravel(together_held)
+
+
 def shift(mass, d):
     return mass * (jnp.sum(d * d) * jnp.eye(3) - d[:, None] * d[None, :])
 
@@ -114,13 +204,13 @@ def moments(name, total, device, factor, levers):
     return jnp.linalg.eigvalsh(tensor - shift(MASSES[name], other)) * 1e6
 
 
-def factor_of(bodies, levers):
+def factor_of(proof, device, levers):
     """By what factor the wheel's inertia is off: the least squares of the proof body's moments."""
     factor = jnp.asarray(1.0)
     for _ in range(5):
 
         def off(f):
-            found = moments(PROOF, bodies[PROOF].tensor, bodies[DEVICE].tensor, f, levers)
+            found = moments(PROOF, proof, device, f, levers)
             return found / jnp.asarray(TRUTH[PROOF]) - 1.0
 
         error, slope = off(factor), jax.jacfwd(off)(factor)
@@ -145,8 +235,9 @@ def shared(joint, levers, name, total):
     """Variance of the log moments of a tensor by what it takes from the joint fit."""
 
     def of(bodies, levers):
-        factor = factor_of(bodies, levers)
-        return jnp.log(moments(name, jnp.asarray(total), bodies[DEVICE].tensor, factor, levers))
+        device = bodies[DEVICE].tensor
+        factor = factor_of(bodies[PROOF].tensor, device, levers)
+        return jnp.log(moments(name, jnp.asarray(total), device, factor, levers))
 
     low, high = joint.interval_of(lambda bodies, _: of(bodies, levers))
     of_fit = ((high - low) / 2 / identify.quantities.quantile(joint, 0.95)) ** 2
@@ -163,7 +254,7 @@ def show(name, errors, reach):
     return held
 
 
-def main(every=1, end=0.53):
+def main(every=1, end=0.53, laws=()):
     """Print the figures; returns them: errors of single throws, which intervals hold."""
     levers = {name: jnp.asarray(throws.lever(name)) for name in MASSES}
     # The scatter of the levers is itself known from a few throws only.
@@ -176,14 +267,15 @@ def main(every=1, end=0.53):
     for name, value in joint.values.items():
         if name in ("bias", "scale", "skew", "tilt"):
             print(f"  {name}", np.array2string(np.asarray(value), precision=4))
-    factor = factor_of(joint.body, levers)
+    factor = factor_of(joint.body[PROOF].tensor, joint.body[DEVICE].tensor, levers)
     print(f"  the wheel's inertia times {factor:.4f}; noise {np.unique(joint.noise[0]).round(4)}")
     together_held, alone_held, all_errors = [], [], []
     for name, truth in TRUTH.items():
 
         def log_moments(bodies, levers, name=name):
-            f = factor_of(bodies, levers)
-            return jnp.log(moments(name, bodies[name].tensor, bodies[DEVICE].tensor, f, levers))
+            device = bodies[DEVICE].tensor
+            f = factor_of(bodies[PROOF].tensor, device, levers)
+            return jnp.log(moments(name, bodies[name].tensor, device, f, levers))
 
         low, high = joint.interval_of(lambda bodies, _, of=log_moments: of(bodies, levers))
         known = np.diag(of_levers(lambda d, of=log_moments: of(joint.body, d), levers))
@@ -206,17 +298,18 @@ def main(every=1, end=0.53):
             words.append(one.status.split(":")[0])
         print("  status:", ", ".join(f"{words.count(word)} {word}" for word in sorted(set(words))))
         alone_held.append(
-            show(f"{name}, {len(errors)} throws", np.array(errors), np.array(reaches))
+            show(f"{name}, {len(errors)} throws", np.array(errors), np.array(reaches)).ravel()
         )
-        all_errors += list(np.abs(errors))
-    held = np.concatenate([x.ravel() for x in alone_held])
-    print(
-        f"in all: mean {100 * np.mean(all_errors):.2f} %, worst {100 * np.max(all_errors):.2f} %; "
-        f"intervals of single throws that hold {held.mean():.0%}, of the joint fit "
-        f"{np.sum(together_held)} of {np.size(together_held)}"
-    )
-    return np.concatenate([np.ravel(x) for x in all_errors]), held, np.ravel(together_held)
+        all_errors.append(np.abs(errors).ravel())
+    found = summary(all_errors, alone_held, together_held, "the joint fit")
+    for law in laws:
+        throws_with_torque(law, joint, records, levers, few)
+    return found
 
 
 if __name__ == "__main__":
-    main(*(kind(text) for kind, text in zip((int, float), sys.argv[1:], strict=False)))
+    numbers = [text for text in sys.argv[1:] if not text.startswith("--")]
+    main(
+        *(kind(text) for kind, text in zip((int, float), numbers, strict=False)),
+        laws=[text[2:] for text in sys.argv[1:] if text.startswith("--")],
+    )
