@@ -76,13 +76,19 @@ class Refit(eqx.Module):
         From the weighted draws; where these are worth fewer than 100 independent ones (`effective`)
         the covariance is carried by the derivative of the function, which is then to be
         differentiable: take the logarithm of what is positive. That is too narrow on short records.
-        **Raises** `ValueError` for a level outside (0, 1).
+        **Raises** `ValueError` for a level outside (0, 1), and where the density has no maximum at
+        x.
         """
         level = _checks.positive(level, "level")
         if level >= 1:
             raise ValueError(f"level: wanted a probability between 0 and 1, got {level}")
         _checks.function(of, "of", "of a Point to an array")
-
+        if not np.isfinite(np.asarray(self.weights)).all():
+            raise ValueError(
+                "interval_of: the density has no maximum at x, its curvature there is not positive: "
+                "give refit more max_steps, or its fit a better start, or draw from the density "
+                "(estimate.posterior)"
+            )
         if float(self.effective) >= _LEAST:
             each = np.asarray(of_draws(of, self.density, self.draws))
             tails = np.array([0.5 - 0.5 * level, 0.5 + 0.5 * level])
@@ -120,7 +126,8 @@ def refit(
     **Arguments:** `density` a `LogDensity`; `max_steps` at most; `draws` how many; `key` of
     `jax.random` for them, by default always the same.
 
-    **Returns** a `Refit`; `converged` false where it ended early.
+    **Returns** a `Refit`; `converged` false where it ended early, or at no maximum: `weights` are
+    then NaN.
 
     **Raises:** `TypeError` for another kind of thing.
 

@@ -375,6 +375,9 @@ def test_weighted_draws_stand_for_the_density(fitted):
     np.testing.assert_allclose(0.5 * (low + high), at, atol=1e-12)
     low2, high2 = found.interval_of(lambda point: point.parameters.own.spin)
     np.testing.assert_allclose(high2 - low2, high - low, rtol=0.15)
+    nothing = eqx.tree_at(lambda f: f.weights, found, jnp.full_like(one, jnp.nan))
+    with pytest.raises(ValueError, match="the density has no maximum at x"):
+        nothing.interval_of(lambda point: point.parameters.own.spin)
     with pytest.raises(ValueError, match="draws: wanted"):
         estimate.refit(density, draws=0)
 
