@@ -85,9 +85,9 @@ class Refit(eqx.Module):
         _checks.function(of, "of", "of a Point to an array")
         if not np.isfinite(np.asarray(self.weights)).all():
             raise ValueError(
-                "interval_of: the density has no maximum at x, its curvature there is not positive: "
-                "give refit more max_steps, or its fit a better start, or draw from the density "
-                "(estimate.posterior)"
+                "interval_of: the density has no maximum at x, its curvature there is not "
+                "positive: give refit more max_steps, or its fit a better start, or draw from the "
+                "density (estimate.posterior)"
             )
         if float(self.effective) >= _LEAST:
             each = np.asarray(of_draws(of, self.density, self.draws))

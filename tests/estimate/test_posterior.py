@@ -144,6 +144,7 @@ def test_a_noise_that_is_unknown_moves_no_other_number(fitted):
     np.testing.assert_allclose(values[0], values[1], rtol=1e-12)
 
 
+@pytest.mark.oldest
 def test_the_gradient_with_a_process_is_right_recording_by_recording(fitted):
     """Noise, a shared bias with deviations and the process: central differences."""
     record = problem().recordings[0]
