@@ -88,8 +88,9 @@ def fit_windows(
     summed window by window, so that memory does not grow with their number. Starts that may be off
     are found window by window, and taken out of the normal equations (variable projection). From a
     poor guess a long run has lost its way: long windows are first followed for a ninth and a third
-    of their length, ten steps of the search at most for each, and what that finds is the start if
-    it is better than the guess. The search ends within 0.05 standard deviations of the least cost.
+    of their length, ten steps of the search at most for each, and the search goes on from there
+    (from the guess, if it ended higher than the cost at the guess). The search ends within 0.05
+    standard deviations of the least cost.
 
     **Returns** a `WindowFit`; a fit that ends early returns its best point and says so.
 
@@ -135,11 +136,11 @@ def fit_windows(
         )
 
     whole, evaluated = windows.length, Settings(_SETTLED, BOLD, 0)
+    last = Settings(_SETTLED, BOLD, max_steps, level=_LEVEL)
     begin = _grown(searched, guess, back, whole)
-    if begin is not guess:
-        costs = [float(searched(value, evaluated, whole).cost) for value in (begin, guess)]
-        begin = begin if costs[0] < costs[1] or not np.isfinite(costs[1]) else guess
-    end = searched(begin, Settings(_SETTLED, BOLD, max_steps, level=_LEVEL), whole)
+    end = searched(begin, last, whole)
+    if begin is not guess and not end.cost <= searched(guess, evaluated, whole).cost:
+        end = searched(guess, last, whole)
     if not np.isfinite(end.cost):
         raise ValueError("guess: the runs from it are not finite; is the scene right?")
     value, taken = back(end.point), int(end.taken) - 1
