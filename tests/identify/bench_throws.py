@@ -1,6 +1,6 @@
 """The throws of `shared/data/tudelft_throw` as one problem of four bodies with one sensor.
 
-    python tests/identify/bench_throws.py [EVERY] [END] [--white | --correlated]
+    python tests/identify/bench_throws.py [EVERY] [END] [--white | --correlated] [--whole]
 
 The recipe. All throws together: each group has a body of its own (six numbers) and a drag of its
 own; all share the gyro (bias, scale an axis, three skew terms) and the wheel's tilt; each throw has
@@ -14,7 +14,7 @@ EVERY keeps each so many samples (default 1: 1 kHz), END is the last time, s (de
 
 --white and --correlated: then each throw alone also has an unknown torque of that kind, its numbers
 free (`estimate.refit`). Device, wheel and objects are then all of such fits: the device and the
-proof body are the means of theirs.
+proof body are the means of theirs. With --whole all throws of a body are one problem instead.
 """
 
 import importlib.util
@@ -87,28 +87,36 @@ def together(records):
 
 def alone(name, row, joint):
     """One throw with the sensor of the joint fit; its bias and drag about the shared ones."""
-    index = row + joint.problem.of.index(name)
-    scene = jax.tree.map(
-        lambda leaf: leaf[index] if eqx.is_array(leaf) else leaf,
-        joint.problem.scenes(joint.parameters),
-    )
-    shared = joint.values["bias"]
-    scene = eqx.tree_at(lambda r: r.readings[0].sensor.bias, scene, shared)
+    return some(name, [row], joint)
+
+
+def some(name, rows, joint):
+    """Throws of one body; each has a bias and a delay of its own."""
+    first = joint.problem.of.index(name)
+    scenes = joint.problem.scenes(joint.parameters)
+    chosen = [
+        eqx.tree_at(
+            lambda r: r.readings[0].sensor.bias,
+            jax.tree.map(lambda a, i=first + row: a[i] if eqx.is_array(a) else a, scenes),
+            joint.values["bias"],
+        )
+        for row in rows
+    ]
     # As sure as the joint fit is of the drag, of all axes the one that it is least sure of.
     drag = max(
         q.deviation for q in joint.quantities if q.name in [f"drag {a} [{name}]" for a in "xyz"]
     )
-    moves = free({"prior": OWN_BIAS}, {"prior": drag})
-    problem = identify.Problem(scene, identify.Tensor(3e-4), free=moves)
+    moves = free({"prior": OWN_BIAS, "each": True}, {"prior": drag})
+    problem = identify.Problem(chosen, identify.Tensor(3e-4), free=moves)
     start = problem.start(joint.body[name])
-    spin = joint.parameters.own.spin[index][None]
+    spin = joint.parameters.own.spin[jnp.asarray(rows) + first]
     start = eqx.tree_at(lambda p: p.own.spin, start, spin)
     return identify.fit(problem, starts=1, initial=start)
 
 
 def with_torque(found, law):
-    """The fit of one throw, an unknown torque integrated out; nothing else is new."""
-    ts = found.problem.recording.t
+    """The fit of throws, an unknown torque integrated out; nothing else is new."""
+    ts = found.problem.recordings[0].t
     # First guesses: all of the misfit is what the torque does to the rate in the time of the throw,
     # and the torque lasts as long as the errors are autocorrelated.
     momentum = jnp.mean(found.noise[0]) * jnp.trace(found.body.tensor) / 3
@@ -131,12 +139,15 @@ def drawn(best, key, count=1000):
     return jax.vmap(lambda one: best.density.unpack(one).body.tensor)(x)
 
 
-def throws_with_torque(law, joint, records, levers, few):
-    """Print the figures of throws with an unknown torque: each alone, and the mean of a body's."""
+def throws_with_torque(law, joint, records, levers, few, whole=False):
+    """Print the figures of throws with an unknown torque: each alone, and the mean of a body's; or
+    those of all throws of a body as one problem (`whole`).
+    """
     keys = iter(jax.random.split(jax.random.key(0), joint.problem.count))
     totals = {}
     for name, rows in records.items():
-        found = [with_torque(alone(name, row, joint), law) for row in range(len(rows))]
+        each = [[*range(len(rows))]] if whole else [[row] for row in range(len(rows))]
+        found = [with_torque(some(name, rows, joint), law) for rows in each]
         totals[name] = jnp.stack([drawn(best, next(keys)) for best in found])
         densities = [float(best.point.process.density[0]) for best in found]
         evidence = sum(evidence_of(best) for best in found)
@@ -168,13 +179,18 @@ def throws_with_torque(law, joint, records, levers, few):
     all_errors, alone_held, mean_held = [], [], []
     for name in TRUTH:
         error, reach = judge(name, jnp.mean(totals[name], axis=0))
-        mean_held.append(show(f"{name}, mean of its throws", error, reach))
+        mean_held.append(show(f"{name}, {'all' if whole else 'mean of'} its throws", error, reach))
         print(f"  errors % {np.round(100 * error, 2)}, 95 % ±% {np.round(100 * reach, 2)}")
+        if whole:
+            continue
         errors, reaches = map(np.array, zip(*(judge(name, t) for t in totals[name]), strict=True))
         alone_held.append(show(f"{name}, {len(errors)} throws", errors, reaches).ravel())
         print(f"  mean errors % {np.round(100 * errors.mean(axis=0), 2)}")
         all_errors.append(np.abs(errors).ravel())
-    summary(all_errors, alone_held, mean_held, "the means")
+    if whole:
+        print(f"in all: {np.sum(mean_held)} of {np.size(mean_held)} intervals hold")
+    else:
+        summary(all_errors, alone_held, mean_held, "the means")
 
 
 def evidence_of(best):
@@ -254,7 +270,7 @@ def show(name, errors, reach):
     return held
 
 
-def main(every=1, end=0.53, laws=()):
+def main(every=1, end=0.53, laws=(), whole=False):
     """Print the figures; returns them: errors of single throws, which intervals hold."""
     levers = {name: jnp.asarray(throws.lever(name)) for name in MASSES}
     # The scatter of the levers is itself known from a few throws only.
@@ -303,7 +319,7 @@ def main(every=1, end=0.53, laws=()):
         all_errors.append(np.abs(errors).ravel())
     found = summary(all_errors, alone_held, together_held, "the joint fit")
     for law in laws:
-        throws_with_torque(law, joint, records, levers, few)
+        throws_with_torque(law, joint, records, levers, few, whole)
     return found
 
 
@@ -311,5 +327,6 @@ if __name__ == "__main__":
     numbers = [text for text in sys.argv[1:] if not text.startswith("--")]
     main(
         *(kind(text) for kind, text in zip((int, float), numbers, strict=False)),
-        laws=[text[2:] for text in sys.argv[1:] if text.startswith("--")],
+        laws=[text[2:] for text in sys.argv[1:] if text in ("--white", "--correlated")],
+        whole="--whole" in sys.argv,
     )

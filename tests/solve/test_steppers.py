@@ -116,8 +116,9 @@ def test_derivatives_of_equal_steps(law):
 
 
 @pytest.mark.oldest
-@pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
-@pytest.mark.parametrize("law", [TOP, Unsaid()], ids=["top", "by time"])
+@pytest.mark.parametrize(
+    ("law", "dtype"), [(TOP, jnp.float64), (Unsaid(), jnp.float32)], ids=["top", "by time"]
+)
 def test_stages_in_a_loop_take_the_steps_of_those_written_out(law, dtype):
     """Values and derivatives by the rate, in both modes."""
     rolled = explicit.RolledKutta4()
