@@ -15,8 +15,9 @@ from rigidjax.motion.coupled import Coupled, motion_of, started
 from rigidjax.motion.torques.inputs import bind
 from rigidjax.solve import equations_of_motion
 from rigidjax.solve.components import split
-from rigidjax.solve.explicit import RolledKutta4, RungeKutta4
 from rigidjax.solve.fixed_loop import first_row, step
+from rigidjax.solve.magnus import Magnus4
+from rigidjax.solve.rolled import in_a_loop
 from rigidjax.solve.steppers import cheapest, stepper_of
 
 Value = TypeVar("Value")
@@ -55,7 +56,7 @@ def open_loop_errors(
     start = started(body, start, bind(law, first_row(law, size, inputs)), 0.0)
     field = equations_of_motion(body, start, law)
     solver = cheapest(field)
-    solver = RolledKutta4() if isinstance(solver, RungeKutta4) else solver
+    solver = solver if isinstance(solver, Magnus4) else in_a_loop(solver)
     stepper = stepper_of(solver, field, start)
 
     def one(i: Array, now: tuple[Any, Any]) -> tuple[Any, Any]:

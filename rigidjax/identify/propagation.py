@@ -18,7 +18,8 @@ from rigidjax.motion import Attitude, Rigid
 from rigidjax.motion.coupled import Coupled, started
 from rigidjax.motion.torques import Torque
 from rigidjax.solve import equations_of_motion, fixed, simulate, solvers
-from rigidjax.solve.explicit import AbstractExplicit, RolledKutta4
+from rigidjax.solve.explicit import AbstractExplicit
+from rigidjax.solve.rolled import in_a_loop
 
 # Radians turned in a step: a fifth-order method then errs by 1e-9 a radian; and one of order 4 in
 # steps of so much less, at two thirds of the cost.
@@ -66,7 +67,7 @@ class FixedSteps(AbstractIntegrator):
     def states(self, body: Any, state0: Any, ts: Float[Array, " times"], torque: Torque) -> Any:
         y0 = started(body, state0, torque, ts[0])
         field = equations_of_motion(body, y0, torque)
-        return fixed(self.solver, field, ts, y0, self.substeps)
+        return fixed(in_a_loop(self.solver), field, ts, y0, self.substeps)
 
 
 class Adaptive(AbstractIntegrator):
@@ -103,7 +104,7 @@ class Adaptive(AbstractIntegrator):
 def integrator_for(widest: float, rate: float) -> AbstractIntegrator:
     """The integrator for samples at most `widest` s apart of a body that turns at `rate` rad/s."""
     if widest * rate <= TURN_OF_ORDER_4:
-        return FixedSteps(1, RolledKutta4())
+        return FixedSteps(1, solvers.RungeKutta4())
     substeps = max(1, math.ceil(widest * rate / TURN_A_STEP))
     return FixedSteps(substeps) if substeps <= 20 else Adaptive()
 

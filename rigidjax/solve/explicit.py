@@ -103,16 +103,6 @@ class RungeKutta4(AbstractExplicit):
     tableau: ClassVar[Tableau] = KUTTA4
 
 
-class RolledKutta4(AbstractExplicit):
-    """The steps of `RungeKutta4`, their stages in a loop wherever our loops of equal steps run.
-
-    For derivatives in forward mode, as fits take them: with many tangents it compiles in half the
-    time or less and runs as fast. Values alone take a tenth longer, reverse mode a third.
-    """
-
-    tableau: ClassVar[Tableau] = KUTTA4
-
-
 class Tsitouras5(AbstractExplicit):
     """Tsitouras' method of order 5, six stages, with an estimate of order 4.
 
@@ -166,31 +156,6 @@ def advance(
     return _along(y, h, tableau.b, slopes), slopes
 
 
-def end_of_step(
-    solver: AbstractExplicit,
-    field: Callable[[Any, Atoms], Atoms],
-    t: Any,
-    h: Array,
-    y: Atoms,
-    end: Any,
-) -> Atoms:
-    """The end of a step of `solver`, not projected; arguments as for `advance`."""
-    if not isinstance(solver, RolledKutta4):
-        return advance(solver.tableau, field, t, h, y, end)[0]
-
-    # Kutta's method needs in each stage the slope of the one before, no other.
-    def stage(before: tuple[Atoms, Atoms], now: tuple[Array, Array, Array]) -> Any:
-        (total, slope), (time, node, weight) = before, now
-        slope = _fence(field(time, _fence(_plus(y, node * h, slope))))
-        return (_plus(total, weight * h, slope), slope), None
-
-    times = jnp.stack([jnp.asarray(a, h.dtype) for a in (t, t + 0.5 * h, t + 0.5 * h, end)])
-    nodes = jnp.array([0.0, *KUTTA4.c], h.dtype)
-    shares = jnp.array(list(KUTTA4.b.values()), h.dtype)
-    rest = tuple(jnp.zeros_like(a) for a in y)
-    return lax.scan(stage, (y, rest), (times, nodes, shares))[0][0]
-
-
 def _fence(numbers: Atoms) -> Atoms:
     """The same numbers, not to be computed again in each place that reads them.
 
@@ -238,10 +203,11 @@ def _dense(tableau: Tableau, field: Any, step: Step, there: Stages) -> Array:
 
 
 def _along(y: Atoms, h: Any, row: Row, slopes: Sequence[Atoms]) -> Atoms:
-    return _plus(y, h, _weighted(row, slopes))
+    return plus(y, h, _weighted(row, slopes))
 
 
-def _plus(y: Atoms, h: Any, rise: Atoms) -> Atoms:
+def plus(y: Atoms, h: Any, rise: Atoms) -> Atoms:
+    """The state `y + h · rise`, in the precision of y."""
     return tuple(a + _as(h, a) * k for a, k in zip(y, rise, strict=True))
 
 

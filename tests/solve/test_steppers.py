@@ -10,6 +10,7 @@ import pytest
 import rigidjax as rj
 from rigidjax.motion.torques.base import sees_attitude, sees_rate
 from rigidjax.solve import components, explicit, fixed
+from rigidjax.solve.rolled import in_a_loop
 from rigidjax.solve.steppers import stepper_of
 
 BODY = rj.Inertia([[1.6, 0.1, 0.0], [0.1, 2.0, 0.2], [0.0, 0.2, 3.0]])
@@ -117,11 +118,18 @@ def test_derivatives_of_equal_steps(law):
 
 @pytest.mark.oldest
 @pytest.mark.parametrize(
-    ("law", "dtype"), [(TOP, jnp.float64), (Unsaid(), jnp.float32)], ids=["top", "by time"]
+    ("plain", "law", "dtype"),
+    [
+        (explicit.RungeKutta4(), TOP, jnp.float64),
+        (explicit.RungeKutta4(), Unsaid(), jnp.float32),
+        (explicit.Tsitouras5(), Unsaid(), jnp.float64),
+    ],
+    ids=["top", "by time", "order 5"],
 )
-def test_stages_in_a_loop_take_the_steps_of_those_written_out(law, dtype):
+def test_stages_in_a_loop_take_the_steps_of_those_written_out(plain, law, dtype):
     """Values and derivatives by the rate, in both modes."""
-    rolled = explicit.RolledKutta4()
+    rolled = in_a_loop(plain)
+    assert rolled is not plain
     body, start, ts, law = jax.tree.map(
         lambda a: jnp.asarray(a, dtype), (BODY, START, np.array([0.3, 0.5, 0.9]), law)
     )
@@ -135,9 +143,7 @@ def test_stages_in_a_loop_take_the_steps_of_those_written_out(law, dtype):
         forward = jax.jacfwd(run)(omega, solver)
         return run(omega, solver), forward, jax.jacrev(run)(omega, solver)
 
-    found, wanted = (
-        jax.jit(lambda w, s=s: all_of(w, s))(start.omega) for s in (rolled, explicit.RungeKutta4())
-    )
+    found, wanted = (jax.jit(lambda w, s=s: all_of(w, s))(start.omega) for s in (rolled, plain))
     rounding = 30 * float(jnp.finfo(dtype).eps)
     for a, b in zip(found, wanted, strict=True):
         assert a.dtype == b.dtype == dtype
