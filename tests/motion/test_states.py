@@ -95,6 +95,24 @@ def test_wheels_as_scipy_has_them_from_the_equations():
     assert pushed.own[0].shape == (3, 3)
 
 
+def test_basilisk_balanced_wheels():
+    """Attitude after 1 s of Basilisk's integrated test of reaction wheels, "BalancedWheels": three
+    wheels whose torque is limited to 0.2 N m (0.5 are asked for), switched off after 0.5 s. Its
+    wheels are part of the hub's inertia but about their axes: 100 N m s at 6000 rpm.
+    """
+    turns = 2 * np.pi / 60
+    inertia = [100.0 / (6000 * turns)] * 3
+    asked = torques.Held([0.0, 0.5], [[0.20, 0.10, -0.50], [0.0, 0.0, 0.0]])
+    speeds = np.array([500.0, 200.0, -150.0]) * turns
+    law = torques.ReactionWheels(np.eye(3), inertia, speeds, asked, max_torque=0.2)
+    body = law.without_wheels(rj.Inertia.from_principal(900.0, 800.0, 600.0))
+    start = rj.Attitude([1.0, 0, 0, 0], [0.08, 0.01, 0.0])
+    q = rj.simulate(body, start, [0.0, 1.0], law, rtol=1e-12, atol=1e-14).ys.q[-1]
+    # Modified Rodrigues parameters, written there to nine digits.
+    wanted = [1.99853994e-02, 2.45647716e-03, 8.45356279e-06]
+    np.testing.assert_allclose(q[1:] / (1 + q[0]), wanted, rtol=1e-8)
+
+
 def test_momentum_is_kept_by_the_equations_themselves():
     """d/dt R(IΩ + Σ h a) is nothing at states drawn at random, to round-off, and energy changes by
     Σ u s: whatever motors, limits and friction do.
