@@ -77,7 +77,8 @@ def test_without_a_force_that_feels_it_the_mass_is_said_to_be_unseen():
     )
     assert set(words) <= set(found.identifiability)
     told = identify.report.as_dict(found)["undetermined"]
-    assert tuple(one["words"] for one in told) == words
+    # Both are seen by nothing at all: which comes first is round-off.
+    assert {one["words"] for one in told} == set(words)
     assert {name: round(c["change"], 6) for name, c in told[1]["changes"].items()} == dict.fromkeys(
         ("I1", "I2", "I3"), 0.01
     )
