@@ -16,7 +16,6 @@ from rigidjax.motion.torques.inputs import bind
 from rigidjax.solve import equations_of_motion
 from rigidjax.solve.components import split
 from rigidjax.solve.fixed_loop import first_row, step
-from rigidjax.solve.magnus import Magnus4
 from rigidjax.solve.rolled import in_a_loop
 from rigidjax.solve.steppers import cheapest, stepper_of
 
@@ -55,9 +54,7 @@ def open_loop_errors(
     before = next(iter(inputs.values())).shape[0] - length if inputs else 0
     start = started(body, start, bind(law, first_row(law, size, inputs)), 0.0)
     field = equations_of_motion(body, start, law)
-    solver = cheapest(field)
-    solver = solver if isinstance(solver, Magnus4) else in_a_loop(solver)
-    stepper = stepper_of(solver, field, start)
+    stepper = stepper_of(in_a_loop(cheapest(field)), field, start)
 
     def one(i: Array, now: tuple[Any, Any]) -> tuple[Any, Any]:
         y, states = now

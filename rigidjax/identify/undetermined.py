@@ -102,7 +102,9 @@ def undetermined(fit: "Fit") -> tuple[Combination, ...]:
             best = rows, names, size
     assert best is not None
     rows, names, size = best
-    return tuple(_combination(row, names, size, values) for row in rows if row.any())
+    # In the order of their first numbers: that of the directions is round-off.
+    rows = sorted((row for row in rows if row.any()), key=lambda row: np.flatnonzero(row)[0])
+    return tuple(_combination(row, names, size, values) for row in rows)
 
 
 def _combination(

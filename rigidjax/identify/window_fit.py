@@ -38,7 +38,8 @@ class WindowFit(eqx.Module, Generic[Value]):
 
     **Fields:** `value` the free numbers, of the type of the guess; `deviation` their standard
     deviations, from how the windows differ (sandwich; of windows that overlap they are too small);
-    `cost` half the mean square, errors in units of `noise`; `noise` by kind; `steps` taken;
+    `cost` half the mean square, errors in units of `noise`; `noise` by kind; `steps` taken over the
+    whole windows;
     `converged`; `message` what there is to say; `scene` as given.
 
     >>> import rigidjax as rj
@@ -89,8 +90,8 @@ def fit_windows(
     are found window by window, and taken out of the normal equations (variable projection). From a
     poor guess a long run has lost its way: long windows are first followed for a ninth and a third
     of their length, ten steps of the search at most for each, and the search goes on from there
-    (from the guess, if it ended higher than the cost at the guess). The search ends within 0.05
-    standard deviations of the least cost.
+    (from the guess, if it ended higher than the cost at the guess). The search ends where a step
+    gains less than 0.05² of what noise alone lets a fit gain: about 0.05 standard deviations.
 
     **Returns** a `WindowFit`; a fit that ends early returns its best point and says so.
 

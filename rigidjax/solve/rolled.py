@@ -77,8 +77,8 @@ class RolledTsitouras5(AbstractRolled):
         return y
 
 
-def in_a_loop(solver: AbstractExplicit) -> AbstractExplicit:
-    """The method with its stages in a loop, where there is such a one.
+def in_a_loop(solver: Any) -> Any:
+    """The method with its stages in a loop; another, if it is none of order 4 or 5, as it is.
 
     >>> from rigidjax import solvers
     >>> type(in_a_loop(solvers.Tsitouras5())).__name__
