@@ -9,25 +9,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from rigidjax import _checks
-from rigidjax._types import HasSpin, Scalar
-from rigidjax.estimate.belief import Belief
-from rigidjax.estimate.filter import log_likelihood_of
+from rigidjax._types import Scalar
 from rigidjax.estimate.grid import TURN_A_STEP
-from rigidjax.estimate.scene import Extended, Model, size_of
-from rigidjax.estimate.sensing import sensors_of
-from rigidjax.identify import padding, uncertainty
-from rigidjax.identify.jacobian import all_errors, filled, first_state, over_records
-from rigidjax.identify.parameters import Parameters, local
+from rigidjax.estimate.terms import groups_of, prior_residuals, terms
+from rigidjax.identify import uncertainty
+from rigidjax.identify.parameters import Parameters
 from rigidjax.identify.problem import Problem
-from rigidjax.identify.recording import Recording
-from rigidjax.identify.residual import beside, whitened
 from rigidjax.identify.result import Fit
-from rigidjax.identify.sensor_inputs import what_turns
-from rigidjax.identify.several_bodies import matter
-from rigidjax.motion.torques import CorrelatedTorque, RandomTorque, Sum
+from rigidjax.motion.torques import CorrelatedTorque, RandomTorque
 
 # What to say where a fit without the torque ended far from the body.
 _GUESS = (
@@ -135,7 +127,7 @@ class LogDensity(eqx.Module):
         self.deviation = (
             None if spread is None else jnp.asarray(_checks.positive(spread, "deviation"))
         )
-        groups = np.asarray(_groups(problem))
+        groups = np.asarray(groups_of(problem))
         factors = tuple(
             jnp.zeros(groups.max() + 1) if reading.sensor.noise is None else None
             for reading in problem.records.readings
@@ -197,18 +189,18 @@ class LogDensity(eqx.Module):
         """
         x = _checks.floating(x, self.x0.shape, "x")
         parameters, factors, logs = ravel_pytree(self.like)[1](x)
-        noises, process = self._grown_noises(factors), self._grown(logs)
+        noises, process = self._grown_noises(factors), self.grown(logs)
         body, state0 = self.problem.unpack(parameters)
         return Point(parameters, body, state0, self.problem.values(parameters), noises, process)
 
     def _grown_noises(self, factors: tuple) -> tuple[Array, ...]:
         """The noises (R, k) of the sensors by the logarithms of their factors."""
         return tuple(
-            noise if factor is None else noise * jnp.exp(factor)[_groups(self.problem), None]
+            noise if factor is None else noise * jnp.exp(factor)[groups_of(self.problem), None]
             for noise, factor in zip(self.noises, factors, strict=True)
         )
 
-    def _grown(self, logs: Array | None) -> Any:
+    def grown(self, logs: Array | None) -> Any:
         """The process by the logarithms of the factors of its numbers."""
         if logs is None:
             return self.process
@@ -218,90 +210,7 @@ class LogDensity(eqx.Module):
 
     def value(self, x: Float[Array, " n"]) -> Scalar:
         """The same number without a rule for its gradient: for derivatives in forward mode."""
-        problem = self.problem
-        parameters, factors, logs = ravel_pytree(self.like)[1](x)
-        if self.process is None:
-            noises = self._grown_noises(factors)
-            errors, ends = all_errors(parameters, problem)
-            total = jnp.zeros((), x.dtype)
-            scaled = whitened(problem, errors, noises)
-            for e, noise, reading in zip(scaled, noises, problem.records.readings, strict=True):
-                each = -0.5 * e**2 - jnp.log(noise)[:, None] - 0.5 * math.log(2 * math.pi)
-                limit = getattr(reading.sensor, "limit", None)
-                if limit is not None:
-                    # What a channel at its limit counts is a probability, not a density.
-                    full = jnp.abs(reading.values) >= limit[:, None] * (1 - 1e-6)
-                    each = jnp.where(full, -0.5 * e**2, each)
-                total = total + jnp.sum(jnp.where(reading.mask[..., None], each, 0))
-        else:
-            ends = None
-            total = jnp.sum(self._integrated(parameters, factors, logs))
-        for extra in beside(parameters, problem, ends):
-            total = total - 0.5 * jnp.sum(extra**2)
-        if logs is not None and self.deviation is not None:
-            total = total - 0.5 * jnp.sum((logs / self.deviation) ** 2)
-        return total
-
-    def _integrated(self, parameters: Parameters, factors: tuple, logs: Array | None) -> Array:
-        """The likelihood of each recording, the unknown torque integrated out.
-
-        Its derivative is taken recording by recording, by the numbers that each depends on.
-        """
-        problem = self.problem
-        groups = _groups(problem)
-        steps = tuple(None if factor is None else factor[groups] for factor in factors)
-        laws = None if logs is None else jnp.broadcast_to(logs, (problem.count, logs.size))
-        own = (local(problem, parameters), steps, laws)
-        restore = ravel_pytree(padding.one(own, 0))[1]
-
-        def of_one(row: Array, noises: Any, record: Any, ref: Any, which: Any) -> Array:
-            mine, steps, logs = restore(row)
-            noises = tuple(
-                noise if step is None else noise * jnp.exp(step)
-                for noise, step in zip(noises, steps, strict=True)
-            )
-            # Values first: a noise in the place of `None` moves the leaves that the slots count.
-            record = _with_noises(filled(problem, mine, record), noises)
-            body = what_turns(matter(problem.body, mine.body, which), problem.rung)
-            state: HasSpin = first_state(problem.rung, mine, ref)
-            process = self._grown(logs)
-            law = process if record.torque is None else Sum(record.torque, process)
-            model = Model(body, law)
-            sensors = [reading.sensor for reading in record.readings]
-            torques = tuple(jnp.zeros(3, state.omega.dtype) for _ in model.coloured)
-            x = Extended(state, torques, ())
-            known = jnp.zeros(size_of(x) - 3 * len(torques), state.omega.dtype)
-            spread = jnp.concatenate([known, *(law.deviation for law in model.coloured)])
-            first = Belief(record.t[0], x, jnp.diag(spread))
-            return log_likelihood_of(
-                model, sensors_of(sensors, model), record, first, self.substeps
-            )
-
-        def each(function: Any, rows: Array) -> Any:
-            def of(mine: Any, *rest: Any) -> Any:
-                row, noises = mine
-                return function(row, noises, *rest)
-
-            return over_records(of, problem, (rows, self.noises))
-
-        @jax.custom_jvp
-        def values(rows: Array) -> Array:
-            return each(of_one, rows)
-
-        @values.defjvp
-        def _(rows: tuple, step: tuple) -> tuple[Array, Array]:
-            def value_and_slope(row: Array, *rest: Any) -> tuple[Array, Array]:
-                def twice(row: Array) -> tuple[Array, Array]:
-                    out = of_one(row, *rest)
-                    return out, out
-
-                slope, out = jax.jacfwd(twice, has_aux=True)(row)
-                return out, slope
-
-            out, slope = each(value_and_slope, rows[0])
-            return out, jnp.sum(slope * step[0], axis=-1)
-
-        return values(jax.vmap(lambda one: ravel_pytree(one)[0])(own))
+        return terms(self, x).log_density - 0.5 * jnp.sum(prior_residuals(self, x) ** 2)
 
 
 @eqx.filter_jit
@@ -314,19 +223,3 @@ def _definite(covariance: np.ndarray) -> bool:
     """Whether a covariance has a Cholesky factor that round-off does not decide."""
     size = np.sqrt(np.diagonal(covariance))
     return bool(np.linalg.eigvalsh(covariance / np.outer(size, size)).min() > 1e-10)
-
-
-def _groups(problem: Problem) -> Int[Array, " records"]:
-    """Which noise each recording has, as the fit estimates it: all the same unless `noise_each`."""
-    groups = problem.noise_groups
-    return jnp.zeros(problem.count, jnp.int32) if groups is None else groups
-
-
-def _with_noises(record: Recording, noises: tuple[Array, ...]) -> Recording:
-    """The recording whose sensors have these noises (k,)."""
-    return eqx.tree_at(
-        lambda r: [reading.sensor.noise for reading in r.readings],
-        record,
-        list(noises),
-        is_leaf=lambda node: node is None,
-    )

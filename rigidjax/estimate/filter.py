@@ -279,13 +279,12 @@ def _filter(
     return Filtered(beliefs, reads, total, status, lost_at)
 
 
-def log_likelihood_of(
+def reads_of(
     model: Model, sensors: Sensors, recording: Recording, first: Belief, substeps: int
-) -> Scalar:
-    """`log_likelihood` of what has been looked at."""
-    return _log_likelihood(
-        model, sensors, recording, first, grid_of(model, recording, first, substeps)
-    )
+) -> tuple[Read, ...]:
+    """What each sensor's readings gave, at each stop, of what has been looked at."""
+    grid = grid_of(model, recording, first, substeps)
+    return scan_filter(model, sensors, recording, first, grid, lambda belief, read: read)[1][1]
 
 
 @eqx.filter_jit

@@ -1,6 +1,6 @@
 """The most probable numbers of a problem, with the unknown torque integrated out.
 
-Beside them weighted draws from the posterior density (importance sampling): the curvature at the
+Beside them weighted draws from the posterior density (importance sampling): the information at the
 top alone gives intervals that are too narrow on short records, since it holds the torque's density
 at its most probable value, which is below its mean.
 """
@@ -13,20 +13,20 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
 from jax import lax
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float
 
 from rigidjax import _checks
 from rigidjax._types import Scalar
 from rigidjax.estimate.density import LogDensity, Point, of_draws
+from rigidjax.estimate.terms import curvature
+from rigidjax.identify.levenberg_marquardt import Settings, made_of, search
 
-# Of a standard deviation by Laplace's method: over this the gradient is differenced.
-_STEP = 1e-2
+# Steps of so many standard deviations end the search; its damping at the start.
+_SMALL, _DAMPING = 1e-3, 1e-2
 # Draws are of Student's t, wider than Laplace's method: tails that it misses get their weight.
 _FREEDOM, _WIDER = 6.0, 1.2
-# Draws that go side by side.
-_BLOCK = 32
 # Fewer independent draws do not give the ends of an interval.
 _LEAST = 100.0
 
@@ -35,9 +35,9 @@ class Refit(eqx.Module):
     """What `refit` returns.
 
     **Fields:** `density`; `x` (n,) where it is largest, `log_density` there; `covariance` (n, n) of
-    x by the curvature there; `converged`; `draws` (m, n) and their `weights` (m,), which add up to
-    1: together they stand for the posterior density. `effective` is how many independent draws
-    they are worth.
+    x, the inverse of Fisher's information there; `converged`; `draws` (m, n) and their `weights`
+    (m,), which add up to 1: together they stand for the posterior density. `effective` is how many
+    independent draws they are worth.
 
     >>> import rigidjax as rj
     >>> ts = jnp.linspace(0.0, 10.0, 80)
@@ -76,18 +76,18 @@ class Refit(eqx.Module):
         From the weighted draws; where these are worth fewer than 100 independent ones (`effective`)
         the covariance is carried by the derivative of the function, which is then to be
         differentiable: take the logarithm of what is positive. That is too narrow on short records.
-        **Raises** `ValueError` for a level outside (0, 1), and where the density has no maximum at
-        x.
+        **Raises** `ValueError` for a level outside (0, 1), and where neither holds: too few draws
+        are independent, and x is not the maximum.
         """
         level = _checks.positive(level, "level")
         if level >= 1:
             raise ValueError(f"level: wanted a probability between 0 and 1, got {level}")
         _checks.function(of, "of", "of a Point to an array")
-        if not np.isfinite(np.asarray(self.weights)).all():
+        if not (float(self.effective) >= _LEAST or bool(self.converged)):
             raise ValueError(
-                "interval_of: the density has no maximum at x, its curvature there is not "
-                "positive: give refit more max_steps, or its fit a better start, or draw from the "
-                "density (estimate.posterior)"
+                "interval_of: the search did not come to the maximum of the density, and fewer "
+                "than 100 draws are independent: give refit more max_steps, or its fit a better "
+                "start, or draw from the density (estimate.posterior)"
             )
         if float(self.effective) >= _LEAST:
             each = np.asarray(of_draws(of, self.density, self.draws))
@@ -116,18 +116,20 @@ def refit(
     """Where the posterior density is largest, and weighted draws around for intervals.
 
     A fit that allows for an unknown torque: `refit(LogDensity(fit, RandomTorque(1e-4)))` finds
-    body, first states, whatever is free, and the torque's density, from `fit` on. Quasi-Newton
-    (BFGS) of optimistix in numbers scaled by Laplace's covariance, gradients in forward mode
-    through the filter. The draws are of Student's t about that point, with the covariance by the
-    curvature there, made wider; each weighs as much as the density there over that of the t
-    (importance sampling: Geweke 1989, doi:10.2307/1913710). It is quick where x has a dozen
-    numbers; for more `estimate.posterior` is the way.
+    body, first states, whatever is free, and the torque's density, from `fit` on. By Fisher's
+    scoring: Levenberg and Marquardt's search with the expected information of the innovations in
+    the place of the normal matrix (Gupta and Mehra 1974, doi:10.1109/TAC.1974.1100714), added up
+    recording by recording. The draws are of Student's t about that point, with the covariance by
+    that information, made wider; each weighs as much as the density there over that of the t
+    (importance sampling: Geweke 1989, doi:10.2307/1913710). Of more than some dozen numbers draws
+    are worth little (`effective`); intervals are then by the information, which is enough where
+    each recording is long. `estimate.posterior` draws from any density.
 
     **Arguments:** `density` a `LogDensity`; `max_steps` at most; `draws` how many; `key` of
     `jax.random` for them, by default always the same.
 
-    **Returns** a `Refit`; `converged` false where it ended early, or at no maximum: `weights` are
-    then NaN.
+    **Returns** a `Refit`; `converged` false where it ended early, or where some combination of the
+    numbers changes neither readings nor priors: `weights` are then NaN.
 
     **Raises:** `TypeError` for another kind of thing.
 
@@ -143,41 +145,29 @@ def refit(
     _checks.instance(density, LogDensity, "density", hint="estimate.LogDensity(fit) makes one")
     steps, count = _checks.whole(max_steps, "max_steps", 1), _checks.whole(draws, "draws", 1)
     key = jax.random.key(0) if key is None else _checks.key(key)
-    return _refit(density, jnp.linalg.cholesky(density.covariance), key, steps, count)
+    return _refit(density, Settings(_SMALL, _DAMPING, steps), key, count)
 
 
 @eqx.filter_jit
-def _refit(density: LogDensity, root: Array, key: Any, max_steps: int, count: int) -> Refit:
-    def of(z: Array, args: Any = None) -> Array:
-        return -density.value(density.x0 + jnp.sum(root * z[None], 1))
+def _refit(density: LogDensity, settings: Settings, key: Any, count: int) -> Refit:
+    def evaluated(x: Array) -> tuple[None, Array, Array, Array]:
+        found = curvature(density, x)
+        return None, found.cost, found.gram, found.slope
 
-    found = optx.minimise(
-        of,
-        optx.BFGS(rtol=1e-6, atol=1e-6),
-        jnp.zeros_like(density.x0),
-        options={"autodiff_mode": "fwd"},
-        max_steps=max_steps,
-        throw=False,
-    )
-    z = found.value
-    slope = jax.jacfwd(of)
-    # Both ends in one loop, so that the gradient is compiled once.
-    ends = jnp.concatenate([jnp.eye(z.size), -jnp.eye(z.size)]).astype(z.dtype)
-    slopes = lax.map(lambda unit: slope(z + _STEP * unit), ends)
-    curve = (slopes[: z.size] - slopes[z.size :]) / (2 * _STEP)
-    spread = jnp.linalg.inv(0.5 * (curve + curve.T))
-    covariance = root @ spread @ root.T
-    whole = jnp.isfinite(covariance).all() & (jnp.linalg.eigvalsh(curve + curve.T).min() > 0)
-    top = density.x0 + jnp.sum(root * z[None], 1)
-    here, draws, weights = _weighted(density, top, covariance, key, count)
-    converged = (found.result == optx.RESULTS.successful) & whole
-    return Refit(density, top, here, covariance, converged, draws, weights)
+    parameters, factors, logs = density.like
+    ones = jax.tree.map(jnp.ones_like, (factors, logs))
+    made = ravel_pytree((made_of(parameters), *ones))[0]
+    end = search(evaluated, density.x0, made, settings, None)
+    covariance = jnp.linalg.inv(end.gram)
+    draws, weights = _weighted(density, end.point, covariance, key, count)
+    converged = end.converged & jnp.isfinite(weights).all()
+    return Refit(density, end.point, -end.cost, covariance, converged, draws, weights)
 
 
 def _weighted(
     density: LogDensity, top: Array, covariance: Array, key: Any, count: int
-) -> tuple[Scalar, Float[Array, "m n"], Float[Array, " m"]]:
-    """The density at the top, draws of Student's t about it, and their weights."""
+) -> tuple[Float[Array, "m n"], Float[Array, " m"]]:
+    """Draws of Student's t about the top, and their weights."""
     size, kind = top.size, top.dtype
     normal, square = jax.random.split(key)
     z = jax.random.normal(normal, (count, size), kind)
@@ -185,13 +175,8 @@ def _weighted(
     z = z / jnp.sqrt(shrunk)
     root = _WIDER * jnp.linalg.cholesky(covariance)
     draws = top[None] + z @ root.T
-    # Blocks fill the vector units, all at once would fill the memory; a smaller one at the end
-    # would be compiled by itself.
-    spare = jnp.broadcast_to(top, (-(count + 1) % _BLOCK + 1, size))
-    blocks = jnp.concatenate([draws, spare]).reshape(-1, _BLOCK, size)
-    found = lax.map(jax.vmap(density.value), blocks).reshape(-1)
-    here, found = found[-1], found[:count]
+    found = lax.map(density.value, draws)
     taken = -0.5 * (_FREEDOM + size) * jnp.log1p(jnp.sum(z * z, 1) / _FREEDOM)
     # A point so far out that the density is no number there has none.
     logs = jnp.where(jnp.isfinite(found), found - taken, -jnp.inf)
-    return here, draws, jax.nn.softmax(logs)
+    return draws, jax.nn.softmax(logs)

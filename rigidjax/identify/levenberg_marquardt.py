@@ -96,7 +96,7 @@ def descend(
 ) -> tuple[Parameters, Search]:
     """`search` for the free numbers of a problem."""
     flat, restore = ravel_pytree(start)
-    where, made = places(problem, start), _made(start)
+    where, made = places(problem, start), made_of(start)
     number, kind = flat.size, flat.dtype
 
     def evaluated(point: Array) -> tuple[Any, Array, Array, Array]:
@@ -157,7 +157,7 @@ def search(
         grown = jnp.where(linear, 0.01, grown)
         damping = now.damping * jnp.where(first, 1.0, jnp.where(better, grown, 8.0))
         damping = jnp.maximum(damping, 1e-12)
-        fell = jnp.where(better & ~first, jnp.log(now.cost) - jnp.log(cost), 0.0)
+        fell = jnp.where(better & ~first, jnp.log(jnp.abs(now.cost / cost)), 0.0)
         pace = jnp.where(first, now.pace, 0.5 * (now.pace + fell))
         level = better & ~first & (ratio > FAIR) & (now.damping <= FREE)
         if by_noise is not None:
@@ -182,7 +182,7 @@ def search(
         hoped = -(slope @ move) - 0.5 * move @ (gram @ move)
         small = (jnp.max(jnp.abs(move) * root) < settings.tolerance) & (damping <= FREE)
         # At the very bottom round-off refuses every step.
-        bottom = hoped <= 1e-14 * cost
+        bottom = hoped <= 1e-14 * jnp.abs(cost)
         ended = small if by_noise is None else small | level
         converged = sound & (ended | (bottom & ~better & ~first))
         lost = ~finite & first
@@ -242,7 +242,7 @@ def _nothing(problem: Problem, start: Parameters, columns: int, kind: Any) -> An
     return (errors, ends), blocks
 
 
-def _made(parameters: Parameters) -> Float[Array, " n"]:
+def made_of(parameters: Parameters) -> Float[Array, " n"]:
     """One for the numbers that are of order one by their making, zero for those of a `Free`.
 
     The unit of a `Free` is a user's guess. The scale of the others is at most one, so that a

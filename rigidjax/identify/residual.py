@@ -4,7 +4,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from rigidjax.identify.jacobian import all_errors, first_state
 from rigidjax.identify.loss import shrink, weight
@@ -19,27 +19,34 @@ Noise = tuple[Float[Array, "records _"], ...]
 
 
 def whitened(problem: Problem, errors: tuple, noise: Noise) -> tuple[Float[Array, "..."], ...]:
-    """Errors in standard deviations, (R, T, k) for each sensor; saturated channels by their odds.
+    """Errors in standard deviations, (R, T, k) for each sensor: see `standardised`."""
+    out = []
+    for reading, error, sigma in zip(problem.records.readings, errors, noise, strict=True):
+        limit = getattr(reading.sensor, "limit", None)
+        scaled, _ = jax.vmap(standardised)(reading.values, reading.mask, error, sigma, limit)
+        out.append(scaled)
+    return tuple(out)
+
+
+def standardised(
+    values: Float[Array, "times k"],
+    mask: Bool[Array, " times"],
+    error: Float[Array, "times k"],
+    sigma: Float[Array, " k"],
+    limit: Float[Array, " k"] | None,
+) -> tuple[Float[Array, "times k"], Bool[Array, "times k"]]:
+    """Errors in standard deviations, saturated channels by their odds; and which those are.
 
     A channel at its limit says "at least that much": it counts as `√(−2 log Φ(z))`, with z how far
     the prediction is beyond the limit in standard deviations (Tobin 1958, doi:10.2307/1907382).
     """
-    out = []
-    for reading, error, sigma in zip(problem.records.readings, errors, noise, strict=True):
-        scaled = error / sigma[:, None]
-        limit = getattr(reading.sensor, "limit", None)
-        if limit is not None:
-            # The limit has a leading axis over recordings.
-            full = jnp.abs(reading.values) >= limit[:, None] * (1 - 1e-6)
-            side = jnp.sign(reading.values)
-            beyond = -side * scaled
-            scaled = jnp.where(
-                full & reading.mask[..., None],
-                -side * _censored(jnp.where(full, beyond, 0.0)),
-                scaled,
-            )
-        out.append(scaled)
-    return tuple(out)
+    scaled = error / sigma[None]
+    if limit is None:
+        return scaled, jnp.zeros(scaled.shape, bool)
+    full = (jnp.abs(values) >= limit[None] * (1 - 1e-6)) & mask[:, None]
+    side = jnp.sign(values)
+    beyond = jnp.where(full, -side * scaled, 0.0)
+    return jnp.where(full, -side * _censored(beyond), scaled), full
 
 
 def _censored(z: Float[Array, "..."]) -> Float[Array, "..."]:

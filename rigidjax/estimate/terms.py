@@ -1,0 +1,217 @@
+"""What each recording adds to a posterior density, and its derivatives recording by recording."""
+
+import math
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float, Int
+
+from rigidjax._types import HasSpin, Scalar
+from rigidjax.estimate.belief import Belief
+from rigidjax.estimate.filter import reads_of
+from rigidjax.estimate.scene import Extended, Model, size_of
+from rigidjax.estimate.sensing import sensors_of
+from rigidjax.identify import padding
+from rigidjax.identify.jacobian import errors_of_one, filled, first_state
+from rigidjax.identify.parameters import local
+from rigidjax.identify.problem import Problem
+from rigidjax.identify.recording import Recording
+from rigidjax.identify.residual import beside, standardised
+from rigidjax.identify.sensor_inputs import what_turns
+from rigidjax.identify.several_bodies import matter
+from rigidjax.motion.torques import Sum
+
+if TYPE_CHECKING:
+    from rigidjax.estimate.density import LogDensity
+
+
+class Terms(NamedTuple):
+    """The numbers read in each recording, every one normal given those before it.
+
+    **Fields:** `error` (R, N) how far each was from what was expected, in standard deviations;
+    `spread` (R, N) the logarithm of 2π times its variance. Both are zero where nothing was seen; a
+    channel at its limit counts by its odds, and has no spread.
+    """
+
+    error: Float[Array, "*records n"]
+    spread: Float[Array, "*records n"]
+
+    @property
+    def log_density(self) -> Scalar:
+        """The sum of the logarithms of the normal densities."""
+        return -0.5 * jnp.sum(self.error**2 + self.spread)
+
+
+class Curvature(NamedTuple):
+    """The cost, minus a log-density, near a point.
+
+    **Fields:** `cost`; `slope` (n,) its gradient; `gram` (n, n) Fisher's information: what its
+    second derivative is expected to be, over readings that the point itself explains.
+    """
+
+    cost: Scalar
+    slope: Float[Array, " n"]
+    gram: Float[Array, "n n"]
+
+
+def terms(density: "LogDensity", x: Float[Array, " n"]) -> Terms:
+    """The terms of all readings; derivatives recording by recording, by what each depends on."""
+
+    @jax.custom_jvp
+    def of(rows: Array) -> Terms:
+        return _each(density, lambda row, *rest: _of_one(density, row, *rest), rows)
+
+    @of.defjvp
+    def _(rows: tuple, step: tuple) -> tuple[Terms, Terms]:
+        out, blocks = _with_blocks(density, rows[0])
+        return out, jax.tree.map(lambda b: jnp.einsum("rni,ri->rn", b, step[0]), blocks)
+
+    return of(_rows(density, x))
+
+
+def curvature(density: "LogDensity", x: Float[Array, " n"]) -> Curvature:
+    """Cost, gradient and Fisher's information: normal errors with variances that x moves, too.
+
+    `Σ ∂ν ∂νᵀ/s + ½ ∂(log s) ∂(log s)ᵀ` over innovations ν of variance s (Gupta and Mehra 1974,
+    doi:10.1109/TAC.1974.1100714, for the filter), and priors.
+    """
+    rows, push = jax.linearize(lambda x: _rows(density, x), x)
+    placed = jax.vmap(push, out_axes=-1)(jnp.eye(x.size, dtype=x.dtype))
+    found, blocks = _with_blocks(density, rows)
+    # d(ν/√s) = dν/√s − ½ ν/√s d(log s).
+    moved = blocks.error + 0.5 * found.error[..., None] * blocks.spread
+    both = jnp.concatenate([moved, 0.5**0.5 * blocks.spread], axis=1)
+    inner = jnp.einsum("rni,rnj->rij", both, both)
+    gram = jnp.einsum("rin,rij,rjm->nm", placed, inner, placed, optimize="optimal")
+    each = jnp.einsum("rn,rni->ri", found.error, blocks.error) + 0.5 * jnp.sum(blocks.spread, 1)
+    slope = jnp.einsum("rin,ri->n", placed, each)
+
+    def priors(x: Array) -> tuple[Array, Array]:
+        rest = prior_residuals(density, x)
+        return rest, rest
+
+    extra, rest = jax.jacfwd(priors, has_aux=True)(x)
+    cost = 0.5 * jnp.sum(rest**2) - found.log_density
+    return Curvature(cost, slope + rest @ extra, gram + extra.T @ extra)
+
+
+def prior_residuals(density: "LogDensity", x: Float[Array, " n"]) -> Float[Array, " m"]:
+    """What priors add, as numbers whose halved squares are subtracted from the density."""
+    parameters, _, logs = ravel_pytree(density.like)[1](x)
+    parts = [leaf.reshape(-1) for leaf in beside(parameters, density.problem, None)]
+    if logs is not None and density.deviation is not None:
+        parts.append(logs / density.deviation)
+    return jnp.concatenate(parts) if parts else jnp.zeros(0, x.dtype)
+
+
+def groups_of(problem: Problem) -> Int[Array, " records"]:
+    """Which noise each recording has, as the fit estimates it: all the same unless `noise_each`."""
+    groups = problem.noise_groups
+    return jnp.zeros(problem.count, jnp.int32) if groups is None else groups
+
+
+def _own(density: "LogDensity", x: Array) -> Any:
+    """The numbers of x that each recording depends on, with a leading axis."""
+    problem = density.problem
+    parameters, factors, logs = ravel_pytree(density.like)[1](x)
+    groups = groups_of(problem)
+    steps = tuple(None if factor is None else factor[groups] for factor in factors)
+    laws = None if logs is None else jnp.broadcast_to(logs, (problem.count, logs.size))
+    return local(problem, parameters), steps, laws
+
+
+def _rows(density: "LogDensity", x: Array) -> Float[Array, "records m"]:
+    """The same as a row for each recording: a linear function of x."""
+    return jax.vmap(lambda one: ravel_pytree(one)[0])(_own(density, x))
+
+
+def _each(density: "LogDensity", function: Any, rows: Array) -> Any:
+    """`function(row, noises, record, reference, which)` of each recording.
+
+    One by one: XLA:CPU makes one kernel of a loop over a few dozen numbers; of more at once,
+    derivatives or records, it takes four times as long for the same work.
+    """
+    problem = density.problem
+    trees = rows, density.noises, problem.records, problem.reference, problem.which
+    return lax.map(lambda each: function(*each), trees)
+
+
+def _with_blocks(density: "LogDensity", rows: Array) -> tuple[Terms, Terms]:
+    """The terms, and their derivatives (R, N, m) by the row of their recording."""
+
+    def value_and_slope(row: Array, *rest: Any) -> Any:
+        def twice(row: Array) -> tuple[Terms, Terms]:
+            out = _of_one(density, row, *rest)
+            return out, out
+
+        # A dozen numbers and one long loop: forward mode is cheaper to compile and to run.
+        blocks, out = jax.jacfwd(twice, has_aux=True)(row)
+        return out, blocks
+
+    return _each(density, value_and_slope, rows)
+
+
+def _of_one(
+    density: "LogDensity", row: Array, noises: Any, record: Recording, ref: Any, which: Any
+) -> Terms:
+    """The terms of one recording, the unknown torque integrated out by the filter."""
+    problem = density.problem
+    restore = ravel_pytree(padding.one(_own(density, density.x0), 0))[1]
+    mine, steps, logs = restore(row)
+    noises = tuple(
+        noise if step is None else noise * jnp.exp(step)
+        for noise, step in zip(noises, steps, strict=True)
+    )
+    if density.process is None:
+        return _of_motion(problem, mine, noises, record, ref, which)
+    # Values first: a noise in the place of `None` moves the leaves that the slots count.
+    record = _with_noises(filled(problem, mine, record), noises)
+    body = what_turns(matter(problem.body, mine.body, which), problem.rung)
+    state: HasSpin = first_state(problem.rung, mine, ref)
+    process = density.grown(logs)
+    law = process if record.torque is None else Sum(record.torque, process)
+    model = Model(body, law)
+    sensors = [reading.sensor for reading in record.readings]
+    torques = tuple(jnp.zeros(3, state.omega.dtype) for _ in model.coloured)
+    x = Extended(state, torques, ())
+    known = jnp.zeros(size_of(x) - 3 * len(torques), state.omega.dtype)
+    spread = jnp.concatenate([known, *(law.deviation for law in model.coloured)])
+    first = Belief(record.t[0], x, jnp.diag(spread))
+    reads = reads_of(model, sensors_of(sensors, model), record, first, density.substeps)
+    error = [jnp.where(r.seen, r.innovation * lax.rsqrt(r.variance), 0) for r in reads]
+    spread = [jnp.where(r.seen, jnp.log(2 * math.pi * r.variance), 0) for r in reads]
+    return _flat(error, spread)
+
+
+def _of_motion(
+    problem: Problem, mine: Any, noises: Any, record: Recording, ref: Any, which: Any
+) -> Terms:
+    """The terms of one recording without an unknown torque: normal about the motion."""
+    errors, _ = errors_of_one(problem, mine, record, ref, which)
+    scaled, spread = [], []
+    for reading, error, noise in zip(record.readings, errors, noises, strict=True):
+        limit = getattr(reading.sensor, "limit", None)
+        one, full = standardised(reading.values, reading.mask, error, noise, limit)
+        scaled.append(one)
+        # What a channel at its limit counts is a probability, not a density.
+        seen = reading.mask[:, None] & ~full
+        spread.append(jnp.where(seen, jnp.log(2 * math.pi * noise**2)[None], 0))
+    return _flat(scaled, spread)
+
+
+def _flat(error: list[Array], spread: list[Array]) -> Terms:
+    return Terms(*(jnp.concatenate([a.reshape(-1) for a in part]) for part in (error, spread)))
+
+
+def _with_noises(record: Recording, noises: tuple[Array, ...]) -> Recording:
+    """The recording whose sensors have these noises (k,)."""
+    return eqx.tree_at(
+        lambda r: [reading.sensor.noise for reading in r.readings],
+        record,
+        list(noises),
+        is_leaf=lambda node: node is None,
+    )
