@@ -160,11 +160,11 @@ def kick(noise: Array, kept: Joint, off: Array, root: Array) -> tuple[Array, Arr
     **Arguments:** `noise` G; `kept`; `off` (n,) how far the smoothed mean after the step is from
     the predicted one; `root` (n, n) of its smoothed covariance.
     """
-    whitened = roots.divide(kept.predicted, noise)
-    mean = roots.divide(kept.predicted, off[:, None])[:, 0]
+    m = noise.shape[1]
+    both = roots.divide(kept.predicted, jnp.concatenate([noise, off[:, None], root], 1))
+    whitened, mean, spread = both[:, :m], both[:, m], both[:, m + 1 :]
     mean = jnp.sum(whitened * mean[:, None], 0)
-    spread = roots.divide(kept.predicted, root)
-    left = jnp.eye(noise.shape[1], dtype=noise.dtype) - roots.product(whitened.T, whitened)
+    left = jnp.eye(m, dtype=noise.dtype) - roots.product(whitened.T, whitened)
     known = roots.product(whitened.T, spread)
     total = left + roots.product(known, known.T)
     return mean, total

@@ -17,6 +17,7 @@ from rigidjax.motion.torques.base import in_precision, require_law, tensor_of
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.kernels import normalised
 from rigidjax.solve import equations_of_motion
+from rigidjax.special.barrier import barrier
 
 
 class Walk(eqx.Module):
@@ -164,10 +165,11 @@ class Dynamics(eqx.Module):
             if total is not None:
                 spin = change.omega + jnp.sum(self.inverse * total[None], 1)
                 change = eqx.tree_at(lambda s: s.omega, change, spin)
-            return change, tuple(slopes)
+            # XLA:CPU would compute a stage again for every number that comes of it.
+            return barrier((change, tuple(slopes)))
 
         def plus(k: Any, part: Scalar) -> Any:
-            return jax.tree.map(lambda a, b: a + part * b, (x.motion, x.torques), k)
+            return barrier(jax.tree.map(lambda a, b: a + part * b, (x.motion, x.torques), k))
 
         k1 = rate(t, 1.0, x.motion, x.torques)
         k2 = rate(t + 0.5 * h, 0.0, *plus(k1, 0.5 * h))

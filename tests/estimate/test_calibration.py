@@ -25,9 +25,9 @@ COLOURED = rj.torques.CorrelatedTorque(0.03, 1.0)
 AXES = (records.SUN, np.array([1.0, 0.0, 0.0]))
 # Of the logarithms of the torque's numbers.
 PRIOR = 0.5
-# Law, directions that are seen, readings, and records (of 500, 95 % is known to 1 %).
+# Law, directions that are seen, readings, and records (of 1000, 95 % is known to 0.7 %).
 SCENES = {
-    "gyro": (WHITE, (), 80, 500),
+    "gyro": (WHITE, (), 80, 1000),
     "gyro and directions": (WHITE, AXES, 80, 200),
     "correlated torque, longer": (COLOURED, (), 240, 200),
 }

@@ -13,6 +13,7 @@ from rigidjax import _checks
 from rigidjax._types import Scalar, ScalarLike, Vec3
 from rigidjax.motion.torques.base import given
 from rigidjax.rotation.linalg3 import cross, dot
+from rigidjax.special.barrier import barrier
 
 Samples = Float[ArrayLike, "n *channels"] | Sequence[Any]
 
@@ -69,8 +70,9 @@ class Series(eqx.Module):
         place = jnp.where(place < 0.0, 0.0, jnp.where(place > n - 1.0, n - 1.0, place))
         i = jnp.clip(jnp.floor(place).astype(jnp.int32), 0, n - 2)
         s = place - i.astype(place.dtype)
-        left, right = self.values[i], self.values[i + 1]
-        out, into = self.slopes[i], self.slopes[i + 1]
+        rows = self.values[i], self.values[i + 1], self.slopes[i], self.slopes[i + 1]
+        # XLA:CPU would read the table again for every number that comes of it.
+        s, (left, right, out, into) = barrier((s, rows))
         # Cubic Hermite form, from the left value.
         bend = 3.0 * (right - left) - 2.0 * out - into
         twist = 2.0 * (left - right) + out + into
