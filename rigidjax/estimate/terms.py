@@ -16,7 +16,7 @@ from rigidjax.estimate.filter import reads_of
 from rigidjax.estimate.scene import Extended, Model, size_of
 from rigidjax.estimate.sensing import sensors_of
 from rigidjax.identify import padding
-from rigidjax.identify.jacobian import errors_of_one, filled, first_state
+from rigidjax.identify.jacobian import errors_of_one, filled, first_state, over_records
 from rigidjax.identify.parameters import local
 from rigidjax.identify.problem import Problem
 from rigidjax.identify.recording import Recording
@@ -130,14 +130,12 @@ def _rows(density: "LogDensity", x: Array) -> Float[Array, "records m"]:
 
 
 def _each(density: "LogDensity", function: Any, rows: Array) -> Any:
-    """`function(row, noises, record, reference, which)` of each recording.
+    """`function(row, noises, record, reference, which)` of each recording."""
 
-    One by one: XLA:CPU makes one kernel of a loop over a few dozen numbers; of more at once,
-    derivatives or records, it takes four times as long for the same work.
-    """
-    problem = density.problem
-    trees = rows, density.noises, problem.records, problem.reference, problem.which
-    return lax.map(lambda each: function(*each), trees)
+    def of(mine: Any, *rest: Any) -> Any:
+        return function(*mine, *rest)
+
+    return over_records(of, density.problem, (rows, density.noises))
 
 
 def _with_blocks(density: "LogDensity", rows: Array) -> tuple[Terms, Terms]:
