@@ -80,8 +80,9 @@ class LogDensity(eqx.Module):
     no density, and for directions that neither data nor a prior determine.
 
     For numpyro: `numpyro.infer.MCMC(NUTS(potential_fn=lambda x: -density(x)), …)`; for blackjax:
-    `blackjax.nuts(density, …)`, or `estimate.posterior`. Gradients are taken in forward mode. It is
-    a Module of arrays: compile it by `equinox.filter_jit(density)`.
+    `blackjax.nuts(density, …)`, or `estimate.posterior`. Gradients are taken recording by
+    recording in forward mode, whichever mode asks. It is a Module of arrays: compile it by
+    `equinox.filter_jit(density)`.
 
     >>> import rigidjax as rj
     >>> ts = jnp.linspace(0.0, 10.0, 80)
@@ -165,22 +166,7 @@ class LogDensity(eqx.Module):
 
     def __call__(self, x: Float[Array, " n"]) -> Scalar:
         x = _checks.floating(x, self.x0.shape, "x")
-
-        @jax.custom_vjp
-        def value(x: Array) -> Array:
-            return self.value(x)
-
-        def forward(x: Array) -> tuple[Array, Array]:
-            def twice(x: Array) -> tuple[Array, Array]:
-                out = self.value(x)
-                return out, out
-
-            slope, out = jax.jacfwd(twice, has_aux=True)(x)
-            return out, slope
-
-        # A dozen numbers and one long loop: forward mode is cheaper to compile and to run.
-        value.defvjp(forward, lambda slope, g: (g * slope,))
-        return value(x)
+        return terms(self, x).log_density - 0.5 * jnp.sum(prior_residuals(self, x) ** 2)
 
     def unpack(self, x: Float[Array, " n"]) -> Point:
         """What x (n,) stands for: a `Point` with `body`, `state0`, `values`, `noise`, `process`.
@@ -207,10 +193,6 @@ class LogDensity(eqx.Module):
         leaves, structure = jax.tree.flatten(self.process)
         grown = [leaf * jnp.exp(log) for leaf, log in zip(leaves, logs, strict=True)]
         return jax.tree.unflatten(structure, grown)
-
-    def value(self, x: Float[Array, " n"]) -> Scalar:
-        """The same number without a rule for its gradient: for derivatives in forward mode."""
-        return terms(self, x).log_density - 0.5 * jnp.sum(prior_residuals(self, x) ** 2)
 
 
 @eqx.filter_jit

@@ -175,7 +175,7 @@ def _weighted(
     z = z / jnp.sqrt(shrunk)
     root = _WIDER * jnp.linalg.cholesky(covariance)
     draws = top[None] + z @ root.T
-    found = lax.map(density.value, draws)
+    found = lax.map(density, draws)
     taken = -0.5 * (_FREEDOM + size) * jnp.log1p(jnp.sum(z * z, 1) / _FREEDOM)
     # A point so far out that the density is no number there has none.
     logs = jnp.where(jnp.isfinite(found), found - taken, -jnp.inf)
