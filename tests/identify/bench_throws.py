@@ -141,7 +141,8 @@ def drawn(best, key, count=1000):
 
 def throws_with_torque(law, joint, records, levers, few, whole=False):
     """Print the figures of throws with an unknown torque: each alone, and the mean of a body's; or
-    those of all throws of a body as one problem (`whole`).
+    those of all throws of a body as one problem (`whole`). Returns which intervals of means (or of
+    those problems) hold.
     """
     keys = iter(jax.random.split(jax.random.key(0), joint.problem.count))
     totals = {}
@@ -191,6 +192,7 @@ def throws_with_torque(law, joint, records, levers, few, whole=False):
         print(f"in all: {np.sum(mean_held)} of {np.size(mean_held)} intervals hold")
     else:
         summary(all_errors, alone_held, mean_held, "the means")
+    return np.ravel(mean_held)
 
 
 def evidence_of(best):
@@ -270,12 +272,17 @@ def show(name, errors, reach):
     return held
 
 
-def main(every=1, end=0.53, laws=(), whole=False):
-    """Print the figures; returns them: errors of single throws, which intervals hold."""
+def given(every, end):
+    """Recordings of each body, levers, and by how much the scatter of levers of few throws counts."""
+    records = {name: [record(path, every, end) for path in throws.paths(name)] for name in MASSES}
     levers = {name: jnp.asarray(throws.lever(name)) for name in MASSES}
     # The scatter of the levers is itself known from a few throws only.
-    few = stdtrit(min(len(throws.paths(name)) for name in MASSES) - 1, 0.975)
-    records = {name: [record(path, every, end) for path in throws.paths(name)] for name in MASSES}
+    return records, levers, stdtrit(min(len(rows) for rows in records.values()) - 1, 0.975)
+
+
+def main(every=1, end=0.53, laws=(), whole=False):
+    """Print the figures; returns them: errors of single throws, which intervals hold."""
+    records, levers, few = given(every, end)
     began = time.perf_counter()
     joint = together(records)
     print(f"{joint.problem.count} throws together: {time.perf_counter() - began:.1f} s")

@@ -94,12 +94,25 @@ def test_the_bars_of_a_published_method(found, model, group):
     assert np.abs(errors).mean() <= 0.02 and np.abs(errors).max() <= 0.05
 
 
-def test_the_recipe_of_four_bodies_with_one_sensor_meets_its_bars():
+@pytest.fixture(scope="module")
+def bench():
     spec = importlib.util.spec_from_file_location(
         "bench_throws", Path(__file__).with_name("bench_throws.py")
     )
-    bench = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(bench)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_intervals_of_all_throws_of_a_body_with_an_unknown_torque_hold(bench):
+    # Every third sample: their noise is nearly white after the low-pass filter at 200 Hz.
+    records, levers, few = bench.given(3, 0.53)
+    joint = bench.together(records)
+    held = bench.throws_with_torque("white", joint, records, levers, few, whole=True)
+    assert held.size == 9 and held.mean() >= 0.9
+
+
+def test_the_recipe_of_four_bodies_with_one_sensor_meets_its_bars(bench):
     # Every second sample: a third of the time, the same figures to a tenth.
     errors, alone, together = bench.main(every=2)
     assert errors.mean() <= 0.016 and errors.max() <= 0.05
