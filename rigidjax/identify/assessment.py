@@ -1,5 +1,8 @@
 """How good a fit is: covariance, status, and whether other starts explain the data as well."""
 
+from typing import Any
+
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
@@ -17,6 +20,12 @@ from rigidjax.identify.result import Fit, Start
 
 # A point so near to the least misfit, in standard deviations, is where a search was to end.
 AT_THE_END = 0.05
+
+
+@eqx.filter_jit
+def _bodies(problem: Problem, parameters: Parameters) -> Any:
+    # As one program: outside of a trace each operation of JAX costs as much as a run of 100 steps.
+    return problem.bodies(parameters)
 
 
 def assess(
@@ -61,7 +70,7 @@ def assess(
         if s.fits and s.converged and s.cost > best_cost + 0.01 * margin and elsewhere(s.parameters)
     ]
     doubts = list(seen.doubts)
-    found = problem.bodies(value)
+    found = _bodies(problem, value)
     bodies = list(found.values()) if isinstance(found, dict) else [found]
     unreal = of_charts(charts(problem), bodies)
     doubts += unreal
