@@ -93,7 +93,7 @@ class Refit(eqx.Module):
             each = np.asarray(of_draws(of, self.density, self.draws))
             tails = np.array([0.5 - 0.5 * level, 0.5 + 0.5 * level])
             ends = np.apply_along_axis(_quantiles, 0, each, np.asarray(self.weights), tails)
-            return ends[0], ends[1]
+            return np.asarray(ends[0]), np.asarray(ends[1])
 
         def value(x: Array) -> Array:
             return jnp.asarray(of(self.density.unpack(x)))

@@ -29,7 +29,7 @@ def whitened(problem: Problem, errors: tuple, noise: Noise) -> tuple[Float[Array
 
 
 def standardised(
-    values: Float[Array, "times _"],
+    values: Float[Array, "times *components"],
     mask: Bool[Array, " times"],
     error: Float[Array, "times k"],
     sigma: Float[Array, " k"],

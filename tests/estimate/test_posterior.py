@@ -372,6 +372,8 @@ def test_weighted_draws_stand_for_the_density(fitted):
     spread = (weights[:, None] * apart).T @ apart
     wanted = np.asarray(found.covariance) / np.outer(deviation, deviation)
     np.testing.assert_allclose(spread, wanted, atol=0.15)
+    ratio = found.interval_of(lambda point: point.body.moments[0] / point.body.moments[2])
+    assert [end.shape for end in ratio] == [(), ()] and 0.35 < ratio[0] < 0.4 < ratio[1] < 0.45
     # Where the draws are worth nothing the curvature is taken: what is linear in x is normal.
     one = jnp.zeros_like(found.weights).at[0].set(1.0)
     poor = eqx.tree_at(lambda f: f.weights, found, one)
