@@ -33,17 +33,17 @@ class Terms(NamedTuple):
     """The numbers read in each recording, every one normal given those before it.
 
     **Fields:** `error` (R, N) how far each was from what was expected, in standard deviations;
-    `spread` (R, N) the logarithm of 2π times its variance. Both are zero where nothing was seen; a
-    channel at its limit counts by its odds, and has no spread.
+    `log_variance` (R, N) the logarithm of 2π times its variance. Both are zero where nothing was
+    seen; a channel at its limit counts by its odds, and has no variance.
     """
 
     error: Float[Array, "*records n"]
-    spread: Float[Array, "*records n"]
+    log_variance: Float[Array, "*records n"]
 
     @property
     def log_density(self) -> Scalar:
         """The sum of the logarithms of the normal densities."""
-        return -0.5 * jnp.sum(self.error**2 + self.spread)
+        return -0.5 * jnp.sum(self.error**2 + self.log_variance)
 
 
 class Curvature(NamedTuple):
@@ -83,11 +83,13 @@ def curvature(density: "LogDensity", x: Float[Array, " n"]) -> Curvature:
     placed = jax.vmap(push, out_axes=-1)(jnp.eye(x.size, dtype=x.dtype))
     found, blocks = _with_blocks(density, rows)
     # d(ν/√s) = dν/√s − ½ ν/√s d(log s).
-    moved = blocks.error + 0.5 * found.error[..., None] * blocks.spread
-    both = jnp.concatenate([moved, 0.5**0.5 * blocks.spread], axis=1)
+    moved = blocks.error + 0.5 * found.error[..., None] * blocks.log_variance
+    both = jnp.concatenate([moved, 0.5**0.5 * blocks.log_variance], axis=1)
     inner = jnp.einsum("rni,rnj->rij", both, both)
     gram = jnp.einsum("rin,rij,rjm->nm", placed, inner, placed, optimize="optimal")
-    each = jnp.einsum("rn,rni->ri", found.error, blocks.error) + 0.5 * jnp.sum(blocks.spread, 1)
+    each = jnp.einsum("rn,rni->ri", found.error, blocks.error) + 0.5 * jnp.sum(
+        blocks.log_variance, 1
+    )
     slope = jnp.einsum("rin,ri->n", placed, each)
 
     def priors(x: Array) -> tuple[Array, Array]:
@@ -181,8 +183,8 @@ def _of_one(
     first = Belief(record.t[0], x, jnp.diag(spread))
     reads = reads_of(model, sensors_of(sensors, model), record, first, density.substeps)
     error = [jnp.where(r.seen, r.innovation * lax.rsqrt(r.variance), 0) for r in reads]
-    spread = [jnp.where(r.seen, jnp.log(2 * math.pi * r.variance), 0) for r in reads]
-    return _flat(error, spread)
+    log_variance = [jnp.where(r.seen, jnp.log(2 * math.pi * r.variance), 0) for r in reads]
+    return _flat(error, log_variance)
 
 
 def _of_motion(
@@ -190,19 +192,21 @@ def _of_motion(
 ) -> Terms:
     """The terms of one recording without an unknown torque: normal about the motion."""
     errors, _ = errors_of_one(problem, mine, record, ref, which)
-    scaled, spread = [], []
+    scaled, log_variance = [], []
     for reading, error, noise in zip(record.readings, errors, noises, strict=True):
         limit = getattr(reading.sensor, "limit", None)
         one, full = standardised(reading.values, reading.mask, error, noise, limit)
         scaled.append(one)
         # What a channel at its limit counts is a probability, not a density.
         seen = reading.mask[:, None] & ~full
-        spread.append(jnp.where(seen, jnp.log(2 * math.pi * noise**2)[None], 0))
-    return _flat(scaled, spread)
+        log_variance.append(jnp.where(seen, jnp.log(2 * math.pi * noise**2)[None], 0))
+    return _flat(scaled, log_variance)
 
 
-def _flat(error: list[Array], spread: list[Array]) -> Terms:
-    return Terms(*(jnp.concatenate([a.reshape(-1) for a in part]) for part in (error, spread)))
+def _flat(error: list[Array], log_variance: list[Array]) -> Terms:
+    return Terms(
+        *(jnp.concatenate([a.reshape(-1) for a in part]) for part in (error, log_variance))
+    )
 
 
 def _with_noises(record: Recording, noises: tuple[Array, ...]) -> Recording:
