@@ -133,11 +133,12 @@ def search(
 ) -> Search:
     """At most `settings.steps` steps down from `start`; with none, `start` is evaluated.
 
-    **Arguments:** `evaluated` point (n,) → whatever is to be kept of the last evaluation, half the
-    sum of squares, the normal matrix (n, n), the gradient (n,); `made` (n,) one for the numbers
-    that are of order one by their making, which no step moves far, else zero; `nothing` zeros of
-    the shapes of what is to be kept; `by_noise` what was kept, the normal matrix → by how much the
-    cost at the truth is expected to be above the least, for `settings.level`.
+    **Arguments:** `evaluated` point (n,) → whatever is to be kept of the last evaluation, the cost,
+    the normal matrix (n, n), the gradient (n,): half a sum of squares, or minus a log-density with
+    Fisher's information in the place of the normal matrix (scoring); `made` (n,) one for the
+    numbers that are of order one by their making, which no step moves far, else zero; `nothing`
+    zeros of the shapes of what is to be kept; `by_noise` what was kept, the normal matrix → by how
+    much the cost at the truth is expected to be above the least, for `settings.level`.
 
     Source: Marquardt 1963, doi:10.1137/0111030; the damping by the ratio of what a step gained to
     what it was to gain, Madsen, Nielsen and Tingleff 2004, Methods for non-linear least squares
