@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 from rigidjax.identify.jacobian import along, first_state, with_blocks
 from rigidjax.identify.parameters import Parameters, places
 from rigidjax.identify.problem import Problem
+from rigidjax.identify.propagation import FixedSteps
 from rigidjax.identify.residual import Noise, beside, seen_rows
 
 # Damping is in units of the diagonal of the normal equations (Marquardt's): one is a step half as
@@ -30,6 +31,8 @@ LINEAR = 0.05
 # Steps that a search may still be away from where another one ended; its pace is by how much the
 # logarithm of the misfit falls in a step, of the last ones half as much each as the one after it.
 PATIENCE, FIRST_PACE = 25.0, 4.0
+# Samples beyond the last that counts: a low-pass filter looks ahead of it.
+_BEYOND = 2
 # Damping beyond which nothing moves.
 STUCK = 1e12
 
@@ -41,7 +44,8 @@ class Settings(eqx.Module):
     at rest) end it; `damping` at the start; `steps` how many at most; `aim` a misfit that was
     reached elsewhere: the search ends where at its pace it would take more than `PATIENCE` steps
     to come there; 0 for none; `level` a step about as good as hoped whose gain is less than this
-    part of what noise alone lets a fit gain (see `search`) ends it, too.
+    part of what noise alone lets a fit gain (see `search`) ends it, too; `near` a misfit that is
+    low enough to end at; 0 for none.
     """
 
     tolerance: Any
@@ -49,9 +53,16 @@ class Settings(eqx.Module):
     steps: Any
     aim: Any
     level: Any
+    near: Any
 
     def __init__(
-        self, tolerance: float, damping: float, steps: int, aim: float = 0.0, level: float = 0.0
+        self,
+        tolerance: float,
+        damping: float,
+        steps: int,
+        aim: float = 0.0,
+        level: float = 0.0,
+        near: float = 0.0,
     ):
         # NumPy's: outside of a trace each conversion of JAX costs as much as a run of 100 steps.
         kind = jnp.result_type(float)
@@ -60,18 +71,20 @@ class Settings(eqx.Module):
         self.steps = np.asarray(steps, np.int32)
         self.aim = np.asarray(aim, kind)
         self.level = np.asarray(level, kind)
+        self.near = np.asarray(near, kind)
 
 
 class Search(eqx.Module):
     """Where a search stands.
 
-    **Fields:** `point` (n,) the best so far, its `cost`, the normal matrix `gram` (n, n) and the
+    **Fields:** `first` the cost at the start; `point` (n,) the best so far, its `cost`, the normal matrix `gram` (n, n) and the
     gradient `slope` (n,) there; `trial` (n,) what is to be tried next, `hoped` how much lower it
     ought to be; `damping`; `pace` by how much the logarithm of the cost falls in a step; `taken`
     evaluations; `done`, `converged`; `found` what the last
     evaluation gave (see `with_blocks`), `here` whether that was at `point`.
     """
 
+    first: Float[Array, ""]
     point: Float[Array, " n"]
     cost: Float[Array, ""]
     gram: Float[Array, "n n"]
@@ -98,6 +111,7 @@ def descend(
     flat, restore = ravel_pytree(start)
     where, made = places(problem, start), made_of(start)
     number, kind = flat.size, flat.dtype
+    problem = _as_far_as(problem, weights)
 
     def evaluated(point: Array) -> tuple[Any, Array, Array, Array]:
         here = restore(point)
@@ -121,6 +135,19 @@ def descend(
     nothing = _nothing(problem, start, where.shape[1], kind)
     end = search(evaluated, flat, made, settings, nothing)
     return restore(end.point), end
+
+
+def _as_far_as(problem: Problem, weights: Float[Array, "records times"]) -> Problem:
+    """The problem, its motion followed no further than to the last time that counts."""
+    steps = problem.integrator
+    if not isinstance(steps, FixedSteps) or problem.links is not None:
+        return problem
+    counts = jnp.any(weights > 0, axis=0)
+    place = jnp.arange(counts.size, dtype=jnp.int32)
+    last = jnp.minimum(jnp.max(jnp.where(counts, place, 0)) + _BEYOND, counts.size - 1)
+    return eqx.tree_at(
+        lambda p: p.integrator, problem, FixedSteps(steps.substeps, steps.solver, last)
+    )
 
 
 def search(
@@ -189,8 +216,10 @@ def search(
         lost = ~finite & first
         done = converged | lost | (damping > STUCK) | (~sound & (damping > 1.0))
         done = done | ((settings.aim > 0) & (cost > settings.aim * jnp.exp(PATIENCE * pace)))
+        done = done | ((settings.near > 0) & (cost <= settings.near))
         damping = jnp.where(sound, damping, 8.0 * damping)
         return Search(
+            jnp.where(first & finite, cost, now.first),
             point,
             cost,
             gram,
@@ -207,6 +236,7 @@ def search(
         )
 
     begun = Search(
+        jnp.asarray(jnp.inf, kind),
         start,
         jnp.asarray(jnp.inf, kind),
         jnp.zeros((number, number), kind),

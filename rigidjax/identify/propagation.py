@@ -9,7 +9,7 @@ import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from rigidjax import _checks
 from rigidjax.body.inertia import Inertia, MassProperties
@@ -51,7 +51,8 @@ class FixedSteps(AbstractIntegrator):
     result against `Adaptive` and says so, and goes on with that, where the steps were too long.
 
     **Arguments:** `substeps` how many steps between two samples; `solver` the method, one of
-    `rigidjax.solvers`: Tsitouras's of order 5 unless given.
+    `rigidjax.solvers`: Tsitouras's of order 5 unless given; `last` the index of the last time that
+    is needed, which may be traced: no steps are taken after it; `None` for all.
 
     >>> FixedSteps(2).substeps
     2
@@ -59,6 +60,7 @@ class FixedSteps(AbstractIntegrator):
 
     substeps: int = eqx.field(static=True, default=1)
     solver: AbstractExplicit = solvers.Tsitouras5()
+    last: Int[Array, ""] | None = None
 
     def __check_init__(self):
         _checks.whole(self.substeps, "substeps", 1)
@@ -67,7 +69,7 @@ class FixedSteps(AbstractIntegrator):
     def states(self, body: Any, state0: Any, ts: Float[Array, " times"], torque: Torque) -> Any:
         y0 = started(body, state0, torque, ts[0])
         field = equations_of_motion(body, y0, torque)
-        return fixed(in_a_loop(self.solver), field, ts, y0, self.substeps)
+        return fixed(in_a_loop(self.solver), field, ts, y0, self.substeps, self.last)
 
 
 class Adaptive(AbstractIntegrator):

@@ -43,10 +43,16 @@ def least_squares(
     max_steps: int,
     damping: float,
     aim: float = 0.0,
+    near: float = 0.0,
 ) -> Tried:
-    """At most `max_steps` steps from `start`; fewer where they do not lead to an `aim`."""
-    settings = Settings(tolerance, damping, max_steps, aim)
-    tried, end = _descend(start, problem, noise, weights, settings)
+    """At most `max_steps` steps from `start`; fewer where they do not lead to an `aim` or where
+    they are `near` (see `Settings`).
+    """
+    settings = Settings(tolerance, damping, max_steps, aim, near=near)
+    return _ended(*_descend(start, problem, noise, weights, settings))
+
+
+def _ended(tried: Tried, end: Search) -> Tried:
     return dataclasses.replace(tried, found=end.found) if bool(end.here) else tried
 
 
@@ -208,18 +214,19 @@ def climb(
     The whole record at once, where that explains it; else through the horizons. `aim` is the misfit
     of another start that explains the record: a search that does not lead there ends early.
     """
-    tried, start = _at_once(start, problem, noise, tolerance, max_steps, aim)
-    level = np.inf
+    tried, start, level = _at_once(start, problem, noise, tolerance, max_steps, aim)
     for stage in range(start.stage, len(HORIZONS)):
         seen = horizon(problem, HORIZONS[stage])
         if stage < len(HORIZONS) - 1:
             # A part of the record need not be fitted to the end, only to come near.
             count, before = min(STRIDE, max_steps), tried.parameters
             part = aim * HORIZONS[stage]
-            found = least_squares(before, problem, noise, seen, tolerance, count, CAREFUL, part)
+            found = least_squares(
+                before, problem, noise, seen, tolerance, count, CAREFUL, aim=part, near=part
+            )
             after = found.parameters
             # What explains a part alone may be nonsense beyond it: a drag that drives.
-            first = cost_of(before, problem, noise) if stage == start.stage else level
+            first = cost_of(before, problem, noise) if level is None else level
             level = cost_of(after, problem, noise)
             kept = level < WILD * max(first, 1e-300)
             tried, level = fresh(after if kept else before), level if kept else first
@@ -248,16 +255,17 @@ def _at_once(
     tolerance: float,
     max_steps: int,
     aim: float,
-) -> tuple[Tried, Position]:
-    """The start fitted to the whole record, if that explains it; else as it is."""
+) -> tuple[Tried, Position, float | None]:
+    """The start fitted to the whole record, if that explains it; else as it is, and its misfit."""
     if start.stage or start.strides:
-        return start.tried, start
+        return start.tried, start, None
     seen, count = whole(problem), min(STRIDE, max_steps)
     here = start.tried.parameters
-    found = least_squares(here, problem, noise, seen, tolerance, count, CAREFUL, aim)
-    if not bool(found.converged) or float(found.cost) > enough(problem):
-        return start.tried, start
-    return found, Position(len(HORIZONS) - 1, 1, found)
+    tried, end = _descend(here, problem, noise, seen, Settings(tolerance, CAREFUL, count, aim))
+    if not bool(tried.converged) or float(tried.cost) > enough(problem):
+        return start.tried, start, float(end.first)
+    found = _ended(tried, end)
+    return found, Position(len(HORIZONS) - 1, 1, found), None
 
 
 def enough(problem: Problem) -> float:

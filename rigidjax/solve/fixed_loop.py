@@ -27,12 +27,14 @@ def fixed(
     ts: Float[Array, " times"],
     y0: Any,
     substeps: Any,
+    last: Any = None,
 ) -> Any:
     """`substeps` equal steps between each two times of `ts`.
 
     **Arguments:** `solver` a method of `rigidjax.solvers`; `field` a vector field `f(t, y, args)`
     such as `AttitudeEquations`; `ts` (T,) s; `y0` the state at `ts[0]`; `substeps` a whole number;
-    traced, it saves compiling again but has no reverse mode.
+    traced, it saves compiling again but has no reverse mode; `last` the index in `ts` at which to
+    stop, traced as well (no reverse mode): later times get `y0`; `None` goes to the end.
 
     **Returns** the states at `ts`, with a leading time axis. Differentiable in both modes.
 
@@ -56,9 +58,25 @@ def fixed(
             y = lax.fori_loop(0, substeps, lambda i, y: step(stepper, h, left, i, y), y)
         return y, y
 
-    _, rest = lax.scan(span, stepper.start, (ts[:-1], ts[1:]))
+    if last is None:
+        _, rest = lax.scan(span, stepper.start, (ts[:-1], ts[1:]))
+    else:
+        rest = _up_to(last, span, stepper.start, ts)
     later = jax.vmap(stepper.state)(rest)
     return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), y0, later)
+
+
+def _up_to(last: Any, span: Callable[..., Any], start: Any, ts: Array) -> Any:
+    """The ends of the first `last` spans, as `lax.scan` would stack them; then `start`."""
+
+    def one(i: Array, now: tuple[Any, Any]) -> tuple[Any, Any]:
+        y, rest = now
+        y, _ = span(y, (ts[i], ts[i + 1]))
+        return y, jax.tree.map(lambda all_, mine: all_.at[i].set(mine), rest, y)
+
+    rest = jax.tree.map(lambda a: jnp.broadcast_to(a, (ts.size - 1, *a.shape)), start)
+    zero = jnp.zeros((), jnp.int32)
+    return lax.fori_loop(zero, jnp.asarray(last, jnp.int32), one, (start, rest))[1]
 
 
 def step(

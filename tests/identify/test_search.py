@@ -1,13 +1,19 @@
 """What the search does where the motion is lost: it goes back, and says where it stands."""
 
+from typing import ClassVar
+
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jaxtyping import Array
 
+import rigidjax as rj
 from rigidjax import identify
 from rigidjax.identify import search
 from rigidjax.identify.checkpoint import Position, Tried
-from rigidjax.identify.search import climb, fresh, settle
+from rigidjax.identify.levenberg_marquardt import Search, Settings, descend
+from rigidjax.identify.search import climb, fresh, horizon, misfit, settle, whole
 
 TS = np.linspace(0.0, 1.0, 8)
 
@@ -21,6 +27,14 @@ def problem():
 def at(problem, value):
     point = problem.start()
     return type(point)(jnp.full_like(point.body, value), point.shared, point.own)
+
+
+def an_end(first):
+    """A search that began at a cost of `first`, and keeps nothing of where it ended."""
+    one, line, no = jnp.asarray(first), jnp.zeros(5), jnp.asarray(False)
+    return Search(
+        one, line, one, jnp.zeros((5, 5)), line, line, one, one, one, jnp.asarray(1), no, no, (), no
+    )
 
 
 def place(point):
@@ -51,9 +65,10 @@ def test_a_part_is_not_fitted_at_the_cost_of_the_whole(problem, monkeypatch, bey
     def step(start, problem, noise, weights, *_):
         begun.append((place(start), float(weights.mean())))
         # Far above what explains 24 readings.
-        return Tried(at(problem, 1.0), jnp.asarray(1e3), jnp.asarray(True))
+        tried = Tried(at(problem, 1.0), jnp.asarray(1e3), jnp.asarray(True))
+        return tried, an_end(1.0)
 
-    monkeypatch.setattr(search, "least_squares", step)
+    monkeypatch.setattr(search, "_descend", step)
     monkeypatch.setattr(search, "cost_of", lambda point, *_: 1.0 if place(point) == 0.0 else beyond)
     climb(Position(0, 0, fresh(at(problem, 0.0))), problem, (), 1e-4, 25)
     assert [shown for _, shown in begun] == [1.0, 0.25, 0.5, 1.0]
@@ -65,8 +80,72 @@ def test_what_explains_the_whole_record_at_once_is_not_fitted_in_parts(problem, 
 
     def step(start, problem, noise, weights, *_):
         begun.append(float(weights.mean()))
-        return Tried(at(problem, 1.0), jnp.asarray(12.0), jnp.asarray(True))
+        tried = Tried(at(problem, 1.0), jnp.asarray(12.0), jnp.asarray(True))
+        return tried, an_end(1.0)
 
-    monkeypatch.setattr(search, "least_squares", step)
+    monkeypatch.setattr(search, "_descend", step)
     out = climb(Position(0, 0, fresh(at(problem, 0.0))), problem, (), 1e-4, 25)
     assert begun == [1.0] and place(out.parameters) == 1.0 and bool(out.converged)
+
+
+class Blast(rj.torques.AbstractTorque):
+    """None at first; after a time it is not finite."""
+
+    feels: ClassVar[type] = rj.HasSpin
+    since: Array
+
+    def __call__(self, t, state, body):
+        return jnp.where(t > self.since, jnp.nan, 0.0) * state.omega
+
+
+@pytest.fixture(scope="module")
+def pushed():
+    ts = np.linspace(0.0, 4.0, 41)
+    body, law = rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.torques.Damping(0.05 * np.ones(3))
+    read = np.asarray(rj.simulate(body, rj.Spin([1.0, 0.2, 1.0]), ts, law).ys.omega)
+    read = read + 0.01 * np.random.default_rng(0).normal(size=read.shape)
+
+    def problem(lost_after):
+        torque = rj.torques.Sum(law, Blast(jnp.asarray(lost_after)))
+        record = identify.Recording(ts, (identify.Gyro(0.01), read), torque=torque)
+        chart = identify.Principal(1.5)
+        return identify.Problem(record, chart, integrator=identify.FixedSteps(2))
+
+    return problem
+
+
+@eqx.filter_jit
+def searched(problem, weights, settings):
+    noise = (jnp.full((1, 3), 0.01),)
+    start = problem.start(rj.Inertia.from_principal(1.3, 1.9, 2.5))
+    return descend(start, problem, noise, weights, settings)
+
+
+def test_a_part_of_the_record_is_followed_no_further_than_that(pushed):
+    of = pushed(9.0)
+    part, all_of_it = horizon(of, 0.25), whole(of)
+    once = Settings(1e-4, 1.0, 0)
+    # Beyond the part nothing is computed: what is not finite there does no harm.
+    lost = pushed(1.5)
+    here, there = searched(of, part, once)[1], searched(lost, part, once)[1]
+    assert np.isfinite(float(here.cost)) and not np.isfinite(searched(lost, all_of_it, once)[1].cost)
+    np.testing.assert_allclose(there.cost, here.cost, rtol=1e-12)
+    # The misfit and its derivatives are those of the whole motion, looked at in part.
+    noise = (jnp.full((1, 3), 0.01),)
+    start = of.start(rj.Inertia.from_principal(1.3, 1.9, 2.5))
+    for weights in (part, all_of_it):
+        found = searched(of, weights, once)[1]
+        cost = misfit(start, (of, noise, weights))
+        np.testing.assert_allclose(found.cost, cost, rtol=1e-12)
+        np.testing.assert_allclose(found.first, cost, rtol=1e-12)
+
+
+def test_a_search_may_end_near(pushed):
+    of = pushed(9.0)
+    seen = whole(of)
+    _, end = searched(of, seen, Settings(1e-4, 1.0, 25))
+    least = float(end.cost)
+    _, early = searched(of, seen, Settings(1e-4, 1.0, 25, near=1.5 * least))
+    assert bool(end.converged) and not bool(early.converged)
+    assert least < float(early.cost) <= 1.5 * least
+    assert int(early.taken) < int(end.taken)
