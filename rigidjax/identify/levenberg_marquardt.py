@@ -77,11 +77,11 @@ class Settings(eqx.Module):
 class Search(eqx.Module):
     """Where a search stands.
 
-    **Fields:** `first` the cost at the start; `point` (n,) the best so far, its `cost`, the normal matrix `gram` (n, n) and the
-    gradient `slope` (n,) there; `trial` (n,) what is to be tried next, `hoped` how much lower it
-    ought to be; `damping`; `pace` by how much the logarithm of the cost falls in a step; `taken`
-    evaluations; `done`, `converged`; `found` what the last
-    evaluation gave (see `with_blocks`), `here` whether that was at `point`.
+    **Fields:** `first` the cost at the start; `point` (n,) the best so far, its `cost`, the normal
+    matrix `gram` (n, n) and the gradient `slope` (n,) there; `trial` (n,) what is to be tried next,
+    `hoped` how much lower it ought to be; `damping`; `pace` by how much the logarithm of the cost
+    falls in a step; `taken` evaluations; `done`, `converged`; `found` what the last evaluation gave
+    (see `with_blocks`), `here` whether that was at `point`.
     """
 
     first: Float[Array, ""]

@@ -229,9 +229,10 @@ def _meat(linear: Linearised, time: float) -> np.ndarray:
             e, j = error[..., channel] * root, slope[..., channel, :] * root[..., None]
             variance = np.sum(e**2) / max(np.sum(weight > 0), 1)
             share = smooth_share(e, weight > 0)
-            ahead, behind = _fading(j, fade), _fading(j[:, ::-1], fade)[:, ::-1]
-            spread = share * (ahead + behind - j) + (1.0 - share) * j
-            meat = meat + variance * linear.gathered(j.transpose(0, 2, 1) @ spread)
+            # Of the sums over earlier and later errors one is the other's transpose.
+            at_once, ahead = (j.transpose(0, 2, 1) @ x for x in (j, _fading(j, fade)))
+            spread = share * (ahead + ahead.transpose(0, 2, 1)) + (1.0 - 2.0 * share) * at_once
+            meat = meat + variance * linear.gathered(spread)
     return meat
 
 

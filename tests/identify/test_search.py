@@ -128,7 +128,8 @@ def test_a_part_of_the_record_is_followed_no_further_than_that(pushed):
     # Beyond the part nothing is computed: what is not finite there does no harm.
     lost = pushed(1.5)
     here, there = searched(of, part, once)[1], searched(lost, part, once)[1]
-    assert np.isfinite(float(here.cost)) and not np.isfinite(searched(lost, all_of_it, once)[1].cost)
+    assert np.isfinite(float(here.cost))
+    assert not np.isfinite(float(searched(lost, all_of_it, once)[1].cost))
     np.testing.assert_allclose(there.cost, here.cost, rtol=1e-12)
     # The misfit and its derivatives are those of the whole motion, looked at in part.
     noise = (jnp.full((1, 3), 0.01),)
