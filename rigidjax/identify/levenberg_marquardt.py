@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 from rigidjax.identify.jacobian import along, first_state, with_blocks
 from rigidjax.identify.parameters import Parameters, places
 from rigidjax.identify.problem import Problem
-from rigidjax.identify.propagation import FixedSteps
+from rigidjax.identify.propagation import FirstPart, FixedSteps
 from rigidjax.identify.residual import Noise, beside, seen_rows
 
 # Damping is in units of the diagonal of the normal equations (Marquardt's): one is a step half as
@@ -145,9 +145,7 @@ def _as_far_as(problem: Problem, weights: Float[Array, "records times"]) -> Prob
     counts = jnp.any(weights > 0, axis=0)
     place = jnp.arange(counts.size, dtype=jnp.int32)
     last = jnp.minimum(jnp.max(jnp.where(counts, place, 0)) + _BEYOND, counts.size - 1)
-    return eqx.tree_at(
-        lambda p: p.integrator, problem, FixedSteps(steps.substeps, steps.solver, last)
-    )
+    return eqx.tree_at(lambda p: p.integrator, problem, FirstPart(steps, last))
 
 
 def search(

@@ -51,8 +51,7 @@ class FixedSteps(AbstractIntegrator):
     result against `Adaptive` and says so, and goes on with that, where the steps were too long.
 
     **Arguments:** `substeps` how many steps between two samples; `solver` the method, one of
-    `rigidjax.solvers`: Tsitouras's of order 5 unless given; `last` the index of the last time that
-    is needed, which may be traced: no steps are taken after it; `None` for all.
+    `rigidjax.solvers`: Tsitouras's of order 5 unless given.
 
     >>> FixedSteps(2).substeps
     2
@@ -60,16 +59,34 @@ class FixedSteps(AbstractIntegrator):
 
     substeps: int = eqx.field(static=True, default=1)
     solver: AbstractExplicit = solvers.Tsitouras5()
-    last: Int[Array, ""] | None = None
 
     def __check_init__(self):
         _checks.whole(self.substeps, "substeps", 1)
         _checks.instance(self.solver, AbstractExplicit, "solver", wanted="one of rigidjax.solvers")
 
     def states(self, body: Any, state0: Any, ts: Float[Array, " times"], torque: Torque) -> Any:
-        y0 = started(body, state0, torque, ts[0])
-        field = equations_of_motion(body, y0, torque)
-        return fixed(in_a_loop(self.solver), field, ts, y0, self.substeps, self.last)
+        return _in_steps(self, body, state0, ts, torque, None)
+
+
+class FirstPart(AbstractIntegrator):
+    """`FixedSteps` of which no more are taken than a part of the record needs.
+
+    **Fields:** `steps`; `last` the number of the last time that is needed.
+    """
+
+    steps: FixedSteps
+    last: Int[Array, ""]
+
+    def states(self, body: Any, state0: Any, ts: Float[Array, " times"], torque: Torque) -> Any:
+        return _in_steps(self.steps, body, state0, ts, torque, self.last)
+
+
+def _in_steps(
+    steps: FixedSteps, body: Any, state0: Any, ts: Array, torque: Torque, last: Array | None
+) -> Any:
+    y0 = started(body, state0, torque, ts[0])
+    field = equations_of_motion(body, y0, torque)
+    return fixed(in_a_loop(steps.solver), field, ts, y0, steps.substeps, last)
 
 
 class Adaptive(AbstractIntegrator):
