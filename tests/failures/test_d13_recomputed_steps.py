@@ -60,6 +60,7 @@ def test_reverse_mode_at_every_tolerance(name, solver, rtol):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
-def test_forward_mode_is_right_at_every_tolerance(name):
+@pytest.mark.parametrize("adjoint", [None, dfx.ForwardMode()], ids=["default", "ForwardMode"])
+def test_forward_mode_is_right_at_every_tolerance(name, adjoint):
     for rtol in (1e-9, 1e-11, 1e-13):
-        assert away(name, rtol, jax.jacfwd, adjoint=dfx.ForwardMode()) < 1e3 * rtol
+        assert away(name, rtol, jax.jacfwd, adjoint=adjoint) < 1e3 * rtol

@@ -3,7 +3,7 @@
 `python tests/solve/bench_loop.py [--quick]` prints, for the asymmetric heavy top at 1e-9 with 2 and
 with 30 saved times, CPU seconds to trace and compile and CPU time to run, each over that of a
 vector field written by hand under `diffrax.Dopri8`; beside them our solver inside `diffeqsolve` and
-the closed form; then the same for a particle (Foucault, Arenstorf). Medians of interleaved repeats.
+the closed form, and Jacobians through the loop that has both modes ("ours" asks for forward mode); then the same for a particle (Foucault, Arenstorf). Medians of interleaved repeats.
 """
 
 import sys
@@ -71,10 +71,10 @@ def plain(ts, adjoint):
     return run
 
 
-def ours(ts):
+def ours(ts, adjoint=None):
     def run(p, omega):
-        body = rj.Inertia.from_principal(p[0], p[1], p[2])
-        return rj.simulate(body, rj.Attitude(Q, omega), ts, TOP, rtol=RTOL, atol=ATOL).ys.omega
+        body, start = rj.Inertia.from_principal(p[0], p[1], p[2]), rj.Attitude(Q, omega)
+        return rj.simulate(body, start, ts, TOP, rtol=RTOL, atol=ATOL, adjoint=adjoint).ys.omega
 
     return run
 
@@ -87,14 +87,14 @@ def plain_of_all(ts):
     return run
 
 
-def ours_of_all(ts):
+def ours_of_all(ts, adjoint):
     """Of all numbers that a fit would look for: moments, centre of mass, rate, attitude."""
 
     def run(x):
         body = rj.Inertia.from_principal(x[0], x[1], x[2])
         top = rj.torques.HeavyTop(1.0, x[3:6], [0.0, 0.0, -9.81])
         start = rj.Attitude(x[9:], x[6:9])
-        return rj.simulate(body, start, ts, top, rtol=RTOL, atol=ATOL).ys.omega
+        return rj.simulate(body, start, ts, top, rtol=RTOL, atol=ATOL, adjoint=adjoint).ys.omega
 
     return run
 
@@ -183,7 +183,7 @@ def cases(ts):
     many = (moments, jnp.asarray(OMEGA + rng.normal(size=(MANY, 3))))
     whole = jnp.concatenate([one[0], jnp.array([0.1, 0.2, 0.9]), one[1], jnp.asarray(Q)])
     hand, ahead = plain(ts, dfx.RecursiveCheckpointAdjoint()), plain(ts, dfx.ForwardMode())
-    mine, both = ours(ts), (0, 1)
+    mine, both, forward = ours(ts), (0, 1), dfx.ForwardMode()
     return {
         "value": {
             "diffrax": (hand, one),
@@ -198,11 +198,13 @@ def cases(ts):
         },
         "Jacobian by 6": {
             "diffrax": (jax.jacfwd(ahead, both), one),
-            "ours": (jax.jacfwd(mine, both), one),
+            "ours": (jax.jacfwd(ours(ts, forward), both), one),
+            "our loop": (jax.jacfwd(mine, both), one),
         },
         "Jacobian by 13": {
             "diffrax": (jax.jacfwd(plain_of_all(ts)), (whole,)),
-            "ours": (jax.jacfwd(ours_of_all(ts)), (whole,)),
+            "ours": (jax.jacfwd(ours_of_all(ts, forward)), (whole,)),
+            "our loop": (jax.jacfwd(ours_of_all(ts, None)), (whole,)),
         },
         f"{MANY} values": {"diffrax": (jax.vmap(hand), many), "ours": (jax.vmap(mine), many)},
         f"{MANY} gradients": {

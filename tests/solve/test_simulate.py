@@ -63,10 +63,11 @@ def test_basilisk_hub(torque):
     # The closed form's have a test of their own in tests/exact.
     [pytest.param(None, id="free", marks=pytest.mark.slow), pytest.param(Nothing(), id="solver")],
 )
-@pytest.mark.parametrize("mode", ["forward", "reverse"])
+@pytest.mark.parametrize("mode", ["forward", "along", "reverse"])
 def test_derivatives_against_fifty_digits(torque, mode):
     adjoint, jac = {
-        "forward": (dfx.ForwardMode(), jax.jacfwd),
+        "forward": (None, jax.jacfwd),
+        "along": (dfx.ForwardMode(), jax.jacfwd),
         "reverse": (dfx.RecursiveCheckpointAdjoint(), jax.jacrev),
     }[mode]
     places = (np.array([0, 1, 2, 0, 0, 1]), np.array([0, 1, 2, 1, 2, 2]))
@@ -89,6 +90,23 @@ def test_derivatives_against_fifty_digits(torque, mode):
     # q and −q are one attitude.
     wanted[:4] *= np.sign(np.sum(found[:4] * wanted[:4]))
     np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-9 * np.abs(wanted).max())
+
+
+def test_where_forward_mode_is_all_that_is_asked_diffrax_runs_its_own_method():
+    start, law, ts = rj.Attitude(Q, OMEGA), rj.torques.Damping([0.1, 0.2, 0.3]), [0.0, 1.0, 2.0]
+    forward = dict(adjoint=dfx.ForwardMode())
+    found = rj.simulate(rj.Inertia(TENSOR), start, ts, law, **forward)
+    by_diffrax = rj.simulate(rj.Inertia(TENSOR), start, ts, law, solver=dfx.Dopri8(), **forward)
+    np.testing.assert_array_equal(found.ys.q, by_diffrax.ys.q)
+    # An event is found in our own loop only; and a method that was chosen is taken.
+    event = dict(event=lambda t, state, body: t - 1.5, **forward)
+    assert (
+        abs(float(rj.simulate(rj.Inertia(TENSOR), start, ts, law, **event).event_time) - 1.5) < 1e-9
+    )
+    ours = dict(solver=rj.solvers.DormandPrince8(), **forward)
+    chosen = rj.simulate(rj.Inertia(TENSOR), start, ts, law, **ours).ys
+    default = rj.simulate(rj.Inertia(TENSOR), start, ts, law).ys
+    np.testing.assert_array_equal(chosen.q, default.q)
 
 
 @WAYS
