@@ -1,13 +1,14 @@
 """What the first answer costs, and the next ones: `simulate` beside plain diffrax, in one process.
 
-`python tests/solve/bench_loop.py [--quick]` prints, for the asymmetric heavy top at 1e-9 with 2 and
-with 30 saved times, CPU seconds to trace and compile and CPU time to run, each over that of a
+`python tests/solve/bench_loop.py [--quick] [TIMES …]` prints, for the asymmetric heavy top at 1e-9
+with so many saved times (2 and 30 unless given), CPU seconds to trace and compile and CPU time to run, each over that of a
 vector field written by hand under `diffrax.Dopri8`; beside them our solver inside `diffeqsolve` and
 the closed form, and Jacobians through the loop that has both modes ("ours" asks for forward mode); then the same for a particle (Foucault, Arenstorf). Medians of interleaved repeats.
 """
 
 import sys
 import time
+from functools import partial
 
 import diffrax as dfx
 import jax
@@ -22,8 +23,9 @@ jax.config.update("jax_enable_x64", True)
 Q = np.array([0.9, 0.1, 0.3, 0.2]) / np.linalg.norm([0.9, 0.1, 0.3, 0.2])
 MOMENTS, OMEGA = np.array([1.6, 2.0, 3.0]), np.array([0.5, 1.0, 6.0])
 TOP = rj.torques.HeavyTop(1.0, [0.1, 0.2, 0.9], [0.0, 0.0, -9.81])
-END, RTOL, ATOL, MANY = 10.0, 1e-9, 1e-12, 256
+END, RTOL, ATOL, MANY, FEW = 10.0, 1e-9, 1e-12, 256, 64
 WEIGHTS = np.arange(1.0, 4.0)
+REVERSE, FORWARD = dfx.RecursiveCheckpointAdjoint(), dfx.ForwardMode()
 
 
 def by_hand(t, y, p):
@@ -82,7 +84,7 @@ def ours(ts, adjoint=None):
 def plain_of_all(ts):
     def run(x):
         p, start = x[:6], jnp.concatenate([x[9:], x[6:9]])
-        return under_diffrax(by_hand, start, p, ts, dfx.ForwardMode())[:, 4:]
+        return under_diffrax(by_hand, start, p, ts, FORWARD)[:, 4:]
 
     return run
 
@@ -135,12 +137,13 @@ def particles(count):
     ):
         ts = jnp.linspace(0.0, end, count)
 
-        def hand(v, p, field=field, x=x, ts=ts):
-            adjoint = dfx.RecursiveCheckpointAdjoint()
+        def hand(v, p, adjoint=REVERSE, field=field, x=x, ts=ts):
             return under_diffrax(field, jnp.concatenate([x, v]), p, ts, adjoint)[:, :3]
 
-        def mine(v, p, scene=scene, x=x, ts=ts):
-            return rj.simulate(None, rj.Point(x, v), ts, scene(p), rtol=RTOL, atol=ATOL).ys.x
+        def mine(v, p, adjoint=None, scene=scene, x=x, ts=ts):
+            start = rj.Point(x, v)
+            run = rj.simulate(None, start, ts, scene(p), rtol=RTOL, atol=ATOL, adjoint=adjoint)
+            return run.ys.x
 
         found[name] = hand, mine, (v, p)
     return found
@@ -181,9 +184,10 @@ def cases(ts):
     one = (jnp.asarray(MOMENTS), jnp.asarray(OMEGA))
     moments = jnp.asarray(MOMENTS * (1 + 0.1 * rng.uniform(size=(MANY, 3))))
     many = (moments, jnp.asarray(OMEGA + rng.normal(size=(MANY, 3))))
+    few = jax.tree.map(lambda a: a[:FEW], many)
     whole = jnp.concatenate([one[0], jnp.array([0.1, 0.2, 0.9]), one[1], jnp.asarray(Q)])
-    hand, ahead = plain(ts, dfx.RecursiveCheckpointAdjoint()), plain(ts, dfx.ForwardMode())
-    mine, both, forward = ours(ts), (0, 1), dfx.ForwardMode()
+    hand, ahead = plain(ts, REVERSE), plain(ts, FORWARD)
+    mine, along, both = ours(ts), ours(ts, FORWARD), (0, 1)
     return {
         "value": {
             "diffrax": (hand, one),
@@ -198,13 +202,18 @@ def cases(ts):
         },
         "Jacobian by 6": {
             "diffrax": (jax.jacfwd(ahead, both), one),
-            "ours": (jax.jacfwd(ours(ts, forward), both), one),
+            "ours": (jax.jacfwd(along, both), one),
             "our loop": (jax.jacfwd(mine, both), one),
         },
         "Jacobian by 13": {
             "diffrax": (jax.jacfwd(plain_of_all(ts)), (whole,)),
-            "ours": (jax.jacfwd(ours_of_all(ts, forward)), (whole,)),
+            "ours": (jax.jacfwd(ours_of_all(ts, FORWARD)), (whole,)),
             "our loop": (jax.jacfwd(ours_of_all(ts, None)), (whole,)),
+        },
+        f"{FEW} Jacobians by 6": {
+            "diffrax": (jax.vmap(jax.jacfwd(ahead, both)), few),
+            "ours": (jax.vmap(jax.jacfwd(along, both)), few),
+            "our loop": (jax.vmap(jax.jacfwd(mine, both)), few),
         },
         f"{MANY} values": {"diffrax": (jax.vmap(hand), many), "ours": (jax.vmap(mine), many)},
         f"{MANY} gradients": {
@@ -234,7 +243,8 @@ def measured(methods, repeats):
 def main():
     repeats = 3 if "--quick" in sys.argv else 9
     print(f"jax {jax.__version__}, CPU time; in brackets over plain diffrax")
-    for saved in (2, 30):
+    counts = [int(word) for word in sys.argv[1:] if word.isdigit()] or [2, 30]
+    for saved in counts:
         for row, methods in cases(jnp.linspace(0.0, END, saved)).items():
             shown(saved, row, measured(methods, repeats))
         for name, (hand, mine, args) in particles(saved).items():
@@ -243,13 +253,22 @@ def main():
                 who: (jax.grad(number(f)), args) for who, f in (("diffrax", hand), ("ours", mine))
             }
             shown(saved, f"{name}, grad", measured(slopes, repeats))
+            columns = {
+                who: (jax.jacfwd(partial(f, adjoint=adjoint)), args)
+                for who, f, adjoint in (
+                    ("diffrax", hand, FORWARD),
+                    ("ours", mine, FORWARD),
+                    ("our loop", mine, None),
+                )
+            }
+            shown(saved, f"{name}, Jacobian by 3", measured(columns, repeats))
 
 
 def shown(saved, row, found):
     compile0, run0 = found["diffrax"]
     for name, (cpu, run) in found.items():
         print(
-            f"{saved:3d} times  {row:15s} {name:19s} compile {cpu:5.2f} s"
+            f"{saved:3d} times  {row:24s} {name:19s} compile {cpu:5.2f} s"
             f" ({cpu / compile0:.2f})  run {run * 1e6:8.0f} us ({run / run0:.2f})",
             flush=True,
         )
