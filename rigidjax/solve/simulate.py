@@ -72,11 +72,11 @@ def simulate(
     - `solver`: `None` is the cheapest that is right: the closed form (`rigidjax.exact`) for a free
       body, else `rigidjax.solvers.DormandPrince8` (order 8), however many times are saved. The
       explicit methods of `rigidjax.solvers` run in a loop of our own; so does the default, unless a
-      controller, a progress meter, `max_steps=None` or forward mode alone is asked for: then
-      diffrax runs its Dopri8. Any
-      `diffrax.AbstractSolver` may be given; it is wrapped so that attitudes stay unit quaternions,
-      at every step and every saved time. Between its steps the error of `DormandPrince8` is up to
-      ten times `rtol` (7 was the largest found), that of Dopri8 up to 26 times below `rtol=1e-10`.
+      controller, a progress meter, `max_steps=None` or `adjoint=diffrax.ForwardMode()` is given:
+      then diffrax runs its Dopri8. Any `diffrax.AbstractSolver` may be given; it is wrapped so that
+      attitudes stay unit quaternions, at every step and every saved time. Between its steps the
+      error of `DormandPrince8` is up to ten times `rtol` (7 was the largest found), that of Dopri8
+      up to 26 times below `rtol=1e-10`.
     - `rtol`, `atol`: tolerances of the adaptive steps; 1e-9 and 1e-12 in float64, 2e-5 and 1e-7 in
       float32. Traced ones are not checked, and other values do not compile again. Scale `atol` to
       the smallest number that matters: the time of a flip about the middle axis depends on the rate

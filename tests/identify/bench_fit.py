@@ -73,10 +73,10 @@ def law(drag):
     return rj.torques.Sum(wheel, rj.torques.Damping(drag))
 
 
-def problem(readings):
+def problem(readings, integrator=None):
     record = identify.Recording(T, (identify.Gyro(SIGMA), readings), torque=law([0.0, 0.0, 0.0]))
     free = [identify.Free(lambda r: r.torque.parts[1].coefficient, "drag", scale=1e-5)]
-    return identify.Problem(record, identify.Tensor(UNIT), free=free)
+    return identify.Problem(record, identify.Tensor(UNIT), free=free, integrator=integrator)
 
 
 def driven(readings):
@@ -304,15 +304,20 @@ def main():
     draws = draws_of(body, law(DRAG), count, 0)
     peer = with_numba()
     tasks = {} if peer is None else {"SciPy and numba": peer}
-    built = [problem(readings) for readings in draws]
-    ready = {id(r): (p, start(p, r)) for p, r in zip(built, draws, strict=True)}
 
-    def prepared(readings):
-        made, begin = ready[id(readings)]
-        return identify.fit(made, starts=1, initial=begin).starts[0].cost
+    def prepared(integrator=None):
+        built = [problem(readings, integrator) for readings in draws]
+        ready = {id(r): (p, start(p, r)) for p, r in zip(built, draws, strict=True)}
+
+        def fit(readings):
+            made, begin = ready[id(readings)]
+            return identify.fit(made, starts=1, initial=begin).starts[0].cost
+
+        return fit
 
     tasks |= {
-        "ours from the same start": prepared,
+        "ours from the same start": prepared(),
+        "ours from the same start, adaptive steps": prepared(identify.Adaptive()),
         "ours from the same start, with making the problem": same(problem),
         "ours from where it begins by itself": ours(problem, starts=1),
         "ours blind (8 starts)": ours(problem),
