@@ -3,7 +3,8 @@
 `python tests/solve/bench_loop.py [--quick] [TIMES …]` prints, for the asymmetric heavy top at 1e-9
 with so many saved times (2 and 30 unless given), CPU seconds to trace and compile and CPU time to run, each over that of a
 vector field written by hand under `diffrax.Dopri8`; beside them our solver inside `diffeqsolve` and
-the closed form, and Jacobians through the loop that has both modes ("ours" asks for forward mode); then the same for a particle (Foucault, Arenstorf). Medians of interleaved repeats.
+the closed form, `simulate` with a solver of diffrax, and Jacobians through the loop that has both
+modes ("ours" asks for forward mode); then the same for a particle (Foucault, Arenstorf). Medians of interleaved repeats.
 """
 
 import sys
@@ -73,10 +74,12 @@ def plain(ts, adjoint):
     return run
 
 
-def ours(ts, adjoint=None):
+def ours(ts, adjoint=None, solver=None):
+    how = dict(rtol=RTOL, atol=ATOL, adjoint=adjoint, solver=solver)
+
     def run(p, omega):
         body, start = rj.Inertia.from_principal(p[0], p[1], p[2]), rj.Attitude(Q, omega)
-        return rj.simulate(body, start, ts, TOP, rtol=RTOL, atol=ATOL, adjoint=adjoint).ys.omega
+        return rj.simulate(body, start, ts, TOP, **how).ys.omega
 
     return run
 
@@ -188,15 +191,18 @@ def cases(ts):
     whole = jnp.concatenate([one[0], jnp.array([0.1, 0.2, 0.9]), one[1], jnp.asarray(Q)])
     hand, ahead = plain(ts, REVERSE), plain(ts, FORWARD)
     mine, along, both = ours(ts), ours(ts, FORWARD), (0, 1)
+    other = ours(ts, solver=dfx.Dopri8())
     return {
         "value": {
             "diffrax": (hand, one),
             "ours": (mine, one),
+            "ours, by diffrax": (other, one),
             "closed form": (closed_form(ts), one),
         },
         "gradient": {
             "diffrax": (jax.grad(number(hand), both), one),
             "ours": (jax.grad(number(mine), both), one),
+            "ours, by diffrax": (jax.grad(number(other), both), one),
             "inside diffeqsolve": (jax.grad(number(inside_diffrax(ts)), both), one),
             "closed form": (jax.grad(number(closed_form(ts)), both), one),
         },
@@ -215,10 +221,15 @@ def cases(ts):
             "ours": (jax.vmap(jax.jacfwd(along, both)), few),
             "our loop": (jax.vmap(jax.jacfwd(mine, both)), few),
         },
-        f"{MANY} values": {"diffrax": (jax.vmap(hand), many), "ours": (jax.vmap(mine), many)},
+        f"{MANY} values": {
+            "diffrax": (jax.vmap(hand), many),
+            "ours": (jax.vmap(mine), many),
+            "ours, by diffrax": (jax.vmap(other), many),
+        },
         f"{MANY} gradients": {
             "diffrax": (jax.grad(numbers(hand), both), many),
             "ours": (jax.grad(numbers(mine), both), many),
+            "ours, by diffrax": (jax.grad(numbers(other), both), many),
         },
     }
 
