@@ -1,5 +1,6 @@
 """Least squares from several starts."""
 
+import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,7 @@ from rigidjax.identify.search import (
     climb_together,
     cost_of,
     enough,
+    evaluate,
     fresh,
     least_squares,
     settle,
@@ -135,12 +137,14 @@ def fit(
     lowest = float(best.cost)
     best, noise = _with_noise(problem, best, noise, tolerance, max_steps)
     problem, best = with_widths(problem, best, noise, tolerance, max_steps)
-    while (finer := _finer(problem, best.parameters, noise)) is not None:
+    best = _evaluated(best, problem)
+    while (finer := _finer(problem, best, noise)) is not None:
         problem = eqx.tree_at(lambda p: p.integrator, problem, finer)
         whole = jnp.ones_like(problem.records.t)
         near = fresh(best.parameters)
         best = settle(near, problem, noise, whole, tolerance, max_steps, near=True)
         best, noise = _with_noise(problem, best, noise, tolerance, max_steps)
+        best = _evaluated(best, problem)
     return assess(problem, best, noise, tried, lowest)
 
 
@@ -255,21 +259,28 @@ def _say(progress: Any, number: int, total: int, tried: list[Tried]) -> None:
         progress(f"start {number}/{total}: misfit {float(tried[-1].cost):.6g}, best {best:.6g}")
 
 
+def _evaluated(best: Tried, problem: Problem) -> Tried:
+    """The same with errors and derivatives, where the search did not end with them."""
+    if best.found is not None:
+        return best
+    return dataclasses.replace(best, found=evaluate(best.parameters, problem))
+
+
 @eqx.filter_jit
 def _errors_alone(parameters: Parameters, problem: Problem) -> tuple[Float[Array, "..."], ...]:
     # Without the derivatives that `errors_at` computes along: less to compile.
     return all_errors(parameters, problem)[0]
 
 
-def _finer(problem: Problem, parameters: Parameters, noise: Noise) -> AbstractIntegrator | None:
+def _finer(problem: Problem, best: Tried, noise: Noise) -> AbstractIntegrator | None:
     """Where twice as many fixed steps predict otherwise, by a twentieth of the noise: those that
     do not, or adaptive ones; else `None`.
     """
     steps = problem.integrator
     if not isinstance(steps, FixedSteps):
         return None
-    count = steps.substeps
-    coarse = _errors_alone(parameters, problem)
+    count, parameters = steps.substeps, best.parameters
+    (coarse, _), _ = best.found
     # Steps that were asked for are tried in any case.
     while count <= max(FINEST, steps.substeps):
         finer: AbstractIntegrator = FixedSteps(2 * count, steps.solver)
