@@ -54,8 +54,9 @@ class Problem(eqx.Module):
     - `loss`: how an outlier counts: `SoftL1()`, `Huber()`, or `None` for plain least squares.
     - `prior`: `Entropic(guess, weight)`, a prior around a body that is roughly known, or `None`.
     - `integrator`: `FixedSteps(n)` or `Adaptive(rtol, atol)` for a forced motion; `None` chooses by
-      how finely it was sampled. `Adaptive()` is quicker where the torque is smooth, and slow
-      where it reads a noisy log. A free body is followed by the closed form.
+      how finely it was sampled. `Adaptive()` is quicker where the torque is smooth and the body
+      turns by 0.1 rad or more between readings, and slow where the torque reads a noisy log. A free
+      body is followed by the closed form.
     - `noise_each`: where a sensor's noise is estimated, one figure for all recordings (`False`),
       for each (`True`), for each body (`"body"`), or for those of the same label (a sequence).
 
