@@ -14,7 +14,8 @@ repeats in one process, other readings each time; compile apart.
   rates), `mujoco.rollout` with its Runge–Kutta of order 4 at the same steps; ours on the same.
 
 What is not installed is left out. `--joint` adds all throws of the data beside the checkout as one
-problem (see `bench_throws.py`), and as many more as make 55: the first ones of each group again.
+problem (see `bench_throws.py`), then 55: throws of the groups that have fewest are in it twice.
+`--steps` adds what one evaluation costs in equal and in adaptive steps.
 """
 
 import argparse
@@ -36,6 +37,7 @@ jax.config.update("jax_enable_x64", True)
 
 import rigidjax as rj
 from rigidjax import identify
+from rigidjax.identify.jacobian import with_blocks
 
 COUNT, STEP, SIGMA, WHEEL = 700, 1e-3, 0.02, 1.7e-6
 T = np.arange(COUNT) * STEP
@@ -282,13 +284,46 @@ def joint(more):
         )
 
 
+def steps():
+    """Errors and derivatives by each kind of steps: a smooth law, and a throw's noisy log."""
+    body, rates = rj.Inertia.from_principal(1.0, 1.6, 2.2), np.array([0.3, 1.0, 0.2])
+    smooth, tasks = rj.torques.Damping([0.01, 0.01, 0.01]), {}
+    for apart in (0.1, 0.4, 1.6):
+        ts = np.arange(0.0, 100.0, apart / np.linalg.norm(rates))
+        read = np.asarray(rj.simulate(body, rj.Spin(rates), ts, smooth).ys.omega)
+        record = identify.Recording(ts, (identify.Gyro(0.01), read), torque=smooth)
+        made = identify.Problem(record, identify.Principal(1.2))
+        tasks[f"smooth, {apart} rad apart"] = made, made.start(body)
+    places = Path(__file__).parent
+    loaded = importlib.util.spec_from_file_location("bench_throws", places / "bench_throws.py")
+    bench = importlib.util.module_from_spec(loaded)
+    loaded.loader.exec_module(bench)
+    record = bench.record(bench.throws.paths("object_empty")[0], 1, 0.53)
+    made = identify.Problem(record, identify.Tensor(3e-4))
+    tasks["a throw with its log"] = made, made.start(rj.Inertia(GUESS))
+    print("\none evaluation of errors and derivatives, ms")
+    for name, (made, at) in tasks.items():
+        for way in (made.integrator, identify.Adaptive()):
+            chosen = eqx.tree_at(lambda p: p.integrator, made, way)
+            run = eqx.filter_jit(lambda at, chosen: with_blocks(at, chosen))
+            found, _ = compared(
+                {"it": lambda at, run=run, chosen=chosen: jax.block_until_ready(run(at, chosen))},
+                [at] * 9,
+            )
+            kind = type(way).__name__ + str(getattr(way, "substeps", ""))
+            print(f"{name}, {made.records.t.size} samples, {kind}: {found['it']:.2f}")
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--repeats", type=int, default=9)
     parser.add_argument("--joint", action="store_true")
     parser.add_argument("--many", action="store_true")
+    parser.add_argument("--steps", action="store_true")
     options = parser.parse_args()
     print("load of the machine:", os.getloadavg())
+    if options.steps:
+        steps()
     body, count = rj.Inertia(MOMENTS), options.repeats + 2
 
     def ours(of, **more):

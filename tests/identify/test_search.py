@@ -3,9 +3,11 @@
 from typing import ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
 import rigidjax as rj
@@ -139,6 +141,8 @@ def test_a_part_of_the_record_is_followed_no_further_than_that(pushed):
         cost = misfit(start, (of, noise, weights))
         np.testing.assert_allclose(found.cost, cost, rtol=1e-12)
         np.testing.assert_allclose(found.first, cost, rtol=1e-12)
+        slope = jax.grad(misfit)(start, (of, noise, weights))
+        np.testing.assert_allclose(found.slope, ravel_pytree(slope)[0], rtol=1e-9)
 
 
 def test_a_search_may_end_near(pushed):
