@@ -1,23 +1,29 @@
 """`python -m rigidjax`: identify a body from recordings; compare methods."""
 
 import argparse
+import functools
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import jax
 
 import rigidjax as rj
+from rigidjax import _checks
 from rigidjax.workprecision import command
 
 # What the demo heeds as well; all else says how logs are to be read.
 _OF_ALL = ("starts", "checkpoint", "figure", "report", "json", "no_cache")
+# What is written, and what must not be written over.
+_OUT = ("checkpoint", "figure", "report", "json", "csv", "keep")
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command line; returns the exit code (0 good, 1 a fit not to trust, 2 bad input).
+    """Run the command line; returns the exit code.
+
+    0 good; 1 a fit not to trust; 2 bad input, or a file that could not be written; 130 interrupted.
 
     **Arguments:** `arguments` those of the command line; `None` for the ones of this process. Only
     then is the process all ours, and its compiled programs are kept for the next (`--no-cache`).
@@ -29,14 +35,23 @@ def main(arguments: list[str] | None = None) -> int:
         return 0
     # A program of its own, not a library: the switch is ours to set here.
     jax.config.update("jax_enable_x64", True)
+    if options.command == "identify" and options.demo == bool(options.logs):
+        parser.error("identify: give either log FILES or --demo")
+    _check_files(options, parser)
+    if arguments is None:
+        # A name that the terminal cannot show must not end a run.
+        for stream in (sys.stdout, sys.stderr):
+            stream.reconfigure(errors="backslashreplace")  # pyright: ignore
+    try:
+        return _run(options, parser, own=arguments is None)
+    except KeyboardInterrupt:
+        _error("interrupted (Ctrl-C) before there was a result")
+        return 130
+
+
+def _run(options: argparse.Namespace, parser: argparse.ArgumentParser, own: bool) -> int:
     if options.command == "workprecision":
         return command.run(options)
-    if options.demo == bool(options.logs):
-        parser.error("identify: give either log FILES or --demo")
-    for path in (options.figure, options.report, options.json):
-        # Now, not after the fit.
-        if path is not None and not path.parent.is_dir():
-            parser.error(f"{path}: there is no folder {path.parent}")
     if options.demo:
         plain = vars(parser.parse_args(["identify", "--demo"]))
         given = [name for name, value in vars(options).items() if value != plain[name]]
@@ -44,9 +59,38 @@ def main(arguments: list[str] | None = None) -> int:
         if odd:
             names = ", ".join("--" + name.replace("_", "-") for name in odd)
             parser.error(f"identify --demo: {names} is for log FILES only")
-    if arguments is None and not options.no_cache:
+    if own and options.no_cache:
+        jax.config.update("jax_enable_compilation_cache", False)
+    elif own:
         _keep_compiled()
     return _demo(options) if options.demo else _logs(options)
+
+
+def _check_files(options: argparse.Namespace, parser: argparse.ArgumentParser) -> None:
+    """End with a message where a file cannot be written: now, not after the fit."""
+    figure = options.figure
+    if figure is not None and figure.name and not figure.suffix.strip("."):
+        # As matplotlib does, so that its name is said.
+        options.figure = figure.with_name(figure.name.rstrip(".") + ".png")
+    if figure is not None and not _matplotlib():
+        parser.error("--figure: needs matplotlib: pip install 'rigidjax[view]'")
+    if figure is not None and figure.suffix.strip("."):
+        from matplotlib.backend_bases import FigureCanvasBase
+
+        if figure.suffix[1:].lower() not in FigureCanvasBase.get_supported_filetypes():
+            parser.error(f"{figure}: wanted a name that ends in .png, .pdf or .svg")
+    taken = {Path(path).resolve(): "FILE" for path in getattr(options, "logs", ())}
+    if len(taken) < len(getattr(options, "logs", ())):
+        parser.error("identify: a log is given twice; its readings would count twice")
+    for name in _OUT:
+        path = getattr(options, name, None)
+        if path is None:
+            continue
+        if taken.setdefault(path.resolve(), name) != name:
+            parser.error(f"--{name}: {path} is already the {taken[path.resolve()]}")
+        if name != "checkpoint" and (path.is_dir() or not path.parent.is_dir()):
+            why = "is a folder" if path.is_dir() else f"there is no folder {path.parent}"
+            parser.error(f"--{name}: {path}: {why}")
 
 
 def _keep_compiled() -> None:
@@ -54,11 +98,23 @@ def _keep_compiled() -> None:
 
     Not those of `workprecision`, which measures how long compiling takes.
     """
+    if jax.__version_info__ < (0, 12):
+        # Of each program that it loads XLA says two flags of its own, 2.6 kB a line (as an error).
+        jax.config.update("jax_logging_level", "CRITICAL")
     if os.environ.get("JAX_COMPILATION_CACHE_DIR"):
         return
     try:
         folder = _cache_folder()
-        folder.mkdir(parents=True, exist_ok=True)
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        held = folder.stat()
+        # What is loaded from there is run: nobody else may have put it there. Not so on Windows,
+        # where a user's folder is his own already.
+        if hasattr(os, "getuid"):
+            if held.st_uid != os.getuid() or held.st_mode & 0o022:
+                words = f"compiled programs: {folder} is not yours alone, so it is not used; delete it"
+                print(_checks.printable(words), file=sys.stderr)
+                return
+            folder.chmod(0o700)
     except (OSError, RuntimeError):
         # No home, or one that cannot be written to: a slower start, nothing else.
         return
@@ -77,8 +133,13 @@ def _cache_folder() -> Path:
     return Path.home() / inside / "rigidjax"
 
 
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        super().error(_checks.printable(message))
+
+
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog="python -m rigidjax",
         description="Differentiable rigid-body mechanics for JAX: identify inertia from data.",
         epilog="Try: python -m rigidjax identify --demo",
@@ -196,7 +257,6 @@ def _demo(options: argparse.Namespace) -> int:
     print(rj.identify.report.verdict(found))
     title = "4179 Toutatis, December 1992"
     units = {"time_unit": "day", "rate_unit": "deg/day"}
-    _draw(found, options.figure or Path("toutatis.png"), title=title, **units)
     return _write(found, options, title, [toutatis.CITATION], [title], units, more)
 
 
@@ -208,6 +268,9 @@ def _logs(options: argparse.Namespace) -> int:
     unit, time_unit = options.unit or layout.unit, options.time_unit or layout.time_unit
     try:
         if options.sensor:
+            alone = [name for name in ("unit", "noise", "limit") if getattr(options, name)]
+            if alone:
+                raise rj.identify.LogError(f"--{alone[0]}: with --sensor, it stands in that itself")
             channels = [cli_spec.channel(text) for text in options.sensor]
         else:
             noise = None if options.noise is None else cli_spec.noises(options.noise, "--noise")
@@ -221,6 +284,8 @@ def _logs(options: argparse.Namespace) -> int:
             raise rj.identify.LogError(
                 f"--model {options.model}: free motion shows ratios only; a scale needs a --wheel"
             )
+        if "delay" in options.free and not wheels:
+            raise rj.identify.LogError("--free delay: that of a --wheel, and there is none")
         records = [
             cli_spec.read_log(
                 path,
@@ -241,10 +306,9 @@ def _logs(options: argparse.Namespace) -> int:
             loss=options.loss,
         )
     except ValueError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+        return _error(error)
     for path, record in zip(options.logs, records, strict=True):
-        print(f"{path}: {_extent(record)}")
+        _say(f"{path}: {_extent(record)}")
     print()
     found = _fit(problem, options, 8)
     if found is None:
@@ -258,9 +322,7 @@ def _logs(options: argparse.Namespace) -> int:
         print(f"\nrms of the {type(sensor).__name__}: {rms * scale:.4g} {unit}", end="")
     print()
     print(rj.identify.report.verdict(found))
-    names = [Path(path).name for path in options.logs]
-    if options.figure is not None:
-        _draw(found, options.figure, rate_unit=rate_unit, title=names[0])
+    names = [_checks.printable(Path(path).name) for path in options.logs]
     title = f"Identification of {', '.join(names[:3])}{' …' if names[3:] else ''}"
     return _write(found, options, title, names, names, {"rate_unit": rate_unit})
 
@@ -270,12 +332,12 @@ def _fit(problem: rj.identify.Problem, options: argparse.Namespace, starts: int)
     try:
         return rj.identify.fit(
             problem,
-            starts=options.starts or starts,
+            starts=starts if options.starts is None else options.starts,
             progress=_say,
             checkpoint=options.checkpoint,
         )
     except (OSError, ValueError) as error:
-        print(f"error: {error}", file=sys.stderr)
+        _error(error)
         return None
 
 
@@ -295,64 +357,85 @@ def _write(
     units: dict[str, str],
     more: Sequence[tuple[str, float, float, float, str]] = (),
 ) -> int:
-    """The report and the numbers, where asked for; the exit code."""
+    """What was asked for, each on its own; the exit code."""
+    report, figure = rj.identify.report, options.figure
+    if options.demo and figure is None and _matplotlib():
+        figure = Path("toutatis.png")
+    kept = True
+    if figure is not None:
+        kept &= _made(
+            "figure",
+            figure,
+            lambda: rj.plot.fit(found, title=names[0], **units).savefig(figure, dpi=130),
+        )
+    if options.json is not None:
+        kept &= _made(
+            "numbers", options.json, lambda: report.write_json(found, options.json, read, more)
+        )
+    if options.report is not None:
+        figures = _figures(found, names, units) if figure is not None or _matplotlib() else []
+        page = {"title": title, "figures": figures, "files": read, "more": more}
+        kept &= _made(
+            "report",
+            options.report,
+            lambda: report.write_html(found, options.report, rate_unit=units["rate_unit"], **page),
+        )
+    if "interrupted" in found.status:
+        _error("interrupted (Ctrl-C): not all starts were made, see the status")
+        return 130
+    return 2 if not kept else 0 if found.ok else 1
+
+
+def _made(what: str, path: Path, make: Callable[[], Any]) -> bool:
+    """Whether a file could be written; if not, why is said, and nothing else is lost."""
     try:
-        if options.json is not None:
-            rj.identify.report.write_json(found, options.json, read, more)
-            print(f"numbers: {options.json}")
-        if options.report is not None:
-            rj.identify.report.write_html(
-                found,
-                options.report,
-                title=title,
-                figures=_figures(found, names, units),
-                rate_unit=units["rate_unit"],
-                files=read,
-                more=more,
-            )
-            print(f"report: {options.report}")
-    except OSError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    return 0 if found.ok else 1
+        make()
+    except Exception as error:
+        _error(f"no {what}: {path}: {type(error).__name__}: {error}")
+        return False
+    _say(f"{what}: {path}")
+    return True
 
 
 def _figures(found: Any, names: list[str], units: dict[str, str]) -> list[Any]:
+    def of_log(index: int) -> Any:
+        return rj.plot.fit(found, index=index, title=names[index], **units)
+
+    def left_over() -> Any:
+        return rj.plot.residuals(found, time_unit=units.get("time_unit", "s")).flat[0].figure
+
+    def body() -> Any:
+        return rj.plot.inertia_ellipsoid(found)[0].figure
+
+    figures = []
+    logs = [functools.partial(of_log, index) for index in range(len(names[:12]))]
+    for make in (*logs, left_over, body):
+        try:
+            figures.append(make())
+        except Exception as error:
+            _error(f"a figure is left out: {type(error).__name__}: {error}")
+    return figures
+
+
+def _matplotlib() -> bool:
+    """Whether figures can be drawn; without a window."""
     try:
         import matplotlib
     except ModuleNotFoundError:
-        print("no figures: matplotlib is missing (pip install 'rigidjax[view]')")
-        return []
+        _say("no figures: matplotlib is missing (pip install 'rigidjax[view]')")
+        return False
     matplotlib.use("Agg")
-    figures = [
-        rj.plot.fit(found, index=index, title=name, **units)
-        for index, name in enumerate(names[:12])
-    ]
-    time_unit = units.get("time_unit", "s")
-    more = (
-        rj.plot.residuals(found, time_unit=time_unit).flat[0],
-        rj.plot.inertia_ellipsoid(found)[0],
-    )
-    return [*figures, *(axis.figure for axis in more)]
+    return True
 
 
 def _say(line: str) -> None:
-    print(line, flush=True)
+    print(_checks.printable(line), flush=True)
 
 
-def _draw(found: Any, path: Path, **how: Any) -> None:
-    try:
-        import matplotlib
-    except ModuleNotFoundError:
-        print("no figure: matplotlib is missing (pip install 'rigidjax[view]')")
-        return
-    matplotlib.use("Agg")
-    try:
-        rj.plot.fit(found, **how).savefig(path, dpi=130)
-    except (OSError, ValueError) as error:
-        print(f"no figure: {path}: {error}", file=sys.stderr)
-        return
-    print(f"figure: {path}")
+def _error(what: object) -> int:
+    """Say what is wrong, in one line; **returns** the exit code 2."""
+    print(f"error: {_checks.printable(what)}", file=sys.stderr)
+    return 2
 
 
 if __name__ == "__main__":

@@ -283,6 +283,17 @@ def path(value: Any, name: str = "path") -> Path:
     return Path(value)
 
 
+def printable(text: Any) -> str:
+    """The text, with what a terminal would obey (escapes, ends of line) as Python writes it."""
+    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in str(text))
+
+
+def plain(text: Any) -> str:
+    """The text so that matplotlib shows it as it is: no formula between `$`, no hidden label."""
+    text = str(text).replace("$", r"\$")
+    return f" {text}" if text.startswith("_") else text
+
+
 def word(value: Any, options: Sequence[str], name: str) -> str:
     """Return `value` if it is one of `options`."""
     if isinstance(value, str) and value in options:

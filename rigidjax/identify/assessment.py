@@ -1,5 +1,6 @@
 """How good a fit is: covariance, status, and whether other starts explain the data as well."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -34,8 +35,12 @@ def assess(
     noise: Noise,
     tried: list[Tried],
     best_cost: float,
+    interrupted: Sequence[str] = (),
 ) -> Fit:
-    """The `Fit` of the best point, converged or not, among all that were tried."""
+    """The `Fit` of the best point, converged or not, among all that were tried.
+
+    `interrupted` says where the search was.
+    """
     value = best.parameters
     linear = uncertainty.linearise(problem, value, noise, best.found)
     # In a long curved valley steps stay short, although hardly anything is left to gain.
@@ -69,7 +74,7 @@ def assess(
         for s in starts
         if s.fits and s.converged and s.cost > best_cost + 0.01 * margin and elsewhere(s.parameters)
     ]
-    doubts = list(seen.doubts)
+    doubts = [*interrupted, *seen.doubts]
     found = _bodies(problem, value)
     bodies = list(found.values()) if isinstance(found, dict) else [found]
     unreal = of_charts(charts(problem), bodies)
@@ -79,11 +84,12 @@ def assess(
     if not np.isfinite(best_cost):
         status = "failed: no start gave a finite misfit"
     elif believable and not done:
-        ended = "not converged, max_steps reached; this is the best point found"
+        why = "; ".join(interrupted) or "max_steps reached"
+        ended = f"not converged, {why}; this is the best point found"
         status = "failed: " + "; ".join((ended, *unreal))
     elif not believable:
         units = "this is not the motion, or a unit is wrong (rad/s, m/s², m, s)"
-        status = "poor: " + "; ".join((*seen.poor, *unreal, units))
+        status = "poor: " + "; ".join((*interrupted, *seen.poor, *unreal, units))
     elif rivals:
         rival = f"{len(rivals)} of {len(starts)} starts fit as well elsewhere"
         status = "ambiguous: " + "; ".join((rival, *doubts))

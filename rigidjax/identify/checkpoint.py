@@ -1,6 +1,8 @@
 """Where a search stands, kept in a file, so that a killed one goes on from there."""
 
 import dataclasses
+import hashlib
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -52,17 +54,33 @@ def require_folder(path: str | Path) -> None:
         raise ValueError(f"checkpoint {path}: wanted a file, this is a folder")
 
 
+def fingerprint(*trees: Any) -> str:
+    """A hash of the numbers' bytes and of the structure: the same in every process.
+
+    A function counts by its name.
+    """
+    leaves, structure = jax.tree.flatten(trees)
+    words, found = [repr(structure)], hashlib.sha256()
+    for leaf in leaves:
+        array = np.asarray(leaf)
+        words.append(f"{array.dtype} {array.shape}")
+        found.update(array.tobytes())
+    # An address in memory is another one in each process.
+    found.update(re.sub("0x[0-9a-f]+", "", "\n".join(words)).encode())
+    return found.hexdigest()
+
+
 class Checkpoint:
     """What a long search has found so far, on disk after every stride of steps.
 
     **Arguments:** `path` of the file, or `None` to keep nothing; `like` a `Tried` of the right
-    shapes; `print_of` a number that belongs to this problem alone.
+    shapes; `print_of` the `fingerprint` of all that the search depends on.
 
     **Raises:** `ValueError` for a file that is no checkpoint, is cut, or belongs to another
     problem; it is not overwritten.
     """
 
-    def __init__(self, path: str | Path | None, like: Tried, print_of: float):
+    def __init__(self, path: str | Path | None, like: Tried, print_of: str):
         self.path, self.like = None if path is None else Path(path), like
         self.print_of = print_of
         self.done: list[Tried] = []
@@ -90,7 +108,7 @@ class Checkpoint:
             # Of a file that it opened itself and cannot read NumPy leaves the handle open.
             with path.open("rb") as raw, np.load(raw) as file:
                 held = {name: file[name] for name in file.files}
-            print_of, done = float(held["print_of"]), int(held["done"])
+            print_of, done = str(held["print_of"]), int(held["done"])
             stage, strides = int(held["stage"]), int(held["strides"])
         except Exception as error:
             raise ValueError(
@@ -102,7 +120,9 @@ class Checkpoint:
         found = [held.get(f"leaf{i}", np.zeros(0)) for i in range((done + 1) * count)]
         shapes = [leaf.shape for leaf in leaves] * (done + 1)
         if print_of != self.print_of or [leaf.shape for leaf in found] != shapes:
-            raise ValueError(f"{path}: the checkpoint of another problem; name another file")
+            raise ValueError(
+                f"{path}: the checkpoint of another problem, or of other options; name another file"
+            )
         items = [
             jax.tree.unflatten(structure, map(jnp.asarray, found[i * count : (i + 1) * count]))
             for i in range(done + 1)

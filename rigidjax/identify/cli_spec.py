@@ -148,7 +148,9 @@ def read_log(
     Traceback (most recent call last):
     rigidjax.identify.csv_io.LogError: missing.csv: no such file
     """
-    names = [time, *(c for one in channels for c in one.columns), *(w.column for w in wheels)]
+    # Two wheels may share a column of their speed.
+    turning = dict.fromkeys(w.column for w in wheels)
+    names = [time, *(c for one in channels for c in one.columns), *turning]
     table = read_table(path, names)
     t = table[time] * UNITS[time_unit]
     increasing(path, t, time)
@@ -267,7 +269,9 @@ def _free(first: Recording, typical: float, free: Sequence[str]) -> list[Free]:
 
     items: list[Free] = []
     for index, sensor in enumerate(first.sensors):
-        name = type(sensor).__name__.lower()
+        kind = type(sensor).__name__
+        same = [i for i, other in enumerate(first.sensors) if type(other).__name__ == kind]
+        name = kind.lower() + (f" {same.index(index) + 1}" if len(same) > 1 else "")
         if getattr(sensor, "bias", None) is not None:
             size = 0.05 if isinstance(sensor, Gyro) else 0.5
             items.append(Free(sensor_bias(index), f"{name} bias", scale=size, each=True))
@@ -277,5 +281,8 @@ def _free(first: Recording, typical: float, free: Sequence[str]) -> list[Free]:
         items.append(Free(drag, "drag", scale=0.1 * typical, unit="N m s"))
     if "delay" in free and isinstance(first.torque, Sum):
         wheels = len(first.torque.parts) - ("drag" in free)
-        items += [Free(delay(i), "wheel delay", scale=1e-3, each=True) for i in range(wheels)]
+        names = [f"wheel {i + 1} delay" for i in range(wheels)] if wheels > 1 else ["wheel delay"]
+        items += [
+            Free(delay(i), name, scale=1e-3, each=True) for i, name in enumerate(names[:wheels])
+        ]
     return items

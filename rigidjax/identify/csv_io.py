@@ -1,6 +1,7 @@
 """Reading logs from files. Errors name file, line and column."""
 
 import csv
+import itertools
 import math
 from array import array
 from collections.abc import Sequence
@@ -11,7 +12,7 @@ import numpy as np
 
 from rigidjax import _checks
 from rigidjax.identify import blackbox
-from rigidjax.identify.layouts import split_header
+from rigidjax.identify.layouts import read_header
 from rigidjax.identify.recording import Recording
 from rigidjax.identify.sensors import Gyro
 
@@ -40,19 +41,25 @@ class LogError(ValueError):
     True
     """
 
+    def __str__(self) -> str:
+        # Names out of a file must not move the cursor of the terminal that shows them.
+        return _checks.printable(super().__str__())
+
 
 def read_table(path: str | Path, columns: Sequence[str]) -> dict[str, np.ndarray]:
-    """Columns of a log by name: text with a header line, `.npz`, `.mat` (MATLAB up to v7), or a
+    """Columns of a log by name: text with a header, `.npz`, `.mat` (MATLAB up to v7), or a
     Blackbox log of a flight controller, `.bbl` or `.bfl` (with the extra `blackbox`).
 
     **Arguments:** `path`; `columns` the names that are wanted, others are ignored. Text is
     separated by commas, semicolons or tabs, whichever splits the header line into most names; its
-    decimals have a point. **Returns** name → (T,) numbers. An empty cell is a gap and comes back as
-    NaN. A text is read line by line: beside it, up to three times its numbers are held.
+    decimals have a point. Lines that begin with `#` may stand above the header, and the header may
+    be the last of them, as `numpy.savetxt` writes it. **Returns** name → (T,) numbers. An empty
+    cell is a gap and comes back as NaN. A text is read line by line: beside it, up to three times
+    its numbers are held.
 
     **Raises:** `LogError`, one line naming file, line and column, for a file that is missing, cut
-    or not of its kind, a missing column or two of its name, a cell that is not a number, a line
-    with more cells than the header, columns of different lengths.
+    or not of its kind, a missing column or two of its name, a name that is wanted twice, a cell
+    that is not a number, a line with more cells than the header, columns of different lengths.
 
     >>> read_table("missing.csv", ["t"])
     Traceback (most recent call last):
@@ -62,6 +69,9 @@ def read_table(path: str | Path, columns: Sequence[str]) -> dict[str, np.ndarray
     _checks.instance(columns, Sequence, "columns", wanted="a sequence of names")
     if isinstance(columns, str) or not columns or not all(isinstance(c, str) for c in columns):
         raise TypeError(f"columns: wanted a sequence of names, got {columns!r}")
+    twice = [name for name in columns if columns.count(name) > 1]
+    if twice:
+        raise LogError(f"columns: {twice[0]!r} is named twice, one column cannot be two readings")
     if not path.exists():
         raise LogError(f"{path}: no such file")
     if path.is_dir():
@@ -122,7 +132,7 @@ def increasing(path: str | Path, t: np.ndarray, name: str) -> None:
     if falling.size:
         row = int(falling[0]) + 1
         raise LogError(
-            f"{path}: line {row + 2}: column {name!r}: time {t[row]:g} is not above the "
+            f"{path}: column {name!r}: row {row + 1}: time {t[row]:g} is not above the "
             f"{t[row - 1]:g} before it"
         )
 
@@ -138,7 +148,7 @@ def _csv(path: Path, columns: Sequence[str]) -> dict[str, np.ndarray]:
 
 
 def _rows(path: Path, file: TextIO, columns: Sequence[str]) -> dict[str, np.ndarray]:
-    header, separator = split_header(file.readline())
+    header, separator, top, after = read_header(file)
     if not any(header):
         raise LogError(f"{path}: line 1: wanted a header with the columns {', '.join(columns)}")
     for name in columns:
@@ -149,17 +159,17 @@ def _rows(path: Path, file: TextIO, columns: Sequence[str]) -> dict[str, np.ndar
                 else "name yours with --columns or --sensor"
             )
             raise LogError(
-                f"{path}: line 1: no column {name!r}; the columns are {', '.join(header)} "
+                f"{path}: line {top}: no column {name!r}; the columns are {', '.join(header)} "
                 f"({advice})"
             )
         if header.count(name) > 1:
             raise LogError(
-                f"{path}: line 1: {header.count(name)} columns are called {name!r}: which one?"
+                f"{path}: line {top}: {header.count(name)} columns are called {name!r}: which one?"
             )
     wanted = [(name, header.index(name), array("d")) for name in columns]
-    reader = csv.reader(file, delimiter=separator)
+    reader = csv.reader(itertools.chain(after, file), delimiter=separator)
     for cells in reader:
-        line = reader.line_num + 1
+        line = reader.line_num + top
         if len(cells) > len(header) and any(cell.strip() for cell in cells[len(header) :]):
             raise LogError(
                 f"{path}: line {line}: {len(cells)} cells, but the header names {len(header)} "

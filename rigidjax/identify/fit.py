@@ -14,7 +14,14 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from rigidjax import _checks
 from rigidjax.identify import uncertainty
 from rigidjax.identify.assessment import assess
-from rigidjax.identify.checkpoint import Checkpoint, Position, Tried, bare, require_folder
+from rigidjax.identify.checkpoint import (
+    Checkpoint,
+    Position,
+    Tried,
+    bare,
+    fingerprint,
+    require_folder,
+)
 from rigidjax.identify.initial_guess import starting_points
 from rigidjax.identify.jacobian import all_errors
 from rigidjax.identify.multiple_shooting import WIDTHS, joined, pieces as in_pieces, with_width
@@ -81,7 +88,7 @@ def fit(
     when that is not to be trusted: `doubtful` (errors that are autocorrelated, above the noise, or
     a large share of the readings), `ambiguous` (another motion fits as well), `poor` (this is not
     the motion), `failed` (not converged). Interrupting (Ctrl-C)
-    ends the search and keeps what was found.
+    ends the search and keeps what was found; the status says so, and is not `ok`.
 
     Levenberg–Marquardt on normal equations, Jacobians by forward mode through the motion.
 
@@ -121,16 +128,13 @@ def fit(
         points = [_from_pieces(problem, pieces, tolerance, max_steps), *points][:starts]
     if initial is not None:
         points = [initial, *points][:starts]
+    cut: list[str] = []
     if descent is not None:
-        keys = jax.random.split(jax.random.key(1) if key is None else key, len(points))
-        points = [
-            descend(point, problem, noise, descent, own, progress)
-            for point, own in zip(points, keys, strict=True)
-        ]
+        points = _descended(points, problem, noise, descent, key, progress, cut)
     if together > 1:
-        tried = _together(points, problem, noise, tolerance, max_steps, together, progress)
+        tried = _together(points, problem, noise, tolerance, max_steps, together, progress, cut)
     else:
-        tried = _one_by_one(points, problem, noise, tolerance, max_steps, checkpoint, progress)
+        tried = _one_by_one(points, problem, noise, tolerance, max_steps, checkpoint, progress, cut)
     best = min(
         tried, key=lambda item: float(item.cost) if np.isfinite(float(item.cost)) else np.inf
     )
@@ -145,7 +149,7 @@ def fit(
         best = settle(near, problem, noise, whole, tolerance, max_steps, near=True)
         best, noise = _with_noise(problem, best, noise, tolerance, max_steps)
         best = _evaluated(best, problem)
-    return assess(problem, best, noise, tried, lowest)
+    return assess(problem, best, noise, tried, lowest, cut)
 
 
 def _with_noise(
@@ -179,6 +183,26 @@ def _from_pieces(problem: Problem, count: int, tolerance: float, max_steps: int)
     return joined(problem, cut, point)
 
 
+def _descended(
+    points: list[Parameters],
+    problem: Problem,
+    noise: Noise,
+    descent: Descent,
+    key: PRNGKeyArray | None,
+    progress: Callable[[str], Any] | None,
+    cut: list[str],
+) -> list[Parameters]:
+    keys = jax.random.split(jax.random.key(1) if key is None else key, len(points))
+    out: list[Parameters] = []
+    for point, own in zip(points, keys, strict=True):
+        near, whole = descend(point, problem, noise, descent, own, progress)
+        out.append(near)
+        if not whole:
+            cut.append(f"interrupted in the descent of start {len(out)} of {len(points)}")
+            break
+    return out
+
+
 def _one_by_one(
     points: list[Parameters],
     problem: Problem,
@@ -187,11 +211,14 @@ def _one_by_one(
     max_steps: int,
     checkpoint: str | Path | None,
     progress: Callable[[str], Any] | None,
+    cut: list[str],
 ) -> list[Tried]:
     like = Tried(points[0], jnp.asarray(jnp.inf), jnp.asarray(False))
-    print_of = float("nan")
+    print_of = ""
     if checkpoint is not None:
-        print_of = float(sum(cost_of(point, problem, noise) for point in points))
+        # The misfits as well: of a torque that is a function the rest knows the name only.
+        costs = [cost_of(point, problem, noise) for point in points]
+        print_of = fingerprint(points, problem, noise, costs, tolerance, max_steps)
     keep = Checkpoint(checkpoint, like, print_of)
     tried, latest = list(keep.done), [keep.position.tried]
     try:
@@ -217,6 +244,7 @@ def _one_by_one(
             keep.save(tried, Position(0, 0, like))
             _say(progress, number, len(points), tried)
     except KeyboardInterrupt:
+        cut.append(f"interrupted after {len(tried)} of {len(points)} starts")
         if np.isfinite(float(latest[0].cost)):
             tried.append(latest[0])
         if not tried:
@@ -239,6 +267,7 @@ def _together(
     max_steps: int,
     together: int,
     progress: Callable[[str], Any] | None,
+    cut: list[str],
 ) -> list[Tried]:
     tried: list[Tried] = []
     try:
@@ -248,6 +277,7 @@ def _together(
             tried += climb_together(stacked, problem, noise, tolerance, max_steps)
             _say(progress, len(tried), len(points), tried)
     except KeyboardInterrupt:
+        cut.append(f"interrupted after {len(tried)} of {len(points)} starts")
         if not tried:
             raise
     return tried

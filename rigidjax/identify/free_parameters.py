@@ -183,6 +183,8 @@ def find(free: Sequence[Free], recording: Recording, of: Sequence[str] = ("",)) 
             raise ValueError(f"Free {item.name!r}: wanted numbers, got {type(value).__name__}")
         if any(slot.leaf == index for slot in slots):
             raise ValueError(f"Free {item.name!r}: another Free moves the same numbers")
+        if any(slot.name == item.name for slot in slots):
+            raise ValueError(f"Free {item.name!r}: another Free has this name; give each its own")
         if item.positive and not (np.asarray(value) > 0).all():
             raise ValueError(f"Free {item.name!r}: wanted a positive starting value, got {value}")
         scale = jnp.asarray(item.scale)

@@ -3,7 +3,7 @@
 import csv
 import re
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TextIO
 
 from rigidjax.identify import blackbox
 
@@ -30,7 +30,11 @@ def layout_of(path: str | Path) -> Layout:
     path = Path(path)
     if path.suffix.lower() in blackbox.SUFFIXES:
         return Layout(blackbox.COLUMNS, "deg/s", "us")
-    names = header(path)
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            names = read_header(file).names
+    except (OSError, UnicodeDecodeError):
+        return USUAL
     times = [name for name in names if re.search(r"\(s\)$", name)]
     rates = [name for axis in "xyz" for name in names if re.search(rf"\b{axis} \(rad/s\)$", name)]
     if len(times) == 1 and len(rates) == 3:
@@ -39,17 +43,38 @@ def layout_of(path: str | Path) -> Layout:
     return USUAL
 
 
-def header(path: Path) -> list[str]:
-    """The names in the first line of a text; none where there is no such line."""
-    try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            first = file.readline(65536)
-    except (OSError, UnicodeDecodeError):
-        return []
-    return split_header(first)[0]
+class Header(NamedTuple):
+    """The names of the columns; what separates them; in which line they are; the lines that were
+    read after it.
+    """
+
+    names: list[str]
+    separator: str
+    line: int
+    after: list[str]
 
 
-def split_header(first: str) -> tuple[list[str], str]:
-    """The names in a header line, and what separates them: whichever gives most of them."""
+def read_header(file: TextIO) -> Header:
+    """The header of a text, read from its beginning: the first line, below comments (`#`).
+
+    It may be the last of the comments, as `numpy.savetxt` writes it: then numbers follow.
+    """
+    comments, first, line = "", file.readline(_LONGEST), 1
+    while first.startswith("#") or (first and not first.strip()):
+        comments = first if first.startswith("#") else comments
+        first, line = file.readline(_LONGEST), line + 1
+    names, separator = _split(first)
+    if comments and (not first or any(map(_NUMBER.fullmatch, names))):
+        return Header(*_split(comments.lstrip("#")), line - 1, [first])
+    return Header(names, separator, line, [])
+
+
+# A file of one endless line is not read for its header; what `csv` takes as one cell.
+_LONGEST = 131_072
+_NUMBER = re.compile(r"[-+.\d][-+.\deE]*")
+
+
+def _split(first: str) -> tuple[list[str], str]:
+    """The names in a line, and what separates them: whichever gives most of them."""
     separator = max(SEPARATORS, key=first.count)
     return [name.strip() for name in next(csv.reader([first], delimiter=separator), [])], separator

@@ -164,10 +164,13 @@ def as_dict(fit: Fit, files: Sequence[str] = (), more: Sequence[Row] = ()) -> di
                 zip(_rms_of_axes(fit), fit.rms, strict=True)
             )
         },
-        "noise": [np.asarray(noise).tolist() for noise in fit.noise],
-        "chi2": fit.chi2,
+        "noise": [
+            np.where(np.isfinite(noise), noise, None).tolist()  # pyright: ignore
+            for noise in map(np.asarray, fit.noise)
+        ],
+        "chi2": plain(fit.chi2),
         "degrees_of_freedom": fit.dof,
-        "correlation_samples": fit.correlation,
+        "correlation_samples": plain(fit.correlation),
         "covariance": fit.covariance_kind,
         "starts": [
             {"misfit": plain(s.cost), "converged": s.converged, "fits": s.fits} for s in fit.starts
@@ -177,7 +180,7 @@ def as_dict(fit: Fit, files: Sequence[str] = (), more: Sequence[Row] = ()) -> di
             {
                 "words": one.in_words,
                 "changes": {
-                    name: {"change": change, "unit": "relative" if ratio else unit}
+                    name: {"change": plain(change), "unit": "relative" if ratio else unit}
                     for name, change, unit, ratio in zip(
                         one.names, one.changes, one.units, one.relative, strict=True
                     )
@@ -223,7 +226,8 @@ def write_json(
     'ok'
     """
     text = json.dumps(as_dict(fit, files, more), indent=2, ensure_ascii=False, allow_nan=False)
-    Path(path).write_text(text + "\n", encoding="utf-8")
+    # What is no character (of a file's name) stands as JSON writes it.
+    Path(path).write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
 
 
 def write_html(
@@ -297,7 +301,7 @@ img {{ max-width: 100%; margin: 1rem 0 }} .status {{ color: {colour}; font-weigh
 {pictures}
 </html>
 """
-    Path(path).write_text(page, encoding="utf-8")
+    Path(path).write_text(page, encoding="utf-8", errors="backslashreplace")
 
 
 def _png(figure: Any) -> str:

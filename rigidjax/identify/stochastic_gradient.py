@@ -64,13 +64,13 @@ def descend(
     how: Descent,
     key: PRNGKeyArray,
     progress: Callable[[str], Any] | None = None,
-) -> Parameters:
+) -> tuple[Parameters, bool]:
     """Where the steps of `how` end; where the misfit stops being a number, the point before.
 
     **Arguments:** `start`; `problem` of any number of recordings; `noise` (R, k) of each sensor;
-    `how`; `key` of the draws; `progress` called with a line of text now and then. An interruption
-    (Ctrl-C) keeps the point reached. **Raises** `ValueError` where a batch is larger than the
-    number of recordings, or the recordings are pieces of one.
+    `how`; `key` of the draws; `progress` called with a line of text now and then. **Returns** the
+    point, and whether the steps were not interrupted (Ctrl-C). **Raises** `ValueError`
+    where a batch is larger than the number of recordings, or the recordings are pieces of one.
     """
     if how.batch > problem.count:
         raise ValueError(
@@ -92,8 +92,8 @@ def descend(
                 done = first + keys.shape[0]
                 progress(f"descent {done}/{how.steps}: misfit {float(costs.mean()):.6g}")
     except KeyboardInterrupt:
-        pass
-    return point
+        return point, False
+    return point, True
 
 
 @eqx.filter_jit

@@ -14,7 +14,7 @@ from rigidjax import _checks
 from rigidjax._types import HasAttitude
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.body.principal_axes import principal
-from rigidjax.plot.style import COLOURS, attitudes, cube, matrices, pyplot
+from rigidjax.plot.style import COLOURS, attitudes, cube, matrices, plain, pyplot
 
 # Corners of the cube, and its faces in pairs across x, y, z, seen from outside counter-clockwise.
 CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
@@ -116,7 +116,7 @@ def tumble(
         solid.set_verts([placed[list(face)] for face in FACES])
         solid.set_facecolor(colours)
         trail.set_data_3d(*tips[when <= moment].T)
-        ax.set_title(f"{title}  t = {moment:.3g} s".strip(), fontsize=10)
+        ax.set_title(plain(f"{title}  t = {moment:.3g} s".strip()), fontsize=10)
         canvas.draw()
         shots.append(Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB"))
     # One palette for all, or the grey of the panes flickers.

@@ -10,6 +10,7 @@ from rigidjax.plot.style import (
     cube,
     globe,
     matrices,
+    plain,
     solid_axes,
 )
 
@@ -40,5 +41,5 @@ def body_axes(states: HasAttitude, *, title: str = "", ax: Any = None) -> Any:
         ax.plot(*path[-1:].T, color=colour, marker="^", ms=7, ls="")
     cube(ax, 1.0, ("x", "y", "z"))
     ax.legend(loc="upper left", fontsize=9)
-    ax.set_title(title or "body axes on the unit sphere, world frame")
+    ax.set_title(plain(title) or "body axes on the unit sphere, world frame")
     return ax

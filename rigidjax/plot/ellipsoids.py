@@ -9,7 +9,7 @@ from jax.flatten_util import ravel_pytree
 
 from rigidjax import _checks
 from rigidjax.body.inertia import Inertia, MassProperties
-from rigidjax.plot.style import AXES, COLOURS, row_of_axes
+from rigidjax.plot.style import AXES, COLOURS, plain, row_of_axes
 
 _PLANES = ((0, 1), (0, 2), (1, 2))
 
@@ -98,7 +98,7 @@ def inertia_ellipsoid(
         ax[0].figure.legend(
             *ax[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False
         )
-    ax[1].set_title(title or "outline of the body's ellipsoid, body frame")
+    ax[1].set_title(plain(title) or "outline of the body's ellipsoid, body frame")
     return ax
 
 

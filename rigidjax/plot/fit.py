@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rigidjax.plot.style import COLOURS, RATES, TIMES, of_fit, pyplot, unit
+from rigidjax.plot.style import COLOURS, RATES, TIMES, of_fit, plain, pyplot, unit
 from rigidjax.rotation import quaternion
 from rigidjax.solve import simulate
 
@@ -63,7 +63,7 @@ def fit(
         upper.legend(loc="upper right", ncols=3, fontsize="small")
         upper.set_title(f"{type(reading.sensor).__name__}: points read, lines fitted", fontsize=10)
     if title:
-        figure.suptitle(title)
+        figure.suptitle(plain(title))
     return figure
 
 

@@ -10,7 +10,7 @@ from jaxtyping import ArrayLike, Float
 
 from rigidjax import _checks
 from rigidjax.frames import MovingFrame, Point
-from rigidjax.plot.style import AXES, COLOURS, row_of_axes, rows
+from rigidjax.plot.style import AXES, COLOURS, plain, row_of_axes, rows
 
 
 def frames(
@@ -70,9 +70,9 @@ def frames(
         still = jax.tree.map(lambda leaf: jnp.zeros_like(leaf), inside)
         still = Point(still.x + jnp.asarray(here, still.x.dtype)[None], still.v)
         moved = np.asarray(jax.vmap(frame.to_inertial)(still, t).x)
-        ax[0].plot(here[i], here[j], color=colour, marker="s", ms=6, ls="", label=name)
-        ax[1].plot(moved[:, i], moved[:, j], color=colour, lw=0.9, ls="--", label=name)
+        ax[0].plot(here[i], here[j], color=colour, marker="s", ms=6, ls="", label=plain(name))
+        ax[1].plot(moved[:, i], moved[:, j], color=colour, lw=0.9, ls="--", label=plain(name))
     ax[1].legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False, fontsize=9)
     if title:
-        ax[0].figure.suptitle(title)
+        ax[0].figure.suptitle(plain(title))
     return ax

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from rigidjax import _checks
-from rigidjax.plot.style import COLOURS, row_of_axes
+from rigidjax.plot.style import COLOURS, plain, row_of_axes
 
 _KINDS = {
     "x": "position, m",
@@ -67,7 +67,7 @@ def horizons(
             errors = _checks.on_host(getattr(one, measure)[kind], f"found: {kind}")
             ahead = np.concatenate([[0.0], scale * _checks.on_host(one.steps, "found: steps")])
             line = np.concatenate([[0.0], errors])
-            one_ax.plot(ahead, line, color=colour, lw=1.4, label=name or None)
+            one_ax.plot(ahead, line, color=colour, lw=1.4, label=plain(name) or None)
         one_ax.set(xlabel="steps ahead" if step is None else "time ahead, s", ylabel=_KINDS[kind])
         one_ax.margins(x=0)
         one_ax.set_ylim(bottom=0.0)
@@ -75,5 +75,5 @@ def horizons(
     if any(named):
         ax[-1].legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
     said = _MEASURES[measure]
-    ax[0].set_title(f"{title}: {said}" if title else said, loc="left")
+    ax[0].set_title(plain(f"{title}: {said}" if title else said), loc="left")
     return ax

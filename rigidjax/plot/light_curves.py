@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import ArrayLike, Float
 
 from rigidjax import _checks
-from rigidjax.plot.style import COLOURS, TIMES, pyplot, unit
+from rigidjax.plot.style import COLOURS, TIMES, plain, pyplot, unit
 
 # Colours of one cycle after another, from the first to the last.
 _MAP = "viridis"
@@ -73,7 +73,7 @@ def light_curve(
         if quantity == "mag" and not one.yaxis_inverted():
             one.invert_yaxis()
     if title:
-        ax[0].set_title(title)
+        ax[0].set_title(plain(title))
     return ax
 
 

@@ -19,6 +19,7 @@ from rigidjax.plot.style import (
     flat_axes,
     globe,
     matrices,
+    plain,
     rows,
     solid_axes,
 )
@@ -81,7 +82,7 @@ def polhode(
     handles += [Patch(color=COLOURS[5], alpha=0.4), Line2D([], [], color=COLOURS[4], lw=0.8)]
     names += ["momentum sphere", "energy ellipsoid"]
     ax.legend(handles, names, loc="upper left", fontsize=8)
-    ax.set_title(title or "polhode, principal axes of the body")
+    ax.set_title(plain(title) or "polhode, principal axes of the body")
     return ax
 
 
@@ -173,6 +174,6 @@ def herpolhode(inertia: Inertia, states: HasAttitude, *, title: str = "", ax: An
     ax.plot(0, 0, color="0.2", marker="+", ms=8, ls="", label="momentum")
     ax.set_aspect("equal")
     ax.set(xlabel="ω along e₁, rad/s", ylabel="ω along e₂, rad/s")
-    ax.set_title(title or "herpolhode, across the angular momentum")
+    ax.set_title(plain(title) or "herpolhode, across the angular momentum")
     ax.legend(loc="upper right", fontsize=8)
     return ax

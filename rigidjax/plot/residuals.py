@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from rigidjax.plot.style import COLOURS, TIMES, of_fit, pyplot, unit
+from rigidjax.plot.style import COLOURS, TIMES, of_fit, plain, pyplot, unit
 
 # Frequencies of an uneven record, at most.
 _MOST = 2000
@@ -57,7 +57,7 @@ def residuals(
         row[0].set_ylabel(f"{type(reading.sensor).__name__}\nerror / noise")
         row[0].set_xlabel(f"time, {time_unit}")
         row[3].set_xlabel(f"frequency, {'Hz' if time_unit == 's' else f'1/{time_unit}'}")
-    ax[0, 1].set_title(title or "residuals of the fit")
+    ax[0, 1].set_title(plain(title) or "residuals of the fit")
     return ax
 
 

@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 
 from rigidjax import _checks
+from rigidjax._checks import plain as plain
 
 # Okabe and Ito's colours, told apart by everyone (Okabe and Ito 2008, "Color Universal Design").
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")

@@ -7,7 +7,17 @@ from jaxtyping import ArrayLike, Float
 
 from rigidjax import _checks
 from rigidjax._types import HasSpin
-from rigidjax.plot.style import COLOURS, RATES, TIMES, attitudes, matrices, pyplot, rows, unit
+from rigidjax.plot.style import (
+    COLOURS,
+    RATES,
+    TIMES,
+    attitudes,
+    matrices,
+    plain,
+    pyplot,
+    rows,
+    unit,
+)
 
 
 def motion(
@@ -62,7 +72,7 @@ def motion(
         # Beside the picture: a legend inside would lie on some line sooner or later.
         one.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
     if title:
-        ax[0].set_title(title)
+        ax[0].set_title(plain(title))
     return ax
 
 

@@ -3,6 +3,7 @@
 from collections.abc import Iterable
 from typing import Any
 
+from rigidjax._checks import plain
 from rigidjax.workprecision.pareto import first_answers, front
 from rigidjax.workprecision.record import Record, listed
 
@@ -52,10 +53,10 @@ def draw(records: Iterable[Record], *, title: str | None = None) -> Any:
             if name in ("foucault", "arenstorf") and kind == "value":
                 what = "relative error of the place"
             axis.set_xlabel(what)
-            axis.set_title(f"{name}: {kind}{words}", fontsize=10)
+            axis.set_title(plain(f"{name}: {kind}{words}"), fontsize=10)
             axis.set_ylabel("compile and run, ms" if words else "time, ms")
     if title:
-        figure.suptitle(title)
+        figure.suptitle(plain(title))
     return figure
 
 
@@ -77,7 +78,7 @@ def _one(axis: Any, records: list[Record], labels: list[tuple[str, str]]) -> Non
             [max(1e3 * (r.time_high - r.time), 0.0) for r in of],
         ]
         axis.errorbar(
-            errors, times, bars, label=label, color=colour, marker=_MARKS[i % len(_MARKS)],
+            errors, times, bars, label=plain(label), color=colour, marker=_MARKS[i % len(_MARKS)],
             markersize=4, linewidth=1.6 if group == "ours" else 0.9, elinewidth=0.6,
             linestyle="-" if group == "ours" else "--" if group == "jax" else ":",
         )  # fmt: skip

@@ -188,12 +188,6 @@ def _timed(records: list[Record]) -> list[Record]:
 
 
 def _draw(records: list[Record], path: Path) -> None:
-    try:
-        import matplotlib
-    except ModuleNotFoundError:
-        print("no figure: matplotlib is missing (pip install 'rigidjax[view]')")
-        return
-    matplotlib.use("Agg")
     chart.draw(_timed(records)).savefig(path, dpi=110)
     print(f"figure: {path}")
 

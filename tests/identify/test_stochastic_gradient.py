@@ -79,7 +79,7 @@ def test_descent_alone_comes_near_and_a_fit_ends_at_the_bottom(problem):
     blind = problem.start()
     blind = type(blind)(blind.body + 0.8, blind.shared, blind.own)
     said = []
-    near = descend(blind, problem, NOISE, how, jax.random.key(3), said.append)
+    near, _ = descend(blind, problem, NOISE, how, jax.random.key(3), said.append)
     whole = jnp.ones_like(problem.records.t)
     before, after = (float(misfit(p, (problem, NOISE, whole))) for p in (blind, near))
     # 1800 readings: the bottom is at 900; descent in noise of its own stays a little above.
@@ -91,7 +91,8 @@ def test_descent_alone_comes_near_and_a_fit_ends_at_the_bottom(problem):
 def test_where_the_misfit_is_lost_the_point_before_is_kept(problem):
     how = identify.Descent(optax.sgd(1e300), steps=100, batch=2)
     start = problem.start(BODY)
-    kept = descend(start, problem, NOISE, how, jax.random.key(0))
+    kept, whole = descend(start, problem, NOISE, how, jax.random.key(0))
+    assert whole
     assert all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(kept))
 
 

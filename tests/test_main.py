@@ -1,0 +1,228 @@
+"""The command line as a newcomer meets it: what is said, what is kept, and the exit code."""
+
+import html
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import jax.numpy as jnp
+import matplotlib as mpl
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+
+import rigidjax as rj
+from rigidjax import __main__ as command
+from rigidjax.__main__ import main
+
+GOOD = "t,wx,wy,wz\n" + "\n".join(f"{k},{np.cos(k):.6f},{np.sin(k):.6f},1.0" for k in range(12))
+
+
+@pytest.fixture(scope="module")
+def found():
+    """A fit, to be shown: how it was found does not count here."""
+    ts = jnp.linspace(0.0, 10.0, 60)
+    motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1, 0.1, 1.0]), ts)
+    record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), motion.ys.omega))
+    return rj.identify.fit(rj.identify.Problem(record, rj.identify.PrincipalRatios()), starts=1)
+
+
+@pytest.fixture
+def fitted(found, monkeypatch):
+    asked = []
+    monkeypatch.setattr(rj.identify, "fit", lambda problem, **how: asked.append(how) or found)
+    return asked
+
+
+@pytest.fixture(autouse=True)
+def closed():
+    yield
+    plt.close("all")
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """Ours, with a log in it."""
+    monkeypatch.chdir(tmp_path)
+    Path("log.csv").write_text(GOOD)
+    return tmp_path
+
+
+def environment(folder):
+    """A process of its own, with a cache folder of its own."""
+    unwanted = ("JAX_COMPILATION_CACHE_DIR", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS")
+    own = {name: value for name, value in os.environ.items() if name not in unwanted}
+    # matplotlib would look through all fonts again, and say so.
+    own |= {"XDG_CACHE_HOME": str(folder), "MPLCONFIGDIR": mpl.get_cachedir()}
+    return own | {"PYTHONPATH": str(Path(rj.__file__).parents[1])}
+
+
+@pytest.mark.oldest
+@pytest.mark.skipif(sys.platform != "linux", reason="the cache folder is that of Linux")
+def test_the_demo_says_nothing_but_its_progress(tmp_path):
+    """Neither cold nor with programs from the cache, of which XLA 0.10 has 2.6 kB a line to say."""
+    words = [sys.executable, "-m", "rigidjax", "identify", "--demo", "--starts", "2"]
+    how = {"env": environment(tmp_path), "cwd": tmp_path, "capture_output": True, "text": True}
+    cold, warm = (subprocess.run(words, **how, timeout=500) for _ in range(2))
+    assert (cold.returncode, cold.stderr) == (warm.returncode, warm.stderr) == (0, "")
+    assert cold.stdout == warm.stdout
+    held = tmp_path / "rigidjax"
+    assert held.stat().st_mode & 0o777 == 0o700 and len(list(held.iterdir())) > 5
+
+
+@pytest.mark.skipif(not hasattr(os, "getuid"), reason="users and modes are those of POSIX")
+@pytest.mark.parametrize(
+    ("mode", "owner", "used"),
+    [(None, 0, True), (0o755, 0, True), (0o777, 0, False), (0o770, 0, False), (0o700, 1, False)],
+)
+def test_programs_are_kept_in_a_folder_of_the_users_own(
+    mode, owner, used, tmp_path, monkeypatch, capsys
+):
+    said, user = {}, os.getuid()
+    config = SimpleNamespace(update=said.__setitem__)
+    monkeypatch.setattr(command, "jax", SimpleNamespace(config=config, __version_info__=(0, 12, 0)))
+    monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR", raising=False)
+    monkeypatch.setattr(command, "_cache_folder", lambda: tmp_path / "rigidjax")
+    if mode is not None:
+        (tmp_path / "rigidjax").mkdir()
+        (tmp_path / "rigidjax").chmod(mode)
+    monkeypatch.setattr(os, "getuid", lambda: user + owner)
+    command._keep_compiled()
+    assert ("jax_compilation_cache_dir" in said) == used
+    err = capsys.readouterr().err
+    assert (err == "") == used and ("is not yours alone" in err) != used
+    if used:
+        assert (tmp_path / "rigidjax").stat().st_mode & 0o777 == 0o700
+
+
+HARD = (r"m$\badcmd{$.csv", "<script>alert(1)</script>.csv", "_a$b$\x1b[31m.csv", "bad\udcff.csv")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="names that other systems refuse")
+@pytest.mark.parametrize("name", HARD)
+def test_hard_names_of_files_take_nothing_away(name, folder, fitted, capsys):
+    os.makedirs(os.path.dirname(name) or ".", exist_ok=True)
+    Path(name).write_text(GOOD)
+    options = ["--figure", "f", "--report", "r.html", "--json", "n.json"]
+    assert main(["identify", name, *options]) == 0
+    out = capsys.readouterr()
+    assert out.err == "" and "\x1b" not in out.out and "\udcff" not in out.out
+    assert "figure: f.png" in out.out and Path("f.png").stat().st_size > 10_000
+    page = Path("r.html").read_text()
+    assert page.count("data:image/png;base64,") == 3 and "<script>" not in page
+    shown = Path(name).name.replace("\x1b", r"\x1b").replace("\udcff", r"\udcff")
+    assert html.escape(shown) in page
+    assert json.loads(Path("n.json").read_text())["files"] == [shown]
+
+
+def test_names_of_columns_and_parameters_are_escaped_on_the_page(tmp_path):
+    ts = jnp.linspace(0.0, 10.0, 30)
+    motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1, 0.1, 1.0]), ts)
+    gyro = rj.identify.Gyro(0.01, bias=[0.0, 0.0, 0.0])
+    record = rj.identify.Recording(ts, (gyro, motion.ys.omega))
+    free = rj.identify.Free(lambda r: r.readings[0].sensor.bias, "<script>$", scale=0.01)
+    problem = rj.identify.Problem(record, rj.identify.PrincipalRatios(), free=[free])
+    found = rj.identify.fit(problem, starts=1)
+    page = tmp_path / "page.html"
+    rj.identify.report.write_html(found, page, title="<script>", files=["<script>"])
+    text = page.read_text()
+    assert "<script>" not in text and text.count("&lt;script&gt;") >= 5
+
+
+@pytest.mark.parametrize("broken", ["fit", "residuals", "write_json", "write_html", "both"])
+def test_what_fails_after_a_fit_takes_nothing_else_with_it(
+    broken, folder, fitted, monkeypatch, capsys
+):
+    def fails(*_, **__):
+        raise RuntimeError("of\nall things")
+
+    report = rj.identify.report
+    for name in ("write_json", "write_html") if broken == "both" else (broken,):
+        monkeypatch.setattr(report if name.startswith("write") else rj.plot, name, fails)
+    code = main(["identify", "log.csv", "--figure", "f.png", "--report", "r.html", "--json", "n.json"])
+    out = capsys.readouterr()
+    assert "Ix/Iz" in out.out and "status: ok" in out.out
+    wrong = {"fit": {"f.png"}, "write_json": {"n.json"}, "write_html": {"r.html"}, "residuals": set()}
+    wrong["both"] = {"n.json", "r.html"}
+    written = {name for name in ("f.png", "r.html", "n.json") if Path(name).exists()}
+    assert written == {"f.png", "r.html", "n.json"} - wrong[broken]
+    # A page without one of its figures is a page; that one is left out is said.
+    assert code == (2 if wrong[broken] else 0)
+    assert r"RuntimeError: of\nall things" in out.err
+
+
+def test_numbers_that_are_none_are_written_all_the_same(found, tmp_path):
+    import equinox as eqx
+
+    odd = eqx.tree_at(
+        lambda f: (f.chi2, f.correlation, f.noises),
+        found,
+        (np.nan, np.inf, (jnp.array([[np.inf, 1.0, 1.0]]),)),
+    )
+    rj.identify.report.write_json(odd, tmp_path / "n.json")
+    held = json.loads((tmp_path / "n.json").read_text())
+    assert held["chi2"] is None and held["correlation_samples"] is None
+    assert held["noise"] == [[None, 1.0, 1.0]]
+
+
+def test_ctrl_c_is_said_and_is_the_exit_code(folder, found, monkeypatch, capsys):
+    import equinox as eqx
+
+    status = "doubtful: interrupted after 1 of 8 starts"
+    cut = eqx.tree_at(lambda f: f.status, found, status)
+    monkeypatch.setattr(rj.identify, "fit", lambda *_, **__: cut)
+    assert main(["identify", "log.csv", "--json", "n.json"]) == 130
+    out = capsys.readouterr()
+    assert status in out.out and "interrupted" in out.err
+    assert json.loads(Path("n.json").read_text())["status"] == status
+
+    def at_once(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(rj.identify, "fit", at_once)
+    assert main(["identify", "log.csv"]) == 130
+    assert capsys.readouterr().err == "error: interrupted (Ctrl-C) before there was a result\n"
+
+
+REFUSED = [
+    (["log.csv", "--columns", "t", "wx", "wy", "wx"], "'wx' is named twice"),
+    (["log.csv", "--columns", "t", "t", "wy", "wz"], "'t' is named twice"),
+    (["log.csv", "--sensor", "gyro=wx,wy,wy"], "'wy' is named twice"),
+    (["log.csv", "--sensor", "gyro=wx,wy,wz", "--sensor", "accelerometer=wx,wy,wz"], "'wx' is named twice"),
+    (["log.csv", "--wheel", "wx:1e-6"], "'wx' is named twice"),
+    (["log.csv", "./log.csv"], "a log is given twice"),
+    (["log.csv", "--json", "log.csv"], "--json: log.csv is already the FILE"),
+    (["log.csv", "--json", "a", "--report", "./a"], "--json: a is already the report"),
+    (["log.csv", "--figure", "f.xyz"], "f.xyz: wanted a name that ends in .png, .pdf or .svg"),
+    (["log.csv", "--figure", "."], "is a folder"),
+    (["log.csv", "--json", "absent/n.json"], "there is no folder absent"),
+    (["log.csv", "--starts", "0"], "starts: wanted a whole number of at least 1, got 0"),
+    (["log.csv", "--sensor", "gyro=wx,wy,wz", "--unit", "deg/s"], "--unit: with --sensor"),
+    (["log.csv", "--sensor", "gyro=wx,wy,wz", "--noise", "1"], "--noise: with --sensor"),
+    (["log.csv", "--free", "delay"], "--free delay: that of a --wheel, and there is none"),
+    (["a\x1b[31m.csv"], r"a\x1b[31m.csv: no such file"),
+    (["log.csv", "--json", "a\x1b[31m/b"], r"there is no folder a\x1b[31m"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("options", "words"), REFUSED)
+@pytest.mark.usefixtures("unhooked")
+def test_mistakes_are_told_before_the_fit(options, words, folder, capsys):
+    before = sorted(folder.iterdir())
+    try:
+        code = main(["identify", *options])
+    except SystemExit as ended:
+        code = ended.code
+    err = capsys.readouterr().err
+    assert code == 2 and words in err and "\x1b" not in err
+    assert sorted(folder.iterdir()) == before and Path("log.csv").read_text() == GOOD
+
+
+def test_the_charts_of_other_commands_are_named_as_they_are_written(folder, capsys):
+    stored = Path(__file__).parent / "workprecision" / "record.csv"
+    with pytest.raises(SystemExit):
+        main(["workprecision", "--from", str(stored), "--csv", "absent/a.csv"])
+    assert "there is no folder absent" in capsys.readouterr().err
