@@ -5,7 +5,11 @@ import time
 import traceback
 
 import jax
-from surface import values_bodies as values_bodies, values_numbers as values_numbers
+from surface import (
+    values_bodies as values_bodies,
+    values_motion as values_motion,
+    values_numbers as values_numbers,
+)
 from surface.values import WAYS, draws_of, judged
 
 
