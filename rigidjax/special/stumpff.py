@@ -59,13 +59,13 @@ def _stumpff_jvp(k: int, primals: Any, tangents: Any) -> tuple[Any, Any]:
 def inverse_kernel(t: Float[Array, "..."]) -> Float[Array, "..."]:
     """The kernel (1 − (θ/2) cot(θ/2))/θ² of the inverse Jacobians, for t = θ² < (2π)².
 
-    **Arguments:** `t` of any shape, dimensionless. Written as (c_3 − 2c_4)/(2c_2), which is
+    **Arguments:** `t` of any shape, dimensionless. Written as (c_3 − 2c_4)/c_1(t/4)², which is
     1/12 at 0 without a quotient of vanishing numbers, and 1/π² at a half turn.
 
     >>> round(float(inverse_kernel(jnp.asarray(0.0))), 12)
     0.083333333333
     """
-    return (stumpff(3, t) - 2 * stumpff(4, t)) / (2 * stumpff(2, t))
+    return (stumpff(3, t) - 2 * stumpff(4, t)) / stumpff(1, 0.25 * t) ** 2
 
 
 def arctan_ratio(z: Float[Array, "..."]) -> Float[Array, "..."]:

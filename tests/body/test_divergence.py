@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from once import once
 
-from rigidjax.body import parameters
+from rigidjax.body import parameters, shapes
 from rigidjax.body.divergence import divergence
+from rigidjax.rotation import quaternion
 
 
 def body(seed):
@@ -33,6 +34,19 @@ def test_it_is_the_log_determinant_divergence_of_the_four_by_four_matrix(seed):
         ratio = mpmath.inverse(pseudo_inertia(b)) * pseudo_inertia(a)
         exact = sum(ratio[i, i] for i in range(4)) - mpmath.log(mpmath.det(ratio)) - 4
     np.testing.assert_allclose(divergence(a, b), float(exact), rtol=1e-11)
+
+
+@pytest.mark.parametrize("radius", [1e-1, 1e-2, 1e-3, 1e-4])
+def test_long_thin_bodies(radius):
+    """𝔖 is known to ε of its largest entry, its smallest eigenvalue to ε 𝔖₁/𝔖₃."""
+    q = quaternion.exp(jnp.array([0.3, 0.5, -0.7]))
+    a = shapes.cylinder(1.1, 1.1 * radius, 1.05).rotated(q)
+    b = shapes.cylinder(1.0, radius, 1.0).rotated(q)
+    with mpmath.workdps(50):
+        ratio = mpmath.inverse(pseudo_inertia(b)) * pseudo_inertia(a)
+        right = sum(ratio[i, i] for i in range(4)) - mpmath.log(mpmath.det(ratio)) - 4
+    assert abs(float(divergence(a, b) - float(right))) < 8 * 2.2e-16 * 4 / 12 / (radius / 2) ** 2
+    assert abs(float(divergence(b, b))) < 8 * 2.2e-16 * 4 / 12 / (radius / 2) ** 2
 
 
 def test_zero_only_at_the_reference_and_flat_there():

@@ -78,6 +78,27 @@ def test_inverse_kernel(dtype):
 
 
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_inverse_kernel_near_a_full_turn(dtype):
+    """It is 1/θ(2π − θ) there, and as good as 2π − θ is."""
+    eps = np.finfo(dtype).eps
+    left = np.array([1, 1e-1, 1e-2, 1e-3] + [1e-5, 1e-7] * (dtype == np.float64))
+    ts = np.square(2 * np.pi - left).astype(dtype)
+    left = 2 * np.pi - np.sqrt(ts.astype(float))
+
+    def want(t):
+        half = mp.sqrt(t) / 2
+        return (1 - half * mp.cot(half)) / t
+
+    got = jax.vmap(stumpff.inverse_kernel)(ts)
+    slope = jax.vmap(jax.grad(stumpff.inverse_kernel))(ts)
+    with mp.workdps(40):
+        values = np.array([float(want(mp.mpf(float(t)))) for t in ts])
+        slopes = np.array([float(mp.diff(want, mp.mpf(float(t)))) for t in ts])
+    for found, right, lost in ((got, values, 1), (slope, slopes, 2)):
+        np.testing.assert_array_less(abs(np.asarray(found, float) / right - 1), 8 * eps * (1 + lost * np.pi / left))
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
 def test_arctan_ratio(dtype):
     z = np.linspace(0, np.tan(np.pi / 8) ** 2, 50).astype(dtype)
     root = np.sqrt(z.astype(np.float64)[1:])
