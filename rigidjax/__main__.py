@@ -111,7 +111,9 @@ def _keep_compiled() -> None:
         # where a user's folder is his own already.
         if hasattr(os, "getuid"):
             if held.st_uid != os.getuid() or held.st_mode & 0o022:
-                words = f"compiled programs: {folder} is not yours alone, so it is not used; delete it"
+                words = (
+                    f"compiled programs: {folder} is not yours alone, so it is not used; delete it"
+                )
                 print(_checks.printable(words), file=sys.stderr)
                 return
             folder.chmod(0o700)

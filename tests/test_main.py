@@ -142,10 +142,17 @@ def test_what_fails_after_a_fit_takes_nothing_else_with_it(
     report = rj.identify.report
     for name in ("write_json", "write_html") if broken == "both" else (broken,):
         monkeypatch.setattr(report if name.startswith("write") else rj.plot, name, fails)
-    code = main(["identify", "log.csv", "--figure", "f.png", "--report", "r.html", "--json", "n.json"])
+    code = main(
+        ["identify", "log.csv", "--figure", "f.png", "--report", "r.html", "--json", "n.json"]
+    )
     out = capsys.readouterr()
     assert "Ix/Iz" in out.out and "status: ok" in out.out
-    wrong = {"fit": {"f.png"}, "write_json": {"n.json"}, "write_html": {"r.html"}, "residuals": set()}
+    wrong = {
+        "fit": {"f.png"},
+        "write_json": {"n.json"},
+        "write_html": {"r.html"},
+        "residuals": set(),
+    }
     wrong["both"] = {"n.json", "r.html"}
     written = {name for name in ("f.png", "r.html", "n.json") if Path(name).exists()}
     assert written == {"f.png", "r.html", "n.json"} - wrong[broken]

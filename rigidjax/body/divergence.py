@@ -18,7 +18,8 @@ def divergence(body: MassProperties, reference: MassProperties) -> Scalar:
     `J = [[𝔖 + m c cᵀ, m c], [m cᵀ, m]]`: zero only if the bodies are equal, convex in J, infinite
     at plates and rods, and unchanged when both bodies are seen from another frame or in other
     units. Known to round-off of the trace. Add `weight * divergence(body, guess)` to a loss so that
-    what the data cannot see stays near the guess. It is twice the Kullback–Leibler divergence for the mass seen as a Gaussian.
+    what the data cannot see stays near the guess. It is twice the Kullback–Leibler divergence for
+    the mass seen as a Gaussian.
 
     **Arguments:** `body`; `reference` a body with a positive definite 𝔖; the same frame and units.
 

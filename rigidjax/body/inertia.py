@@ -155,7 +155,7 @@ class Inertia(eqx.Module):
         >>> Inertia.from_principal(1.0, 2.0, 2.5).invertible().moments
         Array([1. , 2. , 2.5], dtype=float64)
         """
-        return validation.nonzero_moments(self, self.tensor)
+        return validation.possible(self, self.tensor, None, throw=True)
 
     def __add__(self, other: "Inertia") -> "Inertia":
         """Two bodies turning as one about the same point, in the same axes."""
@@ -202,7 +202,7 @@ class MassProperties(eqx.Module):
         second_moment = _checks.floating(second_moment, (3, 3), "second_moment", batched=True)
         _checks.same_batch(mass=(mass, 0), com=(com, 1), second_moment=(second_moment, 2))
         dtype = jnp.result_type(mass, com, second_moment)
-        self.mass = validation.if_known(validation.real_mass, mass.astype(dtype))
+        self.mass = validation.mass_of_a_body(mass.astype(dtype))
         self.com = validation.if_known(validation.real_place, com.astype(dtype))
         self.second_moment = validation.if_known(
             validation.real_second_moment, second_moment.astype(dtype)
@@ -235,7 +235,7 @@ class MassProperties(eqx.Module):
         >>> MassProperties(1.0, [0.0, 0, 0], [[1.0, 0, 0], [0, 1, 0], [0, 0, 1]]).invertible().mass
         Array(1., dtype=float64)
         """
-        return validation.nonzero_moments(self, self.inertia.tensor)
+        return validation.possible(self, self.inertia.tensor, self.mass, throw=True)
 
     def second_moment_about(self, point: Vector) -> Mat3:
         """𝔖 about another point: `𝔖 + m d dᵀ`, `d = c − point`.

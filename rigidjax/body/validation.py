@@ -8,6 +8,8 @@ round-off are tolerated, so that plates, rods and points, which lie on the bound
 from collections.abc import Callable
 from typing import Any
 
+import equinox as eqx
+import jax
 import jax.core
 import jax.numpy as jnp
 import numpy as np
@@ -38,6 +40,11 @@ def real_mass(mass: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
     mass = _finite(mass, "mass")
     found = f", got {np.asarray(mass)}" if known(mass) else ""
     return _checks.refuse(mass, (mass <= 0).any(), f"mass: wanted a positive mass (kg){found}")
+
+
+def mass_of_a_body(mass: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+    """A positive mass as it is; another is refused if it is known, and NaN if it is traced."""
+    return real_mass(mass) if known(mass) else jnp.where(mass > 0, mass, jnp.nan)
 
 
 def real_place(com: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3"]:
@@ -71,23 +78,74 @@ def real_second_moment(s: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3 
     )
 
 
-def nonzero_moments(body: Any, tensor: Float[Array, "*batch 3 3"]) -> Any:
-    """Return `body` unless its inertia `tensor` has a moment that is zero to round-off, or NaN."""
-    _checks.numbers(tensor, "inertia tensor")
-    if known(tensor):
-        _finite(tensor, "inertia tensor")
-    moments = _eigenvalues(tensor)
-    bad = (moments[..., 0] <= _slack(tensor) * moments[..., 2]).any()
-    found = f" {_show(moments)} kg m²" if known(tensor) else ", or not a number"
-    if not known(tensor):
-        # The eigenvalues of a matrix with a NaN need not be NaN.
-        bad = bad | ~jnp.isfinite(tensor).all()
-    return _checks.refuse(
-        body,
-        bad,
-        f"inertia: a principal moment is zero{found}; the equations of motion divide by it. A "
-        "thin rod or a point does not resist turning about that axis: give it a thickness",
-    )
+def possible(body: Any, tensor: Float[Array, "*batch 3 3"], mass: Any, throw: bool) -> Any:
+    """Return `body` if a body can be so and turns in all directions.
+
+    Else known numbers, and traced ones with `throw`, are refused with the cause; without `throw`
+    all numbers of a traced body are NaN, so that its motion is, too, and no other's.
+
+    **Arguments:** `tensor` the inertia, kg m²; `mass` kg, `None` for a body that only turns.
+    """
+    tensor = _checks.numbers(tensor, "inertia tensor")
+    is_known = known(tensor) and (mass is None or known(mass))
+    xp = np if is_known else jnp
+    light = xp.asarray(False) if mass is None else ~(_values(mass) > 0)
+    flat, broken = _impossible(xp, _values(tensor), _slack(tensor))
+    bad = light | flat | broken
+    if is_known:
+        if bad.any():
+            if mass is not None:
+                real_mass(mass)
+            real_inertia(tensor)
+            _checks.refuse(body, True, f"{_FLAT} {_show(_eigenvalues(tensor))} kg m²{_THIN}")
+        return body
+    if not throw:
+        nan = lambda a: jnp.where(bad.reshape(bad.shape + (1,) * (a.ndim - bad.ndim)), jnp.nan, a)  # noqa: E731
+        return jax.tree.map(nan, body)
+    which = jnp.where(light.any(), 0, jnp.where(broken.any(), 1, 2))
+    words = [_MASS, _BROKEN, f"{_FLAT}, or not a number{_THIN}"]
+    return eqx.branched_error_if(body, bad.any(), which, words)
+
+
+_MASS = "mass: wanted a positive mass (kg), got zero, a negative one or NaN"
+_BROKEN = (
+    "inertia: wanted moments that are not negative and keep the triangle inequality I1 + I2 ≥ I3, "
+    "got others: no distribution of mass has such moments. Is this a second moment 𝔖? then use "
+    "from_second_moment"
+)
+_FLAT = "inertia: a principal moment is zero"
+_THIN = (
+    "; the equations of motion divide by it. A thin rod or a point does not resist turning about "
+    "that axis: give it a thickness"
+)
+
+
+def _impossible(xp: Any, tensor: Any, slack: float) -> tuple[Any, Any]:
+    """Whether a moment is zero to round-off or NaN, and whether no mass has these moments.
+
+    No mass has them unless 𝔖 = ½Tr(I) 1 − I is positive semi-definite: its principal minors tell,
+    for a tenth of what eigenvalues cost in a batch.
+    """
+
+    def minors(a: Any) -> tuple[Any, ...]:
+        xx, yy, zz, xy, xz, yz = (a[..., i, j] for i, j in _PAIRS)
+        two = xx * yy - xy * xy, xx * zz - xz * xz, yy * zz - yz * yz
+        whole = xx * two[2] - xy * (xy * zz - xz * yz) + xz * (xy * yz - xz * yy)
+        return xx, yy, zz, *two, whole
+
+    trace = tensor[..., 0, 0] + tensor[..., 1, 1] + tensor[..., 2, 2]
+    safe = xp.where(trace > 0, trace, 1)
+    a = tensor / safe[..., None, None]
+    second = 0.5 * xp.eye(3, dtype=a.dtype) - a
+    broken = trace < 0
+    for minor in minors(second):
+        broken = broken | (minor < -slack)
+    # det I is between half and one times the product of the least moment and the largest squared.
+    least = minors(a)[-1]
+    return ~(trace > 0) | ~(least > 0.125 * slack), broken
+
+
+_PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 
 def unit_quaternion(q: Quaternion) -> Quat:

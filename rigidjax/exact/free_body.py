@@ -11,6 +11,7 @@ from jaxtyping import Array
 
 from rigidjax import _checks
 from rigidjax._types import HasAttitude, HasPose, HasSpin, Mat3, Quat, Scalar, ScalarLike
+from rigidjax.body import validation
 from rigidjax.body.inertia import Inertia
 from rigidjax.exact._xla import fence, opaque_one
 from rigidjax.exact.components3 import Six, Triple, adjugate, determinant, times
@@ -45,6 +46,7 @@ class FreeBody(eqx.Module):
 
     def __init__(self, inertia: Inertia, state0: HasSpin):
         _check(inertia, state0)
+        inertia = validation.possible(inertia, inertia.tensor, None, throw=False)
         omega = state0.omega
         # Powers of two, so that scaling costs no digit and no body is too large or small.
         self.exponent = exponent_of(omega)

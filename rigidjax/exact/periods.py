@@ -7,6 +7,7 @@ import jax.numpy as jnp
 
 from rigidjax import _checks
 from rigidjax._types import Mat3, Scalar, Vec3, Vec3Like
+from rigidjax.body import validation
 from rigidjax.body.inertia import Inertia
 from rigidjax.exact import sigma_form
 from rigidjax.exact.complete_integrals import half_period
@@ -69,9 +70,7 @@ def precession_period(inertia: Inertia, omega0: Vec3Like) -> Scalar:
 
 def _checked(inertia: Inertia, omega0: Vec3Like) -> tuple[Mat3, Vec3]:
     _checks.single(inertia, Inertia, "inertia", hint="of MassProperties pass .inertia")
-    if _checks.known(inertia.tensor):
-        inertia = inertia.invertible()
-    tensor = inertia.tensor
+    tensor = validation.possible(inertia, inertia.tensor, None, throw=False).tensor
     return tensor, _checks.floating(omega0, (3,), "omega0").astype(tensor.dtype)
 
 

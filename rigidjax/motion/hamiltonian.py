@@ -9,7 +9,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from rigidjax import _checks
 from rigidjax._types import HasAttitude, Mat3, Scalar, ScalarLike, Vec3
-from rigidjax.body import inertia as _inertia
+from rigidjax.body import inertia as _inertia, validation
 from rigidjax.body._types import Vectors
 from rigidjax.motion.torques import HeavyTop
 from rigidjax.rotation import quaternion
@@ -117,7 +117,7 @@ def lie_poisson_with_direction(hamiltonian: Callable[[Any, Any], Any]) -> LiePoi
 
 def _invertible(inertia: Any) -> _inertia.Inertia:
     _checks.single(inertia, _inertia.Inertia, "inertia")
-    return inertia.invertible() if _checks.known(inertia) else inertia
+    return validation.possible(inertia, inertia.tensor, None, throw=False)
 
 
 class RotationalHamiltonian(eqx.Module):

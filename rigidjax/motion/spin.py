@@ -57,8 +57,8 @@ class EulerEquations(eqx.Module):
         _checks.single(inertia, _inertia.Inertia, "inertia", hint=_HINT)
         if torque is not None:
             require_law(torque)
-        # Where the numbers are traced, `simulate` has looked at them before.
-        self.inertia = inertia.invertible() if validation.known(inertia.tensor) else inertia
+        # Traced numbers of no body are NaN from here on: in a batch the other bodies go on.
+        self.inertia = validation.possible(inertia, inertia.tensor, None, throw=False)
         # Once per solve: a division inside the field costs 25 times the rest of it.
         self.inverse = _inertia.inverse(inertia.tensor)
         self.torque = torque

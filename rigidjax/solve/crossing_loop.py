@@ -157,7 +157,8 @@ def _pass(motion: Motion, search: Search, stops: Array, before: Array, body: _Bo
     after, size, following = motion.attempt(t, length, late, y)
     g, rate, slope = motion.condition(late, after)
     size = jnp.where(jnp.isnan(size), jnp.inf, size)
-    other = side * g <= 0
+    # Zero counts only where g came to it: not at the start, and not where it is zero all along.
+    other = (side * g < 0) | ((g == 0) & (body.g != 0) & (side != 0))
     wanted = -side if search.direction == 0 else jnp.full_like(side, search.direction)
     asked = -side == wanted
     here = _End(length, g, rate)
@@ -229,7 +230,7 @@ def _pass(motion: Motion, search: Search, stops: Array, before: Array, body: _Bo
         t=jnp.where(new, place, t),
         y=jnp.where(lift(new, y), jnp.where(lift(done, y), shifted, after), y),
         h=next_h,
-        side=jnp.where(done | passed, -side, side),
+        side=jnp.where(done | passed, -side, jnp.where(accept & (side == 0), jnp.sign(g), side)),
         g=jnp.where(done, jnp.zeros_like(g), jnp.where(accept, g, body.g)),
         rate=jnp.where(new, rate, body.rate),
         stop=body.stop + (arrived | reached).astype(jnp.int32),

@@ -28,6 +28,7 @@ from rigidjax.solve.events import (
     require_step,
 )
 from rigidjax.solve.explicit import AbstractExplicit, DormandPrince8
+from rigidjax.solve.linear_map import lost
 from rigidjax.solve.run import Free, Loop
 from rigidjax.solve.step_control import Watched
 
@@ -96,7 +97,8 @@ def crossings(
       as accurate as a step, that of a free body to round-off.
     - `max_steps`: parts of steps included.
 
-    A start on the section does not count, and a tangential contact may be missed. Many bodies:
+    A start on the section does not count, a condition that is zero all along has no crossing, and a
+    tangential contact may be missed. Many bodies:
     `jax.vmap(lambda start: rj.crossings(body, start, …))`.
 
     **Returns** `Crossings`. Times and states have first and second derivatives with respect to all
@@ -157,4 +159,6 @@ def _solved(
     state0 = on_the_group(state0)
     step = None if step is None else lax.stop_gradient(step)
     found = found_by(search, setup, asked, step, what, state0, ts)
-    return Crossings(found.times, found.states, found.number, found.result, found.steps)
+    inputs = (asked, getattr(setup, "torque", None), state0, ts)
+    times, states = lost((found.times, found.states), inputs)
+    return Crossings(times, states, found.number, found.result, found.steps)

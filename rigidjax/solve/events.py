@@ -21,6 +21,7 @@ from rigidjax.solve.components import flat, unflat
 from rigidjax.solve.crossing_loop import Search
 from rigidjax.solve.crossing_search import Found, Numbers, Scene, correction, only_found
 from rigidjax.solve.direction import Directed, DirectedCondition, DirectedJumps
+from rigidjax.solve.linear_map import lost
 from rigidjax.solve.run import Free, Loop, solve
 from rigidjax.solve.vector_field import equations_of_motion
 
@@ -42,7 +43,7 @@ class Event(eqx.Module):
       the end of a step, or has one extremum within it; a condition that is much faster than the
       motion needs shorter steps.
 
-    A start at a zero does not count.
+    A start at a zero does not count, nor a condition that is zero all along.
 
     **Raises:** `TypeError`, `ValueError` for what is no function, another direction, a step that is
     not positive.
@@ -244,5 +245,7 @@ def solve_until(
     successful = result == dfx.RESULTS.successful
     met = met & successful
     time, state = jax.tree.map(lambda leaf: jnp.where(met, leaf, jnp.nan), (time, state))
+    inputs = (asked, getattr(setup, "torque", None), state0, ts)
+    ys, time, state = lost((ys, time, state), inputs)
     result = dfx.RESULTS.where(met, dfx.RESULTS.event_occurred, result)
     return ys, stats, result, time, state

@@ -6,14 +6,17 @@ directions, so that `jax.jvp`, `jax.vjp`, `jax.vmap` and forward over reverse al
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
+from jaxtyping import Array
 
 Arrays = list[Any]
 Map = Callable[..., Arrays]
@@ -58,6 +61,48 @@ def forward_only(function: Map, pushed: Map) -> Map:
         return out, [next(found) if _is_smooth(o) else _no_tangent(o) for o in out]
 
     return wrapped
+
+
+def lost(tree: Any, inputs: Any) -> Any:
+    """The same numbers; the derivative by all `inputs` of one that is NaN is NaN, in both modes.
+
+    What a run did not reach is put in by `where`, which has the derivative 0: a wrong one. A number
+    that is not used, cotangent 0, leaves the gradient of the others as it is.
+    """
+    outs, structure = jax.tree.flatten(tree)
+    whole = [_is_smooth(a) for a in outs]
+    smooth = [a for a, w in zip(outs, whole, strict=True) if w]
+    anchors = [a for a in jax.tree.leaves(inputs) if eqx.is_inexact_array(a)]
+    told = iter(_lost(len(smooth), *smooth, *anchors))
+    outs = [next(told) if w else a for a, w in zip(outs, whole, strict=True)]
+    return jax.tree.unflatten(structure, outs)
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _lost(count: int, *numbers: Array) -> Arrays:
+    return list(numbers[:count])
+
+
+@_lost.defjvp
+def _(count: int, primals: Any, tangents: Any) -> Any:
+    outs = list(primals[:count])
+    there = [jnp.isfinite(a) for a in outs]
+    # What the transpose has to know of the inputs is their shapes.
+    given = [*there, *[jnp.zeros_like(a) for a in primals[count:]]]
+
+    def along(*args: Array) -> Arrays:
+        moved = args[len(given) : len(given) + count]
+        return [jnp.where(t, m, jnp.nan) for t, m in zip(args[:count], moved, strict=True)]
+
+    def back(*args: Array) -> Arrays:
+        there, inputs, bars = args[:count], args[count : len(given)], args[len(given) :]
+        bad = jnp.asarray(False)
+        for t, bar in zip(there, bars, strict=True):
+            bad = bad | jnp.any(~t & (bar != 0))
+        kept = [jnp.where(t, bar, 0) for t, bar in zip(there, bars, strict=True)]
+        return [*kept, *[jnp.where(bad, jnp.full_like(a, jnp.nan), a) for a in inputs]]
+
+    return outs, linear_map(along, back, given, list(tangents))
 
 
 def _shape(a: Any) -> tuple[tuple[int, ...], Any]:

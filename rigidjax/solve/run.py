@@ -19,6 +19,7 @@ from rigidjax.motion.torques.base import jumps_of
 from rigidjax.solve.adaptive import adaptive
 from rigidjax.solve.direction import Directed, DirectedCondition, DirectedJumps
 from rigidjax.solve.explicit import AbstractExplicit
+from rigidjax.solve.linear_map import lost
 from rigidjax.solve.projection import Projected
 from rigidjax.solve.step_control import NONFINITE, finite
 from rigidjax.solve.vector_field import equations_of_motion
@@ -68,6 +69,14 @@ class Loop(eqx.Module):
 
 @eqx.filter_jit
 def solve(
+    setup: Free | Loop | Setup, state0: Any, ts: Array
+) -> tuple[Any, dict[str, Any], dfx.RESULTS]:
+    ys, stats, result = _solved(setup, state0, ts)
+    inputs = (setup.body, getattr(setup, "torque", None), state0, ts)
+    return lost(ys, inputs), stats, result
+
+
+def _solved(
     setup: Free | Loop | Setup, state0: Any, ts: Array
 ) -> tuple[Any, dict[str, Any], dfx.RESULTS]:
     # One jit around everything: an operation outside of it costs as much as a hundred steps.
@@ -180,8 +189,16 @@ def _raise(ys: Any, result: dfx.RESULTS) -> Any:
         "of the run? With equal steps: are they short enough for this spin? throw=False keeps "
         "what came before",
     )
+    ys = eqx.error_if(
+        ys,
+        result == dfx.RESULTS.dt_min_reached,
+        "simulate: no step is short enough: the minimum step size, some units of round-off of the "
+        "time, was reached. Does the torque jump or grow without bound? In float32 the times near "
+        "1e9 s are 100 s apart: count time from a later origin, or use float64",
+    )
     ill = (result != dfx.RESULTS.successful) & (result != dfx.RESULTS.event_occurred)
-    return result.error_if(ys, ill & (result != NONFINITE))
+    ill = ill & (result != NONFINITE) & (result != dfx.RESULTS.dt_min_reached)
+    return result.error_if(ys, ill)
 
 
 def _free(setup: Free, state0: Any, ts: Array) -> tuple[Any, dict[str, Any], dfx.RESULTS]:

@@ -95,13 +95,14 @@ def simulate(
       zero. `event_time` and `event_state` of the solution are exact to the tolerances, with first
       and second derivatives with respect to everything, the condition's own numbers, too; `ys`
       beyond are NaN, and `result` is `event_occurred`. Where it is not met they are NaN and the run
-      goes on. In our own loop and the closed form; for a solver of diffrax give `diffrax.Event`
-      there.
+      goes on (`jax_debug_nans` takes these NaN for mistakes). In our own loop and the closed form;
+      for a solver of diffrax give `diffrax.Event` there.
     - `max_steps`, `progress_meter`: as in `diffrax.diffeqsolve`.
     - `throw`: `False` never raises for what happens during the run, or for a bad start in a batch:
-      `result` says what happened, states not reached are NaN, and other bodies of the batch get
-      what they would get without the bad one, to the last bit. Known numbers that are wrong are
-      refused in any case.
+      `result` says what happened, states not reached are NaN, as are their derivatives, and other
+      bodies of the batch get what they would get without the bad one, to the last bit. The motion of
+      a traced body that cannot be (a mass that is not positive, moments that no body has) is NaN,
+      its `result` is `nonfinite`. Known numbers that are wrong are refused in any case.
 
     **Returns** a `Solution`. A second call with other numbers of the same shapes does not compile
     again.

@@ -262,9 +262,7 @@ def unpack(x):
 
 
 LAMBDA = lambda i: (sum(i) - 2 * i) / 2  # noqa: E731
-way(
-    "body.parameters.pack", lambda m, c, s: parameters.pack(props(m, c, s)), BODY, pack, norm=True
-)
+way("body.parameters.pack", lambda m, c, s: parameters.pack(props(m, c, s)), BODY, pack, norm=True)
 way(
     "body.parameters.pack_second_moment body.parameters.pack_shape",
     lambda s: (parameters.pack_second_moment(s), parameters.pack_shape(s)),
@@ -434,8 +432,13 @@ way(
 # A box of density 1 + a x², whose integrals are powers.
 def weighted(a, size):
     power = lambda n, k: size[k] ** (n + 1) / (n + 1)  # noqa: E731
-    whole = lambda i, j, k: power(i, 0) * power(j, 1) * power(k, 2) + a * (  # noqa: E731
-        power(i + 2, 0) * power(j, 1) * power(k, 2))
+    whole = lambda i, j, k: (
+        power(i, 0) * power(j, 1) * power(k, 2)
+        + a
+        * (  # noqa: E731
+            power(i + 2, 0) * power(j, 1) * power(k, 2)
+        )
+    )
     e = np.eye(3, dtype=int)
     m = whole(0, 0, 0)
     c = np.array([whole(*e[k]) / m for k in range(3)])

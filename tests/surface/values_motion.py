@@ -440,8 +440,13 @@ way(
 )  # fmt: skip
 
 # Lagrange's and Lie and Poisson's equations: those of Euler, in Euler's angles.
-ANGLES = lambda rng, i: np.array([  # noqa: E731
-    rng.uniform(-3, 3), rng.uniform(0.3, 2.8), rng.uniform(-3, 3)])
+ANGLES = lambda rng, i: np.array(
+    [  # noqa: E731
+        rng.uniform(-3, 3),
+        rng.uniform(0.3, 2.8),
+        rng.uniform(-3, 3),
+    ]
+)
 
 
 def euler_top(m, c, g, i, q, rate):

@@ -320,7 +320,8 @@ def chart_rates(of, quaternion):
     def both(x, y):
         size = max(v.norm(x), 1)
         moved = lambda e: derivative(  # noqa: E731
-            lambda h: of(v.times(quaternion(x), v.quaternion_of(h * e / size))) * size)
+            lambda h: of(v.times(quaternion(x), v.quaternion_of(h * e / size))) * size
+        )
         slope = np.stack([moved(e) for e in v.eye()], 1)
         return slope @ y, v.solve(slope, y)
 
@@ -420,7 +421,8 @@ def tilted(sequence):
     """Angles whose middle one is not singular, or nearly."""
     proper = sequence[0] == sequence[2]
     middle = one_of(
-        between(0.2, 1.4), lambda rng, i: 10.0 ** rng.uniform(-6, -2) + (0 if proper else -np.pi / 2)
+        between(0.2, 1.4),
+        lambda rng, i: 10.0 ** rng.uniform(-6, -2) + (0 if proper else -np.pi / 2),
     )
     return lambda rng, i: np.array([rng.uniform(-3, 3), middle(rng, i), rng.uniform(-3, 3)])
 
@@ -470,7 +472,8 @@ def hermite(ts, q, p, w0, w1, t):
 def interpolant(ts, q, p, w0, w1, t):
     # Two knots far from t beside them: the piece is found among several.
     made = AttitudeInterpolant(
-        jnp.stack([ts[0], ts[1], ts[1] + 1.0]), jnp.stack([q, p, p]), jnp.stack([w0, w1, w1]))
+        jnp.stack([ts[0], ts[1], ts[1] + 1.0]), jnp.stack([q, p, p]), jnp.stack([w0, w1, w1])
+    )
     return q4.to_matrix(made(t)), made.omega(t)
 
 
