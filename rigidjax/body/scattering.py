@@ -9,6 +9,7 @@ import abc
 import math
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -16,13 +17,13 @@ from jaxtyping import Array, Float
 from rigidjax import _checks
 from rigidjax._types import Mat3, Scalar, Vec3, Vec3Like
 from rigidjax.body._types import Numbers
-from rigidjax.rotation.linalg3 import cross, dot, entries
+from rigidjax.rotation.linalg3 import apply, cofactors, cross, determinant, dot
 from rigidjax.special.scaling import exponent_of, times_power_of_two
 
 # Below it the function of Lommel and Seeliger's law is a series, of so many terms.
 _SMALL, _TERMS = 0.1, 16
-# Gauss–Legendre points across and along the lune, for Lambert's law.
-_ACROSS, _ALONG = 12, 24
+# Gauss–Legendre points of both integrals of Lambert's law.
+_POINTS = 32
 
 
 class AbstractScattering(eqx.Module):
@@ -73,7 +74,8 @@ class LommelSeeliger(AbstractScattering):
     Of an ellipsoid `π (|p||q| + p·q)/(|p| + |q|) [1 − (1 − z²) artanh(z)/z]/z²` with
     `z = |p + q|/(|p| + |q|)`, p and q times the product of the semi-axes. A form of the closed
     result of Muinonen and Lumme 2015, A&A 584:A23, doi:10.1051/0004-6361/201526456, that keeps its
-    digits at any phase.
+    digits at any phase. At zero phase exactly the second derivative by a direction is −∞ (the
+    brightness is like φ² ln φ there); what is returned is finite and wrong.
 
     >>> float(LommelSeeliger().per_area(jnp.asarray(0.5), jnp.asarray(0.5)))
     0.5
@@ -86,14 +88,15 @@ class LommelSeeliger(AbstractScattering):
 
     def of_ellipsoid(self, shape: Mat3, sun: Vec3, observer: Vec3) -> Scalar:
         p, q, more, w, rest = _sides(shape, sun, observer)
-        return math.pi * _over(more, p + q) * _lune(w, rest)
+        return math.pi * _over(more, p + q) * (1.0 - rest * _excess(w, rest))
 
 
 class Lambert(AbstractScattering):
     """`3/2 μ₀ μ`: the law of bright, rough surfaces.
 
-    Of a triaxial ellipsoid it has no elementary form: Gauss–Legendre points on the lune, 12 across
-    and 24 along it, give six digits or more of axes up to 3 : 1.
+    Of a triaxial ellipsoid it has no elementary form: two integrals of one variable, by 32 points
+    each. Of axes up to 30 : 1, at phases up to 170°, the relative error is below 1e-9; errors of
+    first and second derivatives are below 1e-8 and 1e-6 of the brightness.
 
     >>> float(Lambert().per_area(jnp.asarray(1.0), jnp.asarray(0.5)))
     0.75
@@ -129,24 +132,12 @@ def direction(value: Vec3Like | Numbers, name: str) -> Vec3:
 
 def _sides(shape: Mat3, sun: Vec3, observer: Vec3) -> tuple[Scalar, ...]:
     """|p|, |q|, |p||q| + p·q, z² and 1 − z², p and q times the product of the semi-axes."""
-    xx, xy, xz, _, yy, yz, _, _, zz = entries(shape)
-    c00, c11, c22 = yy * zz - yz * yz, xx * zz - xz * xz, xx * yy - xy * xy
-    c01, c02, c12 = xz * yz - xy * zz, xy * yz - xz * yy, xy * xz - xx * yz
-    (s0, s1, s2), (o0, o1, o2) = (tuple(v[k] for k in range(3)) for v in (sun, observer))
-    m0, m1, m2 = (
-        c00 * s0 + c01 * s1 + c02 * s2,
-        c01 * s0 + c11 * s1 + c12 * s2,
-        c02 * s0 + c12 * s1 + c22 * s2,
-    )
-    pp, pq = s0 * m0 + s1 * m1 + s2 * m2, o0 * m0 + o1 * m1 + o2 * m2
-    qq = c00 * o0 * o0 + c11 * o1 * o1 + c22 * o2 * o2
-    qq = qq + 2.0 * (c01 * o0 * o1 + c02 * o0 * o2 + c12 * o1 * o2)
-    p, q = _root(pp), _root(qq)
+    minors = cofactors(shape)
+    of_sun, turned = apply(minors, sun), cross(sun, observer)
+    pq = dot(observer, of_sun)
+    p, q = _root(dot(sun, of_sun)), _root(dot(observer, apply(minors, observer)))
     # |p × q|² without subtraction: what is small at zero phase and opposite to it keeps its digits.
-    n0, n1, n2 = s1 * o2 - s2 * o1, s2 * o0 - s0 * o2, s0 * o1 - s1 * o0
-    turned = xx * n0 * n0 + yy * n1 * n1 + zz * n2 * n2
-    turned = turned + 2.0 * (xy * n0 * n1 + xz * n0 * n2 + yz * n1 * n2)
-    across = turned * (xx * c00 + xy * c01 + xz * c02)
+    across = dot(turned, apply(shape, turned)) * determinant(shape)
     ahead = pq > 0
     large = p * q + jnp.where(ahead, pq, -pq)
     small = _over(across, large)
@@ -155,67 +146,96 @@ def _sides(shape: Mat3, sun: Vec3, observer: Vec3) -> tuple[Scalar, ...]:
     return p, q, more, 1.0 - rest, rest
 
 
-def _lune(w: Scalar, rest: Scalar) -> Scalar:
-    """`[1 − (1 − w) artanh(√w)/√w]/w`, with `rest` = 1 − w; 2/3 at w = 0, 1 at w = 1."""
-    near = w < _SMALL
+def _excess(w: Array, rest: Array) -> Array:
+    """`(artanh(√w)/√w − 1)/w`, with `rest` = 1 − w, also of complex numbers; 1/3 at w = 0."""
+    near = jnp.abs(w) < _SMALL
     few = jnp.where(near, w, 0.0)
     series = jnp.zeros_like(w)
     for k in reversed(range(_TERMS)):
-        series = series * few + 2.0 / ((2 * k + 1) * (2 * k + 3))
+        series = series * few + 1.0 / (2 * k + 3)
     far = jnp.where(near, 0.5, w)
     z = jnp.sqrt(far)
-    lone = rest > 0
+    lone = jnp.abs(rest) > 0
     # x ln x and its derivative's limit along any direction: at zero phase x is least.
     logarithm = jnp.where(lone, jnp.log(jnp.where(lone, rest, 1.0)), 0.0)
-    return jnp.where(near, series, (1.0 - rest * (jnp.log1p(z) - 0.5 * logarithm) / z) / far)
+    return jnp.where(near, series, ((jnp.log1p(z) - 0.5 * logarithm) / z - 1.0) / far)
 
 
 def _lambert(shape: Mat3, sun: Vec3, observer: Vec3) -> Scalar:
-    """`∫ μ₀ μ dA` over what is lit and seen, by points on the lune between p and q."""
-    # r = L u with the triangular root L of the tensor.
-    xx, xy, xz, _, yy, yz, _, _, zz = entries(shape)
-    a = jnp.sqrt(xx)
-    b, c = xy / a, xz / a
-    d = jnp.sqrt(yy - b * b)
-    e = (yz - b * c) / d
-    f = jnp.sqrt(zz - c * c - e * e)
+    """`∫ μ₀ μ dA` over what is lit and seen, as an integral over normals: dA = det E/(n·En)² dn.
 
-    def back(v: Vec3) -> Vec3:
-        x = v[0] / a
-        y = (v[1] - b * x) / d
-        return jnp.stack([x, y, (v[2] - c * x - e * y) / f])
+    Over all that is lit, with μ < 0 where it is not seen, it is `sun·T observer`,
+    `T = π det E ∫ (E + τ²)⁻¹ det(E + τ²)^(−½) dτ` from 0 on (both are one Gaussian integral). So
+    `B(sun, observer) = sun·T observer + B(sun, −observer)`: the smaller one is left, over a lune.
+    """
+    minors = cofactors(shape)
+    total, of_sun = shape[0, 0] + shape[1, 1] + shape[2, 2], apply(minors, sun)
+    size, second = determinant(shape), minors[0, 0] + minors[1, 1] + minors[2, 2]
+    x, w = np.polynomial.legendre.leggauss(_POINTS)
+    tangent, w = np.tan(0.25 * np.pi * (1.0 + x)), 0.25 * np.pi * w
+    tangent, w = (jnp.asarray(v, size.dtype) for v in (tangent, w * (1.0 + tangent**2)))
+    # τ² of the middle point, between the squares of the least and the largest semi-axis.
+    middle = jax.lax.stop_gradient(jnp.sqrt(total * size / second))
+    square, both = middle * tangent * tangent, dot(sun, observer)
+    top = total * both - dot(observer, apply(shape, sun)) + square * both
+    top = dot(observer, of_sun) + square * top
+    below = size + square * (second + square * (total + square))
+    whole = math.pi * size * jnp.sqrt(middle) * jnp.sum(w * top / (below * jnp.sqrt(below)))
+    seen = whole > 0
+    lune = _across_the_lune(shape, minors, sun, jnp.where(seen, -observer, observer))
+    return jnp.where(seen, whole, 0.0) + size * lune
 
-    p, q = back(sun), back(observer)
-    first = p / jnp.sqrt(dot(p, p))
-    pole = cross(p, q)
-    size, whole = dot(pole, pole), dot(p, p) * dot(q, q)
-    apart = size > jnp.finfo(size.dtype).eps * whole
-    # At zero phase any pole will do; what the lune's edge moves is of second order.
-    least = jnp.eye(3, dtype=p.dtype)[jnp.argmin(jnp.abs(p))]
-    pole = jnp.where(apart, pole, cross(first, least))
+
+def _across_the_lune(shape: Mat3, minors: Mat3, sun: Vec3, observer: Vec3) -> Scalar:
+    """`∫ (n·sun)(n·observer)/(n·En)² dn` over the normals n where both factors are positive.
+
+    Along the lune, `n ∝ a + t pole` with a across it, the integral over t is elementary.
+    """
+    pole = cross(sun, observer)
+    sine, apart = _root(dot(pole, pole)), dot(pole, pole) > jnp.finfo(pole.dtype).eps ** 2
+    # Where there is hardly a lune any pole will do.
+    least = jnp.eye(3, dtype=pole.dtype)[jnp.argmin(jnp.abs(sun))]
+    pole = jnp.where(apart, pole, cross(sun, least))
     pole = pole / jnp.sqrt(dot(pole, pole))
-    sine = jnp.sqrt(jnp.where(apart, size, 1.0))
-    ahead = jnp.where(dot(p, q) > 0, 0.0, math.pi)
-    angle = jnp.where(apart, jnp.arctan2(sine, dot(p, q)), ahead)
-    second = cross(pole, first)
-    x, wx = np.polynomial.legendre.leggauss(_ACROSS)
-    y, wy = np.polynomial.legendre.leggauss(_ALONG)
-    x, wx, y, wy = (jnp.asarray(v, p.dtype) for v in (x, wx, y, wy))
-    half = 0.5 * (math.pi - angle)
-    phi, psi = 0.5 * angle + half * x, 0.5 * math.pi * y
-    around = jnp.cos(phi)[:, None] * first[None, :] + jnp.sin(phi)[:, None] * second[None, :]
-    u = jnp.cos(psi)[None, :, None] * around[:, None, :] + (
-        jnp.sin(psi)[None, :, None] * pole[None, None, :]
+    edge = cross(pole, sun)
+    width = jnp.arctan2(jnp.where(apart, sine, 0.0), -dot(sun, observer))
+    e_edge, e_pole, turned = apply(shape, edge), apply(shape, pole), apply(minors, edge)
+    d0, d1, d2 = dot(sun, apply(minors, sun)), -dot(sun, turned), dot(edge, turned)
+    # The integrand has a peak where d is least. In a variable after two of Landen's transformations
+    # it has none: nearly that of an elliptic integral.
+    m0, m1, m2 = (jax.lax.stop_gradient(d) for d in (d0, d1, d2))
+    mean, far = 0.5 * (m0 + m2), jnp.sqrt(0.25 * (m0 - m2) ** 2 + m1 * m1)
+    first = 0.5 * jnp.arctan2(2.0 * m1, m0 - m2)
+    k = jnp.sqrt(jnp.maximum(mean - far, jnp.finfo(mean.dtype).eps * mean) / (mean + far))
+    ends, moduli = jnp.stack([-first, width - first]), []
+    for _ in range(2):
+        c, s = jnp.cos(ends), jnp.sin(ends)
+        ends = 2.0 * ends - jnp.arctan2((1.0 - k) * s * c, c * c + k * s * s)
+        moduli.append((1.0 - k) / (1.0 + k))
+        k = 2.0 * jnp.sqrt(k) / (1.0 + k)
+    x, w = (jnp.asarray(v, k.dtype) for v in np.polynomial.legendre.leggauss(_POINTS))
+    half = 0.5 * (ends[1] - ends[0])
+    angle, weight = ends[0] + half * (1.0 + x), half * w
+    for k in reversed(moduli):
+        s = k * jnp.sin(angle)
+        weight = 0.5 * weight * (1.0 + k * jnp.cos(angle) / jnp.sqrt(1.0 - s * s))
+        angle = 0.5 * (angle + jnp.arcsin(s))
+    angle = angle + first
+    c, s = jnp.cos(angle), jnp.sin(angle)
+    # With a = c edge + s sun: a·Ea, a·E pole, and the determinant of E on the plane of both.
+    along = c * c * dot(edge, e_edge) + s * (
+        2.0 * c * dot(sun, e_edge) + s * dot(sun, apply(shape, sun))
     )
-    weight = half * wx[:, None] * (0.5 * math.pi * wy * jnp.cos(psi))[None, :]
-    # |L⁻ᵀu|: how much longer the surface is there.
-    k = u[..., 2] / f
-    j = (u[..., 1] - e * k) / d
-    i = (u[..., 0] - b * j - c * k) / a
-    longer = jnp.sqrt(i * i + j * j + k * k)
-    lit = u[..., 0] * p[0] + u[..., 1] * p[1] + u[..., 2] * p[2]
-    seen = u[..., 0] * q[0] + u[..., 1] * q[1] + u[..., 2] * q[2]
-    return a * d * f * jnp.sum(weight * lit * seen / longer)
+    tilt = c * dot(edge, e_pole) + s * dot(sun, e_pole)
+    d = c * c * d0 + s * (2.0 * c * d1 + s * d2)
+    root = jnp.sqrt(d)
+    e = jax.lax.complex(root / along, -tilt / along)
+    square = e * e
+    excess = _excess(1.0 - square, square)
+    inner = (e + e * (1.0 - square) * excess).real * dot(pole, e_pole) / root + (
+        square * excess
+    ).real
+    return jnp.sum(weight * s * jnp.sin(width - angle) * inner / d)
 
 
 def _root(x: Scalar) -> Scalar:

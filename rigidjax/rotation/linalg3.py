@@ -178,6 +178,19 @@ def determinant(a: Mat3Like) -> Scalar:
     return dot_components(m[:3], cross_components(m[3:6], m[6:]))
 
 
+def cofactors(a: Mat3) -> Mat3:
+    """The matrix of cofactors: det a · a⁻ᵀ, also where there is no inverse.
+
+    **Arguments:** `a` (3, 3).
+
+    >>> cofactors(2.0 * jnp.eye(3)).tolist()
+    [[4.0, 0.0, 0.0], [0.0, 4.0, 0.0], [0.0, 0.0, 4.0]]
+    """
+    m = entries(a)
+    p, q, r = m[:3], m[3:6], m[6:]
+    return jnp.stack([jnp.stack(cross_components(*two)) for two in ((q, r), (r, p), (p, q))])
+
+
 def dot(a: Vec3Like, b: Vec3Like) -> Scalar:
     """Scalar product a · b.
 

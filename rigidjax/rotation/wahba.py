@@ -19,7 +19,17 @@ from rigidjax import _checks
 from rigidjax._types import Mat3, Mat3Like, Scalar, Vec3Like
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.kernels import matrix_to_quaternion
-from rigidjax.rotation.linalg3 import cross, determinant, dot, hat, near_one, product, solve, vee
+from rigidjax.rotation.linalg3 import (
+    cofactors,
+    cross,
+    determinant,
+    dot,
+    hat,
+    near_one,
+    product,
+    solve,
+    vee,
+)
 from rigidjax.rotation.validation import direction
 
 
@@ -132,7 +142,7 @@ def weights_of(weights: Any, like: Array, of: str) -> Array:
 
 def _quartic(b: Mat3) -> tuple[Scalar, Scalar]:
     """The sum of the singular values λ (signed by det), and ζ, of a matrix of Frobenius norm 1."""
-    det, adjugate = determinant(b), _cofactors(b)
+    det, adjugate = determinant(b), cofactors(b)
     flat = 4 * (adjugate * adjugate).sum()
 
     def newton(_: Any, root: Scalar) -> Scalar:
@@ -143,10 +153,6 @@ def _quartic(b: Mat3) -> tuple[Scalar, Scalar]:
     # From above the largest root, Newton's method comes down to it without overshooting.
     root = lax.fori_loop(0, 24, newton, jnp.full_like(det, np.sqrt(3)))
     return root, 0.5 * (root * root - 1) * root - det
-
-
-def _cofactors(b: Mat3) -> Mat3:
-    return jnp.stack([cross(b[1], b[2]), cross(b[2], b[0]), cross(b[0], b[1])])
 
 
 def _curvature(r: Mat3, b: Mat3) -> Mat3:
@@ -163,7 +169,7 @@ def nearest(b: Mat3) -> Mat3:
     b = b / jnp.sqrt((b * b).sum())
     root, zeta = _quartic(b)
     kappa = 0.5 * (root * root - 1)
-    rough = ((kappa + 1) * b + root * _cofactors(b) - product(b, product(b.T, b))) / zeta
+    rough = ((kappa + 1) * b + root * cofactors(b) - product(b, product(b.T, b))) / zeta
     q = matrix_to_quaternion(rough)
     # The root of the quartic may have half its digits; Newton steps on the group mend that.
     for _ in range(3):
