@@ -64,7 +64,7 @@ def environment(folder):
 @pytest.mark.skipif(sys.platform != "linux", reason="the cache folder is that of Linux")
 def test_the_demo_says_nothing_but_its_progress(tmp_path):
     """Neither cold nor with programs from the cache, of which XLA 0.10 has 2.6 kB a line to say."""
-    words = [sys.executable, "-m", "rigidjax", "identify", "--demo", "--starts", "2"]
+    words = [sys.executable, "-m", "rigidjax", "identify", "--demo"]
     how = {"env": environment(tmp_path), "cwd": tmp_path, "capture_output": True, "text": True}
     cold, warm = (subprocess.run(words, **how, timeout=500) for _ in range(2))
     assert (cold.returncode, cold.stderr) == (warm.returncode, warm.stderr) == (0, "")
@@ -142,10 +142,17 @@ def test_what_fails_after_a_fit_takes_nothing_else_with_it(
     report = rj.identify.report
     for name in ("write_json", "write_html") if broken == "both" else (broken,):
         monkeypatch.setattr(report if name.startswith("write") else rj.plot, name, fails)
-    code = main(["identify", "log.csv", "--figure", "f.png", "--report", "r.html", "--json", "n.json"])
+    code = main(
+        ["identify", "log.csv", "--figure", "f.png", "--report", "r.html", "--json", "n.json"]
+    )
     out = capsys.readouterr()
     assert "Ix/Iz" in out.out and "status: ok" in out.out
-    wrong = {"fit": {"f.png"}, "write_json": {"n.json"}, "write_html": {"r.html"}, "residuals": set()}
+    wrong = {
+        "fit": {"f.png"},
+        "write_json": {"n.json"},
+        "write_html": {"r.html"},
+        "residuals": set(),
+    }
     wrong["both"] = {"n.json", "r.html"}
     written = {name for name in ("f.png", "r.html", "n.json") if Path(name).exists()}
     assert written == {"f.png", "r.html", "n.json"} - wrong[broken]
@@ -223,6 +230,10 @@ def test_mistakes_are_told_before_the_fit(options, words, folder, capsys):
 
 def test_the_charts_of_other_commands_are_named_as_they_are_written(folder, capsys):
     stored = Path(__file__).parent / "workprecision" / "record.csv"
+    rows = stored.read_text().replace("simulate", r"s$\badcmd{$")
+    Path("stored.csv").write_text("\n".join(rows.splitlines()[:20]))
+    assert main(["workprecision", "--from", "stored.csv", "--figure", "chart"]) == 0
+    assert "figure: chart.png" in capsys.readouterr().out and Path("chart.png").exists()
     with pytest.raises(SystemExit):
         main(["workprecision", "--from", str(stored), "--csv", "absent/a.csv"])
     assert "there is no folder absent" in capsys.readouterr().err
