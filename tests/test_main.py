@@ -5,6 +5,7 @@ import json
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -191,7 +192,20 @@ def test_ctrl_c_is_said_and_is_the_exit_code(folder, found, monkeypatch, capsys)
 
     monkeypatch.setattr(rj.identify, "fit", at_once)
     assert main(["identify", "log.csv"]) == 130
-    assert capsys.readouterr().err == "error: interrupted (Ctrl-C) before there was a result\n"
+    assert capsys.readouterr().err == "error: interrupted (Ctrl-C); nothing more is written\n"
+
+
+def test_ctrl_c_is_not_lost_in_the_garbage_collector(monkeypatch):
+    """JAX has a callback there: what is raised in it Python shows and forgets."""
+
+    class Dropped:
+        def __del__(self):
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(sys, "unraisablehook", command._once_more)
+    with pytest.raises(KeyboardInterrupt):
+        Dropped()
+        time.sleep(5)
 
 
 REFUSED = [
