@@ -1,9 +1,11 @@
 """`python -m rigidjax`: identify a body from recordings; compare methods."""
 
+import _thread
 import argparse
 import functools
 import os
 import sys
+import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
@@ -42,11 +44,21 @@ def main(arguments: list[str] | None = None) -> int:
         # A name that the terminal cannot show must not end a run.
         for stream in (sys.stdout, sys.stderr):
             stream.reconfigure(errors="backslashreplace")  # pyright: ignore
+        sys.unraisablehook = _once_more
     try:
         return _run(options, parser, own=arguments is None)
     except KeyboardInterrupt:
-        _error("interrupted (Ctrl-C) before there was a result")
+        _error("interrupted (Ctrl-C); nothing more is written")
         return 130
+
+
+def _once_more(lost: Any) -> None:
+    """Ctrl-C where Python drops it, as in JAX's callback of the garbage collector: once more."""
+    if lost.exc_type is KeyboardInterrupt:
+        # From another thread, and later: here it would be dropped again.
+        threading.Timer(0.05, _thread.interrupt_main).start()
+    else:
+        sys.__unraisablehook__(lost)
 
 
 def _run(options: argparse.Namespace, parser: argparse.ArgumentParser, own: bool) -> int:

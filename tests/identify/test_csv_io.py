@@ -9,6 +9,7 @@ from scipy.io import savemat
 
 import rigidjax as rj
 from rigidjax.__main__ import main
+from rigidjax.identify.layouts import layout_of
 
 GOOD = "t,wx,wy,wz\n" + "\n".join(
     f"{0.1 * k:.1f},{np.cos(k):.6f},{np.sin(k):.6f},1.0" for k in range(12)
@@ -27,7 +28,13 @@ WRONG = {
     "text": (_swap(5, "0.3,1,fast,1"), "line 5: column 'wy': 'fast' is not a number"),
     "no time": (_swap(5, ",1,1,1"), "column 't': row 4 is empty"),
     "short line": (_swap(6, "0.4,1"), "line 6: column 'wy': the line ends before it"),
-    "time stands": (_swap(6, "0.3,1,1,1"), "line 6: column 't': time 0.3 is not above the 0.3"),
+    "time stands": (_swap(6, "0.3,1,1,1"), "column 't': row 5: time 0.3 is not above the 0.3"),
+    "a time that stands, below a comment": ("# by hand\n\n" + _swap(6, "0.3,1,1,1"), "column 't': row 5: time 0.3 is not above the 0.3"),
+    "a comment, no column": ("# by hand\n" + GOOD.replace("wy", "gyro"), "line 2: no column 'wy'; the columns are t, wx, gyro, wz"),
+    "a cell below comments": ("# by hand\n\n# twice\n" + _swap(5, "0.3,1,fast,1"), "line 8: column 'wy': 'fast' is not a number"),
+    "a cell below a header that is a comment": ("# by hand\n# " + _swap(5, "0.3,1,fast,1"), "line 6: column 'wy': 'fast' is not a number"),
+    "comments alone": ("# t,wx,wy,wz\n# t,wx,wy,wz\n", "wanted at least 4 samples, got 0"),
+    "escapes": (GOOD.replace("wy", "\x1b[31mwy\x9b\u202e"), r"line 1: no column 'wy'; the columns are t, wx, \x1b[31mwy\x9b\u202e, wz"),
     "empty": ("", "line 1: wanted a header"),
     "a thousand": (_swap(4, "0.2,1_000,1,1"), "line 4: column 'wx': '1_000' is not a number"),
     "digits of another alphabet": (_swap(4, "0.2,١,1,1"), "line 4: column 'wx': '١' is not a number"),
@@ -67,6 +74,34 @@ def test_commas_semicolons_and_tabs(separator, tmp_path):
     np.testing.assert_array_equal(table["t"], [0.0, 1.0])
     np.testing.assert_array_equal(table["wy"], [np.nan, 5.0])
     np.testing.assert_array_equal(table["wx"] + table["wz"], [4.0, 10.0])
+
+
+@pytest.mark.parametrize("comments", ["", "# by hand\n", "# 17.5\n\n# t,x\n#\n"])
+@pytest.mark.parametrize("mark", ["", "# ", "#"])
+@pytest.mark.parametrize("separator", [",", "\t"])
+def test_comments_above_the_header_and_the_header_of_savetxt(comments, mark, separator, tmp_path):
+    path, values = tmp_path / "log.csv", np.arange(20.0).reshape(5, 4)
+    header = separator.join(("t", "wx", "wy", "wz"))
+    np.savetxt(path, values, delimiter=separator, header=header, comments=mark)
+    path.write_text("\ufeff" + comments + path.read_text())
+    table = rj.identify.read_table(path, ["wz", "t", "wy"])
+    for place, name in ((0, "t"), (2, "wy"), (3, "wz")):
+        np.testing.assert_array_equal(table[name], values[:, place])
+
+
+def test_a_header_that_is_a_comment_is_known_as_that_of_phyphox(tmp_path):
+    names = ["Time (s)", *(f"Gyroscope {axis} (rad/s)" for axis in "xyz")]
+    path = tmp_path / "log.csv"
+    path.write_text("# export\n# " + ",".join(names) + "\n0,,1,\n1,2,3,4\n")
+    assert layout_of(path).columns == tuple(names)
+    np.testing.assert_array_equal(rj.identify.read_table(path, names[:2])[names[1]], [np.nan, 2.0])
+
+
+def test_a_name_that_is_wanted_twice_is_refused(tmp_path):
+    path = tmp_path / "log.csv"
+    path.write_text(GOOD)
+    with pytest.raises(rj.identify.LogError, match="'wx' is named twice"):
+        rj.identify.read_gyro_csv(path, columns=("t", "wx", "wy", "wx"))
 
 
 KINDS = ["empty", "cut", "text", "other"]

@@ -9,6 +9,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 
 import rigidjax as rj
@@ -127,6 +128,45 @@ def test_interrupting_keeps_what_was_found(tumble):
         rj.identify.Problem(record, rj.identify.Ratios()), starts=4, progress=stop
     )
     assert len(found.starts) == 1
+    assert not found.ok and found.status == "doubtful: interrupted after 1 of 4 starts"
+
+
+@pytest.mark.parametrize("good", [True, False])
+def test_interrupting_is_said_whatever_else_is(tumble, good):
+    """Of starts side by side, of a descent before them, of a motion that explains nothing."""
+    _, ts, ys = tumble
+    read = ys.omega if good else np.random.default_rng(3).normal(size=ys.omega.shape)
+    record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), read))
+    problem = rj.identify.Problem(record, rj.identify.Ratios())
+
+    def stop(line):
+        raise KeyboardInterrupt
+
+    kind = "doubtful: " if good else "poor: "
+    found = rj.identify.fit(problem, starts=4, together=2, progress=stop)
+    assert found.status.startswith(f"{kind}interrupted after 2 of 4 starts")
+
+    def in_descent(line):
+        if line.startswith("descent"):
+            raise KeyboardInterrupt
+
+    how = rj.identify.Descent(optax.sgd(1e-9), steps=2, batch=1)
+    found = rj.identify.fit(problem, starts=3, descent=how, progress=in_descent)
+    assert found.status.startswith(f"{kind}interrupted in the descent of start 1 of 3")
+    assert len(found.starts) == 1
+
+
+def test_two_numbers_of_one_name_are_refused(tumble):
+    """Values and intervals go by name: one would be shown with the interval of the other."""
+    _, ts, ys = tumble
+    gyro = rj.identify.Gyro(0.01, bias=[0.0, 0.0, 0.0])
+    record = rj.identify.Recording(ts, (gyro, ys.omega), (gyro, ys.omega))
+    free = [
+        rj.identify.Free(lambda r: r.readings[0].sensor.bias, "bias"),
+        rj.identify.Free(lambda r: r.readings[1].sensor.bias, "bias"),
+    ]
+    with pytest.raises(ValueError, match="Free 'bias': another Free has this name"):
+        rj.identify.Problem(record, rj.identify.Ratios(), free=free)
 
 
 def test_what_cannot_be_seen_is_said():

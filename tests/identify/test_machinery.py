@@ -16,7 +16,7 @@ from jax.flatten_util import ravel_pytree
 import rigidjax as rj
 from rigidjax import identify
 from rigidjax.__main__ import main
-from rigidjax.identify import checkpoint, quantities, search
+from rigidjax.identify import checkpoint, cli_spec, quantities, search
 from rigidjax.identify.checkpoint import Tried
 from rigidjax.identify.jacobian import errors_of_one, with_blocks
 from rigidjax.identify.padding import one
@@ -281,12 +281,60 @@ def test_a_fit_killed_after_any_stride_ends_at_the_same_bits(short_record, tmp_p
         identify.fit(other, starts=2, checkpoint=path)
 
 
+def test_a_checkpoint_is_known_by_all_that_the_search_depends_on(short_record):
+    """By the bytes, not by one sum of misfits: that of NaN equals none, that of ∞ any other."""
+    reading = short_record.readings[0]
+
+    def print_of(values, noise=0.01, body=None, count=2):
+        record = identify.Recording(short_record.t, (identify.Gyro(noise), values))
+        problem = identify.Problem(record, body or identify.PrincipalRatios())
+        odd = jnp.asarray([jnp.inf, jnp.nan])
+        return checkpoint.fingerprint([problem.start()] * count, problem, odd, 1e-4)
+
+    values = np.asarray(reading.values)
+    near = values.copy()
+    # A sum of misfits is the same for readings in another order.
+    near[[3, 4]] = near[[4, 3]]
+    found = [
+        print_of(values),
+        print_of(near),
+        print_of(np.nextafter(values, np.inf)),
+        print_of(values, noise=0.02),
+        print_of(values, body=identify.Ratios()),
+        print_of(values, count=3),
+    ]
+    assert len(set(found)) == len(found) and found[0] == print_of(values)
+
+
+def test_a_checkpoint_of_other_options_is_refused(short_record, tmp_path):
+    problem, path = identify.Problem(short_record, identify.PrincipalRatios()), tmp_path / "fit.npz"
+    found = identify.fit(problem, starts=1, max_steps=20, checkpoint=path)
+    again = identify.fit(problem, starts=1, max_steps=20, checkpoint=path)
+    np.testing.assert_array_equal(found.parameters.body, again.parameters.body)
+    for other in ({"max_steps": 21}, {"tolerance": 1e-3}):
+        with pytest.raises(ValueError, match="of another problem, or of other options"):
+            identify.fit(problem, starts=1, checkpoint=path, **{"max_steps": 20, **other})
+
+
+def test_sensors_and_wheels_of_one_kind_have_names_of_their_own(tmp_path):
+    path, rng = tmp_path / "log.csv", np.random.default_rng(0)
+    table = np.column_stack([np.arange(20.0), rng.normal(size=(20, 8))])
+    np.savetxt(path, table, delimiter=",", header="t,a,b,c,d,e,f,s,r")
+    channels = [cli_spec.channel(text) for text in ("gyro=a,b,c", "gyro=d,e,f")]
+    wheels = [cli_spec.wheel(text) for text in ("s:1e-6:x", "r:1e-6:y")]
+    free = ("bias", "delay")
+    record = cli_spec.read_log(path, channels, wheels=wheels, free=free)
+    slots = cli_spec.problem_of([record], "tensor", free=free).slots
+    names = ["gyro 1 bias", "gyro 2 bias", "wheel 1 delay", "wheel 2 delay"]
+    assert [slot.name for slot in slots] == names
+
+
 @pytest.mark.parametrize("kind", ["empty", "cut", "text", "table", "fewer"])
 def test_a_damaged_checkpoint_is_told_in_words(short_record, tmp_path, kind):
     problem = identify.Problem(short_record, identify.PrincipalRatios())
     path = tmp_path / "fit.npz"
     like = Tried(problem.start(), jnp.asarray(1.0), jnp.asarray(True))
-    checkpoint.Checkpoint(path, like, 2.0).save([like], checkpoint.Position(1, 0, like))
+    checkpoint.Checkpoint(path, like, "2").save([like], checkpoint.Position(1, 0, like))
     whole = path.read_bytes()
     if kind == "empty":
         path.write_bytes(b"")
@@ -303,7 +351,7 @@ def test_a_damaged_checkpoint_is_told_in_words(short_record, tmp_path, kind):
     words = "another problem" if kind == "fewer" else "no checkpoint of a fit, or a damaged one"
     before = path.read_bytes()
     with pytest.raises(ValueError, match=words):
-        checkpoint.Checkpoint(path, like, 2.0)
+        checkpoint.Checkpoint(path, like, "2")
     assert path.read_bytes() == before
 
 

@@ -1,5 +1,6 @@
 """What the pictures show is what they were given: lines against closed forms, words on mistakes."""
 
+import io
 import subprocess
 import sys
 from types import SimpleNamespace
@@ -54,6 +55,27 @@ def test_motion_shows_rates_and_attitude_in_the_units_it_names(flip):
     assert [one.get_label() for one in above.lines] == ["qw", "qx", "qy", "qz"]
     (only,) = rj.plot.motion(flip.ts, rj.Spin(flip.ys.omega))
     assert len(only.lines) == 3
+
+
+@pytest.mark.parametrize("name", [r"m$\badcmd{$", r"a\$b$c$", "_hidden", "$x$"])
+def test_names_are_shown_as_they_are(name, flip):
+    """No formula, which may not even be one, and no label that matplotlib leaves out."""
+    ax = rj.plot.motion(flip.ts, flip.ys, title=name)[0]
+    turning = rj.frames.MovingFrame(rj.frames.Uniform([0.0, 0.0, 1.0]))
+    path = rj.frames.Point(jnp.ones((5, 3)), jnp.zeros((5, 3)))
+    here = rj.plot.frames(turning, TS[:5], path, marks={name: [1.0, 0, 0]})
+    for drawn in (ax, here[1]):
+        drawn.figure.savefig(io.BytesIO(), format="png")
+    texts = here[1].get_legend().get_texts()
+    assert any(name in parsed(text) for text in texts)
+    assert parsed(ax.title).strip() == name
+
+
+def parsed(text):
+    """What matplotlib draws of a text that is no formula."""
+    raw = text.get_text()
+    assert (raw.count("$") - raw.count(r"\$")) == 0
+    return raw.replace(r"\$", "$")
 
 
 def test_motion_shows_the_angles_of_the_notes(flip):
