@@ -310,7 +310,11 @@ def derivative(f):
     """Of an array by a number, at 0: central differences of order 8, to 28 digits of 40."""
     with mp.extradps(40):
         h = mp.mpf(10) ** -8
-        terms = zip((mp.mpf(4) / 5, mp.mpf(-1) / 5, mp.mpf(4) / 105, mp.mpf(-1) / 280), range(1, 5))
+        terms = zip(
+            (mp.mpf(4) / 5, mp.mpf(-1) / 5, mp.mpf(4) / 105, mp.mpf(-1) / 280),
+            range(1, 5),
+            strict=True,
+        )
         return sum(c * (f(k * h) - f(-k * h)) for c, k in terms) / h
 
 
@@ -382,7 +386,10 @@ EULER = ("ZXZ", "ZYX", "xyz", "YXY", "xzx", "YZX")
 
 
 def euler_matrix(angles, sequence):
-    turns = [v.rotation(a * v.eye()["xyz".index(s.lower())]) for a, s in zip(angles, sequence)]
+    turns = [
+        v.rotation(a * v.eye()["xyz".index(s.lower())])
+        for a, s in zip(angles, sequence, strict=True)
+    ]
     a, b, c = turns if sequence.isupper() else turns[::-1]
     return a @ b @ c
 
