@@ -388,7 +388,7 @@ def _write(
         )
     if options.report is not None:
         figures = _figures(found, names, units) if figure is not None or _matplotlib() else []
-        page = {"title": title, "figures": figures, "files": read, "more": more}
+        page: dict[str, Any] = {"title": title, "figures": figures, "files": read, "more": more}
         kept &= _made(
             "report",
             options.report,

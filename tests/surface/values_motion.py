@@ -23,7 +23,7 @@ def rigid(x, u, q, w):
 
 def gradient(potential, q):
     """The torque of U(q), body axes: minus the slope along turns about them."""
-    turned = lambda h, e: v.times(q, v.quaternion_of(h * e))  # noqa: E731
+    turned = lambda h, e: v.times(q, v.quaternion_of(h * e))
     return np.array([-derivative(lambda h, e=e: potential(turned(h, e))) for e in v.eye()])
 
 
@@ -111,7 +111,7 @@ def central_energy(mu, m, s, x, q):
 
 
 # A body not larger than its distance: 𝔖/m is that of a body of about 1 m.
-FAR = lambda rng, i: v.direction(rng, i) * 10.0 ** rng.uniform(0.5, 8)  # noqa: E731
+FAR = lambda rng, i: v.direction(rng, i) * 10.0 ** rng.uniform(0.5, 8)
 
 
 def small(rng, i):
@@ -175,7 +175,7 @@ def pushes(n, d, k, c, r):
 
 
 # Directions are unit to round-off.
-UNITS = lambda rng, i: np.stack([v.direction(rng, 1) for _ in range(3)])  # noqa: E731
+UNITS = lambda rng, i: np.stack([v.direction(rng, 1) for _ in range(3)])
 way(
     "motion.torques.Rotors",
     lambda n, d, k, c, r, q: (
@@ -441,7 +441,7 @@ way(
 
 # Lagrange's and Lie and Poisson's equations: those of Euler, in Euler's angles.
 ANGLES = lambda rng, i: np.array(
-    [  # noqa: E731
+    [
         rng.uniform(-3, 3),
         rng.uniform(0.3, 2.8),
         rng.uniform(-3, 3),

@@ -201,7 +201,7 @@ def aligned(a, b):
     """From a to b about a × b: reflections in b and in their bisector, one after the other."""
     a, b = a / v.norm(a), b / v.norm(b)
     h = a + b
-    mirror = lambda n: 2 * np.outer(n, n) / v.dot(n, n) - v.eye()  # noqa: E731
+    mirror = lambda n: 2 * np.outer(n, n) / v.dot(n, n) - v.eye()
     return mirror(h) @ mirror(a)
 
 
@@ -254,7 +254,7 @@ way(
 )  # fmt: skip
 
 # Quaternions.
-LONG = lambda rng, i: v.quaternion(rng, i) * 10.0 ** rng.uniform(-20, 20)  # noqa: E731
+LONG = lambda rng, i: v.quaternion(rng, i) * 10.0 ** rng.uniform(-20, 20)
 
 
 def positive(q):
@@ -323,7 +323,7 @@ def chart_rates(of, quaternion):
 
     def both(x, y):
         size = max(v.norm(x), 1)
-        moved = lambda e: derivative(  # noqa: E731
+        moved = lambda e: derivative(
             lambda h: of(v.times(quaternion(x), v.quaternion_of(h * e / size))) * size
         )
         slope = np.stack([moved(e) for e in v.eye()], 1)
@@ -363,7 +363,7 @@ way(
     one_of(v.normal(3, low=-20, high=20), v.rotated_by(between(0.5, 2.0))),
     lambda s: (-s / v.dot(s, s), s if v.dot(s, s) <= 1 else -s / v.dot(s, s)),
 )  # fmt: skip
-HALF = lambda rng, i: np.array([10.0 ** rng.uniform(-12, 0), *direction(rng, i)])  # noqa: E731
+HALF = lambda rng, i: np.array([10.0 ** rng.uniform(-12, 0), *direction(rng, i)])
 way("rotation.rodrigues.from_quaternion", rodrigues.from_quaternion,
     HALF, rodrigues_of)  # fmt: skip
 way(
