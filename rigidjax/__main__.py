@@ -123,10 +123,10 @@ def _keep_compiled() -> None:
         # where a user's folder is his own already.
         if hasattr(os, "getuid"):
             if held.st_uid != os.getuid() or held.st_mode & 0o022:
-                words = (
-                    f"compiled programs: {folder} is not yours alone, so it is not used; delete it"
+                told = (
+                    f"{folder} is not yours alone: it is not used, and starts are slower; delete it"
                 )
-                print(_checks.printable(words), file=sys.stderr)
+                print(_checks.printable(told), file=sys.stderr)
                 return
             folder.chmod(0o700)
     except (OSError, RuntimeError):
@@ -380,7 +380,7 @@ def _write(
         kept &= _made(
             "figure",
             figure,
-            lambda: rj.plot.fit(found, title=names[0], **units).savefig(figure, dpi=130),
+            lambda: rj.plot.fit(found, index=0, title=names[0], **units).savefig(figure, dpi=130),
         )
     if options.json is not None:
         kept &= _made(
