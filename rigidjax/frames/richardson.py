@@ -59,6 +59,11 @@ def guess(
     s1 = (s1 - 0.375 * c4 * (3 * k2 * k2 - 8 * k2 + 8)) / below
     s2 = 1.5 * c3 * (2 * a22 * (k2 - 2) + a24 * (k2 + 2) + 2 * k * b22 + 5 * d21)
     s2 = (s2 + 0.375 * c4 * (12 - k2)) / below
+    # What the third order adds to the first harmonic of y, where that of x is the amplitude.
+    b33 = 12 * c3 * (b21 - 2 * k * a21 + k * a23) + 3 * c4 * k * (3 * k2 - 4)
+    b33 = -k / (16 * w) * (b33 + 16 * s1 * w * (w * k - 1))
+    b34 = -12 * c3 * k * a22 + 3 * c4 * k + 8 * s2 * w * (w * k - 1)
+    b34 = -k / (16 * w) * (2 * b34 - 12 * c3 * (b22 + k * a24) - 3 * c4 * k)
     if along_z is None:
         ax, az = _amplitude(along_x) / unit, jnp.zeros_like(unit)
     else:
@@ -74,6 +79,7 @@ def guess(
     sweep = w * (1 + s1 * x2 + s2 * z2)
     x = a21 * x2 + a22 * z2 - ax + a23 * x2 - a24 * z2 + ax * (a31 * x2 - a32 * z2)
     y_rate = k * ax + 2 * (b21 * x2 - b22 * z2) + 3 * ax * (b31 * x2 - b32 * z2)
+    y_rate = y_rate + ax * (b33 * x2 + b34 * z2)
     z = az - 2 * d21 * ax * az + az * (d32 * x2 - d31 * z2)
     centre, zero = points(mu)[point - 1, 0], jnp.zeros_like(x)
     place = jnp.stack([centre + unit * x, zero, unit * z])

@@ -190,6 +190,19 @@ def test_lyapunov_family(point):
     assert periods[0] < periods[1] < periods[2]
 
 
+def test_the_guess_of_a_lyapunov_orbit_is_of_third_order():
+    """The velocity is off by the fourth power of the amplitude, of itself by the third."""
+
+    @filter_once
+    def off(amplitude):
+        guess = MOON.lyapunov_guess(1, amplitude)
+        found = MOON.periodic_orbit(guess)
+        return guess.state.v[1] / found.state.v[1] - 1
+
+    left = [float(off(jnp.asarray(a))) for a in (1e-3, 5e-4)]
+    assert 7.5 < left[0] / left[1] < 8.5
+
+
 @pytest.mark.oldest
 def test_the_derivative_of_an_orbit_both_ways():
     def period(p):

@@ -5,7 +5,7 @@ import mpmath as mp
 import numpy as np
 from scipy.interpolate import CubicSpline
 from surface import values as v
-from surface.scenes import Quadratic, Spring
+from surface.scenes import SYMMETRIC, Quadratic, Spring
 from surface.values import between, fixed, leave_out, one_of, scale, way
 from surface.values_bodies import props, tensor_of
 from surface.values_numbers import derivative, euler_matrix, euler_rates
@@ -304,11 +304,11 @@ def unscaled(rng, i):
     return v.inertia(rng, i % 5)
 
 
-# The body that is given sets nothing: its inertia is replaced.
+# The body that is given sets nothing but, by its inverse, how many digits are left.
 way(
     "motion.torques.ChangingInertia motion.torques.ChangingInertia.tensor",
     lambda i, j, c, t, w: (
-        rj.EulerEquations(rj.Inertia(i), laws.ChangingInertia(
+        rj.EulerEquations(rj.Inertia(SYMMETRIC), laws.ChangingInertia(
             lambda s: i + s * j, laws.Damping(c)))(t, rj.Spin(w)),
         laws.ChangingInertia(lambda s: i + s * j).tensor(t),
     ),

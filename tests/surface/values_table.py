@@ -7,6 +7,7 @@ import traceback
 import jax
 from surface import (
     values_bodies as values_bodies,
+    values_frames as values_frames,
     values_motion as values_motion,
     values_numbers as values_numbers,
 )
