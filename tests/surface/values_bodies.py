@@ -433,11 +433,7 @@ way(
 def weighted(a, size):
     power = lambda n, k: size[k] ** (n + 1) / (n + 1)
     whole = lambda i, j, k: (
-        power(i, 0) * power(j, 1) * power(k, 2)
-        + a
-        * (
-            power(i + 2, 0) * power(j, 1) * power(k, 2)
-        )
+        power(i, 0) * power(j, 1) * power(k, 2) + a * (power(i + 2, 0) * power(j, 1) * power(k, 2))
     )
     e = np.eye(3, dtype=int)
     m = whole(0, 0, 0)
