@@ -107,7 +107,10 @@ def _no_more(omega):
     return rj.crossings(BODY, rj.Spin(omega), 0.0, 5.0, far, max_crossings=2).times
 
 
-@pytest.mark.parametrize("value", [_too_few_steps, _never, _after, _too_fast, _no_more])
+@pytest.mark.parametrize(
+    "value",
+    [pytest.param(_too_few_steps, marks=pytest.mark.oldest), _never, _after, _too_fast, _no_more],
+)
 def test_where_a_value_is_nan_its_derivative_is(value):
     assert bool(jnp.isnan(value(OMEGA)).all())
     for mode in (jax.jacrev, jax.jacfwd):
