@@ -10,6 +10,7 @@ from surface import (
     values_frames as values_frames,
     values_motion as values_motion,
     values_numbers as values_numbers,
+    values_solve as values_solve,
 )
 from surface.values import WAYS, draws_of, judged
 
