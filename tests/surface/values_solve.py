@@ -7,9 +7,10 @@ import mpmath as mp
 import numpy as np
 from exact import twin
 from scipy.integrate import solve_ivp
-from scipy.integrate._ivp.dop853_coefficients import A as DOP_A, B as DOP_B, C as DOP_C
+from scipy.integrate._ivp.dop853_coefficients import A as DOP_A, B as DOP_B
 from surface import values as v
-from surface.values import between, fixed, leave_out, one_of, scale, way
+from surface.values import between, leave_out, way
+from surface.values_numbers import series
 
 import rigidjax as rj
 from rigidjax import torques as laws
@@ -257,7 +258,6 @@ KUTTA = ([[], [HALF], [0, HALF], [0, 0, 1]], [mp.mpf(1) / 6, mp.mpf(1) / 3, mp.m
 _TSIT = dfx.Tsit5.tableau
 TSIT = ([[], *[list(row) for row in _TSIT.a_lower[:-1]]], list(_TSIT.b_sol[:-1]))
 DOP = ([list(row[:n]) for n, row in enumerate(DOP_A[:12])], list(DOP_B))
-del DOP_C
 
 
 def our_steps(solver, number, step):
@@ -375,8 +375,6 @@ def spread(j, d, w, t):
     """A ball that is slowed down: each rate by itself; free: turns of a turn."""
     ts = [0 * t, t]
     slow = [np.diag([mp.exp(-x * s / j) for x in d]) for s in ts]
-    from surface.values_numbers import series
-
     turned = []
     for s in ts:
         block = np.zeros((6, 6), object)
@@ -446,14 +444,14 @@ def decay(t, y, args):
     return jnp.array([0.3, -0.2, -0.7]) * y
 
 
-def exponents(field=decay):
-    return lambda x: rj.lyapunov_exponents(
-        field, x, 20.0, intervals=40, transient=10, rtol=1e-11, atol=1e-13, max_steps=100
-    )
+def exponents(x):
+    return rj.lyapunov_exponents(
+        decay, x, 20.0, intervals=40, transient=10, rtol=1e-11, atol=1e-13, max_steps=100
+    ).values
 
 
 way(
-    "lyapunov_exponents Exponents", lambda x: exponents()(x).values, between(0.1, 1.0, 3),
+    "lyapunov_exponents Exponents", exponents, between(0.1, 1.0, 3),
     lambda x: np.array([0.3, -0.2, -0.7]) + 0 * x, plain=True, rtol=1e-9, cost=2,
 )  # fmt: skip
 leave_out("options of a compiler: no numbers", "batch.compiler_options", "cpu_flags", "batch.CpuFlags")
