@@ -6,7 +6,7 @@ row: `ulps` units of round-off of what the result is (the largest number of each
 it changes by when the arguments do. The second is measured, on the second way. Only a method that
 has a tolerance (a solver, a quadrature) adds it to round-off, as `rtol`.
 
-`python -m surface.values_table [NAME]`, from `tests`, says how near each row comes to its bound.
+`JAX_ENABLE_X64=1 python -m surface.values_table [NAME]`, from `tests`, says how near each row comes to its bound.
 """
 
 import dataclasses

@@ -4,12 +4,13 @@ import sys
 import time
 import traceback
 
-import jax
 from surface import (
     values_bodies as values_bodies,
     values_frames as values_frames,
+    values_identify as values_identify,
     values_motion as values_motion,
     values_numbers as values_numbers,
+    values_solve as values_solve,
 )
 from surface.values import WAYS, draws_of, judged
 
@@ -39,5 +40,4 @@ def main(only: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    jax.config.update("jax_enable_x64", True)
     main(sys.argv[1:])

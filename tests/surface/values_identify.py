@@ -1,0 +1,468 @@
+"""A second way for fits and filters: charts and sensors in words, Gaussians by conditioning."""
+
+import tempfile
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import mpmath as mp
+import numpy as np
+from surface import values as v
+from surface.values import between, fixed, leave_out, one_of, scale, way
+from surface.values_bodies import (
+    divergence, of_lune, pack, pack_second, pack_shape, props, tensor_of, unpack, unpack_second,
+    unpack_shape,
+)  # fmt: skip
+from surface.values_motion import euler
+from surface.values_numbers import euler_matrix, nearest
+
+import rigidjax as rj
+from rigidjax import estimate, identify
+from rigidjax.rotation import quaternion as q4
+
+# Charts: numbers to a body, what is reported of it, and back.
+TYPICAL = 3.0
+
+
+def shape_chart(x):
+    i = tensor_of(unpack_shape(x))
+    m = v.eigen(i)[0]
+    return i, v.log(m[:2] / m[2]), np.zeros(0)
+
+
+def ratios_chart(x):
+    s = np.array([mp.exp(x[0]), mp.exp(x[1]), mp.mpf(1)])
+    j = sum(s) - s
+    return np.diag(j) + 0 * v.eye(), v.log(j[:2] / j[2]), np.zeros(0)
+
+
+def tensor_chart(x):
+    i = tensor_of(unpack_second(x) * TYPICAL / 2)
+    at = [(0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1)]
+    return i, v.log(v.eigen(i)[0]), np.array([i[p] for p in at])
+
+
+def moments_chart(x):
+    s = v.exp(2 * x) * TYPICAL / 2
+    j = sum(s) - s
+    return np.diag(j) + 0 * v.eye(), v.log(j), np.zeros(0)
+
+
+BACK = {
+    "Ratios": (lambda s: pack_shape(s), 5, identify.Ratios(), shape_chart),
+    "PrincipalRatios": (lambda s: v.log(np.diag(s)[:2] / s[2, 2]), 2, identify.PrincipalRatios(),
+                        ratios_chart),
+    "Tensor": (lambda s: pack_second(s * 2 / TYPICAL), 6, identify.Tensor(TYPICAL), tensor_chart),
+    "Principal": (lambda s: v.log(np.diag(s) * 2 / TYPICAL) / 2, 3, identify.Principal(TYPICAL),
+                  moments_chart),
+}  # fmt: skip
+for name, (back, size, chart, forth) in BACK.items():
+    way(
+        " ".join(f"identify.{name}{what}" for what in ("", ".body", ".logs", ".plain", ".vector")),
+        lambda x, s, c=chart: (
+            (b := c.body(x)), c.logs(b), c.plain(b), c.vector(rj.Inertia.from_second_moment(s))),
+        (one_of(between(-1, 1, size), fixed(np.zeros(size))),
+         lambda rng, i: v.second_moment(rng, 0) * 10.0 ** rng.uniform(-3, 3)),
+        lambda x, s, f=forth, b=back: (*f(x), b(s)), norm=True, ulps=32,
+    )  # fmt: skip
+
+
+GUESS = 2.0, np.array([0.1, -0.2, 0.3]), np.diag([1.0, 2.0, 1.5])
+
+
+def guess():
+    return props(*(jnp.asarray(x) for x in GUESS))
+
+
+def mass_chart(x, m, c, s):
+    """The logarithms of the guess moved, lengths by its own."""
+    start = [v.number(part) for part in GUESS]
+    size = mp.sqrt(np.trace(start[2]) / start[0])
+    logs = np.array([mp.log(m), *v.log(v.eigen(tensor_of(s))[0])])
+    return [
+        *unpack(pack(*start) + x * np.array([1, 1, 1, 1, *([size] * 6)])), np.zeros(10), logs, c,
+        start[0] * mp.exp(2 * x[0]), start[1],
+    ]  # fmt: skip
+
+
+def our_mass_chart(x, m, c, s):
+    chart, body = identify.Mass(guess()), props(m, c, s)
+    lighter = identify.Mass(guess(), ["mass"]).body(x[:1])
+    return [
+        chart.body(x), chart.vector(body), chart.logs(body), chart.plain(body), lighter.mass,
+        lighter.com,
+    ]  # fmt: skip
+
+
+way(
+    "identify.Mass identify.Mass.body identify.Mass.vector identify.Mass.logs identify.Mass.plain",
+    our_mass_chart,
+    (between(-1, 1, 10), scale(-2, 2), v.ordinary, lambda rng, i: v.second_moment(rng, 0)),
+    mass_chart, norm=True,
+)  # fmt: skip
+way(
+    "identify.Known identify.Known.body identify.Known.logs identify.Known.plain "
+    "identify.Known.vector",
+    lambda i: (
+        (k := identify.Known(rj.Inertia(i))).body(jnp.zeros(0)), k.logs(rj.Inertia(i)),
+        k.plain(rj.Inertia(i)), k.vector(rj.Inertia(i))),
+    v.inertia, lambda i: (i, np.zeros(0), np.zeros(0), np.zeros(0)),
+)  # fmt: skip
+# A sum of squares that is 2 w D, known to round-off of the trace.
+way(
+    "identify.Entropic identify.Entropic.residuals",
+    lambda m, c, s: jnp.sum(identify.Entropic(guess(), 0.75).residuals(props(m, c, s)) ** 2) + 6.0,
+    (scale(-1, 1), v.ordinary, lambda rng, i: v.second_moment(rng, 0)),
+    lambda m, c, s: 1.5 * (divergence(m, c, s, *map(v.number, GUESS)) + 4), norm=True,
+)  # fmt: skip
+
+# Losses.
+
+
+def huber(e):
+    s = v.dot(e, e)
+    c = mp.mpf(3)
+    if s <= c * c:
+        return e, mp.mpf(1)
+    return e * mp.sqrt((2 * c * mp.sqrt(s) - c * c) / s), c / mp.sqrt(s)
+
+
+def soft(e):
+    s, c = v.dot(e, e), mp.mpf(3)
+    root = mp.sqrt(1 + s / c**2)
+    return (e * mp.sqrt(2 * c * c * (root - 1) / s) if s else e), 1 / root
+
+
+ERRORS = one_of(v.normal(3, low=-8, high=8), v.ordinary, fixed([0.0, 0, 0]))
+for name, loss in (("Huber", huber), ("SoftL1", soft)):
+    way(
+        f"identify.{name} identify.{name}.shrink identify.{name}.weight",
+        lambda e, c=getattr(identify, name)(): (c.shrink(e), c.weight(e)), ERRORS, loss,
+    )  # fmt: skip
+
+# Sensors.
+
+
+def scene_of(x, u, q, w, m, c, s):
+    body = props(m, c, s)
+    law = rj.torques.Sum(rj.torques.UniformGravity([0.0, 0.0, -9.8]), rj.torques.Drag(0.2, c))
+    field = rj.NewtonEuler(body, law)
+    return identify.SensorInput(jnp.asarray(0.0), rj.Rigid(x, u, q, w), body, field)
+
+
+def our_sensors(x, u, q, w, m, c, s, b, r, read, other):
+    now = scene_of(x, u, q, w, m, c, s)
+    kw = dict(bias=b, scale=1.0 + 0.1 * r, mounting=0.3 * b, skew=0.1 * b)
+    star = identify.AttitudeSensor(0.1, mounting=0.3 * b)
+    return [
+        identify.Gyro(0.1, **kw).error(now, read),
+        identify.Accelerometer(0.1, place=r, gravity=[0.0, 0, -9.8], **kw).error(now, read),
+        identify.Magnetometer(0.1, field=r, **kw).error(now, read),
+        star.error(now, other), q4.to_matrix(star.reading_of(now, 0.5 * b)),
+        identify.Marker(r, 0.1).error(now, read),
+        identify.Position(0.1, bias=b).error(now, read),
+        identify.Velocity(0.1, place=r, mounting=0.3 * b, bias=b).error(now, read),
+        identify.Velocity(0.1, place=r).error(now, read),
+        identify.Range(read, 0.1, place=r, bias=0.3).error(now, jnp.asarray(1.5)),
+        now.lever(r),
+    ]  # fmt: skip
+
+
+def sensors(x, u, q, w, m, c, s, b, r, read, other):
+    turned, i, down = v.matrix_of(q), tensor_of(s), np.array([0, 0, mp.mpf(-9.8)])
+    seen = v.rotation(mp.mpf(0.3) * b).T
+    a, d, e = mp.mpf(0.1) * b
+    skew = np.array([[1, a, d], [0, 1, e], [0, 0, 1]])
+    shown = lambda y: (1 + mp.mpf(0.1) * r) * (skew @ seen @ y) + b  # noqa: E731
+    lever = r - c
+    push = down - mp.mpf(0.2) * v.norm(u) * u / m
+    torque = np.cross(c, turned.T @ (-mp.mpf(0.2) * v.norm(u) * u))
+    felt = turned.T @ (push - down) + np.cross(euler(i, w, torque), lever) + np.cross(
+        w, np.cross(w, lever))  # fmt: skip
+    mount = v.quaternion_of(mp.mpf(0.3) * b)
+    expected = v.times(q, mount)
+    miss = v.times([expected[0], *(-expected[1:])], other)
+    point = x + turned @ lever
+    speed = u + turned @ np.cross(w, lever)
+    return [
+        read - shown(w), read - shown(felt), read - shown(turned.T @ r), v.turn_of(miss),
+        v.matrix_of(v.times(expected, v.quaternion_of(b / 2))), read - point, read - x - b,
+        read - seen @ turned.T @ speed - b, read - speed,
+        np.array([mp.mpf(1.5) - v.norm(point - read) - mp.mpf(0.3)]), lever,
+    ]  # fmt: skip
+
+
+way(
+    " ".join(f"identify.{name}" for name in (
+        "Gyro", "Gyro.error", "Accelerometer", "Accelerometer.error", "Magnetometer",
+        "Magnetometer.error", "AttitudeSensor", "AttitudeSensor.error",
+        "AttitudeSensor.reading_of", "Marker", "Marker.error", "Position", "Position.error",
+        "Velocity", "Velocity.error", "Range", "Range.error", "SensorInput",
+        "SensorInput.lever",
+    )),
+    our_sensors,
+    (v.ordinary, v.ordinary, lambda rng, i: v.quaternion(rng, i), v.ordinary, scale(-1, 1),
+     v.ordinary, lambda rng, i: v.second_moment(rng, 0), v.ordinary, v.ordinary, v.ordinary,
+     lambda rng, i: v.quaternion(rng, 0)),
+    sensors, norm=True, cost=2,
+)  # fmt: skip
+
+
+way(
+    "identify.Direction identify.Direction.error identify.Direction.reading_of",
+    lambda q, world, read, e: (
+        jnp.linalg.norm(identify.Direction(world, 0.1).error(_still(q), read)),
+        jnp.linalg.norm(identify.Direction(world, 0.1).error(
+            _still(q), identify.Direction(world, 0.1).reading_of(_still(q), e))),
+    ),
+    (v.quaternion, v.ordinary, lambda rng, i: v.direction(rng, 1), between(-0.3, 0.3, 2)),
+    lambda q, world, read, e: (direction_error(q, world, read), v.norm(e)), norm=True, ulps=32,
+)  # fmt: skip
+
+
+def _still(q):
+    state = rj.Attitude(q, jnp.zeros(3))
+    return identify.SensorInput(jnp.asarray(0.0), state, rj.Inertia(jnp.eye(3)), None)
+
+
+def direction_error(q, world, read):
+    """As long as the chord: 2 sin of half the angle."""
+    expected = v.matrix_of(q).T @ (world / v.norm(world))
+    return v.norm(read - expected)
+
+
+def light(sun, observer, q, axes, level):
+    r = v.matrix_of(q).T
+    b = of_lune(axes, r @ sun, r @ observer)[1] / (mp.pi * axes.prod() ** (mp.mpf(2) / 3))
+    return level * b, level - mp.mpf(2.5) * mp.log10(b), np.array([1 - level * b])
+
+
+def our_light(sun, observer, q, axes, level):
+    now = _still(q)
+    flux = identify.Brightness(sun, observer, noise=0.1, level=level, semi_axes=axes)
+    mag = identify.Brightness(sun, observer, noise=0.1, level=level, semi_axes=axes, unit="mag")
+    return flux.predicted(now), mag.predicted(now), flux.error(now, jnp.asarray(1.0))
+
+
+way(
+    "identify.Brightness identify.Brightness.predicted identify.Brightness.error",
+    our_light, (v.ordinary, v.ordinary, v.quaternion, between(0.5, 2.0, 3), between(1, 3)), light,
+    norm=True, ulps=32, cost=2,
+)  # fmt: skip
+leave_out(
+    "a truth value for each row and words: tests/identify give good and bad rows",
+    *(f"identify.{name}.refusal" for name in ("AttitudeSensor", "Brightness", "Direction", "Range")),
+)  # fmt: skip
+
+
+# What a low-pass filter makes of a parabola: the parabola's own answer, whatever the samples.
+def lagged(t, a, w):
+    u, du, ddu = a[0] + a[1] * t + a[2] * t * t, a[1] + 2 * a[2] * t, 2 * a[2]
+    rate = 2 * mp.pi * w
+    return [
+        (u - du / rate + ddu / rate**2)[:, None],
+        (u - mp.sqrt(2) * du / rate + ddu / rate**2)[:, None],
+    ]  # fmt: skip
+
+
+way(
+    "identify.LowPass",
+    lambda t, a, w: [
+        identify.LowPass(w, order)(t, (a[0] + a[1] * t + a[2] * t * t)[:, None]) for order in (1, 2)
+    ],
+    (lambda rng, i: np.cumsum(rng.uniform(0.5, 1.4, 9)), v.ordinary, scale(-1, 1)), lagged,
+    norm=True, ulps=64,
+)  # fmt: skip
+
+
+# Readings of attitudes: conversions.
+def our_readings(angles, ms):
+    return [
+        np.asarray(jax.vmap(q4.to_matrix)(jnp.asarray(found)))
+        for found in (
+            identify.quaternions_from_euler(angles, "ZYX"),
+            identify.quaternions_from_euler(np.degrees(angles), "ZYX", unit="deg"),
+            identify.quaternions_from_matrices(ms),
+        )
+    ]  # fmt: skip
+
+
+way(
+    "identify.quaternions_from_euler identify.quaternions_from_matrices", our_readings,
+    (between(-3, 3, 2, 3), lambda rng, i: np.stack([v.matrix(rng, i), v.matrix(rng, 0)])),
+    lambda a, ms: [np.stack([euler_matrix(x, "ZYX") for x in a])] * 2 + [
+        np.stack([v.matrix_of(nearest(m)) for m in ms])],
+    batched=False, norm=True,
+)  # fmt: skip
+
+
+# Files: what is written with 17 digits is read again.
+def our_table(t, w):
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "log.csv"
+        rows = [",".join(repr(float(x)) for x in (a, *b)) for a, b in zip(t, w, strict=True)]
+        path.write_text("\n".join(["t,wx,wy,wz", *rows]))
+        read = identify.read_gyro_csv(path)
+        turned = identify.read_gyro_csv(path, unit="deg/s", noise=0.1)
+        columns = identify.read_table(path, ["wy", "t"])
+        return [
+            read.t, read.readings[0].values, columns["wy"], columns["t"],
+            turned.readings[0].values, turned.readings[0].sensor.noise,
+        ]  # fmt: skip
+
+
+way(
+    "identify.read_gyro_csv identify.read_table identify.Recording identify.Reading", our_table,
+    (lambda rng, i: np.cumsum(rng.uniform(0.1, 1.0, 4)), v.normal(4, 3, low=-20, high=20)),
+    lambda t, w: [t, w, w[:, 1], t, w * mp.pi / 180, np.full(3, mp.pi / 1800)], batched=False,
+)  # fmt: skip
+
+
+# A linear model: all states and readings as one Gaussian, conditioned.
+def conditioned(f, g, h, r, y, mean, root, upto):
+    """Mean and covariance of the states given the readings up to a time, and log-density of all."""
+    n, times = len(mean), len(y)
+    means, cov = [mean], [[root @ root.T]]
+    for k in range(1, times):
+        means.append(f @ means[-1])
+        row = [f @ x for x in cov[-1]]
+        cov.append([*row, row[-1] @ f.T + g @ g.T])
+    full = np.empty((n * times, n * times), object)
+    for i in range(times):
+        for j in range(i + 1):
+            full[i * n : i * n + n, j * n : j * n + n] = cov[i][j]
+            full[j * n : j * n + n, i * n : i * n + n] = cov[i][j].T
+    seen = np.zeros((times * len(h), n * times), object)
+    for i in range(times):
+        seen[i * len(h) : (i + 1) * len(h), i * n : i * n + n] = h
+    stacked = np.concatenate(means)
+    spread = seen @ full @ seen.T + np.diag(np.tile(r * r, times))
+    left = y.ravel() - seen @ stacked
+    rows = upto * len(h)
+    gain = v.solve(spread[:rows, :rows], (seen[:rows] @ full)).T
+    found = stacked + gain @ left[:rows]
+    left_over = full - gain @ seen[:rows] @ full
+    log = -(v.dot(left, v.solve(spread, left)) + mp.log(v.determinant(spread)) + rows_log(spread)) / 2
+    return found, left_over, log
+
+
+def rows_log(spread):
+    return len(spread) * mp.log(2 * mp.pi)
+
+
+def filtered(f, g, h, r, y, mean, root):
+    n, times = len(mean), len(y)
+    each = [conditioned(f, g, h, r, y, mean, root, k + 1) for k in range(times)]
+    block = lambda k: slice(k * n, k * n + n)  # noqa: E731
+    means = np.stack([m[block(k)] for k, (m, _, _) in enumerate(each)])
+    covs = np.stack([c[block(k), block(k)] for k, (_, c, _) in enumerate(each)])
+    m, c, log = each[-1]
+    return [
+        means, covs, log, m.reshape(times, n),
+        np.stack([c[block(k), block(k)] for k in range(times)]), log,
+        v.sqrt(np.stack([np.diag(c) for c in covs])),
+    ]  # fmt: skip
+
+
+def our_filtered(f, g, h, r, y, mean, root):
+    model = estimate.LinearModel(f, g, h, r)
+    forth = estimate.linear_filter(model, y, mean, root)
+    back = estimate.linear_smooth(model, y, mean, root)
+    return [
+        forth.mean, forth.covariance, forth.log_likelihood, back.mean, back.covariance,
+        back.log_likelihood, forth.deviation,
+    ]  # fmt: skip
+
+
+way(
+    "estimate.LinearModel estimate.linear_filter estimate.linear_smooth estimate.LinearEstimate "
+    "estimate.LinearEstimate.covariance estimate.LinearEstimate.deviation",
+    our_filtered,
+    (v.normal(3, 3), v.normal(3, 2), v.normal(2, 3), between(0.1, 1.0, 2), v.normal(4, 2),
+     v.ordinary, v.normal(3, 3)),
+    filtered, norm=True, ulps=64, cost=2,
+)  # fmt: skip
+
+# A ball with a gyro under white torque: its rate is a random walk, read with noise.
+TS = np.arange(4) * 0.5
+
+
+def walked(j, d, noise, y, w):
+    g = mp.sqrt(d / 2) / j * v.eye()
+    return filtered(v.eye(), g, v.eye(), noise * np.ones(3), y, w, mp.mpf(0.4) * v.eye())
+
+
+def ball(j, d, noise, y, w):
+    """What the filter of any motion gives, as rows of `filtered`."""
+    found = walked(j, d, noise, y, w)
+    first = np.array([w, np.full(3, mp.mpf(0.4))])
+    return [*found[:6], found[6], found[2], first[0], first[1], found[0][0]]
+
+
+def our_ball(j, d, noise, y, w):
+    model = estimate.Model(rj.Inertia(j * jnp.eye(3)), rj.torques.RandomTorque(d))
+    gyro = identify.Gyro(noise)
+    # Made without the checks of known numbers: a recording is of the host.
+    empty = identify.Recording(TS, (identify.Gyro(1.0), np.zeros((4, 3))))
+    reading = identify.Reading(gyro, y, jnp.ones(4, bool))
+    recording = eqx.tree_at(lambda r: r.readings[0], empty, reading)
+    first = estimate.start(model, recording, rj.Spin(w), rate=0.4)
+    forth = estimate.filter(model, recording, first, throw=False, substeps=1)
+    back = estimate.smooth(model, recording, first, throw=False, substeps=1)
+    one = estimate.step(model, first, 0.0, (gyro, y[0]))
+    return [
+        forth.states.omega, forth.belief.covariance, forth.log_likelihood,
+        back.states.omega, back.belief.covariance, back.log_likelihood, forth.belief.deviation,
+        estimate.log_likelihood(model, recording, first, substeps=1), first.state.omega,
+        first.deviation, one.state.omega,
+    ]  # fmt: skip
+
+
+way(
+    "estimate.Model estimate.start estimate.filter estimate.smooth estimate.step "
+    "estimate.log_likelihood estimate.Belief estimate.Belief.covariance estimate.Belief.deviation "
+    "estimate.Belief.state estimate.Filtered estimate.Filtered.states estimate.Smoothed "
+    "estimate.Smoothed.states",
+    our_ball, (scale(-1, 1), scale(-2, 0), between(0.1, 0.5), v.normal(4, 3), v.ordinary), ball,
+    norm=True, ulps=64, cost=2,
+)  # fmt: skip
+
+
+# A fit that is linear: a ball that turns as it did, read by a gyro. The mean, by hand.
+def fitted(y, noise):
+    count = len(y)
+    mean = sum(y) / count
+    deviation = noise / mp.sqrt(count)
+    chi2 = sum(v.dot(row, row) for row in y - mean) / noise**2
+    reach = mp.mpf(1.959963984540054)
+    return [
+        mean, np.full(3, deviation), chi2, mp.mpf(3 * count - 3), mp.mpf(1) * y - mean,
+        mean - reach * deviation, mean + reach * deviation, mean - reach * deviation,
+        mean + reach * deviation, np.full(3, deviation), np.stack([mean] * count), mean,
+    ]  # fmt: skip
+
+
+def our_fit(y, noise):
+    recording = identify.Recording(np.arange(float(len(y))), (identify.Gyro(float(noise)), y))
+    problem = identify.Problem(recording, identify.Known(rj.Inertia(jnp.eye(3))))
+    fit = identify.fit(problem, starts=1)
+    low, high = zip(*fit.interval().values(), strict=True)
+    ends = fit.interval_of(lambda body, state: state.omega)
+    planned = identify.expected(problem, fit.parameters)
+    return [
+        fit.state0.omega, np.array([q.deviation for q in fit.quantities[-3:]]), fit.chi2, fit.dof,
+        fit.residuals[0], np.array(low[-3:]), np.array(high[-3:]), *ends,
+        np.array([q.deviation for q in planned[-3:]]), problem.motion(fit.parameters).omega,
+        problem.unpack(fit.parameters)[1].omega,
+    ]  # fmt: skip
+
+
+way(
+    "identify.fit identify.Fit identify.Fit.interval identify.Fit.interval_of identify.Fit.body "
+    "identify.Fit.state0 identify.Fit.residuals identify.Problem identify.Problem.motion "
+    "identify.Problem.unpack identify.expected identify.Quantity",
+    our_fit,
+    (lambda rng, i: rng.normal(size=3) + 0.01 * rng.normal(size=(12, 3)), fixed(0.01)), fitted,
+    batched=False, rtol=1e-6, cost=2,
+)  # fmt: skip
