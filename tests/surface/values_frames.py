@@ -263,8 +263,8 @@ way(
 def hung(length, e, n, a, b):
     up = -mp.sqrt(length**2 - (length * e) ** 2 - (length * n) ** 2)
     e, n = length * e, length * n
-    return [np.array([e, n, up]), np.array([a, b, -(e * a + n * b) / up])] + [
-        np.array([e, n, up]), 0 * np.array([a, b, a])]  # fmt: skip
+    place = np.array([e, n, up])
+    return [place, np.array([a, b, -(e * a + n * b) / up]), place, 0 * np.array([a, b, a])]
 
 
 way(

@@ -11,7 +11,15 @@ import numpy as np
 from surface import values as v
 from surface.values import between, fixed, leave_out, one_of, scale, way
 from surface.values_bodies import (
-    divergence, of_lune, pack, pack_second, pack_shape, props, tensor_of, unpack, unpack_second,
+    divergence,
+    of_lune,
+    pack,
+    pack_second,
+    pack_shape,
+    props,
+    tensor_of,
+    unpack,
+    unpack_second,
     unpack_shape,
 )  # fmt: skip
 from surface.values_motion import euler
@@ -138,7 +146,7 @@ ERRORS = one_of(v.normal(3, low=-8, high=8), v.ordinary, fixed([0.0, 0, 0]))
 for name, loss in (("Huber", huber), ("SoftL1", soft)):
     way(
         f"identify.{name} identify.{name}.shrink identify.{name}.weight",
-        lambda e, c=getattr(identify, name)(): (c.shrink(e), c.weight(e)), ERRORS, loss,
+        lambda e, c=getattr(identify, name)(): (c.shrink(e), c.weight(e)), ERRORS, loss,  # noqa: B008
     )  # fmt: skip
 
 # Sensors.
@@ -174,7 +182,7 @@ def sensors(x, u, q, w, m, c, s, b, r, read, other):
     seen = v.rotation(mp.mpf(0.3) * b).T
     a, d, e = mp.mpf(0.1) * b
     skew = np.array([[1, a, d], [0, 1, e], [0, 0, 1]])
-    shown = lambda y: (1 + mp.mpf(0.1) * r) * (skew @ seen @ y) + b  # noqa: E731
+    shown = lambda y: (1 + mp.mpf(0.1) * r) * (skew @ seen @ y) + b
     lever = r - c
     push = down - mp.mpf(0.2) * v.norm(u) * u / m
     torque = np.cross(c, turned.T @ (-mp.mpf(0.2) * v.norm(u) * u))
@@ -324,7 +332,7 @@ def conditioned(f, g, h, r, y, mean, root, upto):
     """Mean and covariance of the states given the readings up to a time, and log-density of all."""
     n, times = len(mean), len(y)
     means, cov = [mean], [[root @ root.T]]
-    for k in range(1, times):
+    for _ in range(1, times):
         means.append(f @ means[-1])
         row = [f @ x for x in cov[-1]]
         cov.append([*row, row[-1] @ f.T + g @ g.T])
@@ -343,7 +351,9 @@ def conditioned(f, g, h, r, y, mean, root, upto):
     gain = v.solve(spread[:rows, :rows], (seen[:rows] @ full)).T
     found = stacked + gain @ left[:rows]
     left_over = full - gain @ seen[:rows] @ full
-    log = -(v.dot(left, v.solve(spread, left)) + mp.log(v.determinant(spread)) + rows_log(spread)) / 2
+    log = (
+        -(v.dot(left, v.solve(spread, left)) + mp.log(v.determinant(spread)) + rows_log(spread)) / 2
+    )
     return found, left_over, log
 
 
@@ -354,7 +364,7 @@ def rows_log(spread):
 def filtered(f, g, h, r, y, mean, root):
     n, times = len(mean), len(y)
     each = [conditioned(f, g, h, r, y, mean, root, k + 1) for k in range(times)]
-    block = lambda k: slice(k * n, k * n + n)  # noqa: E731
+    block = lambda k: slice(k * n, k * n + n)
     means = np.stack([m[block(k)] for k, (m, _, _) in enumerate(each)])
     covs = np.stack([c[block(k), block(k)] for k, (_, c, _) in enumerate(each)])
     m, c, log = each[-1]
