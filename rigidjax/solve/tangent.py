@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rigidjax._types import HasAttitude
+from rigidjax.motion.coupled import motion_of
 from rigidjax.rotation import quaternion
 from rigidjax.solve.components import flat, unflat
 
@@ -21,12 +22,12 @@ def dimension(state: Any) -> int:
     6
     """
     size = sum(math.prod(jnp.shape(leaf)) for leaf in jax.tree.leaves(state))
-    return size - 1 if isinstance(state, HasAttitude) else size
+    return size - isinstance(motion_of(state), HasAttitude)
 
 
 def _turning(state: Any, turn: Any) -> Any:
     """What is changed: the state, a small turn in the place of its quaternion."""
-    return eqx.tree_at(lambda s: s.q, state, turn)
+    return eqx.tree_at(lambda s: motion_of(s).q, state, turn)
 
 
 def moved(state: Any, change: Float[Array, " n"]) -> Any:
@@ -38,11 +39,13 @@ def moved(state: Any, change: Float[Array, " n"]) -> Any:
     >>> moved(rj.Spin([1.0, 0, 0]), jnp.array([0.0, 0.5, 0.0])).omega.tolist()
     [1.0, 0.5, 0.0]
     """
-    if not isinstance(state, HasAttitude):
+    motion = motion_of(state)
+    if not isinstance(motion, HasAttitude):
         return jax.tree.map(jnp.add, state, unflat(change, state))
-    parts = unflat(change, _turning(state, jnp.zeros_like(state.omega)))
-    whole = jax.tree.map(lambda a, b: a + b, _turning(state, jnp.zeros_like(state.omega)), parts)
-    return _turning(whole, quaternion.multiply(state.q, quaternion.exp(parts.q)))
+    still = _turning(state, jnp.zeros_like(motion.omega))
+    parts = unflat(change, still)
+    turn = quaternion.exp(motion_of(parts).q)
+    return _turning(jax.tree.map(jnp.add, still, parts), quaternion.multiply(motion.q, turn))
 
 
 def between(reference: Any, state: Any) -> Float[Array, " n"]:
@@ -53,7 +56,8 @@ def between(reference: Any, state: Any) -> Float[Array, " n"]:
     [0.0, 0.5, 0.0]
     """
     gap = jax.tree.map(jnp.subtract, state, reference)
-    if isinstance(state, HasAttitude):
-        turn = quaternion.multiply(quaternion.conjugate(reference.q), state.q)
+    motion = motion_of(state)
+    if isinstance(motion, HasAttitude):
+        turn = quaternion.multiply(quaternion.conjugate(motion_of(reference).q), motion.q)
         gap = _turning(gap, 2 * turn[1:])
     return flat(gap)
