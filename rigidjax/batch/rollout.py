@@ -22,6 +22,7 @@ from rigidjax.solve.fixed_loop import first_row, march, piece_length
 from rigidjax.solve.magnus import Magnus4
 from rigidjax.solve.splitting import AbstractSplitting
 from rigidjax.solve.steppers import stepper_of
+from rigidjax.solve.validation import real_or_nan
 
 State = TypeVar("State", Spin, Attitude, Rigid)
 Reduced = TypeVar("Reduced")
@@ -188,6 +189,7 @@ def _run(plan: _Plan, reduce: Reduce | None, rest: Any, numbers: Any) -> Any:
         own, inputs = each
         body, state0, torque = Bodies.one(shared, own, rest)
         state0 = start_of(state0)
+        body = real_or_nan(body)
         state0 = started(body, state0, bind(torque, first_row(torque, h, inputs)), t0)
         field = equations_of_motion(body, state0, torque)
         stepper = stepper_of(plan.solver, field, state0)

@@ -23,6 +23,7 @@ from rigidjax.solve.explicit import DormandPrince8
 from rigidjax.solve.magnus import Magnus4
 from rigidjax.solve.run import free_motion
 from rigidjax.solve.step_control import NONFINITE, finite
+from rigidjax.solve.validation import real_or_nan
 
 State = TypeVar("State", Spin, Attitude, Rigid)
 
@@ -168,6 +169,7 @@ def _run(plan: _Plan, rest: Any, numbers: Any) -> Any:
         shared, ts = given
         body, state0, torque = Bodies.one(shared, each, rest)
         state0 = start_of(state0)
+        body = real_or_nan(body)
         if isinstance(plan.how, _Free):
             return _free(body, state0, ts)
         return _adaptive(plan.how, body, state0, torque, ts)

@@ -46,7 +46,6 @@ class FreeBody(eqx.Module):
 
     def __init__(self, inertia: Inertia, state0: HasSpin):
         _check(inertia, state0)
-        inertia = validation.possible(inertia, inertia.tensor, None, throw=False)
         omega = state0.omega
         # Powers of two, so that scaling costs no digit and no body is too large or small.
         self.exponent = exponent_of(omega)
@@ -120,6 +119,7 @@ def free_body(inertia: Inertia, state0: State, t: ScalarLike) -> State:
     Array([-0.42522037, -0.90508985,  0.24550111], dtype=float64)
     """
     _check(inertia, state0)
+    inertia = validation.possible(inertia, inertia.tensor, None, throw=False)
     return _jitted(inertia, state0, _time(t, state0.omega))
 
 

@@ -57,8 +57,8 @@ class EulerEquations(eqx.Module):
         _checks.single(inertia, _inertia.Inertia, "inertia", hint=_HINT)
         if torque is not None:
             require_law(torque)
-        # Traced numbers of no body are NaN from here on: in a batch the other bodies go on.
-        self.inertia = validation.possible(inertia, inertia.tensor, None, throw=False)
+        # Traced numbers are looked at where a motion is asked for: a fit may pass through such.
+        self.inertia = inertia.invertible() if validation.known(inertia.tensor) else inertia
         # Once per solve: a division inside the field costs 25 times the rest of it.
         self.inverse = _inertia.inverse(inertia.tensor)
         self.torque = torque

@@ -130,8 +130,8 @@ def crossings(
         dtype = jnp.promote_types(dtype, leaf.dtype)
     times, state0 = jax.tree.map(lambda leaf: leaf.astype(dtype), (times, state0))
     validation.require_fit(body, state0, torque)
-    if body is not None and _checks.known(body):
-        body = body.invertible()
+    if body is not None:
+        body = validation.real_or_nan(body)
     asked = Asked(condition, body)
     state0 = started(body, state0, torque, times[0])
     require_condition(asked, times[0], state0)

@@ -126,8 +126,8 @@ def simulate(
         dtype = jnp.promote_types(dtype, leaf.dtype)
     times, state0 = jax.tree.map(lambda leaf: _as(leaf, dtype), (times, state0))
     validation.require_fit(body, state0, torque)
-    if body is not None and (throw or _checks.known(body)):
-        body = body.invertible()
+    if body is not None:
+        body = body.invertible() if throw else validation.real_or_nan(body)
     controller = stepsize_controller
     if controller is None:
         rtol, atol = validation.tolerances(rtol, atol, dtype)

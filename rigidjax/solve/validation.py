@@ -12,6 +12,7 @@ from jaxtyping import Array
 from rigidjax import _checks
 from rigidjax._types import HasAttitude
 from rigidjax.body.inertia import Inertia, MassProperties
+from rigidjax.body.validation import possible
 from rigidjax.frames import AbstractScene, MovingFrame, Point
 from rigidjax.frames.frame_dynamics import scene_of
 from rigidjax.motion import Attitude, Rigid, Spin
@@ -42,6 +43,17 @@ def require_fit(body: Any, state0: Any, torque: Any) -> None:
         )
     if body is not None:
         _one_body(body)
+
+
+def real_or_nan(body: Inertia | MassProperties) -> Any:
+    """The body; where its numbers are traced and no body has them, all of them are NaN.
+
+    >>> real_or_nan(Inertia.from_principal(1.0, 2.0, 2.5)).moments
+    Array([1. , 2. , 2.5], dtype=float64)
+    """
+    matter = isinstance(body, MassProperties)
+    tensor = body.inertia.tensor if matter else body.tensor
+    return possible(body, tensor, body.mass if matter else None, throw=False)
 
 
 def _one_body(body: Inertia | MassProperties) -> None:
