@@ -1,10 +1,10 @@
 """Tumblers that are no ellipsoids, found by a fit of ellipsoids: status, errors, intervals.
 
-    python tests/identify/bench_real_shapes.py [how many] [first] [rough] [noise]
+    python tests/identify/bench_real_shapes.py [how many] [first] [rough] [noise] [told]
 
 Convex polyhedra about ellipsoids (`tumblers.polyhedron`): distances are moved by `rough` (0.05: by
-5 %). Magnitudes with `noise` (0.02: 2 %) that the fit is not told. For each status: how many, how
-often both periods are right to 0.5 %, the median error of the periods and ratios of moments of
+5 %). Magnitudes with `noise` (0.02: 2 %); the fit is told so where `told` is 1. For each status: how many, how
+often both periods are right to 2 %, the median error of the periods and ratios of moments of
 those, and how often each of the four true numbers is inside its 95 % interval.
 """
 
@@ -22,13 +22,14 @@ from rigidjax import identify
 NAMES = ("rotation", "precession", "first ratio", "second ratio")
 
 
-def main(count: int, first: int, rough: float, noise: float) -> None:
+def main(count: int, first: int, rough: float, noise: float, told: int) -> None:
     said = []
     for seed in range(first, first + count):
         one = tumbler(seed, ("long", "short")[seed % 2], rough, noise)
-        found = identify.fit_light_curve(problem(of_unknown_noise(one)))
+        recording = one.recording if told else of_unknown_noise(one)
+        found = identify.fit_light_curve(problem(recording))
         error, deviations = apart(one, found.aliases[0]), found.deviations
-        right = found.aliases[0].mode == one.mode and np.abs(error[:2]).max() < 5e-3
+        right = found.aliases[0].mode == one.mode and np.abs(error[:2]).max() < 2e-2
         said.append((found.status.split(":")[0], right, error, deviations))
         print(
             f"{seed:3d} {one.mode:5s} {said[-1][0]:9s} {'right' if right else 'WRONG'} errors in % "
@@ -51,5 +52,5 @@ def main(count: int, first: int, rough: float, noise: float) -> None:
 
 
 if __name__ == "__main__":
-    given = (*sys.argv[1:], *("20", "0", "0.05", "0.02")[len(sys.argv) - 1 :])
-    main(int(given[0]), int(given[1]), float(given[2]), float(given[3]))
+    given = (*sys.argv[1:], *("20", "0", "0.05", "0.02", "0")[len(sys.argv) - 1 :])
+    main(int(given[0]), int(given[1]), float(given[2]), float(given[3]), int(given[4]))

@@ -45,6 +45,15 @@ def brightness(sensor, moments, state, ts):
     return jax.vmap(at)(ts)
 
 
+def half_way(one: "Tumbler", sensor: Any) -> np.ndarray:
+    """Directions (T, 3) half way between sun and observer, body frame, of the true motion."""
+    motion = exact.FreeBody(rj.Inertia(jnp.diag(jnp.asarray(one.moments))), one.state)
+    middle = sensor.sun / jnp.linalg.norm(sensor.sun) + sensor.observer
+    middle = middle / jnp.linalg.norm(middle)
+    turn = jax.vmap(lambda t: rj.quaternion.rotate_inverse(motion(t).q, middle))
+    return np.asarray(turn(jnp.asarray(one.recording.t)))
+
+
 def nights(rng):
     """Times of readings, s: 9 to 12 nights of 6 to 9 hours, some lost, some with a cloud."""
     out, last = [], int(rng.integers(9, 13))
