@@ -1,5 +1,6 @@
 """A tumbling body from its brightness alone: every motion that explains it, none left out."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -12,17 +13,25 @@ from jaxtyping import Array, Float
 
 from rigidjax import _checks, exact
 from rigidjax.body.inertia import MassProperties
-from rigidjax.identify import padding
+from rigidjax.identify import padding, uncertainty
 from rigidjax.identify.checkpoint import Tried
 from rigidjax.identify.fit import fit
 from rigidjax.identify.parameters import Parameters
 from rigidjax.identify.problem import Problem, one_problem
-from rigidjax.identify.quantities import carried
+from rigidjax.identify.quantities import carried, quantities
 from rigidjax.identify.result import Fit
 from rigidjax.identify.sensors import Brightness
 from rigidjax.identify.several_bodies import Bodies
-from rigidjax.identify.tumbling_search import descended, noise_of, relative_flux, starts_of
+from rigidjax.identify.tumbling_search import (
+    MAGNITUDE,
+    descended,
+    noise_of,
+    relative_flux,
+    starts_of,
+)
 from rigidjax.identify.two_frequencies import TwoFrequencies, two_frequencies
+from rigidjax.motion.torques.base import vector_at
+from rigidjax.rotation import quaternion
 from rigidjax.rotation.linalg3 import apply, dot
 
 # Motions are the same where both periods and both ratios of moments differ by less than that, or
@@ -30,6 +39,8 @@ from rigidjax.rotation.linalg3 import apply, dot
 SAME, REACH = np.array([1e-3, 1e-3, 0.05, 0.05]), 5.0
 # Log-likelihood within which a rival explains the data nearly as well: e¹⁰ to one.
 MARGIN = 10.0
+# Seen from a side a real body is brighter or fainter than its ellipsoid by this standard deviation.
+SHAPE = 0.04
 # χ² of the best above its mean by so many deviations is not believed: with a wrong alias the errors
 # may be hardly larger than the noise, and a fit by itself is content with five.
 CONTENT = 3.0
@@ -65,7 +76,8 @@ class Alias(eqx.Module):
 class LightCurve(eqx.Module):
     """What `fit_light_curve` returns.
 
-    **Fields:** `fit` of the best motion; `aliases` all motions that were found, the best first,
+    **Fields:** `fit` of the best motion, its covariance with an allowance for a body that is no
+    ellipsoid (see `fit_light_curve`); `aliases` all motions that were found, the best first,
     then by their misfit; `deviations` (4,) relative standard deviations of the best one's rotation,
     precession and two ratios; `pairs` the frequencies that they came from; `status` one line: that
     of the fit, or `ambiguous` where another of the aliases explains the data nearly as well, or
@@ -111,6 +123,10 @@ def fit_light_curve(
     that were found are listed. What brightness leaves free by symmetry (half turns of the world,
     see `Brightness`, and of the body about its axes) is one motion here: periods, moments and mode
     are the same.
+
+    Intervals allow for a real shape as consider parameters do (Tapley, Schutz and Born 2004,
+    Statistical Orbit Determination, ch. 6): as though the brightness were multiplied by 1 + n·S n,
+    n half way between sun and observer, body frame, the entries of S independent of deviation 4 %.
 
     **Arguments:** `problem` of one recording with one `Brightness` sensor and no torque; let a
     `Free` move the sensor's `level` unless it is known. `shortest` period of a line in the
@@ -230,11 +246,53 @@ def _same(a: Alias, b: Alias, near: np.ndarray) -> bool:
     return a.mode == b.mode and bool((np.abs(_numbers(a) - _numbers(b)) < near).all())
 
 
+@eqx.filter_jit
+def _half_way(parameters: Parameters, problem: Problem) -> Float[Array, "times 3"]:
+    """Directions half way between sun and observer, body frame."""
+    body, state0 = problem.unpack(parameters)
+    inertia = body.inertia if isinstance(body, MassProperties) else body
+    motion, t = exact.FreeBody(inertia, state0), problem.records.t[0]
+    sensor = padding.one(problem.records.readings[0], 0).sensor
+
+    def at(now: Array) -> Array:
+        sides = (vector_at(side, now, "") for side in (sensor.sun, sensor.observer))
+        middle = sum(side / jnp.sqrt(dot(side, side)) for side in sides)
+        state: Any = motion(now - t[0])
+        return quaternion.rotate_inverse(state.q, middle / jnp.sqrt(dot(middle, middle)))
+
+    return jax.vmap(at)(t)
+
+
+def _with_shape(best: Fit) -> Fit:
+    """The fit with a covariance that allows for a body that is no ellipsoid."""
+    linear = uncertainty.linearise(best.problem, best.parameters, best.noises)
+    reading, weight = padding.one(best.problem.records.readings[0], 0), linear.weights[0][0]
+    flux = np.asarray(reading.values) - linear.raw[0][0, :, 0]
+    size = np.full(weight.shape, 1.0 / MAGNITUDE) if reading.sensor.unit == "mag" else flux
+    n = np.asarray(_half_way(best.parameters, best.problem))
+    change = SHAPE / float(best.noises[0][0, 0]) * size[:, None, None] * n[:, :, None] * n[:, None]
+    slopes = linear.spread(linear.slopes[0][0, :, 0] * weight[:, None], linear.places[0])
+    kept = weight > 0
+    shift = uncertainty.of_white_errors(linear) @ slopes[kept].T @ change[kept].reshape(-1, 9)
+    covariance, seen = (np.asarray(c) + shift @ shift.T for c in (best.covariance, best.seen))
+    null = np.asarray(best.null_directions)
+    return dataclasses.replace(
+        best,
+        covariance=jnp.asarray(covariance),
+        seen=jnp.asarray(seen),
+        covariance_kind=f"sandwich: a shape {SHAPE:.0%} off the ellipsoid; {best.covariance_kind}",
+        quantities=quantities(best.problem, best.parameters, seen, null),
+    )
+
+
 def _told(best: Fit, aliases: list[Alias], found: TwoFrequencies, cut: bool) -> LightCurve:
-    slopes = np.asarray(_slopes(best.parameters, best.problem))
-    deviations = carried(slopes, np.asarray(best.seen), np.asarray(best.null_directions))
+    slopes, wider = np.asarray(_slopes(best.parameters, best.problem)), _with_shape(best)
+    own, deviations = (
+        carried(slopes, np.asarray(one.seen), np.asarray(one.null_directions))
+        for one in (best, wider)
+    )
     # The misfits of a search that stopped on its way to the same motion are no rival's.
-    near = np.maximum(SAME, REACH * deviations)
+    near = np.maximum(SAME, REACH * own)
     # Costs of the search, all with one noise: a fit may have estimated another.
     first = _alias(best.problem, best.parameters, aliases[0].cost)
     others = [alias for alias in aliases if not _same(alias, first, near)]
@@ -259,4 +317,4 @@ def _told(best: Fit, aliases: list[Alias], found: TwoFrequencies, cut: bool) -> 
             f"doubtful: χ² is {best.chi2:.0f} of {best.dof}: another motion that was not found, or "
             "more noise than was said"
         )
-    return LightCurve(best, marked, deviations, found, status)
+    return LightCurve(wider, marked, deviations, found, status)

@@ -106,6 +106,46 @@ def test_a_tumbler_is_found_blind(seed, mode):
     assert len(found.aliases) > 1 and f"{mode}-axis mode" in str(found)
 
 
+def test_intervals_hold_the_truth_of_a_body_that_is_no_ellipsoid():
+    # Once its first ratio was off by twelve of its deviations, and called ok.
+    one = tumblers.tumbler(8, "long", rough=0.05)
+    found = identify.fit_light_curve(tumblers.problem(tumblers.of_unknown_noise(one)))
+    error = np.abs(tumblers.apart(one, found.aliases[0]))
+    assert found.ok and error[2] > 0.02 and (error[:2] < 5e-3).all()
+    assert (error < 1.96 * found.deviations).all()
+    # They are those of the fit itself, and no wider than the ratios can be known.
+    assert abs(found.fit.quantities[0].deviation / found.deviations[2] - 1) < 1e-6
+    assert (found.deviations[2:] < 0.1).all()
+
+
+def test_the_allowance_for_shape_is_what_such_shapes_do_to_a_fit():
+    one = tumblers.tumbler(2, "long")
+    problem = tumblers.problem(one.recording)
+    found = identify.fit_light_curve(problem)
+    reading = one.recording.readings[0]
+    n, size = tumblers.half_way(one, reading.sensor), 0.002
+    total = np.zeros(2)
+
+    def refitted(change):
+        values = np.asarray(reading.values) - 2.5 * np.log10(1 + size * change)
+        moved = tumblers.problem(identify.Recording(one.recording.t, (reading.sensor, values)))
+        fitted = identify.fit(moved, starts=1, initial=found.fit.parameters, tolerance=1e-6)
+        return fitted.quantities[:2]
+
+    plain = refitted(np.zeros(n.shape[0]))
+    for i in range(3):
+        for j in range(i + 1):
+            shift = [
+                np.log(a.value / b.value)
+                for a, b in zip(refitted(n[:, i] * n[:, j]), plain, strict=True)
+            ]
+            # Off the diagonal there are two of each.
+            total += (1 + (i != j)) * np.square(shift) * (0.04 / size) ** 2
+    for a, b, wanted in zip(found.fit.quantities[:2], plain, total, strict=True):
+        added = a.deviation**2 - b.deviation**2
+        np.testing.assert_allclose(added, wanted, rtol=0.1)
+
+
 def test_a_light_curve_of_something_else_is_not_called_ok():
     one = tumblers.tumbler(2, "long")
     t = np.asarray(one.recording.t)

@@ -1,10 +1,11 @@
-"""Simulated tumblers: light curves of lit ellipsoids, read on some nights with 2 % noise."""
+"""Simulated tumblers: light curves of lit bodies, read on some nights with 2 % noise."""
 
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.spatial import ConvexHull
 
 import rigidjax as rj
 from rigidjax import exact, identify
@@ -44,6 +45,15 @@ def brightness(sensor, moments, state, ts):
     return jax.vmap(at)(ts)
 
 
+def half_way(one: "Tumbler", sensor: Any) -> np.ndarray:
+    """Directions (T, 3) half way between sun and observer, body frame, of the true motion."""
+    motion = exact.FreeBody(rj.Inertia(jnp.diag(jnp.asarray(one.moments))), one.state)
+    middle = sensor.sun / jnp.linalg.norm(sensor.sun) + sensor.observer
+    middle = middle / jnp.linalg.norm(middle)
+    turn = jax.vmap(lambda t: rj.quaternion.rotate_inverse(motion(t).q, middle))
+    return np.asarray(turn(jnp.asarray(one.recording.t)))
+
+
 def nights(rng):
     """Times of readings, s: 9 to 12 nights of 6 to 9 hours, some lost, some with a cloud."""
     out, last = [], int(rng.integers(9, 13))
@@ -62,14 +72,54 @@ def nights(rng):
     return (t - t[0]) * HOUR
 
 
-def tumbler(seed: int, mode: str) -> Tumbler:
-    """One tumbler in long- or short-axis mode, of 4 to 16 hours of precession."""
+def polyhedron(rng, semi_axes, rough):
+    """Corners and faces of a convex polyhedron about an ellipsoid, in its principal axes; moments.
+
+    The hull of 150 points: the logarithm of each one's distance is moved by a smooth random
+    function of the direction, of standard deviation `rough`.
+    """
+    u = rng.normal(size=(150, 3))
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    waves, phases = 2.0 * rng.normal(size=(3, 50)), rng.uniform(0, 2 * np.pi, 50)
+    moved = rough * np.sin(u @ waves + phases).sum(axis=1) / 5.0
+    corners = u * semi_axes * np.exp(moved)[:, None]
+    hull = ConvexHull(corners)
+    faces = hull.simplices.copy()
+    a, b, c = (corners[faces[:, k]] for k in range(3))
+    inward = np.sum(np.cross(b - a, c - a) * hull.equations[:, :3], axis=1) < 0
+    faces[inward] = faces[inward][:, ::-1]
+    moments, axes = np.linalg.eigh(np.asarray(rj.shapes.mesh(corners, faces, 1.0).inertia.tensor))
+    axes[:, 0] *= np.linalg.det(axes)
+    return corners @ axes, faces, moments
+
+
+def magnitudes(corners, faces, sensor, moments, state, ts):
+    """What `sensor` reads of a polyhedron in its principal axes, without noise."""
+
+    motion = exact.FreeBody(rj.Inertia(jnp.diag(jnp.asarray(moments))), state)
+
+    def at(t):
+        q = motion(t).q
+        sides = [rj.quaternion.rotate_inverse(q, d) for d in (sensor.sun, sensor.observer)]
+        return rj.body.brightness.mesh(corners, faces, *sides)
+
+    return -2.5 * np.log10(np.asarray(jax.jit(jax.vmap(at))(jnp.asarray(ts))))
+
+
+def tumbler(seed: int, mode: str, rough: float = 0.0, noise: float = NOISE) -> Tumbler:
+    """One tumbler in long- or short-axis mode, of 4 to 16 hours of precession.
+
+    Of `rough` above zero it is no ellipsoid but a `polyhedron`.
+    """
     rng = np.random.default_rng(1000 + seed)
+    shape = None
     while True:
         b = rng.uniform(0.5, 0.9)
         c = b * rng.uniform(0.6, 0.95)
         second = np.array([1.0, b * b, c * c])
         moments = second.sum() - second
+        if rough:
+            *shape, moments = polyhedron(rng, np.sqrt(second), rough)
         moments = moments / moments[2]
         # h²/2T from a spin about the axis of the mode (0) to the separatrix (1).
         part = rng.uniform(0.15, 0.85)
@@ -88,12 +138,15 @@ def tumbler(seed: int, mode: str) -> Tumbler:
     state = exact.free_body(body, state, rng.uniform(0, rotation))
     phase = rng.uniform(10, 50)
     observer = [np.cos(np.radians(phase)), np.sin(np.radians(phase)), 0.0]
-    sensor = Brightness([1.0, 0.0, 0.0], observer, noise=1.0857 * NOISE, unit="mag")
+    sensor = Brightness([1.0, 0.0, 0.0], observer, noise=1.0857 * noise, unit="mag")
     ts = nights(rng)
-    clean = np.asarray(brightness(sensor, jnp.asarray(moments), state, jnp.asarray(ts)))
+    if shape is None:
+        clean = np.asarray(brightness(sensor, jnp.asarray(moments), state, jnp.asarray(ts)))
+    else:
+        clean = magnitudes(*shape, sensor, moments, state, ts)
     flux = 10 ** (-0.4 * clean)
     level = rng.uniform(10.0, 20.0)
-    read = level - 2.5 * np.log10(flux * (1 + NOISE * rng.normal(size=ts.size)))
+    read = level - 2.5 * np.log10(flux * (1 + noise * rng.normal(size=ts.size)))
     amplitude = float(flux.std() / flux.mean())
     recording = identify.Recording(ts, (sensor, read))
     semi_axes = np.array([1.0, b, c])
@@ -114,3 +167,17 @@ def off(one: Tumbler, alias: identify.Alias) -> tuple[float, float]:
     times = alias.rotation / one.rotation - 1, alias.precession / one.precession - 1
     ratios = alias.ratios / one.moments[:2] - 1
     return max(abs(time) for time in times), float(np.abs(ratios).max())
+
+
+def of_unknown_noise(one: Tumbler) -> identify.Recording:
+    """The same recording without a noise that is given."""
+    reading = one.recording.readings[0]
+    known: Any = reading.sensor
+    sensor = Brightness(known.sun, known.observer, unit="mag")
+    return identify.Recording(np.asarray(one.recording.t), (sensor, np.asarray(reading.values)))
+
+
+def apart(one: Tumbler, alias: identify.Alias) -> np.ndarray:
+    """Logarithms (4,) of rotation, precession and both ratios of moments over the true ones."""
+    found = np.array([alias.rotation, alias.precession, *alias.ratios])
+    return np.log(found / [one.rotation, one.precession, *one.moments[:2]])
