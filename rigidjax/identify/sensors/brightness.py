@@ -38,6 +38,7 @@ class Brightness(AbstractSensor):
 
     Brightness alone leaves the world's turns free that leave it unchanged: with fixed directions
     the half turns about `sun × observer`, and, but for `Geometric`, about their sum and difference.
+    A `fit` takes the body for an ellipsoid; `fit_light_curve` allows for one that is none.
 
     **Raises** `ValueError` for a direction of length zero, a noise or semi-axis that is not
     positive, a wrong shape, NaN; `TypeError` for another kind of argument.
