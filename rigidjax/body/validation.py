@@ -79,10 +79,10 @@ def real_second_moment(s: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3 
 
 
 def possible(body: Any, tensor: Float[Array, "*batch 3 3"], mass: Any, throw: bool) -> Any:
-    """Return `body` if a body can be so and turns in all directions.
+    """Return `body` if some mass has these numbers and no moment is zero.
 
-    Else known numbers, and traced ones with `throw`, are refused with the cause; without `throw`
-    all numbers of a traced body are NaN, so that its motion is, too, and no other's.
+    Other numbers are refused with the cause if they are known, or if `throw`. Without `throw` all
+    numbers of a traced body become NaN: so does its motion, and no other body's.
 
     **Arguments:** `tensor` the inertia, kg m²; `mass` kg, `None` for a body that only turns.
     """
@@ -139,10 +139,11 @@ def _impossible(xp: Any, tensor: Any, slack: float) -> tuple[Any, Any]:
     second = 0.5 * xp.eye(3, dtype=a.dtype) - a
     broken = trace < 0
     for minor in minors(second):
-        broken = broken | (minor < -slack)
-    # det I is between half and one times the product of the least moment and the largest squared.
-    least = minors(a)[-1]
-    return ~(trace > 0) | ~(least > 0.125 * slack), broken
+        # With a NaN the other entries are not scaled, and say nothing.
+        broken = broken | ((trace > 0) & (minor < -slack))
+    # The product of the two larger moments is 1/9 to 1/4 of the squared trace.
+    determinant = minors(a)[-1]
+    return ~(trace > 0) | ~(determinant > 0.125 * slack), broken
 
 
 _PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))

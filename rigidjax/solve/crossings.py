@@ -28,7 +28,7 @@ from rigidjax.solve.events import (
     require_step,
 )
 from rigidjax.solve.explicit import AbstractExplicit, DormandPrince8
-from rigidjax.solve.linear_map import lost
+from rigidjax.solve.linear_map import nan_derivatives
 from rigidjax.solve.run import Free, Loop
 from rigidjax.solve.step_control import Watched
 
@@ -160,5 +160,5 @@ def _solved(
     step = None if step is None else lax.stop_gradient(step)
     found = found_by(search, setup, asked, step, what, state0, ts)
     inputs = (asked, getattr(setup, "torque", None), state0, ts)
-    times, states = lost((found.times, found.states), inputs)
+    times, states = nan_derivatives((found.times, found.states), inputs)
     return Crossings(times, states, found.number, found.result, found.steps)

@@ -21,7 +21,7 @@ from rigidjax.solve.components import flat, unflat
 from rigidjax.solve.crossing_loop import Search
 from rigidjax.solve.crossing_search import Found, Numbers, Scene, correction, only_found
 from rigidjax.solve.direction import Directed, DirectedCondition, DirectedJumps
-from rigidjax.solve.linear_map import lost
+from rigidjax.solve.linear_map import nan_derivatives
 from rigidjax.solve.run import Free, Loop, solve
 from rigidjax.solve.vector_field import equations_of_motion
 
@@ -246,6 +246,6 @@ def solve_until(
     met = met & successful
     time, state = jax.tree.map(lambda leaf: jnp.where(met, leaf, jnp.nan), (time, state))
     inputs = (asked, getattr(setup, "torque", None), state0, ts)
-    ys, time, state = lost((ys, time, state), inputs)
+    ys, time, state = nan_derivatives((ys, time, state), inputs)
     result = dfx.RESULTS.where(met, dfx.RESULTS.event_occurred, result)
     return ys, stats, result, time, state

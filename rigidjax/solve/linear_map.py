@@ -63,27 +63,27 @@ def forward_only(function: Map, pushed: Map) -> Map:
     return wrapped
 
 
-def lost(tree: Any, inputs: Any) -> Any:
-    """The same numbers; the derivative by all `inputs` of one that is NaN is NaN, in both modes.
+def nan_derivatives(tree: Any, inputs: Any) -> Any:
+    """The same numbers; where one is not finite its derivative by all `inputs` is NaN, in both modes.
 
-    What a run did not reach is put in by `where`, which has the derivative 0: a wrong one. A number
-    that is not used, cotangent 0, leaves the gradient of the others as it is.
+    A state that a run did not reach is NaN by a `where`, whose derivative is 0: a wrong one. A
+    number that is not used has the cotangent 0 and leaves the gradient of the others as it is.
     """
     outs, structure = jax.tree.flatten(tree)
     whole = [_is_smooth(a) for a in outs]
     smooth = [a for a, w in zip(outs, whole, strict=True) if w]
     anchors = [a for a in jax.tree.leaves(inputs) if eqx.is_inexact_array(a)]
-    told = iter(_lost(len(smooth), *smooth, *anchors))
+    told = iter(_with_nan(len(smooth), *smooth, *anchors))
     outs = [next(told) if w else a for a, w in zip(outs, whole, strict=True)]
     return jax.tree.unflatten(structure, outs)
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _lost(count: int, *numbers: Array) -> Arrays:
+def _with_nan(count: int, *numbers: Array) -> Arrays:
     return list(numbers[:count])
 
 
-@_lost.defjvp
+@_with_nan.defjvp
 def _(count: int, primals: Any, tangents: Any) -> Any:
     outs = list(primals[:count])
     there = [jnp.isfinite(a) for a in outs]

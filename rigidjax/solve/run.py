@@ -19,7 +19,7 @@ from rigidjax.motion.torques.base import jumps_of
 from rigidjax.solve.adaptive import adaptive
 from rigidjax.solve.direction import Directed, DirectedCondition, DirectedJumps
 from rigidjax.solve.explicit import AbstractExplicit
-from rigidjax.solve.linear_map import lost
+from rigidjax.solve.linear_map import nan_derivatives
 from rigidjax.solve.projection import Projected
 from rigidjax.solve.step_control import NONFINITE, finite
 from rigidjax.solve.vector_field import equations_of_motion
@@ -73,7 +73,7 @@ def solve(
 ) -> tuple[Any, dict[str, Any], dfx.RESULTS]:
     ys, stats, result = _solved(setup, state0, ts)
     inputs = (setup.body, getattr(setup, "torque", None), state0, ts)
-    return lost(ys, inputs), stats, result
+    return nan_derivatives(ys, inputs), stats, result
 
 
 def _solved(
