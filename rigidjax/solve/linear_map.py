@@ -64,7 +64,7 @@ def forward_only(function: Map, pushed: Map) -> Map:
 
 
 def nan_derivatives(tree: Any, inputs: Any) -> Any:
-    """The same numbers; where one is not finite its derivative by all `inputs` is NaN, in both modes.
+    """The same numbers; one that is not finite has NaN derivatives by `inputs`, in both modes.
 
     A state that a run did not reach is NaN by a `where`, whose derivative is 0: a wrong one. A
     number that is not used has the cotangent 0 and leaves the gradient of the others as it is.
