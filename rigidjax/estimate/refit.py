@@ -22,6 +22,7 @@ from rigidjax._types import Scalar
 from rigidjax.estimate.density import LogDensity, Point, of_draws
 from rigidjax.estimate.terms import curvature
 from rigidjax.identify.levenberg_marquardt import Settings, made_of, search
+from rigidjax.identify.quantities import carried
 
 # Steps of so many standard deviations end the search; its damping at the start.
 _SMALL, _DAMPING = 1e-3, 1e-2
@@ -98,10 +99,10 @@ class Refit(eqx.Module):
         def value(x: Array) -> Array:
             return jnp.asarray(of(self.density.unpack(x)))
 
-        centre, slope = value(self.x), jax.jacfwd(value)(self.x)
-        spread = jnp.sqrt(jnp.einsum("...i,ij,...j->...", slope, self.covariance, slope))
-        reach = NormalDist().inv_cdf(0.5 + 0.5 * level) * spread
-        return np.asarray(centre - reach), np.asarray(centre + reach)
+        centre, slope = (np.asarray(a) for a in (value(self.x), jax.jacfwd(value)(self.x)))
+        deviation = carried(slope, np.asarray(self.covariance), np.zeros((0, self.x.size)))
+        reach = NormalDist().inv_cdf(0.5 + 0.5 * level) * deviation
+        return centre - reach, centre + reach
 
 
 def _quantiles(values: np.ndarray, weights: np.ndarray, at: np.ndarray) -> np.ndarray:

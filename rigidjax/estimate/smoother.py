@@ -202,7 +202,7 @@ def _smooth(
         mine = slice(6 * index, 6 * index + 3)
         size = jnp.where(h > 0, 1 / jnp.sqrt(jnp.where(h > 0, h, 1)), 0)[:, None] * root[None]
         variance = jnp.diagonal(out.kick_covariance, axis1=1, axis2=2)[:, mine]
-        pushes.append(Push(size * out.kicks[:, mine], size * jnp.sqrt(jnp.maximum(variance, 0))))
+        pushes.append(Push(size * out.kicks[:, mine], size * jnp.sqrt(variance)))
     return Smoothed(
         Belief(stops.t, x, out.root[1:]),
         here,

@@ -16,7 +16,7 @@ from rigidjax.identify.jacobian import with_blocks
 from rigidjax.identify.parameters import Parameters, places
 from rigidjax.identify.problem import Problem, fits, one_problem
 from rigidjax.identify.quantities import Quantity, quantities
-from rigidjax.identify.uncertainty import WEAKEST
+from rigidjax.identify.uncertainty import inverted
 
 
 def expected(problem: Problem, parameters: Parameters) -> tuple[Quantity, ...]:
@@ -46,15 +46,7 @@ def expected(problem: Problem, parameters: Parameters) -> tuple[Quantity, ...]:
             "expected: Fisher's information has NaN or infinity in it: problem holds NaN in its "
             "recordings, or the motion of these parameters is beyond the dtype"
         )
-    size = np.sqrt(np.diag(information))
-    size = np.maximum(size, max(WEAKEST * size.max(), 1e-300))
-    values, vectors = np.linalg.eigh(information / np.outer(size, size))
-    seen = values > 1e-14 * values.max()
-    inverse = np.where(seen, 1.0 / np.where(seen, values, 1.0), 0.0)
-    covariance = (vectors * inverse) @ vectors.T / np.outer(size, size)
-    null = vectors[:, ~seen].T / size
-    null = null / np.linalg.norm(null, axis=1, keepdims=True)
-    return quantities(problem, parameters, covariance, null)
+    return quantities(problem, parameters, *inverted(information))
 
 
 def plan_of(problem: Problem, body: Any, omega: Any) -> Parameters:

@@ -69,14 +69,14 @@ def goodness(problem: Problem, linear: Linearised, times: Times, free: int) -> G
             chi2, count = chi2 + own, count + many
             factor = _above(problem, e, weight, kept, own, many, free)
             if factor > FAR:
-                poor.append(f"{name} are {factor:.1f} times the noise")
+                poor.append(f"{name} are {factor:.3g} times the noise")
             elif factor > 1.0:
-                doubts.append(f"{name} are {factor:.2f} times the noise")
+                doubts.append(f"{name} are {factor:.3g} times the noise")
         given = reading.sensor.noise is not None
         if not _white(e * np.sqrt(weight)[..., None], kept, given) and left > tiny:
             size = _over_scatter(np.asarray(error), kept)
             doubts.append(
-                f"{name} are autocorrelated over {times.longest:.0f} samples, {size:.1f} times "
+                f"{name} are autocorrelated over {times.longest:.0f} samples, {size:.3g} times "
                 "their scatter from one reading to the next (something is missing in the model, "
                 "or the data were filtered)"
             )

@@ -84,11 +84,14 @@ def _rate(fit: "Fit", reach: float) -> str:
     for index in range(fit.problem.count):
         three = rates[3 * index : 3 * index + 3]
         length = np.linalg.norm([q.value for q in three])
-        shares.append(reach * max(q.deviation for q in three) / length)
-    grade = "well" if max(shares) < 0.1 else "weakly"
+        shares.append(reach * np.max([q.deviation for q in three]) / max(length, 1e-300))
+    wide = np.max(shares)
     what = "The first body rate is" if fit.problem.count == 1 else "The first body rates are"
+    if not wide < 1.0:
+        return f"{what} not determined by these data."
+    grade = "well" if wide < 0.1 else "weakly"
     its = "its length" if fit.problem.count == 1 else "their lengths"
-    return f"{what} {grade} determined, to ±{max(shares):.2g} of {its}."
+    return f"{what} {grade} determined, to ±{wide:.2g} of {its}."
 
 
 def _unseen(fit: "Fit") -> list[str]:

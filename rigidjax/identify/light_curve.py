@@ -69,7 +69,7 @@ class Alias(eqx.Module):
         return (
             f"{self.mode}-axis mode, rotation {self.rotation:.6g} s, precession "
             f"{self.precession:.6g} s, moments {self.ratios[0]:.3f} : {self.ratios[1]:.3f} : 1, "
-            f"misfit {self.cost:.1f}"
+            f"misfit {self.cost:.6g}"
         )
 
 
@@ -151,12 +151,12 @@ def fit_light_curve(
     found = two_frequencies(t, squares, spread, shortest=shortest, count=count)
     used = _used(found)
     starts = starts_of(problem, reading, t, squares, spread, found, used)
-    say(f"{used} pairs of frequencies, χ² {found.misfits[0]:.0f} of {found.dof}")
+    say(f"{used} pairs of frequencies, χ² {found.misfits[0]:.6g} of {found.dof}")
     say(f"{len(starts)} starts")
     sigma = noise_of(problem, reading, flux, found)
     ends = descended(problem, starts, sigma, tolerance)
     aliases = _aliases(problem, ends)
-    say(f"{len(aliases)} motions, misfit {aliases[0].cost:.1f}")
+    say(f"{len(aliases)} motions, misfit {aliases[0].cost:.6g}")
     best = fit(problem, starts=1, initial=aliases[0].parameters, tolerance=tolerance)
     return _told(best, aliases, found, used >= count)
 
@@ -292,7 +292,7 @@ def _told(best: Fit, aliases: list[Alias], found: TwoFrequencies, cut: bool) -> 
         for one in (best, wider)
     )
     # The misfits of a search that stopped on its way to the same motion are no rival's.
-    near = np.maximum(SAME, REACH * own)
+    near = np.fmax(SAME, REACH * own)
     # Costs of the search, all with one noise: a fit may have estimated another.
     first = _alias(best.problem, best.parameters, aliases[0].cost)
     others = [alias for alias in aliases if not _same(alias, first, near)]
@@ -314,7 +314,7 @@ def _told(best: Fit, aliases: list[Alias], found: TwoFrequencies, cut: bool) -> 
     above = best.chi2 - best.dof if best.problem.loss is None else 0.0
     if status == "ok" and above > CONTENT * np.sqrt(2.0 * best.dof):
         status = (
-            f"doubtful: χ² is {best.chi2:.0f} of {best.dof}: another motion that was not found, or "
+            f"doubtful: χ² is {best.chi2:.6g} of {best.dof}: another motion that was not found, or "
             "more noise than was said"
         )
     return LightCurve(wider, marked, deviations, found, status)

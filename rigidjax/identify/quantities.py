@@ -126,12 +126,16 @@ def quantities(
     """
     values, slope = (np.asarray(x) for x in _value_and_slope(problem, parameters))
     deviations = carried(slope, covariance, null)
+    # A number that changes with none of those that were fitted is not determined by them.
+    deviations = np.where(np.any(slope != 0, axis=-1), deviations, np.nan)
     out = []
     for (name, unit, positive), value, deviation in zip(
         labels(problem), values, deviations, strict=True
     ):
         shown = float(np.exp(value)) if positive else float(value)
-        out.append(Quantity(name, shown, float(deviation), unit, positive))
+        # Nor is it known better than it is written.
+        least = np.finfo(float).eps * (1.0 if positive else abs(shown))
+        out.append(Quantity(name, shown, float(np.maximum(deviation, least)), unit, positive))
     return tuple(out)
 
 
@@ -142,15 +146,25 @@ def covariance(fit: "Fit") -> np.ndarray:
 
 
 def carried(slope: np.ndarray, covariance: np.ndarray, null: np.ndarray) -> np.ndarray:
-    """Standard deviations of functions with this derivative (…, n).
+    """Standard deviations of functions with this derivative (…, n): all intervals are made of them.
 
-    Infinite where the function changes along a direction of `null` (k, n).
+    Infinite where the function changes along a direction of `null` (k, n). NaN, not determined,
+    where it changes along one whose variance is negative, or has no variance but round-off.
     """
+    if not np.isfinite(covariance).all():
+        return np.full(slope.shape[:-1], np.nan)
+    unit = np.sqrt(np.abs(np.diag(covariance)))
+    unit = np.where(unit > 0, unit, 1.0)
+    values, axes = np.linalg.eigh(covariance / np.outer(unit, unit))
     size = np.abs(slope).max(axis=-1, initial=1e-300)
-    along = np.abs(slope @ null.T).max(axis=-1, initial=0.0)
-    touched = along > 1e-6 * size
-    variance = np.einsum("...i,ij,...j->...", slope, covariance, slope)
-    return np.where(touched, np.inf, np.sqrt(np.maximum(variance, 0.0)))
+    touched = np.abs(slope @ null.T).max(axis=-1, initial=0.0) > 1e-6 * size
+    along = slope * unit @ axes
+    length = np.linalg.norm(along, axis=-1)
+    least = 10 * unit.size * np.finfo(float).eps * np.abs(values).max(initial=0.0)
+    unreal = np.linalg.norm(along[..., values < -least], axis=-1) > 1e-6 * length
+    variance = along**2 @ np.maximum(values, 0.0)
+    lost = (length > 0) & (unreal | (variance <= least * length**2))
+    return np.where(touched, np.inf, np.where(lost, np.nan, np.sqrt(variance)))
 
 
 def interval_of(

@@ -68,7 +68,7 @@ def table(lines: list[Row]) -> str:
     out = [f"{'':{wide}}  {'value':>14}  95 % interval"]
     for name, value, low, high, unit in lines:
         shown = numbers(value, low, high)
-        out.append(f"{name:{wide}}  {shown[0]:>14}  {shown[1]} … {shown[2]} {unit}".rstrip())
+        out.append(f"{name:{wide}}  {shown[0]:>14}  {_between(shown)} {unit}".rstrip())
     return "\n".join(out)
 
 
@@ -84,20 +84,32 @@ def numbers(value: float, low: float, high: float) -> list[str]:
     """
     value = _checks.number(value, "value")
     low, high = _checks.number(low, "low"), _checks.number(high, "high")
-    width, size = high - low, max(abs(value), abs(low) if np.isfinite(low) else 0.0)
-    if 0 < size < 1e-3 or size >= 1e6:
-        digits = 3
-        if np.isfinite(width) and width > 0:
-            digits = int(np.clip(2 + np.floor(np.log10(size)) - np.floor(np.log10(width)), 1, 12))
-        return [f"{number:.{digits}e}" for number in (value, low, high)]
-    digits = _decimals(width)
-    return [f"{number:.{digits}f}" for number in (value, low, high)]
+    wholes = [abs(number) for number in (value, low, high) if np.isfinite(number)]
+    size, gaps = max(wholes, default=0.0), (value - low, high - value)
+    fixed = size == 0 or 1e-3 <= size < 1e6
+    near = min((gap for gap in gaps if 0 < gap < np.inf), default=0.0)
+
+    def shown(number: float, gap: float) -> str:
+        if not np.isfinite(number):
+            return str(number)
+        top = _place(size if fixed else number)
+        # Two digits more than the first one of the uncertainty; six in all where there is none.
+        last = _place(2 * min(gap, 8e307)) - 2 if 0 < gap < np.inf else top - 5
+        last = min(max(last, top - 12), top - 2)
+        return f"{number:.{max(-last, 0)}f}" if fixed else f"{number:.{top - last}e}"
+
+    ends = (near, near, near) if fixed else (near, *gaps)
+    return [shown(number, gap) for number, gap in zip((value, low, high), ends, strict=True)]
 
 
-def _decimals(width: float) -> int:
-    if not np.isfinite(width) or width <= 0:
-        return 6
-    return int(np.clip(2 - np.floor(np.log10(width)), 0, 12))
+def _place(number: float) -> int:
+    """The power of ten of the first digit."""
+    return int(np.floor(np.log10(abs(number)))) if number else 0
+
+
+def _between(shown: list[str]) -> str:
+    """The interval of what `numbers` gives, in words where there is none."""
+    return "not determined" if "nan" in shown[1:] else f"{shown[1]} … {shown[2]}"
 
 
 def verdict(fit: Fit) -> str:
@@ -125,7 +137,7 @@ def verdict(fit: Fit) -> str:
 
 
 def as_dict(fit: Fit, files: Sequence[str] = (), more: Sequence[Row] = ()) -> dict[str, Any]:
-    """All that was found as plain numbers and text, for JSON. Infinity is written as `null`.
+    """All that was found as plain numbers and text, for JSON. What is infinite or NaN is `null`.
 
     **Arguments:** `fit`; `files` the names of what was read; `more` rows of further quantities.
 
@@ -261,7 +273,7 @@ def write_html(
     lines = []
     for name, value, low, high, unit in [*rows(fit, rate_unit), *more]:
         shown = numbers(value, low, high)
-        cells = (name, shown[0], f"{shown[1]} … {shown[2]}", unit)
+        cells = (name, shown[0], _between(shown), unit)
         lines.append("<tr>" + "".join(f"<td>{html.escape(c)}</td>" for c in cells) + "</tr>")
     words = "".join(f"<li>{html.escape(line)}</li>" for line in fit.identifiability)
     sizes = "".join(

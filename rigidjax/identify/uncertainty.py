@@ -45,36 +45,33 @@ class Linearised(eqx.Module):
         return int(self.extra_slopes.shape[-1])
 
     @property
+    def dense(self) -> np.ndarray:
+        """All slopes (R, N, m) of each recording, each row weighted."""
+        parts = [
+            (slope * np.sqrt(weight)[..., None, None]).reshape(len(slope), -1, slope.shape[-1])
+            for slope, weight in zip(self.slopes, self.weights, strict=True)
+        ]
+        return np.concatenate(parts, axis=1)
+
+    @property
     def rows(self) -> np.ndarray:
         """Rows (N, n) whose Gram matrix is that of the Jacobian, each row weighted.
 
         Those of a recording are brought to a triangle: as many as the numbers it depends on.
         """
-        out = []
-        for record, where in enumerate(self.places):
-            parts = [
-                (slope[record] * np.sqrt(weight[record])[..., None, None]).reshape(
-                    -1, slope.shape[-1]
-                )
-                for slope, weight in zip(self.slopes, self.weights, strict=True)
-            ]
-            dense = np.concatenate(parts)
-            if not np.isfinite(dense).all():
-                return np.full((1, self.size), np.nan)
-            out.append(self.spread(np.linalg.qr(dense, mode="r"), where))
-        return np.concatenate([*out, self.extra_slopes])
+        if not np.isfinite(self.dense).all():
+            return np.full((1, self.size), np.nan)
+        return np.concatenate([*self.apart(np.linalg.qr(self.dense, mode="r")), self.extra_slopes])
+
+    def apart(self, blocks: np.ndarray) -> list[np.ndarray]:
+        """Columns (R, …, m) of the recordings as columns of all numbers (…, n)."""
+        return [self.spread(block, where) for block, where in zip(blocks, self.places, strict=True)]
 
     def spread(self, block: np.ndarray, where: np.ndarray) -> np.ndarray:
         """A recording's columns (…, m) as columns of all numbers (…, n)."""
         wide = np.zeros((*block.shape[:-1], self.size + 1))
         np.add.at(wide.T, where, block.T)
         return wide[..., :-1]
-
-    def gathered(self, squares: np.ndarray) -> np.ndarray:
-        """Matrices (R, m, m) of the recordings, added up as one (n, n)."""
-        total = np.zeros((self.size + 1, self.size + 1))
-        np.add.at(total, (self.places[:, :, None], self.places[:, None, :]), squares)
-        return total[:-1, :-1]
 
     @property
     def scores(self) -> np.ndarray:
@@ -83,8 +80,7 @@ class Linearised(eqx.Module):
             np.einsum("rtk,rtkm,rt->rm", error, slope, weight)
             for error, slope, weight in zip(self.errors, self.slopes, self.weights, strict=True)
         )
-        rows = [self.spread(mine, where) for mine, where in zip(total, self.places, strict=True)]
-        return np.stack(rows)
+        return np.stack(self.apart(total))
 
 
 @eqx.filter_jit
@@ -170,7 +166,7 @@ def spread(linear: Linearised, times: "Times") -> Spread:
     covariance = (half @ half.T) / np.outer(size, size)
     kind = "Gauss–Newton"
     if times.longest > 1.5:
-        covariance = _sandwich(linear, covariance, times)
+        covariance = _sandwich(linear, half / size[:, None], times)
         kind = f"sandwich: the errors are autocorrelated over {times.longest:.0f} samples"
     null = directions[~seen] / size
     null = null / np.linalg.norm(null, axis=1, keepdims=True)
@@ -178,6 +174,17 @@ def spread(linear: Linearised, times: "Times") -> Spread:
     blind = np.abs(null).max(axis=0, initial=0.0) > 1e-6
     shown[blind, blind] = np.inf
     return Spread(shown, covariance, kind, singular, null)
+
+
+def inverted(information: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The covariance (n, n) within what is seen, and what is not, `null` (k, n), by information."""
+    size = np.sqrt(np.diag(information))
+    size = np.maximum(size, max(WEAKEST * size.max(), 1e-300))
+    values, vectors = np.linalg.eigh(information / np.outer(size, size))
+    seen = values > 1e-14 * values.max()
+    half = vectors[:, seen] / np.sqrt(values[seen]) / size[:, None]
+    null = vectors[:, ~seen].T / size
+    return half @ half.T, null / np.linalg.norm(null, axis=1, keepdims=True)
 
 
 def distance(linear: Linearised) -> float:
@@ -199,40 +206,54 @@ def _of_white(linear: Linearised) -> Spread:
     return spread(linear, Times(((1.0,),), 0.0, float(linear.size)))
 
 
-def _sandwich(linear: Linearised, bread: np.ndarray, times: "Times") -> np.ndarray:
+def _sandwich(linear: Linearised, half: np.ndarray, times: "Times") -> np.ndarray:
+    """The sandwich whose bread is `half halfᵀ`.
+
+    The meat is that of orthonormal columns: of slopes, between two breads, round-off would make
+    the variance of a direction that is hardly seen negative.
+    """
+    columns, triangles = np.linalg.qr(linear.dense)
+    seen = np.concatenate(linear.apart(triangles)) @ half
     longest = max(int(np.median((linear.weights[0] > 0).sum(axis=1))) // 2, 2)
     spans = 2.0 ** np.arange(1, np.log2(longest) + 1)
-    n = bread.shape[0]
+    n = half.shape[0]
     grown = times.independent / max(times.independent - n, 0.1 * times.independent)
-    found = [grown * bread @ _meat(linear, span) @ bread for span in spans]
-    scores = linear.scores
+    meats = ((_meat(linear, columns, span) @ seen.reshape(len(columns), -1, n)) for span in spans)
+    found = [grown * half @ (seen.T @ meat.reshape(-1, n)) @ half.T for meat in meats]
+    scores = linear.scores @ half
     records = scores.shape[0]
     if records > n // 2 and records > 5:
         # Many recordings: what differs between them shows without any model of their errors.
-        found.append(bread @ (scores.T @ scores) @ bread * records / (records - 1))
+        found.append(half @ (scores.T @ scores) @ half.T * records / (records - 1))
     # Never narrower than white errors would have it.
-    all_ = np.maximum(np.stack([np.diag(bread), *(np.diag(c) for c in found)]), 0.0)
-    least = np.maximum(np.diag(bread), 1e-300)
+    all_ = np.stack([np.sum(half**2, axis=1), *(np.diag(c) for c in found)])
+    least = np.maximum(all_[0], 1e-300)
     out = found[int(np.argmax((all_[1:] / least).mean(axis=1)))]
     own = np.maximum(np.diag(out), 1e-300)
     factor = np.sqrt(np.maximum(all_.max(axis=0) / own, 1.0))
     return out * np.outer(factor, factor)
 
 
-def _meat(linear: Linearised, time: float) -> np.ndarray:
-    """`Jᵀ C J` with C the scatter of each channel and a part that fades over `time` samples."""
+def _meat(linear: Linearised, columns: np.ndarray, time: float) -> np.ndarray:
+    """`Jᵀ C J` with C the scatter of each channel and a part that fades over `time` samples.
+
+    J the `columns` (R, N, m) of each recording, rows as in `Linearised.dense`.
+    """
     meat: Any = 0.0
+    first = 0
     fade = float(np.exp(-1.0 / time))
-    for error, slope, weight in zip(linear.errors, linear.slopes, linear.weights, strict=True):
-        root = np.sqrt(weight)
+    for error, weight in zip(linear.errors, linear.weights, strict=True):
+        root, last = np.sqrt(weight), first + error[0].size
+        slope = columns[:, first:last].reshape(*error.shape, -1)
+        first = last
         for channel in range(error.shape[-1]):
-            e, j = error[..., channel] * root, slope[..., channel, :] * root[..., None]
+            e, j = error[..., channel] * root, slope[..., channel, :]
             variance = np.sum(e**2) / max(np.sum(weight > 0), 1)
             share = smooth_share(e, weight > 0)
             # Of the sums over earlier and later errors one is the other's transpose.
             at_once, ahead = (j.transpose(0, 2, 1) @ x for x in (j, _fading(j, fade)))
             spread = share * (ahead + ahead.transpose(0, 2, 1)) + (1.0 - 2.0 * share) * at_once
-            meat = meat + variance * linear.gathered(spread)
+            meat = meat + variance * spread
     return meat
 
 

@@ -15,7 +15,9 @@ from rigidjax import _checks
 from rigidjax.identify.horizons import Horizons, between, kinds_of
 from rigidjax.identify.levenberg_marquardt import BOLD, Search, Settings, search
 from rigidjax.identify.open_loop import errors_by_horizon, open_loop_errors
+from rigidjax.identify.quantities import carried
 from rigidjax.identify.real_bodies import unreal
+from rigidjax.identify.uncertainty import inverted
 from rigidjax.identify.window_starts import eliminated, moved, precisions, with_jacobian
 from rigidjax.identify.windows import Windows
 from rigidjax.motion.torques.inputs import delays_of, require_inputs
@@ -37,7 +39,8 @@ class WindowFit(eqx.Module, Generic[Value]):
     """What `fit_windows` returns.
 
     **Fields:** `value` the free numbers, of the type of the guess; `deviation` their standard
-    deviations, from how the windows differ (sandwich; of windows that overlap they are too small);
+    deviations, from how the windows differ (sandwich; of windows that overlap they are too small),
+    infinite for a number that no window shows, NaN where windows are too few;
     `cost` half the mean square, errors in units of `noise`; `noise` by kind; `steps` taken over the
     whole windows;
     `converged`; `message` what there is to say; `scene` as given.
@@ -147,11 +150,15 @@ def fit_windows(
     value, taken = back(end.point), int(end.taken) - 1
     # Once more where it ended, if the last that was tried was no better.
     there = end if end.here else searched(value, evaluated, whole)
-    inverse = np.linalg.pinv(np.asarray(there.gram))
-    spread = inverse @ np.asarray(there.found) @ inverse
-    deviation = np.sqrt(np.clip(np.diag(spread), 0, None))
+    inverse, null = inverted(np.asarray(there.gram))
+    deviation = carried(np.eye(x.size), inverse @ np.asarray(there.found) @ inverse, null)
     converged = bool(end.converged)
     message = [] if converged else [f"stopped after {taken} steps: its best point"]
+    if len(null):
+        message.append("some combination of the free numbers changes nothing in the windows")
+    if windows.count <= x.size:
+        deviation = np.full(x.size, np.nan)
+        message.append(f"deviations need more windows than free numbers, {x.size}")
     wrong = unreal(scene(value)[0])
     message += [] if wrong is None else [wrong]
     try:

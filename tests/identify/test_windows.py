@@ -78,6 +78,26 @@ def test_known_numbers_come_back():
     np.testing.assert_allclose(held.mean_absolute["omega"][0], rise, rtol=1e-12)
 
 
+def test_what_windows_do_not_show_has_no_deviation():
+    rng = np.random.default_rng(1)
+    t = H * np.arange(T)
+    omega = np.array([0.5, 1.0, -0.4]) * np.exp(-0.3 * t)[:, None]
+    spins = rj.Spin(omega + 1e-3 * rng.normal(size=(T, 3)))
+    ball = rj.Inertia.from_principal(1.0, 1.0, 1.0)
+    both = lambda k: (ball, torques.Damping((k["a"] + k["b"]) * jnp.ones(3)))
+    guess = {"a": jnp.asarray(0.1), "b": jnp.asarray(0.1)}
+    found = identify.fit_windows(identify.windows(t, spins, length=8, stride=8), both, guess)
+    assert float(found.value["a"] + found.value["b"]) == pytest.approx(0.3, abs=0.02)
+    assert {float(d) for d in found.deviation.values()} == {np.inf}
+    assert "some combination of the free numbers changes nothing" in found.message
+    one = lambda k: (ball, torques.Damping(k * jnp.ones(3)))
+    # From how windows differ: of one window nothing.
+    cut = identify.windows(t[:9], rj.Spin(spins.omega[:9]), length=8)
+    found = identify.fit_windows(cut, one, jnp.asarray(0.1))
+    assert cut.count == 1 and np.isnan(found.deviation)
+    assert "deviations need more windows than free numbers, 1" in found.message
+
+
 def test_deviations_say_how_far_off_the_numbers_are():
     """Ten records with noise: of forty numbers as many within two deviations as there should be."""
     inside = []

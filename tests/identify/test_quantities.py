@@ -1,0 +1,120 @@
+"""Intervals: none of a negative variance, none of width zero; their digits."""
+
+import json
+import math
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import rigidjax as rj
+from rigidjax import identify
+from rigidjax.identify import report
+from rigidjax.identify.quantities import carried, quantities
+
+NONE = np.zeros((0, 2))
+TIMES = np.linspace(0.0, 10.0, 80)
+
+
+def fitted():
+    motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1, 0.1, 1.0]), TIMES)
+    record = identify.Recording(TIMES, (identify.Gyro(0.01), motion.ys.omega))
+    return identify.fit(identify.Problem(record, identify.PrincipalRatios()))
+
+
+def test_deviations_of_a_good_covariance():
+    # √(gᵀCg), by hand; and of two numbers that differ by 1e-6 of what each is unsure by.
+    slopes = np.array([[1.0, 0.0], [1.0, -1.0], [0.0, 0.0]])
+    covariance = np.array([[4.0, 1.0], [1.0, 9.0]])
+    np.testing.assert_allclose(carried(slopes, covariance, NONE), [2.0, math.sqrt(11.0), 0.0])
+    close = np.array([[1.0, 1.0], [1.0, 1.0 + 1e-12]])
+    assert carried(slopes[1], close, NONE) == pytest.approx(1e-6, rel=1e-2)
+    # In any units.
+    units = np.array([1e-9, 1e6])
+    scaled = covariance * np.outer(units, units)
+    np.testing.assert_allclose(
+        carried(slopes / units, scaled, NONE), [2.0, math.sqrt(11.0), 0.0], rtol=1e-12
+    )
+    blind = np.array([[0.0, 1.0]])
+    assert carried(slopes, covariance, blind)[1:].tolist() == [np.inf, 0.0]
+
+
+def test_a_negative_variance_gives_no_interval():
+    slopes = np.array([[1.0, 0.0], [0.0, 1.0], [1.0, 1.0], [2.0, 1.0], [0.0, 0.0]])
+    found = carried(slopes, np.diag([1.0, -1.0]), NONE)
+    np.testing.assert_array_equal(found, [1.0, np.nan, np.nan, np.nan, 0.0])
+    # A positive diagonal hides it: the difference of the two has the variance −1.
+    found = carried(np.array([[1.0, 0.0], [1.0, -1.0]]), np.array([[1.0, 1.5], [1.5, 1.0]]), NONE)
+    assert np.isnan(found).all()
+    # What is left of a variance after all digits cancel is none.
+    assert np.isnan(carried(np.array([1.0, -1.0]), np.ones((2, 2)), NONE))
+
+
+def test_an_indefinite_information_is_told():
+    found = fitted()
+    seen = np.asarray(found.seen).copy()
+    seen[0, 0] = -seen[0, 0]
+    numbers = quantities(found.problem, found.parameters, seen, np.asarray(found.null_directions))
+    wrong = eqx.tree_at(lambda f: (f.seen, f.quantities), found, (jnp.asarray(seen), numbers))
+    assert np.isnan(wrong.interval()["Ix/Iz"]).all()
+    low, high = wrong.interval_of(lambda body, _: body.moments[:1])
+    assert np.isnan(low).all() and np.isnan(high).all()
+    assert "Ix/Iz is not determined by these data." in wrong.identifiability
+    (row,) = [line for line in report.table(report.rows(wrong)).splitlines() if "Ix/Iz" in line]
+    assert row.split() == ["Ix/Iz", "0.400000", "not", "determined"]
+    assert report.as_dict(wrong)["quantities"]["Ix/Iz"]["interval_95"] == [None, None]
+    json.dumps(report.as_dict(wrong), allow_nan=False)
+    assert not any(np.isnan(x) for x in (number for q in found.interval().values() for number in q))
+
+
+def test_a_fitted_number_has_a_width():
+    # Exact readings whose noise is estimated: round-off is all there is.
+    found = fitted()
+    exact = quantities(
+        found.problem, found.parameters, 1e-40 * np.asarray(found.seen), np.zeros((0, 5))
+    )
+    for number in exact:
+        low, high = number.interval(1.96)
+        assert low < number.value < high
+    still = quantities(found.problem, found.parameters, np.zeros((5, 5)), np.zeros((0, 5)))
+    assert all(np.isnan(number.deviation) for number in still)
+
+
+@pytest.mark.parametrize(
+    ("given", "wanted"),
+    [
+        ((1.23456, 1.2, 1.27), ["1.2346", "1.2000", "1.2700"]),
+        ((0.0689, 1e-40, 3e65), ["6.89e-02", "1.00e-40", "3.00e+65"]),
+        ((0.0689, 0.0, np.inf), ["0.0689", "0.0000", "inf"]),
+        ((0.0689351234567, -np.inf, np.inf), ["0.0689351", "-inf", "inf"]),
+        ((0.0689351234567, np.nan, np.nan), ["0.0689351", "nan", "nan"]),
+        ((123456.123456, np.nan, np.nan), ["123456", "nan", "nan"]),
+        ((2.5e70, 2.4e70, 2.6e70), ["2.500e+70", "2.400e+70", "2.600e+70"]),
+        ((1.0, 0.5, 2e8), ["1.00e+00", "5.00e-01", "2.00e+08"]),
+        ((0.0, -0.012, 0.012), ["0.0000", "-0.0120", "0.0120"]),
+        ((3.0e-7, -1.0e-3, 1.0e-3), ["0.00000", "-0.00100", "0.00100"]),
+        ((1.0, 1.0 - 1e-30, 1.0 + 1e-30), ["1.00000", "1.00000", "1.00000"]),
+        ((np.nan, np.nan, np.nan), ["nan", "nan", "nan"]),
+        ((1e308, 0.0, np.inf), ["1.00e+308", "0.00e+00", "inf"]),
+    ],
+)
+def test_numbers_have_the_digits_that_they_mean(given, wanted):
+    assert report.numbers(*given) == wanted
+
+
+def test_no_number_is_long():
+    rng = np.random.default_rng(0)
+    for _ in range(300):
+        value, scale, wide = 10.0 ** rng.uniform(-300, 300, 3)
+        if rng.random() < 0.5:
+            value, scale, wide = 10.0 ** rng.uniform(-9, 9, 3)
+        low, high = value - scale, value + wide
+        shown = report.numbers(value, low, high)
+        assert max(len(text) for text in shown) < 22, (value, low, high, shown)
+        below, above = value - low, high - value
+        if not (below > 0 and above > 0):
+            continue
+        gaps = (min(below, above), below, above)
+        for text, number, gap in zip(shown, (value, low, high), gaps, strict=True):
+            assert abs(float(text) - number) <= 0.05 * gap + 1e-12 * max(abs(low), high)

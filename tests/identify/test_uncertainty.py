@@ -1,0 +1,78 @@
+"""How sure a fit is, where the data hardly see a direction: a real toss of a flat body."""
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rigidjax import identify
+from rigidjax.identify import report
+from rigidjax.identify.uncertainty import correlation_times, inverted, linearise, spread
+
+TOSSES = Path(__file__).parents[3] / "shared" / "data" / "tennis_racket" / "tosses.csv"
+
+
+@pytest.fixture(scope="module")
+def toss():
+    if not TOSSES.exists():
+        pytest.skip("shared/data/tennis_racket/tosses.csv is not beside this checkout")
+    with TOSSES.open() as file:
+        rows = [row for row in csv.DictReader(file) if (row["round"], row["toss"]) == ("3", "32")]
+    rows = np.array([[float(row[k]) for k in ("t", "wx", "wy", "wz")] for row in rows])[:60]
+    return identify.Recording(rows[:, 0], (identify.Gyro(), rows[:, 1:]))
+
+
+def test_a_real_flat_body_has_intervals_with_a_width(toss):
+    found = identify.fit(identify.Problem(toss, identify.Ratios()))
+    for low, high in found.interval().values():
+        assert low < high
+    values = np.linalg.eigvalsh(np.asarray(found.seen))
+    assert values.min() > -1e-15 * values.max()
+    words = " ".join(found.identifiability)
+    assert "±0 " not in words and "I1/I3 is well determined" not in words
+    # In principal axes nothing is so weakly seen: deviations of the same ratios, same order.
+    other = identify.fit(identify.Problem(toss, identify.PrincipalRatios()))
+    wanted = other.quantities[1].deviation
+    assert 0.5 * wanted < found.quantities[0].deviation < 2.5 * wanted
+    assert all(len(cell) < 12 for row in report.rows(found) for cell in report.numbers(*row[1:4]))
+
+
+def test_the_sandwich_is_that_of_its_definition(toss):
+    # H⁻¹ M H⁻¹ from the slopes themselves where nothing is weakly seen, M's errors in time by hand.
+    found = identify.fit(identify.Problem(toss, identify.PrincipalRatios()))
+    linear = linearise(found.problem, found.parameters, found.noises)
+    times = correlation_times(linear)
+    got = spread(linear, times)
+    slopes = linear.slopes[0][0] * np.sqrt(linear.weights[0][0])[:, None, None]
+    inverse = np.linalg.inv(np.einsum("tki,tkj->ij", slopes, slopes))
+    apart = np.abs(np.subtract.outer(np.arange(60), np.arange(60)))
+    candidates = []
+    for span in (2.0, 4.0, 8.0, 16.0, 32.0):
+        meat = 0.0
+        for channel in range(3):
+            error = linear.errors[0][0, :, channel]
+            scatter = np.mean(np.diff(error, 2) ** 2) / 6
+            variance = np.mean(error**2)
+            share = np.clip(1 - scatter / variance, 0, 1)
+            time = share * np.exp(-apart / span) + (1 - share) * np.eye(60)
+            meat = meat + variance * slopes[:, channel].T @ time @ slopes[:, channel]
+        candidates.append(inverse @ meat @ inverse)
+    best = max(candidates, key=lambda c: np.mean(np.diag(c) / np.diag(inverse)))
+    scale = np.sqrt(np.outer(np.diag(best), np.diag(best)))
+    of_spread = np.sqrt(np.outer(np.diag(got.seen), np.diag(got.seen)))
+    np.testing.assert_allclose(got.seen / of_spread, best / scale, atol=1e-9)
+    grown = np.diag(got.seen) / np.diag(best)
+    assert (grown > 1 - 1e-9).all()
+
+
+def test_what_an_information_does_not_show_is_not_made_up():
+    covariance, null = inverted(np.array([[2.0, 2.0, 0.0], [2.0, 2.0, 0.0], [0.0, 0.0, 4.0]]))
+    np.testing.assert_allclose(covariance[2], [0.0, 0.0, 0.25], atol=1e-15)
+    np.testing.assert_allclose(np.abs(null), [[0.5**0.5, 0.5**0.5, 0.0]], atol=1e-12)
+    units = np.array([1e-6, 1.0, 1e6])
+    good = np.array([[2.0, 1.0, 0.0], [1.0, 2.0, 0.5], [0.0, 0.5, 4.0]])
+    covariance, null = inverted(good * np.outer(units, units))
+    wanted = np.linalg.inv(good) / np.outer(units, units)
+    np.testing.assert_allclose(covariance, wanted, rtol=1e-12)
+    assert null.shape == (0, 3)
