@@ -95,7 +95,9 @@ def test_inverse_kernel_near_a_full_turn(dtype):
         values = np.array([float(want(mp.mpf(float(t)))) for t in ts])
         slopes = np.array([float(mp.diff(want, mp.mpf(float(t)))) for t in ts])
     for found, right, lost in ((got, values, 1), (slope, slopes, 2)):
-        np.testing.assert_array_less(abs(np.asarray(found, float) / right - 1), 8 * eps * (1 + lost * np.pi / left))
+        np.testing.assert_array_less(
+            abs(np.asarray(found, float) / right - 1), 8 * eps * (1 + lost * np.pi / left)
+        )
 
 
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
