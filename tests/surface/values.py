@@ -89,9 +89,13 @@ def wanted() -> set[str]:
         if name.startswith(_FAR):
             continue
         for base in thing.__mro__:
-            if not base.__module__.startswith("rigidjax") or (base is not thing and id(base) in known):
+            if not base.__module__.startswith("rigidjax") or (
+                base is not thing and id(base) in known
+            ):
                 continue
             for member, value in vars(base).items():
+                if getattr(value, "__isabstractmethod__", False):
+                    continue
                 plain = inspect.isfunction(value) or isinstance(value, staticmethod | classmethod)
                 if not member.startswith("_") and (plain or isinstance(value, property)):
                     found.add(f"{name}.{member}")
@@ -109,10 +113,7 @@ def drawn(row: Way, key: str, count: int, seed: int) -> list[tuple]:
         rng = np.random.default_rng([seed, zlib.crc32(key.encode()), i])
         start = int(rng.integers(1000)) if len(row.draws) > 1 else 0
         found.append(
-            tuple(
-                np.asarray(draw(rng, i + k * (start + 1)))
-                for k, draw in enumerate(row.draws)
-            )
+            tuple(np.asarray(draw(rng, i + k * (start + 1))) for k, draw in enumerate(row.draws))
         )
     return found
 

@@ -97,7 +97,7 @@ way(
 def joined(m, c, s, n, d, u):
     mass = m + n
     middle = (m * c + n * d) / mass
-    out = lambda x: np.outer(x - middle, x - middle)  # noqa: E731
+    out = lambda x: np.outer(x - middle, x - middle)
     return mass, middle, s + u + m * out(c) + n * out(d)
 
 
@@ -151,7 +151,7 @@ way(
 
 
 def ellipsoid_of(m, c, s):
-    f = lambda k: mp.sqrt(abs(5 * k / m))  # noqa: E731
+    f = lambda k: mp.sqrt(abs(5 * k / m))
     return [f(k) for k in v.eigen(s)[0]] * np.ones(3), function_of(f)(s)
 
 
@@ -261,10 +261,8 @@ def unpack(x):
     return m, x[7:], m * unpack_second(x[1:7])
 
 
-LAMBDA = lambda i: (sum(i) - 2 * i) / 2  # noqa: E731
-way(
-    "body.parameters.pack", lambda m, c, s: parameters.pack(props(m, c, s)), BODY, pack, norm=True
-)
+LAMBDA = lambda i: (sum(i) - 2 * i) / 2
+way("body.parameters.pack", lambda m, c, s: parameters.pack(props(m, c, s)), BODY, pack, norm=True)
 way(
     "body.parameters.pack_second_moment body.parameters.pack_shape",
     lambda s: (parameters.pack_second_moment(s), parameters.pack_shape(s)),
@@ -275,7 +273,7 @@ way(
     lambda rng, i: np.trace(np.diag(x := v.moments(rng, i))) - x,
     lambda i: v.log(LAMBDA(i)) / 2, norm=True,
 )  # fmt: skip
-NUMBERS = lambda n: one_of(between(-2, 2, n), between(-20, 20, n), fixed(np.zeros(n)))  # noqa: E731
+NUMBERS = lambda n: one_of(between(-2, 2, n), between(-20, 20, n), fixed(np.zeros(n)))
 way("body.parameters.unpack", parameters.unpack, NUMBERS(10), unpack)
 way("body.parameters.unpack_second_moment", parameters.unpack_second_moment, NUMBERS(6),
     unpack_second)  # fmt: skip
@@ -285,11 +283,21 @@ way(
     lambda x: sum(v.exp(2 * x)) - v.exp(2 * x),
 )  # fmt: skip
 
+
 # Solids: slices along z, each a disc, a ring, a rectangle or an ellipse; Gauss's points along z.
+def _gauss(n):
+    """Points and weights on (−1, 1), by Newton's method from Tricomi's estimate."""
+
+    def legendre(x):
+        return mp.legendre(n, x)
+
+    guesses = [mp.cos(mp.pi * (k + mp.mpf(3) / 4) / (n + mp.mpf(1) / 2)) for k in range(n)]
+    points = [mp.findroot(legendre, guess) for guess in guesses]
+    return [(x, 2 / ((1 - x * x) * mp.diff(legendre, x) ** 2)) for x in points]
+
+
 with mp.workdps(v.DIGITS + 10):
-    _LEGENDRE = [mp.polyroots(mp.taylor(lambda x: mp.legendre(12, x), 0, 12)[::-1], maxsteps=200)]
-    NODES = [(x, 2 / ((1 - x * x) * mp.diff(lambda y: mp.legendre(12, y), x) ** 2))
-             for x in _LEGENDRE[0]]  # fmt: skip
+    NODES = _gauss(12)
 
 
 def along(slices, low, high):
@@ -433,9 +441,10 @@ way(
 
 # A box of density 1 + a x², whose integrals are powers.
 def weighted(a, size):
-    power = lambda n, k: size[k] ** (n + 1) / (n + 1)  # noqa: E731
-    whole = lambda i, j, k: power(i, 0) * power(j, 1) * power(k, 2) + a * (  # noqa: E731
-        power(i + 2, 0) * power(j, 1) * power(k, 2))
+    power = lambda n, k: size[k] ** (n + 1) / (n + 1)
+    whole = lambda i, j, k: (
+        power(i, 0) * power(j, 1) * power(k, 2) + a * (power(i + 2, 0) * power(j, 1) * power(k, 2))
+    )
     e = np.eye(3, dtype=int)
     m = whole(0, 0, 0)
     c = np.array([whole(*e[k]) / m for k in range(3)])

@@ -32,9 +32,9 @@ def pose(axis, k, place, t):
 
 def rates(axis, k, place, t):
     """M, X, Ω and dΩ/dt in the axes of S', dX/dt, d²X/dt²: by differences of M and X."""
-    at = lambda h: pose(axis, k, place, t + h)  # noqa: E731
-    omega = lambda h: v.vee(at(h)[0].T @ derivative(lambda s: at(h + s)[0]))  # noqa: E731
-    change = lambda h: derivative(lambda s: at(h + s)[1])  # noqa: E731
+    at = lambda h: pose(axis, k, place, t + h)
+    omega = lambda h: v.vee(at(h)[0].T @ derivative(lambda s: at(h + s)[0]))
+    change = lambda h: derivative(lambda s: at(h + s)[1])
     return *at(0), omega(0), derivative(omega), change(0), derivative(change)
 
 
@@ -93,6 +93,7 @@ way(
 
 def there(axis, k, place, t, x, u, q, w):
     """What S sees: place, velocity, attitude and rate by differences; and from S' of the same."""
+
     def at(s):
         m, origin = pose(axis, k, place, t + s)
         return origin + m @ (x + u * s), m @ v.matrix_of(v.times(q, v.quaternion_of(w * s)))
@@ -112,7 +113,7 @@ def there(axis, k, place, t, x, u, q, w):
 
 def our_there(axis, k, place, t, x, u, q, w):
     frame, y = moving(axis, k, place), rj.Rigid(x, u, q, w)
-    parts = lambda y: (y.x, y.v, q4.to_matrix(y.q), y.omega)  # noqa: E731
+    parts = lambda y: (y.x, y.v, q4.to_matrix(y.q), y.omega)
     now, twice, back = frame.at(t), frame.then(frame), frame.inverse()
     return [
         parts(frame.to_inertial(y, t)), parts(frame.from_inertial(y, t)),
@@ -143,7 +144,7 @@ def in_frame(axis, k, place, t, x, u, w):
 
 
 def our_in_frame(axis, k, place, t, x, u, w):
-    power = lambda x: jnp.sum(x**4)  # noqa: E731
+    power = lambda x: jnp.sum(x**4)
     scene = frames.InFrame(
         moving(axis, k, place), inside=lambda t, y: y.v, outside=lambda t, y: place - y.x,
         potential=power,
@@ -170,7 +171,7 @@ def in_body(axis, k, place, t, s, q, w):
     """The torque: I dΩ'/dt − IΩ' × Ω', with Ω' = Ω − R'ᵀΩ_frame differentiated along the motion."""
     i = tensor_of(s)
     _, _, omega, domega, _, _ = rates(axis, k, place, t)
-    seen = lambda h: v.matrix_of(v.times(q, v.quaternion_of(w * h))).T @ (omega + domega * h)  # noqa: E731
+    seen = lambda h: v.matrix_of(v.times(q, v.quaternion_of(w * h))).T @ (omega + domega * h)
     whole = w + seen(0 * t)
     change = v.solve(i, np.cross(i @ whole, whole)) - derivative(seen)
     return [i @ change - np.cross(i @ w, w)]
@@ -189,7 +190,7 @@ def libration(n, i, q, w):
     r = v.matrix_of(q)
     up, normal = r[0], r[2]
     spin = np.array([0 * n, 0 * n, n])
-    seen = lambda h: v.matrix_of(v.times(q, v.quaternion_of(w * h))).T @ spin  # noqa: E731
+    seen = lambda h: v.matrix_of(v.times(q, v.quaternion_of(w * h))).T @ spin
     whole = w + seen(0 * n)
     torque = 3 * n * n * np.cross(up, i @ up)
     change = v.solve(i, np.cross(i @ whole, whole) + torque) - derivative(seen)
@@ -224,7 +225,7 @@ def on_earth(latitude, g, rate, length, h, t, x, u):
     f = mp.sqrt(g / length + up * up)
     s, ds = mp.mpc(x[0], x[1]), mp.mpc(u[0], u[1])
     b = (ds + 1j * up * s) / f
-    at = lambda t: mp.exp(-1j * up * t) * (s * mp.cos(f * t) + b * mp.sin(f * t))  # noqa: E731
+    at = lambda t: mp.exp(-1j * up * t) * (s * mp.cos(f * t) + b * mp.sin(f * t))
     place = at(t)
     speed = derivative(lambda h: at(t + h))
     return [
@@ -262,8 +263,8 @@ way(
 def hung(length, e, n, a, b):
     up = -mp.sqrt(length**2 - (length * e) ** 2 - (length * n) ** 2)
     e, n = length * e, length * n
-    return [np.array([e, n, up]), np.array([a, b, -(e * a + n * b) / up])] + [
-        np.array([e, n, up]), 0 * np.array([a, b, a])]  # fmt: skip
+    place = np.array([e, n, up])
+    return [place, np.array([a, b, -(e * a + n * b) / up]), place, 0 * place]
 
 
 way(
@@ -398,17 +399,20 @@ way(
 
 def equilibria(mu):
     """Zeros of dU/dx between and beyond the bodies, from a bracket; tips of triangles."""
+
     def pull(x):
         a, b = x + mu, x - 1 + mu
         return x - (1 - mu) * a / abs(a) ** 3 - mu * b / abs(b) ** 3
 
-    hill = mp.cbrt(mu / 3)
-    rows = []
-    for low, high in ((1 - mu - 2 * hill, 1 - mu - hill / 2), (1 - mu + hill / 2, 1 - mu + 2 * hill),
-                      (-mu - mp.mpf(3) / 2, -mu - mp.mpf(1) / 3)):  # fmt: skip
-        low = max(low, -mu + mp.mpf(1) / 3) if low > -mu else low
-        rows.append([mp.findroot(pull, (low, high), solver="anderson", tol=mp.mpf(10) ** -60,
-                                 verify=False), 0, 0])  # fmt: skip
+    hill, second = mp.cbrt(mu / 3), 1 - mu
+    ends = (
+        (-mu + mp.mpf(1) / 100, second - hill / 4), (second + hill / 4, second + 2 * hill + 1),
+        (-mu - 2, -mu - mp.mpf(1) / 10),
+    )  # fmt: skip
+    rows = [
+        [mp.findroot(pull, pair, solver="anderson", tol=mp.mpf(10) ** -70, maxsteps=200), 0, 0]
+        for pair in ends
+    ]
     tip = mp.sqrt(mp.mpf(3)) / 2
     return np.array([*rows, [mp.mpf(1) / 2 - mu, tip, 0], [mp.mpf(1) / 2 - mu, -tip, 0]])
 
@@ -445,6 +449,7 @@ DOWN = 1e-13
 
 def field_of(mu):
     """The field of cr3bp(mu), of Hill's problem for None, with its slope."""
+
     def field(x, u):
         if mu is None:
             r = np.sqrt(x @ x)
@@ -456,7 +461,7 @@ def field_of(mu):
                 d = x - [at, 0, 0]
                 r = np.sqrt(d @ d)
                 a, h = a - m * d / r**3, h - m * (np.eye(3) / r**3 - 3 * np.outer(d, d) / r**5)
-        return a + [2 * u[1], -2 * u[0], 0], h
+        return a + np.array([2 * u[1], -2 * u[0], 0]), h
 
     return field
 
@@ -471,7 +476,9 @@ def flown(mu, state, times):
     def slope(t, y):
         a, h = field(y[:3], y[3:6])
         phi = y[6:].reshape(6, 6)
-        return np.concatenate([y[3:6], a, np.concatenate([phi[3:], h @ phi[:3] + TURN @ phi[3:]]).ravel()])
+        return np.concatenate(
+            [y[3:6], a, np.concatenate([phi[3:], h @ phi[:3] + TURN @ phi[3:]]).ravel()]
+        )
 
     y0 = np.concatenate([state, np.eye(6).ravel()])
     found = solve_ivp(slope, (times[0], times[-1]), y0, "DOP853", times, rtol=DOWN, atol=1e-14)
@@ -561,7 +568,8 @@ def orbits(mu, step=1e-3):
         for _ in range(4):
             after = shot(mu, after, "x")
             after = after + growth * (step - (after - start) * half @ along) / (
-                growth * half @ along)
+                growth * half @ along
+            )
         return [
             start, whole_turn(mu, start), whole_turn(mu, start, t), indices(mu, start), growth,
             np.stack([start, member]), after[None],
@@ -623,7 +631,7 @@ def our_manifold(x, distance):
     scene = scenes.cr3bp(MOON)
     orbit = scene.periodic_orbit(orbit_at(guess(MOON, x)))
     made = scene.manifold(orbit, "unstable", time=1.0, count=2, samples=3, distance=distance)
-    flat = lambda p: jnp.concatenate([p.x, p.v], -1)  # noqa: E731
+    flat = lambda p: jnp.concatenate([p.x, p.v], -1)
     return [
         made.ts, flat(made.states), made.phases, made.multiplier,
         flat(scene.manifold_start(orbit, 0.5, "unstable", distance=distance)),

@@ -23,7 +23,7 @@ def rigid(x, u, q, w):
 
 def gradient(potential, q):
     """The torque of U(q), body axes: minus the slope along turns about them."""
-    turned = lambda h, e: v.times(q, v.quaternion_of(h * e))  # noqa: E731
+    turned = lambda h, e: v.times(q, v.quaternion_of(h * e))
     return np.array([-derivative(lambda h, e=e: potential(turned(h, e))) for e in v.eye()])
 
 
@@ -111,7 +111,7 @@ def central_energy(mu, m, s, x, q):
 
 
 # A body not larger than its distance: 𝔖/m is that of a body of about 1 m.
-FAR = lambda rng, i: v.direction(rng, i) * 10.0 ** rng.uniform(0.5, 8)  # noqa: E731
+FAR = lambda rng, i: v.direction(rng, i) * 10.0 ** rng.uniform(0.5, 8)
 
 
 def small(rng, i):
@@ -175,7 +175,7 @@ def pushes(n, d, k, c, r):
 
 
 # Directions are unit to round-off.
-UNITS = lambda rng, i: np.stack([v.direction(rng, 1) for _ in range(3)])  # noqa: E731
+UNITS = lambda rng, i: np.stack([v.direction(rng, 1) for _ in range(3)])
 way(
     "motion.torques.Rotors",
     lambda n, d, k, c, r, q: (
@@ -440,8 +440,7 @@ way(
 )  # fmt: skip
 
 # Lagrange's and Lie and Poisson's equations: those of Euler, in Euler's angles.
-ANGLES = lambda rng, i: np.array([  # noqa: E731
-    rng.uniform(-3, 3), rng.uniform(0.3, 2.8), rng.uniform(-3, 3)])
+ANGLES = lambda rng, i: np.array([rng.uniform(-3, 3), rng.uniform(0.3, 2.8), rng.uniform(-3, 3)])
 
 
 def euler_top(m, c, g, i, q, rate):
@@ -516,3 +515,44 @@ way(
     norm=True,
 )  # fmt: skip
 leave_out("abstract", "motion.torques.AbstractForce", "motion.torques.AbstractTorque")
+
+
+# What a law hands on of the functions of time in it.
+def jumping(j):
+    ts = jnp.asarray(TIMES)
+    ramp, step = laws.Linear(ts, jnp.ones((5, 3))), laws.Held(ts, jnp.ones((5, 3)))
+    spin = laws.Linear(ts, jnp.ones((5, 3, 3)))
+    wheels = laws.ReactionWheels(jnp.eye(3), j, 0.0 * j, step)
+    rotors = laws.Rotors(jnp.eye(3), jnp.eye(3), jnp.ones(3), 1.0, 1.0, step)
+    both = laws.Sum(laws.InSpace(ramp), laws.Pulses(ts + 0.25, jnp.ones((4, 3))))
+    found = (
+        laws.Pulses(ts, jnp.ones((4, 3))), laws.Tabulated(ts, jnp.ones((5, 3))),
+        laws.InSpace(ramp), laws.Flywheel(ramp), laws.GravityGradient(1.0, ramp),
+        laws.MagneticDipole(j, ramp), laws.Lagged(step, 0.1), rotors, wheels,
+        laws.ChangingInertia(spin), laws.InSpace(laws.Delayed(step, 0.25)), both,
+    )  # fmt: skip
+    return [jnp.sort(law.jump_times) for law in found]
+
+
+way(
+    " ".join(f"motion.torques.{name}.jump_times" for name in (
+        "Pulses", "Tabulated", "InSpace", "Flywheel", "GravityGradient", "MagneticDipole", "Lagged",
+        "Rotors", "ReactionWheels", "ChangingInertia", "Sum",
+    )),
+    jumping, between(1.0, 2.0, 3),
+    lambda j: [TIMES] * 10 + [TIMES + 0.25, np.sort([*TIMES, *(TIMES + 0.25)])], cost=4,
+)  # fmt: skip
+way(
+    "motion.torques.GravityGradient.axis",
+    lambda r: laws.GravityGradient(1.0, r).axis / jnp.linalg.norm(laws.GravityGradient(1.0, r).axis),
+    v.ordinary, lambda r: r / v.norm(r),
+)  # fmt: skip
+leave_out(
+    "a truth value, a kind or a name: no number",
+    *(f"motion.torques.{name}.steady" for name in (
+        "BodyDrag", "CentralGravity", "ConstantTorque", "CorrelatedTorque", "Damping", "Drag",
+        "Flywheel", "FromPotential", "GravityGradient", "HeavyTop", "InSpace", "MagneticDipole",
+        "QuadraticDamping", "RandomTorque", "ReactionWheels", "UniformGravity")),
+    "motion.torques.ChangingInertia.feels", "motion.torques.Sum.feels",
+    "motion.torques.Sum.rate_free",
+)  # fmt: skip

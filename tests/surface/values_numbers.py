@@ -201,7 +201,7 @@ def aligned(a, b):
     """From a to b about a × b: reflections in b and in their bisector, one after the other."""
     a, b = a / v.norm(a), b / v.norm(b)
     h = a + b
-    mirror = lambda n: 2 * np.outer(n, n) / v.dot(n, n) - v.eye()  # noqa: E731
+    mirror = lambda n: 2 * np.outer(n, n) / v.dot(n, n) - v.eye()
     return mirror(h) @ mirror(a)
 
 
@@ -254,7 +254,7 @@ way(
 )  # fmt: skip
 
 # Quaternions.
-LONG = lambda rng, i: v.quaternion(rng, i) * 10.0 ** rng.uniform(-20, 20)  # noqa: E731
+LONG = lambda rng, i: v.quaternion(rng, i) * 10.0 ** rng.uniform(-20, 20)
 
 
 def positive(q):
@@ -310,8 +310,8 @@ def derivative(f):
     """Of an array by a number, at 0: central differences of order 8, to 28 digits of 40."""
     with mp.extradps(40):
         h = mp.mpf(10) ** -8
-        terms = zip((mp.mpf(4) / 5, mp.mpf(-1) / 5, mp.mpf(4) / 105, mp.mpf(-1) / 280), range(1, 5))
-        return sum(c * (f(k * h) - f(-k * h)) for c, k in terms) / h
+        terms = ((1, 4, 5), (2, -1, 5), (3, 4, 105), (4, -1, 280))
+        return sum(mp.mpf(a) / b * (f(k * h) - f(-k * h)) for k, a, b in terms) / h
 
 
 def chart_rates(of, quaternion):
@@ -319,8 +319,9 @@ def chart_rates(of, quaternion):
 
     def both(x, y):
         size = max(v.norm(x), 1)
-        moved = lambda e: derivative(  # noqa: E731
-            lambda h: of(v.times(quaternion(x), v.quaternion_of(h * e / size))) * size)
+        moved = lambda e: derivative(
+            lambda h: of(v.times(quaternion(x), v.quaternion_of(h * e / size))) * size
+        )
         slope = np.stack([moved(e) for e in v.eye()], 1)
         return slope @ y, v.solve(slope, y)
 
@@ -358,7 +359,7 @@ way(
     one_of(v.normal(3, low=-20, high=20), v.rotated_by(between(0.5, 2.0))),
     lambda s: (-s / v.dot(s, s), s if v.dot(s, s) <= 1 else -s / v.dot(s, s)),
 )  # fmt: skip
-HALF = lambda rng, i: np.array([10.0 ** rng.uniform(-12, 0), *direction(rng, i)])  # noqa: E731
+HALF = lambda rng, i: np.array([10.0 ** rng.uniform(-12, 0), *direction(rng, i)])
 way("rotation.rodrigues.from_quaternion", rodrigues.from_quaternion,
     HALF, rodrigues_of)  # fmt: skip
 way(
@@ -381,7 +382,10 @@ EULER = ("ZXZ", "ZYX", "xyz", "YXY", "xzx", "YZX")
 
 
 def euler_matrix(angles, sequence):
-    turns = [v.rotation(a * v.eye()["xyz".index(s.lower())]) for a, s in zip(angles, sequence)]
+    turns = [
+        v.rotation(a * v.eye()["xyz".index(s.lower())])
+        for a, s in zip(angles, sequence, strict=True)
+    ]
     a, b, c = turns if sequence.isupper() else turns[::-1]
     return a @ b @ c
 
@@ -420,7 +424,8 @@ def tilted(sequence):
     """Angles whose middle one is not singular, or nearly."""
     proper = sequence[0] == sequence[2]
     middle = one_of(
-        between(0.2, 1.4), lambda rng, i: 10.0 ** rng.uniform(-6, -2) + (0 if proper else -np.pi / 2)
+        between(0.2, 1.4),
+        lambda rng, i: 10.0 ** rng.uniform(-6, -2) + (0 if proper else -np.pi / 2),
     )
     return lambda rng, i: np.array([rng.uniform(-3, 3), middle(rng, i), rng.uniform(-3, 3)])
 
@@ -470,7 +475,8 @@ def hermite(ts, q, p, w0, w1, t):
 def interpolant(ts, q, p, w0, w1, t):
     # Two knots far from t beside them: the piece is found among several.
     made = AttitudeInterpolant(
-        jnp.stack([ts[0], ts[1], ts[1] + 1.0]), jnp.stack([q, p, p]), jnp.stack([w0, w1, w1]))
+        jnp.stack([ts[0], ts[1], ts[1] + 1.0]), jnp.stack([q, p, p]), jnp.stack([w0, w1, w1])
+    )
     return q4.to_matrix(made(t)), made.omega(t)
 
 

@@ -98,7 +98,11 @@ def periods(row):
 
 def tumbling(rng, i):
     """Of no symmetry, not near the separatrix or an axis."""
-    s = np.sort(rng.uniform(0.3, 1.0, 3)) * [0.7, 1.0, 1.3] * 10.0 ** (rng.uniform(-20, 20) * (i % 2))
+    s = (
+        np.sort(rng.uniform(0.3, 1.0, 3))
+        * [0.7, 1.0, 1.3]
+        * 10.0 ** (rng.uniform(-20, 20) * (i % 2))
+    )
     j = np.diag(s.sum() - s)
     w = rng.normal(size=3) * ([1.0, 0.1, 0.1] if i % 2 else [0.1, 0.1, 1.0])
     w = w * 10.0 ** (rng.uniform(-20, 20) * (i % 3 == 2))
@@ -134,8 +138,15 @@ def textbook(force, i, x, u, q, w, ts=TS, m=1.0, rtol=1e-13):
         push, torque = force(t, r, x, u, w)
         a, b, c, d = q
         e, f, g = w
-        dq = [-b * e - c * f - d * g, a * e + c * g - d * f, a * f + d * e - b * g, a * g + b * f - c * e]
-        return np.concatenate([u, push / m, np.array(dq) / 2, inverse @ (np.cross(i @ w, w) + torque)])
+        dq = [
+            -b * e - c * f - d * g,
+            a * e + c * g - d * f,
+            a * f + d * e - b * g,
+            a * g + b * f - c * e,
+        ]
+        return np.concatenate(
+            [u, push / m, np.array(dq) / 2, inverse @ (np.cross(i @ w, w) + torque)]
+        )
 
     y0 = np.concatenate([x, u, q, w])
     found = solve_ivp(slope, (ts[0], ts[-1]), y0, "DOP853", ts, rtol=rtol, atol=1e-15)
@@ -240,8 +251,11 @@ def stepped(a, b, number, step):
         for _ in range(number):
             ks = []
             for row in a:
-                move = lambda y, n, row=row, ks=ks: y + mp.mpf(step) * sum(  # noqa: E731
-                    (x * k[n] for x, k in zip(row, ks, strict=False) if x), 0 * y)
+                move = lambda y, n, row=row, ks=ks: (
+                    y
+                    + mp.mpf(step)
+                    * sum((x * k[n] for x, k in zip(row, ks, strict=False) if x), 0 * y)
+                )
                 ks.append(slope(move(q, 0), move(w, 1)))
             q, w = (
                 y + mp.mpf(step) * sum(x * k[n] for x, k in zip(b, ks, strict=True))
@@ -254,7 +268,10 @@ def stepped(a, b, number, step):
 
 
 HALF = mp.mpf(1) / 2
-KUTTA = ([[], [HALF], [0, HALF], [0, 0, 1]], [mp.mpf(1) / 6, mp.mpf(1) / 3, mp.mpf(1) / 3, mp.mpf(1) / 6])
+KUTTA = (
+    [[], [HALF], [0, HALF], [0, 0, 1]],
+    [mp.mpf(1) / 6, mp.mpf(1) / 3, mp.mpf(1) / 3, mp.mpf(1) / 6],
+)
 _TSIT = dfx.Tsit5.tableau
 TSIT = ([[], *[list(row) for row in _TSIT.a_lower[:-1]]], list(_TSIT.b_sol[:-1]))
 DOP = ([list(row[:n]) for n, row in enumerate(DOP_A[:12])], list(DOP_B))
@@ -263,7 +280,9 @@ DOP = ([list(row[:n]) for n, row in enumerate(DOP_A[:12])], list(DOP_B))
 def our_steps(solver, number, step):
     def run(i, q, w, c, d):
         field = rj.AttitudeEquations(rj.Inertia(i), law_of(c, d))
-        ends = fixed_steps(solver, field, jnp.array([0.0, number * step]), rj.Attitude(q, w), number)
+        ends = fixed_steps(
+            solver, field, jnp.array([0.0, number * step]), rj.Attitude(q, w), number
+        )
         states = jax.tree.map(lambda x: x[None], rj.Attitude(q, w))
         rolled = rj.batch.rollout(rj.Inertia(i), states, step, number, law_of(c, d), solver=solver)
         last = jax.tree.map(lambda x: x[-1], ends), jax.tree.map(lambda x: x[0], rolled)
@@ -273,7 +292,8 @@ def our_steps(solver, number, step):
 
 
 for name, (a, b), solver in (
-    ("RungeKutta4", KUTTA, solvers.RungeKutta4()), ("Tsitouras5", TSIT, solvers.Tsitouras5()),
+    ("RungeKutta4", KUTTA, solvers.RungeKutta4()),
+    ("Tsitouras5", TSIT, solvers.Tsitouras5()),
     ("DormandPrince8", DOP, solvers.DormandPrince8()),
 ):
     run = stepped(a, b, 3, 0.125)
@@ -308,7 +328,9 @@ def gravity_force(c, d):
 
 # (rate · step)^order, with rates to ten, and a hundred for the derivatives of the torque.
 for name, steps, order in (("Splitting2", 4000, 2), ("Splitting4", 400, 4), ("Splitting6", 200, 6)):
-    long_run(getattr(solvers, name)(), gravity, gravity_force, steps, 100 * (10 / steps) ** order, name)
+    long_run(
+        getattr(solvers, name)(), gravity, gravity_force, steps, 100 * (10 / steps) ** order, name
+    )
 long_run(
     solvers.Magnus4(), lambda c, d: laws.Damping(d),
     lambda c, d: lambda t, r, x, u, w: (ZERO, -d * w), 400, 100 * (10 / 400) ** 4, "Magnus4",
@@ -343,9 +365,18 @@ def our_many(i, q, w, c, d):
     bodies = rj.Inertia(jnp.stack([i, 1.5 * i]))
     states = rj.Attitude(jnp.stack([q, q]), jnp.stack([w, -0.5 * w]))
     out = rj.batch.simulate(bodies, states, TS, law_of(c, d), rtol=1e-11, atol=1e-14)
-    each = jax.vmap(lambda body, y: adaptive(
-        solvers.DormandPrince8(), rj.AttitudeEquations(body, law_of(c, d)), jnp.asarray(TS), y,
-        rtol=1e-11, atol=1e-14).ys)(bodies, states)
+    each = jax.vmap(
+        lambda body, y: (
+            adaptive(
+                solvers.DormandPrince8(),
+                rj.AttitudeEquations(body, law_of(c, d)),
+                jnp.asarray(TS),
+                y,
+                rtol=1e-11,
+                atol=1e-14,
+            ).ys
+        )
+    )(bodies, states)
     return out.ys, each
 
 
@@ -454,7 +485,9 @@ way(
     "lyapunov_exponents Exponents", exponents, between(0.1, 1.0, 3),
     lambda x: np.array([0.3, -0.2, -0.7]) + 0 * x, plain=True, rtol=1e-9, cost=2,
 )  # fmt: skip
-leave_out("options of a compiler: no numbers", "batch.compiler_options", "cpu_flags", "batch.CpuFlags")
+leave_out(
+    "options of a compiler: no numbers", "batch.compiler_options", "cpu_flags", "batch.CpuFlags"
+)
 leave_out("shares of a run's own statistics: `drift` and `lyapunov_exponents` are rows",
           "Solution.drift", "Solution.growth")  # fmt: skip
 leave_out("a truth value beside `times`: the row of `crossings`", "Crossings.full")
