@@ -18,7 +18,8 @@ SAMPLE = (
     "frames.scenes.ThreeBody.lagrange_points",
     "identify.LowPass",
 )
-# Of 200 and more rows; a default run takes a tenth.
+# Draws of a row of the sample, and of one of all; how many calls these are to be, a public function
+# and a set of arguments each.
 FEW, MANY, CALLS = 20, 6, 2000
 
 
@@ -36,6 +37,7 @@ def test_every_public_name_has_a_second_way_or_a_reason():
     assert covered & set(WITHOUT) == set()
 
 
+@pytest.mark.usefixtures("unhooked")
 @pytest.mark.parametrize("key", SAMPLE)
 def test_a_sample(key):
     _, wrong = looked_at(key, FEW)
@@ -43,6 +45,7 @@ def test_a_sample(key):
 
 
 @pytest.mark.long
+@pytest.mark.usefixtures("unhooked")
 def test_all():
     calls, vague, wrong = 0, 0, []
     for key, row in WAYS.items():

@@ -286,13 +286,13 @@ way(
 
 # Solids: slices along z, each a disc, a ring, a rectangle or an ellipse; Gauss's points along z.
 def _gauss(n):
-    """Points and weights on (−1, 1), by Newton's method from Tricomi's estimate."""
+    """Points and weights on (−1, 1), by the secant method from Tricomi's estimate."""
 
     def legendre(x):
         return mp.legendre(n, x)
 
     guesses = [mp.cos(mp.pi * (k + mp.mpf(3) / 4) / (n + mp.mpf(1) / 2)) for k in range(n)]
-    points = [mp.findroot(legendre, guess) for guess in guesses]
+    points = [mp.findroot(legendre, (x, x + mp.mpf(10) ** -6)) for x in guesses]
     return [(x, 2 / ((1 - x * x) * mp.diff(legendre, x) ** 2)) for x in points]
 
 

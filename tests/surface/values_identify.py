@@ -99,7 +99,7 @@ def our_mass_chart(x, m, c, s):
     chart, body = identify.Mass(guess()), props(m, c, s)
     lighter = identify.Mass(guess(), ["mass"]).body(x[:1])
     return [
-        chart.body(x), chart.vector(body), chart.logs(body), chart.plain(body), lighter.mass,
+        chart.body(x), chart.vector(body.inertia), chart.logs(body), chart.plain(body), lighter.mass,
         lighter.com,
     ]  # fmt: skip
 
