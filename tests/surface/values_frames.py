@@ -388,12 +388,12 @@ way(
      v.normal()),
     lambda *a: three_body(*a)[:-3], norm=True, cost=2,
 )  # fmt: skip
-# Of places in the plane, where the three pairs are.
+# Of places in the plane, where the three pairs are; of up to their eighth powers.
 way(
     "frames.scenes.ThreeBody.exponents",
     lambda mu, x: our_three_body(mu, x, x, mu)[-3:],
     (MU, lambda rng, i: np.array([*rng.normal(size=2), 0.0])),
-    lambda mu, x: three_body(mu, x, x, mu)[-3:], norm=True,
+    lambda mu, x: three_body(mu, x, x, mu)[-3:], norm=True, ulps=32,
 )  # fmt: skip
 
 

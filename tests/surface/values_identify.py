@@ -28,7 +28,7 @@ from surface.values_solve import TOP, TS as TIMES_OF_RUN, law_of, textbook, top_
 
 import rigidjax as rj
 from rigidjax import estimate, identify
-from rigidjax.rotation import quaternion as q4
+from rigidjax.rotation import quaternion as q4, so3
 
 # Charts: numbers to a body, what is reported of it, and back.
 TYPICAL = 3.0
@@ -221,13 +221,14 @@ way(
 
 way(
     "identify.Direction identify.Direction.error identify.Direction.reading_of",
-    lambda q, world, read, e: (
-        jnp.linalg.norm(identify.Direction(world, 0.1).error(_still(q), read)),
+    lambda q, world, x, e: (
+        jnp.linalg.norm(identify.Direction(world, 0.1).error(_still(q), so3.exp(x) @ q4.rotate_inverse(
+            q, world / jnp.linalg.norm(world)))),
         jnp.linalg.norm(identify.Direction(world, 0.1).error(
             _still(q), identify.Direction(world, 0.1).reading_of(_still(q), e))),
     ),
-    (v.quaternion, v.ordinary, lambda rng, i: v.direction(rng, 1), between(-0.3, 0.3, 2)),
-    lambda q, world, read, e: (direction_error(q, world, read), v.norm(e)), norm=True, ulps=32,
+    (v.quaternion, v.ordinary, v.rotated_by(between(0, 2)), between(-0.3, 0.3, 2)),
+    lambda q, world, x, e: (direction_error(q, world, x), v.norm(e)), norm=True, ulps=32,
 )  # fmt: skip
 
 
@@ -236,10 +237,10 @@ def _still(q):
     return identify.SensorInput(jnp.asarray(0.0), state, rj.Inertia(jnp.eye(3)), None)
 
 
-def direction_error(q, world, read):
+def direction_error(q, world, x):
     """As long as the chord: 2 sin of half the angle."""
     expected = v.matrix_of(q).T @ (world / v.norm(world))
-    return v.norm(read - expected)
+    return v.norm(v.rotation(x) @ expected - expected)
 
 
 def light(sun, observer, q, axes, level):
@@ -441,6 +442,12 @@ way(
 )  # fmt: skip
 
 
+def back_and_forth(rng, i):
+    """Readings whose errors are not autocorrelated by chance: then intervals are wider."""
+    sign = np.where(np.arange(12) % 2, 1.0, -1.0)[:, None]
+    return rng.normal(size=3) + 0.01 * sign * rng.uniform(0.5, 1.5, (12, 3))
+
+
 # A fit that is linear: a ball that turns as it did, read by a gyro. The mean, by hand.
 def fitted(y, noise):
     count = len(y)
@@ -475,7 +482,7 @@ way(
     "identify.Fit.state0 identify.Fit.residuals identify.Problem identify.Problem.motion "
     "identify.Problem.unpack identify.expected identify.Quantity",
     our_fit,
-    (lambda rng, i: rng.normal(size=3) + 0.01 * rng.normal(size=(12, 3)), fixed(0.01)), fitted,
+    (back_and_forth, fixed(0.01)), fitted,
     batched=False, rtol=1e-6, cost=2,
 )  # fmt: skip
 

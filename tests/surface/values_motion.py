@@ -208,9 +208,8 @@ def line(rows, t):
 
 def tables(rows, t):
     inside = TIMES[0] <= t < TIMES[-1]
-    within = TIMES[0] <= t <= TIMES[-1]
     return [
-        held(rows, t), line(rows, t), line(rows, t) if within else 0 * rows[0],
+        held(rows, t), line(rows, t), line(rows, t) if inside else 0 * rows[0],
         rows[row_at(t)] if inside else 0 * rows[0],
         sum((b - a) * r for a, b, r in zip(TIMES, TIMES[1:], rows, strict=False)),
         held(rows, t - mp.mpf(0.75)), [v.number(TIMES)] * 2, v.number(TIMES + 0.75),
