@@ -8,7 +8,7 @@ from jax.scipy.linalg import solve_triangular
 from rigidjax import _checks
 from rigidjax._types import Scalar
 from rigidjax.body.inertia import MassProperties
-from rigidjax.rotation.linalg3 import determinant, dot
+from rigidjax.rotation.linalg3 import dot
 
 
 def divergence(body: MassProperties, reference: MassProperties) -> Scalar:
@@ -17,9 +17,9 @@ def divergence(body: MassProperties, reference: MassProperties) -> Scalar:
     `D = Tr(J₀⁻¹ J) − log det(J₀⁻¹ J) − 4` with the 4×4 pseudo-inertia
     `J = [[𝔖 + m c cᵀ, m c], [m cᵀ, m]]`: zero only if the bodies are equal, convex in J, infinite
     at plates and rods, and unchanged when both bodies are seen from another frame or in other
-    units. Known to round-off of the trace. Add `weight * divergence(body, guess)` to a loss so that
-    what the data cannot see stays near the guess. It is twice the Kullback–Leibler divergence for
-    the mass seen as a Gaussian.
+    units. It is known to round-off of the trace. Add `weight * divergence(body, guess)` to a loss
+    so that what the data cannot see stays near the guess. It is twice the Kullback–Leibler
+    divergence for the mass seen as a Gaussian.
 
     **Arguments:** `body`; `reference` a body with a positive definite 𝔖; the same frame and units.
 
@@ -34,14 +34,14 @@ def divergence(body: MassProperties, reference: MassProperties) -> Scalar:
     _checks.single(body, MassProperties, "body")
     _checks.single(reference, MassProperties, "reference")
     ratio = body.mass / reference.mass
-    # By a root, not an inverse: of a long, thin reference cofactors lose twice the digits.
+    # By factors, not by cofactors, which lose twice the digits of a long, thin body.
     root = jnp.linalg.cholesky(reference.second_moment / reference.mass)
     seen = partial(solve_triangular, root, lower=True)
     overlap = seen(seen(body.second_moment / body.mass).T)
     d = seen(body.com - reference.com)
     return (
         ratio * (jnp.trace(overlap) + dot(d, d) + 1.0)
-        - jnp.log(determinant(overlap))
+        - jnp.linalg.slogdet(overlap)[1]
         - 4.0 * jnp.log(ratio)
         - 4.0
     )

@@ -318,8 +318,11 @@ class MassProperties(eqx.Module):
 def _joined(body, mass, com, second_moment):
     total = body.mass + mass
     d = com - body.com
+    # From the heavier one: what is far and light moves the centre little.
+    heavy = body.mass >= mass
+    moved = jnp.where(heavy, mass, -body.mass) / total * d
     return MassProperties(
         total,
-        body.com + (mass / total) * d,
+        jnp.where(heavy, body.com, com) + moved,
         body.second_moment + second_moment + (body.mass * (mass / total)) * outer(d, d),
     )

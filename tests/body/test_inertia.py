@@ -122,6 +122,14 @@ def test_inverse_and_solve_from_grains_to_planets(dtype):
         assert got.dtype == np.float64 and inverse(a).dtype == dtype
 
 
+def test_a_light_body_far_away_keeps_the_digits_of_the_centre():
+    ball = shapes.sphere(1.0, 1.0)
+    grain = shapes.sphere(2.0**-40, 1e-3).shifted(jnp.array([2.0**30, 1.0, 0.0]))
+    exact = np.array([2.0**30, 1.0, 0.0]) / (1 + 2.0**40)
+    for whole in (ball + grain, grain + ball):
+        np.testing.assert_allclose(whole.com, exact, rtol=4e-16)
+
+
 def test_derivative_of_the_inverse_at_a_sphere():
     e = jnp.asarray([[0.1, 0.3, 0.2], [0.3, -0.2, 0.4], [0.2, 0.4, 0.5]])
     moved = jax.jvp(inverse, (2.0 * jnp.eye(3),), (e,))[1]

@@ -94,6 +94,8 @@ def wanted() -> set[str]:
             ):
                 continue
             for member, value in vars(base).items():
+                if getattr(value, "__isabstractmethod__", False):
+                    continue
                 plain = inspect.isfunction(value) or isinstance(value, staticmethod | classmethod)
                 if not member.startswith("_") and (plain or isinstance(value, property)):
                     found.add(f"{name}.{member}")
@@ -110,9 +112,12 @@ def drawn(row: Way, key: str, count: int, seed: int) -> list[tuple]:
     for i in range(count):
         rng = np.random.default_rng([seed, zlib.crc32(key.encode()), i])
         start = int(rng.integers(1000)) if len(row.draws) > 1 else 0
-        found.append(
-            tuple(np.asarray(draw(rng, i + k * (start + 1))) for k, draw in enumerate(row.draws))
-        )
+        one: list[np.ndarray] = []
+        for k, draw in enumerate(row.draws):
+            made = draw(rng, i + k * (start + 1))
+            # Several that belong together, each an argument.
+            one += map(np.asarray, made if isinstance(made, tuple) else [made])
+        found.append(tuple(one))
     return found
 
 
@@ -174,7 +179,8 @@ def _moved(x: Any, nudge: Any, norm: bool, rng: np.random.Generator) -> Any:
     x = np.asarray(x)
     if x.dtype.kind in "biuU" or x.size == 0:
         return x
-    signs = rng.choice([-1.0, 1.0], x.shape)
+    # Not all by as much: moves of several numbers do not undo each other.
+    signs = rng.choice([-1.0, 1.0], x.shape) * rng.uniform(0.5, 1.0, x.shape)
     if x.ndim == 2 and x.shape[0] == x.shape[1] and (x == x.T).all():
         signs = np.triu(signs) + np.triu(signs, 1).T
     signs = number(signs) if x.dtype == object else signs
@@ -390,7 +396,7 @@ def quaternion(rng: np.random.Generator, i: int) -> np.ndarray:
     if kind == 1:
         q[1:] *= 10.0 ** rng.uniform(-16, -3)
     elif kind == 2:
-        q[0] *= 10.0 ** rng.uniform(-16, -3)
+        q[0] *= 10.0 ** rng.uniform(-12, -3)
     elif kind == 3:
         q[rng.integers(4)] = 0.0
     elif kind == 4:

@@ -264,7 +264,7 @@ def hung(length, e, n, a, b):
     up = -mp.sqrt(length**2 - (length * e) ** 2 - (length * n) ** 2)
     e, n = length * e, length * n
     place = np.array([e, n, up])
-    return [place, np.array([a, b, -(e * a + n * b) / up]), place, 0 * np.array([a, b, a])]
+    return [place, np.array([a, b, -(e * a + n * b) / up]), place, 0 * place]
 
 
 way(
@@ -388,12 +388,12 @@ way(
      v.normal()),
     lambda *a: three_body(*a)[:-3], norm=True, cost=2,
 )  # fmt: skip
-# Of places in the plane, where the three pairs are.
+# Of places in the plane, where the three pairs are; of up to their eighth powers.
 way(
     "frames.scenes.ThreeBody.exponents",
     lambda mu, x: our_three_body(mu, x, x, mu)[-3:],
     (MU, lambda rng, i: np.array([*rng.normal(size=2), 0.0])),
-    lambda mu, x: three_body(mu, x, x, mu)[-3:], norm=True,
+    lambda mu, x: three_body(mu, x, x, mu)[-3:], norm=True, ulps=32,
 )  # fmt: skip
 
 
@@ -404,13 +404,15 @@ def equilibria(mu):
         a, b = x + mu, x - 1 + mu
         return x - (1 - mu) * a / abs(a) ** 3 - mu * b / abs(b) ** 3
 
-    hill = mp.cbrt(mu / 3)
-    rows = []
-    for low, high in ((1 - mu - 2 * hill, 1 - mu - hill / 2), (1 - mu + hill / 2, 1 - mu + 2 * hill),
-                      (-mu - mp.mpf(3) / 2, -mu - mp.mpf(1) / 3)):  # fmt: skip
-        low = max(low, -mu + mp.mpf(1) / 3) if low > -mu else low
-        rows.append([mp.findroot(pull, (low, high), solver="anderson", tol=mp.mpf(10) ** -60,
-                                 verify=False), 0, 0])  # fmt: skip
+    hill, second = mp.cbrt(mu / 3), 1 - mu
+    ends = (
+        (-mu + mp.mpf(1) / 100, second - hill / 4), (second + hill / 4, second + 2 * hill + 1),
+        (-mu - 2, -mu - mp.mpf(1) / 10),
+    )  # fmt: skip
+    rows = [
+        [mp.findroot(pull, pair, solver="anderson", tol=mp.mpf(10) ** -70, maxsteps=200), 0, 0]
+        for pair in ends
+    ]
     tip = mp.sqrt(mp.mpf(3)) / 2
     return np.array([*rows, [mp.mpf(1) / 2 - mu, tip, 0], [mp.mpf(1) / 2 - mu, -tip, 0]])
 
@@ -459,7 +461,7 @@ def field_of(mu):
                 d = x - [at, 0, 0]
                 r = np.sqrt(d @ d)
                 a, h = a - m * d / r**3, h - m * (np.eye(3) / r**3 - 3 * np.outer(d, d) / r**5)
-        return [*a, 2 * u[1], -2 * u[0], 0], h
+        return a + np.array([2 * u[1], -2 * u[0], 0]), h
 
     return field
 

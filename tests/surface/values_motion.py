@@ -208,9 +208,8 @@ def line(rows, t):
 
 def tables(rows, t):
     inside = TIMES[0] <= t < TIMES[-1]
-    within = TIMES[0] <= t <= TIMES[-1]
     return [
-        held(rows, t), line(rows, t), line(rows, t) if within else 0 * rows[0],
+        held(rows, t), line(rows, t), line(rows, t) if inside else 0 * rows[0],
         rows[row_at(t)] if inside else 0 * rows[0],
         sum((b - a) * r for a, b, r in zip(TIMES, TIMES[1:], rows, strict=False)),
         held(rows, t - mp.mpf(0.75)), [v.number(TIMES)] * 2, v.number(TIMES + 0.75),
@@ -440,13 +439,7 @@ way(
 )  # fmt: skip
 
 # Lagrange's and Lie and Poisson's equations: those of Euler, in Euler's angles.
-ANGLES = lambda rng, i: np.array(
-    [
-        rng.uniform(-3, 3),
-        rng.uniform(0.3, 2.8),
-        rng.uniform(-3, 3),
-    ]
-)
+ANGLES = lambda rng, i: np.array([rng.uniform(-3, 3), rng.uniform(0.3, 2.8), rng.uniform(-3, 3)])
 
 
 def euler_top(m, c, g, i, q, rate):
@@ -521,3 +514,44 @@ way(
     norm=True,
 )  # fmt: skip
 leave_out("abstract", "motion.torques.AbstractForce", "motion.torques.AbstractTorque")
+
+
+# What a law hands on of the functions of time in it.
+def jumping(j):
+    ts = jnp.asarray(TIMES)
+    ramp, step = laws.Linear(ts, jnp.ones((5, 3))), laws.Held(ts, jnp.ones((5, 3)))
+    spin = laws.Linear(ts, jnp.ones((5, 3, 3)))
+    wheels = laws.ReactionWheels(jnp.eye(3), j, 0.0 * j, step)
+    rotors = laws.Rotors(jnp.eye(3), jnp.eye(3), jnp.ones(3), 1.0, 1.0, step)
+    both = laws.Sum(laws.InSpace(ramp), laws.Pulses(ts + 0.25, jnp.ones((4, 3))))
+    found = (
+        laws.Pulses(ts, jnp.ones((4, 3))), laws.Tabulated(ts, jnp.ones((5, 3))),
+        laws.InSpace(ramp), laws.Flywheel(ramp), laws.GravityGradient(1.0, ramp),
+        laws.MagneticDipole(j, ramp), laws.Lagged(step, 0.1), rotors, wheels,
+        laws.ChangingInertia(spin), laws.InSpace(laws.Delayed(step, 0.25)), both,
+    )  # fmt: skip
+    return [jnp.sort(law.jump_times) for law in found]
+
+
+way(
+    " ".join(f"motion.torques.{name}.jump_times" for name in (
+        "Pulses", "Tabulated", "InSpace", "Flywheel", "GravityGradient", "MagneticDipole", "Lagged",
+        "Rotors", "ReactionWheels", "ChangingInertia", "Sum",
+    )),
+    jumping, between(1.0, 2.0, 3),
+    lambda j: [TIMES] * 10 + [TIMES + 0.25, np.sort([*TIMES, *(TIMES + 0.25)])], cost=4,
+)  # fmt: skip
+way(
+    "motion.torques.GravityGradient.axis",
+    lambda r: laws.GravityGradient(1.0, r).axis / jnp.linalg.norm(laws.GravityGradient(1.0, r).axis),
+    v.ordinary, lambda r: r / v.norm(r),
+)  # fmt: skip
+leave_out(
+    "a truth value, a kind or a name: no number",
+    *(f"motion.torques.{name}.steady" for name in (
+        "BodyDrag", "CentralGravity", "ConstantTorque", "CorrelatedTorque", "Damping", "Drag",
+        "Flywheel", "FromPotential", "GravityGradient", "HeavyTop", "InSpace", "MagneticDipole",
+        "QuadraticDamping", "RandomTorque", "ReactionWheels", "UniformGravity")),
+    "motion.torques.ChangingInertia.feels", "motion.torques.Sum.feels",
+    "motion.torques.Sum.rate_free",
+)  # fmt: skip

@@ -113,9 +113,9 @@ class Wheel(eqx.Module):
 
     **Arguments:** `inertia` J, kg m², about the axis; `axis` (3,) a, body frame, unit; `speed`
     rad/s relative to the body, a callable Module of time such as `Series(times, speeds)`; `delay`
-    s: the log shows at t what was at t − delay; `None` for none; `tilt` (2,) rad, how far the axis
-    is tilted towards two directions across it (about x, y and z: the next two axes in turn, y and
-    z, z and x, x and y); `None` for none.
+    s: the log shows at t what was at t − delay; `None` for none; `tilt` (2,) tangents (rad, where
+    small) of how far the axis is tilted towards two directions across it (about x, y and z: the
+    next two axes in turn, y and z, z and x, x and y); `None` for none.
 
     **Raises:** `ValueError` for an axis that is not a unit vector.
 
