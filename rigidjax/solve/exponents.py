@@ -201,7 +201,9 @@ def _solved(
     whole = count // _PARTS * _PARTS
     means = jnp.mean(rates[count - whole :].reshape(_PARTS, -1, how.many), axis=1)
     apart = jnp.var(means, axis=0, ddof=1) / _PARTS
-    errors = jnp.sqrt(apart + (jnp.mean(off[how.transient :], axis=0) / step) ** 2)
+    # What the twenty equal parts leave out, up to 19 intervals at the start, counts whole.
+    left = running[-1] - jnp.mean(means, axis=0)
+    errors = jnp.sqrt(apart + left**2 + (jnp.mean(off[how.transient :], axis=0) / step) ** 2)
     first = jnp.argmax(jax.vmap(lambda result: result != dfx.RESULTS.successful)(results))
     result = jax.tree.map(lambda leaf: leaf[first], results)
     return Exponents(running[-1], errors, times, running, state, result)

@@ -73,6 +73,16 @@ def test_a_linear_field_is_exact_within_its_errors(rtol):
     assert (off <= found.errors).all() and (found.errors < 300 * rtol).all()
 
 
+def test_errors_hold_what_is_left_of_the_transient():
+    # 30 intervals are twenty parts of one each, and ten at the start that are in no part.
+    found = rj.lyapunov_exponents(
+        lambda t, y, args: jnp.array([0.3, -0.2, -0.7]) * y, jnp.ones(3), 20.0, intervals=40,
+        transient=10, rtol=1e-11,
+    )  # fmt: skip
+    off = np.abs(found.values - np.array([0.3, -0.2, -0.7]))
+    assert (off < 4 * found.errors).all()
+
+
 def test_other_states_over_long_intervals():
     # x″ = −40 x − 41 v: −1 and −40 along each axis.
     point = rj.Point([0.1, 0.2, 0.0], [0.0, 0.0, 0.3])
