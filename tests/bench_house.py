@@ -1,0 +1,94 @@
+"""How large the library is: lines, names, and how many functions a first call goes through.
+
+`python tests/bench_house.py` prints one line a figure. Lines of code have no docstring, comment or
+blank; the longest function is counted in such lines. Functions entered are named ones of ours,
+each counted once, in a call that nothing was compiled for (`sys.setprofile`).
+"""
+
+import ast
+import io
+import sys
+import tokenize
+from pathlib import Path
+from types import ModuleType
+
+import jax
+import jax.numpy as jnp
+
+import rigidjax as rj
+
+ROOT = Path(rj.__file__).parent
+SPARE = (tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT)
+
+
+def code_lines(text: str) -> set[int]:
+    """The numbers of the lines that have code."""
+    tokens = tokenize.generate_tokens(io.StringIO(text).readline)
+    lines = set()
+    for token in tokens:
+        if token.type not in (*SPARE, tokenize.ENDMARKER):
+            lines |= set(range(token.start[0], token.end[0] + 1))
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and ast.get_docstring(
+            node
+        ):
+            word = node.body[0]
+            lines -= set(range(word.lineno, (word.end_lineno or word.lineno) + 1))
+    return lines
+
+
+def entered(call: object) -> tuple[int, int]:
+    """How many functions, of how many modules."""
+    seen: set[tuple[str, str]] = set()
+
+    def watch(frame, event, _):
+        code = frame.f_code
+        if event == "call" and code.co_filename.startswith(str(ROOT)) and code.co_name[0] != "<":
+            seen.add((code.co_filename, code.co_qualname))
+
+    sys.setprofile(watch)
+    try:
+        jax.block_until_ready(call())  # pyright: ignore[reportCallIssue]
+    finally:
+        sys.setprofile(None)
+    return len(seen), len({file for file, _ in seen})
+
+
+def main() -> None:
+    jax.config.update("jax_enable_x64", True)
+    files = sorted(ROOT.rglob("*.py"))
+    texts = {file: file.read_text() for file in files}
+    code = {file: code_lines(text) for file, text in texts.items()}
+    print(f"modules {len(files)}, lines {sum(len(t.splitlines()) for t in texts.values())}")
+    print(f"lines of code {sum(len(lines) for lines in code.values())}")
+    floors = [f for f in files if f.relative_to(ROOT).parts[0] in ("solve", "exact", "batch")]
+    print(f"solve + exact + batch {sum(len(texts[f].splitlines()) for f in floors)}")
+    names = [n for n in dir(rj) if not isinstance(getattr(rj, n), ModuleType)]
+    print(f"names in rj.* that are no module {len(names)}: {' '.join(names)}")
+    lengths = [
+        (
+            len(code[file] & set(range(node.lineno, (node.end_lineno or 0) + 1))),
+            node.name,
+            file.name,
+        )
+        for file, text in texts.items()
+        for node in ast.walk(ast.parse(text))
+        if isinstance(node, ast.FunctionDef)
+    ]
+    print("longest functions", *sorted(lengths, reverse=True)[:5])
+
+    body = rj.Inertia.from_principal(1.6, 2.0, 3.0)
+    top = rj.torques.HeavyTop(1.0, [0.1, 0.2, 0.9], [0.0, 0.0, -9.81])
+
+    def last(omega):
+        start = rj.Attitude([1.0, 0, 0, 0], omega)
+        return rj.simulate(body, start, [0.0, 1.0, 2.0], top).ys.omega[-1, 0]
+
+    omega = jnp.array([0.5, 1.0, 6.0])
+    print("functions and modules of a cold forced value", *entered(lambda: last(omega)))
+    jax.clear_caches()
+    print("functions and modules of its gradient", *entered(lambda: jax.grad(last)(omega)))
+
+
+if __name__ == "__main__":
+    main()
