@@ -1,9 +1,9 @@
 """Differentiable rigid-body and rotating-frame mechanics for JAX.
 
-From the ground up: `special` (functions), `rotation` and `body`, `motion` (states, equations,
-torques) and `frames`, `exact` and `solve` (the motion in closed form, or by a solver), and what
-uses them: `identify`, `estimate`, `batch`, `workprecision`, `plot`. Most programs begin with
-`simulate`.
+From the ground up: `rotation` and `body`, `motion` (states, equations, torques) and `frames`,
+`exact` and `solve` (the motion in closed form, or by a solver), and what uses them: `identify`,
+`estimate`, `batch`, `workprecision`, `plot`. Fields of their own are loaded when they are asked
+for: `elliptic`. Most programs begin with `simulate`.
 """
 
 import importlib
@@ -71,11 +71,11 @@ from rigidjax.solve import (
     simulate as simulate,
     solvers as solvers,
 )
-from rigidjax.special import elliptic as elliptic
 
 if TYPE_CHECKING:
     from rigidjax import (
         datasets as datasets,
+        elliptic as elliptic,
         plot as plot,
         workprecision as workprecision,
     )
@@ -83,7 +83,7 @@ if TYPE_CHECKING:
 __version__ = "0.2.0"
 
 # Loaded when first asked for: few programs draw, fewer compare methods.
-_LATER = ("datasets", "plot", "workprecision")
+_LATER = ("datasets", "elliptic", "plot", "workprecision")
 
 
 def __getattr__(name: str) -> ModuleType:

@@ -8,6 +8,9 @@ from pathlib import Path
 
 import pytest
 
+# What `import rigidjax` leaves until it is asked for: imported here under the hook.
+LATER = ("datasets", "elliptic", "plot", "workprecision")
+
 
 def pytest_configure(config):
     """Compiled programs are kept beside pytest's own cache: the next run takes a third of the time.
@@ -42,7 +45,7 @@ def _load(default_run):
     once.ask(default_run)
     usual = once.library_programs(("rigidjax.identify", "rigidjax.frames"))
     with install_import_hook("rigidjax", "beartype.beartype"):
-        for name in ("rigidjax", "rigidjax.plot", "rigidjax.workprecision"):
+        for name in ("rigidjax", *(f"rigidjax.{late}" for late in LATER)):
             importlib.import_module(name)
     equinox.filter_jit = usual
 

@@ -1,4 +1,4 @@
-"""How bright a lit body looks: ellipsoids in closed form, convex meshes by their faces (floor 1).
+"""How bright a lit body looks: ellipsoids in closed form, convex meshes by their faces.
 
 The brightness is the light that reaches the observer from all that is lit and seen,
 `∫ f(μ₀, μ) dA`, with μ₀ and μ the cosines of incidence and emission. It is counted as an area: the
@@ -14,6 +14,7 @@ from rigidjax._types import Scalar
 from rigidjax.body import validation
 from rigidjax.body._types import Numbers, Vector
 from rigidjax.body.meshes import faces_of
+from rigidjax.body.scaling import exponent_of, times_power_of_two
 from rigidjax.body.scattering import (
     AbstractScattering as AbstractScattering,
     Geometric as Geometric,
@@ -22,7 +23,6 @@ from rigidjax.body.scattering import (
     direction,
     law_of,
 )
-from rigidjax.special.scaling import exponent_of, times_power_of_two
 
 
 def ellipsoid(

@@ -1,4 +1,4 @@
-"""Laws of scattering: what a piece of surface sends, and an ellipsoid as a whole (floor 1).
+"""Laws of scattering: what a piece of surface sends, and an ellipsoid as a whole.
 
 With r = A u and |u| = 1 an ellipsoid becomes a sphere: `μ₀ dA = det A (p·u) du`, p = A⁻¹ s, and
 what is lit and seen becomes the lune between p and q = A⁻¹ o. All of it depends on `|p|, |q|, p·q`
@@ -17,8 +17,8 @@ from jaxtyping import Array, Float
 from rigidjax import _checks
 from rigidjax._types import Mat3, Scalar, Vec3, Vec3Like
 from rigidjax.body._types import Numbers
+from rigidjax.body.scaling import exponent_of, times_power_of_two
 from rigidjax.rotation.linalg3 import apply, cofactors, cross, determinant, dot
-from rigidjax.special.scaling import exponent_of, times_power_of_two
 
 # Below it the function of Lommel and Seeliger's law is a series, of so many terms.
 _SMALL, _TERMS = 0.1, 16

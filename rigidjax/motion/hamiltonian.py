@@ -1,4 +1,4 @@
-"""Lie–Poisson equations from any Hamiltonian of the body's momentum (floor 2)."""
+"""Lie–Poisson equations from any Hamiltonian of the body's momentum."""
 
 from collections.abc import Callable
 from typing import Any

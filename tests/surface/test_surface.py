@@ -22,7 +22,7 @@ from surface.calls import TABLE, WITHOUT
 TESTS = Path(__file__).parents[1]
 # One of each kind: numbers, a body and a state, a law, a frame, a sensor, a function for an argument.
 SAMPLE = (
-    "special.elliptic.rf",
+    "elliptic.rf",
     "rotation.so3.cross",
     "rotation.quaternion.angle",
     "Inertia",

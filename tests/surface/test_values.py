@@ -7,7 +7,7 @@ from surface.values import WAYS, WITHOUT
 
 # Quick to compile, some of each kind.
 SAMPLE = (
-    "special.elliptic.ellippi",
+    "elliptic.ellippi",
     "rotation.so3.wahba",
     "rotation.euler.from_quaternion rotation.euler.from_matrix (ZYX)",
     "rotation.so3.left_jacobian_inverse rotation.so3.right_jacobian_inverse",

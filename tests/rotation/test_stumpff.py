@@ -6,7 +6,7 @@ import mpmath as mp
 import numpy as np
 import pytest
 
-from rigidjax.special import stumpff
+from rigidjax.rotation import stumpff
 
 mp.mp.dps = 50
 TS = np.concatenate(

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from once import once
 
-from rigidjax.special import elliptic
+from rigidjax import elliptic
 
 M1 = (0.5, 0.1, 0.9, 1.0, 3.0, 1e-3, 1e-6, 1e-10, 1e-16, 1e-20, 1e-30)
 FRACTIONS = (1e-9, 0.01, 0.37, 0.5, 0.999, 1.0, 2.0, 3.1, 4.7, 7.9, -1.3)

@@ -1,4 +1,4 @@
-"""Elliptic functions and integrals: the public face, `rj.elliptic` (floor 0).
+"""Elliptic functions and integrals: the public face, `rj.elliptic`.
 
 Jacobi's functions (`jacobi.py`), Legendre's integrals (`legendre.py`), Carlson's (`carlson.py`).
 Everything takes the parameter m = k², as SciPy and mpmath do, and optionally its complement
@@ -11,9 +11,9 @@ fixed by the dtype.
 """
 
 from rigidjax._names import own_names
-from rigidjax.special.carlson import rc as rc, rd as rd, rf as rf, rj_ as rj_
-from rigidjax.special.jacobi import am as am, sncndn as sncndn
-from rigidjax.special.legendre import (
+from rigidjax.elliptic.carlson import rc as rc, rd as rd, rf as rf, rj_ as rj_
+from rigidjax.elliptic.jacobi import am as am, sncndn as sncndn
+from rigidjax.elliptic.legendre import (
     ellipe as ellipe,
     ellipeinc as ellipeinc,
     ellipf as ellipf,

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rigidjax.special.scaling import exponent_of, times_power_of_two
+from rigidjax.body.scaling import exponent_of, times_power_of_two
 
 # (x, n) with a normal product; 2ⁿ itself is out of range in some.
 DOUBLE = [

@@ -1,4 +1,4 @@
-"""What the special functions do with their arguments before any arithmetic (floor 0)."""
+"""What the special functions do with their arguments before any arithmetic."""
 
 from typing import Any
 

@@ -8,7 +8,7 @@ import pytest
 from jax import test_util
 from once import once
 
-from rigidjax.special import elliptic
+from rigidjax import elliptic
 
 DTYPES = (np.float64, np.float32)
 

@@ -1,4 +1,4 @@
-"""sn, cn, dn near m = 1 as sums over images: one hyperbolic function per half period (floor 0).
+"""sn, cn, dn near m = 1 as sums over images: one hyperbolic function per half period.
 
 With p = exp(−πK/K') ≈ m1/16 the complementary nome and B = π/2K' (DLMF §22.12, after Jacobi's
 imaginary transformation, §22.6(iv)),

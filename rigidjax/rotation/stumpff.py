@@ -1,4 +1,4 @@
-"""Smooth kernels of θ², right with all their derivatives from θ = 0 upwards (floor 0).
+"""Smooth kernels of θ², right with all their derivatives from θ = 0 upwards.
 
 Rotations need sin θ/θ, (1 − cos θ)/θ², (θ − sin θ)/θ³, … as functions of t = θ². These are the
 Stumpff functions c_k(t) = Σ (−t)ⁿ/(k + 2n)!  (Stumpff 1959; Battin 1999, sec. 4.5). Their

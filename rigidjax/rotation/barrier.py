@@ -1,4 +1,4 @@
-"""Keep XLA from computing numbers again in each place that reads them (floor 0)."""
+"""Keep XLA from computing numbers again in each place that reads them."""
 
 from typing import TypeVar
 

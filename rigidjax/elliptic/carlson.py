@@ -1,4 +1,4 @@
-"""Carlson's symmetric elliptic integrals R_F, R_D, R_J, R_C (floor 0).
+"""Carlson's symmetric elliptic integrals R_F, R_D, R_J, R_C.
 
 R_F, R_D, R_C by duplication (Carlson 1995, doi 10.1007/BF02198293; DLMF 19.36(i)): each step
 replaces every argument a by (a + λ)/4, which first halves the logarithm of their ratio and then
@@ -15,8 +15,8 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, ArrayLike, Float
 
-from rigidjax.special.arguments import common
-from rigidjax.special.carlson_r import r_integral
+from rigidjax.elliptic.arguments import common
+from rigidjax.elliptic.carlson_r import r_integral
 
 # Steps after which the series is exact for ratios over the whole range of the dtype.
 _STEPS = {np.dtype("float64"): 13, np.dtype("float32"): 8}

@@ -1,4 +1,4 @@
-"""Legendre's elliptic integrals, complete and incomplete, on the parameter m = k² (floor 0).
+"""Legendre's elliptic integrals, complete and incomplete, on the parameter m = k².
 
 All of them, and all their derivatives, belong to one family that is closed under differentiation:
 
@@ -19,9 +19,9 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, ArrayLike, Float
 
-from rigidjax.special.arguments import common, complementary
-from rigidjax.special.carlson import rd, rf
-from rigidjax.special.carlson_r import r_integral
+from rigidjax.elliptic.arguments import common, complementary
+from rigidjax.elliptic.carlson import rd, rf
+from rigidjax.elliptic.carlson_r import r_integral
 
 # Steps after which a and b agree to √eps for b/a down to the square root of the least number.
 MEAN_STEPS = {np.dtype("float64"): 11, np.dtype("float32"): 8}

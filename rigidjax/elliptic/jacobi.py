@@ -1,4 +1,4 @@
-"""Jacobi's elliptic functions sn, cn, dn and the amplitude, for every real parameter (floor 0).
+"""Jacobi's elliptic functions sn, cn, dn and the amplitude, for every real parameter.
 
 Values: the argument is reduced by the half period 2K, then Bulirsch's descending transformation
 (1965, doi 10.1007/BF01397975) works with 1 − m, so that nothing is lost as m → 1.
@@ -22,9 +22,9 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, ArrayLike, Float
 
-from rigidjax.special.arguments import common, complementary, exact_complement
-from rigidjax.special.jacobi_near_one import LARGEST_M1, near_one
-from rigidjax.special.legendre import MEAN_STEPS, complete, half_turns, integral
+from rigidjax.elliptic.arguments import common, complementary, exact_complement
+from rigidjax.elliptic.jacobi_near_one import LARGEST_M1, near_one
+from rigidjax.elliptic.legendre import MEAN_STEPS, complete, half_turns, integral
 
 # Below this cn and dn, integrals over sd² depend on their ratio only (to the floor squared).
 _FLOOR = {np.dtype("float64"): 1e-40, np.dtype("float32"): 1e-8}
