@@ -15,7 +15,7 @@ SAMPLE = (
     "body.shapes.mesh",
     "body.divergence",
     "motion.torques.GravityGradient motion.torques.GravityGradient.energy",
-    "frames.scenes.ThreeBody.lagrange_points",
+    "orbits.ThreeBody.lagrange_points",
     "identify.LowPass",
 )
 # Draws of a row of the sample, and of one of all; how many calls these are to be, a public function

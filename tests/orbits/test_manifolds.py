@@ -8,10 +8,11 @@ from once import filter_once
 from scipy.integrate import solve_ivp
 
 import rigidjax as rj
-from rigidjax.frames import manifolds, scenes
+from rigidjax import orbits
+from rigidjax.orbits import manifolds
 
 MU = 0.0121505856
-MOON = scenes.cr3bp(MU)
+MOON = orbits.cr3bp(MU)
 
 
 @filter_once
@@ -91,7 +92,7 @@ MU_SUN = 9.537e-4
 
 @pytest.mark.slow
 def test_a_connection_between_two_orbits():
-    sun = scenes.cr3bp(MU_SUN)
+    sun = orbits.cr3bp(MU_SUN)
     jacobi = 3.037
 
     def orbit_with(point):
@@ -175,7 +176,7 @@ def test_where_the_halo_orbits_begin():
         guess = jax.tree.map(lambda leaf: leaf, found)
         x = guess.state.x.at[2].set(height)
         halo = MOON.periodic_orbit(
-            scenes.PeriodicOrbit(rj.Point(x, guess.state.v), guess.period), hold="z"
+            orbits.PeriodicOrbit(rj.Point(x, guess.state.v), guess.period), hold="z"
         )
         numbers.append(
             np.array(
@@ -210,7 +211,7 @@ def test_words(unhooked):
     with pytest.raises(ValueError, match="phase: contains NaN"):
         MOON.manifold_start(orbit, np.nan, "stable")
     # Long after the end of Hill's family g is a stable orbit: the retrograde ones.
-    hill = scenes.hill()
-    stable = scenes.PeriodicOrbit(rj.Point([0.3, 0, 0], [0.0, -2.2, 0]), 0.8)
+    hill = orbits.hill()
+    stable = orbits.PeriodicOrbit(rj.Point([0.3, 0, 0], [0.0, -2.2, 0]), 0.8)
     with pytest.raises(ValueError, match="no multiplier that is real and larger than 1"):
         hill.manifold(hill.periodic_orbit(stable), "unstable", count=2, samples=2)

@@ -9,16 +9,16 @@ from jaxtyping import Array, ArrayLike, Complex, Float
 from rigidjax import _checks
 from rigidjax._types import Mat3, Scalar, ScalarLike, Vec3
 from rigidjax.body._types import Vector
-from rigidjax.frames import lagrange_points, richardson
-from rigidjax.frames.differential_correction import PeriodicOrbit
 from rigidjax.frames.point import Point, require_point
-from rigidjax.frames.reversible_scene import AbstractReversible
-from rigidjax.frames.state_transition import smallest_distance
+from rigidjax.orbits import lagrange_points, richardson
+from rigidjax.orbits.differential_correction import PeriodicOrbit
+from rigidjax.orbits.reversible_scene import AbstractReversible
+from rigidjax.orbits.state_transition import smallest_distance
 from rigidjax.rotation.linalg3 import components
 
 
 class ThreeBody(AbstractReversible):
-    """A particle under two bodies that circle each other: make one with `scenes.cr3bp(mu)`.
+    """A particle under two bodies that circle each other: make one with `orbits.cr3bp(mu)`.
 
     Rotating axes, origin at the common centre of mass, the first body (mass 1 − μ) at (−μ, 0, 0),
     the second (mass μ) at (1 − μ, 0, 0). Units: their distance, their total mass, and 1/(their
@@ -72,8 +72,8 @@ class ThreeBody(AbstractReversible):
     def jacobi_constant(self, state: Point) -> Scalar:
         """C = 2U − |v|², kept along the motion (Szebehely 1967, eq 1.5(20)).
 
-        >>> from rigidjax.frames import scenes
-        >>> float(scenes.cr3bp(0.5).jacobi_constant(Point([0.0, 0, 0], [0.0, 0, 0])))
+        >>> from rigidjax import orbits
+        >>> float(orbits.cr3bp(0.5).jacobi_constant(Point([0.0, 0, 0], [0.0, 0, 0])))
         4.0
         """
         require_point(state)
@@ -98,8 +98,8 @@ class ThreeBody(AbstractReversible):
         **Arguments:** `xs`, `ys` places along the axes. `matplotlib.pyplot.contour(xs, ys, grid,
         levels=[C])` draws the curve of zero velocity (Szebehely 1967, sec. 4.7).
 
-        >>> from rigidjax.frames import scenes
-        >>> scenes.cr3bp(0.5).zero_velocity([0.0], [0.0]).tolist()
+        >>> from rigidjax import orbits
+        >>> orbits.cr3bp(0.5).zero_velocity([0.0], [0.0]).tolist()
         [[4.0]]
         """
         columns, rows = _checks.numbers(xs, "xs"), _checks.numbers(ys, "ys")
@@ -126,7 +126,7 @@ class ThreeBody(AbstractReversible):
 
     @property
     def lagrange_points(self) -> Float[Array, "5 3"]:
-        """L1 … L5 (5, 3): see `rigidjax.frames.lagrange_points.points`."""
+        """L1 … L5 (5, 3): see `rigidjax.orbits.lagrange_points.points`."""
         return lagrange_points.points(self.mu)
 
     def hessian(self, x: Vector) -> Mat3:
@@ -141,8 +141,8 @@ class ThreeBody(AbstractReversible):
         In the plane λ⁴ + (4 − U_xx − U_yy) λ² + U_xx U_yy − U_xy² = 0, across it λ² = U_zz
         (Szebehely 1967, sec. 5.2).
 
-        >>> from rigidjax.frames import scenes
-        >>> moon = scenes.cr3bp(0.0121505856)
+        >>> from rigidjax import orbits
+        >>> moon = orbits.cr3bp(0.0121505856)
         >>> bool((moon.exponents(moon.lagrange_points[3]).real < 1e-12).all())
         True
         """

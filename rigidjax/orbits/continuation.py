@@ -11,7 +11,7 @@ from jaxtyping import Array, Complex, Float
 
 from rigidjax import _checks
 from rigidjax._types import Scalar
-from rigidjax.frames.differential_correction import (
+from rigidjax.orbits.differential_correction import (
     MAX_STEPS,
     PeriodicOrbit,
     corrected,
@@ -30,9 +30,9 @@ def at_values(scene: Any, orbit: PeriodicOrbit, values: Any, hold: str) -> Perio
 
     **Raises:** `ValueError` (`EquinoxRuntimeError` under `jit`) where a member is not found.
 
-    >>> from rigidjax.frames import scenes
+    >>> from rigidjax import orbits
     >>> from rigidjax.frames.point import Point
-    >>> hill = scenes.hill()
+    >>> hill = orbits.hill()
     >>> orbit = PeriodicOrbit(Point([0.3, 0, 0], [0.0, 1.6, 0]), 1.2)
     >>> [round(float(p), 3) for p in at_values(hill, orbit, [0.3, 0.31], "x").period]
     [1.404, 1.536]
@@ -91,9 +91,9 @@ def _at_values(scene: Any, start: Array, held: Array, index: int, tolerance: flo
 def slope(scene: Any, orbit: PeriodicOrbit, hold: str) -> PeriodicOrbit:
     """How state and period change along the family, per unit of `hold`: `ThreeBody.family_slope`.
 
-    >>> from rigidjax.frames import scenes
+    >>> from rigidjax import orbits
     >>> from rigidjax.frames.point import Point
-    >>> hill = scenes.hill()
+    >>> hill = orbits.hill()
     >>> orbit = hill.periodic_orbit(PeriodicOrbit(Point([0.3, 0, 0], [0.0, 1.6, 0]), 1.2))
     >>> round(float(slope(hill, orbit, "x").period), 3)
     12.076
@@ -121,9 +121,9 @@ def follow(scene: Any, orbit: PeriodicOrbit, step: Any, count: int, rising: str)
 
     **Raises:** `ValueError` (`EquinoxRuntimeError` under `jit`) where a member is not found.
 
-    >>> from rigidjax.frames import scenes
+    >>> from rigidjax import orbits
     >>> from rigidjax.frames.point import Point
-    >>> hill = scenes.hill()
+    >>> hill = orbits.hill()
     >>> orbit = hill.periodic_orbit(PeriodicOrbit(Point([0.3, 0, 0], [0.0, 1.6, 0]), 1.2))
     >>> follow(hill, orbit, 0.05, 3, "x").state.x.shape
     (3, 3)

@@ -6,9 +6,9 @@ import jax.numpy as jnp
 
 from rigidjax import _checks
 from rigidjax._types import Scalar, ScalarLike
-from rigidjax.frames.differential_correction import PeriodicOrbit
-from rigidjax.frames.lagrange_points import distances, points
 from rigidjax.frames.point import Point
+from rigidjax.orbits.differential_correction import PeriodicOrbit
+from rigidjax.orbits.lagrange_points import distances, points
 
 
 def guess(

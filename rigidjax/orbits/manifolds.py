@@ -12,9 +12,10 @@ from jaxtyping import Array, Float
 
 from rigidjax import _checks
 from rigidjax._types import Scalar, ScalarLike
-from rigidjax.frames import collision, continuation, state_transition
-from rigidjax.frames.differential_correction import PeriodicOrbit, crossing, named
 from rigidjax.frames.point import Point
+from rigidjax.orbits import continuation, state_transition
+from rigidjax.orbits.differential_correction import PeriodicOrbit, crossing, named
+from rigidjax.solve import ending
 
 # Time run backwards is seen in the mirror y → −y: x, y, z, vx, vy, vz.
 _MIRROR = np.array([1.0, -1.0, 1.0, -1.0, 1.0, -1.0])
@@ -32,10 +33,10 @@ class Manifold(eqx.Module):
     `phases` (N,) where on the orbit each begins, in periods; `multiplier` λ by which a small
     distance along it changes in a period.
 
-    >>> from rigidjax.frames import scenes
+    >>> from rigidjax import orbits
     >>> ts, phases = jnp.array([0.0, 0.1]), jnp.array([0.0])
     >>> states = Point(jnp.zeros((1, 2, 3)), jnp.zeros((1, 2, 3)))
-    >>> scenes.Manifold(ts, states, phases, jnp.asarray(2.5)).states.x.shape
+    >>> orbits.Manifold(ts, states, phases, jnp.asarray(2.5)).states.x.shape
     (1, 2, 3)
     """
 
@@ -172,7 +173,7 @@ def _paths(scene: Any, starts: Point, ts: Array, which: str) -> Point:
             seen(start),
             saveat=dfx.SaveAt(ts=ts),
             stepsize_controller=dfx.PIDController(rtol=1e-11, atol=1e-12),
-            event=collision.event(scene),
+            event=dfx.Event(ending.Ends(scene)),
             adjoint=dfx.ForwardMode(),
             max_steps=100_000,
             throw=False,

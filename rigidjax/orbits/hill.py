@@ -6,13 +6,13 @@ from jaxtyping import Array, Float
 from rigidjax import _checks
 from rigidjax._types import Scalar, ScalarLike, Vec3
 from rigidjax.frames.point import Point, require_point
-from rigidjax.frames.reversible_scene import AbstractReversible
-from rigidjax.frames.state_transition import smallest_distance
+from rigidjax.orbits.reversible_scene import AbstractReversible
+from rigidjax.orbits.state_transition import smallest_distance
 from rigidjax.rotation.linalg3 import components
 
 
 class Hill(AbstractReversible):
-    """A particle near a small body that circles a large one: make one with `scenes.hill()`.
+    """A particle near a small body that circles a large one: make one with `orbits.hill()`.
 
     Rotating axes centred on the small body, x away from the large one. Units: μ^{1/3} of the
     bodies' distance, and 1/(their angular rate). **Field:** `radius` of the small body.

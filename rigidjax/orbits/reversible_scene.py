@@ -1,17 +1,19 @@
 """Scenes that are symmetric under time reversal: their periodic orbits, families, stability."""
 
+import abc
 from collections.abc import Sequence
 
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Complex, Float
+from jaxtyping import Array, ArrayLike, Bool, Complex, Float
 
 from rigidjax import _checks
 from rigidjax._types import ScalarLike
-from rigidjax.frames import continuation, differential_correction, manifolds, state_transition
 from rigidjax.frames.base import AbstractScene
-from rigidjax.frames.differential_correction import PeriodicOrbit
-from rigidjax.frames.manifolds import Manifold
 from rigidjax.frames.point import Point
+from rigidjax.orbits import continuation, differential_correction, manifolds, state_transition
+from rigidjax.orbits.differential_correction import PeriodicOrbit
+from rigidjax.orbits.manifolds import Manifold
 
 
 class AbstractReversible(AbstractScene):
@@ -20,6 +22,26 @@ class AbstractReversible(AbstractScene):
     An orbit that crosses the xz-plane at a right angle twice is then periodic (Roy and Ovenden
     1955, doi:10.1093/mnras/115.3.296).
     """
+
+    @abc.abstractmethod
+    def approach(self, t: ScalarLike, state: Point) -> tuple[Array, Array]:
+        """Distances from the bodies (k,), and those at which a run ends, named as a collision."""
+
+    def ends(self, t: ScalarLike, state: Point) -> Bool[Array, ""]:
+        """Whether the particle has collided with one of the bodies: there a run ends."""
+        gaps, least = self.approach(t, state)
+        return jnp.any(gaps <= least)
+
+    def end_words(self, t: ScalarLike, state: Point) -> str:
+        """A collision in words: with which body, when, and how near."""
+        gaps = self.approach(t, state)[0]
+        if not _checks.known(gaps):
+            return "the particle collided with one of the scene's bodies"
+        near, when = np.asarray(gaps), float(np.asarray(t))
+        return (
+            f"collision with body {int(near.argmin()) + 1} of the scene at t = {when:.9g}, "
+            f"distance {near.min():.3g}"
+        )
 
     def transition(
         self, state: Point, t: ScalarLike, *, rtol: float = 1e-13, atol: float = 1e-14
@@ -69,8 +91,8 @@ class AbstractReversible(AbstractScene):
 
         **Raises:** `ValueError` (`EquinoxRuntimeError` under `jit`) if Newton does not converge.
 
-        >>> from rigidjax.frames import scenes
-        >>> moon = scenes.cr3bp(0.0121505856)
+        >>> from rigidjax import orbits
+        >>> moon = orbits.cr3bp(0.0121505856)
         >>> orbit = moon.periodic_orbit(moon.lyapunov_guess(1, 0.01))
         >>> round(float(orbit.period), 4)
         2.712
@@ -97,8 +119,8 @@ class AbstractReversible(AbstractScene):
 
         **Raises:** `ValueError` (`EquinoxRuntimeError` under `jit`) saying where it was lost.
 
-        >>> from rigidjax.frames import scenes
-        >>> moon = scenes.cr3bp(0.0121505856)
+        >>> from rigidjax import orbits
+        >>> moon = orbits.cr3bp(0.0121505856)
         >>> start = moon.lyapunov_guess(1, 0.01)
         >>> found = moon.family(start, start.state.x[0] - jnp.array([0.0, 0.01]))
         >>> [round(float(p), 3) for p in found.period]
@@ -162,8 +184,8 @@ class AbstractReversible(AbstractScene):
 
         **Raises:** `ValueError` where the orbit has no such multiplier; for another word.
 
-        >>> from rigidjax.frames import scenes
-        >>> moon = scenes.cr3bp(0.0121505856)
+        >>> from rigidjax import orbits
+        >>> moon = orbits.cr3bp(0.0121505856)
         >>> orbit = moon.periodic_orbit(moon.lyapunov_guess(1, 0.01))
         >>> moon.manifold(orbit, "unstable", count=3, samples=5).states.x.shape
         (3, 5, 3)
@@ -185,8 +207,8 @@ class AbstractReversible(AbstractScene):
         `manifold`. Derivatives, by `phase`, by the orbit and by the scene's numbers, are in
         forward mode: connections between orbits are found with them by Newton's method.
 
-        >>> from rigidjax.frames import scenes
-        >>> moon = scenes.cr3bp(0.0121505856)
+        >>> from rigidjax import orbits
+        >>> moon = orbits.cr3bp(0.0121505856)
         >>> orbit = moon.periodic_orbit(moon.lyapunov_guess(1, 0.01))
         >>> start = moon.manifold_start(orbit, 0.0, "stable")
         >>> bool(abs(start.x[0] - orbit.state.x[0]) < 1e-5)

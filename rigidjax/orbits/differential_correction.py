@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from rigidjax import _checks
 from rigidjax._types import Scalar, ScalarLike
 from rigidjax.frames.point import Point
-from rigidjax.frames.state_transition import attempt
+from rigidjax.orbits.state_transition import attempt
 from rigidjax.rotation.linalg3 import components
 
 _NAMES = ("x", "z", "vy", "period")
@@ -50,8 +50,8 @@ def correct(
 
     **Raises:** `ValueError` (`EquinoxRuntimeError` under `jit`) if Newton does not converge.
 
-    >>> from rigidjax.frames import scenes
-    >>> hill = scenes.hill()
+    >>> from rigidjax import orbits
+    >>> hill = orbits.hill()
     >>> orbit = correct(hill, PeriodicOrbit(Point([0.3, 0, 0], [0.0, 1.6, 0]), 1.2), "x")
     >>> round(float(orbit.period), 3)
     1.404
@@ -152,8 +152,8 @@ def usual_tolerance(numbers: Array) -> float:
 def miss(scene: Any, numbers: Float[Array, "4"]) -> Float[Array, "3"]:
     """y, v_x and v_z at the half period: what makes an orbit periodic where they vanish.
 
-    >>> from rigidjax.frames import scenes
-    >>> miss(scenes.hill(), jnp.array([3.0 ** (-1 / 3), 0.0, 0.0, 0.0])).tolist()
+    >>> from rigidjax import orbits
+    >>> miss(orbits.hill(), jnp.array([3.0 ** (-1 / 3), 0.0, 0.0, 0.0])).tolist()
     [0.0, 0.0, 0.0]
     """
     orbit = orbit_of(numbers)

@@ -8,15 +8,16 @@ import jax.numpy as jnp
 import mpmath as mp
 import numpy as np
 import pytest
-from frames.three_body_series import solve
 from once import filter_once
+from orbits.three_body_series import solve
 from scipy.integrate import solve_ivp
 
-from rigidjax.frames import Point, differential_correction, scenes
-from rigidjax.frames.scenes import PeriodicOrbit
+from rigidjax import orbits
+from rigidjax.frames import Point
+from rigidjax.orbits import PeriodicOrbit, differential_correction
 
 MU = 0.01215058560962404
-MOON = scenes.cr3bp(MU)
+MOON = orbits.cr3bp(MU)
 # Howell 1984, doi:10.1007/BF01358403: halo orbits about L1 at μ = 0.04, six digits printed:
 # x, z, v_y, half the period.
 HOWELL = np.array(
@@ -62,7 +63,7 @@ def left(scene, orbits):
 
 @pytest.mark.slow
 def test_published_halo_orbits_and_their_stability():
-    scene = scenes.cr3bp(0.04)
+    scene = orbits.cr3bp(0.04)
     correct = eqx.filter_jit(jax.vmap(lambda row: scene.periodic_orbit(orbit_of(row), hold="z")))
     found = correct(jnp.asarray(HOWELL))
     numbers = jax.vmap(differential_correction.crossing)(found)
@@ -172,7 +173,7 @@ def test_a_member_is_periodic_at_thirty_digits():
 @pytest.mark.slow
 def test_following_a_family_past_its_turn():
     # x of the halo family about L1 at μ = 0.04 first falls, then grows: held, it would be lost.
-    scene = scenes.cr3bp(0.04)
+    scene = orbits.cr3bp(0.04)
     first = eqx.filter_jit(
         lambda: scene.periodic_orbit(orbit_of(jnp.asarray(HOWELL[0])), hold="z")
     )()
@@ -195,7 +196,7 @@ def test_gradients_of_a_family_both_ways():
     values = start.state.x[0] - jnp.array([0.0, 0.01, 0.02])
 
     def total(mu, values):
-        found = scenes.cr3bp(mu).family(start, values)
+        found = orbits.cr3bp(mu).family(start, values)
         return jnp.sum(found.period * jnp.arange(1.0, 4.0)) + jnp.sum(found.state.v)
 
     reverse = jax.grad(total, (0, 1))(jnp.asarray(MU), values)
@@ -235,7 +236,7 @@ def test_where_the_halo_family_branches_off():
 @pytest.mark.parametrize(("mu", "stable"), [(0.04, True), (0.06, False)])
 def test_a_long_walk_finds_the_stable_band(mu, stable):
     # Howell 1984: about L1 halo orbits are stable in a band that is gone at μ = 0.0573.
-    scene = scenes.cr3bp(mu)
+    scene = orbits.cr3bp(mu)
     near = eqx.filter_jit(lambda: scene.periodic_orbit(scene.halo_guess(1, 0.06), hold="z"))()
     found = scene.follow(near, 0.01, 75, rising="z")
     missed, nu = left(scene, found)

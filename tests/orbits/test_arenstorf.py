@@ -4,17 +4,18 @@ import jax.numpy as jnp
 import mpmath as mp
 import numpy as np
 import pytest
-from frames.three_body_series import solve
+from orbits.three_body_series import solve
 
 import rigidjax as rj
-from rigidjax.frames import Point, scenes
+from rigidjax import orbits
+from rigidjax.frames import Point
 
 # Hairer, Nørsett, Wanner, Solving Ordinary Differential Equations I, II.0.
 MU = "0.012277471"
 PLACE = "0.994"
 SPEED = "-2.00158510637908252240537862224"
 PERIOD = "17.0652165601579625588917206249"
-SCENE = scenes.cr3bp(float(MU))
+SCENE = orbits.cr3bp(float(MU))
 START = Point([float(PLACE), 0.0, 0.0], [0.0, float(SPEED), 0.0])
 
 
