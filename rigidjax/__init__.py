@@ -3,7 +3,7 @@
 From the ground up: `rotation` and `body`, `motion` (states, equations, torques) and `frames`,
 `exact` and `solve` (the motion in closed form, or by a solver), and what uses them: `identify`,
 `estimate`, `batch`, `workprecision`, `plot`. Fields of their own are loaded when they are asked
-for: `elliptic`, `orbits`. Most programs begin with `simulate`.
+for: `elliptic`, `lagrangian`, `orbits`. Most programs begin with `simulate`.
 """
 
 import importlib
@@ -49,7 +49,6 @@ from rigidjax.motion import (
     conserved as conserved,
     drift as drift,
     energy as energy,
-    lagrangian as lagrangian,
     torques as torques,
 )
 from rigidjax.rotation import (
@@ -76,6 +75,7 @@ if TYPE_CHECKING:
     from rigidjax import (
         datasets as datasets,
         elliptic as elliptic,
+        lagrangian as lagrangian,
         orbits as orbits,
         plot as plot,
         workprecision as workprecision,
@@ -84,7 +84,7 @@ if TYPE_CHECKING:
 __version__ = "0.2.0"
 
 # Loaded when first asked for: few programs draw, fewer compare methods.
-_LATER = ("datasets", "elliptic", "orbits", "plot", "workprecision")
+_LATER = ("datasets", "elliptic", "lagrangian", "orbits", "plot", "workprecision")
 
 
 def __getattr__(name: str) -> ModuleType:

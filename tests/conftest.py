@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 # What `import rigidjax` leaves until it is asked for: imported here under the hook.
-LATER = ("datasets", "elliptic", "orbits", "plot", "workprecision")
+LATER = ("datasets", "elliptic", "lagrangian", "orbits", "plot", "workprecision")
 
 
 def pytest_configure(config):

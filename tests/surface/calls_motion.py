@@ -17,9 +17,9 @@ row("Attitude", dict(q=Q, omega=W))
 row("Rigid", dict(x=Y, v=V, q=Q, omega=W))
 row("Point", dict(x=Y, v=V))
 row("motion.on_the_group", lambda: dict(state=s.attitude()))
-row("motion.lagrangian.Coordinates", dict(q=V, rate=W))
-row("motion.lagrangian.Momentum", dict(pi=W))
-row("motion.lagrangian.MomentumAndDirection", dict(pi=W, gamma=V))
+row("lagrangian.Coordinates", dict(q=V, rate=W))
+row("lagrangian.Momentum", dict(pi=W))
+row("lagrangian.MomentumAndDirection", dict(pi=W, gamma=V))
 
 # Vector fields.
 row("EulerEquations", lambda: dict(inertia=s.inertia(), torque=s.damping()))
@@ -31,21 +31,21 @@ row(
     says=("inertia", "needs a state"),
 )
 row(
-    "motion.lagrangian.equations_of_motion",
+    "lagrangian.equations_of_motion",
     lambda: dict(lagrangian=s.Kinetic(jnp.asarray(9.8)), force=lambda t, q, rate: -0.1 * rate),
 )
-row("motion.lagrangian.EulerAngleTop", lambda: dict(inertia=s.inertia(), torque=s.top()))
-row("motion.lagrangian.HeavyTopHamiltonian", lambda: dict(inertia=s.inertia(), top=s.top()))
-row("motion.lagrangian.RotationalHamiltonian", lambda: dict(inertia=s.inertia()))
-row("motion.lagrangian.lie_poisson", dict(hamiltonian=lambda p: jnp.sum(p * p)))
-row("motion.lagrangian.lie_poisson_with_direction", dict(hamiltonian=lambda p, g: jnp.sum(p * g)))
-row("motion.lagrangian.from_attitude", lambda: dict(state=s.attitude()))
+row("lagrangian.EulerAngleTop", lambda: dict(inertia=s.inertia(), torque=s.top()))
+row("lagrangian.HeavyTopHamiltonian", lambda: dict(inertia=s.inertia(), top=s.top()))
+row("lagrangian.RotationalHamiltonian", lambda: dict(inertia=s.inertia()))
+row("lagrangian.lie_poisson", dict(hamiltonian=lambda p: jnp.sum(p * p)))
+row("lagrangian.lie_poisson_with_direction", dict(hamiltonian=lambda p, g: jnp.sum(p * g)))
+row("lagrangian.from_attitude", lambda: dict(state=s.attitude()))
 row(
-    "motion.lagrangian.to_attitude",
+    "lagrangian.to_attitude",
     lambda: dict(y=rj.lagrangian.Coordinates(V, W)),
     says=("angles",),
 )
-leave_out("made by motion.lagrangian.equations_of_motion", "motion.lagrangian.LagrangeEquations")
+leave_out("made by lagrangian.equations_of_motion", "lagrangian.LagrangeEquations")
 
 # What is conserved.
 row("energy", lambda: dict(body=s.inertia(), state=s.attitude(), torque=s.top(), t=0.3))

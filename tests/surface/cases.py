@@ -539,7 +539,7 @@ def equations() -> list[Case]:
             {"ordinary": join([0.3, 0.7, 0.2], W), "at rest": join([0.3, 0.7, 0.2], np.zeros(3))},
             step=0.01, rtol2=1e-7,
             covers=tuple(
-                f"motion.lagrangian.{n}" for n in (
+                f"lagrangian.{n}" for n in (
                     "equations_of_motion", "to_attitude", "from_attitude", "lie_poisson",
                     "lie_poisson_with_direction", "EulerAngleTop", "RotationalHamiltonian", "HeavyTopHamiltonian",
                 )

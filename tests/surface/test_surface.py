@@ -28,7 +28,7 @@ SAMPLE = (
     "Inertia",
     "kinetic_energy",
     "motion.torques.HeavyTop",
-    "motion.lagrangian.lie_poisson",
+    "lagrangian.lie_poisson",
     "frames.AboutAxis",
     "identify.Gyro",
     "identify.FixedSteps",

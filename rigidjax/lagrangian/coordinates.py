@@ -1,9 +1,4 @@
-"""Equations of motion from any Lagrangian by differentiation; Euler angles as the worked case.
-
-A cross-check and for teaching, and for scenes that bring their own coordinates. For a rigid body
-the equations of `Attitude` cost less and have no singular attitude: in Euler angles the equations
-break at sin θ = 0, and near it steps become many and small. `lie_poisson` is the Hamiltonian side.
-"""
+"""Equations of motion from any Lagrangian by differentiation; Euler angles as the worked case."""
 
 from collections.abc import Callable
 from typing import Any
@@ -15,18 +10,9 @@ import lineax as lx
 from jaxtyping import Array, ArrayLike, Float
 
 from rigidjax import _checks
-from rigidjax._names import own_names
 from rigidjax._types import HasAttitude, Scalar, ScalarLike
 from rigidjax.body.inertia import Inertia
 from rigidjax.motion.attitude import Attitude
-from rigidjax.motion.hamiltonian import (
-    HeavyTopHamiltonian as HeavyTopHamiltonian,
-    Momentum as Momentum,
-    MomentumAndDirection as MomentumAndDirection,
-    RotationalHamiltonian as RotationalHamiltonian,
-    lie_poisson as lie_poisson,
-    lie_poisson_with_direction as lie_poisson_with_direction,
-)
 from rigidjax.motion.torques import Torque
 from rigidjax.motion.torques.base import require_law
 from rigidjax.rotation import euler, linalg3
@@ -210,6 +196,3 @@ def _solve(matrix: Float[Array, "n n"], push: Float[Array, " n"]) -> Float[Array
     if n == 3:
         return linalg3.solve(matrix, push)
     return lx.linear_solve(lx.MatrixLinearOperator(matrix), push, lx.LU(), throw=False).value
-
-
-__dir__ = own_names(__name__)

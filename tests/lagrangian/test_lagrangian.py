@@ -8,8 +8,7 @@ from once import once
 from systems.marching import rk4
 
 import rigidjax as rj
-from rigidjax import torques
-from rigidjax.motion import lagrangian
+from rigidjax import lagrangian, torques
 
 TENSOR = np.array([[1.0, 0.1, -0.05], [0.1, 1.6, 0.2], [-0.05, 0.2, 2.1]])
 INERTIA = rj.Inertia(TENSOR)
