@@ -3,7 +3,7 @@
 From the ground up: `rotation` and `body`, `motion` (states, equations, torques) and `frames`,
 `exact` and `solve` (the motion in closed form, or by a solver), and what uses them: `identify`,
 `estimate`, `batch`, `workprecision`, `plot`. Fields of their own are loaded when they are asked
-for: `elliptic`, `lagrangian`, `orbits`. Most programs begin with `simulate`.
+for: `elliptic`, `lagrangian`, `orbits`, `tumblers`. Most programs begin with `simulate`.
 """
 
 import importlib
@@ -78,13 +78,14 @@ if TYPE_CHECKING:
         lagrangian as lagrangian,
         orbits as orbits,
         plot as plot,
+        tumblers as tumblers,
         workprecision as workprecision,
     )
 
 __version__ = "0.2.0"
 
 # Loaded when first asked for: few programs draw, fewer compare methods.
-_LATER = ("datasets", "elliptic", "lagrangian", "orbits", "plot", "workprecision")
+_LATER = ("datasets", "elliptic", "lagrangian", "orbits", "plot", "tumblers", "workprecision")
 
 
 def __getattr__(name: str) -> ModuleType:

@@ -124,7 +124,7 @@ def test_an_old_name_gives_the_new_thing_and_says_where_it_is(module, old, new):
 LATER = """
 import sys, rigidjax
 heavy = "scipy.signal", "scipy.stats", "scipy.interpolate", "scipy.special", "scipy.optimize", "optax.contrib",
-heavy += "matplotlib", "rigidjax.plot", "rigidjax.workprecision", "rigidjax.elliptic", "rigidjax.orbits", "rigidjax.lagrangian"
+heavy += "matplotlib", "rigidjax.plot", "rigidjax.workprecision", "rigidjax.elliptic", "rigidjax.orbits", "rigidjax.lagrangian", "rigidjax.tumblers"
 print([name for name in heavy if name in sys.modules])
 rigidjax.plot.fit, rigidjax.workprecision.measure
 """

@@ -29,11 +29,16 @@ LIMIT = "the right limit for an infinite argument"
 ACCEPTED: list[tuple[str, str, str, str]] = [
     # Light: directions of time, no period to fold with, no motion to draw.
     *(
-        ("identify.Brightness", f"{name}: function", "taken without a word*", OF_TIME)
+        ("tumblers.Brightness", f"{name}: function", "taken without a word*", OF_TIME)
         for name in ("sun", "observer")
     ),
-    ("plot.light_curve", "periods: empty list", "*", "no period is documented: nothing is folded"),
-    ("plot.light_curve", "model: None", "*", "None is documented: no motion is drawn"),
+    (
+        "tumblers.plot.light_curve",
+        "periods: empty list",
+        "*",
+        "no period is documented: nothing is folded",
+    ),
+    ("tumblers.plot.light_curve", "model: None", "*", "None is documented: no motion is drawn"),
     *(
         (
             name,

@@ -10,12 +10,12 @@ from jaxtyping import Array, Float
 
 from rigidjax import _checks
 from rigidjax._types import HasAttitude, Scalar, Vec3
-from rigidjax.body.brightness import AbstractScattering
-from rigidjax.body.scattering import direction, law_of
 from rigidjax.identify.sensors.base import AbstractSensor, SensorInput, noise_of, number_of
 from rigidjax.motion.torques.base import vector_at
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.linalg3 import dot, entries
+from rigidjax.tumblers.brightness import AbstractScattering
+from rigidjax.tumblers.scattering import direction, law_of
 
 UNITS = ("flux", "mag")
 
@@ -24,13 +24,13 @@ class Brightness(AbstractSensor):
     """Reads how bright an ellipsoid is that is lit by the sun: a light curve.
 
     `level · B/(π (abc)^⅔)` as a flux, `level − 2.5 log₁₀(B/(π (abc)^⅔))` in magnitudes, B as
-    `rigidjax.body.brightness.ellipsoid`: a sphere of the same volume at zero phase has the level.
+    `rj.tumblers.brightness.ellipsoid`: a sphere of the same volume at zero phase has the level.
     Only the ratios of the semi-axes count. Readings are those at unit distances.
 
     **Arguments:** `sun`, `observer` directions from the body to them, world frame, any length:
     (3,), or a callable Module of time, t → (3,), such as `torques.Linear(times, directions)`;
     `scattering` the law: `LommelSeeliger()` (also for `None`), `Geometric()`, `Lambert()` of
-    `rigidjax.body.brightness`; `noise` standard deviation in the unit of a reading, `None` to have
+    `rj.tumblers.brightness`; `noise` standard deviation in the unit of a reading, `None` to have
     it estimated; `unit` of a reading, `"flux"` or `"mag"`; `level` flux or magnitude as above,
     `None` for 1 and 0: seldom known, let a `Free` move it; `semi_axes` (3,) along the body's axes,
     or `None`: then the ellipsoid is the uniform one that turns as the body does (semi-axes √λ_k of
@@ -43,7 +43,7 @@ class Brightness(AbstractSensor):
     **Raises** `ValueError` for a direction of length zero, a noise or semi-axis that is not
     positive, a wrong shape, NaN; `TypeError` for another kind of argument.
 
-    Source: as `rigidjax.body.brightness`; of light curves of tumblers Kaasalainen 2001, A&A
+    Source: as `rigidjax.tumblers.brightness`; of light curves of tumblers Kaasalainen 2001, A&A
     376:302, doi:10.1051/0004-6361:20010935.
 
     >>> Brightness([1.0, 0.0, 0.0], [0.0, 1.0, 0.0], noise=0.02, unit="mag").components
@@ -109,6 +109,18 @@ class Brightness(AbstractSensor):
         # Of a body that hides its lit side nothing is seen: fainter than any reading.
         some = relative > 1e-12
         return self.level - 2.5 / math.log(10.0) * jnp.log(jnp.where(some, relative, 1e-12))
+
+    def typical_rate(self, t: np.ndarray, values: np.ndarray) -> float:
+        """About how fast the body turns, rad/s: half the strongest frequency of the first 1000."""
+        t, values = t[:1000], values[:1000]
+        if t.size < 10 or np.ptp(values) == 0:
+            return 0.0
+        span = t[-1] - t[0]
+        highest = min(0.25 / np.median(np.diff(t)), 500.0 / span)
+        turns = 2.0 * np.pi * np.arange(0.5 / span, max(highest, 1.0 / span), 0.25 / span)
+        waves = np.exp(1j * turns[:, None] * (t - t[0]))
+        power = np.abs(waves @ (values - values.mean()))
+        return 0.5 * float(turns[np.argmax(power)])
 
     def refusal(self, values: np.ndarray) -> tuple[np.ndarray, str]:
         wrong = values < 0 if self.unit == "flux" else np.zeros(values.shape, bool)

@@ -1,6 +1,6 @@
 """What light curves of tumbling ellipsoids cost: 5000 bodies at 1000 times, by the closed form.
 
-python tests/body/bench_light_curves.py [bodies] [times]
+python tests/tumblers/bench_light_curves.py [bodies] [times]
 """
 
 import sys
@@ -13,7 +13,8 @@ jax.config.update("jax_enable_x64", True)
 import jax.numpy as jnp
 
 import rigidjax as rj
-from rigidjax.identify import Brightness, SensorInput
+from rigidjax.identify import SensorInput
+from rigidjax.tumblers import Brightness
 
 BODIES, TIMES = (int(a) for a in (*sys.argv[1:], *("5000", "1000")[len(sys.argv) - 1 :]))
 

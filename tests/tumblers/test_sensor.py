@@ -1,4 +1,4 @@
-"""Light curves as a sensor: SciPy's rotations and the closed forms of `rigidjax.body.brightness`."""
+"""Light curves as a sensor: SciPy's rotations and the closed forms of `rigidjax.tumblers.brightness`."""
 
 from typing import Any
 
@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 
 import rigidjax as rj
 from rigidjax import identify
-from rigidjax.body import brightness
-from rigidjax.identify import Brightness, SensorInput
+from rigidjax.identify import SensorInput
+from rigidjax.tumblers import Brightness, brightness
 
 AXES = np.array([2.0, 1.3, 1.0])
 SUN, OBSERVER = [1.0, 0.0, 0.0], [0.8, 0.6, 0.3]

@@ -8,8 +8,9 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 import rigidjax as rj
-from rigidjax import exact, identify
-from rigidjax.identify import Brightness, SensorInput
+from rigidjax import exact, identify, tumblers
+from rigidjax.identify import SensorInput
+from rigidjax.tumblers import Brightness
 
 HOUR, NOISE, COUNT = 3600.0, 0.02, 480
 
@@ -101,7 +102,7 @@ def magnitudes(corners, faces, sensor, moments, state, ts):
     def at(t):
         q = motion(t).q
         sides = [rj.quaternion.rotate_inverse(q, d) for d in (sensor.sun, sensor.observer)]
-        return rj.body.brightness.mesh(corners, faces, *sides)
+        return rj.tumblers.brightness.mesh(corners, faces, *sides)
 
     return -2.5 * np.log10(np.asarray(jax.jit(jax.vmap(at))(jnp.asarray(ts))))
 
@@ -162,7 +163,7 @@ def problem(recording: identify.Recording) -> identify.Problem:
     return identify.Problem(recording, identify.PrincipalRatios(), free=free)
 
 
-def off(one: Tumbler, alias: identify.Alias) -> tuple[float, float]:
+def off(one: Tumbler, alias: tumblers.Alias) -> tuple[float, float]:
     """The largest relative errors of both periods and of both ratios of moments."""
     times = alias.rotation / one.rotation - 1, alias.precession / one.precession - 1
     ratios = alias.ratios / one.moments[:2] - 1
@@ -177,7 +178,7 @@ def of_unknown_noise(one: Tumbler) -> identify.Recording:
     return identify.Recording(np.asarray(one.recording.t), (sensor, np.asarray(reading.values)))
 
 
-def apart(one: Tumbler, alias: identify.Alias) -> np.ndarray:
+def apart(one: Tumbler, alias: tumblers.Alias) -> np.ndarray:
     """Logarithms (4,) of rotation, precession and both ratios of moments over the true ones."""
     found = np.array([alias.rotation, alias.precession, *alias.ratios])
     return np.log(found / [one.rotation, one.precession, *one.moments[:2]])

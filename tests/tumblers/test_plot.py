@@ -21,7 +21,7 @@ def closed():
 
 def test_it_shows_what_was_read_and_folds_it():
     model = VALUES + 0.01
-    above, below = rj.plot.light_curve(TS, VALUES, 5000.0, model=model, time_unit="h")[:2]
+    above, below = rj.tumblers.plot.light_curve(TS, VALUES, 5000.0, model=model, time_unit="h")[:2]
     np.testing.assert_allclose(above.lines[0].get_xdata(), TS / 3600)
     np.testing.assert_allclose(above.lines[0].get_ydata(), VALUES)
     drawn = above.lines[1].get_ydata()
@@ -36,7 +36,7 @@ def test_it_shows_what_was_read_and_folds_it():
 
 
 def test_a_flux_is_not_upside_down_and_no_period_is_no_fold():
-    (only,) = rj.plot.light_curve(TS, VALUES, quantity="flux")
+    (only,) = rj.tumblers.plot.light_curve(TS, VALUES, quantity="flux")
     assert not only.yaxis_inverted() and only.get_ylabel() == "flux"
 
 
@@ -53,4 +53,4 @@ def test_a_flux_is_not_upside_down_and_no_period_is_no_fold():
 )
 def test_words_on_mistakes(given, options, words):
     with pytest.raises(ValueError, match=words):
-        rj.plot.light_curve(*given, **options)
+        rj.tumblers.plot.light_curve(*given, **options)

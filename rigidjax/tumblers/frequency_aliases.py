@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from rigidjax.identify.lattice_series import Sums, misfits_of, side_peaks
+from rigidjax.tumblers.lattice_series import Sums, misfits_of, side_peaks
 
 # Pairs nearer than that, in 1/span, are one.
 NEAR = 0.25

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import ArrayLike, Float
 
 from rigidjax import _checks
+from rigidjax._names import own_names
 from rigidjax.plot.style import COLOURS, TIMES, plain, pyplot, unit
 
 # Colours of one cycle after another, from the first to the last.
@@ -96,3 +97,6 @@ def _folded(ax: Any, turns: np.ndarray, read: np.ndarray, predicted: np.ndarray 
     dots = ax.scatter(both, np.tile(read, 2), c=np.floor(twice), s=8, cmap=_MAP, lw=0)
     ax.set_xlim(0.0, 2.0)
     ax.figure.colorbar(dots, ax=ax, label="cycle", pad=0.01)
+
+
+__dir__ = own_names(__name__)

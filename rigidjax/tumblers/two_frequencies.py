@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from rigidjax import _checks
-from rigidjax.identify.frequency_aliases import apart, distinct, refined, with_aliases
-from rigidjax.identify.lattice_series import BATCH, FIRST, Sums, filled, misfits_of, sums
+from rigidjax.tumblers.frequency_aliases import apart, distinct, refined, with_aliases
+from rigidjax.tumblers.lattice_series import BATCH, FIRST, Sums, filled, misfits_of, sums
 
 # Lines through which pairs are laid, and the grid of the first frequency, in 1/span.
 LINES, STEP = 3, 0.1

@@ -1,6 +1,6 @@
 """Tumblers from their brightness alone, blind: how many of 100 are found, and what is said of each.
 
-    python tests/identify/bench_brightness.py [how many] [first]
+    python tests/tumblers/bench_brightness.py [how many] [first]
 
 Right is: both periods to 0.1 % and both ratios of moments to 5 %. Then: with which status, whether
 a wrong alias was ever called "ok", and for those that are not right whether it is another motion or
@@ -15,9 +15,9 @@ import jax
 
 jax.config.update("jax_enable_x64", True)
 
-from tumblers import HOUR, off, problem, tumbler
+from simulated import HOUR, off, problem, tumbler
 
-from rigidjax import identify
+from rigidjax import tumblers
 
 
 def main(count: int, first: int) -> None:
@@ -26,7 +26,7 @@ def main(count: int, first: int) -> None:
     began = time.process_time()
     for seed in range(first, first + count):
         one = tumbler(seed, ("long", "short")[seed % 2])
-        found = identify.fit_light_curve(problem(one.recording))
+        found = tumblers.fit_light_curve(problem(one.recording))
         times, ratios = off(one, found.aliases[0])
         right = times < 1e-3 and ratios < 0.05
         # The same motion, less precisely.

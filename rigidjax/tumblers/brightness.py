@@ -15,7 +15,7 @@ from rigidjax.body import validation
 from rigidjax.body._types import Numbers, Vector
 from rigidjax.body.meshes import faces_of
 from rigidjax.body.scaling import exponent_of, times_power_of_two
-from rigidjax.body.scattering import (
+from rigidjax.tumblers.scattering import (
     AbstractScattering as AbstractScattering,
     Geometric as Geometric,
     Lambert as Lambert,

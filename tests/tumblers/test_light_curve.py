@@ -1,29 +1,15 @@
 """Tumblers from brightness alone; the oracle is the motion that the light curve was made with."""
 
-import importlib.util
-import sys
-from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from tumblers import simulated
 
-from rigidjax import identify
-from rigidjax.identify import (
-    Brightness,
-    Gyro,
-    frequency_aliases,
-    lattice_series,
-    two_frequencies,
-)
-
-_spec: Any = importlib.util.spec_from_file_location(
-    "tumblers", Path(__file__).with_name("tumblers.py")
-)
-tumblers = importlib.util.module_from_spec(_spec)
-sys.modules["tumblers"] = tumblers
-_spec.loader.exec_module(tumblers)
+from rigidjax import identify, tumblers
+from rigidjax.identify import Gyro
+from rigidjax.tumblers import Brightness, frequency_aliases, lattice_series, two_frequencies
 
 TS = np.linspace(0.0, 1e5, 300)
 RNG = np.random.default_rng(3)
@@ -54,8 +40,8 @@ def test_a_series_in_two_frequencies_is_found():
 def daily(seed):
     """Readings at night of a strong f₁ and 2 f₁ and a weak f₂ and its sum with f₁, as in number 70."""
     rng = np.random.default_rng(seed)
-    t = tumblers.nights(rng)
-    day = 24 * tumblers.HOUR
+    t = simulated.nights(rng)
+    day = 24 * simulated.HOUR
     pair = np.array([3.2346, 5.3318]) / day
     y = np.full(t.shape, 5.0)
     for (j, k), size in (((1, 0), 1.0), ((2, 0), 0.8), ((0, 1), 0.15), ((1, 1), 0.2)):
@@ -67,7 +53,7 @@ def daily(seed):
 @pytest.mark.long
 def test_daily_aliases_of_a_pair_are_tried():
     t, y, pair, day = daily(0)
-    found = two_frequencies(t, y, 0.1, shortest=2 * tumblers.HOUR)
+    found = two_frequencies(t, y, 0.1, shortest=2 * simulated.HOUR)
     fits = found.misfits < found.misfits[0] + 5.0
     near = np.abs(found.frequencies - pair).max(axis=1) < 0.05 / t[-1]
     assert (near & fits).any() and abs(found.misfits[0] - found.dof) < 5 * np.sqrt(2 * found.dof)
@@ -93,9 +79,9 @@ def test_from_any_alias_alone_the_right_pair_is_found(shift):
 
 @pytest.mark.parametrize(("seed", "mode"), [(2, "long"), (7, "short")])
 def test_a_tumbler_is_found_blind(seed, mode):
-    one = tumblers.tumbler(seed, mode)
-    found = identify.fit_light_curve(tumblers.problem(one.recording))
-    times, ratios = tumblers.off(one, found.aliases[0])
+    one = simulated.tumbler(seed, mode)
+    found = tumblers.fit_light_curve(simulated.problem(one.recording))
+    times, ratios = simulated.off(one, found.aliases[0])
     assert found.ok and times < 1e-3 and ratios < 0.05
     assert found.aliases[0].mode == mode and not found.rivals
     truth = np.log([one.rotation, one.precession, *one.moments[:2]])
@@ -108,9 +94,9 @@ def test_a_tumbler_is_found_blind(seed, mode):
 
 def test_intervals_hold_the_truth_of_a_body_that_is_no_ellipsoid():
     # Once its first ratio was off by twelve of its deviations, and called ok.
-    one = tumblers.tumbler(8, "long", rough=0.05)
-    found = identify.fit_light_curve(tumblers.problem(tumblers.of_unknown_noise(one)))
-    error = np.abs(tumblers.apart(one, found.aliases[0]))
+    one = simulated.tumbler(8, "long", rough=0.05)
+    found = tumblers.fit_light_curve(simulated.problem(simulated.of_unknown_noise(one)))
+    error = np.abs(simulated.apart(one, found.aliases[0]))
     assert found.ok and error[2] > 0.02 and (error[:2] < 5e-3).all()
     assert (error < 1.96 * found.deviations).all()
     # They are those of the fit itself, and no wider than the ratios can be known.
@@ -119,16 +105,16 @@ def test_intervals_hold_the_truth_of_a_body_that_is_no_ellipsoid():
 
 
 def test_the_allowance_for_shape_is_what_such_shapes_do_to_a_fit():
-    one = tumblers.tumbler(2, "long")
-    problem = tumblers.problem(one.recording)
-    found = identify.fit_light_curve(problem)
+    one = simulated.tumbler(2, "long")
+    problem = simulated.problem(one.recording)
+    found = tumblers.fit_light_curve(problem)
     reading = one.recording.readings[0]
-    n, size = tumblers.half_way(one, reading.sensor), 0.002
+    n, size = simulated.half_way(one, reading.sensor), 0.002
     total = np.zeros(2)
 
     def refitted(change):
         values = np.asarray(reading.values) - 2.5 * np.log10(1 + size * change)
-        moved = tumblers.problem(identify.Recording(one.recording.t, (reading.sensor, values)))
+        moved = simulated.problem(identify.Recording(one.recording.t, (reading.sensor, values)))
         fitted = identify.fit(moved, starts=1, initial=found.fit.parameters, tolerance=1e-6)
         return fitted.quantities[:2]
 
@@ -147,20 +133,20 @@ def test_the_allowance_for_shape_is_what_such_shapes_do_to_a_fit():
 
 
 def test_a_light_curve_of_something_else_is_not_called_ok():
-    one = tumblers.tumbler(2, "long")
+    one = simulated.tumbler(2, "long")
     t = np.asarray(one.recording.t)
     two_spots = 12.0 + 0.3 * np.sin(2 * np.pi * t / 21000.0) ** 3 + 0.3 * np.sin(t / 9000.0) ** 5
     sensor = one.recording.readings[0].sensor
-    found = identify.fit_light_curve(tumblers.problem(identify.Recording(t, (sensor, two_spots))))
+    found = tumblers.fit_light_curve(simulated.problem(identify.Recording(t, (sensor, two_spots))))
     assert not found.ok
 
 
 def test_a_daily_alias_is_not_taken_for_the_rotation():
     # Once its pair of frequencies was not among those tried, and one off by one a day fitted with
     # errors of 1.12 times the noise.
-    one = tumblers.tumbler(70, "long")
-    found = identify.fit_light_curve(tumblers.problem(one.recording))
-    assert tumblers.off(one, found.aliases[0])[0] < 1e-3 and found.ok
+    one = simulated.tumbler(70, "long")
+    found = tumblers.fit_light_curve(simulated.problem(one.recording))
+    assert simulated.off(one, found.aliases[0])[0] < 1e-3 and found.ok
 
 
 def problem(*readings, torque=None, count=1):
@@ -174,9 +160,9 @@ def test_what_is_refused():
     light = Brightness([1.0, 0, 0], [0, 1.0, 0], noise=0.1), 2 + np.sin(np.linspace(0, 9, 60))
     gyro = Gyro(0.1), np.ones((60, 3))
     with pytest.raises(ValueError, match="wanted one Brightness sensor, got Gyro"):
-        identify.fit_light_curve(problem(gyro))
+        tumblers.fit_light_curve(problem(gyro))
     with pytest.raises(ValueError, match="wanted one recording, got 2"):
-        identify.fit_light_curve(problem(light, count=2))
+        tumblers.fit_light_curve(problem(light, count=2))
     with pytest.raises(ValueError, match="times, as the series has, got 5"):
         two_frequencies(TS[:5], TS[:5])
     with pytest.raises(ValueError, match="wanted increasing times"):

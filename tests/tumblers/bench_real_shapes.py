@@ -1,8 +1,8 @@
 """Tumblers that are no ellipsoids, found by a fit of ellipsoids: status, errors, intervals.
 
-    python tests/identify/bench_real_shapes.py [how many] [first] [rough] [noise] [told]
+    python tests/tumblers/bench_real_shapes.py [how many] [first] [rough] [noise] [told]
 
-Convex polyhedra about ellipsoids (`tumblers.polyhedron`): distances are moved by `rough` (0.05: by
+Convex polyhedra about ellipsoids (`simulated.polyhedron`): distances are moved by `rough` (0.05: by
 5 %). Magnitudes with `noise` (0.02: 2 %); the fit is told so where `told` is 1. For each status: how many, how
 often both periods are right to 2 %, the median error of the periods and ratios of moments of
 those, and how often each of the four true numbers is inside its 95 % interval.
@@ -15,9 +15,9 @@ import jax
 jax.config.update("jax_enable_x64", True)
 
 import numpy as np
-from tumblers import apart, of_unknown_noise, problem, tumbler
+from simulated import apart, of_unknown_noise, problem, tumbler
 
-from rigidjax import identify
+from rigidjax import tumblers
 
 NAMES = ("rotation", "precession", "first ratio", "second ratio")
 
@@ -27,7 +27,7 @@ def main(count: int, first: int, rough: float, noise: float, told: int) -> None:
     for seed in range(first, first + count):
         one = tumbler(seed, ("long", "short")[seed % 2], rough, noise)
         recording = one.recording if told else of_unknown_noise(one)
-        found = identify.fit_light_curve(problem(recording))
+        found = tumblers.fit_light_curve(problem(recording))
         error, deviations = apart(one, found.aliases[0]), found.deviations
         right = found.aliases[0].mode == one.mode and np.abs(error[:2]).max() < 2e-2
         said.append((found.status.split(":")[0], right, error, deviations))

@@ -13,7 +13,7 @@ import pytest
 from once import once
 from scipy.spatial import ConvexHull
 
-from rigidjax.body import brightness
+from rigidjax.tumblers import brightness
 
 AXES = np.array([2.0, 1.3, 0.8])
 LAWS = {

@@ -20,19 +20,19 @@ from rigidjax.identify.parameters import Parameters
 from rigidjax.identify.problem import Problem, one_problem
 from rigidjax.identify.quantities import carried, quantities
 from rigidjax.identify.result import Fit
-from rigidjax.identify.sensors import Brightness
 from rigidjax.identify.several_bodies import Bodies
-from rigidjax.identify.tumbling_search import (
+from rigidjax.motion.torques.base import vector_at
+from rigidjax.rotation import quaternion
+from rigidjax.rotation.linalg3 import apply, dot
+from rigidjax.tumblers.search import (
     MAGNITUDE,
     descended,
     noise_of,
     relative_flux,
     starts_of,
 )
-from rigidjax.identify.two_frequencies import TwoFrequencies, two_frequencies
-from rigidjax.motion.torques.base import vector_at
-from rigidjax.rotation import quaternion
-from rigidjax.rotation.linalg3 import apply, dot
+from rigidjax.tumblers.sensor import Brightness
+from rigidjax.tumblers.two_frequencies import TwoFrequencies, two_frequencies
 
 # Motions are the same where both periods and both ratios of moments differ by less than that, or
 # by less than so many of their standard deviations.

@@ -4,21 +4,17 @@ The bodies are uniform ellipsoids with the published ratios of moments (of 2008 
 here: any body that can tumble so), the nights, phases and poles are made up.
 """
 
-import sys
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.optimize import brentq
+from tumblers import simulated
 
 import rigidjax as rj
-from rigidjax import identify
-from rigidjax.identify import Brightness, two_frequencies
-
-sys.path.insert(0, str(Path(__file__).parent))
-import tumblers
+from rigidjax import identify, tumblers
+from rigidjax.tumblers import Brightness, two_frequencies
 
 MINUTE, HOUR, DAY = 60.0, 3600.0, 86400.0
 NOISE = 0.02
@@ -93,11 +89,11 @@ def rates(one: Published) -> np.ndarray:
         return np.array([np.sqrt(x), 0.0, np.sqrt(1 - x)]) / one.moments
 
     def miss(part):
-        rotation, precession = tumblers.periods(one.moments, rate(part))
+        rotation, precession = simulated.periods(one.moments, rate(part))
         return float(precession / rotation) - one.precession / one.rotation
 
     omega = rate(brentq(miss, 1e-4, 1 - 1e-6))
-    return omega * float(tumblers.periods(one.moments, omega)[1]) / one.precession
+    return omega * float(simulated.periods(one.moments, omega)[1]) / one.precession
 
 
 def light_curve(name: str) -> tuple[Published, Brightness, np.ndarray]:
@@ -109,11 +105,11 @@ def light_curve(name: str) -> tuple[Published, Brightness, np.ndarray]:
     q = np.array([0.5, -0.3, 0.7, 0.4])
     state = rj.Attitude(q / np.linalg.norm(q), rates(one))
     moments: Any = jnp.asarray(one.moments)
-    clean = np.asarray(tumblers.brightness(sensor, moments, state, jnp.asarray(one.ts)))
+    clean = np.asarray(simulated.brightness(sensor, moments, state, jnp.asarray(one.ts)))
     return one, sensor, clean + 1.0857 * NOISE * rng.normal(size=clean.size)
 
 
-def pairs_of(name: str) -> tuple[Published, identify.TwoFrequencies]:
+def pairs_of(name: str) -> tuple[Published, tumblers.TwoFrequencies]:
     one, _, read = light_curve(name)
     squares = 10 ** (-0.8 * (read - np.median(read)))
     return one, two_frequencies(one.ts - one.ts[0], squares, 2 * NOISE * squares, count=48)
@@ -147,7 +143,7 @@ def test_apophis_has_the_published_strongest_line_and_energy():
 def test_their_motion_is_found_blind(name):
     one, sensor, read = light_curve(name)
     record = identify.Recording(one.ts, (sensor, read))
-    found = identify.fit_light_curve(tumblers.problem(record))
+    found = tumblers.fit_light_curve(simulated.problem(record))
     best = found.aliases[0]
     assert found.ok and best.mode == one.mode
     assert abs(best.rotation / one.rotation - 1) < 1e-3

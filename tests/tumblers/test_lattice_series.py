@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rigidjax.identify import lattice_series
+from rigidjax.tumblers import lattice_series
 
 RNG = np.random.default_rng(3)
 T = np.sort(RNG.uniform(0, 1, 100))

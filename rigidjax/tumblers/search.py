@@ -10,14 +10,14 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from rigidjax.body.inertia import Inertia
-from rigidjax.identify import tumbling_starts
 from rigidjax.identify.checkpoint import Tried
 from rigidjax.identify.levenberg_marquardt import CAREFUL, Settings, search
 from rigidjax.identify.parameters import Parameters
 from rigidjax.identify.problem import Problem
-from rigidjax.identify.two_frequencies import BLOCK, TwoFrequencies
 from rigidjax.motion.torques.base import vector_at
 from rigidjax.rotation import quaternion
+from rigidjax.tumblers import starts
+from rigidjax.tumblers.two_frequencies import BLOCK, TwoFrequencies
 
 # Starts of the first round, its steps; those that go on, and how far.
 FIRST, STEPS, SECOND, MORE = 96, 12, 24, 60
@@ -69,11 +69,11 @@ def starts_of(
         areas = (np.prod(axes) / axes[order]) ** 2
     best_of, others = [], []
     for pair in found.frequencies[:used]:
-        for mode in tumbling_starts.MODES:
-            some = tumbling_starts.candidates(pair, mode, light, half_way, areas, 3)
+        for mode in starts.MODES:
+            some = starts.candidates(pair, mode, light, half_way, areas, 3)
             # Of each reading of each pair one: which of them is true a grid alone cannot tell.
-            best_of += some[: len(tumbling_starts.ABOUT)]
-            others += some[len(tumbling_starts.ABOUT) :]
+            best_of += some[: len(starts.ABOUT)]
+            others += some[len(starts.ABOUT) :]
     best_of.sort(key=lambda one: one.misfit)
     others.sort(key=lambda one: one.misfit)
     chunks = max(1, -(-len(best_of) // FIRST))
@@ -88,7 +88,7 @@ def _turn(order: np.ndarray) -> np.ndarray:
     return turn * np.array([1.0, 1.0, np.linalg.det(turn)])
 
 
-def _parameters(problem: Problem, one: tumbling_starts.Candidate, turn: np.ndarray) -> Parameters:
+def _parameters(problem: Problem, one: starts.Candidate, turn: np.ndarray) -> Parameters:
     moments = turn @ np.diag(one.moments) @ turn.T
     start = problem.start(Inertia(jnp.asarray(moments)))
     reference = problem.reference
