@@ -1,9 +1,9 @@
 """Differentiable rigid-body and rotating-frame mechanics for JAX.
 
-From the ground up: `special` (functions), `rotation` and `body`, `motion` (states, equations,
-torques) and `frames`, `exact` and `solve` (the motion in closed form, or by a solver), and what
-uses them: `identify`, `estimate`, `batch`, `workprecision`, `plot`. Most programs begin with
-`simulate`.
+From the ground up: `rotation` and `body`, `motion` (states, equations, torques) and `frames`,
+`exact` and `solve` (the motion in closed form, or by a solver), and what uses them: `identify`,
+`estimate`, `batch`, `workprecision`, `plot`. Fields of their own are loaded when they are asked
+for: `elliptic`, `lagrangian`, `orbits`, `tumblers`. Most programs begin with `simulate`.
 """
 
 import importlib
@@ -49,7 +49,6 @@ from rigidjax.motion import (
     conserved as conserved,
     drift as drift,
     energy as energy,
-    lagrangian as lagrangian,
     torques as torques,
 )
 from rigidjax.rotation import (
@@ -71,19 +70,22 @@ from rigidjax.solve import (
     simulate as simulate,
     solvers as solvers,
 )
-from rigidjax.special import elliptic as elliptic
 
 if TYPE_CHECKING:
     from rigidjax import (
         datasets as datasets,
+        elliptic as elliptic,
+        lagrangian as lagrangian,
+        orbits as orbits,
         plot as plot,
+        tumblers as tumblers,
         workprecision as workprecision,
     )
 
 __version__ = "0.2.0"
 
 # Loaded when first asked for: few programs draw, fewer compare methods.
-_LATER = ("datasets", "plot", "workprecision")
+_LATER = ("datasets", "elliptic", "lagrangian", "orbits", "plot", "tumblers", "workprecision")
 
 
 def __getattr__(name: str) -> ModuleType:

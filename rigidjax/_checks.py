@@ -1,4 +1,4 @@
-"""Checks at public boundaries: what was wanted, what came, and the likely cause (floor 0)."""
+"""Checks at public boundaries: what was wanted, what came, and the likely cause."""
 
 import functools
 import inspect

@@ -1,4 +1,4 @@
-"""The names of public modules: what `dir` shows, old names, and what was meant (floor 0)."""
+"""The names of public modules: what `dir` shows, old names, and what was meant."""
 
 import ast
 import difflib

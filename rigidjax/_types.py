@@ -1,4 +1,4 @@
-"""Names for the arrays that everything passes around (floor 0).
+"""Names for the arrays that everything passes around.
 
 `Vec3`, `Mat3`, `Quat`, `Scalar` are what functions return: JAX arrays. The `…Like` forms are what
 they take: anything NumPy-like of the same shape. One body at a time; batch with `jax.vmap`.

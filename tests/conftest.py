@@ -8,6 +8,9 @@ from pathlib import Path
 
 import pytest
 
+# What `import rigidjax` leaves until it is asked for: imported here under the hook.
+LATER = ("datasets", "elliptic", "lagrangian", "orbits", "plot", "tumblers", "workprecision")
+
 
 def pytest_configure(config):
     """Compiled programs are kept beside pytest's own cache: the next run takes a third of the time.
@@ -40,9 +43,9 @@ def _load(default_run):
     # default run they are compiled as `once` does, in a long run as users compile them.
     once = importlib.import_module("once")
     once.ask(default_run)
-    usual = once.library_programs(("rigidjax.identify", "rigidjax.frames"))
+    usual = once.library_programs(("rigidjax.identify", "rigidjax.orbits", "rigidjax.tumblers"))
     with install_import_hook("rigidjax", "beartype.beartype"):
-        for name in ("rigidjax", "rigidjax.plot", "rigidjax.workprecision"):
+        for name in ("rigidjax", *(f"rigidjax.{late}" for late in LATER)):
             importlib.import_module(name)
     equinox.filter_jit = usual
 

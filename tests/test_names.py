@@ -68,7 +68,7 @@ def test_nothing_public_is_lost():
         (rj.torques, "Dampning", "rj.torques.Damping"),
         (rj.body, "Sphere", "rj.shapes.sphere"),
         (rj.plot, "polhodes", "rj.plot.polhode or rj.plot.herpolhode"),
-        (rj.frames, "CR3BP", "rj.scenes.cr3bp"),
+        (rj.frames, "CR3BP", "rj.orbits.cr3bp"),
     ],
 )
 def test_a_wrong_name_is_answered_with_what_is_meant(module, name, meant):
@@ -124,7 +124,7 @@ def test_an_old_name_gives_the_new_thing_and_says_where_it_is(module, old, new):
 LATER = """
 import sys, rigidjax
 heavy = "scipy.signal", "scipy.stats", "scipy.interpolate", "scipy.special", "scipy.optimize", "optax.contrib",
-heavy += "matplotlib", "rigidjax.plot", "rigidjax.workprecision"
+heavy += "matplotlib", "rigidjax.plot", "rigidjax.workprecision", "rigidjax.elliptic", "rigidjax.orbits", "rigidjax.lagrangian", "rigidjax.tumblers"
 print([name for name in heavy if name in sys.modules])
 rigidjax.plot.fit, rigidjax.workprecision.measure
 """

@@ -4,7 +4,6 @@ from typing import TYPE_CHECKING
 
 from rigidjax._names import own_names, suggests
 from rigidjax.body import (
-    brightness as brightness,
     parameters as parameters,
     shapes as shapes,
     volumes as volumes,

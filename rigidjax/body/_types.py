@@ -1,4 +1,4 @@
-"""What the constructors take: an array, or nested lists of numbers (floor 1)."""
+"""What the constructors take: an array, or nested lists of numbers."""
 
 from collections.abc import Sequence
 from typing import Any

@@ -1,4 +1,4 @@
-"""How far one body is from another, the same in every frame: a prior for fits (floor 1)."""
+"""How far one body is from another, the same in every frame: a prior for fits."""
 
 from functools import partial
 

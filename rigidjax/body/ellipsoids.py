@@ -1,4 +1,4 @@
-"""Ellipsoids of a body: of energy, of momentum, and the uniform one that equals it (floor 1).
+"""Ellipsoids of a body: of energy, of momentum, and the uniform one that equals it.
 
 Poinsot: free motion rolls the energy ellipsoid on a fixed plane; in the body the rate stays on the
 curve where the two ellipsoids of Ω meet. Source: Landau and Lifshitz, Mechanics, § 37.

@@ -1,4 +1,4 @@
-"""Kinetic energy and angular momentum of whatever turns (floor 1).
+"""Kinetic energy and angular momentum of whatever turns.
 
 The notes write the energy of rotation in three forms. Printed eqs 61–65 lack the factor ½ that
 eqs 57 and 73–75 have; here all three have it and agree.

@@ -1,4 +1,4 @@
-"""What is turned: the inertia of a body, and its mass, centre of mass and second moment (floor 1).
+"""What is turned: the inertia of a body, and its mass, centre of mass and second moment.
 
 Two tensors say the same thing: the second moment `𝔖 = ∫ r rᵀ dm` (notes, eq 60) and the inertia
 tensor `I = Tr(𝔖) 1 − 𝔖` (eqs 76–78). A matrix is the 𝔖 of a real body exactly when it is positive

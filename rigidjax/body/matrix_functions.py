@@ -1,4 +1,4 @@
-"""Functions of a symmetric matrix, differentiable where eigenvalues meet (floor 1)."""
+"""Functions of a symmetric matrix, differentiable where eigenvalues meet."""
 
 import itertools
 from collections.abc import Callable
@@ -11,8 +11,8 @@ from jax.lax import stop_gradient
 from rigidjax import _checks
 from rigidjax._types import Mat3, Mat3Like, Scalar
 from rigidjax.body.principal_axes import eigensystem
+from rigidjax.body.scaling import exponent_of, times_power_of_two
 from rigidjax.body.symmetric3 import product
-from rigidjax.special.scaling import exponent_of, times_power_of_two
 
 # Eigenvalues within this fraction of the largest are handled by an integral, not a quotient.
 _CLOSE = 1.0 / 32.0

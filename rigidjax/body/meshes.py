@@ -1,4 +1,4 @@
-"""Mass properties of the solid inside a closed triangle mesh, by exact integrals (floor 1).
+"""Mass properties of the solid inside a closed triangle mesh, by exact integrals.
 
 The solid is a signed sum of tetrahedra from one inner point to each face; over a tetrahedron with
 corners 0, a, b, c the integrals of 1, r and r rᵀ are polynomials of a, b, c. So the result is exact

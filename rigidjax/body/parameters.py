@@ -1,4 +1,4 @@
-"""Unconstrained numbers ↔ real bodies (floor 1).
+"""Unconstrained numbers ↔ real bodies.
 
 A log-Cholesky chart: any vector is a body with positive mass and a positive definite second
 moment, so that an optimiser needs no constraint and cannot leave the bodies. Plates, rods and

@@ -1,4 +1,4 @@
-"""Mass properties by adding up: points, voxels, quadrature over a volume (floor 1)."""
+"""Mass properties by adding up: points, voxels, quadrature over a volume."""
 
 from collections.abc import Callable
 

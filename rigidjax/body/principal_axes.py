@@ -1,4 +1,4 @@
-"""Principal moments and axes that may stand inside a differentiated function (floor 1).
+"""Principal moments and axes that may stand inside a differentiated function.
 
 `eigh`'s own derivative divides by differences of eigenvalues: NaN for a sphere and for every
 symmetric top, and, as implemented in JAX, for distinct moments above 1e16 kg m² (jax#669).
@@ -11,8 +11,8 @@ import jax.numpy as jnp
 
 from rigidjax import _checks
 from rigidjax._types import Mat3, Mat3Like, Quat, Vec3
+from rigidjax.body.scaling import exponent_of, times_power_of_two
 from rigidjax.body.symmetric3 import product
-from rigidjax.special.scaling import exponent_of, times_power_of_two
 
 # Moments closer than this many units of round-off of the largest count as equal.
 _EQUAL = 64.0

@@ -1,4 +1,4 @@
-"""Mass properties of solids, shells, plates and rods in closed form (floor 1).
+"""Mass properties of solids, shells, plates and rods in closed form.
 
 Each function takes the mass and then the dimensions, and is differentiable in all of them. Every
 shape lies with its **centre of mass at the origin** and its axis of symmetry, if it has one, along

@@ -1,4 +1,4 @@
-"""Symmetric 3×3 matrices written out in components (floor 1).
+"""Symmetric 3×3 matrices written out in components.
 
 Products are spelled out instead of `@`: on CPU the gradient of a 3×3 `@` inside a differentiated
 loop costs fifty times its value, and on GPUs `@` may round to ten bits (TF32).

@@ -1,4 +1,4 @@
-"""Is there a body with these numbers? Checks that name what is wrong (floor 1).
+"""Is there a body with these numbers? Checks that name what is wrong.
 
 Each returns its argument, refused where no real body has it. They work on known values (plain
 exceptions, with the numbers) and under `jit` (`equinox.error_if`, without them). A few units of

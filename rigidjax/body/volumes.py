@@ -1,4 +1,4 @@
-"""Volumes of the solids of `shapes`, to make a mass from a density (floor 1).
+"""Volumes of the solids of `shapes`, to make a mass from a density.
 
 `shapes.box(density * volumes.box(size), size)` is differentiable in the density and in the size.
 """

@@ -15,9 +15,9 @@ from rigidjax.motion import Rigid
 from rigidjax.motion.torques import CorrelatedTorque, RandomTorque, Sum, Torque
 from rigidjax.motion.torques.base import in_precision, require_law, tensor_of
 from rigidjax.rotation import quaternion
+from rigidjax.rotation.barrier import barrier
 from rigidjax.rotation.kernels import normalised
 from rigidjax.solve import equations_of_motion
-from rigidjax.special.barrier import barrier
 
 
 class Walk(eqx.Module):

@@ -13,13 +13,13 @@ from rigidjax import _checks
 from rigidjax._types import HasAttitude, HasPose, HasSpin, Mat3, Quat, Scalar, ScalarLike
 from rigidjax.body import validation
 from rigidjax.body.inertia import Inertia
+from rigidjax.body.scaling import exponent_of, times_power_of_two
 from rigidjax.exact._xla import fence, opaque_one
 from rigidjax.exact.components3 import Six, Triple, adjugate, determinant, times
 from rigidjax.exact.derivatives import flow
 from rigidjax.exact.principal_axes import into, out_of, principal_frame
 from rigidjax.rotation.kernels import product4
 from rigidjax.rotation.linalg3 import components
-from rigidjax.special.scaling import exponent_of, times_power_of_two
 
 State = TypeVar("State", bound=HasSpin)
 

@@ -9,13 +9,13 @@ from rigidjax import _checks
 from rigidjax._types import Mat3, Scalar, Vec3, Vec3Like
 from rigidjax.body import validation
 from rigidjax.body.inertia import Inertia
+from rigidjax.body.scaling import exponent_of, times_power_of_two
 from rigidjax.exact import sigma_form
 from rigidjax.exact.complete_integrals import half_period
 from rigidjax.exact.components3 import Six, Triple, times
 from rigidjax.exact.derivatives import first_order, reciprocal
 from rigidjax.exact.jacobi_duplication import Modulus, is_endless
 from rigidjax.exact.principal_axes import into, principal_frame
-from rigidjax.special.scaling import exponent_of, times_power_of_two
 
 
 def body_period(inertia: Inertia, omega0: Vec3Like) -> Scalar:

@@ -18,7 +18,9 @@ class AbstractScene(eqx.Module):
     """The equations of motion of a particle: subclass it, give `acceleration` and `conserved`.
 
     `rigidjax.simulate(None, Point(x, v), ts, scene)` solves it; `diffrax.ODETerm(scene.field)` is
-    the same in plain diffrax.
+    the same in plain diffrax. A scene that ends a run, as at a collision, has two methods more:
+    `ends(t, state)`, true where it does, and `end_words(t, state)`, why; `stats` of the solution
+    then has `ended`, `end_time` and `end_state`.
 
     >>> class Spring(AbstractScene):
     ...     def acceleration(self, t, state):

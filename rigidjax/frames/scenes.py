@@ -3,17 +3,13 @@
 from typing import TYPE_CHECKING
 
 from rigidjax._names import own_names, suggests
-from rigidjax.frames.cr3bp import ThreeBody as ThreeBody, cr3bp as cr3bp
-from rigidjax.frames.differential_correction import PeriodicOrbit as PeriodicOrbit
 from rigidjax.frames.earth import Earth as Earth, earth as earth
 from rigidjax.frames.foucault import Foucault as Foucault, foucault as foucault
-from rigidjax.frames.hill import Hill as Hill, hill as hill
 from rigidjax.frames.hoop import Hoop as Hoop, hoop as hoop, turntable as turntable
 from rigidjax.frames.libration import (
     libration as libration,
     libration_integral as libration_integral,
 )
-from rigidjax.frames.manifolds import Manifold as Manifold
 
 if not TYPE_CHECKING:
     __getattr__ = suggests(__name__)

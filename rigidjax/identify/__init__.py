@@ -30,11 +30,6 @@ from rigidjax.identify.design import (
 from rigidjax.identify.fit import fit as fit
 from rigidjax.identify.free_parameters import Free as Free
 from rigidjax.identify.horizons import Horizons as Horizons
-from rigidjax.identify.light_curve import (
-    Alias as Alias,
-    LightCurve as LightCurve,
-    fit_light_curve as fit_light_curve,
-)
 from rigidjax.identify.loss import AbstractLoss as AbstractLoss, Huber as Huber, SoftL1 as SoftL1
 from rigidjax.identify.multiple_shooting import pieces as pieces
 from rigidjax.identify.parameters import Own as Own, Parameters as Parameters
@@ -53,7 +48,6 @@ from rigidjax.identify.sensors import (
     AbstractSensor as AbstractSensor,
     Accelerometer as Accelerometer,
     AttitudeSensor as AttitudeSensor,
-    Brightness as Brightness,
     Direction as Direction,
     Gyro as Gyro,
     LowPass as LowPass,
@@ -68,10 +62,6 @@ from rigidjax.identify.sensors import (
 )
 from rigidjax.identify.simulated_readings import simulate_readings as simulate_readings
 from rigidjax.identify.stochastic_gradient import Descent as Descent
-from rigidjax.identify.two_frequencies import (
-    TwoFrequencies as TwoFrequencies,
-    two_frequencies as two_frequencies,
-)
 from rigidjax.identify.undetermined import Combination as Combination
 from rigidjax.identify.window_fit import WindowFit as WindowFit, fit_windows as fit_windows
 from rigidjax.identify.windows import Windows as Windows, windows as windows

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from rigidjax.identify.direct_estimates import attitudes, place_of, rates
 from rigidjax.identify.recording import Recording
-from rigidjax.identify.sensors import Brightness, Gyro, Marker, Position, Range, Velocity
+from rigidjax.identify.sensors import Gyro, Marker, Position, Range, Velocity
 from rigidjax.motion import Rigid, Spin
 from rigidjax.rotation import quaternion
 
@@ -48,24 +48,17 @@ def _typical_rate(recording: Recording) -> float:
             rate = float(np.sqrt(np.mean(np.sum(values**2, axis=1))))
             break
     else:
-        rate = float(np.linalg.norm(first_rate(recording))) or _rate_of_light(recording)
+        rate = float(np.linalg.norm(first_rate(recording))) or _rate_of_readings(recording)
     return rate if rate > 0 else 1.0
 
 
-def _rate_of_light(recording: Recording) -> float:
-    """About how fast a body turns whose brightness varies, rad/s: half the strongest frequency."""
+def _rate_of_readings(recording: Recording) -> float:
+    """What the first sensor that can tell a rate from its readings says, rad/s; 0 without one."""
     for reading in recording.readings:
-        if isinstance(reading.sensor, Brightness):
-            t = np.asarray(recording.t)[reading.seen][:1000]
-            values = np.asarray(reading.values)[reading.seen][:1000]
-            if t.size < 10 or np.ptp(values) == 0:
-                return 0.0
-            span = t[-1] - t[0]
-            highest = min(0.25 / np.median(np.diff(t)), 500.0 / span)
-            turns = 2.0 * np.pi * np.arange(0.5 / span, max(highest, 1.0 / span), 0.25 / span)
-            waves = np.exp(1j * turns[:, None] * (t - t[0]))
-            power = np.abs(waves @ (values - values.mean()))
-            return 0.5 * float(turns[np.argmax(power)])
+        sensor: Any = reading.sensor
+        if hasattr(sensor, "typical_rate"):
+            t, values = np.asarray(recording.t), np.asarray(reading.values)
+            return sensor.typical_rate(t[reading.seen], values[reading.seen])
     return 0.0
 
 

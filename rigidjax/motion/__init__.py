@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING
 
 from rigidjax._names import own_names, suggests
-from rigidjax.motion import lagrangian as lagrangian, torques as torques
+from rigidjax.motion import torques as torques
 from rigidjax.motion.attitude import (
     Attitude as Attitude,
     AttitudeEquations as AttitudeEquations,

@@ -1,4 +1,4 @@
-"""What a scene conserves, and by how much a computed motion fails to (floor 2)."""
+"""What a scene conserves, and by how much a computed motion fails to."""
 
 from typing import Any
 

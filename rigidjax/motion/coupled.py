@@ -1,4 +1,4 @@
-"""A body's state and those of the laws that turn it, integrated together (floor 2)."""
+"""A body's state and those of the laws that turn it, integrated together."""
 
 from collections.abc import Callable
 from typing import Any

@@ -13,7 +13,6 @@ from rigidjax.plot.ellipsoids import inertia_ellipsoid as inertia_ellipsoid
 from rigidjax.plot.fit import fit as fit
 from rigidjax.plot.frames import frames as frames
 from rigidjax.plot.horizons import horizons as horizons
-from rigidjax.plot.light_curves import light_curve as light_curve
 from rigidjax.plot.phase_portrait import phase_portrait as phase_portrait
 from rigidjax.plot.player import player as player
 from rigidjax.plot.poinsot import herpolhode as herpolhode, polhode as polhode

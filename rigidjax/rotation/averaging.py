@@ -1,4 +1,4 @@
-"""The mean of rotations (floor 1)."""
+"""The mean of rotations."""
 
 from functools import partial
 from typing import Any
@@ -13,9 +13,9 @@ from rigidjax._types import Mat3, Quat, Vec3
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.kernels import matrix_to_quaternion
 from rigidjax.rotation.linalg3 import dot, hat, product, solve
+from rigidjax.rotation.stumpff import inverse_kernel
 from rigidjax.rotation.validation import rotation_matrix, unit_quaternion
 from rigidjax.rotation.wahba import nearest, of_order_one, weights_of
-from rigidjax.special.stumpff import inverse_kernel
 
 
 def mean(matrices: Float[ArrayLike, "n 3 3"], weights: Float[ArrayLike, "n"] | None = None) -> Mat3:

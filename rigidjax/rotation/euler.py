@@ -1,4 +1,4 @@
-"""Euler angles in all 24 sequences; the 3-1-3 of the notes, "ZXZ", first (floor 1).
+"""Euler angles in all 24 sequences; the 3-1-3 of the notes, "ZXZ", first.
 
 A sequence is three letters, the angles are listed in its order, and every angle is active and in
 radians. **Capitals are intrinsic**: each turn is about the axis as already turned, and

@@ -1,4 +1,4 @@
-"""A smooth attitude through attitudes and body rates (floor 1)."""
+"""A smooth attitude through attitudes and body rates."""
 
 import equinox as eqx
 import jax

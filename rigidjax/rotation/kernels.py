@@ -1,4 +1,4 @@
-"""The costly maps without their checks, compiled once also when called from the prompt (floor 1).
+"""The costly maps without their checks, compiled once also when called from the prompt.
 
 `quaternion` and `so3` are the public face of these; nothing here looks at shapes or values.
 """
@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from rigidjax._types import Mat3, Quat, Scalar, Vec3
+from rigidjax.rotation.barrier import once
 from rigidjax.rotation.linalg3 import (
     components,
     cross_components,
@@ -20,8 +21,7 @@ from rigidjax.rotation.linalg3 import (
     near_one,
     square,
 )
-from rigidjax.special.barrier import once
-from rigidjax.special.stumpff import arctan_ratio, inverse_kernel, stumpff
+from rigidjax.rotation.stumpff import arctan_ratio, inverse_kernel, stumpff
 
 # Inlined in whatever is being traced, so that XLA and `jax.grad` see no boundary.
 _compiled = partial(jax.jit, inline=True)

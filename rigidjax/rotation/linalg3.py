@@ -1,4 +1,4 @@
-"""Vectors and 3×3 matrices, written on components (floor 1).
+"""Vectors and 3×3 matrices, written on components.
 
 `@` on 3×3 matrices is slow in gradients on CPU and runs in TF32 on some GPUs; these do neither.
 
@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 
 from rigidjax import _checks
 from rigidjax._types import Mat3, Mat3Like, Scalar, Vec3, Vec3Like
-from rigidjax.special.barrier import once
+from rigidjax.rotation.barrier import once
 
 
 def components(v: Float[Array, "n"]) -> tuple[Scalar, ...]:

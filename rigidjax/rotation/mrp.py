@@ -1,4 +1,4 @@
-"""Modified Rodrigues parameters σ = n tan(θ/4), and their shadow set (floor 1).
+"""Modified Rodrigues parameters σ = n tan(θ/4), and their shadow set.
 
 Three numbers without a sine: regular up to a full turn, where σ runs to infinity. σ and its shadow
 −σ/|σ|² are the same rotation; switching at |σ| = 1 keeps to θ ≤ π. Source: Schaub & Junkins, 2018,

@@ -1,4 +1,4 @@
-"""Unit quaternions (w, x, y, z), scalar first: q turns body vectors into world vectors (floor 1).
+"""Unit quaternions (w, x, y, z), scalar first: q turns body vectors into world vectors.
 
 q and −q are the same rotation. `log`, and every error built on it, gives the same bits for both.
 The maps here take one quaternion and normalise nothing, so that they cost little in a vector field;

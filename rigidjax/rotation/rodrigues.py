@@ -1,4 +1,4 @@
-"""Rodrigues (Gibbs, Cayley) parameters g = n tan(θ/2) (floor 1).
+"""Rodrigues (Gibbs, Cayley) parameters g = n tan(θ/2).
 
 Rational in both directions, and without a double cover; a half turn lies at infinity, and
 `is_singular` tells. M = (1 + hat g)(1 − hat g)⁻¹ is Cayley's transform. Source: Schaub & Junkins,

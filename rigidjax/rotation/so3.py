@@ -1,4 +1,4 @@
-"""Rotation matrices M, active, body → world, and their tangent vectors (floor 1).
+"""Rotation matrices M, active, body → world, and their tangent vectors.
 
 `exp` and `log` take and return one rotation; batch with `jax.vmap`. Every kernel is a smooth
 function of θ², so that values and derivatives of any order are right at θ = 0. Range: as in
@@ -29,9 +29,9 @@ from rigidjax.rotation.linalg3 import (
     square,
     vee as vee,
 )
+from rigidjax.rotation.stumpff import inverse_kernel, stumpff
 from rigidjax.rotation.validation import rotation_matrix, turn
 from rigidjax.rotation.wahba import align as align, project as project, wahba as wahba
-from rigidjax.special.stumpff import inverse_kernel, stumpff
 
 
 def exp(v: Vec3Like) -> Mat3:

@@ -1,4 +1,4 @@
-"""The rotation that fits best: projection, alignment, Wahba's problem (floor 1).
+"""The rotation that fits best: projection, alignment, Wahba's problem.
 
 No singular value decomposition and no eigenvectors: their derivatives are NaN at every rotation,
 where all three singular values are 1. The best rotation R of a 3×3 matrix B, the one with the

@@ -11,6 +11,7 @@ from jax import lax
 from jaxtyping import Array
 
 from rigidjax.motion import on_the_group
+from rigidjax.rotation.barrier import barrier
 from rigidjax.solve.components import flat, leaf_sizes, unflat
 from rigidjax.solve.runge_kutta import (
     Stages,
@@ -22,7 +23,6 @@ from rigidjax.solve.runge_kutta import (
     weights,
 )
 from rigidjax.solve.tableaus import DORMAND_PRINCE8, KUTTA4, TSITOURAS5, Row, Tableau
-from rigidjax.special.barrier import barrier
 
 Atoms = tuple[Array, ...]
 

@@ -15,11 +15,11 @@ from jaxtyping import Array
 from rigidjax.exact.components3 import Four, Triple, cross
 from rigidjax.motion import Attitude, AttitudeEquations
 from rigidjax.motion.torques.base import sees_attitude
+from rigidjax.rotation.barrier import barrier
 from rigidjax.rotation.kernels import product4, square4
 from rigidjax.solve.components import join, split
 from rigidjax.solve.explicit import NestedInterpolation, advance, cubic_rows
 from rigidjax.solve.tableaus import KUTTA4
-from rigidjax.special.barrier import barrier
 
 
 def turned(

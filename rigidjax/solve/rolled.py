@@ -13,9 +13,9 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
+from rigidjax.rotation.barrier import barrier
 from rigidjax.solve.explicit import AbstractExplicit, Atoms, RungeKutta4, Tsitouras5, advance, plus
 from rigidjax.solve.tableaus import KUTTA4, TSITOURAS5, Tableau
-from rigidjax.special.barrier import barrier
 
 # field(t, y) on tuples of arrays.
 Field = Callable[[Any, Atoms], Atoms]

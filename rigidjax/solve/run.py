@@ -11,11 +11,12 @@ from jaxtyping import Array
 
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.exact import FreeBody
-from rigidjax.frames import Point, collision
+from rigidjax.frames import Point
 from rigidjax.frames.frame_dynamics import scene_of
 from rigidjax.motion import Attitude, Rigid, on_the_group
 from rigidjax.motion.coupled import started
 from rigidjax.motion.torques.base import jumps_of
+from rigidjax.solve import ending
 from rigidjax.solve.adaptive import adaptive
 from rigidjax.solve.direction import Directed, DirectedCondition, DirectedJumps
 from rigidjax.solve.explicit import AbstractExplicit
@@ -89,7 +90,7 @@ def _solved(
         return _loop(setup, state0, ts)
     field = equations_of_motion(setup.body, state0, setup.torque)
     scene: Any = scene_of(setup.torque) if isinstance(state0, Point) else None
-    watch = collision.event(scene)
+    watch = ending.condition(scene)
     subs = (
         (dfx.SubSaveAt(ts=ts),) if watch is None else (dfx.SubSaveAt(ts=ts), dfx.SubSaveAt(t1=True))
     )
@@ -106,7 +107,7 @@ def _solved(
         max_steps=setup.max_steps,
         throw=False,
         progress_meter=setup.progress_meter,
-        event=watch,
+        event=None if watch is None else dfx.Event(watch),
     )
     stats: dict[str, Any] = {k: value for k, value in out.stats.items() if k != "max_steps"}
     times: Any = out.ts
@@ -121,7 +122,7 @@ def _solved(
     if scene is not None:
         if watch is not None:
             end, end_time = jax.tree.map(lambda leaf: leaf[0], (saved[1], times[1]))
-            stats |= _collision(scene, out.result, end_time, end)
+            stats |= _ended(out.result, end_time, end)
         stats["drift"] = scene.drift(ts, ys)
     return ys, stats, result
 
@@ -129,7 +130,7 @@ def _solved(
 def _loop(setup: Loop, state0: Any, ts: Array) -> tuple[Any, dict[str, Any], dfx.RESULTS]:
     controller: Any = setup.controller
     scene: Any = scene_of(setup.torque) if isinstance(state0, Point) else None
-    watch = None if scene is None else collision.condition(scene)
+    watch = ending.condition(scene)
     field, jumps = equations_of_motion(setup.body, state0, setup.torque), jumps_of(setup.torque)
     sign, along = setup.sign, ts
     if sign is not None:
@@ -158,16 +159,16 @@ def _loop(setup: Loop, state0: Any, ts: Array) -> tuple[Any, dict[str, Any], dfx
     }
     if scene is not None:
         if watch is not None:
-            stats |= _collision(scene, out.result, out.last_time, out.last)
+            stats |= _ended(out.result, out.last_time, out.last)
         stats["drift"] = scene.drift(ts, ys)
     return ys, stats, out.result
 
 
-def _collision(scene: Any, result: dfx.RESULTS, time: Array, state: Any) -> dict[str, Any]:
+def _ended(result: dfx.RESULTS, time: Array, state: Any) -> dict[str, Any]:
     return {
-        "collided": result == dfx.RESULTS.event_occurred,
+        "ended": result == dfx.RESULTS.event_occurred,
         "end_time": time,
-        "end_distances": scene.approach(time, state)[0],
+        "end_state": state,
     }
 
 

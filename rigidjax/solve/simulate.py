@@ -12,10 +12,10 @@ from jaxtyping import Array, ArrayLike, Float
 from rigidjax import _checks
 from rigidjax._types import ScalarLike
 from rigidjax.body.inertia import Inertia, MassProperties
-from rigidjax.frames import AbstractScene, MovingFrame, collision
+from rigidjax.frames import AbstractScene, MovingFrame
 from rigidjax.motion.coupled import Coupled, started
 from rigidjax.motion.torques.base import jumps_of
-from rigidjax.solve import validation
+from rigidjax.solve import ending, validation
 from rigidjax.solve.direction import direction
 from rigidjax.solve.events import Asked, Event, require_condition, solve_until
 from rigidjax.solve.explicit import AbstractExplicit, DormandPrince8
@@ -184,8 +184,8 @@ def _solution(setup: Free | Loop | Setup, state0: Any, times: Array) -> Solution
         ys, stats, result = solve(setup, state0, times)
     except RuntimeError as error:
         raise _checks.bare(error) from None
-    if setup.throw and "collided" in stats:
-        ys = collision.refuse(ys, stats, times)
+    if setup.throw and "ended" in stats:
+        ys = ending.refuse(getattr(setup, "torque", None), ys, stats, times)
     if isinstance(ys, Coupled):
         return Solution(times, ys.motion, stats, result, setup, own=ys.own)
     return Solution(times, ys, stats, result, setup)
@@ -199,8 +199,8 @@ def _until(event: Any, setup: Free | Loop, state0: Any, times: Array) -> Solutio
         ys, stats, result, time, state = solve_until(setup, event, state0, times)
     except RuntimeError as error:
         raise _checks.bare(error) from None
-    if setup.throw and "collided" in stats:
-        ys = collision.refuse(ys, stats, times)
+    if setup.throw and "ended" in stats:
+        ys = ending.refuse(getattr(setup, "torque", None), ys, stats, times)
     if isinstance(ys, Coupled):
         return Solution(times, ys.motion, stats, result, setup, time, state, ys.own)
     return Solution(times, ys, stats, result, setup, time, state)

@@ -33,13 +33,13 @@ from rigidjax.motion import Attitude, AttitudeEquations, EulerEquations, Spin, o
 from rigidjax.motion.torques.base import evaluate, sees_attitude
 from rigidjax.motion.torques.inputs import bind, delays_of
 from rigidjax.rotation import quaternion
+from rigidjax.rotation.barrier import barrier
 from rigidjax.solve import splitting
 from rigidjax.solve.components import join, split
 from rigidjax.solve.explicit import AbstractExplicit, Atoms, RungeKutta4
 from rigidjax.solve.magnus import Magnus4, require_blind, turned
 from rigidjax.solve.rolled import end_of_step
 from rigidjax.solve.splitting import AbstractSplitting
-from rigidjax.special.barrier import barrier
 
 
 class Stepper(NamedTuple):

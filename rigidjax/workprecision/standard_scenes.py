@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from rigidjax import orbits
 from rigidjax.body.inertia import Inertia
 from rigidjax.frames import Point, scenes as places
 from rigidjax.motion import Attitude
@@ -154,7 +155,7 @@ def arenstorf() -> Scene:
     """Arenstorf's orbit about Earth and Moon, once round."""
     mu, x, v, period = ARENSTORF
     return _point(
-        "arenstorf", "Arenstorf's orbit", [x, 0.0, 0.0], [0.0, v, 0.0], period, places.cr3bp(mu),
+        "arenstorf", "Arenstorf's orbit", [x, 0.0, 0.0], [0.0, v, 0.0], period, orbits.cr3bp(mu),
         equations.three_body, (mu,),
     )  # fmt: skip
 

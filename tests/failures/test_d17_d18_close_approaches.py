@@ -1,5 +1,5 @@
 """Rows D17, D18 in single precision, and how near is too near; in double: tests/systems/test_tops.py
-(over the pole), tests/frames (Arenstorf's orbit, collisions).
+(over the pole), tests/orbits (Arenstorf's orbit, collisions).
 """
 
 import jax
@@ -43,7 +43,7 @@ def test_d17_a_top_through_the_pole():
 
 def test_d18_arenstorf_in_single_precision():
     """Closure of the place 1e-2 (peers: 0.1); the velocity is lost at the last fall on the Moon."""
-    scene = rj.scenes.cr3bp(0.012277471)
+    scene = rj.orbits.cr3bp(0.012277471)
     start = rj.Point([0.994, 0.0, 0.0], [0.0, -2.00158510637908252, 0.0])
     ts = jnp.array([0.0, 8.0, 17.0652165601579625], SINGLE)
     out = rj.simulate(None, single(start), ts, scene, throw=False)
@@ -58,7 +58,7 @@ def test_d18_arenstorf_in_single_precision():
 @pytest.mark.parametrize("miss", [1e-1, 1e-2, 1e-3])
 def test_d18_a_close_pass_keeps_the_integral(miss):
     """Past the heavy body at a distance: the Jacobi constant to 1e3 tolerances of its size there."""
-    scene = rj.scenes.cr3bp(1e-3)
+    scene = rj.orbits.cr3bp(1e-3)
     # On a parabola about the heavy body whose nearest point is `miss` away.
     r, p = 0.4, 2 * miss
     speed, around = np.sqrt(2 / r), np.sqrt(p) / r

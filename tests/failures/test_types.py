@@ -18,7 +18,7 @@ q = rj.simulate(body, at, [0.0, 1.0], top).ys.q
 omega = rj.simulate(body, spin, [0.0, 1.0], rj.torques.Damping([1.0, 1, 1])).ys.omega
 rj.simulate(body, at, [0.0, 1.0], rj.torques.Sum(top, rj.torques.Damping([1.0, 1, 1])))
 rj.simulate(body, at, [0.0, 1.0], lambda t, state, body: -state.omega)
-rj.simulate(None, rj.Point([1.0, 0, 0], [0.0, 1, 0]), [0.0, 1.0], rj.scenes.hill(0.1))
+rj.simulate(None, rj.Point([1.0, 0, 0], [0.0, 1, 0]), [0.0, 1.0], rj.orbits.hill(0.1))
 """
 WRONG = ["rj.simulate(body, spin, [0.0, 1.0], top)", "rj.simulate(body, spin, [0.0, 1.0]).ys.q"]
 

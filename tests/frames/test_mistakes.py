@@ -4,6 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from rigidjax import orbits
 from rigidjax.frames import (
     AboutAxis,
     BodyInFrame,
@@ -17,15 +18,15 @@ from rigidjax.frames import (
 
 NAN = float("nan")
 FRAME = MovingFrame(Uniform([0.0, 0.0, 1.0]))
-MOON = scenes.cr3bp(0.0121505856)
+MOON = orbits.cr3bp(0.0121505856)
 
 
 @pytest.mark.parametrize(
     ("call", "error", "words"),
     [
-        (lambda: scenes.cr3bp("moon"), TypeError, "mu: wanted an array of numbers, got str"),
-        (lambda: scenes.cr3bp([0.1, 0.2]), ValueError, "mu: wanted shape .* jax.vmap"),
-        (lambda: scenes.cr3bp(0.1, [NAN, 0.0]), ValueError, "radii: wanted two numbers ≥ 0"),
+        (lambda: orbits.cr3bp("moon"), TypeError, "mu: wanted an array of numbers, got str"),
+        (lambda: orbits.cr3bp([0.1, 0.2]), ValueError, "mu: wanted shape .* jax.vmap"),
+        (lambda: orbits.cr3bp(0.1, [NAN, 0.0]), ValueError, "radii: wanted two numbers ≥ 0"),
         (lambda: scenes.foucault(48.9, 10.0), ValueError, "were these degrees"),
         (lambda: scenes.foucault(0.5, np.inf), ValueError, "length: wanted a positive number"),
         (lambda: scenes.earth(0.5, np.inf), ValueError, "gravity: wanted a positive number"),
@@ -36,7 +37,7 @@ MOON = scenes.cr3bp(0.0121505856)
         (lambda: scenes.hoop(1.0, NAN), ValueError, "rate: contains NaN"),
         (lambda: scenes.hoop(1.0, 1.0, NAN), ValueError, "gravity: contains NaN"),
         (lambda: scenes.libration(NAN), ValueError, "rate: contains NaN"),
-        (lambda: scenes.hill(NAN), ValueError, "radius: wanted a number ≥ 0"),
+        (lambda: orbits.hill(NAN), ValueError, "radius: wanted a number ≥ 0"),
         (lambda: Uniform([NAN, 0, 1]), ValueError, r"omega: contains NaN or infinity at index"),
         (lambda: Uniform(2.0), ValueError, r"omega: wanted shape \(3,\)"),
         (lambda: AboutAxis([NAN, 0, 0], lambda t: t), ValueError, "axis: contains NaN"),
@@ -52,7 +53,7 @@ MOON = scenes.cr3bp(0.0121505856)
         (lambda: InFrame(Uniform([0.0, 0, 1])), TypeError, "InFrame: wanted a MovingFrame, got Un"),
         (lambda: BodyInFrame(np.eye(3)), TypeError, "BodyInFrame: wanted a MovingFrame"),
         (lambda: Force(3.0), TypeError, "force: wanted a function"),
-        (lambda: scenes.PeriodicOrbit([1.0, 2, 3], 1.0), TypeError, "state: wanted a Point"),
+        (lambda: orbits.PeriodicOrbit([1.0, 2, 3], 1.0), TypeError, "state: wanted a Point"),
         (lambda: MOON.transition([1.0, 2, 3], 1.0), TypeError, "state: wanted a Point"),
         (lambda: MOON.transition(Point([0.5, 0, 0], [0.0, 1, 0]), NAN), ValueError, "t: contains"),
         (lambda: MOON.lyapunov_guess(1, NAN), ValueError, "amplitude: contains NaN"),

@@ -11,6 +11,7 @@ from scipy.linalg import expm
 from scipy.special import ellipj
 
 import rigidjax as rj
+from rigidjax import orbits
 from rigidjax.frames import Point, scenes
 from rigidjax.frames.earth import RATE
 
@@ -159,7 +160,7 @@ def test_single_precision_stays():
         scenes.earth(0.5),
         scenes.foucault(0.5, 1.0),
         scenes.hoop(1.0, 2.0),
-        scenes.hill(),
+        orbits.hill(),
     ):
         assert scene.acceleration(np.float32(0), state).dtype == jnp.float32
         assert all(q.dtype == jnp.float32 for q in scene.conserved(np.float32(0), state).values())
@@ -202,7 +203,7 @@ def foucault_record(p):
 def arc(p):
     """An arc of a particle under two bodies of mass ratio p."""
     start, ts = Point([1.02, -0.05, 0.2], [-0.1, 0.1, 0.1]), jnp.linspace(0.0, 2.0, 41)
-    scene = scenes.cr3bp(p[0])
+    scene = orbits.cr3bp(p[0])
     return rj.simulate(None, start, ts, scene, adjoint=dfx.ForwardMode()).ys.x.reshape(-1)
 
 
@@ -241,7 +242,7 @@ def test_intervals_cover_as_often_as_they_say(name):
         (lambda: scenes.foucault(0.5, 0.0), "length: wanted a positive number"),
         (lambda: scenes.foucault(0.5, 1.0).start(2.0, 0.0), "beyond the length of the string"),
         (lambda: scenes.hoop(-1.0, 1.0), "radius: wanted a positive number"),
-        (lambda: scenes.hill(-1.0), "radius: wanted a number ≥ 0"),
+        (lambda: orbits.hill(-1.0), "radius: wanted a number ≥ 0"),
     ],
 )
 @pytest.mark.usefixtures("unhooked")

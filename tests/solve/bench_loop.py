@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import rigidjax as rj
+from rigidjax import orbits
 from rigidjax.frames import scenes
 
 jax.config.update("jax_enable_x64", True)
@@ -137,7 +138,7 @@ def particles(count):
     found = {}
     for name, field, x, v, p, end, scene in (
         ("Foucault", foucault_by_hand, start.x, start.v, earth, 600.0, lambda p: law),
-        ("Arenstorf", three_body_by_hand, orbit, speed, mu, 17.0652, lambda p: scenes.cr3bp(p[0])),
+        ("Arenstorf", three_body_by_hand, orbit, speed, mu, 17.0652, lambda p: orbits.cr3bp(p[0])),
     ):
         ts = jnp.linspace(0.0, end, count)
 

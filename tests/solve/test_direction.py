@@ -79,7 +79,7 @@ def test_a_body_that_moves_and_a_point():
     ys = rj.simulate(mass, start, [0.0, -2.0], fall).ys
     # x(t) = x + v t + g t²/2
     np.testing.assert_allclose(ys.x[-1], [-6.0, 1.0, 2.0 + 2.0 - 0.5 * 9.81 * 4], atol=1e-9)
-    moon = rj.scenes.cr3bp(0.0121505856)
+    moon = rj.orbits.cr3bp(0.0121505856)
     first = rj.Point([0.85, 0, 0.1], [0.0, 0.2, 0.0])
     there = last(rj.simulate(None, first, [0.0, 1.0], moon, **TIGHT).ys)
     close(last(rj.simulate(None, there, [1.0, 0.0], moon, **TIGHT).ys), first, 1e-11)
@@ -92,7 +92,7 @@ M = np.array([1.0, -1.0, 1.0])
 
 
 def test_collision_on_the_way_back():
-    moon = rj.scenes.cr3bp(0.0121505856, radii=(0.02, 0.005))
+    moon = rj.orbits.cr3bp(0.0121505856, radii=(0.02, 0.005))
     first = rj.Point([0.95, 0, 0], [0.0, 0.0, 0.0])
     out = [
         rj.simulate(None, first, [0.0, end], moon, throw=False).stats["end_time"]

@@ -191,7 +191,7 @@ def test_transition_matrices_of_others():
     assert found.shape == (12, 12)
     np.testing.assert_allclose(found[:3, 3:6], 2.0 * np.eye(3), atol=1e-12)
     np.testing.assert_allclose(np.linalg.det(found), 1.0, atol=1e-9)
-    moon = rj.scenes.cr3bp(0.0121505856)
+    moon = rj.orbits.cr3bp(0.0121505856)
     point = rj.Point([0.85, 0, 0.1], [0.0, 0.2, 0.0])
     out = rj.simulate(None, point, [0.0, 1.0], moon, rtol=1e-12, atol=1e-13)
     wanted = moon.transition(point, 1.0)

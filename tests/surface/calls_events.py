@@ -76,4 +76,4 @@ row(
 )  # fmt: skip
 leave_out("made by crossings", "Crossings")
 leave_out("made by lyapunov_exponents", "Exponents")
-leave_out("made by ThreeBody.manifold", "frames.scenes.Manifold")
+leave_out("made by ThreeBody.manifold", "orbits.Manifold")

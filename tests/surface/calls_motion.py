@@ -17,9 +17,9 @@ row("Attitude", dict(q=Q, omega=W))
 row("Rigid", dict(x=Y, v=V, q=Q, omega=W))
 row("Point", dict(x=Y, v=V))
 row("motion.on_the_group", lambda: dict(state=s.attitude()))
-row("motion.lagrangian.Coordinates", dict(q=V, rate=W))
-row("motion.lagrangian.Momentum", dict(pi=W))
-row("motion.lagrangian.MomentumAndDirection", dict(pi=W, gamma=V))
+row("lagrangian.Coordinates", dict(q=V, rate=W))
+row("lagrangian.Momentum", dict(pi=W))
+row("lagrangian.MomentumAndDirection", dict(pi=W, gamma=V))
 
 # Vector fields.
 row("EulerEquations", lambda: dict(inertia=s.inertia(), torque=s.damping()))
@@ -31,21 +31,21 @@ row(
     says=("inertia", "needs a state"),
 )
 row(
-    "motion.lagrangian.equations_of_motion",
+    "lagrangian.equations_of_motion",
     lambda: dict(lagrangian=s.Kinetic(jnp.asarray(9.8)), force=lambda t, q, rate: -0.1 * rate),
 )
-row("motion.lagrangian.EulerAngleTop", lambda: dict(inertia=s.inertia(), torque=s.top()))
-row("motion.lagrangian.HeavyTopHamiltonian", lambda: dict(inertia=s.inertia(), top=s.top()))
-row("motion.lagrangian.RotationalHamiltonian", lambda: dict(inertia=s.inertia()))
-row("motion.lagrangian.lie_poisson", dict(hamiltonian=lambda p: jnp.sum(p * p)))
-row("motion.lagrangian.lie_poisson_with_direction", dict(hamiltonian=lambda p, g: jnp.sum(p * g)))
-row("motion.lagrangian.from_attitude", lambda: dict(state=s.attitude()))
+row("lagrangian.EulerAngleTop", lambda: dict(inertia=s.inertia(), torque=s.top()))
+row("lagrangian.HeavyTopHamiltonian", lambda: dict(inertia=s.inertia(), top=s.top()))
+row("lagrangian.RotationalHamiltonian", lambda: dict(inertia=s.inertia()))
+row("lagrangian.lie_poisson", dict(hamiltonian=lambda p: jnp.sum(p * p)))
+row("lagrangian.lie_poisson_with_direction", dict(hamiltonian=lambda p, g: jnp.sum(p * g)))
+row("lagrangian.from_attitude", lambda: dict(state=s.attitude()))
 row(
-    "motion.lagrangian.to_attitude",
+    "lagrangian.to_attitude",
     lambda: dict(y=rj.lagrangian.Coordinates(V, W)),
     says=("angles",),
 )
-leave_out("made by motion.lagrangian.equations_of_motion", "motion.lagrangian.LagrangeEquations")
+leave_out("made by lagrangian.equations_of_motion", "lagrangian.LagrangeEquations")
 
 # What is conserved.
 row("energy", lambda: dict(body=s.inertia(), state=s.attitude(), torque=s.top(), t=0.3))
@@ -184,10 +184,10 @@ leave_out("made by MovingFrame.at", "frames.Instant")
 leave_out("abstract: made by subclassing", "frames.AbstractScene")
 
 # Scenes of particles.
-row("frames.scenes.cr3bp", dict(mu=0.3, radii=np.array([0.01, 0.02])))
+row("orbits.cr3bp", dict(mu=0.3, radii=np.array([0.01, 0.02])))
 row("frames.scenes.earth", dict(latitude=0.7, gravity=9.8, rate=7e-5))
 row("frames.scenes.foucault", dict(latitude=0.7, length=10.0, gravity=9.8, rate=7e-5))
-row("frames.scenes.hill", dict(radius=0.01))
+row("orbits.hill", dict(radius=0.01))
 row("frames.scenes.hoop", dict(radius=0.7, rate=5.0, gravity=9.8))
 row("frames.scenes.libration", dict(rate=0.3))
 row(
@@ -195,9 +195,10 @@ row(
     lambda: dict(state=s.attitude(), body=s.inertia(), rate=0.3),
 )
 row("frames.scenes.turntable", dict(rate=0.7, growth=0.2))
-row("frames.scenes.PeriodicOrbit", lambda: dict(state=s.point(), period=2.5))
+row("orbits.PeriodicOrbit", lambda: dict(state=s.point(), period=2.5))
 made = "made by the function of its name in small letters"
-leave_out(made, *(f"frames.scenes.{n}" for n in ("Earth", "Foucault", "Hill", "Hoop", "ThreeBody")))
+leave_out(made, *(f"frames.scenes.{n}" for n in ("Earth", "Foucault", "Hoop")))
+leave_out(made, "orbits.Hill", "orbits.ThreeBody")
 for name, given in {
     "potential": dict(x=Y),
     "distances": dict(x=Y),
@@ -209,21 +210,21 @@ for name, given in {
     "halo_guess": dict(point=1, amplitude=0.01),
 }.items():
     row(
-        f"frames.scenes.ThreeBody.{name}",
-        lambda given=given: dict(self=rj.scenes.cr3bp(0.3), **given),
+        f"orbits.ThreeBody.{name}",
+        lambda given=given: dict(self=rj.orbits.cr3bp(0.3), **given),
         arguments=tuple(given),
         transforms=()
         if name == "exponents"
         else ("jit", "vmap", "grad", "jacfwd", "hessian", "scan", "checkpoint"),
     )
 row(
-    "frames.scenes.ThreeBody.jacobi_constant",
-    lambda: dict(self=rj.scenes.cr3bp(0.3), state=s.point()),
+    "orbits.ThreeBody.jacobi_constant",
+    lambda: dict(self=rj.orbits.cr3bp(0.3), state=s.point()),
     arguments=("state",),
 )
 row(
-    "frames.scenes.Hill.jacobi_constant",
-    lambda: dict(self=rj.scenes.hill(), state=s.point()),
+    "orbits.Hill.jacobi_constant",
+    lambda: dict(self=rj.orbits.hill(), state=s.point()),
     arguments=("state",),
     traced=("state",),
 )

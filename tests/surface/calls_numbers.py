@@ -9,13 +9,13 @@ from surface.scenes import SECOND, SYMMETRIC, M, N, P, Q, V, W, Y
 
 # Elliptic functions.
 for name in ("am", "sncndn"):
-    row(f"special.elliptic.{name}", dict(u=0.7, m=0.4, m1=0.6))
+    row(f"elliptic.{name}", dict(u=0.7, m=0.4, m1=0.6))
 for name in ("ellipe", "ellipk"):
-    row(f"special.elliptic.{name}", dict(m=0.4, m1=0.6))
+    row(f"elliptic.{name}", dict(m=0.4, m1=0.6))
 for name in ("ellipeinc", "ellipf"):
-    row(f"special.elliptic.{name}", dict(phi=0.7, m=0.4, m1=0.6))
-row("special.elliptic.ellippi", dict(n=0.3, m=0.4, m1=0.6, n1=0.7))
-row("special.elliptic.ellippiinc", dict(n=0.3, phi=0.7, m=0.4, m1=0.6, n1=0.7))
+    row(f"elliptic.{name}", dict(phi=0.7, m=0.4, m1=0.6))
+row("elliptic.ellippi", dict(n=0.3, m=0.4, m1=0.6, n1=0.7))
+row("elliptic.ellippiinc", dict(n=0.3, phi=0.7, m=0.4, m1=0.6, n1=0.7))
 # Without the complement, which refuses most other values of m.
 for name, given in {
     "am": dict(u=0.7, m=0.4),
@@ -27,12 +27,12 @@ for name, given in {
     "ellippi": dict(n=0.3, m=0.4),
     "ellippiinc": dict(n=0.3, phi=0.7, m=0.4),
 }.items():
-    found = public.functions()[f"special.elliptic.{name}"]
-    row(f"special.elliptic.{name} (no complement)", given, run=found, transforms=())
-row("special.elliptic.rc", dict(x=0.7, y=1.3))
-row("special.elliptic.rf", dict(x=0.7, y=1.3, z=2.1))
-row("special.elliptic.rd", dict(x=0.7, y=1.3, z=2.1))
-row("special.elliptic.rj_", dict(x=0.7, y=1.3, z=2.1, p=0.9))
+    found = public.functions()[f"elliptic.{name}"]
+    row(f"elliptic.{name} (no complement)", given, run=found, transforms=())
+row("elliptic.rc", dict(x=0.7, y=1.3))
+row("elliptic.rf", dict(x=0.7, y=1.3, z=2.1))
+row("elliptic.rd", dict(x=0.7, y=1.3, z=2.1))
+row("elliptic.rj_", dict(x=0.7, y=1.3, z=2.1, p=0.9))
 
 # Vectors and matrices.
 for name in ("cross", "dot", "align"):

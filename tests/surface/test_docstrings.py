@@ -18,7 +18,7 @@ WITHOUT_EXAMPLE = {
         "takes the fit of real observations, tens of seconds: `python -m rigidjax demo` is it",
     ),
     **dict.fromkeys(
-        ("identify.fit_light_curve", "identify.LightCurve", "identify.Alias"),
+        ("tumblers.fit_light_curve", "tumblers.LightCurve", "tumblers.Alias"),
         "a search of minutes: the guide's page on brightness has it",
     ),
     **dict.fromkeys(

@@ -22,13 +22,13 @@ from surface.calls import TABLE, WITHOUT
 TESTS = Path(__file__).parents[1]
 # One of each kind: numbers, a body and a state, a law, a frame, a sensor, a function for an argument.
 SAMPLE = (
-    "special.elliptic.rf",
+    "elliptic.rf",
     "rotation.so3.cross",
     "rotation.quaternion.angle",
     "Inertia",
     "kinetic_energy",
     "motion.torques.HeavyTop",
-    "motion.lagrangian.lie_poisson",
+    "lagrangian.lie_poisson",
     "frames.AboutAxis",
     "identify.Gyro",
     "identify.FixedSteps",

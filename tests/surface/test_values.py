@@ -7,7 +7,7 @@ from surface.values import WAYS, WITHOUT
 
 # Quick to compile, some of each kind.
 SAMPLE = (
-    "special.elliptic.ellippi",
+    "elliptic.ellippi",
     "rotation.so3.wahba",
     "rotation.euler.from_quaternion rotation.euler.from_matrix (ZYX)",
     "rotation.so3.left_jacobian_inverse rotation.so3.right_jacobian_inverse",
@@ -15,7 +15,7 @@ SAMPLE = (
     "body.shapes.mesh",
     "body.divergence",
     "motion.torques.GravityGradient motion.torques.GravityGradient.energy",
-    "frames.scenes.ThreeBody.lagrange_points",
+    "orbits.ThreeBody.lagrange_points",
     "identify.LowPass",
 )
 # Draws of a row of the sample, and of one of all; how many calls these are to be, a public function

@@ -103,7 +103,7 @@ def wanted() -> set[str]:
 
 
 # Pictures, timings, processes and one recording: no numbers of mechanics.
-_FAR = ("plot.", "workprecision.", "batch.distributed.", "datasets.")
+_FAR = ("plot.", "tumblers.plot.", "workprecision.", "batch.distributed.", "datasets.")
 
 
 def drawn(row: Way, key: str, count: int, seed: int) -> list[tuple]:

@@ -7,7 +7,7 @@ from surface import values as v
 from surface.values import between, fixed, leave_out, one_of, scale, way
 
 import rigidjax as rj
-from rigidjax import body as bodies, parameters, quaternion as q4, shapes, so3, volumes
+from rigidjax import body as bodies, parameters, quaternion as q4, shapes, so3, tumblers, volumes
 
 MASS = scale(-20, 20)
 # LAPACK's eigenvalues are those of a matrix some dozen units off: p(n) ε, its guide says.
@@ -505,9 +505,9 @@ leave_out("a Protocol: no numbers", "HasAttitude", "HasPose", "HasSpin", "HasAtt
 
 # Brightness: a sum over the ellipsoid's directions, by the sphere it is an image of.
 leave_out("being mended for long shapes (issue 33, 1): its test holds it by a quadrature",
-          "body.brightness.Lambert", "body.brightness.Lambert.of_ellipsoid")  # fmt: skip
-leave_out("abstract", "body.brightness.AbstractScattering")
-LAWS = (bodies.brightness.Geometric(), bodies.brightness.LommelSeeliger())
+          "tumblers.brightness.Lambert", "tumblers.brightness.Lambert.of_ellipsoid")  # fmt: skip
+leave_out("abstract", "tumblers.brightness.AbstractScattering")
+LAWS = (tumblers.brightness.Geometric(), tumblers.brightness.LommelSeeliger())
 
 
 def of_lune(axes, sun, observer):
@@ -530,13 +530,13 @@ AXES = one_of(between(0.5, 2.0, 3), lambda rng, i: 10.0 ** rng.uniform(-1, 1, 3)
               10.0 ** rng.uniform(-20, 20) * rng.uniform(0.5, 2.0, 3))  # fmt: skip
 LIGHT = (AXES, v.vector, one_of(v.ordinary, v.direction))
 way(
-    "body.brightness.ellipsoid body.brightness.Geometric body.brightness.Geometric.of_ellipsoid "
-    "body.brightness.LommelSeeliger body.brightness.LommelSeeliger.of_ellipsoid",
-    lambda *a: [bodies.brightness.ellipsoid(*a, law) for law in LAWS], LIGHT, of_lune, cost=2,
+    "tumblers.brightness.ellipsoid tumblers.brightness.Geometric tumblers.brightness.Geometric.of_ellipsoid "
+    "tumblers.brightness.LommelSeeliger tumblers.brightness.LommelSeeliger.of_ellipsoid",
+    lambda *a: [tumblers.brightness.ellipsoid(*a, law) for law in LAWS], LIGHT, of_lune, cost=2,
 )  # fmt: skip
 way(
-    "body.brightness.ellipsoid (small phase)",
-    lambda a, s, e: [bodies.brightness.ellipsoid(a, s, s + e * jnp.roll(s, 1), law) for law in LAWS],
+    "tumblers.brightness.ellipsoid (small phase)",
+    lambda a, s, e: [tumblers.brightness.ellipsoid(a, s, s + e * jnp.roll(s, 1), law) for law in LAWS],
     (AXES, v.ordinary, one_of(scale(-16, -1), fixed(0.0))),
     lambda a, s, e: of_lune(a, s, s + e * np.roll(s, 1)), cost=2,
 )  # fmt: skip
@@ -557,11 +557,11 @@ def of_faces(rows, sun, observer):
 
 
 way(
-    "body.brightness.mesh body.brightness.Geometric.per_area "
-    "body.brightness.LommelSeeliger.per_area body.brightness.Lambert.per_area",
+    "tumblers.brightness.mesh tumblers.brightness.Geometric.per_area "
+    "tumblers.brightness.LommelSeeliger.per_area tumblers.brightness.Lambert.per_area",
     lambda rows, s, o: [
-        bodies.brightness.mesh(rows, FACES, s, o, law)
-        for law in (*LAWS, bodies.brightness.Lambert())
+        tumblers.brightness.mesh(rows, FACES, s, o, law)
+        for law in (*LAWS, tumblers.brightness.Lambert())
     ],
     (corners, v.vector, v.ordinary), of_faces, norm=True,
 )  # fmt: skip

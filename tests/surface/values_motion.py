@@ -461,14 +461,14 @@ def our_top(m, c, g, i, q, rate):
 
 
 way(
-    "motion.lagrangian.EulerAngleTop motion.lagrangian.equations_of_motion "
-    "motion.lagrangian.LagrangeEquations motion.lagrangian.LagrangeEquations.energy "
-    "motion.lagrangian.Coordinates",
+    "lagrangian.EulerAngleTop lagrangian.equations_of_motion "
+    "lagrangian.LagrangeEquations lagrangian.LagrangeEquations.energy "
+    "lagrangian.Coordinates",
     our_top, (scale(-1, 1), v.ordinary, v.ordinary, lambda rng, i: v.inertia(rng, i % 5), ANGLES, v.ordinary), euler_top,
     norm=True, cost=2,
 )  # fmt: skip
 way(
-    "motion.lagrangian.to_attitude motion.lagrangian.from_attitude",
+    "lagrangian.to_attitude lagrangian.from_attitude",
     lambda q, rate, w: (
         q4.to_matrix((y := lagrangian.to_attitude(lagrangian.Coordinates(q, rate))).q), y.omega,
         lagrangian.from_attitude(rj.Attitude(y.q, w)),
@@ -504,10 +504,10 @@ def our_poisson(m, c, g, i, q, w, p, gamma):
 
 
 way(
-    "motion.lagrangian.RotationalHamiltonian motion.lagrangian.HeavyTopHamiltonian "
-    "motion.lagrangian.HeavyTopHamiltonian.start motion.lagrangian.lie_poisson "
-    "motion.lagrangian.lie_poisson_with_direction motion.lagrangian.Momentum "
-    "motion.lagrangian.MomentumAndDirection",
+    "lagrangian.RotationalHamiltonian lagrangian.HeavyTopHamiltonian "
+    "lagrangian.HeavyTopHamiltonian.start lagrangian.lie_poisson "
+    "lagrangian.lie_poisson_with_direction lagrangian.Momentum "
+    "lagrangian.MomentumAndDirection",
     our_poisson,
     (scale(-3, 3), v.vector, v.vector, v.inertia, v.quaternion, v.ordinary, v.vector, v.vector),
     poisson,

@@ -41,42 +41,42 @@ def jacobi(u, m1):
 
 # Of m above 1, which has to be given by m itself.
 U = one_of(between(-2.0, 2.0), scale(-20, -1), between(-60, 60))
-way("special.elliptic.sncndn", lambda u, m1: ell.sncndn(u, 1 - m1, m1), (U, M1), jacobi)
+way("elliptic.sncndn", lambda u, m1: ell.sncndn(u, 1 - m1, m1), (U, M1), jacobi)
 way(
-    "special.elliptic.sncndn (m > 1)", lambda u, m: ell.sncndn(u, m), (U, between(1.01, 30)),
+    "elliptic.sncndn (m > 1)", lambda u, m: ell.sncndn(u, m), (U, between(1.01, 30)),
     lambda u, m: jacobi(u, 1 - m), ulps=32,
 )  # fmt: skip
-way("special.elliptic.am", lambda u, m1: ell.am(u, 1 - m1, m1), (U, M1), amplitude)
+way("elliptic.am", lambda u, m1: ell.am(u, 1 - m1, m1), (U, M1), amplitude)
 way(
-    "special.elliptic.am (m > 1)", lambda u, m: ell.am(u, m), (U, between(1.01, 30)),
+    "elliptic.am (m > 1)", lambda u, m: ell.am(u, m), (U, between(1.01, 30)),
     lambda u, m: amplitude(u, 1 - m), ulps=32,
 )  # fmt: skip
-way("special.elliptic.ellipk", lambda m1: ell.ellipk(1 - m1, m1), M1, lambda m1: mp.ellipk(1 - m1))
-way("special.elliptic.ellipe", lambda m1: ell.ellipe(1 - m1, m1), M1, lambda m1: mp.ellipe(1 - m1))
-way("special.elliptic.ellipf", lambda p, m1: ell.ellipf(p, 1 - m1, m1), (PHI, M1), f_of)
+way("elliptic.ellipk", lambda m1: ell.ellipk(1 - m1, m1), M1, lambda m1: mp.ellipk(1 - m1))
+way("elliptic.ellipe", lambda m1: ell.ellipe(1 - m1, m1), M1, lambda m1: mp.ellipe(1 - m1))
+way("elliptic.ellipf", lambda p, m1: ell.ellipf(p, 1 - m1, m1), (PHI, M1), f_of)
 way(
-    "special.elliptic.ellipeinc", lambda p, m1: ell.ellipeinc(p, 1 - m1, m1), (PHI, M1),
+    "elliptic.ellipeinc", lambda p, m1: ell.ellipeinc(p, 1 - m1, m1), (PHI, M1),
     real(lambda p, m1: mp.ellipe(p, 1 - m1)),
 )  # fmt: skip
 way(
-    "special.elliptic.ellippi", lambda n1, m1: ell.ellippi(1 - n1, 1 - m1, m1, n1), (N1, M1),
+    "elliptic.ellippi", lambda n1, m1: ell.ellippi(1 - n1, 1 - m1, m1, n1), (N1, M1),
     real(lambda n1, m1: mp.ellippi(1 - n1, 1 - m1)),
 )  # fmt: skip
 way(
-    "special.elliptic.ellippiinc",
+    "elliptic.ellippiinc",
     lambda n1, p, m1: ell.ellippiinc(1 - n1, p, 1 - m1, m1, n1), (N1, PHI, M1),
     real(lambda n1, p, m1: mp.ellippi(1 - n1, p, 1 - m1)),
 )  # fmt: skip
 way(
-    "special.elliptic.rc", ell.rc, (POSITIVE, one_of(POSITIVE, between(-3.0, -0.1))),
+    "elliptic.rc", ell.rc, (POSITIVE, one_of(POSITIVE, between(-3.0, -0.1))),
     real(lambda x, y: mp.elliprc(x, y)),
 )  # fmt: skip
 for name in ("rf", "rd"):
     way(
-        f"special.elliptic.{name}", getattr(ell, name), (POSITIVE,) * 3,
+        f"elliptic.{name}", getattr(ell, name), (POSITIVE,) * 3,
         real(getattr(mp, f"ellip{name}")),
     )  # fmt: skip
-way("special.elliptic.rj_", ell.rj_, (POSITIVE,) * 4, real(mp.elliprj))
+way("elliptic.rj_", ell.rj_, (POSITIVE,) * 4, real(mp.elliprj))
 
 # Vectors and matrices.
 ANY = one_of(v.normal(3, 3), v.normal(3, 3, low=-20, high=20))

@@ -320,10 +320,10 @@ def test_lagrange_top_against_quadrature(theta, rates):
 
     def run(p):
         body = rj.Inertia(jnp.diag(jnp.stack([i1 + 0 * p[0], i1 + 0 * p[0], i3 + 0 * p[0]])))
-        start = rj.motion.lagrangian.Coordinates(
+        start = rj.lagrangian.Coordinates(
             jnp.stack([0 * p[0], p[0], 0 * p[0]]), jnp.stack([p[1], p[2], p[3]])
         )
-        attitude = rj.motion.lagrangian.to_attitude(start)
+        attitude = rj.lagrangian.to_attitude(start)
         end = rk4(rj.AttitudeEquations(body, law), attitude, t, 3000)
         return 1 - 2 * (end.q[1] ** 2 + end.q[2] ** 2), end
 

@@ -7,8 +7,8 @@ import pytest
 from systems import tops_mp
 
 import rigidjax as rj
-from rigidjax import torques
-from rigidjax.motion import drift, energy, lagrangian
+from rigidjax import lagrangian, torques
+from rigidjax.motion import drift, energy
 
 DOWN = np.array([0.0, 0.0, -9.81])
 

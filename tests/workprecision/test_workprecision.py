@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import mpmath as mp
 import numpy as np
 import pytest
-from frames.three_body_series import solve
+from orbits.three_body_series import solve
 from systems import free_body_mp, tops_mp
 
 import rigidjax as rj

@@ -12,7 +12,6 @@ from rigidjax.identify.sensors.base import (
     AbstractSensor as AbstractSensor,
     SensorInput as SensorInput,
 )
-from rigidjax.identify.sensors.brightness import Brightness as Brightness
 from rigidjax.identify.sensors.lowpass import LowPass as LowPass
 from rigidjax.identify.sensors.position import (
     Position as Position,

@@ -55,9 +55,10 @@ class AbstractSensor(eqx.Module):
     Optional members: `offset`, s: the sensor's clock is behind, it shows at t what was at
     t + offset; `limit` (k,): where a channel saturates, in the unit of the error; `lowpass` a
     `LowPass`, where the error is reading minus prediction; a method `refusal(values)`: which rows
-    cannot be readings, (T,) true where wrong, and why; where the error is not reading minus
-    prediction, a method `reading_of(now, error)`, the reading that has this error, for
-    `simulate_readings`.
+    cannot be readings, (T,) true where wrong, and why; a method `typical_rate(t, values)`: about
+    how fast the body turns, rad/s, by the readings seen, where no other sensor tells; where the
+    error is not reading minus prediction, a method `reading_of(now, error)`, the reading that has
+    this error, for `simulate_readings`.
 
     >>> import rigidjax as rj
     >>> class Tachometer(AbstractSensor):  # the size of the body rate, rad/s

@@ -1,4 +1,4 @@
-"""What a torque or a force is, and how a field asks it for its value (floor 2)."""
+"""What a torque or a force is, and how a field asks it for its value."""
 
 import abc
 import dataclasses

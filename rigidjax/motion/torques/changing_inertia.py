@@ -1,4 +1,4 @@
-"""A body whose inertia changes in time: booms that go out, fuel that is spent (floor 2)."""
+"""A body whose inertia changes in time: booms that go out, fuel that is spent."""
 
 from collections.abc import Callable
 from typing import Any

@@ -1,4 +1,4 @@
-"""What lies between a command and what it does: a lag of first order (floor 2)."""
+"""What lies between a command and what it does: a lag of first order."""
 
 from typing import Any
 

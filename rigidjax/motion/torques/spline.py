@@ -12,8 +12,8 @@ from jaxtyping import Array, ArrayLike, Float
 from rigidjax import _checks
 from rigidjax._types import Scalar, ScalarLike, Vec3
 from rigidjax.motion.torques.base import given
+from rigidjax.rotation.barrier import barrier
 from rigidjax.rotation.linalg3 import cross, dot
-from rigidjax.special.barrier import barrier
 
 Samples = Float[ArrayLike, "n *channels"] | Sequence[Any]
 

@@ -1,4 +1,4 @@
-"""Laws and functions of time that have states of their own, integrated with the body's (floor 2).
+"""Laws and functions of time that have states of their own, integrated with the body's.
 
 Such a law has `state0`, its states at the start, and `rate`, their derivative; it is called with
 its states last. Everything else of the library sees it as a plain law once they are put in:

@@ -1,4 +1,4 @@
-"""Reaction wheels: a gyrostat whose wheels have speeds of their own (floor 2)."""
+"""Reaction wheels: a gyrostat whose wheels have speeds of their own."""
 
 from collections.abc import Callable
 from typing import Any, ClassVar, TypeVar

@@ -1,0 +1,63 @@
+"""What the special functions do with their arguments before any arithmetic."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Float
+
+from rigidjax import _checks
+
+
+def common(**named: Any) -> tuple[Float[Array, "..."], ...]:
+    """All arguments as floating arrays of one dtype, broadcast to one shape.
+
+    Python numbers take the dtype of the arrays beside them; without arrays it is JAX's default.
+
+    **Raises:** `TypeError` for what is not float32, float64 or an integer; `ValueError` for shapes
+    that do not broadcast.
+    """
+    arrays = {
+        name: _checks.floating(value, (), name, batched=True) for name, value in named.items()
+    }
+    dtype = jnp.result_type(*arrays.values())
+    try:
+        shape = jnp.broadcast_shapes(*(array.shape for array in arrays.values()))
+    except ValueError as error:
+        shapes = ", ".join(f"{name} {array.shape}" for name, array in arrays.items())
+        raise ValueError(f"shapes do not broadcast together: {shapes}") from error
+    return tuple(jnp.broadcast_to(array.astype(dtype), shape) for array in arrays.values())
+
+
+def complementary(name: str, value: Any, complement: Any) -> dict[str, Any]:
+    """The pair (value, 1 − value) for `common`, the second computed if it was not given.
+
+    **Raises:** `ValueError` when both are given, are concrete, and do not add up to 1.
+    """
+    value = _checks.floating(value, (), name, batched=True)
+    if complement is None:
+        return {name: value, name + "1": 1 - value}
+    other = _checks.floating(complement, (), name + "1", batched=True)
+    if not isinstance(value, Tracer) and not isinstance(other, Tracer):
+        a, b = np.asarray(value), np.asarray(other)
+        eps = max(np.finfo(a.dtype).eps, np.finfo(b.dtype).eps)
+        excess = np.abs(a + b - 1)
+        if np.any(excess > 16 * eps * np.maximum(1, np.abs(a))):
+            raise ValueError(
+                f"{name}1: wanted 1 − {name}, but {name} + {name}1 differs from 1 by up to "
+                f"{float(np.max(excess)):.3g}; likely a modulus k given for the parameter m = k²"
+            )
+    return {name: value, name + "1": other}
+
+
+@jax.custom_jvp
+def exact_complement(value: Float[Array, "..."], complement: Float[Array, "..."]) -> Any:
+    """`value` with its own digits, but as a function of its `complement` alone: slope −1."""
+    return value
+
+
+@exact_complement.defjvp
+def _exact_complement_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
+    return exact_complement(*primals), -tangents[1]

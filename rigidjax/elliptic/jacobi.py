@@ -1,0 +1,219 @@
+"""Jacobi's elliptic functions sn, cn, dn and the amplitude, for every real parameter.
+
+Values: the argument is reduced by the half period 2K, then Bulirsch's descending transformation
+(1965, doi 10.1007/BF01397975) works with 1 − m, so that nothing is lost as m → 1.
+
+Derivatives: with φ = am(u|m) and u = F(φ|m), keeping u fixed gives ∂φ/∂m = dn X with
+
+    X = −∂F/∂m = −½ ∫₀^u sd²(v) dv.
+
+The integrand is positive: X has all its digits at m = 0 and as m → 1, where the textbook formulas
+(Byrd & Friedman 1971, 710.51–53) divide a small difference by m m1. The second derivative in m
+comes from X too for m ≤ 0.9 or |u| ≤ 1; elsewhere from a sum over images (`jacobi_near_one.py`).
+"""
+
+import math
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.custom_derivatives import SymbolicZero
+from jaxtyping import Array, ArrayLike, Float
+
+from rigidjax.elliptic.arguments import common, complementary, exact_complement
+from rigidjax.elliptic.jacobi_near_one import LARGEST_M1, near_one
+from rigidjax.elliptic.legendre import MEAN_STEPS, complete, half_turns, integral
+
+# Below this cn and dn, integrals over sd² depend on their ratio only (to the floor squared).
+_FLOOR = {np.dtype("float64"): 1e-40, np.dtype("float32"): 1e-8}
+
+
+def sncndn(
+    u: Float[ArrayLike, "..."],
+    m: Float[ArrayLike, "..."],
+    m1: Float[ArrayLike, "..."] | None = None,
+) -> tuple[Float[Array, "..."], Float[Array, "..."], Float[Array, "..."]]:
+    """Jacobi's sn(u|m), cn(u|m), dn(u|m).
+
+    **Arguments:** `u` real; the error grows as |u| eps. `m` the parameter k², not the modulus: any
+    real number, also negative or above 1. `m1` = 1 − m given exactly, where m is so near 1 that
+    1 − m would lose digits; then the functions are functions of m1 alone, value and derivative, and
+    m only lends its digits where it is small. Shapes broadcast.
+
+    **Returns:** three arrays (DLMF 22.2.4–6). m = 0 gives sin, cos, 1; m = 1 gives tanh, sech,
+    sech (DLMF 22.5.3–4); m < 0 and m > 1 by DLMF 22.17. Exact derivatives of every order in u
+    (DLMF 22.13(i)), m, m1.
+
+    **Raises:** `TypeError` for half precision; `ValueError` for shapes that do not broadcast or
+    m + m1 ≠ 1.
+
+    >>> [round(float(x), 12) for x in sncndn(1.0, 0.5)]
+    [0.803001824896, 0.595976567672, 0.823161001632]
+    """
+    u, m, m1 = common(u=u, **complementary("m", m, m1))
+    s, c, d, _ = _functions(u, exact_complement(m, m1), m1)
+    return s, c, d
+
+
+def am(
+    u: Float[ArrayLike, "..."],
+    m: Float[ArrayLike, "..."],
+    m1: Float[ArrayLike, "..."] | None = None,
+) -> Float[Array, "..."]:
+    """Jacobi's amplitude φ = ∫₀^u dn(v|m) dv, rad: the inverse of F(φ|m) for m ≤ 1.
+
+    **Arguments:** as `sncndn`. For m ≤ 1 the amplitude grows by π each half period 2K, without
+    jumps; for m > 1 it swings within |φ| ≤ arcsin(1/√m).
+
+    **Returns:** DLMF 22.16.1–3.
+
+    **Raises:** as `sncndn`.
+
+    >>> round(float(am(1.0, 0.5)), 12)
+    0.932315079884
+    """
+    u, m, m1 = common(u=u, **complementary("m", m, m1))
+    s, c, _, turns = _functions(u, exact_complement(m, m1), m1)
+    sign = _parity(turns)
+    return jnp.arctan2(sign * s, sign * c) + math.pi * turns
+
+
+def _functions(u: Any, m: Any, m1: Any) -> tuple[Any, Any, Any, Any]:
+    """sn, cn, dn for any real m, and the half turns of the amplitude."""
+    # DLMF 22.17.2–4: m > 1 becomes 1/m, and cn and dn change places.
+    above = m1 < 0
+    divisor = jnp.where(above, m, 1)
+    root = jnp.sqrt(divisor)
+    v = u * root
+    inner_m = jnp.where(above, 1, m) / divisor
+    inner_m1 = jnp.where(above, -m1, m1) / divisor
+
+    s, c, d = _core(v, inner_m, inner_m1)
+    turns = _turns(jax.lax.stop_gradient(v), jax.lax.stop_gradient(inner_m1))[0]
+    return (
+        s / root,
+        jnp.where(above, d, c),
+        jnp.where(above, c, d),
+        jnp.where(above, 0, turns),
+    )
+
+
+@jax.custom_jvp
+def _core(u: Any, m: Any, m1: Any) -> tuple[Any, Any, Any]:
+    """sn, cn, dn for m ≤ 1, as functions of u and m1; m must be the complement of m1."""
+    turns, angle, lows, highs, mean = _turns(u, m1)
+    sign = _parity(turns)
+    theta = jnp.abs(angle)
+    # Bulirsch's recursion carries cot²φ: let it not overflow, neither at 0 nor at a half period.
+    tiny = jnp.abs(u) * jnp.maximum(1, jnp.sqrt(m1)) < float(jnp.finfo(u.dtype).eps) ** (1 / 3)
+    safe = jnp.maximum(theta, float(jnp.finfo(u.dtype).tiny) ** 0.4)
+    a = jnp.cos(safe) / jnp.sin(safe)
+    c, d = mean * a, jnp.ones_like(u)
+    for low, high in zip(lows[::-1], highs[::-1], strict=True):
+        a, c = a * c, c * d
+        d = (high + a) / (low + a)
+        a = c / low
+    hypotenuse = jnp.sqrt(1 + c * c)
+    s = jnp.where(angle < 0, -sign, sign) / hypotenuse
+    c = sign * c / hypotenuse
+
+    square = u * u
+    s = jnp.where(tiny, u * (1 - square * (1 + m) / 6), s)
+    c = jnp.where(tiny, 1 - square / 2, c)
+    d = jnp.where(tiny, 1 - m * square / 2, d)
+
+    # m = 1. Beyond the clip sech would underflow, and its quotients with it.
+    largest = 0.97 * math.log(float(jnp.finfo(u.dtype).max))
+    e = jnp.exp(-jnp.minimum(jnp.abs(u), largest))
+    sech = 2 * e / (1 + e * e)
+    hyperbolic = m1 == 0
+    return (
+        jnp.where(hyperbolic, jnp.tanh(u), s),
+        jnp.where(hyperbolic, sech, c),
+        jnp.where(hyperbolic, sech, d),
+    )
+
+
+@partial(_core.defjvp, symbolic_zeros=True)
+def _core_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
+    (u, m, m1), (du, _, dm1) = primals, tangents
+    s, c, d = _core(u, m, m1)
+    ds, dc, dd = jnp.zeros_like(u), jnp.zeros_like(u), jnp.zeros_like(u)
+    if not isinstance(du, SymbolicZero):
+        # DLMF 22.13.1–3.
+        ds, dc, dd = c * d * du, -s * d * du, -m * s * c * du
+    if not isinstance(dm1, SymbolicZero):
+        sm, cm, dm = _slopes(u, m, m1)
+        ds, dc, dd = ds - sm * dm1, dc - cm * dm1, dd - dm * dm1
+    return (s, c, d), (ds, dc, dd)
+
+
+@jax.custom_jvp
+def _slopes(u: Any, m: Any, m1: Any) -> tuple[Any, Any, Any]:
+    """Derivatives of sn, cn, dn with respect to m."""
+    return _slopes_from_integral(u, m, m1)
+
+
+@partial(_slopes.defjvp, symbolic_zeros=True)
+def _slopes_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
+    (u, m, m1), (du, _, dm1) = primals, tangents
+    sm, cm, dm = slopes = _slopes(u, m, m1)
+    ds, dc, dd = jnp.zeros_like(u), jnp.zeros_like(u), jnp.zeros_like(u)
+    if not isinstance(du, SymbolicZero):
+        s, c, d = _core(u, m, m1)
+        ds, dc, dd = (
+            (cm * d + c * dm) * du,
+            -(sm * d + s * dm) * du,
+            -(s * c + m * (sm * c + s * cm)) * du,
+        )
+    if not isinstance(dm1, SymbolicZero):
+        # For small u the images cancel to leave u³, and the integral has no large terms.
+        near = (m1 < LARGEST_M1) & (jnp.abs(u) > 1)
+        middle, one = jnp.full_like(m1, 0.5), jnp.ones_like(m1)
+        far_m, far_m1 = jnp.where(near, middle, m), jnp.where(near, middle, m1)
+        _, far = jax.jvp(partial(_slopes_from_integral, u), (far_m, far_m1), (one, -one))
+        near_m = jnp.where(near, m, 1 - LARGEST_M1)
+        near_m1 = jnp.where(near, m1, LARGEST_M1)
+
+        def first(a: Any, b: Any) -> Any:
+            return jax.jvp(partial(near_one, u), (a, b), (one, -one))[1]
+
+        _, close = jax.jvp(first, (near_m, near_m1), (one, -one))
+        ss, cc, d2 = (jnp.where(near, a, b) for a, b in zip(close, far, strict=True))
+        ds, dc, dd = ds - ss * dm1, dc - cc * dm1, dd - d2 * dm1
+    return slopes, (ds, dc, dd)
+
+
+def _slopes_from_integral(u: Any, m: Any, m1: Any) -> tuple[Any, Any, Any]:
+    """The slopes in φ times dn X, X by Carlson's R_D over the rest of u after half periods."""
+    s, c, d = _core(u, m, m1)
+    turns = _turns(jax.lax.stop_gradient(u), jax.lax.stop_gradient(m1))[0]
+    sign = _parity(turns)
+    # X ~ 1/dn² must not overflow. Where cn and dn are minute it depends, but for that factor, on
+    # their ratio only (to the floor squared): raise both.
+    up = jnp.maximum(1, _FLOOR[np.dtype(u.dtype)] / jax.lax.stop_gradient(d))
+    c, d, raised = c * up, d * up, m1 * up * up
+    near = turns == 0
+    whole = complete((1, 1, 0), jnp.where(near, 1, raised))
+    x = integral((1, 1, 0), sign * s, sign * c, raised, jnp.ones_like(m1))
+    x = -0.5 * (x + jnp.where(near, 0, 2 * turns * whole))
+    return c * d * x, -s * d * x * up, -(0.5 * s * s / d + m * s * c * x) * up
+
+
+def _turns(u: Any, m1: Any) -> tuple[Any, Any, list[Any], list[Any], Any]:
+    """Half periods n in u, what is left as an angle πr/2K, the two rows of means, agm(1, √m1)."""
+    a, b = jnp.ones_like(m1), jnp.sqrt(jnp.where(m1 == 0, 1, m1))
+    lows, highs = [], []
+    for _ in range(MEAN_STEPS[np.dtype(m1.dtype)]):
+        lows.append(a)
+        highs.append(b)
+        a, b = 0.5 * (a + b), jnp.sqrt(a * b)
+    turns, angle = half_turns(u * a)
+    return jnp.where(m1 == 0, 0, turns), angle, lows, highs, a
+
+
+def _parity(turns: Any) -> Any:
+    """(−1)ⁿ."""
+    return 1 - 2 * (turns - 2 * jnp.floor(0.5 * turns))

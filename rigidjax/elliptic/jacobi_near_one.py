@@ -1,0 +1,77 @@
+"""sn, cn, dn near m = 1 as sums over images: one hyperbolic function per half period.
+
+With p = exp(−πK/K') ≈ m1/16 the complementary nome and B = π/2K' (DLMF §22.12, after Jacobi's
+imaginary transformation, §22.6(iv)),
+
+    dn u = B Σᵢ sech(B(u − 2iK))            cn u = (B/k) Σᵢ (−1)ⁱ sech(B(u − 2iK))
+    sn u = (B/k) Σᵢ (−1)ⁱ tanh(B(u − 2iK)),     i = −∞ … ∞,     e^(−2BK) = p.
+
+B, k and p are analytic in m1 at 0, so every derivative in m, at m = 1 and near it, is that of an
+explicit sum. It serves the second derivatives: through ∂F/∂m they lose all digits as m1 → 0.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+# The nome is below 0.0066 there: a few images, and two terms of its own series, are enough.
+LARGEST_M1 = 0.1
+_IMAGES = {np.dtype("float64"): 8, np.dtype("float32"): 4}
+
+
+def near_one(
+    u: Float[Array, "..."], m: Float[Array, "..."], m1: Float[Array, "..."]
+) -> tuple[Float[Array, "..."], Float[Array, "..."], Float[Array, "..."]]:
+    """(sn, cn, dn) for 0 ≤ m1 ≤ 0.1, to round-off of 1, with right derivatives in m.
+
+    **Arguments:** `u`, `m` and `m1` = 1 − m of one shape; a tangent of m must be minus that of m1.
+    """
+    root = jnp.sqrt(m)
+    fourth = jnp.sqrt(root)
+    # DLMF 19.5.5–6, the difference 1 − m^(1/4) written as a quotient.
+    x = 0.5 * m1 / ((1 + fourth) * (1 + fourth) * (1 + root))
+    x4 = (x * x) * (x * x)
+    nome = x * (1 + x4 * (2 + 15 * x4))
+    # DLMF 20.9.2: K' = (π/2) θ₃².
+    theta3 = 1 + 2 * nome * (1 + nome * nome * nome)
+    rate = 1 / (theta3 * theta3)
+
+    y = jnp.abs(u) * rate
+    length = -jnp.log(jax.lax.stop_gradient(nome))
+    turns = jnp.round(jax.lax.stop_gradient(y) / length)
+    reach = _IMAGES[np.dtype(u.dtype)]
+    offset = jnp.arange(-reach, reach + 1, dtype=u.dtype).reshape((1,) * u.ndim + (-1,))
+    image = turns[..., None] + offset
+    # e^(−distance to the image) as a power of the nome times e^(±y).
+    beyond = jax.lax.stop_gradient(y) >= jnp.where(turns == 0, 0, turns * length)
+    side = jnp.where(
+        jnp.where(offset == 0, beyond[..., None], jnp.broadcast_to(offset < 0, image.shape)), -1, 1
+    ).astype(u.dtype)
+    z = _power_exp(nome[..., None], side * y[..., None], side * image)
+    hyperbolic = 2 * z / (1 + z * z)
+    # tanh, less its limits ±1 on either side, which cancel in pairs.
+    tangent = jnp.where(offset == 0, -side * (1 - z * z), side * 2 * z * z) / (1 + z * z)
+
+    alternating = 1 - 2 * (image - 2 * jnp.floor(0.5 * image))
+    sine = rate / root * (alternating * tangent).sum(-1)
+    cosine = rate / root * (alternating * hyperbolic).sum(-1)
+    return jnp.where(u < 0, -sine, sine), cosine, rate * hyperbolic.sum(-1)
+
+
+@jax.custom_jvp
+def _power_exp(p: Any, y: Any, n: Any) -> Any:
+    """pⁿ e^y with the derivative n pⁿ⁻¹ e^y: exactly 0 the second time for n = 1, where the
+    derivatives of exp(y + n ln p) would be differences of large numbers.
+    """
+    return jnp.exp(y + jnp.where(n == 0, 0, n * jnp.log(p)))
+
+
+@_power_exp.defjvp
+def _power_exp_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
+    (p, y, n), (dp, dy, _) = primals, tangents
+    value = _power_exp(p, y, n)
+    slope = jnp.where(n == 0, 0, n * _power_exp(p, y, n - 1))
+    return value, slope * dp + value * dy

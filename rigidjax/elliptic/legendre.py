@@ -1,0 +1,274 @@
+"""Legendre's elliptic integrals, complete and incomplete, on the parameter m = k².
+
+All of them, and all their derivatives, belong to one family that is closed under differentiation:
+
+    I_jkl(φ, m, n) = ∫₀^φ sin^{2j}θ Δ^{−(2k+1)} (1 − n sin²θ)^{−l} dθ,      Δ = √(1 − m sin²θ)
+    dI_jkl = [integrand at φ] dφ + (k + ½) I_{j+1,k+1,l} dm + l I_{j+1,k,l+1} dn
+
+F is I_000, E is I_{0,−1,0}, Π is I_001. Every integrand is positive, so no derivative is a
+difference of large numbers: the textbook formulas (DLMF 19.4) divide such differences by m m1.
+"""
+
+import math
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.custom_derivatives import SymbolicZero
+from jaxtyping import Array, ArrayLike, Float
+
+from rigidjax.elliptic.arguments import common, complementary
+from rigidjax.elliptic.carlson import rd, rf
+from rigidjax.elliptic.carlson_r import r_integral
+
+# Steps after which a and b agree to √eps for b/a down to the square root of the least number.
+MEAN_STEPS = {np.dtype("float64"): 11, np.dtype("float32"): 8}
+
+# π in three parts, the first two of 28 (float64) or 10 (float32) bits.
+PI_PARTS = {
+    np.dtype("float64"): (3.141592651605606, 1.9841871479187034e-09, 1.1442377452219664e-17),
+    np.dtype("float32"): (3.140625, 0.0009670257568359375, 6.278329465203569e-07),
+}
+
+
+def ellipk(
+    m: Float[ArrayLike, "..."], m1: Float[ArrayLike, "..."] | None = None
+) -> Float[Array, "..."]:
+    """Complete elliptic integral of the first kind, K(m) = ∫₀^{π/2} dθ/√(1 − m sin²θ).
+
+    **Arguments:** `m` the parameter k², not the modulus; m < 1 (infinite at 1, NaN beyond; negative
+    is fine). `m1` = 1 − m given exactly, where m is so near 1 that 1 − m would lose digits: then
+    it alone decides, value and derivative. Shapes broadcast.
+
+    **Returns:** π/(2 agm(1, √m1)) (DLMF 19.8.5), the arithmetic–geometric mean by a number of steps
+    fixed by the dtype.
+
+    **Raises:** `TypeError` for half precision; `ValueError` for shapes that do not broadcast or
+    m + m1 ≠ 1.
+
+    >>> round(float(ellipk(1.0, 1e-30)), 12)
+    35.925070756031
+    """
+    _, m1 = common(**complementary("m", m, m1))
+    return _complete_first(m1)
+
+
+def ellipe(
+    m: Float[ArrayLike, "..."], m1: Float[ArrayLike, "..."] | None = None
+) -> Float[Array, "..."]:
+    """Complete elliptic integral of the second kind, E(m) = ∫₀^{π/2} √(1 − m sin²θ) dθ.
+
+    **Arguments:** `m` ≤ 1 the parameter k² (NaN beyond 1); `m1` = 1 − m given exactly, see
+    `ellipk`. Shapes broadcast.
+
+    **Returns:** DLMF 19.25.1 in Carlson's integrals, a sum of positive terms.
+
+    **Raises:** as `ellipk`.
+
+    >>> float(ellipe(1.0))
+    1.0
+    """
+    _, m1 = common(**complementary("m", m, m1))
+    return complete((0, -1, 0), m1)
+
+
+def ellippi(
+    n: Float[ArrayLike, "..."],
+    m: Float[ArrayLike, "..."],
+    m1: Float[ArrayLike, "..."] | None = None,
+    n1: Float[ArrayLike, "..."] | None = None,
+) -> Float[Array, "..."]:
+    """Complete elliptic integral of the third kind, ∫₀^{π/2} dθ/((1 − n sin²θ) √(1 − m sin²θ)).
+
+    **Arguments:** `n` < 1 the characteristic (DLMF's α²; infinite at 1; the principal value for
+    n > 1 is not offered: NaN), `m` < 1 the parameter k²; `m1` = 1 − m and `n1` = 1 − n given
+    exactly, see `ellipk`. Shapes broadcast. The order is Wolfram's and mpmath's.
+
+    **Returns:** DLMF 19.2.8 as one half-line integral with a positive integrand: full accuracy for
+    any n < 1, circular and hyperbolic.
+
+    **Raises:** as `ellipk`.
+
+    >>> round(float(ellippi(0.5, 0.5)), 12)
+    2.701287762095
+    """
+    _, n1, _, m1 = common(**complementary("n", n, n1), **complementary("m", m, m1))
+    return complete((0, 0, 1), m1, n1)
+
+
+def ellipf(
+    phi: Float[ArrayLike, "..."],
+    m: Float[ArrayLike, "..."],
+    m1: Float[ArrayLike, "..."] | None = None,
+) -> Float[Array, "..."]:
+    """Incomplete elliptic integral of the first kind, F(φ|m) = ∫₀^φ dθ/√(1 − m sin²θ).
+
+    **Arguments:** `phi` the amplitude, rad, any size; `m` the parameter k², m sin²φ < 1 (NaN
+    beyond); `m1` = 1 − m given exactly, see `ellipk`. Shapes broadcast.
+
+    **Returns:** DLMF 19.25.5 in Carlson's R_F after reduction to |φ| ≤ π/2 (DLMF 19.2.10).
+
+    **Raises:** as `ellipk`.
+
+    >>> round(float(ellipf(1.0, 0.5)), 12)
+    1.083216772845
+    """
+    phi, _, m1 = common(phi=phi, **complementary("m", m, m1))
+    return _incomplete((0, 0, 0), phi, m1)
+
+
+def ellipeinc(
+    phi: Float[ArrayLike, "..."],
+    m: Float[ArrayLike, "..."],
+    m1: Float[ArrayLike, "..."] | None = None,
+) -> Float[Array, "..."]:
+    """Incomplete elliptic integral of the second kind, E(φ|m) = ∫₀^φ √(1 − m sin²θ) dθ.
+
+    **Arguments:** `phi` the amplitude, rad, any size; `m` ≤ 1 the parameter k² (NaN beyond 1);
+    `m1` = 1 − m given exactly, see `ellipk`. Shapes broadcast.
+
+    **Returns:** DLMF 19.25.9 or 19.25.10 in Carlson's integrals, whichever has positive terms,
+    after reduction to |φ| ≤ π/2 (DLMF 19.2.10).
+
+    **Raises:** as `ellipk`.
+
+    >>> round(float(ellipeinc(1.0, 0.5)), 12)
+    0.927329883624
+    """
+    phi, _, m1 = common(phi=phi, **complementary("m", m, m1))
+    return _incomplete((0, -1, 0), phi, m1)
+
+
+def ellippiinc(
+    n: Float[ArrayLike, "..."],
+    phi: Float[ArrayLike, "..."],
+    m: Float[ArrayLike, "..."],
+    m1: Float[ArrayLike, "..."] | None = None,
+    n1: Float[ArrayLike, "..."] | None = None,
+) -> Float[Array, "..."]:
+    """Incomplete elliptic integral of the third kind, ∫₀^φ dθ/((1 − n sin²θ) √(1 − m sin²θ)).
+
+    **Arguments:** `n` the characteristic, n sin²φ < 1; `phi` the amplitude, rad, any size; `m` the
+    parameter k², m sin²φ < 1 (NaN beyond either bound); `m1` = 1 − m and `n1` = 1 − n given
+    exactly, see `ellipk`. Shapes broadcast. The order is Wolfram's and mpmath's.
+
+    **Returns:** DLMF 19.2.7 as one half-line integral after reduction to |φ| ≤ π/2 (19.2.10).
+
+    **Raises:** as `ellipk`.
+
+    >>> round(float(ellippiinc(0.5, 1.0, 0.5)), 12)
+    1.288978174245
+    """
+    _, n1, phi, _, m1 = common(**complementary("n", n, n1), phi=phi, **complementary("m", m, m1))
+    return _incomplete((0, 0, 1), phi, m1, n1)
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def integral(orders: tuple[int, int, int], sine: Any, cosine: Any, m1: Any, n1: Any) -> Any:
+    """I_jkl from the sine and cosine of an amplitude |φ| ≤ π/2, so that φ near π/2 loses nothing.
+
+    `orders` is (j, k, l); `m1` = 1 − m, `n1` = 1 − n (anything where l = 0).
+    """
+    j, k, last = orders
+    s, c2 = sine, cosine * cosine
+    one, delta2 = jnp.ones_like(s), c2 + m1 * s * s
+    if orders == (0, 0, 0):
+        return s * rf(c2, delta2, one)
+    if orders == (1, 1, 0):
+        return s**3 / 3 * rd(c2, one, delta2)
+    if orders == (1, 0, 0):
+        return s**3 / 3 * rd(c2, delta2, one)
+    if orders == (0, -1, 0):
+        return _second_kind(s, c2, delta2, m1)
+    powers, values = [j - k - last + 0.5, 0.5, k + 0.5], [one, c2, delta2]
+    if last:
+        powers, values = [*powers, float(last)], [*values, c2 + n1 * s * s]
+    return 0.5 * s ** (2 * j + 1) * r_integral(tuple(powers), tuple(values))
+
+
+@partial(integral.defjvp, symbolic_zeros=True)
+def _integral_jvp(orders: Any, primals: Any, tangents: Any) -> tuple[Any, Any]:
+    j, k, last = orders
+    s, c, m1, n1 = primals
+    ds, dc, dm1, dn1 = tangents
+    value = integral(orders, *primals)
+    tangent = jnp.zeros_like(value)
+    if not (isinstance(ds, SymbolicZero) and isinstance(dc, SymbolicZero)):
+        ds = jnp.zeros_like(s) if isinstance(ds, SymbolicZero) else ds
+        dc = jnp.zeros_like(c) if isinstance(dc, SymbolicZero) else dc
+        delta2 = c * c + m1 * s * s
+        rate = s ** (2 * j) * _odd_power(delta2, -k)
+        if last:
+            rate = rate / (c * c + n1 * s * s) ** last
+        tangent = tangent + rate * (c * ds - s * dc)
+    if not isinstance(dm1, SymbolicZero):
+        tangent = tangent - (k + 0.5) * integral((j + 1, k + 1, last), *primals) * dm1
+    if last and not isinstance(dn1, SymbolicZero):
+        tangent = tangent - last * integral((j + 1, k, last + 1), *primals) * dn1
+    return value, tangent
+
+
+def complete(orders: tuple[int, int, int], m1: Any, n1: Any = None) -> Any:
+    """I_jkl at φ = π/2."""
+    one = jnp.ones_like(m1)
+    return integral(orders, one, jnp.zeros_like(m1), m1, one if n1 is None else n1)
+
+
+@jax.custom_jvp
+def _complete_first(m1: Any) -> Any:
+    a, b = jnp.ones_like(m1), jnp.sqrt(m1)
+    for _ in range(MEAN_STEPS[np.dtype(m1.dtype)]):
+        a, b = 0.5 * (a + b), jnp.sqrt(a * b)
+    return jnp.where(m1 == 0, jnp.inf, math.pi / (a + b))
+
+
+@_complete_first.defjvp
+def _complete_first_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
+    (m1,), (dm1,) = primals, tangents
+    return _complete_first(m1), -0.5 * complete((1, 1, 0), m1) * dm1
+
+
+def _second_kind(s: Any, c2: Any, delta2: Any, m1: Any) -> Any:
+    """E, for 0 ≤ m ≤ 1 by DLMF 19.25.10, for m < 0 by 19.25.9: every term is positive."""
+    m, one = 1 - m1, jnp.ones_like(s)
+    # E(φ|1) = sin φ: at φ = π/2 the terms below have no values of their own.
+    end = delta2 == 0
+    c2, delta2 = jnp.where(end, one, c2), jnp.where(end, one, delta2)
+    above = m >= 0
+    first = jnp.where(above, m1, one) * s * rf(c2, delta2, one)
+    third = rd(c2, jnp.where(above, one, delta2), jnp.where(above, delta2, one))
+    second = jnp.where(above, m1 * m, -m) * s**3 / 3 * third
+    rest = jnp.where(above, m * s * jnp.sqrt(c2 / delta2), 0)
+    value = jnp.where(end, s, first + second + rest)
+    return jnp.where(m1 < 0, jnp.nan, value)
+
+
+def _incomplete(orders: tuple[int, int, int], phi: Any, m1: Any, n1: Any = None) -> Any:
+    """I_jkl at any φ: the whole half turns by the complete integral, the rest by its sine."""
+    turns, remainder = half_turns(phi)
+    n1 = jnp.ones_like(m1) if n1 is None else n1
+    part = integral(orders, jnp.sin(remainder), jnp.cos(remainder), m1, n1)
+    # Within the first half turn the complete integral may be infinite, and is not wanted.
+    near = turns == 0
+    one = jnp.ones_like(m1)
+    safe_m1, safe_n1 = jnp.where(near, one, m1), jnp.where(near, one, n1)
+    if orders == (0, 0, 0):
+        whole = _complete_first(safe_m1)
+    else:
+        whole = complete(orders, safe_m1, safe_n1)
+    return part + jnp.where(near, 0, 2 * turns * whole)
+
+
+def half_turns(angle: Any) -> tuple[Any, Any]:
+    """(n, r) with angle = nπ + r, |r| ≤ π/2; the tangent of r is that of the angle."""
+    turns = jax.lax.stop_gradient(jnp.round(angle * (1 / math.pi)))
+    # Cody & Waite 1980: n × head and n × middle are exact, so that r keeps the digits of the angle.
+    head, middle, tail = PI_PARTS[np.dtype(angle.dtype)]
+    return turns, ((angle - turns * head) - turns * middle) - turns * tail
+
+
+def _odd_power(x: Any, k: int) -> Any:
+    """x^(k − ½)."""
+    return jax.lax.integer_pow(x, k) * jax.lax.rsqrt(x)

@@ -1,0 +1,198 @@
+"""Equations of motion from any Lagrangian by differentiation; Euler angles as the worked case."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import lineax as lx
+from jaxtyping import Array, ArrayLike, Float
+
+from rigidjax import _checks
+from rigidjax._types import HasAttitude, Scalar, ScalarLike
+from rigidjax.body.inertia import Inertia
+from rigidjax.motion.attitude import Attitude
+from rigidjax.motion.torques import Torque
+from rigidjax.motion.torques.base import require_law
+from rigidjax.rotation import euler, linalg3
+
+
+class Coordinates(eqx.Module):
+    """The state of a Lagrangian system: coordinates and their rates.
+
+    **Arguments:** `q` (n,) generalised coordinates, in the Lagrangian's units; `rate` (n,) dq/dt,
+    per second. Leading axes are allowed in a container of many states; functions take one.
+
+    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
+
+    >>> Coordinates([0.1, 0.2], [0.0, 1.0]).rate.shape
+    (2,)
+    """
+
+    q: Float[Array, "*batch n"]
+    rate: Float[Array, "*batch n"]
+
+    def __init__(
+        self, q: Float[ArrayLike, "*batch n"] | object, rate: Float[ArrayLike, "*batch n"] | object
+    ):
+        self.q = _checks.numbers(q, "q")
+        if self.q.ndim == 0 or self.q.size == 0:
+            raise ValueError(
+                f"q: wanted generalised coordinates (n,), got shape {self.q.shape}; of one give [q]"
+            )
+        self.rate = _checks.floating(
+            rate, self.q.shape, "rate", hint="one rate for each coordinate"
+        )
+
+
+class LagrangeEquations(eqx.Module):
+    """Lagrange's equations as a vector field; made by `equations_of_motion`.
+
+    **Fields:** `lagrangian` and `force` as given there.
+
+    >>> pendulum = equations_of_motion(lambda q, v: 0.5 * v[0] ** 2 + 9.81 * jnp.cos(q[0]))
+    >>> round(float(pendulum.energy(Coordinates([0.0], [2.0]))), 6)  # ½ v² − 9.81 cos q
+    -7.81
+    """
+
+    lagrangian: Callable[[Any, Any], Any]
+    force: Callable[[Any, Any, Any], Any] | None
+
+    def __call__(self, t: ScalarLike, y: Coordinates, args: object = None) -> Coordinates:
+        q, rate = y.q, y.rate
+        momentum = jax.grad(self._value, argnums=1)
+        _, carried = jax.jvp(lambda x: momentum(x, rate), (q,), (rate,))
+        push = jax.grad(self._value)(q, rate) - carried
+        if self.force is not None:
+            push = push + _checks.floating(self.force(t, q, rate), q.shape, "force")
+        return Coordinates(rate, _solve(jax.jacfwd(lambda v: momentum(q, v))(rate), push))
+
+    def energy(self, y: Coordinates) -> Scalar:
+        """Jacobi's integral `q̇·∂L/∂q̇ − L`, J: kept where there is no `force`."""
+        momentum = jax.grad(self._value, argnums=1)(y.q, y.rate)
+        return jnp.sum(y.rate * momentum) - self._value(y.q, y.rate)
+
+    def _value(self, q: Any, rate: Any) -> Scalar:
+        return _checks.floating(self.lagrangian(q, rate), (), "lagrangian", hint="one number, J")
+
+
+def equations_of_motion(
+    lagrangian: Callable[[Any, Any], Any],
+    force: Callable[[Any, Any, Any], Any] | None = None,
+) -> LagrangeEquations:
+    """The vector field `f(t, y, args)` on `Coordinates` of any Lagrangian L(q, q̇).
+
+    `d/dt ∂L/∂q̇ = ∂L/∂q + Q`, solved for q̈: `(∂²L/∂q̇∂q̇) q̈ = ∂L/∂q − (∂²L/∂q̇∂q) q̇ + Q`.
+
+    **Arguments:** `lagrangian` a callable, best a Module (its numbers can then be differentiated
+    and changed without compiling again), `(q, q̇) → L`, J, with `q`, `q̇` (n,); `force` generalised
+    forces that have no potential, `(t, q, q̇) → Q` (n,), or `None`.
+
+    **Returns** a Module, for `diffrax.ODETerm`. Up to three coordinates are solved by cofactors,
+    more by LU (`lineax`).
+
+    Source: Landau and Lifshitz, Mechanics, eq 2.6; the notes ask for it after eq 57.
+
+    **Raises:** `TypeError` for what cannot be called; `ValueError` where L is not one number. A
+    singular ∂²L/∂q̇∂q̇ (a chart's singularity, a coordinate without mass) gives infinities or NaN.
+
+    >>> pendulum = equations_of_motion(lambda q, v: 0.5 * v[0] ** 2 + 9.81 * jnp.cos(q[0]))
+    >>> pendulum(0.0, Coordinates([jnp.pi / 2], [0.0])).rate
+    Array([-9.81], dtype=float64)
+    """
+    _checks.function(lagrangian, "lagrangian", "(q, q̇) → L, J")
+    if force is not None:
+        _checks.function(force, "force", "(t, q, q̇) → Q")
+    return LagrangeEquations(lagrangian, force)
+
+
+class EulerAngleTop(eqx.Module):
+    """The worked case: L = ½ Ω·IΩ − U of a body about a fixed point, in the notes' Euler angles.
+
+    **Arguments:** `inertia` about the fixed point (or the centre of mass, if free); `torque` one
+    with a potential that does not depend on time, such as `HeavyTop`, or `None`.
+
+    Called with the angles (φ, θ, ψ), sequence 3-1-3, rad, and their rates, gives L, J. Source:
+    notes, eqs 33, 75, 81–83. Singular at sin θ = 0.
+
+    **Raises:** `TypeError` for a torque without a potential.
+
+    >>> from rigidjax import Inertia
+    >>> free = EulerAngleTop(Inertia.from_principal(1.0, 1.0, 2.0))
+    >>> free(jnp.array([0.0, 1.0, 0.0]), jnp.array([0.0, 0.0, 2.0]))
+    Array(4., dtype=float64)
+    """
+
+    inertia: Inertia
+    torque: Torque | None
+
+    def __init__(self, inertia: Inertia, torque: Torque | None = None):
+        _checks.single(inertia, Inertia, "inertia")
+        if torque is not None:
+            require_law(torque)
+        if torque is not None and not hasattr(torque, "energy"):
+            raise TypeError(
+                f"{type(torque).__name__} has no potential (no method energy(t, state, body)): "
+                "give it as the generalised force of equations_of_motion"
+            )
+        self.inertia, self.torque = inertia, torque
+
+    def __call__(self, q: Float[ArrayLike, "3"], rate: Float[ArrayLike, "3"]) -> Scalar:
+        omega = euler.rates_to_omega(q, rate)
+        kinetic = 0.5 * linalg3.dot(omega, linalg3.apply(self.inertia.tensor, omega))
+        if self.torque is None:
+            return kinetic
+        state = Attitude(euler.to_quaternion(q), omega)
+        potential: Any = self.torque
+        return kinetic - potential.energy(0.0, state, self.inertia)
+
+
+def to_attitude(y: Coordinates) -> Attitude:
+    """Attitude and body rate of 3-1-3 Euler angles and their rates (notes, eqs 33, 81–83).
+
+    **Arguments:** `y` with `q` = (φ, θ, ψ), rad, and `rate`, rad/s.
+
+    >>> to_attitude(Coordinates([0.0, 0.0, 0.0], [0.0, 0.0, 2.0])).omega.tolist()
+    [0.0, 0.0, 2.0]
+    """
+    _checks.instance(y, Coordinates, "y")
+    _checks.floating(y.q, (3,), "y.q", hint="three Euler angles")
+    return Attitude(euler.to_quaternion(y.q), euler.rates_to_omega(y.q, y.rate))
+
+
+def from_attitude(state: HasAttitude) -> Coordinates:
+    """3-1-3 Euler angles and their rates of an attitude and a body rate.
+
+    **Arguments:** `state` with `.q` (4,), body → world, and `.omega` (3,), rad/s.
+
+    **Raises:** `ValueError` (`EquinoxRuntimeError` under `jit`) at sin θ = 0, where the angles are
+    not unique and the rates do not exist.
+
+    >>> back = from_attitude(to_attitude(Coordinates([0.1, 0.2, 0.3], [1.0, 2.0, 3.0])))
+    >>> back.rate.round(12).tolist()
+    [1.0, 2.0, 3.0]
+    """
+    _checks.single(state, HasAttitude, "state", wanted="an Attitude")
+    angles = euler.from_quaternion(state.q)
+    angles = _checks.refuse(
+        angles,
+        euler.is_singular(angles),
+        "from_attitude: sin θ = 0, where Euler angles (3-1-3) are singular; solve for an Attitude, "
+        "which has no such place",
+    )
+    return Coordinates(angles, euler.omega_to_rates(angles, state.omega))
+
+
+def _solve(matrix: Float[Array, "n n"], push: Float[Array, " n"]) -> Float[Array, " n"]:
+    """The x with matrix x = push."""
+    n = push.shape[0]
+    if n == 1:
+        return push / matrix[0]
+    if n == 2:
+        (a, b), (c, d) = matrix
+        x, y = push
+        return jnp.stack([d * x - b * y, a * y - c * x]) / (a * d - b * c)
+    if n == 3:
+        return linalg3.solve(matrix, push)
+    return lx.linear_solve(lx.MatrixLinearOperator(matrix), push, lx.LU(), throw=False).value

@@ -1,0 +1,195 @@
+"""Lie–Poisson equations from any Hamiltonian of the body's momentum."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+from jaxtyping import Array, ArrayLike, Float
+
+from rigidjax import _checks
+from rigidjax._types import HasAttitude, Mat3, Scalar, ScalarLike, Vec3
+from rigidjax.body import inertia as _inertia, validation
+from rigidjax.body._types import Vectors
+from rigidjax.motion.torques import HeavyTop
+from rigidjax.rotation import quaternion
+from rigidjax.rotation.linalg3 import apply, cross, dot
+
+
+class Momentum(eqx.Module):
+    """The state of Lie–Poisson motion: the angular momentum in the body.
+
+    **Arguments:** `pi` (3,) Π = IΩ, N m s, body frame. Leading axes are allowed in a container of
+    many states; functions take one.
+
+    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
+
+    >>> Momentum([1.0, 0.0, 0.0]).pi.shape
+    (3,)
+    """
+
+    pi: Float[Array, "*batch 3"]
+
+    def __init__(self, pi: Vectors):
+        self.pi = _checks.floating(pi, (3,), "pi", batched=True)
+
+
+class MomentumAndDirection(eqx.Module):
+    """The state of a heavy top reduced by its symmetry: momentum, and a fixed direction.
+
+    **Arguments:** `pi` (3,) Π, N m s, body frame; `gamma` (3,) γ = Rᵀ d of a vector d that is fixed
+    in the world, body frame. Any length and unit: for `HeavyTopHamiltonian` d = g, m/s².
+
+    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype, or leading axes that differ.
+
+    >>> MomentumAndDirection([1.0, 0.0, 0.0], [0.0, 0.0, -9.81]).gamma.shape
+    (3,)
+    """
+
+    pi: Float[Array, "*batch 3"]
+    gamma: Float[Array, "*batch 3"]
+
+    def __init__(self, pi: Vectors, gamma: Vectors):
+        self.pi = _checks.floating(pi, (3,), "pi", batched=True)
+        self.gamma = _checks.floating(gamma, (3,), "gamma", batched=True)
+        _checks.same_batch(pi=(self.pi, 1), gamma=(self.gamma, 1))
+
+
+class LiePoisson(eqx.Module):
+    """`dΠ/dt = Π × ∇H(Π)` as a vector field; made by `lie_poisson`."""
+
+    hamiltonian: Callable[[Any], Any]
+
+    def __call__(self, t: ScalarLike, y: Momentum, args: object = None) -> Momentum:
+        return Momentum(cross(y.pi, jax.grad(lambda p: _number(self.hamiltonian(p)))(y.pi)))
+
+
+class LiePoissonWithDirection(eqx.Module):
+    """The same with a direction carried along; made by `lie_poisson_with_direction`."""
+
+    hamiltonian: Callable[[Any, Any], Any]
+
+    def __call__(
+        self, t: ScalarLike, y: MomentumAndDirection, args: object = None
+    ) -> MomentumAndDirection:
+        turn, pull = jax.grad(lambda p, g: _number(self.hamiltonian(p, g)), argnums=(0, 1))(
+            y.pi, y.gamma
+        )
+        return MomentumAndDirection(cross(y.pi, turn) + cross(y.gamma, pull), cross(y.gamma, turn))
+
+
+def lie_poisson(hamiltonian: Callable[[Any], Any]) -> LiePoisson:
+    """The vector field `dΠ/dt = Π × ∇H(Π)` on `Momentum`, of any Hamiltonian H(Π).
+
+    **Arguments:** `hamiltonian` a callable, best a Module, `Π → H`, J, with Π (3,), N m s, body
+    frame; ∇H is then the body rate Ω. For `½ Π·I⁻¹Π`, `RotationalHamiltonian(inertia)`, these are
+    Euler's equations. Keeps H and the Casimir |Π|².
+
+    Source: Marsden and Ratiu, Introduction to Mechanics and Symmetry, §§1.2, 1.3.
+
+    **Raises:** `TypeError` for what cannot be called; `ValueError` where H is not one number.
+
+    >>> import rigidjax as rj
+    >>> H = RotationalHamiltonian(rj.Inertia.from_principal(1.0, 2.0, 2.0))
+    >>> lie_poisson(H)(0.0, Momentum([1.0, 1.0, 1.0])).pi
+    Array([ 0. ,  0.5, -0.5], dtype=float64)
+    """
+    return LiePoisson(_callable(hamiltonian))
+
+
+def lie_poisson_with_direction(hamiltonian: Callable[[Any, Any], Any]) -> LiePoissonWithDirection:
+    """The heavy-top form: `dΠ/dt = Π × ∂H/∂Π + γ × ∂H/∂γ`, `dγ/dt = γ × ∂H/∂Π`, of any H(Π, γ).
+
+    **Arguments:** `hamiltonian` a callable, best a Module, `(Π, γ) → H`, J. For a heavy top give
+    `HeavyTopHamiltonian(inertia, top)`. Keeps H and the Casimirs |γ|² and Π·γ.
+
+    Source: the Lie–Poisson equations of se(3)*; Marsden and Ratiu, Introduction to Mechanics and
+    Symmetry, §1.4.
+
+    **Raises:** `TypeError` for what cannot be called; `ValueError` where H is not one number.
+
+    >>> field = lie_poisson_with_direction(lambda p, g: 0.5 * dot(p, p) - g[2])
+    >>> field(0.0, MomentumAndDirection([0.0, 0, 1], [1.0, 0, 0])).pi.tolist()
+    [0.0, 1.0, 0.0]
+    """
+    return LiePoissonWithDirection(_callable(hamiltonian))
+
+
+def _invertible(inertia: Any) -> _inertia.Inertia:
+    _checks.single(inertia, _inertia.Inertia, "inertia")
+    return validation.possible(inertia, inertia.tensor, None, throw=False)
+
+
+class RotationalHamiltonian(eqx.Module):
+    """H = ½ Π·I⁻¹Π, the energy of rotation.
+
+    **Arguments:** `inertia` about the centre of mass or a fixed point. Called with Π (3,), gives J.
+
+    **Raises:** `TypeError` for what is no `Inertia`; `ValueError` for a moment known to be zero.
+
+    >>> import rigidjax as rj
+    >>> RotationalHamiltonian(rj.Inertia.from_principal(1.0, 1.0, 2.0))([0.0, 0.0, 2.0])
+    Array(1., dtype=float64)
+    """
+
+    inverse: Mat3
+
+    def __init__(self, inertia: _inertia.Inertia):
+        self.inverse = _inertia.inverse(_invertible(inertia).tensor)
+
+    def __call__(self, pi: Float[ArrayLike, "3"] | list[float]) -> Scalar:
+        pi = _checks.floating(pi, (3,), "pi")
+        return 0.5 * dot(pi, apply(self.inverse, pi))
+
+
+class HeavyTopHamiltonian(eqx.Module):
+    """H = ½ Π·I⁻¹Π − m c·γ with γ = Rᵀ g, the energy of a heavy top.
+
+    **Arguments:** `inertia` about the fixed point; `top` a `HeavyTop`, of which m and c are used.
+    Called with Π (3,) and γ (3,), m/s², body frame, gives J. `start` makes the state.
+
+    **Raises:** `TypeError` for an `inertia` that is no `Inertia`, or a `top` that is no `HeavyTop`:
+    another torque has no such Hamiltonian; `ValueError` for a moment known to be zero.
+
+    >>> import rigidjax as rj
+    >>> top = rj.torques.HeavyTop(2.0, [0.0, 0, 0.5], [0.0, 0, -9.81])
+    >>> H = HeavyTopHamiltonian(rj.Inertia.from_principal(1.0, 1.0, 2.0), top)
+    >>> H([0.0, 0.0, 2.0], [0.0, 0.0, -9.81])
+    Array(10.81, dtype=float64)
+    """
+
+    inertia: _inertia.Inertia
+    inverse: Mat3
+    top: HeavyTop
+
+    def __init__(self, inertia: _inertia.Inertia, top: HeavyTop):
+        self.inertia = _invertible(inertia)
+        self.top = _checks.instance(
+            top, HeavyTop, "top", hint="this Hamiltonian is that of gravity alone"
+        )
+        self.inverse = _inertia.inverse(self.inertia.tensor)
+
+    def __call__(
+        self, pi: Float[ArrayLike, "3"] | list[float], gamma: Float[ArrayLike, "3"] | list[float]
+    ) -> Scalar:
+        pi, gamma = _checks.floating(pi, (3,), "pi"), _checks.floating(gamma, (3,), "gamma")
+        return 0.5 * dot(pi, apply(self.inverse, pi)) - self.top.mass * dot(self.top.com, gamma)
+
+    def start(self, state: HasAttitude) -> MomentumAndDirection:
+        """Π = IΩ and γ = Rᵀ g of an attitude and a body rate."""
+        pi: Vec3 = apply(self.inertia.tensor, state.omega)
+        return MomentumAndDirection(pi, quaternion.rotate_inverse(state.q, self.top.gravity))
+
+
+def _callable(hamiltonian):
+    return _checks.function(hamiltonian, "hamiltonian", "of the momentum to H, J")
+
+
+def _of_kind(value, kind, name, why=""):
+    if not isinstance(value, kind):
+        raise TypeError(f"{name}: wanted {kind.__name__}, got {type(value).__name__}{why}")
+    return value
+
+
+def _number(value):
+    return _checks.floating(value, (), "hamiltonian", hint="one number, J")

@@ -1,0 +1,194 @@
+"""The circular restricted three-body problem, in the plane and in space."""
+
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Complex, Float
+
+from rigidjax import _checks
+from rigidjax._types import Mat3, Scalar, ScalarLike, Vec3
+from rigidjax.body._types import Vector
+from rigidjax.frames.point import Point, require_point
+from rigidjax.orbits import lagrange_points, richardson
+from rigidjax.orbits.differential_correction import PeriodicOrbit
+from rigidjax.orbits.reversible_scene import AbstractReversible
+from rigidjax.orbits.state_transition import smallest_distance
+from rigidjax.rotation.linalg3 import components
+
+
+class ThreeBody(AbstractReversible):
+    """A particle under two bodies that circle each other: make one with `orbits.cr3bp(mu)`.
+
+    Rotating axes, origin at the common centre of mass, the first body (mass 1 − μ) at (−μ, 0, 0),
+    the second (mass μ) at (1 − μ, 0, 0). Units: their distance, their total mass, and 1/(their
+    angular rate); a period of theirs is 2π.
+
+    **Fields:** `mu` μ, scalar; `radii` (2,) of the bodies, at which a particle has collided.
+
+    >>> scene = cr3bp(0.5)
+    >>> [float(r) for r in scene.distances(jnp.array([0.0, 0.0, 0.0]))]
+    [0.5, 0.5]
+    """
+
+    mu: Scalar
+    radii: Float[Array, "2"]
+
+    def acceleration(self, t: ScalarLike, state: Point) -> Vec3:
+        """d²x/dt² (3,), rotating axes: attraction, centrifugal and Coriolis (notes, eq 91)."""
+        x, y, z = components(state.x)
+        vx, vy, _ = components(state.v)
+        mu = self.mu.astype(x.dtype)
+        first, second = x + mu, (x - 1) + mu
+        flat = y * y + z * z
+        d1, d2 = first * first + flat, second * second + flat
+        a1, a2 = (1 - mu) / (d1 * jnp.sqrt(d1)), mu / (d2 * jnp.sqrt(d2))
+        pull = a1 + a2
+        return jnp.stack(
+            [
+                2 * vy + x - a1 * first - a2 * second,
+                y - 2 * vx - pull * y,
+                -pull * z,
+            ]
+        )
+
+    def potential(self, x: Vector) -> Scalar:
+        """U = ½(x² + y²) + (1 − μ)/r₁ + μ/r₂ (Szebehely 1967, sec. 1.5, without its constant).
+
+        **Arguments:** `x` (3,), rotating axes.
+        """
+        x = _checks.floating(x, (3,), "x")
+        r1, r2 = self.distances(x)
+        mu = self.mu.astype(x.dtype)
+        return 0.5 * (x[0] * x[0] + x[1] * x[1]) + (1 - mu) / r1 + mu / r2
+
+    def distances(self, x: Vector) -> tuple[Scalar, Scalar]:
+        """How far a place (3,) is from the first and from the second body."""
+        a, b, c = components(_checks.floating(x, (3,), "x"))
+        mu = self.mu.astype(a.dtype)
+        first, second, flat = a + mu, (a - 1) + mu, b * b + c * c
+        return jnp.sqrt(first * first + flat), jnp.sqrt(second * second + flat)
+
+    def jacobi_constant(self, state: Point) -> Scalar:
+        """C = 2U − |v|², kept along the motion (Szebehely 1967, eq 1.5(20)).
+
+        >>> from rigidjax import orbits
+        >>> float(orbits.cr3bp(0.5).jacobi_constant(Point([0.0, 0, 0], [0.0, 0, 0])))
+        4.0
+        """
+        require_point(state)
+        return self.speed_squared(state.x, 0.0) - jnp.sum(state.v * state.v)
+
+    def speed_squared(self, x: Vector, jacobi: ScalarLike) -> Scalar:
+        """|v|² = 2U(x) − C at a place: zero-velocity curves are where it is 0.
+
+        **Arguments:** `x` (3,); `jacobi` C. Negative where a particle with this C cannot come.
+        Draw `matplotlib.pyplot.contour(…, levels=[0])` of it.
+        """
+        u = self.potential(x)
+        return 2 * u - _checks.floating(jacobi, (), "jacobi").astype(u.dtype)
+
+    def zero_velocity(
+        self,
+        xs: Float[ArrayLike, " columns"] | Sequence[float],
+        ys: Float[ArrayLike, " rows"] | Sequence[float],
+    ) -> Float[Array, "rows columns"]:
+        """2U on a grid of the plane z = 0 (rows along y): a particle with constant C keeps to ≥ C.
+
+        **Arguments:** `xs`, `ys` places along the axes. `matplotlib.pyplot.contour(xs, ys, grid,
+        levels=[C])` draws the curve of zero velocity (Szebehely 1967, sec. 4.7).
+
+        >>> from rigidjax import orbits
+        >>> orbits.cr3bp(0.5).zero_velocity([0.0], [0.0]).tolist()
+        [[4.0]]
+        """
+        columns, rows = _checks.numbers(xs, "xs"), _checks.numbers(ys, "ys")
+        if columns.ndim != 1 or rows.ndim != 1 or 0 in (columns.size, rows.size):
+            raise ValueError(
+                f"zero_velocity: wanted xs (N,) and ys (M,), got {columns.shape} and {rows.shape}; "
+                "give the axes, not a mesh"
+            )
+
+        def value(x: Scalar, y: Scalar) -> Scalar:
+            return 2 * self.potential(jnp.stack([x, y, jnp.zeros_like(x)]))
+
+        along = jax.vmap(value, (0, None))
+        return jax.vmap(along, (None, 0))(columns, rows.astype(columns.dtype))
+
+    def conserved(self, t: ScalarLike, state: Point) -> dict[str, Scalar]:
+        return {"jacobi": self.jacobi_constant(state)}
+
+    def approach(self, t: ScalarLike, state: Point) -> tuple[Float[Array, "2"], Float[Array, "2"]]:
+        """Distances from the two bodies, and those at which a run ends, named as a collision."""
+        first, second = self.distances(state.x)
+        gaps = jnp.stack([first, second])
+        return gaps, jnp.maximum(self.radii.astype(gaps.dtype), smallest_distance(gaps.dtype))
+
+    @property
+    def lagrange_points(self) -> Float[Array, "5 3"]:
+        """L1 … L5 (5, 3): see `rigidjax.orbits.lagrange_points.points`."""
+        return lagrange_points.points(self.mu)
+
+    def hessian(self, x: Vector) -> Mat3:
+        """The second derivatives of U (3, 3) at a place."""
+        return jax.hessian(self.potential)(_checks.floating(x, (3,), "x"))
+
+    def exponents(self, x: Vector) -> Complex[Array, "6"]:
+        """The six exponents λ of small motions about an equilibrium in the plane, e^{λt}.
+
+        **Arguments:** `x` (3,), such as a row of `lagrange_points`. Stable (to first order) where
+        no real part is positive: L4 and L5 below Routh's μ = ½(1 − √(23/27)), L1–L3 never.
+        In the plane λ⁴ + (4 − U_xx − U_yy) λ² + U_xx U_yy − U_xy² = 0, across it λ² = U_zz
+        (Szebehely 1967, sec. 5.2).
+
+        >>> from rigidjax import orbits
+        >>> moon = orbits.cr3bp(0.0121505856)
+        >>> bool((moon.exponents(moon.lagrange_points[3]).real < 1e-12).all())
+        True
+        """
+        u = self.hessian(x)
+        middle = 0.5 * (4 - u[0, 0] - u[1, 1])
+        product = u[0, 0] * u[1, 1] - u[0, 1] * u[0, 1]
+        kind = jnp.complex128 if u.dtype == jnp.float64 else jnp.complex64
+        half = jnp.sqrt((middle * middle - product).astype(kind))
+        squares = jnp.stack([half - middle, -half - middle, u[2, 2].astype(half.dtype)])
+        roots = jnp.sqrt(squares)
+        return jnp.concatenate([roots, -roots])
+
+    def lyapunov_guess(self, point: int, amplitude: ScalarLike) -> PeriodicOrbit:
+        """A start near a planar Lyapunov orbit about L1, L2 or L3, for `periodic_orbit`.
+
+        **Arguments:** `point` 1, 2 or 3; `amplitude` along x. Source: `richardson.guess`.
+        """
+        return richardson.guess(self.mu, point, amplitude, None)
+
+    def halo_guess(self, point: int, amplitude: ScalarLike) -> PeriodicOrbit:
+        """A start near a halo orbit about L1, L2 or L3, for `periodic_orbit(…, hold="z")`.
+
+        **Arguments:** `point` 1, 2 or 3; `amplitude` along z, its sign the branch. Source:
+        Richardson 1980, doi:10.1007/BF01229511 (third order).
+        """
+        return richardson.guess(self.mu, point, None, amplitude)
+
+
+def cr3bp(mu: ScalarLike, radii: Float[Array, "2"] | object = (0.0, 0.0)) -> ThreeBody:
+    """The circular restricted three-body problem with mass ratio μ.
+
+    **Arguments:** `mu` μ = m₂/(m₁ + m₂), 0 < μ ≤ ½ (Earth–Moon 0.01215…); `radii` (2,) of the two
+    bodies in units of their distance: a run that comes closer ends with a collision's name, time
+    and distance. With zeros it ends where float64 can no longer tell the place from the body.
+
+    **Raises:** `ValueError` for μ outside (0, ½] (`EquinoxRuntimeError` under `jit`).
+
+    Source: notes, eq 91, with a uniform Ω = (0, 0, 1); Szebehely 1967, Theory of Orbits.
+
+    >>> cr3bp(0.5).lagrange_points[3].round(12).tolist()
+    [0.0, 0.866025403784, 0.0]
+    """
+    ratio = _checks.floating(mu, (), "mu")
+    bad = ~((ratio > 0) & (ratio <= 0.5))
+    ratio = _checks.refuse(
+        ratio, bad, "mu: wanted 0 < mu ≤ ½, the mass of the lighter body over that of both"
+    )
+    radii = _checks.floating(list(radii) if isinstance(radii, tuple) else radii, (2,), "radii")
+    return ThreeBody(ratio, _checks.refuse(radii, ~(radii >= 0), "radii: wanted two numbers ≥ 0"))

@@ -1,0 +1,233 @@
+"""Periodic orbits by Newton's method, with the derivatives of the family they belong to."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float
+
+from rigidjax import _checks
+from rigidjax._types import Scalar, ScalarLike
+from rigidjax.frames.point import Point
+from rigidjax.orbits.state_transition import attempt
+from rigidjax.rotation.linalg3 import components
+
+_NAMES = ("x", "z", "vy", "period")
+MAX_STEPS = 25
+
+
+class PeriodicOrbit(eqx.Module):
+    """A periodic orbit: a state on it, and its period.
+
+    **Arguments:** `state` a `Point`; `period` its period, in the scene's unit of time. Many: the
+    same leading axes before both.
+
+    >>> float(PeriodicOrbit(Point([0.9, 0, 0], [0.0, -0.5, 0]), 3.0).period)
+    3.0
+    """
+
+    state: Point
+    period: Float[Array, "*batch"]
+
+    def __init__(self, state: Point, period: ScalarLike):
+        if not isinstance(state, Point):
+            raise TypeError(f"state: wanted a Point(x, v), got {type(state).__name__}")
+        _checks.floating(state.x, (3,), "state.x", batched=True)
+        self.state = state
+        period = _checks.floating(period, (), "period", batched=True)
+        _checks.same_batch(state=(state.x, 1), period=(period, 0))
+        self.period = period.astype(state.x.dtype)
+
+
+def correct(
+    scene: Any, guess: PeriodicOrbit, hold: str, tolerance: float | None = None
+) -> PeriodicOrbit:
+    """The orbit near `guess` that crosses y = 0 at right angles twice: see `periodic_orbit`.
+
+    **Raises:** `ValueError` (`EquinoxRuntimeError` under `jit`) if Newton does not converge.
+
+    >>> from rigidjax import orbits
+    >>> hill = orbits.hill()
+    >>> orbit = correct(hill, PeriodicOrbit(Point([0.3, 0, 0], [0.0, 1.6, 0]), 1.2), "x")
+    >>> round(float(orbit.period), 3)
+    1.404
+    """
+    numbers, index = crossing(guess), named(hold)
+    free = np.array([i for i in range(4) if i != index])
+    if tolerance is None:
+        tolerance = usual_tolerance(numbers)
+    unknown, left = _solve(scene, numbers[free], numbers[index], index, tolerance)
+    bad = ~(left <= tolerance)
+    said = f" ({float(left):.1e} left at half period)" if _checks.known(left) else ""
+    unknown = _checks.refuse(
+        unknown,
+        bad,
+        f"periodic_orbit: Newton's method found no orbit near the guess{said}; start nearer, "
+        "hold another of x, z, vy, period, or loosen the tolerance",
+    )
+    found = together(unknown, numbers[index], index)
+    # A half period of zero solves the equations of every start.
+    ratio = found[3] / numbers[3]
+    found = _checks.refuse(
+        found,
+        ~((ratio > 0.5) & (ratio < 2)),
+        "periodic_orbit: Newton's method went from the guess to an orbit of less than half or more "
+        "than twice its period; start nearer",
+    )
+    return orbit_of(found)
+
+
+def named(hold: str) -> int:
+    """Which of the four numbers of a crossing `hold` names.
+
+    >>> named("vy")
+    2
+    """
+    if hold not in _NAMES:
+        raise ValueError(f"hold: wanted one of {', '.join(_NAMES)}, got {hold!r}")
+    return _NAMES.index(hold)
+
+
+def crossing(guess: PeriodicOrbit) -> Float[Array, "4"]:
+    """The four numbers of an orbit that crosses y = 0 at a right angle: x, z, v_y, T/2.
+
+    >>> crossing(PeriodicOrbit(Point([0.9, 0, 0.1], [0.0, -0.5, 0]), 3.0)).tolist()
+    [0.9, 0.1, -0.5, 1.5]
+    """
+    if not isinstance(guess, PeriodicOrbit):
+        raise TypeError(
+            f"guess: wanted a PeriodicOrbit(state, period), got {type(guess).__name__}; "
+            "lyapunov_guess and halo_guess make one"
+        )
+    x, v = guess.state.x, guess.state.v
+    if x.ndim != 1:
+        raise ValueError(f"guess: wanted one orbit, x of shape (3,), got {x.shape}; use jax.vmap")
+    slant = jnp.maximum(jnp.abs(x[1]), jnp.maximum(jnp.abs(v[0]), jnp.abs(v[2])))
+    x = _checks.refuse(
+        x,
+        slant > 1e-6,
+        "guess: wanted a start that crosses y = 0 at a right angle: y = vx = vz = 0",
+    )
+    period = _checks.refuse(
+        guess.period, ~(guess.period > 0), "guess: wanted a period that is positive"
+    )
+    return _checks.finite(jnp.stack([x[0], x[2], v[1], 0.5 * period]), "guess")
+
+
+def orbit_of(numbers: Float[Array, "4"]) -> PeriodicOrbit:
+    """The inverse of `crossing`.
+
+    >>> orbit_of(jnp.array([0.9, 0.1, -0.5, 1.5])).state.v.tolist()
+    [0.0, -0.5, 0.0]
+    """
+    x, z, vy, half = components(numbers)
+    zero = jnp.zeros_like(x)
+    return PeriodicOrbit(Point(jnp.stack([x, zero, z]), jnp.stack([zero, vy, zero])), 2 * half)
+
+
+def together(unknown: Float[Array, "3"], held: Scalar, index: int) -> Float[Array, "4"]:
+    """The four numbers of a crossing, the held one put in its place among the others.
+
+    >>> together(jnp.array([1.0, 2.0, 3.0]), jnp.asarray(9.0), 1).tolist()
+    [1.0, 9.0, 2.0, 3.0]
+    """
+    parts = [unknown[0], unknown[1], unknown[2]]
+    parts.insert(index, held)
+    return jnp.stack(parts)
+
+
+def usual_tolerance(numbers: Array) -> float:
+    """What is left of y, v_x, v_z at the half period: 1e-12, in float32 1e-4.
+
+    >>> usual_tolerance(jnp.zeros(4))
+    1e-12
+    """
+    return 1e-12 if numbers.dtype == jnp.float64 else 1e-4
+
+
+def miss(scene: Any, numbers: Float[Array, "4"]) -> Float[Array, "3"]:
+    """y, v_x and v_z at the half period: what makes an orbit periodic where they vanish.
+
+    >>> from rigidjax import orbits
+    >>> miss(orbits.hill(), jnp.array([3.0 ** (-1 / 3), 0.0, 0.0, 0.0])).tolist()
+    [0.0, 0.0, 0.0]
+    """
+    orbit = orbit_of(numbers)
+    tight = float(jnp.finfo(numbers.dtype).eps)
+    end = attempt(scene, orbit.state, 0.5 * orbit.period, 200 * tight, 10 * tight)
+    return jnp.stack([end.x[1], end.v[0], end.v[2]])
+
+
+def value_and_jacobian(f: Any, x: Array) -> tuple[Array, Array]:
+    """f(x) and its Jacobian from one pass in forward mode.
+
+    >>> value_and_jacobian(lambda x: x**2, jnp.array([3.0]))[1].tolist()
+    [[6.0]]
+    """
+    value, columns = jax.vmap(lambda e: jax.jvp(f, (x,), (e,)), out_axes=(None, 1))(
+        jnp.eye(x.shape[0], dtype=x.dtype)
+    )
+    return value, columns
+
+
+# Newton itself is not differentiated: the rule below is linear in the tangents, so that the same
+# one serves jacfwd and grad although the solves within run in forward mode.
+@eqx.filter_jit
+def _solve(scene: Any, unknown: Array, held: Array, index: int, tolerance: float) -> Any:
+    return corrected(index, float(tolerance), scene, unknown, held)
+
+
+@eqx.filter_custom_jvp
+def corrected(index: int, tolerance: float, scene: Any, unknown: Array, held: Array) -> Any:
+    def keep_on(carry: Any) -> Any:
+        _, left, count = carry
+        return (left > 0.1 * tolerance) & (count < MAX_STEPS)
+
+    def step(carry: Any) -> Any:
+        unknown, _, count = carry
+        missed, slope = value_and_jacobian(lambda u: miss(scene, together(u, held, index)), unknown)
+        moved = unknown - jnp.linalg.solve(slope, missed)
+        # The miss before the last move says how good the last start was; stop once it is small.
+        return jnp.where(jnp.isfinite(moved), moved, unknown), jnp.max(jnp.abs(missed)), count + 1
+
+    carry = unknown, jnp.full_like(held, jnp.inf), 0
+    unknown, _, _ = lax.while_loop(keep_on, step, carry)
+    return unknown, jnp.max(jnp.abs(miss(scene, together(unknown, held, index))))
+
+
+@corrected.def_jvp
+def _corrected_jvp(primals: Any, tangents: Any) -> Any:
+    index, tolerance, scene, unknown, held = primals
+    _, _, scene_dot, _, held_dot = tangents
+    found, left = corrected(index, tolerance, scene, unknown, held)
+    # All derivatives of the miss as one matrix, so that the rule stays linear in the tangents and
+    # can be transposed.
+    numbers, rest = eqx.partition(scene, eqx.is_inexact_array)
+    leaves, tree = jax.tree.flatten(numbers)
+    flat, unflatten = ravel_pytree((leaves, held, found))
+
+    def missed(flat: Array) -> Array:
+        leaves, held, unknown = unflatten(flat)
+        whole = eqx.combine(jax.tree.unflatten(tree, leaves), rest)
+        return miss(whole, together(unknown, held, index))
+
+    matrix = jax.jacfwd(missed)(flat)
+    dots = [
+        jnp.zeros_like(leaf) if dot is None else dot
+        for leaf, dot in zip(leaves, _tangents(numbers, scene_dot), strict=True)
+    ]
+    held_dot = jnp.zeros_like(held) if held_dot is None else held_dot
+    pushed, _ = ravel_pytree((dots, held_dot))
+    moved = jnp.sum(matrix[:, :-3] * pushed[None], axis=1)
+    total = -jnp.linalg.solve(matrix[:, -3:], moved)
+    return (found, left), (total, jnp.zeros_like(left))
+
+
+def _tangents(numbers: Any, dots: Any) -> list[Any]:
+    """The tangents that belong to the leaves of `numbers`; `None` where there is none."""
+    paths = {path: leaf for path, leaf in jax.tree.leaves_with_path(dots) if leaf is not None}
+    return [paths.get(path) for path, _ in jax.tree.leaves_with_path(numbers)]

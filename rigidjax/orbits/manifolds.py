@@ -1,0 +1,237 @@
+"""Stable and unstable manifolds of periodic orbits, and where a family branches."""
+
+from typing import Any
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
+
+from rigidjax import _checks
+from rigidjax._types import Scalar, ScalarLike
+from rigidjax.frames.point import Point
+from rigidjax.orbits import continuation, state_transition
+from rigidjax.orbits.differential_correction import PeriodicOrbit, crossing, named
+from rigidjax.solve import ending
+
+# Time run backwards is seen in the mirror y → −y: x, y, z, vx, vy, vz.
+_MIRROR = np.array([1.0, -1.0, 1.0, -1.0, 1.0, -1.0])
+_TIGHT = dict(rtol=1e-13, atol=1e-14)
+# What is left of an eigenvector after each step of inverse iteration is a hundredth at most.
+_ITERATIONS = 12
+_MOST = 60
+
+
+class Manifold(eqx.Module):
+    """Motions that come from a periodic orbit, or go to it.
+
+    **Fields:** `ts` (T,) since the start near the orbit, in the scene's unit: falling for a stable
+    manifold; `states` a `Point` with axes (N, T): one motion for each phase, NaN after a collision;
+    `phases` (N,) where on the orbit each begins, in periods; `multiplier` λ by which a small
+    distance along it changes in a period.
+
+    >>> from rigidjax import orbits
+    >>> ts, phases = jnp.array([0.0, 0.1]), jnp.array([0.0])
+    >>> states = Point(jnp.zeros((1, 2, 3)), jnp.zeros((1, 2, 3)))
+    >>> orbits.Manifold(ts, states, phases, jnp.asarray(2.5)).states.x.shape
+    (1, 2, 3)
+    """
+
+    ts: Float[Array, " T"]
+    states: Point
+    phases: Float[Array, " N"]
+    multiplier: Float[Array, ""]
+
+
+def unstable(monodromy: Float[Array, "6 6"]) -> tuple[Scalar, Float[Array, "6"]]:
+    """The multiplier λ of an orbit that is largest in size, and its eigenvector, of length 1.
+
+    λ is from traces (`stability_indices`), the vector by inverse iteration and one bordered solve,
+    which has the derivative of the vector. NaN where no multiplier is real and larger than 1.
+
+    >>> value, vector = unstable(jnp.diag(jnp.array([4.0, 0.25, 1.0, 1.0, 1.0, 1.0])))
+    >>> round(float(value), 12), round(float(vector[0]), 12)
+    (4.0, 1.0)
+    """
+    index = continuation.stability_indices(monodromy)
+    real = jnp.abs(index.imag) <= 1e-6 * jnp.abs(index)
+    size = jnp.where(real, jnp.abs(index.real), 0.0)
+    index = jnp.where(size[0] >= size[1], index.real[0], index.real[1])
+    free = jnp.max(size) > 1
+    safe = jnp.where(free, index, 2.0)
+    value = safe + jnp.sign(safe) * jnp.sqrt(safe * safe - 1)
+    eye = jnp.eye(6, dtype=monodromy.dtype)
+    # A shift off the root of round-off: else the matrix may be singular to the last digit.
+    near = value * (1 + jnp.finfo(value.dtype).eps ** 0.5)
+    still, shift = lax.stop_gradient((monodromy, near))
+
+    def closer(_: Array, both: Any) -> Any:
+        right, left = both
+        right = jnp.linalg.solve(still - shift * eye, right)
+        left = jnp.linalg.solve((still - shift * eye).T, left)
+        return right / jnp.sqrt(jnp.sum(right**2)), left / jnp.sqrt(jnp.sum(left**2))
+
+    first = jnp.asarray(np.full(6, 6**-0.5), monodromy.dtype)
+    right, left = lax.fori_loop(0, _ITERATIONS, closer, (first, first))
+    # (M − λ) v + m left = 0, right · v = 1.
+    top = jnp.concatenate([monodromy - value * eye, left[:, None]], 1)
+    last = jnp.concatenate([right, jnp.zeros(1, right.dtype)])[None]
+    wanted = jnp.zeros(7, right.dtype).at[6].set(1)
+    vector = jnp.linalg.solve(jnp.concatenate([top, last]), wanted)[:6]
+    vector = vector / jnp.sqrt(jnp.sum(vector**2))
+    vector = vector * lax.stop_gradient(jnp.where(vector[0] < 0, -1.0, 1.0))
+    return jnp.where(free, value, jnp.nan), jnp.where(free, vector, jnp.nan)
+
+
+def branch(
+    scene: Any, orbit: PeriodicOrbit, phase: Scalar, which: str, side: int, distance: Scalar
+) -> tuple[Point, Scalar]:
+    """The start at `phase`, and the multiplier: see `AbstractReversible.manifold_start`."""
+    _checks.word(which, ("stable", "unstable"), "which")
+    if isinstance(side, bool) or side not in (1, -1):
+        raise ValueError(f"side: wanted 1, to larger x at the orbit's start, or -1, got {side!r}")
+    crossing(orbit)
+    return _branch(scene, orbit, phase, which, side, distance)
+
+
+@eqx.filter_jit
+def _branch(
+    scene: Any, orbit: PeriodicOrbit, phase: Scalar, which: str, side: int, distance: Scalar
+) -> tuple[Point, Scalar]:
+    value, vector = unstable(scene.monodromy(orbit))
+    # The mirror turns the unstable manifold into the stable one, and the phase round.
+    turned = phase if which == "unstable" else -phase
+    turned = turned - lax.stop_gradient(jnp.floor(turned))
+
+    def later(numbers: Array) -> Array:
+        start = Point(numbers[:3], numbers[3:])
+        end = state_transition.flow(scene, start, turned * orbit.period, **_TIGHT)
+        return jnp.concatenate([end.x, end.v])
+
+    start = jnp.concatenate([orbit.state.x, orbit.state.v])
+    there, along = jax.jvp(later, (start,), (vector,))
+    numbers = there + side * distance * along / jnp.sqrt(jnp.sum(along * along))
+    if which == "stable":
+        numbers = numbers * jnp.asarray(_MIRROR, numbers.dtype)
+        value = 1 / value
+    return Point(numbers[:3], numbers[3:]), value
+
+
+def manifold(
+    scene: Any,
+    orbit: PeriodicOrbit,
+    which: str,
+    time: ScalarLike | None,
+    side: int,
+    count: int,
+    samples: int,
+    distance: ScalarLike,
+) -> Manifold:
+    """See `AbstractReversible.manifold`."""
+    count, samples = _checks.whole(count, "count", 1), _checks.whole(samples, "samples", 2)
+    dtype = orbit.state.x.dtype if isinstance(orbit, PeriodicOrbit) else None
+    distance = _positive(distance, "distance", dtype)
+    phases = jnp.arange(count).astype(distance.dtype) / count
+    starts, value = jax.vmap(lambda p: branch(scene, orbit, p, which, side, distance))(phases)
+    value = _checks.refuse(
+        value[0],
+        jnp.isnan(value[0]),
+        "manifold: the orbit has no multiplier that is real and larger than 1: it is stable to "
+        "first order, or spirals",
+    )
+    length = 2 * orbit.period if time is None else _positive(time, "time", dtype)
+    ts = jnp.linspace(jnp.zeros_like(length), length, samples)
+    states = _paths(scene, starts, ts, which)
+    return Manifold(ts if which == "unstable" else -ts, states, phases, value)
+
+
+def _positive(value: ScalarLike, name: str, dtype: Any) -> Array:
+    found = _checks.floating(value, (), name)
+    found = found if dtype is None else found.astype(dtype)
+    return _checks.refuse(found, ~(found > 0), f"{name}: wanted a positive number")
+
+
+@eqx.filter_jit
+def _paths(scene: Any, starts: Point, ts: Array, which: str) -> Point:
+    mirror = jnp.asarray(_MIRROR, ts.dtype)
+    turn = which == "stable"
+
+    def seen(state: Point) -> Point:
+        # Mirrored, the way back is a way forth.
+        return Point(state.x * mirror[:3], state.v * mirror[3:]) if turn else state
+
+    def path(start: Point) -> Point:
+        out = dfx.diffeqsolve(
+            dfx.ODETerm(scene.field),
+            dfx.Dopri8(),
+            ts[0],
+            ts[-1],
+            None,
+            seen(start),
+            saveat=dfx.SaveAt(ts=ts),
+            stepsize_controller=dfx.PIDController(rtol=1e-11, atol=1e-12),
+            event=dfx.Event(ending.Ends(scene)),
+            adjoint=dfx.ForwardMode(),
+            max_steps=100_000,
+            throw=False,
+        )
+        there: Any = jnp.isfinite(jnp.asarray(out.ts))[:, None]
+        ys: Any = jax.tree.map(lambda leaf: jnp.where(there, leaf, jnp.nan), out.ys)
+        return jax.vmap(seen)(ys)
+
+    return jax.vmap(path)(starts)
+
+
+def bifurcation(
+    scene: Any, orbit: PeriodicOrbit, other: PeriodicOrbit, index: int, value: float, hold: str
+) -> PeriodicOrbit:
+    """`AbstractReversible.bifurcation`: the Illinois method between two members, on the host."""
+    place = named(hold)
+    if isinstance(index, bool) or index not in (0, 1):
+        raise ValueError(f"index: wanted 0 or 1, which of the two stability indices, got {index!r}")
+    value = _checks.number(value, "value")
+    ends = [np.asarray(crossing(one)) for one in (orbit, other)]
+    left, right = (scene.periodic_orbit(one, hold=hold) for one in (orbit, other))
+    low, high = (_index(scene, one, index) - value for one in (left, right))
+    if not low * high <= 0:
+        raise ValueError(
+            f"bifurcation: the index is {low + value:.6g} at one orbit, {high + value:.6g} at the "
+            f"other: {value:g} does not lie between"
+        )
+    a, b = float(ends[0][place]), float(ends[1][place])
+    width = abs(b - a)
+    found, at_found = (left, low) if abs(low) < abs(high) else (right, high)
+    for _ in range(_MOST):
+        if abs(b - a) <= 1e-13 * max(1.0, width) or at_found == 0:
+            break
+        part = low / (low - high)
+        middle = a + (b - a) * min(max(part, 1e-3), 1 - 1e-3)
+        share = (middle - a) / (b - a)
+        guess = jax.tree.map(lambda x, y, s=share: (1 - s) * x + s * y, left, right)
+        found = scene.periodic_orbit(guess, hold=hold)
+        at_found = _index(scene, found, index) - value
+        if abs(at_found) < 1e-12 * max(1.0, abs(value)):
+            break
+        if at_found * high > 0:
+            b, right, high, low = middle, found, at_found, 0.5 * low
+        else:
+            a, left, low, high = middle, found, at_found, 0.5 * high
+    return found
+
+
+def _index(scene: Any, orbit: PeriodicOrbit, index: int) -> float:
+    found = np.asarray(_indices(scene, orbit))[index]
+    if abs(found.imag) > 1e-9 * max(1.0, abs(found)):
+        raise ValueError(
+            "bifurcation: the stability indices are complex at a member between the orbits; give "
+            "orbits nearer to each other"
+        )
+    return float(found.real)
+
+
+@eqx.filter_jit
+def _indices(scene: Any, orbit: PeriodicOrbit) -> Array:
+    return scene.stability_indices(orbit)

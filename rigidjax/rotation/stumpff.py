@@ -1,0 +1,124 @@
+"""Smooth kernels of θ², right with all their derivatives from θ = 0 upwards.
+
+Rotations need sin θ/θ, (1 − cos θ)/θ², (θ − sin θ)/θ³, … as functions of t = θ². These are the
+Stumpff functions c_k(t) = Σ (−t)ⁿ/(k + 2n)!  (Stumpff 1959; Battin 1999, sec. 4.5). Their
+derivatives are Stumpff functions again,
+
+    c_k' = ½ (k c_{k+2} − c_{k+1}),
+
+so that every derivative, of any order, is computed without a cancelling quotient. Polynomials on a
+reduced range stand in for libm's sine and cosine, which run one lane at a time on CPU.
+"""
+
+import math
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+# Largest tan² of an eighth of a turn's quarter: the reach of `arctan_ratio`.
+_REACH = math.tan(math.pi / 8) ** 2
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def stumpff(k: int, t: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Stumpff function c_k(t) = Σ (−t)ⁿ/(k + 2n)!, for t = θ² ≥ 0.
+
+    **Arguments:** `k` ≥ 0, a Python integer: 0 is cos θ, 1 is sin θ/θ, 2 is (1 − cos θ)/θ², 3 is
+    (θ − sin θ)/θ³. `t` of any shape, dimensionless.
+
+    **Returns:** an array like `t`, right to a few units of round-off of 1/k!; so are its
+    derivatives of every order (c_k' = ½ (k c_{k+2} − c_{k+1}); Battin 1999, eq 4.80 and problem).
+
+    >>> float(stumpff(1, jnp.asarray(0.0)))
+    1.0
+    """
+    if k < 2:
+        return _cosine_or_sinc(k, t)
+    # From t = π² on, c_{j+2} = (1/j! − c_j)/t loses nothing that matters.
+    limit = math.pi**2
+    far = t > limit
+    divisor = jnp.where(far, t, 1)
+    value = _cosine_or_sinc(k % 2, t)
+    for j in range(k % 2, k - 2, 2):
+        value = (1 / math.factorial(j) - value) / divisor
+    near = _polynomial(k, jnp.where(far, 0, t), limit)
+    return jnp.where(far, 1 / math.factorial(k - 2) - value, near) / divisor
+
+
+@stumpff.defjvp
+def _stumpff_jvp(k: int, primals: Any, tangents: Any) -> tuple[Any, Any]:
+    (t,), (dt,) = primals, tangents
+    slope = k * stumpff(k + 2, t) - stumpff(k + 1, t) if k else -stumpff(1, t)
+    return stumpff(k, t), 0.5 * slope * dt
+
+
+def inverse_kernel(t: Float[Array, "..."]) -> Float[Array, "..."]:
+    """The kernel (1 − (θ/2) cot(θ/2))/θ² of the inverse Jacobians, for t = θ² < (2π)².
+
+    **Arguments:** `t` of any shape, dimensionless. Written as (c_3 − 2c_4)/c_1(t/4)², which is
+    1/12 at 0 without a quotient of vanishing numbers, and 1/π² at a half turn.
+
+    >>> round(float(inverse_kernel(jnp.asarray(0.0))), 12)
+    0.083333333333
+    """
+    return (stumpff(3, t) - 2 * stumpff(4, t)) / stumpff(1, 0.25 * t) ** 2
+
+
+def arctan_ratio(z: Float[Array, "..."]) -> Float[Array, "..."]:
+    """arctan(√z)/√z for 0 ≤ z ≤ tan²(π/8), by its Taylor series (Abramowitz & Stegun 4.4.42).
+
+    **Arguments:** `z` of any shape, dimensionless. Halve an angle twice to come into this range.
+
+    >>> float(arctan_ratio(jnp.asarray(0.0)))
+    1.0
+    """
+    tiny = jnp.finfo(z.dtype).eps / 4
+    terms = next(n for n in range(1, 40) if _REACH**n / (2 * n + 1) < tiny)
+    return _horner([(-1) ** n / (2 * n + 1) for n in range(terms)], z)
+
+
+def _cosine_or_sinc(k: int, t: Float[Array, "..."]) -> Float[Array, "..."]:
+    """The cosine (k = 0) or sin θ/θ (k = 1) from t = θ²; beyond π/2, θ is reduced by kπ."""
+    limit = (math.pi / 2) ** 2
+    far = t > limit
+    theta = jnp.sqrt(jnp.where(far, t, 1))
+    turns = jnp.round(theta * (1 / math.pi))
+    head, tail = _split_pi(t.dtype)
+    # turns × head is exact (Cody & Waite 1980), so the remainder is as good as θ itself.
+    remainder = (theta - turns * head) - turns * tail
+    # Of a θ beyond 1/ε nothing is left but its round-off: keep to where polynomials are good.
+    remainder = jnp.clip(remainder, -2.0, 2.0)
+    value = _polynomial(k, jnp.where(far, remainder * remainder, t), limit)
+    value = value * jnp.where(far, remainder, 1) if k else value
+    # The sign goes into a division although a product would do: XLA on CPU computes a quotient
+    # once, but repeats a polynomial in each place where it is used.
+    sign = 1 - 2 * (turns - 2 * jnp.floor(0.5 * turns))
+    return value / jnp.where(far, sign * theta if k else sign, 1)
+
+
+def _split_pi(dtype: Any) -> tuple[float, float]:
+    """π = head + tail, the head short enough that head × (whole number) is exact."""
+    bits = 20 if dtype == jnp.float64 else 10
+    head = float(np.floor(math.pi * 2.0 ** (jnp.finfo(dtype).nmant - bits)))
+    head *= 2.0 ** (bits - jnp.finfo(dtype).nmant)
+    # π − head in float64, with the digits of π that float64 has not.
+    return head, (math.pi - head) + 1.2246467991473532e-16
+
+
+def _polynomial(k: int, t: Float[Array, "..."], limit: float) -> Float[Array, "..."]:
+    """As many Taylor terms of c_k as reach round-off at t = limit."""
+    tiny = jnp.finfo(t.dtype).eps / 8
+    size = 1 / math.factorial(k)
+    terms = next(n for n in range(1, 40) if limit**n / math.factorial(k + 2 * n) < tiny * size)
+    return _horner([(-1) ** n / math.factorial(k + 2 * n) for n in range(terms)], t)
+
+
+def _horner(coefficients: list[float], x: Float[Array, "..."]) -> Float[Array, "..."]:
+    value = jnp.full_like(x, coefficients[-1])
+    for coefficient in coefficients[-2::-1]:
+        value = value * x + coefficient
+    return value

@@ -1,0 +1,100 @@
+"""How bright a lit body looks: ellipsoids in closed form, convex meshes by their faces.
+
+The brightness is the light that reaches the observer from all that is lit and seen,
+`∫ f(μ₀, μ) dA`, with μ₀ and μ the cosines of incidence and emission. It is counted as an area: the
+laws are scaled so that a sphere of radius r at zero phase has π r² under each of them.
+"""
+
+import jax.numpy as jnp
+from jaxtyping import ArrayLike, Float, Int
+
+from rigidjax import _checks
+from rigidjax._names import own_names
+from rigidjax._types import Scalar
+from rigidjax.body import validation
+from rigidjax.body._types import Numbers, Vector
+from rigidjax.body.meshes import faces_of
+from rigidjax.body.scaling import exponent_of, times_power_of_two
+from rigidjax.tumblers.scattering import (
+    AbstractScattering as AbstractScattering,
+    Geometric as Geometric,
+    Lambert as Lambert,
+    LommelSeeliger as LommelSeeliger,
+    direction,
+    law_of,
+)
+
+
+def ellipsoid(
+    semi_axes: Vector, sun: Vector, observer: Vector, scattering: AbstractScattering | None = None
+) -> Scalar:
+    """Brightness of a triaxial ellipsoid, m²: for a sphere at zero phase π r².
+
+    **Arguments:** `semi_axes` (3,) along x, y, z, m; `sun`, `observer` (3,) directions from the
+    body to them, body frame, any length; `scattering` the law: `LommelSeeliger()` (also for
+    `None`), `Geometric()`, `Lambert()`. Differentiable in all numbers, at zero phase and for a
+    sphere, too. For many directions use `jax.vmap`.
+
+    **Raises:** `ValueError`, `TypeError` for a wrong shape, a semi-axis that is not positive, a
+    direction of length zero, NaN (`equinox` error under `jit`).
+
+    >>> round(float(ellipsoid([3.0, 2.0, 1.0], [0, 0, 1.0], [0, 0, 1.0])) / jnp.pi, 12)
+    6.0
+    """
+    law = law_of(scattering)
+    a = _checks.finite(_checks.floating(semi_axes, (3,), "semi_axes"), "semi_axes")
+    a = _checks.refuse(a, (~(a > 0)).any(), "semi_axes: wanted three positive lengths, m")
+    s, o = direction(sun, "sun").astype(a.dtype), direction(observer, "observer").astype(a.dtype)
+    # The fourth power of the axes is taken: a power of two keeps it in range.
+    size = exponent_of(a)
+    a = times_power_of_two(a, -size)
+    return times_power_of_two(law.of_ellipsoid(jnp.diag(a * a), s, o), 2 * size)
+
+
+def mesh(
+    vertices: Float[ArrayLike, "n 3"] | Numbers,
+    faces: Int[ArrayLike, "m 3"] | Numbers,
+    sun: Vector,
+    observer: Vector,
+    scattering: AbstractScattering | None = None,
+) -> Scalar:
+    """Brightness of a convex body by its faces, m²: `Σ f(μ₀, μ) area` of those lit and seen.
+
+    Of a body that is not convex it is what it would be without shadows.
+
+    **Arguments:** `vertices`, `faces` as for `rigidjax.shapes.mesh`; the others as for `ellipsoid`.
+    Differentiable in the vertices and directions: a face that is just coming to light has the
+    derivative of a dark one.
+
+    Source: Kaasalainen and Torppa 2001, Icarus 153:24, doi:10.1006/icar.2001.6673.
+
+    **Raises:** as `ellipsoid`, and as `rigidjax.shapes.mesh` for faces.
+
+    >>> corners = [[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]
+    >>> sides = [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]
+    >>> float(mesh(corners, sides, [0, 0, -1.0], [0, 0, -1.0]))
+    0.5
+    """
+    law = law_of(scattering)
+    corners = _checks.rows(vertices, (3,), "vertices", hint="one row (x, y, z) per vertex")
+    if validation.known(corners):
+        _checks.finite(corners, "vertices")
+    table = faces_of(faces, corners.shape[0])
+    s, o = (
+        direction(v, name).astype(corners.dtype)
+        for v, name in ((sun, "sun"), (observer, "observer"))
+    )
+    first, second, third = (corners[table[:, k]] for k in range(3))
+    double = jnp.cross(second - first, third - first)
+    lit, seen = (double * s[None, :]).sum(axis=1), (double * o[None, :]).sum(axis=1)
+    size = (double * double).sum(axis=1)
+    both = (lit > 0) & (seen > 0) & (size > 0)
+    # What is dark must not reach the derivative.
+    length = jnp.sqrt(jnp.where(both, size, 1.0))
+    sent = law.per_area(
+        jnp.where(both, lit, length) / length, jnp.where(both, seen, length) / length
+    )
+    return jnp.where(both, 0.5 * length * sent, 0.0).sum()
+
+
+__dir__ = own_names(__name__)

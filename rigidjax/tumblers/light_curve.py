@@ -1,0 +1,320 @@
+"""A tumbling body from its brightness alone: every motion that explains it, none left out."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float
+
+from rigidjax import _checks, exact
+from rigidjax.body.inertia import MassProperties
+from rigidjax.identify import padding, uncertainty
+from rigidjax.identify.checkpoint import Tried
+from rigidjax.identify.fit import fit
+from rigidjax.identify.parameters import Parameters
+from rigidjax.identify.problem import Problem, one_problem
+from rigidjax.identify.quantities import carried, quantities
+from rigidjax.identify.result import Fit
+from rigidjax.identify.several_bodies import Bodies
+from rigidjax.motion.torques.base import vector_at
+from rigidjax.rotation import quaternion
+from rigidjax.rotation.linalg3 import apply, dot
+from rigidjax.tumblers.search import (
+    MAGNITUDE,
+    descended,
+    noise_of,
+    relative_flux,
+    starts_of,
+)
+from rigidjax.tumblers.sensor import Brightness
+from rigidjax.tumblers.two_frequencies import TwoFrequencies, two_frequencies
+
+# Motions are the same where both periods and both ratios of moments differ by less than that, or
+# by less than so many of their standard deviations.
+SAME, REACH = np.array([1e-3, 1e-3, 0.05, 0.05]), 5.0
+# Log-likelihood within which a rival explains the data nearly as well: e¹⁰ to one.
+MARGIN = 10.0
+# Seen from a side a real body is brighter or fainter than its ellipsoid by this standard deviation.
+SHAPE = 0.04
+# χ² of the best above its mean by so many deviations is not believed: with a wrong alias the errors
+# may be hardly larger than the noise, and a fit by itself is content with five.
+CONTENT = 3.0
+# Pairs that are tried in any case, and beyond them those with χ² so much above the best.
+LEAST, ABOVE = 12, 40.0
+
+
+class Alias(eqx.Module):
+    """A motion that a search ended at.
+
+    **Fields:** `parameters`; `cost` half of χ²; `rotation` the body period, s, `precession` the
+    mean precession period, s (`rigidjax.exact.body_period`, `precession_period`); `mode` `"long"`
+    or `"short"`: the axis that is circulated; `ratios` (2,) the two smaller moments over the
+    largest; `explains` whether it does so nearly as well as the best.
+    """
+
+    parameters: Parameters
+    cost: float
+    rotation: float
+    precession: float
+    mode: str
+    ratios: np.ndarray
+    explains: bool
+
+    def __str__(self) -> str:
+        return (
+            f"{self.mode}-axis mode, rotation {self.rotation:.6g} s, precession "
+            f"{self.precession:.6g} s, moments {self.ratios[0]:.3f} : {self.ratios[1]:.3f} : 1, "
+            f"misfit {self.cost:.6g}"
+        )
+
+
+class LightCurve(eqx.Module):
+    """What `fit_light_curve` returns.
+
+    **Fields:** `fit` of the best motion, its covariance with an allowance for a body that is no
+    ellipsoid (see `fit_light_curve`); `aliases` all motions that were found, the best first,
+    then by their misfit; `deviations` (4,) relative standard deviations of the best one's rotation,
+    precession and two ratios; `pairs` the frequencies that they came from; `status` one line: that
+    of the fit, or `ambiguous` where another of the aliases explains the data nearly as well, or
+    `doubtful` where χ² is three deviations above what the given noise makes.
+    """
+
+    fit: Fit
+    aliases: tuple[Alias, ...]
+    deviations: Float[np.ndarray, "4"]
+    pairs: TwoFrequencies
+    status: str
+
+    @property
+    def ok(self) -> bool:
+        """Whether the fit is, and no other motion explains the data nearly as well."""
+        return self.status == "ok"
+
+    @property
+    def rivals(self) -> tuple[Alias, ...]:
+        """The other motions that explain the data nearly as well."""
+        return tuple(alias for alias in self.aliases[1:] if alias.explains)
+
+    def __str__(self) -> str:
+        lines = [self.status]
+        for alias in self.aliases:
+            lines.append(f"{'*' if alias.explains else ' '} {alias}")
+        return "\n".join(lines)
+
+
+def fit_light_curve(
+    problem: Problem,
+    *,
+    shortest: float | None = None,
+    count: int = 48,
+    tolerance: float = 1e-4,
+    progress: Callable[[str], Any] | None = None,
+) -> LightCurve:
+    """The motion of a free tumbler from one light curve, without a guess.
+
+    Pairs of frequencies from the squared flux (`two_frequencies`); each read as precession and
+    twice the rotation, in long- and short-axis mode (Kaasalainen 2001), over a grid of bodies and
+    phases; the best of them fitted with the sensor itself; the best of these fitted to the end. All
+    that were found are listed. What brightness leaves free by symmetry (half turns of the world,
+    see `Brightness`, and of the body about its axes) is one motion here: periods, moments and mode
+    are the same.
+
+    Intervals allow for a real shape as consider parameters do (Tapley, Schutz and Born 2004,
+    Statistical Orbit Determination, ch. 6): as though the brightness were multiplied by 1 + n·S n,
+    n half way between sun and observer, body frame, the entries of S independent of deviation 4 %.
+
+    **Arguments:** `problem` of one recording with one `Brightness` sensor and no torque; let a
+    `Free` move the sensor's `level` unless it is known. `shortest` period of a line in the
+    spectrum, s, `None` for four times the median distance of the samples; `count` pairs of
+    frequencies at most: fewer are tried where the others fit worse, and where more of them fit the
+    status is `ambiguous`; `tolerance` as of `fit`; `progress` is called with a line of text.
+
+    Sources: Pravec et al. 2005, Icarus 173:108, doi:10.1016/j.icarus.2004.07.021; Kaasalainen 2001,
+    A&A 376:302, doi:10.1051/0004-6361:20010935.
+
+    **Raises:** `ValueError` for a problem with other sensors, several recordings or a torque;
+    `TypeError` under a trace.
+    """
+    reading = _only(problem)
+    _checks.whole(count, "count", 1)
+    _checks.positive(tolerance, "tolerance")
+    if progress is not None:
+        _checks.function(progress, "progress", "of a line of text, such as print")
+    say = progress if progress is not None else _silent
+    t, flux, noise = relative_flux(problem, reading)
+    squares, spread = flux**2, None if noise is None else 2.0 * flux * noise
+    found = two_frequencies(t, squares, spread, shortest=shortest, count=count)
+    used = _used(found)
+    starts = starts_of(problem, reading, t, squares, spread, found, used)
+    say(f"{used} pairs of frequencies, χ² {found.misfits[0]:.6g} of {found.dof}")
+    say(f"{len(starts)} starts")
+    sigma = noise_of(problem, reading, flux, found)
+    ends = descended(problem, starts, sigma, tolerance)
+    aliases = _aliases(problem, ends)
+    say(f"{len(aliases)} motions, misfit {aliases[0].cost:.6g}")
+    best = fit(problem, starts=1, initial=aliases[0].parameters, tolerance=tolerance)
+    return _told(best, aliases, found, used >= count)
+
+
+def _used(found: TwoFrequencies) -> int:
+    """How many of the pairs fit well enough to be tried."""
+    above = ABOVE * max(1.0, float(found.misfits[0]) / found.dof)
+    return max(LEAST, int((found.misfits <= found.misfits[0] + above).sum()))
+
+
+def _silent(line: str) -> None:
+    pass
+
+
+def _only(problem: Problem) -> Any:
+    """The reading of the only sensor, one light curve of a free body."""
+    one_problem(problem)
+    if not _checks.known(problem):
+        raise TypeError(
+            "problem: wanted known numbers, got traced ones; a search works on the host: call it "
+            "outside of jax.jit, jax.grad and jax.vmap"
+        )
+    readings = problem.records.readings
+    kinds = ", ".join(type(r.sensor).__name__ for r in readings)
+    if len(readings) != 1 or not isinstance(readings[0].sensor, Brightness):
+        raise ValueError(f"fit_light_curve: wanted one Brightness sensor, got {kinds}")
+    if problem.count != 1:
+        raise ValueError(
+            f"fit_light_curve: wanted one recording, got {problem.count}; fit the longest, then "
+            "all of them with rigidjax.identify.fit from what it found"
+        )
+    if isinstance(problem.body, Bodies):
+        raise ValueError("fit_light_curve: wanted one body, got several by name")
+    if problem.records.torque is not None:
+        raise ValueError("fit_light_curve: wanted a free body, got a torque")
+    return padding.one(readings[0], 0)
+
+
+@eqx.filter_jit
+def _read(parameters: Parameters, problem: Problem) -> tuple[Array, Array]:
+    """Logarithms (4,) of both periods and both ratios, and h²/2T over the middle moment."""
+    body: Any = problem.bodies(parameters)
+    inertia = body.inertia if isinstance(body, MassProperties) else body
+    omega = parameters.own.spin[0] * problem.reference.rate[0]
+    moments, momentum = inertia.moments, apply(inertia.tensor, omega)
+    rotation = exact.body_period(inertia, omega)
+    precession = exact.precession_period(inertia, omega)
+    ratios = moments[:2] / moments[2]
+    numbers = jnp.log(jnp.stack([rotation, precession, ratios[0], ratios[1]]))
+    return numbers, dot(momentum, momentum) / dot(omega, momentum) / moments[1]
+
+
+@eqx.filter_jit
+def _slopes(parameters: Parameters, problem: Problem) -> Float[Array, "4 n"]:
+    flat, restore = ravel_pytree(parameters)
+    return jax.jacfwd(lambda x: _read(restore(x), problem)[0])(flat)
+
+
+def _alias(problem: Problem, parameters: Parameters, cost: float) -> Alias:
+    numbers, middle = (np.asarray(v) for v in _read(parameters, problem))
+    rotation, precession, *ratios = np.exp(numbers)
+    mode = "long" if middle < 1 else "short"
+    return Alias(
+        parameters, cost, float(rotation), float(precession), mode, np.array(ratios), False
+    )
+
+
+def _aliases(problem: Problem, ends: list[Tried]) -> list[Alias]:
+    """The different motions, the best first."""
+    out: list[Alias] = []
+    for end in sorted(ends, key=lambda one: float(one.cost)):
+        if not np.isfinite(float(end.cost)):
+            continue
+        alias = _alias(problem, end.parameters, float(end.cost))
+        if not any(_same(alias, other, SAME) for other in out):
+            out.append(alias)
+    if not out:
+        raise ValueError("fit_light_curve: no start gave a finite misfit")
+    return out
+
+
+def _numbers(alias: Alias) -> np.ndarray:
+    return np.log([alias.rotation, alias.precession, *alias.ratios])
+
+
+def _same(a: Alias, b: Alias, near: np.ndarray) -> bool:
+    return a.mode == b.mode and bool((np.abs(_numbers(a) - _numbers(b)) < near).all())
+
+
+@eqx.filter_jit
+def _half_way(parameters: Parameters, problem: Problem) -> Float[Array, "times 3"]:
+    """Directions half way between sun and observer, body frame."""
+    body, state0 = problem.unpack(parameters)
+    inertia = body.inertia if isinstance(body, MassProperties) else body
+    motion, t = exact.FreeBody(inertia, state0), problem.records.t[0]
+    sensor = padding.one(problem.records.readings[0], 0).sensor
+
+    def at(now: Array) -> Array:
+        sides = (vector_at(side, now, "") for side in (sensor.sun, sensor.observer))
+        middle = sum(side / jnp.sqrt(dot(side, side)) for side in sides)
+        state: Any = motion(now - t[0])
+        return quaternion.rotate_inverse(state.q, middle / jnp.sqrt(dot(middle, middle)))
+
+    return jax.vmap(at)(t)
+
+
+def _with_shape(best: Fit) -> Fit:
+    """The fit with a covariance that allows for a body that is no ellipsoid."""
+    linear = uncertainty.linearise(best.problem, best.parameters, best.noises)
+    reading, weight = padding.one(best.problem.records.readings[0], 0), linear.weights[0][0]
+    flux = np.asarray(reading.values) - linear.raw[0][0, :, 0]
+    size = np.full(weight.shape, 1.0 / MAGNITUDE) if reading.sensor.unit == "mag" else flux
+    n = np.asarray(_half_way(best.parameters, best.problem))
+    change = SHAPE / float(best.noises[0][0, 0]) * size[:, None, None] * n[:, :, None] * n[:, None]
+    slopes = linear.spread(linear.slopes[0][0, :, 0] * weight[:, None], linear.places[0])
+    kept = weight > 0
+    shift = uncertainty.of_white_errors(linear) @ slopes[kept].T @ change[kept].reshape(-1, 9)
+    covariance, seen = (np.asarray(c) + shift @ shift.T for c in (best.covariance, best.seen))
+    null = np.asarray(best.null_directions)
+    return dataclasses.replace(
+        best,
+        covariance=jnp.asarray(covariance),
+        seen=jnp.asarray(seen),
+        covariance_kind=f"sandwich: a shape {SHAPE:.0%} off the ellipsoid; {best.covariance_kind}",
+        quantities=quantities(best.problem, best.parameters, seen, null),
+    )
+
+
+def _told(best: Fit, aliases: list[Alias], found: TwoFrequencies, cut: bool) -> LightCurve:
+    slopes, wider = np.asarray(_slopes(best.parameters, best.problem)), _with_shape(best)
+    own, deviations = (
+        carried(slopes, np.asarray(one.seen), np.asarray(one.null_directions))
+        for one in (best, wider)
+    )
+    # The misfits of a search that stopped on its way to the same motion are no rival's.
+    near = np.fmax(SAME, REACH * own)
+    # Costs of the search, all with one noise: a fit may have estimated another.
+    first = _alias(best.problem, best.parameters, aliases[0].cost)
+    others = [alias for alias in aliases if not _same(alias, first, near)]
+    # Where the noise is larger than was said, misfits count for less.
+    count = int(best.problem.records.readings[0].seen.sum())
+    margin = MARGIN * max(1.0, 2.0 * first.cost / count) * max(best.correlation, 1.0)
+    marked = tuple(
+        eqx.tree_at(lambda a: a.explains, alias, alias.cost <= first.cost + margin)
+        for alias in (first, *others)
+    )
+    rivals = sum(alias.explains for alias in marked) - 1
+    status = best.status
+    if rivals and not status.startswith(("failed", "poor")):
+        some = "another motion explains" if rivals == 1 else f"{rivals} other motions explain"
+        status = f"ambiguous: {some} the light curve nearly as well"
+    elif cut and status == "ok":
+        status = "ambiguous: more pairs of frequencies fit than were tried"
+    # Under a robust loss χ² is the outliers'.
+    above = best.chi2 - best.dof if best.problem.loss is None else 0.0
+    if status == "ok" and above > CONTENT * np.sqrt(2.0 * best.dof):
+        status = (
+            f"doubtful: χ² is {best.chi2:.6g} of {best.dof}: another motion that was not found, or "
+            "more noise than was said"
+        )
+    return LightCurve(wider, marked, deviations, found, status)

@@ -1,0 +1,102 @@
+"""Light curves: against time, and folded with a period."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import ArrayLike, Float
+
+from rigidjax import _checks
+from rigidjax._names import own_names
+from rigidjax.plot.style import COLOURS, TIMES, plain, pyplot, unit
+
+# Colours of one cycle after another, from the first to the last.
+_MAP = "viridis"
+
+
+def light_curve(
+    ts: Float[ArrayLike, " times"],
+    values: Float[ArrayLike, " values"],
+    periods: float | Sequence[float] | Float[ArrayLike, " periods"] = (),
+    *,
+    model: Any = None,
+    quantity: str = "mag",
+    time_unit: str = "h",
+    title: str = "",
+    ax: Any = None,
+) -> Any:
+    """A light curve against time, and below it folded with each of some periods.
+
+    A body that turns about a principal axis gives one curve when folded with its period; a tumbler
+    a band, for a second period moves it from cycle to cycle: the colour tells which.
+
+    **Arguments:** `ts` (T,) s; `values` (T,) as read, NaN where there is nothing; `periods` s, one
+    or several, or none; `model` (T,) what a motion predicts at `ts`, such as
+    `values − fit.residuals[0][:, 0]`, or `None`; `quantity` `mag` (bright is up) or `flux`;
+    `time_unit` `s`, `min`, `h`, `day`; `title`; `ax` one axes and one more for each period, else
+    new ones. **Returns** the axes (1 + periods,).
+
+    **Raises** `ValueError` for shapes that differ, an unknown unit, a period that is not positive.
+
+    >>> t = np.linspace(0.0, 7200.0, 50)
+    >>> light_curve(t, 15 + 0.1 * np.cos(2 * np.pi * t / 3600), 3600.0)[1].get_xlabel()
+    'phase, in periods of 1 h'
+    """
+    seconds = unit(time_unit, TIMES, "time_unit")
+    _checks.word(quantity, ("mag", "flux"), "quantity")
+    t, read = _checks.on_host(ts, "ts"), _checks.on_host(values, "values")
+    if t.ndim != 1 or read.shape != t.shape:
+        raise ValueError(f"values: wanted (T,) as ts has, got shapes {t.shape} and {read.shape}")
+    if not np.isfinite(read).any():
+        raise ValueError("values: nothing to draw, every value is NaN or infinite")
+    predicted = None if model is None else _checks.on_host(model, "model")
+    if predicted is not None and predicted.shape != t.shape:
+        raise ValueError(f"model: wanted (T,) as ts has, got {predicted.shape}")
+    several = np.atleast_1d(_checks.on_host(periods, "periods"))
+    if several.ndim != 1:
+        raise ValueError(f"periods: wanted one or a row of them, s, got shape {several.shape}")
+    folds = [_checks.positive(period, "periods", "positive periods, s") for period in several]
+    count = 1 + len(folds)
+    if ax is None:
+        ax = pyplot().subplots(count, 1, figsize=(7.2, 2.5 * count), layout="constrained")[1]
+    ax = np.atleast_1d(np.asarray(ax, dtype=object))
+    if ax.shape != (count,):
+        raise ValueError(f"ax: wanted {count} axes, got shape {ax.shape}")
+    label = "magnitude" if quantity == "mag" else "flux"
+    _against(ax[0], t / seconds, read, predicted)
+    ax[0].set(xlabel=f"time, {time_unit}", ylabel=label)
+    for one, period in zip(ax[1:], folds, strict=True):
+        turns = (t - t[0]) / period
+        _folded(one, turns, read, predicted)
+        one.set(xlabel=f"phase, in periods of {period / seconds:.6g} {time_unit}", ylabel=label)
+    for one in ax:
+        one.grid(alpha=0.3)
+        if quantity == "mag" and not one.yaxis_inverted():
+            one.invert_yaxis()
+    if title:
+        ax[0].set_title(plain(title))
+    return ax
+
+
+def _against(ax: Any, t: np.ndarray, read: np.ndarray, predicted: np.ndarray | None) -> None:
+    ax.plot(t, read, ".", color=COLOURS[6], ms=3, label="read")
+    if predicted is not None:
+        # No line over a gap: nothing is known of the motion's light there.
+        wide = np.append(np.diff(t) > 10 * np.median(np.diff(t)), False)
+        ax.plot(t, np.where(wide, np.nan, predicted), color=COLOURS[1], lw=1.0, label="motion")
+        # Beside the picture: inside it would lie on some night.
+        ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
+
+
+def _folded(ax: Any, turns: np.ndarray, read: np.ndarray, predicted: np.ndarray | None) -> None:
+    phase = turns % 1.0
+    # Once more beyond the end: what joins there is seen.
+    both, twice = np.concatenate([phase, phase + 1.0]), np.concatenate([turns, turns])
+    if predicted is not None:
+        ax.plot(both, np.tile(predicted, 2), ".", color=COLOURS[1], ms=1.5, alpha=0.6)
+    dots = ax.scatter(both, np.tile(read, 2), c=np.floor(twice), s=8, cmap=_MAP, lw=0)
+    ax.set_xlim(0.0, 2.0)
+    ax.figure.colorbar(dots, ax=ax, label="cycle", pad=0.01)
+
+
+__dir__ = own_names(__name__)

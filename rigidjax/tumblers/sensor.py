@@ -1,0 +1,156 @@
+"""A sensor that sees only how bright a body is: a light curve."""
+
+import math
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from rigidjax import _checks
+from rigidjax._types import HasAttitude, Scalar, Vec3
+from rigidjax.identify.sensors.base import AbstractSensor, SensorInput, noise_of, number_of
+from rigidjax.motion.torques.base import vector_at
+from rigidjax.rotation import quaternion
+from rigidjax.rotation.linalg3 import dot, entries
+from rigidjax.tumblers.brightness import AbstractScattering
+from rigidjax.tumblers.scattering import direction, law_of
+
+UNITS = ("flux", "mag")
+
+
+class Brightness(AbstractSensor):
+    """Reads how bright an ellipsoid is that is lit by the sun: a light curve.
+
+    `level · B/(π (abc)^⅔)` as a flux, `level − 2.5 log₁₀(B/(π (abc)^⅔))` in magnitudes, B as
+    `rj.tumblers.brightness.ellipsoid`: a sphere of the same volume at zero phase has the level.
+    Only the ratios of the semi-axes count. Readings are those at unit distances.
+
+    **Arguments:** `sun`, `observer` directions from the body to them, world frame, any length:
+    (3,), or a callable Module of time, t → (3,), such as `torques.Linear(times, directions)`;
+    `scattering` the law: `LommelSeeliger()` (also for `None`), `Geometric()`, `Lambert()` of
+    `rj.tumblers.brightness`; `noise` standard deviation in the unit of a reading, `None` to have
+    it estimated; `unit` of a reading, `"flux"` or `"mag"`; `level` flux or magnitude as above,
+    `None` for 1 and 0: seldom known, let a `Free` move it; `semi_axes` (3,) along the body's axes,
+    or `None`: then the ellipsoid is the uniform one that turns as the body does (semi-axes √λ_k of
+    its second moment 𝔖); `offset` s as for `Gyro`. Readings are (T,).
+
+    Brightness alone leaves the world's turns free that leave it unchanged: with fixed directions
+    the half turns about `sun × observer`, and, but for `Geometric`, about their sum and difference.
+    A `fit` takes the body for an ellipsoid; `fit_light_curve` allows for one that is none.
+
+    **Raises** `ValueError` for a direction of length zero, a noise or semi-axis that is not
+    positive, a wrong shape, NaN; `TypeError` for another kind of argument.
+
+    Source: as `rigidjax.tumblers.brightness`; of light curves of tumblers Kaasalainen 2001, A&A
+    376:302, doi:10.1051/0004-6361:20010935.
+
+    >>> Brightness([1.0, 0.0, 0.0], [0.0, 1.0, 0.0], noise=0.02, unit="mag").components
+    1
+    """
+
+    reading_shape: ClassVar[tuple[int, ...]] = ()
+    components: ClassVar[int] = 1
+    feels: ClassVar[type] = HasAttitude
+    unit: str = eqx.field(static=True)  # pyright: ignore[reportIncompatibleVariableOverride]
+    sun: Any
+    observer: Any
+    scattering: AbstractScattering
+    noise: Float[Array, "1"] | None
+    level: Scalar
+    semi_axes: Float[Array, "3"] | None
+    offset: Scalar | None
+
+    def __init__(
+        self,
+        sun: Any,
+        observer: Any,
+        scattering: AbstractScattering | None = None,
+        *,
+        noise: Any = None,
+        unit: str = "flux",
+        level: Any = None,
+        semi_axes: Any = None,
+        offset: Any = None,
+    ):
+        self.sun, self.observer = _source(sun, "sun"), _source(observer, "observer")
+        self.scattering, self.noise = law_of(scattering), noise_of(noise, 1)
+        self.unit = _checks.word(unit, UNITS, "unit")
+        usual = 1.0 if unit == "flux" else 0.0
+        found = number_of(usual if level is None else level, "level")
+        assert found is not None
+        if unit == "flux":
+            found = _checks.refuse(found, ~(found > 0), "level: wanted a positive flux")
+        self.level = found
+        self.semi_axes = None if semi_axes is None else _lengths(semi_axes)
+        self.offset = number_of(offset, "offset")
+
+    def error(self, now: SensorInput, reading: Array) -> Float[Array, "1"]:
+        return (reading - self.predicted(now))[None]
+
+    def predicted(self, now: SensorInput) -> Scalar:
+        """The reading of this state without noise."""
+        shape = now.body.second_moment
+        if self.semi_axes is not None:
+            shape = jnp.diag(self.semi_axes * self.semi_axes)
+        shape = shape / jnp.trace(shape)
+        xx, xy, xz, _, yy, yz, _, _, zz = entries(shape)
+        volume = xx * (yy * zz - yz * yz) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz)
+        back = quaternion.conjugate(now.state.q)
+        sun, observer = (
+            quaternion.rotate(back, _unit(vector_at(source, now.t, name).astype(back.dtype)))
+            for source, name in ((self.sun, "sun"), (self.observer, "observer"))
+        )
+        seen = self.scattering.of_ellipsoid(shape, sun, observer)
+        relative = seen / (math.pi * jnp.cbrt(volume))
+        if self.unit == "flux":
+            return self.level * relative
+        # Of a body that hides its lit side nothing is seen: fainter than any reading.
+        some = relative > 1e-12
+        return self.level - 2.5 / math.log(10.0) * jnp.log(jnp.where(some, relative, 1e-12))
+
+    def typical_rate(self, t: np.ndarray, values: np.ndarray) -> float:
+        """About how fast the body turns, rad/s: half the strongest frequency of the first 1000."""
+        t, values = t[:1000], values[:1000]
+        if t.size < 10 or np.ptp(values) == 0:
+            return 0.0
+        span = t[-1] - t[0]
+        highest = min(0.25 / np.median(np.diff(t)), 500.0 / span)
+        turns = 2.0 * np.pi * np.arange(0.5 / span, max(highest, 1.0 / span), 0.25 / span)
+        waves = np.exp(1j * turns[:, None] * (t - t[0]))
+        power = np.abs(waves @ (values - values.mean()))
+        return 0.5 * float(turns[np.argmax(power)])
+
+    def refusal(self, values: np.ndarray) -> tuple[np.ndarray, str]:
+        wrong = values < 0 if self.unit == "flux" else np.zeros(values.shape, bool)
+        wrong = wrong & (np.abs(values) > 10 * _scatter(self.noise, values))
+        return wrong, (
+            "the flux at index {index} is far below zero; magnitudes are read with unit='mag'"
+        )
+
+
+def _scatter(noise: Array | None, values: np.ndarray) -> float:
+    return float(np.std(values)) if noise is None else float(np.asarray(noise)[0])
+
+
+def _source(source: Any, name: str) -> Any:
+    if callable(source):
+        return _checks.function(source, name, "of time to (3,)")
+    shape = np.shape(source)
+    if len(shape) == 2 and shape[1] == 3:
+        raise ValueError(
+            f"{name}: wanted a direction (3,) or a function of time, got shape {shape}; one row "
+            "for each time is rigidjax.torques.Linear(times, directions)"
+        )
+    return direction(source, name).astype(jnp.result_type(float))
+
+
+def _unit(v: Vec3) -> Vec3:
+    return v / jnp.sqrt(dot(v, v))
+
+
+def _lengths(semi_axes: Any) -> Array:
+    a = _checks.finite(_checks.floating(semi_axes, (3,), "semi_axes"), "semi_axes")
+    a = jnp.asarray(a, jnp.result_type(float))
+    return _checks.refuse(a, ~(a > 0).all(), "semi_axes: wanted three positive lengths")

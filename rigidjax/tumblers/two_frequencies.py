@@ -1,0 +1,188 @@
+"""Two frequencies behind a light curve: the Fourier series in both that fits best."""
+
+import math
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+from rigidjax import _checks
+from rigidjax.tumblers.frequency_aliases import apart, distinct, refined, with_aliases
+from rigidjax.tumblers.lattice_series import BATCH, FIRST, Sums, filled, misfits_of, sums
+
+# Lines through which pairs are laid, and the grid of the first frequency, in 1/span.
+LINES, STEP = 3, 0.1
+# How far up the second frequency is looked for, over the highest of these lines.
+SECOND = 1.5
+# How many pairs are refined for each that is wanted.
+TRIED = 2
+# Squares of what is larger may overflow; a spectrum of more lines takes hours.
+LARGEST, MOST = 1e100, 1e5
+# Programs are compiled for times in multiples of so many.
+BLOCK = 256
+
+
+class TwoFrequencies(eqx.Module):
+    """What `two_frequencies` returns, the best first.
+
+    **Fields:** `frequencies` (n, 2) in 1/s; `misfits` (n,) χ² of each pair's series, and `dof`;
+    `scatter` the standard deviation of the best one's residuals, in the unit of the values; `lines`
+    (m,) the strongest lines of the spectrum, 1/s.
+
+    >>> t = np.linspace(0.0, 60.0, 300)
+    >>> y = 1 + np.cos(2 * np.pi * 0.4 * t) + 0.5 * np.cos(2 * np.pi * 0.7 * t + 1.0)
+    >>> found = two_frequencies(t, y, 0.1)
+    >>> sorted(found.lines[:2].round(2).tolist())
+    [0.4, 0.7]
+    """
+
+    frequencies: Float[np.ndarray, "n 2"]
+    misfits: Float[np.ndarray, " n"]
+    dof: int
+    scatter: float
+    lines: Float[np.ndarray, " m"]
+
+
+def two_frequencies(
+    t: Float[ArrayLike, " times"],
+    values: Float[ArrayLike, " values"],
+    noise: float | Float[ArrayLike, " noises"] | None = None,
+    *,
+    order: int = 1,
+    shortest: float | None = None,
+    count: int = 12,
+) -> TwoFrequencies:
+    """Pairs (f₁, f₂) whose Fourier series fit best: `Σ c_jk exp 2πi (j f₁ + k f₂) t`, |j| ≤ 2.
+
+    Where the spectrum has its three strongest lines one of them must be j f₁ + k f₂; along these
+    curves all pairs are tried, then the best ones are refined. Then their aliases are tried: either
+    frequency, or both, moved by a side peak of the spectral window (readings at night have such
+    peaks at one and two a day) or by half of it, halved, doubled, or f₂ by f₁. A set of lines has
+    several pairs that make it: all that fit are returned, for a motion to choose among them.
+
+    **Arguments:** `t` (T,) increasing times, s, gaps allowed; `values` (T,) fluxes or their
+    squares; `noise` their standard deviation, one or (T,), `None` if it is not known; `order` k up
+    to which multiples of f₂ are taken; `shortest` period that a line may have, s, `None` for four
+    times the median distance of the times; `count` how many pairs are returned at most.
+
+    Source: Pravec et al. 2005, Icarus 173:108, doi:10.1016/j.icarus.2004.07.021 (with all |j| and
+    |k| up to one order); the linear fit is that of Lomb 1976, doi:10.1007/BF00648343, for many
+    lines.
+
+    **Raises:** `ValueError`, `TypeError` for wrong shapes, times that do not increase, NaN, too few
+    values.
+
+    >>> t = np.linspace(0.0, 60.0, 300)
+    >>> y = 1 + np.cos(2 * np.pi * 0.4 * t) + 0.5 * np.cos(2 * np.pi * 0.7 * t + 1.0)
+    >>> found = two_frequencies(t, y, 0.1)
+    >>> bool(found.misfits[0] < 0.1)
+    True
+    """
+    t, y = _checks.on_host(t, "t"), _checks.on_host(values, "values")
+    order, count = _checks.whole(order, "order", 1), _checks.whole(count, "count", 1)
+    unknowns = (2 * FIRST + 1) * (2 * order + 1) + 2
+    if t.ndim != 1 or y.shape != t.shape:
+        raise ValueError(f"values: wanted (T,) as t has, got shapes {t.shape} and {y.shape}")
+    if t.size <= unknowns:
+        raise ValueError(f"t: wanted more than {unknowns} times, as the series has, got {t.size}")
+    if not (np.isfinite(t).all() and np.isfinite(y).all()):
+        raise ValueError("two_frequencies: t or values contain NaN or infinity; leave gaps out")
+    if not (np.diff(t) > 0).all():
+        raise ValueError("t: wanted increasing times")
+    sigma = np.ones(t.shape)
+    if noise is not None:
+        given = _checks.on_host(noise, "noise")
+        if given.shape not in ((), t.shape):
+            raise ValueError(f"noise: wanted one number or (T,) as t has, got shape {given.shape}")
+        if not (np.isfinite(given) & (given > 0)).all():
+            raise ValueError("noise: wanted positive standard deviations")
+        sigma = np.broadcast_to(given, t.shape)
+    with np.errstate(over="ignore"):
+        worst = max(np.abs(y).max() / sigma.min(), 1 / sigma.min(), sigma.max())
+    if worst > LARGEST:
+        raise ValueError(
+            f"values: wanted numbers, noise and their ratios up to {LARGEST:.0e}, since their "
+            f"squares are added, got {worst:.3g}; give both in another unit"
+        )
+    span = float(t[-1] - t[0])
+    typical = float(np.median(np.diff(t)))
+    least = 4.0 * typical if shortest is None else _checks.positive(shortest, "shortest")
+    if span / least > MOST:
+        raise ValueError(
+            f"shortest: {least:.3g} s, and a light curve of {span:.3g} s: wanted at most "
+            f"{MOST:.0e} periods in it"
+        )
+    light = _padded((t - t[0]) / span, y / sigma, 1.0 / sigma)
+    lines = strongest(light, span / least, 2 * LINES)
+    highest = SECOND * float(lines[:LINES].max())
+    # All multiples of a pair, and what a step of the refinement adds.
+    table = sums(light, 2 * (FIRST + order) * (highest + 1.0))
+    pairs = apart(*_scan(table, lines, order), count * TRIED)
+    pairs, misfits = refined(table, pairs, order)
+    pairs, misfits = with_aliases(table, pairs, misfits, highest, order)
+    keep = distinct(pairs, misfits, count)
+    dof = t.size - unknowns
+    best = max(float(misfits[keep[0]]), 1e-300)
+    scatter = float(np.sqrt(best / dof / np.mean(1.0 / sigma**2)))
+    scale = 1.0 if noise is not None else dof / best
+    return TwoFrequencies(pairs[keep] / span, misfits[keep] * scale, dof, scatter, lines / span)
+
+
+def _padded(x: np.ndarray, z: np.ndarray, w: np.ndarray) -> tuple[Array, Array, Array]:
+    """Times over the span, values and ones over the noise, with zeros up to a whole block."""
+    more = -x.size % BLOCK
+    return tuple(jnp.asarray(np.pad(v, (0, more))) for v in (x, z, w))  # pyright: ignore
+
+
+def strongest(light: Any, highest: float, count: int) -> np.ndarray:
+    """The strongest lines, one after another taken away, in 1/span."""
+    grid = np.arange(0.5, max(highest, 2.0), 0.2)
+    x, z, w = (np.asarray(v) for v in light)
+    found = []
+    for _ in range(count):
+        line, curve = (np.asarray(v) for v in _spectrum(jnp.asarray(filled(grid)), x, z, w))
+        found.append(float(line))
+        z = z - w * curve
+    return np.array(found)
+
+
+@jax.jit
+def _spectrum(grid: Array, x: ArrayLike, z: ArrayLike, w: ArrayLike) -> tuple[Array, Array]:
+    """The frequency of the strongest line, and its curve with a constant."""
+    x, z, w = jnp.asarray(x), jnp.asarray(z), jnp.asarray(w)
+
+    def one(f: Array) -> tuple[Array, Array]:
+        angle = 2.0 * math.pi * f * x
+        plain = jnp.stack([jnp.ones_like(x), jnp.cos(angle), jnp.sin(angle)])
+        rows = plain * w[None, :]
+        gram = rows @ rows.T
+        gram = gram + 1e-9 * jnp.trace(gram) * jnp.eye(3, dtype=x.dtype)
+        side = rows @ z
+        c = jnp.linalg.solve(gram, side)
+        return jnp.sum(z * z) - side @ c, c
+
+    left, c = jax.lax.map(one, grid, batch_size=BATCH)
+    best = jnp.argmin(left)
+    angle = 2.0 * math.pi * grid[best] * x
+    curve = c[best, 0] + c[best, 1] * jnp.cos(angle) + c[best, 2] * jnp.sin(angle)
+    return grid[best], curve
+
+
+def _scan(table: Sums, lines: np.ndarray, order: int) -> tuple[np.ndarray, np.ndarray]:
+    """All pairs of which one of the lines is made, and their misfits."""
+    highest = float(lines[:LINES].max())
+    grid = np.arange(0.5, 0.8 * highest + 0.5, STEP)
+    whole = np.arange(0.5, SECOND * highest, STEP)
+    rows = []
+    for line in lines[:LINES]:
+        rows.append(np.stack([grid, np.full(grid.shape, line)], axis=1))
+        for j in (1, 2):
+            rows.append(np.stack([np.full(whole.shape, line / j), whole], axis=1))
+            for second in (line - j * grid, j * grid - line, line + j * grid):
+                rows.append(np.stack([grid, second], axis=1))
+    pairs = np.concatenate(rows)
+    pairs = pairs[(pairs[:, 1] > 0.5) & (pairs[:, 1] < SECOND * highest)]
+    return pairs, misfits_of(table, pairs, order)
