@@ -31,7 +31,15 @@ def times_power_of_two(x: Float[Array, "..."], n: Int[Array, ""]) -> Float[Array
     Array([1.5, 0. ], dtype=float64)
     """
     half = n // 2
-    one = jnp.ones((), x.dtype)
     # XLA would multiply the two together first where it knows n.
-    first, second = jax.lax.optimization_barrier((jnp.ldexp(one, half), jnp.ldexp(one, n - half)))
+    first, second = jax.lax.optimization_barrier(
+        (_power_of_two(half, x.dtype), _power_of_two(n - half, x.dtype))
+    )
     return x * first * second
+
+
+def _power_of_two(n: Int[Array, ""], dtype: jnp.dtype) -> Float[Array, ""]:
+    """A normal 2ⁿ from its bits: `jnp.ldexp` is fifty operations to compile."""
+    info = jnp.finfo(dtype)
+    bits = (n.astype(f"int{info.bits}") + (info.maxexp - 1)) << info.nmant
+    return jax.lax.bitcast_convert_type(bits, dtype)

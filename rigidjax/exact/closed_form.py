@@ -145,12 +145,12 @@ def from_functions(o: Orbit, f: Elliptic, u: Reduced, t: Scalar) -> tuple[Triple
     # b turns about (half way) momentum's partner axes, the rest is a turn about the momentum.
     b0, b2, b3 = f.C, -o.d12 * f.S * k2 * f.C, -o.d13 * f.S * k3
     size = jnp.maximum(jnp.maximum(jnp.abs(b0), jnp.abs(b2)), jnp.abs(b3))
-    b0, b2, b3 = b0 / size, b2 / size, b3 / size
+    b0, b2, b3 = fence((b0 / size, b2 / size, b3 / size), one)
     r = 1.0 / jnp.sqrt((b0 * b0 + b2 * b2 + b3 * b3) * (f.x * f.x + f.y * f.y))
     sine, cosine = sincos(0.5 * o.a * o.h * t - phase)
     c, s = r * (cosine * f.x + sine * f.y), r * (sine * f.x - cosine * f.y)
     still = o.h <= 0
-    s = jnp.where(still, 0.0, s / jnp.where(still, 1.0, o.h))
+    c, s = fence((c, jnp.where(still, 0.0, s / jnp.where(still, 1.0, o.h))), one)
     p1, p2, p3 = o.P
     w = c * b0 - s * (p2 * b2 + p3 * b3)
     x = s * (p1 * b0 + p2 * b3 - p3 * b2)

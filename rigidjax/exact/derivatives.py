@@ -53,23 +53,32 @@ def flow(moments: Six, momentum: Triple, t: Scalar) -> tuple[Triple, Four]:
 @flow.defjvp
 def _flow_jvp(primals, tangents):
     moments, momentum, t = primals
-    _, d_momentum, d_t = tangents
-    (_, k, energy2), (d_body, d_k, d_energy2) = jax.jvp(
-        reciprocal, (moments, momentum), tangents[:2]
-    )
+    (_, k, energy2), changes = jax.jvp(reciprocal, (moments, momentum), tangents[:2])
     one = opaque_one(t)
-    d_body, d_k, d_energy2 = fence((d_body, d_k, d_energy2), one)
-    motion, rows, g = first_order(moments, momentum, t)
-    (out, turn), rows, g = fence((motion, rows, g), one)
+    changes = fence(changes, one)
+    motion, rows, g = fence(first_order(moments, momentum, t), one)
+    p1, p2, p3 = momentum
+    h2 = p1 * p1 + p2 * p2 + p3 * p3
+    small = jax.lax.stop_gradient(h2 * (k[0] * k[0]) * (t * t)) < _SMALL[t.dtype] ** 2
+    # Away from small turns the series, which is not used there, gets zero: nothing overflows.
+    series = _small_turn(k, momentum, jnp.where(small, t, 0.0))
+    known = (motion, rows, g, series, k, energy2, t, h2, small)
+    return motion, _along(known, (changes, *tangents[1:]))
+
+
+# A gradient keeps `known`, and makes the hundred products of it again: fewer programs to compile.
+@jax.checkpoint
+def _along(known, tangents) -> tuple[Triple, Four]:
+    """Tangents of `flow`, linear in the given ones."""
+    (out, turn), rows, g, series, k, energy2, t, h2, small = known
+    (d_body, d_k, d_energy2), d_momentum, d_t = tangents
+    one = opaque_one(t)
     inputs = (d_body.d12, d_body.d23, d_body.k12, d_body.k13, d_body.k23, *d_momentum, d_t)
     d_out: Triple = tuple(
         sum((row[i] * d for i, d in enumerate(inputs)), jnp.zeros_like(t)) for row in rows
     )
     d_out = fence(d_out, one)
 
-    p1, p2, p3 = momentum
-    h2 = p1 * p1 + p2 * p2 + p3 * p3
-    small = jax.lax.stop_gradient(h2 * (k[0] * k[0]) * (t * t)) < _SMALL[t.dtype] ** 2
     along = 0.5 * t * d_energy2 + energy2 * d_t
     along = (
         along + 0.5 * sum(g[i] * d_k[i] for i in range(3)) + sum(g[i] * d_k[i] for i in range(3, 6))
@@ -79,18 +88,13 @@ def _flow_jvp(primals, tangents):
     r = 1.0 / jnp.where(small, 1.0, h2)
     along, across = fence((along, across), one)
     theta = tuple(r * (a + b * along) for a, b in zip(across, out, strict=True))
-
-    # Away from small turns the series, which is not used there, gets zero: nothing overflows.
-    series = _small_turn(k, momentum, jnp.where(small, t, 0.0))
     lanes = (*d_k, *d_momentum)
-    end = times(k, out)
     near = tuple(
         sum((row[i] * d for i, d in enumerate(lanes)), w * d_t)
-        for row, w in zip(series, end, strict=True)
+        for row, w in zip(series, times(k, out), strict=True)
     )
     theta = tuple(jnp.where(small, a, b) for a, b in zip(near, theta, strict=True))
-    d_turn = half_product(turn, fence(theta, one))
-    return (out, turn), (d_out, d_turn)
+    return d_out, half_product(turn, fence(theta, one))
 
 
 @jax.custom_jvp

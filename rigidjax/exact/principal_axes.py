@@ -22,23 +22,24 @@ def principal_frame(tensor: Mat3) -> tuple[Six, Mat3]:
     derivatives are those of `AᵀIA` with A held fixed.
     """
     axes, moments = _jacobi(jax.lax.stop_gradient(tensor))
-    a = axes
-    rows = [
-        [tensor[i, 0] * a[0][j] + tensor[i, 1] * a[1][j] + tensor[i, 2] * a[2][j] for j in range(3)]
-        for i in range(3)
-    ]
+    return _in_axes(tensor, axes, moments), jnp.stack([jnp.stack(row) for row in axes])
 
-    def entry(i, j):
-        return a[0][i] * rows[0][j] + a[1][i] * rows[1][j] + a[2][i] * rows[2][j]
 
-    def at_value(x, value):
-        return value + (x - jax.lax.stop_gradient(x))
-
+@jax.custom_jvp
+def _in_axes(tensor: Mat3, axes: list[list[Scalar]], moments: Triple) -> Six:
+    """`AᵀIA`: diagonal in value."""
     zero = jnp.zeros_like(tensor[0, 0])
+    return *moments, zero, zero, zero
+
+
+@_in_axes.defjvp
+def _in_axes_jvp(primals, tangents):
+    (_, a, _), m = primals, tangents[0]
+    columns = [(a[0][j], a[1][j], a[2][j]) for j in range(3)]
+    rows = [[sum(m[i, k] * c[k] for k in range(3)) for i in range(3)] for c in columns]
     places = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
-    values = (*moments, zero, zero, zero)
-    six = tuple(at_value(entry(i, j), v) for (i, j), v in zip(places, values, strict=True))
-    return six, jnp.stack([jnp.stack(row) for row in axes])
+    d = tuple(sum(columns[i][k] * rows[j][k] for k in range(3)) for i, j in places)
+    return _in_axes(*primals), d
 
 
 def into(axes: Mat3, v: Vec3) -> Triple:
