@@ -443,7 +443,11 @@ def _matplotlib() -> bool:
 
 
 def _say(line: str) -> None:
-    print(_checks.printable(line), flush=True)
+    try:
+        print(_checks.printable(line), flush=True)
+    except BrokenPipeError:
+        # The reader has stopped, as `head` does: files are still to be written.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _error(what: object) -> int:

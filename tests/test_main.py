@@ -3,6 +3,7 @@
 import html
 import json
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -203,6 +204,8 @@ def test_ctrl_c_is_not_lost_in_the_garbage_collector(monkeypatch):
             raise KeyboardInterrupt
 
     monkeypatch.setattr(sys, "unraisablehook", command._once_more)
+    # A job in the background is started with Ctrl-C ignored.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
     begin = time.monotonic()
 
     def goes_on():
@@ -210,8 +213,21 @@ def test_ctrl_c_is_not_lost_in_the_garbage_collector(monkeypatch):
         while time.monotonic() < begin + 5:
             time.sleep(0.01)
 
-    with pytest.raises(KeyboardInterrupt):
-        goes_on()
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            goes_on()
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def test_a_reader_that_stops_reading_does_not_stop_what_is_written_after():
+    says = "import sys; from rigidjax.__main__ import _say; sys.stdin.read(); _say('1'); _say('2'); print('on', file=sys.stderr)"
+    pipes = dict(stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    run = subprocess.Popen([sys.executable, "-c", says], text=True, **pipes)
+    assert run.stdout is not None
+    run.stdout.close()
+    run.stdout = None
+    assert run.communicate()[1] == "on\n" and run.returncode == 0
 
 
 REFUSED = [

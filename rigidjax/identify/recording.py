@@ -1,8 +1,10 @@
 """A recording: times, what each sensor read then, and what turned the body meanwhile."""
 
+from types import FunctionType
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -97,7 +99,9 @@ class Recording(eqx.Module):
         )
         if torque is not None:
             require_law(torque)
-        self.torque = torque
+        # A function is no array: what goes through transformations has none as a leaf.
+        plain = isinstance(torque, FunctionType)
+        self.torque = jax.tree_util.Partial(torque) if plain else torque
 
     @property
     def size(self) -> int:

@@ -108,13 +108,26 @@ def test_a_wrong_motion_is_not_called_outliers(tumble, loss):
     assert not any("well determined" in words for words in found.identifiability)
 
 
+def test_a_plain_function_turns_a_body_in_a_recording(tumble):
+    body, ts, ys = tumble
+    gyro = (rj.identify.Gyro(0.01), ys.omega)
+    # A push of none: the ratios are those of the free body.
+    record = rj.identify.Recording(ts, gyro, torque=lambda t, state, body: 0 * state.omega)
+    found = rj.identify.fit(rj.identify.Problem(record, rj.identify.Ratios()), starts=2)
+    moments, wanted = (np.linalg.eigvalsh(one.tensor) for one in (found.body, body))
+    np.testing.assert_allclose(moments / moments[-1], wanted / wanted[-1], rtol=1e-4)
+
+
 def test_a_fit_that_stops_early_says_so_and_keeps_its_best(tumble):
     _, ts, ys = tumble
     record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), ys.omega))
     problem = rj.identify.Problem(record, rj.identify.PrincipalRatios())
-    stopped = rj.identify.fit(problem, starts=1, max_steps=1)
-    assert not stopped.ok
+    stopped, later = (rj.identify.fit(problem, starts=1, max_steps=n) for n in (1, 2))
+    assert not stopped.ok and not stopped.starts[0].converged
     assert np.isfinite(stopped.body.tensor).all()
+    # The best so far: with one more step it is no worse, and it is better than no motion at all.
+    still = float((np.asarray(ys.omega) ** 2).sum() / 0.01**2 / 2)
+    assert later.starts[0].cost <= stopped.starts[0].cost < still
 
 
 def test_interrupting_keeps_what_was_found(tumble):
