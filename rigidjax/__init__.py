@@ -20,7 +20,7 @@ from rigidjax import (
     rotation as rotation,
     solve as solve,
 )
-from rigidjax._names import missing, own_names
+from rigidjax._names import own_names, suggests
 from rigidjax._types import (
     HasAttitude as HasAttitude,
     HasPose as HasPose,
@@ -91,7 +91,7 @@ _LATER = ("datasets", "elliptic", "lagrangian", "orbits", "plot", "tumblers", "w
 def __getattr__(name: str) -> ModuleType:
     if name in _LATER:
         return importlib.import_module(f"rigidjax.{name}")
-    raise missing(__name__, name)
+    return suggests(__name__)(name)
 
 
 __dir__ = own_names(__name__)

@@ -1,6 +1,8 @@
 """Motions by a solver: in our own loops, or by diffrax."""
 
-from rigidjax._names import own_names, renamed
+from typing import TYPE_CHECKING
+
+from rigidjax._names import own_names, suggests
 from rigidjax.solve import solvers as solvers
 from rigidjax.solve.adaptive import adaptive as adaptive
 from rigidjax.solve.crossings import Crossings as Crossings, crossings as crossings
@@ -15,7 +17,6 @@ from rigidjax.solve.simulate import simulate as simulate
 from rigidjax.solve.solution import Solution as Solution
 from rigidjax.solve.vector_field import equations_of_motion as equations_of_motion
 
-__getattr__ = renamed(
-    __name__, {"GroupInterpolation": "rigidjax.solve.projection.GroupInterpolation"}
-)
+if not TYPE_CHECKING:
+    __getattr__ = suggests(__name__)
 __dir__ = own_names(__name__)
