@@ -32,22 +32,27 @@ def suggests(module: str) -> Any:
         if name[0] != "_" and not (hasattr(here, "__path__") and find_spec(f"{module}.{name}")):
             near = difflib.get_close_matches(name.lower(), _ways(), n=2, cutoff=0.75)
             near = near[: 1 if name.lower() in near else 2]
-        ways = [min(_ways()[one], key=lambda way: not way.endswith(f".{name}")) for one in near]
-        raise AttributeError(words + f"; did you mean {' or '.join(ways)}?" * bool(ways), name=name)
+        ways = [
+            min(_ways()[one], key=lambda way: (not way[1].endswith(f".{name}"), way[0] != module))
+            for one in near
+        ]
+        raise AttributeError(
+            words + f"; did you mean {' or '.join(way for _, way in ways)}?" * bool(ways), name=name
+        )
 
     here = sys.modules[module]
     return look_up
 
 
 @functools.cache
-def _ways() -> dict[str, list[str]]:
-    """Where each public name is, by the name in lower case: the shortest way first."""
+def _ways() -> dict[str, list[tuple[str, str]]]:
+    """Module and shortest way of each public name, by the name in lower case."""
     left, seen, found = [("rj", sys.modules["rigidjax"])], set(), {}
     for way, module in left:
         if module not in seen:
             seen.add(module)
             for name in dir(module):
-                found.setdefault(name.lower(), []).append(f"{way}.{name}")
+                found.setdefault(name.lower(), []).append((module.__name__, f"{way}.{name}"))
                 if isinstance(value := getattr(module, name), ModuleType):
                     left.append((f"{way}.{name}", value))
     return found
