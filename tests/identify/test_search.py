@@ -93,7 +93,7 @@ def test_what_explains_the_whole_record_at_once_is_not_fitted_in_parts(problem, 
 class Blast(rj.torques.AbstractTorque):
     """None at first; after a time it is not finite."""
 
-    feels: ClassVar[type] = rj.HasSpin
+    feels: ClassVar[type] = rj.motion.HasSpin
     since: Array
 
     def __call__(self, t, state, body):
