@@ -689,7 +689,7 @@ leave_out(
     "estimate.Posterior.points", "estimate.Posterior.rhat", "estimate.Posterior.to_arviz",
     "estimate.Nuts", "estimate.refit", "estimate.Refit", "estimate.Refit.effective",
     "estimate.Refit.interval_of", "estimate.Refit.point", "estimate.LogDensity",
-    "estimate.LogDensity.grown", "estimate.LogDensity.unpack", "estimate.Point",
+    "estimate.LogDensity.grown", "estimate.LogDensity.unpack", "estimate.Unpacked",
     "estimate.Filtered.nis",
 )  # fmt: skip
 leave_out(
