@@ -17,16 +17,11 @@ from rigidjax import (
     exact as exact,
     frames as frames,
     identify as identify,
+    motion as motion,
     rotation as rotation,
     solve as solve,
 )
-from rigidjax._names import missing, own_names
-from rigidjax._types import (
-    HasAttitude as HasAttitude,
-    HasPose as HasPose,
-    HasSpin as HasSpin,
-)
-from rigidjax.batch import cpu_flags as cpu_flags
+from rigidjax._names import own_names, suggests
 from rigidjax.body import (
     Inertia as Inertia,
     MassProperties as MassProperties,
@@ -40,10 +35,6 @@ from rigidjax.body import (
 from rigidjax.frames import Point as Point, scenes as scenes
 from rigidjax.motion import (
     Attitude as Attitude,
-    AttitudeEquations as AttitudeEquations,
-    Coupled as Coupled,
-    EulerEquations as EulerEquations,
-    NewtonEuler as NewtonEuler,
     Rigid as Rigid,
     Spin as Spin,
     conserved as conserved,
@@ -59,11 +50,7 @@ from rigidjax.rotation import (
     so3 as so3,
 )
 from rigidjax.solve import (
-    Crossings as Crossings,
     Event as Event,
-    Exponents as Exponents,
-    Projected as Projected,
-    Solution as Solution,
     crossings as crossings,
     equations_of_motion as equations_of_motion,
     lyapunov_exponents as lyapunov_exponents,
@@ -91,7 +78,7 @@ _LATER = ("datasets", "elliptic", "lagrangian", "orbits", "plot", "tumblers", "w
 def __getattr__(name: str) -> ModuleType:
     if name in _LATER:
         return importlib.import_module(f"rigidjax.{name}")
-    raise missing(__name__, name)
+    return suggests(__name__)(name)
 
 
 __dir__ = own_names(__name__)

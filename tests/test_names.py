@@ -94,33 +94,6 @@ def test_readme_and_guide_use_what_is_shown():
     assert "body" in used and not used - set(dir(rj)) - {"__version__"}
 
 
-TORQUES = {
-    name: f"motion.torques.base.{name}"
-    for name in ("act", "evaluate", "in_precision", "require_rung")
-}
-RENAMED = {
-    "frames": {"scene_of": "frames.frame_dynamics.scene_of"},
-    "motion.torques": TORQUES,
-    "identify": {"Moment": "identify.SensorInput", "toutatis": "datasets.toutatis"},
-    "identify.sensors": {"Moment": "identify.SensorInput"},
-    "exact": {"FreeInterpolation": "exact.diffrax_solver.FreeInterpolation"},
-    "solve": {"GroupInterpolation": "solve.projection.GroupInterpolation"},
-}
-
-
-@pytest.mark.parametrize(
-    ("module", "old", "new"),
-    [(m, old, new) for m, names in RENAMED.items() for old, new in names.items()],
-)
-def test_an_old_name_gives_the_new_thing_and_says_where_it_is(module, old, new):
-    place, _, name = f"rigidjax.{new}".rpartition(".")
-    thing = getattr(importlib.import_module(place), name)
-    module = importlib.import_module(f"rigidjax.{module}")
-    assert old not in dir(module)
-    with pytest.warns(DeprecationWarning, match=f"{old} is now rigidjax.{new}; the old name will"):
-        assert getattr(module, old) is thing
-
-
 LATER = """
 import sys, rigidjax
 heavy = "scipy.signal", "scipy.stats", "scipy.interpolate", "scipy.special", "scipy.optimize", "optax.contrib",

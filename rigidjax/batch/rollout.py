@@ -11,7 +11,7 @@ from jaxtyping import Array
 
 from rigidjax._types import ScalarLike
 from rigidjax.batch.sharding import Compiled, chunk_of, mesh_of, over_bodies
-from rigidjax.batch.validation import Bodies, bodies_of, driven_by, start_of, step_of, time_of
+from rigidjax.batch.validation import BodyBatch, bodies_of, driven_by, start_of, step_of, time_of
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.coupled import started
@@ -123,7 +123,7 @@ def rollout(
 
     **Returns** the states, of the type of `states0`, with leading axes (N,) or, with `save_every`,
     (N, num_steps // save_every); with `reduce` the pair (last states, carried). Under a torque with
-    states of its own they are `rigidjax.Coupled(motion, own)`.
+    states of its own they are `rigidjax.motion.Coupled(motion, own)`.
 
     Memory: the inputs, what is returned, and a chunk. Derivatives are those of the steps as taken,
     in forward mode and in reverse; reverse mode goes back in pieces of √`num_steps` steps and
@@ -187,7 +187,7 @@ def _run(plan: _Plan, reduce: Reduce | None, rest: Any, numbers: Any) -> Any:
     def one(given: Any, each: Any) -> Any:
         shared, initial, h, t0 = given
         own, inputs = each
-        body, state0, torque = Bodies.one(shared, own, rest)
+        body, state0, torque = BodyBatch.one(shared, own, rest)
         state0 = start_of(state0)
         body = real_or_nan(body)
         state0 = started(body, state0, bind(torque, first_row(torque, h, inputs)), t0)

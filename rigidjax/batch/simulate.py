@@ -14,7 +14,7 @@ from rigidjax._types import ScalarLike
 from rigidjax.batch.rollout import Inputs, rollout
 from rigidjax.batch.scheduling import dealt, quickness
 from rigidjax.batch.sharding import Compiled, chunk_of, mesh_of, over_bodies
-from rigidjax.batch.validation import Bodies, bodies_of, start_of, step_of, time_of
+from rigidjax.batch.validation import BodyBatch, bodies_of, start_of, step_of, time_of
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.coupled import Coupled
@@ -167,7 +167,7 @@ def _run(plan: _Plan, rest: Any, numbers: Any) -> Any:
 
     def one(given: Any, each: Any) -> Any:
         shared, ts = given
-        body, state0, torque = Bodies.one(shared, each, rest)
+        body, state0, torque = BodyBatch.one(shared, each, rest)
         state0 = start_of(state0)
         body = real_or_nan(body)
         if isinstance(plan.how, _Free):
@@ -178,7 +178,7 @@ def _run(plan: _Plan, rest: Any, numbers: Any) -> Any:
         return over_bodies(one, (shared, ts), each, plan.chunk, plan.mesh)
 
     def quick(each: Any) -> Array:
-        body, state0, torque = Bodies.one(shared, each, rest)
+        body, state0, torque = BodyBatch.one(shared, each, rest)
         return quickness(body, state0, torque, ts[0])
 
     parts = 1 if plan.mesh is None else plan.mesh.devices.size

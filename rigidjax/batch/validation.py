@@ -16,7 +16,7 @@ from rigidjax.motion.torques.inputs import delays_of, require_inputs
 from rigidjax.solve.validation import require_fit
 
 
-class Bodies(NamedTuple):
+class BodyBatch(NamedTuple):
     """A batch, sorted by what all bodies share and what each has of its own.
 
     **Fields:** `shared`, `each` trees of the same shape, `(body, state0, torque)`, with `None`
@@ -35,7 +35,7 @@ class Bodies(NamedTuple):
         return eqx.combine(shared, each, rest)
 
 
-def bodies_of(bodies: Any, states0: Any, torque: Any, torque_axes: Any) -> Bodies:
+def bodies_of(bodies: Any, states0: Any, torque: Any, torque_axes: Any) -> BodyBatch:
     """The batch.
 
     **Raises:** `TypeError` for what is no body or state, or does not fit together, or for states
@@ -88,12 +88,12 @@ def bodies_of(bodies: Any, states0: Any, torque: Any, torque_axes: Any) -> Bodie
         _own_torque(arrays[2], torque_axes, count),
     )
     each, shared = eqx.partition(arrays, axes)
-    found = Bodies(shared, each, rest, count, dtype)
+    found = BodyBatch(shared, each, rest, count, dtype)
     # Shapes are enough for an Inertia, and taking a row costs as much as many steps.
     shape = lambda a: jax.ShapeDtypeStruct(a.shape[1:], a.dtype)  # noqa: E731
     matter = isinstance(bodies, MassProperties)
     first = jax.tree.map((lambda a: a[0]) if matter else shape, each)
-    require_fit(*Bodies.one(shared, first, rest))
+    require_fit(*BodyBatch.one(shared, first, rest))
     return found
 
 

@@ -7,7 +7,7 @@ motion under random torques.
 
 from rigidjax._names import own_names
 from rigidjax.estimate.belief import Belief as Belief, start as start
-from rigidjax.estimate.density import LogDensity as LogDensity, Point as Point
+from rigidjax.estimate.density import LogDensity as LogDensity, Unpacked as Unpacked
 from rigidjax.estimate.filter import (
     Filtered as Filtered,
     filter as filter,

@@ -28,7 +28,7 @@ _GUESS = (
 )
 
 
-class Point(eqx.Module):
+class Unpacked(eqx.Module):
     """What a vector of unconstrained numbers stands for.
 
     **Fields:** `parameters` of the problem; `body`, of several bodies a dict by name, and `state0`,
@@ -168,8 +168,8 @@ class LogDensity(eqx.Module):
         x = _checks.floating(x, self.x0.shape, "x")
         return terms(self, x).log_density - 0.5 * jnp.sum(prior_residuals(self, x) ** 2)
 
-    def unpack(self, x: Float[Array, " n"]) -> Point:
-        """What x (n,) stands for: a `Point` with `body`, `state0`, `values`, `noise`, `process`.
+    def unpack(self, x: Float[Array, " n"]) -> Unpacked:
+        """What x (n,) stands for: `Unpacked` with `body`, `state0`, `values`, `noise`, `process`.
 
         `values` are those of the `Free`s by name; `parameters` the problem's own numbers.
         """
@@ -177,7 +177,7 @@ class LogDensity(eqx.Module):
         parameters, factors, logs = ravel_pytree(self.like)[1](x)
         noises, process = self._grown_noises(factors), self.grown(logs)
         body, state0 = self.problem.unpack(parameters)
-        return Point(parameters, body, state0, self.problem.values(parameters), noises, process)
+        return Unpacked(parameters, body, state0, self.problem.values(parameters), noises, process)
 
     def _grown_noises(self, factors: tuple) -> tuple[Array, ...]:
         """The noises (R, k) of the sensors by the logarithms of their factors."""
@@ -196,7 +196,9 @@ class LogDensity(eqx.Module):
 
 
 @eqx.filter_jit
-def of_draws(function: Callable[[Point], Any], density: LogDensity, x: Float[Array, "m n"]) -> Any:
+def of_draws(
+    function: Callable[[Unpacked], Any], density: LogDensity, x: Float[Array, "m n"]
+) -> Any:
     """`function(point)` of each draw; compiled once for a function and densities of one form."""
     return jax.vmap(lambda one: function(density.unpack(one)))(x)
 

@@ -10,7 +10,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from rigidjax import _checks
-from rigidjax.estimate.density import LogDensity, Point, of_draws
+from rigidjax.estimate.density import LogDensity, Unpacked, of_draws
 
 # A sampler: key, log-density of z, a first z (n,) → draws (samples, n).
 Sampler = Callable[[Any, Callable[[Array], Array], Array], Array]
@@ -125,17 +125,17 @@ class Posterior(eqx.Module):
         return _blackjax().diagnostics.effective_sample_size(self.x)
 
     @property
-    def points(self) -> Point:
+    def points(self) -> Unpacked:
         """What the draws stand for, with leading axes of chains and samples."""
         return self.of(_itself)
 
-    def of(self, function: Callable[[Point], Any]) -> Any:
+    def of(self, function: Callable[[Unpacked], Any]) -> Any:
         """`function(point)` of each draw, with leading axes of chains and samples.
 
         Such as `drawn.of(lambda point: point.body.moments)`. **Raises** `TypeError` for what is no
         function.
         """
-        _checks.function(function, "function", "of a Point, such as lambda point: point.body")
+        _checks.function(function, "function", "of `Unpacked`, such as lambda point: point.body")
         found = of_draws(function, self.density, self.x.reshape(-1, self.x.shape[-1]))
         return jax.tree.map(lambda leaf: leaf.reshape(*self.x.shape[:2], *leaf.shape[1:]), found)
 
@@ -163,7 +163,7 @@ class Posterior(eqx.Module):
         return arviz.from_dict({"posterior": {k: jnp.asarray(v) for k, v in out.items()}})
 
 
-def _itself(point: Point) -> Point:
+def _itself(point: Unpacked) -> Unpacked:
     return point
 
 

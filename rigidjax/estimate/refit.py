@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float
 
 from rigidjax import _checks
 from rigidjax._types import Scalar
-from rigidjax.estimate.density import LogDensity, Point, of_draws
+from rigidjax.estimate.density import LogDensity, Unpacked, of_draws
 from rigidjax.estimate.terms import curvature
 from rigidjax.identify.levenberg_marquardt import Settings, made_of, search
 from rigidjax.identify.quantities import carried
@@ -60,7 +60,7 @@ class Refit(eqx.Module):
     weights: Float[Array, " m"]
 
     @property
-    def point(self) -> Point:
+    def point(self) -> Unpacked:
         """What x stands for: body, first states, values, noise, process."""
         return self.density.unpack(self.x)
 
@@ -70,9 +70,9 @@ class Refit(eqx.Module):
         return 1.0 / jnp.sum(self.weights**2)
 
     def interval_of(
-        self, of: Callable[[Point], Any], level: float = 0.95
+        self, of: Callable[[Unpacked], Any], level: float = 0.95
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Interval (low, high) of any function of a `Point` to an array, with equal tails.
+        """Interval (low, high) of any function of `Unpacked` to an array, with equal tails.
 
         From the weighted draws; where these are worth fewer than 100 independent ones (`effective`)
         the covariance is carried by the derivative of the function, which is then to be
@@ -83,7 +83,7 @@ class Refit(eqx.Module):
         level = _checks.positive(level, "level")
         if level >= 1:
             raise ValueError(f"level: wanted a probability between 0 and 1, got {level}")
-        _checks.function(of, "of", "of a Point to an array")
+        _checks.function(of, "of", "of `Unpacked` to an array")
         if not (float(self.effective) >= _LEAST or bool(self.converged)):
             raise ValueError(
                 "interval_of: the search did not come to the maximum of the density, and fewer "

@@ -21,7 +21,7 @@ from rigidjax.motion import Rigid
 from rigidjax.motion.torques.base import in_precision
 
 
-class Row(NamedTuple):
+class ReadingRow(NamedTuple):
     """What one sensor says of a state.
 
     **Fields:** `error` (k,) reading minus prediction; `matrix` (k, n) how the prediction changes
@@ -125,7 +125,7 @@ def rows(
     x: Extended,
     values: Sequence[Array],
     masks: Sequence[Array],
-) -> list[Row]:
+) -> list[ReadingRow]:
     """What each sensor's reading at t says of the state x."""
     dtype = x.motion.omega.dtype
     body = in_precision(model.body, dtype)
@@ -154,7 +154,7 @@ def rows(
         if limit is not None:
             seen = seen & (jnp.abs(value) < limit * (1 - 1e-6))
         assert sensor.noise is not None
-        out.append(Row(found, matrix, sensor.noise**2, seen))
+        out.append(ReadingRow(found, matrix, sensor.noise**2, seen))
     return out
 
 
@@ -176,12 +176,12 @@ class Read(NamedTuple):
 
 
 def absorb_all(
-    row: Sequence[Row], step: Array, root: Array
+    row: Sequence[ReadingRow], step: Array, root: Array
 ) -> tuple[Array, Array, tuple[Read, ...]]:
     """Potter's update by all numbers of all sensors, one by one."""
-    stacked = Row(*(jnp.concatenate(parts) for parts in zip(*row, strict=True)))
+    stacked = ReadingRow(*(jnp.concatenate(parts) for parts in zip(*row, strict=True)))
 
-    def one(carry: tuple[Array, Array], number: Row) -> tuple[Any, Any]:
+    def one(carry: tuple[Array, Array], number: ReadingRow) -> tuple[Any, Any]:
         found = roots.absorb(*carry, number.matrix, number.error, number.variance, number.seen)
         return (found.step, found.root), (found.innovation, found.variance)
 

@@ -1,6 +1,8 @@
 """Motions in closed form, without a solver."""
 
-from rigidjax._names import own_names, renamed
+from typing import TYPE_CHECKING
+
+from rigidjax._names import own_names, suggests
 from rigidjax.exact.diffrax_solver import FreeSolver as FreeSolver
 from rigidjax.exact.free_body import FreeBody as FreeBody, free_body as free_body
 from rigidjax.exact.periods import (
@@ -8,7 +10,6 @@ from rigidjax.exact.periods import (
     precession_period as precession_period,
 )
 
-__getattr__ = renamed(
-    __name__, {"FreeInterpolation": "rigidjax.exact.diffrax_solver.FreeInterpolation"}
-)
+if not TYPE_CHECKING:
+    __getattr__ = suggests(__name__)
 __dir__ = own_names(__name__)

@@ -42,7 +42,7 @@ class FreeSolver(dfx.AbstractSolver):
     **Raises:** `ValueError` for a term that is not one of those, or that has a torque.
 
     >>> import diffrax, rigidjax as rj
-    >>> field = rj.EulerEquations(rj.Inertia.from_principal(1.0, 2.0, 3.0))
+    >>> field = rj.motion.EulerEquations(rj.Inertia.from_principal(1.0, 2.0, 3.0))
     >>> y0 = rj.Spin([0.0, 1.0, 1e-4])
     >>> solver = FreeSolver()
     >>> sol = diffrax.diffeqsolve(diffrax.ODETerm(field), solver, 0.0, 20.0, 20.0, y0)

@@ -1,6 +1,8 @@
 """Moving frames, and scenes of particles seen from them. No body is needed."""
 
-from rigidjax._names import own_names, renamed
+from typing import TYPE_CHECKING
+
+from rigidjax._names import own_names, suggests
 from rigidjax.frames import scenes as scenes
 from rigidjax.frames.base import AbstractScene as AbstractScene, Force as Force
 from rigidjax.frames.frame_dynamics import (
@@ -12,5 +14,6 @@ from rigidjax.frames.moving import MovingFrame as MovingFrame
 from rigidjax.frames.point import Point as Point
 from rigidjax.frames.rotation_models import AboutAxis as AboutAxis, Uniform as Uniform
 
-__getattr__ = renamed(__name__, {"scene_of": "rigidjax.frames.frame_dynamics.scene_of"})
+if not TYPE_CHECKING:
+    __getattr__ = suggests(__name__)
 __dir__ = own_names(__name__)

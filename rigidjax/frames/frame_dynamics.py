@@ -88,7 +88,7 @@ def scene_of(force: Any) -> AbstractScene:
     )
 
 
-class Push(eqx.Module):
+class FrameWrench(eqx.Module):
     """A force on the centre of mass, N, axes of S', and a torque about it, N m, body axes, (3,)."""
 
     force: Vec3
@@ -130,7 +130,7 @@ class BodyInFrame(eqx.Module):
         if self.torque is not None:
             _checks.function(self.torque, "torque", "(t, state, body) → (3,), N m, or a law")
 
-    def __call__(self, t: ScalarLike, state: Any, body: Any) -> Vec3 | Push:
+    def __call__(self, t: ScalarLike, state: Any, body: Any) -> Vec3 | FrameWrench:
         now = self.frame.at(t)
         # `MassProperties` hold an inertia, about the centre of mass.
         tensor, omega = getattr(body, "inertia", body).tensor, state.omega
@@ -154,4 +154,4 @@ class BodyInFrame(eqx.Module):
                 force, real = force + real.force.astype(omega.dtype), real.torque
             real = _checks.floating(real, (3,), "torque", hint="body-frame N m")
             torque = torque + real.astype(omega.dtype)
-        return torque if force is None else Push(force, torque)
+        return torque if force is None else FrameWrench(force, torque)

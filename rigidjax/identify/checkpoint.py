@@ -33,7 +33,7 @@ def bare(tried: Tried) -> Tried:
     return tried if tried.found is None else dataclasses.replace(tried, found=None)
 
 
-class Position(NamedTuple):
+class SearchState(NamedTuple):
     """Where the search from one start stands, all that the rest of it depends on.
 
     **Fields:** `stage` the index of the horizon that comes next, their number where it is over;
@@ -84,11 +84,11 @@ class Checkpoint:
         self.path, self.like = None if path is None else Path(path), like
         self.print_of = print_of
         self.done: list[Tried] = []
-        self.position = Position(0, 0, like)
+        self.position = SearchState(0, 0, like)
         if self.path is not None and self.path.exists():
             self._read(self.path)
 
-    def save(self, done: Sequence[Tried], position: Position) -> None:
+    def save(self, done: Sequence[Tried], position: SearchState) -> None:
         """Write what is finished and where the search stands, replacing the file at once."""
         if self.path is None:
             return
@@ -127,4 +127,4 @@ class Checkpoint:
             jax.tree.unflatten(structure, map(jnp.asarray, found[i * count : (i + 1) * count]))
             for i in range(done + 1)
         ]
-        self.done, self.position = items[:-1], Position(stage, strides, items[-1])
+        self.done, self.position = items[:-1], SearchState(stage, strides, items[-1])

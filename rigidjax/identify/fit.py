@@ -16,7 +16,7 @@ from rigidjax.identify import uncertainty
 from rigidjax.identify.assessment import assess
 from rigidjax.identify.checkpoint import (
     Checkpoint,
-    Position,
+    SearchState,
     Tried,
     bare,
     fingerprint,
@@ -228,20 +228,20 @@ def _one_by_one(
             resumed = number == len(keep.done) + 1 and keep.position.stage > 0
             latest = [like]
 
-            def look(position: Position) -> None:
+            def look(position: SearchState) -> None:
                 # A part of the record only: its misfit is no measure of the whole.
                 if np.isfinite(float(position.tried.cost)):
                     latest[0] = position.tried  # noqa: B023
                 keep.save(tried, position)
 
-            start = keep.position if resumed else Position(0, 0, fresh(point))
+            start = keep.position if resumed else SearchState(0, 0, fresh(point))
             # Once a start explains the record, others are only to show whether that is the one.
             aim = min((float(item.cost) for item in tried if bool(item.converged)), default=np.inf)
             aim = aim if aim <= enough(problem) else 0.0
             out = climb(start, problem, noise, tolerance, max_steps, look=look, aim=aim)
             latest = [like]
             tried[:] = _with_one_found([*tried, out])
-            keep.save(tried, Position(0, 0, like))
+            keep.save(tried, SearchState(0, 0, like))
             _say(progress, number, len(points), tried)
     except KeyboardInterrupt:
         cut.append(f"interrupted after {len(tried)} of {len(points)} starts")

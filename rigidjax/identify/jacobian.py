@@ -104,7 +104,7 @@ def _error_of(sensor: Any, now: SensorInput, value: Array) -> Array:
             raise
         raise TypeError(
             f"{name}.error: {wrong}; it says feels = {sensor.feels.__name__}, and what it looks at "
-            "needs more: say feels = rj.HasAttitude, or rj.HasPose"
+            "needs more: say feels = rj.motion.HasAttitude, or rj.motion.HasPose"
         ) from wrong
     wanted = (sensor.components,)
     if jnp.shape(found) != wanted:

@@ -40,7 +40,7 @@ class AbstractIntegrator(eqx.Module):
     def states(self, body: Any, state0: Any, ts: Float[Array, " times"], torque: Torque) -> Any:
         """The states at `ts`, with a leading time axis.
 
-        Under a law with states of its own a `rigidjax.Coupled` of them, where a sensor needs them.
+        Under a law with states of its own a `motion.Coupled` of them, where a sensor needs them.
         """
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
 
-from rigidjax.identify.checkpoint import Position, Tried
+from rigidjax.identify.checkpoint import SearchState, Tried
 from rigidjax.identify.levenberg_marquardt import (
     BOLD as BOLD,
     CAREFUL as CAREFUL,
@@ -200,13 +200,13 @@ def fresh(point: Parameters) -> Tried:
 
 
 def climb(
-    start: Position,
+    start: SearchState,
     problem: Problem,
     noise: Noise,
     tolerance: float,
     max_steps: int,
     *,
-    look: Callable[[Position], None] = lambda position: None,
+    look: Callable[[SearchState], None] = lambda position: None,
     aim: float = 0.0,
 ) -> Tried:
     """One start down to the bottom; `look` is called after each stride with where it stands.
@@ -233,13 +233,13 @@ def climb(
             if part > 0 and not bool(found.converged) and float(found.cost) > WILD * part:
                 # Not even this part, which another start explains.
                 tried = Tried(tried.parameters, jnp.asarray(level), tried.converged)
-                look(Position(len(HORIZONS), 0, tried))
+                look(SearchState(len(HORIZONS), 0, tried))
                 break
-            look(Position(stage + 1, 0, tried))
+            look(SearchState(stage + 1, 0, tried))
             continue
 
         def at_last(now: Tried, strides: int, over: bool, stage: int = stage) -> None:
-            look(Position(stage + over, strides, now))
+            look(SearchState(stage + over, strides, now))
 
         done = start.strides if stage == start.stage else 0
         tried = settle(
@@ -249,13 +249,13 @@ def climb(
 
 
 def _at_once(
-    start: Position,
+    start: SearchState,
     problem: Problem,
     noise: Noise,
     tolerance: float,
     max_steps: int,
     aim: float,
-) -> tuple[Tried, Position, float | None]:
+) -> tuple[Tried, SearchState, float | None]:
     """The start fitted to the whole record, if that explains it; else as it is, and its misfit."""
     if start.stage or start.strides:
         return start.tried, start, None
@@ -265,7 +265,7 @@ def _at_once(
     if not bool(tried.converged) or float(tried.cost) > enough(problem):
         return start.tried, start, float(end.first)
     found = _ended(tried, end)
-    return found, Position(len(HORIZONS) - 1, 1, found), None
+    return found, SearchState(len(HORIZONS) - 1, 1, found), None
 
 
 def enough(problem: Problem) -> float:

@@ -3,6 +3,11 @@
 from typing import TYPE_CHECKING
 
 from rigidjax._names import own_names, suggests
+from rigidjax._types import (
+    HasAttitude as HasAttitude,
+    HasPose as HasPose,
+    HasSpin as HasSpin,
+)
 from rigidjax.motion import torques as torques
 from rigidjax.motion.attitude import (
     Attitude as Attitude,

@@ -56,7 +56,7 @@ class AttitudeEquations(eqx.Module):
     Source: `dM/dt = M J'` (notes, eq 50), written for the quaternion of M.
 
     >>> import rigidjax as rj
-    >>> field = rj.AttitudeEquations(rj.Inertia.from_principal(1.0, 2.0, 3.0))
+    >>> field = rj.motion.AttitudeEquations(rj.Inertia.from_principal(1.0, 2.0, 3.0))
     >>> field(0.0, Attitude([1.0, 0, 0, 0], [0.0, 0, 1]), None).q
     Array([-0. ,  0. ,  0. ,  0.5], dtype=float64)
     """

@@ -61,7 +61,7 @@ class NewtonEuler(eqx.Module):
     **Raises:** as `EulerEquations`.
 
     >>> import rigidjax as rj
-    >>> field = rj.NewtonEuler(rj.shapes.box(2.0, [0.1, 0.2, 0.3]))
+    >>> field = rj.motion.NewtonEuler(rj.shapes.box(2.0, [0.1, 0.2, 0.3]))
     >>> field(0.0, Rigid([0.0, 0, 0], [1.0, 0, 0], [1.0, 0, 0, 0], [0.0, 0, 1]), None).x
     Array([1., 0., 0.], dtype=float64)
     """

@@ -45,7 +45,7 @@ class EulerEquations(eqx.Module):
     the numbers are known; under `jit` call `Inertia.invertible` first.
 
     >>> import rigidjax as rj
-    >>> rj.EulerEquations(rj.Inertia.from_principal(1.0, 2.0, 3.0))(0.0, Spin([1.0, 1, 1]), None)
+    >>> EulerEquations(rj.Inertia.from_principal(1.0, 2.0, 3.0))(0.0, Spin([1.0, 1, 1]), None)
     Spin(omega=f64[3])
     """
 

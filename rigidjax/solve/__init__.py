@@ -1,6 +1,8 @@
 """Motions by a solver: in our own loops, or by diffrax."""
 
-from rigidjax._names import own_names, renamed
+from typing import TYPE_CHECKING
+
+from rigidjax._names import own_names, suggests
 from rigidjax.solve import solvers as solvers
 from rigidjax.solve.adaptive import adaptive as adaptive
 from rigidjax.solve.crossings import Crossings as Crossings, crossings as crossings
@@ -10,12 +12,10 @@ from rigidjax.solve.exponents import (
     lyapunov_exponents as lyapunov_exponents,
 )
 from rigidjax.solve.fixed_loop import fixed as fixed
-from rigidjax.solve.projection import Projected as Projected
 from rigidjax.solve.simulate import simulate as simulate
 from rigidjax.solve.solution import Solution as Solution
 from rigidjax.solve.vector_field import equations_of_motion as equations_of_motion
 
-__getattr__ = renamed(
-    __name__, {"GroupInterpolation": "rigidjax.solve.projection.GroupInterpolation"}
-)
+if not TYPE_CHECKING:
+    __getattr__ = suggests(__name__)
 __dir__ = own_names(__name__)

@@ -69,7 +69,7 @@ def adaptive(
     **Raises:** `TypeError` for a state of several dtypes, or of another than `ts`.
 
     >>> import rigidjax as rj
-    >>> field = rj.AttitudeEquations(rj.Inertia.from_principal(1.0, 2.0, 3.0))
+    >>> field = rj.motion.AttitudeEquations(rj.Inertia.from_principal(1.0, 2.0, 3.0))
     >>> start = rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 1])
     >>> solver, ts = rj.solvers.Tsitouras5(), jnp.array([0.0, 1.0])
     >>> adaptive(solver, field, ts, start, rtol=1e-9, atol=1e-9).ys.q[1, 3]

@@ -36,7 +36,7 @@ class Event(eqx.Module):
 
     - `condition`: a Module or function `(t, state, body) → scalar`, smooth along the motion; it
       may hold traced numbers. Under a law with states of its own the state is a
-      `rigidjax.Coupled`: `state.motion.omega`, `state.own`.
+      `rigidjax.motion.Coupled`: `state.motion.omega`, `state.own`.
     - `direction`: 1 for a zero on the way up, −1 on the way down, 0 for both (as in SciPy), in the
       order in which the run meets them.
     - `max_step`: the longest step, s. Zeros are found where the condition has changed its sign at

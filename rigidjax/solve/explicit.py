@@ -93,7 +93,7 @@ class RungeKutta4(AbstractExplicit):
     Source: Kutta 1901; Hairer, Nørsett and Wanner (1993), II.1, doi:10.1007/978-3-540-78862-1.
 
     >>> import diffrax, rigidjax as rj
-    >>> field = rj.AttitudeEquations(rj.Inertia.from_principal(1.0, 2.0, 3.0))
+    >>> field = rj.motion.AttitudeEquations(rj.Inertia.from_principal(1.0, 2.0, 3.0))
     >>> start = rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 1])
     >>> term = diffrax.ODETerm(field)
     >>> diffrax.diffeqsolve(term, rj.solvers.RungeKutta4(), 0.0, 1.0, 0.01, start).ys.q[0, 3]

@@ -41,7 +41,7 @@ def fixed(
     **Raises:** `TypeError` for another solver, or as the solver does.
 
     >>> import rigidjax as rj
-    >>> field = rj.AttitudeEquations(rj.Inertia.from_principal(1.0, 2.0, 3.0))
+    >>> field = rj.motion.AttitudeEquations(rj.Inertia.from_principal(1.0, 2.0, 3.0))
     >>> start = rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 1])
     >>> ys = fixed(rj.solvers.DormandPrince8(), field, jnp.array([0.0, 1.0]), start, 8)
     >>> ys.q[1, 3]

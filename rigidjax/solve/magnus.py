@@ -80,7 +80,7 @@ class Magnus4(dfx.AbstractSolver):
     **Raises:** `TypeError` for a torque that looks at the attitude, or another state.
 
     >>> import diffrax, rigidjax as rj
-    >>> field = rj.AttitudeEquations(rj.Inertia.from_principal(1.0, 2.0, 3.0))
+    >>> field = rj.motion.AttitudeEquations(rj.Inertia.from_principal(1.0, 2.0, 3.0))
     >>> start = rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 1])
     >>> term = diffrax.ODETerm(field)
     >>> diffrax.diffeqsolve(term, Magnus4(), 0.0, 1.0, 0.01, start).ys.q[0, 3]
@@ -136,5 +136,5 @@ def require_blind(law: Any) -> None:
         raise TypeError(
             f"Magnus4: the torque {type(law).__name__} depends on the attitude, or does not say "
             "what it feels; only time and body rate may enter it: a law of your own says so by "
-            "feels = rigidjax.HasSpin; for others use rigidjax.solvers.RungeKutta4"
+            "feels = rigidjax.motion.HasSpin; for others use rigidjax.solvers.RungeKutta4"
         )

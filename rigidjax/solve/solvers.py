@@ -8,6 +8,7 @@ from rigidjax.solve.explicit import (
     Tsitouras5 as Tsitouras5,
 )
 from rigidjax.solve.magnus import Magnus4 as Magnus4
+from rigidjax.solve.projection import Projected as Projected
 from rigidjax.solve.splitting import (
     Splitting2 as Splitting2,
     Splitting4 as Splitting4,

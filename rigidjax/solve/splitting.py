@@ -113,7 +113,7 @@ class Splitting2(AbstractSplitting):
     Source: Strang 1968, doi:10.1137/0705041, with the free flow of `rigidjax.exact.free_body`.
 
     >>> import diffrax, rigidjax as rj
-    >>> field = rj.AttitudeEquations(rj.Inertia.from_principal(1.0, 2.0, 3.0))
+    >>> field = rj.motion.AttitudeEquations(rj.Inertia.from_principal(1.0, 2.0, 3.0))
     >>> start = rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 1])
     >>> term = diffrax.ODETerm(field)
     >>> diffrax.diffeqsolve(term, Splitting2(), 0.0, 1.0, 0.5, start).ys.q[0, 3]

@@ -62,7 +62,7 @@ def stepper_of(solver: Any, field: Callable[..., Any], y0: Any) -> Stepper:
     `y0` a state. **Raises:** `TypeError` for a solver that has no such step.
 
     >>> import rigidjax as rj
-    >>> field = rj.EulerEquations(rj.Inertia.from_principal(1.0, 2.0, 2.5))
+    >>> field = rj.motion.EulerEquations(rj.Inertia.from_principal(1.0, 2.0, 2.5))
     >>> stepper = stepper_of(None, field, rj.Spin([1.0, 0.0, 0.0]))
     >>> [float(number) for number in stepper.start]
     [1.0, 0.0, 0.0]
@@ -74,7 +74,7 @@ def cheapest(field: Callable[..., Any]) -> Magnus4 | RungeKutta4:
     """The method of order 4 that takes the least work.
 
     >>> import rigidjax as rj
-    >>> type(cheapest(rj.EulerEquations(rj.Inertia.from_principal(1.0, 2.0, 2.5)))).__name__
+    >>> type(cheapest(rj.motion.EulerEquations(rj.Inertia.from_principal(1.0, 2.0, 2.5)))).__name__
     'RungeKutta4'
     """
     attitude = isinstance(field, AttitudeEquations)

@@ -4,7 +4,7 @@ Run `python tests/batch/bench_batch.py [--quick] [--float32] [--flag] [--devices
 [--numba-python /venv/bin/python]`.
 Everything is timed in turn, round after round, on one pinned core, as processor time (on a GPU as
 wall time); medians are printed, and ratios to the first row of each table. Compilation is apart.
-What is not installed is left out and says so. `--flag` starts again with what `rj.cpu_flags` says;
+What is not installed is left out and says so. `--flag` starts again with what `rj.batch.cpu_flags` says;
 `--devices 2` compares one device with two, in wall time, on as many cores.
 """
 
@@ -245,7 +245,7 @@ def naive(bodies, states):
 def plain_diffrax(bodies, states, steps):
     def one(body, state):
         return dfx.diffeqsolve(
-            dfx.ODETerm(rj.AttitudeEquations(body)), dfx.Tsit5(), 0.0, H * steps, H, state,
+            dfx.ODETerm(rj.motion.AttitudeEquations(body)), dfx.Tsit5(), 0.0, H * steps, H, state,
             stepsize_controller=dfx.ConstantStepSize(), max_steps=steps + 1,
         ).ys  # fmt: skip
 
@@ -367,7 +367,7 @@ def adaptive(count):
     few = jax.tree.map(lambda a: a[:small], (bodies, states))
 
     def plain(body, state):
-        field = rj.AttitudeEquations(body, TOP)
+        field = rj.motion.AttitudeEquations(body, TOP)
         return dfx.diffeqsolve(
             dfx.ODETerm(field), dfx.Dopri8(), 0.0, 10.0, None, state,
             stepsize_controller=dfx.PIDController(rtol=1e-9, atol=1e-12),
@@ -423,7 +423,7 @@ def two_devices(count):
 def main():
     device = jax.devices()[0]
     print(f"jax {jax.__version__}, {device.platform} {device.device_kind}, {np.dtype(DTYPE)}")
-    print(rj.cpu_flags() if ON_CPU else "")
+    print(rj.batch.cpu_flags() if ON_CPU else "")
     if DTYPE == jnp.float32:
         print("float32: the error of a long run is at least about 5e-6, whatever the step")
     counts = OPTIONS.bodies or ([1000] if OPTIONS.quick else [10_000, 100_000])

@@ -52,7 +52,7 @@ def test_steps_are_diffraxs(torque, method):
     bodies, states = batch(3)
 
     def one(body, state):
-        field = rj.AttitudeEquations(body, torque)
+        field = rj.motion.AttitudeEquations(body, torque)
         return dfx.diffeqsolve(
             dfx.ODETerm(field), method, 0.0, 1.2, 0.1, state,
             stepsize_controller=dfx.ConstantStepSize(),
@@ -106,7 +106,7 @@ def test_derivatives_are_those_of_the_steps():
         law = eqx.tree_at(lambda law: law.com, TOP, com)
 
         def one(tensor, q, omega):
-            field = rj.AttitudeEquations(rj.Inertia(tensor), law)
+            field = rj.motion.AttitudeEquations(rj.Inertia(tensor), law)
             ts = jnp.stack([0.0 * h, 6 * h])
             return jax.tree.map(lambda a: a[1], fixed(KUTTA, field, ts, rj.Attitude(q, omega), 6))
 

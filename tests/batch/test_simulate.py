@@ -139,9 +139,9 @@ def test_words(unhooked):
 
 def test_cpu_flags_tell_and_do_not_set(monkeypatch):
     monkeypatch.setenv("XLA_FLAGS", "--xla_dump_to=/nowhere")
-    found = rj.cpu_flags()
+    found = rj.batch.cpu_flags()
     assert not found.set
     assert found.xla_flags.startswith("--xla_dump_to=/nowhere --xla_backend_extra_options=")
     assert "export XLA_FLAGS=" in str(found)
     monkeypatch.setenv("XLA_FLAGS", found.xla_flags)
-    assert rj.cpu_flags().set and rj.cpu_flags().xla_flags == found.xla_flags
+    assert rj.batch.cpu_flags().set and rj.batch.cpu_flags().xla_flags == found.xla_flags

@@ -25,7 +25,7 @@ def angle(a, b):
 
 
 class Nothing(rj.torques.AbstractTorque):
-    feels = rj.HasSpin
+    feels = rj.motion.HasSpin
     rate_free = True
 
     def __call__(self, t, state, body):
@@ -36,7 +36,7 @@ def large_steps(axis):
     """D3, D19: 200 steps of a heavy top; error of the energy against h|Ω|."""
     body = rj.Inertia.from_principal(1.0, 1.8, 2.5)
     law = rj.torques.HeavyTop(1.0, [0.0, 0.1, 0.4], [0.0, 0.0, -1.0])
-    field = rj.AttitudeEquations(body, law)
+    field = rj.motion.AttitudeEquations(body, law)
     start = rj.Attitude([1.0, 0, 0, 0], [0.3, 0.5, 1.0])
     size = float(jnp.linalg.norm(start.omega))
     steps = np.logspace(-1.5, 1, 22) / size

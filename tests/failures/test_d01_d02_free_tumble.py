@@ -95,7 +95,7 @@ def test_d02_a_body_that_keeps_its_rate_is_caught():
 
 def test_d02_the_gyroscopic_term_is_differentiated_too():
     """d(dΩ/dt)/dΩ of a free body against the formula, at a spin where it is large."""
-    field = rj.EulerEquations(BODY)
+    field = rj.motion.EulerEquations(BODY)
     found = jax.jacfwd(lambda w: field(0.0, rj.Spin(w), None).omega)(jnp.asarray(OMEGA))
     i1, i2, i3 = 1.0, 2.0, 2.5
     x, y, z = OMEGA

@@ -20,7 +20,7 @@ EQUAL = dfx.ConstantStepSize()
 class Push(rj.torques.AbstractTorque):
     """A torque that swings: on a unit sphere from rest Ω = sin t."""
 
-    feels = rj.HasSpin
+    feels = rj.motion.HasSpin
 
     def __call__(self, t, state, body):
         return jnp.cos(t) * jnp.array([0.0, 0.0, 1.0], state.omega.dtype)

@@ -19,7 +19,7 @@ SOLVERS = pytest.mark.parametrize("solver", [None, dfx.Dopri8()], ids=["default"
 class Breaks(rj.torques.AbstractTorque):
     """A torque that is NaN from a time on."""
 
-    feels = rj.HasSpin
+    feels = rj.motion.HasSpin
     when: jax.Array
 
     def __call__(self, t, state, body):

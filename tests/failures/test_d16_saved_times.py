@@ -13,7 +13,7 @@ from systems.tumble import BODY, START, TOP
 import rigidjax as rj
 from rigidjax.solve import fixed
 
-FIELD = rj.AttitudeEquations(BODY, TOP)
+FIELD = rj.motion.AttitudeEquations(BODY, TOP)
 TS = jnp.linspace(0.0, 20.0, 301)
 
 
@@ -27,7 +27,7 @@ def carried(t0, y, t):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "solver",
-    [rj.Projected(dfx.Dopri8()), rj.Projected(dfx.Tsit5()), rj.solvers.Tsitouras5(),
+    [rj.solvers.Projected(dfx.Dopri8()), rj.solvers.Projected(dfx.Tsit5()), rj.solvers.Tsitouras5(),
      pytest.param(rj.solvers.DormandPrince8(), marks=pytest.mark.slow)],
     ids=["Dopri8", "Tsit5", "Tsitouras5", "DormandPrince8"],
 )  # fmt: skip

@@ -17,7 +17,7 @@ from once import filter_once
 import rigidjax as rj
 
 BODY = rj.Inertia.from_principal(1.0, 2.0, 3.0)
-FIELD = rj.AttitudeEquations(BODY)
+FIELD = rj.motion.AttitudeEquations(BODY)
 Q = jnp.array([1.0, 0.0, 0.0, 0.0])
 OMEGA = jnp.array([0.0, 1.0, 1e-2])
 
@@ -51,8 +51,8 @@ def exactly(omega):
     ("solver", "mode"),
     [
         pytest.param(rj.solvers.Tsitouras5(), "forward", marks=pytest.mark.slow),
-        (rj.Projected(dfx.Dopri8()), "forward"),
-        (rj.Projected(dfx.Dopri8()), "reverse"),
+        (rj.solvers.Projected(dfx.Dopri8()), "forward"),
+        (rj.solvers.Projected(dfx.Dopri8()), "reverse"),
         pytest.param(rj.solvers.Tsitouras5(), "reverse", marks=pytest.mark.slow),
     ],
     ids=["Tsitouras5-forward", "Dopri8-forward", "Dopri8-reverse", "Tsitouras5-reverse"],

@@ -21,7 +21,7 @@ STEPS = {
     "so3.log": lambda v: rj.so3.log(rj.so3.exp(v)),
     "so3.project": lambda v: rj.so3.project(rj.so3.exp(v)),
     "quaternion": lambda v: rj.quaternion.rotate(rj.quaternion.exp(v), v),
-    "field": lambda v: rj.AttitudeEquations(BODY)(0.0, rj.Attitude(START.q, v), None).omega,
+    "field": lambda v: rj.motion.AttitudeEquations(BODY)(0.0, rj.Attitude(START.q, v), None).omega,
     "closed form": lambda v: rj.exact.free_body(BODY, rj.Attitude(START.q, v), 1.0).q,
 }
 

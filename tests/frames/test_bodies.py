@@ -27,7 +27,7 @@ def same(found, wanted, bar):
 class Spring(eqx.Module):
     """A force and a torque in S, of place, velocity, attitude, rate and time."""
 
-    feels = rj.HasPose
+    feels = rj.motion.HasPose
 
     def __call__(self, t, state, body):
         force = (
@@ -97,7 +97,7 @@ def test_a_frame_rides_on_a_forced_body():
     np.testing.assert_allclose(now.rate, there.omega, rtol=0, atol=1e-13)
     np.testing.assert_allclose(now.rotation, rj.quaternion.to_matrix(there.q), rtol=0, atol=1e-13)
     # dΩ/dt of the solved motion against the equation it solves.
-    wanted = rj.AttitudeEquations(INERTIA, DRIVE)(t, there).omega
+    wanted = rj.motion.AttitudeEquations(INERTIA, DRIVE)(t, there).omega
     np.testing.assert_allclose(now.rate_change, wanted, rtol=0, atol=1e-11)
     for state in (Point(NUMBERS[:3], NUMBERS[3:6]), START, ATTITUDE):
         same(now.from_inertial(now.to_inertial(state)), state, 1e-11)

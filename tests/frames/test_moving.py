@@ -261,7 +261,7 @@ def test_a_frame_that_rides_on_a_body():
     state = solution.evaluate(2.5)
     np.testing.assert_allclose(now.rate, state.omega, atol=1e-14)
     np.testing.assert_allclose(now.rotation, rj.quaternion.to_matrix(state.q), atol=1e-14)
-    euler = rj.EulerEquations(body)(0.0, rj.Spin(state.omega)).omega
+    euler = rj.motion.EulerEquations(body)(0.0, rj.Spin(state.omega)).omega
     np.testing.assert_allclose(now.rate_change, euler, atol=1e-12)
     # Its Ω agrees with vee(Mᵀ dM/dt).
     plain = MovingFrame(MovingFrame(solution).matrix).angular_velocity(2.5)

@@ -59,7 +59,7 @@ def scene(craft):
 class Flapping(torques.AbstractForce):
     """The moment of rotors in a cross-flow, linear in the velocity in body axes."""
 
-    feels = rj.HasPose
+    feels = rj.motion.HasPose
     matrix: jax.Array
 
     def __call__(self, t, state, body):

@@ -13,7 +13,7 @@ DRIVE = torques.Held(TS, np.repeat(np.random.default_rng(0).normal(size=27), 3))
 
 
 class Push(torques.AbstractTorque):
-    feels = rj.HasSpin
+    feels = rj.motion.HasSpin
     source: torques.Lagged
 
     @property

@@ -13,7 +13,7 @@ from jaxtyping import Array
 import rigidjax as rj
 from rigidjax import identify
 from rigidjax.identify import search
-from rigidjax.identify.checkpoint import Position, Tried
+from rigidjax.identify.checkpoint import SearchState, Tried
 from rigidjax.identify.levenberg_marquardt import Search, Settings, descend
 from rigidjax.identify.search import climb, fresh, horizon, misfit, settle, whole
 
@@ -72,7 +72,7 @@ def test_a_part_is_not_fitted_at_the_cost_of_the_whole(problem, monkeypatch, bey
 
     monkeypatch.setattr(search, "_descend", step)
     monkeypatch.setattr(search, "cost_of", lambda point, *_: 1.0 if place(point) == 0.0 else beyond)
-    climb(Position(0, 0, fresh(at(problem, 0.0))), problem, (), 1e-4, 25)
+    climb(SearchState(0, 0, fresh(at(problem, 0.0))), problem, (), 1e-4, 25)
     assert [shown for _, shown in begun] == [1.0, 0.25, 0.5, 1.0]
     assert [start for start, _ in begun] == [0.0, 0.0, kept, kept]
 
@@ -86,14 +86,14 @@ def test_what_explains_the_whole_record_at_once_is_not_fitted_in_parts(problem, 
         return tried, an_end(1.0)
 
     monkeypatch.setattr(search, "_descend", step)
-    out = climb(Position(0, 0, fresh(at(problem, 0.0))), problem, (), 1e-4, 25)
+    out = climb(SearchState(0, 0, fresh(at(problem, 0.0))), problem, (), 1e-4, 25)
     assert begun == [1.0] and place(out.parameters) == 1.0 and bool(out.converged)
 
 
 class Blast(rj.torques.AbstractTorque):
     """None at first; after a time it is not finite."""
 
-    feels: ClassVar[type] = rj.HasSpin
+    feels: ClassVar[type] = rj.motion.HasSpin
     since: Array
 
     def __call__(self, t, state, body):

@@ -84,7 +84,7 @@ class Compass(identify.AbstractSensor):
 
     reading_shape: ClassVar[tuple] = ()
     components: ClassVar[int] = 2
-    feels: ClassVar[type] = rj.HasAttitude
+    feels: ClassVar[type] = rj.motion.HasAttitude
     unit: ClassVar[str] = "rad"
     noise: Any = None
 

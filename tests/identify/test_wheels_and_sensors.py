@@ -38,7 +38,7 @@ class Tachometer(identify.AbstractSensor):
     """Reads the wheels' speeds relative to the body."""
 
     reading_shape, components, unit = (2,), 2, "rad/s"
-    feels, noise = rj.HasSpin, None
+    feels, noise = rj.motion.HasSpin, None
     wheels: torques.ReactionWheels
 
     def error(self, now, reading):

@@ -21,7 +21,7 @@ BODY = rj.Inertia.from_principal(1.0, 2.0, 2.5)
 class Push(torques.AbstractTorque):
     """A driven torque along an axis of the body, and damping."""
 
-    feels = rj.HasSpin
+    feels = rj.motion.HasSpin
     gain: jax.Array
     source: torques.Input = torques.Input("u")
 
@@ -47,7 +47,7 @@ def recorded(sigma=0.0, seed=0):
 
     class Whole(eqx.Module):
         law: object
-        feels = rj.HasSpin
+        feels = rj.motion.HasSpin
         jump_times: jax.Array
 
         def __call__(self, t, state, body):

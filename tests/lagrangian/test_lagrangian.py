@@ -26,7 +26,7 @@ def _starts(count):
 @LAWS
 def test_euler_angles_agree_with_newton_euler_in_the_field(law):
     field = lagrangian.equations_of_motion(lagrangian.EulerAngleTop(INERTIA, law))
-    direct = rj.AttitudeEquations(INERTIA, law)
+    direct = rj.motion.AttitudeEquations(INERTIA, law)
 
     @jax.jit
     @jax.vmap
@@ -43,7 +43,7 @@ def test_euler_angles_agree_with_newton_euler_in_the_field(law):
 
 @LAWS
 def test_lie_poisson_agrees_with_newton_euler_in_the_field(law):
-    direct = rj.AttitudeEquations(INERTIA, law)
+    direct = rj.motion.AttitudeEquations(INERTIA, law)
     if law is None:
         field = lagrangian.lie_poisson(lagrangian.RotationalHamiltonian(INERTIA))
     else:
@@ -80,7 +80,7 @@ def test_all_three_agree_along_a_trajectory(law):
     def run(start, state):
         top = lagrangian.EulerAngleTop(INERTIA, law)
         angles = rk4(lagrangian.equations_of_motion(top), start, 0.5, 1000)
-        direct = rk4(rj.AttitudeEquations(INERTIA, law), state, 0.5, 1000)
+        direct = rk4(rj.motion.AttitudeEquations(INERTIA, law), state, 0.5, 1000)
         if law is None:
             field = lagrangian.lie_poisson(lagrangian.RotationalHamiltonian(INERTIA))
             first = lagrangian.Momentum(INERTIA.tensor @ state.omega)
@@ -165,7 +165,7 @@ def test_gradients_with_respect_to_the_numbers_of_a_lagrangian():
 
     def direct(inertia, top, start):
         state = lagrangian.to_attitude(start)
-        return jnp.sum(weights * rj.AttitudeEquations(inertia, top)(0.0, state).omega)
+        return jnp.sum(weights * rj.motion.AttitudeEquations(inertia, top)(0.0, state).omega)
 
     both = jax.jit(lambda *x: (jax.grad(by_angles, (0, 1))(*x), jax.grad(direct, (0, 1))(*x)))
     found, wanted = both(INERTIA, TOP, start)

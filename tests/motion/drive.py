@@ -9,7 +9,7 @@ from rigidjax import torques
 class Drive(torques.AbstractTorque):
     """A torque about the third axis, as given."""
 
-    feels = rj.HasSpin
+    feels = rj.motion.HasSpin
     source: object
 
     @property

@@ -27,7 +27,7 @@ def solve(edges, tolerance, adjoint):
         dfx.PIDController(rtol=tolerance, atol=tolerance), jump_ts=law.jump_times
     )
     return dfx.diffeqsolve(
-        dfx.ODETerm(rj.EulerEquations(BODY, law)),
+        dfx.ODETerm(rj.motion.EulerEquations(BODY, law)),
         dfx.Tsit5(),
         0.0,
         3.0,
@@ -42,8 +42,8 @@ def solve(edges, tolerance, adjoint):
 @jax.jit
 def exact(edges):
     """Three pieces, marched apart: free, pushed, free."""
-    free = rj.EulerEquations(BODY)
-    pushed = rj.EulerEquations(BODY, torques.ConstantTorque([0.0, 0.0, 3.0]))
+    free = rj.motion.EulerEquations(BODY)
+    pushed = rj.motion.EulerEquations(BODY, torques.ConstantTorque([0.0, 0.0, 3.0]))
     y = rk4(free, START, edges[0], 1000)
     y = rk4(pushed, y, edges[1] - edges[0], 1000)
     return rk4(free, y, 3.0 - edges[1], 2000).omega

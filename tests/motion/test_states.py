@@ -117,13 +117,13 @@ def test_momentum_is_kept_by_the_equations_themselves():
     """d/dt R(IΩ + Σ h a) is nothing at states drawn at random, to round-off, and energy changes by
     Σ u s: whatever motors, limits and friction do.
     """
-    field = rj.equations_of_motion(BODY, rj.Coupled.start(BODY, START, WHEELS), WHEELS)
+    field = rj.equations_of_motion(BODY, rj.motion.Coupled.start(BODY, START, WHEELS), WHEELS)
 
     def kept(y):
         return rj.conserved(BODY, y, WHEELS)["momentum"], rj.energy(BODY, y, WHEELS)
 
     def change(q, omega, h, t):
-        y = rj.Coupled(rj.Attitude(rj.quaternion.normalise(q), omega), (h,))
+        y = rj.motion.Coupled(rj.Attitude(rj.quaternion.normalise(q), omega), (h,))
         (value, _), (slope, power) = jax.jvp(kept, (y,), (field(t, y),))
         return (
             value,
@@ -298,7 +298,7 @@ def test_a_scene_without_states_is_the_same_program():
     law = torques.Sum(
         torques.Damping([0.1, 0.1, 0.1]), torques.HeavyTop(1.0, [0.0, 0, 1], [0.0, 0, -9.8])
     )
-    plain = rj.AttitudeEquations(BODY, law)
+    plain = rj.motion.AttitudeEquations(BODY, law)
     made = rj.equations_of_motion(BODY, START, law)
     texts = [str(jax.make_jaxpr(lambda y, f=f: f(0.5, y, None))(START)) for f in (plain, made)]
     assert texts[0] == texts[1]

@@ -43,7 +43,7 @@ def run(name, ts, p, weights, max_steps=100_000):
     tensor = jnp.asarray(TENSOR) + jnp.diag(body[:3])
     tensor = tensor + _symmetric(body[3:])
     torque = scenes(law)[name]
-    field = rj.AttitudeEquations(rj.Inertia(tensor), torque)
+    field = rj.motion.AttitudeEquations(rj.Inertia(tensor), torque)
     y0 = rj.Attitude(jnp.asarray(Q) + start[:4], jnp.array([1.3, 0.7, -1.6]) + start[4:])
     jumps = rj.torques.jumps_of(torque)
     out = adaptive(
@@ -196,7 +196,9 @@ def test_more_times_in_a_step_than_it_looks_at(monkeypatch):
 
     def value(ts, p):
         torque = scenes(p[:3])["pulses"]
-        field = rj.AttitudeEquations(rj.Inertia(jnp.asarray(TENSOR) + jnp.diag(p[3:6])), torque)
+        field = rj.motion.AttitudeEquations(
+            rj.Inertia(jnp.asarray(TENSOR) + jnp.diag(p[3:6])), torque
+        )
         y0 = rj.Attitude(jnp.asarray(Q) + p[9:13], jnp.array([1.3, 0.7, -1.6]) + p[13:])
         out = adaptive(
             rj.solvers.DormandPrince8(), field, ts, y0, rtol=1e-4, atol=1e-6,

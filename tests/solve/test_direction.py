@@ -29,7 +29,7 @@ WAYS = pytest.mark.parametrize(
 class Nothing(rj.torques.AbstractTorque):
     """A torque of zero: the free motion, but through a solver."""
 
-    feels = rj.HasSpin
+    feels = rj.motion.HasSpin
 
     def __call__(self, t, state, body):
         return jnp.zeros_like(state.omega)

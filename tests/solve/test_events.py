@@ -25,7 +25,7 @@ def middle(t, state, body):
 class Nothing(torques.AbstractTorque):
     """A torque of zero: the free motion, but through a solver."""
 
-    feels = rj.HasSpin
+    feels = rj.motion.HasSpin
 
     def __call__(self, t, state, body):
         return jnp.zeros_like(state.omega)

@@ -95,7 +95,7 @@ def test_other_states_over_long_intervals():
     body = rj.Inertia.from_principal(2.0, 2.0, 2.0)
     wheel = torques.ReactionWheels([[0.0, 0, 1]], [0.1], [30.0], viscous=0.2)
     torque = torques.Sum(torques.Damping([0.6, 0.6, 3.0]), wheel)
-    start = rj.Coupled.start(body, START, torque)
+    start = rj.motion.Coupled.start(body, START, torque)
     field = rj.equations_of_motion(body, start, torque)
     found = rj.lyapunov_exponents(field, start, 900.0, intervals=30, transient=10)
     # Ωz and h: 2 Ωz′ = −3 Ωz − u, h′ = u = −0.2 (h/0.1 − Ωz).

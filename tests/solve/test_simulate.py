@@ -20,7 +20,7 @@ Q = Q / np.linalg.norm(Q)
 class Nothing(rj.torques.AbstractTorque):
     """A torque of zero: the same motion, but through the solver."""
 
-    feels = rj.HasSpin
+    feels = rj.motion.HasSpin
     rate_free = True
 
     def __call__(self, t, state, body):
@@ -311,7 +311,7 @@ def test_times_without_end_are_refused():
 
 
 class NeedsAttitude(rj.torques.AbstractTorque):
-    feels = rj.HasAttitude
+    feels = rj.motion.HasAttitude
 
     def __call__(self, t, state, body):
         return state.q[1:]
@@ -371,7 +371,7 @@ def test_a_solver_that_is_projected_already_takes_every_adjoint():
         how = dict(solver=solver, adjoint=dfx.ForwardMode())
         return rj.simulate(body, start, [0.0, 2.0], law, **how).ys.q[-1]
 
-    twice = jax.jacfwd(last)(1.0, rj.Projected(dfx.Dopri8()))
+    twice = jax.jacfwd(last)(1.0, rj.solvers.Projected(dfx.Dopri8()))
     np.testing.assert_allclose(twice, jax.jacfwd(last)(1.0, dfx.Dopri8()), rtol=1e-12)
 
 

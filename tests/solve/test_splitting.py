@@ -27,14 +27,17 @@ LATE = 2.0
 class Swaying(rj.torques.AbstractTorque):
     """A top whose pivot is shaken: a torque of time and attitude."""
 
-    feels = rj.HasAttitude
+    feels = rj.motion.HasAttitude
     rate_free = True
 
     def __call__(self, t, state, body):
         return (1 + 0.5 * jnp.sin(3 * t)) * TOP(t, state, body)
 
 
-FIELDS = {"top": rj.AttitudeEquations(BODY, TOP), "swaying": rj.AttitudeEquations(BODY, Swaying())}
+FIELDS = {
+    "top": rj.motion.AttitudeEquations(BODY, TOP),
+    "swaying": rj.motion.AttitudeEquations(BODY, Swaying()),
+}
 
 
 @eqx.filter_jit
@@ -87,7 +90,7 @@ def energy(y):
 
 def test_invariants_over_a_hundred_thousand_steps():
     # 1e5 flows of a free body: momentum in space, energy, |q| to round-off.
-    free = rj.AttitudeEquations(BODY)
+    free = rj.motion.AttitudeEquations(BODY)
     ts = jnp.linspace(0.0, 1e4, 11)
 
     @eqx.filter_jit
@@ -179,8 +182,8 @@ def test_derivatives_of_a_run():
 @pytest.mark.parametrize(
     ("field", "start", "words"),
     [
-        (rj.AttitudeEquations(BODY, rj.torques.Damping(jnp.ones(3))), START, "Damping depends on the body rate"),
-        (rj.EulerEquations(BODY), rj.Spin(START.omega), "wanted AttitudeEquations .* got EulerEquations and Spin"),
+        (rj.motion.AttitudeEquations(BODY, rj.torques.Damping(jnp.ones(3))), START, "Damping depends on the body rate"),
+        (rj.motion.EulerEquations(BODY), rj.Spin(START.omega), "wanted AttitudeEquations .* got EulerEquations and Spin"),
     ],
 )  # fmt: skip
 def test_what_it_cannot_do_is_refused(field, start, words):

@@ -20,8 +20,8 @@ def held() -> rj.identify.Horizons:
     return rj.identify.windows(t, rj.Spin(np.outer(t, V)), length=3).held()
 
 
-def coupled() -> rj.Coupled:
-    return rj.Coupled(s.attitude(), (jnp.array([0.3, -0.4]),))
+def coupled() -> rj.motion.Coupled:
+    return rj.motion.Coupled(s.attitude(), (jnp.array([0.3, -0.4]),))
 
 
 row(
@@ -71,11 +71,11 @@ row(
     arguments=("law",),
     groups=("same",),
 )
-row("Coupled", lambda: dict(motion=s.attitude(), own=coupled().own), groups=())
+row("motion.Coupled", lambda: dict(motion=s.attitude(), own=coupled().own), groups=())
 row(
-    "Coupled.start",
+    "motion.Coupled.start",
     lambda: dict(body=s.inertia(), state0=s.attitude(), torque=wheels(), t=0.3),
-    run=rj.Coupled.start,
+    run=rj.motion.Coupled.start,
     arguments=("body", "state0", "t"),
     says=("own", "inertia"),
 )

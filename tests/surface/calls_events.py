@@ -74,6 +74,6 @@ row(
     groups=(*KINDS, "nan", "inf"),
     transforms=(),
 )  # fmt: skip
-leave_out("made by crossings", "Crossings")
-leave_out("made by lyapunov_exponents", "Exponents")
+leave_out("made by crossings", "solve.Crossings")
+leave_out("made by lyapunov_exponents", "solve.Exponents")
 leave_out("made by ThreeBody.manifold", "orbits.Manifold")

@@ -22,9 +22,9 @@ row("lagrangian.Momentum", dict(pi=W))
 row("lagrangian.MomentumAndDirection", dict(pi=W, gamma=V))
 
 # Vector fields.
-row("EulerEquations", lambda: dict(inertia=s.inertia(), torque=s.damping()))
-row("AttitudeEquations", lambda: dict(inertia=s.inertia(), torque=s.top()))
-row("NewtonEuler", lambda: dict(body=s.body(), torque=rj.torques.UniformGravity(DOWN)))
+row("motion.EulerEquations", lambda: dict(inertia=s.inertia(), torque=s.damping()))
+row("motion.AttitudeEquations", lambda: dict(inertia=s.inertia(), torque=s.top()))
+row("motion.NewtonEuler", lambda: dict(body=s.body(), torque=rj.torques.UniformGravity(DOWN)))
 row(
     "equations_of_motion",
     lambda: dict(body=s.inertia(), state0=s.attitude(), torque=s.top()),
@@ -293,7 +293,7 @@ for name in ("DormandPrince8", "Magnus4", "RungeKutta4", "Splitting2", "Splittin
     row(f"solve.solvers.{name}", transforms=())
 row("solve.solvers.Tsitouras5", transforms=())
 row("exact.FreeSolver", transforms=())
-row("Projected", lambda: dict(solver=dfx.Tsit5()), transforms=())
+row("solve.solvers.Projected", lambda: dict(solver=dfx.Tsit5()), transforms=())
 row(
     "simulate",
     lambda: dict(
@@ -318,13 +318,13 @@ row(
     transforms=(),
 )  # fmt: skip
 row(
-    "Solution.evaluate",
+    "solve.Solution.evaluate",
     lambda: dict(self=s.motion(), t=0.7),
     arguments=("t",),
     traced=("t",),
     transforms=("jit", "vmap", "grad"),
 )
-leave_out("simulate returns it", "Solution")
+leave_out("simulate returns it", "solve.Solution")
 leave_out(
     "inner loops: simulate and rollout run them",
     *(f"solve.{n}" for n in ("adaptive", "fixed")),
@@ -361,7 +361,7 @@ row(
     transforms=(),
 )
 row("batch.compiler_options", transforms=())
-row("cpu_flags", transforms=())
+row("batch.cpu_flags", transforms=())
 for name in ("share", "gather", "total"):
     row(
         f"batch.distributed.{name}",
@@ -373,4 +373,4 @@ leave_out(
     "joins other processes, or writes: tests/batch/test_devices.py",
     *(f"batch.distributed.{n}" for n in ("connect", "save", "recover")),
 )
-leave_out("batch.simulate, cpu_flags return them", "batch.Batch", "batch.CpuFlags")
+leave_out("batch.simulate, batch.cpu_flags return them", "batch.Batch", "batch.CpuFlags")

@@ -211,4 +211,9 @@ row(
     traced=("vertices", "density"),
 )
 leave_out("reads a file: tests/body/test_meshes.py", "body.shapes.mesh_file")
-leave_out("a Protocol, for isinstance and type checkers", "HasAttitude", "HasPose", "HasSpin")
+leave_out(
+    "a Protocol, for isinstance and type checkers",
+    "motion.HasAttitude",
+    "motion.HasPose",
+    "motion.HasSpin",
+)

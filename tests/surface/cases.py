@@ -519,14 +519,14 @@ def equations() -> list[Case]:
         Case(
             "equations of motion",
             lambda x: (
-                rj.AttitudeEquations(rj.Inertia(symmetric(x[:6])), s.top())(0.0, attitude_of(x[6:]), None),
-                rj.EulerEquations(rj.Inertia(symmetric(x[:6])))(0.0, rj.Spin(x[10:13]), None),
+                rj.motion.AttitudeEquations(rj.Inertia(symmetric(x[:6])), s.top())(0.0, attitude_of(x[6:]), None),
+                rj.motion.EulerEquations(rj.Inertia(symmetric(x[:6])))(0.0, rj.Spin(x[10:13]), None),
             ),
             {k: join(v, Q, W) for k, v in TENSORS.items()} | {"at rest": join(GENERAL, ONE, np.zeros(3))},
             step=0.01,
-            covers=("AttitudeEquations", "EulerEquations", "equations_of_motion"),
+            covers=("motion.AttitudeEquations", "motion.EulerEquations", "equations_of_motion"),
         ),
-        Case("NewtonEuler", lambda x: rj.NewtonEuler(body_of(x[:10]), rj.torques.UniformGravity(DOWN))(0.0, state_of(x[10:]), None), {"ordinary": join(TEN, RIGID), "at rest": join(TEN_BALL, RESTING)}, step=0.01),
+        Case("motion.NewtonEuler", lambda x: rj.motion.NewtonEuler(body_of(x[:10]), rj.torques.UniformGravity(DOWN))(0.0, state_of(x[10:]), None), {"ordinary": join(TEN, RIGID), "at rest": join(TEN_BALL, RESTING)}, step=0.01),
         Case(
             "lagrangian",
             lambda x: (
@@ -747,7 +747,7 @@ def fits() -> list[Case]:
 
         def error(x: Any, sensor: Any = sensor, reading: Any = reading) -> Any:
             state = attitude_of(x)
-            field = rj.AttitudeEquations(s.inertia(), s.top())
+            field = rj.motion.AttitudeEquations(s.inertia(), s.top())
             moment = identify.SensorInput(jnp.asarray(0.0), state, s.inertia(), field)
             return sensor.error(moment, jnp.asarray(reading))
 

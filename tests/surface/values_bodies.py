@@ -500,8 +500,8 @@ leave_out(
     "files: tests/body read what other programs wrote, and the numbers back",
     "body.shapes.mesh_file", "body.read_inertials", "body.write_inertials",
 )  # fmt: skip
-leave_out("a Protocol: no numbers", "HasAttitude", "HasPose", "HasSpin", "HasAttitude.q",
-          "HasPose.x", "HasPose.v", "HasSpin.omega")  # fmt: skip
+leave_out("a Protocol: no numbers", "motion.HasAttitude", "motion.HasPose", "motion.HasSpin", "motion.HasAttitude.q",
+          "motion.HasPose.x", "motion.HasPose.v", "motion.HasSpin.omega")  # fmt: skip
 
 # Brightness: a sum over the ellipsoid's directions, by the sphere it is an image of.
 leave_out("being mended for long shapes (issue 33, 1): its test holds it by a quadrature",

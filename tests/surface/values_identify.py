@@ -157,7 +157,7 @@ for made, loss in ((identify.Huber(), huber), (identify.SoftL1(), soft)):
 def scene_of(x, u, q, w, m, c, s):
     body = props(m, c, s)
     law = rj.torques.Sum(rj.torques.UniformGravity([0.0, 0.0, -9.8]), rj.torques.Drag(0.2, c))
-    field = rj.NewtonEuler(body, law)
+    field = rj.motion.NewtonEuler(body, law)
     return identify.SensorInput(jnp.asarray(0.0), rj.Rigid(x, u, q, w), body, field)
 
 
@@ -635,7 +635,7 @@ def our_sample(j, q, w):
     )
     now = identify.SensorInput(
         jnp.asarray(0.0), rj.Spin(w), rj.Inertia(j * jnp.eye(3)),
-        rj.EulerEquations(rj.Inertia(j * jnp.eye(3)), rj.torques.ConstantTorque(q[:3])),
+        rj.motion.EulerEquations(rj.Inertia(j * jnp.eye(3)), rj.torques.ConstantTorque(q[:3])),
     )  # fmt: skip
     return q4.to_matrix(made.states.q[-1]), made.states.omega[-1], now.rate
 
@@ -689,7 +689,7 @@ leave_out(
     "estimate.Posterior.points", "estimate.Posterior.rhat", "estimate.Posterior.to_arviz",
     "estimate.Nuts", "estimate.refit", "estimate.Refit", "estimate.Refit.effective",
     "estimate.Refit.interval_of", "estimate.Refit.point", "estimate.LogDensity",
-    "estimate.LogDensity.grown", "estimate.LogDensity.unpack", "estimate.Point",
+    "estimate.LogDensity.grown", "estimate.LogDensity.unpack", "estimate.Unpacked",
     "estimate.Filtered.nis",
 )  # fmt: skip
 leave_out(

@@ -307,7 +307,7 @@ def unscaled(rng, i):
 way(
     "motion.torques.ChangingInertia motion.torques.ChangingInertia.tensor",
     lambda i, j, c, t, w: (
-        rj.EulerEquations(rj.Inertia(SYMMETRIC), laws.ChangingInertia(
+        rj.motion.EulerEquations(rj.Inertia(SYMMETRIC), laws.ChangingInertia(
             lambda s: i + s * j, laws.Damping(c)))(t, rj.Spin(w)),
         laws.ChangingInertia(lambda s: i + s * j).tensor(t),
     ),
@@ -344,7 +344,7 @@ def our_wheels(j, s, motor, limit, top, c, d, i, q, w, own):
     return [
         law(0.1, y, body, own), law.energy(0.1, y, body, own), law.internal_momentum(0.1, own),
         law.rate(0.1, own, y, body), law.speeds_of(own, y), law.torques_of(0.1, own, y),
-        law.state0(0.1, y, body), law.without_wheels(body), rj.Coupled.start(body, y, law, 0.1),
+        law.state0(0.1, y, body), law.without_wheels(body), rj.motion.Coupled.start(body, y, law, 0.1),
     ]  # fmt: skip
 
 
@@ -353,7 +353,7 @@ way(
     "motion.torques.ReactionWheels.internal_momentum motion.torques.ReactionWheels.rate "
     "motion.torques.ReactionWheels.speeds_of motion.torques.ReactionWheels.torques_of "
     "motion.torques.ReactionWheels.state0 motion.torques.ReactionWheels.without_wheels "
-    "Coupled Coupled.start",
+    "motion.Coupled motion.Coupled.start",
     our_wheels,
     (between(0.1, 2.0, 2), v.normal(2), v.normal(2), between(0.3, 1.0), between(5.0, 6.0),
      between(0, 1), between(0, 1), v.inertia, v.quaternion, v.ordinary, v.normal(2)),
@@ -367,13 +367,14 @@ def euler(i, w, torque):
 
 
 way(
-    "EulerEquations EulerEquations.rate_of EulerEquations.turned_by AttitudeEquations "
+    "motion.EulerEquations motion.EulerEquations.rate_of "
+    "motion.EulerEquations.turned_by motion.AttitudeEquations "
     "equations_of_motion Spin Attitude",
     lambda i, c, q, w: (
-        rj.EulerEquations(rj.Inertia(i), laws.ConstantTorque(c))(0.0, rj.Spin(w)),
-        rj.EulerEquations(rj.Inertia(i), laws.ConstantTorque(c)).rate_of(0.0, rj.Spin(w)),
-        rj.EulerEquations(rj.Inertia(i)).turned_by(c, rj.Spin(w)),
-        rj.AttitudeEquations(rj.Inertia(i), laws.InSpace(c))(0.0, rj.Attitude(q, w)),
+        rj.motion.EulerEquations(rj.Inertia(i), laws.ConstantTorque(c))(0.0, rj.Spin(w)),
+        rj.motion.EulerEquations(rj.Inertia(i), laws.ConstantTorque(c)).rate_of(0.0, rj.Spin(w)),
+        rj.motion.EulerEquations(rj.Inertia(i)).turned_by(c, rj.Spin(w)),
+        rj.motion.AttitudeEquations(rj.Inertia(i), laws.InSpace(c))(0.0, rj.Attitude(q, w)),
         rj.equations_of_motion(rj.Inertia(i), rj.Attitude(q, w), laws.InSpace(c))(
             0.0, rj.Attitude(q, w), None),
     ),
@@ -385,8 +386,8 @@ way(
     norm=True,
 )  # fmt: skip
 way(
-    "NewtonEuler Rigid",
-    lambda m, c, s, g, k, x, u, q, w: rj.NewtonEuler(
+    "motion.NewtonEuler Rigid",
+    lambda m, c, s, g, k, x, u, q, w: rj.motion.NewtonEuler(
         props(m, c, s), laws.Sum(laws.UniformGravity(g), laws.Drag(k, c)))(
             0.0, rigid(x, u, q, w)),
     (scale(-3, 3), v.ordinary, v.second_moment, v.vector, scale(-3, 3), v.vector, v.vector,

@@ -55,7 +55,7 @@ def free(i, w, t, q):
 def our_free(i, w, t, q):
     body, start = rj.Inertia(i), rj.Attitude(q, w)
     solved = dfx.diffeqsolve(
-        dfx.ODETerm(rj.AttitudeEquations(body)), rj.exact.FreeSolver(), 0.0 * t, t, t, start,
+        dfx.ODETerm(rj.motion.AttitudeEquations(body)), rj.exact.FreeSolver(), 0.0 * t, t, t, start,
         saveat=dfx.SaveAt(t1=True), adjoint=dfx.ForwardMode(), max_steps=2,
     ).ys  # fmt: skip
     return [
@@ -186,9 +186,9 @@ def tops(i, q, w, c, d):
 
 # Errors of an adaptive run add up over its steps, some dozens, each below the tolerance.
 for names, solver in (
-    ("simulate solve.solvers.DormandPrince8 Solution", None),
+    ("simulate solve.solvers.DormandPrince8 solve.Solution", None),
     ("simulate solve.solvers.Tsitouras5", solvers.Tsitouras5()),
-    ("Projected", rj.Projected(dfx.Dopri8())),
+    ("solve.solvers.Projected", rj.solvers.Projected(dfx.Dopri8())),
 ):
     way(f"{names}", our_tops(solver), TOP, tops, plain=True, rtol=1e-9, cost=2)
 
@@ -201,7 +201,7 @@ def far(i, q, w, c, d):
 
 
 way(
-    "Solution.evaluate",
+    "solve.Solution.evaluate",
     lambda i, q, w, c, d: rj.simulate(
         rj.Inertia(i), rj.Attitude(q, w), TS, law_of(c, d), rtol=1e-11, atol=1e-14, throw=False,
     ).evaluate(0.7),
@@ -273,7 +273,7 @@ DOP = ([list(row[:n]) for n, row in enumerate(DOP_A[:12])], list(DOP_B))
 
 def our_steps(solver, number, step):
     def run(i, q, w, c, d):
-        field = rj.AttitudeEquations(rj.Inertia(i), law_of(c, d))
+        field = rj.motion.AttitudeEquations(rj.Inertia(i), law_of(c, d))
         ends = fixed_steps(
             solver, field, jnp.array([0.0, number * step]), rj.Attitude(q, w), number
         )
@@ -301,7 +301,7 @@ for name, (a, b), solver in (
 # Splittings and Magnus: against the equations, at steps whose error is below the bar by theory.
 def long_run(solver, law, second, steps, rtol, name):
     def run(i, q, w, c, d):
-        field = rj.AttitudeEquations(rj.Inertia(i), law(c, d))
+        field = rj.motion.AttitudeEquations(rj.Inertia(i), law(c, d))
         found = fixed_steps(solver, field, jnp.array([0.0, 1.0]), rj.Attitude(q, w), steps)
         return jax.tree.map(lambda x: x[-1], found)
 
@@ -335,7 +335,7 @@ leave_out(
       "DormandPrince8", "Splitting2", "Splitting4", "Splitting6")
       for what in ("order", "init", "step", "func")),
     *(f"exact.FreeSolver.{what}" for what in ("error_order", "func", "init", "order", "step")),
-    *(f"Projected.{what}" for what in (
+    *(f"solve.solvers.Projected.{what}" for what in (
         "error_order", "func", "init", "order", "step", "strong_order", "term_structure",
         "interpolation_cls", "term_compatible_contr_kwargs", "scan_kind", "root_finder",
         "root_find_max_steps")),
@@ -363,7 +363,7 @@ def our_many(i, q, w, c, d):
         lambda body, y: (
             adaptive(
                 solvers.DormandPrince8(),
-                rj.AttitudeEquations(body, law_of(c, d)),
+                rj.motion.AttitudeEquations(body, law_of(c, d)),
                 jnp.asarray(TS),
                 y,
                 rtol=1e-11,
@@ -420,7 +420,7 @@ def our_spread(j, d, w, t):
 
 
 way(
-    "Solution.transition_matrix", our_spread,
+    "solve.Solution.transition_matrix", our_spread,
     (between(0.5, 2.0), between(0.1, 0.5, 3), v.ordinary, between(0.5, 2.0)), spread, rtol=1e-10,
     cost=2,
 )  # fmt: skip
@@ -458,7 +458,7 @@ def our_circling(a, c, rate, spin, phase):
 
 
 way(
-    "crossings Crossings Event", our_circling,
+    "crossings solve.Crossings Event", our_circling,
     (between(0.8, 1.0), between(1.3, 1.6), between(0.5, 2.0), between(1.0, 3.0), between(0.1, 1.4)),
     circling, rtol=1e-10, cost=2,
 )  # fmt: skip
@@ -476,12 +476,15 @@ def exponents(x):
 
 
 way(
-    "lyapunov_exponents Exponents", exponents, between(0.1, 1.0, 3),
+    "lyapunov_exponents solve.Exponents", exponents, between(0.1, 1.0, 3),
     lambda x: np.array([0.3, -0.2, -0.7]) + 0 * x, plain=True, rtol=1e-9, cost=2,
 )  # fmt: skip
 leave_out(
-    "options of a compiler: no numbers", "batch.compiler_options", "cpu_flags", "batch.CpuFlags"
+    "options of a compiler: no numbers",
+    "batch.compiler_options",
+    "batch.cpu_flags",
+    "batch.CpuFlags",
 )
 leave_out("shares of a run's own statistics: `drift` and `lyapunov_exponents` are rows",
-          "Solution.drift", "Solution.growth")  # fmt: skip
-leave_out("a truth value beside `times`: the row of `crossings`", "Crossings.full")
+          "solve.Solution.drift", "solve.Solution.growth")  # fmt: skip
+leave_out("a truth value beside `times`: the row of `crossings`", "solve.Crossings.full")

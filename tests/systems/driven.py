@@ -46,7 +46,7 @@ def attitude(t):
 
 
 class Driver(rj.torques.AbstractTorque):
-    feels = rj.HasSpin
+    feels = rj.motion.HasSpin
     rate_free = True
     moments: jax.Array
 
@@ -61,7 +61,7 @@ def start(t):
 
 def field(dtype=jnp.float64):
     moments = jnp.asarray(MOMENTS, dtype)
-    return rj.AttitudeEquations(rj.Inertia(jnp.diag(moments)), Driver(moments))
+    return rj.motion.AttitudeEquations(rj.Inertia(jnp.diag(moments)), Driver(moments))
 
 
 def error(q, t):

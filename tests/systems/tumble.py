@@ -16,7 +16,7 @@ TOP = rj.torques.HeavyTop(1.0, [0.0, 0.1, 0.4], [0.0, 0.0, -9.81])
 class Nothing(rj.torques.AbstractTorque):
     """No torque, but through a solver."""
 
-    feels = rj.HasSpin
+    feels = rj.motion.HasSpin
     rate_free = True
 
     def __call__(self, t, state, body):

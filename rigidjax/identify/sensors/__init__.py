@@ -1,6 +1,8 @@
 """What a recording was read with."""
 
-from rigidjax._names import own_names, renamed
+from typing import TYPE_CHECKING
+
+from rigidjax._names import own_names, suggests
 from rigidjax.identify.sensors.attitude import (
     AttitudeSensor as AttitudeSensor,
     Direction as Direction,
@@ -24,5 +26,6 @@ from rigidjax.identify.sensors.vectors import (
     Magnetometer as Magnetometer,
 )
 
-__getattr__ = renamed(__name__, {"Moment": "rigidjax.identify.SensorInput"})
+if not TYPE_CHECKING:
+    __getattr__ = suggests(__name__)
 __dir__ = own_names(__name__)

@@ -63,7 +63,7 @@ class AbstractSensor(eqx.Module):
     >>> import rigidjax as rj
     >>> class Tachometer(AbstractSensor):  # the size of the body rate, rad/s
     ...     reading_shape, components, unit = (), 1, "rad/s"
-    ...     feels, noise = rj.HasSpin, None
+    ...     feels, noise = rj.motion.HasSpin, None
     ...     def error(self, now, reading):
     ...         return (reading - jnp.sqrt(jnp.sum(now.state.omega**2)))[None]
     >>> rj.identify.Recording([0.0, 1.0], (Tachometer(), [3.0, 3.0])).readings[0].values.shape

@@ -1,6 +1,8 @@
 """Torques and forces. Each names the lowest state that it acts on."""
 
-from rigidjax._names import own_names, renamed
+from typing import TYPE_CHECKING
+
+from rigidjax._names import own_names, suggests
 from rigidjax.motion.torques.base import (
     AbstractForce as AbstractForce,
     AbstractTorque as AbstractTorque,
@@ -43,7 +45,6 @@ from rigidjax.motion.torques.spline import Series as Series, Wheel as Wheel
 from rigidjax.motion.torques.states import freeze as freeze
 from rigidjax.motion.torques.wheels import ReactionWheels as ReactionWheels
 
-# What laws are evaluated with, not for users.
-_INNER = ("act", "evaluate", "in_precision", "require_rung")
-__getattr__ = renamed(__name__, {name: f"rigidjax.motion.torques.base.{name}" for name in _INNER})
+if not TYPE_CHECKING:
+    __getattr__ = suggests(__name__)
 __dir__ = own_names(__name__)

@@ -91,7 +91,7 @@ class AbstractForce(eqx.Module):
 
     >>> import rigidjax as rj
     >>> class Thrust(AbstractForce):  # 2 N along world z through the centre of mass
-    ...     feels = rj.HasPose
+    ...     feels = rj.motion.HasPose
     ...     def __call__(self, t, state, body):
     ...         return Wrench(force=[0.0, 0.0, 2.0])
     >>> body = rj.MassProperties(4.0, [0.0, 0, 0], jnp.eye(3))
