@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from rigidjax import _checks
 from rigidjax._types import HasAttitude, HasPose, HasSpin, Mat3, Quat, Scalar, ScalarLike
@@ -23,12 +23,15 @@ from rigidjax.rotation.linalg3 import components
 
 State = TypeVar("State", bound=HasSpin)
 
+# Up to so many times a loop over them runs as fast as one batch, and compiles in half the time
+# (gradients too); of 1e5 times the values of one body take it three times as long.
+_LOOPED = 1000
+
 
 class FreeBody(eqx.Module):
     """The whole motion of a free body; call it with a time.
 
-    What does not depend on time is worked out once. `jax.vmap(FreeBody(inertia, state0))(ts)` is
-    the motion at many times.
+    What does not depend on time is worked out once. `at` gives the motion at many times.
 
     **Arguments:** as for `free_body`.
 
@@ -58,6 +61,19 @@ class FreeBody(eqx.Module):
 
     def __call__(self, t: ScalarLike) -> HasSpin:
         return self._at(_time(t, self.state0.omega))
+
+    def at(self, ts: Float[Array, " n"]) -> HasSpin:
+        """The states at `ts` (n,), s: as by `jax.vmap`, compiled in half the time.
+
+        >>> import jax.numpy as jnp, rigidjax as rj
+        >>> motion = FreeBody(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([0.0, 0.0, 1.0]))
+        >>> motion.at(jnp.array([0.0, 10.0])).omega
+        Array([[0., 0., 1.],
+               [0., 0., 1.]], dtype=float64)
+        """
+        if ts.size > _LOOPED:
+            return jax.vmap(self._at)(ts)
+        return jax.lax.map(self._at, ts)
 
     def _at(self, t: Scalar) -> HasSpin:
         t = t.astype(self.axes.dtype)

@@ -21,12 +21,13 @@ def principal_frame(tensor: Mat3) -> tuple[Six, Mat3]:
     Values are Jacobi's (small moments keep their digits; a diagonal tensor stays as it is);
     derivatives are those of `AᵀIA` with A held fixed.
     """
-    axes, moments = _jacobi(jax.lax.stop_gradient(tensor))
-    return _in_axes(tensor, axes, moments), jnp.stack([jnp.stack(row) for row in axes])
+    columns, moments = _jacobi(jax.lax.stop_gradient(tensor))
+    axes = jnp.stack([jnp.stack(row) for row in columns])
+    return _in_axes(tensor, axes, moments), axes
 
 
 @jax.custom_jvp
-def _in_axes(tensor: Mat3, axes: list[list[Scalar]], moments: Triple) -> Six:
+def _in_axes(tensor: Mat3, axes: Mat3, moments: Triple) -> Six:
     """`AᵀIA`: diagonal in value."""
     zero = jnp.zeros_like(tensor[0, 0])
     return *moments, zero, zero, zero
@@ -34,15 +35,12 @@ def _in_axes(tensor: Mat3, axes: list[list[Scalar]], moments: Triple) -> Six:
 
 @_in_axes.defjvp
 def _in_axes_jvp(primals, tangents):
-    (_, a, _), m = primals, tangents[0]
-    columns = [(a[0][j], a[1][j], a[2][j]) for j in range(3)]
-    rows = [[sum(m[i, k] * c[k] for k in range(3)) for i in range(3)] for c in columns]
-    places = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
-    d = tuple(sum(columns[i][k] * rows[j][k] for k in range(3)) for i, j in places)
-    return _in_axes(*primals), d
+    axes, rows = primals[1], [into(primals[1], row) for row in tangents[0]]
+    m: list[Triple] = [into(axes, column) for column in zip(*rows, strict=True)]
+    return _in_axes(*primals), (m[0][0], m[1][1], m[2][2], m[1][0], m[2][0], m[2][1])
 
 
-def into(axes: Mat3, v: Vec3) -> Triple:
+def into(axes: Mat3, v: Vec3 | Triple) -> Triple:
     """Components along the columns of `axes`."""
     return tuple(axes[0, i] * v[0] + axes[1, i] * v[1] + axes[2, i] * v[2] for i in range(3))
 
