@@ -16,7 +16,7 @@ from rigidjax.solve.adjoint import Outputs
 from rigidjax.solve.batching import Arrays, Layout, in_lanes, one, spread
 from rigidjax.solve.components import flat, leaf_sizes, unflat
 from rigidjax.solve.explicit import AbstractExplicit
-from rigidjax.solve.linear_map import forward_only, linear_map, no_tangent
+from rigidjax.solve.linear_map import linear_map, no_tangent
 from rigidjax.solve.record import HALTED, Answer, Method, Record, Run
 from rigidjax.solve.step_control import NONFINITE
 from rigidjax.solve.tableaus import Tableau
@@ -189,8 +189,8 @@ def _solved(program: _Program, constants: Arrays, run: Run) -> Answer:
     number, smooth = len(constants), [i for i, s in enumerate(program.smooth) if s]
 
     def mapped(kind: Any, linear: int, *args: Any) -> Arrays:
-        held, each, together = list(args[:number]), list(args[number:]), kind is _recorded
-        return in_lanes(partial(kind, program), one(held), held, each, linear, together)
+        held = list(args[:number])
+        return in_lanes(partial(kind, program), one(held), held, list(args[number:]), linear)
 
     @jax.custom_jvp
     def answer(*args: Any) -> Arrays:
@@ -198,13 +198,11 @@ def _solved(program: _Program, constants: Arrays, run: Run) -> Answer:
 
     @answer.defjvp
     def _(primals: Any, tangents: Any) -> Any:
-        found = mapped(_recorded, 0, *primals)
-        # Its tangents have no transpose: what asks for one is told so.
-        found = forward_only(lambda *a: list(a), lambda *a: list(a[len(found) :]))(*found)
-        out, given = found[: len(Answer._fields)], [*primals, *found[len(Answer._fields) :]]
+        *out, starts, count, rows, filled = mapped(_recorded, 0, *primals)
+        given = [*primals, starts, count, rows, filled]
         moved = [tangents[i] for i in smooth] + list(tangents[number:])
-        ends = linear_map(push, partial(mapped, _pulled, len(Outputs._fields)), given, moved)
-        return out, [*ends, *[no_tangent(a) for a in out[2:]]]
+        found = linear_map(push, partial(mapped, _pulled, len(Outputs._fields)), given, moved)
+        return out, [*found, *[no_tangent(a) for a in out[2:]]]
 
     def push(*args: Any) -> Arrays:
         primals, moved = args[: number + _RUN], iter(args[number + _RUN + len(Record._fields) :])

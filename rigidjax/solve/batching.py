@@ -41,19 +41,12 @@ def one(constants: Arrays) -> Layout:
 
 
 def in_lanes(
-    program: Program,
-    layout: Layout,
-    constants: Arrays,
-    each: Arrays,
-    linear: int = 0,
-    together: bool = False,
+    program: Program, layout: Layout, constants: Arrays, each: Arrays, linear: int = 0
 ) -> Arrays:
     """The program, whose `jax.vmap` is itself on longer last axes; its tangents are, too.
 
     **Arguments:** `constants` arrays that bodies may share; `each` arrays that every body has its
-    own of, of which the program is linear in the last `linear`; no `None` among them; `together`
-    whether tangents are those of the very steps that give the values, not of a second run of the
-    program, which may round otherwise.
+    own of, of which the program is linear in the last `linear`. No `None` among them.
     """
     number, given = len(constants), len(constants) + len(each) - linear
 
@@ -67,10 +60,6 @@ def in_lanes(
     @call.def_vmap
     def _(size: int, batched: Any, *args: Any) -> Any:
         own = batched[:number]
-        if not any(batched):
-            # JAX asks for this where only tangents are batched.
-            out = program(layout, list(args[:number]), list(args[number:]))
-            return out, [False] * len(out)
         if linear and not any(batched[:given]):
             # Many directions of one motion, which is not to be run once for each.
             axes = [0 if b else None for b in batched[given:]]
@@ -83,7 +72,7 @@ def in_lanes(
             out = in_lanes(over, layout, list(args[:number]), list(args[number:]), linear)
             return out, [True] * len(out)
         new = Layout(True, tuple(s and not b for s, b in zip(layout.shared, own, strict=True)))
-        count = args[number].shape[-1] if layout.bodies else 1
+        count = each[0].shape[-1] if layout.bodies else 1
 
         def last(a: Any, is_batched: bool, has_bodies: bool) -> Any:
             a = jnp.moveaxis(a, 0, -1) if is_batched else a[..., None]
@@ -98,9 +87,7 @@ def in_lanes(
             for a, b, before, now in zip(args, own, layout.shared, new.shared, strict=False)
         ]
         rest = zip(args[number:], batched[number:], strict=True)
-        out = in_lanes(
-            program, new, constants, [last(a, b, True) for a, b in rest], linear, together
-        )
+        out = in_lanes(program, new, constants, [last(a, b, True) for a, b in rest], linear)
 
         def first(a: Any) -> Any:
             if layout.bodies:
@@ -109,7 +96,7 @@ def in_lanes(
 
         return [first(a) for a in out], [True] * len(out)
 
-    if layout.bodies or together:
+    if layout.bodies:
         return call(*constants, *each)
     smooth = [is_smooth(a) for a in [*constants, *each]]
 
