@@ -188,26 +188,26 @@ def taken_out(function: Callable[..., Any], *like: Any) -> tuple[Callable[..., A
 def _solved(program: _Program, constants: Arrays, run: Run) -> Answer:
     number, smooth = len(constants), [i for i, s in enumerate(program.smooth) if s]
 
-    def mapped(kind: Any, linear: int, *args: Any) -> Arrays:
+    def mapped(kind: Any, *args: Any) -> Arrays:
         held = list(args[:number])
-        return in_lanes(partial(kind, program), one(held), held, list(args[number:]), linear)
+        return in_lanes(partial(kind, program), one(held), held, list(args[number:]))
 
     @jax.custom_jvp
     def answer(*args: Any) -> Arrays:
-        return mapped(_value, 0, *args)
+        return mapped(_value, *args)
 
     @answer.defjvp
     def _(primals: Any, tangents: Any) -> Any:
-        *out, starts, count, rows, filled = mapped(_recorded, 0, *primals)
+        *out, starts, count, rows, filled = mapped(_recorded, *primals)
         given = [*primals, starts, count, rows, filled]
         moved = [tangents[i] for i in smooth] + list(tangents[number:])
-        found = linear_map(push, partial(mapped, _pulled, len(Outputs._fields)), given, moved)
+        found = linear_map(push, partial(mapped, _pulled), given, moved)
         return out, [*found, *[no_tangent(a) for a in out[2:]]]
 
     def push(*args: Any) -> Arrays:
         primals, moved = args[: number + _RUN], iter(args[number + _RUN + len(Record._fields) :])
         along = [next(moved) if s else no_tangent(p) for p, s in zip(primals, every, strict=True)]
-        return jax.jvp(partial(mapped, _value, 0), primals, tuple(along))[1][:2]
+        return jax.jvp(partial(mapped, _value), primals, tuple(along))[1][:2]
 
     every = [*program.smooth, *[True] * _RUN]
     return Answer(*answer(*constants, *run))

@@ -40,15 +40,13 @@ def one(constants: Arrays) -> Layout:
     return Layout(False, (True,) * len(constants))
 
 
-def in_lanes(
-    program: Program, layout: Layout, constants: Arrays, each: Arrays, linear: int = 0
-) -> Arrays:
-    """The program, whose `jax.vmap` is itself on longer last axes; its tangents are, too.
+def in_lanes(program: Program, layout: Layout, constants: Arrays, each: Arrays) -> Arrays:
+    """The program, whose `jax.vmap` is itself on longer last axes, and forward mode, too.
 
     **Arguments:** `constants` arrays that bodies may share; `each` arrays that every body has its
-    own of, of which the program is linear in the last `linear`. No `None` among them.
+    own of. No `None` among them. Many tangents of one body are lanes, as many bodies are.
     """
-    number, given = len(constants), len(constants) + len(each) - linear
+    number = len(constants)
 
     @jax.custom_batching.custom_vmap
     def call(*args: Any) -> Arrays:
@@ -60,17 +58,6 @@ def in_lanes(
     @call.def_vmap
     def _(size: int, batched: Any, *args: Any) -> Any:
         own = batched[:number]
-        if linear and not any(batched[:given]):
-            # Many directions of one motion, which is not to be run once for each.
-            axes = [0 if b else None for b in batched[given:]]
-
-            def over(layout: Layout, constants: Arrays, each: Arrays) -> Arrays:
-                head, tail = each[: given - number], each[given - number :]
-                one = lambda *tail: program(layout, constants, [*head, *tail])  # noqa: E731
-                return jax.vmap(one, axes)(*tail)
-
-            out = in_lanes(over, layout, list(args[:number]), list(args[number:]), linear)
-            return out, [True] * len(out)
         new = Layout(True, tuple(s and not b for s, b in zip(layout.shared, own, strict=True)))
         count = each[0].shape[-1] if layout.bodies else 1
 
@@ -87,7 +74,7 @@ def in_lanes(
             for a, b, before, now in zip(args, own, layout.shared, new.shared, strict=False)
         ]
         rest = zip(args[number:], batched[number:], strict=True)
-        out = in_lanes(program, new, constants, [last(a, b, True) for a, b in rest], linear)
+        out = in_lanes(program, new, constants, [last(a, b, True) for a, b in rest])
 
         def first(a: Any) -> Any:
             if layout.bodies:
@@ -113,8 +100,7 @@ def in_lanes(
         return jax.jvp(of_smooth, tuple(real), tuple(along))[1]
 
     def push(*args: Any) -> Arrays:
-        along = len(args) - number - len(each)
-        return in_lanes(moved, layout, list(args[:number]), list(args[number:]), along)
+        return in_lanes(moved, layout, list(args[:number]), list(args[number:]))
 
     return forward_only(call, push)(*constants, *each)
 
