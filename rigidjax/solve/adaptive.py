@@ -8,16 +8,18 @@ import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
 from rigidjax.motion import on_the_group
 from rigidjax.solve import adaptive_loop, adjoint
-from rigidjax.solve.adjoint import Outputs
-from rigidjax.solve.batching import Arrays, Layout, in_lanes, one, spread
+from rigidjax.solve.adjoint import Inputs, Outputs
+from rigidjax.solve.batching import Arrays, Layout, in_lanes, one
 from rigidjax.solve.components import flat, leaf_sizes, unflat
 from rigidjax.solve.explicit import AbstractExplicit
-from rigidjax.solve.linear_map import linear_map, no_tangent
+from rigidjax.solve.linear_map import forward_only, linear_map
 from rigidjax.solve.record import HALTED, Answer, Method, Record, Run
+from rigidjax.solve.runge_kutta import Axes
 from rigidjax.solve.step_control import NONFINITE
 from rigidjax.solve.tableaus import Tableau
 
@@ -138,6 +140,18 @@ class _Program(NamedTuple):
             method = method._replace(halt=partial(halt, constants))
         return method._replace(field=of_smooth), chosen
 
+    def spread(self, layout: Layout, constants: Arrays, run: Run) -> tuple[Layout, Arrays]:
+        """The constants that have derivatives, one a body."""
+        if not layout.bodies:
+            return layout, constants
+        count = run.t0.shape[-1]
+        own = [
+            jnp.broadcast_to(c[..., None], (*c.shape, count)) if shared and smooth else c
+            for c, shared, smooth in zip(constants, layout.shared, self.smooth, strict=True)
+        ]
+        shared = tuple(a and not b for a, b in zip(layout.shared, self.smooth, strict=True))
+        return layout._replace(shared=shared), own
+
 
 def _program(
     tableau: Tableau,
@@ -186,54 +200,114 @@ def taken_out(function: Callable[..., Any], *like: Any) -> tuple[Callable[..., A
 
 
 def _solved(program: _Program, constants: Arrays, run: Run) -> Answer:
-    number, smooth = len(constants), [i for i, s in enumerate(program.smooth) if s]
-
-    def mapped(kind: Any, *args: Any) -> Arrays:
-        held = list(args[:number])
-        return in_lanes(partial(kind, program), one(held), held, list(args[number:]))
+    number = len(constants)
 
     @jax.custom_jvp
     def answer(*args: Any) -> Arrays:
-        return mapped(_value, *args)
+        layout = one(constants)
+        return in_lanes(
+            partial(_value, program), layout, list(args[:number]), list(args[number:]), []
+        )[0]
 
     @answer.defjvp
     def _(primals: Any, tangents: Any) -> Any:
-        *out, starts, count, rows, filled = mapped(_recorded, *primals)
-        given = [*primals, starts, count, rows, filled]
-        moved = [tangents[i] for i in smooth] + list(tangents[number:])
-        found = linear_map(push, partial(mapped, _pulled), given, moved)
-        return out, [*found, *[no_tangent(a) for a in out[2:]]]
+        return _differentiated(program, list(primals), list(tangents))
 
-    def push(*args: Any) -> Arrays:
-        primals, moved = args[: number + _RUN], iter(args[number + _RUN + len(Record._fields) :])
-        along = [next(moved) if s else no_tangent(p) for p, s in zip(primals, every, strict=True)]
-        return jax.jvp(partial(mapped, _value), primals, tuple(along))[1][:2]
-
-    every = [*program.smooth, *[True] * _RUN]
     return Answer(*answer(*constants, *run))
 
 
-_RUN = len(Run._fields)
-
-
-def _value(program: _Program, layout: Layout, constants: Arrays, each: Arrays) -> Arrays:
+def _value(
+    program: _Program, layout: Layout, constants: Arrays, each: Arrays, linear: Arrays
+) -> tuple[Arrays, Arrays]:
+    del linear
     method, chosen = program.of(layout, constants)
-    return list(adaptive_loop.value(method, chosen, Run(*each)))
+    return list(adaptive_loop.value(method, chosen, Run(*each))), []
 
 
-def _recorded(program: _Program, layout: Layout, constants: Arrays, each: Arrays) -> Arrays:
+def _recorded(
+    program: _Program, layout: Layout, constants: Arrays, each: Arrays, linear: Arrays
+) -> tuple[Arrays, Arrays]:
+    del linear
     method, chosen = program.of(layout, constants)
     run = Run(*each)
     answer, record = adaptive_loop.recording(method, chosen, run)
-    counts = (jnp.broadcast_to(a, run.t0.shape) for a in (record.number, record.filled))
-    number, filled = counts
-    return [*answer, record.starts, number, record.rows, filled]
+    record = record._replace(
+        number=jnp.broadcast_to(record.number, run.t0.shape),
+        filled=jnp.broadcast_to(record.filled, run.t0.shape),
+    )
+    return [*answer, *record], []
 
 
-def _pulled(program: _Program, layout: Layout, constants: Arrays, each: Arrays) -> Arrays:
-    run, record, bars = Run(*each[:_RUN]), Record(*each[_RUN:-2]), Outputs(*each[-2:])
-    layout, constants = spread(layout, constants, run.t0)
+_RUN, _ANSWER = len(Run._fields), len(Answer._fields)
+
+
+def _pushed(
+    program: _Program, layout: Layout, constants: Arrays, each: Arrays, linear: Arrays
+) -> tuple[Arrays, Arrays]:
+    run, record = Run(*each[:_RUN]), Record(*each[_RUN:])
+    layout, constants = program.spread(layout, constants, run)
     method, chosen = program.of(layout, constants)
-    found = adjoint.cotangents(method, chosen, run, record, bars)
-    still = [jnp.zeros_like(a) for a in (run.rtol, run.atol, run.h0)]
-    return [*found.constants, found.ends[0], found.ends[1:], found.between, found.y0, *still]
+    *of_constants, ends, between, y0 = linear
+    along = Inputs(of_constants, ends, between, y0)
+    axes = Axes(int(layout.bodies), int(layout.directions))
+    answer, moved = adjoint.tangents(method, chosen, run, record, along, axes)
+    return [], [*answer, *moved]
+
+
+def _pulled(
+    program: _Program, layout: Layout, constants: Arrays, each: Arrays, linear: Arrays
+) -> tuple[Arrays, Arrays]:
+    run, record = Run(*each[:_RUN]), Record(*each[_RUN:])
+    layout, constants = program.spread(layout, constants, run)
+    method, chosen = program.of(layout, constants)
+    axes = Axes(int(layout.bodies), int(layout.directions))
+    bars = adjoint.cotangents(method, chosen, run, record, Outputs(*linear), axes)
+    return [], [*bars.constants, bars.ends, bars.between, bars.y0]
+
+
+def _differentiated(program: _Program, primals: Arrays, tangents: Arrays) -> Any:
+    number = len(program.smooth)
+    smooth = [i for i, s in enumerate(program.smooth) if s]
+
+    def forward(*args: Any) -> Arrays:
+        constants, each = list(args[:number]), list(args[number:])
+        return in_lanes(partial(_recorded, program), one(constants), constants, each, [])[0]
+
+    def mapped(kind: Any, *args: Any) -> Arrays:
+        constants, rest = list(args[:number]), list(args[number:])
+        each, linear = rest[:kept], rest[kept:]
+        return in_lanes(partial(kind, program), one(constants), constants, each, linear)[1]
+
+    def push(*args: Any) -> Arrays:
+        return mapped(_pushed, *args)[:2]
+
+    def push_forward(*args: Any) -> Arrays:
+        head = number + _RUN
+        given = [*args[:head], *args[head + _ANSWER : number + kept + _ANSWER]]
+        moved = args[number + kept + _ANSWER :]
+        between, end, *moved_record = mapped(_pushed, *given, *_linear(smooth, moved))
+        still = [jnp.zeros_like(a) for a in args[head + 2 : head + 5]]
+        answer = [between, end, *still]
+        return [*answer, *moved_record]
+
+    kept = _RUN + len(Record._fields)
+    found = forward_only(forward, push_forward)(*primals)
+    answer, record = found[:_ANSWER], found[_ANSWER:]
+    moved = [tangents[i] for i in smooth] + tangents[number:]
+    between, end = linear_map(
+        push, partial(mapped, _pulled), [*primals, *record], _linear(smooth, moved)
+    )
+    rest = [
+        jnp.zeros_like(a)
+        if jnp.issubdtype(a.dtype, jnp.inexact)
+        else np.zeros(a.shape, jax.dtypes.float0)
+        for a in answer[2:]
+    ]
+    return answer, [between, end, *rest]
+
+
+def _linear(smooth: list[int], moved: Any) -> Arrays:
+    """Tangents of the constants and of a `Run`, as `Inputs` in a list."""
+    of_run = Run(*moved[len(smooth) :])
+    ends = jnp.concatenate([of_run.t0[None], of_run.stops])
+    return [*moved[: len(smooth)], ends, of_run.between, of_run.y0]

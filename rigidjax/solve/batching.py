@@ -12,8 +12,6 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from rigidjax.solve.linear_map import forward_only, is_smooth
-
 Arrays = list[Any]
 
 # Bodies that go through a loop together on CPU: few, so that one step's numbers stay in the first
@@ -24,103 +22,116 @@ BLOCK = 16
 class Layout(NamedTuple):
     """Which axes the arrays of a program have beyond those of one body.
 
-    **Fields:** `bodies` a last axis of bodies; `shared` which constants have none all the same.
+    **Fields:** `bodies` a last axis of bodies; `directions` an axis of tangents or cotangents
+    before it, in what is linear; `shared` which constants have no axis of bodies all the same.
     """
 
     bodies: bool
+    directions: bool
     shared: tuple[bool, ...]
 
 
-# `program(layout, constants, each)` returns a list of what each body has.
-Program = Callable[[Layout, Arrays, Arrays], Arrays]
+# `program(layout, constants, each, linear)` returns two lists: what each body has, what is linear.
+Program = Callable[[Layout, Arrays, Arrays, Arrays], tuple[Arrays, Arrays]]
 
 
 def one(constants: Arrays) -> Layout:
     """The layout of one body."""
-    return Layout(False, (True,) * len(constants))
+    return Layout(False, False, (True,) * len(constants))
 
 
-def in_lanes(program: Program, layout: Layout, constants: Arrays, each: Arrays) -> Arrays:
-    """The program, whose `jax.vmap` is itself on longer last axes, and forward mode, too.
+def in_lanes(
+    program: Program, layout: Layout, constants: Arrays, each: Arrays, linear: Arrays
+) -> tuple[Arrays, Arrays]:
+    """The program, whose `jax.vmap` is itself on longer last axes.
 
     **Arguments:** `constants` arrays that bodies may share; `each` arrays that every body has its
-    own of. No `None` among them. Many tangents of one body are lanes, as many bodies are.
+    own of; `linear` tangents or cotangents. No `None` among them.
     """
-    number = len(constants)
 
-    @jax.custom_batching.custom_vmap
-    def call(*args: Any) -> Arrays:
-        constants, each = list(args[:number]), list(args[number:])
+    def plain(constants: Arrays, each: Arrays, linear: Arrays) -> Any:
         if layout.bodies:
-            return _in_blocks(program, layout, constants, each)
-        return program(layout, constants, each)
+            return _in_blocks(program, layout, constants, each, linear)
+        return program(layout, constants, each, linear)
+
+    call = jax.custom_batching.custom_vmap(plain)
 
     @call.def_vmap
-    def _(size: int, batched: Any, *args: Any) -> Any:
-        own = batched[:number]
-        new = Layout(True, tuple(s and not b for s, b in zip(layout.shared, own, strict=True)))
-        count = each[0].shape[-1] if layout.bodies else 1
+    def _(size: int, batched: Any, constants: Arrays, each: Arrays, linear: Arrays) -> Any:
+        of_constants, of_each, of_linear = batched
+        if any(of_constants) or any(of_each):
+            new = layout._replace(
+                bodies=True,
+                shared=tuple(s and not b for s, b in zip(layout.shared, of_constants, strict=True)),
+            )
+            count = each[0].shape[-1] if layout.bodies else 1
 
-        def last(a: Any, is_batched: bool, has_bodies: bool) -> Any:
-            a = jnp.moveaxis(a, 0, -1) if is_batched else a[..., None]
-            if not layout.bodies:
-                return jnp.broadcast_to(a, (*a.shape[:-1], size))
-            a = a if has_bodies else a[..., None, :]
-            a = jnp.broadcast_to(a, (*a.shape[:-2], count, size))
-            return a.reshape(*a.shape[:-2], count * size)
+            def last(a: Any, is_batched: bool, has_bodies: bool) -> Any:
+                a = jnp.moveaxis(a, 0, -1) if is_batched else a[..., None]
+                if not layout.bodies:
+                    return jnp.broadcast_to(a, (*a.shape[:-1], size))
+                a = a if has_bodies else a[..., None, :]
+                a = jnp.broadcast_to(a, (*a.shape[:-2], count, size))
+                return a.reshape(*a.shape[:-2], count * size)
 
-        constants = [
-            a if now else last(a, b, not before)
-            for a, b, before, now in zip(args, own, layout.shared, new.shared, strict=False)
-        ]
-        rest = zip(args[number:], batched[number:], strict=True)
-        out = in_lanes(program, new, constants, [last(a, b, True) for a, b in rest])
+            constants = [
+                c if s else last(c, b, not before)
+                for c, s, b, before in zip(
+                    constants, new.shared, of_constants, layout.shared, strict=True
+                )
+            ]
+            each = [last(a, b, True) for a, b in zip(each, of_each, strict=True)]
+            linear = [last(a, b, True) for a, b in zip(linear, of_linear, strict=True)]
+            out = in_lanes(program, new, constants, each, linear)
 
-        def first(a: Any) -> Any:
-            if layout.bodies:
-                a = a.reshape(*a.shape[:-1], count, size)
-            return jnp.moveaxis(a, -1, 0)
+            def first(a: Any) -> Any:
+                if layout.bodies:
+                    a = a.reshape(*a.shape[:-1], count, size)
+                return jnp.moveaxis(a, -1, 0)
 
-        return [first(a) for a in out], [True] * len(out)
+            return jax.tree.map(first, out), jax.tree.map(lambda _: True, out)
+        if not any(of_linear):
+            # JAX asks for this where only tangents of second derivatives are batched.
+            out = plain(constants, each, linear)
+            return out, jax.tree.map(lambda _: False, out)
+        # Only what is linear: many directions of one motion.
+        new = layout._replace(directions=True)
+        place = -2 if layout.bodies else -1
+        before = 1
+        if layout.directions:
+            whole = linear[-1].shape[1:] if of_linear[-1] else linear[-1].shape
+            before = whole[place]
 
-    if layout.bodies:
-        return call(*constants, *each)
-    smooth = [is_smooth(a) for a in [*constants, *each]]
+        def beside(a: Any, is_batched: bool) -> Any:
+            if not is_batched:
+                a = jnp.broadcast_to(a, (size, *a.shape))
+            a = jnp.moveaxis(a, 0, place)
+            if layout.directions:
+                axis = a.ndim + place
+                a = a.reshape(*a.shape[: axis - 1], before * size, *a.shape[axis + 1 :])
+            return a
 
-    def moved(layout: Layout, constants: Arrays, rest: Arrays) -> Arrays:
-        layout, constants = spread(layout, constants, rest[0])
-        args, along = [*constants, *rest[: len(each)]], rest[len(each) :]
+        def apart(a: Any) -> Any:
+            axis = a.ndim + place
+            if layout.directions:
+                a = a.reshape(*a.shape[:axis], before, size, *a.shape[axis + 1 :])
+                axis += 1
+            return jnp.moveaxis(a, axis, 0)
 
-        def of_smooth(*real: Any) -> Arrays:
-            queue = iter(real)
-            full = [next(queue) if s else a for a, s in zip(args, smooth, strict=True)]
-            return [a for a in program(layout, full[:number], full[number:]) if is_smooth(a)]
+        linear = [beside(a, b) for a, b in zip(linear, of_linear, strict=True)]
+        own, found = in_lanes(program, new, constants, each, linear)
+        found = [apart(a) for a in found]
+        return (own, found), ([False] * len(own), [True] * len(found))
 
-        real = [a for a, s in zip(args, smooth, strict=True) if s]
-        return jax.jvp(of_smooth, tuple(real), tuple(along))[1]
-
-    def push(*args: Any) -> Arrays:
-        return in_lanes(moved, layout, list(args[:number]), list(args[number:]))
-
-    return forward_only(call, push)(*constants, *each)
-
-
-def spread(layout: Layout, constants: Arrays, like: Any) -> tuple[Layout, Arrays]:
-    """Constants that have derivatives, one a body of `like`."""
-    if not layout.bodies:
-        return layout, constants
-    own = [
-        jnp.broadcast_to(c[..., None], (*c.shape, like.shape[-1])) if s and is_smooth(c) else c
-        for c, s in zip(constants, layout.shared, strict=True)
-    ]
-    shared = (s and not is_smooth(c) for c, s in zip(constants, layout.shared, strict=True))
-    return Layout(True, tuple(shared)), own
+    return call(constants, each, linear)
 
 
-def _in_blocks(program: Program, layout: Layout, constants: Arrays, each: Arrays) -> Arrays:
+def _in_blocks(
+    program: Program, layout: Layout, constants: Arrays, each: Arrays, linear: Arrays
+) -> tuple[Arrays, Arrays]:
     count = each[0].shape[-1]
     if jax.default_backend() != "cpu" or count <= BLOCK:
-        return program(layout, constants, each)
+        return program(layout, constants, each, linear)
     number = -(-count // BLOCK)
     size = -(-count // number)
 
@@ -133,12 +144,14 @@ def _in_blocks(program: Program, layout: Layout, constants: Arrays, each: Arrays
     own = [None if s else cut(c) for c, s in zip(constants, layout.shared, strict=True)]
 
     def block(part: Any) -> Any:
-        own, each = part
+        own, each, linear = part
         mixed = [c if o is None else o for c, o in zip(constants, own, strict=True)]
-        return program(layout, mixed, each)
+        return program(layout, mixed, each, linear)
+
+    out = lax.map(block, (own, [cut(a) for a in each], [cut(a) for a in linear]))
 
     def joined(a: Any) -> Any:
         a = jnp.moveaxis(a, 0, -2)
         return a.reshape(*a.shape[:-2], number * size)[..., :count]
 
-    return [joined(a) for a in lax.map(block, (own, [cut(a) for a in each]))]
+    return jax.tree.map(joined, out)

@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 import diffrax as dfx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array
 
@@ -28,7 +29,6 @@ from rigidjax.solve.batching import Arrays, Layout, in_lanes, one
 from rigidjax.solve.components import flat, leaf_sizes, unflat
 from rigidjax.solve.crossing_loop import Located, Motion, Search
 from rigidjax.solve.explicit import AbstractExplicit
-from rigidjax.solve.linear_map import no_tangent
 from rigidjax.solve.record import Method, Run
 from rigidjax.solve.runge_kutta import Step
 from rigidjax.solve.step_control import NONFINITE, error_norm, first_step
@@ -99,7 +99,7 @@ def search(scene: Scene, what: Search, numbers: Numbers) -> Found:
             return _corrected(scene, rules, what, list(args[:count]), given, found)
 
         value, moved = jax.jvp(again, tuple(primals), tuple(tangents))
-        rest = [no_tangent(a) for a in found[2:]]
+        rest = [_no_tangent(a) for a in found[2:]]
         return [*value, *found[2:]], [*moved, *rest]
 
     return _found(scene, what, numbers, Located(*answer(*constants, *numbers)))
@@ -108,7 +108,7 @@ def search(scene: Scene, what: Search, numbers: Numbers) -> Found:
 def _find(scene: Scene, rules: "_Rules", what: Search, count: int, *args: Array) -> Arrays:
     still = [lax.stop_gradient(a) for a in args]
     program = partial(_located, scene, rules, what)
-    return in_lanes(program, one(still[:count]), still[:count], still[count:])
+    return in_lanes(program, one(still[:count]), still[:count], still[count:], [])[0]
 
 
 def _found(scene: Scene, what: Search, numbers: Numbers, out: Located) -> Found:
@@ -122,6 +122,12 @@ def _found(scene: Scene, what: Search, numbers: Numbers, out: Located) -> Found:
         result = dfx.RESULTS.where(there, word, result)
     states = jax.vmap(partial(unflat, like=scene.like))(out.states)
     return Found(out.times, states, out.number, result, out.steps)
+
+
+def _no_tangent(a: Array) -> Any:
+    if jnp.issubdtype(a.dtype, jnp.inexact):
+        return jnp.zeros_like(a)
+    return np.zeros(a.shape, jax.dtypes.float0)
 
 
 class _Rules(NamedTuple):
@@ -169,7 +175,9 @@ def _located(
     layout: Layout,
     constants: Arrays,
     each: Arrays,
-) -> Arrays:
+    linear: Arrays,
+) -> tuple[Arrays, Arrays]:
+    del linear
     numbers = Numbers(*each)
 
     def project(y: Array) -> Array:
@@ -213,7 +221,7 @@ def _located(
     before = jnp.concatenate([earlier, numbers.stops[-1:]])
     motion = Motion(attempt, condition, project)
     out = crossing_loop.locate(motion, what, numbers.t0, numbers.stops, before, numbers.y0, begin)
-    return list(out)
+    return list(out), []
 
 
 def _corrected(

@@ -11,6 +11,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from rigidjax.solve.components import lift
+from rigidjax.solve.runge_kutta import Axes
+
 Project = Callable[[Array], Array]
 
 
@@ -29,6 +32,33 @@ def states(project: Project, ts: Array, t: Array, h: Array, y: Array, rows: Arra
     **Arguments:** `rows` (r, n, *bodies) of dense output, as `runge_kutta.dense_rows` gives them.
     """
     return jax.vmap(project)(_along(_theta(ts, t, h), y, rows))
+
+
+def moved_states(
+    project: Project,
+    step: tuple[Array, Array, Array, Array, Array],
+    along: tuple[Array, Array, Array, Array, Array],
+    axes: Axes,
+) -> Array:
+    """The tangents (W, n, *directions, *bodies) of `states`, by all of its numbers."""
+    (ts, t, h, y, rows), (of_ts, of_t, of_h, of_y, of_rows) = step, along
+    theta = _theta(ts, t, h)
+    # The slope once, not once a direction.
+    found, rate = jax.jvp(lambda theta: _along(theta, y, rows), (theta,), (jnp.ones_like(theta),))
+    powers = _powers(theta.astype(y.dtype), rows.shape[0])
+    if axes.directions:
+        rate, powers, theta = (
+            jnp.expand_dims(a, axis) for a, axis in ((rate, 2), (powers, 2), (theta, 1))
+        )
+    safe = lift(jnp.where(h == 0, 1, h), of_ts)
+    of_theta = (of_ts - of_t[None] - theta * of_h[None]) / safe
+    moved = jnp.sum(jnp.expand_dims(powers, 2) * jnp.expand_dims(of_rows, 1), 0)
+    moved = of_y[None] + moved + rate * jnp.expand_dims(of_theta.astype(y.dtype), 1)
+
+    def projected(y: Array, moved: Array) -> Array:
+        return axes.over(lambda d: jax.jvp(project, (y,), (d,))[1], 1, 1)(moved)
+
+    return jax.vmap(projected)(found, moved)
 
 
 def _theta(ts: Array, t: Array, h: Array) -> Array:

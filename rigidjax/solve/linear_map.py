@@ -45,8 +45,8 @@ def linear_map(function: Map, transposed: Map, given: Arrays, tangents: Arrays) 
 def forward_only(function: Map, pushed: Map) -> Map:
     """`function` of arrays, a list of them, whose derivatives are in forward mode only.
 
-    **Arguments:** `pushed(*args, *tangents)` the tangents of the results that are not whole
-    numbers; linear in the tangents, which are those of the args that are not whole numbers.
+    **Arguments:** `pushed(*args, *results, *tangents)` the tangents of the results that are not
+    whole numbers; linear in the tangents, which are those of the args that are not whole numbers.
     """
 
     @jax.custom_jvp
@@ -55,10 +55,10 @@ def forward_only(function: Map, pushed: Map) -> Map:
 
     @wrapped.defjvp
     def _(primals: Any, tangents: Any) -> Any:
-        moved = [t for t, p in zip(tangents, primals, strict=True) if is_smooth(p)]
+        moved = [t for t, p in zip(tangents, primals, strict=True) if _is_smooth(p)]
         out = wrapped(*primals)
-        found = iter(linear_map(pushed, _refuse, list(primals), moved))
-        return out, [next(found) if is_smooth(o) else no_tangent(o) for o in out]
+        found = iter(linear_map(pushed, _refuse, [*primals, *out], moved))
+        return out, [next(found) if _is_smooth(o) else _no_tangent(o) for o in out]
 
     return wrapped
 
@@ -70,7 +70,7 @@ def nan_derivatives(tree: Any, inputs: Any) -> Any:
     number that is not used has the cotangent 0 and leaves the gradient of the others as it is.
     """
     outs, structure = jax.tree.flatten(tree)
-    whole = [is_smooth(a) for a in outs]
+    whole = [_is_smooth(a) for a in outs]
     smooth = [a for a, w in zip(outs, whole, strict=True) if w]
     anchors = [a for a in jax.tree.leaves(inputs) if eqx.is_inexact_array(a)]
     told = iter(_with_nan(len(smooth), *smooth, *anchors))
@@ -109,13 +109,12 @@ def _shape(a: Any) -> tuple[tuple[int, ...], Any]:
     return tuple(jnp.shape(a)), jnp.result_type(a)
 
 
-def is_smooth(a: Any) -> bool:
+def _is_smooth(a: Any) -> bool:
     return bool(jnp.issubdtype(jnp.result_type(a), jnp.inexact))
 
 
-def no_tangent(a: Any) -> Any:
-    """The tangent of a number that depends on nothing."""
-    return jnp.zeros_like(a) if is_smooth(a) else np.zeros(jnp.shape(a), jax.dtypes.float0)
+def _no_tangent(a: Any) -> Any:
+    return np.zeros(jnp.shape(a), jax.dtypes.float0)
 
 
 def _jvp(function: Map, primals: Any, tangents: Any) -> Arrays:
@@ -151,7 +150,7 @@ def _differentiated(primals: Any, tangents: Any, **params: Any) -> Any:
         moved = [_whole(t, p) for t, p in zip(moved, along, strict=True)]
         add(_linear_map.bind(*given, *moved, **params))
     which = [
-        not isinstance(t, ad.Zero) and is_smooth(p)
+        not isinstance(t, ad.Zero) and _is_smooth(p)
         for t, p in zip(tangents[:number], given, strict=True)
     ]
     if any(which):
@@ -172,7 +171,10 @@ def _differentiated(primals: Any, tangents: Any, **params: Any) -> Any:
 def _filled_zero(primals: Any, which: Any, tangents: Any) -> list[Any]:
     rest, out = iter(tangents), []
     for primal, there in zip(primals, which, strict=True):
-        out.append(next(rest) if there else no_tangent(primal))
+        if there:
+            out.append(next(rest))
+        else:
+            out.append(jnp.zeros_like(primal) if _is_smooth(primal) else _no_tangent(primal))
     return out
 
 

@@ -191,6 +191,58 @@ def error_estimate(tableau: Tableau, sizes: list[int], h: Array, slopes: Array) 
     return found[0] * jnp.sum(which * ratio[:, None], 0)
 
 
+class Axes(NamedTuple):
+    """Axes of tangents beyond those of the states: `bodies` 0 or 1 last ones, `directions` 0 or 1
+    before all others but the first.
+    """
+
+    bodies: int
+    directions: int
+
+    def over(self, function: Any, into: Any, out: Any) -> Any:
+        """The function for every direction; `into`, `out` are axes, -1 stands for constants'."""
+        if not self.directions:
+            return function
+        axes: Any = jax.tree.map(lambda a: -1 - self.bodies if a < 0 else a, (into, out))
+        return jax.vmap(function, *axes)
+
+
+def pushed(
+    tableau: Tableau,
+    field: Field,
+    constants: list[Array],
+    step: Step,
+    there: Stages,
+    along: tuple[list[Array], Array, Array, Array],
+    axes: Axes,
+    dense: Array | None = None,
+) -> tuple[Array, Array]:
+    """Tangents of the state at the end (n, *directions, *bodies), not projected, and of the slopes
+    (n, s, *directions, *bodies).
+
+    **Arguments:** `along` tangents of the constants, of the step's time and length, of its state.
+    """
+    w = weights(tableau, step.y.dtype, there.slopes.shape[1])
+    of_constants, of_t, of_h, of_y = along
+    h, dh = (lift(a.astype(of_y.dtype), of_y) for a in (step.h, of_h))
+    slopes = jnp.expand_dims(there.slopes, 2) if axes.directions else there.slopes
+
+    def stage(i: Array, moved: Array) -> Array:
+        y = of_y + dh * _sum(w.a[i], slopes) + h * _sum(w.a[i], moved)
+        t = of_t + w.c[i].astype(of_t.dtype) * of_h
+        here = (constants, there.times[i], there.places[:, i])
+
+        def slope(of_constants: Any, t: Array, y: Array) -> Array:
+            return jax.jvp(field, here, (of_constants, t, y))[1]
+
+        return _put(moved, axes.over(slope, (-1, 0, 1), 1)(of_constants, t, y), i)
+
+    count = w.b.shape[0]
+    none = jnp.zeros((of_y.shape[0], count, *of_y.shape[1:]), of_y.dtype)
+    moved = lax.fori_loop(np.int32(0), last_stage(tableau, dense), stage, none)
+    return of_y + dh * _sum(w.b, slopes) + h * _sum(w.b, moved), moved
+
+
 def pulled(
     tableau: Tableau,
     field: Field,
@@ -198,12 +250,13 @@ def pulled(
     step: Step,
     there: Stages,
     cotangent: Array,
+    axes: Axes,
     dense: tuple[Array, Array] | None = None,
 ) -> tuple[list[Array], Array, Array, Array]:
-    """The transpose of a step: cotangents of the constants, of time, of length, of the state.
+    """The transpose of `pushed`: cotangents of the constants, of time, of length, of the state.
 
-    **Arguments:** `cotangent` of the state at the end, not projected; `dense` whether dense output
-    is used, and its cotangents of the slopes (n, s, *bodies).
+    **Arguments:** `cotangent` of the state at the end; `dense` whether dense output is used, and
+    its cotangents of the slopes (n, s, *directions, *bodies).
     """
     w = weights(tableau, step.y.dtype, there.slopes.shape[1])
     count = w.b.shape[0]
@@ -219,7 +272,7 @@ def pulled(
         if more is not None:
             bar = bar + more[:, m]
         pull = jax.vjp(lambda y: field(constants, there.times[m], y), there.places[:, m])[1]
-        return _put(below, pull(bar)[0], m), _put(seeds, seed, m)
+        return _put(below, axes.over(pull, 1, (1,))(bar)[0], m), _put(seeds, seed, m)
 
     none = jnp.zeros((cotangent.shape[0], count, *cotangent.shape[1:]), cotangent.dtype)
     below, seeds = lax.fori_loop(np.int32(0), upper, stage, (none, none))
@@ -230,9 +283,10 @@ def pulled(
     pull = jax.vjp(lambda c, t: every(c, t, there.places), own, there.times)[1]
     bars = lift(h, seeds) * seeds
     bars = bars if more is None else bars + more
-    by_own, by_times = pull(bars)
+    by_own, by_times = axes.over(pull, 2, (-1, 1))(bars)
     by_constants = [jnp.sum(by, 0) for by in by_own]
-    by_length = jnp.sum(seeds * there.slopes, (0, 1)).astype(by_times.dtype)
+    slopes = jnp.expand_dims(there.slopes, 2) if axes.directions else there.slopes
+    by_length = jnp.sum(seeds * slopes, (0, 1)).astype(by_times.dtype)
     c = w.c.astype(by_times.dtype).reshape(-1, *[1] * (by_times.ndim - 1))
     by_length = by_length + jnp.sum(c * by_times, 0)
     return by_constants, jnp.sum(by_times, 0), by_length, cotangent + jnp.sum(below, 1)
