@@ -334,7 +334,7 @@ def test_a_damaged_checkpoint_is_told_in_words(short_record, tmp_path, kind):
     problem = identify.Problem(short_record, identify.PrincipalRatios())
     path = tmp_path / "fit.npz"
     like = Tried(problem.start(), jnp.asarray(1.0), jnp.asarray(True))
-    checkpoint.Checkpoint(path, like, "2").save([like], checkpoint.Position(1, 0, like))
+    checkpoint.Checkpoint(path, like, "2").save([like], checkpoint.SearchState(1, 0, like))
     whole = path.read_bytes()
     if kind == "empty":
         path.write_bytes(b"")

@@ -109,7 +109,8 @@ leave_out(
     *(f"estimate.{name}" for name in ("Filtered", "Smoothed", "Push", "Sampled", "Point")),
     "estimate.LinearEstimate",
 )
-leave_out("made of a fit, which takes long; see tests/estimate", "estimate.LogDensity")
+leave_out("made of a fit, which takes long; see tests/estimate", "estimate.LogDensity",
+          "estimate.Unpacked")  # fmt: skip
 leave_out(
     "takes a LogDensity, and long; see tests/estimate",
     *(f"estimate.{name}" for name in ("posterior", "Posterior", "refit", "Refit")),

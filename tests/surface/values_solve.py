@@ -49,7 +49,7 @@ def symmetric(a):
 
 def free(i, w, t, q):
     at, omega = twin.free_body(mp.matrix(i.tolist()), list(q), list(w), t)
-    return [np.array(at), np.array(omega)] * 3 + [np.array(omega)]
+    return [np.array(at), np.array(omega)] * 4 + [np.array(omega)]
 
 
 def our_free(i, w, t, q):
@@ -60,12 +60,14 @@ def our_free(i, w, t, q):
     ).ys  # fmt: skip
     return [
         rj.exact.free_body(body, start, t), rj.exact.FreeBody(body, start)(t),
+        jax.tree.map(lambda x: x[1], rj.exact.FreeBody(body, start).at(jnp.stack([0 * t, t]))),
         jax.tree.map(lambda x: x[0], solved), rj.exact.free_body(body, rj.Spin(w), t),
     ]  # fmt: skip
 
 
 way(
-    "exact.free_body exact.FreeBody exact.FreeSolver", our_free, (spinning, v.quaternion), free,
+    "exact.free_body exact.FreeBody exact.FreeBody.at exact.FreeSolver", our_free,
+    (spinning, v.quaternion), free,
     norm=True, cost=0.5,
 )  # fmt: skip
 
