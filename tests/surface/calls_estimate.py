@@ -106,11 +106,10 @@ row(
 leave_out("made by start and by each filter", "estimate.Belief")
 leave_out(
     "what a function returns",
-    *(f"estimate.{name}" for name in ("Filtered", "Smoothed", "Push", "Sampled", "Point")),
+    *(f"estimate.{name}" for name in ("Filtered", "Smoothed", "Push", "Sampled", "Unpacked")),
     "estimate.LinearEstimate",
 )
-leave_out("made of a fit, which takes long; see tests/estimate", "estimate.LogDensity",
-          "estimate.Unpacked")  # fmt: skip
+leave_out("made of a fit, which takes long; see tests/estimate", "estimate.LogDensity")
 leave_out(
     "takes a LogDensity, and long; see tests/estimate",
     *(f"estimate.{name}" for name in ("posterior", "Posterior", "refit", "Refit")),
