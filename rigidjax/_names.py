@@ -14,7 +14,10 @@ def own_names(module: str) -> Any:
     """A `__dir__`: what a module defines and imports as itself (`X as X`), as its source has it."""
 
     def names() -> list[str]:
-        body = ast.parse(inspect.getsource(sys.modules[module])).body
+        try:
+            body = ast.parse(inspect.getsource(sys.modules[module])).body
+        except OSError:  # Where there is no source, all names without an underscore are shown.
+            return sorted(n for n in vars(sys.modules[module]) if n[0] != "_")
         body += [inner for node in body if isinstance(node, ast.If) for inner in node.body]
         nodes = [n for one in body for n in getattr(one, "names", getattr(one, "targets", [one]))]
         named = [(getattr(one, "name", getattr(one, "id", "_")), one) for one in nodes]
@@ -36,9 +39,9 @@ def suggests(module: str) -> Any:
             min(_ways()[one], key=lambda way: (not way[1].endswith(f".{name}"), way[0] != module))
             for one in near
         ]
-        raise AttributeError(
-            words + f"; did you mean {' or '.join(way for _, way in ways)}?" * bool(ways), name=name
-        )
+        if ways:
+            words += f"; did you mean {' or '.join(way for _, way in ways)}?"
+        raise AttributeError(words, name=name)
 
     here = sys.modules[module]
     return look_up
@@ -53,6 +56,7 @@ def _ways() -> dict[str, list[tuple[str, str]]]:
             seen.add(module)
             for name in dir(module):
                 found.setdefault(name.lower(), []).append((module.__name__, f"{way}.{name}"))
-                if isinstance(value := getattr(module, name), ModuleType):
+                value = getattr(module, name)
+                if isinstance(value, ModuleType) and value.__name__.startswith("rigidjax"):
                     left.append((f"{way}.{name}", value))
     return found

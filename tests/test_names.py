@@ -10,6 +10,7 @@ from types import ModuleType
 import pytest
 
 import rigidjax as rj
+from rigidjax import _names
 
 ROOT = Path(__file__).parents[1]
 
@@ -46,6 +47,19 @@ def test_a_module_shows_its_own_names_only(name):
     }
     assert not strange
     assert not {"jax", "jnp", "np", "eqx", "dfx", "Array", "Any", "own_names"} & set(shown)
+
+
+def test_without_its_source_a_module_still_answers(monkeypatch):
+    def gone(_):
+        raise OSError("could not get source code")
+
+    monkeypatch.setattr(_names.inspect, "getsource", gone)
+    _names._ways.cache_clear()
+    try:
+        assert "exp" in dir(rj.quaternion) and not any(n[0] == "_" for n in dir(rj.quaternion))
+        assert not hasattr(rj, "heavytop")
+    finally:
+        _names._ways.cache_clear()
 
 
 def test_nothing_public_is_lost():

@@ -23,8 +23,9 @@ from rigidjax.rotation.linalg3 import components
 
 State = TypeVar("State", bound=HasSpin)
 
-# Up to so many times a loop over them runs as fast as one batch, and compiles in half the time
-# (gradients too); of 1e5 times the values of one body take it three times as long.
+# Up to so many times a loop over them compiles in 0.65 to 0.7 of the time of one batch (values and
+# gradients at 301 times), and is as fast or faster for derivatives and many bodies. Values of one
+# body take 1.6 times as long at 301 times (0.1 ms more), four times at 900.
 _LOOPED = 1000
 
 
@@ -63,7 +64,7 @@ class FreeBody(eqx.Module):
         return self._at(_time(t, self.state0.omega))
 
     def at(self, ts: Float[Array, " n"]) -> HasSpin:
-        """The states at `ts` (n,), s: as by `jax.vmap`, compiled in half the time.
+        """The states at `ts` (n,), s since `state0`: as by `jax.vmap`, quicker to compile.
 
         >>> import jax.numpy as jnp, rigidjax as rj
         >>> motion = FreeBody(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([0.0, 0.0, 1.0]))

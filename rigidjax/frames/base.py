@@ -19,8 +19,9 @@ class AbstractScene(eqx.Module):
 
     `rigidjax.simulate(None, Point(x, v), ts, scene)` solves it; `diffrax.ODETerm(scene.field)` is
     the same in plain diffrax. A scene that ends a run, as at a collision, has two methods more:
-    `ends(t, state)`, true where it does, and `end_words(t, state)`, why; `stats` of the solution
-    then has `ended`, `end_time` and `end_state`.
+    `ends(t, state)`, true where it does, and `end_words(t, state)`, why (under `jit` both are
+    traced: words without numbers); `stats` of the solution then has `ended`, `end_time` and
+    `end_state`. Only scenes of a particle end runs so.
 
     >>> class Spring(AbstractScene):
     ...     def acceleration(self, t, state):

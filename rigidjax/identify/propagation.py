@@ -13,13 +13,12 @@ from jaxtyping import Array, Float, Int
 
 from rigidjax import _checks
 from rigidjax.body.inertia import Inertia, MassProperties
-from rigidjax.exact import FreeBody
-from rigidjax.motion import Attitude, Rigid
 from rigidjax.motion.coupled import Coupled, started
 from rigidjax.motion.torques import Torque
 from rigidjax.solve import equations_of_motion, fixed, simulate, solvers
 from rigidjax.solve.explicit import AbstractExplicit
 from rigidjax.solve.rolled import in_a_loop
+from rigidjax.solve.run import free_motion
 
 # Radians turned in a step: a fifth-order method then errs by 1e-9 a radian; and one of order 4 in
 # steps of so much less, at two thirds of the cost.
@@ -139,18 +138,7 @@ def states_at(
     if torque is not None:
         assert integrator is not None
         return integrator.states(body, state0, ts, torque)
-    return free_states(body, state0, ts - ts[0])
-
-
-def free_states(body: Inertia | MassProperties, state0: Any, since: Float[Array, " times"]) -> Any:
-    """The states of a free body at times `since` its `state0`, s, of either sign."""
-    # The checks of `simulate` are for users; inside a fit they are host callbacks.
-    inertia = body if isinstance(body, Inertia) else body.inertia
-    if not isinstance(state0, Rigid):
-        return jax.vmap(FreeBody(inertia, state0))(since)
-    turning: Any = jax.vmap(FreeBody(inertia, Attitude(state0.q, state0.omega)))(since)
-    x = state0.x[None] + since[:, None] * state0.v[None]
-    return Rigid(x, jnp.broadcast_to(state0.v, x.shape), turning.q, turning.omega)
+    return free_motion(body, state0, ts - ts[0])
 
 
 def shifted(field: Callable[..., Any], t: Array, state: Any, offset: Array) -> Any:

@@ -218,10 +218,13 @@ def _free(setup: Free, state0: Any, ts: Array) -> tuple[Any, dict[str, Any], dfx
 
 
 def free_motion(body: Inertia | MassProperties, state0: Any, since: Array) -> Any:
-    """The states of a free body (T, …) at times (T,) since its start, s, of any kind of state."""
+    """The states of a free body (T, …) at times (T,) since its start, s, of any kind of state.
+
+    Nothing is checked: inside a fit checks are host callbacks.
+    """
     inertia = body if isinstance(body, Inertia) else body.inertia
     turning = Attitude(state0.q, state0.omega) if isinstance(state0, Rigid) else state0
-    ys: Any = jax.vmap(FreeBody(inertia, turning))(since)
+    ys: Any = FreeBody(inertia, turning).at(since)
     if not isinstance(state0, Rigid):
         return ys
     x = state0.x[None] + since[:, None] * state0.v[None]

@@ -62,11 +62,19 @@ def test_the_slope_is_that_of_differences(problem):
 
 
 def test_a_batch_holds_the_recordings_it_names(problem):
-    few = only(problem, jnp.array([5, 2]))
+    rows = jnp.array([5, 2])
+    few = only(problem, rows)
     assert few.count == 2
-    np.testing.assert_array_equal(
-        few.records.readings[0].values[1], problem.records.readings[0].values[2]
-    )
+    # Times, readings and masks of both, in the order in which they are named.
+    kept, whole = (jax.tree.leaves(eqx.filter(p.records, eqx.is_array)) for p in (few, problem))
+    for a, b in zip(kept, whole, strict=True):
+        np.testing.assert_array_equal(a, b[rows])
+    # The whole misfit as both show it is the mean of what each shows alone.
+    point = problem.start(BODY)
+    alone = [float(_misfit_of(point, problem, NOISE, row[None])) for row in rows]
+    assert not np.isclose(*alone, rtol=1e-3)
+    both = float(_misfit_of(point, problem, NOISE, rows))
+    np.testing.assert_allclose(both, np.mean(alone), rtol=1e-12)
 
 
 @pytest.mark.slow
