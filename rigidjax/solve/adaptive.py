@@ -8,18 +8,17 @@ import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
+from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array
 
 from rigidjax.motion import on_the_group
 from rigidjax.solve import adaptive_loop, adjoint
-from rigidjax.solve.adjoint import Inputs, Outputs
-from rigidjax.solve.batching import Arrays, Layout, in_lanes, one
+from rigidjax.solve.adjoint import Outputs
+from rigidjax.solve.batching import Arrays, Layout, in_lanes
 from rigidjax.solve.components import flat, leaf_sizes, unflat
 from rigidjax.solve.explicit import AbstractExplicit
-from rigidjax.solve.linear_map import forward_only, linear_map
+from rigidjax.solve.linear_map import linear_map, no_tangent, without_transpose
 from rigidjax.solve.record import HALTED, Answer, Method, Record, Run
-from rigidjax.solve.runge_kutta import Axes
 from rigidjax.solve.step_control import NONFINITE
 from rigidjax.solve.tableaus import Tableau
 
@@ -140,18 +139,6 @@ class _Program(NamedTuple):
             method = method._replace(halt=partial(halt, constants))
         return method._replace(field=of_smooth), chosen
 
-    def spread(self, layout: Layout, constants: Arrays, run: Run) -> tuple[Layout, Arrays]:
-        """The constants that have derivatives, one a body."""
-        if not layout.bodies:
-            return layout, constants
-        count = run.t0.shape[-1]
-        own = [
-            jnp.broadcast_to(c[..., None], (*c.shape, count)) if shared and smooth else c
-            for c, shared, smooth in zip(constants, layout.shared, self.smooth, strict=True)
-        ]
-        shared = tuple(a and not b for a, b in zip(layout.shared, self.smooth, strict=True))
-        return layout._replace(shared=shared), own
-
 
 def _program(
     tableau: Tableau,
@@ -200,114 +187,90 @@ def taken_out(function: Callable[..., Any], *like: Any) -> tuple[Callable[..., A
 
 
 def _solved(program: _Program, constants: Arrays, run: Run) -> Answer:
-    number = len(constants)
+    number, outputs = len(constants), len(Outputs._fields)
+
+    def mapped(kind: Any, linear: int, *args: Any) -> Arrays:
+        return in_lanes(partial(kind, program), list(args[:number]), list(args[number:]), linear)
 
     @jax.custom_jvp
     def answer(*args: Any) -> Arrays:
-        layout = one(constants)
-        return in_lanes(
-            partial(_value, program), layout, list(args[:number]), list(args[number:]), []
-        )[0]
+        return mapped(_value, 0, *args)
 
-    @answer.defjvp
-    def _(primals: Any, tangents: Any) -> Any:
-        return _differentiated(program, list(primals), list(tangents))
+    def rule(primals: Any, tangents: Any) -> Any:
+        # A number without a tangent is none that derivatives have to be taken by.
+        there = [not isinstance(t, SymbolicZero) for t in tangents]
+        smooth = tuple(s and t for s, t in zip(program.smooth, there[:number], strict=True))
+        moving = _Moving(smooth, tuple(there[number:]))
+        along = [t for t, m in zip(tangents, (*smooth, *moving.run), strict=True) if m]
+        found = without_transpose(mapped(_recorded, 0, *primals))
+        out, record = found[: len(Answer._fields)], found[len(Answer._fields) :]
+        push = partial(mapped, partial(_pushed, moving), len(along))
+        pull = partial(mapped, partial(_pulled, moving), outputs)
+        ends = linear_map(push, pull, [*primals, *record], along)
+        return out, [*ends, *[no_tangent(a) for a in out[outputs:]]]
 
+    answer.defjvp(rule, symbolic_zeros=True)
     return Answer(*answer(*constants, *run))
 
 
-def _value(
-    program: _Program, layout: Layout, constants: Arrays, each: Arrays, linear: Arrays
-) -> tuple[Arrays, Arrays]:
-    del linear
+class _Moving(NamedTuple):
+    """Which of the constants and of the numbers of a run have tangents."""
+
+    constants: tuple[bool, ...]
+    run: tuple[bool, ...]
+
+
+def _value(program: _Program, layout: Layout, constants: Arrays, each: Arrays) -> Arrays:
     method, chosen = program.of(layout, constants)
-    return list(adaptive_loop.value(method, chosen, Run(*each))), []
+    return list(adaptive_loop.value(method, chosen, Run(*each)))
 
 
-def _recorded(
-    program: _Program, layout: Layout, constants: Arrays, each: Arrays, linear: Arrays
-) -> tuple[Arrays, Arrays]:
-    del linear
+def _recorded(program: _Program, layout: Layout, constants: Arrays, each: Arrays) -> Arrays:
     method, chosen = program.of(layout, constants)
     run = Run(*each)
     answer, record = adaptive_loop.recording(method, chosen, run)
-    record = record._replace(
-        number=jnp.broadcast_to(record.number, run.t0.shape),
-        filled=jnp.broadcast_to(record.filled, run.t0.shape),
-    )
-    return [*answer, *record], []
+    number, filled = (jnp.broadcast_to(a, run.t0.shape) for a in (record.number, record.filled))
+    return [*answer, *record._replace(number=number, filled=filled)]
 
 
-_RUN, _ANSWER = len(Run._fields), len(Answer._fields)
+def _again(
+    moving: _Moving, program: _Program, layout: Layout, constants: Arrays, each: Arrays
+) -> tuple[Method, Arrays, Run, Record, Arrays]:
+    """A recorded run, those of the constants that move one a body; tangents or cotangents."""
+    many, whole = len(Run._fields), len(Run._fields) + len(Record._fields)
+    run, record = Run(*each[:many]), Record(*each[many:whole])
+    if layout.bodies:
+        own = zip(constants, layout.shared, moving.constants, strict=True)
+        constants = [
+            jnp.broadcast_to(c[..., None], (*c.shape, *run.t0.shape)) if shared and moves else c
+            for c, shared, moves in own
+        ]
+        shared = (a and not b for a, b in zip(layout.shared, moving.constants, strict=True))
+        layout = layout._replace(shared=tuple(shared))
+    method, chosen = program._replace(smooth=moving.constants).of(layout, constants)
+    return method, chosen, run, record, each[whole:]
 
 
 def _pushed(
-    program: _Program, layout: Layout, constants: Arrays, each: Arrays, linear: Arrays
-) -> tuple[Arrays, Arrays]:
-    run, record = Run(*each[:_RUN]), Record(*each[_RUN:])
-    layout, constants = program.spread(layout, constants, run)
-    method, chosen = program.of(layout, constants)
-    *of_constants, ends, between, y0 = linear
-    along = Inputs(of_constants, ends, between, y0)
-    axes = Axes(int(layout.bodies), int(layout.directions))
-    answer, moved = adjoint.tangents(method, chosen, run, record, along, axes)
-    return [], [*answer, *moved]
+    moving: _Moving, program: _Program, layout: Layout, constants: Arrays, each: Arrays
+) -> Arrays:
+    method, chosen, run, record, along = _again(moving, program, layout, constants, each)
+    rest = iter(along[len(chosen) :])
+    still = zip(run, moving.run, strict=True)
+    of_run = Run(*(next(rest) if moves else jnp.zeros_like(a) for a, moves in still))
+
+    def again(chosen: Arrays, run: Run) -> Outputs:
+        return adjoint.replayed(method, chosen, run, record)
+
+    return list(jax.jvp(again, (chosen, run), (along[: len(chosen)], of_run))[1])
 
 
 def _pulled(
-    program: _Program, layout: Layout, constants: Arrays, each: Arrays, linear: Arrays
-) -> tuple[Arrays, Arrays]:
-    run, record = Run(*each[:_RUN]), Record(*each[_RUN:])
-    layout, constants = program.spread(layout, constants, run)
-    method, chosen = program.of(layout, constants)
-    axes = Axes(int(layout.bodies), int(layout.directions))
-    bars = adjoint.cotangents(method, chosen, run, record, Outputs(*linear), axes)
-    return [], [*bars.constants, bars.ends, bars.between, bars.y0]
-
-
-def _differentiated(program: _Program, primals: Arrays, tangents: Arrays) -> Any:
-    number = len(program.smooth)
-    smooth = [i for i, s in enumerate(program.smooth) if s]
-
-    def forward(*args: Any) -> Arrays:
-        constants, each = list(args[:number]), list(args[number:])
-        return in_lanes(partial(_recorded, program), one(constants), constants, each, [])[0]
-
-    def mapped(kind: Any, *args: Any) -> Arrays:
-        constants, rest = list(args[:number]), list(args[number:])
-        each, linear = rest[:kept], rest[kept:]
-        return in_lanes(partial(kind, program), one(constants), constants, each, linear)[1]
-
-    def push(*args: Any) -> Arrays:
-        return mapped(_pushed, *args)[:2]
-
-    def push_forward(*args: Any) -> Arrays:
-        head = number + _RUN
-        given = [*args[:head], *args[head + _ANSWER : number + kept + _ANSWER]]
-        moved = args[number + kept + _ANSWER :]
-        between, end, *moved_record = mapped(_pushed, *given, *_linear(smooth, moved))
-        still = [jnp.zeros_like(a) for a in args[head + 2 : head + 5]]
-        answer = [between, end, *still]
-        return [*answer, *moved_record]
-
-    kept = _RUN + len(Record._fields)
-    found = forward_only(forward, push_forward)(*primals)
-    answer, record = found[:_ANSWER], found[_ANSWER:]
-    moved = [tangents[i] for i in smooth] + tangents[number:]
-    between, end = linear_map(
-        push, partial(mapped, _pulled), [*primals, *record], _linear(smooth, moved)
-    )
-    rest = [
-        jnp.zeros_like(a)
-        if jnp.issubdtype(a.dtype, jnp.inexact)
-        else np.zeros(a.shape, jax.dtypes.float0)
-        for a in answer[2:]
-    ]
-    return answer, [between, end, *rest]
-
-
-def _linear(smooth: list[int], moved: Any) -> Arrays:
-    """Tangents of the constants and of a `Run`, as `Inputs` in a list."""
-    of_run = Run(*moved[len(smooth) :])
-    ends = jnp.concatenate([of_run.t0[None], of_run.stops])
-    return [*moved[: len(smooth)], ends, of_run.between, of_run.y0]
+    moving: _Moving, program: _Program, layout: Layout, constants: Arrays, each: Arrays
+) -> Arrays:
+    method, chosen, run, record, bars = _again(moving, program, layout, constants, each)
+    timed = any(Run(*moving.run)[:3])
+    by = adjoint.cotangents(method, chosen, run, record, Outputs(*bars), timed)
+    still = [jnp.zeros_like(a) for a in (run.rtol, run.atol, run.h0)]
+    of_run = zip([by.t0, by.stops, by.between, by.y0, *still], moving.run, strict=True)
+    return [*by.constants, *(a for a, moves in of_run if moves)]

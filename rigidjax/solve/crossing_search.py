@@ -25,7 +25,7 @@ from jaxtyping import Array
 from rigidjax.motion import on_the_group
 from rigidjax.solve import crossing_loop, runge_kutta
 from rigidjax.solve.adaptive import adaptive, taken_out
-from rigidjax.solve.batching import Arrays, Layout, in_lanes, one
+from rigidjax.solve.batching import Arrays, Layout, in_lanes
 from rigidjax.solve.components import flat, leaf_sizes, unflat
 from rigidjax.solve.crossing_loop import Located, Motion, Search
 from rigidjax.solve.explicit import AbstractExplicit
@@ -108,7 +108,7 @@ def search(scene: Scene, what: Search, numbers: Numbers) -> Found:
 def _find(scene: Scene, rules: "_Rules", what: Search, count: int, *args: Array) -> Arrays:
     still = [lax.stop_gradient(a) for a in args]
     program = partial(_located, scene, rules, what)
-    return in_lanes(program, one(still[:count]), still[:count], still[count:], [])[0]
+    return in_lanes(program, still[:count], still[count:])
 
 
 def _found(scene: Scene, what: Search, numbers: Numbers, out: Located) -> Found:
@@ -175,9 +175,7 @@ def _located(
     layout: Layout,
     constants: Arrays,
     each: Arrays,
-    linear: Arrays,
-) -> tuple[Arrays, Arrays]:
-    del linear
+) -> Arrays:
     numbers = Numbers(*each)
 
     def project(y: Array) -> Array:
@@ -221,7 +219,7 @@ def _located(
     before = jnp.concatenate([earlier, numbers.stops[-1:]])
     motion = Motion(attempt, condition, project)
     out = crossing_loop.locate(motion, what, numbers.t0, numbers.stops, before, numbers.y0, begin)
-    return list(out), []
+    return list(out)
 
 
 def _corrected(

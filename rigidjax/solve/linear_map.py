@@ -42,25 +42,20 @@ def linear_map(function: Map, transposed: Map, given: Arrays, tangents: Arrays) 
     )
 
 
-def forward_only(function: Map, pushed: Map) -> Map:
-    """`function` of arrays, a list of them, whose derivatives are in forward mode only.
-
-    **Arguments:** `pushed(*args, *results, *tangents)` the tangents of the results that are not
-    whole numbers; linear in the tangents, which are those of the args that are not whole numbers.
-    """
+def without_transpose(numbers: Arrays) -> Arrays:
+    """The same numbers; reverse mode through their tangents is refused in words."""
 
     @jax.custom_jvp
-    def wrapped(*args: Any) -> Arrays:
-        return function(*args)
+    def same(*numbers: Any) -> Arrays:
+        return list(numbers)
 
-    @wrapped.defjvp
+    @same.defjvp
     def _(primals: Any, tangents: Any) -> Any:
         moved = [t for t, p in zip(tangents, primals, strict=True) if _is_smooth(p)]
-        out = wrapped(*primals)
-        found = iter(linear_map(pushed, _refuse, [*primals, *out], moved))
-        return out, [next(found) if _is_smooth(o) else _no_tangent(o) for o in out]
+        moved = iter(linear_map(lambda *along: list(along), _refuse, [], moved))
+        return list(primals), [next(moved) if _is_smooth(p) else no_tangent(p) for p in primals]
 
-    return wrapped
+    return same(*numbers)
 
 
 def nan_derivatives(tree: Any, inputs: Any) -> Any:
@@ -113,8 +108,9 @@ def _is_smooth(a: Any) -> bool:
     return bool(jnp.issubdtype(jnp.result_type(a), jnp.inexact))
 
 
-def _no_tangent(a: Any) -> Any:
-    return np.zeros(jnp.shape(a), jax.dtypes.float0)
+def no_tangent(a: Any) -> Any:
+    """The tangent of a number that depends on nothing."""
+    return jnp.zeros_like(a) if _is_smooth(a) else np.zeros(jnp.shape(a), jax.dtypes.float0)
 
 
 def _jvp(function: Map, primals: Any, tangents: Any) -> Arrays:
@@ -171,10 +167,7 @@ def _differentiated(primals: Any, tangents: Any, **params: Any) -> Any:
 def _filled_zero(primals: Any, which: Any, tangents: Any) -> list[Any]:
     rest, out = iter(tangents), []
     for primal, there in zip(primals, which, strict=True):
-        if there:
-            out.append(next(rest))
-        else:
-            out.append(jnp.zeros_like(primal) if _is_smooth(primal) else _no_tangent(primal))
+        out.append(next(rest) if there else no_tangent(primal))
     return out
 
 

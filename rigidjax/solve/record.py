@@ -1,14 +1,13 @@
-"""What an adaptive run is made of, and what is kept of it for derivatives."""
+"""What a run with adaptive steps is made of, and what is kept of it; bodies in the last axis."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from rigidjax.solve.runge_kutta import Field, Step
+from rigidjax.solve.runge_kutta import Field
 from rigidjax.solve.tableaus import Tableau
 
 
@@ -51,54 +50,39 @@ class Run(NamedTuple):
 
 
 class LoopState(NamedTuple):
-    """Where the loop is.
-
-    **Fields:** time, next step, state, index of the next stop, counters; how many of the times
-    between are `known`.
-    """
+    """Where the loop is: time, next step, index of the next stop, counters, state."""
 
     t: Array
     h: Array
-    y: Array
     stop: Array
     steps: Array
     rejected: Array
-    known: Array
+    y: Array
 
 
-# A recorded step is one row (6 + n, *bodies): start; length; kind; index of the stop ahead, and how
-# many times between were known, at the start; how many are in it; state at the start. Kinds: none
-# was taken; one that gave states at times in it only, and is taken again for more of them; a step;
-# each of these two also with its end on the stop.
+# A recorded attempt is one row (4 + n, *bodies): start, length, kind, index of the stop ahead, and
+# the state at the start. Kinds: no step was taken; a step; a step that ends on the stop.
 Rows = Array
-HEAD = 6
-NONE, AGAIN, AGAIN_LAST, STEP, LAST = range(5)
+HEAD = 4
+NONE, STEP, LAST = range(3)
 # The next step of a run that has met the condition that ends it.
 HALTED = -1.0
 
 
-# The start of a segment is one row, too (6 + n, *bodies): what is one number, then the state. Whole
-# numbers are exact in it up to 2²⁴ in float32.
-_NUMBERS = ("t", "h", "stop", "steps", "rejected", "known")
-_WHOLE = 2
-
-
 def packed(loop: LoopState) -> Array:
-    """A `LoopState` as one row."""
-    numbers = [getattr(loop, name).astype(loop.y.dtype) for name in _NUMBERS]
-    return jnp.concatenate([jnp.stack(numbers), loop.y])
+    """A `LoopState` as one row. Whole numbers are exact in it up to 2²⁴ in float32."""
+    return jnp.concatenate([jnp.stack([a.astype(loop.y.dtype) for a in loop[:-1]]), loop.y])
 
 
 def unpacked(row: Array) -> LoopState:
     """What was `packed`."""
-    head, y = row[: len(_NUMBERS)], row[len(_NUMBERS) :]
-    whole = head[_WHOLE:].astype(jnp.int32)
-    return LoopState(y=y, **dict(zip(_NUMBERS, [*head[:_WHOLE], *whole], strict=True)))
+    head = len(LoopState._fields) - 1
+    return LoopState(row[0], row[1], *(a.astype(jnp.int32) for a in row[2:head]), row[head:])
 
 
 class Record(NamedTuple):
-    """A recorded run: the start of each segment (S, 6 + n, *bodies), how many there are, and the
-    last one's rows.
+    """A recorded run: the start of each segment (S, 5 + n, *bodies) and the end of the last, how
+    many segments there are, and the last one's rows and how many they are.
     """
 
     starts: Array
@@ -122,49 +106,46 @@ class Answer(NamedTuple):
     rejected: Array
 
 
-def at_stop(kind: Array) -> Array:
-    """Whether a step ends on the stop."""
-    return (kind == LAST) | (kind == AGAIN_LAST)
-
-
-class Taken(NamedTuple):
-    """A recorded step: its `kind`, the index of the stop ahead, how many times between were known
-    before it, how many are in it.
+class Segment(NamedTuple):
+    """A part of a run: its rows, the time at which each begins (inf where there is none), times of
+    its start and end, and the number of rows.
     """
 
-    step: Step
-    kind: Array
-    stop: Array
-    known: Array
-    inside: Array
+    rows: Rows
+    times: Array
+    begin: Array
+    end: Array
+    count: Array
 
 
-def row_of(run: Run, row: Array) -> Taken:
-    """A recorded step."""
-    t, h, y = row[0], row[1], row[HEAD:]
-    kind, stop, known, inside = (row[i].astype(jnp.int32) for i in range(2, HEAD))
-    end = jnp.where(at_stop(kind), at(run.before, stop), t + h)
-    return Taken(Step(t, h, end, y), kind, stop, known, inside)
+def times_of(run: Run, rows: Rows) -> tuple[Array, Array, Array]:
+    """Start, length and end of the steps of rows (4 + n, *bodies).
+
+    The start moves with the stop before it, the length of a step that ends on a stop with both; all
+    other lengths are held.
+    """
+    t, h, kind, stop = lax.stop_gradient(rows[:HEAD])
+    stop, last = stop.astype(jnp.int32), kind == LAST
+    begun = at(jnp.concatenate([run.t0[None], run.stops]), stop)
+    t = t + (begun - lax.stop_gradient(begun))
+    end = at(run.before, stop)
+    h = jnp.where(last, end - t, h)
+    return t, h, jnp.where(last, end, t + h)
+
+
+# So few rows that it is quicker to add up all of them than to look for one, also in derivatives.
+_FEW = 8
 
 
 def at(a: Array, index: Array) -> Array:
-    """a[index] of each body, along the first axis; a (J, …, *bodies), index (…, *bodies)."""
-    if a.shape[0] == 1:
+    """a[index] of each body; a (J, *bodies), index (*many, *bodies)."""
+    count = a.shape[0]
+    a = a.reshape(count, *[1] * (index.ndim + 1 - a.ndim), *a.shape[1:])
+    if count == 1:
         return jnp.broadcast_to(a[0], index.shape)
-    index = jnp.clip(index, 0, a.shape[0] - 1)
-    if not index.ndim:
-        return a[index]
+    index = jnp.clip(index, 0, count - 1)
+    if count <= _FEW:
+        each = jnp.arange(count, dtype=index.dtype).reshape(-1, *[1] * index.ndim)
+        return jnp.sum(jnp.where(each == index[None], a, 0), 0)
+    a = jnp.broadcast_to(a, (count, *index.shape))
     return jnp.take_along_axis(a, index[None], 0)[0]
-
-
-def per_body(function: Callable[..., Any], bodies: int) -> Callable[..., Any]:
-    """A function of one body's arrays as one of arrays with a last axis of bodies, if there is."""
-    return jax.vmap(function, in_axes=-1, out_axes=-1) if bodies else function
-
-
-def inserted(a: Array, rows: Array, index: Array) -> Array:
-    return lax.dynamic_update_slice_in_dim(a, rows, index, 0)
-
-
-def window(a: Array, index: Array, size: int) -> Array:
-    return lax.dynamic_slice_in_dim(a, index, size, 0)

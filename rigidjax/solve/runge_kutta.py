@@ -109,15 +109,14 @@ def _put(record: Array, row: Array, i: Array) -> Array:
 
 
 def stages(
-    tableau: Tableau, field: Field, constants: list[Array], step: Step, dense: Array | None = None
+    tableau: Tableau, field: Field, constants: list[Array], step: Step, dense: Any = False
 ) -> Stages:
     """All stages of a step; `end` is not projected.
 
-    **Arguments:** `dense` whether the stages of dense output are wanted (else they are the state at
-    the start, their slopes 0); `None` where they never are.
+    **Arguments:** `dense` whether the stages of dense output are wanted. If it is traced and they
+    are not, they are the state at the start, and their slopes 0.
     """
-    plain, whole = stage_counts(tableau)
-    count = plain if dense is None else whole
+    count = stage_counts(tableau)[dense is not False]
     w = weights(tableau, step.y.dtype, count)
     # Time may be kept in another precision than the state.
     h = lift(step.h.astype(step.y.dtype), step.y)
@@ -132,21 +131,18 @@ def stages(
 
     empty = jnp.zeros((step.y.shape[0], count, *step.y.shape[1:]), step.y.dtype)
     times, places = jnp.zeros((count, *step.t.shape), step.t.dtype), empty
-    if dense is not None:
+    if not isinstance(dense, bool):
         # Where a field may have no value at 0, a stage that is left out must be somewhere else.
         times, places = times + step.t[None], places + step.y[:, None]
     times, places, slopes = lax.fori_loop(
-        np.int32(0), last_stage(tableau, dense), stage, (times, places, empty)
+        np.int32(0), _last(tableau, dense), stage, (times, places, empty)
     )
     return Stages(times, places, slopes, step.y + h * _sum(w.b, slopes))
 
 
-def last_stage(tableau: Tableau, dense: Array | None) -> Any:
-    """How many stages are taken, if dense output is wanted or not."""
-    plain, whole = stage_counts(tableau)
-    if dense is None:
-        return np.int32(plain)
-    return jnp.where(dense, np.int32(whole), np.int32(plain))
+def _last(tableau: Tableau, dense: Any) -> Any:
+    plain, whole = (np.int32(count) for count in stage_counts(tableau))
+    return (plain, whole)[dense] if isinstance(dense, bool) else jnp.where(dense, whole, plain)
 
 
 def dense_rows(tableau: Tableau, h: Array, slopes: Array) -> Array:
@@ -191,58 +187,6 @@ def error_estimate(tableau: Tableau, sizes: list[int], h: Array, slopes: Array) 
     return found[0] * jnp.sum(which * ratio[:, None], 0)
 
 
-class Axes(NamedTuple):
-    """Axes of tangents beyond those of the states: `bodies` 0 or 1 last ones, `directions` 0 or 1
-    before all others but the first.
-    """
-
-    bodies: int
-    directions: int
-
-    def over(self, function: Any, into: Any, out: Any) -> Any:
-        """The function for every direction; `into`, `out` are axes, -1 stands for constants'."""
-        if not self.directions:
-            return function
-        axes: Any = jax.tree.map(lambda a: -1 - self.bodies if a < 0 else a, (into, out))
-        return jax.vmap(function, *axes)
-
-
-def pushed(
-    tableau: Tableau,
-    field: Field,
-    constants: list[Array],
-    step: Step,
-    there: Stages,
-    along: tuple[list[Array], Array, Array, Array],
-    axes: Axes,
-    dense: Array | None = None,
-) -> tuple[Array, Array]:
-    """Tangents of the state at the end (n, *directions, *bodies), not projected, and of the slopes
-    (n, s, *directions, *bodies).
-
-    **Arguments:** `along` tangents of the constants, of the step's time and length, of its state.
-    """
-    w = weights(tableau, step.y.dtype, there.slopes.shape[1])
-    of_constants, of_t, of_h, of_y = along
-    h, dh = (lift(a.astype(of_y.dtype), of_y) for a in (step.h, of_h))
-    slopes = jnp.expand_dims(there.slopes, 2) if axes.directions else there.slopes
-
-    def stage(i: Array, moved: Array) -> Array:
-        y = of_y + dh * _sum(w.a[i], slopes) + h * _sum(w.a[i], moved)
-        t = of_t + w.c[i].astype(of_t.dtype) * of_h
-        here = (constants, there.times[i], there.places[:, i])
-
-        def slope(of_constants: Any, t: Array, y: Array) -> Array:
-            return jax.jvp(field, here, (of_constants, t, y))[1]
-
-        return _put(moved, axes.over(slope, (-1, 0, 1), 1)(of_constants, t, y), i)
-
-    count = w.b.shape[0]
-    none = jnp.zeros((of_y.shape[0], count, *of_y.shape[1:]), of_y.dtype)
-    moved = lax.fori_loop(np.int32(0), last_stage(tableau, dense), stage, none)
-    return of_y + dh * _sum(w.b, slopes) + h * _sum(w.b, moved), moved
-
-
 def pulled(
     tableau: Tableau,
     field: Field,
@@ -250,43 +194,39 @@ def pulled(
     step: Step,
     there: Stages,
     cotangent: Array,
-    axes: Axes,
-    dense: tuple[Array, Array] | None = None,
+    of_slopes: Array | None = None,
+    dense: Any = False,
 ) -> tuple[list[Array], Array, Array, Array]:
-    """The transpose of `pushed`: cotangents of the constants, of time, of length, of the state.
+    """The transpose of a step: cotangents of the constants, of time, of length, of the state.
 
-    **Arguments:** `cotangent` of the state at the end; `dense` whether dense output is used, and
-    its cotangents of the slopes (n, s, *directions, *bodies).
+    **Arguments:** `cotangent` of the state at the end; `of_slopes` (n, s, *bodies) of all slopes;
+    `dense` as for `stages`.
     """
-    w = weights(tableau, step.y.dtype, there.slopes.shape[1])
-    count = w.b.shape[0]
-    h = step.h.astype(step.y.dtype)
-    wanted, more = (None, None) if dense is None else dense
-    upper = last_stage(tableau, wanted)
+    count = there.slopes.shape[1]
+    w = weights(tableau, step.y.dtype, count)
+    h, last = step.h.astype(step.y.dtype), _last(tableau, dense)
 
     def stage(i: Array, both: tuple[Array, Array]) -> tuple[Array, Array]:
-        m = upper - 1 - i
+        m = last - 1 - i
         below, seeds = both
         seed = w.b[m] * cotangent + _sum(w.a[:, m], below)
         bar = lift(h, seed) * seed
-        if more is not None:
-            bar = bar + more[:, m]
+        if of_slopes is not None:
+            bar = bar + of_slopes[:, m]
         pull = jax.vjp(lambda y: field(constants, there.times[m], y), there.places[:, m])[1]
-        return _put(below, axes.over(pull, 1, (1,))(bar)[0], m), _put(seeds, seed, m)
+        return _put(below, pull(bar)[0], m), _put(seeds, seed, m)
 
-    none = jnp.zeros((cotangent.shape[0], count, *cotangent.shape[1:]), cotangent.dtype)
-    below, seeds = lax.fori_loop(np.int32(0), upper, stage, (none, none))
+    none = jnp.zeros_like(there.slopes)
+    below, seeds = lax.fori_loop(np.int32(0), last, stage, (none, none))
     # The constants' share of all stages at once: it does not wait for the others. Each stage has
     # constants of its own, and their shares are summed last: else each number is a kernel.
     every = jax.vmap(lambda c, t, y: field(c, t, y), (0, 0, 1), 1)
     own = [jnp.broadcast_to(c, (count, *c.shape)) for c in constants]
     pull = jax.vjp(lambda c, t: every(c, t, there.places), own, there.times)[1]
     bars = lift(h, seeds) * seeds
-    bars = bars if more is None else bars + more
-    by_own, by_times = axes.over(pull, 2, (-1, 1))(bars)
+    by_own, by_times = pull(bars if of_slopes is None else bars + of_slopes)
     by_constants = [jnp.sum(by, 0) for by in by_own]
-    slopes = jnp.expand_dims(there.slopes, 2) if axes.directions else there.slopes
-    by_length = jnp.sum(seeds * slopes, (0, 1)).astype(by_times.dtype)
+    by_length = jnp.sum(seeds * there.slopes, (0, 1)).astype(by_times.dtype)
     c = w.c.astype(by_times.dtype).reshape(-1, *[1] * (by_times.ndim - 1))
     by_length = by_length + jnp.sum(c * by_times, 0)
     return by_constants, jnp.sum(by_times, 0), by_length, cotangent + jnp.sum(below, 1)
