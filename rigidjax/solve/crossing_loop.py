@@ -32,14 +32,14 @@ class Motion(NamedTuple):
     """How a body gets on, on (n, *bodies).
 
     **Fields:** `attempt(step) → (y, norm)` the state a step later, its error over the tolerance;
-    `order` of the method; `longest` step; `condition(t, y) → (g, dg/dt, dy/dt)`; `counts(t, y)`
-    whether a zero is one of the motion, not of its round-off; `project`.
+    `order` of the method; `longest` step; `condition(t, y) → (g, dg/dt, dy/dt, round-off of g)`;
+    `counts(t, y)` whether a zero is one of the motion, not of its round-off; `project`.
     """
 
     attempt: Callable[[Step], tuple[Array, Array]]
     order: int
     longest: Array
-    condition: Callable[[Array, Array], tuple[Array, Array, Array]]
+    condition: Callable[[Array, Array], tuple[Array, ...]]
     counts: Callable[[Array, Array], Array]
     project: Callable[[Array], Array]
 
@@ -101,7 +101,7 @@ def locate(motion: Motion, search: Search, run: Run) -> Located:
     A start on the section is none.
     """
     t0, y0 = run.t0, run.y0
-    g, rate, _ = motion.condition(t0, y0)
+    g, rate, *_ = motion.condition(t0, y0)
     # On the section but for round-off of the time: then the side is where g goes.
     eps = jnp.finfo(t0.dtype).eps
     little = 16 * eps * jnp.maximum(jnp.abs(t0), jnp.abs(run.stops[-1])).astype(g.dtype)
@@ -157,7 +157,7 @@ def _pass(motion: Motion, search: Search, run: Run, body: _Body) -> _Body:
     length = jnp.where(on & ~arrived, length, jnp.zeros_like(length))
     late = jnp.where(last, end, jnp.minimum(t + length, end))
     after, norm = motion.attempt(Step(t, length, late, y))
-    g, rate, slope = motion.condition(late, after)
+    g, rate, slope, blur = motion.condition(late, after)
     # Zero counts only where g came to it: not at the start, and not where it is zero all along.
     other = (side * g < 0) | ((g == 0) & (body.g != 0) & (side != 0))
     wanted = -side if search.direction == 0 else jnp.full_like(side, search.direction)
@@ -170,7 +170,7 @@ def _pass(motion: Motion, search: Search, run: Run, body: _Body) -> _Body:
     good, following = controlled(norm, motion.order, t, length, h, last, whole)
     following = jnp.minimum(following, motion.longest)
     good = step & good
-    hidden, turn = _hidden(side, start, here)
+    hidden, turn = _hidden(side, start, here, blur)
     eps = jnp.finfo(h.dtype).eps
     long_enough = turn > 8 * eps * jnp.maximum(jnp.abs(t), eps * whole)
     shorter = good & hidden & long_enough & (body.tries < _GUESSES)
@@ -224,7 +224,7 @@ def _choose(which: Array, a: _End, b: _End) -> _End:
     return _End(*(jnp.where(which, x, y) for x, y in zip(a, b, strict=True)))
 
 
-def _hidden(side: Array, low: _End, high: _End) -> tuple[Array, Array]:
+def _hidden(side: Array, low: _End, high: _End, blur: Array) -> tuple[Array, Array]:
     """Whether g may have more zeros between two ends than their signs tell, and the offset at which
     the cubic through both, with their slopes, turns back from zero or beyond it.
     """
@@ -248,9 +248,9 @@ def _hidden(side: Array, low: _End, high: _End) -> tuple[Array, Array]:
 
     # Both tangents meet beyond zero: of a g that turns once nothing else is known.
     meet = (last - b - first) / jnp.where(a == b, 1, a - b)
-    touch = (a < 0) & (b > 0) & (first + a * meet <= 0)
-    two = (last > 0) & ((value(least) < 0) | touch)
-    three = (last <= 0) & (value(least) < 0) & within(most) & (value(most) > 0) & (least < most)
+    touch = (a < 0) & (b > 0) & (first + a * meet < -blur)
+    two = (last > 0) & ((value(least) < -blur) | touch)
+    three = (last <= 0) & (value(least) < -blur) & within(most) & (value(most) > 0) & (least < most)
     known = (root != 0) & (q != 0) & ((c >= 0) | (d != 0))
     least = jnp.where(known, least, 0)
     return within(least) & (two | three), least.astype(low.x.dtype) * (high.x - low.x)

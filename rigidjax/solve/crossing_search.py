@@ -169,8 +169,8 @@ def _located(
         shared = [None if s else -1 for s in layout.shared]
         over = lambda f: jax.vmap(f, (shared, -1, -1), -1)  # noqa: E731
         project = jax.vmap(project, -1, -1)
-    motion, rates = over(section.motion), over(section.rates)
-    counts = partial(over(partial(_counts, section)), constants)
+    motion = over(section.motion)
+    seen, counts = (partial(over(partial(f, section)), constants) for f in (_seen, _counts))
 
     def in_closed_form(step: Step) -> tuple[Array, Array]:
         return motion(constants, step.end, step.y), jnp.zeros_like(run.rtol)
@@ -187,25 +187,38 @@ def _located(
         h0, _ = first_step(Method(tableau, motion, project, None, sizes, 0), constants, run)
         h0 = jnp.minimum(jnp.where(jnp.isnan(run.h0), h0, run.h0), longest)
         run = run._replace(h0=h0)
-    moving = Motion(attempt, order, longest, partial(rates, constants), counts, project)
+    moving = Motion(attempt, order, longest, seen, counts, project)
     return list(crossing_loop.locate(moving, what, run)), []
+
+
+def _lengths(like: Any, a: Array) -> Array:
+    """The length of the array of a state that each number belongs to."""
+    which = np.repeat(np.arange(len(leaf_sizes(like))), leaf_sizes(like))
+    same = jnp.asarray(which[:, None] == which[None], a.dtype)
+    return jnp.sqrt(jnp.sum(same * (a * a)[None], 1))
+
+
+def _push(like: Any, y: Array) -> Array:
+    """A change of each number by the length of its array, in a direction along no body's axis."""
+    return jnp.asarray(np.cos(1 + np.arange(y.size)), y.dtype) * _lengths(like, y)
+
+
+def _seen(section: Section, constants: Arrays, s: Array, y: Array) -> tuple[Array, ...]:
+    """g, dg/ds, dy/ds, and what g may be by round-off."""
+    of_g = lambda s, y: section.rates(constants, s, y)[0]  # noqa: E731
+    noise = jax.jvp(of_g, (s, y), (s, _push(section.like, y)))[1]
+    blur = _CLEAR * jnp.finfo(y.dtype).eps * jnp.abs(noise)
+    return *section.rates(constants, s, y), blur
 
 
 def _counts(section: Section, constants: Arrays, s: Array, y: Array) -> Array:
     """Whether g goes through zero faster than by round-off."""
-    sizes = leaf_sizes(section.like)
-
-    def sizes_of(a: Array) -> Array:
-        """The length of the array of the state that each number belongs to."""
-        parts = jnp.split(a, np.cumsum(sizes)[:-1])
-        return jnp.concatenate([jnp.full_like(p, jnp.sqrt(jnp.sum(p * p))) for p in parts])
-
-    # A direction that is along no axis of any body.
-    push = jnp.asarray(np.cos(1 + np.arange(y.size)), y.dtype) * sizes_of(y)
-    _, rate, slope = section.rates(constants, s, y)
-    shift = jax.jvp(lambda y: section.rates(constants, s, y)[2], (y,), (push,))[1]
+    rates, like = partial(section.rates, constants, s), section.like
+    _, rate, slope = rates(y)
+    shift = jax.jvp(lambda y: rates(y)[2], (y,), (_push(like, y),))[1]
     by_s, by_y = jax.jacfwd(lambda s, y: section.rates(constants, s, y)[0], (0, 1))(s, y)
-    terms = jnp.abs(by_s) + jnp.sum(jnp.abs(by_y) * (sizes_of(slope) + sizes_of(shift)))
+    sizes = _lengths(like, slope) + _lengths(like, shift)
+    terms = jnp.abs(by_s) + jnp.sum(jnp.abs(by_y) * sizes)
     return ~(jnp.abs(rate) < _CLEAR * jnp.finfo(y.dtype).eps * terms)
 
 
