@@ -19,7 +19,7 @@ from rigidjax.solve.components import flat, leaf_sizes, unflat
 from rigidjax.solve.explicit import AbstractExplicit
 from rigidjax.solve.linear_map import linear_map, no_tangent, without_transpose
 from rigidjax.solve.record import HALTED, Answer, Method, Record, Run
-from rigidjax.solve.step_control import NONFINITE
+from rigidjax.solve.step_control import outcome
 from rigidjax.solve.tableaus import Tableau
 
 
@@ -96,14 +96,7 @@ def adaptive(
         jnp.asarray(jnp.nan if dt0 is None else dt0, ts.dtype),
     )
     out = _solved(program, constants, run)
-    result = dfx.RESULTS.dt_min_reached
-    for there, word in (
-        (jnp.isnan(out.h), NONFINITE),
-        (out.h > 0, dfx.RESULTS.max_steps_reached),
-        (out.t >= ts[-1], dfx.RESULTS.successful),
-        (out.h == HALTED, dfx.RESULTS.event_occurred),
-    ):
-        result = dfx.RESULTS.where(there, word, result)
+    result = outcome(out.h, out.t, ts[-1], out.h == HALTED)
     rows = jnp.concatenate([numbers[None], out.between, out.end[None]])
     ys = jax.vmap(partial(unflat, like=y0))(rows)
     return Found(ys, out.steps, out.rejected, result, out.t, unflat(out.last, y0))

@@ -29,10 +29,8 @@ from rigidjax.solve.record import (
     packed,
 )
 from rigidjax.solve.runge_kutta import Step
-from rigidjax.solve.step_control import error_norm, first_step
+from rigidjax.solve.step_control import controlled, error_norm, first_step
 
-# The defaults of diffrax.PIDController: the same steps, so that figures can be compared.
-_SAFETY, _SMALLEST, _LARGEST = 0.9, 0.2, 10.0
 # Steps in a segment, rejected ones included.
 SEGMENT = 512
 # More rows for one that is run again: it may take a few steps more.
@@ -124,19 +122,9 @@ def _attempt(
     y = method.project(there.end)
     error = runge_kutta.error_estimate(method.tableau, method.sizes, h, there.slopes)
     norm = error_norm(error, loop.y, y, run.rtol, run.atol)
-    # NaN in a step too long says as little as infinity: try a shorter one.
-    norm = lax.stop_gradient(jnp.where(jnp.isnan(norm), jnp.inf, norm))
-    accept = moving & (norm < 1)
-    order = method.tableau.order
-    factor = jnp.clip(_SAFETY * norm ** (-1 / order), _SMALLEST, _LARGEST)
-    following = lax.stop_gradient(h) * factor.astype(h.dtype)
-    following = jnp.where(last & accept, jnp.maximum(following, own), following)
-    # Where no step is left to try the loop ends: h = 0, or NaN where it met one. Where t is 0 its
-    # round-off is, too: then that of the run's length counts.
-    least = jnp.finfo(h.dtype).eps * (run.stops[-1] - run.t0)
-    unit = 8 * jnp.finfo(h.dtype).eps * jnp.maximum(jnp.abs(loop.t), least)
-    why = jnp.where(jnp.isfinite(norm), 0.0, jnp.nan).astype(h.dtype)
-    following = jnp.where(moving & ~accept & ~(following > unit), why, following)
+    length = run.stops[-1] - run.t0
+    good, following = controlled(norm, method.tableau.order, loop.t, h, own, last, length)
+    accept = moving & good
     following = jnp.where(moving, following, own)
     if until is None:
         ended = _unless_halted(method, late, y, following)

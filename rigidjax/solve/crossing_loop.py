@@ -3,14 +3,15 @@
 A pass through the loop is one step of the method from where a body is: an attempt at the next step,
 or a part of it, up to where the crossing is looked for. So a crossing is as accurate as a step, and
 costs about three passes. It is the start of the next step: two crossings in one step are nothing
-special. Where g turns back towards where it came from within a step, the turn is looked for, until
-the tangents at both ends show that g does not get to zero, or g has another sign there. Where the
-cubic through both ends has more zeros than their signs tell, the step is taken again, shorter.
+special. Where the cubic through both ends of a step, with their slopes, has more zeros than their
+signs tell, or g turns back before zero and the tangents at both ends do not show that it stays
+there, the step is taken again, as far as the turn.
 
 Nothing here is differentiated.
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -18,23 +19,28 @@ from jax import lax
 from jaxtyping import Array
 
 from rigidjax.solve.components import lift
-from rigidjax.solve.record import at
+from rigidjax.solve.record import Run, at
+from rigidjax.solve.runge_kutta import Step
+from rigidjax.solve.step_control import controlled
 
-# Newton's guesses in a step; from then on halves.
+# Newton's guesses in a step, from then on halves; and how often a step is taken again for a turn.
 _GUESSES = 8
 _MOST = 70
-MARCH, REFINE, TURN = range(3)
 
 
 class Motion(NamedTuple):
     """How a body gets on, on (n, *bodies).
 
-    **Fields:** `attempt(t, h, end, y) → (y, size, h_next)` the state a step later, its error over
-    the tolerance, the next step; `condition(t, y) → (g, dg/dt, dy/dt)`; `project`.
+    **Fields:** `attempt(step) → (y, norm)` the state a step later, its error over the tolerance;
+    `order` of the method; `longest` step; `condition(t, y) → (g, dg/dt, dy/dt, round-off of g)`;
+    `counts(t, y)` whether a zero is one of the motion, not of its round-off; `project`.
     """
 
-    attempt: Callable[..., tuple[Array, Array, Array]]
-    condition: Callable[..., tuple[Array, Array, Array]]
+    attempt: Callable[[Step], tuple[Array, Array]]
+    order: int
+    longest: Array
+    condition: Callable[[Array, Array], tuple[Array, ...]]
+    counts: Callable[[Array, Array], Array]
     project: Callable[[Array], Array]
 
 
@@ -48,7 +54,7 @@ class Search(NamedTuple):
 
 class Located(NamedTuple):
     """Times (K, *bodies), NaN beyond the last, states (K, n, *bodies), their number (*bodies),
-    where each body is at the end, its next step (NaN where it met one), and steps.
+    where each body is at the end, its next step (NaN where it met one), and passes.
     """
 
     times: Array
@@ -69,7 +75,8 @@ class _End(NamedTuple):
 
 class _Body(NamedTuple):
     """Time, state, next step; the side of zero that g is on, g and dg/dt there; index of the next
-    stop; what is looked for, where, between which ends; counters; whether a crossing was found.
+    stop; whether a zero is looked for in a step, where, between which ends; counters; whether it
+    was found.
     """
 
     t: Array
@@ -79,169 +86,137 @@ class _Body(NamedTuple):
     g: Array
     rate: Array
     stop: Array
-    mode: Array
+    refining: Array
     x: Array
     low: _End
     high: _End
     tries: Array
-    sure: Array
     steps: Array
     found: Array
 
 
-def locate(
-    motion: Motion, search: Search, t0: Array, stops: Array, before: Array, y0: Array, h0: Array
-) -> Located:
-    """The crossings on the way from `t0` through `stops` (J, *bodies).
+def locate(motion: Motion, search: Search, run: Run) -> Located:
+    """The crossings on the way from `run.t0` through `run.stops`, from the first step `run.h0`.
 
     A start on the section is none.
     """
-    g, rate, _ = motion.condition(t0, y0)
+    t0, y0 = run.t0, run.y0
+    g, rate, *_ = motion.condition(t0, y0)
     # On the section but for round-off of the time: then the side is where g goes.
     eps = jnp.finfo(t0.dtype).eps
-    little = 16 * eps * jnp.maximum(jnp.abs(t0), jnp.abs(stops[-1])).astype(g.dtype)
+    little = 16 * eps * jnp.maximum(jnp.abs(t0), jnp.abs(run.stops[-1])).astype(g.dtype)
     there = jnp.abs(g) <= little * jnp.abs(rate)
     side = jnp.where(there, jnp.sign(rate), jnp.sign(g))
-    zero, none = jnp.zeros(t0.shape, jnp.int32), jnp.zeros_like(g)
-    sound = jnp.isfinite(g) & jnp.isfinite(stops[-1]) & jnp.all(jnp.isfinite(y0), 0)
-    no = jnp.zeros(t0.shape, bool)
+    zero, none, no = jnp.zeros(t0.shape, jnp.int32), jnp.zeros_like(g), jnp.zeros(t0.shape, bool)
+    sound = jnp.isfinite(g) & jnp.isfinite(run.stops[-1]) & jnp.all(jnp.isfinite(y0), 0)
     end = _End(jnp.zeros_like(t0), none, none)
-    h0 = jnp.where(sound, h0, jnp.nan)
     body = _Body(
-        t0, y0, h0, side, jnp.where(there, none, g), rate, zero, zero, jnp.zeros_like(t0), end, end,
-        zero, no, zero, no,
+        t0, y0, jnp.where(sound, run.h0, jnp.nan), side, jnp.where(there, none, g), rate, zero, no,
+        jnp.zeros_like(t0), end, end, zero, zero, no,
     )  # fmt: skip
+
+    def on(body: _Body) -> Array:
+        return jnp.any(_going(search, run, body))
+
+    def next_zero(body: _Body) -> _Body:
+        body = lax.while_loop(on, partial(_pass, motion, search, run), body)
+        return body._replace(found=body.found & motion.counts(body.t, body.y))
 
     def row(state: Any) -> Any:
         body, times, states, k, count = state
-        body = body._replace(found=no)
-        body = lax.while_loop(
-            lambda body: jnp.any(_going(search, stops, body)),
-            lambda body: _pass(motion, search, stops, before, body),
-            body,
-        )
+        body = lax.while_loop(on, next_zero, body._replace(found=no))
         t = jnp.where(body.found, body.t, jnp.nan)
         y = jnp.where(lift(body.found, body.y), body.y, jnp.nan)
         times = lax.dynamic_update_index_in_dim(times, t, k, 0)
         states = lax.dynamic_update_index_in_dim(states, y, k, 0)
         return body, times, states, k + 1, count + body.found.astype(jnp.int32)
 
-    def more(state: Any) -> Array:
-        body, _, _, k, _ = state
-        on = _going(search, stops, body._replace(found=no))
-        return (k < search.many) & jnp.any(on)
-
     times = jnp.full((search.many, *t0.shape), jnp.nan, t0.dtype)
     states = jnp.full((search.many, *y0.shape), jnp.nan, y0.dtype)
-    start: Any = (body, times, states, jnp.zeros((), jnp.int32), zero)
-    body, times, states, _, count = lax.while_loop(more, row, start)
+    body, times, states, _, count = lax.while_loop(
+        lambda state: (state[3] < search.many) & on(state[0]._replace(found=no)),
+        row,
+        (body, times, states, jnp.zeros((), jnp.int32), zero),
+    )
     return Located(times, states, count, body.t, body.h, body.steps)
 
 
-def _going(search: Search, stops: Array, body: _Body) -> Array:
-    ahead = (body.stop < stops.shape[0]) & (body.steps < search.max_steps)
+def _going(search: Search, run: Run, body: _Body) -> Array:
+    ahead = (body.stop < run.stops.shape[0]) & (body.steps < search.max_steps)
     return ahead & (body.h > 0) & ~body.found
 
 
-def _pass(motion: Motion, search: Search, stops: Array, before: Array, body: _Body) -> _Body:
-    on = _going(search, stops, body)
+def _pass(motion: Motion, search: Search, run: Run, body: _Body) -> _Body:
+    on = _going(search, run, body)
     t, h, y, side = body.t, body.h, body.y, body.side
-    marching, refining = body.mode == MARCH, body.mode == REFINE
-    begin, end = at(stops, body.stop), at(before, body.stop)
-    arrived = on & marching & (t >= begin)
+    begin, end = at(run.stops, body.stop), at(run.before, body.stop)
+    arrived = on & ~body.refining & (t >= begin)
     left = end - t
-    last = marching & (h >= left)
-    length = jnp.where(marching, jnp.where(last, left, h), body.x)
+    last = ~body.refining & (h >= left)
+    length = jnp.where(body.refining, body.x, jnp.where(last, left, h))
     length = jnp.where(on & ~arrived, length, jnp.zeros_like(length))
     late = jnp.where(last, end, jnp.minimum(t + length, end))
-    after, size, following = motion.attempt(t, length, late, y)
-    g, rate, slope = motion.condition(late, after)
-    size = jnp.where(jnp.isnan(size), jnp.inf, size)
+    after, norm = motion.attempt(Step(t, length, late, y))
+    g, rate, slope, blur = motion.condition(late, after)
     # Zero counts only where g came to it: not at the start, and not where it is zero all along.
     other = (side * g < 0) | ((g == 0) & (body.g != 0) & (side != 0))
     wanted = -side if search.direction == 0 else jnp.full_like(side, search.direction)
     asked = -side == wanted
-    here = _End(length, g, rate)
+    start, here = _End(jnp.zeros_like(length), body.g, body.rate), _End(length, g, rate)
 
-    # A step: accepted, and nothing between its ends; or else one of two searches within it.
-    on = on & ~arrived
-    step = on & marching
-    good = step & (size < 1)
-    start = _End(jnp.zeros_like(length), body.g, body.rate)
-    turns = good & ~other & ~body.sure & _may_touch(side, start, here)
-    # Further crossings within the step: a shorter one, up to where the first is alone.
-    hidden, share = _hidden(side, start, here)
+    # A step: accepted; or taken again as far as g turns; or else with a zero in it.
+    step = on & ~arrived & ~body.refining
+    whole = run.stops[-1] - run.t0
+    good, following = controlled(norm, motion.order, t, length, h, last, whole)
+    following = jnp.minimum(following, motion.longest)
+    good = step & good
+    hidden, turn = _hidden(side, start, here, blur)
     eps = jnp.finfo(h.dtype).eps
-    floor = 8 * eps * jnp.maximum(jnp.abs(t), eps * jnp.abs(stops[-1]))
-    shorter = good & hidden & ~turns & ~body.sure & (share * length > floor)
-    good = good & ~shorter
+    long_enough = turn > 8 * eps * jnp.maximum(jnp.abs(t), eps * whole)
+    shorter = good & hidden & long_enough & (body.tries < _GUESSES)
     # A crossing the other way is not looked for, but for where it ended.
-    passed = good & other & ~asked
-    crossed = good & other & asked
-    accept = good & ~crossed & ~turns
-    why = jnp.where(jnp.isfinite(size), 0.0, jnp.nan).astype(h.dtype)
-    stuck = step & ~good & ~shorter & ~(following > floor)
-    shown = jnp.where(last & accept, jnp.maximum(following, h), following)
-    next_h = jnp.where(accept | (step & ~good), jnp.where(stuck, why, shown), h)
-    next_h = jnp.where(shorter, share.astype(h.dtype) * length, next_h)
+    crossed = good & ~shorter & other & asked
+    accept = good & ~shorter & ~crossed
+    next_h = jnp.where(shorter, turn, jnp.where(step & ~crossed, following, h))
 
     # Newton's method between two ends of which one is on either side.
-    refine = on & refining
+    refine = on & body.refining
     low = _choose(refine & ~other, here, body.low)
     high = _choose(refine & other, here, body.high)
     move = (-g / jnp.where(rate == 0, jnp.ones_like(rate), rate)).astype(length.dtype)
     goal = length + move
     width = high.x - low.x
-    small = jnp.sqrt(jnp.finfo(h.dtype).eps) * h
+    small = jnp.sqrt(eps) * h
     near = (
         (jnp.abs(move) <= small) & (rate != 0) & (goal >= low.x - small) & (goal <= high.x + small)
     )
-    unit = 2 * jnp.finfo(h.dtype).eps * jnp.maximum(jnp.abs(t), h)
+    unit = 2 * eps * jnp.maximum(jnp.abs(t), h)
     pinned = (width <= unit) | (body.tries >= _MOST)
     done = refine & (near | pinned)
-    move = jnp.where(near, move, jnp.zeros_like(move))
+    move = jnp.where(done & near, move, jnp.zeros_like(move))
     inside = (goal > low.x) & (goal < high.x) & (body.tries < _GUESSES)
     guess = jnp.where(inside, goal, low.x + 0.5 * width)
-    found = body.found | (done & asked)
-
-    # The turn of g between two ends on the same side: a secant of dg/dt.
-    turning = on & (body.mode == TURN)
-    back = side * rate < 0
-    dip = turning & other
-    low = _choose(turning & ~other & back, here, low)
-    high = _choose(turning & ~other & ~back, here, high)
-    lost = turning & ~other & (~_may_touch(side, low, high) | (body.tries >= _GUESSES))
-    begun = turns | (turning & ~dip & ~lost)
-    low, high = _choose(turns, start, low), _choose(turns, here, high)
-    # A crossing lies between the start of the search and where g has changed its sign.
-    enter = crossed | dip
-    low = _choose(crossed, start, low)
-    high = _choose(enter, here, high)
-    bottom = _between(low.x, high.x, low.x + (high.x - low.x) * _share(low.rate, high.rate))
-    x = jnp.where(begun, bottom, jnp.where(enter, _first_guess(side, low, high), guess))
+    low, high = _choose(crossed, start, low), _choose(crossed, here, high)
 
     new = accept | done
-    mode = jnp.where(enter, REFINE, jnp.where(turns, TURN, body.mode))
-    mode = jnp.where(done | lost, MARCH, mode).astype(jnp.int32)
     reached = accept & last
-    place = jnp.where(reached, begin, late) + jnp.where(done, move, jnp.zeros_like(move))
-    shifted = motion.project(after + slope * lift(jnp.where(done, move, 0).astype(y.dtype), y))
+    shifted = motion.project(after + slope * lift(move.astype(y.dtype), y))
+    flipped = done | (accept & other)
     return _Body(
-        t=jnp.where(new, place, t),
+        t=jnp.where(new, jnp.where(reached, begin, late) + move, t),
         y=jnp.where(lift(new, y), jnp.where(lift(done, y), shifted, after), y),
         h=next_h,
-        side=jnp.where(done | passed, -side, jnp.where(accept & (side == 0), jnp.sign(g), side)),
+        side=jnp.where(flipped, -side, jnp.where(accept & (side == 0), jnp.sign(g), side)),
         g=jnp.where(done, jnp.zeros_like(g), jnp.where(accept, g, body.g)),
         rate=jnp.where(new, rate, body.rate),
         stop=body.stop + (arrived | reached).astype(jnp.int32),
-        mode=mode,
-        x=x,
+        refining=(body.refining | crossed) & ~done,
+        x=jnp.where(crossed, _first_guess(side, low, high), guess),
         low=low,
         high=high,
-        tries=jnp.where(enter | turns | (body.mode == MARCH), 0, body.tries + 1).astype(jnp.int32),
-        sure=jnp.where(lost, True, jnp.where(new, False, body.sure)),
+        tries=jnp.where(shorter | (refine & ~done), body.tries + 1, 0).astype(jnp.int32),
         steps=body.steps + on.astype(jnp.int32),
-        found=found,
+        found=body.found | done,
     )
 
 
@@ -249,43 +224,21 @@ def _choose(which: Array, a: _End, b: _End) -> _End:
     return _End(*(jnp.where(which, x, y) for x, y in zip(a, b, strict=True)))
 
 
-def _between(low: Array, high: Array, x: Array) -> Array:
-    """`x`, or the middle where it is not well inside."""
-    width = high - low
-    well = (x > low + 1e-3 * width) & (x < high - 1e-3 * width)
-    return jnp.where(well, x, low + 0.5 * width)
-
-
-def _share(a: Array, b: Array) -> Array:
-    """Where between 0 and 1 the line from `a` to `b` is zero."""
-    gap = a - b
-    return jnp.where(gap == 0, 0.5, a / jnp.where(gap == 0, 1, gap))
-
-
-def _may_touch(side: Array, low: _End, high: _End) -> Array:
-    """Whether g turns back between two ends, and its tangents there meet beyond zero."""
-    turns = (side * low.rate < 0) & (side * high.rate > 0)
-    width = (high.x - low.x).astype(low.g.dtype)
-    gap = low.rate - high.rate
-    place = (high.g - high.rate * width - low.g) / jnp.where(gap == 0, 1, gap)
-    return turns & (side * (low.g + low.rate * place) <= 0)
-
-
-def _hidden(side: Array, low: _End, high: _End) -> tuple[Array, Array]:
-    """Whether the cubic in the offset through both ends with their slopes has more zeros between
-    them than their signs tell, and where from 0 to 1 it is first on the other side of zero.
+def _hidden(side: Array, low: _End, high: _End, blur: Array) -> tuple[Array, Array]:
+    """Whether g may have more zeros between two ends than their signs tell, and the offset at which
+    the cubic through both, with their slopes, turns back from zero or beyond it.
     """
     width = (high.x - low.x).astype(low.g.dtype)
     a, b = side * low.rate * width, side * high.rate * width
     first, last = side * low.g, side * high.g
     rise = last - first
-    # Its slope is a + c x + d x².
+    # Its slope from 0 to 1 is a + c x + d x².
     c, d = 2 * (3 * rise - 2 * a - b), 3 * (a + b - 2 * rise)
     root = jnp.sqrt(jnp.maximum(c * c - 4 * a * d, 0))
     q = -0.5 * (c + jnp.where(c < 0, -root, root))
-    u = q / jnp.where(d == 0, 1, d)
-    v = a / jnp.where(q == 0, 1, q)
-    early, late = jnp.minimum(u, v), jnp.maximum(u, v)
+    one, other = a / jnp.where(q == 0, 1, q), q / jnp.where(d == 0, 1, d)
+    # The slope grows through zero at the least value, and falls at the largest.
+    least, most = jnp.where(c < 0, other, one), jnp.where(c < 0, one, other)
 
     def value(x: Array) -> Array:
         return first + x * (a + x * (0.5 * c + x * d / 3))
@@ -293,11 +246,14 @@ def _hidden(side: Array, low: _End, high: _End) -> tuple[Array, Array]:
     def within(x: Array) -> Array:
         return (x > 0) & (x < 1)
 
-    flat = (d == 0) | (q == 0) | (root == 0)
-    below, above = within(early) & (value(early) < 0), within(late) & (value(late) > 0)
-    back = within(late) & (value(late) < 0)
-    three, two = (last <= 0) & below & above, (last > 0) & (below | back)
-    return ~flat & (three | two), jnp.where(below, early, late)
+    # Both tangents meet beyond zero: of a g that turns once nothing else is known.
+    meet = (last - b - first) / jnp.where(a == b, 1, a - b)
+    touch = (a < 0) & (b > 0) & (first + a * meet < -blur)
+    two = (last > 0) & ((value(least) < -blur) | touch)
+    three = (last <= 0) & (value(least) < -blur) & within(most) & (value(most) > 0) & (least < most)
+    known = (root != 0) & (q != 0) & ((c >= 0) | (d != 0))
+    least = jnp.where(known, least, 0)
+    return within(least) & (two | three), least.astype(low.x.dtype) * (high.x - low.x)
 
 
 def _first_guess(side: Array, low: _End, high: _End) -> Array:

@@ -1,4 +1,4 @@
-"""The crossings of one body, with derivatives: found without them, then corrected with them.
+"""The crossings of one body: found without derivatives, then corrected with them.
 
 A crossing at t* of g(t, y(t)) = 0 moves with every number of the scene. The motion is run again to
 the times found, which stay as they are, and what is left of g there, its rates ġ and g̈ along the
@@ -7,240 +7,261 @@ motion give the time and the state by one step of Chebyshev's method,
     τ = −(g/ġ)(1 + ½ g g̈/ġ²),   y = y* + f τ + ½ (df/dt) τ².
 
 τ is zero but for the error of dense output, and its first and second derivatives are those of the
-crossing (the error is of third order in what moves). At a touch, ġ = 0, there is none. The values
-are those that were found, whether there are derivatives or not.
+crossing (the error is of third order in what moves). At a touch, ġ = 0, there is none.
+
+A zero of round-off, of what the motion conserves or of a component that stays at zero, is none: ġ
+is then less than what round-off makes of it, which is ε Σ |∂g/∂yᵢ| times the size of the terms of
+ẏᵢ. This is the size of the array of the state that i belongs to, of ẏ itself and of its change
+where each y changes by the size of its own array.
 """
 
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
-import diffrax as dfx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from rigidjax.motion import on_the_group
-from rigidjax.solve import crossing_loop, runge_kutta
+from rigidjax.body.inertia import Inertia
+from rigidjax.exact import FreeBody
+from rigidjax.motion import Attitude, Rigid, on_the_group
+from rigidjax.motion.torques.base import jumps_of
+from rigidjax.solve import crossing_loop, direction, runge_kutta
 from rigidjax.solve.adaptive import adaptive, taken_out
 from rigidjax.solve.batching import Arrays, Layout, in_lanes
 from rigidjax.solve.components import flat, leaf_sizes, unflat
 from rigidjax.solve.crossing_loop import Located, Motion, Search
 from rigidjax.solve.explicit import AbstractExplicit
+from rigidjax.solve.linear_map import no_tangent
 from rigidjax.solve.record import Method, Run
+from rigidjax.solve.run import Free, Loop
 from rigidjax.solve.runge_kutta import Step
-from rigidjax.solve.step_control import NONFINITE, error_norm, first_step
+from rigidjax.solve.step_control import error_norm, first_step
+from rigidjax.solve.vector_field import equations_of_motion
 
-_SAFETY, _SMALLEST, _LARGEST = 0.9, 0.2, 10.0
+# Samples of a free body's condition in one turn at its largest rate.
+_SAMPLES = 16
+# How many times its round-off the slope of a crossing is.
+_CLEAR = 32
 
 
-class Scene(NamedTuple):
-    """What moves, as functions of numbers and closures.
+class Section(NamedTuple):
+    """What is crossed, and by what motion, in s = σt, which increases.
 
-    **Fields:** `solver` a method of ours, or `None` where `flow` answers; `field` f(t, y, args);
-    `flow(t)` the state at a time in closed form, or `None`; `condition(t, y)` g; `like` a state.
+    **Fields:** `solver` a method of ours, or `None` for the closed form; `motion(constants, s, y)`
+    dy/ds, or the state itself in closed form; `rates(constants, s, y)` g, dg/ds and dy/ds; `like` a
+    state; `sign` σ.
     """
 
     solver: AbstractExplicit | None
-    field: Callable[..., Any]
-    flow: Callable[..., Any] | None
-    condition: Callable[..., Any]
+    motion: Callable[[Arrays, Array, Array], Array]
+    rates: Callable[[Arrays, Array, Array], tuple[Array, Array, Array]]
     like: Any
+    sign: Array
+
+    def project(self, y: Array) -> Array:
+        return flat(on_the_group(unflat(y, self.like)))
+
+    def time(self, s: Array) -> Array:
+        """Time t at s, and the other way."""
+        return self.sign.astype(s.dtype) * s
 
 
-class Numbers(NamedTuple):
-    """`t0`, `stops` (J,) where the field jumps and the end, `y0` (n,), tolerances, first step (NaN
-    to choose one), longest step.
+def section(
+    setup: Free | Loop, condition: Callable[..., Any], max_step: Any, state0: Any, ts: Array
+) -> tuple[Section, Arrays, Run, Array]:
+    """The section `condition(t, y)` = 0 between `ts[0]` and `ts[-1]`; the numbers that it is made
+    of; the run; its longest step.
     """
-
-    t0: Array
-    stops: Array
-    y0: Array
-    rtol: Array
-    atol: Array
-    h0: Array
-    longest: Array
-
-
-class Found(NamedTuple):
-    """Times (K,), NaN beyond the last; states with a leading axis; how many; how the search ended;
-    passes.
-    """
-
-    times: Array
-    states: Any
-    number: Array
-    result: dfx.RESULTS
-    steps: Array
-
-
-def only_found(scene: Scene, what: Search, numbers: Numbers) -> Found:
-    """The first crossings on the way through `numbers.stops`, without derivatives."""
-    rules, constants = _rules(scene, numbers.t0)
-    located = Located(*_find(scene, rules, what, len(constants), *constants, *numbers))
-    return _found(scene, what, numbers, located)
-
-
-def search(scene: Scene, what: Search, numbers: Numbers) -> Found:
-    """As `only_found`, differentiable in all numbers."""
-    rules, constants = _rules(scene, numbers.t0)
-    count = len(constants)
-    find = partial(_find, scene, rules, what, count)
-    answer = jax.custom_jvp(find)
-
-    @answer.defjvp
-    def _(primals: Any, tangents: Any) -> Any:
-        found = Located(*find(*primals))
-
-        def again(*args: Array) -> Any:
-            given = Numbers(*args[count:])
-            return _corrected(scene, rules, what, list(args[:count]), given, found)
-
-        value, moved = jax.jvp(again, tuple(primals), tuple(tangents))
-        rest = [_no_tangent(a) for a in found[2:]]
-        return [*value, *found[2:]], [*moved, *rest]
-
-    return _found(scene, what, numbers, Located(*answer(*constants, *numbers)))
-
-
-def _find(scene: Scene, rules: "_Rules", what: Search, count: int, *args: Array) -> Arrays:
-    still = [lax.stop_gradient(a) for a in args]
-    program = partial(_located, scene, rules, what)
-    return in_lanes(program, still[:count], still[count:])
-
-
-def _found(scene: Scene, what: Search, numbers: Numbers, out: Located) -> Found:
-    result = dfx.RESULTS.dt_min_reached
-    for there, word in (
-        (jnp.isnan(out.h), NONFINITE),
-        (out.h > 0, dfx.RESULTS.max_steps_reached),
-        (out.t >= numbers.stops[-1], dfx.RESULTS.successful),
-        (out.number >= what.many, dfx.RESULTS.event_occurred),
-    ):
-        result = dfx.RESULTS.where(there, word, result)
-    states = jax.vmap(partial(unflat, like=scene.like))(out.states)
-    return Found(out.times, states, out.number, result, out.steps)
-
-
-def _no_tangent(a: Array) -> Any:
-    if jnp.issubdtype(a.dtype, jnp.inexact):
-        return jnp.zeros_like(a)
-    return np.zeros(a.shape, jax.dtypes.float0)
-
-
-class _Rules(NamedTuple):
-    """Functions of one body, of all constants, of t, and of y (n,)."""
-
-    field: Callable[[Arrays, Array, Array], Array]
-    flow: Callable[[Arrays, Array, Array], Array]
-    condition: Callable[[Arrays, Array, Array], Array]
-
-
-def _rules(scene: Scene, t0: Array) -> tuple[_Rules, Arrays]:
-    y0 = flat(scene.like)
-    flow = (lambda t, y: y) if scene.flow is None else lambda t, y: flat(scene.flow(t))  # pyright: ignore
-    parts = (
-        lambda t, y: flat(scene.field(t, unflat(y, scene.like), None)),
-        flow,
-        lambda t, y: scene.condition(t, unflat(y, scene.like)),
+    y0, dtype = flat(state0), ts.dtype
+    sign = way = jnp.sign(ts[-1] - ts[0]).astype(jnp.int32)
+    jumps, torque = jnp.zeros(0, dtype), None
+    if isinstance(setup, Loop):
+        torque, way = setup.torque, setup.sign
+        jumps = jumps_of(torque).astype(dtype)
+    field: Any = equations_of_motion(setup.body, state0, torque)
+    field, condition, along, jumps = direction.ahead(
+        way, field, condition, ts[jnp.array([0, -1])], jumps
     )
-    functions: list[Any] = []
-    constants: Arrays = []
-    for part in parts:
-        function, own = taken_out(part, t0, y0)
-        begin, end = len(constants), len(constants) + len(own)
-        functions.append(partial(_of_own, function, begin, end))
-        constants.extend(own)
-    return _Rules(*functions), constants
+    longest = whole = lax.stop_gradient(along[1] - along[0])
+    if max_step is not None:
+        longest = lax.stop_gradient(jnp.asarray(max_step, dtype))
+
+    def slope(s: Array, y: Array) -> Array:
+        return flat(field(s, unflat(y, state0), None))
+
+    def rates(s: Array, y: Array) -> tuple[Array, Array, Array]:
+        there = slope(s, y)
+        g, rate = jax.jvp(
+            lambda s, y: condition(s, unflat(y, state0)), (s, y), (jnp.ones_like(s), there)
+        )
+        return g, rate, there
+
+    if isinstance(setup, Loop):
+        solver, motion, control = setup.solver, slope, setup.controller
+        rtol, atol = (jnp.asarray(a, y0.dtype) for a in (control.rtol, control.atol))  # pyright: ignore
+        h0 = jnp.asarray(jnp.nan if setup.dt0 is None else setup.dt0, dtype)
+    else:
+        solver, motion = None, _free_motion(setup.body, state0, ts[0], sign)
+        longest = jnp.minimum(longest, _spacing(setup.body, state0, whole))
+        rtol, atol, h0 = jnp.zeros((), y0.dtype), jnp.zeros((), y0.dtype), longest
+    motion, constants = taken_out(motion, along[0], y0)
+    rates, more = taken_out(rates, along[0], y0)
+    count, of_motion, of_rates = len(constants), motion, rates
+    stops = jnp.concatenate([jnp.clip(jnp.sort(jumps), along[0], along[1]), along[1:]])
+    return (
+        Section(
+            solver,
+            lambda constants, s, y: of_motion(constants[:count], s, y),
+            lambda constants, s, y: of_rates(constants[count:], s, y),
+            state0,
+            sign,
+        ),
+        [*constants, *more],
+        Run(along[0], stops, stops[:0], y0, rtol, atol, h0),
+        longest,
+    )
 
 
-def _of_own(function: Any, begin: int, end: int, constants: Arrays, t: Array, y: Array) -> Any:
-    return function(constants[begin:end], t, y)
+def _free_motion(body: Any, state0: Any, t0: Array, sign: Array) -> Callable[..., Array]:
+    """A free body at s = σt, whatever the state is."""
+    rigid = isinstance(state0, Rigid)
+    turning = Attitude(state0.q, state0.omega) if rigid else state0
+    turning = FreeBody(body if isinstance(body, Inertia) else body.inertia, turning)
+
+    def motion(s: Array, y: Array) -> Array:
+        since = sign.astype(s.dtype) * s - t0
+        state: Any = turning(since)
+        return flat((state0.x + since * state0.v, state0.v, state) if rigid else state)
+
+    return motion
 
 
-def _rates(rules: _Rules, constants: Arrays, t: Array, y: Array) -> tuple[Array, Array, Array]:
-    """g, dg/dt along the motion, and dy/dt."""
-    slope = rules.field(constants, t, y)
-    condition = partial(rules.condition, constants)
-    g, rate = jax.jvp(condition, (t, y), (jnp.ones_like(t), slope))
-    return g, rate, slope
+def _spacing(body: Any, state0: Any, whole: Array) -> Array:
+    """A part of the time of one turn at the largest rate that energy and momentum allow."""
+    inertia = body if isinstance(body, Inertia) else body.inertia
+    tensor, omega = lax.stop_gradient((inertia.tensor, state0.omega))
+    momentum = jnp.sum(tensor * omega[None], axis=1)
+    least = jnp.linalg.eigvalsh(tensor)[0]
+    rate = jnp.minimum(
+        jnp.sqrt(jnp.sum(momentum * omega) / least), jnp.sqrt(jnp.sum(momentum**2)) / least
+    )
+    return jnp.where(rate * whole > 1, 2 * np.pi / (_SAMPLES * rate), whole / _SAMPLES)
+
+
+def located(section: Section, what: Search, constants: Arrays, run: Run, longest: Array) -> Located:
+    """The first crossings on the way through `run.stops`, without derivatives."""
+    constants, each = lax.stop_gradient((constants, [*run, longest]))
+    program = partial(_located, section, what)
+    return Located(*in_lanes(program, constants, each))
 
 
 def _located(
-    scene: Scene,
-    rules: _Rules,
-    what: Search,
-    layout: Layout,
-    constants: Arrays,
-    each: Arrays,
+    section: Section, what: Search, layout: Layout, constants: Arrays, each: Arrays
 ) -> Arrays:
-    numbers = Numbers(*each)
-
-    def project(y: Array) -> Array:
-        return flat(on_the_group(unflat(y, scene.like)))
-
-    over = lambda f: f  # noqa: E731
+    run, longest = Run(*each[:-1]), each[-1]
+    sizes, solver = leaf_sizes(section.like), section.solver
+    project, over = section.project, lambda f: f
     if layout.bodies:
         shared = [None if s else -1 for s in layout.shared]
         over = lambda f: jax.vmap(f, (shared, -1, -1), -1)  # noqa: E731
         project = jax.vmap(project, -1, -1)
-    field, flow = over(rules.field), partial(over(rules.flow), constants)
-    condition = partial(over(partial(_rates, rules)), constants)
-    longest = numbers.longest
+    motion = over(section.motion)
+    seen, counts = (partial(over(partial(f, section)), constants) for f in (_seen, _counts))
 
-    def at_any_time(t: Array, h: Array, end: Array, y: Array) -> tuple[Array, Array, Array]:
-        del t, h
-        return flow(end, y), jnp.zeros_like(numbers.rtol), longest
+    def in_closed_form(step: Step) -> tuple[Array, Array]:
+        return motion(constants, step.end, step.y), jnp.zeros_like(run.rtol)
 
-    def a_step(t: Array, h: Array, end: Array, y: Array) -> tuple[Array, Array, Array]:
-        there = runge_kutta.stages(tableau, field, constants, Step(t, h, end, y))
+    def by_a_step(step: Step) -> tuple[Array, Array]:
+        there = runge_kutta.stages(tableau, motion, constants, step)
         after = project(there.end)
-        error = runge_kutta.error_estimate(tableau, sizes, h, there.slopes)
-        size = error_norm(error, y, after, numbers.rtol, numbers.atol)
-        size = jnp.where(jnp.isnan(size), jnp.inf, size)
-        factor = jnp.clip(_SAFETY * size ** (-1 / tableau.order), _SMALLEST, _LARGEST)
-        return after, size, jnp.minimum(h * factor.astype(h.dtype), longest)
+        error = runge_kutta.error_estimate(tableau, sizes, step.h, there.slopes)
+        return after, error_norm(error, step.y, after, run.rtol, run.atol)
 
-    attempt, begin = at_any_time, longest
-    if scene.solver is not None:
-        tableau, sizes = scene.solver.tableau, leaf_sizes(scene.like)
-        attempt = a_step
-        run = Run(
-            numbers.t0, numbers.stops, numbers.stops[:0], numbers.y0, numbers.rtol, numbers.atol,
-            numbers.h0,
-        )  # fmt: skip
-        begin, _ = first_step(Method(tableau, field, project, None, sizes, 0), constants, run)
-        begin = jnp.where(jnp.isnan(numbers.h0), begin, numbers.h0)
-        begin = jnp.minimum(begin, longest)
-    jumps = numbers.stops[:-1]
-    earlier = jnp.nextafter(jumps, jnp.full_like(jumps, -jnp.inf))
-    before = jnp.concatenate([earlier, numbers.stops[-1:]])
-    motion = Motion(attempt, condition, project)
-    out = crossing_loop.locate(motion, what, numbers.t0, numbers.stops, before, numbers.y0, begin)
-    return list(out)
+    attempt, order = in_closed_form, 1
+    if solver is not None:
+        tableau, attempt, order = solver.tableau, by_a_step, solver.tableau.order
+        h0, _ = first_step(Method(tableau, motion, project, None, sizes, 0), constants, run)
+        h0 = jnp.minimum(jnp.where(jnp.isnan(run.h0), h0, run.h0), longest)
+        run = run._replace(h0=h0)
+    moving = Motion(attempt, order, longest, seen, counts, project)
+    return list(crossing_loop.locate(moving, what, run))
+
+
+def _lengths(like: Any, a: Array) -> Array:
+    """The length of the array of a state that each number belongs to."""
+    which = np.repeat(np.arange(len(leaf_sizes(like))), leaf_sizes(like))
+    same = jnp.asarray(which[:, None] == which[None], a.dtype)
+    return jnp.sqrt(jnp.sum(same * (a * a)[None], 1))
+
+
+def _push(like: Any, y: Array) -> Array:
+    """A change of each number by the length of its array, in a direction along no body's axis."""
+    return jnp.asarray(np.cos(1 + np.arange(y.size)), y.dtype) * _lengths(like, y)
+
+
+def _seen(section: Section, constants: Arrays, s: Array, y: Array) -> tuple[Array, ...]:
+    """g, dg/ds, dy/ds, and what g may be by round-off."""
+    of_g = lambda s, y: section.rates(constants, s, y)[0]  # noqa: E731
+    noise = jax.jvp(of_g, (s, y), (s, _push(section.like, y)))[1]
+    blur = _CLEAR * jnp.finfo(y.dtype).eps * jnp.abs(noise)
+    return *section.rates(constants, s, y), blur
+
+
+def _counts(section: Section, constants: Arrays, s: Array, y: Array) -> Array:
+    """Whether g goes through zero faster than by round-off."""
+    rates, like = partial(section.rates, constants, s), section.like
+    _, rate, slope = rates(y)
+    shift = jax.jvp(lambda y: rates(y)[2], (y,), (_push(like, y),))[1]
+    by_s, by_y = jax.jacfwd(lambda s, y: section.rates(constants, s, y)[0], (0, 1))(s, y)
+    sizes = _lengths(like, slope) + _lengths(like, shift)
+    terms = jnp.abs(by_s) + jnp.sum(jnp.abs(by_y) * sizes)
+    return ~(jnp.abs(rate) < _CLEAR * jnp.finfo(y.dtype).eps * terms)
+
+
+def crossings_of(
+    section: Section, what: Search, constants: Arrays, run: Run, longest: Array
+) -> Located:
+    """As `located`; times and states are differentiable in all numbers."""
+    answer = jax.custom_jvp(partial(located, section, what))
+
+    @answer.defjvp
+    def _(primals: Any, tangents: Any) -> Any:
+        found = located(section, what, *primals)
+        again = partial(_corrected, section, what, found)
+        value, moved = jax.jvp(again, primals[:2], tangents[:2])
+        rest = [no_tangent(a) for a in found[2:]]
+        return Located(*value, *found[2:]), Located(*moved, *rest)
+
+    return answer(constants, run, longest)
 
 
 def _corrected(
-    scene: Scene,
-    rules: _Rules,
-    what: Search,
-    constants: Arrays,
-    numbers: Numbers,
-    found: Located,
+    section: Section, what: Search, found: Located, constants: Arrays, run: Run
 ) -> tuple[Array, Array]:
     """The times and states found as functions of all numbers."""
     there = jnp.arange(what.many, dtype=jnp.int32) < found.number
-    last = jnp.max(jnp.where(there, found.times, lax.stop_gradient(numbers.t0)))
+    last = jnp.max(jnp.where(there, found.times, lax.stop_gradient(run.t0)))
     ts = lax.stop_gradient(jnp.where(there, found.times, last))
-    if scene.solver is None:
-        ys = jax.vmap(lambda t: rules.flow(constants, t, numbers.y0))(ts)
+    if section.solver is None:
+        ys = jax.vmap(lambda s: section.motion(constants, s, run.y0))(ts)
     else:
-        ys = _run_again(scene, rules, what, constants, numbers, ts)
-    shift = partial(correction, partial(_rates, rules, constants))
-    times, states = jax.vmap(shift)(ts, ys, there)
-    states = jax.vmap(lambda y: flat(on_the_group(unflat(y, scene.like))))(states)
+        out = adaptive(
+            section.solver,
+            lambda s, y, args: unflat(section.motion(constants, s, flat(y)), section.like),
+            jnp.concatenate([run.t0[None], ts]),
+            unflat(run.y0, section.like),
+            rtol=lax.stop_gradient(run.rtol),
+            atol=lax.stop_gradient(run.atol),
+            dt0=lax.stop_gradient(run.h0),
+            max_steps=what.max_steps,
+            jumps=run.stops[:-1],
+        )
+        ys = jax.vmap(flat)(out.ys)[1:]
+    times, states = jax.vmap(partial(correction, section, constants))(ts, ys, there)
     times, states = (
         value + (a - lax.stop_gradient(a))
         for value, a in ((ts, times), (lax.stop_gradient(found.states), states))
@@ -248,40 +269,18 @@ def _corrected(
     return jnp.where(there, times, jnp.nan), jnp.where(there[:, None], states, jnp.nan)
 
 
-def _run_again(
-    scene: Scene, rules: _Rules, what: Search, constants: Arrays, numbers: Numbers, ts: Array
-) -> Array:
-    def field(t: Array, y: Any, args: Any) -> Any:
-        return unflat(rules.field(constants, t, flat(y)), scene.like)
-
-    solver: Any = scene.solver
-    run = adaptive(
-        solver,
-        field,
-        jnp.concatenate([numbers.t0[None], ts]),
-        unflat(numbers.y0, scene.like),
-        rtol=lax.stop_gradient(numbers.rtol),
-        atol=lax.stop_gradient(numbers.atol),
-        dt0=lax.stop_gradient(numbers.h0),
-        max_steps=what.max_steps,
-        jumps=numbers.stops[:-1],
-    )
-    return jax.vmap(flat)(run.ys)[1:]
-
-
-def correction(rates: Callable[..., Any], t: Array, y: Array, there: Array) -> tuple[Array, Array]:
-    """Time and state (n,) of the crossing near `t`, by Chebyshev's method; as they are if not
-    `there`.
-
-    **Arguments:** `rates(t, y) → (g, dg/dt, dy/dt)`.
-    """
-    g, rate, slope = rates(t, y)
+def correction(
+    section: Section, constants: Arrays, s: Array, y: Array, there: Array
+) -> tuple[Array, Array]:
+    """The crossing near `s`, and the state, by Chebyshev's method; as they are if not `there`."""
+    rates = partial(section.rates, constants)
+    g, rate, slope = rates(s, y)
     # These two meet only the square of what is zero: their derivatives are not wanted.
-    here = lax.stop_gradient((t, y))
-    _, moved = jax.jvp(rates, here, (jnp.ones_like(t), lax.stop_gradient(slope)))
+    here = lax.stop_gradient((s, y))
+    _, moved = jax.jvp(rates, here, (jnp.ones_like(s), lax.stop_gradient(slope)))
     _, second, turn = lax.stop_gradient(moved)
     rate = jnp.where(there, rate, jnp.ones_like(rate))
     newton = -g / rate
     move = jnp.where(there, newton * (1 - 0.5 * newton * second / rate), jnp.zeros_like(newton))
     state = y + slope * move + 0.5 * turn * move * move
-    return t + move.astype(t.dtype), state
+    return s + move.astype(s.dtype), section.project(state)

@@ -1,13 +1,13 @@
 """All crossings of a section: Poincaré sections in one call."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, Generic, TypeVar
 
 import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Float, Int
 
 from rigidjax import _checks
@@ -15,22 +15,17 @@ from rigidjax._types import ScalarLike
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.frames import Point
 from rigidjax.motion import Attitude, Rigid, Spin, on_the_group
-from rigidjax.motion.coupled import Coupled, started
+from rigidjax.motion.coupled import Coupled
 from rigidjax.solve import validation
+from rigidjax.solve.components import unflat
 from rigidjax.solve.crossing_loop import Search
-from rigidjax.solve.crossing_search import search
+from rigidjax.solve.crossing_search import crossings_of, section
 from rigidjax.solve.direction import direction as direction_of
-from rigidjax.solve.events import (
-    Asked,
-    found_by,
-    require_condition,
-    require_direction,
-    require_step,
-)
+from rigidjax.solve.events import Event, ready, value
 from rigidjax.solve.explicit import AbstractExplicit, DormandPrince8
 from rigidjax.solve.linear_map import nan_derivatives
 from rigidjax.solve.run import Free, Loop
-from rigidjax.solve.step_control import Watched
+from rigidjax.solve.step_control import Watched, outcome
 
 State = TypeVar("State", Spin, Attitude, Rigid, Point, Coupled)
 
@@ -119,23 +114,14 @@ def crossings(
     """
     many = _checks.whole(max_crossings, "max_crossings", 1)
     max_steps = _checks.whole(max_steps, "max_steps", 1)
-    _checks.function(condition, "condition", "(t, state, body) → scalar")
+    event = Event(condition, direction, max_step)
     begin, end = _checks.time(t0, "t0"), _checks.time(t1, "t1")
     if _checks.known((begin, end)) and float(begin) == float(end):
         raise ValueError(f"t1: wanted another time than t0, got {float(end):g} for both")
-    times = validation.times(jnp.stack([begin, end]), False)
-    state0 = validation.start(state0, False)
-    dtype = times.dtype
-    for leaf in jax.tree.leaves(state0):
-        dtype = jnp.promote_types(dtype, leaf.dtype)
-    times, state0 = jax.tree.map(lambda leaf: leaf.astype(dtype), (times, state0))
-    validation.require_fit(body, state0, torque)
-    if body is not None:
-        body = validation.real_or_nan(body)
-    asked = Asked(condition, body)
-    state0 = started(body, state0, torque, times[0])
-    require_condition(asked, times[0], state0)
-    step = None if max_step is None else require_step(max_step)
+    body, state0, times = validation.scene(
+        body, state0, jnp.stack([begin, end]), torque, throw=False
+    )
+    state0 = ready(event, body, state0, torque, times[0])
     setup: Free | Loop
     if torque is None and solver is None and body is not None:
         setup = Free(body, False)
@@ -144,21 +130,23 @@ def crossings(
         _checks.instance(
             solver, AbstractExplicit, "solver", wanted="an explicit method of rigidjax.solvers"
         )
-        rtol, atol = validation.tolerances(rtol, atol, dtype)
+        rtol, atol = validation.tolerances(rtol, atol, times.dtype)
         control = Watched(dfx.PIDController(rtol=rtol, atol=atol))  # pyright: ignore
         way = direction_of(times)
         setup = Loop(body, torque, solver, control, None, way, max_steps, False)
-    what = Search(require_direction(direction), many, max_steps)
-    return _solved(setup, asked, step, what, state0, times)
+    return _solved(setup, event, many, max_steps, state0, times)
 
 
 @eqx.filter_jit
 def _solved(
-    setup: Free | Loop, asked: Asked, step: Any, what: Search, state0: Any, ts: Array
+    setup: Free | Loop, event: Event, many: int, max_steps: int, state0: Any, ts: Array
 ) -> Crossings:
     state0 = on_the_group(state0)
-    step = None if step is None else lax.stop_gradient(step)
-    found = found_by(search, setup, asked, step, what, state0, ts)
-    inputs = (asked, getattr(setup, "torque", None), state0, ts)
-    times, states = nan_derivatives((found.times, found.states), inputs)
-    return Crossings(times, states, found.number, found.result, found.steps)
+    condition = lambda t, y: value(event, setup.body, t, y)  # noqa: E731
+    crossed, *numbers = section(setup, condition, event.max_step, state0, ts)
+    found = crossings_of(crossed, Search(event.direction, many, max_steps), *numbers)
+    states = jax.vmap(partial(unflat, like=state0))(found.states)
+    inputs = (event.condition, setup.body, getattr(setup, "torque", None), state0, ts)
+    times, states = nan_derivatives((crossed.time(found.times), states), inputs)
+    result = outcome(found.h, found.t, crossed.time(ts[-1]), found.number >= many)
+    return Crossings(times, states, found.number, result, found.steps)

@@ -26,15 +26,32 @@ def direction(times: Array) -> Int[Array, ""] | None:
     return jnp.asarray(jnp.sign(change), jnp.int32)
 
 
-class Directed(eqx.Module):
-    """A vector field in s = σt: σ f(σs, y), with the sign σ of the direction of time.
+def ahead(
+    sign: Array | None,
+    field: Callable[..., Any],
+    condition: Callable[..., Any] | None,
+    ts: Array,
+    jumps: Array,
+) -> tuple[Callable[..., Any], Callable[..., Any] | None, Array, Array]:
+    """A vector field f(t, y, args), a condition `(t, y)`, times, and those of jumps, in s = σt.
 
-    **Arguments:** `field` f(t, y, args); `sign` σ, 1 or −1.
+    **Arguments:** `sign` σ of the direction of time, 1 or −1, `None` for s = t.
 
-    >>> backwards = Directed(lambda t, y, args: t * y, jnp.asarray(-1))
-    >>> float(backwards(jnp.asarray(-3.0), jnp.asarray(2.0), None))
-    -6.0
+    >>> field, _, ts, _ = ahead(
+    ...     jnp.asarray(-1), lambda t, y, args: t * y, None, jnp.arange(2.0), jnp.zeros(0)
+    ... )
+    >>> float(field(jnp.asarray(-3.0), jnp.asarray(2.0), None)), ts.tolist()
+    (-6.0, [-0.0, -1.0])
     """
+    if sign is None:
+        return field, condition, ts, jumps
+    field = Directed(_BeforeJumps(field, sign) if jumps.size else field, sign)
+    condition = None if condition is None else DirectedCondition(condition, sign)
+    return field, condition, sign.astype(ts.dtype) * ts, sign.astype(jumps.dtype) * jumps
+
+
+class Directed(eqx.Module):
+    """A vector field in s = σt: σ f(σs, y)."""
 
     field: Callable[..., Any]
     sign: Int[Array, ""]
@@ -44,8 +61,8 @@ class Directed(eqx.Module):
         return jax.tree.map(lambda leaf: self.sign.astype(leaf.dtype) * leaf, slope)
 
 
-class DirectedJumps(eqx.Module):
-    """As `Directed`, for fields that jump: a time t means what is before it, on the way back.
+class _BeforeJumps(eqx.Module):
+    """A vector field that jumps: a time t means what is before it, on the way back.
 
     A law has its new value from the jump on. A step back that begins there wants the old one, and
     one that ends there, at the last moment before it in s, the new one.
@@ -54,14 +71,12 @@ class DirectedJumps(eqx.Module):
     field: Callable[..., Any]
     sign: Int[Array, ""]
 
-    def __call__(self, s: Any, y: Any, args: Any = None) -> Any:
-        t = self.sign.astype(s.dtype) * s
+    def __call__(self, t: Any, y: Any, args: Any = None) -> Any:
         # The oldest JAX has no derivative of `nextafter`, not even one to be stopped.
         still = lax.stop_gradient(t)
         before = jnp.nextafter(still, jnp.full_like(still, -jnp.inf))
         shift = jnp.where(self.sign < 0, before - still, jnp.zeros_like(still))
-        slope = self.field(t + shift, y, args)
-        return jax.tree.map(lambda leaf: self.sign.astype(leaf.dtype) * leaf, slope)
+        return self.field(t + shift, y, args)
 
 
 class DirectedCondition(eqx.Module):

@@ -18,7 +18,7 @@ from rigidjax.motion.coupled import started
 from rigidjax.motion.torques.base import jumps_of
 from rigidjax.solve import ending
 from rigidjax.solve.adaptive import adaptive
-from rigidjax.solve.direction import Directed, DirectedCondition, DirectedJumps
+from rigidjax.solve.direction import ahead
 from rigidjax.solve.explicit import AbstractExplicit
 from rigidjax.solve.linear_map import nan_derivatives
 from rigidjax.solve.projection import Projected
@@ -132,11 +132,8 @@ def _loop(setup: Loop, state0: Any, ts: Array) -> tuple[Any, dict[str, Any], dfx
     scene: Any = scene_of(setup.torque) if isinstance(state0, Point) else None
     watch = ending.condition(scene)
     field, jumps = equations_of_motion(setup.body, state0, setup.torque), jumps_of(setup.torque)
-    sign, along = setup.sign, ts
-    if sign is not None:
-        field = DirectedJumps(field, sign) if jumps.size else Directed(field, sign)
-        watch = None if watch is None else DirectedCondition(watch, sign)
-        along, jumps = sign.astype(ts.dtype) * ts, sign.astype(jumps.dtype) * jumps
+    sign = setup.sign
+    field, watch, along, jumps = ahead(sign, field, watch, ts, jumps)
     out = adaptive(
         setup.solver,
         field,

@@ -5,7 +5,6 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import diffrax as dfx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
@@ -13,11 +12,11 @@ from rigidjax import _checks
 from rigidjax._types import ScalarLike
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.frames import AbstractScene, MovingFrame
-from rigidjax.motion.coupled import Coupled, started
+from rigidjax.motion.coupled import Coupled
 from rigidjax.motion.torques.base import jumps_of
 from rigidjax.solve import ending, validation
 from rigidjax.solve.direction import direction
-from rigidjax.solve.events import Asked, Event, require_condition, solve_until
+from rigidjax.solve.events import Event, ready, solve_until
 from rigidjax.solve.explicit import AbstractExplicit, DormandPrince8
 from rigidjax.solve.projection import Projected
 from rigidjax.solve.run import ADJOINT, NO_METER, SOLVER, Free, Loop, Setup, solve
@@ -119,23 +118,15 @@ def simulate(
     True
     """
     max_steps = None if max_steps is None else _checks.whole(max_steps, "max_steps", 1)
-    times = validation.times(ts, throw)
-    state0 = validation.start(state0, throw)
-    dtype = times.dtype
-    for leaf in jax.tree.leaves(state0):
-        dtype = jnp.promote_types(dtype, leaf.dtype)
-    times, state0 = jax.tree.map(lambda leaf: _as(leaf, dtype), (times, state0))
-    validation.require_fit(body, state0, torque)
-    if body is not None:
-        body = body.invertible() if throw else validation.real_or_nan(body)
+    body, state0, times = validation.scene(body, state0, ts, torque, throw)
     controller = stepsize_controller
     if controller is None:
-        rtol, atol = validation.tolerances(rtol, atol, dtype)
+        rtol, atol = validation.tolerances(rtol, atol, times.dtype)
         make: Any = _controller if _checks.known((rtol, atol)) else _watched
         controller = make(rtol, atol)
         if hasattr(torque, "jump_times") and jumps_of(torque).size:
             # An adaptive step passes over a short pulse without seeing it.
-            jump_ts = jnp.sort(jumps_of(torque).astype(dtype))
+            jump_ts = jnp.sort(jumps_of(torque).astype(times.dtype))
             controller = dfx.ClipStepSizeController(controller, jump_ts=jump_ts)
     elif rtol is not None or atol is not None:
         raise ValueError("simulate: give either rtol and atol or a stepsize_controller, not both")
@@ -193,8 +184,7 @@ def _solution(setup: Free | Loop | Setup, state0: Any, times: Array) -> Solution
 
 def _until(event: Any, setup: Free | Loop, state0: Any, times: Array) -> Solution:
     event = event if isinstance(event, Event) else Event(event)
-    state0 = started(setup.body, state0, getattr(setup, "torque", None), times[0])
-    require_condition(Asked(event.condition, setup.body), times[0], state0)
+    state0 = ready(event, setup.body, state0, getattr(setup, "torque", None), times[0])
     try:
         ys, stats, result, time, state = solve_until(setup, event, state0, times)
     except RuntimeError as error:
@@ -225,8 +215,3 @@ def _on_the_group(solver: dfx.AbstractSolver | None) -> dfx.AbstractSolver:
     if isinstance(solver, AbstractExplicit | AbstractSplitting | Projected):
         return solver
     return SOLVER if solver is None else Projected(solver)
-
-
-def _as(leaf: Array, dtype: Any) -> Array:
-    # Outside of `jit` even a conversion to the same dtype costs as much as a step.
-    return leaf if leaf.dtype == dtype else leaf.astype(dtype)

@@ -15,6 +15,9 @@ from rigidjax.solve.record import Method, Run
 # diffrax inherits it from optimistix, where type checkers do not follow.
 NONFINITE: Any = dfx.RESULTS.nonfinite
 
+# The defaults of diffrax.PIDController: the same steps, so that figures can be compared.
+_SAFETY, _SMALLEST, _LARGEST = 0.9, 0.2, 10.0
+
 
 class Watched(dfx.AbstractAdaptiveStepSizeController):
     """Wraps an adaptive step controller so that a run without a way on ends at once.
@@ -111,10 +114,46 @@ def finite(tree: Any) -> Bool[Array, ""]:
 
 
 def error_norm(error: Array, left: Array, right: Array, rtol: Array, atol: Array) -> Array:
-    """Root mean square of error over tolerance, as `diffrax.PIDController` takes it."""
+    """Root mean square of error over tolerance, as `diffrax.PIDController` does; inf for NaN."""
     scale = lift(atol, left) + lift(rtol, left) * jnp.maximum(jnp.abs(left), jnp.abs(right))
     tiny = float(jnp.finfo(error.dtype).tiny)
-    return jnp.sqrt(jnp.mean((error / scale) ** 2, 0) + tiny)
+    norm = jnp.sqrt(jnp.mean((error / scale) ** 2, 0) + tiny)
+    # NaN in a step too long says as little as infinity: try a shorter one.
+    return jnp.where(jnp.isnan(norm), jnp.inf, norm)
+
+
+def controlled(
+    norm: Array, order: int, t: Array, h: Array, kept: Array, last: Array, length: Array
+) -> tuple[Array, Array]:
+    """Whether a step is accepted, and the next one: 0 where none is left to try, NaN after a NaN.
+
+    **Arguments:** `norm` of the error over the tolerance, as of `error_norm`; `t` and `h` of the
+    step, `last` whether it was cut short at a stop, `kept` what the controller had wanted there;
+    `length` of the run, whose round-off counts where that of `t` vanishes.
+    """
+    norm, h, kept = lax.stop_gradient((norm, h, kept))
+    good = norm < 1
+    factor = jnp.clip(_SAFETY * norm ** (-1 / order), _SMALLEST, _LARGEST)
+    following = h * factor.astype(h.dtype)
+    eps = jnp.finfo(h.dtype).eps
+    unit = 8 * eps * jnp.maximum(jnp.abs(t), eps * length)
+    why = jnp.where(jnp.isfinite(norm), 0.0, jnp.nan).astype(h.dtype)
+    shorter = jnp.where(following > unit, following, why)
+    longer = jnp.where(last, jnp.maximum(following, kept), following)
+    return good, jnp.where(good, longer, shorter)
+
+
+def outcome(h: Array, t: Array, end: Array, met: Array) -> dfx.RESULTS:
+    """How a run ended: its next step and time, the last time, whether it met what ends it."""
+    result = dfx.RESULTS.dt_min_reached
+    for there, word in (
+        (jnp.isnan(h), NONFINITE),
+        (h > 0, dfx.RESULTS.max_steps_reached),
+        (t >= end, dfx.RESULTS.successful),
+        (met, dfx.RESULTS.event_occurred),
+    ):
+        result = dfx.RESULTS.where(there, word, result)
+    return result
 
 
 def first_step(method: Method, constants: list[Array], run: Run) -> tuple[Array, Array]:

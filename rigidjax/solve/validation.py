@@ -19,6 +19,25 @@ from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.torques.base import require_rung
 
 
+def scene(body: Any, state0: Any, ts: Any, torque: Any, throw: bool) -> tuple[Any, Any, Array]:
+    """Body, start and times of a run, of one dtype, or an error; with `throw=False` what is traced
+    and cannot be is NaN.
+    """
+    ts = times(ts, throw)
+    state0 = start(state0, throw)
+    dtype = ts.dtype
+    for leaf in jax.tree.leaves(state0):
+        dtype = jnp.promote_types(dtype, leaf.dtype)
+    # Outside of `jit` even a conversion to the same dtype costs as much as a step.
+    ts, state0 = jax.tree.map(
+        lambda leaf: leaf if leaf.dtype == dtype else leaf.astype(dtype), (ts, state0)
+    )
+    require_fit(body, state0, torque)
+    if body is not None:
+        body = body.invertible() if throw else real_or_nan(body)
+    return body, state0, ts
+
+
 def require_fit(body: Any, state0: Any, torque: Any) -> None:
     """Raise `TypeError` unless body, state and torque fit."""
     if isinstance(state0, Point) and body is not None:
