@@ -17,7 +17,7 @@ from rigidjax.solve.adjoint import Outputs
 from rigidjax.solve.batching import Arrays, Layout, in_lanes
 from rigidjax.solve.components import flat, leaf_sizes, unflat
 from rigidjax.solve.explicit import AbstractExplicit
-from rigidjax.solve.linear_map import linear_map, no_tangent, without_transpose
+from rigidjax.solve.linear_map import linear_map, no_tangent, refuse
 from rigidjax.solve.record import HALTED, Answer, Method, Record, Run
 from rigidjax.solve.step_control import outcome
 from rigidjax.solve.tableaus import Tableau
@@ -180,7 +180,7 @@ def taken_out(function: Callable[..., Any], *like: Any) -> tuple[Callable[..., A
 
 
 def _solved(program: _Program, constants: Arrays, run: Run) -> Answer:
-    number, outputs = len(constants), len(Outputs._fields)
+    number, ends = len(constants), len(Outputs._fields)
 
     def mapped(kind: Any, linear: int, *args: Any) -> Arrays:
         return in_lanes(partial(kind, program), list(args[:number]), list(args[number:]), linear)
@@ -189,20 +189,40 @@ def _solved(program: _Program, constants: Arrays, run: Run) -> Answer:
     def answer(*args: Any) -> Arrays:
         return mapped(_value, 0, *args)
 
-    def rule(primals: Any, tangents: Any) -> Any:
+    @jax.custom_jvp
+    def recorded(*args: Any) -> Arrays:
+        return mapped(_recorded, 0, *args)
+
+    def tangents_of(primals: Any, tangents: Any, pull: Any = None) -> tuple[Arrays, Arrays]:
+        """What `recorded` gives, and the tangents of its states; transposed by `pull`."""
         # A number without a tangent is none that derivatives have to be taken by.
         there = [not isinstance(t, SymbolicZero) for t in tangents]
         smooth = tuple(s and t for s, t in zip(program.smooth, there[:number], strict=True))
         moving = _Moving(smooth, tuple(there[number:]))
         along = [t for t, m in zip(tangents, (*smooth, *moving.run), strict=True) if m]
-        found = without_transpose(mapped(_recorded, 0, *primals))
-        out, record = found[: len(Answer._fields)], found[len(Answer._fields) :]
+        found = recorded(*primals)
+        given = [*primals, *found[len(Answer._fields) :]]
         push = partial(mapped, partial(_pushed, moving), len(along))
-        pull = partial(mapped, partial(_pulled, moving), outputs)
-        ends = linear_map(push, pull, [*primals, *record], along)
-        return out, [*ends, *[no_tangent(a) for a in out[outputs:]]]
+        if pull is None:
+            return found, linear_map(push, refuse, given, along)
+        back = partial(mapped, partial(pull, moving), ends)
+        return found, linear_map(lambda *args: push(*args)[:ends], back, given, along)
 
-    answer.defjvp(rule, symbolic_zeros=True)
+    def of_answer(primals: Any, tangents: Any) -> Any:
+        found, moved = tangents_of(primals, tangents, _pulled)
+        out = found[: len(Answer._fields)]
+        return out, [*moved, *(no_tangent(a) for a in out[ends:])]
+
+    def of_record(primals: Any, tangents: Any) -> Any:
+        found, moved = tangents_of(primals, tangents)
+        rest = [no_tangent(a) for a in found]
+        between, end, starts, rows = moved
+        head = len(Answer._fields)
+        record = Record(*rest[head:])._replace(starts=starts, rows=rows)
+        return found, [between, end, *rest[ends:head], *record]
+
+    answer.defjvp(of_answer, symbolic_zeros=True)
+    recorded.defjvp(of_record, symbolic_zeros=True)
     return Answer(*answer(*constants, *run))
 
 
@@ -252,7 +272,7 @@ def _pushed(
     still = zip(run, moving.run, strict=True)
     of_run = Run(*(next(rest) if moves else jnp.zeros_like(a) for a, moves in still))
 
-    def again(chosen: Arrays, run: Run) -> Outputs:
+    def again(chosen: Arrays, run: Run) -> tuple[Array, ...]:
         return adjoint.replayed(method, chosen, run, record)
 
     return list(jax.jvp(again, (chosen, run), (along[: len(chosen)], of_run))[1])

@@ -7,7 +7,7 @@ otherwise, such a segment may take other steps between the same two ends: then t
 that of those, the same to the tolerance.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -28,30 +28,41 @@ class Outputs(NamedTuple):
     end: Array
 
 
-def replayed(method: Method, constants: list[Array], run: Run, record: Record) -> Outputs:
-    """The states by the steps of the record, which are held: its tangents are those of the run."""
+def replayed(
+    method: Method, constants: list[Array], run: Run, record: Record
+) -> tuple[Array, Array, Array, Array]:
+    """The states between and at the end, the starts and the rows by the steps of the record.
 
-    def one(i: Array, both: tuple[Array, Array]) -> tuple[Array, Array]:
-        y, ys = both
-        part = _again(method, constants, run, record, i)
+    These are held: so the tangents of all four are those of the run.
+    """
+    head = record.starts.shape[1] - run.y0.shape[0]
+
+    def one(i: Array, state: tuple[Array, Array, Array, Array]) -> Any:
+        y, ys, starts, _ = state
+        part = _again(method, *still, held, i)
+        starts = lax.dynamic_update_index_in_dim(starts, starts[i].at[head:].set(y), i, 0)
 
         def step(k: Array, both: tuple[Array, Array]) -> tuple[Array, Array]:
-            y, path = both
+            y, rows = both
             row = part.rows[k]
             there = runge_kutta.stages(
                 method.tableau, method.field, constants, Step(*times_of(run, row), y)
             )
-            path = lax.dynamic_update_index_in_dim(path, y, k, 0)
-            return jnp.where(lift(row[2] >= STEP, y), method.project(there.end), y), path
+            rows = lax.dynamic_update_index_in_dim(rows, row.at[HEAD:].set(y), k, 0)
+            return jnp.where(lift(row[2] >= STEP, y), method.project(there.end), y), rows
 
-        y, path = lax.fori_loop(0, part.count, step, (y, jnp.zeros_like(part.rows[:, HEAD:])))
+        y, rows = lax.fori_loop(0, part.count, step, (y, part.rows))
         if run.between.shape[0]:
-            ys = dense_output.saved(method, constants, run, part, path, ys)
-        return y, ys
+            ys = dense_output.saved(method, constants, run, part, rows[:, HEAD:], ys)
+        return y, ys, starts, rows
 
+    still, held = lax.stop_gradient(((constants, run), record))
+    number = jnp.max(held.number)
     ys = jnp.zeros((dense_output.room(run), *run.y0.shape), run.y0.dtype)
-    y, ys = lax.fori_loop(0, jnp.max(record.number), one, (run.y0, ys))
-    return Outputs(ys[: run.between.shape[0]], y)
+    state = (run.y0, ys, held.starts, held.rows)
+    y, ys, starts, rows = lax.fori_loop(0, number, one, state)
+    starts = lax.dynamic_update_index_in_dim(starts, starts[number].at[head:].set(y), number, 0)
+    return ys[: run.between.shape[0]], y, starts, rows
 
 
 class Sums(NamedTuple):

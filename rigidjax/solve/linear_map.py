@@ -42,22 +42,6 @@ def linear_map(function: Map, transposed: Map, given: Arrays, tangents: Arrays) 
     )
 
 
-def without_transpose(numbers: Arrays) -> Arrays:
-    """The same numbers; reverse mode through their tangents is refused in words."""
-
-    @jax.custom_jvp
-    def same(*numbers: Any) -> Arrays:
-        return list(numbers)
-
-    @same.defjvp
-    def _(primals: Any, tangents: Any) -> Any:
-        moved = [t for t, p in zip(tangents, primals, strict=True) if _is_smooth(p)]
-        moved = iter(linear_map(lambda *along: list(along), _refuse, [], moved))
-        return list(primals), [next(moved) if _is_smooth(p) else no_tangent(p) for p in primals]
-
-    return same(*numbers)
-
-
 def nan_derivatives(tree: Any, inputs: Any) -> Any:
     """The same numbers; one that is not finite has NaN derivatives by `inputs`, in both modes.
 
@@ -158,7 +142,7 @@ def _differentiated(primals: Any, tangents: Any, **params: Any) -> Any:
 
         along_ = along
         moved = [t for t, w in zip(tangents[:number], which, strict=True) if w]
-        add(linear_map(push, _refuse, [*given, *along], moved))
+        add(linear_map(push, refuse, [*given, *along], moved))
     return out, [
         _ZERO.from_primal_value(o) if t is None else t for o, t in zip(out, total, strict=True)
     ]
@@ -171,7 +155,8 @@ def _filled_zero(primals: Any, which: Any, tangents: Any) -> list[Any]:
     return out
 
 
-def _refuse(*_: Any) -> Arrays:
+def refuse(*_: Any) -> Arrays:
+    """The transpose of what has none."""
     raise TypeError(
         "second derivatives through a solver are forward over reverse: wanted "
         "jax.jacfwd(jax.grad(f)) or jax.hessian(f), got reverse mode over a derivative, such as "
@@ -183,7 +168,7 @@ def _transposed(cotangents: Any, *args: Any, **params: Any) -> Any:
     number = params["number"]
     given = args[:number]
     if any(ad.is_undefined_primal(g) for g in given):
-        _refuse()
+        refuse()
     whole = [
         jnp.zeros(*result) if isinstance(c, ad.Zero) else c
         for c, result in zip(cotangents, params["results"], strict=True)
