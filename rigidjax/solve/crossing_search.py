@@ -9,10 +9,10 @@ motion give the time and the state by one step of Chebyshev's method,
 τ is zero but for the error of dense output, and its first and second derivatives are those of the
 crossing (the error is of third order in what moves). At a touch, ġ = 0, there is none.
 
-A zero of round-off, of what the motion conserves or of a component that stays at zero, is none: ġ
-is then less than what round-off makes of it, which is ε Σ |∂g/∂yᵢ| times the size of the terms of
-ẏᵢ. This is the size of the array of the state that i belongs to, of ẏ itself and of its change
-where each y changes by the size of its own array.
+A zero of round-off, of what the motion conserves or of a component that stays at zero, is none. Its
+ġ is not more than round-off makes of it, which is some ε (|∂g/∂t| + Σ |∂g/∂yᵢ| rᵢ), times the root
+of the number of steps. The size rᵢ of the terms of ẏᵢ is the length of the array of the state that
+i belongs to, taken of ẏ and of the change of ẏ where each y changes by the length of its array.
 """
 
 from collections.abc import Callable
@@ -43,8 +43,8 @@ from rigidjax.solve.vector_field import equations_of_motion
 
 # Samples of a free body's condition in one turn at its largest rate.
 _SAMPLES = 16
-# How many times its round-off the slope of a crossing is.
-_CLEAR = 32
+# How many times its round-off the slope of a crossing is at least.
+_CLEAR = 16
 
 
 class Section(NamedTuple):
@@ -170,7 +170,12 @@ def _located(
         over = lambda f: jax.vmap(f, (shared, -1, -1), -1)  # noqa: E731
         project = jax.vmap(project, -1, -1)
     motion = over(section.motion)
-    seen, counts = (partial(over(partial(f, section)), constants) for f in (_seen, _counts))
+    seen, clear = (partial(over(partial(f, section)), constants) for f in (_seen, _clear))
+
+    def counts(s: Array, y: Array, steps: Array) -> Array:
+        # The round-off of steps adds up as a random walk does.
+        many = 1 if solver is None else jnp.sqrt(1 + steps.astype(y.dtype))
+        return ~(clear(s, y) < _CLEAR * many)
 
     def in_closed_form(step: Step) -> tuple[Array, Array]:
         return motion(constants, step.end, step.y), jnp.zeros_like(run.rtol)
@@ -211,15 +216,15 @@ def _seen(section: Section, constants: Arrays, s: Array, y: Array) -> tuple[Arra
     return *section.rates(constants, s, y), blur
 
 
-def _counts(section: Section, constants: Arrays, s: Array, y: Array) -> Array:
-    """Whether g goes through zero faster than by round-off."""
+def _clear(section: Section, constants: Arrays, s: Array, y: Array) -> Array:
+    """How many times faster g goes through zero than by round-off."""
     rates, like = partial(section.rates, constants, s), section.like
     _, rate, slope = rates(y)
     shift = jax.jvp(lambda y: rates(y)[2], (y,), (_push(like, y),))[1]
     by_s, by_y = jax.jacfwd(lambda s, y: section.rates(constants, s, y)[0], (0, 1))(s, y)
     sizes = _lengths(like, slope) + _lengths(like, shift)
     terms = jnp.abs(by_s) + jnp.sum(jnp.abs(by_y) * sizes)
-    return ~(jnp.abs(rate) < _CLEAR * jnp.finfo(y.dtype).eps * terms)
+    return jnp.abs(rate) / (jnp.finfo(y.dtype).eps * terms)
 
 
 def crossings_of(

@@ -36,7 +36,8 @@ class Event(eqx.Module):
       the end of a step, or has one extremum within it; a condition that is much faster than the
       motion needs shorter steps.
 
-    A start at a zero does not count, nor a condition that is zero all along.
+    A start at a zero does not count, nor a condition that is zero all along, also if that is so but
+    for round-off (see `crossings`).
 
     **Raises:** `TypeError`, `ValueError` for what is no function, another direction, a step that is
     not positive.
