@@ -145,8 +145,8 @@ def _solved(
 ) -> Crossings:
     state0 = on_the_group(state0)
     condition = lambda t, y: value(event, setup.body, t, y)  # noqa: E731
-    crossed, *numbers = section(setup, condition, event.max_step, state0, ts)
-    found = crossings_of(crossed, Search(event.direction, many, max_steps), *numbers)
+    crossed, numbers = section(setup, condition, event.max_step, state0, ts)
+    found = crossings_of(crossed, Search(event.direction, many, max_steps), numbers)
     states = jax.vmap(partial(unflat, like=state0))(found.states)
     inputs = (event.condition, setup.body, getattr(setup, "torque", None), state0, ts)
     times, states = nan_derivatives((crossed.time(found.times), states), inputs)
