@@ -33,14 +33,14 @@ class Motion(NamedTuple):
 
     **Fields:** `attempt(step) → (y, norm)` the state a step later, its error over the tolerance;
     `order` of the method; `longest` step; `condition(t, y) → (g, dg/dt, dy/dt, round-off of g)`;
-    `counts(t, y)` whether a zero is one of the motion, not of its round-off; `project`.
+    `counts(t, y, steps)` whether a zero is one of the motion, not of its round-off; `project`.
     """
 
     attempt: Callable[[Step], tuple[Array, Array]]
     order: int
     longest: Array
     condition: Callable[[Array, Array], tuple[Array, ...]]
-    counts: Callable[[Array, Array], Array]
+    counts: Callable[[Array, Array, Array], Array]
     project: Callable[[Array], Array]
 
 
@@ -120,7 +120,7 @@ def locate(motion: Motion, search: Search, run: Run) -> Located:
 
     def next_zero(body: _Body) -> _Body:
         body = lax.while_loop(on, partial(_pass, motion, search, run), body)
-        return body._replace(found=body.found & motion.counts(body.t, body.y))
+        return body._replace(found=body.found & motion.counts(body.t, body.y, body.steps))
 
     def row(state: Any) -> Any:
         body, times, states, k, count = state

@@ -9,10 +9,10 @@ motion give the time and the state by one step of Chebyshev's method,
 τ is zero but for the error of dense output, and its first and second derivatives are those of the
 crossing (the error is of third order in what moves). At a touch, ġ = 0, there is none.
 
-A zero of round-off, of what the motion conserves or of a component that stays at zero, is none: ġ
-is then less than what round-off makes of it, which is ε Σ |∂g/∂yᵢ| times the size of the terms of
-ẏᵢ. This is the size of the array of the state that i belongs to, of ẏ itself and of its change
-where each y changes by the size of its own array.
+A zero of round-off, of what the motion conserves or of a component that stays at zero, is none. Its
+ġ is not more than round-off makes of it, which is some ε (|∂g/∂t| + Σ |∂g/∂yᵢ| rᵢ), times the root
+of the number of steps. The size rᵢ of the terms of ẏᵢ is the length of the array of the state that
+i belongs to, taken of ẏ and of the change of ẏ where each y changes by the length of its array.
 """
 
 from collections.abc import Callable
@@ -44,8 +44,8 @@ from rigidjax.solve.vector_field import equations_of_motion
 
 # Samples of a free body's condition in one turn at its largest rate.
 _SAMPLES = 16
-# How many times its round-off the slope of a crossing is.
-_CLEAR = 32
+# How many times its round-off the slope of a crossing is at least.
+_CLEAR = 16
 
 
 class Section(NamedTuple):
@@ -70,12 +70,14 @@ class Section(NamedTuple):
         return self.sign.astype(s.dtype) * s
 
 
+# The constants of a section's functions, the run, its longest step.
+Numbers = tuple[Arrays, Run, Array]
+
+
 def section(
     setup: Free | Loop, condition: Callable[..., Any], max_step: Any, state0: Any, ts: Array
-) -> tuple[Section, Arrays, Run, Array]:
-    """The section `condition(t, y)` = 0 between `ts[0]` and `ts[-1]`; the numbers that it is made
-    of; the run; its longest step.
-    """
+) -> tuple[Section, Numbers]:
+    """The section `condition(t, y)` = 0 between `ts[0]` and `ts[-1]`, and what it is made of."""
     y0, dtype = flat(state0), ts.dtype
     sign = way = jnp.sign(ts[-1] - ts[0]).astype(jnp.int32)
     jumps, torque = jnp.zeros(0, dtype), None
@@ -108,33 +110,30 @@ def section(
         solver, motion = None, _free_motion(setup.body, state0, ts[0], sign)
         longest = jnp.minimum(longest, _spacing(setup.body, state0, whole))
         rtol, atol, h0 = jnp.zeros((), y0.dtype), jnp.zeros((), y0.dtype), longest
-    motion, constants = taken_out(motion, along[0], y0)
-    rates, more = taken_out(rates, along[0], y0)
-    count, of_motion, of_rates = len(constants), motion, rates
+    of_motion, constants = taken_out(motion, along[0], y0)
+    of_rates, more = taken_out(rates, along[0], y0)
+    count = len(constants)
     stops = jnp.concatenate([jnp.clip(jnp.sort(jumps), along[0], along[1]), along[1:]])
-    return (
-        Section(
-            solver,
-            lambda constants, s, y: of_motion(constants[:count], s, y),
-            lambda constants, s, y: of_rates(constants[count:], s, y),
-            state0,
-            sign,
-        ),
-        [*constants, *more],
-        Run(along[0], stops, stops[:0], y0, rtol, atol, h0),
-        longest,
+    crossed = Section(
+        solver,
+        lambda constants, s, y: of_motion(constants[:count], s, y),
+        lambda constants, s, y: of_rates(constants[count:], s, y),
+        state0,
+        sign,
     )
+    run = Run(along[0], stops, stops[:0], y0, rtol, atol, h0)
+    return crossed, ([*constants, *more], run, longest)
 
 
 def _free_motion(body: Any, state0: Any, t0: Array, sign: Array) -> Callable[..., Array]:
     """A free body at s = σt, whatever the state is."""
     rigid = isinstance(state0, Rigid)
-    turning = Attitude(state0.q, state0.omega) if rigid else state0
-    turning = FreeBody(body if isinstance(body, Inertia) else body.inertia, turning)
+    turning: Any = Attitude(state0.q, state0.omega) if rigid else state0
+    free = FreeBody(body if isinstance(body, Inertia) else body.inertia, turning)
 
     def motion(s: Array, y: Array) -> Array:
         since = sign.astype(s.dtype) * s - t0
-        state: Any = turning(since)
+        state: Any = free(since)
         return flat((state0.x + since * state0.v, state0.v, state) if rigid else state)
 
     return motion
@@ -152,11 +151,11 @@ def _spacing(body: Any, state0: Any, whole: Array) -> Array:
     return jnp.where(rate * whole > 1, 2 * np.pi / (_SAMPLES * rate), whole / _SAMPLES)
 
 
-def located(section: Section, what: Search, constants: Arrays, run: Run, longest: Array) -> Located:
+def located(section: Section, what: Search, numbers: Numbers) -> Located:
     """The first crossings on the way through `run.stops`, without derivatives."""
-    constants, each = lax.stop_gradient((constants, [*run, longest]))
+    constants, run, longest = lax.stop_gradient(numbers)
     program = partial(_located, section, what)
-    return Located(*in_lanes(program, constants, each))
+    return Located(*in_lanes(program, constants, [*run, longest]))
 
 
 def _located(
@@ -170,7 +169,12 @@ def _located(
         over = lambda f: jax.vmap(f, (shared, -1, -1), -1)  # noqa: E731
         project = jax.vmap(project, -1, -1)
     motion = over(section.motion)
-    seen, counts = (partial(over(partial(f, section)), constants) for f in (_seen, _counts))
+    seen, clear = (partial(over(partial(f, section)), constants) for f in (_seen, _clear))
+
+    def counts(s: Array, y: Array, steps: Array) -> Array:
+        # The round-off of steps adds up as a random walk does.
+        many = 1 if solver is None else jnp.sqrt(1 + steps.astype(y.dtype))
+        return ~(clear(s, y) < _CLEAR * many)
 
     def in_closed_form(step: Step) -> tuple[Array, Array]:
         return motion(constants, step.end, step.y), jnp.zeros_like(run.rtol)
@@ -211,38 +215,37 @@ def _seen(section: Section, constants: Arrays, s: Array, y: Array) -> tuple[Arra
     return *section.rates(constants, s, y), blur
 
 
-def _counts(section: Section, constants: Arrays, s: Array, y: Array) -> Array:
-    """Whether g goes through zero faster than by round-off."""
+def _clear(section: Section, constants: Arrays, s: Array, y: Array) -> Array:
+    """How many times faster g goes through zero than by round-off."""
     rates, like = partial(section.rates, constants, s), section.like
     _, rate, slope = rates(y)
     shift = jax.jvp(lambda y: rates(y)[2], (y,), (_push(like, y),))[1]
     by_s, by_y = jax.jacfwd(lambda s, y: section.rates(constants, s, y)[0], (0, 1))(s, y)
     sizes = _lengths(like, slope) + _lengths(like, shift)
     terms = jnp.abs(by_s) + jnp.sum(jnp.abs(by_y) * sizes)
-    return ~(jnp.abs(rate) < _CLEAR * jnp.finfo(y.dtype).eps * terms)
+    return jnp.abs(rate) / (jnp.finfo(y.dtype).eps * terms)
 
 
-def crossings_of(
-    section: Section, what: Search, constants: Arrays, run: Run, longest: Array
-) -> Located:
+def crossings_of(section: Section, what: Search, numbers: Numbers) -> Located:
     """As `located`; times and states are differentiable in all numbers."""
-    answer = jax.custom_jvp(partial(located, section, what))
+    answer: Any = jax.custom_jvp(partial(located, section, what))
 
     @answer.defjvp
     def _(primals: Any, tangents: Any) -> Any:
         found = located(section, what, *primals)
         again = partial(_corrected, section, what, found)
-        value, moved = jax.jvp(again, primals[:2], tangents[:2])
+        value, moved = jax.jvp(again, primals, tangents)
         rest = [no_tangent(a) for a in found[2:]]
-        return Located(*value, *found[2:]), Located(*moved, *rest)
+        return Located(*value, *found[2:]), Located(*moved, *rest)  # pyright: ignore
 
-    return answer(constants, run, longest)
+    return answer(numbers)
 
 
 def _corrected(
-    section: Section, what: Search, found: Located, constants: Arrays, run: Run
+    section: Section, what: Search, found: Located, numbers: Numbers
 ) -> tuple[Array, Array]:
     """The times and states found as functions of all numbers."""
+    constants, run, _ = numbers
     there = jnp.arange(what.many, dtype=jnp.int32) < found.number
     last = jnp.max(jnp.where(there, found.times, lax.stop_gradient(run.t0)))
     ts = lax.stop_gradient(jnp.where(there, found.times, last))

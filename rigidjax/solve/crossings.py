@@ -92,8 +92,10 @@ def crossings(
       as accurate as a step, that of a free body to round-off.
     - `max_steps`: parts of steps included.
 
-    A start on the section does not count, a condition that is zero all along has no crossing, and a
-    tangential contact may be missed. Many bodies:
+    A start on the section does not count, and a tangential contact may be missed. A condition that
+    is zero all along has no crossing, nor has one that is so but for round-off, such as an energy
+    minus its value: a zero counts where the condition goes through it 16 times as fast as round-off
+    could make it (in closed form; else times the root of the number of steps). Many bodies:
     `jax.vmap(lambda start: rj.crossings(body, start, …))`.
 
     **Returns** `Crossings`. Times and states have first and second derivatives with respect to all
@@ -143,8 +145,8 @@ def _solved(
 ) -> Crossings:
     state0 = on_the_group(state0)
     condition = lambda t, y: value(event, setup.body, t, y)  # noqa: E731
-    crossed, *numbers = section(setup, condition, event.max_step, state0, ts)
-    found = crossings_of(crossed, Search(event.direction, many, max_steps), *numbers)
+    crossed, numbers = section(setup, condition, event.max_step, state0, ts)
+    found = crossings_of(crossed, Search(event.direction, many, max_steps), numbers)
     states = jax.vmap(partial(unflat, like=state0))(found.states)
     inputs = (event.condition, setup.body, getattr(setup, "torque", None), state0, ts)
     times, states = nan_derivatives((crossed.time(found.times), states), inputs)

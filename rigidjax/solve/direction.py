@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
@@ -32,7 +31,7 @@ def ahead(
     condition: Callable[..., Any] | None,
     ts: Array,
     jumps: Array,
-) -> tuple[Callable[..., Any], Callable[..., Any] | None, Array, Array]:
+) -> tuple[Callable[..., Any], Any, Array, Array]:
     """A vector field f(t, y, args), a condition `(t, y)`, times, and those of jumps, in s = σt.
 
     **Arguments:** `sign` σ of the direction of time, 1 or −1, `None` for s = t.
@@ -45,45 +44,21 @@ def ahead(
     """
     if sign is None:
         return field, condition, ts, jumps
-    field = Directed(_BeforeJumps(field, sign) if jumps.size else field, sign)
-    condition = None if condition is None else DirectedCondition(condition, sign)
-    return field, condition, sign.astype(ts.dtype) * ts, sign.astype(jumps.dtype) * jumps
 
+    def time(s: Array) -> Array:
+        return sign.astype(s.dtype) * s
 
-class Directed(eqx.Module):
-    """A vector field in s = σt: σ f(σs, y)."""
+    def directed(s: Array, y: Any, args: Any = None) -> Any:
+        t = time(s)
+        if jumps.size:
+            # A law has its new value from the jump on. A step back that begins there wants the old
+            # one, and one that ends there, at the last moment before it in s, the new one.
+            # The oldest JAX has no derivative of `nextafter`, not even one to be stopped.
+            still = lax.stop_gradient(t)
+            before = jnp.nextafter(still, jnp.full_like(still, -jnp.inf))
+            t = t + jnp.where(sign < 0, before - still, jnp.zeros_like(still))
+        slope = field(t, y, args)
+        return jax.tree.map(lambda leaf: sign.astype(leaf.dtype) * leaf, slope)
 
-    field: Callable[..., Any]
-    sign: Int[Array, ""]
-
-    def __call__(self, s: Any, y: Any, args: Any = None) -> Any:
-        slope = self.field(self.sign.astype(s.dtype) * s, y, args)
-        return jax.tree.map(lambda leaf: self.sign.astype(leaf.dtype) * leaf, slope)
-
-
-class _BeforeJumps(eqx.Module):
-    """A vector field that jumps: a time t means what is before it, on the way back.
-
-    A law has its new value from the jump on. A step back that begins there wants the old one, and
-    one that ends there, at the last moment before it in s, the new one.
-    """
-
-    field: Callable[..., Any]
-    sign: Int[Array, ""]
-
-    def __call__(self, t: Any, y: Any, args: Any = None) -> Any:
-        # The oldest JAX has no derivative of `nextafter`, not even one to be stopped.
-        still = lax.stop_gradient(t)
-        before = jnp.nextafter(still, jnp.full_like(still, -jnp.inf))
-        shift = jnp.where(self.sign < 0, before - still, jnp.zeros_like(still))
-        return self.field(t + shift, y, args)
-
-
-class DirectedCondition(eqx.Module):
-    """A condition `(t, y)` on states, asked at s = σt."""
-
-    condition: Callable[..., Any]
-    sign: Int[Array, ""]
-
-    def __call__(self, s: Any, y: Any) -> Any:
-        return self.condition(self.sign.astype(s.dtype) * s, y)
+    asked = None if condition is None else lambda s, y: condition(time(s), y)
+    return directed, asked, time(ts), time(jumps)

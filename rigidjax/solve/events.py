@@ -36,7 +36,8 @@ class Event(eqx.Module):
       the end of a step, or has one extremum within it; a condition that is much faster than the
       motion needs shorter steps.
 
-    A start at a zero does not count, nor a condition that is zero all along.
+    A start at a zero does not count, nor a condition that is zero all along, also if that is so but
+    for round-off (see `crossings`).
 
     **Raises:** `TypeError`, `ValueError` for what is no function, another direction, a step that is
     not positive.
@@ -122,16 +123,16 @@ def solve_until(
     """
     state0 = on_the_group(state0)
     condition = lambda t, y: value(event, setup.body, t, y)  # noqa: E731
-    crossed, constants, run, longest = section(setup, condition, event.max_step, state0, ts)
+    crossed, numbers = section(setup, condition, event.max_step, state0, ts)
     steps = setup.max_steps if isinstance(setup, Loop) else 1_000_000
-    found = located(crossed, Search(event.direction, 1, steps), constants, run, longest)
+    found = located(crossed, Search(event.direction, 1, steps), numbers)
     met, last = found.number > 0, lax.stop_gradient(ts[-1])
     end = jnp.where(met, crossed.time(found.times[0]), last)
     before = ~(crossed.time(ts) > crossed.time(end))
     short = jnp.concatenate([jnp.where(before, ts, end), jnp.where(met, end, ts[-1])[None]])
     ys, stats, result = solve(setup, state0, short)
     y = flat(jax.tree.map(lambda leaf: leaf[-1], ys))
-    s, y = correction(crossed, constants, crossed.time(end), y, met)
+    s, y = correction(crossed, numbers[0], crossed.time(end), y, met)
     met = met & (result == dfx.RESULTS.successful)
 
     def rows(leaf: Array) -> Array:

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from once import once
 
 import rigidjax as rj
 from rigidjax import shapes, torques
@@ -144,6 +145,64 @@ def test_a_condition_that_is_zero_all_along_is_never_met(torque):
     later = lambda t, state, body: jnp.where(t < 2.0, 0.0, (t - 2.0) * (4.0 - t))
     found = rj.crossings(BODY, start, 0.0, 10.0, later, torque, max_crossings=5, max_step=0.5)
     np.testing.assert_allclose(found.times[: int(found.count)], [4.0], rtol=1e-12)
+
+
+class Nothing(torques.AbstractTorque):
+    """A torque of zero: the free motion, but through a solver."""
+
+    feels = rj.motion.HasSpin
+
+    def __call__(self, t, state, body):
+        return jnp.zeros_like(state.omega)
+
+
+def numbers_of(state, tensor, axis, across):
+    """Energy, |L|², |q|², rates along two axes, where one points, L, Ω."""
+    momentum = rj.quaternion.rotate(state.q, tensor @ state.omega)
+    energy = 0.5 * jnp.sum(state.omega * (tensor @ state.omega))
+    points = rj.quaternion.rotate(state.q, across) @ axis
+    squares = [jnp.sum(momentum**2), jnp.sum(state.q**2)]
+    first = jnp.stack([energy, *squares, state.omega @ axis, state.omega @ across, points])
+    return jnp.concatenate([first, momentum, state.omega])
+
+
+@pytest.mark.parametrize("dtype", [jnp.float64, pytest.param(jnp.float32, marks=pytest.mark.long)])
+@pytest.mark.parametrize(
+    "torque", [pytest.param(None, marks=pytest.mark.long), Nothing()], ids=["free", "forced"]
+)
+def test_a_condition_that_is_zero_but_for_round_off_is_never_met(torque, dtype):
+    def count(weights, tensor, omega, axis, across, level):
+        start = rj.Attitude(jnp.eye(4, dtype=dtype)[0], omega)
+        first = numbers_of(start, tensor, axis, across)
+
+        def condition(t, state, body):
+            return weights @ (numbers_of(state, tensor, axis, across) - first) + level
+
+        body = rj.Inertia(tensor)
+        ends = jnp.asarray(0.0, dtype), jnp.asarray(60.0, dtype)
+        return rj.crossings(body, start, *ends, condition, torque, max_crossings=20).count
+
+    rng, cases = np.random.default_rng(1), []
+    turned = [np.linalg.qr(rng.normal(size=(3, 3)))[0] for _ in range(3)]
+    tensors = [
+        axes @ np.diag(moments) @ axes.T
+        for axes, moments in zip(turned, ([1, 1.6, 2.2], [2, 2, 0.7], [1, 1.6, 2.2]), strict=True)
+    ]
+    # What is conserved; the rate about the axis of a symmetric body; turns about principal axes.
+    omega = rng.normal(size=3)
+    for i in (0, 1, 2, 6, 7, 8):
+        cases.append((np.eye(12)[i], tensors[0], omega, *turned[0].T[:2], 0.0))
+    cases.append((np.eye(12)[3], tensors[1], omega, *turned[1].T[[2, 0]], 0.0))
+    for axis in turned[2].T[[0, 2]]:
+        for i in (4, 5, 9, 10, 11):
+            cases.append((np.eye(12)[i], tensors[2], axis, axis, turned[2].T[1], 0.0))
+    # And true oscillations about a principal axis, of 10³ to 10⁶ times the round-off.
+    for size in float(jnp.finfo(dtype).eps) * 10.0 ** np.arange(3, 7):
+        omega = turned[2] @ [size, size, 1.0]
+        cases.append((np.eye(12)[4], tensors[2], omega, *turned[2].T[[2, 1]], size))
+    args = [jnp.asarray(np.stack(column), dtype) for column in zip(*cases, strict=True)]
+    # The frequency of these is √(0.6 · 1.2/1.6) rad/s: 13 zeros in 60 s.
+    assert once(jax.vmap(count))(*args).tolist() == [0] * 17 + [13] * 4
 
 
 def test_times_that_float32_cannot_tell_apart_are_named():
