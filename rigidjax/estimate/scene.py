@@ -15,10 +15,11 @@ from rigidjax.motion import Rigid
 from rigidjax.motion.manifold import coordinates, dimension, tangent, turns
 from rigidjax.motion.torques import CorrelatedTorque, RandomTorque, Sum, Torque
 from rigidjax.motion.torques.base import in_precision, require_law, tensor_of
-from rigidjax.rotation.barrier import barrier
 from rigidjax.rotation.kernels import normalised
 from rigidjax.rotation.linalg3 import components
 from rigidjax.solve import equations_of_motion
+from rigidjax.solve.equal_steps import advance
+from rigidjax.solve.tableaus import KUTTA4
 
 
 class Walk(eqx.Module):
@@ -149,11 +150,13 @@ class Dynamics(eqx.Module):
         rest = jnp.where(h > 0, 1 / jnp.sqrt(safe), 0)
         pairs = kicks.reshape(-1, 2, 3) * rest
 
-        def push(pair: Array, share: float) -> Array:
+        def push(pair: Array, share: Scalar) -> Array:
             return pair[0] + 3.0**0.5 * share * pair[1]
 
-        def rate(when: Scalar, share: float, motion: Any, torques: tuple) -> tuple[Any, tuple]:
-            change = self.field(when, motion, None)
+        def rate(since: Scalar, now: tuple[Any, tuple]) -> tuple[Any, tuple]:
+            motion, torques = now
+            change = self.field(t + since, motion, None)
+            share = 1.0 - 2.0 * since / safe
             total = None
             for root, pair in zip(self.white, pairs, strict=False):
                 more = root * push(pair, share)
@@ -166,18 +169,9 @@ class Dynamics(eqx.Module):
             if total is not None:
                 spin = change.omega + jnp.sum(self.inverse * total[None], 1)
                 change = eqx.tree_at(lambda s: s.omega, change, spin)
-            # XLA:CPU would compute a stage again for every number that comes of it.
-            return barrier((change, tuple(slopes)))
+            return change, tuple(slopes)
 
-        def plus(k: Any, part: Scalar) -> Any:
-            return barrier(jax.tree.map(lambda a, b: a + part * b, (x.motion, x.torques), k))
-
-        k1 = rate(t, 1.0, x.motion, x.torques)
-        k2 = rate(t + 0.5 * h, 0.0, *plus(k1, 0.5 * h))
-        k3 = rate(t + 0.5 * h, 0.0, *plus(k2, 0.5 * h))
-        k4 = rate(t + h, -1.0, *plus(k3, h))
-        slope = jax.tree.map(lambda a, b, c, d: (a + 2.0 * b + 2.0 * c + d) / 6.0, k1, k2, k3, k4)
-        motion, torques = plus(slope, h)
+        (motion, torques), _ = advance(KUTTA4, rate, jnp.zeros_like(h), h, (x.motion, x.torques), h)
         if isinstance(motion, HasAttitude):
             motion = eqx.tree_at(lambda s: s.q, motion, normalised(motion.q))
         return Extended(motion, torques, x.walks)

@@ -16,8 +16,8 @@ from rigidjax.motion.manifold import minus_small
 from rigidjax.motion.torques.inputs import bind
 from rigidjax.solve import equations_of_motion
 from rigidjax.solve.components import split
+from rigidjax.solve.equal_steps import in_a_loop
 from rigidjax.solve.fixed_loop import first_row, step
-from rigidjax.solve.rolled import in_a_loop
 from rigidjax.solve.steppers import cheapest, stepper_of
 
 Value = TypeVar("Value")

@@ -15,6 +15,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from rigidjax.motion.torques.inputs import Row, delays_of
+from rigidjax.solve.equal_steps import Rolled
 from rigidjax.solve.explicit import AbstractExplicit
 from rigidjax.solve.magnus import Magnus4
 from rigidjax.solve.splitting import AbstractSplitting
@@ -22,7 +23,7 @@ from rigidjax.solve.steppers import Stepper, stepper_of
 
 
 def fixed(
-    solver: AbstractExplicit | Magnus4 | AbstractSplitting,
+    solver: AbstractExplicit | Rolled | Magnus4 | AbstractSplitting,
     field: Callable[..., Any],
     ts: Float[Array, " times"],
     y0: Any,

@@ -18,7 +18,8 @@ from rigidjax.motion.torques.base import sees_attitude
 from rigidjax.rotation.barrier import barrier
 from rigidjax.rotation.kernels import product4, square4
 from rigidjax.solve.components import join, split
-from rigidjax.solve.explicit import NestedInterpolation, advance, cubic_rows
+from rigidjax.solve.equal_steps import advance
+from rigidjax.solve.explicit import NestedInterpolation, cubic_rows
 from rigidjax.solve.tableaus import KUTTA4
 
 
@@ -38,9 +39,9 @@ def turned(
     cubic through both ends. Source: Magnus 1954, doi:10.1002/cpa.3160070404; Iserles, Munthe-Kaas,
     Nørsett and Zanna 2000, doi:10.1017/S0962492900002154, section 5.
     """
-    after, slopes = advance(KUTTA4, slope, t, h, p, end)
+    after, first = advance(KUTTA4, slope, t, h, p, end)
     after = barrier(after)
-    first, last = slopes[0], slope(end, after)
+    last = slope(end, after)
     middle = tuple(
         0.5 * (a + b) + 0.125 * h * (k - m)
         for a, b, k, m in zip(p, after, first, last, strict=True)

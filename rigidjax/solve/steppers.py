@@ -35,10 +35,10 @@ from rigidjax.motion.torques.inputs import bind, delays_of
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.barrier import barrier
 from rigidjax.solve import splitting
-from rigidjax.solve.components import join, split
-from rigidjax.solve.explicit import AbstractExplicit, Atoms, RungeKutta4
+from rigidjax.solve.components import Atoms, join, split
+from rigidjax.solve.equal_steps import Rolled, end_of_step
+from rigidjax.solve.explicit import AbstractExplicit, RungeKutta4
 from rigidjax.solve.magnus import Magnus4, require_blind, turned
-from rigidjax.solve.rolled import end_of_step
 from rigidjax.solve.splitting import AbstractSplitting
 
 
@@ -90,7 +90,7 @@ def _stepper_of(solver: Any, field: Callable[..., Any], y0: Any) -> Stepper:
         return _free(turning.inertia, y0) if turning.torque is None else _magnus(turning, y0)
     if isinstance(solver, AbstractSplitting):
         return _split(solver, field, y0)
-    if not isinstance(solver, AbstractExplicit):
+    if not isinstance(solver, AbstractExplicit | Rolled):
         raise TypeError(
             f"no equal steps of {type(solver).__name__} on {type(y0).__name__}; wanted "
             "RungeKutta4, Tsitouras5 or DormandPrince8 of rigidjax.solvers, or, for an Attitude, "
@@ -207,43 +207,47 @@ def _magnus(turning: _Turning, state0: Attitude) -> Stepper:
     return Stepper((*start[:4], *times(_entries(body.tensor), start[4:])), step, state)
 
 
-def _explicit(solver: AbstractExplicit, turning: _Turning, state0: Any) -> Stepper:
+def _explicit(solver: AbstractExplicit | Rolled, turning: _Turning, state0: Any) -> Stepper:
     body, weights, torque = turning
     start = split(state0)
     many = len(start) - 3
 
-    def step(t: Any, end: Any, h: Any, y: Atoms, inputs: Any) -> Atoms:
+    def slope_under(inputs: Any) -> Callable[[Any, Atoms], Atoms]:
         law = bind(torque, inputs)
 
-        def field(t: Any, y: Atoms) -> Atoms:
+        def slope(t: Any, y: Atoms) -> Atoms:
             q, p = y[:many], y[many:]
             # Shared by attitude and momentum; fenced: else each of seven results computes it again.
             omega = barrier(times(weights, p))
-            slope = cross(p, omega)
+            pushed = cross(p, omega)
             if law is not None:
                 value = evaluate(law, t, join((*q, *omega), state0), body)
-                slope = _sum(slope, split(value))
-            return (*half_product(q, omega), *slope) if many else slope
+                pushed = _sum(pushed, split(value))
+            return (*half_product(q, omega), *pushed) if many else pushed
 
-        return _projected(end_of_step(solver, field, t, h, y, end), state0)
+        return slope
 
     def state(y: Atoms) -> Any:
         return join((*y[:many], *times(weights, y[many:])), state0)
 
     momentum = times(_entries(body.tensor), start[many:])
-    return Stepper((*start[:many], *momentum), step, state)
+    return _of_slope(solver, slope_under, (*start[:many], *momentum), state, state0)
 
 
-def _general(solver: AbstractExplicit, field: Callable[..., Any], state0: Any) -> Stepper:
-    def step(t: Any, end: Any, h: Any, y: Atoms, inputs: Any) -> Atoms:
+def _general(solver: AbstractExplicit | Rolled, field: Callable[..., Any], state0: Any) -> Stepper:
+    def slope_under(inputs: Any) -> Callable[[Any, Atoms], Atoms]:
         here = bind(field, inputs)
+        return lambda t, y: split(here(t, join(y, state0), None))
 
-        def slope(t: Any, y: Atoms) -> Atoms:
-            return split(here(t, join(y, state0), None))
+    return _of_slope(solver, slope_under, split(state0), lambda y: join(y, state0), state0)
 
-        return _projected(end_of_step(solver, slope, t, h, y, end), state0)
 
-    return Stepper(split(state0), step, lambda y: join(y, state0))
+def _of_slope(solver: Any, slope_under: Any, start: Atoms, state: Any, like: Any) -> Stepper:
+    def step(t: Any, end: Any, h: Any, y: Atoms, inputs: Any) -> Atoms:
+        after = end_of_step(solver, slope_under(inputs), t, h, y, end)
+        return split(on_the_group(join(after, like)))
+
+    return Stepper(start, step, state)
 
 
 def _split(solver: AbstractSplitting, field: Any, state0: Any) -> Stepper:
@@ -260,10 +264,6 @@ def _split(solver: AbstractSplitting, field: Any, state0: Any) -> Stepper:
         return Attitude(y[0], splitting.leave(frame, y[1]))
 
     return Stepper((state0.q, splitting.enter(frame, state0.omega)), step, state)
-
-
-def _projected(y: Atoms, like: Any) -> Atoms:
-    return split(on_the_group(join(y, like)))
 
 
 def _sum(a: Triple, b: Triple) -> Triple:
