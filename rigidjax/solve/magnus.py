@@ -95,15 +95,8 @@ class Magnus4(dfx.AbstractSolver):
         return 4
 
     def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> None:
-        # diffrax wraps the term where time runs backwards.
-        term = terms if isinstance(terms, dfx.ODETerm) else terms.term
-        field: Any = term.vector_field
-        if not isinstance(field, AttitudeEquations) or not isinstance(y0, Attitude):
-            raise TypeError(
-                "Magnus4: wanted AttitudeEquations and an Attitude state, got "
-                f"{type(field).__name__} and {type(y0).__name__}; use RungeKutta4"
-            )
-        require_blind(field.euler.torque)
+        field, _ = field_of(terms)
+        require_blind(require_attitude("Magnus4", field, y0, "RungeKutta4").euler.torque)
 
     def step(
         self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Any, made_jump: Any
@@ -129,6 +122,23 @@ class Magnus4(dfx.AbstractSolver):
 
     def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
         return terms.vf(t0, y0, args)
+
+
+def field_of(terms: Any) -> tuple[Any, Any]:
+    """The vector field inside the term, and the direction of time that diffrax wraps around it."""
+    if isinstance(terms, dfx.ODETerm):
+        return terms.vector_field, 1
+    return terms.term.vector_field, terms.direction
+
+
+def require_attitude(name: str, field: Any, y0: Any, instead: str) -> AttitudeEquations:
+    """`field`, if it is `AttitudeEquations` and the state an `Attitude`; else `TypeError`."""
+    if isinstance(field, AttitudeEquations) and isinstance(y0, Attitude):
+        return field
+    raise TypeError(
+        f"{name}: wanted AttitudeEquations and an Attitude state, got {type(field).__name__} and "
+        f"{type(y0).__name__}; use {instead}"
+    )
 
 
 def require_blind(law: Any) -> None:
