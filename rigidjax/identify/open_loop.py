@@ -17,7 +17,7 @@ from rigidjax.motion.torques.inputs import bind
 from rigidjax.solve import equations_of_motion
 from rigidjax.solve.components import split
 from rigidjax.solve.equal_steps import in_a_loop
-from rigidjax.solve.fixed_loop import first_row, step
+from rigidjax.solve.fixed_loop import first_row, first_rows, step
 from rigidjax.solve.steppers import cheapest, stepper_of
 
 Value = TypeVar("Value")
@@ -54,11 +54,9 @@ def open_loop_errors(
     field = equations_of_motion(body, start, law)
     stepper = stepper_of(in_a_loop(cheapest(field)), field, start)
 
-    def one(i: Array, now: tuple[Any, Any]) -> tuple[Any, Any]:
-        y, states = now
+    def one(y: Any, i: Array) -> tuple[Any, Any]:
         y = step(stepper, size, jnp.zeros_like(size), i, y, inputs or None, before)
-        there = motion_of(stepper.state(y))
-        return y, jax.tree.map(lambda all_, one: all_.at[i].set(one), states, there)
+        return y, motion_of(stepper.state(y))
 
     def ahead(y: Any, i: Array) -> tuple[Any, None]:
         # The law's own states follow the inputs; the body stays as it was measured.
@@ -68,8 +66,7 @@ def open_loop_errors(
     y0 = stepper.start
     if before and isinstance(start, Coupled):
         y0, _ = lax.scan(ahead, y0, jnp.arange(-before, 0, dtype=jnp.int32))
-    last = jnp.asarray(length if steps is None else steps, jnp.int32)
-    _, states = lax.fori_loop(jnp.zeros((), jnp.int32), last, one, (y0, wanted))
+    states = first_rows(length if steps is None else steps, one, y0, wanted)
     return jax.vmap(minus_small)(states, wanted)
 
 
