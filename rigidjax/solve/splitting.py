@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from rigidjax.exact.components3 import Six, Triple, times
+from rigidjax.exact.components3 import Six, Triple, adjugate, determinant, times
 from rigidjax.exact.derivatives import flow
 from rigidjax.exact.principal_axes import into, out_of, principal_frame
 from rigidjax.motion import Attitude, AttitudeEquations
@@ -66,10 +66,37 @@ SRKN11 = _symmetric(
 
 
 class Frame(NamedTuple):
-    """What the free flow needs of a body: moments in its principal axes, and those axes."""
+    """The principal frame of a body: moments in it, their inverse, and its axes as columns.
+
+    The off-diagonal entries of both are zero; they carry the tangents.
+    """
 
     moments: Six
+    weights: Six
     axes: Array
+
+
+def principal(tensor: Array) -> Frame:
+    """The principal frame of an inertia (3, 3)."""
+    six, axes = principal_frame(tensor)
+    # Relative to the trace first: the cube of 1e37 kg m² is no number.
+    size = six[0] + six[1] + six[2]
+    unit: Six = tuple(i / size for i in six)
+    scale = determinant(unit)
+    return Frame(six, tuple(c / scale / size for c in adjugate(unit)), axes)
+
+
+@jax.custom_jvp
+def rate_of(weights: Six, p: Triple) -> Triple:
+    """Ω of Π in principal axes."""
+    return weights[0] * p[0], weights[1] * p[1], weights[2] * p[2]
+
+
+@rate_of.defjvp
+def rate_of_jvp(primals, tangents):
+    (weights, p), (dw, dp) = primals, tangents
+    moved = zip(rate_of(weights, dp), times(dw, p), strict=True)
+    return rate_of(weights, p), tuple(a + b for a, b in moved)
 
 
 class AbstractSplitting(dfx.AbstractSolver):
@@ -159,7 +186,7 @@ def frame_of(field: Any, y0: Any) -> Frame:
             "flywheel), or does not say that it does not; only time and attitude may enter a kick: "
             "a law of your own says so by rate_free = True; for others use DormandPrince8"
         )
-    return Frame(*principal_frame(field.euler.inertia.tensor.astype(y0.omega.dtype)))
+    return principal(field.euler.inertia.tensor.astype(y0.omega.dtype))
 
 
 def enter(frame: Frame, omega: Array) -> Triple:
@@ -169,8 +196,7 @@ def enter(frame: Frame, omega: Array) -> Triple:
 
 def leave(frame: Frame, momentum: Triple) -> Array:
     """Ω in body axes."""
-    (x, y, z), (a, b, c, *_) = momentum, frame.moments
-    return jnp.stack(out_of(frame.axes, (x / a, y / b, z / c)))
+    return jnp.stack(out_of(frame.axes, rate_of(frame.weights, momentum)))
 
 
 def compose(

@@ -22,13 +22,11 @@ from rigidjax.body.inertia import Inertia
 from rigidjax.exact.components3 import (
     Six,
     Triple,
-    adjugate,
     cross,
-    determinant,
     half_product,
     times,
 )
-from rigidjax.exact.principal_axes import into, out_of, principal_frame
+from rigidjax.exact.principal_axes import out_of
 from rigidjax.motion import Attitude, AttitudeEquations, EulerEquations, Spin, on_the_group
 from rigidjax.motion.torques.base import evaluate, sees_attitude
 from rigidjax.motion.torques.inputs import bind, delays_of
@@ -121,45 +119,27 @@ def _turning(field: Any, y0: Any) -> _Turning | None:
 
 def _free(body: Inertia, state0: Attitude) -> Stepper:
     """Principal axes, held fixed in derivatives: the off-diagonal entries carry only tangents."""
-    six, axes = principal_frame(body.tensor)
-    # Relative to the trace first: the cube of 1e37 kg m² is no number.
-    size = six[0] + six[1] + six[2]
-    unit: Six = tuple(i / size for i in six)
-    scale = determinant(unit)
-    weights: Six = tuple(c / scale / size for c in adjugate(unit))
+    frame = splitting.principal(body.tensor)
+    weights, axes = frame.weights, frame.axes
     a, b, c, *_ = lax.stop_gradient(weights)
     gaps = (c - b, a - c, b - a)
-    momentum = times(six, into(axes, state0.omega))
+    momentum = splitting.enter(frame, state0.omega)
     one, none = jnp.ones_like(a), jnp.zeros_like(a)
 
     def step(t: Any, end: Any, h: Any, y: Atoms, inputs: Any) -> Atoms:
         q, p = turned(
             lambda _, p: _free_slope(weights, gaps, p),
-            lambda p: _free_rate(weights, p),
+            lambda p: splitting.rate_of(weights, p),
             t, end, h, y[:4], y[4:],
         )  # fmt: skip
         return (*q, *p)
 
     def state(y: Atoms) -> Attitude:
         # The numbers are the turn since the start, seen from the axes: Aᵀ…A turns its vector.
-        omega = jnp.stack(out_of(axes, _free_rate(weights, y[4:])))
         turn = jnp.stack([y[0], *out_of(axes, y[1:4])])
-        return Attitude(quaternion.multiply(state0.q, turn), omega)
+        return Attitude(quaternion.multiply(state0.q, turn), splitting.leave(frame, y[4:]))
 
     return Stepper((one, none, none, none, *momentum), step, state)
-
-
-@jax.custom_jvp
-def _free_rate(weights: Six, p: Triple) -> Triple:
-    """Ω of Π in principal axes."""
-    return weights[0] * p[0], weights[1] * p[1], weights[2] * p[2]
-
-
-@_free_rate.defjvp
-def _free_rate_jvp(primals, tangents):
-    (weights, p), (dw, dp) = primals, tangents
-    moved = zip(_free_rate(weights, dp), times(dw, p), strict=True)
-    return _free_rate(weights, p), tuple(a + b for a, b in moved)
 
 
 @jax.custom_jvp
@@ -171,7 +151,7 @@ def _free_slope(weights: Six, gaps: Triple, p: Triple) -> Triple:
 @_free_slope.defjvp
 def _free_slope_jvp(primals, tangents):
     (weights, gaps, p), (dw, _, dp) = primals, tangents
-    rate, turning = _free_rate_jvp((weights, p), (dw, dp))
+    rate, turning = splitting.rate_of_jvp((weights, p), (dw, dp))
     moved = zip(cross(dp, rate), cross(p, turning), strict=True)
     return _free_slope(weights, gaps, p), tuple(a + b for a, b in moved)
 
