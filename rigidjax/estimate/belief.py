@@ -9,13 +9,14 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from rigidjax import _checks
-from rigidjax._types import HasAttitude, HasPose, HasSpin
+from rigidjax._types import HasSpin
 from rigidjax.estimate.scene import Extended, Model, not_negative
 from rigidjax.estimate.sensing import sensors_of
 from rigidjax.identify.direct_estimates import attitudes
 from rigidjax.identify.recording import Recording
 from rigidjax.identify.reference_states import first_rate
 from rigidjax.motion import Attitude, Spin, on_the_group
+from rigidjax.motion.manifold import names
 
 
 class Belief(eqx.Module):
@@ -100,18 +101,17 @@ def start(
     state = on_the_group(state)
     dtype = state.omega.dtype
     given = {"attitude": attitude, "rate": rate, "position": position, "velocity": velocity}
-    names = ["position", "velocity"] if isinstance(state, HasPose) else []
-    names += ["attitude"] if isinstance(state, HasAttitude) else []
-    names.append("rate")
+    words = {"x": "position", "v": "velocity", "q": "attitude", "omega": "rate"}
+    wanted = [words[part] for part in names(state)]
     parts = []
     for name, value in given.items():
-        if name not in names and value is not None:
+        if name not in wanted and value is not None:
             raise ValueError(f"{name}: a {type(state).__name__} has none; leave it out")
-    for name in names:
+    for name in wanted:
         if given[name] is None:
             raise ValueError(
                 f"{name}: wanted the standard deviation of the first one, got None; a "
-                f"{type(state).__name__} needs {', '.join(names)}"
+                f"{type(state).__name__} needs {', '.join(wanted)}"
             )
         parts.append(_spread(given[name], (3,), name, dtype))
     parts += [law.deviation.astype(dtype) for law in model.coloured]

@@ -15,9 +15,10 @@ from rigidjax._types import Scalar, ScalarLike
 from rigidjax.estimate import roots
 from rigidjax.estimate.belief import Belief
 from rigidjax.estimate.grid import Grid, gathered, grid_of
-from rigidjax.estimate.scene import Dynamics, Model, bare, reset, retract
+from rigidjax.estimate.scene import Dynamics, Model, bare, reset
 from rigidjax.estimate.sensing import Read, Sensors, absorb_all, rows, sensors_of, values_of
 from rigidjax.identify.recording import Recording
+from rigidjax.motion.manifold import plus
 
 # A filter is lost when for so long, s, and so many readings, none was within so many deviations.
 LOST_AFTER, LOST_READINGS, LOST_BEYOND = 1.0, 3, 6.0
@@ -231,7 +232,7 @@ def _one(
     root = roots.triangular(moved)
     found = rows(model, dynamics, sensors, t.astype(dtype), x, values, masks)
     e, root, read = absorb_all(found, jnp.zeros(root.shape[0], root.dtype), root)
-    return Belief(t, retract(x, e), reset(x, e, root)), read
+    return Belief(t, plus(x, e), reset(x, e, root)), read
 
 
 class Stops(NamedTuple):

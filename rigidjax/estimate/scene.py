@@ -9,15 +9,17 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rigidjax import _checks
-from rigidjax._types import HasAttitude, HasPose, Mat3, Scalar
+from rigidjax._types import HasAttitude, Mat3, Scalar
 from rigidjax.body.inertia import Inertia, MassProperties, inverse
 from rigidjax.motion import Rigid
+from rigidjax.motion.manifold import coordinates, dimension, tangent, turns
 from rigidjax.motion.torques import CorrelatedTorque, RandomTorque, Sum, Torque
 from rigidjax.motion.torques.base import in_precision, require_law, tensor_of
-from rigidjax.rotation import quaternion
-from rigidjax.rotation.barrier import barrier
 from rigidjax.rotation.kernels import normalised
+from rigidjax.rotation.linalg3 import components
 from rigidjax.solve import equations_of_motion
+from rigidjax.solve.equal_steps import advance
+from rigidjax.solve.tableaus import KUTTA4
 
 
 class Walk(eqx.Module):
@@ -96,9 +98,9 @@ class Extended(eqx.Module):
     **Fields:** `motion` a `Spin`, `Attitude` or `Rigid`; `torques` the value (3,) of each
     `CorrelatedTorque`, N m, body frame; `walks` the value of each `Walk`.
 
-    Errors of it are counted as numbers e: first, for a `Rigid`, of x and v (world frame); of the
-    attitude, where there is one, as the rotation vector δθ with `q = q̂ exp(δθ)`, rad, body frame;
-    of Ω; then of torques and walks.
+    Errors of it are changes as `motion.manifold` counts them: first, for a `Rigid`, of x and v
+    (world frame); of the attitude, where there is one, δθ (rad, body frame); of Ω; then of torques
+    and walks.
     """
 
     motion: Any
@@ -148,11 +150,13 @@ class Dynamics(eqx.Module):
         rest = jnp.where(h > 0, 1 / jnp.sqrt(safe), 0)
         pairs = kicks.reshape(-1, 2, 3) * rest
 
-        def push(pair: Array, share: float) -> Array:
+        def push(pair: Array, share: Scalar) -> Array:
             return pair[0] + 3.0**0.5 * share * pair[1]
 
-        def rate(when: Scalar, share: float, motion: Any, torques: tuple) -> tuple[Any, tuple]:
-            change = self.field(when, motion, None)
+        def rate(since: Scalar, now: tuple[Any, tuple]) -> tuple[Any, tuple]:
+            motion, torques = now
+            change = self.field(t + since, motion, None)
+            share = 1.0 - 2.0 * since / safe
             total = None
             for root, pair in zip(self.white, pairs, strict=False):
                 more = root * push(pair, share)
@@ -165,18 +169,9 @@ class Dynamics(eqx.Module):
             if total is not None:
                 spin = change.omega + jnp.sum(self.inverse * total[None], 1)
                 change = eqx.tree_at(lambda s: s.omega, change, spin)
-            # XLA:CPU would compute a stage again for every number that comes of it.
-            return barrier((change, tuple(slopes)))
+            return change, tuple(slopes)
 
-        def plus(k: Any, part: Scalar) -> Any:
-            return barrier(jax.tree.map(lambda a, b: a + part * b, (x.motion, x.torques), k))
-
-        k1 = rate(t, 1.0, x.motion, x.torques)
-        k2 = rate(t + 0.5 * h, 0.0, *plus(k1, 0.5 * h))
-        k3 = rate(t + 0.5 * h, 0.0, *plus(k2, 0.5 * h))
-        k4 = rate(t + h, -1.0, *plus(k3, h))
-        slope = jax.tree.map(lambda a, b, c, d: (a + 2.0 * b + 2.0 * c + d) / 6.0, k1, k2, k3, k4)
-        motion, torques = plus(slope, h)
+        (motion, torques), _ = advance(KUTTA4, rate, jnp.zeros_like(h), h, (x.motion, x.torques), h)
         if isinstance(motion, HasAttitude):
             motion = eqx.tree_at(lambda s: s.q, motion, normalised(motion.q))
         return Extended(motion, torques, x.walks)
@@ -192,14 +187,14 @@ class Dynamics(eqx.Module):
         kicks = jnp.zeros(self.kicks, dtype) if kicks is None else kicks
         after, push = jax.linearize(lambda y, k: self.advance(t, h, y, k), x, kicks)
         moving = Extended(x.motion, x.torques, ())
-        size, drifting = size_of(moving), size_of(x) - size_of(moving)
+        size, drifting = dimension(moving), dimension(x) - dimension(moving)
         count = size + self.kicks
         eye = jnp.eye(count, dtype=dtype)
         still = tuple(jnp.zeros_like(w) for w in x.walks)
 
         def column(unit: Array) -> Array:
-            tangent = tangent_of(moving, unit[:size])
-            moved = push(Extended(tangent.motion, tangent.torques, still), unit[size:])
+            along = tangent(moving, unit[:size])
+            moved = push(Extended(along.motion, along.torques, still), unit[size:])
             return coordinates(after, moved)[:size]
 
         both = jax.vmap(column, out_axes=1)(eye)
@@ -210,67 +205,8 @@ class Dynamics(eqx.Module):
         return after, _block(grown, jnp.eye(drifting, dtype=dtype)), _block(noise, jnp.diag(strewn))
 
 
-def size_of(x: Extended) -> int:
-    """How many numbers an error of it has."""
-    motion = 12 if isinstance(x.motion, HasPose) else 6 if isinstance(x.motion, HasAttitude) else 3
-    return motion + 3 * len(x.torques) + sum(w.size for w in x.walks)
-
-
-def retract(x: Extended, e: Float[Array, " n"]) -> Extended:
-    """The state that lies e from `x`."""
-    parts, rest = _split(x, e)
-    motion = x.motion
-    if isinstance(motion, HasAttitude):
-        q = quaternion.multiply(motion.q, quaternion.exp(parts["turn"]))
-        motion = eqx.tree_at(lambda s: s.q, motion, q)
-    if isinstance(motion, HasPose):
-        moved = (motion.x + parts["x"], motion.v + parts["v"])
-        motion = eqx.tree_at(lambda s: (s.x, s.v), motion, moved)
-    motion = eqx.tree_at(lambda s: s.omega, motion, motion.omega + parts["spin"])
-    torques = tuple(a + b for a, b in zip(x.torques, rest.torques, strict=True))
-    return Extended(motion, torques, tuple(a + b for a, b in zip(x.walks, rest.walks, strict=True)))
-
-
-def between(x: Extended, y: Extended) -> Float[Array, " n"]:
-    """The error e with `retract(x, e) = y`."""
-    parts = []
-    if isinstance(x.motion, HasPose):
-        parts += [y.motion.x - x.motion.x, y.motion.v - x.motion.v]
-    if isinstance(x.motion, HasAttitude):
-        turn = quaternion.multiply(quaternion.conjugate(x.motion.q), y.motion.q)
-        parts.append(quaternion.log(turn))
-    parts.append(y.motion.omega - x.motion.omega)
-    parts += [b - a for a, b in zip(x.torques, y.torques, strict=True)]
-    parts += [(b - a).reshape(-1) for a, b in zip(x.walks, y.walks, strict=True)]
-    return jnp.concatenate(parts)
-
-
-def tangent_of(x: Extended, e: Float[Array, " n"]) -> Extended:
-    """The derivative of `retract(x, ·)` at zero along e."""
-    parts, rest = _split(x, e)
-    motion = x.motion
-    if isinstance(motion, HasAttitude):
-        motion = eqx.tree_at(lambda s: s.q, motion, quaternion.rate(motion.q, parts["turn"]))
-    if isinstance(motion, HasPose):
-        motion = eqx.tree_at(lambda s: (s.x, s.v), motion, (parts["x"], parts["v"]))
-    motion = eqx.tree_at(lambda s: s.omega, motion, parts["spin"])
-    return Extended(motion, rest.torques, rest.walks)
-
-
-def coordinates(x: Extended, moved: Extended) -> Float[Array, " n"]:
-    """The inverse of `tangent_of`: a small change of the state `x` as numbers."""
-    parts = []
-    if isinstance(x.motion, HasPose):
-        parts += [moved.motion.x, moved.motion.v]
-    if isinstance(x.motion, HasAttitude):
-        turned = quaternion.multiply(quaternion.conjugate(x.motion.q), moved.motion.q)
-        parts.append(2.0 * turned[1:])
-    parts += [moved.motion.omega, *moved.torques, *(w.reshape(-1) for w in moved.walks)]
-    return jnp.concatenate(parts)
-
-
 def reset(x: Extended, e: Float[Array, " n"], root: Float[Array, "n m"]) -> Float[Array, "n m"]:
-    """The root of the errors about `retract(x, e)` where `root` is of those about x.
+    """The root of the errors about `x ⊕ e` where `root` is of those about x.
 
     `log(exp(−e) exp(e + δ)) ≈ J_r(e) δ`, to second order in the turn e: Mueller, Hehn and D'Andrea
     2017, doi:10.2514/1.G000848.
@@ -284,35 +220,19 @@ def reset_inverse(x: Extended, e: Float[Array, " n"], a: Float[Array, "n m"]) ->
 
 
 def _turned(x: Extended, e: Array, a: Array, first: float, second: float) -> Array:
-    """The rows of the attitude times `1 + first hat(e) + second hat(e)²`."""
-    if not isinstance(x.motion, HasAttitude):
-        return a
-    at = 6 if isinstance(x.motion, HasPose) else 0
-    p, q, r = e[at], e[at + 1], e[at + 2]
-    mine = a[at : at + 3]
-
-    def across(m: Array) -> Array:
-        return jnp.stack([q * m[2] - r * m[1], r * m[0] - p * m[2], p * m[1] - q * m[0]])
-
-    once = across(mine)
-    turned = mine + first * once + second * across(once)
-    return jnp.concatenate([a[:at], turned, a[at + 3 :]])
+    """The rows of each attitude times `1 + first hat(e) + second hat(e)²`."""
+    for rows in turns(x):
+        turn, mine = e[rows], a[rows]
+        once = _across(turn, mine)
+        mine = mine + first * once + second * _across(turn, once)
+        a = jnp.concatenate([a[: rows.start], mine, a[rows.stop :]])
+    return a
 
 
-def _split(x: Extended, e: Array) -> tuple[dict[str, Array], Extended]:
-    at, parts = 0, {}
-    names = ["x", "v"] if isinstance(x.motion, HasPose) else []
-    names += ["turn"] if isinstance(x.motion, HasAttitude) else []
-    for name in [*names, "spin"]:
-        parts[name], at = e[at : at + 3], at + 3
-    torques, walks = [], []
-    for _ in x.torques:
-        torques.append(e[at : at + 3])
-        at += 3
-    for w in x.walks:
-        walks.append(e[at : at + w.size].reshape(w.shape))
-        at += w.size
-    return parts, Extended(None, tuple(torques), tuple(walks))
+def _across(turn: Array, m: Array) -> Array:
+    """`hat(turn) m`."""
+    p, q, r = components(turn)
+    return jnp.stack([q * m[2] - r * m[1], r * m[0] - p * m[2], p * m[1] - q * m[0]])
 
 
 def _block(a: Array, b: Array) -> Array:

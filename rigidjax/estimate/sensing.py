@@ -13,11 +13,12 @@ from rigidjax import _checks
 from rigidjax._types import Mat3, Scalar
 from rigidjax.body.inertia import MassProperties
 from rigidjax.estimate import roots
-from rigidjax.estimate.scene import Dynamics, Extended, Model, size_of, tangent_of
+from rigidjax.estimate.scene import Dynamics, Extended, Model
 from rigidjax.identify.propagation import shifted
 from rigidjax.identify.recording import Reading, Recording
 from rigidjax.identify.sensors import AbstractSensor, SensorInput
 from rigidjax.motion import Rigid
+from rigidjax.motion.manifold import dimension, tangent
 from rigidjax.motion.torques.base import in_precision
 
 
@@ -131,7 +132,7 @@ def rows(
     body = in_precision(model.body, dtype)
     if isinstance(body, MassProperties) and not isinstance(x.motion, Rigid):
         body = body.inertia
-    basis = jax.vmap(lambda e: tangent_of(x, e))(jnp.eye(size_of(x), dtype=dtype))
+    basis = jax.vmap(lambda e: tangent(x, e))(jnp.eye(dimension(x), dtype=dtype))
     out = []
     for index, (value, mask) in enumerate(zip(values, masks, strict=True)):
         sensor = in_precision(sensors.sensors[index], dtype)

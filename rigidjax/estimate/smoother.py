@@ -19,13 +19,12 @@ from rigidjax.estimate.scene import (
     Extended,
     Model,
     bare,
-    between,
     reset,
     reset_inverse,
-    retract,
 )
 from rigidjax.estimate.sensing import Read, Sensors, absorb_all, rows
 from rigidjax.identify.recording import Recording
+from rigidjax.motion.manifold import minus, plus
 
 
 class Push(NamedTuple):
@@ -231,7 +230,7 @@ def _iterate(
     """
     before = jnp.concatenate([first.t[None], stops.t[:-1]])
     dtype = first.root.dtype
-    x0, off = _at(path, 0), between(first.x, _at(path, 0))
+    x0, off = _at(path, 0), minus(_at(path, 0), first.x)
     start = (-off, reset(x0, off, first.root))
 
     def forward(carry: tuple[Array, Array], now: Any) -> tuple[Any, _Kept]:
@@ -239,7 +238,7 @@ def _iterate(
         t0, stop, x, y, kick = now
         since = (stop.t - t0).astype(dtype)
         after, grown, noise = dynamics.predict(t0.astype(dtype), since, x, kick)
-        push = between(y, after)
+        push = minus(after, y)
         grown, noise = reset_inverse(y, push, grown), reset_inverse(y, push, noise)
         push = push - jnp.sum(noise[:, : dynamics.kicks] * kick[None], 1)
         kept = linear.joint(grown, noise, root)
@@ -265,7 +264,7 @@ def _iterate(
     sure = deviation > 0
     change = jnp.max(jnp.where(sure, jnp.abs(means) / jnp.where(sure, deviation, 1), 0))
     total = jnp.sum(jnp.stack([read.log_density for read in kept.read]))
-    moved = jax.vmap(retract)(path, means)
+    moved = jax.vmap(plus)(path, means)
     return moved, _Solved(spread, kept.read, total, kicks, kick_covariance, change)
 
 

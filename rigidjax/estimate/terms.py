@@ -13,16 +13,17 @@ from jaxtyping import Array, Float, Int
 from rigidjax._types import HasSpin, Scalar
 from rigidjax.estimate.belief import Belief
 from rigidjax.estimate.filter import reads_of
-from rigidjax.estimate.scene import Extended, Model, size_of
+from rigidjax.estimate.scene import Extended, Model
 from rigidjax.estimate.sensing import sensors_of
 from rigidjax.identify import padding
-from rigidjax.identify.jacobian import errors_of_one, filled, first_state, over_records
+from rigidjax.identify.jacobian import errors_of_one, filled, over_records
 from rigidjax.identify.parameters import local
 from rigidjax.identify.problem import Problem
 from rigidjax.identify.recording import Recording
 from rigidjax.identify.residual import beside, standardised
 from rigidjax.identify.sensor_inputs import what_turns
 from rigidjax.identify.several_bodies import matter
+from rigidjax.motion.manifold import dimension
 from rigidjax.motion.torques import Sum
 
 if TYPE_CHECKING:
@@ -171,14 +172,14 @@ def _of_one(
     # Values first: a noise in the place of `None` moves the leaves that the slots count.
     record = _with_noises(filled(problem, mine, record), noises)
     body = what_turns(matter(problem.body, mine.body, which), problem.rung)
-    state: HasSpin = first_state(problem.rung, mine, ref)
+    state: HasSpin = ref.moved(mine)
     process = density.grown(logs)
     law = process if record.torque is None else Sum(record.torque, process)
     model = Model(body, law)
     sensors = [reading.sensor for reading in record.readings]
     torques = tuple(jnp.zeros(3, state.omega.dtype) for _ in model.coloured)
     x = Extended(state, torques, ())
-    known = jnp.zeros(size_of(x) - 3 * len(torques), state.omega.dtype)
+    known = jnp.zeros(dimension(state), state.omega.dtype)
     spread = jnp.concatenate([known, *(law.deviation for law in model.coloured)])
     first = Belief(record.t[0], x, jnp.diag(spread))
     reads = reads_of(model, sensors_of(sensors, model), record, first, density.substeps)

@@ -5,12 +5,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
-from rigidjax._types import HasAttitude
-from rigidjax.motion import Rigid
-from rigidjax.rotation import quaternion
-from rigidjax.rotation.linalg3 import components
+from rigidjax.motion.manifold import minus_small, parts
 
 
 class Horizons(NamedTuple):
@@ -31,33 +28,19 @@ class Horizons(NamedTuple):
     rms: dict[str, Any]
 
 
-def by_horizon(found: dict[str, Array]) -> Horizons:
-    """The means over windows of errors by kind (N, L, 3)."""
-    absolute = {k: np.asarray(jnp.mean(jnp.abs(v), (0, 2))) for k, v in found.items()}
-    rms = {k: np.asarray(jnp.sqrt(jnp.mean(jnp.sum(v * v, 2), 0))) for k, v in found.items()}
-    return Horizons(np.arange(1, found["omega"].shape[1] + 1), absolute, rms)
+def by_horizon(windows: Any, found: Float[Array, "windows steps n"]) -> Horizons:
+    """The means over windows of errors as changes from what was measured."""
+    by_kind = parts(jax.tree.map(lambda leaf: leaf[0], windows.starts), found)
+    absolute = {k: np.asarray(jnp.mean(jnp.abs(v), (0, 2))) for k, v in by_kind.items()}
+    rms = {k: np.asarray(jnp.sqrt(jnp.mean(jnp.sum(v * v, 2), 0))) for k, v in by_kind.items()}
+    return Horizons(np.arange(1, found.shape[1] + 1), absolute, rms)
 
 
-def between(states: Any, wanted: Any) -> dict[str, Array]:
-    found = {}
-    for kind in kinds_of(states):
-        a, b = getattr(states, kind), getattr(wanted, kind)
-        found[kind] = a - b
-        if kind == "q":
-            found[kind] = jax.vmap(_turn)(a.reshape(-1, 4), b.reshape(-1, 4)).reshape(
-                (*a.shape[:-1], 3)
-            )
-    return found
+def held_errors(windows: Any) -> Float[Array, "windows steps n"]:
+    """The errors where the state at the start is held."""
+    return _held(windows.starts, windows.wanted)
 
 
-def _turn(a: Array, b: Array) -> Array:
-    """The rotation from `b` to `a` in body axes, rad, for errors that are small."""
-    w, x, y, z = components(quaternion.multiply(quaternion.conjugate(b), a))
-    twice = jnp.where(w < 0, -2.0, 2.0).astype(w.dtype)
-    return jnp.stack([twice * x, twice * y, twice * z])
-
-
-def kinds_of(states: Any) -> tuple[str, ...]:
-    if isinstance(states, Rigid):
-        return ("x", "v", "q", "omega")
-    return ("q", "omega") if isinstance(states, HasAttitude) else ("omega",)
+@jax.jit
+def _held(starts: Any, wanted: Any) -> Array:
+    return jax.vmap(jax.vmap(minus_small, (None, 0)))(starts, wanted)

@@ -18,27 +18,10 @@ from rigidjax.identify.reference_states import ReferenceStates
 from rigidjax.identify.sensor_inputs import sensor_inputs, what_turns
 from rigidjax.identify.sensors import SensorInput
 from rigidjax.identify.several_bodies import matter
-from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.coupled import motion_of
-from rigidjax.rotation import quaternion
 
 if TYPE_CHECKING:
     from rigidjax.identify.problem import Problem
-
-
-def first_state(rung: type, own: Any, ref: ReferenceStates) -> Any:
-    """The first state of one recording; `own` an `Own` or a `Local`."""
-    omega = own.spin * ref.rate
-    if rung is Spin:
-        return Spin(omega)
-    assert ref.q is not None and own.turn is not None
-    q = quaternion.multiply(ref.q, quaternion.exp(own.turn))
-    if rung is Attitude:
-        return Attitude(q, omega)
-    assert ref.x is not None and ref.v is not None
-    assert own.place is not None and own.speed is not None
-    x = ref.x + ref.length * own.place
-    return Rigid(x, ref.v + ref.length * ref.rate * own.speed, q, omega)
 
 
 def filled(problem: "Problem", mine: Local, record: Recording) -> Recording:
@@ -59,7 +42,7 @@ def states_of_one(
     """
     record = filled(problem, mine, record)
     body = matter(problem.body, mine.body, which)
-    state0 = first_state(problem.rung, mine, ref)
+    state0 = ref.moved(mine)
     turned = what_turns(body, problem.rung)
     states = states_at(problem.integrator, turned, state0, record.t, record.torque)
     return record, body, state0, states

@@ -11,10 +11,11 @@ from jax import lax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
-from rigidjax.identify.jacobian import along, first_state, with_blocks
+from rigidjax.identify.jacobian import along, with_blocks
 from rigidjax.identify.parameters import Parameters, places
 from rigidjax.identify.problem import Problem
 from rigidjax.identify.propagation import FirstPart, FixedSteps
+from rigidjax.identify.reference_states import ReferenceStates
 from rigidjax.identify.residual import Noise, beside, seen_rows
 
 # Damping is in units of the diagonal of the normal equations (Marquardt's): one is a step half as
@@ -261,11 +262,7 @@ def _nothing(problem: Problem, start: Parameters, columns: int, kind: Any) -> An
     )
     ends = jax.tree.map(
         lambda leaf: jnp.zeros(leaf.shape, kind),
-        eqx.filter_eval_shape(
-            jax.vmap(lambda own, ref: first_state(problem.rung, own, ref)),
-            start.own,
-            problem.reference,
-        ),
+        eqx.filter_eval_shape(jax.vmap(ReferenceStates.moved), problem.reference, start.own),
     )
     blocks = jax.tree.map(lambda leaf: jnp.zeros((*leaf.shape, columns), kind), (errors, ends))
     return (errors, ends), blocks

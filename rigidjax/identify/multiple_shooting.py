@@ -95,7 +95,7 @@ def joined(problem: Problem, cut: Problem, found: Parameters) -> Parameters:
         shared.append(value if slot.groups is None else value[None])
         if slot.spread is not None:
             each.append(jnp.zeros((1, *value.shape)))
-    own = Own(spin, first.turn, first.place, first.speed, ())
+    own = Own(first.place, first.speed, first.turn, spin, ())
     own = eqx.tree_at(lambda o: o.each, jax.tree.map(lambda leaf: leaf[None], own), tuple(each))
     return eqx.tree_at(lambda p: (p.body, p.shared, p.own), whole, (found.body, tuple(shared), own))
 

@@ -7,16 +7,17 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
-from rigidjax.identify.horizons import Horizons, between, by_horizon, kinds_of
+from rigidjax.identify.horizons import Horizons, by_horizon
 from rigidjax.identify.windows import Windows
 from rigidjax.motion.coupled import Coupled, motion_of, started
+from rigidjax.motion.manifold import minus_small
 from rigidjax.motion.torques.inputs import bind
 from rigidjax.solve import equations_of_motion
 from rigidjax.solve.components import split
-from rigidjax.solve.fixed_loop import first_row, step
-from rigidjax.solve.rolled import in_a_loop
+from rigidjax.solve.equal_steps import in_a_loop
+from rigidjax.solve.fixed_loop import first_row, first_rows, step
 from rigidjax.solve.steppers import cheapest, stepper_of
 
 Value = TypeVar("Value")
@@ -29,9 +30,7 @@ def errors_by_horizon(
 
     **Arguments:** as for `fit_windows`, with the free numbers `value`.
     """
-    ones = {kind: jnp.ones(()) for kind in kinds_of(windows.starts)}
-    found = _all_errors(scene, windows.step, value, windows, ones)
-    return by_horizon(found)
+    return by_horizon(windows, _all_errors(scene, windows.step, value, windows))
 
 
 def open_loop_errors(
@@ -41,10 +40,9 @@ def open_loop_errors(
     start: Any,
     wanted: Any,
     inputs: Any,
-    scales: Any,
     steps: Any = None,
-) -> dict[str, Array]:
-    """The errors of one window, by kind (L, 3), in units of `scales`.
+) -> Float[Array, "steps n"]:
+    """The errors of one window, as changes from what was measured.
 
     Of the first `steps` of the window alone, where given (a traced number: no reverse mode); the
     others are zero.
@@ -56,11 +54,9 @@ def open_loop_errors(
     field = equations_of_motion(body, start, law)
     stepper = stepper_of(in_a_loop(cheapest(field)), field, start)
 
-    def one(i: Array, now: tuple[Any, Any]) -> tuple[Any, Any]:
-        y, states = now
+    def one(y: Any, i: Array) -> tuple[Any, Any]:
         y = step(stepper, size, jnp.zeros_like(size), i, y, inputs or None, before)
-        there = motion_of(stepper.state(y))
-        return y, jax.tree.map(lambda all_, one: all_.at[i].set(one), states, there)
+        return y, motion_of(stepper.state(y))
 
     def ahead(y: Any, i: Array) -> tuple[Any, None]:
         # The law's own states follow the inputs; the body stays as it was measured.
@@ -70,16 +66,15 @@ def open_loop_errors(
     y0 = stepper.start
     if before and isinstance(start, Coupled):
         y0, _ = lax.scan(ahead, y0, jnp.arange(-before, 0, dtype=jnp.int32))
-    last = jnp.asarray(length if steps is None else steps, jnp.int32)
-    _, states = lax.fori_loop(jnp.zeros((), jnp.int32), last, one, (y0, wanted))
-    return {k: v / scales[k] for k, v in between(states, wanted).items()}
+    states = first_rows(length if steps is None else steps, one, y0, wanted)
+    return jax.vmap(minus_small)(states, wanted)
 
 
 @eqx.filter_jit
-def _all_errors(scene: Any, h: float, value: Any, windows: Windows, scales: Any) -> Any:
-    def one(window: Any) -> Any:
+def _all_errors(scene: Any, h: float, value: Any, windows: Windows) -> Array:
+    def one(window: Any) -> Array:
         start, wanted, inputs = window
-        return open_loop_errors(scene, h, value, start, wanted, inputs, scales)
+        return open_loop_errors(scene, h, value, start, wanted, inputs)
 
     parts = (windows.starts, windows.wanted, windows.inputs)
     return lax.map(one, parts, batch_size=min(128, windows.count))

@@ -18,11 +18,11 @@ if TYPE_CHECKING:
 class Own(eqx.Module):
     """The free numbers that belong to one recording, of order one.
 
-    **Fields:** `spin` (3,) the first body rate over the typical rate; `turn` (3,) the rotation
-    vector from the reference attitude to the first one (body frame, rad), or `None` where nothing
-    depends on the attitude; `place`, `speed` (3,) the first position and velocity from the
-    reference, in typical lengths and speeds, or `None`; `each` the steps of the `Free`s with one
-    value for each recording, and the deviations of those with a `spread`.
+    **Fields:** `place`, `speed` (3,) the first position and velocity from the reference, in typical
+    lengths and speeds, or `None` where nothing depends on them; `turn` (3,) the rotation vector
+    from the reference attitude to the first one (body frame, rad), or `None`; `spin` (3,) the first
+    body rate over the typical rate; `each` the steps of the `Free`s with one value for each
+    recording, and the deviations of those with a `spread`.
 
     >>> import rigidjax as rj
     >>> record = rj.identify.Recording([0.0, 1.0], (rj.identify.Gyro(), [[1.0, 0, 0]] * 2))
@@ -32,10 +32,10 @@ class Own(eqx.Module):
     ([[0.0, 0.0, 3.0]], None)
     """
 
-    spin: Float[Array, "*records 3"]
-    turn: Float[Array, "*records 3"] | None
     place: Float[Array, "*records 3"] | None
     speed: Float[Array, "*records 3"] | None
+    turn: Float[Array, "*records 3"] | None
+    spin: Float[Array, "*records 3"]
     each: tuple[Array, ...]
 
 
@@ -63,15 +63,21 @@ class Local(eqx.Module):
     """The free numbers that one recording depends on.
 
     **Fields:** `body` (K,) of its body, padded to the largest chart; `steps` one for each `Free`;
-    `spin`, `turn`, `place`, `speed` as in `Own`.
+    `place`, `speed`, `turn`, `spin` as in `Own`.
     """
 
     body: Float[Array, "*records chart"]
     steps: tuple[Array, ...]
-    spin: Float[Array, "*records 3"]
-    turn: Float[Array, "*records 3"] | None
     place: Float[Array, "*records 3"] | None
     speed: Float[Array, "*records 3"] | None
+    turn: Float[Array, "*records 3"] | None
+    spin: Float[Array, "*records 3"]
+
+
+def firsts(own: Own | Local) -> list[Any]:
+    """The first state's numbers, those that there are, in the order of a change of a state."""
+    parts = (own.place, own.speed, own.turn, own.spin)
+    return [part for part in parts if part is not None]
 
 
 def local(problem: "Problem", parameters: Parameters) -> Local:
@@ -90,7 +96,7 @@ def local(problem: "Problem", parameters: Parameters) -> Local:
             step = shared[slot.groups]
         steps.append(step if slot.spread is None else step + next(of_each))
     body = spread(problem.body, parameters.body, problem.which, problem.count)
-    return Local(body, tuple(steps), own.spin, own.turn, own.place, own.speed)
+    return Local(body, tuple(steps), own.place, own.speed, own.turn, own.spin)
 
 
 def columns(problem: "Problem", one: Local) -> np.ndarray:
@@ -129,11 +135,10 @@ def places(problem: "Problem", parameters: Parameters) -> Int[Array, "records co
             parts.append(rows(jnp.asarray(shared, jnp.int32)[slot.groups]))
         if slot.spread is not None:
             deviations.append(rows(next(of_each)))
-    own = counted.own
-    firsts = [rows(leaf) for leaf in (own.spin, own.turn, own.place, own.speed) if leaf is not None]
+    first = [rows(leaf) for leaf in firsts(counted.own)]
     numbers = jnp.asarray(counted.body, jnp.int32)
     body = spread(problem.body, numbers, problem.which, count, fill=size)
-    return jnp.concatenate([body, *parts, *firsts, *deviations], axis=1)
+    return jnp.concatenate([body, *parts, *first, *deviations], axis=1)
 
 
 def numbered(tree: Any) -> Any:

@@ -19,7 +19,6 @@ from rigidjax.identify.full_scale import with_limits
 from rigidjax.identify.jacobian import (
     all_errors,
     filled,
-    first_state,
     over_records,
     states_of_one,
 )
@@ -216,10 +215,10 @@ class Problem(eqx.Module):
             vector,
             tuple(shared),
             Own(
-                nothing,
+                nothing if self.rung is Rigid else None,
+                nothing if self.rung is Rigid else None,
                 None if self.rung is Spin else nothing,
-                nothing if self.rung is Rigid else None,
-                nothing if self.rung is Rigid else None,
+                nothing,
                 tuple(each),
             ),
         )
@@ -231,9 +230,7 @@ class Problem(eqx.Module):
         """
         fits(self, parameters)
         body = self.bodies(parameters)
-        states = jax.vmap(lambda own, ref: first_state(self.rung, own, ref))(
-            parameters.own, self.reference
-        )
+        states = jax.vmap(ReferenceStates.moved)(self.reference, parameters.own)
         return body, padding.one(states, 0) if self.count == 1 else states
 
     def bodies(self, parameters: Parameters) -> Any:
@@ -338,13 +335,13 @@ def fits(problem: Problem, parameters: Parameters) -> Parameters:
     wanted = {
         "body": [(problem.body.size,)],
         "shared": shared,
-        "own.spin": [each],
-        "own.turn": [] if problem.rung is Spin else [each],
         "own.place": [each] if problem.rung is Rigid else [],
         "own.speed": [each] if problem.rung is Rigid else [],
+        "own.turn": [] if problem.rung is Spin else [each],
+        "own.spin": [each],
         "own.each": alone,
     }
-    found = (parameters.body, parameters.shared, own.spin, own.turn, own.place, own.speed, own.each)
+    found = (parameters.body, parameters.shared, own.place, own.speed, own.turn, own.spin, own.each)
     for (name, shapes), part in zip(wanted.items(), found, strict=True):
         numbers = [_checks.numbers(leaf, f"parameters.{name}") for leaf in jax.tree.leaves(part)]
         if [leaf.shape for leaf in numbers] != shapes:

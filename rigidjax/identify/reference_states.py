@@ -10,20 +10,35 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from rigidjax.identify.direct_estimates import attitudes, place_of, rates
+from rigidjax.identify.parameters import firsts
 from rigidjax.identify.recording import Recording
 from rigidjax.identify.sensors import Gyro, Marker, Position, Range, Velocity
-from rigidjax.motion import Rigid, Spin
+from rigidjax.motion import Attitude, Rigid, Spin
+from rigidjax.motion.manifold import names, plus
 from rigidjax.rotation import quaternion
 
 
 class ReferenceStates(eqx.Module):
-    """Where the first state of a recording is counted from, and in which units."""
+    """Where the first state of a recording is counted from, at rest, and in which units."""
 
-    q: Float[Array, "*records 4"] | None
-    x: Float[Array, "*records 3"] | None
-    v: Float[Array, "*records 3"] | None
+    state: Any
     rate: Float[Array, "*records"]
     length: Float[Array, "*records"]
+
+    @property
+    def units(self) -> Float[Array, "*records n"]:
+        """How large a change of order one is, number by number."""
+        sizes = {
+            "x": self.length,
+            "v": self.length * self.rate,
+            "q": jnp.ones_like(self.rate),
+            "omega": self.rate,
+        }
+        return jnp.repeat(jnp.stack([sizes[name] for name in names(self.state)], -1), 3, -1)
+
+    def moved(self, own: Any) -> Any:
+        """The first state of one recording; `own` an `Own` or a `Local`."""
+        return plus(self.state, self.units * jnp.concatenate(firsts(own)))
 
 
 def reference_of(recordings: Sequence[Recording], rung: type) -> ReferenceStates:
@@ -32,13 +47,11 @@ def reference_of(recordings: Sequence[Recording], rung: type) -> ReferenceStates
     places = [_first_place(r) for r in recordings]
     dtype = recordings[0].t.dtype
     # Arrays, not floats: another recording must not compile again.
-    return ReferenceStates(
-        None if rung is Spin else jnp.asarray(np.stack(turns), dtype),
-        jnp.asarray(np.stack([x for x, _, _ in places]), dtype) if rung is Rigid else None,
-        jnp.asarray(np.stack([v for _, v, _ in places]), dtype) if rung is Rigid else None,
-        jnp.asarray([_typical_rate(r) for r in recordings], dtype),
-        jnp.asarray([length for _, _, length in places], dtype),
-    )
+    x, v, length = (jnp.asarray(np.stack(part), dtype) for part in zip(*places, strict=True))
+    q, still = jnp.asarray(np.stack(turns), dtype), jnp.zeros_like(x)
+    states = {Spin: Spin(still), Attitude: Attitude(q, still), Rigid: Rigid(x, v, q, still)}
+    typical = jnp.asarray([_typical_rate(r) for r in recordings], dtype)
+    return ReferenceStates(states[rung], typical, length)
 
 
 def _typical_rate(recording: Recording) -> float:

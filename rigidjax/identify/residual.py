@@ -6,13 +6,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from rigidjax.identify.jacobian import all_errors, first_state
+from rigidjax.identify.jacobian import all_errors
 from rigidjax.identify.loss import shrink, weight
 from rigidjax.identify.parameters import Parameters
 from rigidjax.identify.problem import Problem
+from rigidjax.identify.reference_states import ReferenceStates
 from rigidjax.identify.several_bodies import Bodies
-from rigidjax.motion import Attitude, Rigid
-from rigidjax.rotation import quaternion
+from rigidjax.motion.manifold import minus
 
 # One (R, k) for each sensor: R recordings, k components.
 Noise = tuple[Float[Array, "records _"], ...]
@@ -118,19 +118,9 @@ def gaps(parameters: Parameters, problem: Problem, ends: Any) -> Float[Array, "r
     """How far each piece's end is from the next one's start, typical units; zero at the last."""
     assert problem.links is not None
     ref = problem.reference
-    starts = jax.vmap(lambda own, r: first_state(problem.rung, own, r))(parameters.own, ref)
+    starts = jax.vmap(ReferenceStates.moved)(ref, parameters.own)
     following = jax.tree.map(lambda leaf: jnp.roll(leaf, -1, axis=0), starts)
-    rate = ref.rate[:, None]
-    parts = [(ends.omega - following.omega) / rate]
-    if problem.rung in (Attitude, Rigid):
-        between = jax.vmap(
-            lambda a, b: quaternion.log(quaternion.multiply(quaternion.conjugate(a), b))
-        )
-        parts.append(between(following.q, ends.q))
-    if problem.rung is Rigid:
-        length = ref.length[:, None]
-        parts += [(ends.x - following.x) / length, (ends.v - following.v) / (length * rate)]
-    return jnp.concatenate(parts, axis=1) * problem.links.on[:, None]
+    return jax.vmap(minus)(ends, following) / ref.units * problem.links.on[:, None]
 
 
 def weights_of(problem: Problem, errors: tuple, noise: Noise) -> tuple[Float[Array, "..."], ...]:

@@ -1,6 +1,6 @@
 """Which combinations of numbers the data do not determine, by the user's names."""
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import equinox as eqx
 import jax
@@ -13,6 +13,8 @@ from rigidjax.body.inertia import MassProperties
 from rigidjax.identify.parameters import Parameters
 from rigidjax.identify.problem import Problem
 from rigidjax.identify.quantities import charts, labels, recording_names, vector
+from rigidjax.identify.reference_states import ReferenceStates
+from rigidjax.motion.manifold import minus, parts
 from rigidjax.rotation import quaternion
 
 if TYPE_CHECKING:
@@ -162,36 +164,28 @@ def _slopes(problem: Problem, parameters: Parameters) -> tuple[Array, Array]:
     """
     flat, restore = ravel_pytree(parameters)
     reference = problem.reference
-    q = None if parameters.own.turn is None else _attitudes(reference, parameters.own)
+    start = jax.vmap(ReferenceStates.moved)(reference, parameters.own)
 
     def value(x: Array) -> Array:
         moved = restore(x)
         bodies = problem.bodies(moved)
         rows = bodies.values() if isinstance(bodies, dict) else (bodies,)
-        parts = [vector(problem, moved)]
+        shown = [vector(problem, moved)]
         for body in rows:
             tensor = (body.inertia if isinstance(body, MassProperties) else body).tensor
-            parts.append(jnp.stack([tensor[place] for place in TENSOR.values()]))
-        before, beyond = list(parts), []
-        if q is not None:
-            now = _attitudes(reference, moved.own)
-            back = jax.vmap(quaternion.conjugate)(q)
-            turned = jax.vmap(lambda a, b: quaternion.log(quaternion.multiply(a, b)))
-            before.append(turned(now, back).reshape(-1))
-            parts.append(turned(back, now).reshape(-1))
-        if moved.own.place is not None:
-            length, rate = reference.length[:, None], reference.rate[:, None]
-            beyond = [length * moved.own.place, length * rate * moved.own.speed]
-        beyond = [part.reshape(-1) for part in beyond]
-        both = (jnp.concatenate([*some, *beyond]) for some in (before, parts))
-        return jnp.stack(list(both))
+            shown.append(jnp.stack([tensor[place] for place in TENSOR.values()]))
+        now = jax.vmap(ReferenceStates.moved)(reference, moved.own)
+        one = jax.tree.map(lambda leaf: leaf[0], now)
+        change = parts(one, jax.vmap(minus)(now, start))
+        offset = parts(one, jax.vmap(minus)(now, reference.state))
+        beyond = [offset[name].reshape(-1) for name in ("x", "v") if name in offset]
+        both = [], []
+        if "q" in change:
+            world = jax.vmap(quaternion.rotate)(start.q, change["q"])
+            both = [world.reshape(-1)], [change["q"].reshape(-1)]
+        return jnp.stack([jnp.concatenate([*shown, *turn, *beyond]) for turn in both])
 
     return jax.jacfwd(value)(flat), value(flat)[1]
-
-
-def _attitudes(reference: Any, own: Any) -> Array:
-    """The first attitudes (R, 4)."""
-    return jax.vmap(quaternion.multiply)(reference.q, jax.vmap(quaternion.exp)(own.turn))
 
 
 def _kept(fit: "Fit", names: list[str], changes: np.ndarray) -> np.ndarray:

@@ -9,17 +9,18 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from rigidjax import _checks
-from rigidjax.identify.horizons import Horizons, between, kinds_of
+from rigidjax.identify.horizons import Horizons, held_errors
 from rigidjax.identify.levenberg_marquardt import BOLD, Search, Settings, search
 from rigidjax.identify.open_loop import errors_by_horizon, open_loop_errors
 from rigidjax.identify.quantities import carried
 from rigidjax.identify.real_bodies import unreal
 from rigidjax.identify.uncertainty import inverted
-from rigidjax.identify.window_starts import eliminated, moved, precisions, with_jacobian
+from rigidjax.identify.window_starts import eliminated, precisions, with_jacobian
 from rigidjax.identify.windows import Windows
+from rigidjax.motion.manifold import names, parts, plus
 from rigidjax.motion.torques.inputs import delays_of, require_inputs
 from rigidjax.solve.validation import require_fit
 
@@ -130,7 +131,7 @@ def fit_windows(
     require_inputs(law, windows.inputs)
     _require_delays(windows, law)
     scales = _scales(windows, noise)
-    firm = precisions(starts, kinds_of(windows.starts), noise)
+    firm = precisions(starts, names(windows.starts), noise)
     padded, count = _padded(windows), np.asarray(windows.count, np.int32)
 
     def searched(value: Any, settings: Settings, steps: int) -> Search:
@@ -165,7 +166,7 @@ def fit_windows(
         _require_delays(windows, scene(value)[1])
     except ValueError as refused:
         message.append(str(refused))
-    kinds = {k: float(v) for k, v in scales.items()}
+    kinds = {k: float(v[0]) for k, v in parts(start, scales).items()}
     return WindowFit(
         value,
         back(jnp.asarray(deviation)),
@@ -221,19 +222,20 @@ def _require_delays(windows: Windows, law: Any) -> None:
             )
 
 
-def _scales(windows: Windows, noise: Mapping[str, float] | None) -> dict[str, Array]:
-    kinds = kinds_of(windows.starts)
+def _scales(windows: Windows, noise: Mapping[str, float] | None) -> Float[Array, " m"]:
+    """Of each number of an error, what it is measured in."""
+    kinds = names(windows.starts)
     if noise is not None:
         if not isinstance(noise, Mapping):
             raise TypeError(f"noise: wanted numbers by kind, got {type(noise).__name__}")
         if set(noise) != set(kinds):
             raise ValueError(f"noise: wanted a number for each of {kinds}, got {tuple(noise)}")
-        return {k: jnp.asarray(_checks.positive(noise[k], f"noise[{k!r}]")) for k in kinds}
-    held = jax.tree.map(
-        lambda a, b: jnp.broadcast_to(a[:, None], b.shape), windows.starts, windows.wanted
-    )
-    rms = {k: jnp.sqrt(jnp.mean(v * v)) for k, v in between(held, windows.wanted).items()}
-    return {k: jnp.where(v > 0, v, 1.0) for k, v in rms.items()}
+        each = np.array([_checks.positive(noise[k], f"noise[{k!r}]") for k in kinds])
+    else:
+        squares = np.mean(np.asarray(held_errors(windows)) ** 2, (0, 1))
+        each = np.sqrt(np.mean(squares.reshape(len(kinds), 3), 1))
+        each[each == 0] = 1.0
+    return jnp.asarray(np.repeat(each, 3))
 
 
 def _padded(windows: Windows) -> tuple[Any, Any, Any]:
@@ -269,13 +271,12 @@ def _searched(
         start, wanted, inputs = window
 
         def errors(x: Array, start: Any) -> Array:
-            found = open_loop_errors(scene, h, back(x), start, wanted, inputs, scales, steps)
-            return ravel_pytree(found)[0]
+            found = open_loop_errors(scene, h, back(x), start, wanted, inputs, steps)
+            return (found / scales[None]).reshape(-1)
 
         if firm is not None:
-            held = jnp.repeat(jnp.stack([firm[kind] for kind in scales]), 3)
             cost, gram, slope = eliminated(
-                lambda x, step: errors(x, moved(start, step, scales)), x, held
+                lambda x, step: errors(x, plus(start, scales * step)), x, firm
             )
             return slope[:, None] * slope[None], cost, gram, slope
 

@@ -14,7 +14,6 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from rigidjax import _checks
-from rigidjax.rotation import quaternion
 
 # Steps of Gauss and Newton's for each start; residuals of a short run are nearly linear in it.
 _STEPS = 3
@@ -22,8 +21,8 @@ _STEPS = 3
 
 def precisions(
     starts: Any, kinds: tuple[str, ...], noise: Mapping[str, float] | None
-) -> dict[str, Array] | None:
-    """How firmly each kind of the starts is held, (noise/deviation)²; `None` for exactly.
+) -> Float[Array, " m"] | None:
+    """How firmly each number of the starts is held, (noise/deviation)²; `None` for exactly.
 
     **Raises:** `TypeError`, `ValueError` for kinds that there are not, deviations that are not
     positive, or no noise to compare them with.
@@ -39,7 +38,7 @@ def precisions(
             "starts: how far they may be off says something only beside the noise of the readings: "
             "give noise={…}, too"
         )
-    found = {}
+    found = []
     for kind in kinds:
         deviation = _checks.number(starts[kind], f"starts[{kind!r}]")
         if not deviation > 0:
@@ -47,18 +46,8 @@ def precisions(
                 f"starts[{kind!r}]: wanted a positive deviation, or infinity for a start that is "
                 f"free, got {deviation}"
             )
-        found[kind] = jnp.asarray((np.float64(noise[kind]) / deviation) ** 2)
-    return found
-
-
-def moved(start: Any, step: Float[Array, " m"], scales: Mapping[str, Array]) -> Any:
-    """A start moved by three numbers for each kind, in units of `scales`; q by a turn."""
-    found = {}
-    for i, (kind, scale) in enumerate(scales.items()):
-        value, by = getattr(start, kind), scale * step[3 * i : 3 * i + 3]
-        turned = kind == "q"
-        found[kind] = quaternion.multiply(value, quaternion.exp(by)) if turned else value + by
-    return type(start)(**found)
+        found += 3 * [(np.float64(noise[kind]) / deviation) ** 2]
+    return jnp.asarray(np.array(found))
 
 
 def eliminated(

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from rigidjax import _checks
-from rigidjax.identify.horizons import Horizons, between, by_horizon
+from rigidjax.identify.horizons import Horizons, by_horizon, held_errors
 from rigidjax.motion import Attitude, Rigid, Spin
 
 
@@ -48,10 +48,7 @@ class Windows(eqx.Module):
 
     def held(self) -> Horizons:
         """The errors of a prediction that holds the state at the start: what a model must beat."""
-        held = jax.tree.map(
-            lambda a, b: jnp.broadcast_to(a[:, None], b.shape), self.starts, self.wanted
-        )
-        return by_horizon(between(held, self.wanted))
+        return by_horizon(self, held_errors(self))
 
     @staticmethod
     def joined(*parts: "Windows") -> "Windows":

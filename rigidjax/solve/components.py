@@ -12,11 +12,12 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
+Atoms = tuple[Array, ...]
 # Beyond this many numbers, writing each out costs more to compile than it gains.
 FEW = 32
 
 
-def split(tree: Any) -> tuple[Array, ...]:
+def split(tree: Any) -> Atoms:
     """The numbers of a tree of arrays as scalars, leaf by leaf; long leaves stay whole."""
     parts: list[Array] = []
     for leaf in jax.tree.leaves(tree):
@@ -28,7 +29,7 @@ def split(tree: Any) -> tuple[Array, ...]:
     return tuple(parts)
 
 
-def join(parts: tuple[Array, ...], like: Any) -> Any:
+def join(parts: Atoms, like: Any) -> Any:
     """The tree shaped as `like` whose numbers are `parts`, as `split` gave them."""
     leaves, structure = jax.tree.flatten(like)
     queue = iter(parts)

@@ -1,6 +1,5 @@
 """Explicit Runge–Kutta methods of orders 4, 5 and 8 as solvers of diffrax."""
 
-from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
 import diffrax as dfx
@@ -11,7 +10,6 @@ from jax import lax
 from jaxtyping import Array
 
 from rigidjax.motion import on_the_group
-from rigidjax.rotation.barrier import barrier
 from rigidjax.solve.components import flat, leaf_sizes, unflat
 from rigidjax.solve.runge_kutta import (
     Stages,
@@ -22,9 +20,7 @@ from rigidjax.solve.runge_kutta import (
     stages,
     weights,
 )
-from rigidjax.solve.tableaus import DORMAND_PRINCE8, KUTTA4, TSITOURAS5, Row, Tableau
-
-Atoms = tuple[Array, ...]
+from rigidjax.solve.tableaus import DORMAND_PRINCE8, KUTTA4, TSITOURAS5, Tableau
 
 
 class NestedInterpolation(dfx.AbstractLocalInterpolation):
@@ -135,36 +131,6 @@ class DormandPrince8(AbstractExplicit):
     tableau: ClassVar[Tableau] = DORMAND_PRINCE8
 
 
-def advance(
-    tableau: Tableau,
-    field: Callable[[Any, Atoms], Atoms],
-    t: Any,
-    h: Any,
-    y: Atoms,
-    end: Any = None,
-) -> tuple[Atoms, list[Atoms]]:
-    """One step from `y`, not projected, and the slopes at its stages.
-
-    **Arguments:** `field(t, y)` on tuples of arrays, which `y` is; `t`, `h` scalars; `end` the time
-    of the stages at the end of the step, where it is not to be `t + h` rounded.
-    """
-    end = t + h if end is None else end
-    slopes = [_fence(field(t, y))]
-    for node, row in zip(tableau.c, tableau.a, strict=True):
-        place = _fence(_along(y, h, row, slopes))
-        slopes.append(_fence(field(end if node == 1 else t + node * h, place)))
-    return _along(y, h, tableau.b, slopes), slopes
-
-
-def _fence(numbers: Atoms) -> Atoms:
-    """The same numbers, not to be computed again in each place that reads them.
-
-    Without it XLA makes of each result of a step one kernel, which repeats all stages before it. On
-    one trajectory LLVM finds the copies; in a batch, or beside tangents, it cannot.
-    """
-    return barrier(numbers)
-
-
 def _diffrax_step(
     tableau: Tableau, terms: Any, t0: Any, t1: Any, y0: Any, args: Any
 ) -> tuple[Any, Any, Any, None, dfx.RESULTS]:
@@ -200,27 +166,3 @@ def _dense(tableau: Tableau, field: Any, step: Step, there: Stages) -> Array:
     room = jnp.zeros((slopes.shape[0], whole - count), slopes.dtype)
     slopes = jnp.concatenate([slopes, room], 1)
     return dense_rows(tableau, step.h, lax.fori_loop(count, whole, extra, slopes))
-
-
-def _along(y: Atoms, h: Any, row: Row, slopes: Sequence[Atoms]) -> Atoms:
-    return plus(y, h, _weighted(row, slopes))
-
-
-def plus(y: Atoms, h: Any, rise: Atoms) -> Atoms:
-    """The state `y + h · rise`, in the precision of y."""
-    return tuple(a + _as(h, a) * k for a, k in zip(y, rise, strict=True))
-
-
-def _weighted(row: Row, slopes: Sequence[Atoms]) -> Atoms:
-    out = []
-    for i in range(len(slopes[0])):
-        total = None
-        for stage, weight in row.items():
-            part = weight * slopes[stage][i]
-            total = part if total is None else total + part
-        out.append(total)
-    return tuple(out)
-
-
-def _as(h: Any, like: Array) -> Array:
-    return jnp.asarray(h, like.dtype)

@@ -14,11 +14,11 @@ from rigidjax import _checks
 from rigidjax._types import ScalarLike
 from rigidjax.motion import on_the_group
 from rigidjax.motion.coupled import Coupled
+from rigidjax.motion.manifold import dimension, minus_small, plus
 from rigidjax.solve import validation
 from rigidjax.solve.adaptive import adaptive
 from rigidjax.solve.components import flat
 from rigidjax.solve.explicit import AbstractExplicit, DormandPrince8
-from rigidjax.solve.tangent import between, dimension, moved
 
 # Neighbouring intervals are not independent: the error is that of the means of so many parts.
 _PARTS = 20
@@ -165,9 +165,9 @@ def _solved(
         slope = field(t, y.motion, args)
 
         def rate(change: Array) -> Array:
-            near = moved(y.motion, change)
-            both = (slope, field(t, near, args))
-            return jax.jvp(between, (y.motion, near), both)[1]
+            near = plus(y.motion, change)
+            both = (field(t, near, args), slope)
+            return jax.jvp(minus_small, (near, y.motion), both)[1]
 
         # Held orthonormal to second order: off that, the equations of a frame are unstable.
         frame = 1.5 * frame - 0.5 * _product(frame, _product(frame.T, frame))

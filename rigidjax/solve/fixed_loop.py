@@ -15,6 +15,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from rigidjax.motion.torques.inputs import Row, delays_of
+from rigidjax.solve.equal_steps import Rolled
 from rigidjax.solve.explicit import AbstractExplicit
 from rigidjax.solve.magnus import Magnus4
 from rigidjax.solve.splitting import AbstractSplitting
@@ -22,7 +23,7 @@ from rigidjax.solve.steppers import Stepper, stepper_of
 
 
 def fixed(
-    solver: AbstractExplicit | Magnus4 | AbstractSplitting,
+    solver: AbstractExplicit | Rolled | Magnus4 | AbstractSplitting,
     field: Callable[..., Any],
     ts: Float[Array, " times"],
     y0: Any,
@@ -61,22 +62,25 @@ def fixed(
     if last is None:
         _, rest = lax.scan(span, stepper.start, (ts[:-1], ts[1:]))
     else:
-        rest = _up_to(last, span, stepper.start, ts)
+        start = stepper.start
+        still = jax.tree.map(lambda a: jnp.broadcast_to(a, (ts.size - 1, *a.shape)), start)
+        rest = first_rows(last, lambda y, i: span(y, (ts[i], ts[i + 1])), start, still)
     later = jax.vmap(stepper.state)(rest)
     return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), y0, later)
 
 
-def _up_to(last: Any, span: Callable[..., Any], start: Any, ts: Array) -> Any:
-    """The ends of the first `last` spans, as `lax.scan` would stack them; then `start`."""
+def first_rows(many: Any, one: Callable[..., Any], y: Any, rows: Any) -> Any:
+    """`rows` with the first `many` of those that `lax.scan` of `one(y, i)` stacks.
 
-    def one(i: Array, now: tuple[Any, Any]) -> tuple[Any, Any]:
-        y, rest = now
-        y, _ = span(y, (ts[i], ts[i + 1]))
-        return y, jax.tree.map(lambda all_, mine: all_.at[i].set(mine), rest, y)
+    **Arguments:** `many` may be traced (no reverse mode); `one(y, i)` the next y and row i.
+    """
 
-    rest = jax.tree.map(lambda a: jnp.broadcast_to(a, (ts.size - 1, *a.shape)), start)
+    def put(i: Array, now: tuple[Any, Any]) -> tuple[Any, Any]:
+        y, row = one(now[0], i)
+        return y, jax.tree.map(lambda all_, mine: all_.at[i].set(mine), now[1], row)
+
     zero = jnp.zeros((), jnp.int32)
-    return lax.fori_loop(zero, jnp.asarray(last, jnp.int32), one, (start, rest))[1]
+    return lax.fori_loop(zero, jnp.asarray(many, jnp.int32), put, (y, rows))[1]
 
 
 def step(

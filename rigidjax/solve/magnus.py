@@ -18,7 +18,8 @@ from rigidjax.motion.torques.base import sees_attitude
 from rigidjax.rotation.barrier import barrier
 from rigidjax.rotation.kernels import product4, square4
 from rigidjax.solve.components import join, split
-from rigidjax.solve.explicit import NestedInterpolation, advance, cubic_rows
+from rigidjax.solve.equal_steps import advance
+from rigidjax.solve.explicit import NestedInterpolation, cubic_rows
 from rigidjax.solve.tableaus import KUTTA4
 
 
@@ -38,9 +39,9 @@ def turned(
     cubic through both ends. Source: Magnus 1954, doi:10.1002/cpa.3160070404; Iserles, Munthe-Kaas,
     Nørsett and Zanna 2000, doi:10.1017/S0962492900002154, section 5.
     """
-    after, slopes = advance(KUTTA4, slope, t, h, p, end)
+    after, first = advance(KUTTA4, slope, t, h, p, end)
     after = barrier(after)
-    first, last = slopes[0], slope(end, after)
+    last = slope(end, after)
     middle = tuple(
         0.5 * (a + b) + 0.125 * h * (k - m)
         for a, b, k, m in zip(p, after, first, last, strict=True)
@@ -94,15 +95,8 @@ class Magnus4(dfx.AbstractSolver):
         return 4
 
     def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> None:
-        # diffrax wraps the term where time runs backwards.
-        term = terms if isinstance(terms, dfx.ODETerm) else terms.term
-        field: Any = term.vector_field
-        if not isinstance(field, AttitudeEquations) or not isinstance(y0, Attitude):
-            raise TypeError(
-                "Magnus4: wanted AttitudeEquations and an Attitude state, got "
-                f"{type(field).__name__} and {type(y0).__name__}; use RungeKutta4"
-            )
-        require_blind(field.euler.torque)
+        field, _ = field_of(terms)
+        require_blind(require_attitude("Magnus4", field, y0, "RungeKutta4").euler.torque)
 
     def step(
         self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Any, made_jump: Any
@@ -128,6 +122,23 @@ class Magnus4(dfx.AbstractSolver):
 
     def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
         return terms.vf(t0, y0, args)
+
+
+def field_of(terms: Any) -> tuple[Any, Any]:
+    """The vector field inside the term, and the direction of time that diffrax wraps around it."""
+    if isinstance(terms, dfx.ODETerm):
+        return terms.vector_field, 1
+    return terms.term.vector_field, terms.direction
+
+
+def require_attitude(name: str, field: Any, y0: Any, instead: str) -> AttitudeEquations:
+    """`field`, if it is `AttitudeEquations` and the state an `Attitude`; else `TypeError`."""
+    if isinstance(field, AttitudeEquations) and isinstance(y0, Attitude):
+        return field
+    raise TypeError(
+        f"{name}: wanted AttitudeEquations and an Attitude state, got {type(field).__name__} and "
+        f"{type(y0).__name__}; use {instead}"
+    )
 
 
 def require_blind(law: Any) -> None:

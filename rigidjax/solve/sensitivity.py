@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from rigidjax.solve.tangent import between, dimension, moved
+from rigidjax.motion.manifold import dimension, minus_small, plus
 
 
 @eqx.filter_jit
@@ -41,7 +41,7 @@ def transition(flow: Callable[[Any, Array], Any], ts: Array, ys: Any) -> Float[A
     start = jax.tree.map(lambda leaf: leaf[0], ys)
 
     def changes(change: Array) -> Array:
-        return jax.vmap(between)(ys, flow(moved(start, change), ts))
+        return jax.vmap(minus_small)(flow(plus(start, change), ts), ys)
 
     return jax.jacfwd(changes)(jnp.zeros(dimension(start), ts.dtype))
 

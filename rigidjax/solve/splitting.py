@@ -15,13 +15,15 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from rigidjax.exact.components3 import Six, Triple, times
+from rigidjax.exact.components3 import Six, Triple, adjugate, determinant, times
 from rigidjax.exact.derivatives import flow
 from rigidjax.exact.principal_axes import into, out_of, principal_frame
 from rigidjax.motion import Attitude, AttitudeEquations
 from rigidjax.motion.torques.base import evaluate, sees_rate
 from rigidjax.rotation import quaternion
 from rigidjax.solve.explicit import NestedInterpolation, cubic_rows
+from rigidjax.solve.magnus import field_of, require_attitude
+from rigidjax.solve.tableaus import numbers
 
 
 class Composition(NamedTuple):
@@ -49,33 +51,52 @@ STRANG = Composition(2, (1.0,), (0.5, 0.5))
 # kicks commute with each other's commutators: true here too, as a kick depends on attitude alone.
 SRKN6 = _symmetric(
     4,
-    (0.245298957184271, 0.604872665711080),
-    (0.0829844064174052, 0.396309801498368, -0.0390563049223486),
+    numbers("0.245298957184271 0.604872665711080"),
+    numbers("0.0829844064174052 0.396309801498368 -0.0390563049223486"),
 )
 SRKN11 = _symmetric(
     6,
-    (
-        0.123229775946271,
-        0.290553797799558,
-        -0.127049212625417,
-        -0.246331761062075,
-        0.357208872795928,
-    ),
-    (
-        0.0414649985182624,
-        0.198128671918067,
-        -0.0400061921041533,
-        0.0752539843015807,
-        -0.0115113874206879,
-    ),
+    numbers("""
+    0.123229775946271 0.290553797799558 -0.127049212625417 -0.246331761062075 0.357208872795928
+    """),
+    numbers("""
+    0.0414649985182624 0.198128671918067 -0.0400061921041533 0.0752539843015807 -0.0115113874206879
+    """),
 )
 
 
 class Frame(NamedTuple):
-    """What the free flow needs of a body: moments in its principal axes, and those axes."""
+    """The principal frame of a body: moments in it, their inverse, and its axes as columns.
+
+    The off-diagonal entries of both are zero; they carry the tangents.
+    """
 
     moments: Six
+    weights: Six
     axes: Array
+
+
+def principal(tensor: Array) -> Frame:
+    """The principal frame of an inertia (3, 3)."""
+    six, axes = principal_frame(tensor)
+    # Relative to the trace first: the cube of 1e37 kg m² is no number.
+    size = six[0] + six[1] + six[2]
+    unit: Six = tuple(i / size for i in six)
+    scale = determinant(unit)
+    return Frame(six, tuple(c / scale / size for c in adjugate(unit)), axes)
+
+
+@jax.custom_jvp
+def rate_of(weights: Six, p: Triple) -> Triple:
+    """Ω of Π in principal axes."""
+    return weights[0] * p[0], weights[1] * p[1], weights[2] * p[2]
+
+
+@rate_of.defjvp
+def rate_of_jvp(primals, tangents):
+    (weights, p), (dw, dp) = primals, tangents
+    moved = zip(rate_of(weights, dp), times(dw, p), strict=True)
+    return rate_of(weights, p), tuple(a + b for a, b in moved)
 
 
 class AbstractSplitting(dfx.AbstractSolver):
@@ -89,12 +110,17 @@ class AbstractSplitting(dfx.AbstractSolver):
         return self.composition.order
 
     def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> Frame:
-        return frame_of(_field_of(terms)[0], y0)
+        return frame_of(field_of(terms)[0], y0)
 
     def step(
         self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Frame, made_jump: Any
     ) -> Any:
-        return _diffrax_step(self.composition, terms, t0, t1, y0, args, solver_state)
+        field, way = field_of(terms)
+        state, h = (y0.q, enter(solver_state, y0.omega)), jnp.asarray(t1 - t0) * way
+        q, p = compose(self.composition, field, solver_state, jnp.asarray(t0) * way, h, state)
+        y1 = Attitude(q, leave(solver_state, p))
+        dense = dict(y0=y0, coefficients=_dense_rows(terms, t0, t1, args, y0, y1))
+        return y1, None, dense, solver_state, dfx.RESULTS.successful
 
     def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
         return terms.vf(t0, y0, args)
@@ -153,19 +179,14 @@ def frame_of(field: Any, y0: Any) -> Frame:
     **Raises:** `TypeError` for another field than `AttitudeEquations`, or a torque that feels the
     body rate: a kick at a fixed attitude is then no exact flow, and the order falls to 1.
     """
-    if not isinstance(field, AttitudeEquations) or not isinstance(y0, Attitude):
-        raise TypeError(
-            "Splitting: wanted AttitudeEquations and an Attitude state, got "
-            f"{type(field).__name__} and {type(y0).__name__}; use DormandPrince8"
-        )
-    torque = field.euler.torque
+    torque = require_attitude("Splitting", field, y0, "DormandPrince8").euler.torque
     if sees_rate(torque):
         raise TypeError(
             f"Splitting: the torque {type(torque).__name__} depends on the body rate (damping, a "
             "flywheel), or does not say that it does not; only time and attitude may enter a kick: "
             "a law of your own says so by rate_free = True; for others use DormandPrince8"
         )
-    return Frame(*principal_frame(field.euler.inertia.tensor.astype(y0.omega.dtype)))
+    return principal(field.euler.inertia.tensor.astype(y0.omega.dtype))
 
 
 def enter(frame: Frame, omega: Array) -> Triple:
@@ -175,8 +196,7 @@ def enter(frame: Frame, omega: Array) -> Triple:
 
 def leave(frame: Frame, momentum: Triple) -> Array:
     """Ω in body axes."""
-    (x, y, z), (a, b, c, *_) = momentum, frame.moments
-    return jnp.stack(out_of(frame.axes, (x / a, y / b, z / c)))
+    return jnp.stack(out_of(frame.axes, rate_of(frame.weights, momentum)))
 
 
 def compose(
@@ -232,18 +252,6 @@ def _as_long_as(before: Triple, after: Triple) -> Triple:
     return tuple(x + more * x for x in after)
 
 
-def _diffrax_step(
-    composition: Composition, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, frame: Frame
-) -> Any:
-    field, direction = _field_of(terms)
-    h = jnp.asarray(t1 - t0) * direction
-    state = (y0.q, enter(frame, y0.omega))
-    q, momentum = compose(composition, field, frame, jnp.asarray(t0) * direction, h, state)
-    y1 = Attitude(q, leave(frame, momentum))
-    dense = dict(y0=y0, coefficients=_dense_rows(terms, t0, t1, args, y0, y1))
-    return y1, None, dense, frame, dfx.RESULTS.successful
-
-
 def _dense_rows(terms: Any, t0: Any, t1: Any, args: Any, y0: Any, y1: Any) -> Any:
     """The quintic through both ends with first and second derivatives: of order 6."""
     h = terms.contr(t0, t1)
@@ -265,10 +273,3 @@ def _dense_rows(terms: Any, t0: Any, t1: Any, args: Any, y0: Any, y1: Any) -> An
         return jnp.stack([rise, second, third, fourth, fifth])
 
     return jax.tree.map(rows, y0, y1, f0, f1, s0, s1)
-
-
-def _field_of(terms: Any) -> tuple[Any, Any]:
-    """The vector field inside the term, and the direction of time that diffrax wraps around it."""
-    if isinstance(terms, dfx.ODETerm):
-        return terms.vector_field, 1
-    return terms.term.vector_field, terms.direction

@@ -22,23 +22,21 @@ from rigidjax.body.inertia import Inertia
 from rigidjax.exact.components3 import (
     Six,
     Triple,
-    adjugate,
     cross,
-    determinant,
     half_product,
     times,
 )
-from rigidjax.exact.principal_axes import into, out_of, principal_frame
+from rigidjax.exact.principal_axes import out_of
 from rigidjax.motion import Attitude, AttitudeEquations, EulerEquations, Spin, on_the_group
 from rigidjax.motion.torques.base import evaluate, sees_attitude
 from rigidjax.motion.torques.inputs import bind, delays_of
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.barrier import barrier
 from rigidjax.solve import splitting
-from rigidjax.solve.components import join, split
-from rigidjax.solve.explicit import AbstractExplicit, Atoms, RungeKutta4
+from rigidjax.solve.components import Atoms, join, split
+from rigidjax.solve.equal_steps import Rolled, end_of_step
+from rigidjax.solve.explicit import AbstractExplicit, RungeKutta4
 from rigidjax.solve.magnus import Magnus4, require_blind, turned
-from rigidjax.solve.rolled import end_of_step
 from rigidjax.solve.splitting import AbstractSplitting
 
 
@@ -90,7 +88,7 @@ def _stepper_of(solver: Any, field: Callable[..., Any], y0: Any) -> Stepper:
         return _free(turning.inertia, y0) if turning.torque is None else _magnus(turning, y0)
     if isinstance(solver, AbstractSplitting):
         return _split(solver, field, y0)
-    if not isinstance(solver, AbstractExplicit):
+    if not isinstance(solver, AbstractExplicit | Rolled):
         raise TypeError(
             f"no equal steps of {type(solver).__name__} on {type(y0).__name__}; wanted "
             "RungeKutta4, Tsitouras5 or DormandPrince8 of rigidjax.solvers, or, for an Attitude, "
@@ -121,45 +119,27 @@ def _turning(field: Any, y0: Any) -> _Turning | None:
 
 def _free(body: Inertia, state0: Attitude) -> Stepper:
     """Principal axes, held fixed in derivatives: the off-diagonal entries carry only tangents."""
-    six, axes = principal_frame(body.tensor)
-    # Relative to the trace first: the cube of 1e37 kg m² is no number.
-    size = six[0] + six[1] + six[2]
-    unit: Six = tuple(i / size for i in six)
-    scale = determinant(unit)
-    weights: Six = tuple(c / scale / size for c in adjugate(unit))
+    frame = splitting.principal(body.tensor)
+    weights, axes = frame.weights, frame.axes
     a, b, c, *_ = lax.stop_gradient(weights)
     gaps = (c - b, a - c, b - a)
-    momentum = times(six, into(axes, state0.omega))
+    momentum = splitting.enter(frame, state0.omega)
     one, none = jnp.ones_like(a), jnp.zeros_like(a)
 
     def step(t: Any, end: Any, h: Any, y: Atoms, inputs: Any) -> Atoms:
         q, p = turned(
             lambda _, p: _free_slope(weights, gaps, p),
-            lambda p: _free_rate(weights, p),
+            lambda p: splitting.rate_of(weights, p),
             t, end, h, y[:4], y[4:],
         )  # fmt: skip
         return (*q, *p)
 
     def state(y: Atoms) -> Attitude:
         # The numbers are the turn since the start, seen from the axes: Aᵀ…A turns its vector.
-        omega = jnp.stack(out_of(axes, _free_rate(weights, y[4:])))
         turn = jnp.stack([y[0], *out_of(axes, y[1:4])])
-        return Attitude(quaternion.multiply(state0.q, turn), omega)
+        return Attitude(quaternion.multiply(state0.q, turn), splitting.leave(frame, y[4:]))
 
     return Stepper((one, none, none, none, *momentum), step, state)
-
-
-@jax.custom_jvp
-def _free_rate(weights: Six, p: Triple) -> Triple:
-    """Ω of Π in principal axes."""
-    return weights[0] * p[0], weights[1] * p[1], weights[2] * p[2]
-
-
-@_free_rate.defjvp
-def _free_rate_jvp(primals, tangents):
-    (weights, p), (dw, dp) = primals, tangents
-    moved = zip(_free_rate(weights, dp), times(dw, p), strict=True)
-    return _free_rate(weights, p), tuple(a + b for a, b in moved)
 
 
 @jax.custom_jvp
@@ -171,7 +151,7 @@ def _free_slope(weights: Six, gaps: Triple, p: Triple) -> Triple:
 @_free_slope.defjvp
 def _free_slope_jvp(primals, tangents):
     (weights, gaps, p), (dw, _, dp) = primals, tangents
-    rate, turning = _free_rate_jvp((weights, p), (dw, dp))
+    rate, turning = splitting.rate_of_jvp((weights, p), (dw, dp))
     moved = zip(cross(dp, rate), cross(p, turning), strict=True)
     return _free_slope(weights, gaps, p), tuple(a + b for a, b in moved)
 
@@ -207,43 +187,47 @@ def _magnus(turning: _Turning, state0: Attitude) -> Stepper:
     return Stepper((*start[:4], *times(_entries(body.tensor), start[4:])), step, state)
 
 
-def _explicit(solver: AbstractExplicit, turning: _Turning, state0: Any) -> Stepper:
+def _explicit(solver: AbstractExplicit | Rolled, turning: _Turning, state0: Any) -> Stepper:
     body, weights, torque = turning
     start = split(state0)
     many = len(start) - 3
 
-    def step(t: Any, end: Any, h: Any, y: Atoms, inputs: Any) -> Atoms:
+    def slope_under(inputs: Any) -> Callable[[Any, Atoms], Atoms]:
         law = bind(torque, inputs)
 
-        def field(t: Any, y: Atoms) -> Atoms:
+        def slope(t: Any, y: Atoms) -> Atoms:
             q, p = y[:many], y[many:]
             # Shared by attitude and momentum; fenced: else each of seven results computes it again.
             omega = barrier(times(weights, p))
-            slope = cross(p, omega)
+            pushed = cross(p, omega)
             if law is not None:
                 value = evaluate(law, t, join((*q, *omega), state0), body)
-                slope = _sum(slope, split(value))
-            return (*half_product(q, omega), *slope) if many else slope
+                pushed = _sum(pushed, split(value))
+            return (*half_product(q, omega), *pushed) if many else pushed
 
-        return _projected(end_of_step(solver, field, t, h, y, end), state0)
+        return slope
 
     def state(y: Atoms) -> Any:
         return join((*y[:many], *times(weights, y[many:])), state0)
 
     momentum = times(_entries(body.tensor), start[many:])
-    return Stepper((*start[:many], *momentum), step, state)
+    return _of_slope(solver, slope_under, (*start[:many], *momentum), state, state0)
 
 
-def _general(solver: AbstractExplicit, field: Callable[..., Any], state0: Any) -> Stepper:
-    def step(t: Any, end: Any, h: Any, y: Atoms, inputs: Any) -> Atoms:
+def _general(solver: AbstractExplicit | Rolled, field: Callable[..., Any], state0: Any) -> Stepper:
+    def slope_under(inputs: Any) -> Callable[[Any, Atoms], Atoms]:
         here = bind(field, inputs)
+        return lambda t, y: split(here(t, join(y, state0), None))
 
-        def slope(t: Any, y: Atoms) -> Atoms:
-            return split(here(t, join(y, state0), None))
+    return _of_slope(solver, slope_under, split(state0), lambda y: join(y, state0), state0)
 
-        return _projected(end_of_step(solver, slope, t, h, y, end), state0)
 
-    return Stepper(split(state0), step, lambda y: join(y, state0))
+def _of_slope(solver: Any, slope_under: Any, start: Atoms, state: Any, like: Any) -> Stepper:
+    def step(t: Any, end: Any, h: Any, y: Atoms, inputs: Any) -> Atoms:
+        after = end_of_step(solver, slope_under(inputs), t, h, y, end)
+        return split(on_the_group(join(after, like)))
+
+    return Stepper(start, step, state)
 
 
 def _split(solver: AbstractSplitting, field: Any, state0: Any) -> Stepper:
@@ -260,10 +244,6 @@ def _split(solver: AbstractSplitting, field: Any, state0: Any) -> Stepper:
         return Attitude(y[0], splitting.leave(frame, y[1]))
 
     return Stepper((state0.q, splitting.enter(frame, state0.omega)), step, state)
-
-
-def _projected(y: Atoms, like: Any) -> Atoms:
-    return split(on_the_group(join(y, like)))
 
 
 def _sum(a: Triple, b: Triple) -> Triple:

@@ -92,8 +92,7 @@ def _parameters(problem: Problem, one: starts.Candidate, turn: np.ndarray) -> Pa
     moments = turn @ np.diag(one.moments) @ turn.T
     start = problem.start(Inertia(jnp.asarray(moments)))
     reference = problem.reference
-    assert reference.q is not None
-    q = _place(jnp.asarray(one.q), jnp.asarray(turn), reference.q[0])
+    q = _place(jnp.asarray(one.q), jnp.asarray(turn), reference.state.q[0])
     spin = jnp.asarray(turn @ one.omega)[None] / reference.rate[:, None]
     return eqx.tree_at(lambda p: (p.own.spin, p.own.turn), start, (spin, q[None]))
 

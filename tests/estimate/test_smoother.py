@@ -10,7 +10,8 @@ from once import once
 
 import rigidjax as rj
 from rigidjax import estimate, identify
-from rigidjax.estimate.scene import Dynamics, Extended, between, retract
+from rigidjax.estimate.scene import Dynamics, Extended
+from rigidjax.motion.manifold import minus, plus
 
 COUNT = 5
 
@@ -41,7 +42,7 @@ def test_it_is_the_most_probable_motion(short):
 
     def residuals(z):
         """Of the first error and all kicks, in unit normal numbers."""
-        x = retract(first.x, first.root @ z[:6])
+        x = plus(first.x, first.root @ z[:6])
         out = []
         for k in range(COUNT):
             if k:
@@ -61,10 +62,10 @@ def test_it_is_the_most_probable_motion(short):
     )  # fmt: skip
     last = once(lambda z: residuals(z)[1])(best.x)
     end = jax.tree.map(lambda leaf: leaf[-1], found.belief.x)
-    np.testing.assert_allclose(between(last, end), 0, atol=1e-7)
+    np.testing.assert_allclose(minus(end, last), 0, atol=1e-7)
     # The deviations are those of the same problem's normal equations.
     spread = np.linalg.inv(best.jac.T @ best.jac)
-    moved = once(jax.jacfwd(lambda z: between(last, residuals(z)[1])))(best.x)
+    moved = once(jax.jacfwd(lambda z: minus(residuals(z)[1], last)))(best.x)
     np.testing.assert_allclose(found.belief.covariance[-1], moved @ spread @ moved.T, atol=1e-7)
     # The kicks, whose first three numbers are the mean torque of a step.
     step = float(record.t[1] - record.t[0])

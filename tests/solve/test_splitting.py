@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from once import once
 from systems import driven
 
 import rigidjax as rj
@@ -176,6 +177,22 @@ def test_derivatives_of_a_run():
     np.testing.assert_allclose(
         eqx.filter_jit(jax.jacfwd(end))(w), eqx.filter_jit(jax.jacfwd(right))(w), atol=1e-7
     )
+
+
+@pytest.mark.long
+def test_derivatives_by_the_whole_tensor():
+    """A change that turns the principal axes, too: beside central differences of the same steps."""
+    change = jnp.array([[0.3, -1.0, 0.7], [-1.0, 0.2, 0.4], [0.7, 0.4, -0.5]])
+
+    def end(s):
+        field = rj.motion.AttitudeEquations(rj.Inertia(TENSOR + s * change), TOP)
+        out = fixed(Splitting2(), field, jnp.array([0.0, 0.3]), START, 2)
+        return jnp.concatenate([out.q[-1], out.omega[-1]])
+
+    value = once(end)
+    low, high = (value(jnp.asarray(s)) for s in (-1e-5, 1e-5))
+    found = once(jax.jacfwd(end))(jnp.asarray(0.0))
+    np.testing.assert_allclose(found, (high - low) / 2e-5, rtol=0, atol=1e-8)
 
 
 @pytest.mark.usefixtures("unhooked")

@@ -10,7 +10,7 @@ import pytest
 import rigidjax as rj
 from rigidjax.motion.torques.base import sees_attitude, sees_rate
 from rigidjax.solve import components, explicit, fixed
-from rigidjax.solve.rolled import in_a_loop
+from rigidjax.solve.equal_steps import in_a_loop
 from rigidjax.solve.steppers import stepper_of
 
 BODY = rj.Inertia([[1.6, 0.1, 0.0], [0.1, 2.0, 0.2], [0.0, 0.2, 3.0]])

@@ -1,0 +1,193 @@
+"""Small changes of a state: ⊕, ⊖, how many numbers a change has, and their names.
+
+A state is any tree of arrays: a `Spin`, an `Attitude`, a `Rigid`, a `Coupled`, a `frames.Point`, an
+array. A change of it is one vector, the numbers of the leaves in their own order; a quaternion q of
+a state with an attitude counts as three, the rotation vector δθ (rad, body frame) of `q exp(δθ)`.
+So a change of a `Rigid` is (x, v, δθ, Ω). Source: Solà, Deray and Atchuthan 2018, arXiv:1812.01537,
+right-⊕ and right-⊖.
+"""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from rigidjax._types import HasAttitude
+from rigidjax.rotation import quaternion
+from rigidjax.rotation.kernels import quaternion_to_vector, vector_to_quaternion
+from rigidjax.rotation.linalg3 import components
+
+
+def dimension(state: Any) -> int:
+    """How many numbers a change of `state` has: one less than its own for each quaternion.
+
+    >>> import rigidjax as rj
+    >>> dimension(rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 0]))
+    6
+    """
+    return sum(_sizes(state))
+
+
+def names(state: Any) -> tuple[str, ...]:
+    """The names of the leaves, in the order in which a change has their numbers.
+
+    >>> import rigidjax as rj
+    >>> names(rj.Rigid([0.0, 0, 0], [0.0, 0, 0], [1.0, 0, 0, 0], [0.0, 0, 0]))
+    ('x', 'v', 'q', 'omega')
+    """
+    paths = jax.tree.leaves_with_path(state)
+    return tuple(jax.tree_util.keystr(path, simple=True, separator=".") for path, _ in paths)
+
+
+def parts(state: Any, change: Float[Array, "*batch n"]) -> dict[str, Float[Array, "*batch _"]]:
+    """The numbers of each leaf in a change, by name; those of a quaternion are three.
+
+    >>> import rigidjax as rj
+    >>> parts(rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 0]), jnp.arange(6.0))["omega"].tolist()
+    [3.0, 4.0, 5.0]
+    """
+    return dict(zip(names(state), _cut(state, change), strict=True))
+
+
+def turns(state: Any) -> tuple[slice, ...]:
+    """Where in a change the rotation vectors are, one for each quaternion.
+
+    >>> import rigidjax as rj
+    >>> turns(rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 0]))
+    (slice(0, 3, None),)
+    """
+    sizes, end, out = _sizes(state), 0, []
+    for size, turned in zip(sizes, _turned(state), strict=True):
+        end += size
+        out += [slice(end - size, end)] if turned else []
+    return tuple(out)
+
+
+def plus(state: Any, change: Float[Array, " n"]) -> Any:
+    """`state ⊕ change`: q exp(δθ), and sums; exactly `state` at 0.
+
+    >>> import rigidjax as rj
+    >>> plus(rj.Spin([1.0, 0, 0]), jnp.array([0.0, 0.5, 0.0])).omega.tolist()
+    [1.0, 0.5, 0.0]
+    """
+
+    def turned(q: Array, part: Array) -> Array:
+        return quaternion.multiply(q, vector_to_quaternion(part))
+
+    return _leaf_by_leaf(state, change, turned, jnp.add)
+
+
+def minus(state: Any, reference: Any) -> Float[Array, " n"]:
+    """`state ⊖ reference`: the change with `plus(reference, change) = state`, a turn of up to π.
+
+    >>> import rigidjax as rj
+    >>> minus(rj.Spin([1.0, 0.5, 0.0]), rj.Spin([1.0, 0, 0])).tolist()
+    [0.0, 0.5, 0.0]
+    """
+    return _vector(
+        state,
+        reference,
+        lambda q, q0: quaternion_to_vector(quaternion.multiply(quaternion.conjugate(q0), q)),
+        jnp.subtract,
+    )
+
+
+def minus_small(state: Any, reference: Any) -> Float[Array, " n"]:
+    """`minus` of a state near the reference: of a turn by θ it has 2 sin(θ/2), not θ.
+
+    Right to second order in θ; no arctangent, which derivatives would double.
+
+    >>> import rigidjax as rj
+    >>> minus_small(rj.Spin([1.0, 0.5, 0.0]), rj.Spin([1.0, 0, 0])).tolist()
+    [0.0, 0.5, 0.0]
+    """
+
+    def turn(q: Array, q0: Array) -> Array:
+        w, *u = components(quaternion.multiply(quaternion.conjugate(q0), q))
+        twice = jnp.where(w < 0, -2.0, 2.0).astype(w.dtype)
+        return jnp.stack([twice * part for part in u])
+
+    return _vector(state, reference, turn, jnp.subtract)
+
+
+def tangent(state: Any, change: Float[Array, " n"]) -> Any:
+    """The derivative of `plus(state, ·)` at zero along a change: a tangent, as JAX has them.
+
+    >>> import rigidjax as rj
+    >>> at = rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 0])
+    >>> float(tangent(at, jnp.array([0.0, 0.0, 2.0, 0.0, 0.0, 0.0])).q[3])
+    1.0
+    """
+    return _leaf_by_leaf(state, change, quaternion.rate, lambda _, part: part)
+
+
+def coordinates(state: Any, along: Any) -> Float[Array, " n"]:
+    """The change whose `tangent` at `state` is `along`: the inverse of `tangent`.
+
+    >>> import rigidjax as rj
+    >>> at, change = rj.Attitude([0.6, 0, 0.8, 0], [0.0, 0, 0]), jnp.arange(6.0)
+    >>> coordinates(at, tangent(at, change)).round(12).tolist()
+    [0.0, 1.0, 2.0, 3.0, 4.0, 5.0]
+    """
+    return _vector(
+        along,
+        state,
+        lambda dq, q: 2.0 * quaternion.multiply(quaternion.conjugate(q), dq)[1:],
+        lambda part, _: part,
+    )
+
+
+def _turned(state: Any) -> list[bool]:
+    """Of each leaf whether it is the quaternion of a state with an attitude."""
+    out = []
+    for node in jax.tree.leaves(state, is_leaf=lambda node: isinstance(node, HasAttitude)):
+        q = node.q if isinstance(node, HasAttitude) else None
+        out += [leaf is q for leaf in jax.tree.leaves(node)]
+    return out
+
+
+def _sizes(state: Any) -> list[int]:
+    leaves = jax.tree.leaves(state)
+    return [
+        math.prod(jnp.shape(leaf)) - turned
+        for leaf, turned in zip(leaves, _turned(state), strict=True)
+    ]
+
+
+def _cut(state: Any, change: Array) -> list[Array]:
+    """The numbers of each leaf."""
+    out, begin = [], 0
+    for size in _sizes(state):
+        out.append(change[..., begin : begin + size])
+        begin += size
+    return out
+
+
+def _leaf_by_leaf(
+    state: Any,
+    change: Array,
+    of_quaternion: Callable[[Array, Array], Array],
+    of_others: Callable[[Array, Array], Array],
+) -> Any:
+    leaves, tree = jax.tree.flatten(state)
+    out = [
+        of_quaternion(leaf, part) if turned else of_others(leaf, part.reshape(jnp.shape(leaf)))
+        for leaf, part, turned in zip(leaves, _cut(state, change), _turned(state), strict=True)
+    ]
+    return jax.tree.unflatten(tree, out)
+
+
+def _vector(
+    first: Any,
+    second: Any,
+    of_quaternions: Callable[[Array, Array], Array],
+    of_others: Callable[[Array, Array], Array],
+) -> Array:
+    pairs = zip(jax.tree.leaves(first), jax.tree.leaves(second), _turned(second), strict=True)
+    out = [
+        of_quaternions(a, b) if turned else of_others(a, b).reshape(-1) for a, b, turned in pairs
+    ]
+    return jnp.concatenate(out)
