@@ -5,7 +5,7 @@ import inspect
 import os
 import re
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -150,10 +150,32 @@ def finite(value: Float[Array, "..."], name: str) -> Float[Array, "..."]:
     return refuse(value, bad.any(), f"{name}: contains NaN or infinity{where}")
 
 
+def given(value: Any, shape: tuple[int, ...], name: str, *, hint: str = "") -> Array:
+    """Return `value` as `floating` does, finite where it is known.
+
+    >>> given([1.0, 2.0, 3.0], (3,), "torque").shape
+    (3,)
+    """
+    array = floating(value, shape, name, hint=hint)
+    return finite(array, name) if known(array) else array
+
+
 def time(value: Any, name: str = "t") -> Array:
     """Return a time: one number, and where it is known a finite one."""
-    t = floating(value, (), name)
-    return finite(t, name) if known(t) else t
+    return given(value, (), name)
+
+
+def sign(value: Array, name: str, wanted: str, *, zero: bool = False) -> Array:
+    """Return `value` unless a number of it is not finite, or not above 0 (`zero`: or is below)."""
+    xp = namespace(value)
+    numbers = xp.asarray(value)
+    bad = ~(((numbers >= 0) if zero else (numbers > 0)) & xp.isfinite(numbers)).all()
+    return refuse(value, bad, f"{name}: wanted {wanted}" + (f", got {value}" if xp is np else ""))
+
+
+def if_known(check: Callable[..., Array], value: Array, *args: Any, **options: Any) -> Array:
+    """`check(value, …)` if its numbers are known, and there are some; otherwise `value` as it is."""
+    return check(value, *args, **options) if known(value) and value.size else value
 
 
 def instance(

@@ -13,7 +13,6 @@ from jaxtyping import Array, Float
 
 from rigidjax import _checks
 from rigidjax._types import HasAttitude, HasPose, HasSpin, Scalar, ScalarLike, Vec3, Vec3Like
-from rigidjax.body import validation
 from rigidjax.body._types import Vector
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.motion.torques.states import Frozen, require_frozen
@@ -107,24 +106,25 @@ class AbstractForce(eqx.Module):
         """Force (3,), N, world; torque (3,), N m, body frame, about the centre of mass."""
 
 
+class OfTime(AbstractTorque):
+    """A torque of vectors, one of which may be a function of time."""
+
+    @property
+    def steady(self) -> bool:
+        """Whether no vector is a function of time."""
+        return not any(callable(part) for part in vars(self).values())
+
+    @property
+    def jump_times(self) -> Float[Array, " n"]:
+        """Times, s, where a vector jumps or has a kink."""
+        return jumps_in(*vars(self).values())
+
+
 # A user's own callable Module need not subclass anything.
 Torque = AbstractTorque | AbstractForce | Callable[[Any, Any, Any], Any]
 
 # From the lowest: the states that a torque may act on.
 LADDER = (HasSpin, HasAttitude, HasPose)
-
-
-def given(value: Any, shape: tuple[int, ...], name: str, *, hint: str = "") -> Array:
-    """A law's number or vector, its shape checked, and that it is finite where it is known.
-
-    >>> given([1.0, 2.0, 3.0], (3,), "torque").shape
-    (3,)
-    """
-    array = _checks.floating(value, shape, name, hint=hint)
-    # NumPy: inside a trace a check with jax would become part of the program.
-    if validation.known(array) and not np.isfinite(np.asarray(array)).all():
-        raise ValueError(f"{name}: contains NaN or infinity, got {np.asarray(array)}")
-    return array
 
 
 def require_law(torque: object, name: str = "torque") -> None:
@@ -318,20 +318,11 @@ def vector_at(source: Any, t: ScalarLike, name: str, size: int = 3) -> Float[Arr
     return _checks.floating(source(t), (size,), f"{name}(t)") if callable(source) else source
 
 
-def stays(source: Any) -> Vec3 | None:
-    """A vector that is constant; `None` for a function of time.
-
-    >>> stays(jnp.ones(3))
-    Array([1., 1., 1.], dtype=float64)
-    """
-    return None if callable(source) else source
-
-
 def constant_or_callable(source: Any, name: str, size: int = 3) -> Any:
     """`source` as it is if it can be called with a time; otherwise as a vector (size,)."""
     if callable(source):
         return _checks.function(source, name, f"of time to ({size},)")
-    return given(source, (size,), name)
+    return _checks.given(source, (size,), name)
 
 
 def jumps_of(source: object) -> Float[Array, " n"]:
@@ -345,6 +336,38 @@ def jumps_of(source: object) -> Float[Array, " n"]:
     """
     found = getattr(source, "jump_times", None)
     return jnp.zeros(0) if found is None else found
+
+
+def jumps_in(*sources: object) -> Float[Array, " n"]:
+    """The times at which any of several laws or functions of time jumps, s, in order."""
+    times = [found for source in sources if (found := jumps_of(source)).shape[0]]
+    if len(times) < 2:
+        return times[0] if times else jnp.zeros(0)
+    dtype = jnp.result_type(*times)
+    return jnp.sort(jnp.concatenate([found.astype(dtype) for found in times]))
+
+
+def unit_rows(value: Any, name: str, count: int) -> Float[Array, "n 3"]:
+    """Directions (count, 3), unit where they are known."""
+    rows = _checks.given(value, (count, 3), name)
+    if _checks.known(rows):
+        lengths = np.linalg.norm(np.asarray(rows, float), axis=1)
+        if abs(lengths - 1).max() > 1e-6:
+            raise ValueError(f"{name}: wanted unit vectors, got lengths {lengths}")
+    return rows
+
+
+def count_of(value: Any, name: str, one: str) -> int:
+    """How many rows (x, y, z) there are, one for each of what `one` says: at least one."""
+    shape = _checks.numbers(value, name).shape
+    if len(shape) != 2 or shape[1] != 3 or not shape[0]:
+        raise ValueError(f"{name}: wanted (R, 3), one row a {one}, got shape {shape}")
+    return shape[0]
+
+
+def each(value: Any, count: int, name: str) -> Array:
+    """One number for all, or one for each of `count`."""
+    return _checks.given(value, (count,) if _checks.numbers(value, name).ndim else (), name)
 
 
 def length_or_zero(v: Vec3Like) -> Scalar:

@@ -28,15 +28,11 @@ class RandomTorque(AbstractTorque):
     """
 
     feels: ClassVar[type] = HasSpin
+    steady: ClassVar[bool] = True
     density: Float[Array, "3"]
 
     def __init__(self, density: Any):
         self.density = density_of(density)
-
-    @property
-    def steady(self) -> bool:
-        """Its mean does not depend on time."""
-        return True
 
     def __call__(self, t: ScalarLike, state: HasSpin, body: object) -> Vec3:
         return jnp.zeros_like(self.density)
@@ -60,6 +56,7 @@ class CorrelatedTorque(AbstractTorque):
     """
 
     feels: ClassVar[type] = HasSpin
+    steady: ClassVar[bool] = True
     density: Float[Array, "3"]
     time: Scalar
 
@@ -68,11 +65,6 @@ class CorrelatedTorque(AbstractTorque):
         number = jnp.asarray(_checks.floating(time, (), "time")).astype(self.density.dtype)
         words = "time: wanted a positive correlation time, s"
         self.time = _checks.refuse(number, ~((number > 0) & jnp.isfinite(number)), words)
-
-    @property
-    def steady(self) -> bool:
-        """Its mean does not depend on time."""
-        return True
 
     @property
     def deviation(self) -> Vec3:

@@ -11,7 +11,6 @@ from jaxtyping import Array, ArrayLike, Float
 
 from rigidjax import _checks
 from rigidjax._types import Scalar, ScalarLike, Vec3
-from rigidjax.motion.torques.base import given
 from rigidjax.rotation.barrier import barrier
 from rigidjax.rotation.linalg3 import cross, dot
 
@@ -148,12 +147,12 @@ class Wheel(eqx.Module):
             f"axis: wanted a unit vector (3,){found}",
         )
         _checks.function(speed, "speed", "of time to rad/s")
-        self.inertia = given(inertia, (), "inertia").astype(jnp.result_type(float))
+        self.inertia = _checks.given(inertia, (), "inertia").astype(jnp.result_type(float))
         self.axis = axis.astype(jnp.result_type(float))
         self.speed = speed
         kind = jnp.result_type(float)
-        self.delay = None if delay is None else given(delay, (), "delay").astype(kind)
-        self.tilt = None if tilt is None else given(tilt, (2,), "tilt").astype(kind)
+        self.delay = None if delay is None else _checks.given(delay, (), "delay").astype(kind)
+        self.tilt = None if tilt is None else _checks.given(tilt, (2,), "tilt").astype(kind)
 
     @property
     def direction(self) -> Vec3:
