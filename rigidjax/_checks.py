@@ -140,7 +140,7 @@ def bare(error: RuntimeError) -> RuntimeError:
     return type(error)(found[1]) if found else error
 
 
-def finite(value: Float[Array, "..."], name: str) -> Float[Array, "..."]:
+def finite(value: Float[ArrayLike, "..."], name: str) -> Any:
     """Return `value` unless it holds a NaN or an infinity."""
     xp = namespace(value)
     bad = ~xp.isfinite(value)
@@ -174,7 +174,7 @@ def sign(value: Array, name: str, wanted: str, *, zero: bool = False) -> Array:
 
 
 def if_known(check: Callable[..., Array], value: Array, *args: Any, **options: Any) -> Array:
-    """`check(value, …)` if its numbers are known, and there are some; otherwise `value` as it is."""
+    """`check(value, …)` if its numbers are known, and there are some; otherwise `value`."""
     return check(value, *args, **options) if known(value) and value.size else value
 
 

@@ -9,19 +9,21 @@ from rigidjax._types import (
     HasSpin as HasSpin,
 )
 from rigidjax.motion import torques as torques
-from rigidjax.motion.attitude import (
-    Attitude as Attitude,
-    AttitudeEquations as AttitudeEquations,
-    on_the_group as on_the_group,
-)
 from rigidjax.motion.conserved import (
     conserved as conserved,
     drift as drift,
     energy as energy,
 )
 from rigidjax.motion.coupled import Coupled as Coupled
-from rigidjax.motion.rigid import NewtonEuler as NewtonEuler, Rigid as Rigid
-from rigidjax.motion.spin import EulerEquations as EulerEquations, Spin as Spin
+from rigidjax.motion.equations import (
+    Attitude as Attitude,
+    AttitudeEquations as AttitudeEquations,
+    EulerEquations as EulerEquations,
+    NewtonEuler as NewtonEuler,
+    Rigid as Rigid,
+    Spin as Spin,
+    on_the_group as on_the_group,
+)
 
 if not TYPE_CHECKING:
     __getattr__ = suggests(__name__)

@@ -62,9 +62,8 @@ class CorrelatedTorque(AbstractTorque):
 
     def __init__(self, density: Any, time: Any):
         self.density = density_of(density)
-        number = jnp.asarray(_checks.floating(time, (), "time")).astype(self.density.dtype)
-        words = "time: wanted a positive correlation time, s"
-        self.time = _checks.refuse(number, ~((number > 0) & jnp.isfinite(number)), words)
+        number = _checks.floating(time, (), "time").astype(self.density.dtype)
+        self.time = _checks.sign(number, "time", "a positive correlation time, s")
 
     @property
     def deviation(self) -> Vec3:
@@ -85,5 +84,4 @@ def density_of(value: Any, name: str = "density", size: int = 3) -> Array:
     if density.shape not in ((), (size,)):
         raise ValueError(f"{name}: wanted one number or {size}, got shape {density.shape}")
     density = jnp.broadcast_to(density, (size,)).astype(density.dtype)
-    words = f"{name}: wanted a finite number that is not below zero"
-    return _checks.refuse(density, ~((density >= 0) & jnp.isfinite(density)).all(), words)
+    return _checks.sign(density, name, "a finite number that is not below zero", zero=True)
