@@ -169,8 +169,9 @@ def sign(value: Array, name: str, wanted: str, *, zero: bool = False) -> Array:
     """Return `value` unless a number of it is not finite, or not above 0 (`zero`: or is below)."""
     xp = namespace(value)
     numbers = xp.asarray(value)
-    bad = ~(((numbers >= 0) if zero else (numbers > 0)) & xp.isfinite(numbers)).all()
-    return refuse(value, bad, f"{name}: wanted {wanted}" + (f", got {value}" if xp is np else ""))
+    bad = ~(((numbers >= 0) if zero else (numbers > 0)) & xp.isfinite(numbers))
+    found = f", got {numbers[bad][0]}" if xp is np and bad.any() else ""
+    return refuse(value, bad.any(), f"{name}: wanted {wanted}{found}")
 
 
 def if_known(check: Callable[..., Array], value: Array, *args: Any, **options: Any) -> Array:

@@ -10,17 +10,27 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rigidjax import _checks
-from rigidjax._types import Mat3, Quat, ScalarLike, Vec3
+from rigidjax._types import (
+    Mat3,
+    Matrices,
+    Matrix,
+    Quat,
+    Quaternion,
+    ScalarLike,
+    Scalars,
+    Vec3,
+    Vector,
+    Vectors,
+)
 from rigidjax.body import validation
-from rigidjax.body._types import Matrices, Matrix, Quaternion, Scalars, Vector, Vectors
 from rigidjax.body.principal_axes import eigensystem, principal
 from rigidjax.body.symmetric3 import (
     apply as apply,
     inverse as inverse,
     outer,
     product,
-    solve as solve,
     swap_trace,
+    swap_trace_back,
 )
 from rigidjax.rotation import quaternion
 
@@ -98,11 +108,7 @@ class Inertia(eqx.Module):
     @property
     def second_moment(self) -> Float[Array, "*batch 3 3"]:
         """𝔖 = ½ Tr(I) 1 − I, (3, 3), kg m², body frame (notes, eqs 76–78 solved)."""
-        a = self.tensor
-        x, y, z = a[..., 0, 0], a[..., 1, 1], a[..., 2, 2]
-        diagonal = 0.5 * jnp.stack([(y - x) + z, (z - y) + x, (x - z) + y], axis=-1)
-        eye = jnp.broadcast_to(jnp.eye(3, dtype=bool), a.shape)
-        return jnp.where(eye, jnp.broadcast_to(diagonal[..., None], a.shape), 0.0 - a)
+        return swap_trace_back(self.tensor)
 
     @property
     def moments(self) -> Vec3:
@@ -186,12 +192,7 @@ class MassProperties(eqx.Module):
     com: Float[Array, "*batch 3"]
     second_moment: Float[Array, "*batch 3 3"]
 
-    def __init__(
-        self,
-        mass: Scalars,
-        com: Vectors,
-        second_moment: Matrices,
-    ):
+    def __init__(self, mass: Scalars, com: Vectors, second_moment: Matrices):
         mass = _checks.floating(mass, (), "mass", batched=True)
         com = _checks.floating(com, (3,), "com", batched=True)
         if isinstance(second_moment, Inertia):
@@ -203,10 +204,9 @@ class MassProperties(eqx.Module):
         _checks.same_batch(mass=(mass, 0), com=(com, 1), second_moment=(second_moment, 2))
         dtype = jnp.result_type(mass, com, second_moment)
         self.mass = validation.mass_of_a_body(mass.astype(dtype))
-        self.com = validation.if_known(validation.real_place, com.astype(dtype))
-        self.second_moment = validation.if_known(
-            validation.real_second_moment, second_moment.astype(dtype)
-        )
+        self.com = _checks.if_known(_checks.finite, com.astype(dtype), "com")
+        second_moment = second_moment.astype(dtype)
+        self.second_moment = _checks.if_known(validation.real_second_moment, second_moment)
 
     @property
     def inertia(self) -> Inertia:
@@ -223,7 +223,7 @@ class MassProperties(eqx.Module):
         """
         return MassProperties(
             validation.real_mass(self.mass),
-            validation.real_place(self.com),
+            _checks.finite(self.com, "com"),
             validation.real_second_moment(self.second_moment),
         )
 

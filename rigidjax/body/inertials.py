@@ -9,7 +9,7 @@ import numpy as np
 
 from rigidjax import _checks
 from rigidjax.body.inertia import MassProperties
-from rigidjax.rotation import so3
+from rigidjax.rotation import euler, quaternion
 
 # How far a sum of two moments may fall below the third, for files are rounded.
 ROUNDED = 1e-6
@@ -109,45 +109,32 @@ def _from_urdf(inertial: Tree.Element) -> MassProperties:
     if mass is None or inertia is None:
         raise ValueError("wanted a <mass> and an <inertia>")
     place = _numbers(origin, "xyz", 3, [0.0] * 3)
-    roll, pitch, yaw = _numbers(origin, "rpy", 3, [0.0] * 3)
+    # Fixed axes: roll about x, then pitch about y, then yaw about z.
+    turn = euler.to_matrix(_numbers(origin, "rpy", 3, [0.0] * 3), "xyz")
     parts = {key: _numbers(inertia, key, 1)[0] for key in ("ixx", "iyy", "izz")}
     parts |= {key: _numbers(inertia, key, 1, [0.0])[0] for key in ("ixy", "ixz", "iyz")}
-    tensor = np.array(
-        [
-            [parts["ixx"], parts["ixy"], parts["ixz"]],
-            [parts["ixy"], parts["iyy"], parts["iyz"]],
-            [parts["ixz"], parts["iyz"], parts["izz"]],
-        ]
-    )
-    # Fixed axes: roll about x, then pitch about y, then yaw about z.
-    turn = _turn(2, yaw) @ _turn(1, pitch) @ _turn(0, roll)
-    return _body(_numbers(mass, "value", 1)[0], place, turn @ tensor @ turn.T)
+    rows = (("ixx", "ixy", "ixz"), ("ixy", "iyy", "iyz"), ("ixz", "iyz", "izz"))
+    tensor = np.array([[parts[key] for key in row] for row in rows])
+    return _body(_numbers(mass, "value", 1)[0], place, turn, tensor)
 
 
 def _from_mujoco(inertial: Tree.Element) -> MassProperties:
     other = [key for key in ("axisangle", "xyaxes", "zaxis", "euler") if key in inertial.attrib]
     if other:
         raise ValueError(f"its inertial is turned by {other[0]}; wanted quat")
-    turn = np.eye(3)
-    if "quat" in inertial.attrib:
-        w, x, y, z = _numbers(inertial, "quat", 4)
-        size = np.sqrt(w * w + x * x + y * y + z * z)
-        if not size > 0:
-            raise ValueError("its quat is zero")
-        half = np.array([x, y, z]) / size
-        length = np.linalg.norm(half)
-        angle = 2.0 * np.arctan2(length, w / size)
-        turn = _exp(angle * half / length) if length > 0 else turn
+    q = quaternion.normalise(_numbers(inertial, "quat", 4, [1.0, 0.0, 0.0, 0.0]))
     if "fullinertia" in inertial.attrib:
         xx, yy, zz, xy, xz, yz = _numbers(inertial, "fullinertia", 6)
         tensor = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
     else:
         tensor = np.diag(_numbers(inertial, "diaginertia", 3))
     place = _numbers(inertial, "pos", 3, [0.0] * 3)
-    return _body(_numbers(inertial, "mass", 1)[0], place, turn @ tensor @ turn.T)
+    return _body(_numbers(inertial, "mass", 1)[0], place, quaternion.to_matrix(q), tensor)
 
 
-def _body(mass: float, place: np.ndarray, tensor: np.ndarray) -> MassProperties:
+def _body(mass: float, place: np.ndarray, turn: Any, tensor: np.ndarray) -> MassProperties:
+    turn = np.asarray(turn, float)
+    tensor = turn @ tensor @ turn.T
     if not mass > 0:
         raise ValueError(f"wanted a positive mass, got {mass:g}")
     second = 0.5 * np.trace(tensor) * np.eye(3) - tensor
@@ -177,14 +164,6 @@ def _numbers(node: Any, key: str, count: int, otherwise: Any = None) -> np.ndarr
     if numbers.size != count or not np.isfinite(numbers).all():
         raise ValueError(f"{key}: wanted {count} finite numbers, got {text!r}")
     return numbers
-
-
-def _turn(axis: int, angle: float) -> np.ndarray:
-    return _exp(angle * np.eye(3)[axis])
-
-
-def _exp(vector: np.ndarray) -> np.ndarray:
-    return np.asarray(so3.exp(vector), float)
 
 
 def _text(numbers: Any) -> str:

@@ -14,8 +14,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from rigidjax import _checks
 from rigidjax._names import own_names
-from rigidjax._types import Mat3, Vec3
-from rigidjax.body._types import Matrix, Numbers, Vector
+from rigidjax._types import Mat3, Matrix, Numbers, Vec3, Vector
 from rigidjax.body.inertia import MassProperties
 from rigidjax.body.symmetric3 import from_components
 from rigidjax.body.validation import real_moments

@@ -16,9 +16,7 @@ from jaxtyping import ArrayLike, Float
 
 from rigidjax import _checks
 from rigidjax._names import own_names, suggests
-from rigidjax._types import ScalarLike
-from rigidjax.body import validation
-from rigidjax.body._types import Numbers, Vector
+from rigidjax._types import Numbers, ScalarLike, Vector
 from rigidjax.body.inertia import MassProperties
 from rigidjax.body.meshes import mesh as mesh, mesh_file as mesh_file
 from rigidjax.body.point_masses import (
@@ -201,18 +199,13 @@ def plate(mass: ScalarLike, size: Float[ArrayLike, "2"] | Numbers) -> MassProper
 
 
 def _lengths(value, shape, name):
-    lengths = _checks.floating(value, shape, name)
-    if validation.known(lengths):
-        _checks.finite(lengths, name)
-        _checks.refuse(
-            lengths, (lengths < 0).any(), f"{name}: wanted lengths ≥ 0 (m), got {lengths}"
-        )
-    return lengths
+    lengths = _checks.given(value, shape, name)
+    return _checks.if_known(_checks.sign, lengths, name, "lengths ≥ 0 (m)", zero=True)
 
 
 def _nested(inner, outer, names=("inner", "outer")):
     r, R = _lengths(inner, (), names[0]), _lengths(outer, (), names[1])
-    if validation.known(r) and validation.known(R):
+    if _checks.known((r, R)):
         _checks.refuse(r, r > R, f"{names[0]}: wanted {names[0]} ≤ {names[1]}, got {r} and {R} (m)")
     return r, R
 

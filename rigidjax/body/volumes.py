@@ -7,8 +7,7 @@ import jax.numpy as jnp
 
 from rigidjax import _checks
 from rigidjax._names import own_names
-from rigidjax._types import Scalar, ScalarLike
-from rigidjax.body._types import Vector
+from rigidjax._types import Scalar, ScalarLike, Vector
 
 
 def box(size: Vector) -> Scalar:

@@ -5,8 +5,7 @@ from typing import Any
 import equinox as eqx
 
 from rigidjax import _checks
-from rigidjax._types import Mat3, Vec3
-from rigidjax.body._types import Vector
+from rigidjax._types import Mat3, Vec3, Vector
 from rigidjax.rotation import linalg3, quaternion
 
 

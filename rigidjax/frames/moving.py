@@ -8,8 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from rigidjax import _checks
-from rigidjax._types import Mat3, Scalar, ScalarLike, Vec3
-from rigidjax.body._types import Vector
+from rigidjax._types import Mat3, Scalar, ScalarLike, Vec3, Vector
 from rigidjax.frames import rotation_models
 from rigidjax.frames.frame_kinematics import Instant
 from rigidjax.frames.point import require_point

@@ -74,6 +74,16 @@ def rotation_matrix(m: Float[Array, "*batch 3 3"], name: str) -> Float[Array, "*
     )
 
 
+def near_unit(q: Float[Array, "4"], name: str, limit: float) -> Float[Array, "4"]:
+    """Refuse, where it is known, a quaternion whose length is not 1 to `limit`."""
+    if _checks.known(q):
+        length = float(np.linalg.norm(np.asarray(q, float)))
+        words = f"{name}: wanted a unit quaternion (w, x, y, z), got one of length {length:.6g}"
+        words += "; rigidjax.quaternion.normalise makes it one"
+        _checks.refuse(q, not abs(length - 1) <= limit, words)
+    return q
+
+
 def unit_quaternion(q: Float[Array, "*batch 4"], name: str) -> Float[Array, "*batch 4"]:
     """Normalise a quaternion that is nearly a unit one; refuse any other."""
     q = _checks.finite(q, name)

@@ -12,8 +12,16 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from rigidjax import _checks
-from rigidjax._types import HasAttitude, HasPose, HasSpin, Scalar, ScalarLike, Vec3, Vec3Like
-from rigidjax.body._types import Vector
+from rigidjax._types import (
+    HasAttitude,
+    HasPose,
+    HasSpin,
+    Scalar,
+    ScalarLike,
+    Vec3,
+    Vec3Like,
+    Vector,
+)
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.motion.torques.states import Frozen, require_frozen
 

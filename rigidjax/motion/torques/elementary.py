@@ -6,8 +6,7 @@ import equinox as eqx
 from jaxtyping import Array, Float
 
 from rigidjax import _checks
-from rigidjax._types import HasAttitude, HasSpin, ScalarLike, Vec3
-from rigidjax.body._types import Vector
+from rigidjax._types import HasAttitude, HasSpin, ScalarLike, Vec3, Vector
 from rigidjax.motion.torques.base import (
     AbstractTorque,
     OfTime,

@@ -8,8 +8,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from rigidjax import _checks
-from rigidjax._types import HasPose, Scalar, ScalarLike, Vec3
-from rigidjax.body._types import Vector
+from rigidjax._types import HasPose, Scalar, ScalarLike, Vec3, Vector
 from rigidjax.body.inertia import MassProperties
 from rigidjax.motion.torques.base import (
     AbstractForce,

@@ -10,8 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from rigidjax import _checks
-from rigidjax._types import HasAttitude, HasPose, Scalar, ScalarLike, Vec3
-from rigidjax.body._types import Vector
+from rigidjax._types import HasAttitude, HasPose, Scalar, ScalarLike, Vec3, Vector
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.motion.torques.base import (
     AbstractTorque,
