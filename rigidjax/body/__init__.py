@@ -1,8 +1,6 @@
 """Bodies: inertia, mass, second moments, shapes, charts by unconstrained numbers."""
 
-from typing import TYPE_CHECKING
-
-from rigidjax._names import own_names, suggests
+from rigidjax._names import show
 from rigidjax.body import (
     parameters as parameters,
     shapes as shapes,
@@ -31,6 +29,4 @@ from rigidjax.body.principal_axes import (
     principal as principal,
 )
 
-if not TYPE_CHECKING:
-    __getattr__ = suggests(__name__)
-__dir__ = own_names(__name__)
+show(__name__)

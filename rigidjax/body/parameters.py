@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from rigidjax import _checks
-from rigidjax._names import own_names
+from rigidjax._names import show
 from rigidjax._types import Mat3, Matrix, Numbers, Vec3, Vector
 from rigidjax.body.inertia import MassProperties
 from rigidjax.body.symmetric3 import from_components
@@ -216,4 +216,4 @@ def _reach(exponent: Float[Array, "*n"]) -> Float[Array, "*n"]:
     return jnp.where(beyond > 0, jnp.sign(exponent) * (limit + jnp.expm1(beyond)), exponent)
 
 
-__dir__ = own_names(__name__)
+show(__name__)

@@ -9,13 +9,11 @@ What is written down is the second moment 𝔖 = ∫ r rᵀ dm (notes, eq 60), d
 `I1 = λ2 + λ3`, … (eqs 76–78) turns it into the textbook moments of inertia.
 """
 
-from typing import TYPE_CHECKING
-
 import jax.numpy as jnp
 from jaxtyping import ArrayLike, Float
 
 from rigidjax import _checks
-from rigidjax._names import own_names, suggests
+from rigidjax._names import show
 from rigidjax._types import Numbers, ScalarLike, Vector
 from rigidjax.body.inertia import MassProperties
 from rigidjax.body.meshes import mesh as mesh, mesh_file as mesh_file
@@ -219,6 +217,4 @@ def _centred(mass, per_mass):
     return MassProperties(m, jnp.zeros_like(per_mass), jnp.diag(m * per_mass))
 
 
-if not TYPE_CHECKING:
-    __getattr__ = suggests(__name__)
-__dir__ = own_names(__name__)
+show(__name__)

@@ -1,8 +1,6 @@
 """States, their equations of motion, torques: model no more than the scene needs."""
 
-from typing import TYPE_CHECKING
-
-from rigidjax._names import own_names, suggests
+from rigidjax._names import show
 from rigidjax._types import (
     HasAttitude as HasAttitude,
     HasPose as HasPose,
@@ -25,6 +23,4 @@ from rigidjax.motion.equations import (
     on_the_group as on_the_group,
 )
 
-if not TYPE_CHECKING:
-    __getattr__ = suggests(__name__)
-__dir__ = own_names(__name__)
+show(__name__)

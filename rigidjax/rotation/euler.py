@@ -13,7 +13,7 @@ there are finite: those of the remaining chart, with the middle angle held. `is_
 """
 
 import warnings
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import jax.numpy as jnp
 import numpy as np
@@ -21,7 +21,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool
 
 from rigidjax import _checks
-from rigidjax._names import own_names, suggests
+from rigidjax._names import show
 from rigidjax._types import Mat3, Mat3Like, Quat, QuatLike, Scalar, Vec3, Vec3Like
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.linalg3 import apply, components, cross, dot, near_one
@@ -270,6 +270,4 @@ def _to_body(omega: Vec3, angles: Vec3, sequence: str, frame: str) -> Vec3:
     return _from_body(omega, angles, sequence, frame)
 
 
-if not TYPE_CHECKING:
-    __getattr__ = suggests(__name__)
-__dir__ = own_names(__name__)
+show(__name__)

@@ -9,7 +9,7 @@ Analytical Mechanics of Space Systems, sec. 3.5.2. Range: any σ, and up to 1e75
 import jax.numpy as jnp
 
 from rigidjax import _checks
-from rigidjax._names import own_names
+from rigidjax._names import show
 from rigidjax._types import Mat3, Mat3Like, Quat, QuatLike, Vec3, Vec3Like
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.linalg3 import components, cross, dot, near_one
@@ -128,4 +128,4 @@ def rates_to_omega(sigma: Vec3Like, rates: Vec3Like) -> Vec3:
     return 4 / (1 + s) ** 2 * turned
 
 
-__dir__ = own_names(__name__)
+show(__name__)

@@ -13,7 +13,7 @@ vectors and rates may have components up to 1e307 (1e37).
 """
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +21,7 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
 from rigidjax import _checks
-from rigidjax._names import own_names, suggests
+from rigidjax._names import show
 from rigidjax._types import Mat3, Mat3Like, Quat, QuatLike, Scalar, ScalarLike, Vec3, Vec3Like
 from rigidjax.rotation.kernels import (
     flipped,
@@ -332,6 +332,4 @@ def _turn(w: Scalar, u: Sequence[Scalar], y: Sequence[Scalar]) -> Vec3:
     return jnp.stack([y[i] + (w * t[i] + again[i]) for i in range(3)])
 
 
-if not TYPE_CHECKING:
-    __getattr__ = suggests(__name__)
-__dir__ = own_names(__name__)
+show(__name__)

@@ -5,13 +5,13 @@ function of θ², so that values and derivatives of any order are right at θ = 
 `rigidjax.quaternion`.
 """
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
 from rigidjax import _checks
-from rigidjax._names import own_names, suggests
+from rigidjax._names import show
 from rigidjax._types import Mat3, Mat3Like, Scalar, ScalarLike, Vec3, Vec3Like
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.averaging import mean as mean, mean_quaternion as mean_quaternion
@@ -271,6 +271,4 @@ def check(
     return rotation_matrix(_checks.floating(matrix, (3, 3), name, batched=True), name)
 
 
-if not TYPE_CHECKING:
-    __getattr__ = suggests(__name__)
-__dir__ = own_names(__name__)
+show(__name__)

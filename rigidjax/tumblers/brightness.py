@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import ArrayLike, Float, Int
 
 from rigidjax import _checks
-from rigidjax._names import own_names
+from rigidjax._names import show
 from rigidjax._types import Numbers, Scalar, Vector
 from rigidjax.body.meshes import faces_of
 from rigidjax.body.scaling import exponent_of, times_power_of_two
@@ -95,4 +95,4 @@ def mesh(
     return jnp.where(both, 0.5 * length * sent, 0.0).sum()
 
 
-__dir__ = own_names(__name__)
+show(__name__)

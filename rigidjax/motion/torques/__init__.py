@@ -1,8 +1,6 @@
 """Torques and forces. Each names the lowest state that it acts on."""
 
-from typing import TYPE_CHECKING
-
-from rigidjax._names import own_names, suggests
+from rigidjax._names import show
 from rigidjax.motion.torques.base import (
     AbstractForce as AbstractForce,
     AbstractTorque as AbstractTorque,
@@ -50,6 +48,4 @@ from rigidjax.motion.torques.spline import Series as Series, Wheel as Wheel
 from rigidjax.motion.torques.states import freeze as freeze
 from rigidjax.motion.torques.wheels import Flywheel as Flywheel, ReactionWheels as ReactionWheels
 
-if not TYPE_CHECKING:
-    __getattr__ = suggests(__name__)
-__dir__ = own_names(__name__)
+show(__name__)
