@@ -36,9 +36,7 @@ def to_quaternion(sigma: Vec3Like) -> Quat:
     >>> to_quaternion(jnp.array([0.0, 0.0, 1.0])).tolist()
     [0.0, 0.0, 0.0, 1.0]
     """
-    sigma = _checks.floating(sigma, (3,), "sigma")
-    if _checks.known(sigma):
-        sigma = _checks.finite(sigma, "sigma")
+    sigma = _checks.given(sigma, (3,), "sigma")
     # Both parts of the ratio by the square of a power of two: 1 is then `one`.
     one = jnp.minimum(near_one(*components(sigma)), 1)
     sigma = one * sigma
