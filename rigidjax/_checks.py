@@ -151,11 +151,7 @@ def finite(value: Float[ArrayLike, "..."], name: str) -> Any:
 
 
 def given(value: Any, shape: tuple[int, ...], name: str, *, hint: str = "") -> Array:
-    """Return `value` as `floating` does, finite where it is known.
-
-    >>> given([1.0, 2.0, 3.0], (3,), "torque").shape
-    (3,)
-    """
+    """Return `value` as `floating` does, finite where it is known."""
     array = floating(value, shape, name, hint=hint)
     return finite(array, name) if known(array) else array
 

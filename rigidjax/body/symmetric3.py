@@ -22,9 +22,6 @@ def inverse(tensor: Mat3Like) -> Mat3:
     infinities: `Inertia.invertible` refuses it in words.
 
     **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
-
-    >>> inverse(jnp.diag(jnp.array([1.0, 2.0, 4.0])))[2, 2]
-    Array(0.25, dtype=float64)
     """
     return _inverse(_checks.floating(tensor, (3, 3), "tensor"))
 

@@ -96,11 +96,7 @@ def earth(latitude: ScalarLike, gravity: ScalarLike = GRAVITY, rate: ScalarLike 
 def checked(
     latitude: ScalarLike, gravity: ScalarLike, rate: ScalarLike
 ) -> tuple[Scalar, Scalar, Scalar]:
-    """Latitude, gravity and rate as scalars of one dtype, or the likely mistake.
-
-    >>> [float(x) for x in checked(0.5, 9.8, 7e-5)]
-    [0.5, 9.8, 7e-05]
-    """
+    """Latitude, gravity and rate as scalars of one dtype, or the likely mistake."""
     values = {"latitude": latitude, "gravity": gravity, "rate": rate}
     known = {name: _checks.floating(value, (), name) for name, value in values.items()}
     dtype = jnp.result_type(*known.values())

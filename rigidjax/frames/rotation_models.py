@@ -73,9 +73,6 @@ def differentiable(rotation: Any) -> Any:
     """`rotation`; the solves that it does itself made ready for forward differentiation.
 
     A frame needs dΩ/dt, and the default adjoint of a solution of `simulate` refuses that.
-
-    >>> differentiable({"adjoint": dfx.RecursiveCheckpointAdjoint()})["adjoint"]
-    ForwardMode()
     """
 
     def reverse(part: Any) -> bool:

@@ -136,10 +136,7 @@ LADDER = (HasSpin, HasAttitude, HasPose)
 
 
 def require_law(torque: object, name: str = "torque") -> None:
-    """Raise `TypeError` unless `torque` is something that can be called for its value.
-
-    >>> require_law(lambda t, state, body: -state.omega)
-    """
+    """Raise `TypeError` unless `torque` is something that can be called for its value."""
     if isinstance(torque, type):
         raise TypeError(
             f"{name}: got the class {torque.__name__}, wanted one made from it: "
@@ -158,33 +155,19 @@ def require_law(torque: object, name: str = "torque") -> None:
 
 
 def sees_attitude(torque: Torque | None) -> bool:
-    """Whether a law may look at the attitude: it says so by `feels`, or has none.
-
-    >>> from rigidjax import torques
-    >>> sees_attitude(torques.Damping([1.0, 1.0, 1.0]))
-    False
-    """
+    """Whether a law may look at the attitude: it says so by `feels`, or has none."""
     if hasattr(torque, "parts"):
         return any(sees_attitude(part) for part in torque.parts)  # pyright: ignore
     return torque is not None and getattr(torque, "feels", None) is not HasSpin
 
 
 def sees_rate(torque: Torque | None) -> bool:
-    """Whether a law may look at the body rate: it has not said that it is `rate_free`.
-
-    >>> from rigidjax import torques
-    >>> sees_rate(torques.HeavyTop(1.0, [0.0, 0.0, 1.0], [0.0, 0.0, -9.81]))
-    False
-    """
+    """Whether a law may look at the body rate: it has not said that it is `rate_free`."""
     return torque is not None and not getattr(torque, "rate_free", False)
 
 
 def require_rung(torque: Torque, state: object) -> None:
-    """Raise `TypeError` unless `torque` is a law and `state` has what it feels.
-
-    >>> from rigidjax import Spin
-    >>> require_rung(lambda t, state, body: -state.omega, Spin([0.0, 0, 1]))
-    """
+    """Raise `TypeError` unless `torque` is a law and `state` has what it feels."""
     require_law(torque)
     feels = getattr(torque, "feels", None)
     if feels is not None and not isinstance(state, feels):
@@ -200,11 +183,6 @@ def evaluate(torque: Torque, t: ScalarLike, state: HasSpin, body: Inertia | Mass
     **Arguments:** `torque` any law; `t` s; `state`; `body`. The law is taken in the precision of
     `state.omega`. **Raises:** `TypeError` for a force, which acts on `Rigid` only; `ValueError` for
     a wrong shape.
-
-    >>> from rigidjax import Inertia, Spin, torques
-    >>> body = Inertia.from_principal(1.0, 2.0, 3.0)
-    >>> evaluate(torques.Damping([1.0, 1.0, 1.0]), 0.0, Spin([0.0, 0.0, 2.0]), body)
-    Array([-0., -0., -2.], dtype=float64)
     """
     force, value = act(torque, t, state, body)
     if force is not None:
@@ -222,9 +200,6 @@ def act(
 
     **Arguments** as for `evaluate`. **Returns** a force (3,) or `None`, and a torque (3,), N m,
     body frame, in the precision of `state.omega`.
-
-    >>> from rigidjax import Inertia, Spin, torques
-    >>> act(torques.ConstantTorque([0.0, 0, 1]), 0.0, Spin([0.0, 0, 1]), Inertia(jnp.eye(3)))[0]
     """
     _checks.single(state, HasSpin, "state", wanted="a Spin, an Attitude or a Rigid")
     require_rung(law, state)
@@ -276,9 +251,6 @@ def one_law(law: Any) -> None:
     """Raise `ValueError` where an array of one of our laws has not the shape that its field says.
 
     Its constructor saw to that; `jax.vmap` and `jax.tree.map` make laws of many bodies.
-
-    >>> from rigidjax import torques
-    >>> one_law(torques.ConstantTorque([0.0, 0.0, 1.0]))
     """
     if not type(law).__module__.startswith(__package__ or ""):
         return
@@ -293,11 +265,7 @@ def one_law(law: Any) -> None:
 
 
 def in_precision(tree: Any, dtype: Any) -> Any:
-    """The same tree with every floating array in `dtype`.
-
-    >>> in_precision({"a": jnp.ones(2)}, jnp.float32)["a"].dtype
-    dtype('float32')
-    """
+    """The same tree with every floating array in `dtype`."""
 
     def cast(leaf: Any) -> Any:
         if eqx.is_array_like(leaf) and hasattr(leaf, "dtype"):
@@ -308,21 +276,12 @@ def in_precision(tree: Any, dtype: Any) -> Any:
 
 
 def tensor_of(body: Inertia | MassProperties) -> Float[Array, "3 3"]:
-    """The inertia tensor (3, 3), kg m²: of an `Inertia`, or about the centre of mass.
-
-    >>> from rigidjax import shapes
-    >>> tensor_of(Inertia(jnp.eye(3)))[0, 0]
-    Array(1., dtype=float64)
-    """
+    """The inertia tensor (3, 3), kg m²: of an `Inertia`, or about the centre of mass."""
     return body.tensor if isinstance(body, Inertia) else body.inertia.tensor
 
 
 def vector_at(source: Any, t: ScalarLike, name: str, size: int = 3) -> Float[Array, " size"]:
-    """A vector that is constant, or the value at `t` of a callable Module of time.
-
-    >>> vector_at(jnp.ones(3), 0.0, "field")
-    Array([1., 1., 1.], dtype=float64)
-    """
+    """A vector that is constant, or the value at `t` of a callable Module of time."""
     return _checks.floating(source(t), (size,), f"{name}(t)") if callable(source) else source
 
 
@@ -379,11 +338,7 @@ def each(value: Any, count: int, name: str) -> Array:
 
 
 def length_or_zero(v: Vec3Like) -> Scalar:
-    """|v|, whose derivative at v = 0 is taken as 0: for |v| v, which has one and it is 0.
-
-    >>> float(length_or_zero(jnp.array([3.0, 4.0, 0.0])))
-    5.0
-    """
+    """|v|, whose derivative at v = 0 is taken as 0: for |v| v, which has one and it is 0."""
     v = _checks.floating(v, (3,), "v")
     square = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
     return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)

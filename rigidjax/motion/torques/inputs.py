@@ -225,21 +225,13 @@ def _is_delayed(node: Any) -> bool:
 
 
 def delays_of(law: Any) -> list[tuple[str, Array]]:
-    """The name and the delay of each delayed input, as they stand in the law.
-
-    >>> [(name, float(delay)) for name, delay in delays_of((Delayed(Input("u"), 0.1), Input("v")))]
-    [('u', 0.1)]
-    """
+    """The name and the delay of each delayed input, as they stand in the law."""
     nodes = jax.tree.leaves(law, is_leaf=_is_delayed)
     return [(node.source.name, node.delay) for node in nodes if _is_delayed(node)]
 
 
 def inputs_of(law: Any) -> list[str]:
-    """The names of the inputs that a law reads.
-
-    >>> inputs_of((Input("a"), Input("b"), Input("a")))
-    ['a', 'b']
-    """
+    """The names of the inputs that a law reads."""
     nodes = jax.tree.leaves(law, is_leaf=lambda node: isinstance(node, Input))
     return list(dict.fromkeys(node.name for node in nodes if isinstance(node, Input)))
 
@@ -249,9 +241,6 @@ def require_inputs(law: Any, inputs: Any) -> Mapping[str, Any]:
 
     **Raises:** `ValueError` for one that is missing, or that the law does not read; `TypeError` for
     what is no mapping.
-
-    >>> sorted(require_inputs(Input("u"), {"u": 1.0}))
-    ['u']
     """
     read, found = inputs_of(law), {} if inputs is None else inputs
     if not isinstance(found, Mapping):

@@ -75,11 +75,7 @@ class CorrelatedTorque(AbstractTorque):
 
 
 def density_of(value: Any, name: str = "density", size: int = 3) -> Array:
-    """A spectral density (size,) of one number or as many, none below zero.
-
-    >>> density_of(2.0, size=2).tolist()
-    [2.0, 2.0]
-    """
+    """A spectral density (size,) of one number or as many, none below zero."""
     density = _checks.numbers(value, name)
     if density.shape not in ((), (size,)):
         raise ValueError(f"{name}: wanted one number or {size}, got shape {density.shape}")

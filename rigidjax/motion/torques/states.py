@@ -51,30 +51,17 @@ class _Last(eqx.Module):
 
 
 def has_own(node: object) -> bool:
-    """Whether this law, or function of time, itself has states: `state0` and `rate`.
-
-    >>> from rigidjax import torques
-    >>> has_own(torques.Lagged(torques.Input("u"), 0.1)), has_own(torques.Input("u"))
-    (True, False)
-    """
+    """Whether this law, or function of time, itself has states: `state0` and `rate`."""
     return not isinstance(node, type) and hasattr(node, "state0") and hasattr(node, "rate")
 
 
 def has_states(law: Any) -> bool:
-    """Whether a law, or anything inside it, has states of its own.
-
-    >>> from rigidjax import torques
-    >>> has_states(torques.InSpace(torques.Lagged(torques.Input("u"), 0.1)))
-    True
-    """
+    """Whether a law, or anything inside it, has states of its own."""
     return any(map(has_own, jax.tree.leaves(law, is_leaf=_stop)))
 
 
 def require_stateless(law: Any, what: str) -> None:
-    """Raise `ValueError` for a law with states of its own where they are not followed.
-
-    >>> require_stateless(None, "crossings")
-    """
+    """Raise `ValueError` for a law with states of its own where they are not followed."""
     if has_states(law):
         raise ValueError(
             f"{what}: wanted a torque without states of its own, got one that has some (such as "
@@ -151,10 +138,7 @@ def rates_of(
 
 
 def require_frozen(law: Any) -> None:
-    """Raise `TypeError` for a law that was to be called without its states.
-
-    >>> require_frozen(lambda t, state, body: -state.omega)
-    """
+    """Raise `TypeError` for a law that was to be called without its states."""
     if has_own(law):
         raise TypeError(
             f"{type(law).__name__} has states of its own (state0, rate): simulate, batch.rollout, "
