@@ -156,6 +156,12 @@ def given(value: Any, shape: tuple[int, ...], name: str, *, hint: str = "") -> A
     return finite(array, name) if known(array) else array
 
 
+def scalars(**named: Any) -> list[Array]:
+    """Numbers by name, as `floating` does, in one precision."""
+    found = [floating(value, (), name) for name, value in named.items()]
+    return [value.astype(jnp.result_type(*found)) for value in found]
+
+
 def time(value: Any, name: str = "t") -> Array:
     """Return a time: one number, and where it is known a finite one."""
     return given(value, (), name)

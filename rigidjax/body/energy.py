@@ -14,6 +14,7 @@ from rigidjax._types import (
     HasAttitude,
     HasPose,
     HasSpin,
+    Mat3,
     Matrix,
     Quat,
     Quaternion,
@@ -22,7 +23,7 @@ from rigidjax._types import (
     Vec3,
     Vector,
 )
-from rigidjax.body.inertia import Inertia, MassProperties
+from rigidjax.body.inertia import Inertia, MassProperties, tensor_of
 from rigidjax.body.principal_axes import principal
 from rigidjax.body.validation import unit_quaternion
 from rigidjax.rotation import quaternion
@@ -43,9 +44,8 @@ def kinetic_energy(body: Inertia | MassProperties, state: HasSpin | Vector) -> S
     >>> kinetic_energy(Inertia.from_principal(1.0, 2.0, 3.0), [1.0, 1.0, 1.0])
     Array(3., dtype=float64)
     """
-    inertia = _inertia_of(body)
     omega = _omega(state)
-    energy = 0.5 * dot(omega, apply(inertia.tensor, omega))
+    energy = 0.5 * dot(omega, apply(_tensor(body), omega))
     if isinstance(body, MassProperties) and isinstance(state, HasPose):
         energy = energy + 0.5 * body.mass * dot(state.v, state.v)
     return energy
@@ -132,8 +132,7 @@ def angular_momentum(body: Inertia | MassProperties, state: HasSpin | Vector) ->
     >>> angular_momentum(Inertia.from_principal(1.0, 2.0, 3.0), [1.0, 1.0, 1.0])
     Array([1., 2., 3.], dtype=float64)
     """
-    inertia = _inertia_of(body)
-    return apply(inertia.tensor, _omega(state))
+    return apply(_tensor(body), _omega(state))
 
 
 def spatial_angular_momentum(body: Inertia | MassProperties, state: HasAttitude) -> Vec3:
@@ -221,7 +220,6 @@ def _vector(value, name):
     return _checks.floating(value, (3,), name)
 
 
-def _inertia_of(body: Inertia | MassProperties) -> Inertia:
+def _tensor(body: Inertia | MassProperties) -> Mat3:
     hint = "Inertia.from_tensor makes one of a matrix"
-    _checks.single(body, (Inertia, MassProperties), "body", hint=hint)
-    return body if isinstance(body, Inertia) else body.inertia
+    return tensor_of(_checks.single(body, (Inertia, MassProperties), "body", hint=hint))

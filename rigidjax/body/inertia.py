@@ -84,9 +84,8 @@ class Inertia(eqx.Module):
         >>> Inertia.from_principal(1.0, 2.0, 3.0).tensor[2, 2]
         Array(3., dtype=float64)
         """
-        moments = [_checks.floating(i, (), f"i{k + 1}") for k, i in enumerate((i1, i2, i3))]
-        moments = jnp.stack([m.astype(jnp.result_type(*moments)) for m in moments])
-        return Inertia(jnp.diag(validation.real_moments(moments)))
+        moments = validation.real_moments(jnp.stack(_checks.scalars(i1=i1, i2=i2, i3=i3)))
+        return Inertia(jnp.diag(moments))
 
     @staticmethod
     def from_second_moment(second_moment: Matrix) -> "Inertia":
@@ -313,6 +312,11 @@ class MassProperties(eqx.Module):
         if not isinstance(other, MassProperties):
             return NotImplemented
         return _joined(self, -other.mass, other.com, -other.second_moment)
+
+
+def tensor_of(body: Inertia | MassProperties) -> Mat3:
+    """The inertia tensor (3, 3), kg m²: of an `Inertia`, or about the centre of mass."""
+    return body.tensor if isinstance(body, Inertia) else body.inertia.tensor
 
 
 def _joined(body, mass, com, second_moment):

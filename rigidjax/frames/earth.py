@@ -73,7 +73,7 @@ class Earth(AbstractScene):
         0.02195
         """
         h = _checks.floating(height, (), "height")
-        h = _checks.refuse(h, ~(h >= 0), "height: wanted metres above the ground, a number ≥ 0")
+        h = _checks.sign(h, "height", "metres above the ground, a number ≥ 0", zero=True)
         time = jnp.sqrt(2 * h / self.gravity)
         return self.rate * self.gravity * jnp.cos(self.latitude) * time**3 / 3
 
@@ -97,16 +97,11 @@ def checked(
     latitude: ScalarLike, gravity: ScalarLike, rate: ScalarLike
 ) -> tuple[Scalar, Scalar, Scalar]:
     """Latitude, gravity and rate as scalars of one dtype, or the likely mistake."""
-    values = {"latitude": latitude, "gravity": gravity, "rate": rate}
-    known = {name: _checks.floating(value, (), name) for name, value in values.items()}
-    dtype = jnp.result_type(*known.values())
-    lat, g, w = (value.astype(dtype) for value in known.values())
+    lat, g, w = _checks.scalars(latitude=latitude, gravity=gravity, rate=rate)
     lat = _checks.refuse(
         lat,
         ~(jnp.abs(lat) <= 0.5000001 * jnp.pi),
         "latitude: wanted radians between −π/2 and π/2; were these degrees?",
     )
-    g = _checks.refuse(
-        g, ~((g > 0) & jnp.isfinite(g)), "gravity: wanted a positive number, m/s²; it points down"
-    )
+    g = _checks.sign(g, "gravity", "a positive number, m/s²; it points down")
     return lat, g, _checks.refuse(w, ~jnp.isfinite(w), "rate: wanted a finite number, rad/s")

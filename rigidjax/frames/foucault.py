@@ -56,12 +56,14 @@ class Foucault(AbstractScene):
         >>> foucault(0.5, 10.0).state(6.0, 0.0, 4.0, 0.0).v.tolist()
         [4.0, 0.0, 3.0]
         """
-        given = (east, north, east_speed, north_speed)
-        names = ("east", "north", "east_speed", "north_speed")
-        values = [_checks.floating(v, (), n) for v, n in zip(given, names, strict=True)]
-        dtype = jnp.result_type(self.length, *values)
-        e, n, ve, vn = (value.astype(dtype) for value in values)
-        below = self.length.astype(dtype) ** 2 - e * e - n * n
+        length, e, n, ve, vn = _checks.scalars(
+            length=self.length,
+            east=east,
+            north=north,
+            east_speed=east_speed,
+            north_speed=north_speed,
+        )
+        below = length**2 - e * e - n * n
         below = _checks.refuse(
             below, ~(below > 0), "foucault: the start lies beyond the length of the string"
         )
@@ -130,7 +132,5 @@ def foucault(
     """
     place = Earth(*checked(latitude, gravity, rate))
     string = _checks.floating(length, (), "length")
-    string = _checks.refuse(
-        string, ~((string > 0) & jnp.isfinite(string)), "length: wanted a positive number, m"
-    )
+    string = _checks.sign(string, "length", "a positive number, m")
     return Foucault(place, string.astype(jnp.promote_types(string.dtype, place.rate.dtype)))

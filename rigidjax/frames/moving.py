@@ -208,12 +208,13 @@ class MovingFrame(eqx.Module):
         >>> half.then(half).at(0.0).rate.tolist()
         [0.0, 0.0, 2.0]
         """
-        require_frame(inner, "then")
-        return MovingFrame(_ComposedRotation(self, inner), _ComposedOrigin(self, inner))
+        both = _Composed(self, require_frame(inner, "then"))
+        return MovingFrame(both.rotation, both.origin, both.rate)
 
     def inverse(self) -> "MovingFrame":
         """S as S' sees it: M → Mᵀ, X → −MᵀX. `frame.then(frame.inverse())` is no motion at all."""
-        return MovingFrame(_InverseRotation(self), _InverseOrigin(self))
+        back = _Inverse(self)
+        return MovingFrame(back.rotation, back.origin, back.rate)
 
     def place(self, t: ScalarLike) -> Vec3:
         """X(t) (3,), m, axes of S."""
@@ -221,16 +222,10 @@ class MovingFrame(eqx.Module):
         return jnp.zeros(3, t.dtype) if self.origin is None else _Place(self.origin)(t)
 
 
-def require_frame(frame: Any, name: str) -> None:
-    """Raise `TypeError` unless `frame` is a `MovingFrame`.
-
-    >>> require_frame(MovingFrame(rj.frames.Uniform([0.0, 0.0, 1.0])), "frame")
-    """
-    if not isinstance(frame, MovingFrame):
-        raise TypeError(
-            f"{name}: wanted a MovingFrame, got {type(frame).__name__}; make one from a rotation "
-            "with MovingFrame(rotation)"
-        )
+def require_frame(frame: Any, name: str) -> Any:
+    """Return `frame` if it is a `MovingFrame`; else raise in words."""
+    hint = "make one from a rotation with MovingFrame(rotation)"
+    return _checks.instance(frame, MovingFrame, name, wanted="a MovingFrame", hint=hint)
 
 
 class _Place(eqx.Module):
@@ -242,11 +237,11 @@ class _Place(eqx.Module):
         return _checks.floating(self.origin(t), (3,), "origin").astype(t.dtype)
 
 
-class _ComposedRotation(eqx.Module):
+class _Composed(eqx.Module):
     outer: MovingFrame
     inner: MovingFrame
 
-    def __call__(self, t: Any) -> Any:
+    def rotation(self, t: Any) -> Any:
         return linalg3.product(self.outer.matrix(t), self.inner.matrix(t))
 
     def rate(self, t: Any) -> Any:
@@ -254,27 +249,18 @@ class _ComposedRotation(eqx.Module):
         carried = linalg3.apply(self.inner.matrix(t).T, self.outer.angular_velocity(t))
         return carried + self.inner.angular_velocity(t)
 
-
-class _ComposedOrigin(eqx.Module):
-    outer: MovingFrame
-    inner: MovingFrame
-
-    def __call__(self, t: Any) -> Any:
+    def origin(self, t: Any) -> Any:
         return self.outer.place(t) + linalg3.apply(self.outer.matrix(t), self.inner.place(t))
 
 
-class _InverseRotation(eqx.Module):
+class _Inverse(eqx.Module):
     frame: MovingFrame
 
-    def __call__(self, t: Any) -> Any:
+    def rotation(self, t: Any) -> Any:
         return self.frame.matrix(t).T
 
     def rate(self, t: Any) -> Any:
         return -linalg3.apply(self.frame.matrix(t), self.frame.angular_velocity(t))
 
-
-class _InverseOrigin(eqx.Module):
-    frame: MovingFrame
-
-    def __call__(self, t: Any) -> Any:
+    def origin(self, t: Any) -> Any:
         return -linalg3.apply(self.frame.matrix(t).T, self.frame.place(t))

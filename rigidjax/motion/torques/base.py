@@ -22,7 +22,7 @@ from rigidjax._types import (
     Vec3Like,
     Vector,
 )
-from rigidjax.body.inertia import Inertia, MassProperties
+from rigidjax.body.inertia import Inertia, MassProperties, tensor_of as tensor_of
 from rigidjax.motion.torques.states import Frozen, require_frozen
 
 
@@ -273,11 +273,6 @@ def in_precision(tree: Any, dtype: Any) -> Any:
         return leaf
 
     return jax.tree.map(cast, tree)
-
-
-def tensor_of(body: Inertia | MassProperties) -> Float[Array, "3 3"]:
-    """The inertia tensor (3, 3), kg m²: of an `Inertia`, or about the centre of mass."""
-    return body.tensor if isinstance(body, Inertia) else body.inertia.tensor
 
 
 def vector_at(source: Any, t: ScalarLike, name: str, size: int = 3) -> Float[Array, " size"]:

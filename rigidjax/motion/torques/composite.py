@@ -10,18 +10,9 @@ from jaxtyping import Array, Float
 
 from rigidjax import _checks
 from rigidjax._types import HasSpin, Mat3, ScalarLike, Vec3
-from rigidjax.body.inertia import Inertia, MassProperties
+from rigidjax.body.inertia import Inertia, MassProperties, tensor_of
 from rigidjax.body.symmetric3 import apply, inverse
-from rigidjax.motion.torques.base import (
-    LADDER,
-    Torque,
-    Wrench,
-    act,
-    jumps_in,
-    require_law,
-    sees_rate,
-    tensor_of,
-)
+from rigidjax.motion.torques import base
 from rigidjax.rotation.linalg3 import cross
 
 
@@ -39,11 +30,11 @@ class Sum(eqx.Module):
 
     parts: tuple[Any, ...]
 
-    def __init__(self, *parts: Torque):
+    def __init__(self, *parts: base.Torque):
         if not parts:
             raise ValueError("Sum: wanted at least one torque; for a free body give torque=None")
         for part in parts:
-            require_law(part, "Sum")
+            base.require_law(part, "Sum")
             if isinstance(part, ChangingInertia) and len(parts) > 1:
                 raise TypeError(
                     "Sum: ChangingInertia divides all torques by the inertia at their time: put "
@@ -54,28 +45,30 @@ class Sum(eqx.Module):
     @property
     def feels(self) -> type:
         """The highest state that a part needs."""
-        rungs = [getattr(part, "feels", LADDER[0]) for part in self.parts]
-        return max(rungs, key=lambda r: LADDER.index(r) if r in LADDER else len(LADDER))
+        rungs = [getattr(part, "feels", base.LADDER[0]) for part in self.parts]
+        return max(
+            rungs, key=lambda r: base.LADDER.index(r) if r in base.LADDER else len(base.LADDER)
+        )
 
     @property
     def rate_free(self) -> bool:
         """Whether no part looks at the body rate."""
-        return all(not sees_rate(part) for part in self.parts)
+        return all(not base.sees_rate(part) for part in self.parts)
 
     @property
     def jump_times(self) -> Float[Array, " n"]:
         """The times of all parts, s, in order."""
-        return jumps_in(*self.parts)
+        return base.jumps_in(*self.parts)
 
-    def __call__(self, t: ScalarLike, state: Any, body: Any) -> Vec3 | Wrench:
+    def __call__(self, t: ScalarLike, state: Any, body: Any) -> Vec3 | base.Wrench:
         forces, torque = [], None
         for part in self.parts:
-            force, more = act(part, t, state, body)
+            force, more = base.act(part, t, state, body)
             torque = more if torque is None else torque + more
             forces += [] if force is None else [force]
         if not forces:
             return torque  # pyright: ignore[reportReturnType]
-        return Wrench(sum(forces[1:], forces[0]), torque)
+        return base.Wrench(sum(forces[1:], forces[0]), torque)
 
 
 class ChangingInertia(eqx.Module):
@@ -107,10 +100,10 @@ class ChangingInertia(eqx.Module):
     inertia: Callable[[Any], Any]
     torque: Any
 
-    def __init__(self, inertia: Callable[[Any], Any], torque: Torque | None = None):
+    def __init__(self, inertia: Callable[[Any], Any], torque: base.Torque | None = None):
         self.inertia = _checks.function(inertia, "inertia", "of time to (3, 3), kg m²")
         if torque is not None:
-            require_law(torque)
+            base.require_law(torque)
         self.torque = torque
 
     @property
@@ -121,7 +114,7 @@ class ChangingInertia(eqx.Module):
     @property
     def jump_times(self) -> Float[Array, " n"]:
         """Times, s, where the inertia has a kink, or the torque jumps."""
-        return jumps_in(self.inertia, self.torque)
+        return base.jumps_in(self.inertia, self.torque)
 
     def tensor(self, t: ScalarLike) -> Mat3:
         """I(t), (3, 3), kg m²."""
@@ -129,7 +122,7 @@ class ChangingInertia(eqx.Module):
         found = found.tensor if isinstance(found, Inertia) else found
         return _checks.floating(found, (3, 3), "inertia(t)")
 
-    def __call__(self, t: ScalarLike, state: HasSpin, body: Any) -> Vec3 | Wrench:
+    def __call__(self, t: ScalarLike, state: HasSpin, body: Any) -> Vec3 | base.Wrench:
         omega = state.omega
         t = jnp.asarray(t, omega.dtype)
         now, rate = jax.jvp(self.tensor, (t,), (jnp.ones_like(t),))
@@ -137,13 +130,13 @@ class ChangingInertia(eqx.Module):
         turning = cross(apply(now, omega), omega) - apply(rate, omega)
         force = None
         if self.torque is not None:
-            force, torque = act(self.torque, t, state, _as_it_is(body, now))
+            force, torque = base.act(self.torque, t, state, _as_it_is(body, now))
             turning = turning + torque
         # The body's own equations have its own inertia: the torque that brings them to this.
         fixed = tensor_of(body)
         slope = apply(inverse(now), turning)
         torque = apply(fixed, slope) - cross(apply(fixed, omega), omega)
-        return torque if force is None else Wrench(force, torque)
+        return torque if force is None else base.Wrench(force, torque)
 
 
 def _as_it_is(body: Any, tensor: Mat3) -> Any:

@@ -7,17 +7,11 @@ from jaxtyping import Array, Float
 
 from rigidjax import _checks
 from rigidjax._types import HasAttitude, HasSpin, ScalarLike, Vec3, Vector
-from rigidjax.motion.torques.base import (
-    AbstractTorque,
-    OfTime,
-    constant_or_callable,
-    length_or_zero,
-    vector_at,
-)
+from rigidjax.motion.torques import base
 from rigidjax.rotation import quaternion
 
 
-class ConstantTorque(AbstractTorque):
+class ConstantTorque(base.AbstractTorque):
     """A torque that stays the same in the body, such as a thruster: `τ = const`.
 
     **Arguments:** `torque` (3,) N m, body frame. About a principal axis it spins the body up
@@ -42,7 +36,7 @@ class ConstantTorque(AbstractTorque):
         return self.torque
 
 
-class InSpace(OfTime):
+class InSpace(base.OfTime):
     """A torque whose direction is given in space: `τ = Rᵀ τ_w`.
 
     **Arguments:** `torque` τ_w, N m, world frame: (3,), or a callable Module of time, t → (3,),
@@ -63,13 +57,13 @@ class InSpace(OfTime):
     torque: eqx.Module | Float[Array, "3"]
 
     def __init__(self, torque: object):
-        self.torque = constant_or_callable(torque, "torque")
+        self.torque = base.constant_or_callable(torque, "torque")
 
     def __call__(self, t: ScalarLike, state: HasAttitude, body: object) -> Vec3:
-        return quaternion.rotate_inverse(state.q, vector_at(self.torque, t, "torque"))
+        return quaternion.rotate_inverse(state.q, base.vector_at(self.torque, t, "torque"))
 
 
-class Damping(AbstractTorque):
+class Damping(base.AbstractTorque):
     """Linear damping `τ = −c Ω`, component by component.
 
     **Arguments:** `coefficient` (3,) c along the body axes, N m s/rad. A sphere of inertia I then
@@ -95,7 +89,7 @@ class Damping(AbstractTorque):
         return -self.coefficient * state.omega
 
 
-class QuadraticDamping(AbstractTorque):
+class QuadraticDamping(base.AbstractTorque):
     """Quadratic damping `τ = −c |Ω| Ω`, component by component.
 
     **Arguments:** `coefficient` (3,) c along the body axes, N m s²/rad². A body turning about a
@@ -120,4 +114,4 @@ class QuadraticDamping(AbstractTorque):
         )
 
     def __call__(self, t: ScalarLike, state: HasSpin, body: object) -> Vec3:
-        return -length_or_zero(state.omega) * self.coefficient * state.omega
+        return -base.length_or_zero(state.omega) * self.coefficient * state.omega

@@ -10,22 +10,12 @@ from jaxtyping import Array, ArrayLike, Float
 from rigidjax import _checks
 from rigidjax._types import HasPose, Scalar, ScalarLike, Vec3, Vector
 from rigidjax.body.inertia import MassProperties
-from rigidjax.motion.torques.base import (
-    AbstractForce,
-    Wrench,
-    constant_or_callable,
-    count_of,
-    each,
-    jumps_of,
-    length_or_zero,
-    unit_rows,
-    vector_at,
-)
+from rigidjax.motion.torques import base
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.linalg3 import apply, cross, dot
 
 
-class UniformGravity(AbstractForce):
+class UniformGravity(base.AbstractForce):
     """The same acceleration everywhere: `F = m g`, no torque about the centre, `U = −m g·x`.
 
     **Arguments:** `gravity` (3,) g, m/s², world frame, such as [0, 0, −9.81].
@@ -58,11 +48,11 @@ class UniformGravity(AbstractForce):
         """Zero, N m s: it does not turn the body, and nothing turns inside."""
         return jnp.zeros_like(self.gravity)
 
-    def __call__(self, t: ScalarLike, state: HasPose, body: MassProperties) -> Wrench:
-        return Wrench(body.mass * self.gravity)
+    def __call__(self, t: ScalarLike, state: HasPose, body: MassProperties) -> base.Wrench:
+        return base.Wrench(body.mass * self.gravity)
 
 
-class CentralGravity(AbstractForce):
+class CentralGravity(base.AbstractForce):
     """A centre of attraction at the world's origin, on a body of some size.
 
     `U = −μ m/r − (μ/2r³)(Tr I − 3 r̂·I_w r̂)` (MacCullagh's formula), with its force and its torque,
@@ -94,7 +84,7 @@ class CentralGravity(AbstractForce):
         size = tensor[0, 0] + tensor[1, 1] + tensor[2, 2] - 3 * dot(up, apply(tensor, up))
         return -(self.mu / r) * (body.mass + 0.5 * size / r / r)
 
-    def __call__(self, t: ScalarLike, state: HasPose, body: MassProperties) -> Wrench:
+    def __call__(self, t: ScalarLike, state: HasPose, body: MassProperties) -> base.Wrench:
         r = jnp.sqrt(dot(state.x, state.x))
         tensor = body.inertia.tensor
         up = quaternion.rotate_inverse(state.q, state.x / r)
@@ -104,10 +94,10 @@ class CentralGravity(AbstractForce):
         # −∂U/∂x in body axes: the part along r, and the part of I r̂ across it.
         radial = -strength * (body.mass + 1.5 * (trace - 5 * along) / r / r)
         force = radial * up - 3 * strength / r / r * pull
-        return Wrench(quaternion.rotate(state.q, force), cross(3 * strength / r * up, pull))
+        return base.Wrench(quaternion.rotate(state.q, force), cross(3 * strength / r * up, pull))
 
 
-class Drag(AbstractForce):
+class Drag(base.AbstractForce):
     """Drag of a fluid: `F = −k |u| u`, `u = v − wind`, at a point of the body.
 
     **Arguments:** `coefficient` k = ½ ρ C_d A, kg/m; `centre` (3,) the point where it acts, m, body
@@ -142,13 +132,13 @@ class Drag(AbstractForce):
         self.centre = _checks.given(centre, (3,), "centre")
         self.wind = _checks.given(wind, (3,), "wind")
 
-    def __call__(self, t: ScalarLike, state: HasPose, body: MassProperties) -> Wrench:
+    def __call__(self, t: ScalarLike, state: HasPose, body: MassProperties) -> base.Wrench:
         u = state.v - self.wind
-        force = -self.coefficient * length_or_zero(u) * u
-        return Wrench(force, cross(self.centre, quaternion.rotate_inverse(state.q, force)))
+        force = -self.coefficient * base.length_or_zero(u) * u
+        return base.Wrench(force, cross(self.centre, quaternion.rotate_inverse(state.q, force)))
 
 
-class Rotors(AbstractForce):
+class Rotors(base.AbstractForce):
     """Propellers: thrust `F_i = k_i n_i² d_i` at r_i, and the reaction `τ_i = −s_i c_i n_i² d_i`.
 
     **Arguments:** `positions` r (R, 3) m, body frame, from the centre of mass; `directions` d
@@ -187,22 +177,22 @@ class Rotors(AbstractForce):
         drag: Float[ArrayLike, "*rotors"] | Any,
         speeds: Any,
     ):
-        count = count_of(positions, "positions", "rotor")
+        count = base.count_of(positions, "positions", "rotor")
         self.positions = _checks.given(positions, (count, 3), "positions")
-        self.directions = unit_rows(directions, "directions", count)
+        self.directions = base.unit_rows(directions, "directions", count)
         self.spins = _checks.given(spins, (count,), "spins")
         if _checks.known(self.spins) and (abs(np.asarray(self.spins)) != 1).any():
             raise ValueError(f"spins: wanted 1 or -1 for each rotor, got {np.asarray(self.spins)}")
-        self.thrust, self.drag = each(thrust, count, "thrust"), each(drag, count, "drag")
-        self.speeds = constant_or_callable(speeds, "speeds", count)
+        self.thrust, self.drag = base.each(thrust, count, "thrust"), base.each(drag, count, "drag")
+        self.speeds = base.constant_or_callable(speeds, "speeds", count)
 
     @property
     def jump_times(self) -> Float[Array, " n"]:
         """Times, s, where the speeds jump or have a kink."""
-        return jumps_of(self.speeds)
+        return base.jumps_of(self.speeds)
 
-    def __call__(self, t: ScalarLike, state: HasPose, body: MassProperties) -> Wrench:
-        n = vector_at(self.speeds, t, "speeds", self.spins.shape[0]).astype(self.spins.dtype)
+    def __call__(self, t: ScalarLike, state: HasPose, body: MassProperties) -> base.Wrench:
+        n = base.vector_at(self.speeds, t, "speeds", self.spins.shape[0]).astype(self.spins.dtype)
         square = n * n
         lift, twist = self.thrust * square, self.spins * self.drag * square
         # Written out, rotor by rotor: few, and sums of arrays are slow in a batch.
@@ -211,10 +201,10 @@ class Rotors(AbstractForce):
             along = self.directions[i]
             force = force + lift[i] * along
             torque = torque + lift[i] * cross(self.positions[i], along) - twist[i] * along
-        return Wrench(quaternion.rotate(state.q, force), torque)
+        return base.Wrench(quaternion.rotate(state.q, force), torque)
 
 
-class BodyDrag(AbstractForce):
+class BodyDrag(base.AbstractForce):
     """Drag along the body's axes: `F = −R (a ∘ u + b ∘ |u| u)`, `τ = c × RᵀF`, `u = Rᵀ (v − wind)`.
 
     **Arguments:** `linear` a (3,) kg/s, such as of rotors in a cross-flow; `quadratic` b (3,) kg/m;
@@ -251,7 +241,7 @@ class BodyDrag(AbstractForce):
         self.centre = _checks.given(centre, (3,), "centre")
         self.wind = _checks.given(wind, (3,), "wind")
 
-    def __call__(self, t: ScalarLike, state: HasPose, body: MassProperties) -> Wrench:
+    def __call__(self, t: ScalarLike, state: HasPose, body: MassProperties) -> base.Wrench:
         u = quaternion.rotate_inverse(state.q, state.v - self.wind)
         force = -(self.linear + self.quadratic * jnp.abs(u)) * u
-        return Wrench(quaternion.rotate(state.q, force), cross(self.centre, force))
+        return base.Wrench(quaternion.rotate(state.q, force), cross(self.centre, force))

@@ -11,19 +11,13 @@ from jaxtyping import Array, Float
 
 from rigidjax import _checks
 from rigidjax._types import HasAttitude, HasPose, Scalar, ScalarLike, Vec3, Vector
-from rigidjax.body.inertia import Inertia, MassProperties
-from rigidjax.motion.torques.base import (
-    AbstractTorque,
-    OfTime,
-    constant_or_callable,
-    tensor_of,
-    vector_at,
-)
+from rigidjax.body.inertia import Inertia, MassProperties, tensor_of
+from rigidjax.motion.torques import base
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.linalg3 import apply, cross, dot
 
 
-class HeavyTop(AbstractTorque):
+class HeavyTop(base.AbstractTorque):
     """Gravity on a body with a fixed point: `τ = c × m Rᵀg`, `U = −m g·Rc`.
 
     **Arguments:** `mass` m, kg; `com` (3,) c, from the fixed point to the centre of mass, m, body
@@ -76,7 +70,7 @@ class HeavyTop(AbstractTorque):
         return cross(self.mass * self.com, quaternion.rotate_inverse(state.q, self.gravity))
 
 
-class GravityGradient(OfTime):
+class GravityGradient(base.OfTime):
     """The torque of a far central body: `τ = (3μ/r³) r̂' × I r̂'`, `r̂' = Rᵀ r̂`.
 
     **Arguments:** `mu` μ = G M of the central body, m³/s²; `position` r (3,) m, world frame, from
@@ -103,7 +97,7 @@ class GravityGradient(OfTime):
 
     def __init__(self, mu: ScalarLike, position: object):
         self.mu = _checks.given(mu, (), "mu")
-        self.position = constant_or_callable(position, "position")
+        self.position = base.constant_or_callable(position, "position")
         at: Any = self.position
         if not callable(at) and _checks.known(at) and not np.asarray(at).any():
             raise ValueError(
@@ -128,7 +122,7 @@ class GravityGradient(OfTime):
 
     def _down(self, t, state):
         """Direction of the central body in body axes, and μ/r³."""
-        r = vector_at(self.position, t, "position")
+        r = base.vector_at(self.position, t, "position")
         distance = jnp.sqrt(dot(r, r))
         # r³ overflows in float32 beyond 7e12 m: divide by r three times instead.
         return (
@@ -137,7 +131,7 @@ class GravityGradient(OfTime):
         )
 
 
-class MagneticDipole(OfTime):
+class MagneticDipole(base.OfTime):
     """A magnetic moment fixed in the body, in a uniform field: `τ = m × RᵀB`, `U = −m·RᵀB`.
 
     **Arguments:** `moment` (3,) m, A m², body frame; `field` B, T, world frame: (3,), or a callable
@@ -160,7 +154,7 @@ class MagneticDipole(OfTime):
 
     def __init__(self, moment: Vector, field: object):
         self.moment = _checks.given(moment, (3,), "moment")
-        self.field = constant_or_callable(field, "field")
+        self.field = base.constant_or_callable(field, "field")
 
     @property
     def axis(self) -> Vec3 | None:
@@ -175,10 +169,10 @@ class MagneticDipole(OfTime):
         return cross(self.moment, self._field_in_body(t, state))
 
     def _field_in_body(self, t, state):
-        return quaternion.rotate_inverse(state.q, vector_at(self.field, t, "field"))
+        return quaternion.rotate_inverse(state.q, base.vector_at(self.field, t, "field"))
 
 
-class FromPotential(AbstractTorque):
+class FromPotential(base.AbstractTorque):
     """The torque of any potential `U(q)` on the attitude, by differentiation.
 
     **Arguments:** `potential` a callable Module `q → U`, J, with `q` (4,) unit, body → world.

@@ -12,16 +12,7 @@ from rigidjax import _checks
 from rigidjax._types import HasSpin, Scalar, ScalarLike, Vec3
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.body.symmetric3 import outer
-from rigidjax.motion.torques.base import (
-    AbstractTorque,
-    OfTime,
-    constant_or_callable,
-    count_of,
-    each,
-    jumps_of,
-    unit_rows,
-    vector_at,
-)
+from rigidjax.motion.torques import base
 from rigidjax.motion.torques.states import has_states
 from rigidjax.rotation.linalg3 import cross
 
@@ -31,7 +22,7 @@ Numbers = Float[ArrayLike, "*wheels"] | Any
 _FADE = 0.05
 
 
-class Flywheel(OfTime):
+class Flywheel(base.OfTime):
     """What wheels inside do to the body that carries them: `τ = h × Ω − dh/dt`.
 
     **Arguments:** `momentum` h, N m s, body frame: (3,) for wheels that run at constant speed, or a
@@ -55,7 +46,7 @@ class Flywheel(OfTime):
     momentum: eqx.Module | Float[Array, "3"]
 
     def __init__(self, momentum: object):
-        self.momentum = constant_or_callable(momentum, "momentum")
+        self.momentum = base.constant_or_callable(momentum, "momentum")
         if has_states(momentum):
             raise TypeError(
                 "Flywheel: wanted a momentum whose derivative by time is known, got one with "
@@ -64,7 +55,7 @@ class Flywheel(OfTime):
 
     def internal_momentum(self, t: ScalarLike) -> Vec3:
         """The wheels' momentum h at `t`, (3,), N m s, body frame."""
-        return vector_at(self.momentum, t, "momentum")
+        return base.vector_at(self.momentum, t, "momentum")
 
     def energy(self, t: ScalarLike, state: HasSpin, body: object) -> Scalar:
         """Zero, J: h × Ω does no work."""
@@ -79,7 +70,7 @@ class Flywheel(OfTime):
         return cross(h, state.omega) - rate
 
 
-class ReactionWheels(AbstractTorque):
+class ReactionWheels(base.AbstractTorque):
     """Wheels on motors inside the body (a gyrostat): `τ = (Σ h a) × Ω − Σ u a`, `dh/dt = u`.
 
     **Arguments:** for R wheels
@@ -147,12 +138,12 @@ class ReactionWheels(AbstractTorque):
         coulomb: Numbers = None,
         turn_over: ScalarLike = 1.0,
     ):
-        count = count_of(axes, "axes", "wheel")
-        self.axes = unit_rows(axes, "axes", count)
+        count = base.count_of(axes, "axes", "wheel")
+        self.axes = base.unit_rows(axes, "axes", count)
         inertia = _checks.given(inertia, (count,), "inertia")
         self.inertia = _checks.if_known(_checks.sign, inertia, "inertia", "> 0")
         self.speeds = _checks.given(speeds, (count,), "speeds")
-        self.motor = None if motor is None else constant_or_callable(motor, "motor", count)
+        self.motor = None if motor is None else base.constant_or_callable(motor, "motor", count)
         if feedback is not None:
             words = "(t, state, speeds) → torques (R,), N m"
             feedback = _checks.function(feedback, "feedback", words)
@@ -173,7 +164,7 @@ class ReactionWheels(AbstractTorque):
     @property
     def jump_times(self) -> Float[Array, " n"]:
         """Times, s, where the motors' torques jump or have a kink."""
-        return jumps_of(self.motor)
+        return base.jumps_of(self.motor)
 
     def without_wheels(self, body: Body) -> Body:
         """The body without the wheels' axial moments: `I − Σ J a aᵀ`.
@@ -202,7 +193,7 @@ class ReactionWheels(AbstractTorque):
         t = _checks.floating(t, (), "t")
         count, total = self.inertia.shape[0], jnp.zeros_like(speeds)
         if self.motor is not None:
-            total = total + vector_at(self.motor, t, "motor", count).astype(total.dtype)
+            total = total + base.vector_at(self.motor, t, "motor", count).astype(total.dtype)
         if self.feedback is not None:
             found = self.feedback(t, state, speeds)
             total = total + _checks.floating(found, (count,), "feedback(t, state, speeds)")
@@ -255,5 +246,5 @@ def _each(value: Any, count: int, name: str, wanted: str) -> Array | None:
     """A number for all wheels, or one a wheel: "> 0" or "≥ 0"."""
     if value is None:
         return None
-    found = each(value, count, name)
+    found = base.each(value, count, name)
     return _checks.if_known(_checks.sign, found, name, wanted, zero=wanted == "≥ 0")
