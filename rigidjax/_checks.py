@@ -7,14 +7,16 @@ import re
 import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, ArrayLike, Bool, Float
+from jaxtyping import Array, ArrayLike, Bool
+
+Numbers = TypeVar("Numbers", bound=Any)
 
 
 def floating(
@@ -140,7 +142,7 @@ def bare(error: RuntimeError) -> RuntimeError:
     return type(error)(found[1]) if found else error
 
 
-def finite(value: Float[ArrayLike, "..."], name: str) -> Any:
+def finite(value: Numbers, name: str) -> Numbers:
     """Return `value` unless it holds a NaN or an infinity."""
     xp = namespace(value)
     bad = ~xp.isfinite(value)

@@ -8,11 +8,12 @@ far from the origin, where a sum about the origin subtracts numbers of size (dis
 
 import os
 from collections.abc import Iterable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import ArrayLike, Float, Int
+from jaxtyping import Array, ArrayLike, Float, Int
 
 from rigidjax import _checks
 from rigidjax._types import Numbers, ScalarLike
@@ -142,7 +143,7 @@ def _outward(volume, corners, faces):
     )
 
 
-def faces_of(faces, n):
+def faces_of(faces: Any, n: int) -> Array:
     """The faces as an array (m, 3) of vertex numbers below n, checked where they are known."""
     if not _checks.known(faces):
         return faces

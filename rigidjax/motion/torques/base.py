@@ -280,6 +280,11 @@ def vector_at(source: Any, t: ScalarLike, name: str, size: int = 3) -> Float[Arr
     return _checks.floating(source(t), (size,), f"{name}(t)") if callable(source) else source
 
 
+def stays(source: Any) -> Vec3 | None:
+    """A vector that is constant; `None` for a function of time."""
+    return None if callable(source) else source
+
+
 def constant_or_callable(source: Any, name: str, size: int = 3) -> Any:
     """`source` as it is if it can be called with a time; otherwise as a vector (size,)."""
     if callable(source):

@@ -107,7 +107,7 @@ class GravityGradient(base.OfTime):
     @property
     def axis(self) -> Vec3 | None:
         """The direction without torque about it, world frame, if it stays: the position's."""
-        return None if callable(self.position) else self.position
+        return base.stays(self.position)
 
     def energy(self, t: ScalarLike, state: HasAttitude, body: Inertia | MassProperties) -> Scalar:
         """Potential energy of the attitude, J: `U = (μ/2r³)(3 r̂'·I r̂' − Tr I)`."""
@@ -159,7 +159,7 @@ class MagneticDipole(base.OfTime):
     @property
     def axis(self) -> Vec3 | None:
         """The direction about which there is no torque, world frame, if it stays: the field's."""
-        return None if callable(self.field) else self.field
+        return base.stays(self.field)
 
     def energy(self, t: ScalarLike, state: HasAttitude, body: object) -> Scalar:
         """Potential energy, J: `U = −m·RᵀB`."""
