@@ -5,6 +5,8 @@ tensor `I = Tr(𝔖) 1 − 𝔖` (eqs 76–78). A matrix is the 𝔖 of a real b
 semi-definite; for I that reads as the triangle inequality of its moments.
 """
 
+from typing import TypeVar
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -317,6 +319,16 @@ class MassProperties(eqx.Module):
 def tensor_of(body: Inertia | MassProperties) -> Mat3:
     """The inertia tensor (3, 3), kg m²: of an `Inertia`, or about the centre of mass."""
     return body.tensor if isinstance(body, Inertia) else body.inertia.tensor
+
+
+Body = TypeVar("Body", Inertia, MassProperties)
+
+
+def with_tensor(body: Body, tensor: Mat3) -> Body:
+    """The body with another inertia tensor, unchecked: parts of a body may turn as no body does."""
+    if isinstance(body, Inertia):
+        return Inertia(tensor)
+    return eqx.tree_at(lambda b: b.second_moment, body, swap_trace_back(tensor))
 
 
 def _joined(body, mass, com, second_moment):

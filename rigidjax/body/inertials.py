@@ -32,14 +32,14 @@ def read_inertials(path: str | Path) -> dict[str, MassProperties]:
     ValueError: missing.urdf: no such file
     """
     path = _checks.path(path)
-    root = _parsed(path)
-    urdf = _is_urdf(path, root)
+    root, nodes = _opened(path)
+    read = _from_urdf if root.tag == "robot" else _from_mujoco
     out: dict[str, MassProperties] = {}
-    for name, node in _bodies(path, root):
+    for name, node in nodes.items():
         inertial = node.find("inertial")
         if inertial is not None:
             try:
-                out[name] = _from_urdf(inertial) if urdf else _from_mujoco(inertial)
+                out[name] = read(inertial)
             except ValueError as error:
                 raise ValueError(f"{path}: body {name!r}: {error}") from None
     return out
@@ -64,9 +64,8 @@ def write_inertials(
     _checks.instance(bodies, Mapping, "bodies", wanted="a dict of name → MassProperties")
     if not bodies:
         raise ValueError("bodies: wanted at least one name → MassProperties, got none")
-    root = _parsed(source)
-    urdf = _is_urdf(source, root)
-    nodes = dict(_bodies(source, root))
+    root, nodes = _opened(source)
+    write = _to_urdf if root.tag == "robot" else _to_mujoco
     for name, body in bodies.items():
         _checks.single(body, MassProperties, f"bodies[{name!r}]")
         if name not in nodes:
@@ -75,33 +74,27 @@ def write_inertials(
         if inertial is None:
             inertial = Tree.SubElement(nodes[name], "inertial")
         inertial.clear()
-        (_to_urdf if urdf else _to_mujoco)(inertial, body)
+        write(inertial, body)
     Tree.ElementTree(root).write(path, encoding="utf-8", xml_declaration=True)
 
 
-def _parsed(path: Path) -> Tree.Element:
+def _opened(path: Path) -> tuple[Tree.Element, dict[str, Tree.Element]]:
+    """The file's root, `robot` or `mujoco`, and its links or bodies by name."""
     if not path.exists():
         raise ValueError(f"{path}: no such file")
     try:
-        return Tree.parse(path).getroot()
+        root = Tree.parse(path).getroot()
     except (Tree.ParseError, OSError, ValueError) as error:
         raise ValueError(f"{path}: cannot be read as XML ({error})") from None
-
-
-def _is_urdf(path: Path, root: Tree.Element) -> bool:
     if root.tag not in ("robot", "mujoco"):
         raise ValueError(f"{path}: wanted a URDF (robot) or MuJoCo file, got <{root.tag}>")
-    return root.tag == "robot"
-
-
-def _bodies(path: Path, root: Tree.Element) -> list[tuple[str, Tree.Element]]:
     tag = "link" if root.tag == "robot" else "body"
     nodes = root.findall("link") if tag == "link" else list(root.iter("body"))
     names = [node.get("name", f"{tag} {index}") for index, node in enumerate(nodes)]
     twice = [name for name in names if names.count(name) > 1]
     if twice:
         raise ValueError(f"{path}: two bodies are called {twice[0]!r}")
-    return list(zip(names, nodes, strict=True))
+    return root, dict(zip(names, nodes, strict=True))
 
 
 def _from_urdf(inertial: Tree.Element) -> MassProperties:
@@ -174,9 +167,10 @@ def _to_urdf(inertial: Tree.Element, body: MassProperties) -> None:
     tensor = np.asarray(body.inertia.tensor)
     Tree.SubElement(inertial, "origin", xyz=_text(body.com), rpy="0 0 0")
     Tree.SubElement(inertial, "mass", value=_text(body.mass))
-    places = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2)}
-    places["izz"] = (2, 2)
-    Tree.SubElement(inertial, "inertia", {key: _text(tensor[at]) for key, at in places.items()})
+    entries = zip(
+        ("ixx", "ixy", "ixz", "iyy", "iyz", "izz"), tensor[np.triu_indices(3)], strict=True
+    )
+    Tree.SubElement(inertial, "inertia", {key: _text(entry) for key, entry in entries})
 
 
 def _to_mujoco(inertial: Tree.Element, body: MassProperties) -> None:

@@ -12,8 +12,8 @@ from rigidjax.body.energy import angular_momentum, kinetic_energy
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.motion.coupled import Coupled, motion_of
 from rigidjax.motion.torques import AbstractTorque, CentralGravity, Sum, Torque, freeze
-from rigidjax.motion.torques.base import in_precision, length_or_zero, one_law, require_rung
-from rigidjax.motion.torques.states import Frozen, require_frozen
+from rigidjax.motion.torques.base import in_precision, length_or_zero, require_scene
+from rigidjax.motion.torques.states import Frozen
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.linalg3 import cross, dot
 
@@ -99,7 +99,8 @@ def conserved(
             length = length_or_zero(axis)
             found["momentum_along_axis"] = dot(momentum, axis) / jnp.where(length > 0, length, 1)
     if isinstance(turning, HasPose) and isinstance(body, MassProperties):
-        pushed = [part for part in parts if not isinstance(_itself(part), AbstractTorque)]
+        plain = [(part, part.law if isinstance(part, Frozen) else part) for part in parts]
+        pushed = [part for part, law in plain if not isinstance(law, AbstractTorque)]
         if not pushed:
             found["linear_momentum"] = body.mass * turning.v
         if all(isinstance(part, CentralGravity) for part in [*outside, *pushed]):
@@ -154,25 +155,13 @@ def drift(
     return found
 
 
-def _itself(part: Any) -> Any:
-    return part.law if isinstance(part, Frozen) else part
-
-
 def _scene(body: Any, state: Any, torque: Any, t: Any) -> tuple[Any, tuple[Any, ...], Scalar]:
-    """The body's state, the laws that act on it with their own states put in, and the time.
-
-    Raises in words unless these are a body, a state, and a law or none.
-    """
+    """The body's state, the laws that act on it with their own states put in, and the time."""
     if isinstance(state, Coupled):
         state, torque = state.motion, freeze(torque, state.own)
-    _checks.single(body, (Inertia, MassProperties), "body")
-    _checks.single(state, HasSpin, "state", wanted="a Spin, an Attitude or a Rigid")
-    if torque is not None:
-        require_rung(torque, state)
     parts = _parts(torque)
-    for part in parts:
-        require_frozen(part)
-        one_law(_itself(part))
+    for part in parts or (None,):
+        require_scene(part, state, body)
     return state, parts, _checks.floating(t, (), "t")
 
 

@@ -177,6 +177,16 @@ def require_rung(torque: Torque, state: object) -> None:
         )
 
 
+def require_scene(law: Torque | None, state: object, body: object) -> None:
+    """Raise in words unless these are a body, a state, and one law that can be called, or none."""
+    _checks.single(state, HasSpin, "state", wanted="a Spin, an Attitude or a Rigid")
+    if law is not None:
+        require_rung(law, state)
+        require_frozen(law)
+        one_law(law.law if isinstance(law, Frozen) else law)
+    _checks.single(body, (Inertia, MassProperties), "body")
+
+
 def evaluate(torque: Torque, t: ScalarLike, state: HasSpin, body: Inertia | MassProperties) -> Vec3:
     """The torque's value (3,), N m, body frame, its shape checked.
 
@@ -201,11 +211,7 @@ def act(
     **Arguments** as for `evaluate`. **Returns** a force (3,) or `None`, and a torque (3,), N m,
     body frame, in the precision of `state.omega`.
     """
-    _checks.single(state, HasSpin, "state", wanted="a Spin, an Attitude or a Rigid")
-    require_rung(law, state)
-    require_frozen(law)
-    one_law(law.law if isinstance(law, Frozen) else law)
-    _checks.single(body, (Inertia, MassProperties), "body")
+    require_scene(law, state, body)
     dtype = state.omega.dtype
     t = _checks.floating(t, (), "t").astype(dtype)
     # A table in float64 must not lift a float32 solve, nor stop it under strict promotion.

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from rigidjax import _checks
 from rigidjax._types import HasSpin, Mat3, ScalarLike, Vec3
-from rigidjax.body.inertia import Inertia, MassProperties, tensor_of
+from rigidjax.body.inertia import Inertia, tensor_of, with_tensor
 from rigidjax.body.symmetric3 import apply, inverse
 from rigidjax.motion.torques import base
 from rigidjax.rotation.linalg3 import cross
@@ -130,17 +130,10 @@ class ChangingInertia(eqx.Module):
         turning = cross(apply(now, omega), omega) - apply(rate, omega)
         force = None
         if self.torque is not None:
-            force, torque = base.act(self.torque, t, state, _as_it_is(body, now))
+            force, torque = base.act(self.torque, t, state, with_tensor(body, now))
             turning = turning + torque
         # The body's own equations have its own inertia: the torque that brings them to this.
         fixed = tensor_of(body)
         slope = apply(inverse(now), turning)
         torque = apply(fixed, slope) - cross(apply(fixed, omega), omega)
         return torque if force is None else base.Wrench(force, torque)
-
-
-def _as_it_is(body: Any, tensor: Mat3) -> Any:
-    now = Inertia(tensor)
-    if isinstance(body, MassProperties):
-        return eqx.tree_at(lambda b: b.second_moment, body, now.second_moment)
-    return now

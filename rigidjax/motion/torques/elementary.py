@@ -63,7 +63,20 @@ class InSpace(base.OfTime):
         return quaternion.rotate_inverse(state.q, base.vector_at(self.torque, t, "torque"))
 
 
-class Damping(base.AbstractTorque):
+class _Against(base.AbstractTorque):
+    """A torque against the spin, with a coefficient for each body axis."""
+
+    feels: ClassVar[type] = HasSpin
+    steady: ClassVar[bool] = True
+    coefficient: Float[Array, "3"]
+
+    def __init__(self, coefficient: Vector):
+        self.coefficient = _checks.given(
+            coefficient, (3,), "coefficient", hint="one number for each body axis"
+        )
+
+
+class Damping(_Against):
     """Linear damping `τ = −c Ω`, component by component.
 
     **Arguments:** `coefficient` (3,) c along the body axes, N m s/rad. A sphere of inertia I then
@@ -76,20 +89,11 @@ class Damping(base.AbstractTorque):
     (3,)
     """
 
-    feels: ClassVar[type] = HasSpin
-    steady: ClassVar[bool] = True
-    coefficient: Float[Array, "3"]
-
-    def __init__(self, coefficient: Vector):
-        self.coefficient = _checks.given(
-            coefficient, (3,), "coefficient", hint="one number for each body axis"
-        )
-
     def __call__(self, t: ScalarLike, state: HasSpin, body: object) -> Vec3:
         return -self.coefficient * state.omega
 
 
-class QuadraticDamping(base.AbstractTorque):
+class QuadraticDamping(_Against):
     """Quadratic damping `τ = −c |Ω| Ω`, component by component.
 
     **Arguments:** `coefficient` (3,) c along the body axes, N m s²/rad². A body turning about a
@@ -103,15 +107,6 @@ class QuadraticDamping(base.AbstractTorque):
     >>> QuadraticDamping([0.1, 0.1, 0.1]).coefficient.shape
     (3,)
     """
-
-    feels: ClassVar[type] = HasSpin
-    steady: ClassVar[bool] = True
-    coefficient: Float[Array, "3"]
-
-    def __init__(self, coefficient: Vector):
-        self.coefficient = _checks.given(
-            coefficient, (3,), "coefficient", hint="one number for each body axis"
-        )
 
     def __call__(self, t: ScalarLike, state: HasSpin, body: object) -> Vec3:
         return -base.length_or_zero(state.omega) * self.coefficient * state.omega

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from rigidjax import _checks
-from rigidjax._types import HasPose, Scalar, ScalarLike, Vec3, Vector
+from rigidjax._types import HasPose, Mat3, Scalar, ScalarLike, Vec3, Vector
 from rigidjax.body.inertia import MassProperties
 from rigidjax.motion.torques import base
 from rigidjax.rotation import quaternion
@@ -78,23 +78,23 @@ class CentralGravity(base.AbstractForce):
 
     def energy(self, t: ScalarLike, state: HasPose, body: MassProperties) -> Scalar:
         """Potential energy, J, zero far away."""
-        r = jnp.sqrt(dot(state.x, state.x))
-        tensor = body.inertia.tensor
-        up = quaternion.rotate_inverse(state.q, state.x / r)
-        size = tensor[0, 0] + tensor[1, 1] + tensor[2, 2] - 3 * dot(up, apply(tensor, up))
-        return -(self.mu / r) * (body.mass + 0.5 * size / r / r)
+        r, up, pull, trace = _seen_from_centre(state, body.inertia.tensor)
+        return -(self.mu / r) * (body.mass + 0.5 * (trace - 3 * dot(up, pull)) / r / r)
 
     def __call__(self, t: ScalarLike, state: HasPose, body: MassProperties) -> base.Wrench:
-        r = jnp.sqrt(dot(state.x, state.x))
-        tensor = body.inertia.tensor
-        up = quaternion.rotate_inverse(state.q, state.x / r)
-        pull = apply(tensor, up)
-        strength = self.mu / r / r
-        trace, along = tensor[0, 0] + tensor[1, 1] + tensor[2, 2], dot(up, pull)
+        r, up, pull, trace = _seen_from_centre(state, body.inertia.tensor)
+        strength, along = self.mu / r / r, dot(up, pull)
         # −∂U/∂x in body axes: the part along r, and the part of I r̂ across it.
         radial = -strength * (body.mass + 1.5 * (trace - 5 * along) / r / r)
         force = radial * up - 3 * strength / r / r * pull
         return base.Wrench(quaternion.rotate(state.q, force), cross(3 * strength / r * up, pull))
+
+
+def _seen_from_centre(state: HasPose, tensor: Mat3) -> tuple[Scalar, Vec3, Vec3, Scalar]:
+    """r, r̂ in body axes, I r̂, and Tr I."""
+    r = jnp.sqrt(dot(state.x, state.x))
+    up = quaternion.rotate_inverse(state.q, state.x / r)
+    return r, up, apply(tensor, up), tensor[0, 0] + tensor[1, 1] + tensor[2, 2]
 
 
 class Drag(base.AbstractForce):

@@ -49,10 +49,7 @@ class Linear(_Table):
     def __call__(self, t: ScalarLike) -> Array:
         """The value at `t` (s), (*k)."""
         t = jnp.asarray(t, self.times.dtype)
-        i = jnp.clip(_row(self.times, t), 0, self.times.shape[0] - 2)
-        low, high = self.times[i], self.times[i + 1]
-        part = (jnp.clip(t, self.times[0], self.times[-1]) - low) / (high - low)
-        return self.values[i] + part * (self.values[i + 1] - self.values[i])
+        return _line(self.times, self.values, jnp.clip(t, self.times[0], self.times[-1]))
 
 
 class Held(_Table):
@@ -109,9 +106,7 @@ class Tabulated(AbstractTorque):
     def __call__(self, t: ScalarLike, state: HasSpin, body: object) -> Vec3:
         t = jnp.asarray(t, self.times.dtype)
         inside = (t >= self.times[0]) & (t < self.times[-1])
-        i = jnp.clip(_row(self.times, t), 0, self.times.shape[0] - 2)
-        part = (t - self.times[i]) / (self.times[i + 1] - self.times[i])
-        value = self.torques[i] + part * (self.torques[i + 1] - self.torques[i])
+        value = _line(self.times, self.torques, t)
         return jnp.where(inside, value, jnp.zeros_like(value))
 
 
@@ -161,6 +156,13 @@ def _row(times: Float[Array, " n"], t: Scalar) -> Any:
     # Comparing all keeps a short table inside the solver's one kernel; a search is a loop.
     method = "compare_all" if times.shape[0] <= 128 else "scan"
     return jnp.searchsorted(times, t, side="right", method=method) - 1
+
+
+def _line(times: Float[Array, " n"], rows: Float[Array, "n *k"], t: Scalar) -> Array:
+    """The value at `t` of the straight line between the rows around it."""
+    i = jnp.clip(_row(times, t), 0, times.shape[0] - 2)
+    part = (t - times[i]) / (times[i + 1] - times[i])
+    return rows[i] + part * (rows[i + 1] - rows[i])
 
 
 def _rows(

@@ -37,17 +37,7 @@ class Frozen(eqx.Module):
         if name.startswith("_") or name in ("law", "own", "state0", "rate"):
             raise AttributeError(name)
         found = getattr(self.law, name)
-        return _Last(found, self.own) if name in _OF_STATES else found
-
-
-class _Last(eqx.Module):
-    """A method with the states as its last argument."""
-
-    method: Callable[..., Any]
-    own: tuple[Any]
-
-    def __call__(self, *args: Any) -> Any:
-        return self.method(*args, self.own[0])
+        return Frozen(found, self.own) if name in _OF_STATES else found
 
 
 def has_own(node: object) -> bool:

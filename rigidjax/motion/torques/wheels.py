@@ -1,7 +1,7 @@
 """Wheels inside the body (a gyrostat): of known momentum, or with speeds of their own."""
 
 from collections.abc import Callable
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -10,13 +10,12 @@ from jaxtyping import Array, ArrayLike, Float
 
 from rigidjax import _checks
 from rigidjax._types import HasSpin, Scalar, ScalarLike, Vec3
-from rigidjax.body.inertia import Inertia, MassProperties
+from rigidjax.body.inertia import Body, Inertia, MassProperties, tensor_of, with_tensor
 from rigidjax.body.symmetric3 import outer
 from rigidjax.motion.torques import base
 from rigidjax.motion.torques.states import has_states
 from rigidjax.rotation.linalg3 import cross
 
-Body = TypeVar("Body", Inertia, MassProperties)
 Numbers = Float[ArrayLike, "*wheels"] | Any
 # Where a wheel's top speed is near, what its motor can still give falls to nothing.
 _FADE = 0.05
@@ -174,11 +173,7 @@ class ReactionWheels(base.AbstractTorque):
         _checks.single(body, (Inertia, MassProperties), "body")
         rows = (j * outer(a, a) for j, a in zip(self.inertia, self.axes, strict=True))
         taken = sum(rows, jnp.zeros((3, 3), self.axes.dtype))
-        if isinstance(body, Inertia):
-            return Inertia(body.tensor - taken)
-        rest = Inertia(body.inertia.tensor - taken)
-        # Not the constructor: what is left turns as no single body does, where wheels are large.
-        return eqx.tree_at(lambda b: b.second_moment, body, rest.second_moment)
+        return with_tensor(body, tensor_of(body) - taken)
 
     def speeds_of(self, own: Array, state: HasSpin) -> Float[Array, " wheels"]:
         """The speeds (R,) relative to the body, rad/s, of the momenta `own` and the state."""
