@@ -6,6 +6,7 @@ symmetric top, and, as implemented in JAX, for distinct moments above 1e16 kg mÂ
 
 import itertools
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
@@ -133,21 +134,9 @@ def _ascending(values, axes):
 def _nearest_signs(axes) -> Mat3:
     """Turn two axes round, or none: whichever gives the largest trace."""
     d0, d1, d2 = axes[0][0], axes[1][1], axes[2][2]
-    choices = (d0 + d1 + d2, d0 - d1 - d2, d1 - d0 - d2, d2 - d0 - d1)
-    best = jnp.maximum(jnp.maximum(choices[0], choices[1]), jnp.maximum(choices[2], choices[3]))
-    first = (choices[1] == best) & (choices[0] != best)
-    second = (choices[2] == best) & (choices[0] != best) & ~first
-    third = (choices[0] != best) & ~first & ~second
-    signs = (
-        jnp.where(second | third, -1.0, 1.0),
-        jnp.where(first | third, -1.0, 1.0),
-        jnp.where(first | second, -1.0, 1.0),
-    )
-    columns = [
-        jnp.stack([sign.astype(p.dtype) * p for p in axis])
-        for sign, axis in zip(signs, axes, strict=True)
-    ]
-    return jnp.stack(columns, axis=1)
+    traces = jnp.stack([d0 + d1 + d2, d0 - d1 - d2, d1 - d0 - d2, d2 - d0 - d1])
+    signs = jnp.asarray([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]], traces.dtype)
+    return jnp.stack([jnp.stack(axis) for axis in axes], axis=1) * signs[jnp.argmax(traces)][None]
 
 
 def _with(values: tuple[Any, ...], changed: dict[int, Any]) -> tuple[Any, ...]:
@@ -202,12 +191,7 @@ def _divided_differences(f, values):
     close = _CLOSE * jnp.max(jnp.abs(values))
     pairs, triples = np.array(_PAIRS), np.array(_TRIPLES)
 
-    def first(x, y):
-        return _first(f, x, y, close)
-
-    def second(x, y, z):
-        return _second(f, x, y, z, close)
-
+    first, second = partial(_first, f, close=close), partial(_second, f, close=close)
     of_pairs = jax.vmap(first)(*(values[pairs[:, k]] for k in range(2)))
     of_triples = jax.vmap(second)(*(values[triples[:, k]] for k in range(3)))
     return of_pairs[_PAIR], of_triples[_TRIPLE]

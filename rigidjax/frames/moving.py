@@ -79,13 +79,9 @@ class MovingFrame(eqx.Module):
         t = _checks.time(t)
         one = jnp.ones_like(t)
         rate, rate_change = jax.jvp(self.angular_velocity, (t,), (one,))
-        zero = jnp.zeros(3, t.dtype)
-        origin, velocity, acceleration = zero, zero, zero
-        if self.origin is not None:
-            place = _Place(self.origin)
-            (origin, velocity), (_, acceleration) = jax.jvp(
-                lambda s: jax.jvp(place, (s,), (jnp.ones_like(s),)), (t,), (one,)
-            )
+        (origin, velocity), (_, acceleration) = jax.jvp(
+            lambda s: jax.jvp(self.place, (s,), (one,)), (t,), (one,)
+        )
         return Instant(self.matrix(t), rate, rate_change, origin, velocity, acceleration)
 
     def angular_velocity(self, t: ScalarLike) -> Vec3:
@@ -219,22 +215,15 @@ class MovingFrame(eqx.Module):
     def place(self, t: ScalarLike) -> Vec3:
         """X(t) (3,), m, axes of S."""
         t = _checks.time(t)
-        return jnp.zeros(3, t.dtype) if self.origin is None else _Place(self.origin)(t)
+        if self.origin is None:
+            return jnp.zeros(3, t.dtype)
+        return _checks.floating(self.origin(t), (3,), "origin").astype(t.dtype)
 
 
 def require_frame(frame: Any, name: str) -> Any:
     """Return `frame` if it is a `MovingFrame`; else raise in words."""
     hint = "make one from a rotation with MovingFrame(rotation)"
     return _checks.instance(frame, MovingFrame, name, wanted="a MovingFrame", hint=hint)
-
-
-class _Place(eqx.Module):
-    """An origin, its shape and dtype checked."""
-
-    origin: Callable[[Any], Any]
-
-    def __call__(self, t: Any) -> Any:
-        return _checks.floating(self.origin(t), (3,), "origin").astype(t.dtype)
 
 
 class _Composed(eqx.Module):

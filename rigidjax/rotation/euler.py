@@ -236,17 +236,11 @@ def _wrap(angle: Scalar) -> Scalar:
 
 def _turning_axes(axes: tuple[int, int, int], angles: tuple) -> tuple[Vec3, Vec3, Vec3]:
     """The three axes of turning, seen from the body: what each unit rate adds to Ω."""
-    _, b, c = angles
-    e = jnp.eye(3, dtype=b.dtype)
-    i, j, k = axes
-    return _back(k, c, _back(j, b, e[i])), _back(k, c, e[j]), e[k]
-
-
-def _back(axis: int, angle: Scalar, y: Vec3) -> Vec3:
-    """Turn y by −angle about a coordinate axis."""
-    e = jnp.eye(3, dtype=y.dtype)[axis]
-    along = e * y
-    return along + jnp.cos(angle) * (y - along) - jnp.sin(angle) * cross(e, y)
+    _, j, k = axes
+    first, second, third = (jnp.eye(3, dtype=angles[0].dtype)[axis] for axis in axes)
+    middle, last = _about(j, angles[1]), _about(k, angles[2])
+    first = quaternion.rotate_inverse(middle, first)
+    return (*(quaternion.rotate_inverse(last, axis) for axis in (first, second)), third)
 
 
 def _vanishing(middle: Scalar, axes: tuple[int, int, int]) -> tuple[Scalar, Bool[Array, ""]]:
