@@ -149,7 +149,7 @@ def finite(value: Numbers, name: str) -> Numbers:
     xp = namespace(value)
     bad = ~xp.isfinite(value)
     where = ""
-    if xp is np and bad.any():
+    if xp is np and bad.ndim and bad.any():
         where = f" at index {tuple(int(i) for i in np.argwhere(bad)[0])}"
     return refuse(value, bad.any(), f"{name}: contains NaN or infinity{where}")
 

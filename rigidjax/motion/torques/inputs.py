@@ -137,18 +137,9 @@ class Lagged(eqx.Module):
     def __init__(self, source: Any, time: Any, start: Any = None):
         self.source = _checks.function(source, "source", "of time")
         kind = jnp.result_type(float)
-        array = _checks.numbers(time, "time")
-        if not array.size:
-            raise ValueError("time: wanted one number, s, or one a channel, got none")
-        self.time = _checks.given(time, array.shape, "time").astype(kind)
-        _checks.if_known(_checks.sign, array, "time", "a positive time, s")
-        if start is not None:
-            start = _checks.given(start, _checks.numbers(start, "start").shape, "start").astype(
-                kind
-            )
-            if not start.size:
-                raise ValueError("start: wanted one number, or one a channel, got none")
-        self.start = start
+        time = _checks.if_known(_checks.sign, _channels(time, "time"), "time", "a positive time, s")
+        self.time = time.astype(kind)
+        self.start = None if start is None else _channels(start, "start").astype(kind)
 
     @property
     def jump_times(self) -> Float[Array, " n"]:
@@ -170,6 +161,13 @@ class Lagged(eqx.Module):
 
     def __call__(self, t: ScalarLike, own: Array) -> Array:
         return own
+
+
+def _channels(value: Any, name: str) -> Array:
+    array = _checks.numbers(value, name)
+    if not array.size:
+        raise ValueError(f"{name}: wanted one number, or one a channel, got none")
+    return _checks.if_known(_checks.finite, array, name)
 
 
 class Row(NamedTuple):

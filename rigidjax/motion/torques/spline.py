@@ -142,10 +142,9 @@ class Wheel(eqx.Module):
             f"axis: wanted a unit vector (3,){found}",
         )
         _checks.function(speed, "speed", "of time to rad/s")
-        self.inertia = _checks.given(inertia, (), "inertia").astype(jnp.result_type(float))
-        self.axis = axis.astype(jnp.result_type(float))
-        self.speed = speed
         kind = jnp.result_type(float)
+        self.inertia = _checks.given(inertia, (), "inertia").astype(kind)
+        self.axis, self.speed = axis.astype(kind), speed
         self.delay = None if delay is None else _checks.given(delay, (), "delay").astype(kind)
         self.tilt = None if tilt is None else _checks.given(tilt, (2,), "tilt").astype(kind)
 
