@@ -1,8 +1,12 @@
 """Ready-made scenes: `rigidjax.simulate(None, Point(x, v), ts, scene)`, no body is needed."""
 
 from rigidjax._names import show
-from rigidjax.frames.earth import Earth as Earth, earth as earth
-from rigidjax.frames.foucault import Foucault as Foucault, foucault as foucault
+from rigidjax.frames.earth import (
+    Earth as Earth,
+    Foucault as Foucault,
+    earth as earth,
+    foucault as foucault,
+)
 from rigidjax.frames.hoop import Hoop as Hoop, hoop as hoop, turntable as turntable
 from rigidjax.frames.libration import (
     libration as libration,

@@ -239,8 +239,8 @@ def _turning_axes(axes: tuple[int, int, int], angles: tuple) -> tuple[Vec3, Vec3
     _, j, k = axes
     first, second, third = (jnp.eye(3, dtype=angles[0].dtype)[axis] for axis in axes)
     middle, last = _about(j, angles[1]), _about(k, angles[2])
-    first = quaternion.rotate_inverse(middle, first)
-    return (*(quaternion.rotate_inverse(last, axis) for axis in (first, second)), third)
+    first = quaternion.rotate_inverse(last, quaternion.rotate_inverse(middle, first))
+    return first, quaternion.rotate_inverse(last, second), third
 
 
 def _vanishing(middle: Scalar, axes: tuple[int, int, int]) -> tuple[Scalar, Bool[Array, ""]]:
