@@ -133,6 +133,8 @@ Torque = AbstractTorque | AbstractForce | Callable[[Any, Any, Any], Any]
 
 # From the lowest: the states that a torque may act on.
 LADDER = (HasSpin, HasAttitude, HasPose)
+# A hint for gravity.
+WORLD = "a vector in world axes, such as [0, 0, -9.81]"
 
 
 def require_law(torque: object, name: str = "torque") -> None:
@@ -289,6 +291,24 @@ def vector_at(source: Any, t: ScalarLike, name: str, size: int = 3) -> Float[Arr
 def stays(source: Any) -> Vec3 | None:
     """A vector that is constant; `None` for a function of time."""
     return None if callable(source) else source
+
+
+def vector(name: str, *, hint: str = "") -> Callable[[Vector], Array]:
+    """What makes a field of three numbers, for `equinox.field(converter=…)`."""
+
+    def converted(value: Vector) -> Array:
+        return _checks.given(value, (3,), name, hint=hint)
+
+    return converted
+
+
+def number(name: str) -> Callable[[ScalarLike], Array]:
+    """What makes a field of one number."""
+
+    def converted(value: ScalarLike) -> Array:
+        return _checks.given(value, (), name)
+
+    return converted
 
 
 def constant_or_callable(source: Any, name: str, size: int = 3) -> Any:

@@ -5,8 +5,7 @@ from typing import ClassVar
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from rigidjax import _checks
-from rigidjax._types import HasAttitude, HasSpin, ScalarLike, Vec3, Vector
+from rigidjax._types import HasAttitude, HasSpin, ScalarLike, Vec3
 from rigidjax.motion.torques import base
 from rigidjax.rotation import quaternion
 
@@ -27,10 +26,7 @@ class ConstantTorque(base.AbstractTorque):
     feels: ClassVar[type] = HasSpin
     rate_free: ClassVar[bool] = True
     steady: ClassVar[bool] = True
-    torque: Float[Array, "3"]
-
-    def __init__(self, torque: Vector):
-        self.torque = _checks.given(torque, (3,), "torque")
+    torque: Float[Array, "3"] = eqx.field(converter=base.vector("torque"))
 
     def __call__(self, t: ScalarLike, state: HasSpin, body: object) -> Vec3:
         return self.torque
@@ -68,12 +64,9 @@ class _Against(base.AbstractTorque):
 
     feels: ClassVar[type] = HasSpin
     steady: ClassVar[bool] = True
-    coefficient: Float[Array, "3"]
-
-    def __init__(self, coefficient: Vector):
-        self.coefficient = _checks.given(
-            coefficient, (3,), "coefficient", hint="one number for each body axis"
-        )
+    coefficient: Float[Array, "3"] = eqx.field(
+        converter=base.vector("coefficient", hint="one number for each body axis")
+    )
 
 
 class Damping(_Against):

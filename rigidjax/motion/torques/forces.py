@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from rigidjax import _checks
-from rigidjax._types import HasPose, Mat3, Scalar, ScalarLike, Vec3, Vector
+from rigidjax._types import HasPose, Mat3, Scalar, ScalarLike, Vec3
 from rigidjax.body.inertia import MassProperties
 from rigidjax.motion.torques import base
 from rigidjax.rotation import quaternion
@@ -33,12 +33,7 @@ class UniformGravity(base.AbstractForce):
 
     feels: ClassVar[type] = HasPose
     steady: ClassVar[bool] = True
-    gravity: Float[Array, "3"]
-
-    def __init__(self, gravity: Vector):
-        self.gravity = _checks.given(
-            gravity, (3,), "gravity", hint="a vector in world axes, such as [0, 0, -9.81]"
-        )
+    gravity: Float[Array, "3"] = eqx.field(converter=base.vector("gravity", hint=base.WORLD))
 
     def energy(self, t: ScalarLike, state: HasPose, body: MassProperties) -> Scalar:
         """Potential energy, J: `U = −m g·x`, zero at the world's origin."""
@@ -71,10 +66,7 @@ class CentralGravity(base.AbstractForce):
 
     feels: ClassVar[type] = HasPose
     steady: ClassVar[bool] = True
-    mu: Float[Array, ""]
-
-    def __init__(self, mu: ScalarLike):
-        self.mu = _checks.given(mu, (), "mu")
+    mu: Float[Array, ""] = eqx.field(converter=base.number("mu"))
 
     def energy(self, t: ScalarLike, state: HasPose, body: MassProperties) -> Scalar:
         """Potential energy, J, zero far away."""
@@ -118,19 +110,9 @@ class Drag(base.AbstractForce):
 
     feels: ClassVar[type] = HasPose
     steady: ClassVar[bool] = True
-    coefficient: Float[Array, ""]
-    centre: Float[Array, "3"]
-    wind: Float[Array, "3"]
-
-    def __init__(
-        self,
-        coefficient: ScalarLike,
-        centre: Vector = (0.0, 0.0, 0.0),
-        wind: Vector = (0.0, 0.0, 0.0),
-    ):
-        self.coefficient = _checks.given(coefficient, (), "coefficient")
-        self.centre = _checks.given(centre, (3,), "centre")
-        self.wind = _checks.given(wind, (3,), "wind")
+    coefficient: Float[Array, ""] = eqx.field(converter=base.number("coefficient"))
+    centre: Float[Array, "3"] = eqx.field(converter=base.vector("centre"), default=(0.0, 0.0, 0.0))
+    wind: Float[Array, "3"] = eqx.field(converter=base.vector("wind"), default=(0.0, 0.0, 0.0))
 
     def __call__(self, t: ScalarLike, state: HasPose, body: MassProperties) -> base.Wrench:
         u = state.v - self.wind
@@ -224,22 +206,12 @@ class BodyDrag(base.AbstractForce):
 
     feels: ClassVar[type] = HasPose
     steady: ClassVar[bool] = True
-    linear: Float[Array, "3"]
-    quadratic: Float[Array, "3"]
-    centre: Float[Array, "3"]
-    wind: Float[Array, "3"]
-
-    def __init__(
-        self,
-        linear: Vector,
-        quadratic: Vector = (0.0, 0.0, 0.0),
-        centre: Vector = (0.0, 0.0, 0.0),
-        wind: Vector = (0.0, 0.0, 0.0),
-    ):
-        self.linear = _checks.given(linear, (3,), "linear")
-        self.quadratic = _checks.given(quadratic, (3,), "quadratic")
-        self.centre = _checks.given(centre, (3,), "centre")
-        self.wind = _checks.given(wind, (3,), "wind")
+    linear: Float[Array, "3"] = eqx.field(converter=base.vector("linear"))
+    quadratic: Float[Array, "3"] = eqx.field(
+        converter=base.vector("quadratic"), default=(0.0, 0.0, 0.0)
+    )
+    centre: Float[Array, "3"] = eqx.field(converter=base.vector("centre"), default=(0.0, 0.0, 0.0))
+    wind: Float[Array, "3"] = eqx.field(converter=base.vector("wind"), default=(0.0, 0.0, 0.0))
 
     def __call__(self, t: ScalarLike, state: HasPose, body: MassProperties) -> base.Wrench:
         u = quaternion.rotate_inverse(state.q, state.v - self.wind)

@@ -40,16 +40,9 @@ class HeavyTop(base.AbstractTorque):
     feels: ClassVar[type] = HasAttitude
     rate_free: ClassVar[bool] = True
     steady: ClassVar[bool] = True
-    mass: Float[Array, ""]
-    com: Float[Array, "3"]
-    gravity: Float[Array, "3"]
-
-    def __init__(self, mass: ScalarLike, com: Vector, gravity: Vector):
-        self.mass = _checks.given(mass, (), "mass")
-        self.com = _checks.given(com, (3,), "com")
-        self.gravity = _checks.given(
-            gravity, (3,), "gravity", hint="a vector in world axes, such as [0, 0, -9.81]"
-        )
+    mass: Float[Array, ""] = eqx.field(converter=base.number("mass"))
+    com: Float[Array, "3"] = eqx.field(converter=base.vector("com"))
+    gravity: Float[Array, "3"] = eqx.field(converter=base.vector("gravity", hint=base.WORLD))
 
     @property
     def axis(self) -> Vec3:
