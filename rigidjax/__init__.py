@@ -21,7 +21,7 @@ from rigidjax import (
     rotation as rotation,
     solve as solve,
 )
-from rigidjax._names import own_names, suggests
+from rigidjax._names import show, wrong
 from rigidjax.body import (
     Inertia as Inertia,
     MassProperties as MassProperties,
@@ -74,11 +74,9 @@ __version__ = "0.2.0"
 # Loaded when first asked for: few programs draw, fewer compare methods.
 _LATER = ("datasets", "elliptic", "lagrangian", "orbits", "plot", "tumblers", "workprecision")
 
+show(__name__)
+
 
 def __getattr__(name: str) -> ModuleType:
-    if name in _LATER:
-        return importlib.import_module(f"rigidjax.{name}")
-    return suggests(__name__)(name)
-
-
-__dir__ = own_names(__name__)
+    later = name in _LATER
+    return importlib.import_module(f"rigidjax.{name}") if later else wrong(__name__, name)

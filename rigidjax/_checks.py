@@ -5,16 +5,18 @@ import inspect
 import os
 import re
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, ArrayLike, Bool, Float
+from jaxtyping import Array, ArrayLike, Bool
+
+Numbers = TypeVar("Numbers", bound=Any)
 
 
 def floating(
@@ -32,14 +34,9 @@ def floating(
     array = numbers(value, name)
     found = array.shape[array.ndim - len(shape) :] if batched else array.shape
     if found != shape:
-        advice = hint or (
-            "functions take one body; batch with jax.vmap"
-            if array.ndim > len(shape) and array.shape[array.ndim - len(shape) :] == shape
-            else ""
-        )
-        raise ValueError(
-            f"{name}: wanted shape {shape}, got {array.shape}" + (f"; {advice}" if advice else "")
-        )
+        many = array.ndim > len(shape) and array.shape[array.ndim - len(shape) :] == shape
+        advice = hint or ("functions take one body; batch with jax.vmap" if many else "")
+        raise ValueError(f"{name}: wanted shape {shape}, got {array.shape}{_and(advice)}")
     return array
 
 
@@ -48,10 +45,17 @@ def rows(value: Any, shape: tuple[int, ...], name: str, *, hint: str = "") -> Ar
     array = numbers(value, name)
     if array.ndim != len(shape) + 1 or array.shape[1:] != shape:
         wanted = ", ".join(map(str, ("n", *shape))) + ("," if not shape else "")
-        raise ValueError(
-            f"{name}: wanted shape ({wanted}), got {array.shape}" + (f"; {hint}" if hint else "")
-        )
+        raise ValueError(f"{name}: wanted shape ({wanted}), got {array.shape}{_and(hint)}")
     return array
+
+
+def _and(hint: str) -> str:
+    return f"; {hint}" if hint else ""
+
+
+def kind(value: Any) -> str:
+    """How a message calls what came: its type, or that it is a class."""
+    return f"the class {value.__name__}" if isinstance(value, type) else type(value).__name__
 
 
 def numbers(value: Any, name: str) -> Array:
@@ -140,20 +144,45 @@ def bare(error: RuntimeError) -> RuntimeError:
     return type(error)(found[1]) if found else error
 
 
-def finite(value: Float[Array, "..."], name: str) -> Float[Array, "..."]:
+def finite(value: Numbers, name: str) -> Numbers:
     """Return `value` unless it holds a NaN or an infinity."""
     xp = namespace(value)
     bad = ~xp.isfinite(value)
     where = ""
-    if xp is np and bad.any():
+    if xp is np and bad.ndim and bad.any():
         where = f" at index {tuple(int(i) for i in np.argwhere(bad)[0])}"
     return refuse(value, bad.any(), f"{name}: contains NaN or infinity{where}")
 
 
+def given(value: Any, shape: tuple[int, ...], name: str, *, hint: str = "") -> Array:
+    """Return `value` as `floating` does, finite where it is known."""
+    array = floating(value, shape, name, hint=hint)
+    return finite(array, name) if known(array) else array
+
+
+def scalars(**named: Any) -> list[Array]:
+    """Numbers by name, as `floating` does, in one precision."""
+    found = [floating(value, (), name) for name, value in named.items()]
+    return [value.astype(jnp.result_type(*found)) for value in found]
+
+
 def time(value: Any, name: str = "t") -> Array:
     """Return a time: one number, and where it is known a finite one."""
-    t = floating(value, (), name)
-    return finite(t, name) if known(t) else t
+    return given(value, (), name)
+
+
+def sign(value: Array, name: str, wanted: str, *, zero: bool = False) -> Array:
+    """Return `value` unless a number of it is not finite, or not above 0 (`zero`: or is below)."""
+    xp = namespace(value)
+    numbers = xp.asarray(value)
+    bad = ~(((numbers >= 0) if zero else (numbers > 0)) & xp.isfinite(numbers))
+    found = f", got {numbers[bad][0]}" if xp is np and bad.any() else ""
+    return refuse(value, bad.any(), f"{name}: wanted {wanted}{found}")
+
+
+def if_known(check: Callable[..., Array], value: Array, *args: Any, **options: Any) -> Array:
+    """`check(value, …)` if its numbers are known, and there are some; otherwise `value`."""
+    return check(value, *args, **options) if known(value) and value.size else value
 
 
 def instance(
@@ -169,8 +198,7 @@ def instance(
     if not wanted:
         several = kinds if isinstance(kinds, tuple) else (kinds,)
         wanted = " or ".join(kind.__name__ for kind in several)
-    found = f"the class {value.__name__}" if isinstance(value, type) else type(value).__name__
-    raise TypeError(f"{name}: wanted {wanted}, got {found}" + (f"; {hint}" if hint else ""))
+    raise TypeError(f"{name}: wanted {wanted}, got {kind(value)}{_and(hint)}")
 
 
 # The arrays of one body or one state, by the name of the field.
@@ -201,27 +229,22 @@ def function(value: Any, name: str, of: str, *, hint: str = "") -> Any:
 
     Where `of` begins with a list of arguments, "(t, state, body) → scalar", as many are wanted.
     """
+    found = kind(value)
     if callable(value) and not isinstance(value, type):
         listed = re.match(r"\w*\(([^()]*)\)", of)
-        if listed is not None and not _takes(value, len(listed[1].split(","))):
-            raise TypeError(
-                f"{name}: wanted a function {of}, got one with other arguments: "
-                f"{inspect.signature(value)}" + (f"; {hint}" if hint else "")
-            )
-        return value
-    found = f"the class {value.__name__}" if isinstance(value, type) else type(value).__name__
-    raise TypeError(f"{name}: wanted a function {of}, got {found}" + (f"; {hint}" if hint else ""))
+        if listed is None or _takes(value, len(listed[1].split(","))):
+            return value
+        found = f"one with other arguments: {inspect.signature(value)}"
+    raise TypeError(f"{name}: wanted a function {of}, got {found}{_and(hint)}")
 
 
 def _takes(value: Any, count: int) -> bool:
     """Whether a function can be called with so many arguments, as far as it says."""
     try:
         inspect.signature(value).bind(*[None] * count)
-    except TypeError:
-        return False
-    except ValueError:
+    except (TypeError, ValueError) as error:
         # Some functions written in C have no signature.
-        return True
+        return isinstance(error, ValueError)
     return True
 
 
@@ -274,11 +297,8 @@ def on_host(value: Any, name: str) -> np.ndarray:
 
 def path(value: Any, name: str = "path") -> Path:
     """Return the path of a file that `value` names."""
-    if (
-        not isinstance(value, str | os.PathLike)
-        or isinstance(os.fspath(value), bytes)
-        or value == ""
-    ):
+    named = isinstance(value, str | os.PathLike) and isinstance(os.fspath(value), str)
+    if not named or value == "":
         raise TypeError(f"{name}: wanted the name of a file, got {_shown(value)}")
     return Path(value)
 

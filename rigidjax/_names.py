@@ -1,62 +1,51 @@
 """What `dir` of a public module shows, and what a wrong name may mean."""
 
-import ast
 import difflib
 import functools
 import inspect
+import re
 import sys
 from importlib.util import find_spec
 from types import ModuleType
-from typing import Any
 
 
-def own_names(module: str) -> Any:
-    """A `__dir__`: what a module defines and imports as itself (`X as X`), as its source has it."""
+def show(module: str) -> None:
+    """Have `dir` show what a module defines or imports as itself (`X as X`), and `wrong` answer."""
+    here = sys.modules[module]
 
     def names() -> list[str]:
         try:
-            body = ast.parse(inspect.getsource(sys.modules[module])).body
+            text = inspect.getsource(here).split('"""', 2)[-1]
         except OSError:  # Where there is no source, all names without an underscore are shown.
-            return sorted(n for n in vars(sys.modules[module]) if n[0] != "_")
-        body += [inner for node in body if isinstance(node, ast.If) for inner in node.body]
-        nodes = [n for one in body for n in getattr(one, "names", getattr(one, "targets", [one]))]
-        named = [(getattr(one, "name", getattr(one, "id", "_")), one) for one in nodes]
-        return sorted({n for n, one in named if n[0] != "_" and getattr(one, "asname", n) == n})
+            return sorted(n for n in vars(here) if n[0] != "_")
+        found = re.findall(r"^(?:def|class) (\w+)|^(\w+) = |\b(\w+) as \3\b", text, re.M)
+        return sorted({name for name in map("".join, found) if name[0] != "_"})
 
-    return names
+    vars(here).update(__dir__=names, __getattr__=functools.partial(wrong, module))
 
 
-def suggests(module: str) -> Any:
-    """A `__getattr__`: a wrong name is answered with the nearest that exist, two at most."""
-
-    def look_up(name: str) -> Any:
-        words, near = f"module {module!r} has no attribute {name!r}", []
-        # Tools ask for hidden names, and the import system for modules that are not loaded yet.
-        if name[0] != "_" and not (hasattr(here, "__path__") and find_spec(f"{module}.{name}")):
-            near = difflib.get_close_matches(name.lower(), _ways(), n=2, cutoff=0.75)
-            near = near[: 1 if name.lower() in near else 2]
-        ways = [
-            min(_ways()[one], key=lambda way: (not way[1].endswith(f".{name}"), way[0] != module))
-            for one in near
-        ]
-        if ways:
-            words += f"; did you mean {' or '.join(way for _, way in ways)}?"
-        raise AttributeError(words, name=name)
-
-    here = sys.modules[module]
-    return look_up
+def wrong(module: str, name: str) -> ModuleType:
+    """Answer a wrong name with the nearest that exist, two at most."""
+    here, near, ways = sys.modules[module], [], []
+    # Tools ask for hidden names, and the import system for modules that are not loaded yet.
+    if name[0] != "_" and not (hasattr(here, "__path__") and find_spec(f"{module}.{name}")):
+        near = difflib.get_close_matches(name.lower(), _ways(), n=2, cutoff=0.75)
+    for one in near[: 1 if name.lower() in near else 2]:
+        best = min(_ways()[one], key=lambda w: (not w[1].endswith(f".{name}"), w[0] is not here))
+        ways.append(best[1])
+    words = f"; did you mean {' or '.join(ways)}?" if ways else ""
+    raise AttributeError(f"module {module!r} has no attribute {name!r}{words}", name=name)
 
 
 @functools.cache
-def _ways() -> dict[str, list[tuple[str, str]]]:
+def _ways() -> dict[str, list[tuple[ModuleType, str]]]:
     """Module and shortest way of each public name, by the name in lower case."""
-    left, seen, found = [("rj", sys.modules["rigidjax"])], set(), {}
+    left, found = [("rj", sys.modules["rigidjax"])], {}
     for way, module in left:
-        if module not in seen:
-            seen.add(module)
-            for name in dir(module):
-                found.setdefault(name.lower(), []).append((module.__name__, f"{way}.{name}"))
-                value = getattr(module, name)
-                if isinstance(value, ModuleType) and value.__name__.startswith("rigidjax"):
-                    left.append((f"{way}.{name}", value))
+        for name in dir(module):
+            found.setdefault(name.lower(), []).append((module, f"{way}.{name}"))
+            value = getattr(module, name)
+            ours = isinstance(value, ModuleType) and value.__name__.startswith("rigidjax")
+            if ours and all(value is not old for _, old in left):
+                left.append((f"{way}.{name}", value))
     return found

@@ -4,7 +4,8 @@
 they take: anything NumPy-like of the same shape. One body at a time; batch with `jax.vmap`.
 """
 
-from typing import Protocol, runtime_checkable
+from collections.abc import Sequence
+from typing import Any, Protocol, runtime_checkable
 
 from jaxtyping import Array, ArrayLike, Float
 
@@ -17,6 +18,15 @@ ScalarLike = Float[ArrayLike, ""]
 Vec3Like = Float[ArrayLike, "3"]
 Mat3Like = Float[ArrayLike, "3 3"]
 QuatLike = Float[ArrayLike, "4"]
+
+# What the constructors take: an array, or nested lists of numbers.
+Numbers = Sequence[Any]
+Vector = Vec3Like | Numbers
+Matrix = Mat3Like | Numbers
+Quaternion = QuatLike | Numbers
+Vectors = Float[ArrayLike, "*batch 3"] | Numbers
+Matrices = Float[ArrayLike, "*batch 3 3"] | Numbers
+Scalars = Float[ArrayLike, "*batch"] | Numbers | float
 
 
 @runtime_checkable

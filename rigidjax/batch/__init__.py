@@ -23,15 +23,11 @@ ends* all end within `patience`; shares written before the collective are recove
 again.
 """
 
-from typing import TYPE_CHECKING
-
-from rigidjax._names import own_names, suggests
+from rigidjax._names import show
 from rigidjax.batch import distributed as distributed
 from rigidjax.batch.rollout import rollout as rollout
 from rigidjax.batch.sharding import compiler_options as compiler_options
 from rigidjax.batch.simulate import Batch as Batch, Steps as Steps, simulate as simulate
 from rigidjax.batch.xla_flags import CpuFlags as CpuFlags, cpu_flags as cpu_flags
 
-if not TYPE_CHECKING:
-    __getattr__ = suggests(__name__)
-__dir__ = own_names(__name__)
+show(__name__)

@@ -18,7 +18,7 @@ import numpy as np
 from jax.experimental import multihost_utils
 
 from rigidjax import _checks
-from rigidjax._names import own_names
+from rigidjax._names import show
 
 # Seconds without a sign of life after which a peer counts as dead.
 PATIENCE = 20
@@ -215,4 +215,4 @@ def _together(send: Callable[[], Any], checkpoint: Any) -> Any:
         ) from error
 
 
-__dir__ = own_names(__name__)
+show(__name__)

@@ -1,26 +1,22 @@
 """Bodies: inertia, mass, second moments, shapes, charts by unconstrained numbers."""
 
-from typing import TYPE_CHECKING
-
-from rigidjax._names import own_names, suggests
+from rigidjax._names import show
 from rigidjax.body import (
     parameters as parameters,
     shapes as shapes,
     volumes as volumes,
 )
 from rigidjax.body.divergence import divergence as divergence
-from rigidjax.body.ellipsoids import (
-    energy_ellipsoid as energy_ellipsoid,
-    equal_ellipsoid as equal_ellipsoid,
-    momentum_ellipsoid as momentum_ellipsoid,
-)
 from rigidjax.body.energy import (
     angular_momentum as angular_momentum,
+    energy_ellipsoid as energy_ellipsoid,
+    equal_ellipsoid as equal_ellipsoid,
     kinetic_energy as kinetic_energy,
     kinetic_energy_about as kinetic_energy_about,
     kinetic_energy_of_generator as kinetic_energy_of_generator,
     kinetic_energy_of_matrix_rate as kinetic_energy_of_matrix_rate,
     kinetic_energy_of_moments as kinetic_energy_of_moments,
+    momentum_ellipsoid as momentum_ellipsoid,
     spatial_angular_momentum as spatial_angular_momentum,
 )
 from rigidjax.body.inertia import Inertia as Inertia, MassProperties as MassProperties
@@ -28,9 +24,9 @@ from rigidjax.body.inertials import (
     read_inertials as read_inertials,
     write_inertials as write_inertials,
 )
-from rigidjax.body.matrix_functions import matrix_function as matrix_function
-from rigidjax.body.principal_axes import principal as principal
+from rigidjax.body.principal_axes import (
+    matrix_function as matrix_function,
+    principal as principal,
+)
 
-if not TYPE_CHECKING:
-    __getattr__ = suggests(__name__)
-__dir__ = own_names(__name__)
+show(__name__)

@@ -1,7 +1,10 @@
-"""Kinetic energy and angular momentum of whatever turns.
+"""Kinetic energy and angular momentum of whatever turns, and the ellipsoids of a body.
 
 The notes write the energy of rotation in three forms. Printed eqs 61–65 lack the factor ½ that
 eqs 57 and 73–75 have; here all three have it and agree.
+
+Poinsot: free motion rolls the energy ellipsoid on a fixed plane; in the body the rate stays on the
+curve where the two ellipsoids of Ω meet. Source: Landau and Lifshitz, Mechanics, § 37.
 """
 
 import jax.numpy as jnp
@@ -11,11 +14,17 @@ from rigidjax._types import (
     HasAttitude,
     HasPose,
     HasSpin,
+    Mat3,
+    Matrix,
+    Quat,
+    Quaternion,
     Scalar,
+    ScalarLike,
     Vec3,
+    Vector,
 )
-from rigidjax.body._types import Matrix, Quaternion, Vector
-from rigidjax.body.inertia import Inertia, MassProperties
+from rigidjax.body.inertia import Inertia, MassProperties, tensor_of
+from rigidjax.body.principal_axes import principal
 from rigidjax.body.validation import unit_quaternion
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.linalg3 import apply, cross, dot, product
@@ -35,9 +44,8 @@ def kinetic_energy(body: Inertia | MassProperties, state: HasSpin | Vector) -> S
     >>> kinetic_energy(Inertia.from_principal(1.0, 2.0, 3.0), [1.0, 1.0, 1.0])
     Array(3., dtype=float64)
     """
-    inertia = _inertia_of(body)
     omega = _omega(state)
-    energy = 0.5 * dot(omega, apply(inertia.tensor, omega))
+    energy = 0.5 * dot(omega, apply(_tensor(body), omega))
     if isinstance(body, MassProperties) and isinstance(state, HasPose):
         energy = energy + 0.5 * body.mass * dot(state.v, state.v)
     return energy
@@ -124,8 +132,7 @@ def angular_momentum(body: Inertia | MassProperties, state: HasSpin | Vector) ->
     >>> angular_momentum(Inertia.from_principal(1.0, 2.0, 3.0), [1.0, 1.0, 1.0])
     Array([1., 2., 3.], dtype=float64)
     """
-    inertia = _inertia_of(body)
-    return apply(inertia.tensor, _omega(state))
+    return apply(_tensor(body), _omega(state))
 
 
 def spatial_angular_momentum(body: Inertia | MassProperties, state: HasAttitude) -> Vec3:
@@ -154,15 +161,65 @@ def spatial_angular_momentum(body: Inertia | MassProperties, state: HasAttitude)
     return momentum
 
 
+def energy_ellipsoid(inertia: Inertia, energy: ScalarLike) -> tuple[Vec3, Quat]:
+    """The rates Ω of one energy: `½ Ω·IΩ = T`, an ellipsoid of semi-axes `√(2T/I_k)`.
+
+    **Arguments:** `inertia`; `energy` T ≥ 0, J. **Returns** `(semi_axes, q)`: (3,) rad/s in the
+    order of ascending moments, and (4,) the rotation principal axes → body axes.
+
+    **Raises:** `ValueError` for a zero moment or a negative number (`equinox` error under `jit`).
+
+    >>> energy_ellipsoid(Inertia.from_principal(1.0, 2.0, 2.0), 4.0)[0]
+    Array([2.82842712, 2.        , 2.        ], dtype=float64)
+    """
+    moments, q = _checks.single(inertia, Inertia, "inertia").invertible().principal()
+    twice = 2.0 * _not_negative(energy, "energy", "J")
+    return jnp.sqrt(twice / moments), q
+
+
+def momentum_ellipsoid(inertia: Inertia, momentum: ScalarLike) -> tuple[Vec3, Quat]:
+    """The rates Ω of one angular momentum: `|IΩ| = h`, an ellipsoid of semi-axes `h/I_k`.
+
+    **Arguments:** `inertia`; `momentum` h ≥ 0, kg m²/s. **Returns** `(semi_axes, q)` as
+    `energy_ellipsoid`.
+
+    **Raises:** `ValueError` for a zero moment or a negative number (`equinox` error under `jit`).
+
+    >>> momentum_ellipsoid(Inertia.from_principal(1.0, 2.0, 2.0), 4.0)[0]
+    Array([4., 2., 2.], dtype=float64)
+    """
+    moments, q = _checks.single(inertia, Inertia, "inertia").invertible().principal()
+    return _not_negative(momentum, "momentum", "kg m²/s") / moments, q
+
+
+def equal_ellipsoid(body: MassProperties) -> tuple[Vec3, Quat]:
+    """The uniform solid ellipsoid of the same mass, centre and 𝔖: semi-axes `√(5 λ_k/m)`.
+
+    **Arguments:** `body`. **Returns** `(semi_axes, q)`: (3,) m, ascending, and (4,) the rotation
+    principal axes → body axes. It moves exactly as the body does: a way to see inertia.
+
+    >>> import rigidjax as rj
+    >>> equal_ellipsoid(rj.shapes.ellipsoid(3.0, [1.0, 2.0, 3.0]))[0]
+    Array([1., 2., 3.], dtype=float64)
+    """
+    _checks.single(body, MassProperties, "body")
+    second_moments, q = principal(body.second_moment)
+    return jnp.sqrt(5.0 * second_moments / body.mass), q
+
+
 def _omega(state):
     return _vector(state.omega if isinstance(state, HasSpin) else state, "omega")
+
+
+def _not_negative(value: ScalarLike, name: str, unit: str) -> Scalar:
+    number = _checks.floating(value, (), name)
+    return _checks.sign(number, name, f"a number ≥ 0, {unit}", zero=True)
 
 
 def _vector(value, name):
     return _checks.floating(value, (3,), name)
 
 
-def _inertia_of(body: Inertia | MassProperties) -> Inertia:
+def _tensor(body: Inertia | MassProperties) -> Mat3:
     hint = "Inertia.from_tensor makes one of a matrix"
-    _checks.single(body, (Inertia, MassProperties), "body", hint=hint)
-    return body if isinstance(body, Inertia) else body.inertia
+    return tensor_of(_checks.single(body, (Inertia, MassProperties), "body", hint=hint))

@@ -5,22 +5,34 @@ tensor `I = Tr(𝔖) 1 − 𝔖` (eqs 76–78). A matrix is the 𝔖 of a real b
 semi-definite; for I that reads as the triangle inequality of its moments.
 """
 
+from typing import TypeVar
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rigidjax import _checks
-from rigidjax._types import Mat3, Quat, ScalarLike, Vec3
+from rigidjax._types import (
+    Mat3,
+    Matrices,
+    Matrix,
+    Quat,
+    Quaternion,
+    ScalarLike,
+    Scalars,
+    Vec3,
+    Vector,
+    Vectors,
+)
 from rigidjax.body import validation
-from rigidjax.body._types import Matrices, Matrix, Quaternion, Scalars, Vector, Vectors
 from rigidjax.body.principal_axes import eigensystem, principal
 from rigidjax.body.symmetric3 import (
     apply as apply,
     inverse as inverse,
     outer,
     product,
-    solve as solve,
     swap_trace,
+    swap_trace_back,
 )
 from rigidjax.rotation import quaternion
 
@@ -74,9 +86,8 @@ class Inertia(eqx.Module):
         >>> Inertia.from_principal(1.0, 2.0, 3.0).tensor[2, 2]
         Array(3., dtype=float64)
         """
-        moments = [_checks.floating(i, (), f"i{k + 1}") for k, i in enumerate((i1, i2, i3))]
-        moments = jnp.stack([m.astype(jnp.result_type(*moments)) for m in moments])
-        return Inertia(jnp.diag(validation.real_moments(moments)))
+        moments = validation.real_moments(jnp.stack(_checks.scalars(i1=i1, i2=i2, i3=i3)))
+        return Inertia(jnp.diag(moments))
 
     @staticmethod
     def from_second_moment(second_moment: Matrix) -> "Inertia":
@@ -98,11 +109,7 @@ class Inertia(eqx.Module):
     @property
     def second_moment(self) -> Float[Array, "*batch 3 3"]:
         """𝔖 = ½ Tr(I) 1 − I, (3, 3), kg m², body frame (notes, eqs 76–78 solved)."""
-        a = self.tensor
-        x, y, z = a[..., 0, 0], a[..., 1, 1], a[..., 2, 2]
-        diagonal = 0.5 * jnp.stack([(y - x) + z, (z - y) + x, (x - z) + y], axis=-1)
-        eye = jnp.broadcast_to(jnp.eye(3, dtype=bool), a.shape)
-        return jnp.where(eye, jnp.broadcast_to(diagonal[..., None], a.shape), 0.0 - a)
+        return swap_trace_back(self.tensor)
 
     @property
     def moments(self) -> Vec3:
@@ -186,12 +193,7 @@ class MassProperties(eqx.Module):
     com: Float[Array, "*batch 3"]
     second_moment: Float[Array, "*batch 3 3"]
 
-    def __init__(
-        self,
-        mass: Scalars,
-        com: Vectors,
-        second_moment: Matrices,
-    ):
+    def __init__(self, mass: Scalars, com: Vectors, second_moment: Matrices):
         mass = _checks.floating(mass, (), "mass", batched=True)
         com = _checks.floating(com, (3,), "com", batched=True)
         if isinstance(second_moment, Inertia):
@@ -203,10 +205,9 @@ class MassProperties(eqx.Module):
         _checks.same_batch(mass=(mass, 0), com=(com, 1), second_moment=(second_moment, 2))
         dtype = jnp.result_type(mass, com, second_moment)
         self.mass = validation.mass_of_a_body(mass.astype(dtype))
-        self.com = validation.if_known(validation.real_place, com.astype(dtype))
-        self.second_moment = validation.if_known(
-            validation.real_second_moment, second_moment.astype(dtype)
-        )
+        self.com = _checks.if_known(_checks.finite, com.astype(dtype), "com")
+        second_moment = second_moment.astype(dtype)
+        self.second_moment = _checks.if_known(validation.real_second_moment, second_moment)
 
     @property
     def inertia(self) -> Inertia:
@@ -223,7 +224,7 @@ class MassProperties(eqx.Module):
         """
         return MassProperties(
             validation.real_mass(self.mass),
-            validation.real_place(self.com),
+            _checks.finite(self.com, "com"),
             validation.real_second_moment(self.second_moment),
         )
 
@@ -313,6 +314,21 @@ class MassProperties(eqx.Module):
         if not isinstance(other, MassProperties):
             return NotImplemented
         return _joined(self, -other.mass, other.com, -other.second_moment)
+
+
+def tensor_of(body: Inertia | MassProperties) -> Mat3:
+    """The inertia tensor (3, 3), kg m²: of an `Inertia`, or about the centre of mass."""
+    return body.tensor if isinstance(body, Inertia) else body.inertia.tensor
+
+
+Body = TypeVar("Body", Inertia, MassProperties)
+
+
+def with_tensor(body: Body, tensor: Mat3) -> Body:
+    """The body with another inertia tensor, unchecked: parts of a body may turn as no body does."""
+    if isinstance(body, Inertia):
+        return Inertia(tensor)
+    return eqx.tree_at(lambda b: b.second_moment, body, swap_trace_back(tensor))
 
 
 def _joined(body, mass, com, second_moment):

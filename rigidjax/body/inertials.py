@@ -9,7 +9,7 @@ import numpy as np
 
 from rigidjax import _checks
 from rigidjax.body.inertia import MassProperties
-from rigidjax.rotation import so3
+from rigidjax.rotation import euler, quaternion
 
 # How far a sum of two moments may fall below the third, for files are rounded.
 ROUNDED = 1e-6
@@ -32,14 +32,14 @@ def read_inertials(path: str | Path) -> dict[str, MassProperties]:
     ValueError: missing.urdf: no such file
     """
     path = _checks.path(path)
-    root = _parsed(path)
-    urdf = _is_urdf(path, root)
+    root, nodes = _opened(path)
+    read = _from_urdf if root.tag == "robot" else _from_mujoco
     out: dict[str, MassProperties] = {}
-    for name, node in _bodies(path, root):
+    for name, node in nodes.items():
         inertial = node.find("inertial")
         if inertial is not None:
             try:
-                out[name] = _from_urdf(inertial) if urdf else _from_mujoco(inertial)
+                out[name] = read(inertial)
             except ValueError as error:
                 raise ValueError(f"{path}: body {name!r}: {error}") from None
     return out
@@ -64,9 +64,8 @@ def write_inertials(
     _checks.instance(bodies, Mapping, "bodies", wanted="a dict of name → MassProperties")
     if not bodies:
         raise ValueError("bodies: wanted at least one name → MassProperties, got none")
-    root = _parsed(source)
-    urdf = _is_urdf(source, root)
-    nodes = dict(_bodies(source, root))
+    root, nodes = _opened(source)
+    write = _to_urdf if root.tag == "robot" else _to_mujoco
     for name, body in bodies.items():
         _checks.single(body, MassProperties, f"bodies[{name!r}]")
         if name not in nodes:
@@ -75,33 +74,27 @@ def write_inertials(
         if inertial is None:
             inertial = Tree.SubElement(nodes[name], "inertial")
         inertial.clear()
-        (_to_urdf if urdf else _to_mujoco)(inertial, body)
+        write(inertial, body)
     Tree.ElementTree(root).write(path, encoding="utf-8", xml_declaration=True)
 
 
-def _parsed(path: Path) -> Tree.Element:
+def _opened(path: Path) -> tuple[Tree.Element, dict[str, Tree.Element]]:
+    """The file's root, `robot` or `mujoco`, and its links or bodies by name."""
     if not path.exists():
         raise ValueError(f"{path}: no such file")
     try:
-        return Tree.parse(path).getroot()
+        root = Tree.parse(path).getroot()
     except (Tree.ParseError, OSError, ValueError) as error:
         raise ValueError(f"{path}: cannot be read as XML ({error})") from None
-
-
-def _is_urdf(path: Path, root: Tree.Element) -> bool:
     if root.tag not in ("robot", "mujoco"):
         raise ValueError(f"{path}: wanted a URDF (robot) or MuJoCo file, got <{root.tag}>")
-    return root.tag == "robot"
-
-
-def _bodies(path: Path, root: Tree.Element) -> list[tuple[str, Tree.Element]]:
     tag = "link" if root.tag == "robot" else "body"
     nodes = root.findall("link") if tag == "link" else list(root.iter("body"))
     names = [node.get("name", f"{tag} {index}") for index, node in enumerate(nodes)]
     twice = [name for name in names if names.count(name) > 1]
     if twice:
         raise ValueError(f"{path}: two bodies are called {twice[0]!r}")
-    return list(zip(names, nodes, strict=True))
+    return root, dict(zip(names, nodes, strict=True))
 
 
 def _from_urdf(inertial: Tree.Element) -> MassProperties:
@@ -109,45 +102,32 @@ def _from_urdf(inertial: Tree.Element) -> MassProperties:
     if mass is None or inertia is None:
         raise ValueError("wanted a <mass> and an <inertia>")
     place = _numbers(origin, "xyz", 3, [0.0] * 3)
-    roll, pitch, yaw = _numbers(origin, "rpy", 3, [0.0] * 3)
+    # Fixed axes: roll about x, then pitch about y, then yaw about z.
+    turn = euler.to_matrix(_numbers(origin, "rpy", 3, [0.0] * 3), "xyz")
     parts = {key: _numbers(inertia, key, 1)[0] for key in ("ixx", "iyy", "izz")}
     parts |= {key: _numbers(inertia, key, 1, [0.0])[0] for key in ("ixy", "ixz", "iyz")}
-    tensor = np.array(
-        [
-            [parts["ixx"], parts["ixy"], parts["ixz"]],
-            [parts["ixy"], parts["iyy"], parts["iyz"]],
-            [parts["ixz"], parts["iyz"], parts["izz"]],
-        ]
-    )
-    # Fixed axes: roll about x, then pitch about y, then yaw about z.
-    turn = _turn(2, yaw) @ _turn(1, pitch) @ _turn(0, roll)
-    return _body(_numbers(mass, "value", 1)[0], place, turn @ tensor @ turn.T)
+    rows = (("ixx", "ixy", "ixz"), ("ixy", "iyy", "iyz"), ("ixz", "iyz", "izz"))
+    tensor = np.array([[parts[key] for key in row] for row in rows])
+    return _body(_numbers(mass, "value", 1)[0], place, turn, tensor)
 
 
 def _from_mujoco(inertial: Tree.Element) -> MassProperties:
     other = [key for key in ("axisangle", "xyaxes", "zaxis", "euler") if key in inertial.attrib]
     if other:
         raise ValueError(f"its inertial is turned by {other[0]}; wanted quat")
-    turn = np.eye(3)
-    if "quat" in inertial.attrib:
-        w, x, y, z = _numbers(inertial, "quat", 4)
-        size = np.sqrt(w * w + x * x + y * y + z * z)
-        if not size > 0:
-            raise ValueError("its quat is zero")
-        half = np.array([x, y, z]) / size
-        length = np.linalg.norm(half)
-        angle = 2.0 * np.arctan2(length, w / size)
-        turn = _exp(angle * half / length) if length > 0 else turn
+    q = quaternion.normalise(_numbers(inertial, "quat", 4, [1.0, 0.0, 0.0, 0.0]))
     if "fullinertia" in inertial.attrib:
         xx, yy, zz, xy, xz, yz = _numbers(inertial, "fullinertia", 6)
         tensor = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
     else:
         tensor = np.diag(_numbers(inertial, "diaginertia", 3))
     place = _numbers(inertial, "pos", 3, [0.0] * 3)
-    return _body(_numbers(inertial, "mass", 1)[0], place, turn @ tensor @ turn.T)
+    return _body(_numbers(inertial, "mass", 1)[0], place, quaternion.to_matrix(q), tensor)
 
 
-def _body(mass: float, place: np.ndarray, tensor: np.ndarray) -> MassProperties:
+def _body(mass: float, place: np.ndarray, turn: Any, tensor: np.ndarray) -> MassProperties:
+    turn = np.asarray(turn, float)
+    tensor = turn @ tensor @ turn.T
     if not mass > 0:
         raise ValueError(f"wanted a positive mass, got {mass:g}")
     second = 0.5 * np.trace(tensor) * np.eye(3) - tensor
@@ -179,14 +159,6 @@ def _numbers(node: Any, key: str, count: int, otherwise: Any = None) -> np.ndarr
     return numbers
 
 
-def _turn(axis: int, angle: float) -> np.ndarray:
-    return _exp(angle * np.eye(3)[axis])
-
-
-def _exp(vector: np.ndarray) -> np.ndarray:
-    return np.asarray(so3.exp(vector), float)
-
-
 def _text(numbers: Any) -> str:
     return " ".join(repr(float(number)) for number in np.ravel(numbers))
 
@@ -195,9 +167,10 @@ def _to_urdf(inertial: Tree.Element, body: MassProperties) -> None:
     tensor = np.asarray(body.inertia.tensor)
     Tree.SubElement(inertial, "origin", xyz=_text(body.com), rpy="0 0 0")
     Tree.SubElement(inertial, "mass", value=_text(body.mass))
-    places = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2)}
-    places["izz"] = (2, 2)
-    Tree.SubElement(inertial, "inertia", {key: _text(tensor[at]) for key, at in places.items()})
+    entries = zip(
+        ("ixx", "ixy", "ixz", "iyy", "iyz", "izz"), tensor[np.triu_indices(3)], strict=True
+    )
+    Tree.SubElement(inertial, "inertia", {key: _text(entry) for key, entry in entries})
 
 
 def _to_mujoco(inertial: Tree.Element, body: MassProperties) -> None:

@@ -8,17 +8,15 @@ far from the origin, where a sum about the origin subtracts numbers of size (dis
 
 import os
 from collections.abc import Iterable
+from typing import Any
 
 import jax
-import jax.core
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import ArrayLike, Float, Int
+from jaxtyping import Array, ArrayLike, Float, Int
 
 from rigidjax import _checks
-from rigidjax._types import ScalarLike
-from rigidjax.body import validation
-from rigidjax.body._types import Numbers
+from rigidjax._types import Numbers, ScalarLike
 from rigidjax.body.inertia import MassProperties
 from rigidjax.body.symmetric3 import from_components
 
@@ -46,16 +44,12 @@ def mesh(
     (1.0, 0.25)
     """
     corners = _checks.rows(vertices, (3,), "vertices", hint="one row (x, y, z) per vertex")
-    n = corners.shape[0]
-    if n == 0:
+    if not corners.size:
         raise ValueError("vertices: wanted some, got none")
-    if validation.known(corners):
-        _checks.finite(corners, "vertices")
-    faces = faces_of(faces, n)
+    _checks.if_known(_checks.finite, corners, "vertices")
+    faces = faces_of(faces, corners.shape[0])
     density = _checks.floating(density, (), "density")
-    if validation.known(density):
-        fine = (density > 0) & jnp.isfinite(density)
-        _checks.refuse(density, ~fine, f"density: wanted a positive number, kg/m³, got {density}")
+    _checks.if_known(_checks.sign, density, "density", "a positive number, kg/m³")
 
     centre = jax.lax.stop_gradient(corners.mean(axis=0))
     volume, com = _volume_and_centroid(corners - centre[None, :], faces)
@@ -137,7 +131,7 @@ def _outward(volume, corners, faces):
     longest = jnp.ptp(corners, axis=0).max()
     area = 0.5 * jnp.sqrt((jnp.cross(b - a, c - a) ** 2).sum(axis=1)).sum()
     slack = 4.0 * jnp.finfo(corners.dtype).eps * jax.lax.stop_gradient(longest) * area
-    found = f" (volume {float(volume):.6g} m³)" if validation.known(volume) else ""
+    found = f" (volume {float(volume):.6g} m³)" if _checks.known(volume) else ""
     volume = _checks.refuse(
         volume,
         volume < -slack,
@@ -149,9 +143,9 @@ def _outward(volume, corners, faces):
     )
 
 
-def faces_of(faces, n):
+def faces_of(faces: Any, n: int) -> Array:
     """The faces as an array (m, 3) of vertex numbers below n, checked where they are known."""
-    if isinstance(faces, jax.core.Tracer):
+    if not _checks.known(faces):
         return faces
     try:
         table = np.asarray(faces)
@@ -173,10 +167,7 @@ def faces_of(faces, n):
             f"mesh: face {which} is degenerate, it names a vertex twice: {_tuple(table[which])}"
         )
     edges = np.concatenate([table[:, [0, 1]], table[:, [1, 2]], table[:, [2, 0]]])
-    number, reverse = (
-        edges[:, 0] * np.int64(n) + edges[:, 1],
-        edges[:, 1] * np.int64(n) + edges[:, 0],
-    )
+    number, reverse = (edges[:, k] * np.int64(n) + edges[:, 1 - k] for k in (0, 1))
     unique, counts = np.unique(number, return_counts=True)
     alone = ~np.isin(number, reverse)
     twice = counts > 1

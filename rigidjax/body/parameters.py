@@ -9,13 +9,14 @@ doi:10.1109/LRA.2022.3144517. The ten numbers and their order are those of pinoc
 `LogCholeskyParameters`.
 """
 
+from collections.abc import Callable
+
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from rigidjax import _checks
-from rigidjax._names import own_names
-from rigidjax._types import Mat3, Vec3
-from rigidjax.body._types import Matrix, Numbers, Vector
+from rigidjax._names import show
+from rigidjax._types import Mat3, Matrix, Numbers, Vec3, Vector
 from rigidjax.body.inertia import MassProperties
 from rigidjax.body.symmetric3 import from_components
 from rigidjax.body.validation import real_moments
@@ -199,22 +200,20 @@ def _interior(square):
     )
 
 
-def _limit(dtype) -> float:
-    return 31.0 if dtype == jnp.float32 else 330.0
-
-
 def _hold(exponent: Float[Array, "*n"]) -> Float[Array, "*n"]:
     """The exponent itself, but growing only logarithmically past the dtype's range."""
-    limit = _limit(exponent.dtype)
-    beyond = jnp.maximum(jnp.abs(exponent) - limit, 0.0)
-    return jnp.where(beyond > 0, jnp.sign(exponent) * (limit + jnp.log1p(beyond)), exponent)
+    return _bent(exponent, jnp.log1p)
 
 
 def _reach(exponent: Float[Array, "*n"]) -> Float[Array, "*n"]:
     """The inverse of `_hold`."""
-    limit = _limit(exponent.dtype)
+    return _bent(exponent, jnp.expm1)
+
+
+def _bent(exponent: Float[Array, "*n"], bend: Callable[[Array], Array]) -> Float[Array, "*n"]:
+    limit = 31.0 if exponent.dtype == jnp.float32 else 330.0
     beyond = jnp.maximum(jnp.abs(exponent) - limit, 0.0)
-    return jnp.where(beyond > 0, jnp.sign(exponent) * (limit + jnp.expm1(beyond)), exponent)
+    return jnp.where(beyond > 0, jnp.sign(exponent) * (limit + bend(beyond)), exponent)
 
 
-__dir__ = own_names(__name__)
+show(__name__)

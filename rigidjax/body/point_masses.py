@@ -8,10 +8,10 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from rigidjax import _checks
-from rigidjax.body import validation
-from rigidjax.body._types import Numbers, Vector
+from rigidjax._types import Numbers, Vector
 from rigidjax.body.inertia import MassProperties
 from rigidjax.body.symmetric3 import from_components
+from rigidjax.rotation.linalg3 import determinant
 
 
 def points(
@@ -29,16 +29,12 @@ def points(
     """
     masses = _checks.rows(masses, (), "masses")
     n = masses.shape[0]
-    positions = _checks.floating(
-        positions, (n, 3), "positions", hint=f"{n} masses have as many rows"
-    )
+    hint = f"{n} masses have as many rows"
+    positions = _checks.floating(positions, (n, 3), "positions", hint=hint)
     if n == 0:
         raise ValueError("masses: wanted at least one, got none")
-    if validation.known(masses):
-        _checks.finite(masses, "masses")
-        _checks.refuse(masses, (masses < 0).any(), f"masses: wanted masses ≥ 0, got {masses.min()}")
-    if validation.known(positions):
-        _checks.finite(positions, "positions")
+    _checks.if_known(_checks.sign, masses, "masses", "masses ≥ 0", zero=True)
+    _checks.if_known(_checks.finite, positions, "positions")
     return summed(masses, positions)
 
 
@@ -60,15 +56,9 @@ def voxels(
     density = _checks.numbers(density, "density")
     if density.ndim != 3 or density.size == 0:
         raise ValueError(f"density: wanted shape (nx, ny, nz), got {density.shape}")
-    h, low = _checks.floating(spacing, (3,), "spacing"), _checks.floating(corner, (3,), "corner")
-    if validation.known(density):
-        _checks.finite(density, "density")
-        _checks.refuse(density, (density < 0).any(), "density: wanted values ≥ 0 (kg/m³)")
-    if validation.known(h):
-        fine = ((h > 0) & jnp.isfinite(h)).all()
-        _checks.refuse(h, ~fine, f"spacing: wanted three positive edges of a cell, m, got {h}")
-    if validation.known(low):
-        _checks.finite(low, "corner")
+    h, low = _checks.floating(spacing, (3,), "spacing"), _checks.given(corner, (3,), "corner")
+    _checks.if_known(_checks.sign, density, "density", "values ≥ 0 (kg/m³)", zero=True)
+    _checks.if_known(_checks.sign, h, "spacing", "three positive edges of a cell, m")
     axes = [(jnp.arange(n, dtype=density.dtype) + 0.5) * h[i] for i, n in enumerate(density.shape)]
     centres = jnp.stack(jnp.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     masses = density.reshape(-1) * (h[0] * h[1] * h[2])
@@ -109,18 +99,12 @@ def quadrature(
 
     def at(u):
         r = _checks.floating(place(u), (3,), "place(u)")
-        rate = jax.jacfwd(place)(u)
-        volume = (
-            rate[0, 0] * (rate[1, 1] * rate[2, 2] - rate[1, 2] * rate[2, 1])
-            + rate[0, 1] * (rate[1, 2] * rate[2, 0] - rate[1, 0] * rate[2, 2])
-            + rate[0, 2] * (rate[1, 0] * rate[2, 1] - rate[1, 1] * rate[2, 0])
-        )
+        volume = determinant(jax.jacfwd(place)(u))
         return _checks.floating(density(r), (), "density(r)") * jnp.abs(volume), r
 
     per_volume, positions = jax.vmap(at)(cube)
-    for name, values in {"place(u)": positions, "density(r) |∂r/∂u|": per_volume}.items():
-        if validation.known(values):
-            _checks.refuse(values, ~jnp.isfinite(values).all(), f"{name}: contains NaN or infinity")
+    _checks.if_known(_checks.finite, positions, "place(u)")
+    _checks.if_known(_checks.finite, per_volume, "density(r) |∂r/∂u|")
     return summed(per_volume * weight, positions)
 
 

@@ -1,16 +1,20 @@
-"""Principal moments and axes that may stand inside a differentiated function.
+"""Principal moments and axes, functions of a symmetric matrix: inside a differentiated function.
 
 `eigh`'s own derivative divides by differences of eigenvalues: NaN for a sphere and for every
 symmetric top, and, as implemented in JAX, for distinct moments above 1e16 kg m² (jax#669).
 """
 
+import itertools
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from rigidjax import _checks
-from rigidjax._types import Mat3, Mat3Like, Quat, Vec3
+from rigidjax._types import Mat3, Mat3Like, Quat, Scalar, Vec3
 from rigidjax.body.scaling import exponent_of, times_power_of_two
 from rigidjax.body.symmetric3 import product
 
@@ -18,6 +22,16 @@ from rigidjax.body.symmetric3 import product
 _EQUAL = 64.0
 # Convergence is quadratic: double precision needs four or five.
 _SWEEPS = 6
+# Eigenvalues within this fraction of the largest are handled by an integral, not a quotient.
+_CLOSE = 1.0 / 32.0
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
+_NODES, _WEIGHTS = 0.5 * (_NODES + 1.0), 0.5 * _WEIGHTS
+# Which of the ascending eigenvalues, without order: (i, j), and (i, k, j).
+_PAIRS = list(itertools.combinations_with_replacement(range(3), 2))
+_TRIPLES = list(itertools.combinations_with_replacement(range(3), 3))
+_PAIR = np.array([_PAIRS.index(tuple(sorted(t))) for t in np.ndindex(3, 3)]).reshape(3, 3)
+_TRIPLE = np.array([_TRIPLES.index(tuple(sorted(t))) for t in np.ndindex(3, 3, 3)])
+_TRIPLE = _TRIPLE.reshape(3, 3, 3)
 
 
 def principal(tensor: Mat3Like) -> tuple[Vec3, Quat]:
@@ -120,21 +134,9 @@ def _ascending(values, axes):
 def _nearest_signs(axes) -> Mat3:
     """Turn two axes round, or none: whichever gives the largest trace."""
     d0, d1, d2 = axes[0][0], axes[1][1], axes[2][2]
-    choices = (d0 + d1 + d2, d0 - d1 - d2, d1 - d0 - d2, d2 - d0 - d1)
-    best = jnp.maximum(jnp.maximum(choices[0], choices[1]), jnp.maximum(choices[2], choices[3]))
-    first = (choices[1] == best) & (choices[0] != best)
-    second = (choices[2] == best) & (choices[0] != best) & ~first
-    third = (choices[0] != best) & ~first & ~second
-    signs = (
-        jnp.where(second | third, -1.0, 1.0),
-        jnp.where(first | third, -1.0, 1.0),
-        jnp.where(first | second, -1.0, 1.0),
-    )
-    columns = [
-        jnp.stack([sign.astype(p.dtype) * p for p in axis])
-        for sign, axis in zip(signs, axes, strict=True)
-    ]
-    return jnp.stack(columns, axis=1)
+    traces = jnp.stack([d0 + d1 + d2, d0 - d1 - d2, d1 - d0 - d2, d2 - d0 - d1])
+    signs = jnp.asarray([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]], traces.dtype)
+    return jnp.stack([jnp.stack(axis) for axis in axes], axis=1) * signs[jnp.argmax(traces)][None]
 
 
 def _with(values: tuple[Any, ...], changed: dict[int, Any]) -> tuple[Any, ...]:
@@ -146,3 +148,74 @@ def _quaternion_near_identity(m: Mat3) -> Quat:
     w = 0.5 * jnp.sqrt(1.0 + m[0, 0] + m[1, 1] + m[2, 2])
     f = 0.25 / w
     return jnp.stack([w, f * (m[2, 1] - m[1, 2]), f * (m[0, 2] - m[2, 0]), f * (m[1, 0] - m[0, 1])])
+
+
+def matrix_function(function: Callable[[Scalar], Scalar], tensor: Mat3Like) -> Mat3:
+    """`f(A) = R diag(f(λ)) Rᵀ` of a symmetric matrix, such as its square root or exponential.
+
+    Its first and second derivatives are right for every body, also for a sphere and a symmetric
+    top, where the principal axes have none. The axes are held; what moves is `E = Rᵀ dA R`, and
+    `f(Λ + E)_ij = f(λ_i) δ_ij + f[λ_i, λ_j] E_ij + Σ_k f[λ_i, λ_k, λ_j] E_ik E_kj + …` with divided
+    differences, which are smooth where eigenvalues meet (Daleckii and Krein 1965; Higham 2008,
+    "Functions of Matrices", section 3.2). Third derivatives are not carried.
+
+    **Arguments:** `function` f, scalar → scalar, written in `jax.numpy`, smooth on the spectrum; it
+    may depend on values that are differentiated; `tensor` (3, 3) symmetric, I or 𝔖, any units.
+    **Returns** (3, 3), same frame.
+
+    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
+
+    >>> matrix_function(jnp.sqrt, 4.0 * jnp.eye(3))[0]
+    Array([2., 0., 0.], dtype=float64)
+    """
+    a = _checks.floating(tensor, (3, 3), "tensor")
+    _checks.function(function, "function", "number → number, written in jax.numpy")
+    # In units of the largest entry (a power of two), so that no product leaves the dtype's range.
+    # One power less, so that it is a number for the largest of the dtype, too.
+    unit = times_power_of_two(jnp.ones((), a.dtype), exponent_of(a) - 1)
+    a = 0.5 * (a + a.T) / unit
+
+    def scaled(value):
+        return _checks.floating(function(unit * value), (), "function(λ)", hint="one number")
+
+    values, axes = eigensystem(jax.lax.stop_gradient(a))
+    change = product(axes.T, product(a - jax.lax.stop_gradient(a), axes))
+    first, second = _divided_differences(scaled, values)
+    bent = second * change[:, :, None] * change[None, :, :]
+    inner = jnp.diag(jax.vmap(scaled)(values)) + first * change + bent.sum(axis=1)
+    return product(axes, product(inner, axes.T))
+
+
+def _divided_differences(f, values):
+    """f[λi, λj] as (3, 3) and f[λi, λk, λj] as (3, 3, 3), of ascending eigenvalues."""
+    close = _CLOSE * jnp.max(jnp.abs(values))
+    pairs, triples = np.array(_PAIRS), np.array(_TRIPLES)
+
+    first, second = partial(_first, f, close=close), partial(_second, f, close=close)
+    of_pairs = jax.vmap(first)(*(values[pairs[:, k]] for k in range(2)))
+    of_triples = jax.vmap(second)(*(values[triples[:, k]] for k in range(3)))
+    return of_pairs[_PAIR], of_triples[_TRIPLE]
+
+
+def _first(f, x, y, close):
+    """f[x, y]: the mean of f' between x and y (Hermite–Genocchi where they are close)."""
+    near = y - x <= close
+    end = jnp.where(near, y, x)
+    slope = jax.vmap(lambda s: jax.grad(f)(x + s * (end - x)))(jnp.asarray(_NODES, x.dtype))
+    mean = (jnp.asarray(_WEIGHTS, x.dtype) * slope).sum()
+    return jnp.where(near, mean, (f(y) - f(x)) / jnp.where(near, 1.0, y - x))
+
+
+def _second(f, x, y, z, close):
+    """f[x, y, z], x ≤ y ≤ z: an integral of f'' over the triangle that they span."""
+    near = z - x <= close
+    middle, end = jnp.where(near, y, x), jnp.where(near, z, x)
+    u = np.repeat(_NODES, len(_NODES))
+    v = np.tile(_NODES, len(_NODES)) * u
+    weight = np.repeat(_WEIGHTS, len(_NODES)) * np.tile(_WEIGHTS, len(_NODES)) * u
+    bend = jax.vmap(lambda s, t: jax.grad(jax.grad(f))(x + s * (middle - x) + t * (end - middle)))(
+        jnp.asarray(u, x.dtype), jnp.asarray(v, x.dtype)
+    )
+    mean = (jnp.asarray(weight, x.dtype) * bend).sum()
+    quotient = (_first(f, y, z, close) - _first(f, x, y, close)) / jnp.where(near, 1.0, z - x)
+    return jnp.where(near, mean, quotient)

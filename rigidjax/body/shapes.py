@@ -9,16 +9,12 @@ What is written down is the second moment 𝔖 = ∫ r rᵀ dm (notes, eq 60), d
 `I1 = λ2 + λ3`, … (eqs 76–78) turns it into the textbook moments of inertia.
 """
 
-from typing import TYPE_CHECKING
-
 import jax.numpy as jnp
 from jaxtyping import ArrayLike, Float
 
 from rigidjax import _checks
-from rigidjax._names import own_names, suggests
-from rigidjax._types import ScalarLike
-from rigidjax.body import validation
-from rigidjax.body._types import Numbers, Vector
+from rigidjax._names import show
+from rigidjax._types import Numbers, ScalarLike, Vector
 from rigidjax.body.inertia import MassProperties
 from rigidjax.body.meshes import mesh as mesh, mesh_file as mesh_file
 from rigidjax.body.point_masses import (
@@ -201,18 +197,13 @@ def plate(mass: ScalarLike, size: Float[ArrayLike, "2"] | Numbers) -> MassProper
 
 
 def _lengths(value, shape, name):
-    lengths = _checks.floating(value, shape, name)
-    if validation.known(lengths):
-        _checks.finite(lengths, name)
-        _checks.refuse(
-            lengths, (lengths < 0).any(), f"{name}: wanted lengths ≥ 0 (m), got {lengths}"
-        )
-    return lengths
+    lengths = _checks.given(value, shape, name)
+    return _checks.if_known(_checks.sign, lengths, name, "lengths ≥ 0 (m)", zero=True)
 
 
 def _nested(inner, outer, names=("inner", "outer")):
     r, R = _lengths(inner, (), names[0]), _lengths(outer, (), names[1])
-    if validation.known(r) and validation.known(R):
+    if _checks.known((r, R)):
         _checks.refuse(r, r > R, f"{names[0]}: wanted {names[0]} ≤ {names[1]}, got {r} and {R} (m)")
     return r, R
 
@@ -226,6 +217,4 @@ def _centred(mass, per_mass):
     return MassProperties(m, jnp.zeros_like(per_mass), jnp.diag(m * per_mass))
 
 
-if not TYPE_CHECKING:
-    __getattr__ = suggests(__name__)
-__dir__ = own_names(__name__)
+show(__name__)

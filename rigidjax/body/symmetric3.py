@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from rigidjax import _checks
-from rigidjax._types import Mat3, Mat3Like, Scalar, Vec3, Vec3Like
+from rigidjax._types import Mat3, Mat3Like, Scalar
 from rigidjax.rotation.linalg3 import apply as apply, entries, product as product
 
 
@@ -22,9 +22,6 @@ def inverse(tensor: Mat3Like) -> Mat3:
     infinities: `Inertia.invertible` refuses it in words.
 
     **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
-
-    >>> inverse(jnp.diag(jnp.array([1.0, 2.0, 4.0])))[2, 2]
-    Array(0.25, dtype=float64)
     """
     return _inverse(_checks.floating(tensor, (3, 3), "tensor"))
 
@@ -42,22 +39,6 @@ def _inverse_jvp(primals: tuple[Mat3], tangents: tuple[Mat3]) -> tuple[Mat3, Mat
     out = _inverse(a)
     scale = a[0, 0] + a[1, 1] + a[2, 2]
     return out, -product(product(out * scale, da / scale), out)
-
-
-def solve(tensor: Mat3Like, vector: Vec3Like) -> Vec3:
-    """The `x` with `A x = v`, for a symmetric 3×3 matrix.
-
-    **Arguments:** `tensor` (3, 3) symmetric, trace > 0; `vector` (3,), the same frame.
-    **Returns** (3,). To solve with one matrix many times, keep `inverse`.
-
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
-
-    >>> solve(jnp.diag(jnp.array([1.0, 2.0, 4.0])), jnp.array([1.0, 1.0, 1.0]))
-    Array([1.  , 0.5 , 0.25], dtype=float64)
-    """
-    relative, scale = _relative_inverse(_checks.floating(tensor, (3, 3), "tensor"))
-    # v/scale first: 1/1e37 has only half its digits in float32.
-    return apply(relative, _checks.floating(vector, (3,), "vector") / scale)
 
 
 def _relative_inverse(a: Mat3) -> tuple[Mat3, Scalar]:
@@ -96,7 +77,16 @@ def outer(a: Float[Array, "3"], b: Float[Array, "3"]) -> Mat3:
 def swap_trace(a: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3 3"]:
     """`Tr(A) 1 − A` without the cancellation: `[A22 + A33, −A12, …]` (notes, eqs 76–78)."""
     x, y, z = a[..., 0, 0], a[..., 1, 1], a[..., 2, 2]
-    diagonal = jnp.stack([y + z, z + x, x + y], axis=-1)
-    eye = jnp.eye(3, dtype=bool)
-    eye = jnp.broadcast_to(eye, a.shape)
+    return _opposite(a, jnp.stack([y + z, z + x, x + y], axis=-1))
+
+
+def swap_trace_back(a: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3 3"]:
+    """`½ Tr(A) 1 − A`, the inverse of `swap_trace`."""
+    x, y, z = a[..., 0, 0], a[..., 1, 1], a[..., 2, 2]
+    return _opposite(a, 0.5 * jnp.stack([(y - x) + z, (z - y) + x, (x - z) + y], axis=-1))
+
+
+def _opposite(a: Array, diagonal: Array) -> Array:
+    """−A but for its diagonal."""
+    eye = jnp.broadcast_to(jnp.eye(3, dtype=bool), a.shape)
     return jnp.where(eye, jnp.broadcast_to(diagonal[..., None], a.shape), 0.0 - a)

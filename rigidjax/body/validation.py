@@ -5,71 +5,52 @@ exceptions, with the numbers) and under `jit` (`equinox.error_if`, without them)
 round-off are tolerated, so that plates, rods and points, which lie on the boundary, pass.
 """
 
-from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
 import jax
-import jax.core
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
 from rigidjax import _checks
-from rigidjax._types import Quat
-from rigidjax.body._types import Quaternion
+from rigidjax._types import Quat, Quaternion
 from rigidjax.rotation import quaternion
+from rigidjax.rotation.validation import near_unit, tolerance
 
 # Units of round-off, of the largest entry. A product R I Rᵀ is off by about ten.
 _FORGIVEN = 64.0
 
 
-def known(value: Float[Array, "..."]) -> bool:
-    """Whether the numbers can be looked at now (they are not being traced)."""
-    return not isinstance(value, jax.core.Tracer)
-
-
-def if_known(check: Callable, value: Float[Array, "..."]) -> Float[Array, "..."]:
-    """`check(value)` if its numbers are known; otherwise `value` as it is, as where it has none."""
-    return check(value) if known(value) and value.size else value
-
-
 def real_mass(mass: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
     """Refuse a mass that is not positive and finite."""
-    mass = _finite(mass, "mass")
-    found = f", got {np.asarray(mass)}" if known(mass) else ""
-    return _checks.refuse(mass, (mass <= 0).any(), f"mass: wanted a positive mass (kg){found}")
+    return _checks.sign(mass, "mass", "a positive mass (kg)")
 
 
 def mass_of_a_body(mass: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
     """A positive mass as it is; another is refused if it is known, and NaN if it is traced."""
-    return real_mass(mass) if known(mass) else jnp.where(mass > 0, mass, jnp.nan)
-
-
-def real_place(com: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3"]:
-    """Refuse a centre of mass that is not finite."""
-    return _finite(com, "com")
+    return real_mass(mass) if _checks.known(mass) else jnp.where(mass > 0, mass, jnp.nan)
 
 
 def real_inertia(tensor: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3 3"]:
     """Refuse an inertia tensor that is not symmetric or whose moments no body has."""
-    tensor = _symmetric(_finite(tensor, "inertia tensor"), "inertia tensor")
+    tensor = _symmetric(_checks.finite(tensor, "inertia tensor"), "inertia tensor")
     return _moments_of_a_body(tensor, _eigenvalues(tensor))
 
 
 def real_moments(moments: Float[Array, "3"]) -> Float[Array, "3"]:
     """Refuse principal moments, in any order, that no body has."""
-    moments = _finite(moments, "principal moments")
-    xp = np if known(moments) else jnp
+    moments = _checks.finite(moments, "principal moments")
+    xp = np if _checks.known(moments) else jnp
     return _moments_of_a_body(moments, xp.sort(_values(moments)))
 
 
 def real_second_moment(s: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3 3"]:
     """Refuse a second moment that is not symmetric and positive semi-definite."""
-    s = _symmetric(_finite(s, "second moment"), "second moment")
+    s = _symmetric(_checks.finite(s, "second moment"), "second moment")
     least, largest = (e := _eigenvalues(s))[..., 0], e[..., 2]
-    found = f", got principal second moments {_show(e)} kg m²" if known(s) else ""
+    found = f", got principal second moments {_show(e)} kg m²" if _checks.known(s) else ""
     return _checks.refuse(
         s,
         (least < -_slack(s) * largest).any() | (largest < 0).any(),
@@ -87,7 +68,7 @@ def possible(body: Any, tensor: Float[Array, "*batch 3 3"], mass: Any, throw: bo
     **Arguments:** `tensor` the inertia, kg m²; `mass` kg, `None` for a body that only turns.
     """
     tensor = _checks.numbers(tensor, "inertia tensor")
-    is_known = known(tensor) and (mass is None or known(mass))
+    is_known = _checks.known(tensor) and (mass is None or _checks.known(mass))
     xp = np if is_known else jnp
     light = xp.asarray(False) if mass is None else ~(_values(mass) > 0)
     flat, broken = _impossible(xp, _values(tensor), _slack(tensor))
@@ -151,22 +132,13 @@ _PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 def unit_quaternion(q: Quaternion) -> Quat:
     """A unit quaternion (w, x, y, z): normalised if off by round-off, refused if by more."""
-    q = _checks.floating(q, (4,), "q", hint="a quaternion is (w, x, y, z)")
-    if known(q):
-        _checks.finite(q, "q")
-        length = float(np.linalg.norm(np.asarray(q)))
-        _checks.refuse(
-            q,
-            abs(length - 1.0) > (1e-3 if q.dtype == jnp.float32 else 1e-6),
-            f"q: wanted a unit quaternion (w, x, y, z), got one of length {length:.6g}; "
-            "rigidjax.quaternion.normalise makes it one",
-        )
-    return quaternion.normalise(q)
+    q = _checks.given(q, (4,), "q", hint="a quaternion is (w, x, y, z)")
+    return quaternion.normalise(near_unit(q, "q", tolerance(q.dtype)))
 
 
 def _moments_of_a_body(value, moments):
     m1, m2, m3 = moments[..., 0], moments[..., 1], moments[..., 2]
-    found = f" {_show(moments)} kg m²" if known(value) else ""
+    found = f" {_show(moments)} kg m²" if _checks.known(value) else ""
     slack = _slack(value) * abs(m3)
     value = _checks.refuse(
         value,
@@ -174,7 +146,7 @@ def _moments_of_a_body(value, moments):
         f"inertia: wanted moments that are not negative, got{found or ' a negative one'}; "
         "an inside-out mesh or a product of inertia with the wrong sign gives this",
     )
-    short = f" ({float(np.max(m3 - m1 - m2)):.3g} too large)" if known(value) else ""
+    short = f" ({float(np.max(m3 - m1 - m2)):.3g} too large)" if _checks.known(value) else ""
     return _checks.refuse(
         value,
         (m3 - m1 - m2 > slack).any(),
@@ -187,7 +159,7 @@ def _moments_of_a_body(value, moments):
 def _symmetric(a, name):
     difference = abs(_values(a) - _values(a).swapaxes(-1, -2)).max(axis=(-1, -2))
     largest = abs(_values(a)).max(axis=(-1, -2))
-    found = f" (largest difference {float(difference.max()):.3g})" if known(a) else ""
+    found = f" (largest difference {float(difference.max()):.3g})" if _checks.known(a) else ""
     return _checks.refuse(
         a,
         (difference > _slack(a) * largest).any(),
@@ -196,17 +168,13 @@ def _symmetric(a, name):
     )
 
 
-def _finite(a, name):
-    return _checks.finite(a, name)
-
-
 def _values(a):
     """The numbers, without derivatives: NumPy if known, so that a check costs microseconds."""
-    return np.asarray(a) if known(a) else lax.stop_gradient(a)
+    return np.asarray(a) if _checks.known(a) else lax.stop_gradient(a)
 
 
 def _eigenvalues(a):
-    if known(a):
+    if _checks.known(a):
         return np.linalg.eigvalsh(np.asarray(a))
     scale = jnp.abs(a).max(axis=(-1, -2), keepdims=True)
     scale = lax.stop_gradient(jnp.where(scale > 0, scale, 1))

@@ -6,9 +6,8 @@
 import jax.numpy as jnp
 
 from rigidjax import _checks
-from rigidjax._names import own_names
-from rigidjax._types import Scalar, ScalarLike
-from rigidjax.body._types import Vector
+from rigidjax._names import show
+from rigidjax._types import Scalar, ScalarLike, Vector
 
 
 def box(size: Vector) -> Scalar:
@@ -97,4 +96,4 @@ def torus(major: ScalarLike, minor: ScalarLike) -> Scalar:
     return 2.0 * jnp.pi**2 * R * r * r
 
 
-__dir__ = own_names(__name__)
+show(__name__)

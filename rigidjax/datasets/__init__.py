@@ -1,6 +1,6 @@
 """Published recordings, ready to be fitted."""
 
-from rigidjax._names import own_names
+from rigidjax._names import show
 from rigidjax.datasets import toutatis as toutatis
 
-__dir__ = own_names(__name__)
+show(__name__)

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array
 
 from rigidjax import exact
-from rigidjax._names import own_names
+from rigidjax._names import show
 from rigidjax.body import spatial_angular_momentum
 from rigidjax.identify.body_charts import PrincipalRatios
 from rigidjax.identify.loss import SoftL1
@@ -148,4 +148,4 @@ def remarks(fit: Fit) -> str:
     return "\n".join(lines)
 
 
-__dir__ = own_names(__name__)
+show(__name__)

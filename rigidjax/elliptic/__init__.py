@@ -10,7 +10,7 @@ as functions of the same families; no iteration is differentiated, and all loops
 fixed by the dtype.
 """
 
-from rigidjax._names import own_names
+from rigidjax._names import show
 from rigidjax.elliptic.carlson import rc as rc, rd as rd, rf as rf, rj_ as rj_
 from rigidjax.elliptic.jacobi import am as am, sncndn as sncndn
 from rigidjax.elliptic.legendre import (
@@ -22,4 +22,4 @@ from rigidjax.elliptic.legendre import (
     ellippiinc as ellippiinc,
 )
 
-__dir__ = own_names(__name__)
+show(__name__)

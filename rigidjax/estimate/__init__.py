@@ -5,7 +5,7 @@
 motion under random torques.
 """
 
-from rigidjax._names import own_names
+from rigidjax._names import show
 from rigidjax.estimate.belief import Belief as Belief, start as start
 from rigidjax.estimate.density import LogDensity as LogDensity, Unpacked as Unpacked
 from rigidjax.estimate.filter import (
@@ -30,4 +30,4 @@ from rigidjax.estimate.sample import Sampled as Sampled, sample as sample
 from rigidjax.estimate.scene import Model as Model, Walk as Walk
 from rigidjax.estimate.smoother import Push as Push, Smoothed as Smoothed, smooth as smooth
 
-__dir__ = own_names(__name__)
+show(__name__)

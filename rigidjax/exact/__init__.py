@@ -1,8 +1,6 @@
 """Motions in closed form, without a solver."""
 
-from typing import TYPE_CHECKING
-
-from rigidjax._names import own_names, suggests
+from rigidjax._names import show
 from rigidjax.exact.diffrax_solver import FreeSolver as FreeSolver
 from rigidjax.exact.free_body import FreeBody as FreeBody, free_body as free_body
 from rigidjax.exact.periods import (
@@ -10,6 +8,4 @@ from rigidjax.exact.periods import (
     precession_period as precession_period,
 )
 
-if not TYPE_CHECKING:
-    __getattr__ = suggests(__name__)
-__dir__ = own_names(__name__)
+show(__name__)

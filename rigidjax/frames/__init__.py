@@ -1,8 +1,6 @@
 """Moving frames, and scenes of particles seen from them. No body is needed."""
 
-from typing import TYPE_CHECKING
-
-from rigidjax._names import own_names, suggests
+from rigidjax._names import show
 from rigidjax.frames import scenes as scenes
 from rigidjax.frames.base import AbstractScene as AbstractScene, Force as Force
 from rigidjax.frames.frame_dynamics import (
@@ -14,6 +12,4 @@ from rigidjax.frames.moving import MovingFrame as MovingFrame
 from rigidjax.frames.point import Point as Point
 from rigidjax.frames.rotation_models import AboutAxis as AboutAxis, Uniform as Uniform
 
-if not TYPE_CHECKING:
-    __getattr__ = suggests(__name__)
-__dir__ = own_names(__name__)
+show(__name__)

@@ -1,4 +1,4 @@
-"""Dropped and thrown bodies on the turning Earth."""
+"""The turning Earth: dropped and thrown bodies, and Foucault's pendulum."""
 
 import jax.numpy as jnp
 
@@ -6,7 +6,7 @@ from rigidjax import _checks
 from rigidjax._types import Scalar, ScalarLike, Vec3
 from rigidjax.frames.base import AbstractScene
 from rigidjax.frames.point import Point, require_point
-from rigidjax.rotation.linalg3 import components
+from rigidjax.rotation.linalg3 import components, dot_components
 
 # NIMA TR8350.2 (WGS84), table 3.1; ISO 80000-3 for the standard fall.
 RATE = 7.292115e-5
@@ -73,7 +73,7 @@ class Earth(AbstractScene):
         0.02195
         """
         h = _checks.floating(height, (), "height")
-        h = _checks.refuse(h, ~(h >= 0), "height: wanted metres above the ground, a number ≥ 0")
+        h = _checks.sign(h, "height", "metres above the ground, a number ≥ 0", zero=True)
         time = jnp.sqrt(2 * h / self.gravity)
         return self.rate * self.gravity * jnp.cos(self.latitude) * time**3 / 3
 
@@ -93,24 +93,141 @@ def earth(latitude: ScalarLike, gravity: ScalarLike = GRAVITY, rate: ScalarLike 
     return Earth(*checked(latitude, gravity, rate))
 
 
+class Foucault(AbstractScene):
+    """A pendulum on the turning Earth: make one with `scenes.foucault`.
+
+    The bob keeps the distance `length` from the pivot at the origin; axes east, north, up. The
+    string's pull is eliminated, so the length is kept to the solver's tolerance, not exactly:
+    `drift` reports it.
+
+    **Fields:** `place` the `Earth` scene it hangs in; `length` m.
+
+    >>> pendulum = foucault(0.85, 67.0)
+    >>> float(pendulum.length), float(pendulum.place.latitude)
+    (67.0, 0.85)
+    """
+
+    place: Earth
+    length: Scalar
+
+    def acceleration(self, t: ScalarLike, state: Point) -> Vec3:
+        """d²x'/dt² (3,), m/s²: the free one less what the string takes (notes, eq 91)."""
+        x, v = components(state.x), components(state.v)
+        a = components(self.place.acceleration(t, state))
+        pull = (dot_components(x, a) + dot_components(v, v)) / dot_components(x, x)
+        return jnp.stack([a[i] - pull * x[i] for i in range(3)])
+
+    def conserved(self, t: ScalarLike, state: Point) -> dict[str, Scalar]:
+        length = jnp.sqrt(jnp.sum(state.x * state.x))
+        return {"jacobi": self.place.jacobi_integral(state), "length": length}
+
+    def start(self, east: ScalarLike, north: ScalarLike) -> Point:
+        """The bob held at rest, `east` and `north` of its lowest place, m.
+
+        >>> foucault(0.5, 10.0).start(6.0, 0.0).x.tolist()
+        [6.0, 0.0, -8.0]
+        """
+        return self.state(east, north, 0.0, 0.0)
+
+    def state(
+        self, east: ScalarLike, north: ScalarLike, east_speed: ScalarLike, north_speed: ScalarLike
+    ) -> Point:
+        """The bob below the pivot at a horizontal place, m, with a horizontal velocity, m/s.
+
+        **Raises:** `ValueError` for a place beyond the string (`EquinoxRuntimeError` under `jit`).
+
+        >>> foucault(0.5, 10.0).state(6.0, 0.0, 4.0, 0.0).v.tolist()
+        [4.0, 0.0, 3.0]
+        """
+        length, e, n, ve, vn = _checks.scalars(
+            length=self.length,
+            east=east,
+            north=north,
+            east_speed=east_speed,
+            north_speed=north_speed,
+        )
+        below = length**2 - e * e - n * n
+        below = _checks.refuse(
+            below, ~(below > 0), "foucault: the start lies beyond the length of the string"
+        )
+        up = -jnp.sqrt(below)
+        return Point(jnp.stack([e, n, up]), jnp.stack([ve, vn, -(e * ve + n * vn) / up]))
+
+    def small_swing(self, state: Point, t: ScalarLike) -> Point:
+        """Where small swings have come at `t`, s: the closed form.
+
+        With s = east + i north and Ω_z = Ω sin λ, s'' + 2iΩ_z s' + ω₀² s = 0 has the solution
+        s = e^{−iΩ_z t} (A cos ωt + B sin ωt), ω² = ω₀² + Ω_z², ω₀² = g/L (Landau and Lifshitz,
+        Mechanics, sec. 39, problem 3). Right to the square of amplitude/length.
+
+        **Arguments:** `state` at t = 0. **Returns** a `Point` at the height of the lowest place.
+
+        >>> pendulum = foucault(0.5, 10.0)
+        >>> pendulum.small_swing(pendulum.start(0.1, 0.0), 0.0).x[0]
+        Array(0.1, dtype=float64)
+        """
+        require_point(state)
+        t = _checks.floating(t, (), "t").astype(state.x.dtype)
+        x, y, _ = components(state.x)
+        vx, vy, _ = components(state.v)
+        place = self.place
+        up = (place.rate * jnp.sin(place.latitude)).astype(t.dtype)
+        swing = jnp.sqrt(place.gravity.astype(t.dtype) / self.length.astype(t.dtype) + up * up)
+        # In axes that turn with the plane of swing it is a plain oscillator.
+        ax, ay, bx, by = x, y, (vx - up * y) / swing, (vy + up * x) / swing
+        c, s = jnp.cos(swing * t), jnp.sin(swing * t)
+        px, py = ax * c + bx * s, ay * c + by * s
+        qx, qy = swing * (bx * c - ax * s), swing * (by * c - ay * s)
+        c, s = jnp.cos(up * t), jnp.sin(up * t)
+        ex, ey = c * px + s * py, c * py - s * px
+        wx, wy = c * qx + s * qy + up * ey, c * qy - s * qx - up * ex
+        zero = jnp.zeros_like(ex)
+        return Point(jnp.stack([ex, ey, -self.length.astype(t.dtype)]), jnp.stack([wx, wy, zero]))
+
+    def precession_rate(self) -> Scalar:
+        """How fast the plane of small swings turns, rad/s, −Ω sin λ: clockwise in the north.
+
+        One turn takes a sidereal day over sin λ.
+
+        >>> round(float(2 * jnp.pi / -foucault(jnp.pi / 6, 67.0).precession_rate()))
+        172328
+        """
+        return -self.place.rate * jnp.sin(self.place.latitude)
+
+
+def foucault(
+    latitude: ScalarLike,
+    length: ScalarLike,
+    gravity: ScalarLike = GRAVITY,
+    rate: ScalarLike = RATE,
+) -> Foucault:
+    """Foucault's pendulum.
+
+    **Arguments:** `latitude` λ, rad, north positive; `length` of the string, m; `gravity` m/s²,
+    along the plumb line; `rate` of the Earth, rad/s (WGS84 unless given). Any may be traced: the
+    latitude and the rate can be fitted to a record.
+
+    **Raises:** `ValueError` for a length or gravity that is not positive, a latitude in degrees.
+
+    >>> pendulum = foucault(0.85, 67.0)
+    >>> pendulum.start(3.0, 0.0).v.tolist()
+    [0.0, 0.0, 0.0]
+    """
+    place = Earth(*checked(latitude, gravity, rate))
+    string = _checks.floating(length, (), "length")
+    string = _checks.sign(string, "length", "a positive number, m")
+    return Foucault(place, string.astype(jnp.promote_types(string.dtype, place.rate.dtype)))
+
+
 def checked(
     latitude: ScalarLike, gravity: ScalarLike, rate: ScalarLike
 ) -> tuple[Scalar, Scalar, Scalar]:
-    """Latitude, gravity and rate as scalars of one dtype, or the likely mistake.
-
-    >>> [float(x) for x in checked(0.5, 9.8, 7e-5)]
-    [0.5, 9.8, 7e-05]
-    """
-    values = {"latitude": latitude, "gravity": gravity, "rate": rate}
-    known = {name: _checks.floating(value, (), name) for name, value in values.items()}
-    dtype = jnp.result_type(*known.values())
-    lat, g, w = (value.astype(dtype) for value in known.values())
+    """Latitude, gravity and rate as scalars of one dtype, or the likely mistake."""
+    lat, g, w = _checks.scalars(latitude=latitude, gravity=gravity, rate=rate)
     lat = _checks.refuse(
         lat,
         ~(jnp.abs(lat) <= 0.5000001 * jnp.pi),
         "latitude: wanted radians between −π/2 and π/2; were these degrees?",
     )
-    g = _checks.refuse(
-        g, ~((g > 0) & jnp.isfinite(g)), "gravity: wanted a positive number, m/s²; it points down"
-    )
+    g = _checks.sign(g, "gravity", "a positive number, m/s²; it points down")
     return lat, g, _checks.refuse(w, ~jnp.isfinite(w), "rate: wanted a finite number, rad/s")

@@ -41,9 +41,9 @@ class InFrame(AbstractScene):
 
     def __check_init__(self) -> None:
         require_frame(self.frame, "InFrame")
-        for name, of in (("inside", "(t, state) → (3,)"), ("outside", "(t, state) → (3,)")):
+        for name in ("inside", "outside"):
             if getattr(self, name) is not None:
-                _checks.function(getattr(self, name), name, of)
+                _checks.function(getattr(self, name), name, "(t, state) → (3,)")
         if self.potential is not None:
             _checks.function(self.potential, "potential", "of a place (3,) to a number, m²/s²")
 
@@ -72,9 +72,6 @@ def scene_of(force: Any) -> AbstractScene:
     """The scene that `simulate` solves: a scene, a frame seen from inside, or a plain force.
 
     **Raises:** `TypeError` for anything else.
-
-    >>> type(scene_of(None)).__name__
-    'Force'
     """
     if isinstance(force, AbstractScene):
         return force

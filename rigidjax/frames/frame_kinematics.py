@@ -5,8 +5,7 @@ from typing import Any
 import equinox as eqx
 
 from rigidjax import _checks
-from rigidjax._types import Mat3, Vec3
-from rigidjax.body._types import Vector
+from rigidjax._types import Mat3, Vec3, Vector
 from rigidjax.rotation import linalg3, quaternion
 
 
@@ -57,11 +56,9 @@ class Instant(eqx.Module):
             turned["x"], turned["v"] = x, v - linalg3.cross(self.rate.astype(dtype), x)
         if hasattr(state, "q"):
             back = quaternion.from_matrix(self.rotation.T).astype(state.q.dtype)
-            rate = quaternion.rotate_inverse(
-                quaternion.multiply(back, state.q), self.rate.astype(state.q.dtype)
-            )
             turned["q"] = quaternion.multiply(back, state.q)
-            turned["omega"] = state.omega - rate
+            rate = self.rate.astype(state.q.dtype)
+            turned["omega"] = state.omega - quaternion.rotate_inverse(turned["q"], rate)
         return _replaced(state, turned)
 
     def outward(self, y: Vector) -> Vec3:
@@ -105,21 +102,16 @@ def _can_travel(state: Any) -> None:
     point = hasattr(state, "x") and hasattr(state, "v")
     attitude = hasattr(state, "q") and hasattr(state, "omega")
     if not (point or attitude):
+        alone = "; a rate alone has no direction in another frame"
         raise TypeError(
             "a moving frame carries states with x and v (Point), with q and omega (Attitude), or "
             f"with all four (Rigid), got {type(state).__name__}"
-            + (
-                "; a rate alone has no direction in another frame"
-                if hasattr(state, "omega")
-                else ""
-            )
+            + (alone if hasattr(state, "omega") else "")
         )
+    hint = "a frame carries one state at one time, batch with "
+    hint += "jax.vmap(frame.to_inertial)(states, times)"
     for name, size in (("x", 3), ("v", 3), ("q", 4), ("omega", 3)):
         if hasattr(state, name):
-            hint = (
-                "a frame carries one state at one time, batch with "
-                "jax.vmap(frame.to_inertial)(states, times)"
-            )
             _checks.floating(getattr(state, name), (size,), name, hint=hint)
 
 

@@ -88,11 +88,9 @@ def hoop(radius: ScalarLike, rate: ScalarLike, gravity: ScalarLike = GRAVITY) ->
     >>> hoop(1.0, 5.0).acceleration(0.0, Point([0.0, 0, -1], [0.0, 0, 0])).tolist()
     [0.0, 0.0, 0.0]
     """
-    named = {"radius": radius, "rate": rate, "gravity": gravity}
-    values = {n: _checks.finite(_checks.floating(v, (), n), n) for n, v in named.items()}
-    dtype = jnp.result_type(*values.values())
-    r, w, g = (value.astype(dtype) for value in values.values())
-    return Hoop(_checks.refuse(r, ~(r > 0), "radius: wanted a positive number, m"), w, g)
+    r, w, g = _checks.scalars(radius=radius, rate=rate, gravity=gravity)
+    r = _checks.sign(r, "radius", "a positive number, m")
+    return Hoop(r, _checks.finite(w, "rate"), _checks.finite(g, "gravity"))
 
 
 class _Angle(eqx.Module):

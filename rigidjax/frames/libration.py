@@ -21,11 +21,6 @@ class Tide(eqx.Module):
     Spacecraft Attitude Dynamics, sec. 8.1.
 
     **Arguments:** `rate` n, rad/s, scalar array.
-
-    >>> import rigidjax as rj
-    >>> body = rj.Inertia.from_principal(1.0, 2.0, 2.5)
-    >>> Tide(jnp.asarray(1.0))(0.0, rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 0]), body).tolist()
-    [0.0, 0.0, 0.0]
     """
 
     feels: ClassVar[type] = HasAttitude

@@ -8,8 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from rigidjax import _checks
-from rigidjax._types import Mat3, Scalar, ScalarLike, Vec3
-from rigidjax.body._types import Vector
+from rigidjax._types import Mat3, Scalar, ScalarLike, Vec3, Vector
 from rigidjax.frames import rotation_models
 from rigidjax.frames.frame_kinematics import Instant
 from rigidjax.frames.point import require_point
@@ -80,13 +79,9 @@ class MovingFrame(eqx.Module):
         t = _checks.time(t)
         one = jnp.ones_like(t)
         rate, rate_change = jax.jvp(self.angular_velocity, (t,), (one,))
-        zero = jnp.zeros(3, t.dtype)
-        origin, velocity, acceleration = zero, zero, zero
-        if self.origin is not None:
-            place = _Place(self.origin)
-            (origin, velocity), (_, acceleration) = jax.jvp(
-                lambda s: jax.jvp(place, (s,), (jnp.ones_like(s),)), (t,), (one,)
-            )
+        (origin, velocity), (_, acceleration) = jax.jvp(
+            lambda s: jax.jvp(self.place, (s,), (one,)), (t,), (one,)
+        )
         return Instant(self.matrix(t), rate, rate_change, origin, velocity, acceleration)
 
     def angular_velocity(self, t: ScalarLike) -> Vec3:
@@ -209,45 +204,33 @@ class MovingFrame(eqx.Module):
         >>> half.then(half).at(0.0).rate.tolist()
         [0.0, 0.0, 2.0]
         """
-        require_frame(inner, "then")
-        return MovingFrame(_ComposedRotation(self, inner), _ComposedOrigin(self, inner))
+        both = _Composed(self, require_frame(inner, "then"))
+        return MovingFrame(both.rotation, both.origin, both.rate)
 
     def inverse(self) -> "MovingFrame":
         """S as S' sees it: M → Mᵀ, X → −MᵀX. `frame.then(frame.inverse())` is no motion at all."""
-        return MovingFrame(_InverseRotation(self), _InverseOrigin(self))
+        back = _Inverse(self)
+        return MovingFrame(back.rotation, back.origin, back.rate)
 
     def place(self, t: ScalarLike) -> Vec3:
         """X(t) (3,), m, axes of S."""
         t = _checks.time(t)
-        return jnp.zeros(3, t.dtype) if self.origin is None else _Place(self.origin)(t)
-
-
-def require_frame(frame: Any, name: str) -> None:
-    """Raise `TypeError` unless `frame` is a `MovingFrame`.
-
-    >>> require_frame(MovingFrame(rj.frames.Uniform([0.0, 0.0, 1.0])), "frame")
-    """
-    if not isinstance(frame, MovingFrame):
-        raise TypeError(
-            f"{name}: wanted a MovingFrame, got {type(frame).__name__}; make one from a rotation "
-            "with MovingFrame(rotation)"
-        )
-
-
-class _Place(eqx.Module):
-    """An origin, its shape and dtype checked."""
-
-    origin: Callable[[Any], Any]
-
-    def __call__(self, t: Any) -> Any:
+        if self.origin is None:
+            return jnp.zeros(3, t.dtype)
         return _checks.floating(self.origin(t), (3,), "origin").astype(t.dtype)
 
 
-class _ComposedRotation(eqx.Module):
+def require_frame(frame: Any, name: str) -> Any:
+    """Return `frame` if it is a `MovingFrame`; else raise in words."""
+    hint = "make one from a rotation with MovingFrame(rotation)"
+    return _checks.instance(frame, MovingFrame, name, wanted="a MovingFrame", hint=hint)
+
+
+class _Composed(eqx.Module):
     outer: MovingFrame
     inner: MovingFrame
 
-    def __call__(self, t: Any) -> Any:
+    def rotation(self, t: Any) -> Any:
         return linalg3.product(self.outer.matrix(t), self.inner.matrix(t))
 
     def rate(self, t: Any) -> Any:
@@ -255,27 +238,18 @@ class _ComposedRotation(eqx.Module):
         carried = linalg3.apply(self.inner.matrix(t).T, self.outer.angular_velocity(t))
         return carried + self.inner.angular_velocity(t)
 
-
-class _ComposedOrigin(eqx.Module):
-    outer: MovingFrame
-    inner: MovingFrame
-
-    def __call__(self, t: Any) -> Any:
+    def origin(self, t: Any) -> Any:
         return self.outer.place(t) + linalg3.apply(self.outer.matrix(t), self.inner.place(t))
 
 
-class _InverseRotation(eqx.Module):
+class _Inverse(eqx.Module):
     frame: MovingFrame
 
-    def __call__(self, t: Any) -> Any:
+    def rotation(self, t: Any) -> Any:
         return self.frame.matrix(t).T
 
     def rate(self, t: Any) -> Any:
         return -linalg3.apply(self.frame.matrix(t), self.frame.angular_velocity(t))
 
-
-class _InverseOrigin(eqx.Module):
-    frame: MovingFrame
-
-    def __call__(self, t: Any) -> Any:
+    def origin(self, t: Any) -> Any:
         return -linalg3.apply(self.frame.matrix(t).T, self.frame.place(t))

@@ -35,14 +35,9 @@ class Point(eqx.Module):
 
 
 def require_point(state: Any, name: str = "state") -> Any:
-    """Return `state` if it has one place and one velocity; else raise in words.
-
-    >>> require_point(Point([1.0, 0, 0], [0.0, 2, 0])).v.shape
-    (3,)
-    """
+    """Return `state` if it has one place and one velocity; else raise in words."""
     if isinstance(state, type) or not (hasattr(state, "x") and hasattr(state, "v")):
-        found = f"the class {state.__name__}" if isinstance(state, type) else type(state).__name__
-        raise TypeError(f"{name}: wanted a Point(x, v), got {found}")
+        raise TypeError(f"{name}: wanted a Point(x, v), got {_checks.kind(state)}")
     for part in ("x", "v"):
         _checks.floating(getattr(state, part), (3,), f"{name}.{part}")
     return state

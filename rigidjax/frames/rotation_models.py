@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 from rigidjax import _checks
 from rigidjax._types import Mat3, Vec3
 from rigidjax.rotation import linalg3, quaternion, so3
+from rigidjax.rotation.validation import near_unit, tolerance
 
 
 class Uniform(eqx.Module):
@@ -72,9 +73,6 @@ def differentiable(rotation: Any) -> Any:
     """`rotation`; the solves that it does itself made ready for forward differentiation.
 
     A frame needs dΩ/dt, and the default adjoint of a solution of `simulate` refuses that.
-
-    >>> differentiable({"adjoint": dfx.RecursiveCheckpointAdjoint()})["adjoint"]
-    ForwardMode()
     """
 
     def reverse(part: Any) -> bool:
@@ -95,15 +93,13 @@ def matrix(rotation: Any, t: Array) -> Mat3:
     shape = jnp.shape(value)
     if shape == (4,):
         q = _checks.floating(value, (4,), "rotation").astype(t.dtype)
-        if _checks.known(q):
-            far = ~(jnp.abs(jnp.sqrt(jnp.sum(q * q)) - 1) < 1e-3)
-            _checks.refuse(q, far, "rotation: wanted a unit quaternion (w, x, y, z)")
-        return quaternion.to_matrix(quaternion.normalise(q))
+        return quaternion.to_matrix(quaternion.normalise(near_unit(q, "rotation", 1e-3)))
     m = _checks.floating(value, (3, 3), "rotation", hint="wanted a matrix or a quaternion (4,)")
     if _checks.known(m):
-        tolerance = 1e-6 if m.dtype == jnp.float64 else 1e-3
         off = jnp.max(jnp.abs(linalg3.product(m.T, m) - jnp.eye(3, dtype=m.dtype)))
-        _checks.refuse(m, ~(off < tolerance), "rotation: Mᵀ M is not 1, so this is no rotation")
+        _checks.refuse(
+            m, ~(off < tolerance(m.dtype)), "rotation: Mᵀ M is not 1, so this is no rotation"
+        )
         left = linalg3.determinant(m) < 0
         _checks.refuse(m, left, "rotation: left-handed axes, det = −1 (notes, eq 10)")
     return m.astype(t.dtype)

@@ -1,8 +1,6 @@
 """Identification: from recordings to a body, with its uncertainty."""
 
-from typing import TYPE_CHECKING
-
-from rigidjax._names import own_names, suggests
+from rigidjax._names import show
 from rigidjax.identify import report as report
 from rigidjax.identify.body_charts import (
     AbstractBodyChart as AbstractBodyChart,
@@ -68,6 +66,4 @@ from rigidjax.identify.undetermined import Combination as Combination
 from rigidjax.identify.window_fit import WindowFit as WindowFit, fit_windows as fit_windows
 from rigidjax.identify.windows import Windows as Windows, windows as windows
 
-if not TYPE_CHECKING:
-    __getattr__ = suggests(__name__)
-__dir__ = own_names(__name__)
+show(__name__)

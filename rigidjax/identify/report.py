@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from rigidjax import _checks
-from rigidjax._names import own_names
+from rigidjax._names import show
 from rigidjax.identify.full_scale import at_limit
 from rigidjax.identify.result import Fit, one_fit
 
@@ -322,4 +322,4 @@ def _png(figure: Any) -> str:
     return base64.b64encode(buffer.getvalue()).decode("ascii")
 
 
-__dir__ = own_names(__name__)
+show(__name__)

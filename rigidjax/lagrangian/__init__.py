@@ -5,7 +5,7 @@ the equations of `Attitude` cost less and have no singular attitude: in Euler an
 break at sin θ = 0, and near it steps become many and small. `lie_poisson` is the Hamiltonian side.
 """
 
-from rigidjax._names import own_names
+from rigidjax._names import show
 from rigidjax.lagrangian.coordinates import (
     Coordinates as Coordinates,
     EulerAngleTop as EulerAngleTop,
@@ -23,4 +23,4 @@ from rigidjax.lagrangian.hamiltonian import (
     lie_poisson_with_direction as lie_poisson_with_direction,
 )
 
-__dir__ = own_names(__name__)
+show(__name__)

@@ -12,7 +12,7 @@ from jaxtyping import Array, ArrayLike, Float
 from rigidjax import _checks
 from rigidjax._types import HasAttitude, Scalar, ScalarLike
 from rigidjax.body.inertia import Inertia
-from rigidjax.motion.attitude import Attitude
+from rigidjax.motion import Attitude
 from rigidjax.motion.torques import Torque
 from rigidjax.motion.torques.base import require_law
 from rigidjax.rotation import euler, linalg3

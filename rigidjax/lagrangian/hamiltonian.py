@@ -8,9 +8,8 @@ import jax
 from jaxtyping import Array, ArrayLike, Float
 
 from rigidjax import _checks
-from rigidjax._types import HasAttitude, Mat3, Scalar, ScalarLike, Vec3
+from rigidjax._types import HasAttitude, Mat3, Scalar, ScalarLike, Vec3, Vectors
 from rigidjax.body import inertia as _inertia, validation
-from rigidjax.body._types import Vectors
 from rigidjax.motion.torques import HeavyTop
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.linalg3 import apply, cross, dot

@@ -1,28 +1,26 @@
 """States, their equations of motion, torques: model no more than the scene needs."""
 
-from typing import TYPE_CHECKING
-
-from rigidjax._names import own_names, suggests
+from rigidjax._names import show
 from rigidjax._types import (
     HasAttitude as HasAttitude,
     HasPose as HasPose,
     HasSpin as HasSpin,
 )
 from rigidjax.motion import torques as torques
-from rigidjax.motion.attitude import (
-    Attitude as Attitude,
-    AttitudeEquations as AttitudeEquations,
-    on_the_group as on_the_group,
-)
 from rigidjax.motion.conserved import (
     conserved as conserved,
     drift as drift,
     energy as energy,
 )
 from rigidjax.motion.coupled import Coupled as Coupled
-from rigidjax.motion.rigid import NewtonEuler as NewtonEuler, Rigid as Rigid
-from rigidjax.motion.spin import EulerEquations as EulerEquations, Spin as Spin
+from rigidjax.motion.equations import (
+    Attitude as Attitude,
+    AttitudeEquations as AttitudeEquations,
+    EulerEquations as EulerEquations,
+    NewtonEuler as NewtonEuler,
+    Rigid as Rigid,
+    Spin as Spin,
+    on_the_group as on_the_group,
+)
 
-if not TYPE_CHECKING:
-    __getattr__ = suggests(__name__)
-__dir__ = own_names(__name__)
+show(__name__)

@@ -12,8 +12,8 @@ from rigidjax.body.energy import angular_momentum, kinetic_energy
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.motion.coupled import Coupled, motion_of
 from rigidjax.motion.torques import AbstractTorque, CentralGravity, Sum, Torque, freeze
-from rigidjax.motion.torques.base import in_precision, length_or_zero, one_law, require_rung
-from rigidjax.motion.torques.states import Frozen, require_frozen
+from rigidjax.motion.torques.base import in_precision, length_or_zero, require_scene
+from rigidjax.motion.torques.states import Frozen
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.linalg3 import cross, dot
 
@@ -39,10 +39,7 @@ def energy(
     >>> energy(rj.Inertia.from_principal(1.0, 1.0, 1.0), start, top)
     Array(10.31, dtype=float64)
     """
-    turning, law = _plain(state, torque)
-    _look(body, turning, law)
-    t = _checks.floating(t, (), "t")
-    parts = _parts(law)
+    turning, parts, t = _scene(body, state, torque, t)
     for part in parts:
         if not hasattr(part, "energy"):
             raise TypeError(
@@ -50,10 +47,7 @@ def energy(
                 "body)), so there is no energy that it conserves; give only the laws "
                 "that have one, or see kinetic_energy"
             )
-    total = kinetic_energy(in_precision(body, turning.omega.dtype), turning)
-    for part in parts:
-        total = total + _energy_of(part, t, turning, body)
-    return total
+    return _energy(in_precision(body, turning.omega.dtype), turning, parts, t)
 
 
 def conserved(
@@ -85,18 +79,14 @@ def conserved(
     >>> sorted(conserved(body, rj.Spin([1.0, 0, 0])))
     ['energy', 'momentum_squared']
     """
-    turning, law = _plain(state, torque)
-    _look(body, turning, law)
-    t = _checks.floating(t, (), "t")
-    parts = _parts(law)
+    turning, parts, t = _scene(body, state, torque, t)
     dtype = turning.omega.dtype
     body = in_precision(body, dtype)
     found: dict[str, Float[Array, "..."]] = {}
     if all(hasattr(part, "energy") and getattr(part, "steady", False) for part in parts):
-        found["energy"] = energy(body, turning, law, t)
-    inside = [part for part in parts if hasattr(part, "internal_momentum")]
+        found["energy"] = _energy(body, turning, parts, t)
     outside = [part for part in parts if not hasattr(part, "internal_momentum")]
-    momentum = _momentum(body, turning, inside, t)
+    momentum = _momentum(body, turning, parts, t)
     if not outside:
         found["momentum_squared"] = dot(momentum, momentum)
     if isinstance(turning, HasAttitude):
@@ -109,7 +99,8 @@ def conserved(
             length = length_or_zero(axis)
             found["momentum_along_axis"] = dot(momentum, axis) / jnp.where(length > 0, length, 1)
     if isinstance(turning, HasPose) and isinstance(body, MassProperties):
-        pushed = [part for part in parts if not isinstance(_itself(part), AbstractTorque)]
+        plain = [(part, part.law if isinstance(part, Frozen) else part) for part in parts]
+        pushed = [part for part, law in plain if not isinstance(law, AbstractTorque)]
         if not pushed:
             found["linear_momentum"] = body.mass * turning.v
         if all(isinstance(part, CentralGravity) for part in [*outside, *pushed]):
@@ -164,26 +155,14 @@ def drift(
     return found
 
 
-def _plain(state: Any, torque: Any) -> tuple[Any, Any]:
-    """The body's state, and the torque with its own states put in."""
-    if not isinstance(state, Coupled):
-        return state, torque
-    return state.motion, freeze(torque, state.own)
-
-
-def _itself(part: Any) -> Any:
-    return part.law if isinstance(part, Frozen) else part
-
-
-def _look(body: Any, state: Any, torque: Any) -> None:
-    """Raise in words unless these are a body, a state, and a law or none."""
-    _checks.single(body, (Inertia, MassProperties), "body")
-    _checks.single(state, HasSpin, "state", wanted="a Spin, an Attitude or a Rigid")
-    if torque is not None:
-        require_rung(torque, state)
-    for part in _parts(torque):
-        require_frozen(part)
-        one_law(_itself(part))
+def _scene(body: Any, state: Any, torque: Any, t: Any) -> tuple[Any, tuple[Any, ...], Scalar]:
+    """The body's state, the laws that act on it with their own states put in, and the time."""
+    if isinstance(state, Coupled):
+        state, torque = state.motion, freeze(torque, state.own)
+    parts = _parts(torque)
+    for part in parts or (None,):
+        require_scene(part, state, body)
+    return state, parts, _checks.floating(t, (), "t")
 
 
 def _parts(torque: Torque | None) -> tuple[Any, ...]:
@@ -195,26 +174,26 @@ def _parts(torque: Torque | None) -> tuple[Any, ...]:
     return (torque,)
 
 
-def _energy_of(part: Any, t: ScalarLike, state: HasSpin, body: Any) -> Scalar:
-    dtype = state.omega.dtype
-    value = in_precision(part, dtype).energy(
-        jnp.asarray(t, dtype), state, in_precision(body, dtype)
-    )
-    return value.astype(dtype)
+def _energy(body: Any, state: HasSpin, parts: tuple[Any, ...], t: Scalar) -> Scalar:
+    dtype, total = state.omega.dtype, kinetic_energy(body, state)
+    for part in parts:
+        value = in_precision(part, dtype).energy(t.astype(dtype), state, body)
+        total = total + value.astype(dtype)
+    return total
 
 
-def _momentum(body: Any, state: HasSpin, inside: list[Any], t: ScalarLike) -> Vec3:
+def _momentum(body: Any, state: HasSpin, parts: tuple[Any, ...], t: ScalarLike) -> Vec3:
     """The whole angular momentum, (3,), body frame, with what the wheels hold."""
     momentum = angular_momentum(body, state)
-    for part in inside:
-        momentum = momentum + part.internal_momentum(t).astype(momentum.dtype)
+    for part in parts:
+        if hasattr(part, "internal_momentum"):
+            momentum = momentum + part.internal_momentum(t).astype(momentum.dtype)
     return momentum
 
 
 def _spin_size(body: Any, state: Any, torque: Torque | None, t: ScalarLike) -> Scalar:
-    state, torque = _plain(state, torque)
-    inside = [part for part in _parts(torque) if hasattr(part, "internal_momentum")]
-    return length_or_zero(_momentum(in_precision(body, state.omega.dtype), state, inside, t))
+    state, parts, t = _scene(body, state, torque, t)
+    return length_or_zero(_momentum(in_precision(body, state.omega.dtype), state, parts, t))
 
 
 def _size(values: Float[Array, "times *shape"]) -> Float[Array, " times"]:

@@ -61,22 +61,12 @@ class CoupledEquations(eqx.Module):
 
 
 def started(body: Any, state0: Any, torque: Any, t: ScalarLike) -> Any:
-    """`state0`, `Coupled` with the states of the torque where it has some.
-
-    >>> from rigidjax import Spin
-    >>> started(None, Spin([0.0, 0.0, 1.0]), None, 0.0)
-    Spin(omega=f64[3])
-    """
+    """`state0`, `Coupled` with the states of the torque where it has some."""
     if isinstance(state0, Coupled) or not has_states(torque):
         return state0
     return Coupled.start(body, state0, torque, t)
 
 
 def motion_of(y: Any) -> Any:
-    """The body's part of a state.
-
-    >>> from rigidjax import Spin
-    >>> motion_of(Coupled(Spin([0.0, 0.0, 1.0]), ()))
-    Spin(omega=f64[3])
-    """
+    """The body's part of a state."""
     return y.motion if isinstance(y, Coupled) else y

@@ -3,14 +3,10 @@
 `rigidjax.simulate(None, Point(x, v), ts, orbits.cr3bp(mu))` solves one motion.
 """
 
-from typing import TYPE_CHECKING
-
-from rigidjax._names import own_names, suggests
+from rigidjax._names import show
 from rigidjax.orbits.cr3bp import ThreeBody as ThreeBody, cr3bp as cr3bp
 from rigidjax.orbits.differential_correction import PeriodicOrbit as PeriodicOrbit
 from rigidjax.orbits.hill import Hill as Hill, hill as hill
 from rigidjax.orbits.manifolds import Manifold as Manifold
 
-if not TYPE_CHECKING:
-    __getattr__ = suggests(__name__)
-__dir__ = own_names(__name__)
+show(__name__)

@@ -7,8 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Complex, Float
 
 from rigidjax import _checks
-from rigidjax._types import Mat3, Scalar, ScalarLike, Vec3
-from rigidjax.body._types import Vector
+from rigidjax._types import Mat3, Scalar, ScalarLike, Vec3, Vector
 from rigidjax.frames.point import Point, require_point
 from rigidjax.orbits import lagrange_points, richardson
 from rigidjax.orbits.differential_correction import PeriodicOrbit

@@ -4,9 +4,7 @@ Each function draws into axes of yours (`ax=`) or into new ones, and returns the
 Okabe and Ito's, told apart by everyone.
 """
 
-from typing import TYPE_CHECKING
-
-from rigidjax._names import own_names, suggests
+from rigidjax._names import show
 from rigidjax.plot.animation import Film as Film, tumble as tumble
 from rigidjax.plot.body_axes import body_axes as body_axes
 from rigidjax.plot.ellipsoids import inertia_ellipsoid as inertia_ellipsoid
@@ -20,6 +18,4 @@ from rigidjax.plot.residuals import residuals as residuals
 from rigidjax.plot.style import COLOURS as COLOURS
 from rigidjax.plot.time_series import motion as motion
 
-if not TYPE_CHECKING:
-    __getattr__ = suggests(__name__)
-__dir__ = own_names(__name__)
+show(__name__)

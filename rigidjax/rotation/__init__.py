@@ -1,6 +1,6 @@
 """Rotations: matrices, quaternions, Euler angles, Rodrigues parameters."""
 
-from rigidjax._names import own_names
+from rigidjax._names import show
 from rigidjax.rotation import (
     euler as euler,
     mrp as mrp,
@@ -10,4 +10,4 @@ from rigidjax.rotation import (
 )
 from rigidjax.rotation.interpolant import AttitudeInterpolant as AttitudeInterpolant
 
-__dir__ = own_names(__name__)
+show(__name__)

@@ -13,15 +13,14 @@ there are finite: those of the remaining chart, with the middle angle held. `is_
 """
 
 import warnings
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Bool
 
 from rigidjax import _checks
-from rigidjax._names import own_names, suggests
+from rigidjax._names import show
 from rigidjax._types import Mat3, Mat3Like, Quat, QuatLike, Scalar, Vec3, Vec3Like
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.linalg3 import apply, components, cross, dot, near_one
@@ -40,11 +39,8 @@ def to_quaternion(angles: Vec3Like, sequence: str = "ZXZ") -> Quat:
     [0.0, 1.0, 0.0, 0.0]
     """
     axes, reverse = _axes(sequence)
-    angles = _angles(angles)
-    turns = [
-        _about(axis, angle) for axis, angle in zip(axes, _in_order(angles, reverse), strict=True)
-    ]
-    return quaternion.multiply(quaternion.multiply(turns[0], turns[1]), turns[2])
+    first, second, third = map(_about, axes, _in_order(_angles(angles), reverse))
+    return quaternion.multiply(quaternion.multiply(first, second), third)
 
 
 def to_matrix(angles: Vec3Like, sequence: str = "ZXZ") -> Mat3:
@@ -148,7 +144,8 @@ def rates_to_omega(
     angles, rates = _angles(angles), _checks.floating(rates, (3,), "rates")
     first, second, third = _turning_axes(axes, _in_order(angles, reverse))
     a, b, c = _in_order(rates, reverse)
-    return _from_body(a * first + b * second + c * third, angles, sequence, frame)
+    omega = a * first + b * second + c * third
+    return omega if frame == "body" else apply(to_matrix(angles, sequence), omega)
 
 
 def omega_to_rates(
@@ -172,7 +169,8 @@ def omega_to_rates(
     _checks.word(frame, ("body", "world"), "frame")
     axes, reverse = _axes(sequence)
     angles, omega = _angles(angles), _checks.floating(omega, (3,), "omega")
-    omega = _to_body(omega, angles, sequence, frame)
+    if frame == "world":
+        omega = apply(to_matrix(angles, sequence).T, omega)
     first, second, third = _turning_axes(axes, _in_order(angles, reverse))
     reach, singular = _vanishing(angles[1], axes)
     # `second` is normal to the other two; `aside` completes it and `third` to a frame.
@@ -205,7 +203,7 @@ def _unknown(sequence: object, reason: str) -> str:
 
 def _angles(angles: Vec3Like) -> Vec3:
     angles = turn(_checks.floating(angles, (3,), "angles"), "angles")
-    if not isinstance(angles, Tracer) and bool(np.any(np.abs(np.asarray(angles)) > _MANY_TURNS)):
+    if _checks.known(angles) and bool(np.any(np.abs(np.asarray(angles)) > _MANY_TURNS)):
         warnings.warn(
             f"angles {angles.tolist()} rad are more than four turns: are they degrees? "
             "use jnp.deg2rad",
@@ -238,17 +236,11 @@ def _wrap(angle: Scalar) -> Scalar:
 
 def _turning_axes(axes: tuple[int, int, int], angles: tuple) -> tuple[Vec3, Vec3, Vec3]:
     """The three axes of turning, seen from the body: what each unit rate adds to Ω."""
-    _, b, c = angles
-    e = jnp.eye(3, dtype=b.dtype)
-    i, j, k = axes
-    return _back(k, c, _back(j, b, e[i])), _back(k, c, e[j]), e[k]
-
-
-def _back(axis: int, angle: Scalar, y: Vec3) -> Vec3:
-    """Turn y by −angle about a coordinate axis."""
-    e = jnp.eye(3, dtype=y.dtype)[axis]
-    along = e * y
-    return along + jnp.cos(angle) * (y - along) - jnp.sin(angle) * cross(e, y)
+    _, j, k = axes
+    first, second, third = (jnp.eye(3, dtype=angles[0].dtype)[axis] for axis in axes)
+    middle, last = _about(j, angles[1]), _about(k, angles[2])
+    first = quaternion.rotate_inverse(last, quaternion.rotate_inverse(middle, first))
+    return first, quaternion.rotate_inverse(last, second), third
 
 
 def _vanishing(middle: Scalar, axes: tuple[int, int, int]) -> tuple[Scalar, Bool[Array, ""]]:
@@ -258,18 +250,4 @@ def _vanishing(middle: Scalar, axes: tuple[int, int, int]) -> tuple[Scalar, Bool
     return size, jnp.abs(size) < 4 * jnp.finfo(middle.dtype).eps
 
 
-def _from_body(omega: Vec3, angles: Vec3, sequence: str, frame: str) -> Vec3:
-    if frame == "body":
-        return omega
-    return apply(to_matrix(angles, sequence), omega)
-
-
-def _to_body(omega: Vec3, angles: Vec3, sequence: str, frame: str) -> Vec3:
-    if frame == "world":
-        return apply(to_matrix(angles, sequence).T, omega)
-    return _from_body(omega, angles, sequence, frame)
-
-
-if not TYPE_CHECKING:
-    __getattr__ = suggests(__name__)
-__dir__ = own_names(__name__)
+show(__name__)

@@ -104,7 +104,7 @@ def normalised(q: Quat) -> Quat:
     return q / jnp.sqrt(square4(components(q)))
 
 
-def hat_polynomial(v: Sequence[Scalar], a: Scalar, b: Scalar) -> Mat3:
+def hat_polynomial(v: Sequence[Scalar], a: Scalar, b: Scalar | float) -> Mat3:
     """The matrix 1 + a hat v + b (hat v)²."""
     x, y, z = v
     xx, yy, zz = b * x * x, b * y * y, b * z * z
@@ -112,6 +112,12 @@ def hat_polynomial(v: Sequence[Scalar], a: Scalar, b: Scalar) -> Mat3:
     ax, ay, az = a * x, a * y, a * z
     rows = [1 - yy - zz, xy - az, zx + ay], [xy + az, 1 - zz - xx, yz - ax]
     return jnp.stack([*rows[0], *rows[1], zx - ay, yz + ax, 1 - xx - yy]).reshape(3, 3)
+
+
+def left_jacobian_inverse(v: Vec3) -> Mat3:
+    """The matrix 1 − ½ hat v + g (hat v)²."""
+    t = square(parts := components(v))
+    return hat_polynomial(parts, jnp.full_like(t, -0.5), inverse_kernel(t))
 
 
 def square4(q: Sequence[Scalar]) -> Scalar:

@@ -9,7 +9,7 @@ Analytical Mechanics of Space Systems, sec. 3.5.2. Range: any σ, and up to 1e75
 import jax.numpy as jnp
 
 from rigidjax import _checks
-from rigidjax._names import own_names
+from rigidjax._names import show
 from rigidjax._types import Mat3, Mat3Like, Quat, QuatLike, Vec3, Vec3Like
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.linalg3 import components, cross, dot, near_one
@@ -36,9 +36,7 @@ def to_quaternion(sigma: Vec3Like) -> Quat:
     >>> to_quaternion(jnp.array([0.0, 0.0, 1.0])).tolist()
     [0.0, 0.0, 0.0, 1.0]
     """
-    sigma = _checks.floating(sigma, (3,), "sigma")
-    if _checks.known(sigma):
-        sigma = _checks.finite(sigma, "sigma")
+    sigma = _checks.given(sigma, (3,), "sigma")
     # Both parts of the ratio by the square of a power of two: 1 is then `one`.
     one = jnp.minimum(near_one(*components(sigma)), 1)
     sigma = one * sigma
@@ -128,4 +126,4 @@ def rates_to_omega(sigma: Vec3Like, rates: Vec3Like) -> Vec3:
     return 4 / (1 + s) ** 2 * turned
 
 
-__dir__ = own_names(__name__)
+show(__name__)

@@ -13,18 +13,18 @@ vectors and rates may have components up to 1e307 (1e37).
 """
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
 from rigidjax import _checks
-from rigidjax._names import own_names, suggests
+from rigidjax._names import show
 from rigidjax._types import Mat3, Mat3Like, Quat, QuatLike, Scalar, ScalarLike, Vec3, Vec3Like
 from rigidjax.rotation.kernels import (
     flipped,
+    hat_polynomial,
     matrix_to_quaternion,
     normalised,
     product4,
@@ -200,14 +200,8 @@ def rate(q: QuatLike, omega: Vec3Like) -> Quat:
     q, omega = _checks.floating(q, (4,), "q"), _checks.floating(omega, (3,), "omega")
     w, x, y, z = q[0], q[1], q[2], q[3]
     a, b, c = 0.5 * omega[0], 0.5 * omega[1], 0.5 * omega[2]
-    return jnp.stack(
-        [
-            -x * a - y * b - z * c,
-            w * a + y * c - z * b,
-            w * b + z * a - x * c,
-            w * c + x * b - y * a,
-        ]
-    )
+    rates = w * a + y * c - z * b, w * b + z * a - x * c, w * c + x * b - y * a
+    return jnp.stack([-x * a - y * b - z * c, *rates])
 
 
 def interpolate(p: QuatLike, q: QuatLike, s: ScalarLike) -> Quat:
@@ -288,23 +282,8 @@ def to_matrix(q: QuatLike) -> Mat3:
     >>> to_matrix(jnp.array([0.0, 0.0, 0.0, 1.0])).tolist()
     [[-1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]]
     """
-    w, x, y, z = components(_checks.floating(q, (4,), "q", hint=_HINT))
-    xx, yy, zz = 2 * x * x, 2 * y * y, 2 * z * z
-    xy, yz, zx = 2 * x * y, 2 * y * z, 2 * z * x
-    wx, wy, wz = 2 * w * x, 2 * w * y, 2 * w * z
-    return jnp.stack(
-        [
-            1 - yy - zz,
-            xy - wz,
-            zx + wy,
-            xy + wz,
-            1 - zz - xx,
-            yz - wx,
-            zx - wy,
-            yz + wx,
-            1 - xx - yy,
-        ]
-    ).reshape(3, 3)
+    w, *u = components(_checks.floating(q, (4,), "q", hint=_HINT))
+    return hat_polynomial(u, 2 * w, 2.0)
 
 
 def from_matrix(matrix: Mat3Like) -> Quat:
@@ -320,9 +299,7 @@ def from_matrix(matrix: Mat3Like) -> Quat:
     [0.0, 0.0, 0.0, 1.0]
     """
     matrix = _checks.floating(matrix, (3, 3), "matrix", hint="a rotation matrix is wanted")
-    if not isinstance(matrix, Tracer):
-        matrix = rotation_matrix(matrix, "matrix")
-    return matrix_to_quaternion(matrix)
+    return matrix_to_quaternion(_checks.if_known(rotation_matrix, matrix, "matrix"))
 
 
 def _turn(w: Scalar, u: Sequence[Scalar], y: Sequence[Scalar]) -> Vec3:
@@ -332,6 +309,4 @@ def _turn(w: Scalar, u: Sequence[Scalar], y: Sequence[Scalar]) -> Vec3:
     return jnp.stack([y[i] + (w * t[i] + again[i]) for i in range(3)])
 
 
-if not TYPE_CHECKING:
-    __getattr__ = suggests(__name__)
-__dir__ = own_names(__name__)
+show(__name__)

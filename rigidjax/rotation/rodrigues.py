@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
 from rigidjax import _checks
-from rigidjax._names import own_names
+from rigidjax._names import show
 from rigidjax._types import Mat3, Mat3Like, Quat, QuatLike, Vec3, Vec3Like
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.linalg3 import components, cross, dot, near_one
@@ -40,9 +40,7 @@ def to_quaternion(g: Vec3Like) -> Quat:
     >>> to_quaternion(jnp.zeros(3)).tolist()
     [1.0, 0.0, 0.0, 0.0]
     """
-    g = _checks.floating(g, (3,), "g")
-    if _checks.known(g):
-        g = _checks.finite(g, "g")
+    g = _checks.given(g, (3,), "g")
     return quaternion.normalise(jnp.concatenate([jnp.ones_like(g[:1]), g]))
 
 
@@ -104,4 +102,4 @@ def rates_to_omega(g: Vec3Like, rates: Vec3Like) -> Vec3:
     return 2 / (1 + dot(g, g)) * (rates - cross(g, rates))
 
 
-__dir__ = own_names(__name__)
+show(__name__)

@@ -5,16 +5,22 @@ function of θ², so that values and derivatives of any order are right at θ = 
 `rigidjax.quaternion`.
 """
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
 from rigidjax import _checks
-from rigidjax._names import own_names, suggests
+from rigidjax._names import show
 from rigidjax._types import Mat3, Mat3Like, Scalar, ScalarLike, Vec3, Vec3Like
-from rigidjax.rotation import quaternion
-from rigidjax.rotation.averaging import mean as mean, mean_quaternion as mean_quaternion
+from rigidjax.rotation import kernels, quaternion
+from rigidjax.rotation.fitting import (
+    align as align,
+    mean as mean,
+    mean_quaternion as mean_quaternion,
+    project as project,
+    wahba as wahba,
+)
 from rigidjax.rotation.kernels import hat_polynomial, matrix_to_quaternion, vector_to_matrix
 from rigidjax.rotation.linalg3 import (
     apply as apply,
@@ -29,9 +35,8 @@ from rigidjax.rotation.linalg3 import (
     square,
     vee as vee,
 )
-from rigidjax.rotation.stumpff import inverse_kernel, stumpff
+from rigidjax.rotation.stumpff import stumpff
 from rigidjax.rotation.validation import rotation_matrix, turn
-from rigidjax.rotation.wahba import align as align, project as project, wahba as wahba
 
 
 def exp(v: Vec3Like) -> Mat3:
@@ -93,9 +98,7 @@ def left_jacobian_inverse(v: Vec3Like) -> Mat3:
     >>> left_jacobian_inverse(jnp.zeros(3)).tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
     """
-    parts = components(turn(_checks.floating(v, (3,), "v"), "v"))
-    t = square(parts)
-    return hat_polynomial(parts, jnp.full_like(t, -0.5), inverse_kernel(t))
+    return kernels.left_jacobian_inverse(turn(_checks.floating(v, (3,), "v"), "v"))
 
 
 def right_jacobian_inverse(v: Vec3Like) -> Mat3:
@@ -271,6 +274,4 @@ def check(
     return rotation_matrix(_checks.floating(matrix, (3, 3), name, batched=True), name)
 
 
-if not TYPE_CHECKING:
-    __getattr__ = suggests(__name__)
-__dir__ = own_names(__name__)
+show(__name__)

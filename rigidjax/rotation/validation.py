@@ -7,7 +7,6 @@ batch of 1e5 logarithms five times slower. So the maps do not look at traced val
 
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from rigidjax import _checks
@@ -49,7 +48,7 @@ def _largest(v: Float[Array, "*n"]) -> float:
 def rotation_matrix(m: Float[Array, "*batch 3 3"], name: str) -> Float[Array, "*batch 3 3"]:
     """Refuse what is not a rotation matrix."""
     m = _checks.finite(m, name)
-    known = not isinstance(m, Tracer)
+    known = _checks.known(m)
     xp, values = (np, np.asarray(m)) if known else (jnp, m)
     rows = [values[..., i, :] for i in range(3)]
     # Entries of 1e200 are refused as any others, without NumPy's warning.
@@ -74,10 +73,20 @@ def rotation_matrix(m: Float[Array, "*batch 3 3"], name: str) -> Float[Array, "*
     )
 
 
+def near_unit(q: Float[Array, "4"], name: str, limit: float) -> Float[Array, "4"]:
+    """Refuse, where it is known, a quaternion whose length is not 1 to `limit`."""
+    if _checks.known(q):
+        length = float(np.linalg.norm(np.asarray(q, float)))
+        words = f"{name}: wanted a unit quaternion (w, x, y, z), got one of length {length:.6g}"
+        words += "; rigidjax.quaternion.normalise makes it one"
+        _checks.refuse(q, not abs(length - 1) <= limit, words)
+    return q
+
+
 def unit_quaternion(q: Float[Array, "*batch 4"], name: str) -> Float[Array, "*batch 4"]:
     """Normalise a quaternion that is nearly a unit one; refuse any other."""
     q = _checks.finite(q, name)
-    known = not isinstance(q, Tracer)
+    known = _checks.known(q)
     length = jnp.sqrt((q * q).sum(-1, keepdims=True))
     q = _checks.refuse(
         q, (length == 0).any(), f"{name}: zero quaternion; it is no rotation (w, x, y, z)"

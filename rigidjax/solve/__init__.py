@@ -1,8 +1,6 @@
 """Motions by a solver: in our own loops, or by diffrax."""
 
-from typing import TYPE_CHECKING
-
-from rigidjax._names import own_names, suggests
+from rigidjax._names import show
 from rigidjax.solve import solvers as solvers
 from rigidjax.solve.adaptive import adaptive as adaptive
 from rigidjax.solve.crossings import Crossings as Crossings, crossings as crossings
@@ -16,6 +14,4 @@ from rigidjax.solve.simulate import simulate as simulate
 from rigidjax.solve.solution import Solution as Solution
 from rigidjax.solve.vector_field import equations_of_motion as equations_of_motion
 
-if not TYPE_CHECKING:
-    __getattr__ = suggests(__name__)
-__dir__ = own_names(__name__)
+show(__name__)

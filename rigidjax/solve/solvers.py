@@ -1,6 +1,6 @@
 """Every solver of ours, in one module: `rigidjax.solvers`."""
 
-from rigidjax._names import own_names
+from rigidjax._names import show
 from rigidjax.exact.diffrax_solver import FreeSolver as FreeSolver
 from rigidjax.solve.explicit import (
     DormandPrince8 as DormandPrince8,
@@ -15,4 +15,4 @@ from rigidjax.solve.splitting import (
     Splitting6 as Splitting6,
 )
 
-__dir__ = own_names(__name__)
+show(__name__)

@@ -24,7 +24,7 @@ def equations_of_motion(
 
     >>> import rigidjax as rj
     >>> type(equations_of_motion(rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([1.0, 0, 0])))
-    <class 'rigidjax.motion.spin.EulerEquations'>
+    <class 'rigidjax.motion.equations.EulerEquations'>
     """
     if isinstance(state0, Coupled):
         return CoupledEquations(equations_of_motion(body, state0.motion, torque), body)

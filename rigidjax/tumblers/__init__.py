@@ -1,8 +1,6 @@
 """Tumbling bodies seen as points of light: brightness, light curves, the body from one alone."""
 
-from typing import TYPE_CHECKING
-
-from rigidjax._names import own_names, suggests
+from rigidjax._names import show
 from rigidjax.tumblers import brightness as brightness, plot as plot
 from rigidjax.tumblers.light_curve import (
     Alias as Alias,
@@ -15,6 +13,4 @@ from rigidjax.tumblers.two_frequencies import (
     two_frequencies as two_frequencies,
 )
 
-if not TYPE_CHECKING:
-    __getattr__ = suggests(__name__)
-__dir__ = own_names(__name__)
+show(__name__)

@@ -9,10 +9,8 @@ import jax.numpy as jnp
 from jaxtyping import ArrayLike, Float, Int
 
 from rigidjax import _checks
-from rigidjax._names import own_names
-from rigidjax._types import Scalar
-from rigidjax.body import validation
-from rigidjax.body._types import Numbers, Vector
+from rigidjax._names import show
+from rigidjax._types import Numbers, Scalar, Vector
 from rigidjax.body.meshes import faces_of
 from rigidjax.body.scaling import exponent_of, times_power_of_two
 from rigidjax.tumblers.scattering import (
@@ -77,7 +75,7 @@ def mesh(
     """
     law = law_of(scattering)
     corners = _checks.rows(vertices, (3,), "vertices", hint="one row (x, y, z) per vertex")
-    if validation.known(corners):
+    if _checks.known(corners):
         _checks.finite(corners, "vertices")
     table = faces_of(faces, corners.shape[0])
     s, o = (
@@ -97,4 +95,4 @@ def mesh(
     return jnp.where(both, 0.5 * length * sent, 0.0).sum()
 
 
-__dir__ = own_names(__name__)
+show(__name__)

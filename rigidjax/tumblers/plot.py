@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import ArrayLike, Float
 
 from rigidjax import _checks
-from rigidjax._names import own_names
+from rigidjax._names import show
 from rigidjax.plot.style import COLOURS, TIMES, plain, pyplot, unit
 
 # Colours of one cycle after another, from the first to the last.
@@ -99,4 +99,4 @@ def _folded(ax: Any, turns: np.ndarray, read: np.ndarray, predicted: np.ndarray 
     ax.figure.colorbar(dots, ax=ax, label="cycle", pad=0.01)
 
 
-__dir__ = own_names(__name__)
+show(__name__)

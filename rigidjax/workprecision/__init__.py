@@ -4,7 +4,7 @@
 chart, `choose` the short table. `python -m rigidjax workprecision` is all of it.
 """
 
-from rigidjax._names import own_names
+from rigidjax._names import show
 from rigidjax.workprecision.baseline import moved as moved
 from rigidjax.workprecision.chart import draw as draw
 from rigidjax.workprecision.drift import long_drift as long_drift
@@ -32,4 +32,4 @@ from rigidjax.workprecision.registry import methods as methods
 from rigidjax.workprecision.scene import Scene as Scene
 from rigidjax.workprecision.standard_scenes import scenes as scenes
 
-__dir__ = own_names(__name__)
+show(__name__)

@@ -7,7 +7,7 @@ import pytest
 
 import rigidjax as rj
 from rigidjax.body import shapes
-from rigidjax.body.ellipsoids import energy_ellipsoid, equal_ellipsoid, momentum_ellipsoid
+from rigidjax.body.energy import energy_ellipsoid, equal_ellipsoid, momentum_ellipsoid
 
 INERTIA = rj.Inertia.from_principal(1.0, 2.0, 2.5).rotated(np.array([0.8, 0.0, 0.6, 0.0]))
 

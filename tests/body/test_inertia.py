@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from rigidjax.body import shapes
-from rigidjax.body.inertia import Inertia, MassProperties, apply, inverse, solve
+from rigidjax.body.inertia import Inertia, MassProperties, inverse
 from rigidjax.rotation import quaternion
 
 ORIGIN = [0.0, 0.0, 0.0]
@@ -109,16 +109,13 @@ def test_joining_is_associative_commutative_and_undone_by_cutting():
 
 
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
-def test_inverse_and_solve_from_grains_to_planets(dtype):
+def test_inverse_from_grains_to_planets(dtype):
     turned = Inertia.from_principal(0.3, 1.0, 1.2).rotated([0.8, 0.1, 0.5, 0.1**0.5]).tensor
     want = np.linalg.inv(np.asarray(turned, dtype).astype(np.float64))
-    v = jnp.asarray([0.3, -1.0, 0.5], dtype)
     for scale in (1e-20, 1e-10, 1.0, 1e20, 1e37):
         a = (turned * scale).astype(dtype)
         got = np.asarray(inverse(a), np.float64) * scale
         np.testing.assert_allclose(got, want, rtol=0, atol=20 * jnp.finfo(dtype).eps)
-        back = apply(turned.astype(dtype), solve(a, v * jnp.asarray(scale, dtype)))
-        np.testing.assert_allclose(back, v, rtol=0, atol=20 * jnp.finfo(dtype).eps)
         assert got.dtype == np.float64 and inverse(a).dtype == dtype
 
 

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from once import once
 
-from rigidjax.body.matrix_functions import matrix_function
-from rigidjax.body.principal_axes import principal
+from rigidjax.body.principal_axes import matrix_function, principal
 from rigidjax.rotation import quaternion
 
 SCALES = [1e-20, 1.0, 1e20, 1e37]

@@ -550,9 +550,7 @@ way(
 leave_out(
     "a truth value, a kind or a name: no number",
     *(f"motion.torques.{name}.steady" for name in (
-        "BodyDrag", "CentralGravity", "ConstantTorque", "CorrelatedTorque", "Damping", "Drag",
-        "Flywheel", "FromPotential", "GravityGradient", "HeavyTop", "InSpace", "MagneticDipole",
-        "QuadraticDamping", "RandomTorque", "ReactionWheels", "UniformGravity")),
+        "Flywheel", "GravityGradient", "InSpace", "MagneticDipole", "ReactionWheels")),
     "motion.torques.ChangingInertia.feels", "motion.torques.Sum.feels",
     "motion.torques.Sum.rate_free",
 )  # fmt: skip

@@ -1,8 +1,6 @@
 """What a recording was read with."""
 
-from typing import TYPE_CHECKING
-
-from rigidjax._names import own_names, suggests
+from rigidjax._names import show
 from rigidjax.identify.sensors.attitude import (
     AttitudeSensor as AttitudeSensor,
     Direction as Direction,
@@ -26,6 +24,4 @@ from rigidjax.identify.sensors.vectors import (
     Magnetometer as Magnetometer,
 )
 
-if not TYPE_CHECKING:
-    __getattr__ = suggests(__name__)
-__dir__ = own_names(__name__)
+show(__name__)

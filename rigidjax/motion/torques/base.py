@@ -12,10 +12,17 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from rigidjax import _checks
-from rigidjax._types import HasAttitude, HasPose, HasSpin, Scalar, ScalarLike, Vec3, Vec3Like
-from rigidjax.body import validation
-from rigidjax.body._types import Vector
-from rigidjax.body.inertia import Inertia, MassProperties
+from rigidjax._types import (
+    HasAttitude,
+    HasPose,
+    HasSpin,
+    Scalar,
+    ScalarLike,
+    Vec3,
+    Vec3Like,
+    Vector,
+)
+from rigidjax.body.inertia import Inertia, MassProperties, tensor_of as tensor_of
 from rigidjax.motion.torques.states import Frozen, require_frozen
 
 
@@ -107,31 +114,31 @@ class AbstractForce(eqx.Module):
         """Force (3,), N, world; torque (3,), N m, body frame, about the centre of mass."""
 
 
+class OfTime(AbstractTorque):
+    """A torque of vectors, one of which may be a function of time."""
+
+    @property
+    def steady(self) -> bool:
+        """Whether no vector is a function of time."""
+        return not any(callable(part) for part in vars(self).values())
+
+    @property
+    def jump_times(self) -> Float[Array, " n"]:
+        """Times, s, where a vector jumps or has a kink."""
+        return jumps_in(*vars(self).values())
+
+
 # A user's own callable Module need not subclass anything.
 Torque = AbstractTorque | AbstractForce | Callable[[Any, Any, Any], Any]
 
 # From the lowest: the states that a torque may act on.
 LADDER = (HasSpin, HasAttitude, HasPose)
-
-
-def given(value: Any, shape: tuple[int, ...], name: str, *, hint: str = "") -> Array:
-    """A law's number or vector, its shape checked, and that it is finite where it is known.
-
-    >>> given([1.0, 2.0, 3.0], (3,), "torque").shape
-    (3,)
-    """
-    array = _checks.floating(value, shape, name, hint=hint)
-    # NumPy: inside a trace a check with jax would become part of the program.
-    if validation.known(array) and not np.isfinite(np.asarray(array)).all():
-        raise ValueError(f"{name}: contains NaN or infinity, got {np.asarray(array)}")
-    return array
+# A hint for gravity.
+WORLD = "a vector in world axes, such as [0, 0, -9.81]"
 
 
 def require_law(torque: object, name: str = "torque") -> None:
-    """Raise `TypeError` unless `torque` is something that can be called for its value.
-
-    >>> require_law(lambda t, state, body: -state.omega)
-    """
+    """Raise `TypeError` unless `torque` is something that can be called for its value."""
     if isinstance(torque, type):
         raise TypeError(
             f"{name}: got the class {torque.__name__}, wanted one made from it: "
@@ -150,33 +157,19 @@ def require_law(torque: object, name: str = "torque") -> None:
 
 
 def sees_attitude(torque: Torque | None) -> bool:
-    """Whether a law may look at the attitude: it says so by `feels`, or has none.
-
-    >>> from rigidjax import torques
-    >>> sees_attitude(torques.Damping([1.0, 1.0, 1.0]))
-    False
-    """
+    """Whether a law may look at the attitude: it says so by `feels`, or has none."""
     if hasattr(torque, "parts"):
         return any(sees_attitude(part) for part in torque.parts)  # pyright: ignore
     return torque is not None and getattr(torque, "feels", None) is not HasSpin
 
 
 def sees_rate(torque: Torque | None) -> bool:
-    """Whether a law may look at the body rate: it has not said that it is `rate_free`.
-
-    >>> from rigidjax import torques
-    >>> sees_rate(torques.HeavyTop(1.0, [0.0, 0.0, 1.0], [0.0, 0.0, -9.81]))
-    False
-    """
+    """Whether a law may look at the body rate: it has not said that it is `rate_free`."""
     return torque is not None and not getattr(torque, "rate_free", False)
 
 
 def require_rung(torque: Torque, state: object) -> None:
-    """Raise `TypeError` unless `torque` is a law and `state` has what it feels.
-
-    >>> from rigidjax import Spin
-    >>> require_rung(lambda t, state, body: -state.omega, Spin([0.0, 0, 1]))
-    """
+    """Raise `TypeError` unless `torque` is a law and `state` has what it feels."""
     require_law(torque)
     feels = getattr(torque, "feels", None)
     if feels is not None and not isinstance(state, feels):
@@ -186,17 +179,22 @@ def require_rung(torque: Torque, state: object) -> None:
         )
 
 
+def require_scene(law: Torque | None, state: object, body: object) -> None:
+    """Raise in words unless these are a body, a state, and one law that can be called, or none."""
+    _checks.single(state, HasSpin, "state", wanted="a Spin, an Attitude or a Rigid")
+    if law is not None:
+        require_rung(law, state)
+        require_frozen(law)
+        one_law(law.law if isinstance(law, Frozen) else law)
+    _checks.single(body, (Inertia, MassProperties), "body")
+
+
 def evaluate(torque: Torque, t: ScalarLike, state: HasSpin, body: Inertia | MassProperties) -> Vec3:
     """The torque's value (3,), N m, body frame, its shape checked.
 
     **Arguments:** `torque` any law; `t` s; `state`; `body`. The law is taken in the precision of
     `state.omega`. **Raises:** `TypeError` for a force, which acts on `Rigid` only; `ValueError` for
     a wrong shape.
-
-    >>> from rigidjax import Inertia, Spin, torques
-    >>> body = Inertia.from_principal(1.0, 2.0, 3.0)
-    >>> evaluate(torques.Damping([1.0, 1.0, 1.0]), 0.0, Spin([0.0, 0.0, 2.0]), body)
-    Array([-0., -0., -2.], dtype=float64)
     """
     force, value = act(torque, t, state, body)
     if force is not None:
@@ -214,15 +212,8 @@ def act(
 
     **Arguments** as for `evaluate`. **Returns** a force (3,) or `None`, and a torque (3,), N m,
     body frame, in the precision of `state.omega`.
-
-    >>> from rigidjax import Inertia, Spin, torques
-    >>> act(torques.ConstantTorque([0.0, 0, 1]), 0.0, Spin([0.0, 0, 1]), Inertia(jnp.eye(3)))[0]
     """
-    _checks.single(state, HasSpin, "state", wanted="a Spin, an Attitude or a Rigid")
-    require_rung(law, state)
-    require_frozen(law)
-    one_law(law.law if isinstance(law, Frozen) else law)
-    _checks.single(body, (Inertia, MassProperties), "body")
+    require_scene(law, state, body)
     dtype = state.omega.dtype
     t = _checks.floating(t, (), "t").astype(dtype)
     # A table in float64 must not lift a float32 solve, nor stop it under strict promotion.
@@ -268,9 +259,6 @@ def one_law(law: Any) -> None:
     """Raise `ValueError` where an array of one of our laws has not the shape that its field says.
 
     Its constructor saw to that; `jax.vmap` and `jax.tree.map` make laws of many bodies.
-
-    >>> from rigidjax import torques
-    >>> one_law(torques.ConstantTorque([0.0, 0.0, 1.0]))
     """
     if not type(law).__module__.startswith(__package__ or ""):
         return
@@ -285,11 +273,7 @@ def one_law(law: Any) -> None:
 
 
 def in_precision(tree: Any, dtype: Any) -> Any:
-    """The same tree with every floating array in `dtype`.
-
-    >>> in_precision({"a": jnp.ones(2)}, jnp.float32)["a"].dtype
-    dtype('float32')
-    """
+    """The same tree with every floating array in `dtype`."""
 
     def cast(leaf: Any) -> Any:
         if eqx.is_array_like(leaf) and hasattr(leaf, "dtype"):
@@ -299,39 +283,39 @@ def in_precision(tree: Any, dtype: Any) -> Any:
     return jax.tree.map(cast, tree)
 
 
-def tensor_of(body: Inertia | MassProperties) -> Float[Array, "3 3"]:
-    """The inertia tensor (3, 3), kg m²: of an `Inertia`, or about the centre of mass.
-
-    >>> from rigidjax import shapes
-    >>> tensor_of(Inertia(jnp.eye(3)))[0, 0]
-    Array(1., dtype=float64)
-    """
-    return body.tensor if isinstance(body, Inertia) else body.inertia.tensor
-
-
 def vector_at(source: Any, t: ScalarLike, name: str, size: int = 3) -> Float[Array, " size"]:
-    """A vector that is constant, or the value at `t` of a callable Module of time.
-
-    >>> vector_at(jnp.ones(3), 0.0, "field")
-    Array([1., 1., 1.], dtype=float64)
-    """
+    """A vector that is constant, or the value at `t` of a callable Module of time."""
     return _checks.floating(source(t), (size,), f"{name}(t)") if callable(source) else source
 
 
 def stays(source: Any) -> Vec3 | None:
-    """A vector that is constant; `None` for a function of time.
-
-    >>> stays(jnp.ones(3))
-    Array([1., 1., 1.], dtype=float64)
-    """
+    """A vector that is constant; `None` for a function of time."""
     return None if callable(source) else source
+
+
+def vector(name: str, *, hint: str = "") -> Callable[[Vector], Array]:
+    """What makes a field of three numbers, for `equinox.field(converter=…)`."""
+
+    def converted(value: Vector) -> Array:
+        return _checks.given(value, (3,), name, hint=hint)
+
+    return converted
+
+
+def number(name: str) -> Callable[[ScalarLike], Array]:
+    """What makes a field of one number."""
+
+    def converted(value: ScalarLike) -> Array:
+        return _checks.given(value, (), name)
+
+    return converted
 
 
 def constant_or_callable(source: Any, name: str, size: int = 3) -> Any:
     """`source` as it is if it can be called with a time; otherwise as a vector (size,)."""
     if callable(source):
         return _checks.function(source, name, f"of time to ({size},)")
-    return given(source, (size,), name)
+    return _checks.given(source, (size,), name)
 
 
 def jumps_of(source: object) -> Float[Array, " n"]:
@@ -347,12 +331,40 @@ def jumps_of(source: object) -> Float[Array, " n"]:
     return jnp.zeros(0) if found is None else found
 
 
-def length_or_zero(v: Vec3Like) -> Scalar:
-    """|v|, whose derivative at v = 0 is taken as 0: for |v| v, which has one and it is 0.
+def jumps_in(*sources: object) -> Float[Array, " n"]:
+    """The times at which any of several laws or functions of time jumps, s, in order."""
+    times = [found for source in sources if (found := jumps_of(source)).shape[0]]
+    if len(times) < 2:
+        return times[0] if times else jnp.zeros(0)
+    dtype = jnp.result_type(*times)
+    return jnp.sort(jnp.concatenate([found.astype(dtype) for found in times]))
 
-    >>> float(length_or_zero(jnp.array([3.0, 4.0, 0.0])))
-    5.0
-    """
+
+def unit_rows(value: Any, name: str, count: int) -> Float[Array, "n 3"]:
+    """Directions (count, 3), unit where they are known."""
+    rows = _checks.given(value, (count, 3), name)
+    if _checks.known(rows):
+        lengths = np.linalg.norm(np.asarray(rows, float), axis=1)
+        if abs(lengths - 1).max() > 1e-6:
+            raise ValueError(f"{name}: wanted unit vectors, got lengths {lengths}")
+    return rows
+
+
+def count_of(value: Any, name: str, one: str) -> int:
+    """How many rows (x, y, z) there are, one for each of what `one` says: at least one."""
+    shape = _checks.numbers(value, name).shape
+    if len(shape) != 2 or shape[1] != 3 or not shape[0]:
+        raise ValueError(f"{name}: wanted (R, 3), one row a {one}, got shape {shape}")
+    return shape[0]
+
+
+def each(value: Any, count: int, name: str) -> Array:
+    """One number for all, or one for each of `count`."""
+    return _checks.given(value, (count,) if _checks.numbers(value, name).ndim else (), name)
+
+
+def length_or_zero(v: Vec3Like) -> Scalar:
+    """|v|, whose derivative at v = 0 is taken as 0: for |v| v, which has one and it is 0."""
     v = _checks.floating(v, (3,), "v")
     square = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
     return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)

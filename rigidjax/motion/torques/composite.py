@@ -1,7 +1,7 @@
-"""Several torques at once, and a torque from any potential."""
+"""Several torques at once, and those on a body whose inertia changes in time."""
 
 from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -9,18 +9,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rigidjax import _checks
-from rigidjax._types import HasAttitude, Scalar, ScalarLike, Vec3
-from rigidjax.motion.torques.base import (
-    LADDER,
-    AbstractTorque,
-    Torque,
-    Wrench,
-    act,
-    jumps_of,
-    require_law,
-    sees_rate,
-)
-from rigidjax.motion.torques.changing_inertia import ChangingInertia
+from rigidjax._types import HasSpin, Mat3, ScalarLike, Vec3
+from rigidjax.body.inertia import Inertia, tensor_of, with_tensor
+from rigidjax.body.symmetric3 import apply, inverse
+from rigidjax.motion.torques import base
+from rigidjax.rotation.linalg3 import cross
 
 
 class Sum(eqx.Module):
@@ -37,11 +30,11 @@ class Sum(eqx.Module):
 
     parts: tuple[Any, ...]
 
-    def __init__(self, *parts: Torque):
+    def __init__(self, *parts: base.Torque):
         if not parts:
             raise ValueError("Sum: wanted at least one torque; for a free body give torque=None")
         for part in parts:
-            require_law(part, "Sum")
+            base.require_law(part, "Sum")
             if isinstance(part, ChangingInertia) and len(parts) > 1:
                 raise TypeError(
                     "Sum: ChangingInertia divides all torques by the inertia at their time: put "
@@ -52,81 +45,95 @@ class Sum(eqx.Module):
     @property
     def feels(self) -> type:
         """The highest state that a part needs."""
-        rungs = [getattr(part, "feels", LADDER[0]) for part in self.parts]
-        return max(rungs, key=lambda r: LADDER.index(r) if r in LADDER else len(LADDER))
+        rungs = [getattr(part, "feels", base.LADDER[0]) for part in self.parts]
+        return max(
+            rungs, key=lambda r: base.LADDER.index(r) if r in base.LADDER else len(base.LADDER)
+        )
 
     @property
     def rate_free(self) -> bool:
         """Whether no part looks at the body rate."""
-        return all(not sees_rate(part) for part in self.parts)
+        return all(not base.sees_rate(part) for part in self.parts)
 
     @property
     def jump_times(self) -> Float[Array, " n"]:
         """The times of all parts, s, in order."""
-        times = [jumps_of(part) for part in self.parts]
-        times = [found for found in times if found.shape[0]]
-        if not times:
-            return jnp.zeros(0)
-        dtype = jnp.result_type(*times)
-        return jnp.sort(jnp.concatenate([found.astype(dtype) for found in times]))
+        return base.jumps_in(*self.parts)
 
-    def __call__(self, t: ScalarLike, state: Any, body: Any) -> Vec3 | Wrench:
+    def __call__(self, t: ScalarLike, state: Any, body: Any) -> Vec3 | base.Wrench:
         forces, torque = [], None
         for part in self.parts:
-            force, more = act(part, t, state, body)
+            force, more = base.act(part, t, state, body)
             torque = more if torque is None else torque + more
             forces += [] if force is None else [force]
         if not forces:
             return torque  # pyright: ignore[reportReturnType]
-        return Wrench(sum(forces[1:], forces[0]), torque)
+        return base.Wrench(sum(forces[1:], forces[0]), torque)
 
 
-class FromPotential(AbstractTorque):
-    """The torque of any potential `U(q)` on the attitude, by differentiation.
+class ChangingInertia(eqx.Module):
+    """What a changing inertia does to a body: `I(t) dΩ/dt = I(t)Ω × Ω − İΩ + τ`.
 
-    **Arguments:** `potential` a callable Module `q → U`, J, with `q` (4,) unit, body → world.
+    **Arguments:** `inertia` a function of time, t → (3, 3), kg m², body frame, about the point that
+    the body turns about (the centre of mass of a `Rigid`), whose derivative is taken: such as
+    `Linear(times, tensors)`; `torque` all else that acts, or `None`: it stands inside, not beside
+    in a `Sum`, because its τ turns I(t), and it is given the body as it is at t.
 
-    `τ_i = −∂U/∂q · ½ q ⊗ e_i`, the derivative along a turn about body axis i. Source: Landau and
-    Lifshitz, Mechanics, §34.
+    The body that `simulate` is given only sets the state's units: its inertia is replaced. What is
+    moved about inside is symmetric enough to have no momentum of its own in the body frame (Σ m r ×
+    ṙ = 0), as booms that go out in a straight line from the centre have none; else add it as the
+    momentum of a `Flywheel` to `torque`. Fuel that is thrown out takes its share of İΩ along: then
+    add İΩ to `torque`.
 
-    **Raises:** `TypeError` for what cannot be called, `ValueError` for a U that is not a number.
+    Source: Hughes 1986, Spacecraft Attitude Dynamics, ch. 3; without τ the momentum `R I(t) Ω` is
+    kept.
 
-    >>> class Spring(eqx.Module):
-    ...     k: Array
-    ...     def __call__(self, q):
-    ...         return 2.0 * self.k * (q[1] ** 2 + q[2] ** 2 + q[3] ** 2)
-    >>> from rigidjax import Attitude, quaternion
-    >>> at = Attitude(quaternion.exp(jnp.array([0.0, 0.0, 1e-3])), [0.0, 0, 0])
-    >>> FromPotential(Spring(jnp.array(2.0)))(0.0, at, None).round(5).tolist()
-    [-0.0, -0.0, -0.002]
+    **Raises:** `TypeError` for what cannot be called; `ValueError` for a value that is not (3, 3).
+
+    >>> import rigidjax as rj
+    >>> grows = ChangingInertia(lambda t: (1.0 + t) * jnp.eye(3))
+    >>> body = rj.Inertia(jnp.eye(3))
+    >>> rj.simulate(body, rj.Spin([0.0, 0, 1.0]), [0.0, 1.0], grows).ys.omega[-1, 2]
+    Array(0.5, dtype=float64)
     """
 
-    feels: ClassVar[type] = HasAttitude
-    rate_free: ClassVar[bool] = True
-    potential: Callable[[Any], Any]
+    inertia: Callable[[Any], Any]
+    torque: Any
 
-    def __init__(self, potential: Callable[[Any], Any]):
-        self.potential = _checks.function(potential, "potential", "q → U, J")
+    def __init__(self, inertia: Callable[[Any], Any], torque: base.Torque | None = None):
+        self.inertia = _checks.function(inertia, "inertia", "of time to (3, 3), kg m²")
+        if torque is not None:
+            base.require_law(torque)
+        self.torque = torque
 
     @property
-    def steady(self) -> bool:
-        """It does not depend on time."""
-        return True
+    def feels(self) -> type:
+        """The lowest state that the torque inside acts on."""
+        return getattr(self.torque, "feels", HasSpin)
 
-    def energy(self, t: ScalarLike, state: HasAttitude, body: object) -> Scalar:
-        """Potential energy, J."""
-        return self._value(state.q)
+    @property
+    def jump_times(self) -> Float[Array, " n"]:
+        """Times, s, where the inertia has a kink, or the torque jumps."""
+        return base.jumps_in(self.inertia, self.torque)
 
-    def __call__(self, t: ScalarLike, state: HasAttitude, body: object) -> Vec3:
-        w, x, y, z = state.q
-        dw, dx, dy, dz = jax.grad(self._value)(state.q)
-        return -0.5 * jnp.stack(
-            [
-                -x * dw + w * dx + z * dy - y * dz,
-                -y * dw - z * dx + w * dy + x * dz,
-                -z * dw + y * dx - x * dy + w * dz,
-            ]
-        )
+    def tensor(self, t: ScalarLike) -> Mat3:
+        """I(t), (3, 3), kg m²."""
+        found = self.inertia(t)
+        found = found.tensor if isinstance(found, Inertia) else found
+        return _checks.floating(found, (3, 3), "inertia(t)")
 
-    def _value(self, q):
-        return _checks.floating(self.potential(q), (), "potential", hint="one number, J")
+    def __call__(self, t: ScalarLike, state: HasSpin, body: Any) -> Vec3 | base.Wrench:
+        omega = state.omega
+        t = jnp.asarray(t, omega.dtype)
+        now, rate = jax.jvp(self.tensor, (t,), (jnp.ones_like(t),))
+        now, rate = now.astype(omega.dtype), rate.astype(omega.dtype)
+        turning = cross(apply(now, omega), omega) - apply(rate, omega)
+        force = None
+        if self.torque is not None:
+            force, torque = base.act(self.torque, t, state, with_tensor(body, now))
+            turning = turning + torque
+        # The body's own equations have its own inertia: the torque that brings them to this.
+        fixed = tensor_of(body)
+        slope = apply(inverse(now), turning)
+        torque = apply(fixed, slope) - cross(apply(fixed, omega), omega)
+        return torque if force is None else base.Wrench(force, torque)

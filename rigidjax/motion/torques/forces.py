@@ -1,19 +1,21 @@
-"""Forces on a body that moves: uniform gravity, a centre of attraction, drag."""
+"""Forces on a body that moves: gravity, a centre of attraction, drag, rotors."""
 
-from typing import ClassVar
+from typing import Any, ClassVar
 
+import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
 
-from rigidjax._types import HasPose, Scalar, ScalarLike, Vec3
-from rigidjax.body._types import Vector
+from rigidjax import _checks
+from rigidjax._types import HasPose, Mat3, Scalar, ScalarLike, Vec3
 from rigidjax.body.inertia import MassProperties
-from rigidjax.motion.torques.base import AbstractForce, Wrench, given, length_or_zero
+from rigidjax.motion.torques import base
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.linalg3 import apply, cross, dot
 
 
-class UniformGravity(AbstractForce):
+class UniformGravity(base.AbstractForce):
     """The same acceleration everywhere: `F = m g`, no torque about the centre, `U = −m g·x`.
 
     **Arguments:** `gravity` (3,) g, m/s², world frame, such as [0, 0, −9.81].
@@ -30,17 +32,8 @@ class UniformGravity(AbstractForce):
     """
 
     feels: ClassVar[type] = HasPose
-    gravity: Float[Array, "3"]
-
-    def __init__(self, gravity: Vector):
-        self.gravity = given(
-            gravity, (3,), "gravity", hint="a vector in world axes, such as [0, 0, -9.81]"
-        )
-
-    @property
-    def steady(self) -> bool:
-        """It does not depend on time."""
-        return True
+    steady: ClassVar[bool] = True
+    gravity: Float[Array, "3"] = eqx.field(converter=base.vector("gravity", hint=base.WORLD))
 
     def energy(self, t: ScalarLike, state: HasPose, body: MassProperties) -> Scalar:
         """Potential energy, J: `U = −m g·x`, zero at the world's origin."""
@@ -50,11 +43,11 @@ class UniformGravity(AbstractForce):
         """Zero, N m s: it does not turn the body, and nothing turns inside."""
         return jnp.zeros_like(self.gravity)
 
-    def __call__(self, t: ScalarLike, state: HasPose, body: MassProperties) -> Wrench:
-        return Wrench(body.mass * self.gravity)
+    def __call__(self, t: ScalarLike, state: HasPose, body: MassProperties) -> base.Wrench:
+        return base.Wrench(body.mass * self.gravity)
 
 
-class CentralGravity(AbstractForce):
+class CentralGravity(base.AbstractForce):
     """A centre of attraction at the world's origin, on a body of some size.
 
     `U = −μ m/r − (μ/2r³)(Tr I − 3 r̂·I_w r̂)` (MacCullagh's formula), with its force and its torque,
@@ -72,38 +65,31 @@ class CentralGravity(AbstractForce):
     """
 
     feels: ClassVar[type] = HasPose
-    mu: Float[Array, ""]
-
-    def __init__(self, mu: ScalarLike):
-        self.mu = given(mu, (), "mu")
-
-    @property
-    def steady(self) -> bool:
-        """It does not depend on time."""
-        return True
+    steady: ClassVar[bool] = True
+    mu: Float[Array, ""] = eqx.field(converter=base.number("mu"))
 
     def energy(self, t: ScalarLike, state: HasPose, body: MassProperties) -> Scalar:
         """Potential energy, J, zero far away."""
-        r = jnp.sqrt(dot(state.x, state.x))
-        tensor = body.inertia.tensor
-        up = quaternion.rotate_inverse(state.q, state.x / r)
-        size = tensor[0, 0] + tensor[1, 1] + tensor[2, 2] - 3 * dot(up, apply(tensor, up))
-        return -(self.mu / r) * (body.mass + 0.5 * size / r / r)
+        r, up, pull, trace = _seen_from_centre(state, body.inertia.tensor)
+        return -(self.mu / r) * (body.mass + 0.5 * (trace - 3 * dot(up, pull)) / r / r)
 
-    def __call__(self, t: ScalarLike, state: HasPose, body: MassProperties) -> Wrench:
-        r = jnp.sqrt(dot(state.x, state.x))
-        tensor = body.inertia.tensor
-        up = quaternion.rotate_inverse(state.q, state.x / r)
-        pull = apply(tensor, up)
-        strength = self.mu / r / r
-        trace, along = tensor[0, 0] + tensor[1, 1] + tensor[2, 2], dot(up, pull)
+    def __call__(self, t: ScalarLike, state: HasPose, body: MassProperties) -> base.Wrench:
+        r, up, pull, trace = _seen_from_centre(state, body.inertia.tensor)
+        strength, along = self.mu / r / r, dot(up, pull)
         # −∂U/∂x in body axes: the part along r, and the part of I r̂ across it.
         radial = -strength * (body.mass + 1.5 * (trace - 5 * along) / r / r)
         force = radial * up - 3 * strength / r / r * pull
-        return Wrench(quaternion.rotate(state.q, force), cross(3 * strength / r * up, pull))
+        return base.Wrench(quaternion.rotate(state.q, force), cross(3 * strength / r * up, pull))
 
 
-class Drag(AbstractForce):
+def _seen_from_centre(state: HasPose, tensor: Mat3) -> tuple[Scalar, Vec3, Vec3, Scalar]:
+    """r, r̂ in body axes, I r̂, and Tr I."""
+    r = jnp.sqrt(dot(state.x, state.x))
+    up = quaternion.rotate_inverse(state.q, state.x / r)
+    return r, up, apply(tensor, up), tensor[0, 0] + tensor[1, 1] + tensor[2, 2]
+
+
+class Drag(base.AbstractForce):
     """Drag of a fluid: `F = −k |u| u`, `u = v − wind`, at a point of the body.
 
     **Arguments:** `coefficient` k = ½ ρ C_d A, kg/m; `centre` (3,) the point where it acts, m, body
@@ -123,26 +109,111 @@ class Drag(AbstractForce):
     """
 
     feels: ClassVar[type] = HasPose
-    coefficient: Float[Array, ""]
-    centre: Float[Array, "3"]
-    wind: Float[Array, "3"]
+    steady: ClassVar[bool] = True
+    coefficient: Float[Array, ""] = eqx.field(converter=base.number("coefficient"))
+    centre: Float[Array, "3"] = eqx.field(converter=base.vector("centre"), default=(0.0, 0.0, 0.0))
+    wind: Float[Array, "3"] = eqx.field(converter=base.vector("wind"), default=(0.0, 0.0, 0.0))
+
+    def __call__(self, t: ScalarLike, state: HasPose, body: MassProperties) -> base.Wrench:
+        u = state.v - self.wind
+        force = -self.coefficient * base.length_or_zero(u) * u
+        return base.Wrench(force, cross(self.centre, quaternion.rotate_inverse(state.q, force)))
+
+
+class Rotors(base.AbstractForce):
+    """Propellers: thrust `F_i = k_i n_i² d_i` at r_i, and the reaction `τ_i = −s_i c_i n_i² d_i`.
+
+    **Arguments:** `positions` r (R, 3) m, body frame, from the centre of mass; `directions` d
+    (R, 3) of the thrusts, body frame, unit; `spins` s (R,), 1 where a rotor turns about d by the
+    right-hand rule, −1 where it turns the other way; `thrust` k, N s²/rad², and `drag` c,
+    N m s²/rad², each one number or (R,); `speeds` n (R,) rad/s: constant, a callable Module of
+    time such as `Held(times, values)`, or `Input("speeds")`.
+
+    Source: Mahony, Kumar and Corke 2012, Multirotor aerial vehicles, eqs 4–6,
+    doi:10.1109/MRA.2012.2206474.
+
+    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype; `ValueError` for a direction
+    that is not a unit vector, or a spin that is not 1 or −1.
+
+    >>> from rigidjax import Rigid, shapes
+    >>> up = Rotors([[0.1, 0.0, 0.0]], [[0.0, 0.0, 1.0]], [1.0], 2.0, 0.5, [3.0])
+    >>> rest = Rigid([0.0, 0, 0], [0.0, 0, 0], [1.0, 0, 0, 0], [0.0, 0, 0])
+    >>> up(0.0, rest, shapes.sphere(1.0, 1.0)).torque.tolist()
+    [0.0, -1.8, -4.5]
+    """
+
+    feels: ClassVar[type] = HasPose
+    positions: Float[Array, "rotors 3"]
+    directions: Float[Array, "rotors 3"]
+    spins: Float[Array, " rotors"]
+    thrust: Float[Array, "*rotors"]
+    drag: Float[Array, "*rotors"]
+    speeds: eqx.Module | Float[Array, " rotors"]
 
     def __init__(
         self,
-        coefficient: ScalarLike,
-        centre: Vector = (0.0, 0.0, 0.0),
-        wind: Vector = (0.0, 0.0, 0.0),
+        positions: Float[ArrayLike, "rotors 3"] | Any,
+        directions: Float[ArrayLike, "rotors 3"] | Any,
+        spins: Float[ArrayLike, " rotors"] | Any,
+        thrust: Float[ArrayLike, "*rotors"] | Any,
+        drag: Float[ArrayLike, "*rotors"] | Any,
+        speeds: Any,
     ):
-        self.coefficient = given(coefficient, (), "coefficient")
-        self.centre = given(centre, (3,), "centre")
-        self.wind = given(wind, (3,), "wind")
+        count = base.count_of(positions, "positions", "rotor")
+        self.positions = _checks.given(positions, (count, 3), "positions")
+        self.directions = base.unit_rows(directions, "directions", count)
+        self.spins = _checks.given(spins, (count,), "spins")
+        if _checks.known(self.spins) and (abs(np.asarray(self.spins)) != 1).any():
+            raise ValueError(f"spins: wanted 1 or -1 for each rotor, got {np.asarray(self.spins)}")
+        self.thrust, self.drag = base.each(thrust, count, "thrust"), base.each(drag, count, "drag")
+        self.speeds = base.constant_or_callable(speeds, "speeds", count)
 
     @property
-    def steady(self) -> bool:
-        """It does not depend on time."""
-        return True
+    def jump_times(self) -> Float[Array, " n"]:
+        """Times, s, where the speeds jump or have a kink."""
+        return base.jumps_of(self.speeds)
 
-    def __call__(self, t: ScalarLike, state: HasPose, body: MassProperties) -> Wrench:
-        u = state.v - self.wind
-        force = -self.coefficient * length_or_zero(u) * u
-        return Wrench(force, cross(self.centre, quaternion.rotate_inverse(state.q, force)))
+    def __call__(self, t: ScalarLike, state: HasPose, body: MassProperties) -> base.Wrench:
+        n = base.vector_at(self.speeds, t, "speeds", self.spins.shape[0]).astype(self.spins.dtype)
+        square = n * n
+        lift, twist = self.thrust * square, self.spins * self.drag * square
+        # Written out, rotor by rotor: few, and sums of arrays are slow in a batch.
+        force, torque = jnp.zeros(3, lift.dtype), jnp.zeros(3, lift.dtype)
+        for i in range(self.spins.shape[0]):
+            along = self.directions[i]
+            force = force + lift[i] * along
+            torque = torque + lift[i] * cross(self.positions[i], along) - twist[i] * along
+        return base.Wrench(quaternion.rotate(state.q, force), torque)
+
+
+class BodyDrag(base.AbstractForce):
+    """Drag along the body's axes: `F = −R (a ∘ u + b ∘ |u| u)`, `τ = c × RᵀF`, `u = Rᵀ (v − wind)`.
+
+    **Arguments:** `linear` a (3,) kg/s, such as of rotors in a cross-flow; `quadratic` b (3,) kg/m;
+    `centre` c (3,) the point where it acts, m, body frame, from the centre of mass; `wind` (3,) the
+    air's velocity, m/s, world frame. For a sphere see `Drag`.
+
+    Source: Faessler, Franchi and Scaramuzza 2018, eq 5, doi:10.1109/LRA.2017.2776353, for the
+    linear part; Hoerner 1965, Fluid-Dynamic Drag, for the other. |u| u is taken axis by axis.
+
+    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
+
+    >>> from rigidjax import Rigid, shapes
+    >>> fast = Rigid([0.0, 0, 0], [2.0, 0, 0], [1.0, 0, 0, 0], [0.0, 0, 0])
+    >>> BodyDrag([1.0, 1, 1], [0.5, 0, 0])(0.0, fast, shapes.sphere(1.0, 1.0)).force.tolist()
+    [-4.0, 0.0, 0.0]
+    """
+
+    feels: ClassVar[type] = HasPose
+    steady: ClassVar[bool] = True
+    linear: Float[Array, "3"] = eqx.field(converter=base.vector("linear"))
+    quadratic: Float[Array, "3"] = eqx.field(
+        converter=base.vector("quadratic"), default=(0.0, 0.0, 0.0)
+    )
+    centre: Float[Array, "3"] = eqx.field(converter=base.vector("centre"), default=(0.0, 0.0, 0.0))
+    wind: Float[Array, "3"] = eqx.field(converter=base.vector("wind"), default=(0.0, 0.0, 0.0))
+
+    def __call__(self, t: ScalarLike, state: HasPose, body: MassProperties) -> base.Wrench:
+        u = quaternion.rotate_inverse(state.q, state.v - self.wind)
+        force = -(self.linear + self.quadratic * jnp.abs(u)) * u
+        return base.Wrench(quaternion.rotate(state.q, force), cross(self.centre, force))

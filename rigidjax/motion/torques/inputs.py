@@ -1,4 +1,4 @@
-"""Quantities that drive a law, by name: given by a loop at each step, or as functions of time."""
+"""What drives a law: quantities by name, of a loop or functions of time; what delays, what lags."""
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple, TypeVar
@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from rigidjax import _checks
 from rigidjax._types import ScalarLike
-from rigidjax.motion.torques.base import given, jumps_of
+from rigidjax.motion.torques.base import jumps_of
 from rigidjax.motion.torques.states import has_states
 
 Law = TypeVar("Law")
@@ -79,7 +79,7 @@ class Delayed(eqx.Module):
                 f"Delayed: {type(source).__name__} has states, whose past is not kept; delay what "
                 "goes into it: Lagged(Delayed(source, delay), time)"
             )
-        self.delay = given(delay, (), "delay").astype(jnp.result_type(float))
+        self.delay = _checks.given(delay, (), "delay").astype(jnp.result_type(float))
         if isinstance(source, Delayed):
             source, self.delay = source.source, self.delay + source.delay
         if not isinstance(source, Input) and inputs_of(source):
@@ -105,6 +105,69 @@ class Delayed(eqx.Module):
 
     def __call__(self, t: ScalarLike) -> Any:
         return self.source(t - self.delay.astype(jnp.result_type(t)))
+
+
+class Lagged(eqx.Module):
+    """A lag of first order, such as a motor's: `T dy/dt = u(t) − y`, whose value is y.
+
+    A state of its own, integrated with the body's (see `AbstractTorque`); it stands where a
+    function of time may: `Rotors(…, speeds=Lagged(Input("speeds"), 0.05))`.
+
+    **Arguments:** `source` u, a function of time such as `Held(times, values)`, or `Input("u")`;
+    `time` T, s, > 0: one number, or one a channel; it may be free in a fit; `start` y at the start;
+    `None` for u there.
+
+    For a u that jumps from 0 to 1 it is `1 − exp(−t/T)`. Source: any text on control, such as
+    Åström and Murray, Feedback Systems.
+
+    **Raises:** `TypeError` for a source that cannot be called; `ValueError` for a time that is
+    known and not positive, or wrong shapes.
+
+    >>> import rigidjax as rj
+    >>> push = rj.torques.InSpace(Lagged(lambda t: jnp.array([0.0, 0.0, 1.0]), 0.5, jnp.zeros(3)))
+    >>> body, start = rj.Inertia(jnp.eye(3)), rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 0])
+    >>> rj.simulate(body, start, [0.0, 0.5], push).own[0][-1, 2]  # 1 − 1/e
+    Array(0.63212056, dtype=float64)
+    """
+
+    source: Any
+    time: Float[Array, "*k"]
+    start: Array | None
+
+    def __init__(self, source: Any, time: Any, start: Any = None):
+        self.source = _checks.function(source, "source", "of time")
+        kind = jnp.result_type(float)
+        time = _checks.if_known(_checks.sign, _channels(time, "time"), "time", "a positive time, s")
+        self.time = time.astype(kind)
+        self.start = None if start is None else _channels(start, "start").astype(kind)
+
+    @property
+    def jump_times(self) -> Float[Array, " n"]:
+        """Times, s, where the source jumps: the value has a kink there."""
+        return jumps_of(self.source)
+
+    def state0(self, t: ScalarLike, state: Any, body: Any) -> Array:
+        """The value at the start."""
+        return self.source(t) if self.start is None else self.start
+
+    def rate(self, t: ScalarLike, own: Array, state: Any, body: Any) -> Array:
+        """dy/dt, in the source's unit per second."""
+        wanted = _checks.numbers(self.source(t), "source(t)").astype(own.dtype)
+        if jnp.shape(wanted) != jnp.shape(own):
+            raise ValueError(
+                f"Lagged: start has the shape {jnp.shape(own)}, the source {jnp.shape(wanted)}"
+            )
+        return (wanted - own) / self.time
+
+    def __call__(self, t: ScalarLike, own: Array) -> Array:
+        return own
+
+
+def _channels(value: Any, name: str) -> Array:
+    array = _checks.numbers(value, name)
+    if not array.size:
+        raise ValueError(f"{name}: wanted one number, or one a channel, got none")
+    return _checks.if_known(_checks.finite, array, name)
 
 
 class Row(NamedTuple):
@@ -160,21 +223,13 @@ def _is_delayed(node: Any) -> bool:
 
 
 def delays_of(law: Any) -> list[tuple[str, Array]]:
-    """The name and the delay of each delayed input, as they stand in the law.
-
-    >>> [(name, float(delay)) for name, delay in delays_of((Delayed(Input("u"), 0.1), Input("v")))]
-    [('u', 0.1)]
-    """
+    """The name and the delay of each delayed input, as they stand in the law."""
     nodes = jax.tree.leaves(law, is_leaf=_is_delayed)
     return [(node.source.name, node.delay) for node in nodes if _is_delayed(node)]
 
 
 def inputs_of(law: Any) -> list[str]:
-    """The names of the inputs that a law reads.
-
-    >>> inputs_of((Input("a"), Input("b"), Input("a")))
-    ['a', 'b']
-    """
+    """The names of the inputs that a law reads."""
     nodes = jax.tree.leaves(law, is_leaf=lambda node: isinstance(node, Input))
     return list(dict.fromkeys(node.name for node in nodes if isinstance(node, Input)))
 
@@ -184,9 +239,6 @@ def require_inputs(law: Any, inputs: Any) -> Mapping[str, Any]:
 
     **Raises:** `ValueError` for one that is missing, or that the law does not read; `TypeError` for
     what is no mapping.
-
-    >>> sorted(require_inputs(Input("u"), {"u": 1.0}))
-    ['u']
     """
     read, found = inputs_of(law), {} if inputs is None else inputs
     if not isinstance(found, Mapping):

@@ -16,7 +16,22 @@ Times = Float[ArrayLike, " times"] | Sequence[Any]
 Rows = Float[ArrayLike, "rows 3"] | Sequence[Any]
 
 
-class Linear(eqx.Module):
+class _Table(eqx.Module):
+    """Rows of numbers against time."""
+
+    times: Float[Array, " n"]
+    values: Float[Array, "n *k"]
+
+    def __init__(self, times: Times, values: Float[ArrayLike, "rows *k"] | Sequence[Any]):
+        self.times, self.values = _rows("times", times, "values", values)
+
+    @property
+    def jump_times(self) -> Float[Array, " n"]:
+        """The times of the rows, s: the value jumps, or has a kink, at each."""
+        return self.times
+
+
+class Linear(_Table):
     """A function of time, t → (*k): straight lines between rows, constant beyond the ends.
 
     **Arguments:** `times` (n,) s, increasing; `values` (n, *k), any number of channels: (n, 3) for
@@ -31,27 +46,13 @@ class Linear(eqx.Module):
     Array([0., 0., 2.], dtype=float64)
     """
 
-    times: Float[Array, " n"]
-    values: Float[Array, "n *k"]
-
-    def __init__(self, times: Times, values: Float[ArrayLike, "rows *k"] | Sequence[Any]):
-        self.times, self.values = _rows(("times", times), ("values", values), extra=0, shape=None)
-
-    @property
-    def jump_times(self) -> Float[Array, " n"]:
-        """The times of the rows, s: the function has a kink at each."""
-        return self.times
-
     def __call__(self, t: ScalarLike) -> Array:
         """The value at `t` (s), (*k)."""
         t = jnp.asarray(t, self.times.dtype)
-        i = jnp.clip(_row(self.times, t), 0, self.times.shape[0] - 2)
-        low, high = self.times[i], self.times[i + 1]
-        part = (jnp.clip(t, self.times[0], self.times[-1]) - low) / (high - low)
-        return self.values[i] + part * (self.values[i + 1] - self.values[i])
+        return _line(self.times, self.values, jnp.clip(t, self.times[0], self.times[-1]))
 
 
-class Held(eqx.Module):
+class Held(_Table):
     """A function of time, t → (*k), that holds each sample until the next one (zero-order hold).
 
     **Arguments:** `times` (n,) s, increasing; `values` (n, *k), row i from time i on, the first
@@ -66,17 +67,6 @@ class Held(eqx.Module):
     >>> Held([0.0, 1.0, 2.0], [[5.0], [6.0], [7.0]])(1.5)
     Array([6.], dtype=float64)
     """
-
-    times: Float[Array, " n"]
-    values: Float[Array, "n *k"]
-
-    def __init__(self, times: Times, values: Float[ArrayLike, "rows *k"] | Sequence[Any]):
-        self.times, self.values = _rows(("times", times), ("values", values), extra=0, shape=None)
-
-    @property
-    def jump_times(self) -> Float[Array, " n"]:
-        """The times of the samples, s: the value jumps at each."""
-        return self.times
 
     def __call__(self, t: ScalarLike) -> Array:
         """The value at `t` (s), (*k)."""
@@ -106,7 +96,7 @@ class Tabulated(AbstractTorque):
     torques: Float[Array, "n 3"]
 
     def __init__(self, times: Times, torques: Rows):
-        self.times, self.torques = _rows(("times", times), ("torques", torques), extra=0)
+        self.times, self.torques = _rows("times", times, "torques", torques, extra=0)
 
     @property
     def jump_times(self) -> Float[Array, " n"]:
@@ -116,9 +106,7 @@ class Tabulated(AbstractTorque):
     def __call__(self, t: ScalarLike, state: HasSpin, body: object) -> Vec3:
         t = jnp.asarray(t, self.times.dtype)
         inside = (t >= self.times[0]) & (t < self.times[-1])
-        i = jnp.clip(_row(self.times, t), 0, self.times.shape[0] - 2)
-        part = (t - self.times[i]) / (self.times[i + 1] - self.times[i])
-        value = self.torques[i] + part * (self.torques[i + 1] - self.torques[i])
+        value = _line(self.times, self.torques, t)
         return jnp.where(inside, value, jnp.zeros_like(value))
 
 
@@ -144,7 +132,7 @@ class Pulses(AbstractTorque):
     torques: Float[Array, "n 3"]
 
     def __init__(self, edges: Times, torques: Rows):
-        self.edges, self.torques = _rows(("edges", edges), ("torques", torques), extra=1)
+        self.edges, self.torques = _rows("edges", edges, "torques", torques, extra=1)
 
     @property
     def jump_times(self) -> Float[Array, " edges"]:
@@ -170,47 +158,38 @@ def _row(times: Float[Array, " n"], t: Scalar) -> Any:
     return jnp.searchsorted(times, t, side="right", method=method) - 1
 
 
+def _line(times: Float[Array, " n"], rows: Float[Array, "n *k"], t: Scalar) -> Array:
+    """The value at `t` of the straight line between the rows around it."""
+    i = jnp.clip(_row(times, t), 0, times.shape[0] - 2)
+    part = (t - times[i]) / (times[i + 1] - times[i])
+    return rows[i] + part * (rows[i + 1] - rows[i])
+
+
 def _rows(
-    named_times: tuple[str, Any],
-    named_rows: tuple[str, Any],
-    extra: int,
-    shape: tuple[int, ...] | None = (3,),
+    name: str, times: Any, other: str, values: Any, extra: int | None = None
 ) -> tuple[Array, Array]:
-    """Times and rows of one precision, checked; each with its name. `shape` of a row, if known."""
-    (name, times), (other, values) = named_times, named_rows
-    count, least = _length(times), 2
-    if count is None or count < least:
-        raise ValueError(f"{name}: wanted at least {least} times, shape (n,), got {_shape(times)}")
-    if _length(values) != count - extra and shape is not None:
-        advice = (
-            "; n constant pieces have n + 1 edges (Tabulated draws lines between n rows)"
-            if extra
-            else "; n times go with n rows (constant pieces: Pulses)"
-        )
-        raise ValueError(f"{other}: wanted {count - extra} rows of 3, got {_shape(values)}{advice}")
-    times = _checks.finite(_checks.floating(times, (count,), name), name)
-    rows = _checks.numbers(values, other)
-    if shape is None and rows.shape[:1] != (count,):
+    """Times and rows of one precision, checked. `extra` times more than rows, which are of 3."""
+    times, rows = _checks.rows(times, (), name), _checks.numbers(values, other)
+    count = times.shape[0]
+    if count < 2:
+        raise ValueError(f"{name}: wanted at least 2 times, shape (n,), got {times.shape}")
+    if extra is None and rows.shape[:1] != times.shape:
         raise ValueError(f"{other}: wanted a row for each of {count} times, got {rows.shape}")
-    shape = rows.shape[1:] if shape is None else shape
-    values = _checks.finite(_checks.floating(values, (count - extra, *shape), other), other)
-    ordered = np.asarray(times) if _checks.known(times) else times
+    if extra is not None and rows.shape != (count - extra, 3):
+        advice = (
+            "n constant pieces have n + 1 edges (Tabulated draws lines between n rows)"
+            if extra
+            else "n times go with n rows (constant pieces: Pulses)"
+        )
+        raise ValueError(
+            f"{other}: wanted {count - extra} rows of 3, got shape {rows.shape}; {advice}"
+        )
+    times, rows = _checks.finite(times, name), _checks.finite(rows, other)
+    ordered = _checks.namespace(times).asarray(times)
     falling = ordered[1:] <= ordered[:-1]
     where = ""
-    if isinstance(falling, np.ndarray) and falling.any():
+    if _checks.known(falling) and falling.any():
         where = f"; {name}[{int(np.argmax(falling)) + 1}] is not above the one before"
     times = _checks.refuse(times, falling.any(), f"{name}: wanted increasing times, s{where}")
-    dtype = jnp.result_type(times, values)
-    return times.astype(dtype), values.astype(dtype)
-
-
-def _length(value: Any) -> int | None:
-    shape = _shape(value)
-    return shape[0] if isinstance(shape, tuple) and shape else None
-
-
-def _shape(value: Any) -> Any:
-    try:
-        return tuple(np.shape(value))
-    except ValueError:
-        return "rows of different lengths"
+    dtype = jnp.result_type(times, rows)
+    return times.astype(dtype), rows.astype(dtype)

@@ -28,15 +28,11 @@ class RandomTorque(AbstractTorque):
     """
 
     feels: ClassVar[type] = HasSpin
+    steady: ClassVar[bool] = True
     density: Float[Array, "3"]
 
     def __init__(self, density: Any):
         self.density = density_of(density)
-
-    @property
-    def steady(self) -> bool:
-        """Its mean does not depend on time."""
-        return True
 
     def __call__(self, t: ScalarLike, state: HasSpin, body: object) -> Vec3:
         return jnp.zeros_like(self.density)
@@ -60,19 +56,14 @@ class CorrelatedTorque(AbstractTorque):
     """
 
     feels: ClassVar[type] = HasSpin
+    steady: ClassVar[bool] = True
     density: Float[Array, "3"]
     time: Scalar
 
     def __init__(self, density: Any, time: Any):
         self.density = density_of(density)
-        number = jnp.asarray(_checks.floating(time, (), "time")).astype(self.density.dtype)
-        words = "time: wanted a positive correlation time, s"
-        self.time = _checks.refuse(number, ~((number > 0) & jnp.isfinite(number)), words)
-
-    @property
-    def steady(self) -> bool:
-        """Its mean does not depend on time."""
-        return True
+        number = _checks.floating(time, (), "time").astype(self.density.dtype)
+        self.time = _checks.sign(number, "time", "a positive correlation time, s")
 
     @property
     def deviation(self) -> Vec3:
@@ -84,14 +75,9 @@ class CorrelatedTorque(AbstractTorque):
 
 
 def density_of(value: Any, name: str = "density", size: int = 3) -> Array:
-    """A spectral density (size,) of one number or as many, none below zero.
-
-    >>> density_of(2.0, size=2).tolist()
-    [2.0, 2.0]
-    """
+    """A spectral density (size,) of one number or as many, none below zero."""
     density = _checks.numbers(value, name)
     if density.shape not in ((), (size,)):
         raise ValueError(f"{name}: wanted one number or {size}, got shape {density.shape}")
     density = jnp.broadcast_to(density, (size,)).astype(density.dtype)
-    words = f"{name}: wanted a finite number that is not below zero"
-    return _checks.refuse(density, ~((density >= 0) & jnp.isfinite(density)).all(), words)
+    return _checks.sign(density, name, "a finite number that is not below zero", zero=True)

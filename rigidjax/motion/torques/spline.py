@@ -11,7 +11,6 @@ from jaxtyping import Array, ArrayLike, Float
 
 from rigidjax import _checks
 from rigidjax._types import Scalar, ScalarLike, Vec3
-from rigidjax.motion.torques.base import given
 from rigidjax.rotation.barrier import barrier
 from rigidjax.rotation.linalg3 import cross, dot
 
@@ -49,7 +48,7 @@ class Series(eqx.Module):
                 f"Series: wanted at least four times and as many rows, got shapes {t.shape} and "
                 f"{rows.shape}"
             )
-        t, rows = _finite(t, "times"), _finite(rows, "values")
+        t, rows = _checks.finite(t, "Series: times"), _checks.finite(rows, "Series: values")
         step = (t[-1] - t[0]) / (t.size - 1)
         uneven = ~((step > 0) & (abs(t[1:] - t[:-1] - step).max() <= 1e-6 * step))
         step = _checks.refuse(
@@ -60,7 +59,7 @@ class Series(eqx.Module):
         dtype = jnp.result_type(float)
         self.start, self.step = jnp.asarray(t[0], dtype), jnp.asarray(step, dtype)
         self.values = jnp.asarray(rows, dtype)
-        self.slopes = _finite(_slopes(self.values), "slopes of the values")
+        self.slopes = _checks.finite(_slopes(self.values), "Series: slopes of the values")
 
     def __call__(self, t: ScalarLike) -> Any:
         """The value at `t` (s), () or (k,)."""
@@ -84,11 +83,6 @@ def _numbers(value: Any, name: str) -> Any:
     if _checks.known(value):
         return _checks.on_host(value, f"Series: {name}")
     return _checks.numbers(value, f"Series: {name}").astype(jnp.result_type(float))
-
-
-def _finite(numbers: Any, name: str) -> Any:
-    bad = ~_checks.namespace(numbers).isfinite(numbers)
-    return _checks.refuse(numbers, bad.any(), f"Series: {name}: contains NaN or infinity")
 
 
 def _slopes(values: Float[Array, "n *channels"]) -> Float[Array, "n *channels"]:
@@ -148,12 +142,11 @@ class Wheel(eqx.Module):
             f"axis: wanted a unit vector (3,){found}",
         )
         _checks.function(speed, "speed", "of time to rad/s")
-        self.inertia = given(inertia, (), "inertia").astype(jnp.result_type(float))
-        self.axis = axis.astype(jnp.result_type(float))
-        self.speed = speed
         kind = jnp.result_type(float)
-        self.delay = None if delay is None else given(delay, (), "delay").astype(kind)
-        self.tilt = None if tilt is None else given(tilt, (2,), "tilt").astype(kind)
+        self.inertia = _checks.given(inertia, (), "inertia").astype(kind)
+        self.axis, self.speed = axis.astype(kind), speed
+        self.delay = None if delay is None else _checks.given(delay, (), "delay").astype(kind)
+        self.tilt = None if tilt is None else _checks.given(tilt, (2,), "tilt").astype(kind)
 
     @property
     def direction(self) -> Vec3:

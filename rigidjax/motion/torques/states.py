@@ -37,44 +37,21 @@ class Frozen(eqx.Module):
         if name.startswith("_") or name in ("law", "own", "state0", "rate"):
             raise AttributeError(name)
         found = getattr(self.law, name)
-        return _Last(found, self.own) if name in _OF_STATES else found
-
-
-class _Last(eqx.Module):
-    """A method with the states as its last argument."""
-
-    method: Callable[..., Any]
-    own: tuple[Any]
-
-    def __call__(self, *args: Any) -> Any:
-        return self.method(*args, self.own[0])
+        return Frozen(found, self.own) if name in _OF_STATES else found
 
 
 def has_own(node: object) -> bool:
-    """Whether this law, or function of time, itself has states: `state0` and `rate`.
-
-    >>> from rigidjax import torques
-    >>> has_own(torques.Lagged(torques.Input("u"), 0.1)), has_own(torques.Input("u"))
-    (True, False)
-    """
+    """Whether this law, or function of time, itself has states: `state0` and `rate`."""
     return not isinstance(node, type) and hasattr(node, "state0") and hasattr(node, "rate")
 
 
 def has_states(law: Any) -> bool:
-    """Whether a law, or anything inside it, has states of its own.
-
-    >>> from rigidjax import torques
-    >>> has_states(torques.InSpace(torques.Lagged(torques.Input("u"), 0.1)))
-    True
-    """
+    """Whether a law, or anything inside it, has states of its own."""
     return any(map(has_own, jax.tree.leaves(law, is_leaf=_stop)))
 
 
 def require_stateless(law: Any, what: str) -> None:
-    """Raise `ValueError` for a law with states of its own where they are not followed.
-
-    >>> require_stateless(None, "crossings")
-    """
+    """Raise `ValueError` for a law with states of its own where they are not followed."""
     if has_states(law):
         raise ValueError(
             f"{what}: wanted a torque without states of its own, got one that has some (such as "
@@ -151,10 +128,7 @@ def rates_of(
 
 
 def require_frozen(law: Any) -> None:
-    """Raise `TypeError` for a law that was to be called without its states.
-
-    >>> require_frozen(lambda t, state, body: -state.omega)
-    """
+    """Raise `TypeError` for a law that was to be called without its states."""
     if has_own(law):
         raise TypeError(
             f"{type(law).__name__} has states of its own (state0, rate): simulate, batch.rollout, "

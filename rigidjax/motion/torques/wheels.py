@@ -1,34 +1,75 @@
-"""Reaction wheels: a gyrostat whose wheels have speeds of their own."""
+"""Wheels inside the body (a gyrostat): of known momentum, or with speeds of their own."""
 
 from collections.abc import Callable
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from rigidjax import _checks
 from rigidjax._types import HasSpin, Scalar, ScalarLike, Vec3
-from rigidjax.body import validation
-from rigidjax.body.inertia import Inertia, MassProperties
+from rigidjax.body.inertia import Body, Inertia, MassProperties, tensor_of, with_tensor
 from rigidjax.body.symmetric3 import outer
-from rigidjax.motion.torques.base import (
-    AbstractTorque,
-    constant_or_callable,
-    given,
-    jumps_of,
-    vector_at,
-)
+from rigidjax.motion.torques import base
+from rigidjax.motion.torques.states import has_states
 from rigidjax.rotation.linalg3 import cross
 
-Body = TypeVar("Body", Inertia, MassProperties)
 Numbers = Float[ArrayLike, "*wheels"] | Any
 # Where a wheel's top speed is near, what its motor can still give falls to nothing.
 _FADE = 0.05
 
 
-class ReactionWheels(AbstractTorque):
+class Flywheel(base.OfTime):
+    """What wheels inside do to the body that carries them: `τ = h × Ω − dh/dt`.
+
+    **Arguments:** `momentum` h, N m s, body frame: (3,) for wheels that run at constant speed, or a
+    callable Module of time, t → (3,), for wheels that are spun up, such as `Linear(times, values)`.
+    Several wheels: give the sum.
+
+    The body's `Inertia` goes with the meaning of h. With the wheels counted as if locked, h is
+    their momentum relative to the body. With the wheels' axial moments taken out (I − Σ J a aᵀ),
+    h is their whole axial momentum, and dh/dt is the torque of the motors.
+
+    The momentum in space, `R (IΩ + h)`, is kept; the energy `½ Ω·IΩ` too while h is constant.
+    Source: Zhukovsky 1885, Volterra 1898; Hughes, Spacecraft Attitude Dynamics, chs. 3, 6.
+
+    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
+
+    >>> Flywheel([0.0, 0.0, 2.0]).internal_momentum(0.0)
+    Array([0., 0., 2.], dtype=float64)
+    """
+
+    feels: ClassVar[type] = HasSpin
+    momentum: eqx.Module | Float[Array, "3"]
+
+    def __init__(self, momentum: object):
+        self.momentum = base.constant_or_callable(momentum, "momentum")
+        if has_states(momentum):
+            raise TypeError(
+                "Flywheel: wanted a momentum whose derivative by time is known, got one with "
+                "states of its own; see ReactionWheels"
+            )
+
+    def internal_momentum(self, t: ScalarLike) -> Vec3:
+        """The wheels' momentum h at `t`, (3,), N m s, body frame."""
+        return base.vector_at(self.momentum, t, "momentum")
+
+    def energy(self, t: ScalarLike, state: HasSpin, body: object) -> Scalar:
+        """Zero, J: h × Ω does no work."""
+        return jnp.zeros((), state.omega.dtype)
+
+    def __call__(self, t: ScalarLike, state: HasSpin, body: object) -> Vec3:
+        source: Any = self.momentum
+        if not callable(source):
+            return cross(source, state.omega)
+        t = jnp.asarray(t, state.omega.dtype)
+        h, rate = jax.jvp(self.internal_momentum, (t,), (jnp.ones_like(t),))
+        return cross(h, state.omega) - rate
+
+
+class ReactionWheels(base.AbstractTorque):
     """Wheels on motors inside the body (a gyrostat): `τ = (Σ h a) × Ω − Σ u a`, `dh/dt = u`.
 
     **Arguments:** for R wheels
@@ -96,27 +137,22 @@ class ReactionWheels(AbstractTorque):
         coulomb: Numbers = None,
         turn_over: ScalarLike = 1.0,
     ):
-        shape = _checks.numbers(axes, "axes").shape
-        if len(shape) != 2 or shape[1] != 3 or not shape[0]:
-            raise ValueError(f"axes: wanted (R, 3), one row a wheel, got shape {shape}")
-        count = shape[0]
-        self.axes = given(axes, (count, 3), "axes")
-        if validation.known(self.axes):
-            lengths = np.linalg.norm(np.asarray(self.axes, float), axis=1)
-            if abs(lengths - 1).max() > 1e-6:
-                raise ValueError(f"axes: wanted unit vectors, got lengths {lengths}")
-        self.inertia = _positive(given(inertia, (count,), "inertia"), "inertia")
-        self.speeds = given(speeds, (count,), "speeds")
-        self.motor = None if motor is None else constant_or_callable(motor, "motor", count)
+        count = base.count_of(axes, "axes", "wheel")
+        self.axes = base.unit_rows(axes, "axes", count)
+        inertia = _checks.given(inertia, (count,), "inertia")
+        self.inertia = _checks.if_known(_checks.sign, inertia, "inertia", "> 0")
+        self.speeds = _checks.given(speeds, (count,), "speeds")
+        self.motor = None if motor is None else base.constant_or_callable(motor, "motor", count)
         if feedback is not None:
             words = "(t, state, speeds) → torques (R,), N m"
             feedback = _checks.function(feedback, "feedback", words)
         self.feedback = feedback
-        self.max_torque = _each(max_torque, count, "max_torque")
-        self.max_speed = _each(max_speed, count, "max_speed")
-        self.viscous = _each(viscous, count, "viscous", zero=True)
-        self.coulomb = _each(coulomb, count, "coulomb", zero=True)
-        self.turn_over = _positive(given(turn_over, (), "turn_over"), "turn_over")
+        self.max_torque = _each(max_torque, count, "max_torque", "> 0")
+        self.max_speed = _each(max_speed, count, "max_speed", "> 0")
+        self.viscous = _each(viscous, count, "viscous", "≥ 0")
+        self.coulomb = _each(coulomb, count, "coulomb", "≥ 0")
+        turn_over = _checks.given(turn_over, (), "turn_over")
+        self.turn_over = _checks.if_known(_checks.sign, turn_over, "turn_over", "> 0")
 
     @property
     def steady(self) -> bool:
@@ -127,7 +163,7 @@ class ReactionWheels(AbstractTorque):
     @property
     def jump_times(self) -> Float[Array, " n"]:
         """Times, s, where the motors' torques jump or have a kink."""
-        return jumps_of(self.motor)
+        return base.jumps_of(self.motor)
 
     def without_wheels(self, body: Body) -> Body:
         """The body without the wheels' axial moments: `I − Σ J a aᵀ`.
@@ -137,11 +173,7 @@ class ReactionWheels(AbstractTorque):
         _checks.single(body, (Inertia, MassProperties), "body")
         rows = (j * outer(a, a) for j, a in zip(self.inertia, self.axes, strict=True))
         taken = sum(rows, jnp.zeros((3, 3), self.axes.dtype))
-        if isinstance(body, Inertia):
-            return Inertia(body.tensor - taken)
-        rest = Inertia(body.inertia.tensor - taken)
-        # Not the constructor: what is left turns as no single body does, where wheels are large.
-        return eqx.tree_at(lambda b: b.second_moment, body, rest.second_moment)
+        return with_tensor(body, tensor_of(body) - taken)
 
     def speeds_of(self, own: Array, state: HasSpin) -> Float[Array, " wheels"]:
         """The speeds (R,) relative to the body, rad/s, of the momenta `own` and the state."""
@@ -156,7 +188,7 @@ class ReactionWheels(AbstractTorque):
         t = _checks.floating(t, (), "t")
         count, total = self.inertia.shape[0], jnp.zeros_like(speeds)
         if self.motor is not None:
-            total = total + vector_at(self.motor, t, "motor", count).astype(total.dtype)
+            total = total + base.vector_at(self.motor, t, "motor", count).astype(total.dtype)
         if self.feedback is not None:
             found = self.feedback(t, state, speeds)
             total = total + _checks.floating(found, (count,), "feedback(t, state, speeds)")
@@ -205,17 +237,9 @@ def _smooth(x: Array) -> Array:
     return x * x * x * (10.0 + x * (6.0 * x - 15.0))
 
 
-def _each(value: Any, count: int, name: str, *, zero: bool = False) -> Array | None:
-    """A number for all wheels, or one a wheel."""
+def _each(value: Any, count: int, name: str, wanted: str) -> Array | None:
+    """A number for all wheels, or one a wheel: "> 0" or "≥ 0"."""
     if value is None:
         return None
-    shape = (count,) if _checks.numbers(value, name).ndim else ()
-    return _positive(given(value, shape, name), name, zero=zero)
-
-
-def _positive(value: Array, name: str, *, zero: bool = False) -> Array:
-    if validation.known(value):
-        numbers = np.asarray(value)
-        if not ((numbers >= 0) if zero else (numbers > 0)).all():
-            raise ValueError(f"{name}: wanted {'≥ 0' if zero else '> 0'}, got {numbers}")
-    return value
+    found = base.each(value, count, name)
+    return _checks.if_known(_checks.sign, found, name, wanted, zero=wanted == "≥ 0")

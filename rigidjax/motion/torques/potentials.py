@@ -1,30 +1,23 @@
-"""Gravity on what only turns: a heavy top about its fixed point, and the gradient of a far body."""
+"""Torques of a potential: gravity on what only turns, a magnet in a field, any U(q)."""
 
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from rigidjax._types import HasAttitude, HasPose, Scalar, ScalarLike, Vec3
-from rigidjax.body import validation
-from rigidjax.body._types import Vector
-from rigidjax.body.inertia import Inertia, MassProperties
-from rigidjax.motion.torques.base import (
-    AbstractTorque,
-    constant_or_callable,
-    given,
-    jumps_of,
-    stays,
-    tensor_of,
-    vector_at,
-)
+from rigidjax import _checks
+from rigidjax._types import HasAttitude, HasPose, Scalar, ScalarLike, Vec3, Vector
+from rigidjax.body.inertia import Inertia, MassProperties, tensor_of
+from rigidjax.motion.torques import base
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.linalg3 import apply, cross, dot
 
 
-class HeavyTop(AbstractTorque):
+class HeavyTop(base.AbstractTorque):
     """Gravity on a body with a fixed point: `τ = c × m Rᵀg`, `U = −m g·Rc`.
 
     **Arguments:** `mass` m, kg; `com` (3,) c, from the fixed point to the centre of mass, m, body
@@ -46,21 +39,10 @@ class HeavyTop(AbstractTorque):
 
     feels: ClassVar[type] = HasAttitude
     rate_free: ClassVar[bool] = True
-    mass: Float[Array, ""]
-    com: Float[Array, "3"]
-    gravity: Float[Array, "3"]
-
-    def __init__(self, mass: ScalarLike, com: Vector, gravity: Vector):
-        self.mass = given(mass, (), "mass")
-        self.com = given(com, (3,), "com")
-        self.gravity = given(
-            gravity, (3,), "gravity", hint="a vector in world axes, such as [0, 0, -9.81]"
-        )
-
-    @property
-    def steady(self) -> bool:
-        """It does not depend on time."""
-        return True
+    steady: ClassVar[bool] = True
+    mass: Float[Array, ""] = eqx.field(converter=base.number("mass"))
+    com: Float[Array, "3"] = eqx.field(converter=base.vector("com"))
+    gravity: Float[Array, "3"] = eqx.field(converter=base.vector("gravity", hint=base.WORLD))
 
     @property
     def axis(self) -> Vec3:
@@ -81,7 +63,7 @@ class HeavyTop(AbstractTorque):
         return cross(self.mass * self.com, quaternion.rotate_inverse(state.q, self.gravity))
 
 
-class GravityGradient(AbstractTorque):
+class GravityGradient(base.OfTime):
     """The torque of a far central body: `τ = (3μ/r³) r̂' × I r̂'`, `r̂' = Rᵀ r̂`.
 
     **Arguments:** `mu` μ = G M of the central body, m³/s²; `position` r (3,) m, world frame, from
@@ -107,28 +89,18 @@ class GravityGradient(AbstractTorque):
     position: eqx.Module | Float[Array, "3"]
 
     def __init__(self, mu: ScalarLike, position: object):
-        self.mu = given(mu, (), "mu")
-        self.position = constant_or_callable(position, "position")
+        self.mu = _checks.given(mu, (), "mu")
+        self.position = base.constant_or_callable(position, "position")
         at: Any = self.position
-        if not callable(at) and validation.known(at) and not np.asarray(at).any():
+        if not callable(at) and _checks.known(at) and not np.asarray(at).any():
             raise ValueError(
                 "position: wanted the vector between the body and the central body, got zero"
             )
 
     @property
-    def steady(self) -> bool:
-        """Whether the central body stays where it is."""
-        return not callable(self.position)
-
-    @property
     def axis(self) -> Vec3 | None:
         """The direction without torque about it, world frame, if it stays: the position's."""
-        return stays(self.position)
-
-    @property
-    def jump_times(self) -> Float[Array, " n"]:
-        """Times, s, where the position jumps or has a kink."""
-        return jumps_of(self.position)
+        return base.stays(self.position)
 
     def energy(self, t: ScalarLike, state: HasAttitude, body: Inertia | MassProperties) -> Scalar:
         """Potential energy of the attitude, J: `U = (μ/2r³)(3 r̂'·I r̂' − Tr I)`."""
@@ -143,10 +115,98 @@ class GravityGradient(AbstractTorque):
 
     def _down(self, t, state):
         """Direction of the central body in body axes, and μ/r³."""
-        r = vector_at(self.position, t, "position")
+        r = base.vector_at(self.position, t, "position")
         distance = jnp.sqrt(dot(r, r))
         # r³ overflows in float32 beyond 7e12 m: divide by r three times instead.
         return (
             quaternion.rotate_inverse(state.q, r / distance),
             self.mu / distance / distance / distance,
         )
+
+
+class MagneticDipole(base.OfTime):
+    """A magnetic moment fixed in the body, in a uniform field: `τ = m × RᵀB`, `U = −m·RᵀB`.
+
+    **Arguments:** `moment` (3,) m, A m², body frame; `field` B, T, world frame: (3,), or a callable
+    Module of time, t → (3,), for a field that changes along an orbit.
+
+    Source: Jackson, Classical Electrodynamics, eqs 5.71, 5.72.
+
+    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
+
+    >>> import rigidjax as rj
+    >>> state = rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 0])
+    >>> MagneticDipole([0.0, 0.0, 2.0], [3.0, 0.0, 0.0])(0.0, state, None).tolist()  # z × x = y
+    [0.0, 6.0, 0.0]
+    """
+
+    feels: ClassVar[type] = HasAttitude
+    rate_free: ClassVar[bool] = True
+    moment: Float[Array, "3"]
+    field: eqx.Module | Float[Array, "3"]
+
+    def __init__(self, moment: Vector, field: object):
+        self.moment = _checks.given(moment, (3,), "moment")
+        self.field = base.constant_or_callable(field, "field")
+
+    @property
+    def axis(self) -> Vec3 | None:
+        """The direction about which there is no torque, world frame, if it stays: the field's."""
+        return base.stays(self.field)
+
+    def energy(self, t: ScalarLike, state: HasAttitude, body: object) -> Scalar:
+        """Potential energy, J: `U = −m·RᵀB`."""
+        return -dot(self.moment, self._field_in_body(t, state))
+
+    def __call__(self, t: ScalarLike, state: HasAttitude, body: object) -> Vec3:
+        return cross(self.moment, self._field_in_body(t, state))
+
+    def _field_in_body(self, t, state):
+        return quaternion.rotate_inverse(state.q, base.vector_at(self.field, t, "field"))
+
+
+class FromPotential(base.AbstractTorque):
+    """The torque of any potential `U(q)` on the attitude, by differentiation.
+
+    **Arguments:** `potential` a callable Module `q → U`, J, with `q` (4,) unit, body → world.
+
+    `τ_i = −∂U/∂q · ½ q ⊗ e_i`, the derivative along a turn about body axis i. Source: Landau and
+    Lifshitz, Mechanics, §34.
+
+    **Raises:** `TypeError` for what cannot be called, `ValueError` for a U that is not a number.
+
+    >>> class Spring(eqx.Module):
+    ...     k: Array
+    ...     def __call__(self, q):
+    ...         return 2.0 * self.k * (q[1] ** 2 + q[2] ** 2 + q[3] ** 2)
+    >>> from rigidjax import Attitude, quaternion
+    >>> at = Attitude(quaternion.exp(jnp.array([0.0, 0.0, 1e-3])), [0.0, 0, 0])
+    >>> FromPotential(Spring(jnp.array(2.0)))(0.0, at, None).round(5).tolist()
+    [-0.0, -0.0, -0.002]
+    """
+
+    feels: ClassVar[type] = HasAttitude
+    rate_free: ClassVar[bool] = True
+    steady: ClassVar[bool] = True
+    potential: Callable[[Any], Any]
+
+    def __init__(self, potential: Callable[[Any], Any]):
+        self.potential = _checks.function(potential, "potential", "q → U, J")
+
+    def energy(self, t: ScalarLike, state: HasAttitude, body: object) -> Scalar:
+        """Potential energy, J."""
+        return self._value(state.q)
+
+    def __call__(self, t: ScalarLike, state: HasAttitude, body: object) -> Vec3:
+        w, x, y, z = state.q
+        dw, dx, dy, dz = jax.grad(self._value)(state.q)
+        return -0.5 * jnp.stack(
+            [
+                -x * dw + w * dx + z * dy - y * dz,
+                -y * dw - z * dx + w * dy + x * dz,
+                -z * dw + y * dx - x * dy + w * dz,
+            ]
+        )
+
+    def _value(self, q):
+        return _checks.floating(self.potential(q), (), "potential", hint="one number, J")

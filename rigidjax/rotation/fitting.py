@@ -1,4 +1,4 @@
-"""The rotation that fits best: projection, alignment, Wahba's problem.
+"""The rotation that fits best: projection, alignment, Wahba's problem, the mean of rotations.
 
 No singular value decomposition and no eigenvectors: their derivatives are NaN at every rotation,
 where all three singular values are 1. The best rotation R of a 3×3 matrix B, the one with the
@@ -6,19 +6,19 @@ largest Tr(RᵀB), has the derivative dR = R hat(x), (Tr(S) 1 − S) x = 2 vee(R
 which is regular wherever the answer is unique.
 """
 
+from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
 from rigidjax import _checks
-from rigidjax._types import Mat3, Mat3Like, Scalar, Vec3Like
+from rigidjax._types import Mat3, Mat3Like, Quat, Scalar, Vec3Like
 from rigidjax.rotation import quaternion
-from rigidjax.rotation.kernels import matrix_to_quaternion
+from rigidjax.rotation.kernels import left_jacobian_inverse, matrix_to_quaternion
 from rigidjax.rotation.linalg3 import (
     cofactors,
     cross,
@@ -30,7 +30,7 @@ from rigidjax.rotation.linalg3 import (
     solve,
     vee,
 )
-from rigidjax.rotation.validation import direction
+from rigidjax.rotation.validation import direction, rotation_matrix, unit_quaternion
 
 
 def project(matrix: Mat3Like) -> Mat3:
@@ -45,7 +45,7 @@ def project(matrix: Mat3Like) -> Mat3:
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
     """
     matrix = _checks.floating(matrix, (3, 3), "matrix")
-    if not isinstance(matrix, Tracer):
+    if _checks.known(matrix):
         _checks.finite(matrix, "matrix")
         direction(matrix.reshape(9), "matrix")
         size = np.max(np.abs(np.asarray(matrix)))
@@ -121,6 +121,61 @@ def align(a: Vec3Like, b: Vec3Like) -> Mat3:
     return quaternion.to_matrix(quaternion.normalise(jnp.concatenate([w[None], axis])))
 
 
+def mean(matrices: Float[ArrayLike, "n 3 3"], weights: Float[ArrayLike, "n"] | None = None) -> Mat3:
+    """The Karcher mean: the rotation least in Σ w_i |angle to R_i|².
+
+    **Arguments:** `matrices` (n, 3, 3) rotations, within a quarter turn of the mean, where it is
+    unique (Karcher 1977, doi:10.1002/cpa.3160300502); `weights` (n,), not negative.
+
+    **Returns:** (3, 3), with first and second derivatives from the last two Newton steps alone.
+    **Raises:** as `so3.check`, if the matrices are known now; `ValueError` for weights that make no
+    mean.
+
+    >>> mean(jnp.stack([jnp.eye(3), jnp.eye(3)])).round(12).tolist()
+    [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+    """
+    matrices = _checks.rows(matrices, (3, 3), "matrices")
+    _checks.if_known(rotation_matrix, matrices, "matrices")
+    weights_of(weights, matrices[:, 0, 0], "matrices")
+    return quaternion.to_matrix(mean_quaternion(jax.vmap(matrix_to_quaternion)(matrices), weights))
+
+
+def mean_quaternion(
+    quaternions: Float[ArrayLike, "n 4"], weights: Float[ArrayLike, "n"] | None = None
+) -> Quat:
+    """The Karcher mean of unit quaternions; each may have either sign.
+
+    **Arguments:** `quaternions` (n, 4); `weights` (n,). See `mean`. **Returns:** (4,), w ≥ 0.
+    **Raises:** as `quaternion.check`, if they are known now.
+
+    >>> mean_quaternion(jnp.array([[1.0, 0, 0, 0], [-1.0, 0, 0, 0]])).tolist()
+    [1.0, 0.0, 0.0, 0.0]
+    """
+    q = _checks.rows(quaternions, (4,), "quaternions")
+    _checks.if_known(unit_quaternion, q, "quaternions")
+    return _karcher(q, of_order_one(weights_of(weights, q[:, 0], "quaternions")))
+
+
+# Compiled once: called from the prompt, the loop would be compiled anew each time.
+@partial(jax.jit, inline=True)
+def _karcher(q: Float[Array, "n 4"], w: Float[Array, "n"]) -> Quat:
+
+    def newton(_: Any, start: Quat, q: Array, w: Array) -> Quat:
+        apart = jax.vmap(lambda each: quaternion.multiply(quaternion.conjugate(start), each))(q)
+        v = jax.vmap(quaternion.log)(apart)
+        slope = (w[:, None, None] * jax.vmap(left_jacobian_inverse)(v)).sum(0)
+        return quaternion.multiply(start, quaternion.exp(solve(slope, (w[:, None] * v).sum(0))))
+
+    fixed_q, fixed_w = lax.stop_gradient((q, w))
+    chord = (fixed_w[:, None, None] * jax.vmap(quaternion.to_matrix)(fixed_q)).sum(0)
+    start = matrix_to_quaternion(nearest(chord))
+    start = lax.fori_loop(0, 6, lambda i, s: newton(i, s, fixed_q, fixed_w), start)
+    # Each Newton step from the solution doubles the order to which derivatives are right.
+    for i in range(2):
+        start = newton(i, lax.stop_gradient(start) if i == 0 else start, q, w)
+    return quaternion.canonical(quaternion.normalise(start))
+
+
 def of_order_one(x: Array) -> Array:
     """The same but for a power of two, where only ratios count: no product overflows."""
     return near_one(jnp.max(jnp.abs(x))) * x
@@ -133,10 +188,10 @@ def weights_of(weights: Any, like: Array, of: str) -> Array:
     if weights is None:
         return jnp.ones_like(like)
     w = _checks.floating(weights, like.shape, "weights")
-    if not isinstance(w, Tracer):
-        _checks.finite(w, "weights")
-        bad = (w < 0).any() | ~(w > 0).any()
-        _checks.refuse(w, bad, "weights: wanted numbers ≥ 0, of which one at least is positive")
+    if _checks.known(w):
+        words = "numbers ≥ 0, of which one at least is positive"
+        _checks.sign(_checks.finite(w, "weights"), "weights", words, zero=True)
+        _checks.refuse(w, ~(w > 0).any(), f"weights: wanted {words}")
     return w
 
 

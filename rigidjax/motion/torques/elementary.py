@@ -1,0 +1,105 @@
+"""Torques that stay the same, in the body or in space, and torques against the spin."""
+
+from typing import ClassVar
+
+import equinox as eqx
+from jaxtyping import Array, Float
+
+from rigidjax._types import HasAttitude, HasSpin, ScalarLike, Vec3
+from rigidjax.motion.torques import base
+from rigidjax.rotation import quaternion
+
+
+class ConstantTorque(base.AbstractTorque):
+    """A torque that stays the same in the body, such as a thruster: `τ = const`.
+
+    **Arguments:** `torque` (3,) N m, body frame. About a principal axis it spins the body up
+    linearly (Euler 1758); for one in space see `InSpace`.
+
+    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
+
+    >>> import rigidjax as rj
+    >>> ConstantTorque([0.0, 0.0, 1.0])(0.0, rj.Spin([0.0, 0.0, 5.0]), None).tolist()
+    [0.0, 0.0, 1.0]
+    """
+
+    feels: ClassVar[type] = HasSpin
+    rate_free: ClassVar[bool] = True
+    steady: ClassVar[bool] = True
+    torque: Float[Array, "3"] = eqx.field(converter=base.vector("torque"))
+
+    def __call__(self, t: ScalarLike, state: HasSpin, body: object) -> Vec3:
+        return self.torque
+
+
+class InSpace(base.OfTime):
+    """A torque whose direction is given in space: `τ = Rᵀ τ_w`.
+
+    **Arguments:** `torque` τ_w, N m, world frame: (3,), or a callable Module of time, t → (3,),
+    such as `Linear(times, values)`.
+
+    A constant τ_w keeps the angular momentum across it, and adds τ_w t along it.
+
+    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
+
+    >>> import rigidjax as rj
+    >>> turned = rj.Attitude([0.0, 1.0, 0.0, 0.0], [0.0, 0, 0])  # half a turn about x
+    >>> InSpace([0.0, 0.0, 1.0])(0.0, turned, None).tolist()  # in body axes
+    [0.0, 0.0, -1.0]
+    """
+
+    feels: ClassVar[type] = HasAttitude
+    rate_free: ClassVar[bool] = True
+    torque: eqx.Module | Float[Array, "3"]
+
+    def __init__(self, torque: object):
+        self.torque = base.constant_or_callable(torque, "torque")
+
+    def __call__(self, t: ScalarLike, state: HasAttitude, body: object) -> Vec3:
+        return quaternion.rotate_inverse(state.q, base.vector_at(self.torque, t, "torque"))
+
+
+class _Against(base.AbstractTorque):
+    """A torque against the spin, with a coefficient for each body axis."""
+
+    feels: ClassVar[type] = HasSpin
+    steady: ClassVar[bool] = True
+    coefficient: Float[Array, "3"] = eqx.field(
+        converter=base.vector("coefficient", hint="one number for each body axis")
+    )
+
+
+class Damping(_Against):
+    """Linear damping `τ = −c Ω`, component by component.
+
+    **Arguments:** `coefficient` (3,) c along the body axes, N m s/rad. A sphere of inertia I then
+    slows as exp(−c t/I). For a ball in a viscous fluid c = 8πηr³ (Kirchhoff 1876; Lamb,
+    Hydrodynamics, §334).
+
+    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
+
+    >>> Damping([0.1, 0.1, 0.1]).coefficient.shape
+    (3,)
+    """
+
+    def __call__(self, t: ScalarLike, state: HasSpin, body: object) -> Vec3:
+        return -self.coefficient * state.omega
+
+
+class QuadraticDamping(_Against):
+    """Quadratic damping `τ = −c |Ω| Ω`, component by component.
+
+    **Arguments:** `coefficient` (3,) c along the body axes, N m s²/rad². A body turning about a
+    principal axis then slows as Ω0/(1 + c Ω0 t/I): drag at a large Reynolds number (Newton,
+    Principia, Book II, Section II).
+
+    At Ω = 0 the first derivative is right, and zero; a second does not exist there.
+
+    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
+
+    >>> QuadraticDamping([0.1, 0.1, 0.1]).coefficient.shape
+    (3,)
+    """
+
+    def __call__(self, t: ScalarLike, state: HasSpin, body: object) -> Vec3:
+        return -base.length_or_zero(state.omega) * self.coefficient * state.omega
