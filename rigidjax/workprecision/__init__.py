@@ -5,7 +5,6 @@ chart, `choose` the short table. `python -m rigidjax workprecision` is all of it
 """
 
 from rigidjax._names import own_names
-from rigidjax.workprecision.baseline import moved as moved
 from rigidjax.workprecision.chart import draw as draw
 from rigidjax.workprecision.drift import long_drift as long_drift
 from rigidjax.workprecision.jax_methods import diffrax_method as diffrax_method
@@ -22,14 +21,14 @@ from rigidjax.workprecision.pareto import (
     table as table,
     time_to as time_to,
 )
+from rigidjax.workprecision.peers import methods as methods
 from rigidjax.workprecision.record import (
     Record as Record,
+    moved as moved,
     read_csv as read_csv,
     write_csv as write_csv,
 )
-from rigidjax.workprecision.reference import Reference as Reference
-from rigidjax.workprecision.registry import methods as methods
-from rigidjax.workprecision.scene import Scene as Scene
+from rigidjax.workprecision.scene import Reference as Reference, Scene as Scene
 from rigidjax.workprecision.standard_scenes import scenes as scenes
 
 __dir__ = own_names(__name__)

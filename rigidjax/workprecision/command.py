@@ -8,12 +8,12 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from rigidjax.workprecision import baseline, chart, pareto
+from rigidjax.workprecision import chart, pareto
 from rigidjax.workprecision.drift import long_drift
 from rigidjax.workprecision.measurement import measure
 from rigidjax.workprecision.method import Method
-from rigidjax.workprecision.record import Record, read_csv, write_csv
-from rigidjax.workprecision.registry import methods
+from rigidjax.workprecision.peers import methods
+from rigidjax.workprecision.record import Record, kept, moved, read_csv, write_csv
 from rigidjax.workprecision.standard_scenes import scenes
 
 STORED = Path("tests/workprecision/record.csv")
@@ -29,14 +29,28 @@ SMALL = {
 }
 DRIFT = "long-drift"
 # Compiling gradients is most of a run: of all scenes, these; of a scene that is named, always.
-GRADED = (
-    "free-top",
-    "heavy-top",
-    "asymmetric-top",
-    "gravity-gradient",
-    "damped-gyrostat",
-    "arenstorf",
-)
+GRADED = (*QUICK, "asymmetric-top", "gravity-gradient", "arenstorf")
+_FILE: dict[str, Any] = {"type": Path, "metavar": "FILE"}
+_FLAG: dict[str, Any] = {"action": "store_true"}
+_STORED = _FILE | {"nargs": "?", "const": STORED}
+OPTIONS: dict[str, dict[str, Any]] = {
+    "scene": dict(nargs="*", metavar="SCENE", help="which scenes (default: all)"),
+    "--quick": _FLAG | dict(help="three scenes, few settings"),
+    "--no-peers": _FLAG | dict(help="only what runs in JAX"),
+    "--no-gradients": _FLAG | dict(help="values only"),
+    "--thin": dict(type=int, default=1, metavar="N", help="every N-th setting"),
+    "--csv": _FILE | dict(help="keep the records"),
+    "--figure": _FILE | dict(help="draw the charts"),
+    "--from": _FILE | dict(dest="stored", help="measure nothing, read the records of --csv"),
+    "--choose": _FLAG | dict(help="scene × error → method"),
+    "--keep": _STORED
+    | dict(help=f"store the table that --check compares with (default: {STORED}); a quick run"),
+    "--check": _STORED
+    | dict(
+        help=f"say what moved since a stored table (default: {STORED}); a quick run; exit code 1 "
+        "if an error or a number of steps did"
+    ),
+}
 
 
 def add(commands: Any) -> None:
@@ -50,33 +64,8 @@ def add(commands: Any) -> None:
         epilog=f"Scenes: {', '.join(scenes())}, {DRIFT} (a million steps). Without a scene: all "
         "but the slow ones.",
     )
-    parser.add_argument("scene", nargs="*", metavar="SCENE", help="which scenes (default: all)")
-    parser.add_argument("--quick", action="store_true", help="three scenes, few settings")
-    parser.add_argument("--no-peers", action="store_true", help="only what runs in JAX")
-    parser.add_argument("--no-gradients", action="store_true", help="values only")
-    parser.add_argument("--thin", type=int, default=1, metavar="N", help="every N-th setting")
-    parser.add_argument("--csv", type=Path, metavar="FILE", help="keep the records")
-    parser.add_argument("--figure", type=Path, metavar="FILE", help="draw the charts")
-    parser.add_argument("--from", dest="stored", type=Path, metavar="FILE",
-                        help="measure nothing, read the records of --csv")  # fmt: skip
-    parser.add_argument("--choose", action="store_true", help="scene × error → method")
-    parser.add_argument(
-        "--keep",
-        nargs="?",
-        type=Path,
-        const=STORED,
-        metavar="FILE",
-        help=f"store the table that --check compares with (default: {STORED}); a quick run",
-    )
-    parser.add_argument(
-        "--check",
-        nargs="?",
-        type=Path,
-        const=STORED,
-        metavar="FILE",
-        help=f"say what moved since a stored table (default: {STORED}); a quick run; exit code 1 "
-        "if an error or a number of steps did",
-    )
+    for name, how in OPTIONS.items():
+        parser.add_argument(name, **how)
 
 
 def run(options: argparse.Namespace) -> int:
@@ -98,7 +87,7 @@ def run(options: argparse.Namespace) -> int:
             write_csv(records, options.csv)
             print(f"records: {options.csv}")
         if options.keep is not None:
-            write_csv(baseline.kept(records), options.keep)
+            write_csv(kept(records), options.keep)
             print(f"kept: {options.keep}")
         print(summary(records))
         if options.choose:
@@ -193,7 +182,7 @@ def _draw(records: list[Record], path: Path) -> None:
 
 
 def _compared(records: list[Record], before: list[Record]) -> int:
-    wrong, paced = baseline.moved(records, before)
+    wrong, paced = moved(records, before)
     for line in wrong:
         print(f"moved: {line}")
     for line in paced:

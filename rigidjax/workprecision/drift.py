@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +16,14 @@ from rigidjax.workprecision.record import Record
 STEPS = 1_000_000
 BODY = (0.7, 1.2, 1.6)
 LOOKS = 101
+# Length of a step, s.
+RUNS = {
+    "Splitting2": (0.1, solvers.Splitting2),
+    "Splitting4": (0.1, solvers.Splitting4),
+    "Splitting6": (0.2, solvers.Splitting6),
+    "DormandPrince8": (0.1, solvers.DormandPrince8),
+    "RungeKutta4": (0.02, solvers.RungeKutta4),
+}
 
 
 def long_drift(
@@ -44,41 +51,27 @@ def long_drift(
     start = Attitude([0.955336489125606, 0.29552020666133955, 0.0, 0.0], [0.4, 0.3, 1.2])
     law = HeavyTop(1.0, [0.05, 0.1, 0.3], [0.0, 0.0, -1.0])
     field = AttitudeEquations(body, law)
-
-    def equal(solver: Any) -> Callable[..., Any]:
-        return lambda ts, n: fixed(solver, field, ts, start, n)
-
-    runs: dict[str, tuple[float, Callable[..., Any]]] = {
-        "Splitting2": (0.1, equal(solvers.Splitting2())),
-        "Splitting4": (0.1, equal(solvers.Splitting4())),
-        "Splitting6": (0.2, equal(solvers.Splitting6())),
-        "DormandPrince8": (0.1, equal(solvers.DormandPrince8())),
-        "RungeKutta4": (0.02, equal(solvers.RungeKutta4())),
-    }
-    unknown = sorted(set(only or ()) - set(runs))
+    unknown = sorted(set(only or ()) - set(RUNS))
     if unknown:
-        raise ValueError(f"long_drift: no method {unknown[0]!r}; there are {', '.join(runs)}")
+        raise ValueError(f"long_drift: no method {unknown[0]!r}; there are {', '.join(RUNS)}")
     if steps < 100 * (LOOKS - 1):
         raise ValueError(f"long_drift: wanted {100 * (LOOKS - 1)} steps or more, got {steps}")
     found = []
-    for name, (h, run) in runs.items():
-        if only is not None and name not in only:
-            continue
+    for name in RUNS if only is None else [name for name in RUNS if name in only]:
+        h, solver = RUNS[name]
         if progress is not None:
             progress(f"long-drift: {name}")
+        run = jax.jit(lambda ts, n, s=solver: fixed(s(), field, ts, start, n))
         ts = jnp.linspace(0.0, h * steps, LOOKS)
-        early = jnp.linspace(0.0, h * steps / 100, LOOKS)
         begin = time.perf_counter()
-        ready = jax.jit(run).lower(ts, jnp.asarray(1)).compile()
+        ready = run.lower(ts, jnp.asarray(1)).compile()
         compiling = time.perf_counter() - begin
-        for scene, times, count in (
-            ("long-drift, first hundredth", early, steps // 100),
-            ("long-drift", ts, steps),
-        ):
+        for scene, part in (("long-drift, first hundredth", 100), ("long-drift", 1)):
+            count = steps // part
             begin = time.perf_counter()
-            ys = jax.block_until_ready(ready(times, jnp.asarray(count // (LOOKS - 1))))
+            ys = jax.block_until_ready(ready(ts / part, jnp.asarray(count // (LOOKS - 1))))
             spent = time.perf_counter() - begin
-            away = {k: float(v) for k, v in drift(times, ys, body, law).items()}
+            away = {k: float(v) for k, v in drift(ts / part, ys, body, law).items()}
             if not np.isfinite(list(away.values())).all():
                 raise FloatingPointError(f"long_drift: {name} gave no numbers: {away}")
             found.append(

@@ -9,14 +9,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from rigidjax import _checks
 from rigidjax.frames.frame_dynamics import scene_of
 from rigidjax.motion import Attitude, conserved
-from rigidjax.solve import equations_of_motion, fixed, solvers
-from rigidjax.workprecision import registry
+from rigidjax.solve import solvers
+from rigidjax.workprecision import peers as known
+from rigidjax.workprecision.jax_methods import equal_steps
 from rigidjax.workprecision.method import Method, Ready, Run
 from rigidjax.workprecision.record import Record
-from rigidjax.workprecision.reference import Reference
-from rigidjax.workprecision.scene import Scene, distance
+from rigidjax.workprecision.scene import Reference, Scene, distance
 
 # Runs longer than this, s, are timed three times, those shorter than SHORT thrice as often.
 LONG, SHORT = 0.5, 0.02
@@ -53,15 +54,11 @@ def measure(
 
     **Raises:** `TypeError` for something that is no `Scene` or `Method`.
     """
-    if not isinstance(scene, Scene):
-        raise TypeError(
-            f"measure: wanted a Scene, got {type(scene).__name__}; standard ones are made by "
-            'rj.workprecision.scenes()["heavy-top"]()'
-        )
-    chosen = [*(registry.methods() if methods is None else methods), *peers]
+    made = 'standard ones are made by rj.workprecision.scenes()["heavy-top"]()'
+    _checks.instance(scene, Scene, "scene", wanted="a Scene", hint=made)
+    chosen = [*(known.methods() if methods is None else methods), *peers]
     for method in chosen:
-        if not isinstance(method, Method):
-            raise TypeError(f"measure: wanted Methods, got {type(method).__name__}")
+        _checks.instance(method, Method, "methods", wanted="Methods")
     right = scene.reference if scene.reference is not None else worked_out(scene, gradients)
     jobs: list[_Job] = []
     for method in chosen:
@@ -88,21 +85,13 @@ def worked_out(scene: Scene, gradients: bool = True) -> Reference:
     **Arguments:** `scene`; `gradients` whether the gradient is worked out, too.
     """
     counts = (4000, 2000)
-    numbers = scene.numbers
-    ts = jnp.array([0.0, scene.end], numbers.dtype)
-
-    def flow(numbers: Any, count: Any) -> Any:
-        body, start = scene.assembled(numbers)
-        field = equations_of_motion(body, start, scene.torque)
-        ys = fixed(solvers.DormandPrince8(), field, ts, start, count)
-        return scene.flat(jax.tree.map(lambda leaf: leaf[-1], ys))
-
-    scale = max(1.0, _turn(scene) / 50)
+    numbers, scale = scene.numbers, max(1.0, _turn(scene) / 50)
+    flow = equal_steps(scene, solvers.DormandPrince8())
     run = jax.jit(flow)
-    take = jax.jit(jax.jacfwd(lambda p, count: scene.loss(flow(p, count))))
+    take = jax.jit(jax.jacfwd(lambda p, count: scene.loss(flow(p, count)[0])))
     ends, slopes = [], []
     for count in (jnp.asarray(round(c * scale)) for c in counts):
-        ends.append(np.asarray(run(numbers, count)))
+        ends.append(np.asarray(run(numbers, count)[0]))
         if gradients:
             slopes.append(np.asarray(take(numbers, count)))
     floor = 100 * float(np.finfo(ends[0].dtype).eps)

@@ -1,7 +1,10 @@
-"""A scene: what moves, for how long, and which numbers of it a gradient is taken by."""
+"""A scene: what moves, for how long, which numbers a gradient is taken by, and the right answer."""
 
+import functools
+import json
 from collections.abc import Callable
-from typing import Any
+from importlib import resources
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -13,10 +16,49 @@ from rigidjax.body.inertia import Inertia
 from rigidjax.frames import Point
 from rigidjax.motion import Attitude
 from rigidjax.rotation import quaternion
-from rigidjax.workprecision.reference import Reference
 
 # The scalar that gradients are taken of: a.R b + c.Ω/|Ω0| at the end, of no particular direction.
 A, B, C = (0.6, -0.48, 0.64), (0.36, 0.8, -0.48), (0.28, -0.5, 0.82)
+
+
+class Reference(NamedTuple):
+    """Where a scene ends, and the gradient of its scalar.
+
+    **Fields:** `end` the state as one tuple; `error` of its largest number, as estimated by the
+    method that made it; `gradient`, `gradient_error` the same, empty where there is none;
+    `source` words.
+
+    >>> top = stored("heavy top")
+    >>> top is None or top.error < 1e-12
+    True
+    """
+
+    end: tuple[float, ...]
+    error: float
+    gradient: tuple[float, ...]
+    gradient_error: float
+    source: str
+
+
+@functools.cache
+def _answers() -> dict[str, Any]:
+    folder = resources.files("rigidjax.workprecision")
+    return json.loads(folder.joinpath("references.json").read_text())
+
+
+def stored(name: str) -> Reference | None:
+    """The stored answer to the standard scene of this name, if there is one.
+
+    They are made by `tests/workprecision/make_references.py` at 40 digits and rounded to float64.
+
+    >>> stored("no such scene") is None
+    True
+    """
+    row = _answers().get(name)
+    if row is None:
+        return None
+    end, slope = (tuple(map(float, row[key])) for key in ("end", "gradient"))
+    return Reference(end, float(row["error"]), slope, float(row["gradient_error"]), row["source"])
 
 
 class Scene(eqx.Module):
