@@ -29,10 +29,21 @@ from rigidjax.identify.sensors import (
 )
 from rigidjax.motion.torques import Damping, Flywheel, Series, Sum, Torque, Wheel
 
-MODELS = ("ratios", "principal-ratios", "tensor", "principal")
-FREE = ("bias", "drag", "delay")
-LOSSES = ("soft-l1", "huber", "none")
-DEFAULT_UNITS = {"gyro": "rad/s", "accelerometer": "m/s2", "quaternion": "1"}
+# Of the typical size of a moment, kg m².
+MODELS: dict[str, Callable[[float], AbstractBodyChart]] = {
+    "ratios": lambda _: Ratios(),
+    "principal-ratios": lambda _: PrincipalRatios(),
+    "tensor": Tensor,
+    "principal": Principal,
+}
+LOSSES = {"soft-l1": SoftL1(), "huber": Huber(), "none": None}
+# The units of each kind of sensor, the usual one first; angles have those of "euler".
+SENSOR_UNITS = {
+    "gyro": ("rad/s", "deg/s", "rpm"),
+    "accelerometer": ("m/s2", "g"),
+    "quaternion": ("1",),
+    "euler": ("rad", "deg"),
+}
 
 
 class Channel(eqx.Module):
@@ -69,7 +80,8 @@ def channel(text: str) -> Channel:
     kind, _, rest = text.partition("=")
     names, *more = rest.split(":")
     columns = tuple(name.strip() for name in names.split(","))
-    if kind not in DEFAULT_UNITS and not kind.startswith("euler-"):
+    allowed = SENSOR_UNITS.get("euler" if kind.startswith("euler-") else kind)
+    if allowed is None or kind == "euler":
         raise LogError(
             f"sensor {text!r}: wanted gyro, accelerometer, quaternion or euler-SEQUENCE, as in "
             "gyro=wx,wy,wz:deg/s"
@@ -77,12 +89,7 @@ def channel(text: str) -> Channel:
     wanted = 4 if kind == "quaternion" else 3
     if len(columns) != wanted or not all(columns):
         raise LogError(f"sensor {text!r}: wanted {wanted} columns, got {names!r}")
-    unit = more[0] if more and more[0] else DEFAULT_UNITS.get(kind, "rad")
-    allowed = {
-        "gyro": ("rad/s", "deg/s", "rpm"),
-        "accelerometer": ("m/s2", "g"),
-        "quaternion": ("1",),
-    }.get(kind, ("rad", "deg"))
+    unit = more[0] if more and more[0] else allowed[0]
     if unit not in allowed:
         raise LogError(f"sensor {text!r}: wanted the unit {' or '.join(allowed)}, got {unit!r}")
     return Channel(kind, columns, unit, _noise(text, more[1]) if len(more) > 1 else None)
@@ -236,20 +243,12 @@ def problem_of(
 
     **Raises** `LogError` for an unknown model or a scale that nothing can show.
     """
-    charts: dict[str, AbstractBodyChart] = {
-        "ratios": Ratios(),
-        "principal-ratios": PrincipalRatios(),
-        "tensor": Tensor(typical),
-        "principal": Principal(typical),
-    }
-    if model not in charts:
+    if model not in MODELS:
         raise LogError(f"model: wanted one of {', '.join(MODELS)}, got {model!r}")
     if loss not in LOSSES:
         raise LogError(f"loss: wanted one of {', '.join(LOSSES)}, got {loss!r}")
-    counts = {"soft-l1": SoftL1(), "huber": Huber(), "none": None}[loss]
-    return Problem(
-        list(recordings), charts[model], free=_free(recordings[0], typical, free), loss=counts
-    )
+    chart, moving = MODELS[model](typical), _free(recordings[0], typical, free)
+    return Problem(list(recordings), chart, free=moving, loss=LOSSES[loss])
 
 
 def _free(first: Recording, typical: float, free: Sequence[str]) -> list[Free]:
