@@ -270,8 +270,8 @@ def _read(options: argparse.Namespace) -> tuple[list[Any], list[Any], rj.identif
         )
     if "delay" in options.free and not wheels:
         raise rj.identify.LogError("--free delay: that of a --wheel, and there is none")
-    how = dict(time=time, time_unit=options.time_unit or layout.time_unit, window=options.window)
-    how |= dict(wheels=wheels, free=options.free)
+    how: dict[str, Any] = dict(time=time, time_unit=options.time_unit or layout.time_unit)
+    how |= dict(window=options.window, wheels=wheels, free=options.free)
     records = [cli_spec.read_log(path, channels, **how) for path in options.logs]
     problem = cli_spec.problem_of(
         records, options.model, typical=options.typical, free=options.free, loss=options.loss
