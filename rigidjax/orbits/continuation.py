@@ -12,12 +12,12 @@ from jaxtyping import Array, Complex, Float
 from rigidjax import _checks
 from rigidjax._types import Scalar
 from rigidjax.orbits.differential_correction import (
-    MAX_STEPS,
     PeriodicOrbit,
     corrected,
     crossing,
     miss,
     named,
+    newton,
     orbit_of,
     together,
     usual_tolerance,
@@ -26,17 +26,7 @@ from rigidjax.orbits.differential_correction import (
 
 
 def at_values(scene: Any, orbit: PeriodicOrbit, values: Any, hold: str) -> PeriodicOrbit:
-    """The members of a family at given values of one number: see `ThreeBody.family`.
-
-    **Raises:** `ValueError` (`EquinoxRuntimeError` under `jit`) where a member is not found.
-
-    >>> from rigidjax import orbits
-    >>> from rigidjax.frames.point import Point
-    >>> hill = orbits.hill()
-    >>> orbit = PeriodicOrbit(Point([0.3, 0, 0], [0.0, 1.6, 0]), 1.2)
-    >>> [round(float(p), 3) for p in at_values(hill, orbit, [0.3, 0.31], "x").period]
-    [1.404, 1.536]
-    """
+    """The members of a family at given values of one number: see `ThreeBody.family`."""
     start, index = crossing(orbit), named(hold)
     length = np.shape(values)
     if len(length) != 1 or length[0] < 1:
@@ -89,15 +79,7 @@ def _at_values(scene: Any, start: Array, held: Array, index: int, tolerance: flo
 
 
 def slope(scene: Any, orbit: PeriodicOrbit, hold: str) -> PeriodicOrbit:
-    """How state and period change along the family, per unit of `hold`: `ThreeBody.family_slope`.
-
-    >>> from rigidjax import orbits
-    >>> from rigidjax.frames.point import Point
-    >>> hill = orbits.hill()
-    >>> orbit = hill.periodic_orbit(PeriodicOrbit(Point([0.3, 0, 0], [0.0, 1.6, 0]), 1.2))
-    >>> round(float(slope(hill, orbit, "x").period), 3)
-    12.076
-    """
+    """How an orbit changes along its family, per unit of `hold`: see `ThreeBody.family_slope`."""
     change = _slope(scene, crossing(orbit), named(hold))
     turned = ~jnp.isfinite(change.period)
     words = (
@@ -117,17 +99,7 @@ def _slope(scene: Any, numbers: Array, index: int) -> PeriodicOrbit:
 
 
 def follow(scene: Any, orbit: PeriodicOrbit, step: Any, count: int, rising: str) -> PeriodicOrbit:
-    """Members of a family at equal steps of arclength, past its folds: see `ThreeBody.follow`.
-
-    **Raises:** `ValueError` (`EquinoxRuntimeError` under `jit`) where a member is not found.
-
-    >>> from rigidjax import orbits
-    >>> from rigidjax.frames.point import Point
-    >>> hill = orbits.hill()
-    >>> orbit = hill.periodic_orbit(PeriodicOrbit(Point([0.3, 0, 0], [0.0, 1.6, 0]), 1.2))
-    >>> follow(hill, orbit, 0.05, 3, "x").state.x.shape
-    (3, 3)
-    """
+    """Members of a family at equal steps of arclength, past its folds: see `ThreeBody.follow`."""
     start, index = crossing(orbit), named(rising)
     step = _checks.floating(step, (), "step").astype(start.dtype)
     step = _checks.refuse(step, ~(jnp.isfinite(step) & (step != 0)), "step: wanted a number not 0")
@@ -161,18 +133,10 @@ def _follow(scene: Any, start: Array, step: Array, count: int, index: int, toler
         _, matrix = value_and_jacobian(missed, last)
         along = tangent(matrix, before)
 
-        def keep_on(carry: Any) -> Any:
-            return (carry[1] > 0.1 * tolerance) & (carry[2] < MAX_STEPS)
+        def across(numbers: Array) -> Array:
+            return jnp.append(missed(numbers), jnp.sum(along * (numbers - last)) - step)
 
-        def newton(carry: Any) -> Any:
-            numbers, _, n = carry
-            value, matrix = value_and_jacobian(missed, numbers)
-            value = jnp.append(value, jnp.sum(along * (numbers - last)) - step)
-            moved = numbers - jnp.linalg.solve(jnp.concatenate([matrix, along[None]]), value)
-            return jnp.where(jnp.isfinite(moved), moved, numbers), jnp.max(jnp.abs(value)), n + 1
-
-        guess: Any = last + step * along, jnp.full_like(step, jnp.inf), 0
-        found, _, _ = lax.while_loop(keep_on, newton, guess)
+        found = newton(across, last + step * along, tolerance)
         return (found, along), (found, jnp.max(jnp.abs(missed(found))))
 
     first = jnp.zeros(4, start.dtype).at[index].set(1)

@@ -46,16 +46,7 @@ class PeriodicOrbit(eqx.Module):
 def correct(
     scene: Any, guess: PeriodicOrbit, hold: str, tolerance: float | None = None
 ) -> PeriodicOrbit:
-    """The orbit near `guess` that crosses y = 0 at right angles twice: see `periodic_orbit`.
-
-    **Raises:** `ValueError` (`EquinoxRuntimeError` under `jit`) if Newton does not converge.
-
-    >>> from rigidjax import orbits
-    >>> hill = orbits.hill()
-    >>> orbit = correct(hill, PeriodicOrbit(Point([0.3, 0, 0], [0.0, 1.6, 0]), 1.2), "x")
-    >>> round(float(orbit.period), 3)
-    1.404
-    """
+    """The orbit near `guess` that crosses y = 0 at right angles twice: see `periodic_orbit`."""
     numbers, index = crossing(guess), named(hold)
     free = np.array([i for i in range(4) if i != index])
     if tolerance is None:
@@ -82,11 +73,7 @@ def correct(
 
 
 def named(hold: str) -> int:
-    """Which of the four numbers of a crossing `hold` names.
-
-    >>> named("vy")
-    2
-    """
+    """Which of the four numbers of a crossing `hold` names."""
     if hold not in _NAMES:
         raise ValueError(f"hold: wanted one of {', '.join(_NAMES)}, got {hold!r}")
     return _NAMES.index(hold)
@@ -119,33 +106,21 @@ def crossing(guess: PeriodicOrbit) -> Float[Array, "4"]:
 
 
 def orbit_of(numbers: Float[Array, "4"]) -> PeriodicOrbit:
-    """The inverse of `crossing`.
-
-    >>> orbit_of(jnp.array([0.9, 0.1, -0.5, 1.5])).state.v.tolist()
-    [0.0, -0.5, 0.0]
-    """
+    """The inverse of `crossing`."""
     x, z, vy, half = components(numbers)
     zero = jnp.zeros_like(x)
     return PeriodicOrbit(Point(jnp.stack([x, zero, z]), jnp.stack([zero, vy, zero])), 2 * half)
 
 
 def together(unknown: Float[Array, "3"], held: Scalar, index: int) -> Float[Array, "4"]:
-    """The four numbers of a crossing, the held one put in its place among the others.
-
-    >>> together(jnp.array([1.0, 2.0, 3.0]), jnp.asarray(9.0), 1).tolist()
-    [1.0, 9.0, 2.0, 3.0]
-    """
+    """The four numbers of a crossing, the held one put in its place among the others."""
     parts = [unknown[0], unknown[1], unknown[2]]
     parts.insert(index, held)
     return jnp.stack(parts)
 
 
 def usual_tolerance(numbers: Array) -> float:
-    """What is left of y, v_x, v_z at the half period: 1e-12, in float32 1e-4.
-
-    >>> usual_tolerance(jnp.zeros(4))
-    1e-12
-    """
+    """What is left of y, v_x, v_z at the half period: 1e-12, in float32 1e-4."""
     return 1e-12 if numbers.dtype == jnp.float64 else 1e-4
 
 
@@ -163,15 +138,28 @@ def miss(scene: Any, numbers: Float[Array, "4"]) -> Float[Array, "3"]:
 
 
 def value_and_jacobian(f: Any, x: Array) -> tuple[Array, Array]:
-    """f(x) and its Jacobian from one pass in forward mode.
-
-    >>> value_and_jacobian(lambda x: x**2, jnp.array([3.0]))[1].tolist()
-    [[6.0]]
-    """
+    """f(x) and its Jacobian from one pass in forward mode."""
     value, columns = jax.vmap(lambda e: jax.jvp(f, (x,), (e,)), out_axes=(None, 1))(
         jnp.eye(x.shape[0], dtype=x.dtype)
     )
     return value, columns
+
+
+def newton(f: Any, x: Array, tolerance: float) -> Array:
+    """A zero of `f` near `x`: steps until what is left is a tenth of the tolerance."""
+
+    def keep_on(carry: Any) -> Any:
+        _, left, count = carry
+        return (left > 0.1 * tolerance) & (count < MAX_STEPS)
+
+    def step(carry: Any) -> Any:
+        x, _, count = carry
+        missed, slope = value_and_jacobian(f, x)
+        moved = x - jnp.linalg.solve(slope, missed)
+        # The miss before the last move says how good the last start was; stop once it is small.
+        return jnp.where(jnp.isfinite(moved), moved, x), jnp.max(jnp.abs(missed)), count + 1
+
+    return lax.while_loop(keep_on, step, (x, jnp.full_like(x[0], jnp.inf), 0))[0]
 
 
 # Newton itself is not differentiated: the rule below is linear in the tangents, so that the same
@@ -183,20 +171,11 @@ def _solve(scene: Any, unknown: Array, held: Array, index: int, tolerance: float
 
 @eqx.filter_custom_jvp
 def corrected(index: int, tolerance: float, scene: Any, unknown: Array, held: Array) -> Any:
-    def keep_on(carry: Any) -> Any:
-        _, left, count = carry
-        return (left > 0.1 * tolerance) & (count < MAX_STEPS)
+    def missed(unknown: Array) -> Array:
+        return miss(scene, together(unknown, held, index))
 
-    def step(carry: Any) -> Any:
-        unknown, _, count = carry
-        missed, slope = value_and_jacobian(lambda u: miss(scene, together(u, held, index)), unknown)
-        moved = unknown - jnp.linalg.solve(slope, missed)
-        # The miss before the last move says how good the last start was; stop once it is small.
-        return jnp.where(jnp.isfinite(moved), moved, unknown), jnp.max(jnp.abs(missed)), count + 1
-
-    carry = unknown, jnp.full_like(held, jnp.inf), 0
-    unknown, _, _ = lax.while_loop(keep_on, step, carry)
-    return unknown, jnp.max(jnp.abs(miss(scene, together(unknown, held, index))))
+    unknown = newton(missed, unknown, tolerance)
+    return unknown, jnp.max(jnp.abs(missed(unknown)))
 
 
 @corrected.def_jvp

@@ -50,7 +50,10 @@ class AbstractReversible(AbstractScene):
 
         **Arguments:** `state` the start; `t` when. Its determinant is 1.
         """
-        return state_transition.transition(self, state, t, rtol=rtol, atol=atol)
+        _checks.instance(state, Point, "state", wanted="a Point(x, v)")
+        t = _checks.finite(_checks.floating(t, (), "t"), "t")
+        numbers = jnp.concatenate([state.x, state.v])
+        return state_transition.transition(self, numbers, t, rtol, atol)
 
     def monodromy(self, orbit: PeriodicOrbit) -> Float[Array, "6 6"]:
         """The transition matrix over one period; its eigenvalues say whether the orbit is stable.
@@ -135,6 +138,12 @@ class AbstractReversible(AbstractScene):
         the shape of an orbit: `.period` is d period/d hold. Exact (implicit function theorem).
 
         **Raises:** `ValueError` where the family turns back in `hold`.
+
+        >>> from rigidjax import orbits
+        >>> hill, start = orbits.hill(), Point([0.3, 0, 0], [0.0, 1.6, 0])
+        >>> orbit = hill.periodic_orbit(orbits.PeriodicOrbit(start, 1.2))
+        >>> round(float(hill.family_slope(orbit).period), 3)
+        12.076
         """
         return continuation.slope(self, orbit, hold)
 
