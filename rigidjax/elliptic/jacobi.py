@@ -83,12 +83,7 @@ def _functions(u: Any, m: Any, m1: Any) -> tuple[Any, Any, Any, Any]:
 
     s, c, d = _core(v, inner_m, inner_m1)
     turns = _turns(jax.lax.stop_gradient(v), jax.lax.stop_gradient(inner_m1))[0]
-    return (
-        s / root,
-        jnp.where(above, d, c),
-        jnp.where(above, c, d),
-        jnp.where(above, 0, turns),
-    )
+    return (s / root, jnp.where(above, d, c), jnp.where(above, c, d), jnp.where(above, 0, turns))
 
 
 @jax.custom_jvp

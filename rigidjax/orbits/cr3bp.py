@@ -44,13 +44,7 @@ class ThreeBody(AbstractReversible):
         d1, d2 = first * first + flat, second * second + flat
         a1, a2 = (1 - mu) / (d1 * jnp.sqrt(d1)), mu / (d2 * jnp.sqrt(d2))
         pull = a1 + a2
-        return jnp.stack(
-            [
-                2 * vy + x - a1 * first - a2 * second,
-                y - 2 * vx - pull * y,
-                -pull * z,
-            ]
-        )
+        return jnp.stack([2 * vy + x - a1 * first - a2 * second, y - 2 * vx - pull * y, -pull * z])
 
     def potential(self, x: Vector) -> Scalar:
         """U = ½(x² + y²) + (1 − μ)/r₁ + μ/r₂ (Szebehely 1967, sec. 1.5, without its constant).

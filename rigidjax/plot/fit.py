@@ -12,12 +12,7 @@ from rigidjax.solve import simulate
 
 
 def fit(
-    found: Any,
-    *,
-    index: int = 0,
-    time_unit: str = "s",
-    rate_unit: str = "rad/s",
-    title: str = "",
+    found: Any, *, index: int = 0, time_unit: str = "s", rate_unit: str = "rad/s", title: str = ""
 ) -> Any:
     """Data and fit of each sensor above, the residuals below.
 

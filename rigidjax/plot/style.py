@@ -14,12 +14,7 @@ from rigidjax.rotation import quaternion
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 AXES = "xyz"
 TIMES = {"s": 1.0, "min": 60.0, "h": 3600.0, "day": 86400.0}
-RATES = {
-    "rad/s": 1.0,
-    "deg/s": 180 / np.pi,
-    "rpm": 30 / np.pi,
-    "deg/day": 86400 * 180 / np.pi,
-}
+RATES = {"rad/s": 1.0, "deg/s": 180 / np.pi, "rpm": 30 / np.pi, "deg/day": 86400 * 180 / np.pi}
 
 
 def pyplot() -> Any:

@@ -170,13 +170,7 @@ def _energy(moments: Array, ratio: Array, long: Array) -> tuple[Array, Array, Ar
 
 @jax.jit
 def _grid(
-    long: Array,
-    moments: Array,
-    forms: Array,
-    pair: Array,
-    t: Array,
-    squares: Array,
-    weights: Array,
+    long: Array, moments: Array, forms: Array, pair: Array, t: Array, squares: Array, weights: Array
 ) -> tuple[Array, Array, Array, Array]:
     """Misfits (S, phases), n nᵀ times the level (…, 6), attitudes (…, 4) and rates (…, 3)."""
     ratio = 0.5 * pair[1] / pair[0]

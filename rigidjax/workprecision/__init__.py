@@ -8,10 +8,7 @@ from rigidjax._names import own_names
 from rigidjax.workprecision.chart import draw as draw
 from rigidjax.workprecision.drift import long_drift as long_drift
 from rigidjax.workprecision.jax_methods import diffrax_method as diffrax_method
-from rigidjax.workprecision.measurement import (
-    measure as measure,
-    worked_out as worked_out,
-)
+from rigidjax.workprecision.measurement import measure as measure, worked_out as worked_out
 from rigidjax.workprecision.method import Method as Method, Ready as Ready, Run as Run
 from rigidjax.workprecision.pareto import (
     Choice as Choice,
