@@ -43,10 +43,33 @@ class PeriodicOrbit(eqx.Module):
         self.period = period.astype(state.x.dtype)
 
 
-def correct(
-    scene: Any, guess: PeriodicOrbit, hold: str, tolerance: float | None = None
+def periodic_orbit(
+    scene: Any, guess: PeriodicOrbit, *, hold: str = "x", tolerance: float | None = None
 ) -> PeriodicOrbit:
-    """The orbit near `guess` that crosses y = 0 at right angles twice: see `periodic_orbit`."""
+    """The periodic orbit near `guess`, by differentiable correction.
+
+    For orbits symmetric about the xz-plane: Lyapunov, halo, Arenstorf's and most others in use.
+    They cross it at a right angle (y = v_x = v_z = 0) twice a period. Newton's method on three
+    of (x, z, v_y, T/2) makes y, v_x, v_z vanish at the half period.
+
+    **Arguments:** `guess` a `PeriodicOrbit(state, period)` whose state crosses at a right
+    angle; `hold` which of `"x"`, `"z"`, `"vy"`, `"period"` stays as guessed: this labels the
+    orbit within its family (`"x"` for Lyapunov orbits, `"z"` for halo orbits); `tolerance`
+    largest |y|, |v_x|, |v_z| left at the half period, 1e-12 unless given (1e-4 in float32).
+
+    **Returns** a `PeriodicOrbit`. Its derivatives with respect to μ and the held number are
+    those of the family, by the implicit function theorem, forward and reverse.
+
+    Source: Howell 1984, doi:10.1007/BF01358403.
+
+    **Raises:** `ValueError` (`EquinoxRuntimeError` under `jit`) if Newton does not converge.
+
+    >>> from rigidjax import orbits
+    >>> moon = orbits.cr3bp(0.0121505856)
+    >>> orbit = moon.periodic_orbit(moon.lyapunov_guess(1, 0.01))
+    >>> round(float(orbit.period), 4)
+    2.712
+    """
     numbers, index = crossing(guess), named(hold)
     free = np.array([i for i in range(4) if i != index])
     if tolerance is None:

@@ -25,6 +25,8 @@ _SMALL, _TERMS = 0.1, 16
 # Gauss–Legendre points of both integrals of Lambert's law.
 _POINTS = 32
 
+Faces = Float[Array, "*faces"]
+
 
 class AbstractScattering(eqx.Module):
     """A law of scattering: what a piece of surface sends, and a whole ellipsoid.
@@ -39,9 +41,7 @@ class AbstractScattering(eqx.Module):
     """
 
     @abc.abstractmethod
-    def per_area(
-        self, incidence: Float[Array, "*faces"], emission: Float[Array, "*faces"]
-    ) -> Float[Array, "*faces"]:
+    def per_area(self, incidence: Faces, emission: Faces) -> Faces:
         """Brightness over area, of the cosines of incidence and emission, both positive."""
 
     @abc.abstractmethod
@@ -58,9 +58,7 @@ class Geometric(AbstractScattering):
     0.25
     """
 
-    def per_area(
-        self, incidence: Float[Array, "*faces"], emission: Float[Array, "*faces"]
-    ) -> Float[Array, "*faces"]:
+    def per_area(self, incidence: Faces, emission: Faces) -> Faces:
         return emission
 
     def of_ellipsoid(self, shape: Mat3, sun: Vec3, observer: Vec3) -> Scalar:
@@ -81,9 +79,7 @@ class LommelSeeliger(AbstractScattering):
     0.5
     """
 
-    def per_area(
-        self, incidence: Float[Array, "*faces"], emission: Float[Array, "*faces"]
-    ) -> Float[Array, "*faces"]:
+    def per_area(self, incidence: Faces, emission: Faces) -> Faces:
         return 2.0 * incidence * emission / (incidence + emission)
 
     def of_ellipsoid(self, shape: Mat3, sun: Vec3, observer: Vec3) -> Scalar:
@@ -102,9 +98,7 @@ class Lambert(AbstractScattering):
     0.75
     """
 
-    def per_area(
-        self, incidence: Float[Array, "*faces"], emission: Float[Array, "*faces"]
-    ) -> Float[Array, "*faces"]:
+    def per_area(self, incidence: Faces, emission: Faces) -> Faces:
         return 1.5 * incidence * emission
 
     def of_ellipsoid(self, shape: Mat3, sun: Vec3, observer: Vec3) -> Scalar:

@@ -41,17 +41,13 @@ class Candidate(NamedTuple):
     misfit: float
 
 
-def shapes_of_grid() -> np.ndarray:
-    """Semi-axes (S, 3), descending, the longest one."""
+def bodies_of_grid() -> tuple[np.ndarray, np.ndarray]:
+    """Semi-axes and moments (S, 3) of uniform ellipsoids: the longest and the largest are one."""
     b, ratio = np.meshgrid(MIDDLE, SHORT, indexing="ij")
-    return np.stack([np.ones(b.size), b.ravel(), (b * ratio).ravel()], axis=1)
-
-
-def moments_of(semi_axes: np.ndarray) -> np.ndarray:
-    """Principal moments (S, 3) of uniform ellipsoids, the largest one."""
+    semi_axes = np.stack([np.ones(b.size), b.ravel(), (b * ratio).ravel()], axis=1)
     second = semi_axes**2
     moments = second.sum(axis=1, keepdims=True) - second
-    return moments / moments[:, 2:]
+    return semi_axes, moments / moments[:, 2:]
 
 
 def candidates(
@@ -70,8 +66,7 @@ def candidates(
     frame; `areas` M (3,) of a known ellipsoid, or `None` for the uniform one of each body; `count`
     how many bodies, each with all turns of `ABOUT`.
     """
-    semi_axes = shapes_of_grid()
-    moments = moments_of(semi_axes)
+    semi_axes, moments = bodies_of_grid()
     forms = (np.prod(semi_axes, axis=1, keepdims=True) / semi_axes) ** 2
     if areas is not None:
         forms = np.broadcast_to(areas, forms.shape)
@@ -86,9 +81,8 @@ def candidates(
         if not np.isfinite(least[k]):
             continue
         at = k, phase[k]
-        for q0 in _placed(sides[at], half_way):
-            placed = _times(q0, q[at])
-            out.append(Candidate(moments[k], placed, omega[at], float(least[k])))
+        placed = (_times(q0, q[at]) for q0 in _placed(sides[at], half_way))
+        out += [Candidate(moments[k], one, omega[at], float(least[k])) for one in placed]
     return out
 
 
@@ -100,13 +94,10 @@ def _placed(side: np.ndarray, half_way: np.ndarray) -> list[np.ndarray]:
     xx, yy, zz, xy, xz, yz = side
     _, axes = np.linalg.eigh(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
     n = axes[:, -1]
-    turns = []
-    for angle in ABOUT:
-        first = _between(n, half_way)
-        half = 0.5 * angle
-        about = np.concatenate([[np.cos(half)], np.sin(half) * half_way])
-        turns.append(_times(about, first))
-    return turns
+    first = _between(n, half_way)
+    halves = [0.5 * angle for angle in ABOUT]
+    about = [np.concatenate([[np.cos(half)], np.sin(half) * half_way]) for half in halves]
+    return [_times(one, first) for one in about]
 
 
 def _between(u: np.ndarray, v: np.ndarray) -> np.ndarray:

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from rigidjax import _checks
-from rigidjax.tumblers.frequency_aliases import apart, distinct, refined, with_aliases
+from rigidjax.tumblers.frequency_aliases import distinct, refined, with_aliases
 from rigidjax.tumblers.lattice_series import BATCH, FIRST, Sums, filled, misfits_of, sums
 
 # Lines through which pairs are laid, and the grid of the first frequency, in 1/span.
@@ -120,8 +120,8 @@ def two_frequencies(
     highest = SECOND * float(lines[:LINES].max())
     # All multiples of a pair, and what a step of the refinement adds.
     table = sums(light, 2 * (FIRST + order) * (highest + 1.0))
-    pairs = apart(*_scan(table, lines, order), count * TRIED)
-    pairs, misfits = refined(table, pairs, order)
+    pairs, misfits = _scan(table, lines, order)
+    pairs, misfits = refined(table, pairs[distinct(pairs, misfits, count * TRIED)], order)
     pairs, misfits = with_aliases(table, pairs, misfits, highest, order)
     keep = distinct(pairs, misfits, count)
     dof = t.size - unknowns
