@@ -106,16 +106,13 @@ def power(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return np.zeros(0), np.zeros(0)
     gap = float(np.median(gaps))
     if (np.abs(gaps - gap) <= 1e-3 * gap).all():
-        frequencies, density = welch(values, 1 / gap, nperseg=_segment(t.size))
+        # Several segments: the noise of the estimate is then small.
+        segment = min(t.size, max(64, min(t.size // 4, 512)))
+        frequencies, density = welch(values, 1 / gap, nperseg=segment)
         return frequencies[1:], density[1:] / (2 * gap)
     span = float(t[-1] - t[0])
     frequencies = np.arange(1, min(_MOST, max(2, int(span / (2 * gap))))) / span
     return frequencies, lombscargle(t, values - values.mean(), 2 * np.pi * frequencies)
-
-
-def _segment(samples: int) -> int:
-    """The length of Welch's segments: some of them, so that the noise of the estimate is small."""
-    return min(samples, max(64, min(samples // 4, 512)))
 
 
 def _correlation(values: np.ndarray, lags: np.ndarray) -> np.ndarray:

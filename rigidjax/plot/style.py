@@ -124,12 +124,6 @@ def on_sphere(around: np.ndarray, down: np.ndarray) -> np.ndarray:
     )
 
 
-def towards_viewer(ax: Any) -> np.ndarray:
-    """Unit vector (3,) from the middle of 3-D axes to the eye, as they are turned now."""
-    up, around = np.radians(ax.elev), np.radians(ax.azim)
-    return np.array([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)])
-
-
 def around_ball(
     ax: Any,
     path: np.ndarray,
@@ -143,7 +137,9 @@ def around_ball(
     **Arguments:** `path` (T, 3); `centre_free` (T, 3) the outward normals there; `behind` how the
     hidden part differs, faint unless said otherwise; `how` of matplotlib's lines.
     """
-    front = centre_free @ towards_viewer(ax) > 0
+    up, around = np.radians(ax.elev), np.radians(ax.azim)
+    eye = np.array([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)])
+    front = centre_free @ eye > 0
     label = how.pop("label", None)
     alpha = how.pop("alpha", 1.0)
     hidden = {"alpha": 0.25 * alpha, **(behind or {})}

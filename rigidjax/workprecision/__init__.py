@@ -9,7 +9,6 @@ from rigidjax.workprecision.chart import draw as draw
 from rigidjax.workprecision.drift import long_drift as long_drift
 from rigidjax.workprecision.jax_methods import diffrax_method as diffrax_method
 from rigidjax.workprecision.measurement import measure as measure, worked_out as worked_out
-from rigidjax.workprecision.method import Method as Method, Ready as Ready, Run as Run
 from rigidjax.workprecision.pareto import (
     Choice as Choice,
     choose as choose,
@@ -25,7 +24,13 @@ from rigidjax.workprecision.record import (
     read_csv as read_csv,
     write_csv as write_csv,
 )
-from rigidjax.workprecision.scene import Reference as Reference, Scene as Scene
+from rigidjax.workprecision.scene import (
+    Method as Method,
+    Ready as Ready,
+    Reference as Reference,
+    Run as Run,
+    Scene as Scene,
+)
 from rigidjax.workprecision.standard_scenes import scenes as scenes
 
 __dir__ = own_names(__name__)

@@ -11,9 +11,9 @@ from typing import Any
 from rigidjax.workprecision import chart, pareto
 from rigidjax.workprecision.drift import long_drift
 from rigidjax.workprecision.measurement import measure
-from rigidjax.workprecision.method import Method
 from rigidjax.workprecision.peers import methods
 from rigidjax.workprecision.record import Record, kept, moved, read_csv, write_csv
+from rigidjax.workprecision.scene import Method
 from rigidjax.workprecision.standard_scenes import scenes
 
 STORED = Path("tests/workprecision/record.csv")
@@ -70,15 +70,13 @@ def add(commands: Any) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Run the subcommand; returns the exit code: 0 good, 1 something moved, 2 bad input."""
-    known = [*scenes(), DRIFT]
-    for name in options.scene:
-        if name not in known:
-            print(f"error: no scene {name!r}; there are {', '.join(known)}", file=sys.stderr)
-            return 2
-    if options.thin < 1:
-        print(f"error: --thin: wanted 1 or more, got {options.thin}", file=sys.stderr)
-        return 2
     try:
+        known = [*scenes(), DRIFT]
+        for name in options.scene:
+            if name not in known:
+                raise ValueError(f"no scene {name!r}; there are {', '.join(known)}")
+        if options.thin < 1:
+            raise ValueError(f"--thin: wanted 1 or more, got {options.thin}")
         before = None if options.check is None else read_csv(options.check)
         records = _measured(options) if options.stored is None else read_csv(options.stored)
         if options.stored is not None and options.scene:
@@ -90,10 +88,12 @@ def run(options: argparse.Namespace) -> int:
             write_csv(kept(records), options.keep)
             print(f"kept: {options.keep}")
         print(summary(records))
+        timed = [r for r in records if not r.scene.startswith(DRIFT)]
         if options.choose:
-            print(f"\n{pareto.table(pareto.choose(_timed(records)))}")
+            print(f"\n{pareto.table(pareto.choose(timed))}")
         if options.figure is not None:
-            _draw(records, options.figure)
+            chart.draw(timed).savefig(options.figure, dpi=110)
+            print(f"figure: {options.figure}")
     except (OSError, ValueError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
@@ -172,21 +172,8 @@ def _drifts(scene: str, records: list[Record]) -> list[str]:
     ]
 
 
-def _timed(records: list[Record]) -> list[Record]:
-    return [r for r in records if not r.scene.startswith(DRIFT)]
-
-
-def _draw(records: list[Record], path: Path) -> None:
-    chart.draw(_timed(records)).savefig(path, dpi=110)
-    print(f"figure: {path}")
-
-
 def _compared(records: list[Record], before: list[Record]) -> int:
     wrong, paced = moved(records, before)
-    for line in wrong:
-        print(f"moved: {line}")
-    for line in paced:
-        print(f"time: {line}")
-    if not wrong and not paced:
-        print("nothing moved")
+    lines = [*(f"moved: {line}" for line in wrong), *(f"time: {line}" for line in paced)]
+    print("\n".join(lines or ["nothing moved"]))
     return 1 if wrong else 0

@@ -12,8 +12,7 @@ import jax.numpy as jnp
 from rigidjax import _checks
 from rigidjax.exact import FreeBody
 from rigidjax.solve import adaptive, equations_of_motion, fixed, simulate, solvers
-from rigidjax.workprecision.method import Method, Ready, Run
-from rigidjax.workprecision.scene import Scene
+from rigidjax.workprecision.scene import Method, Ready, Run, Scene
 
 TOLERANCES = tuple(10.0**-k for k in range(3, 14))
 EIGHT = (40, 60, 80, 120, 170, 240, 340, 480, 680, 1000)
@@ -97,10 +96,6 @@ def equal_steps(scene: Scene, solver: Any) -> Flow:
         return fixed(solver, field, ts, start, count), count
 
     return flow_of(scene, run)
-
-
-def _split(scene: Scene, solver: Any) -> Flow | None:
-    return None if scene.body is None else equal_steps(scene, solver)
 
 
 def _in_diffrax(scene: Scene, solver: Any, adjoint: Any = None) -> Flow:
@@ -202,20 +197,22 @@ def _ours(name: str, settings: Any, make: Make, modes: Any = (), equal: bool = F
 def methods_in_jax() -> list[Method]:
     """Ours, and diffrax's, in the order of the charts."""
     eight = solvers.DormandPrince8()
-    in_turn = {
-        "DormandPrince8": (EIGHT, partial(equal_steps, solver=eight)),
-        "RungeKutta4": (FOUR, partial(equal_steps, solver=solvers.RungeKutta4())),
-        "Splitting4": (EIGHT, partial(_split, solver=solvers.Splitting4())),
-        "Splitting6": (EIGHT, partial(_split, solver=solvers.Splitting6())),
-    }
+    equal = ((EIGHT, eight), (FOUR, solvers.RungeKutta4()))
+    equal += ((EIGHT, solvers.Splitting4()), (EIGHT, solvers.Splitting6()))
     five, there = solvers.Tsitouras5(), partial(_in_diffrax, solver=eight)
     return [
         _ours("closed form", (0.0,), _closed, MODES),
         _ours("simulate", TOLERANCES, _simulate, MODES),
         _ours("DormandPrince8", TOLERANCES, partial(_adaptive, solver=eight), MODES),
         _ours("Tsitouras5", TOLERANCES, partial(_adaptive, solver=five)),
-        *(_ours(f"{name}, equal steps", *how, equal=True) for name, how in in_turn.items()),
+        *(
+            _ours(
+                f"{type(solver).__name__}, equal steps", counts,
+                partial(equal_steps, solver=solver), equal=True,
+            )
+            for counts, solver in equal
+        ),
         _ours("DormandPrince8 in diffeqsolve", TOLERANCES, there),
         diffrax_method(dfx.Tsit5()),
         diffrax_method(dfx.Dopri8(), gradients=True),
-    ]
+    ]  # fmt: skip

@@ -11,13 +11,12 @@ import numpy as np
 
 from rigidjax import _checks
 from rigidjax.frames.frame_dynamics import scene_of
-from rigidjax.motion import Attitude, conserved
+from rigidjax.motion import Attitude, drift
 from rigidjax.solve import solvers
 from rigidjax.workprecision import peers as known
 from rigidjax.workprecision.jax_methods import equal_steps
-from rigidjax.workprecision.method import Method, Ready, Run
 from rigidjax.workprecision.record import Record
-from rigidjax.workprecision.scene import Reference, Scene, distance
+from rigidjax.workprecision.scene import Method, Ready, Reference, Run, Scene, distance
 
 # Runs longer than this, s, are timed three times, those shorter than SHORT thrice as often.
 LONG, SHORT = 0.5, 0.02
@@ -168,19 +167,10 @@ def drifts(scene: Scene, end: Any) -> tuple[float, float]:
         return abs(b - a) / max(abs(a), 0.5 * scene.size[1] ** 2), float("nan")
     first: Any = scene.state0
     last = Attitude(end[:4] / np.linalg.norm(end[:4]), end[4:])
-    kept = (
-        conserved(scene.body, first, scene.torque, 0.0),
-        conserved(scene.body, last, scene.torque, scene.end),
-    )
-    spin = float(jnp.linalg.norm(scene.body.tensor @ first.omega))
-    kinetic = 0.5 * float(first.omega @ scene.body.tensor @ first.omega)
-    away = {
-        name: float(np.linalg.norm(np.asarray(kept[1][name]) - np.asarray(value)))
-        for name, value in kept[0].items()
-    }
-    energy = away["energy"] / kinetic if "energy" in away else float("nan")
-    momenta = [away[n] / spin for n in ("momentum", "momentum_along_axis") if n in away]
-    return energy, max(momenta, default=float("nan"))
+    states = jax.tree.map(lambda *leaves: jnp.stack(leaves), first, last)
+    away = drift(jnp.array([0.0, scene.end]), states, scene.body, scene.torque)
+    momenta = [float(away[n]) for n in ("momentum", "momentum_along_axis") if n in away]
+    return float(away.get("energy", jnp.nan)), max(momenta, default=float("nan"))
 
 
 def _timed(jobs: list[_Job], rounds: int) -> None:

@@ -12,8 +12,7 @@ import numpy as np
 
 from rigidjax import _checks
 from rigidjax.workprecision.jax_methods import methods_in_jax
-from rigidjax.workprecision.method import Method, Ready, Run
-from rigidjax.workprecision.scene import Scene
+from rigidjax.workprecision.scene import Method, Ready, Run, Scene
 
 TOLERANCES = (1e-4, 1e-7, 1e-10, 1e-13)
 TAYLOR = (1e-4, 1e-6, 1e-8, 1e-10, 1e-12, 1e-14)
