@@ -112,7 +112,7 @@ def _keep_compiled() -> None:
     Not those of `workprecision`, which measures how long compiling takes.
     """
     if jax.__version_info__ < (0, 12):
-        # Of each program that it loads XLA says two flags of its own, 2.6 kB a line (as an error).
+        # XLA reports two flags of its own for each program that it loads, 2.6 kB a line, as errors.
         jax.config.update("jax_logging_level", "CRITICAL")
     if os.environ.get("JAX_COMPILATION_CACHE_DIR"):
         return
@@ -120,8 +120,8 @@ def _keep_compiled() -> None:
         folder = _cache_folder()
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         held = folder.stat()
-        # What is loaded from there is run: nobody else may have put it there. Not so on Windows,
-        # where a user's folder is his own already.
+        # Programs loaded from there are run: nobody else may have put them there. On Windows a
+        # user's folder is the user's own already.
         if hasattr(os, "getuid"):
             if held.st_uid != os.getuid() or held.st_mode & 0o022:
                 told = (

@@ -177,7 +177,7 @@ def _slopes_from_integral(u: Any, m: Any, m1: Any) -> tuple[Any, Any, Any]:
     s, c, d = _core(u, m, m1)
     turns = _turns(jax.lax.stop_gradient(u), jax.lax.stop_gradient(m1))[0]
     sign = _parity(turns)
-    # X ~ 1/dn² must not overflow. Where cn and dn are minute it depends, but for that factor, on
+    # X ~ 1/dn² must not overflow. If cn and dn are minute it depends, but for that factor, on
     # their ratio only (to the floor squared): raise both.
     up = jnp.maximum(1, _FLOOR[np.dtype(u.dtype)] / jax.lax.stop_gradient(d))
     c, d, raised = c * up, d * up, m1 * up * up

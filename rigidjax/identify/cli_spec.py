@@ -251,7 +251,7 @@ def problem_of(
 
 
 def _free(first: Recording, typical: float, free: Sequence[str]) -> list[Free]:
-    """What of the sensors and the torque is free, as `read_log` laid them out."""
+    """The free numbers of the sensors and the torque, as `read_log` laid them out."""
 
     def of_sensor(index: int, name: str) -> Callable[[Any], Any]:
         return lambda r: getattr(r.readings[index].sensor, name)

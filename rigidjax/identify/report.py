@@ -137,7 +137,7 @@ def verdict(fit: Fit) -> str:
 
 
 def as_dict(fit: Fit, files: Sequence[str] = (), more: Sequence[Row] = ()) -> dict[str, Any]:
-    """All that was found as plain numbers and text, for JSON. What is infinite or NaN is `null`.
+    """All that was found as plain numbers and text, for JSON; infinity and NaN become `null`.
 
     **Arguments:** `fit`; `files` the names of what was read; `more` rows of further quantities.
 
@@ -231,7 +231,7 @@ def write_json(
     'ok'
     """
     text = json.dumps(as_dict(fit, files, more), indent=2, ensure_ascii=False, allow_nan=False)
-    # What is no character (of a file's name) stands as JSON writes it.
+    # A part of a file's name that is no character stands as JSON writes it.
     Path(path).write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
 
 

@@ -78,7 +78,7 @@ def family(
 
 
 def _lost(start: Array, numbers: Array, left: Array) -> Array:
-    """Where Newton did not end, or ended at another orbit that solves the equations too."""
+    """Which members Newton's method did not find, or found as another orbit that solves it too."""
     before = jnp.concatenate([start[None], numbers[:-1]])
     ratio = numbers[:, 3] / before[:, 3]
     return ~((left <= usual_tolerance(start)) & (ratio > 0.5) & (ratio < 2))
@@ -92,7 +92,7 @@ def _at_values(scene: Any, start: Array, held: Array, index: int, tolerance: flo
     )
 
     def step(last: Array, value: Scalar) -> Any:
-        # Where Newton starts from has no derivative: the orbit found does not depend on it.
+        # The start of Newton's method has no derivative: the orbit found does not depend on it.
         last, aim = lax.stop_gradient(last), lax.stop_gradient(value)
         _, matrix = value_and_jacobian(lambda n: miss(still, n), last)
         slope = -jnp.linalg.solve(matrix[:, free], matrix[:, index])

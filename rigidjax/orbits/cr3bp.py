@@ -76,8 +76,8 @@ class ThreeBody(AbstractReversible):
     def speed_squared(self, x: Vector, jacobi: ScalarLike) -> Scalar:
         """|v|² = 2U(x) − C at a place: zero-velocity curves are where it is 0.
 
-        **Arguments:** `x` (3,); `jacobi` C. Negative where a particle with this C cannot come.
-        Draw `matplotlib.pyplot.contour(…, levels=[0])` of it.
+        **Arguments:** `x` (3,); `jacobi` C. It is negative at places that a particle with this C
+        cannot reach. Draw `matplotlib.pyplot.contour(…, levels=[0])` of it.
         """
         u = self.potential(x)
         return 2 * u - _checks.floating(jacobi, (), "jacobi").astype(u.dtype)

@@ -179,7 +179,7 @@ def manifold_start(
     side: int = 1,
     distance: ScalarLike = 1e-5,
 ) -> Point:
-    """Where the motion of a manifold begins that belongs to a phase of the orbit.
+    """The start of the motion of a manifold that belongs to a phase of the orbit.
 
     **Arguments:** `phase` in periods from the orbit's start, of any size; others as for
     `manifold`. Derivatives, by `phase`, by the orbit and by the scene's numbers, are in

@@ -93,12 +93,12 @@ def polhode(
     twice_energy = float(np.sum(pi[0] ** 2 / i))
 
     ax = solid_axes(ax)
-    # By what is said here, not by depth, which matplotlib takes of a whole surface: the path would
-    # be lost under the sphere.
+    # We say what lies in front. matplotlib takes one depth for a whole surface, and would draw the
+    # sphere over the path.
     ax.computed_zorder = False
     globe(ax, (1.0, 1.0, 1.0), COLOURS[5], 0.15)
     cage(ax, np.sqrt(twice_energy * i), COLOURS[4], lw=0.5, alpha=0.8, zorder=2)
-    # Where all moments are equal every energy is the same one: there are no lines to draw.
+    # All energies are the same one if all moments are equal: there are no lines to draw.
     if i[2] - i[0] > 1e-9 * i[2]:
         _others(ax, i, energies)
     hidden = {"alpha": 1.0, "ls": (0, (1, 1)), "lw": 1.8}

@@ -75,7 +75,8 @@ def _one_sensor(row: Any, t: np.ndarray, scaled: np.ndarray, seen: np.ndarray) -
     low, high = (inside.min(), inside.max()) if inside.size else (-1.0, 1.0)
     middle, half = 0.5 * (low + high), max(0.5 * (high - low), 1e-3 * reach)
     count = int(np.clip(2 * np.sqrt(everything.size), 9, 41))
-    bins = np.linspace(middle - half, middle + half, count)
+    # No less than from `low` to `high`: rounding must not leave the last reading out.
+    bins = np.linspace(min(low, middle - half), max(high, middle + half), count)
     told = f"{beyond} beyond" if beyond else None
     weights = np.full(everything.size, 1 / (everything.size * (bins[1] - bins[0])))
     spread.hist(everything, bins=bins, weights=weights, color=COLOURS[5], alpha=0.8, label=told)

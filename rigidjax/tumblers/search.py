@@ -71,7 +71,7 @@ def starts_of(
     for pair in found.frequencies[:used]:
         for mode in starts.MODES:
             some = starts.candidates(pair, mode, light, half_way, areas, 3)
-            # Of each reading of each pair one: which of them is true a grid alone cannot tell.
+            # One of each reading of each pair: a grid alone cannot tell which of them is true.
             best_of += some[: len(starts.ABOUT)]
             others += some[len(starts.ABOUT) :]
     best_of.sort(key=lambda one: one.misfit)

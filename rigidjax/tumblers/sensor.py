@@ -104,7 +104,7 @@ class Brightness(AbstractSensor):
         relative = seen / (math.pi * jnp.cbrt(determinant(shape)))
         if self.unit == "flux":
             return self.level * relative
-        # Of a body that hides its lit side nothing is seen: fainter than any reading.
+        # A body that hides its lit side is not seen: it is fainter than any reading.
         some = relative > 1e-12
         return self.level - 2.5 / math.log(10.0) * jnp.log(jnp.where(some, relative, 1e-12))
 

@@ -19,6 +19,7 @@ from jaxtyping import Array, Float
 from rigidjax import exact
 from rigidjax.body.inertia import Inertia
 from rigidjax.motion import Attitude
+from rigidjax.rotation import quaternion
 from rigidjax.rotation.linalg3 import cross
 
 # Semi-axes of the grid: b/a and c/b; phases in half a rotation.
@@ -89,7 +90,7 @@ def candidates(
 def _placed(side: np.ndarray, half_way: np.ndarray) -> list[np.ndarray]:
     """Turns (4,) that take the frame of the momentum to the world.
 
-    Of the symmetric matrix that least squares found the nearest of rank one.
+    They are those of the matrix of rank one that is nearest to what least squares found.
     """
     xx, yy, zz, xy, xz, yz = side
     _, axes = np.linalg.eigh(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
@@ -178,16 +179,12 @@ def _grid(
             since = part / pair[1]
 
             def row(q: Array) -> Array:
-                w, x, y, u = (q[k] for k in range(4))
-                m = form
-                # Body axes in the world, written out.
-                a = (1 - 2 * (y * y + u * u), 2 * (x * y + w * u), 2 * (x * u - w * y))
-                b = (2 * (x * y - w * u), 1 - 2 * (x * x + u * u), 2 * (y * u + w * x))
-                c = (2 * (x * u + w * y), 2 * (y * u - w * x), 1 - 2 * (x * x + y * y))
+                m = quaternion.to_matrix(q)
 
-                def entry(i: int, j: int) -> Array:
-                    return m[0] * a[i] * a[j] + m[1] * b[i] * b[j] + m[2] * c[i] * c[j]
+                def entry(i: int, j: int) -> Any:
+                    return sum(form[k] * m[i, k] * m[j, k] for k in range(3))
 
+                # Σ M_k r_k r_kᵀ, body axes r in the world.
                 twice = (2 * entry(0, 1), 2 * entry(0, 2), 2 * entry(1, 2))
                 return jnp.stack([entry(0, 0), entry(1, 1), entry(2, 2), *twice])
 

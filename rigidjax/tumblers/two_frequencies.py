@@ -57,8 +57,8 @@ def two_frequencies(
 ) -> TwoFrequencies:
     """Pairs (f₁, f₂) whose Fourier series fit best: `Σ c_jk exp 2πi (j f₁ + k f₂) t`, |j| ≤ 2.
 
-    Where the spectrum has its three strongest lines one of them must be j f₁ + k f₂; along these
-    curves all pairs are tried, then the best ones are refined. Then their aliases are tried: either
+    One of the three strongest lines of the spectrum must be j f₁ + k f₂. All pairs along these
+    curves are tried, then the best ones are refined. Then their aliases are tried: either
     frequency, or both, moved by a side peak of the spectral window (readings at night have such
     peaks at one and two a day) or by half of it, halved, doubled, or f₂ by f₁. A set of lines has
     several pairs that make it: all that fit are returned, for a motion to choose among them.

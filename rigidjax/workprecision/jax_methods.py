@@ -166,7 +166,7 @@ def _ready(make: Make, take: Any, scene: Scene) -> Ready | None:
 def diffrax_method(solver: dfx.AbstractSolver, *, gradients: bool = False) -> Method:
     """Any `diffrax` solver as a method, with a step controller, on equations written by hand.
 
-    Where a scene has none (`plain`), on our vector field.
+    It runs on our vector field where a scene has none of these (`plain`).
 
     **Arguments:** `solver` with an error estimate; `gradients` whether its adjoints are measured,
     too: `forward`, `checkpointed`, `backsolve`.

@@ -15,9 +15,9 @@ WANTED = (1e-4, 1e-7, 1e-10)
 def front(records: Iterable[Record]) -> list[Record]:
     """Those records of one scene and kind that nothing beats in both error and time.
 
-    What is compared with are the curves of the others, log–log between their settings, not only
-    the points that happened to be measured. By falling error. Give records of one scene, and of
-    values or gradients only.
+    A record is compared with the curves of the others, log–log between their settings, not only
+    with the points that happened to be measured. Give records of one scene, and of values or
+    gradients only. **Returns** the records by falling error.
 
     **Raises:** `ValueError` for a mixture.
 
@@ -45,7 +45,7 @@ def front(records: Iterable[Record]) -> list[Record]:
 def first_answers(records: Iterable[Record]) -> list[Record]:
     """The same records with the time that a first answer takes: compiling and one run.
 
-    What is not compiled, or made ready in no known time, counts with its run.
+    A method that is not compiled, or was made ready in no known time, counts with its run alone.
 
     >>> cold = Record("scene", "method", "ours", "value", "", 1e-6, time=1e-3, compile=2.0)
     >>> first_answers([cold])[0].time
@@ -61,8 +61,8 @@ def first_answers(records: Iterable[Record]) -> list[Record]:
 def time_to(records: Iterable[Record], error: float) -> float:
     """Time, s, that the method of these records takes to an error, between its settings in log–log.
 
-    Of a run whose error is smaller already at its coarsest setting, that setting's time. NaN where
-    it never gets there.
+    It is the coarsest setting's time if the error is smaller there already, and NaN if the method
+    never gets to the error.
 
     >>> rough = Record("scene", "method", "jax", "value", "", 1e-2, error=1e-2, time=1.0)
     >>> fine = Record("scene", "method", "jax", "value", "", 1e-4, error=1e-4, time=4.0)
