@@ -115,7 +115,7 @@ def family_slope(scene: Any, orbit: PeriodicOrbit, *, hold: str = "x") -> Period
 
     **Raises:** `ValueError` where the family turns back in `hold`.
 
-    >>> from rigidjax import orbits
+    >>> from rigidjax import Point, orbits
     >>> hill, start = orbits.hill(), Point([0.3, 0, 0], [0.0, 1.6, 0])
     >>> orbit = hill.periodic_orbit(orbits.PeriodicOrbit(start, 1.2))
     >>> round(float(hill.family_slope(orbit).period), 3)

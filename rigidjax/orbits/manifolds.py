@@ -214,20 +214,8 @@ def _paths(scene: Any, starts: Point, ts: Array, which: str) -> Point:
         return Point(state.x * mirror[:3], state.v * mirror[3:]) if turn else state
 
     def path(start: Point) -> Point:
-        out = dfx.diffeqsolve(
-            dfx.ODETerm(scene.field),
-            dfx.Dopri8(),
-            ts[0],
-            ts[-1],
-            None,
-            seen(start),
-            saveat=dfx.SaveAt(ts=ts),
-            stepsize_controller=dfx.PIDController(rtol=1e-11, atol=1e-12),
-            event=dfx.Event(ending.Ends(scene)),
-            adjoint=dfx.ForwardMode(),
-            max_steps=100_000,
-            throw=False,
-        )
+        how = dict(saveat=dfx.SaveAt(ts=ts), event=dfx.Event(ending.Ends(scene)))
+        out = state_transition.solved(scene, seen(start), ts[-1], 1e-11, 1e-12, **how)
         there: Any = jnp.isfinite(jnp.asarray(out.ts))[:, None]
         ys: Any = jax.tree.map(lambda leaf: jnp.where(there, leaf, jnp.nan), out.ys)
         return jax.vmap(seen)(ys)

@@ -38,7 +38,15 @@ def _end(
     scene: AbstractScene, state: Point, t: ScalarLike, rtol: float, atol: float
 ) -> tuple[Point, dfx.RESULTS]:
     t = _checks.floating(t, (), "t").astype(state.x.dtype)
-    out = dfx.diffeqsolve(
+    out = solved(scene, state, t, rtol, atol)
+    return jax.tree.map(lambda leaf: leaf[0], out.ys), out.result
+
+
+def solved(
+    scene: AbstractScene, state: Point, t: Array, rtol: float, atol: float, **how: Any
+) -> dfx.Solution:
+    """The motion from 0 to `t`, with derivatives in forward mode; `how` as for `diffeqsolve`."""
+    return dfx.diffeqsolve(
         dfx.ODETerm(scene.field),
         dfx.Dopri8(),
         jnp.zeros_like(t),
@@ -49,8 +57,8 @@ def _end(
         adjoint=dfx.ForwardMode(),
         max_steps=100_000,
         throw=False,
+        **how,
     )
-    return jax.tree.map(lambda leaf: leaf[0], out.ys), out.result
 
 
 @eqx.filter_jit

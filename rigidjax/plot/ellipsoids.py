@@ -52,7 +52,7 @@ def inertia_ellipsoid(
         # A body known up to scale only is compared in shape.
         own = solid and isinstance(truth, MassProperties)
         shapes["truth"] = other[None] / (1.0 if own else float(np.trace(other)))
-    ax = several_axes(ax, (3,), "3 axes in a row", ncols=3, figsize=(10.5, 3.9))
+    ax = several_axes(ax, (3,), ncols=3, figsize=(10.5, 3.9))
     _outlines(ax, shapes, "m" if solid else "relative size")
     if len(shapes) > 1:
         how = dict(loc="outside lower center", ncols=3, frameon=False)

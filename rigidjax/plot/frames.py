@@ -50,7 +50,7 @@ def frames(
     kind = _checks.numbers(inside.x, "inside.x").dtype
     t = jnp.asarray(times(ts, path.shape[0], "the path has"), kind)
     outside = np.asarray(jax.vmap(frame.to_inertial)(inside, t).x)
-    ax = several_axes(ax, (2,), "2 axes in a row", ncols=2, figsize=(9.6, 4.6))
+    ax = several_axes(ax, (2,), ncols=2, figsize=(9.6, 4.6))
     names = (("moving", path), ("inertial", outside))
     for one, (name, line) in zip(ax, names, strict=True):
         one.plot(line[:, i], line[:, j], color=COLOURS[0], lw=1.2)

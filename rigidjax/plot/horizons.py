@@ -62,8 +62,7 @@ def horizons(
                 f"{sorted(getattr(one, measure))}"
             )
     count = len(kinds)
-    how = dict(ncols=count, figsize=(3.4 * count + 0.6, 3.2))
-    ax = several_axes(ax, (count,), f"{count} axes in a row", **how)
+    ax = several_axes(ax, (count,), ncols=count, figsize=(3.4 * count + 0.6, 3.2))
     for one_ax, kind in zip(ax, kinds, strict=True):
         for (name, one), colour in zip(named.items(), COLOURS * len(named), strict=False):
             errors = _checks.on_host(getattr(one, measure)[kind], f"found: {kind}")

@@ -40,8 +40,7 @@ def residuals(
     record = found.problem.recordings[index]
     several = found.problem.count > 1
     count = len(record.readings)
-    how = dict(nrows=count, ncols=4, figsize=(14, 3.1 * count))
-    ax = several_axes(ax, (count, 4), f"({count}, 4) axes, a row a sensor", **how)
+    ax = several_axes(ax, (count, 4), nrows=count, ncols=4, figsize=(14, 3.1 * count))
     t = np.asarray(record.t) / seconds
     for row, reading, errors, noise in zip(
         ax, record.readings, found.residuals, found.noise, strict=True

@@ -68,12 +68,14 @@ def solid_axes(ax: Any, **how: Any) -> Any:
     return ax
 
 
-def several_axes(ax: Any, shape: tuple[int, ...], words: str, **how: Any) -> Any:
+def several_axes(ax: Any, shape: tuple[int, ...], **how: Any) -> Any:
     """As many axes as given, or new ones (`how` of `subplots`); `ValueError` for another shape."""
     if ax is None:
         ax = np.reshape(pyplot().subplots(layout="constrained", **how)[1], shape)
     ax = np.atleast_1d(np.asarray(ax, dtype=object))
     if ax.shape != shape:
+        words = f"{shape[0]} axes" + (" in a row" if "ncols" in how else "")
+        words = words if len(shape) == 1 else f"{shape} axes, a row a sensor"
         raise ValueError(f"ax: wanted {words}, got shape {ax.shape}")
     return ax
 

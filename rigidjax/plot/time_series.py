@@ -53,8 +53,7 @@ def motion(
     t = times(ts, omega.shape[0]) / seconds
     both = hasattr(states, "q")
     count = 2 if both else 1
-    how = dict(nrows=count, sharex=True, figsize=(7.2, 2.6 * count))
-    ax = several_axes(ax, (count,), f"{count} axes", **how)
+    ax = several_axes(ax, (count,), nrows=count, sharex=True, figsize=(7.2, 2.6 * count))
     if both:
         _attitude(ax[0], t, attitudes(states), attitude)
     for values, name, colour in zip(omega.T, "xyz", COLOURS[:3], strict=True):

@@ -57,8 +57,7 @@ def light_curve(
         raise ValueError(f"periods: wanted one or a row of them, s, got shape {several.shape}")
     folds = [_checks.positive(period, "periods", "positive periods, s") for period in several]
     count = 1 + len(folds)
-    how = dict(nrows=count, figsize=(7.2, 2.5 * count))
-    ax = several_axes(ax, (count,), f"{count} axes", **how)
+    ax = several_axes(ax, (count,), nrows=count, figsize=(7.2, 2.5 * count))
     label = "magnitude" if quantity == "mag" else "flux"
     _against(ax[0], t / seconds, read, predicted)
     ax[0].set(xlabel=f"time, {time_unit}", ylabel=label)

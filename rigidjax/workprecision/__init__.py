@@ -6,9 +6,12 @@ chart, `choose` the short table. `python -m rigidjax workprecision` is all of it
 
 from rigidjax._names import own_names
 from rigidjax.workprecision.chart import draw as draw
-from rigidjax.workprecision.drift import long_drift as long_drift
 from rigidjax.workprecision.jax_methods import diffrax_method as diffrax_method
-from rigidjax.workprecision.measurement import measure as measure, worked_out as worked_out
+from rigidjax.workprecision.measurement import (
+    long_drift as long_drift,
+    measure as measure,
+    worked_out as worked_out,
+)
 from rigidjax.workprecision.pareto import (
     Choice as Choice,
     choose as choose,

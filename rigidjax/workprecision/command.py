@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from rigidjax.workprecision import chart, pareto
-from rigidjax.workprecision.drift import long_drift
-from rigidjax.workprecision.measurement import measure
+from rigidjax.workprecision.measurement import long_drift, measure
 from rigidjax.workprecision.peers import methods
 from rigidjax.workprecision.record import Record, kept, moved, read_csv, write_csv
 from rigidjax.workprecision.scene import Method
@@ -132,11 +131,7 @@ def smaller(method: Method) -> Method:
 
 
 def summary(records: Iterable[Record]) -> str:
-    """Scene by scene: time to each wanted error, µs; on the front *, on that of JAX alone +.
-
-    >>> summary([])
-    ''
-    """
+    """Scene by scene: time to each wanted error, µs; on the front *, on that of JAX alone +."""
     records = list(records)
     lines: list[str] = []
     for scene in dict.fromkeys(r.scene for r in records):

@@ -64,11 +64,7 @@ _WORDS = ("scene", "method", "group", "kind", "adjoint")
 
 
 def listed(records: Iterable[Record], name: str = "records") -> list[Record]:
-    """The records as a list; `TypeError` where something else is among them.
-
-    >>> listed(())
-    []
-    """
+    """The records as a list; `TypeError` where something else is among them."""
     _checks.instance(records, Iterable, name, wanted="records")
     found = list(records)
     for record in found:

@@ -50,13 +50,13 @@ BODIES: dict[str, tuple[str, Any, Any, float, Any, Any]] = {
         "damped gyrostat", (1.0, 1.3, 0.7), (1.0, 0.5, 2.0), 50.0,
         equations.gyrostat, (0.0, 0.3, 0.1, 0.01, 0.02, 0.01),
     ),
-}  # fmt: skip
-SPUN: dict[str, tuple[str, Any, Any, float, Any, Any]] = {
-    f"spinning-top-1e{power}": (
-        f"top spun at {10.0**power:g} rad/s", (1.0, 1.0, 0.7), (0.0, 0.0, 10.0**power), 1.0,
-        equations.heavy, (0.0, 0.0, 0.5, *WEIGHT),
-    )
-    for power in (2, 3, 4)
+    **{
+        f"spinning-top-1e{power}": (
+            f"top spun at {10.0**power:g} rad/s", (1.0, 1.0, 0.7), (0.0, 0.0, 10.0**power), 1.0,
+            equations.heavy, (0.0, 0.0, 0.5, *WEIGHT),
+        )
+        for power in (2, 3, 4)
+    },
 }  # fmt: skip
 
 
@@ -147,8 +147,5 @@ def scenes() -> dict[str, Callable[[], Scene]]:
     >>> sorted(scenes())[:3]
     ['arenstorf', 'asymmetric-top', 'damped-gyrostat']
     """
-    bodies, spun = (
-        {name: functools.partial(_body, name, *row) for name, row in rows.items()}
-        for rows in (BODIES, SPUN)
-    )
-    return {**bodies, "foucault": _foucault, "arenstorf": _arenstorf, **spun}
+    bodies = {name: functools.partial(_body, name, *row) for name, row in BODIES.items()}
+    return {**bodies, "foucault": _foucault, "arenstorf": _arenstorf}
