@@ -128,25 +128,19 @@ def choose(records: Iterable[Record], wanted: Sequence[float] = WANTED) -> list[
 def _choice(here: list[Record], scene: str, error: float) -> Choice:
     values, slopes = quickest(here, "value", error), quickest(here, "gradient", error)
     ours = {r.label for r in here if r.group == "ours"}
-    free = any(r.method == "closed form" for r in here)
-    default = "closed form" if free else "simulate"
-    method, spent = next(((n, t) for n, t in values.items() if n in ours), ("", math.nan))
-    slope, taken = next(((n, t) for n, t in slopes.items() if n in ours), ("", math.nan))
-    other, others = next(((n, t) for n, t in values.items() if n not in ours), ("", math.nan))
-    quicker = bool(other) and not others >= spent
-    defaults = [t for n, t in slopes.items() if n.split(", ")[0] == default]
-    return Choice(
-        scene=scene,
-        wanted=error,
-        method=method,
-        time=spent,
-        gradient=slope,
-        gradient_time=taken,
-        default=values.get(default, math.nan),
-        default_gradient=min(defaults, default=math.nan),
-        peer=other if quicker else "",
-        peer_time=others if quicker else math.nan,
+
+    def first(times: dict[str, float], own: bool = True) -> tuple[str, float]:
+        return next(((n, t) for n, t in times.items() if (n in ours) == own), ("", math.nan))
+
+    best, elsewhere = first(values), first(values, own=False)
+    if elsewhere[1] >= best[1]:
+        elsewhere = "", math.nan
+    default = "closed form" if any(r.method == "closed form" for r in here) else "simulate"
+    default_slope = min(
+        (t for n, t in slopes.items() if n.split(", ")[0] == default), default=math.nan
     )
+    default_time = values.get(default, math.nan)
+    return Choice(scene, error, *best, *first(slopes), default_time, default_slope, *elsewhere)
 
 
 def quickest(records: Iterable[Record], kind: str, error: float) -> dict[str, float]:
