@@ -34,10 +34,8 @@ class PeriodicOrbit(eqx.Module):
     period: Float[Array, "*batch"]
 
     def __init__(self, state: Point, period: ScalarLike):
-        if not isinstance(state, Point):
-            raise TypeError(f"state: wanted a Point(x, v), got {type(state).__name__}")
+        self.state = _checks.instance(state, Point, "state", wanted="a Point(x, v)")
         _checks.floating(state.x, (3,), "state.x", batched=True)
-        self.state = state
         period = _checks.floating(period, (), "period", batched=True)
         _checks.same_batch(state=(state.x, 1), period=(period, 0))
         self.period = period.astype(state.x.dtype)
@@ -97,9 +95,7 @@ def periodic_orbit(
 
 def named(hold: str) -> int:
     """Which of the four numbers of a crossing `hold` names."""
-    if hold not in _NAMES:
-        raise ValueError(f"hold: wanted one of {', '.join(_NAMES)}, got {hold!r}")
-    return _NAMES.index(hold)
+    return _NAMES.index(_checks.word(hold, _NAMES, "hold"))
 
 
 def crossing(guess: PeriodicOrbit) -> Float[Array, "4"]:
@@ -108,23 +104,16 @@ def crossing(guess: PeriodicOrbit) -> Float[Array, "4"]:
     >>> crossing(PeriodicOrbit(Point([0.9, 0, 0.1], [0.0, -0.5, 0]), 3.0)).tolist()
     [0.9, 0.1, -0.5, 1.5]
     """
-    if not isinstance(guess, PeriodicOrbit):
-        raise TypeError(
-            f"guess: wanted a PeriodicOrbit(state, period), got {type(guess).__name__}; "
-            "lyapunov_guess and halo_guess make one"
-        )
+    made = "lyapunov_guess and halo_guess make one"
+    wanted = "a PeriodicOrbit(state, period)"
+    _checks.instance(guess, PeriodicOrbit, "guess", wanted=wanted, hint=made)
     x, v = guess.state.x, guess.state.v
     if x.ndim != 1:
         raise ValueError(f"guess: wanted one orbit, x of shape (3,), got {x.shape}; use jax.vmap")
     slant = jnp.maximum(jnp.abs(x[1]), jnp.maximum(jnp.abs(v[0]), jnp.abs(v[2])))
-    x = _checks.refuse(
-        x,
-        slant > 1e-6,
-        "guess: wanted a start that crosses y = 0 at a right angle: y = vx = vz = 0",
-    )
-    period = _checks.refuse(
-        guess.period, ~(guess.period > 0), "guess: wanted a period that is positive"
-    )
+    right = "guess: wanted a start that crosses y = 0 at a right angle: y = vx = vz = 0"
+    x, period = _checks.refuse(x, slant > 1e-6, right), guess.period
+    period = _checks.refuse(period, ~(period > 0), "guess: wanted a period that is positive")
     return _checks.finite(jnp.stack([x[0], x[2], v[1], 0.5 * period]), "guess")
 
 
