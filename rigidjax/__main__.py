@@ -14,6 +14,7 @@ import jax
 
 import rigidjax as rj
 from rigidjax import _checks
+from rigidjax.identify import cli_spec
 from rigidjax.workprecision import command
 
 # What the demo heeds as well; all else says how logs are to be read.
@@ -111,7 +112,7 @@ def _keep_compiled() -> None:
     Not those of `workprecision`, which measures how long compiling takes.
     """
     if jax.__version_info__ < (0, 12):
-        # Of each program that it loads XLA says two flags of its own, 2.6 kB a line (as an error).
+        # XLA reports two flags of its own for each program that it loads, 2.6 kB a line, as errors.
         jax.config.update("jax_logging_level", "CRITICAL")
     if os.environ.get("JAX_COMPILATION_CACHE_DIR"):
         return
@@ -119,8 +120,8 @@ def _keep_compiled() -> None:
         folder = _cache_folder()
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         held = folder.stat()
-        # What is loaded from there is run: nobody else may have put it there. Not so on Windows,
-        # where a user's folder is his own already.
+        # Programs loaded from there are run: nobody else may have put them there. On Windows a
+        # user's folder is the user's own already.
         if hasattr(os, "getuid"):
             if held.st_uid != os.getuid() or held.st_mode & 0o022:
                 told = (
@@ -152,6 +153,55 @@ class _Parser(argparse.ArgumentParser):
         super().error(_checks.printable(message))
 
 
+_FLAG: dict[str, Any] = {"action": "store_true"}
+# The options of `identify`, as `argparse` takes them.
+OPTIONS: dict[str, dict[str, Any]] = {
+    "logs": dict(metavar="FILE", nargs="*", help="logs of one body"),
+    "--demo": _FLAG | dict(help="the tumbling of 4179 Toutatis"),
+    "--columns": dict(
+        nargs=4, metavar=("T", "WX", "WY", "WZ"), help="names of the time column and of the three "
+        "body rates (default: t wx wy wz; those of phyphox and Blackbox are known)"),
+    "--unit": dict(
+        choices=("rad/s", "deg/s"), help="of the rates (default: rad/s; Blackbox deg/s)"),
+    "--noise": dict(
+        nargs="+", type=float, help="standard deviation of a rate, in --unit, one number or one "
+        "for each axis (default: estimated)"),
+    "--limit": dict(
+        type=float, help="full scale of the rates, in --unit: a reading at it counts as at least "
+        "that much (default: found where the log shows a plateau)"),
+    "--loss": dict(
+        choices=tuple(cli_spec.LOSSES), default="soft-l1",
+        help="how an outlier counts: linearly, or squared (none; default: soft-l1)"),
+    "--sensor": dict(
+        action="append", metavar="KIND=COLUMNS[:UNIT[:NOISE]]",
+        help="instead of --columns: gyro=wx,wy,wz:deg/s:0.1, accelerometer=ax,ay,az:m/s2, "
+        "quaternion=qw,qx,qy,qz, euler-ZYX=yaw,pitch,roll:deg (body to world); may be repeated"),
+    "--time-unit": dict(
+        choices=("s", "ms", "us"), help="of the time column (default: s; Blackbox us)"),
+    "--window": dict(
+        nargs=2, type=float, metavar=("FROM", "TO"), help="use these seconds only"),
+    "--wheel": dict(
+        action="append", default=[], metavar="COLUMN:INERTIA[:AXIS[:UNIT]]",
+        help="a wheel whose speed was logged: its inertia in kg m², axis x, y or z, rad/s or rpm"),
+    "--model": dict(
+        choices=tuple(cli_spec.MODELS), default="ratios",
+        help="what of the body is free (default: ratios, all that free motion shows)"),
+    "--typical": dict(
+        type=float, default=1.0, metavar="KG_M2", help="about how large a moment is"),
+    "--free": dict(
+        nargs="+", default=[], choices=("bias", "drag", "delay"),
+        help="what else is free: sensor bias and wheel delay of each log, linear drag of all"),
+    "--starts": dict(type=int, help="how many starting points to try"),
+    "--checkpoint": dict(type=Path, help="keep and resume a long fit in this file"),
+    "--figure": dict(
+        type=Path, metavar="FILE", help="where the figure goes (.png, .pdf, .svg)"),
+    "--report": dict(type=Path, metavar="OUT.html", help="a page with all of it"),
+    "--no-cache": _FLAG | dict(
+        help="compile anew, and keep no compiled programs in the user's cache folder"),
+    "--json": dict(type=Path, metavar="OUT.json", help="the same as numbers"),
+}  # fmt: skip
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = _Parser(
         prog="python -m rigidjax",
@@ -170,88 +220,9 @@ def _parser() -> argparse.ArgumentParser:
         "throw2.csv --wheel flywheel:1.2e-6:z --model tensor --typical 3e-4 --free drag bias "
         "--report throws.html",
     )
+    for name, how in OPTIONS.items():
+        identify.add_argument(name, **how)
     command.add(commands)
-    identify.add_argument("logs", metavar="FILE", nargs="*", help="logs of one body")
-    identify.add_argument("--demo", action="store_true", help="the tumbling of 4179 Toutatis")
-    identify.add_argument(
-        "--columns",
-        nargs=4,
-        metavar=("T", "WX", "WY", "WZ"),
-        help="names of the time column and of the three body rates (default: t wx wy wz; those of "
-        "phyphox and Blackbox are known)",
-    )
-    identify.add_argument(
-        "--unit", choices=("rad/s", "deg/s"), help="of the rates (default: rad/s; Blackbox deg/s)"
-    )
-    identify.add_argument(
-        "--noise",
-        nargs="+",
-        type=float,
-        help="standard deviation of a rate, in --unit, one number or one for each axis "
-        "(default: estimated)",
-    )
-    identify.add_argument(
-        "--limit",
-        type=float,
-        help="full scale of the rates, in --unit: a reading at it counts as at least that much "
-        "(default: found where the log shows a plateau)",
-    )
-    identify.add_argument(
-        "--loss",
-        choices=("soft-l1", "huber", "none"),
-        default="soft-l1",
-        help="how an outlier counts: linearly, or squared (none; default: soft-l1)",
-    )
-    identify.add_argument(
-        "--sensor",
-        action="append",
-        metavar="KIND=COLUMNS[:UNIT[:NOISE]]",
-        help="instead of --columns: gyro=wx,wy,wz:deg/s:0.1, accelerometer=ax,ay,az:m/s2, "
-        "quaternion=qw,qx,qy,qz, euler-ZYX=yaw,pitch,roll:deg (body to world); may be repeated",
-    )
-    identify.add_argument(
-        "--time-unit",
-        choices=("s", "ms", "us"),
-        help="of the time column (default: s; Blackbox us)",
-    )
-    identify.add_argument(
-        "--window", nargs=2, type=float, metavar=("FROM", "TO"), help="use these seconds only"
-    )
-    identify.add_argument(
-        "--wheel",
-        action="append",
-        default=[],
-        metavar="COLUMN:INERTIA[:AXIS[:UNIT]]",
-        help="a wheel whose speed was logged: its inertia in kg m², axis x, y or z, rad/s or rpm",
-    )
-    identify.add_argument(
-        "--model",
-        choices=("ratios", "principal-ratios", "tensor", "principal"),
-        default="ratios",
-        help="what of the body is free (default: ratios, all that free motion shows)",
-    )
-    identify.add_argument(
-        "--typical", type=float, default=1.0, metavar="KG_M2", help="about how large a moment is"
-    )
-    identify.add_argument(
-        "--free",
-        nargs="+",
-        default=[],
-        choices=("bias", "drag", "delay"),
-        help="what else is free: sensor bias and wheel delay of each log, linear drag of all",
-    )
-    identify.add_argument("--starts", type=int, help="how many starting points to try")
-    identify.add_argument("--checkpoint", type=Path, help="keep and resume a long fit in this file")
-    identify.add_argument(
-        "--figure", type=Path, metavar="FILE", help="where the figure goes (.png, .pdf, .svg)"
-    )
-    identify.add_argument("--report", type=Path, metavar="OUT.html", help="a page with all of it")
-    identify.add_argument(
-        "--no-cache",
-        action="store_true",
-        help="compile anew, and keep no compiled programs in the user's cache folder",
-    )
-    identify.add_argument("--json", type=Path, metavar="OUT.json", help="the same as numbers")
     return parser
 
 
@@ -274,51 +245,43 @@ def _demo(options: argparse.Namespace) -> int:
     return _write(found, options, title, [toutatis.CITATION], [title], units, more)
 
 
-def _logs(options: argparse.Namespace) -> int:
-    from rigidjax.identify import cli_spec
+def _channels(options: argparse.Namespace, rates: Sequence[str], unit: str) -> list[Any]:
+    """The sensors that are described."""
+    if options.sensor:
+        alone = [name for name in ("unit", "noise", "limit") if getattr(options, name)]
+        if alone:
+            raise rj.identify.LogError(f"--{alone[0]}: with --sensor, it stands in that itself")
+        return [cli_spec.channel(text) for text in options.sensor]
+    noise = None if options.noise is None else cli_spec.noises(options.noise, "--noise")
+    if options.limit is not None and not options.limit > 0:
+        raise rj.identify.LogError(f"--limit: wanted a positive number, got {options.limit}")
+    return [cli_spec.Channel("gyro", tuple(rates), unit, noise, options.limit)]
 
+
+def _read(options: argparse.Namespace) -> tuple[list[Any], list[Any], rj.identify.Problem]:
+    """The sensors, the recordings, and the problem that the options describe."""
     layout = cli_spec.layout_of(options.logs[0]) if options.columns is None else cli_spec.USUAL
     time, *rates = options.columns or layout.columns
-    unit, time_unit = options.unit or layout.unit, options.time_unit or layout.time_unit
-    try:
-        if options.sensor:
-            alone = [name for name in ("unit", "noise", "limit") if getattr(options, name)]
-            if alone:
-                raise rj.identify.LogError(f"--{alone[0]}: with --sensor, it stands in that itself")
-            channels = [cli_spec.channel(text) for text in options.sensor]
-        else:
-            noise = None if options.noise is None else cli_spec.noises(options.noise, "--noise")
-            if options.limit is not None and not options.limit > 0:
-                raise rj.identify.LogError(
-                    f"--limit: wanted a positive number, got {options.limit}"
-                )
-            channels = [cli_spec.Channel("gyro", tuple(rates), unit, noise, options.limit)]
-        wheels = [cli_spec.wheel(text) for text in options.wheel]
-        if options.model in ("tensor", "principal") and not wheels:
-            raise rj.identify.LogError(
-                f"--model {options.model}: free motion shows ratios only; a scale needs a --wheel"
-            )
-        if "delay" in options.free and not wheels:
-            raise rj.identify.LogError("--free delay: that of a --wheel, and there is none")
-        records = [
-            cli_spec.read_log(
-                path,
-                channels,
-                time=time,
-                time_unit=time_unit,
-                window=options.window,
-                wheels=wheels,
-                free=options.free,
-            )
-            for path in options.logs
-        ]
-        problem = cli_spec.problem_of(
-            records,
-            options.model,
-            typical=options.typical,
-            free=options.free,
-            loss=options.loss,
+    channels = _channels(options, rates, options.unit or layout.unit)
+    wheels = [cli_spec.wheel(text) for text in options.wheel]
+    if options.model in ("tensor", "principal") and not wheels:
+        raise rj.identify.LogError(
+            f"--model {options.model}: free motion shows ratios only; a scale needs a --wheel"
         )
+    if "delay" in options.free and not wheels:
+        raise rj.identify.LogError("--free delay: that of a --wheel, and there is none")
+    how: dict[str, Any] = dict(time=time, time_unit=options.time_unit or layout.time_unit)
+    how |= dict(window=options.window, wheels=wheels, free=options.free)
+    records = [cli_spec.read_log(path, channels, **how) for path in options.logs]
+    problem = cli_spec.problem_of(
+        records, options.model, typical=options.typical, free=options.free, loss=options.loss
+    )
+    return channels, records, problem
+
+
+def _logs(options: argparse.Namespace) -> int:
+    try:
+        channels, records, problem = _read(options)
     except ValueError as error:
         return _error(error)
     for path, record in zip(options.logs, records, strict=True):
@@ -375,29 +338,25 @@ def _write(
     report, figure = rj.identify.report, options.figure
     if options.demo and figure is None and _matplotlib():
         figure = Path("toutatis.png")
-    kept = True
-    if figure is not None:
-        kept &= _made(
-            "figure",
-            figure,
-            lambda: rj.plot.fit(found, index=0, title=names[0], **units).savefig(figure, dpi=130),
-        )
-    if options.json is not None:
-        kept &= _made(
-            "numbers", options.json, lambda: report.write_json(found, options.json, read, more)
-        )
-    if options.report is not None:
+
+    def page() -> None:
         figures = _figures(found, names, units) if figure is not None or _matplotlib() else []
         page: dict[str, Any] = {"title": title, "figures": figures, "files": read, "more": more}
-        kept &= _made(
-            "report",
-            options.report,
-            lambda: report.write_html(found, options.report, rate_unit=units["rate_unit"], **page),
-        )
+        report.write_html(found, options.report, rate_unit=units["rate_unit"], **page)
+
+    def drawn() -> None:
+        rj.plot.fit(found, index=0, title=names[0], **units).savefig(figure, dpi=130)
+
+    def numbers() -> None:
+        report.write_json(found, options.json, read, more)
+
+    wanted = {"figure": (figure, drawn), "numbers": (options.json, numbers)}
+    wanted |= {"report": (options.report, page)}
+    kept = [_made(what, path, make) for what, (path, make) in wanted.items() if path is not None]
     if "interrupted" in found.status:
         _error("interrupted (Ctrl-C): not all starts were made, see the status")
         return 130
-    return 2 if not kept else 0 if found.ok else 1
+    return 2 if not all(kept) else 0 if found.ok else 1
 
 
 def _made(what: str, path: Path, make: Callable[[], Any]) -> bool:
@@ -412,17 +371,14 @@ def _made(what: str, path: Path, make: Callable[[], Any]) -> bool:
 
 
 def _figures(found: Any, names: list[str], units: dict[str, str]) -> list[Any]:
-    def of_log(index: int) -> Any:
-        return rj.plot.fit(found, index=index, title=names[index], **units)
-
     def left_over() -> Any:
         return rj.plot.residuals(found, time_unit=units.get("time_unit", "s")).flat[0].figure
 
     def body() -> Any:
         return rj.plot.inertia_ellipsoid(found)[0].figure
 
-    figures = []
-    logs = [functools.partial(of_log, index) for index in range(len(names[:12]))]
+    figures, fit = [], functools.partial(rj.plot.fit, found, **units)
+    logs = [functools.partial(fit, index=i, title=name) for i, name in enumerate(names[:12])]
     for make in (*logs, left_over, body):
         try:
             figures.append(make())

@@ -6,12 +6,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from rigidjax import _checks
 
+# Arguments and results of all functions: real numbers of shapes that broadcast.
+Real = Float[ArrayLike, "..."]
+Result = Float[Array, "..."]
 
-def common(**named: Any) -> tuple[Float[Array, "..."], ...]:
+
+def common(**named: Any) -> tuple[Result, ...]:
     """All arguments as floating arrays of one dtype, broadcast to one shape.
 
     Python numbers take the dtype of the arrays beside them; without arrays it is JAX's default.
@@ -53,7 +57,7 @@ def complementary(name: str, value: Any, complement: Any) -> dict[str, Any]:
 
 
 @jax.custom_jvp
-def exact_complement(value: Float[Array, "..."], complement: Float[Array, "..."]) -> Any:
+def exact_complement(value: Result, complement: Result) -> Any:
     """`value` with its own digits, but as a function of its `complement` alone: slope −1."""
     return value
 

@@ -1,6 +1,6 @@
 """Carlson's symmetric elliptic integrals R_F, R_D, R_J, R_C.
 
-R_F, R_D, R_C by duplication (Carlson 1995, doi 10.1007/BF02198293; DLMF 19.36(i)): each step
+R_F and R_D by duplication (Carlson 1995, doi 10.1007/BF02198293; DLMF 19.36(i)): each step
 replaces every argument a by (a + λ)/4, which first halves the logarithm of their ratio and then
 quarters their distance, until a Taylor series about the mean is exact to round-off. R_J is the
 half-line integral it is defined by. Derivatives are integrals of the same kind (DLMF 19.18).
@@ -13,18 +13,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.custom_derivatives import SymbolicZero
-from jaxtyping import Array, ArrayLike, Float
 
-from rigidjax.elliptic.arguments import common
-from rigidjax.elliptic.carlson_r import r_integral
+from rigidjax.elliptic.arguments import Real, Result, common
+from rigidjax.elliptic.carlson_r import change, r_integral, scale_of
 
 # Steps after which the series is exact for ratios over the whole range of the dtype.
 _STEPS = {np.dtype("float64"): 13, np.dtype("float32"): 8}
 
 
-def rf(
-    x: Float[ArrayLike, "..."], y: Float[ArrayLike, "..."], z: Float[ArrayLike, "..."]
-) -> Float[Array, "..."]:
+def rf(x: Real, y: Real, z: Real) -> Result:
     """R_F(x, y, z) = ½ ∫₀^∞ dt / √((t+x)(t+y)(t+z)), Carlson's integral of the first kind.
 
     **Arguments:** `x`, `y`, `z` ≥ 0 of shapes that broadcast, at most one of them 0; any one unit
@@ -42,9 +39,7 @@ def rf(
     return _rf(common(x=x, y=y, z=z))
 
 
-def rd(
-    x: Float[ArrayLike, "..."], y: Float[ArrayLike, "..."], z: Float[ArrayLike, "..."]
-) -> Float[Array, "..."]:
+def rd(x: Real, y: Real, z: Real) -> Result:
     """R_D(x, y, z) = (3/2) ∫₀^∞ dt / ((t+z) √((t+x)(t+y)(t+z))), of the second kind.
 
     **Arguments:** `x`, `y` ≥ 0, at most one of them 0, and `z` > 0, of shapes that broadcast; any
@@ -60,12 +55,7 @@ def rd(
     return _rd(common(x=x, y=y, z=z))
 
 
-def rj_(
-    x: Float[ArrayLike, "..."],
-    y: Float[ArrayLike, "..."],
-    z: Float[ArrayLike, "..."],
-    p: Float[ArrayLike, "..."],
-) -> Float[Array, "..."]:
+def rj_(x: Real, y: Real, z: Real, p: Real) -> Result:
     """R_J(x, y, z, p) = (3/2) ∫₀^∞ dt / ((t+p) √((t+x)(t+y)(t+z))), of the third kind.
 
     The underscore keeps the name apart from `import rigidjax as rj`.
@@ -83,7 +73,7 @@ def rj_(
     return 1.5 * r_integral((0.5, 0.5, 0.5, 1.0), common(x=x, y=y, z=z, p=p))
 
 
-def rc(x: Float[ArrayLike, "..."], y: Float[ArrayLike, "..."]) -> Float[Array, "..."]:
+def rc(x: Real, y: Real) -> Result:
     """R_C(x, y) = ½ ∫₀^∞ dt / ((t+y) √(t+x)), the elementary one: arctangents and logarithms.
 
     **Arguments:** `x` ≥ 0 and `y` ≠ 0 of shapes that broadcast; any one unit. For y < 0 the
@@ -101,12 +91,13 @@ def rc(x: Float[ArrayLike, "..."], y: Float[ArrayLike, "..."]) -> Float[Array, "
     length = jnp.where(below, x - y, 1)
     # √0 has no derivative: keep it out of the branch that is not taken.
     factor = jnp.sqrt(jnp.where(below, x / length, 1))
-    return factor * _rc((jnp.where(below, x - y, x), jnp.where(below, -y, y)))
+    positive = jnp.where(below, -y, y)
+    return factor * _rf((jnp.where(below, x - y, x), positive, positive))
 
 
 @jax.custom_jvp
 def _rf(arguments: Any) -> Any:
-    scale = _scale(arguments)
+    scale = scale_of(arguments)
     x, y, z = (a / scale for a in arguments)
     for _ in range(_STEPS[np.dtype(x.dtype)]):
         step = _lambda(x, y, z)
@@ -123,18 +114,17 @@ def _rf(arguments: Any) -> Any:
 
 @partial(_rf.defjvp, symbolic_zeros=True)
 def _rf_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
-    (arguments,), (directions,) = primals, tangents
-    tangent = jnp.zeros_like(arguments[0])
+    (a,), (directions,) = primals, tangents
+    tangent = jnp.zeros_like(a[0])
     for i, direction in enumerate(directions):
         if not isinstance(direction, SymbolicZero):
-            others = (*arguments[:i], *arguments[i + 1 :])
-            tangent = tangent - _rd((*others, arguments[i])) * direction / 6
-    return _rf(arguments), tangent
+            tangent = tangent - _rd((*a[:i], *a[i + 1 :], a[i])) * direction / 6
+    return _rf(a), tangent
 
 
 @jax.custom_jvp
 def _rd(arguments: Any) -> Any:
-    scale = _scale(arguments)
+    scale = scale_of(arguments)
     x, y, z = (a / scale for a in arguments)
     total, weight = jnp.zeros_like(x), 3.0
     for _ in range(_STEPS[np.dtype(x.dtype)]):
@@ -161,53 +151,13 @@ def _rd(arguments: Any) -> Any:
 @partial(_rd.defjvp, symbolic_zeros=True)
 def _rd_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
     (arguments,), (directions,) = primals, tangents
-    powers = (0.5, 0.5, 1.5)
-    tangent = jnp.zeros_like(arguments[0])
-    for i, direction in enumerate(directions):
-        if not isinstance(direction, SymbolicZero):
-            raised = (*powers[:i], powers[i] + 1, *powers[i + 1 :])
-            tangent = tangent - 1.5 * powers[i] * r_integral(raised, arguments) * direction
-    return _rd(arguments), tangent
-
-
-@jax.custom_jvp
-def _rc(arguments: Any) -> Any:
-    scale = _scale(arguments)
-    x, y = (a / scale for a in arguments)
-    for _ in range(_STEPS[np.dtype(x.dtype)]):
-        step = 2 * jnp.sqrt(x) * jnp.sqrt(y) + y
-        x, y = 0.25 * (x + step), 0.25 * (y + step)
-    mean = (x + 2 * y) / 3
-    s = (y - mean) / mean
-    # DLMF 19.36 with x, y, y; Carlson 1995, eq 2.15.
-    series = s * (1 / 7 + s * (3 / 8 + s * (9 / 22 + s * (159 / 208 + s * 9 / 8))))
-    value = (1 + s**2 * (0.3 + series)) / jnp.sqrt(mean * scale)
-    return _domain(jnp.where(arguments[1] == 0, jnp.inf, value), arguments)
-
-
-@partial(_rc.defjvp, symbolic_zeros=True)
-def _rc_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
-    ((x, y),), ((dx, dy),) = primals, tangents
-    tangent = jnp.zeros_like(x)
-    if not isinstance(dx, SymbolicZero):
-        tangent = tangent - _rd((y, y, x)) * dx / 6
-    if not isinstance(dy, SymbolicZero):
-        tangent = tangent - _rd((x, y, y)) * dy / 3
-    return _rc((x, y)), tangent
+    return _rd(arguments), 1.5 * change((0.5, 0.5, 1.5), arguments, directions)
 
 
 def _lambda(x: Any, y: Any, z: Any) -> Any:
     """λ of the duplication theorem (DLMF 19.26.18)."""
     a, b, c = jnp.sqrt(x), jnp.sqrt(y), jnp.sqrt(z)
     return a * b + b * c + c * a
-
-
-def _scale(arguments: Any) -> Any:
-    """The largest argument: all integrals are homogeneous, and squares must not overflow."""
-    largest = arguments[0]
-    for a in arguments[1:]:
-        largest = jnp.maximum(largest, a)
-    return jnp.where(largest > 0, largest, 1)
 
 
 def _domain(value: Any, arguments: Any) -> Any:

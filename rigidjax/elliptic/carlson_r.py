@@ -9,6 +9,7 @@ trapezoidal rule converges like exp(−2π²/h) (Trefethen & Weideman 2014, doi 
 a number of nodes fixed by the dtype reaches round-off for arguments of very different sizes.
 """
 
+import functools
 import math
 from functools import partial
 from typing import Any
@@ -17,7 +18,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.custom_derivatives import SymbolicZero
-from jaxtyping import Array, Float
+
+from rigidjax.elliptic.arguments import Result
 
 # Enough that h < 0.5 (float64) or 0.9 (float32) for arguments in ratios of 1e35.
 _NODES = {np.dtype("float64"): 512, np.dtype("float32"): 160}
@@ -26,9 +28,7 @@ _UNIT = {np.dtype("float64"): 1.0, np.dtype("float32"): 2.0**24}
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def r_integral(
-    powers: tuple[float, ...], arguments: tuple[Float[Array, "..."], ...]
-) -> Float[Array, "..."]:
+def r_integral(powers: tuple[float, ...], arguments: tuple[Result, ...]) -> Result:
     """∫₀^∞ ∏ (t + aᵢ)^(−bᵢ) dt for aᵢ ≥ 0, to a few units of round-off.
 
     **Arguments:** `powers` the bᵢ, multiples of ½ with Σ bᵢ > 1 (negative ones may be among them).
@@ -42,10 +42,7 @@ def r_integral(
     >>> round(float(r_integral((2.0,), (jnp.asarray(4.0),))), 12)
     0.25
     """
-    largest = arguments[0]
-    for a in arguments[1:]:
-        largest = jnp.maximum(largest, a)
-    scale = jnp.where(largest > 0, largest, 1)
+    scale = scale_of(arguments)
     dtype = np.dtype(arguments[0].dtype)
     unit = _UNIT[dtype]
     scaled = [a / scale * unit for a in arguments]
@@ -71,7 +68,7 @@ def r_integral(
     value = product.sum(0) * step * unit**excess
     value = _divide(value, scale, excess)
     value = jnp.where(at_zero > 0, value, jnp.inf)
-    negative = jnp.isnan(largest)
+    negative = jnp.zeros_like(value, dtype=bool)
     for a in arguments:
         negative = negative | ~(a >= 0)
     return jnp.where(negative, jnp.nan, value)
@@ -80,12 +77,23 @@ def r_integral(
 @partial(r_integral.defjvp, symbolic_zeros=True)
 def _r_integral_jvp(powers: Any, primals: Any, tangents: Any) -> tuple[Any, Any]:
     (arguments,), (directions,) = primals, tangents
+    return r_integral(powers, arguments), change(powers, arguments, directions)
+
+
+def change(powers: tuple[float, ...], arguments: Any, directions: Any) -> Any:
+    """The derivative of `r_integral` along `directions`."""
     tangent = jnp.zeros_like(arguments[0])
     for i, direction in enumerate(directions):
         if powers[i] and not isinstance(direction, SymbolicZero):
             raised = (*powers[:i], powers[i] + 1, *powers[i + 1 :])
             tangent = tangent - powers[i] * r_integral(raised, arguments) * direction
-    return r_integral(powers, arguments), tangent
+    return tangent
+
+
+def scale_of(arguments: Any) -> Any:
+    """The largest argument: all integrals are homogeneous, and squares must not overflow."""
+    largest = functools.reduce(jnp.maximum, arguments)
+    return jnp.where(largest > 0, largest, 1)
 
 
 def _divide(value: Any, x: Any, power: float) -> Any:

@@ -20,9 +20,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.custom_derivatives import SymbolicZero
-from jaxtyping import Array, ArrayLike, Float
 
-from rigidjax.elliptic.arguments import common, complementary, exact_complement
+from rigidjax.elliptic.arguments import Real, Result, common, complementary, exact_complement
 from rigidjax.elliptic.jacobi_near_one import LARGEST_M1, near_one
 from rigidjax.elliptic.legendre import MEAN_STEPS, complete, half_turns, integral
 
@@ -30,11 +29,7 @@ from rigidjax.elliptic.legendre import MEAN_STEPS, complete, half_turns, integra
 _FLOOR = {np.dtype("float64"): 1e-40, np.dtype("float32"): 1e-8}
 
 
-def sncndn(
-    u: Float[ArrayLike, "..."],
-    m: Float[ArrayLike, "..."],
-    m1: Float[ArrayLike, "..."] | None = None,
-) -> tuple[Float[Array, "..."], Float[Array, "..."], Float[Array, "..."]]:
+def sncndn(u: Real, m: Real, m1: Real | None = None) -> tuple[Result, Result, Result]:
     """Jacobi's sn(u|m), cn(u|m), dn(u|m).
 
     **Arguments:** `u` real; the error grows as |u| eps. `m` the parameter k², not the modulus: any
@@ -57,11 +52,7 @@ def sncndn(
     return s, c, d
 
 
-def am(
-    u: Float[ArrayLike, "..."],
-    m: Float[ArrayLike, "..."],
-    m1: Float[ArrayLike, "..."] | None = None,
-) -> Float[Array, "..."]:
+def am(u: Real, m: Real, m1: Real | None = None) -> Result:
     """Jacobi's amplitude φ = ∫₀^u dn(v|m) dv, rad: the inverse of F(φ|m) for m ≤ 1.
 
     **Arguments:** as `sncndn`. For m ≤ 1 the amplitude grows by π each half period 2K, without
@@ -92,12 +83,7 @@ def _functions(u: Any, m: Any, m1: Any) -> tuple[Any, Any, Any, Any]:
 
     s, c, d = _core(v, inner_m, inner_m1)
     turns = _turns(jax.lax.stop_gradient(v), jax.lax.stop_gradient(inner_m1))[0]
-    return (
-        s / root,
-        jnp.where(above, d, c),
-        jnp.where(above, c, d),
-        jnp.where(above, 0, turns),
-    )
+    return (s / root, jnp.where(above, d, c), jnp.where(above, c, d), jnp.where(above, 0, turns))
 
 
 @jax.custom_jvp
@@ -191,7 +177,7 @@ def _slopes_from_integral(u: Any, m: Any, m1: Any) -> tuple[Any, Any, Any]:
     s, c, d = _core(u, m, m1)
     turns = _turns(jax.lax.stop_gradient(u), jax.lax.stop_gradient(m1))[0]
     sign = _parity(turns)
-    # X ~ 1/dn² must not overflow. Where cn and dn are minute it depends, but for that factor, on
+    # X ~ 1/dn² must not overflow. If cn and dn are minute it depends, but for that factor, on
     # their ratio only (to the floor squared): raise both.
     up = jnp.maximum(1, _FLOOR[np.dtype(u.dtype)] / jax.lax.stop_gradient(d))
     c, d, raised = c * up, d * up, m1 * up * up

@@ -15,16 +15,15 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+
+from rigidjax.elliptic.arguments import Result
 
 # The nome is below 0.0066 there: a few images, and two terms of its own series, are enough.
 LARGEST_M1 = 0.1
 _IMAGES = {np.dtype("float64"): 8, np.dtype("float32"): 4}
 
 
-def near_one(
-    u: Float[Array, "..."], m: Float[Array, "..."], m1: Float[Array, "..."]
-) -> tuple[Float[Array, "..."], Float[Array, "..."], Float[Array, "..."]]:
+def near_one(u: Result, m: Result, m1: Result) -> tuple[Result, Result, Result]:
     """(sn, cn, dn) for 0 ≤ m1 ≤ 0.1, to round-off of 1, with right derivatives in m.
 
     **Arguments:** `u`, `m` and `m1` = 1 − m of one shape; a tangent of m must be minus that of m1.

@@ -17,9 +17,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.custom_derivatives import SymbolicZero
-from jaxtyping import Array, ArrayLike, Float
 
-from rigidjax.elliptic.arguments import common, complementary
+from rigidjax.elliptic.arguments import Real, Result, common, complementary
 from rigidjax.elliptic.carlson import rd, rf
 from rigidjax.elliptic.carlson_r import r_integral
 
@@ -33,9 +32,7 @@ PI_PARTS = {
 }
 
 
-def ellipk(
-    m: Float[ArrayLike, "..."], m1: Float[ArrayLike, "..."] | None = None
-) -> Float[Array, "..."]:
+def ellipk(m: Real, m1: Real | None = None) -> Result:
     """Complete elliptic integral of the first kind, K(m) = ∫₀^{π/2} dθ/√(1 − m sin²θ).
 
     **Arguments:** `m` the parameter k², not the modulus; m < 1 (infinite at 1, NaN beyond; negative
@@ -55,9 +52,7 @@ def ellipk(
     return _complete_first(m1)
 
 
-def ellipe(
-    m: Float[ArrayLike, "..."], m1: Float[ArrayLike, "..."] | None = None
-) -> Float[Array, "..."]:
+def ellipe(m: Real, m1: Real | None = None) -> Result:
     """Complete elliptic integral of the second kind, E(m) = ∫₀^{π/2} √(1 − m sin²θ) dθ.
 
     **Arguments:** `m` ≤ 1 the parameter k² (NaN beyond 1); `m1` = 1 − m given exactly, see
@@ -74,12 +69,7 @@ def ellipe(
     return complete((0, -1, 0), m1)
 
 
-def ellippi(
-    n: Float[ArrayLike, "..."],
-    m: Float[ArrayLike, "..."],
-    m1: Float[ArrayLike, "..."] | None = None,
-    n1: Float[ArrayLike, "..."] | None = None,
-) -> Float[Array, "..."]:
+def ellippi(n: Real, m: Real, m1: Real | None = None, n1: Real | None = None) -> Result:
     """Complete elliptic integral of the third kind, ∫₀^{π/2} dθ/((1 − n sin²θ) √(1 − m sin²θ)).
 
     **Arguments:** `n` < 1 the characteristic (DLMF's α²; infinite at 1; the principal value for
@@ -98,11 +88,7 @@ def ellippi(
     return complete((0, 0, 1), m1, n1)
 
 
-def ellipf(
-    phi: Float[ArrayLike, "..."],
-    m: Float[ArrayLike, "..."],
-    m1: Float[ArrayLike, "..."] | None = None,
-) -> Float[Array, "..."]:
+def ellipf(phi: Real, m: Real, m1: Real | None = None) -> Result:
     """Incomplete elliptic integral of the first kind, F(φ|m) = ∫₀^φ dθ/√(1 − m sin²θ).
 
     **Arguments:** `phi` the amplitude, rad, any size; `m` the parameter k², m sin²φ < 1 (NaN
@@ -119,11 +105,7 @@ def ellipf(
     return _incomplete((0, 0, 0), phi, m1)
 
 
-def ellipeinc(
-    phi: Float[ArrayLike, "..."],
-    m: Float[ArrayLike, "..."],
-    m1: Float[ArrayLike, "..."] | None = None,
-) -> Float[Array, "..."]:
+def ellipeinc(phi: Real, m: Real, m1: Real | None = None) -> Result:
     """Incomplete elliptic integral of the second kind, E(φ|m) = ∫₀^φ √(1 − m sin²θ) dθ.
 
     **Arguments:** `phi` the amplitude, rad, any size; `m` ≤ 1 the parameter k² (NaN beyond 1);
@@ -142,12 +124,8 @@ def ellipeinc(
 
 
 def ellippiinc(
-    n: Float[ArrayLike, "..."],
-    phi: Float[ArrayLike, "..."],
-    m: Float[ArrayLike, "..."],
-    m1: Float[ArrayLike, "..."] | None = None,
-    n1: Float[ArrayLike, "..."] | None = None,
-) -> Float[Array, "..."]:
+    n: Real, phi: Real, m: Real, m1: Real | None = None, n1: Real | None = None
+) -> Result:
     """Incomplete elliptic integral of the third kind, ∫₀^φ dθ/((1 − n sin²θ) √(1 − m sin²θ)).
 
     **Arguments:** `n` the characteristic, n sin²φ < 1; `phi` the amplitude, rad, any size; `m` the

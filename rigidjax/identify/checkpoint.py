@@ -105,7 +105,7 @@ class Checkpoint:
     def _read(self, path: Path) -> None:
         # An empty file raises EOFError; a cut one BadZipFile, or zlib.error.
         try:
-            # Of a file that it opened itself and cannot read NumPy leaves the handle open.
+            # NumPy leaves the handle open of a file that it opened itself and cannot read.
             with path.open("rb") as raw, np.load(raw) as file:
                 held = {name: file[name] for name in file.files}
             print_of, done = str(held["print_of"]), int(held["done"])

@@ -1,6 +1,7 @@
 """From a description in words, as the command line gives it, to recordings and a problem."""
 
 from collections.abc import Callable, Sequence
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -29,10 +30,21 @@ from rigidjax.identify.sensors import (
 )
 from rigidjax.motion.torques import Damping, Flywheel, Series, Sum, Torque, Wheel
 
-MODELS = ("ratios", "principal-ratios", "tensor", "principal")
-FREE = ("bias", "drag", "delay")
-LOSSES = ("soft-l1", "huber", "none")
-DEFAULT_UNITS = {"gyro": "rad/s", "accelerometer": "m/s2", "quaternion": "1"}
+# Of the typical size of a moment, kg m².
+MODELS: dict[str, Callable[[float], AbstractBodyChart]] = {
+    "ratios": lambda _: Ratios(),
+    "principal-ratios": lambda _: PrincipalRatios(),
+    "tensor": Tensor,
+    "principal": Principal,
+}
+LOSSES = {"soft-l1": SoftL1(), "huber": Huber(), "none": None}
+# The units of each kind of sensor, the usual one first; angles have those of "euler".
+SENSOR_UNITS = {
+    "gyro": ("rad/s", "deg/s", "rpm"),
+    "accelerometer": ("m/s2", "g"),
+    "quaternion": ("1",),
+    "euler": ("rad", "deg"),
+}
 
 
 class Channel(eqx.Module):
@@ -69,7 +81,8 @@ def channel(text: str) -> Channel:
     kind, _, rest = text.partition("=")
     names, *more = rest.split(":")
     columns = tuple(name.strip() for name in names.split(","))
-    if kind not in DEFAULT_UNITS and not kind.startswith("euler-"):
+    allowed = SENSOR_UNITS.get("euler" if kind.startswith("euler-") else kind)
+    if allowed is None or kind == "euler":
         raise LogError(
             f"sensor {text!r}: wanted gyro, accelerometer, quaternion or euler-SEQUENCE, as in "
             "gyro=wx,wy,wz:deg/s"
@@ -77,23 +90,16 @@ def channel(text: str) -> Channel:
     wanted = 4 if kind == "quaternion" else 3
     if len(columns) != wanted or not all(columns):
         raise LogError(f"sensor {text!r}: wanted {wanted} columns, got {names!r}")
-    unit = more[0] if more and more[0] else DEFAULT_UNITS.get(kind, "rad")
-    allowed = {
-        "gyro": ("rad/s", "deg/s", "rpm"),
-        "accelerometer": ("m/s2", "g"),
-        "quaternion": ("1",),
-    }.get(kind, ("rad", "deg"))
+    unit = more[0] if more and more[0] else allowed[0]
     if unit not in allowed:
         raise LogError(f"sensor {text!r}: wanted the unit {' or '.join(allowed)}, got {unit!r}")
-    return Channel(kind, columns, unit, _noise(text, more[1]) if len(more) > 1 else None)
-
-
-def _noise(text: str, cell: str) -> tuple[float, ...]:
+    if len(more) < 2:
+        return Channel(kind, columns, unit, None)
     try:
-        noise = tuple(float(part) for part in cell.split(","))
+        noise = tuple(float(part) for part in more[1].split(","))
     except ValueError:
-        raise LogError(f"sensor {text!r}: wanted a number for the noise, got {cell!r}") from None
-    return noises(noise, f"sensor {text!r}")
+        raise LogError(f"sensor {text!r}: wanted a number for the noise, got {more[1]!r}") from None
+    return Channel(kind, columns, unit, noises(noise, f"sensor {text!r}"))
 
 
 def noises(noise: Sequence[float], where: str) -> tuple[float, ...]:
@@ -122,8 +128,8 @@ def wheel(text: str) -> WheelColumn:
         raise LogError(f"wheel {text!r}: wanted COLUMN:INERTIA, as in flywheel:5.2e-7:z") from None
     if axis not in ("x", "y", "z") or unit not in ("rad/s", "rpm"):
         raise LogError(f"wheel {text!r}: wanted an axis x, y or z and a unit rad/s or rpm")
-    directions = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
-    return WheelColumn(name, unit, inertia, directions[axis])
+    x, y, z = (float(axis == one) for one in "xyz")
+    return WheelColumn(name, unit, inertia, (x, y, z))
 
 
 def read_log(
@@ -236,36 +242,22 @@ def problem_of(
 
     **Raises** `LogError` for an unknown model or a scale that nothing can show.
     """
-    charts: dict[str, AbstractBodyChart] = {
-        "ratios": Ratios(),
-        "principal-ratios": PrincipalRatios(),
-        "tensor": Tensor(typical),
-        "principal": Principal(typical),
-    }
-    if model not in charts:
+    if model not in MODELS:
         raise LogError(f"model: wanted one of {', '.join(MODELS)}, got {model!r}")
     if loss not in LOSSES:
         raise LogError(f"loss: wanted one of {', '.join(LOSSES)}, got {loss!r}")
-    counts = {"soft-l1": SoftL1(), "huber": Huber(), "none": None}[loss]
-    return Problem(
-        list(recordings), charts[model], free=_free(recordings[0], typical, free), loss=counts
-    )
+    chart, moving = MODELS[model](typical), _free(recordings[0], typical, free)
+    return Problem(list(recordings), chart, free=moving, loss=LOSSES[loss])
 
 
 def _free(first: Recording, typical: float, free: Sequence[str]) -> list[Free]:
-    """What of the sensors and the torque is free, as `read_log` laid them out."""
+    """The free numbers of the sensors and the torque, as `read_log` laid them out."""
 
-    def sensor_bias(index: int) -> Callable[[Any], Any]:
-        return lambda r: r.readings[index].sensor.bias
+    def of_sensor(index: int, name: str) -> Callable[[Any], Any]:
+        return lambda r: getattr(r.readings[index].sensor, name)
 
-    def place(index: int) -> Callable[[Any], Any]:
-        return lambda r: r.readings[index].sensor.place
-
-    def delay(index: int) -> Callable[[Any], Any]:
-        return lambda r: r.torque.parts[index].momentum.delay
-
-    def drag(r: Any) -> Any:
-        return r.torque.parts[-1].coefficient
+    def of_torque(index: int, path: str) -> Callable[[Any], Any]:
+        return lambda r: attrgetter(path)(r.torque.parts[index])
 
     items: list[Free] = []
     for index, sensor in enumerate(first.sensors):
@@ -274,15 +266,15 @@ def _free(first: Recording, typical: float, free: Sequence[str]) -> list[Free]:
         name = kind.lower() + (f" {same.index(index) + 1}" if len(same) > 1 else "")
         if getattr(sensor, "bias", None) is not None:
             size = 0.05 if isinstance(sensor, Gyro) else 0.5
-            items.append(Free(sensor_bias(index), f"{name} bias", scale=size, each=True))
+            items.append(Free(of_sensor(index, "bias"), f"{name} bias", scale=size, each=True))
         if isinstance(sensor, Accelerometer):
-            items.append(Free(place(index), f"{name} place", scale=0.01))
+            items.append(Free(of_sensor(index, "place"), f"{name} place", scale=0.01))
     if "drag" in free:
-        items.append(Free(drag, "drag", scale=0.1 * typical, unit="N m s"))
+        where = of_torque(-1, "coefficient")
+        items.append(Free(where, "drag", scale=0.1 * typical, unit="N m s"))
     if "delay" in free and isinstance(first.torque, Sum):
         wheels = len(first.torque.parts) - ("drag" in free)
-        names = [f"wheel {i + 1} delay" for i in range(wheels)] if wheels > 1 else ["wheel delay"]
-        items += [
-            Free(delay(i), name, scale=1e-3, each=True) for i, name in enumerate(names[:wheels])
-        ]
+        for i in range(wheels):
+            name = f"wheel {i + 1} delay" if wheels > 1 else "wheel delay"
+            items.append(Free(of_torque(i, "momentum.delay"), name, scale=1e-3, each=True))
     return items

@@ -202,7 +202,7 @@ def _number(cell: str) -> float:
 
 
 def _arrays(path: Path, columns: Sequence[str]) -> dict[str, np.ndarray]:
-    # Of an empty or a cut file the readers raise whatever they run into.
+    # The readers raise whatever they run into in an empty or a cut file.
     try:
         names, held = _readers[path.suffix.lower()](path, columns)
     except ModuleNotFoundError as error:
@@ -232,7 +232,7 @@ def _arrays(path: Path, columns: Sequence[str]) -> dict[str, np.ndarray]:
 
 
 def _npz(path: Path, columns: Sequence[str]) -> tuple[list[str], dict[str, Any]]:
-    # Of a file that it opened itself and cannot read NumPy leaves the handle open.
+    # NumPy leaves the handle open of a file that it opened itself and cannot read.
     with path.open("rb") as raw, np.load(raw) as file:
         return file.files, {name: file[name] for name in columns if name in file.files}
 

@@ -4,7 +4,7 @@ import base64
 import html
 import io
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -137,7 +137,7 @@ def verdict(fit: Fit) -> str:
 
 
 def as_dict(fit: Fit, files: Sequence[str] = (), more: Sequence[Row] = ()) -> dict[str, Any]:
-    """All that was found as plain numbers and text, for JSON. What is infinite or NaN is `null`.
+    """All that was found as plain numbers and text, for JSON; infinity and NaN become `null`.
 
     **Arguments:** `fit`; `files` the names of what was read; `more` rows of further quantities.
 
@@ -155,20 +155,13 @@ def as_dict(fit: Fit, files: Sequence[str] = (), more: Sequence[Row] = ()) -> di
 
     one_fit(fit)
     bounds = fit.interval(0.95)
+    found = [(one.name, one.value, *bounds[one.name], one.unit) for one in fit.quantities]
     return {
         "files": list(files),
         "status": fit.status,
         "quantities": {
-            quantity.name: {
-                "value": plain(quantity.value),
-                "interval_95": [plain(x) for x in bounds[quantity.name]],
-                "unit": quantity.unit,
-            }
-            for quantity in fit.quantities
-        }
-        | {
             name: {"value": plain(value), "interval_95": [plain(low), plain(high)], "unit": unit}
-            for name, value, low, high, unit in more
+            for name, value, low, high, unit in (*found, *more)
         },
         "rms": {
             f"{index} {name}": {"value": plain(rms), "axes": list(map(plain, axes)), "unit": unit}
@@ -238,7 +231,7 @@ def write_json(
     'ok'
     """
     text = json.dumps(as_dict(fit, files, more), indent=2, ensure_ascii=False, allow_nan=False)
-    # What is no character (of a file's name) stands as JSON writes it.
+    # A part of a file's name that is no character stands as JSON writes it.
     Path(path).write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
 
 
@@ -269,22 +262,21 @@ def write_html(
     '<!doctype html>'
     """
     one_fit(fit)
-    good = fit.ok
-    lines = []
-    for name, value, low, high, unit in [*rows(fit, rate_unit), *more]:
-        shown = numbers(value, low, high)
-        cells = (name, shown[0], _between(shown), unit)
-        lines.append("<tr>" + "".join(f"<td>{html.escape(c)}</td>" for c in cells) + "</tr>")
-    words = "".join(f"<li>{html.escape(line)}</li>" for line in fit.identifiability)
-    sizes = "".join(
-        f"<tr><td>{html.escape(name)}</td><td>{' '.join(f'{x:.3g}' for x in axes)}</td>"
-        f"<td>{html.escape(unit)}</td></tr>"
-        for name, axes, unit in _rms_of_axes(fit)
+    lines = _cells(
+        (name, (shown := numbers(*three))[0], _between(shown), unit)
+        for name, *three, unit in (*rows(fit, rate_unit), *more)
     )
-    starts = "".join(
-        f"<tr><td>{number}</td><td>{start.cost:.6g}</td>"
-        f"<td>{'converged' if start.converged else 'not converged'}</td>"
-        f"<td>{'explains the data' if start.fits else 'does not explain the data'}</td></tr>"
+    words = "".join(f"<li>{html.escape(line)}</li>" for line in fit.identifiability)
+    sizes = _cells(
+        (name, " ".join(f"{x:.3g}" for x in axes), unit) for name, axes, unit in _rms_of_axes(fit)
+    )
+    starts = _cells(
+        (
+            str(number),
+            f"{start.cost:.6g}",
+            "converged" if start.converged else "not converged",
+            "explains the data" if start.fits else "does not explain the data",
+        )
         for number, start in enumerate(fit.starts, 1)
     )
     pictures = "".join(
@@ -292,7 +284,7 @@ def write_html(
         for index, figure in enumerate(figures, 1)
     )
     read = ", ".join(html.escape(str(name)) for name in files)
-    colour = "#009E73" if good else "#D55E00"
+    colour = "#009E73" if fit.ok else "#D55E00"
     page = f"""<!doctype html>
 <html lang="en"><meta charset="utf-8"><title>{html.escape(title)}</title>
 <style>
@@ -305,7 +297,7 @@ img {{ max-width: 100%; margin: 1rem 0 }} .status {{ color: {colour}; font-weigh
 <h1>{html.escape(title)}</h1>
 <p>{read}</p>
 <p class="status">{html.escape(fit.status)}</p>
-<table><tr><th></th><th>value</th><th>95 % interval</th><th>unit</th></tr>{"".join(lines)}</table>
+<table><tr><th></th><th>value</th><th>95 % interval</th><th>unit</th></tr>{lines}</table>
 <p>Covariance: {html.escape(fit.covariance_kind)}.</p>
 <ul>{words}</ul>
 <table><tr><th>sensor</th><th>rms error an axis</th><th>unit</th></tr>{sizes}</table>
@@ -314,6 +306,12 @@ img {{ max-width: 100%; margin: 1rem 0 }} .status {{ color: {colour}; font-weigh
 </html>
 """
     Path(path).write_text(page, encoding="utf-8", errors="backslashreplace")
+
+
+def _cells(lines: Iterable[tuple[str, ...]]) -> str:
+    """Lines of a table."""
+    cells = ("".join(f"<td>{html.escape(cell)}</td>" for cell in line) for line in lines)
+    return "".join(f"<tr>{line}</tr>" for line in cells)
 
 
 def _png(figure: Any) -> str:

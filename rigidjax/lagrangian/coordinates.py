@@ -78,8 +78,7 @@ class LagrangeEquations(eqx.Module):
 
 
 def equations_of_motion(
-    lagrangian: Callable[[Any, Any], Any],
-    force: Callable[[Any, Any, Any], Any] | None = None,
+    lagrangian: Callable[[Any, Any], Any], force: Callable[[Any, Any, Any], Any] | None = None
 ) -> LagrangeEquations:
     """The vector field `f(t, y, args)` on `Coordinates` of any Lagrangian L(q, q̇).
 

@@ -184,11 +184,5 @@ def _callable(hamiltonian):
     return _checks.function(hamiltonian, "hamiltonian", "of the momentum to H, J")
 
 
-def _of_kind(value, kind, name, why=""):
-    if not isinstance(value, kind):
-        raise TypeError(f"{name}: wanted {kind.__name__}, got {type(value).__name__}{why}")
-    return value
-
-
 def _number(value):
     return _checks.floating(value, (), "hamiltonian", hint="one number, J")

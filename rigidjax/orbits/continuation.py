@@ -1,5 +1,6 @@
-"""Families of periodic orbits, continued by the derivatives of the orbit; their stability."""
+"""Families of periodic orbits: continued by the orbit's derivatives, their stability, branches."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -7,35 +8,53 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, ArrayLike, Complex, Float
 
 from rigidjax import _checks
-from rigidjax._types import Scalar
+from rigidjax._types import Scalar, ScalarLike
 from rigidjax.orbits.differential_correction import (
-    MAX_STEPS,
     PeriodicOrbit,
     corrected,
     crossing,
     miss,
     named,
+    newton,
     orbit_of,
     together,
     usual_tolerance,
     value_and_jacobian,
 )
 
+# Steps of the search for a branching.
+_MOST = 60
 
-def at_values(scene: Any, orbit: PeriodicOrbit, values: Any, hold: str) -> PeriodicOrbit:
-    """The members of a family at given values of one number: see `ThreeBody.family`.
 
-    **Raises:** `ValueError` (`EquinoxRuntimeError` under `jit`) where a member is not found.
+def family(
+    scene: Any,
+    orbit: PeriodicOrbit,
+    values: Float[ArrayLike, " members"] | Sequence[float],
+    *,
+    hold: str = "x",
+) -> PeriodicOrbit:
+    """The members of the family of `orbit` at which `hold` has these values, one by one.
+
+    Each is found from the one before and its tangent, and corrected as by `periodic_orbit`.
+
+    **Arguments:** `orbit` one near the first of them; `values` (N,), neighbours near one
+    another; `hold` `"x"`, `"z"`, `"vy"` or `"period"`, which may not turn back on the way
+    (there `follow` goes on).
+
+    **Returns** a `PeriodicOrbit` with a leading axis; its derivatives with respect to μ and
+    `values` are those of the family, forward and reverse.
+
+    **Raises:** `ValueError` (`EquinoxRuntimeError` under `jit`) saying where it was lost.
 
     >>> from rigidjax import orbits
-    >>> from rigidjax.frames.point import Point
-    >>> hill = orbits.hill()
-    >>> orbit = PeriodicOrbit(Point([0.3, 0, 0], [0.0, 1.6, 0]), 1.2)
-    >>> [round(float(p), 3) for p in at_values(hill, orbit, [0.3, 0.31], "x").period]
-    [1.404, 1.536]
+    >>> moon = orbits.cr3bp(0.0121505856)
+    >>> start = moon.lyapunov_guess(1, 0.01)
+    >>> found = moon.family(start, start.state.x[0] - jnp.array([0.0, 0.01]))
+    >>> [round(float(p), 3) for p in found.period]
+    [2.712, 2.811]
     """
     start, index = crossing(orbit), named(hold)
     length = np.shape(values)
@@ -59,7 +78,7 @@ def at_values(scene: Any, orbit: PeriodicOrbit, values: Any, hold: str) -> Perio
 
 
 def _lost(start: Array, numbers: Array, left: Array) -> Array:
-    """Where Newton did not end, or ended at another orbit that solves the equations too."""
+    """Which members Newton's method did not find, or found as another orbit that solves it too."""
     before = jnp.concatenate([start[None], numbers[:-1]])
     ratio = numbers[:, 3] / before[:, 3]
     return ~((left <= usual_tolerance(start)) & (ratio > 0.5) & (ratio < 2))
@@ -73,7 +92,7 @@ def _at_values(scene: Any, start: Array, held: Array, index: int, tolerance: flo
     )
 
     def step(last: Array, value: Scalar) -> Any:
-        # Where Newton starts from has no derivative: the orbit found does not depend on it.
+        # The start of Newton's method has no derivative: the orbit found does not depend on it.
         last, aim = lax.stop_gradient(last), lax.stop_gradient(value)
         _, matrix = value_and_jacobian(lambda n: miss(still, n), last)
         slope = -jnp.linalg.solve(matrix[:, free], matrix[:, index])
@@ -88,14 +107,18 @@ def _at_values(scene: Any, start: Array, held: Array, index: int, tolerance: flo
     return out
 
 
-def slope(scene: Any, orbit: PeriodicOrbit, hold: str) -> PeriodicOrbit:
-    """How state and period change along the family, per unit of `hold`: `ThreeBody.family_slope`.
+def family_slope(scene: Any, orbit: PeriodicOrbit, *, hold: str = "x") -> PeriodicOrbit:
+    """How start and period of an orbit change along its family, per unit of `hold`.
 
-    >>> from rigidjax import orbits
-    >>> from rigidjax.frames.point import Point
-    >>> hill = orbits.hill()
-    >>> orbit = hill.periodic_orbit(PeriodicOrbit(Point([0.3, 0, 0], [0.0, 1.6, 0]), 1.2))
-    >>> round(float(slope(hill, orbit, "x").period), 3)
+    **Arguments:** `orbit` a member of it; `hold` as in `family`. **Returns** the derivatives in
+    the shape of an orbit: `.period` is d period/d hold. Exact (implicit function theorem).
+
+    **Raises:** `ValueError` where the family turns back in `hold`.
+
+    >>> from rigidjax import Point, orbits
+    >>> hill, start = orbits.hill(), Point([0.3, 0, 0], [0.0, 1.6, 0])
+    >>> orbit = hill.periodic_orbit(orbits.PeriodicOrbit(start, 1.2))
+    >>> round(float(hill.family_slope(orbit).period), 3)
     12.076
     """
     change = _slope(scene, crossing(orbit), named(hold))
@@ -116,27 +139,32 @@ def _slope(scene: Any, numbers: Array, index: int) -> PeriodicOrbit:
     return jax.tree.map(lambda leaf: 0.5 * leaf, change) if index == 3 else change
 
 
-def follow(scene: Any, orbit: PeriodicOrbit, step: Any, count: int, rising: str) -> PeriodicOrbit:
-    """Members of a family at equal steps of arclength, past its folds: see `ThreeBody.follow`.
+def follow(
+    scene: Any, orbit: PeriodicOrbit, step: ScalarLike, count: int, *, rising: str = "x"
+) -> PeriodicOrbit:
+    """The next `count` members of a family, at equal steps of arclength, past its folds.
 
-    **Raises:** `ValueError` (`EquinoxRuntimeError` under `jit`) where a member is not found.
+    Pseudo-arclength continuation in (x, z, v_y, T/2): each start lies at `step` along the
+    tangent, and Newton's method goes back across it (Keller 1977, in
+    Applications of Bifurcation Theory).
 
-    >>> from rigidjax import orbits
-    >>> from rigidjax.frames.point import Point
-    >>> hill = orbits.hill()
-    >>> orbit = hill.periodic_orbit(PeriodicOrbit(Point([0.3, 0, 0], [0.0, 1.6, 0]), 1.2))
-    >>> follow(hill, orbit, 0.05, 3, "x").state.x.shape
-    (3, 3)
+    **Arguments:** `orbit` a member, not returned; `step` arclength, its sign the way;
+    `rising` the number that grows at first when `step` is positive.
+
+    **Returns** a `PeriodicOrbit` with a leading axis. To differentiate one give it to
+    `periodic_orbit`. **Raises:** `ValueError` (`EquinoxRuntimeError` under `jit`) saying after
+    how many members it was lost.
     """
     start, index = crossing(orbit), named(rising)
-    step = _checks.floating(step, (), "step").astype(start.dtype)
-    step = _checks.refuse(step, ~(jnp.isfinite(step) & (step != 0)), "step: wanted a number not 0")
+    length = _checks.floating(step, (), "step").astype(start.dtype)
+    bad = ~(jnp.isfinite(length) & (length != 0))
+    length = _checks.refuse(length, bad, "step: wanted a number not 0")
     if isinstance(count, bool) or not isinstance(count, int) or count < 1:
         raise ValueError(f"count: wanted how many members, an integer ≥ 1, got {count!r}")
     tolerance = usual_tolerance(start)
-    numbers, left = _follow(scene, start, step, count, index, tolerance)
+    numbers, left = _follow(scene, start, length, count, index, tolerance)
     moved = jnp.diff(jnp.concatenate([start[None], numbers]), axis=0)
-    far = jnp.sqrt(jnp.sum(moved * moved, axis=1)) > 2 * jnp.abs(step)
+    far = jnp.sqrt(jnp.sum(moved * moved, axis=1)) > 2 * jnp.abs(length)
     lost = _lost(start, numbers, left) | far
     where = ""
     if _checks.known(lost) and bool(lost.any()):
@@ -161,18 +189,10 @@ def _follow(scene: Any, start: Array, step: Array, count: int, index: int, toler
         _, matrix = value_and_jacobian(missed, last)
         along = tangent(matrix, before)
 
-        def keep_on(carry: Any) -> Any:
-            return (carry[1] > 0.1 * tolerance) & (carry[2] < MAX_STEPS)
+        def across(numbers: Array) -> Array:
+            return jnp.append(missed(numbers), jnp.sum(along * (numbers - last)) - step)
 
-        def newton(carry: Any) -> Any:
-            numbers, _, n = carry
-            value, matrix = value_and_jacobian(missed, numbers)
-            value = jnp.append(value, jnp.sum(along * (numbers - last)) - step)
-            moved = numbers - jnp.linalg.solve(jnp.concatenate([matrix, along[None]]), value)
-            return jnp.where(jnp.isfinite(moved), moved, numbers), jnp.max(jnp.abs(value)), n + 1
-
-        guess: Any = last + step * along, jnp.full_like(step, jnp.inf), 0
-        found, _, _ = lax.while_loop(keep_on, newton, guess)
+        found = newton(across, last + step * along, tolerance)
         return (found, along), (found, jnp.max(jnp.abs(missed(found))))
 
     first = jnp.zeros(4, start.dtype).at[index].set(1)
@@ -197,3 +217,77 @@ def stability_indices(monodromy: Float[Array, "6 6"]) -> Complex[Array, "2"]:
     kind = jnp.complex128 if monodromy.dtype == jnp.float64 else jnp.complex64
     half, root = half.astype(kind), jnp.sqrt(gap.astype(kind))
     return 0.5 * jnp.stack([half + root, half - root])
+
+
+def bifurcation(
+    scene: Any,
+    orbit: PeriodicOrbit,
+    other: PeriodicOrbit,
+    *,
+    index: int = 1,
+    value: float = 1.0,
+    hold: str = "x",
+) -> PeriodicOrbit:
+    """The member of a family between two others at which a stability index takes a value.
+
+    At 1 a family of the same period branches off, or the family turns; at −1 one of twice the
+    period; at cos(2πp/q) one of q times the period. `index` 1 of planar Lyapunov orbits is that
+    across the plane, and 1 is where the halo orbits begin.
+
+    **Arguments:** `orbit`, `other` two members near each other, between which the index passes
+    the value; `index` 0 or 1 of `stability_indices`; `value` of it; `hold` the number of the
+    family that is searched in, `"x"`, `"z"`, `"vy"` or `"period"`. Works on the host.
+
+    Source: Howell 1984, doi:10.1007/BF01358403; Robin and Markellos 1980,
+    doi:10.1007/BF01231183.
+
+    **Raises:** `ValueError` where the value does not lie between, or the indices are complex.
+    """
+    place = named(hold)
+    if isinstance(index, bool) or index not in (0, 1):
+        raise ValueError(f"index: wanted 0 or 1, which of the two stability indices, got {index!r}")
+    value = _checks.number(value, "value")
+    if not np.isfinite(value):
+        raise ValueError(f"value: wanted a finite number, got {value}")
+    ends = [np.asarray(crossing(one)) for one in (orbit, other)]
+    left, right = (scene.periodic_orbit(one, hold=hold) for one in (orbit, other))
+    low, high = (_index(scene, one, index) - value for one in (left, right))
+    if not low * high <= 0:
+        raise ValueError(
+            f"bifurcation: the index is {low + value:.6g} at one orbit, {high + value:.6g} at the "
+            f"other: {value:g} does not lie between"
+        )
+    a, b = float(ends[0][place]), float(ends[1][place])
+    width = abs(b - a)
+    found, at_found = (left, low) if abs(low) < abs(high) else (right, high)
+    for _ in range(_MOST):
+        if abs(b - a) <= 1e-13 * max(1.0, width) or at_found == 0:
+            break
+        part = low / (low - high)
+        middle = a + (b - a) * min(max(part, 1e-3), 1 - 1e-3)
+        share = (middle - a) / (b - a)
+        guess = jax.tree.map(lambda x, y, s=share: (1 - s) * x + s * y, left, right)
+        found = scene.periodic_orbit(guess, hold=hold)
+        at_found = _index(scene, found, index) - value
+        if abs(at_found) < 1e-12 * max(1.0, abs(value)):
+            break
+        if at_found * high > 0:
+            b, right, high, low = middle, found, at_found, 0.5 * low
+        else:
+            a, left, low, high = middle, found, at_found, 0.5 * high
+    return found
+
+
+def _index(scene: Any, orbit: PeriodicOrbit, index: int) -> float:
+    found = np.asarray(_indices(scene, orbit))[index]
+    if abs(found.imag) > 1e-9 * max(1.0, abs(found)):
+        raise ValueError(
+            "bifurcation: the stability indices are complex at a member between the orbits; give "
+            "orbits nearer to each other"
+        )
+    return float(found.real)
+
+
+@eqx.filter_jit
+def _indices(scene: Any, orbit: PeriodicOrbit) -> Array:
+    return scene.stability_indices(orbit)

@@ -43,13 +43,7 @@ class ThreeBody(AbstractReversible):
         d1, d2 = first * first + flat, second * second + flat
         a1, a2 = (1 - mu) / (d1 * jnp.sqrt(d1)), mu / (d2 * jnp.sqrt(d2))
         pull = a1 + a2
-        return jnp.stack(
-            [
-                2 * vy + x - a1 * first - a2 * second,
-                y - 2 * vx - pull * y,
-                -pull * z,
-            ]
-        )
+        return jnp.stack([2 * vy + x - a1 * first - a2 * second, y - 2 * vx - pull * y, -pull * z])
 
     def potential(self, x: Vector) -> Scalar:
         """U = ½(x² + y²) + (1 − μ)/r₁ + μ/r₂ (Szebehely 1967, sec. 1.5, without its constant).
@@ -81,8 +75,8 @@ class ThreeBody(AbstractReversible):
     def speed_squared(self, x: Vector, jacobi: ScalarLike) -> Scalar:
         """|v|² = 2U(x) − C at a place: zero-velocity curves are where it is 0.
 
-        **Arguments:** `x` (3,); `jacobi` C. Negative where a particle with this C cannot come.
-        Draw `matplotlib.pyplot.contour(…, levels=[0])` of it.
+        **Arguments:** `x` (3,); `jacobi` C. It is negative at places that a particle with this C
+        cannot reach. Draw `matplotlib.pyplot.contour(…, levels=[0])` of it.
         """
         u = self.potential(x)
         return 2 * u - _checks.floating(jacobi, (), "jacobi").astype(u.dtype)

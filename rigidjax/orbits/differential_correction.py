@@ -34,27 +34,39 @@ class PeriodicOrbit(eqx.Module):
     period: Float[Array, "*batch"]
 
     def __init__(self, state: Point, period: ScalarLike):
-        if not isinstance(state, Point):
-            raise TypeError(f"state: wanted a Point(x, v), got {type(state).__name__}")
+        self.state = _checks.instance(state, Point, "state", wanted="a Point(x, v)")
         _checks.floating(state.x, (3,), "state.x", batched=True)
-        self.state = state
         period = _checks.floating(period, (), "period", batched=True)
         _checks.same_batch(state=(state.x, 1), period=(period, 0))
         self.period = period.astype(state.x.dtype)
 
 
-def correct(
-    scene: Any, guess: PeriodicOrbit, hold: str, tolerance: float | None = None
+def periodic_orbit(
+    scene: Any, guess: PeriodicOrbit, *, hold: str = "x", tolerance: float | None = None
 ) -> PeriodicOrbit:
-    """The orbit near `guess` that crosses y = 0 at right angles twice: see `periodic_orbit`.
+    """The periodic orbit near `guess`, by differentiable correction.
+
+    For orbits symmetric about the xz-plane: Lyapunov, halo, Arenstorf's and most others in use.
+    They cross it at a right angle (y = v_x = v_z = 0) twice a period. Newton's method on three
+    of (x, z, v_y, T/2) makes y, v_x, v_z vanish at the half period.
+
+    **Arguments:** `guess` a `PeriodicOrbit(state, period)` whose state crosses at a right
+    angle; `hold` which of `"x"`, `"z"`, `"vy"`, `"period"` stays as guessed: this labels the
+    orbit within its family (`"x"` for Lyapunov orbits, `"z"` for halo orbits); `tolerance`
+    largest |y|, |v_x|, |v_z| left at the half period, 1e-12 unless given (1e-4 in float32).
+
+    **Returns** a `PeriodicOrbit`. Its derivatives with respect to μ and the held number are
+    those of the family, by the implicit function theorem, forward and reverse.
+
+    Source: Howell 1984, doi:10.1007/BF01358403.
 
     **Raises:** `ValueError` (`EquinoxRuntimeError` under `jit`) if Newton does not converge.
 
     >>> from rigidjax import orbits
-    >>> hill = orbits.hill()
-    >>> orbit = correct(hill, PeriodicOrbit(Point([0.3, 0, 0], [0.0, 1.6, 0]), 1.2), "x")
-    >>> round(float(orbit.period), 3)
-    1.404
+    >>> moon = orbits.cr3bp(0.0121505856)
+    >>> orbit = moon.periodic_orbit(moon.lyapunov_guess(1, 0.01))
+    >>> round(float(orbit.period), 4)
+    2.712
     """
     numbers, index = crossing(guess), named(hold)
     free = np.array([i for i in range(4) if i != index])
@@ -82,14 +94,8 @@ def correct(
 
 
 def named(hold: str) -> int:
-    """Which of the four numbers of a crossing `hold` names.
-
-    >>> named("vy")
-    2
-    """
-    if hold not in _NAMES:
-        raise ValueError(f"hold: wanted one of {', '.join(_NAMES)}, got {hold!r}")
-    return _NAMES.index(hold)
+    """Which of the four numbers of a crossing `hold` names."""
+    return _NAMES.index(_checks.word(hold, _NAMES, "hold"))
 
 
 def crossing(guess: PeriodicOrbit) -> Float[Array, "4"]:
@@ -98,54 +104,35 @@ def crossing(guess: PeriodicOrbit) -> Float[Array, "4"]:
     >>> crossing(PeriodicOrbit(Point([0.9, 0, 0.1], [0.0, -0.5, 0]), 3.0)).tolist()
     [0.9, 0.1, -0.5, 1.5]
     """
-    if not isinstance(guess, PeriodicOrbit):
-        raise TypeError(
-            f"guess: wanted a PeriodicOrbit(state, period), got {type(guess).__name__}; "
-            "lyapunov_guess and halo_guess make one"
-        )
+    made = "lyapunov_guess and halo_guess make one"
+    wanted = "a PeriodicOrbit(state, period)"
+    _checks.instance(guess, PeriodicOrbit, "guess", wanted=wanted, hint=made)
     x, v = guess.state.x, guess.state.v
     if x.ndim != 1:
         raise ValueError(f"guess: wanted one orbit, x of shape (3,), got {x.shape}; use jax.vmap")
     slant = jnp.maximum(jnp.abs(x[1]), jnp.maximum(jnp.abs(v[0]), jnp.abs(v[2])))
-    x = _checks.refuse(
-        x,
-        slant > 1e-6,
-        "guess: wanted a start that crosses y = 0 at a right angle: y = vx = vz = 0",
-    )
-    period = _checks.refuse(
-        guess.period, ~(guess.period > 0), "guess: wanted a period that is positive"
-    )
+    right = "guess: wanted a start that crosses y = 0 at a right angle: y = vx = vz = 0"
+    x, period = _checks.refuse(x, slant > 1e-6, right), guess.period
+    period = _checks.refuse(period, ~(period > 0), "guess: wanted a period that is positive")
     return _checks.finite(jnp.stack([x[0], x[2], v[1], 0.5 * period]), "guess")
 
 
 def orbit_of(numbers: Float[Array, "4"]) -> PeriodicOrbit:
-    """The inverse of `crossing`.
-
-    >>> orbit_of(jnp.array([0.9, 0.1, -0.5, 1.5])).state.v.tolist()
-    [0.0, -0.5, 0.0]
-    """
+    """The inverse of `crossing`."""
     x, z, vy, half = components(numbers)
     zero = jnp.zeros_like(x)
     return PeriodicOrbit(Point(jnp.stack([x, zero, z]), jnp.stack([zero, vy, zero])), 2 * half)
 
 
 def together(unknown: Float[Array, "3"], held: Scalar, index: int) -> Float[Array, "4"]:
-    """The four numbers of a crossing, the held one put in its place among the others.
-
-    >>> together(jnp.array([1.0, 2.0, 3.0]), jnp.asarray(9.0), 1).tolist()
-    [1.0, 9.0, 2.0, 3.0]
-    """
+    """The four numbers of a crossing, the held one put in its place among the others."""
     parts = [unknown[0], unknown[1], unknown[2]]
     parts.insert(index, held)
     return jnp.stack(parts)
 
 
 def usual_tolerance(numbers: Array) -> float:
-    """What is left of y, v_x, v_z at the half period: 1e-12, in float32 1e-4.
-
-    >>> usual_tolerance(jnp.zeros(4))
-    1e-12
-    """
+    """What is left of y, v_x, v_z at the half period: 1e-12, in float32 1e-4."""
     return 1e-12 if numbers.dtype == jnp.float64 else 1e-4
 
 
@@ -163,15 +150,28 @@ def miss(scene: Any, numbers: Float[Array, "4"]) -> Float[Array, "3"]:
 
 
 def value_and_jacobian(f: Any, x: Array) -> tuple[Array, Array]:
-    """f(x) and its Jacobian from one pass in forward mode.
-
-    >>> value_and_jacobian(lambda x: x**2, jnp.array([3.0]))[1].tolist()
-    [[6.0]]
-    """
+    """f(x) and its Jacobian from one pass in forward mode."""
     value, columns = jax.vmap(lambda e: jax.jvp(f, (x,), (e,)), out_axes=(None, 1))(
         jnp.eye(x.shape[0], dtype=x.dtype)
     )
     return value, columns
+
+
+def newton(f: Any, x: Array, tolerance: float) -> Array:
+    """A zero of `f` near `x`: steps until what is left is a tenth of the tolerance."""
+
+    def keep_on(carry: Any) -> Any:
+        _, left, count = carry
+        return (left > 0.1 * tolerance) & (count < MAX_STEPS)
+
+    def step(carry: Any) -> Any:
+        x, _, count = carry
+        missed, slope = value_and_jacobian(f, x)
+        moved = x - jnp.linalg.solve(slope, missed)
+        # The miss before the last move says how good the last start was; stop once it is small.
+        return jnp.where(jnp.isfinite(moved), moved, x), jnp.max(jnp.abs(missed)), count + 1
+
+    return lax.while_loop(keep_on, step, (x, jnp.full_like(x[0], jnp.inf), 0))[0]
 
 
 # Newton itself is not differentiated: the rule below is linear in the tangents, so that the same
@@ -183,20 +183,11 @@ def _solve(scene: Any, unknown: Array, held: Array, index: int, tolerance: float
 
 @eqx.filter_custom_jvp
 def corrected(index: int, tolerance: float, scene: Any, unknown: Array, held: Array) -> Any:
-    def keep_on(carry: Any) -> Any:
-        _, left, count = carry
-        return (left > 0.1 * tolerance) & (count < MAX_STEPS)
+    def missed(unknown: Array) -> Array:
+        return miss(scene, together(unknown, held, index))
 
-    def step(carry: Any) -> Any:
-        unknown, _, count = carry
-        missed, slope = value_and_jacobian(lambda u: miss(scene, together(u, held, index)), unknown)
-        moved = unknown - jnp.linalg.solve(slope, missed)
-        # The miss before the last move says how good the last start was; stop once it is small.
-        return jnp.where(jnp.isfinite(moved), moved, unknown), jnp.max(jnp.abs(missed)), count + 1
-
-    carry = unknown, jnp.full_like(held, jnp.inf), 0
-    unknown, _, _ = lax.while_loop(keep_on, step, carry)
-    return unknown, jnp.max(jnp.abs(miss(scene, together(unknown, held, index))))
+    unknown = newton(missed, unknown, tolerance)
+    return unknown, jnp.max(jnp.abs(missed(unknown)))
 
 
 @corrected.def_jvp

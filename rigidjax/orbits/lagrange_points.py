@@ -31,11 +31,7 @@ def points(mu: Scalar) -> Float[Array, "5 3"]:
 
 
 def distances(mu: Scalar) -> tuple[Scalar, Scalar, Scalar]:
-    """How far L1 and L2 are from the second primary, and L3 from the first.
-
-    >>> [round(float(d), 12) for d in distances(jnp.asarray(0.5))]
-    [0.5, 0.698406144555, 0.698406144555]
-    """
+    """How far L1 and L2 are from the second primary, and L3 from the first."""
     one = jnp.ones_like(mu)
     hill = jnp.cbrt(mu / (3 * (1 - mu)))
     between = _root([one, mu - 3, 3 - 2 * mu, -mu, 2 * mu, -mu], hill * (1 - hill / 3))

@@ -1,4 +1,4 @@
-"""Stable and unstable manifolds of periodic orbits, and where a family branches."""
+"""Stable and unstable manifolds of periodic orbits."""
 
 from typing import Any
 
@@ -14,7 +14,7 @@ from rigidjax import _checks
 from rigidjax._types import Scalar, ScalarLike
 from rigidjax.frames.point import Point
 from rigidjax.orbits import continuation, state_transition
-from rigidjax.orbits.differential_correction import PeriodicOrbit, crossing, named
+from rigidjax.orbits.differential_correction import PeriodicOrbit, crossing
 from rigidjax.solve import ending
 
 # Time run backwards is seen in the mirror y → −y: x, y, z, vx, vy, vz.
@@ -22,7 +22,6 @@ _MIRROR = np.array([1.0, -1.0, 1.0, -1.0, 1.0, -1.0])
 _TIGHT = dict(rtol=1e-13, atol=1e-14)
 # What is left of an eigenvector after each step of inverse iteration is a hundredth at most.
 _ITERATIONS = 12
-_MOST = 60
 
 
 class Manifold(eqx.Module):
@@ -89,7 +88,7 @@ def unstable(monodromy: Float[Array, "6 6"]) -> tuple[Scalar, Float[Array, "6"]]
 def branch(
     scene: Any, orbit: PeriodicOrbit, phase: Scalar, which: str, side: int, distance: Scalar
 ) -> tuple[Point, Scalar]:
-    """The start at `phase`, and the multiplier: see `AbstractReversible.manifold_start`."""
+    """The start at `phase`, and the multiplier: see `manifold_start`."""
     _checks.word(which, ("stable", "unstable"), "which")
     if isinstance(side, bool) or side not in (1, -1):
         raise ValueError(f"side: wanted 1, to larger x at the orbit's start, or -1, got {side!r}")
@@ -124,13 +123,36 @@ def manifold(
     scene: Any,
     orbit: PeriodicOrbit,
     which: str,
-    time: ScalarLike | None,
-    side: int,
-    count: int,
-    samples: int,
-    distance: ScalarLike,
+    *,
+    time: ScalarLike | None = None,
+    side: int = 1,
+    count: int = 40,
+    samples: int = 200,
+    distance: ScalarLike = 1e-5,
 ) -> Manifold:
-    """See `AbstractReversible.manifold`."""
+    """Motions that leave an unstable periodic orbit, or come to it: its invariant manifolds.
+
+    **Arguments:** `orbit` as of `periodic_orbit`; `which` `"unstable"` (they leave it) or
+    `"stable"` (they come to it: the times go back); `time` how far to follow them, two periods
+    unless given; `side` 1 for the branch that goes to larger x at the orbit's start, −1 for the
+    other; `count` N motions, from equal phases of the orbit; `samples` T times of each;
+    `distance` of the starts from the orbit, in (x, v): its square is what they are off.
+
+    The direction is the eigenvector of the monodromy whose multiplier is the largest, carried
+    along the orbit by the transition matrix; the stable manifold is the mirror image, in
+    y → −y, of the unstable one.
+
+    **Returns** a `Manifold`. Source: Koon, Lo, Marsden and Ross 2011, Dynamical Systems, the
+    Three-Body Problem and Space Mission Design, sec. 7.4.
+
+    **Raises:** `ValueError` where the orbit has no such multiplier; for another word.
+
+    >>> from rigidjax import orbits
+    >>> moon = orbits.cr3bp(0.0121505856)
+    >>> orbit = moon.periodic_orbit(moon.lyapunov_guess(1, 0.01))
+    >>> moon.manifold(orbit, "unstable", count=3, samples=5).states.x.shape
+    (3, 5, 3)
+    """
     count, samples = _checks.whole(count, "count", 1), _checks.whole(samples, "samples", 2)
     dtype = orbit.state.x.dtype if isinstance(orbit, PeriodicOrbit) else None
     distance = _positive(distance, "distance", dtype)
@@ -146,6 +168,34 @@ def manifold(
     ts = jnp.linspace(jnp.zeros_like(length), length, samples)
     states = _paths(scene, starts, ts, which)
     return Manifold(ts if which == "unstable" else -ts, states, phases, value)
+
+
+def manifold_start(
+    scene: Any,
+    orbit: PeriodicOrbit,
+    phase: ScalarLike,
+    which: str,
+    *,
+    side: int = 1,
+    distance: ScalarLike = 1e-5,
+) -> Point:
+    """The start of the motion of a manifold that belongs to a phase of the orbit.
+
+    **Arguments:** `phase` in periods from the orbit's start, of any size; others as for
+    `manifold`. Derivatives, by `phase`, by the orbit and by the scene's numbers, are in
+    forward mode: connections between orbits are found with them by Newton's method.
+
+    >>> from rigidjax import orbits
+    >>> moon = orbits.cr3bp(0.0121505856)
+    >>> orbit = moon.periodic_orbit(moon.lyapunov_guess(1, 0.01))
+    >>> start = moon.manifold_start(orbit, 0.0, "stable")
+    >>> bool(abs(start.x[0] - orbit.state.x[0]) < 1e-5)
+    True
+    """
+    dtype = orbit.state.x.dtype if isinstance(orbit, PeriodicOrbit) else None
+    where = _checks.time(phase, "phase").astype(dtype)
+    away = _checks.floating(distance, (), "distance").astype(dtype)
+    return branch(scene, orbit, where, which, side, away)[0]
 
 
 def _positive(value: ScalarLike, name: str, dtype: Any) -> Array:
@@ -164,74 +214,10 @@ def _paths(scene: Any, starts: Point, ts: Array, which: str) -> Point:
         return Point(state.x * mirror[:3], state.v * mirror[3:]) if turn else state
 
     def path(start: Point) -> Point:
-        out = dfx.diffeqsolve(
-            dfx.ODETerm(scene.field),
-            dfx.Dopri8(),
-            ts[0],
-            ts[-1],
-            None,
-            seen(start),
-            saveat=dfx.SaveAt(ts=ts),
-            stepsize_controller=dfx.PIDController(rtol=1e-11, atol=1e-12),
-            event=dfx.Event(ending.Ends(scene)),
-            adjoint=dfx.ForwardMode(),
-            max_steps=100_000,
-            throw=False,
-        )
+        how = dict(saveat=dfx.SaveAt(ts=ts), event=dfx.Event(ending.Ends(scene)))
+        out = state_transition.solved(scene, seen(start), ts[-1], 1e-11, 1e-12, **how)
         there: Any = jnp.isfinite(jnp.asarray(out.ts))[:, None]
         ys: Any = jax.tree.map(lambda leaf: jnp.where(there, leaf, jnp.nan), out.ys)
         return jax.vmap(seen)(ys)
 
     return jax.vmap(path)(starts)
-
-
-def bifurcation(
-    scene: Any, orbit: PeriodicOrbit, other: PeriodicOrbit, index: int, value: float, hold: str
-) -> PeriodicOrbit:
-    """`AbstractReversible.bifurcation`: the Illinois method between two members, on the host."""
-    place = named(hold)
-    if isinstance(index, bool) or index not in (0, 1):
-        raise ValueError(f"index: wanted 0 or 1, which of the two stability indices, got {index!r}")
-    value = _checks.number(value, "value")
-    ends = [np.asarray(crossing(one)) for one in (orbit, other)]
-    left, right = (scene.periodic_orbit(one, hold=hold) for one in (orbit, other))
-    low, high = (_index(scene, one, index) - value for one in (left, right))
-    if not low * high <= 0:
-        raise ValueError(
-            f"bifurcation: the index is {low + value:.6g} at one orbit, {high + value:.6g} at the "
-            f"other: {value:g} does not lie between"
-        )
-    a, b = float(ends[0][place]), float(ends[1][place])
-    width = abs(b - a)
-    found, at_found = (left, low) if abs(low) < abs(high) else (right, high)
-    for _ in range(_MOST):
-        if abs(b - a) <= 1e-13 * max(1.0, width) or at_found == 0:
-            break
-        part = low / (low - high)
-        middle = a + (b - a) * min(max(part, 1e-3), 1 - 1e-3)
-        share = (middle - a) / (b - a)
-        guess = jax.tree.map(lambda x, y, s=share: (1 - s) * x + s * y, left, right)
-        found = scene.periodic_orbit(guess, hold=hold)
-        at_found = _index(scene, found, index) - value
-        if abs(at_found) < 1e-12 * max(1.0, abs(value)):
-            break
-        if at_found * high > 0:
-            b, right, high, low = middle, found, at_found, 0.5 * low
-        else:
-            a, left, low, high = middle, found, at_found, 0.5 * high
-    return found
-
-
-def _index(scene: Any, orbit: PeriodicOrbit, index: int) -> float:
-    found = np.asarray(_indices(scene, orbit))[index]
-    if abs(found.imag) > 1e-9 * max(1.0, abs(found)):
-        raise ValueError(
-            "bifurcation: the stability indices are complex at a member between the orbits; give "
-            "orbits nearer to each other"
-        )
-    return float(found.real)
-
-
-@eqx.filter_jit
-def _indices(scene: Any, orbit: PeriodicOrbit) -> Array:
-    return scene.stability_indices(orbit)

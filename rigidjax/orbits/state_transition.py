@@ -28,12 +28,7 @@ def flow(scene: AbstractScene, state: Point, t: ScalarLike, rtol: float, atol: f
 
 @eqx.filter_jit
 def attempt(scene: AbstractScene, state: Point, t: ScalarLike, rtol: float, atol: float) -> Point:
-    """As `flow`, but NaN where the solve fails: for starts that Newton's method only tries.
-
-    >>> from rigidjax.frames import scenes
-    >>> attempt(scenes.turntable(0.0), Point([0.0, 0, 0], [1.0, 0, 0]), 2.0, 1e-9, 1e-9).x.tolist()
-    [2.0, 0.0, 0.0]
-    """
+    """As `flow`, but NaN where the solve fails: for starts that Newton's method only tries."""
     end, result = _end(scene, state, t, rtol, atol)
     good = result == dfx.RESULTS.successful
     return jax.tree.map(lambda leaf: jnp.where(good, leaf, jnp.full_like(leaf, jnp.nan)), end)
@@ -43,7 +38,15 @@ def _end(
     scene: AbstractScene, state: Point, t: ScalarLike, rtol: float, atol: float
 ) -> tuple[Point, dfx.RESULTS]:
     t = _checks.floating(t, (), "t").astype(state.x.dtype)
-    out = dfx.diffeqsolve(
+    out = solved(scene, state, t, rtol, atol)
+    return jax.tree.map(lambda leaf: leaf[0], out.ys), out.result
+
+
+def solved(
+    scene: AbstractScene, state: Point, t: Array, rtol: float, atol: float, **how: Any
+) -> dfx.Solution:
+    """The motion from 0 to `t`, with derivatives in forward mode; `how` as for `diffeqsolve`."""
+    return dfx.diffeqsolve(
         dfx.ODETerm(scene.field),
         dfx.Dopri8(),
         jnp.zeros_like(t),
@@ -54,28 +57,16 @@ def _end(
         adjoint=dfx.ForwardMode(),
         max_steps=100_000,
         throw=False,
+        **how,
     )
-    return jax.tree.map(lambda leaf: leaf[0], out.ys), out.result
-
-
-def transition(
-    scene: AbstractScene, state: Point, t: ScalarLike, *, rtol: float, atol: float
-) -> Float[Array, "6 6"]:
-    """∂(x, v)(t)/∂(x, v)(0) (6, 6): the tangents are solved along with the motion.
-
-    >>> from rigidjax.frames import scenes
-    >>> start = Point([0.0, 0, 0], [1.0, 0, 0])
-    >>> float(transition(scenes.turntable(0.0), start, 2.0, rtol=1e-9, atol=1e-9)[0, 3])
-    2.0
-    """
-    if not isinstance(state, Point):
-        raise TypeError(f"state: wanted a Point(x, v), got {type(state).__name__}")
-    t = _checks.finite(_checks.floating(t, (), "t"), "t")
-    return _transition(scene, jnp.concatenate([state.x, state.v]), t, rtol, atol)
 
 
 @eqx.filter_jit
-def _transition(scene: Any, numbers: Array, t: Any, rtol: float, atol: float) -> Array:
+def transition(
+    scene: AbstractScene, numbers: Float[Array, "6"], t: Any, rtol: float, atol: float
+) -> Float[Array, "6 6"]:
+    """∂(x, v)(t)/∂(x, v)(0): the tangents are solved along with the motion."""
+
     def end(numbers: Array) -> Array:
         out = flow(scene, Point(numbers[:3], numbers[3:]), t, rtol, atol)
         return jnp.concatenate([out.x, out.v])

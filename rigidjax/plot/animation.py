@@ -1,4 +1,4 @@
-"""A tumbling body as an animation."""
+"""A tumbling body as an animation: a film, or a page of its own that is turned with the mouse."""
 
 import base64
 import html
@@ -14,7 +14,7 @@ from rigidjax import _checks
 from rigidjax._types import HasAttitude
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.body.principal_axes import principal
-from rigidjax.plot.style import COLOURS, attitudes, cube, matrices, plain, pyplot
+from rigidjax.plot.style import COLOURS, attitudes, cube, matrices, plain, pyplot, times
 
 # Corners of the cube, and its faces in pairs across x, y, z, seen from outside counter-clockwise.
 CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
@@ -85,7 +85,7 @@ def tumble(
     """
     seconds = _checks.positive(seconds, "seconds")
     _checks.single(body, (Inertia, MassProperties), "body")
-    times, q = evenly(ts, states, pictures)
+    moments, q = evenly(ts, states, pictures)
     half, turn = box_of(body)
     pyplot()
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -111,7 +111,7 @@ def tumble(
     (trail,) = ax.plot([], [], [], color="0.3", lw=0.9)
     colours = [COLOURS[axis] for axis in (0, 0, 1, 1, 2, 2)]
     shots = []
-    for moment, rotation in zip(times, m, strict=True):
+    for moment, rotation in zip(moments, m, strict=True):
         placed = corners @ rotation.T
         solid.set_verts([placed[list(face)] for face in FACES])
         solid.set_facecolor(colours)
@@ -123,30 +123,97 @@ def tumble(
     palette = shots[0].quantize(48)
     shots = [shot.quantize(48, palette=palette, dither=Image.Dither.NONE) for shot in shots]
     out = io.BytesIO()
-    shots[0].save(
-        out,
-        "GIF",
-        save_all=True,
-        append_images=shots[1:],
-        duration=int(1000 * seconds / pictures),
-        loop=0,
-    )
+    how = dict(save_all=True, append_images=shots[1:], loop=0)
+    shots[0].save(out, "GIF", duration=int(1000 * seconds / pictures), **how)
     return Film(out.getvalue(), "gif", 288)
+
+
+def player(
+    body: Inertia | MassProperties,
+    ts: Float[ArrayLike, " times"],
+    states: HasAttitude,
+    *,
+    pictures: int = 200,
+    seconds: float = 10.0,
+    height: int = 420,
+) -> Film:
+    """A page that plays the motion in 3-D, to be turned and zoomed while it runs.
+
+    The box is the uniform solid one with the same 𝔖, the line the path of its longest axis. The
+    page holds everything, viser's program too (0.8 MB): a notebook shows it without a network or a
+    running kernel, `.save("tumble.html")` makes it a file.
+
+    **Arguments:** as `tumble`; `height` px in a notebook. **Returns** a `Film`.
+
+    **Raises** `ModuleNotFoundError` where viser is missing (extra `view`); else as `tumble`.
+    """
+    _, q = evenly(ts, states, pictures)
+    half, turn = box_of(body)
+    try:
+        import viser
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError(
+            "rigidjax.plot.player needs viser: pip install 'rigidjax[view]'"
+        ) from error
+    import rich
+
+    # Viser records what a server is told; nobody has to connect to it, or to be told its address.
+    console = rich.get_console()
+    told, console.quiet = console.quiet, True
+    try:
+        server = viser.ViserServer(host="127.0.0.1", verbose=False)
+        try:
+            page = _record(server, half, turn, q, seconds)
+        finally:
+            server.stop()
+    finally:
+        console.quiet = told
+    return Film(page.encode("utf-8"), "html", height)
+
+
+def _record(server: Any, half: np.ndarray, turn: np.ndarray, q: np.ndarray, seconds: float) -> str:
+    scene = server.scene
+    reach = float(np.linalg.norm(half))
+    scene.set_up_direction("+z")
+    server.initial_camera.position = tuple(1.8 * reach * np.array([1.0, -1.2, 0.7]))
+    server.initial_camera.look_at = (0.0, 0.0, 0.0)
+    scene.add_frame("/world", axes_length=1.1 * reach, axes_radius=0.008 * reach)
+    attitude = scene.add_frame("/body", show_axes=False, wxyz=tuple(q[0]))
+    corners = ((CORNERS * half) @ turn.T).astype(np.float32)
+    for axis, colour in enumerate(COLOURS[:3]):
+        faces = FACES[2 * axis : 2 * axis + 2]
+        triangles = [t for a, b, c, d in faces for t in ((a, b, c), (a, c, d))]
+        scene.add_mesh_simple(
+            f"/body/side{axis}",
+            vertices=corners,
+            faces=np.array(triangles, dtype=np.uint32),
+            color=tuple(int(colour[k : k + 2], 16) for k in (1, 3, 5)),
+            flat_shading=True,
+            side="double",
+        )
+    longest = np.argmax(half)
+    tips = (matrices(q) @ turn[:, longest] * half[longest]).astype(np.float32)
+    lines = np.stack([tips[:-1], tips[1:]], axis=1)
+    scene.add_line_segments("/trail", points=lines, colors=(90, 90, 90), thickness=0.01 * reach)
+    recording = server.get_scene_serializer()
+    for one in q:
+        attitude.wxyz = tuple(one)
+        recording.insert_sleep(seconds / len(q))
+    return recording.as_html()
 
 
 def evenly(ts: Any, states: Any, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Times evenly spaced, and the attitudes there (count, 4), along the shorter arc."""
-    q, t, count = attitudes(states), _checks.on_host(ts, "ts"), _checks.whole(count, "pictures", 2)
-    if t.shape != (q.shape[0],):
-        raise ValueError(f"ts: wanted ({q.shape[0]},) as the states have, got {t.shape}")
+    q, count = attitudes(states), _checks.whole(count, "pictures", 2)
+    t = times(ts, q.shape[0])
     if t.size < 2:
         raise ValueError(f"ts: wanted at least two times, got {t.size}")
     # q and −q are one attitude: choose signs so that neighbours are near.
     signs = np.where(np.einsum("ti,ti->t", q[1:], q[:-1]) < 0, -1.0, 1.0)
     q = q * np.concatenate([[1.0], np.cumprod(signs)])[:, None]
-    times = np.linspace(t[0], t[-1], count)
-    between = np.stack([np.interp(times, t, column) for column in q.T], axis=-1)
-    return times, between / np.linalg.norm(between, axis=1, keepdims=True)
+    when = np.linspace(t[0], t[-1], count)
+    between = np.stack([np.interp(when, t, column) for column in q.T], axis=-1)
+    return when, between / np.linalg.norm(between, axis=1, keepdims=True)
 
 
 def box_of(body: Inertia | MassProperties) -> tuple[np.ndarray, np.ndarray]:

@@ -12,12 +12,7 @@ from rigidjax.solve import simulate
 
 
 def fit(
-    found: Any,
-    *,
-    index: int = 0,
-    time_unit: str = "s",
-    rate_unit: str = "rad/s",
-    title: str = "",
+    found: Any, *, index: int = 0, time_unit: str = "s", rate_unit: str = "rad/s", title: str = ""
 ) -> Any:
     """Data and fit of each sensor above, the residuals below.
 
@@ -44,15 +39,8 @@ def fit(
     left = [np.asarray(e)[: record.t.shape[0]] for e in left]
     t = np.asarray(record.t) / seconds
     count = len(record.readings)
-    figure, axes = plt.subplots(
-        2,
-        count,
-        figsize=(max(6.2 * count, 7.5), 6),
-        sharex=True,
-        squeeze=False,
-        height_ratios=(2, 1),
-        layout="constrained",
-    )
+    size, how = (max(6.2 * count, 7.5), 6), dict(squeeze=False, layout="constrained")
+    figure, axes = plt.subplots(2, count, figsize=size, sharex=True, height_ratios=(2, 1), **how)
     dense = _between(found, index)
     for column, (reading, errors) in enumerate(zip(record.readings, left, strict=True)):
         upper, lower = axes[:, column]

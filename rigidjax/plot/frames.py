@@ -10,7 +10,7 @@ from jaxtyping import ArrayLike, Float
 
 from rigidjax import _checks
 from rigidjax.frames import MovingFrame, Point
-from rigidjax.plot.style import AXES, COLOURS, plain, row_of_axes, rows
+from rigidjax.plot.style import AXES, COLOURS, plain, rows, several_axes, times
 
 
 def frames(
@@ -47,11 +47,10 @@ def frames(
         raise ValueError(f"plane: wanted two of x, y, z such as 'xz', got {plane!r}")
     i, j = (AXES.index(name) for name in plane)
     path = rows(inside.x, 3, "inside.x")
-    t = _checks.numbers(ts, "ts").astype(_checks.numbers(inside.x, "inside.x").dtype)
-    if t.shape != (path.shape[0],):
-        raise ValueError(f"ts: wanted ({path.shape[0]},) as the path has, got {t.shape}")
+    kind = _checks.numbers(inside.x, "inside.x").dtype
+    t = jnp.asarray(times(ts, path.shape[0], "the path has"), kind)
     outside = np.asarray(jax.vmap(frame.to_inertial)(inside, t).x)
-    ax = row_of_axes(ax, 2, figsize=(9.6, 4.6))
+    ax = several_axes(ax, (2,), ncols=2, figsize=(9.6, 4.6))
     names = (("moving", path), ("inertial", outside))
     for one, (name, line) in zip(ax, names, strict=True):
         one.plot(line[:, i], line[:, j], color=COLOURS[0], lw=1.2)

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from rigidjax import _checks
-from rigidjax.plot.style import COLOURS, plain, row_of_axes
+from rigidjax.plot.style import COLOURS, plain, several_axes
 
 _KINDS = {
     "x": "position, m",
@@ -61,7 +61,8 @@ def horizons(
                 f"found: wanted the same kinds of errors, got {kinds} and {name!r} with "
                 f"{sorted(getattr(one, measure))}"
             )
-    ax = row_of_axes(ax, len(kinds), figsize=(3.4 * len(kinds) + 0.6, 3.2))
+    count = len(kinds)
+    ax = several_axes(ax, (count,), ncols=count, figsize=(3.4 * count + 0.6, 3.2))
     for one_ax, kind in zip(ax, kinds, strict=True):
         for (name, one), colour in zip(named.items(), COLOURS * len(named), strict=False):
             errors = _checks.on_host(getattr(one, measure)[kind], f"found: {kind}")

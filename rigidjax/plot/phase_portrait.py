@@ -77,14 +77,8 @@ def phase_portrait(
     top_level = max(float(np.median(own)) * 2 - floor, floor + 1e-3 * weight)
     # Evenly spaced in the amplitude of the nutation, not in energy.
     steps = np.linspace(0, 1.5, levels + 1)[1:] ** 2
-    ax.contour(
-        np.degrees(grid),
-        rates,
-        energy,
-        levels=floor + steps * (top_level - floor) / 2,
-        colors="0.6",
-        linewidths=0.7,
-    )
+    heights = floor + steps * (top_level - floor) / 2
+    ax.contour(np.degrees(grid), rates, energy, levels=heights, colors="0.6", linewidths=0.7)
     ax.plot(np.degrees(tilt), rate, color=COLOURS[0], lw=2.0, label="this motion")
     ax.plot(np.degrees(tilt[:1]), rate[:1], color=COLOURS[0], marker="o", ls="", label="start")
     lowest = grid[np.argmin(potential(grid))]

@@ -1,4 +1,4 @@
-"""Poinsot's picture of free motion: the polhode in the body, the herpolhode in space."""
+"""A motion on a sphere: body axes, and Poinsot's polhode in the body and herpolhode in space."""
 
 from typing import Any
 
@@ -19,10 +19,41 @@ from rigidjax.plot.style import (
     flat_axes,
     globe,
     matrices,
+    on_sphere,
     plain,
     rows,
     solid_axes,
 )
+
+
+def body_axes(states: HasAttitude, *, title: str = "", ax: Any = None) -> Any:
+    """The paths of the three body axes on the unit sphere, world frame.
+
+    A dot marks the start, a triangle the end; what lies behind the sphere is faint.
+
+    **Arguments:** `states` of one body with a leading time axis; `title`; `ax` 3-D axes of yours,
+    turned as you like (`view_init`) before the call. **Returns** the axes.
+
+    **Raises** `TypeError` for states without an attitude or flat axes, `ValueError` for a batch.
+
+    >>> import rigidjax as rj
+    >>> sol = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 3.0),
+    ...                   rj.Attitude([1.0, 0, 0, 0], [0, 1, 0.1]), [0.0, 1.0, 2.0])
+    >>> body_axes(sol.ys).get_zlabel()
+    'z'
+    """
+    m = matrices(attitudes(states))
+    ax = solid_axes(ax)
+    globe(ax, (1.0, 1.0, 1.0), "0.8", 0.12)
+    for axis, colour in enumerate(COLOURS[:3]):
+        path = m[:, :, axis]
+        around_ball(ax, path, path, color=colour, lw=1.6, label=f"body {'xyz'[axis]} axis")
+        ax.plot(*path[:1].T, color=colour, marker="o", ms=6, ls="")
+        ax.plot(*path[-1:].T, color=colour, marker="^", ms=7, ls="")
+    cube(ax, 1.0, ("x", "y", "z"))
+    ax.legend(loc="upper left", fontsize=9)
+    ax.set_title(plain(title) or "body axes on the unit sphere, world frame")
+    return ax
 
 
 def polhode(
@@ -62,12 +93,12 @@ def polhode(
     twice_energy = float(np.sum(pi[0] ** 2 / i))
 
     ax = solid_axes(ax)
-    # By what is said here, not by depth, which matplotlib takes of a whole surface: the path would
-    # be lost under the sphere.
+    # We say what lies in front. matplotlib takes one depth for a whole surface, and would draw the
+    # sphere over the path.
     ax.computed_zorder = False
     globe(ax, (1.0, 1.0, 1.0), COLOURS[5], 0.15)
     cage(ax, np.sqrt(twice_energy * i), COLOURS[4], lw=0.5, alpha=0.8, zorder=2)
-    # Where all moments are equal every energy is the same one: there are no lines to draw.
+    # All energies are the same one if all moments are equal: there are no lines to draw.
     if i[2] - i[0] > 1e-9 * i[2]:
         _others(ax, i, energies)
     hidden = {"alpha": 1.0, "ls": (0, (1, 1)), "lw": 1.8}
@@ -86,6 +117,11 @@ def polhode(
     return ax
 
 
+def _about_middle(around: np.ndarray, down: np.ndarray) -> np.ndarray:
+    """`on_sphere` with the pole along the middle axis."""
+    return on_sphere(around, down)[[1, 2, 0]]
+
+
 def _others(ax: Any, i: np.ndarray, energies: int) -> None:
     """Curves of equal energy on the unit momentum sphere."""
     import contourpy
@@ -93,30 +129,18 @@ def _others(ax: Any, i: np.ndarray, energies: int) -> None:
     inverse = 1 / i
     # The pole of the grid along the axis of the middle moment: no family of loops goes round it.
     around, down = np.linspace(0, 2 * np.pi, 181), np.linspace(0, np.pi, 91)
-    ball = np.stack(
-        [
-            np.outer(np.sin(down), np.sin(around)),
-            np.outer(np.cos(down), np.ones_like(around)),
-            np.outer(np.sin(down), np.cos(around)),
-        ]
-    )
-    level = np.einsum("i,ijk->jk", inverse, ball**2)
+    level = np.einsum("i,ijk->jk", inverse, _about_middle(around, down[:, None]) ** 2)
     lines = contourpy.contour_generator(around, down, level)
     for value in np.linspace(inverse[2], inverse[0], energies + 2)[1:-1]:
         _curves(ax, lines.lines(value), lw=0.6, color="0.35", zorder=3)
-    distinct = min(i[1] - i[0], i[2] - i[1]) > 1e-9 * i[2]
-    if distinct:
-        _curves(
-            ax, lines.lines(inverse[1]), lw=1.2, color="0.1", ls="--", label="separatrix", zorder=4
-        )
+    if min(i[1] - i[0], i[2] - i[1]) > 1e-9 * i[2]:
+        how = dict(lw=1.2, color="0.1", ls="--", label="separatrix", zorder=4)
+        _curves(ax, lines.lines(inverse[1]), **how)
 
 
 def _curves(ax: Any, curves: Any, **how: Any) -> None:
     for curve in curves:
-        around, down = np.asarray(curve).T
-        path = np.stack(
-            [np.sin(down) * np.sin(around), np.cos(down), np.sin(down) * np.cos(around)], axis=-1
-        )
+        path = _about_middle(*np.asarray(curve).T).T
         around_ball(ax, path, path, **how)
         how.pop("label", None)
 
@@ -141,12 +165,8 @@ def herpolhode(inertia: Inertia, states: HasAttitude, *, title: str = "", ax: An
     """
     m = matrices(attitudes(states))
     omega = np.einsum("tij,tj->ti", m, rows(states.omega, 3, "states.omega"))
-    momenta = np.asarray(
-        jax.vmap(lambda state: spatial_angular_momentum(inertia, state))(
-            jax.tree.map(jnp.asarray, states)
-        ),
-        dtype=float,
-    )
+    each = jax.vmap(lambda state: spatial_angular_momentum(inertia, state))
+    momenta = np.asarray(each(jax.tree.map(jnp.asarray, states)), dtype=float)
     size = np.linalg.norm(momenta, axis=1)
     if not size[0] > 0:
         raise ValueError("herpolhode: the body is at rest, there is no invariable plane")

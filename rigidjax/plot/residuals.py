@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from rigidjax.plot.style import COLOURS, TIMES, of_fit, plain, pyplot, unit
+from rigidjax.plot.style import COLOURS, TIMES, of_fit, plain, several_axes, unit
 
 # Frequencies of an uneven record, at most.
 _MOST = 2000
@@ -40,13 +40,7 @@ def residuals(
     record = found.problem.recordings[index]
     several = found.problem.count > 1
     count = len(record.readings)
-    if ax is None:
-        ax = pyplot().subplots(
-            count, 4, figsize=(14, 3.1 * count), squeeze=False, layout="constrained"
-        )[1]
-    ax = np.asarray(ax, dtype=object)
-    if ax.shape != (count, 4):
-        raise ValueError(f"ax: wanted ({count}, 4) axes, a row a sensor, got {ax.shape}")
+    ax = several_axes(ax, (count, 4), nrows=count, ncols=4, figsize=(14, 3.1 * count))
     t = np.asarray(record.t) / seconds
     for row, reading, errors, noise in zip(
         ax, record.readings, found.residuals, found.noise, strict=True
@@ -68,12 +62,10 @@ def _one_sensor(row: Any, t: np.ndarray, scaled: np.ndarray, seen: np.ndarray) -
     # One wild reading must not press all others into a line: what lies beyond is counted.
     reach = float(np.clip(np.abs(everything).max(initial=0.0) * 1.1, 4.0, 8.0))
     beyond = int((np.abs(everything) > reach).sum())
-    many = seen.sum() > 100
     shown = np.where(np.abs(scaled[seen]) <= reach, scaled[seen], np.nan)
+    how: dict[str, Any] = dict(ms=2.5 if seen.sum() > 100 else 5, alpha=0.7)
     for values, colour, name in zip(shown.T, colours, names, strict=True):
-        over_time.plot(
-            t[seen], values, ".", ms=2.5 if many else 5, color=colour, alpha=0.7, label=name
-        )
+        over_time.plot(t[seen], values, ".", color=colour, label=name, **how)
     over_time.axhspan(-2, 2, color="0.9", zorder=0)
     over_time.legend(loc="upper right", ncols=3, fontsize=8, markerscale=2)
     over_time.set_ylim(-reach, 1.35 * reach)
@@ -81,9 +73,9 @@ def _one_sensor(row: Any, t: np.ndarray, scaled: np.ndarray, seen: np.ndarray) -
     inside = everything[np.abs(everything) <= reach]
     low, high = (inside.min(), inside.max()) if inside.size else (-1.0, 1.0)
     middle, half = 0.5 * (low + high), max(0.5 * (high - low), 1e-3 * reach)
-    bins = np.linspace(
-        middle - half, middle + half, int(np.clip(2 * np.sqrt(everything.size), 9, 41))
-    )
+    count = int(np.clip(2 * np.sqrt(everything.size), 9, 41))
+    # No less than from `low` to `high`: rounding must not leave the last reading out.
+    bins = np.linspace(min(low, middle - half), max(high, middle + half), count)
     told = f"{beyond} beyond" if beyond else None
     weights = np.full(everything.size, 1 / (everything.size * (bins[1] - bins[0])))
     spread.hist(everything, bins=bins, weights=weights, color=COLOURS[5], alpha=0.8, label=told)
@@ -96,13 +88,11 @@ def _one_sensor(row: Any, t: np.ndarray, scaled: np.ndarray, seen: np.ndarray) -
     lags = np.arange(1, max(2, min(40, number // 2)))
     for values, colour in zip(scaled[seen].T, colours, strict=True):
         memory.plot(lags, _correlation(values, lags), ".-", color=colour, ms=4, lw=0.8)
+        spectrum.plot(*power(t[seen], values), color=colour, lw=1)
     band = 2 / np.sqrt(max(number, 1))
     memory.axhspan(-band, band, color="0.9", zorder=0)
     memory.axhline(0, color="0.6", lw=0.8)
     memory.set(xlabel="lag, samples", ylabel="correlation", ylim=(-1, 1))
-
-    for values, colour in zip(scaled[seen].T, colours, strict=True):
-        spectrum.plot(*power(t[seen], values), color=colour, lw=1)
     spectrum.axhline(1, color="0.6", lw=0.8)
     spectrum.set(yscale="log", ylabel="power / that of the noise")
 
@@ -116,16 +106,13 @@ def power(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return np.zeros(0), np.zeros(0)
     gap = float(np.median(gaps))
     if (np.abs(gaps - gap) <= 1e-3 * gap).all():
-        frequencies, density = welch(values, 1 / gap, nperseg=_segment(t.size))
+        # Several segments: the noise of the estimate is then small.
+        segment = min(t.size, max(64, min(t.size // 4, 512)))
+        frequencies, density = welch(values, 1 / gap, nperseg=segment)
         return frequencies[1:], density[1:] / (2 * gap)
     span = float(t[-1] - t[0])
     frequencies = np.arange(1, min(_MOST, max(2, int(span / (2 * gap))))) / span
     return frequencies, lombscargle(t, values - values.mean(), 2 * np.pi * frequencies)
-
-
-def _segment(samples: int) -> int:
-    """The length of Welch's segments: some of them, so that the noise of the estimate is small."""
-    return min(samples, max(64, min(samples // 4, 512)))
 
 
 def _correlation(values: np.ndarray, lags: np.ndarray) -> np.ndarray:

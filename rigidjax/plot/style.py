@@ -2,21 +2,19 @@
 
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from rigidjax import _checks
 from rigidjax._checks import plain as plain
+from rigidjax.rotation import quaternion
 
 # Okabe and Ito's colours, told apart by everyone (Okabe and Ito 2008, "Color Universal Design").
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 AXES = "xyz"
 TIMES = {"s": 1.0, "min": 60.0, "h": 3600.0, "day": 86400.0}
-RATES = {
-    "rad/s": 1.0,
-    "deg/s": 180 / np.pi,
-    "rpm": 30 / np.pi,
-    "deg/day": 86400 * 180 / np.pi,
-}
+RATES = {"rad/s": 1.0, "deg/s": 180 / np.pi, "rpm": 30 / np.pi, "deg/day": 86400 * 180 / np.pi}
 
 
 def pyplot() -> Any:
@@ -70,14 +68,24 @@ def solid_axes(ax: Any, **how: Any) -> Any:
     return ax
 
 
-def row_of_axes(ax: Any, count: int, **how: Any) -> Any:
-    """As many axes as given, or new ones side by side; `ValueError` for another number."""
+def several_axes(ax: Any, shape: tuple[int, ...], **how: Any) -> Any:
+    """As many axes as given, or new ones (`how` of `subplots`); `ValueError` for another shape."""
     if ax is None:
-        ax = pyplot().subplots(1, count, layout="constrained", **how)[1]
+        ax = np.reshape(pyplot().subplots(layout="constrained", **how)[1], shape)
     ax = np.atleast_1d(np.asarray(ax, dtype=object))
-    if ax.shape != (count,):
-        raise ValueError(f"ax: wanted {count} axes in a row, got shape {ax.shape}")
+    if ax.shape != shape:
+        words = f"{shape[0]} axes" + (" in a row" if "ncols" in how else "")
+        words = words if len(shape) == 1 else f"{shape} axes, a row a sensor"
+        raise ValueError(f"ax: wanted {words}, got shape {ax.shape}")
     return ax
+
+
+def times(ts: Any, count: int, what: str = "the states have") -> np.ndarray:
+    """Times (T,) as NumPy float64; `ValueError` where there are not as many as states."""
+    t = _checks.on_host(ts, "ts")
+    if t.shape != (count,):
+        raise ValueError(f"ts: wanted ({count},) as {what}, got {t.shape}")
+    return t
 
 
 def rows(values: Any, width: int, name: str) -> np.ndarray:
@@ -105,21 +113,17 @@ def attitudes(states: Any, name: str = "states") -> np.ndarray:
 
 def matrices(q: np.ndarray) -> np.ndarray:
     """Rotation matrices (T, 3, 3), body → world, of quaternions (T, 4), for pictures."""
-    w, x, y, z = (q / np.linalg.norm(q, axis=1, keepdims=True)).T
+    unit = jnp.asarray(q / np.linalg.norm(q, axis=1, keepdims=True))
+    return np.asarray(jax.vmap(quaternion.to_matrix)(unit), dtype=float)
+
+
+def on_sphere(around: np.ndarray, down: np.ndarray) -> np.ndarray:
+    """Places (3, …) on the unit sphere, by the angles about z and from it."""
     return np.stack(
-        [
-            np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
-            np.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], -1),
-            np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1),
-        ],
-        axis=1,
+        np.broadcast_arrays(
+            np.cos(around) * np.sin(down), np.sin(around) * np.sin(down), np.cos(down)
+        )
     )
-
-
-def towards_viewer(ax: Any) -> np.ndarray:
-    """Unit vector (3,) from the middle of 3-D axes to the eye, as they are turned now."""
-    up, around = np.radians(ax.elev), np.radians(ax.azim)
-    return np.array([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)])
 
 
 def around_ball(
@@ -135,7 +139,9 @@ def around_ball(
     **Arguments:** `path` (T, 3); `centre_free` (T, 3) the outward normals there; `behind` how the
     hidden part differs, faint unless said otherwise; `how` of matplotlib's lines.
     """
-    front = centre_free @ towards_viewer(ax) > 0
+    up, around = np.radians(ax.elev), np.radians(ax.azim)
+    eye = np.array([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)])
+    front = centre_free @ eye > 0
     label = how.pop("label", None)
     alpha = how.pop("alpha", 1.0)
     hidden = {"alpha": 0.25 * alpha, **(behind or {})}
@@ -160,30 +166,19 @@ def cage(ax: Any, semi_axes: Any, colour: str, **how: Any) -> None:
 
 
 def _ellipsoid(semi_axes: Any) -> np.ndarray:
-    u, v = np.linspace(0, 2 * np.pi, 49), np.linspace(0, np.pi, 25)
-    ball = np.stack(
-        [
-            np.outer(np.cos(u), np.sin(v)),
-            np.outer(np.sin(u), np.sin(v)),
-            np.outer(u * 0 + 1, np.cos(v)),
-        ]
-    )
+    ball = on_sphere(np.linspace(0, 2 * np.pi, 49)[:, None], np.linspace(0, np.pi, 25))
     return np.asarray(semi_axes)[:, None, None] * ball
 
 
 def cube(ax: Any, reach: float, labels: tuple[str, str, str]) -> None:
     """Equal scales on all three axes, few ticks, names that do not run into them."""
+    from matplotlib.ticker import MaxNLocator
+
     ax.set(xlim=(-reach, reach), ylim=(-reach, reach), zlim=(-reach, reach))
     ax.set_box_aspect((1, 1, 1))
     for axis, label in zip((ax.xaxis, ax.yaxis, ax.zaxis), labels, strict=True):
-        axis.set_major_locator(_ticks())
+        # The ends left out: at the corners of the cube they would lie on those of the next axis.
+        axis.set_major_locator(MaxNLocator(5, prune="both"))
         axis.set_label_text(label)
         axis.labelpad = 4
         axis.set_tick_params(labelsize=8, pad=0)
-
-
-def _ticks() -> Any:
-    from matplotlib.ticker import MaxNLocator
-
-    # The ends left out: at the corners of the cube they would lie on those of the next axis.
-    return MaxNLocator(5, prune="both")

@@ -14,8 +14,9 @@ from rigidjax.plot.style import (
     attitudes,
     matrices,
     plain,
-    pyplot,
     rows,
+    several_axes,
+    times,
     unit,
 )
 
@@ -49,18 +50,10 @@ def motion(
     turned, seconds = unit(rate_unit, RATES, "rate_unit"), unit(time_unit, TIMES, "time_unit")
     _checks.instance(states, HasSpin, "states", wanted="a Spin, an Attitude or a Rigid")
     omega = rows(states.omega, 3, "states.omega") * turned
-    t = _checks.on_host(ts, "ts") / seconds
-    if t.shape != (omega.shape[0],):
-        raise ValueError(f"ts: wanted ({omega.shape[0]},) as the states have, got {t.shape}")
+    t = times(ts, omega.shape[0]) / seconds
     both = hasattr(states, "q")
     count = 2 if both else 1
-    if ax is None:
-        ax = pyplot().subplots(
-            count, 1, sharex=True, figsize=(7.2, 2.6 * count), layout="constrained"
-        )[1]
-    ax = np.atleast_1d(np.asarray(ax, dtype=object))
-    if ax.shape != (count,):
-        raise ValueError(f"ax: wanted {count} axes, got shape {ax.shape}")
+    ax = several_axes(ax, (count,), nrows=count, sharex=True, figsize=(7.2, 2.6 * count))
     if both:
         _attitude(ax[0], t, attitudes(states), attitude)
     for values, name, colour in zip(omega.T, "xyz", COLOURS[:3], strict=True):

@@ -58,7 +58,7 @@ def mesh(
 ) -> Scalar:
     """Brightness of a convex body by its faces, m²: `Σ f(μ₀, μ) area` of those lit and seen.
 
-    Of a body that is not convex it is what it would be without shadows.
+    For a body that is not convex it is the brightness without shadows.
 
     **Arguments:** `vertices`, `faces` as for `rigidjax.shapes.mesh`; the others as for `ellipsoid`.
     Differentiable in the vertices and directions: a face that is just coming to light has the

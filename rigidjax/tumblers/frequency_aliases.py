@@ -40,17 +40,13 @@ def with_aliases(
         more = more[((more > 0.5) & (more < highest)).all(axis=1)]
         if not len(more):
             break
-        more, new = refined(table, apart(more, misfits_of(table, more, order), 2 * SEEDS), order)
+        best = distinct(more, misfits_of(table, more, order), 2 * SEEDS)
+        more, new = refined(table, more[best], order)
         before = misfits.min()
         pairs, misfits = np.concatenate([pairs, more]), np.concatenate([misfits, new])
         if not new.min() < before * (1 - 1e-3):
             break
     return pairs, misfits
-
-
-def apart(pairs: np.ndarray, misfits: np.ndarray, count: int) -> np.ndarray:
-    """The best of the pairs that are not one."""
-    return pairs[distinct(pairs, misfits, count)]
 
 
 def distinct(pairs: np.ndarray, misfits: np.ndarray, count: int) -> list[int]:

@@ -24,13 +24,7 @@ from rigidjax.identify.several_bodies import Bodies
 from rigidjax.motion.torques.base import vector_at
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.linalg3 import apply, dot
-from rigidjax.tumblers.search import (
-    MAGNITUDE,
-    descended,
-    noise_of,
-    relative_flux,
-    starts_of,
-)
+from rigidjax.tumblers.search import MAGNITUDE, descended, noise_of, relative_flux, starts_of
 from rigidjax.tumblers.sensor import Brightness
 from rigidjax.tumblers.two_frequencies import TwoFrequencies, two_frequencies
 
@@ -101,10 +95,8 @@ class LightCurve(eqx.Module):
         return tuple(alias for alias in self.aliases[1:] if alias.explains)
 
     def __str__(self) -> str:
-        lines = [self.status]
-        for alias in self.aliases:
-            lines.append(f"{'*' if alias.explains else ' '} {alias}")
-        return "\n".join(lines)
+        aliases = (f"{'*' if alias.explains else ' '} {alias}" for alias in self.aliases)
+        return "\n".join([self.status, *aliases])
 
 
 def fit_light_curve(
@@ -145,7 +137,7 @@ def fit_light_curve(
     _checks.positive(tolerance, "tolerance")
     if progress is not None:
         _checks.function(progress, "progress", "of a line of text, such as print")
-    say = progress if progress is not None else _silent
+    say = progress if progress is not None else lambda line: None
     t, flux, noise = relative_flux(problem, reading)
     squares, spread = flux**2, None if noise is None else 2.0 * flux * noise
     found = two_frequencies(t, squares, spread, shortest=shortest, count=count)
@@ -165,10 +157,6 @@ def _used(found: TwoFrequencies) -> int:
     """How many of the pairs fit well enough to be tried."""
     above = ABOVE * max(1.0, float(found.misfits[0]) / found.dof)
     return max(LEAST, int((found.misfits <= found.misfits[0] + above).sum()))
-
-
-def _silent(line: str) -> None:
-    pass
 
 
 def _only(problem: Problem) -> Any:

@@ -8,7 +8,7 @@ from jaxtyping import ArrayLike, Float
 
 from rigidjax import _checks
 from rigidjax._names import show
-from rigidjax.plot.style import COLOURS, TIMES, plain, pyplot, unit
+from rigidjax.plot.style import COLOURS, TIMES, plain, several_axes, unit
 
 # Colours of one cycle after another, from the first to the last.
 _MAP = "viridis"
@@ -57,11 +57,7 @@ def light_curve(
         raise ValueError(f"periods: wanted one or a row of them, s, got shape {several.shape}")
     folds = [_checks.positive(period, "periods", "positive periods, s") for period in several]
     count = 1 + len(folds)
-    if ax is None:
-        ax = pyplot().subplots(count, 1, figsize=(7.2, 2.5 * count), layout="constrained")[1]
-    ax = np.atleast_1d(np.asarray(ax, dtype=object))
-    if ax.shape != (count,):
-        raise ValueError(f"ax: wanted {count} axes, got shape {ax.shape}")
+    ax = several_axes(ax, (count,), nrows=count, figsize=(7.2, 2.5 * count))
     label = "magnitude" if quantity == "mag" else "flux"
     _against(ax[0], t / seconds, read, predicted)
     ax[0].set(xlabel=f"time, {time_unit}", ylabel=label)

@@ -24,6 +24,8 @@ _SMALL, _TERMS = 0.1, 16
 # Gauss–Legendre points of both integrals of Lambert's law.
 _POINTS = 32
 
+Faces = Float[Array, "*faces"]
+
 
 class AbstractScattering(eqx.Module):
     """A law of scattering: what a piece of surface sends, and a whole ellipsoid.
@@ -38,9 +40,7 @@ class AbstractScattering(eqx.Module):
     """
 
     @abc.abstractmethod
-    def per_area(
-        self, incidence: Float[Array, "*faces"], emission: Float[Array, "*faces"]
-    ) -> Float[Array, "*faces"]:
+    def per_area(self, incidence: Faces, emission: Faces) -> Faces:
         """Brightness over area, of the cosines of incidence and emission, both positive."""
 
     @abc.abstractmethod
@@ -57,9 +57,7 @@ class Geometric(AbstractScattering):
     0.25
     """
 
-    def per_area(
-        self, incidence: Float[Array, "*faces"], emission: Float[Array, "*faces"]
-    ) -> Float[Array, "*faces"]:
+    def per_area(self, incidence: Faces, emission: Faces) -> Faces:
         return emission
 
     def of_ellipsoid(self, shape: Mat3, sun: Vec3, observer: Vec3) -> Scalar:
@@ -70,7 +68,7 @@ class Geometric(AbstractScattering):
 class LommelSeeliger(AbstractScattering):
     """Light scattered once, `2 μ₀ μ/(μ₀ + μ)`: the law of dark surfaces, as asteroids have.
 
-    Of an ellipsoid `π (|p||q| + p·q)/(|p| + |q|) [1 − (1 − z²) artanh(z)/z]/z²` with
+    An ellipsoid has `π (|p||q| + p·q)/(|p| + |q|) [1 − (1 − z²) artanh(z)/z]/z²` with
     `z = |p + q|/(|p| + |q|)`, p and q times the product of the semi-axes. A form of the closed
     result of Muinonen and Lumme 2015, A&A 584:A23, doi:10.1051/0004-6361/201526456, that keeps its
     digits at any phase. At zero phase exactly the second derivative by a direction is −∞ (the
@@ -80,9 +78,7 @@ class LommelSeeliger(AbstractScattering):
     0.5
     """
 
-    def per_area(
-        self, incidence: Float[Array, "*faces"], emission: Float[Array, "*faces"]
-    ) -> Float[Array, "*faces"]:
+    def per_area(self, incidence: Faces, emission: Faces) -> Faces:
         return 2.0 * incidence * emission / (incidence + emission)
 
     def of_ellipsoid(self, shape: Mat3, sun: Vec3, observer: Vec3) -> Scalar:
@@ -93,17 +89,15 @@ class LommelSeeliger(AbstractScattering):
 class Lambert(AbstractScattering):
     """`3/2 μ₀ μ`: the law of bright, rough surfaces.
 
-    Of a triaxial ellipsoid it has no elementary form: two integrals of one variable, by 32 points
-    each. Of axes up to 30 : 1, at phases up to 170°, the relative error is below 1e-9; errors of
-    first and second derivatives are below 1e-8 and 1e-6 of the brightness.
+    It has no elementary form for a triaxial ellipsoid: there are two integrals of one variable, by
+    32 points each. The relative error is below 1e-9 for axes up to 30 : 1 at phases up to 170°;
+    errors of first and second derivatives are below 1e-8 and 1e-6 of the brightness.
 
     >>> float(Lambert().per_area(jnp.asarray(1.0), jnp.asarray(0.5)))
     0.75
     """
 
-    def per_area(
-        self, incidence: Float[Array, "*faces"], emission: Float[Array, "*faces"]
-    ) -> Float[Array, "*faces"]:
+    def per_area(self, incidence: Faces, emission: Faces) -> Faces:
         return 1.5 * incidence * emission
 
     def of_ellipsoid(self, shape: Mat3, sun: Vec3, observer: Vec3) -> Scalar:
@@ -124,7 +118,7 @@ def direction(value: Vec3Like | Numbers, name: str) -> Vec3:
     v = _checks.refuse(
         v, ~(jnp.abs(v) > 0).any(), f"{name}: wanted a direction, got a vector of length zero"
     )
-    # Of a star's 1e200 m the square would overflow.
+    # The square of a star's 1e200 m would overflow.
     v = times_power_of_two(v, -exponent_of(v))
     return v / jnp.sqrt(dot(v, v))
 
@@ -192,7 +186,7 @@ def _across_the_lune(shape: Mat3, minors: Mat3, sun: Vec3, observer: Vec3) -> Sc
     """
     pole = cross(sun, observer)
     sine, apart = _root(dot(pole, pole)), dot(pole, pole) > jnp.finfo(pole.dtype).eps ** 2
-    # Where there is hardly a lune any pole will do.
+    # Any pole will do if there is hardly a lune.
     least = jnp.eye(3, dtype=pole.dtype)[jnp.argmin(jnp.abs(sun))]
     pole = jnp.where(apart, pole, cross(sun, least))
     pole = pole / jnp.sqrt(dot(pole, pole))

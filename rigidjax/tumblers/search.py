@@ -71,21 +71,17 @@ def starts_of(
     for pair in found.frequencies[:used]:
         for mode in starts.MODES:
             some = starts.candidates(pair, mode, light, half_way, areas, 3)
-            # Of each reading of each pair one: which of them is true a grid alone cannot tell.
+            # One of each reading of each pair: a grid alone cannot tell which of them is true.
             best_of += some[: len(starts.ABOUT)]
             others += some[len(starts.ABOUT) :]
     best_of.sort(key=lambda one: one.misfit)
     others.sort(key=lambda one: one.misfit)
     chunks = max(1, -(-len(best_of) // FIRST))
     all_of = (best_of + others)[: chunks * FIRST]
-    turn = _turn(order)
-    return [_parameters(problem, one, turn) for one in all_of]
-
-
-def _turn(order: np.ndarray) -> np.ndarray:
-    """The rotation whose columns are the body's axes of ascending moments."""
+    # The rotation whose columns are the body's axes of ascending moments.
     turn = np.eye(3)[:, order]
-    return turn * np.array([1.0, 1.0, np.linalg.det(turn)])
+    turn = turn * np.array([1.0, 1.0, np.linalg.det(turn)])
+    return [_parameters(problem, one, turn) for one in all_of]
 
 
 def _parameters(problem: Problem, one: starts.Candidate, turn: np.ndarray) -> Parameters:
@@ -130,15 +126,12 @@ def descended(
         costs.append(np.asarray(found.cost))
     all_of = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parameters)
     cost_of = np.concatenate(costs)
-    order = np.argsort(cost_of)
-    kept, seen = [], []
-    for index in order:
-        cost = float(cost_of[index])
-        if all(abs(cost - other) > 1e-3 * (1.0 + other) for other in seen):
+    kept: list[int] = []
+    for index in np.argsort(cost_of):
+        others = cost_of[kept]
+        if (np.abs(cost_of[index] - others) > 1e-3 * (1.0 + others)).all():
             kept.append(int(index))
-            seen.append(cost)
-        if len(kept) == SECOND:
-            break
+    kept = kept[:SECOND]
     rows = jnp.asarray(np.resize(kept, FIRST))
     nearer = jax.tree.map(lambda leaf: leaf[rows], all_of)
     last = _many(nearer, problem, noise, Settings(tolerance, 1e-2, MORE), np.int32(len(kept)))

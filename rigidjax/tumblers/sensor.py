@@ -9,11 +9,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from rigidjax import _checks
-from rigidjax._types import HasAttitude, Scalar, Vec3
+from rigidjax._types import HasAttitude, Scalar
 from rigidjax.identify.sensors.base import AbstractSensor, SensorInput, noise_of, number_of
 from rigidjax.motion.torques.base import vector_at
 from rigidjax.rotation import quaternion
-from rigidjax.rotation.linalg3 import dot, entries
+from rigidjax.rotation.linalg3 import determinant, dot
 from rigidjax.tumblers.brightness import AbstractScattering
 from rigidjax.tumblers.scattering import direction, law_of
 
@@ -95,18 +95,16 @@ class Brightness(AbstractSensor):
         if self.semi_axes is not None:
             shape = jnp.diag(self.semi_axes * self.semi_axes)
         shape = shape / jnp.trace(shape)
-        xx, xy, xz, _, yy, yz, _, _, zz = entries(shape)
-        volume = xx * (yy * zz - yz * yz) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz)
-        back = quaternion.conjugate(now.state.q)
+        sides = ((self.sun, "sun"), (self.observer, "observer"))
+        away = (vector_at(side, now.t, name).astype(now.state.q.dtype) for side, name in sides)
         sun, observer = (
-            quaternion.rotate(back, _unit(vector_at(source, now.t, name).astype(back.dtype)))
-            for source, name in ((self.sun, "sun"), (self.observer, "observer"))
+            quaternion.rotate_inverse(now.state.q, v / jnp.sqrt(dot(v, v))) for v in away
         )
         seen = self.scattering.of_ellipsoid(shape, sun, observer)
-        relative = seen / (math.pi * jnp.cbrt(volume))
+        relative = seen / (math.pi * jnp.cbrt(determinant(shape)))
         if self.unit == "flux":
             return self.level * relative
-        # Of a body that hides its lit side nothing is seen: fainter than any reading.
+        # A body that hides its lit side is not seen: it is fainter than any reading.
         some = relative > 1e-12
         return self.level - 2.5 / math.log(10.0) * jnp.log(jnp.where(some, relative, 1e-12))
 
@@ -144,10 +142,6 @@ def _source(source: Any, name: str) -> Any:
             "for each time is rigidjax.torques.Linear(times, directions)"
         )
     return direction(source, name).astype(jnp.result_type(float))
-
-
-def _unit(v: Vec3) -> Vec3:
-    return v / jnp.sqrt(dot(v, v))
 
 
 def _lengths(semi_axes: Any) -> Array:

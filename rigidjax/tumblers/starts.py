@@ -19,6 +19,7 @@ from jaxtyping import Array, Float
 from rigidjax import exact
 from rigidjax.body.inertia import Inertia
 from rigidjax.motion import Attitude
+from rigidjax.rotation import quaternion
 from rigidjax.rotation.linalg3 import cross
 
 # Semi-axes of the grid: b/a and c/b; phases in half a rotation.
@@ -41,17 +42,13 @@ class Candidate(NamedTuple):
     misfit: float
 
 
-def shapes_of_grid() -> np.ndarray:
-    """Semi-axes (S, 3), descending, the longest one."""
+def bodies_of_grid() -> tuple[np.ndarray, np.ndarray]:
+    """Semi-axes and moments (S, 3) of uniform ellipsoids: the longest and the largest are one."""
     b, ratio = np.meshgrid(MIDDLE, SHORT, indexing="ij")
-    return np.stack([np.ones(b.size), b.ravel(), (b * ratio).ravel()], axis=1)
-
-
-def moments_of(semi_axes: np.ndarray) -> np.ndarray:
-    """Principal moments (S, 3) of uniform ellipsoids, the largest one."""
+    semi_axes = np.stack([np.ones(b.size), b.ravel(), (b * ratio).ravel()], axis=1)
     second = semi_axes**2
     moments = second.sum(axis=1, keepdims=True) - second
-    return moments / moments[:, 2:]
+    return semi_axes, moments / moments[:, 2:]
 
 
 def candidates(
@@ -70,8 +67,7 @@ def candidates(
     frame; `areas` M (3,) of a known ellipsoid, or `None` for the uniform one of each body; `count`
     how many bodies, each with all turns of `ABOUT`.
     """
-    semi_axes = shapes_of_grid()
-    moments = moments_of(semi_axes)
+    semi_axes, moments = bodies_of_grid()
     forms = (np.prod(semi_axes, axis=1, keepdims=True) / semi_axes) ** 2
     if areas is not None:
         forms = np.broadcast_to(areas, forms.shape)
@@ -86,27 +82,23 @@ def candidates(
         if not np.isfinite(least[k]):
             continue
         at = k, phase[k]
-        for q0 in _placed(sides[at], half_way):
-            placed = _times(q0, q[at])
-            out.append(Candidate(moments[k], placed, omega[at], float(least[k])))
+        placed = (_times(q0, q[at]) for q0 in _placed(sides[at], half_way))
+        out += [Candidate(moments[k], one, omega[at], float(least[k])) for one in placed]
     return out
 
 
 def _placed(side: np.ndarray, half_way: np.ndarray) -> list[np.ndarray]:
     """Turns (4,) that take the frame of the momentum to the world.
 
-    Of the symmetric matrix that least squares found the nearest of rank one.
+    They are those of the matrix of rank one that is nearest to what least squares found.
     """
     xx, yy, zz, xy, xz, yz = side
     _, axes = np.linalg.eigh(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
     n = axes[:, -1]
-    turns = []
-    for angle in ABOUT:
-        first = _between(n, half_way)
-        half = 0.5 * angle
-        about = np.concatenate([[np.cos(half)], np.sin(half) * half_way])
-        turns.append(_times(about, first))
-    return turns
+    first = _between(n, half_way)
+    halves = [0.5 * angle for angle in ABOUT]
+    about = [np.concatenate([[np.cos(half)], np.sin(half) * half_way]) for half in halves]
+    return [_times(one, first) for one in about]
 
 
 def _between(u: np.ndarray, v: np.ndarray) -> np.ndarray:
@@ -170,13 +162,7 @@ def _energy(moments: Array, ratio: Array, long: Array) -> tuple[Array, Array, Ar
 
 @jax.jit
 def _grid(
-    long: Array,
-    moments: Array,
-    forms: Array,
-    pair: Array,
-    t: Array,
-    squares: Array,
-    weights: Array,
+    long: Array, moments: Array, forms: Array, pair: Array, t: Array, squares: Array, weights: Array
 ) -> tuple[Array, Array, Array, Array]:
     """Misfits (S, phases), n nᵀ times the level (…, 6), attitudes (…, 4) and rates (…, 3)."""
     ratio = 0.5 * pair[1] / pair[0]
@@ -193,16 +179,12 @@ def _grid(
             since = part / pair[1]
 
             def row(q: Array) -> Array:
-                w, x, y, u = (q[k] for k in range(4))
-                m = form
-                # Body axes in the world, written out.
-                a = (1 - 2 * (y * y + u * u), 2 * (x * y + w * u), 2 * (x * u - w * y))
-                b = (2 * (x * y - w * u), 1 - 2 * (x * x + u * u), 2 * (y * u + w * x))
-                c = (2 * (x * u + w * y), 2 * (y * u - w * x), 1 - 2 * (x * x + y * y))
+                m = quaternion.to_matrix(q)
 
-                def entry(i: int, j: int) -> Array:
-                    return m[0] * a[i] * a[j] + m[1] * b[i] * b[j] + m[2] * c[i] * c[j]
+                def entry(i: int, j: int) -> Any:
+                    return sum(form[k] * m[i, k] * m[j, k] for k in range(3))
 
+                # Σ M_k r_k r_kᵀ, body axes r in the world.
                 twice = (2 * entry(0, 1), 2 * entry(0, 2), 2 * entry(1, 2))
                 return jnp.stack([entry(0, 0), entry(1, 1), entry(2, 2), *twice])
 

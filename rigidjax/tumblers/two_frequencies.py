@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from rigidjax import _checks
-from rigidjax.tumblers.frequency_aliases import apart, distinct, refined, with_aliases
+from rigidjax.tumblers.frequency_aliases import distinct, refined, with_aliases
 from rigidjax.tumblers.lattice_series import BATCH, FIRST, Sums, filled, misfits_of, sums
 
 # Lines through which pairs are laid, and the grid of the first frequency, in 1/span.
@@ -57,8 +57,8 @@ def two_frequencies(
 ) -> TwoFrequencies:
     """Pairs (f₁, f₂) whose Fourier series fit best: `Σ c_jk exp 2πi (j f₁ + k f₂) t`, |j| ≤ 2.
 
-    Where the spectrum has its three strongest lines one of them must be j f₁ + k f₂; along these
-    curves all pairs are tried, then the best ones are refined. Then their aliases are tried: either
+    One of the three strongest lines of the spectrum must be j f₁ + k f₂. All pairs along these
+    curves are tried, then the best ones are refined. Then their aliases are tried: either
     frequency, or both, moved by a side peak of the spectral window (readings at night have such
     peaks at one and two a day) or by half of it, halved, doubled, or f₂ by f₁. A set of lines has
     several pairs that make it: all that fit are returned, for a motion to choose among them.
@@ -120,8 +120,8 @@ def two_frequencies(
     highest = SECOND * float(lines[:LINES].max())
     # All multiples of a pair, and what a step of the refinement adds.
     table = sums(light, 2 * (FIRST + order) * (highest + 1.0))
-    pairs = apart(*_scan(table, lines, order), count * TRIED)
-    pairs, misfits = refined(table, pairs, order)
+    pairs, misfits = _scan(table, lines, order)
+    pairs, misfits = refined(table, pairs[distinct(pairs, misfits, count * TRIED)], order)
     pairs, misfits = with_aliases(table, pairs, misfits, highest, order)
     keep = distinct(pairs, misfits, count)
     dof = t.size - unknowns

@@ -5,15 +5,13 @@ chart, `choose` the short table. `python -m rigidjax workprecision` is all of it
 """
 
 from rigidjax._names import show
-from rigidjax.workprecision.baseline import moved as moved
 from rigidjax.workprecision.chart import draw as draw
-from rigidjax.workprecision.drift import long_drift as long_drift
 from rigidjax.workprecision.jax_methods import diffrax_method as diffrax_method
 from rigidjax.workprecision.measurement import (
+    long_drift as long_drift,
     measure as measure,
     worked_out as worked_out,
 )
-from rigidjax.workprecision.method import Method as Method, Ready as Ready, Run as Run
 from rigidjax.workprecision.pareto import (
     Choice as Choice,
     choose as choose,
@@ -22,14 +20,20 @@ from rigidjax.workprecision.pareto import (
     table as table,
     time_to as time_to,
 )
+from rigidjax.workprecision.peers import methods as methods
 from rigidjax.workprecision.record import (
     Record as Record,
+    moved as moved,
     read_csv as read_csv,
     write_csv as write_csv,
 )
-from rigidjax.workprecision.reference import Reference as Reference
-from rigidjax.workprecision.registry import methods as methods
-from rigidjax.workprecision.scene import Scene as Scene
+from rigidjax.workprecision.scene import (
+    Method as Method,
+    Ready as Ready,
+    Reference as Reference,
+    Run as Run,
+    Scene as Scene,
+)
 from rigidjax.workprecision.standard_scenes import scenes as scenes
 
 show(__name__)

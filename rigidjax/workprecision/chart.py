@@ -52,12 +52,16 @@ def draw(records: Iterable[Record], *, title: str | None = None) -> Any:
             what = "error of the attitude, rad" if kind == "value" else "relative error"
             if name in ("foucault", "arenstorf") and kind == "value":
                 what = "relative error of the place"
-            axis.set_xlabel(what)
+            axis.set(xlabel=what, ylabel="compile and run, ms" if words else "time, ms")
             axis.set_title(plain(f"{name}: {kind}{words}"), fontsize=10)
-            axis.set_ylabel("compile and run, ms" if words else "time, ms")
     if title:
         figure.suptitle(plain(title))
     return figure
+
+
+def _places(records: list[Record]) -> tuple[list[float], list[float]]:
+    """Errors and times, ms."""
+    return [max(r.error, 1e-16) for r in records], [1e3 * r.time for r in records]
 
 
 def _one(axis: Any, records: list[Record], labels: list[tuple[str, str]]) -> None:
@@ -67,18 +71,14 @@ def _one(axis: Any, records: list[Record], labels: list[tuple[str, str]]) -> Non
         of = sorted((r for r in records if r.label == label), key=lambda r: r.setting)
         if not of:
             continue
-        same = [name for name, g in labels if g == group]
-        colour = mpl.colormaps[_COLOURS[group]](
-            same.index(label) % mpl.colormaps[_COLOURS[group]].N
-        )
-        errors = [max(r.error, 1e-16) for r in of]
-        times = [1e3 * r.time for r in of]
+        same, colours = [name for name, g in labels if g == group], mpl.colormaps[_COLOURS[group]]
+        colour = colours(same.index(label) % colours.N)
         bars = [
             [max(1e3 * (r.time - r.time_low), 0.0) for r in of],
             [max(1e3 * (r.time_high - r.time), 0.0) for r in of],
         ]
         axis.errorbar(
-            errors, times, bars, label=plain(label), color=colour, marker=_MARKS[i % len(_MARKS)],
+            *_places(of), bars, label=plain(label), color=colour, marker=_MARKS[i % len(_MARKS)],
             markersize=4, linewidth=1.6 if group == "ours" else 0.9, elinewidth=0.6,
             linestyle="-" if group == "ours" else "--" if group == "jax" else ":",
         )  # fmt: skip
@@ -86,16 +86,10 @@ def _one(axis: Any, records: list[Record], labels: list[tuple[str, str]]) -> Non
         (front(records), "0.6", "front"),
         (front(r for r in records if r.group != "peer"), "tab:cyan", "front in JAX"),
     ):
-        errors = [max(r.error, 1e-16) for r in best]
-        times = [1e3 * r.time for r in best]
-        axis.plot(errors, times, "-", color=colour, linewidth=6, alpha=0.3, zorder=0, label=what)
-    ringed = front(records)
-    axis.plot(
-        [max(r.error, 1e-16) for r in ringed], [1e3 * r.time for r in ringed], "o", color="k",
-        markerfacecolor="none", markersize=9, zorder=5,
-    )  # fmt: skip
-    axis.set_xscale("log")
-    axis.set_yscale("log")
+        axis.plot(*_places(best), "-", color=colour, linewidth=6, alpha=0.3, zorder=0, label=what)
+    ringed = dict(color="k", markerfacecolor="none", markersize=9, zorder=5)
+    axis.plot(*_places(front(records)), "o", **ringed)
+    axis.set(xscale="log", yscale="log")
     # Better is to the right and down.
     axis.invert_xaxis()
     axis.grid(alpha=0.3, which="major")

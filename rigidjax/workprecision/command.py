@@ -8,12 +8,11 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from rigidjax.workprecision import baseline, chart, pareto
-from rigidjax.workprecision.drift import long_drift
-from rigidjax.workprecision.measurement import measure
-from rigidjax.workprecision.method import Method
-from rigidjax.workprecision.record import Record, read_csv, write_csv
-from rigidjax.workprecision.registry import methods
+from rigidjax.workprecision import chart, pareto
+from rigidjax.workprecision.measurement import long_drift, measure
+from rigidjax.workprecision.peers import methods
+from rigidjax.workprecision.record import Record, kept, moved, read_csv, write_csv
+from rigidjax.workprecision.scene import Method
 from rigidjax.workprecision.standard_scenes import scenes
 
 STORED = Path("tests/workprecision/record.csv")
@@ -29,14 +28,28 @@ SMALL = {
 }
 DRIFT = "long-drift"
 # Compiling gradients is most of a run: of all scenes, these; of a scene that is named, always.
-GRADED = (
-    "free-top",
-    "heavy-top",
-    "asymmetric-top",
-    "gravity-gradient",
-    "damped-gyrostat",
-    "arenstorf",
-)
+GRADED = (*QUICK, "asymmetric-top", "gravity-gradient", "arenstorf")
+_FILE: dict[str, Any] = {"type": Path, "metavar": "FILE"}
+_FLAG: dict[str, Any] = {"action": "store_true"}
+_STORED = _FILE | {"nargs": "?", "const": STORED}
+OPTIONS: dict[str, dict[str, Any]] = {
+    "scene": dict(nargs="*", metavar="SCENE", help="which scenes (default: all)"),
+    "--quick": _FLAG | dict(help="three scenes, few settings"),
+    "--no-peers": _FLAG | dict(help="only what runs in JAX"),
+    "--no-gradients": _FLAG | dict(help="values only"),
+    "--thin": dict(type=int, default=1, metavar="N", help="every N-th setting"),
+    "--csv": _FILE | dict(help="keep the records"),
+    "--figure": _FILE | dict(help="draw the charts"),
+    "--from": _FILE | dict(dest="stored", help="measure nothing, read the records of --csv"),
+    "--choose": _FLAG | dict(help="scene × error → method"),
+    "--keep": _STORED
+    | dict(help=f"store the table that --check compares with (default: {STORED}); a quick run"),
+    "--check": _STORED
+    | dict(
+        help=f"say what moved since a stored table (default: {STORED}); a quick run; exit code 1 "
+        "if an error or a number of steps did"
+    ),
+}
 
 
 def add(commands: Any) -> None:
@@ -50,46 +63,19 @@ def add(commands: Any) -> None:
         epilog=f"Scenes: {', '.join(scenes())}, {DRIFT} (a million steps). Without a scene: all "
         "but the slow ones.",
     )
-    parser.add_argument("scene", nargs="*", metavar="SCENE", help="which scenes (default: all)")
-    parser.add_argument("--quick", action="store_true", help="three scenes, few settings")
-    parser.add_argument("--no-peers", action="store_true", help="only what runs in JAX")
-    parser.add_argument("--no-gradients", action="store_true", help="values only")
-    parser.add_argument("--thin", type=int, default=1, metavar="N", help="every N-th setting")
-    parser.add_argument("--csv", type=Path, metavar="FILE", help="keep the records")
-    parser.add_argument("--figure", type=Path, metavar="FILE", help="draw the charts")
-    parser.add_argument("--from", dest="stored", type=Path, metavar="FILE",
-                        help="measure nothing, read the records of --csv")  # fmt: skip
-    parser.add_argument("--choose", action="store_true", help="scene × error → method")
-    parser.add_argument(
-        "--keep",
-        nargs="?",
-        type=Path,
-        const=STORED,
-        metavar="FILE",
-        help=f"store the table that --check compares with (default: {STORED}); a quick run",
-    )
-    parser.add_argument(
-        "--check",
-        nargs="?",
-        type=Path,
-        const=STORED,
-        metavar="FILE",
-        help=f"say what moved since a stored table (default: {STORED}); a quick run; exit code 1 "
-        "if an error or a number of steps did",
-    )
+    for name, how in OPTIONS.items():
+        parser.add_argument(name, **how)
 
 
 def run(options: argparse.Namespace) -> int:
     """Run the subcommand; returns the exit code: 0 good, 1 something moved, 2 bad input."""
-    known = [*scenes(), DRIFT]
-    for name in options.scene:
-        if name not in known:
-            print(f"error: no scene {name!r}; there are {', '.join(known)}", file=sys.stderr)
-            return 2
-    if options.thin < 1:
-        print(f"error: --thin: wanted 1 or more, got {options.thin}", file=sys.stderr)
-        return 2
     try:
+        known = [*scenes(), DRIFT]
+        for name in options.scene:
+            if name not in known:
+                raise ValueError(f"no scene {name!r}; there are {', '.join(known)}")
+        if options.thin < 1:
+            raise ValueError(f"--thin: wanted 1 or more, got {options.thin}")
         before = None if options.check is None else read_csv(options.check)
         records = _measured(options) if options.stored is None else read_csv(options.stored)
         if options.stored is not None and options.scene:
@@ -98,13 +84,15 @@ def run(options: argparse.Namespace) -> int:
             write_csv(records, options.csv)
             print(f"records: {options.csv}")
         if options.keep is not None:
-            write_csv(baseline.kept(records), options.keep)
+            write_csv(kept(records), options.keep)
             print(f"kept: {options.keep}")
         print(summary(records))
+        timed = [r for r in records if not r.scene.startswith(DRIFT)]
         if options.choose:
-            print(f"\n{pareto.table(pareto.choose(_timed(records)))}")
+            print(f"\n{pareto.table(pareto.choose(timed))}")
         if options.figure is not None:
-            _draw(records, options.figure)
+            chart.draw(timed).savefig(options.figure, dpi=110)
+            print(f"figure: {options.figure}")
     except (OSError, ValueError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
@@ -143,11 +131,7 @@ def smaller(method: Method) -> Method:
 
 
 def summary(records: Iterable[Record]) -> str:
-    """Scene by scene: time to each wanted error, µs; on the front *, on that of JAX alone +.
-
-    >>> summary([])
-    ''
-    """
+    """Scene by scene: time to each wanted error, µs; on the front *, on that of JAX alone +."""
     records = list(records)
     lines: list[str] = []
     for scene in dict.fromkeys(r.scene for r in records):
@@ -183,21 +167,8 @@ def _drifts(scene: str, records: list[Record]) -> list[str]:
     ]
 
 
-def _timed(records: list[Record]) -> list[Record]:
-    return [r for r in records if not r.scene.startswith(DRIFT)]
-
-
-def _draw(records: list[Record], path: Path) -> None:
-    chart.draw(_timed(records)).savefig(path, dpi=110)
-    print(f"figure: {path}")
-
-
 def _compared(records: list[Record], before: list[Record]) -> int:
-    wrong, paced = baseline.moved(records, before)
-    for line in wrong:
-        print(f"moved: {line}")
-    for line in paced:
-        print(f"time: {line}")
-    if not wrong and not paced:
-        print("nothing moved")
+    wrong, paced = moved(records, before)
+    lines = [*(f"moved: {line}" for line in wrong), *(f"time: {line}" for line in paced)]
+    print("\n".join(lines or ["nothing moved"]))
     return 1 if wrong else 0

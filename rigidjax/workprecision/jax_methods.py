@@ -12,16 +12,17 @@ import jax.numpy as jnp
 from rigidjax import _checks
 from rigidjax.exact import FreeBody
 from rigidjax.solve import adaptive, equations_of_motion, fixed, simulate, solvers
-from rigidjax.workprecision.method import Method, Ready, Run
-from rigidjax.workprecision.scene import Scene
+from rigidjax.workprecision.scene import Method, Ready, Run, Scene
 
 TOLERANCES = tuple(10.0**-k for k in range(3, 14))
 EIGHT = (40, 60, 80, 120, 170, 240, 340, 480, 680, 1000)
 FOUR = (200, 500, 1200, 3000, 8000, 20000, 60000)
 MOST = 400_000
+MODES = {"forward": jax.jacfwd, "reverse": jax.grad}
 
 # numbers, setting → the last state as a vector, steps
 Flow = Callable[[Any, Any], tuple[Any, Any]]
+Make = Callable[[Scene], Flow | None]
 
 
 def compiled(scene: Scene, flow: Flow) -> Ready:
@@ -44,92 +45,67 @@ def compiled(scene: Scene, flow: Flow) -> Ready:
     return Ready(run, spent, held)
 
 
-def slopes(scene: Scene, flow: Flow, take: Callable[..., Any]) -> Ready:
-    """The gradient of the scene's scalar by `take`, `jax.grad` or `jax.jacfwd`."""
+def flow_of(scene: Scene, run: Callable[[Any, Any, Any, Any], tuple[Any, Any]]) -> Flow:
+    """The flow of `run`: body, first state, both times, setting → states over time, steps."""
 
-    def both(numbers: Any, setting: Any) -> tuple[Any, Any]:
-        def loss(numbers: Any) -> Any:
-            end, steps = flow(numbers, setting)
-            return scene.loss(end), steps
+    def flow(numbers: Any, setting: Any) -> tuple[Any, Any]:
+        body, start = scene.assembled(numbers)
+        ys, steps = run(body, start, jnp.array([0.0, scene.end], numbers.dtype), setting)
+        return scene.flat(jax.tree.map(lambda leaf: leaf[-1], ys)), steps
 
-        return take(loss, has_aux=True)(numbers)
-
-    return compiled(scene, both)
+    return flow
 
 
 def _closed(scene: Scene) -> Flow | None:
-    if scene.torque is not None or scene.body is None:
-        return None
+    def run(body: Any, start: Any, ts: Any, setting: Any) -> tuple[Any, Any]:
+        end: Any = FreeBody(body, start)(ts[1])
+        return jax.tree.map(lambda leaf: leaf[None], end), jnp.zeros(())
 
-    def flow(numbers: Any, setting: Any) -> tuple[Any, Any]:
-        body, start = scene.assembled(numbers)
-        end: Any = FreeBody(body, start)(jnp.asarray(scene.end, numbers.dtype))
-        return scene.flat(end), jnp.zeros(())
-
-    return flow
+    return flow_of(scene, run) if scene.torque is None and scene.body is not None else None
 
 
-def _simulate(scene: Scene, adjoint: Any = None) -> Flow | None:
+def _simulate(scene: Scene) -> Flow | None:
     """`simulate` with its defaults, but for the tolerance: traced, so that one program does."""
-    if scene.torque is None:
-        return None
 
-    def flow(numbers: Any, setting: Any) -> tuple[Any, Any]:
-        body, start = scene.assembled(numbers)
+    def run(body: Any, start: Any, ts: Any, setting: Any) -> tuple[Any, Any]:
         out = simulate(
-            body, start, jnp.array([0.0, scene.end], numbers.dtype), scene.torque,
-            rtol=setting, atol=1e-3 * setting, adjoint=adjoint, throw=False, max_steps=MOST,
+            body, start, ts, scene.torque, rtol=setting, atol=1e-3 * setting, throw=False,
+            max_steps=MOST,
         )  # fmt: skip
-        end: Any = jax.tree.map(lambda leaf: leaf[-1], out.ys)
-        return scene.flat(end), out.stats["num_steps"]
+        return out.ys, out.stats["num_steps"]
 
-    return flow
-
-
-def _field(scene: Scene, body: Any, start: Any) -> Any:
-    return equations_of_motion(body, start, scene.torque)
+    return None if scene.torque is None else flow_of(scene, run)
 
 
 def _adaptive(scene: Scene, solver: Any) -> Flow:
     """The loop that `simulate` runs in under a torque, in both modes."""
 
-    def flow(numbers: Any, setting: Any) -> tuple[Any, Any]:
-        body, start = scene.assembled(numbers)
-        ts = jnp.array([0.0, scene.end], numbers.dtype)
-        out = adaptive(
-            solver, _field(scene, body, start), ts, start, rtol=setting, atol=1e-3 * setting,
-            max_steps=MOST,
-        )  # fmt: skip
-        end: Any = jax.tree.map(lambda leaf: leaf[-1], out.ys)
-        return scene.flat(end), out.num_steps
+    def run(body: Any, start: Any, ts: Any, setting: Any) -> tuple[Any, Any]:
+        field = equations_of_motion(body, start, scene.torque)
+        out = adaptive(solver, field, ts, start, rtol=setting, atol=1e-3 * setting, max_steps=MOST)
+        return out.ys, out.num_steps
 
-    return flow
+    return flow_of(scene, run)
 
 
-def _equal(scene: Scene, solver: Any) -> Flow:
-    def flow(numbers: Any, setting: Any) -> tuple[Any, Any]:
-        body, start = scene.assembled(numbers)
-        ts, count = jnp.array([0.0, scene.end], numbers.dtype), setting.astype(int)
-        ys = fixed(solver, _field(scene, body, start), ts, start, count)
-        return scene.flat(jax.tree.map(lambda leaf: leaf[-1], ys)), count
+def equal_steps(scene: Scene, solver: Any) -> Flow:
+    """As many equal steps of `solver` as the setting says."""
 
-    return flow
+    def run(body: Any, start: Any, ts: Any, setting: Any) -> tuple[Any, Any]:
+        field, count = equations_of_motion(body, start, scene.torque), setting.astype(int)
+        return fixed(solver, field, ts, start, count), count
 
-
-def _split(scene: Scene, solver: Any) -> Flow | None:
-    return None if scene.body is None else _equal(scene, solver)
+    return flow_of(scene, run)
 
 
 def _in_diffrax(scene: Scene, solver: Any, adjoint: Any = None) -> Flow:
     """Our field and state in diffrax's loop."""
 
-    def flow(numbers: Any, setting: Any) -> tuple[Any, Any]:
-        body, start = scene.assembled(numbers)
-        out = _solved(_field(scene, body, start), None, start, solver, adjoint, setting, scene.end)
-        end: Any = jax.tree.map(lambda leaf: leaf[-1], out.ys)
-        return scene.flat(end), out.stats["num_steps"]
+    def run(body: Any, start: Any, ts: Any, setting: Any) -> tuple[Any, Any]:
+        field = equations_of_motion(body, start, scene.torque)
+        return _solved(field, None, start, solver, adjoint, setting, scene.end)
 
-    return flow
+    return flow_of(scene, run)
 
 
 def _diffrax(scene: Scene, solver: Any, adjoint: Any = None) -> Flow:
@@ -147,28 +123,39 @@ def _diffrax(scene: Scene, solver: Any, adjoint: Any = None) -> Flow:
         def field(t: Any, y: Any, constants: Any) -> Any:
             return by_hand(t, y, *constants)
 
-        out = _solved(field, constants, start, solver, adjoint, setting, scene.end)
-        ys: Any = out.ys
-        return ys[-1], out.stats["num_steps"]
+        ys, steps = _solved(field, constants, start, solver, adjoint, setting, scene.end)
+        return ys[-1], steps
 
     return flow
 
 
 def _solved(
     field: Any, args: Any, start: Any, solver: Any, adjoint: Any, setting: Any, end: float
-) -> dfx.Solution:
-    return dfx.diffeqsolve(
+) -> tuple[Any, Any]:
+    out = dfx.diffeqsolve(
         dfx.ODETerm(field), solver, 0.0, end, None, start, args,
         stepsize_controller=dfx.PIDController(rtol=setting, atol=1e-3 * setting),
         adjoint=dfx.RecursiveCheckpointAdjoint() if adjoint is None else adjoint,
         max_steps=MOST, throw=False,
     )  # fmt: skip
+    return out.ys, out.stats["num_steps"]
 
 
-def _value(make: Callable[[Scene], Flow | None], scene: Scene) -> Ready | None:
+def _ready(make: Make, take: Any, scene: Scene) -> Ready | None:
+    """The flow made ready; with `take` the gradient by it of the scene's scalar."""
     flow = make(scene)
+    if flow is None:
+        return None
+
+    def slopes(numbers: Any, setting: Any) -> tuple[Any, Any]:
+        def loss(numbers: Any) -> Any:
+            end, steps = flow(numbers, setting)
+            return scene.loss(end), steps
+
+        return take(loss, has_aux=True)(numbers)
+
     try:
-        return None if flow is None else compiled(scene, flow)
+        return compiled(scene, flow if take is None else slopes)
     except TypeError as refused:
         # A splitting says so where a torque feels the rate.
         if "Splitting" in str(refused):
@@ -176,15 +163,10 @@ def _value(make: Callable[[Scene], Flow | None], scene: Scene) -> Ready | None:
         raise
 
 
-def _slope(make: Callable[[Scene], Flow | None], take: Any, scene: Scene) -> Ready | None:
-    flow = make(scene)
-    return None if flow is None else slopes(scene, flow, take)
-
-
 def diffrax_method(solver: dfx.AbstractSolver, *, gradients: bool = False) -> Method:
     """Any `diffrax` solver as a method, with a step controller, on equations written by hand.
 
-    Where a scene has none (`plain`), on our vector field.
+    It runs on our vector field where a scene has none of these (`plain`).
 
     **Arguments:** `solver` with an error estimate; `gradients` whether its adjoints are measured,
     too: `forward`, `checkpointed`, `backsolve`.
@@ -198,75 +180,39 @@ def diffrax_method(solver: dfx.AbstractSolver, *, gradients: bool = False) -> Me
         "checkpointed": (dfx.RecursiveCheckpointAdjoint(), jax.grad),
         "backsolve": (dfx.BacksolveAdjoint(), jax.grad),
     }
-    return Method(
-        f"diffrax {type(solver).__name__}",
-        "jax",
-        TOLERANCES,
-        partial(_value, partial(_diffrax, solver=solver)),
-        {
-            name: partial(_slope, partial(_diffrax, solver=solver, adjoint=adjoint), take)
-            for name, (adjoint, take) in ways.items()
-        }
-        if gradients
-        else {},
-    )
+    slopes = {
+        name: partial(_ready, partial(_diffrax, solver=solver, adjoint=adjoint), take)
+        for name, (adjoint, take) in ways.items()
+    }
+    value = partial(_ready, partial(_diffrax, solver=solver), None)
+    name = f"diffrax {type(solver).__name__}"
+    return Method(name, "jax", TOLERANCES, value, slopes if gradients else {})
+
+
+def _ours(name: str, settings: Any, make: Make, modes: Any = (), equal: bool = False) -> Method:
+    slopes = {mode: partial(_ready, make, MODES[mode]) for mode in modes}
+    return Method(name, "ours", settings, partial(_ready, make, None), slopes, equal)
 
 
 def methods_in_jax() -> list[Method]:
     """Ours, and diffrax's, in the order of the charts."""
-    eight, five, four = solvers.DormandPrince8(), solvers.Tsitouras5(), solvers.RungeKutta4()
+    eight = solvers.DormandPrince8()
+    equal = ((EIGHT, eight), (FOUR, solvers.RungeKutta4()))
+    equal += ((EIGHT, solvers.Splitting4()), (EIGHT, solvers.Splitting6()))
+    five, there = solvers.Tsitouras5(), partial(_in_diffrax, solver=eight)
     return [
-        Method(
-            "closed form",
-            "ours",
-            (0.0,),
-            partial(_value, _closed),
-            {
-                "forward": partial(_slope, _closed, jax.jacfwd),
-                "reverse": partial(_slope, _closed, jax.grad),
-            },
+        _ours("closed form", (0.0,), _closed, MODES),
+        _ours("simulate", TOLERANCES, _simulate, MODES),
+        _ours("DormandPrince8", TOLERANCES, partial(_adaptive, solver=eight), MODES),
+        _ours("Tsitouras5", TOLERANCES, partial(_adaptive, solver=five)),
+        *(
+            _ours(
+                f"{type(solver).__name__}, equal steps", counts,
+                partial(equal_steps, solver=solver), equal=True,
+            )
+            for counts, solver in equal
         ),
-        Method(
-            "simulate",
-            "ours",
-            TOLERANCES,
-            partial(_value, _simulate),
-            {
-                "forward": partial(_slope, _simulate, jax.jacfwd),
-                "reverse": partial(_slope, _simulate, jax.grad),
-            },
-        ),
-        Method(
-            "DormandPrince8",
-            "ours",
-            TOLERANCES,
-            partial(_value, partial(_adaptive, solver=eight)),
-            {
-                "forward": partial(_slope, partial(_adaptive, solver=eight), jax.jacfwd),
-                "reverse": partial(_slope, partial(_adaptive, solver=eight), jax.grad),
-            },
-        ),
-        Method("Tsitouras5", "ours", TOLERANCES, partial(_value, partial(_adaptive, solver=five))),
-        Method(
-            "DormandPrince8, equal steps", "ours", EIGHT,
-            partial(_value, partial(_equal, solver=eight)), equal=True,
-        ),
-        Method(
-            "RungeKutta4, equal steps", "ours", FOUR,
-            partial(_value, partial(_equal, solver=four)), equal=True,
-        ),
-        Method(
-            "Splitting4, equal steps", "ours", EIGHT,
-            partial(_value, partial(_split, solver=solvers.Splitting4())), equal=True,
-        ),
-        Method(
-            "Splitting6, equal steps", "ours", EIGHT,
-            partial(_value, partial(_split, solver=solvers.Splitting6())), equal=True,
-        ),
-        Method(
-            "DormandPrince8 in diffeqsolve", "ours", TOLERANCES,
-            partial(_value, partial(_in_diffrax, solver=eight)),
-        ),
+        _ours("DormandPrince8 in diffeqsolve", TOLERANCES, there),
         diffrax_method(dfx.Tsit5()),
         diffrax_method(dfx.Dopri8(), gradients=True),
     ]  # fmt: skip

@@ -1,28 +1,41 @@
-"""The measurement: every method on a scene made ready, then timed in turn, round after round."""
+"""Measurements: methods made ready for a scene and timed in turn; the drift of a very long run."""
 
 import dataclasses
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from rigidjax import _checks
+from rigidjax.body.inertia import Inertia
 from rigidjax.frames.frame_dynamics import scene_of
-from rigidjax.motion import Attitude, conserved
-from rigidjax.solve import equations_of_motion, fixed, solvers
-from rigidjax.workprecision import registry
-from rigidjax.workprecision.method import Method, Ready, Run
+from rigidjax.motion import Attitude, AttitudeEquations, drift
+from rigidjax.motion.torques import HeavyTop
+from rigidjax.solve import fixed, solvers
+from rigidjax.workprecision import peers as known
+from rigidjax.workprecision.jax_methods import equal_steps
 from rigidjax.workprecision.record import Record
-from rigidjax.workprecision.reference import Reference
-from rigidjax.workprecision.scene import Scene, distance
+from rigidjax.workprecision.scene import Method, Ready, Reference, Run, Scene, distance
 
 # Runs longer than this, s, are timed three times, those shorter than SHORT thrice as often.
 LONG, SHORT = 0.5, 0.02
 # Short runs are timed so many seconds at a stretch.
 BURST = 3e-3
 WRONG = 0.5
+# A long run: its steps, its looks at them, its body, and the length of a step, s, by solver.
+STEPS = 1_000_000
+BODY = (0.7, 1.2, 1.6)
+LOOKS = 101
+RUNS = {
+    "Splitting2": (0.1, solvers.Splitting2),
+    "Splitting4": (0.1, solvers.Splitting4),
+    "Splitting6": (0.2, solvers.Splitting6),
+    "DormandPrince8": (0.1, solvers.DormandPrince8),
+    "RungeKutta4": (0.02, solvers.RungeKutta4),
+}
 
 
 class _Job(NamedTuple):
@@ -53,15 +66,11 @@ def measure(
 
     **Raises:** `TypeError` for something that is no `Scene` or `Method`.
     """
-    if not isinstance(scene, Scene):
-        raise TypeError(
-            f"measure: wanted a Scene, got {type(scene).__name__}; standard ones are made by "
-            'rj.workprecision.scenes()["heavy-top"]()'
-        )
-    chosen = [*(registry.methods() if methods is None else methods), *peers]
+    made = 'standard ones are made by rj.workprecision.scenes()["heavy-top"]()'
+    _checks.instance(scene, Scene, "scene", wanted="a Scene", hint=made)
+    chosen = [*(known.methods() if methods is None else methods), *peers]
     for method in chosen:
-        if not isinstance(method, Method):
-            raise TypeError(f"measure: wanted Methods, got {type(method).__name__}")
+        _checks.instance(method, Method, "methods", wanted="Methods")
     right = scene.reference if scene.reference is not None else worked_out(scene, gradients)
     jobs: list[_Job] = []
     for method in chosen:
@@ -88,21 +97,13 @@ def worked_out(scene: Scene, gradients: bool = True) -> Reference:
     **Arguments:** `scene`; `gradients` whether the gradient is worked out, too.
     """
     counts = (4000, 2000)
-    numbers = scene.numbers
-    ts = jnp.array([0.0, scene.end], numbers.dtype)
-
-    def flow(numbers: Any, count: Any) -> Any:
-        body, start = scene.assembled(numbers)
-        field = equations_of_motion(body, start, scene.torque)
-        ys = fixed(solvers.DormandPrince8(), field, ts, start, count)
-        return scene.flat(jax.tree.map(lambda leaf: leaf[-1], ys))
-
-    scale = max(1.0, _turn(scene) / 50)
+    numbers, scale = scene.numbers, max(1.0, _turn(scene) / 50)
+    flow = equal_steps(scene, solvers.DormandPrince8())
     run = jax.jit(flow)
-    take = jax.jit(jax.jacfwd(lambda p, count: scene.loss(flow(p, count))))
+    take = jax.jit(jax.jacfwd(lambda p, count: scene.loss(flow(p, count)[0])))
     ends, slopes = [], []
     for count in (jnp.asarray(round(c * scale)) for c in counts):
-        ends.append(np.asarray(run(numbers, count)))
+        ends.append(np.asarray(run(numbers, count)[0]))
         if gradients:
             slopes.append(np.asarray(take(numbers, count)))
     floor = 100 * float(np.finfo(ends[0].dtype).eps)
@@ -179,19 +180,10 @@ def drifts(scene: Scene, end: Any) -> tuple[float, float]:
         return abs(b - a) / max(abs(a), 0.5 * scene.size[1] ** 2), float("nan")
     first: Any = scene.state0
     last = Attitude(end[:4] / np.linalg.norm(end[:4]), end[4:])
-    kept = (
-        conserved(scene.body, first, scene.torque, 0.0),
-        conserved(scene.body, last, scene.torque, scene.end),
-    )
-    spin = float(jnp.linalg.norm(scene.body.tensor @ first.omega))
-    kinetic = 0.5 * float(first.omega @ scene.body.tensor @ first.omega)
-    away = {
-        name: float(np.linalg.norm(np.asarray(kept[1][name]) - np.asarray(value)))
-        for name, value in kept[0].items()
-    }
-    energy = away["energy"] / kinetic if "energy" in away else float("nan")
-    momenta = [away[n] / spin for n in ("momentum", "momentum_along_axis") if n in away]
-    return energy, max(momenta, default=float("nan"))
+    states = jax.tree.map(lambda *leaves: jnp.stack(leaves), first, last)
+    away = drift(jnp.array([0.0, scene.end]), states, scene.body, scene.torque)
+    momenta = [float(away[n]) for n in ("momentum", "momentum_along_axis") if n in away]
+    return float(away.get("energy", jnp.nan)), max(momenta, default=float("nan"))
 
 
 def _timed(jobs: list[_Job], rounds: int) -> None:
@@ -215,3 +207,62 @@ def _finished(job: _Job) -> Record:
     return dataclasses.replace(
         job.record, time=float(middle), time_low=float(low), time_high=float(high)
     )
+
+
+def long_drift(
+    steps: int = STEPS,
+    only: Sequence[str] | None = None,
+    *,
+    progress: Callable[[str], None] | None = None,
+) -> list[Record]:
+    """Largest drift of energy and momentum over `steps` equal steps of an asymmetric heavy top.
+
+    Two records for each method, of the first hundredth of the run and of all of it: where they
+    agree the drift is bounded, where the second is a hundred times the first it grows with time.
+    `setting` is the length of a step, s; there is no error of the attitude (the motion forgets its
+    start long before), `error` is the energy's. Timed once: it is a run of seconds.
+
+    **Arguments:** `steps` how many; `only` names of methods, all by default; `progress` is told a
+    line now and then.
+
+    **Raises:** `ValueError` for a method that is not among them, or too few steps to look at.
+
+    >>> [record.steps for record in long_drift(10_000, ["RungeKutta4"])]
+    [100.0, 10000.0]
+    """
+    body = Inertia.from_principal(*BODY)
+    start = Attitude([0.955336489125606, 0.29552020666133955, 0.0, 0.0], [0.4, 0.3, 1.2])
+    law = HeavyTop(1.0, [0.05, 0.1, 0.3], [0.0, 0.0, -1.0])
+    field = AttitudeEquations(body, law)
+    unknown = sorted(set(only or ()) - set(RUNS))
+    if unknown:
+        raise ValueError(f"long_drift: no method {unknown[0]!r}; there are {', '.join(RUNS)}")
+    if steps < 100 * (LOOKS - 1):
+        raise ValueError(f"long_drift: wanted {100 * (LOOKS - 1)} steps or more, got {steps}")
+    found = []
+    for name in RUNS if only is None else [name for name in RUNS if name in only]:
+        h, solver = RUNS[name]
+        if progress is not None:
+            progress(f"long-drift: {name}")
+        run = jax.jit(lambda ts, n, s=solver: fixed(s(), field, ts, start, n))
+        ts = jnp.linspace(0.0, h * steps, LOOKS)
+        begin = time.perf_counter()
+        ready = run.lower(ts, jnp.asarray(1)).compile()
+        compiling = time.perf_counter() - begin
+        for scene, part in (("long-drift, first hundredth", 100), ("long-drift", 1)):
+            count = steps // part
+            begin = time.perf_counter()
+            ys = jax.block_until_ready(ready(ts / part, jnp.asarray(count // (LOOKS - 1))))
+            spent = time.perf_counter() - begin
+            away = {k: float(v) for k, v in drift(ts / part, ys, body, law).items()}
+            if not np.isfinite(list(away.values())).all():
+                raise FloatingPointError(f"long_drift: {name} gave no numbers: {away}")
+            found.append(
+                Record(
+                    scene, f"{name}, equal steps", "ours", "value", "", h, error=away["energy"],
+                    energy=away["energy"], momentum=away["momentum_along_axis"],
+                    steps=float(count), time=spent, time_low=spent, time_high=spent,
+                    compile=compiling,
+                )
+            )  # fmt: skip
+    return found

@@ -15,9 +15,9 @@ WANTED = (1e-4, 1e-7, 1e-10)
 def front(records: Iterable[Record]) -> list[Record]:
     """Those records of one scene and kind that nothing beats in both error and time.
 
-    What is compared with are the curves of the others, log–log between their settings, not only
-    the points that happened to be measured. By falling error. Give records of one scene, and of
-    values or gradients only.
+    A record is compared with the curves of the others, log–log between their settings, not only
+    with the points that happened to be measured. Give records of one scene, and of values or
+    gradients only. **Returns** the records by falling error.
 
     **Raises:** `ValueError` for a mixture.
 
@@ -45,7 +45,7 @@ def front(records: Iterable[Record]) -> list[Record]:
 def first_answers(records: Iterable[Record]) -> list[Record]:
     """The same records with the time that a first answer takes: compiling and one run.
 
-    What is not compiled, or made ready in no known time, counts with its run.
+    A method that is not compiled, or was made ready in no known time, counts with its run alone.
 
     >>> cold = Record("scene", "method", "ours", "value", "", 1e-6, time=1e-3, compile=2.0)
     >>> first_answers([cold])[0].time
@@ -61,8 +61,8 @@ def first_answers(records: Iterable[Record]) -> list[Record]:
 def time_to(records: Iterable[Record], error: float) -> float:
     """Time, s, that the method of these records takes to an error, between its settings in log–log.
 
-    Of a run whose error is smaller already at its coarsest setting, that setting's time. NaN where
-    it never gets there.
+    It is the coarsest setting's time if the error is smaller there already, and NaN if the method
+    never gets to the error.
 
     >>> rough = Record("scene", "method", "jax", "value", "", 1e-2, error=1e-2, time=1.0)
     >>> fine = Record("scene", "method", "jax", "value", "", 1e-4, error=1e-4, time=4.0)
@@ -128,25 +128,19 @@ def choose(records: Iterable[Record], wanted: Sequence[float] = WANTED) -> list[
 def _choice(here: list[Record], scene: str, error: float) -> Choice:
     values, slopes = quickest(here, "value", error), quickest(here, "gradient", error)
     ours = {r.label for r in here if r.group == "ours"}
-    free = any(r.method == "closed form" for r in here)
-    default = "closed form" if free else "simulate"
-    method, spent = next(((n, t) for n, t in values.items() if n in ours), ("", math.nan))
-    slope, taken = next(((n, t) for n, t in slopes.items() if n in ours), ("", math.nan))
-    other, others = next(((n, t) for n, t in values.items() if n not in ours), ("", math.nan))
-    quicker = bool(other) and not others >= spent
-    defaults = [t for n, t in slopes.items() if n.split(", ")[0] == default]
-    return Choice(
-        scene=scene,
-        wanted=error,
-        method=method,
-        time=spent,
-        gradient=slope,
-        gradient_time=taken,
-        default=values.get(default, math.nan),
-        default_gradient=min(defaults, default=math.nan),
-        peer=other if quicker else "",
-        peer_time=others if quicker else math.nan,
+
+    def first(times: dict[str, float], own: bool = True) -> tuple[str, float]:
+        return next(((n, t) for n, t in times.items() if (n in ours) == own), ("", math.nan))
+
+    best, elsewhere = first(values), first(values, own=False)
+    if elsewhere[1] >= best[1]:
+        elsewhere = "", math.nan
+    default = "closed form" if any(r.method == "closed form" for r in here) else "simulate"
+    default_slope = min(
+        (t for n, t in slopes.items() if n.split(", ")[0] == default), default=math.nan
     )
+    default_time = values.get(default, math.nan)
+    return Choice(scene, error, *best, *first(slopes), default_time, default_slope, *elsewhere)
 
 
 def quickest(records: Iterable[Record], kind: str, error: float) -> dict[str, float]:

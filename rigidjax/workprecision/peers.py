@@ -1,33 +1,39 @@
-"""Peers that are no JAX: SciPy, SciPy with numba, MuJoCo. Left out where not installed."""
+"""Peers that are no JAX, left out where not installed; and all methods that can be compared."""
 
 import importlib
 import importlib.util
 import math
 import time
+from collections.abc import Callable
 from typing import Any
 
+import jax
 import numpy as np
 
-from rigidjax.workprecision.method import Method, Ready, Run
-from rigidjax.workprecision.scene import Scene
+from rigidjax import _checks
+from rigidjax.workprecision.jax_methods import methods_in_jax
+from rigidjax.workprecision.scene import Method, Ready, Run, Scene
 
 TOLERANCES = (1e-4, 1e-7, 1e-10, 1e-13)
+TAYLOR = (1e-4, 1e-6, 1e-8, 1e-10, 1e-12, 1e-14)
 STEPS = (5e-2, 2e-2, 5e-3)
 
 
-def _rates(scene: Scene, wrap: Any = None) -> Any:
+def _start(scene: Scene) -> np.ndarray:
+    return np.asarray(scene.flat(scene.state0), float)
+
+
+def _rates(scene: Scene, **how: Any) -> Any:
     """The plain equations on floats."""
     if scene.plain is None:
         return None
-    numbers = tuple(float(x) for x in scene.numbers)
-    how = {} if wrap is None else {"wrap": wrap}
-    return scene.plain(numbers, math.sin, math.cos, math.sqrt, **how)
+    return scene.plain(tuple(map(float, scene.numbers)), math.sin, math.cos, math.sqrt, **how)
 
 
 def _solver(scene: Scene, f: Any, warm: float) -> Ready:
     from scipy.integrate import DOP853
 
-    start = np.asarray(scene.flat(scene.state0), float)
+    start = _start(scene)
 
     def run(setting: float) -> Run:
         # The stepper itself: solve_ivp would keep every step.
@@ -50,16 +56,15 @@ def _numba(scene: Scene) -> Ready | None:
     numba: Any = importlib.import_module("numba")
 
     begin = time.perf_counter()
-    rates = _rates(scene, numba.njit)
+    rates = _rates(scene, wrap=numba.njit)
     if rates is None:
         return None
-    start = np.asarray(scene.flat(scene.state0), float)
 
     @numba.njit
     def f(t: Any, y: Any) -> Any:
         return np.array(rates(t, y))
 
-    f(0.0, start)
+    f(0.0, _start(scene))
     return _solver(scene, f, time.perf_counter() - begin)
 
 
@@ -86,16 +91,86 @@ def _mujoco(scene: Scene) -> Ready | None:
     # It would write a file into the folder one works in where a step is too long.
     mujoco.set_mju_user_warning(lambda message: None)
     spent = time.perf_counter() - begin
-    start: Any = scene.state0
-    q0, omega0 = np.asarray(start.q), np.asarray(start.omega)
+    start = _start(scene)
 
     def run(setting: float) -> Run:
         mujoco.mj_resetData(model, data)
         count = round(scene.end / setting)
         model.opt.timestep = scene.end / count
-        data.qpos[:], data.qvel[:] = q0, omega0
+        data.qpos[:], data.qvel[:] = start[:4], start[4:]
         mujoco.mj_step(model, data, nstep=count)
         return Run(np.concatenate([data.qpos, data.qvel]), count)
+
+    return Ready(run, spent)
+
+
+def _system(scene: Scene, hy: Any, numbers: Any) -> Any:
+    names = "abcdxyz" if scene.body is not None else ("px", "py", "pz", "vx", "vy", "vz")
+    variables = hy.make_vars(*names)
+    plain: Any = scene.plain
+    rates = plain(numbers, hy.sin, hy.cos, hy.sqrt)(hy.time, variables)
+    return list(zip(variables, rates, strict=True))
+
+
+def _steppers(hy: Any, scene: Scene, system: Any, **how: Any) -> Callable[[float], Any]:
+    """Tolerance → its stepper at the start. Order and code follow from it: each is compiled."""
+    made: dict[float, Any] = {}
+
+    def stepper_of(setting: float) -> Any:
+        if setting not in made:
+            stepper = hy.taylor_adaptive(system, _start(scene), tol=setting, **how)
+            made[setting] = stepper, stepper.state.copy()
+        stepper, first = made[setting]
+        stepper.state[:], stepper.time = first, 0.0
+        return stepper
+
+    return stepper_of
+
+
+def _taylor(scene: Scene) -> Ready | None:
+    if scene.plain is None:
+        return None
+    hy: Any = importlib.import_module("heyoka")
+    stepper_of = _steppers(hy, scene, _system(scene, hy, list(map(float, scene.numbers))))
+    begin = time.perf_counter()
+    stepper_of(TAYLOR[0])
+    spent = time.perf_counter() - begin
+
+    def run(setting: float) -> Run:
+        stepper = stepper_of(setting)
+        steps = stepper.propagate_until(scene.end)[3]
+        return Run(stepper.state.copy(), steps)
+
+    return Ready(run, spent)
+
+
+def _varied(scene: Scene) -> Ready | None:
+    """Variational equations by the first state and the inertia, contracted with the scalar's."""
+    if scene.plain is None:
+        return None
+    hy: Any = importlib.import_module("heyoka")
+    numbers = np.asarray(scene.numbers)
+    size = 6 if scene.body is not None else 0
+    symbols = [hy.par[i] for i in range(size)] or list(numbers)
+    system = _system(scene, hy, [*symbols, *numbers[size:]] if size else symbols)
+    flavour = hy.var_args.vars | hy.var_args.params if size else hy.var_args.vars
+    begin = time.perf_counter()
+    varied = hy.var_ode_sys(system, flavour, order=1)
+    stepper_of = _steppers(hy, scene, varied, pars=numbers[:size], compact_mode=True)
+    stepper_of(TAYLOR[2])
+    spent = time.perf_counter() - begin
+    n = len(_start(scene))
+    chain = np.asarray(jax.jacfwd(lambda p: scene.flat(scene.assembled(p)[1]))(scene.numbers))
+    pull = jax.jit(jax.grad(scene.loss))
+
+    def run(setting: float) -> Run:
+        stepper = stepper_of(setting)
+        steps = stepper.propagate_until(scene.end)[3]
+        slope = np.asarray(pull(stepper.state[:n])) @ stepper.state[n:].reshape(n, -1)
+        # By the first state, carried on to the numbers of the scene; then by the parameters.
+        found = slope[:n] @ chain
+        found[:size] += slope[n : n + size]
+        return Run(found, steps)
 
     return Ready(run, spent)
 
@@ -103,20 +178,26 @@ def _mujoco(scene: Scene) -> Ready | None:
 def methods_outside() -> list[Method]:
     """Those of SciPy, numba, MuJoCo and heyoka that can be imported here.
 
-    >>> methods_outside()[0].name
-    'scipy DOP853'
+    heyoka.py's adaptive Taylor method: Biscani and Izzo 2021, doi:10.1093/mnras/stab1032.
     """
-    from rigidjax.workprecision.heyoka import heyoka_method
-
-    found = [Method("scipy DOP853", "peer", TOLERANCES, _scipy)]
-    if _there("numba"):
-        found.append(Method("scipy DOP853, numba", "peer", TOLERANCES, _numba))
-    if _there("mujoco"):
-        found.append(Method("MuJoCo RK4", "peer", STEPS, _mujoco))
-    if _there("heyoka"):
-        found.append(heyoka_method())
-    return found
+    peers = {
+        "scipy": Method("scipy DOP853", "peer", TOLERANCES, _scipy),
+        "numba": Method("scipy DOP853, numba", "peer", TOLERANCES, _numba),
+        "mujoco": Method("MuJoCo RK4", "peer", STEPS, _mujoco),
+        "heyoka": Method("heyoka Taylor", "peer", TAYLOR, _taylor, {"variational": _varied}),
+    }
+    return [method for name, method in peers.items() if importlib.util.find_spec(name)]
 
 
-def _there(name: str) -> bool:
-    return importlib.util.find_spec(name) is not None
+def methods(group: str | None = None) -> list[Method]:
+    """The methods that can be compared here: ours, others in JAX, and the peers installed.
+
+    **Arguments:** `group` `ours`, `jax` or `peer` for those alone.
+
+    >>> [method.name for method in methods("ours")][:2]
+    ['closed form', 'simulate']
+    """
+    if group is not None:
+        _checks.word(group, ("ours", "jax", "peer"), "group")
+    found = [*methods_in_jax(), *methods_outside()]
+    return [method for method in found if group in (None, method.group)]

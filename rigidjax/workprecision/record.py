@@ -1,11 +1,20 @@
-"""What is measured, one line for each run, and its file."""
+"""What is measured, one line for each run; its file; and what moved since a stored table.
+
+Tables are compared by errors, steps, and ratios of times, never by absolute times.
+"""
 
 import csv
 import dataclasses
+import math
 from collections.abc import Iterable
 from pathlib import Path
 
 from rigidjax import _checks
+
+# Errors at round-off wander: nothing below this has moved.
+FLOOR = 1e-13
+WORSE, STEPS, SLOWER = 3.0, 0.02, 2.0
+BASE = "diffrax Dopri8"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,11 +64,7 @@ _WORDS = ("scene", "method", "group", "kind", "adjoint")
 
 
 def listed(records: Iterable[Record], name: str = "records") -> list[Record]:
-    """The records as a list; `TypeError` where something else is among them.
-
-    >>> listed(())
-    []
-    """
+    """The records as a list; `TypeError` where something else is among them."""
     _checks.instance(records, Iterable, name, wanted="records")
     found = list(records)
     for record in found:
@@ -101,13 +106,12 @@ def read_csv(path: str | Path) -> list[Record]:
     []
     """
     with Path(path).open(newline="") as file:
-        rows = csv.DictReader(file)
-        lacks = {field.name for field in dataclasses.fields(Record)} - set(rows.fieldnames or ())
+        rows, names = csv.DictReader(file), [field.name for field in dataclasses.fields(Record)]
+        lacks = set(names) - set(rows.fieldnames or ())
         if lacks:
             raise ValueError(
                 f"{path}: wanted the columns of a file of records, lacks {', '.join(sorted(lacks))}"
             )
-        names = [field.name for field in dataclasses.fields(Record)]
         return [
             Record(**{n: row[n] if n in _WORDS else float(row[n] or "nan") for n in names})  # pyright: ignore
             for row in rows
@@ -118,3 +122,88 @@ def _written(value: object) -> str:
     if not isinstance(value, float):
         return str(value)
     return "" if value != value else f"{value:.6g}"
+
+
+def moved(records: Iterable[Record], stored: Iterable[Record]) -> tuple[list[str], list[str]]:
+    """What differs between two tables: (what is wrong, what is only slower or quicker), in words.
+
+    Compared line by line, as far as both have it, peers left out: an error more than three times as
+    large or as small, steps by more than 2 %; and the median time over that of `diffrax Dopri8` on
+    the same scene, each at its finest common settings, by more than a factor of 2.
+
+    **Arguments:** `records` as measured now; `stored` those to compare with.
+
+    >>> was = Record("s", "m", "ours", "value", "", 1e-6, error=1e-7, steps=100.0)
+    >>> moved([was], [was])
+    ([], [])
+    """
+    records, stored = listed(records), listed(stored, "stored")
+    now = {_key(r): r for r in records if r.group != "peer"}
+    then = {_key(r): r for r in stored if r.group != "peer"}
+    wrong, paced = [], []
+    scenes = {r.scene for r in now.values()}
+    for key, old in then.items():
+        new = now.get(key)
+        if new is None:
+            if old.scene in scenes and old.error < 0.1:
+                wrong.append(f"{_name(old)}: not there any more")
+            continue
+        a, b = max(old.error, FLOOR), max(new.error, FLOOR)
+        if not 1 / WORSE <= b / a <= WORSE or math.isnan(new.error) != math.isnan(old.error):
+            wrong.append(f"{_name(old)}: error was {old.error:.2g}, is {new.error:.2g}")
+        if not math.isnan(old.steps) and abs(new.steps - old.steps) > max(STEPS * old.steps, 1):
+            wrong.append(f"{_name(old)}: steps were {old.steps:g}, are {new.steps:g}")
+    before, after = _ratios(then, set(now)), _ratios(now, set(then))
+    for label, ratio in after.items():
+        if label in before and not 1 / SLOWER <= ratio / before[label] <= SLOWER:
+            scene, kind, method = label
+            paced.append(
+                f"{scene}, {kind}, {method}: time over {BASE}'s was {before[label]:.2g}, is "
+                f"{ratio:.2g}"
+            )
+    return wrong, paced
+
+
+def kept(records: Iterable[Record]) -> list[Record]:
+    """What a stored table keeps: no peers, no absolute times but multiples of the base's median.
+
+    >>> kept([Record("s", BASE, "jax", "value", "", 1e-6, error=1e-7, time=3.0)])[0].time
+    1.0
+    """
+    records = [r for r in records if r.group != "peer"]
+    middle = _middles(records)
+    bases = [middle.get((r.scene, "value", BASE), math.nan) for r in records]
+    return [
+        dataclasses.replace(
+            r, time=r.time / base, time_low=r.time_low / base, time_high=r.time_high / base,
+            compile=math.nan, memory=math.nan,
+        )
+        for r, base in zip(records, bases, strict=True)
+    ]  # fmt: skip
+
+
+def _key(record: Record) -> tuple[str, ...]:
+    return (record.scene, record.kind, record.label, f"{record.setting:.6g}")
+
+
+def _name(record: Record) -> str:
+    return f"{record.scene}, {record.kind}, {record.label} at {record.setting:g}"
+
+
+def _middles(records: Iterable[Record]) -> dict[tuple[str, str, str], float]:
+    """Median time of each scene, kind and label."""
+    times: dict[tuple[str, str, str], list[float]] = {}
+    for r in records:
+        if r.time == r.time:
+            times.setdefault((r.scene, r.kind, r.label), []).append(r.time)
+    return {label: sorted(spent)[len(spent) // 2] for label, spent in times.items()}
+
+
+def _ratios(table: dict, common: set) -> dict[tuple[str, str, str], float]:
+    """Median over common settings of each label's time, over that of the base."""
+    middle = _middles(record for key, record in table.items() if key in common)
+    return {
+        label: spent / middle[label[0], "value", BASE]
+        for label, spent in middle.items()
+        if label[2] != BASE and middle.get((label[0], "value", BASE))
+    }

@@ -1,7 +1,10 @@
-"""A scene: what moves, for how long, and which numbers of it a gradient is taken by."""
+"""What is compared: a scene, with its right answer, and a method, made ready for it and run."""
 
-from collections.abc import Callable
-from typing import Any
+import functools
+import json
+from collections.abc import Callable, Sequence
+from importlib import resources
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -13,10 +16,46 @@ from rigidjax.body.inertia import Inertia
 from rigidjax.frames import Point
 from rigidjax.motion import Attitude
 from rigidjax.rotation import quaternion
-from rigidjax.workprecision.reference import Reference
 
 # The scalar that gradients are taken of: a.R b + c.Ω/|Ω0| at the end, of no particular direction.
 A, B, C = (0.6, -0.48, 0.64), (0.36, 0.8, -0.48), (0.28, -0.5, 0.82)
+
+
+class Reference(NamedTuple):
+    """Where a scene ends, and the gradient of its scalar.
+
+    **Fields:** `end` the state as one tuple; `error` of its largest number, as estimated by the
+    method that made it; `gradient`, `gradient_error` the same, empty where there is none;
+    `source` words.
+
+    >>> top = stored("heavy top")
+    >>> top is None or top.error < 1e-12
+    True
+    """
+
+    end: tuple[float, ...]
+    error: float
+    gradient: tuple[float, ...]
+    gradient_error: float
+    source: str
+
+
+@functools.cache
+def _answers() -> dict[str, Any]:
+    folder = resources.files("rigidjax.workprecision")
+    return json.loads(folder.joinpath("references.json").read_text())
+
+
+def stored(name: str) -> Reference | None:
+    """The stored answer to the standard scene of this name, if there is one.
+
+    They are made by `tests/workprecision/make_references.py` at 40 digits and rounded to float64.
+    """
+    row = _answers().get(name)
+    if row is None:
+        return None
+    end, slope = (tuple(map(float, row[key])) for key in ("end", "gradient"))
+    return Reference(end, float(row["error"]), slope, float(row["gradient_error"]), row["source"])
 
 
 class Scene(eqx.Module):
@@ -126,3 +165,56 @@ def distance(scene: Scene, end: Any, right: Any) -> tuple[float, float]:
     turn = a * v - b * u + np.cross(v, u)
     angle = 2 * float(np.arctan2(np.linalg.norm(turn), abs(a * b + u @ v)))
     return angle, float(np.linalg.norm(end[4:] - right[4:])) / two
+
+
+class Run(NamedTuple):
+    """What one run gives.
+
+    **Fields:** `numbers` the last state (or the gradient) as one vector; `steps` taken.
+
+    >>> float(Run([0.0, 1.0], 12).steps)
+    12.0
+    """
+
+    numbers: Any
+    steps: float
+
+
+class Ready(NamedTuple):
+    """A method made ready for a scene.
+
+    **Fields:** `run` setting → `Run`, complete when it returns; `compile` s that making it took,
+    `memory` bytes of temporaries, each NaN where unknown.
+
+    >>> ready = Ready(lambda setting: Run([0.0, 1.0], 1 / setting))
+    >>> ready.run(1e-2).steps, ready.compile
+    (100.0, nan)
+    """
+
+    run: Callable[[float], Run]
+    compile: float = float("nan")
+    memory: float = float("nan")
+
+
+class Method(NamedTuple):
+    """A method to compare; give your own, or a peer's, to `measure` as one of these.
+
+    **Fields:** `name`; `group` `ours`, `jax` (anything else that runs in JAX) or `peer`;
+    `settings` tolerances, or numbers of equal steps, from coarse to fine; `value` makes it ready
+    for a scene, `None` where it cannot do that one; `gradients` adjoint → the same for the gradient
+    of the scene's scalar by its `numbers`; `equal` whether settings are numbers of steps for a run
+    of 50 rad, to be scaled to the scene.
+
+    >>> import numpy as np
+    >>> ready = Ready(lambda setting: Run(np.ones(7), 0))
+    >>> guess = Method("a guess", "peer", (1e-3,), lambda scene: ready)
+    >>> guess.gradients
+    {}
+    """
+
+    name: str
+    group: str
+    settings: Sequence[float]
+    value: Callable[[Scene], Ready | None]
+    gradients: dict[str, Callable[[Scene], Ready | None]] = {}  # noqa: RUF012
+    equal: bool = False
