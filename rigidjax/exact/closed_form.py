@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rigidjax._types import Scalar
-from rigidjax.exact._xla import fence, opaque_one
+from rigidjax.exact._xla import fence, one_kernel, opaque_one
 from rigidjax.exact.complete_integrals import HalfPeriod, half_period
 from rigidjax.exact.components3 import Four, Triple
 from rigidjax.exact.jacobi_duplication import Elliptic, Modulus, duplicate, elliptic, until_rest
@@ -38,6 +38,7 @@ class Orbit(NamedTuple):
     swapped: Float[Array, ""]
 
 
+@one_kernel
 def orbit(moments: Triple, momentum: Triple) -> Orbit:
     """Set up the motion of a body with principal moments I1 ≤ I2 ≤ I3 (any of them equal)."""
     (i1, i2, i3), (p1, p2, p3) = moments, momentum
@@ -128,6 +129,7 @@ def momentum_at(o: Orbit, f: Elliptic) -> Triple:
     return y1 * r, y2 * r, y3 * r
 
 
+@one_kernel
 def momentum_and_turn(o: Orbit, t: Scalar) -> tuple[Triple, Four]:
     """Body momentum at t, and the quaternion of the turn since t = 0, in principal axes."""
     u = reduced(0.5 * t, o.half.time, o.modulus)

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from rigidjax._types import Mat3, Scalar, Vec3
+from rigidjax.exact._xla import one_kernel
 from rigidjax.exact.components3 import Six, Triple
 
 # Cyclic Jacobi converges quadratically; 3×3 needs four or five sweeps from anywhere.
@@ -50,6 +51,7 @@ def out_of(axes: Mat3, v: Triple) -> Triple:
     return tuple(axes[i, 0] * v[0] + axes[i, 1] * v[1] + axes[i, 2] * v[2] for i in range(3))
 
 
+@one_kernel
 def _jacobi(m: Mat3) -> tuple[list[list[Scalar]], Triple]:
     one, zero = jnp.ones_like(m[0, 0]), jnp.zeros_like(m[0, 0])
     # Nearly equal moments keep their differences: a shift that is exact by Sterbenz' lemma.
