@@ -25,9 +25,9 @@ from rigidjax.rotation import quaternion
 _FORGIVEN = 64.0
 
 
-def known(value: Float[Array, "..."]) -> bool:
-    """Whether the numbers can be looked at now (they are not being traced)."""
-    return not isinstance(value, jax.core.Tracer)
+def known(value: Any) -> bool:
+    """Whether the numbers, of a tree of arrays, can be looked at now (they are not traced)."""
+    return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(value))
 
 
 def if_known(check: Callable, value: Float[Array, "..."]) -> Float[Array, "..."]:
@@ -60,6 +60,10 @@ def real_inertia(tensor: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3 3
 
 def real_moments(moments: Float[Array, "3"]) -> Float[Array, "3"]:
     """Refuse principal moments, in any order, that no body has."""
+    if not known(moments) and known(plain := lax.stop_gradient(moments)):
+        # Only differentiated: one look at the numbers, in the place of twenty programs.
+        real_moments(plain)
+        return moments
     moments = _finite(moments, "principal moments")
     xp = np if known(moments) else jnp
     return _moments_of_a_body(moments, xp.sort(_values(moments)))
@@ -87,6 +91,11 @@ def possible(body: Any, tensor: Float[Array, "*batch 3 3"], mass: Any, throw: bo
     **Arguments:** `tensor` the inertia, kg m²; `mass` kg, `None` for a body that only turns.
     """
     tensor = _checks.numbers(tensor, "inertia tensor")
+    if not known(tensor) and known(plain := lax.stop_gradient((tensor, mass))):
+        # Only differentiated: one look at the numbers, in the place of thirty programs.
+        flat, broken = _impossible(np, np.asarray(plain[0]), _slack(tensor))
+        if not (flat | broken).any() and (mass is None or (np.asarray(plain[1]) > 0).all()):
+            return body
     is_known = known(tensor) and (mass is None or known(mass))
     xp = np if is_known else jnp
     light = xp.asarray(False) if mass is None else ~(_values(mass) > 0)

@@ -39,6 +39,8 @@ def one_kernel(function: Function) -> Function:
     A loop of one turn: XLA knows neither the number of turns nor that the arguments stay, so
     nothing is taken out of it. Batches, and derivatives, are those of `function` itself.
     """
+    # Traced once for all the uses below.
+    once = jax.jit(function, inline=True)
 
     @jax.custom_jvp
     @functools.wraps(function)
@@ -49,13 +51,11 @@ def one_kernel(function: Function) -> Function:
     def alone(*args: Any) -> Any:
         first = jax.tree.leaves(args)[0].ravel()[0]
         step = jnp.where(first == first, 1, 2)
-        blank = jax.tree.map(
-            lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(function, *args)
-        )
+        blank = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(once, *args))
 
         def turn(carry: Any) -> Any:
             i, args, _ = carry
-            return i + step, jax.tree.map(jnp.zeros_like, args), function(*args)
+            return i + step, jax.tree.map(jnp.zeros_like, args), once(*args)
 
         return jax.lax.while_loop(lambda c: c[0] < 1, turn, (jnp.zeros_like(step), args, blank))[2]
 
@@ -63,11 +63,11 @@ def one_kernel(function: Function) -> Function:
     def _batched(size: int, batched: Any, *args: Any) -> Any:
         del size
         axes = jax.tree.map(lambda b: 0 if b else None, tuple(batched))
-        out = jax.vmap(function, axes)(*args)
+        out = jax.vmap(once, axes)(*args)
         return out, jax.tree.map(lambda _: True, out)
 
     @call.defjvp
     def _jvp(primals: Any, tangents: Any) -> Any:
-        return jax.jvp(function, primals, tangents)
+        return jax.jvp(once, primals, tangents)
 
     return call  # pyright: ignore[reportReturnType]

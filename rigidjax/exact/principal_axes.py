@@ -24,21 +24,21 @@ def principal_frame(tensor: Mat3) -> tuple[Six, Mat3]:
     """
     columns, moments = _jacobi(jax.lax.stop_gradient(tensor))
     axes = jnp.stack([jnp.stack(row) for row in columns])
-    return _in_axes(tensor, axes, moments), axes
+    return in_axes(tensor, axes, moments), axes
 
 
 @jax.custom_jvp
-def _in_axes(tensor: Mat3, axes: Mat3, moments: Triple) -> Six:
+def in_axes(tensor: Mat3, axes: Mat3, moments: Triple) -> Six:
     """`AᵀIA`: diagonal in value."""
     zero = jnp.zeros_like(tensor[0, 0])
     return *moments, zero, zero, zero
 
 
-@_in_axes.defjvp
+@in_axes.defjvp
 def _in_axes_jvp(primals, tangents):
     axes, rows = primals[1], [into(primals[1], row) for row in tangents[0]]
     m: list[Triple] = [into(axes, column) for column in zip(*rows, strict=True)]
-    return _in_axes(*primals), (m[0][0], m[1][1], m[2][2], m[1][0], m[2][0], m[2][1])
+    return in_axes(*primals), (m[0][0], m[1][1], m[2][2], m[1][0], m[2][0], m[2][1])
 
 
 def into(axes: Mat3, v: Vec3 | Triple) -> Triple:
