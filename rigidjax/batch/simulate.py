@@ -17,12 +17,12 @@ from rigidjax.batch.rollout import Inputs, rollout
 from rigidjax.batch.sharding import Compiled, chunk_of, mesh_of, over_bodies
 from rigidjax.batch.validation import BodyBatch, bodies_of, start_of, step_of, time_of
 from rigidjax.body.inertia import Inertia, MassProperties
+from rigidjax.exact.free_body import FreeMotion
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.coupled import Coupled, motion_of, started
 from rigidjax.solve import equations_of_motion, simulate as simulate_one, validation
 from rigidjax.solve.explicit import DormandPrince8
 from rigidjax.solve.magnus import Magnus4
-from rigidjax.solve.run import free_motion
 from rigidjax.solve.step_control import NONFINITE, finite
 from rigidjax.solve.validation import real_or_nan
 
@@ -180,7 +180,7 @@ _compiled = Compiled(_run)
 
 
 def _free(body: Any, state0: Any, ts: Array) -> Any:
-    later = free_motion(body, state0, ts[1:] - ts[0])
+    later = FreeMotion(body, state0)(ts[1:] - ts[0])
     ys = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), state0, later)
     return ys, _status(ys), jnp.zeros((), jnp.int32), None
 

@@ -1,7 +1,7 @@
 """A torque-free body at any time, in closed form."""
 
 import functools
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -13,9 +13,10 @@ from jaxtyping import Array, Float
 from rigidjax import _checks
 from rigidjax._types import HasAttitude, HasPose, HasSpin, Mat3, Quat, Scalar, ScalarLike, Vec3
 from rigidjax.body import validation
-from rigidjax.body.inertia import Inertia
+from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.body.scaling import exponent_of, times_power_of_two
 from rigidjax.exact.derivatives import Setting, motion, set_up
+from rigidjax.motion import Attitude, Rigid
 from rigidjax.rotation.kernels import product4
 from rigidjax.rotation.linalg3 import components
 
@@ -53,7 +54,7 @@ class FreeBody(eqx.Module):
     def __call__(self, t: ScalarLike) -> HasSpin:
         return self._at(_time(t, self.state0.omega))
 
-    def at(self, ts: Float[Array, " n"]) -> HasSpin:
+    def at(self, ts: Float[Array, "*n"]) -> HasSpin:
         """The states at `ts` (n,), s since `state0`: as by `jax.vmap`, quicker to compile.
 
         >>> import jax.numpy as jnp, rigidjax as rj
@@ -77,6 +78,42 @@ class FreeBody(eqx.Module):
             return state
         first = jnp.broadcast_to(state.q, turn.shape)
         return eqx.tree_at(lambda s: s.q, state, _unit_product(first, turn))
+
+
+class FreeMotion(eqx.Module):
+    """The motion of a free body of any kind: `FreeBody`, and x + v t of a `Rigid`.
+
+    Call it with a time (scalar) or with times (n,), s since `state0`. Times that are too long give
+    NaN.
+
+    **Arguments:** `body` an `Inertia`, or `MassProperties` for a `Rigid`; `state0` a `Spin`,
+    `Attitude` or `Rigid`.
+
+    **Raises:** as `free_body`.
+
+    >>> import rigidjax as rj
+    >>> body = rj.MassProperties(2.0, [0.0, 0, 0], [[1.0, 0, 0], [0, 1, 0], [0, 0, 1]])
+    >>> start = rj.Rigid([0.0, 0, 0], [1.0, 0, 0], [1.0, 0, 0, 0], [0.0, 0, 1])
+    >>> FreeMotion(body, start)(jnp.array([0.0, 2.0])).x[1]
+    Array([2., 0., 0.], dtype=float64)
+    """
+
+    state0: Any
+    turning: FreeBody
+
+    def __init__(self, body: Inertia | MassProperties, state0: Any):
+        self.state0 = state0
+        rigid = isinstance(state0, Rigid)
+        turning = Attitude(state0.q, state0.omega) if rigid else state0
+        self.turning = FreeBody(body if isinstance(body, Inertia) else body.inertia, turning)
+
+    def __call__(self, since: Float[Array, "*n"]) -> Any:
+        turned: Any = self.turning.at(since)
+        if not isinstance(self.state0, Rigid):
+            return turned
+        v = jnp.broadcast_to(self.state0.v, turned.omega.shape)
+        x = jnp.broadcast_to(self.state0.x, v.shape) + since[..., None] * v
+        return Rigid(x, v, turned.q, turned.omega)
 
 
 def free_body(inertia: Inertia, state0: State, t: ScalarLike) -> State:
