@@ -90,12 +90,7 @@ def gather(tree: Any, checkpoint: str | os.PathLike[str] | None = None) -> Any:
     >>> gather(jnp.arange(3)).tolist()
     [0, 1, 2]
     """
-    tree = _known(tree, "gather")
-    if checkpoint is not None:
-        save(tree, checkpoint)
-    if jax.process_count() == 1:
-        return tree
-    return _together(lambda: jax.tree.map(_rows_of_all, tree), checkpoint)
+    return _together(_rows_of_all, _known(tree, "gather"), checkpoint)
 
 
 def total(tree: Any, checkpoint: str | os.PathLike[str] | None = None) -> Any:
@@ -109,17 +104,7 @@ def total(tree: Any, checkpoint: str | os.PathLike[str] | None = None) -> Any:
     >>> total(jnp.ones(2)).tolist()
     [1.0, 1.0]
     """
-    tree = _known(tree, "total")
-    if checkpoint is not None:
-        save(tree, checkpoint)
-    if jax.process_count() == 1:
-        return tree
-    return _together(
-        lambda: jax.tree.map(
-            lambda leaf: multihost_utils.process_allgather(jnp.asarray(leaf)).sum(axis=0), tree
-        ),
-        checkpoint,
-    )
+    return _together(_sum_of_all, _known(tree, "total"), checkpoint)
 
 
 def save(tree: Any, folder: str | os.PathLike[str]) -> Path:
@@ -190,6 +175,10 @@ def _known(tree: Any, name: str) -> Any:
     return jax.tree.map(np.asarray, tree)
 
 
+def _sum_of_all(leaf: Any) -> Any:
+    return multihost_utils.process_allgather(jnp.asarray(leaf)).sum(axis=0)
+
+
 def _rows_of_all(leaf: Any) -> np.ndarray:
     # Shares differ by a row at most: fill up, send, cut.
     rows = np.asarray(leaf)
@@ -200,9 +189,14 @@ def _rows_of_all(leaf: Any) -> np.ndarray:
     return np.concatenate([part[:n] for part, n in zip(sent, counts, strict=True)])
 
 
-def _together(send: Callable[[], Any], checkpoint: Any) -> Any:
+def _together(send: Callable[[Any], Any], tree: Any, checkpoint: Any) -> Any:
+    """`send` of every array, after the tree has been written to the `checkpoint`."""
+    if checkpoint is not None:
+        save(tree, checkpoint)
+    if jax.process_count() == 1:
+        return tree
     try:
-        return send()
+        return jax.tree.map(send, tree)
     except Exception as error:
         kept = (
             f"this process's share is in {Path(checkpoint) / f'share-{jax.process_index()}.npz'}"

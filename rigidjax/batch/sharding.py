@@ -66,13 +66,9 @@ def mesh_of(devices: Any) -> Mesh | None:
     """
     if devices is None:
         return None
-    if isinstance(devices, str):
-        if devices != "all":
-            raise ValueError(
-                f'devices: wanted None, "all" or a sequence of jax.devices(), got {devices!r}'
-            )
+    if devices == "all":
         devices = jax.local_devices()
-    if not isinstance(devices, Sequence) or not devices:
+    if not isinstance(devices, Sequence) or isinstance(devices, str) or not devices:
         raise ValueError(
             f'devices: wanted None, "all" or a sequence of jax.devices(), got {devices!r}'
         )

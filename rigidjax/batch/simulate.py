@@ -7,21 +7,22 @@ import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax import lax
 from jaxtyping import Array, ArrayLike, Float, Int
 
 from rigidjax import _checks
 from rigidjax._types import ScalarLike
 from rigidjax.batch.rollout import Inputs, rollout
-from rigidjax.batch.scheduling import dealt, quickness
 from rigidjax.batch.sharding import Compiled, chunk_of, mesh_of, over_bodies
 from rigidjax.batch.validation import BodyBatch, bodies_of, start_of, step_of, time_of
 from rigidjax.body.inertia import Inertia, MassProperties
+from rigidjax.exact.free_body import FreeMotion
 from rigidjax.motion import Attitude, Rigid, Spin
-from rigidjax.motion.coupled import Coupled
-from rigidjax.solve import simulate as simulate_one, validation
+from rigidjax.motion.coupled import Coupled, motion_of, started
+from rigidjax.solve import equations_of_motion, simulate as simulate_one, validation
 from rigidjax.solve.explicit import DormandPrince8
 from rigidjax.solve.magnus import Magnus4
-from rigidjax.solve.run import free_motion
 from rigidjax.solve.step_control import NONFINITE, finite
 from rigidjax.solve.validation import real_or_nan
 
@@ -113,10 +114,8 @@ def simulate(
     (5, 2, 4)
     """
     if isinstance(ts_or_steps, Steps):
-        equal_solver: Any = solver
-        return _equal(
-            bodies, states0, ts_or_steps, torque, equal_solver, inputs, torque_axes, chunk, devices
-        )
+        how = dict(solver=solver, inputs=inputs, torque_axes=torque_axes)
+        return _equal(ts_or_steps, bodies, states0, torque, chunk=chunk, devices=devices, **how)
     if inputs is not None:
         raise ValueError(
             "simulate: inputs are for Steps(size, number); with times put torques.Held(times, "
@@ -126,38 +125,25 @@ def simulate(
         raise ValueError("simulate: Magnus4 takes equal steps; give Steps(size, number), not times")
     batch = bodies_of(bodies, states0, torque, torque_axes)
     ts = validation.times(ts_or_steps, True).astype(batch.dtype)
-    if torque is None and solver is None:
-        how: Any = _Free()
-    else:
+    if torque is not None or solver is not None:
         max_steps = _checks.whole(max_steps, "max_steps", 1)
-        tolerances: Any = validation.tolerances(rtol, atol, batch.dtype)
+        rtol, atol = validation.tolerances(rtol, atol, batch.dtype)
         solver = DormandPrince8() if solver is None else solver
-        how = _Adaptive(solver, tolerances[0], tolerances[1], max_steps, adjoint)
-    mesh = mesh_of(devices)
-    plan = _Plan(how, chunk_of(chunk, batch.dtype, batch.many), mesh)
+    chunk, mesh = chunk_of(chunk, batch.dtype, batch.many), mesh_of(devices)
+    plan = _Plan(solver, rtol, atol, max_steps, adjoint, chunk, mesh)
     numbers = (batch.shared, batch.each, ts)
     ys, result, steps, own = _compiled(plan, batch.rest, numbers)
     return Batch(ts, ys, result, steps, own)
 
 
-class _Free(eqx.Module):
-    """The closed form."""
+class _Plan(eqx.Module):
+    """What is compiled. Without a solver it is the closed form."""
 
-
-class _Adaptive(eqx.Module):
-    """Adaptive steps."""
-
-    solver: dfx.AbstractSolver
-    rtol: float = eqx.field(static=True)
-    atol: float = eqx.field(static=True)
+    solver: dfx.AbstractSolver | None
+    rtol: float | None = eqx.field(static=True)
+    atol: float | None = eqx.field(static=True)
     max_steps: int = eqx.field(static=True)
     adjoint: dfx.AbstractAdjoint | None
-
-
-class _Plan(eqx.Module):
-    """What is compiled."""
-
-    how: _Free | _Adaptive
     chunk: int = eqx.field(static=True)
     mesh: Any = eqx.field(static=True)
 
@@ -170,11 +156,13 @@ def _run(plan: _Plan, rest: Any, numbers: Any) -> Any:
         body, state0, torque = BodyBatch.one(shared, each, rest)
         state0 = start_of(state0)
         body = real_or_nan(body)
-        if isinstance(plan.how, _Free):
-            return _free(body, state0, ts)
-        return _adaptive(plan.how, body, state0, torque, ts)
+        return (
+            _free(body, state0, ts)
+            if plan.solver is None
+            else _adaptive(plan, body, state0, torque, ts)
+        )
 
-    if isinstance(plan.how, _Free):
+    if plan.solver is None:
         return over_bodies(one, (shared, ts), each, plan.chunk, plan.mesh)
 
     def quick(each: Any) -> Array:
@@ -192,55 +180,30 @@ _compiled = Compiled(_run)
 
 
 def _free(body: Any, state0: Any, ts: Array) -> Any:
-    later = free_motion(body, state0, ts[1:] - ts[0])
+    later = FreeMotion(body, state0)(ts[1:] - ts[0])
     ys = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), state0, later)
-    result = dfx.RESULTS.where(finite(ys), dfx.RESULTS.successful, NONFINITE)
-    return ys, result, jnp.zeros((), jnp.int32), None
+    return ys, _status(ys), jnp.zeros((), jnp.int32), None
 
 
-def _adaptive(how: _Adaptive, body: Any, state0: Any, torque: Any, ts: Array) -> Any:
-    found = simulate_one(
-        body,
-        state0,
-        ts,
-        torque,
-        solver=how.solver,
-        rtol=how.rtol,
-        atol=how.atol,
-        max_steps=how.max_steps,
-        adjoint=how.adjoint,
-        throw=False,
-    )
+def _status(ys: Any) -> dfx.RESULTS:
+    return dfx.RESULTS.where(finite(ys), dfx.RESULTS.successful, NONFINITE)
+
+
+_statuses = jax.jit(jax.vmap(_status))
+
+
+def _adaptive(plan: _Plan, body: Any, state0: Any, torque: Any, ts: Array) -> Any:
+    names = ("solver", "rtol", "atol", "max_steps", "adjoint")
+    how: Any = {name: getattr(plan, name) for name in names}
+    found = simulate_one(body, state0, ts, torque, throw=False, **how)
     steps = jnp.asarray(found.stats["num_steps"], jnp.int32)
     return found.ys, found.result, steps, found.own
 
 
-def _equal(
-    bodies: Any,
-    states0: Any,
-    steps: Steps,
-    torque: Any,
-    solver: Any,
-    inputs: Any,
-    torque_axes: Any,
-    chunk: Any,
-    devices: Any,
-) -> Batch[Any]:
+def _equal(steps: Steps, bodies: Any, states0: Any, torque: Any, **how: Any) -> Batch[Any]:
     every = steps.number if steps.save_every is None else steps.save_every
-    ys: Any = rollout(
-        bodies,
-        states0,
-        steps.size,
-        steps.number,
-        torque,
-        solver=solver,
-        save_every=every,
-        t0=steps.t0,
-        inputs=inputs,
-        torque_axes=torque_axes,
-        chunk=chunk,
-        devices=devices,
-    )
+    how |= dict(save_every=every, t0=steps.t0)
+    ys: Any = rollout(bodies, states0, steps.size, steps.number, torque, **how)
     dtype = states0.omega.dtype
     h, count = step_of(steps.size, steps.number, dtype)
     ts = time_of(steps.t0, dtype) + h * jnp.arange(every, count + 1, every).astype(dtype)
@@ -251,9 +214,31 @@ def _equal(
     return Batch(ts, ys, result, steps_taken)
 
 
-@jax.jit
-def _statuses(ys: Any) -> Any:
-    def one(ys: Any) -> Any:
-        return dfx.RESULTS.where(finite(ys), dfx.RESULTS.successful, NONFINITE)
+def quickness(body: Any, state0: Any, torque: Any, t0: Array) -> Array:
+    """How fast a body turns and is turned at the start, rad/s: steps are as many as that is large.
 
-    return jax.vmap(one)(ys)
+    **Returns** a scalar, `|Ω| + √|dΩ/dt|`; NaN where there is no slope.
+    """
+    y0 = started(body, state0, torque, t0)
+    slope = motion_of(equations_of_motion(body, y0, torque)(t0, y0, None))
+    rate, change = jnp.sum(state0.omega**2), jnp.sum(slope.omega**2)
+    return lax.stop_gradient(jnp.sqrt(rate) + jnp.sqrt(jnp.sqrt(change)))
+
+
+def dealt(key: Array, chunk: int, parts: int) -> tuple[Array, Array]:
+    """An order by `key` (N,), NaN last, and the way back from it.
+
+    With several devices chunks are dealt like cards, so that each gets quick ones and slow ones.
+
+    >>> order, back = dealt(jnp.array([3.0, 1.0, 2.0]), 128, 1)
+    >>> order.tolist(), back.tolist()
+    ([1, 2, 0], [2, 0, 1])
+    """
+    order, count = jnp.argsort(key), key.shape[0]
+    chunk = min(chunk, -(-count // parts))
+    size = -(-count // (chunk * parts)) * chunk
+    # Where each device's share of `size` lies in the order; the last may be a short one.
+    seats = np.arange(size * parts).reshape(-1, parts, chunk).transpose(1, 0, 2).reshape(-1)
+    seats = seats[seats < count]
+    order = order[seats]
+    return order, jnp.zeros_like(order).at[order].set(jnp.arange(count, dtype=order.dtype))

@@ -74,6 +74,8 @@ def outer(a: Float[Array, "3"], b: Float[Array, "3"]) -> Mat3:
     return a[:, None] * b[None, :]
 
 
+# One program: outside of a trace each operation would be one.
+@jax.jit
 def swap_trace(a: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3 3"]:
     """`Tr(A) 1 − A` without the cancellation: `[A22 + A33, −A12, …]` (notes, eqs 76–78)."""
     x, y, z = a[..., 0, 0], a[..., 1, 1], a[..., 2, 2]

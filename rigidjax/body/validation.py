@@ -41,6 +41,10 @@ def real_inertia(tensor: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3 3
 
 def real_moments(moments: Float[Array, "3"]) -> Float[Array, "3"]:
     """Refuse principal moments, in any order, that no body has."""
+    if not _checks.known(moments) and _checks.known(plain := lax.stop_gradient(moments)):
+        # Only differentiated: one look at the numbers, in the place of twenty programs.
+        real_moments(plain)
+        return moments
     moments = _checks.finite(moments, "principal moments")
     xp = np if _checks.known(moments) else jnp
     return _moments_of_a_body(moments, xp.sort(_values(moments)))
@@ -68,7 +72,12 @@ def possible(body: Any, tensor: Float[Array, "*batch 3 3"], mass: Any, throw: bo
     **Arguments:** `tensor` the inertia, kg m²; `mass` kg, `None` for a body that only turns.
     """
     tensor = _checks.numbers(tensor, "inertia tensor")
-    is_known = _checks.known(tensor) and (mass is None or _checks.known(mass))
+    is_known = _checks.known((tensor, mass))
+    if not is_known and _checks.known(plain := lax.stop_gradient((tensor, mass))):
+        # Only differentiated: one look at the numbers, in the place of thirty programs.
+        flat, broken = _impossible(np, np.asarray(plain[0]), _slack(tensor))
+        if not (flat | broken).any() and (mass is None or (np.asarray(plain[1]) > 0).all()):
+            return body
     xp = np if is_known else jnp
     light = xp.asarray(False) if mass is None else ~(_values(mass) > 0)
     flat, broken = _impossible(xp, _values(tensor), _slack(tensor))

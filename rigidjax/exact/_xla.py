@@ -1,11 +1,16 @@
-"""Keep XLA from computing shared intermediates once for every output.
+"""What XLA on CPU has to be told, so that scalar formulas compile soon and run fast.
 
-XLA on CPU copies cheap arithmetic into each kernel that needs it: a chain of stages that all feed
-one another grows exponentially, in compile time and in run time. It does not copy divisions.
-Dividing by a 1 that it cannot see to be 1 therefore keeps a stage whole, and changes no bit.
+XLA copies cheap arithmetic into each kernel that needs it: a chain of stages that all feed one
+another grows exponentially, in compile time and in run time. It does not copy divisions. Dividing
+by a 1 that it cannot see to be 1 keeps a stage whole, and changes no bit (`fence`).
+
+And a kernel of one body costs 5 to 10 ms to compile, whatever it holds. Loops with a small state
+become one kernel as a whole; so what is done once is put into a loop (`one_kernel`).
 """
 
-from typing import TypeVar
+import functools
+from collections.abc import Callable
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +18,7 @@ import jax.numpy as jnp
 from rigidjax._types import Scalar
 
 Tree = TypeVar("Tree")
+Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def opaque_one(t: Scalar) -> Scalar:
@@ -25,3 +31,43 @@ def fence(tree: Tree, one: Scalar) -> Tree:
     return jax.tree.map(
         lambda x: x / (one if x.ndim == 0 else jnp.broadcast_to(one, x.shape)), tree
     )
+
+
+def one_kernel(function: Function) -> Function:
+    """The same function of trees of arrays, compiled as one kernel if it is not batched.
+
+    A loop of one turn: XLA knows neither the number of turns nor that the arguments stay, so
+    nothing is taken out of it. Batches, and derivatives, are those of `function` itself.
+    """
+    # Traced once for all the uses below.
+    once = jax.jit(function, inline=True)
+
+    @jax.custom_jvp
+    @functools.wraps(function)
+    def call(*args: Any) -> Any:
+        return alone(*args)
+
+    @jax.custom_batching.custom_vmap
+    def alone(*args: Any) -> Any:
+        first = jax.tree.leaves(args)[0].ravel()[0]
+        step = jnp.where(first == first, 1, 2)
+        blank = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(once, *args))
+
+        def turn(carry: Any) -> Any:
+            i, args, _ = carry
+            return i + step, jax.tree.map(jnp.zeros_like, args), once(*args)
+
+        return jax.lax.while_loop(lambda c: c[0] < 1, turn, (jnp.zeros_like(step), args, blank))[2]
+
+    @alone.def_vmap
+    def _batched(size: int, batched: Any, *args: Any) -> Any:
+        del size
+        axes = jax.tree.map(lambda b: 0 if b else None, tuple(batched))
+        out = jax.vmap(once, axes)(*args)
+        return out, jax.tree.map(lambda _: True, out)
+
+    @call.defjvp
+    def _jvp(primals: Any, tangents: Any) -> Any:
+        return jax.jvp(once, primals, tangents)
+
+    return call  # pyright: ignore[reportReturnType]

@@ -10,11 +10,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rigidjax._types import Scalar
-from rigidjax.exact._xla import fence, opaque_one
+from rigidjax.exact._xla import fence, one_kernel, opaque_one
 from rigidjax.exact.complete_integrals import HalfPeriod, half_period
 from rigidjax.exact.components3 import Four, Triple
 from rigidjax.exact.jacobi_duplication import Elliptic, Modulus, duplicate, elliptic, until_rest
-from rigidjax.exact.sincos import sincos
 
 
 class Orbit(NamedTuple):
@@ -38,6 +37,7 @@ class Orbit(NamedTuple):
     swapped: Float[Array, ""]
 
 
+@one_kernel
 def orbit(moments: Triple, momentum: Triple) -> Orbit:
     """Set up the motion of a body with principal moments I1 ≤ I2 ≤ I3 (any of them equal)."""
     (i1, i2, i3), (p1, p2, p3) = moments, momentum
@@ -128,6 +128,7 @@ def momentum_at(o: Orbit, f: Elliptic) -> Triple:
     return y1 * r, y2 * r, y3 * r
 
 
+@one_kernel
 def momentum_and_turn(o: Orbit, t: Scalar) -> tuple[Triple, Four]:
     """Body momentum at t, and the quaternion of the turn since t = 0, in principal axes."""
     u = reduced(0.5 * t, o.half.time, o.modulus)
@@ -147,7 +148,8 @@ def from_functions(o: Orbit, f: Elliptic, u: Reduced, t: Scalar) -> tuple[Triple
     size = jnp.maximum(jnp.maximum(jnp.abs(b0), jnp.abs(b2)), jnp.abs(b3))
     b0, b2, b3 = fence((b0 / size, b2 / size, b3 / size), one)
     r = 1.0 / jnp.sqrt((b0 * b0 + b2 * b2 + b3 * b3) * (f.x * f.x + f.y * f.y))
-    sine, cosine = sincos(0.5 * o.a * o.h * t - phase)
+    angle = 0.5 * o.a * o.h * t - phase
+    sine, cosine = jnp.sin(angle), jnp.cos(angle)
     c, s = r * (cosine * f.x + sine * f.y), r * (sine * f.x - cosine * f.y)
     still = o.h <= 0
     c, s = fence((c, jnp.where(still, 0.0, s / jnp.where(still, 1.0, o.h))), one)

@@ -69,8 +69,8 @@ def half_product(q: Four, v: Triple) -> Four:
 
 
 def turned_back(q: Four, v: Triple) -> Triple:
-    """R(q)ᵀ v."""
+    """R(q)ᵀ v − v."""
     w, *axis = q
     first = cross(v, tuple(axis))
     second = cross(first, tuple(axis))
-    return tuple(c + 2.0 * (w * a + b) for c, a, b in zip(v, first, second, strict=True))
+    return tuple(2.0 * (w * a + b) for a, b in zip(first, second, strict=True))

@@ -1,6 +1,7 @@
 """A torque-free body at any time, in closed form."""
 
-from typing import TypeVar
+import functools
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -10,23 +11,16 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from rigidjax import _checks
-from rigidjax._types import HasAttitude, HasPose, HasSpin, Mat3, Quat, Scalar, ScalarLike
+from rigidjax._types import HasAttitude, HasPose, HasSpin, Mat3, Quat, Scalar, ScalarLike, Vec3
 from rigidjax.body import validation
-from rigidjax.body.inertia import Inertia
+from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.body.scaling import exponent_of, times_power_of_two
-from rigidjax.exact._xla import fence, opaque_one
-from rigidjax.exact.components3 import Six, Triple, adjugate, determinant, times
-from rigidjax.exact.derivatives import flow
-from rigidjax.exact.principal_axes import into, out_of, principal_frame
+from rigidjax.exact.derivatives import Setting, motion, set_up
+from rigidjax.motion import Attitude, Rigid
 from rigidjax.rotation.kernels import product4
 from rigidjax.rotation.linalg3 import components
 
 State = TypeVar("State", bound=HasSpin)
-
-# Up to so many times a loop over them compiles in 0.65 to 0.7 of the time of one batch (values and
-# gradients at 301 times), and is as fast or faster for derivatives and many bodies. Values of one
-# body take 1.6 times as long at 301 times (0.1 ms more), four times at 900.
-_LOOPED = 1000
 
 
 class FreeBody(eqx.Module):
@@ -43,27 +37,24 @@ class FreeBody(eqx.Module):
     """
 
     state0: HasSpin
-    axes: Mat3
-    moments: Six
-    momentum: Triple
+    tensor: Mat3
+    omega: Vec3
     exponent: Array
+    setting: Setting
 
     def __init__(self, inertia: Inertia, state0: HasSpin):
         _check(inertia, state0)
-        omega = state0.omega
         # Powers of two, so that scaling costs no digit and no body is too large or small.
-        self.exponent = exponent_of(omega)
-        tensor = times_power_of_two(inertia.tensor, -exponent_of(inertia.tensor))
-        one = opaque_one(tensor[0, 0])
-        self.moments, self.axes = fence(principal_frame(tensor), one)
-        rate = into(self.axes, times_power_of_two(omega, -self.exponent))
-        self.momentum = fence(times(self.moments, rate), one)
+        self.exponent = exponent_of(state0.omega)
+        self.tensor = times_power_of_two(inertia.tensor, -exponent_of(inertia.tensor))
+        self.omega = times_power_of_two(state0.omega, -self.exponent)
+        self.setting = jax.lax.stop_gradient(set_up(self.tensor, self.omega))
         self.state0 = state0
 
     def __call__(self, t: ScalarLike) -> HasSpin:
         return self._at(_time(t, self.state0.omega))
 
-    def at(self, ts: Float[Array, " n"]) -> HasSpin:
+    def at(self, ts: Float[Array, "*n"]) -> HasSpin:
         """The states at `ts` (n,), s since `state0`: as by `jax.vmap`, quicker to compile.
 
         >>> import jax.numpy as jnp, rigidjax as rj
@@ -72,28 +63,57 @@ class FreeBody(eqx.Module):
         Array([[0., 0., 1.],
                [0., 0., 1.]], dtype=float64)
         """
-        if ts.size > _LOOPED:
-            return jax.vmap(self._at)(ts)
-        return jax.lax.map(self._at, ts)
+        return self._at(ts)
 
-    def _at(self, t: Scalar) -> HasSpin:
-        t = t.astype(self.axes.dtype)
+    def _at(self, t: Array) -> HasSpin:
+        t = t.astype(self.tensor.dtype)
         # Of so many turns the dtype holds no digit within one: then there is no state.
         turned = jnp.abs(t) * jnp.max(jnp.abs(self.state0.omega))
         t = jnp.where(turned <= 1 / jnp.finfo(t.dtype).eps, t, jnp.nan)
-        momentum, (w, *axis) = flow(
-            self.moments, self.momentum, times_power_of_two(t, self.exponent)
-        )
-        one = opaque_one(t)
-        momentum, w, axis = fence((momentum, w, axis), one)
-        omega = out_of(self.axes, fence(_solve(self.moments, momentum), one))
-        state = eqx.tree_at(
-            lambda s: s.omega, self.state0, times_power_of_two(jnp.stack(omega), self.exponent)
-        )
+        since = times_power_of_two(t, self.exponent)
+        omega, turn = motion(self.tensor, self.omega, self.setting, since)
+        omega = times_power_of_two(omega, self.exponent)
+        state = eqx.tree_at(lambda s: s.omega, self.state0, omega)
         if not isinstance(state, HasAttitude):
             return state
-        x, y, z = fence(out_of(self.axes, tuple(axis)), one)
-        return eqx.tree_at(lambda s: s.q, state, _unit_product(state.q, (w, x, y, z)))
+        first = jnp.broadcast_to(state.q, turn.shape)
+        return eqx.tree_at(lambda s: s.q, state, _unit_product(first, turn))
+
+
+class FreeMotion(eqx.Module):
+    """The motion of a free body of any kind: `FreeBody`, and x + v t of a `Rigid`.
+
+    Call it with a time (scalar) or with times (n,), s since `state0`. Times that are too long give
+    NaN.
+
+    **Arguments:** `body` an `Inertia`, or `MassProperties` for a `Rigid`; `state0` a `Spin`,
+    `Attitude` or `Rigid`.
+
+    **Raises:** as `free_body`.
+
+    >>> import rigidjax as rj
+    >>> body = rj.MassProperties(2.0, [0.0, 0, 0], [[1.0, 0, 0], [0, 1, 0], [0, 0, 1]])
+    >>> start = rj.Rigid([0.0, 0, 0], [1.0, 0, 0], [1.0, 0, 0, 0], [0.0, 0, 1])
+    >>> FreeMotion(body, start)(jnp.array([0.0, 2.0])).x[1]
+    Array([2., 0., 0.], dtype=float64)
+    """
+
+    state0: Any
+    turning: FreeBody
+
+    def __init__(self, body: Inertia | MassProperties, state0: Any):
+        self.state0 = state0
+        rigid = isinstance(state0, Rigid)
+        turning = Attitude(state0.q, state0.omega) if rigid else state0
+        self.turning = FreeBody(body if isinstance(body, Inertia) else body.inertia, turning)
+
+    def __call__(self, since: Float[Array, "*n"]) -> Any:
+        turned: Any = self.turning.at(since)
+        if not isinstance(self.state0, Rigid):
+            return turned
+        v = jnp.broadcast_to(self.state0.v, turned.omega.shape)
+        x = jnp.broadcast_to(self.state0.x, v.shape) + since[..., None] * v
+        return Rigid(x, v, turned.q, turned.omega)
 
 
 def free_body(inertia: Inertia, state0: State, t: ScalarLike) -> State:
@@ -186,22 +206,7 @@ def _check(inertia: Inertia, state0: HasSpin) -> None:
             raise ValueError(f"q: wanted a unit quaternion (w, x, y, z), got length {length:.6g}")
 
 
-@jax.custom_jvp
-def _solve(moments: Six, momentum: Triple) -> Triple:
-    """I⁻¹ Π for an inertia that is diagonal in value; its derivative is right to any order."""
-    return tuple(p / i for p, i in zip(momentum, moments[:3], strict=True))
-
-
-@_solve.defjvp
-def _solve_jvp(primals, tangents):
-    # Not `_solve` of the tangents: partial evaluation would drop its rule, and with it the second
-    # derivative by off-diagonal entries.
-    rate, r = _solve(*primals), 1.0 / determinant(primals[0])
-    turned = times(tangents[0], rate)
-    free = tuple(a - b for a, b in zip(tangents[1], turned, strict=True))
-    return rate, times(tuple(c * r for c in adjugate(primals[0])), free)
-
-
-def _unit_product(q: Quat, other) -> Quat:
-    out = jnp.stack(product4(components(q), other))
+@functools.partial(jnp.vectorize, signature="(n),(n)->(n)")
+def _unit_product(q: Quat, other: Quat) -> Quat:
+    out = jnp.stack(product4(components(q), components(other)))
     return out / jnp.sqrt(jnp.sum(out * out))

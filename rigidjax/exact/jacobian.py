@@ -26,10 +26,7 @@ from rigidjax.exact.jacobi_duplication import (
     limits,
     series,
 )
-from rigidjax.exact.sigma_form import Differences
-
-# Columns: d12, d23, k12, k13, k23, Π1, Π2, Π3, t.
-Row = tuple[Scalar, ...]
+from rigidjax.exact.sigma_form import Differences, invariants
 
 
 class Integrals(NamedTuple):
@@ -52,16 +49,14 @@ class Halfway(NamedTuple):
 def jacobian_and_integral(
     body: Differences, momentum: Triple, t: Scalar, halfway: Halfway
 ) -> tuple[tuple, Six]:
-    """dΠ(t)/d(d12, d23, k12, k13, k23, Π(0), t) as three rows, and G = ∫ Π Πᵀ dt.
+    """d(Π(t) − Π(0)) by (d12, d23, k12, k13, k23, Π(0), k11, t) as three rows, and G = ∫ Π Πᵀ dt.
 
-    Takes off-diagonal entries as zero. Regular at rest. C and D of `halfway` as in `body`.
+    Relatively right for short times too. Takes off-diagonal entries as zero. Regular at rest. C and
+    D of `halfway` as in `body`.
     """
-    d12, d13, d23 = body.d12, body.d13, body.d23
+    d12, d13, d23 = body[:3]
     p1, p2, p3 = momentum
-    A1 = d12 * p2 * p2 + d13 * p3 * p3
-    A3 = d13 * p1 * p1 + d23 * p2 * p2
-    A2 = d23 * p3 * p3 - d12 * p1 * p1
-    p, q, gap = d23 * A1, d12 * A3, d13 * A2
+    _, A1, A2, A3, q, p, gap, *_ = invariants(body, momentum)
     m = Modulus(p, q, gap)
     three = gap > 0
     top = jnp.where(three, p, q)
@@ -83,9 +78,18 @@ def jacobian_and_integral(
     ss, tt = S * S, jnp.where(three, D, C)
     rw = 1.0 / (tt * tt + ss * z)
     m1, m2, m3 = y1 * rw, y2 * rw, y3 * rw
+    # For short times less 1, without subtraction: of C, D and W only what is small.
+    w1 = ss * (z - jnp.where(three, q, p))
+    short = jnp.abs(w1) < 0.5
+    c1 = jnp.where(C > 0, -p * ss / (1.0 + jnp.abs(C)), C - 1.0)
+    d1 = jnp.where(D > 0, -q * ss / (1.0 + jnp.abs(D)), D - 1.0)
+    one1 = jnp.where(short, c1 - w1, C)
+    one2 = jnp.where(short, c1 * D + d1 - w1, C * D)
+    one3 = jnp.where(short, d1 - w1, D)
+    less = jnp.where(short, 0.0, 1.0)
     rc, rd = 0.5 * ss / jnp.where(three, 1.0, C), 0.5 * ss / jnp.where(three, D, 1.0)
 
-    def tangent(e12, e23, o12, o13, o23, e1, e2, e3, et):
+    def tangent(e12, e23, o12, o13, o23, e1, e2, e3, _, et):
         e13 = e12 + e23
         mixed = 2.0 * (o12 * (p1 * p2) + o13 * (p1 * p3) + o23 * (p2 * p3))
         dA1 = e12 * (p2 * p2) + e13 * (p3 * p3) + 2.0 * (e2 * (d12 * p2) + e3 * (d13 * p3)) - mixed
@@ -122,7 +126,7 @@ def jacobian_and_integral(
             + o23 * (p1 * p3)
         )
         dy1 = (
-            e1 * C
+            e1 * one1
             + p1 * dC
             - x12 * C * p2
             - x13 * p3
@@ -130,7 +134,7 @@ def jacobian_and_integral(
             + S * (dD * u1 + D * du1 + x12 * u2 + x13 * u3)
         )
         dy2 = (
-            e2 * C * D
+            e2 * one2
             + p2 * (dC * D + C * dD)
             - x12 * C * p1
             - x23 * D * p3
@@ -138,7 +142,7 @@ def jacobian_and_integral(
             + S * (du2 + x12 * u1 + x23 * u3)
         )
         dy3 = (
-            e3 * D
+            e3 * one3
             + p3 * dD
             - x13 * p1
             - x23 * D * p2
@@ -153,9 +157,13 @@ def jacobian_and_integral(
             + 2.0 * p3 * (d13 * d23 * e3 - d23 * o13 * p1 - d13 * o23 * p2),
         )
         dw = 2.0 * (tt * jnp.where(three, dD, dC) + S * dS * z) + ss * dz
-        return (dy1 - m1 * dw) * rw, (dy2 - m2 * dw) * rw, (dy3 - m3 * dw) * rw
+        return (
+            (dy1 - m1 * dw) * rw - e1 * less,
+            (dy2 - m2 * dw) * rw - e2 * less,
+            (dy3 - m3 * dw) * rw - e3 * less,
+        )
 
-    rows = jax.vmap(lambda e: tangent(*e))(jnp.eye(9, dtype=t.dtype))
+    rows = jax.vmap(lambda e: tangent(*e))(jnp.eye(10, dtype=t.dtype))
 
     # G: its 22 entry, the other two by ∫A₁ and ∫A₃, and the off-diagonal ones.
     g22 = A1 * A3 * grown2 + (S * C * D * p2 * p2 + ss * p2 * u2) * rw

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from rigidjax._types import Mat3, Scalar, Vec3
+from rigidjax.exact._xla import one_kernel
 from rigidjax.exact.components3 import Six, Triple
 
 # Cyclic Jacobi converges quadratically; 3×3 needs four or five sweeps from anywhere.
@@ -23,21 +24,21 @@ def principal_frame(tensor: Mat3) -> tuple[Six, Mat3]:
     """
     columns, moments = _jacobi(jax.lax.stop_gradient(tensor))
     axes = jnp.stack([jnp.stack(row) for row in columns])
-    return _in_axes(tensor, axes, moments), axes
+    return in_axes(tensor, axes, moments), axes
 
 
 @jax.custom_jvp
-def _in_axes(tensor: Mat3, axes: Mat3, moments: Triple) -> Six:
+def in_axes(tensor: Mat3, axes: Mat3, moments: Triple) -> Six:
     """`AᵀIA`: diagonal in value."""
     zero = jnp.zeros_like(tensor[0, 0])
     return *moments, zero, zero, zero
 
 
-@_in_axes.defjvp
+@in_axes.defjvp
 def _in_axes_jvp(primals, tangents):
     axes, rows = primals[1], [into(primals[1], row) for row in tangents[0]]
     m: list[Triple] = [into(axes, column) for column in zip(*rows, strict=True)]
-    return _in_axes(*primals), (m[0][0], m[1][1], m[2][2], m[1][0], m[2][0], m[2][1])
+    return in_axes(*primals), (m[0][0], m[1][1], m[2][2], m[1][0], m[2][0], m[2][1])
 
 
 def into(axes: Mat3, v: Vec3 | Triple) -> Triple:
@@ -50,6 +51,7 @@ def out_of(axes: Mat3, v: Triple) -> Triple:
     return tuple(axes[i, 0] * v[0] + axes[i, 1] * v[1] + axes[i, 2] * v[2] for i in range(3))
 
 
+@one_kernel
 def _jacobi(m: Mat3) -> tuple[list[list[Scalar]], Triple]:
     one, zero = jnp.ones_like(m[0, 0]), jnp.zeros_like(m[0, 0])
     # Nearly equal moments keep their differences: a shift that is exact by Sterbenz' lemma.

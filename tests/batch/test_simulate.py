@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import rigidjax as rj
-from rigidjax.batch.scheduling import dealt
+from rigidjax.batch.simulate import dealt
 
 TOP = rj.torques.HeavyTop(1.0, [0.0, 0.0, 1.0], [0.0, 0.0, -1.0])
 TS = [0.0, 0.7, 2.0]

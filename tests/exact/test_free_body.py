@@ -12,7 +12,8 @@ import optimistix as optx
 import pytest
 
 import rigidjax.exact as exact
-from rigidjax.body.inertia import Inertia
+from rigidjax.body.inertia import Inertia, MassProperties
+from rigidjax.exact.free_body import FreeMotion
 from rigidjax.motion import Attitude, AttitudeEquations, EulerEquations, Rigid, Spin
 from rigidjax.motion.torques import ConstantTorque
 
@@ -497,6 +498,22 @@ def test_solver_adjoints_agree():
     forward = jax.jacfwd(final)(omega, diffrax.ForwardMode())
     np.testing.assert_allclose(reverse, ref, rtol=1e-12)
     np.testing.assert_allclose(forward, ref, rtol=1e-12)
+
+
+def test_one_free_motion_for_every_state():
+    # At one time and at many; a Rigid goes straight ahead besides.
+    body = MassProperties(2.0, [0.0, 0, 0], np.diag([1.0, 0.8, 0.5]))
+    start = Rigid([1.0, 0, 0], [0.0, 0.5, 0], [1.0, 0, 0, 0], [0.1, 1.0, 0.2])
+    ts = jnp.array([0.0, 0.7, 3.0])
+    turned = motion_of(body.inertia, Attitude(start.q, start.omega), ts)
+    many = eqx.filter_jit(lambda ts: FreeMotion(body, start)(ts))(ts)
+    one = eqx.filter_jit(lambda t: FreeMotion(body, start)(t))(ts[1])
+    np.testing.assert_allclose(many.x, np.asarray(start.x) + np.outer(ts, start.v), rtol=1e-15)
+    np.testing.assert_allclose(many.q, turned.q, atol=1e-15)
+    for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(many), strict=True):
+        np.testing.assert_allclose(a, b[1], atol=1e-15)
+    spin = FreeMotion(body.inertia, Spin(start.omega))
+    np.testing.assert_allclose(spin(ts[1]).omega, one.omega, atol=1e-15)
 
 
 @pytest.mark.usefixtures("unhooked")
