@@ -12,12 +12,12 @@ from jaxtyping import Array, Float, Int
 
 from rigidjax import _checks
 from rigidjax.body.inertia import Inertia, MassProperties
+from rigidjax.exact.free_body import FreeMotion
 from rigidjax.motion.coupled import Coupled, started
 from rigidjax.motion.torques import Torque
 from rigidjax.solve import equations_of_motion, fixed, simulate, solvers
 from rigidjax.solve.equal_steps import advance, in_a_loop
 from rigidjax.solve.explicit import AbstractExplicit
-from rigidjax.solve.run import free_motion
 from rigidjax.solve.tableaus import KUTTA4
 
 # Radians turned in a step: a fifth-order method then errs by 1e-9 a radian; and one of order 4 in
@@ -138,7 +138,7 @@ def states_at(
     if torque is not None:
         assert integrator is not None
         return integrator.states(body, state0, ts, torque)
-    return free_motion(body, state0, ts - ts[0])
+    return FreeMotion(body, state0)(ts - ts[0])
 
 
 def shifted(field: Callable[..., Any], t: Array, state: Any, offset: Array) -> Any:

@@ -7,13 +7,13 @@ import jax
 from jaxtyping import Array
 
 from rigidjax.body.inertia import MassProperties
+from rigidjax.exact.free_body import FreeMotion
 from rigidjax.identify.propagation import shifted
 from rigidjax.identify.sensors import SensorInput
 from rigidjax.motion import Rigid
 from rigidjax.motion.coupled import Coupled, CoupledEquations
 from rigidjax.motion.torques.states import freeze
 from rigidjax.solve import equations_of_motion
-from rigidjax.solve.run import free_motion
 
 
 def what_turns(body: Any, rung: type) -> Any:
@@ -37,7 +37,7 @@ def sensor_inputs(
     if offset is not None:
         times = ts + offset
         if torque is None:
-            states = free_motion(turned, state0, times - ts[0])
+            states = FreeMotion(turned, state0)(times - ts[0])
         else:
             whole = CoupledEquations(field, turned) if isinstance(states, Coupled) else field
             states = jax.vmap(lambda t, y: shifted(whole, t, y, offset))(ts, states)

@@ -26,8 +26,8 @@ from jax import lax
 from jaxtyping import Array
 
 from rigidjax.body.inertia import Inertia
-from rigidjax.exact import FreeBody
-from rigidjax.motion import Attitude, Rigid, on_the_group
+from rigidjax.exact.free_body import FreeMotion
+from rigidjax.motion import on_the_group
 from rigidjax.motion.torques.base import jumps_of
 from rigidjax.solve import crossing_loop, direction, runge_kutta
 from rigidjax.solve.adaptive import adaptive, taken_out
@@ -107,7 +107,8 @@ def section(
         rtol, atol = (jnp.asarray(a, y0.dtype) for a in (control.rtol, control.atol))  # pyright: ignore
         h0 = jnp.asarray(jnp.nan if setup.dt0 is None else setup.dt0, dtype)
     else:
-        solver, motion = None, _free_motion(setup.body, state0, ts[0], sign)
+        solver, free = None, FreeMotion(setup.body, state0)
+        motion = lambda s, y: flat(free(sign.astype(s.dtype) * s - ts[0]))  # noqa: E731
         longest = jnp.minimum(longest, _spacing(setup.body, state0, whole))
         rtol, atol, h0 = jnp.zeros((), y0.dtype), jnp.zeros((), y0.dtype), longest
     of_motion, constants = taken_out(motion, along[0], y0)
@@ -123,20 +124,6 @@ def section(
     )
     run = Run(along[0], stops, stops[:0], y0, rtol, atol, h0)
     return crossed, ([*constants, *more], run, longest)
-
-
-def _free_motion(body: Any, state0: Any, t0: Array, sign: Array) -> Callable[..., Array]:
-    """A free body at s = σt, whatever the state is."""
-    rigid = isinstance(state0, Rigid)
-    turning: Any = Attitude(state0.q, state0.omega) if rigid else state0
-    free = FreeBody(body if isinstance(body, Inertia) else body.inertia, turning)
-
-    def motion(s: Array, y: Array) -> Array:
-        since = sign.astype(s.dtype) * s - t0
-        state: Any = free(since)
-        return flat((state0.x + since * state0.v, state0.v, state) if rigid else state)
-
-    return motion
 
 
 def _spacing(body: Any, state0: Any, whole: Array) -> Array:

@@ -10,10 +10,10 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from rigidjax.body.inertia import Inertia, MassProperties
-from rigidjax.exact import FreeBody
+from rigidjax.exact.free_body import FreeMotion
 from rigidjax.frames import Point
 from rigidjax.frames.frame_dynamics import scene_of
-from rigidjax.motion import Attitude, Rigid, on_the_group
+from rigidjax.motion import on_the_group
 from rigidjax.motion.coupled import started
 from rigidjax.motion.torques.base import jumps_of
 from rigidjax.solve import ending
@@ -200,7 +200,7 @@ def _raise(ys: Any, result: dfx.RESULTS) -> Any:
 
 
 def _free(setup: Free, state0: Any, ts: Array) -> tuple[Any, dict[str, Any], dfx.RESULTS]:
-    ys = free_motion(setup.body, state0, ts - ts[0])
+    ys = FreeMotion(setup.body, state0)(ts - ts[0])
     none = jnp.zeros((), int)
     stats = {"num_steps": none, "num_accepted_steps": none, "num_rejected_steps": none}
     if setup.throw:
@@ -212,20 +212,6 @@ def _free(setup: Free, state0: Any, ts: Array) -> tuple[Any, dict[str, Any], dfx
         )
         return ys, stats, dfx.RESULTS.successful
     return ys, stats, dfx.RESULTS.where(finite(ys), dfx.RESULTS.successful, NONFINITE)
-
-
-def free_motion(body: Inertia | MassProperties, state0: Any, since: Array) -> Any:
-    """The states of a free body (T, …) at times (T,) since its start, s, of any kind of state.
-
-    Nothing is checked: inside a fit checks are host callbacks.
-    """
-    inertia = body if isinstance(body, Inertia) else body.inertia
-    turning = Attitude(state0.q, state0.omega) if isinstance(state0, Rigid) else state0
-    ys: Any = FreeBody(inertia, turning).at(since)
-    if not isinstance(state0, Rigid):
-        return ys
-    x = state0.x[None] + since[:, None] * state0.v[None]
-    return Rigid(x, jnp.broadcast_to(state0.v, x.shape), ys.q, ys.omega)
 
 
 class Flow(eqx.Module):
