@@ -23,7 +23,7 @@ from rigidjax.motion.coupled import Coupled, motion_of, started
 from rigidjax.solve import equations_of_motion, simulate as simulate_one, validation
 from rigidjax.solve.explicit import DormandPrince8
 from rigidjax.solve.magnus import Magnus4
-from rigidjax.solve.step_control import NONFINITE, finite
+from rigidjax.solve.step_control import NONFINITE, finite, of_body
 from rigidjax.solve.validation import real_or_nan
 
 State = TypeVar("State", Spin, Attitude, Rigid)
@@ -49,9 +49,9 @@ class Batch(eqx.Module, Generic[State]):
 
     **Fields:** `ts` (T,) s; `ys` the states there, of the type of `states0`, with leading axes
     (N, T), in the order that the bodies were given; NaN where a body did not get to. `result` a
-    `diffrax.RESULTS` for each body: `successful`, `nonfinite`, `max_steps_reached`,
-    `dt_min_reached`. `num_steps` (N,) accepted and rejected, 0 for the closed form. `own` a tuple
-    of the states of the laws that have some, as `ys`, or `None`.
+    `diffrax.RESULTS` for each body: `successful`, `nonfinite`, `nonfinite_input` (no body has these
+    numbers), `max_steps_reached`, `dt_min_reached`. `num_steps` (N,) accepted and rejected, 0 for
+    the closed form. `own` a tuple of the states of the laws that have some, as `ys`, or `None`.
 
     >>> import rigidjax as rj
     >>> bodies = rj.Inertia(jnp.diag(jnp.array([1.0, 2.0, 3.0])))
@@ -182,14 +182,20 @@ _compiled = Compiled(_run)
 def _free(body: Any, state0: Any, ts: Array) -> Any:
     later = FreeMotion(body, state0)(ts[1:] - ts[0])
     ys = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), state0, later)
-    return ys, _status(ys), jnp.zeros((), jnp.int32), None
+    return ys, _status(ys, body), jnp.zeros((), jnp.int32), None
 
 
-def _status(ys: Any) -> dfx.RESULTS:
-    return dfx.RESULTS.where(finite(ys), dfx.RESULTS.successful, NONFINITE)
+def _status(ys: Any, body: Any) -> dfx.RESULTS:
+    result = dfx.RESULTS.where(finite(ys), dfx.RESULTS.successful, NONFINITE)
+    return of_body(result, body)
 
 
-_statuses = jax.jit(jax.vmap(_status))
+@eqx.filter_jit
+def _statuses(batch: BodyBatch, ys: Any) -> dfx.RESULTS:
+    def one(each: Any, ys: Any) -> dfx.RESULTS:
+        return _status(ys, real_or_nan(BodyBatch.one(batch.shared, each, batch.rest)[0]))
+
+    return jax.vmap(one)(batch.each, ys)
 
 
 def _adaptive(plan: _Plan, body: Any, state0: Any, torque: Any, ts: Array) -> Any:
@@ -207,7 +213,7 @@ def _equal(steps: Steps, bodies: Any, states0: Any, torque: Any, **how: Any) -> 
     dtype = states0.omega.dtype
     h, count = step_of(steps.size, steps.number, dtype)
     ts = time_of(steps.t0, dtype) + h * jnp.arange(every, count + 1, every).astype(dtype)
-    result = _statuses(ys)
+    result = _statuses(bodies_of(bodies, states0, torque, how["torque_axes"]), ys)
     steps_taken = jnp.full(states0.omega.shape[:1], count, jnp.int32)
     if isinstance(ys, Coupled):
         return Batch(ts, ys.motion, result, steps_taken, ys.own)

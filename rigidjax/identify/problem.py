@@ -149,6 +149,12 @@ class Problem(eqx.Module):
         elif not isinstance(apart, bool):
             self.noise_groups, _ = grouped(apart, of, "noise_each")
         self.slots = find(free, recordings[0], of)
+        for one in chart.charts if isinstance(chart, Bodies) else (chart,):
+            for slot in self.slots:
+                if slot.name in (*one.log_names, *one.plain_names, "Ωx", "Ωy", "Ωz"):
+                    raise ValueError(
+                        f"Free {slot.name!r}: a quantity of the body has this name; give another"
+                    )
         self.rung = _rung(recordings[0], chart)
         self.reference = reference_of(recordings, self.rung)
         if integrator is None and self.records.torque is not None:

@@ -25,7 +25,7 @@ from rigidjax.solve.events import Event, ready, value
 from rigidjax.solve.explicit import AbstractExplicit, DormandPrince8
 from rigidjax.solve.linear_map import nan_derivatives
 from rigidjax.solve.run import Free, Loop
-from rigidjax.solve.step_control import Watched, outcome
+from rigidjax.solve.step_control import Watched, of_body, outcome
 
 State = TypeVar("State", Spin, Attitude, Rigid, Point, Coupled)
 
@@ -151,4 +151,5 @@ def _solved(
     inputs = (event.condition, setup.body, getattr(setup, "torque", None), state0, ts)
     times, states = nan_derivatives((crossed.time(found.times), states), inputs)
     result = outcome(found.h, found.t, crossed.time(ts[-1]), found.number >= many)
+    result = of_body(result, setup.body)
     return Crossings(times, states, found.number, result, found.steps)

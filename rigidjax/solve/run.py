@@ -22,7 +22,7 @@ from rigidjax.solve.direction import ahead
 from rigidjax.solve.explicit import AbstractExplicit
 from rigidjax.solve.linear_map import nan_derivatives
 from rigidjax.solve.projection import Projected
-from rigidjax.solve.step_control import NONFINITE, finite
+from rigidjax.solve.step_control import NONFINITE, finite, of_body
 from rigidjax.solve.vector_field import equations_of_motion
 
 # Made once: building a Module costs as much as ten steps, and `jit` compares it leaf by leaf.
@@ -74,7 +74,7 @@ def solve(
 ) -> tuple[Any, dict[str, Any], dfx.RESULTS]:
     ys, stats, result = _solved(setup, state0, ts)
     inputs = (setup.body, getattr(setup, "torque", None), state0, ts)
-    return nan_derivatives(ys, inputs), stats, result
+    return nan_derivatives(ys, inputs), stats, of_body(result, setup.body)
 
 
 def _solved(

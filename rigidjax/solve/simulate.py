@@ -101,7 +101,7 @@ def simulate(
       `result` says what happened, states not reached are NaN, as are their derivatives, and other
       bodies of the batch get what they would get without the bad one, to the last bit. The motion
       of a traced body that cannot be (a mass that is not positive, moments that no body has) is
-      NaN, its `result` is `nonfinite`. Known numbers that are wrong are refused in any case.
+      NaN, its `result` is `nonfinite_input`. Known numbers that are wrong are refused in any case.
 
     **Returns** a `Solution`. A second call with other numbers of the same shapes does not compile
     again.

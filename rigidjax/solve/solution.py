@@ -29,7 +29,8 @@ class Solution(eqx.Module, Generic[State]):
     with a leading time axis, NaN where the run did not get to; `stats` a dict with `num_steps`,
     `num_accepted_steps`, `num_rejected_steps`, for a `Point` also `drift` of what its scene
     conserves; `result` a `diffrax.RESULTS`: `successful`, or why the run ended early, such as
-    `max_steps_reached`, `nonfinite`, `dt_min_reached`; `event_occurred` where the event was met.
+    `max_steps_reached`, `nonfinite`, `nonfinite_input` (no body has these numbers),
+    `dt_min_reached`; `event_occurred` where the event was met.
     `event_time` s, `event_state` of the type of `state0` (`motion.Coupled` under a law with
     states): NaN where it was not met, `None` where there is no event. `own` a tuple of the states
     of the laws that have some, as `ys` with a leading time axis (see `rigidjax.torques.freeze`), or

@@ -14,6 +14,7 @@ from rigidjax.solve.record import Method, Run
 
 # diffrax inherits it from optimistix, where type checkers do not follow.
 NONFINITE: Any = dfx.RESULTS.nonfinite
+_IMPOSSIBLE: Any = dfx.RESULTS.nonfinite_input
 
 # The defaults of diffrax.PIDController: the same steps, so that figures can be compared.
 _SAFETY, _SMALLEST, _LARGEST = 0.9, 0.2, 10.0
@@ -111,6 +112,17 @@ def finite(tree: Any) -> Bool[Array, ""]:
     for leaf in jax.tree.leaves(tree):
         good = good & jnp.all(jnp.isfinite(leaf))
     return good
+
+
+def of_body(result: dfx.RESULTS, body: Any) -> dfx.RESULTS:
+    """The result of a run; `nonfinite_input` where no body has these numbers.
+
+    **Arguments:** `body` as `validation.real_or_nan` gives it, NaN where it cannot be.
+
+    >>> of_body(dfx.RESULTS.nonfinite, jnp.nan) == dfx.RESULTS.nonfinite_input
+    Array(True, dtype=bool)
+    """
+    return dfx.RESULTS.where(finite(body), result, _IMPOSSIBLE)
 
 
 def error_norm(error: Array, left: Array, right: Array, rtol: Array, atol: Array) -> Array:

@@ -180,6 +180,10 @@ def test_two_numbers_of_one_name_are_refused(tumble):
     ]
     with pytest.raises(ValueError, match="Free 'bias': another Free has this name"):
         rj.identify.Problem(record, rj.identify.Ratios(), free=free)
+    for name in ("I1/I3", "Ωx"):
+        free = [rj.identify.Free(lambda r: r.readings[0].sensor.bias, name)]
+        with pytest.raises(ValueError, match=f"Free '{name}': a quantity of the body has this"):
+            rj.identify.Problem(record, rj.identify.Ratios(), free=free)
 
 
 def test_what_cannot_be_seen_is_said():

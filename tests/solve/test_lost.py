@@ -30,7 +30,7 @@ def test_a_traced_body_that_cannot_be_has_no_motion(name, torque):
         sol = rj.simulate(
             rj.Inertia(jnp.diag(moments)), rj.Spin(OMEGA), [0.0, 1.0], torque, throw=throw
         )
-        return sol.ys.omega[-1], sol.result == dfx.RESULTS.nonfinite
+        return sol.ys.omega[-1], sol.result == dfx.RESULTS.nonfinite_input
 
     good = jnp.array([1.0, 1.6, 2.2])
     both = jax.vmap(lambda m: run(m, False))(jnp.stack([good, jnp.array(moments)]))
@@ -55,13 +55,16 @@ def test_every_door_refuses_it_alone(name, way):
             one = lambda body: rj.crossings(
                 body, rj.Spin(OMEGA), 0.0, 20.0, across, max_crossings=3
             )
-            return jax.vmap(lambda body: one(body).count)(bodies)
+            return jax.vmap(lambda body: (one(body).count, one(body).result))(bodies)
         if way == "rollout":
-            return rj.batch.rollout(bodies, states, 0.01, 8).omega
+            sol = rj.batch.simulate(bodies, states, rj.batch.Steps(0.01, 8))
+            return rj.batch.rollout(bodies, states, 0.01, 8).omega, sol.result
         torque = None if way == "closed form" else DAMPING
-        return rj.batch.simulate(bodies, states, [0.0, 1.0], torque).ys.omega[:, -1]
+        sol = rj.batch.simulate(bodies, states, [0.0, 1.0], torque)
+        return sol.ys.omega[:, -1], sol.result
 
-    out = run(moments)
+    out, result = run(moments)
+    assert (result == dfx.RESULTS.nonfinite_input).tolist() == [False, True]
     if way == "crossings":
         assert int(out[0]) == 3 and int(out[1]) == 0
     else:
@@ -74,7 +77,7 @@ def test_a_negative_mass_is_named_and_has_no_energy():
     def run(mass, throw):
         body = shapes.box(mass, [0.3, 0.2, 0.1])
         sol = rj.simulate(body, state, [0.0, 1.0], torques.Drag(0.1), throw=throw)
-        return sol.ys.omega[-1], sol.result == dfx.RESULTS.nonfinite
+        return sol.ys.omega[-1], sol.result == dfx.RESULTS.nonfinite_input
 
     omega, ill = jax.vmap(lambda mass: run(mass, False))(jnp.array([1.0, -1.0]))
     assert ill.tolist() == [False, True] and bool(jnp.isnan(omega[1]).all())
