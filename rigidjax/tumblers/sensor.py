@@ -135,7 +135,7 @@ def _scatter(noise: Array | None, values: np.ndarray) -> float:
 def _source(source: Any, name: str) -> Any:
     if callable(source):
         return _checks.function(source, name, "of time to (3,)")
-    shape = np.shape(source)
+    shape = _checks.numbers(source, name).shape
     if len(shape) == 2 and shape[1] == 3:
         raise ValueError(
             f"{name}: wanted a direction (3,) or a function of time, got shape {shape}; one row "
