@@ -14,6 +14,7 @@ from rigidjax.exact._xla import fence, one_kernel, opaque_one
 from rigidjax.exact.complete_integrals import HalfPeriod, half_period
 from rigidjax.exact.components3 import Four, Triple
 from rigidjax.exact.jacobi_duplication import Elliptic, Modulus, duplicate, elliptic, until_rest
+from rigidjax.exact.sincos import sincos
 
 
 class Orbit(NamedTuple):
@@ -148,8 +149,7 @@ def from_functions(o: Orbit, f: Elliptic, u: Reduced, t: Scalar) -> tuple[Triple
     size = jnp.maximum(jnp.maximum(jnp.abs(b0), jnp.abs(b2)), jnp.abs(b3))
     b0, b2, b3 = fence((b0 / size, b2 / size, b3 / size), one)
     r = 1.0 / jnp.sqrt((b0 * b0 + b2 * b2 + b3 * b3) * (f.x * f.x + f.y * f.y))
-    angle = 0.5 * o.a * o.h * t - phase
-    sine, cosine = jnp.sin(angle), jnp.cos(angle)
+    sine, cosine = sincos(0.5 * o.a * o.h * t - phase)
     c, s = r * (cosine * f.x + sine * f.y), r * (sine * f.x - cosine * f.y)
     still = o.h <= 0
     c, s = fence((c, jnp.where(still, 0.0, s / jnp.where(still, 1.0, o.h))), one)

@@ -80,8 +80,9 @@ class Setting(NamedTuple):
 @one_kernel
 def set_up(tensor: Mat3, omega: Vec3) -> Setting:
     """Principal axes, and the orbit of the momentum in them."""
-    moments, axes = principal_frame(tensor)
-    momentum = fence(times(moments, into(axes, omega)), opaque_one(omega[0]))
+    one = opaque_one(tensor[0, 0])
+    moments, axes = fence(principal_frame(tensor), one)
+    momentum = fence(times(moments, into(axes, omega)), one)
     return Setting(axes, moments[:3], momentum, orbit(moments[:3], momentum))
 
 
@@ -102,7 +103,12 @@ def _motion_jvp(primals, tangents):
     first = _by_body(jnp.concatenate([tensor.ravel(), omega]), setting)
     out, (rates, thetas) = _each(lambda time: _body_slopes(tensor, omega, setting, time), t)
     change = first @ jnp.concatenate([d_tensor.ravel(), d_omega])
-    d_rate, theta = (m[..., :9] @ change + m[..., 9] * d_t[..., None] for m in (rates, thetas))
+    change = jnp.broadcast_to(change, (*t.shape, 9))
+    change = jnp.concatenate([change, d_t[..., None]], axis=-1)
+    d_rate, theta = (
+        jnp.stack([jnp.sum(row * change, axis=-1) for row in rows], axis=-1)
+        for rows in (rates, thetas)
+    )
     return out, (d_rate, _turning(out[1], theta))
 
 
@@ -123,7 +129,7 @@ def _values(s: Setting, t: Scalar) -> tuple[Vec3, Quat]:
     one = opaque_one(t)
     momentum, w, axis = fence((momentum, w, axis), one)
     rate = fence(tuple(p / i for p, i in zip(momentum, s.moments, strict=True)), one)
-    turn = jnp.stack([w, *out_of(s.axes, tuple(axis))])
+    turn = jnp.stack([w, *fence(out_of(s.axes, tuple(axis)), one)])
     return jnp.stack(out_of(s.axes, rate)), turn
 
 
@@ -143,11 +149,13 @@ def _by_body(body: Float[Array, "12"], s: Setting) -> Float[Array, "9 12"]:
 
 @one_kernel
 def _body_slopes(tensor: Mat3, omega: Vec3, s: Setting, t: Scalar):
-    moments, momentum = _in_axes(tensor, omega, s)
-    (out, (w, *axis)), rows = slopes(moments, momentum, t)
-    rate = out_of(s.axes, times(reciprocal(moments, momentum)[1], out))
+    one = opaque_one(t)
+    moments, momentum = fence(_in_axes(tensor, omega, s), one)
+    ((out, (w, *axis)), rows) = fence(slopes(moments, momentum, t), one)
+    rate = out_of(s.axes, fence(times(reciprocal(moments, momentum)[1], out), one))
     turn = jnp.stack([w, *out_of(s.axes, tuple(axis))])
-    in_body = jax.vmap(lambda *v: jnp.stack(out_of(s.axes, v)), out_axes=1)
+    # Rows, not matrices: to stack them costs a batch five times what they are.
+    in_body = jax.vmap(lambda *v: out_of(s.axes, v))
     return (jnp.stack(rate), turn), (in_body(*rows.rate), in_body(*rows.theta))
 
 
@@ -162,16 +170,18 @@ class Slopes(NamedTuple):
 @one_kernel
 def slopes(moments: Six, momentum: Triple, t: Scalar) -> tuple[tuple[Triple, Four], Slopes]:
     """What `flow` returns, and its derivatives."""
-    (out, turn), rows, g = first_order(moments, momentum, t)
+    one = opaque_one(t)
+    (out, turn), rows, g = fence(first_order(moments, momentum, t), one)
     _, k, energy2 = reciprocal(moments, momentum)
+    k, energy2 = fence((k, energy2), one)
     p1, p2, p3 = momentum
     h2 = p1 * p1 + p2 * p2 + p3 * p3
     still = jax.lax.stop_gradient(h2 * (k[0] * k[0]) * (t * t)) <= _STILL[t.dtype] ** 2
     r = 1.0 / jnp.where(still, 1.0, h2)
-    rate = times(k, momentum)
+    rate, r = fence((times(k, momentum), r), one)
     squares = (p1 * p1, p2 * p2, p3 * p3, p1 * p2, p1 * p3, p2 * p3)
     half = (0.5, 0.5, 0.5, 1.0, 1.0, 1.0)
-    weights = tuple(c * (t * a + b) for c, a, b in zip(half, squares, g, strict=True))
+    weights = fence(tuple(c * (t * a + b) for c, a, b in zip(half, squares, g, strict=True)), one)
 
     def column(e, change):
         e12, e23, o12, o13, o23, e1, e2, e3, e11, et = e
@@ -181,6 +191,7 @@ def slopes(moments: Six, momentum: Triple, t: Scalar) -> tuple[tuple[Triple, Fou
         across = cross(out, tuple(a - b for a, b in zip(back, change, strict=True)))
         along = sum(a * b for a, b in zip(weights, d_k, strict=True))
         along = along + t * sum(a * b for a, b in zip(rate, start, strict=True)) + energy2 * et
+        d_out, across, along = fence((d_out, across, along), one)
         theta = tuple(r * (a + b * along) for a, b in zip(across, out, strict=True))
         # At rest, to second order in time.
         faster = _sum(times(d_k, momentum), times(k, start))
@@ -189,7 +200,7 @@ def slopes(moments: Six, momentum: Triple, t: Scalar) -> tuple[tuple[Triple, Fou
         near = zip(faster, bent, times(k, out), strict=True)
         near = tuple(t * (a + 0.5 * t * b) + et * c for a, b, c in near)
         theta = tuple(jnp.where(still, a, b) for a, b in zip(near, theta, strict=True))
-        return d_out, theta, _sum(times(k, d_out), times(d_k, out))
+        return fence((d_out, theta, _sum(times(k, d_out), times(d_k, out))), one)
 
     return (out, turn), Slopes(*jax.vmap(column)(jnp.eye(10, dtype=t.dtype), rows))
 
