@@ -64,7 +64,7 @@ def _flow_jvp(primals, tangents):
     motion, rows = slopes(*primals)
     _, change = jax.jvp(inputs_of, primals[:2], tangents[:2])
     change = jnp.stack([*change, tangents[2]])
-    d_out, theta, _ = jax.tree.map(lambda row: row @ change, rows)
+    d_out, theta, _ = jax.tree.map(lambda row: jnp.sum(row * change), rows)
     return motion, (d_out, half_product(motion[1], theta))
 
 
@@ -102,7 +102,8 @@ def _motion_jvp(primals, tangents):
     # Two matrices, so that what is transposed is short: all else is compiled once.
     first = _by_body(jnp.concatenate([tensor.ravel(), omega]), setting)
     out, (rates, thetas) = _each(lambda time: _body_slopes(tensor, omega, setting, time), t)
-    change = first @ jnp.concatenate([d_tensor.ravel(), d_omega])
+    # Summed, not a product of matrices: on a GPU that is rounded to ten bits in float32.
+    change = jnp.sum(first * jnp.concatenate([d_tensor.ravel(), d_omega])[None], axis=-1)
     change = jnp.broadcast_to(change, (*t.shape, 9))
     change = jnp.concatenate([change, d_t[..., None]], axis=-1)
     d_rate, theta = (
