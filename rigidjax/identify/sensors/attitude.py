@@ -1,7 +1,9 @@
 """Sensors that see which way the body points or where its parts are."""
 
+import dataclasses
 from typing import Any, ClassVar
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -11,10 +13,9 @@ from rigidjax._types import HasAttitude, HasPose, Scalar, Vec3
 from rigidjax.identify.sensors.base import (
     AbstractSensor,
     SensorInput,
-    noise_of,
-    number_of,
-    place_of,
-    vector_of,
+    deviations,
+    optional,
+    required,
 )
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.linalg3 import cross, dot
@@ -40,13 +41,10 @@ class AttitudeSensor(AbstractSensor):
     components: ClassVar[int] = 3
     feels: ClassVar[type] = HasAttitude
     unit: ClassVar[str] = "rad"
-    noise: Float[Array, "3"] | None
-    mounting: Float[Array, "3"] | None
-    offset: Scalar | None
-
-    def __init__(self, noise: Any = None, *, mounting: Any = None, offset: Any = None):
-        self.noise, self.mounting = noise_of(noise), vector_of(mounting, "mounting")
-        self.offset = number_of(offset, "offset")
+    noise: Vec3 | None = eqx.field(converter=deviations(), default=None)
+    _: dataclasses.KW_ONLY
+    mounting: Vec3 | None = eqx.field(converter=optional("mounting"), default=None)
+    offset: Scalar | None = eqx.field(converter=optional("offset", ()), default=None)
 
     def error(self, now: SensorInput, reading: Array) -> Vec3:
         q = now.state.q
@@ -66,6 +64,13 @@ class AttitudeSensor(AbstractSensor):
         return wrong, (
             "the quaternion at index {index} is not unit; wanted (w, x, y, z) with the scalar first"
         )
+
+
+def _unit(world: Any) -> Vec3:
+    vector = required("world")(world)
+    length = jnp.sqrt(dot(vector, vector))
+    words = "world: wanted a direction, got a vector of length zero"
+    return vector / _checks.refuse(length, ~(length > 0), words)
 
 
 class Direction(AbstractSensor):
@@ -88,19 +93,11 @@ class Direction(AbstractSensor):
     components: ClassVar[int] = 2
     feels: ClassVar[type] = HasAttitude
     unit: ClassVar[str] = "rad"
-    world: Float[Array, "3"]
-    noise: Float[Array, "2"] | None
-    mounting: Float[Array, "3"] | None
-    offset: Scalar | None
-
-    def __init__(self, world: Any, noise: Any = None, *, mounting: Any = None, offset: Any = None):
-        vector = place_of(world, "world")
-        length = jnp.sqrt(dot(vector, vector))
-        words = "world: wanted a direction, got a vector of length zero"
-        length = _checks.refuse(length, ~(length > 0), words)
-        self.world, self.noise = vector / length, noise_of(noise, 2)
-        self.mounting = vector_of(mounting, "mounting")
-        self.offset = number_of(offset, "offset")
+    world: Vec3 = eqx.field(converter=_unit)
+    noise: Float[Array, "2"] | None = eqx.field(converter=deviations(2), default=None)
+    _: dataclasses.KW_ONLY
+    mounting: Vec3 | None = eqx.field(converter=optional("mounting"), default=None)
+    offset: Scalar | None = eqx.field(converter=optional("offset", ()), default=None)
 
     def error(self, now: SensorInput, reading: Array) -> Float[Array, "2"]:
         seen = self._seen(now)
@@ -160,14 +157,11 @@ class Marker(AbstractSensor):
     reading_shape: ClassVar[tuple[int, ...]] = (3,)
     components: ClassVar[int] = 3
     unit: ClassVar[str] = "m"
-    place: Float[Array, "3"]
-    noise: Float[Array, "3"] | None
-    origin: Float[Array, "3"] | None
-    offset: Scalar | None
-
-    def __init__(self, place: Any, noise: Any = None, *, origin: Any = None, offset: Any = None):
-        self.place, self.noise = place_of(place, "place"), noise_of(noise)
-        self.origin, self.offset = vector_of(origin, "origin"), number_of(offset, "offset")
+    place: Vec3 = eqx.field(converter=required("place"), default=None)
+    noise: Vec3 | None = eqx.field(converter=deviations(), default=None)
+    _: dataclasses.KW_ONLY
+    origin: Vec3 | None = eqx.field(converter=optional("origin"), default=None)
+    offset: Scalar | None = eqx.field(converter=optional("offset", ()), default=None)
 
     @property
     def feels(self) -> type:  # pyright: ignore[reportIncompatibleVariableOverride]
