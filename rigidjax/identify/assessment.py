@@ -18,15 +18,16 @@ from rigidjax.identify.quantities import charts, quantities as quantities_of
 from rigidjax.identify.real_bodies import of_charts
 from rigidjax.identify.residual import Noise
 from rigidjax.identify.result import Fit, Start
+from rigidjax.identify.several_bodies import in_a_row
 
 # A point so near to the least misfit, in standard deviations, is where a search was to end.
 AT_THE_END = 0.05
 
 
 @eqx.filter_jit
-def _bodies(problem: Problem, parameters: Parameters) -> Any:
+def _bodies(problem: Problem, parameters: Parameters) -> list[Any]:
     # As one program: outside of a trace each operation of JAX costs as much as a run of 100 steps.
-    return problem.bodies(parameters)
+    return in_a_row(problem.bodies(parameters))
 
 
 def assess(
@@ -55,8 +56,7 @@ def assess(
     # the noise is estimated from the best point, its cost is half the number of readings.
     margin = 10.0
     if any(sensor.noise is None for sensor in problem.records.sensors):
-        count = sum(r.sensor.components * int(r.seen.sum()) for r in problem.records.readings)
-        margin *= 2 * best_cost / count
+        margin *= 2 * best_cost / problem.records.size
     # Of autocorrelated errors there are the fewer.
     margin *= max(times.longest, 1.0)
 
@@ -75,9 +75,7 @@ def assess(
         if s.fits and s.converged and s.cost > best_cost + 0.01 * margin and elsewhere(s.parameters)
     ]
     doubts = [*interrupted, *seen.doubts]
-    found = _bodies(problem, value)
-    bodies = list(found.values()) if isinstance(found, dict) else [found]
-    unreal = of_charts(charts(problem), bodies)
+    unreal = of_charts(charts(problem), _bodies(problem, value))
     doubts += unreal
     if not any(start.fits for start in starts):
         doubts.append("no single start came near the best point")

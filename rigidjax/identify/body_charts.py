@@ -20,6 +20,7 @@ _PARTS = {
     "com": ("centre of mass", (7, 8, 9)),
     "inertia": ("inertia tensor", (1, 2, 3, 4, 5, 6)),
 }
+# Components of a tensor in the order of their names.
 COMPONENTS = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))
 
 

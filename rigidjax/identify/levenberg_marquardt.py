@@ -38,6 +38,11 @@ _BEYOND = 2
 STUCK = 1e12
 
 
+def _float(value: Any) -> np.ndarray:
+    # NumPy's: outside of a trace each conversion of JAX costs as much as a run of 100 steps.
+    return np.asarray(value, jnp.result_type(float))
+
+
 class Settings(eqx.Module):
     """How a search goes: arrays, so as not to compile again.
 
@@ -49,30 +54,12 @@ class Settings(eqx.Module):
     low enough to end at; 0 for none.
     """
 
-    tolerance: Any
-    damping: Any
-    steps: Any
-    aim: Any
-    level: Any
-    near: Any
-
-    def __init__(
-        self,
-        tolerance: float,
-        damping: float,
-        steps: int,
-        aim: float = 0.0,
-        level: float = 0.0,
-        near: float = 0.0,
-    ):
-        # NumPy's: outside of a trace each conversion of JAX costs as much as a run of 100 steps.
-        kind = jnp.result_type(float)
-        self.tolerance = np.asarray(tolerance, kind)
-        self.damping = np.asarray(damping, kind)
-        self.steps = np.asarray(steps, np.int32)
-        self.aim = np.asarray(aim, kind)
-        self.level = np.asarray(level, kind)
-        self.near = np.asarray(near, kind)
+    tolerance: Any = eqx.field(converter=_float)
+    damping: Any = eqx.field(converter=_float)
+    steps: Any = eqx.field(converter=lambda steps: np.asarray(steps, np.int32))
+    aim: Any = eqx.field(converter=_float, default=0.0)
+    level: Any = eqx.field(converter=_float, default=0.0)
+    near: Any = eqx.field(converter=_float, default=0.0)
 
 
 class Search(eqx.Module):

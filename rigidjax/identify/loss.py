@@ -1,7 +1,6 @@
 """How much an outlier counts."""
 
 import abc
-from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -90,13 +89,3 @@ class Huber(AbstractLoss):
     def weight(self, error: Float[Array, " k"]) -> Scalar:
         s = jnp.sum(error**2) / self.scale**2
         return 1.0 / jnp.sqrt(jnp.maximum(s, 1.0))
-
-
-def shrink(loss: AbstractLoss | None, error: Float[Array, " k"]) -> Float[Array, " k"]:
-    """The error as least squares is to see it."""
-    return error if loss is None else loss.shrink(error)
-
-
-def weight(loss: AbstractLoss | None, error: Float[Array, " k"]) -> Any:
-    """The weight of the reading in the normal equations."""
-    return jnp.ones((), error.dtype) if loss is None else loss.weight(error)

@@ -1,5 +1,6 @@
 """What is known, what is free, and how far a guess is from the data."""
 
+import operator
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -28,7 +29,7 @@ from rigidjax.identify.prior import Entropic
 from rigidjax.identify.propagation import AbstractIntegrator, integrator_for
 from rigidjax.identify.recording import Recording
 from rigidjax.identify.reference_states import ReferenceStates, reference_of
-from rigidjax.identify.several_bodies import Bodies, has_mass
+from rigidjax.identify.several_bodies import Bodies, charts_of, has_mass
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.coupled import motion_of
 from rigidjax.motion.torques import AbstractForce, Sum, Torque
@@ -103,8 +104,7 @@ class Problem(eqx.Module):
         if not recordings:
             raise ValueError("Problem: wanted at least one Recording, got an empty sequence")
         for item in recordings:
-            if not isinstance(item, Recording):
-                raise TypeError(f"Problem: wanted a Recording, got {type(item).__name__}")
+            _checks.instance(item, Recording, "Problem", wanted="a Recording")
             if not _checks.known((item.t, [reading.values for reading in item.readings])):
                 raise TypeError(
                     "recording: wanted known readings, got traced ones; make the Problem outside "
@@ -116,12 +116,12 @@ class Problem(eqx.Module):
                     "recording: wanted one, as Recording(t, …) makes it, got times and masks of "
                     f"shapes {sorted(lengths)}; of many give a sequence"
                 )
-        for one in chart.charts if isinstance(chart, Bodies) else (chart,):
-            if not isinstance(one, AbstractBodyChart):
-                raise TypeError(
-                    "Problem: wanted what of the body is free, such as Ratios() or "
-                    f"PrincipalRatios(), got {_named(one)}"
-                )
+        for one in charts_of(chart):
+            known = isinstance(one, Inertia | MassProperties)
+            hint = "a body that is known is Known(body)" if known else ""
+            hint = "was () forgotten?" if isinstance(one, type) else hint
+            wanted = "what of the body is free, such as Ratios() or PrincipalRatios()"
+            _checks.instance(one, AbstractBodyChart, "Problem", wanted=wanted, hint=hint)
         if isinstance(free, str):
             free = (free,)  # pyright: ignore[reportAssignmentType]
         _checks.instance(free, Sequence, "free", wanted="a sequence of Free(where, name)")
@@ -149,7 +149,7 @@ class Problem(eqx.Module):
         elif not isinstance(apart, bool):
             self.noise_groups, _ = grouped(apart, of, "noise_each")
         self.slots = find(free, recordings[0], of)
-        for one in chart.charts if isinstance(chart, Bodies) else (chart,):
+        for one in charts_of(chart):
             for slot in self.slots:
                 if slot.name in (*one.log_names, *one.plain_names, "Ωx", "Ωy", "Ωz"):
                     raise ValueError(
@@ -208,26 +208,11 @@ class Problem(eqx.Module):
             )
         else:
             vector = _numbers(self.body, body)
-        shared, each = [], []
-        for slot in self.slots:
-            size = jnp.shape(slot.read(self.records))[1:]
-            if not slot.each:
-                some = () if slot.groups is None else (len(slot.labels),)
-                shared.append(_zeros(*some, *size))
-            if slot.each or slot.spread is not None:
-                each.append(_zeros(self.count, *size))
-        nothing = _zeros(self.count, 3)
-        return Parameters(
-            vector,
-            tuple(shared),
-            Own(
-                nothing if self.rung is Rigid else None,
-                nothing if self.rung is Rigid else None,
-                None if self.rung is Spin else nothing,
-                nothing,
-                tuple(each),
-            ),
-        )
+        zeros = ([_zeros(*shape) for shape in shapes] for shapes in _shapes(self).values())
+        _, shared, *state, each = zeros
+        firsts: Any = [part[0] if part else None for part in state]
+        own = Own(*firsts, each=tuple(each))
+        return Parameters(vector, tuple(shared), own)
 
     def unpack(self, parameters: Parameters) -> tuple[Any, Any]:
         """The body and the first state that the parameters stand for.
@@ -330,25 +315,8 @@ def fits(problem: Problem, parameters: Parameters) -> Parameters:
     one_problem(problem)
     hint = "problem.start(body) makes them"
     _checks.instance(parameters, Parameters, "parameters", hint=hint)
-    own, each = parameters.own, (problem.count, 3)
-    shared, alone = [], []
-    for slot in problem.slots:
-        size = jnp.shape(slot.read(problem.records))[1:]
-        if not slot.each:
-            shared.append(size if slot.groups is None else (len(slot.labels), *size))
-        if slot.each or slot.spread is not None:
-            alone.append((problem.count, *size))
-    wanted = {
-        "body": [(problem.body.size,)],
-        "shared": shared,
-        "own.place": [each] if problem.rung is Rigid else [],
-        "own.speed": [each] if problem.rung is Rigid else [],
-        "own.turn": [] if problem.rung is Spin else [each],
-        "own.spin": [each],
-        "own.each": alone,
-    }
-    found = (parameters.body, parameters.shared, own.place, own.speed, own.turn, own.spin, own.each)
-    for (name, shapes), part in zip(wanted.items(), found, strict=True):
+    for name, shapes in _shapes(problem).items():
+        part = operator.attrgetter(name)(parameters)
         numbers = [_checks.numbers(leaf, f"parameters.{name}") for leaf in jax.tree.leaves(part)]
         if [leaf.shape for leaf in numbers] != shapes:
             raise ValueError(
@@ -364,6 +332,26 @@ def fits(problem: Problem, parameters: Parameters) -> Parameters:
             if _checks.known(leaf):
                 _checks.finite(leaf, f"parameters.{name}")
     return parameters
+
+
+def _shapes(problem: Problem) -> dict[str, list[tuple[int, ...]]]:
+    """The shapes of the arrays of each part of the problem's `Parameters`."""
+    shared, alone, each = [], [], (problem.count, 3)
+    for slot in problem.slots:
+        size = jnp.shape(slot.read(problem.records))[1:]
+        if not slot.each:
+            shared.append(size if slot.groups is None else (len(slot.labels), *size))
+        if slot.each or slot.spread is not None:
+            alone.append((problem.count, *size))
+    return {
+        "body": [(problem.body.size,)],
+        "shared": shared,
+        "own.place": [each] if problem.rung is Rigid else [],
+        "own.speed": [each] if problem.rung is Rigid else [],
+        "own.turn": [] if problem.rung is Spin else [each],
+        "own.spin": [each],
+        "own.each": alone,
+    }
 
 
 class Links(eqx.Module):
@@ -440,14 +428,6 @@ def _firsts(slot: Slot) -> Array:
     return jnp.argmax(slot.groups[None, :] == rows[:, None], axis=1)
 
 
-def _named(thing: Any) -> str:
-    if isinstance(thing, Inertia | MassProperties):
-        return f"{type(thing).__name__}; a body that is known is Known(body)"
-    if isinstance(thing, type):
-        return f"the class {thing.__name__}; was () forgotten?"
-    return type(thing).__name__
-
-
 def _with(recording: Recording, torque: Torque) -> Recording:
     if recording.torque is not None:
         raise ValueError(
@@ -464,7 +444,7 @@ def _rung(recording: Recording, body: AbstractBodyChart | Bodies) -> type:
     parts = law.parts if isinstance(law, Sum) else (law,)
     forced = any(isinstance(part, AbstractForce) for part in parts)
     if HasPose in felt or forced:
-        for chart in body.charts if isinstance(body, Bodies) else (body,):
+        for chart in charts_of(body):
             if not has_mass(chart):
                 raise ValueError(
                     "Problem: a sensor or force needs a body that moves, whose mass is known or "

@@ -7,7 +7,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from rigidjax.identify.jacobian import all_errors
-from rigidjax.identify.loss import shrink, weight
 from rigidjax.identify.parameters import Parameters
 from rigidjax.identify.problem import Problem
 from rigidjax.identify.reference_states import ReferenceStates
@@ -61,12 +60,8 @@ def residuals(parameters: Parameters, args: Any) -> Any:
     **Arguments:** `parameters`; `args` the problem, the noise of each sensor, and weights (R, T)
     of the times.
     """
-    return assembled(parameters, args, *all_errors(parameters, args[0]))
-
-
-def assembled(parameters: Parameters, args: Any, errors: tuple, ends: Any) -> Any:
-    """`residuals` of errors and last states that are known."""
     problem, noise, weights = args
+    errors, ends = all_errors(parameters, problem)
     return seen(problem, errors, noise, weights), beside(parameters, problem, ends)
 
 
@@ -74,10 +69,9 @@ def seen(problem: Problem, errors: tuple, noise: Noise, weights: Array) -> tuple
     """The readings' residuals (R, T, k) as least squares is to see them."""
     read = []
     for scaled in whitened(problem, errors, noise):
-        shrunk = scaled
         if problem.loss is not None:
-            shrunk = jax.vmap(jax.vmap(lambda e: shrink(problem.loss, e)))(scaled)
-        read.append(shrunk * weights[..., None])
+            scaled = jax.vmap(jax.vmap(problem.loss.shrink))(scaled)
+        read.append(scaled * weights[..., None])
     return tuple(read)
 
 
@@ -128,6 +122,8 @@ def weights_of(problem: Problem, errors: tuple, noise: Noise) -> tuple[Float[Arr
     out = []
     scaled = whitened(problem, errors, noise)
     for reading, e in zip(problem.records.readings, scaled, strict=True):
-        each = jax.vmap(jax.vmap(lambda x: weight(problem.loss, x)))(e)
+        each = jnp.ones(e.shape[:-1], e.dtype)
+        if problem.loss is not None:
+            each = jax.vmap(jax.vmap(problem.loss.weight))(e)
         out.append(jnp.where(reading.mask, each, 0.0))
     return tuple(out)

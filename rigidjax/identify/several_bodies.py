@@ -126,6 +126,21 @@ def matter(
     return body.body(vector, which)
 
 
+def charts_of(body: Any) -> tuple[Any, ...]:
+    """The charts of a problem's body or bodies."""
+    return body.charts if isinstance(body, Bodies) else (body,)
+
+
+def in_a_row(bodies: Any) -> list[Any]:
+    """The bodies of `Problem.bodies`, of one or of several."""
+    return list(bodies.values()) if isinstance(bodies, dict) else [bodies]
+
+
+def tensor_of(body: Inertia | MassProperties) -> Float[Array, "3 3"]:
+    """The inertia tensor of a body, about its centre of mass if it has one, kg m²."""
+    return (body.inertia if isinstance(body, MassProperties) else body).tensor
+
+
 def has_mass(chart: AbstractBodyChart) -> bool:
     """Whether the chart's bodies have a mass."""
     sample: Any = eqx.filter_eval_shape(chart.body, jnp.zeros(chart.size))

@@ -349,9 +349,8 @@ def estimate_noise(problem: Problem, errors: tuple, noise: Noise, parameters: Pa
     parameters is taken off the number of errors.
     """
     free = ravel_pytree(parameters)[0].size
-    total = sum(int(r.seen.sum()) * r.sensor.components for r in problem.records.readings)
     weights = weights_of(problem, errors, noise)
-    share = max(1.0 - free / total, 0.1)
+    share = max(1.0 - free / problem.records.size, 0.1)
     count = problem.count
     groups = np.zeros(count, int) if problem.noise_groups is None else problem.noise_groups
     groups = np.asarray(groups)

@@ -16,7 +16,7 @@ from rigidjax.identify.checkpoint import Tried
 from rigidjax.identify.parameters import Parameters, numbered
 from rigidjax.identify.problem import Problem
 from rigidjax.identify.residual import Noise
-from rigidjax.identify.search import fresh, settle
+from rigidjax.identify.search import again
 
 # Rounds, and the relative change at which they end; a width that falls below so much of the first
 # one is zero.
@@ -31,15 +31,13 @@ def with_widths(
     wanted = [index for index, slot in enumerate(problem.slots) if slot.estimated]
     if not wanted:
         return problem, best
-    whole = jnp.ones_like(problem.records.t)
     least = _LEAST * _widths(problem)[wanted]
     for _ in range(_ROUNDS):
         before = _widths(problem)[wanted]
         found = np.maximum(_expected(problem, best.parameters, noise)[wanted], least)
         new = [jnp.asarray(width) for width in found]
         problem = eqx.tree_at(lambda p: [p.slots[i].spread for i in wanted], problem, new)
-        near = fresh(best.parameters)
-        best = settle(near, problem, noise, whole, tolerance, max_steps, near=True)
+        best = again(best, problem, noise, tolerance, max_steps)
         if (np.abs(found - before) < _SETTLED * before).all() or (found <= least).all():
             break
     return problem, best

@@ -156,17 +156,14 @@ class Marker(AbstractSensor):
 
     reading_shape: ClassVar[tuple[int, ...]] = (3,)
     components: ClassVar[int] = 3
+    # A body on a pivot need not move.
+    feels: ClassVar[Any] = property(lambda self: HasPose if self.origin is None else HasAttitude)
     unit: ClassVar[str] = "m"
     place: Vec3 = eqx.field(converter=required("place"), default=None)
     noise: Vec3 | None = eqx.field(converter=deviations(), default=None)
     _: dataclasses.KW_ONLY
     origin: Vec3 | None = eqx.field(converter=optional("origin"), default=None)
     offset: Scalar | None = eqx.field(converter=optional("offset", ()), default=None)
-
-    @property
-    def feels(self) -> type:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """A body on a pivot need not move."""
-        return HasPose if self.origin is None else HasAttitude
 
     def error(self, now: SensorInput, reading: Array) -> Vec3:
         state = now.state

@@ -1,7 +1,7 @@
 """Sensors that read a vector in their own axes: rate gyro, accelerometer, magnetometer."""
 
 import dataclasses
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -44,6 +44,8 @@ class Gyro(AbstractSensor):
 
     reading_shape: ClassVar[tuple[int, ...]] = (3,)
     components: ClassVar[int] = 3
+    # Only gravity needs the attitude.
+    feels: ClassVar[Any] = property(lambda self: HasSpin if self.gravity is None else HasAttitude)
     unit: ClassVar[str] = "rad/s"
     noise: Vec3 | None = eqx.field(converter=deviations(), default=None)
     _: dataclasses.KW_ONLY
@@ -67,11 +69,6 @@ class Gyro(AbstractSensor):
                 raise ValueError(f"Gyro: {wanted}")
         elif self.place is None:
             self.place = jnp.zeros(3)
-
-    @property
-    def feels(self) -> type:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Only gravity needs the attitude."""
-        return HasSpin if self.gravity is None else HasAttitude
 
     def error(self, now: SensorInput, reading: Array) -> Vec3:
         seen = shown(now.state.omega, self.bias, self.scale, self.mounting, self.skew)
@@ -114,6 +111,8 @@ class Accelerometer(AbstractSensor):
 
     reading_shape: ClassVar[tuple[int, ...]] = (3,)
     components: ClassVar[int] = 3
+    # Only gravity needs the attitude.
+    feels: ClassVar[Any] = property(lambda self: HasSpin if self.gravity is None else HasAttitude)
     unit: ClassVar[str] = "m/s²"
     noise: Vec3 | None = eqx.field(converter=deviations(), default=None)
     _: dataclasses.KW_ONLY
@@ -126,11 +125,6 @@ class Accelerometer(AbstractSensor):
     limit: Vec3 | None = eqx.field(converter=full_scale, default=None)
     offset: Scalar | None = eqx.field(converter=optional("offset", ()), default=None)
     lowpass: LowPass | None = eqx.field(converter=lowpass_of, default=None)
-
-    @property
-    def feels(self) -> type:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Only gravity needs the attitude."""
-        return HasSpin if self.gravity is None else HasAttitude
 
     def error(self, now: SensorInput, reading: Array) -> Vec3:
         force = specific_force(now, self.place, self.gravity)
