@@ -7,7 +7,7 @@ import numpy as np
 
 from rigidjax.identify.full_scale import at_limit
 from rigidjax.identify.problem import Problem
-from rigidjax.identify.uncertainty import Linearised, Times
+from rigidjax.identify.uncertainty import Linearised, Times, scatter
 
 # Errors are called autocorrelated where white ones would look so once in so many fits.
 RARE = 1e-5
@@ -150,14 +150,7 @@ def _white(e: np.ndarray, kept: np.ndarray, given: bool) -> bool:
 
 def _over_scatter(error: np.ndarray, kept: np.ndarray) -> float:
     """The errors over what their second differences say is their scatter."""
-    all_, apart, count, triples = 0.0, 0.0, 0, 0
-    for channel in range(error.shape[-1]):
-        for x, seen in zip(error[..., channel], kept[..., channel], strict=True):
-            row = x[seen]
-            bend = row[2:] - 2.0 * row[1:-1] + row[:-2]
-            all_, count = all_ + float(row @ row), count + row.size
-            apart, triples = apart + float(bend @ bend), triples + bend.size
-    if not apart > 0:
-        return np.inf
-    # The second difference of white noise has six times its variance.
-    return float(np.sqrt(all_ / count / (apart / triples / 6.0)))
+    channels = [np.moveaxis(x, -1, 0).reshape(-1, x.shape[1]) for x in (error, kept)]
+    rows = [row[seen] for row, seen in zip(*channels, strict=True)]
+    apart = scatter(rows)
+    return float(np.sqrt(np.mean(np.concatenate(rows) ** 2) / apart)) if apart > 0 else np.inf

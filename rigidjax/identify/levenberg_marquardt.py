@@ -11,7 +11,7 @@ from jax import lax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
-from rigidjax.identify.jacobian import along, with_blocks
+from rigidjax.identify.jacobian import along, normal_matrix, with_blocks
 from rigidjax.identify.parameters import Parameters, places
 from rigidjax.identify.problem import Problem
 from rigidjax.identify.propagation import FirstPart, FixedSteps
@@ -105,15 +105,12 @@ def descend(
         here = restore(point)
         found = with_blocks(here, problem)
         (errors, ends), (slopes, end_slopes) = found
-        total, gram = jnp.zeros((), kind), jnp.zeros((number + 1, number + 1), kind)
-        slope = jnp.zeros(number + 1, kind)
-        for e, rows in seen_rows(problem, errors, slopes, noise, weights):
+        total, slope = jnp.zeros((), kind), jnp.zeros(number + 1, kind)
+        read, blocks = seen_rows(problem, errors, slopes, noise, weights)
+        for e, rows in zip(read, blocks, strict=True):
             total = total + jnp.sum(e**2)
-            gram = gram.at[where[:, :, None], where[:, None, :]].add(
-                jnp.einsum("rtki,rtkj->rij", rows, rows)
-            )
             slope = slope.at[where].add(jnp.einsum("rtki,rtk->ri", rows, e))
-        gram, slope = gram[:-1, :-1], slope[:-1]
+        gram, slope = normal_matrix(blocks, where, number), slope[:-1]
         e, rows = beside_rows(problem, point, restore, ends, end_slopes)
         if e.size:
             total = total + jnp.sum(e**2)
@@ -181,16 +178,7 @@ def search(
             (now.trial, cost, gram, slope),
             (now.point, now.cost, now.gram, now.slope),
         )
-        felt = jnp.diagonal(gram)
-        floor = jnp.maximum(1e-12 * jnp.max(felt), 1e-300)
-        scale = jnp.maximum(jnp.maximum(felt, floor), made)
-        # Columns of length one: the factor of Cholesky loses no digits to units.
-        root = jnp.sqrt(jnp.maximum(felt, floor))
-        matrix = gram / (root[:, None] * root[None, :]) + jnp.diag(damping * scale / root**2)
-        factor = jax.scipy.linalg.cho_factor(matrix, lower=True)
-        move = -jax.scipy.linalg.cho_solve(factor, slope / root) / root
-        far = jnp.max(jnp.abs(move) * made)
-        move = move * jnp.minimum(1.0, LONGEST / jnp.maximum(far, 1e-300))
+        move, root = _damped(gram, slope, made, damping)
         sound = jnp.isfinite(move).all()
         move = jnp.where(sound, move, 0.0)
         hoped = -(slope @ move) - 0.5 * move @ (gram @ move)
@@ -238,6 +226,20 @@ def search(
         jnp.asarray(False),
     )
     return lax.while_loop(lambda now: ~now.done & (now.taken <= settings.steps), step, begun)
+
+
+def _damped(gram: Array, slope: Array, made: Array, damping: Array) -> tuple[Array, Array]:
+    """The step (n,), and the root of the diagonal of the normal matrix (n,)."""
+    felt = jnp.diagonal(gram)
+    felt = jnp.maximum(felt, jnp.maximum(1e-12 * jnp.max(felt), 1e-300))
+    # Columns of length one: the factor of Cholesky loses no digits to units.
+    root = jnp.sqrt(felt)
+    damped = damping * jnp.maximum(felt, made) / root**2
+    matrix = gram / (root[:, None] * root[None, :]) + jnp.diag(damped)
+    factor = jax.scipy.linalg.cho_factor(matrix, lower=True)
+    move = -jax.scipy.linalg.cho_solve(factor, slope / root) / root
+    far = jnp.max(jnp.abs(move) * made)
+    return move * jnp.minimum(1.0, LONGEST / jnp.maximum(far, 1e-300)), root
 
 
 def _nothing(problem: Problem, start: Parameters, columns: int, kind: Any) -> Any:

@@ -42,7 +42,7 @@ class Entropic(eqx.Module):
         if isinstance(body, MassProperties) and isinstance(self.guess, MassProperties):
             here, there = _pseudo_inertia(body), _pseudo_inertia(self.guess)
         else:
-            here, there = _second_moment(body), _second_moment(self.guess)
+            here, there = body.second_moment, self.guess.second_moment
         if not scaled:
             here, there = here / jnp.trace(here), there / jnp.trace(there)
         root = jnp.linalg.cholesky(there)
@@ -65,17 +65,8 @@ def _root(c: Float[Array, " n"]) -> Float[Array, " n"]:
     return jnp.where(near, x * jnp.sqrt(2.0 * series), exact)
 
 
-def _second_moment(body: Inertia | MassProperties) -> Float[Array, "3 3"]:
-    return body.second_moment
-
-
 def _pseudo_inertia(body: MassProperties) -> Float[Array, "4 4"]:
     m, c = body.mass, body.com
     upper = body.second_moment + m * c[:, None] * c[None, :]
     side = (m * c)[:, None]
-    return jnp.concatenate(
-        [
-            jnp.concatenate([upper, side], axis=1),
-            jnp.concatenate([side.T, m.reshape(1, 1)], axis=1),
-        ]
-    )
+    return jnp.block([[upper, side], [side.T, m]])

@@ -24,7 +24,7 @@ from rigidjax.identify.jacobian import (
     states_of_one,
 )
 from rigidjax.identify.loss import AbstractLoss
-from rigidjax.identify.parameters import Own, Parameters, local
+from rigidjax.identify.parameters import Own, Parameters, by_slot, local
 from rigidjax.identify.prior import Entropic
 from rigidjax.identify.propagation import AbstractIntegrator, integrator_for
 from rigidjax.identify.recording import Recording
@@ -243,16 +243,14 @@ class Problem(eqx.Module):
         of those with a `spread` the shared value, and each recording's under "its name, own".
         """
         scenes = self.scenes(parameters)
-        of_all = iter(parameters.shared)
         out = {}
-        for slot in self.slots:
+        for slot, step, _ in by_slot(self, parameters):
             value = slot.read(scenes)
-            if slot.each:
+            if step is None:
                 out[slot.name] = value
                 continue
-            step, start = next(of_all), slot.read(self.records)
             first = 0 if slot.groups is None else _firsts(slot)
-            out[slot.name] = slot.move(start[first], step)
+            out[slot.name] = slot.move(slot.read(self.records)[first], step)
             if slot.spread is not None:
                 out[f"{slot.name}, own"] = value
         return out

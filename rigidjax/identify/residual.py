@@ -1,5 +1,6 @@
 """From errors to what least squares makes small: noise, saturation, losses, priors, joints."""
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -7,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from rigidjax.identify.jacobian import all_errors
-from rigidjax.identify.parameters import Parameters
+from rigidjax.identify.parameters import Parameters, by_slot
 from rigidjax.identify.problem import Problem
 from rigidjax.identify.reference_states import ReferenceStates
 from rigidjax.identify.several_bodies import Bodies
@@ -77,28 +78,30 @@ def seen(problem: Problem, errors: tuple, noise: Noise, weights: Array) -> tuple
 
 def seen_rows(
     problem: Problem, errors: tuple, blocks: tuple, noise: Noise, weights: Array
-) -> list[tuple[Array, Array]]:
-    """For each sensor, `seen` and its derivatives (R, T, k, n), of those of the errors."""
+) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
+    """`seen`, and its derivatives (R, T, k, n) for each sensor, of those of the errors."""
 
     def of(errors: tuple) -> tuple[Array, ...]:
         return seen(problem, errors, noise, weights)
 
+    return with_rows(of, errors, blocks)
+
+
+def with_rows(of: Callable[[tuple], tuple], errors: tuple, blocks: tuple) -> tuple[tuple, tuple]:
+    """`of(errors)`, and its derivatives (R, T, k, n) of those of the errors, `blocks`."""
     # What each reading says depends on its own error alone: a product of small matrices.
     read, push = jax.linearize(of, errors)
-    rows = jax.vmap(push, in_axes=-1, out_axes=-1)(blocks)
-    return list(zip(read, rows, strict=True))
+    return read, jax.vmap(push, in_axes=-1, out_axes=-1)(blocks)
 
 
 def beside(parameters: Parameters, problem: Problem, ends: Any) -> tuple[Array, ...]:
     """Residuals that are no readings: priors, and joints between pieces of one recording."""
     out = []
-    shared, each = iter(parameters.shared), iter(parameters.own.each)
-    for slot in problem.slots:
-        step = next(each if slot.each else shared)
+    for slot, shared, each in by_slot(problem, parameters):
         if slot.prior is not None:
-            out.append(step / slot.prior)
+            out.append((each if shared is None else shared) / slot.prior)
         if slot.spread is not None:
-            out.append(next(each) / slot.spread)
+            out.append(each / slot.spread)
     if problem.prior is not None:
         assert not isinstance(problem.body, Bodies)
         body = problem.body.body(parameters.body)

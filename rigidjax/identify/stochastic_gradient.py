@@ -48,11 +48,8 @@ class Descent(eqx.Module):
     def __init__(self, optimiser: "optax.GradientTransformation", *, steps: int, batch: int):
         import optax
 
-        if not isinstance(optimiser, optax.GradientTransformation):
-            raise TypeError(
-                "Descent: wanted an optimiser of optax such as optax.adam(1e-2), got "
-                f"{type(optimiser).__name__}"
-            )
+        wanted = "an optimiser of optax such as optax.adam(1e-2)"
+        _checks.instance(optimiser, optax.GradientTransformation, "Descent", wanted=wanted)
         self.optimiser = optimiser
         self.steps, self.batch = _checks.whole(steps, "steps", 1), _checks.whole(batch, "batch", 1)
 

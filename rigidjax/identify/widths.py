@@ -13,7 +13,7 @@ import numpy as np
 
 from rigidjax.identify import uncertainty
 from rigidjax.identify.checkpoint import Tried
-from rigidjax.identify.parameters import Parameters, numbered
+from rigidjax.identify.parameters import Parameters, by_slot, numbered
 from rigidjax.identify.problem import Problem
 from rigidjax.identify.residual import Noise
 from rigidjax.identify.search import again
@@ -52,14 +52,11 @@ def _expected(problem: Problem, parameters: Parameters, noise: Noise) -> np.ndar
     """The root mean square of each one's deviations, what is not known of them included."""
     linear = uncertainty.linearise(problem, parameters, noise)
     variance = np.diag(uncertainty.spread(linear, _WHITE).seen)
-    values, places = iter(parameters.own.each), iter(numbered(parameters).own.each)
+    values, places = (by_slot(problem, of) for of in (parameters, numbered(parameters)))
     out = np.ones(len(problem.slots))
     for index, slot in enumerate(problem.slots):
-        if slot.each:
-            next(values)
-            next(places)
         if slot.spread is not None:
-            deviation, where = np.asarray(next(values)), np.ravel(next(places)).astype(int)
+            deviation, where = np.asarray(values[index][2]), np.ravel(places[index][2]).astype(int)
             out[index] = np.sqrt(np.mean(deviation**2) + np.mean(variance[where]))
     return out
 
