@@ -126,14 +126,7 @@ def _with_shared(problem: Problem, found: Fit) -> Problem:
         if slot.each:
             own.append(slot)
         elif slot.spread is not None:
-            own.append(
-                eqx.tree_at(
-                    lambda s: (s.prior, s.spread),
-                    dataclasses.replace(slot, each=True),
-                    (slot.spread, None),
-                    is_leaf=lambda node: node is None,
-                )
-            )
+            own.append(dataclasses.replace(slot, each=True, prior=slot.spread, spread=None))
     return eqx.tree_at(
         lambda p: (p.body, p.records, p.slots), problem, (Known(found.body), records, tuple(own))
     )

@@ -78,11 +78,7 @@ class Free(eqx.Module):
 
 
 def shares(each: Any, name: str) -> bool | str | tuple[Any, ...]:
-    """`each` if it says who shares a number. **Raises** `TypeError`, `ValueError` for others.
-
-    >>> shares(["heavy", "light", "heavy"], "each")
-    ('heavy', 'light', 'heavy')
-    """
+    """`each` if it says who shares a number. **Raises** `TypeError`, `ValueError` for others."""
     if isinstance(each, bool):
         return each
     if isinstance(each, str):

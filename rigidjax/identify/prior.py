@@ -9,6 +9,10 @@ from rigidjax._types import Scalar
 from rigidjax.body.inertia import Inertia, MassProperties
 
 
+def _weight(value: float) -> Scalar:
+    return jnp.asarray(_checks.positive(value, "weight"), jnp.result_type(float))
+
+
 class Entropic(eqx.Module):
     """The entropic prior `w D(body, guess)`, D the log-determinant divergence of two bodies.
 
@@ -30,12 +34,10 @@ class Entropic(eqx.Module):
     """
 
     guess: Inertia | MassProperties
-    weight: Scalar
+    weight: Scalar = eqx.field(converter=_weight)
 
-    def __init__(self, guess: Inertia | MassProperties, weight: float):
-        self.guess = _checks.single(guess, (Inertia, MassProperties), "guess")
-        weight = _checks.positive(weight, "weight")
-        self.weight = jnp.asarray(weight, jnp.result_type(float))
+    def __check_init__(self) -> None:
+        _checks.single(self.guess, (Inertia, MassProperties), "guess")
 
     def residuals(self, body: Inertia | MassProperties, scaled: bool = True) -> Float[Array, " n"]:
         """Numbers whose squares add up to `2 w D`; `scaled` false compares shapes alone."""

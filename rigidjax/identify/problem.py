@@ -101,21 +101,7 @@ class Problem(eqx.Module):
         noise_each: bool | str | Sequence[Any] = False,
     ):
         recordings, chart, of = _sorted(recording, body)
-        if not recordings:
-            raise ValueError("Problem: wanted at least one Recording, got an empty sequence")
-        for item in recordings:
-            _checks.instance(item, Recording, "Problem", wanted="a Recording")
-            if not _checks.known((item.t, [reading.values for reading in item.readings])):
-                raise TypeError(
-                    "recording: wanted known readings, got traced ones; make the Problem outside "
-                    "of jax.jit, jax.grad and jax.vmap, and give it to them as an argument"
-                )
-            lengths = {item.t.shape, *(reading.mask.shape for reading in item.readings)}
-            if len(lengths) > 1 or item.t.ndim != 1:
-                raise ValueError(
-                    "recording: wanted one, as Recording(t, …) makes it, got times and masks of "
-                    f"shapes {sorted(lengths)}; of many give a sequence"
-                )
+        _are_recordings(recordings)
         for one in charts_of(chart):
             known = isinstance(one, Inertia | MassProperties)
             hint = "a body that is known is Known(body)" if known else ""
@@ -152,9 +138,8 @@ class Problem(eqx.Module):
         for one in charts_of(chart):
             for slot in self.slots:
                 if slot.name in (*one.log_names, *one.plain_names, "Ωx", "Ωy", "Ωz"):
-                    raise ValueError(
-                        f"Free {slot.name!r}: a quantity of the body has this name; give another"
-                    )
+                    wanted = "a quantity of the body has this name; give another"
+                    raise ValueError(f"Free {slot.name!r}: {wanted}")
         self.rung = _rung(recordings[0], chart)
         self.reference = reference_of(recordings, self.rung)
         if integrator is None and self.records.torque is not None:
@@ -279,11 +264,6 @@ def one_problem(problem: Any) -> Problem:
     """`problem`, if it is one as its constructor makes it.
 
     **Raises:** `TypeError` for another kind of thing, `ValueError` for arrays of other shapes.
-
-    >>> import rigidjax as rj
-    >>> record = rj.identify.Recording([0.0, 1.0], (rj.identify.Gyro(), [[1.0, 0, 0]] * 2))
-    >>> one_problem(Problem(record, rj.identify.Ratios())).count
-    1
     """
     _checks.instance(problem, Problem, "problem")
     records, rate = problem.records, problem.reference.rate
@@ -303,12 +283,6 @@ def fits(problem: Problem, parameters: Parameters) -> Parameters:
 
     **Raises:** `TypeError` for another kind of thing or another dtype, `ValueError` for other
     shapes, and for NaN where it is known.
-
-    >>> import rigidjax as rj
-    >>> record = rj.identify.Recording([0.0, 1.0], (rj.identify.Gyro(), [[1.0, 0, 0]] * 2))
-    >>> problem = Problem(record, rj.identify.Ratios())
-    >>> fits(problem, problem.start()).body.shape
-    (5,)
     """
     one_problem(problem)
     hint = "problem.start(body) makes them"
@@ -391,6 +365,24 @@ def _sorted(recording: Any, body: Any) -> tuple[list[Recording], Any, tuple[str,
         return [recording], body, ("",)
     rows = list(recording) if isinstance(recording, Sequence) else [recording]
     return rows, body, ("",) * len(rows)
+
+
+def _are_recordings(recordings: Sequence[Any]) -> None:
+    if not recordings:
+        raise ValueError("Problem: wanted at least one Recording, got an empty sequence")
+    for item in recordings:
+        _checks.instance(item, Recording, "Problem", wanted="a Recording")
+        if not _checks.known((item.t, [reading.values for reading in item.readings])):
+            raise TypeError(
+                "recording: wanted known readings, got traced ones; make the Problem outside "
+                "of jax.jit, jax.grad and jax.vmap, and give it to them as an argument"
+            )
+        lengths = {item.t.shape, *(reading.mask.shape for reading in item.readings)}
+        if len(lengths) > 1 or item.t.ndim != 1:
+            raise ValueError(
+                "recording: wanted one, as Recording(t, …) makes it, got times and masks of "
+                f"shapes {sorted(lengths)}; of many give a sequence"
+            )
 
 
 def _numbers(chart: AbstractBodyChart, body: Any) -> Float[Array, " chart"]:

@@ -81,9 +81,11 @@ def _end(
         inner, outer = outer, 2.0 * outer
         if outer > max(most, 4.0 * reach):
             return side * np.inf
-    steps: Any = brentq(growth, inner, outer, xtol=1e-2 * reach) if inner > 0 else None
-    if steps is None:
-        steps = brentq(lambda s: growth(s) if s > 0 else -(reach**2), 0.0, outer, xtol=1e-2 * reach)
+
+    def known(steps: float) -> float:
+        return growth(steps) if steps > 0 else -(reach**2)
+
+    steps: Any = brentq(known, inner, outer, xtol=1e-2 * reach)
     return middle + side * float(steps) * deviation
 
 

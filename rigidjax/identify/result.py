@@ -162,10 +162,6 @@ def one_fit(found: Any, name: str = "fit") -> Fit:
     """`found`, if it is one `Fit`, not many in one container.
 
     **Raises:** `TypeError` for another kind of thing, `ValueError` for leading axes.
-
-    >>> one_fit(3)
-    Traceback (most recent call last):
-    TypeError: ...
     """
     _checks.instance(found, Fit, name)
     if np.shape(found.chi2) != ():

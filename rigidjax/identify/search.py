@@ -61,7 +61,10 @@ def _descend(
     start: Parameters, problem: Problem, noise: Noise, weights: Array, settings: Settings
 ) -> tuple[Tried, Search]:
     value, end = descend(start, problem, noise, weights, settings)
-    return _safe(start, value, end.cost, end.converged), end
+    # A wild step can end in NaN: the start is then the better point.
+    lost = ~jnp.isfinite(end.cost)
+    value = jax.tree.map(lambda a, b: jnp.where(lost, b, a), value, start)
+    return Tried(value, jnp.where(lost, jnp.inf, end.cost), end.converged & ~lost), end
 
 
 def evaluate(parameters: Parameters, problem: Problem) -> Any:
@@ -90,19 +93,7 @@ def many(
     settings: Settings,
 ) -> Tried:
     """`least_squares` from many starts at once (a leading axis on `starts`)."""
-
-    def one(start: Parameters) -> Tried:
-        value, end = descend(start, problem, noise, weights, settings)
-        return _safe(start, value, end.cost, end.converged)
-
-    return jax.vmap(one)(starts)
-
-
-def _safe(start: Parameters, value: Parameters, cost: Array, done: Array) -> Tried:
-    # A wild step can end in NaN: the start is then the better point.
-    lost = ~jnp.isfinite(cost)
-    value = jax.tree.map(lambda a, b: jnp.where(lost, b, a), value, start)
-    return Tried(value, jnp.where(lost, jnp.inf, cost), done & ~lost)
+    return jax.vmap(lambda start: _descend(start, problem, noise, weights, settings)[0])(starts)
 
 
 def cost_of(parameters: Parameters, problem: Problem, noise: Noise) -> float:

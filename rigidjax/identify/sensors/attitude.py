@@ -47,23 +47,22 @@ class AttitudeSensor(AbstractSensor):
     offset: Scalar | None = eqx.field(converter=optional("offset", ()), default=None)
 
     def error(self, now: SensorInput, reading: Array) -> Vec3:
-        q = now.state.q
-        if self.mounting is not None:
-            q = quaternion.multiply(q, quaternion.exp(self.mounting))
+        q = _mounted(now.state.q, self.mounting)
         return quaternion.log(quaternion.multiply(quaternion.conjugate(q), reading))
 
     def reading_of(self, now: SensorInput, error: Vec3) -> Float[Array, "4"]:
         """The reading (4,) whose error (3,) rad is this one."""
-        q = now.state.q
-        if self.mounting is not None:
-            q = quaternion.multiply(q, quaternion.exp(self.mounting))
+        q = _mounted(now.state.q, self.mounting)
         return quaternion.multiply(q, quaternion.exp(error))
 
     def refusal(self, values: np.ndarray) -> tuple[np.ndarray, str]:
-        wrong = np.abs(np.linalg.norm(values, axis=1) - 1) > 1e-6
-        return wrong, (
-            "the quaternion at index {index} is not unit; wanted (w, x, y, z) with the scalar first"
-        )
+        wanted = "wanted (w, x, y, z) with the scalar first"
+        return _not_unit(values), f"the quaternion at index {{index}} is not unit; {wanted}"
+
+
+def _mounted(q: Array, mounting: Vec3 | None) -> Array:
+    """The attitude of a sensor's axes."""
+    return q if mounting is None else quaternion.multiply(q, quaternion.exp(mounting))
 
 
 def _unit(world: Any) -> Vec3:
@@ -126,8 +125,11 @@ class Direction(AbstractSensor):
         return seen
 
     def refusal(self, values: np.ndarray) -> tuple[np.ndarray, str]:
-        wrong = np.abs(np.linalg.norm(values, axis=1) - 1) > 1e-6
-        return wrong, "the direction at index {index} is not of length 1"
+        return _not_unit(values), "the direction at index {index} is not of length 1"
+
+
+def _not_unit(rows: np.ndarray) -> np.ndarray:
+    return np.abs(np.linalg.norm(rows, axis=1) - 1) > 1e-6
 
 
 def _across(line: Vec3) -> tuple[Vec3, Vec3]:
