@@ -30,6 +30,18 @@ def _bodies(problem: Problem, parameters: Parameters) -> list[Any]:
     return in_a_row(problem.bodies(parameters))
 
 
+def _margin(problem: Problem, best_cost: float, longest: float) -> float:
+    """By how much the misfit of a start may be above the best for it to explain the data, too.
+
+    Ten units of log-likelihood: a point further above the best is e¹⁰ times less likely. Where the
+    noise is estimated from the best point, its cost is half the number of readings. Of
+    autocorrelated errors there are the fewer.
+    """
+    guessed = any(sensor.noise is None for sensor in problem.records.sensors)
+    unit = 2 * best_cost / problem.records.size if guessed else 1.0
+    return 10.0 * unit * max(longest, 1.0)
+
+
 def assess(
     problem: Problem,
     best: Tried,
@@ -52,23 +64,20 @@ def assess(
     free = ravel_pytree(value)[0].size
     seen = goodness(problem, linear, times, free)
     believable = not seen.poor
-    # Ten units of log-likelihood: a point further above the best is e¹⁰ times less likely. Where
-    # the noise is estimated from the best point, its cost is half the number of readings.
-    margin = 10.0
-    if any(sensor.noise is None for sensor in problem.records.sensors):
-        margin *= 2 * best_cost / problem.records.size
-    # Of autocorrelated errors there are the fewer.
-    margin *= max(times.longest, 1.0)
+    margin = _margin(problem, best_cost, times.longest)
 
     def elsewhere(other: Parameters) -> bool:
         # In one flat valley searches end apart, where no reading would tell them apart.
         away = ravel_pytree(other)[0] - ravel_pytree(value)[0]
         return float(np.sum((linear.rows @ np.asarray(away)) ** 2)) > 2 * margin
 
-    starts = []
-    for item in tried:
-        fits = believable and float(item.cost) <= best_cost + margin
-        starts.append(Start(item.parameters, float(item.cost), bool(item.converged), fits))
+    starts = [
+        Start(
+            item.parameters, cost, bool(item.converged), believable and cost <= best_cost + margin
+        )
+        for item in tried
+        for cost in (float(item.cost),)
+    ]
     rivals = [
         s
         for s in starts
@@ -80,21 +89,19 @@ def assess(
     if not any(start.fits for start in starts):
         doubts.append("no single start came near the best point")
     if not np.isfinite(best_cost):
-        status = "failed: no start gave a finite misfit"
-    elif believable and not done:
-        why = "; ".join(interrupted) or "max_steps reached"
-        ended = f"not converged, {why}; this is the best point found"
-        status = "failed: " + "; ".join((ended, *unreal))
+        words = "failed", "no start gave a finite misfit"
     elif not believable:
         units = "this is not the motion, or a unit is wrong (rad/s, m/s², m, s)"
-        status = "poor: " + "; ".join((*interrupted, *seen.poor, *unreal, units))
+        words = "poor", *interrupted, *seen.poor, *unreal, units
+    elif not done:
+        why = "; ".join(interrupted) or "max_steps reached"
+        words = "failed", f"not converged, {why}; this is the best point found", *unreal
     elif rivals:
         rival = f"{len(rivals)} of {len(starts)} starts fit as well elsewhere"
-        status = "ambiguous: " + "; ".join((rival, *doubts))
-    elif doubts:
-        status = "doubtful: " + "; ".join(doubts)
+        words = "ambiguous", rival, *doubts
     else:
-        status = "ok"
+        words = ("doubtful", *doubts) if doubts else ("ok",)
+    status = ": ".join((words[0], "; ".join(words[1:]))) if len(words) > 1 else words[0]
     return Fit(
         problem,
         value,

@@ -137,20 +137,16 @@ def _names(problem: Problem) -> list[list[tuple[str, str, bool]]]:
         of_all += [(f"{part}{name}", unit, False) for part in TENSOR]
     own, out = problem.start().own, []
     for axes in ("the world's", "the body's"):
-        rows = list(of_all)
-        for where in recording_names(problem):
-            if own.turn is not None:
-                rows += [
-                    (f"the first attitude about {axes} {k}{where}", "rad", False) for k in "xyz"
-                ]
-        for part, name, unit in ((own.place, "position", "m"), (own.speed, "velocity", "m/s")):
-            if part is not None:
-                rows += [
-                    (f"the first {name} {k}{where}", unit, False)
-                    for where in recording_names(problem)
-                    for k in "xyz"
-                ]
-        out.append(rows)
+        turn = (own.turn, f"attitude about {axes}", "rad")
+        parts = (turn, (own.place, "position", "m"), (own.speed, "velocity", "m/s"))
+        rows = [
+            (f"the first {name} {k}{where}", unit, False)
+            for part, name, unit in parts
+            if part is not None
+            for where in recording_names(problem)
+            for k in "xyz"
+        ]
+        out.append([*of_all, *rows])
     return out
 
 
