@@ -156,59 +156,6 @@ def search(
     """
     number, kind = start.size, start.dtype
 
-    def step(now: Search) -> Search:
-        found, cost, gram, slope = evaluated(now.trial)
-        finite = jnp.isfinite(cost) & jnp.isfinite(slope).all() & jnp.isfinite(gram).all()
-        first = now.taken == 0
-        better = finite & ((cost < now.cost) | first)
-        ratio = (now.cost - cost) / jnp.where(now.hoped > 0, now.hoped, 1.0)
-        grown = jnp.where(ratio > 0.75, 0.1, jnp.where(ratio > FAIR, 0.5, 2.0))
-        # Where the misfit falls as the linear problem's does, damping only makes steps short.
-        linear = (jnp.abs(ratio - 1.0) < LINEAR) & (now.damping > FREE)
-        grown = jnp.where(linear, 0.01, grown)
-        damping = now.damping * jnp.where(first, 1.0, jnp.where(better, grown, 8.0))
-        damping = jnp.maximum(damping, 1e-12)
-        fell = jnp.where(better & ~first, jnp.log(jnp.abs(now.cost / cost)), 0.0)
-        pace = jnp.where(first, now.pace, 0.5 * (now.pace + fell))
-        level = better & ~first & (ratio > FAIR) & (now.damping <= FREE)
-        if by_noise is not None:
-            level = level & (now.cost - cost < settings.level * by_noise(found, gram))
-        point, cost, gram, slope = jax.tree.map(
-            lambda new, old: jnp.where(better, new, old),
-            (now.trial, cost, gram, slope),
-            (now.point, now.cost, now.gram, now.slope),
-        )
-        move, root = _damped(gram, slope, made, damping)
-        sound = jnp.isfinite(move).all()
-        move = jnp.where(sound, move, 0.0)
-        hoped = -(slope @ move) - 0.5 * move @ (gram @ move)
-        small = (jnp.max(jnp.abs(move) * root) < settings.tolerance) & (damping <= FREE)
-        # At the very bottom round-off refuses every step.
-        bottom = hoped <= 1e-14 * jnp.abs(cost)
-        ended = small if by_noise is None else small | level
-        converged = sound & (ended | (bottom & ~better & ~first))
-        lost = ~finite & first
-        done = converged | lost | (damping > STUCK) | (~sound & (damping > 1.0))
-        done = done | ((settings.aim > 0) & (cost > settings.aim * jnp.exp(PATIENCE * pace)))
-        done = done | ((settings.near > 0) & (cost <= settings.near))
-        damping = jnp.where(sound, damping, 8.0 * damping)
-        return Search(
-            jnp.where(first & finite, cost, now.first),
-            point,
-            cost,
-            gram,
-            slope,
-            point + move,
-            hoped,
-            damping,
-            pace,
-            now.taken + 1,
-            done,
-            converged,
-            found,
-            better,
-        )
-
     begun = Search(
         jnp.asarray(jnp.inf, kind),
         start,
@@ -225,7 +172,72 @@ def search(
         nothing,
         jnp.asarray(False),
     )
+
+    def step(now: Search) -> Search:
+        return _after(now, evaluated(now.trial), made, settings, by_noise)
+
     return lax.while_loop(lambda now: ~now.done & (now.taken <= settings.steps), step, begun)
+
+
+def _after(
+    now: Search,
+    trial: tuple[Any, Array, Array, Array],
+    made: Array,
+    settings: Settings,
+    by_noise: Callable[[Any, Array], Array] | None,
+) -> Search:
+    """Where the search stands after an evaluation of what was to be tried, and what comes next."""
+    found, cost, gram, slope = trial
+    finite = jnp.isfinite(cost) & jnp.isfinite(slope).all() & jnp.isfinite(gram).all()
+    first = now.taken == 0
+    better = finite & ((cost < now.cost) | first)
+    ratio = (now.cost - cost) / jnp.where(now.hoped > 0, now.hoped, 1.0)
+    grown = jnp.where(ratio > 0.75, 0.1, jnp.where(ratio > FAIR, 0.5, 2.0))
+    # Where the misfit falls as the linear problem's does, damping only makes steps short.
+    linear = (jnp.abs(ratio - 1.0) < LINEAR) & (now.damping > FREE)
+    grown = jnp.where(linear, 0.01, grown)
+    damping = now.damping * jnp.where(first, 1.0, jnp.where(better, grown, 8.0))
+    damping = jnp.maximum(damping, 1e-12)
+    fell = jnp.where(better & ~first, jnp.log(jnp.abs(now.cost / cost)), 0.0)
+    pace = jnp.where(first, now.pace, 0.5 * (now.pace + fell))
+    level = better & ~first & (ratio > FAIR) & (now.damping <= FREE)
+    if by_noise is not None:
+        level = level & (now.cost - cost < settings.level * by_noise(found, gram))
+    point, cost, gram, slope = jax.tree.map(
+        lambda new, old: jnp.where(better, new, old),
+        (now.trial, cost, gram, slope),
+        (now.point, now.cost, now.gram, now.slope),
+    )
+    move, root = _damped(gram, slope, made, damping)
+    sound = jnp.isfinite(move).all()
+    move = jnp.where(sound, move, 0.0)
+    hoped = -(slope @ move) - 0.5 * move @ (gram @ move)
+    small = (jnp.max(jnp.abs(move) * root) < settings.tolerance) & (damping <= FREE)
+    # At the very bottom round-off refuses every step.
+    bottom = hoped <= 1e-14 * jnp.abs(cost)
+    ended = small if by_noise is None else small | level
+    converged = sound & (ended | (bottom & ~better & ~first))
+    lost = ~finite & first
+    done = converged | lost | (damping > STUCK) | (~sound & (damping > 1.0))
+    done = done | ((settings.aim > 0) & (cost > settings.aim * jnp.exp(PATIENCE * pace)))
+    done = done | ((settings.near > 0) & (cost <= settings.near))
+    damping = jnp.where(sound, damping, 8.0 * damping)
+    return Search(
+        jnp.where(first & finite, cost, now.first),
+        point,
+        cost,
+        gram,
+        slope,
+        point + move,
+        hoped,
+        damping,
+        pace,
+        now.taken + 1,
+        done,
+        converged,
+        found,
+        better,
+    )
 
 
 def _damped(gram: Array, slope: Array, made: Array, damping: Array) -> tuple[Array, Array]:
