@@ -18,15 +18,28 @@ from rigidjax.identify.quantities import charts, quantities as quantities_of
 from rigidjax.identify.real_bodies import of_charts
 from rigidjax.identify.residual import Noise
 from rigidjax.identify.result import Fit, Start
+from rigidjax.identify.several_bodies import in_a_row
 
 # A point so near to the least misfit, in standard deviations, is where a search was to end.
 AT_THE_END = 0.05
 
 
 @eqx.filter_jit
-def _bodies(problem: Problem, parameters: Parameters) -> Any:
+def _bodies(problem: Problem, parameters: Parameters) -> list[Any]:
     # As one program: outside of a trace each operation of JAX costs as much as a run of 100 steps.
-    return problem.bodies(parameters)
+    return in_a_row(problem.bodies(parameters))
+
+
+def _margin(problem: Problem, best_cost: float, longest: float) -> float:
+    """By how much the misfit of a start may be above the best for it to explain the data, too.
+
+    Ten units of log-likelihood: a point further above the best is e¹⁰ times less likely. Where the
+    noise is estimated from the best point, its cost is half the number of readings. Of
+    autocorrelated errors there are the fewer.
+    """
+    guessed = any(sensor.noise is None for sensor in problem.records.sensors)
+    unit = 2 * best_cost / problem.records.size if guessed else 1.0
+    return 10.0 * unit * max(longest, 1.0)
 
 
 def assess(
@@ -51,52 +64,44 @@ def assess(
     free = ravel_pytree(value)[0].size
     seen = goodness(problem, linear, times, free)
     believable = not seen.poor
-    # Ten units of log-likelihood: a point further above the best is e¹⁰ times less likely. Where
-    # the noise is estimated from the best point, its cost is half the number of readings.
-    margin = 10.0
-    if any(sensor.noise is None for sensor in problem.records.sensors):
-        count = sum(r.sensor.components * int(r.seen.sum()) for r in problem.records.readings)
-        margin *= 2 * best_cost / count
-    # Of autocorrelated errors there are the fewer.
-    margin *= max(times.longest, 1.0)
+    margin = _margin(problem, best_cost, times.longest)
 
     def elsewhere(other: Parameters) -> bool:
         # In one flat valley searches end apart, where no reading would tell them apart.
         away = ravel_pytree(other)[0] - ravel_pytree(value)[0]
         return float(np.sum((linear.rows @ np.asarray(away)) ** 2)) > 2 * margin
 
-    starts = []
-    for item in tried:
-        fits = believable and float(item.cost) <= best_cost + margin
-        starts.append(Start(item.parameters, float(item.cost), bool(item.converged), fits))
+    starts = [
+        Start(
+            item.parameters, cost, bool(item.converged), believable and cost <= best_cost + margin
+        )
+        for item in tried
+        for cost in (float(item.cost),)
+    ]
     rivals = [
         s
         for s in starts
         if s.fits and s.converged and s.cost > best_cost + 0.01 * margin and elsewhere(s.parameters)
     ]
     doubts = [*interrupted, *seen.doubts]
-    found = _bodies(problem, value)
-    bodies = list(found.values()) if isinstance(found, dict) else [found]
-    unreal = of_charts(charts(problem), bodies)
+    unreal = of_charts(charts(problem), _bodies(problem, value))
     doubts += unreal
     if not any(start.fits for start in starts):
         doubts.append("no single start came near the best point")
     if not np.isfinite(best_cost):
-        status = "failed: no start gave a finite misfit"
-    elif believable and not done:
-        why = "; ".join(interrupted) or "max_steps reached"
-        ended = f"not converged, {why}; this is the best point found"
-        status = "failed: " + "; ".join((ended, *unreal))
+        words = "failed", "no start gave a finite misfit"
     elif not believable:
         units = "this is not the motion, or a unit is wrong (rad/s, m/s², m, s)"
-        status = "poor: " + "; ".join((*interrupted, *seen.poor, *unreal, units))
+        words = "poor", *interrupted, *seen.poor, *unreal, units
+    elif not done:
+        why = "; ".join(interrupted) or "max_steps reached"
+        words = "failed", f"not converged, {why}; this is the best point found", *unreal
     elif rivals:
         rival = f"{len(rivals)} of {len(starts)} starts fit as well elsewhere"
-        status = "ambiguous: " + "; ".join((rival, *doubts))
-    elif doubts:
-        status = "doubtful: " + "; ".join(doubts)
+        words = "ambiguous", rival, *doubts
     else:
-        status = "ok"
+        words = ("doubtful", *doubts) if doubts else ("ok",)
+    status = ": ".join((words[0], "; ".join(words[1:]))) if len(words) > 1 else words[0]
     return Fit(
         problem,
         value,

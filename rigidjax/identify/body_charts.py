@@ -20,6 +20,7 @@ _PARTS = {
     "com": ("centre of mass", (7, 8, 9)),
     "inertia": ("inertia tensor", (1, 2, 3, 4, 5, 6)),
 }
+# Components of a tensor in the order of their names.
 COMPONENTS = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))
 
 
@@ -118,15 +119,26 @@ class PrincipalRatios(AbstractBodyChart):
         return _diagonal(jnp.stack([vector[0], vector[1], jnp.zeros((), vector.dtype)]))
 
     def vector(self, body: Inertia) -> Float[Array, " chart"]:
-        s = body.second_moment
-        return jnp.log(jnp.stack([s[0, 0], s[1, 1]]) / s[2, 2])
+        s = jnp.diagonal(body.second_moment)
+        return jnp.log(s[:2] / s[2])
 
     def logs(self, body: Inertia) -> Float[Array, "2"]:
-        i = body.tensor
-        return jnp.log(jnp.stack([i[0, 0], i[1, 1]]) / i[2, 2])
+        i = jnp.diagonal(body.tensor)
+        return jnp.log(i[:2] / i[2])
 
     def plain(self, body: Inertia) -> Float[Array, "0"]:
         return jnp.zeros(0, body.tensor.dtype)
+
+
+def _typical(value: Any) -> Array:
+    if isinstance(value, Inertia | MassProperties):
+        raise TypeError(
+            "typical: wanted about how large the moments are, one number, kg m², got "
+            f"{type(value).__name__}; a body that is known is Known(body), one to begin with goes "
+            "to fit(initial=problem.start(body))"
+        )
+    size = _checks.positive(value, "typical", "a positive moment of inertia, kg m²")
+    return jnp.asarray(size, jnp.result_type(float))
 
 
 class Tensor(AbstractBodyChart):
@@ -141,15 +153,12 @@ class Tensor(AbstractBodyChart):
     Array(0.001, dtype=float64)
     """
 
-    typical: Float[Array, ""]
+    typical: Float[Array, ""] = eqx.field(converter=_typical, default=1.0)
     size: ClassVar[int] = 6
     in_words: ClassVar[str] = "the inertia tensor"
     log_names: ClassVar[tuple[str, ...]] = ("I1", "I2", "I3")
     plain_names: ClassVar[tuple[str, ...]] = ("Ixx", "Iyy", "Izz", "Iyz", "Ixz", "Ixy")
     unit: ClassVar[str] = "kg m²"
-
-    def __init__(self, typical: float = 1.0):
-        self.typical = _typical(typical)
 
     def body(self, vector: Float[Array, " chart"]) -> Inertia:
         s = charts.unpack_second_moment(vector) * (0.5 * self.typical)
@@ -176,26 +185,21 @@ class Principal(AbstractBodyChart):
     Array(2., dtype=float64)
     """
 
-    typical: Float[Array, ""]
+    typical: Float[Array, ""] = eqx.field(converter=_typical, default=1.0)
     size: ClassVar[int] = 3
     in_words: ClassVar[str] = "three moments, the body axes being principal"
     log_names: ClassVar[tuple[str, ...]] = ("Ix", "Iy", "Iz")
     plain_names: ClassVar[tuple[str, ...]] = ()
     unit: ClassVar[str] = "kg m²"
 
-    def __init__(self, typical: float = 1.0):
-        self.typical = _typical(typical)
-
     def body(self, vector: Float[Array, " chart"]) -> Inertia:
         return Inertia(_diagonal(2.0 * vector).tensor * (0.5 * self.typical))
 
     def vector(self, body: Inertia) -> Float[Array, " chart"]:
-        s = body.second_moment / (0.5 * self.typical)
-        return 0.5 * jnp.log(jnp.stack([s[0, 0], s[1, 1], s[2, 2]]))
+        return 0.5 * jnp.log(jnp.diagonal(body.second_moment) / (0.5 * self.typical))
 
     def logs(self, body: Inertia) -> Float[Array, "3"]:
-        i = body.tensor
-        return jnp.log(jnp.stack([i[0, 0], i[1, 1], i[2, 2]]))
+        return jnp.log(jnp.diagonal(body.tensor))
 
     def plain(self, body: Inertia) -> Float[Array, "0"]:
         return jnp.zeros(0, body.tensor.dtype)
@@ -299,8 +303,8 @@ class Known(AbstractBodyChart):
     plain_names: ClassVar[tuple[str, ...]] = ()
     unit: ClassVar[str] = ""
 
-    def __init__(self, known: Inertia | MassProperties):
-        self.known = _checks.single(known, (Inertia, MassProperties), "known")
+    def __check_init__(self) -> None:
+        _checks.single(self.known, (Inertia, MassProperties), "known")
 
     def body(self, vector: Float[Array, " chart"]) -> Inertia | MassProperties:
         return self.known
@@ -319,14 +323,3 @@ def _diagonal(logs: Float[Array, "3"]) -> Inertia:
     """The body whose second moments along the axes have these logarithms."""
     a, b, c = jnp.exp(logs[0]), jnp.exp(logs[1]), jnp.exp(logs[2])
     return Inertia(jnp.diag(jnp.stack([b + c, c + a, a + b])))
-
-
-def _typical(value: Any) -> Array:
-    if isinstance(value, Inertia | MassProperties):
-        raise TypeError(
-            "typical: wanted about how large the moments are, one number, kg m², got "
-            f"{type(value).__name__}; a body that is known is Known(body), one to begin with goes "
-            "to fit(initial=problem.start(body))"
-        )
-    size = _checks.positive(value, "typical", "a positive moment of inertia, kg m²")
-    return jnp.asarray(size, jnp.result_type(float))

@@ -11,7 +11,7 @@ from rigidjax import _checks
 from rigidjax.identify.body_charts import Known
 from rigidjax.identify.fit import fit
 from rigidjax.identify.problem import Problem
-from rigidjax.identify.recording import Recording
+from rigidjax.identify.recording import Recording, count_of
 from rigidjax.identify.result import Fit
 
 
@@ -22,12 +22,7 @@ class Comparison(eqx.Module):
     how many samples its errors are autocorrelated; `information` its Bayesian information criterion
     less the best one's: 0 for the best, 10 and more is strong evidence against.
 
-    >>> import rigidjax as rj
-    >>> ts = jnp.linspace(0.0, 10.0, 80)
-    >>> motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1, 0.1, 1.0]), ts)
-    >>> record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), motion.ys.omega))
-    >>> found = rj.identify.fit(rj.identify.Problem(record, rj.identify.PrincipalRatios()))
-    >>> compare({"free": found})[0].free  # two ratios and the first body rate
+    >>> Comparison("free", 5, (0.01,), 1.0, 0.0).free  # two ratios and the first body rate
     5
     """
 
@@ -64,7 +59,10 @@ def compare(fits: Mapping[str, Fit]) -> tuple[Comparison, ...]:
         _checks.instance(found, Fit, f"fits[{name!r}]")
     if not fits:
         raise ValueError("compare: wanted at least one fit")
-    counts = {name: _counts(found) for name, found in fits.items()}
+    counts = {
+        name: tuple(count_of(reading) for reading in found.problem.records.readings)
+        for name, found in fits.items()
+    }
     if len(set(counts.values())) > 1:
         raise ValueError(f"compare: wanted fits of the same readings, got {counts}")
     shortest = max(min(found.correlation for found in fits.values()), 1.0)
@@ -83,10 +81,6 @@ def compare(fits: Mapping[str, Fit]) -> tuple[Comparison, ...]:
         Comparison(name, size, found.rms, found.correlation, float(total - best))
         for total, name, size, found in rows
     )
-
-
-def _counts(found: Fit) -> tuple[int, ...]:
-    return tuple(r.sensor.components * int(r.seen.sum()) for r in found.problem.records.readings)
 
 
 def cross_validate(
@@ -132,14 +126,7 @@ def _with_shared(problem: Problem, found: Fit) -> Problem:
         if slot.each:
             own.append(slot)
         elif slot.spread is not None:
-            own.append(
-                eqx.tree_at(
-                    lambda s: (s.prior, s.spread),
-                    dataclasses.replace(slot, each=True),
-                    (slot.spread, None),
-                    is_leaf=lambda node: node is None,
-                )
-            )
+            own.append(dataclasses.replace(slot, each=True, prior=slot.spread, spread=None))
     return eqx.tree_at(
         lambda p: (p.body, p.records, p.slots), problem, (Known(found.body), records, tuple(own))
     )

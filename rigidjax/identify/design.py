@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from rigidjax import _checks
 from rigidjax._types import Scalar, Vec3
 from rigidjax.body.inertia import Inertia, MassProperties
-from rigidjax.identify.jacobian import with_blocks
+from rigidjax.identify.jacobian import normal_matrix, with_blocks
 from rigidjax.identify.parameters import Parameters, places
 from rigidjax.identify.problem import Problem, fits, one_problem
 from rigidjax.identify.quantities import Quantity, quantities
@@ -88,17 +88,10 @@ def fisher(problem: Problem, parameters: Parameters) -> Float[Array, "n n"]:
 
 @eqx.filter_jit
 def _fisher(problem: Problem, parameters: Parameters) -> Float[Array, "n n"]:
-    size = ravel_pytree(parameters)[0].size
-    where = places(problem, parameters)
-    total = jnp.zeros((size + 1, size + 1), parameters.own.spin.dtype)
-    for block, reading in zip(
-        with_blocks(parameters, problem)[1][0], problem.records.readings, strict=True
-    ):
-        assert reading.sensor.noise is not None
-        rows = block / reading.sensor.noise[:, None, :, None]
-        squares = jnp.einsum("rtki,rtkj->rij", rows, rows)
-        total = total.at[where[:, :, None], where[:, None, :]].add(squares)
-    return total[:-1, :-1]
+    noises: list[Any] = [sensor.noise for sensor in problem.records.sensors]
+    blocks = with_blocks(parameters, problem)[1][0]
+    rows = [rows / noise[:, None, :, None] for rows, noise in zip(blocks, noises, strict=True)]
+    return normal_matrix(rows, places(problem, parameters), ravel_pytree(parameters)[0].size)
 
 
 def _look(problem: Problem, parameters: Parameters) -> None:

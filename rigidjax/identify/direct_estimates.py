@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike
 
-from rigidjax.identify.recording import Reading, Recording
+from rigidjax.identify.recording import Recording, readings_of
 from rigidjax.identify.sensors import AttitudeSensor, Direction, Marker
 from rigidjax.rotation import quaternion, so3
 
@@ -25,32 +25,28 @@ def attitudes(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
     (`rigidjax.so3.wahba`). At least three markers that are not in line, or two directions.
     """
     t = np.asarray(recording.t)
-    for reading in recording.readings:
-        sensor = reading.sensor
-        if isinstance(sensor, AttitudeSensor):
-            q = np.asarray(reading.values)[reading.seen]
-            if sensor.mounting is not None:
-                back = quaternion.exp(-sensor.mounting)
-                q = np.asarray(jax.vmap(quaternion.multiply, (0, None))(jnp.asarray(q), back))
-            return t[reading.seen], q
+    for reading in readings_of(recording, AttitudeSensor):
+        q, mounting = np.asarray(reading.values)[reading.seen], reading.sensor.mounting
+        if mounting is not None:
+            back = quaternion.exp(-mounting)
+            q = np.asarray(jax.vmap(quaternion.multiply, (0, None))(jnp.asarray(q), back))
+        return t[reading.seen], q
     body, world, seen = [], [], np.ones(t.shape, bool)
-    markers = [r for r in recording.readings if isinstance(r.sensor, Marker)]
+    markers = readings_of(recording, Marker)
     if len(markers) >= 3:
-        places = np.stack([place_of(r) for r in markers])
+        places = np.stack([np.asarray(r.sensor.place) for r in markers])
         there = np.stack([np.asarray(r.values) for r in markers], axis=1)
         size = np.linalg.norm(places - places.mean(axis=0), axis=1).max() or 1.0
         body.append(np.broadcast_to((places - places.mean(axis=0)) / size, there.shape))
         world.append((there - there.mean(axis=1, keepdims=True)) / size)
         seen = seen & np.all([r.seen for r in markers], axis=0)
-    for reading in recording.readings:
-        sensor = reading.sensor
-        if isinstance(sensor, Direction):
-            along = np.asarray(reading.values)
-            if sensor.mounting is not None:
-                along = along @ np.asarray(so3.exp(sensor.mounting)).T
-            body.append(along[:, None, :])
-            world.append(np.broadcast_to(np.asarray(sensor.world), along.shape)[:, None, :])
-            seen = seen & reading.seen
+    for reading in readings_of(recording, Direction):
+        along, sensor = np.asarray(reading.values), reading.sensor
+        if sensor.mounting is not None:
+            along = along @ np.asarray(so3.exp(sensor.mounting)).T
+        body.append(along[:, None, :])
+        world.append(np.broadcast_to(np.asarray(sensor.world), along.shape)[:, None, :])
+        seen = seen & reading.seen
     if not body:
         return np.zeros(0), np.zeros((0, 4))
     rows, sides = np.concatenate(body, axis=1)[seen], np.concatenate(world, axis=1)[seen]
@@ -65,12 +61,6 @@ def attitudes(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
 @jax.jit
 def _nearest(body: ArrayLike, world: ArrayLike) -> Array:
     return jax.vmap(lambda a, b: quaternion.from_matrix(so3.wahba(a, b)))(body, world)
-
-
-def place_of(marker: Reading) -> np.ndarray:
-    """Where a marker is on the body, m, body frame."""
-    assert isinstance(marker.sensor, Marker)
-    return np.asarray(marker.sensor.place)
 
 
 def rates(recording: Recording) -> tuple[np.ndarray, np.ndarray]:

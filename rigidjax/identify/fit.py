@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path
+from types import NoneType
 from typing import Any
 
 import equinox as eqx
@@ -32,6 +33,7 @@ from rigidjax.identify.residual import Noise
 from rigidjax.identify.result import Fit
 from rigidjax.identify.search import (
     CAREFUL,
+    again,
     climb,
     climb_together,
     cost_of,
@@ -39,7 +41,7 @@ from rigidjax.identify.search import (
     evaluate,
     fresh,
     least_squares,
-    settle,
+    whole,
 )
 from rigidjax.identify.stochastic_gradient import Descent, descend
 from rigidjax.identify.widths import with_widths
@@ -113,17 +115,14 @@ def fit(
         fits(problem, initial)
     if progress is not None:
         _checks.function(progress, "progress", "of a line of text, such as print")
-    if checkpoint is not None and together > 1:
-        raise ValueError("fit: a checkpoint goes with together=1, one start after another")
     if checkpoint is not None:
+        if together > 1:
+            raise ValueError("fit: a checkpoint goes with together=1, one start after another")
         require_folder(checkpoint)
     given = (initial is not None) + (pieces > 1)
     points = starting_points(problem, starts - given, key) if starts > given else []
     noise = _first_noise(problem)
-    if descent is not None and not isinstance(descent, Descent):
-        raise TypeError(
-            f"fit: wanted a Descent(optimiser, …) or None, got {type(descent).__name__}"
-        )
+    _checks.instance(descent, (Descent, NoneType), "fit", wanted="a Descent(optimiser, …) or None")
     if pieces > 1:
         points = [_from_pieces(problem, pieces, tolerance, max_steps), *points][:starts]
     if initial is not None:
@@ -144,9 +143,7 @@ def fit(
     best = _evaluated(best, problem)
     while (finer := _finer(problem, best, noise)) is not None:
         problem = eqx.tree_at(lambda p: p.integrator, problem, finer)
-        whole = jnp.ones_like(problem.records.t)
-        near = fresh(best.parameters)
-        best = settle(near, problem, noise, whole, tolerance, max_steps, near=True)
+        best = again(best, problem, noise, tolerance, max_steps)
         best, noise = _with_noise(problem, best, noise, tolerance, max_steps)
         best = _evaluated(best, problem)
     return assess(problem, best, noise, tried, lowest, cut)
@@ -163,23 +160,21 @@ def _with_noise(
         errors = uncertainty.errors_at(best.parameters, problem)
         return uncertainty.estimate_noise(problem, errors, noise, best.parameters)
 
-    whole = jnp.ones_like(problem.records.t)
     # Twice: the weights of the channels and the robust loss both depend on the noise.
     for _ in range(2):
-        noise, near = estimated(noise), fresh(best.parameters)
-        best = settle(near, problem, noise, whole, tolerance, max_steps, near=True)
+        noise = estimated(noise)
+        best = again(best, problem, noise, tolerance, max_steps)
     return best, estimated(noise)
 
 
 def _from_pieces(problem: Problem, count: int, tolerance: float, max_steps: int) -> Parameters:
     cut = in_pieces(problem, count)
-    noise, whole = _first_noise(cut), jnp.ones_like(cut.records.t)
+    noise, everywhere = _first_noise(cut), whole(cut)
     point = starting_points(cut, 1, None)[0]
     for width in WIDTHS:
         narrowed = with_width(cut, width)
-        point = least_squares(
-            point, narrowed, noise, whole, tolerance, max_steps, CAREFUL
-        ).parameters
+        end = least_squares(point, narrowed, noise, everywhere, tolerance, max_steps, CAREFUL)
+        point = end.parameters
     return joined(problem, cut, point)
 
 

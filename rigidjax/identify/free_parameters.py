@@ -62,28 +62,23 @@ class Free(eqx.Module):
         _checks.function(where, "where", "of a recording, such as lambda r: r.torque.coefficient")
         _checks.instance(name, str, "name")
         self.where, self.name = where, name
-        self.unit = None if unit is None else _checks.instance(unit, str, f"Free {name!r}: unit")
-        self.scale = _checks.positive(scale, f"Free {name!r}: scale")
-        self.each = shares(each, f"Free {name!r}: each")
+        here = f"Free {name!r}"
+        self.unit = None if unit is None else _checks.instance(unit, str, f"{here}: unit")
+        self.scale = _checks.positive(scale, f"{here}: scale")
+        self.each = shares(each, f"{here}: each")
         self.positive = positive
-        self.prior = None if prior is None else _checks.positive(prior, f"Free {name!r}: prior")
+        self.prior = None if prior is None else _checks.positive(prior, f"{here}: prior")
         if spread is not None and spread != "estimated":
-            spread = _checks.positive(
-                spread, f"Free {name!r}: spread", 'a positive number or "estimated"'
-            )
+            wanted = 'a positive number or "estimated"'
+            spread = _checks.positive(spread, f"{here}: spread", wanted)
         self.spread = spread
         if each is True and spread is not None:
-            raise ValueError(
-                f"Free {name!r}: spread is about a shared value, each=True has none; give prior"
-            )
+            wanted = "spread is about a shared value, each=True has none; give prior"
+            raise ValueError(f"{here}: {wanted}")
 
 
 def shares(each: Any, name: str) -> bool | str | tuple[Any, ...]:
-    """`each` if it says who shares a number. **Raises** `TypeError`, `ValueError` for others.
-
-    >>> shares(["heavy", "light", "heavy"], "each")
-    ('heavy', 'light', 'heavy')
-    """
+    """`each` if it says who shares a number. **Raises** `TypeError`, `ValueError` for others."""
     if isinstance(each, bool):
         return each
     if isinstance(each, str):
@@ -163,47 +158,45 @@ def find(free: Sequence[Free], recording: Recording, of: Sequence[str] = ("",)) 
     numbered = jax.tree.unflatten(structure, list(range(len(leaves))))
     slots: list[Slot] = []
     for item in free:
-        if not isinstance(item, Free):
-            raise TypeError(f"free: wanted Free(where, name), got {type(item).__name__}")
-        try:
-            index = item.where(numbered)
-        except (AttributeError, IndexError, TypeError) as error:
-            raise ValueError(f"Free {item.name!r}: nothing is there ({error})") from None
-        if index is None:
-            raise ValueError(
-                f"Free {item.name!r}: None is there; give it a starting value, such as "
-                "Gyro(bias=[0.0, 0.0, 0.0])"
-            )
-        if not isinstance(index, int):
-            raise ValueError(
-                f"Free {item.name!r}: wanted one array, got {type(index).__name__}; one Free each"
-            )
+        _checks.instance(item, Free, "free", wanted="Free(where, name)")
+        here = f"Free {item.name!r}"
+        index = _leaf(item.where, numbered, here)
         value = leaves[index]
         if not eqx.is_inexact_array_like(value):
-            raise ValueError(f"Free {item.name!r}: wanted numbers, got {type(value).__name__}")
+            raise ValueError(f"{here}: wanted numbers, got {type(value).__name__}")
         if any(slot.leaf == index for slot in slots):
-            raise ValueError(f"Free {item.name!r}: another Free moves the same numbers")
+            raise ValueError(f"{here}: another Free moves the same numbers")
         if any(slot.name == item.name for slot in slots):
-            raise ValueError(f"Free {item.name!r}: another Free has this name; give each its own")
+            raise ValueError(f"{here}: another Free has this name; give each its own")
         if item.positive and not (np.asarray(value) > 0).all():
-            raise ValueError(f"Free {item.name!r}: wanted a positive starting value, got {value}")
-        scale = jnp.asarray(item.scale)
-        prior = None if item.prior is None else jnp.asarray(item.prior / item.scale)
+            raise ValueError(f"{here}: wanted a positive starting value, got {value}")
         guessed = isinstance(item.spread, str)
         if guessed and len(of) < 3:
-            raise ValueError(
-                f"Free {item.name!r}: a spread is estimated from three recordings or more, got "
-                f"{len(of)}; give it"
-            )
-        first = item.scale if isinstance(item.spread, str) else item.spread
-        wide = None if first is None else jnp.asarray(first / item.scale)
-        alone, groups, labels = item.each is True, None, ()
+            wanted = "a spread is estimated from three recordings or more"
+            raise ValueError(f"{here}: {wanted}, got {len(of)}; give it")
+        wide = item.scale if isinstance(item.spread, str) else item.spread
+        steps = (None if x is None else jnp.asarray(x / item.scale) for x in (item.prior, wide))
+        groups, labels = None, ()
         if not isinstance(item.each, bool):
-            groups, labels = grouped(item.each, of, f"Free {item.name!r}")
+            groups, labels = grouped(item.each, of, here)
         unit = _unit_of(recording, index) if item.unit is None else item.unit
-        own = (item.positive, labels, groups, scale, prior, wide, guessed)
-        slots.append(Slot(index, item.name, unit, alone, *own))
+        own: Any = (item.positive, labels, groups, jnp.asarray(item.scale), *steps, guessed)
+        slots.append(Slot(index, item.name, unit, item.each is True, *own))
     return tuple(slots)
+
+
+def _leaf(where: Callable[[Any], Any], numbered: Any, here: str) -> int:
+    """The index of the leaf that `where` picks, of a tree of indices."""
+    try:
+        index = where(numbered)
+    except (AttributeError, IndexError, TypeError) as error:
+        raise ValueError(f"{here}: nothing is there ({error})") from None
+    if index is None:
+        wanted = "give it a starting value, such as Gyro(bias=[0.0, 0.0, 0.0])"
+        raise ValueError(f"{here}: None is there; {wanted}")
+    if not isinstance(index, int):
+        raise ValueError(f"{here}: wanted one array, got {type(index).__name__}; one Free each")
+    return index
 
 
 _UNITS = {"offset": "s", "delay": "s", "mounting": "rad", "tilt": "rad", "place": "m"}

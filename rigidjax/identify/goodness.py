@@ -7,7 +7,7 @@ import numpy as np
 
 from rigidjax.identify.full_scale import at_limit
 from rigidjax.identify.problem import Problem
-from rigidjax.identify.uncertainty import Linearised, Times
+from rigidjax.identify.uncertainty import Linearised, Times, scatter
 
 # Errors are called autocorrelated where white ones would look so once in so many fits.
 RARE = 1e-5
@@ -67,7 +67,11 @@ def goodness(problem: Problem, linear: Linearised, times: Times, free: int) -> G
         else:
             own, many = float(np.sum((weight[..., None] * e**2)[kept])), int(kept.sum())
             chi2, count = chi2 + own, count + many
-            factor = _above(problem, e, weight, kept, own, many, free)
+            if problem.loss is None or not many:
+                factor = _above(own, many, free)
+            else:
+                rows = kept.all(axis=-1) & (weight > 0)
+                factor = _median_above(np.sum(e[rows] ** 2, axis=-1), e.shape[-1])
             if factor > FAR:
                 poor.append(f"{name} are {factor:.3g} times the noise")
             elif factor > 1.0:
@@ -90,27 +94,20 @@ def _sizes(reading: Any, error: np.ndarray, kept: np.ndarray) -> tuple[float, fl
     return float(np.sum(error[kept] ** 2)), varies, 1e-12 * float(np.sum(values**2))
 
 
-def _above(
-    problem: Problem,
-    e: np.ndarray,
-    weight: np.ndarray,
-    kept: np.ndarray,
-    own: float,
-    many: int,
-    free: int,
-) -> float:
-    """How many times the noise the errors are; one where they agree with it."""
-    if problem.loss is None or not many:
-        dof = max(many - free, 1)
-        return float(np.sqrt(own / dof)) if own > dof + 5 * np.sqrt(2 * dof) else 1.0
-    # Outliers are expected, and χ² is theirs: the median is that of readings without outliers.
-    rows = kept.all(axis=-1) & (weight > 0)
-    if not rows.any():
+def _above(own: float, many: int, free: int) -> float:
+    """How many times the noise the errors are by χ²; one where they agree with it."""
+    dof = max(many - free, 1)
+    return float(np.sqrt(own / dof)) if own > dof + 5 * np.sqrt(2 * dof) else 1.0
+
+
+def _median_above(squares: np.ndarray, size: int) -> float:
+    """The same by the median: outliers are expected, and χ² is theirs."""
+    if not squares.size:
         return 1.0
-    middle = float(np.median(np.sum(e[rows] ** 2, axis=-1)))
-    half, density = median_of_chi2(e.shape[-1])
+    middle = float(np.median(squares))
+    half, density = median_of_chi2(size)
     # Of a sample's median: 1 / (2 f √n), f the density there.
-    wide = 0.5 / (density * np.sqrt(rows.sum()))
+    wide = 0.5 / (density * np.sqrt(squares.size))
     return float(np.sqrt(middle / half)) if middle > half + 5 * wide else 1.0
 
 
@@ -150,14 +147,7 @@ def _white(e: np.ndarray, kept: np.ndarray, given: bool) -> bool:
 
 def _over_scatter(error: np.ndarray, kept: np.ndarray) -> float:
     """The errors over what their second differences say is their scatter."""
-    all_, apart, count, triples = 0.0, 0.0, 0, 0
-    for channel in range(error.shape[-1]):
-        for x, seen in zip(error[..., channel], kept[..., channel], strict=True):
-            row = x[seen]
-            bend = row[2:] - 2.0 * row[1:-1] + row[:-2]
-            all_, count = all_ + float(row @ row), count + row.size
-            apart, triples = apart + float(bend @ bend), triples + bend.size
-    if not apart > 0:
-        return np.inf
-    # The second difference of white noise has six times its variance.
-    return float(np.sqrt(all_ / count / (apart / triples / 6.0)))
+    channels = [np.moveaxis(x, -1, 0).reshape(-1, x.shape[1]) for x in (error, kept)]
+    rows = [row[seen] for row, seen in zip(*channels, strict=True)]
+    apart = scatter(rows)
+    return float(np.sqrt(np.mean(np.concatenate(rows) ** 2) / apart)) if apart > 0 else np.inf

@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from rigidjax.body.inertia import MassProperties
 from rigidjax.identify.full_scale import in_words
 from rigidjax.identify.quantities import (
     Quantity,
@@ -15,7 +14,7 @@ from rigidjax.identify.quantities import (
     covariance as reported_covariance,
     quantile,
 )
-from rigidjax.identify.several_bodies import Bodies
+from rigidjax.identify.several_bodies import Bodies, tensor_of
 from rigidjax.identify.undetermined import SEVERAL, undetermined
 
 if TYPE_CHECKING:
@@ -112,16 +111,11 @@ def scale_is_unseen(fit: "Fit") -> bool:
     """Whether some unseen direction is the body grown as a whole, all else at rest."""
     flat, restore = ravel_pytree(fit.parameters)
     null = np.asarray(fit.null_directions)
-    if not len(null):
-        return False
-
-    if isinstance(fit.problem.body, Bodies):
+    if not len(null) or isinstance(fit.problem.body, Bodies):
         return False
 
     def tensor(x: jax.Array) -> jax.Array:
-        body = fit.problem.bodies(restore(x))
-        inertia = body.inertia if isinstance(body, MassProperties) else body
-        return inertia.tensor.reshape(-1)
+        return tensor_of(fit.problem.bodies(restore(x))).reshape(-1)
 
     here = np.asarray(tensor(flat))
     slopes = np.stack([np.asarray(jax.jvp(tensor, (flat,), (jnp.asarray(v),))[1]) for v in null])

@@ -11,10 +11,11 @@ from jaxtyping import PRNGKeyArray
 from rigidjax._types import HasSpin
 from rigidjax.body.inertia import Inertia
 from rigidjax.identify import padding
+from rigidjax.identify.body_charts import COMPONENTS
 from rigidjax.identify.direct_estimates import rates
 from rigidjax.identify.parameters import Parameters
 from rigidjax.identify.problem import Problem
-from rigidjax.identify.recording import Recording
+from rigidjax.identify.recording import Recording, readings_of
 from rigidjax.identify.reference_states import first_rate
 from rigidjax.identify.sensors import Gyro
 from rigidjax.identify.several_bodies import Bodies
@@ -23,8 +24,9 @@ from rigidjax.motion.torques import Torque
 from rigidjax.motion.torques.base import evaluate
 from rigidjax.motion.torques.states import has_states
 
+# What each component of a tensor adds to it.
 BASIS = np.zeros((6, 3, 3))
-for _k, (_i, _j) in enumerate([(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)]):
+for _k, (_i, _j) in enumerate(COMPONENTS):
     BASIS[_k, _i, _j] = BASIS[_k, _j, _i] = 1.0
 
 
@@ -43,11 +45,10 @@ def starting_points(problem: Problem, count: int, key: PRNGKeyArray | None) -> l
         for name in problem.body.names:
             mine = [r for r, of in zip(recordings, problem.of, strict=True) if of == name]
             found[name] = regress_inertia(tuple(mine))
-        known = {name: body for name, body in found.items() if body is not None}
-        regressed, start = known or None, problem.start(known)
+        regressed = {name: body for name, body in found.items() if body is not None} or None
     else:
         regressed = regress_inertia(recordings)
-        start = problem.start(regressed)
+    start = problem.start(regressed)
     rates = np.stack([first_rate(recording) for recording in recordings])
     rates = rates / np.asarray(problem.reference.rate)[:, None]
     centre = np.asarray(start.body)
@@ -75,14 +76,12 @@ def regress_inertia(recordings: tuple[Recording, ...]) -> Inertia | None:
     positive. `None` where there was no gyro and no attitude, they came too seldom, or the torque
     needs more than a rate, or has states of its own.
     """
-    rows, sides = [], []
+    found = []
     for recording in recordings:
-        found = _equations(recording)
-        if found is None:
+        found.append(_equations(recording))
+        if found[-1] is None:
             return None
-        rows.append(found[0])
-        sides.append(found[1])
-    matrix, side = np.concatenate(rows), np.concatenate(sides)
+    matrix, side = (np.concatenate(part) for part in zip(*found, strict=True))
     if not np.abs(side).max() > 0:
         components = np.linalg.svd(matrix, full_matrices=False)[2][-1]
         components = components * np.sign(components[:3].sum())
@@ -100,7 +99,7 @@ def regress_inertia(recordings: tuple[Recording, ...]) -> Inertia | None:
 
 def _equations(recording: Recording) -> tuple[np.ndarray, np.ndarray] | None:
     """Rows (n, 6) and right sides (n,) of the integral of Euler's equations over one recording."""
-    gyro = [r for r in recording.readings if isinstance(r.sensor, Gyro)]
+    gyro = readings_of(recording, Gyro)
     if gyro:
         seen = gyro[0].seen
         t, w = np.asarray(recording.t)[seen], np.asarray(gyro[0].values)[seen]

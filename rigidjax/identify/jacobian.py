@@ -1,5 +1,6 @@
 """The errors of all readings, and their derivatives recording by recording."""
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
@@ -154,6 +155,15 @@ def along(problem: "Problem", blocks: Any, step: Parameters) -> Any:
     where = places(problem, step)
     moved = jnp.concatenate([flat, jnp.zeros(1, flat.dtype)])[where]
     return jax.tree.map(lambda block: jnp.einsum("r...n,rn->r...", block, moved), blocks)
+
+
+def normal_matrix(blocks: Sequence[Array], where: Array, size: int) -> Array:
+    """Σ JᵀJ (n, n) of blocks (R, T, k, m), their columns at the places `where` (R, m) of n."""
+    total = jnp.zeros((size + 1, size + 1), blocks[0].dtype)
+    for rows in blocks:
+        squares = jnp.einsum("rtki,rtkj->rij", rows, rows)
+        total = total.at[where[:, :, None], where[:, None, :]].add(squares)
+    return total[:-1, :-1]
 
 
 def with_blocks(parameters: Parameters, problem: "Problem") -> tuple[Any, Any]:

@@ -11,7 +11,7 @@ from jax import lax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
-from rigidjax.identify.jacobian import along, with_blocks
+from rigidjax.identify.jacobian import along, normal_matrix, with_blocks
 from rigidjax.identify.parameters import Parameters, places
 from rigidjax.identify.problem import Problem
 from rigidjax.identify.propagation import FirstPart, FixedSteps
@@ -38,6 +38,11 @@ _BEYOND = 2
 STUCK = 1e12
 
 
+def _float(value: Any) -> np.ndarray:
+    # NumPy's: outside of a trace each conversion of JAX costs as much as a run of 100 steps.
+    return np.asarray(value, jnp.result_type(float))
+
+
 class Settings(eqx.Module):
     """How a search goes: arrays, so as not to compile again.
 
@@ -49,30 +54,12 @@ class Settings(eqx.Module):
     low enough to end at; 0 for none.
     """
 
-    tolerance: Any
-    damping: Any
-    steps: Any
-    aim: Any
-    level: Any
-    near: Any
-
-    def __init__(
-        self,
-        tolerance: float,
-        damping: float,
-        steps: int,
-        aim: float = 0.0,
-        level: float = 0.0,
-        near: float = 0.0,
-    ):
-        # NumPy's: outside of a trace each conversion of JAX costs as much as a run of 100 steps.
-        kind = jnp.result_type(float)
-        self.tolerance = np.asarray(tolerance, kind)
-        self.damping = np.asarray(damping, kind)
-        self.steps = np.asarray(steps, np.int32)
-        self.aim = np.asarray(aim, kind)
-        self.level = np.asarray(level, kind)
-        self.near = np.asarray(near, kind)
+    tolerance: Any = eqx.field(converter=_float)
+    damping: Any = eqx.field(converter=_float)
+    steps: Any = eqx.field(converter=lambda steps: np.asarray(steps, np.int32))
+    aim: Any = eqx.field(converter=_float, default=0.0)
+    level: Any = eqx.field(converter=_float, default=0.0)
+    near: Any = eqx.field(converter=_float, default=0.0)
 
 
 class Search(eqx.Module):
@@ -118,15 +105,12 @@ def descend(
         here = restore(point)
         found = with_blocks(here, problem)
         (errors, ends), (slopes, end_slopes) = found
-        total, gram = jnp.zeros((), kind), jnp.zeros((number + 1, number + 1), kind)
-        slope = jnp.zeros(number + 1, kind)
-        for e, rows in seen_rows(problem, errors, slopes, noise, weights):
+        total, slope = jnp.zeros((), kind), jnp.zeros(number + 1, kind)
+        read, blocks = seen_rows(problem, errors, slopes, noise, weights)
+        for e, rows in zip(read, blocks, strict=True):
             total = total + jnp.sum(e**2)
-            gram = gram.at[where[:, :, None], where[:, None, :]].add(
-                jnp.einsum("rtki,rtkj->rij", rows, rows)
-            )
             slope = slope.at[where].add(jnp.einsum("rtki,rtk->ri", rows, e))
-        gram, slope = gram[:-1, :-1], slope[:-1]
+        gram, slope = normal_matrix(blocks, where, number), slope[:-1]
         e, rows = beside_rows(problem, point, restore, ends, end_slopes)
         if e.size:
             total = total + jnp.sum(e**2)
@@ -172,68 +156,6 @@ def search(
     """
     number, kind = start.size, start.dtype
 
-    def step(now: Search) -> Search:
-        found, cost, gram, slope = evaluated(now.trial)
-        finite = jnp.isfinite(cost) & jnp.isfinite(slope).all() & jnp.isfinite(gram).all()
-        first = now.taken == 0
-        better = finite & ((cost < now.cost) | first)
-        ratio = (now.cost - cost) / jnp.where(now.hoped > 0, now.hoped, 1.0)
-        grown = jnp.where(ratio > 0.75, 0.1, jnp.where(ratio > FAIR, 0.5, 2.0))
-        # Where the misfit falls as the linear problem's does, damping only makes steps short.
-        linear = (jnp.abs(ratio - 1.0) < LINEAR) & (now.damping > FREE)
-        grown = jnp.where(linear, 0.01, grown)
-        damping = now.damping * jnp.where(first, 1.0, jnp.where(better, grown, 8.0))
-        damping = jnp.maximum(damping, 1e-12)
-        fell = jnp.where(better & ~first, jnp.log(jnp.abs(now.cost / cost)), 0.0)
-        pace = jnp.where(first, now.pace, 0.5 * (now.pace + fell))
-        level = better & ~first & (ratio > FAIR) & (now.damping <= FREE)
-        if by_noise is not None:
-            level = level & (now.cost - cost < settings.level * by_noise(found, gram))
-        point, cost, gram, slope = jax.tree.map(
-            lambda new, old: jnp.where(better, new, old),
-            (now.trial, cost, gram, slope),
-            (now.point, now.cost, now.gram, now.slope),
-        )
-        felt = jnp.diagonal(gram)
-        floor = jnp.maximum(1e-12 * jnp.max(felt), 1e-300)
-        scale = jnp.maximum(jnp.maximum(felt, floor), made)
-        # Columns of length one: the factor of Cholesky loses no digits to units.
-        root = jnp.sqrt(jnp.maximum(felt, floor))
-        matrix = gram / (root[:, None] * root[None, :]) + jnp.diag(damping * scale / root**2)
-        factor = jax.scipy.linalg.cho_factor(matrix, lower=True)
-        move = -jax.scipy.linalg.cho_solve(factor, slope / root) / root
-        far = jnp.max(jnp.abs(move) * made)
-        move = move * jnp.minimum(1.0, LONGEST / jnp.maximum(far, 1e-300))
-        sound = jnp.isfinite(move).all()
-        move = jnp.where(sound, move, 0.0)
-        hoped = -(slope @ move) - 0.5 * move @ (gram @ move)
-        small = (jnp.max(jnp.abs(move) * root) < settings.tolerance) & (damping <= FREE)
-        # At the very bottom round-off refuses every step.
-        bottom = hoped <= 1e-14 * jnp.abs(cost)
-        ended = small if by_noise is None else small | level
-        converged = sound & (ended | (bottom & ~better & ~first))
-        lost = ~finite & first
-        done = converged | lost | (damping > STUCK) | (~sound & (damping > 1.0))
-        done = done | ((settings.aim > 0) & (cost > settings.aim * jnp.exp(PATIENCE * pace)))
-        done = done | ((settings.near > 0) & (cost <= settings.near))
-        damping = jnp.where(sound, damping, 8.0 * damping)
-        return Search(
-            jnp.where(first & finite, cost, now.first),
-            point,
-            cost,
-            gram,
-            slope,
-            point + move,
-            hoped,
-            damping,
-            pace,
-            now.taken + 1,
-            done,
-            converged,
-            found,
-            better,
-        )
-
     begun = Search(
         jnp.asarray(jnp.inf, kind),
         start,
@@ -250,7 +172,86 @@ def search(
         nothing,
         jnp.asarray(False),
     )
+
+    def step(now: Search) -> Search:
+        return _after(now, evaluated(now.trial), made, settings, by_noise)
+
     return lax.while_loop(lambda now: ~now.done & (now.taken <= settings.steps), step, begun)
+
+
+def _after(
+    now: Search,
+    trial: tuple[Any, Array, Array, Array],
+    made: Array,
+    settings: Settings,
+    by_noise: Callable[[Any, Array], Array] | None,
+) -> Search:
+    """Where the search stands after an evaluation of what was to be tried, and what comes next."""
+    found, cost, gram, slope = trial
+    finite = jnp.isfinite(cost) & jnp.isfinite(slope).all() & jnp.isfinite(gram).all()
+    first = now.taken == 0
+    better = finite & ((cost < now.cost) | first)
+    ratio = (now.cost - cost) / jnp.where(now.hoped > 0, now.hoped, 1.0)
+    grown = jnp.where(ratio > 0.75, 0.1, jnp.where(ratio > FAIR, 0.5, 2.0))
+    # Where the misfit falls as the linear problem's does, damping only makes steps short.
+    linear = (jnp.abs(ratio - 1.0) < LINEAR) & (now.damping > FREE)
+    grown = jnp.where(linear, 0.01, grown)
+    damping = now.damping * jnp.where(first, 1.0, jnp.where(better, grown, 8.0))
+    damping = jnp.maximum(damping, 1e-12)
+    fell = jnp.where(better & ~first, jnp.log(jnp.abs(now.cost / cost)), 0.0)
+    pace = jnp.where(first, now.pace, 0.5 * (now.pace + fell))
+    level = better & ~first & (ratio > FAIR) & (now.damping <= FREE)
+    if by_noise is not None:
+        level = level & (now.cost - cost < settings.level * by_noise(found, gram))
+    point, cost, gram, slope = jax.tree.map(
+        lambda new, old: jnp.where(better, new, old),
+        (now.trial, cost, gram, slope),
+        (now.point, now.cost, now.gram, now.slope),
+    )
+    move, root = _damped(gram, slope, made, damping)
+    sound = jnp.isfinite(move).all()
+    move = jnp.where(sound, move, 0.0)
+    hoped = -(slope @ move) - 0.5 * move @ (gram @ move)
+    small = (jnp.max(jnp.abs(move) * root) < settings.tolerance) & (damping <= FREE)
+    # At the very bottom round-off refuses every step.
+    bottom = hoped <= 1e-14 * jnp.abs(cost)
+    ended = small if by_noise is None else small | level
+    converged = sound & (ended | (bottom & ~better & ~first))
+    lost = ~finite & first
+    done = converged | lost | (damping > STUCK) | (~sound & (damping > 1.0))
+    done = done | ((settings.aim > 0) & (cost > settings.aim * jnp.exp(PATIENCE * pace)))
+    done = done | ((settings.near > 0) & (cost <= settings.near))
+    damping = jnp.where(sound, damping, 8.0 * damping)
+    return Search(
+        jnp.where(first & finite, cost, now.first),
+        point,
+        cost,
+        gram,
+        slope,
+        point + move,
+        hoped,
+        damping,
+        pace,
+        now.taken + 1,
+        done,
+        converged,
+        found,
+        better,
+    )
+
+
+def _damped(gram: Array, slope: Array, made: Array, damping: Array) -> tuple[Array, Array]:
+    """The step (n,), and the root of the diagonal of the normal matrix (n,)."""
+    felt = jnp.diagonal(gram)
+    felt = jnp.maximum(felt, jnp.maximum(1e-12 * jnp.max(felt), 1e-300))
+    # Columns of length one: the factor of Cholesky loses no digits to units.
+    root = jnp.sqrt(felt)
+    damped = damping * jnp.maximum(felt, made) / root**2
+    matrix = gram / (root[:, None] * root[None, :]) + jnp.diag(damped)
+    factor = jax.scipy.linalg.cho_factor(matrix, lower=True)
+    move = -jax.scipy.linalg.cho_solve(factor, slope / root) / root
+    far = jnp.max(jnp.abs(move) * made)
+    return move * jnp.minimum(1.0, LONGEST / jnp.maximum(far, 1e-300)), root
 
 
 def _nothing(problem: Problem, start: Parameters, columns: int, kind: Any) -> Any:

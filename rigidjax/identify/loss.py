@@ -35,6 +35,10 @@ class AbstractLoss(eqx.Module):
         """dρ/ds, the weight of the reading in the normal equations: 1 for a small error."""
 
 
+def _scale(value: Any) -> float:
+    return _checks.positive(value, "scale")
+
+
 class SoftL1(AbstractLoss):
     """Quadratic for ordinary errors, linear for large ones: `ρ(s) = 2c²(√(1 + s/c²) − 1)`.
 
@@ -50,10 +54,7 @@ class SoftL1(AbstractLoss):
     True
     """
 
-    scale: float = 3.0
-
-    def __check_init__(self) -> None:
-        _checks.positive(self.scale, "scale")
+    scale: float = eqx.field(default=3.0, converter=_scale)
 
     def shrink(self, error: Float[Array, " k"]) -> Float[Array, " k"]:
         s = jnp.sum(error**2) / self.scale**2
@@ -76,10 +77,7 @@ class Huber(AbstractLoss):
     Array(0.5, dtype=float64)
     """
 
-    scale: float = 3.0
-
-    def __check_init__(self) -> None:
-        _checks.positive(self.scale, "scale")
+    scale: float = eqx.field(default=3.0, converter=_scale)
 
     def shrink(self, error: Float[Array, " k"]) -> Float[Array, " k"]:
         s = jnp.sum(error**2) / self.scale**2
@@ -90,13 +88,3 @@ class Huber(AbstractLoss):
     def weight(self, error: Float[Array, " k"]) -> Scalar:
         s = jnp.sum(error**2) / self.scale**2
         return 1.0 / jnp.sqrt(jnp.maximum(s, 1.0))
-
-
-def shrink(loss: AbstractLoss | None, error: Float[Array, " k"]) -> Float[Array, " k"]:
-    """The error as least squares is to see it."""
-    return error if loss is None else loss.shrink(error)
-
-
-def weight(loss: AbstractLoss | None, error: Float[Array, " k"]) -> Any:
-    """The weight of the reading in the normal equations."""
-    return jnp.ones((), error.dtype) if loss is None else loss.weight(error)

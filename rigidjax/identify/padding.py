@@ -96,31 +96,21 @@ def _rows(tree: Any) -> int:
 
 def _lengthen(recording: Recording, count: int, rows: int) -> Recording:
     missing = count - recording.t.shape[0]
-    if missing:
-        t = jnp.concatenate([recording.t, jnp.broadcast_to(recording.t[-1], (missing,))])
-        readings = tuple(
-            Reading(
-                r.sensor,
-                _repeat_last(r.values, missing),
-                jnp.concatenate([r.mask, jnp.zeros(missing, bool)]),
-            )
-            for r in recording.readings
-        )
-        recording = eqx.tree_at(lambda r: (r.t, r.readings), recording, (t, readings))
-    longer = jax.tree.map(
+    torque, sensors = jax.tree.map(
         lambda node: _table(node, rows) if _is_table(node) else node,
         _tabled(recording),
         is_leaf=_is_table,
     )
-    torque, sensors = longer
-    readings = tuple(
-        Reading(sensor, r.values, r.mask)
-        for sensor, r in zip(sensors, recording.readings, strict=True)
-    )
+    t, readings = recording.t, recording.readings
+    parts = [(r.values, r.mask) for r in readings]
+    if missing:
+        t = _repeat_last(t, missing)
+        nothing = jnp.zeros(missing, bool)
+        parts = [(_repeat_last(v, missing), jnp.concatenate([m, nothing])) for v, m in parts]
     return eqx.tree_at(
-        lambda r: (r.torque, r.readings),
+        lambda r: (r.t, r.torque, r.readings),
         recording,
-        (torque, readings),
+        (t, torque, tuple(Reading(s, *part) for s, part in zip(sensors, parts, strict=True))),
         is_leaf=lambda node: node is None,
     )
 

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float, Int
 from rigidjax.identify.several_bodies import spread
 
 if TYPE_CHECKING:
+    from rigidjax.identify.free_parameters import Slot
     from rigidjax.identify.problem import Problem
 
 
@@ -82,21 +83,35 @@ def firsts(own: Own | Local) -> list[Any]:
 
 def local(problem: "Problem", parameters: Parameters) -> Local:
     """What each recording depends on, with a leading axis over recordings."""
-    own = parameters.own
-    of_all, of_each = iter(parameters.shared), iter(own.each)
-    steps = []
-    for slot in problem.slots:
-        if slot.each:
-            steps.append(next(of_each))
+    own, steps = parameters.own, []
+    for slot, shared, each in by_slot(problem, parameters):
+        if shared is None:
+            steps.append(each)
             continue
-        shared = next(of_all)
-        if slot.groups is None:
-            step = jnp.broadcast_to(shared, (problem.count, *shared.shape))
-        else:
-            step = shared[slot.groups]
-        steps.append(step if slot.spread is None else step + next(of_each))
+        step = _of_each(slot, shared, problem.count)
+        steps.append(step if each is None else step + each)
     body = spread(problem.body, parameters.body, problem.which, problem.count)
     return Local(body, tuple(steps), own.place, own.speed, own.turn, own.spin)
+
+
+def by_slot(problem: "Problem", parameters: Parameters) -> list[tuple["Slot", Any, Any]]:
+    """With each `Free` its shared number and those of the recordings; `None` for what it lacks."""
+    of_all, of_each = iter(parameters.shared), iter(parameters.own.each)
+    return [
+        (
+            slot,
+            None if slot.each else next(of_all),
+            next(of_each) if slot.each or slot.spread is not None else None,
+        )
+        for slot in problem.slots
+    ]
+
+
+def _of_each(slot: "Slot", shared: Array, count: int) -> Array:
+    """A shared number as each recording has it, (R, …)."""
+    if slot.groups is not None:
+        return shared[slot.groups]
+    return jnp.broadcast_to(shared, (count, *shared.shape))
 
 
 def columns(problem: "Problem", one: Local) -> np.ndarray:
@@ -118,23 +133,18 @@ def places(problem: "Problem", parameters: Parameters) -> Int[Array, "records co
     """Where in the flattened parameters the number of each column is; n for those of no number."""
     count, size = problem.count, ravel_pytree(parameters)[0].size
     counted = numbered(parameters)
-    of_all, of_each = iter(counted.shared), iter(counted.own.each)
     parts, deviations = [], []
 
     def rows(leaf: Any) -> Array:
         return jnp.asarray(leaf, jnp.int32).reshape(count, -1)
 
-    for slot in problem.slots:
-        if slot.each:
-            parts.append(rows(next(of_each)))
+    for slot, shared, each in by_slot(problem, counted):
+        if shared is None:
+            parts.append(rows(each))
             continue
-        shared = next(of_all)
-        if slot.groups is None:
-            parts.append(rows(np.broadcast_to(shared, (count, *shared.shape))))
-        else:
-            parts.append(rows(jnp.asarray(shared, jnp.int32)[slot.groups]))
-        if slot.spread is not None:
-            deviations.append(rows(next(of_each)))
+        parts.append(rows(_of_each(slot, jnp.asarray(shared, jnp.int32), count)))
+        if each is not None:
+            deviations.append(rows(each))
     first = [rows(leaf) for leaf in firsts(counted.own)]
     numbers = jnp.asarray(counted.body, jnp.int32)
     body = spread(problem.body, numbers, problem.which, count, fill=size)

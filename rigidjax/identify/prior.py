@@ -9,6 +9,10 @@ from rigidjax._types import Scalar
 from rigidjax.body.inertia import Inertia, MassProperties
 
 
+def _weight(value: float) -> Scalar:
+    return jnp.asarray(_checks.positive(value, "weight"), jnp.result_type(float))
+
+
 class Entropic(eqx.Module):
     """The entropic prior `w D(body, guess)`, D the log-determinant divergence of two bodies.
 
@@ -30,19 +34,17 @@ class Entropic(eqx.Module):
     """
 
     guess: Inertia | MassProperties
-    weight: Scalar
+    weight: Scalar = eqx.field(converter=_weight)
 
-    def __init__(self, guess: Inertia | MassProperties, weight: float):
-        self.guess = _checks.single(guess, (Inertia, MassProperties), "guess")
-        weight = _checks.positive(weight, "weight")
-        self.weight = jnp.asarray(weight, jnp.result_type(float))
+    def __check_init__(self) -> None:
+        _checks.single(self.guess, (Inertia, MassProperties), "guess")
 
     def residuals(self, body: Inertia | MassProperties, scaled: bool = True) -> Float[Array, " n"]:
         """Numbers whose squares add up to `2 w D`; `scaled` false compares shapes alone."""
         if isinstance(body, MassProperties) and isinstance(self.guess, MassProperties):
             here, there = _pseudo_inertia(body), _pseudo_inertia(self.guess)
         else:
-            here, there = _second_moment(body), _second_moment(self.guess)
+            here, there = body.second_moment, self.guess.second_moment
         if not scaled:
             here, there = here / jnp.trace(here), there / jnp.trace(there)
         root = jnp.linalg.cholesky(there)
@@ -65,17 +67,8 @@ def _root(c: Float[Array, " n"]) -> Float[Array, " n"]:
     return jnp.where(near, x * jnp.sqrt(2.0 * series), exact)
 
 
-def _second_moment(body: Inertia | MassProperties) -> Float[Array, "3 3"]:
-    return body.second_moment
-
-
 def _pseudo_inertia(body: MassProperties) -> Float[Array, "4 4"]:
     m, c = body.mass, body.com
     upper = body.second_moment + m * c[:, None] * c[None, :]
     side = (m * c)[:, None]
-    return jnp.concatenate(
-        [
-            jnp.concatenate([upper, side], axis=1),
-            jnp.concatenate([side.T, m.reshape(1, 1)], axis=1),
-        ]
-    )
+    return jnp.block([[upper, side], [side.T, m]])

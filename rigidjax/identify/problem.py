@@ -1,5 +1,6 @@
 """What is known, what is free, and how far a guess is from the data."""
 
+import operator
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -23,12 +24,12 @@ from rigidjax.identify.jacobian import (
     states_of_one,
 )
 from rigidjax.identify.loss import AbstractLoss
-from rigidjax.identify.parameters import Own, Parameters, local
+from rigidjax.identify.parameters import Own, Parameters, by_slot, local
 from rigidjax.identify.prior import Entropic
 from rigidjax.identify.propagation import AbstractIntegrator, integrator_for
 from rigidjax.identify.recording import Recording
 from rigidjax.identify.reference_states import ReferenceStates, reference_of
-from rigidjax.identify.several_bodies import Bodies, has_mass
+from rigidjax.identify.several_bodies import Bodies, charts_of, has_mass
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.coupled import motion_of
 from rigidjax.motion.torques import AbstractForce, Sum, Torque
@@ -100,28 +101,13 @@ class Problem(eqx.Module):
         noise_each: bool | str | Sequence[Any] = False,
     ):
         recordings, chart, of = _sorted(recording, body)
-        if not recordings:
-            raise ValueError("Problem: wanted at least one Recording, got an empty sequence")
-        for item in recordings:
-            if not isinstance(item, Recording):
-                raise TypeError(f"Problem: wanted a Recording, got {type(item).__name__}")
-            if not _checks.known((item.t, [reading.values for reading in item.readings])):
-                raise TypeError(
-                    "recording: wanted known readings, got traced ones; make the Problem outside "
-                    "of jax.jit, jax.grad and jax.vmap, and give it to them as an argument"
-                )
-            lengths = {item.t.shape, *(reading.mask.shape for reading in item.readings)}
-            if len(lengths) > 1 or item.t.ndim != 1:
-                raise ValueError(
-                    "recording: wanted one, as Recording(t, …) makes it, got times and masks of "
-                    f"shapes {sorted(lengths)}; of many give a sequence"
-                )
-        for one in chart.charts if isinstance(chart, Bodies) else (chart,):
-            if not isinstance(one, AbstractBodyChart):
-                raise TypeError(
-                    "Problem: wanted what of the body is free, such as Ratios() or "
-                    f"PrincipalRatios(), got {_named(one)}"
-                )
+        _are_recordings(recordings)
+        for one in charts_of(chart):
+            known = isinstance(one, Inertia | MassProperties)
+            hint = "a body that is known is Known(body)" if known else ""
+            hint = "was () forgotten?" if isinstance(one, type) else hint
+            wanted = "what of the body is free, such as Ratios() or PrincipalRatios()"
+            _checks.instance(one, AbstractBodyChart, "Problem", wanted=wanted, hint=hint)
         if isinstance(free, str):
             free = (free,)  # pyright: ignore[reportAssignmentType]
         _checks.instance(free, Sequence, "free", wanted="a sequence of Free(where, name)")
@@ -149,12 +135,11 @@ class Problem(eqx.Module):
         elif not isinstance(apart, bool):
             self.noise_groups, _ = grouped(apart, of, "noise_each")
         self.slots = find(free, recordings[0], of)
-        for one in chart.charts if isinstance(chart, Bodies) else (chart,):
+        for one in charts_of(chart):
             for slot in self.slots:
                 if slot.name in (*one.log_names, *one.plain_names, "Ωx", "Ωy", "Ωz"):
-                    raise ValueError(
-                        f"Free {slot.name!r}: a quantity of the body has this name; give another"
-                    )
+                    wanted = "a quantity of the body has this name; give another"
+                    raise ValueError(f"Free {slot.name!r}: {wanted}")
         self.rung = _rung(recordings[0], chart)
         self.reference = reference_of(recordings, self.rung)
         if integrator is None and self.records.torque is not None:
@@ -208,26 +193,11 @@ class Problem(eqx.Module):
             )
         else:
             vector = _numbers(self.body, body)
-        shared, each = [], []
-        for slot in self.slots:
-            size = jnp.shape(slot.read(self.records))[1:]
-            if not slot.each:
-                some = () if slot.groups is None else (len(slot.labels),)
-                shared.append(_zeros(*some, *size))
-            if slot.each or slot.spread is not None:
-                each.append(_zeros(self.count, *size))
-        nothing = _zeros(self.count, 3)
-        return Parameters(
-            vector,
-            tuple(shared),
-            Own(
-                nothing if self.rung is Rigid else None,
-                nothing if self.rung is Rigid else None,
-                None if self.rung is Spin else nothing,
-                nothing,
-                tuple(each),
-            ),
-        )
+        zeros = ([_zeros(*shape) for shape in shapes] for shapes in _shapes(self).values())
+        _, shared, *state, each = zeros
+        firsts: Any = [part[0] if part else None for part in state]
+        own = Own(*firsts, each=tuple(each))
+        return Parameters(vector, tuple(shared), own)
 
     def unpack(self, parameters: Parameters) -> tuple[Any, Any]:
         """The body and the first state that the parameters stand for.
@@ -258,16 +228,14 @@ class Problem(eqx.Module):
         of those with a `spread` the shared value, and each recording's under "its name, own".
         """
         scenes = self.scenes(parameters)
-        of_all = iter(parameters.shared)
         out = {}
-        for slot in self.slots:
+        for slot, step, _ in by_slot(self, parameters):
             value = slot.read(scenes)
-            if slot.each:
+            if step is None:
                 out[slot.name] = value
                 continue
-            step, start = next(of_all), slot.read(self.records)
             first = 0 if slot.groups is None else _firsts(slot)
-            out[slot.name] = slot.move(start[first], step)
+            out[slot.name] = slot.move(slot.read(self.records)[first], step)
             if slot.spread is not None:
                 out[f"{slot.name}, own"] = value
         return out
@@ -296,11 +264,6 @@ def one_problem(problem: Any) -> Problem:
     """`problem`, if it is one as its constructor makes it.
 
     **Raises:** `TypeError` for another kind of thing, `ValueError` for arrays of other shapes.
-
-    >>> import rigidjax as rj
-    >>> record = rj.identify.Recording([0.0, 1.0], (rj.identify.Gyro(), [[1.0, 0, 0]] * 2))
-    >>> one_problem(Problem(record, rj.identify.Ratios())).count
-    1
     """
     _checks.instance(problem, Problem, "problem")
     records, rate = problem.records, problem.reference.rate
@@ -320,35 +283,12 @@ def fits(problem: Problem, parameters: Parameters) -> Parameters:
 
     **Raises:** `TypeError` for another kind of thing or another dtype, `ValueError` for other
     shapes, and for NaN where it is known.
-
-    >>> import rigidjax as rj
-    >>> record = rj.identify.Recording([0.0, 1.0], (rj.identify.Gyro(), [[1.0, 0, 0]] * 2))
-    >>> problem = Problem(record, rj.identify.Ratios())
-    >>> fits(problem, problem.start()).body.shape
-    (5,)
     """
     one_problem(problem)
     hint = "problem.start(body) makes them"
     _checks.instance(parameters, Parameters, "parameters", hint=hint)
-    own, each = parameters.own, (problem.count, 3)
-    shared, alone = [], []
-    for slot in problem.slots:
-        size = jnp.shape(slot.read(problem.records))[1:]
-        if not slot.each:
-            shared.append(size if slot.groups is None else (len(slot.labels), *size))
-        if slot.each or slot.spread is not None:
-            alone.append((problem.count, *size))
-    wanted = {
-        "body": [(problem.body.size,)],
-        "shared": shared,
-        "own.place": [each] if problem.rung is Rigid else [],
-        "own.speed": [each] if problem.rung is Rigid else [],
-        "own.turn": [] if problem.rung is Spin else [each],
-        "own.spin": [each],
-        "own.each": alone,
-    }
-    found = (parameters.body, parameters.shared, own.place, own.speed, own.turn, own.spin, own.each)
-    for (name, shapes), part in zip(wanted.items(), found, strict=True):
+    for name, shapes in _shapes(problem).items():
+        part = operator.attrgetter(name)(parameters)
         numbers = [_checks.numbers(leaf, f"parameters.{name}") for leaf in jax.tree.leaves(part)]
         if [leaf.shape for leaf in numbers] != shapes:
             raise ValueError(
@@ -364,6 +304,26 @@ def fits(problem: Problem, parameters: Parameters) -> Parameters:
             if _checks.known(leaf):
                 _checks.finite(leaf, f"parameters.{name}")
     return parameters
+
+
+def _shapes(problem: Problem) -> dict[str, list[tuple[int, ...]]]:
+    """The shapes of the arrays of each part of the problem's `Parameters`."""
+    shared, alone, each = [], [], (problem.count, 3)
+    for slot in problem.slots:
+        size = jnp.shape(slot.read(problem.records))[1:]
+        if not slot.each:
+            shared.append(size if slot.groups is None else (len(slot.labels), *size))
+        if slot.each or slot.spread is not None:
+            alone.append((problem.count, *size))
+    return {
+        "body": [(problem.body.size,)],
+        "shared": shared,
+        "own.place": [each] if problem.rung is Rigid else [],
+        "own.speed": [each] if problem.rung is Rigid else [],
+        "own.turn": [] if problem.rung is Spin else [each],
+        "own.spin": [each],
+        "own.each": alone,
+    }
 
 
 class Links(eqx.Module):
@@ -407,6 +367,24 @@ def _sorted(recording: Any, body: Any) -> tuple[list[Recording], Any, tuple[str,
     return rows, body, ("",) * len(rows)
 
 
+def _are_recordings(recordings: Sequence[Any]) -> None:
+    if not recordings:
+        raise ValueError("Problem: wanted at least one Recording, got an empty sequence")
+    for item in recordings:
+        _checks.instance(item, Recording, "Problem", wanted="a Recording")
+        if not _checks.known((item.t, [reading.values for reading in item.readings])):
+            raise TypeError(
+                "recording: wanted known readings, got traced ones; make the Problem outside "
+                "of jax.jit, jax.grad and jax.vmap, and give it to them as an argument"
+            )
+        lengths = {item.t.shape, *(reading.mask.shape for reading in item.readings)}
+        if len(lengths) > 1 or item.t.ndim != 1:
+            raise ValueError(
+                "recording: wanted one, as Recording(t, …) makes it, got times and masks of "
+                f"shapes {sorted(lengths)}; of many give a sequence"
+            )
+
+
 def _numbers(chart: AbstractBodyChart, body: Any) -> Float[Array, " chart"]:
     """The chart's numbers of a guess, or where it starts."""
     if body is None:
@@ -440,14 +418,6 @@ def _firsts(slot: Slot) -> Array:
     return jnp.argmax(slot.groups[None, :] == rows[:, None], axis=1)
 
 
-def _named(thing: Any) -> str:
-    if isinstance(thing, Inertia | MassProperties):
-        return f"{type(thing).__name__}; a body that is known is Known(body)"
-    if isinstance(thing, type):
-        return f"the class {thing.__name__}; was () forgotten?"
-    return type(thing).__name__
-
-
 def _with(recording: Recording, torque: Torque) -> Recording:
     if recording.torque is not None:
         raise ValueError(
@@ -464,7 +434,7 @@ def _rung(recording: Recording, body: AbstractBodyChart | Bodies) -> type:
     parts = law.parts if isinstance(law, Sum) else (law,)
     forced = any(isinstance(part, AbstractForce) for part in parts)
     if HasPose in felt or forced:
-        for chart in body.charts if isinstance(body, Bodies) else (body,):
+        for chart in charts_of(body):
             if not has_mass(chart):
                 raise ValueError(
                     "Problem: a sensor or force needs a body that moves, whose mass is known or "

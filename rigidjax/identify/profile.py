@@ -12,7 +12,7 @@ from rigidjax.identify import quantities
 from rigidjax.identify.parameters import Parameters
 from rigidjax.identify.residual import residuals
 from rigidjax.identify.result import Fit, one_fit
-from rigidjax.identify.search import cost_of, misfit, solver_for
+from rigidjax.identify.search import cost_of, misfit
 
 
 def profile(fit: Fit, name: str, level: float = 0.95) -> tuple[float, float]:
@@ -52,7 +52,8 @@ def profile(fit: Fit, name: str, level: float = 0.95) -> tuple[float, float]:
     wide = np.log(1e3) if quantity.positive else 1e3 * max(abs(middle), 1e-12)
     if not np.isfinite(deviation) or deviation <= 0:
         deviation = wide / 10
-    solver = solver_for(1e-4)
+    # Arrays, so as not to compile again.
+    solver = optx.LevenbergMarquardt(jnp.asarray(1e-12), jnp.asarray(1e-4))  # pyright: ignore
     bottom = 2.0 * cost_of(fit.parameters, fit.problem, fit.noises)
     shares = max(fit.correlation, 1.0)
     ends = []
@@ -80,9 +81,11 @@ def _end(
         inner, outer = outer, 2.0 * outer
         if outer > max(most, 4.0 * reach):
             return side * np.inf
-    steps: Any = brentq(growth, inner, outer, xtol=1e-2 * reach) if inner > 0 else None
-    if steps is None:
-        steps = brentq(lambda s: growth(s) if s > 0 else -(reach**2), 0.0, outer, xtol=1e-2 * reach)
+
+    def known(steps: float) -> float:
+        return growth(steps) if steps > 0 else -(reach**2)
+
+    steps: Any = brentq(known, inner, outer, xtol=1e-2 * reach)
     return middle + side * float(steps) * deviation
 
 

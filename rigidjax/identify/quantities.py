@@ -14,7 +14,7 @@ from rigidjax import _checks
 from rigidjax.identify.body_charts import AbstractBodyChart
 from rigidjax.identify.parameters import Parameters
 from rigidjax.identify.problem import Problem
-from rigidjax.identify.several_bodies import Bodies
+from rigidjax.identify.several_bodies import Bodies, in_a_row
 
 if TYPE_CHECKING:
     from rigidjax.identify.result import Fit
@@ -93,9 +93,7 @@ def _place(index: tuple[int, ...]) -> str:
 def vector(problem: Problem, parameters: Parameters) -> Array:
     """The reported quantities, logarithms of those that are positive."""
     rates = parameters.own.spin * problem.reference.rate[:, None]
-    found = problem.bodies(parameters)
-    bodies = found.values() if isinstance(found, dict) else (found,)
-    parts = []
+    parts, bodies = [], in_a_row(problem.bodies(parameters))
     for (_, chart), body in zip(charts(problem), bodies, strict=True):
         parts += [chart.logs(body), chart.plain(body)]
     parts.append(rates.reshape(-1))

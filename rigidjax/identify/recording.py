@@ -114,6 +114,11 @@ class Recording(eqx.Module):
         return tuple(reading.sensor for reading in self.readings)
 
 
+def readings_of(recording: Recording, kind: type) -> list[Any]:
+    """The readings of the sensors of one kind."""
+    return [reading for reading in recording.readings if isinstance(reading.sensor, kind)]
+
+
 def count_of(reading: Reading) -> int:
     """How many numbers a reading holds: those seen, times the components of an error."""
     return reading.sensor.components * int(reading.seen.sum())

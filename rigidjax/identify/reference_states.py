@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from rigidjax.identify.direct_estimates import attitudes, place_of, rates
+from rigidjax.identify.direct_estimates import attitudes, rates
 from rigidjax.identify.parameters import firsts
-from rigidjax.identify.recording import Recording
+from rigidjax.identify.recording import Recording, readings_of
 from rigidjax.identify.sensors import Gyro, Marker, Position, Range, Velocity
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.manifold import names, plus
@@ -55,11 +55,10 @@ def reference_of(recordings: Sequence[Recording], rung: type) -> ReferenceStates
 
 
 def _typical_rate(recording: Recording) -> float:
-    for reading in recording.readings:
-        if isinstance(reading.sensor, Gyro):
-            values = np.asarray(reading.values)[reading.seen]
-            rate = float(np.sqrt(np.mean(np.sum(values**2, axis=1))))
-            break
+    gyros = readings_of(recording, Gyro)
+    if gyros:
+        values = np.asarray(gyros[0].values)[gyros[0].seen]
+        rate = float(np.sqrt(np.mean(np.sum(values**2, axis=1))))
     else:
         rate = float(np.linalg.norm(first_rate(recording))) or _rate_of_readings(recording)
     return rate if rate > 0 else 1.0
@@ -89,7 +88,7 @@ def _first_place(recording: Recording) -> tuple[np.ndarray, np.ndarray, float]:
     direct = _read_place(recording)
     if direct is not None:
         return direct
-    markers = [r for r in recording.readings if isinstance(r.sensor, Marker)]
+    markers = readings_of(recording, Marker)
     if not markers:
         return np.zeros(3), np.zeros(3), 1.0
     seen = np.all([r.seen for r in markers], axis=0)
@@ -97,46 +96,49 @@ def _first_place(recording: Recording) -> tuple[np.ndarray, np.ndarray, float]:
         markers, seen = markers[:1], markers[0].seen
     t = np.asarray(recording.t)[seen]
     x = np.mean([np.asarray(r.values)[seen] for r in markers], axis=0)
-    place = np.mean([place_of(r) for r in markers], axis=0)
+    place = np.mean([np.asarray(r.sensor.place) for r in markers], axis=0)
     known, q = attitudes(recording)
     there = np.isin(t, known)
     if there.all():
         arms = jax.vmap(lambda turn: quaternion.rotate(turn, place))(q[np.isin(known, t)])
         x = x - np.asarray(arms)
+    return x[0], _first_speed(t, x), _length(x)
+
+
+def _first_speed(t: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """The slope of a line through the first places (n, 3); zero of one place."""
     few = slice(0, max(2, min(5, t.size)))
-    v = np.polyfit(t[few] - t[0], x[few], 1)[0] if t.size > 1 else np.zeros(3)
-    length = float(np.linalg.norm(x - x.mean(axis=0), axis=1).max())
-    return x[0], v, length if length > 0 else 1.0
+    return np.polyfit(t[few] - t[0], x[few], 1)[0] if t.size > 1 else np.zeros(3)
+
+
+def _length(x: np.ndarray) -> float:
+    """How far places (n, 3) are from their mean at most; 1 where they are all the same."""
+    return float(np.linalg.norm(x - x.mean(axis=0), axis=1).max()) or 1.0
 
 
 def _read_place(recording: Recording) -> tuple[np.ndarray, np.ndarray, float] | None:
     """As `_first_place`, from what reads positions, ranges and velocities; `None` without them."""
-    t, readings = np.asarray(recording.t), recording.readings
-    positions = [r for r in readings if isinstance(r.sensor, Position)]
-    ranges = [r for r in readings if isinstance(r.sensor, Range)]
-    speeds = [r for r in readings if isinstance(r.sensor, Velocity) and r.sensor.mounting is None]
-    if any(isinstance(r.sensor, Marker) for r in readings) and not positions:
+    t = np.asarray(recording.t)
+    positions, ranges = readings_of(recording, Position), readings_of(recording, Range)
+    speeds = [r for r in readings_of(recording, Velocity) if r.sensor.mounting is None]
+    if readings_of(recording, Marker) and not positions:
         return None
     when, x = np.zeros(0), np.zeros((0, 3))
     if positions:
         when, x = t[positions[0].seen], np.asarray(positions[0].values)[positions[0].seen]
     elif ranges:
         seen = np.all([r.seen for r in ranges], axis=0)
-        sensors: list[Any] = [r.sensor for r in ranges]
-        stations = np.stack([np.asarray(sensor.station) for sensor in sensors])
+        stations = np.stack([np.asarray(r.sensor.station) for r in ranges])
         lengths = np.stack([np.asarray(r.values) for r in ranges], axis=1)[seen]
         when, x = t[seen], _from_ranges(stations, lengths)
     if not when.size and not speeds:
         return None
-    v = np.zeros(3)
     if speeds:
         v = np.asarray(speeds[0].values)[speeds[0].seen][0]
-    elif when.size > 1:
-        few = slice(0, max(2, min(5, when.size)))
-        v = np.polyfit(when[few] - when[0], x[few], 1)[0]
+    else:
+        v = _first_speed(when, x)
     x = x if when.size else np.zeros((1, 3))
-    length = float(np.linalg.norm(x - x.mean(axis=0), axis=1).max())
-    return x[0], v, length if length > 0 else 1.0
+    return x[0], v, _length(x)
 
 
 def _from_ranges(stations: np.ndarray, lengths: np.ndarray) -> np.ndarray:
@@ -154,8 +156,7 @@ def _from_ranges(stations: np.ndarray, lengths: np.ndarray) -> np.ndarray:
 
 def first_rate(recording: Recording) -> np.ndarray:
     """A first body rate (3,), rad/s: a gyro's, or between attitudes; zero without either."""
-    for reading in recording.readings:
-        if isinstance(reading.sensor, Gyro):
-            return np.asarray(reading.values)[int(np.argmax(reading.seen))]
+    for reading in readings_of(recording, Gyro):
+        return np.asarray(reading.values)[int(np.argmax(reading.seen))]
     _, w = rates(recording)
     return w[0] if len(w) else np.zeros(3)

@@ -1,5 +1,6 @@
 """From errors to what least squares makes small: noise, saturation, losses, priors, joints."""
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -7,8 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from rigidjax.identify.jacobian import all_errors
-from rigidjax.identify.loss import shrink, weight
-from rigidjax.identify.parameters import Parameters
+from rigidjax.identify.parameters import Parameters, by_slot
 from rigidjax.identify.problem import Problem
 from rigidjax.identify.reference_states import ReferenceStates
 from rigidjax.identify.several_bodies import Bodies
@@ -61,12 +61,8 @@ def residuals(parameters: Parameters, args: Any) -> Any:
     **Arguments:** `parameters`; `args` the problem, the noise of each sensor, and weights (R, T)
     of the times.
     """
-    return assembled(parameters, args, *all_errors(parameters, args[0]))
-
-
-def assembled(parameters: Parameters, args: Any, errors: tuple, ends: Any) -> Any:
-    """`residuals` of errors and last states that are known."""
     problem, noise, weights = args
+    errors, ends = all_errors(parameters, problem)
     return seen(problem, errors, noise, weights), beside(parameters, problem, ends)
 
 
@@ -74,37 +70,38 @@ def seen(problem: Problem, errors: tuple, noise: Noise, weights: Array) -> tuple
     """The readings' residuals (R, T, k) as least squares is to see them."""
     read = []
     for scaled in whitened(problem, errors, noise):
-        shrunk = scaled
         if problem.loss is not None:
-            shrunk = jax.vmap(jax.vmap(lambda e: shrink(problem.loss, e)))(scaled)
-        read.append(shrunk * weights[..., None])
+            scaled = jax.vmap(jax.vmap(problem.loss.shrink))(scaled)
+        read.append(scaled * weights[..., None])
     return tuple(read)
 
 
 def seen_rows(
     problem: Problem, errors: tuple, blocks: tuple, noise: Noise, weights: Array
-) -> list[tuple[Array, Array]]:
-    """For each sensor, `seen` and its derivatives (R, T, k, n), of those of the errors."""
+) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
+    """`seen`, and its derivatives (R, T, k, n) for each sensor, of those of the errors."""
 
     def of(errors: tuple) -> tuple[Array, ...]:
         return seen(problem, errors, noise, weights)
 
+    return with_rows(of, errors, blocks)
+
+
+def with_rows(of: Callable[[tuple], tuple], errors: tuple, blocks: tuple) -> tuple[tuple, tuple]:
+    """`of(errors)`, and its derivatives (R, T, k, n) of those of the errors, `blocks`."""
     # What each reading says depends on its own error alone: a product of small matrices.
     read, push = jax.linearize(of, errors)
-    rows = jax.vmap(push, in_axes=-1, out_axes=-1)(blocks)
-    return list(zip(read, rows, strict=True))
+    return read, jax.vmap(push, in_axes=-1, out_axes=-1)(blocks)
 
 
 def beside(parameters: Parameters, problem: Problem, ends: Any) -> tuple[Array, ...]:
     """Residuals that are no readings: priors, and joints between pieces of one recording."""
     out = []
-    shared, each = iter(parameters.shared), iter(parameters.own.each)
-    for slot in problem.slots:
-        step = next(each if slot.each else shared)
+    for slot, shared, each in by_slot(problem, parameters):
         if slot.prior is not None:
-            out.append(step / slot.prior)
+            out.append((each if shared is None else shared) / slot.prior)
         if slot.spread is not None:
-            out.append(next(each) / slot.spread)
+            out.append(each / slot.spread)
     if problem.prior is not None:
         assert not isinstance(problem.body, Bodies)
         body = problem.body.body(parameters.body)
@@ -128,6 +125,8 @@ def weights_of(problem: Problem, errors: tuple, noise: Noise) -> tuple[Float[Arr
     out = []
     scaled = whitened(problem, errors, noise)
     for reading, e in zip(problem.records.readings, scaled, strict=True):
-        each = jax.vmap(jax.vmap(lambda x: weight(problem.loss, x)))(e)
+        each = jnp.ones(e.shape[:-1], e.dtype)
+        if problem.loss is not None:
+            each = jax.vmap(jax.vmap(problem.loss.weight))(e)
         out.append(jnp.where(reading.mask, each, 0.0))
     return tuple(out)

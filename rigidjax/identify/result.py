@@ -24,13 +24,11 @@ class Start(eqx.Module):
     **Fields:** `parameters` where it ended; `cost` half of the sum of squares there; `converged`
     whether the search did; `fits` whether it explains the data as well as the best point does.
 
-    >>> import jax.numpy as jnp, rigidjax as rj
-    >>> ts = jnp.linspace(0.0, 10.0, 80)
-    >>> motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1, 0.1, 1.0]), ts)
-    >>> record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), motion.ys.omega))
-    >>> found = rj.identify.fit(rj.identify.Problem(record, rj.identify.PrincipalRatios()))
-    >>> len(found.starts), all(start.cost < 1e-6 for start in found.starts)
-    (8, True)
+    >>> import rigidjax as rj
+    >>> record = rj.identify.Recording([0.0, 1.0], (rj.identify.Gyro(), [[1.0, 0, 0]] * 2))
+    >>> problem = rj.identify.Problem(record, rj.identify.PrincipalRatios())
+    >>> Start(problem.start(), 0.0, True, True).fits
+    True
     """
 
     parameters: Parameters
@@ -164,10 +162,6 @@ def one_fit(found: Any, name: str = "fit") -> Fit:
     """`found`, if it is one `Fit`, not many in one container.
 
     **Raises:** `TypeError` for another kind of thing, `ValueError` for leading axes.
-
-    >>> one_fit(3)
-    Traceback (most recent call last):
-    TypeError: ...
     """
     _checks.instance(found, Fit, name)
     if np.shape(found.chi2) != ():

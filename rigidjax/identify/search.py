@@ -8,7 +8,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
 from jaxtyping import Array, Float
 
 from rigidjax.identify.checkpoint import SearchState, Tried
@@ -21,6 +20,7 @@ from rigidjax.identify.levenberg_marquardt import (
 )
 from rigidjax.identify.parameters import Parameters
 from rigidjax.identify.problem import Problem
+from rigidjax.identify.recording import count_of
 from rigidjax.identify.residual import Noise, residuals
 
 # The record is fitted from its beginning first: a long one is a forest of wrong minima (the phase
@@ -61,7 +61,10 @@ def _descend(
     start: Parameters, problem: Problem, noise: Noise, weights: Array, settings: Settings
 ) -> tuple[Tried, Search]:
     value, end = descend(start, problem, noise, weights, settings)
-    return _safe(start, value, end.cost, end.converged), end
+    # A wild step can end in NaN: the start is then the better point.
+    lost = ~jnp.isfinite(end.cost)
+    value = jax.tree.map(lambda a, b: jnp.where(lost, b, a), value, start)
+    return Tried(value, jnp.where(lost, jnp.inf, end.cost), end.converged & ~lost), end
 
 
 def evaluate(parameters: Parameters, problem: Problem) -> Any:
@@ -90,19 +93,7 @@ def many(
     settings: Settings,
 ) -> Tried:
     """`least_squares` from many starts at once (a leading axis on `starts`)."""
-
-    def one(start: Parameters) -> Tried:
-        value, end = descend(start, problem, noise, weights, settings)
-        return _safe(start, value, end.cost, end.converged)
-
-    return jax.vmap(one)(starts)
-
-
-def _safe(start: Parameters, value: Parameters, cost: Array, done: Array) -> Tried:
-    # A wild step can end in NaN: the start is then the better point.
-    lost = ~jnp.isfinite(cost)
-    value = jax.tree.map(lambda a, b: jnp.where(lost, b, a), value, start)
-    return Tried(value, jnp.where(lost, jnp.inf, cost), done & ~lost)
+    return jax.vmap(lambda start: _descend(start, problem, noise, weights, settings)[0])(starts)
 
 
 def cost_of(parameters: Parameters, problem: Problem, noise: Noise) -> float:
@@ -118,15 +109,6 @@ def misfit(parameters: Parameters, args: Any) -> Float[Array, ""]:
 def half_sum(tree: Any) -> Float[Array, ""]:
     """Half the sum of the squares of all leaves."""
     return 0.5 * sum((jnp.sum(leaf**2) for leaf in jax.tree.leaves(tree)), jnp.zeros(()))
-
-
-def solver_for(tolerance: float) -> optx.LevenbergMarquardt:
-    """Levenberg–Marquardt of optimistix that stops at steps of `tolerance` standard deviations.
-
-    An array, so as not to compile again.
-    """
-    limit: Any = jnp.asarray(tolerance)
-    return optx.LevenbergMarquardt(rtol=jnp.asarray(1e-12), atol=limit)  # pyright: ignore
 
 
 def whole(problem: Problem) -> Float[Array, "records times"]:
@@ -197,6 +179,12 @@ def settle(
 def fresh(point: Parameters) -> Tried:
     """A start whose misfit is not known yet."""
     return Tried(point, jnp.asarray(jnp.inf), jnp.asarray(False))
+
+
+def again(best: Tried, problem: Problem, noise: Noise, tolerance: float, max_steps: int) -> Tried:
+    """`settle` over the whole of the records from a point that is near the bottom."""
+    near = fresh(best.parameters)
+    return settle(near, problem, noise, whole(problem), tolerance, max_steps, near=True)
 
 
 def climb(
@@ -275,7 +263,7 @@ def enough(problem: Problem) -> float:
     total = 0.0
     for reading in problem.records.readings:
         share = 0.01 if reading.sensor.noise is None else 1.0
-        total += share * reading.sensor.components * int(reading.seen.sum())
+        total += share * count_of(reading)
     return total
 
 

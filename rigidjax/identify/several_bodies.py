@@ -30,21 +30,19 @@ class Bodies(eqx.Module):
 
     def __init__(self, charts: Mapping[str, AbstractBodyChart]):
         self.names, self.charts = tuple(charts), tuple(charts.values())
-        forms: list[Any] = []
-        members: list[list[AbstractBodyChart]] = []
+        members: dict[Any, list[AbstractBodyChart]] = {}
         kind_of, row_of = [], []
         for chart in self.charts:
             leaves, structure = jax.tree.flatten(chart)
-            form = structure, [np.shape(leaf) for leaf in leaves]
-            if form not in forms:
-                forms.append(form)
-                members.append([])
-            kind = forms.index(form)
-            kind_of.append(kind)
-            row_of.append(len(members[kind]))
-            members[kind].append(chart)
+            form = structure, tuple(np.shape(leaf) for leaf in leaves)
+            alike = members.setdefault(form, [])
+            kind_of.append(list(members).index(form))
+            row_of.append(len(alike))
+            alike.append(chart)
         self.kind_of, self.row_of = tuple(kind_of), tuple(row_of)
-        self.kinds = tuple(jax.tree.map(lambda *x: jnp.stack(x), *alike) for alike in members)
+        self.kinds = tuple(
+            jax.tree.map(lambda *x: jnp.stack(x), *alike) for alike in members.values()
+        )
         if len({has_mass(chart) for chart in self.charts}) > 1:
             raise ValueError(
                 "body: wanted all bodies with a mass or none of them, got "
@@ -88,13 +86,10 @@ class Bodies(eqx.Module):
             here = jnp.where(kind == index, row, 0)
             chart = jax.tree.map(lambda leaf, at=here: leaf[at], charts)
             body = chart.body(vector[: chart.size])
-            found = (
-                body
-                if found is None
-                else jax.tree.map(
-                    lambda new, old, at=index: jnp.where(kind == at, new, old), body, found
-                )
-            )
+            if found is not None:
+                mine = kind == index
+                body = jax.tree.map(lambda a, b, mine=mine: jnp.where(mine, a, b), body, found)
+            found = body
         return found
 
 
@@ -124,6 +119,21 @@ def matter(
         return body.body(vector)
     assert which is not None
     return body.body(vector, which)
+
+
+def charts_of(body: Any) -> tuple[Any, ...]:
+    """The charts of a problem's body or bodies."""
+    return body.charts if isinstance(body, Bodies) else (body,)
+
+
+def in_a_row(bodies: Any) -> list[Any]:
+    """The bodies of `Problem.bodies`, of one or of several."""
+    return list(bodies.values()) if isinstance(bodies, dict) else [bodies]
+
+
+def tensor_of(body: Inertia | MassProperties) -> Float[Array, "3 3"]:
+    """The inertia tensor of a body, about its centre of mass if it has one, kg m²."""
+    return (body.inertia if isinstance(body, MassProperties) else body).tensor
 
 
 def has_mass(chart: AbstractBodyChart) -> bool:

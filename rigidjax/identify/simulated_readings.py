@@ -1,5 +1,6 @@
 """What sensors would read of a motion that is known: simulated data."""
 
+import math
 from collections.abc import Sequence
 from typing import Any, overload
 
@@ -94,9 +95,8 @@ def simulate_readings(
     start: Any = state0
     sol = simulate(what_turns(body, type(state0)), start, ts, torque)
     states = sol.ys if sol.own is None else Coupled(sol.ys, sol.own)
-    keys = (
-        [None] * len(sensors) if key is None else jax.random.split(_checks.key(key), len(sensors))
-    )
+    count = len(sensors)
+    keys = [None] * count if key is None else jax.random.split(_checks.key(key), count)
     out = tuple(
         _readings(one, body, torque, sol.ts, start, states, each)
         for one, each in zip(sensors, keys, strict=True)
@@ -144,10 +144,8 @@ class _Plain(eqx.Module):
 
 def _fits(sensor: Any, state0: Any, key: Any) -> None:
     """Refuse what is no sensor, and one that needs more than there is."""
-    name = type(sensor).__name__
-    _checks.instance(
-        sensor, AbstractSensor, "sensor", wanted="a sensor such as Gyro(0.01), or several"
-    )
+    name, wanted = type(sensor).__name__, "a sensor such as Gyro(0.01), or several"
+    _checks.instance(sensor, AbstractSensor, "sensor", wanted=wanted)
     if not isinstance(state0, sensor.feels):
         raise TypeError(
             f"{name} needs a state with {sensor.feels.__name__}, got {type(state0).__name__}; take "
@@ -162,10 +160,7 @@ def _fits(sensor: Any, state0: Any, key: Any) -> None:
         raise ValueError(
             f"{name}: noise=None says no size of the noise to draw; give noise, or key=None"
         )
-    size = 1
-    for length in sensor.reading_shape:
-        size *= length
-    if not hasattr(sensor, "reading_of") and size != sensor.components:
+    if not hasattr(sensor, "reading_of") and math.prod(sensor.reading_shape) != sensor.components:
         raise ValueError(
             f"{name}: its readings of shape {sensor.reading_shape} are not its error of "
             f"{sensor.components} numbers plus a prediction; write a method reading_of(now, "

@@ -48,11 +48,8 @@ class Descent(eqx.Module):
     def __init__(self, optimiser: "optax.GradientTransformation", *, steps: int, batch: int):
         import optax
 
-        if not isinstance(optimiser, optax.GradientTransformation):
-            raise TypeError(
-                "Descent: wanted an optimiser of optax such as optax.adam(1e-2), got "
-                f"{type(optimiser).__name__}"
-            )
+        wanted = "an optimiser of optax such as optax.adam(1e-2)"
+        _checks.instance(optimiser, optax.GradientTransformation, "Descent", wanted=wanted)
         self.optimiser = optimiser
         self.steps, self.batch = _checks.whole(steps, "steps", 1), _checks.whole(batch, "batch", 1)
 
@@ -131,13 +128,11 @@ def only(problem: Problem, rows: Array) -> Problem:
     For misfits alone: its `recordings` are not cut to their own lengths.
     """
 
-    def pick(at: Any, whole: Any) -> Any:
-        return whole if at(whole) is None else eqx.tree_at(at, whole, _rows(at(whole), rows))
+    def at(of: Problem) -> Any:
+        return of.records, of.reference, of.which, [slot.groups for slot in of.slots]
 
-    for at in (lambda p: p.records, lambda p: p.reference, lambda p: p.which):
-        problem = pick(at, problem)
-    slots = tuple(pick(lambda slot: slot.groups, slot) for slot in problem.slots)
-    return eqx.tree_at(lambda p: p.slots, problem, slots) if slots else problem
+    few = _rows(at(problem), rows)
+    return eqx.tree_at(at, problem, few, is_leaf=lambda node: node is None)
 
 
 def _rows(tree: Any, rows: Array) -> Any:

@@ -13,7 +13,7 @@ from rigidjax.identify.full_scale import at_limit
 from rigidjax.identify.levenberg_marquardt import beside_rows
 from rigidjax.identify.parameters import Parameters, places
 from rigidjax.identify.problem import Problem
-from rigidjax.identify.residual import Noise, weights_of, whitened
+from rigidjax.identify.residual import Noise, weights_of, whitened, with_rows
 from rigidjax.identify.search import evaluate
 
 # A direction whose singular value is below this share of the largest is not seen at all.
@@ -65,13 +65,12 @@ class Linearised(eqx.Module):
 
     def apart(self, blocks: np.ndarray) -> list[np.ndarray]:
         """Columns (R, …, m) of the recordings as columns of all numbers (…, n)."""
-        return [self.spread(block, where) for block, where in zip(blocks, self.places, strict=True)]
-
-    def spread(self, block: np.ndarray, where: np.ndarray) -> np.ndarray:
-        """A recording's columns (…, m) as columns of all numbers (…, n)."""
-        wide = np.zeros((*block.shape[:-1], self.size + 1))
-        np.add.at(wide.T, where, block.T)
-        return wide[..., :-1]
+        out = []
+        for block, where in zip(blocks, self.places, strict=True):
+            wide = np.zeros((*block.shape[:-1], self.size + 1))
+            np.add.at(wide.T, where, block.T)
+            out.append(wide[..., :-1])
+        return out
 
     @property
     def scores(self) -> np.ndarray:
@@ -90,8 +89,7 @@ def _linearised(problem: Problem, parameters: Parameters, noise: Noise, found: A
     def of(errors: tuple) -> tuple[Array, ...]:
         return whitened(problem, errors, noise)
 
-    out, push = jax.linearize(of, errors)
-    slopes = jax.vmap(push, in_axes=-1, out_axes=-1)(blocks)
+    out, slopes = with_rows(of, errors, blocks)
     flat, restore = ravel_pytree(parameters)
     extra, extra_slopes = beside_rows(problem, flat, restore, ends, end_blocks)
     weights = weights_of(problem, errors, noise)
@@ -261,11 +259,14 @@ def smooth_share(e: np.ndarray, seen: np.ndarray) -> float:
     """The share of the variance of errors (R, T) that second differences do not show."""
     rows = [x[kept] for x, kept in zip(e, seen, strict=True)]
     total = sum(float(row @ row) for row in rows) / max(sum(row.size for row in rows), 1)
+    return float(np.clip(1.0 - scatter(rows) / total, 0.0, 1.0)) if total > 0 else 1.0
+
+
+def scatter(rows: list[np.ndarray]) -> float:
+    """The variance that rows would have if they were white, by their second differences."""
     bends = np.concatenate([row[2:] - 2.0 * row[1:-1] + row[:-2] for row in rows])
-    if not bends.size or not total > 0:
-        return 1.0
     # The second difference of white noise has six times its variance.
-    return float(np.clip(1.0 - np.mean(bends**2) / 6.0 / total, 0.0, 1.0))
+    return float(np.mean(bends**2)) / 6.0 if bends.size else 0.0
 
 
 def _fading(x: np.ndarray, rho: float) -> np.ndarray:
@@ -349,9 +350,8 @@ def estimate_noise(problem: Problem, errors: tuple, noise: Noise, parameters: Pa
     parameters is taken off the number of errors.
     """
     free = ravel_pytree(parameters)[0].size
-    total = sum(int(r.seen.sum()) * r.sensor.components for r in problem.records.readings)
     weights = weights_of(problem, errors, noise)
-    share = max(1.0 - free / total, 0.1)
+    share = max(1.0 - free / problem.records.size, 0.1)
     count = problem.count
     groups = np.zeros(count, int) if problem.noise_groups is None else problem.noise_groups
     groups = np.asarray(groups)

@@ -9,11 +9,12 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
-from rigidjax.body.inertia import MassProperties
+from rigidjax.identify.body_charts import COMPONENTS, Tensor
 from rigidjax.identify.parameters import Parameters
 from rigidjax.identify.problem import Problem
 from rigidjax.identify.quantities import charts, labels, recording_names, vector
 from rigidjax.identify.reference_states import ReferenceStates
+from rigidjax.identify.several_bodies import in_a_row, tensor_of
 from rigidjax.motion.manifold import minus, parts
 from rigidjax.rotation import quaternion
 
@@ -73,8 +74,7 @@ class Combination(eqx.Module):
         return f"No reading changes where these change together: {', '.join(parts[:MOST])}{more}."
 
 
-# Components of a tensor in the order of its names.
-TENSOR = {"Ixx": (0, 0), "Iyy": (1, 1), "Izz": (2, 2), "Iyz": (1, 2), "Ixz": (0, 2), "Ixy": (0, 1)}
+TENSOR = dict(zip(Tensor.plain_names, COMPONENTS, strict=True))
 
 
 def undetermined(fit: "Fit") -> tuple[Combination, ...]:
@@ -137,20 +137,16 @@ def _names(problem: Problem) -> list[list[tuple[str, str, bool]]]:
         of_all += [(f"{part}{name}", unit, False) for part in TENSOR]
     own, out = problem.start().own, []
     for axes in ("the world's", "the body's"):
-        rows = list(of_all)
-        for where in recording_names(problem):
-            if own.turn is not None:
-                rows += [
-                    (f"the first attitude about {axes} {k}{where}", "rad", False) for k in "xyz"
-                ]
-        for part, name, unit in ((own.place, "position", "m"), (own.speed, "velocity", "m/s")):
-            if part is not None:
-                rows += [
-                    (f"the first {name} {k}{where}", unit, False)
-                    for where in recording_names(problem)
-                    for k in "xyz"
-                ]
-        out.append(rows)
+        turn = (own.turn, f"attitude about {axes}", "rad")
+        parts = (turn, (own.place, "position", "m"), (own.speed, "velocity", "m/s"))
+        rows = [
+            (f"the first {name} {k}{where}", unit, False)
+            for part, name, unit in parts
+            if part is not None
+            for where in recording_names(problem)
+            for k in "xyz"
+        ]
+        out.append([*of_all, *rows])
     return out
 
 
@@ -168,11 +164,9 @@ def _slopes(problem: Problem, parameters: Parameters) -> tuple[Array, Array]:
 
     def value(x: Array) -> Array:
         moved = restore(x)
-        bodies = problem.bodies(moved)
-        rows = bodies.values() if isinstance(bodies, dict) else (bodies,)
         shown = [vector(problem, moved)]
-        for body in rows:
-            tensor = (body.inertia if isinstance(body, MassProperties) else body).tensor
+        for body in in_a_row(problem.bodies(moved)):
+            tensor = tensor_of(body)
             shown.append(jnp.stack([tensor[place] for place in TENSOR.values()]))
         now = jax.vmap(ReferenceStates.moved)(reference, moved.own)
         one = jax.tree.map(lambda leaf: leaf[0], now)
@@ -192,17 +186,15 @@ def _kept(fit: "Fit", names: list[str], changes: np.ndarray) -> np.ndarray:
     """Which numbers name the changes (k, M): of each body its moments; where the principal axes
     turn, the components of its tensor.
     """
-    bodies = fit.problem.bodies(fit.parameters)
-    rows = bodies.values() if isinstance(bodies, dict) else (bodies,)
+    rows = in_a_row(fit.problem.bodies(fit.parameters))
     kept = np.ones(len(names), bool)
     for (where, chart), body in zip(charts(fit.problem), rows, strict=True):
-        inertia = body.inertia if isinstance(body, MassProperties) else body
         # A chart may report these components, too: the last are those of all charts.
         every = [[i for i, one in enumerate(names) if one == f"{part}{where}"] for part in TENSOR]
         places = [some[-1] for some in every]
         kept[[i for some in every for i in some]] = False
         moments = [names.index(f"{log}{where}") for log in chart.log_names if log != "mass"]
-        if moments and _turns(np.asarray(inertia.tensor), changes[:, places]):
+        if moments and _turns(np.asarray(tensor_of(body)), changes[:, places]):
             kept[moments], kept[places] = False, True
     return kept
 

@@ -13,10 +13,10 @@ import numpy as np
 
 from rigidjax.identify import uncertainty
 from rigidjax.identify.checkpoint import Tried
-from rigidjax.identify.parameters import Parameters, numbered
+from rigidjax.identify.parameters import Parameters, by_slot, numbered
 from rigidjax.identify.problem import Problem
 from rigidjax.identify.residual import Noise
-from rigidjax.identify.search import fresh, settle
+from rigidjax.identify.search import again
 
 # Rounds, and the relative change at which they end; a width that falls below so much of the first
 # one is zero.
@@ -31,15 +31,13 @@ def with_widths(
     wanted = [index for index, slot in enumerate(problem.slots) if slot.estimated]
     if not wanted:
         return problem, best
-    whole = jnp.ones_like(problem.records.t)
     least = _LEAST * _widths(problem)[wanted]
     for _ in range(_ROUNDS):
         before = _widths(problem)[wanted]
         found = np.maximum(_expected(problem, best.parameters, noise)[wanted], least)
         new = [jnp.asarray(width) for width in found]
         problem = eqx.tree_at(lambda p: [p.slots[i].spread for i in wanted], problem, new)
-        near = fresh(best.parameters)
-        best = settle(near, problem, noise, whole, tolerance, max_steps, near=True)
+        best = again(best, problem, noise, tolerance, max_steps)
         if (np.abs(found - before) < _SETTLED * before).all() or (found <= least).all():
             break
     return problem, best
@@ -54,14 +52,11 @@ def _expected(problem: Problem, parameters: Parameters, noise: Noise) -> np.ndar
     """The root mean square of each one's deviations, what is not known of them included."""
     linear = uncertainty.linearise(problem, parameters, noise)
     variance = np.diag(uncertainty.spread(linear, _WHITE).seen)
-    values, places = iter(parameters.own.each), iter(numbered(parameters).own.each)
+    values, places = (by_slot(problem, of) for of in (parameters, numbered(parameters)))
     out = np.ones(len(problem.slots))
     for index, slot in enumerate(problem.slots):
-        if slot.each:
-            next(values)
-            next(places)
         if slot.spread is not None:
-            deviation, where = np.asarray(next(values)), np.ravel(next(places)).astype(int)
+            deviation, where = np.asarray(values[index][2]), np.ravel(places[index][2]).astype(int)
             out[index] = np.sqrt(np.mean(deviation**2) + np.mean(variance[where]))
     return out
 

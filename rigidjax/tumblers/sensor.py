@@ -10,7 +10,13 @@ from jaxtyping import Array, Float
 
 from rigidjax import _checks
 from rigidjax._types import HasAttitude, Scalar
-from rigidjax.identify.sensors.base import AbstractSensor, SensorInput, noise_of, number_of
+from rigidjax.identify.sensors.base import (
+    AbstractSensor,
+    SensorInput,
+    deviations,
+    optional,
+    required,
+)
 from rigidjax.motion.torques.base import vector_at
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.linalg3 import determinant, dot
@@ -75,16 +81,15 @@ class Brightness(AbstractSensor):
         offset: Any = None,
     ):
         self.sun, self.observer = _source(sun, "sun"), _source(observer, "observer")
-        self.scattering, self.noise = law_of(scattering), noise_of(noise, 1)
+        self.scattering, self.noise = law_of(scattering), deviations(1)(noise)
         self.unit = _checks.word(unit, UNITS, "unit")
         usual = 1.0 if unit == "flux" else 0.0
-        found = number_of(usual if level is None else level, "level")
-        assert found is not None
+        found = required("level", ())(usual if level is None else level)
         if unit == "flux":
             found = _checks.refuse(found, ~(found > 0), "level: wanted a positive flux")
         self.level = found
         self.semi_axes = None if semi_axes is None else _lengths(semi_axes)
-        self.offset = number_of(offset, "offset")
+        self.offset = optional("offset", ())(offset)
 
     def error(self, now: SensorInput, reading: Array) -> Float[Array, "1"]:
         return (reading - self.predicted(now))[None]

@@ -1,7 +1,9 @@
 """Sensors that see which way the body points or where its parts are."""
 
+import dataclasses
 from typing import Any, ClassVar
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -11,10 +13,9 @@ from rigidjax._types import HasAttitude, HasPose, Scalar, Vec3
 from rigidjax.identify.sensors.base import (
     AbstractSensor,
     SensorInput,
-    noise_of,
-    number_of,
-    place_of,
-    vector_of,
+    deviations,
+    optional,
+    required,
 )
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.linalg3 import cross, dot
@@ -40,32 +41,35 @@ class AttitudeSensor(AbstractSensor):
     components: ClassVar[int] = 3
     feels: ClassVar[type] = HasAttitude
     unit: ClassVar[str] = "rad"
-    noise: Float[Array, "3"] | None
-    mounting: Float[Array, "3"] | None
-    offset: Scalar | None
-
-    def __init__(self, noise: Any = None, *, mounting: Any = None, offset: Any = None):
-        self.noise, self.mounting = noise_of(noise), vector_of(mounting, "mounting")
-        self.offset = number_of(offset, "offset")
+    noise: Vec3 | None = eqx.field(converter=deviations(), default=None)
+    _: dataclasses.KW_ONLY
+    mounting: Vec3 | None = eqx.field(converter=optional("mounting"), default=None)
+    offset: Scalar | None = eqx.field(converter=optional("offset", ()), default=None)
 
     def error(self, now: SensorInput, reading: Array) -> Vec3:
-        q = now.state.q
-        if self.mounting is not None:
-            q = quaternion.multiply(q, quaternion.exp(self.mounting))
+        q = _mounted(now.state.q, self.mounting)
         return quaternion.log(quaternion.multiply(quaternion.conjugate(q), reading))
 
     def reading_of(self, now: SensorInput, error: Vec3) -> Float[Array, "4"]:
         """The reading (4,) whose error (3,) rad is this one."""
-        q = now.state.q
-        if self.mounting is not None:
-            q = quaternion.multiply(q, quaternion.exp(self.mounting))
+        q = _mounted(now.state.q, self.mounting)
         return quaternion.multiply(q, quaternion.exp(error))
 
     def refusal(self, values: np.ndarray) -> tuple[np.ndarray, str]:
-        wrong = np.abs(np.linalg.norm(values, axis=1) - 1) > 1e-6
-        return wrong, (
-            "the quaternion at index {index} is not unit; wanted (w, x, y, z) with the scalar first"
-        )
+        wanted = "wanted (w, x, y, z) with the scalar first"
+        return _not_unit(values), f"the quaternion at index {{index}} is not unit; {wanted}"
+
+
+def _mounted(q: Array, mounting: Vec3 | None) -> Array:
+    """The attitude of a sensor's axes."""
+    return q if mounting is None else quaternion.multiply(q, quaternion.exp(mounting))
+
+
+def _unit(world: Any) -> Vec3:
+    vector = required("world")(world)
+    length = jnp.sqrt(dot(vector, vector))
+    words = "world: wanted a direction, got a vector of length zero"
+    return vector / _checks.refuse(length, ~(length > 0), words)
 
 
 class Direction(AbstractSensor):
@@ -88,19 +92,11 @@ class Direction(AbstractSensor):
     components: ClassVar[int] = 2
     feels: ClassVar[type] = HasAttitude
     unit: ClassVar[str] = "rad"
-    world: Float[Array, "3"]
-    noise: Float[Array, "2"] | None
-    mounting: Float[Array, "3"] | None
-    offset: Scalar | None
-
-    def __init__(self, world: Any, noise: Any = None, *, mounting: Any = None, offset: Any = None):
-        vector = place_of(world, "world")
-        length = jnp.sqrt(dot(vector, vector))
-        words = "world: wanted a direction, got a vector of length zero"
-        length = _checks.refuse(length, ~(length > 0), words)
-        self.world, self.noise = vector / length, noise_of(noise, 2)
-        self.mounting = vector_of(mounting, "mounting")
-        self.offset = number_of(offset, "offset")
+    world: Vec3 = eqx.field(converter=_unit)
+    noise: Float[Array, "2"] | None = eqx.field(converter=deviations(2), default=None)
+    _: dataclasses.KW_ONLY
+    mounting: Vec3 | None = eqx.field(converter=optional("mounting"), default=None)
+    offset: Scalar | None = eqx.field(converter=optional("offset", ()), default=None)
 
     def error(self, now: SensorInput, reading: Array) -> Float[Array, "2"]:
         seen = self._seen(now)
@@ -129,8 +125,11 @@ class Direction(AbstractSensor):
         return seen
 
     def refusal(self, values: np.ndarray) -> tuple[np.ndarray, str]:
-        wrong = np.abs(np.linalg.norm(values, axis=1) - 1) > 1e-6
-        return wrong, "the direction at index {index} is not of length 1"
+        return _not_unit(values), "the direction at index {index} is not of length 1"
+
+
+def _not_unit(rows: np.ndarray) -> np.ndarray:
+    return np.abs(np.linalg.norm(rows, axis=1) - 1) > 1e-6
 
 
 def _across(line: Vec3) -> tuple[Vec3, Vec3]:
@@ -159,20 +158,14 @@ class Marker(AbstractSensor):
 
     reading_shape: ClassVar[tuple[int, ...]] = (3,)
     components: ClassVar[int] = 3
+    # A body on a pivot need not move.
+    feels: ClassVar[Any] = property(lambda self: HasPose if self.origin is None else HasAttitude)
     unit: ClassVar[str] = "m"
-    place: Float[Array, "3"]
-    noise: Float[Array, "3"] | None
-    origin: Float[Array, "3"] | None
-    offset: Scalar | None
-
-    def __init__(self, place: Any, noise: Any = None, *, origin: Any = None, offset: Any = None):
-        self.place, self.noise = place_of(place, "place"), noise_of(noise)
-        self.origin, self.offset = vector_of(origin, "origin"), number_of(offset, "offset")
-
-    @property
-    def feels(self) -> type:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """A body on a pivot need not move."""
-        return HasPose if self.origin is None else HasAttitude
+    place: Vec3 = eqx.field(converter=required("place"), default=None)
+    noise: Vec3 | None = eqx.field(converter=deviations(), default=None)
+    _: dataclasses.KW_ONLY
+    origin: Vec3 | None = eqx.field(converter=optional("origin"), default=None)
+    offset: Scalar | None = eqx.field(converter=optional("offset", ()), default=None)
 
     def error(self, now: SensorInput, reading: Array) -> Vec3:
         state = now.state

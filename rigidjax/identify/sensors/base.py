@@ -81,48 +81,42 @@ class AbstractSensor(eqx.Module):
         """Reading minus prediction (k,), in the sensor's unit."""
 
 
-def noise_of(noise: Any, size: int = 3) -> Array | None:
-    """A standard deviation (size,) of one number or as many, positive; or `None`."""
-    if noise is None:
-        return None
-    noise = _one_or(noise, size, "noise")
-    return _checks.refuse(noise, ~(noise > 0), "noise: wanted a positive standard deviation")
+def required(name: str, shape: tuple[int, ...] = (3,)) -> Callable[[Any], Array]:
+    """What makes a field of finite numbers, which a fit may move: `equinox.field(converter=…)`."""
+
+    def converted(value: Any) -> Array:
+        if value is None:
+            raise ValueError(f"{name}: wanted three numbers, got None")
+        return _checks.finite(_checks.floating(value, shape, name), name)
+
+    return converted
 
 
-def number_of(value: Any, name: str) -> Scalar | None:
-    """A number that is finite, as an array that a fit may move; or `None`."""
-    if value is None:
-        return None
-    return jnp.asarray(_checks.finite(_checks.floating(value, (), name), name))
+def optional(name: str, shape: tuple[int, ...] = (3,)) -> Callable[[Any], Array | None]:
+    """The same of a field that may be `None`."""
+    converted = required(name, shape)
+    return lambda value: None if value is None else converted(value)
 
 
-def vector_of(value: Any, name: str) -> Vec3 | None:
-    """Three finite numbers, as an array that a fit may move; or `None`."""
-    return None if value is None else place_of(value, name)
+def deviations(size: int = 3) -> Callable[[Any], Array | None]:
+    """What makes a field of standard deviations (size,), of one number or as many; or `None`."""
+    return lambda value: _positive(value, "noise", "a positive standard deviation", size)
 
 
-def place_of(value: Any, name: str, shape: tuple[int, ...] = (3,)) -> Any:
-    """Three finite numbers, or others of a shape, as an array that a fit may move."""
-    if value is None:
-        raise ValueError(f"{name}: wanted three numbers, got None")
-    return jnp.asarray(_checks.finite(_checks.floating(value, shape, name), name))
-
-
-def limit_of(limit: Any) -> Vec3 | None:
+def full_scale(limit: Any) -> Vec3 | None:
     """Where the channels saturate (3,), one number or three, positive; or `None`."""
-    if limit is None:
+    return _positive(limit, "limit", "a positive full scale", 3)
+
+
+def _positive(value: Any, name: str, wanted: str, size: int) -> Array | None:
+    if value is None:
         return None
-    limit = _one_or(limit, 3, "limit")
-    return _checks.refuse(limit, ~(limit > 0), "limit: wanted a positive full scale")
-
-
-def _one_or(value: Any, size: int, name: str) -> Array:
-    """One number or `size` of them, as (size,)."""
     numbers = _checks.numbers(value, name).astype(jnp.result_type(float))
     if numbers.shape not in ((), (size,)):
         count = {1: "one", 2: "two", 3: "three"}.get(size, str(size))
         raise ValueError(f"{name}: wanted one number or {count}, got shape {numbers.shape}")
-    return jnp.broadcast_to(numbers, (size,))
+    numbers = jnp.broadcast_to(numbers, (size,))
+    return _checks.refuse(numbers, ~(numbers > 0), f"{name}: wanted {wanted}")
 
 
 def shown(

@@ -1,6 +1,7 @@
 """A filter that readings went through before they were logged."""
 
 import math
+from types import NoneType
 from typing import Any
 
 import equinox as eqx
@@ -45,12 +46,8 @@ class LowPass(eqx.Module):
 
     def __init__(self, cutoff: ScalarLike, order: int = 1):
         cutoff = _checks.floating(cutoff, (), "cutoff")
-        found = f", got {float(cutoff):g}" if _checks.known(cutoff) else ""
-        self.cutoff = _checks.refuse(
-            cutoff,
-            ~((cutoff > 0) & jnp.isfinite(cutoff)),
-            f"cutoff: wanted a positive frequency, Hz{found}",
-        ).astype(jnp.result_type(float))
+        cutoff = _checks.sign(cutoff, "cutoff", "a positive frequency, Hz")
+        self.cutoff = cutoff.astype(jnp.result_type(float))
         if _checks.whole(order, "order", 1) > 2:
             raise ValueError(f"order: wanted 1 or 2, got {order}")
         self.order = order
@@ -96,11 +93,8 @@ class LowPass(eqx.Module):
 
 def lowpass_of(given: Any) -> LowPass | None:
     """`given` if it is a `LowPass` or `None`. **Raises** `TypeError` for others."""
-    if given is not None and not isinstance(given, LowPass):
-        raise TypeError(
-            f"lowpass: wanted LowPass(cutoff in Hz) or None, got {type(given).__name__}"
-        )
-    return given
+    wanted = "LowPass(cutoff in Hz) or None"
+    return _checks.instance(given, (LowPass, NoneType), "lowpass", wanted=wanted)
 
 
 def _within(t: np.ndarray, values: np.ndarray) -> None:

@@ -1,7 +1,9 @@
 """Sensors that see where the body is and how fast it moves."""
 
-from typing import Any, ClassVar
+import dataclasses
+from typing import ClassVar
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -10,10 +12,9 @@ from rigidjax._types import HasPose, Scalar, Vec3
 from rigidjax.identify.sensors.base import (
     AbstractSensor,
     SensorInput,
-    noise_of,
-    number_of,
-    place_of,
-    vector_of,
+    deviations,
+    optional,
+    required,
 )
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.linalg3 import cross, dot
@@ -35,13 +36,10 @@ class Position(AbstractSensor):
     components: ClassVar[int] = 3
     feels: ClassVar[type] = HasPose
     unit: ClassVar[str] = "m"
-    noise: Float[Array, "3"] | None
-    bias: Float[Array, "3"] | None
-    offset: Scalar | None
-
-    def __init__(self, noise: Any = None, *, bias: Any = None, offset: Any = None):
-        self.noise, self.bias = noise_of(noise), vector_of(bias, "bias")
-        self.offset = number_of(offset, "offset")
+    noise: Vec3 | None = eqx.field(converter=deviations(), default=None)
+    _: dataclasses.KW_ONLY
+    bias: Vec3 | None = eqx.field(converter=optional("bias"), default=None)
+    offset: Scalar | None = eqx.field(converter=optional("offset", ()), default=None)
 
     def error(self, now: SensorInput, reading: Array) -> Vec3:
         place = now.state.x
@@ -70,24 +68,12 @@ class Velocity(AbstractSensor):
     components: ClassVar[int] = 3
     feels: ClassVar[type] = HasPose
     unit: ClassVar[str] = "m/s"
-    noise: Float[Array, "3"] | None
-    place: Float[Array, "3"] | None
-    mounting: Float[Array, "3"] | None
-    bias: Float[Array, "3"] | None
-    offset: Scalar | None
-
-    def __init__(
-        self,
-        noise: Any = None,
-        *,
-        place: Any = None,
-        mounting: Any = None,
-        bias: Any = None,
-        offset: Any = None,
-    ):
-        self.noise, self.place = noise_of(noise), vector_of(place, "place")
-        self.mounting, self.bias = vector_of(mounting, "mounting"), vector_of(bias, "bias")
-        self.offset = number_of(offset, "offset")
+    noise: Vec3 | None = eqx.field(converter=deviations(), default=None)
+    _: dataclasses.KW_ONLY
+    place: Vec3 | None = eqx.field(converter=optional("place"), default=None)
+    mounting: Vec3 | None = eqx.field(converter=optional("mounting"), default=None)
+    bias: Vec3 | None = eqx.field(converter=optional("bias"), default=None)
+    offset: Scalar | None = eqx.field(converter=optional("offset", ()), default=None)
 
     def error(self, now: SensorInput, reading: Array) -> Vec3:
         state = now.state
@@ -118,24 +104,12 @@ class Range(AbstractSensor):
     components: ClassVar[int] = 1
     feels: ClassVar[type] = HasPose
     unit: ClassVar[str] = "m"
-    station: Float[Array, "3"]
-    noise: Float[Array, "1"] | None
-    place: Float[Array, "3"] | None
-    bias: Scalar | None
-    offset: Scalar | None
-
-    def __init__(
-        self,
-        station: Any,
-        noise: Any = None,
-        *,
-        place: Any = None,
-        bias: Any = None,
-        offset: Any = None,
-    ):
-        self.station, self.noise = place_of(station, "station"), noise_of(noise, 1)
-        self.place = vector_of(place, "place")
-        self.bias, self.offset = number_of(bias, "bias"), number_of(offset, "offset")
+    station: Vec3 = eqx.field(converter=required("station"), default=None)
+    noise: Float[Array, "1"] | None = eqx.field(converter=deviations(1), default=None)
+    _: dataclasses.KW_ONLY
+    place: Vec3 | None = eqx.field(converter=optional("place"), default=None)
+    bias: Scalar | None = eqx.field(converter=optional("bias", ()), default=None)
+    offset: Scalar | None = eqx.field(converter=optional("offset", ()), default=None)
 
     def error(self, now: SensorInput, reading: Array) -> Float[Array, "1"]:
         state = now.state

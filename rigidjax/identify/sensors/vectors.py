@@ -1,20 +1,21 @@
 """Sensors that read a vector in their own axes: rate gyro, accelerometer, magnetometer."""
 
+import dataclasses
 from typing import Any, ClassVar
 
 import equinox as eqx
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rigidjax._types import HasAttitude, HasPose, HasSpin, Scalar, Vec3
 from rigidjax.identify.sensors.base import (
     AbstractSensor,
     SensorInput,
-    limit_of,
-    noise_of,
-    number_of,
-    place_of,
+    deviations,
+    full_scale,
+    optional,
+    required,
     shown,
-    vector_of,
 )
 from rigidjax.identify.sensors.lowpass import LowPass, lowpass_of
 from rigidjax.rotation import quaternion
@@ -43,50 +44,31 @@ class Gyro(AbstractSensor):
 
     reading_shape: ClassVar[tuple[int, ...]] = (3,)
     components: ClassVar[int] = 3
-    unit: ClassVar[str] = "rad/s"
-    noise: Float[Array, "3"] | None
-    bias: Float[Array, "3"] | None
-    scale: Float[Array, "3"] | None
-    mounting: Float[Array, "3"] | None
-    skew: Float[Array, "3"] | None
-    limit: Float[Array, "3"] | None
-    offset: Scalar | None
-    lowpass: LowPass | None
-    g_sensitivity: Float[Array, "3 3"] | None
-    place: Float[Array, "3"] | None
-    gravity: Float[Array, "3"] | None
     # Only gravity needs the attitude.
-    feels: type = eqx.field(static=True, default=HasSpin)
+    feels: ClassVar[Any] = property(lambda self: HasSpin if self.gravity is None else HasAttitude)
+    unit: ClassVar[str] = "rad/s"
+    noise: Vec3 | None = eqx.field(converter=deviations(), default=None)
+    _: dataclasses.KW_ONLY
+    bias: Vec3 | None = eqx.field(converter=optional("bias"), default=None)
+    scale: Vec3 | None = eqx.field(converter=optional("scale"), default=None)
+    mounting: Vec3 | None = eqx.field(converter=optional("mounting"), default=None)
+    skew: Vec3 | None = eqx.field(converter=optional("skew"), default=None)
+    limit: Vec3 | None = eqx.field(converter=full_scale, default=None)
+    offset: Scalar | None = eqx.field(converter=optional("offset", ()), default=None)
+    lowpass: LowPass | None = eqx.field(converter=lowpass_of, default=None)
+    g_sensitivity: Float[Array, "3 3"] | None = eqx.field(
+        converter=optional("g_sensitivity", (3, 3)), default=None
+    )
+    place: Vec3 | None = eqx.field(converter=optional("place"), default=None)
+    gravity: Vec3 | None = eqx.field(converter=optional("gravity"), default=None)
 
-    def __init__(
-        self,
-        noise: Any = None,
-        *,
-        bias: Any = None,
-        scale: Any = None,
-        mounting: Any = None,
-        skew: Any = None,
-        limit: Any = None,
-        offset: Any = None,
-        lowpass: Any = None,
-        g_sensitivity: Any = None,
-        place: Any = None,
-        gravity: Any = None,
-    ):
-        self.noise = noise_of(noise)
-        self.bias, self.scale = vector_of(bias, "bias"), vector_of(scale, "scale")
-        self.mounting, self.skew = vector_of(mounting, "mounting"), vector_of(skew, "skew")
-        self.limit = limit_of(limit)
-        self.offset, self.lowpass = number_of(offset, "offset"), lowpass_of(lowpass)
-        self.g_sensitivity = self.place = self.gravity = None
-        self.feels = HasSpin
-        if g_sensitivity is not None:
-            self.g_sensitivity = place_of(g_sensitivity, "g_sensitivity", (3, 3))
-            self.place = place_of([0.0, 0.0, 0.0] if place is None else place, "place")
-            self.gravity = vector_of(gravity, "gravity")
-            self.feels = HasSpin if gravity is None else HasAttitude
-        elif place is not None or gravity is not None:
-            raise ValueError("Gyro: place and gravity say something only beside a g_sensitivity")
+    def __post_init__(self) -> None:
+        if self.g_sensitivity is None:
+            if self.place is not None or self.gravity is not None:
+                wanted = "place and gravity say something only beside a g_sensitivity"
+                raise ValueError(f"Gyro: {wanted}")
+        elif self.place is None:
+            self.place = jnp.zeros(3)
 
     def error(self, now: SensorInput, reading: Array) -> Vec3:
         seen = shown(now.state.omega, self.bias, self.scale, self.mounting, self.skew)
@@ -129,43 +111,20 @@ class Accelerometer(AbstractSensor):
 
     reading_shape: ClassVar[tuple[int, ...]] = (3,)
     components: ClassVar[int] = 3
+    # Only gravity needs the attitude.
+    feels: ClassVar[Any] = property(lambda self: HasSpin if self.gravity is None else HasAttitude)
     unit: ClassVar[str] = "m/s²"
-    place: Float[Array, "3"]
-    noise: Float[Array, "3"] | None
-    gravity: Float[Array, "3"] | None
-    bias: Float[Array, "3"] | None
-    scale: Float[Array, "3"] | None
-    mounting: Float[Array, "3"] | None
-    skew: Float[Array, "3"] | None
-    limit: Float[Array, "3"] | None
-    offset: Scalar | None
-    lowpass: LowPass | None
-
-    def __init__(
-        self,
-        noise: Any = None,
-        *,
-        place: Any,
-        gravity: Any = None,
-        bias: Any = None,
-        scale: Any = None,
-        mounting: Any = None,
-        skew: Any = None,
-        limit: Any = None,
-        offset: Any = None,
-        lowpass: Any = None,
-    ):
-        self.place, self.noise = place_of(place, "place"), noise_of(noise)
-        self.gravity = vector_of(gravity, "gravity")
-        self.bias, self.scale = vector_of(bias, "bias"), vector_of(scale, "scale")
-        self.mounting, self.skew = vector_of(mounting, "mounting"), vector_of(skew, "skew")
-        self.limit = limit_of(limit)
-        self.offset, self.lowpass = number_of(offset, "offset"), lowpass_of(lowpass)
-
-    @property
-    def feels(self) -> type:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Only gravity needs the attitude."""
-        return HasSpin if self.gravity is None else HasAttitude
+    noise: Vec3 | None = eqx.field(converter=deviations(), default=None)
+    _: dataclasses.KW_ONLY
+    place: Vec3 = eqx.field(converter=required("place"), default=None)
+    gravity: Vec3 | None = eqx.field(converter=optional("gravity"), default=None)
+    bias: Vec3 | None = eqx.field(converter=optional("bias"), default=None)
+    scale: Vec3 | None = eqx.field(converter=optional("scale"), default=None)
+    mounting: Vec3 | None = eqx.field(converter=optional("mounting"), default=None)
+    skew: Vec3 | None = eqx.field(converter=optional("skew"), default=None)
+    limit: Vec3 | None = eqx.field(converter=full_scale, default=None)
+    offset: Scalar | None = eqx.field(converter=optional("offset", ()), default=None)
+    lowpass: LowPass | None = eqx.field(converter=lowpass_of, default=None)
 
     def error(self, now: SensorInput, reading: Array) -> Vec3:
         force = specific_force(now, self.place, self.gravity)
@@ -190,34 +149,16 @@ class Magnetometer(AbstractSensor):
     components: ClassVar[int] = 3
     feels: ClassVar[type] = HasAttitude
     unit: ClassVar[str] = "of the field"
-    field: Float[Array, "3"]
-    noise: Float[Array, "3"] | None
-    bias: Float[Array, "3"] | None
-    scale: Float[Array, "3"] | None
-    mounting: Float[Array, "3"] | None
-    skew: Float[Array, "3"] | None
-    limit: Float[Array, "3"] | None
-    offset: Scalar | None
-    lowpass: LowPass | None
-
-    def __init__(
-        self,
-        noise: Any = None,
-        *,
-        field: Any,
-        bias: Any = None,
-        scale: Any = None,
-        mounting: Any = None,
-        skew: Any = None,
-        limit: Any = None,
-        offset: Any = None,
-        lowpass: Any = None,
-    ):
-        self.field, self.noise = place_of(field, "field"), noise_of(noise)
-        self.bias, self.scale = vector_of(bias, "bias"), vector_of(scale, "scale")
-        self.mounting, self.skew = vector_of(mounting, "mounting"), vector_of(skew, "skew")
-        self.limit = limit_of(limit)
-        self.offset, self.lowpass = number_of(offset, "offset"), lowpass_of(lowpass)
+    noise: Vec3 | None = eqx.field(converter=deviations(), default=None)
+    _: dataclasses.KW_ONLY
+    field: Vec3 = eqx.field(converter=required("field"), default=None)
+    bias: Vec3 | None = eqx.field(converter=optional("bias"), default=None)
+    scale: Vec3 | None = eqx.field(converter=optional("scale"), default=None)
+    mounting: Vec3 | None = eqx.field(converter=optional("mounting"), default=None)
+    skew: Vec3 | None = eqx.field(converter=optional("skew"), default=None)
+    limit: Vec3 | None = eqx.field(converter=full_scale, default=None)
+    offset: Scalar | None = eqx.field(converter=optional("offset", ()), default=None)
+    lowpass: LowPass | None = eqx.field(converter=lowpass_of, default=None)
 
     def error(self, now: SensorInput, reading: Array) -> Vec3:
         seen = quaternion.rotate(quaternion.conjugate(now.state.q), self.field)
