@@ -159,28 +159,11 @@ def find(free: Sequence[Free], recording: Recording, of: Sequence[str] = ("",)) 
 
     **Raises** `ValueError` where it picks nothing, something that is no number, or the same twice.
     """
-    leaves, structure = jax.tree.flatten(recording)
-    numbered = jax.tree.unflatten(structure, list(range(len(leaves))))
     slots: list[Slot] = []
     for item in free:
         if not isinstance(item, Free):
             raise TypeError(f"free: wanted Free(where, name), got {type(item).__name__}")
-        try:
-            index = item.where(numbered)
-        except (AttributeError, IndexError, TypeError) as error:
-            raise ValueError(f"Free {item.name!r}: nothing is there ({error})") from None
-        if index is None:
-            raise ValueError(
-                f"Free {item.name!r}: None is there; give it a starting value, such as "
-                "Gyro(bias=[0.0, 0.0, 0.0])"
-            )
-        if not isinstance(index, int):
-            raise ValueError(
-                f"Free {item.name!r}: wanted one array, got {type(index).__name__}; one Free each"
-            )
-        value = leaves[index]
-        if not eqx.is_inexact_array_like(value):
-            raise ValueError(f"Free {item.name!r}: wanted numbers, got {type(value).__name__}")
+        index, value = leaf_at(item.where, recording, f"Free {item.name!r}", "it")
         if any(slot.leaf == index for slot in slots):
             raise ValueError(f"Free {item.name!r}: another Free moves the same numbers")
         if any(slot.name == item.name for slot in slots):
@@ -204,6 +187,30 @@ def find(free: Sequence[Free], recording: Recording, of: Sequence[str] = ("",)) 
         own = (item.positive, labels, groups, scale, prior, wide, guessed)
         slots.append(Slot(index, item.name, unit, alone, *own))
     return tuple(slots)
+
+
+def leaf_at(where: Callable[[Any], Any], tree: Any, name: str, what: str) -> tuple[int, Any]:
+    """Which leaf of a tree `where` picks, and the leaf: an array of numbers.
+
+    **Arguments:** `name` for messages; `what` is to have a starting value where `None` is.
+    **Raises** `ValueError` where it picks nothing, several, or something that is no number.
+    """
+    leaves, structure = jax.tree.flatten(tree)
+    try:
+        index = where(jax.tree.unflatten(structure, list(range(len(leaves)))))
+    except (AttributeError, IndexError, TypeError) as error:
+        raise ValueError(f"{name}: nothing is there ({error})") from None
+    if index is None:
+        raise ValueError(
+            f"{name}: None is there; give {what} a starting value, such as "
+            "Gyro(bias=[0.0, 0.0, 0.0])"
+        )
+    if not isinstance(index, int):
+        one = name.split()[0]
+        raise ValueError(f"{name}: wanted one array, got {type(index).__name__}; one {one} each")
+    if not eqx.is_inexact_array_like(leaves[index]):
+        raise ValueError(f"{name}: wanted numbers, got {type(leaves[index]).__name__}")
+    return index, leaves[index]
 
 
 _UNITS = {"offset": "s", "delay": "s", "mounting": "rad", "tilt": "rad", "place": "m"}

@@ -248,7 +248,8 @@ def main():
         )  # fmt: skip
 
     def alone():
-        open_loop.errors_by_horizon(windows, scene, jnp.asarray(GUESS))
+        found = open_loop.all_errors(windows, scene, jnp.asarray(GUESS))
+        horizons.by_horizon(windows.starts, found)
 
     timed("ours, errors alone and their means", alone, options.repeats)
     once = timed("ours, errors and derivatives", evaluated, options.repeats)
