@@ -1,6 +1,5 @@
 """The extended Kalman filter on the manifold, in square-root form."""
 
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -14,9 +13,9 @@ from rigidjax import _checks
 from rigidjax._types import Scalar, ScalarLike
 from rigidjax.estimate import roots
 from rigidjax.estimate.belief import Belief
-from rigidjax.estimate.grid import Grid, gathered, grid_of
+from rigidjax.estimate.grid import Grid, grid_of
 from rigidjax.estimate.scene import Dynamics, Model, bare, reset
-from rigidjax.estimate.sensing import Read, Sensors, absorb_all, rows, sensors_of
+from rigidjax.estimate.sensing import Read, Sensors, Stops, absorb_all, sensors_of
 from rigidjax.identify.recording import Recording
 from rigidjax.motion.manifold import plus
 
@@ -201,33 +200,19 @@ def _step(
         for value, mask in zip(values, masks, strict=True)
     )
     dynamics = Dynamics(model, belief.x, sensors.densities)
-    return _one(dynamics, sensors, belief, t, values, masks)[0]
+    return _one(dynamics, sensors, belief, Stops(t, values, masks))[0]
 
 
 def _one(
-    dynamics: Dynamics,
-    sensors: Sensors,
-    belief: Belief,
-    t: Array,
-    values: Sequence[Array],
-    masks: Sequence[Array],
+    dynamics: Dynamics, sensors: Sensors, belief: Belief, stop: Stops
 ) -> tuple[Belief, tuple[Read, ...]]:
     dtype = belief.root.dtype
     # Times may have more digits than the state: after a thousand seconds seven are too few.
-    since = (t - belief.t).astype(dtype)
+    since = (stop.t - belief.t).astype(dtype)
     x, grown, noise = dynamics.predict(belief.t.astype(dtype), since, belief.x)
     root = roots.predicted(grown, belief.root, noise)
-    found = rows(dynamics, sensors, t.astype(dtype), x, values, masks)
-    e, root, read = absorb_all(found, jnp.zeros(root.shape[0], root.dtype), root)
-    return Belief(t, plus(x, e), reset(x, e, root)), read
-
-
-class Stops(NamedTuple):
-    """Where the filter stops, and what was read there."""
-
-    t: Array
-    values: tuple[Array, ...]
-    masks: tuple[Array, ...]
+    e, root, read = absorb_all(dynamics, sensors, stop, x, jnp.zeros_like(root[0]), root)
+    return Belief(stop.t, plus(x, e), reset(x, e, root)), read
 
 
 class Task(NamedTuple):
@@ -245,13 +230,15 @@ def scan_filter(task: Task, keep: Any) -> tuple[Stops, Any]:
     model, sensors, recording, first, grid = task
     dtype = first.root.dtype
     dynamics = Dynamics(model, first.x, sensors.densities)
-    readings = recording.readings
-    values = tuple(reading.values.astype(dtype) for reading in readings)
-    stops = Stops(*gathered(grid, recording.t, values, tuple(one.mask for one in readings)))
+    values = tuple(reading.values.astype(dtype) for reading in recording.readings)
+    stops = Stops(recording.t, values, tuple(reading.mask for reading in recording.readings))
+    if grid is not None:
+        _, values, masks = jax.tree.map(lambda leaf: leaf[grid.source], stops)
+        stops = Stops(grid.t, values, tuple(mask & grid.real for mask in masks))
 
     def body(carry: tuple[Belief, Array], stop: Stops) -> tuple[Any, Any]:
         belief, total = carry
-        belief, read = _one(dynamics, sensors, belief, *stop)
+        belief, read = _one(dynamics, sensors, belief, stop)
         total = total + sum(r.log_density for r in read)
         return (belief, total), keep(belief, read)
 

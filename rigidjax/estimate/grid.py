@@ -82,14 +82,3 @@ def _fastest(recording: Recording, first: Belief) -> float:
             values = np.asarray(reading.values, float)[reading.seen]
             rate = max(rate, float(np.quantile(np.linalg.norm(values, axis=1), 0.99)))
     return rate
-
-
-def gathered(grid: Grid | None, t: Array, values: Any, masks: Any) -> tuple[Array, Any, Any]:
-    """Times, values and masks at each stop."""
-    if grid is None:
-        return t, values, masks
-    return (
-        grid.t,
-        tuple(v[grid.source] for v in values),
-        tuple(m[grid.source] & grid.real for m in masks),
-    )

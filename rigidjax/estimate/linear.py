@@ -128,14 +128,11 @@ def joint(grown: Array, noise: Array, root: Array) -> Joint:
     From one triangularisation of `[[F S, G], [S, 0]]`: Park and Kailath 1995,
     doi:10.1080/00207179508921582.
     """
-    n = root.shape[0]
+    n, m = noise.shape
     upper = jnp.concatenate([roots.product(grown, root), noise], 1)
-    lower = jnp.concatenate([root, jnp.zeros((n, noise.shape[1]), root.dtype)], 1)
-    whole = jnp.concatenate([upper, lower])
-    missing = 2 * n - whole.shape[1]
-    if missing > 0:
-        whole = jnp.concatenate([whole, jnp.zeros((2 * n, missing), root.dtype)], 1)
-    whole = roots.triangular(whole)
+    whole = jnp.concatenate([upper, jnp.pad(root, ((0, 0), (0, m)))])
+    # A triangle of 2n needs as many columns.
+    whole = roots.triangular(jnp.pad(whole, ((0, 0), (0, max(0, n - m)))))
     predicted, cross = whole[:n, :n], whole[n:, :n]
     return Joint(predicted, roots.divide_right(cross, predicted), whole[n:, n:])
 

@@ -9,7 +9,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from rigidjax import _checks
-from rigidjax._types import Scalar
 from rigidjax.estimate import roots
 from rigidjax.estimate.scene import Dynamics, Extended, Model
 from rigidjax.identify.free_parameters import leaf_at
@@ -81,19 +80,21 @@ def sensors_of(sensors: Sequence[AbstractSensor], model: Model) -> Sensors:
     return Sensors(readings, leaves, tuple(walk.density for walk in model.walks))
 
 
-def rows(
-    dynamics: Dynamics,
-    sensors: Sensors,
-    t: Scalar,
-    x: Extended,
-    values: Sequence[Array],
-    masks: Sequence[Array],
-) -> list[ReadingRow]:
-    """What each sensor's reading at t says of the state x."""
+class Stops(NamedTuple):
+    """Where the filter stops, and what was read there."""
+
+    t: Array
+    values: tuple[Array, ...]
+    masks: tuple[Array, ...]
+
+
+def _rows(dynamics: Dynamics, sensors: Sensors, stop: Stops, x: Extended) -> list[ReadingRow]:
+    """What each sensor's reading at a stop says of the state x."""
     dtype = x.motion.omega.dtype
+    t = stop.t.astype(dtype)
     basis = jax.vmap(lambda e: tangent(x, e))(jnp.eye(dimension(x), dtype=dtype))
     out = []
-    for index, (value, mask) in enumerate(zip(values, masks, strict=True)):
+    for index, (value, mask) in enumerate(zip(stop.values, stop.masks, strict=True)):
         sensor = in_precision(sensors.readings[index].sensor, dtype)
 
         def error(y: Extended, index: int = index, value: Array = value) -> Array:
@@ -138,14 +139,15 @@ class Read(NamedTuple):
 
 
 def absorb_all(
-    row: Sequence[ReadingRow], step: Array, root: Array
+    dynamics: Dynamics, sensors: Sensors, stop: Stops, x: Extended, step: Array, root: Array
 ) -> tuple[Array, Array, tuple[Read, ...]]:
-    """Potter's update by all numbers of all sensors, one by one."""
-    stacked = ReadingRow(*(jnp.concatenate(parts) for parts in zip(*row, strict=True)))
+    """Potter's update by all numbers of all sensors, one by one, of an error of mean `step`."""
+    rows = _rows(dynamics, sensors, stop, x)
+    stacked = ReadingRow(*(jnp.concatenate(parts) for parts in zip(*rows, strict=True)))
     found = roots.absorb_all(step, root, *stacked)
     out, at = [], 0
-    for part in row:
-        here = slice(at, at + part.error.shape[0])
-        out.append(Read(found.innovation[here], found.variance[here], part.seen))
+    for row in rows:
+        here = slice(at, at + row.error.shape[0])
+        out.append(Read(found.innovation[here], found.variance[here], row.seen))
         at = here.stop
     return found.step, found.root, tuple(out)

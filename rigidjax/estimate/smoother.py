@@ -12,9 +12,9 @@ from rigidjax import _checks
 from rigidjax._types import Scalar
 from rigidjax.estimate import linear, roots
 from rigidjax.estimate.belief import Belief
-from rigidjax.estimate.filter import WORDS, Stops, Task, looked_at, scan_filter, status_of, told
+from rigidjax.estimate.filter import WORDS, Task, looked_at, scan_filter, status_of, told
 from rigidjax.estimate.scene import Dynamics, Extended, Model, reset, reset_inverse
-from rigidjax.estimate.sensing import Read, Sensors, absorb_all, rows
+from rigidjax.estimate.sensing import Read, Sensors, Stops, absorb_all
 from rigidjax.identify.recording import Recording
 from rigidjax.motion.manifold import minus, plus
 
@@ -25,13 +25,9 @@ class Push(NamedTuple):
     **Fields:** `mean`, `deviation` (N, 3) N m, body frame; wide where steps are short, for white
     noise has no value at a time.
 
-    >>> import rigidjax as rj
-    >>> record = rj.identify.Recording([0.0, 0.1], (rj.identify.Gyro(0.1), [[1.0, 0, 0]] * 2))
-    >>> body = rj.Inertia.from_principal(1.0, 2.0, 2.5)
-    >>> model = rj.estimate.Model(body, rj.torques.RandomTorque(1.0))
-    >>> found = rj.estimate.smooth(model, record, rj.estimate.start(model, record, rate=1.0))
-    >>> found.pushes[0].mean.shape, bool((found.pushes[0].deviation[1:] > 0).all())
-    ((3, 3), True)
+    >>> shown = Push(jnp.array([[0.0, 0.0, 0.3]]), 0.1 * jnp.ones((1, 3)))
+    >>> (shown.mean / shown.deviation).round(1).tolist()  # about the third axis it turns the body
+    [[0.0, 0.0, 3.0]]
     """
 
     mean: Float[Array, "stops 3"]
@@ -222,8 +218,7 @@ def _iterate(
         push = push - jnp.sum(noise[:, : dynamics.kicks] * kick[None], 1)
         kept = linear.joint(grown, noise, root)
         predicted = jnp.sum(grown * mean[None], 1) + push
-        found = rows(dynamics, sensors, stop.t.astype(dtype), y, stop.values, stop.masks)
-        later, root, read = absorb_all(found, predicted, kept.predicted)
+        later, root, read = absorb_all(dynamics, sensors, stop, y, predicted, kept.predicted)
         return (later, root), _Kept(kept, predicted, mean, noise, read)
 
     earlier = jax.tree.map(lambda leaf: leaf[:-1], path)
