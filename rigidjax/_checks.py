@@ -273,6 +273,14 @@ def positive(value: Any, name: str, what: str = "a positive number") -> float:
     return found
 
 
+def fraction(value: Any, name: str, what: str = "a number between 0 and 1") -> float:
+    """Return `value` as a number of Python above 0 and below 1."""
+    found = positive(value, name, what)
+    if not found < 1:
+        raise ValueError(f"{name}: wanted {what}, got {found}")
+    return found
+
+
 def not_negative(value: Any, name: str) -> float:
     """Return `value` as a finite number of Python ≥ 0, known before anything is compiled."""
     found = number(value, name)

@@ -102,28 +102,23 @@ def start(
     dtype = state.omega.dtype
     given = {"attitude": attitude, "rate": rate, "position": position, "velocity": velocity}
     words = {"x": "position", "v": "velocity", "q": "attitude", "omega": "rate"}
-    wanted = [words[part] for part in names(state)]
-    parts = []
+    kind, wanted = type(state).__name__, [words[part] for part in names(state)]
     for name, value in given.items():
         if name not in wanted and value is not None:
-            raise ValueError(f"{name}: a {type(state).__name__} has none; leave it out")
-    for name in wanted:
-        if given[name] is None:
+            raise ValueError(f"{name}: a {kind} has none; leave it out")
+        if name in wanted and value is None:
             raise ValueError(
-                f"{name}: wanted the standard deviation of the first one, got None; a "
-                f"{type(state).__name__} needs {', '.join(wanted)}"
+                f"{name}: wanted the standard deviation of the first one, got None; a {kind} needs "
+                + ", ".join(wanted)
             )
-        parts.append(_spread(given[name], (3,), name, dtype))
+    parts = [_spread(given[name], (3,), name, dtype) for name in wanted]
     parts += [law.deviation.astype(dtype) for law in model.coloured]
-    walks = []
     numbers = jax.tree.leaves(sensors.readings)
-    for walk, leaf in zip(model.walks, sensors.leaves, strict=True):
-        value = jnp.asarray(numbers[leaf]).astype(dtype)
-        walks.append(value)
+    walks = tuple(jnp.asarray(numbers[leaf]).astype(dtype) for leaf in sensors.leaves)
+    for walk, value in zip(model.walks, walks, strict=True):
         parts.append(_spread(walk.deviation, value.shape, "deviation", dtype).reshape(-1))
         _spread(walk.density, value.shape, "density", dtype)
-    torques = tuple(jnp.zeros(3, dtype) for _ in model.coloured)
-    x = Extended(state, torques, tuple(walks))
+    x = Extended(state, tuple(jnp.zeros(3, dtype) for _ in model.coloured), walks)
     return Belief(recording.t[0], x, jnp.diag(jnp.concatenate(parts)))
 
 
@@ -138,9 +133,8 @@ def _shown(recording: Recording) -> Spin | Attitude:
     """The first attitude and rate that the readings show."""
     if not _checks.known(recording.t):
         raise TypeError("state: wanted a state; a recording that is traced shows none")
-    needs = [sensor.feels is not HasSpin for sensor in recording.sensors]
     omega = jnp.asarray(first_rate(recording), recording.t.dtype)
-    if not any(needs):
+    if all(sensor.feels is HasSpin for sensor in recording.sensors):
         return Spin(omega)
     _, q = attitudes(recording)
     if not len(q):

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from rigidjax import _checks
 from rigidjax._types import Scalar
 from rigidjax.estimate.grid import TURN_A_STEP
-from rigidjax.estimate.terms import groups_of, prior_residuals, terms
+from rigidjax.estimate.terms import groups_of, grown_noises, own_numbers, prior_residuals, terms
 from rigidjax.identify import uncertainty
 from rigidjax.identify.parameters import Parameters
 from rigidjax.identify.problem import Problem
@@ -124,18 +124,14 @@ class LogDensity(eqx.Module):
                 f"posterior; give a prior or fewer free numbers{hint}. {what}".rstrip()
             )
         self.problem, self.process, self.noises = problem, process, fit.noises
-        spread = None if process is None or deviation is None else deviation
-        self.deviation = (
-            None if spread is None else jnp.asarray(_checks.positive(spread, "deviation"))
-        )
+        known = process is None or deviation is None
+        self.deviation = None if known else jnp.asarray(_checks.positive(deviation, "deviation"))
         groups = np.asarray(groups_of(problem))
         factors = tuple(
             jnp.zeros(groups.max() + 1) if reading.sensor.noise is None else None
             for reading in problem.records.readings
         )
-        logs = None
-        if self.deviation is not None:
-            logs = jnp.zeros(len(jax.tree.leaves(process)))
+        logs = None if known else jnp.zeros(len(jax.tree.leaves(process)))
         self.like = (fit.parameters, factors, logs)
         self.x0 = ravel_pytree(self.like)[0]
         seen = np.asarray(fit.covariance)
@@ -174,17 +170,11 @@ class LogDensity(eqx.Module):
         `values` are those of the `Free`s by name; `parameters` the problem's own numbers.
         """
         x = _checks.floating(x, self.x0.shape, "x")
-        parameters, factors, logs = ravel_pytree(self.like)[1](x)
-        noises, process = self._grown_noises(factors), self.grown(logs)
+        parameters, _, logs = ravel_pytree(self.like)[1](x)
+        noises = grown_noises(self.noises, own_numbers(self, x)[1])
         body, state0 = self.problem.unpack(parameters)
-        return Unpacked(parameters, body, state0, self.problem.values(parameters), noises, process)
-
-    def _grown_noises(self, factors: tuple) -> tuple[Array, ...]:
-        """The noises (R, k) of the sensors by the logarithms of their factors."""
-        return tuple(
-            noise if factor is None else noise * jnp.exp(factor)[groups_of(self.problem), None]
-            for noise, factor in zip(self.noises, factors, strict=True)
-        )
+        values, process = self.problem.values(parameters), self.grown(logs)
+        return Unpacked(parameters, body, state0, values, noises, process)
 
     def grown(self, logs: Array | None) -> Any:
         """The process by the logarithms of the factors of its numbers."""

@@ -1,6 +1,5 @@
 """The extended Kalman filter on the manifold, in square-root form."""
 
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -14,9 +13,9 @@ from rigidjax import _checks
 from rigidjax._types import Scalar, ScalarLike
 from rigidjax.estimate import roots
 from rigidjax.estimate.belief import Belief
-from rigidjax.estimate.grid import Grid, gathered, grid_of
+from rigidjax.estimate.grid import Grid, grid_of
 from rigidjax.estimate.scene import Dynamics, Model, bare, reset
-from rigidjax.estimate.sensing import Read, Sensors, absorb_all, rows, sensors_of, values_of
+from rigidjax.estimate.sensing import Read, Sensors, Stops, absorb_all, sensors_of
 from rigidjax.identify.recording import Recording
 from rigidjax.motion.manifold import plus
 
@@ -38,10 +37,9 @@ class Filtered(eqx.Module):
     lost.
 
     >>> import rigidjax as rj
-    >>> from rigidjax import estimate
     >>> record = rj.identify.Recording([0.0, 0.1], (rj.identify.Gyro(0.1), [[1.0, 0, 0]] * 2))
-    >>> model = estimate.Model(rj.Inertia.from_principal(1.0, 2.0, 2.5))
-    >>> found = estimate.filter(model, record, estimate.start(model, record, rate=1.0))
+    >>> model = rj.estimate.Model(rj.Inertia.from_principal(1.0, 2.0, 2.5))
+    >>> found = rj.estimate.filter(model, record, rj.estimate.start(model, record, rate=1.0))
     >>> found.readings[0].innovation.shape, int(found.status)
     ((2, 3), 0)
     """
@@ -108,19 +106,14 @@ def filter(
     expected.
 
     >>> import rigidjax as rj
-    >>> from rigidjax import estimate
     >>> record = rj.identify.Recording([0.0, 0.1], (rj.identify.Gyro(0.1), [[1.0, 0, 0]] * 2))
-    >>> model = estimate.Model(rj.Inertia.from_principal(1.0, 2.0, 2.5))
-    >>> found = estimate.filter(model, record, estimate.start(model, record, rate=1.0))
+    >>> model = rj.estimate.Model(rj.Inertia.from_principal(1.0, 2.0, 2.5))
+    >>> found = rj.estimate.filter(model, record, rj.estimate.start(model, record, rate=1.0))
     >>> found.states.omega.shape, found.words
     ((2, 3), 'followed')
     """
-    sensors = looked_at(model, recording, first)
-    grid = grid_of(model, recording, first, substeps)
-    out = _filter(bare(model), sensors, recording, first, grid)
-    if not throw:
-        return out
-    return told(out)
+    out = _filter(looked_at(model, recording, first, substeps))
+    return told(out) if throw else out
 
 
 def told(out: Any) -> Any:
@@ -144,16 +137,13 @@ def log_likelihood(
     **Arguments** and **raises** as for `filter`; differentiable in forward and reverse mode.
 
     >>> import rigidjax as rj
-    >>> from rigidjax import estimate
     >>> record = rj.identify.Recording([0.0, 0.1], (rj.identify.Gyro(1.0), [[1.0, 0, 0]] * 2))
-    >>> model = estimate.Model(rj.Inertia.from_principal(1.0, 1.0, 1.0))
-    >>> first = estimate.start(model, record, rj.Spin([1.0, 0, 0]), rate=0.0)
+    >>> model = rj.estimate.Model(rj.Inertia.from_principal(1.0, 1.0, 1.0))
+    >>> first = rj.estimate.start(model, record, rj.Spin([1.0, 0, 0]), rate=0.0)
     >>> log_likelihood(model, record, first).round(6)
     Array(-5.513631, dtype=float64)
     """
-    sensors = looked_at(model, recording, first)
-    grid = grid_of(model, recording, first, substeps)
-    return _log_likelihood(bare(model), sensors, recording, first, grid)
+    return _log_likelihood(looked_at(model, recording, first, substeps))
 
 
 def step(model: Model, belief: Belief, t: ScalarLike, *readings: tuple) -> Belief:
@@ -169,12 +159,11 @@ def step(model: Model, belief: Belief, t: ScalarLike, *readings: tuple) -> Belie
     holds NaN.
 
     >>> import jax, rigidjax as rj
-    >>> from rigidjax import estimate
     >>> gyro = rj.identify.Gyro(0.1)
     >>> record = rj.identify.Recording([0.0, 0.1], (gyro, [[1.0, 0, 0]] * 2))
-    >>> model = estimate.Model(rj.Inertia.from_principal(1.0, 2.0, 2.5))
-    >>> belief = estimate.start(model, record, rate=1.0)
-    >>> estimate.step(model, belief, 0.1, (gyro, jnp.array([1.0, 0.0, 0.0]))).t
+    >>> model = rj.estimate.Model(rj.Inertia.from_principal(1.0, 2.0, 2.5))
+    >>> belief = rj.estimate.start(model, record, rate=1.0)
+    >>> rj.estimate.step(model, belief, 0.1, (gyro, jnp.array([1.0, 0.0, 0.0]))).t
     Array(0.1, dtype=float64)
     """
     _checks.instance(model, Model, "model")
@@ -210,55 +199,46 @@ def _step(
         jnp.where(mask, value, jnp.zeros_like(value).at[0].set(1)).astype(belief.root.dtype)
         for value, mask in zip(values, masks, strict=True)
     )
-    return _one(
-        model, Dynamics(model, belief.x, sensors.densities), sensors, belief, t, values, masks
-    )[0]
+    dynamics = Dynamics(model, belief.x, sensors.densities)
+    return _one(dynamics, sensors, belief, Stops(t, values, masks))[0]
 
 
 def _one(
-    model: Model,
-    dynamics: Dynamics,
-    sensors: Sensors,
-    belief: Belief,
-    t: Array,
-    values: Sequence[Array],
-    masks: Sequence[Array],
+    dynamics: Dynamics, sensors: Sensors, belief: Belief, stop: Stops
 ) -> tuple[Belief, tuple[Read, ...]]:
     dtype = belief.root.dtype
     # Times may have more digits than the state: after a thousand seconds seven are too few.
-    since = (t - belief.t).astype(dtype)
+    since = (stop.t - belief.t).astype(dtype)
     x, grown, noise = dynamics.predict(belief.t.astype(dtype), since, belief.x)
-    moved = jnp.concatenate([roots.product(grown, belief.root), noise], 1)
-    root = roots.triangular(moved)
-    found = rows(model, dynamics, sensors, t.astype(dtype), x, values, masks)
-    e, root, read = absorb_all(found, jnp.zeros(root.shape[0], root.dtype), root)
-    return Belief(t, plus(x, e), reset(x, e, root)), read
+    root = roots.predicted(grown, belief.root, noise)
+    e, root, read = absorb_all(dynamics, sensors, stop, x, jnp.zeros_like(root[0]), root)
+    return Belief(stop.t, plus(x, e), reset(x, e, root)), read
 
 
-class Stops(NamedTuple):
-    """Where the filter stops, and what was read there."""
+class Task(NamedTuple):
+    """What a filter is to go through, looked at."""
 
-    t: Array
-    values: tuple[Array, ...]
-    masks: tuple[Array, ...]
+    model: Model
+    sensors: Sensors
+    recording: Recording
+    first: Belief
+    grid: Grid | None
 
 
-def scan_filter(
-    model: Model,
-    sensors: Sensors,
-    recording: Recording,
-    first: Belief,
-    grid: Grid | None,
-    keep: Any,
-) -> tuple[Stops, Any]:
+def scan_filter(task: Task, keep: Any) -> tuple[Stops, Any]:
     """All stops, and `lax.scan` of the filter over them, which keeps `keep(belief, read)`."""
+    model, sensors, recording, first, grid = task
     dtype = first.root.dtype
     dynamics = Dynamics(model, first.x, sensors.densities)
-    stops = Stops(*gathered(grid, recording.t, *values_of(recording, dtype)))
+    values = tuple(reading.values.astype(dtype) for reading in recording.readings)
+    stops = Stops(recording.t, values, tuple(reading.mask for reading in recording.readings))
+    if grid is not None:
+        _, values, masks = jax.tree.map(lambda leaf: leaf[grid.source], stops)
+        stops = Stops(grid.t, values, tuple(mask & grid.real for mask in masks))
 
     def body(carry: tuple[Belief, Array], stop: Stops) -> tuple[Any, Any]:
         belief, total = carry
-        belief, read = _one(model, dynamics, sensors, belief, *stop)
+        belief, read = _one(dynamics, sensors, belief, stop)
         total = total + sum(r.log_density for r in read)
         return (belief, total), keep(belief, read)
 
@@ -268,34 +248,16 @@ def scan_filter(
 
 
 @eqx.filter_jit
-def _filter(
-    model: Model, sensors: Sensors, recording: Recording, first: Belief, grid: Grid | None
-) -> Filtered:
-    _, ((_, total), (beliefs, reads)) = scan_filter(
-        model, sensors, recording, first, grid, lambda belief, read: (belief, read)
-    )
-    if grid is not None:
-        beliefs, reads = jax.tree.map(lambda leaf: leaf[grid.rows], (beliefs, reads))
-    status, lost_at = status_of(beliefs, reads, first.t)
-    return Filtered(beliefs, reads, total, status, lost_at)
-
-
-def reads_of(
-    model: Model, sensors: Sensors, recording: Recording, first: Belief, substeps: int
-) -> tuple[Read, ...]:
-    """What each sensor's readings gave, at each stop, of what has been looked at."""
-    grid = grid_of(model, recording, first, substeps)
-    return scan_filter(model, sensors, recording, first, grid, lambda belief, read: read)[1][1]
+def _filter(task: Task) -> Filtered:
+    grid = task.grid
+    _, ((_, total), kept) = scan_filter(task, lambda belief, read: (belief, read))
+    beliefs, reads = kept if grid is None else jax.tree.map(lambda leaf: leaf[grid.rows], kept)
+    return Filtered(beliefs, reads, total, *status_of(beliefs, reads, task.first.t))
 
 
 @eqx.filter_jit
-def _log_likelihood(
-    model: Model, sensors: Sensors, recording: Recording, first: Belief, grid: Grid | None
-) -> Scalar:
-    _, ((_, total), _) = scan_filter(
-        model, sensors, recording, first, grid, lambda belief, read: None
-    )
-    return total
+def _log_likelihood(task: Task) -> Scalar:
+    return scan_filter(task, lambda belief, read: None)[1][0][1]
 
 
 def status_of(beliefs: Belief, reads: tuple[Read, ...], t0: Array) -> tuple[Array, Array]:
@@ -316,17 +278,17 @@ def status_of(beliefs: Belief, reads: tuple[Read, ...], t0: Array) -> tuple[Arra
     return status, jnp.where(lost.any(), t[jnp.argmax(lost)], jnp.nan)
 
 
-def looked_at(model: Model, recording: Recording, first: Belief) -> Sensors:
+def looked_at(model: Model, recording: Recording, first: Belief, substeps: int | None) -> Task:
+    """The task of `filter` and `smooth`, its arguments checked in words."""
     _checks.instance(model, Model, "model")
     _checks.instance(recording, Recording, "recording")
     _checks.instance(first, Belief, "first", hint="estimate.start makes it")
     if recording.torque is not None:
         raise ValueError("recording: it has a torque of its own; put it into the model instead")
-    felt = [sensor.feels for sensor in recording.sensors]
-    for kind in felt:
-        if not isinstance(first.x.motion, kind):
-            raise TypeError(
-                f"first: a sensor needs a state with {kind.__name__}, got a "
-                f"{type(first.x.motion).__name__}"
-            )
-    return sensors_of(recording.sensors, model)
+    for sensor in recording.sensors:
+        if not isinstance(first.x.motion, sensor.feels):
+            kind, got = sensor.feels.__name__, type(first.x.motion).__name__
+            raise TypeError(f"first: a sensor needs a state with {kind}, got a {got}")
+    sensors = sensors_of(recording.sensors, model)
+    grid = grid_of(model, recording, first, substeps)
+    return Task(bare(model), sensors, recording, first, grid)

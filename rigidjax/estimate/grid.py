@@ -37,63 +37,48 @@ def grid_of(model: Model, recording: Recording, first: Belief, substeps: int | N
     """
     t, t0 = recording.t, first.t
     if _checks.known((t, t0)):
-        early = bool(np.asarray(t)[0] < np.asarray(t0))
-        _checks.refuse(
-            t,
-            early,
-            f"recording: readings are out of order: the first is at {np.asarray(t)[0]:g} s, before "
-            f"the time of the belief it starts from, {np.asarray(t0):g} s",
+        begin = np.asarray(t)[0]
+        words = (
+            f"recording: readings are out of order: the first is at {begin:g} s, before the time "
+            f"of the belief it starts from, {np.asarray(t0):g} s"
         )
+        _checks.refuse(t, begin < np.asarray(t0), words)
     if substeps is not None:
-        pieces = _checks.whole(substeps, "substeps", 1)
-        if pieces == 1:
-            return None
-        before = jnp.concatenate([t0[None], t[:-1]])
-        part = jnp.arange(1, pieces + 1, dtype=t.dtype) / pieces
-        inner = before[:, None] + (t - before)[:, None] * part[None]
-        inner = inner.at[:, -1].set(t)
-        count = t.shape[0]
-        real = jnp.tile(jnp.arange(pieces) == pieces - 1, count)
-        index = jnp.repeat(jnp.arange(count), pieces)
-        return Grid(inner.reshape(-1), index, real, jnp.arange(1, count + 1) * pieces - 1)
-    if not _checks.known((t, t0, first.x.motion.omega, model.coloured)):
+        counts = np.full(t.shape, _checks.whole(substeps, "substeps", 1))
+    elif _checks.known((t, t0, first.x.motion.omega, model.coloured)):
+        gaps = np.diff(np.concatenate([[float(t0)], np.asarray(t)]))
+        counts = steps_of(gaps, longest_step(model, _fastest(recording, first)))
+    else:
         return None
-    longest = _longest(model, recording, first)
-    stops, before = np.asarray(t), np.concatenate([[float(t0)], np.asarray(t)[:-1]])
-    counts = np.maximum(1, np.ceil((stops - before) / longest * (1 - 1e-9))).astype(int)
     if (counts == 1).all():
         return None
-    index = np.repeat(np.arange(stops.size), counts)
+    xp = _checks.namespace((t, t0))
+    index = np.repeat(np.arange(counts.size), counts)
     rows = np.cumsum(counts) - 1
-    part = (np.arange(index.size) - np.repeat(rows - counts, counts)) / np.repeat(counts, counts)
-    times = before[index] + (stops - before)[index] * part
-    times[rows] = stops
-    real = np.zeros(index.size, bool)
-    real[rows] = True
-    return Grid(
-        jnp.asarray(times, t.dtype), jnp.asarray(index), jnp.asarray(real), jnp.asarray(rows)
-    )
+    part = (np.arange(index.size) - np.repeat(rows - counts, counts)) / counts[index]
+    t, t0 = xp.asarray(t), xp.asarray(t0)
+    before = xp.concatenate([t0[None], t[:-1]])
+    times = before[index] + (t - before)[index] * xp.asarray(part, t.dtype)
+    times = xp.where(part == 1, t[index], times)
+    return Grid(*map(jnp.asarray, (times, index, part == 1, rows)))
 
 
-def _longest(model: Model, recording: Recording, first: Belief) -> float:
-    """The longest step, s."""
+def longest_step(model: Model, rate: float) -> float:
+    """The longest step, s, of a body that turns at `rate` rad/s."""
+    times = [MEMORY_A_STEP * float(law.time) for law in model.coloured]
+    return min([TURN_A_STEP / rate if rate > 0 else math.inf, *times])
+
+
+def steps_of(span: Any, longest: float) -> Any:
+    """How many equal steps of at most `longest` go from one time to another, `span` s later."""
+    return np.maximum(1, np.ceil(span / longest * (1 - 1e-9))).astype(int)
+
+
+def _fastest(recording: Recording, first: Belief) -> float:
+    """The largest rate that the first state and the gyros show, rad/s."""
     rate = float(np.linalg.norm(np.asarray(first.x.motion.omega, float)))
     for reading in recording.readings:
         if isinstance(reading.sensor, Gyro):
             values = np.asarray(reading.values, float)[reading.seen]
             rate = max(rate, float(np.quantile(np.linalg.norm(values, axis=1), 0.99)))
-    longest = TURN_A_STEP / rate if rate > 0 else math.inf
-    for law in model.coloured:
-        longest = min(longest, MEMORY_A_STEP * float(law.time))
-    return longest
-
-
-def gathered(grid: Grid | None, t: Array, values: Any, masks: Any) -> tuple[Array, Any, Any]:
-    """Times, values and masks at each stop."""
-    if grid is None:
-        return t, values, masks
-    return (
-        grid.t,
-        tuple(v[grid.source] for v in values),
-        tuple(m[grid.source] & grid.real for m in masks),
-    )
+    return rate

@@ -57,9 +57,8 @@ class LinearModel(eqx.Module):
         self.push = None if push is None else _checks.numbers(push, "push")
         self.offset = None if offset is None else _checks.numbers(offset, "offset")
         if self.transition.ndim < 2:
-            raise ValueError(
-                f"transition: wanted a matrix (n, n), got shape {self.transition.shape}"
-            )
+            got = self.transition.shape
+            raise ValueError(f"transition: wanted a matrix (n, n), got shape {got}")
         n, k = self.transition.shape[-1], self.matrix.shape[-2:-1]
         for name, wanted in {
             "transition": (n, n),
@@ -70,10 +69,8 @@ class LinearModel(eqx.Module):
             "offset": k,
         }.items():
             part = getattr(self, name)
-            if part is None:
-                continue
-            extra = part.ndim - len(wanted)
-            if extra not in (0, 1) or part.shape[extra:] != wanted:
+            extra = 0 if part is None else part.ndim - len(wanted)
+            if part is not None and (extra not in (0, 1) or part.shape[extra:] != wanted):
                 raise ValueError(
                     f"{name}: wanted shape {wanted}, with one leading axis of times or none, got "
                     f"{part.shape}"
@@ -131,14 +128,11 @@ def joint(grown: Array, noise: Array, root: Array) -> Joint:
     From one triangularisation of `[[F S, G], [S, 0]]`: Park and Kailath 1995,
     doi:10.1080/00207179508921582.
     """
-    n = root.shape[0]
+    n, m = noise.shape
     upper = jnp.concatenate([roots.product(grown, root), noise], 1)
-    lower = jnp.concatenate([root, jnp.zeros((n, noise.shape[1]), root.dtype)], 1)
-    whole = jnp.concatenate([upper, lower])
-    missing = 2 * n - whole.shape[1]
-    if missing > 0:
-        whole = jnp.concatenate([whole, jnp.zeros((2 * n, missing), root.dtype)], 1)
-    whole = roots.triangular(whole)
+    whole = jnp.concatenate([upper, jnp.pad(root, ((0, 0), (0, m)))])
+    # A triangle of 2n needs as many columns.
+    whole = roots.triangular(jnp.pad(whole, ((0, 0), (0, max(0, n - m)))))
     predicted, cross = whole[:n, :n], whole[n:, :n]
     return Joint(predicted, roots.divide_right(cross, predicted), whole[n:, n:])
 
@@ -148,8 +142,7 @@ def backward(
 ) -> tuple[Array, Array]:
     """The smoothed mean and root before a step from those after it (Rauch, Tung, Striebel 1965)."""
     mean = mean + jnp.sum(kept.gain * (later - predicted)[None], 1)
-    moved = jnp.concatenate([kept.rest, roots.product(kept.gain, root)], 1)
-    return mean, roots.triangular(moved)
+    return mean, roots.predicted(kept.gain, root, kept.rest)
 
 
 def kick(noise: Array, kept: Joint, off: Array, root: Array) -> tuple[Array, Array]:
@@ -166,8 +159,7 @@ def kick(noise: Array, kept: Joint, off: Array, root: Array) -> tuple[Array, Arr
     mean = jnp.sum(whitened * mean[:, None], 0)
     left = jnp.eye(m, dtype=noise.dtype) - roots.product(whitened.T, whitened)
     known = roots.product(whitened.T, spread)
-    total = left + roots.product(known, known.T)
-    return mean, total
+    return mean, left + roots.product(known, known.T)
 
 
 def linear_filter(
@@ -220,76 +212,56 @@ def _given(model: LinearModel, readings: Any, mean: Any, root: Any, seen: Any) -
     bad = seen & ~jnp.isfinite(readings)
     words = "readings: contains NaN or infinity; mask it by `seen` if it is a gap"
     readings = jnp.where(seen, _checks.refuse(readings, bad.any(), words), 0)
-    for name, base, wanted in (
-        ("transition", 2, times - 1),
-        ("noise", 2, times - 1),
-        ("push", 1, times - 1),
-        ("matrix", 2, times),
-        ("deviation", 1, times),
-        ("offset", 1, times),
-    ):
-        part = getattr(model, name)
-        if part is not None and part.ndim > base and part.shape[0] != wanted:
-            raise ValueError(f"{name}: wanted {wanted} rows for {times} times, got {part.shape[0]}")
+    for axes, wanted in ((_STEPS, times - 1), (_TIMES, times)):
+        for name, part in _moving(model, axes).items():
+            if part is not None and part.shape[0] != wanted:
+                raise ValueError(
+                    f"{name}: wanted {wanted} rows for {times} times, got {part.shape[0]}"
+                )
     return readings, mean, root, seen
 
 
-class _Passed(NamedTuple):
-    mean: Array
-    root: Array
-    innovation: Array
-    variance: Array
+# The parts of a model that may change from step to step, and from time to time: their axes.
+_STEPS = {"transition": 2, "noise": 2, "push": 1}
+_TIMES = {"matrix": 2, "deviation": 1, "offset": 1}
 
 
-def _read(row: Any, y: Array, seen: Array, mean: Array, root: Array) -> _Passed:
+def _moving(model: LinearModel, axes: dict[str, int]) -> dict[str, Array | None]:
+    """Those that do, by name; `None` for others."""
+    parts = {name: getattr(model, name) for name in axes}
+    return {n: p if p is not None and p.ndim > axes[n] else None for n, p in parts.items()}
+
+
+def _now(model: LinearModel, axes: dict[str, int], moving: dict[str, Array | None]) -> list[Any]:
+    """All parts at one step or time, from those there that do change."""
+    return [getattr(model, n) if moving[n] is None else moving[n] for n in axes]
+
+
+def _read(row: Any, y: Array, seen: Array, mean: Array, root: Array) -> roots.Absorbed:
     """The update by one row of readings."""
-
-    def one(carry: tuple[Array, Array], number: tuple) -> tuple[Any, Any]:
-        h, error, variance, there = number
-        found = roots.absorb(*carry, h, error, variance, there)
-        return (found.step, found.root), (found.innovation, found.variance)
-
     matrix, deviation, offset = row
     error = y if offset is None else y - offset
-    (mean, root), (innovation, variance) = lax.scan(
-        one, (mean, root), (matrix, error, deviation**2, seen)
-    )
-    return _Passed(mean, root, innovation, variance)
-
-
-def _split(parts: tuple, base: tuple[int, ...]) -> tuple[tuple, Any]:
-    """What changes with time, and a function that puts it beside what does not."""
-    moving = tuple(
-        p if p is not None and p.ndim > b else None for p, b in zip(parts, base, strict=True)
-    )
-
-    def whole(now: tuple) -> tuple:
-        return tuple(p if m is None else n for p, m, n in zip(parts, moving, now, strict=True))
-
-    return moving, whole
+    return roots.absorb_all(mean, root, matrix, error, deviation**2, seen)
 
 
 def _pass(model: LinearModel, readings: Array, mean: Array, root: Array, seen: Array, step: Any):
     """Forward through all times; `step(F, G, root)` gives the predicted root and what is kept."""
-    steps, at_step = _split((model.transition, model.noise, model.push), (2, 2, 1))
-    times, at_time = _split((model.matrix, model.deviation, model.offset), (2, 1, 1))
-    first = _read(
-        at_time(jax.tree.map(lambda leaf: leaf[0], times)), readings[0], seen[0], mean, root
-    )
+    steps, times = _moving(model, _STEPS), _moving(model, _TIMES)
+    now, later = (jax.tree.map(lambda leaf, at=at: leaf[at], times) for at in (0, slice(1, None)))
+    first = _read(_now(model, _TIMES, now), readings[0], seen[0], mean, root)
 
     def body(carry: tuple[Array, Array], now: Any) -> tuple[Any, Any]:
-        grown, noise, push = at_step(now[0])
+        grown, noise, push = _now(model, _STEPS, now[0])
         mean, root = carry
         predicted = jnp.sum(grown * mean[None], 1)
         if push is not None:
             predicted = predicted + push
         before, kept = step(grown, noise, root)
-        passed = _read(at_time(now[1]), now[2], now[3], predicted, before)
-        return (passed.mean, passed.root), (passed, predicted, kept)
+        passed = _read(_now(model, _TIMES, now[1]), now[2], now[3], predicted, before)
+        return (passed.step, passed.root), (passed, predicted, kept)
 
-    later = jax.tree.map(lambda leaf: leaf[1:], times)
     _, (rest, predicted, kept) = lax.scan(
-        body, (first.mean, first.root), (steps, later, readings[1:], seen[1:])
+        body, (first.step, first.root), (steps, later, readings[1:], seen[1:])
     )
     passed = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first, rest)
     total = jnp.sum(roots.log_normal(passed.innovation, passed.variance, seen))
@@ -301,13 +273,11 @@ def _filter(
     model: LinearModel, readings: Array, mean: Array, root: Array, seen: Bool[Array, "..."]
 ) -> LinearEstimate:
     def step(grown: Array, noise: Array, root: Array) -> tuple[Array, None]:
-        moved = jnp.concatenate([roots.product(grown, root), noise], 1)
-        return roots.triangular(moved), None
+        return roots.predicted(grown, root, noise), None
 
     passed, _, _, total = _pass(model, readings, mean, root, seen, step)
-    return LinearEstimate(
-        passed.mean, passed.root, passed.innovation, passed.variance, total, None, None
-    )
+    mean, root, innovation, variance = passed
+    return LinearEstimate(mean, root, innovation, variance, total, None, None)
 
 
 @jax.jit
@@ -321,11 +291,11 @@ def _smooth(
     passed, predicted, kept, total = _pass(model, readings, mean, root, seen, step)
     _, (means, spreads) = lax.scan(
         lambda later, now: (lambda out: (out, out))(backward(now[0], now[1], now[2], *later)),
-        (passed.mean[-1], passed.root[-1]),
-        (kept, passed.mean[:-1], predicted),
+        (passed.step[-1], passed.root[-1]),
+        (kept, passed.step[:-1], predicted),
         reverse=True,
     )
-    means = jnp.concatenate([means, passed.mean[-1:]])
+    means = jnp.concatenate([means, passed.step[-1:]])
     spreads = jnp.concatenate([spreads, passed.root[-1:]])
     axis = 0 if model.noise.ndim > 2 else None
     kicks, spread_of_kicks = jax.vmap(kick, (axis, 0, 0, 0))(

@@ -1,5 +1,6 @@
 """Draws from a posterior density, by samplers of other libraries."""
 
+import importlib
 from collections.abc import Callable
 from typing import Any
 
@@ -44,8 +45,7 @@ class Nuts(eqx.Module):
     def __check_init__(self):
         _checks.whole(self.samples, "samples", 1)
         _checks.whole(self.warmup, "warmup", 1)
-        if not 0 < _checks.positive(self.acceptance, "acceptance") < 1:
-            raise ValueError(f"acceptance: wanted a number between 0 and 1, got {self.acceptance}")
+        _checks.fraction(self.acceptance, "acceptance")
 
     def __call__(self, key: Any, density: Callable[[Array], Array], start: Array) -> Array:
         """Draws (samples, n) of one chain."""
@@ -144,12 +144,7 @@ class Posterior(eqx.Module):
 
         **Raises:** `ImportError` without arviz (it needs Python 3.12).
         """
-        try:
-            import arviz  # pyright: ignore[reportMissingImports]
-        except ImportError as error:
-            raise ImportError(
-                "to_arviz: arviz is missing; pip install 'rigidjax[posterior]' (Python 3.12)"
-            ) from error
+        arviz = _extra("to_arviz", "arviz", " (Python 3.12)")
         points = self.points
         out = dict(points.values)
         out["omega0"] = points.state0.omega
@@ -220,10 +215,12 @@ def _draw(density: LogDensity, root: Array, keys: Array, sampler: Any) -> Array:
 
 
 def _blackjax() -> Any:
+    return _extra("posterior", "blackjax")
+
+
+def _extra(name: str, module: str, note: str = "") -> Any:
     try:
-        import blackjax  # pyright: ignore[reportMissingImports]
+        return importlib.import_module(module)
     except ImportError as error:
-        raise ImportError(
-            "posterior: blackjax is missing; pip install 'rigidjax[posterior]'"
-        ) from error
-    return blackjax
+        words = f"{name}: {module} is missing; pip install 'rigidjax[posterior]'{note}"
+        raise ImportError(words) from error

@@ -80,9 +80,7 @@ class Refit(eqx.Module):
         **Raises** `ValueError` for a level outside (0, 1), and where neither holds: too few draws
         are independent, and x is not the maximum.
         """
-        level = _checks.positive(level, "level")
-        if level >= 1:
-            raise ValueError(f"level: wanted a probability between 0 and 1, got {level}")
+        level = _checks.fraction(level, "level", "a probability between 0 and 1")
         _checks.function(of, "of", "of `Unpacked` to an array")
         if not (float(self.effective) >= _LEAST or bool(self.converged)):
             raise ValueError(

@@ -1,7 +1,7 @@
 """Covariances by their square roots: P = S Sᵀ, which no rounding makes indefinite."""
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jax import lax
@@ -27,13 +27,32 @@ def triangular(a: Float[Array, "n m"]) -> Float[Array, "n n"]:
 
     def take(a: Array, k: Array) -> tuple[Array, Array]:
         row = lax.dynamic_index_in_dim(a, k, keepdims=False)
-        square = jnp.sum(row * row)
-        there = square > least[k]
-        unit = row * jnp.where(there, 1 / jnp.sqrt(jnp.where(there, square, 1)), 0)
+        unit = row * inverse_root(jnp.sum(row * row), least[k])
         column = jnp.where(below >= k, jnp.sum(a * unit[None], 1), 0)
         return a - column[:, None] * unit[None], column
 
     return lax.scan(take, a, below)[1].T
+
+
+def predicted(
+    grown: Float[Array, "k n"], root: Float[Array, "n n"], noise: Float[Array, "k m"]
+) -> Float[Array, "k k"]:
+    """The triangular root of `F P Fᵀ + G Gᵀ`, of F, a root of P, and G.
+
+    >>> predicted(3.0 * jnp.eye(1), jnp.eye(1), 4.0 * jnp.eye(1)).tolist()
+    [[5.0]]
+    """
+    return triangular(jnp.concatenate([product(grown, root), noise], 1))
+
+
+def inverse_root(x: Array, least: Any = 0) -> Array:
+    """1/√x where x is above `least`, else zero, as its derivatives are there.
+
+    >>> inverse_root(jnp.array([4.0, 0.0])).tolist()
+    [0.5, 0.0]
+    """
+    there = x > least
+    return jnp.where(there, 1 / jnp.sqrt(jnp.where(there, x, 1)), 0)
 
 
 def product(a: Float[Array, "n m"], b: Float[Array, "m k"]) -> Float[Array, "n k"]:
@@ -46,16 +65,17 @@ def product(a: Float[Array, "n m"], b: Float[Array, "m k"]) -> Float[Array, "n k
 
 
 class Absorbed(NamedTuple):
-    """What one number read does: the mean's step, the root after it, and how far off it was.
+    """What numbers read do: the mean's step, the root after it, and how far off each was.
 
-    **Fields:** `step` (n,); `root` (n, n); `innovation` ν, what was read minus what was expected;
-    `variance` s of ν; both of a masked number are such that it counts for nothing (0 and 1).
+    **Fields:** `step` (n,); `root` (n, n); `innovation` ν, what was read minus what was expected of
+    all before; `variance` s of ν; both of a masked number are such that it counts for nothing (0
+    and 1).
     """
 
     step: Float[Array, " n"]
     root: Float[Array, "n n"]
-    innovation: Scalar
-    variance: Scalar
+    innovation: Float[Array, "*k"]
+    variance: Float[Array, "*k"]
 
 
 def absorb(
@@ -83,6 +103,29 @@ def absorb(
     step = step + along * (innovation / total)
     shrink = 1 / (total + jnp.sqrt(total * variance))
     return Absorbed(step, root - (along * shrink)[:, None] * across[None], innovation, total)
+
+
+def absorb_all(
+    step: Float[Array, " n"],
+    root: Float[Array, "n n"],
+    matrix: Float[Array, "k n"],
+    error: Float[Array, " k"],
+    variance: Float[Array, " k"],
+    seen: Bool[Array, " k"],
+) -> Absorbed:
+    """`absorb` of k numbers, one after another.
+
+    >>> one = jnp.ones(2)
+    >>> absorb_all(jnp.zeros(1), jnp.eye(1), one[:, None], one, one, one > 0).variance.tolist()
+    [2.0, 1.5]
+    """
+
+    def one(now: tuple[Array, Array], number: tuple) -> tuple[Any, Any]:
+        found = absorb(*now, *number)
+        return (found.step, found.root), (found.innovation, found.variance)
+
+    (step, root), (innovation, total) = lax.scan(one, (step, root), (matrix, error, variance, seen))
+    return Absorbed(step, root, innovation, total)
 
 
 def log_normal(innovation: Array, variance: Array, seen: Array) -> Array:

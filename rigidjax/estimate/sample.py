@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from rigidjax import _checks
 from rigidjax._types import HasSpin
-from rigidjax.estimate.grid import MEMORY_A_STEP, TURN_A_STEP
+from rigidjax.estimate.grid import longest_step, steps_of
 from rigidjax.estimate.scene import Dynamics, Extended, Model
 from rigidjax.motion import on_the_group
 
@@ -23,9 +23,8 @@ class Sampled(eqx.Module):
     `CorrelatedTorque`, N m, body frame.
 
     >>> import jax, rigidjax as rj
-    >>> from rigidjax import estimate
     >>> body = rj.Inertia.from_principal(1.0, 2.0, 2.5)
-    >>> model = estimate.Model(body, rj.torques.RandomTorque(0.01))
+    >>> model = rj.estimate.Model(body, rj.torques.RandomTorque(0.01))
     >>> drawn = sample(jax.random.key(0), model, rj.Spin([0.0, 0.0, 1.0]), [0.0, 0.5, 1.0])
     >>> drawn.t.shape, drawn.torques  # white noise has no value at a time
     ((3,), ())
@@ -53,9 +52,8 @@ def sample(key: Any, model: Model, state0: Any, ts: Any, *, substeps: int | None
     **Raises:** `ValueError` for times that do not increase, `TypeError` for another kind of thing.
 
     >>> import jax, rigidjax as rj
-    >>> from rigidjax import estimate
     >>> body = rj.Inertia.from_principal(1.0, 2.0, 2.5)
-    >>> model = estimate.Model(body, rj.torques.RandomTorque(0.01))
+    >>> model = rj.estimate.Model(body, rj.torques.RandomTorque(0.01))
     >>> drawn = sample(jax.random.key(0), model, rj.Spin([0.0, 0.0, 1.0]), [0.0, 0.5, 1.0])
     >>> drawn.states.omega.shape
     (3, 3)
@@ -72,11 +70,8 @@ def sample(key: Any, model: Model, state0: Any, ts: Any, *, substeps: int | None
     if substeps is not None:
         pieces = _checks.whole(substeps, "substeps", 1)
     elif _checks.known((times, state0.omega, model.coloured)):
-        widest = float(np.diff(np.asarray(times)).max())
-        pieces = np.ceil(widest * float(np.linalg.norm(np.asarray(state0.omega))) / TURN_A_STEP)
-        for law in model.coloured:
-            pieces = max(pieces, np.ceil(widest / (MEMORY_A_STEP * float(law.time))))
-        pieces = max(1, int(pieces))
+        rate = float(np.linalg.norm(np.asarray(state0.omega)))
+        pieces = int(steps_of(np.diff(np.asarray(times)).max(), longest_step(model, rate)))
     else:
         pieces = 1
     return _sample(key, model, on_the_group(state0), times, pieces)

@@ -6,17 +6,19 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.scipy.linalg import block_diag
 from jaxtyping import Array, Float
 
 from rigidjax import _checks
 from rigidjax._types import HasAttitude, Mat3, Scalar
 from rigidjax.body.inertia import Inertia, MassProperties, inverse
-from rigidjax.motion import Rigid
+from rigidjax.estimate import roots
+from rigidjax.identify.sensor_inputs import what_turns
 from rigidjax.motion.manifold import coordinates, dimension, tangent, turns
 from rigidjax.motion.torques import CorrelatedTorque, RandomTorque, Sum, Torque
 from rigidjax.motion.torques.base import in_precision, require_law, tensor_of
 from rigidjax.rotation.kernels import normalised
-from rigidjax.rotation.linalg3 import components
+from rigidjax.rotation.linalg3 import cross
 from rigidjax.solve import equations_of_motion
 from rigidjax.solve.equal_steps import advance
 from rigidjax.solve.tableaus import KUTTA4
@@ -111,6 +113,7 @@ class Extended(eqx.Module):
 class Dynamics(eqx.Module):
     """A model for one dtype and one kind of state: what does not change is computed once."""
 
+    body: Inertia | MassProperties
     field: Callable[..., Any]
     inverse: Mat3
     white: tuple[Array, ...]
@@ -119,11 +122,9 @@ class Dynamics(eqx.Module):
 
     def __init__(self, model: Model, x: Extended, densities: Sequence[Array] = ()):
         dtype = x.motion.omega.dtype
-        body = in_precision(model.body, dtype)
-        if isinstance(body, MassProperties) and type(x.motion) is not Rigid:
-            body = body.inertia
-        self.field = equations_of_motion(body, x.motion, in_precision(model.torque, dtype))
-        self.inverse = inverse(tensor_of(body))
+        self.body = what_turns(in_precision(model.body, dtype), type(x.motion))
+        self.field = equations_of_motion(self.body, x.motion, in_precision(model.torque, dtype))
+        self.inverse = inverse(tensor_of(self.body))
         self.white = tuple(jnp.sqrt(law.density.astype(dtype)) for law in model.white)
         self.coloured = tuple(
             (jnp.sqrt(law.density.astype(dtype)), law.time.astype(dtype)) for law in model.coloured
@@ -138,6 +139,13 @@ class Dynamics(eqx.Module):
         """How many unit normal numbers push motion and torques in one step."""
         return 6 * (len(self.white) + len(self.coloured))
 
+    def pushed(self, change: Any, torque: Array | None) -> Any:
+        """A rate of change of the motion, with a torque beside those of its equations."""
+        if torque is None:
+            return change
+        spin = change.omega + jnp.sum(self.inverse * torque[None], 1)
+        return eqx.tree_at(lambda s: s.omega, change, spin)
+
     def advance(self, t: Scalar, h: Scalar, x: Extended, kicks: Array) -> Extended:
         """`x` a time `h` later, pushed by noise; `kicks` (kicks,) of unit variance.
 
@@ -147,15 +155,13 @@ class Dynamics(eqx.Module):
         doi:10.1137/19M1261912); the step is the classical one of order 4.
         """
         safe = jnp.where(h > 0, h, 1)
-        rest = jnp.where(h > 0, 1 / jnp.sqrt(safe), 0)
-        pairs = kicks.reshape(-1, 2, 3) * rest
+        pairs = kicks.reshape(-1, 2, 3) * roots.inverse_root(h)
 
         def push(pair: Array, share: Scalar) -> Array:
             return pair[0] + 3.0**0.5 * share * pair[1]
 
         def rate(since: Scalar, now: tuple[Any, tuple]) -> tuple[Any, tuple]:
             motion, torques = now
-            change = self.field(t + since, motion, None)
             share = 1.0 - 2.0 * since / safe
             total = None
             for root, pair in zip(self.white, pairs, strict=False):
@@ -166,10 +172,7 @@ class Dynamics(eqx.Module):
             for (root, memory), pair, torque in zip(self.coloured, later, torques, strict=True):
                 total = torque if total is None else total + torque
                 slopes.append((root * push(pair, share) - torque) / memory)
-            if total is not None:
-                spin = change.omega + jnp.sum(self.inverse * total[None], 1)
-                change = eqx.tree_at(lambda s: s.omega, change, spin)
-            return change, tuple(slopes)
+            return self.pushed(self.field(t + since, motion, None), total), tuple(slopes)
 
         (motion, torques), _ = advance(KUTTA4, rate, jnp.zeros_like(h), h, (x.motion, x.torques), h)
         if isinstance(motion, HasAttitude):
@@ -183,13 +186,10 @@ class Dynamics(eqx.Module):
 
         Linearised about `kicks` (kicks,), `None` for none; drifts of walks come last in G.
         """
-        dtype = x.motion.omega.dtype
-        kicks = jnp.zeros(self.kicks, dtype) if kicks is None else kicks
+        kicks = jnp.zeros(self.kicks, x.motion.omega.dtype) if kicks is None else kicks
         after, push = jax.linearize(lambda y, k: self.advance(t, h, y, k), x, kicks)
         moving = Extended(x.motion, x.torques, ())
         size, drifting = dimension(moving), dimension(x) - dimension(moving)
-        count = size + self.kicks
-        eye = jnp.eye(count, dtype=dtype)
         still = tuple(jnp.zeros_like(w) for w in x.walks)
 
         def column(unit: Array) -> Array:
@@ -197,12 +197,13 @@ class Dynamics(eqx.Module):
             moved = push(Extended(along.motion, along.torques, still), unit[size:])
             return coordinates(after, moved)[:size]
 
-        both = jax.vmap(column, out_axes=1)(eye)
+        both = jax.vmap(column, out_axes=1)(jnp.eye(size + self.kicks, dtype=kicks.dtype))
         grown, noise = both[:, :size], both[:, size:]
         if not drifting:
             return after, grown, noise
-        strewn = jnp.concatenate([w.reshape(-1) for w in self.walks]) * jnp.sqrt(h)
-        return after, _block(grown, jnp.eye(drifting, dtype=dtype)), _block(noise, jnp.diag(strewn))
+        same = jnp.eye(drifting, dtype=kicks.dtype)
+        strewn = jnp.diag(jnp.concatenate([w.reshape(-1) for w in self.walks]) * jnp.sqrt(h))
+        return after, block_diag(grown, same), block_diag(noise, strewn)
 
 
 def reset(x: Extended, e: Float[Array, " n"], root: Float[Array, "n m"]) -> Float[Array, "n m"]:
@@ -221,24 +222,13 @@ def reset_inverse(x: Extended, e: Float[Array, " n"], a: Float[Array, "n m"]) ->
 
 def _turned(x: Extended, e: Array, a: Array, first: float, second: float) -> Array:
     """The rows of each attitude times `1 + first hat(e) + second hat(e)²`."""
+    across = jax.vmap(cross, (None, 1), 1)
     for rows in turns(x):
         turn, mine = e[rows], a[rows]
-        once = _across(turn, mine)
-        mine = mine + first * once + second * _across(turn, once)
+        once = across(turn, mine)
+        mine = mine + first * once + second * across(turn, once)
         a = jnp.concatenate([a[: rows.start], mine, a[rows.stop :]])
     return a
-
-
-def _across(turn: Array, m: Array) -> Array:
-    """`hat(turn) m`."""
-    p, q, r = components(turn)
-    return jnp.stack([q * m[2] - r * m[1], r * m[0] - p * m[2], p * m[1] - q * m[0]])
-
-
-def _block(a: Array, b: Array) -> Array:
-    upper = jnp.concatenate([a, jnp.zeros((a.shape[0], b.shape[1]), a.dtype)], 1)
-    lower = jnp.concatenate([jnp.zeros((b.shape[0], a.shape[1]), a.dtype), b], 1)
-    return jnp.concatenate([upper, lower])
 
 
 def _parts(torque: Torque) -> list[Any]:
@@ -251,8 +241,7 @@ def _parts(torque: Torque) -> list[Any]:
 
 def not_negative(value: Any, name: str) -> Array:
     """Finite numbers, none below zero."""
-    array = _checks.numbers(value, name)
-    words = f"{name}: wanted a finite number that is not below zero"
+    array, wanted = _checks.numbers(value, name), "a finite number that is not below zero"
     if not array.size:
-        raise ValueError(f"{words}, got none")
-    return _checks.refuse(array, ~((array >= 0) & jnp.isfinite(array)).all(), words)
+        raise ValueError(f"{name}: wanted {wanted}, got none")
+    return _checks.sign(array, name, wanted, zero=True)

@@ -10,19 +10,11 @@ from jaxtyping import Array, Float, Int
 
 from rigidjax import _checks
 from rigidjax._types import Scalar
-from rigidjax.estimate import linear
+from rigidjax.estimate import linear, roots
 from rigidjax.estimate.belief import Belief
-from rigidjax.estimate.filter import WORDS, Stops, looked_at, scan_filter, status_of, told
-from rigidjax.estimate.grid import Grid, grid_of
-from rigidjax.estimate.scene import (
-    Dynamics,
-    Extended,
-    Model,
-    bare,
-    reset,
-    reset_inverse,
-)
-from rigidjax.estimate.sensing import Read, Sensors, absorb_all, rows
+from rigidjax.estimate.filter import WORDS, Task, looked_at, scan_filter, status_of, told
+from rigidjax.estimate.scene import Dynamics, Extended, Model, reset, reset_inverse
+from rigidjax.estimate.sensing import Read, Sensors, Stops, absorb_all
 from rigidjax.identify.recording import Recording
 from rigidjax.motion.manifold import minus, plus
 
@@ -33,14 +25,9 @@ class Push(NamedTuple):
     **Fields:** `mean`, `deviation` (N, 3) N m, body frame; wide where steps are short, for white
     noise has no value at a time.
 
-    >>> import rigidjax as rj
-    >>> from rigidjax import estimate
-    >>> record = rj.identify.Recording([0.0, 0.1], (rj.identify.Gyro(0.1), [[1.0, 0, 0]] * 2))
-    >>> body = rj.Inertia.from_principal(1.0, 2.0, 2.5)
-    >>> model = estimate.Model(body, rj.torques.RandomTorque(1.0))
-    >>> found = estimate.smooth(model, record, estimate.start(model, record, rate=1.0))
-    >>> found.pushes[0].mean.shape, bool((found.pushes[0].deviation[1:] > 0).all())
-    ((3, 3), True)
+    >>> shown = Push(jnp.array([[0.0, 0.0, 0.3]]), 0.1 * jnp.ones((1, 3)))
+    >>> (shown.mean / shown.deviation).round(1).tolist()  # about the third axis it turns the body
+    [[0.0, 0.0, 3.0]]
     """
 
     mean: Float[Array, "stops 3"]
@@ -58,11 +45,10 @@ class Smoothed(eqx.Module):
     `iterations`; `status`, `lost_at` as of `Filtered`.
 
     >>> import rigidjax as rj
-    >>> from rigidjax import estimate
     >>> record = rj.identify.Recording([0.0, 0.1], (rj.identify.Gyro(0.1), [[1.0, 0, 0]] * 2))
     >>> body = rj.Inertia.from_principal(1.0, 2.0, 2.5)
-    >>> model = estimate.Model(body, rj.torques.RandomTorque(1.0))
-    >>> found = estimate.smooth(model, record, estimate.start(model, record, rate=1.0))
+    >>> model = rj.estimate.Model(body, rj.torques.RandomTorque(1.0))
+    >>> found = rj.estimate.smooth(model, record, rj.estimate.start(model, record, rate=1.0))
     >>> found.words, found.rows.tolist()  # of three stops the first and last are readings
     ('followed', [0, 2])
     """
@@ -118,19 +104,17 @@ def smooth(
     **Raises:** as `filter`; where `throw`, also for a motion that still moves by a deviation.
 
     >>> import rigidjax as rj
-    >>> from rigidjax import estimate
     >>> record = rj.identify.Recording([0.0, 0.1], (rj.identify.Gyro(0.1), [[1.0, 0, 0]] * 2))
     >>> body = rj.Inertia.from_principal(1.0, 2.0, 2.5)
-    >>> model = estimate.Model(body, rj.torques.RandomTorque(1.0))
-    >>> found = estimate.smooth(model, record, estimate.start(model, record, rate=1.0))
+    >>> model = rj.estimate.Model(body, rj.torques.RandomTorque(1.0))
+    >>> found = rj.estimate.smooth(model, record, rj.estimate.start(model, record, rate=1.0))
     >>> found.states.omega.shape, found.pushes[0].mean.shape  # one stop between
     ((2, 3), (3, 3))
     """
     _checks.whole(iterations, "iterations", 1)
     _checks.positive(tolerance, "tolerance")
-    sensors = looked_at(model, recording, first)
-    grid = grid_of(model, recording, first, substeps)
-    out = _smooth(bare(model), sensors, recording, first, grid, iterations, tolerance)
+    task = looked_at(model, recording, first, substeps)
+    out = _smooth(task, iterations, tolerance)
     if not throw:
         return out
     words = (
@@ -159,26 +143,17 @@ class _Solved(NamedTuple):
 
 
 @eqx.filter_jit
-def _smooth(
-    model: Model,
-    sensors: Sensors,
-    recording: Recording,
-    first: Belief,
-    grid: Grid | None,
-    iterations: int,
-    tolerance: float,
-) -> Smoothed:
-    stops, (_, (beliefs, filtered)) = scan_filter(
-        model, sensors, recording, first, grid, lambda belief, read: (belief, read)
-    )
-    here = jnp.arange(stops.t.shape[0]) if grid is None else grid.rows
-    seen: Any = jax.tree.map(lambda leaf: leaf[here], (beliefs, filtered))
-    status, lost_at = status_of(seen[0], seen[1], first.t)
-    path = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first.x, beliefs.x)
-    dynamics = Dynamics(model, first.x, sensors.densities)
+def _smooth(task: Task, iterations: int, tolerance: float) -> Smoothed:
+    first = task.first
+    stops, (_, kept) = scan_filter(task, lambda belief, read: (belief, read))
+    here = jnp.arange(stops.t.shape[0]) if task.grid is None else task.grid.rows
+    beliefs, reads = jax.tree.map(lambda leaf: leaf[here], kept)
+    status, lost_at = status_of(beliefs, reads, first.t)
+    path = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first.x, kept[0].x)
+    dynamics = Dynamics(task.model, first.x, task.sensors.densities)
 
     def once(path: Extended, kicks: Array) -> tuple[Extended, Any]:
-        return _iterate(model, dynamics, sensors, first, stops, path, kicks)
+        return _iterate(dynamics, task.sensors, first, stops, path, kicks)
 
     def more(state: tuple) -> Array:
         return (state[2] < iterations) & (state[1].change > tolerance)
@@ -199,7 +174,7 @@ def _smooth(
     pushes = []
     for index, root in enumerate(dynamics.white):
         mine = slice(6 * index, 6 * index + 3)
-        size = jnp.where(h > 0, 1 / jnp.sqrt(jnp.where(h > 0, h, 1)), 0)[:, None] * root[None]
+        size = roots.inverse_root(h)[:, None] * root[None]
         variance = jnp.diagonal(out.kick_covariance, axis1=1, axis2=2)[:, mine]
         pushes.append(Push(size * out.kicks[:, mine], size * jnp.sqrt(variance)))
     return Smoothed(
@@ -216,7 +191,6 @@ def _smooth(
 
 
 def _iterate(
-    model: Model,
     dynamics: Dynamics,
     sensors: Sensors,
     first: Belief,
@@ -230,7 +204,8 @@ def _iterate(
     """
     before = jnp.concatenate([first.t[None], stops.t[:-1]])
     dtype = first.root.dtype
-    x0, off = _at(path, 0), minus(_at(path, 0), first.x)
+    x0 = jax.tree.map(lambda leaf: leaf[0], path)
+    off = minus(x0, first.x)
     start = (-off, reset(x0, off, first.root))
 
     def forward(carry: tuple[Array, Array], now: Any) -> tuple[Any, _Kept]:
@@ -243,8 +218,7 @@ def _iterate(
         push = push - jnp.sum(noise[:, : dynamics.kicks] * kick[None], 1)
         kept = linear.joint(grown, noise, root)
         predicted = jnp.sum(grown * mean[None], 1) + push
-        found = rows(model, dynamics, sensors, stop.t.astype(dtype), y, stop.values, stop.masks)
-        later, root, read = absorb_all(found, predicted, kept.predicted)
+        later, root, read = absorb_all(dynamics, sensors, stop, y, predicted, kept.predicted)
         return (later, root), _Kept(kept, predicted, mean, noise, read)
 
     earlier = jax.tree.map(lambda leaf: leaf[:-1], path)
@@ -260,13 +234,7 @@ def _iterate(
     _, ((means, spread), (kicks, kick_covariance)) = lax.scan(backward, end, kept, reverse=True)
     means = jnp.concatenate([means, end[0][None]])
     spread = jnp.concatenate([spread, end[1][None]])
-    deviation = jnp.sqrt(jnp.sum(spread**2, -1))
-    sure = deviation > 0
-    change = jnp.max(jnp.where(sure, jnp.abs(means) / jnp.where(sure, deviation, 1), 0))
+    change = jnp.max(jnp.abs(means) * roots.inverse_root(jnp.sum(spread**2, -1)))
     total = jnp.sum(jnp.stack([read.log_density for read in kept.read]))
     moved = jax.vmap(plus)(path, means)
     return moved, _Solved(spread, kept.read, total, kicks, kick_covariance, change)
-
-
-def _at(tree: Any, index: int) -> Any:
-    return jax.tree.map(lambda leaf: leaf[index], tree)

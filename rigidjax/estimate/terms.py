@@ -1,6 +1,7 @@
 """What each recording adds to a posterior density, and its derivatives recording by recording."""
 
 import math
+from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
@@ -12,11 +13,12 @@ from jaxtyping import Array, Float, Int
 
 from rigidjax._types import HasSpin, Scalar
 from rigidjax.estimate.belief import Belief
-from rigidjax.estimate.filter import reads_of
+from rigidjax.estimate.filter import Task, scan_filter
+from rigidjax.estimate.grid import grid_of
 from rigidjax.estimate.scene import Extended, Model
 from rigidjax.estimate.sensing import sensors_of
 from rigidjax.identify import padding
-from rigidjax.identify.jacobian import errors_of_one, filled, over_records
+from rigidjax.identify.jacobian import errors_of_one, filled, over_records, with_jacobian
 from rigidjax.identify.parameters import local
 from rigidjax.identify.problem import Problem
 from rigidjax.identify.recording import Recording
@@ -64,7 +66,8 @@ def terms(density: "LogDensity", x: Float[Array, " n"]) -> Terms:
 
     @jax.custom_jvp
     def of(rows: Array) -> Terms:
-        return _each(density, lambda row, *rest: _of_one(density, row, *rest), rows)
+        of_one = partial(_of_one, density)
+        return over_records(of_one, density.problem, (rows, density.noises))
 
     @of.defjvp
     def _(rows: tuple, step: tuple) -> tuple[Terms, Terms]:
@@ -93,11 +96,7 @@ def curvature(density: "LogDensity", x: Float[Array, " n"]) -> Curvature:
     )
     slope = jnp.einsum("rin,ri->n", placed, each)
 
-    def priors(x: Array) -> tuple[Array, Array]:
-        rest = prior_residuals(density, x)
-        return rest, rest
-
-    extra, rest = jax.jacfwd(priors, has_aux=True)(x)
+    extra, rest = with_jacobian(lambda x: prior_residuals(density, x), x)
     cost = 0.5 * jnp.sum(rest**2) - found.log_density
     return Curvature(cost, slope + rest @ extra, gram + extra.T @ extra)
 
@@ -117,8 +116,19 @@ def groups_of(problem: Problem) -> Int[Array, " records"]:
     return jnp.zeros(problem.count, jnp.int32) if groups is None else groups
 
 
-def _own(density: "LogDensity", x: Array) -> Any:
-    """The numbers of x that each recording depends on, with a leading axis."""
+def grown_noises(noises: tuple, steps: tuple) -> tuple[Float[Array, "*records k"], ...]:
+    """The noises of the sensors by the logarithms of their factors, `None` for none."""
+    return tuple(
+        noise if step is None else noise * jnp.exp(step)[..., None]
+        for noise, step in zip(noises, steps, strict=True)
+    )
+
+
+def own_numbers(density: "LogDensity", x: Array) -> Any:
+    """The numbers of x that each recording depends on, with a leading axis.
+
+    Those of the problem, the logarithms of the noises' factors, and those of the process.
+    """
     problem = density.problem
     parameters, factors, logs = ravel_pytree(density.like)[1](x)
     groups = groups_of(problem)
@@ -129,48 +139,41 @@ def _own(density: "LogDensity", x: Array) -> Any:
 
 def _rows(density: "LogDensity", x: Array) -> Float[Array, "records m"]:
     """The same as a row for each recording: a linear function of x."""
-    return jax.vmap(lambda one: ravel_pytree(one)[0])(_own(density, x))
-
-
-def _each(density: "LogDensity", function: Any, rows: Array) -> Any:
-    """`function(row, noises, record, reference, which)` of each recording."""
-
-    def of(mine: Any, *rest: Any) -> Any:
-        return function(*mine, *rest)
-
-    return over_records(of, density.problem, (rows, density.noises))
+    return jax.vmap(lambda one: ravel_pytree(one)[0])(own_numbers(density, x))
 
 
 def _with_blocks(density: "LogDensity", rows: Array) -> tuple[Terms, Terms]:
     """The terms, and their derivatives (R, N, m) by the row of their recording."""
 
-    def value_and_slope(row: Array, *rest: Any) -> Any:
-        def twice(row: Array) -> tuple[Terms, Terms]:
-            out = _of_one(density, row, *rest)
-            return out, out
-
+    def value_and_slope(mine: tuple[Array, Any], *rest: Any) -> Any:
+        row, noises = mine
         # A dozen numbers and one long loop: forward mode is cheaper to compile and to run.
-        blocks, out = jax.jacfwd(twice, has_aux=True)(row)
+        blocks, out = with_jacobian(lambda row: _of_one(density, (row, noises), *rest), row)
         return out, blocks
 
-    return _each(density, value_and_slope, rows)
+    return over_records(value_and_slope, density.problem, (rows, density.noises))
 
 
 def _of_one(
-    density: "LogDensity", row: Array, noises: Any, record: Recording, ref: Any, which: Any
+    density: "LogDensity", own: tuple[Array, Any], record: Recording, ref: Any, which: Any
 ) -> Terms:
-    """The terms of one recording, the unknown torque integrated out by the filter."""
+    """The terms of one recording, the unknown torque integrated out by the filter.
+
+    **Arguments:** `own` its row of `_rows`, and the noises (k,) of its sensors at the fit.
+    """
     problem = density.problem
-    restore = ravel_pytree(padding.one(_own(density, density.x0), 0))[1]
-    mine, steps, logs = restore(row)
-    noises = tuple(
-        noise if step is None else noise * jnp.exp(step)
-        for noise, step in zip(noises, steps, strict=True)
-    )
+    restore = ravel_pytree(padding.one(own_numbers(density, density.x0), 0))[1]
+    mine, steps, logs = restore(own[0])
+    noises = grown_noises(own[1], steps)
     if density.process is None:
         return _of_motion(problem, mine, noises, record, ref, which)
     # Values first: a noise in the place of `None` moves the leaves that the slots count.
-    record = _with_noises(filled(problem, mine, record), noises)
+    record = eqx.tree_at(
+        lambda r: [reading.sensor.noise for reading in r.readings],
+        filled(problem, mine, record),
+        list(noises),
+        is_leaf=lambda node: node is None,
+    )
     body = what_turns(matter(problem.body, mine.body, which), problem.rung)
     state: HasSpin = ref.moved(mine)
     process = density.grown(logs)
@@ -182,7 +185,9 @@ def _of_one(
     known = jnp.zeros(dimension(state), state.omega.dtype)
     spread = jnp.concatenate([known, *(law.deviation for law in model.coloured)])
     first = Belief(record.t[0], x, jnp.diag(spread))
-    reads = reads_of(model, sensors_of(sensors, model), record, first, density.substeps)
+    grid = grid_of(model, record, first, density.substeps)
+    task = Task(model, sensors_of(sensors, model), record, first, grid)
+    reads = scan_filter(task, lambda belief, read: read)[1][1]
     error = [jnp.where(r.seen, r.innovation * lax.rsqrt(r.variance), 0) for r in reads]
     log_variance = [jnp.where(r.seen, jnp.log(2 * math.pi * r.variance), 0) for r in reads]
     return _flat(error, log_variance)
@@ -207,14 +212,4 @@ def _of_motion(
 def _flat(error: list[Array], log_variance: list[Array]) -> Terms:
     return Terms(
         *(jnp.concatenate([a.reshape(-1) for a in part]) for part in (error, log_variance))
-    )
-
-
-def _with_noises(record: Recording, noises: tuple[Array, ...]) -> Recording:
-    """The recording whose sensors have these noises (k,)."""
-    return eqx.tree_at(
-        lambda r: [reading.sensor.noise for reading in r.readings],
-        record,
-        list(noises),
-        is_leaf=lambda node: node is None,
     )

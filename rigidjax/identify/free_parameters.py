@@ -154,16 +154,11 @@ def find(free: Sequence[Free], recording: Recording, of: Sequence[str] = ("",)) 
 
     **Raises** `ValueError` where it picks nothing, something that is no number, or the same twice.
     """
-    leaves, structure = jax.tree.flatten(recording)
-    numbered = jax.tree.unflatten(structure, list(range(len(leaves))))
     slots: list[Slot] = []
     for item in free:
         _checks.instance(item, Free, "free", wanted="Free(where, name)")
         here = f"Free {item.name!r}"
-        index = _leaf(item.where, numbered, here)
-        value = leaves[index]
-        if not eqx.is_inexact_array_like(value):
-            raise ValueError(f"{here}: wanted numbers, got {type(value).__name__}")
+        index, value = leaf_at(item.where, recording, here, "it")
         if any(slot.leaf == index for slot in slots):
             raise ValueError(f"{here}: another Free moves the same numbers")
         if any(slot.name == item.name for slot in slots):
@@ -185,18 +180,28 @@ def find(free: Sequence[Free], recording: Recording, of: Sequence[str] = ("",)) 
     return tuple(slots)
 
 
-def _leaf(where: Callable[[Any], Any], numbered: Any, here: str) -> int:
-    """The index of the leaf that `where` picks, of a tree of indices."""
+def leaf_at(where: Callable[[Any], Any], tree: Any, name: str, what: str) -> tuple[int, Any]:
+    """Which leaf of a tree `where` picks, and the leaf: an array of numbers.
+
+    **Arguments:** `name` for messages; `what` is to have a starting value where `None` is.
+    **Raises** `ValueError` where it picks nothing, several, or something that is no number.
+    """
+    leaves, structure = jax.tree.flatten(tree)
     try:
-        index = where(numbered)
+        index = where(jax.tree.unflatten(structure, list(range(len(leaves)))))
     except (AttributeError, IndexError, TypeError) as error:
-        raise ValueError(f"{here}: nothing is there ({error})") from None
+        raise ValueError(f"{name}: nothing is there ({error})") from None
     if index is None:
-        wanted = "give it a starting value, such as Gyro(bias=[0.0, 0.0, 0.0])"
-        raise ValueError(f"{here}: None is there; {wanted}")
+        raise ValueError(
+            f"{name}: None is there; give {what} a starting value, such as "
+            "Gyro(bias=[0.0, 0.0, 0.0])"
+        )
     if not isinstance(index, int):
-        raise ValueError(f"{here}: wanted one array, got {type(index).__name__}; one Free each")
-    return index
+        one = name.split()[0]
+        raise ValueError(f"{name}: wanted one array, got {type(index).__name__}; one {one} each")
+    if not eqx.is_inexact_array_like(leaves[index]):
+        raise ValueError(f"{name}: wanted numbers, got {type(leaves[index]).__name__}")
+    return index, leaves[index]
 
 
 _UNITS = {"offset": "s", "delay": "s", "mounting": "rad", "tilt": "rad", "place": "m"}

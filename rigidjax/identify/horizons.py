@@ -28,19 +28,15 @@ class Horizons(NamedTuple):
     rms: dict[str, Any]
 
 
-def by_horizon(windows: Any, found: Float[Array, "windows steps n"]) -> Horizons:
+def by_horizon(starts: Any, found: Float[Array, "windows steps n"]) -> Horizons:
     """The means over windows of errors as changes from what was measured."""
-    by_kind = parts(jax.tree.map(lambda leaf: leaf[0], windows.starts), found)
+    by_kind = parts(jax.tree.map(lambda leaf: leaf[0], starts), found)
     absolute = {k: np.asarray(jnp.mean(jnp.abs(v), (0, 2))) for k, v in by_kind.items()}
     rms = {k: np.asarray(jnp.sqrt(jnp.mean(jnp.sum(v * v, 2), 0))) for k, v in by_kind.items()}
     return Horizons(np.arange(1, found.shape[1] + 1), absolute, rms)
 
 
-def held_errors(windows: Any) -> Float[Array, "windows steps n"]:
-    """The errors where the state at the start is held."""
-    return _held(windows.starts, windows.wanted)
-
-
 @jax.jit
-def _held(starts: Any, wanted: Any) -> Array:
+def held_errors(starts: Any, wanted: Any) -> Float[Array, "windows steps n"]:
+    """The errors where the state at the start is held."""
     return jax.vmap(jax.vmap(minus_small, (None, 0)))(starts, wanted)

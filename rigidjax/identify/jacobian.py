@@ -1,6 +1,6 @@
 """The errors of all readings, and their derivatives recording by recording."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from rigidjax.identify import padding
 from rigidjax.identify.free_parameters import put
@@ -177,14 +177,25 @@ def with_blocks(parameters: Parameters, problem: "Problem") -> tuple[Any, Any]:
 
     def of_one(one: Local, record: Recording, ref: ReferenceStates, which: Array | None) -> Any:
         flat, restore = ravel_pytree(one)
-
-        def value(vector: Array) -> Any:
-            out = errors_of_one(problem, restore(vector), record, ref, which)
-            return out, out
-
-        blocks, out = jax.jacfwd(value, has_aux=True)(flat)
+        blocks, out = with_jacobian(
+            lambda vector: errors_of_one(problem, restore(vector), record, ref, which), flat
+        )
         if twice.size > flat.size:
             blocks = jax.tree.map(lambda block: block[..., twice], blocks)
         return out, blocks
 
     return over_records(of_one, problem, mine)
+
+
+def with_jacobian(function: Callable[[Array], Any], at: Float[Array, " n"]) -> tuple[Any, Any]:
+    """The derivative (…, n) of a function, in forward mode, and its value (…).
+
+    >>> with_jacobian(lambda x: x * x, jnp.array([1.0, 3.0]))[0].tolist()
+    [[2.0, 0.0], [0.0, 6.0]]
+    """
+
+    def twice(at: Array) -> tuple[Any, Any]:
+        found = function(at)
+        return found, found
+
+    return jax.jacfwd(twice, has_aux=True)(at)

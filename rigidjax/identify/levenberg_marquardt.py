@@ -11,7 +11,7 @@ from jax import lax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
-from rigidjax.identify.jacobian import along, normal_matrix, with_blocks
+from rigidjax.identify.jacobian import along, normal_matrix, with_blocks, with_jacobian
 from rigidjax.identify.parameters import Parameters, places
 from rigidjax.identify.problem import Problem
 from rigidjax.identify.propagation import FirstPart, FixedSteps
@@ -293,10 +293,9 @@ def beside_rows(
     def _(primals: Any, tangents: Any) -> Any:
         return ends, along(problem, end_slopes, restore(tangents[0]))
 
-    def value(vector: Array) -> Any:
+    def value(vector: Array) -> Array:
         parts = [leaf.reshape(-1) for leaf in beside(restore(vector), problem, last(vector))]
-        joined = jnp.concatenate(parts) if parts else jnp.zeros(0, vector.dtype)
-        return joined, joined
+        return jnp.concatenate(parts) if parts else jnp.zeros(0, vector.dtype)
 
-    rows, e = jax.jacfwd(value, has_aux=True)(point)
+    rows, e = with_jacobian(value, point)
     return e, rows

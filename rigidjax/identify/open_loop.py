@@ -1,7 +1,6 @@
 """Open-loop runs of a model from the starts of windows, and their errors."""
 
-from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -9,7 +8,6 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from rigidjax.identify.horizons import Horizons, by_horizon
 from rigidjax.identify.windows import Windows
 from rigidjax.motion.coupled import Coupled, motion_of, started
 from rigidjax.motion.manifold import minus_small
@@ -19,18 +17,6 @@ from rigidjax.solve.components import split
 from rigidjax.solve.equal_steps import in_a_loop
 from rigidjax.solve.fixed_loop import first_row, first_rows, step
 from rigidjax.solve.steppers import cheapest, stepper_of
-
-Value = TypeVar("Value")
-
-
-def errors_by_horizon(
-    windows: Windows, scene: Callable[[Value], tuple[Any, Any]], value: Value
-) -> Horizons:
-    """The open-loop errors of a model with these numbers, step by step.
-
-    **Arguments:** as for `fit_windows`, with the free numbers `value`.
-    """
-    return by_horizon(windows, _all_errors(scene, windows.step, value, windows))
 
 
 def open_loop_errors(
@@ -71,10 +57,11 @@ def open_loop_errors(
 
 
 @eqx.filter_jit
-def _all_errors(scene: Any, h: float, value: Any, windows: Windows) -> Array:
+def all_errors(windows: Windows, scene: Any, value: Any) -> Float[Array, "windows steps n"]:
+    """The errors of a model with these numbers."""
+
     def one(window: Any) -> Array:
-        start, wanted, inputs = window
-        return open_loop_errors(scene, h, value, start, wanted, inputs)
+        return open_loop_errors(scene, windows.step, value, *window)
 
     parts = (windows.starts, windows.wanted, windows.inputs)
     return lax.map(one, parts, batch_size=min(128, windows.count))

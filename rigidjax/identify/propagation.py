@@ -64,28 +64,23 @@ class FixedSteps(AbstractIntegrator):
         _checks.instance(self.solver, AbstractExplicit, "solver", wanted="one of rigidjax.solvers")
 
     def states(self, body: Any, state0: Any, ts: Float[Array, " times"], torque: Torque) -> Any:
-        return _in_steps(self, body, state0, ts, torque, None)
+        return FirstPart(self, None).states(body, state0, ts, torque)
 
 
 class FirstPart(AbstractIntegrator):
     """`FixedSteps` of which no more are taken than a part of the record needs.
 
-    **Fields:** `steps`; `last` the number of the last time that is needed.
+    **Fields:** `steps`; `last` the number of the last time that is needed, `None` for all.
     """
 
     steps: FixedSteps
-    last: Int[Array, ""]
+    last: Int[Array, ""] | None
 
     def states(self, body: Any, state0: Any, ts: Float[Array, " times"], torque: Torque) -> Any:
-        return _in_steps(self.steps, body, state0, ts, torque, self.last)
-
-
-def _in_steps(
-    steps: FixedSteps, body: Any, state0: Any, ts: Array, torque: Torque, last: Array | None
-) -> Any:
-    y0 = started(body, state0, torque, ts[0])
-    field = equations_of_motion(body, y0, torque)
-    return fixed(in_a_loop(steps.solver), field, ts, y0, steps.substeps, last)
+        y0 = started(body, state0, torque, ts[0])
+        field = equations_of_motion(body, y0, torque)
+        solver = in_a_loop(self.steps.solver)
+        return fixed(solver, field, ts, y0, self.steps.substeps, self.last)
 
 
 class Adaptive(AbstractIntegrator):

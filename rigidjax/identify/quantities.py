@@ -192,9 +192,7 @@ def quantile(fit: "Fit", level: float) -> float:
 
     Autocorrelated errors count as the fewer they are.
     """
-    level = _checks.positive(level, "level", "a level between 0 and 1")
-    if not level < 1:
-        raise ValueError(f"interval: wanted a level between 0 and 1, got {level}")
+    level = _checks.fraction(level, "interval", "a level between 0 and 1")
     from scipy.special import ndtri, stdtrit
 
     tail = 0.5 * (1 + level)

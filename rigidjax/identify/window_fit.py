@@ -12,13 +12,14 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from rigidjax import _checks
-from rigidjax.identify.horizons import Horizons, held_errors
+from rigidjax.identify.horizons import Horizons, by_horizon, held_errors
+from rigidjax.identify.jacobian import with_jacobian
 from rigidjax.identify.levenberg_marquardt import BOLD, Search, Settings, search
-from rigidjax.identify.open_loop import errors_by_horizon, open_loop_errors
+from rigidjax.identify.open_loop import all_errors, open_loop_errors
 from rigidjax.identify.quantities import carried
 from rigidjax.identify.real_bodies import unreal
 from rigidjax.identify.uncertainty import inverted
-from rigidjax.identify.window_starts import eliminated, precisions, with_jacobian
+from rigidjax.identify.window_starts import eliminated, precisions, require_kinds
 from rigidjax.identify.windows import Windows
 from rigidjax.motion.manifold import names, parts, plus
 from rigidjax.motion.torques.inputs import delays_of, require_inputs
@@ -67,7 +68,7 @@ class WindowFit(eqx.Module, Generic[Value]):
 
     def predict(self, windows: Windows) -> Horizons:
         """The errors at every horizon, of these windows or of others."""
-        return errors_by_horizon(windows, self.scene, self.value)
+        return by_horizon(windows.starts, all_errors(windows, self.scene, self.value))
 
 
 def fit_windows(
@@ -114,33 +115,22 @@ def fit_windows(
     max_steps = _checks.whole(max_steps, "max_steps", 1)
     _require_windows(windows)
     _checks.function(scene, "scene", "of the free numbers to (body, torque)")
-    leaves, tree = jax.tree.flatten(guess)
-    kind = windows.starts.omega.dtype
-    leaves = [_checks.finite(_checks.numbers(leaf, "guess"), "guess") for leaf in leaves]
-    leaves = [jnp.asarray(leaf).astype(kind) for leaf in leaves]
-    x, back = ravel_pytree(jax.tree.unflatten(tree, leaves))
-    if not x.size:
-        raise ValueError("guess: wanted a tree of floating numbers, at least one")
+    x, back = _numbers(guess, windows.starts.omega.dtype)
     guess = back(x)
-    made: Any = scene(guess)
-    if not isinstance(made, tuple) or len(made) != 2:
-        raise TypeError(f"scene: wanted (body, torque), got {type(made).__name__}")
-    body, law = made
     start = jax.tree.map(lambda a: a[0], windows.starts)
-    require_fit(body, start, law)
-    require_inputs(law, windows.inputs)
-    _require_delays(windows, law)
-    scales = _scales(windows, noise)
+    _require_scene(windows, start, scene(guess))
+    whole = windows.length
+    scales = _scales(windows, whole, noise)
     firm = precisions(starts, names(windows.starts), noise)
     padded, count = _padded(windows), np.asarray(windows.count, np.int32)
 
     def searched(value: Any, settings: Settings, steps: int) -> Search:
-        units = scales if steps == windows.length else _scales(_first(windows, steps), noise)
+        units = scales if steps == whole else _scales(windows, steps, noise)
         return _searched(
             scene, windows.step, value, padded, count, units, firm, settings, np.int32(steps)
         )
 
-    whole, evaluated = windows.length, Settings(_SETTLED, BOLD, 0)
+    evaluated = Settings(_SETTLED, BOLD, 0)
     last = Settings(_SETTLED, BOLD, max_steps, level=_LEVEL)
     begin = _grown(searched, guess, back, whole)
     end = searched(begin, last, whole)
@@ -160,12 +150,8 @@ def fit_windows(
     if windows.count <= x.size:
         deviation = np.full(x.size, np.nan)
         message.append(f"deviations need more windows than free numbers, {x.size}")
-    wrong = unreal(scene(value)[0])
-    message += [] if wrong is None else [wrong]
-    try:
-        _require_delays(windows, scene(value)[1])
-    except ValueError as refused:
-        message.append(str(refused))
+    body, law = scene(value)
+    message += [wrong for wrong in (unreal(body), _too_late(windows, law)) if wrong]
     kinds = {k: float(v[0]) for k, v in parts(start, scales).items()}
     return WindowFit(
         value,
@@ -190,11 +176,6 @@ def _grown(searched: Any, guess: Any, back: Any, length: int) -> Any:
     return value
 
 
-def _first(windows: Windows, steps: int) -> Windows:
-    wanted = jax.tree.map(lambda a: a[:, :steps], windows.wanted)
-    return eqx.tree_at(lambda w: w.wanted, windows, wanted)
-
-
 def _require_windows(windows: Any) -> None:
     _checks.instance(windows, Windows, "windows", wanted="what identify.windows returns")
     for name in ("starts", "wanted"):
@@ -206,33 +187,50 @@ def _require_windows(windows: Any) -> None:
             _checks.finite(leaf, f"windows: {name}")
 
 
-def _require_delays(windows: Windows, law: Any) -> None:
-    """Raise `ValueError` for a delay beyond the inputs that the windows know."""
+def _numbers(guess: Any, kind: Any) -> tuple[Float[Array, " n"], Callable[[Array], Any]]:
+    """The free numbers in one vector, and a function that puts them back."""
+    leaves, tree = jax.tree.flatten(guess)
+    leaves = [_checks.finite(_checks.numbers(leaf, "guess"), "guess") for leaf in leaves]
+    x, back = ravel_pytree(jax.tree.unflatten(tree, [leaf.astype(kind) for leaf in leaves]))
+    if not x.size:
+        raise ValueError("guess: wanted a tree of floating numbers, at least one")
+    return x, back
+
+
+def _require_scene(windows: Windows, start: Any, made: Any) -> None:
+    if not isinstance(made, tuple) or len(made) != 2:
+        raise TypeError(f"scene: wanted (body, torque), got {type(made).__name__}")
+    body, law = made
+    require_fit(body, start, law)
+    require_inputs(law, windows.inputs)
+    if wrong := _too_late(windows, law):
+        raise ValueError(wrong)
+
+
+def _too_late(windows: Windows, law: Any) -> str | None:
+    """What is wrong where a delay goes beyond the inputs that the windows know."""
     known, length = windows.before * windows.step, windows.length * windows.step
     for name, delay in delays_of(law):
+        late = f"inputs[{name!r}]: a delay of {float(delay):.6g} s"
         if -float(delay) > length:
-            raise ValueError(
-                f"inputs[{name!r}]: a delay of {float(delay):.6g} s reaches beyond the end of "
-                f"windows of {length:.6g} s; is it in seconds?"
-            )
+            return f"{late} reaches beyond the end of windows of {length:.6g} s; is it in seconds?"
         if float(delay) > known:
-            raise ValueError(
-                f"inputs[{name!r}]: a delay of {float(delay):.6g} s, and inputs that are known "
-                f"{known:.6g} s before a window: cut them with windows(…, before=k)"
+            return (
+                f"{late}, and inputs that are known {known:.6g} s before a window: cut them with "
+                "windows(…, before=k)"
             )
+    return None
 
 
-def _scales(windows: Windows, noise: Mapping[str, float] | None) -> Float[Array, " m"]:
-    """Of each number of an error, what it is measured in."""
+def _scales(windows: Windows, steps: int, noise: Mapping[str, float] | None) -> Float[Array, " m"]:
+    """Of each number of an error, what it is measured in: of windows of so many steps."""
     kinds = names(windows.starts)
     if noise is not None:
-        if not isinstance(noise, Mapping):
-            raise TypeError(f"noise: wanted numbers by kind, got {type(noise).__name__}")
-        if set(noise) != set(kinds):
-            raise ValueError(f"noise: wanted a number for each of {kinds}, got {tuple(noise)}")
+        require_kinds(noise, kinds, "noise")
         each = np.array([_checks.positive(noise[k], f"noise[{k!r}]") for k in kinds])
     else:
-        squares = np.mean(np.asarray(held_errors(windows)) ** 2, (0, 1))
+        wanted = jax.tree.map(lambda a: a[:, :steps], windows.wanted)
+        squares = np.mean(np.asarray(held_errors(windows.starts, wanted)) ** 2, (0, 1))
         each = np.sqrt(np.mean(squares.reshape(len(kinds), 3), 1))
         each[each == 0] = 1.0
     return jnp.asarray(np.repeat(each, 3))

@@ -7,13 +7,13 @@ projection: Golub and Pereyra 2003, doi:10.1088/0266-5611/19/2/201).
 from collections.abc import Callable, Mapping
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
 from rigidjax import _checks
+from rigidjax.identify.jacobian import with_jacobian
 
 # Steps of Gauss and Newton's for each start; residuals of a short run are nearly linear in it.
 _STEPS = 3
@@ -29,10 +29,7 @@ def precisions(
     """
     if starts is None:
         return None
-    if not isinstance(starts, Mapping):
-        raise TypeError(f"starts: wanted deviations by kind, got {type(starts).__name__}")
-    if set(starts) != set(kinds):
-        raise ValueError(f"starts: wanted a number for each of {kinds}, got {tuple(starts)}")
+    require_kinds(starts, kinds, "starts")
     if noise is None:
         raise ValueError(
             "starts: how far they may be off says something only beside the noise of the readings: "
@@ -48,6 +45,13 @@ def precisions(
             )
         found += 3 * [(np.float64(noise[kind]) / deviation) ** 2]
     return jnp.asarray(np.array(found))
+
+
+def require_kinds(given: Any, kinds: tuple[str, ...], name: str) -> None:
+    """Raise `TypeError`, `ValueError` for what is not a mapping with these keys."""
+    _checks.instance(given, Mapping, name, wanted="numbers by kind")
+    if set(given) != set(kinds):
+        raise ValueError(f"{name}: wanted a number for each of {kinds}, got {tuple(given)}")
 
 
 def eliminated(
@@ -77,19 +81,3 @@ def eliminated(
     taken = gram[:number, number:] @ jnp.linalg.solve(beside, sides)
     cost = 0.5 * (found @ found + jnp.sum(firm * step * step))
     return cost, gram[:number, :number] - taken[:, :number], slope[:number] - taken[:, number]
-
-
-def with_jacobian(
-    function: Callable[[Array], Array], at: Float[Array, " n"]
-) -> tuple[Float[Array, "r n"], Float[Array, " r"]]:
-    """The derivative (r, n) of a function, and its value (r,).
-
-    >>> with_jacobian(lambda x: x * x, jnp.array([1.0, 3.0]))[0].tolist()
-    [[2.0, 0.0], [0.0, 6.0]]
-    """
-
-    def twice(at: Array) -> tuple[Array, Array]:
-        found = function(at)
-        return found, found
-
-    return jax.jacfwd(twice, has_aux=True)(at)

@@ -16,6 +16,7 @@ from jaxtyping import Array, ArrayLike, Float
 from rigidjax import _checks
 from rigidjax.identify.horizons import Horizons, by_horizon, held_errors
 from rigidjax.motion import Attitude, Rigid, Spin
+from rigidjax.motion.manifold import names
 
 
 class Windows(eqx.Module):
@@ -48,7 +49,7 @@ class Windows(eqx.Module):
 
     def held(self) -> Horizons:
         """The errors of a prediction that holds the state at the start: what a model must beat."""
-        return by_horizon(self, held_errors(self))
+        return by_horizon(self.starts, held_errors(self.starts, self.wanted))
 
     @staticmethod
     def joined(*parts: "Windows") -> "Windows":
@@ -62,15 +63,13 @@ class Windows(eqx.Module):
             (p.step, p.length, tuple(sorted(p.inputs)), type(p.starts), p.before) for p in parts
         }
         if len(kinds) > 1:
+            got = [f"{k[0]:g} s, {k[1]}, {k[3].__name__}, {k[2]}, before={k[4]}" for k in kinds]
             raise ValueError(
                 "Windows.joined: wanted one step, length, kind of state and the same inputs, got "
-                + "; ".join(
-                    f"{k[0]:g} s, {k[1]}, {k[3].__name__}, {k[2]}, before={k[4]}" for k in kinds
-                )
+                + "; ".join(got)
             )
-        first, *rest = parts
-        if not rest:
-            return first
+        if len(parts) == 1:
+            return parts[0]
         return jax.tree.map(lambda *a: jnp.concatenate(a), *parts)
 
 
@@ -102,43 +101,15 @@ def windows(
     times = _checks.on_host(t, "t")
     length, stride = _checks.whole(length, "length", 1), _checks.whole(stride, "stride", 1)
     before = _checks.whole(before, "before", 0)
-    if not isinstance(states, Spin | Attitude | Rigid):
-        raise TypeError(f"states: wanted Spin, Attitude or Rigid, got {type(states).__name__}")
+    _checks.instance(states, (Spin, Attitude, Rigid), "states")
     if times.ndim != 1 or times.size < length + 1:
         raise ValueError(
             f"t: wanted at least length + 1 = {length + 1} times (T,), got shape {times.shape}"
         )
     if not isinstance(inputs, Mapping | None):
         raise TypeError(f"inputs: wanted arrays by name, got {type(inputs).__name__}")
-    rows = {str(k[-1]).lstrip("."): v for k, v in jax.tree.leaves_with_path(states)}
-    rows |= {f"inputs[{k!r}]": v for k, v in (inputs or {}).items()}
-    for name, value in rows.items():
-        if np.shape(value)[:1] != times.shape:
-            raise ValueError(
-                f"{name}: wanted a row for each of {times.size} times, got shape {np.shape(value)}"
-            )
-        bad = ~np.isfinite(np.asarray(value, float)).reshape(times.size, -1).all(1)
-        if bad.any():
-            raise ValueError(
-                f"{name}: NaN or infinity in row {int(np.argmax(bad))}; leave such rows out: a "
-                "window does not go across the gap"
-            )
-    if isinstance(states, Attitude | Rigid):
-        off = np.abs(np.linalg.norm(np.asarray(states.q, float), axis=-1) - 1.0)
-        if off.max() > 0.01:
-            raise ValueError(
-                f"q: wanted quaternions of length 1, scalar first, got another in row "
-                f"{int(np.argmax(off))}: {np.asarray(states.q)[int(np.argmax(off))]}"
-            )
-    gaps = np.diff(times)
-    h = float(np.median(gaps))
-    even = np.abs(gaps - h) <= 1e-3 * h
-    if not np.all(even | (gaps > 1.5 * h)):
-        i = int(np.argmin(even | (gaps > 1.5 * h)))
-        raise ValueError(
-            f"t: wanted even times with or without gaps, got {gaps[i]:.6g} s after row {i} where "
-            f"others are {h:.6g} s apart; resample first"
-        )
+    _require_rows(times, states, inputs or {})
+    h, even = _step_of(times)
     broken = np.concatenate([[0], np.cumsum(~even)])
     begin = np.arange(before, times.size - length, stride)
     begin = begin[broken[begin + length] == broken[begin - before]]
@@ -160,3 +131,43 @@ def windows(
         {k: jnp.asarray(v[rows_of]) for k, v in samples.items()},
         before,
     )
+
+
+def _require_rows(times: np.ndarray, states: Any, inputs: Mapping[str, Any]) -> None:
+    """Raise `ValueError` for states and inputs that are not a row of numbers for each time."""
+    rows = dict(zip(names(states), jax.tree.leaves(states), strict=True))
+    rows |= {f"inputs[{k!r}]": v for k, v in inputs.items()}
+    for name, value in rows.items():
+        if np.shape(value)[:1] != times.shape:
+            raise ValueError(
+                f"{name}: wanted a row for each of {times.size} times, got shape {np.shape(value)}"
+            )
+        bad = ~np.isfinite(np.asarray(value, float)).reshape(times.size, -1).all(1)
+        if bad.any():
+            raise ValueError(
+                f"{name}: NaN or infinity in row {int(np.argmax(bad))}; leave such rows out: a "
+                "window does not go across the gap"
+            )
+    if isinstance(states, Attitude | Rigid):
+        off = np.abs(np.linalg.norm(np.asarray(states.q, float), axis=-1) - 1.0)
+        row = int(np.argmax(off))
+        if off[row] > 0.01:
+            raise ValueError(
+                f"q: wanted quaternions of length 1, scalar first, got another in row {row}: "
+                f"{np.asarray(states.q)[row]}"
+            )
+
+
+def _step_of(times: np.ndarray) -> tuple[float, np.ndarray]:
+    """The time between samples, s, and after which there is no gap."""
+    gaps = np.diff(times)
+    h = float(np.median(gaps))
+    even = np.abs(gaps - h) <= 1e-3 * h
+    allowed = even | (gaps > 1.5 * h)
+    if not allowed.all():
+        i = int(np.argmin(allowed))
+        raise ValueError(
+            f"t: wanted even times with or without gaps, got {gaps[i]:.6g} s after row {i} where "
+            f"others are {h:.6g} s apart; resample first"
+        )
+    return h, even

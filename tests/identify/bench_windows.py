@@ -27,7 +27,7 @@ jax.config.update("jax_enable_x64", True)
 
 import rigidjax as rj
 from rigidjax import identify, torques
-from rigidjax.identify import open_loop, window_fit
+from rigidjax.identify import horizons, open_loop, window_fit
 from rigidjax.identify.levenberg_marquardt import Settings
 
 _spec = importlib.util.spec_from_file_location(
@@ -232,7 +232,7 @@ def main():
     options = parser.parse_args()
     windows = cut(options.folder, options.count)
     print(f"{windows.count} windows of {LENGTH} steps, {GUESS.size} numbers; {os.getloadavg()}")
-    found, scales = {}, window_fit._scales(windows, None)
+    found, scales = {}, window_fit._scales(windows, LENGTH, None)
     padded, count = window_fit._padded(windows), np.asarray(windows.count, np.int32)
 
     def ours():
@@ -248,7 +248,8 @@ def main():
         )  # fmt: skip
 
     def alone():
-        open_loop.errors_by_horizon(windows, scene, jnp.asarray(GUESS))
+        found = open_loop.all_errors(windows, scene, jnp.asarray(GUESS))
+        horizons.by_horizon(windows.starts, found)
 
     timed("ours, errors alone and their means", alone, options.repeats)
     once = timed("ours, errors and derivatives", evaluated, options.repeats)
