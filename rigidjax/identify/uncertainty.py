@@ -65,12 +65,13 @@ class Linearised(eqx.Module):
 
     def apart(self, blocks: np.ndarray) -> list[np.ndarray]:
         """Columns (R, …, m) of the recordings as columns of all numbers (…, n)."""
-        out = []
-        for block, where in zip(blocks, self.places, strict=True):
-            wide = np.zeros((*block.shape[:-1], self.size + 1))
-            np.add.at(wide.T, where, block.T)
-            out.append(wide[..., :-1])
-        return out
+        return [self.spread(block, where) for block, where in zip(blocks, self.places, strict=True)]
+
+    def spread(self, block: np.ndarray, where: np.ndarray) -> np.ndarray:
+        """A recording's columns (…, m) as columns of all numbers (…, n)."""
+        wide = np.zeros((*block.shape[:-1], self.size + 1))
+        np.add.at(wide.T, where, block.T)
+        return wide[..., :-1]
 
     @property
     def scores(self) -> np.ndarray:
