@@ -282,7 +282,7 @@ def _pulled(
     moving: _Moving, program: _Program, layout: Layout, constants: Arrays, each: Arrays
 ) -> Arrays:
     method, chosen, run, record, bars = _again(moving, program, layout, constants, each)
-    timed = any(Run(*moving.run)[:3])
+    timed = any(moving.run[:3])
     by = adjoint.cotangents(method, chosen, run, record, Outputs(*bars), timed)
     still = [jnp.zeros_like(a) for a in (run.rtol, run.atol, run.h0)]
     of_run = zip([by.t0, by.stops, by.between, by.y0, *still], moving.run, strict=True)

@@ -51,7 +51,7 @@ def replayed(
             rows = lax.dynamic_update_index_in_dim(rows, row.at[HEAD:].set(y), k, 0)
             return jnp.where(lift(row[2] >= STEP, y), method.project(there.end), y), rows
 
-        y, rows = lax.fori_loop(0, part.count, step, (y, part.rows))
+        y, rows = lax.fori_loop(0, part.number, step, (y, part.rows))
         if run.between.shape[0]:
             ys = dense_output.saved(method, constants, run, part, rows[:, HEAD:], ys)
         return y, ys, starts, rows
@@ -91,7 +91,7 @@ def cotangents(
         known = dense_output.known(run, part) if size else None
 
         def step(k: Array, sums: Sums) -> Sums:
-            k = part.count - 1 - k
+            k = part.number - 1 - k
             row = part.rows[k]
             by = lambda t0, stops: times_of(run._replace(t0=t0, stops=stops), row)  # noqa: E731
             (t, h, end), of_times = jax.vjp(by, run.t0, run.stops)
@@ -121,17 +121,17 @@ def cotangents(
             on = row[2] >= STEP
             by_t, by_h, by_y = (_where(on, a) for a in rest)
             by_t0, by_stops = of_times((by_t, by_h, jnp.zeros_like(end)))
-            total = zip(sums.constants, by_constants, strict=True)
-            return Sums(
-                [a + _where(on, b) for a, b in total],
-                *((sums.t0 + by_t0, sums.stops + by_stops, between) if timed else sums[1:4]),
-                by_y + _where(~on, sums.y0),
-            )
+            both = zip(sums.constants, by_constants, strict=True)
+            total, by_y = [a + _where(on, b) for a, b in both], by_y + _where(~on, sums.y0)
+            if between is None or not timed:
+                return sums._replace(constants=total, y0=by_y)
+            return Sums(total, sums.t0 + by_t0, sums.stops + by_stops, between, by_y)
 
-        return lax.fori_loop(0, part.count, step, sums)
+        return lax.fori_loop(0, part.number, step, sums)
 
-    none = ([jnp.zeros_like(c) for c in constants], *(jnp.zeros_like(a) for a in run[:3]))
-    return lax.fori_loop(0, number, one, Sums(*none, bars.end))
+    t0, stops, between = (jnp.zeros_like(a) for a in run[:3])
+    none = Sums([jnp.zeros_like(c) for c in constants], t0, stops, between, bars.end)
+    return lax.fori_loop(0, number, one, none)
 
 
 def _where(there: Array, a: Array) -> Array:

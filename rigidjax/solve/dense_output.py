@@ -30,7 +30,7 @@ class _Steps(NamedTuple):
 
     ts: Array
     inside: Array
-    index: Array
+    row: Array
     rows: Rows
 
 
@@ -54,7 +54,7 @@ def saved(
     field, project = _in_lanes(run, method)
 
     def fill(found: _Steps, number: Array, ys: Array) -> Array:
-        y = _picked(run, path, found.index)
+        y = _picked(run, path, found.row)
         t, h, end = times_of(run, found.rows)
         there = stages(method.tableau, field, constants, Step(t, h, end, y), True)
         new = _state(method, project, found.ts, t, h, y, there.slopes)

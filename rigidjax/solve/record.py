@@ -77,7 +77,8 @@ def packed(loop: LoopState) -> Array:
 def unpacked(row: Array) -> LoopState:
     """What was `packed`."""
     head = len(LoopState._fields) - 1
-    return LoopState(row[0], row[1], *(a.astype(jnp.int32) for a in row[2:head]), row[head:])
+    stop, steps, rejected = row[2:head].astype(jnp.int32)
+    return LoopState(row[0], row[1], stop, steps, rejected, row[head:])
 
 
 class Record(NamedTuple):
@@ -115,7 +116,7 @@ class Segment(NamedTuple):
     times: Array
     begin: Array
     end: Array
-    count: Array
+    number: Array
 
 
 def times_of(run: Run, rows: Rows) -> tuple[Array, Array, Array]:
