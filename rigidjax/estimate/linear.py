@@ -137,29 +137,39 @@ def joint(grown: Array, noise: Array, root: Array) -> Joint:
     return Joint(predicted, roots.divide_right(cross, predicted), whole[n:, n:])
 
 
-def backward(
-    kept: Joint, mean: Array, predicted: Array, later: Array, root: Array
-) -> tuple[Array, Array]:
-    """The smoothed mean and root before a step from those after it (Rauch, Tung, Striebel 1965)."""
-    mean = mean + jnp.sum(kept.gain * (later - predicted)[None], 1)
-    return mean, roots.predicted(kept.gain, root, kept.rest)
+def smoothed(
+    kept: Joint, mean: Array, predicted: Array, noise: Array, end: tuple[Array, Array]
+) -> tuple[Array, Array, Array, Array]:
+    """Means and roots at all times, and means and covariances of the unit noise of all steps.
 
+    The pass back (Rauch, Tung, Striebel 1965), and of the noise (m, m) with `Z = L⁻¹ G`, L the
+    predicted root: `1 − ZᵀZ + (Zᵀ L⁻¹ S)(Zᵀ L⁻¹ S)ᵀ`, where S is the smoothed root after the step.
 
-def kick(noise: Array, kept: Joint, off: Array, root: Array) -> tuple[Array, Array]:
-    """Mean and covariance (m, m) of the unit noise of a step, all readings known.
-
-    `1 − ZᵀZ + (Zᵀ L⁻¹ S)(Zᵀ L⁻¹ S)ᵀ` with `Z = L⁻¹ G`, L the predicted root.
-
-    **Arguments:** `noise` G; `kept`; `off` (n,) how far the smoothed mean after the step is from
-    the predicted one; `root` (n, n) of its smoothed covariance.
+    **Arguments:** of each step what `joint` gave, the mean before it, the `predicted` one after it,
+    and G; `end` mean and root at the last time.
     """
-    m = noise.shape[1]
-    both = roots.divide(kept.predicted, jnp.concatenate([noise, off[:, None], root], 1))
-    whitened, mean, spread = both[:, :m], both[:, m], both[:, m + 1 :]
-    mean = jnp.sum(whitened * mean[:, None], 0)
-    left = jnp.eye(m, dtype=noise.dtype) - roots.product(whitened.T, whitened)
-    known = roots.product(whitened.T, spread)
-    return mean, left + roots.product(known, known.T)
+
+    def kick(noise: Array, lower: Array, off: Array, root: Array) -> tuple[Array, Array]:
+        m = noise.shape[1]
+        both = roots.divide(lower, jnp.concatenate([noise, off[:, None], root], 1))
+        whitened, mean, spread = both[:, :m], both[:, m], both[:, m + 1 :]
+        mean = jnp.sum(whitened * mean[:, None], 0)
+        left = jnp.eye(m, dtype=noise.dtype) - roots.product(whitened.T, whitened)
+        known = roots.product(whitened.T, spread)
+        return mean, left + roots.product(known, known.T)
+
+    def back(later: tuple[Array, Array], now: Any) -> tuple[Any, Any]:
+        kept, mean, predicted, moving = now
+        off, root = later[0] - predicted, later[1]
+        kicks = kick(noise if moving is None else moving, kept.predicted, off, root)
+        mean = mean + jnp.sum(kept.gain * off[None], 1)
+        out = mean, roots.predicted(kept.gain, root, kept.rest)
+        return out, (*out, *kicks)
+
+    moving = noise if noise.ndim > 2 else None
+    _, before = lax.scan(back, end, (kept, mean, predicted, moving), reverse=True)
+    means, spread = (jnp.concatenate([a, b[None]]) for a, b in zip(before, end, strict=False))
+    return means, spread, *before[2:]
 
 
 def linear_filter(
@@ -289,18 +299,6 @@ def _smooth(
         return kept.predicted, kept
 
     passed, predicted, kept, total = _pass(model, readings, mean, root, seen, step)
-    _, (means, spreads) = lax.scan(
-        lambda later, now: (lambda out: (out, out))(backward(now[0], now[1], now[2], *later)),
-        (passed.step[-1], passed.root[-1]),
-        (kept, passed.step[:-1], predicted),
-        reverse=True,
-    )
-    means = jnp.concatenate([means, passed.step[-1:]])
-    spreads = jnp.concatenate([spreads, passed.root[-1:]])
-    axis = 0 if model.noise.ndim > 2 else None
-    kicks, spread_of_kicks = jax.vmap(kick, (axis, 0, 0, 0))(
-        model.noise, kept, means[1:] - predicted, spreads[1:]
-    )
-    return LinearEstimate(
-        means, spreads, passed.innovation, passed.variance, total, kicks, spread_of_kicks
-    )
+    end = passed.step[-1], passed.root[-1]
+    means, spread, *kicks = smoothed(kept, passed.step[:-1], predicted, model.noise, end)
+    return LinearEstimate(means, spread, passed.innovation, passed.variance, total, *kicks)

@@ -225,15 +225,9 @@ def _iterate(
     later = jax.tree.map(lambda leaf: leaf[1:], path)
     end, kept = lax.scan(forward, start, (before, stops, earlier, later, kicks))
 
-    def backward(carry: tuple[Array, Array], now: _Kept) -> tuple[Any, Any]:
-        mean, root = carry
-        kicks = linear.kick(now.noise, now.joint, mean - now.before, root)
-        out = linear.backward(now.joint, now.mean, now.before, mean, root)
-        return out, (out, kicks)
-
-    _, ((means, spread), (kicks, kick_covariance)) = lax.scan(backward, end, kept, reverse=True)
-    means = jnp.concatenate([means, end[0][None]])
-    spread = jnp.concatenate([spread, end[1][None]])
+    means, spread, kicks, kick_covariance = linear.smoothed(
+        kept.joint, kept.mean, kept.before, kept.noise, end
+    )
     change = jnp.max(jnp.abs(means) * roots.inverse_root(jnp.sum(spread**2, -1)))
     total = jnp.sum(jnp.stack([read.log_density for read in kept.read]))
     moved = jax.vmap(plus)(path, means)
