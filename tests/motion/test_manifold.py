@@ -84,7 +84,9 @@ def test_there_and_back(kind):
         np.testing.assert_array_equal(jnp.concatenate(jax.tree.leaves(there)), sums)
         return
     # The turn is SciPy's, in body axes; the sign of q does not matter.
-    turned = Rotation.from_quat(Q, scalar_first=True) * Rotation.from_rotvec(change[at : at + 3])
+    # A copy: older SciPy takes no array that cannot be written to.
+    turn = Rotation.from_rotvec(np.array(change[at : at + 3]))
+    turned = Rotation.from_quat(Q, scalar_first=True) * turn
     wanted = turned.as_quat(scalar_first=True)
     np.testing.assert_allclose(q_of(there), wanted * np.sign(wanted @ q_of(there)), atol=1e-15)
     other = jax.tree.map(lambda a: -a if a.shape == (4,) else a, there)
