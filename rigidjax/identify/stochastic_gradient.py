@@ -128,11 +128,13 @@ def only(problem: Problem, rows: Array) -> Problem:
     For misfits alone: its `recordings` are not cut to their own lengths.
     """
 
-    def at(of: Problem) -> Any:
-        return of.records, of.reference, of.which, [slot.groups for slot in of.slots]
+    def pick(at: Any, whole: Any) -> Any:
+        return whole if at(whole) is None else eqx.tree_at(at, whole, _rows(at(whole), rows))
 
-    few = _rows(at(problem), rows)
-    return eqx.tree_at(at, problem, few, is_leaf=lambda node: node is None)
+    for at in (lambda p: p.records, lambda p: p.reference, lambda p: p.which):
+        problem = pick(at, problem)
+    slots = tuple(pick(lambda slot: slot.groups, slot) for slot in problem.slots)
+    return eqx.tree_at(lambda p: p.slots, problem, slots) if slots else problem
 
 
 def _rows(tree: Any, rows: Array) -> Any:

@@ -657,7 +657,7 @@ way(
 leave_out(
     "a truth value, a count, a kind, a name or words",
     "estimate.Filtered.words", "estimate.Smoothed.words", "estimate.LinearModel.size",
-    "estimate.LogDensity.size", "identify.Accelerometer.feels", "identify.Gyro.feels", "identify.Marker.feels",
+    "estimate.LogDensity.size", "identify.Accelerometer.feels", "identify.Marker.feels",
     "identify.Combination.in_words", "identify.Fit.ok", "tumblers.LightCurve.ok",
     "identify.Mass.in_words", "identify.Mass.log_names", "identify.Mass.plain_names",
     "identify.Mass.size", "identify.Problem.count", "identify.Recording.size", "identify.LogError",

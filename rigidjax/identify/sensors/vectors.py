@@ -44,8 +44,6 @@ class Gyro(AbstractSensor):
 
     reading_shape: ClassVar[tuple[int, ...]] = (3,)
     components: ClassVar[int] = 3
-    # Only gravity needs the attitude.
-    feels: ClassVar[Any] = property(lambda self: HasSpin if self.gravity is None else HasAttitude)
     unit: ClassVar[str] = "rad/s"
     noise: Vec3 | None = eqx.field(converter=deviations(), default=None)
     _: dataclasses.KW_ONLY
@@ -61,8 +59,11 @@ class Gyro(AbstractSensor):
     )
     place: Vec3 | None = eqx.field(converter=optional("place"), default=None)
     gravity: Vec3 | None = eqx.field(converter=optional("gravity"), default=None)
+    # Only gravity needs the attitude.
+    feels: type = eqx.field(static=True, default=HasSpin)
 
     def __post_init__(self) -> None:
+        self.feels = HasSpin if self.gravity is None else HasAttitude
         if self.g_sensitivity is None:
             if self.place is not None or self.gravity is not None:
                 wanted = "place and gravity say something only beside a g_sensitivity"
