@@ -60,7 +60,7 @@ class Gyro(AbstractSensor):
     place: Vec3 | None = eqx.field(converter=optional("place"), default=None)
     gravity: Vec3 | None = eqx.field(converter=optional("gravity"), default=None)
     # Only gravity needs the attitude.
-    feels: type = eqx.field(static=True, default=HasSpin)
+    feels: type = eqx.field(static=True, init=False, default=HasSpin)
 
     def __post_init__(self) -> None:
         self.feels = HasSpin if self.gravity is None else HasAttitude
