@@ -55,7 +55,7 @@ def _load(default_run):
     gc.set_threshold(100_000, 50, 50)
 
 
-# Tests that took four seconds or more of a run beside others; of many cases the shortest stays.
+# Tests that took some three seconds or more of a run beside others; of many cases the shortest stays.
 LONG = frozenset((Path(__file__).parent / "long.txt").read_text(encoding="utf-8").splitlines())
 
 
