@@ -1,41 +1,39 @@
 """Unconstrained numbers ↔ real bodies.
 
-A log-Cholesky chart: any vector is a body with positive mass and a positive definite second
-moment, so that an optimiser needs no constraint and cannot leave the bodies. Plates, rods and
-points lie at infinity (a logarithm of −∞) and are approached as closely as wanted.
-
-Source: Rucker and Wensing 2022, "Smooth parameterization of rigid-body inertia", IEEE RA-L 7:2771,
-doi:10.1109/LRA.2022.3144517. The ten numbers and their order are those of pinocchio's
-`LogCholeskyParameters`.
+The second moment is the square of a symmetric matrix, 𝔖 ∝ (1 + V)² with V trace-free, so that any
+vector is a body: an optimiser needs no constraint and cannot leave the bodies. Plates and rods are
+ordinary points: their root has a zero eigenvalue. In the log-Cholesky chart (Rucker and Wensing
+2022, doi:10.1109/LRA.2022.3144517) they lie at infinity; in Cholesky's factor itself a small turn
+of a plate is a large step.
 """
 
 from collections.abc import Callable
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from rigidjax import _checks
 from rigidjax._names import show
-from rigidjax._types import Mat3, Matrix, Numbers, Vec3, Vector
+from rigidjax._types import Mat3, Matrix, Numbers, Scalar, Vec3, Vector
 from rigidjax.body.inertia import MassProperties
-from rigidjax.body.symmetric3 import from_components
-from rigidjax.body.validation import real_moments
+from rigidjax.body.principal_axes import eigensystem
+from rigidjax.body.symmetric3 import from_components, product
+from rigidjax.body.validation import real_moments, real_second_moment
 
 
 def pack(body: MassProperties) -> Float[Array, "10"]:
     """Ten unconstrained numbers of a body.
 
-    **Arguments:** `body` with a positive definite second moment. **Returns** (10,)
-    `(α, d1, d2, d3, s12, s23, s13, t1, t2, t3)`: `mass = e^{2α}`, `com = t` (m, body frame),
-    `𝔖 = mass · U Uᵀ` about the centre of mass, U upper triangular with `e^{d_i}` on its diagonal
-    and `s_ij` (m) above it.
-    Source: Rucker and Wensing 2022.
+    **Arguments:** `body`, also a plate or a rod. **Returns** (10,)
+    `(α, ρ, d1, d2, s12, s23, s13, t1, t2, t3)`: `mass = e^{2α}`, `com = t` (m, body frame), and
+    about the centre of mass `𝔖 / mass` as in `pack_second_moment`, ρ the logarithm of a length (m).
 
-    **Raises:** `ValueError` (`equinox` error under `jit`) on the boundary: a plate, rod or point.
+    **Raises:** `ValueError` (`equinox` error under `jit`) for a point.
 
     >>> import rigidjax as rj
     >>> vector = pack(rj.shapes.box(2.0, [0.1, 0.2, 0.3]))
-    >>> float(unpack(vector).mass)
+    >>> round(float(unpack(vector).mass), 12)
     2.0
     """
     if not isinstance(body, MassProperties):
@@ -45,16 +43,15 @@ def pack(body: MassProperties) -> Float[Array, "10"]:
         )
     _checks.single(body, MassProperties, "body")
     half_log_mass = 0.5 * jnp.log(body.mass)
-    shape = _factor(body.second_moment / body.mass)
-    logs = _reach(half_log_mass + shape[:3]) - _reach(half_log_mass)
-    return jnp.concatenate([_reach(half_log_mass)[None], logs, shape[3:], body.com])
+    shape = _factors(body.second_moment / body.mass)
+    return jnp.concatenate([_reach(half_log_mass)[None], shape, body.com])
 
 
 def unpack(vector: Float[ArrayLike, "10"] | Numbers) -> MassProperties:
     """The body of ten unconstrained numbers: any ten.
 
     **Arguments:** `vector` (10,) as `pack` returns them. Exponents beyond what the dtype can hold
-    (|α|, |α + d| over 330 in float64, 31 in float32) grow logarithmically instead, so that a far
+    (|α|, |α + ρ| over 330 in float64, 31 in float32) grow logarithmically instead, so that a far
     too long step of an optimiser gives a large body and not an infinity.
 
     **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
@@ -64,26 +61,24 @@ def unpack(vector: Float[ArrayLike, "10"] | Numbers) -> MassProperties:
     Array([2., 2., 2.], dtype=float64)
     """
     v = _checks.floating(vector, (10,), "vector")
-    alpha = _hold(v[0])
-    diagonal = jnp.exp(_hold(v[0] + v[1:4]))
-    return MassProperties(jnp.exp(2.0 * alpha), v[7:10], _expand(diagonal, jnp.exp(alpha) * v[4:7]))
+    size = jnp.exp(2.0 * _hold(_hold(v[0]) + v[1]))
+    mass = jnp.exp(2.0 * _hold(v[0]))
+    return MassProperties(mass, v[7:10], 3.0 * size * _shape(v[2:7]))
 
 
 def pack_second_moment(second_moment: Matrix) -> Float[Array, "6"]:
-    """Six unconstrained numbers of a positive definite second moment.
+    """Six unconstrained numbers of a second moment.
 
-    **Arguments:** `second_moment` (3, 3) 𝔖, kg m². **Returns** (6,)
-    `(d1, d2, d3, s12, s23, s13)`, `𝔖 = U Uᵀ` as in `pack` with unit mass.
+    **Arguments:** `second_moment` (3, 3) 𝔖, kg m², positive semi-definite. **Returns** (6,)
+    `(ρ, d1, d2, s12, s23, s13)`: `Tr 𝔖 = 3 e^{2ρ}`, and the shape as in `pack_shape`.
 
-    **Raises:** `ValueError` (`equinox` error under `jit`) on the boundary.
+    **Raises:** `ValueError` (`equinox` error under `jit`) for what is no second moment, or zero.
 
     >>> import jax.numpy as jnp
     >>> pack_second_moment(jnp.eye(3))
     Array([0., 0., 0., 0., 0., 0.], dtype=float64)
     """
-    s = _checks.floating(second_moment, (3, 3), "second_moment")
-    shape = _factor(s)
-    return jnp.concatenate([_reach(shape[:3]), shape[3:]])
+    return _factors(_checks.floating(second_moment, (3, 3), "second_moment"))
 
 
 def unpack_second_moment(vector: Float[ArrayLike, "6"] | Numbers) -> Mat3:
@@ -98,26 +93,24 @@ def unpack_second_moment(vector: Float[ArrayLike, "6"] | Numbers) -> Mat3:
     Array([1., 0., 0.], dtype=float64)
     """
     v = _checks.floating(vector, (6,), "vector")
-    return _expand(jnp.exp(_hold(v[:3])), v[3:])
+    return 3.0 * jnp.exp(2.0 * _hold(v[0])) * _shape(v[1:])
 
 
 def pack_shape(second_moment: Matrix) -> Float[Array, "5"]:
     """Five unconstrained numbers of a second moment up to its scale.
 
     Free motion sees only this: the ratios of inertia and the axes. **Arguments:** `second_moment`
-    (3, 3) 𝔖, positive definite, any units. **Returns** (5,) `(d1, d2, s12, s23, s13)` of the
-    factor U of determinant one.
+    (3, 3) 𝔖, positive semi-definite, any units. **Returns** (5,) `(d1, d2, s12, s23, s13)`: the
+    root √𝔖 scaled to trace 3 is `1 + V`, V symmetric with `(d1, d2, −d1 − d2)` on its diagonal and
+    `s_ij` beside it.
 
-    **Raises:** `ValueError` (`equinox` error under `jit`) on the boundary.
+    **Raises:** `ValueError` (`equinox` error under `jit`) for what is no second moment, or zero.
 
     >>> import jax.numpy as jnp
-    >>> pack_shape(7.0 * jnp.eye(3))
-    Array([0., 0., 0., 0., 0.], dtype=float64)
+    >>> pack_shape(jnp.diag(jnp.array([4.0, 4.0, 0.0])))  # a plate
+    Array([0.5, 0.5, 0. , 0. , 0. ], dtype=float64)
     """
-    s = _checks.floating(second_moment, (3, 3), "second_moment")
-    shape = _factor(s / (s[0, 0] + s[1, 1] + s[2, 2]))
-    mean = (shape[0] + shape[1] + shape[2]) / 3.0
-    return jnp.concatenate([_reach(shape[:2] - mean), jnp.exp(-mean) * shape[3:]])
+    return _factors(_checks.floating(second_moment, (3, 3), "second_moment"))[1:]
 
 
 def unpack_shape(vector: Float[ArrayLike, "5"] | Numbers) -> Mat3:
@@ -131,26 +124,25 @@ def unpack_shape(vector: Float[ArrayLike, "5"] | Numbers) -> Mat3:
     >>> float(jnp.trace(unpack_shape(jnp.ones(5))))
     1.0
     """
-    v = _checks.floating(vector, (5,), "vector")
-    d1, d2 = _hold(v[0]), _hold(v[1])
-    s = _expand(jnp.exp(jnp.stack([d1, d2, _hold(-d1 - d2)])), v[2:])
-    return s / (s[0, 0] + s[1, 1] + s[2, 2])
+    return _shape(_checks.floating(vector, (5,), "vector"))
 
 
 def pack_moments(moments: Vector) -> Float[Array, "3"]:
     """Three unconstrained numbers of principal moments, the axes being known.
 
-    **Arguments:** `moments` (3,) I1, I2, I3 in any order, kg m². **Returns** (3,)
-    `½ log λ_i`, the second moments `λ1 = ½(I2 + I3 − I1)`, … (notes, eqs 76–78).
+    **Arguments:** `moments` (3,) I1, I2, I3 in any order, kg m². **Returns** (3,) `(ρ, d1, d2)` as
+    in `pack_second_moment`, of the second moments `λ1 = ½(I2 + I3 − I1)`, … (notes, eqs 76–78).
 
-    **Raises:** `ValueError` (`equinox` error under `jit`) on the boundary or beyond it.
+    **Raises:** `ValueError` (`equinox` error under `jit`) for moments of no body, or of a point.
 
     >>> pack_moments([2.0, 2.0, 2.0])
     Array([0., 0., 0.], dtype=float64)
     """
     i = real_moments(_checks.floating(moments, (3,), "moments"))
     s = 0.5 * jnp.stack([(i[1] - i[0]) + i[2], (i[2] - i[1]) + i[0], (i[0] - i[2]) + i[1]])
-    return _reach(0.5 * jnp.log(_interior(s)))
+    total = _not_a_point(s[0] + s[1] + s[2])
+    root = jnp.sqrt(jnp.maximum(s / total, 0.0))
+    return jnp.stack([_radius(total), *(3.0 * root[:2] / (root[0] + root[1] + root[2]) - 1.0)])
 
 
 def unpack_moments(vector: Float[ArrayLike, "3"] | Numbers) -> Vec3:
@@ -163,40 +155,59 @@ def unpack_moments(vector: Float[ArrayLike, "3"] | Numbers) -> Vec3:
     >>> unpack_moments([0.0, 0.0, 0.0])
     Array([2., 2., 2.], dtype=float64)
     """
-    s = jnp.exp(2.0 * _hold(_checks.floating(vector, (3,), "vector")))
-    return jnp.stack([s[1] + s[2], s[2] + s[0], s[0] + s[1]])
+    v = _checks.floating(vector, (3,), "vector")
+    a, b, c = _squares(jnp.stack([1.0 + v[1], 1.0 + v[2], 1.0 - v[1] - v[2]]))
+    s = 3.0 * jnp.exp(2.0 * _hold(v[0]))
+    return s * jnp.stack([b + c, c + a, a + b])
 
 
-def _factor(s: Mat3) -> Float[Array, "6"]:
-    """(log u11, log u22, log u33, u12, u23, u13) of the upper triangular U with s = U Uᵀ."""
-    u33 = jnp.sqrt(_interior(s[2, 2]))
-    u13, u23 = s[0, 2] / u33, s[1, 2] / u33
-    u22 = jnp.sqrt(_interior(s[1, 1] - u23 * u23))
-    u12 = (s[0, 1] - u13 * u23) / u22
-    u11 = jnp.sqrt(_interior(s[0, 0] - u12 * u12 - u13 * u13))
-    return jnp.stack([jnp.log(u11), jnp.log(u22), jnp.log(u33), u12, u23, u13])
+def _squares(root: Vec3) -> Vec3:
+    """The squares of three numbers, not all zero, over their sum."""
+    root = root / jax.lax.stop_gradient(jnp.max(jnp.abs(root)))
+    return root * root / jnp.sum(root * root)
 
 
-def _expand(diagonal: Vec3, upper: Vec3) -> Mat3:
-    """U Uᵀ from the diagonal of U and (u12, u23, u13)."""
-    u1, u2, u3 = diagonal[0], diagonal[1], diagonal[2]
-    u12, u23, u13 = upper[0], upper[1], upper[2]
-    return from_components(
-        u1 * u1 + u12 * u12 + u13 * u13,
-        u2 * u2 + u23 * u23,
-        u3 * u3,
-        u12 * u2 + u13 * u23,
-        u13 * u3,
-        u23 * u3,
-    )
+def _shape(v: Float[Array, "5"]) -> Mat3:
+    """(1 + V)² over its trace."""
+    d1, d2, s12, s23, s13 = v
+    root = from_components(1.0 + d1, 1.0 + d2, 1.0 - d1 - d2, s12, s13, s23)
+    # Scaled first: the squares of a far too long step of an optimiser overflow.
+    root = root / jax.lax.stop_gradient(jnp.max(jnp.abs(root)))
+    square = product(root, root)
+    return square / (square[0, 0] + square[1, 1] + square[2, 2])
 
 
-def _interior(square):
+def _factors(s: Mat3) -> Float[Array, "6"]:
+    """(ρ, d1, d2, s12, s23, s13) of 𝔖 = 3 e^{2ρ} (1 + V)² / Tr (1 + V)²."""
+    total = _not_a_point(s[0, 0] + s[1, 1] + s[2, 2])
+    root = _root(real_second_moment(s) / total)
+    v = 3.0 * root / (root[0, 0] + root[1, 1] + root[2, 2]) - jnp.eye(3, dtype=s.dtype)
+    return jnp.stack([_radius(total), v[0, 0], v[1, 1], v[0, 1], v[1, 2], v[0, 2]])
+
+
+@jax.custom_jvp
+def _root(s: Mat3) -> Mat3:
+    """The symmetric, positive semi-definite root."""
+    values, axes = eigensystem(s)
+    return product(axes * jnp.sqrt(jnp.maximum(values, 0.0))[None], axes.T)
+
+
+@_root.defjvp
+def _root_jvp(primals: tuple[Mat3], tangents: tuple[Mat3]) -> tuple[Mat3, Mat3]:
+    # dA of A dA + dA A = d𝔖 as nine equations: right at equal moments, too, where axes have no
+    # derivative.
+    root, one = _root(*primals), jnp.eye(3, dtype=primals[0].dtype)
+    sums = jnp.kron(root, one) + jnp.kron(one, root)
+    return root, jnp.linalg.solve(sums, tangents[0].reshape(9)).reshape(3, 3)
+
+
+def _radius(total: Scalar) -> Scalar:
+    return _reach(0.5 * jnp.log(total / 3.0))
+
+
+def _not_a_point(total: Scalar) -> Scalar:
     return _checks.refuse(
-        square,
-        (~(square > 0)).any(),
-        "pack: the second moment has a zero eigenvalue (a plate, rod or point), which the chart "
-        "reaches only at infinity; give the body a thickness, 1e-6 of its size will do",
+        total, ~(total > 0), "pack: the second moment is zero: a point has no shape"
     )
 
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from rigidjax.identify import uncertainty
+from rigidjax.identify import flat_limit, uncertainty
 from rigidjax.identify.checkpoint import Tried
 from rigidjax.identify.full_scale import at_limit
 from rigidjax.identify.goodness import goodness
@@ -56,11 +56,20 @@ def assess(
     """
     value = best.parameters
     linear = uncertainty.linearise(problem, value, noise, best.found)
-    # In a long curved valley steps stay short, although hardly anything is left to gain.
-    done = bool(best.converged) or uncertainty.distance(linear) < AT_THE_END
+    near = flat_limit.beside(problem, value)
+    if near is not None:
+        aside = uncertainty.linearise(problem, near, noise)
+        slopes = aside.slopes, aside.extra_slopes
+        linear = eqx.tree_at(lambda x: (x.slopes, x.extra_slopes), linear, slopes)
     cut = at_limit(problem.records.readings)
     times = uncertainty.correlation_times(linear, cut)
     spread = uncertainty.spread(linear, times)
+    limits = flat_limit.limits(
+        problem, value, near, uncertainty.step(linear), [name for name, _ in charts(problem)]
+    )
+    # In a long curved valley steps stay short, although hardly anything is left to gain.
+    held = [limit.slope for limit in limits if limit.free < 0]
+    done = bool(best.converged) or uncertainty.distance(linear, held) < AT_THE_END
     free = ravel_pytree(value)[0].size
     seen = goodness(problem, linear, times, free)
     believable = not seen.poor
@@ -116,6 +125,8 @@ def assess(
         times.independent,
         jnp.asarray(spread.singular_values),
         jnp.asarray(spread.null_directions),
-        quantities_of(problem, value, spread.seen, spread.null_directions),
+        quantities_of(problem, value, spread.seen, spread.null_directions, near, limits),
         status,
+        limits,
+        near,
     )

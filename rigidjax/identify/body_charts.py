@@ -56,8 +56,8 @@ class AbstractBodyChart(eqx.Module):
         """The body of these numbers."""
 
     @abc.abstractmethod
-    def vector(self, body: Inertia) -> Float[Array, " chart"]:
-        """The numbers of a body with this inertia, a guess where a fit starts."""
+    def vector(self, body: Any) -> Float[Array, " chart"]:
+        """The numbers of a body with this `Inertia`, a guess where a fit starts."""
 
     @abc.abstractmethod
     def logs(self, body: Any) -> Float[Array, " logs"]:
@@ -71,9 +71,8 @@ class AbstractBodyChart(eqx.Module):
 class Ratios(AbstractBodyChart):
     """The whole inertia tensor up to scale: two ratios of moments and the principal axes.
 
-    Five numbers: the log-Cholesky factor of the second moment 𝔖, its scale fixed
-    (Rucker and Wensing 2022, IEEE RA-L 7:2771, doi:10.1109/LRA.2022.3144517). For free motion,
-    which cannot show the scale.
+    Five numbers: the root of the second moment 𝔖, its scale fixed (`rigidjax.body.parameters`), so
+    that a flat body is an ordinary point. For free motion, which cannot show the scale.
 
     >>> Ratios().logs(Ratios().body(jnp.zeros(5)))
     Array([0., 0.], dtype=float64)
@@ -102,8 +101,8 @@ class Ratios(AbstractBodyChart):
 class PrincipalRatios(AbstractBodyChart):
     """Two ratios of moments, where the body axes are known to be principal.
 
-    Two numbers: the logarithms of λ1/λ3 and λ2/λ3, the second moments along the axes (notes,
-    eqs 72, 76–78), so that every pair of numbers obeys the triangle inequalities.
+    Two numbers: the roots of the second moments along the axes, λ1, λ2, λ3, their scale fixed
+    (notes, eqs 72, 76–78), so that every pair of numbers obeys the triangle inequalities.
 
     >>> PrincipalRatios().body(jnp.zeros(2)).tensor[0, 0]
     Array(2., dtype=float64)
@@ -116,11 +115,11 @@ class PrincipalRatios(AbstractBodyChart):
     unit: ClassVar[str] = ""
 
     def body(self, vector: Float[Array, " chart"]) -> Inertia:
-        return _diagonal(jnp.stack([vector[0], vector[1], jnp.zeros((), vector.dtype)]))
+        moments = charts.unpack_moments(jnp.concatenate([jnp.zeros(1, vector.dtype), vector]))
+        return Inertia(jnp.diag(moments))
 
     def vector(self, body: Inertia) -> Float[Array, " chart"]:
-        s = jnp.diagonal(body.second_moment)
-        return jnp.log(s[:2] / s[2])
+        return charts.pack_moments(jnp.diagonal(body.tensor))[1:]
 
     def logs(self, body: Inertia) -> Float[Array, "2"]:
         i = jnp.diagonal(body.tensor)
@@ -144,7 +143,7 @@ def _typical(value: Any) -> Array:
 class Tensor(AbstractBodyChart):
     """The whole inertia tensor with its scale, which a known torque or momentum inside shows.
 
-    Six numbers: the log-Cholesky factor of 𝔖 (as `Ratios`), in units of `typical`.
+    Six numbers: the logarithm of the size of 𝔖 in units of `typical`, and its shape (as `Ratios`).
 
     **Arguments:** `typical` kg m², about how large the moments are: a fit starts there. **Raises**
     `ValueError` where it is not positive.
@@ -177,7 +176,7 @@ class Tensor(AbstractBodyChart):
 class Principal(AbstractBodyChart):
     """Three principal moments with their scale, where the body axes are known to be principal.
 
-    Three numbers: ½ log of the second moments along the axes, in units of `typical`.
+    Three numbers: the logarithm of the size in units of `typical`, and as `PrincipalRatios`.
 
     **Arguments:** as for `Tensor`.
 
@@ -193,10 +192,10 @@ class Principal(AbstractBodyChart):
     unit: ClassVar[str] = "kg m²"
 
     def body(self, vector: Float[Array, " chart"]) -> Inertia:
-        return Inertia(_diagonal(2.0 * vector).tensor * (0.5 * self.typical))
+        return Inertia(jnp.diag(charts.unpack_moments(vector) * (0.5 * self.typical)))
 
     def vector(self, body: Inertia) -> Float[Array, " chart"]:
-        return 0.5 * jnp.log(jnp.diagonal(body.second_moment) / (0.5 * self.typical))
+        return charts.pack_moments(jnp.diagonal(body.tensor) / (0.5 * self.typical))
 
     def logs(self, body: Inertia) -> Float[Array, "3"]:
         return jnp.log(jnp.diagonal(body.tensor))
@@ -208,7 +207,7 @@ class Principal(AbstractBodyChart):
 class Mass(AbstractBodyChart):
     """Mass, centre of mass and inertia: all ten numbers, where forces show them, or some of them.
 
-    The log-Cholesky chart of the 4 × 4 pseudo-inertia around a `guess`, which is where it starts.
+    The chart of `rigidjax.body.parameters.pack` around a `guess`, which is where it starts.
 
     **Arguments:** `guess` a `MassProperties`, about the right size, and right in all that is not
     free; `free` which of it a fit may move: `"mass"` (the second moment follows it, its ratio to
@@ -265,16 +264,23 @@ class Mass(AbstractBodyChart):
     def _places(self) -> list[int]:
         return [place for name in self.free for place in _PARTS[name][1]]
 
+    @property
+    def _length(self) -> Array:
+        # The centre in units of the body's own size: every number is of order one.
+        return jnp.sqrt(jnp.trace(self.guess.second_moment) / self.guess.mass)
+
     def body(self, vector: Float[Array, " chart"]) -> MassProperties:
-        # Lengths in units of the body's own size: every number is of order one.
-        size = jnp.sqrt(jnp.trace(self.guess.second_moment) / self.guess.mass)
         if self.size < 10:
             vector = jnp.zeros(10, vector.dtype).at[np.array(self._places)].set(vector)
-        step = jnp.concatenate([vector[:4], size * vector[4:]])
+        step = jnp.concatenate([vector[:7], self._length * vector[7:]])
         return charts.unpack(charts.pack(self.guess) + step)
 
-    def vector(self, body: Inertia) -> Float[Array, " chart"]:
-        return jnp.zeros(self.size, self.guess.mass.dtype)
+    def vector(self, body: Inertia | MassProperties) -> Float[Array, " chart"]:
+        if isinstance(body, Inertia):
+            return jnp.zeros(self.size, self.guess.mass.dtype)
+        step = charts.pack(body) - charts.pack(self.guess)
+        step = jnp.concatenate([step[:7], step[7:] / self._length])
+        return step[np.array(self._places)]
 
     def logs(self, body: MassProperties) -> Float[Array, " logs"]:
         mass, moments = body.mass[None], body.inertia.moments
@@ -317,9 +323,3 @@ class Known(AbstractBodyChart):
 
     def plain(self, body: Any) -> Float[Array, "0"]:
         return jnp.zeros(0)
-
-
-def _diagonal(logs: Float[Array, "3"]) -> Inertia:
-    """The body whose second moments along the axes have these logarithms."""
-    a, b, c = jnp.exp(logs[0]), jnp.exp(logs[1]), jnp.exp(logs[2])
-    return Inertia(jnp.diag(jnp.stack([b + c, c + a, a + b])))

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 from rigidjax import _checks
 from rigidjax._types import Scalar, Vec3
 from rigidjax.body.inertia import Inertia, MassProperties
+from rigidjax.identify import flat_limit
 from rigidjax.identify.jacobian import normal_matrix, with_blocks
 from rigidjax.identify.parameters import Parameters, places
 from rigidjax.identify.problem import Problem, fits, one_problem
@@ -40,13 +41,14 @@ def expected(problem: Problem, parameters: Parameters) -> tuple[Quantity, ...]:
     """
     _on_host(problem, parameters)
     _look(problem, parameters)
-    information = np.asarray(fisher(problem, parameters))
+    near = flat_limit.beside(problem, parameters)
+    information = np.asarray(fisher(problem, parameters if near is None else near))
     if not np.isfinite(information).all():
         raise ValueError(
             "expected: Fisher's information has NaN or infinity in it: problem holds NaN in its "
             "recordings, or the motion of these parameters is beyond the dtype"
         )
-    return quantities(problem, parameters, *inverted(information))
+    return quantities(problem, parameters, *inverted(information), near)
 
 
 def plan_of(problem: Problem, body: Any, omega: Any) -> Parameters:

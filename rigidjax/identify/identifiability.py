@@ -50,6 +50,7 @@ def identifiability(fit: "Fit") -> tuple[str, ...]:
             )
         else:
             out.append(f"{quantity.name} is well determined, to ±{wide:.2g} of its value.")
+    out += _flat(fit, reach)
     out.append(_rate(fit, reach))
     out += _unseen(fit)
     out += correlations(fit)
@@ -74,6 +75,17 @@ def _moments(fit: "Fit") -> list[Quantity]:
         out += fit.quantities[first : first + len(chart.log_names)]
         first += len(chart.log_names) + len(chart.plain_names)
     return out
+
+
+def _flat(fit: "Fit", reach: float) -> list[str]:
+    """What is known of bodies that may be flat."""
+    covariance = np.asarray(fit.seen)
+    return [
+        f"The body{limit.where} is flat to within what the readings show: (I1 + I2 − I3)/I3 ≤ "
+        f"{limit.bound(covariance):.2g} (95 %); intervals end at what a body can be."
+        for limit in fit.limits
+        if limit.is_near(covariance, reach)
+    ]
 
 
 def _rate(fit: "Fit", reach: float) -> str:
@@ -109,7 +121,7 @@ def _unseen(fit: "Fit") -> list[str]:
 
 def scale_is_unseen(fit: "Fit") -> bool:
     """Whether some unseen direction is the body grown as a whole, all else at rest."""
-    flat, restore = ravel_pytree(fit.parameters)
+    flat, restore = ravel_pytree(fit.beside)
     null = np.asarray(fit.null_directions)
     if not len(null) or isinstance(fit.problem.body, Bodies):
         return False

@@ -1,6 +1,6 @@
 """The quantities that a fit reports by name, their values, deviations and intervals."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
@@ -11,7 +11,8 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
 from rigidjax import _checks
-from rigidjax.identify.body_charts import AbstractBodyChart
+from rigidjax.identify import flat_limit
+from rigidjax.identify.body_charts import AbstractBodyChart, Ratios
 from rigidjax.identify.parameters import Parameters
 from rigidjax.identify.problem import Problem
 from rigidjax.identify.several_bodies import Bodies, in_a_row
@@ -20,8 +21,15 @@ if TYPE_CHECKING:
     from rigidjax.identify.result import Fit
 
 
+# A factor beyond which an interval says nothing of a positive number.
+FARTHEST = 1e3
+
+
 class Quantity(eqx.Module):
     """A number with a name: its value, standard deviation (of the log where positive), unit.
+
+    `cuts` are its correlation with the flatness of each body, and how far that is from zero in
+    standard deviations (`rigidjax.identify.flat_limit`); `most` is what no body exceeds.
 
     >>> mass = Quantity("mass", 2.0, 0.01, "kg", True)
     >>> low, high = mass.interval(1.96)
@@ -34,15 +42,31 @@ class Quantity(eqx.Module):
     deviation: float
     unit: str
     positive: bool
+    cuts: tuple[tuple[float, float], ...] = ()
+    most: float = np.inf
 
     def interval(self, reach: float) -> tuple[float, float]:
-        """Low and high, `reach` standard deviations away; through the log where positive."""
-        if self.positive:
-            with np.errstate(over="ignore"):
-                low, high = self.value * np.exp(np.array([-1.0, 1.0]) * reach * self.deviation)
-        else:
-            low, high = self.value - reach * self.deviation, self.value + reach * self.deviation
-        return float(low), float(high)
+        """Low and high, `reach` standard deviations away; through the log where positive.
+
+        Nearer where a body would be past flat. Of a positive number 0 and infinity where it is not
+        known to a factor of 1e3.
+        """
+        low, high = (float(side) * self.deviation for side in cut_ends(reach, self.cuts))
+        if not self.positive:
+            return self.value + low, self.value + high
+        if max(-low, high) > np.log(FARTHEST):
+            return 0.0, self.most
+        return float(self.value * np.exp(low)), min(float(self.value * np.exp(high)), self.most)
+
+
+def cut_ends(reach: float, cuts: Sequence[tuple[Any, float]]) -> tuple[Any, Any]:
+    """The ends of an interval in standard deviations, by each of the limits that cut it."""
+    low: Any = -reach
+    high: Any = reach
+    for correlation, away in cuts:
+        least, most = flat_limit.ends(reach, correlation, away)
+        low, high = np.maximum(low, least), np.minimum(high, most)
+    return low, high
 
 
 def labels(problem: Problem) -> list[tuple[str, str, bool]]:
@@ -116,30 +140,58 @@ def _value_and_slope(problem: Problem, parameters: Parameters) -> tuple[Array, A
 
 
 def quantities(
-    problem: Problem, parameters: Parameters, covariance: np.ndarray, null: np.ndarray
+    problem: Problem,
+    parameters: Parameters,
+    covariance: np.ndarray,
+    null: np.ndarray,
+    near: Parameters | None = None,
+    limits: tuple[flat_limit.Limit, ...] = (),
 ) -> tuple[Quantity, ...]:
     """Every reported quantity with its standard deviation.
 
-    **Arguments:** `covariance` (n, n) within what is seen; `null` (k, n) what is not.
+    **Arguments:** `covariance` (n, n) within what is seen; `null` (k, n) what is not; `near` where
+    derivatives are taken, if not at `parameters`; `limits` that cut the intervals.
     """
     values, slope = (np.asarray(x) for x in _value_and_slope(problem, parameters))
+    if near is not None:
+        slope = np.asarray(_value_and_slope(problem, near)[1])
     deviations = carried(slope, covariance, null)
+    cuts = _cuts(slope, covariance, deviations, limits)
     # A number that changes with none of those that were fitted is not determined by them.
     deviations = np.where(np.any(slope != 0, axis=-1), deviations, np.nan)
     out = []
-    for (name, unit, positive), value, deviation in zip(
-        labels(problem), values, deviations, strict=True
-    ):
+    for index, (name, unit, positive) in enumerate(labels(problem)):
+        value, deviation = values[index], deviations[index]
         shown = float(np.exp(value)) if positive else float(value)
         # Nor is it known better than it is written.
         least = np.finfo(float).eps * (1.0 if positive else abs(shown))
-        out.append(Quantity(name, shown, float(np.maximum(deviation, least)), unit, positive))
+        most = 1.0 if name.startswith(Ratios.log_names) else np.inf
+        mine = tuple((float(rho[index]), away) for rho, away in cuts)
+        deviation = float(np.maximum(deviation, least))
+        out.append(Quantity(name, shown, deviation, unit, positive, mine, most))
     return tuple(out)
+
+
+def _cuts(
+    slope: np.ndarray,
+    covariance: np.ndarray,
+    deviations: np.ndarray,
+    limits: tuple[flat_limit.Limit, ...],
+) -> list[tuple[np.ndarray, float]]:
+    """For each limit the correlations of functions with it, and how far it is."""
+    out = []
+    for limit in limits:
+        wide = limit.deviation(covariance)
+        if np.isfinite(wide) and wide > 0:
+            with np.errstate(invalid="ignore", divide="ignore"):
+                rho = slope @ covariance @ limit.slope / (deviations * wide)
+            out.append((np.where(np.isfinite(rho), rho, 0.0), limit.free / wide))
+    return out
 
 
 def covariance(fit: "Fit") -> np.ndarray:
     """Covariance of the reported quantities, of the logarithms of those that are positive."""
-    _, slope = (np.asarray(x) for x in _value_and_slope(fit.problem, fit.parameters))
+    _, slope = (np.asarray(x) for x in _value_and_slope(fit.problem, fit.beside))
     return slope @ np.asarray(fit.seen) @ slope.T
 
 
@@ -181,10 +233,11 @@ def interval_of(
         return _checks.numbers(of(*fit.problem.unpack(restore(x))), "of(body, state0)")
 
     middle = np.asarray(_checks.finite(value(flat), "of(body, state0)"))
-    slope = np.asarray(jax.jacfwd(value)(flat))
-    found = carried(slope, np.asarray(fit.seen), np.asarray(fit.null_directions))
-    reach = quantile(fit, level) * found
-    return np.asarray(middle - reach), np.asarray(middle + reach)
+    slope = np.asarray(jax.jacfwd(value)(ravel_pytree(fit.beside)[0]))
+    seen = np.asarray(fit.seen)
+    found = carried(slope, seen, np.asarray(fit.null_directions))
+    low, high = cut_ends(quantile(fit, level), _cuts(slope, seen, found, fit.limits))
+    return np.asarray(middle + low * found), np.asarray(middle + high * found)
 
 
 def quantile(fit: "Fit", level: float) -> float:

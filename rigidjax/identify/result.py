@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 
 from rigidjax import _checks
 from rigidjax.identify import identifiability, uncertainty
+from rigidjax.identify.flat_limit import Limit
 from rigidjax.identify.full_scale import at_limit
 from rigidjax.identify.parameters import Parameters
 from rigidjax.identify.problem import Problem
@@ -48,7 +49,8 @@ class Fit(eqx.Module):
     white ones, and `independent` how many independent ones that leaves; `singular_values` (n,) of
     the whitened Jacobian, its columns of length one; `null_directions` (k, n) that the data do not
     determine; `quantities` all that is reported, by name; `status` one line: `ok`, or `doubtful`,
-    `ambiguous`, `poor`, `failed`, a colon and the reasons.
+    `ambiguous`, `poor`, `failed`, a colon and the reasons; `limits` how far each body is from the
+    flat ones; `near` where a flat body made the derivatives be taken, else `None`.
 
     >>> import jax.numpy as jnp, rigidjax as rj
     >>> ts = jnp.linspace(0.0, 10.0, 80)
@@ -74,11 +76,18 @@ class Fit(eqx.Module):
     null_directions: Float[Array, "unseen n"]
     quantities: tuple[Quantity, ...]
     status: str
+    limits: tuple[Limit, ...] = ()
+    near: Parameters | None = None
 
     @property
     def ok(self) -> bool:
         """Whether the fit converged, explains the data, and is the only one that does."""
         return self.status == "ok"
+
+    @property
+    def beside(self) -> Parameters:
+        """The free numbers to which `covariance` belongs: `parameters`, a flat body thicker."""
+        return self.parameters if self.near is None else self.near
 
     @property
     def body(self) -> Any:

@@ -1,5 +1,6 @@
 """How sure a fit is: covariance, also where the errors are not white, and what the data miss."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -43,6 +44,11 @@ class Linearised(eqx.Module):
     def size(self) -> int:
         """How many numbers are free."""
         return int(self.extra_slopes.shape[-1])
+
+    @property
+    def slope(self) -> np.ndarray:
+        """The gradient (n,) of the misfit."""
+        return self.scores.sum(axis=0) + self.extra @ self.extra_slopes
 
     @property
     def dense(self) -> np.ndarray:
@@ -186,14 +192,22 @@ def inverted(information: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return half @ half.T, null / np.linalg.norm(null, axis=1, keepdims=True)
 
 
-def distance(linear: Linearised) -> float:
+def step(linear: Linearised) -> np.ndarray:
+    """The step (n,) to the least misfit of the linear problem, −(JᵀWJ)⁻¹g within what is seen."""
+    return -_of_white(linear).seen @ linear.slope
+
+
+def distance(linear: Linearised, held: Sequence[np.ndarray] = ()) -> float:
     """How many standard deviations of white errors away the least misfit is, √(gᵀ(JᵀWJ)⁻¹g).
 
     As the linear problem has it, within what is seen: the criterion of MINUIT (James and Roos 1975,
-    doi:10.1016/0010-4655(75)90039-9).
+    doi:10.1016/0010-4655(75)90039-9). **Arguments:** `held` derivatives (n,) of what is to stay.
     """
-    slope = linear.scores.sum(axis=0) + linear.extra @ linear.extra_slopes
-    return float(np.sqrt(max(slope @ _of_white(linear).seen @ slope, 0.0)))
+    covariance = _of_white(linear).seen
+    for row in held:
+        across = covariance @ row
+        covariance = covariance - np.outer(across, across) / max(row @ across, 1e-300)
+    return float(np.sqrt(max(linear.slope @ covariance @ linear.slope, 0.0)))
 
 
 def of_white_errors(linear: Linearised) -> np.ndarray:

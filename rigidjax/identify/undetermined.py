@@ -88,7 +88,7 @@ def undetermined(fit: "Fit") -> tuple[Combination, ...]:
     if not null.size:
         return ()
     best = None
-    slopes, values = map(np.asarray, _slopes(fit.problem, fit.parameters))
+    slopes, values = map(np.asarray, _slopes(fit.problem, fit.beside))
     for slope, names in zip(slopes, _names(fit.problem), strict=True):
         # The free numbers are of order one: a number's largest derivative is its own size.
         size = np.abs(slope).max(axis=1)
@@ -186,7 +186,7 @@ def _kept(fit: "Fit", names: list[str], changes: np.ndarray) -> np.ndarray:
     """Which numbers name the changes (k, M): of each body its moments; where the principal axes
     turn, the components of its tensor.
     """
-    rows = in_a_row(fit.problem.bodies(fit.parameters))
+    rows = in_a_row(fit.problem.bodies(fit.beside))
     kept = np.ones(len(names), bool)
     for (where, chart), body in zip(charts(fit.problem), rows, strict=True):
         # A chart may report these components, too: the last are those of all charts.

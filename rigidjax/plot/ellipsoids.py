@@ -74,7 +74,7 @@ def _given(body: Any, samples: int) -> tuple[Inertia | MassProperties, Any]:
         raise ValueError(
             "inertia_ellipsoid: wanted one body, got a Fit of several: give fit.body[name]"
         )
-    flat, restore = ravel_pytree(body.parameters)
+    flat, restore = ravel_pytree(body.beside)
     values, vectors = np.linalg.eigh(np.asarray(body.seen))
     # A fixed seed: the same fit gives the same picture.
     steps = np.random.default_rng(0).standard_normal((samples, values.size))

@@ -230,29 +230,25 @@ way(
 )  # fmt: skip
 
 
-# Unconstrained parameters: Cholesky's factor from the last row on.
-def upper(s):
-    a = mp.cholesky(mp.matrix(s[::-1, ::-1].tolist()))
-    return np.array(a.tolist(), object).reshape(3, 3)[::-1, ::-1]
-
-
+# Unconstrained parameters: the root by eigenvalues.
 def pack_second(s):
-    u = upper(s)
-    return np.array([*map(mp.log, np.diag(u)), u[0, 1], u[1, 2], u[0, 2]])
+    values, axes = v.eigen(s)
+    a = axes @ np.diag([mp.sqrt(max(x, mp.mpf(0))) for x in values]) @ axes.T
+    a = 3 * a / np.trace(a)
+    return np.array([
+        mp.log(np.trace(s) / 3) / 2, a[0, 0] - 1, a[1, 1] - 1, a[0, 1], a[1, 2], a[0, 2]
+    ])  # fmt: skip
 
 
 def unpack_second(x):
-    u = np.array([[mp.exp(x[0]), x[3], x[5]], [0, mp.exp(x[1]), x[4]], [0, 0, mp.exp(x[2])]])
-    return u @ u.T
-
-
-def pack_shape(s):
-    return np.delete(pack_second(s / v.determinant(s) ** (mp.mpf(1) / 3)), 2)
+    return 3 * mp.exp(2 * x[0]) * unpack_shape(x[1:])
 
 
 def unpack_shape(x):
-    s = unpack_second(np.array([x[0], x[1], -x[0] - x[1], *x[2:]]))
-    return s / np.trace(s)
+    a = np.array([
+        [1 + x[0], x[2], x[4]], [x[2], 1 + x[1], x[3]], [x[4], x[3], 1 - x[0] - x[1]]
+    ])  # fmt: skip
+    return a @ a / np.trace(a @ a)
 
 
 def pack(m, c, s):
@@ -264,27 +260,35 @@ def unpack(x):
     return m, x[7:], m * unpack_second(x[1:7])
 
 
+def pack_moments(i):
+    a = v.sqrt(LAMBDA(i))
+    return np.array([mp.log(sum(LAMBDA(i)) / 3) / 2, *(3 * a[:2] / sum(a) - 1)])
+
+
+def unpack_moments(x):
+    s = np.array([1 + x[1], 1 + x[2], 1 - x[1] - x[2]]) ** 2
+    s = 3 * mp.exp(2 * x[0]) * s / sum(s)
+    return sum(s) - s
+
+
 LAMBDA = lambda i: (sum(i) - 2 * i) / 2
 way("body.parameters.pack", lambda m, c, s: parameters.pack(props(m, c, s)), BODY, pack, norm=True)
 way(
     "body.parameters.pack_second_moment body.parameters.pack_shape",
     lambda s: (parameters.pack_second_moment(s), parameters.pack_shape(s)),
-    v.second_moment, lambda s: (pack_second(s), pack_shape(s)), norm=True,
+    v.second_moment, lambda s: (pack_second(s), pack_second(s)[1:]), norm=True,
 )  # fmt: skip
 way(
     "body.parameters.pack_moments", parameters.pack_moments,
     lambda rng, i: np.trace(np.diag(x := v.moments(rng, i))) - x,
-    lambda i: v.log(LAMBDA(i)) / 2, norm=True,
+    pack_moments, norm=True,
 )  # fmt: skip
 NUMBERS = lambda n: one_of(between(-2, 2, n), between(-20, 20, n), fixed(np.zeros(n)))
 way("body.parameters.unpack", parameters.unpack, NUMBERS(10), unpack)
 way("body.parameters.unpack_second_moment", parameters.unpack_second_moment, NUMBERS(6),
     unpack_second)  # fmt: skip
 way("body.parameters.unpack_shape", parameters.unpack_shape, NUMBERS(5), unpack_shape)
-way(
-    "body.parameters.unpack_moments", parameters.unpack_moments, NUMBERS(3),
-    lambda x: sum(v.exp(2 * x)) - v.exp(2 * x),
-)  # fmt: skip
+way("body.parameters.unpack_moments", parameters.unpack_moments, NUMBERS(3), unpack_moments)
 
 
 # Solids: slices along z, each a disc, a ring, a rectangle or an ellipse; Gauss's points along z.

@@ -14,11 +14,12 @@ from surface.values_bodies import (
     divergence,
     of_lune,
     pack,
+    pack_moments,
     pack_second,
-    pack_shape,
     props,
     tensor_of,
     unpack,
+    unpack_moments,
     unpack_second,
     unpack_shape,
 )  # fmt: skip
@@ -41,8 +42,7 @@ def shape_chart(x):
 
 
 def ratios_chart(x):
-    s = np.array([mp.exp(x[0]), mp.exp(x[1]), mp.mpf(1)])
-    j = sum(s) - s
+    j = unpack_moments(np.array([mp.mpf(0), *x]))
     return np.diag(j) + 0 * v.eye(), v.log(j[:2] / j[2]), np.zeros(0)
 
 
@@ -53,17 +53,16 @@ def tensor_chart(x):
 
 
 def moments_chart(x):
-    s = v.exp(2 * x) * TYPICAL / 2
-    j = sum(s) - s
+    j = unpack_moments(x) * TYPICAL / 2
     return np.diag(j) + 0 * v.eye(), v.log(j), np.zeros(0)
 
 
 BACK = {
-    "Ratios": (lambda s: pack_shape(s), 5, identify.Ratios(), shape_chart),
-    "PrincipalRatios": (lambda s: v.log(np.diag(s)[:2] / s[2, 2]), 2, identify.PrincipalRatios(),
+    "Ratios": (lambda s: pack_second(s)[1:], 5, identify.Ratios(), shape_chart),
+    "PrincipalRatios": (lambda s: pack_moments(sum(d := np.diag(s)) - d)[1:], 2, identify.PrincipalRatios(),
                         ratios_chart),
     "Tensor": (lambda s: pack_second(s * 2 / TYPICAL), 6, identify.Tensor(TYPICAL), tensor_chart),
-    "Principal": (lambda s: v.log(np.diag(s) * 2 / TYPICAL) / 2, 3, identify.Principal(TYPICAL),
+    "Principal": (lambda s: pack_moments((sum(d := np.diag(s)) - d) * 2 / TYPICAL), 3, identify.Principal(TYPICAL),
                   moments_chart),
 }  # fmt: skip
 for name, (back, size, chart, forth) in BACK.items():
@@ -90,7 +89,7 @@ def mass_chart(x, m, c, s):
     size = mp.sqrt(np.trace(start[2]) / start[0])
     logs = np.array([mp.log(m), *v.log(v.eigen(tensor_of(s))[0])])
     return [
-        *unpack(pack(*start) + x * np.array([1, 1, 1, 1, *([size] * 6)])), np.zeros(10), logs, c,
+        *unpack(pack(*start) + x * np.array([*([1] * 7), *([size] * 3)])), np.zeros(10), logs, c,
         start[0] * mp.exp(2 * x[0]), start[1],
     ]  # fmt: skip
 

@@ -1,0 +1,163 @@
+"""Flat bodies, I1 + I2 = I3: where the bodies end. Derivatives beside it, intervals cut at it."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float
+
+from rigidjax.body.inertia import Inertia, MassProperties
+from rigidjax.body.principal_axes import eigensystem
+from rigidjax.body.symmetric3 import swap_trace
+from rigidjax.identify.body_charts import AbstractBodyChart
+from rigidjax.identify.parameters import Parameters
+from rigidjax.identify.problem import Problem
+from rigidjax.identify.several_bodies import charts_of, in_a_row
+
+# Derivatives are taken where the least second moment is at least this share of the trace.
+THIN = 1e-4
+# The quantile of a one-sided bound of 95 %.
+ONE_SIDED = 1.645
+
+
+class Limit(eqx.Module):
+    """How far a body is from the flat ones: `flatness = (I1 + I2 − I3) / I3`, never negative.
+
+    **Fields:** `where` what is added to the names of the body's quantities; `flatness` at the best
+    point; `free` what it would be if it could be negative, as the linear problem has it; `slope`
+    (n,) its derivative in the free numbers.
+    """
+
+    where: str
+    flatness: float
+    free: float
+    slope: np.ndarray
+
+    def deviation(self, covariance: np.ndarray) -> float:
+        """The standard deviation of the flatness; NaN where there is none."""
+        with np.errstate(invalid="ignore"):
+            return float(np.sqrt(self.slope @ covariance @ self.slope))
+
+    def bound(self, covariance: np.ndarray) -> float:
+        """The flatness is at most this (95 %, one-sided)."""
+        wide = self.deviation(covariance)
+        return self.free + float(np.hypot(ONE_SIDED * wide, min(self.free, 0.0)))
+
+    def is_near(self, covariance: np.ndarray, reach: float) -> bool:
+        """Whether a flat body is within `reach` standard deviations."""
+        return bool(self.free < reach * self.deviation(covariance))
+
+
+def ends(reach: float, correlation: np.ndarray, away: float) -> tuple[np.ndarray, np.ndarray]:
+    """The ends of an interval from its middle, in standard deviations, where a body may not be
+    past flat.
+
+    They are those of the likelihood ratio of two Gaussian numbers of which one is not negative:
+    `m²(y) = min over z ≥ 0`. **Arguments:** `reach` the quantile; `correlation` of the number y
+    with the flatness z; `away` the free flatness over its standard deviation.
+
+    >>> ends(2.0, np.array([0.0, 1.0]), 0.0)
+    (array([-2., -0.]), array([2., 2.]))
+    """
+    rho = np.clip(np.asarray(correlation), -1.0, 1.0)
+    past = min(away, 0.0)
+    middle, square = rho * past, reach**2 + past**2
+
+    def end(side: float) -> np.ndarray:
+        free = middle + side * np.sqrt(square)
+        held = middle - rho * away
+        held = held + side * np.sqrt((1.0 - rho**2) * max(square - away**2, 0.0))
+        return np.where(away + rho * (free - middle) >= 0, free, held)
+
+    return end(-1.0), end(1.0)
+
+
+def beside(problem: Problem, parameters: Parameters) -> Parameters | None:
+    """The same numbers, but flat bodies a little thicker; `None` where no body is flat.
+
+    At a flat body the chart has a derivative of zero: no reading changes with the thickness. What
+    the readings say of the tensor itself is regular there and hardly changes within so little.
+    """
+    vectors, first, changed = [], 0, False
+    for chart, body in zip(
+        charts_of(problem.body), in_a_row(_bodies(problem, parameters)), strict=True
+    ):
+        vector = parameters.body[first : first + chart.size]
+        first += chart.size
+        thick = _thicker(chart, body)
+        changed |= thick is not None
+        vectors.append(vector if thick is None else thick)
+    if not changed:
+        return None
+    return eqx.tree_at(lambda p: p.body, parameters, jnp.concatenate(vectors))
+
+
+@eqx.filter_jit
+def _bodies(problem: Problem, parameters: Parameters) -> Any:
+    # As one program: outside of a trace each operation of JAX costs as much as a run of 100 steps.
+    return problem.bodies(parameters)
+
+
+def _thicker(chart: AbstractBodyChart, body: Inertia | MassProperties) -> Array | None:
+    """The chart's numbers of a thicker body, where it is flat and the chart is one of ours."""
+    second = np.asarray(body.second_moment)
+    if not _has_limit(chart) or not np.isfinite(second).all():
+        return None
+    values, axes = np.linalg.eigh(second)
+    least = THIN * values.sum()
+    if values[0] >= least:
+        return None
+    second = jnp.asarray((axes * np.maximum(values, least)) @ axes.T)
+    if isinstance(body, MassProperties):
+        return chart.vector(MassProperties(body.mass, body.com, second))
+    return chart.vector(Inertia(swap_trace(second)))
+
+
+def _has_limit(chart: AbstractBodyChart) -> bool:
+    return type(chart).__module__ == AbstractBodyChart.__module__ and any(
+        name != "mass" for name in chart.log_names
+    )
+
+
+@eqx.filter_jit
+def _flatness(problem: Problem, parameters: Parameters) -> tuple[Array, Array]:
+    flat, restore = ravel_pytree(parameters)
+
+    def of(x: Array) -> Float[Array, " bodies"]:
+        out = []
+        for body in in_a_row(problem.bodies(restore(x))):
+            values, _ = eigensystem(body.second_moment)
+            out.append(2.0 * values[0] / (values[1] + values[2]))
+        return jnp.stack(out)
+
+    return of(flat), jax.jacfwd(of)(flat)
+
+
+def limits(
+    problem: Problem,
+    parameters: Parameters,
+    near: Parameters | None,
+    step: np.ndarray,
+    names: list[str],
+) -> tuple[Limit, ...]:
+    """The limit of each body whose moments are free.
+
+    **Arguments:** `near` where derivatives are taken, if not at `parameters`; `step` (n,) to the
+    least misfit of the linear problem; `names` what is added to the names of a body's quantities.
+    """
+    kept = [_has_limit(chart) for chart in charts_of(problem.body)]
+    if not any(kept):
+        return ()
+    values, slopes = (
+        np.asarray(x) for x in _flatness(problem, parameters if near is None else near)
+    )
+    if near is not None:
+        values = np.asarray(_flatness(problem, parameters)[0])
+    return tuple(
+        Limit(name, float(value), float(value + min(slope @ step, 0.0)), slope)
+        for name, value, slope, one in zip(names, values, slopes, kept, strict=True)
+        if one
+    )
