@@ -18,8 +18,11 @@ from rigidjax._names import show
 from rigidjax._types import Mat3, Matrix, Numbers, Scalar, Vec3, Vector
 from rigidjax.body.inertia import MassProperties
 from rigidjax.body.principal_axes import eigensystem
-from rigidjax.body.symmetric3 import from_components, product
+from rigidjax.body.symmetric3 import apply, from_components, product
 from rigidjax.body.validation import real_moments, real_second_moment
+
+# A body is flat where its least second moment is below this share of their sum.
+FLAT = 1e-3
 
 
 def pack(body: MassProperties) -> Float[Array, "10"]:
@@ -161,6 +164,41 @@ def unpack_moments(vector: Float[ArrayLike, "3"] | Numbers) -> Vec3:
     return s * jnp.stack([b + c, c + a, a + b])
 
 
+def flat_bend(shape: Float[Array, "5"], slope: Float[Array, "5"]) -> Float[Array, "3 5"]:
+    """Rows b whose squares are the second derivative of a misfit that the chart's bend gives.
+
+    Near a flat body the least second moment is a square, λ = a² in a number a of the chart: a
+    misfit that pushes towards λ < 0 has a least at a = 0, which products of first derivatives do
+    not see. With n the axis of a, `d²λ = 2 |dA n|²`; what the misfit changes by in λ is the part of
+    its derivative in the root A along n nᵀ. Zero where the body is not flat, or not pushed.
+
+    **Arguments:** `shape` (5,) as in `pack_shape`; `slope` (5,) the misfit's derivative in it.
+    """
+    root = _root_of(shape)
+    values, axes = eigensystem(root)
+    thin = jnp.argmin(jnp.abs(values))
+    a, n = values[thin], axes[:, thin]
+    d1, d2, s12, s23, s13 = slope
+    # The misfit does not depend on the size of A: its derivative along A is zero.
+    trace = -(shape @ slope)
+    d3 = (trace - d1 - d2) / 3.0
+    pull = from_components(d1 + d3, d2 + d3, d3, 0.5 * s12, 0.5 * s13, 0.5 * s23)
+    square = jnp.sum(root * root)
+    gained = a * (n @ apply(pull, n)) / 2.0
+    flat = (a * a < FLAT * square) & (gained > 0)
+    size = jnp.where(flat, jnp.sqrt(2.0 * jnp.where(flat, gained, 1.0)), 0.0)
+    size = size / jnp.where(flat, jnp.abs(a), 1.0)
+    x, y, z = n
+    nil = jnp.zeros((), n.dtype)
+    return size * jnp.stack(
+        [
+            jnp.stack([x, nil, y, nil, z]),
+            jnp.stack([nil, y, x, z, nil]),
+            jnp.stack([-z, -z, nil, y, x]),
+        ]
+    )
+
+
 def _squares(root: Vec3) -> Vec3:
     """The squares of three numbers, not all zero, over their sum."""
     root = root / jax.lax.stop_gradient(jnp.max(jnp.abs(root)))
@@ -169,12 +207,17 @@ def _squares(root: Vec3) -> Vec3:
 
 def _shape(v: Float[Array, "5"]) -> Mat3:
     """(1 + V)² over its trace."""
-    d1, d2, s12, s23, s13 = v
-    root = from_components(1.0 + d1, 1.0 + d2, 1.0 - d1 - d2, s12, s13, s23)
+    root = _root_of(v)
     # Scaled first: the squares of a far too long step of an optimiser overflow.
     root = root / jax.lax.stop_gradient(jnp.max(jnp.abs(root)))
     square = product(root, root)
     return square / (square[0, 0] + square[1, 1] + square[2, 2])
+
+
+def _root_of(shape: Float[Array, "5"]) -> Mat3:
+    """The root 1 + V of a second moment, of trace 3."""
+    d1, d2, s12, s23, s13 = shape
+    return from_components(1.0 + d1, 1.0 + d2, 1.0 - d1 - d2, s12, s13, s23)
 
 
 def _factors(s: Mat3) -> Float[Array, "6"]:

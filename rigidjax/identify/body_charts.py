@@ -59,6 +59,16 @@ class AbstractBodyChart(eqx.Module):
     def vector(self, body: Any) -> Float[Array, " chart"]:
         """The numbers of a body with this `Inertia`, a guess where a fit starts."""
 
+    def bend(
+        self, vector: Float[Array, " chart"], slope: Float[Array, " chart"]
+    ) -> Float[Array, "rows chart"]:
+        """Rows whose squares are the second derivative of a misfit by the chart's own bend.
+
+        Of use where a body may be flat (`rigidjax.body.parameters.flat_bend`); else none.
+        **Arguments:** `slope` the misfit's derivative in the chart's numbers.
+        """
+        return jnp.zeros((0, self.size), vector.dtype)
+
     @abc.abstractmethod
     def logs(self, body: Any) -> Float[Array, " logs"]:
         """Logarithms of the positive quantities that are reported."""
@@ -90,6 +100,11 @@ class Ratios(AbstractBodyChart):
     def vector(self, body: Inertia) -> Float[Array, " chart"]:
         return charts.pack_shape(body.second_moment)
 
+    def bend(
+        self, vector: Float[Array, " chart"], slope: Float[Array, " chart"]
+    ) -> Float[Array, "rows chart"]:
+        return charts.flat_bend(vector, slope)
+
     def logs(self, body: Inertia) -> Float[Array, "2"]:
         moments = jnp.log(body.moments)
         return moments[:2] - moments[2]
@@ -120,6 +135,11 @@ class PrincipalRatios(AbstractBodyChart):
 
     def vector(self, body: Inertia) -> Float[Array, " chart"]:
         return charts.pack_moments(jnp.diagonal(body.tensor))[1:]
+
+    def bend(
+        self, vector: Float[Array, " chart"], slope: Float[Array, " chart"]
+    ) -> Float[Array, "rows chart"]:
+        return charts.flat_bend(_padded(vector, 0, 3), _padded(slope, 0, 3))[:, :2]
 
     def logs(self, body: Inertia) -> Float[Array, "2"]:
         i = jnp.diagonal(body.tensor)
@@ -166,6 +186,11 @@ class Tensor(AbstractBodyChart):
     def vector(self, body: Inertia) -> Float[Array, " chart"]:
         return charts.pack_second_moment(body.second_moment / (0.5 * self.typical))
 
+    def bend(
+        self, vector: Float[Array, " chart"], slope: Float[Array, " chart"]
+    ) -> Float[Array, "rows chart"]:
+        return _padded(charts.flat_bend(vector[1:], slope[1:]), 1, 0)
+
     def logs(self, body: Inertia) -> Float[Array, "3"]:
         return jnp.log(body.moments)
 
@@ -196,6 +221,12 @@ class Principal(AbstractBodyChart):
 
     def vector(self, body: Inertia) -> Float[Array, " chart"]:
         return charts.pack_moments(jnp.diagonal(body.tensor) / (0.5 * self.typical))
+
+    def bend(
+        self, vector: Float[Array, " chart"], slope: Float[Array, " chart"]
+    ) -> Float[Array, "rows chart"]:
+        shape, slope = (_padded(x[1:], 0, 3) for x in (vector, slope))
+        return _padded(charts.flat_bend(shape, slope)[:, :2], 1, 0)
 
     def logs(self, body: Inertia) -> Float[Array, "3"]:
         return jnp.log(jnp.diagonal(body.tensor))
@@ -262,7 +293,7 @@ class Mass(AbstractBodyChart):
 
     @property
     def _places(self) -> list[int]:
-        return [place for name in self.free for place in _PARTS[name][1]]
+        return sorted(place for name in self.free for place in _PARTS[name][1])
 
     @property
     def _length(self) -> Array:
@@ -281,6 +312,17 @@ class Mass(AbstractBodyChart):
         step = charts.pack(body) - charts.pack(self.guess)
         step = jnp.concatenate([step[:7], step[7:] / self._length])
         return step[np.array(self._places)]
+
+    def bend(
+        self, vector: Float[Array, " chart"], slope: Float[Array, " chart"]
+    ) -> Float[Array, "rows chart"]:
+        if "inertia" not in self.free:
+            return jnp.zeros((0, self.size), vector.dtype)
+        first = self._places.index(2)
+        rows = charts.flat_bend(
+            charts.pack(self.guess)[2:7] + vector[first : first + 5], slope[first : first + 5]
+        )
+        return _padded(rows, first, self.size - first - 5)
 
     def logs(self, body: MassProperties) -> Float[Array, " logs"]:
         mass, moments = body.mass[None], body.inertia.moments
@@ -323,3 +365,8 @@ class Known(AbstractBodyChart):
 
     def plain(self, body: Any) -> Float[Array, "0"]:
         return jnp.zeros(0)
+
+
+def _padded(x: Float[Array, "*rows n"], before: int, after: int) -> Float[Array, "*rows m"]:
+    """The same numbers with zeros before and after them."""
+    return jnp.pad(x, [(0, 0)] * (x.ndim - 1) + [(before, after)])

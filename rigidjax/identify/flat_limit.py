@@ -51,7 +51,9 @@ class Limit(eqx.Module):
         return bool(self.free < reach * self.deviation(covariance))
 
 
-def ends(reach: float, correlation: np.ndarray, away: float) -> tuple[np.ndarray, np.ndarray]:
+def ends(
+    reach: float, correlation: np.ndarray | float, away: float
+) -> tuple[np.ndarray, np.ndarray]:
     """The ends of an interval from its middle, in standard deviations, where a body may not be
     past flat.
 
@@ -73,6 +75,18 @@ def ends(reach: float, correlation: np.ndarray, away: float) -> tuple[np.ndarray
         return np.where(away + rho * (free - middle) >= 0, free, held)
 
     return end(-1.0), end(1.0)
+
+
+def in_words(body: Inertia | MassProperties) -> str | None:
+    """What is to be said of a flat body, where a fit ended at one without an interval for it."""
+    values = np.linalg.eigvalsh(np.asarray(body.second_moment))
+    if not values[0] < THIN * values.sum():
+        return None
+    flatness = 2 * values[0] / (values[1] + values[2])
+    return (
+        f"the body is flat: (I1 + I2 − I3)/I3 = {flatness:.2g}; if it is not, something is "
+        "missing in the model"
+    )
 
 
 def beside(problem: Problem, parameters: Parameters) -> Parameters | None:
@@ -130,7 +144,8 @@ def _flatness(problem: Problem, parameters: Parameters) -> tuple[Array, Array]:
         out = []
         for body in in_a_row(problem.bodies(restore(x))):
             values, _ = eigensystem(body.second_moment)
-            out.append(2.0 * values[0] / (values[1] + values[2]))
+            # Of a flat body round-off may be below zero.
+            out.append(2.0 * jnp.maximum(values[0], 0.0) / (values[1] + values[2]))
         return jnp.stack(out)
 
     return of(flat), jax.jacfwd(of)(flat)

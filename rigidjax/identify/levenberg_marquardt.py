@@ -17,6 +17,7 @@ from rigidjax.identify.problem import Problem
 from rigidjax.identify.propagation import FirstPart, FixedSteps
 from rigidjax.identify.reference_states import ReferenceStates
 from rigidjax.identify.residual import Noise, beside, seen_rows
+from rigidjax.identify.several_bodies import charts_of
 
 # Damping is in units of the diagonal of the normal equations (Marquardt's): one is a step half as
 # long as Gauss and Newton's.
@@ -115,11 +116,23 @@ def descend(
         if e.size:
             total = total + jnp.sum(e**2)
             gram, slope = gram + rows.T @ rows, slope + e @ rows
-        return found, 0.5 * total, gram, slope
+        rows = _bends(problem, here.body, slope)
+        return found, 0.5 * total, gram + rows.T @ rows, slope
 
     nothing = _nothing(problem, start, where.shape[1], kind)
     end = search(evaluated, flat, made, settings, nothing)
     return restore(end.point), end
+
+
+def _bends(problem: Problem, numbers: Array, slope: Float[Array, " n"]) -> Array:
+    """What the bends of the charts of bodies add to the Jacobian (m, n)."""
+    out, first = [jnp.zeros((0, slope.size), slope.dtype)], 0
+    for chart in charts_of(problem.body):
+        mine = slice(first, first + chart.size)
+        rows = chart.bend(numbers[mine], slope[mine])
+        out.append(jnp.zeros((rows.shape[0], slope.size), slope.dtype).at[:, mine].set(rows))
+        first += chart.size
+    return jnp.concatenate(out)
 
 
 def _as_far_as(problem: Problem, weights: Float[Array, "records times"]) -> Problem:

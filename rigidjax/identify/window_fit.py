@@ -12,6 +12,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from rigidjax import _checks
+from rigidjax.identify import flat_limit
 from rigidjax.identify.horizons import Horizons, by_horizon, held_errors
 from rigidjax.identify.jacobian import with_jacobian
 from rigidjax.identify.levenberg_marquardt import BOLD, Search, Settings, search
@@ -34,6 +35,8 @@ _SETTLED = 1e-5
 # 0.05 standard deviations from the least cost. The first searches need not come so near.
 _LEVEL, _ROUGH = 0.05**2, 1.0
 # Windows are first followed for a ninth and a third of their length, if that is so many steps.
+# A deviation of so many times a number that is of order one says that nothing is known of it.
+VAGUE = 100.0
 _PARTS, _SHORTEST, _FEW = (9, 3), 5, 10
 
 
@@ -150,8 +153,13 @@ def fit_windows(
     if windows.count <= x.size:
         deviation = np.full(x.size, np.nan)
         message.append(f"deviations need more windows than free numbers, {x.size}")
+    vague = np.flatnonzero(deviation > VAGUE * np.maximum(1.0, np.abs(np.asarray(end.point))))
+    if vague.size:
+        listed = ", ".join(f"number {k} (± {deviation[k]:.3g})" for k in vague)
+        message.append(f"of the flattened free numbers these are not determined: {listed}")
     body, law = scene(value)
-    message += [wrong for wrong in (unreal(body), _too_late(windows, law)) if wrong]
+    told = (unreal(body) or flat_limit.in_words(body), _too_late(windows, law))
+    message += [wrong for wrong in told if wrong]
     kinds = {k: float(v[0]) for k, v in parts(start, scales).items()}
     return WindowFit(
         value,
