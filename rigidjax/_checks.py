@@ -60,6 +60,7 @@ def kind(value: Any) -> str:
 
 def numbers(value: Any, name: str) -> Array:
     """Return `value` as a float32 or float64 array of any shape, as `floating` does."""
+    value = _in_si(value, name)
     try:
         array = jnp.asarray(value)
     except (TypeError, ValueError) as error:
@@ -76,6 +77,29 @@ def numbers(value: Any, name: str) -> Array:
         reason = " (half precision cannot hold a rotation)" if half else ""
         raise TypeError(f"{name}: wanted float32 or float64, got {array.dtype}{reason}")
     return array
+
+
+def _in_si(value: Any, name: str) -> Any:
+    """What has a unit as numbers in SI (astropy's, pint's), or refused; all else as it is."""
+    if isinstance(value, (list, tuple)):
+        return type(value)(_in_si(item, name) for item in value) if _has_units(value) else value
+    unit = getattr(value, "unit", getattr(value, "units", None))
+    if unit is None or isinstance(value, jax.Array):
+        return value
+    if hasattr(value, "si"):
+        return np.asarray(value.si.value)
+    if hasattr(value, "to_base_units"):
+        return np.asarray(value.to_base_units().magnitude)
+    raise TypeError(
+        f"{name}: wanted plain numbers in SI units, got {type(value).__name__} in {unit}; convert "
+        "it to m, kg, s, rad and give its numbers"
+    )
+
+
+def _has_units(values: Any) -> bool:
+    if isinstance(values, (list, tuple)):
+        return any(_has_units(value) for value in values)
+    return hasattr(values, "unit") or hasattr(values, "units")
 
 
 def same_batch(**arrays: tuple[Array, int]) -> None:
@@ -295,7 +319,7 @@ def on_host(value: Any, name: str) -> np.ndarray:
             "call it outside of jax.jit, jax.grad and jax.vmap"
         )
     try:
-        array = np.asarray(value)
+        array = np.asarray(_in_si(value, name))
     except (TypeError, ValueError) as error:
         raise TypeError(f"{name}: wanted numbers, got {type(value).__name__}") from error
     if array.dtype.kind not in "iuf" and array.dtype != jnp.bfloat16:

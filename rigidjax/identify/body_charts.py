@@ -119,7 +119,7 @@ class PrincipalRatios(AbstractBodyChart):
     Two numbers: the roots of the second moments along the axes, λ1, λ2, λ3, their scale fixed
     (notes, eqs 72, 76–78), so that every pair of numbers obeys the triangle inequalities.
 
-    >>> PrincipalRatios().body(jnp.zeros(2)).tensor[0, 0]
+    >>> PrincipalRatios().body(jnp.zeros(2)).moments.sum().round(12)  # Tr I = 2, as of `Ratios`
     Array(2., dtype=float64)
     """
 
@@ -131,7 +131,7 @@ class PrincipalRatios(AbstractBodyChart):
 
     def body(self, vector: Float[Array, " chart"]) -> Inertia:
         moments = charts.unpack_moments(jnp.concatenate([jnp.zeros(1, vector.dtype), vector]))
-        return Inertia(jnp.diag(moments))
+        return Inertia(jnp.diag(moments / 3.0))
 
     def vector(self, body: Inertia) -> Float[Array, " chart"]:
         return charts.pack_moments(jnp.diagonal(body.tensor))[1:]

@@ -18,10 +18,10 @@ import rigidjax as rj
 from rigidjax import estimate, identify
 
 DT, NOISE = 0.05, 0.02
-# A gyro shows only ratios: of the body as `PrincipalRatios` makes it, whose third second moment is 1.
-BODY = rj.Inertia.from_principal(4.0, 8.0, 10.0)
-WHITE = rj.torques.RandomTorque(0.03)
-COLOURED = rj.torques.CorrelatedTorque(0.03, 1.0)
+# A gyro shows only ratios: of the body as `PrincipalRatios` makes it, whose tensor has trace 2.
+BODY = rj.Inertia.from_principal(4.0 / 11, 8.0 / 11, 10.0 / 11)
+WHITE = rj.torques.RandomTorque(0.03 / 11)
+COLOURED = rj.torques.CorrelatedTorque(0.03 / 11, 1.0)
 AXES = (records.SUN, np.array([1.0, 0.0, 0.0]))
 # Of the logarithms of the torque's numbers.
 PRIOR = 0.5

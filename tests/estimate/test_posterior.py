@@ -389,12 +389,12 @@ def test_weighted_draws_stand_for_the_density(fitted):
         estimate.refit(density, draws=0)
 
 
-@pytest.mark.parametrize("process", [None, rj.torques.RandomTorque(0.03)])
+@pytest.mark.parametrize("process", [None, rj.torques.RandomTorque(0.03 / 11)])
 def test_the_information_is_the_covariance_of_the_gradient(fitted, process):
     """At the truth, over readings made by the model: with noise and torque among the numbers."""
     ts, many = 0.1 * jnp.arange(25, dtype=float), 400
     # The ratios of `records.BODY`, as large as `PrincipalRatios` makes them.
-    body = rj.Inertia.from_principal(4.0, 8.0, 10.0)
+    body = rj.Inertia.from_principal(4.0 / 11, 8.0 / 11, 10.0 / 11)
 
     seen = identify.Recording(ts, (identify.Gyro(), jnp.ones((25, 3))))
     other = identify.Problem(seen, identify.PrincipalRatios())

@@ -24,9 +24,9 @@ NOISE = 0.02
 RATE, RATE_SPREAD = jnp.array([0.3, 0.7, 0.4]), 0.05
 BIAS_SPREAD = 0.05
 CHART = identify.PrincipalRatios()
-PRIOR = identify.Entropic(rj.Inertia.from_principal(4.0, 8.0, 10.0), 40.0)
+PRIOR = identify.Entropic(rj.Inertia.from_principal(4.0 / 11, 8.0 / 11, 10.0 / 11), 40.0)
 # Of the logarithm of the torque's density.
-LAW, LAW_SPREAD = rj.torques.RandomTorque(0.05), 0.5
+LAW, LAW_SPREAD = rj.torques.RandomTorque(0.05 / 11), 0.5
 RECORDS, BINS = 200, 10
 SAMPLER = estimate.Nuts(samples=150, warmup=60)
 # Every third draw of two chains.
@@ -40,8 +40,11 @@ def drawn_body(key):
     centre = identify.Problem(record(np.ones((TS.size, 3))), CHART).start(PRIOR.guess)
     points = centre.body[None] + jnp.stack(jnp.meshgrid(line, line), axis=-1).reshape(-1, 2)
     log = jax.vmap(lambda x: -0.5 * jnp.sum(PRIOR.residuals(CHART.body(x), scaled=False) ** 2))
+    # Of the numbers of a body those whose root has no negative eigenvalue: a flat body, which the
+    # prior forbids, is between these and the others.
+    inside = (points > -1.0).all(axis=1) & (points.sum(axis=1) < 1.0)
     first, second = jax.random.split(key)
-    index = jax.random.categorical(first, log(points))
+    index = jax.random.categorical(first, jnp.where(inside, log(points), -jnp.inf))
     return points[index] + cell * (jax.random.uniform(second, (2,)) - 0.5)
 
 

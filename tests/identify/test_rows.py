@@ -103,8 +103,10 @@ def test_i3_no_start_is_called_right_that_is_wrong():
     truth = identify.plan_of(problem, BODY, [0.4, 1.2, -0.3])
     right = 0
     for first in np.linspace(-2.0, 1.5, 41):
-        start = jax.tree.map(lambda x: x, truth)
-        start = identify.Parameters(start.body.at[0].add(first), start.shared, start.own)
+        # The first second moment, over the others, off by e to the power of `first`.
+        second = BODY.second_moment.at[0, 0].multiply(jnp.exp(first))
+        body = problem.body.vector(rj.Inertia.from_second_moment(second))
+        start = identify.Parameters(body, truth.shared, truth.own)
         found = identify.fit(problem, starts=1, initial=start)
         if found.ok:
             assert off(found) < 0.05

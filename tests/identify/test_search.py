@@ -148,9 +148,9 @@ def test_a_part_of_the_record_is_followed_no_further_than_that(pushed):
 def test_a_search_may_end_near(pushed):
     of = pushed(9.0)
     seen = whole(of)
-    _, end = searched(of, seen, Settings(1e-4, 1.0, 25))
+    _, end = searched(of, seen, Settings(1e-4, 1.0, 60))
     least = float(end.cost)
-    _, early = searched(of, seen, Settings(1e-4, 1.0, 25, near=1.5 * least))
+    _, early = searched(of, seen, Settings(1e-4, 1.0, 60, near=1.5 * least))
     assert bool(end.converged) and not bool(early.converged)
     assert least < float(early.cost) <= 1.5 * least
     assert int(early.taken) < int(end.taken)
