@@ -8,6 +8,8 @@ import sys
 from importlib.util import find_spec
 from types import ModuleType
 
+_NOT_MODELLED = ("joint", "contact", "hinge", "constraint", "collide", "render", "flexib", "urdf")
+
 
 def show(module: str) -> None:
     """Have `dir` show what a module defines or imports as itself (`X as X`), and `wrong` answer."""
@@ -34,6 +36,11 @@ def wrong(module: str, name: str) -> ModuleType:
         best = min(_ways()[one], key=lambda w: (not w[1].endswith(f".{name}"), w[0] is not here))
         ways.append(best[1])
     words = f"; did you mean {' or '.join(ways)}?" if ways else ""
+    if module == "rigidjax" and any(word in name.lower() for word in _NOT_MODELLED):
+        words = (
+            "; contact, joints, trees of bodies, flexibility and rendering are not modelled: take "
+            "MuJoCo MJX, Brax or Drake"
+        )
     raise AttributeError(f"module {module!r} has no attribute {name!r}{words}", name=name)
 
 

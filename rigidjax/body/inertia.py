@@ -11,7 +11,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from rigidjax import _checks
+from rigidjax import _checks, _show
 from rigidjax._types import (
     Mat3,
     Matrices,
@@ -54,6 +54,8 @@ class Inertia(eqx.Module):
     """
 
     tensor: Float[Array, "*batch 3 3"]
+
+    __repr__ = _show.numbers
 
     def __init__(self, tensor: Matrices):
         hint = "of principal moments Inertia.from_principal makes one"
@@ -192,6 +194,8 @@ class MassProperties(eqx.Module):
     mass: Float[Array, "*batch"]
     com: Float[Array, "*batch 3"]
     second_moment: Float[Array, "*batch 3 3"]
+
+    __repr__ = _show.numbers
 
     def __init__(self, mass: Scalars, com: Vectors, second_moment: Matrices):
         mass = _checks.floating(mass, (), "mass", batched=True)

@@ -164,7 +164,9 @@ def unpack_moments(vector: Float[ArrayLike, "3"] | Numbers) -> Vec3:
     return s * jnp.stack([b + c, c + a, a + b])
 
 
-def flat_bend(shape: Float[Array, "5"], slope: Float[Array, "5"]) -> Float[Array, "3 5"]:
+def flat_bend(
+    shape: Float[ArrayLike, "5"] | Numbers, slope: Float[ArrayLike, "5"] | Numbers
+) -> Float[Array, "3 5"]:
     """Rows b whose squares are the second derivative of a misfit that the chart's bend gives.
 
     Near a flat body the least second moment is a square, λ = a² in a number a of the chart: a
@@ -173,7 +175,15 @@ def flat_bend(shape: Float[Array, "5"], slope: Float[Array, "5"]) -> Float[Array
     its derivative in the root A along n nᵀ. Zero where the body is not flat, or not pushed.
 
     **Arguments:** `shape` (5,) as in `pack_shape`; `slope` (5,) the misfit's derivative in it.
+
+    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
+
+    >>> plate = pack_shape(jnp.diag(jnp.array([4.0, 4.0, 1e-12])))
+    >>> flat_bend(plate, -1e-6 * jnp.ones(5)).shape
+    (3, 5)
     """
+    shape = _checks.floating(shape, (5,), "shape")
+    slope = _checks.floating(slope, (5,), "slope")
     root = _root_of(shape)
     values, axes = eigensystem(root)
     thin = jnp.argmin(jnp.abs(values))

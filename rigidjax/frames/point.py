@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from rigidjax import _checks
+from rigidjax import _checks, _show
 
 
 class Point(eqx.Module):
@@ -24,6 +24,8 @@ class Point(eqx.Module):
 
     x: Float[Array, "*batch 3"]
     v: Float[Array, "*batch 3"]
+
+    __repr__ = _show.numbers
 
     def __init__(self, x: Float[Array, "*batch 3"] | object, v: Float[Array, "*batch 3"] | object):
         hint = "a plane problem has z = 0; functions take one particle, batch with jax.vmap"

@@ -62,7 +62,7 @@ def ends(
     with the flatness z; `away` the free flatness over its standard deviation.
 
     >>> ends(2.0, np.array([0.0, 1.0]), 0.0)
-    (array([-2., -0.]), array([2., 2.]))
+    (array([-2.,  0.]), array([2., 2.]))
     """
     rho = np.clip(np.asarray(correlation), -1.0, 1.0)
     past = min(away, 0.0)

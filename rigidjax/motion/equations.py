@@ -8,7 +8,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from rigidjax import _checks
+from rigidjax import _checks, _show
 from rigidjax._types import HasAttitude, HasPose, HasSpin, Mat3, Quat, ScalarLike, Vec3
 from rigidjax.body.inertia import Inertia, MassProperties, apply, inverse
 from rigidjax.motion.coupled import Coupled
@@ -36,6 +36,8 @@ class Spin(eqx.Module):
 
     omega: Float[Array, "*batch 3"]
 
+    __repr__ = _show.numbers
+
     def __init__(self, omega: Float[Array, "*batch 3"] | object):
         self.omega = _checks.floating(omega, (3,), "omega", batched=True)
 
@@ -57,6 +59,8 @@ class Attitude(eqx.Module):
 
     q: Float[Array, "*batch 4"]
     omega: Float[Array, "*batch 3"]
+
+    __repr__ = _show.numbers
 
     def __init__(
         self, q: Float[Array, "*batch 4"] | object, omega: Float[Array, "*batch 3"] | object
@@ -84,6 +88,8 @@ class Rigid(eqx.Module):
     v: Float[Array, "*batch 3"]
     q: Float[Array, "*batch 4"]
     omega: Float[Array, "*batch 3"]
+
+    __repr__ = _show.numbers
 
     def __init__(
         self,
@@ -114,7 +120,7 @@ class EulerEquations(eqx.Module):
 
     >>> import rigidjax as rj
     >>> EulerEquations(rj.Inertia.from_principal(1.0, 2.0, 3.0))(0.0, Spin([1.0, 1, 1]), None)
-    Spin(omega=f64[3])
+    Spin(omega=[-1, 1, -0.333333])
     """
 
     inertia: Inertia

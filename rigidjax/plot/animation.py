@@ -3,6 +3,8 @@
 import base64
 import html
 import io
+import shutil
+import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -38,11 +40,25 @@ class Film(eqx.Module):
         return f"Film({self.kind}, {len(self.data) // 1024} kB)"
 
     def save(self, path: str | Path) -> Path:
-        """Write the file; **returns** its path. **Raises** `ValueError` for another suffix."""
+        """Write the file; **returns** its path.
+
+        **Arguments:** `path` that ends in `.gif` or `.html`; `.mp4` where the program ffmpeg is
+        installed. A page of `player` is `.html` only. **Raises** `ValueError` for another suffix,
+        `FileNotFoundError` where ffmpeg is wanted and missing.
+        """
         path = Path(path)
-        if path.suffix.lower() != f".{self.kind}":
-            raise ValueError(f"save: wanted a name that ends in .{self.kind}, got {path.name}")
-        path.write_bytes(self.data)
+        suffix = path.suffix.lower()
+        kinds = (".gif", ".html", ".mp4") if self.kind == "gif" else (".html",)
+        if suffix not in kinds:
+            raise ValueError(
+                f"save: wanted a name that ends in {' or '.join(kinds)}, got {path.name}"
+            )
+        if suffix == ".mp4":
+            _to_mp4(self.data, path)
+        elif suffix == ".html" and self.kind == "gif":
+            path.write_text(f"<!doctype html>\n{self._repr_html_()}\n", encoding="utf-8")
+        else:
+            path.write_bytes(self.data)
         return path
 
     def _repr_html_(self) -> str:
@@ -56,36 +72,51 @@ class Film(eqx.Module):
         )
 
 
+def _to_mp4(gif: bytes, path: Path) -> None:
+    program = shutil.which("ffmpeg")
+    if program is None:
+        raise FileNotFoundError("save: a film in .mp4 needs the program ffmpeg; .gif needs nothing")
+    # Sizes of that format are even.
+    even = "scale=trunc(iw/2)*2:trunc(ih/2)*2"
+    options = ["-vf", even, "-pix_fmt", "yuv420p", "-movflags", "faststart"]
+    run = [program, "-y", "-loglevel", "error", "-f", "gif", "-i", "-", *options, str(path)]
+    subprocess.run(run, input=gif, check=True)
+
+
 def tumble(
     body: Inertia | MassProperties,
     ts: Float[ArrayLike, " times"],
     states: HasAttitude,
     *,
-    pictures: int = 60,
-    seconds: float = 6.0,
+    seconds: float | int | None = None,
+    fps: float | int = 15,
+    size: int = 400,
     title: str = "",
 ) -> Film:
     """A GIF of the body's box as it tumbles, with the path of its longest axis.
 
     The box is the uniform solid one with the same 𝔖: it moves exactly as the body does. Faces
-    across its principal axes are blue, orange and green, shortest first; the origin is held still.
+    across its principal axes are blue, orange and green, shortest axis first, those on the negative
+    side pale, so that a flip is seen; the origin is held still.
 
     **Arguments:** `body`; `ts` (T,) s; `states` of one body with a leading time axis, close enough
-    together that it turns by less than a quarter turn from one to the next; `pictures` how many;
-    `seconds` the film takes; `title`. **Returns** a `Film`, shown by a notebook; `.save(path)`.
+    together that it turns by less than a quarter turn from one to the next; `seconds` the film
+    takes, by default as many as the motion, 20 at most; `fps` pictures a second; `size` px of a
+    side; `title`. **Returns** a `Film`, shown by a notebook; `.save(path)`.
 
-    **Raises** `ValueError` for a batch, other lengths or fewer than two pictures; `TypeError` for
-    states without an attitude.
+    **Raises** `ValueError` for a batch, other lengths or numbers that are not positive; `TypeError`
+    for states without an attitude.
 
     >>> import rigidjax as rj
     >>> body = rj.shapes.box(1.0, [0.1, 0.2, 0.3])
     >>> sol = rj.simulate(body.inertia, rj.Attitude([1.0, 0, 0, 0], [0, 1, 0.1]), [0.0, 0.5, 1.0])
-    >>> tumble(body, sol.ts, sol.ys, pictures=2).data[:6]
+    >>> tumble(body, sol.ts, sol.ys, fps=2).data[:6]
     b'GIF89a'
     """
-    seconds = _checks.positive(seconds, "seconds")
+    seconds, pictures = _length(ts, seconds, fps)
     _checks.single(body, (Inertia, MassProperties), "body")
     moments, q = evenly(ts, states, pictures)
+    size = _checks.whole(size, "size", 64)
     half, turn = box_of(body)
     pyplot()
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -94,7 +125,7 @@ def tumble(
     from PIL import Image
 
     # Not pyplot's: a film must not leave a figure behind, nor open a window.
-    figure = Figure(figsize=(3.6, 3.6), dpi=80)
+    figure = Figure(figsize=(3.6, 3.6), dpi=size / 3.6)
     canvas = FigureCanvasAgg(figure)
     ax: Any = figure.add_axes((0.0, 0.08, 0.86, 0.84), projection="3d")
     corners = (CORNERS * half) @ turn.T
@@ -109,7 +140,7 @@ def tumble(
     solid = Poly3DCollection([], edgecolor="0.2", linewidths=0.8, alpha=0.85)
     ax.add_collection3d(solid)
     (trail,) = ax.plot([], [], [], color="0.3", lw=0.9)
-    colours = [COLOURS[axis] for axis in (0, 0, 1, 1, 2, 2)]
+    colours = [shade for axis in range(3) for shade in _shades(COLOURS[axis])]
     shots = []
     for moment, rotation in zip(moments, m, strict=True):
         placed = corners @ rotation.T
@@ -125,7 +156,22 @@ def tumble(
     out = io.BytesIO()
     how = dict(save_all=True, append_images=shots[1:], loop=0)
     shots[0].save(out, "GIF", duration=int(1000 * seconds / pictures), **how)
-    return Film(out.getvalue(), "gif", 288)
+    return Film(out.getvalue(), "gif", size)
+
+
+def _length(ts: Any, seconds: float | int | None, fps: float | int) -> tuple[float, int]:
+    """How many seconds a film takes, and how many pictures it has."""
+    if seconds is None:
+        when = _checks.on_host(ts, "ts")
+        seconds = min(abs(float(when[-1] - when[0])), 20.0) if when.ndim == 1 and when.size else 1.0
+    seconds = _checks.positive(seconds, "seconds")
+    return seconds, max(round(seconds * _checks.positive(fps, "fps")), 2)
+
+
+def _shades(colour: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """A colour for the face on the negative side of an axis, pale, and for the other."""
+    full = np.array([int(colour[k : k + 2], 16) for k in (1, 3, 5)]) / 255
+    return tuple(0.4 * full + 0.6), tuple(full)
 
 
 def player(
@@ -133,8 +179,8 @@ def player(
     ts: Float[ArrayLike, " times"],
     states: HasAttitude,
     *,
-    pictures: int = 200,
-    seconds: float = 10.0,
+    seconds: float | int | None = None,
+    fps: float | int = 20,
     height: int = 420,
 ) -> Film:
     """A page that plays the motion in 3-D, to be turned and zoomed while it runs.
@@ -147,6 +193,7 @@ def player(
 
     **Raises** `ModuleNotFoundError` where viser is missing (extra `view`); else as `tumble`.
     """
+    seconds, pictures = _length(ts, seconds, fps)
     _, q = evenly(ts, states, pictures)
     half, turn = box_of(body)
     try:
@@ -180,14 +227,13 @@ def _record(server: Any, half: np.ndarray, turn: np.ndarray, q: np.ndarray, seco
     scene.add_frame("/world", axes_length=1.1 * reach, axes_radius=0.008 * reach)
     attitude = scene.add_frame("/body", show_axes=False, wxyz=tuple(q[0]))
     corners = ((CORNERS * half) @ turn.T).astype(np.float32)
-    for axis, colour in enumerate(COLOURS[:3]):
-        faces = FACES[2 * axis : 2 * axis + 2]
-        triangles = [t for a, b, c, d in faces for t in ((a, b, c), (a, c, d))]
+    shades = [shade for colour in COLOURS[:3] for shade in _shades(colour)]
+    for side, ((a, b, c, d), shade) in enumerate(zip(FACES, shades, strict=True)):
         scene.add_mesh_simple(
-            f"/body/side{axis}",
+            f"/body/side{side}",
             vertices=corners,
-            faces=np.array(triangles, dtype=np.uint32),
-            color=tuple(int(colour[k : k + 2], 16) for k in (1, 3, 5)),
+            faces=np.array([(a, b, c), (a, c, d)], dtype=np.uint32),
+            color=tuple(round(255 * part) for part in shade),
             flat_shading=True,
             side="double",
         )
@@ -204,7 +250,7 @@ def _record(server: Any, half: np.ndarray, turn: np.ndarray, q: np.ndarray, seco
 
 def evenly(ts: Any, states: Any, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Times evenly spaced, and the attitudes there (count, 4), along the shorter arc."""
-    q, count = attitudes(states), _checks.whole(count, "pictures", 2)
+    q = attitudes(states)
     t = times(ts, q.shape[0])
     if t.size < 2:
         raise ValueError(f"ts: wanted at least two times, got {t.size}")

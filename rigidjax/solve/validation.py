@@ -54,14 +54,25 @@ def require_fit(body: Any, state0: Any, torque: Any) -> None:
     if isinstance(state0, Rigid) and not isinstance(body, MassProperties):
         raise TypeError(
             f"Rigid moves as well as turns: wanted MassProperties, got {type(body).__name__}"
+            + _body_of(body, moves=True)
         )
     if not isinstance(state0, Rigid | Point) and not isinstance(body, Inertia):
         raise TypeError(
             f"{type(state0).__name__} only turns: wanted Inertia, got {type(body).__name__}"
-            + ("; pass body.inertia" if isinstance(body, MassProperties) else "")
+            + ("; pass body.inertia" if isinstance(body, MassProperties) else _body_of(body))
         )
     if body is not None:
         _one_body(body)
+
+
+def _body_of(numbers: Any, moves: bool = False) -> str:
+    """What to write in the place of bare numbers."""
+    if not isinstance(numbers, (list, tuple, np.ndarray, jax.Array)):
+        return ""
+    if moves:
+        return "; rj.MassProperties(mass, com, second_moment) makes one, rj.shapes a solid"
+    moments = np.shape(numbers) == (3,)
+    return f"; rj.Inertia{'.from_principal(*moments)' if moments else '(tensor)'} makes one of them"
 
 
 def real_or_nan(body: Inertia | MassProperties) -> Any:
@@ -127,6 +138,8 @@ def times(ts: Any, throw: bool) -> Array:
     >>> times([0, 1, 2], True).shape
     (3,)
     """
+    if isinstance(ts, (Spin, Attitude, Rigid, Point)):
+        raise TypeError(f"ts: wanted times, got {type(ts).__name__}; the state comes before them")
     try:
         length = np.shape(ts)
     except ValueError:

@@ -265,7 +265,9 @@ def test_a_free_particle_goes_straight_on_the_right():
 def test_a_film_has_its_pictures(flip, tmp_path):
     from PIL import Image
 
-    film = rj.plot.tumble(rj.shapes.box(1.0, [0.1, 0.2, 0.3]), flip.ts, flip.ys, pictures=4)
+    film = rj.plot.tumble(
+        rj.shapes.box(1.0, [0.1, 0.2, 0.3]), flip.ts, flip.ys, seconds=0.4, fps=10
+    )
     path = film.save(tmp_path / "tumble.gif")
     with Image.open(path) as picture:
         assert picture.n_frames == 4
@@ -273,7 +275,7 @@ def test_a_film_has_its_pictures(flip, tmp_path):
         picture.seek(2)
         assert np.abs(np.asarray(picture.convert("RGB"), dtype=float) - first).mean() > 1
     assert film._repr_html_().startswith("<img")
-    with pytest.raises(ValueError, match=r"ends in \.gif, got tumble\.png"):
+    with pytest.raises(ValueError, match=r"ends in \.gif or \.html or \.mp4, got tumble\.png"):
         film.save(tmp_path / "tumble.png")
     assert not plt.get_fignums()
 
@@ -303,7 +305,7 @@ def test_between_saved_times_a_film_stays_on_the_group():
 def test_the_player_is_one_page_without_a_network(flip, capsys):
     pytest.importorskip("viser", exc_type=ImportError)
     body = rj.shapes.box(1.0, [0.1, 0.2, 0.3])
-    film = rj.plot.player(body, flip.ts, flip.ys, pictures=20)
+    film = rj.plot.player(body, flip.ts, flip.ys, seconds=1, fps=20)
     page = film.data.decode("utf-8")
     assert 'window.__VISER_EMBED_DATA__="' in page
     assert "<script src=" not in page
@@ -343,8 +345,8 @@ def test_words_on_mistakes(flip, monkeypatch):
             rj.Point(flip.ys.omega, flip.ys.omega),
             plane="xyz",
         )
-    with pytest.raises(ValueError, match="pictures: wanted a whole number of at least 2, got 1"):
-        rj.plot.tumble(BODY, flip.ts, flip.ys, pictures=1)
+    with pytest.raises(ValueError, match="fps: wanted a positive number, got 0"):
+        rj.plot.tumble(BODY, flip.ts, flip.ys, fps=0)
     monkeypatch.setitem(sys.modules, "matplotlib.pyplot", None)
     with pytest.raises(ModuleNotFoundError, match=r"pip install 'rigidjax\[view\]'"):
         rj.plot.motion(flip.ts, flip.ys)

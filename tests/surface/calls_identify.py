@@ -310,7 +310,7 @@ row(
 )
 row(
     "plot.tumble",
-    lambda: dict(body=s.body(), ts=times(), states=states(), pictures=2, seconds=0.1),
+    lambda: dict(body=s.body(), ts=times(), states=states(), fps=20.0, seconds=0.1),
     groups=KINDS,
     transforms=(),
 )

@@ -154,6 +154,8 @@ def require_law(torque: object, name: str = "torque") -> None:
             f"{name}: wanted a torque or force of rigidjax.torques, or a callable (t, state, "
             f"body), got {type(torque).__name__}{advice}"
         )
+    if not isinstance(torque, eqx.Module):  # A law with states takes these, too.
+        _checks.function(torque, name, "(t, state, body) → torque (3,), N m, body frame")
 
 
 def sees_attitude(torque: Torque | None) -> bool:

@@ -1,0 +1,31 @@
+"""How states and bodies are printed: with their numbers."""
+
+import dataclasses
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+
+# More numbers than this are printed as their shape.
+MOST = 16
+
+
+def numbers(module: Any) -> str:
+    """`Name(field=numbers, …)`; of a traced array or a large one its shape."""
+    fields = [(f.name, getattr(module, f.name)) for f in dataclasses.fields(module) if f.repr]
+    parts = ", ".join(f"{name}={_shown(value)}" for name, value in fields)
+    return f"{type(module).__name__}({parts})"
+
+
+def _shown(value: Any) -> str:
+    known = isinstance(value, (jax.Array, np.ndarray)) and not isinstance(value, jax.core.Tracer)
+    if not known or value.size > MOST:
+        return eqx.tree_pformat(value)
+    return _nested(np.asarray(value).tolist())
+
+
+def _nested(value: Any) -> str:
+    if isinstance(value, list):
+        return f"[{', '.join(map(_nested, value))}]"
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
