@@ -150,9 +150,11 @@ def tumble(
         ax.set_title(plain(f"{title}  t = {moment:.3g} s".strip()), fontsize=10)
         canvas.draw()
         shots.append(Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB"))
-    # One palette for all, or the grey of the panes flickers.
-    palette = shots[0].quantize(48)
-    shots = [shot.quantize(48, palette=palette, dither=Image.Dither.NONE) for shot in shots]
+    # One palette for all, or the grey of the panes flickers; of many, or colours are missing.
+    some = shots[:: max(len(shots) // 12, 1)]
+    together = Image.fromarray(np.concatenate([np.asarray(shot) for shot in some]))
+    palette = together.quantize(64)
+    shots = [shot.quantize(64, palette=palette, dither=Image.Dither.NONE) for shot in shots]
     out = io.BytesIO()
     how = dict(save_all=True, append_images=shots[1:], loop=0)
     shots[0].save(out, "GIF", duration=int(1000 * seconds / pictures), **how)
