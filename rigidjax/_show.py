@@ -11,11 +11,11 @@ import numpy as np
 MOST = 16
 
 
-def numbers(module: Any) -> str:
+def numbers(self: Any) -> str:
     """`Name(field=numbers, …)`; of a traced array or a large one its shape."""
-    fields = [(f.name, getattr(module, f.name)) for f in dataclasses.fields(module) if f.repr]
+    fields = [(f.name, getattr(self, f.name)) for f in dataclasses.fields(self) if f.repr]
     parts = ", ".join(f"{name}={_shown(value)}" for name, value in fields)
-    return f"{type(module).__name__}({parts})"
+    return f"{type(self).__name__}({parts})"
 
 
 def _shown(value: Any) -> str:

@@ -140,7 +140,7 @@ class LogDensity(eqx.Module):
             # The density takes errors for white: its own width is less than the fit's intervals.
             # Of many recordings the sandwich may be singular, and no scale for a search.
             linear = uncertainty.linearise(problem, fit.parameters, fit.noises)
-            seen = uncertainty.of_white_errors(linear)
+            seen = uncertainty.of_white(linear).covariance
         rest, total = [], 0
         for factor, reading in zip(factors, problem.records.readings, strict=True):
             rows = np.bincount(groups, np.asarray(reading.seen.sum(axis=1)))

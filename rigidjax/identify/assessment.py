@@ -14,7 +14,7 @@ from rigidjax.identify.full_scale import at_limit
 from rigidjax.identify.goodness import goodness
 from rigidjax.identify.parameters import Parameters
 from rigidjax.identify.problem import Problem
-from rigidjax.identify.quantities import charts, quantities as quantities_of
+from rigidjax.identify.quantities import charts, quantities as quantities_of, values_and_slopes
 from rigidjax.identify.real_bodies import of_charts
 from rigidjax.identify.residual import Noise
 from rigidjax.identify.result import Fit, Start
@@ -63,13 +63,13 @@ def assess(
         linear = eqx.tree_at(lambda x: (x.slopes, x.extra_slopes), linear, slopes)
     cut = at_limit(problem.records.readings)
     times = uncertainty.correlation_times(linear, cut)
-    spread = uncertainty.spread(linear, times)
-    limits = flat_limit.limits(
-        problem, value, near, uncertainty.step(linear), [name for name, _ in charts(problem)]
-    )
+    white = uncertainty.of_white(linear)
+    spread = uncertainty.spread(linear, times, white)
+    numbers, names = values_and_slopes(problem, value, near), [n for n, _ in charts(problem)]
+    limits = flat_limit.limits(problem, numbers, uncertainty.step(linear, white), names)
     # In a long curved valley steps stay short, although hardly anything is left to gain.
     held = [limit.slope for limit in limits if limit.free < 0]
-    done = bool(best.converged) or uncertainty.distance(linear, held) < AT_THE_END
+    done = bool(best.converged) or uncertainty.distance(linear, white, held) < AT_THE_END
     free = ravel_pytree(value)[0].size
     seen = goodness(problem, linear, times, free)
     believable = not seen.poor
@@ -125,7 +125,7 @@ def assess(
         times.independent,
         jnp.asarray(spread.singular_values),
         jnp.asarray(spread.null_directions),
-        quantities_of(problem, value, spread.seen, spread.null_directions, near, limits),
+        quantities_of(problem, numbers, spread.seen, spread.null_directions, limits),
         status,
         limits,
         near,

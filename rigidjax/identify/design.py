@@ -16,7 +16,7 @@ from rigidjax.identify import flat_limit
 from rigidjax.identify.jacobian import normal_matrix, with_blocks
 from rigidjax.identify.parameters import Parameters, places
 from rigidjax.identify.problem import Problem, fits, one_problem
-from rigidjax.identify.quantities import Quantity, quantities
+from rigidjax.identify.quantities import Quantity, quantities, values_and_slopes
 from rigidjax.identify.uncertainty import inverted
 
 
@@ -48,7 +48,8 @@ def expected(problem: Problem, parameters: Parameters) -> tuple[Quantity, ...]:
             "expected: Fisher's information has NaN or infinity in it: problem holds NaN in its "
             "recordings, or the motion of these parameters is beyond the dtype"
         )
-    return quantities(problem, parameters, *inverted(information), near)
+    found = values_and_slopes(problem, parameters, near)
+    return quantities(problem, found, *inverted(information))
 
 
 def plan_of(problem: Problem, body: Any, omega: Any) -> Parameters:

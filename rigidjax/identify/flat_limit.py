@@ -3,10 +3,8 @@
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from rigidjax.body.inertia import Inertia, MassProperties
@@ -136,43 +134,33 @@ def _has_limit(chart: AbstractBodyChart) -> bool:
     )
 
 
-@eqx.filter_jit
-def _flatness(problem: Problem, parameters: Parameters) -> tuple[Array, Array]:
-    flat, restore = ravel_pytree(parameters)
-
-    def of(x: Array) -> Float[Array, " bodies"]:
-        out = []
-        for body in in_a_row(problem.bodies(restore(x))):
-            values, _ = eigensystem(body.second_moment)
-            # Of a flat body round-off may be below zero.
-            out.append(2.0 * jnp.maximum(values[0], 0.0) / (values[1] + values[2]))
-        return jnp.stack(out)
-
-    return of(flat), jax.jacfwd(of)(flat)
+def flatness(problem: Problem, parameters: Parameters) -> Float[Array, " bodies"]:
+    """(I1 + I2 − I3) / I3 of each body; 1 of one whose moments are not free."""
+    out = []
+    bodies = in_a_row(problem.bodies(parameters))
+    for chart, body in zip(charts_of(problem.body), bodies, strict=True):
+        if not _has_limit(chart):
+            out.append(jnp.ones((), parameters.own.spin.dtype))
+            continue
+        values, _ = eigensystem(body.second_moment)
+        # Of a flat body round-off may be below zero.
+        out.append(2.0 * jnp.maximum(values[0], 0.0) / (values[1] + values[2]))
+    return jnp.stack(out)
 
 
 def limits(
-    problem: Problem,
-    parameters: Parameters,
-    near: Parameters | None,
-    step: np.ndarray,
-    names: list[str],
+    problem: Problem, found: tuple[np.ndarray, np.ndarray], step: np.ndarray, names: list[str]
 ) -> tuple[Limit, ...]:
     """The limit of each body whose moments are free.
 
-    **Arguments:** `near` where derivatives are taken, if not at `parameters`; `step` (n,) to the
-    least misfit of the linear problem; `names` what is added to the names of a body's quantities.
+    **Arguments:** `found` numbers of which the last are the flatness of each body, and their
+    derivatives; `step` (n,) to the least misfit of the linear problem; `names` what is added to the
+    names of a body's quantities.
     """
+    rows = zip(names, *(part[-len(names) :] for part in found), strict=True)
     kept = [_has_limit(chart) for chart in charts_of(problem.body)]
-    if not any(kept):
-        return ()
-    values, slopes = (
-        np.asarray(x) for x in _flatness(problem, parameters if near is None else near)
-    )
-    if near is not None:
-        values = np.asarray(_flatness(problem, parameters)[0])
     return tuple(
         Limit(name, float(value), float(value + min(slope @ step, 0.0)), slope)
-        for name, value, slope, one in zip(names, values, slopes, kept, strict=True)
+        for (name, value, slope), one in zip(rows, kept, strict=True)
         if one
     )

@@ -131,36 +131,46 @@ def vector(problem: Problem, parameters: Parameters) -> Array:
 
 @eqx.filter_jit
 def _value_and_slope(problem: Problem, parameters: Parameters) -> tuple[Array, Array]:
+    """The reported quantities and the flatness of each body, and their derivatives."""
     flat, restore = ravel_pytree(parameters)
 
     def value(x: Array) -> Array:
-        return vector(problem, restore(x))
+        moved = restore(x)
+        return jnp.concatenate([vector(problem, moved), flat_limit.flatness(problem, moved)])
 
     return value(flat), jax.jacfwd(value)(flat)
 
 
+def values_and_slopes(
+    problem: Problem, parameters: Parameters, near: Parameters | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """What is reported and the flatness of each body, and their derivatives, taken at `near`."""
+    values, slopes = (np.asarray(x) for x in _value_and_slope(problem, parameters))
+    if near is not None:
+        slopes = np.asarray(_value_and_slope(problem, near)[1])
+    return values, slopes
+
+
 def quantities(
     problem: Problem,
-    parameters: Parameters,
+    found: tuple[np.ndarray, np.ndarray],
     covariance: np.ndarray,
     null: np.ndarray,
-    near: Parameters | None = None,
     limits: tuple[flat_limit.Limit, ...] = (),
 ) -> tuple[Quantity, ...]:
     """Every reported quantity with its standard deviation.
 
-    **Arguments:** `covariance` (n, n) within what is seen; `null` (k, n) what is not; `near` where
-    derivatives are taken, if not at `parameters`; `limits` that cut the intervals.
+    **Arguments:** `found` what `values_and_slopes` gives; `covariance` (n, n) within what is seen;
+    `null` (k, n) what is not; `limits` that cut the intervals.
     """
-    values, slope = (np.asarray(x) for x in _value_and_slope(problem, parameters))
-    if near is not None:
-        slope = np.asarray(_value_and_slope(problem, near)[1])
+    names = labels(problem)
+    values, slope = (part[: len(names)] for part in found)
     deviations = carried(slope, covariance, null)
     cuts = _cuts(slope, covariance, deviations, limits)
     # A number that changes with none of those that were fitted is not determined by them.
     deviations = np.where(np.any(slope != 0, axis=-1), deviations, np.nan)
     out = []
-    for index, (name, unit, positive) in enumerate(labels(problem)):
+    for index, (name, unit, positive) in enumerate(names):
         value, deviation = values[index], deviations[index]
         shown = float(np.exp(value)) if positive else float(value)
         # Nor is it known better than it is written.
@@ -191,7 +201,7 @@ def _cuts(
 
 def covariance(fit: "Fit") -> np.ndarray:
     """Covariance of the reported quantities, of the logarithms of those that are positive."""
-    _, slope = (np.asarray(x) for x in _value_and_slope(fit.problem, fit.beside))
+    slope = np.asarray(_value_and_slope(fit.problem, fit.beside)[1])[: len(labels(fit.problem))]
     return slope @ np.asarray(fit.seen) @ slope.T
 
 

@@ -128,7 +128,8 @@ class Spread(eqx.Module):
 
     **Fields:** `covariance` (n, n), infinite where a number depends on what is not seen; `seen`
     (n, n) the same within what is seen; `kind` in words; `singular_values` (n,) of the weighted
-    Jacobian, its columns of length one; `null_directions` (k, n) that the data do not determine.
+    Jacobian, its columns of length one; `null_directions` (k, n) that the data do not determine;
+    `root` (n, m) of the covariance of white errors, `root rootᵀ`.
     """
 
     covariance: np.ndarray
@@ -136,21 +137,11 @@ class Spread(eqx.Module):
     kind: str
     singular_values: np.ndarray
     null_directions: np.ndarray
+    root: np.ndarray
 
 
-def spread(linear: Linearised, times: "Times") -> Spread:
-    """`(JᵀWJ)⁻¹` where the errors are white, else the sandwich `H⁻¹ M H⁻¹`.
-
-    `M = Jᵀ C J` with C the errors' own covariance in time: of each channel the part that its second
-    differences show is white, the rest fades exponentially. Over which time it fades fitted errors
-    do not tell well, for a fit takes the slow part of them away: of all times from two samples to
-    half a record that one counts which makes a number least sure. Fitted errors are smaller than
-    true ones, the more so the fewer of them are independent: M is scaled up by n/(n − p) for n
-    independent errors. With many recordings, what differs between them is taken where it is more.
-
-    **Arguments:** `linear`; `times` over how long the errors are autocorrelated.
-
-    Source: White 1980, doi:10.2307/1912934; Liang and Zeger 1986, doi:10.1093/biomet/73.1.13.
+def of_white(linear: Linearised) -> Spread:
+    """`(JᵀWJ)⁻¹`, whether the errors are white or not: what Laplace's method gives.
 
     A direction whose singular value is below 1e-8 of the largest has infinite variance, not a
     made-up one.
@@ -159,7 +150,7 @@ def spread(linear: Linearised, times: "Times") -> Spread:
     n = rows.shape[1]
     if not np.isfinite(rows).all():
         lost, kind = np.full((n, n), np.nan), "none: the motion is not finite"
-        return Spread(lost, lost, kind, np.full(n, np.nan), np.zeros((0, n)))
+        return Spread(lost, lost, kind, np.full(n, np.nan), np.zeros((0, n)), lost)
     # Columns of order one: a bias in rad/s must not look blind beside a moment. But a column of
     # round-off is not to be blown up.
     size = np.sqrt(np.sum(rows**2, axis=0))
@@ -169,16 +160,43 @@ def spread(linear: Linearised, times: "Times") -> Spread:
     inverse = np.where(seen, 1.0 / np.where(seen, singular, 1.0), 0.0)
     half = directions.T * inverse
     covariance = (half @ half.T) / np.outer(size, size)
-    kind = "Gauss–Newton"
-    if times.longest > 1.5:
-        covariance = _sandwich(linear, half / size[:, None], times)
-        kind = f"sandwich: the errors are autocorrelated over {times.longest:.0f} samples"
     null = directions[~seen] / size
     null = null / np.linalg.norm(null, axis=1, keepdims=True)
+    shown = _blinded(covariance, null)
+    return Spread(shown, covariance, "Gauss–Newton", singular, null, half / size[:, None])
+
+
+def spread(linear: Linearised, times: "Times", white: Spread | None = None) -> Spread:
+    """`(JᵀWJ)⁻¹` where the errors are white, else the sandwich `H⁻¹ M H⁻¹`.
+
+    `M = Jᵀ C J` with C the errors' own covariance in time: of each channel the part that its second
+    differences show is white, the rest fades exponentially. Over which time it fades fitted errors
+    do not tell well, for a fit takes the slow part of them away: of all times from two samples to
+    half a record that one counts which makes a number least sure. Fitted errors are smaller than
+    true ones, the more so the fewer of them are independent: M is scaled up by n/(n − p) for n
+    independent errors. With many recordings, what differs between them is taken where it is more.
+
+    **Arguments:** `linear`; `times` over how long the errors are autocorrelated; `white` what
+    `of_white` gives, where that is known.
+
+    Source: White 1980, doi:10.2307/1912934; Liang and Zeger 1986, doi:10.1093/biomet/73.1.13.
+    """
+    white = of_white(linear) if white is None else white
+    if times.longest <= 1.5 or not np.isfinite(white.seen).all():
+        return white
+    covariance = _sandwich(linear, white.root, times)
+    kind = f"sandwich: the errors are autocorrelated over {times.longest:.0f} samples"
+    null = white.null_directions
+    shown = _blinded(covariance, null)
+    return Spread(shown, covariance, kind, white.singular_values, null, white.root)
+
+
+def _blinded(covariance: np.ndarray, null: np.ndarray) -> np.ndarray:
+    """The covariance, infinite where a number depends on what is not seen."""
     shown = covariance.copy()
     blind = np.abs(null).max(axis=0, initial=0.0) > 1e-6
     shown[blind, blind] = np.inf
-    return Spread(shown, covariance, kind, singular, null)
+    return shown
 
 
 def inverted(information: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -192,31 +210,23 @@ def inverted(information: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return half @ half.T, null / np.linalg.norm(null, axis=1, keepdims=True)
 
 
-def step(linear: Linearised) -> np.ndarray:
+def step(linear: Linearised, white: Spread) -> np.ndarray:
     """The step (n,) to the least misfit of the linear problem, −(JᵀWJ)⁻¹g within what is seen."""
-    return -_of_white(linear).seen @ linear.slope
+    return -white.seen @ linear.slope
 
 
-def distance(linear: Linearised, held: Sequence[np.ndarray] = ()) -> float:
+def distance(linear: Linearised, white: Spread, held: Sequence[np.ndarray] = ()) -> float:
     """How many standard deviations of white errors away the least misfit is, √(gᵀ(JᵀWJ)⁻¹g).
 
     As the linear problem has it, within what is seen: the criterion of MINUIT (James and Roos 1975,
-    doi:10.1016/0010-4655(75)90039-9). **Arguments:** `held` derivatives (n,) of what is to stay.
+    doi:10.1016/0010-4655(75)90039-9). **Arguments:** `white` what `of_white` gives; `held`
+    derivatives (n,) of what is to stay.
     """
-    covariance = _of_white(linear).seen
+    covariance = white.seen
     for row in held:
         across = covariance @ row
         covariance = covariance - np.outer(across, across) / max(row @ across, 1e-300)
     return float(np.sqrt(max(linear.slope @ covariance @ linear.slope, 0.0)))
-
-
-def of_white_errors(linear: Linearised) -> np.ndarray:
-    """`(JᵀWJ)⁻¹` (n, n) whether the errors are white or not: what Laplace's method gives."""
-    return _of_white(linear).covariance
-
-
-def _of_white(linear: Linearised) -> Spread:
-    return spread(linear, Times(((1.0,),), 0.0, float(linear.size)))
 
 
 def _sandwich(linear: Linearised, half: np.ndarray, times: "Times") -> np.ndarray:

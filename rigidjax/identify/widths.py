@@ -21,7 +21,6 @@ from rigidjax.identify.search import again
 # Rounds, and the relative change at which they end; a width that falls below so much of the first
 # one is zero.
 _ROUNDS, _SETTLED, _LEAST = 40, 0.01, 1e-4
-_WHITE = uncertainty.Times(((1.0,),), 0.0, 1.0)
 
 
 def with_widths(
@@ -51,7 +50,7 @@ def _widths(problem: Problem) -> np.ndarray:
 def _expected(problem: Problem, parameters: Parameters, noise: Noise) -> np.ndarray:
     """The root mean square of each one's deviations, what is not known of them included."""
     linear = uncertainty.linearise(problem, parameters, noise)
-    variance = np.diag(uncertainty.spread(linear, _WHITE).seen)
+    variance = np.diag(uncertainty.of_white(linear).seen)
     values, places = (by_slot(problem, of) for of in (parameters, numbered(parameters)))
     out = np.ones(len(problem.slots))
     for index, slot in enumerate(problem.slots):

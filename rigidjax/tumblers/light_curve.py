@@ -18,7 +18,7 @@ from rigidjax.identify.checkpoint import Tried
 from rigidjax.identify.fit import fit
 from rigidjax.identify.parameters import Parameters
 from rigidjax.identify.problem import Problem, one_problem
-from rigidjax.identify.quantities import carried, quantities
+from rigidjax.identify.quantities import carried, quantities, values_and_slopes
 from rigidjax.identify.result import Fit
 from rigidjax.identify.several_bodies import Bodies
 from rigidjax.motion.torques.base import vector_at
@@ -261,15 +261,16 @@ def _with_shape(best: Fit) -> Fit:
     change = SHAPE / float(best.noises[0][0, 0]) * size[:, None, None] * n[:, :, None] * n[:, None]
     slopes = linear.spread(linear.slopes[0][0, :, 0] * weight[:, None], linear.places[0])
     kept = weight > 0
-    shift = uncertainty.of_white_errors(linear) @ slopes[kept].T @ change[kept].reshape(-1, 9)
+    shift = uncertainty.of_white(linear).covariance @ slopes[kept].T @ change[kept].reshape(-1, 9)
     covariance, seen = (np.asarray(c) + shift @ shift.T for c in (best.covariance, best.seen))
     null = np.asarray(best.null_directions)
+    found = values_and_slopes(best.problem, best.parameters, best.near)
     return dataclasses.replace(
         best,
         covariance=jnp.asarray(covariance),
         seen=jnp.asarray(seen),
         covariance_kind=f"sandwich: a shape {SHAPE:.0%} off the ellipsoid; {best.covariance_kind}",
-        quantities=quantities(best.problem, best.parameters, seen, null, best.near, best.limits),
+        quantities=quantities(best.problem, found, seen, null, best.limits),
     )
 
 
