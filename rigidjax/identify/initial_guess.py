@@ -16,7 +16,6 @@ from rigidjax.identify.direct_estimates import rates
 from rigidjax.identify.parameters import Parameters
 from rigidjax.identify.problem import Problem
 from rigidjax.identify.recording import Recording, readings_of
-from rigidjax.identify.reference_states import first_rate
 from rigidjax.identify.sensors import Gyro
 from rigidjax.identify.several_bodies import Bodies
 from rigidjax.motion import Spin
@@ -49,8 +48,7 @@ def starting_points(problem: Problem, count: int, key: PRNGKeyArray | None) -> l
     else:
         regressed = regress_inertia(recordings)
     start = problem.start(regressed)
-    rates = np.stack([first_rate(recording) for recording in recordings])
-    rates = rates / np.asarray(problem.reference.rate)[:, None]
+    rates = np.asarray(start.own.spin)
     centre = np.asarray(start.body)
     # NumPy's generator: that of JAX takes seconds to compile.
     rng = np.random.default_rng(np.asarray(jax.random.key_data(key)) if key is not None else 0)

@@ -11,7 +11,7 @@ import pytest
 import rigidjax as rj
 from rigidjax import identify
 from rigidjax.identify import report
-from rigidjax.identify.quantities import carried, quantities
+from rigidjax.identify.quantities import carried, quantities, values_and_slopes
 
 NONE = np.zeros((0, 2))
 TIMES = np.linspace(0.0, 10.0, 80)
@@ -55,7 +55,12 @@ def test_an_indefinite_information_is_told():
     found = fitted()
     seen = np.asarray(found.seen).copy()
     seen[0, 0] = -seen[0, 0]
-    numbers = quantities(found.problem, found.parameters, seen, np.asarray(found.null_directions))
+    numbers = quantities(
+        found.problem,
+        values_and_slopes(found.problem, found.parameters, None),
+        seen,
+        np.asarray(found.null_directions),
+    )
     wrong = eqx.tree_at(lambda f: (f.seen, f.quantities), found, (jnp.asarray(seen), numbers))
     assert np.isnan(wrong.interval()["Ix/Iz"]).all()
     low, high = wrong.interval_of(lambda body, _: body.moments[:1])
@@ -72,12 +77,20 @@ def test_a_fitted_number_has_a_width():
     # Exact readings whose noise is estimated: round-off is all there is.
     found = fitted()
     exact = quantities(
-        found.problem, found.parameters, 1e-40 * np.asarray(found.seen), np.zeros((0, 5))
+        found.problem,
+        values_and_slopes(found.problem, found.parameters, None),
+        1e-40 * np.asarray(found.seen),
+        np.zeros((0, 5)),
     )
     for number in exact:
         low, high = number.interval(1.96)
         assert low < number.value < high
-    still = quantities(found.problem, found.parameters, np.zeros((5, 5)), np.zeros((0, 5)))
+    still = quantities(
+        found.problem,
+        values_and_slopes(found.problem, found.parameters, None),
+        np.zeros((5, 5)),
+        np.zeros((0, 5)),
+    )
     assert all(np.isnan(number.deviation) for number in still)
 
 
