@@ -8,7 +8,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from rigidjax import _checks
-from rigidjax.identify import identifiability, uncertainty
+from rigidjax.identify import answers, identifiability, uncertainty
+from rigidjax.identify.answers import Answer, Cause
 from rigidjax.identify.full_scale import at_limit
 from rigidjax.identify.parameters import Parameters
 from rigidjax.identify.problem import Problem
@@ -47,8 +48,10 @@ class Fit(eqx.Module):
     whose noise was given; `correlation` over how many samples the errors are autocorrelated, 1 for
     white ones, and `independent` how many independent ones that leaves; `singular_values` (n,) of
     the whitened Jacobian, its columns of length one; `null_directions` (k, n) that the data do not
-    determine; `quantities` all that is reported, by name; `status` one line: `ok`, or `doubtful`,
-    `ambiguous`, `poor`, `failed`, a colon and the reasons.
+    determine; `quantities` all that is reported, by name; `search` the first answer, whose `word`
+    is `found`, `not alone` or `not ended`; `model` the second one: `explains the readings`,
+    `leaves a part`, `does not explain the readings`; `causes` what most likely makes the errors
+    that are left, where that shows.
 
     >>> import jax.numpy as jnp, rigidjax as rj
     >>> ts = jnp.linspace(0.0, 10.0, 80)
@@ -73,12 +76,34 @@ class Fit(eqx.Module):
     singular_values: Float[Array, " n"]
     null_directions: Float[Array, "unseen n"]
     quantities: tuple[Quantity, ...]
-    status: str
+    search: Answer
+    model: Answer
+    causes: tuple[Cause, ...]
+
+    @property
+    def status(self) -> str:
+        """Both answers in one line; `ok` where there is nothing else to say."""
+        return answers.status(self.search, self.model)
 
     @property
     def ok(self) -> bool:
         """Whether the fit converged, explains the data, and is the only one that does."""
         return self.status == "ok"
+
+    @property
+    def advice(self) -> str:
+        """Whether the intervals can be trusted, and what to try."""
+        return answers.advice(self.search, self.model, self.causes, self.covariance_kind)
+
+    def __str__(self) -> str:
+        from rigidjax.identify import report
+
+        return f"{report.table(report.rows(self))}\n\n{report.verdict(self)}"
+
+    def _repr_html_(self) -> str:
+        from rigidjax.identify import report
+
+        return report.as_html(self)
 
     @property
     def body(self) -> Any:
