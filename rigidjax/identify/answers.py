@@ -6,12 +6,10 @@ import equinox as eqx
 FOUND, NOT_ALONE, NOT_ENDED = "found", "not alone", "not ended"
 # Of the model.
 EXPLAINS, LEAVES, FAILS = "explains the readings", "leaves a part", "does not explain the readings"
-# A cause that explains so much of the squared errors is what to mend first.
-MOST = 0.6
 
 
 class Answer(eqx.Module):
-    """A word, and in other words why; printed as `word (reason; reason)`.
+    """A `word`, and the `reasons` for it in words; printed as `word (reason; reason)`.
 
     >>> print(Answer("not ended", ("max_steps reached",)))
     not ended (max_steps reached)
@@ -25,13 +23,14 @@ class Answer(eqx.Module):
 
 
 class Cause(eqx.Module):
-    """What most likely makes the errors of a sensor.
+    """What most likely makes the errors of a sensor; printed as its words.
 
     **Fields:** `name` of the cause; `sensor` whose errors; `share` of their sum of squares that it
-    explains, `None` where it was found without them; `words` what was found; `remedy` what to try.
+    explains (1 for `misread`, which explains the readings themselves), `None` where it is a guess;
+    `words` what was found; `remedy` what to try.
 
     >>> print(Cause("drag", "Gyro", 0.9, "a torque against the rate", "add a Damping"))
-    a torque against the rate (90 % of the squared errors of the Gyro)
+    a torque against the rate
     """
 
     name: str
@@ -41,28 +40,18 @@ class Cause(eqx.Module):
     remedy: str
 
     def __str__(self) -> str:
-        if self.share is None:
-            return self.words
-        return f"{self.words} ({100 * self.share:.0f} % of the squared errors of the {self.sensor})"
+        return self.words
 
 
 def status(search: Answer, model: Answer) -> str:
-    """Both answers in one line: `ok` where neither has anything to say.
-
-    >>> status(Answer(FOUND), Answer(EXPLAINS)), status(Answer(FOUND), Answer(LEAVES, ("much",)))
-    ('ok', 'search: found; model: leaves a part (much)')
-    """
+    """Both answers in one line: `ok` where neither has anything to say."""
     if search == Answer(FOUND) and model == Answer(EXPLAINS):
         return "ok"
     return f"search: {search}; model: {model}"
 
 
 def advice(search: Answer, model: Answer, causes: tuple[Cause, ...], kind: str) -> str:
-    """What follows: whether the intervals can be trusted, and what to try.
-
-    **Arguments:** the two answers; `causes` of what the model leaves, by sensor; `kind` what the
-    covariance rests on, in words.
-    """
+    """Whether the intervals can be trusted, and what to try; `kind` is that of the covariance."""
     remedies = list(dict.fromkeys(cause.remedy for cause in causes))
     tries = f" Try: {'; '.join(remedies)}." if remedies else ""
     if model.word == FAILS:
@@ -79,7 +68,7 @@ def advice(search: Answer, model: Answer, causes: tuple[Cause, ...], kind: str) 
             "Each interval is that of the best motion alone; fit.starts holds the others. Record "
             f"longer, or turn about two axes in one record.{tries}"
         )
-    if model.word == LEAVES and any(c.share is None or c.share > MOST for c in causes):
+    if model.word == LEAVES and any(cause.share is not None for cause in causes):
         return (
             "The intervals cannot be trusted: they take the errors for chance, and most of them "
             f"have one cause.{tries}"

@@ -58,9 +58,8 @@ def goodness(problem: Problem, linear: Linearised, times: Times, free: int) -> G
         if given:
             own, many = float(np.sum((weight[..., None] * e**2)[kept])), int(kept.sum())
             chi2, count = chi2 + own, count + many
-            if problem.loss is None or not many:
-                factor = _above(own, many, free)
-            else:
+            factor = _above(own, many, free)
+            if problem.loss is not None and many:
                 rows = kept.all(axis=-1) & (weight > 0)
                 factor = _median_above(np.sum(e[rows] ** 2, axis=-1), e.shape[-1])
         white = left <= tiny or _white(e * np.sqrt(weight)[..., None], kept, given)
@@ -75,25 +74,38 @@ def goodness(problem: Problem, linear: Linearised, times: Times, free: int) -> G
             word = FAILS
         word = LEAVES if word == EXPLAINS else word
         sensors.append(index)
-        sizes = [f"{np.sqrt(left / max(kept.any(axis=-1).sum(), 1)):.3g} {reading.sensor.unit}"]
-        if reading.values.ndim - 2 <= 1 and reading.sensor.components == _width(reading):
-            sizes.append(f"{100 * np.sqrt(left / max(varies, 1e-300)):.2g} % of what varies")
-        if factor > 1.0:
-            sizes.append(f"{factor:.3g} times the noise")
-        if not white:
-            scatter_ = _over_scatter(error, kept)
-            sizes.append(
-                f"{scatter_:.3g} times their scatter from one reading to the next, autocorrelated "
-                f"over {times.longest:.0f} samples"
-            )
-        name = f"the errors of the {type(reading.sensor).__name__}"
-        words.append(f"{name}: {', '.join(sizes)}, {_where(problem, error, kept)}")
+        share = left / varies if varies > tiny and _differences(reading) else None
+        span = None if white else times.longest
+        words.append(_in_words(problem, reading, error, kept, factor, share, span))
     return Goodness(chi2, max(count - free, 1), Answer(word, tuple(words)), tuple(sensors))
 
 
-def _width(reading: Any) -> int:
-    """How many numbers a reading has."""
-    return int(np.prod(reading.sensor.reading_shape))
+def _differences(reading: Any) -> bool:
+    """Whether an error has as many numbers as a reading, and so its unit."""
+    return int(np.prod(reading.sensor.reading_shape)) == reading.sensor.components
+
+
+def _in_words(
+    problem: Problem,
+    reading: Any,
+    error: np.ndarray,
+    kept: np.ndarray,
+    factor: float,
+    share: float | None,
+    span: float | None,
+) -> str:
+    """How large errors are and where; `share` of what varies, `span` of samples if not white."""
+    sensor, many = reading.sensor, max(int(kept.any(axis=-1).sum()), 1)
+    size = np.sqrt(np.sum(error[kept] ** 2) / many)
+    words = [f"the errors of the {type(sensor).__name__} are {size:.3g} {sensor.unit}"]
+    if share is not None:
+        words.append(f"{100 * np.sqrt(share):.2g} % of what varies in its readings")
+    if factor > 1.0:
+        words.append(f"{factor:.3g} times the noise")
+    if span is not None:
+        words.append(f"{_over_scatter(error, kept):.3g} times their scatter between neighbours")
+        words.append(f"autocorrelated over {span:.0f} samples")
+    return f"{', '.join(words)}, {_where(problem, error, kept)}"
 
 
 def _where(problem: Problem, error: np.ndarray, kept: np.ndarray) -> str:
@@ -108,7 +120,7 @@ def _where(problem: Problem, error: np.ndarray, kept: np.ndarray) -> str:
     if end - begin > 0.4 * (t[-1] - t[0]):
         return "all along"
     of = f" of recording {row}" if problem.count > 1 else ""
-    return f"half of their squares from {begin:.4g} to {end:.4g} s{of}"
+    return f"half of the squared ones from {begin:.4g} to {end:.4g} s{of}"
 
 
 def _sizes(reading: Any, error: np.ndarray, kept: np.ndarray) -> tuple[float, float, float]:

@@ -66,11 +66,6 @@ def identifiability(fit: "Fit") -> tuple[str, ...]:
                 "body: they cannot show such a mistake."
             )
     out += in_words(fit.problem.records.readings)
-    if fit.correlation > 1.5:
-        out.append(
-            f"The errors are autocorrelated over {fit.correlation:.0f} samples, so something is "
-            "missing in the model or the data were filtered; the intervals allow for it."
-        )
     return tuple(out)
 
 

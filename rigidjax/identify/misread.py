@@ -51,25 +51,27 @@ def misread(recordings: Sequence[Recording]) -> Cause | None:
         return None
     known = [attitudes(recording) for recording in recordings]
     if all(len(t) > 10 for t, _ in known):
-        as_is = _of_attitudes(recordings, known, _SAME)
+        bound = BETTER * _of_attitudes(recordings, known, _SAME)
         found = {name: _of_attitudes(recordings, known, turn) for name, turn in RATES.items()}
         for name, change in ATTITUDES.items():
             changed = [(t, change(q)) for t, q in known]
             found[name] = _of_attitudes(recordings, changed, _SAME)
     elif all(_of_rates(recording.torque) for recording in recordings):
-        # Errors of the sensor can make a flat body a little less than a body.
-        as_is = _of_euler(recordings, _SAME, 1.0, (-0.5, 1.0))
-        real = (-0.01, 0.95)
-        found = {name: _of_euler(recordings, turn, 1.0, real) for name, turn in RATES.items()}
+        bound, margin = _of_euler(recordings, _SAME)
+        # Errors of the sensor alone can make a body one that is none.
+        bound *= BETTER if margin > -0.8 else EQUAL
+        tried = {name: _of_euler(recordings, turn) for name, turn in RATES.items()}
         if recordings[0].torque is not None:
-            found["the torque with the other sign"] = _of_euler(recordings, _SAME, -1.0, real)
+            tried["the torque with the other sign"] = _of_euler(recordings, _SAME, -1.0)
+        # Of a ball any rates are free ones.
+        found = {name: left if -0.01 < m < 0.8 else np.inf for name, (left, m) in tried.items()}
     else:
         return None
     least = min(found.values())
-    if not least < min(BETTER * as_is, LITTLE):
+    if not least < min(bound, LITTLE):
         return None
     words = " or ".join(name for name, left in found.items() if left <= EQUAL * least)
-    return Cause("misread", "Gyro", None, f"most likely {words}", f"read the log again: {words}")
+    return Cause("misread", "Gyro", 1.0, f"most likely {words}", f"read the log again: {words}")
 
 
 def _of_rates(torque: Any) -> bool:
@@ -78,16 +80,14 @@ def _of_rates(torque: Any) -> bool:
 
 
 def _of_euler(
-    recordings: Sequence[Recording], turn: np.ndarray, sign: float, real: tuple[float, float]
-) -> float:
-    """What Euler's equations leave of the momentum; infinite where no such body fits them."""
+    recordings: Sequence[Recording], turn: np.ndarray, sign: float = 1.0
+) -> tuple[float, float]:
+    """What Euler's equations leave of the momentum, and by how much the best body is one."""
     found = [balance(recording, turn) for recording in recordings]
     matrix, side, momentum = (np.concatenate(part) for part in zip(*found, strict=True))
     components, margin = tensor_and_margin(matrix, sign * side)
     left = np.linalg.norm(matrix @ components - sign * side)
-    # Of a ball any rates are free ones.
-    allowed = real[0] < margin < real[1]
-    return float(left / np.linalg.norm(momentum @ components)) if allowed else np.inf
+    return float(left / np.linalg.norm(momentum @ components)), margin
 
 
 def _of_attitudes(recordings: Sequence[Recording], known: Sequence[Any], turn: np.ndarray) -> float:

@@ -130,7 +130,7 @@ def verdict(fit: Fit) -> str:
     lines = ["status: ok"] if fit.ok else [f"search: {fit.search}", f"model: {fit.model}"]
     lines += [str(cause) for cause in fit.causes] + [fit.advice]
     lines.append(
-        f"starts: {len(good)} of {len(fit.starts)} reached a motion that explains the data"
+        f"starts: {len(good)} of {len(fit.starts)} reached a motion that fits as well as the best"
         + (", all the same one" if fit.ok and len(good) > 1 else "")
     )
     lines += [f"- {line}" for line in fit.identifiability]

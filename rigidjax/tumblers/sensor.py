@@ -59,10 +59,10 @@ class Brightness(AbstractSensor):
     reading_shape: ClassVar[tuple[int, ...]] = ()
     components: ClassVar[int] = 1
     feels: ClassVar[type] = HasAttitude
-    suspect_words: ClassVar[tuple[str, str, str]] = (
+    suspect: ClassVar[tuple[str, str, str]] = (
         "shape",
-        "a shape that is no ellipsoid",
-        "take the intervals of fit_light_curve, which allow for it; the motion may be right",
+        "perhaps a shape that is no ellipsoid: then the motion may be right all the same",
+        "take the intervals of fit_light_curve, which allow for it",
     )
     unit: str = eqx.field(static=True)  # pyright: ignore[reportIncompatibleVariableOverride]
     sun: Any
@@ -117,16 +117,6 @@ class Brightness(AbstractSensor):
         # A body that hides its lit side is not seen: it is fainter than any reading.
         some = relative > 1e-12
         return self.level - 2.5 / math.log(10.0) * jnp.log(jnp.where(some, relative, 1e-12))
-
-    def suspect(self, now: SensorInput) -> Float[Array, "1 6"]:
-        """How the reading changes where the body is no ellipsoid: as if its brightness were more by
-        n·S n, n half way between sun and observer, body frame, for each entry of a symmetric S.
-        """
-        sides = (vector_at(side, now.t, "") for side in (self.sun, self.observer))
-        ways = [side / jnp.sqrt(dot(side, side)) for side in sides]
-        x, y, z = quaternion.rotate_inverse(now.state.q, ways[0] + ways[1])
-        size = self.predicted(now) if self.unit == "flux" else -2.5 / math.log(10.0)
-        return (size * jnp.stack([x * x, y * y, z * z, y * z, z * x, x * y]))[None]
 
     def typical_rate(self, t: np.ndarray, values: np.ndarray) -> float:
         """About how fast the body turns, rad/s: half the strongest frequency of the first 1000."""
