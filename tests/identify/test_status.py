@@ -143,7 +143,7 @@ CAUSES = {
     "axes that are not principal": "axes that are turned",
     "a bias left out": "a bias left out, (0.039, -0.041, 0.053) rad/s",
     "deg/s, a gyro alone": "deg/s read as rad/s",
-    "time stamps that scatter": "time stamps that scatter by 3",
+    "time stamps that scatter": "time stamps that scatter by 42 ms",
     "deg/s read as rad/s": "deg/s read as rad/s",
     "rad/s read as deg/s": "rad/s read as deg/s",
     "signs of all axes": "all signs turned round",
