@@ -160,7 +160,7 @@ def median_of_chi2(size: int) -> tuple[float, float]:
 def _white(e: np.ndarray, kept: np.ndarray, given: bool) -> bool:
     """Whether whitened errors (R, T, k) are white, in all channels together.
 
-    Where the noise is `given`, what is far below it cannot make a fit doubtful.
+    Where the noise is `given`, what is far below it speaks against no fit.
     """
     from scipy.special import chdtrc
 
