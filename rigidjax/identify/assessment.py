@@ -10,7 +10,6 @@ from jax.flatten_util import ravel_pytree
 
 from rigidjax.identify import uncertainty
 from rigidjax.identify.answers import FAILS, FOUND, NOT_ALONE, NOT_ENDED, Answer
-from rigidjax.identify.causes import causes
 from rigidjax.identify.checkpoint import Tried
 from rigidjax.identify.full_scale import at_limit
 from rigidjax.identify.goodness import goodness
@@ -100,8 +99,7 @@ def assess(
         search = Answer(FOUND, tuple(remarks))
     unreal = of_charts(charts(problem), _bodies(problem, value))
     model = Answer(seen.model.word, (*unreal, *seen.model.reasons))
-    whole = np.isfinite(best_cost) and seen.left
-    found = causes(problem, value, noise, linear, seen.left) if whole else ()
+    model = model if np.isfinite(best_cost) else Answer(FAILS)
     return Fit(
         problem,
         value,
@@ -119,5 +117,5 @@ def assess(
         quantities_of(problem, value, spread.seen, spread.null_directions),
         search,
         model,
-        found,
+        seen.left,
     )

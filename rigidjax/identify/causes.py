@@ -93,7 +93,10 @@ def _largest(sensor: Any, rows: Sequence[tuple], shares: Sequence[tuple]) -> Cau
     told = [
         (share, name, words.format(size=", ".join(f"{x:.2g}" for x in size)), remedy)
         for (name, _, words, remedy), (share, size) in zip(rows, shares, strict=True)
-        if name not in LINEAR or np.abs(size).max() < SMALL
+        if name not in LINEAR
+        or np.abs(size).max() < SMALL
+        # A unit: g read as m/s².
+        or (name == "scale" and np.ptp(size) < 0.1 * abs(size.mean()))
     ]
     most = max((share for share, *_ in told), default=0.0)
     if not most > ENOUGH:
@@ -132,8 +135,8 @@ def _table(
          "let a Free move the sensor's offset, or the delay of the torque's log"),
         ("bias", axes, f"a bias left out, ({{size}}) {unit}", "let a Free move the sensor's bias"),
         ("scale", itself,
-         "scales that are off by ({size}) (all alike: also a clock that runs fast or slow)",
-         "let a Free move the sensor's scale"),
+         "scales that are off by ({size}) (all alike: a unit, or a clock that runs fast or slow)",
+         "look at the sensor's unit, or let a Free move its scale"),
         ("drag", response(-itself), "a torque against the rate, such as drag of the air",
          "add a Damping or QuadraticDamping whose coefficient is free"),
         ("wheel", response(turned), "a constant angular momentum inside, such as a wheel's",

@@ -16,7 +16,7 @@ RARE = 1e-5
 # Lags that the test for whiteness looks at.
 LAGS = 10
 # Errors above this share of what varies in the readings (their variance) explain too little.
-HALF, QUARTER = 0.5, 0.25
+HALF, QUARTER, TENTH = 0.5, 0.25, 0.1
 
 
 class Goodness(eqx.Module):
@@ -69,7 +69,7 @@ def goodness(problem: Problem, linear: Linearised, times: Times, free: int) -> G
         if factor == 1.0 and white and small and not late:
             continue
         lasting = max(times.closeness, 0.0) * left
-        missed = left > HALF * varies + tiny or lasting > QUARTER * varies + tiny
+        missed = left > HALF * varies + tiny or lasting > TENTH * varies + tiny
         if missed and (factor > 1.0 or not given):
             word = FAILS
         word = LEAVES if word == EXPLAINS else word

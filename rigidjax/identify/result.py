@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 from rigidjax import _checks
 from rigidjax.identify import answers, identifiability, uncertainty
 from rigidjax.identify.answers import Answer, Cause
+from rigidjax.identify.causes import causes
 from rigidjax.identify.full_scale import at_limit
 from rigidjax.identify.parameters import Parameters
 from rigidjax.identify.problem import Problem
@@ -50,8 +51,8 @@ class Fit(eqx.Module):
     the whitened Jacobian, its columns of length one; `null_directions` (k, n) that the data do not
     determine; `quantities` all that is reported, by name; `search` the first answer, whose `word`
     is `found`, `not alone` or `not ended`; `model` the second one: `explains the readings`,
-    `leaves a part`, `does not explain the readings`; `causes` what most likely makes the errors
-    that are left, where that shows.
+    `leaves a part`, `does not explain the readings`; `left` the indices of the sensors whose errors
+    it does not explain.
 
     >>> import jax.numpy as jnp, rigidjax as rj
     >>> ts = jnp.linspace(0.0, 10.0, 80)
@@ -78,7 +79,7 @@ class Fit(eqx.Module):
     quantities: tuple[Quantity, ...]
     search: Answer
     model: Answer
-    causes: tuple[Cause, ...]
+    left: tuple[int, ...]
 
     @property
     def status(self) -> str:
@@ -89,6 +90,14 @@ class Fit(eqx.Module):
     def ok(self) -> bool:
         """Whether the fit converged, explains the data, and is the only one that does."""
         return self.status == "ok"
+
+    @property
+    def causes(self) -> tuple[Cause, ...]:
+        """What most likely makes the errors that are left, where that shows."""
+        if not self.left:
+            return ()
+        linear = uncertainty.linearise(self.problem, self.parameters, self.noises)
+        return causes(self.problem, self.parameters, self.noises, linear, self.left)
 
     @property
     def advice(self) -> str:

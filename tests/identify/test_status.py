@@ -89,6 +89,16 @@ def scattered(sigma=0.04):
     return shown[np.argsort(order)]
 
 
+def weighed(unit):
+    """A gyro and an accelerometer whose readings are in `unit` m/s²."""
+    sensors = identify.Gyro(SIGMA), identify.Accelerometer(0.02, place=[0.3, 0.0, 0.1])
+    start = rj.Spin(list(OMEGA))
+    read = identify.simulate_readings(sensors, BODY, start, TS, key=jax.random.key(0))
+    unknown = identify.Accelerometer(place=[0.3, 0.0, 0.1])
+    record = identify.Recording(TS, (sensors[0], read[0]), (unknown, read[1] / unit))
+    return identify.fit(identify.Problem(record, identify.PrincipalRatios()), starts=2)
+
+
 def still(momentum=0.1):
     """A wheel of constant speed."""
     speed = rj.torques.Series(np.linspace(-1.0, 11.0, 4), np.ones(4))
@@ -124,6 +134,7 @@ WRONG = {
     "a bias that drifts": lambda: both(*drifting()),
     "random readings": lambda: gyro(np.random.default_rng(1).normal(size=(80, 3)), noise=None),
     "the wheel not named": lambda: gyro(tumble(law=WHEEL)[0], noise=None),
+    "g read as m/s²": lambda: weighed(9.81),
     "a still wheel not named": lambda: gyro(tumble(law=still())[0], noise=None),
     "an axis mirrored beside a wheel": lambda: wheel(tumble(law=WHEEL)[0] * [1, -1, 1], WHEEL),
     "the wheel the other way": lambda: wheel(tumble(law=WHEEL)[0], law(-0.6)),
@@ -156,6 +167,7 @@ CAUSES = {
     "gyro turned by 6 degrees": "axes that are turned",
     "one scale 5 % off": "scales that are off by (0.048,",
     "a bias that drifts": "a bias that drifts by (0.0099, -0.01, 0.005)",
+    "g read as m/s²": "scales that are off by (-0.9, -0.89, -0.9)",
     "a still wheel not named": "a constant angular momentum",
     "an axis mirrored beside a wheel": "the y axis mirrored",
     "the wheel the other way": "the torque with the other sign",
