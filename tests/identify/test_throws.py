@@ -50,6 +50,30 @@ def test_no_throw_diverges_from_a_blind_start(found, model):
         assert "does not explain the readings" not in {f.model.word for f in found[group][model]}
 
 
+def test_a_right_throw_has_no_cause_of_its_errors_and_one_read_wrong_has_its_own(found, model):
+    for group in GROUPS:
+        assert not any(f.causes for f in found[group][model])
+    # Without drag most throws of the lighter object say what is missing.
+    names = [cause.name for f in found["object_empty"]["delay"] for cause in f.causes]
+    assert sum("drag" in name for name in names) >= 6
+    right = throws.record(throws.FOLDER / "object_empty_log00179.csv")
+
+    def changed(where, change):
+        record = eqx.tree_at(where, right, replace_fn=change)
+        (cause,) = identify.fit(throws.problem([record], model), starts=1).causes
+        return cause.words
+
+    def rates(r):
+        return r.readings[0].values
+
+    words = changed(lambda r: r.torque.parts[0].momentum.inertia, lambda x: -x)
+    assert words == "most likely the torque with the other sign"
+    assert changed(rates, np.degrees) == "most likely deg/s read as rad/s"
+    words = changed(rates, lambda w: w * np.array([1.0, -1.0, 1.0]))
+    assert "the y axis mirrored" in words and "z" not in words
+    assert changed(rates, lambda w: w[:, [0, 2, 1]]) == "most likely y and z swapped"
+
+
 def test_the_calibration_reproduces_the_proof_body(found, model):
     _, moments = throws.calibrate(*(found[g][model] for g in GROUPS[:2]))
     print("proof body", moments, moments / throws.PROOF_MOMENTS - 1)
