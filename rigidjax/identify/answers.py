@@ -7,6 +7,9 @@ FOUND, NOT_ALONE, NOT_ENDED = "found", "not alone", "not ended"
 # Of the model.
 EXPLAINS, LEAVES, FAILS = "explains the readings", "leaves a part", "does not explain the readings"
 
+# No sensor is worse than its noise by more than this factor.
+FAR = 3.0
+
 
 class Answer(eqx.Module):
     """A `word`, and the `reasons` for it in words; printed as `word (reason; reason)`.
@@ -50,8 +53,13 @@ def status(search: Answer, model: Answer) -> str:
     return f"search: {search}; model: {model}"
 
 
-def advice(search: Answer, model: Answer, causes: tuple[Cause, ...], kind: str) -> str:
-    """Whether the intervals can be trusted, and what to try; `kind` is that of the covariance."""
+def advice(
+    search: Answer, model: Answer, causes: tuple[Cause, ...], kind: str, above: float
+) -> str:
+    """Whether the intervals can be trusted, and what to try.
+
+    **Arguments:** `kind` of the covariance; `above`, the errors over the noise that was given.
+    """
     remedies = list(dict.fromkeys(cause.remedy for cause in causes))
     tries = f" Try: {'; '.join(remedies)}." if remedies else ""
     if model.word == FAILS:
@@ -73,6 +81,8 @@ def advice(search: Answer, model: Answer, causes: tuple[Cause, ...], kind: str) 
             "The intervals cannot be trusted: they take the errors for chance, and most of them "
             f"have one cause.{tries}"
         )
+    if above > FAR:
+        return f"The intervals cannot be trusted: the sensors make no errors of this size.{tries}"
     if model.word == LEAVES:
         allowed = "allow" if kind.startswith("sandwich") else "do not allow"
         return (

@@ -47,7 +47,8 @@ def misread(recordings: Sequence[Recording]) -> Cause | None:
     equations, integrated over the record, for the body that fits them best: rates count only where
     that is a real one. Without a torque a mirrored axis leaves no trace.
     """
-    if not readings_of(recordings[0], Gyro):
+    gyros = readings_of(recordings[0], Gyro)
+    if not gyros or not _as_the_body(gyros[0].sensor):
         return None
     known = [attitudes(recording) for recording in recordings]
     if all(len(t) > 10 for t, _ in known):
@@ -72,6 +73,12 @@ def misread(recordings: Sequence[Recording]) -> Cause | None:
         return None
     words = " or ".join(name for name, left in found.items() if left <= EQUAL * least)
     return Cause("misread", "Gyro", 1.0, f"most likely {words}", f"read the log again: {words}")
+
+
+def _as_the_body(gyro: Gyro) -> bool:
+    """Whether a gyro's axes and scales are said to be about those of the body."""
+    turn, scale = (np.asarray(0.0 if x is None else x) for x in (gyro.mounting, gyro.scale))
+    return bool(np.abs(turn).max() < 0.1 and (gyro.scale is None or np.abs(scale - 1).max() < 0.1))
 
 
 def _of_rates(torque: Any) -> bool:

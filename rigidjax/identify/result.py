@@ -102,7 +102,9 @@ class Fit(eqx.Module):
     @property
     def advice(self) -> str:
         """Whether the intervals can be trusted, and what to try."""
-        return answers.advice(self.search, self.model, self.causes, self.covariance_kind)
+        # Under a robust loss χ² is the outliers'.
+        above = np.sqrt(self.chi2 / self.dof) if self.problem.loss is None else 1.0
+        return answers.advice(self.search, self.model, self.causes, self.covariance_kind, above)
 
     def __str__(self) -> str:
         from rigidjax.identify import report

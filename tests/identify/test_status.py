@@ -255,6 +255,14 @@ def test_free_rates_do_not_show_a_mirrored_axis(sign):
     assert found.ok and any("cannot show such a mistake" in line for line in found.identifiability)
 
 
+@pytest.mark.slow
+def test_axes_that_are_known_to_be_turned_are_not_called_misread():
+    rates, turns = drifting()
+    back = np.asarray(rj.so3.exp(jnp.array([0.0, 0.0, -np.pi / 2])))
+    found = both(rates @ back.T, turns, mounting=[0.0, 0.0, np.pi / 2])
+    assert found.causes[0].name == "drift"
+
+
 def test_a_plateau_is_one_only_where_readings_are_cut_off():
     t = np.linspace(0.0, 10.0, 200)
     wave = np.sin(2 * t) + 0.3 * np.sin(5 * t)
