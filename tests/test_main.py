@@ -180,13 +180,15 @@ def test_numbers_that_are_none_are_written_all_the_same(found, tmp_path):
 def test_ctrl_c_is_said_and_is_the_exit_code(folder, found, monkeypatch, capsys):
     import equinox as eqx
 
-    status = "doubtful: interrupted after 1 of 8 starts"
-    cut = eqx.tree_at(lambda f: f.status, found, status)
+    search = rj.identify.Answer("found", ("interrupted after 1 of 8 starts",))
+    cut = eqx.tree_at(lambda f: f.search, found, search)
     monkeypatch.setattr(rj.identify, "fit", lambda *_, **__: cut)
     assert main(["identify", "log.csv", "--json", "n.json"]) == 130
     out = capsys.readouterr()
-    assert status in out.out and "interrupted" in out.err
-    assert json.loads(Path("n.json").read_text())["status"] == status
+    assert f"search: {search}" in out.out and "interrupted" in out.err
+    held = json.loads(Path("n.json").read_text())
+    assert held["search"] == {"answer": "found", "reasons": ["interrupted after 1 of 8 starts"]}
+    assert held["status"] == cut.status
 
     def at_once(*_, **__):
         raise KeyboardInterrupt

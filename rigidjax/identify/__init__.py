@@ -2,6 +2,7 @@
 
 from rigidjax._names import show
 from rigidjax.identify import report as report
+from rigidjax.identify.answers import Answer as Answer, Cause as Cause
 from rigidjax.identify.body_charts import (
     AbstractBodyChart as AbstractBodyChart,
     Known as Known,

@@ -9,6 +9,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from rigidjax.identify import flat_limit, uncertainty
+from rigidjax.identify.answers import FAILS, FOUND, NOT_ALONE, NOT_ENDED, Answer
 from rigidjax.identify.checkpoint import Tried
 from rigidjax.identify.full_scale import at_limit
 from rigidjax.identify.goodness import goodness
@@ -72,7 +73,7 @@ def assess(
     done = bool(best.converged) or uncertainty.distance(linear, white, held) < AT_THE_END
     free = ravel_pytree(value)[0].size
     seen = goodness(problem, linear, times, free)
-    believable = not seen.poor
+    believable = seen.model.word != FAILS
     margin = _margin(problem, best_cost, times.longest)
 
     def elsewhere(other: Parameters) -> bool:
@@ -92,25 +93,22 @@ def assess(
         for s in starts
         if s.fits and s.converged and s.cost > best_cost + 0.01 * margin and elsewhere(s.parameters)
     ]
-    doubts = [*interrupted, *seen.doubts]
-    unreal = of_charts(charts(problem), _bodies(problem, value))
-    doubts += unreal
-    if not any(start.fits for start in starts):
-        doubts.append("no single start came near the best point")
+    remarks = list(interrupted)
+    if not any(start.fits for start in starts) and believable:
+        remarks.append("no single start came near the best point")
     if not np.isfinite(best_cost):
-        words = "failed", "no start gave a finite misfit"
-    elif not believable:
-        units = "this is not the motion, or a unit is wrong (rad/s, m/s², m, s)"
-        words = "poor", *interrupted, *seen.poor, *unreal, units
+        search = Answer(NOT_ENDED, ("no start gave a finite misfit",))
     elif not done:
-        why = "; ".join(interrupted) or "max_steps reached"
-        words = "failed", f"not converged, {why}; this is the best point found", *unreal
+        why = interrupted or ("max_steps reached",)
+        search = Answer(NOT_ENDED, (*why, "this is the best point found"))
     elif rivals:
         rival = f"{len(rivals)} of {len(starts)} starts fit as well elsewhere"
-        words = "ambiguous", rival, *doubts
+        search = Answer(NOT_ALONE, (rival, *remarks))
     else:
-        words = ("doubtful", *doubts) if doubts else ("ok",)
-    status = ": ".join((words[0], "; ".join(words[1:]))) if len(words) > 1 else words[0]
+        search = Answer(FOUND, tuple(remarks))
+    unreal = of_charts(charts(problem), _bodies(problem, value))
+    model = Answer(seen.model.word, (*unreal, *seen.model.reasons))
+    model = model if np.isfinite(best_cost) else Answer(FAILS)
     return Fit(
         problem,
         value,
@@ -126,7 +124,9 @@ def assess(
         jnp.asarray(spread.singular_values),
         jnp.asarray(spread.null_directions),
         quantities_of(problem, numbers, spread.seen, spread.null_directions, limits),
-        status,
+        search,
+        model,
+        seen.left,
         limits,
         near,
     )

@@ -65,7 +65,11 @@ def _nearest(body: ArrayLike, world: ArrayLike) -> Array:
 
 def rates(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
     """Times (n,), s, and body rates (n, 3), rad/s, between attitudes; n may be 0."""
-    t, q = attitudes(recording)
+    return rates_of(*attitudes(recording))
+
+
+def rates_of(t: np.ndarray, q: np.ndarray | Array) -> tuple[np.ndarray, np.ndarray]:
+    """The same of attitudes (n, 4) at times (n,)."""
     if t.size < 2:
         return np.zeros(0), np.zeros((0, 3))
     turned = np.concatenate([[0.0], np.cumsum(np.linalg.norm(_turns(q[:-1], q[1:]), axis=1))])

@@ -86,11 +86,13 @@ def fit(
       the same point to the last bit, wherever the first was killed. `together` = 1 only.
     - `progress`: called with a line of text after each start, such as `print`.
 
-    **Returns** a `Fit`. It always holds the best point that was reached; `fit.status` says in words
-    when that is not to be trusted: `doubtful` (errors that are autocorrelated, above the noise, or
-    a large share of the readings), `ambiguous` (another motion fits as well), `poor` (this is not
-    the motion), `failed` (not converged). Interrupting (Ctrl-C)
-    ends the search and keeps what was found; the status says so, and is not `ok`.
+    **Returns** a `Fit`. It always holds the best point that was reached, and two answers.
+    `fit.search`: `found`, `not alone` (another motion fits as well), or `not ended`. `fit.model`:
+    `explains the readings` (the errors are white and of the sensor's size), `leaves a part` (how
+    large, and where), or `does not explain the readings`. `fit.causes` names what most likely makes
+    the errors that are left, `fit.advice` says whether the intervals can be trusted and what to
+    try, `fit.status` is both answers in a line, `ok` where all is well. Interrupting (Ctrl-C) ends
+    the search and keeps what was found; the status says so, and is not `ok`.
 
     Levenberg–Marquardt on normal equations, Jacobians by forward mode through the motion.
 

@@ -5,6 +5,8 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
+from rigidjax.identify.answers import EXPLAINS, FAILS, LEAVES, Answer
+from rigidjax.identify.causes import clock
 from rigidjax.identify.full_scale import at_limit
 from rigidjax.identify.problem import Problem
 from rigidjax.identify.uncertainty import Linearised, Times, scatter
@@ -14,26 +16,24 @@ RARE = 1e-5
 # Lags that the test for whiteness looks at.
 LAGS = 10
 # Errors above this share of what varies in the readings (their variance) explain too little.
-HALF, QUARTER = 0.5, 0.25
-# Above the noise by more than this factor the motion is another one.
-FAR = 3.0
+HALF, QUARTER, TENTH = 0.5, 0.25, 0.1
 
 
 class Goodness(eqx.Module):
     """How well the errors agree with what the sensors can do.
 
-    **Fields:** `chi2`, `dof` of the sensors whose noise was given; `poor` and `doubts` in words:
-    what shows that this is not the motion, and what makes it doubtful.
+    **Fields:** `chi2`, `dof` of the sensors whose noise was given; `model` the answer; `left` the
+    indices of the sensors whose errors the model does not explain.
     """
 
     chi2: float
     dof: int
-    poor: tuple[str, ...]
-    doubts: tuple[str, ...]
+    model: Answer
+    left: tuple[int, ...]
 
 
 def goodness(problem: Problem, linear: Linearised, times: Times, free: int) -> Goodness:
-    """χ² of the sensors with a given noise, and what speaks against the fit.
+    """χ² of the sensors with a given noise, and what the model leaves in the errors.
 
     For each sensor: the size of its errors against the noise, where that was given (five standard
     deviations of χ², or under a robust loss of the median of the squared errors), and against what
@@ -45,46 +45,82 @@ def goodness(problem: Problem, linear: Linearised, times: Times, free: int) -> G
 
     Source: Ljung and Box 1978, doi:10.1093/biomet/65.2.297.
     """
-    chi2, count = 0.0, 0
-    poor: list[str] = []
-    doubts: list[str] = []
+    chi2, count, word = 0.0, 0, EXPLAINS
+    words: list[str] = []
+    sensors: list[int] = []
     cut = at_limit(problem.records.readings)
-    for reading, error, e, weight, full in zip(
-        problem.records.readings, linear.raw, linear.errors, linear.weights, cut, strict=True
+    for index, (reading, error, e, weight, full) in enumerate(
+        zip(problem.records.readings, linear.raw, linear.errors, linear.weights, cut, strict=True)
     ):
-        name = f"the errors of the {type(reading.sensor).__name__}"
-        kept = (weight > 0)[..., None] & ~full
-        left, varies, tiny = _sizes(reading, np.asarray(error), kept)
-        if reading.sensor.noise is None:
-            if left > HALF * varies + tiny:
-                poor.append(f"{name} are as large as the variation of its readings")
-            elif left > QUARTER * varies + tiny:
-                doubts.append(
-                    f"{name} are {np.sqrt(left / varies):.0%} of the variation of its readings"
-                )
-            elif max(times.closeness, 0.0) * left > 0.1 * varies + tiny:
-                poor.append(f"{name} are large and autocorrelated")
-        else:
+        kept, given = (weight > 0)[..., None] & ~full, reading.sensor.noise is not None
+        left, varies, tiny = _sizes(reading, error, kept)
+        factor = 1.0
+        if given:
             own, many = float(np.sum((weight[..., None] * e**2)[kept])), int(kept.sum())
             chi2, count = chi2 + own, count + many
-            if problem.loss is None or not many:
-                factor = _above(own, many, free)
-            else:
+            factor = _above(own, many, free)
+            if problem.loss is not None and many:
                 rows = kept.all(axis=-1) & (weight > 0)
                 factor = _median_above(np.sum(e[rows] ** 2, axis=-1), e.shape[-1])
-            if factor > FAR:
-                poor.append(f"{name} are {factor:.3g} times the noise")
-            elif factor > 1.0:
-                doubts.append(f"{name} are {factor:.3g} times the noise")
-        given = reading.sensor.noise is not None
-        if not _white(e * np.sqrt(weight)[..., None], kept, given) and left > tiny:
-            size = _over_scatter(np.asarray(error), kept)
-            doubts.append(
-                f"{name} are autocorrelated over {times.longest:.0f} samples, {size:.3g} times "
-                "their scatter from one reading to the next (something is missing in the model, "
-                "or the data were filtered)"
-            )
-    return Goodness(chi2, max(count - free, 1), tuple(poor), tuple(doubts))
+        white = left <= tiny or _white(e * np.sqrt(weight)[..., None], kept, given)
+        late = left > tiny and clock(problem, linear, index) is not None
+        # What is below a noise that was given has nothing that could be missed.
+        small = given or left <= QUARTER * varies + tiny
+        if factor == 1.0 and white and small and not late:
+            continue
+        lasting = max(times.closeness, 0.0) * left
+        missed = left > HALF * varies + tiny or lasting > TENTH * varies + tiny
+        if missed and (factor > 1.0 or not given):
+            word = FAILS
+        word = LEAVES if word == EXPLAINS else word
+        sensors.append(index)
+        share = left / varies if varies > tiny and _differences(reading) else None
+        span = None if white else times.longest
+        words.append(_in_words(problem, reading, error, kept, factor, share, span))
+    return Goodness(chi2, max(count - free, 1), Answer(word, tuple(words)), tuple(sensors))
+
+
+def _differences(reading: Any) -> bool:
+    """Whether an error has as many numbers as a reading, and so its unit."""
+    return int(np.prod(reading.sensor.reading_shape)) == reading.sensor.components
+
+
+def _in_words(
+    problem: Problem,
+    reading: Any,
+    error: np.ndarray,
+    kept: np.ndarray,
+    factor: float,
+    share: float | None,
+    span: float | None,
+) -> str:
+    """How large errors are and where; `share` of what varies, `span` of samples if not white."""
+    sensor, many = reading.sensor, max(int(kept.any(axis=-1).sum()), 1)
+    size = np.sqrt(np.sum(error[kept] ** 2) / many)
+    words = [f"the errors of the {type(sensor).__name__} are {size:.3g} {sensor.unit}"]
+    if share is not None:
+        words.append(f"{100 * np.sqrt(share):.2g} % of what varies in its readings")
+    if factor > 1.0:
+        words.append(f"{factor:.3g} times the noise")
+    if span is not None:
+        words.append(f"{_over_scatter(error, kept):.3g} times their scatter between neighbours")
+        words.append(f"autocorrelated over {span:.0f} samples")
+    return f"{', '.join(words)}, {_where(problem, error, kept)}"
+
+
+def _where(problem: Problem, error: np.ndarray, kept: np.ndarray) -> str:
+    """The shortest time in which half of the squared errors are."""
+    squares = np.sum(np.where(kept, error, 0.0) ** 2, axis=-1)
+    row = int(np.argmax(squares.sum(axis=1)))
+    count = problem.counts[row]
+    t, total = np.asarray(problem.records.t)[row, :count], np.cumsum(squares[row, :count])
+    last = np.searchsorted(total, total - squares[row, :count] + 0.5 * total[-1])
+    first = int(np.argmin(np.where(last < count, t[np.minimum(last, count - 1)] - t, np.inf)))
+    begin, end = t[first], t[min(last[first], count - 1)]
+    if end - begin > 0.4 * (t[-1] - t[0]):
+        return "all along"
+    of = f" of recording {row}" if problem.count > 1 else ""
+    return f"half of the squared ones from {begin:.4g} to {end:.4g} s{of}"
 
 
 def _sizes(reading: Any, error: np.ndarray, kept: np.ndarray) -> tuple[float, float, float]:
@@ -124,7 +160,7 @@ def median_of_chi2(size: int) -> tuple[float, float]:
 def _white(e: np.ndarray, kept: np.ndarray, given: bool) -> bool:
     """Whether whitened errors (R, T, k) are white, in all channels together.
 
-    Where the noise is `given`, what is far below it cannot make a fit doubtful.
+    Where the noise is `given`, what is far below it speaks against no fit.
     """
     from scipy.special import chdtrc
 

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
+from rigidjax.identify.answers import FAILS, NOT_ENDED
 from rigidjax.identify.full_scale import in_words
 from rigidjax.identify.quantities import (
     Quantity,
@@ -14,6 +15,7 @@ from rigidjax.identify.quantities import (
     covariance as reported_covariance,
     quantile,
 )
+from rigidjax.identify.sensors import Gyro
 from rigidjax.identify.several_bodies import Bodies, tensor_of
 from rigidjax.identify.undetermined import SEVERAL, undetermined
 
@@ -26,15 +28,15 @@ def identifiability(fit: "Fit") -> tuple[str, ...]:
 
     Of a fit that does not explain them, or did not end, nothing is called determined.
     """
-    word = fit.status.partition(":")[0]
-    if word in ("poor", "failed"):
-        why = "does not explain the data" if word == "poor" else "did not end in a minimum"
+    lost = fit.model.word == FAILS
+    if lost or fit.search.word == NOT_ENDED:
+        why = "does not explain the data" if lost else "did not end in a minimum"
         out = [
             f"This fit {why}, so that nothing is determined by it: its numbers and intervals are "
             "those of the best point found, and say nothing about the body."
         ]
         # A search that did not end may have wandered along what the data do not determine.
-        out += _unseen(fit) if word == "failed" else []
+        out += [] if lost else _unseen(fit)
         return (*out, *in_words(fit.problem.records.readings))
     reach = quantile(fit, 0.95)
     out = []
@@ -59,12 +61,12 @@ def identifiability(fit: "Fit") -> tuple[str, ...]:
             "Free motion cannot show the absolute inertia, only ratios of moments; nor the mass or "
             "the centre of mass."
         )
+        if all(isinstance(sensor, Gyro) for sensor in fit.problem.records.sensors):
+            out.append(
+                "Rates of free motion fit as well with an axis mirrored or two swapped, by another "
+                "body: they cannot show such a mistake."
+            )
     out += in_words(fit.problem.records.readings)
-    if fit.correlation > 1.5:
-        out.append(
-            f"The errors are autocorrelated over {fit.correlation:.0f} samples, so something is "
-            "missing in the model or the data were filtered; the intervals allow for it."
-        )
     return tuple(out)
 
 

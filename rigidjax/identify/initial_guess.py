@@ -79,15 +79,10 @@ def regress_inertia(recordings: tuple[Recording, ...]) -> Inertia | None:
         found.append(_equations(recording))
         if found[-1] is None:
             return None
-    matrix, side = (np.concatenate(part) for part in zip(*found, strict=True))
-    if not np.abs(side).max() > 0:
-        components = np.linalg.svd(matrix, full_matrices=False)[2][-1]
-        components = components * np.sign(components[:3].sum())
-        components = components / components[:3].sum()
-    else:
-        components = np.linalg.lstsq(matrix, side, rcond=None)[0]
-        if not components[:3].sum() > 0:
-            return None
+    matrix, side, _ = (np.concatenate(part) for part in zip(*found, strict=True))
+    components, _ = tensor_and_margin(matrix, side)
+    if not components[:3].sum() > 0:
+        return None
     tensor = np.einsum("k,kij->ij", components, BASIS)
     values, axes = np.linalg.eigh(0.5 * np.trace(tensor) * np.eye(3) - tensor)
     values = np.maximum(values, 1e-2 * values.max())
@@ -95,30 +90,62 @@ def regress_inertia(recordings: tuple[Recording, ...]) -> Inertia | None:
     return Inertia(jnp.asarray(np.trace(second_moment) * np.eye(3) - second_moment))
 
 
-def _equations(recording: Recording) -> tuple[np.ndarray, np.ndarray] | None:
-    """Rows (n, 6) and right sides (n,) of the integral of Euler's equations over one recording."""
-    gyro = readings_of(recording, Gyro)
-    if gyro:
-        seen = gyro[0].seen
-        t, w = np.asarray(recording.t)[seen], np.asarray(gyro[0].values)[seen]
+def tensor_and_margin(matrix: np.ndarray, side: np.ndarray) -> tuple[np.ndarray, float]:
+    """The six components of I that rows (n, 6) fit best, and how real a body it is.
+
+    Above zero for a real one: the least eigenvalue of its second moment over the largest. Where the
+    right sides (n,) are zero, components whose trace is one.
+    """
+    if np.abs(side).max() > 0:
+        components = np.linalg.lstsq(matrix, side, rcond=None)[0]
     else:
-        t, w = rates(recording)
+        components = np.linalg.svd(matrix, full_matrices=False)[2][-1]
+        components = components * np.sign(components[:3].sum())
+        components = components / components[:3].sum()
+    tensor = np.einsum("k,kij->ij", components, BASIS)
+    values = np.linalg.eigvalsh(0.5 * np.trace(tensor) * np.eye(3) - tensor)
+    return components, float(values[0] / max(np.abs(values).max(), 1e-300))
+
+
+def _equations(recording: Recording) -> tuple[np.ndarray, ...] | None:
+    """As `balance`; `None` where rates came too seldom, or the torque needs more than a rate."""
+    t, w = _rates(recording)
     if t.size < 10 or np.median(np.diff(t)) * np.linalg.norm(w, axis=1).max() > 0.5:
         return None
-    pushed = np.zeros((t.size, 3))
     if recording.torque is not None:
         felt: Any = getattr(recording.torque, "feels", None)
         if felt is not HasSpin or has_states(recording.torque):
             return None
+    return balance(recording, np.eye(3))
+
+
+def _rates(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
+    """Times and rates of the gyro, or else of attitudes."""
+    gyro = readings_of(recording, Gyro)
+    if not gyro:
+        return rates(recording)
+    return np.asarray(recording.t)[gyro[0].seen], np.asarray(gyro[0].values)[gyro[0].seen]
+
+
+def balance(recording: Recording, turn: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The integral of Euler's equations over one recording: rows (n, 6), right sides (n,).
+
+    And the rows of the momentum itself. The rates are taken as `turn` (3, 3) times what was read.
+    """
+    t, w = _rates(recording)
+    w, pushed = w @ turn.T, np.zeros((t.size, 3))
+    if recording.torque is not None:
         pushed = np.asarray(_torques(recording.torque, t, w))
-    stride = max(1, t.size // 60)
     momenta = np.einsum("kij,tj->tki", BASIS, w)
-    flux = np.cross(w[:, None, :], momenta)
-    total = momenta + _integral(flux, t)
-    # What is conserved is constant: compare with its mean over the record.
-    impulse = _integral(pushed[:, None, :], t)[:, 0]
-    rows = (total - total.mean(axis=0))[::stride].transpose(0, 2, 1).reshape(-1, 6)
-    return rows, (impulse - impulse.mean(axis=0))[::stride].reshape(-1)
+    total = momenta + _integral(np.cross(w[:, None, :], momenta), t)
+    impulse = _integral(pushed[:, None, :], t)
+
+    def about_the_mean(x: np.ndarray) -> np.ndarray:
+        # What is conserved is constant: compare with its mean over the record.
+        some = (x - x.mean(axis=0))[:: max(1, t.size // 60)]
+        return some.transpose(0, 2, 1).reshape(-1, x.shape[1])
+
+    return about_the_mean(total), about_the_mean(impulse)[:, 0], about_the_mean(momenta)
 
 
 @eqx.filter_jit

@@ -127,9 +127,10 @@ def verdict(fit: Fit) -> str:
     """
     one_fit(fit)
     good = [start for start in fit.starts if start.converged and start.fits]
-    lines = [f"status: {fit.status}"]
+    lines = ["status: ok"] if fit.ok else [f"search: {fit.search}", f"model: {fit.model}"]
+    lines += [str(cause) for cause in fit.causes] + [fit.advice]
     lines.append(
-        f"starts: {len(good)} of {len(fit.starts)} reached a motion that explains the data"
+        f"starts: {len(good)} of {len(fit.starts)} reached a motion that fits as well as the best"
         + (", all the same one" if fit.ok and len(good) > 1 else "")
     )
     lines += [f"- {line}" for line in fit.identifiability]
@@ -159,6 +160,19 @@ def as_dict(fit: Fit, files: Sequence[str] = (), more: Sequence[Row] = ()) -> di
     return {
         "files": list(files),
         "status": fit.status,
+        "search": {"answer": fit.search.word, "reasons": list(fit.search.reasons)},
+        "model": {"answer": fit.model.word, "reasons": list(fit.model.reasons)},
+        "causes": [
+            {
+                "name": cause.name,
+                "sensor": cause.sensor,
+                "share": cause.share,
+                "words": cause.words,
+                "remedy": cause.remedy,
+            }
+            for cause in fit.causes
+        ],
+        "advice": fit.advice,
         "quantities": {
             name: {"value": plain(value), "interval_95": [plain(low), plain(high)], "unit": unit}
             for name, value, low, high, unit in (*found, *more)
@@ -262,11 +276,6 @@ def write_html(
     '<!doctype html>'
     """
     one_fit(fit)
-    lines = _cells(
-        (name, (shown := numbers(*three))[0], _between(shown), unit)
-        for name, *three, unit in (*rows(fit, rate_unit), *more)
-    )
-    words = "".join(f"<li>{html.escape(line)}</li>" for line in fit.identifiability)
     sizes = _cells(
         (name, " ".join(f"{x:.3g}" for x in axes), unit) for name, axes, unit in _rms_of_axes(fit)
     )
@@ -284,7 +293,6 @@ def write_html(
         for index, figure in enumerate(figures, 1)
     )
     read = ", ".join(html.escape(str(name)) for name in files)
-    colour = "#009E73" if fit.ok else "#D55E00"
     page = f"""<!doctype html>
 <html lang="en"><meta charset="utf-8"><title>{html.escape(title)}</title>
 <style>
@@ -292,20 +300,43 @@ body {{ font: 15px/1.5 system-ui, sans-serif; max-width: 62rem; margin: 2rem aut
 padding: 0 1rem }}
 table {{ border-collapse: collapse }} td, th {{ padding: .2rem .8rem; text-align: left;
 border-bottom: 1px solid #ddd; font-variant-numeric: tabular-nums }}
-img {{ max-width: 100%; margin: 1rem 0 }} .status {{ color: {colour}; font-weight: 600 }}
+img {{ max-width: 100%; margin: 1rem 0 }}
 </style>
 <h1>{html.escape(title)}</h1>
 <p>{read}</p>
-<p class="status">{html.escape(fit.status)}</p>
-<table><tr><th></th><th>value</th><th>95 % interval</th><th>unit</th></tr>{lines}</table>
-<p>Covariance: {html.escape(fit.covariance_kind)}.</p>
-<ul>{words}</ul>
+{as_html(fit, rate_unit, more)}
 <table><tr><th>sensor</th><th>rms error an axis</th><th>unit</th></tr>{sizes}</table>
 <table><tr><th>start</th><th>misfit</th><th></th><th></th></tr>{starts}</table>
 {pictures}
 </html>
 """
     Path(path).write_text(page, encoding="utf-8", errors="backslashreplace")
+
+
+def as_html(fit: Fit, rate_unit: str = "rad/s", more: Sequence[Row] = ()) -> str:
+    """Status, table and words as HTML, for a page or a notebook.
+
+    **Arguments:** `fit`; `rate_unit` as for `rows`; `more` rows of further quantities.
+
+    >>> import jax.numpy as jnp, rigidjax as rj
+    >>> ts = jnp.linspace(0.0, 10.0, 80)
+    >>> motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1, 0.1, 1.0]), ts)
+    >>> record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), motion.ys.omega))
+    >>> found = rj.identify.fit(rj.identify.Problem(record, rj.identify.PrincipalRatios()))
+    >>> as_html(found).startswith("<p") and "Ix/Iz" in as_html(found)
+    True
+    """
+    lines = _cells(
+        (name, (shown := numbers(*three))[0], _between(shown), unit)
+        for name, *three, unit in (*rows(fit, rate_unit), *more)
+    )
+    head, *words = verdict(fit).splitlines()
+    said = "".join(f"<li>{html.escape(line.removeprefix('- '))}</li>" for line in words)
+    colour = "#009E73" if fit.ok else "#D55E00"
+    return f"""<p style="color: {colour}; font-weight: 600">{html.escape(head)}</p>
+<table><tr><th></th><th>value</th><th>95 % interval</th><th>unit</th></tr>{lines}</table>
+<p>Covariance: {html.escape(fit.covariance_kind)}.</p>
+<ul>{said}</ul>"""
 
 
 def _cells(lines: Iterable[tuple[str, ...]]) -> str:

@@ -8,7 +8,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from rigidjax import _checks
-from rigidjax.identify import identifiability, uncertainty
+from rigidjax.identify import answers, identifiability, uncertainty
+from rigidjax.identify.answers import Answer, Cause
+from rigidjax.identify.causes import causes
 from rigidjax.identify.flat_limit import Limit
 from rigidjax.identify.full_scale import at_limit
 from rigidjax.identify.parameters import Parameters
@@ -48,9 +50,11 @@ class Fit(eqx.Module):
     whose noise was given; `correlation` over how many samples the errors are autocorrelated, 1 for
     white ones, and `independent` how many independent ones that leaves; `singular_values` (n,) of
     the whitened Jacobian, its columns of length one; `null_directions` (k, n) that the data do not
-    determine; `quantities` all that is reported, by name; `status` one line: `ok`, or `doubtful`,
-    `ambiguous`, `poor`, `failed`, a colon and the reasons; `limits` how far each body is from the
-    flat ones; `near` where a flat body made the derivatives be taken, else `None`.
+    determine; `quantities` all that is reported, by name; `search` the first answer, whose `word`
+    is `found`, `not alone` or `not ended`; `model` the second one: `explains the readings`,
+    `leaves a part`, `does not explain the readings`; `left` the indices of the sensors whose errors
+    it does not explain; `limits` how far each body is from the flat ones; `near` where a flat body
+    made the derivatives be taken, else `None`.
 
     >>> import jax.numpy as jnp, rigidjax as rj
     >>> ts = jnp.linspace(0.0, 10.0, 80)
@@ -75,9 +79,16 @@ class Fit(eqx.Module):
     singular_values: Float[Array, " n"]
     null_directions: Float[Array, "unseen n"]
     quantities: tuple[Quantity, ...]
-    status: str
+    search: Answer
+    model: Answer
+    left: tuple[int, ...]
     limits: tuple[Limit, ...] = ()
     near: Parameters | None = None
+
+    @property
+    def status(self) -> str:
+        """Both answers in one line; `ok` where there is nothing else to say."""
+        return answers.status(self.search, self.model)
 
     @property
     def ok(self) -> bool:
@@ -88,6 +99,31 @@ class Fit(eqx.Module):
     def beside(self) -> Parameters:
         """The free numbers to which `covariance` belongs: `parameters`, a flat body thicker."""
         return self.parameters if self.near is None else self.near
+
+    @property
+    def causes(self) -> tuple[Cause, ...]:
+        """What most likely makes the errors that are left, where that shows."""
+        if not self.left:
+            return ()
+        linear = uncertainty.linearise(self.problem, self.parameters, self.noises)
+        return causes(self.problem, self.parameters, self.noises, linear, self.left)
+
+    @property
+    def advice(self) -> str:
+        """Whether the intervals can be trusted, and what to try."""
+        # Under a robust loss χ² is the outliers'.
+        above = np.sqrt(self.chi2 / self.dof) if self.problem.loss is None else 1.0
+        return answers.advice(self.search, self.model, self.causes, self.covariance_kind, above)
+
+    def __str__(self) -> str:
+        from rigidjax.identify import report
+
+        return f"{report.table(report.rows(self))}\n\n{report.verdict(self)}"
+
+    def _repr_html_(self) -> str:
+        from rigidjax.identify import report
+
+        return report.as_html(self)
 
     @property
     def body(self) -> Any:

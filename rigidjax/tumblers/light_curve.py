@@ -13,7 +13,8 @@ from jaxtyping import Array, Float
 
 from rigidjax import _checks, exact
 from rigidjax.body.inertia import MassProperties
-from rigidjax.identify import padding, uncertainty
+from rigidjax.identify import answers, padding, uncertainty
+from rigidjax.identify.answers import FAILS, FOUND, LEAVES, NOT_ALONE, NOT_ENDED, Answer
 from rigidjax.identify.checkpoint import Tried
 from rigidjax.identify.fit import fit
 from rigidjax.identify.parameters import Parameters
@@ -73,16 +74,23 @@ class LightCurve(eqx.Module):
     **Fields:** `fit` of the best motion, its covariance with an allowance for a body that is no
     ellipsoid (see `fit_light_curve`); `aliases` all motions that were found, the best first,
     then by their misfit; `deviations` (4,) relative standard deviations of the best one's rotation,
-    precession and two ratios; `pairs` the frequencies that they came from; `status` one line: that
-    of the fit, or `ambiguous` where another of the aliases explains the data nearly as well, or
-    `doubtful` where χ² is three deviations above what the given noise makes.
+    precession and two ratios; `pairs` the frequencies that they came from; `search` and `model` the
+    two answers as of a `Fit`: also `not alone` where another of the aliases explains the data
+    nearly as well, and `leaves a part` where χ² is three deviations above what the given noise
+    makes.
     """
 
     fit: Fit
     aliases: tuple[Alias, ...]
     deviations: Float[np.ndarray, "4"]
     pairs: TwoFrequencies
-    status: str
+    search: Answer
+    model: Answer
+
+    @property
+    def status(self) -> str:
+        """Both answers in one line; `ok` where there is nothing else to say."""
+        return answers.status(self.search, self.model)
 
     @property
     def ok(self) -> bool:
@@ -124,7 +132,7 @@ def fit_light_curve(
     `Free` move the sensor's `level` unless it is known. `shortest` period of a line in the
     spectrum, s, `None` for four times the median distance of the samples; `count` pairs of
     frequencies at most: fewer are tried where the others fit worse, and where more of them fit the
-    status is `ambiguous`; `tolerance` as of `fit`; `progress` is called with a line of text.
+    search has `not ended`; `tolerance` as of `fit`; `progress` is called with a line of text.
 
     Sources: Pravec et al. 2005, Icarus 173:108, doi:10.1016/j.icarus.2004.07.021; Kaasalainen 2001,
     A&A 376:302, doi:10.1051/0004-6361:20010935.
@@ -293,17 +301,15 @@ def _told(best: Fit, aliases: list[Alias], found: TwoFrequencies, cut: bool) -> 
         for alias in (first, *others)
     )
     rivals = sum(alias.explains for alias in marked) - 1
-    status = best.status
-    if rivals and not status.startswith(("failed", "poor")):
+    search, model = best.search, best.model
+    if rivals and search.word != NOT_ENDED and model.word != FAILS:
         some = "another motion explains" if rivals == 1 else f"{rivals} other motions explain"
-        status = f"ambiguous: {some} the light curve nearly as well"
-    elif cut and status == "ok":
-        status = "ambiguous: more pairs of frequencies fit than were tried"
+        search = Answer(NOT_ALONE, (f"{some} the light curve nearly as well",))
+    elif cut and best.ok:
+        search = Answer(NOT_ENDED, ("more pairs of frequencies fit than were tried",))
     # Under a robust loss χ² is the outliers'.
     above = best.chi2 - best.dof if best.problem.loss is None else 0.0
-    if status == "ok" and above > CONTENT * np.sqrt(2.0 * best.dof):
-        status = (
-            f"doubtful: χ² is {best.chi2:.6g} of {best.dof}: another motion that was not found, or "
-            "more noise than was said"
-        )
-    return LightCurve(wider, marked, deviations, found, status)
+    if search == Answer(FOUND) and best.ok and above > CONTENT * np.sqrt(2.0 * best.dof):
+        why = "another motion that was not found, or more noise than was said"
+        model = Answer(LEAVES, (f"χ² is {best.chi2:.6g} of {best.dof}: {why}",))
+    return LightCurve(wider, marked, deviations, found, search, model)

@@ -59,6 +59,11 @@ class Brightness(AbstractSensor):
     reading_shape: ClassVar[tuple[int, ...]] = ()
     components: ClassVar[int] = 1
     feels: ClassVar[type] = HasAttitude
+    suspect: ClassVar[tuple[str, str, str]] = (
+        "shape",
+        "perhaps a shape that is no ellipsoid: then the motion may be right all the same",
+        "take the intervals of fit_light_curve, which allow for it",
+    )
     unit: str = eqx.field(static=True)  # pyright: ignore[reportIncompatibleVariableOverride]
     sun: Any
     observer: Any

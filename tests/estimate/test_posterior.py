@@ -37,7 +37,8 @@ def fitted():
     nothing = jnp.zeros((0, 5))
     return identify.Fit(
         problem(), at, covariance, covariance, "", (jnp.full((1, 3), 0.02),), (), 0.0, 1, 1.0, 1.0,
-        jnp.ones(5), nothing, (), "ok",
+        jnp.ones(5), nothing, (), identify.Answer("found"),
+        identify.Answer("explains the readings"), (),
     )  # fmt: skip
 
 

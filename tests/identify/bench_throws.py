@@ -318,7 +318,7 @@ def main(every=1, end=0.53, laws=(), whole=False):
             low, high = one.interval_of(own)
             errors.append(0.5 * (low + high) - np.log(truth))
             reaches.append(np.hypot((high - low) / 2, few * np.sqrt(beside)))
-            words.append(one.status.split(":")[0])
+            words.append(one.model.word)
         print("  status:", ", ".join(f"{words.count(word)} {word}" for word in sorted(set(words))))
         alone_held.append(
             show(f"{name}, {len(errors)} throws", np.array(errors), np.array(reaches)).ravel()

@@ -93,7 +93,7 @@ def test_a_wrong_motion_is_not_called_success(tumble, noise):
     readings = np.random.default_rng(3).normal(size=(80, 3))
     record = rj.identify.Recording(ts, (rj.identify.Gyro(noise), readings))
     found = rj.identify.fit(rj.identify.Problem(record, rj.identify.PrincipalRatios()), starts=2)
-    assert found.status.startswith("poor")
+    assert found.model.word == "does not explain the readings"
     assert not any("well determined" in words for words in found.identifiability)
 
 
@@ -104,7 +104,7 @@ def test_a_wrong_motion_is_not_called_outliers(tumble, loss):
     rng = np.random.default_rng(3)
     record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), rng.normal(size=(80, 3))))
     found = rj.identify.fit(rj.identify.Problem(record, rj.identify.Ratios(), loss=loss), starts=2)
-    assert found.status.startswith("poor")
+    assert found.model.word == "does not explain the readings"
     assert not any("well determined" in words for words in found.identifiability)
 
 
@@ -141,7 +141,7 @@ def test_interrupting_keeps_what_was_found(tumble):
         rj.identify.Problem(record, rj.identify.Ratios()), starts=4, progress=stop
     )
     assert len(found.starts) == 1
-    assert not found.ok and found.status == "doubtful: interrupted after 1 of 4 starts"
+    assert not found.ok and "search: found (interrupted after 1 of 4 starts)" in found.status
 
 
 @pytest.mark.parametrize("good", [True, False])
@@ -155,9 +155,10 @@ def test_interrupting_is_said_whatever_else_is(tumble, good):
     def stop(line):
         raise KeyboardInterrupt
 
-    kind = "doubtful: " if good else "poor: "
+    model = "explains the readings" if good else "does not explain the readings"
     found = rj.identify.fit(problem, starts=4, together=2, progress=stop)
-    assert found.status.startswith(f"{kind}interrupted after 2 of 4 starts")
+    assert not found.ok and found.model.word == model
+    assert "interrupted after 2 of 4 starts" in found.search.reasons
 
     def in_descent(line):
         if line.startswith("descent"):
@@ -165,7 +166,8 @@ def test_interrupting_is_said_whatever_else_is(tumble, good):
 
     how = rj.identify.Descent(optax.sgd(1e-9), steps=2, batch=1)
     found = rj.identify.fit(problem, starts=3, descent=how, progress=in_descent)
-    assert found.status.startswith(f"{kind}interrupted in the descent of start 1 of 3")
+    assert not found.ok and found.model.word == model
+    assert "interrupted in the descent of start 1 of 3" in found.search.reasons
     assert len(found.starts) == 1
 
 

@@ -15,7 +15,7 @@ TS = np.linspace(0.0, 1.0, 5)
 BODY = rj.Inertia.from_principal(1.0, 1.6, 2.1)
 
 
-def fit_with(chart, directions, status="ok", mix=None):
+def fit_with(chart, directions, search="found", model="explains the readings", mix=None):
     """A fit of which only the directions that its data do not determine matter.
 
     **Arguments:** `directions` functions of zeroed `Parameters` to changed ones.
@@ -35,7 +35,8 @@ def fit_with(chart, directions, status="ok", mix=None):
     like = jnp.eye(n)
     return identify.Fit(
         problem, here, like, like, "none", tuple(jnp.ones((1, k)) for k in (3, 3)), (), 1.0, 1,
-        1.0, 1.0, jnp.ones(n), jnp.asarray(null), (), status,
+        1.0, 1.0, jnp.ones(n), jnp.asarray(null), (), identify.Answer(search),
+        identify.Answer(model), (),
     )  # fmt: skip
 
 
@@ -89,10 +90,10 @@ def test_axes_that_turn_are_named_by_the_tensor():
 
 
 def test_a_fit_that_explains_nothing_calls_nothing_determined():
-    poor = fit_with(identify.Principal(1.5), [grown], "poor: the errors are 9.0 times the noise")
-    (line,) = poor.identifiability
+    lost = "does not explain the readings"
+    (line,) = fit_with(identify.Principal(1.5), [grown], model=lost).identifiability
     assert "does not explain the data, so that nothing is determined by it" in line
-    failed = fit_with(identify.Principal(1.5), [grown], "failed: not converged").identifiability
+    failed = fit_with(identify.Principal(1.5), [grown], "not ended").identifiability
     assert "did not end in a minimum" in failed[0]
     assert "Ix, Iy and Iz rise together: only their ratios are determined." in failed
     assert not any("well determined" in line for line in failed)

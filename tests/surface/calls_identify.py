@@ -169,7 +169,7 @@ row(
     arguments=("of", "level"),
     **HOST,
 )
-records = ("Fit", "Start", "Quantity", "Comparison", "Own", "Parameters")
+records = ("Fit", "Answer", "Cause", "Start", "Quantity", "Comparison", "Own", "Parameters")
 leave_out("a record that the library fills", *(f"identify.{name}" for name in records))
 leave_out("an exception", "identify.LogError")
 leave_out(
@@ -246,6 +246,7 @@ row(
     says=("no such file",),
 )
 row("identify.report.as_dict", lambda: dict(fit=s.found()), groups=KINDS, transforms=())
+row("identify.report.as_html", lambda: dict(fit=s.found()), groups=KINDS, transforms=())
 row("identify.report.numbers", dict(value=1.0, low=0.9, high=1.2), transforms=())
 row(
     "identify.report.rows",

@@ -658,6 +658,8 @@ leave_out(
     "estimate.Filtered.words", "estimate.Smoothed.words", "estimate.LinearModel.size",
     "estimate.LogDensity.size", "identify.Accelerometer.feels", "identify.Marker.feels",
     "identify.Combination.in_words", "identify.Fit.ok", "tumblers.LightCurve.ok",
+    "identify.Fit.status", "tumblers.LightCurve.status", "identify.Fit.advice", "identify.Fit.causes",
+    "identify.Answer", "identify.Cause",
     "identify.Mass.in_words", "identify.Mass.log_names", "identify.Mass.plain_names",
     "identify.Mass.size", "identify.Problem.count", "identify.Recording.size", "identify.LogError",
     "identify.Descent", "identify.Combination",
@@ -687,7 +689,7 @@ leave_out(
 leave_out(
     "text for a reader, of numbers that other rows hold: tests/identify/test_report.py",
     *(f"identify.report.{name}" for name in (
-        "as_dict", "numbers", "rows", "table", "verdict", "write_html", "write_json")),
+        "as_dict", "as_html", "numbers", "rows", "table", "verdict", "write_html", "write_json")),
 )  # fmt: skip
 leave_out(
     "draws, and statistics of draws: tests/estimate hold them against densities that are known",

@@ -30,7 +30,14 @@ def main(count: int, first: int, rough: float, noise: float, told: int) -> None:
         found = tumblers.fit_light_curve(problem(recording))
         error, deviations = apart(one, found.aliases[0]), found.deviations
         right = found.aliases[0].mode == one.mode and np.abs(error[:2]).max() < 2e-2
-        said.append((found.status.split(":")[0], right, error, deviations))
+        said.append(
+            (
+                found.status if found.ok else f"{found.search.word}, {found.model.word}",
+                right,
+                error,
+                deviations,
+            )
+        )
         print(
             f"{seed:3d} {one.mode:5s} {said[-1][0]:9s} {'right' if right else 'WRONG'} errors in % "
             f"{np.array2string(100 * error, precision=3, suppress_small=True)}, deviations "

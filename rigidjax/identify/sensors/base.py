@@ -58,7 +58,8 @@ class AbstractSensor(eqx.Module):
     cannot be readings, (T,) true where wrong, and why; a method `typical_rate(t, values)`: about
     how fast the body turns, rad/s, by the readings seen, where no other sensor tells; where the
     error is not reading minus prediction, a method `reading_of(now, error)`, the reading that has
-    this error, for `simulate_readings`.
+    this error, for `simulate_readings`; `suspect`: name, words and remedy of what a fit
+    names as the cause of its errors where no other shows.
 
     >>> import rigidjax as rj
     >>> class Tachometer(AbstractSensor):  # the size of the body rate, rad/s

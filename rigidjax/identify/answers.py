@@ -1,0 +1,94 @@
+"""What a fit says of itself in two answers, and what follows from them for whoever reads it."""
+
+import equinox as eqx
+
+# Of the search.
+FOUND, NOT_ALONE, NOT_ENDED = "found", "not alone", "not ended"
+# Of the model.
+EXPLAINS, LEAVES, FAILS = "explains the readings", "leaves a part", "does not explain the readings"
+
+# No sensor is worse than its noise by more than this factor.
+FAR = 3.0
+
+
+class Answer(eqx.Module):
+    """A `word`, and the `reasons` for it in words; printed as `word (reason; reason)`.
+
+    >>> print(Answer("not ended", ("max_steps reached",)))
+    not ended (max_steps reached)
+    """
+
+    word: str
+    reasons: tuple[str, ...] = ()
+
+    def __str__(self) -> str:
+        return f"{self.word} ({'; '.join(self.reasons)})" if self.reasons else self.word
+
+
+class Cause(eqx.Module):
+    """What most likely makes the errors of a sensor; printed as its words.
+
+    **Fields:** `name` of the cause; `sensor` whose errors; `share` of their sum of squares that it
+    explains (1 for `misread`, which explains the readings themselves), `None` where it is a guess;
+    `words` what was found; `remedy` what to try.
+
+    >>> print(Cause("drag", "Gyro", 0.9, "a torque against the rate", "add a Damping"))
+    a torque against the rate
+    """
+
+    name: str
+    sensor: str
+    share: float | None
+    words: str
+    remedy: str
+
+    def __str__(self) -> str:
+        return self.words
+
+
+def status(search: Answer, model: Answer) -> str:
+    """Both answers in one line: `ok` where neither has anything to say."""
+    if search == Answer(FOUND) and model == Answer(EXPLAINS):
+        return "ok"
+    return f"search: {search}; model: {model}"
+
+
+def advice(
+    search: Answer, model: Answer, causes: tuple[Cause, ...], kind: str, above: float
+) -> str:
+    """Whether the intervals can be trusted, and what to try.
+
+    **Arguments:** `kind` of the covariance; `above`, the errors over the noise that was given.
+    """
+    remedies = list(dict.fromkeys(cause.remedy for cause in causes))
+    tries = f" Try: {'; '.join(remedies)}." if remedies else ""
+    if model.word == FAILS:
+        tries = tries or (
+            " Check units (rad/s, m/s², m, s), signs and order of axes, and what else turns the "
+            "body; more starts help only where the motion is right."
+        )
+        return f"The numbers and intervals say nothing about the body.{tries}"
+    if search.word == NOT_ENDED:
+        tries = tries or " Try more max_steps, more starts, or a start of your own (initial)."
+        return f"The intervals are those of a point on the way and cannot be trusted.{tries}"
+    if search.word == NOT_ALONE:
+        return (
+            "Each interval is that of the best motion alone; fit.starts holds the others. Record "
+            f"longer, or turn about two axes in one record.{tries}"
+        )
+    if model.word == LEAVES and any(cause.share is not None for cause in causes):
+        return (
+            "The intervals cannot be trusted: they take the errors for chance, and most of them "
+            f"have one cause.{tries}"
+        )
+    if above > FAR:
+        return f"The intervals cannot be trusted: the sensors make no errors of this size.{tries}"
+    if model.word == LEAVES:
+        allowed = "allow" if kind.startswith("sandwich") else "do not allow"
+        return (
+            f"The intervals {allowed} for errors of this size that last, whatever their cause; "
+            f"what shifts a number all along they do not show.{tries}"
+        )
+    if search.reasons or model.reasons:
+        return f"The intervals can be trusted as far as the remarks go.{tries}"
+    return "The intervals can be trusted."

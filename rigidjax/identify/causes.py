@@ -1,0 +1,208 @@
+"""What a fit leaves in its errors, and which cause explains the most of it.
+
+Each cause has a direction: how readings change with it, as the fitted motion says. Errors are
+regressed on it beside all free numbers (a score test: Rao 1948, doi:10.1017/S0305004100023987), so
+that a cause which those could take up explains nothing.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from rigidjax.identify import padding
+from rigidjax.identify.answers import Cause
+from rigidjax.identify.full_scale import at_limit
+from rigidjax.identify.misread import misread
+from rigidjax.identify.parameters import Parameters, numbered
+from rigidjax.identify.problem import Problem
+from rigidjax.identify.residual import Noise
+from rigidjax.identify.sensors import Gyro
+from rigidjax.identify.several_bodies import in_a_row, tensor_of
+from rigidjax.identify.uncertainty import Linearised
+
+# A cause is named that explains so much of the squared errors, and what explains nearly as much.
+ENOUGH, NEARLY = 0.7, 0.95
+# Directions of which the free numbers take up all but this part are not told from them.
+APART = 0.05
+# Changes of axes and scales are small ones, or none of them.
+LINEAR, SMALL = ("scale", "mounting", "skew"), 0.5
+# What x shows of y, x of z, and y of z.
+SKEW = np.zeros((3, 3, 3))
+SKEW[1, 0, 0] = SKEW[2, 0, 1] = SKEW[2, 1, 2] = 1.0
+
+
+def causes(
+    problem: Problem, parameters: Parameters, noise: Noise, linear: Linearised, which: Sequence[int]
+) -> tuple[Cause, ...]:
+    """The most likely cause of the errors of each sensor in `which`, where one shows."""
+    given = zip(padding.on_host(problem.records, problem.counts), problem.of, strict=True)
+    wrong = misread([recording for recording, of in given if of == problem.of[0]])
+    if wrong is not None:
+        return (wrong,)
+    if not np.isfinite(linear.dense).all():
+        return ()
+    free = np.linalg.qr(linear.dense)[0]
+    found = []
+    for index in which:
+        sensor: Any = problem.records.readings[index].sensor
+        cause = clock(problem, linear, index)
+        if cause is None and _of_three(sensor):
+            rows = _table(problem, parameters, noise, linear, index)
+            shares = [_explained(noise, linear, index, which, free, row[1]) for row in rows]
+            cause = _largest(sensor, rows, shares)
+        if cause is None and hasattr(sensor, "suspect"):
+            cause = Cause(sensor.suspect[0], type(sensor).__name__, None, *sensor.suspect[1:])
+        found += [] if cause is None else [cause]
+    return tuple(found)
+
+
+def clock(problem: Problem, linear: Linearised, index: int) -> Cause | None:
+    """Time stamps that scatter: each error is along the change of the readings."""
+    sensor, error = problem.records.readings[index].sensor, linear.raw[index]
+    kept = (linear.weights[index] > 0) & ~at_limit(problem.records.readings)[index].any(axis=-1)
+    if not (_of_three(sensor) and error[kept].any()):
+        return None
+    slope = _slope(problem, np.asarray(problem.records.readings[index].values) - error)
+    moved = np.sum(slope**2, axis=-1) * kept
+    moving = moved > 1e-2 * moved.max()
+    if not moving.any():
+        return None
+    along = np.sum(np.sum(error * slope, axis=-1)[moving] ** 2 / moved[moving])
+    channels = np.sum(error[kept] ** 2, axis=0)
+    # What errors of these channels' sizes have along this direction by chance.
+    ways = np.mean(slope[moving] ** 2 / moved[moving][:, None], axis=0)
+    chance, share = float(ways @ channels / channels.sum()), float(along / channels.sum())
+    if not share > chance + 0.5 * (1.0 - chance) + 1.0 / np.sqrt(moving.sum()):
+        return None
+    scatter = 1e3 * np.sqrt(along / moved[moving].sum())
+    return _cause(
+        "clock", sensor, share, f"time stamps that scatter by {scatter:.2g} ms",
+        "take times from the sensor's own count of samples, or say a larger noise",
+    )  # fmt: skip
+
+
+def _cause(name: str, sensor: Any, share: float, words: str, remedy: str) -> Cause:
+    kind = type(sensor).__name__
+    explained = f"{100 * share:.0f} % of the squared errors of the {kind}"
+    return Cause(name, kind, share, f"most likely {words}: {explained}", remedy)
+
+
+def _largest(sensor: Any, rows: Sequence[tuple], shares: Sequence[tuple]) -> Cause | None:
+    """The cause that explains the most, and those that explain about as much."""
+    told = [
+        (share, name, words.format(size=", ".join(f"{x:.2g}" for x in size)), remedy)
+        for (name, _, words, remedy), (share, size) in zip(rows, shares, strict=True)
+        if name not in LINEAR
+        or np.abs(size).max() < SMALL
+        # A unit: g read as m/s².
+        or (name == "scale" and np.ptp(size) < 0.1 * abs(size.mean()))
+    ]
+    most = max((share for share, *_ in told), default=0.0)
+    if not most > ENOUGH:
+        return None
+    best = [row for share, *row in told if share >= NEARLY * most]
+    names, words, remedies = (" or ".join(column) for column in zip(*best, strict=True))
+    return _cause(names, sensor, most, words, remedies)
+
+
+def _of_three(sensor: Any) -> bool:
+    """Whether errors are readings minus predictions along three axes."""
+    return sensor.reading_shape == (3,) and sensor.components == 3
+
+
+def _slope(problem: Problem, shown: np.ndarray) -> np.ndarray:
+    """The derivative in time of what a sensor shows (R, T, k), zero where nothing was read."""
+    t, out = np.asarray(problem.records.t), np.zeros_like(shown)
+    for row, count in enumerate(problem.counts):
+        if count > 2:
+            out[row, :count] = np.gradient(shown[row, :count], t[row, :count], axis=0)
+    return out
+
+
+def _table(
+    problem: Problem, parameters: Parameters, noise: Noise, linear: Linearised, index: int
+) -> tuple[tuple[str, np.ndarray, str, str], ...]:
+    """Name, direction (R, T, 3, c), words and remedy of each cause."""
+    reading = problem.records.readings[index]
+    t, shown = np.asarray(problem.records.t), np.asarray(reading.values) - linear.raw[index]
+    axes = np.broadcast_to(np.eye(3), (*shown.shape, 3))
+    turned = np.cross(shown[..., None, :], axes).swapaxes(-1, -2)
+    unit, itself = reading.sensor.unit, shown[..., None] * axes
+    response = _response(problem, parameters, noise, linear, index)
+    return (
+        ("lag", _slope(problem, shown)[..., None], "a clock that is off by {size} s",
+         "let a Free move the sensor's offset, or the delay of the torque's log"),
+        ("bias", axes, f"a bias left out, ({{size}}) {unit}", "let a Free move the sensor's bias"),
+        ("scale", itself,
+         "scales that are off by ({size}) (all alike: a unit, or a clock that runs fast or slow)",
+         "look at the sensor's unit, or let a Free move its scale"),
+        ("drag", response(-itself), "a torque against the rate, such as drag of the air",
+         "add a Damping or QuadraticDamping whose coefficient is free"),
+        ("wheel", response(turned), "a constant angular momentum inside, such as a wheel's",
+         "add a Flywheel whose momentum is free"),
+        ("mounting", turned, "axes that are turned by ({size}) rad",
+         "let a Free move the sensor's mounting, or take a chart of the full tensor"),
+        ("skew", np.einsum("rti,ijk->rtjk", shown, SKEW),
+         "axes that are off a right angle by ({size}) rad", "let a Free move the sensor's skew"),
+        ("push", response(axes), "a constant torque in the body's axes",
+         "add a ConstantTorque whose value is free"),
+        ("drift", axes * (t - t[:, :1])[..., None, None],
+         f"a bias that drifts by ({{size}}) {unit} a second",
+         "cut the record into pieces with a bias each"),
+    )  # fmt: skip
+
+
+def _response(
+    problem: Problem, parameters: Parameters, noise: Noise, linear: Linearised, index: int
+) -> Callable[[np.ndarray], np.ndarray]:
+    """What torques (R, T, 3, c) do to rates: `Φ(t) ∫ Φ⁻¹ I⁻¹ τ dt` (variation of constants).
+
+    Φ is the derivative of the rates by the first one, which the fit has of a gyro.
+    """
+    if not isinstance(problem.records.readings[index].sensor, Gyro):
+        return np.zeros_like
+    first = np.asarray(numbered(parameters).own.spin)[0]
+    columns = (linear.places[0][:, None] == first).argmax(axis=0)
+    flow = linear.slopes[index][..., columns] * np.asarray(noise[index])[:, None, :, None]
+    tensors = np.stack([np.asarray(tensor_of(b)) for b in in_a_row(problem.bodies(parameters))])
+    of = np.zeros(problem.count, int) if problem.which is None else np.asarray(problem.which)
+    back = np.linalg.pinv(flow) @ np.linalg.inv(tensors)[of][:, None]
+    steps = np.diff(np.asarray(problem.records.t), axis=1)[..., None, None]
+
+    def response(torque: np.ndarray) -> np.ndarray:
+        pushed = back @ torque
+        middle = 0.5 * (pushed[:, 1:] + pushed[:, :-1]) * steps
+        return flow @ np.concatenate([0 * pushed[:, :1], np.cumsum(middle, axis=1)], axis=1)
+
+    return response
+
+
+def _explained(
+    noise: Noise,
+    linear: Linearised,
+    index: int,
+    which: Sequence[int],
+    free: np.ndarray,
+    direction: np.ndarray,
+) -> tuple[float, np.ndarray]:
+    """The share of squared errors that a direction (R, T, k, c) explains, and how much of it.
+
+    `free` (R, N, m) are orthonormal columns of the free numbers; of the sensors in `which`.
+    """
+    roots = [np.sqrt(weight)[..., None] for weight in linear.weights]
+    errors = [e * root for e, root in zip(linear.errors, roots, strict=True)]
+    scaled = direction / np.asarray(noise[index])[:, None, :, None] * roots[index][..., None]
+    size = np.sqrt(np.sum(scaled**2, axis=(0, 1, 2)))
+    size[size == 0] = 1.0
+    columns = [np.zeros((*error.shape, size.size)) for error in errors]
+    columns[index] = scaled / size
+
+    def besides(parts: Sequence[np.ndarray], width: int) -> np.ndarray:
+        x = np.concatenate([part.reshape(len(part), -1, width) for part in parts], axis=1)
+        return (x - free @ (free.swapaxes(1, 2) @ x)).reshape(-1, width)
+
+    u, s, v = np.linalg.svd(besides(columns, size.size), full_matrices=False)
+    told = np.where(s > APART, u.T @ besides(errors, 1)[:, 0], 0.0)
+    total = sum(float(np.sum(errors[i] ** 2)) for i in which)
+    return min(float(told @ told) / total, 1.0), v.T @ (told / np.maximum(s, APART)) / size
