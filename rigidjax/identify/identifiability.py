@@ -83,8 +83,8 @@ def _flat(fit: "Fit", reach: float) -> list[str]:
     """What is known of bodies that may be flat."""
     covariance = np.asarray(fit.seen)
     return [
-        f"The body{limit.where} is flat to within what the readings show: (I1 + I2 − I3)/I3 ≤ "
-        f"{limit.bound(covariance):.2g} (95 %); intervals end at what a body can be."
+        f"A flat body{limit.where} fits as well: (I1 + I2 − I3)/I3 ≤ "
+        f"{limit.bound(covariance):.2g} (95 %). Intervals end at what a body can be."
         for limit in fit.limits
         if limit.is_near(covariance, reach)
     ]
