@@ -28,7 +28,7 @@ from rigidjax.identify.parameters import Own, Parameters, by_slot, local
 from rigidjax.identify.prior import Entropic
 from rigidjax.identify.propagation import AbstractIntegrator, integrator_for
 from rigidjax.identify.recording import Recording
-from rigidjax.identify.reference_states import ReferenceStates, first_rate, reference_of
+from rigidjax.identify.reference_states import ReferenceStates, first_rates, reference_of
 from rigidjax.identify.several_bodies import Bodies, charts_of, has_mass
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.coupled import motion_of
@@ -179,8 +179,8 @@ class Problem(eqx.Module):
     def start(self, body: Any = None) -> Parameters:
         """Where a fit may start: the recordings as they are given, with this body or a sphere.
 
-        The first body rates are the first readings of a gyro, or the turn between attitudes. Of
-        several bodies give a dict of those that are known about.
+        The first body rates are the first readings of a gyro, or the turn between attitudes (0
+        where these are traced). Of several bodies give a dict of those that are known about.
 
         **Raises:** `ValueError` for a body that the chart does not hold.
         """
@@ -197,11 +197,8 @@ class Problem(eqx.Module):
         zeros = ([_zeros(*shape) for shape in shapes] for shapes in _shapes(self).values())
         _, shared, *state, each = zeros
         firsts: Any = [part[0] if part else None for part in state]
-        if _checks.known(self):
-            recordings = padding.on_host(self.records, self.counts)
-            rates = np.stack([first_rate(recording) for recording in recordings])
-            rates = rates / np.asarray(self.reference.rate)[:, None]
-            firsts[-1] = jnp.asarray(rates, firsts[-1].dtype)
+        rates = first_rates(self.records, self.counts) / self.reference.rate[:, None]
+        firsts[-1] = rates.astype(firsts[-1].dtype)
         own = Own(*firsts, each=tuple(each))
         return Parameters(vector, tuple(shared), own)
 

@@ -9,6 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from rigidjax import _checks
+from rigidjax.identify import padding
 from rigidjax.identify.direct_estimates import attitudes, rates
 from rigidjax.identify.parameters import firsts
 from rigidjax.identify.recording import Recording, readings_of
@@ -152,6 +154,18 @@ def _from_ranges(stations: np.ndarray, lengths: np.ndarray) -> np.ndarray:
     sides = (s * s).sum(axis=1)[None] - lengths**2
     sides = 0.5 * (sides - sides.mean(axis=1, keepdims=True))
     return centre + np.linalg.lstsq(s, sides.T, rcond=1e-9)[0].T
+
+
+def first_rates(records: Recording, counts: tuple[int, ...]) -> Float[Array, "records 3"]:
+    """`first_rate` of each of several recordings (a leading axis), also of traced ones."""
+    for reading in readings_of(records, Gyro):
+        xp = np if _checks.known(reading) else jnp
+        first = xp.argmax(xp.asarray(reading.mask), axis=1)[:, None, None]
+        return jnp.asarray(xp.take_along_axis(xp.asarray(reading.values), first, axis=1)[:, 0])
+    if not _checks.known(records):
+        return jnp.zeros((len(counts), 3), records.t.dtype)
+    found = [first_rate(recording) for recording in padding.on_host(records, counts)]
+    return jnp.asarray(np.stack(found), records.t.dtype)
 
 
 def first_rate(recording: Recording) -> np.ndarray:

@@ -175,6 +175,7 @@ def stand_in():
         residuals=(errors,),
         noise=(np.full(3, 0.01),),
         parameters=jnp.zeros(3),
+        beside=jnp.zeros(3),
         seen=0.01 * np.eye(3),
         body=shaped(jnp.zeros(3)),
     )
