@@ -29,7 +29,7 @@ from rigidjax.body.inertia import Inertia
 from rigidjax.exact.free_body import FreeMotion
 from rigidjax.motion import on_the_group
 from rigidjax.motion.torques.base import jumps_of
-from rigidjax.solve import crossing_loop, direction, runge_kutta
+from rigidjax.solve import crossing_loop, runge_kutta
 from rigidjax.solve.adaptive import adaptive, taken_out
 from rigidjax.solve.batching import Arrays, Layout, in_lanes
 from rigidjax.solve.components import flat, leaf_sizes, unflat
@@ -40,7 +40,7 @@ from rigidjax.solve.record import Method, Run
 from rigidjax.solve.run import Free, Loop
 from rigidjax.solve.runge_kutta import Step
 from rigidjax.solve.step_control import error_norm, first_step
-from rigidjax.solve.vector_field import equations_of_motion
+from rigidjax.solve.vector_field import ahead, equations_of_motion
 
 # Samples of a free body's condition in one turn at its largest rate.
 _SAMPLES = 16
@@ -85,9 +85,7 @@ def section(
         torque, way = setup.torque, setup.sign
         jumps = jumps_of(torque).astype(dtype)
     field: Any = equations_of_motion(setup.body, state0, torque)
-    field, condition, along, jumps = direction.ahead(
-        way, field, condition, ts[jnp.array([0, -1])], jumps
-    )
+    field, condition, along, jumps = ahead(way, field, condition, ts[jnp.array([0, -1])], jumps)
     longest = whole = lax.stop_gradient(along[1] - along[0])
     if max_step is not None:
         longest = lax.stop_gradient(jnp.asarray(max_step, dtype))

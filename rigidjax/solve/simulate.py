@@ -12,17 +12,26 @@ from rigidjax import _checks
 from rigidjax._types import ScalarLike
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.frames import AbstractScene, MovingFrame
-from rigidjax.motion.coupled import Coupled
+from rigidjax.motion.coupled import Coupled, motion_of
 from rigidjax.motion.torques.base import jumps_of
-from rigidjax.solve import ending, validation
-from rigidjax.solve.direction import direction
-from rigidjax.solve.events import Event, ready, solve_until
+from rigidjax.solve import validation
+from rigidjax.solve.crossings import Event, ready, solve_until
 from rigidjax.solve.explicit import AbstractExplicit, DormandPrince8
 from rigidjax.solve.projection import Projected
-from rigidjax.solve.run import ADJOINT, NO_METER, SOLVER, Free, Loop, Setup, solve
+from rigidjax.solve.run import (
+    ADJOINT,
+    NO_METER,
+    SOLVER,
+    Free,
+    Loop,
+    Setup,
+    refuse_ended,
+    solve,
+)
 from rigidjax.solve.solution import Solution, State
 from rigidjax.solve.splitting import AbstractSplitting
-from rigidjax.solve.step_control import Watched
+from rigidjax.solve.step_control import Watched, watched
+from rigidjax.solve.vector_field import direction
 
 # A law must take the state that there is: gravity on a `Spin` is an error that type checkers see.
 Law = Callable[[Any, State, Any], Any] | AbstractScene | MovingFrame | None
@@ -119,37 +128,21 @@ def simulate(
     """
     max_steps = None if max_steps is None else _checks.whole(max_steps, "max_steps", 1)
     body, state0, times = validation.scene(body, state0, ts, torque, throw)
-    controller = stepsize_controller
-    if controller is None:
+    if stepsize_controller is None:
         rtol, atol = validation.tolerances(rtol, atol, times.dtype)
-        make: Any = _controller if _checks.known((rtol, atol)) else _watched
-        controller = make(rtol, atol)
-        if hasattr(torque, "jump_times") and jumps_of(torque).size:
-            # An adaptive step passes over a short pulse without seeing it.
-            jump_ts = jnp.sort(jumps_of(torque).astype(times.dtype))
-            controller = dfx.ClipStepSizeController(controller, jump_ts=jump_ts)
-    elif rtol is not None or atol is not None:
-        raise ValueError("simulate: give either rtol and atol or a stepsize_controller, not both")
-    elif isinstance(controller, dfx.AbstractAdaptiveStepSizeController):
-        controller = Watched(controller)
+    controller = _controller(stepsize_controller, rtol, atol, torque, times.dtype)
     if torque is None and solver is None and stepsize_controller is None and body is not None:
-        free = Free(body, throw)
-        if event is not None:
-            return _until(event, free, state0, times)
-        return _solution(free, state0, times)
+        return _solution(Free(body, throw), event, state0, times)
     method = DormandPrince8() if solver is None else solver
     plain = isinstance(method, AbstractExplicit) and max_steps is not None
     plain = plain and stepsize_controller is None and progress_meter is None
     # Where forward mode is all that is asked, diffrax is quicker: tangents go along with the run.
     forward = isinstance(adjoint, dfx.ForwardMode) and solver is None and event is None
-    plain = plain and isinstance(adjoint, _EITHER_MODE) and not forward
-    if plain:
+    if plain and isinstance(adjoint, _EITHER_MODE) and not forward:
         first = validation.first_step(dt0, times)
         way = direction(times)
         loop = Loop(body, torque, method, controller, first, way, max_steps, throw)  # pyright: ignore
-        return (
-            _solution(loop, state0, times) if event is None else _until(event, loop, state0, times)
-        )
+        return _solution(loop, event, state0, times)
     if event is not None:
         raise ValueError(
             "simulate: an event is looked for in our own loop and in closed form: leave solver, "
@@ -167,40 +160,46 @@ def simulate(
         max_steps=max_steps,
         throw=throw,
     )
-    return _solution(setup, state0, times)
+    return _solution(setup, None, state0, times)
 
 
-def _solution(setup: Free | Loop | Setup, state0: Any, times: Array) -> Solution:
+def _solution(setup: Free | Loop | Setup, event: Any, state0: Any, times: Array) -> Solution:
+    event_time = event_state = None
     try:
-        ys, stats, result = solve(setup, state0, times)
+        if event is None:
+            ys, stats, result = solve(setup, state0, times)
+        else:
+            event = event if isinstance(event, Event) else Event(event)
+            state0 = ready(event, setup.body, state0, setup.torque, times[0])
+            ys, stats, result, event_time, event_state = solve_until(setup, event, state0, times)
     except RuntimeError as error:
         raise _checks.bare(error) from None
     if setup.throw and "ended" in stats:
-        ys = ending.refuse(getattr(setup, "torque", None), ys, stats, times)
-    if isinstance(ys, Coupled):
-        return Solution(times, ys.motion, stats, result, setup, own=ys.own)
-    return Solution(times, ys, stats, result, setup)
+        ys = refuse_ended(setup.torque, ys, stats, times)
+    own = ys.own if isinstance(ys, Coupled) else None
+    return Solution(times, motion_of(ys), stats, result, setup, event_time, event_state, own)
 
 
-def _until(event: Any, setup: Free | Loop, state0: Any, times: Array) -> Solution:
-    event = event if isinstance(event, Event) else Event(event)
-    state0 = ready(event, setup.body, state0, getattr(setup, "torque", None), times[0])
-    try:
-        ys, stats, result, time, state = solve_until(setup, event, state0, times)
-    except RuntimeError as error:
-        raise _checks.bare(error) from None
-    if setup.throw and "ended" in stats:
-        ys = ending.refuse(getattr(setup, "torque", None), ys, stats, times)
-    if isinstance(ys, Coupled):
-        return Solution(times, ys.motion, stats, result, setup, time, state, ys.own)
-    return Solution(times, ys, stats, result, setup, time, state)
+def _controller(
+    given: dfx.AbstractStepSizeController | None, rtol: Any, atol: Any, torque: Any, dtype: Any
+) -> dfx.AbstractStepSizeController:
+    if given is not None:
+        if rtol is not None or atol is not None:
+            raise ValueError(
+                "simulate: give either rtol and atol or a stepsize_controller, not both"
+            )
+        return (
+            Watched(given) if isinstance(given, dfx.AbstractAdaptiveStepSizeController) else given
+        )
+    make: Any = _cached if _checks.known((rtol, atol)) else watched
+    if not hasattr(torque, "jump_times") or not jumps_of(torque).size:
+        return make(rtol, atol)
+    # An adaptive step passes over a short pulse without seeing it.
+    jump_ts = jnp.sort(jumps_of(torque).astype(dtype))
+    return dfx.ClipStepSizeController(make(rtol, atol), jump_ts=jump_ts)
 
 
-def _watched(rtol: Any, atol: Any) -> Watched:
-    return Watched(dfx.PIDController(rtol=rtol, atol=atol))
-
-
-_controller = functools.cache(_watched)
+_cached = functools.cache(watched)
 
 
 def _adjoint(controller: dfx.AbstractStepSizeController) -> dfx.AbstractAdjoint:

@@ -102,6 +102,11 @@ class Watched(dfx.AbstractAdaptiveStepSizeController):
         )
 
 
+def watched(rtol: Any, atol: Any) -> Watched:
+    """The controller of `simulate`, from its tolerances."""
+    return Watched(dfx.PIDController(rtol=rtol, atol=atol))
+
+
 def finite(tree: Any) -> Bool[Array, ""]:
     """Whether every number in `tree` is finite.
 
