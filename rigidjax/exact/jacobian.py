@@ -104,58 +104,23 @@ def jacobian_and_integral(
         dC = -p * S * D * theta - C * shrink + jnp.where(three, 0.0, rc * dgap)
         dD = -q * S * C * theta - D * shrink + jnp.where(three, rd * dgap, 0.0)
         x12, x13, x23 = o12 * t12, o13 * t13, o23 * t23
-        du1 = (
-            -e23 * (p2 * p3)
-            - d23 * (e2 * p3 + e3 * p2)
-            + o12 * (-p1 * p3)
-            + o13 * (p1 * p2)
-            + o23 * (p2 * p2 - p3 * p3)
-        )
-        du2 = (
-            e13 * (p1 * p3)
-            + d13 * (e1 * p3 + e3 * p1)
-            + o12 * (p2 * p3)
-            + o13 * (p3 * p3 - p1 * p1)
-            - o23 * (p1 * p2)
-        )
-        du3 = (
-            -e12 * (p1 * p2)
-            - d12 * (e1 * p2 + e2 * p1)
-            + o12 * (p1 * p1 - p2 * p2)
-            - o13 * (p2 * p3)
-            + o23 * (p1 * p3)
-        )
-        dy1 = (
-            e1 * one1
-            + p1 * dC
-            - x12 * C * p2
-            - x13 * p3
-            + dS * D * u1
-            + S * (dD * u1 + D * du1 + x12 * u2 + x13 * u3)
-        )
-        dy2 = (
-            e2 * one2
-            + p2 * (dC * D + C * dD)
-            - x12 * C * p1
-            - x23 * D * p3
-            + dS * u2
-            + S * (du2 + x12 * u1 + x23 * u3)
-        )
-        dy3 = (
-            e3 * one3
-            + p3 * dD
-            - x13 * p1
-            - x23 * D * p2
-            + dS * C * u3
-            + S * (dC * u3 + C * du3 + x13 * u1 + x23 * u2)
-        )
-        dz = jnp.where(
-            three,
-            (e12 * d13 + d12 * e13) * (p1 * p1)
-            + 2.0 * p1 * (d12 * d13 * e1 + d13 * o12 * p2 + d12 * o13 * p3),
-            (e13 * d23 + d13 * e23) * (p3 * p3)
-            + 2.0 * p3 * (d13 * d23 * e3 - d23 * o13 * p1 - d13 * o23 * p2),
-        )
+        du1 = -e23 * (p2 * p3) - d23 * (e2 * p3 + e3 * p2) - o12 * (p1 * p3)
+        du1 = du1 + o13 * (p1 * p2) + o23 * (p2 * p2 - p3 * p3)
+        du2 = e13 * (p1 * p3) + d13 * (e1 * p3 + e3 * p1) + o12 * (p2 * p3)
+        du2 = du2 + o13 * (p3 * p3 - p1 * p1) - o23 * (p1 * p2)
+        du3 = -e12 * (p1 * p2) - d12 * (e1 * p2 + e2 * p1) + o12 * (p1 * p1 - p2 * p2)
+        du3 = du3 - o13 * (p2 * p3) + o23 * (p1 * p3)
+        dy1 = e1 * one1 + p1 * dC - x12 * C * p2 - x13 * p3 + dS * D * u1
+        dy1 = dy1 + S * (dD * u1 + D * du1 + x12 * u2 + x13 * u3)
+        dy2 = e2 * one2 + p2 * (dC * D + C * dD) - x12 * C * p1 - x23 * D * p3
+        dy2 = dy2 + dS * u2 + S * (du2 + x12 * u1 + x23 * u3)
+        dy3 = e3 * one3 + p3 * dD - x13 * p1 - x23 * D * p2 + dS * C * u3
+        dy3 = dy3 + S * (dC * u3 + C * du3 + x13 * u1 + x23 * u2)
+        dz1 = 2.0 * p1 * (d12 * d13 * e1 + d13 * o12 * p2 + d12 * o13 * p3)
+        dz3 = 2.0 * p3 * (d13 * d23 * e3 - d23 * o13 * p1 - d13 * o23 * p2)
+        dz1 = (e12 * d13 + d12 * e13) * (p1 * p1) + dz1
+        dz3 = (e13 * d23 + d13 * e23) * (p3 * p3) + dz3
+        dz = jnp.where(three, dz1, dz3)
         dw = 2.0 * (tt * jnp.where(three, dD, dC) + S * dS * z) + ss * dz
         return (
             (dy1 - m1 * dw) * rw - e1 * less,

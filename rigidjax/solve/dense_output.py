@@ -1,13 +1,11 @@
 """States at times inside the steps of a run: dense output, on the group.
 
-y(θ) = y0 + Σ φ_r(θ) F_r with φ = θ, θ (1−θ), θ² (1−θ), … Source: Hairer, Nørsett and Wanner (1993),
-II.6, doi:10.1007/978-3-540-78862-1.
-
 The loop does not look at the times that are asked for. Its steps with such times in them are taken
 once more: of one body many side by side, of many bodies one of each.
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -17,7 +15,7 @@ from jaxtyping import Array
 
 from rigidjax.solve.components import lift
 from rigidjax.solve.record import Method, Rows, Run, Segment, times_of
-from rigidjax.solve.runge_kutta import Step, stages, weights
+from rigidjax.solve.runge_kutta import Step, nested, stages, weights
 
 # Times of one body that are taken together.
 _TOGETHER = 16
@@ -57,7 +55,7 @@ def saved(
         y = _picked(run, path, found.row)
         t, h, end = times_of(run, found.rows)
         there = stages(method.tableau, field, constants, Step(t, h, end, y), True)
-        new = _state(method, project, found.ts, t, h, y, there.slopes)
+        new = _states(method, project, found.ts[None], t, h, y, there.slopes)[0]
         new = jnp.where(found.inside[None], new, _cut(run, ys, number))
         return _put(run, ys, new, number)
 
@@ -95,12 +93,7 @@ def pulled(
     """
     size = run.between.shape[0]
     width = min(size, max(4, min(size // 50, 16)))
-    project = jax.vmap(method.project)
-
-    def states(ts: Array, t: Array, h: Array, y: Array, slopes: Array) -> Array:
-        shares = _shares(method, (ts - t[None]) / jnp.where(h == 0, 1, h)[None], slopes)
-        rise = jnp.sum(jnp.expand_dims(shares, 1) * slopes[None], 2)
-        return project(y[None] + lift(h.astype(y.dtype), rise) * rise)
+    states = partial(_states, method, method.project)
 
     def window(state: tuple[Array, Back]) -> tuple[Array, Back]:
         begin, by = state
@@ -189,24 +182,14 @@ def _in_lanes(run: Run, method: Method) -> tuple[Any, Any]:
     return jax.vmap(method.field, (None, -1, -1), -1), jax.vmap(method.project, -1, -1)
 
 
-def _state(
+def _states(
     method: Method, project: Any, ts: Array, t: Array, h: Array, y: Array, slopes: Array
 ) -> Array:
-    """The states (n, lanes) at times `ts` (lanes), each in a step of its own."""
-    shares = _shares(method, ((ts - t) / jnp.where(h == 0, 1, h))[None], slopes)[0]
-    return project(y + h.astype(y.dtype)[None] * jnp.sum(shares[None] * slopes, 1))
-
-
-def _shares(method: Method, theta: Array, slopes: Array) -> Array:
-    """The weights (W, s, lanes) of the slopes at θ (W, lanes).
-
-    They are one number a stage; the rows F_r would be n.
-    """
-    theta = theta.astype(slopes.dtype)
-    powers = [theta]
+    """The states (W, n, lanes) at times `ts` (W, lanes), all in one step of each lane."""
+    theta = ((ts - t[None]) / jnp.where(h == 0, 1, h)[None]).astype(slopes.dtype)
+    # Weights of the slopes are one number a stage; the rows F_r would be n.
     rows = weights(method.tableau, slopes.dtype, slopes.shape[1]).dense
-    for r in range(1, rows.shape[0]):
-        powers.append(powers[-1] * (1 - theta if r % 2 else theta))
-    ones = [1] * (theta.ndim - 1)
-    terms = zip(rows, powers, strict=True)
-    return sum(row.reshape(1, -1, *ones) * jnp.expand_dims(power, 1) for row, power in terms)  # pyright: ignore
+    rows = rows.reshape(rows.shape[0], 1, -1, *[1] * (theta.ndim - 1))
+    shares = nested(jnp.expand_dims(theta, 1), rows)
+    rise = jnp.sum(jnp.expand_dims(shares, 1) * slopes[None], 2)
+    return jax.vmap(project)(y[None] + lift(h.astype(y.dtype), rise) * rise)
