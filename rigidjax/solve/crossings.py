@@ -25,7 +25,7 @@ from rigidjax.solve.crossing_search import correction, crossings_of, located, se
 from rigidjax.solve.explicit import AbstractExplicit, DormandPrince8
 from rigidjax.solve.linear_map import nan_derivatives
 from rigidjax.solve.run import Free, Loop, solve
-from rigidjax.solve.step_control import of_body, outcome, watched
+from rigidjax.solve.step_control import of_body, outcome
 from rigidjax.solve.vector_field import direction as direction_of
 
 State = TypeVar("State", Spin, Attitude, Rigid, Point, Coupled)
@@ -184,9 +184,9 @@ def crossings(
         _checks.instance(
             solver, AbstractExplicit, "solver", wanted="an explicit method of rigidjax.solvers"
         )
-        control = watched(*validation.tolerances(rtol, atol, times.dtype))
+        rtol, atol = validation.tolerances(rtol, atol, times.dtype)
         way = direction_of(times)
-        setup = Loop(body, torque, solver, control, None, way, max_steps, False)
+        setup = Loop(body, torque, solver, rtol, atol, None, way, max_steps, False)
     return _solved(setup, event, many, max_steps, state0, times)
 
 

@@ -62,7 +62,8 @@ class Loop(eqx.Module):
     body: Inertia | MassProperties | None
     torque: Any
     solver: AbstractExplicit
-    controller: dfx.AbstractStepSizeController
+    rtol: Any
+    atol: Any
     dt0: Any
     sign: Array | None
     max_steps: int = eqx.field(static=True)
@@ -151,7 +152,6 @@ def _by_diffrax(
 def _loop(
     setup: Loop, watch: Ends | None, state0: Any, ts: Array
 ) -> tuple[Any, dict[str, Any], dfx.RESULTS, Any]:
-    controller: Any = setup.controller
     field, jumps = equations_of_motion(setup.body, state0, setup.torque), jumps_of(setup.torque)
     field, watch, along, jumps = ahead(setup.sign, field, watch, ts, jumps)
     out = adaptive(
@@ -159,8 +159,8 @@ def _loop(
         field,
         along,
         state0,
-        rtol=controller.rtol,
-        atol=controller.atol,
+        rtol=setup.rtol,
+        atol=setup.atol,
         dt0=setup.dt0,
         max_steps=setup.max_steps,
         jumps=jumps,

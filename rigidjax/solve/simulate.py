@@ -17,7 +17,7 @@ from rigidjax.motion.torques.base import jumps_of
 from rigidjax.solve import validation
 from rigidjax.solve.crossings import Event, ready, solve_until
 from rigidjax.solve.explicit import AbstractExplicit, DormandPrince8
-from rigidjax.solve.projection import Projected
+from rigidjax.solve.projection import Projected, Watched
 from rigidjax.solve.run import (
     ADJOINT,
     NO_METER,
@@ -30,7 +30,6 @@ from rigidjax.solve.run import (
 )
 from rigidjax.solve.solution import Solution, State
 from rigidjax.solve.splitting import AbstractSplitting
-from rigidjax.solve.step_control import Watched, watched
 from rigidjax.solve.vector_field import direction
 
 # A law must take the state that there is: gravity on a `Spin` is an error that type checkers see.
@@ -130,7 +129,8 @@ def simulate(
     body, state0, times = validation.scene(body, state0, ts, torque, throw)
     if stepsize_controller is None:
         rtol, atol = validation.tolerances(rtol, atol, times.dtype)
-    controller = _controller(stepsize_controller, rtol, atol, torque, times.dtype)
+    elif rtol is not None or atol is not None:
+        raise ValueError("simulate: give either rtol and atol or a stepsize_controller, not both")
     if torque is None and solver is None and stepsize_controller is None and body is not None:
         return _solution(Free(body, throw), event, state0, times)
     method = DormandPrince8() if solver is None else solver
@@ -141,7 +141,7 @@ def simulate(
     if plain and isinstance(adjoint, _EITHER_MODE) and not forward:
         first = validation.first_step(dt0, times)
         way = direction(times)
-        loop = Loop(body, torque, method, controller, first, way, max_steps, throw)  # pyright: ignore
+        loop = Loop(body, torque, method, rtol, atol, first, way, max_steps, throw)  # pyright: ignore
         return _solution(loop, event, state0, times)
     if event is not None:
         raise ValueError(
@@ -149,6 +149,7 @@ def simulate(
             "stepsize_controller, adjoint and progress_meter to their defaults (or take a solver "
             "of rigidjax.solvers), or give diffrax.Event to diffrax.diffeqsolve"
         )
+    controller = _controller(stepsize_controller, rtol, atol, torque, times.dtype)
     setup = Setup(
         body=body,
         torque=torque,
@@ -163,7 +164,7 @@ def simulate(
     return _solution(setup, None, state0, times)
 
 
-def _solution(setup: Free | Loop | Setup, event: Any, state0: Any, times: Array) -> Solution:
+def _solution(setup: Any, event: Any, state0: Any, times: Array) -> Solution:
     event_time = event_state = None
     try:
         if event is None:
@@ -184,22 +185,19 @@ def _controller(
     given: dfx.AbstractStepSizeController | None, rtol: Any, atol: Any, torque: Any, dtype: Any
 ) -> dfx.AbstractStepSizeController:
     if given is not None:
-        if rtol is not None or atol is not None:
-            raise ValueError(
-                "simulate: give either rtol and atol or a stepsize_controller, not both"
-            )
-        return (
-            Watched(given) if isinstance(given, dfx.AbstractAdaptiveStepSizeController) else given
-        )
-    make: Any = _cached if _checks.known((rtol, atol)) else watched
+        adaptive = isinstance(given, dfx.AbstractAdaptiveStepSizeController)
+        return Watched(given) if adaptive else given
+    make: Any = _watched if _checks.known((rtol, atol)) else _watched.__wrapped__
+    watched = make(rtol, atol)
     if not hasattr(torque, "jump_times") or not jumps_of(torque).size:
-        return make(rtol, atol)
+        return watched
     # An adaptive step passes over a short pulse without seeing it.
-    jump_ts = jnp.sort(jumps_of(torque).astype(dtype))
-    return dfx.ClipStepSizeController(make(rtol, atol), jump_ts=jump_ts)
+    return dfx.ClipStepSizeController(watched, jump_ts=jnp.sort(jumps_of(torque).astype(dtype)))
 
 
-_cached = functools.cache(watched)
+@functools.cache
+def _watched(rtol: Any, atol: Any) -> Watched:
+    return Watched(dfx.PIDController(rtol=rtol, atol=atol))
 
 
 def _adjoint(controller: dfx.AbstractStepSizeController) -> dfx.AbstractAdjoint:

@@ -83,7 +83,8 @@ class Solution(eqx.Module, Generic[State]):
         Ruelle 1985, doi:10.1103/RevModPhys.57.617).
         """
         found = _growth(_forward(self._setup), self.ts, self._states)
-        rtol = getattr(getattr(self._setup, "controller", None), "rtol", None)
+        how = self._setup.controller if isinstance(self._setup, Setup) else self._setup
+        rtol = getattr(how, "rtol", None)
         if rtol is None:
             rtol = 100 * float(jnp.finfo(self.ts.dtype).eps)
         if _checks.known((found, rtol, self.ts)):
