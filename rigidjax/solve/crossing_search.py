@@ -38,7 +38,7 @@ from rigidjax.solve.explicit import AbstractExplicit
 from rigidjax.solve.linear_map import no_tangent
 from rigidjax.solve.run import Free, Loop
 from rigidjax.solve.runge_kutta import Step
-from rigidjax.solve.step_control import Method, Run, first_step
+from rigidjax.solve.step_control import Method, Run, first_step, tried
 from rigidjax.solve.vector_field import ahead, equations_of_motion
 
 # Samples of a free body's condition in one turn at its largest rate.
