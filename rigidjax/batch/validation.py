@@ -15,6 +15,7 @@ from rigidjax.motion import Attitude, Rigid, Spin, on_the_group
 from rigidjax.motion.torques.inputs import delays_of, require_inputs
 from rigidjax.rotation.validation import tolerance
 from rigidjax.solve import validation
+from rigidjax.solve.components import one_dtype
 
 
 class BodyBatch(NamedTuple):
@@ -61,10 +62,7 @@ def bodies_of(bodies: Any, states0: Any, torque: Any, torque_axes: Any) -> BodyB
                 f"states0: {count} rows of omega, but {str(path[-1]).lstrip('.')} of shape "
                 f"{leaf.shape}"
             )
-    kinds = {leaf.dtype for leaf in jax.tree.leaves(states0)}
-    if len(kinds) != 1:
-        raise TypeError(f"states0: wanted one dtype, got {', '.join(sorted(map(str, kinds)))}")
-    dtype = kinds.pop()
+    dtype = one_dtype(states0, "states0")
     if not isinstance(bodies, Inertia | MassProperties):
         raise TypeError(
             f"bodies: wanted Inertia, or MassProperties for Rigid, got {type(bodies).__name__}"
