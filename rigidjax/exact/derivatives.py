@@ -36,7 +36,7 @@ from rigidjax.exact.components3 import (
     times,
     turned_back,
 )
-from rigidjax.exact.jacobian import Halfway, integrals, jacobian_and_integral
+from rigidjax.exact.jacobian import integrals, jacobian_and_integral
 from rigidjax.exact.principal_axes import in_axes, into, out_of, principal_frame
 from rigidjax.exact.sigma_form import Differences
 from rigidjax.rotation.linalg3 import components
@@ -232,9 +232,9 @@ def _first_order(o: Orbit, moments: Six, momentum: Triple, t: Scalar):
     whole = jnp.where(u.halves == 0, 0.0, 2.0 * u.halves) * jnp.where(
         u.halves == 0, 0.0, o.half.time
     )
-    halfway = Halfway(at._replace(f=f), u.halves, whole, o.half.mean)
     body, _, _ = reciprocal(moments, momentum)
-    rows, g = jacobian_and_integral(body, momentum, t, halfway)
+    half = at._replace(f=f)
+    rows, g = jacobian_and_integral(body, momentum, t, half, u.halves, whole, o.half.mean)
     return from_functions(o, at.f, u, t), rows, g
 
 

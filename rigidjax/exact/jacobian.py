@@ -37,22 +37,20 @@ class Integrals(NamedTuple):
     y: Scalar
 
 
-class Halfway(NamedTuple):
-    """At half of a time that was reduced by whole periods, `whole` in all; the mean of S²."""
-
-    at: Integrals
-    halves: Scalar
-    whole: Scalar
-    mean: Scalar
-
-
 def jacobian_and_integral(
-    body: Differences, momentum: Triple, t: Scalar, halfway: Halfway
+    body: Differences,
+    momentum: Triple,
+    t: Scalar,
+    before: Integrals,
+    halves: Scalar,
+    whole: Scalar,
+    mean: Scalar,
 ) -> tuple[tuple, Six]:
     """d(Π(t) − Π(0)) by (d12, d23, k12, k13, k23, Π(0), k11, t) as three rows, and G = ∫ Π Πᵀ dt.
 
-    Relatively right for short times too. Takes off-diagonal entries as zero. Regular at rest. C and
-    D of `halfway` as in `body`.
+    Relatively right for short times too. Takes off-diagonal entries as zero. Regular at rest.
+    `before` at half of a time that was reduced by `halves` half periods, `whole` in all, its C and
+    D as in `body`; `mean` of S².
     """
     d12, d13, d23 = body[:3]
     p1, p2, p3 = momentum
@@ -60,7 +58,6 @@ def jacobian_and_integral(
     m = Modulus(p, q, gap)
     three = gap > 0
     top = jnp.where(three, p, q)
-    before, halves, whole, mean = halfway
     after = twice(before, m, jnp.zeros_like(t), jnp.zeros_like(t))
     S, C, D, *_ = after.f
     grown2 = after.y2 + whole * mean

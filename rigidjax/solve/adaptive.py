@@ -13,7 +13,6 @@ from jaxtyping import Array
 
 from rigidjax.motion import on_the_group
 from rigidjax.solve import adaptive_loop, adjoint
-from rigidjax.solve.adjoint import Outputs
 from rigidjax.solve.batching import Arrays, Layout, in_lanes
 from rigidjax.solve.components import flat, leaf_sizes, unflat
 from rigidjax.solve.explicit import AbstractExplicit
@@ -183,7 +182,8 @@ def _of_constants(part: slice, tree: Any, rest: Any, constants: Arrays, *args: A
 
 
 def _solved(program: _Program, constants: Arrays, run: Run) -> Answer:
-    number, ends = len(constants), len(Outputs._fields)
+    # The states between and at the end are what has derivatives.
+    number, ends = len(constants), 2
 
     def mapped(kind: Any, linear: int, *args: Any) -> Arrays:
         return in_lanes(partial(kind, program), list(args[:number]), list(args[number:]), linear)
@@ -286,5 +286,5 @@ def _pulled(
 ) -> Arrays:
     method, chosen, run, record, bars = _again(moving, program, layout, constants, each)
     timed = any(moving.run[:3])
-    total, of_run = adjoint.cotangents(method, chosen, run, record, Outputs(*bars), timed)
+    total, of_run = adjoint.cotangents(method, chosen, run, record, bars, timed)
     return [*total, *(a for a, moves in zip(of_run, moving.run, strict=True) if moves)]

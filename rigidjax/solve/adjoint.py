@@ -7,7 +7,8 @@ otherwise, such a segment may take other steps between the same two ends: then t
 that of those, the same to the tolerance.
 """
 
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -19,13 +20,6 @@ from rigidjax.solve.adaptive_loop import going, recorded, segment
 from rigidjax.solve.components import lift
 from rigidjax.solve.runge_kutta import Step
 from rigidjax.solve.step_control import HEAD, STEP, Method, Record, Run, Segment, times_of, unpacked
-
-
-class Outputs(NamedTuple):
-    """States (or cotangents of them) `between` (K, n, *bodies) and at the `end` (n, *bodies)."""
-
-    between: Array
-    end: Array
 
 
 def replayed(
@@ -70,12 +64,14 @@ def cotangents(
     constants: list[Array],
     run: Run,
     record: Record,
-    bars: Outputs,
+    bars: Sequence[Array],
     timed: bool,
 ) -> tuple[list[Array], Run]:
     """The transpose of the tangents of `replayed`: cotangents of the constants and of the run.
 
     Those of times only where they are `timed`; those of tolerances and of the first step are 0.
+
+    **Arguments:** `bars` of the states between (K, n, *bodies) and at the end (n, *bodies).
     """
     number, size = jnp.max(record.number), run.between.shape[0]
 
@@ -103,7 +99,7 @@ def cotangents(
                     there.slopes,
                     known[k],
                     known[k + 1],
-                    bars.between,
+                    bars[0],
                     between if timed else None,
                 )
             by_constants, *rest = runge_kutta.pulled(
@@ -124,7 +120,7 @@ def cotangents(
 
         return lax.fori_loop(0, part.number, step, sums)
 
-    none = Run(*(jnp.zeros_like(a) for a in run))._replace(y0=bars.end)
+    none = Run(*(jnp.zeros_like(a) for a in run))._replace(y0=bars[1])
     return lax.fori_loop(0, number, one, ([jnp.zeros_like(c) for c in constants], none))
 
 

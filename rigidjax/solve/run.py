@@ -21,14 +21,8 @@ from rigidjax.motion.torques.base import jumps_of
 from rigidjax.solve.adaptive import adaptive
 from rigidjax.solve.explicit import AbstractExplicit
 from rigidjax.solve.linear_map import nan_derivatives
-from rigidjax.solve.projection import Projected
 from rigidjax.solve.step_control import NONFINITE, finite, of_body
 from rigidjax.solve.vector_field import ahead, equations_of_motion
-
-# Made once: building a Module costs as much as ten steps, and `jit` compares it leaf by leaf.
-SOLVER = Projected(dfx.Dopri8())
-ADJOINT = dfx.RecursiveCheckpointAdjoint()
-NO_METER = dfx.NoProgressMeter()
 
 
 class Free(eqx.Module):

@@ -18,16 +18,7 @@ from rigidjax.solve import validation
 from rigidjax.solve.crossings import Event, ready, solve_until
 from rigidjax.solve.explicit import AbstractExplicit, DormandPrince8
 from rigidjax.solve.projection import Projected, Watched
-from rigidjax.solve.run import (
-    ADJOINT,
-    NO_METER,
-    SOLVER,
-    Free,
-    Loop,
-    Setup,
-    refuse_ended,
-    solve,
-)
+from rigidjax.solve.run import Free, Loop, Setup, refuse_ended, solve
 from rigidjax.solve.solution import Solution, State
 from rigidjax.solve.splitting import AbstractSplitting
 from rigidjax.solve.vector_field import direction
@@ -35,6 +26,10 @@ from rigidjax.solve.vector_field import direction
 # A law must take the state that there is: gravity on a `Spin` is an error that type checkers see.
 Law = Callable[[Any, State, Any], Any] | AbstractScene | MovingFrame | None
 
+# Made once: building a Module costs as much as ten steps, and `jit` compares it leaf by leaf.
+SOLVER = Projected(dfx.Dopri8())
+ADJOINT = dfx.RecursiveCheckpointAdjoint()
+NO_METER = dfx.NoProgressMeter()
 # Our loop has both modes of differentiation: these adjoints of diffrax ask no more than that.
 _EITHER_MODE = (type(None), dfx.ForwardMode, dfx.RecursiveCheckpointAdjoint)
 # A step that reverse mode runs again rounds differently. Where the tolerance is so near round-off
@@ -138,8 +133,8 @@ def simulate(
     plain = plain and stepsize_controller is None and progress_meter is None
     # Where forward mode is all that is asked, diffrax is quicker: tangents go along with the run.
     forward = isinstance(adjoint, dfx.ForwardMode) and solver is None and event is None
+    first = validation.first_step(dt0, times)
     if plain and isinstance(adjoint, _EITHER_MODE) and not forward:
-        first = validation.first_step(dt0, times)
         way = direction(times)
         loop = Loop(body, torque, method, rtol, atol, first, way, max_steps, throw)  # pyright: ignore
         return _solution(loop, event, state0, times)
@@ -155,7 +150,7 @@ def simulate(
         torque=torque,
         solver=_on_the_group(solver),
         controller=controller,
-        dt0=validation.signed_step(dt0, times),
+        dt0=None if first is None else first * jnp.sign(times[-1] - times[0]),
         adjoint=_adjoint(controller) if adjoint is None else adjoint,
         progress_meter=NO_METER if progress_meter is None else progress_meter,
         max_steps=max_steps,

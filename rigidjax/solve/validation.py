@@ -188,12 +188,6 @@ def first_step(dt0: Any, times: Array) -> Array | None:
     return abs(step)
 
 
-def signed_step(dt0: Any, times: Array) -> Array | None:
-    """`first_step` with the sign of the direction of time, as diffrax wants it."""
-    step = first_step(dt0, times)
-    return step if step is None else step * jnp.sign(times[-1] - times[0])
-
-
 def start(state0: Any, throw: bool) -> Any:
     """`state0` of one body, finite, with a unit quaternion; poisoned as `times` does it."""
     if not isinstance(state0, Spin | Attitude | Rigid | Point):
