@@ -158,13 +158,8 @@ def rollout(
             f"save_every: wanted a whole part of num_steps = {count}, got {save_every!r}"
         )
     start = jax.tree.map(jnp.asarray, initial)
-    numbers = (
-        batch.shared,
-        (batch.each, driven),
-        start,
-        h,
-        _checks.time(t0, "t0").astype(batch.dtype),
-    )
+    begin = _checks.time(t0, "t0").astype(batch.dtype)
+    numbers = (batch.shared, (batch.each, driven), start, h, begin)
     plan = _Plan(
         solver,
         count,
