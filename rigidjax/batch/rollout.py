@@ -9,9 +9,10 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
+from rigidjax import _checks
 from rigidjax._types import ScalarLike
 from rigidjax.batch.sharding import Compiled, chunk_of, mesh_of, over_bodies
-from rigidjax.batch.validation import BodyBatch, bodies_of, driven_by, start_of, step_of, time_of
+from rigidjax.batch.validation import bodies_of, driven_by, one_of, step_of
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.coupled import started
@@ -22,7 +23,6 @@ from rigidjax.solve.fixed_loop import first_row, march, piece_length
 from rigidjax.solve.magnus import Magnus4
 from rigidjax.solve.splitting import AbstractSplitting
 from rigidjax.solve.steppers import stepper_of
-from rigidjax.solve.validation import real_or_nan
 
 State = TypeVar("State", Spin, Attitude, Rigid)
 Reduced = TypeVar("Reduced")
@@ -158,7 +158,8 @@ def rollout(
             f"save_every: wanted a whole part of num_steps = {count}, got {save_every!r}"
         )
     start = jax.tree.map(jnp.asarray, initial)
-    numbers = (batch.shared, (batch.each, driven), start, h, time_of(t0, batch.dtype))
+    begin = _checks.time(t0, "t0").astype(batch.dtype)
+    numbers = (batch.shared, (batch.each, driven), start, h, begin)
     plan = _Plan(
         solver,
         count,
@@ -187,9 +188,7 @@ def _run(plan: _Plan, reduce: Reduce | None, rest: Any, numbers: Any) -> Any:
     def one(given: Any, each: Any) -> Any:
         shared, initial, h, t0 = given
         own, inputs = each
-        body, state0, torque = BodyBatch.one(shared, own, rest)
-        state0 = start_of(state0)
-        body = real_or_nan(body)
+        body, state0, torque = one_of(shared, own, rest)
         state0 = started(body, state0, bind(torque, first_row(torque, h, inputs)), t0)
         field = equations_of_motion(body, state0, torque)
         stepper = stepper_of(plan.solver, field, state0)

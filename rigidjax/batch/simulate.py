@@ -15,7 +15,7 @@ from rigidjax import _checks
 from rigidjax._types import ScalarLike
 from rigidjax.batch.rollout import Inputs, rollout
 from rigidjax.batch.sharding import Compiled, chunk_of, mesh_of, over_bodies
-from rigidjax.batch.validation import BodyBatch, bodies_of, start_of, step_of, time_of
+from rigidjax.batch.validation import BodyBatch, bodies_of, one_of, step_of
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.exact.free_body import FreeMotion
 from rigidjax.motion import Attitude, Rigid, Spin
@@ -24,7 +24,6 @@ from rigidjax.solve import equations_of_motion, simulate as simulate_one, valida
 from rigidjax.solve.explicit import DormandPrince8
 from rigidjax.solve.magnus import Magnus4
 from rigidjax.solve.step_control import NONFINITE, finite, of_body
-from rigidjax.solve.validation import real_or_nan
 
 State = TypeVar("State", Spin, Attitude, Rigid)
 
@@ -153,21 +152,16 @@ def _run(plan: _Plan, rest: Any, numbers: Any) -> Any:
 
     def one(given: Any, each: Any) -> Any:
         shared, ts = given
-        body, state0, torque = BodyBatch.one(shared, each, rest)
-        state0 = start_of(state0)
-        body = real_or_nan(body)
-        return (
-            _free(body, state0, ts)
-            if plan.solver is None
-            else _adaptive(plan, body, state0, torque, ts)
-        )
+        body, state0, torque = one_of(shared, each, rest)
+        if plan.solver is None:
+            return _free(body, state0, ts)
+        return _adaptive(plan, body, state0, torque, ts)
 
     if plan.solver is None:
         return over_bodies(one, (shared, ts), each, plan.chunk, plan.mesh)
 
     def quick(each: Any) -> Array:
-        body, state0, torque = BodyBatch.one(shared, each, rest)
-        return quickness(body, state0, torque, ts[0])
+        return quickness(*one_of(shared, each, rest), ts[0])
 
     parts = 1 if plan.mesh is None else plan.mesh.devices.size
     order, back = dealt(jax.vmap(quick)(each), plan.chunk, parts)
@@ -193,7 +187,7 @@ def _status(ys: Any, body: Any) -> dfx.RESULTS:
 @eqx.filter_jit
 def _statuses(batch: BodyBatch, ys: Any) -> dfx.RESULTS:
     def one(each: Any, ys: Any) -> dfx.RESULTS:
-        return _status(ys, real_or_nan(BodyBatch.one(batch.shared, each, batch.rest)[0]))
+        return _status(ys, one_of(batch.shared, each, batch.rest)[0])
 
     return jax.vmap(one)(batch.each, ys)
 
@@ -210,14 +204,13 @@ def _equal(steps: Steps, bodies: Any, states0: Any, torque: Any, **how: Any) -> 
     every = steps.number if steps.save_every is None else steps.save_every
     how |= dict(save_every=every, t0=steps.t0)
     ys: Any = rollout(bodies, states0, steps.size, steps.number, torque, **how)
-    dtype = states0.omega.dtype
-    h, count = step_of(steps.size, steps.number, dtype)
-    ts = time_of(steps.t0, dtype) + h * jnp.arange(every, count + 1, every).astype(dtype)
-    result = _statuses(bodies_of(bodies, states0, torque, how["torque_axes"]), ys)
-    steps_taken = jnp.full(states0.omega.shape[:1], count, jnp.int32)
-    if isinstance(ys, Coupled):
-        return Batch(ts, ys.motion, result, steps_taken, ys.own)
-    return Batch(ts, ys, result, steps_taken)
+    batch = bodies_of(bodies, states0, torque, how["torque_axes"])
+    h, count = step_of(steps.size, steps.number, batch.dtype)
+    ts = h * jnp.arange(every, count + 1, every).astype(h.dtype)
+    ts = _checks.time(steps.t0, "t0").astype(h.dtype) + ts
+    taken = jnp.full(batch.many, count, jnp.int32)
+    own = ys.own if isinstance(ys, Coupled) else None
+    return Batch(ts, motion_of(ys), _statuses(batch, ys), taken, own)
 
 
 def quickness(body: Any, state0: Any, torque: Any, t0: Array) -> Array:

@@ -13,7 +13,9 @@ from rigidjax._types import HasAttitude
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.motion import Attitude, Rigid, Spin, on_the_group
 from rigidjax.motion.torques.inputs import delays_of, require_inputs
-from rigidjax.solve.validation import require_fit
+from rigidjax.rotation.validation import tolerance
+from rigidjax.solve import validation
+from rigidjax.solve.components import one_dtype
 
 
 class BodyBatch(NamedTuple):
@@ -29,10 +31,11 @@ class BodyBatch(NamedTuple):
     many: int
     dtype: Any
 
-    @staticmethod
-    def one(shared: Any, each: Any, rest: Any) -> tuple[Any, Any, Any]:
-        """A single body, its state and its torque."""
-        return eqx.combine(shared, each, rest)
+
+def one_of(shared: Any, each: Any, rest: Any) -> tuple[Any, Any, Any]:
+    """A single body, its state and its torque; NaN, for that body alone, where it cannot be."""
+    body, state0, torque = eqx.combine(shared, each, rest)
+    return validation.real_or_nan(body), on_the_group(validation.start(state0, False)), torque
 
 
 def bodies_of(bodies: Any, states0: Any, torque: Any, torque_axes: Any) -> BodyBatch:
@@ -59,10 +62,7 @@ def bodies_of(bodies: Any, states0: Any, torque: Any, torque_axes: Any) -> BodyB
                 f"states0: {count} rows of omega, but {str(path[-1]).lstrip('.')} of shape "
                 f"{leaf.shape}"
             )
-    kinds = {leaf.dtype for leaf in jax.tree.leaves(states0)}
-    if len(kinds) != 1:
-        raise TypeError(f"states0: wanted one dtype, got {', '.join(sorted(map(str, kinds)))}")
-    dtype = kinds.pop()
+    dtype = one_dtype(states0, "states0")
     if not isinstance(bodies, Inertia | MassProperties):
         raise TypeError(
             f"bodies: wanted Inertia, or MassProperties for Rigid, got {type(bodies).__name__}"
@@ -93,7 +93,7 @@ def bodies_of(bodies: Any, states0: Any, torque: Any, torque_axes: Any) -> BodyB
     shape = lambda a: jax.ShapeDtypeStruct(a.shape[1:], a.dtype)  # noqa: E731
     matter = isinstance(bodies, MassProperties)
     first = jax.tree.map((lambda a: a[0]) if matter else shape, each)
-    require_fit(*BodyBatch.one(shared, first, rest))
+    validation.require_fit(*eqx.combine(shared, first, rest))
     return found
 
 
@@ -185,9 +185,8 @@ def _positive(tensor: Array) -> None:
 def _unit(q: Array) -> None:
     if not _checks.known(q):
         return
-    numbers = np.asarray(q)
-    far = np.abs(np.sqrt(np.sum(np.square(numbers), axis=-1)) - 1)
-    bad = far > (1e-6 if numbers.dtype == np.float64 else 1e-3)
+    far = np.abs(np.sqrt(np.sum(np.square(np.asarray(q)), axis=-1)) - 1)
+    bad = far > tolerance(q.dtype)
     if bad.any():
         i = int(np.argmax(bad))
         raise ValueError(
@@ -208,29 +207,4 @@ def step_of(step_size: Any, num_steps: Any, dtype: Any) -> tuple[Array, int]:
             f"step_size: wanted a positive step, s, got {step_size}; to go back in time negate Ω "
             "and the torque's time"
         )
-    if isinstance(num_steps, bool) or not isinstance(num_steps, int | np.integer):
-        raise TypeError(
-            f"num_steps: wanted a whole number known before compiling, got {num_steps!r}"
-        )
-    if num_steps < 1:
-        raise ValueError(f"num_steps: wanted at least one step, got {num_steps}")
-    return h, int(num_steps)
-
-
-def time_of(value: Any, dtype: Any) -> Array:
-    """A scalar time, s.
-
-    **Raises:** `ValueError` for one that is known and not finite.
-    """
-    t0 = _checks.floating(value, (), "t0")
-    return (_checks.finite(t0, "t0") if _checks.known(t0) else t0).astype(dtype)
-
-
-def start_of(state0: Any) -> Any:
-    """The start with its quaternion of length 1; NaN, for that body alone, if it is far from it."""
-    if not isinstance(state0, HasAttitude):
-        return state0
-    q = state0.q
-    far = jnp.abs(jnp.sqrt(jnp.sum(q * q)) - 1) > (1e-6 if q.dtype == jnp.float64 else 1e-3)
-    q = jnp.where(far, jnp.full_like(q, jnp.nan), q)
-    return on_the_group(eqx.tree_at(lambda s: s.q, state0, q))
+    return h, _checks.whole(num_steps, "num_steps", 1)

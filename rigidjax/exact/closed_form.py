@@ -10,11 +10,17 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rigidjax._types import Scalar
-from rigidjax.exact._xla import fence, one_kernel, opaque_one
-from rigidjax.exact.complete_integrals import HalfPeriod, half_period
+from rigidjax.exact._xla import fence, one_kernel, opaque_one, sincos
 from rigidjax.exact.components3 import Four, Triple
-from rigidjax.exact.jacobi_duplication import Elliptic, Modulus, duplicate, elliptic, until_rest
-from rigidjax.exact.sincos import sincos
+from rigidjax.exact.jacobi_duplication import (
+    Elliptic,
+    HalfPeriod,
+    Modulus,
+    duplicate,
+    elliptic,
+    half_period,
+    until_rest,
+)
 
 
 class Orbit(NamedTuple):

@@ -11,6 +11,10 @@ Four = tuple[Scalar, ...]
 Six = tuple[Scalar, ...]
 
 
+def plus(a: Triple, b: Triple) -> Triple:
+    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
+
+
 def times(m: Six, v: Triple) -> Triple:
     """A symmetric matrix times a vector."""
     a, b, c, x, y, z = m

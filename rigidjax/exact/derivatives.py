@@ -32,10 +32,11 @@ from rigidjax.exact.components3 import (
     cross,
     determinant,
     half_product,
+    plus,
     times,
     turned_back,
 )
-from rigidjax.exact.jacobian import Halfway, integrals, jacobian_and_integral
+from rigidjax.exact.jacobian import integrals, jacobian_and_integral
 from rigidjax.exact.principal_axes import in_axes, into, out_of, principal_frame
 from rigidjax.exact.sigma_form import Differences
 from rigidjax.rotation.linalg3 import components
@@ -195,19 +196,15 @@ def slopes(moments: Six, momentum: Triple, t: Scalar) -> tuple[tuple[Triple, Fou
         d_out, across, along = fence((d_out, across, along), one)
         theta = tuple(r * (a + b * along) for a, b in zip(across, out, strict=True))
         # At rest, to second order in time.
-        faster = _sum(times(d_k, momentum), times(k, start))
-        bent = times(k, _sum(cross(start, rate), cross(momentum, faster)))
-        bent = _sum(_sum(bent, times(d_k, cross(momentum, rate))), cross(faster, rate))
+        faster = plus(times(d_k, momentum), times(k, start))
+        bent = times(k, plus(cross(start, rate), cross(momentum, faster)))
+        bent = plus(plus(bent, times(d_k, cross(momentum, rate))), cross(faster, rate))
         near = zip(faster, bent, times(k, out), strict=True)
         near = tuple(t * (a + 0.5 * t * b) + et * c for a, b, c in near)
         theta = tuple(jnp.where(still, a, b) for a, b in zip(near, theta, strict=True))
-        return fence((d_out, theta, _sum(times(k, d_out), times(d_k, out))), one)
+        return fence((d_out, theta, plus(times(k, d_out), times(d_k, out))), one)
 
     return (out, turn), Slopes(*jax.vmap(column)(jnp.eye(10, dtype=t.dtype), rows))
-
-
-def _sum(a: Triple, b: Triple) -> Triple:
-    return tuple(x + y for x, y in zip(a, b, strict=True))
 
 
 def inputs_of(moments: Six, momentum: Triple) -> tuple[Scalar, ...]:
@@ -235,9 +232,9 @@ def _first_order(o: Orbit, moments: Six, momentum: Triple, t: Scalar):
     whole = jnp.where(u.halves == 0, 0.0, 2.0 * u.halves) * jnp.where(
         u.halves == 0, 0.0, o.half.time
     )
-    halfway = Halfway(at._replace(f=f), u.halves, whole, o.half.mean)
     body, _, _ = reciprocal(moments, momentum)
-    rows, g = jacobian_and_integral(body, momentum, t, halfway)
+    half = at._replace(f=f)
+    rows, g = jacobian_and_integral(body, momentum, t, half, u.halves, whole, o.half.mean)
     return from_functions(o, at.f, u, t), rows, g
 
 

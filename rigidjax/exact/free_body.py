@@ -7,7 +7,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from rigidjax import _checks
@@ -19,6 +18,7 @@ from rigidjax.exact.derivatives import Setting, motion, set_up
 from rigidjax.motion import Attitude, Rigid
 from rigidjax.rotation.kernels import product4
 from rigidjax.rotation.linalg3 import components
+from rigidjax.rotation.validation import near_unit, tolerance
 
 State = TypeVar("State", bound=HasSpin)
 
@@ -184,15 +184,15 @@ def _check(inertia: Inertia, state0: HasSpin) -> None:
             f"state0: wanted a Spin or an Attitude, got {type(state0).__name__}; a body that "
             "also moves is free in both: add x + v t yourself, or use simulate"
         )
-    _checks.instance(inertia, Inertia, "inertia", hint="of MassProperties pass .inertia")
-    tensor = _checks.floating(inertia.tensor, (3, 3), "inertia tensor")
+    _checks.single(inertia, Inertia, "inertia", hint="of MassProperties pass .inertia")
+    tensor = inertia.tensor
     arrays = {"omega": _checks.floating(state0.omega, (3,), "omega")}
     if isinstance(state0, HasAttitude):
         arrays["q"] = _checks.floating(state0.q, (4,), "q", hint="a quaternion is (w, x, y, z)")
     for name, array in arrays.items():
         if array.dtype != tensor.dtype:
             raise TypeError(f"{name} is {array.dtype}, but the inertia tensor is {tensor.dtype}")
-    if any(isinstance(x, Tracer) for x in (tensor, *arrays.values())):
+    if not _checks.known((tensor, arrays)):
         return
     tensor = np.asarray(_checks.finite(tensor, "inertia tensor"), dtype=np.float64)
     least = np.linalg.eigvalsh(tensor).min()
@@ -201,9 +201,7 @@ def _check(inertia: Inertia, state0: HasSpin) -> None:
     for name, array in arrays.items():
         _checks.finite(array, name)
     if "q" in arrays:
-        length = float(np.linalg.norm(np.asarray(arrays["q"], dtype=np.float64)))
-        if abs(length - 1) > (1e-6 if arrays["q"].dtype == np.float64 else 1e-3):
-            raise ValueError(f"q: wanted a unit quaternion (w, x, y, z), got length {length:.6g}")
+        near_unit(arrays["q"], "q", tolerance(inertia.tensor.dtype))
 
 
 @functools.partial(jnp.vectorize, signature="(n),(n)->(n)")

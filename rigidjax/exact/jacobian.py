@@ -37,22 +37,20 @@ class Integrals(NamedTuple):
     y: Scalar
 
 
-class Halfway(NamedTuple):
-    """At half of a time that was reduced by whole periods, `whole` in all; the mean of S²."""
-
-    at: Integrals
-    halves: Scalar
-    whole: Scalar
-    mean: Scalar
-
-
 def jacobian_and_integral(
-    body: Differences, momentum: Triple, t: Scalar, halfway: Halfway
+    body: Differences,
+    momentum: Triple,
+    t: Scalar,
+    before: Integrals,
+    halves: Scalar,
+    whole: Scalar,
+    mean: Scalar,
 ) -> tuple[tuple, Six]:
     """d(Π(t) − Π(0)) by (d12, d23, k12, k13, k23, Π(0), k11, t) as three rows, and G = ∫ Π Πᵀ dt.
 
-    Relatively right for short times too. Takes off-diagonal entries as zero. Regular at rest. C and
-    D of `halfway` as in `body`.
+    Relatively right for short times too. Takes off-diagonal entries as zero. Regular at rest.
+    `before` at half of a time that was reduced by `halves` half periods, `whole` in all, its C and
+    D as in `body`; `mean` of S².
     """
     d12, d13, d23 = body[:3]
     p1, p2, p3 = momentum
@@ -60,7 +58,6 @@ def jacobian_and_integral(
     m = Modulus(p, q, gap)
     three = gap > 0
     top = jnp.where(three, p, q)
-    before, halves, whole, mean = halfway
     after = twice(before, m, jnp.zeros_like(t), jnp.zeros_like(t))
     S, C, D, *_ = after.f
     grown2 = after.y2 + whole * mean
@@ -104,58 +101,23 @@ def jacobian_and_integral(
         dC = -p * S * D * theta - C * shrink + jnp.where(three, 0.0, rc * dgap)
         dD = -q * S * C * theta - D * shrink + jnp.where(three, rd * dgap, 0.0)
         x12, x13, x23 = o12 * t12, o13 * t13, o23 * t23
-        du1 = (
-            -e23 * (p2 * p3)
-            - d23 * (e2 * p3 + e3 * p2)
-            + o12 * (-p1 * p3)
-            + o13 * (p1 * p2)
-            + o23 * (p2 * p2 - p3 * p3)
-        )
-        du2 = (
-            e13 * (p1 * p3)
-            + d13 * (e1 * p3 + e3 * p1)
-            + o12 * (p2 * p3)
-            + o13 * (p3 * p3 - p1 * p1)
-            - o23 * (p1 * p2)
-        )
-        du3 = (
-            -e12 * (p1 * p2)
-            - d12 * (e1 * p2 + e2 * p1)
-            + o12 * (p1 * p1 - p2 * p2)
-            - o13 * (p2 * p3)
-            + o23 * (p1 * p3)
-        )
-        dy1 = (
-            e1 * one1
-            + p1 * dC
-            - x12 * C * p2
-            - x13 * p3
-            + dS * D * u1
-            + S * (dD * u1 + D * du1 + x12 * u2 + x13 * u3)
-        )
-        dy2 = (
-            e2 * one2
-            + p2 * (dC * D + C * dD)
-            - x12 * C * p1
-            - x23 * D * p3
-            + dS * u2
-            + S * (du2 + x12 * u1 + x23 * u3)
-        )
-        dy3 = (
-            e3 * one3
-            + p3 * dD
-            - x13 * p1
-            - x23 * D * p2
-            + dS * C * u3
-            + S * (dC * u3 + C * du3 + x13 * u1 + x23 * u2)
-        )
-        dz = jnp.where(
-            three,
-            (e12 * d13 + d12 * e13) * (p1 * p1)
-            + 2.0 * p1 * (d12 * d13 * e1 + d13 * o12 * p2 + d12 * o13 * p3),
-            (e13 * d23 + d13 * e23) * (p3 * p3)
-            + 2.0 * p3 * (d13 * d23 * e3 - d23 * o13 * p1 - d13 * o23 * p2),
-        )
+        du1 = -e23 * (p2 * p3) - d23 * (e2 * p3 + e3 * p2) - o12 * (p1 * p3)
+        du1 = du1 + o13 * (p1 * p2) + o23 * (p2 * p2 - p3 * p3)
+        du2 = e13 * (p1 * p3) + d13 * (e1 * p3 + e3 * p1) + o12 * (p2 * p3)
+        du2 = du2 + o13 * (p3 * p3 - p1 * p1) - o23 * (p1 * p2)
+        du3 = -e12 * (p1 * p2) - d12 * (e1 * p2 + e2 * p1) + o12 * (p1 * p1 - p2 * p2)
+        du3 = du3 - o13 * (p2 * p3) + o23 * (p1 * p3)
+        dy1 = e1 * one1 + p1 * dC - x12 * C * p2 - x13 * p3 + dS * D * u1
+        dy1 = dy1 + S * (dD * u1 + D * du1 + x12 * u2 + x13 * u3)
+        dy2 = e2 * one2 + p2 * (dC * D + C * dD) - x12 * C * p1 - x23 * D * p3
+        dy2 = dy2 + dS * u2 + S * (du2 + x12 * u1 + x23 * u3)
+        dy3 = e3 * one3 + p3 * dD - x13 * p1 - x23 * D * p2 + dS * C * u3
+        dy3 = dy3 + S * (dC * u3 + C * du3 + x13 * u1 + x23 * u2)
+        dz1 = 2.0 * p1 * (d12 * d13 * e1 + d13 * o12 * p2 + d12 * o13 * p3)
+        dz3 = 2.0 * p3 * (d13 * d23 * e3 - d23 * o13 * p1 - d13 * o23 * p2)
+        dz1 = (e12 * d13 + d12 * e13) * (p1 * p1) + dz1
+        dz3 = (e13 * d23 + d13 * e23) * (p3 * p3) + dz3
+        dz = jnp.where(three, dz1, dz3)
         dw = 2.0 * (tt * jnp.where(three, dD, dC) + S * dS * z) + ss * dz
         return (
             (dy1 - m1 * dw) * rw - e1 * less,

@@ -11,10 +11,9 @@ from rigidjax.body import validation
 from rigidjax.body.inertia import Inertia
 from rigidjax.body.scaling import exponent_of, times_power_of_two
 from rigidjax.exact import sigma_form
-from rigidjax.exact.complete_integrals import half_period
 from rigidjax.exact.components3 import Six, Triple, times
 from rigidjax.exact.derivatives import first_order, reciprocal
-from rigidjax.exact.jacobi_duplication import Modulus, is_endless
+from rigidjax.exact.jacobi_duplication import Modulus, half_period, is_endless
 from rigidjax.exact.principal_axes import into, principal_frame
 
 
@@ -91,8 +90,10 @@ def _periods(moments: Six, momentum: Triple) -> tuple[Scalar, Scalar]:
     endless = is_endless(jax.lax.stop_gradient(Modulus(v.p, v.q, v.gap)))
     # Where there is no period the branch not taken gets other inputs: no derivative is NaN.
     one, zero = jnp.ones_like(h), jnp.zeros_like(h)
-    safe_moments = _choose(endless, (one, 2 * one, 3 * one, zero, zero, zero), moments)
-    safe_momentum = _choose(endless, (one, zero, zero), momentum)
+    other = (one, 2 * one, 3 * one, zero, zero, zero), (one, zero, zero)
+    safe_moments, safe_momentum = jax.tree.map(
+        lambda a, b: jnp.where(endless, a, b), other, (moments, momentum)
+    )
     body, _, _ = reciprocal(safe_moments, safe_momentum)
     period = sigma_form.period(sigma_form.invariants(body, safe_momentum))
     angle = _precession(safe_moments, safe_momentum, period)
@@ -130,7 +131,3 @@ def _precession_jvp(primals, tangents):
     )
     h = jnp.sqrt(sum(p * p for p in momentum))
     return _precession(*primals), along / h
-
-
-def _choose(condition, a, b):
-    return tuple(jnp.where(condition, x, y) for x, y in zip(a, b, strict=True))

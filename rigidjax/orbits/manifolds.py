@@ -15,7 +15,7 @@ from rigidjax._types import Scalar, ScalarLike
 from rigidjax.frames.point import Point
 from rigidjax.orbits import continuation, state_transition
 from rigidjax.orbits.differential_correction import PeriodicOrbit, crossing
-from rigidjax.solve import ending
+from rigidjax.solve.run import Ends
 
 # Time run backwards is seen in the mirror y → −y: x, y, z, vx, vy, vz.
 _MIRROR = np.array([1.0, -1.0, 1.0, -1.0, 1.0, -1.0])
@@ -214,7 +214,7 @@ def _paths(scene: Any, starts: Point, ts: Array, which: str) -> Point:
         return Point(state.x * mirror[:3], state.v * mirror[3:]) if turn else state
 
     def path(start: Point) -> Point:
-        how = dict(saveat=dfx.SaveAt(ts=ts), event=dfx.Event(ending.Ends(scene)))
+        how = dict(saveat=dfx.SaveAt(ts=ts), event=dfx.Event(Ends(scene)))
         out = state_transition.solved(scene, seen(start), ts[-1], 1e-11, 1e-12, **how)
         there: Any = jnp.isfinite(jnp.asarray(out.ts))[:, None]
         ys: Any = jax.tree.map(lambda leaf: jnp.where(there, leaf, jnp.nan), out.ys)

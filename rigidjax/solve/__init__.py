@@ -3,8 +3,11 @@
 from rigidjax._names import show
 from rigidjax.solve import solvers as solvers
 from rigidjax.solve.adaptive import adaptive as adaptive
-from rigidjax.solve.crossings import Crossings as Crossings, crossings as crossings
-from rigidjax.solve.events import Event as Event
+from rigidjax.solve.crossings import (
+    Crossings as Crossings,
+    Event as Event,
+    crossings as crossings,
+)
 from rigidjax.solve.exponents import (
     Exponents as Exponents,
     lyapunov_exponents as lyapunov_exponents,

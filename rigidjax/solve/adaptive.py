@@ -13,13 +13,11 @@ from jaxtyping import Array
 
 from rigidjax.motion import on_the_group
 from rigidjax.solve import adaptive_loop, adjoint
-from rigidjax.solve.adjoint import Outputs
 from rigidjax.solve.batching import Arrays, Layout, in_lanes
 from rigidjax.solve.components import flat, leaf_sizes, unflat
 from rigidjax.solve.explicit import AbstractExplicit
-from rigidjax.solve.linear_map import linear_map, no_tangent, refuse
-from rigidjax.solve.record import HALTED, Answer, Method, Record, Run
-from rigidjax.solve.step_control import outcome
+from rigidjax.solve.linear_map import is_smooth, linear_map, no_tangent, refuse
+from rigidjax.solve.step_control import HALTED, Answer, Method, Record, Run, outcome
 from rigidjax.solve.tableaus import Tableau
 
 
@@ -149,38 +147,43 @@ def _program(
     def project(y: Array) -> Array:
         return flat(on_the_group(unflat(y, like)))
 
-    of_one, constants = taken_out(flat_field, t0, flat(y0))
-    count, ended = len(constants), None
-    smooth = [bool(jnp.issubdtype(c.dtype, jnp.inexact)) for c in constants]
+    functions: list[Any] = [flat_field]
     if halt is not None:
-        condition, more = taken_out(lambda t, y: halt(t, unflat(y, like)), t0, flat(y0))
-        ended = lambda constants, t, y: condition(constants[count:], t, y)  # noqa: E731
-        constants, smooth = [*constants, *more], [*smooth, *[False] * len(more)]
-    method = Method(
-        tableau,
-        lambda constants, t, y: of_one(constants[:count], t, y),
-        project,
-        None,
-        leaf_sizes(like),
-        max_steps,
-    )
-    return _Program(method, ended, tuple(smooth)), constants
+        functions.append(lambda t, y: halt(t, unflat(y, like)))
+    (of_one, *ended), constants, count = taken_out(functions, t0, flat(y0))
+    # The condition that ends a run has no derivative.
+    smooth = [i < count and is_smooth(c) for i, c in enumerate(constants)]
+    method = Method(tableau, of_one, project, None, leaf_sizes(like), max_steps)
+    return _Program(method, ended[0] if ended else None, tuple(smooth)), constants
 
 
-def taken_out(function: Callable[..., Any], *like: Any) -> tuple[Callable[..., Any], Arrays]:
-    """`f(constants, t, y)` and the constants: what a function depends on, also by closure."""
-    converted = eqx.filter_closure_convert(function, *like)
-    arrays, rest = eqx.partition(converted, eqx.is_array)
-    constants, tree = jax.tree.flatten(arrays)
+def taken_out(
+    functions: list[Callable[..., Any]], *like: Any
+) -> tuple[list[Callable[..., Any]], Arrays, int]:
+    """Each function as `f(constants, *args)`; the constants: what they depend on, also by closure.
 
-    def of_constants(constants: Arrays, t: Array, y: Array) -> Any:
-        return eqx.combine(jax.tree.unflatten(tree, constants), rest)(t, y)
+    **Returns** the functions, the constants of all, and how many of these are the first one's.
+    """
+    constants: Arrays = []
+    out, counts = [], []
+    for function in functions:
+        arrays, rest = eqx.partition(eqx.filter_closure_convert(function, *like), eqx.is_array)
+        own, tree = jax.tree.flatten(arrays)
+        counts.append(len(own))
+        out.append(
+            partial(_of_constants, slice(len(constants), len(constants) + len(own)), tree, rest)
+        )
+        constants += own
+    return out, constants, counts[0]
 
-    return of_constants, constants
+
+def _of_constants(part: slice, tree: Any, rest: Any, constants: Arrays, *args: Any) -> Any:
+    return eqx.combine(jax.tree.unflatten(tree, constants[part]), rest)(*args)
 
 
 def _solved(program: _Program, constants: Arrays, run: Run) -> Answer:
-    number, ends = len(constants), len(Outputs._fields)
+    # The states between and at the end are what has derivatives.
+    number, ends = len(constants), 2
 
     def mapped(kind: Any, linear: int, *args: Any) -> Arrays:
         return in_lanes(partial(kind, program), list(args[:number]), list(args[number:]), linear)
@@ -283,7 +286,5 @@ def _pulled(
 ) -> Arrays:
     method, chosen, run, record, bars = _again(moving, program, layout, constants, each)
     timed = any(moving.run[:3])
-    by = adjoint.cotangents(method, chosen, run, record, Outputs(*bars), timed)
-    still = [jnp.zeros_like(a) for a in (run.rtol, run.atol, run.h0)]
-    of_run = zip([by.t0, by.stops, by.between, by.y0, *still], moving.run, strict=True)
-    return [*by.constants, *(a for a, moves in of_run if moves)]
+    total, of_run = adjoint.cotangents(method, chosen, run, record, bars, timed)
+    return [*total, *(a for a, moves in zip(of_run, moving.run, strict=True) if moves)]

@@ -10,9 +10,10 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from rigidjax.solve import dense_output, runge_kutta
+from rigidjax.solve import dense_output
 from rigidjax.solve.components import lift
-from rigidjax.solve.record import (
+from rigidjax.solve.runge_kutta import Step
+from rigidjax.solve.step_control import (
     HALTED,
     HEAD,
     LAST,
@@ -26,10 +27,11 @@ from rigidjax.solve.record import (
     Run,
     Segment,
     at,
+    controlled,
+    first_step,
     packed,
+    tried,
 )
-from rigidjax.solve.runge_kutta import Step
-from rigidjax.solve.step_control import controlled, error_norm, first_step
 
 # Steps in a segment, rejected ones included.
 SEGMENT = 512
@@ -58,7 +60,7 @@ def recording(method: Method, constants: list[Array], run: Run) -> tuple[Answer,
     most = method.max_steps + run.stops.shape[0]
     first = packed(loop)
     starts = jnp.zeros((-(-most // SEGMENT) + 1, *first.shape), first.dtype)
-    ys = jnp.full((dense_output.room(run), *run.y0.shape), jnp.nan, run.y0.dtype)
+    ys = jnp.full((run.between.shape[0], *run.y0.shape), jnp.nan, run.y0.dtype)
     rows = jnp.zeros((SEGMENT + _MORE + _MOST, HEAD + run.y0.shape[0], *run.t0.shape), ys.dtype)
     zero = jnp.zeros((), jnp.int32)
 
@@ -75,7 +77,7 @@ def recording(method: Method, constants: list[Array], run: Run) -> tuple[Answer,
     state = (loop, ys, Record(starts.at[0].set(first), zero, rows, zero))
     more = lambda state: jnp.any(going(method, run, state[0], None))  # noqa: E731
     loop, ys, record = lax.while_loop(more, one, state)
-    return _answer(run, loop, ys[: run.between.shape[0]]), record
+    return _answer(run, loop, ys), record
 
 
 def start(method: Method, constants: list[Array], run: Run) -> LoopState:
@@ -116,12 +118,7 @@ def _attempt(
     last = own >= left
     h = jnp.where(moving, jnp.where(last, left, own), jnp.zeros_like(own))
     late = jnp.where(last, end, loop.t + h)
-    there = runge_kutta.stages(
-        method.tableau, method.field, constants, Step(loop.t, h, late, loop.y)
-    )
-    y = method.project(there.end)
-    error = runge_kutta.error_estimate(method.tableau, method.sizes, h, there.slopes)
-    norm = error_norm(error, loop.y, y, run.rtol, run.atol)
+    y, norm = tried(method, constants, run, Step(loop.t, h, late, loop.y))
     length = run.stops[-1] - run.t0
     good, following = controlled(norm, method.tableau.order, loop.t, h, own, last, length)
     accept = moving & good

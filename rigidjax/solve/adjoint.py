@@ -7,7 +7,8 @@ otherwise, such a segment may take other steps between the same two ends: then t
 that of those, the same to the tolerance.
 """
 
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -17,15 +18,8 @@ from jaxtyping import Array
 from rigidjax.solve import dense_output, runge_kutta
 from rigidjax.solve.adaptive_loop import going, recorded, segment
 from rigidjax.solve.components import lift
-from rigidjax.solve.record import HEAD, STEP, Method, Record, Run, Segment, times_of, unpacked
 from rigidjax.solve.runge_kutta import Step
-
-
-class Outputs(NamedTuple):
-    """States (or cotangents of them) `between` (K, n, *bodies) and at the `end` (n, *bodies)."""
-
-    between: Array
-    end: Array
+from rigidjax.solve.step_control import HEAD, STEP, Method, Record, Run, Segment, times_of, unpacked
 
 
 def replayed(
@@ -58,21 +52,11 @@ def replayed(
 
     still, held = lax.stop_gradient(((constants, run), record))
     number = jnp.max(held.number)
-    ys = jnp.zeros((dense_output.room(run), *run.y0.shape), run.y0.dtype)
+    ys = jnp.zeros((run.between.shape[0], *run.y0.shape), run.y0.dtype)
     state = (run.y0, ys, held.starts, held.rows)
     y, ys, starts, rows = lax.fori_loop(0, number, one, state)
     starts = lax.dynamic_update_index_in_dim(starts, starts[number].at[head:].set(y), number, 0)
-    return ys[: run.between.shape[0]], y, starts, rows
-
-
-class Sums(NamedTuple):
-    """Cotangents of what an answer depends on: of constants, times, the first state."""
-
-    constants: list[Array]
-    t0: Array
-    stops: Array
-    between: Array
-    y0: Array
+    return ys, y, starts, rows
 
 
 def cotangents(
@@ -80,27 +64,33 @@ def cotangents(
     constants: list[Array],
     run: Run,
     record: Record,
-    bars: Outputs,
+    bars: Sequence[Array],
     timed: bool,
-) -> Sums:
-    """The transpose of the tangents of `replayed`; by times only where they are `timed`."""
+) -> tuple[list[Array], Run]:
+    """The transpose of the tangents of `replayed`: cotangents of the constants and of the run.
+
+    Those of times only where they are `timed`; those of tolerances and of the first step are 0.
+
+    **Arguments:** `bars` of the states between (K, n, *bodies) and at the end (n, *bodies).
+    """
     number, size = jnp.max(record.number), run.between.shape[0]
 
-    def one(i: Array, sums: Sums) -> Sums:
+    def one(i: Array, sums: tuple[list[Array], Run]) -> tuple[list[Array], Run]:
         part = _again(method, constants, run, record, number - 1 - i)
         known = dense_output.known(run, part) if size else None
 
-        def step(k: Array, sums: Sums) -> Sums:
+        def step(k: Array, sums: tuple[list[Array], Run]) -> tuple[list[Array], Run]:
+            total, of_run = sums
             k = part.number - 1 - k
             row = part.rows[k]
             by = lambda t0, stops: times_of(run._replace(t0=t0, stops=stops), row)  # noqa: E731
             (t, h, end), of_times = jax.vjp(by, run.t0, run.stops)
             here = Step(t, h, end, row[HEAD:])
-            dense, seeds, of_slopes, between = False, [], None, sums.between
+            dense, seeds, of_slopes, between = False, [], None, of_run.between
             if known is not None:
                 dense = jnp.any(known[k] < known[k + 1])
             there = runge_kutta.stages(method.tableau, method.field, constants, here, dense)
-            bar = jax.vjp(method.project, there.end)[1](sums.y0)[0]
+            bar = jax.vjp(method.project, there.end)[1](of_run.y0)[0]
             if known is not None:
                 between, *seeds, of_slopes = dense_output.pulled(
                     method,
@@ -109,7 +99,7 @@ def cotangents(
                     there.slopes,
                     known[k],
                     known[k + 1],
-                    bars.between,
+                    bars[0],
                     between if timed else None,
                 )
             by_constants, *rest = runge_kutta.pulled(
@@ -121,17 +111,17 @@ def cotangents(
             on = row[2] >= STEP
             by_t, by_h, by_y = (_where(on, a) for a in rest)
             by_t0, by_stops = of_times((by_t, by_h, jnp.zeros_like(end)))
-            both = zip(sums.constants, by_constants, strict=True)
-            total, by_y = [a + _where(on, b) for a, b in both], by_y + _where(~on, sums.y0)
+            total = [a + _where(on, b) for a, b in zip(total, by_constants, strict=True)]
+            of_run = of_run._replace(y0=by_y + _where(~on, of_run.y0))
             if between is None or not timed:
-                return sums._replace(constants=total, y0=by_y)
-            return Sums(total, sums.t0 + by_t0, sums.stops + by_stops, between, by_y)
+                return total, of_run
+            t0, stops = of_run.t0 + by_t0, of_run.stops + by_stops
+            return total, of_run._replace(t0=t0, stops=stops, between=between)
 
         return lax.fori_loop(0, part.number, step, sums)
 
-    t0, stops, between = (jnp.zeros_like(a) for a in run[:3])
-    none = Sums([jnp.zeros_like(c) for c in constants], t0, stops, between, bars.end)
-    return lax.fori_loop(0, number, one, none)
+    none = Run(*(jnp.zeros_like(a) for a in run))._replace(y0=bars[1])
+    return lax.fori_loop(0, number, one, ([jnp.zeros_like(c) for c in constants], none))
 
 
 def _where(there: Array, a: Array) -> Array:

@@ -52,7 +52,7 @@ def in_lanes(
     @jax.custom_batching.custom_vmap
     def call(*args: Any) -> Arrays:
         constants, each = list(args[:number]), list(args[number:])
-        return (_in_blocks if was.bodies else _at_once)(program, was, constants, each)
+        return _in_blocks(program, was, constants, each)
 
     @call.def_vmap
     def _(size: int, batched: Any, *args: Any) -> Any:
@@ -97,12 +97,8 @@ def in_lanes(
     return call(*constants, *each)
 
 
-def _at_once(program: Program, layout: Layout, constants: Arrays, each: Arrays) -> Arrays:
-    return program(layout, constants, each)
-
-
 def _in_blocks(program: Program, layout: Layout, constants: Arrays, each: Arrays) -> Arrays:
-    count = each[0].shape[-1]
+    count = each[0].shape[-1] if layout.bodies else 1
     if jax.default_backend() != "cpu" or count <= BLOCK:
         return program(layout, constants, each)
     number = -(-count // BLOCK)

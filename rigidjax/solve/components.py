@@ -55,18 +55,22 @@ def leaf_sizes(like: Any) -> list[int]:
     return [math.prod(jnp.shape(leaf)) for leaf in jax.tree.leaves(like)]
 
 
+def one_dtype(tree: Any, name: str, advice: str = "") -> Any:
+    """The dtype of all arrays of a tree, or `TypeError`."""
+    kinds = {jnp.result_type(leaf) for leaf in jax.tree.leaves(tree)}
+    if len(kinds) != 1:
+        found = ", ".join(sorted(map(str, kinds)))
+        raise TypeError(f"{name}: wanted arrays of one dtype, got {found}{advice}")
+    return kinds.pop()
+
+
 def flat(tree: Any) -> Array:
     """The numbers of a tree of arrays of one dtype as a vector.
 
     >>> flat((jnp.zeros(2), jnp.ones(())))
     Array([0., 0., 1.], dtype=float64)
     """
-    kinds = {jnp.result_type(leaf) for leaf in jax.tree.leaves(tree)}
-    if len(kinds) != 1:
-        raise TypeError(
-            f"wanted a state of one dtype, got {', '.join(sorted(map(str, kinds)))}; convert its "
-            "arrays to one, or use a solver of diffrax"
-        )
+    one_dtype(tree, "state", "; convert its arrays to one, or use a solver of diffrax")
     return jnp.concatenate([jnp.reshape(leaf, -1) for leaf in jax.tree.leaves(tree)])
 
 

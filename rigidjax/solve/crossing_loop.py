@@ -19,9 +19,8 @@ from jax import lax
 from jaxtyping import Array
 
 from rigidjax.solve.components import lift
-from rigidjax.solve.record import Run, at
 from rigidjax.solve.runge_kutta import Step
-from rigidjax.solve.step_control import controlled
+from rigidjax.solve.step_control import Run, at, controlled
 
 # Newton's guesses in a step, from then on halves; and how often a step is taken again for a turn.
 _GUESSES = 8
@@ -183,19 +182,9 @@ def _pass(motion: Motion, search: Search, run: Run, body: _Body) -> _Body:
     refine = on & body.refining
     low = _choose(refine & ~other, here, body.low)
     high = _choose(refine & other, here, body.high)
-    move = (-g / jnp.where(rate == 0, jnp.ones_like(rate), rate)).astype(length.dtype)
-    goal = length + move
-    width = high.x - low.x
-    small = jnp.sqrt(eps) * h
-    near = (
-        (jnp.abs(move) <= small) & (rate != 0) & (goal >= low.x - small) & (goal <= high.x + small)
-    )
-    unit = 2 * eps * jnp.maximum(jnp.abs(t), h)
-    pinned = (width <= unit) | (body.tries >= _MOST)
-    done = refine & (near | pinned)
-    move = jnp.where(done & near, move, jnp.zeros_like(move))
-    inside = (goal > low.x) & (goal < high.x) & (body.tries < _GUESSES)
-    guess = jnp.where(inside, goal, low.x + 0.5 * width)
+    near, move, guess = _newton(body, low, high, here)
+    done = refine & near
+    move = jnp.where(done, move, jnp.zeros_like(move))
     low, high = _choose(crossed, start, low), _choose(crossed, here, high)
 
     new = accept | done
@@ -218,6 +207,22 @@ def _pass(motion: Motion, search: Search, run: Run, body: _Body) -> _Body:
         steps=body.steps + on.astype(jnp.int32),
         found=body.found | done,
     )
+
+
+def _newton(body: _Body, low: _End, high: _End, here: _End) -> tuple[Array, Array, Array]:
+    """Whether the zero is found, how far it is from `here` then, and else where to look next."""
+    rate, eps = here.rate, jnp.finfo(body.h.dtype).eps
+    move = (-here.g / jnp.where(rate == 0, jnp.ones_like(rate), rate)).astype(here.x.dtype)
+    goal = here.x + move
+    width = high.x - low.x
+    small = jnp.sqrt(eps) * body.h
+    near = (jnp.abs(move) <= small) & (rate != 0)
+    near = near & (goal >= low.x - small) & (goal <= high.x + small)
+    unit = 2 * eps * jnp.maximum(jnp.abs(body.t), body.h)
+    pinned = (width <= unit) | (body.tries >= _MOST)
+    inside = (goal > low.x) & (goal < high.x) & (body.tries < _GUESSES)
+    guess = jnp.where(inside, goal, low.x + 0.5 * width)
+    return near | pinned, jnp.where(near, move, jnp.zeros_like(move)), guess
 
 
 def _choose(which: Array, a: _End, b: _End) -> _End:

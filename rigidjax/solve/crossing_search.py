@@ -29,18 +29,17 @@ from rigidjax.body.inertia import Inertia
 from rigidjax.exact.free_body import FreeMotion
 from rigidjax.motion import on_the_group
 from rigidjax.motion.torques.base import jumps_of
-from rigidjax.solve import crossing_loop, direction, runge_kutta
+from rigidjax.solve import crossing_loop
 from rigidjax.solve.adaptive import adaptive, taken_out
 from rigidjax.solve.batching import Arrays, Layout, in_lanes
 from rigidjax.solve.components import flat, leaf_sizes, unflat
 from rigidjax.solve.crossing_loop import Located, Motion, Search
 from rigidjax.solve.explicit import AbstractExplicit
 from rigidjax.solve.linear_map import no_tangent
-from rigidjax.solve.record import Method, Run
 from rigidjax.solve.run import Free, Loop
 from rigidjax.solve.runge_kutta import Step
-from rigidjax.solve.step_control import error_norm, first_step
-from rigidjax.solve.vector_field import equations_of_motion
+from rigidjax.solve.step_control import Method, Run, first_step, tried
+from rigidjax.solve.vector_field import ahead, equations_of_motion
 
 # Samples of a free body's condition in one turn at its largest rate.
 _SAMPLES = 16
@@ -79,15 +78,11 @@ def section(
 ) -> tuple[Section, Numbers]:
     """The section `condition(t, y)` = 0 between `ts[0]` and `ts[-1]`, and what it is made of."""
     y0, dtype = flat(state0), ts.dtype
-    sign = way = jnp.sign(ts[-1] - ts[0]).astype(jnp.int32)
-    jumps, torque = jnp.zeros(0, dtype), None
-    if isinstance(setup, Loop):
-        torque, way = setup.torque, setup.sign
-        jumps = jumps_of(torque).astype(dtype)
-    field: Any = equations_of_motion(setup.body, state0, torque)
-    field, condition, along, jumps = direction.ahead(
-        way, field, condition, ts[jnp.array([0, -1])], jumps
-    )
+    sign = jnp.sign(ts[-1] - ts[0]).astype(jnp.int32)
+    way = setup.sign if isinstance(setup, Loop) else sign
+    jumps = jumps_of(setup.torque).astype(dtype)
+    field: Any = equations_of_motion(setup.body, state0, setup.torque)
+    field, condition, along, jumps = ahead(way, field, condition, ts[jnp.array([0, -1])], jumps)
     longest = whole = lax.stop_gradient(along[1] - along[0])
     if max_step is not None:
         longest = lax.stop_gradient(jnp.asarray(max_step, dtype))
@@ -103,27 +98,19 @@ def section(
         return g, rate, there
 
     if isinstance(setup, Loop):
-        solver, motion, control = setup.solver, slope, setup.controller
-        rtol, atol = (jnp.asarray(a, y0.dtype) for a in (control.rtol, control.atol))  # pyright: ignore
+        solver, motion = setup.solver, slope
+        rtol, atol = (jnp.asarray(a, y0.dtype) for a in (setup.rtol, setup.atol))
         h0 = jnp.asarray(jnp.nan if setup.dt0 is None else setup.dt0, dtype)
     else:
         solver, free = None, FreeMotion(setup.body, state0)
-        motion = lambda s, y: flat(free(sign.astype(s.dtype) * s - ts[0]))  # noqa: E731
+        motion = lambda s, _: flat(free(sign.astype(s.dtype) * s - ts[0]))  # noqa: E731
         longest = jnp.minimum(longest, _spacing(setup.body, state0, whole))
         rtol, atol, h0 = jnp.zeros((), y0.dtype), jnp.zeros((), y0.dtype), longest
-    of_motion, constants = taken_out(motion, along[0], y0)
-    of_rates, more = taken_out(rates, along[0], y0)
-    count = len(constants)
+    (of_motion, of_rates), constants, _ = taken_out([motion, rates], along[0], y0)
     stops = jnp.concatenate([jnp.clip(jnp.sort(jumps), along[0], along[1]), along[1:]])
-    crossed = Section(
-        solver,
-        lambda constants, s, y: of_motion(constants[:count], s, y),
-        lambda constants, s, y: of_rates(constants[count:], s, y),
-        state0,
-        sign,
-    )
+    crossed = Section(solver, of_motion, of_rates, state0, sign)
     run = Run(along[0], stops, stops[:0], y0, rtol, atol, h0)
-    return crossed, ([*constants, *more], run, longest)
+    return crossed, (constants, run, longest)
 
 
 def _spacing(body: Any, state0: Any, whole: Array) -> Array:
@@ -149,8 +136,7 @@ def _located(
     section: Section, what: Search, layout: Layout, constants: Arrays, each: Arrays
 ) -> Arrays:
     run, longest = Run(*each[:-1]), each[-1]
-    sizes, solver = leaf_sizes(section.like), section.solver
-    project, over = section.project, lambda f: f
+    solver, project, over = section.solver, section.project, lambda f: f
     if layout.bodies:
         shared = [None if s else -1 for s in layout.shared]
         over = lambda f: jax.vmap(f, (shared, -1, -1), -1)  # noqa: E731
@@ -166,18 +152,13 @@ def _located(
     def in_closed_form(step: Step) -> tuple[Array, Array]:
         return motion(constants, step.end, step.y), jnp.zeros_like(run.rtol)
 
-    def by_a_step(step: Step) -> tuple[Array, Array]:
-        there = runge_kutta.stages(tableau, motion, constants, step)
-        after = project(there.end)
-        error = runge_kutta.error_estimate(tableau, sizes, step.h, there.slopes)
-        return after, error_norm(error, step.y, after, run.rtol, run.atol)
-
     attempt, order = in_closed_form, 1
     if solver is not None:
-        tableau, attempt, order = solver.tableau, by_a_step, solver.tableau.order
-        h0, _ = first_step(Method(tableau, motion, project, None, sizes, 0), constants, run)
+        method = Method(solver.tableau, motion, project, None, leaf_sizes(section.like), 0)
+        h0, _ = first_step(method, constants, run)
         h0 = jnp.minimum(jnp.where(jnp.isnan(run.h0), h0, run.h0), longest)
         run = run._replace(h0=h0)
+        attempt, order = partial(tried, method, constants, run), solver.tableau.order
     moving = Motion(attempt, order, longest, seen, counts, project)
     return list(crossing_loop.locate(moving, what, run))
 

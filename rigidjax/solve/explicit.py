@@ -11,23 +11,14 @@ from jaxtyping import Array
 
 from rigidjax.motion import on_the_group
 from rigidjax.solve.components import flat, leaf_sizes, unflat
-from rigidjax.solve.runge_kutta import (
-    Stages,
-    Step,
-    dense_rows,
-    error_estimate,
-    stage_counts,
-    stages,
-    weights,
-)
+from rigidjax.solve.runge_kutta import Step, dense_rows, error_estimate, nested, stages
 from rigidjax.solve.tableaus import DORMAND_PRINCE8, KUTTA4, TSITOURAS5, Tableau
 
 
 class NestedInterpolation(dfx.AbstractLocalInterpolation):
     """Dense output of a Runge–Kutta step, its quaternion scaled to length 1.
 
-    `y0 + θ(F0 + (1−θ)(F1 + θ(F2 + (1−θ)(F3 + …))))`, θ from 0 to 1 along the step; the rows of
-    `coefficients` are F0, F1, … Source: Hairer, Nørsett and Wanner (1993), II.6.
+    The rows of `coefficients` are those of `rigidjax.solve.runge_kutta.nested`.
     """
 
     t0: Any
@@ -43,11 +34,7 @@ class NestedInterpolation(dfx.AbstractLocalInterpolation):
         theta = jnp.where(length == 0, jnp.zeros_like(length), (t0 - self.t0) / safe)
 
         def value(y: Array, rows: Array) -> Array:
-            along = theta.astype(y.dtype)
-            total = jnp.zeros_like(y)
-            for i in reversed(range(rows.shape[0])):
-                total = (total + rows[i]) * (along if i % 2 == 0 else 1 - along)
-            return y + total
+            return y + nested(theta.astype(y.dtype), rows)
 
         return on_the_group(jax.tree.map(value, self.y0, self.coefficients))
 
@@ -73,7 +60,19 @@ class AbstractExplicit(dfx.AbstractAdaptiveSolver):
     def step(
         self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Any, made_jump: Any
     ) -> Any:
-        return _diffrax_step(self.tableau, terms, t0, t1, y0, args)
+        def field(_: Any, t: Any, y: Array) -> Array:
+            return flat(terms.vf(t, unflat(y, y0), args))
+
+        h = jnp.asarray(terms.contr(t0, t1))
+        step = Step(jnp.asarray(t0), h, jnp.asarray(t1), flat(y0))
+        there = stages(self.tableau, field, [], step)
+        # Once, after the stages: inside them it changes the order (jaxsim#192).
+        y1 = on_the_group(unflat(there.end, y0))
+        # Which steps are taken is no thing to differentiate: their error is below the tolerance.
+        error = error_estimate(self.tableau, leaf_sizes(y0), h, there.slopes)
+        rows = dense_rows(self.tableau, field, step, there.slopes)
+        dense = dict(y0=y0, coefficients=jax.vmap(lambda row: unflat(row, y0))(rows))
+        return y1, unflat(lax.stop_gradient(error), y0), dense, None, dfx.RESULTS.successful
 
     def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
         return terms.vf(t0, y0, args)
@@ -129,40 +128,3 @@ class DormandPrince8(AbstractExplicit):
     """
 
     tableau: ClassVar[Tableau] = DORMAND_PRINCE8
-
-
-def _diffrax_step(
-    tableau: Tableau, terms: Any, t0: Any, t1: Any, y0: Any, args: Any
-) -> tuple[Any, Any, Any, None, dfx.RESULTS]:
-    def field(_: Any, t: Any, y: Array) -> Array:
-        return flat(terms.vf(t, unflat(y, y0), args))
-
-    start = flat(y0)
-    h = jnp.asarray(terms.contr(t0, t1))
-    step = Step(jnp.asarray(t0), h, jnp.asarray(t1), start)
-    there = stages(tableau, field, [], step)
-    # Once, after the stages: inside them it changes the order (jaxsim#192).
-    y1 = on_the_group(unflat(there.end, y0))
-    # Which steps are taken is not a thing to differentiate: their error is below the tolerance.
-    error = lax.stop_gradient(error_estimate(tableau, leaf_sizes(y0), h, there.slopes))
-    rows = _dense(tableau, field, step, there)
-    coefficients = jax.tree.map(lambda *leaves: jnp.stack(leaves), *[unflat(r, y0) for r in rows])
-    dense = dict(y0=y0, coefficients=coefficients)
-    return y1, unflat(error, y0), dense, None, dfx.RESULTS.successful
-
-
-def _dense(tableau: Tableau, field: Any, step: Step, there: Stages) -> Array:
-    """The rows of `NestedInterpolation`; what only they need is worked out apart."""
-    (count, whole), slopes = stage_counts(tableau), there.slopes
-    w = weights(tableau, slopes.dtype, whole)
-    h = step.h.astype(slopes.dtype)
-
-    def extra(i: Array, slopes: Array) -> Array:
-        place = step.y + h * (w.a[i][None] * slopes).sum(1)
-        t = step.t + w.c[i].astype(step.t.dtype) * step.h
-        slope = field([], jnp.where(w.last[i], step.end, t), place)
-        return lax.dynamic_update_slice_in_dim(slopes, slope[:, None], i, 1)
-
-    room = jnp.zeros((slopes.shape[0], whole - count), slopes.dtype)
-    slopes = jnp.concatenate([slopes, room], 1)
-    return dense_rows(tableau, step.h, lax.fori_loop(count, whole, extra, slopes))

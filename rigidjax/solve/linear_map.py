@@ -49,7 +49,7 @@ def nan_derivatives(tree: Any, inputs: Any) -> Any:
     number that is not used has the cotangent 0 and leaves the gradient of the others as it is.
     """
     outs, structure = jax.tree.flatten(tree)
-    whole = [_is_smooth(a) for a in outs]
+    whole = [is_smooth(a) for a in outs]
     smooth = [a for a, w in zip(outs, whole, strict=True) if w]
     anchors = [a for a in jax.tree.leaves(inputs) if eqx.is_inexact_array(a)]
     told = iter(_with_nan(len(smooth), *smooth, *anchors))
@@ -88,17 +88,14 @@ def _shape(a: Any) -> tuple[tuple[int, ...], Any]:
     return tuple(jnp.shape(a)), jnp.result_type(a)
 
 
-def _is_smooth(a: Any) -> bool:
+def is_smooth(a: Any) -> bool:
+    """Whether a number may have a derivative."""
     return bool(jnp.issubdtype(jnp.result_type(a), jnp.inexact))
 
 
 def no_tangent(a: Any) -> Any:
     """The tangent of a number that depends on nothing."""
-    return jnp.zeros_like(a) if _is_smooth(a) else np.zeros(jnp.shape(a), jax.dtypes.float0)
-
-
-def _jvp(function: Map, primals: Any, tangents: Any) -> Arrays:
-    return jax.jvp(lambda *p: function(*p), tuple(primals), tuple(tangents))[1]
+    return jnp.zeros_like(a) if is_smooth(a) else np.zeros(jnp.shape(a), jax.dtypes.float0)
 
 
 _linear_map = Primitive("rigidjax_linear_map")
@@ -117,42 +114,30 @@ def _abstract(*_: Any, results: Any, **__: Any) -> Any:
 
 def _differentiated(primals: Any, tangents: Any, **params: Any) -> Any:
     number, function = params["number"], params["function"]
-    out = _linear_map.bind(*primals, **params)
-    given, along = primals[:number], primals[number:]
-    total: list[Any] = [None] * len(out)
-
-    def add(more: Any) -> None:
-        for i, value in enumerate(more):
-            total[i] = value if total[i] is None else total[i] + value
-
-    moved = tangents[number:]
-    if not all(isinstance(t, ad.Zero) for t in moved):
-        moved = [_whole(t, p) for t, p in zip(moved, along, strict=True)]
-        add(_linear_map.bind(*given, *moved, **params))
-    which = [
-        not isinstance(t, ad.Zero) and _is_smooth(p)
-        for t, p in zip(tangents[:number], given, strict=True)
-    ]
+    out, parts = _linear_map.bind(*primals, **params), []
+    moving = [not isinstance(t, ad.Zero) for t in tangents]
+    if any(moving[number:]):
+        whole = [
+            t if m else jnp.zeros_like(p) for t, m, p in zip(tangents, moving, primals, strict=True)
+        ]
+        parts.append(_linear_map.bind(*primals[:number], *whole[number:], **params))
+    which = [m and is_smooth(p) for m, p in zip(moving[:number], primals, strict=False)]
     if any(which):
 
         def push(*args: Any) -> Arrays:
-            given, along = args[:number], args[number : number + len(along_)]
-            moved = _filled_zero(given, which, args[number + len(along_) :])
-            return _jvp(lambda *g: function(*g, *along), given, moved)
+            given, along, rest = (
+                args[:number],
+                args[number : len(primals)],
+                iter(args[len(primals) :]),
+            )
+            moved = [next(rest) if w else no_tangent(g) for g, w in zip(given, which, strict=True)]
+            return jax.jvp(lambda *g: function(*g, *along), tuple(given), tuple(moved))[1]
 
-        along_ = along
-        moved = [t for t, w in zip(tangents[:number], which, strict=True) if w]
-        add(linear_map(push, refuse, [*given, *along], moved))
-    return out, [
-        _ZERO.from_primal_value(o) if t is None else t for o, t in zip(out, total, strict=True)
-    ]
-
-
-def _filled_zero(primals: Any, which: Any, tangents: Any) -> list[Any]:
-    rest, out = iter(tangents), []
-    for primal, there in zip(primals, which, strict=True):
-        out.append(next(rest) if there else no_tangent(primal))
-    return out
+        moved = [t for t, w in zip(tangents, which, strict=False) if w]
+        parts.append(linear_map(push, refuse, list(primals), moved))
+    if not parts:
+        return out, [_ZERO.from_primal_value(o) for o in out]
+    return out, [sum(more, first) for first, *more in zip(*parts, strict=True)]
 
 
 def refuse(*_: Any) -> Arrays:
@@ -210,10 +195,6 @@ def _batched(args: Any, dims: Any, **params: Any) -> Any:
         results=longer(params["results"]),
     )
     return out, [0] * len(out)
-
-
-def _whole(tangent: Any, primal: Any) -> Any:
-    return jnp.zeros_like(primal) if isinstance(tangent, ad.Zero) else tangent
 
 
 ad.primitive_jvps[_linear_map] = _differentiated

@@ -1,9 +1,10 @@
-"""Any diffrax solver, kept on the group: projected once per accepted step, and in between."""
+"""What diffrax runs: any solver, kept on the group, and any control of its steps, ended by NaN."""
 
 from typing import Any
 
 import diffrax as dfx
 import equinox as eqx
+import jax.numpy as jnp
 import jax.tree_util as jtu
 
 from rigidjax import _checks
@@ -111,3 +112,85 @@ class Projected(dfx.AbstractWrappedSolver):
 
     def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
         return self.solver.func(terms, t0, y0, args)
+
+
+class Watched(dfx.AbstractAdaptiveStepSizeController):
+    """Wraps an adaptive step controller so that a run without a way on ends at once.
+
+    Where the vector field is NaN, `diffrax.PIDController` tries smaller and smaller steps until
+    `max_steps`, and in a batch all the others wait for it. Here a start without a slope, and a
+    rejected step whose successor would be below a few units of round-off of the time, end the run:
+    with `RESULTS.nonfinite` where there was NaN or infinity, else with `RESULTS.dt_min_reached`.
+    The steps of a healthy run are not touched.
+
+    **Arguments:** `controller` any adaptive controller of diffrax.
+
+    >>> Watched(dfx.PIDController(rtol=1e-6, atol=1e-9)).rtol
+    1e-06
+    """
+
+    controller: Any
+
+    def __init__(self, controller: Any):
+        self.controller = controller
+
+    @property
+    def rtol(self) -> Any:
+        return self.controller.rtol
+
+    @property
+    def atol(self) -> Any:
+        return self.controller.atol
+
+    @property
+    def norm(self) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
+        return self.controller.norm
+
+    def wrap(self, direction: Any) -> "Watched":
+        return Watched(self.controller.wrap(direction))
+
+    def init(
+        self,
+        terms: Any,
+        t0: Any,
+        t1: Any,
+        y0: Any,
+        dt0: Any,
+        args: Any,
+        func: Any,
+        error_order: Any,
+    ) -> tuple[Any, Any]:
+        first, inner = self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
+        # At t = 0 the round-off of t vanishes: that of the length of the run is taken.
+        least = jnp.finfo(t0.dtype).eps * jnp.abs(t1 - t0)
+        # Where the first derivative is not finite the run ends at once.
+        return first, (inner, least, ~finite((y0, func(terms, t0, y0, args))))
+
+    def adapt_step_size(
+        self,
+        t0: Any,
+        t1: Any,
+        y0: Any,
+        y1_candidate: Any,
+        args: Any,
+        y_error: Any,
+        error_order: Any,
+        controller_state: Any,
+    ) -> tuple[Any, Any, Any, Any, Any, dfx.RESULTS]:
+        inner, least, lost = controller_state
+        keep, left, right, jumped, inner, result = self.controller.adapt_step_size(
+            t0, t1, y0, y1_candidate, args, y_error, error_order, inner
+        )
+        unit = 8 * jnp.finfo(left.dtype).eps * jnp.maximum(jnp.abs(left), least)
+        stuck = lost | (~keep & ~(right - left > unit))
+        stuck = stuck & (result == dfx.RESULTS.successful)
+        ill = lost | ~finite((right, y1_candidate, y_error))
+        why = dfx.RESULTS.where(ill, NONFINITE, dfx.RESULTS.dt_min_reached)
+        return (
+            keep,
+            left,
+            right,
+            jumped,
+            (inner, least, lost),
+            dfx.RESULTS.where(stuck, why, result),
+        )

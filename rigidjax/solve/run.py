@@ -1,14 +1,16 @@
 """A run in one compiled piece: by the closed form, by diffrax, or by our own loop."""
 
-import dataclasses
-from typing import Any
+from typing import Any, ClassVar
 
 import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+import numpy as np
+from jaxtyping import Array, Bool
 
+from rigidjax import _checks
+from rigidjax._types import ScalarLike
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.exact.free_body import FreeMotion
 from rigidjax.frames import Point
@@ -16,19 +18,11 @@ from rigidjax.frames.frame_dynamics import scene_of
 from rigidjax.motion import on_the_group
 from rigidjax.motion.coupled import started
 from rigidjax.motion.torques.base import jumps_of
-from rigidjax.solve import ending
 from rigidjax.solve.adaptive import adaptive
-from rigidjax.solve.direction import ahead
 from rigidjax.solve.explicit import AbstractExplicit
 from rigidjax.solve.linear_map import nan_derivatives
-from rigidjax.solve.projection import Projected
 from rigidjax.solve.step_control import NONFINITE, finite, of_body
-from rigidjax.solve.vector_field import equations_of_motion
-
-# Made once: building a Module costs as much as ten steps, and `jit` compares it leaf by leaf.
-SOLVER = Projected(dfx.Dopri8())
-ADJOINT = dfx.RecursiveCheckpointAdjoint()
-NO_METER = dfx.NoProgressMeter()
+from rigidjax.solve.vector_field import ahead, equations_of_motion
 
 
 class Free(eqx.Module):
@@ -36,6 +30,7 @@ class Free(eqx.Module):
 
     body: Inertia | MassProperties
     throw: bool = eqx.field(static=True)
+    torque: ClassVar[None] = None
 
 
 class Setup(eqx.Module):
@@ -61,41 +56,69 @@ class Loop(eqx.Module):
     body: Inertia | MassProperties | None
     torque: Any
     solver: AbstractExplicit
-    controller: dfx.AbstractStepSizeController
+    rtol: Any
+    atol: Any
     dt0: Any
     sign: Array | None
     max_steps: int = eqx.field(static=True)
     throw: bool = eqx.field(static=True)
 
 
+class Ends(eqx.Module):
+    """The condition that ends a run of a scene, as `diffrax.Event` asks it.
+
+    A scene may end a run, instead of ever smaller steps: at a collision, where it is lost, …
+
+    **Arguments:** `scene` any with `ends(t, state) → bool` and `end_words(t, state) → str`.
+
+    >>> from rigidjax import orbits
+    >>> bool(Ends(orbits.hill(0.1))(0.0, rj.Point([0.05, 0, 0], [0.0, 0, 0])))
+    True
+    """
+
+    scene: Any
+
+    def __call__(self, t: ScalarLike, y: Any, args: object = None, **_: object) -> Bool[Array, ""]:
+        return self.scene.ends(t, y)
+
+
 @eqx.filter_jit
 def solve(
     setup: Free | Loop | Setup, state0: Any, ts: Array
 ) -> tuple[Any, dict[str, Any], dfx.RESULTS]:
-    ys, stats, result = _solved(setup, state0, ts)
-    inputs = (setup.body, getattr(setup, "torque", None), state0, ts)
+    # One jit around everything: an operation outside of it costs as much as a hundred steps.
+    state0 = on_the_group(state0)
+    run = _free if isinstance(setup, Free) else _in_steps
+    ys, stats, result = run(setup, state0, ts)  # pyright: ignore[reportArgumentType]
+    inputs = (setup.body, setup.torque, state0, ts)
     return nan_derivatives(ys, inputs), stats, of_body(result, setup.body)
 
 
-def _solved(
-    setup: Free | Loop | Setup, state0: Any, ts: Array
+def _in_steps(
+    setup: Loop | Setup, state0: Any, ts: Array
 ) -> tuple[Any, dict[str, Any], dfx.RESULTS]:
-    # One jit around everything: an operation outside of it costs as much as a hundred steps.
-    state0 = on_the_group(state0)
-    if isinstance(setup, Free):
-        return _free(setup, state0, ts)
     # With the states of the torque, where it has some.
     state0 = started(setup.body, state0, setup.torque, ts[0])
-    if isinstance(setup, Loop):
-        return _loop(setup, state0, ts)
-    field = equations_of_motion(setup.body, state0, setup.torque)
     scene: Any = scene_of(setup.torque) if isinstance(state0, Point) else None
-    watch = ending.condition(scene)
-    subs = (
-        (dfx.SubSaveAt(ts=ts),) if watch is None else (dfx.SubSaveAt(ts=ts), dfx.SubSaveAt(t1=True))
-    )
+    watch = Ends(scene) if hasattr(scene, "ends") else None
+    run: Any = _loop if isinstance(setup, Loop) else _by_diffrax
+    ys, stats, result, end = run(setup, watch, state0, ts)
+    if setup.throw:
+        ys = _raise(ys, result)
+    if watch is not None:
+        ended = result == dfx.RESULTS.event_occurred
+        stats |= {"ended": ended, "end_time": end[0], "end_state": end[1]}
+    if scene is not None:
+        stats["drift"] = scene.drift(ts, ys)
+    return ys, stats, result
+
+
+def _by_diffrax(
+    setup: Setup, watch: Ends | None, state0: Any, ts: Array
+) -> tuple[Any, dict[str, Any], dfx.RESULTS, Any]:
+    subs = [dfx.SubSaveAt(ts=ts)] + [dfx.SubSaveAt(t1=True)] * (watch is not None)
     out = dfx.diffeqsolve(
-        dfx.ODETerm(field),
+        dfx.ODETerm(equations_of_motion(setup.body, state0, setup.torque)),
         setup.solver,
         ts[0],
         ts[-1],
@@ -110,63 +133,41 @@ def _solved(
         event=None if watch is None else dfx.Event(watch),
     )
     stats: dict[str, Any] = {k: value for k, value in out.stats.items() if k != "max_steps"}
-    times: Any = out.ts
-    saved: Any = out.ys
-    ys, result = _reached(saved[0], times[0]), out.result
+    (times, *last_time), (ys, *last) = out.ts, out.ys  # pyright: ignore
+    ys, result = _reached(ys, times), out.result
     if not isinstance(setup.controller, dfx.AbstractAdaptiveStepSizeController):
         # Equal steps look at no error, and would go on with NaN.
         ill = (result == dfx.RESULTS.successful) & ~finite(ys)
         result = dfx.RESULTS.where(ill, NONFINITE, result)
-    if setup.throw:
-        ys = _raise(ys, result)
-    if scene is not None:
-        if watch is not None:
-            end, end_time = jax.tree.map(lambda leaf: leaf[0], (saved[1], times[1]))
-            stats |= _ended(out.result, end_time, end)
-        stats["drift"] = scene.drift(ts, ys)
-    return ys, stats, result
+    end = jax.tree.map(lambda leaf: leaf[0], (*last_time, *last))
+    return ys, stats, result, end
 
 
-def _loop(setup: Loop, state0: Any, ts: Array) -> tuple[Any, dict[str, Any], dfx.RESULTS]:
-    controller: Any = setup.controller
-    scene: Any = scene_of(setup.torque) if isinstance(state0, Point) else None
-    watch = ending.condition(scene)
+def _loop(
+    setup: Loop, watch: Ends | None, state0: Any, ts: Array
+) -> tuple[Any, dict[str, Any], dfx.RESULTS, Any]:
     field, jumps = equations_of_motion(setup.body, state0, setup.torque), jumps_of(setup.torque)
-    sign = setup.sign
-    field, watch, along, jumps = ahead(sign, field, watch, ts, jumps)
+    field, watch, along, jumps = ahead(setup.sign, field, watch, ts, jumps)
     out = adaptive(
         setup.solver,
         field,
         along,
         state0,
-        rtol=controller.rtol,
-        atol=controller.atol,
+        rtol=setup.rtol,
+        atol=setup.atol,
         dt0=setup.dt0,
         max_steps=setup.max_steps,
         jumps=jumps,
         halt=watch,
     )
-    if sign is not None:
-        out = out._replace(last_time=sign.astype(ts.dtype) * out.last_time)
-    ys = _raise(out.ys, out.result) if setup.throw else out.ys
     stats: dict[str, Any] = {
         "num_steps": out.num_steps,
         "num_accepted_steps": out.num_steps - out.num_rejected,
         "num_rejected_steps": out.num_rejected,
     }
-    if scene is not None:
-        if watch is not None:
-            stats |= _ended(out.result, out.last_time, out.last)
-        stats["drift"] = scene.drift(ts, ys)
-    return ys, stats, out.result
-
-
-def _ended(result: dfx.RESULTS, time: Array, state: Any) -> dict[str, Any]:
-    return {
-        "ended": result == dfx.RESULTS.event_occurred,
-        "end_time": time,
-        "end_state": state,
-    }
+    sign = setup.sign
+    last_time = out.last_time if sign is None else sign.astype(ts.dtype) * out.last_time
+    return out.ys, stats, out.result, (last_time, out.last)
 
 
 def _reached(ys: Any, times: Array) -> Any:
@@ -214,16 +215,22 @@ def _free(setup: Free, state0: Any, ts: Array) -> tuple[Any, dict[str, Any], dfx
     return ys, stats, dfx.RESULTS.where(finite(ys), dfx.RESULTS.successful, NONFINITE)
 
 
-class Flow(eqx.Module):
-    """The same run from another start, as a function that forward mode goes through."""
+def refuse_ended(scene: Any, ys: Any, stats: dict[str, Any], ts: Any) -> Any:
+    """The states `ys`, unless the scene has ended the run: then an error in the scene's words.
 
-    setup: Free | Loop | Setup
+    **Arguments:** `scene` as of `Ends`; `ys` the states saved at `ts`; `stats` with `ended`,
+    `end_time` and `end_state`. **Raises:** `ValueError` with the last time saved before; under
+    `jit` or `vmap` `EquinoxRuntimeError` without numbers.
 
-    def __init__(self, setup: "Free | Loop | Setup"):
-        setup = dataclasses.replace(setup, throw=False)
-        if isinstance(setup, Setup):
-            setup = dataclasses.replace(setup, adjoint=dfx.ForwardMode())
-        self.setup = setup
-
-    def __call__(self, state0: Any, ts: Array) -> Any:
-        return solve(self.setup, state0, ts)[0]
+    >>> refuse_ended(None, 0.0, {"ended": np.asarray(False)}, None)
+    0.0
+    """
+    ended, advice = stats["ended"], "; give throw=False to keep what came before it"
+    if _checks.known(ended) and not np.any(np.asarray(ended)):
+        return ys
+    words = "simulate: " + scene.end_words(stats["end_time"], stats["end_state"])
+    if not _checks.known(ended):
+        return eqx.error_if(ys, ended, words + advice)
+    before = np.asarray(ts)[np.asarray(ts) < float(stats["end_time"])]
+    last = f"the last of ts before it is {before[-1]:.9g}{advice}" if len(before) else "the start"
+    raise ValueError(f"{words}; {last}")

@@ -65,16 +65,6 @@ def stage_counts(tableau: Tableau) -> tuple[int, int]:
     return max(len(tableau.a), *tableau.errors[0]) + 1, whole
 
 
-def dense_size(tableau: Tableau) -> int:
-    """How many rows dense output has.
-
-    >>> from rigidjax.solve.tableaus import DORMAND_PRINCE8
-    >>> dense_size(DORMAND_PRINCE8)
-    7
-    """
-    return 3 + len(tableau.dense)
-
-
 def weights(tableau: Tableau, dtype: Any, count: int) -> Weights:
     """The weights of the first `count` stages of a tableau.
 
@@ -118,14 +108,10 @@ def stages(
     """
     count = stage_counts(tableau)[dense is not False]
     w = weights(tableau, step.y.dtype, count)
-    # Time may be kept in another precision than the state.
-    h = lift(step.h.astype(step.y.dtype), step.y)
 
     def stage(i: Array, both: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         times, places, slopes = both
-        y = step.y + h * _sum(w.a[i], slopes)
-        t = jnp.where(w.last[i], step.end, step.t + w.c[i].astype(step.t.dtype) * step.h)
-        slope = field(constants, t, y)
+        t, y, slope = _stage(w, field, constants, step, i, slopes)
         times = lax.dynamic_update_slice_in_dim(times, t[None], i, 0)
         return times, _put(places, y, i), _put(slopes, slope, i)
 
@@ -137,7 +123,20 @@ def stages(
     times, places, slopes = lax.fori_loop(
         np.int32(0), _last(tableau, dense), stage, (times, places, empty)
     )
-    return Stages(times, places, slopes, step.y + h * _sum(w.b, slopes))
+    return Stages(times, places, slopes, step.y + _length(step) * _sum(w.b, slopes))
+
+
+def _stage(
+    w: Weights, field: Field, constants: list[Array], step: Step, i: Array, slopes: Array
+) -> tuple[Array, Array, Array]:
+    y = step.y + _length(step) * _sum(w.a[i], slopes)
+    t = jnp.where(w.last[i], step.end, step.t + w.c[i].astype(step.t.dtype) * step.h)
+    return t, y, field(constants, t, y)
+
+
+def _length(step: Step) -> Array:
+    # Time may be kept in another precision than the state.
+    return lift(step.h.astype(step.y.dtype), step.y)
 
 
 def _last(tableau: Tableau, dense: Any) -> Any:
@@ -145,20 +144,28 @@ def _last(tableau: Tableau, dense: Any) -> Any:
     return (plain, whole)[dense] if isinstance(dense, bool) else jnp.where(dense, whole, plain)
 
 
-def dense_rows(tableau: Tableau, h: Array, slopes: Array) -> Array:
-    """The rows (r, n, *bodies) of dense output: of a step of length `h`, from all its slopes.
+def dense_rows(tableau: Tableau, field: Field, step: Step, slopes: Array) -> Array:
+    """The rows F0, F1, … of `nested` (r, n) of one body, times the length of the step.
 
-    The state at θ is y0 + θ (F0 + (1−θ) (F1 + θ (F2 + (1−θ) (F3 + …)))), Hairer, Nørsett and Wanner
-    (1993), II.6.
+    The stages that only they need are worked out here, apart from those of the step.
     """
-    w = weights(tableau, slopes.dtype, slopes.shape[1]).dense
-    if slopes.ndim == 2:
-        found = jnp.sum(w[:, None] * slopes[None], 2)
-    else:
-        # In a batch XLA makes vector instructions of a product of matrices, not of the sum; for one
-        # body the product would be a kernel of its own.
-        found = jnp.einsum("rs,ns...->rn...", w, slopes)
-    return lift(h.astype(found.dtype), found) * found
+    count, whole = stage_counts(tableau)
+    w = weights(tableau, slopes.dtype, whole)
+    slopes = jnp.concatenate([slopes, jnp.zeros((slopes.shape[0], whole - count), slopes.dtype)], 1)
+    more = lambda i, slopes: _put(slopes, _stage(w, field, [], step, i, slopes)[2], i)  # noqa: E731
+    slopes = lax.fori_loop(count, whole, more, slopes)
+    return step.h.astype(slopes.dtype) * jnp.sum(w.dense[:, None] * slopes[None], 2)
+
+
+def nested(theta: Array, rows: Array) -> Array:
+    """θ (F0 + (1−θ) (F1 + θ (F2 + (1−θ) (F3 + …)))) of rows (r, …) and θ from 0 to 1 in a step.
+
+    Added to the state at the start it is dense output: Hairer, Nørsett and Wanner (1993), II.6.
+    """
+    total = jnp.zeros((), rows.dtype)
+    for i in reversed(range(rows.shape[0])):
+        total = (total + rows[i]) * (1 - theta if i % 2 else theta)
+    return total
 
 
 def error_estimate(tableau: Tableau, sizes: list[int], h: Array, slopes: Array) -> Array:

@@ -12,21 +12,24 @@ from rigidjax import _checks
 from rigidjax._types import ScalarLike
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.frames import AbstractScene, MovingFrame
-from rigidjax.motion.coupled import Coupled
+from rigidjax.motion.coupled import Coupled, motion_of
 from rigidjax.motion.torques.base import jumps_of
-from rigidjax.solve import ending, validation
-from rigidjax.solve.direction import direction
-from rigidjax.solve.events import Event, ready, solve_until
+from rigidjax.solve import validation
+from rigidjax.solve.crossings import Event, ready, solve_until
 from rigidjax.solve.explicit import AbstractExplicit, DormandPrince8
-from rigidjax.solve.projection import Projected
-from rigidjax.solve.run import ADJOINT, NO_METER, SOLVER, Free, Loop, Setup, solve
+from rigidjax.solve.projection import Projected, Watched
+from rigidjax.solve.run import Free, Loop, Setup, refuse_ended, solve
 from rigidjax.solve.solution import Solution, State
 from rigidjax.solve.splitting import AbstractSplitting
-from rigidjax.solve.step_control import Watched
+from rigidjax.solve.vector_field import direction
 
 # A law must take the state that there is: gravity on a `Spin` is an error that type checkers see.
 Law = Callable[[Any, State, Any], Any] | AbstractScene | MovingFrame | None
 
+# Made once: building a Module costs as much as ten steps, and `jit` compares it leaf by leaf.
+SOLVER = Projected(dfx.Dopri8())
+ADJOINT = dfx.RecursiveCheckpointAdjoint()
+NO_METER = dfx.NoProgressMeter()
 # Our loop has both modes of differentiation: these adjoints of diffrax ask no more than that.
 _EITHER_MODE = (type(None), dfx.ForwardMode, dfx.RecursiveCheckpointAdjoint)
 # A step that reverse mode runs again rounds differently. Where the tolerance is so near round-off
@@ -119,88 +122,77 @@ def simulate(
     """
     max_steps = None if max_steps is None else _checks.whole(max_steps, "max_steps", 1)
     body, state0, times = validation.scene(body, state0, ts, torque, throw)
-    controller = stepsize_controller
-    if controller is None:
+    if stepsize_controller is None:
         rtol, atol = validation.tolerances(rtol, atol, times.dtype)
-        make: Any = _controller if _checks.known((rtol, atol)) else _watched
-        controller = make(rtol, atol)
-        if hasattr(torque, "jump_times") and jumps_of(torque).size:
-            # An adaptive step passes over a short pulse without seeing it.
-            jump_ts = jnp.sort(jumps_of(torque).astype(times.dtype))
-            controller = dfx.ClipStepSizeController(controller, jump_ts=jump_ts)
     elif rtol is not None or atol is not None:
         raise ValueError("simulate: give either rtol and atol or a stepsize_controller, not both")
-    elif isinstance(controller, dfx.AbstractAdaptiveStepSizeController):
-        controller = Watched(controller)
     if torque is None and solver is None and stepsize_controller is None and body is not None:
-        free = Free(body, throw)
-        if event is not None:
-            return _until(event, free, state0, times)
-        return _solution(free, state0, times)
+        return _solution(Free(body, throw), event, state0, times)
     method = DormandPrince8() if solver is None else solver
     plain = isinstance(method, AbstractExplicit) and max_steps is not None
     plain = plain and stepsize_controller is None and progress_meter is None
     # Where forward mode is all that is asked, diffrax is quicker: tangents go along with the run.
     forward = isinstance(adjoint, dfx.ForwardMode) and solver is None and event is None
-    plain = plain and isinstance(adjoint, _EITHER_MODE) and not forward
-    if plain:
-        first = validation.first_step(dt0, times)
+    first = validation.first_step(dt0, times)
+    if plain and isinstance(adjoint, _EITHER_MODE) and not forward:
         way = direction(times)
-        loop = Loop(body, torque, method, controller, first, way, max_steps, throw)  # pyright: ignore
-        return (
-            _solution(loop, state0, times) if event is None else _until(event, loop, state0, times)
-        )
+        loop = Loop(body, torque, method, rtol, atol, first, way, max_steps, throw)  # pyright: ignore
+        return _solution(loop, event, state0, times)
     if event is not None:
         raise ValueError(
             "simulate: an event is looked for in our own loop and in closed form: leave solver, "
             "stepsize_controller, adjoint and progress_meter to their defaults (or take a solver "
             "of rigidjax.solvers), or give diffrax.Event to diffrax.diffeqsolve"
         )
+    controller = _controller(stepsize_controller, rtol, atol, torque, times.dtype)
     setup = Setup(
         body=body,
         torque=torque,
         solver=_on_the_group(solver),
         controller=controller,
-        dt0=validation.signed_step(dt0, times),
+        dt0=None if first is None else first * jnp.sign(times[-1] - times[0]),
         adjoint=_adjoint(controller) if adjoint is None else adjoint,
         progress_meter=NO_METER if progress_meter is None else progress_meter,
         max_steps=max_steps,
         throw=throw,
     )
-    return _solution(setup, state0, times)
+    return _solution(setup, None, state0, times)
 
 
-def _solution(setup: Free | Loop | Setup, state0: Any, times: Array) -> Solution:
+def _solution(setup: Any, event: Any, state0: Any, times: Array) -> Solution:
+    event_time = event_state = None
     try:
-        ys, stats, result = solve(setup, state0, times)
+        if event is None:
+            ys, stats, result = solve(setup, state0, times)
+        else:
+            event = event if isinstance(event, Event) else Event(event)
+            state0 = ready(event, setup.body, state0, setup.torque, times[0])
+            ys, stats, result, event_time, event_state = solve_until(setup, event, state0, times)
     except RuntimeError as error:
         raise _checks.bare(error) from None
     if setup.throw and "ended" in stats:
-        ys = ending.refuse(getattr(setup, "torque", None), ys, stats, times)
-    if isinstance(ys, Coupled):
-        return Solution(times, ys.motion, stats, result, setup, own=ys.own)
-    return Solution(times, ys, stats, result, setup)
+        ys = refuse_ended(setup.torque, ys, stats, times)
+    own = ys.own if isinstance(ys, Coupled) else None
+    return Solution(times, motion_of(ys), stats, result, setup, event_time, event_state, own)
 
 
-def _until(event: Any, setup: Free | Loop, state0: Any, times: Array) -> Solution:
-    event = event if isinstance(event, Event) else Event(event)
-    state0 = ready(event, setup.body, state0, getattr(setup, "torque", None), times[0])
-    try:
-        ys, stats, result, time, state = solve_until(setup, event, state0, times)
-    except RuntimeError as error:
-        raise _checks.bare(error) from None
-    if setup.throw and "ended" in stats:
-        ys = ending.refuse(getattr(setup, "torque", None), ys, stats, times)
-    if isinstance(ys, Coupled):
-        return Solution(times, ys.motion, stats, result, setup, time, state, ys.own)
-    return Solution(times, ys, stats, result, setup, time, state)
+def _controller(
+    given: dfx.AbstractStepSizeController | None, rtol: Any, atol: Any, torque: Any, dtype: Any
+) -> dfx.AbstractStepSizeController:
+    if given is not None:
+        adaptive = isinstance(given, dfx.AbstractAdaptiveStepSizeController)
+        return Watched(given) if adaptive else given
+    make: Any = _watched if _checks.known((rtol, atol)) else _watched.__wrapped__
+    watched = make(rtol, atol)
+    if not hasattr(torque, "jump_times") or not jumps_of(torque).size:
+        return watched
+    # An adaptive step passes over a short pulse without seeing it.
+    return dfx.ClipStepSizeController(watched, jump_ts=jnp.sort(jumps_of(torque).astype(dtype)))
 
 
+@functools.cache
 def _watched(rtol: Any, atol: Any) -> Watched:
     return Watched(dfx.PIDController(rtol=rtol, atol=atol))
-
-
-_controller = functools.cache(_watched)
 
 
 def _adjoint(controller: dfx.AbstractStepSizeController) -> dfx.AbstractAdjoint:

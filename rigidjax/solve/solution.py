@@ -1,5 +1,6 @@
 """The result of a run."""
 
+import dataclasses
 import warnings
 from typing import Any, Generic, TypeVar
 
@@ -8,6 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from rigidjax import _checks, motion
@@ -15,9 +17,9 @@ from rigidjax._types import ScalarLike
 from rigidjax.frames import Point
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.coupled import Coupled, motion_of
+from rigidjax.motion.manifold import dimension, minus_small, plus
 from rigidjax.motion.torques.states import require_stateless
-from rigidjax.solve.run import Flow, Free, Loop, Setup, solve
-from rigidjax.solve.sensitivity import growth, transition
+from rigidjax.solve.run import Free, Loop, Setup, solve
 
 State = TypeVar("State", Spin, Attitude, Rigid, Point)
 
@@ -80,8 +82,9 @@ class Solution(eqx.Module, Generic[State]):
         Source: the largest finite-time Lyapunov exponent is its logarithm over t (Eckmann and
         Ruelle 1985, doi:10.1103/RevModPhys.57.617).
         """
-        found = growth(Flow(self._setup), self.ts, self._states)
-        rtol = getattr(getattr(self._setup, "controller", None), "rtol", None)
+        found = _growth(_forward(self._setup), self.ts, self._states)
+        how = self._setup.controller if isinstance(self._setup, Setup) else self._setup
+        rtol = getattr(how, "rtol", None)
         if rtol is None:
             rtol = 100 * float(jnp.finfo(self.ts.dtype).eps)
         if _checks.known((found, rtol, self.ts)):
@@ -109,8 +112,8 @@ class Solution(eqx.Module, Generic[State]):
         >>> rj.simulate(body, start, [0.0, 2.0]).transition_matrix()[1, 2].tolist()
         [0.0, 0.0, 1.0]
         """
-        require_stateless(getattr(self._setup, "torque", None), "transition_matrix")
-        return transition(Flow(self._setup), self.ts, self.ys)
+        require_stateless(self._setup.torque, "transition_matrix")
+        return _transition(_forward(self._setup), self.ts, self.ys)
 
     def evaluate(self, t: ScalarLike) -> State:
         """The state at any `t` between the first and the last of `ts`, s.
@@ -138,5 +141,43 @@ class Solution(eqx.Module, Generic[State]):
 
 @eqx.filter_jit
 def _drift(setup: Free | Loop | Setup, ts: Array, ys: Any) -> dict[str, Array]:
-    torque = None if isinstance(setup, Free) else setup.torque
-    return motion.drift(ts, ys, setup.body, torque)  # pyright: ignore[reportArgumentType]
+    return motion.drift(ts, ys, setup.body, setup.torque)  # pyright: ignore[reportArgumentType]
+
+
+def _forward(setup: Free | Loop | Setup) -> Free | Loop | Setup:
+    """The same run, which raises nothing, and which forward mode goes through."""
+    setup = dataclasses.replace(setup, throw=False)
+    return (
+        dataclasses.replace(setup, adjoint=dfx.ForwardMode()) if isinstance(setup, Setup) else setup
+    )
+
+
+@eqx.filter_jit
+def _growth(setup: Free | Loop | Setup, ts: Array, ys: Any) -> Float[Array, " times"]:
+    """The largest singular value of dy(t)/dy(t0), each part relative to its largest size."""
+    sizes = jax.tree.map(_size, ys)
+    start = jax.tree.map(lambda leaf, size: leaf[0] / size, ys, sizes)
+    numbers, unravel = ravel_pytree(start)
+
+    def end(numbers: Array) -> Array:
+        y0 = jax.tree.map(lambda leaf, size: leaf * size, unravel(numbers), sizes)
+        rows = jax.tree.map(lambda leaf, size: leaf / size, solve(setup, y0, ts)[0], sizes)
+        return jax.vmap(lambda row: ravel_pytree(row)[0])(rows)
+
+    return jnp.linalg.norm(jax.jacfwd(end)(numbers), ord=2, axis=(1, 2))
+
+
+@eqx.filter_jit
+def _transition(setup: Free | Loop | Setup, ts: Array, ys: Any) -> Float[Array, "times n n"]:
+    start = jax.tree.map(lambda leaf: leaf[0], ys)
+
+    def changes(change: Array) -> Array:
+        return jax.vmap(minus_small)(solve(setup, plus(start, change), ts)[0], ys)
+
+    return jax.jacfwd(changes)(jnp.zeros(dimension(start), ts.dtype))
+
+
+def _size(leaf: Array) -> Array:
+    # A run that ended early has NaN in the rows that it did not reach.
+    size = jnp.sqrt(jnp.nanmax(jnp.sum((leaf * leaf).reshape(leaf.shape[0], -1), axis=1)))
+    return jnp.where(size > 0, size, jnp.ones_like(size))

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from rigidjax.exact.components3 import Six, Triple, adjugate, determinant, times
+from rigidjax.exact.components3 import Six, Triple, adjugate, determinant, plus, times
 from rigidjax.exact.derivatives import flow
 from rigidjax.exact.principal_axes import into, out_of, principal_frame
 from rigidjax.motion import Attitude, AttitudeEquations
@@ -95,8 +95,7 @@ def rate_of(weights: Six, p: Triple) -> Triple:
 @rate_of.defjvp
 def rate_of_jvp(primals, tangents):
     (weights, p), (dw, dp) = primals, tangents
-    moved = zip(rate_of(weights, dp), times(dw, p), strict=True)
-    return rate_of(weights, p), tuple(a + b for a, b in moved)
+    return rate_of(weights, p), plus(rate_of(weights, dp), times(dw, p))
 
 
 class AbstractSplitting(dfx.AbstractSolver):
@@ -210,9 +209,8 @@ def compose(
             return momentum
         # A torque that says that it does not depend on the rate gets none.
         at = Attitude(q, jnp.full(3, jnp.nan, dtype))
-        a, b, c = into(frame.axes, evaluate(field.euler.torque, t, at, field.euler.inertia))
-        x, y, z = momentum
-        return x + weight * a, y + weight * b, z + weight * c
+        torque = into(frame.axes, evaluate(field.euler.torque, t, at, field.euler.inertia))
+        return plus(momentum, tuple(weight * a for a in torque))
 
     # A loop, not twelve copies: the flow is long to compile.
     def stage(carry: Any, weights: tuple[Array, Array]) -> tuple[Any, None]:

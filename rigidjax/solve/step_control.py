@@ -1,6 +1,10 @@
-"""How long a step is: the norm of an error, the first step, and runs that stop on NaN."""
+"""A run with adaptive steps: what it is made of, what is kept of it, how long a step is.
 
-from typing import Any
+Bodies are in the last axis.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import diffrax as dfx
 import jax
@@ -10,7 +14,8 @@ from jax import lax
 from jaxtyping import Array, Bool
 
 from rigidjax.solve.components import lift
-from rigidjax.solve.record import Method, Run
+from rigidjax.solve.runge_kutta import Field, Step, error_estimate, stages
+from rigidjax.solve.tableaus import Tableau
 
 # diffrax inherits it from optimistix, where type checkers do not follow.
 NONFINITE: Any = dfx.RESULTS.nonfinite
@@ -20,86 +25,145 @@ _IMPOSSIBLE: Any = dfx.RESULTS.nonfinite_input
 _SAFETY, _SMALLEST, _LARGEST = 0.9, 0.2, 10.0
 
 
-class Watched(dfx.AbstractAdaptiveStepSizeController):
-    """Wraps an adaptive step controller so that a run without a way on ends at once.
+class Method(NamedTuple):
+    """What a run is made of, beside its numbers.
 
-    Where the vector field is NaN, `diffrax.PIDController` tries smaller and smaller steps until
-    `max_steps`, and in a batch all the others wait for it. Here a start without a slope, and a
-    rejected step whose successor would be below a few units of round-off of the time, end the run:
-    with `RESULTS.nonfinite` where there was NaN or infinity, else with `RESULTS.dt_min_reached`.
-    The steps of a healthy run are not touched.
-
-    **Arguments:** `controller` any adaptive controller of diffrax.
-
-    >>> Watched(dfx.PIDController(rtol=1e-6, atol=1e-9)).rtol
-    1e-06
+    **Fields:** `tableau`; `field` and `project`, on (n, *bodies); `halt(t, y)` whether the run ends
+    here, or `None`; `sizes` how many numbers each array of the state has; `max_steps`.
     """
 
-    controller: Any
+    tableau: Tableau
+    field: Field
+    project: Callable[[Array], Array]
+    halt: Callable[[Array, Array], Array] | None
+    sizes: list[int]
+    max_steps: int
 
-    def __init__(self, controller: Any):
-        self.controller = controller
+
+class Run(NamedTuple):
+    """The numbers of a run, a last axis of bodies in each.
+
+    **Fields:** `t0`; `stops` (J,) where the torque jumps, and the last time; `between` (K,) times
+    asked for; `y0` (n,); `rtol`, `atol`; `h0` the first step, NaN to choose one.
+    """
+
+    t0: Array
+    stops: Array
+    between: Array
+    y0: Array
+    rtol: Array
+    atol: Array
+    h0: Array
 
     @property
-    def rtol(self) -> Any:
-        return self.controller.rtol
+    def before(self) -> Array:
+        """The last moment before each stop (J,): a stage there sees the torque before the jump."""
+        jumps = lax.stop_gradient(self.stops[:-1])
+        gap = jnp.nextafter(jumps, jnp.full_like(jumps, -jnp.inf)) - jumps
+        return jnp.concatenate([self.stops[:-1] + gap, self.stops[-1:]])
 
-    @property
-    def atol(self) -> Any:
-        return self.controller.atol
 
-    @property
-    def norm(self) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
-        return self.controller.norm
+class LoopState(NamedTuple):
+    """Where the loop is: time, next step, index of the next stop, counters, state."""
 
-    def wrap(self, direction: Any) -> "Watched":
-        return Watched(self.controller.wrap(direction))
+    t: Array
+    h: Array
+    stop: Array
+    steps: Array
+    rejected: Array
+    y: Array
 
-    def init(
-        self,
-        terms: Any,
-        t0: Any,
-        t1: Any,
-        y0: Any,
-        dt0: Any,
-        args: Any,
-        func: Any,
-        error_order: Any,
-    ) -> tuple[Any, Any]:
-        first, inner = self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
-        # At t = 0 the round-off of t vanishes: that of the length of the run is taken.
-        least = jnp.finfo(t0.dtype).eps * jnp.abs(t1 - t0)
-        # Where the first derivative is not finite the run ends at once.
-        return first, (inner, least, ~finite((y0, func(terms, t0, y0, args))))
 
-    def adapt_step_size(
-        self,
-        t0: Any,
-        t1: Any,
-        y0: Any,
-        y1_candidate: Any,
-        args: Any,
-        y_error: Any,
-        error_order: Any,
-        controller_state: Any,
-    ) -> tuple[Any, Any, Any, Any, Any, dfx.RESULTS]:
-        inner, least, lost = controller_state
-        keep, left, right, jumped, inner, result = self.controller.adapt_step_size(
-            t0, t1, y0, y1_candidate, args, y_error, error_order, inner
-        )
-        unit = 8 * jnp.finfo(left.dtype).eps * jnp.maximum(jnp.abs(left), least)
-        stuck = lost | (~keep & ~(right - left > unit))
-        stuck = stuck & (result == dfx.RESULTS.successful)
-        ill = lost | ~finite((right, y1_candidate, y_error))
-        why = dfx.RESULTS.where(ill, NONFINITE, dfx.RESULTS.dt_min_reached)
-        return (
-            keep,
-            left,
-            right,
-            jumped,
-            (inner, least, lost),
-            dfx.RESULTS.where(stuck, why, result),
-        )
+# A recorded attempt is one row (4 + n, *bodies): start, length, kind, index of the stop ahead, and
+# the state at the start. Kinds: no step was taken; a step; a step that ends on the stop.
+Rows = Array
+HEAD = 4
+NONE, STEP, LAST = range(3)
+# The next step of a run that has met the condition that ends it.
+HALTED = -1.0
+
+
+def packed(loop: LoopState) -> Array:
+    """A `LoopState` as one row. Whole numbers are exact in it up to 2²⁴ in float32."""
+    return jnp.concatenate([jnp.stack([a.astype(loop.y.dtype) for a in loop[:-1]]), loop.y])
+
+
+def unpacked(row: Array) -> LoopState:
+    """What was `packed`."""
+    head = len(LoopState._fields) - 1
+    stop, steps, rejected = row[2:head].astype(jnp.int32)
+    return LoopState(row[0], row[1], stop, steps, rejected, row[head:])
+
+
+class Record(NamedTuple):
+    """A recorded run: the start of each segment (S, 5 + n, *bodies) and the end of the last, how
+    many segments there are, and the last one's rows and how many they are.
+    """
+
+    starts: Array
+    number: Array
+    rows: Rows
+    filled: Array
+
+
+class Answer(NamedTuple):
+    """States `between` (K, n, *bodies) and at the `end` (n, *bodies), NaN where not reached; time,
+    state and next step of the loop when it ended (0, NaN where none is left to try, `HALTED`), and
+    its counters.
+    """
+
+    between: Array
+    end: Array
+    t: Array
+    last: Array
+    h: Array
+    steps: Array
+    rejected: Array
+
+
+class Segment(NamedTuple):
+    """A part of a run: its rows, the time at which each begins (inf where there is none), times of
+    its start and end, and the number of rows.
+    """
+
+    rows: Rows
+    times: Array
+    begin: Array
+    end: Array
+    number: Array
+
+
+def times_of(run: Run, rows: Rows) -> tuple[Array, Array, Array]:
+    """Start, length and end of the steps of rows (4 + n, *bodies).
+
+    The start moves with the stop before it, the length of a step that ends on a stop with both; all
+    other lengths are held.
+    """
+    t, h, kind, stop = lax.stop_gradient(rows[:HEAD])
+    stop, last = stop.astype(jnp.int32), kind == LAST
+    begun = at(jnp.concatenate([run.t0[None], run.stops]), stop)
+    t = t + (begun - lax.stop_gradient(begun))
+    end = at(run.before, stop)
+    h = jnp.where(last, end - t, h)
+    return t, h, jnp.where(last, end, t + h)
+
+
+# So few rows that it is quicker to add up all of them than to look for one, also in derivatives.
+_FEW = 8
+
+
+def at(a: Array, index: Array) -> Array:
+    """a[index] of each body; a (J, *bodies), index (*many, *bodies)."""
+    count = a.shape[0]
+    a = a.reshape(count, *[1] * (index.ndim + 1 - a.ndim), *a.shape[1:])
+    if count == 1:
+        return jnp.broadcast_to(a[0], index.shape)
+    index = jnp.clip(index, 0, count - 1)
+    if count <= _FEW:
+        each = jnp.arange(count, dtype=index.dtype).reshape(-1, *[1] * index.ndim)
+        return jnp.sum(jnp.where(each == index[None], a, 0), 0)
+    a = jnp.broadcast_to(a, (count, *index.shape))
+    return jnp.take_along_axis(a, index[None], 0)[0]
 
 
 def finite(tree: Any) -> Bool[Array, ""]:
@@ -125,13 +189,20 @@ def of_body(result: dfx.RESULTS, body: Any) -> dfx.RESULTS:
     return dfx.RESULTS.where(finite(body), result, _IMPOSSIBLE)
 
 
-def error_norm(error: Array, left: Array, right: Array, rtol: Array, atol: Array) -> Array:
-    """Root mean square of error over tolerance, as `diffrax.PIDController` does; inf for NaN."""
-    scale = lift(atol, left) + lift(rtol, left) * jnp.maximum(jnp.abs(left), jnp.abs(right))
+def tried(method: Method, constants: list[Array], run: Run, step: Step) -> tuple[Array, Array]:
+    """The state a step later, and its error over the tolerance; inf for NaN.
+
+    Their root mean square, as `diffrax.PIDController` takes it.
+    """
+    there = stages(method.tableau, method.field, constants, step)
+    left, right = step.y, method.project(there.end)
+    error = error_estimate(method.tableau, method.sizes, step.h, there.slopes)
+    largest = jnp.maximum(jnp.abs(left), jnp.abs(right))
+    scale = lift(run.atol, left) + lift(run.rtol, left) * largest
     tiny = float(jnp.finfo(error.dtype).tiny)
     norm = jnp.sqrt(jnp.mean((error / scale) ** 2, 0) + tiny)
     # NaN in a step too long says as little as infinity: try a shorter one.
-    return jnp.where(jnp.isnan(norm), jnp.inf, norm)
+    return right, jnp.where(jnp.isnan(norm), jnp.inf, norm)
 
 
 def controlled(
@@ -139,7 +210,7 @@ def controlled(
 ) -> tuple[Array, Array]:
     """Whether a step is accepted, and the next one: 0 where none is left to try, NaN after a NaN.
 
-    **Arguments:** `norm` of the error over the tolerance, as of `error_norm`; `t` and `h` of the
+    **Arguments:** `norm` of the error over the tolerance, as of `tried`; `t` and `h` of the
     step, `last` whether it was cut short at a stop, `kept` what the controller had wanted there;
     `length` of the run, whose round-off counts where that of `t` vanishes.
     """

@@ -24,6 +24,7 @@ from rigidjax.exact.components3 import (
     Triple,
     cross,
     half_product,
+    plus,
     times,
 )
 from rigidjax.exact.principal_axes import out_of
@@ -152,8 +153,7 @@ def _free_slope(weights: Six, gaps: Triple, p: Triple) -> Triple:
 def _free_slope_jvp(primals, tangents):
     (weights, gaps, p), (dw, _, dp) = primals, tangents
     rate, turning = splitting.rate_of_jvp((weights, p), (dw, dp))
-    moved = zip(cross(dp, rate), cross(p, turning), strict=True)
-    return _free_slope(weights, gaps, p), tuple(a + b for a, b in moved)
+    return _free_slope(weights, gaps, p), plus(cross(dp, rate), cross(p, turning))
 
 
 def _entries(a: Array) -> Six:
@@ -176,7 +176,7 @@ def _magnus(turning: _Turning, state0: Attitude) -> Stepper:
             omega = barrier(rate(p))
             # It gets no attitude that it could look at.
             value = evaluate(law, t, Spin(jnp.stack(omega)), body)
-            return _sum(cross(p, omega), split(value))
+            return plus(cross(p, omega), split(value))
 
         q, p = turned(slope, rate, t, end, h, y[:4], y[4:])
         return (*q, *p)
@@ -202,7 +202,7 @@ def _explicit(solver: AbstractExplicit | Rolled, turning: _Turning, state0: Any)
             pushed = cross(p, omega)
             if law is not None:
                 value = evaluate(law, t, join((*q, *omega), state0), body)
-                pushed = _sum(pushed, split(value))
+                pushed = plus(pushed, split(value))
             return (*half_product(q, omega), *pushed) if many else pushed
 
         return slope
@@ -244,7 +244,3 @@ def _split(solver: AbstractSplitting, field: Any, state0: Any) -> Stepper:
         return Attitude(y[0], splitting.leave(frame, y[1]))
 
     return Stepper((state0.q, splitting.enter(frame, state0.omega)), step, state)
-
-
-def _sum(a: Triple, b: Triple) -> Triple:
-    return tuple(x + y for x, y in zip(a, b, strict=True))

@@ -17,6 +17,7 @@ from rigidjax.frames import AbstractScene, MovingFrame, Point
 from rigidjax.frames.frame_dynamics import scene_of
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.torques.base import require_rung
+from rigidjax.rotation.validation import tolerance
 
 
 def scene(body: Any, state0: Any, ts: Any, torque: Any, throw: bool) -> tuple[Any, Any, Array]:
@@ -61,8 +62,7 @@ def require_fit(body: Any, state0: Any, torque: Any) -> None:
             f"{type(state0).__name__} only turns: wanted Inertia, got {type(body).__name__}"
             + ("; pass body.inertia" if isinstance(body, MassProperties) else _body_of(body))
         )
-    if body is not None:
-        _one_body(body)
+    _single(body, "body")
 
 
 def _body_of(numbers: Any, moves: bool = False) -> str:
@@ -86,18 +86,21 @@ def real_or_nan(body: Inertia | MassProperties) -> Any:
     return possible(body, tensor, body.mass if matter else None, throw=False)
 
 
-def _one_body(body: Inertia | MassProperties) -> None:
-    """Raise `ValueError` unless every leaf of `body` has the shape of one body.
+# The arrays of one body or one state that are no vectors.
+_SHAPES = {"tensor": (3, 3), "mass": (), "second_moment": (3, 3), "q": (4,)}
+
+
+def _single(value: Any, name: str) -> None:
+    """Raise `ValueError` unless every leaf of `value` has the shape of one body.
 
     Constructors see to it that shapes agree; `jax.tree.map` and `eqx.tree_at` do not.
     """
-    wanted = {"tensor": (3, 3), "mass": (), "com": (3,), "second_moment": (3, 3)}
-    for path, leaf in jax.tree.leaves_with_path(body):
-        name = str(path[-1]).lstrip(".")
-        if leaf.shape != wanted[name]:
+    for path, leaf in jax.tree.leaves_with_path(value):
+        part = str(path[-1]).lstrip(".")
+        if leaf.shape != (wanted := _SHAPES.get(part, (3,))):
             raise ValueError(
-                f"body: wanted one body, {name} of shape {wanted[name]}, got {leaf.shape}; batch "
-                "with jax.vmap"
+                f"{name}: wanted one body, {part} of shape {wanted}, got {leaf.shape}; batch with "
+                "jax.vmap"
             )
 
 
@@ -198,12 +201,6 @@ def first_step(dt0: Any, times: Array) -> Array | None:
     return abs(step)
 
 
-def signed_step(dt0: Any, times: Array) -> Array | None:
-    """`first_step` with the sign of the direction of time, as diffrax wants it."""
-    step = first_step(dt0, times)
-    return step if step is None else step * jnp.sign(times[-1] - times[0])
-
-
 def start(state0: Any, throw: bool) -> Any:
     """`state0` of one body, finite, with a unit quaternion; poisoned as `times` does it."""
     if not isinstance(state0, Spin | Attitude | Rigid | Point):
@@ -211,29 +208,19 @@ def start(state0: Any, throw: bool) -> Any:
             "state0: wanted Spin, Attitude or Rigid, or Point without a body, got "
             f"{type(state0).__name__}"
         )
-    for path, leaf in jax.tree.leaves_with_path(state0):
-        name = str(path[-1]).lstrip(".")
-        wanted = (4,) if name == "q" else (3,)
-        if leaf.shape != wanted:
-            raise ValueError(
-                f"state0: wanted one body, {name} of shape {wanted}, got {leaf.shape}; batch with "
-                "jax.vmap"
-            )
-    names = [str(path[-1]).lstrip(".") for path, _ in jax.tree.leaves_with_path(state0)]
-    leaves, tree = jax.tree.flatten(state0)
+    _single(state0, "state0")
+    named, tree = jax.tree.flatten_with_path(state0)
     leaves = [
-        _checks.finite(leaf, name) if throw or _checks.known(leaf) else leaf
-        for leaf, name in zip(leaves, names, strict=True)
+        _checks.finite(leaf, str(path[-1]).lstrip(".")) if throw or _checks.known(leaf) else leaf
+        for path, leaf in named
     ]
     state0 = jax.tree.unflatten(tree, leaves)
     if isinstance(state0, HasAttitude):
         xp = _checks.namespace(state0.q)
-        far = xp.abs(xp.sqrt(xp.sum(xp.square(state0.q))) - 1) > (
-            1e-6 if state0.q.dtype == jnp.float64 else 1e-3
-        )
+        off = xp.abs(xp.sqrt(xp.sum(xp.square(state0.q))) - 1)
         q = _guard(
             state0.q,
-            far,
+            off > tolerance(state0.q.dtype),
             "q: wanted a unit quaternion (w, x, y, z), got one whose length is not 1; normalise it "
             "with rigidjax.quaternion.normalise, and mind that the scalar comes first",
             throw,

@@ -1,8 +1,14 @@
-"""The vector field of a scene: the equations of motion of a body, by the kind of its state."""
+"""The vector field of a scene, by the kind of its state; and in s = −t for runs back in time."""
 
 from collections.abc import Callable
 from typing import Any
 
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Int
+
+from rigidjax import _checks
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.frames import AbstractScene, MovingFrame, Point
 from rigidjax.frames.frame_dynamics import scene_of
@@ -38,3 +44,56 @@ def equations_of_motion(
     if isinstance(state0, Attitude):
         return AttitudeEquations(matter, turning)
     return EulerEquations(matter, turning)
+
+
+def direction(times: Array) -> Int[Array, ""] | None:
+    """`None` for times known to increase; else the sign of t's change, known or traced.
+
+    >>> direction(jnp.array([0.0, 1.0])), int(direction(jnp.array([1.0, 0.0])))
+    (None, -1)
+    """
+    ends = _checks.namespace(times).asarray(times)
+    change = ends[-1] - ends[0]
+    if _checks.known(times) and change > 0:
+        return None
+    # A whole number: derivatives do not carry it along.
+    return jnp.asarray(jnp.sign(change), jnp.int32)
+
+
+def ahead(
+    sign: Array | None,
+    field: Callable[..., Any],
+    condition: Callable[..., Any] | None,
+    ts: Array,
+    jumps: Array,
+) -> tuple[Callable[..., Any], Any, Array, Array]:
+    """A vector field f(t, y, args), a condition `(t, y)`, times, and those of jumps, in s = σt.
+
+    **Arguments:** `sign` σ of the direction of time, 1 or −1, `None` for s = t.
+
+    >>> field, _, ts, _ = ahead(
+    ...     jnp.asarray(-1), lambda t, y, args: t * y, None, jnp.arange(2.0), jnp.zeros(0)
+    ... )
+    >>> float(field(jnp.asarray(-3.0), jnp.asarray(2.0), None)), ts.tolist()
+    (-6.0, [-0.0, -1.0])
+    """
+    if sign is None:
+        return field, condition, ts, jumps
+
+    def time(s: Array) -> Array:
+        return sign.astype(s.dtype) * s
+
+    def directed(s: Array, y: Any, args: Any = None) -> Any:
+        t = time(s)
+        if jumps.size:
+            # A law has its new value from the jump on. A step back that begins there wants the old
+            # one, and one that ends there, at the last moment before it in s, the new one.
+            # The oldest JAX has no derivative of `nextafter`, not even one to be stopped.
+            still = lax.stop_gradient(t)
+            before = jnp.nextafter(still, jnp.full_like(still, -jnp.inf))
+            t = t + jnp.where(sign < 0, before - still, jnp.zeros_like(still))
+        slope = field(t, y, args)
+        return jax.tree.map(lambda leaf: sign.astype(leaf.dtype) * leaf, slope)
+
+    asked = None if condition is None else lambda s, y: condition(time(s), y)
+    return directed, asked, time(ts), time(jumps)
