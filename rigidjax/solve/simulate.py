@@ -19,7 +19,7 @@ from rigidjax.solve.crossings import Event, ready, solve_until
 from rigidjax.solve.explicit import AbstractExplicit, DormandPrince8
 from rigidjax.solve.projection import Projected, Watched
 from rigidjax.solve.run import Free, Loop, Setup, refuse_ended, solve
-from rigidjax.solve.solution import Solution, State
+from rigidjax.solve.solution import Kept, Solution, State
 from rigidjax.solve.splitting import AbstractSplitting
 from rigidjax.solve.vector_field import direction
 
@@ -173,7 +173,8 @@ def _solution(setup: Any, event: Any, state0: Any, times: Array) -> Solution:
     if setup.throw and "ended" in stats:
         ys = refuse_ended(setup.torque, ys, stats, times)
     own = ys.own if isinstance(ys, Coupled) else None
-    return Solution(times, motion_of(ys), stats, result, setup, event_time, event_state, own)
+    kept = Kept(setup)
+    return Solution(times, motion_of(ys), stats, result, kept, event_time, event_state, own)
 
 
 def _controller(

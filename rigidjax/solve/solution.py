@@ -24,6 +24,28 @@ from rigidjax.solve.run import Free, Loop, Setup, solve
 State = TypeVar("State", Spin, Attitude, Rigid, Point)
 
 
+class Kept(eqx.Module):
+    """A set-up as arrays and the rest, so that `jax.jit` and `jax.vmap` can return it."""
+
+    arrays: Any
+    rest: tuple[tuple[Any, ...], Any] = eqx.field(static=True)
+
+    def __init__(self, setup: Free | Loop | Setup):
+        self.arrays, rest = eqx.partition(setup, _is_array)
+        leaves, structure = jax.tree.flatten(rest)
+        self.rest = tuple(leaves), structure
+
+    @property
+    def setup(self) -> Any:
+        """The set-up itself."""
+        leaves, structure = self.rest
+        return eqx.combine(self.arrays, jax.tree.unflatten(structure, leaves))
+
+
+def _is_array(leaf: Any) -> bool:
+    return isinstance(leaf, (jax.Array, np.ndarray, np.generic))
+
+
 class Solution(eqx.Module, Generic[State]):
     """What `simulate` returns.
 
@@ -49,10 +71,22 @@ class Solution(eqx.Module, Generic[State]):
     ys: State
     stats: dict[str, Any]
     result: dfx.RESULTS
-    _setup: Free | Loop | Setup
+    _kept: "Kept"
     event_time: Float[Array, ""] | None = None
     event_state: Any = None
     own: Any = None
+
+    def __repr__(self) -> str:
+        if not _checks.known((self.ts, self.stats, self.result)) or np.ndim(self.ts) != 1:
+            return eqx.tree_pformat(self)
+        count, ends = self.ts.shape[0], f"{float(self.ts[0]):g} … {float(self.ts[-1]):g} s"
+        steps = "".join(
+            f", {int(self.stats[name])} {words}"
+            for name, words in (("num_steps", "steps"), ("num_rejected_steps", "rejected"))
+            if name in self.stats
+        )
+        word = dfx.RESULTS[self.result] or "successful"
+        return f"Solution({type(self.ys).__name__} at {count} times {ends}{steps}; {word})"
 
     @property
     def drift(self) -> dict[str, Array]:
@@ -133,6 +167,10 @@ class Solution(eqx.Module, Generic[State]):
         start = jax.tree.map(lambda leaf: leaf[index], self._states)
         ys, _, _ = solve(self._setup, start, jnp.stack([self.ts[index], t]))
         return motion_of(jax.tree.map(lambda leaf: leaf[-1], ys))
+
+    @property
+    def _setup(self) -> Free | Loop | Setup:
+        return self._kept.setup
 
     @property
     def _states(self) -> Any:
