@@ -159,7 +159,7 @@ def _from_ranges(stations: np.ndarray, lengths: np.ndarray) -> np.ndarray:
 def first_rates(records: Recording, counts: tuple[int, ...]) -> Float[Array, "records 3"]:
     """`first_rate` of each of several recordings (a leading axis), also of traced ones."""
     for reading in readings_of(records, Gyro):
-        xp = np if _checks.known(reading) else jnp
+        xp: Any = np if _checks.known(reading) else jnp
         first = xp.argmax(xp.asarray(reading.mask), axis=1)[:, None, None]
         return jnp.asarray(xp.take_along_axis(xp.asarray(reading.values), first, axis=1)[:, 0])
     if not _checks.known(records):
