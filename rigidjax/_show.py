@@ -6,6 +6,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import numpy as np
+from jax.core import Tracer
 
 # More numbers than this are printed as their shape.
 MOST = 16
@@ -19,7 +20,7 @@ def numbers(self: Any) -> str:
 
 
 def _shown(value: Any) -> str:
-    known = isinstance(value, (jax.Array, np.ndarray)) and not isinstance(value, jax.core.Tracer)
+    known = isinstance(value, (jax.Array, np.ndarray)) and not isinstance(value, Tracer)
     if not known or value.size > MOST:
         return eqx.tree_pformat(value)
     return _nested(np.asarray(value).tolist())

@@ -20,6 +20,7 @@ from rigidjax.body.inertia import MassProperties
 from rigidjax.body.principal_axes import eigensystem
 from rigidjax.body.symmetric3 import apply, from_components, product
 from rigidjax.body.validation import real_moments, real_second_moment
+from rigidjax.rotation.linalg3 import cross
 
 # A body is flat where its least second moment is below this share of their sum.
 FLAT = 1e-3
@@ -185,9 +186,12 @@ def flat_bend(
     shape = _checks.floating(shape, (5,), "shape")
     slope = _checks.floating(slope, (5,), "slope")
     root = _root_of(shape)
-    values, axes = eigensystem(root)
-    thin = jnp.argmin(jnp.abs(values))
-    a, n = values[thin], axes[:, thin]
+    # Of a flat body the columns of the adjugate are along n: no eigenvalues in every step of a fit.
+    rows = root[0], root[1], root[2]
+    adjugate = jnp.stack([cross(rows[k - 2], rows[k - 1]) for k in range(3)])
+    longest = adjugate[jnp.argmax(jnp.abs(jnp.diagonal(adjugate)))]
+    n = longest / jnp.sqrt(jnp.sum(longest * longest) + jnp.finfo(root.dtype).tiny)
+    a = n @ apply(root, n)
     d1, d2, s12, s23, s13 = slope
     # The misfit does not depend on the size of A: its derivative along A is zero.
     trace = -(shape @ slope)

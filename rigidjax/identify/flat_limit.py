@@ -8,7 +8,6 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from rigidjax.body.inertia import Inertia, MassProperties
-from rigidjax.body.principal_axes import eigensystem
 from rigidjax.body.symmetric3 import swap_trace
 from rigidjax.identify.body_charts import AbstractBodyChart
 from rigidjax.identify.parameters import Parameters
@@ -142,9 +141,12 @@ def flatness(problem: Problem, parameters: Parameters) -> Float[Array, " bodies"
         if not _has_limit(chart):
             out.append(jnp.ones((), parameters.own.spin.dtype))
             continue
-        values, _ = eigensystem(body.second_moment)
+        # Up to scale, as they are reported: two ratios, or three moments after a mass.
+        logs = chart.logs(body)[-3:]
+        logs = logs if logs.size == 3 else jnp.append(logs, 0.0)
+        low, middle, high = jnp.sort(jnp.exp(logs - jnp.max(logs)))
         # Of a flat body round-off may be below zero.
-        out.append(2.0 * jnp.maximum(values[0], 0.0) / (values[1] + values[2]))
+        out.append(jnp.maximum(low + middle - high, 0.0) / high)
     return jnp.stack(out)
 
 
