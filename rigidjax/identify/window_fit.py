@@ -34,9 +34,9 @@ _SETTLED = 1e-5
 # A step that gains less than this part of what a fit gains from noise alone is the last: as much as
 # 0.05 standard deviations from the least cost. The first searches need not come so near.
 _LEVEL, _ROUGH = 0.05**2, 1.0
-# Windows are first followed for a ninth and a third of their length, if that is so many steps.
 # A deviation of so many times a number that is of order one says that nothing is known of it.
 VAGUE = 100.0
+# Windows are first followed for a ninth and a third of their length, if that is so many steps.
 _PARTS, _SHORTEST, _FEW = (9, 3), 5, 10
 
 

@@ -101,6 +101,7 @@ def test_principal_moments_through_the_chart_agree_with_fifty_digits():
     np.testing.assert_allclose(got, np.array(columns).T, rtol=1e-12, atol=1e-12)
 
 
+@pytest.mark.oldest
 @pytest.mark.parametrize("values", [(1.0, 2.0, 3.0), (2.0, 2.0, 3.0), (2.0, 2.0, 2.0)])
 def test_packing_has_its_derivative_at_equal_moments_too(values):
     """dA of A² = 𝔖 is the integral of e^(−tA) d𝔖 e^(−tA)."""
