@@ -139,7 +139,7 @@ class LogDensity(eqx.Module):
         if sandwich and (process is None or not _definite(seen)):
             # The density takes errors for white: its own width is less than the fit's intervals.
             # Of many recordings the sandwich may be singular, and no scale for a search.
-            linear = uncertainty.linearise(problem, fit.parameters, fit.noises)
+            linear = uncertainty.linearise(problem, fit.parameters, fit.noises, near=fit.near)
             seen = uncertainty.of_white(linear).covariance
         rest, total = [], 0
         for factor, reading in zip(factors, problem.records.readings, strict=True):

@@ -1,9 +1,7 @@
 """How good a fit is: covariance, status, and whether other starts explain the data as well."""
 
 from collections.abc import Sequence
-from typing import Any
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
@@ -19,16 +17,9 @@ from rigidjax.identify.quantities import charts, quantities as quantities_of, va
 from rigidjax.identify.real_bodies import of_charts
 from rigidjax.identify.residual import Noise
 from rigidjax.identify.result import Fit, Start
-from rigidjax.identify.several_bodies import in_a_row
 
 # A point so near to the least misfit, in standard deviations, is where a search was to end.
 AT_THE_END = 0.05
-
-
-@eqx.filter_jit
-def _bodies(problem: Problem, parameters: Parameters) -> list[Any]:
-    # As one program: outside of a trace each operation of JAX costs as much as a run of 100 steps.
-    return in_a_row(problem.bodies(parameters))
 
 
 def _margin(problem: Problem, best_cost: float, longest: float) -> float:
@@ -56,12 +47,8 @@ def assess(
     `interrupted` says where the search was.
     """
     value = best.parameters
-    linear = uncertainty.linearise(problem, value, noise, best.found)
     near = flat_limit.beside(problem, value)
-    if near is not None:
-        aside = uncertainty.linearise(problem, near, noise)
-        slopes = aside.slopes, aside.extra_slopes
-        linear = eqx.tree_at(lambda x: (x.slopes, x.extra_slopes), linear, slopes)
+    linear = uncertainty.linearise(problem, value, noise, best.found, near)
     cut = at_limit(problem.records.readings)
     times = uncertainty.correlation_times(linear, cut)
     white = uncertainty.of_white(linear)
@@ -106,7 +93,7 @@ def assess(
         search = Answer(NOT_ALONE, (rival, *remarks))
     else:
         search = Answer(FOUND, tuple(remarks))
-    unreal = of_charts(charts(problem), _bodies(problem, value))
+    unreal = of_charts(charts(problem), flat_limit.bodies_of(problem, value))
     model = Answer(seen.model.word, (*unreal, *seen.model.reasons))
     model = model if np.isfinite(best_cost) else Answer(FAILS)
     return Fit(

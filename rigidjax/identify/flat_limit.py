@@ -93,9 +93,8 @@ def beside(problem: Problem, parameters: Parameters) -> Parameters | None:
     the readings say of the tensor itself is regular there and hardly changes within so little.
     """
     vectors, first, changed = [], 0, False
-    for chart, body in zip(
-        charts_of(problem.body), in_a_row(_bodies(problem, parameters)), strict=True
-    ):
+    bodies = bodies_of(problem, parameters)
+    for chart, body in zip(charts_of(problem.body), bodies, strict=True):
         vector = parameters.body[first : first + chart.size]
         first += chart.size
         thick = _thicker(chart, body)
@@ -107,9 +106,10 @@ def beside(problem: Problem, parameters: Parameters) -> Parameters | None:
 
 
 @eqx.filter_jit
-def _bodies(problem: Problem, parameters: Parameters) -> Any:
+def bodies_of(problem: Problem, parameters: Parameters) -> list[Any]:
+    """The bodies of a fit, in the order of their charts."""
     # As one program: outside of a trace each operation of JAX costs as much as a run of 100 steps.
-    return problem.bodies(parameters)
+    return in_a_row(problem.bodies(parameters))
 
 
 def _thicker(chart: AbstractBodyChart, body: Inertia | MassProperties) -> Array | None:

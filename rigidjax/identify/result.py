@@ -105,7 +105,7 @@ class Fit(eqx.Module):
         """What most likely makes the errors that are left, where that shows."""
         if not self.left:
             return ()
-        linear = uncertainty.linearise(self.problem, self.parameters, self.noises)
+        linear = uncertainty.linearise(self.problem, self.parameters, self.noises, near=self.near)
         return causes(self.problem, self.parameters, self.noises, linear, self.left)
 
     @property

@@ -109,17 +109,25 @@ def errors_at(parameters: Parameters, problem: Problem) -> tuple[Float[Array, ".
 
 
 def linearise(
-    problem: Problem, parameters: Parameters, noise: Noise, found: Any = None
+    problem: Problem,
+    parameters: Parameters,
+    noise: Noise,
+    found: Any = None,
+    near: Parameters | None = None,
 ) -> Linearised:
     """Errors, derivatives and weights at these parameters, as NumPy arrays.
 
-    `found` is what `evaluate` gives there, where that is known.
+    **Arguments:** `found` what `evaluate` gives there, where that is known; `near` where the
+    derivatives are taken instead, of a flat body (`rigidjax.identify.flat_limit.beside`).
     """
     found = evaluate(parameters, problem) if found is None else found
     (errors, slopes, weights), where, extra, extra_slopes = jax.tree.map(
         np.asarray, _linearised(problem, parameters, noise, found)
     )
     raw = tuple(np.asarray(error) for error in found[0][0])
+    if near is not None:
+        aside = linearise(problem, near, noise)
+        slopes, extra_slopes = aside.slopes, aside.extra_slopes
     return Linearised(raw, errors, slopes, weights, where, extra, extra_slopes)
 
 

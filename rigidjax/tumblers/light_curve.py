@@ -261,7 +261,7 @@ def _half_way(parameters: Parameters, problem: Problem) -> Float[Array, "times 3
 
 def _with_shape(best: Fit) -> Fit:
     """The fit with a covariance that allows for a body that is no ellipsoid."""
-    linear = uncertainty.linearise(best.problem, best.parameters, best.noises)
+    linear = uncertainty.linearise(best.problem, best.parameters, best.noises, near=best.near)
     reading, weight = padding.one(best.problem.records.readings[0], 0), linear.weights[0][0]
     flux = np.asarray(reading.values) - linear.raw[0][0, :, 0]
     size = np.full(weight.shape, 1.0 / MAGNITUDE) if reading.sensor.unit == "mag" else flux
@@ -283,7 +283,7 @@ def _with_shape(best: Fit) -> Fit:
 
 
 def _told(best: Fit, aliases: list[Alias], found: TwoFrequencies, cut: bool) -> LightCurve:
-    slopes, wider = np.asarray(_slopes(best.parameters, best.problem)), _with_shape(best)
+    slopes, wider = np.asarray(_slopes(best.beside, best.problem)), _with_shape(best)
     own, deviations = (
         carried(slopes, np.asarray(one.seen), np.asarray(one.null_directions))
         for one in (best, wider)
