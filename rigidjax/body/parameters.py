@@ -4,7 +4,8 @@ The second moment is the square of a symmetric matrix, 𝔖 ∝ (1 + V)² with V
 vector is a body: an optimiser needs no constraint and cannot leave the bodies. Plates and rods are
 ordinary points: their root has a zero eigenvalue. In the log-Cholesky chart (Rucker and Wensing
 2022, doi:10.1109/LRA.2022.3144517) they lie at infinity; in Cholesky's factor itself a small turn
-of a plate is a large step.
+of a plate is a large step. A vector whose 1 + V has a negative eigenvalue stands for the same body
+as another one whose root has none, which `pack` returns.
 """
 
 from collections.abc import Callable
