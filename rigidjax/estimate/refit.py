@@ -100,7 +100,7 @@ class Refit(eqx.Module):
         centre, slope = (np.asarray(a) for a in (value(self.x), jax.jacfwd(value)(self.x)))
         deviation = carried(slope, np.asarray(self.covariance), np.zeros((0, self.x.size)))
         reach = NormalDist().inv_cdf(0.5 + 0.5 * level) * deviation
-        return centre - reach, centre + reach
+        return np.asarray(centre - reach), np.asarray(centre + reach)
 
 
 def _quantiles(values: np.ndarray, weights: np.ndarray, at: np.ndarray) -> np.ndarray:

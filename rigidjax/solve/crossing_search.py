@@ -180,7 +180,8 @@ def _seen(section: Section, constants: Arrays, s: Array, y: Array) -> tuple[Arra
     of_g = lambda s, y: section.rates(constants, s, y)[0]  # noqa: E731
     noise = jax.jvp(of_g, (s, y), (s, _push(section.like, y)))[1]
     blur = _CLEAR * jnp.finfo(y.dtype).eps * jnp.abs(noise)
-    return *section.rates(constants, s, y), blur
+    g, rate, slope = section.rates(constants, s, y)
+    return jnp.asarray(g), jnp.asarray(rate), slope, blur
 
 
 def _clear(section: Section, constants: Arrays, s: Array, y: Array) -> Array:

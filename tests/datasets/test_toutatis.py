@@ -41,11 +41,12 @@ def test_periods_and_pole_are_the_published_ones(found):
 def test_every_start_that_reports_success_agrees(found):
     good = [s for s in found.starts if s.converged and s.fits]
     assert len(good) >= 3
+    # Two vectors of a chart may stand for one body.
+    best = found.problem.unpack(found.parameters)
     for start in good:
-        for a, b in zip(
-            jax.tree.leaves(start.parameters), jax.tree.leaves(found.parameters), strict=True
-        ):
-            np.testing.assert_allclose(a, b, atol=1e-4)
+        mine = found.problem.unpack(start.parameters)
+        for a, b in zip(jax.tree.leaves(mine), jax.tree.leaves(best), strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4)
 
 
 def test_one_outlying_observation_does_not_move_the_result(found):
