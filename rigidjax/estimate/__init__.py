@@ -7,7 +7,7 @@ motion under random torques.
 
 from rigidjax._names import show
 from rigidjax.estimate.belief import Belief as Belief, start as start
-from rigidjax.estimate.density import LogDensity as LogDensity, Unpacked as Unpacked
+from rigidjax.estimate.density import LogDensity as LogDensity
 from rigidjax.estimate.filter import (
     Filtered as Filtered,
     filter as filter,

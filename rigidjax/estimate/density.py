@@ -16,7 +16,7 @@ from rigidjax._types import Scalar
 from rigidjax.estimate.grid import TURN_A_STEP
 from rigidjax.estimate.terms import groups_of, grown_noises, own_numbers, prior_residuals, terms
 from rigidjax.identify import uncertainty
-from rigidjax.identify.parameters import Parameters
+from rigidjax.identify.parameters import Unpacked
 from rigidjax.identify.problem import Problem
 from rigidjax.identify.result import Fit
 from rigidjax.motion.torques import CorrelatedTorque, RandomTorque
@@ -26,32 +26,6 @@ _GUESS = (
     ", or begin from a first guess, fit(problem, starts=1, max_steps=1): the torque may be too "
     "strong for a fit without it"
 )
-
-
-class Unpacked(eqx.Module):
-    """What a vector of unconstrained numbers stands for.
-
-    **Fields:** `parameters` of the problem; `body`, of several bodies a dict by name, and `state0`,
-    of several recordings with a leading axis, as `Problem.unpack` gives them; `values` of the
-    `Free`s by name, in their units; `noise` (R, k) of each sensor, in its unit; `process` the
-    random torque or `None`.
-
-    >>> import rigidjax as rj
-    >>> ts = jnp.linspace(0.0, 10.0, 80)
-    >>> motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1, 0.1, 1.0]), ts)
-    >>> record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), motion.ys.omega))
-    >>> found = rj.identify.fit(rj.identify.Problem(record, rj.identify.PrincipalRatios()))
-    >>> density = LogDensity(found)
-    >>> bool(jnp.allclose(density.unpack(density.x0).state0.omega, jnp.array([1.0, 0.1, 1.0])))
-    True
-    """
-
-    parameters: Parameters
-    body: Any
-    state0: Any
-    values: dict[str, Array]
-    noise: tuple[Array, ...]
-    process: RandomTorque | CorrelatedTorque | None
 
 
 class LogDensity(eqx.Module):

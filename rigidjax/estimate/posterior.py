@@ -11,7 +11,8 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from rigidjax import _checks
-from rigidjax.estimate.density import LogDensity, Unpacked, of_draws
+from rigidjax.estimate.density import LogDensity, of_draws
+from rigidjax.identify.parameters import Unpacked
 
 # A sampler: key, log-density of z, a first z (n,) → draws (samples, n).
 Sampler = Callable[[Any, Callable[[Array], Array], Array], Array]

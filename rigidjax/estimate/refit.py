@@ -19,9 +19,10 @@ from jaxtyping import Array, Bool, Float
 
 from rigidjax import _checks
 from rigidjax._types import Scalar
-from rigidjax.estimate.density import LogDensity, Unpacked, of_draws
+from rigidjax.estimate.density import LogDensity, of_draws
 from rigidjax.estimate.terms import curvature
 from rigidjax.identify.levenberg_marquardt import Settings, made_of, search
+from rigidjax.identify.parameters import Unpacked
 from rigidjax.identify.quantities import carried
 
 # Steps of so many standard deviations end the search; its damping at the start.

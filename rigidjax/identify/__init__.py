@@ -33,7 +33,11 @@ from rigidjax.identify.free_parameters import Free as Free
 from rigidjax.identify.horizons import Horizons as Horizons
 from rigidjax.identify.loss import AbstractLoss as AbstractLoss, Huber as Huber, SoftL1 as SoftL1
 from rigidjax.identify.multiple_shooting import pieces as pieces
-from rigidjax.identify.parameters import Own as Own, Parameters as Parameters
+from rigidjax.identify.parameters import (
+    Own as Own,
+    Parameters as Parameters,
+    Unpacked as Unpacked,
+)
 from rigidjax.identify.prior import Entropic as Entropic
 from rigidjax.identify.problem import Problem as Problem
 from rigidjax.identify.profile import profile as profile

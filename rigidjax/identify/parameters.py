@@ -60,6 +60,32 @@ class Parameters(eqx.Module):
     own: Own
 
 
+class Unpacked(eqx.Module):
+    """What the free numbers of a fit or a posterior density stand for.
+
+    **Fields:** `parameters` of the problem; `body`, of several bodies a dict by name, and `state0`,
+    of several recordings with a leading axis, as `Problem.unpack` gives them; `values` of the
+    `Free`s by name, in their units; `noise` (R, k) of each sensor, in its unit; `process` the
+    random torque of a density or `None`.
+
+    >>> import rigidjax as rj
+    >>> ts = jnp.linspace(0.0, 10.0, 80)
+    >>> motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1, 0.1, 1.0]), ts)
+    >>> record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), motion.ys.omega))
+    >>> found = rj.identify.fit(rj.identify.Problem(record, rj.identify.PrincipalRatios()))
+    >>> low, high = found.interval_of(lambda point: point.state0.omega)  # a function of `Unpacked`
+    >>> bool((abs(high - low) < 0.03).all())
+    True
+    """
+
+    parameters: Parameters
+    body: Any
+    state0: Any
+    values: dict[str, Array]
+    noise: tuple[Array, ...]
+    process: Any = None
+
+
 class Local(eqx.Module):
     """The free numbers that one recording depends on.
 

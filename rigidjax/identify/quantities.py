@@ -13,7 +13,7 @@ from jaxtyping import Array
 from rigidjax import _checks
 from rigidjax.identify import flat_limit
 from rigidjax.identify.body_charts import AbstractBodyChart, Ratios
-from rigidjax.identify.parameters import Parameters
+from rigidjax.identify.parameters import Parameters, Unpacked
 from rigidjax.identify.problem import Problem
 from rigidjax.identify.several_bodies import Bodies, in_a_row
 
@@ -228,10 +228,10 @@ def carried(slope: np.ndarray, covariance: np.ndarray, null: np.ndarray) -> np.n
 
 
 def interval_of(
-    fit: "Fit", of: Callable[[Any, Any], Any], level: float
+    fit: "Fit", of: Callable[[Unpacked], Any], level: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """See `Fit.interval_of`."""
-    _checks.function(of, "of", "(body, state0) → array")
+    _checks.function(of, "of", "of `Unpacked` to an array")
     if not _checks.known(fit.parameters):
         raise TypeError(
             "Fit: wanted known numbers, got traced ones; intervals are made on the host: call "
@@ -240,9 +240,12 @@ def interval_of(
     flat, restore = ravel_pytree(fit.parameters)
 
     def value(x: Array) -> Array:
-        return _checks.numbers(of(*fit.problem.unpack(restore(x))), "of(body, state0)")
+        parameters = restore(x)
+        body, state0 = fit.problem.unpack(parameters)
+        point = Unpacked(parameters, body, state0, fit.problem.values(parameters), fit.noises)
+        return _checks.numbers(of(point), "of(point)")
 
-    middle = np.asarray(_checks.finite(value(flat), "of(body, state0)"))
+    middle = np.asarray(_checks.finite(value(flat), "of(point)"))
     slope = np.asarray(jax.jacfwd(value)(ravel_pytree(fit.beside)[0]))
     seen = np.asarray(fit.seen)
     found = carried(slope, seen, np.asarray(fit.null_directions))

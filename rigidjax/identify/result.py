@@ -13,7 +13,7 @@ from rigidjax.identify.answers import Answer, Cause
 from rigidjax.identify.causes import causes
 from rigidjax.identify.flat_limit import Limit
 from rigidjax.identify.full_scale import at_limit
-from rigidjax.identify.parameters import Parameters
+from rigidjax.identify.parameters import Parameters, Unpacked
 from rigidjax.identify.problem import Problem
 from rigidjax.identify.quantities import Quantity, interval_of, quantile
 from rigidjax.identify.residual import Noise
@@ -181,9 +181,9 @@ class Fit(eqx.Module):
         return {quantity.name: quantity.interval(reach) for quantity in self.quantities}
 
     def interval_of(
-        self, of: Callable[[Any, Any], Any], level: float = 0.95
+        self, of: Callable[[Unpacked], Any], level: float = 0.95
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Interval (low, high) of any differentiable function `of(body, state0) → array`.
+        """Interval (low, high) of any differentiable function of `Unpacked` to an array.
 
         The covariance is carried by the function's derivative. **Raises** as `interval`.
         """

@@ -257,7 +257,7 @@ def shared(joint, levers, name, total):
         factor = factor_of(bodies[PROOF].tensor, device, levers)
         return jnp.log(moments(name, jnp.asarray(total), device, factor, levers))
 
-    low, high = joint.interval_of(lambda bodies, _: of(bodies, levers))
+    low, high = joint.interval_of(lambda point: of(point.body, levers))
     of_fit = ((high - low) / 2 / identify.quantities.quantile(joint, 0.95)) ** 2
     return of_fit + np.diag(of_levers(lambda d: of(joint.body, d), levers))
 
@@ -300,7 +300,7 @@ def main(every=1, end=0.53, laws=(), whole=False):
             f = factor_of(bodies[PROOF].tensor, device, levers)
             return jnp.log(moments(name, bodies[name].tensor, device, f, levers))
 
-        low, high = joint.interval_of(lambda bodies, _, of=log_moments: of(bodies, levers))
+        low, high = joint.interval_of(lambda point, of=log_moments: of(point.body, levers))
         known = np.diag(of_levers(lambda d, of=log_moments: of(joint.body, d), levers))
         reach = np.hypot((high - low) / 2, few * np.sqrt(known))
         error = 0.5 * (low + high) - np.log(truth)
@@ -311,9 +311,9 @@ def main(every=1, end=0.53, laws=(), whole=False):
         for row in range(len(records[name])):
             one = alone(name, row, joint)
 
-            def own(body, _, name=name):
+            def own(point, name=name):
                 device = joint.body[DEVICE].tensor
-                return jnp.log(moments(name, body.tensor, device, factor, levers))
+                return jnp.log(moments(name, point.body.tensor, device, factor, levers))
 
             low, high = one.interval_of(own)
             errors.append(0.5 * (low + high) - np.log(truth))

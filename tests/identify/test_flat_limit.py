@@ -117,8 +117,8 @@ def test_a_plate_in_any_axes_is_found_and_told(thin):
     bound = limit.bound(np.asarray(found.seen))
     assert 0 <= limit.flatness <= bound < 0.1
 
-    def flatness(body, _):
-        moments = jnp.sort(body.moments)
+    def flatness(point):
+        moments = jnp.sort(point.body.moments)
         return (moments[0] + moments[1] - moments[2]) / moments[2]
 
     low, high = found.interval_of(flatness)

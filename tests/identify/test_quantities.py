@@ -63,7 +63,7 @@ def test_an_indefinite_information_is_told():
     )
     wrong = eqx.tree_at(lambda f: (f.seen, f.quantities), found, (jnp.asarray(seen), numbers))
     assert np.isnan(wrong.interval()["Ix/Iz"]).all()
-    low, high = wrong.interval_of(lambda body, _: body.moments[:1])
+    low, high = wrong.interval_of(lambda point: point.body.moments[:1])
     assert np.isnan(low).all() and np.isnan(high).all()
     assert "Ix/Iz is not determined by these data." in wrong.identifiability
     (row,) = [line for line in report.table(report.rows(wrong)).splitlines() if "Ix/Iz" in line]

@@ -42,8 +42,8 @@ def fitted(round_, starts):
     return identify.fit(problem, starts=starts, progress=print)
 
 
-def flatness(body, _):
-    moments = jnp.sort(body.moments)
+def flatness(point):
+    moments = jnp.sort(point.body.moments)
     return moments[2] / (moments[0] + moments[1])
 
 
@@ -71,4 +71,4 @@ def test_the_racket_is_flat(rounds):
     for found in rounds:
         low, high = found.interval_of(flatness)
         print("flatness", low, high)
-        assert abs(flatness(found.body, None) - 1) < 0.005
+        assert abs(flatness(found) - 1) < 0.005

@@ -47,7 +47,7 @@ def test_i1_only_ratios_from_free_motion_and_it_says_so():
     assert "I1 is not determined" in words
     # The ratios are as good as with the chart that has no scale.
     low, high = found.interval_of(
-        lambda body, _: jnp.log(body.moments[:2] / body.moments[2]), 0.997
+        lambda point: jnp.log(point.body.moments[:2] / point.body.moments[2]), 0.997
     )
     ratios = np.log(moments[:2] / moments[2])
     assert np.isfinite(high - low).all()
@@ -221,7 +221,8 @@ def test_i9_every_fit_of_a_near_plate_is_a_body(sigma):
     for seed in range(40):
         found = identify.fit(gyro_problem(noisy(clean, sigma, seed)), starts=1)
         i1, i2, i3 = np.sort(np.asarray(found.body.moments))
-        assert i1 > 0 and i1 + i2 >= i3
+        # A fit may end at the limit itself, where round-off decides the sign.
+        assert i1 > 0 and i1 + i2 - i3 >= -1e-14 * i3
 
 
 def test_i9_a_thin_rod_from_a_poor_start():

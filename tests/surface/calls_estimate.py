@@ -106,7 +106,7 @@ row(
 leave_out("made by start and by each filter", "estimate.Belief")
 leave_out(
     "what a function returns",
-    *(f"estimate.{name}" for name in ("Filtered", "Smoothed", "Push", "Sampled", "Unpacked")),
+    *(f"estimate.{name}" for name in ("Filtered", "Smoothed", "Push", "Sampled")),
     "estimate.LinearEstimate",
 )
 leave_out("made of a fit, which takes long; see tests/estimate", "estimate.LogDensity")

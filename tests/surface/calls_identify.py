@@ -165,11 +165,21 @@ row(
 row("identify.Fit.interval", lambda: dict(self=s.found(), level=0.9), arguments=("level",), **HOST)
 row(
     "identify.Fit.interval_of",
-    lambda: dict(self=s.found(), of=lambda body, state: state.omega, level=0.9),
+    lambda: dict(self=s.found(), of=lambda point: point.state0.omega, level=0.9),
     arguments=("of", "level"),
     **HOST,
 )
-records = ("Fit", "Answer", "Cause", "Start", "Quantity", "Comparison", "Own", "Parameters")
+records = (
+    "Fit",
+    "Answer",
+    "Cause",
+    "Start",
+    "Quantity",
+    "Comparison",
+    "Own",
+    "Parameters",
+    "Unpacked",
+)
 leave_out("a record that the library fills", *(f"identify.{name}" for name in records))
 leave_out("an exception", "identify.LogError")
 leave_out(

@@ -471,7 +471,7 @@ def our_fit(y, noise):
     problem = identify.Problem(recording, identify.Known(rj.Inertia(jnp.eye(3))))
     fit = identify.fit(problem, starts=1)
     low, high = zip(*fit.interval().values(), strict=True)
-    ends = fit.interval_of(lambda body, state: state.omega)
+    ends = fit.interval_of(lambda point: point.state0.omega)
     planned = identify.expected(problem, fit.parameters)
     return [
         fit.state0.omega, np.array([q.deviation for q in fit.quantities[-3:]]), fit.chi2, fit.dof,
@@ -697,7 +697,7 @@ leave_out(
     "estimate.Posterior.points", "estimate.Posterior.rhat", "estimate.Posterior.to_arviz",
     "estimate.Nuts", "estimate.refit", "estimate.Refit", "estimate.Refit.effective",
     "estimate.Refit.interval_of", "estimate.Refit.point", "estimate.LogDensity",
-    "estimate.LogDensity.grown", "estimate.LogDensity.unpack", "estimate.Unpacked",
+    "estimate.LogDensity.grown", "estimate.LogDensity.unpack", "identify.Unpacked",
     "estimate.Filtered.nis",
 )  # fmt: skip
 leave_out(
