@@ -14,13 +14,16 @@ from docutils.utils.math import latex2mathml
 import rigidjax
 
 project, author, version = "rigidjax", "the authors of rigidjax", rigidjax.__version__
-extensions = ["myst_nb"]
+extensions = ["myst_nb", "sphinx.ext.viewcode", "sphinx_copybutton"]
+copybutton_prompt_text = ">>> "
+copybutton_only_copy_prompt_lines = True
 exclude_patterns = ["images/*.py"]
 nb_execution_mode = "off"  # notebooks are shown as they were run and committed
 myst_enable_extensions = ["colon_fence", "dollarmath", "amsmath"]
 myst_heading_anchors = 3
 maximum_signature_line_length = 80
 add_module_names = False
+toc_object_entries_show_parents = "hide"
 python_use_unqualified_type_names = True
 
 html_theme = "furo"
@@ -54,3 +57,4 @@ def setup(app):
         "mathml", inline_renderers=(_inline, None), block_renderers=(_block, None)
     )
     app.connect("builder-inited", lambda _: docs_reference.write(HERE / "reference"))
+    app.connect("doctree-read", docs_reference.link_to_source, priority=100)  # before viewcode
