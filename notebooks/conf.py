@@ -14,13 +14,16 @@ from docutils.utils.math import latex2mathml
 import rigidjax
 
 project, author, version = "rigidjax", "the authors of rigidjax", rigidjax.__version__
-extensions = ["myst_nb"]
+extensions = ["myst_nb", "sphinx.ext.viewcode", "sphinx_copybutton"]
+copybutton_prompt_text = ">>> "
+copybutton_only_copy_prompt_lines = True
 exclude_patterns = ["images/*.py"]
 nb_execution_mode = "off"  # notebooks are shown as they were run and committed
 myst_enable_extensions = ["colon_fence", "dollarmath", "amsmath"]
 myst_heading_anchors = 3
 maximum_signature_line_length = 80
 add_module_names = False
+toc_object_entries_show_parents = "hide"
 python_use_unqualified_type_names = True
 
 html_theme = "furo"
@@ -28,6 +31,7 @@ html_title = f"rigidjax {version}"
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
 html_show_sourcelink = False
+html_show_copyright = False
 html_copy_source = False
 html_math_renderer = "mathml"
 
@@ -54,3 +58,4 @@ def setup(app):
         "mathml", inline_renderers=(_inline, None), block_renderers=(_block, None)
     )
     app.connect("builder-inited", lambda _: docs_reference.write(HERE / "reference"))
+    app.connect("doctree-read", docs_reference.link_to_source, priority=100)  # before viewcode

@@ -2,7 +2,8 @@
 
 `write(folder)` walks what `tests/surface` walks, so that nothing public is left out. Docstrings are
 Markdown already; their `>>>` examples become blocks. Signatures are taken from the source: there an
-argument's type has its short name (`Vec3Like`), and not what that stands for.
+argument's type has its short name (`Vec3Like`), and not what that stands for. The order is that of
+`docs_topics`, then that of the source. `link_to_source` gives each name its link to the source.
 """
 
 import ast
@@ -10,12 +11,13 @@ import inspect
 import sys
 import textwrap
 import types
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[1] / "tests")]
 
+import docs_topics
 from surface import public
 
 _OUTER, _INNER = "::::::", ":::::"
@@ -31,13 +33,21 @@ def write(folder: Path) -> list[str]:
     pages, documented = {}, []
     for module, entries in found.items():
         parts = [f"# {short[module.__name__]}", body_of(module)]
-        for full, thing in entries:
-            parts.append(entry(full, thing, names))
-            documented.append(full)
+        topics = by_topic(short[module.__name__], entries)
+        if module.__name__ == "rigidjax":
+            rows = ((links([full]), first_line(thing)) for full, thing in _own(module, names))
+            parts.append(table("name | what it is", rows))
+        if len(topics) > 1:
+            rows = ((title, links((full for full, _ in inner), "~")) for title, inner in topics)
+            parts.append(table("topic | names", rows))
+        for title, inner in topics:
+            parts += [f"## {title}"] * (len(topics) > 1)
+            parts += [entry(full, thing, names) for full, thing in inner]
+            documented += [full for full, _ in inner]
         pages[module] = "\n\n".join(parts) + "\n"
     for module, text in pages.items():
         _put(folder / f"{module.__name__}.md", text)
-    _put(folder / "index.md", index(pages, short))
+    _put(folder / "index.md", index(modules, short, names))
     for path in folder.glob("*.md"):
         if path.stem not in {"index", *(module.__name__ for module in pages)}:
             path.unlink()
@@ -86,8 +96,10 @@ def homes(
         full = [f"{short[place.__name__]}.{other}" for place, other in where]
         best = min(full, key=lambda one: (one.count("."), len(one), one))
         found[module].append((best, getattr(module, name)))
+    places_of = {module: list(vars(module)) for module in modules}
     return {
-        module: sorted(entries, key=lambda e: e[0].lower()) for module, entries in found.items()
+        module: sorted(entries, key=lambda e: places_of[module].index(e[0].rpartition(".")[2]))
+        for module, entries in found.items()
     }
 
 
@@ -98,17 +110,65 @@ def _key(module: types.ModuleType, name: str, thing: Any) -> tuple[str, Any]:
     return module.__name__, name
 
 
-def index(pages: dict[types.ModuleType, str], short: dict[str, str]) -> str:
-    """The list of modules, each with its first line."""
-    rows = [f"| [{short[m.__name__]}]({m.__name__}.md) | {first_line(m)} |" for m in pages]
-    listed = "\n".join(module.__name__ for module in pages)
-    return (
-        "# Reference\n\nEvery public name, by module; `rj` is `import rigidjax as rj`. Arguments' "
-        "shapes and units are those that the docstrings state.\n\n"
-        "| module | what it holds |\n| --- | --- |\n"
-        + "\n".join(rows)
-        + f"\n\n```{{toctree}}\n:hidden:\n\n{listed}\n```\n"
-    )
+def by_topic(name: str, entries: list[tuple[str, Any]]) -> list[tuple[str, list]]:
+    """The entries of a module under its topics, and those of none under More."""
+    left = {full.rpartition(".")[2]: (full, thing) for full, thing in entries}
+    found = [
+        (title, [left.pop(word) for word in words.split()])
+        for title, words in docs_topics.TOPICS.get(name, {}).items()
+    ]
+    return [*found, ("More", list(left.values()))] if left else found
+
+
+def _own(module: types.ModuleType, names: dict[int, str]) -> list[tuple[str, Any]]:
+    """What a package shows that is no module: what is asked for first, then the rest."""
+    first = " ".join(docs_topics.FIRST.values()).split()
+    things = [getattr(module, name) for name in dir(module)]
+    found = [(names[id(thing)], thing) for thing in things if id(thing) in names]
+    return sorted(found, key=lambda one: (*first, one[0]).index(one[0]))
+
+
+def links(names: Iterable[str], short: str = "") -> str:
+    """Links by the full names, or by the last part of each (`~`)."""
+    return ", ".join(f"{{py:obj}}`{short}{name}`" for name in names)
+
+
+def table(head: str, rows: Iterable[tuple[str, str]]) -> str:
+    lines = [f"| {one} | {other} |" for one, other in rows]
+    return "\n".join([f"| {head} |", "| --- | --- |", *lines])
+
+
+def index(modules: list[types.ModuleType], short: dict[str, str], names: dict[int, str]) -> str:
+    """What is asked for first, then the modules in their groups, each with its first line."""
+    found = {short[module.__name__]: module for module in modules}
+    first = {title: words.split() for title, words in docs_topics.FIRST.items()}
+    strange = {full for row in first.values() for full in row} - set(names.values())
+    assert not strange, f"docs_topics.FIRST names {strange}"
+    parts = [
+        "# Reference",
+        "Every public name, by topic; `rj` is `import rigidjax as rj`. Docstrings state the shapes, "
+        "units and frames of arguments; functions and classes have a link to their source.",
+        table("wanted | names", ((title, links(row)) for title, row in first.items())),
+    ]
+    for title, inside in docs_topics.GROUPS.items():
+        rows = [(f"[{n}]({found[n].__name__}.md)", first_line(found[n])) for n in inside]
+        parts += [f"## {title}", table("module | what it holds", rows)]
+    listed = [found.pop(name).__name__ for inside in docs_topics.GROUPS.values() for name in inside]
+    assert not found, f"docs_topics.GROUPS leaves out {list(found)}"
+    return "\n\n".join([*parts, "```{toctree}\n:hidden:\n\n" + "\n".join(listed) + "\n```\n"])
+
+
+def link_to_source(app: Any, doctree: Any) -> None:
+    """Tells `sphinx.ext.viewcode` where a name is: in the module that its full name begins with."""
+    modules = public.modules()
+    short = shortest(modules)
+    sys.modules.update({short[module.__name__]: module for module in modules})
+    homes_of = sorted(short.values(), key=len, reverse=True)
+    for node in doctree.findall(lambda node: "fullname" in getattr(node, "attributes", ())):
+        full = node["fullname"]
+        home = next((name for name in homes_of if full.startswith(name + ".")), None)
+        if home and not node.get("module"):
+            node["module"], node["fullname"] = home, full.removeprefix(home + ".")
 
 
 def first_line(thing: Any) -> str:

@@ -183,11 +183,31 @@ def test_tests_and_files_that_pages_mention_exist():
 
 
 def test_pictures_are_small():
-    pictures = sorted((ROOT / "notebooks" / "images").glob("*.png"))
+    pictures = sorted((ROOT / "notebooks" / "images").rglob("*.png"))
     assert pictures and all(path.stat().st_size <= 60_000 for path in pictures)
 
 
-def test_a_notebook_opens_with_its_title():
+def test_blocks_fit_on_the_site():
+    for path in RUN:
+        assert not [
+            line for block in blocks(path) for line in block.splitlines() if len(line) > 100
+        ]
+
+
+def test_the_gallery_shows_every_notebook():
+    text = text_of(ROOT / "notebooks" / "gallery.md")
     for path in (ROOT / "notebooks").glob("*.ipynb"):
-        first = json.loads(text_of(path))["cells"][0]
-        assert first["cell_type"] == "markdown" and first["source"][0].startswith("# ")
+        assert f"](images/thumbnails/{path.stem}.png)" in text
+        assert f"]({path.name})" in text and f"\n{path.stem}\n" in text
+
+
+def test_a_notebook_opens_with_its_title_and_ends_with_where_to_go_on():
+    for path in (ROOT / "notebooks").glob("*.ipynb"):
+        cells = json.loads(text_of(path))["cells"]
+        assert cells[0]["cell_type"] == "markdown" and cells[0]["source"][0].startswith("# ")
+        assert cells[-1]["source"][0].startswith("**Continue from here:** ")
+
+
+def test_a_page_of_the_guide_ends_with_where_to_go_on():
+    for path in (ROOT / "notebooks" / "guide").glob("*.md"):
+        assert text_of(path).rstrip().rpartition("\n\n")[2].startswith("**Continue from here:** ")

@@ -1,0 +1,108 @@
+"""The order of the reference: what is asked for first, the modules in groups, topics of long modules.
+
+Names are as the reference writes them. What a module holds beside its topics comes last, under More.
+"""
+
+# The table at the head of the reference.
+FIRST = {
+    "A motion": "rj.simulate rj.solve.Solution",
+    "A body": "rj.Inertia rj.MassProperties rj.shapes.box",
+    "A state": "rj.Attitude rj.Spin rj.Rigid rj.Point",
+    "A torque": "rj.torques.HeavyTop rj.torques.Sum",
+    "A rotation": "rj.quaternion.rotate rj.quaternion.exp rj.so3.log",
+    "Conserved quantities": "rj.energy rj.conserved rj.drift",
+    "The time of an event": "rj.Event rj.crossings",
+    "A fit": "rj.identify.fit rj.identify.Problem rj.identify.Recording rj.identify.Gyro",
+    "Many bodies": "rj.batch.rollout rj.batch.simulate",
+    "A picture": "rj.plot.motion rj.plot.polhode rj.plot.fit",
+}
+
+GROUPS = {
+    "Motion": ("rj", "rj.motion", "rj.torques", "rj.solve", "rj.solvers", "rj.exact"),
+    "Bodies": ("rj.body", "rj.shapes", "rj.volumes", "rj.parameters"),
+    "Rotations": (
+        "rj.quaternion",
+        "rj.so3",
+        "rj.euler",
+        "rj.mrp",
+        "rj.rodrigues",
+        "rj.rotation",
+    ),
+    "Identification": (
+        "rj.identify",
+        "rj.identify.report",
+        "rj.estimate",
+        "rj.datasets",
+        "rj.datasets.toutatis",
+    ),
+    "Many bodies": ("rj.batch", "rj.batch.distributed"),
+    "Frames and space": (
+        "rj.frames",
+        "rj.scenes",
+        "rj.orbits",
+        "rj.tumblers",
+        "rj.tumblers.brightness",
+        "rj.tumblers.plot",
+    ),
+    "Pictures, special functions, measurements": (
+        "rj.plot",
+        "rj.elliptic",
+        "rj.lagrangian",
+        "rj.workprecision",
+    ),
+}
+
+TOPICS = {
+    "rj.motion": {
+        "States": "Spin Attitude Rigid Coupled",
+        "Conserved quantities": "energy conserved drift",
+        "Equations of motion": "EulerEquations AttitudeEquations NewtonEuler on_the_group",
+        "What a state has": "HasSpin HasAttitude HasPose",
+    },
+    "rj.torques": {
+        "Gravity and fields": "HeavyTop GravityGradient MagneticDipole FromPotential",
+        "Given torques": "ConstantTorque InSpace Tabulated Pulses",
+        "Air": "Damping QuadraticDamping Drag BodyDrag",
+        "Wheels and propellers": "Flywheel Wheel ReactionWheels Rotors",
+        "Forces": "UniformGravity CentralGravity Wrench AbstractForce",
+        "Functions of time, measured inputs": "Linear Series Held Input bind Delayed Lagged",
+        "Unknown torques": "RandomTorque CorrelatedTorque",
+        "Laws together, laws of your own": "Sum AbstractTorque Torque ChangingInertia freeze jumps_of",
+    },
+    "rj.solve": {
+        "A run": "simulate Solution",
+        "Events, sections, exponents": "Event crossings Crossings lyapunov_exponents Exponents",
+        "The loops and the equations": "equations_of_motion adaptive fixed",
+    },
+    "rj.body": {
+        "Bodies": "Inertia MassProperties read_inertials write_inertials",
+        "Energy and momentum": "kinetic_energy kinetic_energy_about kinetic_energy_of_moments "
+        "kinetic_energy_of_generator kinetic_energy_of_matrix_rate angular_momentum "
+        "spatial_angular_momentum",
+        "Principal axes and ellipsoids": "principal matrix_function equal_ellipsoid "
+        "energy_ellipsoid momentum_ellipsoid",
+        "Distance of two bodies": "divergence",
+    },
+    "rj.identify": {
+        "The problem": "Problem Recording Reading Free",
+        "What is fitted of the body": "PrincipalRatios Ratios Principal Tensor Mass Known "
+        "AbstractBodyChart",
+        "Sensors": "Gyro Accelerometer AttitudeSensor Direction Magnetometer Marker Position "
+        "Velocity Range LowPass AbstractSensor SensorInput quaternions_from_matrices "
+        "quaternions_from_euler",
+        "The fit and its result": "fit Fit Answer Cause Start Quantity Combination",
+        "How it searches": "SoftL1 Huber AbstractLoss FixedSteps Adaptive AbstractIntegrator "
+        "Descent pieces Entropic Parameters Own",
+        "Uncertainty, comparison": "profile compare Comparison cross_validate",
+        "Before the experiment": "simulate_readings expected best_first_rate fisher plan_of",
+        "Short windows of driven bodies": "windows Windows fit_windows WindowFit Horizons",
+        "Log files": "read_table read_gyro_csv LogError",
+    },
+    "rj.estimate": {
+        "The model": "Model Walk start",
+        "Filter and smoother": "filter Filtered smooth Smoothed step Belief Push",
+        "Likelihood, simulated motions": "log_likelihood sample Sampled",
+        "Posterior": "LogDensity Unpacked refit Refit posterior Posterior Nuts",
+        "Linear models": "LinearModel linear_filter linear_smooth LinearEstimate",
+    },
+}

@@ -1,0 +1,54 @@
+"""The small pictures of the gallery, cut from the notebooks' own: python notebooks/images/thumbnails.py"""
+
+import base64
+import io
+import json
+from pathlib import Path
+
+from PIL import Image
+
+HERE = Path(__file__).parent
+WIDTH, HEIGHT = 420, 280
+# Of each notebook which picture, and of it which part: left, top, right, bottom, as fractions.
+PARTS = {
+    "01_the_notes": (0, (0.0, 0.0, 1.0, 1.0)),
+    "02_dzhanibekov": (1, (0.0, 0.0, 0.48, 1.0)),
+    "03_identify": (0, (0.0, 0.06, 0.5, 0.625)),
+    "04_heavy_tops": (0, (0.66, 0.06, 1.0, 0.485)),
+    "05_frames": (0, (0.0, 0.05, 0.455, 1.0)),
+    "06_batches": (2, (0.0, 0.0, 1.0, 1.0)),
+    "07_extend": (1, (0.0, 0.0, 0.84, 1.0)),
+    "08_flyby": (1, (0.0, 0.0, 0.33, 1.0)),
+    "09_crossings": (1, (0.0, 0.0, 1.0, 1.0)),
+    "10_brightness": (2, (0.0, 0.0, 0.53, 0.49)),
+    "11_unknown_torque": (0, (0.525, 0.0, 1.0, 1.0)),
+    "12_posterior": (0, (0.0, 0.03, 0.62, 0.583)),
+    "13_polar_motion": (0, (0.0, 0.0, 0.36, 1.0)),
+    "14_slew": (1, (0.0, 0.5, 0.31, 1.0)),
+}
+
+
+def pictures(notebook):
+    for cell in json.loads(notebook.read_text(encoding="utf-8"))["cells"]:
+        for output in cell.get("outputs", []):
+            drawn = output.get("data", {}).get("image/png")
+            if drawn:
+                yield Image.open(io.BytesIO(base64.b64decode("".join(drawn)))).convert("RGB")
+
+
+def thumbnail(notebook, index, part):
+    """The part, on white, as large as it fits."""
+    whole = list(pictures(notebook))[index]
+    sides = [edge * size for edge, size in zip(part, 2 * whole.size, strict=True)]
+    cut = whole.crop(tuple(round(side) for side in sides))
+    factor = min(WIDTH / cut.width, HEIGHT / cut.height)
+    cut = cut.resize((round(factor * cut.width), round(factor * cut.height)), Image.LANCZOS)
+    page = Image.new("RGB", (WIDTH, HEIGHT), "white")
+    page.paste(cut, ((WIDTH - cut.width) // 2, (HEIGHT - cut.height) // 2))
+    return page.quantize(96, Image.Quantize.FASTOCTREE)
+
+
+if __name__ == "__main__":
+    for name, (index, part) in PARTS.items():
+        found = thumbnail(HERE.parent / f"{name}.ipynb", index, part)
+        found.save(HERE / "thumbnails" / f"{name}.png", optimize=True)
