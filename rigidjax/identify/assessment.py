@@ -34,6 +34,12 @@ def _margin(problem: Problem, best_cost: float, longest: float) -> float:
     return 10.0 * unit * max(longest, 1.0)
 
 
+def _start(tried: Tried, level: float) -> Start:
+    """A start as a user sees it; it fits where its misfit is not above `level`."""
+    cost = float(tried.cost)
+    return Start(tried.parameters, cost, bool(tried.converged), cost <= level)
+
+
 def _elsewhere(
     linear: uncertainty.Linearised, other: Parameters, value: Parameters, margin: float
 ) -> bool:
@@ -85,20 +91,13 @@ def assess(
     believable = seen.model.word != FAILS
     margin = _margin(problem, best_cost, times.longest)
 
-    starts = [
-        Start(
-            item.parameters, cost, bool(item.converged), believable and cost <= best_cost + margin
-        )
-        for item in tried
-        for cost in (float(item.cost),)
-    ]
+    level = best_cost + margin if believable else -np.inf
+    starts = [_start(item, level) for item in tried]
     rivals = [
         s
         for s in starts
-        if s.fits
-        and s.converged
-        and s.cost > best_cost + 0.01 * margin
-        and _elsewhere(linear, s.parameters, value, margin)
+        if s.fits and s.converged and s.cost > best_cost + 0.01 * margin
+        if _elsewhere(linear, s.parameters, value, margin)
     ]
     rival = f"{len(rivals)} of {len(starts)} starts fit as well elsewhere" if rivals else ""
     lost = believable and not any(start.fits for start in starts)
