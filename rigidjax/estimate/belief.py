@@ -15,7 +15,8 @@ from rigidjax.estimate.sensing import sensors_of
 from rigidjax.identify.direct_estimates import attitudes
 from rigidjax.identify.recording import Recording
 from rigidjax.identify.reference_states import first_rate
-from rigidjax.motion import Attitude, Spin, on_the_group
+from rigidjax.motion import Attitude, Spin
+from rigidjax.motion.equations import on_the_group
 from rigidjax.motion.manifold import names
 
 
@@ -82,6 +83,8 @@ def start(
     attitude and rate off the recording (`Spin` where nothing shows an attitude). Then standard
     deviations, one number or three, zero for what is known: `rate` of Ω, rad/s; `attitude` rad;
     `position` m and `velocity` m/s of a `Rigid`. Torques start from their law's own distribution.
+
+    **Returns** a `Belief`: `t`, `state`, `deviation`, `covariance`.
 
     **Raises:** `ValueError` for a deviation that is missing or below zero, `TypeError` for another
     kind of thing.

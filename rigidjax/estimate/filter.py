@@ -99,7 +99,8 @@ def filter(
     asks for where the numbers are known, else one. `throw`: `False` never raises for what happens
     during the run: see `status`.
 
-    **Returns** a `Filtered`. It may be jitted, differentiated, and batched over any argument.
+    **Returns** `belief`, `readings`, `log_likelihood`, `status` and `lost_at` (`Filtered`). It may
+    be jitted, differentiated, and batched over any argument.
 
     **Raises:** `ValueError` for a sensor without noise, readings before `first`; where `throw`, a
     filter that is lost: for a second and three readings none was within 6 deviations of what was
@@ -154,6 +155,8 @@ def step(model: Model, belief: Belief, t: ScalarLike, *readings: tuple) -> Belie
     `where` finds the sensors as `r.readings[i].sensor`, in this order, so each call gives them all.
 
     One step of the classical method: the time between readings must be short against a turn.
+
+    **Returns** the `Belief` at `t`: `state`, `deviation`, `covariance`, and what is of its torques.
 
     **Raises:** `ValueError` where numbers are known and `t` lies before the belief, or a reading
     holds NaN.

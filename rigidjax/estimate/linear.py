@@ -180,6 +180,8 @@ def linear_filter(
     **Arguments:** `model`; `readings` y (T, k); `mean` (n,) and `root` (n, n), a root of the
     covariance, at the first time before its reading; `seen` (T, k) which numbers count, `None` all.
 
+    **Returns** `mean`, `root`, `innovation`, `variance` and `log_likelihood` (`LinearEstimate`).
+
     **Raises:** `ValueError` for shapes that do not fit, NaN that is not masked.
 
     >>> walk = LinearModel(jnp.eye(1), 0.1 * jnp.eye(1), jnp.eye(1), jnp.ones(1))
@@ -196,7 +198,8 @@ def linear_smooth(
 
     Rauch, Tung and Striebel 1965, doi:10.2514/3.3166, on roots of the covariances.
 
-    **Arguments** and **raises** as `linear_filter`.
+    **Arguments**, **returns** and **raises** as `linear_filter`, with `kicks`, the noise u of each
+    step, and `kick_covariance`.
 
     >>> walk = LinearModel(jnp.eye(1), 0.1 * jnp.eye(1), jnp.eye(1), jnp.ones(1))
     >>> found = linear_smooth(walk, jnp.ones((3, 1)), jnp.zeros(1), jnp.eye(1))

@@ -13,7 +13,7 @@ from rigidjax import _checks
 from rigidjax._types import HasSpin
 from rigidjax.estimate.grid import longest_step, steps_of
 from rigidjax.estimate.scene import Dynamics, Extended, Model
-from rigidjax.motion import on_the_group
+from rigidjax.motion.equations import on_the_group
 
 
 class Sampled(eqx.Module):
@@ -48,6 +48,8 @@ def sample(key: Any, model: Model, state0: Any, ts: Any, *, substeps: int | None
     **Arguments:** `key` of `jax.random`; `model`; `state0` a `Spin`, `Attitude` or `Rigid`; `ts`
     (T,) increasing times, s, the first is of `state0`; `substeps` equal steps between two of them,
     `None` as many as the rate asks for where it is known, else one.
+
+    **Returns** `t`, `states` and `torques` at these times (`Sampled`).
 
     **Raises:** `ValueError` for times that do not increase, `TypeError` for another kind of thing.
 

@@ -15,8 +15,8 @@ from rigidjax.body.inertia import Inertia, MassProperties, inverse
 from rigidjax.estimate import roots
 from rigidjax.identify.sensor_inputs import what_turns
 from rigidjax.motion.manifold import coordinates, dimension, tangent, turns
-from rigidjax.motion.torques import CorrelatedTorque, RandomTorque, Sum, Torque
-from rigidjax.motion.torques.base import in_precision, require_law, tensor_of
+from rigidjax.motion.torques import CorrelatedTorque, RandomTorque, Sum
+from rigidjax.motion.torques.base import Torque, in_precision, require_law, tensor_of
 from rigidjax.rotation.kernels import normalised
 from rigidjax.rotation.linalg3 import cross
 from rigidjax.solve import equations_of_motion

@@ -99,7 +99,9 @@ def smooth(
     **Arguments:** as for `filter`; `iterations` at most; it ends when no number moved by more than
     `tolerance` of its standard deviation (what is then left is about the square of it).
 
-    **Returns** a `Smoothed`. It may be jitted, differentiated in forward mode, and batched.
+    **Returns** `belief`, `rows`, `pushes`, `readings`, `log_likelihood`, `change`, `iterations`,
+    `status` and `lost_at` (`Smoothed`). It may be jitted, differentiated in forward mode, and
+    batched.
 
     **Raises:** as `filter`; where `throw`, also for a motion that still moves by a deviation.
 

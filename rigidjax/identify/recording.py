@@ -11,8 +11,7 @@ from jaxtyping import Array, Bool, Float
 
 from rigidjax import _checks
 from rigidjax.identify.sensors import AbstractSensor
-from rigidjax.motion.torques import Torque
-from rigidjax.motion.torques.base import require_law
+from rigidjax.motion.torques.base import Torque, require_law
 
 
 class Reading(eqx.Module):
@@ -40,10 +39,11 @@ class Recording(eqx.Module):
     """Times and readings of one motion.
 
     **Arguments:** `t` (T,) increasing times, s; then, for each sensor, a pair `(sensor, values)` or
-    a triple `(sensor, values, mask)`: `values` (T, 3) for a `Gyro`, (T, 4) for an
-    `AttitudeSensor`, as the sensor's `reading_shape` says; `mask` (T,) true where there is a
-    reading (what it masks may be NaN). A time at which no sensor read anything is dropped: a masked
-    reading and an absent one are the same. Sensors with their own times share the union of these.
+    a triple `(sensor, values, mask)`: `values` (T, 3) for a `Gyro`, (T, 4) or
+    (T, 3, 3) for an `AttitudeSensor`, as the sensor's `reading_shape` says; `mask` (T,) true where
+    there is a reading (what it masks may be NaN). A time at which no sensor read anything is
+    dropped: a masked reading and an absent one are the same. Sensors with their own times share
+    the union of these.
     `torque`, by keyword, is what turned this body besides its own spin: a wheel whose speed was
     logged, a law with coefficients that a `Free` may move; `None` for none.
 
@@ -136,6 +136,8 @@ def _reading(
             f"for each component of the error, or None, got shape {np.shape(sensor.noise)}"
         )
     values = _checks.on_host(values, f"{name}: readings")
+    # Matrices of an attitude, for one, become quaternions.
+    values = getattr(sensor, "readings", lambda values: values)(values)
     wanted = (t.size, *sensor.reading_shape)
     if values.shape != wanted:
         turned = "; transposed?" if values.shape == wanted[::-1] else ""

@@ -15,8 +15,8 @@ from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.exact.free_body import FreeMotion
 from rigidjax.frames import Point
 from rigidjax.frames.frame_dynamics import scene_of
-from rigidjax.motion import on_the_group
 from rigidjax.motion.coupled import started
+from rigidjax.motion.equations import on_the_group
 from rigidjax.motion.torques.base import jumps_of
 from rigidjax.solve.adaptive import adaptive
 from rigidjax.solve.explicit import AbstractExplicit

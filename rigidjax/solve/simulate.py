@@ -109,7 +109,7 @@ def simulate(
     **Returns** a `Solution`. A second call with other numbers of the same shapes does not compile
     again.
 
-    Source: `AttitudeEquations`, `EulerEquations`, `NewtonEuler` (notes, eqs 50, 79, 84).
+    Source: the equations of Newton and Euler (notes, eqs 50, 79, 84).
 
     **Raises:** `TypeError` where body, state and torque do not fit; `ValueError` for times that
     neither increase nor decrease, NaN, or a quaternion that is not unit (`EquinoxRuntimeError`

@@ -55,10 +55,10 @@ class Solution(eqx.Module, Generic[State]):
     conserves; `result` a `diffrax.RESULTS`: `successful`, or why the run ended early, such as
     `max_steps_reached`, `nonfinite`, `nonfinite_input` (no body has these numbers),
     `dt_min_reached`; `event_occurred` where the event was met.
-    `event_time` s, `event_state` of the type of `state0` (`motion.Coupled` under a law with
-    states): NaN where it was not met, `None` where there is no event. `own` a tuple of the states
-    of the laws that have some, as `ys` with a leading time axis (see `rigidjax.torques.freeze`), or
-    `None`.
+    `event_time` s, `event_state` of the type of `state0` (under a law with states `.motion` is
+    that, `.own` the law's): NaN where it was not met, `None` where there is no event. `own` a tuple
+    of the states of the laws that have some, in the order of the laws, what is inside another
+    first, as `ys` with a leading time axis, or `None`.
 
     >>> import rigidjax as rj
     >>> body, start = rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([0.0, 0.0, 1.0])

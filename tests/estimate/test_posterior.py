@@ -15,6 +15,7 @@ from estimate import records
 import rigidjax as rj
 from rigidjax import estimate, identify
 from rigidjax.estimate.terms import curvature
+from rigidjax.identify.answers import Answer
 
 
 @functools.cache
@@ -37,8 +38,8 @@ def fitted():
     nothing = jnp.zeros((0, 5))
     return identify.Fit(
         problem(), at, covariance, covariance, "", (jnp.full((1, 3), 0.02),), (), 0.0, 1, 1.0, 1.0,
-        jnp.ones(5), nothing, (), identify.Answer("found"),
-        identify.Answer("explains the readings"), (),
+        jnp.ones(5), nothing, (), Answer("found"),
+        Answer("explains the readings"), (),
     )  # fmt: skip
 
 

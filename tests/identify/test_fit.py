@@ -29,9 +29,8 @@ def tumble():
 @pytest.mark.skipif(not BRICK.exists(), reason="NASA's check case is not beside this checkout")
 def test_nasa_brick_returns_its_ratios():
     # NASA/TM-2015-218675, case 2: I = (0.00189422, 0.006211019, 0.007194665) slug ft².
-    record = rj.identify.read_gyro_csv(
-        BRICK, columns=("t", "p_deg_s", "q_deg_s", "r_deg_s"), unit="deg/s"
-    )
+    t, *rates = rj.identify.read_table(BRICK, ("t", "p_deg_s", "q_deg_s", "r_deg_s")).values()
+    record = rj.identify.Recording(t, (rj.identify.Gyro(), np.deg2rad(rates).T))
     found = rj.identify.fit(rj.identify.Problem(record, rj.identify.Ratios()), starts=2)
     assert found.ok
     moments = np.asarray(found.body.moments)

@@ -78,7 +78,7 @@ def test_the_model_goes_through_the_filter_and_so_do_its_derivatives():
     record = identify.Recording(t, (gyro, filtered[::20]))
     move = identify.Free(lambda r: r.readings[0].sensor.lowpass.cutoff, "cutoff", positive=True)
     problem = identify.Problem(record, identify.PrincipalRatios(), free=[move])
-    truth = identify.plan_of(problem, BODY, [3.0, 0.5, 4.0])
+    truth = problem.start(BODY, [3.0, 0.5, 4.0])
     flat, back = ravel_pytree(one(local(problem, truth), 0))
 
     def errors(x):
