@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from rigidjax import _checks
+from rigidjax import _checks, _show
 from rigidjax.identify.sensors import AbstractSensor
 from rigidjax.motion.torques.base import Torque, require_law
 
@@ -102,6 +102,19 @@ class Recording(eqx.Module):
         # A function is no array: what goes through transformations has none as a leaf.
         plain = isinstance(torque, FunctionType)
         self.torque = jax.tree_util.Partial(torque) if plain else torque
+
+    def __repr__(self) -> str:
+        if not _checks.known(self) or np.ndim(self.t) != 1:
+            return eqx.tree_pformat(self)
+        ends = f"{float(self.t[0]):g} … {float(self.t[-1]):g} s"
+        parts = [f"{self.t.shape[0]} times {ends}"]
+        for reading in self.readings:
+            first = _show.shown(np.asarray(reading.values)[int(np.argmax(reading.seen))])
+            name, count = type(reading.sensor).__name__, int(reading.seen.sum())
+            parts.append(f"{name}: {count} readings from {first}")
+        if self.torque is not None:
+            parts.append(f"torque: {type(self.torque).__name__}")
+        return f"Recording({'; '.join(parts)})"
 
     @property
     def size(self) -> int:

@@ -107,6 +107,20 @@ def test_a_wrong_motion_is_not_called_outliers(tumble, loss):
     assert not any("well determined" in words for words in found.identifiability)
 
 
+def test_a_recording_prints_what_it_holds():
+    gyro = identify.Gyro(0.1), jnp.ones((5, 3)) * 1.23456789
+    stars = identify.AttitudeSensor(0.1), jnp.array([[1.0, 0, 0, 0]] * 5), [False] + [True] * 4
+    law = rj.torques.Damping([0.1, 0.1, 0.1])
+    record = identify.Recording(jnp.linspace(0.0, 1.0, 5), gyro, stars, torque=law)
+    assert repr(record) == (
+        "Recording(5 times 0 … 1 s; Gyro: 5 readings from [1.23457, 1.23457, 1.23457]; "
+        "AttitudeSensor: 4 readings from [1, 0, 0, 0]; torque: Damping)"
+    )
+    problem = identify.Problem([record, record], identify.PrincipalRatios())
+    # With a leading axis it has no words of its own.
+    assert "values=f64[2,5,3]" in repr(problem)
+
+
 def test_a_plain_function_turns_a_body_in_a_recording(tumble):
     body, ts, ys = tumble
     gyro = (rj.identify.Gyro(0.01), ys.omega)
