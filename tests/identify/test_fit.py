@@ -108,15 +108,15 @@ def test_a_wrong_motion_is_not_called_outliers(tumble, loss):
 
 
 def test_a_recording_prints_what_it_holds():
-    gyro = identify.Gyro(0.1), jnp.ones((5, 3)) * 1.23456789
-    stars = identify.AttitudeSensor(0.1), jnp.array([[1.0, 0, 0, 0]] * 5), [False] + [True] * 4
+    gyro = rj.identify.Gyro(0.1), jnp.ones((5, 3)) * 1.23456789
+    stars = rj.identify.AttitudeSensor(0.1), jnp.array([[1.0, 0, 0, 0]] * 5), [False] + [True] * 4
     law = rj.torques.Damping([0.1, 0.1, 0.1])
-    record = identify.Recording(jnp.linspace(0.0, 1.0, 5), gyro, stars, torque=law)
+    record = rj.identify.Recording(jnp.linspace(0.0, 1.0, 5), gyro, stars, torque=law)
     assert repr(record) == (
         "Recording(5 times 0 … 1 s; Gyro: 5 readings from [1.23457, 1.23457, 1.23457]; "
         "AttitudeSensor: 4 readings from [1, 0, 0, 0]; torque: Damping)"
     )
-    problem = identify.Problem([record, record], identify.PrincipalRatios())
+    problem = rj.identify.Problem([record, record], rj.identify.PrincipalRatios())
     # With a leading axis it has no words of its own.
     assert "values=f64[2,5,3]" in repr(problem)
 
