@@ -50,7 +50,8 @@ class Setup(eqx.Module):
 class Loop(eqx.Module):
     """A solve of which nothing is asked but states and derivatives: our own loop.
 
-    `sign` of the direction of time; `None` where it is known to go forwards.
+    `sign` of the direction of time; `None` where it is known to go forwards. `cuts` times at which
+    a step has to end, beside the jumps of the torque.
     """
 
     body: Inertia | MassProperties | None
@@ -62,6 +63,7 @@ class Loop(eqx.Module):
     sign: Array | None
     max_steps: int = eqx.field(static=True)
     throw: bool = eqx.field(static=True)
+    cuts: Array | None = None
 
 
 class Ends(eqx.Module):
@@ -147,6 +149,8 @@ def _loop(
     setup: Loop, watch: Ends | None, state0: Any, ts: Array
 ) -> tuple[Any, dict[str, Any], dfx.RESULTS, Any]:
     field, jumps = equations_of_motion(setup.body, state0, setup.torque), jumps_of(setup.torque)
+    if setup.cuts is not None:
+        jumps = jnp.concatenate([jumps.astype(ts.dtype), setup.cuts])
     field, watch, along, jumps = ahead(setup.sign, field, watch, ts, jumps)
     out = adaptive(
         setup.solver,
