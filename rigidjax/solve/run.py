@@ -106,7 +106,7 @@ def _in_steps(
     run: Any = _loop if isinstance(setup, Loop) else _by_diffrax
     ys, stats, result, end = run(setup, watch, state0, ts)
     if setup.throw:
-        ys = _raise(ys, result)
+        ys = refuse(ys, result)
     if watch is not None:
         ended = result == dfx.RESULTS.event_occurred
         stats |= {"ended": ended, "end_time": end[0], "end_state": end[1]}
@@ -184,7 +184,8 @@ def _reached(ys: Any, times: Array) -> Any:
     return jax.tree.map(mark, ys)
 
 
-def _raise(ys: Any, result: dfx.RESULTS) -> Any:
+def refuse(ys: Any, result: dfx.RESULTS) -> Any:
+    """The states `ys`, or an error in words where the run did not get to its end."""
     ys = eqx.error_if(
         ys,
         result == NONFINITE,

@@ -76,6 +76,7 @@ class Solution(eqx.Module, Generic[State]):
     event_time: Float[Array, ""] | None = None
     event_state: Any = None
     own: Any = None
+    _error: Error | None = None
 
     def __repr__(self) -> str:
         if not _checks.known((self.ts, self.stats, self.result)) or np.ndim(self.ts) != 1:
@@ -148,6 +149,8 @@ class Solution(eqx.Module, Generic[State]):
         >>> rj.simulate(body, start, [0.0, 5.0], law).error.total["omega"] < 1e-9
         Array([ True,  True], dtype=bool)
         """
+        if self._error is not None:
+            return self._error
         return error_of_run(self._setup, self.ts, self._states, self.stats["num_steps"])
 
     def transition_matrix(self) -> Float[Array, "times n n"]:
@@ -192,6 +195,24 @@ class Solution(eqx.Module, Generic[State]):
     @property
     def _states(self) -> Any:
         return self.ys if self.own is None else Coupled(self.ys, self.own)
+
+
+def told(sol: Solution, error: Error, accuracy: Any) -> Solution:
+    """The solution with its error; in words where that exceeds the accuracy asked for."""
+    if _checks.known((error, accuracy)):
+        over = np.flatnonzero(np.asarray(error.relative) > float(accuracy))
+        if over.size:
+            i, parts = over[0], (error.steps, error.round_off)
+            steps, off = (max(float(part[k][i] / error.sizes[k]) for k in part) for part in parts)
+            lost = bool(error.lost[i])
+            why = "nothing is known (chaos?)" if lost else f"steps {steps:.1e}, round-off {off:.1e}"
+            warnings.warn(
+                f"simulate: an accuracy of {float(accuracy):.1e} cannot be had from t = "
+                f"{float(error.ts[i]):g} s on: {why}; end the run earlier"
+                + ("" if error.ts.dtype == jnp.float64 else ", or use float64"),
+                stacklevel=4,
+            )
+    return dataclasses.replace(sol, _error=error)
 
 
 @eqx.filter_jit
