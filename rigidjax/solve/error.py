@@ -98,7 +98,7 @@ class Error(eqx.Module):
 @eqx.filter_jit
 def error_of_run(setup: Free | Loop | Setup, ts: Array, ys: Any, count: Array) -> Error:
     """The error of the states `ys` that `setup` gave at `ts` in `count` steps."""
-    setup, ts, ys, count = lax.stop_gradient((setup, ts, ys, count))
+    setup, ts, ys, count = _still((setup, ts, ys, count))
     if isinstance(setup, Free):
         steps, rtol = _apart(ys, ys), jnp.zeros((), ts.dtype)
     else:
@@ -112,7 +112,7 @@ def error_of_run(setup: Free | Loop | Setup, ts: Array, ys: Any, count: Array) -
 @eqx.filter_jit
 def foreseen_error(loop: Loop, ts: Array, ys: Any, count: Array, tried: Any) -> Error:
     """The same, too large by up to ten, from another run: its tolerance and its states."""
-    loop, ts, ys, count, tried = lax.stop_gradient((loop, ts, ys, count, tried))
+    loop, ts, ys, count, tried = _still((loop, ts, ys, count, tried))
     before, others = tried
     steps = _apart(others, ys)
     far = _largest(steps, _sizes(ys)) > _FORESEEN
@@ -122,16 +122,20 @@ def foreseen_error(loop: Loop, ts: Array, ys: Any, count: Array, tried: Any) -> 
     )
 
 
+def _still(tree: Any) -> Any:
+    return jax.tree.map(lambda a: lax.stop_gradient(a) if eqx.is_array(a) else a, tree)
+
+
 def _with_round_off(
     setup: Any, ts: Array, ys: Any, count: Array, steps: dict[str, Array], rtol: Array
 ) -> Error:
     sizes, start = _sizes(ys), jax.tree.map(lambda leaf: leaf[0], ys)
     reached = jnp.isfinite(_largest(_apart(ys, ys), sizes))
     # What rounding adds up to where nothing grows but the angle turned.
-    eps = jnp.finfo(ts.dtype).eps
+    eps = float(jnp.finfo(ts.dtype).eps)
     plain = {name: _ABOVE * eps * count.astype(ts.dtype) ** 1.5 * sizes[name] for name in sizes}
     above = jnp.stack([(steps[name] > plain[name])[1:] for name in sizes])
-    clear = jnp.all(above | ~reached[1:]) & (rtol > _COARSE * eps)
+    clear = jnp.all(above | ~reached[None, 1:]) & (rtol > _COARSE * eps)
     # Then the neighbours take no step.
     times = jnp.where(clear, ts[0], ts)
     numbers, rest = eqx.partition((setup.body, setup.torque, start), eqx.is_inexact_array)
@@ -186,9 +190,8 @@ def solve_to(loop: Loop, state0: Any, ts: Array, accuracy: Array) -> tuple[Loop,
     **Returns** the loop at the tolerance found; what `solve` gives with it; the tolerance of the
     run before, and its states.
     """
-    still = lax.stop_gradient((loop, state0, ts, accuracy))
-    floor = _FLOOR * jnp.finfo(ts.dtype).eps
-
+    still = _still((loop, state0, ts, accuracy))
+    floor = _FLOOR * float(jnp.finfo(ts.dtype).eps)
     cut = dataclasses.replace(loop, cuts=_cuts(still[2]))
 
     def closer(carry: Any) -> Any:
@@ -340,7 +343,7 @@ def error_of(
 
     @jax.jit
     def stated(x: Any, first: Array) -> FunctionError:
-        eps = jnp.finfo(dtype).eps
+        eps = float(jnp.finfo(dtype).eps)
         second = first * jnp.maximum(_CLOSER, _DEEPEST * eps / first[0])
         two = lax.map(lambda tolerances: both(x, tolerances), jnp.stack([first, second]))
         answer = jax.tree.map(lambda a: a[0], two)
@@ -352,7 +355,8 @@ def error_of(
         def neighbours() -> Any:
             rng = np.random.default_rng(0)
             near = jax.tree.map(lambda leaf: _nudged(leaf, rng), x)
-            changes = jax.tree.map(jnp.subtract, jax.vmap(both, (0, None))(near, first), answer)
+            others = jax.vmap(both, (0, None))(near, first)
+            changes = jax.tree.map(lambda a, b: a - b[None], others, answer)
             return jax.tree.map(lambda a: _DEVIATIONS * jnp.sqrt(_spread(a)), changes)
 
         off = lax.cond(clear, lambda: jax.tree.map(jnp.zeros_like, answer), neighbours)
@@ -364,8 +368,8 @@ def error_of(
 
 def _spread(changes: Array) -> Array:
     """The variance of runs that differ by so much from one more, which is among them."""
-    mean = jnp.sum(changes, 0) / (_NEIGHBOURS + 1)
-    return (jnp.sum((changes - mean) ** 2, 0) + mean**2) / _NEIGHBOURS
+    mean = jnp.sum(changes, 0, keepdims=True) / (_NEIGHBOURS + 1)
+    return (jnp.sum((changes - mean) ** 2, 0) + mean[0] ** 2) / _NEIGHBOURS
 
 
 def _nudged(leaf: Array, rng: np.random.Generator) -> Array:
@@ -373,4 +377,4 @@ def _nudged(leaf: Array, rng: np.random.Generator) -> Array:
     noise = rng.uniform(-1.0, 1.0, (_NEIGHBOURS, *leaf.shape))
     if leaf.ndim > 1 and leaf.shape[-1] == leaf.shape[-2]:
         noise = 0.5 * (noise + np.swapaxes(noise, -1, -2))
-    return leaf * (1 + jnp.asarray(np.finfo(leaf.dtype).eps * noise, leaf.dtype))
+    return leaf[None] * (1 + jnp.asarray(np.finfo(leaf.dtype).eps * noise, leaf.dtype))

@@ -139,6 +139,8 @@ class Solution(eqx.Module, Generic[State]):
     def error(self) -> Error:
         """How far the states are from the exact motion of the given numbers: an `Error`.
 
+        A `UserWarning` says from which time on nothing is known, as in chaos.
+
         Computed when asked for: a run at a hundredth of the tolerances (of equal steps: with half
         of them), and, where round-off may count, three with the last digits of body, torque and
         start changed; of the closed form these three alone. Under `jit` and `vmap`, too.
@@ -151,7 +153,9 @@ class Solution(eqx.Module, Generic[State]):
         """
         if self._error is not None:
             return self._error
-        return error_of_run(self._setup, self.ts, self._states, self.stats["num_steps"])
+        found = error_of_run(self._setup, self.ts, self._states, self.stats["num_steps"])
+        _say(found, 0.5, "error: nothing is known of the states")
+        return found
 
     def transition_matrix(self) -> Float[Array, "times n n"]:
         """∂ state(t) / ∂ state(t₀) at each of `ts`, on the tangent spaces of the states.
@@ -199,20 +203,24 @@ class Solution(eqx.Module, Generic[State]):
 
 def told(sol: Solution, error: Error, accuracy: Any) -> Solution:
     """The solution with its error; in words where that exceeds the accuracy asked for."""
-    if _checks.known((error, accuracy)):
-        over = np.flatnonzero(np.asarray(error.relative) > float(accuracy))
-        if over.size:
-            i, parts = over[0], (error.steps, error.round_off)
-            steps, off = (max(float(part[k][i] / error.sizes[k]) for k in part) for part in parts)
-            lost = bool(error.lost[i])
-            why = "nothing is known (chaos?)" if lost else f"steps {steps:.1e}, round-off {off:.1e}"
-            warnings.warn(
-                f"simulate: an accuracy of {float(accuracy):.1e} cannot be had from t = "
-                f"{float(error.ts[i]):g} s on: {why}; end the run earlier"
-                + ("" if error.ts.dtype == jnp.float64 else ", or use float64"),
-                stacklevel=4,
-            )
+    _say(error, accuracy, "simulate: the accuracy cannot be had")
     return dataclasses.replace(sol, _error=error)
+
+
+def _say(error: Error, most: Any, words: str) -> None:
+    if not _checks.known((error, most)) or not np.any(np.asarray(error.relative) > most):
+        return
+    i = int(np.argmax(np.asarray(error.relative) > most))
+    steps, off = (
+        max(float(part[name][i] / error.sizes[name]) for name in part)
+        for part in (error.steps, error.round_off)
+    )
+    single = "" if error.ts.dtype == jnp.float64 else ", or take float64"
+    warnings.warn(
+        f"{words} from t = {float(error.ts[i]):g} s on: the steps leave {steps:.1e}, round-off "
+        f"{off:.1e} (rad, or relative); end the run earlier{single}",
+        stacklevel=5,
+    )
 
 
 @eqx.filter_jit
