@@ -7,6 +7,7 @@ what they differ by has grown as a rounding error grows. Nothing about the motio
 """
 
 import dataclasses
+import inspect
 from collections.abc import Callable
 from typing import Any
 
@@ -328,13 +329,17 @@ def error_of(
     (True, True)
     """
     _checks.function(f, "f", "f(x) that takes rtol= and atol=")
+    try:
+        inspect.signature(f).bind(x, rtol=rtol, atol=atol)
+    except TypeError as error:
+        raise TypeError(f"f: wanted f(x, rtol=…, atol=…), got one where {error}") from None
     x = jax.tree.map(lambda leaf: _checks.numbers(leaf, "x"), x)
     dtype = ravel_pytree(x)[0].dtype
     first = jnp.asarray(validation.tolerances(rtol, atol, dtype), dtype)
 
     def both(x: Any, tolerances: Array) -> tuple[Array, Any]:
         def value(x: Any) -> tuple[Array, Array]:
-            found = f(x, rtol=tolerances[0], atol=tolerances[1])
+            found = _checks.numbers(f(x, rtol=tolerances[0], atol=tolerances[1]), "f(x, …)")
             return found, found
 
         scalar = jax.eval_shape(value, x)[0].shape == ()

@@ -490,3 +490,11 @@ leave_out(
 leave_out("shares of a run's own statistics: `drift` and `lyapunov_exponents` are rows",
           "solve.Solution.drift", "solve.Solution.growth")  # fmt: skip
 leave_out("a truth value beside `times`: the row of `crossings`", "solve.Crossings.full")
+leave_out(
+    "errors, held against true ones: tests/solve/test_error.py",
+    *("error_of", "solve.Error", "solve.FunctionError", "solve.FunctionError.known"),
+    *(
+        "solve.Solution.error",
+        *(f"solve.Error.{n}" for n in ("known_until", "lost", "relative", "total")),
+    ),
+)
