@@ -317,7 +317,26 @@ row(
     traced=("t",),
     transforms=("jit", "vmap", "grad"),
 )
-leave_out("simulate returns it", "solve.Solution")
+row(
+    "simulate (accuracy)",
+    lambda: dict(body=s.inertia(), state0=s.attitude(), ts=TS, torque=s.top(), accuracy=1e-6),
+    run=rj.simulate,
+    arguments=("accuracy",),
+    traced=("accuracy", "state0"),
+    groups=(*KINDS, "nan", "inf"),
+    # Stated errors are not repeated to the last digit; tests/solve/test_error.py has them.
+    transforms=(),
+)
+row(
+    "error_of",
+    lambda: dict(f=lambda x, **tolerances: jnp.sum(x * x), x=V, rtol=1e-6, atol=1e-9),
+    arguments=("f", "rtol", "atol"),
+    traced=("x",),
+    groups=(*KINDS, "nan", "inf"),
+    transforms=(),
+)
+leave_out("simulate returns it", "solve.Solution", "solve.Error")
+leave_out("error_of returns it", "solve.FunctionError")
 leave_out(
     "inner loops: simulate and rollout run them",
     *(f"solve.{n}" for n in ("adaptive", "fixed")),

@@ -493,3 +493,11 @@ leave_out("shares of a run's own statistics: `drift` and `lyapunov_exponents` ar
 leave_out("holds what the rows of `adaptive` and of `BodyInFrame` compare", "solve.Found",
           "frames.FrameWrench")  # fmt: skip
 leave_out("a truth value beside `times`: the row of `crossings`", "solve.Crossings.full")
+leave_out(
+    "errors, held against true ones: tests/solve/test_error.py",
+    *("error_of", "solve.Error", "solve.FunctionError", "solve.FunctionError.known"),
+    *(
+        "solve.Solution.error",
+        *(f"solve.Error.{n}" for n in ("known_until", "lost", "relative", "total")),
+    ),
+)
