@@ -108,12 +108,14 @@ def rows(fit: Fit) -> list[Row]:
     middle = np.exp(np.asarray(_periods(fit.body, fit.state0)))
     # What the data do not determine has an end at infinity.
     with np.errstate(over="ignore"):
-        low, high = (np.exp(bound) for bound in fit.interval_of(_periods))
+        bounds = fit.interval_of(lambda point: _periods(point.body, point.state0))
+        low, high = (np.exp(bound) for bound in bounds)
     names = ("rotation about the long axis", "precession of the long axis")
     for name, *numbers in zip(names, middle, low, high, strict=True):
         out.append((name, *numbers, "day"))
     middle = np.degrees(np.asarray(_direction(fit.body, fit.state0)))
-    low, high = (np.degrees(bound) for bound in fit.interval_of(_direction))
+    bounds = fit.interval_of(lambda point: _direction(point.body, point.state0))
+    low, high = (np.degrees(bound) for bound in bounds)
     names = ("angular momentum, longitude", "angular momentum, latitude")
     for name, *numbers in zip(names, middle, low, high, strict=True):
         turn = 360.0 if "longitude" in name and numbers[0] < 0 else 0.0
