@@ -49,7 +49,8 @@ def expected(problem: Problem, parameters: Parameters) -> tuple[Quantity, ...]:
             "recordings, or the motion of these parameters is beyond the dtype"
         )
     found = values_and_slopes(problem, parameters, near)
-    return quantities(problem, found, *inverted(information))
+    half, null = inverted(information)
+    return quantities(problem, found, half @ half.T, null)
 
 
 def plan_of(problem: Problem, body: Any, omega: Any) -> Parameters:

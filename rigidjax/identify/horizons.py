@@ -13,8 +13,8 @@ from rigidjax.motion.manifold import minus_small, parts
 class Horizons(NamedTuple):
     """Open-loop errors by horizon, of each kind (`x` m, `v` m/s, `q` rad, `omega` rad/s).
 
-    **Fields:** `steps` (L,) how many steps ahead; `mean_absolute` of a component, and `rms` of the
-    vector, each by kind (L,).
+    **Fields:** `steps` (L,) how many steps ahead; by kind, each (L,): `mean_absolute` of a
+    component, `mean_norm` the mean length of the vector, `rms` the root of its mean square.
 
     >>> import rigidjax as rj
     >>> t = np.arange(6.0)
@@ -25,6 +25,7 @@ class Horizons(NamedTuple):
 
     steps: Any
     mean_absolute: dict[str, Any]
+    mean_norm: dict[str, Any]
     rms: dict[str, Any]
 
 
@@ -32,8 +33,10 @@ def by_horizon(starts: Any, found: Float[Array, "windows steps n"]) -> Horizons:
     """The means over windows of errors as changes from what was measured."""
     by_kind = parts(jax.tree.map(lambda leaf: leaf[0], starts), found)
     absolute = {k: np.asarray(jnp.mean(jnp.abs(v), (0, 2))) for k, v in by_kind.items()}
-    rms = {k: np.asarray(jnp.sqrt(jnp.mean(jnp.sum(v * v, 2), 0))) for k, v in by_kind.items()}
-    return Horizons(np.arange(1, found.shape[1] + 1), absolute, rms)
+    squares = {k: jnp.sum(v * v, 2) for k, v in by_kind.items()}
+    norm = {k: np.asarray(jnp.mean(jnp.sqrt(v), 0)) for k, v in squares.items()}
+    rms = {k: np.asarray(jnp.sqrt(jnp.mean(v, 0))) for k, v in squares.items()}
+    return Horizons(np.arange(1, found.shape[1] + 1), absolute, norm, rms)
 
 
 @jax.jit

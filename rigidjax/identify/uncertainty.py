@@ -208,14 +208,14 @@ def _blinded(covariance: np.ndarray, null: np.ndarray) -> np.ndarray:
 
 
 def inverted(information: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The covariance (n, n) within what is seen, and what is not, `null` (k, n), by information."""
+    """A root (n, m) of the covariance within what is seen, and what is not, `null` (k, n)."""
     size = np.sqrt(np.diag(information))
     size = np.maximum(size, max(WEAKEST * size.max(), 1e-300))
     values, vectors = np.linalg.eigh(information / np.outer(size, size))
     seen = values > 1e-14 * values.max()
     half = vectors[:, seen] / np.sqrt(values[seen]) / size[:, None]
     null = vectors[:, ~seen].T / size
-    return half @ half.T, null / np.linalg.norm(null, axis=1, keepdims=True)
+    return half, null / np.linalg.norm(null, axis=1, keepdims=True)
 
 
 def step(linear: Linearised, white: Spread) -> np.ndarray:

@@ -144,8 +144,11 @@ def fit_windows(
     value, taken = back(end.point), int(end.taken) - 1
     # Once more where it ended, if the last that was tried was no better.
     there = end if end.here else searched(value, evaluated, whole)
-    inverse, null = inverted(np.asarray(there.gram))
-    deviation = carried(np.eye(x.size), inverse @ np.asarray(there.found) @ inverse, null)
+    half, null = inverted(np.asarray(there.gram))
+    # The meat between roots: between covariances, round-off would make variances negative.
+    sizes, axes = np.linalg.eigh(half.T @ np.asarray(there.found) @ half)
+    root = half @ axes * np.sqrt(np.maximum(sizes, 0.0))
+    deviation = carried(np.eye(x.size), root @ root.T, null)
     converged = bool(end.converged)
     message = [] if converged else [f"stopped after {taken} steps: its best point"]
     if len(null):

@@ -14,7 +14,11 @@ _KINDS = {
     "q": "attitude, rad",
     "omega": "body rate, rad/s",
 }
-_MEASURES = {"mean_absolute": "mean |error| of a component", "rms": "rms error"}
+_MEASURES = {
+    "mean_absolute": "mean |error| of a component",
+    "mean_norm": "mean length of the error",
+    "rms": "rms error",
+}
 
 
 def horizons(
@@ -30,8 +34,9 @@ def horizons(
     **Arguments:** `found` a `rigidjax.identify.Horizons`, as `WindowFit.predict` and `Windows.held`
     return them, or several by name, to be compared: of a model, of a prediction that holds the
     start, of other windows; `step` s between samples, for a scale of time in the place of steps;
-    `measure` `mean_absolute` (of a component) or `rms` (of the vector); `title`; `ax` as many axes
-    of yours as there are kinds, else new ones. Errors start at nothing: both scales are linear.
+    `measure` `mean_absolute` (of a component), `mean_norm` or `rms` (of the vector); `title`; `ax`
+    as many axes of yours as there are kinds, else new ones. Both scales are linear, for errors
+    start at zero.
     **Returns** the axes, one for each of position, velocity, attitude, body rate that there is.
 
     **Raises** `TypeError` for what are no errors by horizon; `ValueError` for none, for kinds that

@@ -1,6 +1,7 @@
 """The throws of `shared/data/tudelft_throw` as one problem of four bodies with one sensor.
 
     python tests/identify/bench_throws.py [EVERY] [END] [--white | --correlated] [--whole]
+    python tests/identify/bench_throws.py [EVERY] [END] --copies COUNT
 
 The recipe. All throws together: each group has a body of its own (six numbers) and a drag of its
 own; all share the gyro (bias, scale an axis, three skew terms) and the wheel's tilt; each throw has
@@ -8,18 +9,22 @@ a first rate, a delay of the wheel's log, and a bias that deviates from the shar
 rad/s. Noise is estimated for each body. No object's truth enters: the proof body's moments fix the
 scale of the wheel. Then each throw alone, with the sensor as it was found and the drag of its body
 as sure as it was found. Intervals: the fit's, and what the lever arms (regression on the
-accelerometer) scatter from throw to throw.
+accelerometer) scatter from throw to throw. Notebook 15 does the same from the logs on.
 
 EVERY keeps each so many samples (default 1: 1 kHz), END is the last time, s (default 0.53).
 
 --white and --correlated: then each throw alone also has an unknown torque of that kind, its numbers
 free (`estimate.refit`). Device, wheel and objects are then all of such fits: the device and the
 proof body are the means of theirs. With --whole all throws of a body are one problem instead.
+
+--copies: simulated copies of the whole experiment instead, whose truth is the joint fit: each throw
+has the residuals of another throw of its body, with a random sign; lever arms scatter as they do.
 """
 
 import importlib.util
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import equinox as eqx
@@ -139,7 +144,7 @@ def drawn(best, key, count=1000):
     return jax.vmap(lambda one: best.density.unpack(one).body.tensor)(x)
 
 
-def throws_with_torque(law, joint, records, levers, few, whole=False):
+def throws_with_torque(law, joint, records, levers, whole=False):
     """Print the figures of throws with an unknown torque: each alone, and the mean of a body's; or
     those of all throws of a body as one problem (`whole`). Returns which intervals of means (or of
     those problems) hold.
@@ -173,9 +178,8 @@ def throws_with_torque(law, joint, records, levers, few, whole=False):
         of = jax.vmap(lambda *parts: log_moments(name, *parts, levers))
         low, high = np.quantile(np.asarray(of(total, device, proof)), (0.025, 0.975), axis=0)
         means = [jnp.mean(part, axis=0) for part in (total, device, proof)]
-        known = np.diag(of_levers(lambda d: log_moments(name, *means, d), levers))
-        reach = np.hypot((high - low) / 2, few * np.sqrt(known))
-        return 0.5 * (low + high) - np.log(TRUTH[name]), reach
+        known = of_levers(lambda d: log_moments(name, *means, d), levers)
+        return 0.5 * (low + high) - np.log(TRUTH[name]), np.hypot((high - low) / 2, known)
 
     all_errors, alone_held, mean_held = [], [], []
     for name in TRUTH:
@@ -223,43 +227,80 @@ def moments(name, total, device, factor, levers):
 
 
 def factor_of(proof, device, levers):
-    """By what factor the wheel's inertia is off: the least squares of the proof body's moments."""
-    factor = jnp.asarray(1.0)
-    for _ in range(5):
-
-        def off(f):
-            found = moments(PROOF, proof, device, f, levers)
-            return found / jnp.asarray(TRUTH[PROOF]) - 1.0
-
-        error, slope = off(factor), jax.jacfwd(off)(factor)
-        factor = factor - jnp.sum(error * slope) / jnp.sum(slope * slope)
-    return factor
+    """By what factor the wheel's inertia is off: what makes the trace of the proof body's right."""
+    between = levers[PROOF] - levers[DEVICE]
+    distance = MASSES[DEVICE] * (1.0 + MASSES[DEVICE] / MASSES[PROOF]) * jnp.sum(between**2)
+    return (1e-6 * sum(TRUTH[PROOF]) + 2.0 * distance) / jnp.trace(proof - device)
 
 
-def of_levers(function, levers):
-    """Covariance of `function(levers)` by the scatter of the levers from throw to throw."""
-    total = 0.0
-    for name in levers:
-        slope = np.asarray(
-            jax.jacfwd(lambda d, name=name: function(levers | {name: d}))(levers[name])
-        )
-        rows = throws.levers(name)
-        # The variance of a median is π/2 times that of a mean.
-        total = total + slope @ (np.cov(rows.T) / len(rows) * np.pi / 2) @ slope.T
-    return total
+def of_levers(function, levers, rows=None):
+    """Half-widths of 95 % intervals of `function(levers)` by their scatter from throw to throw."""
+    slopes, rows = jax.jacfwd(function)(levers), rows or {n: throws.levers(n) for n in levers}
+    # The variance of a median is π/2 times that of a mean.
+    scatter = {n: np.pi / 2 * np.cov(rows[n].T) / len(rows[n]) for n in levers}
+    parts = {n: np.einsum("ij,jk,ik->i", slopes[n], scatter[n], slopes[n]) for n in levers}
+    total = sum(parts.values())
+    # Degrees of freedom by Welch and Satterthwaite (1946, doi:10.2307/3002019).
+    freedom = total**2 / sum(part**2 / (len(rows[n]) - 1) for n, part in parts.items())
+    return stdtrit(freedom, 0.975) * np.sqrt(total)
+
+
+@partial(jax.jit, static_argnums=0)
+def log_moments(name, total, bodies, levers):
+    device = bodies[DEVICE].tensor
+    return jnp.log(
+        moments(name, total, device, factor_of(bodies[PROOF].tensor, device, levers), levers)
+    )
 
 
 def shared(joint, levers, name, total):
-    """Variance of the log moments of a tensor by what it takes from the joint fit."""
+    """Half-widths for the log moments of a tensor by what it takes from the joint fit."""
+    total = jnp.asarray(total)
+    low, high = joint.interval_of(lambda point: log_moments(name, total, point.body, levers))
+    known = of_levers(lambda d: log_moments(name, total, joint.body, d), levers)
+    return np.hypot((high - low) / 2, known)
 
-    def of(bodies, levers):
-        device = bodies[DEVICE].tensor
-        factor = factor_of(bodies[PROOF].tensor, device, levers)
-        return jnp.log(moments(name, jnp.asarray(total), device, factor, levers))
 
-    low, high = joint.interval_of(lambda point: of(point.body, levers))
-    of_fit = ((high - low) / 2 / identify.quantities.quantile(joint, 0.95)) ** 2
-    return of_fit + np.diag(of_levers(lambda d: of(joint.body, d), levers))
+def of_all(name, joint, levers, rows=None):
+    """Middles and half-widths of the log moments of a body in the joint fit."""
+    low, high = joint.interval_of(
+        lambda point: log_moments(name, point.body[name].tensor, point.body, levers)
+    )
+    total = joint.body[name].tensor
+    known = of_levers(lambda d: log_moments(name, total, joint.body, d), levers, rows)
+    return 0.5 * (low + high), np.hypot((high - low) / 2, known)
+
+
+def copies(joint, levers, count):
+    """Print how many intervals of the joint fit hold in simulated copies of the experiment."""
+    rng = np.random.default_rng(0)
+    errors, of = np.asarray(joint.residuals[0]), np.array(joint.problem.of)
+    clean = np.asarray(joint.problem.records.readings[0].values) - errors
+    rows = {name: throws.levers(name) for name in levers}
+    truth = {n: log_moments(n, joint.body[n].tensor, joint.body, levers) for n in TRUTH}
+    held, reaches = [], []
+    for _ in range(count):
+        readings = clean.copy()
+        for name in levers:
+            mine = np.flatnonzero(of == name)
+            sign = rng.choice([-1.0, 1.0], mine.size)[:, None, None]
+            readings[mine] += sign * errors[rng.permutation(mine)]
+        problem = eqx.tree_at(
+            lambda p: p.records.readings[0].values, joint.problem, jnp.asarray(readings)
+        )
+        found = identify.fit(problem, starts=1, initial=joint.parameters)
+        scattered = {
+            n: levers[n] + rng.multivariate_normal(np.zeros(3), np.cov(r.T), len(r))
+            for n, r in rows.items()
+        }
+        middle = {n: jnp.asarray(np.median(r, axis=0)) for n, r in scattered.items()}
+        ends = {n: of_all(n, found, middle, scattered) for n in TRUTH}
+        held.append([np.abs(ends[n][0] - truth[n]) <= ends[n][1] for n in TRUTH])
+        reaches.append([ends[n][1] for n in TRUTH])
+    print(f"of {count} copies {100 * np.mean(held):.1f} % of {np.size(held)} intervals hold")
+    for k, name in enumerate(TRUTH):
+        each = np.mean(held, axis=0)[k], np.mean(reaches, axis=0)[k]
+        print(f"  {name}: {np.round(100 * each[0], 1)} %, ±% {np.round(100 * each[1], 2)}")
 
 
 def show(name, errors, reach):
@@ -273,16 +314,15 @@ def show(name, errors, reach):
 
 
 def given(every, end):
-    """Recordings of each body, levers, and by how much the scatter of levers of few throws counts."""
+    """Recordings of each body, and levers."""
     records = {name: [record(path, every, end) for path in throws.paths(name)] for name in MASSES}
     levers = {name: jnp.asarray(throws.lever(name)) for name in MASSES}
-    # The scatter of the levers is itself known from a few throws only.
-    return records, levers, stdtrit(min(len(rows) for rows in records.values()) - 1, 0.975)
+    return records, levers
 
 
-def main(every=1, end=0.53, laws=(), whole=False):
+def main(every=1, end=0.53, laws=(), whole=False, count=0):
     """Print the figures; returns them: errors of single throws, which intervals hold."""
-    records, levers, few = given(every, end)
+    records, levers = given(every, end)
     began = time.perf_counter()
     joint = together(records)
     print(f"{joint.problem.count} throws together: {time.perf_counter() - began:.1f} s")
@@ -293,17 +333,11 @@ def main(every=1, end=0.53, laws=(), whole=False):
     factor = factor_of(joint.body[PROOF].tensor, joint.body[DEVICE].tensor, levers)
     print(f"  the wheel's inertia times {factor:.4f}; noise {np.unique(joint.noise[0]).round(4)}")
     together_held, alone_held, all_errors = [], [], []
+    if count:
+        return copies(joint, levers, count)
     for name, truth in TRUTH.items():
-
-        def log_moments(bodies, levers, name=name):
-            device = bodies[DEVICE].tensor
-            f = factor_of(bodies[PROOF].tensor, device, levers)
-            return jnp.log(moments(name, bodies[name].tensor, device, f, levers))
-
-        low, high = joint.interval_of(lambda point, of=log_moments: of(point.body, levers))
-        known = np.diag(of_levers(lambda d, of=log_moments: of(joint.body, d), levers))
-        reach = np.hypot((high - low) / 2, few * np.sqrt(known))
-        error = 0.5 * (low + high) - np.log(truth)
+        middle, reach = of_all(name, joint, levers)
+        error = middle - np.log(truth)
         together_held.append(show(f"{name}, together", error, reach))
         print(f"  errors % {np.round(100 * error, 2)}, 95 % ±% {np.round(100 * reach, 2)}")
         errors, reaches, words = [], [], []
@@ -311,13 +345,11 @@ def main(every=1, end=0.53, laws=(), whole=False):
         for row in range(len(records[name])):
             one = alone(name, row, joint)
 
-            def own(point, name=name):
-                device = joint.body[DEVICE].tensor
-                return jnp.log(moments(name, point.body.tensor, device, factor, levers))
-
-            low, high = one.interval_of(own)
+            low, high = one.interval_of(
+                lambda point, n=name: log_moments(n, point.body.tensor, joint.body, levers)
+            )
             errors.append(0.5 * (low + high) - np.log(truth))
-            reaches.append(np.hypot((high - low) / 2, few * np.sqrt(beside)))
+            reaches.append(np.hypot((high - low) / 2, beside))
             words.append(one.model.word)
         print("  status:", ", ".join(f"{words.count(word)} {word}" for word in sorted(set(words))))
         alone_held.append(
@@ -326,14 +358,20 @@ def main(every=1, end=0.53, laws=(), whole=False):
         all_errors.append(np.abs(errors).ravel())
     found = summary(all_errors, alone_held, together_held, "the joint fit")
     for law in laws:
-        throws_with_torque(law, joint, records, levers, few, whole)
+        throws_with_torque(law, joint, records, levers, whole)
     return found
 
 
 if __name__ == "__main__":
-    numbers = [text for text in sys.argv[1:] if not text.startswith("--")]
+    words, count = sys.argv[1:], 0
+    if "--copies" in words:
+        at = words.index("--copies")
+        count = int(words[at + 1])
+        del words[at : at + 2]
+    numbers = [text for text in words if not text.startswith("--")]
     main(
         *(kind(text) for kind, text in zip((int, float), numbers, strict=False)),
-        laws=[text[2:] for text in sys.argv[1:] if text in ("--white", "--correlated")],
-        whole="--whole" in sys.argv,
+        laws=[text[2:] for text in words if text in ("--white", "--correlated")],
+        whole="--whole" in words,
+        count=count,
     )

@@ -1,6 +1,7 @@
 """Real throws with a flywheel: calibration, choice of a model, two objects of known inertia."""
 
 import importlib.util
+import json
 from pathlib import Path
 
 import equinox as eqx
@@ -20,6 +21,7 @@ pytestmark = [
         not throws.FOLDER.exists(), reason="the throws are not beside this checkout"
     ),
 ]
+NOTEBOOK = Path(__file__).parents[2] / "notebooks" / "15_throws.ipynb"
 GROUPS = ("calibration_device_only", "calibration_proof_body", "object_empty", "object_a")
 
 
@@ -131,9 +133,9 @@ def bench():
 
 def test_intervals_of_all_throws_of_a_body_with_an_unknown_torque_hold(bench):
     # Every third sample: their noise is nearly white after the low-pass filter at 200 Hz.
-    records, levers, few = bench.given(3, 0.53)
+    records, levers = bench.given(3, 0.53)
     joint = bench.together(records)
-    held = bench.throws_with_torque("white", joint, records, levers, few, whole=True)
+    held = bench.throws_with_torque("white", joint, records, levers, whole=True)
     assert held.size == 9 and held.mean() >= 0.9
 
 
@@ -158,3 +160,22 @@ def test_a_drag_that_can_drive_does_not_lose_a_throw():
     assert found.search.word == "found" and found.model.word != "does not explain the readings"
     # Linear drag explains the same throw with 0.05 rad/s.
     assert found.rms[0] < 0.1
+
+
+def test_the_notebook_gives_the_figures(monkeypatch):
+    import matplotlib
+
+    matplotlib.use("Agg")
+    monkeypatch.chdir(NOTEBOOK.parent)
+    monkeypatch.delenv("RIGIDJAX_SHORT", raising=False)
+    cells = json.loads(NOTEBOOK.read_text(encoding="utf-8"))["cells"]
+    space = {}
+    for cell in cells:
+        if cell["cell_type"] == "code":
+            exec("".join(cell["source"]), space)
+    for name, mean in (("calibration_proof_body", 0.8), ("object_empty", 1.25), ("object_a", 1.1)):
+        error = 100 * (space["singles"][name][0] - np.log(space["MOMENTS"][name]))
+        assert np.abs(error).mean() < mean
+        middle, reach = space["together"][name]
+        assert (np.abs(middle - np.log(space["MOMENTS"][name])) < reach).all()
+        assert reach.max() < 0.04

@@ -98,6 +98,26 @@ def test_what_windows_do_not_show_has_no_deviation():
     assert "deviations need more windows than free numbers, 1" in found.message
 
 
+@pytest.mark.parametrize("apart", [1e-3, 1e-5, 3e-6])
+def test_numbers_that_are_hardly_told_apart_have_wide_deviations_not_nan(apart):
+    t = H * np.arange(T)
+    omega = np.array([0.5, 1.0, -0.4]) * np.exp(-0.3 * t)[:, None]
+    spins = rj.Spin(omega + 1e-3 * np.random.default_rng(1).normal(size=(T, 3)))
+    ball = rj.Inertia.from_principal(1.0, 1.0, 1.0)
+
+    def both(k):
+        damping = (k["a"] + k["b"]) * jnp.ones(3) + apart * k["b"] * jnp.array([1.0, 0, 0])
+        return ball, torques.Sum(
+            torques.Damping(damping), torques.ConstantTorque(k["c"] * jnp.ones(3))
+        )
+
+    cut = identify.windows(t, spins, length=4, stride=4)
+    found = identify.fit_windows(cut, both, {k: jnp.asarray(0.1) for k in "abc"})
+    # What tells them apart is linear in `apart`.
+    assert float(found.deviation["a"]) * apart == pytest.approx(0.01377, rel=0.01)
+    assert float(found.deviation["c"]) == pytest.approx(0.002754, rel=0.01)
+
+
 def test_deviations_say_how_far_off_the_numbers_are():
     """Ten records with noise: of forty numbers as many within two deviations as there should be."""
     inside = []

@@ -53,7 +53,7 @@ SPIN = identify.windows(T, rj.Spin(FALL.omega), length=10).held()
         (dict(found={}), ValueError, "at least one Horizons"),
         (dict(found=CUT), TypeError, "wanted a Horizons of rigidjax.identify.*got Windows"),
         (dict(found={"a": CUT.held(), "b": SPIN}), ValueError, "the same kinds of errors"),
-        (dict(found=SPIN, measure="worst"), ValueError, "measure: wanted one of mean_absolute, rms"),
+        (dict(found=SPIN, measure="worst"), ValueError, "measure: wanted one of mean_absolute, mean_norm"),
         (dict(found=SPIN, step=0.0), ValueError, "step: wanted a positive time"),
         (dict(found=SPIN, ax=[None, None]), ValueError, "wanted 1 axes in a row"),
     ],

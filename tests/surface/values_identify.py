@@ -562,13 +562,16 @@ def cut(w, u, j):
     starts = w[at]
     missed = wanted - starts[:, None]
     mean = abs(missed).sum(axis=(0, 2)) / 9
-    rms = [mp.sqrt(x) for x in (missed**2).sum(axis=(0, 2)) / 3]
+    squares = (missed**2).sum(axis=2)
+    norm = [sum(mp.sqrt(x) for x in column) / 3 for column in squares.T]
+    rms = [mp.sqrt(x) for x in squares.sum(axis=0) / 3]
     t = h * np.arange(1, length + 1)
     slope = (missed * t[None, :, None]).sum(axis=(0, 1)) / (3 * (t * t).sum())
     held = np.stack([u[k : k + length] for k in at])
     left = missed - slope * t[None, :, None]
     return [
-        starts, wanted, held, np.array([3.0]), np.array([3.0]), mean, np.array(rms),
+        starts, wanted, held, np.array([3.0]), np.array([3.0]), mean, np.array(norm),
+        np.array(rms),
         np.concatenate([starts, starts]), j * slope,
         np.array([mp.sqrt(x) for x in (left**2).sum(axis=(0, 2)) / 3]),
     ]  # fmt: skip
@@ -579,7 +582,8 @@ def our_cut(w, u, j):
     held = made.held()
     return [
         made.starts.omega, made.wanted.omega, made.inputs["u"], np.array([made.count]) * 1.0,
-        np.array([made.length]) * 1.0, held.mean_absolute["omega"], held.rms["omega"],
+        np.array([made.length]) * 1.0, held.mean_absolute["omega"], held.mean_norm["omega"],
+        held.rms["omega"],
         identify.Windows.joined(made, made).starts.omega,
     ]  # fmt: skip
 
