@@ -66,12 +66,13 @@ def _one_sensor(row: Any, t: np.ndarray, scaled: np.ndarray, seen: np.ndarray) -
     how: dict[str, Any] = dict(ms=2.5 if seen.sum() > 100 else 5, alpha=0.7)
     for values, colour, name in zip(shown.T, colours, names, strict=True):
         over_time.plot(t[seen], values, ".", color=colour, label=name, **how)
-    for values, colour in zip(scaled[seen].T if beyond else (), colours, strict=False):
-        for side, mark in ((1, "^"), (-1, "v")):
-            where = t[seen][side * values > reach]
-            at = np.full(where.size, 0.95 * side * reach)
-            over_time.plot(where, at, color=colour, marker=mark, ms=5, ls="")
     if beyond:
+        for axis, (values, colour) in enumerate(zip(scaled[seen].T, colours, strict=True)):
+            for side, mark in ((1, "^"), (-1, "v")):
+                where = t[seen][side * values > reach]
+                # A row an axis: one reading is often wild on all of them.
+                at = np.full(where.size, side * reach * (0.95 - 0.09 * axis))
+                over_time.plot(where, at, color=colour, marker=mark, ms=5, ls="")
         name = f"beyond ±{reach:.0f}"
         over_time.plot([], [], color="0.4", marker="^", ms=2.5, ls="", label=name)
     over_time.axhspan(-2, 2, color="0.9", zorder=0)
