@@ -58,17 +58,14 @@ def flip():
     body = rj.shapes.box(1.0, [0.30, 0.20, 0.08])
     start = rj.Attitude(q=[1.0, 0, 0, 0], omega=[0.02, 6.0, 0.02])
     sol = rj.simulate(body.inertia, start, jnp.linspace(0.0, 9.0, 301))
-    figure = plt.figure(figsize=(8.4, 3.5), layout="constrained")
+    figure = plt.figure(figsize=(8.4, 4.2), layout="constrained")
     ax = figure.add_subplot(1, 2, 1, projection="3d")
     rj.plot.polhode(body.inertia, sol.ys, ax=ax, title="the polhode")
-    legend = ax.get_legend()
-    words = [text.get_text() for text in legend.get_texts()]
-    ax.legend(legend.legend_handles, words, bbox_to_anchor=(0.12, 1.0), fontsize=8)
     ax = figure.add_subplot(1, 2, 2)
     for index, colour in enumerate(rj.plot.COLOURS[:3]):
         ax.plot(sol.ts, sol.ys.omega[:, index], color=colour, label=f"Ω{'₁₂₃'[index]}")
     ax.set(xlabel="time, s", ylabel="body rate, rad/s", title="the flip about the middle axis")
-    ax.legend(loc="upper right", fontsize=8)
+    ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=3, fontsize=8, frameon=False)
     ax.grid(alpha=0.3)
     save(figure, "flip.png")
 

@@ -11,7 +11,15 @@ from rigidjax._types import HasAttitude
 from rigidjax.body.energy import spatial_angular_momentum
 from rigidjax.body.inertia import Inertia
 from rigidjax.motion.torques import HeavyTop
-from rigidjax.plot.style import COLOURS, attitudes, flat_axes, matrices, plain, rows
+from rigidjax.plot.style import (
+    COLOURS,
+    attitudes,
+    flat_axes,
+    legend_below,
+    matrices,
+    plain,
+    rows,
+)
 
 
 def phase_portrait(
@@ -86,8 +94,7 @@ def phase_portrait(
         ax.plot(np.degrees(lowest), 0, color=COLOURS[1], marker="x", ms=8, ls="", label="steady")
     ax.set(xlabel="tilt θ, deg", ylabel="dθ/dt, rad/s", ylim=(-reach, reach))
     ax.set_title(plain(title) or "phase portrait; thin: equal energy, same momenta")
-    # Below: inside it would lie on the curves.
-    ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=3, fontsize=8, frameon=False)
+    legend_below(ax)
     return ax
 
 

@@ -18,6 +18,7 @@ from rigidjax.plot.style import (
     cube,
     flat_axes,
     globe,
+    legend_below,
     matrices,
     on_sphere,
     plain,
@@ -50,8 +51,11 @@ def body_axes(states: HasAttitude, *, title: str = "", ax: Any = None) -> Any:
         around_ball(ax, path, path, color=colour, lw=1.6, label=f"body {'xyz'[axis]} axis")
         ax.plot(*path[:1].T, color=colour, marker="o", ms=6, ls="")
         ax.plot(*path[-1:].T, color=colour, marker="^", ms=7, ls="")
+    # Of no axis: grey.
+    for mark, name in (("o", "start"), ("^", "end")):
+        ax.plot([], [], [], color="0.4", marker=mark, ms=6, ls="", label=name)
     cube(ax, 1.0, ("x", "y", "z"))
-    ax.legend(loc="upper left", fontsize=9)
+    legend_below(ax, down=0.06)
     ax.set_title(plain(title) or "body axes on the unit sphere, world frame")
     return ax
 
@@ -112,7 +116,7 @@ def polhode(
 
     handles += [Patch(color=COLOURS[5], alpha=0.4), Line2D([], [], color=COLOURS[4], lw=0.8)]
     names += ["momentum sphere", "energy ellipsoid"]
-    ax.legend(handles, names, loc="upper left", fontsize=8)
+    legend_below(ax, handles, names, down=0.06)
     ax.set_title(plain(title) or "polhode, principal axes of the body")
     return ax
 
@@ -195,5 +199,5 @@ def herpolhode(inertia: Inertia, states: HasAttitude, *, title: str = "", ax: An
     ax.set_aspect("equal")
     ax.set(xlabel="ω along e₁, rad/s", ylabel="ω along e₂, rad/s")
     ax.set_title(plain(title) or "herpolhode, across the angular momentum")
-    ax.legend(loc="upper right", fontsize=8)
+    legend_below(ax)
     return ax

@@ -15,8 +15,8 @@ def residuals(
 ) -> Any:
     """Residuals of each sensor over its noise: in time, histogram, autocorrelation, spectrum.
 
-    From left to right: they should scatter evenly within ±2 (what lies beyond ±8 is counted, not
-    drawn); their histogram against the normal curve; the correlation of each with a later one,
+    From left to right: they should scatter evenly within ±2 (what lies beyond ±8 is a triangle at
+    the edge); their histogram against the normal curve; the correlation of each with a later one,
     which for white noise stays inside the band ±2/√N; their power spectrum, which for white noise
     of the given size is 1 at all frequencies (Welch's estimate; Lomb's where times are uneven).
     A line in the spectrum is a motion or a torque that the model lacks.
@@ -51,7 +51,7 @@ def residuals(
         row[0].set_ylabel(f"{type(reading.sensor).__name__}\nerror / noise")
         row[0].set_xlabel(f"time, {time_unit}")
         row[3].set_xlabel(f"frequency, {'Hz' if time_unit == 's' else f'1/{time_unit}'}")
-    ax[0, 1].set_title(plain(title) or "residuals of the fit")
+    ax[0, 0].set_title(plain(title) or "residuals of the fit", loc="left")
     return ax
 
 
@@ -59,15 +59,24 @@ def _one_sensor(row: Any, t: np.ndarray, scaled: np.ndarray, seen: np.ndarray) -
     over_time, spread, memory, spectrum = row
     colours, names = COLOURS[: scaled.shape[1]], "xyz"[: scaled.shape[1]]
     everything = scaled[seen].ravel()
-    # One wild reading must not press all others into a line: what lies beyond is counted.
+    # One wild reading must not press all others into a line: what lies beyond is put at the edge.
     reach = float(np.clip(np.abs(everything).max(initial=0.0) * 1.1, 4.0, 8.0))
     beyond = int((np.abs(everything) > reach).sum())
     shown = np.where(np.abs(scaled[seen]) <= reach, scaled[seen], np.nan)
     how: dict[str, Any] = dict(ms=2.5 if seen.sum() > 100 else 5, alpha=0.7)
     for values, colour, name in zip(shown.T, colours, names, strict=True):
         over_time.plot(t[seen], values, ".", color=colour, label=name, **how)
+    if beyond:
+        for axis, (values, colour) in enumerate(zip(scaled[seen].T, colours, strict=True)):
+            for side, mark in ((1, "^"), (-1, "v")):
+                where = t[seen][side * values > reach]
+                # A row an axis: one reading is often wild on all of them.
+                at = np.full(where.size, side * reach * (0.95 - 0.09 * axis))
+                over_time.plot(where, at, color=colour, marker=mark, ms=5, ls="")
+        name = f"beyond ±{reach:.0f}"
+        over_time.plot([], [], color="0.4", marker="^", ms=2.5, ls="", label=name)
     over_time.axhspan(-2, 2, color="0.9", zorder=0)
-    over_time.legend(loc="upper right", ncols=3, fontsize=8, markerscale=2)
+    over_time.legend(loc="upper right", ncols=4, fontsize=8, markerscale=2, columnspacing=1)
     over_time.set_ylim(-reach, 1.35 * reach)
     # As wide as the data: errors far smaller than their noise would all lie in two or three bins.
     inside = everything[np.abs(everything) <= reach]

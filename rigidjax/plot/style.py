@@ -80,6 +80,12 @@ def several_axes(ax: Any, shape: tuple[int, ...], **how: Any) -> Any:
     return ax
 
 
+def legend_below(ax: Any, *entries: Any, down: float = 0.16) -> None:
+    """The legend under the axes, by `down` of their height: inside it would lie on the curves."""
+    place = dict(loc="upper center", bbox_to_anchor=(0.5, -down))
+    ax.legend(*entries, **place, ncols=3, fontsize=8, frameon=False)
+
+
 def times(ts: Any, count: int, what: str = "the states have") -> np.ndarray:
     """Times (T,) as NumPy float64; `ValueError` where there are not as many as states."""
     t = _checks.on_host(ts, "ts")
@@ -178,7 +184,7 @@ def cube(ax: Any, reach: float, labels: tuple[str, str, str]) -> None:
     ax.set_box_aspect((1, 1, 1))
     for axis, label in zip((ax.xaxis, ax.yaxis, ax.zaxis), labels, strict=True):
         # The ends left out: at the corners of the cube they would lie on those of the next axis.
-        axis.set_major_locator(MaxNLocator(5, prune="both"))
+        axis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10], prune="both"))
         axis.set_label_text(label)
         axis.labelpad = 4
         axis.set_tick_params(labelsize=8, pad=0)

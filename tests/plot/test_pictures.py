@@ -121,7 +121,9 @@ def test_the_herpolhode_of_a_symmetric_body_is_a_circle():
 
 def test_body_axes_start_where_the_attitude_says():
     ax = rj.plot.body_axes(spun([0.0, 0.0, 1.0]))
-    starts = [one for one in ax.lines if one.get_marker() == "o"]
+    starts = [one for one in ax.lines if one.get_marker() == "o" and one.get_label() != "start"]
+    names = [text.get_text() for text in ax.get_legend().get_texts()]
+    assert names == ["body x axis", "body y axis", "body z axis", "start", "end"]
     np.testing.assert_allclose(
         [np.stack(one.get_data_3d())[:, 0] for one in starts], np.eye(3), atol=1e-15
     )
@@ -185,6 +187,9 @@ def test_a_wild_reading_is_counted_and_does_not_press_the_others():
     over_time, spread, *_ = rj.plot.residuals(stand_in())[0]
     assert over_time.get_ylim()[0] == -8.0
     assert np.isnan(over_time.lines[0].get_ydata()).sum() == 1
+    # At the edge there, a row for each axis.
+    at_the_edge = [one.get_xydata() for one in over_time.lines if one.get_marker() == "^"][:3]
+    np.testing.assert_allclose(at_the_edge, [[[TS[7], y]] for y in (7.6, 6.88, 6.16)])
     assert spread.get_legend().get_texts()[0].get_text() == "3 beyond"
     area = sum(bar.get_width() * bar.get_height() for bar in spread.patches)
     np.testing.assert_allclose(area, 300 / 303)
