@@ -1,6 +1,6 @@
 """Unknown torques: the motion, the torques and the body from a recording.
 
-`filter`, `step` and `smooth` give states, torques and sensor errors with their deviations;
+`filter`, `step` and `smooth` give states, torques and sensor errors with their standard deviations;
 `log_likelihood` what readings say of anything else, the unknown torques integrated out; `sample` a
 motion under random torques.
 """

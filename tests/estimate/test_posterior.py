@@ -385,7 +385,7 @@ def test_weighted_draws_stand_for_the_density(fitted):
     low2, high2 = found.interval_of(lambda point: point.parameters.own.spin)
     np.testing.assert_allclose(high2 - low2, high - low, rtol=0.15)
     early = eqx.tree_at(lambda f: f.converged, poor, jnp.asarray(False))
-    with pytest.raises(ValueError, match="the search did not come to the maximum"):
+    with pytest.raises(ValueError, match="the search did not reach the maximum"):
         early.interval_of(lambda point: point.parameters.own.spin)
     with pytest.raises(ValueError, match="draws: wanted"):
         estimate.refit(density, draws=0)

@@ -146,5 +146,5 @@ def test_mistakes_are_named():
     t = jnp.linspace(0.0, 1.0, 20)
     gyro = identify.Gyro(0.1, lowpass=identify.LowPass(5.0))
     record = identify.Recording(t, (gyro, jnp.ones((20, 3))))
-    with pytest.raises(ValueError, match="a lowpass has a memory of its own"):
+    with pytest.raises(ValueError, match="a lowpass has states of its own"):
         rj.estimate.start(rj.estimate.Model(BODY), record, rate=0.1)
