@@ -43,7 +43,7 @@ _ABOVE, _COARSE = 300.0, 1e5
 _PLAIN = 1e6
 # A search for a tolerance decreases it by so much at a time, and aims at so small a part of the
 # accuracy: errors follow the tolerance to a factor of eight. One above 0.1 rad does not.
-_FARTHEST, _AIM, _ALLOWED, _FORESEEN = 1e-3, 20.0, 8.0, 0.1
+_FARTHEST, _AIM, _ALLOWED, _FORESEEN, _FEW = 1e-3, 20.0, 8.0, 0.1, 8
 # The least tolerances of a run, and of one to compare with, in roundings.
 _FLOOR, _DEEPEST = 20.0, 4.0
 
@@ -193,26 +193,32 @@ def solve_to(loop: Loop, state0: Any, ts: Array, accuracy: Array) -> tuple[Loop,
     """
     still = _still((loop, state0, ts, accuracy))
     floor = _FLOOR * float(jnp.finfo(ts.dtype).eps)
-    cut = dataclasses.replace(loop, cuts=_cuts(still[2]))
+
+    def run(rtol: Array) -> Any:
+        return solve(_at(still[0], rtol), *still[1:3])
 
     def closer(carry: Any) -> Any:
-        (others, *_), _, before, rtol, _ = carry
-        new = solve(_at(cut, rtol), *still[1:3])
+        (others, stats, _), _, before, rtol, _ = carry
+        new = run(rtol)
         off = jnp.nanmax(_largest(_apart(others, new[0]), _sizes(new[0]))[1:])
         wanted = before * still[3] / (_AIM * off)
         least = jnp.maximum(_FARTHEST * rtol, floor)
-        # A run that is lost foresees nothing; one that got nowhere will get nowhere.
-        sound = off < _FORESEEN
+        # A run that is lost foresees nothing, nor does one whose steps are not those of its
+        # tolerance: short runs end before their steps have grown so long.
+        count, counted = (a["num_accepted_steps"].astype(ts.dtype) for a in (new[1], stats))
+        more = (before / rtol) ** (1 / loop.solver.tableau.order)
+        sound = (off < _FORESEEN) & (count >= _FEW) & (count >= 0.75 * more * counted)
         good = sound & (_ALLOWED * off * rtol <= before * still[3])
         following = jnp.where(sound, jnp.clip(wanted, least, jnp.maximum(rtol / 3, floor)), least)
+        # One that got nowhere will get nowhere.
         return new, (before, others), rtol, following, good | (rtol <= floor) | jnp.isnan(off)
 
     first = jnp.clip(jnp.sqrt(still[3]), 1e-6, 1e-4).astype(ts.dtype)
-    first = jnp.maximum(first, 30 * floor)
-    begun = solve(_at(loop, first), *still[1:3])
-    carry = (begun, (first, begun[0]), first, 0.1 * first, jnp.asarray(False))
+    first = jnp.maximum(first, 100 * floor)
+    begun = run(first)
+    carry = (begun, (first, begun[0]), first, 0.03 * first, jnp.asarray(False))
     new, tried, rtol, *_ = lax.while_loop(lambda carry: ~carry[-1], closer, carry)
-    loop = _at(cut, lax.stop_gradient(rtol))
+    loop = _at(loop, lax.stop_gradient(rtol))
     return loop, (_as_solved(loop, state0, ts, new[0]), *new[1:]), tried
 
 
