@@ -22,7 +22,7 @@ def stack(recordings: Sequence[Recording]) -> tuple[Recording, tuple[int, ...]]:
     counts = tuple(int(r.t.shape[0]) for r in recordings)
     longest = max(counts)
     rows = max((_rows(_tabled(r)) for r in recordings), default=0)
-    alike = [_lengthen(r, longest, rows) for r in recordings]
+    alike = [lengthened(r, longest, rows) for r in recordings]
     first = jax.tree.structure(alike[0])
     for index, other in enumerate(alike):
         if jax.tree.structure(other) != first or _shapes(other) != _shapes(alike[0]):
@@ -94,7 +94,8 @@ def _rows(tree: Any) -> int:
     return max((int(n.values.shape[0]) for n in tables), default=0)
 
 
-def _lengthen(recording: Recording, count: int, rows: int) -> Recording:
+def lengthened(recording: Recording, count: int, rows: int = 0) -> Recording:
+    """The recording with masked readings at its last time, up to `count` times."""
     missing = count - recording.t.shape[0]
     torque, sensors = jax.tree.map(
         lambda node: _table(node, rows) if _is_table(node) else node,
@@ -105,8 +106,7 @@ def _lengthen(recording: Recording, count: int, rows: int) -> Recording:
     parts = [(r.values, r.mask) for r in readings]
     if missing:
         t = _repeat_last(t, missing)
-        nothing = jnp.zeros(missing, bool)
-        parts = [(_repeat_last(v, missing), jnp.concatenate([m, nothing])) for v, m in parts]
+        parts = [(_repeat_last(v, missing), _repeat_last(m, missing, False)) for v, m in parts]
     return eqx.tree_at(
         lambda r: (r.t, r.torque, r.readings),
         recording,
@@ -131,5 +131,10 @@ def _table(table: Any, rows: int) -> Any:
     return eqx.tree_at(lambda s: (s.times, s.values), table, (times, values))
 
 
-def _repeat_last(values: Any, count: int) -> Any:
-    return jnp.concatenate([values, jnp.broadcast_to(values[-1], (count, *values.shape[1:]))])
+def _repeat_last(values: Any, count: int, last: Any = None) -> Any:
+    # By NumPy where the numbers are known: JAX compiles a program for each shape.
+    xp: Any = np if _checks.known(values) else jnp
+    values = xp.asarray(values)
+    last = values[-1] if last is None else last
+    more = xp.broadcast_to(last, (count, *values.shape[1:]))
+    return jnp.asarray(xp.concatenate([values, more]))

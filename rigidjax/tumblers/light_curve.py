@@ -25,7 +25,14 @@ from rigidjax.identify.several_bodies import Bodies
 from rigidjax.motion.torques.base import vector_at
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.linalg3 import apply, dot
-from rigidjax.tumblers.search import MAGNITUDE, descended, noise_of, relative_flux, starts_of
+from rigidjax.tumblers.search import (
+    MAGNITUDE,
+    descended,
+    noise_of,
+    of_few_lengths,
+    relative_flux,
+    starts_of,
+)
 from rigidjax.tumblers.sensor import Brightness
 from rigidjax.tumblers.two_frequencies import TwoFrequencies, two_frequencies
 
@@ -154,11 +161,15 @@ def fit_light_curve(
     say(f"{used} pairs of frequencies, χ² {found.misfits[0]:.6g} of {found.dof}")
     say(f"{len(starts)} starts")
     sigma = noise_of(problem, reading, flux, found)
-    ends = descended(problem, starts, sigma, tolerance)
-    aliases = _aliases(problem, ends)
+    whole = of_few_lengths(problem)
+    ends = descended(whole, starts, sigma, tolerance)
+    aliases = _aliases(whole, ends)
     say(f"{len(aliases)} motions, misfit {aliases[0].cost:.6g}")
-    best = fit(problem, starts=1, initial=aliases[0].parameters, tolerance=tolerance)
-    return _told(best, aliases, found, used >= count)
+    best = fit(whole, starts=1, initial=aliases[0].parameters, tolerance=tolerance)
+    told = _told(best, aliases, found, used >= count)
+    # Of the readings as they were given.
+    own = eqx.tree_at(lambda p: p.slots, problem, best.problem.slots)
+    return eqx.tree_at(lambda one: one.fit.problem, told, own)
 
 
 def _used(found: TwoFrequencies) -> int:

@@ -1,7 +1,9 @@
 """Tumblers from brightness alone; the oracle is the motion that the light curve was made with."""
 
+import re
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ from tumblers import simulated
 from rigidjax import identify, tumblers
 from rigidjax.identify import Gyro
 from rigidjax.tumblers import Brightness, frequency_aliases, lattice_series, two_frequencies
+from rigidjax.tumblers.search import of_few_lengths
 
 TS = np.linspace(0.0, 1e5, 300)
 RNG = np.random.default_rng(3)
@@ -90,6 +93,31 @@ def test_a_tumbler_is_found_blind(seed, mode):
     assert (np.abs(numbers - truth) < 5 * found.deviations).all()
     # The others are listed, and said not to explain it.
     assert len(found.aliases) > 1 and f"{mode}-axis mode" in str(found)
+
+
+# What depends on the readings themselves, and what JAX compiles to hold an array.
+SMALL = {"_table", "lattice_misfits", "stage", "squeeze", "dynamic_slice"}
+
+
+def test_another_length_is_the_same_program(caplog):
+    one = simulated.tumbler(2, "long")
+
+    def of(size):
+        t, reading = np.asarray(one.recording.t)[:size], one.recording.readings[0]
+        record = identify.Recording(t, (reading.sensor, np.asarray(reading.values)[:size]))
+        return simulated.problem(record)
+
+    tumblers.fit_light_curve(of(400))
+    with jax.log_compiles(), caplog.at_level("WARNING"):
+        found = tumblers.fit_light_curve(of(380))
+    assert set(re.findall(r"Compiling jit\((\w+)\)", caplog.text)) <= SMALL
+    assert found.ok and max(simulated.off(one, found.aliases[0])) < 0.05
+    # Of the readings as they were given.
+    assert found.fit.residuals[0].shape == (380, 1) and found.fit.independent == 380
+    assert found.fit.problem.recording.t.shape == (380,)
+    errors = of_few_lengths(of(380)).errors(found.fit.parameters)[0]
+    np.testing.assert_allclose(errors[:380], found.fit.residuals[0], rtol=0, atol=1e-12)
+    assert errors.shape == (432, 1) and not errors[380:].any()
 
 
 def test_intervals_hold_the_truth_of_a_body_that_is_no_ellipsoid():
