@@ -1,6 +1,7 @@
 """The reference of the site: a page a public module, from signatures and docstrings.
 
-`write(folder)` walks what `tests/surface` walks, so that nothing public is left out. Docstrings are
+`write(folder)` walks what `tests/surface` walks, so that nothing public is left out. What functions
+give back, and has no public name, is at the end of their page, by its name in the source. Docstrings are
 Markdown already; their `>>>` examples become blocks. Signatures are taken from the source: there an
 argument's type has its short name (`Vec3Like`), and not what that stands for. The order is that of
 `docs_topics`, then that of the source. `link_to_source` gives each name its link to the source.
@@ -29,11 +30,14 @@ def write(folder: Path) -> list[str]:
     modules = sorted(public.modules(), key=lambda module: module.__name__)
     short = shortest(modules)
     found = homes(modules, short)
-    names = {id(thing): full for entries in found.values() for full, thing in entries}
+    given = results(modules)
+    entries_of = (*found.values(), *given.values())
+    names = {id(thing): full for entries in entries_of for full, thing in entries}
     pages, documented = {}, []
     for module, entries in found.items():
         parts = [f"# {short[module.__name__]}", body_of(module)]
         topics = by_topic(short[module.__name__], entries)
+        topics += [("What these give back", given[module])] if module in given else []
         if module.__name__ == "rigidjax":
             rows = ((links([full]), first_line(thing)) for full, thing in _own(module, names))
             parts.append(table("name | what it is", rows))
@@ -52,6 +56,19 @@ def write(folder: Path) -> list[str]:
         if path.stem not in {"index", *(module.__name__ for module in pages)}:
             path.unlink()
     return documented
+
+
+def results(
+    modules: list[types.ModuleType],
+) -> dict[types.ModuleType, list[tuple[str, type]]]:
+    """By module: (full name, class) of what its functions give back and has no public name."""
+    found: dict[types.ModuleType, list[tuple[str, type]]] = {}
+    for name, cls in public.received().items():
+        full = f"{cls.__module__}.{cls.__name__}"
+        package = f"rigidjax.{name.partition('.')[0]}"
+        found.setdefault(sys.modules[package], []).append((full, cls))
+    assert set(found) <= set(modules)
+    return found
 
 
 def _put(path: Path, text: str) -> None:
@@ -163,7 +180,8 @@ def link_to_source(app: Any, doctree: Any) -> None:
     modules = public.modules()
     short = shortest(modules)
     sys.modules.update({short[module.__name__]: module for module in modules})
-    homes_of = sorted(short.values(), key=len, reverse=True)
+    received = {cls.__module__ for cls in public.received().values()}
+    homes_of = sorted({*short.values(), *received}, key=len, reverse=True)
     for node in doctree.findall(lambda node: "fullname" in getattr(node, "attributes", ())):
         full = node["fullname"]
         home = next((name for name in homes_of if full.startswith(name + ".")), None)
@@ -196,10 +214,18 @@ def entry(full: str, thing: Any, names: dict[int, str]) -> str:
         inner = "\n\n".join(_members(thing, names))
         return directive("class", full + arguments(thing, names), f"{body_of(thing)}\n\n{inner}")
     if inspect.isroutine(thing) or hasattr(thing, "__wrapped__"):
-        return directive("function", full + arguments(thing, names), body_of(thing))
+        text = body_of(thing) + gives(thing, names)
+        return directive("function", full + arguments(thing, names), text)
     value = repr(thing)
     shown = f"`{value}`" if len(value) < 200 and " at 0x" not in value and "\n" not in value else ""
     return directive("data", full, shown)
+
+
+def gives(thing: Any, names: dict[int, str]) -> str:
+    """A line with links to the classes without a public name that a function gives back."""
+    ids = {id(cls) for cls in public.received().values()}
+    found = dict.fromkeys(cls for cls in public.given(thing) if id(cls) in ids)
+    return f"\n\nGives back {links((names[id(cls)] for cls in found), '~')}." if found else ""
 
 
 def directive(kind: str, head: str, text: str, fence: str = _OUTER) -> str:
@@ -215,10 +241,14 @@ def _members(cls: type, names: dict[int, str]) -> Iterator[str]:
         if not inspect.getdoc(plain) or not getattr(plain, "__doc__", None):
             continue
         if isinstance(plain, property):
-            yield directive("property", name, body_of(plain), _INNER)
+            text = body_of(plain) + gives(plain.fget, names)
+            yield directive("property", name, text, _INNER)
         elif inspect.isfunction(plain):
             yield directive(
-                "method", name + arguments(plain, names, bound=True), body_of(plain), _INNER
+                "method",
+                name + arguments(plain, names, bound=True),
+                body_of(plain) + gives(plain, names),
+                _INNER,
             )
 
 

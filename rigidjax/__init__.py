@@ -1,6 +1,6 @@
 """Differentiable rigid-body and rotating-frame mechanics for JAX.
 
-From the ground up: `rotation` and `body`, `motion` (states, equations, torques) and `frames`,
+From the ground up: `quaternion`, `so3`, `euler` and `body`, `motion` and `torques`, `frames`,
 `exact` and `solve` (the motion in closed form, or by a solver), and what uses them: `identify`,
 `estimate`, `batch`, `workprecision`, `plot`. Fields of their own are loaded when they are asked
 for: `elliptic`, `lagrangian`, `orbits`, `tumblers`. Most programs begin with `simulate`.
@@ -18,7 +18,6 @@ from rigidjax import (
     frames as frames,
     identify as identify,
     motion as motion,
-    rotation as rotation,
     solve as solve,
 )
 from rigidjax._names import show, wrong
@@ -53,6 +52,7 @@ from rigidjax.solve import (
     Event as Event,
     crossings as crossings,
     equations_of_motion as equations_of_motion,
+    error_of as error_of,
     lyapunov_exponents as lyapunov_exponents,
     simulate as simulate,
     solvers as solvers,

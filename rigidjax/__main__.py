@@ -15,6 +15,7 @@ import jax
 import rigidjax as rj
 from rigidjax import _checks
 from rigidjax.identify import cli_spec
+from rigidjax.identify.csv_io import LogError
 from rigidjax.workprecision import command
 
 # What the demo heeds as well; all else says how logs are to be read.
@@ -250,11 +251,11 @@ def _channels(options: argparse.Namespace, rates: Sequence[str], unit: str) -> l
     if options.sensor:
         alone = [name for name in ("unit", "noise", "limit") if getattr(options, name)]
         if alone:
-            raise rj.identify.LogError(f"--{alone[0]}: with --sensor, it stands in that itself")
+            raise LogError(f"--{alone[0]}: with --sensor, it stands in that itself")
         return [cli_spec.channel(text) for text in options.sensor]
     noise = None if options.noise is None else cli_spec.noises(options.noise, "--noise")
     if options.limit is not None and not options.limit > 0:
-        raise rj.identify.LogError(f"--limit: wanted a positive number, got {options.limit}")
+        raise LogError(f"--limit: wanted a positive number, got {options.limit}")
     return [cli_spec.Channel("gyro", tuple(rates), unit, noise, options.limit)]
 
 
@@ -265,11 +266,11 @@ def _read(options: argparse.Namespace) -> tuple[list[Any], list[Any], rj.identif
     channels = _channels(options, rates, options.unit or layout.unit)
     wheels = [cli_spec.wheel(text) for text in options.wheel]
     if options.model in ("tensor", "principal") and not wheels:
-        raise rj.identify.LogError(
+        raise LogError(
             f"--model {options.model}: free motion shows ratios only; a scale needs a --wheel"
         )
     if "delay" in options.free and not wheels:
-        raise rj.identify.LogError("--free delay: that of a --wheel, and there is none")
+        raise LogError("--free delay: that of a --wheel, and there is none")
     how: dict[str, Any] = dict(time=time, time_unit=options.time_unit or layout.time_unit)
     how |= dict(window=options.window, wheels=wheels, free=options.free)
     records = [cli_spec.read_log(path, channels, **how) for path in options.logs]

@@ -25,11 +25,11 @@ def floating(
     """Return `value` as a float32 or float64 array of exactly `shape`, or say what is wrong.
 
     **Arguments:** `value` anything array-like; integers become the default float type. `shape` the
-    shape wanted; with `batched` any leading axes may stand before it. `name` how the message calls
-    the argument. `hint` a likely cause, added to a shape message.
+    shape wanted; with `batched` any leading axes may stand before it. `name` the argument's name in
+    the message. `hint` a likely cause, added to a shape message.
 
-    **Raises:** `TypeError` for what is not a real number array, or is half precision (its 3 digits
-    cannot hold a rotation); `ValueError` for a wrong shape.
+    **Raises:** `TypeError` for anything but an array of real numbers, and for half precision (its 3
+    digits cannot hold a rotation); `ValueError` for a wrong shape.
     """
     array = numbers(value, name)
     found = array.shape[array.ndim - len(shape) :] if batched else array.shape
@@ -54,7 +54,7 @@ def _and(hint: str) -> str:
 
 
 def kind(value: Any) -> str:
-    """How a message calls what came: its type, or that it is a class."""
+    """The name of a value's type for a message, or of the class if it is one."""
     return f"the class {value.__name__}" if isinstance(value, type) else type(value).__name__
 
 
@@ -80,7 +80,7 @@ def numbers(value: Any, name: str) -> Array:
 
 
 def _in_si(value: Any, name: str) -> Any:
-    """What has a unit as numbers in SI (astropy's, pint's), or refused; all else as it is."""
+    """Quantities of astropy or pint as numbers in SI; other values as they are."""
     if isinstance(value, (list, tuple)):
         return type(value)(_in_si(item, name) for item in value) if _has_units(value) else value
     unit = getattr(value, "unit", getattr(value, "units", None))
@@ -158,7 +158,7 @@ def refuse(value: Any, bad: Bool[ArrayLike, "..."], message: str) -> Any:
 
 
 def bare(error: RuntimeError) -> RuntimeError:
-    r"""The same error with its own sentence alone, without the long text that Equinox puts around.
+    r"""The same error with its own sentence alone, without the long text that Equinox adds.
 
     >>> long = "Above is the stack.\n\nequinox.EquinoxRuntimeError: ts: too few\n\n-----\n\nError"
     >>> bare(RuntimeError(long))
@@ -179,7 +179,7 @@ def finite(value: Numbers, name: str) -> Numbers:
 
 
 def given(value: Any, shape: tuple[int, ...], name: str, *, hint: str = "") -> Array:
-    """Return `value` as `floating` does, finite where it is known."""
+    """Return `value` as `floating` does; its numbers must be finite if they are known."""
     array = floating(value, shape, name, hint=hint)
     return finite(array, name) if known(array) else array
 
@@ -191,7 +191,7 @@ def scalars(**named: Any) -> list[Array]:
 
 
 def time(value: Any, name: str = "t") -> Array:
-    """Return a time: one number, and where it is known a finite one."""
+    """Return a time: one number, which must be finite if it is known."""
     return given(value, (), name)
 
 
@@ -237,8 +237,8 @@ def single(
 ) -> Any:
     """Return `value` if it is one of `kinds`, and one body or state: no leading axes.
 
-    A container of many is of the same type; without this its shape is met in the middle of the
-    arithmetic.
+    A container of many bodies has the same type; without this check its shape would raise an error
+    in the middle of the arithmetic.
     """
     instance(value, kinds, name, wanted=wanted, hint=hint)
     for field in _ONE.keys() & vars(value).keys():
@@ -249,9 +249,9 @@ def single(
 
 
 def function(value: Any, name: str, of: str, *, hint: str = "") -> Any:
-    """Return `value` if it can be called, and is no class; `of` says what of: "t → (3,)".
+    """Return `value` if it is a function and no class; `of` gives arguments and result: "t → (3,)".
 
-    Where `of` begins with a list of arguments, "(t, state, body) → scalar", as many are wanted.
+    The number of arguments is checked if `of` begins with a list: "(t, state, body) → scalar".
     """
     found = kind(value)
     if callable(value) and not isinstance(value, type):
@@ -263,7 +263,7 @@ def function(value: Any, name: str, of: str, *, hint: str = "") -> Any:
 
 
 def _takes(value: Any, count: int) -> bool:
-    """Whether a function can be called with so many arguments, as far as it says."""
+    """Whether a function can be called with so many arguments, by its signature."""
     try:
         inspect.signature(value).bind(*[None] * count)
     except (TypeError, ValueError) as error:
@@ -312,7 +312,7 @@ def not_negative(value: Any, name: str) -> float:
 
 
 def on_host(value: Any, name: str) -> np.ndarray:
-    """Return known numbers as a NumPy array of floats; refuse what is traced, and what is none."""
+    """Return known numbers as a NumPy array of floats; refuse traced arrays and other values."""
     if isinstance(value, Tracer):
         raise TypeError(
             f"{name}: wanted numbers that are known, got a traced array; this works on the host: "
@@ -336,12 +336,12 @@ def path(value: Any, name: str = "path") -> Path:
 
 
 def printable(text: Any) -> str:
-    """The text, with what a terminal would obey (escapes, ends of line) as Python writes it."""
+    """The text, with control characters (escapes, ends of line) as Python writes them."""
     return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in str(text))
 
 
 def plain(text: Any) -> str:
-    """The text so that matplotlib shows it as it is: no formula between `$`, no hidden label."""
+    """The text as matplotlib shows it unchanged: no formula between `$`, no hidden label."""
     text = str(text).replace("$", r"\$")
     return f" {text}" if text.startswith("_") else text
 
@@ -372,7 +372,7 @@ def key(value: Any, name: str = "key") -> Any:
 
 
 def float_type(value: Any, name: str = "dtype") -> Any:
-    """Return the dtype that `value` names, float32 or float64 (`float`: what JAX is set to)."""
+    """Return the dtype that `value` names, float32 or float64 (`float`: JAX's default)."""
     if value is float:
         return jnp.result_type(float)
     try:

@@ -65,6 +65,10 @@ def main() -> None:
     print(f"solve + exact + batch {sum(len(texts[f].splitlines()) for f in floors)}")
     names = [n for n in dir(rj) if not isinstance(getattr(rj, n), ModuleType)]
     print(f"names in rj.* that are no module {len(names)}: {' '.join(names)}")
+    packages = [getattr(rj, n) for n in dir(rj) if hasattr(getattr(rj, n), "__path__")]
+    print(
+        f"public names of rj and its {len(packages)} packages {sum(map(len, map(dir, [rj, *packages])))}"
+    )
     lengths = [
         (
             len(code[file] & set(range(node.lineno, (node.end_lineno or 0) + 1))),

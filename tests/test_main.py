@@ -19,6 +19,7 @@ import pytest
 import rigidjax as rj
 from rigidjax import __main__ as command
 from rigidjax.__main__ import main
+from rigidjax.identify.answers import Answer
 
 GOOD = "t,wx,wy,wz\n" + "\n".join(f"{k},{np.cos(k):.6f},{np.sin(k):.6f},1.0" for k in range(12))
 
@@ -180,7 +181,7 @@ def test_numbers_that_are_none_are_written_all_the_same(found, tmp_path):
 def test_ctrl_c_is_said_and_is_the_exit_code(folder, found, monkeypatch, capsys):
     import equinox as eqx
 
-    search = rj.identify.Answer("found", ("interrupted after 1 of 8 starts",))
+    search = Answer("found", ("interrupted after 1 of 8 starts",))
     cut = eqx.tree_at(lambda f: f.search, found, search)
     monkeypatch.setattr(rj.identify, "fit", lambda *_, **__: cut)
     assert main(["identify", "log.csv", "--json", "n.json"]) == 130

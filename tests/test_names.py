@@ -63,7 +63,7 @@ def test_without_its_source_a_module_still_answers(monkeypatch):
 
 
 def test_nothing_public_is_lost():
-    assert {"body", "rotation", "plot", "workprecision", "simulate", "Inertia"} <= set(dir(rj))
+    assert {"body", "quaternion", "plot", "workprecision", "simulate", "Inertia"} <= set(dir(rj))
     assert {"exp", "log", "normalise", "check"} <= set(dir(rj.quaternion))
     assert {"box", "mesh_file"} <= set(dir(rj.shapes)) and "hat" in dir(rj.so3)
     assert "sources" not in dir(rj)

@@ -123,7 +123,7 @@ def rollout(
 
     **Returns** the states, of the type of `states0`, with leading axes (N,) or, with `save_every`,
     (N, num_steps // save_every); with `reduce` the pair (last states, carried). Under a torque with
-    states of its own they are `rigidjax.motion.Coupled(motion, own)`.
+    states of its own they have `.motion` and `.own`.
 
     Memory: the inputs, what is returned, and a chunk. Derivatives are those of the steps as taken,
     in forward mode and in reverse; reverse mode goes back in pieces of √`num_steps` steps and

@@ -102,7 +102,8 @@ def simulate(
     body that becomes NaN ends within two steps. Whatever happens to a body, the others get the same
     bits.
 
-    **Returns** a `Batch`. Nothing is raised for what happens during a run: look at `result`.
+    **Returns** `ts`, `ys`, `result`, `num_steps` and `own` of each body (`Batch`). Nothing is
+    raised for what happens during a run: look at `result`.
 
     **Raises:** as `rollout`; `ValueError` for times that neither increase nor decrease.
 

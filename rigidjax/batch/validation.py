@@ -11,7 +11,8 @@ from jaxtyping import Array
 from rigidjax import _checks
 from rigidjax._types import HasAttitude
 from rigidjax.body.inertia import Inertia, MassProperties
-from rigidjax.motion import Attitude, Rigid, Spin, on_the_group
+from rigidjax.motion import Attitude, Rigid, Spin
+from rigidjax.motion.equations import on_the_group
 from rigidjax.motion.torques.inputs import delays_of, require_inputs
 from rigidjax.rotation.validation import tolerance
 from rigidjax.solve import validation

@@ -41,7 +41,8 @@ def cpu_flags() -> CpuFlags:
     jaxlib 0.12.0.1 one heavy top with `diffrax.Dopri8` took 0.7 of the time, in our own loop 0.8,
     and a `rollout` of one free body 0.45. `rollout` of many bodies is as fast without. It acts on
     the whole process, and only if it is there before JAX first looks for devices. This function
-    only tells; it sets nothing.
+    only tells; it sets nothing. **Returns** `xla_flags`, whether they are `set`, the versions of
+    jaxlib that were `checked`, and the `jaxlib` in use (`CpuFlags`).
 
     >>> print(cpu_flags().xla_flags.split()[-1])
     --xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=10000000

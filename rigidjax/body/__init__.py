@@ -1,22 +1,13 @@
-"""Bodies: inertia, mass, second moments, shapes, charts by unconstrained numbers."""
+"""Bodies: inertia, mass, second moments. Beside it: `rj.shapes`, `rj.volumes`, `rj.parameters`."""
 
 from rigidjax._names import show
-from rigidjax.body import (
-    parameters as parameters,
-    shapes as shapes,
-    volumes as volumes,
-)
 from rigidjax.body.divergence import divergence as divergence
 from rigidjax.body.energy import (
     angular_momentum as angular_momentum,
-    energy_ellipsoid as energy_ellipsoid,
-    equal_ellipsoid as equal_ellipsoid,
+    ellipsoid as ellipsoid,
     kinetic_energy as kinetic_energy,
     kinetic_energy_about as kinetic_energy_about,
-    kinetic_energy_of_generator as kinetic_energy_of_generator,
     kinetic_energy_of_matrix_rate as kinetic_energy_of_matrix_rate,
-    kinetic_energy_of_moments as kinetic_energy_of_moments,
-    momentum_ellipsoid as momentum_ellipsoid,
     spatial_angular_momentum as spatial_angular_momentum,
 )
 from rigidjax.body.inertia import Inertia as Inertia, MassProperties as MassProperties

@@ -1,11 +1,14 @@
 """Kinetic energy and angular momentum of whatever turns, and the ellipsoids of a body.
 
 The notes write the energy of rotation in three forms. Printed eqs 61–65 lack the factor ½ that
-eqs 57 and 73–75 have; here all three have it and agree.
+eqs 57 and 73–75 have; here all have it and agree. Eqs 73–75, in principal axes, are
+`kinetic_energy` of `Inertia.from_second_moment(jnp.diag(λ))`.
 
 Poinsot: free motion rolls the energy ellipsoid on a fixed plane; in the body the rate stays on the
 curve where the two ellipsoids of Ω meet. Source: Landau and Lifshitz, Mechanics, § 37.
 """
+
+from typing import Literal
 
 import jax.numpy as jnp
 
@@ -81,10 +84,10 @@ def kinetic_energy_about(
 
 
 def kinetic_energy_of_matrix_rate(second_moment: Matrix, matrix_rate: Matrix) -> Scalar:
-    """Energy of rotation `½ Tr(Ṁ 𝔖 Ṁᵀ)`, J (notes, eq 63 with its missing ½).
+    """Energy of rotation `½ Tr(Ṁ 𝔖 Ṁᵀ) = ½ Tr(J'ᵀ J' 𝔖)`, J (notes, eqs 63, 65 with their ½).
 
-    **Arguments:** `second_moment` (3, 3) 𝔖, kg m², body frame; `matrix_rate` (3, 3) dM/dt, 1/s, of
-    the rotation matrix body → world.
+    **Arguments:** `second_moment` (3, 3) 𝔖, kg m², body frame; `matrix_rate` (3, 3), 1/s: dM/dt of
+    the rotation matrix body → world, or its generator in the body `J' = Mᵀ Ṁ = hat(Ω)`.
 
     >>> kinetic_energy_of_matrix_rate(jnp.eye(3), jnp.asarray([[0.0, -1, 0], [1, 0, 0], [0, 0, 0]]))
     Array(1., dtype=float64)
@@ -92,33 +95,6 @@ def kinetic_energy_of_matrix_rate(second_moment: Matrix, matrix_rate: Matrix) ->
     s = _checks.floating(second_moment, (3, 3), "second_moment")
     rate = _checks.floating(matrix_rate, (3, 3), "matrix_rate")
     return 0.5 * jnp.sum(product(rate, s) * rate)
-
-
-def kinetic_energy_of_generator(second_moment: Matrix, generator: Matrix) -> Scalar:
-    """Energy of rotation `½ Tr(J'ᵀ J' 𝔖)`, J (notes, eq 65 with its missing ½).
-
-    **Arguments:** `second_moment` (3, 3) 𝔖, kg m², body frame; `generator` (3, 3) J' = hat(Ω), 1/s.
-
-    >>> kinetic_energy_of_generator(jnp.eye(3), jnp.asarray([[0.0, -1, 0], [1, 0, 0], [0, 0, 0]]))
-    Array(1., dtype=float64)
-    """
-    s = _checks.floating(second_moment, (3, 3), "second_moment")
-    generator = _checks.floating(generator, (3, 3), "generator")
-    return 0.5 * jnp.sum(product(generator.T, generator) * s.T)
-
-
-def kinetic_energy_of_moments(second_moments: Vector, omega: Vector) -> Scalar:
-    """Energy of rotation `½((λ2+λ3)Ω1² + (λ3+λ1)Ω2² + (λ1+λ2)Ω3²)`, J (notes, eqs 73–75).
-
-    **Arguments:** `second_moments` (3,) λ, eigenvalues of 𝔖, kg m²; `omega` (3,) Ω along the same
-    principal axes, rad/s.
-
-    >>> kinetic_energy_of_moments([1.0, 2.0, 3.0], [1.0, 0.0, 0.0])
-    Array(2.5, dtype=float64)
-    """
-    s, omega = _vector(second_moments, "second_moments"), _vector(omega, "omega")
-    moments = jnp.stack([s[1] + s[2], s[2] + s[0], s[0] + s[1]])
-    return 0.5 * dot(moments, omega * omega)
 
 
 def angular_momentum(body: Inertia | MassProperties, state: HasSpin | Vector) -> Vec3:
@@ -161,57 +137,51 @@ def spatial_angular_momentum(body: Inertia | MassProperties, state: HasAttitude)
     return momentum
 
 
-def energy_ellipsoid(inertia: Inertia, energy: ScalarLike) -> tuple[Vec3, Quat]:
-    """The rates Ω of one energy: `½ Ω·IΩ = T`, an ellipsoid of semi-axes `√(2T/I_k)`.
+def ellipsoid(
+    body: Inertia | MassProperties,
+    kind: Literal["energy", "momentum", "mass"],
+    size: ScalarLike | None = None,
+) -> tuple[Vec3, Quat]:
+    """An ellipsoid of a body: of the rates Ω of one energy or momentum, or of equal inertia.
 
-    **Arguments:** `inertia`; `energy` T ≥ 0, J. **Returns** `(semi_axes, q)`: (3,) rad/s in the
-    order of ascending moments, and (4,) the rotation principal axes → body axes.
+    **Arguments:** `body`; `kind` and `size`:
 
-    **Raises:** `ValueError` for a zero moment or a negative number (`equinox` error under `jit`).
+    - `"energy"`: `½ Ω·IΩ = T`, semi-axes `√(2T/I_k)` rad/s; `size` T ≥ 0, J;
+    - `"momentum"`: `|IΩ| = h`, semi-axes `h/I_k` rad/s; `size` h ≥ 0, kg m²/s;
+    - `"mass"`: the uniform solid ellipsoid of the same mass, centre and 𝔖, semi-axes `√(5 λ_k/m)`,
+      m, of `MassProperties`, without a `size`. It moves exactly as the body does.
 
-    >>> energy_ellipsoid(Inertia.from_principal(1.0, 2.0, 2.0), 4.0)[0]
+    **Returns** `(semi_axes, q)`: (3,) in the order of ascending moments (of `"mass"`: ascending),
+    and (4,) the rotation principal axes → body axes.
+
+    **Raises:** `ValueError` for another kind, a zero moment or a negative number (`equinox` error
+    under `jit`), `TypeError` for a `size` that is missing or too much.
+
+    >>> ellipsoid(Inertia.from_principal(1.0, 2.0, 2.0), "energy", 4.0)[0]
     Array([2.82842712, 2.        , 2.        ], dtype=float64)
-    """
-    moments, q = _checks.single(inertia, Inertia, "inertia").invertible().principal()
-    twice = 2.0 * _not_negative(energy, "energy", "J")
-    return jnp.sqrt(twice / moments), q
-
-
-def momentum_ellipsoid(inertia: Inertia, momentum: ScalarLike) -> tuple[Vec3, Quat]:
-    """The rates Ω of one angular momentum: `|IΩ| = h`, an ellipsoid of semi-axes `h/I_k`.
-
-    **Arguments:** `inertia`; `momentum` h ≥ 0, kg m²/s. **Returns** `(semi_axes, q)` as
-    `energy_ellipsoid`.
-
-    **Raises:** `ValueError` for a zero moment or a negative number (`equinox` error under `jit`).
-
-    >>> momentum_ellipsoid(Inertia.from_principal(1.0, 2.0, 2.0), 4.0)[0]
-    Array([4., 2., 2.], dtype=float64)
-    """
-    moments, q = _checks.single(inertia, Inertia, "inertia").invertible().principal()
-    return _not_negative(momentum, "momentum", "kg m²/s") / moments, q
-
-
-def equal_ellipsoid(body: MassProperties) -> tuple[Vec3, Quat]:
-    """The uniform solid ellipsoid of the same mass, centre and 𝔖: semi-axes `√(5 λ_k/m)`.
-
-    **Arguments:** `body`. **Returns** `(semi_axes, q)`: (3,) m, ascending, and (4,) the rotation
-    principal axes → body axes. It moves exactly as the body does: a way to see inertia.
-
     >>> import rigidjax as rj
-    >>> equal_ellipsoid(rj.shapes.ellipsoid(3.0, [1.0, 2.0, 3.0]))[0]
+    >>> ellipsoid(rj.shapes.ellipsoid(3.0, [1.0, 2.0, 3.0]), "mass")[0]
     Array([1., 2., 3.], dtype=float64)
     """
-    _checks.single(body, MassProperties, "body")
-    second_moments, q = principal(body.second_moment)
-    return jnp.sqrt(5.0 * second_moments / body.mass), q
+    _checks.word(kind, ("energy", "momentum", "mass"), "kind")
+    if (size is None) != (kind == "mass"):
+        words = {"mass": "no size", "energy": "the energy, J", "momentum": "the momentum, kg m²/s"}
+        raise TypeError(f"size: of the ellipsoid of {kind} wanted {words[kind]}, got {size!r}")
+    if kind == "mass":
+        solid = _checks.single(body, MassProperties, "body")
+        second_moments, q = principal(solid.second_moment)
+        return jnp.sqrt(5.0 * second_moments / solid.mass), q
+    moments, q = Inertia(_tensor(body)).invertible().principal()
+    if kind == "energy":
+        return jnp.sqrt(2.0 * _not_negative(size, "size", "J") / moments), q
+    return _not_negative(size, "size", "kg m²/s") / moments, q
 
 
 def _omega(state):
     return _vector(state.omega if isinstance(state, HasSpin) else state, "omega")
 
 
-def _not_negative(value: ScalarLike, name: str, unit: str) -> Scalar:
+def _not_negative(value: ScalarLike | None, name: str, unit: str) -> Scalar:
     number = _checks.floating(value, (), name)
     return _checks.sign(number, name, f"a number ≥ 0, {unit}", zero=True)
 

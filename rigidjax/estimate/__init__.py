@@ -1,21 +1,19 @@
 """Unknown torques: the motion, the torques and the body from a recording.
 
-`filter`, `step` and `smooth` give states, torques and sensor errors with their deviations;
+`filter`, `step` and `smooth` give states, torques and sensor errors with their standard deviations;
 `log_likelihood` what readings say of anything else, the unknown torques integrated out; `sample` a
 motion under random torques.
 """
 
 from rigidjax._names import show
-from rigidjax.estimate.belief import Belief as Belief, start as start
+from rigidjax.estimate.belief import start as start
 from rigidjax.estimate.density import LogDensity as LogDensity
 from rigidjax.estimate.filter import (
-    Filtered as Filtered,
     filter as filter,
     log_likelihood as log_likelihood,
     step as step,
 )
 from rigidjax.estimate.linear import (
-    LinearEstimate as LinearEstimate,
     LinearModel as LinearModel,
     linear_filter as linear_filter,
     linear_smooth as linear_smooth,
@@ -26,8 +24,8 @@ from rigidjax.estimate.posterior import (
     posterior as posterior,
 )
 from rigidjax.estimate.refit import Refit as Refit, refit as refit
-from rigidjax.estimate.sample import Sampled as Sampled, sample as sample
+from rigidjax.estimate.sample import sample as sample
 from rigidjax.estimate.scene import Model as Model, Walk as Walk
-from rigidjax.estimate.smoother import Push as Push, Smoothed as Smoothed, smooth as smooth
+from rigidjax.estimate.smoother import smooth as smooth
 
 show(__name__)

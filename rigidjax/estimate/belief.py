@@ -1,4 +1,4 @@
-"""What is known of a state at a time: an estimate and the root of its covariance."""
+"""The estimate of a state at a time, and the root of its covariance."""
 
 from typing import Any
 
@@ -15,7 +15,8 @@ from rigidjax.estimate.sensing import sensors_of
 from rigidjax.identify.direct_estimates import attitudes
 from rigidjax.identify.recording import Recording
 from rigidjax.identify.reference_states import first_rate
-from rigidjax.motion import Attitude, Spin, on_the_group
+from rigidjax.motion import Attitude, Spin
+from rigidjax.motion.equations import on_the_group
 from rigidjax.motion.manifold import names
 
 
@@ -24,8 +25,8 @@ class Belief(eqx.Module):
 
     **Fields:** `t` s; `x` the `Extended` state, `root` (n, n), with the rows in its order: for a
     `Spin` the errors of Ω; for an `Attitude` δθ (body frame, rad) and Ω; for a `Rigid` x, v, δθ, Ω;
-    then 3 for each `CorrelatedTorque`, then the walks. After `filter` all with a leading time axis.
-    `start` makes the first one.
+    then 3 for each `CorrelatedTorque`, then the walks. After `filter` all fields have a leading
+    time axis. `start` makes the first belief.
 
     >>> import rigidjax as rj
     >>> record = rj.identify.Recording([0.0, 1.0], (rj.identify.Gyro(0.1), [[1.0, 0, 0]] * 2))
@@ -75,16 +76,19 @@ def start(
     position: Any = None,
     velocity: Any = None,
 ) -> Belief:
-    """What is known before the first reading.
+    """The belief before the first reading.
 
-    **Arguments:** `model`; `recording`, whose first time it is of and whose sensors the walks start
-    from; `state` a `Spin`, `Attitude` or `Rigid`: the kind that is followed; `None` reads a first
-    attitude and rate off the recording (`Spin` where nothing shows an attitude). Then standard
-    deviations, one number or three, zero for what is known: `rate` of Ω, rad/s; `attitude` rad;
-    `position` m and `velocity` m/s of a `Rigid`. Torques start from their law's own distribution.
+    **Arguments:** `model`; `recording`, which gives the first time and the first values of the
+    walks; `state` a `Spin`, `Attitude` or `Rigid`, the kind that is followed; `None` takes the
+    initial attitude and rate from the recording (`Spin` if no sensor shows an attitude). Then
+    standard deviations, one number or three, zero for known values: `rate` of Ω, rad/s; `attitude`
+    rad; `position` m and `velocity` m/s of a `Rigid`. Torques start from their model's stationary
+    distribution.
 
-    **Raises:** `ValueError` for a deviation that is missing or below zero, `TypeError` for another
-    kind of thing.
+    **Returns** a `Belief`: `t`, `state`, `deviation`, `covariance`.
+
+    **Raises:** `ValueError` for a deviation that is missing or below zero, `TypeError` for
+    arguments of another type.
 
     >>> import rigidjax as rj
     >>> record = rj.identify.Recording([0.0, 1.0], (rj.identify.Gyro(0.1), [[1.0, 0, 0]] * 2))
@@ -130,9 +134,9 @@ def _spread(value: Any, shape: tuple[int, ...], name: str, dtype: Any) -> Array:
 
 
 def _shown(recording: Recording) -> Spin | Attitude:
-    """The first attitude and rate that the readings show."""
+    """The initial attitude and rate that the readings show."""
     if not _checks.known(recording.t):
-        raise TypeError("state: wanted a state; a recording that is traced shows none")
+        raise TypeError("state: wanted a state; a traced recording shows none")
     omega = jnp.asarray(first_rate(recording), recording.t.dtype)
     if all(sensor.feels is HasSpin for sensor in recording.sensors):
         return Spin(omega)

@@ -21,7 +21,7 @@ from rigidjax.identify.problem import Problem
 from rigidjax.identify.result import Fit
 from rigidjax.motion.torques import CorrelatedTorque, RandomTorque
 
-# What to say where a fit without the torque ended far from the body.
+# The advice if a fit without the torque ended far from the body.
 _GUESS = (
     ", or begin from a first guess, fit(problem, starts=1, max_steps=1): the torque may be too "
     "strong for a fit without it"
@@ -31,31 +31,32 @@ _GUESS = (
 class LogDensity(eqx.Module):
     """The logarithm of the posterior density of a fitted problem, of one vector x.
 
-    Call it with x (n,), real numbers without bounds: those of the problem's `Parameters` (body
-    chart, `Free`s, first states), the logarithms of the factors by which unknown noises differ from
-    the fit's (one for each that the fit estimates), and of those of the process. `unpack(x)` is
-    what x stands for, `x0` the fit, `covariance` Laplace's, a start and a mass matrix for a
-    sampler: where errors are autocorrelated, smaller than the fit's.
+    Call it with x (n,), real numbers without bounds: the problem's `Parameters` (body chart,
+    `Free`s, initial states), then logarithms of factors of the unknown noises (one for each noise
+    that the fit estimates) and of the process's numbers. `unpack(x)` gives body, states and values,
+    `x0` is the fit. `covariance` is Laplace's, for a sampler's start and mass matrix; it is smaller
+    than the fit's if errors are autocorrelated.
 
-    With a `process` the unknown torque is integrated out by the filter, from the first state that x
-    holds; without, the readings are normal about the motion and independent: where a fit says that
-    its errors are autocorrelated this is too narrow; keep fewer readings, or give a process. Priors
-    are the problem's: `Free`s with a prior, an `Entropic` one; all else is flat in x.
+    With a `process` the filter integrates the unknown torque out, from the initial state in x.
+    Without it the readings are independent and normal about the motion: this is too narrow if the
+    fit says that its errors are autocorrelated; keep fewer readings then, or give a process. Priors
+    are the problem's: `Free`s with a prior, an `Entropic` one; the prior of all other numbers is
+    flat in x.
 
-    **Arguments:** `fit` of `identify.fit`, with a process also a first guess,
-    `fit(problem, starts=1, max_steps=1)`: without the torque there may be no motion that explains
-    the readings; `process` a `RandomTorque` or `CorrelatedTorque` or `None`; `deviation` of the
-    normal prior of the logarithms of its density and time about those given, `None` for a process
-    that is known. Where only ratios of moments are determined, as by a gyro alone, the density is
-    so to the square of a moment: compare `density / moment**2`, and give the prior in the fit's own
-    unit of inertia (`fit.body`).
+    **Arguments:** `fit` of `identify.fit`; with a process a first guess is enough,
+    `fit(problem, starts=1, max_steps=1)`, since a motion without the torque may not explain the
+    readings; `process` a `RandomTorque` or `CorrelatedTorque` or `None`; `deviation` of the normal
+    prior of the logarithms of its density and time about the given values, `None` for a known
+    process. The density scales with the square of a moment if only ratios of moments are
+    determined, as by a gyro alone: compare `density / moment**2`, and give the prior in the fit's
+    own unit of inertia (`fit.body`).
 
-    **Raises:** `TypeError` for arguments of another kind; `ValueError` for a robust loss, which is
+    **Raises:** `TypeError` for arguments of another type; `ValueError` for a robust loss, which is
     no density, and for directions that neither data nor a prior determine.
 
     For numpyro: `numpyro.infer.MCMC(NUTS(potential_fn=lambda x: -density(x)), …)`; for blackjax:
-    `blackjax.nuts(density, …)`, or `estimate.posterior`. Gradients are taken recording by
-    recording in forward mode, whichever mode asks. It is a Module of arrays: compile it by
+    `blackjax.nuts(density, …)`, or `estimate.posterior`. Gradients are computed recording by
+    recording in forward mode, also under `jax.grad`. It is a Module of arrays: compile it by
     `equinox.filter_jit(density)`.
 
     >>> import rigidjax as rj
@@ -111,8 +112,8 @@ class LogDensity(eqx.Module):
         seen = np.asarray(fit.covariance)
         sandwich = fit.covariance_kind.startswith("sandwich")
         if sandwich and (process is None or not _definite(seen)):
-            # The density takes errors for white: its own width is less than the fit's intervals.
-            # Of many recordings the sandwich may be singular, and no scale for a search.
+            # The density assumes white errors: it is narrower than the fit's intervals. The
+            # sandwich covariance of many recordings may be singular: no scale for a search.
             linear = uncertainty.linearise(problem, fit.parameters, fit.noises, near=fit.near)
             seen = uncertainty.of_white(linear).covariance
         rest, total = [], 0
@@ -139,7 +140,7 @@ class LogDensity(eqx.Module):
         return terms(self, x).log_density - 0.5 * jnp.sum(prior_residuals(self, x) ** 2)
 
     def unpack(self, x: Float[Array, " n"]) -> Unpacked:
-        """What x (n,) stands for: `Unpacked` with `body`, `state0`, `values`, `noise`, `process`.
+        """The meaning of x (n,): `Unpacked` with `body`, `state0`, `values`, `noise`, `process`.
 
         `values` are those of the `Free`s by name; `parameters` the problem's own numbers.
         """

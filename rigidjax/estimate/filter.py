@@ -19,11 +19,11 @@ from rigidjax.estimate.sensing import Read, Sensors, Stops, absorb_all, sensors_
 from rigidjax.identify.recording import Recording
 from rigidjax.motion.manifold import plus
 
-# A filter is lost when for so long, s, and so many readings, none was within so many deviations.
+# A filter is lost if no reading was within so many deviations for so long, s, and so many readings.
 LOST_AFTER, LOST_READINGS, LOST_BEYOND = 1.0, 3, 6.0
 WORDS = (
     "followed",
-    "lost: for more than a second no reading was within six deviations of what was expected",
+    "lost: no reading was within six standard deviations of its prediction for more than a second",
     "stopped: an estimate is NaN or infinite",
 )
 
@@ -69,7 +69,7 @@ class Filtered(eqx.Module):
     def nis(self) -> tuple[Float[Array, " times"], ...]:
         """Normalised innovations squared of each sensor, and how many numbers each holds.
 
-        Where the model is right they follow χ² with as many degrees of freedom (Bar-Shalom, Li and
+        They follow χ² with as many degrees of freedom if the model is right (Bar-Shalom, Li and
         Kirubarajan, Estimation (2001), §5.4).
         """
         return tuple(
@@ -90,20 +90,21 @@ def filter(
     The multiplicative extended Kalman filter: the estimate is a state on the group, its error a
     rotation vector and numbers (Lefferts, Markley and Shuster 1982, doi:10.2514/3.56190). Between
     readings both follow the equations of motion, by the classical method of order 4 and its exact
-    derivative. The covariance is kept as a root: by Gram–Schmidt from step to step, by Potter's
-    formula at each number read.
+    derivative. The covariance is kept as a root: Gram–Schmidt carries it from step to step,
+    Potter's formula updates it by each number read.
 
     **Arguments:** `model`; `recording` a `Recording` whose sensors have their noise; masked
     readings are gaps, channels at their full scale are left out, a sensor's `offset` is a delay;
-    `first` of `start`; `substeps` equal steps from one time to the next, `None` as many as the rate
-    asks for where the numbers are known, else one. `throw`: `False` never raises for what happens
-    during the run: see `status`.
+    `first` of `start`; `substeps` fixed steps from one time to the next, `None` chooses them by the
+    rate if the numbers are known, else one. `throw`: with `False` no event of the run raises an
+    error; see `status`.
 
-    **Returns** a `Filtered`. It may be jitted, differentiated, and batched over any argument.
+    **Returns** `belief`, `readings`, `log_likelihood`, `status` and `lost_at` (`Filtered`). It may
+    be jitted, differentiated, and batched over any argument.
 
-    **Raises:** `ValueError` for a sensor without noise, readings before `first`; where `throw`, a
-    filter that is lost: for a second and three readings none was within 6 deviations of what was
-    expected.
+    **Raises:** `ValueError` for a sensor without noise, and readings before `first`; with `throw`
+    also for a lost filter: no reading was within 6 deviations of its prediction for a second and
+    three readings.
 
     >>> import rigidjax as rj
     >>> record = rj.identify.Recording([0.0, 0.1], (rj.identify.Gyro(0.1), [[1.0, 0, 0]] * 2))
@@ -117,7 +118,7 @@ def filter(
 
 
 def told(out: Any) -> Any:
-    """The same, unless it is lost or stopped: then raise in words."""
+    """Return `out`; raise an error in words if it is lost or stopped."""
     status = out.status
     at = f" (at {float(out.lost_at):g} s)" if _checks.known(out.lost_at) else ""
     advice = "; is the noise or density too small, or the start far off? throw=False returns it"
@@ -130,9 +131,9 @@ def log_likelihood(
 ) -> Scalar:
     """The logarithm of the density of all readings, the unknown torques integrated out.
 
-    `Σ log N(ν; 0, s)` over innovations (Schweppe 1965, doi:10.1109/TIT.1965.1053737). To be made
-    large in whatever is unknown: moments, a density, a noise, a first state. With no noise and a
-    first state that is known it is the likelihood of a deterministic fit.
+    `Σ log N(ν; 0, s)` over innovations (Schweppe 1965, doi:10.1109/TIT.1965.1053737). Maximise it
+    over the unknowns: moments, a density, a noise, an initial state. It is the likelihood of a
+    deterministic fit if the initial state is known and no torque is random.
 
     **Arguments** and **raises** as for `filter`; differentiable in forward and reverse mode.
 
@@ -147,16 +148,19 @@ def log_likelihood(
 
 
 def step(model: Model, belief: Belief, t: ScalarLike, *readings: tuple) -> Belief:
-    """The belief at `t`, with what was read then: for use while the body moves.
+    """The belief at `t`, after the readings at `t`: for use while the body moves.
 
     **Arguments:** `model`; `belief` of `start` or the last `step`; `t` s, not before it; `readings`
     pairs `(sensor, value)` or triples `(sensor, value, seen)`, `seen` a truth value. The walks'
     `where` finds the sensors as `r.readings[i].sensor`, in this order, so each call gives them all.
 
-    One step of the classical method: the time between readings must be short against a turn.
+    This is one step of the classical method: the time between readings must be short against a
+    turn.
 
-    **Raises:** `ValueError` where numbers are known and `t` lies before the belief, or a reading
-    holds NaN.
+    **Returns** the `Belief` at `t`: `state`, `deviation`, `covariance`, and what is of its torques.
+
+    **Raises:** `ValueError` for a `t` before the belief, or a reading with NaN, if the numbers are
+    known.
 
     >>> import jax, rigidjax as rj
     >>> gyro = rj.identify.Gyro(0.1)
@@ -194,7 +198,7 @@ def step(model: Model, belief: Belief, t: ScalarLike, *readings: tuple) -> Belie
 def _step(
     model: Model, sensors: Sensors, belief: Belief, t: Array, values: tuple, masks: tuple
 ) -> Belief:
-    # A reading that no derivative is lost on, where there is none.
+    # A finite number in the place of a missing reading keeps derivatives finite.
     values = tuple(
         jnp.where(mask, value, jnp.zeros_like(value).at[0].set(1)).astype(belief.root.dtype)
         for value, mask in zip(values, masks, strict=True)
@@ -216,7 +220,7 @@ def _one(
 
 
 class Task(NamedTuple):
-    """What a filter is to go through, looked at."""
+    """The checked model, readings and times of a filter."""
 
     model: Model
     sensors: Sensors
@@ -242,7 +246,7 @@ def scan_filter(task: Task, keep: Any) -> tuple[Stops, Any]:
         total = total + sum(r.log_density for r in read)
         return (belief, total), keep(belief, read)
 
-    # What a reverse pass needs of a step is made again: a step holds some thousand numbers.
+    # A reverse pass computes a step again: a step holds some thousand numbers.
     body = jax.checkpoint(body)  # pyright: ignore[reportPrivateImportUsage]
     return stops, lax.scan(body, (first, jnp.zeros((), dtype)), stops)
 

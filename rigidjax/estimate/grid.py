@@ -1,4 +1,4 @@
-"""The times that a filter stops at: those of the readings, and some between where they are far."""
+"""The times of a filter's steps: those of the readings, and some between if they are far apart."""
 
 import math
 from typing import Any, NamedTuple
@@ -13,9 +13,9 @@ from rigidjax.estimate.scene import Model
 from rigidjax.identify.recording import Recording
 from rigidjax.identify.sensors import Gyro
 
-# Radians turned in a step of the classical method of order 4: it errs by 5e-8 of the turn.
+# The turn in a step of the classical method of order 4, rad: its error is 5e-8 of the turn.
 TURN_A_STEP = 0.05
-# Of the memory of a torque.
+# The longest step as a fraction of a torque's correlation time.
 MEMORY_A_STEP = 0.25
 
 
@@ -31,7 +31,7 @@ class Grid(NamedTuple):
 
 
 def grid_of(model: Model, recording: Recording, first: Belief, substeps: int | None) -> Grid | None:
-    """The times to stop at; `None` where those of the recording will do.
+    """The times of the steps; `None` if the recording's own times are enough.
 
     **Raises:** `ValueError` for a recording that begins before the belief that it starts from.
     """
@@ -70,7 +70,7 @@ def longest_step(model: Model, rate: float) -> float:
 
 
 def steps_of(span: Any, longest: float) -> Any:
-    """How many equal steps of at most `longest` go from one time to another, `span` s later."""
+    """The number of fixed steps of at most `longest` in an interval of `span` s."""
     return np.maximum(1, np.ceil(span / longest * (1 - 1e-9))).astype(int)
 
 

@@ -19,10 +19,10 @@ class LinearModel(eqx.Module):
     **Arguments:** `transition` F (n, n); `noise` G (n, m), a root of the covariance that is added;
     `matrix` H (k, n); `deviation` r (k,) of the noise of each number read; then, `None` for zero,
     `push` d (n,) and `offset` c (k,). Each may have a leading axis: F, G, d over the steps between
-    T times (T − 1), H, r, c over the times (T). A noise whose numbers are correlated is made
-    independent first: divide y, H, c by the Cholesky factor of its covariance.
+    T times (T − 1), H, r, c over the times (T). Make correlated noise independent first: divide y,
+    H, c by the Cholesky factor of its covariance.
 
-    **Raises:** `ValueError` for shapes that do not fit and a deviation that is not positive.
+    **Raises:** `ValueError` for shapes that do not fit, and a deviation that is not positive.
 
     >>> walk = LinearModel(jnp.eye(1), 0.1 * jnp.eye(1), jnp.eye(1), jnp.ones(1))
     >>> walk.size
@@ -51,7 +51,7 @@ class LinearModel(eqx.Module):
         spread = _checks.numbers(deviation, "deviation")
         words = (
             "deviation: wanted positive standard deviations; a measurement without noise is "
-            "singular: leave what it fixes out of the state"
+            "singular: leave the numbers that it fixes out of the state"
         )
         self.deviation = _checks.refuse(spread, ~(spread > 0).all(), words)
         self.push = None if push is None else _checks.numbers(push, "push")
@@ -115,7 +115,7 @@ class LinearEstimate(eqx.Module):
 
 
 class Joint(NamedTuple):
-    """What one step forward keeps for the way back: see `joint`."""
+    """The values of a forward step that the backward pass needs: see `joint`."""
 
     predicted: Float[Array, "n n"]
     gain: Float[Array, "n n"]
@@ -123,7 +123,7 @@ class Joint(NamedTuple):
 
 
 def joint(grown: Array, noise: Array, root: Array) -> Joint:
-    """The root of the predicted covariance, the smoother's gain, and the root of what is left.
+    """The roots of the predicted and of the conditional covariance, and the smoother's gain.
 
     From one triangularisation of `[[F S, G], [S, 0]]`: Park and Kailath 1995,
     doi:10.1080/00207179508921582.
@@ -145,8 +145,8 @@ def smoothed(
     The pass back (Rauch, Tung, Striebel 1965), and of the noise (m, m) with `Z = L⁻¹ G`, L the
     predicted root: `1 − ZᵀZ + (Zᵀ L⁻¹ S)(Zᵀ L⁻¹ S)ᵀ`, where S is the smoothed root after the step.
 
-    **Arguments:** of each step what `joint` gave, the mean before it, the `predicted` one after it,
-    and G; `end` mean and root at the last time.
+    **Arguments:** for each step the result of `joint`, the mean before it, the `predicted` mean
+    after it, and G; `end` mean and root at the last time.
     """
 
     def kick(noise: Array, lower: Array, off: Array, root: Array) -> tuple[Array, Array]:
@@ -180,6 +180,8 @@ def linear_filter(
     **Arguments:** `model`; `readings` y (T, k); `mean` (n,) and `root` (n, n), a root of the
     covariance, at the first time before its reading; `seen` (T, k) which numbers count, `None` all.
 
+    **Returns** `mean`, `root`, `innovation`, `variance` and `log_likelihood` (`LinearEstimate`).
+
     **Raises:** `ValueError` for shapes that do not fit, NaN that is not masked.
 
     >>> walk = LinearModel(jnp.eye(1), 0.1 * jnp.eye(1), jnp.eye(1), jnp.ones(1))
@@ -196,7 +198,8 @@ def linear_smooth(
 
     Rauch, Tung and Striebel 1965, doi:10.2514/3.3166, on roots of the covariances.
 
-    **Arguments** and **raises** as `linear_filter`.
+    **Arguments**, **returns** and **raises** as `linear_filter`, with `kicks`, the noise u of each
+    step, and `kick_covariance`.
 
     >>> walk = LinearModel(jnp.eye(1), 0.1 * jnp.eye(1), jnp.eye(1), jnp.ones(1))
     >>> found = linear_smooth(walk, jnp.ones((3, 1)), jnp.zeros(1), jnp.eye(1))
@@ -237,13 +240,13 @@ _TIMES = {"matrix": 2, "deviation": 1, "offset": 1}
 
 
 def _moving(model: LinearModel, axes: dict[str, int]) -> dict[str, Array | None]:
-    """Those that do, by name; `None` for others."""
+    """The parts that change, by name; `None` for the others."""
     parts = {name: getattr(model, name) for name in axes}
     return {n: p if p is not None and p.ndim > axes[n] else None for n, p in parts.items()}
 
 
 def _now(model: LinearModel, axes: dict[str, int], moving: dict[str, Array | None]) -> list[Any]:
-    """All parts at one step or time, from those there that do change."""
+    """All parts at one step or time, from the ones that change."""
     return [getattr(model, n) if moving[n] is None else moving[n] for n in axes]
 
 
@@ -255,7 +258,7 @@ def _read(row: Any, y: Array, seen: Array, mean: Array, root: Array) -> roots.Ab
 
 
 def _pass(model: LinearModel, readings: Array, mean: Array, root: Array, seen: Array, step: Any):
-    """Forward through all times; `step(F, G, root)` gives the predicted root and what is kept."""
+    """Forward through all times; `step(F, G, root)` gives the predicted root, and more to keep."""
     steps, times = _moving(model, _STEPS), _moving(model, _TIMES)
     now, later = (jax.tree.map(lambda leaf, at=at: leaf[at], times) for at in (0, slice(1, None)))
     first = _read(_now(model, _TIMES, now), readings[0], seen[0], mean, root)

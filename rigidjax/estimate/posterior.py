@@ -18,10 +18,10 @@ from rigidjax.identify.parameters import Unpacked
 Sampler = Callable[[Any, Callable[[Array], Array], Array], Array]
 
 
-# Draws that the first mass matrix is worth: it is good already where Laplace's method is.
+# The weight of the first mass matrix, in draws: it is good already if Laplace's method is.
 _WORTH = 50.0
 
-# As many recordings keep a core busy: gradients of four chains at once take as long as one by one.
+# So many recordings keep a core busy: gradients of four chains at once take as long as one by one.
 _FULL = 8
 
 
@@ -96,8 +96,8 @@ class Posterior(eqx.Module):
     """What `posterior` returns.
 
     **Fields:** `density`; `x` (chains, samples, n) draws of the vector that it takes. `points` are
-    what they stand for, `of(function)` anything computed of each. `rhat` (n,), below 1.01 where the
-    chains agree, and `ess` (n,), how many independent draws they are worth, as in Gelman et al.,
+    their bodies, states and values, `of(function)` any function of each. `rhat` (n,) is below 1.01
+    if the chains agree, and `ess` (n,) is the number of independent draws, as in Gelman et al.,
     Bayesian Data Analysis (2013), §11.4, 11.5.
 
     >>> import jax, rigidjax as rj
@@ -117,23 +117,23 @@ class Posterior(eqx.Module):
 
     @property
     def rhat(self) -> Float[Array, " n"]:
-        """Potential scale reduction between the chains, near 1 where they agree (blackjax)."""
+        """Potential scale reduction between the chains, near 1 if they agree (blackjax)."""
         return _blackjax().diagnostics.potential_scale_reduction(self.x)
 
     @property
     def ess(self) -> Float[Array, " n"]:
-        """How many independent draws they are worth (blackjax)."""
+        """The effective number of independent draws (blackjax)."""
         return _blackjax().diagnostics.effective_sample_size(self.x)
 
     @property
     def points(self) -> Unpacked:
-        """What the draws stand for, with leading axes of chains and samples."""
+        """The bodies, states and values of the draws, with leading axes of chains and samples."""
         return self.of(_itself)
 
     def of(self, function: Callable[[Unpacked], Any]) -> Any:
         """`function(point)` of each draw, with leading axes of chains and samples.
 
-        Such as `drawn.of(lambda point: point.body.moments)`. **Raises** `TypeError` for what is no
+        Such as `drawn.of(lambda point: point.body.moments)`. **Raises** `TypeError` if it is no
         function.
         """
         _checks.function(function, "function", "of `Unpacked`, such as lambda point: point.body")
@@ -141,7 +141,7 @@ class Posterior(eqx.Module):
         return jax.tree.map(lambda leaf: leaf.reshape(*self.x.shape[:2], *leaf.shape[1:]), found)
 
     def to_arviz(self) -> Any:
-        """The draws as ArviZ takes them: body, values, first states, process.
+        """The draws for ArviZ: body, values, initial states, process.
 
         **Raises:** `ImportError` without arviz (it needs Python 3.12).
         """
@@ -166,16 +166,16 @@ def _itself(point: Unpacked) -> Unpacked:
 def posterior(
     density: LogDensity, key: Any, *, sampler: Sampler | None = None, chains: int = 4
 ) -> Posterior:
-    """Draws of body, first states, whatever is free, noise and process, given all readings.
+    """Draws of body, initial states, all `Free`s, noise and process, given all readings.
 
     **Arguments:** `density` a `LogDensity`; `key` of `jax.random`; `sampler` a function of a key,
-    a log-density and a first vector to draws (samples, n), `Nuts()` unless given; it works in
-    numbers whose covariance by Laplace's method is the identity, and starts from a draw of it.
-    `chains` run together under `vmap`; those of eight recordings and more one after another.
+    a log-density and a first vector to draws (samples, n), `Nuts()` unless given; its numbers have
+    the identity as covariance by Laplace's method, and it starts from a draw of that. `chains` run
+    together under `vmap`, or one after another with eight recordings and more.
 
     **Returns** a `Posterior`.
 
-    **Raises:** `TypeError` for arguments of another kind, `ImportError` where blackjax is missing.
+    **Raises:** `TypeError` for arguments of another type, `ImportError` if blackjax is missing.
 
     >>> import jax, rigidjax as rj
     >>> ts = jnp.linspace(0.0, 10.0, 80)

@@ -1,8 +1,8 @@
 """The most probable numbers of a problem, with the unknown torque integrated out.
 
-Beside them weighted draws from the posterior density (importance sampling): the information at the
-top alone gives intervals that are too narrow on short records, since it holds the torque's density
-at its most probable value, which is below its mean.
+It also gives weighted draws from the posterior density (importance sampling). The information at
+the maximum alone gives intervals that are too narrow on short records: it fixes the torque's
+density at its most probable value, which is below its mean.
 """
 
 from collections.abc import Callable
@@ -27,9 +27,9 @@ from rigidjax.identify.quantities import carried
 
 # Steps of so many standard deviations end the search; its damping at the start.
 _SMALL, _DAMPING = 1e-3, 1e-2
-# Draws are of Student's t, wider than Laplace's method: tails that it misses get their weight.
+# Draws come from Student's t, wider than Laplace's method, so that tails get their weight.
 _FREEDOM, _WIDER = 6.0, 1.2
-# Fewer independent draws do not give the ends of an interval.
+# Fewer independent draws cannot give the ends of an interval.
 _LEAST = 100.0
 
 
@@ -38,8 +38,8 @@ class Refit(eqx.Module):
 
     **Fields:** `density`; `x` (n,) where it is largest, `log_density` there; `covariance` (n, n) of
     x, the inverse of Fisher's information there; `converged`; `draws` (m, n) and their `weights`
-    (m,), which add up to 1: together they stand for the posterior density. `effective` is how many
-    independent draws they are worth.
+    (m,), which add up to 1, represent the posterior density. `effective` is the number of
+    independent draws that they are worth.
 
     >>> import rigidjax as rj
     >>> ts = jnp.linspace(0.0, 10.0, 80)
@@ -62,12 +62,12 @@ class Refit(eqx.Module):
 
     @property
     def point(self) -> Unpacked:
-        """What x stands for: body, first states, values, noise, process."""
+        """The meaning of x: body, initial states, values, noise, process."""
         return self.density.unpack(self.x)
 
     @property
     def effective(self) -> Scalar:
-        """How many independent draws the weighted ones are worth, 1/Σw² (Kish 1965)."""
+        """The number of independent draws that the weighted ones are worth, 1/Σw² (Kish 1965)."""
         return 1.0 / jnp.sum(self.weights**2)
 
     def interval_of(
@@ -75,18 +75,18 @@ class Refit(eqx.Module):
     ) -> tuple[np.ndarray, np.ndarray]:
         """Interval (low, high) of any function of `Unpacked` to an array, with equal tails.
 
-        From the weighted draws; where these are worth fewer than 100 independent ones (`effective`)
-        the covariance is carried by the derivative of the function, which is then to be
-        differentiable: take the logarithm of what is positive. That is too narrow on short records.
-        **Raises** `ValueError` for a level outside (0, 1), and where neither holds: too few draws
-        are independent, and x is not the maximum.
+        It comes from the weighted draws. If these are worth fewer than 100 independent ones
+        (`effective`), it comes from the covariance and the derivative of the function, which must
+        then be differentiable: take the logarithm of a positive quantity. That interval is too
+        narrow on short records. **Raises** `ValueError` for a level outside (0, 1), and if too few
+        draws are independent and x is not the maximum either.
         """
         level = _checks.fraction(level, "level", "a probability between 0 and 1")
         _checks.function(of, "of", "of `Unpacked` to an array")
         if not (float(self.effective) >= _LEAST or bool(self.converged)):
             raise ValueError(
-                "interval_of: the search did not come to the maximum of the density, and fewer "
-                "than 100 draws are independent: give refit more max_steps, or its fit a better "
+                "interval_of: the search did not reach the maximum of the density, and fewer than "
+                "100 draws are independent: give refit more max_steps, or its fit a better "
                 "start, or draw from the density (estimate.posterior)"
             )
         if float(self.effective) >= _LEAST:
@@ -113,25 +113,25 @@ def _quantiles(values: np.ndarray, weights: np.ndarray, at: np.ndarray) -> np.nd
 def refit(
     density: LogDensity, *, max_steps: int = 200, draws: int = 1000, key: Any = None
 ) -> Refit:
-    """Where the posterior density is largest, and weighted draws around for intervals.
+    """The maximum of the posterior density, and weighted draws around it for intervals.
 
     A fit that allows for an unknown torque: `refit(LogDensity(fit, RandomTorque(1e-4)))` finds
-    body, first states, whatever is free, and the torque's density, from `fit` on. By Fisher's
-    scoring: Levenberg and Marquardt's search with the expected information of the innovations in
-    the place of the normal matrix (Gupta and Mehra 1974, doi:10.1109/TAC.1974.1100714), added up
-    recording by recording. The draws are of Student's t about that point, with the covariance by
-    that information, made wider; each weighs as much as the density there over that of the t
-    (importance sampling: Geweke 1989, doi:10.2307/1913710). Of more than some dozen numbers draws
-    are worth little (`effective`); intervals are then by the information, which is enough where
+    body, initial states, all `Free`s, and the torque's density, starting from `fit`. The method is
+    Fisher's scoring: Levenberg and Marquardt's search with the expected information of the
+    innovations as the normal matrix (Gupta and Mehra 1974, doi:10.1109/TAC.1974.1100714), added up
+    recording by recording. The draws come from Student's t about that point, with a covariance
+    wider than the inverse information; the weight of a draw is the density over that of the t
+    (importance sampling: Geweke 1989, doi:10.2307/1913710). Draws of more than some dozen numbers
+    are worth little (`effective`); intervals then come from the information, which is enough if
     each recording is long. `estimate.posterior` draws from any density.
 
     **Arguments:** `density` a `LogDensity`; `max_steps` at most; `draws` how many; `key` of
     `jax.random` for them, by default always the same.
 
-    **Returns** a `Refit`; `converged` false where it ended early, or where some combination of the
+    **Returns** a `Refit`; `converged` is false if it ended early, or if some combination of the
     numbers changes neither readings nor priors: `weights` are then NaN.
 
-    **Raises:** `TypeError` for another kind of thing.
+    **Raises:** `TypeError` for arguments of another type.
 
     >>> import rigidjax as rj
     >>> ts = jnp.linspace(0.0, 10.0, 80)
@@ -167,7 +167,7 @@ def _refit(density: LogDensity, settings: Settings, key: Any, count: int) -> Ref
 def _weighted(
     density: LogDensity, top: Array, covariance: Array, key: Any, count: int
 ) -> tuple[Float[Array, "m n"], Float[Array, " m"]]:
-    """Draws of Student's t about the top, and their weights."""
+    """Draws of Student's t about the maximum, and their weights."""
     size, kind = top.size, top.dtype
     normal, square = jax.random.split(key)
     z = jax.random.normal(normal, (count, size), kind)

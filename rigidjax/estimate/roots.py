@@ -1,4 +1,4 @@
-"""Covariances by their square roots: P = S Sᵀ, which no rounding makes indefinite."""
+"""Covariances by their square roots: P = S Sᵀ, which round-off cannot make indefinite."""
 
 import math
 from typing import Any, NamedTuple
@@ -14,9 +14,9 @@ def triangular(a: Float[Array, "n m"]) -> Float[Array, "n n"]:
     """The lower triangular root L of `a aᵀ`, its diagonal ≥ 0.
 
     By the modified Gram–Schmidt process on the rows, whose triangular factor is as good as
-    Householder's (Björck 1967, doi:10.1007/BF01934122). A row that depends on those before it,
-    to a few units of round-off, leaves a zero on the diagonal; derivatives there are zero, where
-    those of `jnp.linalg.qr` are NaN: a state known without error has such rows.
+    Householder's (Björck 1967, doi:10.1007/BF01934122). A row that depends on earlier rows, to a
+    few units of round-off, leaves a zero on the diagonal. Its derivatives are zero, whereas those
+    of `jnp.linalg.qr` are NaN: a state known without error has such rows.
 
     >>> triangular(jnp.array([[3.0, 4.0], [3.0, 4.0]])).tolist()
     [[5.0, 0.0], [5.0, 0.0]]
@@ -46,7 +46,7 @@ def predicted(
 
 
 def inverse_root(x: Array, least: Any = 0) -> Array:
-    """1/√x where x is above `least`, else zero, as its derivatives are there.
+    """1/√x if x is above `least`, else zero with zero derivatives.
 
     >>> inverse_root(jnp.array([4.0, 0.0])).tolist()
     [0.5, 0.0]
@@ -65,11 +65,11 @@ def product(a: Float[Array, "n m"], b: Float[Array, "m k"]) -> Float[Array, "n k
 
 
 class Absorbed(NamedTuple):
-    """What numbers read do: the mean's step, the root after it, and how far off each was.
+    """The update by the numbers read: the mean's step, the new root, and each innovation.
 
-    **Fields:** `step` (n,); `root` (n, n); `innovation` ν, what was read minus what was expected of
-    all before; `variance` s of ν; both of a masked number are such that it counts for nothing (0
-    and 1).
+    **Fields:** `step` (n,); `root` (n, n); `innovation` ν, the reading minus its prediction from
+    all readings before; `variance` s of ν; a masked number has 0 and 1, so that it counts for
+    nothing.
     """
 
     step: Float[Array, " n"]
@@ -129,7 +129,7 @@ def absorb_all(
 
 
 def log_normal(innovation: Array, variance: Array, seen: Array) -> Array:
-    """The logarithm of a normal density, zero where nothing was seen.
+    """The logarithm of a normal density, zero for a masked number.
 
     >>> round(float(log_normal(jnp.array(0.0), jnp.array(1.0), jnp.array(True))), 6)
     -0.918939
@@ -139,7 +139,7 @@ def log_normal(innovation: Array, variance: Array, seen: Array) -> Array:
 
 
 def divide(lower: Float[Array, "n n"], right: Float[Array, "n m"]) -> Float[Array, "n m"]:
-    """`lower⁻¹ right` by substitution; where the diagonal is zero, zero.
+    """`lower⁻¹ right` by substitution; zero where the diagonal is zero.
 
     >>> divide(2.0 * jnp.eye(2), jnp.eye(2)).tolist()
     [[0.5, 0.0], [0.0, 0.5]]
@@ -155,7 +155,7 @@ def divide(lower: Float[Array, "n n"], right: Float[Array, "n m"]) -> Float[Arra
 
 
 def divide_right(left: Float[Array, "m n"], lower: Float[Array, "n n"]) -> Float[Array, "m n"]:
-    """`left lower⁻¹`; where the diagonal is zero, zero.
+    """`left lower⁻¹`; zero where the diagonal is zero.
 
     >>> divide_right(jnp.eye(2), 2.0 * jnp.eye(2)).tolist()
     [[0.5, 0.0], [0.0, 0.5]]

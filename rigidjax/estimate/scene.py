@@ -1,4 +1,4 @@
-"""What moves the state of a filter: the motion, torques with a memory, drifting sensor errors."""
+"""The state equations of a filter: the motion, correlated torques, drifting sensor errors."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -15,8 +15,8 @@ from rigidjax.body.inertia import Inertia, MassProperties, inverse
 from rigidjax.estimate import roots
 from rigidjax.identify.sensor_inputs import what_turns
 from rigidjax.motion.manifold import coordinates, dimension, tangent, turns
-from rigidjax.motion.torques import CorrelatedTorque, RandomTorque, Sum, Torque
-from rigidjax.motion.torques.base import in_precision, require_law, tensor_of
+from rigidjax.motion.torques import CorrelatedTorque, RandomTorque, Sum
+from rigidjax.motion.torques.base import Torque, in_precision, require_law, tensor_of
 from rigidjax.rotation.kernels import normalised
 from rigidjax.rotation.linalg3 import cross
 from rigidjax.solve import equations_of_motion
@@ -25,11 +25,11 @@ from rigidjax.solve.tableaus import KUTTA4
 
 
 class Walk(eqx.Module):
-    """A sensor's error that is unknown and drifts: `dx = √density dW`, a random walk.
+    """An unknown sensor error that drifts: `dx = √density dW`, a random walk.
 
-    **Arguments:** `where` picks it as a `Free` does: `lambda r: r.readings[0].sensor.bias`, whose
-    value in the recording is where it starts; `deviation` of that start, one number or as many, in
-    its unit; `density` how fast it drifts, unit² / s, ≥ 0: zero for one that stays.
+    **Arguments:** `where` picks it as a `Free` does: `lambda r: r.readings[0].sensor.bias`; its
+    value in the recording is the initial value; `deviation` of that value, one number or one for
+    each component, in its unit; `density` of the drift, unit² / s, ≥ 0: zero for a constant error.
 
     **Raises** `ValueError` for a deviation or density below zero.
 
@@ -49,13 +49,13 @@ class Walk(eqx.Module):
 
 
 class Model(eqx.Module):
-    """A body, what turns it, known and unknown, and which errors of its sensors drift.
+    """A body, its known and unknown torques, and the errors of its sensors that drift.
 
     **Arguments:** `body` an `Inertia`, or `MassProperties` for a `Rigid` state; `torque` any
     torques, among them `RandomTorque` and `CorrelatedTorque`, several in a `Sum`; `None` for a free
     body without noise; `walks` the `Walk`s.
 
-    **Raises:** `TypeError` for arguments of another kind.
+    **Raises:** `TypeError` for arguments of another type.
 
     >>> import rigidjax as rj
     >>> model = Model(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.torques.RandomTorque(1e-4))
@@ -95,7 +95,7 @@ def bare(model: Model) -> Model:
 
 
 class Extended(eqx.Module):
-    """All that a filter follows.
+    """The state that a filter follows.
 
     **Fields:** `motion` a `Spin`, `Attitude` or `Rigid`; `torques` the value (3,) of each
     `CorrelatedTorque`, N m, body frame; `walks` the value of each `Walk`.
@@ -136,7 +136,7 @@ class Dynamics(eqx.Module):
 
     @property
     def kicks(self) -> int:
-        """How many unit normal numbers push motion and torques in one step."""
+        """The number of unit normal numbers in one step of motion and torques."""
         return 6 * (len(self.white) + len(self.coloured))
 
     def pushed(self, change: Any, torque: Array | None) -> Any:
@@ -147,7 +147,7 @@ class Dynamics(eqx.Module):
         return eqx.tree_at(lambda s: s.omega, change, spin)
 
     def advance(self, t: Scalar, h: Scalar, x: Extended, kicks: Array) -> Extended:
-        """`x` a time `h` later, pushed by noise; `kicks` (kicks,) of unit variance.
+        """`x` a time `h` later, under noise; `kicks` (kicks,) of unit variance.
 
         White noise within the step is replaced by its first two Legendre polynomials,
         `√(density/h) (k₀ + √3 (1 − 2s/h) k₁)`, which give its effect on rate and angle their exact
@@ -232,7 +232,7 @@ def _turned(x: Extended, e: Array, a: Array, first: float, second: float) -> Arr
 
 
 def _parts(torque: Torque) -> list[Any]:
-    """The laws in a sum, and in sums within it."""
+    """The torque models in a sum, and in sums within it."""
     require_law(torque)
     if isinstance(torque, Sum):
         return [inner for part in torque.parts for inner in _parts(part)]

@@ -1,4 +1,4 @@
-"""What readings say about a state: how far off they are, and how that depends on errors of it."""
+"""The errors of readings at a state, and their derivatives in errors of the state."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -19,7 +19,7 @@ from rigidjax.motion.torques.base import in_precision
 
 
 class ReadingRow(NamedTuple):
-    """What one sensor says of a state.
+    """The reading of one sensor, linearised about a state.
 
     **Fields:** `matrix` (k, n) how the prediction changes with an error e of the state; `error`
     (k,) reading minus prediction; `variance` (k,) of the noise; `seen` (k,) whether it counts.
@@ -60,7 +60,7 @@ class Sensors(eqx.Module):
 
 
 def sensors_of(sensors: Sequence[AbstractSensor], model: Model) -> Sensors:
-    """The sensors, looked at: each has a noise, and each walk finds its numbers."""
+    """The checked sensors: each has a noise, and each walk finds its numbers."""
     for sensor in sensors:
         _checks.instance(sensor, AbstractSensor, "sensor")
         name = type(sensor).__name__
@@ -71,8 +71,8 @@ def sensors_of(sensors: Sequence[AbstractSensor], model: Model) -> Sensors:
             )
         if getattr(sensor, "lowpass", None) is not None:
             raise ValueError(
-                f"{name}: a lowpass has a memory of its own, which the filter "
-                "does not estimate; leave it out, and give its lag as offset"
+                f"{name}: a lowpass has states of its own, which the filter does not estimate; "
+                "leave it out, and give its lag as offset"
             )
     readings = tuple(Mounted(sensor) for sensor in sensors)
     tree = _Recorded(readings)
@@ -81,7 +81,7 @@ def sensors_of(sensors: Sequence[AbstractSensor], model: Model) -> Sensors:
 
 
 class Stops(NamedTuple):
-    """Where the filter stops, and what was read there."""
+    """The times of the filter's steps, and the readings then."""
 
     t: Array
     values: tuple[Array, ...]
@@ -89,7 +89,7 @@ class Stops(NamedTuple):
 
 
 def _rows(dynamics: Dynamics, sensors: Sensors, stop: Stops, x: Extended) -> list[ReadingRow]:
-    """What each sensor's reading at a stop says of the state x."""
+    """The reading of each sensor at one time, linearised about the state x."""
     dtype = x.motion.omega.dtype
     t = stop.t.astype(dtype)
     basis = jax.vmap(lambda e: tangent(x, e))(jnp.eye(dimension(x), dtype=dtype))
@@ -122,10 +122,10 @@ def _rows(dynamics: Dynamics, sensors: Sensors, stop: Stops, x: Extended) -> lis
 
 
 class Read(NamedTuple):
-    """What one sensor's readings gave.
+    """The innovations of one sensor's readings.
 
-    **Fields:** `innovation` (k,) what was read minus what was expected of all read before, the
-    sensor's earlier components among them; `variance` (k,) of it; `seen` (k,).
+    **Fields:** `innovation` (k,) the reading minus its prediction from all readings before, also
+    from the sensor's earlier components; `variance` (k,) of it; `seen` (k,).
     """
 
     innovation: Float[Array, "*times k"]

@@ -20,10 +20,10 @@ from rigidjax.motion.manifold import minus, plus
 
 
 class Push(NamedTuple):
-    """A white torque as the readings show it, averaged over the step that ends at each time.
+    """The estimate of a white torque, averaged over the step that ends at each time.
 
-    **Fields:** `mean`, `deviation` (N, 3) N m, body frame; wide where steps are short, for white
-    noise has no value at a time.
+    **Fields:** `mean`, `deviation` (N, 3) N m, body frame; the deviation is large for short steps,
+    since white noise has no value at a time.
 
     >>> shown = Push(jnp.array([[0.0, 0.0, 0.3]]), 0.1 * jnp.ones((1, 3)))
     >>> (shown.mean / shown.deviation).round(1).tolist()  # about the third axis it turns the body
@@ -91,17 +91,20 @@ def smooth(
 ) -> Smoothed:
     """Attitude, rate, unknown torque and sensor errors from all readings, with their deviations.
 
-    The motion of largest posterior density, by Gauss and Newton's method: each iteration linearises
-    dynamics and sensors about the last motion and solves exactly by a Kalman filter and Rauch, Tung
-    and Striebel's pass back, on roots of covariances (Bell 1994, doi:10.1137/0804035). It starts
-    from what `filter` finds.
+    This is the motion of largest posterior density, by Gauss and Newton's method. Each iteration
+    linearises dynamics and sensors about the last motion. It solves the linear problem exactly by a
+    Kalman filter and the backward pass of Rauch, Tung and Striebel, on roots of covariances (Bell
+    1994, doi:10.1137/0804035). The first motion is the result of `filter`.
 
     **Arguments:** as for `filter`; `iterations` at most; it ends when no number moved by more than
-    `tolerance` of its standard deviation (what is then left is about the square of it).
+    `tolerance` of its standard deviation (the error that remains is about the square of that).
 
-    **Returns** a `Smoothed`. It may be jitted, differentiated in forward mode, and batched.
+    **Returns** `belief`, `rows`, `pushes`, `readings`, `log_likelihood`, `change`, `iterations`,
+    `status` and `lost_at` (`Smoothed`). It may be jitted, differentiated in forward mode, and
+    batched.
 
-    **Raises:** as `filter`; where `throw`, also for a motion that still moves by a deviation.
+    **Raises:** as `filter`; with `throw` also for a motion that still moves by a standard
+    deviation.
 
     >>> import rigidjax as rj
     >>> record = rj.identify.Recording([0.0, 0.1], (rj.identify.Gyro(0.1), [[1.0, 0, 0]] * 2))
@@ -198,9 +201,9 @@ def _iterate(
     path: Extended,
     kicks: Array,
 ) -> tuple[Extended, _Solved]:
-    """One linearisation about `path`, at the first time and each stop, and its exact solution.
+    """One linearisation about `path`, at each time of the filter, and its exact solution.
 
-    Also about the `kicks` between them, in which the motion is not linear either.
+    It is also about the `kicks` between these times, in which the motion is not linear either.
     """
     before = jnp.concatenate([first.t[None], stops.t[:-1]])
     dtype = first.root.dtype

@@ -1,4 +1,4 @@
-"""What each recording adds to a posterior density, and its derivatives recording by recording."""
+"""The terms of a posterior density, and their derivatives, recording by recording."""
 
 import math
 from functools import partial
@@ -33,11 +33,11 @@ if TYPE_CHECKING:
 
 
 class Terms(NamedTuple):
-    """The numbers read in each recording, every one normal given those before it.
+    """The numbers read in each recording, each one normal given the earlier ones.
 
-    **Fields:** `error` (R, N) how far each was from what was expected, in standard deviations;
-    `log_variance` (R, N) the logarithm of 2π times its variance. Both are zero where nothing was
-    seen; a channel at its limit counts by its odds, and has no variance.
+    **Fields:** `error` (R, N) the reading minus its prediction, in standard deviations;
+    `log_variance` (R, N) the logarithm of 2π times its variance. Both are zero for a masked
+    reading; a channel at its limit counts by its probability, and has no variance.
     """
 
     error: Float[Array, "*records n"]
@@ -52,8 +52,8 @@ class Terms(NamedTuple):
 class Curvature(NamedTuple):
     """The cost, minus a log-density, near a point.
 
-    **Fields:** `cost`; `slope` (n,) its gradient; `gram` (n, n) Fisher's information: what its
-    second derivative is expected to be, over readings that the point itself explains.
+    **Fields:** `cost`; `slope` (n,) its gradient; `gram` (n, n) Fisher's information: the
+    expectation of its second derivative over readings that the point itself explains.
     """
 
     cost: Scalar
@@ -62,7 +62,7 @@ class Curvature(NamedTuple):
 
 
 def terms(density: "LogDensity", x: Float[Array, " n"]) -> Terms:
-    """The terms of all readings; derivatives recording by recording, by what each depends on."""
+    """The terms of all readings; derivatives recording by recording, in the numbers of each."""
 
     @jax.custom_jvp
     def of(rows: Array) -> Terms:
@@ -102,7 +102,7 @@ def curvature(density: "LogDensity", x: Float[Array, " n"]) -> Curvature:
 
 
 def prior_residuals(density: "LogDensity", x: Float[Array, " n"]) -> Float[Array, " m"]:
-    """What priors add, as numbers whose halved squares are subtracted from the density."""
+    """The terms of the priors, as numbers whose halved squares are subtracted from the density."""
     parameters, _, logs = ravel_pytree(density.like)[1](x)
     parts = [leaf.reshape(-1) for leaf in beside(parameters, density.problem, None)]
     if logs is not None and density.deviation is not None:

@@ -1,7 +1,6 @@
 """Motions in closed form, without a solver."""
 
 from rigidjax._names import show
-from rigidjax.exact.diffrax_solver import FreeSolver as FreeSolver
 from rigidjax.exact.free_body import FreeBody as FreeBody, free_body as free_body
 from rigidjax.exact.periods import (
     body_period as body_period,

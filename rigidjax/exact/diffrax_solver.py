@@ -10,7 +10,7 @@ from jaxtyping import Array, PyTree
 
 from rigidjax.body.inertia import Inertia
 from rigidjax.exact.free_body import FreeBody
-from rigidjax.motion import AttitudeEquations, EulerEquations
+from rigidjax.motion.equations import AttitudeEquations, EulerEquations
 
 
 class FreeInterpolation(dfx.AbstractLocalInterpolation):
@@ -34,16 +34,16 @@ class FreeInterpolation(dfx.AbstractLocalInterpolation):
 class FreeSolver(dfx.AbstractSolver):
     """A diffrax solver for torque-free spins and attitudes whose step is the closed form.
 
-    Use it with `diffrax.ODETerm(EulerEquations(inertia))` or `…(AttitudeEquations(inertia))`, both
-    with no torque. Steps may be as long as one likes, so `ConstantStepSize` with one step over the
-    whole interval does; events, `SaveAt(ts=…, dense=True)` and every adjoint work as with any
-    solver. Without events, `rigidjax.exact.free_body` is the shorter way.
+    Use it with `diffrax.ODETerm(rigidjax.equations_of_motion(inertia, y0))` of a `Spin` or an
+    `Attitude`, with no torque. Steps may be as long as one likes, so `ConstantStepSize` with one
+    step over the whole interval does; events, `SaveAt(ts=…, dense=True)` and every adjoint work as
+    with any solver. Without events, `rigidjax.exact.free_body` is the shorter way.
 
     **Raises:** `ValueError` for a term that is not one of those, or that has a torque.
 
     >>> import diffrax, rigidjax as rj
-    >>> field = rj.motion.EulerEquations(rj.Inertia.from_principal(1.0, 2.0, 3.0))
     >>> y0 = rj.Spin([0.0, 1.0, 1e-4])
+    >>> field = rj.equations_of_motion(rj.Inertia.from_principal(1.0, 2.0, 3.0), y0)
     >>> solver = FreeSolver()
     >>> sol = diffrax.diffeqsolve(diffrax.ODETerm(field), solver, 0.0, 20.0, 20.0, y0)
     >>> sol.ys.omega[0]
@@ -87,9 +87,8 @@ def _field(terms: Any) -> EulerEquations:
     euler = field.euler if isinstance(field, AttitudeEquations) else field
     if not isinstance(term, dfx.ODETerm) or not isinstance(euler, EulerEquations):
         raise ValueError(
-            "FreeSolver: wanted ODETerm(EulerEquations(inertia)) or "
-            f"ODETerm(AttitudeEquations(inertia)), got {type(term).__name__} of "
-            f"{type(field).__name__}"
+            "FreeSolver: wanted ODETerm(equations_of_motion(inertia, y0)) of a Spin or an "
+            f"Attitude, got {type(term).__name__} of {type(field).__name__}"
         )
     if euler.torque is not None:
         raise ValueError(

@@ -1,13 +1,10 @@
 """Moving frames, and scenes of particles seen from them. No body is needed."""
 
 from rigidjax._names import show
-from rigidjax.frames import scenes as scenes
 from rigidjax.frames.base import AbstractScene as AbstractScene, Force as Force
 from rigidjax.frames.frame_dynamics import (
     BodyInFrame as BodyInFrame,
-    InFrame as InFrame,
 )
-from rigidjax.frames.frame_kinematics import Instant as Instant
 from rigidjax.frames.moving import MovingFrame as MovingFrame
 from rigidjax.frames.point import Point as Point
 from rigidjax.frames.rotation_models import AboutAxis as AboutAxis, Uniform as Uniform

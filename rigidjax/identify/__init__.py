@@ -2,7 +2,6 @@
 
 from rigidjax._names import show
 from rigidjax.identify import report as report
-from rigidjax.identify.answers import Answer as Answer, Cause as Cause
 from rigidjax.identify.body_charts import (
     AbstractBodyChart as AbstractBodyChart,
     Known as Known,
@@ -13,28 +12,21 @@ from rigidjax.identify.body_charts import (
     Tensor as Tensor,
 )
 from rigidjax.identify.compare import (
-    Comparison as Comparison,
     compare as compare,
     cross_validate as cross_validate,
 )
 from rigidjax.identify.csv_io import (
-    LogError as LogError,
-    read_gyro_csv as read_gyro_csv,
     read_table as read_table,
 )
 from rigidjax.identify.design import (
     best_first_rate as best_first_rate,
     expected as expected,
     fisher as fisher,
-    plan_of as plan_of,
 )
 from rigidjax.identify.fit import fit as fit
 from rigidjax.identify.free_parameters import Free as Free
-from rigidjax.identify.horizons import Horizons as Horizons
 from rigidjax.identify.loss import AbstractLoss as AbstractLoss, Huber as Huber, SoftL1 as SoftL1
-from rigidjax.identify.multiple_shooting import pieces as pieces
 from rigidjax.identify.parameters import (
-    Own as Own,
     Parameters as Parameters,
     Unpacked as Unpacked,
 )
@@ -42,13 +34,11 @@ from rigidjax.identify.prior import Entropic as Entropic
 from rigidjax.identify.problem import Problem as Problem
 from rigidjax.identify.profile import profile as profile
 from rigidjax.identify.propagation import (
-    AbstractIntegrator as AbstractIntegrator,
     Adaptive as Adaptive,
     FixedSteps as FixedSteps,
 )
-from rigidjax.identify.quantities import Quantity as Quantity
-from rigidjax.identify.recording import Reading as Reading, Recording as Recording
-from rigidjax.identify.result import Fit as Fit, Start as Start
+from rigidjax.identify.recording import Recording as Recording
+from rigidjax.identify.result import Fit as Fit
 from rigidjax.identify.sensors import (
     AbstractSensor as AbstractSensor,
     Accelerometer as Accelerometer,
@@ -62,12 +52,9 @@ from rigidjax.identify.sensors import (
     Range as Range,
     SensorInput as SensorInput,
     Velocity as Velocity,
-    quaternions_from_euler as quaternions_from_euler,
-    quaternions_from_matrices as quaternions_from_matrices,
 )
 from rigidjax.identify.simulated_readings import simulate_readings as simulate_readings
 from rigidjax.identify.stochastic_gradient import Descent as Descent
-from rigidjax.identify.undetermined import Combination as Combination
 from rigidjax.identify.window_fit import WindowFit as WindowFit, fit_windows as fit_windows
 from rigidjax.identify.windows import Windows as Windows, windows as windows
 

@@ -34,6 +34,34 @@ def _margin(problem: Problem, best_cost: float, longest: float) -> float:
     return 10.0 * unit * max(longest, 1.0)
 
 
+def _start(tried: Tried, level: float) -> Start:
+    """A start as a user sees it; it fits where its misfit is not above `level`."""
+    cost = float(tried.cost)
+    return Start(tried.parameters, cost, bool(tried.converged), cost <= level)
+
+
+def _elsewhere(
+    linear: uncertainty.Linearised, other: Parameters, value: Parameters, margin: float
+) -> bool:
+    """Whether readings tell two points apart: searches in one flat valley end at other points."""
+    away = ravel_pytree(other)[0] - ravel_pytree(value)[0]
+    return float(np.sum((linear.rows @ np.asarray(away)) ** 2)) > 2 * margin
+
+
+def _search(
+    best_cost: float, done: bool, rivals: str, interrupted: Sequence[str], remarks: Sequence[str]
+) -> Answer:
+    """How the search ended, in words: `rivals` empty where no start fits as well elsewhere."""
+    if not np.isfinite(best_cost):
+        return Answer(NOT_ENDED, ("no start gave a finite misfit",))
+    if not done:
+        why = interrupted or ("max_steps reached",)
+        return Answer(NOT_ENDED, (*why, "this is the best point found"))
+    if rivals:
+        return Answer(NOT_ALONE, (rivals, *interrupted, *remarks))
+    return Answer(FOUND, (*interrupted, *remarks))
+
+
 def assess(
     problem: Problem,
     best: Tried,
@@ -63,36 +91,18 @@ def assess(
     believable = seen.model.word != FAILS
     margin = _margin(problem, best_cost, times.longest)
 
-    def elsewhere(other: Parameters) -> bool:
-        # In one flat valley searches end apart, where no reading would tell them apart.
-        away = ravel_pytree(other)[0] - ravel_pytree(value)[0]
-        return float(np.sum((linear.rows @ np.asarray(away)) ** 2)) > 2 * margin
-
-    starts = [
-        Start(
-            item.parameters, cost, bool(item.converged), believable and cost <= best_cost + margin
-        )
-        for item in tried
-        for cost in (float(item.cost),)
-    ]
+    level = best_cost + margin if believable else -np.inf
+    starts = [_start(item, level) for item in tried]
     rivals = [
         s
         for s in starts
-        if s.fits and s.converged and s.cost > best_cost + 0.01 * margin and elsewhere(s.parameters)
+        if s.fits and s.converged and s.cost > best_cost + 0.01 * margin
+        if _elsewhere(linear, s.parameters, value, margin)
     ]
-    remarks = list(interrupted)
-    if not any(start.fits for start in starts) and believable:
-        remarks.append("no single start came near the best point")
-    if not np.isfinite(best_cost):
-        search = Answer(NOT_ENDED, ("no start gave a finite misfit",))
-    elif not done:
-        why = interrupted or ("max_steps reached",)
-        search = Answer(NOT_ENDED, (*why, "this is the best point found"))
-    elif rivals:
-        rival = f"{len(rivals)} of {len(starts)} starts fit as well elsewhere"
-        search = Answer(NOT_ALONE, (rival, *remarks))
-    else:
-        search = Answer(FOUND, tuple(remarks))
+    rival = f"{len(rivals)} of {len(starts)} starts fit as well elsewhere" if rivals else ""
+    lost = believable and not any(start.fits for start in starts)
+    remarks = ("no single start came near the best point",) if lost else ()
+    search = _search(best_cost, done, rival, interrupted, remarks)
     unreal = of_charts(charts(problem), flat_limit.bodies_of(problem, value))
     model = Answer(seen.model.word, (*unreal, *seen.model.reasons))
     model = model if np.isfinite(best_cost) else Answer(FAILS)

@@ -1,11 +1,14 @@
 """From a description in words, as the command line gives it, to recordings and a problem."""
 
+import functools
 from collections.abc import Callable, Sequence
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from rigidjax.identify.body_charts import (
@@ -26,9 +29,10 @@ from rigidjax.identify.sensors import (
     Accelerometer,
     AttitudeSensor,
     Gyro,
-    quaternions_from_euler,
 )
-from rigidjax.motion.torques import Damping, Flywheel, Series, Sum, Torque, Wheel
+from rigidjax.motion.torques import Damping, Flywheel, Series, Sum, Wheel
+from rigidjax.motion.torques.base import Torque
+from rigidjax.rotation import euler
 
 # Of the typical size of a moment, kg m².
 MODELS: dict[str, Callable[[float], AbstractBodyChart]] = {
@@ -198,9 +202,8 @@ def _sensor(
     if one.kind == "quaternion":
         return AttitudeSensor(noise), values
     try:
-        return AttitudeSensor(noise), quaternions_from_euler(
-            values, one.kind.removeprefix("euler-")
-        )
+        turned = functools.partial(euler.to_quaternion, sequence=one.kind.removeprefix("euler-"))
+        return AttitudeSensor(noise), np.asarray(jax.vmap(turned)(jnp.asarray(values)))
     except ValueError as error:
         raise LogError(f"sensor {one.kind}: {error}") from None
 

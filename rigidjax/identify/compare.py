@@ -41,7 +41,8 @@ def compare(fits: Mapping[str, Fit]) -> tuple[Comparison, ...]:
     fitting model are autocorrelated, the same for all.
 
     **Arguments:** `fits` name → `Fit`, all of the same readings. **Raises** `ValueError` for none,
-    or for fits of other readings.
+    or for fits of other readings. **Returns** for each `name`, `free`, `rms`, `correlation` and
+    `information` (`Comparison`).
 
     Source: Schwarz 1978, doi:10.1214/aos/1176344136.
 

@@ -13,8 +13,6 @@ import numpy as np
 from rigidjax import _checks
 from rigidjax.identify import blackbox
 from rigidjax.identify.layouts import read_header
-from rigidjax.identify.recording import Recording
-from rigidjax.identify.sensors import Gyro
 
 # Everything is turned into SI.
 UNITS = {
@@ -57,7 +55,7 @@ def read_table(path: str | Path, columns: Sequence[str]) -> dict[str, np.ndarray
     cell is a gap and comes back as NaN. A text is read line by line: beside it, up to three times
     its numbers are held.
 
-    **Raises:** `LogError`, one line naming file, line and column, for a file that is missing, cut
+    **Raises:** `ValueError`, one line naming file, line and column, for a file that is missing, cut
     or not of its kind, a missing column or two of its name, a name that is wanted twice, a cell
     that is not a number, a line with more cells than the header, columns of different lengths.
 
@@ -79,45 +77,6 @@ def read_table(path: str | Path, columns: Sequence[str]) -> dict[str, np.ndarray
     if path.suffix.lower() in (".npz", ".mat", *blackbox.SUFFIXES):
         return _arrays(path, columns)
     return _csv(path, columns)
-
-
-def read_gyro_csv(
-    path: str | Path,
-    *,
-    columns: tuple[str, str, str, str] = ("t", "wx", "wy", "wz"),
-    unit: str = "rad/s",
-    noise: float | None = None,
-) -> Recording:
-    """A recording of body rates from a CSV file with a header line.
-
-    **Arguments:** `path` the file; `columns` the names of the time column (s) and of the three rate
-    columns (body frame); `unit` of the rates, `rad/s` or `deg/s`; `noise` standard deviation of a
-    reading in that unit, or `None` to have it estimated. Other columns are ignored. For other
-    sensors and files: `read_table`, then `Recording`.
-
-    **Raises:** `LogError`, one line naming file, line and column, for a file that is missing or not
-    text, a missing column, a cell that is not a finite number, or times that do not increase.
-
-    >>> read_gyro_csv("missing.csv")
-    Traceback (most recent call last):
-    rigidjax.identify.csv_io.LogError: missing.csv: no such file
-    """
-    if not isinstance(unit, str) or unit not in ("rad/s", "deg/s"):
-        raise LogError(f"unit: wanted one of rad/s, deg/s, got {unit!r}")
-    noise = None if noise is None else _checks.positive(noise, "noise")
-    table = read_table(path, columns)
-    for name in columns:
-        gap = np.isnan(table[name])
-        if gap.any():
-            raise LogError(f"{path}: column {name!r}: row {int(np.argmax(gap)) + 1} is empty")
-    t = table[columns[0]]
-    increasing(path, t, columns[0])
-    rates = np.stack([table[name] for name in columns[1:]], axis=1)
-    # A large log is not to be held twice.
-    del table
-    rates *= UNITS[unit]
-    sensor = Gyro(None if noise is None else noise * UNITS[unit])
-    return Recording(t, (sensor, rates))
 
 
 def increasing(path: str | Path, t: np.ndarray, name: str) -> None:

@@ -11,7 +11,6 @@ from jaxtyping import Array, Float
 
 from rigidjax import _checks
 from rigidjax._types import Scalar, Vec3
-from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.identify import flat_limit
 from rigidjax.identify.jacobian import normal_matrix, with_blocks
 from rigidjax.identify.parameters import Parameters, places
@@ -25,8 +24,8 @@ def expected(problem: Problem, parameters: Parameters) -> tuple[Quantity, ...]:
 
     **Arguments:** `problem` whose recordings give times, sensors with known noise, and torques (the
     readings themselves do not matter); `parameters` the motion that is planned. **Returns** the
-    quantities of `Fit.quantities` with the standard deviations of the Cramér–Rao bound, infinite
-    where the motion would show nothing.
+    quantities of `Fit.quantities` (`name`, `value`, `deviation`, `unit`) with the standard
+    deviations of the Cramér–Rao bound, infinite where the motion would show nothing.
 
     **Raises:** `ValueError` for a sensor whose noise is not given, or numbers that are not finite.
 
@@ -35,7 +34,7 @@ def expected(problem: Problem, parameters: Parameters) -> tuple[Quantity, ...]:
     >>> record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), jnp.zeros((50, 3))))
     >>> problem = rj.identify.Problem(record, rj.identify.PrincipalRatios())
     >>> body = rj.Inertia.from_principal(1.0, 2.0, 2.5)
-    >>> plan = plan_of(problem, body, [1.0, 0.1, 1.0])
+    >>> plan = problem.start(body, [1.0, 0.1, 1.0])
     >>> bool(expected(problem, plan)[0].deviation < 0.05)
     True
     """
@@ -51,25 +50,6 @@ def expected(problem: Problem, parameters: Parameters) -> tuple[Quantity, ...]:
     found = values_and_slopes(problem, parameters, near)
     half, null = inverted(information)
     return quantities(problem, found, half @ half.T, null)
-
-
-def plan_of(problem: Problem, body: Any, omega: Any) -> Parameters:
-    """The parameters of a planned motion: this body, this first rate.
-
-    **Arguments:** `problem`; `body` an `Inertia` or `MassProperties`; `omega` (3,) first rate,
-    rad/s, body frame. What else is free stays as the recordings give it.
-
-    >>> import rigidjax as rj
-    >>> record = rj.identify.Recording([0.0, 1.0], (rj.identify.Gyro(), [[1.0, 0, 0]] * 2))
-    >>> problem = rj.identify.Problem(record, rj.identify.PrincipalRatios())
-    >>> plan_of(problem, rj.Inertia.from_principal(2.0, 2.0, 2.0), [0.0, 0.0, 3.0]).own.spin
-    Array([[0., 0., 3.]], dtype=float64)
-    """
-    start = one_problem(problem).start(_checks.single(body, (Inertia, MassProperties), "body"))
-    rates = _checks.floating(omega, (3,), "omega").astype(start.own.spin.dtype)
-    rates = jnp.broadcast_to(rates, start.own.spin.shape)
-    spin = rates / problem.reference.rate[:, None]
-    return eqx.tree_at(lambda p: p.own.spin, start, spin)
 
 
 def fisher(problem: Problem, parameters: Parameters) -> Float[Array, "n n"]:
@@ -124,20 +104,21 @@ def best_first_rate(
     (D-optimality of the body, all else free as well), by BFGS of optimistix on the gradient through
     Fisher's information. It finds the best direction near `omega`: try several.
 
-    **Arguments:** `problem`, `body` as for `plan_of`; `omega` (3,) rad/s, body frame, where the
-    search starts and how fast the body can be thrown; `max_steps`. **Returns** the rate (3,) and
-    what to expect from it (`expected`).
+    **Arguments:** `problem`, `body` as for `Problem.start`; `omega` (3,) rad/s, body frame, where
+    the search starts and how fast the body can be thrown; `max_steps`. **Returns** the rate
+    (3,) and what to expect from it (`expected`).
 
     **Raises:** as `fisher`.
     """
+    one_problem(problem)
     max_steps = _checks.whole(max_steps, "max_steps", 1)
     _on_host(problem, (body, omega))
-    _look(problem, plan_of(problem, body, omega))
+    _look(problem, problem.start(body, omega))
     start = _checks.floating(omega, (3,), "omega").astype(problem.records.t.dtype)
     size = jnp.sqrt(jnp.sum(start**2))
     found = _search(problem, body, start / size, size, max_steps)
     rate = size * found / jnp.sqrt(jnp.sum(found**2))
-    return rate, expected(problem, plan_of(problem, body, rate))
+    return rate, expected(problem, problem.start(body, rate))
 
 
 @eqx.filter_jit
@@ -159,7 +140,7 @@ def _doubt(direction: Array, args: Any) -> Scalar:
     """½ log det of the body's covariance over its size, plus a hold on the length."""
     problem, body, size = args
     length = jnp.sqrt(jnp.sum(direction**2))
-    information = fisher(problem, plan_of(problem, body, size * direction / length))
+    information = fisher(problem, problem.start(body, size * direction / length))
     n = problem.body.size
     # The body's own information, all else free: Schur's complement.
     mine, across, rest = information[:n, :n], information[:n, n:], information[n:, n:]

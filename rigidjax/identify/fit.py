@@ -159,7 +159,7 @@ def _with_noise(
         return best, noise
 
     def estimated(noise: Noise) -> Noise:
-        errors = uncertainty.errors_at(best.parameters, problem)
+        (errors, _), _ = _evaluated(best, problem).found
         return uncertainty.estimate_noise(problem, errors, noise, best.parameters)
 
     # Twice: the weights of the channels and the robust loss both depend on the noise.

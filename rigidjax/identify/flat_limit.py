@@ -114,7 +114,12 @@ def bodies_of(problem: Problem, parameters: Parameters) -> list[Any]:
 
 def _thicker(chart: AbstractBodyChart, body: Inertia | MassProperties) -> Array | None:
     """The chart's numbers of a thicker body, where it is flat and the chart is one of ours."""
-    second = np.asarray(body.second_moment)
+    # By NumPy, for an operation of JAX outside of a trace costs as much as a run of 100 steps.
+    if isinstance(body, MassProperties):
+        second = np.asarray(body.second_moment)
+    else:
+        tensor = np.asarray(body.tensor)
+        second = 0.5 * np.trace(tensor) * np.eye(3) - tensor
     if not _has_limit(chart) or not np.isfinite(second).all():
         return None
     values, axes = np.linalg.eigh(second)

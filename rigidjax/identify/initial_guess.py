@@ -19,8 +19,7 @@ from rigidjax.identify.recording import Recording, readings_of
 from rigidjax.identify.sensors import Gyro
 from rigidjax.identify.several_bodies import Bodies
 from rigidjax.motion import Spin
-from rigidjax.motion.torques import Torque
-from rigidjax.motion.torques.base import evaluate
+from rigidjax.motion.torques.base import Torque, evaluate
 from rigidjax.motion.torques.states import has_states
 
 # What each component of a tensor adds to it.

@@ -28,7 +28,7 @@ class Own(eqx.Module):
     >>> import rigidjax as rj
     >>> record = rj.identify.Recording([0.0, 1.0], (rj.identify.Gyro(), [[1.0, 0, 0]] * 2))
     >>> problem = rj.identify.Problem(record, rj.identify.PrincipalRatios())
-    >>> plan = rj.identify.plan_of(problem, rj.Inertia.from_principal(2.0, 2.0, 2.0), [0.0, 0, 3])
+    >>> plan = problem.start(rj.Inertia.from_principal(2.0, 2.0, 2.0), [0.0, 0.0, 3.0])
     >>> plan.own.spin.tolist(), plan.own.turn  # a gyro does not show the attitude
     ([[0.0, 0.0, 3.0]], None)
     """
@@ -50,7 +50,7 @@ class Parameters(eqx.Module):
     >>> import rigidjax as rj
     >>> record = rj.identify.Recording([0.0, 1.0], (rj.identify.Gyro(), [[1.0, 0, 0]] * 2))
     >>> problem = rj.identify.Problem(record, rj.identify.PrincipalRatios())
-    >>> plan = rj.identify.plan_of(problem, rj.Inertia.from_principal(2.0, 2.0, 2.0), [0.0, 0, 3])
+    >>> plan = problem.start(rj.Inertia.from_principal(2.0, 2.0, 2.0), [0.0, 0.0, 3.0])
     >>> plan.body.shape, plan.shared
     ((2,), ())
     """

@@ -32,8 +32,8 @@ from rigidjax.identify.reference_states import ReferenceStates, first_rates, ref
 from rigidjax.identify.several_bodies import Bodies, charts_of, has_mass
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.coupled import motion_of
-from rigidjax.motion.torques import AbstractForce, Sum, Torque
-from rigidjax.motion.torques.base import require_law
+from rigidjax.motion.torques import Sum
+from rigidjax.motion.torques.base import AbstractForce, Torque, require_law
 
 
 class Problem(eqx.Module):
@@ -176,14 +176,17 @@ class Problem(eqx.Module):
         """The size of the body rate in the first recording, rad/s: the unit of `Own.spin`."""
         return self.reference.rate[0]
 
-    def start(self, body: Any = None) -> Parameters:
-        """Where a fit may start: the recordings as they are given, with this body or a sphere.
+    def start(self, body: Any = None, omega: Any = None) -> Parameters:
+        """Where a fit may start, or a motion that is planned: this body, this initial rate.
 
-        The first body rates are the first readings of a gyro, or the turn between attitudes (0
-        where these are traced). Of several bodies give a dict of those that are known about.
+        **Arguments:** `body` an `Inertia` or `MassProperties`, a sphere for `None`; of several
+        bodies a dict of those that are known about. `omega` (3,) initial rate, rad/s, body frame,
+        of all recordings; for `None` the first readings of a gyro, or the turn between attitudes
+        (0 where these are traced). What else is free stays as the recordings give it.
 
-        **Raises:** `ValueError` for a body that the chart does not hold.
+        **Raises:** `ValueError` for a body that the chart does not hold, or a wrong shape.
         """
+        one_problem(self)
         if isinstance(self.body, Bodies):
             given = dict(body) if isinstance(body, Mapping) else {}
             names, charts = self.body.names, self.body.charts
@@ -197,8 +200,13 @@ class Problem(eqx.Module):
         zeros = ([_zeros(*shape) for shape in shapes] for shapes in _shapes(self).values())
         _, shared, *state, each = zeros
         firsts: Any = [part[0] if part else None for part in state]
-        rates = first_rates(self.records, self.counts) / self.reference.rate[:, None]
-        firsts[-1] = rates.astype(firsts[-1].dtype)
+        spin: Any = firsts[-1]
+        if omega is None:
+            rates = first_rates(self.records, self.counts)
+        else:
+            rates = _checks.floating(omega, (3,), "omega").astype(spin.dtype)
+            rates = jnp.broadcast_to(rates, spin.shape)
+        firsts[-1] = (rates / self.reference.rate[:, None]).astype(spin.dtype)
         own = Own(*firsts, each=tuple(each))
         return Parameters(vector, tuple(shared), own)
 

@@ -14,7 +14,7 @@ from rigidjax import _checks
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.exact.free_body import FreeMotion
 from rigidjax.motion.coupled import Coupled, started
-from rigidjax.motion.torques import Torque
+from rigidjax.motion.torques.base import Torque
 from rigidjax.solve import equations_of_motion, fixed, simulate, solvers
 from rigidjax.solve.equal_steps import advance, in_a_loop
 from rigidjax.solve.explicit import AbstractExplicit

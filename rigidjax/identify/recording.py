@@ -9,10 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from rigidjax import _checks
+from rigidjax import _checks, _show
 from rigidjax.identify.sensors import AbstractSensor
-from rigidjax.motion.torques import Torque
-from rigidjax.motion.torques.base import require_law
+from rigidjax.motion.torques.base import Torque, require_law
 
 
 class Reading(eqx.Module):
@@ -40,10 +39,11 @@ class Recording(eqx.Module):
     """Times and readings of one motion.
 
     **Arguments:** `t` (T,) increasing times, s; then, for each sensor, a pair `(sensor, values)` or
-    a triple `(sensor, values, mask)`: `values` (T, 3) for a `Gyro`, (T, 4) for an
-    `AttitudeSensor`, as the sensor's `reading_shape` says; `mask` (T,) true where there is a
-    reading (what it masks may be NaN). A time at which no sensor read anything is dropped: a masked
-    reading and an absent one are the same. Sensors with their own times share the union of these.
+    a triple `(sensor, values, mask)`: `values` (T, 3) for a `Gyro`, (T, 4) or
+    (T, 3, 3) for an `AttitudeSensor`, as the sensor's `reading_shape` says; `mask` (T,) true where
+    there is a reading (what it masks may be NaN). A time at which no sensor read anything is
+    dropped: a masked reading and an absent one are the same. Sensors with their own times share
+    the union of these.
     `torque`, by keyword, is what turned this body besides its own spin: a wheel whose speed was
     logged, a law with coefficients that a `Free` may move; `None` for none.
 
@@ -103,6 +103,19 @@ class Recording(eqx.Module):
         plain = isinstance(torque, FunctionType)
         self.torque = jax.tree_util.Partial(torque) if plain else torque
 
+    def __repr__(self) -> str:
+        if not _checks.known(self) or np.ndim(self.t) != 1:
+            return eqx.tree_pformat(self)
+        ends = f"{float(self.t[0]):g} … {float(self.t[-1]):g} s"
+        parts = [f"{self.t.shape[0]} times {ends}"]
+        for reading in self.readings:
+            first = _show.shown(np.asarray(reading.values)[int(np.argmax(reading.seen))])
+            name, count = type(reading.sensor).__name__, int(reading.seen.sum())
+            parts.append(f"{name}: {count} readings from {first}")
+        if self.torque is not None:
+            parts.append(f"torque: {type(self.torque).__name__}")
+        return f"Recording({'; '.join(parts)})"
+
     @property
     def size(self) -> int:
         """How many numbers were read."""
@@ -136,6 +149,8 @@ def _reading(
             f"for each component of the error, or None, got shape {np.shape(sensor.noise)}"
         )
     values = _checks.on_host(values, f"{name}: readings")
+    # Matrices of an attitude, for one, become quaternions.
+    values = getattr(sensor, "readings", lambda values: values)(values)
     wanted = (t.size, *sensor.reading_shape)
     if values.shape != wanted:
         turned = "; transposed?" if values.shape == wanted[::-1] else ""

@@ -122,11 +122,9 @@ def gaps(parameters: Parameters, problem: Problem, ends: Any) -> Float[Array, "r
 
 def weights_of(problem: Problem, errors: tuple, noise: Noise) -> tuple[Float[Array, "..."], ...]:
     """The weight (R, T) of each reading in the normal equations: the loss's, zero where masked."""
-    out = []
+    masks = [reading.mask for reading in problem.records.readings]
+    if problem.loss is None:
+        return tuple(mask.astype(e.dtype) for mask, e in zip(masks, errors, strict=True))
+    weight = jax.vmap(jax.vmap(problem.loss.weight))
     scaled = whitened(problem, errors, noise)
-    for reading, e in zip(problem.records.readings, scaled, strict=True):
-        each = jnp.ones(e.shape[:-1], e.dtype)
-        if problem.loss is not None:
-            each = jax.vmap(jax.vmap(problem.loss.weight))(e)
-        out.append(jnp.where(reading.mask, each, 0.0))
-    return tuple(out)
+    return tuple(jnp.where(mask, weight(e), 0.0) for mask, e in zip(masks, scaled, strict=True))

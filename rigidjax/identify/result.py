@@ -102,7 +102,10 @@ class Fit(eqx.Module):
 
     @property
     def causes(self) -> tuple[Cause, ...]:
-        """What most likely makes the errors that are left, where that shows."""
+        """What most likely makes the errors that are left, where that shows.
+
+        Each has `name`, `sensor`, `share`, `words` and `remedy`.
+        """
         if not self.left:
             return ()
         linear = uncertainty.linearise(self.problem, self.parameters, self.noises, near=self.near)

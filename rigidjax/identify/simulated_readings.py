@@ -15,7 +15,7 @@ from rigidjax.identify.sensor_inputs import sensor_inputs, what_turns
 from rigidjax.identify.sensors import AbstractSensor, SensorInput
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.coupled import Coupled
-from rigidjax.motion.torques import Torque
+from rigidjax.motion.torques.base import Torque
 from rigidjax.solve import simulate
 
 Readings = Float[Array, "times ..."]

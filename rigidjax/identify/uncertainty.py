@@ -1,6 +1,6 @@
 """How sure a fit is: covariance, also where the errors are not white, and what the data miss."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -249,7 +249,8 @@ def _sandwich(linear: Linearised, half: np.ndarray, times: "Times") -> np.ndarra
     spans = 2.0 ** np.arange(1, np.log2(longest) + 1)
     n = half.shape[0]
     grown = times.independent / max(times.independent - n, 0.1 * times.independent)
-    meats = ((_meat(linear, columns, span) @ seen.reshape(len(columns), -1, n)) for span in spans)
+    channels = list(_channels(linear, columns))
+    meats = ((_meat(channels, span) @ seen.reshape(len(columns), -1, n)) for span in spans)
     found = [grown * half @ (seen.T @ meat.reshape(-1, n)) @ half.T for meat in meats]
     scores = linear.scores @ half
     records = scores.shape[0]
@@ -265,26 +266,31 @@ def _sandwich(linear: Linearised, half: np.ndarray, times: "Times") -> np.ndarra
     return out * np.outer(factor, factor)
 
 
-def _meat(linear: Linearised, columns: np.ndarray, time: float) -> np.ndarray:
-    """`Jᵀ C J` with C the scatter of each channel and a part that fades over `time` samples.
+def _channels(linear: Linearised, columns: np.ndarray) -> Iterator[tuple[np.ndarray, float, float]]:
+    """Of each channel the `columns` (R, T, m), the variance of its errors, its smooth share.
 
-    J the `columns` (R, N, m) of each recording, rows as in `Linearised.dense`.
+    `columns` (R, N, m) of each recording, rows as in `Linearised.dense`.
     """
-    meat: Any = 0.0
     first = 0
-    fade = float(np.exp(-1.0 / time))
     for error, weight in zip(linear.errors, linear.weights, strict=True):
         root, last = np.sqrt(weight), first + error[0].size
         slope = columns[:, first:last].reshape(*error.shape, -1)
         first = last
         for channel in range(error.shape[-1]):
-            e, j = error[..., channel] * root, slope[..., channel, :]
+            e = error[..., channel] * root
             variance = np.sum(e**2) / max(np.sum(weight > 0), 1)
-            share = smooth_share(e, weight > 0)
-            # Of the sums over earlier and later errors one is the other's transpose.
-            at_once, ahead = (j.transpose(0, 2, 1) @ x for x in (j, _fading(j, fade)))
-            spread = share * (ahead + ahead.transpose(0, 2, 1)) + (1.0 - 2.0 * share) * at_once
-            meat = meat + variance * spread
+            yield slope[..., channel, :], variance, smooth_share(e, weight > 0)
+
+
+def _meat(channels: list[tuple[np.ndarray, float, float]], time: float) -> np.ndarray:
+    """`Jᵀ C J` with C the scatter of each channel and a part that fades over `time` samples."""
+    meat: Any = 0.0
+    fade = float(np.exp(-1.0 / time))
+    for j, variance, share in channels:
+        # Of the sums over earlier and later errors one is the other's transpose.
+        at_once, ahead = (j.transpose(0, 2, 1) @ x for x in (j, _fading(j, fade)))
+        spread = share * (ahead + ahead.transpose(0, 2, 1)) + (1.0 - 2.0 * share) * at_once
+        meat = meat + variance * spread
     return meat
 
 

@@ -70,7 +70,7 @@ class WindowFit(eqx.Module, Generic[Value]):
     scene: Callable[[Value], tuple[Any, Any]]
 
     def predict(self, windows: Windows) -> Horizons:
-        """The errors at every horizon, of these windows or of others."""
+        """The errors at every horizon, of these windows or of others: `mean_absolute`, `rms`."""
         return by_horizon(windows.starts, all_errors(windows, self.scene, self.value))
 
 
@@ -144,22 +144,10 @@ def fit_windows(
     value, taken = back(end.point), int(end.taken) - 1
     # Once more where it ended, if the last that was tried was no better.
     there = end if end.here else searched(value, evaluated, whole)
-    half, null = inverted(np.asarray(there.gram))
-    # The meat between roots: between covariances, round-off would make variances negative.
-    sizes, axes = np.linalg.eigh(half.T @ np.asarray(there.found) @ half)
-    root = half @ axes * np.sqrt(np.maximum(sizes, 0.0))
-    deviation = carried(np.eye(x.size), root @ root.T, null)
     converged = bool(end.converged)
     message = [] if converged else [f"stopped after {taken} steps: its best point"]
-    if len(null):
-        message.append("some combination of the free numbers changes nothing in the windows")
-    if windows.count <= x.size:
-        deviation = np.full(x.size, np.nan)
-        message.append(f"deviations need more windows than free numbers, {x.size}")
-    vague = np.flatnonzero(deviation > VAGUE * np.maximum(1.0, np.abs(np.asarray(end.point))))
-    if vague.size:
-        listed = ", ".join(f"number {k} (± {deviation[k]:.3g})" for k in vague)
-        message.append(f"of the flattened free numbers these are not determined: {listed}")
+    deviation, words = _deviations(there, np.asarray(end.point), windows.count)
+    message += words
     body, law = scene(value)
     told = (unreal(body) or flat_limit.in_words(body), _too_late(windows, law))
     message += [wrong for wrong in told if wrong]
@@ -174,6 +162,25 @@ def fit_windows(
         "; ".join(message),
         scene,
     )
+
+
+def _deviations(there: Search, point: np.ndarray, count: int) -> tuple[np.ndarray, list[str]]:
+    """Standard deviations (n,) of the free numbers by how `count` windows differ, and remarks."""
+    half, null = inverted(np.asarray(there.gram))
+    # The meat between roots: between covariances, round-off would make variances negative.
+    sizes, axes = np.linalg.eigh(half.T @ np.asarray(there.found) @ half)
+    root = half @ axes * np.sqrt(np.maximum(sizes, 0.0))
+    deviation, message = carried(np.eye(point.size), root @ root.T, null), []
+    if len(null):
+        message.append("some combination of the free numbers changes nothing in the windows")
+    if count <= point.size:
+        deviation = np.full(point.size, np.nan)
+        message.append(f"deviations need more windows than free numbers, {point.size}")
+    vague = np.flatnonzero(deviation > VAGUE * np.maximum(1.0, np.abs(point)))
+    if vague.size:
+        listed = ", ".join(f"number {k} (± {deviation[k]:.3g})" for k in vague)
+        message.append(f"of the flattened free numbers these are not determined: {listed}")
+    return deviation, message
 
 
 def _grown(searched: Any, guess: Any, back: Any, length: int) -> Any:

@@ -48,7 +48,10 @@ class Windows(eqx.Module):
         return int(self.wanted.omega.shape[1])
 
     def held(self) -> Horizons:
-        """The errors of a prediction that holds the state at the start: what a model must beat."""
+        """The errors of a prediction that holds the state at the start: what a model must beat.
+
+        `mean_absolute` and `rms` after so many `steps`.
+        """
         return by_horizon(self.starts, held_errors(self.starts, self.wanted))
 
     @staticmethod

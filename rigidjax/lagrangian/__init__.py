@@ -9,7 +9,6 @@ from rigidjax._names import show
 from rigidjax.lagrangian.coordinates import (
     Coordinates as Coordinates,
     EulerAngleTop as EulerAngleTop,
-    LagrangeEquations as LagrangeEquations,
     equations_of_motion as equations_of_motion,
     from_attitude as from_attitude,
     to_attitude as to_attitude,
@@ -17,7 +16,6 @@ from rigidjax.lagrangian.coordinates import (
 from rigidjax.lagrangian.hamiltonian import (
     HeavyTopHamiltonian as HeavyTopHamiltonian,
     Momentum as Momentum,
-    MomentumAndDirection as MomentumAndDirection,
     RotationalHamiltonian as RotationalHamiltonian,
     lie_poisson as lie_poisson,
     lie_poisson_with_direction as lie_poisson_with_direction,

@@ -13,8 +13,7 @@ from rigidjax import _checks
 from rigidjax._types import HasAttitude, Scalar, ScalarLike
 from rigidjax.body.inertia import Inertia
 from rigidjax.motion import Attitude
-from rigidjax.motion.torques import Torque
-from rigidjax.motion.torques.base import require_law
+from rigidjax.motion.torques.base import Torque, require_law
 from rigidjax.rotation import euler, linalg3
 
 

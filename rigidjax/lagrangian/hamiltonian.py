@@ -55,7 +55,7 @@ class MomentumAndDirection(eqx.Module):
 
 
 class LiePoisson(eqx.Module):
-    """`dΠ/dt = Π × ∇H(Π)` as a vector field; made by `lie_poisson`."""
+    """`dΠ/dt = Π × ∇H(Π)` as a vector field, H the `hamiltonian`; made by `lie_poisson`."""
 
     hamiltonian: Callable[[Any], Any]
 
@@ -64,7 +64,10 @@ class LiePoisson(eqx.Module):
 
 
 class LiePoissonWithDirection(eqx.Module):
-    """The same with a direction carried along; made by `lie_poisson_with_direction`."""
+    """The same with a direction carried along, `hamiltonian` H(Π, γ).
+
+    `lie_poisson_with_direction` makes it.
+    """
 
     hamiltonian: Callable[[Any, Any], Any]
 

@@ -1,4 +1,4 @@
-"""States, their equations of motion, torques: model no more than the scene needs."""
+"""States and what a motion conserves: model no more than the scene needs."""
 
 from rigidjax._names import show
 from rigidjax._types import (
@@ -6,21 +6,15 @@ from rigidjax._types import (
     HasPose as HasPose,
     HasSpin as HasSpin,
 )
-from rigidjax.motion import torques as torques
 from rigidjax.motion.conserved import (
     conserved as conserved,
     drift as drift,
     energy as energy,
 )
-from rigidjax.motion.coupled import Coupled as Coupled
 from rigidjax.motion.equations import (
     Attitude as Attitude,
-    AttitudeEquations as AttitudeEquations,
-    EulerEquations as EulerEquations,
-    NewtonEuler as NewtonEuler,
     Rigid as Rigid,
     Spin as Spin,
-    on_the_group as on_the_group,
 )
 
 show(__name__)

@@ -11,9 +11,9 @@ from rigidjax._types import HasAttitude, HasPose, HasSpin, Scalar, ScalarLike, V
 from rigidjax.body.energy import angular_momentum, kinetic_energy
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.motion.coupled import Coupled, motion_of
-from rigidjax.motion.torques import AbstractTorque, CentralGravity, Sum, Torque, freeze
-from rigidjax.motion.torques.base import in_precision, length_or_zero, require_scene
-from rigidjax.motion.torques.states import Frozen
+from rigidjax.motion.torques import AbstractTorque, CentralGravity, Sum
+from rigidjax.motion.torques.base import Torque, in_precision, length_or_zero, require_scene
+from rigidjax.motion.torques.states import Frozen, freeze
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.linalg3 import cross, dot
 
@@ -29,7 +29,8 @@ def energy(
     **Arguments:** `body`, `state`, `torque` as for `simulate`; `t` s, for what depends on time.
 
     `T + U`, `T = ½ m |v|² + ½ Ω·IΩ` (notes, eq 79). Wheels inside count as no energy, but for
-    `ReactionWheels`. Under a torque with states of its own `state` is a `Coupled`.
+    `ReactionWheels`. Under a torque with states of its own `state` is a `Coupled`, as
+    `batch.rollout` and `crossings` give it.
 
     **Raises:** `TypeError` for a torque without a potential.
 

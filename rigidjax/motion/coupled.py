@@ -20,7 +20,7 @@ class Coupled(eqx.Module):
     take there.
 
     **Arguments:** `motion` a `Spin`, `Attitude` or `Rigid`; `own` a tuple of the states of each
-    law that has some, see `rigidjax.torques.freeze`.
+    law that has some, as `Solution.own`.
 
     >>> from rigidjax import Inertia, Spin, torques
     >>> wheel = torques.ReactionWheels([[0.0, 0, 1]], [0.1], [30.0])

@@ -12,8 +12,7 @@ from rigidjax import _checks, _show
 from rigidjax._types import HasAttitude, HasPose, HasSpin, Mat3, Quat, ScalarLike, Vec3
 from rigidjax.body.inertia import Inertia, MassProperties, apply, inverse
 from rigidjax.motion.coupled import Coupled
-from rigidjax.motion.torques import Torque
-from rigidjax.motion.torques.base import act, evaluate, require_law
+from rigidjax.motion.torques.base import Torque, act, evaluate, require_law
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.kernels import square4
 from rigidjax.rotation.linalg3 import components, cross
@@ -168,7 +167,7 @@ class AttitudeEquations(eqx.Module):
     Source: `dM/dt = M J'` (notes, eq 50), written for the quaternion of M.
 
     >>> import rigidjax as rj
-    >>> field = rj.motion.AttitudeEquations(rj.Inertia.from_principal(1.0, 2.0, 3.0))
+    >>> field = AttitudeEquations(rj.Inertia.from_principal(1.0, 2.0, 3.0))
     >>> field(0.0, Attitude([1.0, 0, 0, 0], [0.0, 0, 1]), None).q
     Array([-0. ,  0. ,  0. ,  0.5], dtype=float64)
     """
@@ -197,7 +196,7 @@ class NewtonEuler(eqx.Module):
     **Raises:** as `EulerEquations`.
 
     >>> import rigidjax as rj
-    >>> field = rj.motion.NewtonEuler(rj.shapes.box(2.0, [0.1, 0.2, 0.3]))
+    >>> field = NewtonEuler(rj.shapes.box(2.0, [0.1, 0.2, 0.3]))
     >>> field(0.0, Rigid([0.0, 0, 0], [1.0, 0, 0], [1.0, 0, 0, 0], [0.0, 0, 1]), None).x
     Array([1., 0., 0.], dtype=float64)
     """

@@ -7,6 +7,5 @@ from rigidjax._names import show
 from rigidjax.orbits.cr3bp import ThreeBody as ThreeBody, cr3bp as cr3bp
 from rigidjax.orbits.differential_correction import PeriodicOrbit as PeriodicOrbit
 from rigidjax.orbits.hill import Hill as Hill, hill as hill
-from rigidjax.orbits.manifolds import Manifold as Manifold
 
 show(__name__)

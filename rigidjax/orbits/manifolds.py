@@ -32,10 +32,9 @@ class Manifold(eqx.Module):
     `phases` (N,) where on the orbit each begins, in periods; `multiplier` λ by which a small
     distance along it changes in a period.
 
-    >>> from rigidjax import orbits
     >>> ts, phases = jnp.array([0.0, 0.1]), jnp.array([0.0])
     >>> states = Point(jnp.zeros((1, 2, 3)), jnp.zeros((1, 2, 3)))
-    >>> orbits.Manifold(ts, states, phases, jnp.asarray(2.5)).states.x.shape
+    >>> Manifold(ts, states, phases, jnp.asarray(2.5)).states.x.shape
     (1, 2, 3)
     """
 

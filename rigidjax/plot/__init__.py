@@ -5,7 +5,7 @@ Okabe and Ito's, told apart by everyone.
 """
 
 from rigidjax._names import show
-from rigidjax.plot.animation import Film as Film, player as player, tumble as tumble
+from rigidjax.plot.animation import player as player, tumble as tumble
 from rigidjax.plot.ellipsoids import inertia_ellipsoid as inertia_ellipsoid
 from rigidjax.plot.fit import fit as fit
 from rigidjax.plot.frames import frames as frames

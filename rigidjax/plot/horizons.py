@@ -31,7 +31,7 @@ def horizons(
 ) -> Any:
     """Open-loop errors against how far ahead they are, a picture for each kind of state.
 
-    **Arguments:** `found` a `rigidjax.identify.Horizons`, as `WindowFit.predict` and `Windows.held`
+    **Arguments:** `found` a `Horizons`, as `WindowFit.predict` and `Windows.held`
     return them, or several by name, to be compared: of a model, of a prediction that holds the
     start, of other windows; `step` s between samples, for a scale of time in the place of steps;
     `measure` `mean_absolute` (of a component), `mean_norm` or `rms` (of the vector); `title`; `ax`

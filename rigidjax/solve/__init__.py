@@ -1,15 +1,17 @@
 """Motions by a solver: in our own loops, or by diffrax."""
 
 from rigidjax._names import show
-from rigidjax.solve import solvers as solvers
 from rigidjax.solve.adaptive import adaptive as adaptive
 from rigidjax.solve.crossings import (
-    Crossings as Crossings,
     Event as Event,
     crossings as crossings,
 )
+from rigidjax.solve.error import (
+    Error as Error,
+    FunctionError as FunctionError,
+    error_of as error_of,
+)
 from rigidjax.solve.exponents import (
-    Exponents as Exponents,
     lyapunov_exponents as lyapunov_exponents,
 )
 from rigidjax.solve.fixed_loop import fixed as fixed

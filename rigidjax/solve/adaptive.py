@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array
 
-from rigidjax.motion import on_the_group
+from rigidjax.motion.equations import on_the_group
 from rigidjax.solve import adaptive_loop, adjoint
 from rigidjax.solve.batching import Arrays, Layout, in_lanes
 from rigidjax.solve.components import flat, leaf_sizes, unflat
@@ -56,20 +56,21 @@ def adaptive(
     `diffrax.PIDController`.
 
     **Arguments:** `solver` an explicit method of this package; `field` a vector field
-    `f(t, y, args)` such as `AttitudeEquations`; `ts` (T,) s; `y0` the state at `ts[0]`; `rtol`,
+    `f(t, y, args)` as of `equations_of_motion`; `ts` (T,) s; `y0` the state at `ts[0]`; `rtol`,
     `atol` scalars; `dt0` the first step, s, or `None`; `jumps` times, s, in any order, at which the
     field jumps: steps end there; `halt(t, y)` a condition, looked at after each step, that ends the
     run. Derivatives are by all numbers of the field, `ts`, `jumps` and
     `y0`, lengths of steps held; not by tolerances.
 
-    **Returns** a `Found`. A run that needs more than `max_steps`, is halted, or meets a NaN that no
-    shorter step avoids, ends early: its `result` says so, and the states not reached are NaN.
+    **Returns** `ys`, `num_steps`, `num_rejected`, `result`, `last_time`, `last` (`Found`). A run
+    that needs more than `max_steps`, is halted, or meets a NaN that no shorter step avoids, ends
+    early: its `result` says so, and the states not reached are NaN.
 
     **Raises:** `TypeError` for a state of several dtypes, or of another than `ts`.
 
     >>> import rigidjax as rj
-    >>> field = rj.motion.AttitudeEquations(rj.Inertia.from_principal(1.0, 2.0, 3.0))
     >>> start = rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 1])
+    >>> field = rj.equations_of_motion(rj.Inertia.from_principal(1.0, 2.0, 3.0), start)
     >>> solver, ts = rj.solvers.Tsitouras5(), jnp.array([0.0, 1.0])
     >>> adaptive(solver, field, ts, start, rtol=1e-9, atol=1e-9).ys.q[1, 3]
     Array(0.47942554, dtype=float64)

@@ -27,7 +27,7 @@ from jaxtyping import Array
 
 from rigidjax.body.inertia import Inertia
 from rigidjax.exact.free_body import FreeMotion
-from rigidjax.motion import on_the_group
+from rigidjax.motion.equations import on_the_group
 from rigidjax.motion.torques.base import jumps_of
 from rigidjax.solve import crossing_loop
 from rigidjax.solve.adaptive import adaptive, taken_out

@@ -15,8 +15,9 @@ from rigidjax import _checks
 from rigidjax._types import ScalarLike
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.frames import Point
-from rigidjax.motion import Attitude, Rigid, Spin, on_the_group
+from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.coupled import Coupled, started
+from rigidjax.motion.equations import on_the_group
 from rigidjax.motion.torques.base import lacking
 from rigidjax.solve import validation
 from rigidjax.solve.components import flat, unflat
@@ -38,7 +39,7 @@ class Event(eqx.Module):
 
     - `condition`: a Module or function `(t, state, body) → scalar`, smooth along the motion; it
       may hold traced numbers. Under a law with states of its own the state is a
-      `rigidjax.motion.Coupled`: `state.motion.omega`, `state.own`.
+      `Coupled`: `state.motion.omega`, `state.own`.
     - `direction`: 1 for a zero on the way up, −1 on the way down, 0 for both (as in SciPy), in the
       order in which the run meets them.
     - `max_step`: the longest step, s. Zeros are found where the condition has changed its sign at
@@ -150,9 +151,10 @@ def crossings(
     could make it (in closed form; else times the root of the number of steps). Many bodies:
     `jax.vmap(lambda start: rj.crossings(body, start, …))`.
 
-    **Returns** `Crossings`. Times and states have first and second derivatives with respect to all
-    numbers of the scene, of `condition` and of `state0`, forward and reverse; near a tangential
-    contact they grow without bound, as the true ones do.
+    **Returns** `times`, `states`, their `count`, `result` and `num_steps` (`Crossings`). Times and
+    states have first and second derivatives with respect to all numbers of the scene, of
+    `condition` and of `state0`, forward and reverse; near a tangential contact they grow without
+    bound, as the true ones do.
 
     Source: Newton's method on the step from the last accepted state, in the place of Hénon's change
     of variable (Hénon 1982, doi:10.1016/0167-2789(82)90034-3): two to three parts of a step.

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from rigidjax.motion import on_the_group
+from rigidjax.motion.equations import on_the_group
 from rigidjax.solve.components import flat, leaf_sizes, unflat
 from rigidjax.solve.runge_kutta import Step, dense_rows, error_estimate, nested, stages
 from rigidjax.solve.tableaus import DORMAND_PRINCE8, KUTTA4, TSITOURAS5, Tableau
@@ -88,8 +88,8 @@ class RungeKutta4(AbstractExplicit):
     Source: Kutta 1901; Hairer, Nørsett and Wanner (1993), II.1, doi:10.1007/978-3-540-78862-1.
 
     >>> import diffrax, rigidjax as rj
-    >>> field = rj.motion.AttitudeEquations(rj.Inertia.from_principal(1.0, 2.0, 3.0))
     >>> start = rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 1])
+    >>> field = rj.equations_of_motion(rj.Inertia.from_principal(1.0, 2.0, 3.0), start)
     >>> term = diffrax.ODETerm(field)
     >>> diffrax.diffeqsolve(term, rj.solvers.RungeKutta4(), 0.0, 1.0, 0.01, start).ys.q[0, 3]
     Array(0.47942554, dtype=float64)

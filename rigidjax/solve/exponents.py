@@ -12,8 +12,8 @@ from jaxtyping import Array, Float
 
 from rigidjax import _checks
 from rigidjax._types import ScalarLike
-from rigidjax.motion import on_the_group
 from rigidjax.motion.coupled import Coupled
+from rigidjax.motion.equations import on_the_group
 from rigidjax.motion.manifold import dimension, minus_small, plus
 from rigidjax.solve import validation
 from rigidjax.solve.adaptive import adaptive
@@ -82,7 +82,8 @@ def lyapunov_exponents(
     (log t)/t, and `errors` does not include such a trend: look at `running`. In a Hamiltonian
     system the exponents come in pairs ±λ; their sum is the mean divergence of `field` always.
 
-    **Returns** `Exponents`. Where a run fails they are NaN, and `result` says why.
+    **Returns** `values` and `errors`, `times` and `running`, `state`, `result` (`Exponents`). Where
+    a run fails they are NaN, and `result` says why.
 
     Source: Dieci, Russell and Van Vleck 1997, doi:10.1137/S0036142993247311; that frames are to be
     held orthonormal: Christiansen and Rugh 1997, doi:10.1088/0951-7715/10/5/004.

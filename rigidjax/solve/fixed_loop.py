@@ -33,7 +33,7 @@ def fixed(
     """`substeps` equal steps between each two times of `ts`.
 
     **Arguments:** `solver` a method of `rigidjax.solvers`; `field` a vector field `f(t, y, args)`
-    such as `AttitudeEquations`; `ts` (T,) s; `y0` the state at `ts[0]`; `substeps` a whole number;
+    as of `equations_of_motion`; `ts` (T,) s; `y0` the state at `ts[0]`; `substeps` a whole number;
     traced, it saves compiling again but has no reverse mode; `last` the index in `ts` at which to
     stop, traced as well (no reverse mode): later times get `y0`; `None` goes to the end.
 
@@ -42,8 +42,8 @@ def fixed(
     **Raises:** `TypeError` for another solver, or as the solver does.
 
     >>> import rigidjax as rj
-    >>> field = rj.motion.AttitudeEquations(rj.Inertia.from_principal(1.0, 2.0, 3.0))
     >>> start = rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 1])
+    >>> field = rj.equations_of_motion(rj.Inertia.from_principal(1.0, 2.0, 3.0), start)
     >>> ys = fixed(rj.solvers.DormandPrince8(), field, jnp.array([0.0, 1.0]), start, 8)
     >>> ys.q[1, 3]
     Array(0.47942554, dtype=float64)

@@ -13,7 +13,8 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from rigidjax.exact.components3 import Four, Triple, cross
-from rigidjax.motion import Attitude, AttitudeEquations
+from rigidjax.motion import Attitude
+from rigidjax.motion.equations import AttitudeEquations
 from rigidjax.motion.torques.base import sees_attitude
 from rigidjax.rotation.barrier import barrier
 from rigidjax.rotation.kernels import product4, square4
@@ -81,8 +82,8 @@ class Magnus4(dfx.AbstractSolver):
     **Raises:** `TypeError` for a torque that looks at the attitude, or another state.
 
     >>> import diffrax, rigidjax as rj
-    >>> field = rj.motion.AttitudeEquations(rj.Inertia.from_principal(1.0, 2.0, 3.0))
     >>> start = rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 1])
+    >>> field = rj.equations_of_motion(rj.Inertia.from_principal(1.0, 2.0, 3.0), start)
     >>> term = diffrax.ODETerm(field)
     >>> diffrax.diffeqsolve(term, Magnus4(), 0.0, 1.0, 0.01, start).ys.q[0, 3]
     Array(0.47942554, dtype=float64)

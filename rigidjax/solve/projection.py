@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 
 from rigidjax import _checks
-from rigidjax.motion import on_the_group
+from rigidjax.motion.equations import on_the_group
 from rigidjax.solve.step_control import NONFINITE, finite
 
 

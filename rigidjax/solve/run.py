@@ -15,8 +15,8 @@ from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.exact.free_body import FreeMotion
 from rigidjax.frames import Point
 from rigidjax.frames.frame_dynamics import scene_of
-from rigidjax.motion import on_the_group
 from rigidjax.motion.coupled import started
+from rigidjax.motion.equations import on_the_group
 from rigidjax.motion.torques.base import jumps_of
 from rigidjax.solve.adaptive import adaptive
 from rigidjax.solve.explicit import AbstractExplicit
@@ -50,7 +50,8 @@ class Setup(eqx.Module):
 class Loop(eqx.Module):
     """A solve of which nothing is asked but states and derivatives: our own loop.
 
-    `sign` of the direction of time; `None` where it is known to go forwards.
+    `sign` of the direction of time; `None` where it is known to go forwards. `cuts` times at which
+    a step has to end, beside the jumps of the torque.
     """
 
     body: Inertia | MassProperties | None
@@ -62,6 +63,7 @@ class Loop(eqx.Module):
     sign: Array | None
     max_steps: int = eqx.field(static=True)
     throw: bool = eqx.field(static=True)
+    cuts: Array | None = None
 
 
 class Ends(eqx.Module):
@@ -104,7 +106,7 @@ def _in_steps(
     run: Any = _loop if isinstance(setup, Loop) else _by_diffrax
     ys, stats, result, end = run(setup, watch, state0, ts)
     if setup.throw:
-        ys = _raise(ys, result)
+        ys = refuse(ys, result)
     if watch is not None:
         ended = result == dfx.RESULTS.event_occurred
         stats |= {"ended": ended, "end_time": end[0], "end_state": end[1]}
@@ -147,6 +149,8 @@ def _loop(
     setup: Loop, watch: Ends | None, state0: Any, ts: Array
 ) -> tuple[Any, dict[str, Any], dfx.RESULTS, Any]:
     field, jumps = equations_of_motion(setup.body, state0, setup.torque), jumps_of(setup.torque)
+    if setup.cuts is not None:
+        jumps = jnp.concatenate([jumps.astype(ts.dtype), setup.cuts])
     field, watch, along, jumps = ahead(setup.sign, field, watch, ts, jumps)
     out = adaptive(
         setup.solver,
@@ -180,7 +184,8 @@ def _reached(ys: Any, times: Array) -> Any:
     return jax.tree.map(mark, ys)
 
 
-def _raise(ys: Any, result: dfx.RESULTS) -> Any:
+def refuse(ys: Any, result: dfx.RESULTS) -> Any:
+    """The states `ys`, or an error in words where the run did not get to its end."""
     ys = eqx.error_if(
         ys,
         result == NONFINITE,

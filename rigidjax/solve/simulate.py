@@ -1,5 +1,6 @@
 """`simulate`: the motion of a body or a particle, saved at given times."""
 
+import dataclasses
 import functools
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -16,10 +17,11 @@ from rigidjax.motion.coupled import Coupled, motion_of
 from rigidjax.motion.torques.base import jumps_of
 from rigidjax.solve import validation
 from rigidjax.solve.crossings import Event, ready, solve_until
+from rigidjax.solve.error import foreseen_error, solve_to
 from rigidjax.solve.explicit import AbstractExplicit, DormandPrince8
 from rigidjax.solve.projection import Projected, Watched
-from rigidjax.solve.run import Free, Loop, Setup, refuse_ended, solve
-from rigidjax.solve.solution import Kept, Solution, State
+from rigidjax.solve.run import Free, Loop, Setup, refuse, refuse_ended, solve
+from rigidjax.solve.solution import Kept, Solution, State, told
 from rigidjax.solve.splitting import AbstractSplitting
 from rigidjax.solve.vector_field import direction
 
@@ -47,6 +49,7 @@ def simulate(
     solver: dfx.AbstractSolver | None = None,
     rtol: ScalarLike | None = None,
     atol: ScalarLike | None = None,
+    accuracy: ScalarLike | None = None,
     dt0: ScalarLike | None = None,
     stepsize_controller: dfx.AbstractStepSizeController | None = None,
     adjoint: dfx.AbstractAdjoint | None = None,
@@ -84,6 +87,10 @@ def simulate(
       the smallest number that matters: the time of a flip about the middle axis depends on the rate
       off the axis at the start; where this is below `atol`, it has no meaning. The closed form uses
       neither.
+    - `accuracy`: in the place of tolerances, how far the states may be from the exact motion: rad,
+      and relative to the largest value in the run. Two or more cheap runs find the tolerance.
+      `sol.error` is then known without more runs. Where it exceeds the accuracy (chaos, round-off),
+      a `UserWarning` says from which time on; under `jit` look at `sol.error.relative`.
     - `dt0`, `stepsize_controller`: first step and controller where the tolerances are not enough,
       such as `dt0=0.01, stepsize_controller=diffrax.ConstantStepSize()`.
     - `adjoint`: how derivatives through a solver of diffrax are taken, as there. `None` is
@@ -109,7 +116,7 @@ def simulate(
     **Returns** a `Solution`. A second call with other numbers of the same shapes does not compile
     again.
 
-    Source: `AttitudeEquations`, `EulerEquations`, `NewtonEuler` (notes, eqs 50, 79, 84).
+    Source: the equations of Newton and Euler (notes, eqs 50, 79, 84).
 
     **Raises:** `TypeError` where body, state and torque do not fit; `ValueError` for times that
     neither increase nor decrease, NaN, or a quaternion that is not unit (`EquinoxRuntimeError`
@@ -123,11 +130,16 @@ def simulate(
     max_steps = None if max_steps is None else _checks.whole(max_steps, "max_steps", 1)
     body, state0, times = validation.scene(body, state0, ts, torque, throw)
     if stepsize_controller is None:
+        if accuracy is not None and (rtol is not None or atol is not None):
+            raise ValueError("simulate: give either an accuracy or rtol and atol, not both")
+        if accuracy is not None and _checks.known(accuracy):
+            accuracy = _checks.positive(accuracy, "accuracy")
         rtol, atol = validation.tolerances(rtol, atol, times.dtype)
-    elif rtol is not None or atol is not None:
+    elif rtol is not None or atol is not None or accuracy is not None:
         raise ValueError("simulate: give either rtol and atol or a stepsize_controller, not both")
     if torque is None and solver is None and stepsize_controller is None and body is not None:
-        return _solution(Free(body, throw), event, state0, times)
+        found = _solution(Free(body, throw), event, state0, times)
+        return found if accuracy is None else told(found, found.error, accuracy)
     method = DormandPrince8() if solver is None else solver
     plain = isinstance(method, AbstractExplicit) and max_steps is not None
     plain = plain and stepsize_controller is None and progress_meter is None
@@ -137,7 +149,14 @@ def simulate(
     if plain and isinstance(adjoint, _EITHER_MODE) and not forward:
         way = direction(times)
         loop = Loop(body, torque, method, rtol, atol, first, way, max_steps, throw)  # pyright: ignore
-        return _solution(loop, event, state0, times)
+        if accuracy is None:
+            return _solution(loop, event, state0, times)
+        return _accurate(loop, event, state0, times, accuracy)
+    if accuracy is not None:
+        raise ValueError(
+            "simulate: an accuracy is for the closed form and our own loop: leave solver, adjoint, "
+            "progress_meter and max_steps to their defaults, or take a solver of rigidjax.solvers"
+        )
     if event is not None:
         raise ValueError(
             "simulate: an event is looked for in our own loop and in closed form: leave solver, "
@@ -159,10 +178,21 @@ def simulate(
     return _solution(setup, None, state0, times)
 
 
-def _solution(setup: Any, event: Any, state0: Any, times: Array) -> Solution:
+def _accurate(loop: Loop, event: Any, state0: Any, times: Array, accuracy: Any) -> Solution:
+    found, run, tried = solve_to(loop, state0, times, jnp.asarray(accuracy, times.dtype))
+    found = dataclasses.replace(found, throw=loop.throw)
+    sol = _solution(found, event, state0, times, None if event is not None else run)
+    error = foreseen_error(found, times, sol._states, sol.stats["num_steps"], tried)
+    return told(sol, error, accuracy)
+
+
+def _solution(setup: Any, event: Any, state0: Any, times: Array, run: Any = None) -> Solution:
     event_time = event_state = None
     try:
-        if event is None:
+        if run is not None:
+            ys, stats, result = run
+            ys = refuse(ys, result) if setup.throw else ys
+        elif event is None:
             ys, stats, result = solve(setup, state0, times)
         else:
             event = event if isinstance(event, Event) else Event(event)

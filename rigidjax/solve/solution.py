@@ -19,6 +19,7 @@ from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.coupled import Coupled, motion_of
 from rigidjax.motion.manifold import dimension, minus_small, plus
 from rigidjax.motion.torques.states import require_stateless
+from rigidjax.solve.error import Error, error_of_run
 from rigidjax.solve.run import Free, Loop, Setup, solve
 
 State = TypeVar("State", Spin, Attitude, Rigid, Point)
@@ -55,10 +56,10 @@ class Solution(eqx.Module, Generic[State]):
     conserves; `result` a `diffrax.RESULTS`: `successful`, or why the run ended early, such as
     `max_steps_reached`, `nonfinite`, `nonfinite_input` (no body has these numbers),
     `dt_min_reached`; `event_occurred` where the event was met.
-    `event_time` s, `event_state` of the type of `state0` (`motion.Coupled` under a law with
-    states): NaN where it was not met, `None` where there is no event. `own` a tuple of the states
-    of the laws that have some, as `ys` with a leading time axis (see `rigidjax.torques.freeze`), or
-    `None`.
+    `event_time` s, `event_state` of the type of `state0` (under a law with states `.motion` is
+    that, `.own` the law's): NaN where it was not met, `None` where there is no event. `own` a tuple
+    of the states of the laws that have some, in the order of the laws, what is inside another
+    first, as `ys` with a leading time axis, or `None`.
 
     >>> import rigidjax as rj
     >>> body, start = rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([0.0, 0.0, 1.0])
@@ -75,6 +76,7 @@ class Solution(eqx.Module, Generic[State]):
     event_time: Float[Array, ""] | None = None
     event_state: Any = None
     own: Any = None
+    _error: Error | None = None
 
     def __repr__(self) -> str:
         if not _checks.known((self.ts, self.stats, self.result)) or np.ndim(self.ts) != 1:
@@ -133,6 +135,28 @@ class Solution(eqx.Module, Generic[State]):
                 )
         return found
 
+    @property
+    def error(self) -> Error:
+        """How far the states are from the exact motion of the given numbers: an `Error`.
+
+        A `UserWarning` says from which time on nothing is known, as in chaos.
+
+        Computed when asked for: a run at a hundredth of the tolerances (of equal steps: with half
+        of them), and, where round-off may count, three with the last digits of body, torque and
+        start changed; of the closed form these three alone. Under `jit` and `vmap`, too.
+
+        >>> import rigidjax as rj
+        >>> body, start = rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([0.0, 0.5, 1.0])
+        >>> law = rj.torques.Damping([0.1, 0.1, 0.1])
+        >>> rj.simulate(body, start, [0.0, 5.0], law).error.total["omega"] < 1e-9
+        Array([ True,  True], dtype=bool)
+        """
+        if self._error is not None:
+            return self._error
+        found = error_of_run(self._setup, self.ts, self._states, self.stats["num_steps"])
+        _say(found, 0.5, "error: nothing is known of the states")
+        return found
+
     def transition_matrix(self) -> Float[Array, "times n n"]:
         """∂ state(t) / ∂ state(t₀) at each of `ts`, on the tangent spaces of the states.
 
@@ -175,6 +199,28 @@ class Solution(eqx.Module, Generic[State]):
     @property
     def _states(self) -> Any:
         return self.ys if self.own is None else Coupled(self.ys, self.own)
+
+
+def told(sol: Solution, error: Error, accuracy: Any) -> Solution:
+    """The solution with its error; in words where that exceeds the accuracy asked for."""
+    _say(error, accuracy, "simulate: the accuracy cannot be had")
+    return dataclasses.replace(sol, _error=error)
+
+
+def _say(error: Error, most: Any, words: str) -> None:
+    if not _checks.known((error, most)) or not np.any(np.asarray(error.relative) > most):
+        return
+    i = int(np.argmax(np.asarray(error.relative) > most))
+    steps, off = (
+        max(float(part[name][i] / error.sizes[name]) for name in part)
+        for part in (error.steps, error.round_off)
+    )
+    single = "" if error.ts.dtype == jnp.float64 else ", or take float64"
+    warnings.warn(
+        f"{words} from t = {float(error.ts[i]):g} s on: the steps leave {steps:.1e}, round-off "
+        f"{off:.1e} (rad, or relative); end the run earlier{single}",
+        stacklevel=5,
+    )
 
 
 @eqx.filter_jit

@@ -18,7 +18,8 @@ from jaxtyping import Array
 from rigidjax.exact.components3 import Six, Triple, adjugate, determinant, plus, times
 from rigidjax.exact.derivatives import flow
 from rigidjax.exact.principal_axes import into, out_of, principal_frame
-from rigidjax.motion import Attitude, AttitudeEquations
+from rigidjax.motion import Attitude
+from rigidjax.motion.equations import AttitudeEquations
 from rigidjax.motion.torques.base import evaluate, sees_rate
 from rigidjax.rotation import quaternion
 from rigidjax.solve.explicit import NestedInterpolation, cubic_rows
@@ -138,8 +139,8 @@ class Splitting2(AbstractSplitting):
     Source: Strang 1968, doi:10.1137/0705041, with the free flow of `rigidjax.exact.free_body`.
 
     >>> import diffrax, rigidjax as rj
-    >>> field = rj.motion.AttitudeEquations(rj.Inertia.from_principal(1.0, 2.0, 3.0))
     >>> start = rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 1])
+    >>> field = rj.equations_of_motion(rj.Inertia.from_principal(1.0, 2.0, 3.0), start)
     >>> term = diffrax.ODETerm(field)
     >>> diffrax.diffeqsolve(term, Splitting2(), 0.0, 1.0, 0.5, start).ys.q[0, 3]
     Array(0.47942554, dtype=float64)
@@ -175,7 +176,7 @@ class Splitting6(AbstractSplitting):
 def frame_of(field: Any, y0: Any) -> Frame:
     """The principal frame of the field's body.
 
-    **Raises:** `TypeError` for another field than `AttitudeEquations`, or a torque that feels the
+    **Raises:** `TypeError` for another field than that of an `Attitude`, or a torque that feels the
     body rate: a kick at a fixed attitude is then no exact flow, and the order falls to 1.
     """
     torque = require_attitude("Splitting", field, y0, "DormandPrince8").euler.torque

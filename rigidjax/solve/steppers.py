@@ -28,7 +28,8 @@ from rigidjax.exact.components3 import (
     times,
 )
 from rigidjax.exact.principal_axes import out_of
-from rigidjax.motion import Attitude, AttitudeEquations, EulerEquations, Spin, on_the_group
+from rigidjax.motion import Attitude, Spin
+from rigidjax.motion.equations import AttitudeEquations, EulerEquations, on_the_group
 from rigidjax.motion.torques.base import evaluate, sees_attitude
 from rigidjax.motion.torques.inputs import bind, delays_of
 from rigidjax.rotation import quaternion
@@ -57,12 +58,13 @@ class Stepper(NamedTuple):
 def stepper_of(solver: Any, field: Callable[..., Any], y0: Any) -> Stepper:
     """The stepper of a vector field under `solver`, or under the cheapest that is right.
 
-    **Arguments:** `solver` of `rigidjax.solvers`, or `None`; `field` such as `AttitudeEquations`;
+    **Arguments:** `solver` of `rigidjax.solvers`, or `None`; `field` as of `equations_of_motion`;
     `y0` a state. **Raises:** `TypeError` for a solver that has no such step.
 
     >>> import rigidjax as rj
-    >>> field = rj.motion.EulerEquations(rj.Inertia.from_principal(1.0, 2.0, 2.5))
-    >>> stepper = stepper_of(None, field, rj.Spin([1.0, 0.0, 0.0]))
+    >>> start = rj.Spin([1.0, 0.0, 0.0])
+    >>> field = rj.equations_of_motion(rj.Inertia.from_principal(1.0, 2.0, 2.5), start)
+    >>> stepper = stepper_of(None, field, start)
     >>> [float(number) for number in stepper.start]
     [1.0, 0.0, 0.0]
     """
@@ -73,7 +75,7 @@ def cheapest(field: Callable[..., Any]) -> Magnus4 | RungeKutta4:
     """The method of order 4 that takes the least work.
 
     >>> import rigidjax as rj
-    >>> type(cheapest(rj.motion.EulerEquations(rj.Inertia.from_principal(1.0, 2.0, 2.5)))).__name__
+    >>> type(cheapest(EulerEquations(rj.Inertia.from_principal(1.0, 2.0, 2.5)))).__name__
     'RungeKutta4'
     """
     attitude = isinstance(field, AttitudeEquations)

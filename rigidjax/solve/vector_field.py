@@ -12,9 +12,10 @@ from rigidjax import _checks
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.frames import AbstractScene, MovingFrame, Point
 from rigidjax.frames.frame_dynamics import scene_of
-from rigidjax.motion import Attitude, AttitudeEquations, EulerEquations, NewtonEuler, Rigid, Spin
+from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.coupled import Coupled, CoupledEquations
-from rigidjax.motion.torques import Torque
+from rigidjax.motion.equations import AttitudeEquations, EulerEquations, NewtonEuler
+from rigidjax.motion.torques.base import Torque
 from rigidjax.solve import validation
 
 
@@ -26,7 +27,8 @@ def equations_of_motion(
     """The vector field of this body for states like `state0`, for plain `diffrax.ODETerm`.
 
     **Arguments** `body`, `state0`, `torque` as for `simulate`; under a torque with states of its
-    own `state0` is a `rigidjax.motion.Coupled`. **Raises** `TypeError` where they do not fit.
+    own `state0` is a `rigidjax.motion.coupled.Coupled`. **Raises** `TypeError` where they do not
+    fit.
 
     >>> import rigidjax as rj
     >>> type(equations_of_motion(rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([1.0, 0, 0])))

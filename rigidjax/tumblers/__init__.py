@@ -3,13 +3,11 @@
 from rigidjax._names import show
 from rigidjax.tumblers import brightness as brightness, plot as plot
 from rigidjax.tumblers.light_curve import (
-    Alias as Alias,
     LightCurve as LightCurve,
     fit_light_curve as fit_light_curve,
 )
 from rigidjax.tumblers.sensor import Brightness as Brightness
 from rigidjax.tumblers.two_frequencies import (
-    TwoFrequencies as TwoFrequencies,
     two_frequencies as two_frequencies,
 )
 

@@ -99,7 +99,7 @@ class LightCurve(eqx.Module):
 
     @property
     def rivals(self) -> tuple[Alias, ...]:
-        """The other motions that explain the data nearly as well."""
+        """The other motions that explain the data nearly as well: `rotation`, `precession`, …"""
         return tuple(alias for alias in self.aliases[1:] if alias.explains)
 
     def __str__(self) -> str:

@@ -67,6 +67,7 @@ def two_frequencies(
     squares; `noise` their standard deviation, one or (T,), `None` if it is not known; `order` k up
     to which multiples of f₂ are taken; `shortest` period that a line may have, s, `None` for four
     times the median distance of the times; `count` how many pairs are returned at most.
+    **Returns** `frequencies`, `misfits`, `dof`, `scatter` and `lines` (`TwoFrequencies`).
 
     Source: Pravec et al. 2005, Icarus 173:108, doi:10.1016/j.icarus.2004.07.021 (with all |j| and
     |k| up to one order); the linear fit is that of Lomb 1976, doi:10.1007/BF00648343, for many

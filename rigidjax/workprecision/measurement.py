@@ -12,7 +12,8 @@ import numpy as np
 from rigidjax import _checks
 from rigidjax.body.inertia import Inertia
 from rigidjax.frames.frame_dynamics import scene_of
-from rigidjax.motion import Attitude, AttitudeEquations, drift
+from rigidjax.motion import Attitude, drift
+from rigidjax.motion.equations import AttitudeEquations
 from rigidjax.motion.torques import HeavyTop
 from rigidjax.solve import fixed, solvers
 from rigidjax.workprecision import peers as known

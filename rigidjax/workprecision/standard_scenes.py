@@ -142,7 +142,7 @@ def _arenstorf() -> Scene:
 def scenes() -> dict[str, Callable[[], Scene]]:
     """The standard scenes: name → a function that makes it (in the default precision of JAX).
 
-    The drift over a million steps is apart: `rigidjax.workprecision.long_drift`.
+    The drift over a million steps is apart: `python -m rigidjax workprecision` measures it.
 
     >>> sorted(scenes())[:3]
     ['arenstorf', 'asymmetric-top', 'damped-gyrostat']

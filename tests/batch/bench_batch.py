@@ -17,6 +17,8 @@ import tempfile
 import time
 from pathlib import Path
 
+from rigidjax.motion.equations import AttitudeEquations
+
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
 parser.add_argument("--quick", action="store_true", help="1e3 bodies, fewer rounds")
 parser.add_argument("--float32", action="store_true")
@@ -245,7 +247,7 @@ def naive(bodies, states):
 def plain_diffrax(bodies, states, steps):
     def one(body, state):
         return dfx.diffeqsolve(
-            dfx.ODETerm(rj.motion.AttitudeEquations(body)), dfx.Tsit5(), 0.0, H * steps, H, state,
+            dfx.ODETerm(AttitudeEquations(body)), dfx.Tsit5(), 0.0, H * steps, H, state,
             stepsize_controller=dfx.ConstantStepSize(), max_steps=steps + 1,
         ).ys  # fmt: skip
 
@@ -367,7 +369,7 @@ def adaptive(count):
     few = jax.tree.map(lambda a: a[:small], (bodies, states))
 
     def plain(body, state):
-        field = rj.motion.AttitudeEquations(body, TOP)
+        field = AttitudeEquations(body, TOP)
         return dfx.diffeqsolve(
             dfx.ODETerm(field), dfx.Dopri8(), 0.0, 10.0, None, state,
             stepsize_controller=dfx.PIDController(rtol=1e-9, atol=1e-12),

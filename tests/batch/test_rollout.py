@@ -10,6 +10,7 @@ from once import once
 
 import rigidjax as rj
 from rigidjax.batch.sharding import over_bodies
+from rigidjax.motion.equations import AttitudeEquations
 from rigidjax.solve import fixed
 
 KUTTA = rj.solvers.RungeKutta4()
@@ -52,7 +53,7 @@ def test_steps_are_diffraxs(torque, method):
     bodies, states = batch(3)
 
     def one(body, state):
-        field = rj.motion.AttitudeEquations(body, torque)
+        field = AttitudeEquations(body, torque)
         return dfx.diffeqsolve(
             dfx.ODETerm(field), method, 0.0, 1.2, 0.1, state,
             stepsize_controller=dfx.ConstantStepSize(),
@@ -106,7 +107,7 @@ def test_derivatives_are_those_of_the_steps():
         law = eqx.tree_at(lambda law: law.com, TOP, com)
 
         def one(tensor, q, omega):
-            field = rj.motion.AttitudeEquations(rj.Inertia(tensor), law)
+            field = AttitudeEquations(rj.Inertia(tensor), law)
             ts = jnp.stack([0.0 * h, 6 * h])
             return jax.tree.map(lambda a: a[1], fixed(KUTTA, field, ts, rj.Attitude(q, omega), 6))
 

@@ -7,7 +7,7 @@ import pytest
 
 import rigidjax as rj
 from rigidjax.body import shapes
-from rigidjax.body.energy import energy_ellipsoid, equal_ellipsoid, momentum_ellipsoid
+from rigidjax.body.energy import ellipsoid
 
 INERTIA = rj.Inertia.from_principal(1.0, 2.0, 2.5).rotated(np.array([0.8, 0.0, 0.6, 0.0]))
 
@@ -20,24 +20,24 @@ def surface(semi_axes, q):
 
 
 def test_every_rate_on_it_has_that_energy_or_momentum():
-    rates = jnp.asarray(surface(*energy_ellipsoid(INERTIA, 3.0)))
+    rates = jnp.asarray(surface(*ellipsoid(INERTIA, "energy", 3.0)))
     energies = jax.vmap(lambda w: rj.kinetic_energy(INERTIA, w))(rates)
     np.testing.assert_allclose(energies, 3.0, rtol=1e-13)
-    rates = jnp.asarray(surface(*momentum_ellipsoid(INERTIA, 3.0)))
+    rates = jnp.asarray(surface(*ellipsoid(INERTIA, "momentum", 3.0)))
     momenta = jax.vmap(lambda w: rj.angular_momentum(INERTIA, w))(rates)
     np.testing.assert_allclose(np.linalg.norm(momenta, axis=1), 3.0, rtol=1e-13)
 
 
 def test_the_equal_ellipsoid_has_the_same_mass_properties():
     body = shapes.box(2.0, [1.0, 2.0, 3.0]).rotated(np.array([0.8, 0.0, 0.6, 0.0]))
-    semi_axes, q = equal_ellipsoid(body)
+    semi_axes, q = ellipsoid(body, "mass")
     again = shapes.ellipsoid(2.0, semi_axes).rotated(q)
     np.testing.assert_allclose(again.second_moment, body.second_moment, rtol=1e-13, atol=1e-14)
 
 
 def test_a_sphere_carries_derivatives():
     def axes(a):
-        return energy_ellipsoid(rj.Inertia(a), 2.0)[0]
+        return ellipsoid(rj.Inertia(a), "energy", 2.0)[0]
 
     gradient = jax.grad(lambda a: axes(a).sum())(jnp.eye(3))
     np.testing.assert_allclose(gradient, -np.eye(3), atol=1e-14)
@@ -45,4 +45,11 @@ def test_a_sphere_carries_derivatives():
 
 def test_a_rod_has_none(unhooked):
     with pytest.raises(ValueError, match="thin rod"):
-        energy_ellipsoid(shapes.rod(1.0, 1.0).inertia, 1.0)
+        ellipsoid(shapes.rod(1.0, 1.0).inertia, "energy", 1.0)
+
+
+def test_a_size_that_is_missing_or_too_much_is_refused():
+    with pytest.raises(TypeError, match="of momentum wanted the momentum, kg m²/s, got None"):
+        ellipsoid(INERTIA, "momentum")
+    with pytest.raises(TypeError, match=r"of mass wanted no size, got 1\.0"):
+        ellipsoid(shapes.box(2.0, [1.0, 2.0, 3.0]), "mass", 1.0)

@@ -15,6 +15,7 @@ from estimate import records
 import rigidjax as rj
 from rigidjax import estimate, identify
 from rigidjax.estimate.terms import curvature
+from rigidjax.identify.answers import Answer
 
 
 @functools.cache
@@ -37,8 +38,8 @@ def fitted():
     nothing = jnp.zeros((0, 5))
     return identify.Fit(
         problem(), at, covariance, covariance, "", (jnp.full((1, 3), 0.02),), (), 0.0, 1, 1.0, 1.0,
-        jnp.ones(5), nothing, (), identify.Answer("found"),
-        identify.Answer("explains the readings"), (),
+        jnp.ones(5), nothing, (), Answer("found"),
+        Answer("explains the readings"), (),
     )  # fmt: skip
 
 
@@ -384,7 +385,7 @@ def test_weighted_draws_stand_for_the_density(fitted):
     low2, high2 = found.interval_of(lambda point: point.parameters.own.spin)
     np.testing.assert_allclose(high2 - low2, high - low, rtol=0.15)
     early = eqx.tree_at(lambda f: f.converged, poor, jnp.asarray(False))
-    with pytest.raises(ValueError, match="the search did not come to the maximum"):
+    with pytest.raises(ValueError, match="the search did not reach the maximum"):
         early.interval_of(lambda point: point.parameters.own.spin)
     with pytest.raises(ValueError, match="draws: wanted"):
         estimate.refit(density, draws=0)

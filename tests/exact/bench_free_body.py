@@ -12,7 +12,8 @@ jax.config.update("jax_enable_x64", True)
 
 import rigidjax.exact as exact
 from rigidjax.body.inertia import Inertia
-from rigidjax.motion import Attitude, AttitudeEquations
+from rigidjax.motion import Attitude
+from rigidjax.motion.equations import AttitudeEquations
 
 
 def closed(tensor, omega, t):

@@ -13,8 +13,10 @@ import pytest
 
 import rigidjax.exact as exact
 from rigidjax.body.inertia import Inertia, MassProperties
+from rigidjax.exact.diffrax_solver import FreeSolver
 from rigidjax.exact.free_body import FreeMotion
-from rigidjax.motion import Attitude, AttitudeEquations, EulerEquations, Rigid, Spin
+from rigidjax.motion import Attitude, Rigid, Spin
+from rigidjax.motion.equations import AttitudeEquations, EulerEquations
 from rigidjax.motion.torques import ConstantTorque
 
 sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[1] / "systems")]
@@ -449,7 +451,7 @@ def test_solver_is_exact_at_any_step_both_ways():
     def solve(first, last, step, start, ts, between):
         """States at `ts`, and by the interpolation."""
         saveat = diffrax.SaveAt(ts=ts, dense=True)
-        sol = diffrax.diffeqsolve(TERM, exact.FreeSolver(), first, last, step, start, saveat=saveat)
+        sol = diffrax.diffeqsolve(TERM, FreeSolver(), first, last, step, start, saveat=saveat)
         return sol.ys, sol.evaluate(between)
 
     ys, between = solve(0.0, 20.0, 20.0, START, ts, ts[1])
@@ -464,7 +466,7 @@ def test_solver_is_exact_at_any_step_both_ways():
 def test_solver_finds_an_event():
     event = diffrax.Event(lambda t, y, args, **_: y.omega[1], optx.Newton(1e-9, 1e-9))
     solve = diffrax.diffeqsolve
-    sol = filter_once(solve)(TERM, exact.FreeSolver(), 0.0, 30.0, 1.0, START, event=event)
+    sol = filter_once(solve)(TERM, FreeSolver(), 0.0, 30.0, 1.0, START, event=event)
     assert abs(float(sol.ts[0]) / 17.402483478546878418 - 1) < 1e-12
 
 
@@ -478,7 +480,7 @@ def test_solver_finds_the_first_of_many_events():
         return y.omega[1] + 0.5
 
     event = diffrax.Event([middle, low], optx.Newton(1e-10, 1e-10))
-    sol = diffrax.diffeqsolve(TERM, exact.FreeSolver(), 0.0, 200.0, 6.0, START, event=event)
+    sol = diffrax.diffeqsolve(TERM, FreeSolver(), 0.0, 200.0, 6.0, START, event=event)
     assert sol.result == diffrax.RESULTS.event_occurred
     assert abs(float(sol.ts[0]) / 17.402483478546878418 - 1) < 1e-12
 
@@ -487,9 +489,7 @@ def test_solver_finds_the_first_of_many_events():
 def test_solver_adjoints_agree():
     def final(omega, adjoint):
         term = diffrax.ODETerm(EulerEquations(BODY))
-        sol = diffrax.diffeqsolve(
-            term, exact.FreeSolver(), 0.0, 3.0, 1.0, Spin(omega), adjoint=adjoint
-        )
+        sol = diffrax.diffeqsolve(term, FreeSolver(), 0.0, 3.0, 1.0, Spin(omega), adjoint=adjoint)
         return sol.ys.omega[0, 0]
 
     omega = jnp.array([0.2, 1.0, 0.3])
@@ -538,7 +538,7 @@ def test_one_free_motion_for_every_state():
         ),
         (lambda: exact.free_body(BODY, START, [1.0, 2.0]), "vmap"),
         (
-            lambda: exact.FreeSolver().init(
+            lambda: FreeSolver().init(
                 diffrax.ODETerm(EulerEquations(BODY, ConstantTorque([0.0, 0, 1]))),
                 0,
                 1,

@@ -12,6 +12,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from rigidjax.motion.equations import AttitudeEquations
+
 jax.config.update("jax_enable_x64", True)
 
 import rigidjax as rj
@@ -36,7 +38,7 @@ def large_steps(axis):
     """D3, D19: 200 steps of a heavy top; error of the energy against h|Ω|."""
     body = rj.Inertia.from_principal(1.0, 1.8, 2.5)
     law = rj.torques.HeavyTop(1.0, [0.0, 0.1, 0.4], [0.0, 0.0, -1.0])
-    field = rj.motion.AttitudeEquations(body, law)
+    field = AttitudeEquations(body, law)
     start = rj.Attitude([1.0, 0, 0, 0], [0.3, 0.5, 1.0])
     size = float(jnp.linalg.norm(start.omega))
     steps = np.logspace(-1.5, 1, 22) / size

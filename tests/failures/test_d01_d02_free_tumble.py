@@ -18,6 +18,7 @@ import pytest
 from systems.tumble import Nothing
 
 import rigidjax as rj
+from rigidjax.motion.equations import EulerEquations
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "exact"))
 import twin
@@ -95,7 +96,7 @@ def test_d02_a_body_that_keeps_its_rate_is_caught():
 
 def test_d02_the_gyroscopic_term_is_differentiated_too():
     """d(dΩ/dt)/dΩ of a free body against the formula, at a spin where it is large."""
-    field = rj.motion.EulerEquations(BODY)
+    field = EulerEquations(BODY)
     found = jax.jacfwd(lambda w: field(0.0, rj.Spin(w), None).omega)(jnp.asarray(OMEGA))
     i1, i2, i3 = 1.0, 2.0, 2.5
     x, y, z = OMEGA

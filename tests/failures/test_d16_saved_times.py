@@ -11,9 +11,10 @@ import pytest
 from systems.tumble import BODY, START, TOP
 
 import rigidjax as rj
+from rigidjax.motion.equations import AttitudeEquations
 from rigidjax.solve import fixed
 
-FIELD = rj.motion.AttitudeEquations(BODY, TOP)
+FIELD = AttitudeEquations(BODY, TOP)
 TS = jnp.linspace(0.0, 20.0, 301)
 
 

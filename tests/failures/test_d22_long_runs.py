@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import rigidjax as rj
+from rigidjax.motion.equations import AttitudeEquations
 from rigidjax.solve import fixed
 
 STEPS, LOOKS = 1_000_000, 101
@@ -33,7 +34,7 @@ def test_d22_a_million_steps(solver, dtype, bars):
     body = rj.Inertia(jnp.diag(jnp.array([1.0, 2.0, 3.0], dtype)))
     start = rj.Attitude(jnp.array([1.0, 0, 0, 0], dtype), jnp.array([1.0, 0.7, 0.4], dtype))
     ts = jnp.linspace(0.0, 0.01 * STEPS, LOOKS, dtype=dtype)
-    field = rj.motion.AttitudeEquations(body)
+    field = AttitudeEquations(body)
     n = jnp.asarray(STEPS // (LOOKS - 1))
     ys = jax.jit(lambda ts, n: fixed(solver, field, ts, start, n))(ts, n)
     double = lambda tree: jax.tree.map(lambda leaf: leaf.astype(jnp.float64), tree)
@@ -49,7 +50,7 @@ def test_d22_a_million_steps(solver, dtype, bars):
 @pytest.mark.slow
 def test_d19_the_length_of_the_momentum_over_a_million_steps():
     body = rj.Inertia.from_principal(1.0, 1.8, 2.5)
-    field = rj.motion.AttitudeEquations(body)
+    field = AttitudeEquations(body)
     start = rj.Attitude([1.0, 0, 0, 0], [0.3, 0.2, 1.0])
     ts = jnp.linspace(0.0, 1e6, LOOKS)
     ys = jax.jit(lambda ts, n: fixed(rj.solvers.Splitting2(), field, ts, start, n))(

@@ -15,9 +15,10 @@ import pytest
 from once import filter_once
 
 import rigidjax as rj
+from rigidjax.motion.equations import AttitudeEquations
 
 BODY = rj.Inertia.from_principal(1.0, 2.0, 3.0)
-FIELD = rj.motion.AttitudeEquations(BODY)
+FIELD = AttitudeEquations(BODY)
 Q = jnp.array([1.0, 0.0, 0.0, 0.0])
 OMEGA = jnp.array([0.0, 1.0, 1e-2])
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import rigidjax as rj
+from rigidjax.motion.equations import AttitudeEquations
 
 TURN = jnp.array([0.3, -0.2, 0.5], jnp.float32)
 BODY = rj.Inertia(jnp.diag(jnp.array([1.0, 2.0, 3.0], jnp.float32)))
@@ -21,7 +22,7 @@ STEPS = {
     "so3.log": lambda v: rj.so3.log(rj.so3.exp(v)),
     "so3.project": lambda v: rj.so3.project(rj.so3.exp(v)),
     "quaternion": lambda v: rj.quaternion.rotate(rj.quaternion.exp(v), v),
-    "field": lambda v: rj.motion.AttitudeEquations(BODY)(0.0, rj.Attitude(START.q, v), None).omega,
+    "field": lambda v: AttitudeEquations(BODY)(0.0, rj.Attitude(START.q, v), None).omega,
     "closed form": lambda v: rj.exact.free_body(BODY, rj.Attitude(START.q, v), 1.0).q,
 }
 

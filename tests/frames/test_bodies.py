@@ -8,7 +8,9 @@ import pytest
 from frames.test_moving import NUMBERS, TIGHT, wobbly
 
 import rigidjax as rj
-from rigidjax.frames import BodyInFrame, InFrame, MovingFrame, Point
+from rigidjax.frames import BodyInFrame, MovingFrame, Point
+from rigidjax.frames.frame_dynamics import InFrame
+from rigidjax.motion.equations import AttitudeEquations
 
 BODY = rj.shapes.box(2.0, [0.3, 0.5, 0.8])
 START = rj.Rigid([0.4, -0.2, 0.3], [0.1, 0.5, -0.3], [0.8, 0.0, 0.6, 0.0], [0.5, -0.4, 0.7])
@@ -97,7 +99,7 @@ def test_a_frame_rides_on_a_forced_body():
     np.testing.assert_allclose(now.rate, there.omega, rtol=0, atol=1e-13)
     np.testing.assert_allclose(now.rotation, rj.quaternion.to_matrix(there.q), rtol=0, atol=1e-13)
     # dΩ/dt of the solved motion against the equation it solves.
-    wanted = rj.motion.AttitudeEquations(INERTIA, DRIVE)(t, there).omega
+    wanted = AttitudeEquations(INERTIA, DRIVE)(t, there).omega
     np.testing.assert_allclose(now.rate_change, wanted, rtol=0, atol=1e-11)
     for state in (Point(NUMBERS[:3], NUMBERS[3:6]), START, ATTITUDE):
         same(now.from_inertial(now.to_inertial(state)), state, 1e-11)

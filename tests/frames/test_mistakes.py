@@ -5,16 +5,8 @@ import numpy as np
 import pytest
 
 from rigidjax import orbits
-from rigidjax.frames import (
-    AboutAxis,
-    BodyInFrame,
-    Force,
-    InFrame,
-    MovingFrame,
-    Point,
-    Uniform,
-    scenes,
-)
+from rigidjax.frames import AboutAxis, BodyInFrame, Force, MovingFrame, Point, Uniform, scenes
+from rigidjax.frames.frame_dynamics import InFrame
 
 NAN = float("nan")
 FRAME = MovingFrame(Uniform([0.0, 0.0, 1.0]))

@@ -11,16 +11,10 @@ from hypothesis import given, settings, strategies as st
 from once import once
 
 import rigidjax as rj
-from rigidjax.frames import (
-    AboutAxis,
-    BodyInFrame,
-    Force,
-    InFrame,
-    Instant,
-    MovingFrame,
-    Point,
-    Uniform,
-)
+from rigidjax.frames import AboutAxis, BodyInFrame, Force, MovingFrame, Point, Uniform
+from rigidjax.frames.frame_dynamics import InFrame
+from rigidjax.frames.frame_kinematics import Instant
+from rigidjax.motion.equations import EulerEquations
 
 TIGHT = dict(rtol=1e-13, atol=1e-14)
 
@@ -261,7 +255,7 @@ def test_a_frame_that_rides_on_a_body():
     state = solution.evaluate(2.5)
     np.testing.assert_allclose(now.rate, state.omega, atol=1e-14)
     np.testing.assert_allclose(now.rotation, rj.quaternion.to_matrix(state.q), atol=1e-14)
-    euler = rj.motion.EulerEquations(body)(0.0, rj.Spin(state.omega)).omega
+    euler = EulerEquations(body)(0.0, rj.Spin(state.omega)).omega
     np.testing.assert_allclose(now.rate_change, euler, atol=1e-12)
     # Its Ω agrees with vee(Mᵀ dM/dt).
     plain = MovingFrame(MovingFrame(solution).matrix).angular_velocity(2.5)

@@ -1,6 +1,6 @@
 """How long fits of throws take, beside SciPy with numba and beside `mujoco.sysid`.
 
-    python tests/identify/bench_fit.py [--repeats 9] [--joint] [--many]
+    python tests/identify/bench_fit.py [--repeats 9] [--joint] [--many] [--real]
 
 One throw: 0.7 s at 1 kHz with a wheel inside, twelve free numbers (`Tensor`, rates, drag). All
 from the same start but where it says otherwise, times of the processor, medians of interleaved
@@ -15,7 +15,9 @@ repeats in one process, other readings each time; compile apart.
 
 What is not installed is left out. `--joint` adds all throws of the data beside the checkout as one
 problem (see `bench_throws.py`), then 55: throws of the groups that have fewest are in it twice.
-`--steps` adds what one evaluation costs in equal and in adaptive steps.
+`--steps` adds what one evaluation costs in equal and in adaptive steps. `--real` has only the first
+comparison, with the throws of an object beside the checkout in the place of simulated readings:
+their errors are not white, and the fit estimates its noise.
 """
 
 import argparse
@@ -75,6 +77,24 @@ def law(drag):
     return rj.torques.Sum(wheel, rj.torques.Damping(drag))
 
 
+def real():
+    """Of each throw of an object what SciPy needs, the problem of twelve numbers, its start."""
+    places = Path(__file__).parent
+    loaded = importlib.util.spec_from_file_location("throws", places / "throws.py")
+    throws = importlib.util.module_from_spec(loaded)
+    loaded.loader.exec_module(throws)
+    free = [identify.Free(lambda r: r.torque.parts[1].coefficient, "drag", scale=1e-5)]
+    out = []
+    for path in throws.paths("object_empty"):
+        record = throws.record(path)
+        momentum = record.torque.parts[0].momentum
+        h = np.asarray(jax.vmap(momentum.speed)(record.t)) * throws.WHEEL
+        scene = np.asarray(record.readings[0].values), h, np.gradient(h, STEP)
+        made = identify.Problem(record, identify.Tensor(UNIT), free=free)
+        out.append((scene, made, start(made, scene[0])))
+    return out
+
+
 def problem(readings, integrator=None):
     record = identify.Recording(T, (identify.Gyro(SIGMA), readings), torque=law([0.0, 0.0, 0.0]))
     free = [identify.Free(lambda r: r.torque.parts[1].coefficient, "drag", scale=1e-5)]
@@ -131,15 +151,15 @@ def with_numba():
             out[i + 1] = w
         return out
 
-    def residual(x, readings):
+    def residual(x, readings, h, dh):
         inertia = UNIT * symmetric(x)
         inverse = np.linalg.inv(inertia)
-        w = motion(10 * x[6:9], inertia, inverse, 1e-5 * x[9:], WHEEL * SPEED, WHEEL * RATE, STEP)
+        w = motion(10 * x[6:9], inertia, inverse, 1e-5 * x[9:], h, dh, STEP)
         return ((w - readings) / SIGMA).ravel()
 
-    def fit(readings):
+    def fit(readings, h=WHEEL * SPEED, dh=WHEEL * RATE):
         begin = np.r_[np.diag(GUESS) / UNIT, np.zeros(3), readings[0] / 10, np.zeros(3)]
-        return least_squares(residual, begin, args=(readings,), method="lm").cost
+        return least_squares(residual, begin, args=(readings, h, dh), method="lm").cost
 
     return fit
 
@@ -320,6 +340,7 @@ def main():
     parser.add_argument("--joint", action="store_true")
     parser.add_argument("--many", action="store_true")
     parser.add_argument("--steps", action="store_true")
+    parser.add_argument("--real", action="store_true")
     options = parser.parse_args()
     print("load of the machine:", os.getloadavg())
     if options.steps:
@@ -336,8 +357,24 @@ def main():
 
         return fit
 
-    draws = draws_of(body, law(DRAG), count, 0)
     peer = with_numba()
+    if options.real:
+        thrown = real()
+        draws = [thrown[k % len(thrown)] for k in range(count)]
+        tasks = {} if peer is None else {"SciPy and numba": lambda draw: peer(*draw[0])}
+
+        def misfit(found):
+            # As SciPy counts it, from the noise that was estimated.
+            left = found.problem.records.size - found.covariance.shape[0]
+            return 0.5 * left * float(found.noises[0][0, 0] / SIGMA) ** 2
+
+        tasks["ours from the same start"] = lambda draw: misfit(
+            identify.fit(draw[1], starts=1, initial=draw[2])
+        )
+        tasks["ours blind (8 starts)"] = lambda draw: misfit(identify.fit(draw[1]))
+        table("a real throw, 0.5 s, twelve numbers", tasks, draws, "SciPy and numba")
+        return
+    draws = draws_of(body, law(DRAG), count, 0)
     tasks = {} if peer is None else {"SciPy and numba": peer}
 
     def prepared(integrator=None):

@@ -15,6 +15,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from rigidjax.motion.torques.base import AbstractForce
+
 jax.config.update("jax_enable_x64", True)
 
 import rigidjax as rj
@@ -56,7 +58,7 @@ def scene(craft):
     return body, law
 
 
-class Flapping(torques.AbstractForce):
+class Flapping(AbstractForce):
     """The moment of rotors in a cross-flow, linear in the velocity in body axes."""
 
     feels = rj.motion.HasPose

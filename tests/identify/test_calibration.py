@@ -88,7 +88,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say(scene):
         record, chart, free = scene(rng)
         problem = identify.Problem(record, chart, free=free)
         omega = [0.4, 1.2, 1.5] if scene is two_directions_of_a_top else OMEGA
-        plan = identify.plan_of(problem, BODY, omega)
+        plan = problem.start(BODY, omega)
         if truth is None:
             n = sum(x.size for x in jax.tree.leaves(plan))
             named = quantities(problem, plan, np.eye(n), np.zeros((0, n)))

@@ -29,9 +29,8 @@ def tumble():
 @pytest.mark.skipif(not BRICK.exists(), reason="NASA's check case is not beside this checkout")
 def test_nasa_brick_returns_its_ratios():
     # NASA/TM-2015-218675, case 2: I = (0.00189422, 0.006211019, 0.007194665) slug ft².
-    record = rj.identify.read_gyro_csv(
-        BRICK, columns=("t", "p_deg_s", "q_deg_s", "r_deg_s"), unit="deg/s"
-    )
+    t, *rates = rj.identify.read_table(BRICK, ("t", "p_deg_s", "q_deg_s", "r_deg_s")).values()
+    record = rj.identify.Recording(t, (rj.identify.Gyro(), np.deg2rad(rates).T))
     found = rj.identify.fit(rj.identify.Problem(record, rj.identify.Ratios()), starts=2)
     assert found.ok
     moments = np.asarray(found.body.moments)
@@ -106,6 +105,20 @@ def test_a_wrong_motion_is_not_called_outliers(tumble, loss):
     found = rj.identify.fit(rj.identify.Problem(record, rj.identify.Ratios(), loss=loss), starts=2)
     assert found.model.word == "does not explain the readings"
     assert not any("well determined" in words for words in found.identifiability)
+
+
+def test_a_recording_prints_what_it_holds():
+    gyro = rj.identify.Gyro(0.1), jnp.ones((5, 3)) * 1.23456789
+    stars = rj.identify.AttitudeSensor(0.1), jnp.array([[1.0, 0, 0, 0]] * 5), [False] + [True] * 4
+    law = rj.torques.Damping([0.1, 0.1, 0.1])
+    record = rj.identify.Recording(jnp.linspace(0.0, 1.0, 5), gyro, stars, torque=law)
+    assert repr(record) == (
+        "Recording(5 times 0 … 1 s; Gyro: 5 readings from [1.23457, 1.23457, 1.23457]; "
+        "AttitudeSensor: 4 readings from [1, 0, 0, 0]; torque: Damping)"
+    )
+    problem = rj.identify.Problem([record, record], rj.identify.PrincipalRatios())
+    # With a leading axis it has no words of its own.
+    assert "values=f64[2,5,3]" in repr(problem)
 
 
 def test_a_plain_function_turns_a_body_in_a_recording(tumble):

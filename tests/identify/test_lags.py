@@ -6,6 +6,7 @@ import pytest
 
 import rigidjax as rj
 from rigidjax import identify, torques
+from rigidjax.identify.multiple_shooting import pieces
 
 BODY = rj.Inertia.from_principal(1.0, 2.0, 2.5)
 TS = np.linspace(0.0, 4.0, 81)
@@ -45,4 +46,4 @@ def test_moments_and_a_motors_lag_come_back():
 
 def test_pieces_are_refused():
     with pytest.raises(ValueError, match="the torque has states of its own"):
-        identify.pieces(identify.Problem(recording(0.1), identify.Principal(1.5)), 4)
+        pieces(identify.Problem(recording(0.1), identify.Principal(1.5)), 4)

@@ -78,7 +78,7 @@ def test_the_model_goes_through_the_filter_and_so_do_its_derivatives():
     record = identify.Recording(t, (gyro, filtered[::20]))
     move = identify.Free(lambda r: r.readings[0].sensor.lowpass.cutoff, "cutoff", positive=True)
     problem = identify.Problem(record, identify.PrincipalRatios(), free=[move])
-    truth = identify.plan_of(problem, BODY, [3.0, 0.5, 4.0])
+    truth = problem.start(BODY, [3.0, 0.5, 4.0])
     flat, back = ravel_pytree(one(local(problem, truth), 0))
 
     def errors(x):
@@ -146,5 +146,5 @@ def test_mistakes_are_named():
     t = jnp.linspace(0.0, 1.0, 20)
     gyro = identify.Gyro(0.1, lowpass=identify.LowPass(5.0))
     record = identify.Recording(t, (gyro, jnp.ones((20, 3))))
-    with pytest.raises(ValueError, match="a lowpass has a memory of its own"):
+    with pytest.raises(ValueError, match="a lowpass has states of its own"):
         rj.estimate.start(rj.estimate.Model(BODY), record, rate=0.1)

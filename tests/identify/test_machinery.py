@@ -18,7 +18,9 @@ from rigidjax import identify
 from rigidjax.__main__ import main
 from rigidjax.identify import checkpoint, cli_spec, quantities, search
 from rigidjax.identify.checkpoint import Tried
+from rigidjax.identify.csv_io import LogError
 from rigidjax.identify.jacobian import errors_of_one, with_blocks
+from rigidjax.identify.multiple_shooting import pieces
 from rigidjax.identify.padding import one
 from rigidjax.identify.parameters import local, places
 
@@ -189,7 +191,7 @@ def test_pieces_meet_and_give_the_start(free_record):
     np.testing.assert_allclose(
         np.exp(problem.body.logs(whole.body)), [1 / 2.1, 1.6 / 2.1], rtol=0.02
     )
-    cut = identify.fit(identify.pieces(problem, 6), starts=1)
+    cut = identify.fit(pieces(problem, 6), starts=1)
     np.testing.assert_allclose(
         problem.body.logs(cut.body), problem.body.logs(whole.body), atol=5e-3
     )
@@ -197,7 +199,7 @@ def test_pieces_meet_and_give_the_start(free_record):
     motion = rj.simulate(whole.body, whole.state0, free_record.t).ys.omega
     np.testing.assert_allclose(states, motion[::20][:6], atol=0.02)
     with pytest.raises(ValueError, match="at least two pieces of four samples"):
-        identify.pieces(problem, 60)
+        pieces(problem, 60)
 
 
 @pytest.mark.slow
@@ -214,7 +216,7 @@ def test_profile_agrees_with_the_covariance_where_the_misfit_is_quadratic(free_r
 def test_a_design_expects_what_a_fit_then_finds(short_record):
     problem = identify.Problem(short_record, identify.PrincipalRatios())
     found = identify.fit(problem, starts=1)
-    plan = identify.plan_of(problem, BODY, [0.4, 1.2, -0.3])
+    plan = problem.start(BODY, [0.4, 1.2, -0.3])
     for before, after in zip(identify.expected(problem, plan), found.quantities, strict=True):
         np.testing.assert_allclose(before.deviation, after.deviation, rtol=0.05)
     silent = identify.Recording(short_record.t, (identify.Gyro(), short_record.readings[0].values))
@@ -227,7 +229,7 @@ def test_the_best_first_rate_shows_more(free_record):
     problem = identify.Problem(free_record, identify.PrincipalRatios())
     start = [0.05, 0.1, 1.3]
     rate, promise = identify.best_first_rate(problem, BODY, start)
-    poor = identify.expected(problem, identify.plan_of(problem, BODY, start))
+    poor = identify.expected(problem, problem.start(BODY, start))
     np.testing.assert_allclose(jnp.linalg.norm(rate), np.linalg.norm(start), rtol=1e-9)
     doubts = [np.prod([q.deviation for q in qs[:2]]) for qs in (promise, poor)]
     assert doubts[0] < 0.5 * doubts[1]
@@ -478,9 +480,9 @@ def test_logs_of_other_kinds(tmp_path):
     from scipy.io import savemat
 
     savemat(tmp_path / "a.mat", {"t": t, "w": np.ones(5)})
-    with pytest.raises(identify.LogError, match="arrays of different lengths"):
+    with pytest.raises(LogError, match="arrays of different lengths"):
         identify.read_table(tmp_path / "a.mat", ["t", "w"])
-    with pytest.raises(identify.LogError, match="no array 'q'; the arrays are t, w"):
+    with pytest.raises(LogError, match="no array 'q'; the arrays are t, w"):
         identify.read_table(tmp_path / "a.npz", ["q"])
 
 

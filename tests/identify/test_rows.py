@@ -68,7 +68,7 @@ MOTIONS = {
 def test_i2_rank_of_degenerate_motions(name):
     body, omega, rank = MOTIONS[name]
     problem = gyro_problem(rates(body, omega), chart=identify.Tensor(3.0))
-    truth = identify.plan_of(problem, body, list(omega))
+    truth = problem.start(body, list(omega))
     noise = (jnp.full((1, 3), 0.01),)
     linear = uncertainty.linearise(problem, truth, noise)
     spread = uncertainty.spread(linear, uncertainty.correlation_times(linear))
@@ -78,7 +78,7 @@ def test_i2_rank_of_degenerate_motions(name):
 def test_i2_nearly_a_pure_spin_is_seen_but_weakly():
     omega = (1e-4, 0.0, 1.0)
     problem = gyro_problem(rates(omega=omega), chart=identify.Tensor(3.0))
-    truth = identify.plan_of(problem, BODY, list(omega))
+    truth = problem.start(BODY, list(omega))
     noise = (jnp.full((1, 3), 1e-6),)
     linear = uncertainty.linearise(problem, truth, noise)
     spread = uncertainty.spread(linear, uncertainty.correlation_times(linear))
@@ -91,7 +91,7 @@ def away(linear):
 
 def test_the_distance_to_the_least_misfit_is_what_it_explains():
     problem = gyro_problem(rates(), chart=identify.Tensor(3.0))
-    truth = identify.plan_of(problem, BODY, [0.4, 1.2, -0.3])
+    truth = problem.start(BODY, [0.4, 1.2, -0.3])
     moved = jax.tree.map(lambda x: x + 1e-4, truth)
     noise = (jnp.full((1, 3), 0.01),)
     # Exact readings: all of the misfit is the distance, and nothing at the truth.
@@ -104,7 +104,7 @@ def test_the_distance_to_the_least_misfit_is_what_it_explains():
 def test_i3_no_start_is_called_right_that_is_wrong():
     ts = jnp.linspace(0.0, 50.0, 80)
     problem = gyro_problem(noisy(rates(ts=ts), 0.01), ts=ts)
-    truth = identify.plan_of(problem, BODY, [0.4, 1.2, -0.3])
+    truth = problem.start(BODY, [0.4, 1.2, -0.3])
     right = 0
     for first in np.linspace(-2.0, 1.5, 41):
         # The first second moment, over the others, off by e to the power of `first`.
@@ -230,7 +230,7 @@ def test_i9_a_thin_rod_from_a_poor_start():
     omega = (3.0, 0.4, -0.3)
     values = noisy(rates(rod, omega), 1e-3, 7)
     problem = gyro_problem(values, identify.Gyro(1e-3))
-    start = identify.plan_of(problem, rj.Inertia.from_principal(1.1, 45.0, 45.4), list(omega))
+    start = problem.start(rj.Inertia.from_principal(1.1, 45.0, 45.4), list(omega))
     found = identify.fit(problem, starts=1, initial=start)
     moments = np.sort(np.asarray(found.body.moments))
     assert moments[0] > 0 and moments[0] + moments[1] >= moments[2]

@@ -108,11 +108,17 @@ def test_attitude_reads_the_same_for_q_and_minus_q_bit_for_bit():
 def test_readings_as_matrices_and_euler_angles_are_the_same():
     angles = np.array([[0.3, 0.4, 0.5], [1.0, 0.2, -0.4]])
     matrices = np.stack([np.asarray(rj.euler.to_matrix(jnp.asarray(a), "ZYX")) for a in angles])
-    one = rj.identify.quaternions_from_matrices(matrices)
-    two = rj.identify.quaternions_from_euler(np.degrees(angles), "ZYX", unit="deg")
+    sensor = rj.identify.AttitudeSensor(0.01)
+    one = rj.identify.Recording([0.0, 1.0], (sensor, matrices)).readings[0].values
+    degrees = jnp.asarray(np.degrees(angles))
+    two = jax.vmap(lambda a: rj.euler.to_quaternion(jnp.deg2rad(a), "ZYX"))(degrees)
     np.testing.assert_allclose(np.abs(np.sum(one * two, axis=1)), 1, atol=1e-15)
-    gap = rj.identify.quaternions_from_euler([[np.nan, 0, 0], [0.0, 0, 0]], "ZYX")
-    assert np.isnan(gap[0]).all() and gap[1, 0] == 1
+    # A gap is masked as any other.
+    matrices = np.concatenate([matrices, np.full((1, 3, 3), np.nan)])
+    with pytest.raises(ValueError, match="the reading at index 2 contains NaN"):
+        rj.identify.Recording([0.0, 1.0, 2.0], (sensor, matrices))
+    gap = rj.identify.Recording([0.0, 1.0, 2.0], (sensor, matrices, [True, True, False]))
+    np.testing.assert_array_equal(gap.readings[0].values, one)
 
 
 class Tachometer(rj.identify.AbstractSensor):
@@ -135,7 +141,7 @@ def test_a_sensor_of_ones_own():
     squares = jnp.sum(ys.omega**2, axis=1, keepdims=True)
     record = rj.identify.Recording(ts, (Tachometer(), squares), (rj.identify.Gyro(1e-4), ys.omega))
     problem = rj.identify.Problem(record, rj.identify.PrincipalRatios())
-    truth = rj.identify.plan_of(problem, body, ys.omega[0])
+    truth = problem.start(body, ys.omega[0])
     for error in problem.errors(truth):
         np.testing.assert_allclose(error, 0, atol=1e-12)
 
@@ -156,7 +162,7 @@ def test_mistakes_in_a_sensor_of_ones_own_are_named():
         gyro = (rj.identify.Gyro(1e-4), jnp.ones((40, 3)))
         record = rj.identify.Recording(ts, (sensor, readings), gyro)
         problem = rj.identify.Problem(record, rj.identify.PrincipalRatios())
-        return problem.errors(rj.identify.plan_of(problem, body, [1.0, 1.0, 1.0]))
+        return problem.errors(problem.start(body, [1.0, 1.0, 1.0]))
 
     with pytest.raises(ValueError, match=r"Scalar.error: wanted .* of shape \(1,\), .*got \(\)"):
         errors(Scalar())
@@ -178,8 +184,7 @@ MISTAKES = [
     (lambda: rj.identify.Accelerometer(place=None), "place: wanted three numbers, got None"),
     (lambda: rj.identify.Direction([0.0, 0.0, 0.0]), "got a vector of length zero"),
     (lambda: rj.identify.Direction([0.0, 0, 1], [0.1, 0.1, 0.1]), r"one number or two, got shape \(3,\)"),
-    (lambda: rj.identify.quaternions_from_matrices(np.diag([1.0, 1, -1])[None]), "index 0 is no rotation.*det = -1"),
-    (lambda: rj.identify.quaternions_from_euler([[0.0, 0, 0]], "ZYX", unit="grad"), "unit: wanted one of rad, deg, got 'grad'"),
+    (lambda: rj.identify.Recording([0.0, 1.0], (rj.identify.AttitudeSensor(), np.stack([np.diag([1.0, 1, -1])] * 2))), "index 0 is no rotation.*det = -1"),
     (lambda: rj.identify.Recording([0.0, 1.0], (rj.identify.Direction([0.0, 0, 1]), [[0.0, 0, 1], [0.0, 0, 2]])), "direction at index 1 is not of length 1"),
     (lambda: rj.identify.Recording([0.0, 1.0], (rj.identify.Gyro(), np.zeros((2, 3)), [False, False])), "it is masked|is masked"),
 ]  # fmt: skip

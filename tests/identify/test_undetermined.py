@@ -9,6 +9,7 @@ from jax.flatten_util import ravel_pytree
 
 import rigidjax as rj
 from rigidjax import identify
+from rigidjax.identify.answers import Answer
 from rigidjax.identify.undetermined import Combination
 
 TS = np.linspace(0.0, 1.0, 5)
@@ -35,8 +36,8 @@ def fit_with(chart, directions, search="found", model="explains the readings", m
     like = jnp.eye(n)
     return identify.Fit(
         problem, here, like, like, "none", tuple(jnp.ones((1, k)) for k in (3, 3)), (), 1.0, 1,
-        1.0, 1.0, jnp.ones(n), jnp.asarray(null), (), identify.Answer(search),
-        identify.Answer(model), (),
+        1.0, 1.0, jnp.ones(n), jnp.asarray(null), (), Answer(search),
+        Answer(model), (),
     )  # fmt: skip
 
 

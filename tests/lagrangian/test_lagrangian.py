@@ -9,6 +9,8 @@ from systems.marching import rk4
 
 import rigidjax as rj
 from rigidjax import lagrangian, torques
+from rigidjax.lagrangian.hamiltonian import MomentumAndDirection
+from rigidjax.motion.equations import AttitudeEquations
 
 TENSOR = np.array([[1.0, 0.1, -0.05], [0.1, 1.6, 0.2], [-0.05, 0.2, 2.1]])
 INERTIA = rj.Inertia(TENSOR)
@@ -26,7 +28,7 @@ def _starts(count):
 @LAWS
 def test_euler_angles_agree_with_newton_euler_in_the_field(law):
     field = lagrangian.equations_of_motion(lagrangian.EulerAngleTop(INERTIA, law))
-    direct = rj.motion.AttitudeEquations(INERTIA, law)
+    direct = AttitudeEquations(INERTIA, law)
 
     @jax.jit
     @jax.vmap
@@ -43,7 +45,7 @@ def test_euler_angles_agree_with_newton_euler_in_the_field(law):
 
 @LAWS
 def test_lie_poisson_agrees_with_newton_euler_in_the_field(law):
-    direct = rj.motion.AttitudeEquations(INERTIA, law)
+    direct = AttitudeEquations(INERTIA, law)
     if law is None:
         field = lagrangian.lie_poisson(lagrangian.RotationalHamiltonian(INERTIA))
     else:
@@ -80,7 +82,7 @@ def test_all_three_agree_along_a_trajectory(law):
     def run(start, state):
         top = lagrangian.EulerAngleTop(INERTIA, law)
         angles = rk4(lagrangian.equations_of_motion(top), start, 0.5, 1000)
-        direct = rk4(rj.motion.AttitudeEquations(INERTIA, law), state, 0.5, 1000)
+        direct = rk4(AttitudeEquations(INERTIA, law), state, 0.5, 1000)
         if law is None:
             field = lagrangian.lie_poisson(lagrangian.RotationalHamiltonian(INERTIA))
             first = lagrangian.Momentum(INERTIA.tensor @ state.omega)
@@ -144,7 +146,7 @@ def test_casimirs_are_kept_by_any_hamiltonian():
     field = lagrangian.lie_poisson_with_direction(
         lambda p, g: jnp.sum(p**4) + jnp.sin(g[0]) * p[1] + jnp.exp(g[2])
     )
-    y = lagrangian.MomentumAndDirection([0.4, -1.0, 0.7], [0.1, 0.9, -0.3])
+    y = MomentumAndDirection([0.4, -1.0, 0.7], [0.1, 0.9, -0.3])
 
     def casimirs(y):
         return jnp.stack([jnp.sum(y.gamma**2), jnp.sum(y.pi * y.gamma)])
@@ -165,7 +167,7 @@ def test_gradients_with_respect_to_the_numbers_of_a_lagrangian():
 
     def direct(inertia, top, start):
         state = lagrangian.to_attitude(start)
-        return jnp.sum(weights * rj.motion.AttitudeEquations(inertia, top)(0.0, state).omega)
+        return jnp.sum(weights * AttitudeEquations(inertia, top)(0.0, state).omega)
 
     both = jax.jit(lambda *x: (jax.grad(by_angles, (0, 1))(*x), jax.grad(direct, (0, 1))(*x)))
     found, wanted = both(INERTIA, TOP, start)

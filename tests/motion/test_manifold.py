@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 import rigidjax as rj
 from rigidjax.estimate.scene import Extended
-from rigidjax.motion import Coupled
+from rigidjax.motion.coupled import Coupled
 from rigidjax.motion.manifold import (
     coordinates,
     dimension,

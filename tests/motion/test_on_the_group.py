@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import rigidjax as rj
-from rigidjax.motion import on_the_group
+from rigidjax.motion.equations import on_the_group
 
 Q = np.array([0.5, -0.7, 0.1, 0.5])
 

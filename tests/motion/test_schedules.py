@@ -10,6 +10,7 @@ from systems.marching import rk4
 
 import rigidjax as rj
 from rigidjax import torques
+from rigidjax.motion.equations import EulerEquations
 
 BODY = rj.Inertia.from_principal(1.0, 1.3, 1.6)
 START = rj.Spin([0.3, 1.0, 0.2])
@@ -27,7 +28,7 @@ def solve(edges, tolerance, adjoint):
         dfx.PIDController(rtol=tolerance, atol=tolerance), jump_ts=law.jump_times
     )
     return dfx.diffeqsolve(
-        dfx.ODETerm(rj.motion.EulerEquations(BODY, law)),
+        dfx.ODETerm(EulerEquations(BODY, law)),
         dfx.Tsit5(),
         0.0,
         3.0,
@@ -42,8 +43,8 @@ def solve(edges, tolerance, adjoint):
 @jax.jit
 def exact(edges):
     """Three pieces, marched apart: free, pushed, free."""
-    free = rj.motion.EulerEquations(BODY)
-    pushed = rj.motion.EulerEquations(BODY, torques.ConstantTorque([0.0, 0.0, 3.0]))
+    free = EulerEquations(BODY)
+    pushed = EulerEquations(BODY, torques.ConstantTorque([0.0, 0.0, 3.0]))
     y = rk4(free, START, edges[0], 1000)
     y = rk4(pushed, y, edges[1] - edges[0], 1000)
     return rk4(free, y, 3.0 - edges[1], 2000).omega

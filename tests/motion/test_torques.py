@@ -12,7 +12,9 @@ from once import once
 import rigidjax as rj
 from rigidjax import torques
 from rigidjax.motion import conserved, drift, energy
+from rigidjax.motion.equations import AttitudeEquations, EulerEquations, NewtonEuler
 from rigidjax.motion.torques import base
+from rigidjax.motion.torques.base import jumps_of
 
 TENSOR = np.array([[1.0, 0.1, -0.05], [0.1, 1.6, 0.2], [-0.05, 0.2, 2.1]])
 INERTIA = rj.Inertia(TENSOR)
@@ -167,9 +169,9 @@ def test_what_is_said_to_be_conserved_is(law, state, names):
     rigid = isinstance(state, rj.Rigid)
     body = BODY if rigid else INERTIA
     field = {
-        rj.Spin: lambda: rj.motion.EulerEquations(body, law),
-        rj.Attitude: lambda: rj.motion.AttitudeEquations(body, law),
-        rj.Rigid: lambda: rj.motion.NewtonEuler(body, law),
+        rj.Spin: lambda: EulerEquations(body, law),
+        rj.Attitude: lambda: AttitudeEquations(body, law),
+        rj.Rigid: lambda: NewtonEuler(body, law),
     }[type(state)]()
     t = jnp.array(0.5)
     values, rates = jax.jvp(
@@ -182,7 +184,7 @@ def test_what_is_said_to_be_conserved_is(law, state, names):
 
 def test_damping_takes_the_energy_that_it_should():
     law = torques.Sum(torques.Damping([0.1, 0.2, 0.3]), torques.QuadraticDamping([0.3, 0.1, 0.2]))
-    rate = rj.motion.EulerEquations(INERTIA, law)(0.0, SPIN)
+    rate = EulerEquations(INERTIA, law)(0.0, SPIN)
     _, power = jax.jvp(lambda y: energy(INERTIA, y), (SPIN,), (rate,))
     wanted = -np.sum(
         (np.array([0.1, 0.2, 0.3]) + np.array([0.3, 0.1, 0.2]) * np.linalg.norm(OMEGA)) * OMEGA**2
@@ -193,7 +195,7 @@ def test_damping_takes_the_energy_that_it_should():
 def test_newton_euler_adds_forces_and_torques():
     drag = torques.Drag(0.7, centre=[0.1, 0.2, -0.3], wind=[0.1, 0.0, 0.2])
     law = torques.Sum(FALL, drag, torques.ConstantTorque([0.1, 0.2, 0.3]))
-    found = rj.motion.NewtonEuler(BODY, law)(0.0, RIGID)
+    found = NewtonEuler(BODY, law)(0.0, RIGID)
     push = _drag_by_hand()
     np.testing.assert_allclose(found.v, [0.3, -0.4, -9.7] + push / 2.0, rtol=1e-14)
     torque = np.array([0.1, 0.2, 0.3]) + np.cross([0.1, 0.2, -0.3], R.T @ push)
@@ -244,9 +246,9 @@ def test_at_rest_the_first_derivative_of_quadratic_laws_is_zero_not_nan(mode):
 @pytest.mark.parametrize("law", [TOP, GRADIENT, DIPOLE, WHEEL, SPRING, torques.Flywheel(TABLE)])
 def test_float32_states_stay_float32(law):
     state = rj.Attitude(Q.astype(np.float32), OMEGA.astype(np.float32))
-    found = eqx.filter_jit(rj.motion.AttitudeEquations(INERTIA, law))(jnp.float32(0.5), state)
+    found = eqx.filter_jit(AttitudeEquations(INERTIA, law))(jnp.float32(0.5), state)
     assert found.omega.dtype == found.q.dtype == jnp.float32
-    exact = rj.motion.AttitudeEquations(INERTIA, law)(0.5, ATTITUDE)
+    exact = AttitudeEquations(INERTIA, law)(0.5, ATTITUDE)
     np.testing.assert_allclose(found.omega, exact.omega, rtol=3e-6, atol=3e-6)
 
 
@@ -260,7 +262,7 @@ def test_float32_states_stay_float32(law):
 def test_the_equations_are_elementwise(law, state):
     """No matrix product: its gradient is slow on CPU, and GPUs round it to ten bits."""
     rigid = isinstance(state, rj.Rigid)
-    field = rj.motion.NewtonEuler(BODY, law) if rigid else rj.motion.AttitudeEquations(INERTIA, law)
+    field = NewtonEuler(BODY, law) if rigid else AttitudeEquations(INERTIA, law)
     text = str(jax.make_jaxpr(lambda y: field(0.5, y))(state))
     assert "dot_general" not in text and "while" not in text and "cross" not in text
 
@@ -293,7 +295,7 @@ def test_jump_times_reach_the_front_door():
         torques.Damping([1.0, 1, 1]),
     )
     np.testing.assert_array_equal(law.jump_times, [0.0, 0.0, 1.0, 1.0, 2.0, 2.5, 3.0])
-    assert torques.jumps_of(TOP).shape == (0,) and torques.jumps_of(None).shape == (0,)
+    assert jumps_of(TOP).shape == (0,) and jumps_of(None).shape == (0,)
     assert torques.Sum(TOP, WHEEL).jump_times.shape == (0,)
 
 
@@ -349,12 +351,12 @@ def test_energy_adds_up():
         (lambda: base.require_rung(TOP, SPIN), "HeavyTop needs a state with HasAttitude, got Spin; take Attitude"),
         (lambda: base.require_rung(torques.Sum(WHEEL, TOP), SPIN), "Sum needs.*HasAttitude"),
         (lambda: base.require_rung(FALL, ATTITUDE), "UniformGravity needs a state with HasPose"),
-        (lambda: rj.motion.NewtonEuler(BODY, TOP)(0.0, RIGID), "fixed point.*use UniformGravity"),
+        (lambda: NewtonEuler(BODY, TOP)(0.0, RIGID), "fixed point.*use UniformGravity"),
         (lambda: base.evaluate(lambda t, s, b: torques.Wrench([0.0, 0, 1]), 0.0, SPIN, INERTIA), "needs a Rigid"),
         (lambda: base.evaluate(lambda t, s, b: s.omega[:2], 0.0, SPIN, INERTIA), "body-frame N m"),
         (lambda: energy(INERTIA, SPIN, torques.Damping([1.0, 1, 1])), "Damping has no potential"),
-        (lambda: rj.motion.EulerEquations(rj.Inertia.from_principal(1.0, 1.0, 0.0)), "a principal moment is zero.*rod"),
-        (lambda: rj.motion.NewtonEuler(rj.MassProperties(1.0, np.zeros(3), np.diag([0.0, 0, 1.0]))), "moment is zero"),
+        (lambda: EulerEquations(rj.Inertia.from_principal(1.0, 1.0, 0.0)), "a principal moment is zero.*rod"),
+        (lambda: NewtonEuler(rj.MassProperties(1.0, np.zeros(3), np.diag([0.0, 0, 1.0]))), "moment is zero"),
     ],
 )  # fmt: skip
 def test_mistakes_are_told_in_words(make, words):

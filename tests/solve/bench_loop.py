@@ -20,6 +20,7 @@ import numpy as np
 import rigidjax as rj
 from rigidjax import orbits
 from rigidjax.frames import scenes
+from rigidjax.motion.equations import AttitudeEquations
 
 jax.config.update("jax_enable_x64", True)
 
@@ -158,7 +159,7 @@ def inside_diffrax(ts):
     def run(p, omega):
         body = rj.Inertia.from_principal(p[0], p[1], p[2])
         out = dfx.diffeqsolve(
-            dfx.ODETerm(rj.motion.AttitudeEquations(body, TOP)), rj.solvers.DormandPrince8(), ts[0],
+            dfx.ODETerm(AttitudeEquations(body, TOP)), rj.solvers.DormandPrince8(), ts[0],
             ts[-1], None, rj.Attitude(Q, omega), saveat=dfx.SaveAt(ts=ts), max_steps=100_000,
             stepsize_controller=dfx.PIDController(rtol=RTOL, atol=ATOL),
         )  # fmt: skip

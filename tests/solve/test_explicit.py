@@ -13,6 +13,7 @@ from once import filter_once, once
 from systems import driven, free_body_mp
 
 import rigidjax as rj
+from rigidjax.motion.equations import AttitudeEquations, EulerEquations, NewtonEuler
 from rigidjax.solve import adaptive, fixed, tableaus
 from rigidjax.solve.explicit import DormandPrince8, RungeKutta4, Tsitouras5
 
@@ -23,7 +24,7 @@ METHODS = pytest.mark.parametrize("method", list(LADDER), ids=lambda m: m.__name
 BODY = rj.Inertia.from_principal(1.0, 1.7, 2.2)
 OMEGA = np.array([1.3, 0.7, -1.6])
 Q = np.array([0.8, -0.2, 0.4, 0.4]) / np.linalg.norm([0.8, -0.2, 0.4, 0.4])
-FREE = rj.motion.AttitudeEquations(BODY)
+FREE = AttitudeEquations(BODY)
 START = rj.Attitude(Q, OMEGA)
 LATE = 3.0
 
@@ -272,7 +273,7 @@ def test_events_and_the_gradient_of_their_time():
 
 def test_backwards_rigid_spin_and_batches():
     body = rj.MassProperties(2.0, jnp.zeros(3), BODY.second_moment)
-    field = rj.motion.NewtonEuler(body, rj.torques.Damping(jnp.full(3, 0.1)))
+    field = NewtonEuler(body, rj.torques.Damping(jnp.full(3, 0.1)))
     y0 = rj.Rigid([0.0, 1, 2], [3.0, 0, -1], Q, OMEGA)
 
     @once
@@ -291,7 +292,7 @@ def test_backwards_rigid_spin_and_batches():
         np.testing.assert_allclose(a, b, atol=1e-8)
     rates = jnp.stack([jnp.asarray(OMEGA), 2.0 * OMEGA, jnp.zeros(3)])
     ts = jnp.array([0.0, 1.0])
-    euler = rj.motion.EulerEquations(BODY)
+    euler = EulerEquations(BODY)
 
     def end(w):
         return adaptive(Tsitouras5(), euler, ts, rj.Spin(w), rtol=1e-9, atol=1e-9).ys.omega[-1]

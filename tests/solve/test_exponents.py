@@ -8,6 +8,7 @@ from scipy.integrate import solve_ivp
 
 import rigidjax as rj
 from rigidjax import torques
+from rigidjax.motion.coupled import Coupled
 from rigidjax.motion.manifold import minus, plus
 
 TOP_BODY = rj.Inertia.from_principal(1.0, 1.4, 0.8)
@@ -96,7 +97,7 @@ def test_other_states_over_long_intervals():
     body = rj.Inertia.from_principal(2.0, 2.0, 2.0)
     wheel = torques.ReactionWheels([[0.0, 0, 1]], [0.1], [30.0], viscous=0.2)
     torque = torques.Sum(torques.Damping([0.6, 0.6, 3.0]), wheel)
-    start = rj.motion.Coupled.start(body, START, torque)
+    start = Coupled.start(body, START, torque)
     field = rj.equations_of_motion(body, start, torque)
     found = rj.lyapunov_exponents(field, start, 900.0, intervals=30, transient=10)
     # Ωz and h: 2 Ωz′ = −3 Ωz − u, h′ = u = −0.2 (h/0.1 − Ωz).

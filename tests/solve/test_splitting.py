@@ -12,6 +12,7 @@ from once import once
 from systems import driven
 
 import rigidjax as rj
+from rigidjax.motion.equations import AttitudeEquations, EulerEquations
 from rigidjax.solve import fixed, splitting
 from rigidjax.solve.solvers import DormandPrince8, Splitting2, Splitting4, Splitting6
 
@@ -36,8 +37,8 @@ class Swaying(rj.torques.AbstractTorque):
 
 
 FIELDS = {
-    "top": rj.motion.AttitudeEquations(BODY, TOP),
-    "swaying": rj.motion.AttitudeEquations(BODY, Swaying()),
+    "top": AttitudeEquations(BODY, TOP),
+    "swaying": AttitudeEquations(BODY, Swaying()),
 }
 
 
@@ -91,7 +92,7 @@ def energy(y):
 
 def test_invariants_over_a_hundred_thousand_steps():
     # 1e5 flows of a free body: momentum in space, energy, |q| to round-off.
-    free = rj.motion.AttitudeEquations(BODY)
+    free = AttitudeEquations(BODY)
     ts = jnp.linspace(0.0, 1e4, 11)
 
     @eqx.filter_jit
@@ -185,7 +186,7 @@ def test_derivatives_by_the_whole_tensor():
     change = jnp.array([[0.3, -1.0, 0.7], [-1.0, 0.2, 0.4], [0.7, 0.4, -0.5]])
 
     def end(s):
-        field = rj.motion.AttitudeEquations(rj.Inertia(TENSOR + s * change), TOP)
+        field = AttitudeEquations(rj.Inertia(TENSOR + s * change), TOP)
         out = fixed(Splitting2(), field, jnp.array([0.0, 0.3]), START, 2)
         return jnp.concatenate([out.q[-1], out.omega[-1]])
 
@@ -199,8 +200,8 @@ def test_derivatives_by_the_whole_tensor():
 @pytest.mark.parametrize(
     ("field", "start", "words"),
     [
-        (rj.motion.AttitudeEquations(BODY, rj.torques.Damping(jnp.ones(3))), START, "Damping depends on the body rate"),
-        (rj.motion.EulerEquations(BODY), rj.Spin(START.omega), "wanted AttitudeEquations .* got EulerEquations and Spin"),
+        (AttitudeEquations(BODY, rj.torques.Damping(jnp.ones(3))), START, "Damping depends on the body rate"),
+        (EulerEquations(BODY), rj.Spin(START.omega), "wanted AttitudeEquations .* got EulerEquations and Spin"),
     ],
 )  # fmt: skip
 def test_what_it_cannot_do_is_refused(field, start, words):

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import rigidjax as rj
+from rigidjax.motion.equations import AttitudeEquations
 from rigidjax.motion.torques.base import sees_attitude, sees_rate
 from rigidjax.solve import components, explicit, fixed
 from rigidjax.solve.equal_steps import in_a_loop
@@ -67,7 +68,7 @@ def test_a_law_says_what_it_looks_at(law, attitude, rate):
 
 @pytest.mark.parametrize("law", [Unsaid(), rj.torques.Sum(PUSH, Unsaid())], ids=["one", "sum"])
 def test_what_a_law_does_not_say_is_asked_for(law):
-    field = rj.motion.AttitudeEquations(BODY, law)
+    field = AttitudeEquations(BODY, law)
     with pytest.raises(TypeError, match=r"depends on the attitude, or does not say.*HasSpin"):
         stepper_of(rj.solvers.Magnus4(), field, START)
     with pytest.raises(TypeError, match=r"depends on the body rate.*rate_free = True"):
@@ -80,14 +81,14 @@ def test_what_a_law_does_not_say_is_asked_for(law):
 
 
 def test_a_law_that_breaks_its_word_gives_no_wrong_number():
-    field = rj.motion.AttitudeEquations(BODY, SaysSpin())
+    field = AttitudeEquations(BODY, SaysSpin())
     ts = jnp.array([0.0, 0.1])
     with pytest.raises(TypeError, match=r"SaysSpin looks at state\.q.*by feels"):
         fixed(rj.solvers.Magnus4(), field, ts, START, 2)
     term, solver = dfx.ODETerm(field), rj.solvers.Magnus4()
     one = jax.jit(lambda y: solver.step(term, 0.0, 0.1, y, None, None, False)[0])(START)
     assert bool(jnp.isnan(one.omega).all())
-    field = rj.motion.AttitudeEquations(BODY, SaysRateFree())
+    field = AttitudeEquations(BODY, SaysRateFree())
     ys = jax.jit(lambda y: fixed(rj.solvers.Splitting2(), field, ts, y, 2))(START)
     assert bool(jnp.isnan(ys.omega[1]).all())
 
@@ -104,7 +105,7 @@ def test_derivatives_of_equal_steps(law):
 
     def loss(six, count):
         tensor = BODY.tensor + jnp.tensordot(six, jnp.asarray(basis), 1)
-        field = rj.motion.AttitudeEquations(rj.Inertia(tensor), law)
+        field = AttitudeEquations(rj.Inertia(tensor), law)
         return jnp.sum(fixed(rj.solvers.RungeKutta4(), field, ts, unit, count).omega ** 2)
 
     def all_of(six):
@@ -136,9 +137,7 @@ def test_stages_in_a_loop_take_the_steps_of_those_written_out(plain, law, dtype)
     start = rj.Attitude(start.q / jnp.linalg.norm(start.q), start.omega)
 
     def run(omega, solver):
-        ys = fixed(
-            solver, rj.motion.AttitudeEquations(body, law), ts, rj.Attitude(start.q, omega), 3
-        )
+        ys = fixed(solver, AttitudeEquations(body, law), ts, rj.Attitude(start.q, omega), 3)
         return jnp.concatenate([ys.q[-1], ys.omega[-1]])
 
     def all_of(omega, solver):

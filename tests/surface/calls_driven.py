@@ -7,6 +7,8 @@ from surface.calls import KINDS, row
 from surface.scenes import V, W
 
 import rigidjax as rj
+from rigidjax.identify.horizons import Horizons
+from rigidjax.motion.coupled import Coupled
 
 AXES = np.eye(3)[:2]
 
@@ -15,13 +17,13 @@ def wheels() -> rj.torques.ReactionWheels:
     return rj.torques.ReactionWheels(AXES, [0.1, 0.2], [3.0, -2.0], [0.01, 0.02], viscous=0.01)
 
 
-def held() -> rj.identify.Horizons:
+def held() -> Horizons:
     t = np.arange(8.0)
     return rj.identify.windows(t, rj.Spin(np.outer(t, V)), length=3).held()
 
 
-def coupled() -> rj.motion.Coupled:
-    return rj.motion.Coupled(s.attitude(), (jnp.array([0.3, -0.4]),))
+def coupled() -> Coupled:
+    return Coupled(s.attitude(), (jnp.array([0.3, -0.4]),))
 
 
 row(
@@ -65,17 +67,11 @@ row(
     "motion.torques.ChangingInertia",
     lambda: dict(inertia=lambda t: (1.0 + t) * jnp.eye(3), torque=s.damping()),
 )
-row(
-    "motion.torques.freeze",
-    lambda: dict(law=wheels(), own=coupled().own),
-    arguments=("law",),
-    groups=("same",),
-)
 row("motion.Coupled", lambda: dict(motion=s.attitude(), own=coupled().own), groups=())
 row(
     "motion.Coupled.start",
     lambda: dict(body=s.inertia(), state0=s.attitude(), torque=wheels(), t=0.3),
-    run=rj.motion.Coupled.start,
+    run=Coupled.start,
     arguments=("body", "state0", "t"),
     says=("own", "inertia"),
 )

@@ -106,7 +106,10 @@ row(
 leave_out("made by start and by each filter", "estimate.Belief")
 leave_out(
     "what a function returns",
-    *(f"estimate.{name}" for name in ("Filtered", "Smoothed", "Push", "Sampled")),
+    *(
+        f"estimate.{name}"
+        for name in ("Filtered", "Smoothed", "Push", "Sampled", "Read", "Extended")
+    ),
     "estimate.LinearEstimate",
 )
 leave_out("made of a fit, which takes long; see tests/estimate", "estimate.LogDensity")

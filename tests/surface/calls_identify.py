@@ -8,7 +8,7 @@ import numpy as np
 import optax
 from surface import scenes as s
 from surface.calls import KINDS, leave_out, row
-from surface.scenes import TS, M, N, V, W, Y
+from surface.scenes import TS, M, V, W, Y
 
 import rigidjax as rj
 
@@ -34,12 +34,6 @@ row(
     "identify.Direction", dict(world=Y, noise=np.array([0.1, 0.2]), mounting=V, offset=0.01), **HOST
 )
 row("identify.Marker", dict(place=Y, noise=0.1, origin=V, offset=0.01))
-row("identify.quaternions_from_matrices", dict(matrices=np.stack([M, N])), **HOST)
-row(
-    "identify.quaternions_from_euler",
-    dict(angles=np.stack([V, W]), sequence="ZYX", unit="rad"),
-    **HOST,
-)
 row(
     "identify.Recording",
     lambda: dict(
@@ -65,10 +59,9 @@ row(
     traced=("body", "state0"),
     transforms=("jit", "vmap", "jacfwd"),
 )  # fmt: skip
-leave_out("Recording makes it", "identify.Reading")
 leave_out("a fit makes it", "identify.Combination")
 leave_out("a fit hands it to a sensor", "identify.SensorInput")
-abstract = ("AbstractBodyChart", "AbstractIntegrator", "AbstractLoss", "AbstractSensor")
+abstract = ("AbstractBodyChart", "AbstractLoss", "AbstractSensor")
 leave_out("abstract: made by subclassing", *(f"identify.{name}" for name in abstract))
 
 # What a fit is asked.
@@ -102,8 +95,11 @@ row(
     ),
     **HOST,
 )
-row("identify.Problem.start", lambda: dict(self=s.problem(), body=s.inertia()), arguments=("body",))
-row("identify.plan_of", lambda: dict(problem=s.problem(), body=s.inertia(), omega=W))
+row(
+    "identify.Problem.start",
+    lambda: dict(self=s.problem(), body=s.inertia(), omega=W),
+    arguments=("body", "omega"),
+)
 plan = lambda: s.problem().start(s.inertia())
 for name in ("unpack", "values", "scenes", "motion", "errors"):
     row(
@@ -142,7 +138,6 @@ row(
     groups=("stranger",),
     **HOST,
 )  # fmt: skip
-row("identify.pieces", lambda: dict(problem=s.problem(), count=3, width=1e-3), **HOST)
 row(
     "identify.profile",
     lambda: dict(fit=s.found(), name="Ix/Iz", level=0.9),
@@ -177,11 +172,11 @@ records = (
     "Quantity",
     "Comparison",
     "Own",
+    "Limit",
     "Parameters",
     "Unpacked",
 )
 leave_out("a record that the library fills", *(f"identify.{name}" for name in records))
-leave_out("an exception", "identify.LogError")
 leave_out(
     "a record that windows and fit_windows fill: tests/identify/test_windows.py",
     *(f"identify.{name}" for name in ("Horizons", "WindowFit", "Windows")),
@@ -230,12 +225,6 @@ row(
     "identify.read_table",
     lambda: dict(path=str(log()), columns=["t", "wx"]),
     transforms=(),
-    says=("no such file",),
-)
-row(
-    "identify.read_gyro_csv",
-    lambda: dict(path=str(log()), unit="rad/s", noise=0.1),
-    **HOST,
     says=("no such file",),
 )
 
@@ -344,7 +333,7 @@ row(
     groups=("same", *KINDS, "nan"),
     transforms=(),
 )
-for name in ("choose", "first_answers", "front", "table"):
+for name in ("choose", "table"):
     lines = "lines" if name == "table" else "records"
     row(
         f"workprecision.{name}",
@@ -354,13 +343,6 @@ for name in ("choose", "first_answers", "front", "table"):
         groups=KINDS,
         transforms=(),
     )
-row(
-    "workprecision.moved",
-    lambda: dict(records=list(s.records()), stored=list(s.records())),
-    groups=KINDS,
-    transforms=(),
-)
-row("workprecision.time_to", lambda: dict(records=list(s.records()[:3]), error=1e-5), transforms=())
 row("workprecision.draw", lambda: dict(records=list(s.records())), groups=KINDS, transforms=())
 row("workprecision.methods", dict(group="ours"), transforms=())
 row("workprecision.scenes", transforms=())
@@ -369,15 +351,7 @@ row(
     lambda: dict(solver=__import__("diffrax").Tsit5()),
     transforms=(),
 )
-leave_out(
-    "minutes of measuring: tests/workprecision",
-    *(f"workprecision.{name}" for name in ("measure", "worked_out", "long_drift")),
-)
-leave_out(
-    "files of our own records: tests/workprecision",
-    "workprecision.read_csv",
-    "workprecision.write_csv",
-)
+leave_out("minutes of measuring: tests/workprecision", "workprecision.measure")
 leave_out(
     "a record that is filled as it comes",
     *(f"workprecision.{n}" for n in ("Choice", "Method", "Ready", "Record", "Reference", "Run")),

@@ -93,10 +93,6 @@ row(
     lambda: dict(key=jax.random.key(0), dtype="float64"),
     transforms=(),
 )
-row(
-    "rotation.AttitudeInterpolant",
-    dict(ts=np.array([0.0, 1.0, 2.5]), qs=np.stack([Q, P, Q]), omegas=np.stack([V, W, Y])),
-)
 
 # Charts.
 for chart, g in (("mrp", "sigma"), ("rodrigues", "g")):
@@ -140,16 +136,14 @@ row("MassProperties.rotated", lambda: dict(self=s.body(), q=Q), arguments=("q",)
 row("body.principal", dict(tensor=SYMMETRIC))
 row("body.matrix_function", dict(function=jnp.sqrt, tensor=SYMMETRIC))
 row("body.divergence", lambda: dict(body=s.body(), reference=s.other_body()))
-row("body.energy_ellipsoid", lambda: dict(inertia=s.inertia(), energy=1.5))
-row("body.momentum_ellipsoid", lambda: dict(inertia=s.inertia(), momentum=1.5))
-row("body.equal_ellipsoid", lambda: dict(body=s.body()))
-row("body.kinetic_energy_about", lambda: dict(body=s.body(), q=Q, velocity=V, omega=W))
+row("body.ellipsoid", lambda: dict(body=s.inertia(), kind="energy", size=1.5))
 row(
-    "body.kinetic_energy_of_generator",
-    dict(second_moment=SECOND, generator=np.cross(np.eye(3), -W)),
+    "body.ellipsoid (mass)",
+    lambda: dict(body=s.body()),
+    run=lambda body: rj.body.ellipsoid(body, "mass"),
 )
+row("body.kinetic_energy_about", lambda: dict(body=s.body(), q=Q, velocity=V, omega=W))
 row("body.kinetic_energy_of_matrix_rate", dict(second_moment=SECOND, matrix_rate=N))
-row("body.kinetic_energy_of_moments", dict(second_moments=np.array([1.0, 2.0, 1.5]), omega=W))
 row("kinetic_energy", lambda: dict(body=s.body(), state=s.rigid()))
 row("angular_momentum", lambda: dict(body=s.inertia(), state=s.spin()))
 row("spatial_angular_momentum", lambda: dict(body=s.body(), state=s.rigid()))

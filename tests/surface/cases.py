@@ -11,6 +11,8 @@ from surface.scenes import DOWN, SECOND, SYMMETRIC, TS, P, Q, V, W, Y
 from surface.sweep import Case
 
 import rigidjax as rj
+from rigidjax.frames.frame_dynamics import InFrame
+from rigidjax.motion.equations import AttitudeEquations, EulerEquations, NewtonEuler
 from rigidjax.motion.torques.base import act
 
 q4, so3, mrp, rodrigues, euler = rj.quaternion, rj.so3, rj.mrp, rj.rodrigues, rj.euler
@@ -220,20 +222,6 @@ def rotations() -> list[Case]:
             {"ordinary": join(V, W)},
             step=0.01,
         ),
-        Case(
-            "AttitudeInterpolant",
-            lambda x: rj.rotation.AttitudeInterpolant(
-                jnp.asarray([0.0, 1.0, 2.5]),
-                jnp.stack([unit(x[:4]), unit(x[4:8]), unit(x[:4])]),
-                x[8:17].reshape(3, 3),
-            )(x[17]),
-            {
-                "ordinary": join(Q, P, V, W, Y, 0.6),
-                "still": join(Q, Q, no, no, no, 0.6),
-                "at the first": join(Q, P, V, W, Y, 0.0),
-            },
-            step=0.01,
-        ),
     ]  # fmt: skip
     for chart, name in ((mrp, "mrp"), (rodrigues, "rodrigues")):
         found.append(
@@ -360,14 +348,14 @@ def bodies() -> list[Case]:
             {"ordinary": GENERAL}, step=0.01, covers=("Inertia.principal",),
         ),
         Case(
-            "body.energy_ellipsoid",
+            "body.ellipsoid",
             lambda x: (
-                rj.body.energy_ellipsoid(rj.Inertia(symmetric(x[:6])), x[6])[0],
-                rj.body.momentum_ellipsoid(rj.Inertia(symmetric(x[:6])), x[6])[0],
+                rj.body.ellipsoid(rj.Inertia(symmetric(x[:6])), "energy", x[6])[0],
+                rj.body.ellipsoid(rj.Inertia(symmetric(x[:6])), "momentum", x[6])[0],
             ),
-            {"ordinary": join(GENERAL, 1.5)}, step=0.01, covers=("body.momentum_ellipsoid",),
+            {"ordinary": join(GENERAL, 1.5)}, step=0.01,
         ),
-        Case("body.equal_ellipsoid", lambda x: rj.body.equal_ellipsoid(body_of(x))[0], {"ordinary": TEN}, step=0.01),
+        Case("body.ellipsoid of mass", lambda x: rj.body.ellipsoid(body_of(x), "mass")[0], {"ordinary": TEN}, step=0.01),
         Case(
             "Inertia.shifted",
             lambda x: (
@@ -397,14 +385,12 @@ def bodies() -> list[Case]:
                 rj.kinetic_energy(body_of(x), state_of(x[10:])), rj.angular_momentum(body_of(x), state_of(x[10:])),
                 rj.spatial_angular_momentum(body_of(x), state_of(x[10:])),
                 rj.body.kinetic_energy_about(body_of(x), unit(x[16:20]), x[13:16], x[20:23]),
-                rj.body.kinetic_energy_of_generator(symmetric(x[4:10]), generator(x[20:23])),
                 rj.body.kinetic_energy_of_matrix_rate(symmetric(x[4:10]), generator(x[20:23])),
-                rj.body.kinetic_energy_of_moments(x[4:7], x[20:23]),
             ),
             {"ordinary": join(TEN, Y, V, Q, W), "at rest": join(TEN_BALL, np.zeros(6), ONE, np.zeros(3))},
             covers=(
                 "kinetic_energy", "angular_momentum", "spatial_angular_momentum", "body.kinetic_energy_about",
-                "body.kinetic_energy_of_generator", "body.kinetic_energy_of_matrix_rate", "body.kinetic_energy_of_moments",
+                "body.kinetic_energy_of_matrix_rate",
             ),
         ),
         Case("body.divergence", lambda x: rj.body.divergence(body_of(x[:10]), body_of(x[10:])), {"ordinary": join(TEN, TEN_BALL), "the same": join(TEN, TEN), "balls": join(TEN_BALL, TEN_BALL)}, step=0.01, atol=1e-11),
@@ -519,14 +505,14 @@ def equations() -> list[Case]:
         Case(
             "equations of motion",
             lambda x: (
-                rj.motion.AttitudeEquations(rj.Inertia(symmetric(x[:6])), s.top())(0.0, attitude_of(x[6:]), None),
-                rj.motion.EulerEquations(rj.Inertia(symmetric(x[:6])))(0.0, rj.Spin(x[10:13]), None),
+                AttitudeEquations(rj.Inertia(symmetric(x[:6])), s.top())(0.0, attitude_of(x[6:]), None),
+                EulerEquations(rj.Inertia(symmetric(x[:6])))(0.0, rj.Spin(x[10:13]), None),
             ),
             {k: join(v, Q, W) for k, v in TENSORS.items()} | {"at rest": join(GENERAL, ONE, np.zeros(3))},
             step=0.01,
             covers=("motion.AttitudeEquations", "motion.EulerEquations", "equations_of_motion"),
         ),
-        Case("motion.NewtonEuler", lambda x: rj.motion.NewtonEuler(body_of(x[:10]), rj.torques.UniformGravity(DOWN))(0.0, state_of(x[10:]), None), {"ordinary": join(TEN, RIGID), "at rest": join(TEN_BALL, RESTING)}, step=0.01),
+        Case("motion.NewtonEuler", lambda x: NewtonEuler(body_of(x[:10]), rj.torques.UniformGravity(DOWN))(0.0, state_of(x[10:]), None), {"ordinary": join(TEN, RIGID), "at rest": join(TEN_BALL, RESTING)}, step=0.01),
         Case(
             "lagrangian",
             lambda x: (
@@ -559,7 +545,7 @@ def frames() -> list[Case]:
             frame.acceleration_to_inertial(x[8:11], x[11:14], x[18:21], t), frame.jacobi_integral(state, t),
             frame.then(frame).matrix(t), frame.inverse().place(t),
             rj.frames.BodyInFrame(frame)(t, state, s.body()).torque,
-            rj.frames.InFrame(frame, potential=lambda y: jnp.sum(y**4)).acceleration(t, state),
+            InFrame(frame, potential=lambda y: jnp.sum(y**4)).acceleration(t, state),
         )  # fmt: skip
 
     place = join(AXIS, 3.0, V)
@@ -747,7 +733,7 @@ def fits() -> list[Case]:
 
         def error(x: Any, sensor: Any = sensor, reading: Any = reading) -> Any:
             state = attitude_of(x)
-            field = rj.motion.AttitudeEquations(s.inertia(), s.top())
+            field = AttitudeEquations(s.inertia(), s.top())
             moment = identify.SensorInput(jnp.asarray(0.0), state, s.inertia(), field)
             return sensor.error(moment, jnp.asarray(reading))
 

@@ -154,7 +154,8 @@ def found() -> rj.identify.Fit:
 @functools.cache
 def scene() -> Any:
     """A scene of work and precision, with a reference of its own."""
-    from rigidjax.workprecision import Reference, Scene
+    from rigidjax.workprecision import Scene
+    from rigidjax.workprecision.scene import Reference
 
     end = tuple(float(x) for x in [*Q, *W])
     return Scene(
@@ -165,7 +166,7 @@ def scene() -> Any:
 
 @functools.cache
 def records() -> tuple:
-    from rigidjax.workprecision import Record
+    from rigidjax.workprecision.record import Record
 
     return tuple(
         Record("s", name, "ours", "value", "", 10.0**-k, error=10.0**-k, time=float(k))

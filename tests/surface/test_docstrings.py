@@ -22,8 +22,20 @@ WITHOUT_EXAMPLE = {
         "a search of minutes: the guide's page on brightness has it",
     ),
     **dict.fromkeys(
-        (f"workprecision.{name}" for name in ("draw", "measure", "worked_out")),
+        (f"workprecision.{name}" for name in ("draw", "measure")),
         "compiles and times many solvers: `python -m rigidjax workprecision` is it",
+    ),
+    **dict.fromkeys(
+        (
+            "frames.FrameWrench",
+            "solve.Found",
+            "lagrangian.LiePoisson",
+            "estimate.Extended",
+            "lagrangian.LiePoissonWithDirection",
+            "estimate.Read",
+            "identify.Limit",
+        ),
+        "is given by a function or is part of what is given, whose example is it",
     ),
     "identify.best_first_rate": "compiles for most of a minute, second derivatives of a motion",
     "plot.player": "viser writes a page of megabytes: the notebook on the Dzhanibekov effect has it",

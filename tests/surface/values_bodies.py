@@ -138,10 +138,10 @@ way(
     lambda m, c, s, e: divergence(m, c, s, m * (1 + e), c, s) + 4, norm=True,
 )  # fmt: skip
 way(
-    "body.energy_ellipsoid body.momentum_ellipsoid",
+    "body.ellipsoid (of rates)",
     lambda i, x: (
-        rebuilt(*bodies.energy_ellipsoid(rj.Inertia(i), x)),
-        rebuilt(*bodies.momentum_ellipsoid(rj.Inertia(i), x)),
+        rebuilt(*bodies.ellipsoid(rj.Inertia(i), "energy", x)),
+        rebuilt(*bodies.ellipsoid(rj.Inertia(i), "momentum", x)),
     ),
     (v.inertia, scale(-20, 20)),
     lambda i, x: (
@@ -160,7 +160,7 @@ def ellipsoid_of(m, c, s):
 
 # The root of a small eigenvalue: as good as the eigenvalue is.
 way(
-    "body.equal_ellipsoid", lambda m, c, s: rebuilt(*bodies.equal_ellipsoid(props(m, c, s))), BODY,
+    "body.ellipsoid (of mass)", lambda m, c, s: rebuilt(*bodies.ellipsoid(props(m, c, s), "mass")), BODY,
     ellipsoid_of, norm=True, ulps=EIGEN,
 )  # fmt: skip
 
@@ -214,18 +214,13 @@ way(
     (*BODY, v.quaternion, v.vector, v.vector), about, norm=True,
 )  # fmt: skip
 way(
-    "body.kinetic_energy_of_generator body.kinetic_energy_of_matrix_rate "
-    "body.kinetic_energy_of_moments",
-    lambda s, w, m, l: (
-        bodies.kinetic_energy_of_generator(s, so3.hat(w)),
+    "body.kinetic_energy_of_matrix_rate",
+    lambda s, w, m: (
+        bodies.kinetic_energy_of_matrix_rate(s, so3.hat(w)),
         bodies.kinetic_energy_of_matrix_rate(s, so3.product(m, so3.hat(w))),
-        bodies.kinetic_energy_of_moments(l, w),
     ),
-    (v.second_moment, v.vector, v.matrix, v.moments),
-    lambda s, w, m, l: (
-        v.dot(w, tensor_of(s) @ w) / 2, v.dot(w, tensor_of(s) @ w) / 2,
-        v.dot(w, tensor_of(np.diag(l) + 0 * v.eye()) @ w) / 2,
-    ),
+    (v.second_moment, v.vector, v.matrix),
+    lambda s, w, m: (v.dot(w, tensor_of(s) @ w) / 2, v.dot(w, tensor_of(s) @ w) / 2),
     norm=True,
 )  # fmt: skip
 

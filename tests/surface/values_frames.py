@@ -145,11 +145,11 @@ def in_frame(axis, k, place, t, x, u, w):
 
 def our_in_frame(axis, k, place, t, x, u, w):
     power = lambda x: jnp.sum(x**4)
-    scene = frames.InFrame(
+    scene = InFrame(
         moving(axis, k, place), inside=lambda t, y: y.v, outside=lambda t, y: place - y.x,
         potential=power,
     )  # fmt: skip
-    steady = frames.InFrame(frames.MovingFrame(frames.Uniform(w)), potential=power)
+    steady = InFrame(frames.MovingFrame(frames.Uniform(w)), potential=power)
     force = frames.Force(lambda t, y, body: y.v - y.x)
     y = rj.Point(x, u)
     return [

@@ -12,6 +12,10 @@ from surface.values_numbers import derivative, euler_matrix, euler_rates
 
 import rigidjax as rj
 from rigidjax import lagrangian, torques as laws
+from rigidjax.lagrangian.hamiltonian import MomentumAndDirection
+from rigidjax.motion.coupled import Coupled
+from rigidjax.motion.equations import AttitudeEquations, EulerEquations, NewtonEuler, on_the_group
+from rigidjax.motion.torques.states import freeze
 from rigidjax.rotation import quaternion as q4
 
 STATE = (v.vector, v.vector, v.quaternion, v.vector)
@@ -224,7 +228,7 @@ def our_tables(rows, t):
     spin = rj.Spin(jnp.zeros(3))
     return [
         step(t), ramp(t), laws.Tabulated(ts, rows)(t, spin, None), pulses(t, spin, None),
-        pulses.impulse, laws.Delayed(step, 0.75)(t), ramp.jump_times, laws.jumps_of(step),
+        pulses.impulse, laws.Delayed(step, 0.75)(t), ramp.jump_times, step.jump_times,
         laws.Delayed(step, 0.75).jump_times,
         laws.Sum(laws.InSpace(laws.bind(laws.Input("u"), {"u": ramp})),
                  laws.InSpace(laws.Delayed(ramp, 0.75)))(
@@ -234,7 +238,7 @@ def our_tables(rows, t):
 
 way(
     "motion.torques.Held motion.torques.Linear motion.torques.Tabulated motion.torques.Pulses "
-    "motion.torques.Pulses.impulse motion.torques.Delayed motion.torques.jumps_of "
+    "motion.torques.Pulses.impulse motion.torques.Delayed "
     "motion.torques.Held.jump_times motion.torques.Linear.jump_times "
     "motion.torques.Delayed.jump_times motion.torques.Input motion.torques.bind",
     our_tables, (v.normal(5, 3, low=-20, high=20), AT), tables, norm=True,
@@ -279,12 +283,11 @@ def lag(u, big, y, t):
 
 
 way(
-    "motion.torques.Lagged motion.torques.Lagged.rate motion.torques.Lagged.state0 "
-    "motion.torques.freeze",
+    "motion.torques.Lagged motion.torques.Lagged.rate motion.torques.Lagged.state0",
     lambda u, big, y, t: (
         laws.Lagged(Quadratic(u), big).rate(t, y, None, None),
         laws.Lagged(Quadratic(u), big).state0(t, None, None),
-        laws.freeze(laws.Lagged(Quadratic(u), big), (y,))(t),
+        freeze(laws.Lagged(Quadratic(u), big), (y,))(t),
     ),
     (scale(-5, 5), scale(-5, 5), scale(-5, 5), between(-3, 3)), lag,
 )  # fmt: skip
@@ -307,7 +310,7 @@ def unscaled(rng, i):
 way(
     "motion.torques.ChangingInertia motion.torques.ChangingInertia.tensor",
     lambda i, j, c, t, w: (
-        rj.motion.EulerEquations(rj.Inertia(SYMMETRIC), laws.ChangingInertia(
+        EulerEquations(rj.Inertia(SYMMETRIC), laws.ChangingInertia(
             lambda s: i + s * j, laws.Damping(c)))(t, rj.Spin(w)),
         laws.ChangingInertia(lambda s: i + s * j).tensor(t),
     ),
@@ -344,7 +347,7 @@ def our_wheels(j, s, motor, limit, top, c, d, i, q, w, own):
     return [
         law(0.1, y, body, own), law.energy(0.1, y, body, own), law.internal_momentum(0.1, own),
         law.rate(0.1, own, y, body), law.speeds_of(own, y), law.torques_of(0.1, own, y),
-        law.state0(0.1, y, body), law.without_wheels(body), rj.motion.Coupled.start(body, y, law, 0.1),
+        law.state0(0.1, y, body), law.without_wheels(body), Coupled.start(body, y, law, 0.1),
     ]  # fmt: skip
 
 
@@ -367,14 +370,12 @@ def euler(i, w, torque):
 
 
 way(
-    "motion.EulerEquations motion.EulerEquations.rate_of "
-    "motion.EulerEquations.turned_by motion.AttitudeEquations "
     "equations_of_motion Spin Attitude",
     lambda i, c, q, w: (
-        rj.motion.EulerEquations(rj.Inertia(i), laws.ConstantTorque(c))(0.0, rj.Spin(w)),
-        rj.motion.EulerEquations(rj.Inertia(i), laws.ConstantTorque(c)).rate_of(0.0, rj.Spin(w)),
-        rj.motion.EulerEquations(rj.Inertia(i)).turned_by(c, rj.Spin(w)),
-        rj.motion.AttitudeEquations(rj.Inertia(i), laws.InSpace(c))(0.0, rj.Attitude(q, w)),
+        EulerEquations(rj.Inertia(i), laws.ConstantTorque(c))(0.0, rj.Spin(w)),
+        EulerEquations(rj.Inertia(i), laws.ConstantTorque(c)).rate_of(0.0, rj.Spin(w)),
+        EulerEquations(rj.Inertia(i)).turned_by(c, rj.Spin(w)),
+        AttitudeEquations(rj.Inertia(i), laws.InSpace(c))(0.0, rj.Attitude(q, w)),
         rj.equations_of_motion(rj.Inertia(i), rj.Attitude(q, w), laws.InSpace(c))(
             0.0, rj.Attitude(q, w), None),
     ),
@@ -386,8 +387,8 @@ way(
     norm=True,
 )  # fmt: skip
 way(
-    "motion.NewtonEuler Rigid",
-    lambda m, c, s, g, k, x, u, q, w: rj.motion.NewtonEuler(
+    "Rigid",
+    lambda m, c, s, g, k, x, u, q, w: NewtonEuler(
         props(m, c, s), laws.Sum(laws.UniformGravity(g), laws.Drag(k, c)))(
             0.0, rigid(x, u, q, w)),
     (scale(-3, 3), v.ordinary, v.second_moment, v.vector, scale(-3, 3), v.vector, v.vector,
@@ -398,7 +399,7 @@ way(
     ),
     norm=True,
 )  # fmt: skip
-way("motion.on_the_group", lambda q, w: rj.motion.on_the_group(rj.Attitude(q, w)),
+way("Attitude (on the group)", lambda q, w: on_the_group(rj.Attitude(q, w)),
     (lambda rng, i: v.quaternion(rng, i) * 10.0 ** rng.uniform(-20, 20), v.vector),
     lambda q, w: (q / v.norm(q), w))  # fmt: skip
 
@@ -500,7 +501,7 @@ def our_poisson(m, c, g, i, q, w, p, gamma):
     return (
         spin(p), lagrangian.lie_poisson(spin)(0.0, lagrangian.Momentum(p)), top(p, gamma),
         top.start(rj.Attitude(q, w)),
-        lagrangian.lie_poisson_with_direction(top)(0.0, lagrangian.MomentumAndDirection(p, gamma)),
+        lagrangian.lie_poisson_with_direction(top)(0.0, MomentumAndDirection(p, gamma)),
     )  # fmt: skip
 
 
@@ -514,7 +515,8 @@ way(
     poisson,
     norm=True,
 )  # fmt: skip
-leave_out("abstract", "motion.torques.AbstractForce", "motion.torques.AbstractTorque")
+leave_out("abstract", "motion.torques.AbstractTorque")
+leave_out("the fields of rows above", "lagrangian.LiePoisson", "lagrangian.LiePoissonWithDirection")
 
 
 # What a law hands on of the functions of time in it.

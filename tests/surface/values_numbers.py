@@ -8,7 +8,6 @@ from surface import values as v
 from surface.values import between, direction, fixed, leave_out, one_of, scale, way
 
 from rigidjax import elliptic as ell, euler, mrp, quaternion as q4, rodrigues, so3
-from rigidjax.rotation import AttitudeInterpolant
 
 # Elliptic functions: the parameter by its complement m1 = 1 − m, near 1, at 0, negative, above 1.
 M1 = one_of(between(0.05, 1.0), scale(-20, -1), fixed(1.0), scale(0, 8), between(0.9, 1.1))
@@ -455,35 +454,3 @@ for sequence in EULER:
         ),
         (tilted(sequence), v.vector), lambda a, y, s=sequence: euler_rates(a, y, s), norm=True,
     )  # fmt: skip
-
-
-# Hermite's cubic in the Lie algebra, and its rate by differentiation.
-def hermite(ts, q, p, w0, w1, t):
-    h = ts[1] - ts[0]
-    end = v.turn_of(v.times([q[0], *(-q[1:])], p))
-    a, b = w0 * h, v.solve(series(-end, 1), w1 * h)
-
-    def at(s):
-        x = s * (1 - s) ** 2 * a + s * s * (3 - 2 * s) * end + s * s * (s - 1) * b
-        return v.times(q, v.quaternion_of(x))
-
-    s = (t - ts[0]) / h
-    m = v.matrix_of(at(s))
-    return m, v.vee(m.T @ derivative(lambda d: v.matrix_of(at(s + d / h))))
-
-
-def interpolant(ts, q, p, w0, w1, t):
-    # Two knots far from t beside them: the piece is found among several.
-    made = AttitudeInterpolant(
-        jnp.stack([ts[0], ts[1], ts[1] + 1.0]), jnp.stack([q, p, p]), jnp.stack([w0, w1, w1])
-    )
-    return q4.to_matrix(made(t)), made.omega(t)
-
-
-way(
-    "rotation.AttitudeInterpolant rotation.AttitudeInterpolant.omega",
-    interpolant,
-    (fixed([0.0, 1.0], [-1.0, 2.0], [100.0, 100.5]), v.quaternion,
-     lambda rng, i: v.quaternion(rng, 0), v.ordinary, v.ordinary, between(0, 1)),
-    hermite, norm=True,
-)  # fmt: skip

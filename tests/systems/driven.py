@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 
 import rigidjax as rj
+from rigidjax.motion.equations import AttitudeEquations
 
 MOMENTS = (0.7, 1.2, 1.6)
 
@@ -61,7 +62,7 @@ def start(t):
 
 def field(dtype=jnp.float64):
     moments = jnp.asarray(MOMENTS, dtype)
-    return rj.motion.AttitudeEquations(rj.Inertia(jnp.diag(moments)), Driver(moments))
+    return AttitudeEquations(rj.Inertia(jnp.diag(moments)), Driver(moments))
 
 
 def error(q, t):

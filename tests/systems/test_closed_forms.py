@@ -15,6 +15,7 @@ from systems.marching import rk4
 
 import rigidjax as rj
 from rigidjax import torques
+from rigidjax.motion.equations import AttitudeEquations, EulerEquations, NewtonEuler
 
 IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
 
@@ -52,7 +53,7 @@ def test_a_damped_sphere_slows_exponentially():
     def run(p):
         moment, c, speed = p
         body = rj.Inertia(moment * jnp.eye(3))
-        field = rj.motion.AttitudeEquations(body, torques.Damping(c * jnp.ones(3)))
+        field = AttitudeEquations(body, torques.Damping(c * jnp.ones(3)))
         end = rk4(field, rj.Attitude(IDENTITY, speed * axis), 2.0, 800)
         return jnp.concatenate([end.q, end.omega])
 
@@ -70,7 +71,7 @@ def test_quadratic_damping_slows_as_one_over_time():
         body = rj.Inertia(jnp.diag(jnp.stack([2.0 + 0 * moment, moment, 1.5 + 0 * moment])))
         law = torques.QuadraticDamping(jnp.stack([0.2 + 0 * c, c, 0.1 + 0 * c]))
         start = rj.Attitude(IDENTITY, speed * np.array([0.0, 1.0, 0.0]))
-        end = rk4(rj.motion.AttitudeEquations(body, law), start, 2.0, 800)
+        end = rk4(AttitudeEquations(body, law), start, 2.0, 800)
         return jnp.concatenate([end.q, end.omega])
 
     def formula(p):
@@ -88,9 +89,7 @@ def test_a_symmetric_body_spun_up_about_its_axis():
         i1, i3, push, a, b, c = p
         body = rj.Inertia(jnp.diag(jnp.stack([i1, i1, i3])))
         law = torques.ConstantTorque(push * np.array([0.0, 0, 1]))
-        return rk4(
-            rj.motion.EulerEquations(body, law), rj.Spin(jnp.stack([a, b, c])), 2.0, 1500
-        ).omega
+        return rk4(EulerEquations(body, law), rj.Spin(jnp.stack([a, b, c])), 2.0, 1500).omega
 
     def formula(p):
         i1, i3, push, a, b, c = p
@@ -111,7 +110,7 @@ def test_a_schedule_is_data(kind):
         times, values = p[:4], p[4:]
         rows = (values[:3] if kind is torques.Pulses else values)[:, None] * axis[None, :]
         law = kind(times, rows)
-        field = rj.motion.EulerEquations(body, law)
+        field = EulerEquations(body, law)
         y = rj.Spin(0.2 * axis)
         for left, right in zip(law.jump_times[:-1], law.jump_times[1:], strict=True):
             # A hair before its end, so that the last stage does not see the next piece.
@@ -131,7 +130,7 @@ def test_a_sphere_with_a_wheel():
     # L = R (IΩ + h) is fixed in space, h in the body: R(t) = exp(t L/I) exp(−t h/I).
     def run(p):
         moment, h, omega = p[0], p[1:4], p[4:7]
-        field = rj.motion.AttitudeEquations(rj.Inertia(moment * jnp.eye(3)), torques.Flywheel(h))
+        field = AttitudeEquations(rj.Inertia(moment * jnp.eye(3)), torques.Flywheel(h))
         end = rk4(field, rj.Attitude(IDENTITY, omega), 2.0, 2000)
         return jnp.concatenate([end.q, end.omega])
 
@@ -161,7 +160,7 @@ def test_a_wheel_spun_up_turns_the_body_back():
     def run(p):
         moment, a, b = p
         body = rj.Inertia(jnp.diag(jnp.stack([1.0 + 0 * moment, 1.0 + 0 * moment, moment])))
-        field = rj.motion.AttitudeEquations(body, torques.Flywheel(Ramp(a, b)))
+        field = AttitudeEquations(body, torques.Flywheel(Ramp(a, b)))
         end = rk4(field, rj.Attitude(IDENTITY, np.zeros(3)), 1.5, 1000)
         return jnp.concatenate([end.q, end.omega])
 
@@ -201,7 +200,7 @@ def test_swings_against_elliptic_functions(name):
         start, k = p
         law, half = make(k), 0.5 * start / fold
         q = jnp.stack([jnp.cos(half), jnp.sin(half), 0 * half, 0 * half])
-        end = rk4(rj.motion.AttitudeEquations(body, law), rj.Attitude(q, np.zeros(3)), 1.3, 1500)
+        end = rk4(AttitudeEquations(body, law), rj.Attitude(q, np.zeros(3)), 1.3, 1500)
         return 2 * fold * jnp.arctan2(end.q[1], end.q[0])
 
     value, slope = once(lambda p: (run(p), jax.jacfwd(run)(p)))(jnp.array([2.0, 1.0]))
@@ -222,18 +221,16 @@ def test_a_body_thrown_and_dropped():
     body = rj.MassProperties(2.0, np.zeros(3), np.diag([1.0, 0.9, 0.8]))
     start = rj.Rigid([0.0, 1, 2], [3.0, 0, 4], IDENTITY, [0.2, 0.4, 0.1])
     fall = torques.UniformGravity([0.0, 0.0, -9.81])
-    thrown = jax.jit(lambda y: rk4(rj.motion.NewtonEuler(body, fall), y, 1.5, 500))(start)
+    thrown = jax.jit(lambda y: rk4(NewtonEuler(body, fall), y, 1.5, 500))(start)
     np.testing.assert_allclose(thrown.x, [4.5, 1.0, 2 + 6 - 9.81 * 1.125], rtol=1e-12)
-    turned = rk4(
-        rj.motion.AttitudeEquations(body.inertia), rj.Attitude(IDENTITY, start.omega), 1.5, 500
-    )
+    turned = rk4(AttitudeEquations(body.inertia), rj.Attitude(IDENTITY, start.omega), 1.5, 500)
     np.testing.assert_allclose(thrown.q, turned.q, rtol=1e-13)
 
     # Dropped in air: v = −v∞ tanh(g t/v∞), v∞² = m g/k.
     def run(p):
         law = torques.Sum(fall, torques.Drag(p[0]))
         at_rest = rj.Rigid(np.zeros(3), np.zeros(3), IDENTITY, np.zeros(3))
-        end = rk4(rj.motion.NewtonEuler(body, law), at_rest, 1.5, 3000)
+        end = rk4(NewtonEuler(body, law), at_rest, 1.5, 3000)
         return jnp.stack([end.x[2], end.v[2]])
 
     def formula(p):
@@ -247,7 +244,7 @@ def test_a_sphere_on_a_circular_orbit():
     body = rj.MassProperties(2.0, np.zeros(3), 0.3 * np.eye(3))
     rate = np.sqrt(5.0 / 1.5**3)
     start = rj.Rigid([1.5, 0, 0], [0.0, 1.5 * rate, 0], IDENTITY, [0.0, 0, 0.7])
-    field = rj.motion.NewtonEuler(body, torques.CentralGravity(5.0))
+    field = NewtonEuler(body, torques.CentralGravity(5.0))
     end = jax.jit(lambda y: rk4(field, y, 2.0, 2000))(start)
     wanted = 1.5 * np.array([np.cos(2 * rate), np.sin(2 * rate), 0.0])
     np.testing.assert_allclose(end.x, wanted, atol=1e-11)
@@ -271,7 +268,7 @@ def test_a_satellite_librates_about_the_vertical():
     body = rj.Inertia.from_principal(1.0, 1.8, 2.2)
     law = torques.GravityGradient(5.0, Circle(1.5, float(rate)))
     start = rj.Attitude(turn([0, 0, 1.0], 0.6), [0.0, 0, rate])
-    end = jax.jit(lambda y: rk4(rj.motion.AttitudeEquations(body, law), y, 1.5, 2000))(start)
+    end = jax.jit(lambda y: rk4(AttitudeEquations(body, law), y, 1.5, 2000))(start)
     angle = 2 * np.arctan2(float(end.q[3]), float(end.q[0])) - 1.5 * rate
     wanted = 0.5 * float(tops_mp.pendulum(3 * rate**2 * 0.8 / 2.2, 1.2, 1.5))
     np.testing.assert_allclose(angle, wanted, atol=1e-11)
@@ -299,7 +296,7 @@ def test_kovalevskaya_and_goryachev_chaplygin_integrals():
         ((3.6, 3.6, 0.9), goryachev_chaplygin, True),
     ):
         inertia = rj.Inertia(jnp.diag(jnp.array(moments)))
-        field = rj.motion.AttitudeEquations(inertia, law)
+        field = AttitudeEquations(inertia, law)
         q, w = rng.normal(size=4), rng.normal(size=3)
         q = q / np.linalg.norm(q)
         if level:
@@ -328,7 +325,7 @@ def test_lagrange_top_against_quadrature(theta, rates):
             jnp.stack([0 * p[0], p[0], 0 * p[0]]), jnp.stack([p[1], p[2], p[3]])
         )
         attitude = rj.lagrangian.to_attitude(start)
-        end = rk4(rj.motion.AttitudeEquations(body, law), attitude, t, 3000)
+        end = rk4(AttitudeEquations(body, law), attitude, t, 3000)
         return 1 - 2 * (end.q[1] ** 2 + end.q[2] ** 2), end
 
     at = jnp.array([theta, *rates])

@@ -8,9 +8,10 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 import rigidjax as rj
-from rigidjax import exact, identify, tumblers
+from rigidjax import exact, identify
 from rigidjax.identify import SensorInput
 from rigidjax.tumblers import Brightness
+from rigidjax.tumblers.light_curve import Alias
 
 HOUR, NOISE, COUNT = 3600.0, 0.02, 480
 
@@ -163,7 +164,7 @@ def problem(recording: identify.Recording) -> identify.Problem:
     return identify.Problem(recording, identify.PrincipalRatios(), free=free)
 
 
-def off(one: Tumbler, alias: tumblers.Alias) -> tuple[float, float]:
+def off(one: Tumbler, alias: Alias) -> tuple[float, float]:
     """The largest relative errors of both periods and of both ratios of moments."""
     times = alias.rotation / one.rotation - 1, alias.precession / one.precession - 1
     ratios = alias.ratios / one.moments[:2] - 1
@@ -178,7 +179,7 @@ def of_unknown_noise(one: Tumbler) -> identify.Recording:
     return identify.Recording(np.asarray(one.recording.t), (sensor, np.asarray(reading.values)))
 
 
-def apart(one: Tumbler, alias: tumblers.Alias) -> np.ndarray:
+def apart(one: Tumbler, alias: Alias) -> np.ndarray:
     """Logarithms (4,) of rotation, precession and both ratios of moments over the true ones."""
     found = np.array([alias.rotation, alias.precession, *alias.ratios])
     return np.log(found / [one.rotation, one.precession, *one.moments[:2]])

@@ -15,6 +15,7 @@ from tumblers import simulated
 import rigidjax as rj
 from rigidjax import identify, tumblers
 from rigidjax.tumblers import Brightness, two_frequencies
+from rigidjax.tumblers.two_frequencies import TwoFrequencies
 
 MINUTE, HOUR, DAY = 60.0, 3600.0, 86400.0
 NOISE = 0.02
@@ -109,7 +110,7 @@ def light_curve(name: str) -> tuple[Published, Brightness, np.ndarray]:
     return one, sensor, clean + 1.0857 * NOISE * rng.normal(size=clean.size)
 
 
-def pairs_of(name: str) -> tuple[Published, tumblers.TwoFrequencies]:
+def pairs_of(name: str) -> tuple[Published, TwoFrequencies]:
     one, _, read = light_curve(name)
     squares = 10 ** (-0.8 * (read - np.median(read)))
     return one, two_frequencies(one.ts - one.ts[0], squares, 2 * NOISE * squares, count=48)

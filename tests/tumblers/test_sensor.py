@@ -83,7 +83,7 @@ def test_a_fit_and_a_design():
 
     level = identify.Free(level_of, "level")
     problem = identify.Problem(record, identify.PrincipalRatios(), free=[level])
-    start = identify.plan_of(problem, BODY, [0.3, 1.02, 0.4])
+    start = problem.start(BODY, [0.3, 1.02, 0.4])
     fit = identify.fit(problem, initial=start, starts=1)
     assert fit.ok and abs(fit.chi2 - fit.dof) < 5 * np.sqrt(2 * fit.dof)
     moments = np.asarray(BODY.moments)

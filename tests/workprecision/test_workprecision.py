@@ -15,26 +15,19 @@ from systems import free_body_mp, tops_mp
 import rigidjax as rj
 from rigidjax.__main__ import main
 from rigidjax.workprecision import (
-    Method,
-    Ready,
-    Record,
-    Run,
     Scene,
     choose,
     diffrax_method,
     draw,
-    front,
     measure,
     methods,
-    moved,
-    read_csv,
     scenes,
     table,
-    time_to,
-    worked_out,
-    write_csv,
 )
-from rigidjax.workprecision.scene import distance
+from rigidjax.workprecision.measurement import long_drift, worked_out
+from rigidjax.workprecision.pareto import front, time_to
+from rigidjax.workprecision.record import Record, moved, read_csv, write_csv
+from rigidjax.workprecision.scene import Method, Ready, Run, distance
 
 NAMES = list(scenes())
 
@@ -260,7 +253,7 @@ def test_nothing_moved_since_the_stored_table():
 
 @pytest.mark.slow
 def test_a_drift_that_is_bounded_and_one_that_grows():
-    found = rj.workprecision.long_drift(100_000)
+    found = long_drift(100_000)
     drift = {(r.method, r.scene): r.energy for r in found}
     early, late = "long-drift, first hundredth", "long-drift"
     assert drift["Splitting4, equal steps", late] < 5 * drift["Splitting4, equal steps", early]

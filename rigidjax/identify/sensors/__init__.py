@@ -5,8 +5,6 @@ from rigidjax.identify.sensors.attitude import (
     AttitudeSensor as AttitudeSensor,
     Direction as Direction,
     Marker as Marker,
-    quaternions_from_euler as quaternions_from_euler,
-    quaternions_from_matrices as quaternions_from_matrices,
 )
 from rigidjax.identify.sensors.base import (
     AbstractSensor as AbstractSensor,

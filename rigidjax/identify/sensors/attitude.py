@@ -4,6 +4,7 @@ import dataclasses
 from typing import Any, ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -25,13 +26,14 @@ class AttitudeSensor(AbstractSensor):
     """Reads the attitude as a quaternion (w, x, y, z), body → world; q and −q read the same.
 
     The error is the rotation vector, in the sensor's axes, that takes the predicted attitude to the
-    reading, `log((q exp(mounting))⁻¹ q_read)`: its length is the angle between them. Readings as
-    matrices or Euler angles: `quaternions_from_matrices`, `quaternions_from_euler`.
+    reading, `log((q exp(mounting))⁻¹ q_read)`: its length is the angle between them. Readings
+    are quaternions (T, 4) or rotation matrices (T, 3, 3); of Euler angles (T, 3) in degrees
+    `jax.vmap(lambda a: rj.euler.to_quaternion(a, "ZYX"))(jnp.deg2rad(angles))` makes them.
 
     **Arguments:** `noise` standard deviation of each component of that vector, rad, one number or
     (3,); `None` has it estimated; `mounting` (3,) rotation vector from the body's axes to the
     sensor's, rad, or `None`; `offset` s as for `Gyro`. **Raises** `ValueError` for a noise that is
-    not positive, a wrong shape, NaN.
+    not positive, a wrong shape, NaN; the recording for a matrix that is no rotation.
 
     >>> AttitudeSensor(noise=0.01).reading_shape
     (4,)
@@ -55,9 +57,28 @@ class AttitudeSensor(AbstractSensor):
         q = _mounted(now.state.q, self.mounting)
         return quaternion.multiply(q, quaternion.exp(error))
 
+    def readings(self, values: np.ndarray) -> np.ndarray:
+        """Readings (T, 4), also of matrices (T, 3, 3)."""
+        return _quaternions(values) if values.shape[1:] == (3, 3) else values
+
     def refusal(self, values: np.ndarray) -> tuple[np.ndarray, str]:
         wanted = "wanted (w, x, y, z) with the scalar first"
         return _not_unit(values), f"the quaternion at index {{index}} is not unit; {wanted}"
+
+
+def _quaternions(matrices: np.ndarray) -> np.ndarray:
+    seen = np.isfinite(matrices).all(axis=(1, 2))
+    filled = np.where(seen[:, None, None], matrices, np.eye(3))
+    off = np.abs(filled @ filled.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+    wrong = (off > 1e-6) | (np.linalg.det(filled) < 0)
+    if wrong.any():
+        index = int(np.argmax(wrong))
+        raise ValueError(
+            f"AttitudeSensor: the matrix at index {index} is no rotation: R Rᵀ − 1 is "
+            f"{off[index]:.2g}, det = {np.linalg.det(filled[index]):.3g}"
+        )
+    out = np.asarray(jax.vmap(quaternion.from_matrix)(jnp.asarray(filled)))
+    return np.where(seen[:, None], out, np.nan)
 
 
 def _mounted(q: Array, mounting: Vec3 | None) -> Array:
@@ -171,56 +192,3 @@ class Marker(AbstractSensor):
         state = now.state
         start = state.x if self.origin is None else self.origin
         return reading - (start + quaternion.rotate(state.q, now.lever(self.place)))
-
-
-def quaternions_from_matrices(matrices: Any) -> Float[np.ndarray, "times 4"]:
-    """Readings (T, 4) for an `AttitudeSensor` of rotation matrices (T, 3, 3), body → world.
-
-    **Raises** `ValueError` for a wrong shape or a matrix that is no rotation, with its index. A row
-    that holds NaN stays NaN, to be masked.
-
-    >>> quaternions_from_matrices(np.eye(3)[None])[0].tolist()
-    [1.0, 0.0, 0.0, 0.0]
-    """
-    matrices = _checks.on_host(matrices, "matrices")
-    if matrices.ndim != 3 or matrices.shape[1:] != (3, 3) or not len(matrices):
-        raise ValueError(f"matrices: wanted shape (T, 3, 3), got {matrices.shape}")
-    seen = np.isfinite(matrices).all(axis=(1, 2))
-    filled = np.where(seen[:, None, None], matrices, np.eye(3))
-    off = np.abs(filled @ filled.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
-    wrong = (off > 1e-6) | (np.linalg.det(filled) < 0)
-    if wrong.any():
-        index = int(np.argmax(wrong))
-        raise ValueError(
-            f"matrices: the one at index {index} is no rotation: R Rᵀ − 1 is {off[index]:.2g}, "
-            f"det = {np.linalg.det(filled[index]):.3g}"
-        )
-    out = np.stack([np.asarray(quaternion.from_matrix(jnp.asarray(m))) for m in filled])
-    return np.where(seen[:, None], out, np.nan)
-
-
-def quaternions_from_euler(
-    angles: Any, sequence: str, *, unit: str = "rad"
-) -> Float[np.ndarray, "times 4"]:
-    """Readings (T, 4) for an `AttitudeSensor` of Euler angles (T, 3), body → world.
-
-    **Arguments:** `angles`; `sequence` as in `rigidjax.euler`, such as `"ZXZ"` (the 3-1-3 of the
-    notes, eq 31) or `"ZYX"` (yaw, pitch, roll); `unit` `rad` or `deg`. **Raises** `ValueError` for
-    a wrong shape, sequence or unit. A row that holds NaN stays NaN, to be masked.
-
-    >>> quaternions_from_euler([[0.0, 0.0, 0.0]], "ZXZ")[0].tolist()
-    [1.0, 0.0, 0.0, 0.0]
-    """
-    from rigidjax.rotation import euler
-
-    angles = _checks.on_host(angles, "angles")
-    if angles.ndim != 2 or angles.shape[1] != 3 or not len(angles):
-        raise ValueError(f"angles: wanted shape (T, 3), got {angles.shape}")
-    _checks.word(unit, ("rad", "deg"), "unit")
-    turned = np.radians(angles) if unit == "deg" else angles
-    seen = np.isfinite(turned).all(axis=1)
-    rows = [
-        np.asarray(euler.to_quaternion(jnp.asarray(row), sequence=sequence))
-        for row in np.where(seen[:, None], turned, 0.0)
-    ]
-    return np.where(seen[:, None], np.stack(rows), np.nan)

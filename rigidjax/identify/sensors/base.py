@@ -19,8 +19,8 @@ class SensorInput(eqx.Module):
 
     **Fields:** `t` s; `state` of the kind that the problem needs; `body` the `Inertia` or
     `MassProperties`; `field` the equations of motion `f(t, state, args)`, with the states of its
-    laws put in as they are at `t`; `own` those states, as `rigidjax.torques.freeze` takes them:
-    for a sensor of one's own that reads a wheel or a motor.
+    laws put in as they are at `t`; `own` those states, as `Solution.own` orders them: for
+    a sensor of one's own that reads a wheel or a motor.
 
     >>> import rigidjax as rj
     >>> body, state = rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([0.0, 0.0, 1.0])

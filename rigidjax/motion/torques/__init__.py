@@ -2,11 +2,8 @@
 
 from rigidjax._names import show
 from rigidjax.motion.torques.base import (
-    AbstractForce as AbstractForce,
     AbstractTorque as AbstractTorque,
-    Torque as Torque,
     Wrench as Wrench,
-    jumps_of as jumps_of,
 )
 from rigidjax.motion.torques.composite import ChangingInertia as ChangingInertia, Sum as Sum
 from rigidjax.motion.torques.elementary import (
@@ -45,7 +42,6 @@ from rigidjax.motion.torques.random import (
     RandomTorque as RandomTorque,
 )
 from rigidjax.motion.torques.spline import Series as Series, Wheel as Wheel
-from rigidjax.motion.torques.states import freeze as freeze
 from rigidjax.motion.torques.wheels import Flywheel as Flywheel, ReactionWheels as ReactionWheels
 
 show(__name__)

@@ -57,6 +57,8 @@ class AbstractTorque(eqx.Module):
     you read from the state: `HasSpin` (`.omega`), `HasAttitude` (also `.q`) or `HasPose` (also
     `.x`, `.v`). `body` is what `simulate` was given: an `Inertia`, or `MassProperties` for `Rigid`.
 
+    A law that feels a `rigidjax.motion.HasPose` may return a `Wrench`, a force as well as a torque.
+
     Optional members. A property `rate_free`, whether the law does not look at the body rate: then
     `rigidjax.solvers.Splitting4` and its like can be used. What is conserved (see
     `rigidjax.conserved`): a method `energy(t, state, body)`, J, if the law has a potential; a

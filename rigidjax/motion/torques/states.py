@@ -56,7 +56,7 @@ def require_stateless(law: Any, what: str) -> None:
         raise ValueError(
             f"{what}: wanted a torque without states of its own, got one that has some (such as "
             "ReactionWheels or Lagged); integrate rigidjax.equations_of_motion with "
-            "diffrax.diffeqsolve and diffrax.Event, or freeze the states (rigidjax.torques.freeze)"
+            "diffrax.diffeqsolve and diffrax.Event"
         )
 
 
@@ -132,8 +132,8 @@ def require_frozen(law: Any) -> None:
     if has_own(law):
         raise TypeError(
             f"{type(law).__name__} has states of its own (state0, rate): simulate, batch.rollout, "
-            "batch.simulate and identify.fit_windows integrate them; elsewhere put them in with "
-            "rigidjax.torques.freeze(law, own)"
+            "batch.simulate and identify.fit_windows integrate them; elsewhere call it with "
+            "its states last: law(t, state, body, own)"
         )
 
 

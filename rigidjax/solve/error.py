@@ -1,0 +1,385 @@
+"""How far a run is from the exact motion of its numbers: a second run and three neighbours say.
+
+The error of the *steps* is the distance to a run at a hundredth of the tolerance, or of equal steps
+half as long. Below round-off two runs agree by luck; so the part of *round-off* is how far runs lie
+apart whose numbers differ by a unit in the last digit: these round differently at every step, and
+what they differ by has grown as a rounding error grows. Nothing about the motion is assumed.
+"""
+
+import dataclasses
+import inspect
+from collections.abc import Callable
+from typing import Any
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Bool, Float
+
+from rigidjax import _checks
+from rigidjax._types import ScalarLike
+from rigidjax.motion.manifold import minus, names, parts
+from rigidjax.solve import validation
+from rigidjax.solve.run import Free, Loop, Setup, solve
+
+# Order 8 makes that 1.8 times the steps.
+_CLOSER = 1e-2
+# The second run of a few steps would take the same ones: no step grows beyond ten times the last.
+_CUTS = 8
+# Three deviations of four runs hold half of the true error in all but few of a thousand runs.
+_NEIGHBOURS, _DEVIATIONS = 3, 3.0
+# Half a radian, or half of the largest rate: errors do not add up any more.
+_LOST = 0.5
+# The size below which a number does not matter, as the defaults of `rtol` and `atol` have it.
+_SMALL = 1e-3
+# Where steps leave so many times what rounding adds up to without any growth, at a tolerance so
+# far above a rounding, they do so with growth, too: both are local errors that grow alike.
+_ABOVE, _COARSE = 300.0, 1e5
+# The same for a function, of whose steps nothing is known.
+_PLAIN = 1e6
+# A search for a tolerance decreases it by so much at a time, and aims at so small a part of the
+# accuracy: errors follow the tolerance to a factor of eight. One above 0.1 rad does not.
+_FARTHEST, _AIM, _ALLOWED, _FORESEEN = 1e-3, 20.0, 8.0, 0.1
+# The least tolerances of a run, and of one to compare with, in roundings.
+_FLOOR, _DEEPEST = 20.0, 4.0
+
+
+class Error(eqx.Module):
+    """How far each part of a state is from the exact motion of the given numbers: `Solution.error`.
+
+    **Fields:** `ts` (T,) s; `steps`, `round_off` an array (T,) by name (`q`, `omega`, `x`, `v`,
+    `own.0`, …): of a quaternion the angle of the turn, rad, of others the length of the difference
+    (rad/s, m, m/s). `steps` is known to some percent (of `accuracy=`: too large by up to ten).
+    `round_off` is three standard deviations, and has the last digits of body, torque and start in
+    it; far below the other it is a bound. NaN where the run did not get to, inf where a run to
+    compare with did not. `sizes` by name what is large: 1 rad, the largest value in the run.
+
+    >>> import rigidjax as rj
+    >>> body, start = rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([0.0, 1.0, 0.01])
+    >>> error = rj.simulate(body, start, [0.0, 1.0, 20.0]).error
+    >>> bool(error.total["omega"][-1] < 1e-13), float(error.known_until)
+    (True, 20.0)
+    """
+
+    ts: Float[Array, " times"]
+    steps: dict[str, Float[Array, " times"]]
+    round_off: dict[str, Float[Array, " times"]]
+    sizes: dict[str, Float[Array, ""]]
+
+    @property
+    def total(self) -> dict[str, Float[Array, " times"]]:
+        """Both parts together (T,), by name; inf where the state is `lost`."""
+        both = jax.tree.map(jnp.hypot, self.steps, self.round_off)
+        return jax.tree.map(lambda part: jnp.where(self.lost, jnp.inf, part), both)
+
+    @property
+    def relative(self) -> Float[Array, " times"]:
+        """The largest part (T,), rad, or relative to the largest value in the run."""
+        return jnp.where(self.lost, jnp.inf, self._relative)
+
+    @property
+    def lost(self) -> Bool[Array, " times"]:
+        """Where nothing is known (T,): `relative` was above one half by then, as in chaos."""
+        return lax.associative_scan(jnp.logical_or, self._relative > _LOST)
+
+    @property
+    def known_until(self) -> Float[Array, ""]:
+        """The last of `ts` at which the state is not lost, s."""
+        return self.ts[jnp.sum(~self.lost) - 1]
+
+    @property
+    def _relative(self) -> Array:
+        return _largest(jax.tree.map(jnp.hypot, self.steps, self.round_off), self.sizes)
+
+
+@eqx.filter_jit
+def error_of_run(setup: Free | Loop | Setup, ts: Array, ys: Any, count: Array) -> Error:
+    """The error of the states `ys` that `setup` gave at `ts` in `count` steps."""
+    setup, ts, ys, count = _still((setup, ts, ys, count))
+    if isinstance(setup, Free):
+        steps, rtol = _apart(ys, ys), jnp.zeros((), ts.dtype)
+    else:
+        second, rtol, factor = _closer(setup, ts)
+        start = jax.tree.map(lambda leaf: leaf[0], ys)
+        steps = _apart(solve(second, start, ts)[0], ys)
+        steps = jax.tree.map(lambda part: factor * part, steps)
+    return _with_round_off(setup, ts, ys, count, steps, rtol)
+
+
+@eqx.filter_jit
+def foreseen_error(loop: Loop, ts: Array, ys: Any, count: Array, tried: Any) -> Error:
+    """The same, too large by up to ten, from another run: its tolerance and its states."""
+    loop, ts, ys, count, tried = _still((loop, ts, ys, count, tried))
+    before, others = tried
+    steps = _apart(others, ys)
+    far = _largest(steps, _sizes(ys)) > _FORESEEN
+    factor = jnp.where(far, jnp.inf, _ALLOWED * loop.rtol / before)
+    return _with_round_off(
+        loop, ts, ys, count, jax.tree.map(lambda part: factor * part, steps), loop.rtol
+    )
+
+
+def _still(tree: Any) -> Any:
+    return jax.tree.map(lambda a: lax.stop_gradient(a) if eqx.is_array(a) else a, tree)
+
+
+def _with_round_off(
+    setup: Any, ts: Array, ys: Any, count: Array, steps: dict[str, Array], rtol: Array
+) -> Error:
+    sizes, start = _sizes(ys), jax.tree.map(lambda leaf: leaf[0], ys)
+    reached = jnp.isfinite(_largest(_apart(ys, ys), sizes))
+    # What rounding adds up to where nothing grows but the angle turned.
+    eps = float(jnp.finfo(ts.dtype).eps)
+    plain = {name: _ABOVE * eps * count.astype(ts.dtype) ** 1.5 * sizes[name] for name in sizes}
+    above = jnp.stack([(steps[name] > plain[name])[1:] for name in sizes])
+    clear = jnp.all(above | ~reached[None, 1:]) & (rtol > _COARSE * eps)
+    # Then the neighbours take no step.
+    times = jnp.where(clear, ts[0], ts)
+    numbers, rest = eqx.partition((setup.body, setup.torque, start), eqx.is_inexact_array)
+
+    def neighbour(numbers: Any) -> Array:
+        body, torque, y0 = eqx.combine(numbers, rest)
+        moved = {} if isinstance(setup, Free) else {"torque": torque}
+        near = dataclasses.replace(setup, body=body, throw=False, **moved)
+        return jax.vmap(minus)(solve(near, y0, times)[0], ys)
+
+    rng = np.random.default_rng(0)
+    changes = jax.vmap(neighbour)(jax.tree.map(lambda leaf: _nudged(leaf, rng), numbers))
+    off = _lengths(start, _DEVIATIONS * jnp.sqrt(_spread(changes)))
+    off = {name: jnp.where(clear, plain[name], off[name]) for name in off}
+
+    def known(part: Array) -> Array:
+        return jnp.where(reached, jnp.where(jnp.isnan(part), jnp.inf, part), jnp.nan)
+
+    steps, off = jax.tree.map(known, (steps, off))
+    return Error(ts, steps, off, sizes)
+
+
+def _apart(others: Any, ys: Any) -> dict[str, Array]:
+    """How far states are from others, part by part (T,)."""
+    return _lengths(jax.tree.map(lambda leaf: leaf[0], ys), jax.vmap(minus)(others, ys))
+
+
+def _lengths(state: Any, changes: Array) -> dict[str, Array]:
+    named = parts(state, changes).items()
+    return {name.removeprefix("motion."): jnp.linalg.norm(part, axis=-1) for name, part in named}
+
+
+def _sizes(ys: Any) -> dict[str, Array]:
+    sizes = {}
+    for name, leaf in zip(names(ys), jax.tree.leaves(ys), strict=True):
+        name = name.removeprefix("motion.")
+        most = jnp.nanmax(jnp.linalg.norm(leaf.reshape(leaf.shape[0], -1), axis=-1))
+        sizes[name] = jnp.ones_like(most) if name == "q" else jnp.maximum(most, _SMALL)
+    return sizes
+
+
+def _largest(apart: dict[str, Array], sizes: dict[str, Array]) -> Array:
+    return jnp.max(jnp.stack([apart[name] / sizes[name] for name in apart]), 0)
+
+
+@eqx.filter_jit
+def solve_to(loop: Loop, state0: Any, ts: Array, accuracy: Array) -> tuple[Loop, Any, Any]:
+    """A run that ends with a global error of `accuracy`, if there is one.
+
+    The error of each run is its distance to the next, and decreases as the tolerance does.
+
+    **Returns** the loop at the tolerance found; what `solve` gives with it; the tolerance of the
+    run before, and its states.
+    """
+    still = _still((loop, state0, ts, accuracy))
+    floor = _FLOOR * float(jnp.finfo(ts.dtype).eps)
+    cut = dataclasses.replace(loop, cuts=_cuts(still[2]))
+
+    def closer(carry: Any) -> Any:
+        (others, *_), _, before, rtol, _ = carry
+        new = solve(_at(cut, rtol), *still[1:3])
+        off = jnp.nanmax(_largest(_apart(others, new[0]), _sizes(new[0]))[1:])
+        wanted = before * still[3] / (_AIM * off)
+        least = jnp.maximum(_FARTHEST * rtol, floor)
+        # A run that is lost foresees nothing; one that got nowhere will get nowhere.
+        sound = off < _FORESEEN
+        good = sound & (_ALLOWED * off * rtol <= before * still[3])
+        following = jnp.where(sound, jnp.clip(wanted, least, jnp.maximum(rtol / 3, floor)), least)
+        return new, (before, others), rtol, following, good | (rtol <= floor) | jnp.isnan(off)
+
+    first = jnp.clip(jnp.sqrt(still[3]), 1e-6, 1e-4).astype(ts.dtype)
+    first = jnp.maximum(first, 30 * floor)
+    begun = solve(_at(loop, first), *still[1:3])
+    carry = (begun, (first, begun[0]), first, 0.1 * first, jnp.asarray(False))
+    new, tried, rtol, *_ = lax.while_loop(lambda carry: ~carry[-1], closer, carry)
+    loop = _at(cut, lax.stop_gradient(rtol))
+    return loop, (_as_solved(loop, state0, ts, new[0]), *new[1:]), tried
+
+
+@eqx.filter_custom_jvp
+def _as_solved(loop: Loop, state0: Any, ts: Array, ys: Any) -> Any:
+    """The states, which `solve` has given: only derivatives run it once more."""
+    return ys
+
+
+@_as_solved.def_jvp
+def _(primals: Any, tangents: Any) -> Any:
+    states = lambda *args: solve(*args)[0]  # noqa: E731
+    return primals[3], eqx.filter_jvp(states, primals[:3], tangents[:3])[1]
+
+
+def _at(loop: Loop, rtol: Any) -> Loop:
+    """The loop at another tolerance, `atol` as the defaults have it."""
+    return dataclasses.replace(loop, rtol=rtol, atol=_SMALL * rtol, throw=False)
+
+
+def _cuts(ts: Array) -> Array:
+    return ts[0] + (ts[-1] - ts[0]) * jnp.arange(1, _CUTS).astype(ts.dtype) / _CUTS
+
+
+def _closer(setup: Any, ts: Array) -> tuple[Any, Any, float]:
+    """The set-up of a closer run, the tolerance of the given one, and their distance's factor."""
+    eps = float(jnp.finfo(ts.dtype).eps)
+    most = None if setup.max_steps is None else 4 * setup.max_steps
+    if isinstance(setup, Loop):
+        rtol = jnp.asarray(setup.rtol, ts.dtype)
+        less = jnp.maximum(_CLOSER * rtol, _DEEPEST * eps)
+        atol = setup.atol * (less / rtol)
+        new = dict(rtol=less, atol=atol, cuts=_cuts(ts), max_steps=most, throw=False)
+        return dataclasses.replace(setup, **new), rtol, 1.0
+    found: list[Any] = []
+
+    def tighter(node: Any) -> Any:
+        if isinstance(node, dfx.PIDController):
+            found.append(node.rtol)
+            less = jnp.maximum(_CLOSER * node.rtol, _DEEPEST * eps)
+            atol = node.atol * (less / node.rtol)
+            return eqx.tree_at(lambda c: (c.rtol, c.atol), node, (less, atol))
+        return node
+
+    pid = lambda node: isinstance(node, dfx.PIDController)  # noqa: E731
+    controller = jax.tree.map(tighter, setup.controller, is_leaf=pid)
+    new = dict(controller=controller, max_steps=most, throw=False)
+    if found:
+        return dataclasses.replace(setup, **new), jnp.asarray(found[0], ts.dtype), 1.0
+    if not isinstance(setup.controller, dfx.ConstantStepSize):
+        raise TypeError(
+            "error: a second run needs a diffrax.PIDController or ConstantStepSize, got "
+            f"{type(setup.controller).__name__}"
+        )
+    # Of order 2; of a higher one it is a third too much at most.
+    return dataclasses.replace(setup, **new, dt0=0.5 * setup.dt0), jnp.zeros(()), 4 / 3
+
+
+class FunctionError(eqx.Module):
+    """A value and its derivative, with the error of each number: see `error_of`.
+
+    **Fields:** `value`, and `derivative` by x, as `jax.grad` or `jax.jacfwd` have it;
+    `value_error` and `derivative_error` of their shapes, absolute.
+
+    >>> import rigidjax as rj
+    >>> rj.error_of(lambda x, **tolerances: x * x, 3.0).known
+    Array(True, dtype=bool)
+    """
+
+    value: Array
+    value_error: Array
+    derivative: Any
+    derivative_error: Any
+
+    @property
+    def known(self) -> Bool[Array, ""]:
+        """Whether the error of the derivative is below half of its length.
+
+        Where it is not, as in chaos, the derivative means nothing, finite or not.
+        """
+        size = jnp.linalg.norm(ravel_pytree(self.derivative)[0])
+        return jnp.linalg.norm(ravel_pytree(self.derivative_error)[0]) < _LOST * size
+
+
+def error_of(
+    f: Callable[..., Array],
+    x: Any,
+    *,
+    rtol: ScalarLike | None = None,
+    atol: ScalarLike | None = None,
+) -> FunctionError:
+    """Value and derivative of a function that runs through `simulate`, with their errors.
+
+    **Arguments:**
+
+    - `f`: `f(x, rtol=…, atol=…) → array`, which hands both to every `simulate` in it (as
+      `**tolerances`). What does not depend on them, such as a closed form, has round-off alone.
+    - `x`: numbers, or a tree of them, all of one dtype. The derivative is taken in reverse mode
+      where the value is a scalar, else in forward mode.
+    - `rtol`, `atol`: those of the answer, by default those of `simulate`.
+
+    The second run has a hundredth of them; where its distance is not far above round-off, three
+    more have the last digits of `x` changed (in a `vmap` always). See `Solution.error`. Each call
+    compiles anew: put it into a `jax.jit` of your own to call it often.
+
+    **Returns** a `FunctionError`.
+
+    >>> import rigidjax as rj
+    >>> body, law = rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.torques.Damping([0.1, 0.1, 0.1])
+    >>> def last(omega, **tolerances):
+    ...     return rj.simulate(body, rj.Spin(omega), [0.0, 5.0], law, **tolerances).ys.omega[-1, 0]
+    >>> found = error_of(last, jnp.array([0.0, 0.5, 1.0]))
+    >>> bool(found.value_error < 1e-8), bool(found.derivative_error.max() < 1e-7)
+    (True, True)
+    """
+    _checks.function(f, "f", "f(x) that takes rtol= and atol=")
+    try:
+        inspect.signature(f).bind(x, rtol=rtol, atol=atol)
+    except TypeError as error:
+        raise TypeError(f"f: wanted f(x, rtol=…, atol=…), got one where {error}") from None
+    x = jax.tree.map(lambda leaf: _checks.numbers(leaf, "x"), x)
+    dtype = ravel_pytree(x)[0].dtype
+    first = jnp.asarray(validation.tolerances(rtol, atol, dtype), dtype)
+
+    def both(x: Any, tolerances: Array) -> tuple[Array, Any]:
+        def value(x: Any) -> tuple[Array, Array]:
+            found = _checks.numbers(f(x, rtol=tolerances[0], atol=tolerances[1]), "f(x, …)")
+            return found, found
+
+        scalar = jax.eval_shape(value, x)[0].shape == ()
+        derivative, found = (jax.grad if scalar else jax.jacfwd)(value, has_aux=True)(x)
+        return found, derivative
+
+    @jax.jit
+    def stated(x: Any, first: Array) -> FunctionError:
+        eps = float(jnp.finfo(dtype).eps)
+        second = first * jnp.maximum(_CLOSER, _DEEPEST * eps / first[0])
+        two = lax.map(lambda tolerances: both(x, tolerances), jnp.stack([first, second]))
+        answer = jax.tree.map(lambda a: a[0], two)
+        steps = jax.tree.map(lambda a: jnp.abs(a[0] - a[1]), two)
+        sizes = jax.tree.map(lambda a: _PLAIN * eps * jnp.max(jnp.abs(a)), answer)
+        above = jax.tree.map(lambda a, size: jnp.max(a) > size, steps, sizes)
+        clear = jnp.all(jnp.stack(jax.tree.leaves(above))) & (first[0] > _COARSE * eps)
+
+        def neighbours() -> Any:
+            rng = np.random.default_rng(0)
+            near = jax.tree.map(lambda leaf: _nudged(leaf, rng), x)
+            others = jax.vmap(both, (0, None))(near, first)
+            changes = jax.tree.map(lambda a, b: a - b[None], others, answer)
+            return jax.tree.map(lambda a: _DEVIATIONS * jnp.sqrt(_spread(a)), changes)
+
+        off = lax.cond(clear, lambda: jax.tree.map(jnp.zeros_like, answer), neighbours)
+        (value, derivative), whole = answer, jax.tree.map(jnp.hypot, steps, off)
+        return FunctionError(value, whole[0], derivative, whole[1])
+
+    return stated(x, first)
+
+
+def _spread(changes: Array) -> Array:
+    """The variance of runs that differ by so much from one more, which is among them."""
+    mean = jnp.sum(changes, 0, keepdims=True) / (_NEIGHBOURS + 1)
+    return (jnp.sum((changes - mean) ** 2, 0) + mean[0] ** 2) / _NEIGHBOURS
+
+
+def _nudged(leaf: Array, rng: np.random.Generator) -> Array:
+    """Numbers changed by up to a unit in the last digit; what is symmetric stays so."""
+    noise = rng.uniform(-1.0, 1.0, (_NEIGHBOURS, *leaf.shape))
+    if leaf.ndim > 1 and leaf.shape[-1] == leaf.shape[-2]:
+        noise = 0.5 * (noise + np.swapaxes(noise, -1, -2))
+    return leaf[None] * (1 + jnp.asarray(np.finfo(leaf.dtype).eps * noise, leaf.dtype))
