@@ -16,7 +16,7 @@ from rigidjax.identify.layouts import read_header
 from rigidjax.identify.recording import Recording
 from rigidjax.identify.sensors import Gyro
 
-# Everything is turned into SI.
+# All units become SI.
 UNITS = {
     "s": 1.0,
     "ms": 1e-3,
@@ -54,12 +54,12 @@ def read_table(path: str | Path, columns: Sequence[str]) -> dict[str, np.ndarray
     separated by commas, semicolons or tabs, whichever splits the header line into most names; its
     decimals have a point. Lines that begin with `#` may stand above the header, and the header may
     be the last of them, as `numpy.savetxt` writes it. **Returns** name → (T,) numbers. An empty
-    cell is a gap and comes back as NaN. A text is read line by line: beside it, up to three times
-    its numbers are held.
+    cell is a gap and comes back as NaN. A text is read line by line; the memory needed is up to
+    three times its numbers.
 
     **Raises:** `LogError`, one line naming file, line and column, for a file that is missing, cut
-    or not of its kind, a missing column or two of its name, a name that is wanted twice, a cell
-    that is not a number, a line with more cells than the header, columns of different lengths.
+    or not of its kind, a column that is missing or occurs twice, a name given twice, a cell that is
+    not a number, a line with more cells than the header, columns of different lengths.
 
     >>> read_table("missing.csv", ["t"])
     Traceback (most recent call last):
@@ -92,7 +92,7 @@ def read_gyro_csv(
 
     **Arguments:** `path` the file; `columns` the names of the time column (s) and of the three rate
     columns (body frame); `unit` of the rates, `rad/s` or `deg/s`; `noise` standard deviation of a
-    reading in that unit, or `None` to have it estimated. Other columns are ignored. For other
+    reading in that unit, or `None` to estimate it. Other columns are ignored. For other
     sensors and files: `read_table`, then `Recording`.
 
     **Raises:** `LogError`, one line naming file, line and column, for a file that is missing or not
@@ -121,7 +121,7 @@ def read_gyro_csv(
 
 
 def increasing(path: str | Path, t: np.ndarray, name: str) -> None:
-    """Raise `LogError` unless there are four times at least and each is above the one before."""
+    """Raise `LogError` unless there are at least four times and they increase."""
     if t.size < 4:
         raise LogError(f"{path}: wanted at least 4 samples, got {t.size}")
     if not np.isfinite(t).all():
@@ -139,7 +139,7 @@ def increasing(path: str | Path, t: np.ndarray, name: str) -> None:
 
 def _csv(path: Path, columns: Sequence[str]) -> dict[str, np.ndarray]:
     try:
-        # Line by line: what is held of a large file is its numbers.
+        # Line by line: only the numbers of a large file stay in memory.
         with path.open(encoding="utf-8-sig", newline="") as file:
             return _rows(path, file, columns)
     except (OSError, UnicodeDecodeError, csv.Error) as error:
@@ -202,7 +202,7 @@ def _number(cell: str) -> float:
 
 
 def _arrays(path: Path, columns: Sequence[str]) -> dict[str, np.ndarray]:
-    # The readers raise whatever they run into in an empty or a cut file.
+    # The readers raise many kinds of errors for an empty or a cut file.
     try:
         names, held = _readers[path.suffix.lower()](path, columns)
     except ModuleNotFoundError as error:
@@ -232,7 +232,7 @@ def _arrays(path: Path, columns: Sequence[str]) -> dict[str, np.ndarray]:
 
 
 def _npz(path: Path, columns: Sequence[str]) -> tuple[list[str], dict[str, Any]]:
-    # NumPy leaves the handle open of a file that it opened itself and cannot read.
+    # NumPy does not close a file that it opened itself and cannot read.
     with path.open("rb") as raw, np.load(raw) as file:
         return file.files, {name: file[name] for name in columns if name in file.files}
 

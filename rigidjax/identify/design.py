@@ -1,4 +1,4 @@
-"""Experiment design: what a motion would show before it is made, and which motion shows most."""
+"""Experiment design: the expected uncertainty of a planned motion, and the best motion."""
 
 from typing import Any
 
@@ -21,12 +21,12 @@ from rigidjax.identify.uncertainty import inverted
 
 
 def expected(problem: Problem, parameters: Parameters) -> tuple[Quantity, ...]:
-    """What a fit of such a recording would report, and how sure it would be.
+    """The expected report of a fit of such a recording, with its standard deviations.
 
     **Arguments:** `problem` whose recordings give times, sensors with known noise, and torques (the
-    readings themselves do not matter); `parameters` the motion that is planned. **Returns** the
-    quantities of `Fit.quantities` with the standard deviations of the Cramér–Rao bound, infinite
-    where the motion would show nothing.
+    readings themselves do not matter); `parameters` the planned motion. **Returns** the quantities
+    of `Fit.quantities` with the standard deviations of the Cramér–Rao bound, infinite for a
+    quantity that the motion does not show.
 
     **Raises:** `ValueError` for a sensor whose noise is not given, or numbers that are not finite.
 
@@ -54,10 +54,10 @@ def expected(problem: Problem, parameters: Parameters) -> tuple[Quantity, ...]:
 
 
 def plan_of(problem: Problem, body: Any, omega: Any) -> Parameters:
-    """The parameters of a planned motion: this body, this first rate.
+    """The parameters of a planned motion: this body, this initial rate.
 
-    **Arguments:** `problem`; `body` an `Inertia` or `MassProperties`; `omega` (3,) first rate,
-    rad/s, body frame. What else is free stays as the recordings give it.
+    **Arguments:** `problem`; `body` an `Inertia` or `MassProperties`; `omega` (3,) initial rate,
+    rad/s, body frame. Other free numbers keep the values of the recordings.
 
     >>> import rigidjax as rj
     >>> record = rj.identify.Recording([0.0, 1.0], (rj.identify.Gyro(), [[1.0, 0, 0]] * 2))
@@ -75,8 +75,8 @@ def plan_of(problem: Problem, body: Any, omega: Any) -> Parameters:
 def fisher(problem: Problem, parameters: Parameters) -> Float[Array, "n n"]:
     """Fisher's information (n, n) of the free numbers: `Jᵀ Σ⁻¹ J` of the predictions.
 
-    **Arguments:** `problem` with known noises; `parameters` the motion. Differentiable in the
-    parameters: a design follows its gradient. **Raises** `ValueError` for a
+    **Arguments:** `problem` with known noises; `parameters` the motion. It is differentiable in the
+    parameters, for a design by gradients. **Raises** `ValueError` for a
     sensor whose noise is not given.
 
     >>> import rigidjax as rj
@@ -118,15 +118,15 @@ def _on_host(problem: Problem, motion: Any) -> None:
 def best_first_rate(
     problem: Problem, body: Any, omega: Any, *, max_steps: int = 60
 ) -> tuple[Vec3, tuple[Quantity, ...]]:
-    """The direction of the first rate that shows most of the body, its length kept.
+    """The direction of the initial rate that determines the body best; its length is kept.
 
-    Makes the mean logarithm of the standard deviations of the body's free numbers small
-    (D-optimality of the body, all else free as well), by BFGS of optimistix on the gradient through
-    Fisher's information. It finds the best direction near `omega`: try several.
+    It minimises the mean logarithm of the standard deviations of the body's free numbers
+    (D-optimality of the body, other numbers free as well), by BFGS of optimistix on the gradient
+    through Fisher's information. It finds the best direction near `omega`: try several.
 
-    **Arguments:** `problem`, `body` as for `plan_of`; `omega` (3,) rad/s, body frame, where the
-    search starts and how fast the body can be thrown; `max_steps`. **Returns** the rate (3,) and
-    what to expect from it (`expected`).
+    **Arguments:** `problem`, `body` as for `plan_of`; `omega` (3,) rad/s, body frame, the start of
+    the search, whose length is the rate of the throw; `max_steps`. **Returns** the rate (3,) and
+    the result of `expected` for it.
 
     **Raises:** as `fisher`.
     """
@@ -156,12 +156,12 @@ def _search(problem: Problem, body: Any, start: Array, size: Array, max_steps: i
 
 
 def _doubt(direction: Array, args: Any) -> Scalar:
-    """½ log det of the body's covariance over its size, plus a hold on the length."""
+    """½ log det of the body's covariance over its size, plus a penalty on the length."""
     problem, body, size = args
     length = jnp.sqrt(jnp.sum(direction**2))
     information = fisher(problem, plan_of(problem, body, size * direction / length))
     n = problem.body.size
-    # The body's own information, all else free: Schur's complement.
+    # The body's information with the other numbers free: Schur's complement.
     mine, across, rest = information[:n, :n], information[:n, n:], information[n:, n:]
     scale = jnp.sqrt(jnp.diagonal(rest))
     rest = rest / (scale[:, None] * scale[None, :]) + 1e-12 * jnp.eye(rest.shape[0])
