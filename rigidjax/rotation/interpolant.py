@@ -13,12 +13,12 @@ from rigidjax.rotation import quaternion, so3
 class AttitudeInterpolant(eqx.Module):
     """Attitude q(t) and body rate Ω(t), both continuous, through given ones.
 
-    Between two knots q(t) = q_0 exp(v(s)), with v the cubic that has the right ends and slopes in
-    the Lie algebra (Hermite; cf. Park & Ravani 1997, doi:10.1145/256157.256160). q(t) is a rotation
+    Between two knots q(t) = q_0 exp(v(s)), with v the cubic with the given ends and slopes in the
+    Lie algebra (Hermite; cf. Park & Ravani 1997, doi:10.1145/256157.256160). q(t) is a rotation
     everywhere; the error between knots falls as the fourth power of their distance.
 
     **Arguments:** `ts` (n,) s, increasing, n ≥ 2; `qs` (n, 4) unit, body → world, either sign;
-    `omegas` (n, 3) rad/s, body frame. From knot to knot the body turns by less than half a turn:
+    `omegas` (n, 3) rad/s, body frame. The body must turn by less than half a turn between knots:
     the shorter way is taken. **Raises:** for wrong shapes, times that do not increase, and
     quaternions that `quaternion.check` refuses, under `jit` too.
 
