@@ -1,4 +1,4 @@
-"""States, their equations of motion, torques: model no more than the scene needs."""
+"""States, their equations of motion, torques. Take the smallest state that the scene needs."""
 
 from rigidjax._names import show
 from rigidjax._types import (
