@@ -1,4 +1,4 @@
-"""Residuals of a fit: are they noise?"""
+"""Residuals of a fit, and a comparison with white noise."""
 
 from typing import Any
 
@@ -15,17 +15,17 @@ def residuals(
 ) -> Any:
     """Residuals of each sensor over its noise: in time, histogram, autocorrelation, spectrum.
 
-    From left to right: they should scatter evenly within ±2 (what lies beyond ±8 is counted, not
+    From left to right: they should scatter evenly within ±2 (residuals beyond ±8 are counted, not
     drawn); their histogram against the normal curve; the correlation of each with a later one,
     which for white noise stays inside the band ±2/√N; their power spectrum, which for white noise
-    of the given size is 1 at all frequencies (Welch's estimate; Lomb's where times are uneven).
+    of the given size is 1 at all frequencies (Welch's estimate; Lomb's for uneven times).
     A line in the spectrum is a motion or a torque that the model lacks.
 
-    **Arguments:** `found` a `rigidjax.identify.Fit`; `index` which of its recordings; `time_unit`
-    `s`, `min`, `h` or `day`; `title`; `ax` axes of yours (sensors, 4). **Returns** the axes.
+    **Arguments:** `found` a `rigidjax.identify.Fit`; `index` of the recording; `time_unit` `s`,
+    `min`, `h` or `day`; `title`; `ax` your axes (sensors, 4). **Returns** the axes.
 
-    **Raises** `ModuleNotFoundError` where matplotlib is missing; `ValueError` for an unknown unit
-    or axes of another shape; `IndexError` for a recording that is not there.
+    **Raises** `ModuleNotFoundError` if matplotlib is missing; `ValueError` for an unknown unit or
+    axes of another shape; `IndexError` for a missing recording.
 
     >>> import jax.numpy as jnp, rigidjax as rj
     >>> ts = jnp.linspace(0.0, 10.0, 80)
@@ -59,7 +59,7 @@ def _one_sensor(row: Any, t: np.ndarray, scaled: np.ndarray, seen: np.ndarray) -
     over_time, spread, memory, spectrum = row
     colours, names = COLOURS[: scaled.shape[1]], "xyz"[: scaled.shape[1]]
     everything = scaled[seen].ravel()
-    # One wild reading must not press all others into a line: what lies beyond is counted.
+    # One outlier must not compress all others into a line: residuals beyond are counted.
     reach = float(np.clip(np.abs(everything).max(initial=0.0) * 1.1, 4.0, 8.0))
     beyond = int((np.abs(everything) > reach).sum())
     shown = np.where(np.abs(scaled[seen]) <= reach, scaled[seen], np.nan)
