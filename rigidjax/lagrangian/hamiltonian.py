@@ -64,7 +64,7 @@ class LiePoisson(eqx.Module):
 
 
 class LiePoissonWithDirection(eqx.Module):
-    """The same with a direction carried along; made by `lie_poisson_with_direction`."""
+    """The same with a direction fixed in the world; made by `lie_poisson_with_direction`."""
 
     hamiltonian: Callable[[Any, Any], Any]
 
