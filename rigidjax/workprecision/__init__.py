@@ -1,7 +1,7 @@
-"""Error against cost, of the value and of the gradient: what to choose for a scene.
+"""Error against cost, of the value and of the gradient: the choice of a method for a scene.
 
-`measure(scene)` runs methods on a scene, `front` finds those that nothing beats, `draw` makes the
-chart, `choose` the short table. `python -m rigidjax workprecision` is all of it.
+`measure(scene)` runs methods on a scene, `front` finds the Pareto front, `draw` makes the chart,
+`choose` the short table. `python -m rigidjax workprecision` is all of it.
 """
 
 from rigidjax._names import show

@@ -1,4 +1,4 @@
-"""What is compared: a scene, with its right answer, and a method, made ready for it and run."""
+"""A scene with its reference, and a method that is prepared for it and run."""
 
 import functools
 import json
@@ -59,14 +59,14 @@ def stored(name: str) -> Reference | None:
 
 
 class Scene(eqx.Module):
-    """One motion that methods are compared on.
+    """One motion for the comparison of methods.
 
     **Fields:** `name`, `title` words; `body` an `Inertia`, `None` for a `Point`; `state0` an
     `Attitude` or a `Point`; `torque` as for `rigidjax.simulate`; `end` s, the run is from 0 to
     `end`; `plain` the same equations without JAX, `plain(numbers, sin, cos, sqrt) → f(t, y)`, for
-    peers and references (`None`: peers are left out); `reference` the right answer, `None`: worked
-    out by our own method at small steps; `slow` whether only a full run looks at it; `notes` what
-    a peer needs to know beyond the equations.
+    peers and references (`None`: peers are left out); `reference` the correct answer, `None`:
+    computed by our own method at small steps; `slow` whether only a full run uses it; `notes` data
+    for a peer beyond the equations.
 
     >>> from rigidjax import Attitude, Inertia, torques
     >>> scene = Scene("mine", "my body", Inertia(jnp.eye(3)),
@@ -168,7 +168,7 @@ def distance(scene: Scene, end: Any, right: Any) -> tuple[float, float]:
 
 
 class Run(NamedTuple):
-    """What one run gives.
+    """The result of one run.
 
     **Fields:** `numbers` the last state (or the gradient) as one vector; `steps` taken.
 
@@ -181,7 +181,7 @@ class Run(NamedTuple):
 
 
 class Ready(NamedTuple):
-    """A method made ready for a scene.
+    """A method prepared for a scene.
 
     **Fields:** `run` setting → `Run`, complete when it returns; `compile` s that making it took,
     `memory` bytes of temporaries, each NaN where unknown.
