@@ -1,7 +1,7 @@
-"""Equal steps: nothing carried but a time, a step and the state's numbers.
+"""Fixed steps: the loop carries only a time, a step and the state's numbers.
 
-`diffrax.diffeqsolve` can do more, at some cost in each step. There is no interpolation: at saved
-times, too, the error is the method's own.
+`diffrax.diffeqsolve` can do more, at some cost in each step. There is no interpolation: the error
+at saved times is also the method's own.
 """
 
 import functools
@@ -30,7 +30,7 @@ def fixed(
     substeps: Any,
     last: Any = None,
 ) -> Any:
-    """`substeps` equal steps between each two times of `ts`.
+    """`substeps` fixed steps between each two times of `ts`.
 
     **Arguments:** `solver` a method of `rigidjax.solvers`; `field` a vector field `f(t, y, args)`
     such as `AttitudeEquations`; `ts` (T,) s; `y0` the state at `ts[0]`; `substeps` a whole number;

@@ -1,4 +1,4 @@
-"""A step of equal length of a method, a body and a torque: all that a loop has to know of them.
+"""A fixed step of a method, a body and a torque: their interface to a loop.
 
 The numbers are carried one by one: XLA on CPU runs a loop over a tuple of scalars as one kernel
 and, batched, over a tuple of (N,) arrays in vector instructions; of a loop over (7,) or (N, 7)

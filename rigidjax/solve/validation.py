@@ -1,4 +1,4 @@
-"""Checks of what `simulate` is given, before anything is integrated."""
+"""Checks of the arguments of `simulate`, before anything is integrated."""
 
 import warnings
 from typing import Any
@@ -40,7 +40,7 @@ def scene(body: Any, state0: Any, ts: Any, torque: Any, throw: bool) -> tuple[An
 
 
 def require_fit(body: Any, state0: Any, torque: Any) -> None:
-    """Raise `TypeError` unless body, state and torque fit."""
+    """Raise `TypeError` unless body, state and torque fit together."""
     if isinstance(state0, Point) and body is not None:
         raise TypeError(f"Point is no body: wanted None in its place, got {type(body).__name__}")
     if isinstance(torque, AbstractScene | MovingFrame) and not isinstance(state0, Point):
@@ -105,7 +105,7 @@ def _single(value: Any, name: str) -> None:
 
 
 def tolerances(rtol: Any, atol: Any, dtype: Any) -> tuple[Any, Any]:
-    """`rtol` and `atol`, by default what `dtype` is good for; a warning where it cannot reach them.
+    """`rtol` and `atol`, by default suited to `dtype`; a warning if it cannot reach them.
 
     Traced ones are taken as they are.
 

@@ -25,8 +25,9 @@ def equations_of_motion(
 ) -> Callable[..., Any]:
     """The vector field of this body for states like `state0`, for plain `diffrax.ODETerm`.
 
-    **Arguments** `body`, `state0`, `torque` as for `simulate`; under a torque with states of its
-    own `state0` is a `rigidjax.motion.Coupled`. **Raises** `TypeError` where they do not fit.
+    **Arguments** `body`, `state0`, `torque` as for `simulate`; `state0` is a
+    `rigidjax.motion.Coupled` if a torque has states of its own. **Raises** `TypeError` if they do
+    not fit together.
 
     >>> import rigidjax as rj
     >>> type(equations_of_motion(rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([1.0, 0, 0])))
