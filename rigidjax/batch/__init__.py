@@ -1,6 +1,6 @@
 """Many bodies: on one device, on several, on several hosts.
 
-    rollout     equal steps; last states, thinned states, or reduced on the way
+    rollout     fixed steps; last states, thinned states, or reduced on the way
     simulate    closed form, adaptive steps, or `Steps`, with a status for each body
     distributed several processes: `connect`, `share`, `gather`, `total`
 
@@ -16,7 +16,7 @@ a fit's loss, gradient and normal equations, once an iteration, by `distributed.
 numbers; histograms and moments of a large batch by `reduce=` on the way and `distributed.total` at
 the end. States are gathered (`distributed.gather`) only if one process needs them all; else each
 writes its own (`distributed.save`). *Expect:* the slowest share determines a run's time.
-Shares are equal in number, so equal steps scale with cores; bodies with adaptive steps are
+Shares are equal in number, so fixed steps scale with cores; bodies with adaptive steps are
 distributed over the devices of a process by speed, not over processes: shuffle them before `share`.
 An iteration of a fit adds one all-reduce of a few kilobytes, against 35 to 55 ms for the gradient
 of 1000 bodies over 1000 steps: with 1000 bodies per process it counts for little. *When one process

@@ -29,7 +29,7 @@ State = TypeVar("State", Spin, Attitude, Rigid)
 
 
 class Steps(NamedTuple):
-    """Fixed steps, in the place of times.
+    """Fixed steps, instead of times.
 
     **Fields:** `size` s; `number` of steps; `save_every` k saves each k-th state, `None` the last;
     `t0` s.
@@ -45,7 +45,7 @@ class Steps(NamedTuple):
 
 
 class Batch(eqx.Module, Generic[State]):
-    """What `simulate` returns.
+    """The result of `simulate`.
 
     **Fields:** `ts` (T,) s; `ys` the states there, of the type of `states0`, with leading axes (N,
     T), in the order of the given bodies; NaN at times that a body did not reach. `result` a

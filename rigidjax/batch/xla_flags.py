@@ -12,7 +12,7 @@ CHECKED = ("0.12.0.1",)
 
 
 class CpuFlags(NamedTuple):
-    """What `cpu_flags` returns.
+    """The result of `cpu_flags`.
 
     **Fields:** `xla_flags` the value for the environment variable `XLA_FLAGS`, with its present
     contents; `set` whether the flag is there; `checked` versions of jaxlib it was measured on;

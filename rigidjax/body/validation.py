@@ -153,7 +153,7 @@ def _moments_of_a_body(value, moments):
         value,
         (m1 < -slack).any() | (m3 < 0).any(),
         f"inertia: wanted moments that are not negative, got{found or ' a negative one'}; "
-        "an inside-out mesh or a product of inertia with the wrong sign gives this",
+        "possible causes: an inside-out mesh, or a product of inertia with the wrong sign",
     )
     short = f" ({float(np.max(m3 - m1 - m2)):.3g} too large)" if _checks.known(value) else ""
     return _checks.refuse(

@@ -39,7 +39,7 @@ class FreeSolver(dfx.AbstractSolver):
     interval is enough; events, `SaveAt(ts=…, dense=True)` and every adjoint work as with any
     solver. `rigidjax.exact.free_body` is shorter if there are no events.
 
-    **Raises:** `ValueError` for a term that is not one of those, or that has a torque.
+    **Raises:** `ValueError` for another term, or one with a torque.
 
     >>> import diffrax, rigidjax as rj
     >>> field = rj.motion.EulerEquations(rj.Inertia.from_principal(1.0, 2.0, 3.0))

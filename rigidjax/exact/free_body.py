@@ -122,8 +122,8 @@ def free_body(inertia: Inertia, state0: State, t: ScalarLike) -> State:
     **Arguments:** `inertia` about the centre of mass, any tensor with positive moments, kg m², body
     frame; `state0` a `Spin` (Ω) or `Attitude` (q, Ω): Ω rad/s in the body frame, q unit quaternion
     (w, x, y, z) body → world; `t` scalar time since `state0`, s, of either sign.
-    **Returns** the state at `t`, of the type and dtype of `state0`. Write `jax.vmap` for many
-    times or bodies; `FreeBody(inertia, state0)` keeps the constants of the motion.
+    **Returns** the state at `t`, of the type and dtype of `state0`. Use `jax.vmap` for many times
+    or bodies; `FreeBody(inertia, state0)` keeps the constants of the motion.
 
     With Π = IΩ and axes 1, 2, 3 in order of their moments, S, C, D Jacobi's functions in a scaling
     that is symmetric in the axes (`rigidjax.exact.jacobi_duplication`) and `dᵢⱼ = 1/Iᵢ − 1/Iⱼ`,

@@ -8,7 +8,7 @@ With f = S/E (E = D or C, whichever has no zero) and `Y₂ = ∫ S²`, `Y = ∫ 
 
 Both integrals double: `Y(2u) = 2Y(u) + f(u)² f(2u)`, and grow by their means over whole periods.
 Off-diagonal entries of K enter through the divided differences of T = diag(D, 1, C), which the last
-doubling gives without a quotient (see `sigma_form`, whose derivatives these are).
+doubling gives without a quotient. These are the derivatives of `sigma_form`.
 """
 
 from typing import NamedTuple

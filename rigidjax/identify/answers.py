@@ -26,7 +26,7 @@ class Answer(eqx.Module):
 
 
 class Cause(eqx.Module):
-    """What most likely makes the errors of a sensor; printed as its words.
+    """The most likely cause of the errors of a sensor; printed as its words.
 
     **Fields:** `name` of the cause; `sensor` whose errors; `share` of their sum of squares that it
     explains (1 for `misread`, which explains the readings themselves), `None` for a guess; `words`
@@ -64,8 +64,8 @@ def advice(
     tries = f" Try: {'; '.join(remedies)}." if remedies else ""
     if model.word == FAILS:
         tries = tries or (
-            " Check units (rad/s, m/s², m, s), signs and order of axes, and what else turns the "
-            "body; more starts help only where the motion is right."
+            " Check units (rad/s, m/s², m, s), signs and order of axes, and other torques on the "
+            "body; more starts help only if the model is right."
         )
         return f"The numbers and intervals say nothing about the body.{tries}"
     if search.word == NOT_ENDED:

@@ -1,4 +1,4 @@
-"""How good a fit is: covariance, status, and whether other starts explain the data as well."""
+"""The quality of a fit: covariance, status, and whether other starts explain the data as well."""
 
 from collections.abc import Sequence
 
@@ -51,7 +51,7 @@ def _elsewhere(
 def _search(
     best_cost: float, done: bool, rivals: str, interrupted: Sequence[str], remarks: Sequence[str]
 ) -> Answer:
-    """How the search ended, in words; `rivals` are the starts that fit as well elsewhere."""
+    """The end of the search in words; `rivals` are the starts that fit as well elsewhere."""
     if not np.isfinite(best_cost):
         return Answer(NOT_ENDED, ("no start gave a finite misfit",))
     if not done:

@@ -272,7 +272,7 @@ class Mass(AbstractBodyChart):
 
     @property
     def size(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """How many numbers are free."""
+        """The number of free numbers."""
         return len(self._places)
 
     @property

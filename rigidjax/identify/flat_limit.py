@@ -53,7 +53,7 @@ def ends(
 ) -> tuple[np.ndarray, np.ndarray]:
     """The ends of an interval from its middle, in standard deviations, cut at a flat body.
 
-    They are those of the likelihood ratio of two Gaussian numbers of which one is not negative:
+    They follow from the likelihood ratio of two Gaussian numbers, one of them not negative:
     `m²(y) = min over z ≥ 0`. **Arguments:** `reach` the quantile; `correlation` of the number y
     with the flatness z; `away` the free flatness over its standard deviation.
 

@@ -184,7 +184,7 @@ def find(free: Sequence[Free], recording: Recording, of: Sequence[str] = ("",)) 
 def leaf_at(where: Callable[[Any], Any], tree: Any, name: str, what: str) -> tuple[int, Any]:
     """The index of the leaf that `where` picks, and the leaf: an array of numbers.
 
-    **Arguments:** `name` for messages; `what` needs a starting value in the place of `None`.
+    **Arguments:** `name` for messages; `what` needs a starting value instead of `None`.
     **Raises** `ValueError` if it picks nothing, several leaves, or something other than numbers.
     """
     leaves, structure = jax.tree.flatten(tree)

@@ -71,7 +71,7 @@ def _limits(reading: Any) -> np.ndarray | None:
 
 
 def at_limit(readings: Sequence[Any]) -> tuple[np.ndarray, ...]:
-    """Which readings of each sensor are at full scale, (R, T, k); of a problem's stacked ones."""
+    """The mask of each sensor's readings at full scale, (R, T, k); of a problem's stacked ones."""
     out = []
     for reading in readings:
         limit = getattr(reading.sensor, "limit", None)

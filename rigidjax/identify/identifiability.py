@@ -1,4 +1,4 @@
-"""Which numbers a fit determines and which not, in words."""
+"""The numbers that a fit determines, and those that it does not, in words."""
 
 from typing import TYPE_CHECKING
 

@@ -37,7 +37,7 @@ def filled(problem: "Problem", mine: Local, record: Recording) -> Recording:
 def states_of_one(
     problem: "Problem", mine: Local, record: Recording, ref: ReferenceStates, which: Array | None
 ) -> tuple[Recording, Any, Any, Any]:
-    """One recording with its values filled in, its body, its first state and its states.
+    """One recording with its values filled in, its body, its initial state and its states.
 
     The states are `Coupled` if a torque has states of its own.
     """

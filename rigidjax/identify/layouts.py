@@ -44,9 +44,7 @@ def layout_of(path: str | Path) -> Layout:
 
 
 class Header(NamedTuple):
-    """The names of the columns; what separates them; in which line they are; the lines that were
-    read after it.
-    """
+    """Column names; their separator; the number of their line; the lines read after it."""
 
     names: list[str]
     separator: str

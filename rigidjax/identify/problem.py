@@ -45,8 +45,8 @@ class Problem(eqx.Module):
       initial state, all share the body.
     - `body`: the chart of the body: `Ratios()` (the full tensor up to scale), `PrincipalRatios()`
       (body axes known to be principal), `Tensor()`, `Principal()` (with the scale), `Mass(guess)`
-      (all ten numbers), `Known(body)`.
-      Of several bodies: recordings and charts by the bodies' names, as in
+      (all ten numbers), `Known(body)`. For several bodies give recordings and charts by the bodies'
+      names, as in
       `Problem({"proof": [a, b], "box": [c]}, {"proof": Known(body), "box": Tensor(1e-3)})`.
     - `free`: what else is free, a sequence of `Free(where, name, …)`: one value for all, for each
       body, group or recording.
@@ -150,7 +150,7 @@ class Problem(eqx.Module):
 
     @property
     def count(self) -> int:
-        """How many recordings there are."""
+        """The number of recordings."""
         return int(self.records.t.shape[0])
 
     @property
@@ -275,7 +275,7 @@ def one_problem(problem: Any) -> Problem:
     if len(shapes) > 1 or records.t.ndim != 2 or rate.shape != records.t.shape[:1]:
         raise ValueError(
             "problem: wanted one, as Problem(recording, …) makes it, got times and masks of shapes "
-            f"{sorted(shapes)}; of many take them one by one"
+            f"{sorted(shapes)}; take many one by one"
         )
     if _checks.known(rate):
         _checks.finite(rate, "problem: its typical rate")
@@ -385,7 +385,7 @@ def _are_recordings(recordings: Sequence[Any]) -> None:
         if len(lengths) > 1 or item.t.ndim != 1:
             raise ValueError(
                 "recording: wanted one, as Recording(t, …) makes it, got times and masks of "
-                f"shapes {sorted(lengths)}; of many give a sequence"
+                f"shapes {sorted(lengths)}; for many give a sequence"
             )
 
 

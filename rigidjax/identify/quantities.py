@@ -115,7 +115,7 @@ def _place(index: tuple[int, ...]) -> str:
 
 
 def vector(problem: Problem, parameters: Parameters) -> Array:
-    """The reported quantities, logarithms of those that are positive."""
+    """The reported quantities, with logarithms of the positive ones."""
     rates = parameters.own.spin * problem.reference.rate[:, None]
     parts, bodies = [], in_a_row(problem.bodies(parameters))
     for (_, chart), body in zip(charts(problem), bodies, strict=True):
@@ -201,7 +201,7 @@ def _cuts(
 
 
 def covariance(fit: "Fit") -> np.ndarray:
-    """Covariance of the reported quantities, of the logarithms of those that are positive."""
+    """Covariance of the reported quantities, with logarithms of the positive ones."""
     slope = np.asarray(_value_and_slope(fit.problem, fit.beside)[1])[: len(labels(fit.problem))]
     return slope @ np.asarray(fit.seen) @ slope.T
 

@@ -105,7 +105,7 @@ class Recording(eqx.Module):
 
     @property
     def size(self) -> int:
-        """How many numbers were read."""
+        """The number of numbers read."""
         return sum(count_of(reading) for reading in self.readings)
 
     @property

@@ -213,6 +213,6 @@ def one_fit(found: Any, name: str = "fit") -> Fit:
     if np.shape(found.chi2) != ():
         raise ValueError(
             f"{name}: wanted one Fit, as identify.fit returns it, got one with a chi2 of shape "
-            f"{np.shape(found.chi2)}; of many take them one by one"
+            f"{np.shape(found.chi2)}; take many one by one"
         )
     return found

@@ -154,7 +154,7 @@ def _fits(sensor: Any, state0: Any, key: Any) -> None:
     if sensor.noise is not None and jnp.shape(sensor.noise) != (sensor.components,):
         raise ValueError(
             f"sensor: {name}: noise: wanted shape ({sensor.components},), of one sensor, got "
-            f"{jnp.shape(sensor.noise)}; of many use jax.vmap"
+            f"{jnp.shape(sensor.noise)}; for many use jax.vmap"
         )
     if key is not None and sensor.noise is None:
         raise ValueError(

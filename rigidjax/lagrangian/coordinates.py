@@ -91,7 +91,7 @@ def equations_of_motion(
     **Returns** a Module, for `diffrax.ODETerm`. Up to three coordinates are solved by cofactors,
     more by LU (`lineax`).
 
-    Source: Landau and Lifshitz, Mechanics, eq 2.6; the notes ask for it after eq 57.
+    Source: Landau and Lifshitz, Mechanics, eq 2.6; the notes mention it after eq 57.
 
     **Raises:** `TypeError` for anything but functions; `ValueError` if L is not one number. A
     singular ∂²L/∂q̇∂q̇ (a chart's singularity, a coordinate without mass) gives infinities or NaN.

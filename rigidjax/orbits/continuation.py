@@ -124,9 +124,7 @@ def family_slope(scene: Any, orbit: PeriodicOrbit, *, hold: str = "x") -> Period
     """
     change = _slope(scene, crossing(orbit), named(hold))
     turned = ~jnp.isfinite(change.period)
-    words = (
-        f"family_slope: the family does not go on in {hold} here; take another of x, z, vy, period"
-    )
+    words = f"family_slope: the family has a fold in {hold} here; take another of x, z, vy, period"
     return _checks.refuse(change, turned, words)
 
 

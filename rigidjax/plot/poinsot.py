@@ -61,7 +61,7 @@ def polhode(
 ) -> Any:
     """The path of Π = IΩ where the momentum sphere |Π| = h meets the ellipsoid ΣΠᵢ²/Iᵢ = 2T.
 
-    Drawn along the principal axes (ascending moments), in units of h = |Π| of the first state.
+    Drawn along the principal axes (ascending moments), with unit h, the initial |Π|.
     Thin lines are other energies at the same h; the broken ones the separatrix through the middle
     axis. Lines behind the sphere are dotted (this motion) or faint (the others).
 

@@ -244,7 +244,7 @@ def normalise(q: QuatLike) -> Quat:
 
 
 def canonical(q: QuatLike) -> Quat:
-    """Of q and −q, the one with w > 0; if w = 0, the one whose first nonzero component is positive.
+    """The one of q and −q with w > 0; if w = 0, the one with a positive first nonzero component.
 
     **Arguments:** `q` (4,). The same bits come back for q and −q.
 

@@ -30,7 +30,7 @@ def direction(v: Float[Array, "n"], name: str) -> Float[Array, "n"]:
 
 
 def turn(v: Float[Array, "*n"], name: str) -> Float[Array, "*n"]:
-    """Refuse, where it is known, a rotation vector or an angle of which no digit is left."""
+    """Refuse a known rotation vector or angle without a correct digit."""
     if _checks.known(v) and not _largest(v) <= (limit := 1 / float(jnp.finfo(v.dtype).eps)):
         _checks.finite(v, name)
         raise ValueError(
@@ -46,7 +46,7 @@ def _largest(v: Float[Array, "*n"]) -> float:
 
 
 def rotation_matrix(m: Float[Array, "*batch 3 3"], name: str) -> Float[Array, "*batch 3 3"]:
-    """Refuse what is not a rotation matrix."""
+    """Refuse any matrix but a rotation."""
     m = _checks.finite(m, name)
     known = _checks.known(m)
     xp, values = (np, np.asarray(m)) if known else (jnp, m)

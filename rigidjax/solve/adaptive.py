@@ -197,7 +197,7 @@ def _solved(program: _Program, constants: Arrays, run: Run) -> Answer:
         return mapped(_recorded, 0, *args)
 
     def tangents_of(primals: Any, tangents: Any, pull: Any = None) -> tuple[Arrays, Arrays]:
-        """What `recorded` gives, and the tangents of its states; transposed by `pull`."""
+        """The result of `recorded`, and the tangents of its states; transposed by `pull`."""
         # A number without a tangent needs no derivative.
         there = [not isinstance(t, SymbolicZero) for t in tangents]
         smooth = tuple(s and t for s, t in zip(program.smooth, there[:number], strict=True))
@@ -230,7 +230,7 @@ def _solved(program: _Program, constants: Arrays, run: Run) -> Answer:
 
 
 class _Moving(NamedTuple):
-    """Which of the constants and of the numbers of a run have tangents."""
+    """A mask of the constants and the numbers of a run that have tangents."""
 
     constants: tuple[bool, ...]
     run: tuple[bool, ...]

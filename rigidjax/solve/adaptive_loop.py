@@ -154,7 +154,7 @@ def recorded(
     rows: Rows,
     until: Array | None,
 ) -> tuple[LoopState, Rows, Array]:
-    """From here on, as far as there is room for rows; and how many there were."""
+    """The loop from here until the rows are full; and the number of rows."""
     many = max(1, min(_MOST, _BLOCK // run.y0.dtype.itemsize // rows.shape[1]))
 
     def block(state: Any) -> Any:

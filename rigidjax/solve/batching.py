@@ -20,7 +20,7 @@ BLOCK = 16
 
 
 class Layout(NamedTuple):
-    """Which axes the arrays of a program have beyond those of one body.
+    """The axes of a program's arrays beyond those of one body.
 
     **Fields:** `bodies` a last axis of bodies; `shared` which constants have none all the same.
     """

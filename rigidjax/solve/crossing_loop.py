@@ -28,7 +28,7 @@ _MOST = 70
 
 
 class Motion(NamedTuple):
-    """How a body gets on, on (n, *bodies).
+    """The motion of a body, on (n, *bodies).
 
     **Fields:** `attempt(step) → (y, norm)` the state a step later, its error over the tolerance;
     `order` of the method; `longest` step; `condition(t, y) → (g, dg/dt, dy/dt, round-off of g)`;
@@ -44,7 +44,7 @@ class Motion(NamedTuple):
 
 
 class Search(NamedTuple):
-    """What is looked for: crossings upwards (1), downwards (−1) or both (0); so many at most."""
+    """The crossings to find: upwards (1), downwards (−1) or both (0); so many at most."""
 
     direction: int
     many: int

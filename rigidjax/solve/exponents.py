@@ -73,7 +73,7 @@ def lyapunov_exponents(
       or your own on any array or Module of one dtype.
     - `state0`: the state at `t0`; `time`: the length of the run, s.
     - `number`: k, the number of exponents; `None` for all, 6 for an `Attitude`.
-    - `intervals`: N, after each of which the frame is made orthonormal to round-off. Directions may
+    - `intervals`: N; the frame is made orthonormal to round-off after each. Directions may
       grow apart in one by any amount: the frame itself does not grow.
     - `transient`: intervals at the beginning that are not counted: the state approaches its
       attractor, and the tangents to their directions.
@@ -85,8 +85,8 @@ def lyapunov_exponents(
 
     **Returns** `Exponents`. They are NaN if a run fails, and `result` says why.
 
-    Source: Dieci, Russell and Van Vleck 1997, doi:10.1137/S0036142993247311; that frames are to be
-    held orthonormal: Christiansen and Rugh 1997, doi:10.1088/0951-7715/10/5/004.
+    Source: Dieci, Russell and Van Vleck 1997, doi:10.1137/S0036142993247311; for orthonormal
+    frames: Christiansen and Rugh 1997, doi:10.1088/0951-7715/10/5/004.
 
     **Raises:** `TypeError`, `ValueError` for invalid numbers.
 
@@ -150,7 +150,7 @@ class _How(eqx.Module):
 
 
 def _product(a: Array, b: Array) -> Array:
-    """`a @ b` of small matrices, which XLA fuses with what is around it."""
+    """`a @ b` of small matrices, which XLA fuses with the code around it."""
     return jnp.sum(a[:, :, None] * b[None], 1)
 
 

@@ -15,7 +15,7 @@ from rigidjax.solve.step_control import NONFINITE, finite
 class GroupInterpolation(dfx.AbstractLocalInterpolation):
     """Dense output of another interpolation, its quaternion scaled to length 1.
 
-    Saved times fall between steps, so projecting the steps alone leaves what is saved off the
+    Saved times fall between steps, so a projection of the steps alone leaves saved states off the
     group by the error of the interpolation (|q|−1 = 3e-3 at a tolerance of 1e-3).
     """
 

@@ -5,7 +5,7 @@ and, batched, over a tuple of (N,) arrays in vector instructions; of a loop over
 arrays it makes many small kernels. Torques are called on arrays all the same: XLA sees through the
 stacks and slices between.
 
-A body that turns carries the momentum Π = IΩ in the place of Ω. Runge–Kutta methods do not notice a
+A body that turns carries the momentum Π = IΩ instead of Ω. Runge–Kutta methods do not notice a
 constant linear change of variables, so these are the steps that `diffrax` takes with the same
 solver, to round-off; and each of their stages is a third cheaper.
 """
@@ -91,7 +91,7 @@ def _stepper_of(solver: Any, field: Callable[..., Any], y0: Any) -> Stepper:
         return _split(solver, field, y0)
     if not isinstance(solver, AbstractExplicit | Rolled):
         raise TypeError(
-            f"no equal steps of {type(solver).__name__} on {type(y0).__name__}; wanted "
+            f"no fixed steps of {type(solver).__name__} on {type(y0).__name__}; wanted "
             "RungeKutta4, Tsitouras5 or DormandPrince8 of rigidjax.solvers, or, for an Attitude, "
             "Magnus4 or a Splitting of rigidjax.solvers; for others use simulate with "
             "stepsize_controller=diffrax.ConstantStepSize() under jax.vmap"

@@ -21,8 +21,8 @@ from rigidjax.rotation.validation import tolerance
 
 
 def scene(body: Any, state0: Any, ts: Any, torque: Any, throw: bool) -> tuple[Any, Any, Array]:
-    """Body, start and times of a run, of one dtype, or an error; with `throw=False` what is traced
-    and cannot be is NaN.
+    """Body, start and times of a run, of one dtype, or an error; with `throw=False` invalid traced
+    numbers become NaN.
     """
     ts = times(ts, throw)
     state0 = start(state0, throw)
@@ -66,7 +66,7 @@ def require_fit(body: Any, state0: Any, torque: Any) -> None:
 
 
 def _body_of(numbers: Any, moves: bool = False) -> str:
-    """What to write in the place of bare numbers."""
+    """The advice for bare numbers."""
     if not isinstance(numbers, (list, tuple, np.ndarray, jax.Array)):
         return ""
     if moves:

@@ -69,7 +69,7 @@ class Alias(eqx.Module):
 
 
 class LightCurve(eqx.Module):
-    """What `fit_light_curve` returns.
+    """The result of `fit_light_curve`.
 
     **Fields:** `fit` of the best motion, its covariance with an allowance for a body that is no
     ellipsoid (see `fit_light_curve`); `aliases` all motions found, the best first, then by their

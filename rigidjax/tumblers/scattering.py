@@ -155,11 +155,13 @@ def _excess(w: Array, rest: Array) -> Array:
 
 
 def _lambert(shape: Mat3, sun: Vec3, observer: Vec3) -> Scalar:
-    """`∫ μ₀ μ dA` over what is lit and seen, as an integral over normals: dA = det E/(n·En)² dn.
+    """`∫ μ₀ μ dA` over the lit and visible part, as an integral over normals: dA = det E/(n·En)²
+    dn.
 
     Over all that is lit, with μ < 0 where it is not seen, it is `sun·T observer`,
     `T = π det E ∫ (E + τ²)⁻¹ det(E + τ²)^(−½) dτ` from 0 on (both are one Gaussian integral). So
-    `B(sun, observer) = sun·T observer + B(sun, −observer)`: the smaller one is left, over a lune.
+    `B(sun, observer) = sun·T observer + B(sun, −observer)`: the smaller integral remains, over a
+    lune.
     """
     minors = cofactors(shape)
     total, of_sun = shape[0, 0] + shape[1, 1] + shape[2, 2], apply(minors, sun)

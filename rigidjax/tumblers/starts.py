@@ -62,7 +62,7 @@ def candidates(
     """The best of the grid whose precession and rotation have these frequencies, the best first.
 
     **Arguments:** `pair` (2,) of the mean precession and of twice the rotation, 1/s; `mode` of
-    `MODES`: the axis that is circulated; `light` times since the first, s, squared fluxes and ones
+    `MODES`: the circulated axis; `light` times since the first, s, squared fluxes and ones
     over their noise, and zeros where there is none; `half_way` (3,) the direction half way, world
     frame; `areas` M (3,) of a known ellipsoid, or `None` for the uniform one of each body; `count`
     how many bodies, each with all turns of `ABOUT`.

@@ -26,7 +26,7 @@ BLOCK = 256
 
 
 class TwoFrequencies(eqx.Module):
-    """What `two_frequencies` returns, the best first.
+    """The result of `two_frequencies`, the best first.
 
     **Fields:** `frequencies` (n, 2) in 1/s; `misfits` (n,) χ² of each pair's series, and `dof`;
     `scatter` the standard deviation of the best one's residuals, in the unit of the values; `lines`

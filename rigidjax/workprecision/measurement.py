@@ -56,9 +56,9 @@ def measure(
 ) -> list[Record]:
     """Error and cost of each method at each of its settings, of the value and of its gradient.
 
-    All runs are in this process, in turn, round after round; compilation is timed separately. A
-    method that cannot do the scene is left out. So is a run with an error of more than half a
-    radian (or 100 %).
+    All runs are in this process, in turn, round after round; compilation is timed separately. The
+    records omit methods that cannot do the scene, and runs with an error of more than half a radian
+    (or 100 %).
 
     **Arguments:** `scene`; `methods` (all of `methods()` by default); `peers` more of them;
     `gradients` whether gradients are measured, too; `thin` takes every `thin`-th setting; `rounds`
@@ -167,7 +167,7 @@ def _gradient_errors(scene: Scene, run: Run, right: Reference) -> dict[str, floa
 
 
 def drifts(scene: Scene, end: Any) -> tuple[float, float]:
-    """How far energy and momentum (of a point its integral, and nothing) moved, relative."""
+    """The relative drift of energy and momentum (for a point of its integral alone)."""
     if scene.body is None:
         law: Any = scene_of(scene.torque)
         state: Any = scene.state0

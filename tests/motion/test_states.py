@@ -337,7 +337,7 @@ def made(**change):
         (lambda: torques.Lagged(lambda t: t, 0.0), ValueError, "time: wanted a positive time"),
         (lambda: rj.simulate(BODY, START, TS, Drive(torques.Lagged(lambda t: t, 0.1, [1.0, 2.0]))), ValueError, r"start has the shape \(2,\)"),
         (lambda: torques.Delayed(torques.Lagged(lambda t: t, 1.0), 0.1), TypeError, "delay its input"),
-        (lambda: rj.batch.rollout(BODY, rj.Attitude(START.q[None], START.omega[None]), 0.1, 2, WHEELS, solver=rj.solvers.Magnus4()), TypeError, "no equal steps of Magnus4 on Coupled"),
+        (lambda: rj.batch.rollout(BODY, rj.Attitude(START.q[None], START.omega[None]), 0.1, 2, WHEELS, solver=rj.solvers.Magnus4()), TypeError, "no fixed steps of Magnus4 on Coupled"),
         (lambda: rj.simulate(BODY, START, TS, WHEELS, solver=rj.solvers.Splitting4()), TypeError, "Splitting: wanted AttitudeEquations"),
         (lambda: made(axes=2 * AXES), ValueError, "axes: wanted unit vectors"),
         (lambda: made(axes=AXES[0]), ValueError, r"axes: wanted \(R, 3\)"),

@@ -19,8 +19,8 @@ class SensorInput(eqx.Module):
 
     **Fields:** `t` s; `state` of the kind that the problem needs; `body` the `Inertia` or
     `MassProperties`; `field` the equations of motion `f(t, state, args)`, with the torques' own
-    states put in at their values at `t`; `own` these states, for `rigidjax.torques.freeze`: a
-    sensor of your own may read a wheel or a motor by them.
+    states put in at their values at `t`; `own` these states, for `rigidjax.torques.freeze`; your
+    own sensor can read a wheel or a motor from them.
 
     >>> import rigidjax as rj
     >>> body, state = rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([0.0, 0.0, 1.0])
