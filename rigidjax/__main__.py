@@ -18,19 +18,21 @@ from rigidjax.identify import cli_spec
 from rigidjax.identify.csv_io import LogError
 from rigidjax.workprecision import command
 
-# What the demo heeds as well; all else says how logs are to be read.
+# The options that the demo uses as well; the others describe how to read logs.
 _OF_ALL = ("starts", "checkpoint", "figure", "report", "json", "no_cache")
-# What is written, and what must not be written over.
+# The outputs, and the inputs that must not be overwritten.
 _OUT = ("checkpoint", "figure", "report", "json", "csv", "keep")
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line; returns the exit code.
 
-    0 good; 1 a fit not to trust; 2 bad input, or a file that could not be written; 130 interrupted.
+    0 success; 1 an untrustworthy fit; 2 bad input, or a file that could not be written; 130
+    interrupted.
 
     **Arguments:** `arguments` those of the command line; `None` for the ones of this process. Only
-    then is the process all ours, and its compiled programs are kept for the next (`--no-cache`).
+    then does the process belong to this command, and its compiled programs are kept for the next
+    run (`--no-cache`).
     """
     parser = _parser()
     options = parser.parse_args(arguments)
@@ -306,7 +308,7 @@ def _logs(options: argparse.Namespace) -> int:
 
 
 def _fit(problem: rj.identify.Problem, options: argparse.Namespace, starts: int) -> Any:
-    """The fit, or `None` after a line on what is wrong."""
+    """The fit, or `None` after an error message."""
     try:
         return rj.identify.fit(
             problem,
@@ -335,7 +337,7 @@ def _write(
     units: dict[str, str],
     more: Sequence[tuple[str, float, float, float, str]] = (),
 ) -> int:
-    """What was asked for, each on its own; the exit code."""
+    """The outputs that the options ask for, each separately; the exit code."""
     report, figure = rj.identify.report, options.figure
     if options.demo and figure is None and _matplotlib():
         figure = Path("toutatis.png")
@@ -408,7 +410,7 @@ def _say(line: str) -> None:
 
 
 def _error(what: object) -> int:
-    """Say what is wrong, in one line; **returns** the exit code 2."""
+    """Print the error in one line; **returns** the exit code 2."""
     print(f"error: {_checks.printable(what)}", file=sys.stderr)
     return 2
 

@@ -1,4 +1,4 @@
-"""What `dir` of a public module shows, and what a wrong name may mean."""
+"""The names that `dir` of a public module shows, and suggestions for a wrong name."""
 
 import difflib
 import functools

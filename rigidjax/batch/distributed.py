@@ -1,9 +1,8 @@
 """Several hosts: each works on its own share of the bodies; only results are sent.
 
-Bodies are independent, so a run itself sends nothing, and a process gets for its share what
-one process alone would get, bit for bit. What can fail is the gathering: where another process has
-ended there is nothing to wait for. So a share is written to disk first, and the run then ends with
-an error.
+Bodies are independent: a run itself sends nothing, and the results of a share are the same bits as
+on one process alone. Gathering fails if another process has ended. A share is therefore written to
+disk first, and the run then ends with an error.
 """
 
 import os
@@ -25,14 +24,14 @@ PATIENCE = 20
 
 
 def connect(address: str, processes: int, process: int, *, patience: int = PATIENCE) -> None:
-    """Join the other processes; to be called before anything else of JAX.
+    """Join the other processes; call it before anything else of JAX.
 
-    **Arguments:** `address` "host:port" of process 0; `processes` how many there are; `process`
-    which of them this is, from 0; `patience` s after which a process that does not answer is given
-    up: every process then ends, with a message and a non-zero exit code.
+    **Arguments:** `address` "host:port" of process 0; `processes` their number; `process` the index
+    of this one, from 0; `patience` s after which a process without an answer counts as dead: every
+    process then ends, with a message and a non-zero exit code.
 
-    **Raises:** `ValueError` for a number that is none of theirs; `RuntimeError` where JAX is in use
-    already or the others do not come.
+    **Raises:** `ValueError` for an index out of range; `RuntimeError` if JAX is in use already or
+    the others do not answer.
 
     >>> connect("localhost:1234", 2, 2)
     Traceback (most recent call last):
@@ -55,10 +54,10 @@ def connect(address: str, processes: int, process: int, *, patience: int = PATIE
 def share(tree: Any) -> Any:
     """This process's rows of arrays that have a leading axis of bodies.
 
-    **Returns** the tree with ⌈N / processes⌉ rows, the last processes fewer. Arrays that all bodies
-    share do not belong in it.
+    **Returns** the tree with ⌈N / processes⌉ rows, the last processes fewer. Leave out arrays that
+    all bodies share.
 
-    **Raises:** `ValueError` where there are fewer bodies than processes.
+    **Raises:** `ValueError` for fewer bodies than processes.
 
     >>> share(jnp.arange(5)).shape
     (5,)
@@ -80,12 +79,12 @@ def share(tree: Any) -> Any:
 def gather(tree: Any, checkpoint: str | os.PathLike[str] | None = None) -> Any:
     """All processes' rows, on every process, in order.
 
-    **Arguments:** `tree` arrays with this process's rows, as `share` cut them; `checkpoint` a
+    **Arguments:** `tree` arrays with this process's rows, as from `share`; `checkpoint` a
     folder: the rows are written there first, as `share-3.npz`, for `recover`.
     **Returns** the tree with the rows of all, in host memory.
 
-    **Raises:** `TypeError` for arrays that are traced; `RuntimeError` where another process has
-    ended. The process should end then: what JAX holds is of no use any more.
+    **Raises:** `TypeError` for traced arrays; `RuntimeError` if another process has ended. This
+    process should end then: JAX's arrays are of no use any more.
 
     >>> gather(jnp.arange(3)).tolist()
     [0, 1, 2]
@@ -97,7 +96,7 @@ def total(tree: Any, checkpoint: str | os.PathLike[str] | None = None) -> Any:
     """The sum over all processes, on every process: of losses, gradients, normal equations.
 
     **Arguments:** `tree` arrays, the same shapes everywhere; `checkpoint` as for `gather`. The sum
-    is taken in the order of the processes, so that every process has the same bits.
+    follows the order of the processes, so that every process has the same bits.
 
     **Raises:** as `gather`.
 
@@ -108,7 +107,7 @@ def total(tree: Any, checkpoint: str | os.PathLike[str] | None = None) -> Any:
 
 
 def save(tree: Any, folder: str | os.PathLike[str]) -> Path:
-    """Write this process's rows to `folder/share-<process>.npz`; whole or not at all.
+    """Write this process's rows to `folder/share-<process>.npz`, all or nothing.
 
     **Arguments:** `tree` of arrays, whose first axis is this process's share; `folder` that all
     processes see. **Returns** the path of the file.
@@ -133,10 +132,10 @@ def save(tree: Any, folder: str | os.PathLike[str]) -> Path:
 
 
 def recover(like: Any, folder: str | os.PathLike[str]) -> list[Any]:
-    """What `save` wrote, process by process; `like` a tree of the same structure.
+    """The rows that `save` wrote, process by process; `like` a tree of the same structure.
 
-    **Raises:** `FileNotFoundError` for a folder without shares; `ValueError` for a file that is
-    none of `save`'s, is cut short, or holds another number of arrays than `like`.
+    **Raises:** `FileNotFoundError` for a folder without shares; `ValueError` for a file that is not
+    from `save`, is cut short, or has another number of arrays than `like`.
 
     >>> import tempfile
     >>> with tempfile.TemporaryDirectory() as folder:

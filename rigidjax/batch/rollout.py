@@ -1,4 +1,4 @@
-"""Equal steps for a whole batch, differentiable in both modes in bounded memory."""
+"""Fixed steps for a whole batch, differentiable in both modes in bounded memory."""
 
 from collections.abc import Callable
 from typing import Any, TypeVar, overload
@@ -26,7 +26,7 @@ from rigidjax.solve.steppers import stepper_of
 
 State = TypeVar("State", Spin, Attitude, Rigid)
 Reduced = TypeVar("Reduced")
-# What `reduce` carries, the time, the state of one body → what it carries on.
+# Carried value, time, state of one body → next carried value.
 Reduce = Callable[[Any, Array, Any], Any]
 # By name, samples of each body (N, steps, *k), held through a step.
 Inputs = Any
@@ -92,50 +92,51 @@ def rollout(
     chunk: int | None = None,
     devices: Any = None,
 ) -> Any:
-    """`num_steps` equal steps of N bodies, each with its own start, inertia and torque.
+    """`num_steps` fixed steps of N bodies, each with its own initial state, inertia and torque.
 
     **Arguments:**
 
     - `bodies`: one `Inertia` (3, 3) for all, or one per body (N, 3, 3), kg m², body frame;
       `MassProperties` likewise for `Rigid`.
     - `states0`: `Spin`, `Attitude` or `Rigid` whose arrays have a leading axis N, at `t0`.
-    - `step_size` s, the same for all; `num_steps` a whole number, part of what is compiled.
-    - `torque`: `None`, or any law that `rigidjax.simulate` takes. Its arrays are shared by all
-      bodies unless `torque_axes` is 0 (each array has a leading axis N: make one law per body with
-      `jax.vmap`), a function that picks those that have (`lambda law: law.speed`, of a `Sum`
-      `lambda law: law.parts[1]`, several in a tuple), or a tree of 0 and `None`, one for each.
+    - `step_size` s, the same for all; `num_steps` a whole number, a constant of the program.
+    - `torque`: `None`, or any torque that `rigidjax.simulate` takes. All bodies share its arrays
+      unless `torque_axes` says otherwise: 0 (each array has a leading axis N: make one torque per
+      body with `jax.vmap`), a function that picks the arrays with this axis
+      (`lambda law: law.speed`, for a `Sum` `lambda law: law.parts[1]`, several in a tuple), or a
+      tree of 0 and `None`, one for each.
     - `solver`: `None` takes `Magnus4` for a free attitude, or a torque that does not depend on the
-      attitude, and `rigidjax.solvers.RungeKutta4` for all else. Any of `rigidjax.solvers` that is
-      explicit may be given; the steps are those that `diffrax` takes with it, to round-off.
-    - `save_every`: `None` returns the last states only; k those after k, 2k, … steps.
+      attitude, and else `rigidjax.solvers.RungeKutta4`. It may be any explicit method of
+      `rigidjax.solvers`; the steps agree with those of `diffrax` to round-off.
+    - `save_every`: `None` returns the last states only; k the states after k, 2k, … steps.
     - `reduce`, `initial`: a function `(carried, t, state) → carried` of one body, called after
       every `save_every` steps (one, by default), and its first value. States are not kept then.
       A new function for each call compiles again: define it once, best as a Module.
-    - `t0` s, when the first step begins.
-    - `inputs`: what drives the law, by the names of its `rigidjax.torques.Input`s: arrays
-      (N, num_steps, *k) whose row i is held exactly through step i of that body; those of a
+    - `t0` s, the time of the first step.
+    - `inputs`: the inputs of the torque, by the names of its `rigidjax.torques.Input`s: arrays (N,
+      num_steps, *k) whose row i is held exactly through step i of that body; rows of a
       `rigidjax.torques.Delayed` input come later.
-    - `chunk`: how many bodies are computed at a time. `None` is what fits the first cache, 128 in
+    - `chunk`: the number of bodies computed at a time. `None` fills the first cache, 128 in
       float64. Bodies are independent: chunks change results in the last digits at most.
     - `devices`: `None` for one, `"all"` of this process, or a sequence of them; N is cut into
-      equal shares. Free bodies get the same bits; with a torque whose numbers are shared XLA may
-      order products in another way, which is one rounding.
+      equal shares. Free bodies get the same bits; XLA may change the order of products of a shared
+      torque, which is one rounding.
 
     **Returns** the states, of the type of `states0`, with leading axes (N,) or, with `save_every`,
     (N, num_steps // save_every); with `reduce` the pair (last states, carried). Under a torque with
     states of its own they have `.motion` and `.own`.
 
-    Memory: the inputs, what is returned, and a chunk. Derivatives are those of the steps as taken,
-    in forward mode and in reverse; reverse mode goes back in pieces of √`num_steps` steps and
-    holds one chunk's at a time, five to ten times the time of the value. A body that becomes NaN
+    Memory: the inputs, the results, and a chunk. Derivatives are exact for the steps taken, in
+    forward and reverse mode. Reverse mode goes back in pieces of √`num_steps` steps and stores one
+    chunk at a time; it takes five to ten times the time of the value. A body that becomes NaN
     stays NaN and changes no other.
 
-    Inside `jax.jit` of your own see `rigidjax.batch.compiler_options`.
+    For use inside your own `jax.jit` see `rigidjax.batch.compiler_options`.
 
-    **Raises:** `TypeError` where bodies, states, torque and solver do not fit; `ValueError` for
-    shapes that do not agree, an input that is missing or that no law reads, a step that is not
-    positive, a `save_every` that does not divide
-    `num_steps`, and, where numbers are known, no positive moments or no unit quaternion.
+    **Raises:** `TypeError` if bodies, states, torque and solver do not fit together; `ValueError`
+    for shapes that do not agree, an input that is missing or that no torque reads, a step that is
+    not positive, a `save_every` that does not divide `num_steps`, and, for known numbers, moments
+    that are not positive or quaternions that are not unit.
 
     >>> import rigidjax as rj
     >>> bodies = rj.Inertia(jnp.diag(jnp.array([1.0, 2.0, 3.0])))
@@ -147,7 +148,7 @@ def rollout(
     h, count = step_of(step_size, num_steps, batch.dtype)
     driven = driven_by(inputs, torque, states0, count, h)
     if reduce is None and initial is not None:
-        raise ValueError("rollout: initial is what reduce begins with; no reduce was given")
+        raise ValueError("rollout: initial is the first value of reduce; no reduce was given")
     if reduce is not None and not callable(reduce):
         raise TypeError(
             f"reduce: wanted a function (carried, t, state) -> carried, got {type(reduce).__name__}"
@@ -172,7 +173,7 @@ def rollout(
 
 
 class _Plan(eqx.Module):
-    """What is compiled."""
+    """The compiled program."""
 
     solver: Any
     count: int = eqx.field(static=True)
@@ -214,7 +215,7 @@ def _run(plan: _Plan, reduce: Reduce | None, rest: Any, numbers: Any) -> Any:
 
     size = sum(leaf.size for leaf in jax.tree.leaves(each[0])) * h.dtype.itemsize
     if size * (plan.count // plan.every) * (plan.every // piece_length(plan.every) + 1) > _KEPT:
-        # Going back, a chunk is worked out anew: else every chunk's pieces would be kept.
+        # A reverse pass computes a chunk again: else every chunk's pieces would be kept.
         one = jax.checkpoint(one)
     return over_bodies(one, (shared, initial, h, t0), each, plan.chunk, plan.mesh)
 

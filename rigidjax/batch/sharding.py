@@ -1,6 +1,6 @@
-"""Many bodies, a few at a time: chunks that fit the cache, and shares for devices.
+"""Many bodies in chunks that fit the cache, and in shares for devices.
 
-Nothing here knows what is done with a body.
+The functions here do not depend on the computation for a body.
 """
 
 import functools
@@ -26,10 +26,10 @@ _WIDE = {"xla_cpu_prefer_vector_width": 512}
 def compiler_options() -> dict[str, Any]:
     """Options for `jax.jit(f, compiler_options=…)` around code that calls `rigidjax.batch`.
 
-    On CPU 512-bit vectors, which XLA does not use unless told to: 1.5 to 2 times the speed on cores
-    that have AVX-512, no change on others. `rollout` and `simulate` do this themselves when they
-    are called outside of any transformation; JAX takes options only at the outermost `jit`, so
-    inside your own give them there. Nothing elsewhere than on CPU.
+    They enable 512-bit vectors on CPU, which XLA does not use by default: 1.5 to 2 times the speed
+    on cores with AVX-512, no change on others. `rollout` and `simulate` use them outside of any
+    transformation. JAX takes options only at the outermost `jit`: give them there if it is your
+    own. They are empty unless the backend is CPU.
 
     >>> bool(jax.jit(lambda x: x + 1, compiler_options=compiler_options())(1.0) == 2)
     True
@@ -40,8 +40,8 @@ def compiler_options() -> dict[str, Any]:
 class Compiled:
     """A function compiled once with `compiler_options`, or, inside a transformation, without.
 
-    A tracer among the `numbers`, its last argument, means that somebody else's `jit` may be
-    outermost, and only that one takes options.
+    A tracer among the `numbers`, its last argument, means that another `jit` may be outermost, and
+    only that one takes options.
     """
 
     def __init__(self, function: Callable[..., Any]):
@@ -83,7 +83,7 @@ def mesh_of(devices: Any) -> Mesh | None:
 
 
 def chunk_of(chunk: int | None, dtype: Any, count: int) -> int:
-    """How many bodies are computed at a time: what fits the cache on CPU, all of them elsewhere."""
+    """The number of bodies computed at a time: a full cache on CPU, all of them elsewhere."""
     if chunk is None:
         small = _ROW // np.dtype(dtype).itemsize
         chunk = small if jax.default_backend() == "cpu" else count
@@ -98,7 +98,7 @@ def over_bodies(
     """`one(shared, a body's part of each)` for all bodies, stacked along a new first axis.
 
     **Arguments:** `shared`, `each` trees of arrays, those of `each` with a leading axis of bodies.
-    Bodies are independent: nothing is sent between devices.
+    Bodies are independent: devices exchange nothing.
     """
     count = jax.tree.leaves(each)[0].shape[0]
     parts = 1 if mesh is None else mesh.devices.size
@@ -106,7 +106,7 @@ def over_bodies(
     room = -(-count // (chunk * parts)) * chunk * parts
 
     def side_by_side(shared: Any, row: Any) -> Any:
-        # Fences, so that a chunk is compiled in the same way, to the last bit, wherever it lies.
+        # Fences, so that each chunk gets the same program, to the last bit.
         shared, row = lax.optimization_barrier((shared, row))
         return lax.optimization_barrier(jax.vmap(one, (None, 0))(shared, row))
 
@@ -127,6 +127,6 @@ def over_bodies(
 
 
 def _padded(a: Any, room: int) -> Any:
-    """The last body again in the places that are left over."""
+    """The last body again in the empty places."""
     more = room - a.shape[0]
     return a if not more else jnp.concatenate([a, jnp.repeat(a[-1:], more, axis=0)])

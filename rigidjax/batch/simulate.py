@@ -1,4 +1,4 @@
-"""The motion of many bodies: closed form, equal steps, or adaptive steps."""
+"""The motion of many bodies: closed form, fixed steps, or adaptive steps."""
 
 from collections.abc import Sequence
 from typing import Any, Generic, NamedTuple, TypeVar
@@ -29,9 +29,10 @@ State = TypeVar("State", Spin, Attitude, Rigid)
 
 
 class Steps(NamedTuple):
-    """Equal steps, in the place of times.
+    """Fixed steps, instead of times.
 
-    **Fields:** `size` s; `number` of steps; `save_every` so many, or the last state only; `t0` s.
+    **Fields:** `size` s; `number` of steps; `save_every` k saves each k-th state, `None` the last;
+    `t0` s.
 
     >>> Steps(0.01, 1000).number
     1000
@@ -44,13 +45,13 @@ class Steps(NamedTuple):
 
 
 class Batch(eqx.Module, Generic[State]):
-    """What `simulate` returns.
+    """The result of `simulate`.
 
-    **Fields:** `ts` (T,) s; `ys` the states there, of the type of `states0`, with leading axes
-    (N, T), in the order that the bodies were given; NaN where a body did not get to. `result` a
+    **Fields:** `ts` (T,) s; `ys` the states there, of the type of `states0`, with leading axes (N,
+    T), in the order of the given bodies; NaN at times that a body did not reach. `result` a
     `diffrax.RESULTS` for each body: `successful`, `nonfinite`, `nonfinite_input` (no body has these
     numbers), `max_steps_reached`, `dt_min_reached`. `num_steps` (N,) accepted and rejected, 0 for
-    the closed form. `own` a tuple of the states of the laws that have some, as `ys`, or `None`.
+    the closed form. `own` a tuple of the torques' own states, as `ys`, or `None`.
 
     >>> import rigidjax as rj
     >>> bodies = rj.Inertia(jnp.diag(jnp.array([1.0, 2.0, 3.0])))
@@ -83,24 +84,24 @@ def simulate(
     chunk: int | None = None,
     devices: Any = None,
 ) -> Batch[State]:
-    """The motion of N bodies, each with its own start, inertia and torque.
+    """The motion of N bodies, each with its own initial state, inertia and torque.
 
     **Arguments:**
 
     - `bodies`, `states0`, `torque`, `torque_axes`, `chunk`, `devices`, and for `Steps` `inputs`: as
       for `rigidjax.batch.rollout`.
-    - `ts_or_steps`: (T,) increasing times, s, or decreasing ones, the first of them the start; or
-      `Steps(size, number)` for equal steps.
+    - `ts_or_steps`: (T,) increasing or decreasing times, s, the first is the start; or
+      `Steps(size, number)` for fixed steps.
     - `solver`: `None` takes the closed form for free bodies, `rigidjax.solvers.DormandPrince8`
-      under a torque, and what `rollout` takes for `Steps`. With times any `diffrax.AbstractSolver`
-      may be given; the explicit ones of `rigidjax.solvers` run in our own loop (256 heavy tops at
-      1e-9 take a seventh of the time that `jax.vmap` of plain `diffrax.Dopri8` takes).
+      under a torque, and the choice of `rollout` for `Steps`. With times any
+      `diffrax.AbstractSolver` may be given; the explicit ones of `rigidjax.solvers` run in our own
+      loop (256 heavy tops at 1e-9 take a seventh of the time that `jax.vmap` of plain
+      `diffrax.Dopri8` takes).
     - `rtol`, `atol`, `max_steps`, `adjoint`: as for `rigidjax.simulate`.
 
-    Bodies that are computed together take steps until the last of them has arrived. So bodies are
-    ordered by how fast they turn at the start, and only those of a chunk wait for each other. A
-    body that becomes NaN ends within two steps. Whatever happens to a body, the others get the same
-    bits.
+    Bodies of one chunk take steps until the last of them has arrived. Bodies are therefore ordered
+    by their initial rate, so that bodies of a chunk are alike. A body that becomes NaN ends within
+    two steps. The other bodies get the same bits whatever happens to one.
 
     **Returns** `ts`, `ys`, `result`, `num_steps` and `own` of each body (`Batch`). Nothing is
     raised for what happens during a run: look at `result`.
@@ -122,7 +123,7 @@ def simulate(
             "values) in the law"
         )
     if isinstance(solver, Magnus4):
-        raise ValueError("simulate: Magnus4 takes equal steps; give Steps(size, number), not times")
+        raise ValueError("simulate: Magnus4 takes fixed steps; give Steps(size, number), not times")
     batch = bodies_of(bodies, states0, torque, torque_axes)
     ts = validation.times(ts_or_steps, True).astype(batch.dtype)
     if torque is not None or solver is not None:
@@ -137,7 +138,7 @@ def simulate(
 
 
 class _Plan(eqx.Module):
-    """What is compiled. Without a solver it is the closed form."""
+    """The compiled program. Without a solver it is the closed form."""
 
     solver: dfx.AbstractSolver | None
     rtol: float | None = eqx.field(static=True)
@@ -215,9 +216,9 @@ def _equal(steps: Steps, bodies: Any, states0: Any, torque: Any, **how: Any) -> 
 
 
 def quickness(body: Any, state0: Any, torque: Any, t0: Array) -> Array:
-    """How fast a body turns and is turned at the start, rad/s: steps are as many as that is large.
+    """The rate of change of the motion at the start, rad/s; the number of steps grows with it.
 
-    **Returns** a scalar, `|Ω| + √|dΩ/dt|`; NaN where there is no slope.
+    **Returns** a scalar, `|Ω| + √|dΩ/dt|`; NaN if the derivative is NaN.
     """
     y0 = started(body, state0, torque, t0)
     slope = motion_of(equations_of_motion(body, y0, torque)(t0, y0, None))
@@ -228,7 +229,7 @@ def quickness(body: Any, state0: Any, torque: Any, t0: Array) -> Array:
 def dealt(key: Array, chunk: int, parts: int) -> tuple[Array, Array]:
     """An order by `key` (N,), NaN last, and the way back from it.
 
-    With several devices chunks are dealt like cards, so that each gets quick ones and slow ones.
+    Several devices get chunks in turn, so that each has quick and slow ones.
 
     >>> order, back = dealt(jnp.array([3.0, 1.0, 2.0]), 128, 1)
     >>> order.tolist(), back.tolist()
@@ -237,7 +238,7 @@ def dealt(key: Array, chunk: int, parts: int) -> tuple[Array, Array]:
     order, count = jnp.argsort(key), key.shape[0]
     chunk = min(chunk, -(-count // parts))
     size = -(-count // (chunk * parts)) * chunk
-    # Where each device's share of `size` lies in the order; the last may be a short one.
+    # The place of each device's share of `size` in the order; the last may be short.
     seats = np.arange(size * parts).reshape(-1, parts, chunk).transpose(1, 0, 2).reshape(-1)
     seats = seats[seats < count]
     order = order[seats]

@@ -1,4 +1,4 @@
-"""What a batch is given, looked at before anything runs: shapes, kinds, and known numbers."""
+"""Checks of a batch before anything runs: shapes, types, and known numbers."""
 
 from typing import Any, NamedTuple
 
@@ -20,10 +20,10 @@ from rigidjax.solve.components import one_dtype
 
 
 class BodyBatch(NamedTuple):
-    """A batch, sorted by what all bodies share and what each has of its own.
+    """A batch, split into the arrays that all bodies share and the arrays of each.
 
     **Fields:** `shared`, `each` trees of the same shape, `(body, state0, torque)`, with `None`
-    where the other has the array; `rest` what is no array at all; `many` N; `dtype`.
+    where the other has the array; `rest` the leaves that are no arrays; `many` N; `dtype`.
     """
 
     shared: Any
@@ -34,7 +34,7 @@ class BodyBatch(NamedTuple):
 
 
 def one_of(shared: Any, each: Any, rest: Any) -> tuple[Any, Any, Any]:
-    """A single body, its state and its torque; NaN, for that body alone, where it cannot be."""
+    """A single body, its state and its torque; NaN, for that body alone, if it is invalid."""
     body, state0, torque = eqx.combine(shared, each, rest)
     return validation.real_or_nan(body), on_the_group(validation.start(state0, False)), torque
 
@@ -42,9 +42,9 @@ def one_of(shared: Any, each: Any, rest: Any) -> tuple[Any, Any, Any]:
 def bodies_of(bodies: Any, states0: Any, torque: Any, torque_axes: Any) -> BodyBatch:
     """The batch.
 
-    **Raises:** `TypeError` for what is no body or state, or does not fit together, or for states
-    of several dtypes; `ValueError` for shapes that do not agree, and, where numbers are known, for
-    a moment that is not positive or a quaternion whose length is not 1, naming the first such body.
+    **Raises:** `TypeError` for anything but bodies and states that fit together, and for states of
+    several dtypes; `ValueError` for shapes that do not agree, and, if numbers are known, for a
+    moment that is not positive or a quaternion whose length is not 1, naming the first such body.
     """
     if not isinstance(states0, Spin | Attitude | Rigid):
         raise TypeError(
@@ -90,7 +90,7 @@ def bodies_of(bodies: Any, states0: Any, torque: Any, torque_axes: Any) -> BodyB
     )
     each, shared = eqx.partition(arrays, axes)
     found = BodyBatch(shared, each, rest, count, dtype)
-    # Shapes are enough for an Inertia, and taking a row costs as much as many steps.
+    # Shapes are enough for an Inertia; taking a row costs as much as many steps.
     shape = lambda a: jax.ShapeDtypeStruct(a.shape[1:], a.dtype)  # noqa: E731
     matter = isinstance(bodies, MassProperties)
     first = jax.tree.map((lambda a: a[0]) if matter else shape, each)
@@ -101,9 +101,9 @@ def bodies_of(bodies: Any, states0: Any, torque: Any, torque_axes: Any) -> BodyB
 def driven_by(inputs: Any, torque: Any, states0: Any, count: int, h: Array) -> Any:
     """The inputs of each body, by name (N, steps, *k), in the precision of the states.
 
-    **Raises:** `ValueError` for an input that is missing, or that the law does not read, for
-    another number of bodies or steps, NaN, a delay as long as the run; `TypeError` for what is no
-    mapping.
+    **Raises:** `ValueError` for an input that is missing, or that the torque does not read, for
+    another number of bodies or steps, NaN, a delay as long as the run; `TypeError` for anything but
+    a mapping.
     """
     for name, delay in delays_of(torque):
         if _checks.known((delay, h)) and (np.abs(np.asarray(delay)) >= count * float(h)).any():
@@ -126,7 +126,7 @@ def driven_by(inputs: Any, torque: Any, states0: Any, count: int, h: Array) -> A
 
 
 def _own_torque(torque: Any, axes: Any, count: int) -> Any:
-    """Which arrays of the torque have a row for each body."""
+    """The arrays of the torque with a row for each body."""
     if callable(axes) and not isinstance(axes, eqx.Module):
         prefix = _selected(torque, axes)
     else:
@@ -148,7 +148,7 @@ def _own_torque(torque: Any, axes: Any, count: int) -> Any:
 
 
 def _selected(torque: Any, pick: Any) -> Any:
-    """True for each array that `pick(law)` gives, alone, in a tuple, or in a part of the law."""
+    """True for each array that `pick(law)` gives, alone, in a tuple, or in a part of the torque."""
     leaves, structure = jax.tree.flatten(torque)
     numbered = jax.tree.unflatten(structure, list(range(len(leaves))))
     try:
@@ -174,7 +174,7 @@ def _positive(tensor: Array) -> None:
             - a[:, 1, 2] * (a[:, 0, 0] * a[:, 2, 1] - a[:, 0, 1] * a[:, 2, 0])
             + a[:, 2, 2] * minor
         )
-        # NaN is a body of its own, whose status will say so.
+        # A body with NaN gets its own status.
         bad = (a[:, 0, 0] <= 0) | (minor <= 0) | (whole <= 0)
     if bad.any():
         i = int(np.argmax(bad))
@@ -200,7 +200,7 @@ def step_of(step_size: Any, num_steps: Any, dtype: Any) -> tuple[Array, int]:
     """The step, s, and the number of steps.
 
     **Raises:** `ValueError` for a step that is not positive; `TypeError` for a number of steps that
-    is no whole number known beforehand.
+    is not a known whole number.
     """
     h = _checks.floating(step_size, (), "step_size").astype(dtype)
     if _checks.known(h) and not 0 < float(h) < np.inf:

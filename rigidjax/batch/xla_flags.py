@@ -7,16 +7,16 @@ import jax
 
 _OPTION = "xla_cpu_small_while_loop_byte_threshold"
 _FLAG = f"--xla_backend_extra_options={_OPTION}=10000000"
-# Where it was measured: `python tests/batch/bench_batch.py --flag`.
+# The versions of the measurement: `python tests/batch/bench_batch.py --flag`.
 CHECKED = ("0.12.0.1",)
 
 
 class CpuFlags(NamedTuple):
-    """What `cpu_flags` returns.
+    """The result of `cpu_flags`.
 
-    **Fields:** `xla_flags` the value for the environment variable `XLA_FLAGS`, with what it holds
-    already; `set` whether it is there; `checked` versions of jaxlib it was measured on; `jaxlib`
-    the one in use.
+    **Fields:** `xla_flags` the value for the environment variable `XLA_FLAGS`, with its present
+    contents; `set` whether the flag is there; `checked` versions of jaxlib it was measured on;
+    `jaxlib` the one in use.
 
     >>> isinstance(cpu_flags().set, bool)
     True
@@ -34,10 +34,10 @@ class CpuFlags(NamedTuple):
 
 
 def cpu_flags() -> CpuFlags:
-    """What to export before Python starts, for loops over one or few bodies on CPU.
+    """The flag to export before Python starts, for loops over one or few bodies on CPU.
 
-    XLA compiles a loop as one kernel if it thinks it small; the option, undocumented, says what is
-    small. It helps where the loop's state is larger than a kilobyte and the arrays are short: on
+    XLA compiles a small loop as one kernel; this undocumented option sets the limit of small. It
+    helps if the loop's state is larger than a kilobyte and the arrays are short: on
     jaxlib 0.12.0.1 one heavy top with `diffrax.Dopri8` took 0.7 of the time, in our own loop 0.8,
     and a `rollout` of one free body 0.45. `rollout` of many bodies is as fast without. It acts on
     the whole process, and only if it is there before JAX first looks for devices. This function

@@ -1,4 +1,4 @@
-"""How far one body is from another, the same in every frame: a prior for fits."""
+"""The distance of one body from another, the same in every frame: a prior for fits."""
 
 from functools import partial
 
@@ -17,9 +17,9 @@ def divergence(body: MassProperties, reference: MassProperties) -> Scalar:
     `D = Tr(J₀⁻¹ J) − log det(J₀⁻¹ J) − 4` with the 4×4 pseudo-inertia
     `J = [[𝔖 + m c cᵀ, m c], [m cᵀ, m]]`: zero only if the bodies are equal, convex in J, infinite
     at plates and rods, and unchanged when both bodies are seen from another frame or in other
-    units. It is known to round-off of the trace. Add `weight * divergence(body, guess)` to a loss
-    so that what the data cannot see stays near the guess. It is twice the Kullback–Leibler
-    divergence for the mass seen as a Gaussian.
+    units. Its error is the round-off of the trace. Add `weight * divergence(body, guess)` to a
+    loss, so that quantities which the data do not determine stay near the guess. It is twice the
+    Kullback–Leibler divergence for the mass seen as a Gaussian.
 
     **Arguments:** `body`; `reference` a body with a positive definite 𝔖; the same frame and units.
 

@@ -1,11 +1,11 @@
-"""Kinetic energy and angular momentum of whatever turns, and the ellipsoids of a body.
+"""Kinetic energy and angular momentum of a turning body, and its ellipsoids.
 
 The notes write the energy of rotation in three forms. Printed eqs 61–65 lack the factor ½ that
 eqs 57 and 73–75 have; here all have it and agree. Eqs 73–75, in principal axes, are
 `kinetic_energy` of `Inertia.from_second_moment(jnp.diag(λ))`.
 
-Poinsot: free motion rolls the energy ellipsoid on a fixed plane; in the body the rate stays on the
-curve where the two ellipsoids of Ω meet. Source: Landau and Lifshitz, Mechanics, § 37.
+Poinsot: free motion rolls the energy ellipsoid on a fixed plane; the rate in the body frame stays
+on the curve where the two ellipsoids of Ω meet. Source: Landau and Lifshitz, Mechanics, § 37.
 """
 
 from typing import Literal
@@ -37,8 +37,9 @@ def kinetic_energy(body: Inertia | MassProperties, state: HasSpin | Vector) -> S
     """Kinetic energy of a body in a state of motion, J.
 
     **Arguments:** `body` an `Inertia` about the point it turns about, or `MassProperties`;
-    `state` anything with `.omega` (Ω, rad/s, body frame), or Ω (3,) itself. With `MassProperties`
-    and a state that moves (`.v`, m/s, of the centre of mass, world frame) translation counts too.
+    `state` anything with `.omega` (Ω, rad/s, body frame), or Ω (3,) itself. Translation counts,
+    too, for `MassProperties` and a state that moves (`.v`, m/s, of the centre of mass, world
+    frame).
 
     `T = ½ m |v|² + ½ Ω·IΩ`. Source: notes, eqs 75 and 79, in any body axes.
 
@@ -57,12 +58,12 @@ def kinetic_energy(body: Inertia | MassProperties, state: HasSpin | Vector) -> S
 def kinetic_energy_about(
     body: MassProperties, q: Quaternion, velocity: Vector, omega: Vector
 ) -> Scalar:
-    """Kinetic energy when the point followed is not the centre of mass, J.
+    """Kinetic energy by the velocity of a point other than the centre of mass, J.
 
-    `T = ½ m |V|² + m V·R(Ω × c) + ½ Ω·I_o Ω`: the cross term that the notes drop by putting the
-    origin at the centre of mass (eqs 54–57).
+    `T = ½ m |V|² + m V·R(Ω × c) + ½ Ω·I_o Ω`: the notes drop the cross term by choosing the origin
+    at the centre of mass (eqs 54–57).
 
-    **Arguments:** `body`; its origin, from which `com` is counted, is the point followed. `q` (4,)
+    **Arguments:** `body`; the point is its origin, the zero of `com`. `q` (4,)
     (w, x, y, z), body → world; `velocity` (3,) V of that point, m/s, world frame; `omega` (3,) Ω,
     rad/s, body frame.
 
@@ -112,11 +113,11 @@ def angular_momentum(body: Inertia | MassProperties, state: HasSpin | Vector) ->
 
 
 def spatial_angular_momentum(body: Inertia | MassProperties, state: HasAttitude) -> Vec3:
-    """Angular momentum in the world frame, `R Π`, (3,), kg m²/s: kept by a free body.
+    """Angular momentum in the world frame, `R Π`, (3,), kg m²/s: constant for a free body.
 
-    **Arguments:** as `angular_momentum`; `state` has `.q` (4,), body → world, and `.omega`. With
-    `MassProperties` and a state that moves (`.x`, `.v`), the orbital part `m x × v` about the
-    world's origin is added.
+    **Arguments:** as `angular_momentum`; `state` has `.q` (4,), body → world, and `.omega`. The
+    orbital part `m x × v` about the world's origin is added for `MassProperties` and a state that
+    moves (`.x`, `.v`).
 
     **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype, or a state without attitude.
 

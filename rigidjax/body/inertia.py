@@ -1,8 +1,8 @@
-"""What is turned: the inertia of a body, and its mass, centre of mass and second moment.
+"""The inertia of a body, and its mass, centre of mass and second moment.
 
-Two tensors say the same thing: the second moment `𝔖 = ∫ r rᵀ dm` (notes, eq 60) and the inertia
-tensor `I = Tr(𝔖) 1 − 𝔖` (eqs 76–78). A matrix is the 𝔖 of a real body exactly when it is positive
-semi-definite; for I that reads as the triangle inequality of its moments.
+Two tensors have the same information: the second moment `𝔖 = ∫ r rᵀ dm` (notes, eq 60) and the
+inertia tensor `I = Tr(𝔖) 1 − 𝔖` (eqs 76–78). A matrix is the 𝔖 of a real body exactly if it is
+positive semi-definite; this is the triangle inequality of the moments of I.
 """
 
 from typing import TypeVar
@@ -40,11 +40,11 @@ from rigidjax.rotation import quaternion
 class Inertia(eqx.Module):
     """The inertia tensor I of a body about the point it turns about.
 
-    **Arguments:** `tensor` (3, 3), kg m², body frame. The constructor looks at shape and dtype
-    only; `from_tensor`, `from_principal` and `from_second_moment` also check that a real body has
-    it. Leading axes are allowed in a container of many bodies; methods take one.
+    **Arguments:** `tensor` (3, 3), kg m², body frame. The constructor checks shape and dtype only;
+    `from_tensor`, `from_principal` and `from_second_moment` also check that the body is real.
+    Leading axes are allowed in a container of many bodies; methods take one.
 
-    I is what is stored, not 𝔖: `from_tensor` is then the identity, and the small moment of a rod
+    The object stores I, not 𝔖: `from_tensor` is then the identity, and the small moment of a rod
     keeps all its digits. Source: notes, eqs 76–78.
 
     **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
@@ -122,8 +122,8 @@ class Inertia(eqx.Module):
         """Principal moments, ascending, and the rotation principal axes → body axes.
 
         **Returns** `(moments, q)`, (3,) kg m² and (4,), with `I = R(q) diag(moments) R(q)ᵀ`.
-        Derivatives are finite for any body, also at equal moments: see
-        `rigidjax.body.principal` for what they mean there.
+        Derivatives are finite for any body, also at equal moments: see `rigidjax.body.principal`
+        for their meaning there.
 
         >>> Inertia.from_principal(3.0, 2.0, 2.5).principal()[0]
         Array([2. , 2.5, 3. ], dtype=float64)
@@ -171,7 +171,7 @@ class Inertia(eqx.Module):
         return Inertia(self.tensor + other.tensor)
 
     def __sub__(self, other: "Inertia") -> "Inertia":
-        """The rest when a part is cut away, about the same point, in the same axes."""
+        """The body without a part, about the same point, in the same axes."""
         return Inertia(self.tensor - other.tensor)
 
 
@@ -267,7 +267,7 @@ class MassProperties(eqx.Module):
         return Inertia(swap_trace(self.second_moment_about(point)))
 
     def shifted(self, r: Vector) -> "MassProperties":
-        """The body carried by `r` (3,), m, in its own axes: only its centre of mass changes.
+        """The body shifted by `r` (3,), m, in its own axes: only its centre of mass changes.
 
         >>> body = MassProperties(2.0, [1.0, 0, 0], [[1.0, 0, 0], [0, 1, 0], [0, 0, 1]])
         >>> body.shifted([0.0, 1.0, 0.0]).com
@@ -307,9 +307,9 @@ class MassProperties(eqx.Module):
         return self if isinstance(other, int) and other == 0 else NotImplemented
 
     def __sub__(self, other: "MassProperties") -> "MassProperties":
-        """The rest when a part is cut away, in the same axes.
+        """The body without a part, in the same axes.
 
-        **Raises:** `ValueError` if more is cut away than is there.
+        **Raises:** `ValueError` if the part has more mass than the body.
 
         >>> part = MassProperties(1.0, [0.0, 0, 0], [[1.0, 0, 0], [0, 1, 0], [0, 0, 1]])
         >>> ((part + part.shifted([2.0, 0, 0])) - part).com
@@ -329,7 +329,7 @@ Body = TypeVar("Body", Inertia, MassProperties)
 
 
 def with_tensor(body: Body, tensor: Mat3) -> Body:
-    """The body with another inertia tensor, unchecked: parts of a body may turn as no body does."""
+    """The body with another inertia tensor, unchecked: parts of a body need not be real bodies."""
     if isinstance(body, Inertia):
         return Inertia(tensor)
     return eqx.tree_at(lambda b: b.second_moment, body, swap_trace_back(tensor))
@@ -338,7 +338,7 @@ def with_tensor(body: Body, tensor: Mat3) -> Body:
 def _joined(body, mass, com, second_moment):
     total = body.mass + mass
     d = com - body.com
-    # From the heavier one: what is far and light moves the centre little.
+    # From the heavier one: a light and distant part moves the centre little.
     heavy = body.mass >= mass
     moved = jnp.where(heavy, mass, -body.mass) / total * d
     return MassProperties(

@@ -11,21 +11,21 @@ from rigidjax import _checks
 from rigidjax.body.inertia import MassProperties
 from rigidjax.rotation import euler, quaternion
 
-# How far a sum of two moments may fall below the third, for files are rounded.
+# The tolerance of the triangle inequality, since files are rounded.
 ROUNDED = 1e-6
 
 
 def read_inertials(path: str | Path) -> dict[str, MassProperties]:
-    """The bodies of a URDF or MuJoCo XML file that state their inertia, by name.
+    """The bodies with inertia in a URDF or MuJoCo XML file, by name.
 
     In the frame of the link or body. URDF: `<inertial>` with `origin` (`xyz`, `rpy`), `mass`,
     `inertia`. MuJoCo: `<inertial>` with `mass`, `pos`, `quat`, `diaginertia` or `fullinertia`;
-    what a file leaves to be computed from its geometry is not read.
+    an inertia that MuJoCo would compute from geometry is not read.
 
     **Arguments:** `path` of the file. **Returns** name → `MassProperties`, in order.
 
-    **Raises:** `ValueError`, naming file and body, for a file that is missing or no such XML, a
-    number that is none, an orientation stated otherwise, an inertia that no body has.
+    **Raises:** `ValueError`, naming file and body, for a file that is missing or of another format,
+    an invalid number, an orientation in another form, an inertia of no real body.
 
     >>> read_inertials("missing.urdf")
     Traceback (most recent call last):
@@ -51,10 +51,10 @@ def write_inertials(
     """A copy of a URDF or MuJoCo XML file with the inertials of these bodies in it.
 
     **Arguments:** `path` of the new file; `bodies` name → `MassProperties`, in the frames of the
-    file's links or bodies; `source` the file to copy; all else in it stays.
+    file's links or bodies; `source` the file to copy; the rest of it stays.
 
-    **Raises:** `ValueError` as `read_inertials`, and for a name that the file has not; `TypeError`
-    for what is no `MassProperties`.
+    **Raises:** `ValueError` as `read_inertials`, and for a name that is not in the file;
+    `TypeError` for anything but `MassProperties`.
 
     >>> write_inertials("new.urdf", {}, "old.urdf")
     Traceback (most recent call last):

@@ -1,9 +1,10 @@
 """Mass properties of the solid inside a closed triangle mesh, by exact integrals.
 
 The solid is a signed sum of tetrahedra from one inner point to each face; over a tetrahedron with
-corners 0, a, b, c the integrals of 1, r and r rᵀ are polynomials of a, b, c. So the result is exact
-up to round-off and differentiable in the vertices. Shifting to the centroid first keeps all digits
-far from the origin, where a sum about the origin subtracts numbers of size (distance)⁵.
+corners 0, a, b, c the integrals of 1, r and r rᵀ are polynomials of a, b, c. The result is
+therefore exact up to round-off and differentiable in the vertices. The mesh is first shifted to its
+centroid, to keep all digits far from the origin: a sum about the origin subtracts numbers of size
+(distance)⁵.
 """
 
 import os
@@ -126,7 +127,7 @@ def _six_volumes(a, b, c):
 
 
 def _outward(volume, corners, faces):
-    # Flat to round-off: as thick as the last digit of its length.
+    # Flat to round-off: its thickness is the last digit of its length.
     a, b, c = (jax.lax.stop_gradient(corners[faces[:, k]]) for k in range(3))
     longest = jnp.ptp(corners, axis=0).max()
     area = 0.5 * jnp.sqrt((jnp.cross(b - a, c - a) ** 2).sum(axis=1)).sum()

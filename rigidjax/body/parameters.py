@@ -1,11 +1,11 @@
 """Unconstrained numbers ↔ real bodies.
 
 The second moment is the square of a symmetric matrix, 𝔖 ∝ (1 + V)² with V trace-free, so that any
-vector is a body: an optimiser needs no constraint and cannot leave the bodies. Plates and rods are
+vector is a body: an optimiser needs no constraint and always has a real body. Plates and rods are
 ordinary points: their root has a zero eigenvalue. In the log-Cholesky chart (Rucker and Wensing
 2022, doi:10.1109/LRA.2022.3144517) they lie at infinity; in Cholesky's factor itself a small turn
-of a plate is a large step. A vector whose 1 + V has a negative eigenvalue stands for the same body
-as another one whose root has none, which `pack` returns.
+of a plate is a large step. A vector with a negative eigenvalue of 1 + V has the same body as
+another vector without one, which `pack` returns.
 """
 
 from collections.abc import Callable
@@ -23,7 +23,7 @@ from rigidjax.body.symmetric3 import apply, from_components, product
 from rigidjax.body.validation import real_moments, real_second_moment
 from rigidjax.rotation.linalg3 import cross
 
-# A body is flat where its least second moment is below this share of their sum.
+# A body is flat if its least second moment is below this share of their sum.
 FLAT = 1e-3
 
 
@@ -56,8 +56,8 @@ def unpack(vector: Float[ArrayLike, "10"] | Numbers) -> MassProperties:
     """The body of ten unconstrained numbers: any ten.
 
     **Arguments:** `vector` (10,) as `pack` returns them. Exponents beyond what the dtype can hold
-    (|α|, |α + ρ| over 330 in float64, 31 in float32) grow logarithmically instead, so that a far
-    too long step of an optimiser gives a large body and not an infinity.
+    (|α|, |α + ρ| over 330 in float64, 31 in float32) grow logarithmically instead, so that an
+    optimiser's step that is much too long gives a large body and not an infinity.
 
     **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
 
@@ -77,7 +77,7 @@ def pack_second_moment(second_moment: Matrix) -> Float[Array, "6"]:
     **Arguments:** `second_moment` (3, 3) 𝔖, kg m², positive semi-definite. **Returns** (6,)
     `(ρ, d1, d2, s12, s23, s13)`: `Tr 𝔖 = 3 e^{2ρ}`, and the shape as in `pack_shape`.
 
-    **Raises:** `ValueError` (`equinox` error under `jit`) for what is no second moment, or zero.
+    **Raises:** `ValueError` (`equinox` error under `jit`) for an invalid or zero second moment.
 
     >>> import jax.numpy as jnp
     >>> pack_second_moment(jnp.eye(3))
@@ -104,12 +104,12 @@ def unpack_second_moment(vector: Float[ArrayLike, "6"] | Numbers) -> Mat3:
 def pack_shape(second_moment: Matrix) -> Float[Array, "5"]:
     """Five unconstrained numbers of a second moment up to its scale.
 
-    Free motion sees only this: the ratios of inertia and the axes. **Arguments:** `second_moment`
-    (3, 3) 𝔖, positive semi-definite, any units. **Returns** (5,) `(d1, d2, s12, s23, s13)`: the
-    root √𝔖 scaled to trace 3 is `1 + V`, V symmetric with `(d1, d2, −d1 − d2)` on its diagonal and
-    `s_ij` beside it.
+    Free motion depends only on this: the ratios of inertia and the axes. **Arguments:**
+    `second_moment` (3, 3) 𝔖, positive semi-definite, any units. **Returns** (5,)
+    `(d1, d2, s12, s23, s13)`: the root √𝔖 scaled to trace 3 is `1 + V`, V symmetric with
+    `(d1, d2, −d1 − d2)` on its diagonal and `s_ij` beside it.
 
-    **Raises:** `ValueError` (`equinox` error under `jit`) for what is no second moment, or zero.
+    **Raises:** `ValueError` (`equinox` error under `jit`) for an invalid or zero second moment.
 
     >>> import jax.numpy as jnp
     >>> pack_shape(jnp.diag(jnp.array([4.0, 4.0, 0.0])))  # a plate

@@ -1,4 +1,4 @@
-"""Mass properties by adding up: points, voxels, quadrature over a volume."""
+"""Mass properties by sums: points, voxels, quadrature over a volume."""
 
 from collections.abc import Callable
 
@@ -75,7 +75,7 @@ def quadrature(
     """The body that fills a parametrised volume: `∫ ρ(r(u)) |∂r/∂u| d³u` over the unit cube.
 
     Gauss–Legendre points, `order` in each direction: exact for polynomials of degree
-    `2·order − 1`. Differentiable in whatever `density` and `place` depend on.
+    `2·order − 1`. It is differentiable in all numbers of `density` and `place`.
 
     **Arguments:** `density` ρ, from r (3,) m to kg/m³; `place` from u (3,) in [0, 1]³ to r (3,) m,
     body frame, one to one inside; `order` points along each direction.

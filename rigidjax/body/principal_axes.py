@@ -39,15 +39,15 @@ def principal(tensor: Mat3Like) -> tuple[Vec3, Quat]:
 
     **Arguments:** `tensor` (3, 3) symmetric: I (kg m²) or 𝔖 (kg m²), body frame.
     **Returns** `(moments, q)`: (3,), ascending, in the units of `tensor`, and (4,) a unit
-    quaternion (w, x, y, z) with `A = R(q) diag(moments) R(q)ᵀ`. Of the four right-handed choices
-    of sign the one closest to no rotation is taken, hence `w ≥ ½`.
+    quaternion (w, x, y, z) with `A = R(q) diag(moments) R(q)ᵀ`. The sign is the one of four
+    right-handed choices that is closest to no rotation, hence `w ≥ ½`.
 
     The derivative is exact where moments differ. Moments that are equal to round-off are one
     eigenspace: the axes do not turn inside it, and its moments move by their own diagonal
-    entries. That is the right derivative of whatever depends on the moments symmetrically and on
-    the eigenspaces only. What mixes axes inside an eigenspace is not seen by any finite tangent
-    of an axis: for a smooth function of the whole matrix, such as a square root, use
-    `rigidjax.body.matrix_function`; to solve, use the matrix itself.
+    entries. That is the correct derivative of any function of the eigenspaces that is symmetric in
+    the moments. No finite tangent of an axis describes a mixing of axes inside an eigenspace: use
+    `rigidjax.body.matrix_function` for a smooth function of the whole matrix, such as a square
+    root; to solve, use the matrix itself.
 
     Source: notes, eqs 71–72; first-order perturbation theory, Kato 1966, II.2.
 
@@ -153,14 +153,14 @@ def _quaternion_near_identity(m: Mat3) -> Quat:
 def matrix_function(function: Callable[[Scalar], Scalar], tensor: Mat3Like) -> Mat3:
     """`f(A) = R diag(f(λ)) Rᵀ` of a symmetric matrix, such as its square root or exponential.
 
-    Its first and second derivatives are right for every body, also for a sphere and a symmetric
-    top, where the principal axes have none. The axes are held; what moves is `E = Rᵀ dA R`, and
+    Its first and second derivatives are correct for every body, also for a sphere and a symmetric
+    top, where the principal axes have none. The axes are held; the change is `E = Rᵀ dA R`, and
     `f(Λ + E)_ij = f(λ_i) δ_ij + f[λ_i, λ_j] E_ij + Σ_k f[λ_i, λ_k, λ_j] E_ik E_kj + …` with divided
     differences, which are smooth where eigenvalues meet (Daleckii and Krein 1965; Higham 2008,
-    "Functions of Matrices", section 3.2). Third derivatives are not carried.
+    "Functions of Matrices", section 3.2). Third derivatives are not available.
 
     **Arguments:** `function` f, scalar → scalar, written in `jax.numpy`, smooth on the spectrum; it
-    may depend on values that are differentiated; `tensor` (3, 3) symmetric, I or 𝔖, any units.
+    may depend on differentiated values; `tensor` (3, 3) symmetric, I or 𝔖, any units.
     **Returns** (3, 3), same frame.
 
     **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.

@@ -1,4 +1,4 @@
-"""Scaling by powers of two, which costs no digit.
+"""Scaling by powers of two, which loses no digit.
 
 Not `jnp.ldexp(x, n)`: before jax 0.12 its derivative by x is 1 instead of 2ⁿ at x = 0 (as in every
 off-diagonal entry of a diagonal tensor), loses digits at large |n|, and is infinite at n = 1023.

@@ -5,7 +5,7 @@ shape lies with its **centre of mass at the origin** and its axis of symmetry, i
 z; place it with `.rotated` and `.shifted`, join with `+`, cut away with `-`. For a density, use
 `rigidjax.body.volumes`: `box(density * volumes.box(size), size)`.
 
-What is written down is the second moment 𝔖 = ∫ r rᵀ dm (notes, eq 60), diagonal in these axes;
+The formulas give the second moment 𝔖 = ∫ r rᵀ dm (notes, eq 60), diagonal in these axes;
 `I1 = λ2 + λ3`, … (eqs 76–78) turns it into the textbook moments of inertia.
 """
 
@@ -171,7 +171,8 @@ def torus(mass: ScalarLike, major: ScalarLike, minor: ScalarLike) -> MassPropert
 def rod(mass: ScalarLike, length: ScalarLike) -> MassProperties:
     """A rod along z without thickness. `𝔖 = m diag(0, 0, ℓ²/12)`.
 
-    Its moment about z is zero: the equations of motion refuse it. Use `cylinder` for a real one.
+    Its moment about z is zero: the equations of motion refuse it. Use `cylinder` for a rod with
+    thickness.
 
     **Arguments:** `mass` kg; `length` m. **Raises:** `ValueError` for a mass ≤ 0 or a negative
     length.

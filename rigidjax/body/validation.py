@@ -1,6 +1,6 @@
-"""Is there a body with these numbers? Checks that name what is wrong.
+"""Checks that a body has these numbers, with the error in words.
 
-Each returns its argument, refused where no real body has it. They work on known values (plain
+Each returns its argument, and refuses numbers of no real body. They work on known values (plain
 exceptions, with the numbers) and under `jit` (`equinox.error_if`, without them). A few units of
 round-off are tolerated, so that plates, rods and points, which lie on the boundary, pass.
 """
@@ -34,13 +34,13 @@ def mass_of_a_body(mass: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
 
 
 def real_inertia(tensor: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3 3"]:
-    """Refuse an inertia tensor that is not symmetric or whose moments no body has."""
+    """Refuse an inertia tensor that is not symmetric, or has moments of no real body."""
     tensor = _symmetric(_checks.finite(tensor, "inertia tensor"), "inertia tensor")
     return _moments_of_a_body(tensor, _eigenvalues(tensor))
 
 
 def real_moments(moments: Float[Array, "3"]) -> Float[Array, "3"]:
-    """Refuse principal moments, in any order, that no body has."""
+    """Refuse principal moments, in any order, of no real body."""
     if not _checks.known(moments) and _checks.known(plain := lax.stop_gradient(moments)):
         # Only differentiated: one look at the numbers, in the place of twenty programs.
         real_moments(plain)
@@ -67,7 +67,7 @@ def possible(body: Any, tensor: Float[Array, "*batch 3 3"], mass: Any, throw: bo
     """Return `body` if some mass has these numbers and no moment is zero.
 
     Other numbers are refused with the cause if they are known, or if `throw`. Without `throw` all
-    numbers of a traced body become NaN: so does its motion, and no other body's.
+    numbers of a traced body, and its motion, become NaN, but no other body's.
 
     **Arguments:** `tensor` the inertia, kg m²; `mass` kg, `None` for a body that only turns.
     """
@@ -113,8 +113,8 @@ _THIN = (
 def _impossible(xp: Any, tensor: Any, slack: float) -> tuple[Any, Any]:
     """Whether a moment is zero to round-off or NaN, and whether no mass has these moments.
 
-    No mass has them unless 𝔖 = ½Tr(I) 1 − I is positive semi-definite: its principal minors tell,
-    for a tenth of what eigenvalues cost in a batch.
+    No mass has them unless 𝔖 = ½Tr(I) 1 − I is positive semi-definite: its principal minors show
+    this, at a tenth of the cost of eigenvalues in a batch.
     """
 
     def minors(a: Any) -> tuple[Any, ...]:
@@ -153,7 +153,7 @@ def _moments_of_a_body(value, moments):
         value,
         (m1 < -slack).any() | (m3 < 0).any(),
         f"inertia: wanted moments that are not negative, got{found or ' a negative one'}; "
-        "an inside-out mesh or a product of inertia with the wrong sign gives this",
+        "possible causes: an inside-out mesh, or a product of inertia with the wrong sign",
     )
     short = f" ({float(np.max(m3 - m1 - m2)):.3g} too large)" if _checks.known(value) else ""
     return _checks.refuse(

@@ -1,4 +1,4 @@
-"""What the special functions do with their arguments before any arithmetic."""
+"""Checks and conversions of the special functions' arguments."""
 
 from typing import Any
 
@@ -20,7 +20,7 @@ def common(**named: Any) -> tuple[Result, ...]:
 
     Python numbers take the dtype of the arrays beside them; without arrays it is JAX's default.
 
-    **Raises:** `TypeError` for what is not float32, float64 or an integer; `ValueError` for shapes
+    **Raises:** `TypeError` unless it is float32, float64 or an integer; `ValueError` for shapes
     that do not broadcast.
     """
     arrays = {

@@ -189,7 +189,7 @@ def _slopes_from_integral(u: Any, m: Any, m1: Any) -> tuple[Any, Any, Any]:
 
 
 def _turns(u: Any, m1: Any) -> tuple[Any, Any, list[Any], list[Any], Any]:
-    """Half periods n in u, what is left as an angle πr/2K, the two rows of means, agm(1, √m1)."""
+    """Half periods n in u, the rest as an angle πr/2K, the two rows of means, agm(1, √m1)."""
     a, b = jnp.ones_like(m1), jnp.sqrt(jnp.where(m1 == 0, 1, m1))
     lows, highs = [], []
     for _ in range(MEAN_STEPS[np.dtype(m1.dtype)]):

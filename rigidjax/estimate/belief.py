@@ -143,7 +143,7 @@ def _shown(recording: Recording) -> Spin | Attitude:
     _, q = attitudes(recording)
     if not len(q):
         raise ValueError(
-            "state: the readings show no first attitude by themselves (an attitude sensor, two "
+            "state: the readings alone show no initial attitude (an attitude sensor, two "
             "directions, or three markers do); give an Attitude"
         )
     return Attitude(jnp.asarray(np.asarray(q[0]), recording.t.dtype), omega)

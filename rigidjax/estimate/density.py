@@ -132,7 +132,7 @@ class LogDensity(eqx.Module):
 
     @property
     def size(self) -> int:
-        """How many numbers x has."""
+        """The number of numbers in x."""
         return self.x0.size
 
     def __call__(self, x: Float[Array, " n"]) -> Scalar:

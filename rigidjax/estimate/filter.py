@@ -29,7 +29,7 @@ WORDS = (
 
 
 class Filtered(eqx.Module):
-    """What `filter` returns.
+    """The result of `filter`.
 
     **Fields:** `belief` a `Belief` at each time of the recording, after its readings; `readings`,
     for each sensor, a `Read`: `innovation`, `variance` and `seen`, (T, k); `log_likelihood` of all
@@ -174,7 +174,7 @@ def step(model: Model, belief: Belief, t: ScalarLike, *readings: tuple) -> Belie
     _checks.instance(belief, Belief, "belief")
     if belief.t.shape != ():
         raise ValueError(
-            f"belief: wanted one, got times of shape {belief.t.shape}; of many use jax.vmap"
+            f"belief: wanted one, got times of shape {belief.t.shape}; for many use jax.vmap"
         )
     when = _checks.time(t).astype(belief.t.dtype)
     if _checks.known((when, belief.t)):

@@ -75,7 +75,7 @@ def steps_of(span: Any, longest: float) -> Any:
 
 
 def _fastest(recording: Recording, first: Belief) -> float:
-    """The largest rate that the first state and the gyros show, rad/s."""
+    """The largest rate that the initial state and the gyros show, rad/s."""
     rate = float(np.linalg.norm(np.asarray(first.x.motion.omega, float)))
     for reading in recording.readings:
         if isinstance(reading.sensor, Gyro):

@@ -78,7 +78,7 @@ class LinearModel(eqx.Module):
 
     @property
     def size(self) -> int:
-        """How many numbers the state has."""
+        """The number of numbers in the state."""
         return self.transition.shape[-1]
 
 

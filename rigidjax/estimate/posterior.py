@@ -29,7 +29,7 @@ class Nuts(eqx.Module):
     """The no-U-turn sampler of blackjax, its step and mass matrix adapted first.
 
     **Arguments:** `samples` kept, `warmup` before them, of each chain; `acceptance` the mean
-    probability with which a trajectory's points are to be accepted, which sets the step: 0.8 is
+    acceptance probability of a trajectory's points, which sets the step: 0.8 is
     careful, 0.65 takes half as many gradients where the density is nearly normal. It needs
     blackjax: `pip install rigidjax[posterior]`. Hoffman and Gelman 2014, JMLR 15:1593.
 
@@ -93,7 +93,7 @@ class Nuts(eqx.Module):
 
 
 class Posterior(eqx.Module):
-    """What `posterior` returns.
+    """The result of `posterior`.
 
     **Fields:** `density`; `x` (chains, samples, n) draws of the vector that it takes. `points` are
     their bodies, states and values, `of(function)` any function of each. `rhat` (n,) is below 1.01

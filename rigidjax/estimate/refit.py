@@ -34,7 +34,7 @@ _LEAST = 100.0
 
 
 class Refit(eqx.Module):
-    """What `refit` returns.
+    """The result of `refit`.
 
     **Fields:** `density`; `x` (n,) where it is largest, `log_density` there; `covariance` (n, n) of
     x, the inverse of Fisher's information there; `converged`; `draws` (m, n) and their `weights`

@@ -17,7 +17,7 @@ from rigidjax.motion.equations import on_the_group
 
 
 class Sampled(eqx.Module):
-    """What `sample` returns.
+    """The result of `sample`.
 
     **Fields:** `t` (T,) s; `states` with a leading time axis; `torques` the value (T, 3) of each
     `CorrelatedTorque`, N m, body frame.

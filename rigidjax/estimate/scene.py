@@ -207,7 +207,7 @@ class Dynamics(eqx.Module):
 
 
 def reset(x: Extended, e: Float[Array, " n"], root: Float[Array, "n m"]) -> Float[Array, "n m"]:
-    """The root of the errors about `x ⊕ e` where `root` is of those about x.
+    """The root of the errors about `x ⊕ e`, from the `root` of the errors about x.
 
     `log(exp(−e) exp(e + δ)) ≈ J_r(e) δ`, to second order in the turn e: Mueller, Hehn and D'Andrea
     2017, doi:10.2514/1.G000848.

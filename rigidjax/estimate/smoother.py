@@ -35,7 +35,7 @@ class Push(NamedTuple):
 
 
 class Smoothed(eqx.Module):
-    """What `smooth` returns.
+    """The result of `smooth`.
 
     **Fields:** `belief` a `Belief` at each stop: the times of the recording and, where these are
     far apart, some between; `rows` (T,) which of them are of the recording; `pushes` a `Push` for
@@ -122,7 +122,7 @@ def smooth(
         return out
     words = (
         "smooth: the motion still moves by a standard deviation after the last iteration; give "
-        "more iterations, a better first state, or a model that the readings fit; throw=False "
+        "more iterations, a better initial state, or a model that the readings fit; throw=False "
         "returns it"
     )
     return _checks.refuse(told(out), out.change > 1, words)

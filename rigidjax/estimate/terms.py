@@ -111,7 +111,7 @@ def prior_residuals(density: "LogDensity", x: Float[Array, " n"]) -> Float[Array
 
 
 def groups_of(problem: Problem) -> Int[Array, " records"]:
-    """Which noise each recording has, as the fit estimates it: all the same unless `noise_each`."""
+    """The index of each recording's noise in the fit: all the same unless `noise_each`."""
     groups = problem.noise_groups
     return jnp.zeros(problem.count, jnp.int32) if groups is None else groups
 
@@ -127,7 +127,8 @@ def grown_noises(noises: tuple, steps: tuple) -> tuple[Float[Array, "*records k"
 def own_numbers(density: "LogDensity", x: Array) -> Any:
     """The numbers of x that each recording depends on, with a leading axis.
 
-    Those of the problem, the logarithms of the noises' factors, and those of the process.
+    They are the problem's numbers, the logarithms of the noises' factors, and the process's
+    numbers.
     """
     problem = density.problem
     parameters, factors, logs = ravel_pytree(density.like)[1](x)

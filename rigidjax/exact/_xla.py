@@ -1,13 +1,13 @@
-"""What XLA on CPU has to be told, so that scalar formulas compile soon and run fast.
+"""Hints to XLA on CPU, so that scalar formulas compile and run fast.
 
 XLA copies cheap arithmetic into each kernel that needs it: a chain of stages that all feed one
-another grows exponentially, in compile time and in run time. It does not copy divisions. Dividing
-by a 1 that it cannot see to be 1 keeps a stage whole, and changes no bit (`fence`).
+another grows exponentially, in compile time and in run time. It does not copy divisions. A division
+by a 1 that is unknown to XLA keeps a stage whole, and changes no bit (`fence`).
 
-And a kernel of one body costs 5 to 10 ms to compile, whatever it holds. Loops with a small state
-become one kernel as a whole; so what is done once is put into a loop (`one_kernel`).
+A kernel of one body costs 5 to 10 ms to compile, whatever its size. A loop with a small state
+becomes one kernel; single computations are therefore put into a loop (`one_kernel`).
 
-And in batches of float64 it calls the scalar sine of the C library (`sincos`).
+XLA calls the scalar sine of the C library in batches of float64 (`sincos`).
 """
 
 import functools
@@ -38,8 +38,8 @@ def fence(tree: Tree, one: Scalar) -> Tree:
 def one_kernel(function: Function) -> Function:
     """The same function of trees of arrays, compiled as one kernel if it is not batched.
 
-    A loop of one turn: XLA knows neither the number of turns nor that the arguments stay, so
-    nothing is taken out of it. Batches, and derivatives, are those of `function` itself.
+    It is a loop of one turn: XLA knows neither the number of turns nor that the arguments stay, so
+    it moves nothing out of the loop. Batches and derivatives use `function` itself.
     """
     # Traced once for all the uses below.
     once = jax.jit(function, inline=True)
@@ -100,9 +100,9 @@ _COS32 = (4.166664568298827e-2, -1.388731625493765e-3, 2.443315711809948e-5)
 def sincos(x: Scalar) -> tuple[Scalar, Scalar]:
     """Sin x and cos x of an angle in radians, by short polynomials. Not for differentiation.
 
-    Cody and Waite 1980 (reduction by π/2 in parts), fdlibm's and Cephes' minimax kernels. Right to
-    one or two units in the last place up to 1e6 rad; beyond that within the round-off of the
-    argument.
+    Cody and Waite 1980 (reduction by π/2 in parts), fdlibm's and Cephes' minimax kernels. The error
+    is one or two units in the last place up to 1e6 rad; beyond that it is within the round-off of
+    the argument.
     """
     wide = x.dtype == jnp.float64
     parts, sines, cosines = (_PARTS64, _SIN64, _COS64) if wide else (_PARTS32, _SIN32, _COS32)

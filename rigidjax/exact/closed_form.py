@@ -1,7 +1,7 @@
 """The free motion in principal axes: values only, in components.
 
 The derivatives are in `rigidjax.exact.derivatives`; nothing here is differentiated, so signs,
-orderings and selections may be taken freely.
+orderings and selections are allowed.
 """
 
 from typing import NamedTuple
@@ -24,11 +24,11 @@ from rigidjax.exact.jacobi_duplication import (
 
 
 class Orbit(NamedTuple):
-    """What a free motion has that does not depend on time. Axes are labelled 1, 2, 3 in order.
+    """The constants of a free motion. Axes are labelled 1, 2, 3 in order.
 
     `a` the largest-or-smallest reciprocal moment, `d12, d13, d23` differences of reciprocal
     moments, `P` the initial momentum and `h` its length, all in principal axes after the
-    labelling; `swapped` says which of the two monotone labellings was taken.
+    labelling; `swapped` says which of the two monotone labellings is used.
     """
 
     a: Scalar
@@ -70,10 +70,10 @@ def orbit(moments: Triple, momentum: Triple) -> Orbit:
 
 
 class Reduced(NamedTuple):
-    """A time less whole half periods.
+    """A time minus whole half periods.
 
-    `halves` half periods, `rest` what is left, `near` the same but for the separatrix, which comes
-    to rest and is not followed beyond.
+    `halves` half periods, `rest` the remaining time, `near` the same, but cut on the separatrix
+    after the time to come to rest.
     """
 
     halves: Scalar
@@ -107,10 +107,10 @@ def restored(o: Orbit, f: Elliptic, u: Reduced) -> tuple[Elliptic, Scalar]:
 
 
 def in_step(f: Elliptic, m: Modulus) -> Elliptic:
-    """The larger of C² and D² made anew from the smaller: D² − C² = (p − q)S².
+    """The larger of C² and D², computed again from the smaller: D² − C² = (p − q)S².
 
-    Each has gathered an error of its own in the doublings. Near the middle axis, where a motion
-    that decays passes into one that grows, C and SD cancel, and only what they share cancels too.
+    Each has its own error from the doublings. C and SD cancel near the middle axis, where a
+    decaying motion becomes a growing one, and only a common error cancels with them.
     """
     gs = m.gap * f.S * f.S
     other = jnp.sqrt(jnp.where(gs > 0, f.C * f.C + gs, f.D * f.D - gs))
@@ -121,7 +121,7 @@ def in_step(f: Elliptic, m: Modulus) -> Elliptic:
 
 
 def momentum_at(o: Orbit, f: Elliptic) -> Triple:
-    """Body momentum when S, C, D are those of the time passed, in the orbit's labelling."""
+    """Body momentum for S, C, D at the time passed, in the orbit's labelling."""
     p1, p2, p3 = o.P
     f = in_step(f, o.modulus)
     y1 = p1 * f.C - o.d23 * p2 * p3 * f.S * f.D

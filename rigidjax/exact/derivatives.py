@@ -9,8 +9,8 @@ and along it `d(Π·θ)/dt = Π·δΩ = ½ δE₂ + ½ Π·δK Π`, E₂ = Π·K
 
     Π(t)·θ = ½ t δE₂ + ½ δK : ∫₀ᵗ Π Πᵀ dt + E₂ δt.
 
-Of δΠ(t) − δΠ(0) and R − 1 all is proportional to the turn, so that the quotient by h² loses nothing
-but at rest, where the derivative is that of a Taylor series.
+δΠ(t) − δΠ(0) and R − 1 are proportional to the turn, so that the quotient by h² loses no digits
+except at rest, where the derivative comes from a Taylor series.
 """
 
 import functools
@@ -41,7 +41,7 @@ from rigidjax.exact.principal_axes import in_axes, into, out_of, principal_frame
 from rigidjax.exact.sigma_form import Differences
 from rigidjax.rotation.linalg3 import components
 
-# Below this turn (rad) a series of second order in time is right to round-off.
+# A series of second order in time is accurate to round-off below this turn (rad).
 _STILL = {jnp.dtype("float32"): 1e-4, jnp.dtype("float64"): 1e-9}
 
 
@@ -70,7 +70,7 @@ def _flow_jvp(primals, tangents):
 
 
 class Setting(NamedTuple):
-    """What a free motion has that does not depend on time: by value, never differentiated."""
+    """The constants of a free motion: by value, never differentiated."""
 
     axes: Mat3
     moments: Triple
@@ -100,7 +100,7 @@ def motion(
 def _motion_jvp(primals, tangents):
     tensor, omega, setting, t = primals
     d_tensor, d_omega, _, d_t = tangents
-    # Two matrices, so that what is transposed is short: all else is compiled once.
+    # Two matrices, so that the transposed part is short: the rest is compiled once.
     first = _by_body(jnp.concatenate([tensor.ravel(), omega]), setting)
     out, (rates, thetas) = _each(lambda time: _body_slopes(tensor, omega, setting, time), t)
     # Summed, not a product of matrices: on a GPU that is rounded to ten bits in float32.
@@ -171,7 +171,7 @@ class Slopes(NamedTuple):
 
 @one_kernel
 def slopes(moments: Six, momentum: Triple, t: Scalar) -> tuple[tuple[Triple, Four], Slopes]:
-    """What `flow` returns, and its derivatives."""
+    """The result of `flow`, and its derivatives."""
     one = opaque_one(t)
     (out, turn), rows, g = fence(first_order(moments, momentum, t), one)
     _, k, energy2 = reciprocal(moments, momentum)
@@ -208,14 +208,14 @@ def slopes(moments: Six, momentum: Triple, t: Scalar) -> tuple[tuple[Triple, Fou
 
 
 def inputs_of(moments: Six, momentum: Triple) -> tuple[Scalar, ...]:
-    """d12, d23, k12, k13, k23, Π(0), k11: what all derivatives are taken by, but for the time."""
+    """d12, d23, k12, k13, k23, Π(0), k11: the variables of all derivatives, besides the time."""
     body, k, _ = reciprocal(moments, momentum)
     return body.d12, body.d23, body.k12, body.k13, body.k23, *momentum, k[0]
 
 
 @jax.custom_jvp
 def first_order(moments: Six, momentum: Triple, t: Scalar):
-    """What `flow` returns; the derivatives of Π(t) − Π(0) by `inputs_of` and t; G = ∫ Π Πᵀ dt.
+    """The result of `flow`; the derivatives of Π(t) − Π(0) by `inputs_of` and t; G = ∫ Π Πᵀ dt.
 
     One loop of doublings gives them all.
     """

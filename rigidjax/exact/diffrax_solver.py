@@ -32,14 +32,14 @@ class FreeInterpolation(dfx.AbstractLocalInterpolation):
 
 
 class FreeSolver(dfx.AbstractSolver):
-    """A diffrax solver for torque-free spins and attitudes whose step is the closed form.
+    """A diffrax solver for torque-free spins and attitudes; its step is the closed form.
 
     Use it with `diffrax.ODETerm(rigidjax.equations_of_motion(inertia, y0))` of a `Spin` or an
     `Attitude`, with no torque. Steps may be as long as one likes, so `ConstantStepSize` with one
     step over the whole interval does; events, `SaveAt(ts=…, dense=True)` and every adjoint work as
     with any solver. Without events, `rigidjax.exact.free_body` is the shorter way.
 
-    **Raises:** `ValueError` for a term that is not one of those, or that has a torque.
+    **Raises:** `ValueError` for another term, or one with a torque.
 
     >>> import diffrax, rigidjax as rj
     >>> y0 = rj.Spin([0.0, 1.0, 1e-4])
@@ -54,7 +54,7 @@ class FreeSolver(dfx.AbstractSolver):
     interpolation_cls: ClassVar[Callable[..., FreeInterpolation]] = FreeInterpolation
 
     def order(self, terms: Any) -> int | None:
-        # Of no importance to an exact step; some controllers ask.
+        # An exact step does not need it; some controllers do.
         return 1
 
     def error_order(self, terms: Any) -> float | None:

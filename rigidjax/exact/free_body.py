@@ -26,7 +26,7 @@ State = TypeVar("State", bound=HasSpin)
 class FreeBody(eqx.Module):
     """The whole motion of a free body; call it with a time.
 
-    What does not depend on time is worked out once. `at` gives the motion at many times.
+    Its constants are computed once. `at` gives the motion at many times.
 
     **Arguments:** as for `free_body`.
 
@@ -44,7 +44,7 @@ class FreeBody(eqx.Module):
 
     def __init__(self, inertia: Inertia, state0: HasSpin):
         _check(inertia, state0)
-        # Powers of two, so that scaling costs no digit and no body is too large or small.
+        # Powers of two, so that scaling loses no digit and no body is too large or small.
         self.exponent = exponent_of(state0.omega)
         self.tensor = times_power_of_two(inertia.tensor, -exponent_of(inertia.tensor))
         self.omega = times_power_of_two(state0.omega, -self.exponent)
@@ -67,7 +67,7 @@ class FreeBody(eqx.Module):
 
     def _at(self, t: Array) -> HasSpin:
         t = t.astype(self.tensor.dtype)
-        # Of so many turns the dtype holds no digit within one: then there is no state.
+        # After so many turns the dtype has no digit within one turn: then there is no state.
         turned = jnp.abs(t) * jnp.max(jnp.abs(self.state0.omega))
         t = jnp.where(turned <= 1 / jnp.finfo(t.dtype).eps, t, jnp.nan)
         since = times_power_of_two(t, self.exponent)
@@ -122,8 +122,8 @@ def free_body(inertia: Inertia, state0: State, t: ScalarLike) -> State:
     **Arguments:** `inertia` about the centre of mass, any tensor with positive moments, kg m², body
     frame; `state0` a `Spin` (Ω) or `Attitude` (q, Ω): Ω rad/s in the body frame, q unit quaternion
     (w, x, y, z) body → world; `t` scalar time since `state0`, s, of either sign.
-    **Returns** the state at `t`, of the type and dtype of `state0`. Write `jax.vmap` for many
-    times or bodies; `FreeBody(inertia, state0)` keeps what does not depend on time.
+    **Returns** the state at `t`, of the type and dtype of `state0`. Use `jax.vmap` for many times
+    or bodies; `FreeBody(inertia, state0)` keeps the constants of the motion.
 
     With Π = IΩ and axes 1, 2, 3 in order of their moments, S, C, D Jacobi's functions in a scaling
     that is symmetric in the axes (`rigidjax.exact.jacobi_duplication`) and `dᵢⱼ = 1/Iᵢ − 1/Iⱼ`,
@@ -132,21 +132,20 @@ def free_body(inertia: Inertia, state0: State, t: ScalarLike) -> State:
         q(t) = q(0) ⊗ exp(½(t/I₁ − Ξ) Π) ⊗ (C, 0, −d₁₂SΠ₂(t/2)C, −d₁₃SΠ₃(t/2))/|…|   S, C, D at t/2
 
     (Jacobi 1850; Landau and Lifshitz, Mechanics, eq 37.10 for Ω; the attitude is the addition
-    theorem of the Weierstrass sigma function taken half way, proved by differentiation.) Nothing is
-    divided by a difference of moments, a rate or an energy: sphere, symmetric tops, plates, spins
-    about any axis, the separatrix and rest are ordinary points. The quaternion is continuous in t
-    (it does not jump between q and −q), has length 1, and `R(q) I Ω` stays what
-    it was to round-off.
+    theorem of the Weierstrass sigma function at the half time, proved by differentiation.) No
+    formula divides by a difference of moments, a rate or an energy: sphere, symmetric tops, plates,
+    spins about any axis, the separatrix and rest are ordinary points. The quaternion is continuous
+    in t (it does not jump between q and −q), has length 1, and `R(q) I Ω` is constant to round-off.
 
     A traced time in which the body turns by more than 1/eps rad gives NaN.
 
-    Derivatives with respect to all arguments are closed forms and right to second order at all
-    those points: they are taken from the motion as a function of the whole tensor
-    (`rigidjax.exact.sigma_form`), never from principal axes. On an unstable axis they grow with
-    e^{λt}, as the motion's do; beyond λt ≈ 150 (float32: 40) they stop growing.
+    Derivatives with respect to all arguments are closed forms and correct to second order at all
+    these points: they come from the motion as a function of the whole tensor
+    (`rigidjax.exact.sigma_form`), never from principal axes. They grow with e^{λt} on an unstable
+    axis, as the true ones do; beyond λt ≈ 150 (float32: 40) they stop growing.
 
     **Raises:** `TypeError`, `ValueError` for a wrong shape or dtype, dtypes that differ, a `Rigid`
-    state; where values are known (not inside `jit`), also for NaN, a moment that is not positive,
+    state; if values are known (not inside `jit`), also for NaN, a moment that is not positive,
     a quaternion whose length is off 1 by more than 1e-6 (float32: 1e-3), and a time in which the
     body turns by more than 1/eps rad, so that no digit of its attitude is left.
 

@@ -10,8 +10,8 @@ q = 0 a symmetric top or a spin about an axis. No case is special, and nothing i
 or p − q. Start from the Taylor series at `u/2^N` and apply the duplication formula N times (DLMF
 22.6(ii)). Three things keep the digits:
 
-* p − q comes in as a number of its own: near the separatrix `C(2u) ∝ C⁴ − p(p − q)S⁴` loses
-  nothing, where `1 − m` from m would lose everything;
+* p − q is a separate number: `C(2u) ∝ C⁴ − p(p − q)S⁴` keeps its digits near the separatrix,
+  whereas `1 − m` from m would lose them;
 * while S is small, `1 − C` is doubled instead, `1 − C(2u) = 2pS²D²/(C² + pS²D²)`: squaring C
   itself would multiply its round-off by 4 at each step;
 * every denominator is a sum of two positive terms.
@@ -48,7 +48,7 @@ class Modulus(NamedTuple):
 
 
 class Limits(NamedTuple):
-    """How far, and in how many doublings, for a dtype."""
+    """The range and the number of doublings for a dtype."""
 
     doublings: int  # from u/2^doublings to u
     agm: int  # steps of the arithmetic–geometric mean
@@ -166,7 +166,7 @@ def half_period(m: Modulus, mu: Scalar, turn: Scalar) -> HalfPeriod:
     With λ² = max(p, q), a₀ = 1, b₀ = √|p − q|/λ: `T = π/(λ agm(a₀, b₀))` (DLMF 19.8.5), and with
     `c₁ = (a₀ − b₀)/2, c_{n+1} = c_n²/(4 a_{n+1})` the mean `⟨S²⟩ = (½ + Σ 2^{n−1} c_n²/w)/λ²`,
     w = min(p, q)/λ² (19.8.6 divided through by w, so that w = 0 is an ordinary value). The phase is
-    the complete integral of the third kind, 19.8.7–19.8.9, with μ in the place of −α².
+    the complete integral of the third kind, 19.8.7–19.8.9, with μ instead of −α².
     """
     big, small = jnp.maximum(m.p, m.q), jnp.minimum(m.p, m.q)
     at_rest = big <= 0
@@ -190,7 +190,7 @@ def half_period(m: Modulus, mu: Scalar, turn: Scalar) -> HalfPeriod:
 
 
 def _mean(_: Array, state: tuple[Scalar, ...]) -> tuple[Scalar, ...]:
-    """A step of the arithmetic–geometric mean, and of what is summed along it.
+    """A step of the arithmetic–geometric mean, and of the sums along it.
 
     `ratio` carries 2^{n−1}.
     """

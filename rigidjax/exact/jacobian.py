@@ -8,7 +8,7 @@ With f = S/E (E = D or C, whichever has no zero) and `Y₂ = ∫ S²`, `Y = ∫ 
 
 Both integrals double: `Y(2u) = 2Y(u) + f(u)² f(2u)`, and grow by their means over whole periods.
 Off-diagonal entries of K enter through the divided differences of T = diag(D, 1, C), which the last
-doubling gives without a quotient (see `sigma_form`, whose derivatives these are).
+doubling gives without a quotient. These are the derivatives of `sigma_form`.
 """
 
 from typing import NamedTuple
@@ -48,9 +48,9 @@ def jacobian_and_integral(
 ) -> tuple[tuple, Six]:
     """d(Π(t) − Π(0)) by (d12, d23, k12, k13, k23, Π(0), k11, t) as three rows, and G = ∫ Π Πᵀ dt.
 
-    Relatively right for short times too. Takes off-diagonal entries as zero. Regular at rest.
-    `before` at half of a time that was reduced by `halves` half periods, `whole` in all, its C and
-    D as in `body`; `mean` of S².
+    The relative error is small for short times, too. Off-diagonal entries must be zero. It is
+    regular at rest. `before` at half of a time that was reduced by `halves` half periods, `whole`
+    in all, its C and D as in `body`; `mean` of S².
     """
     d12, d13, d23 = body[:3]
     p1, p2, p3 = momentum
@@ -75,7 +75,7 @@ def jacobian_and_integral(
     ss, tt = S * S, jnp.where(three, D, C)
     rw = 1.0 / (tt * tt + ss * z)
     m1, m2, m3 = y1 * rw, y2 * rw, y3 * rw
-    # For short times less 1, without subtraction: of C, D and W only what is small.
+    # For short times the values minus 1, without subtraction: only the small parts of C, D and W.
     w1 = ss * (z - jnp.where(three, q, p))
     short = jnp.abs(w1) < 0.5
     c1 = jnp.where(C > 0, -p * ss / (1.0 + jnp.abs(C)), C - 1.0)

@@ -18,19 +18,19 @@ from rigidjax.exact.principal_axes import into, principal_frame
 
 
 def body_period(inertia: Inertia, omega0: Vec3Like) -> Scalar:
-    """Time after which the body rates repeat: one rotation about the axis that is circulated.
+    """Time after which the body rates repeat: one rotation about the circulated axis.
 
-    Seen from the body, the angular momentum circles the axis of the smallest or of the largest
-    moment. This is the time of one round: the rotation period about that axis (5.41 days about the
-    long axis for 4179 Toutatis). For a spin about a stable axis it is the limit, the period of
-    small wobbles. It is infinite on the separatrix, for a sphere and at rest.
+    The angular momentum circles the axis of the smallest or of the largest moment in the body
+    frame. This is the time of one round: the rotation period about that axis (5.41 days about the
+    long axis for 4179 Toutatis). It is the limit, the period of small wobbles, for a spin about a
+    stable axis. It is infinite on the separatrix, for a sphere and at rest.
 
     **Arguments:** `inertia` of the body about its centre of mass (kg m²); `omega0` (3,) Ω at any
     moment, rad/s, body frame. **Returns** a scalar, s.
 
     `T = 2π/agm(√(e₁ − e₂), √(e₁ − e₃))`, eᵢ the roots in `rigidjax.exact.sigma_form` (DLMF
-    19.8.5; Landau and Lifshitz, Mechanics, eq 37.11). Its derivatives are right wherever it is
-    finite, symmetric tops and principal axes included.
+    19.8.5; Landau and Lifshitz, Mechanics, eq 37.11). Its derivatives are correct wherever it is
+    finite, also for symmetric tops and principal axes.
 
     **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype, or a moment known to be zero.
 
@@ -43,13 +43,13 @@ def body_period(inertia: Inertia, omega0: Vec3Like) -> Scalar:
 
 
 def precession_period(inertia: Inertia, omega0: Vec3Like) -> Scalar:
-    """Mean time in which the circulated axis goes round the angular momentum, in space.
+    """Mean time in which the circulated axis turns once about the angular momentum, in space.
 
     The axis of the smallest or largest moment, whichever the momentum circles in the body, turns
     about the fixed angular momentum at a rate that varies within `body_period`; this is 2π over its
-    mean (7.35 days for the long axis of 4179 Toutatis). Where nothing is circulated (separatrix,
-    sphere) it is the period of the turn about the middle axis, `2π I₂/|L|`, its limit. Infinite at
-    rest.
+    mean (7.35 days for the long axis of 4179 Toutatis). It is the period of the turn about the
+    middle axis, `2π I₂/|L|`, its limit, if no axis is circulated (separatrix, sphere). It is
+    infinite at rest.
 
     **Arguments:** as for `body_period`. **Returns** a scalar, s.
 
@@ -88,7 +88,7 @@ def _periods(moments: Six, momentum: Triple) -> tuple[Scalar, Scalar]:
     v = sigma_form.invariants(body, momentum)
     h = jnp.sqrt(sum(p * p for p in momentum))
     endless = is_endless(jax.lax.stop_gradient(Modulus(v.p, v.q, v.gap)))
-    # Where there is no period the branch not taken gets other inputs: no derivative is NaN.
+    # The branch not taken gets other inputs if there is no period, so that no derivative is NaN.
     one, zero = jnp.ones_like(h), jnp.zeros_like(h)
     other = (one, 2 * one, 3 * one, zero, zero, zero), (one, zero, zero)
     safe_moments, safe_momentum = jax.tree.map(
@@ -105,7 +105,7 @@ def _periods(moments: Six, momentum: Triple) -> tuple[Scalar, Scalar]:
 
 @jax.custom_jvp
 def _precession(moments: Six, momentum: Triple, period: Scalar) -> Scalar:
-    """Angle that the circulated axis goes round the momentum in one period of the body rates."""
+    """Angle of the circulated axis about the momentum in one period of the body rates."""
     (i1, i2, i3, *_), (p1, p2, p3) = moments, momentum
     r1, r2, r3 = 1.0 / i1, 1.0 / i2, 1.0 / i3
     d12, d13, d23 = (i2 - i1) * (r1 * r2), (i3 - i1) * (r1 * r3), (i3 - i2) * (r2 * r3)

@@ -1,8 +1,8 @@
 """Principal axes as a fixed frame: chosen once by value, never differentiated.
 
 In this frame the inertia is diagonal in value; its off-diagonal entries are exact zeros that carry
-the tangents (and `sigma_form` says what they do). So nothing is divided by a difference of
-moments, and no derivative of an axis is taken.
+the tangents (`sigma_form` describes their use). No formula divides by a difference of moments, and
+no axis is differentiated.
 """
 
 import jax

@@ -1,4 +1,4 @@
-"""The free motion as a smooth function of the whole inertia tensor: what derivatives are made of.
+"""The free motion as a smooth function of the whole inertia tensor, for its derivatives.
 
 Principal axes are not a smooth function of a tensor; the motion is. With `K = I⁻¹`, Π the body
 momentum, `E₂ = Π·KΠ` and `h = |Π|`, let
@@ -20,14 +20,14 @@ which doubles as `Y(2u) = 2Y + (σT⁻¹)²(u) (σT⁻¹)(2u)`,
 
 Proof of the first: in principal axes of K it is Jacobi's solution with T = diag(D, 1, C), σ = S, by
 `E₃₃ − E₂₂ = (a₂ − a₃)(a₁h² − E₂) = p`, `E₁₁ − E₂₂ = q`; both sides turn with the axes, so it holds
-in any axes. All is polynomial in K but for `|…|`, so a sphere or a symmetric top is an ordinary
+in any axes. All terms but `|…|` are polynomial in K, so a sphere or a symmetric top is an ordinary
 point, with derivatives of any order. (The second: differentiate in principal axes, axis by axis:
 with g = σ/τᵢ, g' = τⱼτₖ/τᵢ², both sides have the same derivative; the symmetric choice of the mid
 point removes the terms even in time.)
 
-Used in axes that are principal at the point of evaluation: off-diagonal entries are zeros that
-carry tangents, diagonal differences come in as accurate numbers, and of the equal forms of an entry
-the one that does not cancel is taken.
+The axes are principal at the point of evaluation: off-diagonal entries are zeros that carry
+tangents, diagonal differences are given as accurate numbers, and each entry uses the one of its
+equal forms that does not cancel.
 """
 
 from typing import NamedTuple
@@ -41,7 +41,7 @@ from rigidjax.exact.jacobi_duplication import Modulus, is_endless, limits, until
 
 
 class Differences(NamedTuple):
-    """K = I⁻¹ but for its trace: differences of its diagonal, and its off-diagonal entries."""
+    """K = I⁻¹ without its trace: differences of its diagonal, and its off-diagonal entries."""
 
     d12: Scalar
     d13: Scalar
@@ -52,7 +52,7 @@ class Differences(NamedTuple):
 
 
 class Invariants(NamedTuple):
-    """Of E less E₂₂ 1. `a1, a2, a3`: a₁h² − E₂, a₂h² − E₂, E₂ − a₃h²."""
+    """The parts of E − E₂₂ 1. `a1, a2, a3`: a₁h² − E₂, a₂h² − E₂, E₂ − a₃h²."""
 
     h2: Scalar
     a1: Scalar
@@ -260,7 +260,7 @@ def momentum_and_integral(body: Differences, momentum: Triple, t: Scalar) -> tup
     v = invariants(body, momentum)
     m = jax.lax.stop_gradient(Modulus(v.p, v.q, v.gap))
     endless = is_endless(m)
-    # Dummy invariants where there is no period keep NaN out of the derivatives.
+    # Dummy invariants keep NaN out of the derivatives if there is no period.
     one, zero = jnp.ones_like(t), jnp.zeros_like(t)
     tame = Invariants(one, one, one, one, zero, one, one, zero, zero, zero)
     usual = jax.tree.map(lambda a, b: jnp.where(endless, b, a), v, tame)

@@ -1,4 +1,4 @@
-"""What every scene of a particle offers: a vector field, and what it conserves."""
+"""The base class of scenes of a particle: a vector field, and conserved quantities."""
 
 import abc
 from collections.abc import Callable
@@ -18,8 +18,8 @@ class AbstractScene(eqx.Module):
     """The equations of motion of a particle: subclass it, give `acceleration` and `conserved`.
 
     `rigidjax.simulate(None, Point(x, v), ts, scene)` solves it; `diffrax.ODETerm(scene.field)` is
-    the same in plain diffrax. A scene that ends a run, as at a collision, has two methods more:
-    `ends(t, state)`, true where it does, and `end_words(t, state)`, why (under `jit` both are
+    the same in plain diffrax. A scene that ends a run, as at a collision, has two more methods:
+    `ends(t, state)`, true at the end, and `end_words(t, state)`, the reason (under `jit` both are
     traced: words without numbers); `stats` of the solution then has `ended`, `end_time` and
     `end_state`. Only scenes of a particle end runs so.
 
@@ -38,7 +38,7 @@ class AbstractScene(eqx.Module):
 
     @abc.abstractmethod
     def conserved(self, t: ScalarLike, state: Any) -> dict[str, Scalar]:
-        """What the exact motion keeps, by name; empty where there is nothing."""
+        """The conserved quantities of the exact motion, by name; empty if there are none."""
 
     def field(self, t: ScalarLike, y: Any, args: object = None) -> Any:
         """The vector field `(dx/dt, dv/dt)` as a `Point`, for `diffrax.ODETerm`."""
@@ -59,10 +59,10 @@ class AbstractScene(eqx.Module):
 
 
 class Force(AbstractScene):
-    """A user's own force per mass as a scene, in an inertial frame (notes, eq 84).
+    """Your own force per mass as a scene, in an inertial frame (notes, eq 84).
 
     **Arguments:** `force` a callable Module `(t, state, body) → (3,)`, m/s²; `body` is `None`. A
-    `force` of `None` leaves the particle to itself.
+    `force` of `None` is a free particle.
 
     >>> fall = Force(lambda t, state, body: jnp.array([0.0, 0.0, -9.8]))
     >>> fall.field(0.0, Point([0.0, 0, 0], [1.0, 0, 0])).v.tolist()
@@ -85,7 +85,7 @@ class Force(AbstractScene):
 
 
 def per_mass(value: Any, force: object) -> Vec3:
-    """A force's value, its shape checked: a user's own may return anything."""
+    """A force's value with its shape checked: a user's own may return anything."""
     name = getattr(force, "__name__", type(force).__name__)
     return _checks.floating(value, (3,), f"force {name}", hint="force per mass, m/s²")
 

@@ -16,8 +16,8 @@ GRAVITY = 9.80665
 class Earth(AbstractScene):
     """Free fall and throws near one place of the turning Earth: make one with `scenes.earth`.
 
-    Axes east, north, up; up is the plumb line. Gravity is uniform and holds the centrifugal
-    acceleration at the origin; what changes of it with x' is added apart.
+    Axes east, north, up; up is the plumb line. Gravity is uniform and contains the centrifugal
+    acceleration at the origin; its change with x' is added separately.
 
     **Fields:** `latitude` rad, `gravity` m/s², `rate` rad/s.
 
@@ -54,7 +54,7 @@ class Earth(AbstractScene):
         return {"jacobi": self.jacobi_integral(state)}
 
     def jacobi_integral(self, state: Point) -> Scalar:
-        """½|v'|² + g z − ½|Ω × x'|², m²/s², kept along the motion."""
+        """½|v'|² + g z − ½|Ω × x'|², m²/s², conserved along the motion."""
         require_point(state)
         x, v = components(state.x), components(state.v)
         dtype = state.x.dtype
@@ -65,7 +65,8 @@ class Earth(AbstractScene):
         return 0.5 * (speed - moved) + self.gravity.astype(dtype) * x[2]
 
     def eastward_deflection(self, height: ScalarLike) -> Scalar:
-        """How far east a dropped body lands, m, to first order in Ω: ⅓ Ω g cos λ (2h/g)^{3/2}.
+        """The eastward deflection of a dropped body, m, to first order in Ω: ⅓ Ω g cos λ
+        (2h/g)^{3/2}.
 
         **Arguments:** `height` h, m. Source: Landau and Lifshitz, Mechanics, sec. 39, problem 1.
 
@@ -111,7 +112,7 @@ class Foucault(AbstractScene):
     length: Scalar
 
     def acceleration(self, t: ScalarLike, state: Point) -> Vec3:
-        """d²x'/dt² (3,), m/s²: the free one less what the string takes (notes, eq 91)."""
+        """d²x'/dt² (3,), m/s²: the free one minus the part along the string (notes, eq 91)."""
         x, v = components(state.x), components(state.v)
         a = components(self.place.acceleration(t, state))
         pull = (dot_components(x, a) + dot_components(v, v)) / dot_components(x, x)
@@ -154,11 +155,11 @@ class Foucault(AbstractScene):
         return Point(jnp.stack([e, n, up]), jnp.stack([ve, vn, -(e * ve + n * vn) / up]))
 
     def small_swing(self, state: Point, t: ScalarLike) -> Point:
-        """Where small swings have come at `t`, s: the closed form.
+        """The position of small swings at `t`, s: the closed form.
 
         With s = east + i north and Ω_z = Ω sin λ, s'' + 2iΩ_z s' + ω₀² s = 0 has the solution
         s = e^{−iΩ_z t} (A cos ωt + B sin ωt), ω² = ω₀² + Ω_z², ω₀² = g/L (Landau and Lifshitz,
-        Mechanics, sec. 39, problem 3). Right to the square of amplitude/length.
+        Mechanics, sec. 39, problem 3). Its error is of the order of (amplitude/length)².
 
         **Arguments:** `state` at t = 0. **Returns** a `Point` at the height of the lowest place.
 
@@ -173,7 +174,7 @@ class Foucault(AbstractScene):
         place = self.place
         up = (place.rate * jnp.sin(place.latitude)).astype(t.dtype)
         swing = jnp.sqrt(place.gravity.astype(t.dtype) / self.length.astype(t.dtype) + up * up)
-        # In axes that turn with the plane of swing it is a plain oscillator.
+        # It is a plain oscillator in axes that turn with the plane of swing.
         ax, ay, bx, by = x, y, (vx - up * y) / swing, (vy + up * x) / swing
         c, s = jnp.cos(swing * t), jnp.sin(swing * t)
         px, py = ax * c + bx * s, ay * c + by * s
@@ -185,7 +186,7 @@ class Foucault(AbstractScene):
         return Point(jnp.stack([ex, ey, -self.length.astype(t.dtype)]), jnp.stack([wx, wy, zero]))
 
     def precession_rate(self) -> Scalar:
-        """How fast the plane of small swings turns, rad/s, −Ω sin λ: clockwise in the north.
+        """The rate of the plane of small swings, rad/s, −Ω sin λ: clockwise in the north.
 
         One turn takes a sidereal day over sin λ.
 

@@ -21,12 +21,12 @@ class InFrame(AbstractScene):
 
     **Arguments:**
 
-    - `frame`: the `MovingFrame` S'; states are what it sees.
+    - `frame`: the `MovingFrame` S'; states are in this frame.
     - `inside`: force per mass in S', `(t, Point in S') → (3,)`, m/s², axes of S'.
     - `outside`: force per mass in S, `(t, Point in S) → (3,)`, m/s², axes of S.
     - `potential`: V(x') per mass, `(3,) → ()`, m²/s²; its force −∇V is taken by automatic
-      differentiation. In a uniformly turning frame, with no other force, `conserved` then has the
-      Jacobi integral.
+      differentiation. `conserved` then has the Jacobi integral in a uniformly turning frame with no
+      other force.
 
     >>> import rigidjax as rj
     >>> scene = InFrame(MovingFrame(rj.frames.Uniform([0.0, 0.0, 1.0])))
@@ -93,10 +93,10 @@ class FrameWrench(eqx.Module):
 
 
 class BodyInFrame(eqx.Module):
-    """The torque, and for `Rigid` the force, that make a body's equations right in a moving frame.
+    """The torque, and for `Rigid` the force, that make a body's equations valid in a moving frame.
 
-    Give it to `simulate` as the torque of an `Attitude` or `Rigid` state that S' sees: q' body →
-    S', and Ω' the rate relative to S', as ever in body axes; x', v' of the centre of mass.
+    Give it to `simulate` as the torque of an `Attitude` or `Rigid` state in S': q' body → S', and
+    Ω' the rate relative to S', in body axes; x', v' of the centre of mass.
 
     With W = Q'ᵀ Ω the frame's rate in body axes, Ω' = Ω_abs − W, and from I dΩ_abs/dt =
     IΩ_abs × Ω_abs + τ follows
@@ -105,8 +105,9 @@ class BodyInFrame(eqx.Module):
 
     and the centre of mass moves as a `Point` does (eq 91).
 
-    **Arguments:** `frame` the `MovingFrame` S'; `torque` the real τ, `(t, state in S', body) →
-    (3,)`, N m, body axes, or a law that gives a `Wrench`, its force in the axes of S'; or `None`.
+    **Arguments:** `frame` the `MovingFrame` S'; `torque` the real τ,
+    `(t, state in S', body) → (3,)`, N m, body axes, or a model of it that gives a `Wrench`, with
+    its force in the axes of S'; or `None`.
 
     Source: notes, eqs 50, 91, for a body instead of a point. **Raises:** `TypeError` for a force on
     a state that only turns.

@@ -10,11 +10,11 @@ from rigidjax.rotation import linalg3, quaternion
 
 
 class Instant(eqx.Module):
-    """Where a moving frame S' is, how it turns and how it moves, at one time.
+    """The position, rotation and motion of a moving frame S' at one time.
 
     **Fields:** `rotation` M (3, 3), S' → S; `rate` Ω (3,), rad/s, and `rate_change` dΩ/dt (3,),
     rad/s², both in the axes of S'; `origin`, `origin_velocity`, `origin_acceleration` of S', (3,),
-    in the axes of S. `MovingFrame.at(t)` makes one. x', v' below are what S' sees.
+    in the axes of S. `MovingFrame.at(t)` makes one. x', v' below are in S'.
 
     >>> import rigidjax as rj
     >>> now = rj.frames.MovingFrame(rj.frames.Uniform([0.0, 0.0, 2.0])).at(0.0)
@@ -30,7 +30,7 @@ class Instant(eqx.Module):
     origin_acceleration: Vec3
 
     def to_inertial(self, state: Any) -> Any:
-        """What S sees of a state seen by S' (notes, eqs 85, 88): see `MovingFrame.to_inertial`."""
+        """A state in S', transformed to S (notes, eqs 85, 88): `MovingFrame.to_inertial`."""
         _can_travel(state)
         turned = {}
         if hasattr(state, "x"):
@@ -46,7 +46,7 @@ class Instant(eqx.Module):
         return _replaced(state, turned)
 
     def from_inertial(self, state: Any) -> Any:
-        """What S' sees of a state seen by S (notes, eqs 86, 88): `MovingFrame.from_inertial`."""
+        """A state in S, transformed to S' (notes, eqs 86, 88): `MovingFrame.from_inertial`."""
         _can_travel(state)
         turned = {}
         if hasattr(state, "x"):
@@ -88,11 +88,11 @@ class Instant(eqx.Module):
         return linalg3.cross(x, self.rate_change.astype(x.dtype))
 
     def translation(self) -> Vec3:
-        """Acceleration −Mᵀ d²X/dt²: what an accelerated origin adds."""
+        """Acceleration −Mᵀ d²X/dt² of an accelerated origin."""
         return -self.inward(self.origin_acceleration)
 
     def fictitious(self, x: Vector, v: Vector) -> Vec3:
-        """All four terms that no force makes."""
+        """The sum of the four inertial accelerations."""
         x, v = _checks.floating(x, (3,), "x"), _checks.floating(v, (3,), "v")
         turning = self.centrifugal(x) + self.coriolis(v) + self.euler_acceleration(x)
         return turning + self.translation().astype(x.dtype)

@@ -46,7 +46,7 @@ class Hoop(AbstractScene):
         return {"jacobi": jacobi, "radius": jnp.sqrt(x * x + z * z)}
 
     def side_push(self, state: Point) -> Scalar:
-        """What the hoop presses across its plane, m/s² along y: 2Ω v_x, against Coriolis.
+        """The hoop's force per mass across its plane, m/s² along y: 2Ω v_x, against Coriolis.
 
         >>> float(hoop(1.0, 3.0).side_push(Point([0.0, 0, -1], [2.0, 0, 0])))
         12.0
@@ -67,7 +67,7 @@ class Hoop(AbstractScene):
         return Point(radius * place, radius * speed.astype(angle.dtype) * along)
 
     def equilibrium_angle(self) -> Scalar:
-        """Where the bead rests stably, rad: arccos(g/(Ω²R)), 0 while the hoop is slow.
+        """The stable equilibrium of the bead, rad: arccos(g/(Ω²R)), or 0 for a slow hoop.
 
         >>> float(hoop(1.0, 1.0).equilibrium_angle())
         0.0
@@ -105,10 +105,10 @@ class _Angle(eqx.Module):
 
 
 def turntable(rate: ScalarLike, growth: ScalarLike = 0.0) -> InFrame:
-    """A frictionless table that turns about z: what it sees of a puck.
+    """A frictionless table that turns about z, and the motion of a puck in its frame.
 
-    **Arguments:** `rate` Ω at t = 0, rad/s; `growth` dΩ/dt, rad/s². Seen from outside the puck
-    goes straight; `turntable(…).frame` takes states there and back (notes, eqs 85–91).
+    **Arguments:** `rate` Ω at t = 0, rad/s; `growth` dΩ/dt, rad/s². The puck moves straight in the
+    inertial frame; `turntable(…).frame` transforms states both ways (notes, eqs 85–91).
 
     >>> turntable(2.0).acceleration(0.0, Point([1.0, 0, 0], [0.0, 0, 0])).tolist()
     [4.0, 0.0, 0.0]

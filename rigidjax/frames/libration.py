@@ -1,4 +1,4 @@
-"""A body in orbit, turned by the tide: attitude in the orbital frame."""
+"""A body in orbit under the gravity-gradient torque: attitude in the orbital frame."""
 
 from typing import Any, ClassVar
 
@@ -56,7 +56,7 @@ def libration(rate: ScalarLike) -> BodyInFrame:
 
 
 def libration_integral(state: Any, body: Any, rate: ScalarLike) -> Scalar:
-    """½Ω'·IΩ' + (3/2)n² u·Iu − ½n² w·Iw, J: the Jacobi integral of `libration`, kept.
+    """½Ω'·IΩ' + (3/2)n² u·Iu − ½n² w·Iw, J: the conserved Jacobi integral of `libration`.
 
     **Arguments:** `state` an `Attitude` in the orbital frame; `body` an `Inertia`; `rate` n, rad/s.
     u and w are the frame's first and third axes in body axes (Hughes 1986, sec. 9.1).

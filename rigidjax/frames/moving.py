@@ -16,20 +16,21 @@ from rigidjax.rotation import linalg3
 
 
 class MovingFrame(eqx.Module):
-    """A frame S' that turns and moves in any differentiable way, seen from an inertial S.
+    """A frame S' that turns and moves in any differentiable way, relative to an inertial S.
 
-    Coordinates go as x = X(t) + M(t) x' (notes, eqs 85, 86, with an origin added).
+    Coordinates transform as x = X(t) + M(t) x' (notes, eqs 85, 86, with an origin added).
 
     **Arguments:**
 
-    - `rotation`: a function of time, s, to M (3, 3) or to its unit quaternion (4,), S' → S; or
-      what gives a state with `q` and `omega`, such as a solution of `simulate` (its `evaluate` is
+    - `rotation`: a function of time, s, to M (3, 3) or to its unit quaternion (4,), S' → S; or a
+      function to a state with `q` and `omega`, such as a solution of `simulate` (its `evaluate` is
       called) or a `FreeBody`: then the frame is fixed in the body, and derivatives through a solved
-      motion are in forward mode only. A Module (`frames.Uniform`) does
-      not compile again for other numbers, a fresh `lambda` does.
+      motion are in forward mode only. A Module (`frames.Uniform`) does not compile again for other
+      numbers; a new `lambda` does.
     - `origin`: a function of time to X (3,), m, axes of S; `None` where the origins coincide.
-    - `rate`: Ω (3,), rad/s, **axes of S'**, as a function of time, where it is known; else it is
-      Ω = vee(Mᵀ dM/dt) (eqs 45–50) by automatic differentiation. dΩ/dt always is.
+    - `rate`: Ω (3,), rad/s, **axes of S'**, as a function of time, if it is known; else it is Ω =
+      vee(Mᵀ dM/dt) (eqs 45–50) by automatic differentiation. dΩ/dt always comes from automatic
+      differentiation.
 
     Its numbers may be traced: gradients with respect to a rate or an origin pass through.
 
@@ -71,7 +72,7 @@ class MovingFrame(eqx.Module):
     def at(self, t: ScalarLike) -> Instant:
         """The frame at time `t`, s: M, Ω, dΩ/dt, and the origin with two derivatives.
 
-        Take it once where several of the methods below are wanted at the same time.
+        Call it once if you need several of the methods below at the same time.
 
         >>> MovingFrame(rj.frames.Uniform([0.0, 0.0, 2.0])).at(0.0).rate.tolist()
         [0.0, 0.0, 2.0]
@@ -96,7 +97,7 @@ class MovingFrame(eqx.Module):
         return linalg3.vee(linalg3.product(m.T, m_dot))
 
     def to_inertial(self, state: Any, t: ScalarLike) -> Any:
-        """What S sees of a state that S' sees, of the same type.
+        """A state given in S', transformed to S, of the same type.
 
         **Arguments:** `state` a `Point`, `Attitude` or `Rigid`, or any Module with `x` and `v`,
         with `q` and `omega`, or with all four; one state. `t` time, s. Then
@@ -114,7 +115,7 @@ class MovingFrame(eqx.Module):
         return self.at(t).to_inertial(state)
 
     def from_inertial(self, state: Any, t: ScalarLike) -> Any:
-        """What S' sees of a state that S sees: the inverse of `to_inertial`.
+        """A state given in S, transformed to S': the inverse of `to_inertial`.
 
         **Arguments:** as there. x' = Mᵀ(x − X), v' = Mᵀ(v − dX/dt) − Ω × x' (notes, eqs 86–88).
 
@@ -147,13 +148,13 @@ class MovingFrame(eqx.Module):
         return self.at(t).euler_acceleration(x)
 
     def translation(self, t: ScalarLike) -> Vec3:
-        """What an accelerated origin adds, −Mᵀ d²X/dt² (3,), m/s², axes of S'."""
+        """The acceleration by an accelerated origin, −Mᵀ d²X/dt² (3,), m/s², axes of S'."""
         return self.at(t).translation()
 
     def acceleration(
         self, x: Vector, v: Vector, t: ScalarLike, force: Vector | None = None
     ) -> Vec3:
-        """The acceleration that S' sees: eq 91 of the notes, corrected, with a moving origin.
+        """The acceleration in S': eq 91 of the notes, corrected, with a moving origin.
 
         d²x'/dt² = f − Ω×(Ω×x') − 2Ω×v' − dΩ/dt×x' − Mᵀ d²X/dt². (Eq 91 prints one more x'' inside
         its bracket; eq 90 shows that it is a slip.)
@@ -170,7 +171,7 @@ class MovingFrame(eqx.Module):
         return free if force is None else _checks.floating(force, (3,), "force") + free
 
     def acceleration_to_inertial(self, x: Vector, v: Vector, a: Vector, t: ScalarLike) -> Vec3:
-        """The acceleration that S sees (3,), m/s² (notes, eqs 89, 90, with a moving origin).
+        """The acceleration in S (3,), m/s² (notes, eqs 89, 90, with a moving origin).
 
         **Arguments:** `x`, `v`, `a` (3,) position, velocity and acceleration in S'; `t` s.
         """
@@ -186,7 +187,7 @@ class MovingFrame(eqx.Module):
         return linalg3.apply(self.matrix(t), _checks.floating(force, (3,), "force"))
 
     def jacobi_integral(self, state: Any, t: ScalarLike, potential: ScalarLike = 0.0) -> Scalar:
-        """½|v'|² − ½|Ω × x'|² + V, m²/s²: kept where Ω and V(x') do not depend on time.
+        """½|v'|² − ½|Ω × x'|² + V, m²/s²: conserved if Ω and V(x') do not depend on time.
 
         **Arguments:** `state` a `Point` in S'; `t` s; `potential` V per mass there, m²/s².
         Source: Goldstein, Mechanics, sec. 3.12 (as h = −C/2 in the three-body problem).
@@ -208,7 +209,7 @@ class MovingFrame(eqx.Module):
         return MovingFrame(both.rotation, both.origin, both.rate)
 
     def inverse(self) -> "MovingFrame":
-        """S as S' sees it: M → Mᵀ, X → −MᵀX. `frame.then(frame.inverse())` is no motion at all."""
+        """S relative to S': M → Mᵀ, X → −MᵀX. `frame.then(frame.inverse())` is no motion at all."""
         back = _Inverse(self)
         return MovingFrame(back.rotation, back.origin, back.rate)
 
@@ -234,7 +235,7 @@ class _Composed(eqx.Module):
         return linalg3.product(self.outer.matrix(t), self.inner.matrix(t))
 
     def rate(self, t: Any) -> Any:
-        # Rates add in one set of axes, which saves one derivative of the product.
+        # Rates are added in one set of axes, which saves one derivative of the product.
         carried = linalg3.apply(self.inner.matrix(t).T, self.outer.angular_velocity(t))
         return carried + self.inner.angular_velocity(t)
 

@@ -1,4 +1,4 @@
-"""The state of a particle: no body at all."""
+"""The state of a particle, without a body."""
 
 from typing import Any
 

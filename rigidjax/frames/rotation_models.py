@@ -1,4 +1,4 @@
-"""Ways of turning, as functions of time: uniform, about one axis, or read off something else."""
+"""Rotations as functions of time: uniform, about one axis, or from another motion."""
 
 from collections.abc import Callable
 from typing import Any
@@ -34,7 +34,7 @@ class Uniform(eqx.Module):
         return so3.exp(t * self.omega.astype(t.dtype))
 
     def rate(self, t: Any) -> Vec3:
-        """Ω, whatever the time."""
+        """Ω, which is constant."""
         return self.omega.astype(_checks.time(t).dtype)
 
 
@@ -70,7 +70,7 @@ class AboutAxis(eqx.Module):
 
 
 def differentiable(rotation: Any) -> Any:
-    """`rotation`; the solves that it does itself made ready for forward differentiation.
+    """`rotation`, with its own solves made ready for forward differentiation.
 
     A frame needs dΩ/dt, and the default adjoint of a solution of `simulate` refuses that.
     """
@@ -82,12 +82,12 @@ def differentiable(rotation: Any) -> Any:
 
 
 def state_of(rotation: Any, t: Array) -> Any:
-    """What `rotation` gives at `t`: a matrix, a quaternion, or a state with `q` and `omega`."""
+    """The value of `rotation` at `t`: a matrix, a quaternion, or a state with `q` and `omega`."""
     return rotation.evaluate(t) if hasattr(rotation, "evaluate") else rotation(t)
 
 
 def matrix(rotation: Any, t: Array) -> Mat3:
-    """M(t) of whatever a frame was given: a function to (3, 3) or (4,), or a solution."""
+    """M(t) of the rotation given to a frame: a function to (3, 3) or (4,), or a solution."""
     value = state_of(rotation, t)
     value = getattr(value, "q", value)
     shape = jnp.shape(value)

@@ -1,4 +1,4 @@
-"""What a fit says of itself in two answers, and what follows from them for whoever reads it."""
+"""The two answers of a fit, and the advice that follows from them."""
 
 import equinox as eqx
 
@@ -26,11 +26,11 @@ class Answer(eqx.Module):
 
 
 class Cause(eqx.Module):
-    """What most likely makes the errors of a sensor; printed as its words.
+    """The most likely cause of the errors of a sensor; printed as its words.
 
     **Fields:** `name` of the cause; `sensor` whose errors; `share` of their sum of squares that it
-    explains (1 for `misread`, which explains the readings themselves), `None` where it is a guess;
-    `words` what was found; `remedy` what to try.
+    explains (1 for `misread`, which explains the readings themselves), `None` for a guess; `words`
+    the cause in words; `remedy` the advice.
 
     >>> print(Cause("drag", "Gyro", 0.9, "a torque against the rate", "add a Damping"))
     a torque against the rate
@@ -47,7 +47,7 @@ class Cause(eqx.Module):
 
 
 def status(search: Answer, model: Answer) -> str:
-    """Both answers in one line: `ok` where neither has anything to say."""
+    """Both answers in one line: `ok` if both are good and have no reasons."""
     if search == Answer(FOUND) and model == Answer(EXPLAINS):
         return "ok"
     return f"search: {search}; model: {model}"
@@ -64,31 +64,31 @@ def advice(
     tries = f" Try: {'; '.join(remedies)}." if remedies else ""
     if model.word == FAILS:
         tries = tries or (
-            " Check units (rad/s, m/s², m, s), signs and order of axes, and what else turns the "
-            "body; more starts help only where the motion is right."
+            " Check units (rad/s, m/s², m, s), signs and order of axes, and other torques on the "
+            "body; more starts help only if the model is right."
         )
         return f"The numbers and intervals say nothing about the body.{tries}"
     if search.word == NOT_ENDED:
         tries = tries or " Try more max_steps, more starts, or a start of your own (initial)."
-        return f"The intervals are those of a point on the way and cannot be trusted.{tries}"
+        return f"The intervals belong to a point before the minimum and cannot be trusted.{tries}"
     if search.word == NOT_ALONE:
         return (
-            "Each interval is that of the best motion alone; fit.starts holds the others. Record "
+            "Each interval belongs to the best motion alone; fit.starts holds the others. Record "
             f"longer, or turn about two axes in one record.{tries}"
         )
     if model.word == LEAVES and any(cause.share is not None for cause in causes):
         return (
-            "The intervals cannot be trusted: they take the errors for chance, and most of them "
-            f"have one cause.{tries}"
+            "The intervals cannot be trusted: they assume random errors, and one cause makes "
+            f"most of these errors.{tries}"
         )
     if above > FAR:
         return f"The intervals cannot be trusted: the sensors make no errors of this size.{tries}"
     if model.word == LEAVES:
         allowed = "allow" if kind.startswith("sandwich") else "do not allow"
         return (
-            f"The intervals {allowed} for errors of this size that last, whatever their cause; "
-            f"what shifts a number all along they do not show.{tries}"
+            f"The intervals {allowed} for autocorrelated errors of this size, whatever their "
+            f"cause; they do not show a constant shift of a number.{tries}"
         )
     if search.reasons or model.reasons:
-        return f"The intervals can be trusted as far as the remarks go.{tries}"
+        return f"The intervals can be trusted; read the remarks, too.{tries}"
     return "The intervals can be trusted."

@@ -1,4 +1,4 @@
-"""How good a fit is: covariance, status, and whether other starts explain the data as well."""
+"""The quality of a fit: covariance, status, and whether other starts explain the data as well."""
 
 from collections.abc import Sequence
 
@@ -18,16 +18,16 @@ from rigidjax.identify.real_bodies import of_charts
 from rigidjax.identify.residual import Noise
 from rigidjax.identify.result import Fit, Start
 
-# A point so near to the least misfit, in standard deviations, is where a search was to end.
+# A search may end so near to the least misfit, in standard deviations.
 AT_THE_END = 0.05
 
 
 def _margin(problem: Problem, best_cost: float, longest: float) -> float:
-    """By how much the misfit of a start may be above the best for it to explain the data, too.
+    """The largest excess over the best misfit with which a start still explains the data.
 
-    Ten units of log-likelihood: a point further above the best is e¹⁰ times less likely. Where the
-    noise is estimated from the best point, its cost is half the number of readings. Of
-    autocorrelated errors there are the fewer.
+    Ten units of log-likelihood: a point further above the best is e¹⁰ times less likely. The cost
+    of the best point is half the number of readings if the noise is estimated there. Autocorrelated
+    errors count as fewer.
     """
     guessed = any(sensor.noise is None for sensor in problem.records.sensors)
     unit = 2 * best_cost / problem.records.size if guessed else 1.0
@@ -35,7 +35,7 @@ def _margin(problem: Problem, best_cost: float, longest: float) -> float:
 
 
 def _start(tried: Tried, level: float) -> Start:
-    """A start as a user sees it; it fits where its misfit is not above `level`."""
+    """A start for the user; it fits if its misfit is not above `level`."""
     cost = float(tried.cost)
     return Start(tried.parameters, cost, bool(tried.converged), cost <= level)
 
@@ -43,7 +43,7 @@ def _start(tried: Tried, level: float) -> Start:
 def _elsewhere(
     linear: uncertainty.Linearised, other: Parameters, value: Parameters, margin: float
 ) -> bool:
-    """Whether readings tell two points apart: searches in one flat valley end at other points."""
+    """Whether the readings distinguish two points; in a flat valley they do not."""
     away = ravel_pytree(other)[0] - ravel_pytree(value)[0]
     return float(np.sum((linear.rows @ np.asarray(away)) ** 2)) > 2 * margin
 
@@ -51,7 +51,7 @@ def _elsewhere(
 def _search(
     best_cost: float, done: bool, rivals: str, interrupted: Sequence[str], remarks: Sequence[str]
 ) -> Answer:
-    """How the search ended, in words: `rivals` empty where no start fits as well elsewhere."""
+    """The end of the search in words; `rivals` are the starts that fit as well elsewhere."""
     if not np.isfinite(best_cost):
         return Answer(NOT_ENDED, ("no start gave a finite misfit",))
     if not done:
@@ -70,9 +70,9 @@ def assess(
     best_cost: float,
     interrupted: Sequence[str] = (),
 ) -> Fit:
-    """The `Fit` of the best point, converged or not, among all that were tried.
+    """The `Fit` of the best point of all starts, converged or not.
 
-    `interrupted` says where the search was.
+    `interrupted` gives the point of the search in words.
     """
     value = best.parameters
     near = flat_limit.beside(problem, value)
@@ -83,7 +83,7 @@ def assess(
     spread = uncertainty.spread(linear, times, white)
     numbers, names = values_and_slopes(problem, value, near), [n for n, _ in charts(problem)]
     limits = flat_limit.limits(problem, numbers, uncertainty.step(linear, white), names)
-    # In a long curved valley steps stay short, although hardly anything is left to gain.
+    # Steps stay short in a long curved valley, although hardly anything is left to gain.
     held = [limit.slope for limit in limits if limit.free < 0]
     done = bool(best.converged) or uncertainty.distance(linear, white, held) < AT_THE_END
     free = ravel_pytree(value)[0].size

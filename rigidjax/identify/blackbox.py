@@ -18,14 +18,14 @@ def read_blackbox(path: Path, columns: Sequence[str]) -> tuple[list[str], dict[s
     """The names of all fields, and those that are wanted, of the first flight in a file.
 
     Rates (`gyroADC[i]`) come in deg/s and accelerations (`accSmooth[i]`) in g, by the scales in the
-    header; all else as it was logged, the time in µs. A log that ends without its last mark, as
-    after a crash, is read as far as it goes.
+    header; other fields as logged, the time in µs. A log without its last mark, as after a crash,
+    is read up to its end.
 
     Source: the parser is that of the package orangebox; the scales are those of the flight
     controllers' own viewer: raw × gyro_scale is deg/s (Baseflight: rad/µs), raw / acc_1G is g.
 
-    **Raises:** `ModuleNotFoundError` where orangebox is missing; whatever it raises for a file that
-    is none.
+    **Raises:** `ModuleNotFoundError` if orangebox is missing; orangebox's own errors for a file of
+    another kind.
     """
     try:
         from orangebox import Parser
@@ -53,7 +53,7 @@ def read_blackbox(path: Path, columns: Sequence[str]) -> tuple[list[str], dict[s
 
 
 def _scales(headers: dict[str, Any]) -> dict[str, float]:
-    """What the raw numbers of some fields are to be multiplied by."""
+    """The factors of the raw numbers of some fields."""
     found = {}
     if "gyro_scale" in headers:
         value = headers["gyro_scale"]

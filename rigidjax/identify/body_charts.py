@@ -1,4 +1,4 @@
-"""Unconstrained numbers ↔ the body, as a fit needs them. Every point is a real body."""
+"""Unconstrained numbers ↔ the body, for a fit. Every point is a real body."""
 
 import abc
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ from rigidjax.body import parameters as charts
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.body.symmetric3 import swap_trace
 
-# What of a `MassProperties` may be free: in words, and its places among the numbers of `pack`.
+# The parts of a `MassProperties` that may be free: in words, and their places in `pack`.
 _PARTS = {
     "mass": ("mass", (0,)),
     "com": ("centre of mass", (7, 8, 9)),
@@ -27,8 +27,8 @@ COMPONENTS = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))
 class AbstractBodyChart(eqx.Module):
     """A chart of bodies: `size` numbers → an `Inertia` or `MassProperties`, and back.
 
-    `log_names`, `unit` and `logs(body)` are the positive quantities that are reported, through
-    their logarithms; `plain_names` and `plain(body)` those that may have either sign.
+    `log_names`, `unit` and `logs(body)` describe the positive quantities that are reported, through
+    their logarithms; `plain_names` and `plain(body)` describe quantities of either sign.
 
     >>> class Spheres(AbstractBodyChart):  # one number: the logarithm of the moment
     ...     size, in_words, unit = 1, "the moment of a sphere", "kg m²"
@@ -57,14 +57,15 @@ class AbstractBodyChart(eqx.Module):
 
     @abc.abstractmethod
     def vector(self, body: Any) -> Float[Array, " chart"]:
-        """The numbers of a body with this `Inertia`, a guess where a fit starts."""
+        """The numbers of a body with this `Inertia`, the initial guess of a fit."""
 
     def bend(
         self, vector: Float[Array, " chart"], slope: Float[Array, " chart"]
     ) -> Float[Array, "rows chart"]:
-        """Rows whose squares are the second derivative of a misfit by the chart's own bend.
+        """Rows whose squares are the second derivative of a misfit from the chart's curvature.
 
-        Of use where a body may be flat (`rigidjax.body.parameters.flat_bend`); else none.
+        They matter if a body may be flat (`rigidjax.body.parameters.flat_bend`); else there are
+        none.
         **Arguments:** `slope` the misfit's derivative in the chart's numbers.
         """
         return jnp.zeros((0, self.size), vector.dtype)
@@ -152,21 +153,21 @@ class PrincipalRatios(AbstractBodyChart):
 def _typical(value: Any) -> Array:
     if isinstance(value, Inertia | MassProperties):
         raise TypeError(
-            "typical: wanted about how large the moments are, one number, kg m², got "
-            f"{type(value).__name__}; a body that is known is Known(body), one to begin with goes "
-            "to fit(initial=problem.start(body))"
+            "typical: wanted the rough size of the moments, one number, kg m², got "
+            f"{type(value).__name__}; give a known body as Known(body), an initial guess by "
+            "fit(initial=problem.start(body))"
         )
     size = _checks.positive(value, "typical", "a positive moment of inertia, kg m²")
     return jnp.asarray(size, jnp.result_type(float))
 
 
 class Tensor(AbstractBodyChart):
-    """The whole inertia tensor with its scale, which a known torque or momentum inside shows.
+    """The whole inertia tensor with its scale, which a known torque or internal momentum shows.
 
     Six numbers: the logarithm of the size of 𝔖 in units of `typical`, and its shape (as `Ratios`).
 
-    **Arguments:** `typical` kg m², about how large the moments are: a fit starts there. **Raises**
-    `ValueError` where it is not positive.
+    **Arguments:** `typical` kg m², the rough size of the moments, where a fit starts. **Raises**
+    `ValueError` if it is not positive.
 
     >>> Tensor(1e-3).body(jnp.zeros(6)).tensor[0, 0]
     Array(0.001, dtype=float64)
@@ -236,17 +237,17 @@ class Principal(AbstractBodyChart):
 
 
 class Mass(AbstractBodyChart):
-    """Mass, centre of mass and inertia: all ten numbers, where forces show them, or some of them.
+    """Mass, centre of mass and inertia: all ten numbers, if forces show them, or some of them.
 
     The chart of `rigidjax.body.parameters.pack` around a `guess`, which is where it starts.
 
-    **Arguments:** `guess` a `MassProperties`, about the right size, and right in all that is not
-    free; `free` which of it a fit may move: `"mass"` (the second moment follows it, its ratio to
-    the mass being known, unless it is free, too), `"inertia"` about the centre of mass, `"com"`. So
-    `free=["inertia"]` is for a body that was weighed and balanced, `["mass"]` for a load of known
-    shape, `["com"]` for a centre that moved.
+    **Arguments:** `guess` a `MassProperties` of about the right size, with the true values of all
+    numbers that are not free; `free` the parts that a fit may move: `"mass"` (the second moment
+    keeps its ratio to the mass unless the inertia is free, too), `"inertia"` about the centre of
+    mass, `"com"`. Take `free=["inertia"]` for a body that was weighed and balanced, `["mass"]` for
+    a load of known shape, `["com"]` for a centre that moved.
 
-    **Raises:** `TypeError` for a guess of another kind; `ValueError` for another word, or none.
+    **Raises:** `TypeError` for a guess of another type; `ValueError` for another word, or none.
 
     >>> import rigidjax as rj
     >>> box = rj.shapes.box(2.0, [1.0, 1.0, 1.0])
@@ -271,12 +272,12 @@ class Mass(AbstractBodyChart):
 
     @property
     def size(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """How many numbers are free."""
+        """The number of free numbers."""
         return len(self._places)
 
     @property
     def in_words(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """What is free."""
+        """The free parts, in words."""
         *most, last = [_PARTS[name][0] for name in self.free]
         return f"{', '.join(most)} and {last}" if most else last
 
@@ -335,7 +336,7 @@ class Mass(AbstractBodyChart):
 
 
 class Known(AbstractBodyChart):
-    """A body that is known: only states, torques and sensors are fitted.
+    """A known body: only states, torques and sensors are fitted.
 
     **Arguments:** `known` an `Inertia` or `MassProperties`.
 

@@ -1,8 +1,9 @@
-"""What a fit leaves in its errors, and which cause explains the most of it.
+"""The most likely cause of the errors of a fit.
 
-Each cause has a direction: how readings change with it, as the fitted motion says. Errors are
-regressed on it beside all free numbers (a score test: Rao 1948, doi:10.1017/S0305004100023987), so
-that a cause which those could take up explains nothing.
+Each cause has a direction: the change of the readings with it along the fitted motion. Errors are
+regressed on it together with all free numbers (a score test: Rao 1948,
+doi:10.1017/S0305004100023987). A cause that the free numbers could absorb therefore explains
+nothing.
 """
 
 from collections.abc import Callable, Sequence
@@ -21,11 +22,11 @@ from rigidjax.identify.sensors import Gyro
 from rigidjax.identify.several_bodies import in_a_row, tensor_of
 from rigidjax.identify.uncertainty import Linearised
 
-# A cause is named that explains so much of the squared errors, and what explains nearly as much.
+# A cause is named if it explains so much of the squared errors, or nearly as much as the best.
 ENOUGH, NEARLY = 0.7, 0.95
-# Directions of which the free numbers take up all but this part are not told from them.
+# A direction is dropped if the free numbers absorb all of it but this part.
 APART = 0.05
-# Changes of axes and scales are small ones, or none of them.
+# Only small changes of axes and scales are causes.
 LINEAR, SMALL = ("scale", "mounting", "skew"), 0.5
 # What x shows of y, x of z, and y of z.
 SKEW = np.zeros((3, 3, 3))
@@ -35,7 +36,7 @@ SKEW[1, 0, 0] = SKEW[2, 0, 1] = SKEW[2, 1, 2] = 1.0
 def causes(
     problem: Problem, parameters: Parameters, noise: Noise, linear: Linearised, which: Sequence[int]
 ) -> tuple[Cause, ...]:
-    """The most likely cause of the errors of each sensor in `which`, where one shows."""
+    """The most likely cause of the errors of each sensor in `which`, if there is one."""
     given = zip(padding.on_host(problem.records, problem.counts), problem.of, strict=True)
     wrong = misread([recording for recording, of in given if of == problem.of[0]])
     if wrong is not None:
@@ -70,7 +71,7 @@ def clock(problem: Problem, linear: Linearised, index: int) -> Cause | None:
         return None
     along = np.sum(np.sum(error * slope, axis=-1)[moving] ** 2 / moved[moving])
     channels = np.sum(error[kept] ** 2, axis=0)
-    # What errors of these channels' sizes have along this direction by chance.
+    # Random errors of these channels' sizes have so much along this direction.
     ways = np.mean(slope[moving] ** 2 / moved[moving][:, None], axis=0)
     chance, share = float(ways @ channels / channels.sum()), float(along / channels.sum())
     if not share > chance + 0.5 * (1.0 - chance) + 1.0 / np.sqrt(moving.sum()):
@@ -78,7 +79,7 @@ def clock(problem: Problem, linear: Linearised, index: int) -> Cause | None:
     scatter = 1e3 * np.sqrt(along / moved[moving].sum())
     return _cause(
         "clock", sensor, share, f"time stamps that scatter by {scatter:.2g} ms",
-        "take times from the sensor's own count of samples, or say a larger noise",
+        "take times from the sensor's own count of samples, or give a larger noise",
     )  # fmt: skip
 
 
@@ -89,7 +90,7 @@ def _cause(name: str, sensor: Any, share: float, words: str, remedy: str) -> Cau
 
 
 def _largest(sensor: Any, rows: Sequence[tuple], shares: Sequence[tuple]) -> Cause | None:
-    """The cause that explains the most, and those that explain about as much."""
+    """The cause that explains the most, and other causes that explain about as much."""
     told = [
         (share, name, words.format(size=", ".join(f"{x:.2g}" for x in size)), remedy)
         for (name, _, words, remedy), (share, size) in zip(rows, shares, strict=True)
@@ -112,7 +113,7 @@ def _of_three(sensor: Any) -> bool:
 
 
 def _slope(problem: Problem, shown: np.ndarray) -> np.ndarray:
-    """The derivative in time of what a sensor shows (R, T, k), zero where nothing was read."""
+    """The time derivative of a sensor's prediction (R, T, k), zero for a masked reading."""
     t, out = np.asarray(problem.records.t), np.zeros_like(shown)
     for row, count in enumerate(problem.counts):
         if count > 2:
@@ -131,20 +132,20 @@ def _table(
     unit, itself = reading.sensor.unit, shown[..., None] * axes
     response = _response(problem, parameters, noise, linear, index)
     return (
-        ("lag", _slope(problem, shown)[..., None], "a clock that is off by {size} s",
+        ("lag", _slope(problem, shown)[..., None], "a clock offset of {size} s",
          "let a Free move the sensor's offset, or the delay of the torque's log"),
         ("bias", axes, f"a bias left out, ({{size}}) {unit}", "let a Free move the sensor's bias"),
         ("scale", itself,
-         "scales that are off by ({size}) (all alike: a unit, or a clock that runs fast or slow)",
+         "scale errors of ({size}) (all equal: a unit, or a clock that runs fast or slow)",
          "look at the sensor's unit, or let a Free move its scale"),
         ("drag", response(-itself), "a torque against the rate, such as drag of the air",
          "add a Damping or QuadraticDamping whose coefficient is free"),
-        ("wheel", response(turned), "a constant angular momentum inside, such as a wheel's",
+        ("wheel", response(turned), "a constant internal angular momentum, such as a wheel's",
          "add a Flywheel whose momentum is free"),
-        ("mounting", turned, "axes that are turned by ({size}) rad",
+        ("mounting", turned, "axes turned by ({size}) rad",
          "let a Free move the sensor's mounting, or take a chart of the full tensor"),
         ("skew", np.einsum("rti,ijk->rtjk", shown, SKEW),
-         "axes that are off a right angle by ({size}) rad", "let a Free move the sensor's skew"),
+         "axes not orthogonal by ({size}) rad", "let a Free move the sensor's skew"),
         ("push", response(axes), "a constant torque in the body's axes",
          "add a ConstantTorque whose value is free"),
         ("drift", axes * (t - t[:, :1])[..., None, None],
@@ -156,9 +157,9 @@ def _table(
 def _response(
     problem: Problem, parameters: Parameters, noise: Noise, linear: Linearised, index: int
 ) -> Callable[[np.ndarray], np.ndarray]:
-    """What torques (R, T, 3, c) do to rates: `Φ(t) ∫ Φ⁻¹ I⁻¹ τ dt` (variation of constants).
+    """The effect of torques (R, T, 3, c) on rates: `Φ(t) ∫ Φ⁻¹ I⁻¹ τ dt` (variation of constants).
 
-    Φ is the derivative of the rates by the first one, which the fit has of a gyro.
+    Φ is the derivative of the rates in the initial rate, which the fit of a gyro has computed.
     """
     if not isinstance(problem.records.readings[index].sensor, Gyro):
         return np.zeros_like
@@ -186,7 +187,7 @@ def _explained(
     free: np.ndarray,
     direction: np.ndarray,
 ) -> tuple[float, np.ndarray]:
-    """The share of squared errors that a direction (R, T, k, c) explains, and how much of it.
+    """The share of squared errors that a direction (R, T, k, c) explains, and its coefficient.
 
     `free` (R, N, m) are orthonormal columns of the free numbers; of the sensors in `which`.
     """

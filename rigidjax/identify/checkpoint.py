@@ -1,4 +1,4 @@
-"""Where a search stands, kept in a file, so that a killed one goes on from there."""
+"""The state of a search in a file, so that a killed search can continue."""
 
 import dataclasses
 import hashlib
@@ -17,9 +17,9 @@ from rigidjax.identify.parameters import Parameters
 
 
 class Tried(eqx.Module):
-    """Where one start ended: its parameters, misfit (½ Σ of squares), and whether it converged.
+    """The end of one start: its parameters, misfit (½ Σ of squares), and whether it converged.
 
-    `found` is what `with_blocks` gives at the parameters, where the search has just been there.
+    `found` is the result of `with_blocks` at the parameters, if the search evaluated it last.
     """
 
     parameters: Parameters
@@ -29,15 +29,15 @@ class Tried(eqx.Module):
 
 
 def bare(tried: Tried) -> Tried:
-    """Without what takes room."""
+    """The same without its large arrays."""
     return tried if tried.found is None else dataclasses.replace(tried, found=None)
 
 
 class SearchState(NamedTuple):
-    """Where the search from one start stands, all that the rest of it depends on.
+    """The state of the search from one start; the rest of the search depends on nothing else.
 
-    **Fields:** `stage` the index of the horizon that comes next, their number where it is over;
-    `strides` how many were taken there; `tried` what was found.
+    **Fields:** `stage` the index of the next horizon, or their number at the end; `strides` the
+    number taken there; `tried` the result.
     """
 
     stage: int
@@ -65,16 +65,16 @@ def fingerprint(*trees: Any) -> str:
         array = np.asarray(leaf)
         words.append(f"{array.dtype} {array.shape}")
         found.update(array.tobytes())
-    # An address in memory is another one in each process.
+    # An address in memory differs between processes.
     found.update(re.sub("0x[0-9a-f]+", "", "\n".join(words)).encode())
     return found.hexdigest()
 
 
 class Checkpoint:
-    """What a long search has found so far, on disk after every stride of steps.
+    """The results of a long search so far, on disk after every stride of steps.
 
     **Arguments:** `path` of the file, or `None` to keep nothing; `like` a `Tried` of the right
-    shapes; `print_of` the `fingerprint` of all that the search depends on.
+    shapes; `print_of` the `fingerprint` of everything that the search depends on.
 
     **Raises:** `ValueError` for a file that is no checkpoint, is cut, or belongs to another
     problem; it is not overwritten.
@@ -89,7 +89,7 @@ class Checkpoint:
             self._read(self.path)
 
     def save(self, done: Sequence[Tried], position: SearchState) -> None:
-        """Write what is finished and where the search stands, replacing the file at once."""
+        """Write the finished starts and the state of the search, replacing the file at once."""
         if self.path is None:
             return
         stage, strides, current = position

@@ -146,11 +146,11 @@ def read_log(
     wheels: Sequence[WheelColumn] = (),
     free: Sequence[str] = (),
 ) -> Recording:
-    """One recording from a file, with the sensors and wheels that are described.
+    """One recording from a file, with the described sensors and wheels.
 
     **Arguments:** `path`; `channels`; `time`, `time_unit` the time column; `window` (from, to), s,
-    or `None` for all; `wheels`; `free` of `bias`, `drag`, `delay`: what the sensors and the torque
-    are to have so that a fit can move it. An empty cell is a gap.
+    or `None` for all; `wheels`; `free` some of `bias`, `drag`, `delay`: sensors and torque get
+    these numbers, so that a fit can move them. An empty cell is a gap.
 
     **Raises** `LogError` as `read_table`.
 
@@ -239,11 +239,11 @@ def problem_of(
     """The problem of these recordings.
 
     **Arguments:** `recordings` of `read_log`; `model` one of `ratios`, `principal-ratios`,
-    `tensor`, `principal`; `typical` kg m², about how large the moments are; `free` as `read_log`
-    was given: a drag coefficient for all, a bias and a delay for each recording; `loss` how an
-    outlier counts: `soft-l1`, `huber` (both linearly), `none` (squared).
+    `tensor`, `principal`; `typical` kg m², the rough size of the moments; `free` as for `read_log`:
+    a drag coefficient for all, a bias and a delay for each recording; `loss` the weight of an
+    outlier: `soft-l1`, `huber` (both linear), `none` (squared).
 
-    **Raises** `LogError` for an unknown model or a scale that nothing can show.
+    **Raises** `LogError` for an unknown model, or a scale that no reading can show.
     """
     if model not in MODELS:
         raise LogError(f"model: wanted one of {', '.join(MODELS)}, got {model!r}")

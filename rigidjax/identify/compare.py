@@ -1,4 +1,4 @@
-"""Which model do the data ask for: information criteria, and prediction of what was left out."""
+"""Comparison of models: information criteria, and prediction of the recording left out."""
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
@@ -16,11 +16,12 @@ from rigidjax.identify.result import Fit
 
 
 class Comparison(eqx.Module):
-    """One model among others of the same data.
+    """One of several models of the same data.
 
-    **Fields:** `name`; `free` how many numbers are free; `rms` of each sensor; `correlation` over
-    how many samples its errors are autocorrelated; `information` its Bayesian information criterion
-    less the best one's: 0 for the best, 10 and more is strong evidence against.
+    **Fields:** `name`; `free` the number of free numbers; `rms` of each sensor; `correlation` the
+    samples over which its errors are autocorrelated; `information` its Bayesian information
+    criterion minus that of the best: 0 for the best, 10 and more is strong evidence against the
+    model.
 
     >>> Comparison("free", 5, (0.01,), 1.0, 0.0).free  # two ratios and the first body rate
     5
@@ -37,8 +38,8 @@ def compare(fits: Mapping[str, Fit]) -> tuple[Comparison, ...]:
     """Models of the same data, best first, by Schwarz's criterion.
 
     `N log s² + p log N` with s² the mean square of each sensor's errors and N the number of
-    independent readings: the number of readings over how many samples the errors of the best
-    fitting model are autocorrelated, the same for all.
+    independent readings: the number of readings divided by the samples over which the errors of the
+    best model are autocorrelated, the same for all.
 
     **Arguments:** `fits` name → `Fit`, all of the same readings. **Raises** `ValueError` for none,
     or for fits of other readings. **Returns** for each `name`, `free`, `rms`, `correlation` and
@@ -89,10 +90,10 @@ def cross_validate(
     recordings: Sequence[Recording],
     **options: Any,
 ) -> tuple[tuple[float, ...], ...]:
-    """How well each recording is predicted by a body that was fitted to all others.
+    """The errors of each recording under a body fitted to all other recordings.
 
-    The body and all that recordings share come from the others; the left-out recording fits only
-    what is its own: its first state and the `Free`s with one value for each.
+    The body and all shared numbers come from the other recordings. The fit to the recording left
+    out moves only its own numbers: its initial state and the `Free`s with one value for each.
 
     **Arguments:** `build` the problem of a sequence of recordings; `recordings` two at least;
     `options` for `fit`. **Returns** for each recording the root mean square error of each sensor.

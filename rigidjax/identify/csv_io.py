@@ -14,7 +14,7 @@ from rigidjax import _checks
 from rigidjax.identify import blackbox
 from rigidjax.identify.layouts import read_header
 
-# Everything is turned into SI.
+# All units become SI.
 UNITS = {
     "s": 1.0,
     "ms": 1e-3,
@@ -52,8 +52,8 @@ def read_table(path: str | Path, columns: Sequence[str]) -> dict[str, np.ndarray
     separated by commas, semicolons or tabs, whichever splits the header line into most names; its
     decimals have a point. Lines that begin with `#` may stand above the header, and the header may
     be the last of them, as `numpy.savetxt` writes it. **Returns** name → (T,) numbers. An empty
-    cell is a gap and comes back as NaN. A text is read line by line: beside it, up to three times
-    its numbers are held.
+    cell is a gap and comes back as NaN. A text is read line by line; the memory needed is up to
+    three times its numbers.
 
     **Raises:** `ValueError`, one line naming file, line and column, for a file that is missing, cut
     or not of its kind, a missing column or two of its name, a name that is wanted twice, a cell
@@ -80,7 +80,7 @@ def read_table(path: str | Path, columns: Sequence[str]) -> dict[str, np.ndarray
 
 
 def increasing(path: str | Path, t: np.ndarray, name: str) -> None:
-    """Raise `LogError` unless there are four times at least and each is above the one before."""
+    """Raise `LogError` unless there are at least four times and they increase."""
     if t.size < 4:
         raise LogError(f"{path}: wanted at least 4 samples, got {t.size}")
     if not np.isfinite(t).all():
@@ -98,7 +98,7 @@ def increasing(path: str | Path, t: np.ndarray, name: str) -> None:
 
 def _csv(path: Path, columns: Sequence[str]) -> dict[str, np.ndarray]:
     try:
-        # Line by line: what is held of a large file is its numbers.
+        # Line by line: only the numbers of a large file stay in memory.
         with path.open(encoding="utf-8-sig", newline="") as file:
             return _rows(path, file, columns)
     except (OSError, UnicodeDecodeError, csv.Error) as error:
@@ -161,7 +161,7 @@ def _number(cell: str) -> float:
 
 
 def _arrays(path: Path, columns: Sequence[str]) -> dict[str, np.ndarray]:
-    # The readers raise whatever they run into in an empty or a cut file.
+    # The readers raise many kinds of errors for an empty or a cut file.
     try:
         names, held = _readers[path.suffix.lower()](path, columns)
     except ModuleNotFoundError as error:
@@ -191,7 +191,7 @@ def _arrays(path: Path, columns: Sequence[str]) -> dict[str, np.ndarray]:
 
 
 def _npz(path: Path, columns: Sequence[str]) -> tuple[list[str], dict[str, Any]]:
-    # NumPy leaves the handle open of a file that it opened itself and cannot read.
+    # NumPy does not close a file that it opened itself and cannot read.
     with path.open("rb") as raw, np.load(raw) as file:
         return file.files, {name: file[name] for name in columns if name in file.files}
 

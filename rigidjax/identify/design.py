@@ -1,4 +1,4 @@
-"""Experiment design: what a motion would show before it is made, and which motion shows most."""
+"""Experiment design: the expected uncertainty of a planned motion, and the best motion."""
 
 from typing import Any
 
@@ -20,7 +20,7 @@ from rigidjax.identify.uncertainty import inverted
 
 
 def expected(problem: Problem, parameters: Parameters) -> tuple[Quantity, ...]:
-    """What a fit of such a recording would report, and how sure it would be.
+    """The expected report of a fit of such a recording, with its standard deviations.
 
     **Arguments:** `problem` whose recordings give times, sensors with known noise, and torques (the
     readings themselves do not matter); `parameters` the motion that is planned. **Returns** the
@@ -55,8 +55,8 @@ def expected(problem: Problem, parameters: Parameters) -> tuple[Quantity, ...]:
 def fisher(problem: Problem, parameters: Parameters) -> Float[Array, "n n"]:
     """Fisher's information (n, n) of the free numbers: `Jᵀ Σ⁻¹ J` of the predictions.
 
-    **Arguments:** `problem` with known noises; `parameters` the motion. Differentiable in the
-    parameters: a design follows its gradient. **Raises** `ValueError` for a
+    **Arguments:** `problem` with known noises; `parameters` the motion. It is differentiable in the
+    parameters, for a design by gradients. **Raises** `ValueError` for a
     sensor whose noise is not given.
 
     >>> import rigidjax as rj
@@ -98,11 +98,11 @@ def _on_host(problem: Problem, motion: Any) -> None:
 def best_first_rate(
     problem: Problem, body: Any, omega: Any, *, max_steps: int = 60
 ) -> tuple[Vec3, tuple[Quantity, ...]]:
-    """The direction of the first rate that shows most of the body, its length kept.
+    """The direction of the initial rate that determines the body best; its length is kept.
 
-    Makes the mean logarithm of the standard deviations of the body's free numbers small
-    (D-optimality of the body, all else free as well), by BFGS of optimistix on the gradient through
-    Fisher's information. It finds the best direction near `omega`: try several.
+    It minimises the mean logarithm of the standard deviations of the body's free numbers
+    (D-optimality of the body, other numbers free as well), by BFGS of optimistix on the gradient
+    through Fisher's information. It finds the best direction near `omega`: try several.
 
     **Arguments:** `problem`, `body` as for `Problem.start`; `omega` (3,) rad/s, body frame, where
     the search starts and how fast the body can be thrown; `max_steps`. **Returns** the rate
@@ -137,12 +137,12 @@ def _search(problem: Problem, body: Any, start: Array, size: Array, max_steps: i
 
 
 def _doubt(direction: Array, args: Any) -> Scalar:
-    """½ log det of the body's covariance over its size, plus a hold on the length."""
+    """½ log det of the body's covariance over its size, plus a penalty on the length."""
     problem, body, size = args
     length = jnp.sqrt(jnp.sum(direction**2))
     information = fisher(problem, problem.start(body, size * direction / length))
     n = problem.body.size
-    # The body's own information, all else free: Schur's complement.
+    # The body's information with the other numbers free: Schur's complement.
     mine, across, rest = information[:n, :n], information[:n, n:], information[n:, n:]
     scale = jnp.sqrt(jnp.diagonal(rest))
     rest = rest / (scale[:, None] * scale[None, :]) + 1e-12 * jnp.eye(rest.shape[0])

@@ -1,4 +1,4 @@
-"""Attitudes and rates that readings show without any motion in between: where a fit starts from."""
+"""Attitudes and rates directly from readings, without a motion between them: the start of a fit."""
 
 import jax
 import jax.numpy as jnp
@@ -9,20 +9,20 @@ from rigidjax.identify.recording import Recording, readings_of
 from rigidjax.identify.sensors import AttitudeSensor, Direction, Marker
 from rigidjax.rotation import quaternion, so3
 
-# A rate is the turn between two attitudes so far apart, rad, that noise counts little, and yet so
-# near that the axis has not moved much.
+# The turn, rad, between two attitudes that give a rate: large against noise, small enough that the
+# axis hardly moves.
 _TURN = 0.3
-# Singular values of Σ world bodyᵀ: where two of them are below this share of the largest, a turn is
-# free.
+# A turn is undetermined if two singular values of Σ world bodyᵀ are below this share of the
+# largest.
 _FIRM = 1e-3
 
 
 def attitudes(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
     """Times (n,), s, and attitudes (n, 4), body → world, that the readings show; n may be 0.
 
-    Those of an attitude sensor, or, at times when all see, the rotation that takes markers' places
-    and directions in the body nearest to where they are in the world
-    (`rigidjax.so3.wahba`). At least three markers that are not in line, or two directions.
+    They come from an attitude sensor. Otherwise, at times with readings of all sensors, they are
+    the rotation that best takes the markers' places and directions from the body to the world
+    (`rigidjax.so3.wahba`), from at least three markers not in line, or two directions.
     """
     t = np.asarray(recording.t)
     for reading in readings_of(recording, AttitudeSensor):

@@ -46,7 +46,7 @@ from rigidjax.identify.search import (
 from rigidjax.identify.stochastic_gradient import Descent, descend
 from rigidjax.identify.widths import with_widths
 
-# More equal steps than this between two samples cost more than steps chosen as they are needed.
+# More fixed steps than this between two samples cost more than adaptive steps.
 FINEST = 32
 
 
@@ -64,40 +64,41 @@ def fit(
     checkpoint: str | Path | None = None,
     progress: Callable[[str], Any] | None = None,
 ) -> Fit:
-    """The body and the first state that explain a recording best.
+    """The body and the initial state that explain a recording best.
 
     **Arguments:**
 
-    - `problem`: what was read and what is free.
-    - `starts`: how many starting points to try (regression first, then scattered ones). Each is
+    - `problem`: the readings and the free numbers.
+    - `starts`: the number of starting points (regression first, then scattered ones). Each is
       fitted to a quarter, a half and then the whole of the record.
     - `initial`: a starting point of your own, tried first.
-    - `key`: random key of the scattered starts; the same ones each time unless given.
-    - `tolerance`, `max_steps`: where Levenberg–Marquardt stops: at steps of so many standard
-      deviations (of each parameter with all others at rest), and misfits that change as little;
-      after so many steps.
-    - `together`: how many starts go through one `vmap` at once.
-    - `pieces`: where more than one, the record is first fitted in so many pieces whose ends are
-      joined (see `pieces`), and the result is the first start.
+    - `key`: random key of the scattered starts; they are always the same unless it is given.
+    - `tolerance`, `max_steps`: Levenberg–Marquardt stops at steps of `tolerance` standard
+      deviations (of each parameter with all others fixed) with an equally small change of the
+      misfit, or after `max_steps` steps.
+    - `together`: the number of starts in one `vmap`.
+    - `pieces`: if more than one, the record is first fitted in so many pieces with joined ends (see
+      `pieces`), and the result is the first start.
     - `descent`: a `Descent(optimiser, steps=…, batch=…)` of optax first improves each start on a
-      few recordings at a time: for many recordings, where a step of least squares costs much.
-    - `checkpoint`: a file that keeps what was found after every 25 steps; a second call with the
-      same problem and options goes on from there and, on the same machine and versions, ends at
-      the same point to the last bit, wherever the first was killed. `together` = 1 only.
+      few recordings at a time: for many recordings, when a step of least squares is expensive.
+    - `checkpoint`: a file that keeps the state of the search after every 25 steps. A second call
+      with the same problem and options continues from there. It ends at the same point to the last
+      bit on the same machine and versions, wherever the first was killed. `together` = 1 only.
     - `progress`: called with a line of text after each start, such as `print`.
 
-    **Returns** a `Fit`. It always holds the best point that was reached, and two answers.
+    **Returns** a `Fit`. It always holds the best point reached, and two answers.
     `fit.search`: `found`, `not alone` (another motion fits as well), or `not ended`. `fit.model`:
     `explains the readings` (the errors are white and of the sensor's size), `leaves a part` (how
-    large, and where), or `does not explain the readings`. `fit.causes` names what most likely makes
-    the errors that are left, `fit.advice` says whether the intervals can be trusted and what to
-    try, `fit.status` is both answers in a line, `ok` where all is well. Interrupting (Ctrl-C) ends
-    the search and keeps what was found; the status says so, and is not `ok`.
+    large, and where), or `does not explain the readings`. `fit.causes` names the most likely causes
+    of the remaining errors, `fit.advice` says whether the intervals can be trusted and gives
+    advice, `fit.status` is both answers in a line, `ok` if all is well. An interrupt (Ctrl-C) ends
+    the search and keeps the best point so far; the status says so, and is not `ok`.
 
-    Levenberg–Marquardt on normal equations, Jacobians by forward mode through the motion.
+    The method is Levenberg–Marquardt on normal equations, with Jacobians by forward mode through
+    the motion.
 
-    **Raises:** `TypeError` for what is no `Problem`, `ValueError` for fewer than one start, a
-    checkpoint that is damaged or of another problem, or one in a folder that does not exist.
+    **Raises:** `TypeError` unless `problem` is a `Problem`, `ValueError` for fewer than one start,
+    a checkpoint that is damaged or of another problem, or one in a folder that does not exist.
 
     >>> import jax.numpy as jnp, rigidjax as rj
     >>> ts = jnp.linspace(0.0, 10.0, 80)
@@ -154,7 +155,7 @@ def fit(
 def _with_noise(
     problem: Problem, best: Tried, noise: Noise, tolerance: float, max_steps: int
 ) -> tuple[Tried, Noise]:
-    """The best point and the noise that belong together, where some noise is to be estimated."""
+    """The best point together with its noise, if some noise is to be estimated."""
     if all(sensor.noise is not None for sensor in problem.records.sensors):
         return best, noise
 
@@ -213,7 +214,7 @@ def _one_by_one(
     like = Tried(points[0], jnp.asarray(jnp.inf), jnp.asarray(False))
     print_of = ""
     if checkpoint is not None:
-        # The misfits as well: of a torque that is a function the rest knows the name only.
+        # The misfits as well: the fingerprint contains only the name of a torque function.
         costs = [cost_of(point, problem, noise) for point in points]
         print_of = fingerprint(points, problem, noise, costs, tolerance, max_steps)
     keep = Checkpoint(checkpoint, like, print_of)
@@ -226,13 +227,13 @@ def _one_by_one(
             latest = [like]
 
             def look(position: SearchState) -> None:
-                # A part of the record only: its misfit is no measure of the whole.
+                # This is a part of the record: its misfit is no measure of the whole.
                 if np.isfinite(float(position.tried.cost)):
                     latest[0] = position.tried  # noqa: B023
                 keep.save(tried, position)
 
             start = keep.position if resumed else SearchState(0, 0, fresh(point))
-            # Once a start explains the record, others are only to show whether that is the one.
+            # After a start that explains the record, other starts only show whether it is unique.
             aim = min((float(item.cost) for item in tried if bool(item.converged)), default=np.inf)
             aim = aim if aim <= enough(problem) else 0.0
             out = climb(start, problem, noise, tolerance, max_steps, look=look, aim=aim)
@@ -250,7 +251,7 @@ def _one_by_one(
 
 
 def _with_one_found(tried: list[Tried]) -> list[Tried]:
-    """The same; only the lowest keeps its derivatives, which take room."""
+    """The same; only the best start keeps its derivatives, which need memory."""
     costs = [float(item.cost) for item in tried]
     lowest = int(np.argmin([cost if np.isfinite(cost) else np.inf for cost in costs]))
     return [item if index == lowest else bare(item) for index, item in enumerate(tried)]
@@ -287,7 +288,7 @@ def _say(progress: Any, number: int, total: int, tried: list[Tried]) -> None:
 
 
 def _evaluated(best: Tried, problem: Problem) -> Tried:
-    """The same with errors and derivatives, where the search did not end with them."""
+    """The same with errors and derivatives, unless the search ended with them."""
     if best.found is not None:
         return best
     return dataclasses.replace(best, found=evaluate(best.parameters, problem))
@@ -300,15 +301,15 @@ def _errors_alone(parameters: Parameters, problem: Problem) -> tuple[Float[Array
 
 
 def _finer(problem: Problem, best: Tried, noise: Noise) -> AbstractIntegrator | None:
-    """Where twice as many fixed steps predict otherwise, by a twentieth of the noise: those that
-    do not, or adaptive ones; else `None`.
+    """A finer integrator if twice as many fixed steps change predictions by a twentieth of the
+    noise: more fixed steps, or adaptive ones; else `None`.
     """
     steps = problem.integrator
     if not isinstance(steps, FixedSteps):
         return None
     count, parameters = steps.substeps, best.parameters
     (coarse, _), _ = best.found
-    # Steps that were asked for are tried in any case.
+    # Steps given by the user are tried in any case.
     while count <= max(FINEST, steps.substeps):
         finer: AbstractIntegrator = FixedSteps(2 * count, steps.solver)
         exact = _errors_alone(parameters, eqx.tree_at(lambda p: p.integrator, problem, finer))

@@ -1,4 +1,4 @@
-"""Flat bodies, I1 + I2 = I3: where the bodies end. Derivatives beside it, intervals cut at it."""
+"""Flat bodies, I1 + I2 = I3: the limit of real bodies, with derivatives and intervals near it."""
 
 from typing import Any
 
@@ -21,10 +21,10 @@ ONE_SIDED = 1.645
 
 
 class Limit(eqx.Module):
-    """How far a body is from the flat ones: `flatness = (I1 + I2 − I3) / I3`, never negative.
+    """The distance of a body from a flat one: `flatness = (I1 + I2 − I3) / I3`, never negative.
 
-    **Fields:** `where` what is added to the names of the body's quantities; `flatness` at the best
-    point; `free` what it would be if it could be negative, as the linear problem has it; `slope`
+    **Fields:** `where` the suffix of the names of the body's quantities; `flatness` at the best
+    point; `free` its value in the linear problem, which may be negative; `slope`
     (n,) its derivative in the free numbers.
     """
 
@@ -51,10 +51,9 @@ class Limit(eqx.Module):
 def ends(
     reach: float, correlation: np.ndarray | float, away: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The ends of an interval from its middle, in standard deviations, where a body may not be
-    past flat.
+    """The ends of an interval from its middle, in standard deviations, cut at a flat body.
 
-    They are those of the likelihood ratio of two Gaussian numbers of which one is not negative:
+    They follow from the likelihood ratio of two Gaussian numbers, one of them not negative:
     `m²(y) = min over z ≥ 0`. **Arguments:** `reach` the quantile; `correlation` of the number y
     with the flatness z; `away` the free flatness over its standard deviation.
 
@@ -75,22 +74,23 @@ def ends(
 
 
 def in_words(body: Inertia | MassProperties) -> str | None:
-    """What is to be said of a flat body, where a fit ended at one without an interval for it."""
+    """The remark on a flat body, if a fit ended at one without an interval for it."""
     values = np.linalg.eigvalsh(np.asarray(body.second_moment))
     if not values[0] < THIN * values.sum():
         return None
     flatness = 2 * values[0] / (values[1] + values[2])
     return (
-        f"the body is flat: (I1 + I2 − I3)/I3 = {flatness:.2g}; if it is not, something is "
-        "missing in the model"
+        f"the fitted body is flat: (I1 + I2 − I3)/I3 = {flatness:.2g}; if the true body is not, "
+        "the model is incomplete"
     )
 
 
 def beside(problem: Problem, parameters: Parameters) -> Parameters | None:
-    """The same numbers, but flat bodies a little thicker; `None` where no body is flat.
+    """The same numbers, but flat bodies a little thicker; `None` if no body is flat.
 
-    At a flat body the chart has a derivative of zero: no reading changes with the thickness. What
-    the readings say of the tensor itself is regular there and hardly changes within so little.
+    The chart has a derivative of zero at a flat body: no reading changes with the thickness. The
+    information about the tensor itself is regular there and hardly changes over such a small
+    thickness.
     """
     vectors, first, changed = [], 0, False
     bodies = bodies_of(problem, parameters)
@@ -113,7 +113,7 @@ def bodies_of(problem: Problem, parameters: Parameters) -> list[Any]:
 
 
 def _thicker(chart: AbstractBodyChart, body: Inertia | MassProperties) -> Array | None:
-    """The chart's numbers of a thicker body, where it is flat and the chart is one of ours."""
+    """The chart's numbers of a thicker body, if it is flat and the chart is one of ours."""
     # By NumPy, for an operation of JAX outside of a trace costs as much as a run of 100 steps.
     if isinstance(body, MassProperties):
         second = np.asarray(body.second_moment)
@@ -150,7 +150,7 @@ def flatness(problem: Problem, parameters: Parameters) -> Float[Array, " bodies"
         logs = chart.logs(body)[-3:]
         logs = logs if logs.size == 3 else jnp.append(logs, 0.0)
         low, middle, high = jnp.sort(jnp.exp(logs - jnp.max(logs)))
-        # Of a flat body round-off may be below zero.
+        # Round-off may make the flatness of a flat body negative.
         out.append(jnp.maximum(low + middle - high, 0.0) / high)
     return jnp.stack(out)
 
@@ -160,9 +160,9 @@ def limits(
 ) -> tuple[Limit, ...]:
     """The limit of each body whose moments are free.
 
-    **Arguments:** `found` numbers of which the last are the flatness of each body, and their
-    derivatives; `step` (n,) to the least misfit of the linear problem; `names` what is added to the
-    names of a body's quantities.
+    **Arguments:** `found` numbers and their derivatives, the last ones being the flatness of each
+    body; `step` (n,) to the least misfit of the linear problem; `names` the suffixes of the names
+    of a body's quantities.
     """
     rows = zip(names, *(part[-len(names) :] for part in found), strict=True)
     kept = [_has_limit(chart) for chart in charts_of(problem.body)]

@@ -1,4 +1,4 @@
-"""What of a recording's torque and sensors a fit may move."""
+"""The numbers of a recording's torque and sensors that a fit may move."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -18,20 +18,20 @@ class Free(eqx.Module):
     """A number or array inside the recordings' torque or sensors that the fit may move.
 
     **Arguments:** `where` picks it: `lambda r: r.readings[0].sensor.bias`, or
-    `lambda r: r.torque.coefficient`; what the recording holds there is the starting value. `name`
+    `lambda r: r.torque.coefficient`; the starting value is the recording's value there. `name`
     for reports, `unit` too; `None` names that of a bias, a delay or a clock offset, a mounting or
     tilt, and a place. `scale` its natural size: a step of one in the fit is one `scale`, in its
     unit. `each`: `False` for one value for all recordings, `True` for one for each, `"body"` for
-    one for each body, or a sequence of labels, one for each recording: those of the same label
-    share one.
-    `positive`: moved through its logarithm, so that it keeps its sign. `prior` a standard deviation
-    around the starting value (a Gaussian prior, in its unit; relative for `positive`), or `None`.
-    `spread`: each recording deviates from the shared value by a number of its own, with this
-    standard deviation (in its unit; relative for `positive`), or `"estimated"` from the deviations
-    of three recordings or more, beginning with one `scale`; `None` for no deviations.
+    one for each body, or a sequence of labels, one for each recording: recordings with the same
+    label share a value. `positive`: the fit moves its logarithm, so that it keeps its sign. `prior`
+    a standard deviation around the starting value (a Gaussian prior, in its unit; relative for
+    `positive`), or `None`. `spread`: each recording deviates from the shared value by a number of
+    its own, with this standard deviation (in its unit; relative for `positive`), or `"estimated"`
+    from the deviations of three recordings or more, with one `scale` as first guess; `None` for no
+    deviations.
 
-    **Raises** `ValueError` for a scale, prior or spread that is not positive, a spread where each
-    recording has its own value already.
+    **Raises** `ValueError` for a scale, prior or spread that is not positive, and for a spread if
+    each recording has its own value already.
 
     >>> import rigidjax as rj
     >>> Free(lambda r: r.readings[0].sensor.bias, "gyro bias", scale=0.01, spread=0.02).name
@@ -78,7 +78,7 @@ class Free(eqx.Module):
 
 
 def shares(each: Any, name: str) -> bool | str | tuple[Any, ...]:
-    """`each` if it says who shares a number. **Raises** `TypeError`, `ValueError` for others."""
+    """`each` if it is valid. **Raises** `TypeError`, `ValueError` for other values."""
     if isinstance(each, bool):
         return each
     if isinstance(each, str):
@@ -92,7 +92,7 @@ class Slot(eqx.Module):
     problem of the same form does not compile again.
 
     **Fields:** `each` whether every recording has its own; `groups` (R,) the index of each
-    recording's value where a group shares one, `labels` of the groups; `prior`, `spread` in steps,
+    recording's value if groups share values, `labels` of the groups; `prior`, `spread` in steps,
     `estimated` whether the spread is only a first guess.
     """
 
@@ -150,9 +150,10 @@ def grouped(
 
 
 def find(free: Sequence[Free], recording: Recording, of: Sequence[str] = ("",)) -> tuple[Slot, ...]:
-    """Where each `Free` is among the recording's leaves; `of` the name of each recording's body.
+    """The leaf of the recording that each `Free` moves; `of` the name of each recording's body.
 
-    **Raises** `ValueError` where it picks nothing, something that is no number, or the same twice.
+    **Raises** `ValueError` if it picks nothing, something other than numbers, or the same numbers
+    twice.
     """
     slots: list[Slot] = []
     for item in free:
@@ -181,10 +182,10 @@ def find(free: Sequence[Free], recording: Recording, of: Sequence[str] = ("",)) 
 
 
 def leaf_at(where: Callable[[Any], Any], tree: Any, name: str, what: str) -> tuple[int, Any]:
-    """Which leaf of a tree `where` picks, and the leaf: an array of numbers.
+    """The index of the leaf that `where` picks, and the leaf: an array of numbers.
 
-    **Arguments:** `name` for messages; `what` is to have a starting value where `None` is.
-    **Raises** `ValueError` where it picks nothing, several, or something that is no number.
+    **Arguments:** `name` for messages; `what` needs a starting value instead of `None`.
+    **Raises** `ValueError` if it picks nothing, several leaves, or something other than numbers.
     """
     leaves, structure = jax.tree.flatten(tree)
     try:
@@ -208,7 +209,7 @@ _UNITS = {"offset": "s", "delay": "s", "mounting": "rad", "tilt": "rad", "place"
 
 
 def _unit_of(recording: Recording, index: int) -> str:
-    """The unit of a leaf of a recording, as far as its name says."""
+    """The unit of a leaf of a recording, if its name implies one."""
     path, _ = jax.tree.leaves_with_path(recording)[index]
     *way, last = path
     name = getattr(last, "name", "")

@@ -1,4 +1,4 @@
-"""Readings at full scale: found in a record, counted as "at least that much", reported."""
+"""Readings at full scale: their detection, their weight as "at least that much", their report."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -9,17 +9,17 @@ import numpy as np
 
 from rigidjax.identify.recording import Recording
 
-# So many readings in a row at the largest value are a plateau.
+# A plateau has so many readings in a row at the largest value.
 RUN = 3
-# A record that is at its largest value for a larger share than this stands still, or was cut.
+# A record with a larger share than this at its largest value is constant, or was cut.
 MOST = 0.7
 
 
 def plateau(values: np.ndarray) -> float | None:
-    """The full scale (> 0) of one channel (T,) whose largest readings are cut off, or `None`.
+    """The full scale (> 0) of one channel (T,) if its largest readings are cut off, else `None`.
 
-    The largest magnitude, where more readings in a row have it than the top of a smooth wave in so
-    many digits would: with the last digit d and second differences a that is `2 √(2d/a)` of them.
+    It is the largest magnitude if more readings in a row have it than at the top of a smooth wave:
+    with the last digit d and second differences a the top has `2 √(2d/a)` equal readings.
     """
     size = np.abs(values)
     top = float(size.max(initial=0.0))
@@ -38,9 +38,9 @@ def plateau(values: np.ndarray) -> float | None:
 
 
 def with_limits(recordings: Sequence[Recording]) -> list[Recording]:
-    """The recordings, the sensors that were cut off with the full scale that shows.
+    """The recordings, with the full scale found in the sensors that were cut off.
 
-    Where a sensor has a `limit` already, that stands.
+    A sensor keeps its `limit` if it has one.
     """
     found = [[_limits(reading) for reading in r.readings] for r in recordings]
     out = list(recordings)
@@ -61,7 +61,7 @@ def with_limits(recordings: Sequence[Recording]) -> list[Recording]:
 
 
 def _limits(reading: Any) -> np.ndarray | None:
-    """The full scale of each channel, infinite where none shows; `None` where none is asked for."""
+    """The full scale of each channel, infinite if none is found; `None` if none is sought."""
     sensor = reading.sensor
     if getattr(sensor, "limit", 0) is not None or sensor.reading_shape != (sensor.components,):
         return None
@@ -71,7 +71,7 @@ def _limits(reading: Any) -> np.ndarray | None:
 
 
 def at_limit(readings: Sequence[Any]) -> tuple[np.ndarray, ...]:
-    """Which readings of each sensor are at full scale, (R, T, k); of a problem's stacked ones."""
+    """The mask of each sensor's readings at full scale, (R, T, k); of a problem's stacked ones."""
     out = []
     for reading in readings:
         limit = getattr(reading.sensor, "limit", None)
@@ -84,7 +84,7 @@ def at_limit(readings: Sequence[Any]) -> tuple[np.ndarray, ...]:
 
 
 def in_words(readings: Sequence[Any]) -> list[str]:
-    """What was at full scale, for a report."""
+    """The readings at full scale, for a report."""
     out = []
     for reading, full in zip(readings, at_limit(readings), strict=True):
         count = full.sum(axis=(0, 1))

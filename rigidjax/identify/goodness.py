@@ -11,16 +11,16 @@ from rigidjax.identify.full_scale import at_limit
 from rigidjax.identify.problem import Problem
 from rigidjax.identify.uncertainty import Linearised, Times, scatter
 
-# Errors are called autocorrelated where white ones would look so once in so many fits.
+# The false-alarm rate of the test for autocorrelated errors.
 RARE = 1e-5
-# Lags that the test for whiteness looks at.
+# Lags in the test for whiteness.
 LAGS = 10
-# Errors above this share of what varies in the readings (their variance) explain too little.
+# A model explains too little if its errors exceed this share of the readings' variance.
 HALF, QUARTER, TENTH = 0.5, 0.25, 0.1
 
 
 class Goodness(eqx.Module):
-    """How well the errors agree with what the sensors can do.
+    """The agreement of the errors with the sensors' noise.
 
     **Fields:** `chi2`, `dof` of the sensors whose noise was given; `model` the answer; `left` the
     indices of the sensors whose errors the model does not explain.
@@ -33,12 +33,13 @@ class Goodness(eqx.Module):
 
 
 def goodness(problem: Problem, linear: Linearised, times: Times, free: int) -> Goodness:
-    """χ² of the sensors with a given noise, and what the model leaves in the errors.
+    """χ² of the sensors with a given noise, and the sensors whose errors the model does not
+    explain.
 
-    For each sensor: the size of its errors against the noise, where that was given (five standard
-    deviations of χ², or under a robust loss of the median of the squared errors), and against what
-    varies in its readings; and whether its errors are white (Ljung and Box's test,
-    with one false alarm in 1e5). Readings at full scale take no part.
+    The size of each sensor's errors is compared with a given noise (five standard deviations of χ²,
+    or of the median of the squared errors under a robust loss), and with the variance of its
+    readings. Ljung and Box's test says whether the errors are white (with one false alarm in 1e5).
+    Readings at full scale take no part.
 
     **Arguments:** `linear` the problem at its best point; `times` the errors' correlation; `free`
     how many numbers are free.
@@ -64,7 +65,7 @@ def goodness(problem: Problem, linear: Linearised, times: Times, free: int) -> G
                 factor = _median_above(np.sum(e[rows] ** 2, axis=-1), e.shape[-1])
         white = left <= tiny or _white(e * np.sqrt(weight)[..., None], kept, given)
         late = left > tiny and clock(problem, linear, index) is not None
-        # What is below a noise that was given has nothing that could be missed.
+        # Errors below a given noise cannot hide a missing part of the model.
         small = given or left <= QUARTER * varies + tiny
         if factor == 1.0 and white and small and not late:
             continue
@@ -94,7 +95,7 @@ def _in_words(
     share: float | None,
     span: float | None,
 ) -> str:
-    """How large errors are and where; `share` of what varies, `span` of samples if not white."""
+    """Size and place of errors in words; `share` of the variance, `span` of samples or `None`."""
     sensor, many = reading.sensor, max(int(kept.any(axis=-1).sum()), 1)
     size = np.sqrt(np.sum(error[kept] ** 2) / many)
     words = [f"the errors of the {type(sensor).__name__} are {size:.3g} {sensor.unit}"]
@@ -124,25 +125,25 @@ def _where(problem: Problem, error: np.ndarray, kept: np.ndarray) -> str:
 
 
 def _sizes(reading: Any, error: np.ndarray, kept: np.ndarray) -> tuple[float, float, float]:
-    """Sums of squares: of the errors, of what varies in the readings, and of round-off."""
+    """Sums of squares: of the errors, of the readings about their mean, and of round-off."""
     values = np.asarray(reading.values)[reading.seen]
     varies = float(np.sum((values - values.mean(axis=0)) ** 2))
     return float(np.sum(error[kept] ** 2)), varies, 1e-12 * float(np.sum(values**2))
 
 
 def _above(own: float, many: int, free: int) -> float:
-    """How many times the noise the errors are by χ²; one where they agree with it."""
+    """The ratio of the errors to the noise by χ²; one if they agree."""
     dof = max(many - free, 1)
     return float(np.sqrt(own / dof)) if own > dof + 5 * np.sqrt(2 * dof) else 1.0
 
 
 def _median_above(squares: np.ndarray, size: int) -> float:
-    """The same by the median: outliers are expected, and χ² is theirs."""
+    """The same by the median: outliers are expected, and dominate χ²."""
     if not squares.size:
         return 1.0
     middle = float(np.median(squares))
     half, density = median_of_chi2(size)
-    # Of a sample's median: 1 / (2 f √n), f the density there.
+    # The deviation of a sample's median is 1 / (2 f √n), f the density there.
     wide = 0.5 / (density * np.sqrt(squares.size))
     return float(np.sqrt(middle / half)) if middle > half + 5 * wide else 1.0
 
@@ -160,7 +161,7 @@ def median_of_chi2(size: int) -> tuple[float, float]:
 def _white(e: np.ndarray, kept: np.ndarray, given: bool) -> bool:
     """Whether whitened errors (R, T, k) are white, in all channels together.
 
-    Where the noise is `given`, what is far below it speaks against no fit.
+    Errors far below a `given` noise are no evidence against a fit.
     """
     from scipy.special import chdtrc
 
@@ -182,7 +183,7 @@ def _white(e: np.ndarray, kept: np.ndarray, given: bool) -> bool:
 
 
 def _over_scatter(error: np.ndarray, kept: np.ndarray) -> float:
-    """The errors over what their second differences say is their scatter."""
+    """The errors over their scatter, which second differences give."""
     channels = [np.moveaxis(x, -1, 0).reshape(-1, x.shape[1]) for x in (error, kept)]
     rows = [row[seen] for row, seen in zip(*channels, strict=True)]
     apart = scatter(rows)

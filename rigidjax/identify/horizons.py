@@ -1,4 +1,4 @@
-"""Errors of a prediction by horizon: how far off, so many steps after the start."""
+"""Errors of a prediction by horizon, the number of steps after the start."""
 
 from typing import Any, NamedTuple
 
@@ -30,7 +30,7 @@ class Horizons(NamedTuple):
 
 
 def by_horizon(starts: Any, found: Float[Array, "windows steps n"]) -> Horizons:
-    """The means over windows of errors as changes from what was measured."""
+    """The means over windows of errors, as changes from the measured states."""
     by_kind = parts(jax.tree.map(lambda leaf: leaf[0], starts), found)
     absolute = {k: np.asarray(jnp.mean(jnp.abs(v), (0, 2))) for k, v in by_kind.items()}
     squares = {k: jnp.sum(v * v, 2) for k, v in by_kind.items()}
@@ -41,5 +41,5 @@ def by_horizon(starts: Any, found: Float[Array, "windows steps n"]) -> Horizons:
 
 @jax.jit
 def held_errors(starts: Any, wanted: Any) -> Float[Array, "windows steps n"]:
-    """The errors where the state at the start is held."""
+    """The errors of a prediction that holds the state at the start."""
     return jax.vmap(jax.vmap(minus_small, (None, 0)))(starts, wanted)

@@ -1,4 +1,4 @@
-"""Which numbers a fit determines and which not, in words."""
+"""The numbers that a fit determines, and those that it does not, in words."""
 
 from typing import TYPE_CHECKING
 
@@ -24,25 +24,25 @@ if TYPE_CHECKING:
 
 
 def identifiability(fit: "Fit") -> tuple[str, ...]:
-    """What the data determine, what they determine weakly, what not at all.
+    """The quantities that the data determine well, weakly, and not at all.
 
-    Of a fit that does not explain them, or did not end, nothing is called determined.
+    Nothing is called determined if the fit does not explain the data, or did not end.
     """
     lost = fit.model.word == FAILS
     if lost or fit.search.word == NOT_ENDED:
         why = "does not explain the data" if lost else "did not end in a minimum"
         out = [
-            f"This fit {why}, so that nothing is determined by it: its numbers and intervals are "
-            "those of the best point found, and say nothing about the body."
+            f"This fit {why}, so it determines nothing: its numbers and intervals belong to the "
+            "best point found, and say nothing about the body."
         ]
-        # A search that did not end may have wandered along what the data do not determine.
+        # A search that did not end may have moved along directions that the data do not determine.
         out += [] if lost else _unseen(fit)
         return (*out, *in_words(fit.problem.records.readings))
     reach = quantile(fit, 0.95)
     out = []
     for quantity in _moments(fit):
         wide = reach * quantity.deviation
-        # Half-width over value where narrow; a factor where wide.
+        # Half-width over value for a narrow interval; a factor for a wide one.
         if not np.isfinite(wide) or wide > 1.5:
             out.append(f"{quantity.name} is not determined by these data.")
         elif wide > 0.05:
@@ -63,8 +63,8 @@ def identifiability(fit: "Fit") -> tuple[str, ...]:
         )
         if all(isinstance(sensor, Gyro) for sensor in fit.problem.records.sensors):
             out.append(
-                "Rates of free motion fit as well with an axis mirrored or two swapped, by another "
-                "body: they cannot show such a mistake."
+                "Rates of free motion with an axis mirrored or two axes swapped fit another body "
+                "as well: they cannot show such a mistake."
             )
     out += in_words(fit.problem.records.readings)
     return tuple(out)
@@ -80,11 +80,11 @@ def _moments(fit: "Fit") -> list[Quantity]:
 
 
 def _flat(fit: "Fit", reach: float) -> list[str]:
-    """What is known of bodies that may be flat."""
+    """Remarks on bodies that may be flat."""
     covariance = np.asarray(fit.seen)
     return [
         f"A flat body{limit.where} fits as well: (I1 + I2 − I3)/I3 ≤ "
-        f"{limit.bound(covariance):.2g} (95 %). Intervals end at what a body can be."
+        f"{limit.bound(covariance):.2g} (95 %). Intervals end at the limit of real bodies."
         for limit in fit.limits
         if limit.is_near(covariance, reach)
     ]
@@ -99,7 +99,7 @@ def _rate(fit: "Fit", reach: float) -> str:
         length = np.linalg.norm([q.value for q in three])
         shares.append(reach * np.max([q.deviation for q in three]) / max(length, 1e-300))
     wide = np.max(shares)
-    what = "The first body rate is" if fit.problem.count == 1 else "The first body rates are"
+    what = "The initial body rate is" if fit.problem.count == 1 else "The initial body rates are"
     if not wide < 1.0:
         return f"{what} not determined by these data."
     grade = "well" if wide < 0.1 else "weakly"
@@ -117,12 +117,12 @@ def _unseen(fit: "Fit") -> list[str]:
     out += [one.in_words for one in found[:SEVERAL]]
     if len(found) > SEVERAL:
         out.append(f"{len(found) - SEVERAL} more combinations of numbers are not determined.")
-    out.append("Intervals that depend on what is not determined are infinite.")
+    out.append("Intervals of quantities that depend on these are infinite.")
     return out
 
 
 def scale_is_unseen(fit: "Fit") -> bool:
-    """Whether some unseen direction is the body grown as a whole, all else at rest."""
+    """Whether an undetermined direction scales the whole body and changes nothing else."""
     flat, restore = ravel_pytree(fit.beside)
     null = np.asarray(fit.null_directions)
     if not len(null) or isinstance(fit.problem.body, Bodies):
@@ -141,7 +141,7 @@ def scale_is_unseen(fit: "Fit") -> bool:
 def correlations(fit: "Fit") -> list[str]:
     """Pairs of reported quantities whose errors are correlated (|ρ| > 0.95).
 
-    Of an inertia tensor its principal moments, not its components, which follow from them.
+    An inertia tensor enters by its principal moments, not by its components.
     """
     covariance = reported_covariance(fit)
     deviation = np.array([quantity.deviation for quantity in fit.quantities])

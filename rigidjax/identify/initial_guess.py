@@ -1,4 +1,4 @@
-"""Where a fit starts: a linear regression where the data allow it, and scattered points around."""
+"""The starts of a fit: a linear regression if the data allow it, and scattered points around it."""
 
 from typing import Any
 
@@ -22,20 +22,20 @@ from rigidjax.motion import Spin
 from rigidjax.motion.torques.base import Torque, evaluate
 from rigidjax.motion.torques.states import has_states
 
-# What each component of a tensor adds to it.
+# The basis of symmetric tensors.
 BASIS = np.zeros((6, 3, 3))
 for _k, (_i, _j) in enumerate(COMPONENTS):
     BASIS[_k, _i, _j] = BASIS[_k, _j, _i] = 1.0
 
 
 def starting_points(problem: Problem, count: int, key: PRNGKeyArray | None) -> list[Parameters]:
-    """`count` starting points, the most informed first.
+    """`count` starting points, the best informed first.
 
-    **Arguments:** `problem`; `count` ≥ 1; `key` a JAX random key, or `None`. The first body rate is
-    the first reading (or the turn between attitudes over its time). The inertia is the regression
-    on Euler's equations where it was sampled finely enough, else a sphere; further starts scatter
-    the shape over the whole chart and the rate by a tenth. What a `Free` moves starts as it is
-    given.
+    **Arguments:** `problem`; `count` ≥ 1; `key` a JAX random key, or `None`. The initial body rate
+    is the first reading (or the turn between attitudes over its time). The inertia comes from the
+    regression on Euler's equations if samples are close enough, else it is a sphere; further starts
+    scatter the shape over the whole chart and the rate by a tenth. A `Free` starts at its given
+    value.
     """
     recordings = padding.on_host(problem.records, problem.counts)
     if isinstance(problem.body, Bodies):
@@ -64,14 +64,15 @@ def starting_points(problem: Problem, count: int, key: PRNGKeyArray | None) -> l
 
 
 def regress_inertia(recordings: tuple[Recording, ...]) -> Inertia | None:
-    """The inertia that Euler's equations in integral form fit best; without torque up to scale.
+    """The inertia from a regression on Euler's equations in integral form; without torque up to
+    scale.
 
-    Between two samples `I ΔΩ + ∫ Ω × IΩ dt = ∫ τ dt` is linear in the six components of I: without
-    a torque, or with one that starts at nothing as a drag does, the smallest right singular vector
-    of all such rows is the answer, else (the torque at its starting values, along the measured
-    rates) the least squares solution. Then moved to the nearest second moment whose eigenvalues are
-    positive. `None` where there was no gyro and no attitude, they came too seldom, or the torque
-    needs more than a rate, or has states of its own.
+    Between two samples `I ΔΩ + ∫ Ω × IΩ dt = ∫ τ dt` is linear in the six components of I. The
+    answer is the smallest right singular vector of all such rows if there is no torque, or a torque
+    that starts at zero, such as a drag. Otherwise it is the least squares solution, with the torque
+    at its starting values along the measured rates. The answer is moved to the nearest second
+    moment with positive eigenvalues. It is `None` without a gyro or attitudes, if samples are too
+    far apart, or if the torque needs more than a rate or has states of its own.
     """
     found = []
     for recording in recordings:
@@ -92,8 +93,8 @@ def regress_inertia(recordings: tuple[Recording, ...]) -> Inertia | None:
 def tensor_and_margin(matrix: np.ndarray, side: np.ndarray) -> tuple[np.ndarray, float]:
     """The six components of I that rows (n, 6) fit best, and how real a body it is.
 
-    Above zero for a real one: the least eigenvalue of its second moment over the largest. Where the
-    right sides (n,) are zero, components whose trace is one.
+    The second result is the least eigenvalue of its second moment over the largest, above zero for
+    a real body. The trace of the components is one if the right sides (n,) are zero.
     """
     if np.abs(side).max() > 0:
         components = np.linalg.lstsq(matrix, side, rcond=None)[0]
@@ -107,7 +108,7 @@ def tensor_and_margin(matrix: np.ndarray, side: np.ndarray) -> tuple[np.ndarray,
 
 
 def _equations(recording: Recording) -> tuple[np.ndarray, ...] | None:
-    """As `balance`; `None` where rates came too seldom, or the torque needs more than a rate."""
+    """As `balance`; `None` if rates are too far apart, or the torque needs more than a rate."""
     t, w = _rates(recording)
     if t.size < 10 or np.median(np.diff(t)) * np.linalg.norm(w, axis=1).max() > 0.5:
         return None
@@ -140,7 +141,7 @@ def balance(recording: Recording, turn: np.ndarray) -> tuple[np.ndarray, np.ndar
     impulse = _integral(pushed[:, None, :], t)
 
     def about_the_mean(x: np.ndarray) -> np.ndarray:
-        # What is conserved is constant: compare with its mean over the record.
+        # A conserved momentum is constant: compare it with its mean over the record.
         some = (x - x.mean(axis=0))[:: max(1, t.size // 60)]
         return some.transpose(0, 2, 1).reshape(-1, x.shape[1])
 

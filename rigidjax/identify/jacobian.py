@@ -37,9 +37,9 @@ def filled(problem: "Problem", mine: Local, record: Recording) -> Recording:
 def states_of_one(
     problem: "Problem", mine: Local, record: Recording, ref: ReferenceStates, which: Array | None
 ) -> tuple[Recording, Any, Any, Any]:
-    """One recording with its values filled in, its body, its first state and its states.
+    """One recording with its values filled in, its body, its initial state and its states.
 
-    Under a law with states of its own these are `Coupled`.
+    The states are `Coupled` if a torque has states of its own.
     """
     record = filled(problem, mine, record)
     body = matter(problem.body, mine.body, which)
@@ -54,8 +54,8 @@ def errors_of_one(
 ) -> tuple[tuple[Array, ...], Any]:
     """The errors (T, k) of each sensor in one recording, and the last state.
 
-    **Arguments:** `mine` the numbers it depends on; `record`, `ref`; `which` the index of its body
-    among several.
+    **Arguments:** `mine` the numbers that it depends on; `record`, `ref`; `which` the index of its
+    body among several.
     """
     record, body, state0, states = states_of_one(problem, mine, record, ref, which)
     out = []
@@ -71,7 +71,7 @@ def errors_of_one(
         if lowpass is None:
             errors = jax.vmap(error)(times, seen, reading.values)
         else:
-            # The error of a reading of zero is what the sensor shows, but for its sign.
+            # The error of a zero reading is the prediction with the opposite sign.
             shown = jax.vmap(error)(times, seen, jnp.zeros_like(reading.values))
             errors = reading.values + lowpass(times, shown)
         out.append(jnp.where(reading.mask[:, None], errors, 0.0))
@@ -79,7 +79,7 @@ def errors_of_one(
 
 
 def _error_of(sensor: Any, now: SensorInput, value: Array) -> Array:
-    """What a sensor's `error` returns, looked at: a user may have written it."""
+    """The checked result of a sensor's `error`, which a user may have written."""
     name = type(sensor).__name__
     try:
         found = sensor.error(now, value)
@@ -87,8 +87,8 @@ def _error_of(sensor: Any, now: SensorInput, value: Array) -> Array:
         if type(now.state).__name__ not in str(wrong):
             raise
         raise TypeError(
-            f"{name}.error: {wrong}; it says feels = {sensor.feels.__name__}, and what it looks at "
-            "needs more: say feels = rj.motion.HasAttitude, or rj.motion.HasPose"
+            f"{name}.error: {wrong}; it has feels = {sensor.feels.__name__}, but it reads more "
+            "than that: set feels = rj.motion.HasAttitude, or rj.motion.HasPose"
         ) from wrong
     wanted = (sensor.components,)
     if jnp.shape(found) != wanted:
@@ -102,13 +102,13 @@ def _error_of(sensor: Any, now: SensorInput, value: Array) -> Array:
 def over_records(function: Any, problem: "Problem", mine: Any) -> Any:
     """`function(mine, record, reference, which)` of every recording.
 
-    On a CPU one after another: XLA makes one kernel of a loop over a few dozen numbers, but not of
-    the same for many recordings, which compiles twice as long and runs longer. Batches of one, for
-    within another loop scalars make it half as fast.
+    On a CPU recordings run one after another: XLA makes one kernel of a loop over a few dozen
+    numbers. For many recordings at once it does not; that compiles twice as long and runs longer.
+    Batches have size one, since scalars within another loop run at half the speed.
     """
     trees = mine, problem.records, problem.reference, problem.which
     if problem.count == 1:
-        # Without the loop around it compiles to less.
+        # Without the outer loop it compiles to a smaller program.
         out = function(*(padding.one(tree, 0) for tree in trees))
         return jax.tree.map(lambda leaf: leaf[None], out)
     if jax.default_backend() == "cpu":
@@ -120,8 +120,8 @@ def over_records(function: Any, problem: "Problem", mine: Any) -> Any:
 def all_errors(parameters: Parameters, problem: "Problem") -> tuple[tuple[Array, ...], Any]:
     """The errors (R, T, k) of each sensor, and the last states (R, …).
 
-    Its derivative is taken recording by recording: each has a block for the numbers that it depends
-    on, and no zeros are carried through the motion.
+    Its derivative is computed recording by recording: each has a block for the numbers that it
+    depends on, and no zeros pass through the motion.
     """
 
     def of_one(*trees: Any) -> Any:
@@ -169,7 +169,7 @@ def normal_matrix(blocks: Sequence[Array], where: Array, size: int) -> Array:
 def with_blocks(parameters: Parameters, problem: "Problem") -> tuple[Any, Any]:
     """The errors and last states, and their derivatives (…, n) in what each recording depends on.
 
-    `places` says which of the flattened parameters each of the n columns is for.
+    `places` gives the flattened parameter of each of the n columns.
     """
     mine = local(problem, parameters)
     single = padding.one(mine, 0)

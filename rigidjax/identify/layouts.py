@@ -1,4 +1,4 @@
-"""Logs whose columns are known by their program: phyphox, Blackbox."""
+"""Logs with the column names of a known program: phyphox, Blackbox."""
 
 import csv
 import re
@@ -22,10 +22,10 @@ USUAL = Layout(("t", "wx", "wy", "wz"), "rad/s", "s")
 
 
 def layout_of(path: str | Path) -> Layout:
-    """The layout of a log: that of phyphox or Blackbox where it is one, else `USUAL`.
+    """The layout of a log: phyphox or Blackbox if the names match, else `USUAL`.
 
     phyphox writes `Time (s)` and three columns such as `Gyroscope x (rad/s)`, in the language of
-    the phone. Nothing is raised: what is wrong with a file is said where it is read.
+    the phone. It raises nothing: errors of a file are raised when it is read.
     """
     path = Path(path)
     if path.suffix.lower() in blackbox.SUFFIXES:
@@ -44,9 +44,7 @@ def layout_of(path: str | Path) -> Layout:
 
 
 class Header(NamedTuple):
-    """The names of the columns; what separates them; in which line they are; the lines that were
-    read after it.
-    """
+    """Column names; their separator; the number of their line; the lines read after it."""
 
     names: list[str]
     separator: str
@@ -57,7 +55,7 @@ class Header(NamedTuple):
 def read_header(file: TextIO) -> Header:
     """The header of a text, read from its beginning: the first line, below comments (`#`).
 
-    It may be the last of the comments, as `numpy.savetxt` writes it: then numbers follow.
+    It may be the last comment, as `numpy.savetxt` writes it: then numbers follow.
     """
     comments, first, line = "", file.readline(_LONGEST), 1
     while first.startswith("#") or (first and not first.strip()):

@@ -22,18 +22,18 @@ from rigidjax.identify.several_bodies import charts_of
 # Damping is in units of the diagonal of the normal equations (Marquardt's): one is a step half as
 # long as Gauss and Newton's.
 CAREFUL, BOLD = 1.0, 1e-3
-# Numbers of order one by their making go no further than this in a step.
+# Numbers scaled to order one go no further than this in a step.
 LONGEST = 2.0
-# A step this little damped is one of Gauss and Newton.
+# A step with damping below this counts as one of Gauss and Newton.
 FREE = 1e-2
-# The least ratio of what a step gained to what it was to gain that speaks for its model.
+# The least ratio of actual to predicted gain of a step that supports its model.
 FAIR = 0.25
-# How near one the ratio of what a step gained to what it was to gain is where a problem is linear.
+# A problem counts as linear if the ratio of actual to predicted gain is so near to one.
 LINEAR = 0.05
 # Steps that a search may still be away from where another one ended; its pace is by how much the
 # logarithm of the misfit falls in a step, of the last ones half as much each as the one after it.
 PATIENCE, FIRST_PACE = 25.0, 4.0
-# Samples beyond the last that counts: a low-pass filter looks ahead of it.
+# Samples after the last one with weight: a low-pass filter looks ahead.
 _BEYOND = 2
 # Damping beyond which nothing moves.
 STUCK = 1e12
@@ -45,14 +45,14 @@ def _float(value: Any) -> np.ndarray:
 
 
 class Settings(eqx.Module):
-    """How a search goes: arrays, so as not to compile again.
+    """The settings of a search: arrays, so as not to compile again.
 
-    **Fields:** `tolerance` steps of so many standard deviations (of each parameter with all others
-    at rest) end it; `damping` at the start; `steps` how many at most; `aim` a misfit that was
-    reached elsewhere: the search ends where at its pace it would take more than `PATIENCE` steps
-    to come there; 0 for none; `level` a step about as good as hoped whose gain is less than this
-    part of what noise alone lets a fit gain (see `search`) ends it, too; `near` a misfit that is
-    low enough to end at; 0 for none.
+    **Fields:** `tolerance`: steps of so many standard deviations (of each parameter with all others
+    fixed) end it; `damping` at the start; `steps` at most; `aim` a misfit reached by another
+    search: this one ends if it would need more than `PATIENCE` steps at its pace to reach it; 0 for
+    none; `level`: a step with about the predicted gain also ends it, if that gain is less than this
+    part of the gain that a fit has from noise alone (see `search`); `near` a misfit that is low
+    enough to end at; 0 for none.
     """
 
     tolerance: Any = eqx.field(converter=_float)
@@ -64,13 +64,13 @@ class Settings(eqx.Module):
 
 
 class Search(eqx.Module):
-    """Where a search stands.
+    """The state of a search.
 
     **Fields:** `first` the cost at the start; `point` (n,) the best so far, its `cost`, the normal
-    matrix `gram` (n, n) and the gradient `slope` (n,) there; `trial` (n,) what is to be tried next,
-    `hoped` how much lower it ought to be; `damping`; `pace` by how much the logarithm of the cost
-    falls in a step; `taken` evaluations; `done`, `converged`; `found` what the last evaluation gave
-    (see `with_blocks`), `here` whether that was at `point`.
+    matrix `gram` (n, n) and the gradient `slope` (n,) there; `trial` (n,) the next point, `hoped`
+    its predicted gain; `damping`; `pace` the decrease of the logarithm of the cost in a step;
+    `taken` evaluations; `done`, `converged`; `found` the result of the last evaluation (see
+    `with_blocks`), `here` whether that was at `point`.
     """
 
     first: Float[Array, ""]
@@ -125,7 +125,7 @@ def descend(
 
 
 def _bends(problem: Problem, numbers: Array, slope: Float[Array, " n"]) -> Array:
-    """What the bends of the charts of bodies add to the Jacobian (m, n)."""
+    """The rows (m, n) of the Jacobian from the curvature of the charts of bodies."""
     out, first = [jnp.zeros((0, slope.size), slope.dtype)], 0
     for chart in charts_of(problem.body):
         mine = slice(first, first + chart.size)
@@ -136,7 +136,7 @@ def _bends(problem: Problem, numbers: Array, slope: Float[Array, " n"]) -> Array
 
 
 def _as_far_as(problem: Problem, weights: Float[Array, "records times"]) -> Problem:
-    """The problem, its motion followed no further than to the last time that counts."""
+    """The problem, with its motion followed to the last time with weight."""
     steps = problem.integrator
     if not isinstance(steps, FixedSteps) or problem.links is not None:
         return problem
@@ -156,15 +156,15 @@ def search(
 ) -> Search:
     """At most `settings.steps` steps down from `start`; with none, `start` is evaluated.
 
-    **Arguments:** `evaluated` point (n,) → whatever is to be kept of the last evaluation, the cost,
-    the normal matrix (n, n), the gradient (n,): half a sum of squares, or minus a log-density with
-    Fisher's information in the place of the normal matrix (scoring); `made` (n,) one for the
-    numbers that are of order one by their making, which no step moves far, else zero; `nothing`
-    zeros of the shapes of what is to be kept; `by_noise` what was kept, the normal matrix → by how
-    much the cost at the truth is expected to be above the least, for `settings.level`.
+    **Arguments:** `evaluated` point (n,) → values to keep from the last evaluation, the cost, the
+    normal matrix (n, n), the gradient (n,): half a sum of squares, or minus a log-density with
+    Fisher's information as the normal matrix (scoring); `made` (n,) one for numbers scaled to order
+    one, which no step moves far, else zero; `nothing` zeros of the shapes of the kept values;
+    `by_noise` the kept values, the normal matrix → the expected excess of the cost at the true
+    numbers over the least, for `settings.level`.
 
-    Source: Marquardt 1963, doi:10.1137/0111030; the damping by the ratio of what a step gained to
-    what it was to gain, Madsen, Nielsen and Tingleff 2004, Methods for non-linear least squares
+    Source: Marquardt 1963, doi:10.1137/0111030; the damping by the ratio of actual to predicted
+    gain, Madsen, Nielsen and Tingleff 2004, Methods for non-linear least squares
     problems, section 3.2.
     """
     number, kind = start.size, start.dtype
@@ -199,14 +199,14 @@ def _after(
     settings: Settings,
     by_noise: Callable[[Any, Array], Array] | None,
 ) -> Search:
-    """Where the search stands after an evaluation of what was to be tried, and what comes next."""
+    """The state of the search after an evaluation of the trial point, with the next trial."""
     found, cost, gram, slope = trial
     finite = jnp.isfinite(cost) & jnp.isfinite(slope).all() & jnp.isfinite(gram).all()
     first = now.taken == 0
     better = finite & ((cost < now.cost) | first)
     ratio = (now.cost - cost) / jnp.where(now.hoped > 0, now.hoped, 1.0)
     grown = jnp.where(ratio > 0.75, 0.1, jnp.where(ratio > FAIR, 0.5, 2.0))
-    # Where the misfit falls as the linear problem's does, damping only makes steps short.
+    # Damping only makes steps short if the misfit falls as that of the linear problem.
     linear = (jnp.abs(ratio - 1.0) < LINEAR) & (now.damping > FREE)
     grown = jnp.where(linear, 0.01, grown)
     damping = now.damping * jnp.where(first, 1.0, jnp.where(better, grown, 8.0))
@@ -226,7 +226,7 @@ def _after(
     move = jnp.where(sound, move, 0.0)
     hoped = -(slope @ move) - 0.5 * move @ (gram @ move)
     small = (jnp.max(jnp.abs(move) * root) < settings.tolerance) & (damping <= FREE)
-    # At the very bottom round-off refuses every step.
+    # Round-off refuses every step at the minimum itself.
     bottom = hoped <= 1e-14 * jnp.abs(cost)
     ended = small if by_noise is None else small | level
     converged = sound & (ended | (bottom & ~better & ~first))
@@ -283,7 +283,7 @@ def _nothing(problem: Problem, start: Parameters, columns: int, kind: Any) -> An
 
 
 def made_of(parameters: Parameters) -> Float[Array, " n"]:
-    """One for the numbers that are of order one by their making, zero for those of a `Free`.
+    """One for the numbers scaled to order one, zero for the numbers of a `Free`.
 
     The unit of a `Free` is a user's guess. The scale of the others is at most one, so that a
     weakly observed number takes no large steps.

@@ -1,4 +1,4 @@
-"""How much an outlier counts."""
+"""Losses: the weight of an outlier."""
 
 import abc
 from typing import Any
@@ -28,7 +28,7 @@ class AbstractLoss(eqx.Module):
 
     @abc.abstractmethod
     def shrink(self, error: Float[Array, " k"]) -> Float[Array, " k"]:
-        """The error scaled so that its square is ρ(s): what least squares then minimises."""
+        """The error scaled so that its square is ρ(s), for least squares."""
 
     @abc.abstractmethod
     def weight(self, error: Float[Array, " k"]) -> Scalar:

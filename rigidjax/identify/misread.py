@@ -1,4 +1,4 @@
-"""Rates with another unit, sign or order of axes: what attitudes or Euler's equations say of it."""
+"""Rates with a wrong unit, sign or order of axes: a test by attitudes or Euler's equations."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -14,13 +14,13 @@ from rigidjax.identify.recording import Recording, readings_of
 from rigidjax.identify.sensors import Gyro
 from rigidjax.motion.torques.states import has_states
 
-# Other rates must leave less than this share of what is left as they are, and of all.
+# Corrected rates must leave less than this share of the error as read, and of the whole signal.
 BETTER, LITTLE = 0.5, 0.3
 # As good as the best: these records cannot tell them apart.
 EQUAL = 1.1
 _SAME = np.eye(3)
 
-# What may have been done to rates, and the matrix that undoes it.
+# Mistakes in rates, and the matrix that corrects each.
 RATES = {
     "deg/s read as rad/s": _SAME * np.pi / 180,
     "rad/s read as deg/s": _SAME * 180 / np.pi,
@@ -41,11 +41,11 @@ ATTITUDES = {
 
 
 def misread(recordings: Sequence[Recording]) -> Cause | None:
-    """What the rates of one body were taken for and are not, if anything.
+    """The mistake in reading the rates of one body, if there is one.
 
-    With attitudes the rates are compared with those that attitudes turn by; else with Euler's
-    equations, integrated over the record, for the body that fits them best: rates count only where
-    that is a real one. Without a torque a mirrored axis leaves no trace.
+    The rates are compared with the rates between attitudes. Without attitudes they are compared
+    with Euler's equations, integrated over the record, for the best body: a correction counts only
+    if that is a real body. A mirrored axis cannot be detected without a torque.
     """
     gyros = readings_of(recordings[0], Gyro)
     if not gyros or not _as_the_body(gyros[0].sensor):
@@ -59,12 +59,12 @@ def misread(recordings: Sequence[Recording]) -> Cause | None:
             found[name] = _of_attitudes(recordings, changed, _SAME)
     elif all(_of_rates(recording.torque) for recording in recordings):
         bound, margin = _of_euler(recordings, _SAME)
-        # Errors of the sensor alone can make a body one that is none.
+        # Sensor errors alone can give numbers of no real body.
         bound *= BETTER if margin > -0.8 else EQUAL
         tried = {name: _of_euler(recordings, turn) for name, turn in RATES.items()}
         if recordings[0].torque is not None:
             tried["the torque with the other sign"] = _of_euler(recordings, _SAME, -1.0)
-        # Of a ball any rates are free ones.
+        # Any rates are a free motion of a ball.
         found = {name: left if -0.01 < m < 0.8 else np.inf for name, (left, m) in tried.items()}
     else:
         return None
@@ -76,20 +76,20 @@ def misread(recordings: Sequence[Recording]) -> Cause | None:
 
 
 def _as_the_body(gyro: Gyro) -> bool:
-    """Whether a gyro's axes and scales are said to be about those of the body."""
+    """Whether a gyro's given axes and scales are close to those of the body."""
     turn, scale = (np.asarray(0.0 if x is None else x) for x in (gyro.mounting, gyro.scale))
     return bool(np.abs(turn).max() < 0.1 and (gyro.scale is None or np.abs(scale - 1).max() < 0.1))
 
 
 def _of_rates(torque: Any) -> bool:
-    """Whether a torque is none, or a function of time and rate alone."""
+    """Whether there is no torque, or it depends on time and rate alone."""
     return torque is None or (getattr(torque, "feels", None) is HasSpin and not has_states(torque))
 
 
 def _of_euler(
     recordings: Sequence[Recording], turn: np.ndarray, sign: float = 1.0
 ) -> tuple[float, float]:
-    """What Euler's equations leave of the momentum, and by how much the best body is one."""
+    """The residual of Euler's equations, and the margin by which the best body is real."""
     found = [balance(recording, turn) for recording in recordings]
     matrix, side, momentum = (np.concatenate(part) for part in zip(*found, strict=True))
     components, margin = tensor_and_margin(matrix, sign * side)
@@ -98,7 +98,7 @@ def _of_euler(
 
 
 def _of_attitudes(recordings: Sequence[Recording], known: Sequence[Any], turn: np.ndarray) -> float:
-    """How far rates are from those of attitudes, over the size of those."""
+    """The relative difference of rates from the rates between attitudes."""
     left, size = 0.0, 1e-300
     for recording, (t, q) in zip(recordings, known, strict=True):
         when, wanted = rates_of(t, jnp.asarray(q))

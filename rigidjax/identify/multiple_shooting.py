@@ -1,4 +1,4 @@
-"""Multiple shooting: a long or chaotic recording as pieces whose ends must meet."""
+"""Multiple shooting: a long or chaotic recording in pieces with joined ends."""
 
 import itertools
 
@@ -15,21 +15,21 @@ from rigidjax.identify.recording import Reading, Recording
 from rigidjax.identify.several_bodies import Bodies
 from rigidjax.motion.torques.states import has_states
 
-# How wide the gaps may be, in turn: first the pieces are nearly free, at the end they are one.
+# The widths of the gaps, in turn: first the pieces are nearly free, at the end they are joined.
 WIDTHS = (1.0, 1e-1, 1e-2, 1e-3)
 
 
 def pieces(problem: Problem, count: int, *, width: float = WIDTHS[-1]) -> Problem:
-    """The problem with its recording cut into pieces, each with a first state of its own.
+    """The problem with its recording cut into pieces, each with its own initial state.
 
-    Where errors grow along the record, the misfit of one first state has many local minima and very
-    large derivatives; over a short piece it has not. The end of each piece is held to
-    the start of the next as a reading of standard deviation `width` would.
+    The misfit of one initial state has many local minima and very large derivatives if errors grow
+    along the record; over a short piece it has not. The end of each piece is held to the start of
+    the next by a residual of standard deviation `width`.
 
     **Arguments:** `problem` with one recording; `count` ≥ 2 pieces of about as many samples each;
     `width` of the gaps, in typical rates and rad. **Returns** a problem with `count` recordings:
     `fit` takes it like any other (its `state0` then has a leading axis); or call
-    `fit(problem, pieces=count)`, which goes on to one first state.
+    `fit(problem, pieces=count)`, which then fits one initial state.
 
     Source: Bock 1983, doi:10.1007/978-1-4684-7324-7_8.
 
@@ -62,7 +62,7 @@ def pieces(problem: Problem, count: int, *, width: float = WIDTHS[-1]) -> Proble
     ]
     chart = problem.body.charts[0] if isinstance(problem.body, Bodies) else problem.body
     cut = Problem(parts, chart, loss=problem.loss, prior=problem.prior)
-    # One rate for all, so that a gap is the same number at every joint.
+    # One typical rate for all pieces, so that a gap has the same unit at every joint.
     rate = jnp.broadcast_to(problem.reference.rate[0], (count,))
     slots = tuple(slot.alone() for slot in problem.slots)
     links = Links(jnp.ones(count).at[-1].set(0.0), jnp.asarray(float(width)))
@@ -81,7 +81,7 @@ def with_width(problem: Problem, width: float) -> Problem:
 
 
 def joined(problem: Problem, cut: Problem, found: Parameters) -> Parameters:
-    """The parameters of the uncut problem that the pieces point to: the first piece's."""
+    """The parameters of the uncut problem, taken from the first piece."""
     first = padding.one(found.own, 0)
     spin = first.spin * cut.reference.rate[0] / problem.reference.rate[0]
     whole = problem.start()
@@ -101,7 +101,7 @@ def joined(problem: Problem, cut: Problem, found: Parameters) -> Parameters:
 
 
 def _piece(record: Recording, first: int, last: int, ends: bool) -> Recording:
-    """Samples `first` to `last`; the last only as a time, where the next piece reads it."""
+    """Samples `first` to `last`; the last is only a time: the next piece has its readings."""
     rows = slice(first, last + 1)
     readings = []
     for reading in record.readings:

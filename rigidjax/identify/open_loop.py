@@ -28,10 +28,10 @@ def open_loop_errors(
     inputs: Any,
     steps: Any = None,
 ) -> Float[Array, "steps n"]:
-    """The errors of one window, as changes from what was measured.
+    """The errors of one window, as changes from the measured states.
 
-    Of the first `steps` of the window alone, where given (a traced number: no reverse mode); the
-    others are zero.
+    With `steps` given (a traced number: no reverse mode), only the first `steps` of the window
+    count; the others are zero.
     """
     body, law = scene(value)
     size, length = jnp.asarray(h, wanted.omega.dtype), wanted.omega.shape[0]
@@ -45,7 +45,7 @@ def open_loop_errors(
         return y, motion_of(stepper.state(y))
 
     def ahead(y: Any, i: Array) -> tuple[Any, None]:
-        # The law's own states follow the inputs; the body stays as it was measured.
+        # The torque's own states follow the inputs; the body keeps its measured state.
         y = step(stepper, size, jnp.zeros_like(size), i, y, inputs, before)
         return split(Coupled(start.motion, stepper.state(y).own)), None
 

@@ -1,4 +1,4 @@
-"""Several recordings of one body as one tree with a leading axis, so that one program fits all."""
+"""Several recordings of one body as one tree with a leading axis, so that one program fits them."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -14,10 +14,10 @@ from rigidjax.motion.torques import Linear, Series
 
 
 def stack(recordings: Sequence[Recording]) -> tuple[Recording, tuple[int, ...]]:
-    """One recording with a leading axis, and how many times each of them had.
+    """One recording with a leading axis, and the number of times of each original one.
 
     The shorter ones are continued with masked readings at their last time, tables of time with
-    their last value. **Raises** `ValueError` where sensors or torques differ in kind.
+    their last value. **Raises** `ValueError` if sensors or torques differ in kind.
     """
     counts = tuple(int(r.t.shape[0]) for r in recordings)
     longest = max(counts)
@@ -28,14 +28,14 @@ def stack(recordings: Sequence[Recording]) -> tuple[Recording, tuple[int, ...]]:
         if jax.tree.structure(other) != first or _shapes(other) != _shapes(alike[0]):
             raise ValueError(
                 f"recordings: the one at index {index} differs from the first in its sensors or "
-                "its torque; give all of them the same kinds in the same order, with the same "
+                "its torque; give all recordings the same kinds in the same order, with the same "
                 "options"
             )
     return jax.tree.map(_stacked, *alike), counts
 
 
 def _stacked(*leaves: Any) -> Any:
-    # By NumPy where the numbers are known: JAX compiles a program for each shape.
+    # By NumPy if the numbers are known: JAX compiles a program for each shape.
     if _checks.known(leaves):
         return jnp.asarray(np.stack([np.asarray(leaf) for leaf in leaves]))
     return jnp.stack(leaves)
@@ -53,7 +53,7 @@ def one(records: Any, index: int) -> Any:
 
 
 def on_host(records: Recording, counts: Sequence[int]) -> tuple[Recording, ...]:
-    """The recordings one by one, of NumPy's arrays: to be looked at, at no cost of JAX's."""
+    """The recordings one by one, in NumPy's arrays, so that no JAX operation is needed."""
     known = jax.tree.map(lambda leaf: np.asarray(leaf) if eqx.is_array(leaf) else leaf, records)
 
     def pick(leaf: Any, index: int) -> Any:
@@ -66,7 +66,7 @@ def on_host(records: Recording, counts: Sequence[int]) -> tuple[Recording, ...]:
 
 
 def cut(recording: Recording, count: int) -> Recording:
-    """A recording without what `stack` appended."""
+    """A recording without the rows that `stack` appended."""
     if recording.t.shape[0] == count:
         return recording
 
@@ -85,7 +85,7 @@ def _is_table(node: Any) -> bool:
 
 
 def _tabled(recording: Recording) -> Any:
-    """What may hold tables of time: the torque, and sensors that look at what moves."""
+    """The parts that may hold tables of time: the torque, and sensors that read a moving object."""
     return recording.torque, recording.sensors
 
 

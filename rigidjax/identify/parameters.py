@@ -1,4 +1,4 @@
-"""The free numbers of a fit, those that one recording depends on, and where each of them is."""
+"""The free numbers of a fit, the numbers of one recording among them, and their places."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -19,11 +19,11 @@ if TYPE_CHECKING:
 class Own(eqx.Module):
     """The free numbers that belong to one recording, of order one.
 
-    **Fields:** `place`, `speed` (3,) the first position and velocity from the reference, in typical
-    lengths and speeds, or `None` where nothing depends on them; `turn` (3,) the rotation vector
-    from the reference attitude to the first one (body frame, rad), or `None`; `spin` (3,) the first
-    body rate over the typical rate; `each` the steps of the `Free`s with one value for each
-    recording, and the deviations of those with a `spread`.
+    **Fields:** `place`, `speed` (3,) the initial position and velocity from the reference, in
+    typical lengths and speeds, or `None` if nothing depends on them; `turn` (3,) the rotation
+    vector from the reference attitude to the initial one (body frame, rad), or `None`; `spin` (3,)
+    the initial body rate over the typical rate; `each` the steps of the `Free`s with one value for
+    each recording, and the deviations of those with a `spread`.
 
     >>> import rigidjax as rj
     >>> record = rj.identify.Recording([0.0, 1.0], (rj.identify.Gyro(), [[1.0, 0, 0]] * 2))
@@ -44,8 +44,8 @@ class Parameters(eqx.Module):
     """The free numbers of a fit, all unconstrained and of order one.
 
     **Fields:** `body` the chart's numbers, of several bodies one after another; `shared` the steps
-    of the `Free`s with one value for all, or (groups, …) for one in each group; `own` what belongs
-    to each recording, with a leading axis.
+    of the `Free`s with one value for all, or (groups, …) for one in each group; `own` the numbers
+    of each recording, with a leading axis.
 
     >>> import rigidjax as rj
     >>> record = rj.identify.Recording([0.0, 1.0], (rj.identify.Gyro(), [[1.0, 0, 0]] * 2))
@@ -61,7 +61,7 @@ class Parameters(eqx.Module):
 
 
 class Unpacked(eqx.Module):
-    """What the free numbers of a fit or a posterior density stand for.
+    """The quantities that the free numbers of a fit or a posterior density represent.
 
     **Fields:** `parameters` of the problem; `body`, of several bodies a dict by name, and `state0`,
     of several recordings with a leading axis, as `Problem.unpack` gives them; `values` of the
@@ -102,13 +102,13 @@ class Local(eqx.Module):
 
 
 def firsts(own: Own | Local) -> list[Any]:
-    """The first state's numbers, those that there are, in the order of a change of a state."""
+    """The numbers of the initial state in use, in the order of a change of a state."""
     parts = (own.place, own.speed, own.turn, own.spin)
     return [part for part in parts if part is not None]
 
 
 def local(problem: "Problem", parameters: Parameters) -> Local:
-    """What each recording depends on, with a leading axis over recordings."""
+    """The numbers that each recording depends on, with a leading axis over recordings."""
     own, steps = parameters.own, []
     for slot, shared, each in by_slot(problem, parameters):
         if shared is None:
@@ -121,7 +121,7 @@ def local(problem: "Problem", parameters: Parameters) -> Local:
 
 
 def by_slot(problem: "Problem", parameters: Parameters) -> list[tuple["Slot", Any, Any]]:
-    """With each `Free` its shared number and those of the recordings; `None` for what it lacks."""
+    """Each `Free` with its shared number and the recordings' own numbers; `None` if it has none."""
     of_all, of_each = iter(parameters.shared), iter(parameters.own.each)
     return [
         (
@@ -134,16 +134,16 @@ def by_slot(problem: "Problem", parameters: Parameters) -> list[tuple["Slot", An
 
 
 def _of_each(slot: "Slot", shared: Array, count: int) -> Array:
-    """A shared number as each recording has it, (R, …)."""
+    """A shared number repeated for each recording, (R, …)."""
     if slot.groups is not None:
         return shared[slot.groups]
     return jnp.broadcast_to(shared, (count, *shared.shape))
 
 
 def columns(problem: "Problem", one: Local) -> np.ndarray:
-    """Which of a recording's numbers each column of its block is for.
+    """The recording's number that belongs to each column of its block.
 
-    All in order; then once more those that are a shared value and a deviation.
+    All numbers in order; then again the numbers made of a shared value and a deviation.
     """
     counted = numbered(one)
     twice = [
@@ -156,7 +156,7 @@ def columns(problem: "Problem", one: Local) -> np.ndarray:
 
 
 def places(problem: "Problem", parameters: Parameters) -> Int[Array, "records columns"]:
-    """Where in the flattened parameters the number of each column is; n for those of no number."""
+    """Each column's place in the flattened parameters; n for a column of no number."""
     count, size = problem.count, ravel_pytree(parameters)[0].size
     counted = numbered(parameters)
     parts, deviations = [], []

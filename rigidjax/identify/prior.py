@@ -1,4 +1,4 @@
-"""A prior around a body that is roughly known, the same in every frame and unit."""
+"""A prior around a roughly known body, the same in every frame and unit."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -16,16 +16,16 @@ def _weight(value: float) -> Scalar:
 class Entropic(eqx.Module):
     """The entropic prior `w D(body, guess)`, D the log-determinant divergence of two bodies.
 
-    D is `rigidjax.body.divergence` for a `Mass` chart, and the same of 𝔖 alone for an inertia; with
-    a chart that has no scale, of the shapes. With weight w the fit holds the body to the guess as
-    w/2 readings drawn from it would. Written as a sum of squares, so that least squares takes it:
-    with `L₀⁻¹ J L₀⁻ᵀ = C Cᵀ`, `D = Σ_{i>j} c_ij² + Σ_i (c_ii² − 1 − 2 log c_ii)`.
+    D is `rigidjax.body.divergence` for a `Mass` chart, the same of 𝔖 alone for an inertia, and of
+    the shapes for a chart without a scale. A weight w has the effect of w/2 readings drawn from the
+    guess. It is a sum of squares, for least squares: with `L₀⁻¹ J L₀⁻ᵀ = C Cᵀ`,
+    `D = Σ_{i>j} c_ij² + Σ_i (c_ii² − 1 − 2 log c_ii)`.
 
     **Arguments:** `guess` an `Inertia`, or `MassProperties` for a `Mass` chart; `weight` w > 0.
 
     Source: Lee, Wensing and Park 2020, doi:10.1109/TRO.2019.2926491 (the divergence).
 
-    **Raises:** `TypeError`, `ValueError` for arguments of another kind.
+    **Raises:** `TypeError`, `ValueError` for arguments of another type or shape.
 
     >>> import rigidjax as rj
     >>> body = rj.Inertia.from_principal(1.0, 2.0, 2.5)

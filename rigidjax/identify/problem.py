@@ -1,4 +1,4 @@
-"""What is known, what is free, and how far a guess is from the data."""
+"""A problem: the known and the free numbers, and the errors of a guess."""
 
 import operator
 from collections.abc import Mapping, Sequence
@@ -37,36 +37,36 @@ from rigidjax.motion.torques.base import AbstractForce, Torque, require_law
 
 
 class Problem(eqx.Module):
-    """A recording or several of one body, and what of the motion behind them is free.
+    """A recording or several of one body, and the free numbers of their motion.
 
     **Arguments:**
 
     - `recording`: one `Recording`, or a sequence of them with the same sensors: each has its own
-      first state, all share the body.
+      initial state, all share the body.
     - `body`: the chart of the body: `Ratios()` (the full tensor up to scale), `PrincipalRatios()`
       (body axes known to be principal), `Tensor()`, `Principal()` (with the scale), `Mass(guess)`
-      (all ten numbers), `Known(body)`.
-      Of several bodies: recordings and charts by the bodies' names, as in
+      (all ten numbers), `Known(body)`. For several bodies give recordings and charts by the bodies'
+      names, as in
       `Problem({"proof": [a, b], "box": [c]}, {"proof": Known(body), "box": Tensor(1e-3)})`.
     - `free`: what else is free, a sequence of `Free(where, name, …)`: one value for all, for each
       body, group or recording.
-    - `torque`: what turns the body besides its own spin, for the recordings that have none.
-    - `loss`: how an outlier counts: `SoftL1()`, `Huber()`, or `None` for plain least squares.
-    - `prior`: `Entropic(guess, weight)`, a prior around a body that is roughly known, or `None`.
+    - `torque`: the torque on the body, for the recordings that have none of their own.
+    - `loss`: the weight of an outlier: `SoftL1()`, `Huber()`, or `None` for plain least squares.
+    - `prior`: `Entropic(guess, weight)`, a prior around a roughly known body, or `None`.
     - `integrator`: `FixedSteps(n)` or `Adaptive(rtol, atol)` for a forced motion; `None` chooses by
-      how finely it was sampled. `Adaptive()` is quicker where the torque is smooth and the body
-      turns by 0.1 rad or more between readings, and slow where the torque reads a noisy log. A free
-      body is followed by the closed form.
-    - `noise_each`: where a sensor's noise is estimated, one figure for all recordings (`False`),
-      for each (`True`), for each body (`"body"`), or for those of the same label (a sequence).
+      the sampling. `Adaptive()` is quicker if the torque is smooth and the body turns by 0.1 rad or
+      more between readings, and slow if the torque reads a noisy log. A free body is followed by
+      the closed form.
+    - `noise_each`: an estimated noise is one figure for all recordings (`False`), for each
+      (`True`), for each body (`"body"`), or for recordings with the same label (a sequence).
 
-    Channels that were cut off at full scale are found, and their readings there count as "at least
-    that much", as with a sensor's `limit`.
+    The problem finds channels that were cut off at full scale; their readings there count as "at
+    least that much", as with a sensor's `limit`.
 
-    The motion starts at the first time of each recording. Its state is the lowest that sensors
-    and torque can do with: `Spin`, `Attitude`, `Rigid`.
+    The motion starts at the first time of each recording. Its state is the smallest that sensors
+    and torque need: `Spin`, `Attitude`, `Rigid`.
 
-    **Raises:** `TypeError` for arguments of another kind; `ValueError` where they do not fit.
+    **Raises:** `TypeError` for arguments of another type; `ValueError` if they do not fit together.
 
     >>> import rigidjax as rj
     >>> record = rj.identify.Recording([0.0, 1.0], (rj.identify.Gyro(), [[1.0, 0, 0]] * 2))
@@ -104,7 +104,7 @@ class Problem(eqx.Module):
         _are_recordings(recordings)
         for one in charts_of(chart):
             known = isinstance(one, Inertia | MassProperties)
-            hint = "a body that is known is Known(body)" if known else ""
+            hint = "give a known body as Known(body)" if known else ""
             hint = "was () forgotten?" if isinstance(one, type) else hint
             wanted = "what of the body is free, such as Ratios() or PrincipalRatios()"
             _checks.instance(one, AbstractBodyChart, "Problem", wanted=wanted, hint=hint)
@@ -150,7 +150,7 @@ class Problem(eqx.Module):
 
     @property
     def count(self) -> int:
-        """How many recordings there are."""
+        """The number of recordings."""
         return int(self.records.t.shape[0])
 
     @property
@@ -168,7 +168,7 @@ class Problem(eqx.Module):
 
     @property
     def torque(self) -> Torque | None:
-        """What turns the body besides its own spin, with a leading axis over recordings."""
+        """The torque on the body, with a leading axis over recordings."""
         return self.records.torque
 
     @property
@@ -211,7 +211,7 @@ class Problem(eqx.Module):
         return Parameters(vector, tuple(shared), own)
 
     def unpack(self, parameters: Parameters) -> tuple[Any, Any]:
-        """The body and the first state that the parameters stand for.
+        """The body and the initial state that the parameters represent.
 
         With several recordings the states have a leading axis.
         """
@@ -221,7 +221,7 @@ class Problem(eqx.Module):
         return body, padding.one(states, 0) if self.count == 1 else states
 
     def bodies(self, parameters: Parameters) -> Any:
-        """The body that the parameters stand for; of several, a dict of them by name."""
+        """The body that the parameters represent; for several bodies a dict by name."""
         if isinstance(self.body, Bodies):
             return self.body.all(parameters.body)
         return self.body.body(parameters.body)
@@ -235,8 +235,9 @@ class Problem(eqx.Module):
     def values(self, parameters: Parameters) -> dict[str, Array]:
         """The value of each `Free`, by name, in its unit.
 
-        (R, …) for those with one for each recording, (groups, …) for those with one for each group;
-        of those with a `spread` the shared value, and each recording's under "its name, own".
+        The shape is (R, …) with one value for each recording, (groups, …) with one for each group.
+        A `Free` with a `spread` gives the shared value, and each recording's value under "its name,
+        own".
         """
         scenes = self.scenes(parameters)
         out = {}
@@ -272,9 +273,9 @@ class Problem(eqx.Module):
 
 
 def one_problem(problem: Any) -> Problem:
-    """`problem`, if it is one as its constructor makes it.
+    """`problem`, if it is a valid `Problem`.
 
-    **Raises:** `TypeError` for another kind of thing, `ValueError` for arrays of other shapes.
+    **Raises:** `TypeError` for another type, `ValueError` for arrays of other shapes.
     """
     _checks.instance(problem, Problem, "problem")
     records, rate = problem.records, problem.reference.rate
@@ -282,7 +283,7 @@ def one_problem(problem: Any) -> Problem:
     if len(shapes) > 1 or records.t.ndim != 2 or rate.shape != records.t.shape[:1]:
         raise ValueError(
             "problem: wanted one, as Problem(recording, …) makes it, got times and masks of shapes "
-            f"{sorted(shapes)}; of many take them one by one"
+            f"{sorted(shapes)}; take many one by one"
         )
     if _checks.known(rate):
         _checks.finite(rate, "problem: its typical rate")
@@ -292,8 +293,8 @@ def one_problem(problem: Any) -> Problem:
 def fits(problem: Problem, parameters: Parameters) -> Parameters:
     """`parameters`, if they are of this problem.
 
-    **Raises:** `TypeError` for another kind of thing or another dtype, `ValueError` for other
-    shapes, and for NaN where it is known.
+    **Raises:** `TypeError` for another type or dtype, `ValueError` for other shapes, and for known
+    NaN.
     """
     one_problem(problem)
     hint = "problem.start(body) makes them"
@@ -338,10 +339,10 @@ def _shapes(problem: Problem) -> dict[str, list[tuple[int, ...]]]:
 
 
 class Links(eqx.Module):
-    """That each recording goes on where the one before it ended: the pieces of a long one.
+    """The condition that each recording starts at the end of the one before: pieces of a long one.
 
-    **Fields:** `on` (R,) one where the recording goes on into the next, else zero; `width` the gap
-    between them that counts as one standard deviation, of order-one numbers.
+    **Fields:** `on` (R,) one if the recording continues in the next, else zero; `width` the
+    standard deviation of the gap between them, in order-one numbers.
     """
 
     on: Float[Array, " records"]
@@ -392,12 +393,12 @@ def _are_recordings(recordings: Sequence[Any]) -> None:
         if len(lengths) > 1 or item.t.ndim != 1:
             raise ValueError(
                 "recording: wanted one, as Recording(t, …) makes it, got times and masks of "
-                f"shapes {sorted(lengths)}; of many give a sequence"
+                f"shapes {sorted(lengths)}; for many give a sequence"
             )
 
 
 def _numbers(chart: AbstractBodyChart, body: Any) -> Float[Array, " chart"]:
-    """The chart's numbers of a guess, or where it starts."""
+    """The chart's numbers of a guess, or its default start."""
     if body is None:
         return _zeros(chart.size)
     _checks.single(body, (Inertia, MassProperties), "body")

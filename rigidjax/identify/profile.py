@@ -1,4 +1,4 @@
-"""Profile intervals: how far a quantity can go before the best misfit grows too much."""
+"""Profile intervals: the range of a quantity in which the best misfit grows little."""
 
 from typing import Any
 
@@ -18,10 +18,10 @@ from rigidjax.identify.search import cost_of, misfit
 def profile(fit: Fit, name: str, level: float = 0.95) -> tuple[float, float]:
     """The profile interval (low, high) of one reported quantity.
 
-    All else is fitted anew with the quantity held at a value; the ends are where twice the misfit
-    has grown by the square of the quantile, `t²`. Where the misfit is not quadratic (a quantity
-    that the data see weakly, or near a boundary) this is the interval to trust. Where the errors
-    are autocorrelated the growth is divided by over how many samples, as `Fit.interval` does.
+    The other numbers are fitted again with the quantity held at a value; at the ends twice the
+    misfit has grown by the square of the quantile, `t²`. Trust this interval if the misfit is not
+    quadratic (a weakly determined quantity, or one near a boundary). The growth is divided by the
+    number of samples over which errors are autocorrelated, as in `Fit.interval`.
 
     **Arguments:** `fit`; `name` as in `fit.interval()`; `level` the probability. **Returns** the
     interval, infinite or 0 on a side where the misfit never grows that far within a factor of 1e3

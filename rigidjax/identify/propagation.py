@@ -1,4 +1,4 @@
-"""From a body and a first state to the states at a recording's times."""
+"""From a body and an initial state to the states at a recording's times."""
 
 import abc
 import math
@@ -20,13 +20,13 @@ from rigidjax.solve.equal_steps import advance, in_a_loop
 from rigidjax.solve.explicit import AbstractExplicit
 from rigidjax.solve.tableaus import KUTTA4
 
-# Radians turned in a step: a fifth-order method then errs by 1e-9 a radian; and one of order 4 in
-# steps of so much less, at two thirds of the cost.
+# The turn in a step, rad: the error of a fifth-order method is then 1e-9 a radian. A method of
+# order 4 has it in steps shorter by the second factor, at two thirds of the cost.
 TURN_A_STEP, TURN_OF_ORDER_4 = 0.1, 0.02
 
 
 class AbstractIntegrator(eqx.Module):
-    """How a forced motion is followed inside a fit, differentiable in forward mode.
+    """The integrator of a forced motion inside a fit, differentiable in forward mode.
 
     >>> class Halves(AbstractIntegrator):  # two equal steps from one sample to the next
     ...     def states(self, body, state0, ts, torque):
@@ -39,17 +39,18 @@ class AbstractIntegrator(eqx.Module):
     def states(self, body: Any, state0: Any, ts: Float[Array, " times"], torque: Torque) -> Any:
         """The states at `ts`, with a leading time axis.
 
-        Under a law with states of its own a `motion.Coupled` of them, where a sensor needs them.
+        They are a `motion.Coupled` if a torque has states of its own and a sensor needs them.
         """
 
 
 class FixedSteps(AbstractIntegrator):
-    """The same number of equal steps between any two samples.
+    """The same number of fixed steps between any two samples.
 
-    The cheapest where samples are close together, as logs of 100 Hz and more are. A fit checks its
-    result against `Adaptive` and says so, and goes on with that, where the steps were too long.
+    It is the cheapest if samples are close together, as in logs of 100 Hz and more. A fit checks
+    its result against finer steps. If the steps were too long, it says so and continues with
+    `Adaptive`.
 
-    **Arguments:** `substeps` how many steps between two samples; `solver` the method, one of
+    **Arguments:** `substeps` the number of steps between two samples; `solver` the method, one of
     `rigidjax.solvers`: Tsitouras's of order 5 unless given.
 
     >>> FixedSteps(2).substeps
@@ -68,7 +69,7 @@ class FixedSteps(AbstractIntegrator):
 
 
 class FirstPart(AbstractIntegrator):
-    """`FixedSteps` of which no more are taken than a part of the record needs.
+    """`FixedSteps` up to the last time that a part of the record needs.
 
     **Fields:** `steps`; `last` the number of the last time that is needed, `None` for all.
     """
@@ -84,7 +85,7 @@ class FirstPart(AbstractIntegrator):
 
 
 class Adaptive(AbstractIntegrator):
-    """Steps as the tolerances ask, through `rigidjax.simulate`.
+    """Steps chosen by the tolerances, through `rigidjax.simulate`.
 
     **Arguments:** `rtol`, `atol` as there.
 
@@ -100,7 +101,7 @@ class Adaptive(AbstractIntegrator):
         _checks.not_negative(self.atol, "atol")
 
     def states(self, body: Any, state0: Any, ts: Float[Array, " times"], torque: Torque) -> Any:
-        # Times that repeat (the tail of a shorter record) are no times to a solver.
+        # A solver refuses repeated times (the tail of a shorter record).
         out = simulate(
             body,
             state0,
@@ -137,7 +138,7 @@ def states_at(
 
 
 def shifted(field: Callable[..., Any], t: Array, state: Any, offset: Array) -> Any:
-    """The state `offset` s later: four steps of the classical method of order 4, either way."""
+    """The state `offset` s later or earlier: four steps of the classical method of order 4."""
     h = offset / 4.0
     for index in range(4):
         state, _ = advance(KUTTA4, lambda t, y: field(t, y, None), t + index * h, h, state)
@@ -145,7 +146,7 @@ def shifted(field: Callable[..., Any], t: Array, state: Any, offset: Array) -> A
 
 
 def _increasing(ts: Float[Array, " times"]) -> Float[Array, " times"]:
-    """The same times, those that repeat at the end moved on by a hair."""
+    """The same times, with the repeated ones at the end increased by a few units of round-off."""
     gap = 1e-9 * (ts[-1] - ts[0])
     again = jnp.cumsum(jnp.concatenate([jnp.zeros(1, bool), jnp.diff(ts) <= 0]).astype(ts.dtype))
     return ts + gap * again

@@ -1,4 +1,4 @@
-"""The quantities that a fit reports by name, their values, deviations and intervals."""
+"""The quantities that a fit reports by name, their values, standard deviations and intervals."""
 
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
@@ -21,15 +21,15 @@ if TYPE_CHECKING:
     from rigidjax.identify.result import Fit
 
 
-# A factor beyond which an interval says nothing of a positive number.
+# An interval wider than this factor says nothing about a positive number.
 FARTHEST = 1e3
 
 
 class Quantity(eqx.Module):
-    """A number with a name: its value, standard deviation (of the log where positive), unit.
+    """A number with a name: its value, standard deviation (of the logarithm if positive), unit.
 
-    `cuts` are its correlation with the flatness of each body, and how far that is from zero in
-    standard deviations (`rigidjax.identify.flat_limit`); `most` is what no body exceeds.
+    `cuts` are its correlation with the flatness of each body, and the flatness in standard
+    deviations (`rigidjax.identify.flat_limit`); `most` is an upper limit for all bodies.
 
     >>> mass = Quantity("mass", 2.0, 0.01, "kg", True)
     >>> low, high = mass.interval(1.96)
@@ -46,10 +46,10 @@ class Quantity(eqx.Module):
     most: float = np.inf
 
     def interval(self, reach: float) -> tuple[float, float]:
-        """Low and high, `reach` standard deviations away; through the log where positive.
+        """Low and high, `reach` standard deviations away; through the logarithm if positive.
 
-        Nearer where a body would be past flat. Of a positive number 0 and infinity where it is not
-        known to a factor of 1e3.
+        An end is nearer if the body there would be past flat. The ends are 0 and infinity for a
+        positive number that is not known to a factor of 1e3.
         """
         low, high = (float(side) * self.deviation for side in cut_ends(reach, self.cuts))
         if not self.positive:
@@ -60,7 +60,7 @@ class Quantity(eqx.Module):
 
 
 def cut_ends(reach: float, cuts: Sequence[tuple[Any, float]]) -> tuple[Any, Any]:
-    """The ends of an interval in standard deviations, by each of the limits that cut it."""
+    """The ends of an interval in standard deviations, for each limit that cuts it."""
     low: Any = -reach
     high: Any = reach
     for correlation, away in cuts:
@@ -93,14 +93,14 @@ def labels(problem: Problem) -> list[tuple[str, str, bool]]:
 
 
 def charts(problem: Problem) -> list[tuple[str, AbstractBodyChart]]:
-    """The chart of each body, and what is added to the names of its quantities."""
+    """The chart of each body, and the suffix of the names of its quantities."""
     if not isinstance(problem.body, Bodies):
         return [("", problem.body)]
     return [(f" [{n}]", c) for n, c in zip(problem.body.names, problem.body.charts, strict=True)]
 
 
 def recording_names(problem: Problem) -> list[str]:
-    """What is added to the names of a recording's quantities: its number, among its body's."""
+    """The suffix of the names of a recording's quantities: its number in its body's list."""
     if problem.count == 1:
         return [""]
     out: list[str] = []
@@ -115,7 +115,7 @@ def _place(index: tuple[int, ...]) -> str:
 
 
 def vector(problem: Problem, parameters: Parameters) -> Array:
-    """The reported quantities, logarithms of those that are positive."""
+    """The reported quantities, with logarithms of the positive ones."""
     rates = parameters.own.spin * problem.reference.rate[:, None]
     parts, bodies = [], in_a_row(problem.bodies(parameters))
     for (_, chart), body in zip(charts(problem), bodies, strict=True):
@@ -144,7 +144,7 @@ def _value_and_slope(problem: Problem, parameters: Parameters) -> tuple[Array, A
 def values_and_slopes(
     problem: Problem, parameters: Parameters, near: Parameters | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What is reported and the flatness of each body, and their derivatives, taken at `near`."""
+    """The reported quantities and the flatness of each body, with their derivatives at `near`."""
     values, slopes = (np.asarray(x) for x in _value_and_slope(problem, parameters))
     if near is not None:
         slopes = np.asarray(_value_and_slope(problem, near)[1])
@@ -160,20 +160,21 @@ def quantities(
 ) -> tuple[Quantity, ...]:
     """Every reported quantity with its standard deviation.
 
-    **Arguments:** `found` what `values_and_slopes` gives; `covariance` (n, n) within what is seen;
-    `null` (k, n) what is not; `limits` that cut the intervals.
+    **Arguments:** `found` the result of `values_and_slopes`; `covariance` (n, n) within the
+    determined directions; `null` (k, n) the undetermined directions; `limits` that cut the
+    intervals.
     """
     names = labels(problem)
     values, slope = (part[: len(names)] for part in found)
     deviations = carried(slope, covariance, null)
     cuts = _cuts(slope, covariance, deviations, limits)
-    # A number that changes with none of those that were fitted is not determined by them.
+    # A number that changes with no fitted number is not determined.
     deviations = np.where(np.any(slope != 0, axis=-1), deviations, np.nan)
     out = []
     for index, (name, unit, positive) in enumerate(names):
         value, deviation = values[index], deviations[index]
         shown = float(np.exp(value)) if positive else float(value)
-        # Nor is it known better than it is written.
+        # A number is not known better than its round-off.
         least = np.finfo(float).eps * (1.0 if positive else abs(shown))
         most = 1.0 if name.startswith(Ratios.log_names) else np.inf
         mine = tuple((float(rho[index]), away) for rho, away in cuts)
@@ -188,7 +189,7 @@ def _cuts(
     deviations: np.ndarray,
     limits: tuple[flat_limit.Limit, ...],
 ) -> list[tuple[np.ndarray, float]]:
-    """For each limit the correlations of functions with it, and how far it is."""
+    """The correlations of functions with each limit, and the distance from it."""
     out = []
     for limit in limits:
         wide = limit.deviation(covariance)
@@ -200,16 +201,17 @@ def _cuts(
 
 
 def covariance(fit: "Fit") -> np.ndarray:
-    """Covariance of the reported quantities, of the logarithms of those that are positive."""
+    """Covariance of the reported quantities, with logarithms of the positive ones."""
     slope = np.asarray(_value_and_slope(fit.problem, fit.beside)[1])[: len(labels(fit.problem))]
     return slope @ np.asarray(fit.seen) @ slope.T
 
 
 def carried(slope: np.ndarray, covariance: np.ndarray, null: np.ndarray) -> np.ndarray:
-    """Standard deviations of functions with this derivative (…, n): all intervals are made of them.
+    """Standard deviations of functions with this derivative (…, n); all intervals use them.
 
-    Infinite where the function changes along a direction of `null` (k, n). NaN, not determined,
-    where it changes along one whose variance is negative, or has no variance but round-off.
+    It is infinite if the function changes along a direction of `null` (k, n). It is NaN, not
+    determined, if the function changes along a direction of negative variance, or its variance is
+    round-off.
     """
     if not np.isfinite(covariance).all():
         return np.full(slope.shape[:-1], np.nan)
@@ -256,7 +258,7 @@ def interval_of(
 def quantile(fit: "Fit", level: float) -> float:
     """Half-width of an interval in standard deviations: Student's where the noise is estimated.
 
-    Autocorrelated errors count as the fewer they are.
+    Autocorrelated errors count as fewer independent ones.
     """
     level = _checks.fraction(level, "interval", "a level between 0 and 1")
     from scipy.special import ndtri, stdtrit

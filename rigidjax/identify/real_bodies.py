@@ -1,4 +1,4 @@
-"""Whether the numbers that a fit ended at are those of a body: inside of a trace nobody looked."""
+"""A check that the fitted numbers belong to a real body, which a traced fit cannot make."""
 
 from typing import Any
 
@@ -7,7 +7,7 @@ from rigidjax.identify.body_charts import AbstractBodyChart
 
 
 def unreal(body: Any) -> str | None:
-    """What is wrong with a body's numbers, in words; `None` for a real body."""
+    """The error in a body's numbers, in words; `None` for a real body."""
     try:
         if isinstance(body, MassProperties):
             MassProperties(body.mass, body.com, body.second_moment)
@@ -19,7 +19,7 @@ def unreal(body: Any) -> str | None:
 
 
 def of_charts(charts: list[tuple[str, AbstractBodyChart]], bodies: list[Any]) -> list[str]:
-    """`unreal` of the bodies of charts that users wrote: every point of ours is a real body."""
+    """`unreal` for the bodies of charts by users: every point of our charts is a real body."""
     out = []
     for (name, chart), body in zip(charts, bodies, strict=True):
         ours = type(chart).__module__ == AbstractBodyChart.__module__

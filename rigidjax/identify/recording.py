@@ -1,4 +1,4 @@
-"""A recording: times, what each sensor read then, and what turned the body meanwhile."""
+"""A recording: times, the readings of each sensor, and the torque on the body."""
 
 from types import FunctionType
 from typing import Any
@@ -15,7 +15,7 @@ from rigidjax.motion.torques.base import Torque, require_law
 
 
 class Reading(eqx.Module):
-    """What one sensor read: `values` (T, …) and `mask` (T,), true where there is a reading.
+    """The readings of one sensor: `values` (T, …) and `mask` (T,), true where there is a reading.
 
     Inside a `Problem` all arrays have a leading axis over recordings.
 
@@ -31,7 +31,7 @@ class Reading(eqx.Module):
 
     @property
     def seen(self) -> np.ndarray:
-        """The mask as a NumPy array, for what happens outside `jit`."""
+        """The mask as a NumPy array, for work outside `jit`."""
         return np.asarray(self.mask)
 
 
@@ -47,9 +47,9 @@ class Recording(eqx.Module):
     `torque`, by keyword, is what turned this body besides its own spin: a wheel whose speed was
     logged, a law with coefficients that a `Free` may move; `None` for none.
 
-    **Raises** `TypeError` for numbers that are traced (which times are kept depends on them) and
-    what is no sensor; `ValueError` for times that do not increase, a wrong shape, an unmasked NaN
-    (with its index), or a quaternion that is not unit.
+    **Raises** `TypeError` for traced numbers (the times that are kept depend on them) and for
+    anything but a sensor; `ValueError` for times that do not increase, a wrong shape, an unmasked
+    NaN (with its index), or a quaternion that is not unit.
 
     >>> import rigidjax as rj
     >>> Recording([0.0, 1.0], (rj.identify.Gyro(0.01), [[1.0, 0, 0], [1.0, 0, 0]])).t.shape
@@ -88,9 +88,9 @@ class Recording(eqx.Module):
         used = np.any([mask for _, _, mask in rows], axis=0)
         if used.sum() < 2:
             raise ValueError("Recording: wanted readings at two times at least; the rest is masked")
-        # Told in reports, and no part of what a fit sees.
+        # For reports; a fit does not use it.
         self.dropped = int((~used).sum())
-        # A long recording is not to be held once more than needed.
+        # A long recording must not be copied more than needed.
         kept = used if self.dropped else slice(None)
         self.t = jnp.asarray(t[kept])
         self.readings = tuple(
@@ -99,7 +99,7 @@ class Recording(eqx.Module):
         )
         if torque is not None:
             require_law(torque)
-        # A function is no array: what goes through transformations has none as a leaf.
+        # A function is no array, and must be no leaf under transformations.
         plain = isinstance(torque, FunctionType)
         self.torque = jax.tree_util.Partial(torque) if plain else torque
 
@@ -118,7 +118,7 @@ class Recording(eqx.Module):
 
     @property
     def size(self) -> int:
-        """How many numbers were read."""
+        """The number of numbers read."""
         return sum(count_of(reading) for reading in self.readings)
 
     @property
@@ -133,7 +133,7 @@ def readings_of(recording: Recording, kind: type) -> list[Any]:
 
 
 def count_of(reading: Reading) -> int:
-    """How many numbers a reading holds: those seen, times the components of an error."""
+    """The number of numbers read: unmasked readings times the components of an error."""
     return reading.sensor.components * int(reading.seen.sum())
 
 
@@ -168,7 +168,7 @@ def _reading(
         )
     if not mask.any():
         raise ValueError(f"{name}: every reading is masked")
-    # What is masked must not reach a derivative, for 0 · NaN is NaN: any reading will do instead.
+    # A masked NaN must not reach a derivative, since 0 · NaN is NaN: any valid reading replaces it.
     if not mask.all():
         shaped = mask.reshape(-1, *(1 for _ in across))
         values = np.where(shaped, values, values[int(np.argmax(mask))])

@@ -1,4 +1,4 @@
-"""Where the first states of a fit are counted from: the first readings of each recording."""
+"""The reference of the initial states of a fit: the first readings of each recording."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -21,7 +21,7 @@ from rigidjax.rotation import quaternion
 
 
 class ReferenceStates(eqx.Module):
-    """Where the first state of a recording is counted from, at rest, and in which units."""
+    """The reference state of a recording, at rest, and the units of changes from it."""
 
     state: Any
     rate: Float[Array, "*records"]
@@ -29,7 +29,7 @@ class ReferenceStates(eqx.Module):
 
     @property
     def units(self) -> Float[Array, "*records n"]:
-        """How large a change of order one is, number by number."""
+        """The size of a change of order one, number by number."""
         sizes = {
             "x": self.length,
             "v": self.length * self.rate,
@@ -39,12 +39,12 @@ class ReferenceStates(eqx.Module):
         return jnp.repeat(jnp.stack([sizes[name] for name in names(self.state)], -1), 3, -1)
 
     def moved(self, own: Any) -> Any:
-        """The first state of one recording; `own` an `Own` or a `Local`."""
+        """The initial state of one recording; `own` an `Own` or a `Local`."""
         return plus(self.state, self.units * jnp.concatenate(firsts(own)))
 
 
 def reference_of(recordings: Sequence[Recording], rung: type) -> ReferenceStates:
-    """From the first readings of each recording, as far as the rung needs it."""
+    """From the first readings of each recording, for the kind of state in use."""
     turns = [_first_attitude(r) for r in recordings]
     places = [_first_place(r) for r in recordings]
     dtype = recordings[0].t.dtype
@@ -67,7 +67,7 @@ def _typical_rate(recording: Recording) -> float:
 
 
 def _rate_of_readings(recording: Recording) -> float:
-    """What the first sensor that can tell a rate from its readings says, rad/s; 0 without one."""
+    """The rate by the first sensor whose readings show one, rad/s; 0 without such a sensor."""
     for reading in recording.readings:
         sensor: Any = reading.sensor
         if hasattr(sensor, "typical_rate"):
@@ -84,8 +84,8 @@ def _first_attitude(recording: Recording) -> np.ndarray:
 def _first_place(recording: Recording) -> tuple[np.ndarray, np.ndarray, float]:
     """First position and velocity of the body's frame, m and m/s, and a typical length, m.
 
-    Of the frame's origin where attitudes tell how far the markers are from it; of the centre of
-    mass where its position, or ranges to it, were read.
+    They belong to the frame's origin if attitudes give its distance from the markers, and to the
+    centre of mass if its position, or ranges to it, were read.
     """
     direct = _read_place(recording)
     if direct is not None:
@@ -114,12 +114,12 @@ def _first_speed(t: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 
 def _length(x: np.ndarray) -> float:
-    """How far places (n, 3) are from their mean at most; 1 where they are all the same."""
+    """The largest distance of places (n, 3) from their mean; 1 if they are all the same."""
     return float(np.linalg.norm(x - x.mean(axis=0), axis=1).max()) or 1.0
 
 
 def _read_place(recording: Recording) -> tuple[np.ndarray, np.ndarray, float] | None:
-    """As `_first_place`, from what reads positions, ranges and velocities; `None` without them."""
+    """As `_first_place`, from sensors of positions, ranges and velocities; `None` without them."""
     t = np.asarray(recording.t)
     positions, ranges = readings_of(recording, Position), readings_of(recording, Range)
     speeds = [r for r in readings_of(recording, Velocity) if r.sensor.mounting is None]
@@ -146,8 +146,9 @@ def _read_place(recording: Recording) -> tuple[np.ndarray, np.ndarray, float] | 
 def _from_ranges(stations: np.ndarray, lengths: np.ndarray) -> np.ndarray:
     """Places (n, 3) that distances (n, k) to stations (k, 3) show.
 
-    The differences of `|x|² − 2 s·x + |s|² = d²` from their mean are linear in x; along what they
-    do not show (fewer than four stations, or in a plane) it is the stations' centre.
+    The differences of `|x|² − 2 s·x + |s|² = d²` from their mean are linear in x; along
+    undetermined directions (fewer than four stations, or stations in a plane) it is the stations'
+    centre.
     """
     centre = stations.mean(axis=0)
     s = stations - centre
@@ -169,7 +170,7 @@ def first_rates(records: Recording, counts: tuple[int, ...]) -> Float[Array, "re
 
 
 def first_rate(recording: Recording) -> np.ndarray:
-    """A first body rate (3,), rad/s: a gyro's, or between attitudes; zero without either."""
+    """The initial body rate (3,), rad/s: from a gyro, or between attitudes; zero without either."""
     for reading in readings_of(recording, Gyro):
         return np.asarray(reading.values)[int(np.argmax(reading.seen))]
     _, w = rates(recording)

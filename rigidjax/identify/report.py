@@ -1,4 +1,4 @@
-"""A fit as a table for the terminal, as JSON, and as a page of HTML that stands alone."""
+"""A fit as a table for the terminal, as JSON, and as a self-contained page of HTML."""
 
 import base64
 import html
@@ -20,9 +20,9 @@ Row = tuple[str, float, float, float, str]
 
 
 def rows(fit: Fit, rate_unit: str = "rad/s") -> list[Row]:
-    """All that was found as rows (name, value, low, high, unit), 95 % intervals.
+    """All results as rows (name, value, low, high, unit), 95 % intervals.
 
-    **Arguments:** `fit`; `rate_unit` of the first body rate: `rad/s`, `deg/s`, `deg/day`.
+    **Arguments:** `fit`; `rate_unit` of the initial body rate: `rad/s`, `deg/s`, `deg/day`.
 
     >>> import jax.numpy as jnp, rigidjax as rj
     >>> ts = jnp.linspace(0.0, 10.0, 80)
@@ -49,11 +49,11 @@ def rows(fit: Fit, rate_unit: str = "rad/s") -> list[Row]:
 
 
 def table(lines: list[Row]) -> str:
-    """Rows as text, with the digits that the interval allows.
+    """Rows as text, rounded by their intervals.
 
     **Arguments:** `lines` rows of (name, value, low, high, unit), such as `rows` gives.
 
-    **Raises:** `TypeError` for what is no row; `ValueError` for none.
+    **Raises:** `TypeError` for anything but rows; `ValueError` for none.
 
     >>> print(table([("I1", 1.23456, 1.2, 1.27, "kg m²")]))
                  value  95 % interval
@@ -73,11 +73,11 @@ def table(lines: list[Row]) -> str:
 
 
 def numbers(value: float, low: float, high: float) -> list[str]:
-    """The three as text, with the digits that the interval allows.
+    """Value, low and high as text, rounded by the interval.
 
     **Arguments:** `value`; `low` and `high`, the ends of its interval, in the same unit.
 
-    **Raises:** `TypeError`, `ValueError` for what is no number.
+    **Raises:** `TypeError`, `ValueError` for anything but numbers.
 
     >>> numbers(1.23456, 1.2, 1.27)
     ['1.2346', '1.2000', '1.2700']
@@ -93,7 +93,7 @@ def numbers(value: float, low: float, high: float) -> list[str]:
         if not np.isfinite(number):
             return str(number)
         top = _place(size if fixed else number)
-        # Two digits more than the first one of the uncertainty; six in all where there is none.
+        # Two digits more than the first one of the uncertainty; six in all without an uncertainty.
         last = _place(2 * min(gap, 8e307)) - 2 if 0 < gap < np.inf else top - 5
         last = min(max(last, top - 12), top - 2)
         return f"{number:.{max(-last, 0)}f}" if fixed else f"{number:.{top - last}e}"
@@ -108,14 +108,15 @@ def _place(number: float) -> int:
 
 
 def _between(shown: list[str]) -> str:
-    """The interval of what `numbers` gives, in words where there is none."""
+    """The interval by `numbers`, in words if there is none."""
     return "not determined" if "nan" in shown[1:] else f"{shown[1]} … {shown[2]}"
 
 
 def verdict(fit: Fit) -> str:
-    """What is well and what is weakly determined, and whether the starts agree, in words.
+    """The well and the weakly determined quantities, and the agreement of the starts, in words.
 
-    **Arguments:** `fit` what `rigidjax.identify.fit` returned. **Raises** `TypeError` for another.
+    **Arguments:** `fit` a result of `rigidjax.identify.fit`. **Raises** `TypeError` for another
+    type.
 
     >>> import jax.numpy as jnp, rigidjax as rj
     >>> ts = jnp.linspace(0.0, 10.0, 80)
@@ -138,9 +139,10 @@ def verdict(fit: Fit) -> str:
 
 
 def as_dict(fit: Fit, files: Sequence[str] = (), more: Sequence[Row] = ()) -> dict[str, Any]:
-    """All that was found as plain numbers and text, for JSON; infinity and NaN become `null`.
+    """All results as plain numbers and text, for JSON; infinity and NaN become `null`.
 
-    **Arguments:** `fit`; `files` the names of what was read; `more` rows of further quantities.
+    **Arguments:** `fit`; `files` the names of the files that were read; `more` rows of further
+    quantities.
 
     >>> import jax.numpy as jnp, rigidjax as rj
     >>> ts = jnp.linspace(0.0, 10.0, 80)
@@ -230,7 +232,7 @@ def _rms_of_axes(fit: Fit) -> list[tuple[str, list[float], str]]:
 def write_json(
     fit: Fit, path: str | Path, files: Sequence[str] = (), more: Sequence[Row] = ()
 ) -> None:
-    """What was found as JSON in a file: `as_dict`, written to `path`.
+    """All results as JSON in a file: `as_dict`, written to `path`.
 
     **Arguments:** `fit`; `path` of the file, written over; `files` and `more` as for `as_dict`.
 
@@ -245,7 +247,7 @@ def write_json(
     'ok'
     """
     text = json.dumps(as_dict(fit, files, more), indent=2, ensure_ascii=False, allow_nan=False)
-    # A part of a file's name that is no character stands as JSON writes it.
+    # Bytes of a file's name that are no character are written as JSON escapes.
     Path(path).write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
 
 
@@ -259,11 +261,11 @@ def write_html(
     files: Sequence[str] = (),
     more: Sequence[Row] = (),
 ) -> None:
-    """A page that stands alone: status, table, words, errors, starts, figures inside it.
+    """A self-contained page: status, table, words, errors, starts, figures.
 
     **Arguments:** `fit`; `path`; `title`; `figures` of matplotlib, such as those of
-    `rigidjax.plot.fit`; `rate_unit` as for `rows`; `files` the names of what was read; `more`
-    rows of further quantities.
+    `rigidjax.plot.fit`; `rate_unit` as for `rows`; `files` the names of the files that were
+    read; `more` rows of further quantities.
 
     >>> import tempfile, jax.numpy as jnp, rigidjax as rj
     >>> ts = jnp.linspace(0.0, 10.0, 80)

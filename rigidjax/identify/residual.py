@@ -1,4 +1,4 @@
-"""From errors to what least squares makes small: noise, saturation, losses, priors, joints."""
+"""From errors to residuals of least squares: noise, saturation, losses, priors, joints."""
 
 from collections.abc import Callable
 from typing import Any
@@ -35,10 +35,11 @@ def standardised(
     sigma: Float[Array, " k"],
     limit: Float[Array, " k"] | None,
 ) -> tuple[Float[Array, "times k"], Bool[Array, "times k"]]:
-    """Errors in standard deviations, saturated channels by their odds; and which those are.
+    """Errors in standard deviations, saturated channels by their probability; and a mask of these.
 
-    A channel at its limit says "at least that much": it counts as `√(−2 log Φ(z))`, with z how far
-    the prediction is beyond the limit in standard deviations (Tobin 1958, doi:10.2307/1907382).
+    A channel at its limit says "at least that much": it counts as `√(−2 log Φ(z))`, with z the
+    excess of the prediction over the limit in standard deviations (Tobin 1958,
+    doi:10.2307/1907382).
     """
     scaled = error / sigma[None]
     if limit is None:
@@ -50,13 +51,13 @@ def standardised(
 
 
 def _censored(z: Float[Array, "..."]) -> Float[Array, "..."]:
-    # Beyond five standard deviations nothing is left to say, and the root has no derivative.
+    # The term vanishes beyond five standard deviations, and the root has no derivative there.
     inside = jnp.minimum(z, 5.0)
     return jnp.where(z < 5.0, jnp.sqrt(-2.0 * jax.scipy.special.log_ndtr(inside)), 0.0)
 
 
 def residuals(parameters: Parameters, args: Any) -> Any:
-    """Everything whose squares a fit adds up, as a tree: readings, priors, joints between pieces.
+    """All residuals of a fit, as a tree: readings, priors, joints between pieces.
 
     **Arguments:** `parameters`; `args` the problem, the noise of each sensor, and weights (R, T)
     of the times.
@@ -67,7 +68,7 @@ def residuals(parameters: Parameters, args: Any) -> Any:
 
 
 def seen(problem: Problem, errors: tuple, noise: Noise, weights: Array) -> tuple[Array, ...]:
-    """The readings' residuals (R, T, k) as least squares is to see them."""
+    """The readings' residuals (R, T, k) for least squares."""
     read = []
     for scaled in whitened(problem, errors, noise):
         if problem.loss is not None:
@@ -89,7 +90,7 @@ def seen_rows(
 
 def with_rows(of: Callable[[tuple], tuple], errors: tuple, blocks: tuple) -> tuple[tuple, tuple]:
     """`of(errors)`, and its derivatives (R, T, k, n) of those of the errors, `blocks`."""
-    # What each reading says depends on its own error alone: a product of small matrices.
+    # Each residual depends on its own error alone: a product of small matrices.
     read, push = jax.linearize(of, errors)
     return read, jax.vmap(push, in_axes=-1, out_axes=-1)(blocks)
 
@@ -112,7 +113,7 @@ def beside(parameters: Parameters, problem: Problem, ends: Any) -> tuple[Array, 
 
 
 def gaps(parameters: Parameters, problem: Problem, ends: Any) -> Float[Array, "records n"]:
-    """How far each piece's end is from the next one's start, typical units; zero at the last."""
+    """The gap between a piece's end and the next one's start, typical units; zero at the last."""
     assert problem.links is not None
     ref = problem.reference
     starts = jax.vmap(ReferenceStates.moved)(ref, parameters.own)
@@ -121,7 +122,7 @@ def gaps(parameters: Parameters, problem: Problem, ends: Any) -> Float[Array, "r
 
 
 def weights_of(problem: Problem, errors: tuple, noise: Noise) -> tuple[Float[Array, "..."], ...]:
-    """The weight (R, T) of each reading in the normal equations: the loss's, zero where masked."""
+    """The weight (R, T) of each reading in the normal equations: the loss's, zero if masked."""
     masks = [reading.mask for reading in problem.records.readings]
     if problem.loss is None:
         return tuple(mask.astype(e.dtype) for mask, e in zip(masks, errors, strict=True))

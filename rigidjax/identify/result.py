@@ -1,4 +1,4 @@
-"""What a fit returns: the best point, how sure it is, and what came of each start."""
+"""The result of a fit: the best point, its uncertainty, and the end of each start."""
 
 from collections.abc import Callable
 from typing import Any
@@ -22,9 +22,9 @@ from rigidjax.identify.widths import widths
 
 
 class Start(eqx.Module):
-    """The result of one start: where the search ended, and whether that explains the data.
+    """The result of one start: the end of the search, and whether it explains the data.
 
-    **Fields:** `parameters` where it ended; `cost` half of the sum of squares there; `converged`
+    **Fields:** `parameters` at its end; `cost` half of the sum of squares there; `converged`
     whether the search did; `fits` whether it explains the data as well as the best point does.
 
     >>> import rigidjax as rj
@@ -41,20 +41,20 @@ class Start(eqx.Module):
 
 
 class Fit(eqx.Module):
-    """What `fit` returns: the best point and how sure it is.
+    """The result of `fit`: the best point and its uncertainty.
 
     **Fields:** `problem` that was fitted; `parameters` the free numbers at the best point;
-    `covariance` (n, n) of them, flattened in order, infinite where the data do not determine them,
-    `seen` the same within what they determine, `covariance_kind` what it rests on; `noises` (R, k)
+    `covariance` (n, n) of them, flattened in order, infinite for undetermined numbers, `seen` the
+    same within the determined directions, `covariance_kind` its method; `noises` (R, k)
     for each sensor; `starts` a `Start` each; `chi2` and `dof` of the whitened errors of the sensors
-    whose noise was given; `correlation` over how many samples the errors are autocorrelated, 1 for
-    white ones, and `independent` how many independent ones that leaves; `singular_values` (n,) of
-    the whitened Jacobian, its columns of length one; `null_directions` (k, n) that the data do not
-    determine; `quantities` all that is reported, by name; `search` the first answer, whose `word`
-    is `found`, `not alone` or `not ended`; `model` the second one: `explains the readings`,
-    `leaves a part`, `does not explain the readings`; `left` the indices of the sensors whose errors
-    it does not explain; `limits` how far each body is from the flat ones; `near` where a flat body
-    made the derivatives be taken, else `None`.
+    whose noise was given; `correlation` the number of samples over which the errors are
+    autocorrelated, 1 for white ones, and `independent` the number of independent errors;
+    `singular_values` (n,) of the whitened Jacobian, its columns of length one; `null_directions`
+    (k, n) that the data do not determine; `quantities` all reported quantities, by name; `search`
+    the first answer, whose `word` is `found`, `not alone` or `not ended`; `model` the second one:
+    `explains the readings`, `leaves a part`, `does not explain the readings`; `left` the indices of
+    the sensors whose errors it does not explain; `limits` the distance of each body from a flat
+    one; `near` the point of the derivatives beside a flat body, else `None`.
 
     >>> import jax.numpy as jnp, rigidjax as rj
     >>> ts = jnp.linspace(0.0, 10.0, 80)
@@ -87,17 +87,17 @@ class Fit(eqx.Module):
 
     @property
     def status(self) -> str:
-        """Both answers in one line; `ok` where there is nothing else to say."""
+        """Both answers in one line; `ok` if both are good and have no reasons."""
         return answers.status(self.search, self.model)
 
     @property
     def ok(self) -> bool:
-        """Whether the fit converged, explains the data, and is the only one that does."""
+        """Whether the fit converged, explains the data, and is unique."""
         return self.status == "ok"
 
     @property
     def beside(self) -> Parameters:
-        """The free numbers to which `covariance` belongs: `parameters`, a flat body thicker."""
+        """The free numbers of `covariance`: `parameters`, with a flat body made thicker."""
         return self.parameters if self.near is None else self.near
 
     @property
@@ -113,8 +113,8 @@ class Fit(eqx.Module):
 
     @property
     def advice(self) -> str:
-        """Whether the intervals can be trusted, and what to try."""
-        # Under a robust loss χ² is the outliers'.
+        """Advice: whether the intervals can be trusted, and what to try."""
+        # Outliers dominate χ² under a robust loss.
         above = np.sqrt(self.chi2 / self.dof) if self.problem.loss is None else 1.0
         return answers.advice(self.search, self.model, self.causes, self.covariance_kind, above)
 
@@ -130,7 +130,7 @@ class Fit(eqx.Module):
 
     @property
     def body(self) -> Any:
-        """The body, up to scale where the chart has none; of several a dict of them by name."""
+        """The body, up to scale if the chart has none; for several bodies a dict by name."""
         return self.problem.unpack(self.parameters)[0]
 
     @property
@@ -175,10 +175,10 @@ class Fit(eqx.Module):
         return tuple(out)
 
     def interval(self, level: float = 0.95) -> dict[str, tuple[float, float]]:
-        """Intervals of everything that is reported, name → (low, high).
+        """Intervals of all reported quantities, name → (low, high).
 
-        What is positive goes through its logarithm. **Arguments:** `level` the probability with
-        which each holds the truth. **Raises** `ValueError` outside (0, 1).
+        The interval of a positive quantity goes through its logarithm. **Arguments:** `level` the
+        probability that an interval holds the true value. **Raises** `ValueError` outside (0, 1).
         """
         reach = quantile(self, level)
         return {quantity.name: quantity.interval(reach) for quantity in self.quantities}
@@ -188,7 +188,7 @@ class Fit(eqx.Module):
     ) -> tuple[np.ndarray, np.ndarray]:
         """Interval (low, high) of any differentiable function of `Unpacked` to an array.
 
-        The covariance is carried by the function's derivative. **Raises** as `interval`.
+        It comes from the covariance and the function's derivative. **Raises** as `interval`.
         """
         return interval_of(self, of, level)
 
@@ -196,25 +196,26 @@ class Fit(eqx.Module):
     def undetermined(self) -> tuple[Combination, ...]:
         """The combinations of numbers that the data do not determine at all, by name.
 
-        Empty where they determine all. Each says `names`, `changes` and `in_words`.
+        The list is empty if they determine all. Each combination has `names`, `changes` and
+        `in_words`.
         """
         return undetermined(self)
 
     @property
     def identifiability(self) -> tuple[str, ...]:
-        """In words: what the data determine, what only weakly, and what not."""
+        """In words: the quantities that the data determine well, weakly, and not at all."""
         return identifiability.identifiability(self)
 
 
 def one_fit(found: Any, name: str = "fit") -> Fit:
     """`found`, if it is one `Fit`, not many in one container.
 
-    **Raises:** `TypeError` for another kind of thing, `ValueError` for leading axes.
+    **Raises:** `TypeError` for another type, `ValueError` for leading axes.
     """
     _checks.instance(found, Fit, name)
     if np.shape(found.chi2) != ():
         raise ValueError(
             f"{name}: wanted one Fit, as identify.fit returns it, got one with a chi2 of shape "
-            f"{np.shape(found.chi2)}; of many take them one by one"
+            f"{np.shape(found.chi2)}; take many one by one"
         )
     return found

@@ -1,4 +1,4 @@
-"""Where the misfit is least: Levenberg–Marquardt from several starts, the record from its start."""
+"""The least misfit: Levenberg–Marquardt from several starts, over growing records."""
 
 import dataclasses
 from collections.abc import Callable
@@ -23,14 +23,14 @@ from rigidjax.identify.problem import Problem
 from rigidjax.identify.recording import count_of
 from rigidjax.identify.residual import Noise, residuals
 
-# The record is fitted from its beginning first: a long one is a forest of wrong minima (the phase
-# slips by whole turns), a short one is not.
+# The beginning of the record is fitted first: a long record has many wrong minima (the phase slips
+# by whole turns), a short one has not.
 HORIZONS = (0.25, 0.5, 1.0)
-# Steps between two looks at the clock, the keyboard and the checkpoint.
+# Steps between two checks of the clock, the keyboard and the checkpoint.
 STRIDE = 25
-# A stride that lowers the misfit by less than this share has come to the bottom.
+# A stride that lowers the misfit by less than this share is at the minimum.
 SETTLED = 1e-7
-# A part of the record may be fitted at the expense of the whole, but not by more than this factor.
+# A fit to a part of the record may raise the misfit of the whole by at most this factor.
 WILD = 100.0
 
 
@@ -45,8 +45,8 @@ def least_squares(
     aim: float = 0.0,
     near: float = 0.0,
 ) -> Tried:
-    """At most `max_steps` steps from `start`; fewer where they do not lead to an `aim` or where
-    they are `near` (see `Settings`).
+    """At most `max_steps` steps from `start`; fewer if they do not lead to an `aim`, or are `near`
+    (see `Settings`).
     """
     settings = Settings(tolerance, damping, max_steps, aim, near=near)
     return _ended(*_descend(start, problem, noise, weights, settings))
@@ -70,7 +70,7 @@ def _descend(
 def evaluate(parameters: Parameters, problem: Problem) -> Any:
     """Errors and last states with their derivatives (see `with_blocks`).
 
-    By the program of the search, which is the only one that follows the motion.
+    It uses the program of the search, so that no other one for the motion is compiled.
     """
     kind = problem.records.t.dtype
     noise = tuple(
@@ -137,13 +137,12 @@ def settle(
     strides: int = 0,
     aim: float = 0.0,
 ) -> Tried:
-    """Strides from where `tried` ended until one more of them changes nothing.
+    """Strides from the end of `tried` until one more changes nothing.
 
-    A search that says it has converged may only have been damped too much: it has converged where a
-    fresh start from there ends there. `tried.cost` is the misfit at its end, infinite if unknown;
-    `near` says that it is near the bottom already; `strides` how many led to it; `aim` see
-    `Settings`. `look` is called after each, with how many there are by then and whether that was
-    the last.
+    A search may report convergence only because of large damping: it has converged if a new search
+    from its end stays there. `tried.cost` is the misfit at its end, infinite if unknown; `near`
+    says that it is near the minimum already; `strides` the number before it; `aim` see `Settings`.
+    `look` is called after each stride, with the number so far and whether it was the last.
     """
     if strides and bool(tried.converged):
         look(tried, strides, True)
@@ -163,10 +162,10 @@ def settle(
             look(tried, strides, True)
             break
         tried = after
-        # At the very bottom round-off refuses every step: whether it moved is what counts.
+        # Round-off refuses every step at the minimum: the test is whether the point moved.
         stands = before - float(tried.cost) < SETTLED * (1.0 + abs(before))
         settled = bool(tried.converged) or stands
-        # As much again would not lead to the aim.
+        # The same gain again would not reach the aim.
         hopeless = aim > 0 and not settled and float(tried.cost) ** 2 > aim * before
         over = settled or hopeless or first + STRIDE >= max_steps
         tried = dataclasses.replace(tried, converged=jnp.asarray(settled))
@@ -177,12 +176,12 @@ def settle(
 
 
 def fresh(point: Parameters) -> Tried:
-    """A start whose misfit is not known yet."""
+    """A start before its misfit is known."""
     return Tried(point, jnp.asarray(jnp.inf), jnp.asarray(False))
 
 
 def again(best: Tried, problem: Problem, noise: Noise, tolerance: float, max_steps: int) -> Tried:
-    """`settle` over the whole of the records from a point that is near the bottom."""
+    """`settle` over the whole of the records from a point near the minimum."""
     near = fresh(best.parameters)
     return settle(near, problem, noise, whole(problem), tolerance, max_steps, near=True)
 
@@ -197,29 +196,29 @@ def climb(
     look: Callable[[SearchState], None] = lambda position: None,
     aim: float = 0.0,
 ) -> Tried:
-    """One start down to the bottom; `look` is called after each stride with where it stands.
+    """The search from one start; `look` is called after each stride with its state.
 
-    The whole record at once, where that explains it; else through the horizons. `aim` is the misfit
-    of another start that explains the record: a search that does not lead there ends early.
+    It fits the whole record at once if that explains it, else the horizons in turn. `aim` is the
+    misfit of another start that explains the record: a search that does not lead there ends early.
     """
     tried, start, level = _at_once(start, problem, noise, tolerance, max_steps, aim)
     for stage in range(start.stage, len(HORIZONS)):
         seen = horizon(problem, HORIZONS[stage])
         if stage < len(HORIZONS) - 1:
-            # A part of the record need not be fitted to the end, only to come near.
+            # A part of the record need not be fitted to convergence.
             count, before = min(STRIDE, max_steps), tried.parameters
             part = aim * HORIZONS[stage]
             found = least_squares(
                 before, problem, noise, seen, tolerance, count, CAREFUL, aim=part, near=part
             )
             after = found.parameters
-            # What explains a part alone may be nonsense beyond it: a drag that drives.
+            # A point that explains a part alone may be wrong beyond it, such as a negative drag.
             first = cost_of(before, problem, noise) if level is None else level
             level = cost_of(after, problem, noise)
             kept = level < WILD * max(first, 1e-300)
             tried, level = fresh(after if kept else before), level if kept else first
             if part > 0 and not bool(found.converged) and float(found.cost) > WILD * part:
-                # Not even this part, which another start explains.
+                # It does not even explain this part, which another start explains.
                 tried = Tried(tried.parameters, jnp.asarray(level), tried.converged)
                 look(SearchState(len(HORIZONS), 0, tried))
                 break
@@ -244,7 +243,7 @@ def _at_once(
     max_steps: int,
     aim: float,
 ) -> tuple[Tried, SearchState, float | None]:
-    """The start fitted to the whole record, if that explains it; else as it is, and its misfit."""
+    """The start fitted to the whole record, if that explains it; else the start and its misfit."""
     if start.stage or start.strides:
         return start.tried, start, None
     seen, count = whole(problem), min(STRIDE, max_steps)
@@ -257,8 +256,8 @@ def _at_once(
 
 
 def enough(problem: Problem) -> float:
-    """A misfit that only the motion has: of χ² twice its mean; of a noise that was guessed at a
-    tenth of the signal, errors of a hundredth.
+    """A misfit that only the true motion reaches: twice the mean of χ²; errors of a hundredth of
+    the signal if the noise was guessed at a tenth.
     """
     total = 0.0
     for reading in problem.records.readings:
@@ -270,7 +269,7 @@ def enough(problem: Problem) -> float:
 def climb_together(
     points: Parameters, problem: Problem, noise: Noise, tolerance: float, max_steps: int
 ) -> list[Tried]:
-    """Many starts through the horizons in one `vmap` (a leading axis on `points`)."""
+    """Many starts over the horizons in one `vmap` (a leading axis on `points`)."""
     tried, settings = None, Settings(tolerance, CAREFUL, max_steps)
     for part in HORIZONS:
         seen = horizon(problem, part)

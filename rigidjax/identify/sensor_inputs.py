@@ -1,4 +1,4 @@
-"""What a sensor looks at, along a motion: for the errors of a fit and for simulated readings."""
+"""The input of a sensor along a motion: for the errors of a fit and for simulated readings."""
 
 from collections.abc import Callable
 from typing import Any
@@ -17,19 +17,19 @@ from rigidjax.solve import equations_of_motion
 
 
 def what_turns(body: Any, rung: type) -> Any:
-    """The body of the equations of motion: one that does not move needs no mass."""
+    """The body of the equations of motion: a body at a fixed point needs no mass."""
     return body.inertia if isinstance(body, MassProperties) and rung is not Rigid else body
 
 
 def sensor_inputs(
     sensor: Any, body: Any, torque: Any, ts: Array, state0: Any, states: Any
 ) -> tuple[Array, Any, Callable[[Array, Any], SensorInput]]:
-    """The times that a sensor shows at `ts` (T,), the states then, and its input at one of them.
+    """The times that a sensor shows at `ts` (T,), the states then, and its input at one time.
 
-    The two differ from `ts` and `states` where the sensor's clock has an `offset`.
+    Times and states differ from `ts` and `states` if the sensor's clock has an `offset`.
 
-    **Arguments:** `state0` the first state, without those of laws; `states` with a leading time
-    axis, `Coupled` where a law has states of its own.
+    **Arguments:** `state0` the initial state, without the torques' own; `states` with a leading
+    time axis, `Coupled` if a torque has states of its own.
     """
     turned = what_turns(body, type(state0))
     field = equations_of_motion(turned, state0, torque)

@@ -18,8 +18,8 @@ class Bodies(eqx.Module):
 
     Charts of the same kind are kept stacked, so that one program serves all recordings.
 
-    **Arguments:** `charts` name → chart. **Raises** `ValueError` for bodies of which some have a
-    mass and some have none.
+    **Arguments:** `charts` name → chart. **Raises** `ValueError` if some bodies have a mass and
+    some have none.
     """
 
     names: tuple[str, ...] = eqx.field(static=True)
@@ -45,23 +45,23 @@ class Bodies(eqx.Module):
         )
         if len({has_mass(chart) for chart in self.charts}) > 1:
             raise ValueError(
-                "body: wanted all bodies with a mass or none of them, got "
+                "body: wanted a mass for all bodies or for none, got "
                 + ", ".join(f"{n}: {type(c).__name__}" for n, c in charts.items())
             )
 
     @property
     def size(self) -> int:
-        """How many free numbers all of them have."""
+        """The number of free numbers of all bodies."""
         return sum(chart.size for chart in self.charts)
 
     @property
     def widest(self) -> int:
-        """How many free numbers the largest chart has."""
+        """The number of free numbers of the largest chart."""
         return max(chart.size for chart in self.charts)
 
     @property
     def in_words(self) -> str:
-        """What of the bodies is free."""
+        """The free parts of the bodies, in words."""
         parts = (f"{c.in_words} ({n})" for n, c in zip(self.names, self.charts, strict=True))
         return ", ".join(parts)
 
@@ -79,7 +79,7 @@ class Bodies(eqx.Module):
         return {n: c.body(parts[n]) for n, c in zip(self.names, self.charts, strict=True)}
 
     def body(self, vector: Float[Array, " chart"], which: Int[Array, ""]) -> Any:
-        """The body at the index `which`, of its numbers, padded with zeros."""
+        """The body at the index `which`, from its numbers, padded with zeros."""
         kind, row = jnp.asarray(self.kind_of)[which], jnp.asarray(self.row_of)[which]
         found: Any = None
         for index, charts in enumerate(self.kinds):

@@ -1,4 +1,4 @@
-"""What sensors would read of a motion that is known: simulated data."""
+"""The readings of sensors along a known motion: simulated data."""
 
 import math
 from collections.abc import Sequence
@@ -57,23 +57,23 @@ def simulate_readings(
     *,
     key: Any = None,
 ) -> Readings | tuple[Readings, ...]:
-    """What a sensor would read of a known motion, with noise: data for trying out a fit.
+    """The readings of a sensor along a known motion, with noise: data to test a fit.
 
-    The motion is that of `rigidjax.simulate`; bias, scale, mounting, clock offset, low-pass filter
-    and full scale are those of the sensor. A fit of the readings with the same sensor leaves
-    residuals that are the noise. It is differentiable, and works under `jax.jit` and `jax.vmap`.
+    The motion comes from `rigidjax.simulate`; bias, scale, mounting, clock offset, low-pass filter
+    and full scale come from the sensor. The residuals of a fit with the same sensor are the noise.
+    The function is differentiable, and works under `jax.jit` and `jax.vmap`.
 
-    **Arguments:** `sensor` an `AbstractSensor`, or a sequence of them, which then see one motion;
+    **Arguments:** `sensor` an `AbstractSensor`, or a sequence of them along one motion;
     `body`, `state0`, `ts` (T,) s, `torque` as for `rigidjax.simulate`; `MassProperties` are allowed
     for all states (a sensor's `place` is then in their frame). `key` of `jax.random`: normal noise
     of the sensor's standard deviation `noise` is added; `None` for readings without noise.
 
-    **Returns** readings (T, …) as the sensor's `reading_shape` says, in its unit, for
-    `Recording(ts, (sensor, readings), torque=torque)`; of a sequence a tuple of them.
+    **Returns** readings (T, …) by the sensor's `reading_shape`, in its unit, for
+    `Recording(ts, (sensor, readings), torque=torque)`; for a sequence a tuple of them.
 
-    **Raises:** `TypeError` for what is no sensor, and a state without what the sensor feels;
-    `ValueError` for a key where the sensor's noise is `None`, and for a sensor of one's own whose
-    readings have another shape than its error and that has no method `reading_of`; as
+    **Raises:** `TypeError` for anything but a sensor, and for a state without the parts that the
+    sensor reads; `ValueError` for a key if the sensor's noise is `None`, and for a sensor of your
+    own without a method `reading_of` if its readings have another shape than its error; as
     `rigidjax.simulate`.
 
     >>> import rigidjax as rj
@@ -132,7 +132,7 @@ def _readings(
 
 
 class _Plain(eqx.Module):
-    """Prediction plus error, of a sensor whose error is reading minus prediction."""
+    """Prediction plus error, for a sensor whose error is reading minus prediction."""
 
     sensor: AbstractSensor
 
@@ -143,7 +143,7 @@ class _Plain(eqx.Module):
 
 
 def _fits(sensor: Any, state0: Any, key: Any) -> None:
-    """Refuse what is no sensor, and one that needs more than there is."""
+    """Refuse anything but a sensor, and a sensor that needs more than the state has."""
     name, wanted = type(sensor).__name__, "a sensor such as Gyro(0.01), or several"
     _checks.instance(sensor, AbstractSensor, "sensor", wanted=wanted)
     if not isinstance(state0, sensor.feels):
@@ -154,11 +154,11 @@ def _fits(sensor: Any, state0: Any, key: Any) -> None:
     if sensor.noise is not None and jnp.shape(sensor.noise) != (sensor.components,):
         raise ValueError(
             f"sensor: {name}: noise: wanted shape ({sensor.components},), of one sensor, got "
-            f"{jnp.shape(sensor.noise)}; of many use jax.vmap"
+            f"{jnp.shape(sensor.noise)}; for many use jax.vmap"
         )
     if key is not None and sensor.noise is None:
         raise ValueError(
-            f"{name}: noise=None says no size of the noise to draw; give noise, or key=None"
+            f"{name}: noise=None gives no size of the noise to draw; give noise, or key=None"
         )
     if not hasattr(sensor, "reading_of") and math.prod(sensor.reading_shape) != sensor.components:
         raise ValueError(

@@ -1,4 +1,4 @@
-"""Stochastic descent by optax, for more recordings than one step of least squares can look at."""
+"""Stochastic descent by optax, for more recordings than one step of least squares can use."""
 
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
@@ -18,23 +18,23 @@ from rigidjax.identify.search import half_sum
 if TYPE_CHECKING:
     import optax
 
-# Steps between two looks at the keyboard and at whether the misfit is still a number.
+# Steps between two checks of the keyboard and of the misfit, which may become NaN.
 STRIDE = 50
 
 
 class Descent(eqx.Module):
-    """How a fit first descends on a few recordings at a time.
+    """The first descent of a fit, on a few recordings at a time.
 
     Each step draws `batch` recordings, differentiates their misfit (exactly, by forward mode within
     each recording) and hands the gradient of all parameters to `optimiser`. The parameters of a
     `Problem` are unconstrained and of order one, so that a learning rate is a share of order one.
 
-    **Arguments:** `optimiser` any `optax.GradientTransformation`; `steps` how many steps; `batch`
-    how many recordings a step looks at, drawn without replacement.
+    **Arguments:** `optimiser` any `optax.GradientTransformation`; `steps` their number; `batch` the
+    number of recordings in a step, drawn without replacement.
 
     Source: Robbins and Monro 1951, doi:10.1214/aoms/1177729586; the optimisers are optax's.
 
-    **Raises:** `TypeError` for what is no optimiser, `ValueError` for counts below one.
+    **Raises:** `TypeError` for anything but an optimiser, `ValueError` for counts below one.
 
     >>> import optax, rigidjax as rj
     >>> rj.identify.Descent(optax.adam(1e-2), steps=200, batch=4).batch
@@ -62,12 +62,12 @@ def descend(
     key: PRNGKeyArray,
     progress: Callable[[str], Any] | None = None,
 ) -> tuple[Parameters, bool]:
-    """Where the steps of `how` end; where the misfit stops being a number, the point before.
+    """The end of the steps of `how`, or the last point before the misfit became NaN.
 
     **Arguments:** `start`; `problem` of any number of recordings; `noise` (R, k) of each sensor;
     `how`; `key` of the draws; `progress` called with a line of text now and then. **Returns** the
-    point, and whether the steps were not interrupted (Ctrl-C). **Raises** `ValueError`
-    where a batch is larger than the number of recordings, or the recordings are pieces of one.
+    point, and whether the steps were not interrupted (Ctrl-C). **Raises** `ValueError` if a batch
+    is larger than the number of recordings, or the recordings are pieces of one.
     """
     if how.batch > problem.count:
         raise ValueError(
@@ -112,9 +112,9 @@ def _stride(
 
 
 def _misfit_of(point: Parameters, problem: Problem, noise: Noise, rows: Array) -> Float[Array, ""]:
-    """The whole misfit as these recordings show it: theirs times how many such batches there are.
+    """The estimate of the whole misfit by these recordings: theirs times the number of batches.
 
-    What holds the parameters beside the readings (priors) counts once.
+    Priors count once.
     """
     few, mine, theirs = only(problem, rows), _rows(point.own, rows), tuple(n[rows] for n in noise)
     weights = jnp.ones_like(few.records.t)
@@ -125,7 +125,7 @@ def _misfit_of(point: Parameters, problem: Problem, noise: Noise, rows: Array) -
 def only(problem: Problem, rows: Array) -> Problem:
     """The problem of some of its recordings, by their indices (which may be traced).
 
-    For misfits alone: its `recordings` are not cut to their own lengths.
+    It serves misfits alone: its `recordings` are not cut to their own lengths.
     """
 
     def pick(at: Any, whole: Any) -> Any:

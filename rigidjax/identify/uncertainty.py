@@ -1,4 +1,4 @@
-"""How sure a fit is: covariance, also where the errors are not white, and what the data miss."""
+"""The uncertainty of a fit: covariance, for white and other errors, undetermined directions."""
 
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -17,9 +17,9 @@ from rigidjax.identify.problem import Problem
 from rigidjax.identify.residual import Noise, weights_of, whitened, with_rows
 from rigidjax.identify.search import evaluate
 
-# A direction whose singular value is below this share of the largest is not seen at all.
+# A direction is undetermined if its singular value is below this share of the largest.
 BLIND = 1e-8
-# Columns of the Jacobian are brought to length one, but not from below this share of the longest.
+# Columns of the Jacobian are scaled to length one, unless shorter than this share of the longest.
 WEAKEST = 1e-6
 
 
@@ -28,7 +28,7 @@ class Linearised(eqx.Module):
 
     **Fields:** for each sensor `raw` errors (R, T, k) in its unit, whitened `errors` (R, T, k),
     `slopes` (R, T, k, m) in the m numbers that a recording depends on, `weights` (R, T); `places`
-    (R, m) where these are among the n free numbers, n for none; `extra` (j,) and `extra_slopes`
+    (R, m) of these among the n free numbers, n for none; `extra` (j,) and `extra_slopes`
     (j, n) of priors and joints.
     """
 
@@ -42,7 +42,7 @@ class Linearised(eqx.Module):
 
     @property
     def size(self) -> int:
-        """How many numbers are free."""
+        """The number of free numbers."""
         return int(self.extra_slopes.shape[-1])
 
     @property
@@ -63,7 +63,8 @@ class Linearised(eqx.Module):
     def rows(self) -> np.ndarray:
         """Rows (N, n) whose Gram matrix is that of the Jacobian, each row weighted.
 
-        Those of a recording are brought to a triangle: as many as the numbers it depends on.
+        The rows of a recording are reduced to a triangle: as many as the numbers that it depends
+        on.
         """
         if not np.isfinite(self.dense).all():
             return np.full((1, self.size), np.nan)
@@ -81,7 +82,7 @@ class Linearised(eqx.Module):
 
     @property
     def scores(self) -> np.ndarray:
-        """What each recording adds to the gradient of the misfit, (R, n)."""
+        """The part of each recording in the gradient of the misfit, (R, n)."""
         total: Any = sum(
             np.einsum("rtk,rtkm,rt->rm", error, slope, weight)
             for error, slope, weight in zip(self.errors, self.slopes, self.weights, strict=True)
@@ -117,8 +118,8 @@ def linearise(
 ) -> Linearised:
     """Errors, derivatives and weights at these parameters, as NumPy arrays.
 
-    **Arguments:** `found` what `evaluate` gives there, where that is known; `near` where the
-    derivatives are taken instead, of a flat body (`rigidjax.identify.flat_limit.beside`).
+    **Arguments:** `found` the result of `evaluate` there, if known; `near` another point for the
+    derivatives beside a flat body (`rigidjax.identify.flat_limit.beside`).
     """
     found = evaluate(parameters, problem) if found is None else found
     (errors, slopes, weights), where, extra, extra_slopes = jax.tree.map(
@@ -132,12 +133,13 @@ def linearise(
 
 
 class Spread(eqx.Module):
-    """Covariance of the parameters and what it rests on.
+    """Covariance of the parameters and its method.
 
-    **Fields:** `covariance` (n, n), infinite where a number depends on what is not seen; `seen`
-    (n, n) the same within what is seen; `kind` in words; `singular_values` (n,) of the weighted
-    Jacobian, its columns of length one; `null_directions` (k, n) that the data do not determine;
-    `root` (n, m) of the covariance of white errors, `root rootᵀ`.
+    **Fields:** `covariance` (n, n), infinite for a number that depends on an undetermined
+    direction; `seen` (n, n) the same within the determined directions; `kind` the method in words;
+    `singular_values` (n,) of the weighted Jacobian, its columns of length one; `null_directions`
+    (k, n) that the data do not determine; `root` (n, m) of the covariance of white errors,
+    `root rootᵀ`.
     """
 
     covariance: np.ndarray
@@ -149,18 +151,17 @@ class Spread(eqx.Module):
 
 
 def of_white(linear: Linearised) -> Spread:
-    """`(JᵀWJ)⁻¹`, whether the errors are white or not: what Laplace's method gives.
+    """`(JᵀWJ)⁻¹`, for white and other errors: the result of Laplace's method.
 
-    A direction whose singular value is below 1e-8 of the largest has infinite variance, not a
-    made-up one.
+    A direction has infinite variance if its singular value is below 1e-8 of the largest.
     """
     rows = linear.rows
     n = rows.shape[1]
     if not np.isfinite(rows).all():
         lost, kind = np.full((n, n), np.nan), "none: the motion is not finite"
         return Spread(lost, lost, kind, np.full(n, np.nan), np.zeros((0, n)), lost)
-    # Columns of order one: a bias in rad/s must not look blind beside a moment. But a column of
-    # round-off is not to be blown up.
+    # Columns of order one: a bias in rad/s must not look undetermined beside a moment. But a column
+    # of round-off must not be scaled up.
     size = np.sqrt(np.sum(rows**2, axis=0))
     size = np.maximum(size, max(WEAKEST * size.max(), 1e-300))
     _, singular, directions = np.linalg.svd(rows / size, full_matrices=False)
@@ -175,17 +176,17 @@ def of_white(linear: Linearised) -> Spread:
 
 
 def spread(linear: Linearised, times: "Times", white: Spread | None = None) -> Spread:
-    """`(JᵀWJ)⁻¹` where the errors are white, else the sandwich `H⁻¹ M H⁻¹`.
+    """`(JᵀWJ)⁻¹` for white errors, else the sandwich `H⁻¹ M H⁻¹`.
 
-    `M = Jᵀ C J` with C the errors' own covariance in time: of each channel the part that its second
-    differences show is white, the rest fades exponentially. Over which time it fades fitted errors
-    do not tell well, for a fit takes the slow part of them away: of all times from two samples to
-    half a record that one counts which makes a number least sure. Fitted errors are smaller than
-    true ones, the more so the fewer of them are independent: M is scaled up by n/(n − p) for n
-    independent errors. With many recordings, what differs between them is taken where it is more.
+    `M = Jᵀ C J` with C the errors' own covariance in time. The part of each channel that its second
+    differences show is white; the rest decays exponentially. Fitted errors do not show the decay
+    time well, since a fit removes their slow part. Each number gets the largest variance over all
+    times from two samples to half a record. Fitted errors are smaller than true ones, the more so
+    the fewer are independent: M is multiplied by n/(n − p) for n independent errors. With many
+    recordings the variance between recordings is used if it is larger.
 
-    **Arguments:** `linear`; `times` over how long the errors are autocorrelated; `white` what
-    `of_white` gives, where that is known.
+    **Arguments:** `linear`; `times` the errors' autocorrelation times; `white` the result of
+    `of_white`, if known.
 
     Source: White 1980, doi:10.2307/1912934; Liang and Zeger 1986, doi:10.1093/biomet/73.1.13.
     """
@@ -200,7 +201,7 @@ def spread(linear: Linearised, times: "Times", white: Spread | None = None) -> S
 
 
 def _blinded(covariance: np.ndarray, null: np.ndarray) -> np.ndarray:
-    """The covariance, infinite where a number depends on what is not seen."""
+    """The covariance, infinite for a number that depends on an undetermined direction."""
     shown = covariance.copy()
     blind = np.abs(null).max(axis=0, initial=0.0) > 1e-6
     shown[blind, blind] = np.inf
@@ -208,7 +209,7 @@ def _blinded(covariance: np.ndarray, null: np.ndarray) -> np.ndarray:
 
 
 def inverted(information: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A root (n, m) of the covariance within what is seen, and what is not, `null` (k, n)."""
+    """A root (n, m) of the covariance in determined directions; the others are `null` (k, n)."""
     size = np.sqrt(np.diag(information))
     size = np.maximum(size, max(WEAKEST * size.max(), 1e-300))
     values, vectors = np.linalg.eigh(information / np.outer(size, size))
@@ -219,16 +220,16 @@ def inverted(information: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def step(linear: Linearised, white: Spread) -> np.ndarray:
-    """The step (n,) to the least misfit of the linear problem, −(JᵀWJ)⁻¹g within what is seen."""
+    """The step (n,) to the linear least misfit, −(JᵀWJ)⁻¹g in determined directions."""
     return -white.seen @ linear.slope
 
 
 def distance(linear: Linearised, white: Spread, held: Sequence[np.ndarray] = ()) -> float:
-    """How many standard deviations of white errors away the least misfit is, √(gᵀ(JᵀWJ)⁻¹g).
+    """The distance to the least misfit in standard deviations of white errors, √(gᵀ(JᵀWJ)⁻¹g).
 
-    As the linear problem has it, within what is seen: the criterion of MINUIT (James and Roos 1975,
-    doi:10.1016/0010-4655(75)90039-9). **Arguments:** `white` what `of_white` gives; `held`
-    derivatives (n,) of what is to stay.
+    It is the linear problem's distance in determined directions: the criterion of MINUIT (James and
+    Roos 1975, doi:10.1016/0010-4655(75)90039-9). **Arguments:** `white` the result of `of_white`;
+    `held` derivatives (n,) of a quantity held fixed.
     """
     covariance = white.seen
     for row in held:
@@ -240,8 +241,8 @@ def distance(linear: Linearised, white: Spread, held: Sequence[np.ndarray] = ())
 def _sandwich(linear: Linearised, half: np.ndarray, times: "Times") -> np.ndarray:
     """The sandwich whose bread is `half halfᵀ`.
 
-    The meat is that of orthonormal columns: of slopes, between two breads, round-off would make
-    the variance of a direction that is hardly seen negative.
+    The meat is computed for orthonormal columns. For slopes between two breads, round-off would
+    make the variance of a weakly determined direction negative.
     """
     columns, triangles = np.linalg.qr(linear.dense)
     seen = np.concatenate(linear.apart(triangles)) @ half
@@ -255,9 +256,9 @@ def _sandwich(linear: Linearised, half: np.ndarray, times: "Times") -> np.ndarra
     scores = linear.scores @ half
     records = scores.shape[0]
     if records > n // 2 and records > 5:
-        # Many recordings: what differs between them shows without any model of their errors.
+        # Many recordings: the variance between them needs no model of their errors.
         found.append(half @ (scores.T @ scores) @ half.T * records / (records - 1))
-    # Never narrower than white errors would have it.
+    # Never narrower than for white errors.
     all_ = np.stack([np.sum(half**2, axis=1), *(np.diag(c) for c in found)])
     least = np.maximum(all_[0], 1e-300)
     out = found[int(np.argmax((all_[1:] / least).mean(axis=1)))]
@@ -267,7 +268,7 @@ def _sandwich(linear: Linearised, half: np.ndarray, times: "Times") -> np.ndarra
 
 
 def _channels(linear: Linearised, columns: np.ndarray) -> Iterator[tuple[np.ndarray, float, float]]:
-    """Of each channel the `columns` (R, T, m), the variance of its errors, its smooth share.
+    """For each channel the `columns` (R, T, m), the variance of its errors, its smooth share.
 
     `columns` (R, N, m) of each recording, rows as in `Linearised.dense`.
     """
@@ -283,11 +284,11 @@ def _channels(linear: Linearised, columns: np.ndarray) -> Iterator[tuple[np.ndar
 
 
 def _meat(channels: list[tuple[np.ndarray, float, float]], time: float) -> np.ndarray:
-    """`Jᵀ C J` with C the scatter of each channel and a part that fades over `time` samples."""
+    """`Jᵀ C J` with C the scatter of each channel and a part that decays over `time` samples."""
     meat: Any = 0.0
     fade = float(np.exp(-1.0 / time))
     for j, variance, share in channels:
-        # Of the sums over earlier and later errors one is the other's transpose.
+        # The sum over earlier errors is the transpose of the sum over later ones.
         at_once, ahead = (j.transpose(0, 2, 1) @ x for x in (j, _fading(j, fade)))
         spread = share * (ahead + ahead.transpose(0, 2, 1)) + (1.0 - 2.0 * share) * at_once
         meat = meat + variance * spread
@@ -302,9 +303,9 @@ def smooth_share(e: np.ndarray, seen: np.ndarray) -> float:
 
 
 def scatter(rows: list[np.ndarray]) -> float:
-    """The variance that rows would have if they were white, by their second differences."""
+    """The variance of rows by their second differences, as if they were white."""
     bends = np.concatenate([row[2:] - 2.0 * row[1:-1] + row[:-2] for row in rows])
-    # The second difference of white noise has six times its variance.
+    # The second difference of white noise has six times the variance of the noise.
     return float(np.mean(bends**2)) / 6.0 if bends.size else 0.0
 
 
@@ -321,11 +322,11 @@ def _fading(x: np.ndarray, rho: float) -> np.ndarray:
 
 
 class Times(eqx.Module):
-    """Over how many samples the errors are autocorrelated, for each channel of each sensor.
+    """The number of samples over which errors are autocorrelated, for each channel of each sensor.
 
     **Fields:** `spans` one tuple for each sensor, 1 for white errors; `closeness` the correlation
-    from one sample to the next in the channel of the longest; `independent` how many errors that
-    makes independent.
+    from one sample to the next in the channel of the longest; `independent` the number of
+    independent errors.
     """
 
     spans: tuple[tuple[float, ...], ...]
@@ -341,8 +342,8 @@ class Times(eqx.Module):
 def correlation_times(linear: Linearised, cut: tuple[np.ndarray, ...] | None = None) -> Times:
     """The integrated autocorrelation time `1 + 2 Σ ρ_l` of each channel.
 
-    Summed up to the first lag at which ρ falls below twice its own scatter. Readings at full scale
-    (`cut`, (R, T, k) for each sensor) take no part.
+    The sum ends at the first lag at which ρ falls below twice its own scatter. Readings at full
+    scale (`cut`, (R, T, k) for each sensor) take no part.
     """
     cut = tuple(np.zeros(e.shape, bool) for e in linear.errors) if cut is None else cut
     spans, longest, closest, independent = [], 1.0, 0.0, 0.0
@@ -369,7 +370,7 @@ def _channel_time(e: np.ndarray, seen: np.ndarray) -> tuple[float, float]:
     total, first = 1.0, 0.0
     noise = 2.0 / np.sqrt(max(seen.sum(), 1))
     for lag in range(1, max(2, e.shape[1] // 3)):
-        # Each lag has fewer pairs than there are squares.
+        # Each lag has fewer pairs than lag zero.
         pairs = np.sum(seen[:, lag:] & seen[:, :-lag])
         if pairs < 10:
             break
@@ -385,8 +386,8 @@ def _channel_time(e: np.ndarray, seen: np.ndarray) -> tuple[float, float]:
 def estimate_noise(problem: Problem, errors: tuple, noise: Noise, parameters: Parameters) -> Noise:
     """Noise (R, k) of each sensor: as given, or the weighted scatter of its errors.
 
-    One figure for all channels of a sensor and all recordings of a group. The number of free
-    parameters is taken off the number of errors.
+    It is one figure for all channels of a sensor and all recordings of a group. The number of free
+    parameters is subtracted from the number of errors.
     """
     free = ravel_pytree(parameters)[0].size
     weights = weights_of(problem, errors, noise)
@@ -402,13 +403,13 @@ def estimate_noise(problem: Problem, errors: tuple, noise: Noise, parameters: Pa
         if reading.sensor.noise is not None:
             out.append(sigma)
             continue
-        # What a reading at full scale is off by is no noise.
+        # The error of a reading at full scale is no noise.
         kept = reading.seen[..., None] & ~full
         squares = np.asarray(weight)[..., None] * np.asarray(error) ** 2
         squares = np.sum(np.where(kept, squares, 0.0), axis=(1, 2))
         seen = kept.sum(axis=(1, 2))
         variance = np.bincount(groups, squares) / np.maximum(np.bincount(groups, seen), 1) / share
-        # Data without noise must not divide by zero: round-off is the least that is believed.
+        # Data without noise must not divide by zero: the least noise is round-off.
         floor = 1e-15 * float(jnp.abs(reading.values).max() + 1e-300)
         found = np.maximum(np.sqrt(variance), floor)[groups]
         out.append(jnp.broadcast_to(jnp.asarray(found, sigma.dtype)[:, None], sigma.shape))

@@ -1,4 +1,4 @@
-"""Which combinations of numbers the data do not determine, by the user's names."""
+"""The combinations of numbers that the data do not determine, by the user's names."""
 
 from typing import TYPE_CHECKING
 
@@ -21,20 +21,20 @@ from rigidjax.rotation import quaternion
 if TYPE_CHECKING:
     from rigidjax.identify.result import Fit
 
-# A number takes part where it changes by more than this share of the largest change.
+# A number takes part if it changes by more than this share of the largest change.
 PART = 1e-3
-# What is left of a direction below this share is round-off.
+# A rest of a direction below this share is round-off.
 ROUND_OFF = 1e-5
-# Changes by the same factor differ by less than this share.
+# Two changes count as the same factor if they differ by less than this share.
 EVEN = 0.01
-# So many numbers of one combination are written out, so many combinations.
+# The largest number of names written for a combination, and of combinations.
 MOST, SEVERAL = 6, 5
 
 
 class Combination(eqx.Module):
     """Numbers that may change together without changing a reading.
 
-    **Fields:** `names`; small `changes` of each: relative where `relative` says so, else in its
+    **Fields:** `names`; small `changes` of each: relative if `relative` is true, else in its
     `units`.
 
     >>> Combination(("I1", "I2"), (0.01, 0.01), ("", ""), (True, True)).in_words
@@ -80,9 +80,9 @@ TENSOR = dict(zip(Tensor.plain_names, COMPONENTS, strict=True))
 def undetermined(fit: "Fit") -> tuple[Combination, ...]:
     """The combinations that the data do not determine at all, each of few numbers.
 
-    The rows of `Fit.null_directions` are any basis; here each has a number that no other has (the
-    reduced echelon form), in the axes, the world's or the body's, in which the first attitudes
-    take fewer numbers.
+    The rows of `Fit.null_directions` are an arbitrary basis. Here each row has a number that no
+    other has (the reduced echelon form). Initial attitudes are in the axes, world or body, that
+    need fewer numbers.
     """
     null = np.asarray(fit.null_directions)
     if not null.size:
@@ -104,7 +104,7 @@ def undetermined(fit: "Fit") -> tuple[Combination, ...]:
             best = rows, names, size
     assert best is not None
     rows, names, size = best
-    # In the order of their first numbers: that of the directions is round-off.
+    # In the order of their first numbers: the order of the directions depends on round-off.
     rows = sorted((row for row in rows if row.any()), key=lambda row: np.flatnonzero(row)[0])
     return tuple(_combination(row, names, size, values) for row in rows)
 
@@ -116,7 +116,7 @@ def _combination(
     # The largest change: a hundredth of the number, or of its size; the first number goes up.
     changes = 0.01 * np.sign(row[order[0]]) * row / np.abs(row).max() * size
     relative = np.array([name[2] for name in names])
-    # Numbers that only have the same factor are better told so.
+    # Numbers with the same factor get a shorter sentence.
     shares = np.where(relative, changes, changes / np.where(values == 0, np.inf, values))[order]
     if np.ptp(np.abs(shares)) < EVEN * np.abs(shares).max():
         changes[order] = 0.01 * shares / np.abs(shares).max()
@@ -130,7 +130,7 @@ def _combination(
 
 
 def _names(problem: Problem) -> list[list[tuple[str, str, bool]]]:
-    """Name, unit, whether relative, of what `_numbers` gives; for the world's axes, the body's."""
+    """Name, unit, and whether relative, for `_numbers` in the world's axes, then the body's."""
     of_all = labels(problem)
     for name, chart in charts(problem):
         unit = chart.unit.replace("SI", "kg m²")
@@ -140,7 +140,7 @@ def _names(problem: Problem) -> list[list[tuple[str, str, bool]]]:
         turn = (own.turn, f"attitude about {axes}", "rad")
         parts = (turn, (own.place, "position", "m"), (own.speed, "velocity", "m/s"))
         rows = [
-            (f"the first {name} {k}{where}", unit, False)
+            (f"the initial {name} {k}{where}", unit, False)
             for part, name, unit in parts
             if part is not None
             for where in recording_names(problem)
@@ -152,11 +152,10 @@ def _names(problem: Problem) -> list[list[tuple[str, str, bool]]]:
 
 @eqx.filter_jit
 def _slopes(problem: Problem, parameters: Parameters) -> tuple[Array, Array]:
-    """The derivatives (2, M, n) of the numbers by which directions are named, in the free ones,
-    and their values (M,).
+    """The derivatives (2, M, n) of the named numbers in the free ones, and their values (M,).
 
-    All that is reported, the tensors of the bodies, and the first attitudes, positions and
-    velocities; the attitudes in the world's axes, then in the body's.
+    They are all reported quantities, the tensors of the bodies, and the initial attitudes,
+    positions and velocities; the attitudes in the world's axes, then in the body's.
     """
     flat, restore = ravel_pytree(parameters)
     reference = problem.reference
@@ -183,13 +182,13 @@ def _slopes(problem: Problem, parameters: Parameters) -> tuple[Array, Array]:
 
 
 def _kept(fit: "Fit", names: list[str], changes: np.ndarray) -> np.ndarray:
-    """Which numbers name the changes (k, M): of each body its moments; where the principal axes
-    turn, the components of its tensor.
+    """The numbers that name the changes (k, M): the moments of each body, or the components of its
+    tensor if the principal axes turn.
     """
     rows = in_a_row(fit.problem.bodies(fit.beside))
     kept = np.ones(len(names), bool)
     for (where, chart), body in zip(charts(fit.problem), rows, strict=True):
-        # A chart may report these components, too: the last are those of all charts.
+        # A chart may report these components, too: the last entries exist for all charts.
         every = [[i for i, one in enumerate(names) if one == f"{part}{where}"] for part in TENSOR]
         places = [some[-1] for some in every]
         kept[[i for some in every for i in some]] = False

@@ -1,9 +1,9 @@
-"""How much recordings deviate from a shared number, estimated from their deviations.
+"""The width of the recordings' deviations from a shared number, estimated from them.
 
-The width σ of the deviations d_r maximises the marginal likelihood, the deviations and all else
-integrated out about the best point (Laplace). By expectation and maximisation: σ² is the mean of
-d_r² and of what is not known of d_r (Dempster, Laird and Rubin 1977, section 4.5; Laird and Ware
-1982, doi:10.2307/2529876).
+The width σ of the deviations d_r maximises the marginal likelihood, with all other numbers
+integrated out about the best point (Laplace). The method is expectation and maximisation: σ² is the
+mean of d_r² plus the posterior variance of d_r (Dempster, Laird and Rubin 1977, section 4.5; Laird
+and Ware 1982, doi:10.2307/2529876).
 """
 
 import equinox as eqx
@@ -18,15 +18,14 @@ from rigidjax.identify.problem import Problem
 from rigidjax.identify.residual import Noise
 from rigidjax.identify.search import again
 
-# Rounds, and the relative change at which they end; a width that falls below so much of the first
-# one is zero.
+# Rounds, and the relative change at which they end; a width below so much of the first one is zero.
 _ROUNDS, _SETTLED, _LEAST = 40, 0.01, 1e-4
 
 
 def with_widths(
     problem: Problem, best: Tried, noise: Noise, tolerance: float, max_steps: int
 ) -> tuple[Problem, Tried]:
-    """The problem with the widths that are to be estimated, and its best point near `best`."""
+    """The problem with the estimated widths, and its best point near `best`."""
     wanted = [index for index, slot in enumerate(problem.slots) if slot.estimated]
     if not wanted:
         return problem, best
@@ -43,12 +42,12 @@ def with_widths(
 
 
 def _widths(problem: Problem) -> np.ndarray:
-    """Of each `Free`, in steps; 1 for those that have none."""
+    """The width of each `Free`, in steps; 1 for a `Free` without one."""
     return np.array([1.0 if s.spread is None else float(s.spread) for s in problem.slots])
 
 
 def _expected(problem: Problem, parameters: Parameters, noise: Noise) -> np.ndarray:
-    """The root mean square of each one's deviations, what is not known of them included."""
+    """The root mean square of each one's deviations, with their uncertainty included."""
     linear = uncertainty.linearise(problem, parameters, noise)
     variance = np.diag(uncertainty.of_white(linear).seen)
     values, places = (by_slot(problem, of) for of in (parameters, numbered(parameters)))
@@ -61,5 +60,5 @@ def _expected(problem: Problem, parameters: Parameters, noise: Noise) -> np.ndar
 
 
 def widths(problem: Problem) -> dict[str, jax.Array]:
-    """The spread of each `Free` that has one, by name, in its unit."""
+    """The spread of each `Free` with one, by name, in its unit."""
     return {s.name: s.spread * s.scale for s in problem.slots if s.spread is not None}

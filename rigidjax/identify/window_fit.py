@@ -27,28 +27,28 @@ from rigidjax.motion.torques.inputs import delays_of, require_inputs
 from rigidjax.solve.validation import require_fit
 
 Value = TypeVar("Value")
-# Windows side by side: with their tangents they fill the first cache.
+# Windows in one batch: with their tangents they fill the first cache.
 _SIDE_BY_SIDE = 8
-# A step of so many standard deviations, if errors were as large as `noise`, is the last.
+# The last step has so many standard deviations, for errors as large as `noise`.
 _SETTLED = 1e-5
-# A step that gains less than this part of what a fit gains from noise alone is the last: as much as
-# 0.05 standard deviations from the least cost. The first searches need not come so near.
+# The last step gains less than this part of the gain of a fit from noise alone: about 0.05 standard
+# deviations from the least cost. The first searches need not come so near.
 _LEVEL, _ROUGH = 0.05**2, 1.0
-# A deviation of so many times a number that is of order one says that nothing is known of it.
+# A number of order one with a larger deviation than this is unknown.
 VAGUE = 100.0
-# Windows are first followed for a ninth and a third of their length, if that is so many steps.
+# The search first uses a ninth and a third of the windows, if these have so many steps.
 _PARTS, _SHORTEST, _FEW = (9, 3), 5, 10
 
 
 class WindowFit(eqx.Module, Generic[Value]):
-    """What `fit_windows` returns.
+    """The result of `fit_windows`.
 
     **Fields:** `value` the free numbers, of the type of the guess; `deviation` their standard
-    deviations, from how the windows differ (sandwich; of windows that overlap they are too small),
-    infinite for a number that no window shows, NaN where windows are too few;
+    deviations, from the differences between windows (sandwich; they are too small if windows
+    overlap), infinite for a number that no window shows, NaN if windows are too few;
     `cost` half the mean square, errors in units of `noise`; `noise` by kind; `steps` taken over the
     whole windows;
-    `converged`; `message` what there is to say; `scene` as given.
+    `converged`; `message` remarks; `scene` as given.
 
     >>> import rigidjax as rj
     >>> t = np.linspace(0.0, 1.0, 11)
@@ -83,28 +83,28 @@ def fit_windows(
     starts: Mapping[str, float] | None = None,
     max_steps: int = 50,
 ) -> WindowFit[Value]:
-    """The free numbers with which open-loop runs of all windows come nearest to what was measured.
+    """The free numbers with the least errors of open-loop runs over all windows.
 
     **Arguments:** `windows`; `scene` a function of the free numbers → (body, torque), whose torque
-    reads the inputs of the windows; `guess` the free numbers to begin with, any tree of arrays;
-    `noise` by kind (`x`, `v`, `q`, `omega`) what an error is measured in: by default the rms of a
-    prediction that holds the state at the start; `starts` by kind how far the measured starts may
-    be off (a standard deviation, beside the `noise` of the readings, which must be given with it;
-    `np.inf`: the start is free); `None` takes them as they were measured; `max_steps` of the
-    search. Steps of the motion are those of `RungeKutta4`, one a sample.
+    reads the inputs of the windows; `guess` the initial free numbers, any tree of arrays; `noise`
+    by kind (`x`, `v`, `q`, `omega`) the unit of an error: by default the rms of a prediction that
+    holds the state at the start; `starts` by kind the standard deviation of the measured starts
+    (the `noise` of the readings must be given with it; `np.inf`: the start is free); `None` takes
+    the starts as measured; `max_steps` of the search. The motion is computed by `RungeKutta4`, one
+    step a sample.
 
     Levenberg–Marquardt (`rigidjax.identify.levenberg_marquardt`) on normal equations that are
-    summed window by window, so that memory does not grow with their number. Starts that may be off
-    are found window by window, and taken out of the normal equations (variable projection). From a
-    poor guess a long run has lost its way: long windows are first followed for a ninth and a third
-    of their length, ten steps of the search at most for each, and the search goes on from there
-    (from the guess, if it ended higher than the cost at the guess). The search ends where a step
-    gains less than 0.05² of what noise alone lets a fit gain: about 0.05 standard deviations.
+    summed window by window, so that memory does not grow with their number. Uncertain starts are
+    found window by window, and eliminated from the normal equations (variable projection). A long
+    run from a poor guess diverges: the search first uses a ninth and a third of long windows, with
+    ten steps at most for each, and continues from there (from the guess, if the cost is higher than
+    at the guess). The search ends when a step gains less than 0.05² of the gain of a fit from noise
+    alone: about 0.05 standard deviations.
 
     **Returns** a `WindowFit`; a fit that ends early returns its best point and says so.
 
-    **Raises:** `ValueError` for inputs that are missing, kinds that there are not, a guess whose
-    runs are not finite; `TypeError` where body, states and torque do not fit.
+    **Raises:** `ValueError` for missing inputs, unknown kinds, and a guess with runs that are not
+    finite; `TypeError` if body, states and torque do not fit together.
 
     >>> import rigidjax as rj
     >>> t = np.linspace(0.0, 1.0, 11)
@@ -142,7 +142,7 @@ def fit_windows(
     if not np.isfinite(end.cost):
         raise ValueError("guess: the runs from it are not finite; is the scene right?")
     value, taken = back(end.point), int(end.taken) - 1
-    # Once more where it ended, if the last that was tried was no better.
+    # Evaluated once more at the best point, if the last trial was no better.
     there = end if end.here else searched(value, evaluated, whole)
     converged = bool(end.converged)
     message = [] if converged else [f"stopped after {taken} steps: its best point"]
@@ -165,9 +165,9 @@ def fit_windows(
 
 
 def _deviations(there: Search, point: np.ndarray, count: int) -> tuple[np.ndarray, list[str]]:
-    """Standard deviations (n,) of the free numbers by how `count` windows differ, and remarks."""
+    """Standard deviations (n,) by the differences of `count` windows, and remarks."""
     half, null = inverted(np.asarray(there.gram))
-    # The meat between roots: between covariances, round-off would make variances negative.
+    # The meat stands between roots: between covariances round-off would make variances negative.
     sizes, axes = np.linalg.eigh(half.T @ np.asarray(there.found) @ half)
     root = half @ axes * np.sqrt(np.maximum(sizes, 0.0))
     deviation, message = carried(np.eye(point.size), root @ root.T, null), []
@@ -179,12 +179,12 @@ def _deviations(there: Search, point: np.ndarray, count: int) -> tuple[np.ndarra
     vague = np.flatnonzero(deviation > VAGUE * np.maximum(1.0, np.abs(point)))
     if vague.size:
         listed = ", ".join(f"number {k} (± {deviation[k]:.3g})" for k in vague)
-        message.append(f"of the flattened free numbers these are not determined: {listed}")
+        message.append(f"these of the flattened free numbers are not determined: {listed}")
     return deviation, message
 
 
 def _grown(searched: Any, guess: Any, back: Any, length: int) -> Any:
-    """Where searches over the first parts of the windows lead, each from where the last ended."""
+    """The end of searches over the first parts of the windows, one after another."""
     value = guess
     for part in _PARTS:
         if length // part >= _SHORTEST:
@@ -226,7 +226,7 @@ def _require_scene(windows: Windows, start: Any, made: Any) -> None:
 
 
 def _too_late(windows: Windows, law: Any) -> str | None:
-    """What is wrong where a delay goes beyond the inputs that the windows know."""
+    """The error if a delay goes beyond the inputs of the windows."""
     known, length = windows.before * windows.step, windows.length * windows.step
     for name, delay in delays_of(law):
         late = f"inputs[{name!r}]: a delay of {float(delay):.6g} s"
@@ -241,7 +241,7 @@ def _too_late(windows: Windows, law: Any) -> str | None:
 
 
 def _scales(windows: Windows, steps: int, noise: Mapping[str, float] | None) -> Float[Array, " m"]:
-    """Of each number of an error, what it is measured in: of windows of so many steps."""
+    """The unit of each number of an error, for windows of so many steps."""
     kinds = names(windows.starts)
     if noise is not None:
         require_kinds(noise, kinds, "noise")
@@ -255,8 +255,8 @@ def _scales(windows: Windows, steps: int, noise: Mapping[str, float] | None) -> 
 
 
 def _padded(windows: Windows) -> tuple[Any, Any, Any]:
-    """Starts, states and inputs of the windows, the last one repeated so that their number is a
-    multiple of those that go side by side: a remainder would be a program of its own to compile.
+    """Starts, states and inputs of the windows. The last window is repeated until their number is a
+    multiple of the batch: a remainder would need a second program.
     """
     order = np.minimum(
         np.arange(-(-windows.count // _SIDE_BY_SIDE) * _SIDE_BY_SIDE), windows.count - 1
@@ -277,7 +277,7 @@ def _searched(
     settings: Settings,
     steps: Any,
 ) -> Search:
-    """The search from `guess`; what it keeps is the spread of the windows' gradients (n, n).
+    """The search from `guess`; it keeps the spread of the windows' gradients (n, n).
 
     `count` of the windows, the first ones, take part, and the first `steps` of each.
     """
@@ -324,10 +324,10 @@ def _searched(
 
 
 def _by_noise(spread: Array, gram: Array) -> Array:
-    """½ tr(K G⁻¹): how much higher than the least the cost is at the true numbers, on the average.
+    """½ tr(K G⁻¹): the mean excess of the cost at the true numbers over the least cost.
 
-    Half a residual's variance a number where residuals are independent. Source: Takeuchi 1976;
-    Burnham and Anderson 2002, doi:10.1007/b97636, section 7.2.
+    It is half a residual's variance for each number if residuals are independent. Source: Takeuchi
+    1976; Burnham and Anderson 2002, doi:10.1007/b97636, section 7.2.
     """
     felt = jnp.diagonal(gram)
     root = jnp.sqrt(jnp.maximum(felt, 1e-12 * jnp.max(felt)))

@@ -1,6 +1,6 @@
-"""Starts of windows that are not exactly known: found window by window, and taken out of the fit.
+"""Uncertain starts of windows: found window by window, and eliminated from the fit.
 
-What is left is a problem in the free numbers alone, of the same size as with known starts (variable
+The remaining problem has the free numbers alone, the same size as with known starts (variable
 projection: Golub and Pereyra 2003, doi:10.1088/0266-5611/19/2/201).
 """
 
@@ -22,18 +22,17 @@ _STEPS = 3
 def precisions(
     starts: Any, kinds: tuple[str, ...], noise: Mapping[str, float] | None
 ) -> Float[Array, " m"] | None:
-    """How firmly each number of the starts is held, (noise/deviation)²; `None` for exactly.
+    """The precision of each number of the starts, (noise/deviation)²; `None` for exact starts.
 
-    **Raises:** `TypeError`, `ValueError` for kinds that there are not, deviations that are not
-    positive, or no noise to compare them with.
+    **Raises:** `TypeError`, `ValueError` for unknown kinds, deviations that are not positive, or a
+    missing noise.
     """
     if starts is None:
         return None
     require_kinds(starts, kinds, "starts")
     if noise is None:
         raise ValueError(
-            "starts: how far they may be off says something only beside the noise of the readings: "
-            "give noise={…}, too"
+            "starts: deviations of the starts need the noise of the readings: give noise={…}, too"
         )
     found = []
     for kind in kinds:
@@ -48,7 +47,7 @@ def precisions(
 
 
 def require_kinds(given: Any, kinds: tuple[str, ...], name: str) -> None:
-    """Raise `TypeError`, `ValueError` for what is not a mapping with these keys."""
+    """Raise `TypeError`, `ValueError` for anything but a mapping with these keys."""
     _checks.instance(given, Mapping, name, wanted="numbers by kind")
     if set(given) != set(kinds):
         raise ValueError(f"{name}: wanted a number for each of {kinds}, got {tuple(given)}")
@@ -74,7 +73,7 @@ def eliminated(
     jacobian, found = with_jacobian(lambda z: residual(z[:number], z[number:]), both)
     gram, slope = jacobian.T @ jacobian, jacobian.T @ found
     beside = gram[number:, number:] + jnp.diag(firm)
-    # What the start can take up of each number's effect, and what is left of the gradient there.
+    # The part of each number's effect that the start absorbs, and the remaining gradient.
     sides = jnp.concatenate(
         [gram[number:, :number], (slope[number:] + firm * step)[:, None]], axis=1
     )

@@ -1,7 +1,7 @@
-"""Many short open-loop runs from measured starts: how driven machines are identified.
+"""Many short open-loop runs from measured starts, to identify driven machines.
 
-A record of measured states is cut into windows; from the start of each the model runs on its own,
-driven by the recorded inputs, and is compared with what was measured at every step.
+A record of measured states is cut into windows. The model runs open-loop from the start of each,
+driven by the recorded inputs, and is compared with the measured states at every step.
 """
 
 from collections.abc import Mapping
@@ -20,11 +20,11 @@ from rigidjax.motion.manifold import names
 
 
 class Windows(eqx.Module):
-    """Short runs of one length. `windows` makes them; `Windows.joined` puts some together.
+    """Short runs of one length. `windows` makes them; `Windows.joined` joins several.
 
     **Fields:** `step` s between samples; `starts` N states; `wanted` the L states that follow each
     start, with leading axes (N, L); `inputs` by name (N, before + L, *k), row before + i held
-    through step i, where no delay is asked for; `before` how many rows come before the start.
+    through step i, if there is no delay; `before` the number of rows before the start.
 
     >>> found = windows(np.arange(6.0), Spin(np.ones((6, 3))), length=2, stride=2)
     >>> found.count, found.length, found.wanted.omega.shape
@@ -39,12 +39,12 @@ class Windows(eqx.Module):
 
     @property
     def count(self) -> int:
-        """How many windows."""
+        """The number of windows."""
         return int(self.starts.omega.shape[0])
 
     @property
     def length(self) -> int:
-        """How many steps each has."""
+        """The number of steps of each."""
         return int(self.wanted.omega.shape[1])
 
     def held(self) -> Horizons:
@@ -89,10 +89,10 @@ def windows(
 
     **Arguments:** `t` (T,) s, evenly spaced but for gaps; `states` a `Spin`, `Attitude` or `Rigid`
     with a leading axis (T,); `inputs` by name (T, *k), each held until the next sample, for the
-    `rigidjax.torques.Input`s of a law; `before` how many samples of the inputs are kept before each
-    start, for a law that delays them (`rigidjax.torques.Delayed`) or has states of its own, as
-    `Lagged` has: these begin there, and follow the inputs up to the start while the body is held as
-    it was measured at the start. No window, with what is before it, goes across a gap.
+    `rigidjax.torques.Input`s of a torque; `before` the number of input samples kept before each
+    start, for a torque that delays them (`rigidjax.torques.Delayed`) or has states of its own, such
+    as `Lagged`. These states begin there, and follow the inputs up to the start, with the body held
+    at its measured start. No window, with the samples before it, goes across a gap.
 
     **Raises:** `ValueError` for shapes that do not agree, NaN, times that are uneven, a record
     without a window of this length; `TypeError` for other states.
@@ -162,7 +162,7 @@ def _require_rows(times: np.ndarray, states: Any, inputs: Mapping[str, Any]) -> 
 
 
 def _step_of(times: np.ndarray) -> tuple[float, np.ndarray]:
-    """The time between samples, s, and after which there is no gap."""
+    """The time between samples, s, and the samples without a gap after them."""
     gaps = np.diff(times)
     h = float(np.median(gaps))
     even = np.abs(gaps - h) <= 1e-3 * h

@@ -1,8 +1,9 @@
 """Equations of motion from any Lagrangian by differentiation; Euler angles as the worked case.
 
-A cross-check and for teaching, and for scenes that bring their own coordinates. For a rigid body
-the equations of `Attitude` cost less and have no singular attitude: in Euler angles the equations
-break at sin θ = 0, and near it steps become many and small. `lie_poisson` is the Hamiltonian side.
+It serves as a cross-check, for teaching, and for scenes with their own coordinates. The equations
+of `Attitude` cost less for a rigid body and have no singular attitude: the equations in Euler
+angles are singular at sin θ = 0, and need many small steps near it. `lie_poisson` is the
+Hamiltonian side.
 """
 
 from rigidjax._names import show

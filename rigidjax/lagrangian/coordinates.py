@@ -68,7 +68,7 @@ class LagrangeEquations(eqx.Module):
         return Coordinates(rate, _solve(jax.jacfwd(lambda v: momentum(q, v))(rate), push))
 
     def energy(self, y: Coordinates) -> Scalar:
-        """Jacobi's integral `q̇·∂L/∂q̇ − L`, J: kept where there is no `force`."""
+        """Jacobi's integral `q̇·∂L/∂q̇ − L`, J: conserved without a `force`."""
         momentum = jax.grad(self._value, argnums=1)(y.q, y.rate)
         return jnp.sum(y.rate * momentum) - self._value(y.q, y.rate)
 
@@ -85,14 +85,14 @@ def equations_of_motion(
 
     **Arguments:** `lagrangian` a callable, best a Module (its numbers can then be differentiated
     and changed without compiling again), `(q, q̇) → L`, J, with `q`, `q̇` (n,); `force` generalised
-    forces that have no potential, `(t, q, q̇) → Q` (n,), or `None`.
+    forces without a potential, `(t, q, q̇) → Q` (n,), or `None`.
 
     **Returns** a Module, for `diffrax.ODETerm`. Up to three coordinates are solved by cofactors,
     more by LU (`lineax`).
 
-    Source: Landau and Lifshitz, Mechanics, eq 2.6; the notes ask for it after eq 57.
+    Source: Landau and Lifshitz, Mechanics, eq 2.6; the notes mention it after eq 57.
 
-    **Raises:** `TypeError` for what cannot be called; `ValueError` where L is not one number. A
+    **Raises:** `TypeError` for anything but functions; `ValueError` if L is not one number. A
     singular ∂²L/∂q̇∂q̇ (a chart's singularity, a coordinate without mass) gives infinities or NaN.
 
     >>> pendulum = equations_of_motion(lambda q, v: 0.5 * v[0] ** 2 + 9.81 * jnp.cos(q[0]))
@@ -111,7 +111,7 @@ class EulerAngleTop(eqx.Module):
     **Arguments:** `inertia` about the fixed point (or the centre of mass, if free); `torque` one
     with a potential that does not depend on time, such as `HeavyTop`, or `None`.
 
-    Called with the angles (φ, θ, ψ), sequence 3-1-3, rad, and their rates, gives L, J. Source:
+    A call with the angles (φ, θ, ψ), sequence 3-1-3, rad, and their rates returns L, J. Source:
     notes, eqs 33, 75, 81–83. Singular at sin θ = 0.
 
     **Raises:** `TypeError` for a torque without a potential.
@@ -176,8 +176,8 @@ def from_attitude(state: HasAttitude) -> Coordinates:
     angles = _checks.refuse(
         angles,
         euler.is_singular(angles),
-        "from_attitude: sin θ = 0, where Euler angles (3-1-3) are singular; solve for an Attitude, "
-        "which has no such place",
+        "from_attitude: sin θ = 0, where Euler angles (3-1-3) are singular; solve for an "
+        "Attitude, which has no singular attitude",
     )
     return Coordinates(angles, euler.omega_to_rates(angles, state.omega))
 

@@ -103,7 +103,7 @@ def lie_poisson_with_direction(hamiltonian: Callable[[Any, Any], Any]) -> LiePoi
     """The heavy-top form: `dΠ/dt = Π × ∂H/∂Π + γ × ∂H/∂γ`, `dγ/dt = γ × ∂H/∂Π`, of any H(Π, γ).
 
     **Arguments:** `hamiltonian` a callable, best a Module, `(Π, γ) → H`, J. For a heavy top give
-    `HeavyTopHamiltonian(inertia, top)`. Keeps H and the Casimirs |γ|² and Π·γ.
+    `HeavyTopHamiltonian(inertia, top)`. It conserves H and the Casimirs |γ|² and Π·γ.
 
     Source: the Lie–Poisson equations of se(3)*; Marsden and Ratiu, Introduction to Mechanics and
     Symmetry, §1.4.
@@ -127,7 +127,8 @@ class RotationalHamiltonian(eqx.Module):
 
     **Arguments:** `inertia` about the centre of mass or a fixed point. Called with Π (3,), gives J.
 
-    **Raises:** `TypeError` for what is no `Inertia`; `ValueError` for a moment known to be zero.
+    **Raises:** `TypeError` for anything but an `Inertia`; `ValueError` for a moment known to be
+    zero.
 
     >>> import rigidjax as rj
     >>> RotationalHamiltonian(rj.Inertia.from_principal(1.0, 1.0, 2.0))([0.0, 0.0, 2.0])

@@ -1,4 +1,4 @@
-"""What a scene conserves, and by how much a computed motion fails to."""
+"""The conserved quantities of a scene, and their drift in a computed motion."""
 
 from typing import Any
 
@@ -26,7 +26,8 @@ def energy(
 ) -> Scalar:
     """Kinetic energy plus the potential energy of every torque and force, J.
 
-    **Arguments:** `body`, `state`, `torque` as for `simulate`; `t` s, for what depends on time.
+    **Arguments:** `body`, `state`, `torque` as for `simulate`; `t` s, for torques that depend on
+    time.
 
     `T + U`, `T = ½ m |v|² + ½ Ω·IΩ` (notes, eq 79). Wheels inside count as no energy, but for
     `ReactionWheels`. Under a torque with states of its own `state` is a `Coupled`, as
@@ -45,8 +46,8 @@ def energy(
         if not hasattr(part, "energy"):
             raise TypeError(
                 f"energy: {type(part).__name__} has no potential (no method energy(t, state, "
-                "body)), so there is no energy that it conserves; give only the laws "
-                "that have one, or see kinetic_energy"
+                "body)), so it conserves no energy; give only the torques that have one, or see "
+                "kinetic_energy"
             )
     return _energy(in_precision(body, turning.omega.dtype), turning, parts, t)
 
@@ -57,17 +58,18 @@ def conserved(
     torque: Torque | None = None,
     t: ScalarLike = 0.0,
 ) -> dict[str, Float[Array, "..."]]:
-    """The quantities that the exact motion of this scene keeps, at one state.
+    """The conserved quantities of this scene's exact motion, at one state.
 
-    **Arguments:** `body`, `state`, `torque` as for `simulate`; `t` s. A law says what it keeps by
-    optional members, see `rigidjax.torques.AbstractTorque`; one that says nothing keeps nothing.
+    **Arguments:** `body`, `state`, `torque` as for `simulate`; `t` s. A torque declares its
+    conserved quantities by optional members, see `rigidjax.torques.AbstractTorque`; without them
+    nothing is conserved.
 
-    **Returns** a dict of those that hold here, which are the same at all times:
+    **Returns** a dict of the conserved quantities here, the same names at all times:
 
-    - `energy`, J: every law has a potential and none depends on time;
+    - `energy`, J: every torque has a potential and none depends on time;
     - `momentum` (3,), kg m²/s, world frame, `R(IΩ + h)`, and `momentum_squared`, the Casimir
-      `|IΩ + h|²`: nothing outside turns the body (h is the wheels' momentum);
-    - `momentum_along_axis`, kg m²/s: one law turns it, but not about this axis (gravity, a field);
+      `|IΩ + h|²`: no external torque (h is the wheels' momentum);
+    - `momentum_along_axis`, kg m²/s: one torque, with none about this axis (gravity, a field);
     - `linear_momentum` (3,), kg m/s, world frame: no force acts on it;
     - `momentum_about_origin` (3,), kg m²/s, world frame, `m x × v + R(IΩ + h)`: free, or attracted
       by the origin.
@@ -115,7 +117,7 @@ def drift(
     body: Inertia | MassProperties,
     torque: Torque | None = None,
 ) -> dict[str, Scalar]:
-    """By how much each conserved quantity moved during a run, relative to its size.
+    """The drift of each conserved quantity during a run, relative to its size.
 
     **Arguments:** `ts` (T,) s; `ys` states with a leading time axis, a `Coupled` of them under a
     torque with states of its own; `body`, `torque` as for `simulate`.
@@ -157,7 +159,7 @@ def drift(
 
 
 def _scene(body: Any, state: Any, torque: Any, t: Any) -> tuple[Any, tuple[Any, ...], Scalar]:
-    """The body's state, the laws that act on it with their own states put in, and the time."""
+    """The body's state, the torques on it with their own states put in, and the time."""
     if isinstance(state, Coupled):
         state, torque = state.motion, freeze(torque, state.own)
     parts = _parts(torque)
@@ -167,7 +169,7 @@ def _scene(body: Any, state: Any, torque: Any, t: Any) -> tuple[Any, tuple[Any, 
 
 
 def _parts(torque: Torque | None) -> tuple[Any, ...]:
-    """The laws in a sum, and in sums within it."""
+    """The torques in a sum, and in sums within it."""
     if torque is None:
         return ()
     if isinstance(torque, Sum):
@@ -184,7 +186,7 @@ def _energy(body: Any, state: HasSpin, parts: tuple[Any, ...], t: Scalar) -> Sca
 
 
 def _momentum(body: Any, state: HasSpin, parts: tuple[Any, ...], t: ScalarLike) -> Vec3:
-    """The whole angular momentum, (3,), body frame, with what the wheels hold."""
+    """The whole angular momentum, (3,), body frame, with that of the wheels."""
     momentum = angular_momentum(body, state)
     for part in parts:
         if hasattr(part, "internal_momentum"):

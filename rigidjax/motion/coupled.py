@@ -1,4 +1,4 @@
-"""A body's state and those of the laws that turn it, integrated together."""
+"""A body's state and the states of its torques, integrated together."""
 
 from collections.abc import Callable
 from typing import Any
@@ -13,11 +13,11 @@ from rigidjax.motion.torques.states import first_states, freeze, has_states, rat
 
 
 class Coupled(eqx.Module):
-    """The state of a body whose torque has states of its own: what the loops integrate.
+    """The state of a body whose torque has states of its own, for the integrators.
 
-    `simulate` makes it by itself, and gives its parts back: `sol.ys` and `sol.own`. It is what
-    `rigidjax.batch.rollout` returns under such a law, and what `rigidjax.conserved` and `energy`
-    take there.
+    `simulate` makes it itself, and returns its parts: `sol.ys` and `sol.own`.
+    `rigidjax.batch.rollout` returns it for such a torque, and `rigidjax.conserved` and `energy`
+    take it.
 
     **Arguments:** `motion` a `Spin`, `Attitude` or `Rigid`; `own` a tuple of the states of each
     law that has some, as `Solution.own`.
@@ -33,7 +33,7 @@ class Coupled(eqx.Module):
 
     @staticmethod
     def start(body: Any, state0: Any, torque: Any, t: ScalarLike = 0.0) -> "Coupled":
-        """The start of `state0` and of the laws in `torque` (see `rigidjax.simulate`) at `t`, s."""
+        """The initial `state0` and states of `torque` (see `rigidjax.simulate`) at `t`, s."""
         _checks.single(body, (Inertia, MassProperties), "body")
         _checks.single(state0, HasSpin, "state0", wanted="a Spin, an Attitude or a Rigid")
         dtype = state0.omega.dtype
@@ -43,10 +43,10 @@ class Coupled(eqx.Module):
 
 
 class CoupledEquations(eqx.Module):
-    """The equations of a body and of the laws that turn it as a vector field `f(t, y, args)`.
+    """The equations of a body and of its torques' states as a vector field `f(t, y, args)`.
 
-    **Arguments:** `field` the body's own, such as `AttitudeEquations`, whose torque has states;
-    `body`. `rigidjax.equations_of_motion` makes it of a `Coupled`.
+    **Arguments:** `field` the body's own, such as `AttitudeEquations`, with a torque that has
+    states; `body`. `rigidjax.equations_of_motion` makes it for a `Coupled`.
     """
 
     field: Callable[..., Any]
@@ -61,7 +61,7 @@ class CoupledEquations(eqx.Module):
 
 
 def started(body: Any, state0: Any, torque: Any, t: ScalarLike) -> Any:
-    """`state0`, `Coupled` with the states of the torque where it has some."""
+    """`state0`, as `Coupled` if the torque has states of its own."""
     if isinstance(state0, Coupled) or not has_states(torque):
         return state0
     return Coupled.start(body, state0, torque, t)

@@ -1,4 +1,4 @@
-"""The states of a body, each with no more than its scene needs, and their equations of motion."""
+"""The states of a body and their equations of motion."""
 
 from typing import TypeVar
 
@@ -22,7 +22,7 @@ _HINT = "Inertia.from_tensor makes one of a matrix; of MassProperties pass .iner
 
 
 class Spin(eqx.Module):
-    """A body rate and nothing else: a body that turns, its attitude left out.
+    """A body rate alone: the state of a turning body without its attitude.
 
     **Arguments:** `omega` (3,) angular velocity Ω in the body frame, rad/s (notes, eq 49). Leading
     axes are allowed in a container of many states; functions take one.
@@ -114,7 +114,7 @@ class EulerEquations(eqx.Module):
     Source: Lie–Poisson form `dΠ/dt = Π × ∇H(Π) + τ` with `Π = IΩ`, `H = ½ Π·I⁻¹Π`; Landau and
     Lifshitz, Mechanics, eq 36.4.
 
-    **Raises:** `ValueError` for a rod or a point, whose zero moment the equations divide by: where
+    **Raises:** `ValueError` for a rod or a point, since the equations divide by the zero moment, if
     the numbers are known; under `jit` call `Inertia.invertible` first.
 
     >>> import rigidjax as rj
@@ -130,7 +130,7 @@ class EulerEquations(eqx.Module):
         _checks.single(inertia, Inertia, "inertia", hint=_HINT)
         if torque is not None:
             require_law(torque)
-        # Traced numbers are looked at where a motion is asked for: a fit may pass through such.
+        # Traced numbers are checked when a motion is computed: a fit may pass through bad ones.
         self.inertia = inertia.invertible() if _checks.known(inertia.tensor) else inertia
         # Once per solve: a division inside the field costs 25 times the rest of it.
         self.inverse = inverse(inertia.tensor)
@@ -140,14 +140,14 @@ class EulerEquations(eqx.Module):
         return Spin(self.rate_of(t, y))
 
     def rate_of(self, t: ScalarLike, state: HasSpin) -> Vec3:
-        """dΩ/dt (3,), rad/s², body frame, of any state that has a spin."""
+        """dΩ/dt (3,), rad/s², body frame, of any state with a body rate."""
         torque = None
         if self.torque is not None:
             torque = evaluate(self.torque, t, state, self.inertia)
         return self.turned_by(torque, state)
 
     def turned_by(self, torque: Vec3 | None, state: HasSpin) -> Vec3:
-        """dΩ/dt (3,), rad/s², body frame, under a torque (3,), N m, body frame, that is known."""
+        """dΩ/dt (3,), rad/s², body frame, under a known torque (3,), N m, body frame."""
         dtype = state.omega.dtype
         momentum = apply(self.inertia.tensor.astype(dtype), state.omega)
         turning = cross(momentum, state.omega)
@@ -162,7 +162,7 @@ class AttitudeEquations(eqx.Module):
     **Arguments:** as for `EulerEquations`. A field for `diffrax.ODETerm`; `args` is not used.
 
     The state holds Ω, not Π = IΩ: two heavy tops at tolerances 1e-6, 1e-9, 1e-12 took the same
-    number of steps with either to 3 % (diffrax.Dopri8), and ended equally far off to a third.
+    number of steps with either to 3 % (diffrax.Dopri8), and their errors differed by up to a third.
 
     Source: `dM/dt = M J'` (notes, eq 50), written for the quaternion of M.
 
@@ -187,7 +187,7 @@ class NewtonEuler(eqx.Module):
     `m dv/dt = F`, `I dΩ/dt = IΩ × Ω + τ`, `dq/dt = ½ q ⊗ (0, Ω)`.
 
     **Arguments:** `body` mass properties; the inertia used is the one about its centre of mass;
-    `torque` a torque τ about the centre of mass, N m, body frame, or a force law that returns a
+    `torque` a torque τ about the centre of mass, N m, body frame, or a force model that returns a
     `Wrench` (F in N, world frame, and τ), or `None`. A field for `diffrax.ODETerm`; `args` is not
     used.
 
@@ -242,12 +242,12 @@ def on_the_group(state: State) -> State:
 
 
 def _unit(q: Quat) -> Quat:
-    """q/|q|, rounded alike wherever it is compiled.
+    """q/|q|, with the same rounding in every program.
 
-    Where it can, XLA makes q/√n a product with 1/√n, and whether it can depends on the program.
-    Reverse mode runs steps again in another program than the first: a last digit that differs there
-    moves the error estimate, at tight tolerances the lengths of steps with it, and the gradient
-    belongs to another discretisation (7e-6 off at a tolerance of 1e-11). Root and quotient by
-    themselves are exact to the last digit in every program, and for every body of a batch.
+    XLA replaces q/√n by a product with 1/√n in some programs. Reverse mode runs steps again in
+    another program: a different last digit there changes the error estimate, and at tight
+    tolerances the step lengths. The gradient then belongs to another discretisation (an error of
+    7e-6 at a tolerance of 1e-11). A separate root and quotient are exact to the last digit in every
+    program, and for every body of a batch.
     """
     return q / lax.optimization_barrier(jnp.sqrt(square4(components(q))))

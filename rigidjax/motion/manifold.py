@@ -22,7 +22,7 @@ from rigidjax.rotation.linalg3 import components
 
 
 def dimension(state: Any) -> int:
-    """How many numbers a change of `state` has: one less than its own for each quaternion.
+    """The number of numbers in a change of `state`: one less than its own for each quaternion.
 
     >>> import rigidjax as rj
     >>> dimension(rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 0]))
@@ -32,7 +32,7 @@ def dimension(state: Any) -> int:
 
 
 def names(state: Any) -> tuple[str, ...]:
-    """The names of the leaves, in the order in which a change has their numbers.
+    """The names of the leaves, in the order of their numbers in a change.
 
     >>> import rigidjax as rj
     >>> names(rj.Rigid([0.0, 0, 0], [0.0, 0, 0], [1.0, 0, 0, 0], [0.0, 0, 0]))
@@ -53,7 +53,7 @@ def parts(state: Any, change: Float[Array, "*batch n"]) -> dict[str, Float[Array
 
 
 def turns(state: Any) -> tuple[slice, ...]:
-    """Where in a change the rotation vectors are, one for each quaternion.
+    """The places of the rotation vectors in a change, one for each quaternion.
 
     >>> import rigidjax as rj
     >>> turns(rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 0]))
@@ -96,9 +96,9 @@ def minus(state: Any, reference: Any) -> Float[Array, " n"]:
 
 
 def minus_small(state: Any, reference: Any) -> Float[Array, " n"]:
-    """`minus` of a state near the reference: of a turn by θ it has 2 sin(θ/2), not θ.
+    """`minus` for a state near the reference: a turn by θ gives 2 sin(θ/2), not θ.
 
-    Right to second order in θ; no arctangent, which derivatives would double.
+    It is correct to second order in θ, without an arctangent, which derivatives would double.
 
     >>> import rigidjax as rj
     >>> minus_small(rj.Spin([1.0, 0.5, 0.0]), rj.Spin([1.0, 0, 0])).tolist()
@@ -141,7 +141,7 @@ def coordinates(state: Any, along: Any) -> Float[Array, " n"]:
 
 
 def _turned(state: Any) -> list[bool]:
-    """Of each leaf whether it is the quaternion of a state with an attitude."""
+    """Whether each leaf is the quaternion of a state with an attitude."""
     out = []
     for node in jax.tree.leaves(state, is_leaf=lambda node: isinstance(node, HasAttitude)):
         q = node.q if isinstance(node, HasAttitude) else None

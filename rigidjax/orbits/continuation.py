@@ -1,4 +1,4 @@
-"""Families of periodic orbits: continued by the orbit's derivatives, their stability, branches."""
+"""Families of periodic orbits: continuation by the orbit's derivatives, stability, branches."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -38,16 +38,17 @@ def family(
 ) -> PeriodicOrbit:
     """The members of the family of `orbit` at which `hold` has these values, one by one.
 
-    Each is found from the one before and its tangent, and corrected as by `periodic_orbit`.
+    Each member starts from the one before and its tangent, and is corrected as by `periodic_orbit`.
 
     **Arguments:** `orbit` one near the first of them; `values` (N,), neighbours near one
-    another; `hold` `"x"`, `"z"`, `"vy"` or `"period"`, which may not turn back on the way
-    (there `follow` goes on).
+    another; `hold` `"x"`, `"z"`, `"vy"` or `"period"`, which must be monotone along the family (use
+    `follow` past a fold).
 
     **Returns** a `PeriodicOrbit` with a leading axis; its derivatives with respect to μ and
     `values` are those of the family, forward and reverse.
 
-    **Raises:** `ValueError` (`EquinoxRuntimeError` under `jit`) saying where it was lost.
+    **Raises:** `ValueError` (`EquinoxRuntimeError` under `jit`) with the value at which it was
+    lost.
 
     >>> from rigidjax import orbits
     >>> moon = orbits.cr3bp(0.0121505856)
@@ -78,7 +79,7 @@ def family(
 
 
 def _lost(start: Array, numbers: Array, left: Array) -> Array:
-    """Which members Newton's method did not find, or found as another orbit that solves it too."""
+    """The members that Newton's method did not find, or replaced by another solution."""
     before = jnp.concatenate([start[None], numbers[:-1]])
     ratio = numbers[:, 3] / before[:, 3]
     return ~((left <= usual_tolerance(start)) & (ratio > 0.5) & (ratio < 2))
@@ -108,12 +109,12 @@ def _at_values(scene: Any, start: Array, held: Array, index: int, tolerance: flo
 
 
 def family_slope(scene: Any, orbit: PeriodicOrbit, *, hold: str = "x") -> PeriodicOrbit:
-    """How start and period of an orbit change along its family, per unit of `hold`.
+    """The change of an orbit's start and period along its family, per unit of `hold`.
 
     **Arguments:** `orbit` a member of it; `hold` as in `family`. **Returns** the derivatives in
     the shape of an orbit: `.period` is d period/d hold. Exact (implicit function theorem).
 
-    **Raises:** `ValueError` where the family turns back in `hold`.
+    **Raises:** `ValueError` at a fold of the family in `hold`.
 
     >>> from rigidjax import Point, orbits
     >>> hill, start = orbits.hill(), Point([0.3, 0, 0], [0.0, 1.6, 0])
@@ -123,9 +124,7 @@ def family_slope(scene: Any, orbit: PeriodicOrbit, *, hold: str = "x") -> Period
     """
     change = _slope(scene, crossing(orbit), named(hold))
     turned = ~jnp.isfinite(change.period)
-    words = (
-        f"family_slope: the family does not go on in {hold} here; take another of x, z, vy, period"
-    )
+    words = f"family_slope: the family has a fold in {hold} here; take another of x, z, vy, period"
     return _checks.refuse(change, turned, words)
 
 
@@ -142,18 +141,18 @@ def _slope(scene: Any, numbers: Array, index: int) -> PeriodicOrbit:
 def follow(
     scene: Any, orbit: PeriodicOrbit, step: ScalarLike, count: int, *, rising: str = "x"
 ) -> PeriodicOrbit:
-    """The next `count` members of a family, at equal steps of arclength, past its folds.
+    """The next `count` members of a family, at fixed steps of arclength, past its folds.
 
     Pseudo-arclength continuation in (x, z, v_y, T/2): each start lies at `step` along the
     tangent, and Newton's method goes back across it (Keller 1977, in
     Applications of Bifurcation Theory).
 
-    **Arguments:** `orbit` a member, not returned; `step` arclength, its sign the way;
-    `rising` the number that grows at first when `step` is positive.
+    **Arguments:** `orbit` a member, not returned; `step` arclength, with the sign of the direction;
+    `rising` the number that grows at first for a positive `step`.
 
     **Returns** a `PeriodicOrbit` with a leading axis. To differentiate one give it to
-    `periodic_orbit`. **Raises:** `ValueError` (`EquinoxRuntimeError` under `jit`) saying after
-    how many members it was lost.
+    `periodic_orbit`. **Raises:** `ValueError` (`EquinoxRuntimeError` under `jit`) with the number
+    of members before it was lost.
     """
     start, index = crossing(orbit), named(rising)
     length = _checks.floating(step, (), "step").astype(start.dtype)
@@ -179,7 +178,7 @@ def _follow(scene: Any, start: Array, step: Array, count: int, index: int, toler
         return miss(scene, numbers)
 
     def tangent(matrix: Array, before: Array) -> Array:
-        """The direction in which the miss stays 0, on the side of the one before."""
+        """The direction in which the residual stays 0, on the side of the one before."""
         rows = jnp.concatenate([matrix, before[None]])
         along = jnp.linalg.solve(rows, jnp.zeros(4, start.dtype).at[3].set(1))
         return along / jnp.sqrt(jnp.sum(along * along))
@@ -204,8 +203,8 @@ def _follow(scene: Any, start: Array, step: Array, count: int, index: int, toler
 def stability_indices(monodromy: Float[Array, "6 6"]) -> Complex[Array, "2"]:
     """The two ν = ½(λ + 1/λ) of the multipliers λ that are not 1: `ThreeBody.stability_indices`.
 
-    The pair of multipliers 1 is taken out, and the rest found from tr M and tr M²: eigenvalues
-    beside a double one are known to the root of round-off only, these are not.
+    The pair of multipliers 1 is removed, and the others come from tr M and tr M². Eigenvalues
+    beside a double one have an error of the root of round-off; these have not.
 
     >>> stability_indices(jnp.eye(6)).tolist()
     [(1+0j), (1+0j)]
@@ -230,18 +229,18 @@ def bifurcation(
 ) -> PeriodicOrbit:
     """The member of a family between two others at which a stability index takes a value.
 
-    At 1 a family of the same period branches off, or the family turns; at −1 one of twice the
-    period; at cos(2πp/q) one of q times the period. `index` 1 of planar Lyapunov orbits is that
-    across the plane, and 1 is where the halo orbits begin.
+    At 1 a family of the same period branches off, or the family has a fold; at −1 one of twice the
+    period; at cos(2πp/q) one of q times the period. `index` 1 of planar Lyapunov orbits is the one
+    across the plane; the halo orbits begin at its value 1.
 
     **Arguments:** `orbit`, `other` two members near each other, between which the index passes
-    the value; `index` 0 or 1 of `stability_indices`; `value` of it; `hold` the number of the
-    family that is searched in, `"x"`, `"z"`, `"vy"` or `"period"`. Works on the host.
+    the value; `index` 0 or 1 of `stability_indices`; `value` of it; `hold` the number of the family
+    for the search, `"x"`, `"z"`, `"vy"` or `"period"`. It works on the host.
 
     Source: Howell 1984, doi:10.1007/BF01358403; Robin and Markellos 1980,
     doi:10.1007/BF01231183.
 
-    **Raises:** `ValueError` where the value does not lie between, or the indices are complex.
+    **Raises:** `ValueError` if the value does not lie between, or the indices are complex.
     """
     place = named(hold)
     if isinstance(index, bool) or index not in (0, 1):

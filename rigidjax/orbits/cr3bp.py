@@ -17,13 +17,13 @@ from rigidjax.rotation.linalg3 import components
 
 
 class ThreeBody(AbstractReversible):
-    """A particle under two bodies that circle each other: make one with `orbits.cr3bp(mu)`.
+    """A particle under two bodies on circular orbits: make one with `orbits.cr3bp(mu)`.
 
     Rotating axes, origin at the common centre of mass, the first body (mass 1 − μ) at (−μ, 0, 0),
     the second (mass μ) at (1 − μ, 0, 0). Units: their distance, their total mass, and 1/(their
-    angular rate); a period of theirs is 2π.
+    angular rate); their period is 2π.
 
-    **Fields:** `mu` μ, scalar; `radii` (2,) of the bodies, at which a particle has collided.
+    **Fields:** `mu` μ, scalar; `radii` (2,) of the bodies, for collisions.
 
     >>> scene = cr3bp(0.5)
     >>> [float(r) for r in scene.distances(jnp.array([0.0, 0.0, 0.0]))]
@@ -56,14 +56,14 @@ class ThreeBody(AbstractReversible):
         return 0.5 * (x[0] * x[0] + x[1] * x[1]) + (1 - mu) / r1 + mu / r2
 
     def distances(self, x: Vector) -> tuple[Scalar, Scalar]:
-        """How far a place (3,) is from the first and from the second body."""
+        """The distances of a place (3,) from the first and from the second body."""
         a, b, c = components(_checks.floating(x, (3,), "x"))
         mu = self.mu.astype(a.dtype)
         first, second, flat = a + mu, (a - 1) + mu, b * b + c * c
         return jnp.sqrt(first * first + flat), jnp.sqrt(second * second + flat)
 
     def jacobi_constant(self, state: Point) -> Scalar:
-        """C = 2U − |v|², kept along the motion (Szebehely 1967, eq 1.5(20)).
+        """C = 2U − |v|², conserved along the motion (Szebehely 1967, eq 1.5(20)).
 
         >>> from rigidjax import orbits
         >>> float(orbits.cr3bp(0.5).jacobi_constant(Point([0.0, 0, 0], [0.0, 0, 0])))
@@ -73,7 +73,7 @@ class ThreeBody(AbstractReversible):
         return self.speed_squared(state.x, 0.0) - jnp.sum(state.v * state.v)
 
     def speed_squared(self, x: Vector, jacobi: ScalarLike) -> Scalar:
-        """|v|² = 2U(x) − C at a place: zero-velocity curves are where it is 0.
+        """|v|² = 2U(x) − C at a place; it is 0 on zero-velocity curves.
 
         **Arguments:** `x` (3,); `jacobi` C. It is negative at places that a particle with this C
         cannot reach. Draw `matplotlib.pyplot.contour(…, levels=[0])` of it.
@@ -86,7 +86,8 @@ class ThreeBody(AbstractReversible):
         xs: Float[ArrayLike, " columns"] | Sequence[float],
         ys: Float[ArrayLike, " rows"] | Sequence[float],
     ) -> Float[Array, "rows columns"]:
-        """2U on a grid of the plane z = 0 (rows along y): a particle with constant C keeps to ≥ C.
+        """2U on a grid of the plane z = 0 (rows along y): a particle with constant C stays where it
+        is ≥ C.
 
         **Arguments:** `xs`, `ys` places along the axes. `matplotlib.pyplot.contour(xs, ys, grid,
         levels=[C])` draws the curve of zero velocity (Szebehely 1967, sec. 4.7).
@@ -112,7 +113,7 @@ class ThreeBody(AbstractReversible):
         return {"jacobi": self.jacobi_constant(state)}
 
     def approach(self, t: ScalarLike, state: Point) -> tuple[Float[Array, "2"], Float[Array, "2"]]:
-        """Distances from the two bodies, and those at which a run ends, named as a collision."""
+        """Distances from the two bodies, and the distances of a collision, which ends a run."""
         first, second = self.distances(state.x)
         gaps = jnp.stack([first, second])
         return gaps, jnp.maximum(self.radii.astype(gaps.dtype), smallest_distance(gaps.dtype))
@@ -129,8 +130,8 @@ class ThreeBody(AbstractReversible):
     def exponents(self, x: Vector) -> Complex[Array, "6"]:
         """The six exponents λ of small motions about an equilibrium in the plane, e^{λt}.
 
-        **Arguments:** `x` (3,), such as a row of `lagrange_points`. Stable (to first order) where
-        no real part is positive: L4 and L5 below Routh's μ = ½(1 − √(23/27)), L1–L3 never.
+        **Arguments:** `x` (3,), such as a row of `lagrange_points`. It is stable (to first order)
+        if no real part is positive: L4 and L5 below Routh's μ = ½(1 − √(23/27)), L1–L3 never.
         In the plane λ⁴ + (4 − U_xx − U_yy) λ² + U_xx U_yy − U_xy² = 0, across it λ² = U_zz
         (Szebehely 1967, sec. 5.2).
 
@@ -168,8 +169,8 @@ def cr3bp(mu: ScalarLike, radii: Float[Array, "2"] | object = (0.0, 0.0)) -> Thr
     """The circular restricted three-body problem with mass ratio μ.
 
     **Arguments:** `mu` μ = m₂/(m₁ + m₂), 0 < μ ≤ ½ (Earth–Moon 0.01215…); `radii` (2,) of the two
-    bodies in units of their distance: a run that comes closer ends with a collision's name, time
-    and distance. With zeros it ends where float64 can no longer tell the place from the body.
+    bodies in units of their distance: a run that comes closer ends with a collision's body, time
+    and distance. With zeros it ends at a distance that float64 can no longer resolve.
 
     **Raises:** `ValueError` for μ outside (0, ½] (`EquinoxRuntimeError` under `jit`).
 

@@ -1,4 +1,4 @@
-"""Periodic orbits by Newton's method, with the derivatives of the family they belong to."""
+"""Periodic orbits by Newton's method, with the derivatives of their family."""
 
 from typing import Any
 
@@ -46,14 +46,14 @@ def periodic_orbit(
 ) -> PeriodicOrbit:
     """The periodic orbit near `guess`, by differentiable correction.
 
-    For orbits symmetric about the xz-plane: Lyapunov, halo, Arenstorf's and most others in use.
-    They cross it at a right angle (y = v_x = v_z = 0) twice a period. Newton's method on three
+    It finds orbits symmetric about the xz-plane: Lyapunov, halo, Arenstorf's and most others in
+    use. They cross it at a right angle (y = v_x = v_z = 0) twice a period. Newton's method on three
     of (x, z, v_y, T/2) makes y, v_x, v_z vanish at the half period.
 
     **Arguments:** `guess` a `PeriodicOrbit(state, period)` whose state crosses at a right
-    angle; `hold` which of `"x"`, `"z"`, `"vy"`, `"period"` stays as guessed: this labels the
-    orbit within its family (`"x"` for Lyapunov orbits, `"z"` for halo orbits); `tolerance`
-    largest |y|, |v_x|, |v_z| left at the half period, 1e-12 unless given (1e-4 in float32).
+    angle; `hold` the fixed one of `"x"`, `"z"`, `"vy"`, `"period"`, which labels the orbit within
+    its family (`"x"` for Lyapunov orbits, `"z"` for halo orbits); `tolerance` largest |y|, |v_x|,
+    |v_z| at the half period, 1e-12 unless given (1e-4 in float32).
 
     **Returns** a `PeriodicOrbit`. Its derivatives with respect to μ and the held number are
     those of the family, by the implicit function theorem, forward and reverse.
@@ -94,7 +94,7 @@ def periodic_orbit(
 
 
 def named(hold: str) -> int:
-    """Which of the four numbers of a crossing `hold` names."""
+    """The index of `hold` among the four numbers of a crossing."""
     return _NAMES.index(_checks.word(hold, _NAMES, "hold"))
 
 
@@ -132,12 +132,12 @@ def together(unknown: Float[Array, "3"], held: Scalar, index: int) -> Float[Arra
 
 
 def usual_tolerance(numbers: Array) -> float:
-    """What is left of y, v_x, v_z at the half period: 1e-12, in float32 1e-4."""
+    """The tolerance of y, v_x, v_z at the half period: 1e-12, in float32 1e-4."""
     return 1e-12 if numbers.dtype == jnp.float64 else 1e-4
 
 
 def miss(scene: Any, numbers: Float[Array, "4"]) -> Float[Array, "3"]:
-    """y, v_x and v_z at the half period: what makes an orbit periodic where they vanish.
+    """y, v_x and v_z at the half period: an orbit is periodic if they vanish.
 
     >>> from rigidjax import orbits
     >>> miss(orbits.hill(), jnp.array([3.0 ** (-1 / 3), 0.0, 0.0, 0.0])).tolist()
@@ -158,7 +158,7 @@ def value_and_jacobian(f: Any, x: Array) -> tuple[Array, Array]:
 
 
 def newton(f: Any, x: Array, tolerance: float) -> Array:
-    """A zero of `f` near `x`: steps until what is left is a tenth of the tolerance."""
+    """A zero of `f` near `x`: steps until the residual is a tenth of the tolerance."""
 
     def keep_on(carry: Any) -> Any:
         _, left, count = carry

@@ -12,7 +12,7 @@ from rigidjax.rotation.linalg3 import components
 
 
 class Hill(AbstractReversible):
-    """A particle near a small body that circles a large one: make one with `orbits.hill()`.
+    """A particle near a small body on a circular orbit about a large one: see `orbits.hill()`.
 
     Rotating axes centred on the small body, x away from the large one. Units: μ^{1/3} of the
     bodies' distance, and 1/(their angular rate). **Field:** `radius` of the small body.
@@ -47,7 +47,7 @@ class Hill(AbstractReversible):
         return {"jacobi": self.jacobi_constant(state)}
 
     def approach(self, t: ScalarLike, state: Point) -> tuple[Float[Array, "1"], Float[Array, "1"]]:
-        """Distance from the small body, and that at which a run ends, named as a collision."""
+        """Distance from the small body, and the distance of a collision, which ends a run."""
         gap = jnp.sqrt(jnp.sum(state.x * state.x, keepdims=True))
         least = jnp.maximum(self.radius.astype(gap.dtype), smallest_distance(gap.dtype))
         return gap, least.reshape(1)
@@ -62,7 +62,7 @@ class Hill(AbstractReversible):
 def hill(radius: ScalarLike = 0.0) -> Hill:
     """Hill's problem, the limit of `cr3bp(mu)` as μ → 0 in units of μ^{1/3}.
 
-    **Arguments:** `radius` of the small body, in those units, at which a particle has collided.
+    **Arguments:** `radius` of the small body, in these units, for collisions.
 
     Source: Hill 1878, doi:10.2307/2369430; Szebehely 1967, sec. 10.4.
 

@@ -12,7 +12,7 @@ def points(mu: Scalar) -> Float[Array, "5 3"]:
 
     L1, L2, L3 from the roots of Euler's quintics (Szebehely 1967, sec. 4.4), L4 and L5 at the tips
     of equilateral triangles. **Arguments:** `mu` mass ratio μ, scalar array, 0 < μ ≤ ½.
-    Derivatives with respect to μ are those of the roots, of any order.
+    They have derivatives of any order with respect to μ.
 
     >>> points(jnp.asarray(0.5))[0].tolist()
     [0.0, 0.0, 0.0]
@@ -31,7 +31,7 @@ def points(mu: Scalar) -> Float[Array, "5 3"]:
 
 
 def distances(mu: Scalar) -> tuple[Scalar, Scalar, Scalar]:
-    """How far L1 and L2 are from the second primary, and L3 from the first."""
+    """The distances of L1 and L2 from the second primary, and of L3 from the first."""
     one = jnp.ones_like(mu)
     hill = jnp.cbrt(mu / (3 * (1 - mu)))
     between = _root([one, mu - 3, 3 - 2 * mu, -mu, 2 * mu, -mu], hill * (1 - hill / 3))

@@ -17,7 +17,7 @@ from rigidjax.orbits import continuation, state_transition
 from rigidjax.orbits.differential_correction import PeriodicOrbit, crossing
 from rigidjax.solve.run import Ends
 
-# Time run backwards is seen in the mirror y → −y: x, y, z, vx, vy, vz.
+# A motion backwards in time is the mirror image in y → −y: x, y, z, vx, vy, vz.
 _MIRROR = np.array([1.0, -1.0, 1.0, -1.0, 1.0, -1.0])
 _TIGHT = dict(rtol=1e-13, atol=1e-14)
 # What is left of an eigenvector after each step of inverse iteration is a hundredth at most.
@@ -25,12 +25,12 @@ _ITERATIONS = 12
 
 
 class Manifold(eqx.Module):
-    """Motions that come from a periodic orbit, or go to it.
+    """Motions from a periodic orbit, or towards it.
 
     **Fields:** `ts` (T,) since the start near the orbit, in the scene's unit: falling for a stable
     manifold; `states` a `Point` with axes (N, T): one motion for each phase, NaN after a collision;
-    `phases` (N,) where on the orbit each begins, in periods; `multiplier` λ by which a small
-    distance along it changes in a period.
+    `phases` (N,) of their starts on the orbit, in periods; `multiplier` λ of a small distance along
+    it in a period.
 
     >>> ts, phases = jnp.array([0.0, 0.1]), jnp.array([0.0])
     >>> states = Point(jnp.zeros((1, 2, 3)), jnp.zeros((1, 2, 3)))
@@ -45,10 +45,10 @@ class Manifold(eqx.Module):
 
 
 def unstable(monodromy: Float[Array, "6 6"]) -> tuple[Scalar, Float[Array, "6"]]:
-    """The multiplier λ of an orbit that is largest in size, and its eigenvector, of length 1.
+    """The multiplier λ of an orbit with the largest size, and its eigenvector, of length 1.
 
     λ is from traces (`stability_indices`), the vector by inverse iteration and one bordered solve,
-    which has the derivative of the vector. NaN where no multiplier is real and larger than 1.
+    which has the derivative of the vector. It is NaN if no multiplier is real and larger than 1.
 
     >>> value, vector = unstable(jnp.diag(jnp.array([4.0, 0.25, 1.0, 1.0, 1.0, 1.0])))
     >>> round(float(value), 12), round(float(vector[0]), 12)
@@ -129,13 +129,13 @@ def manifold(
     samples: int = 200,
     distance: ScalarLike = 1e-5,
 ) -> Manifold:
-    """Motions that leave an unstable periodic orbit, or come to it: its invariant manifolds.
+    """Motions from an unstable periodic orbit, or towards it: its invariant manifolds.
 
     **Arguments:** `orbit` as of `periodic_orbit`; `which` `"unstable"` (they leave it) or
-    `"stable"` (they come to it: the times go back); `time` how far to follow them, two periods
-    unless given; `side` 1 for the branch that goes to larger x at the orbit's start, −1 for the
+    `"stable"` (they come to it: the times go back); `time` their length, two periods unless given;
+    `side` 1 for the branch that goes to larger x at the orbit's start, −1 for the
     other; `count` N motions, from equal phases of the orbit; `samples` T times of each;
-    `distance` of the starts from the orbit, in (x, v): its square is what they are off.
+    `distance` of the starts from the orbit, in (x, v): their error is of the order of its square.
 
     The direction is the eigenvector of the monodromy whose multiplier is the largest, carried
     along the orbit by the transition matrix; the stable manifold is the mirror image, in
@@ -144,7 +144,7 @@ def manifold(
     **Returns** a `Manifold`. Source: Koon, Lo, Marsden and Ross 2011, Dynamical Systems, the
     Three-Body Problem and Space Mission Design, sec. 7.4.
 
-    **Raises:** `ValueError` where the orbit has no such multiplier; for another word.
+    **Raises:** `ValueError` for an orbit without such a multiplier, and for another word.
 
     >>> from rigidjax import orbits
     >>> moon = orbits.cr3bp(0.0121505856)
@@ -209,7 +209,7 @@ def _paths(scene: Any, starts: Point, ts: Array, which: str) -> Point:
     turn = which == "stable"
 
     def seen(state: Point) -> Point:
-        # Mirrored, the way back is a way forth.
+        # The mirror image runs forwards.
         return Point(state.x * mirror[:3], state.v * mirror[3:]) if turn else state
 
     def path(start: Point) -> Point:

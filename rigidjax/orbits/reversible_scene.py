@@ -26,12 +26,12 @@ class AbstractReversible(AbstractScene):
         """Distances from the bodies (k,), and those at which a run ends, named as a collision."""
 
     def ends(self, t: ScalarLike, state: Point) -> Bool[Array, ""]:
-        """Whether the particle has collided with one of the bodies: there a run ends."""
+        """Whether the particle has collided with one of the bodies, which ends a run."""
         gaps, least = self.approach(t, state)
         return jnp.any(gaps <= least)
 
     def end_words(self, t: ScalarLike, state: Point) -> str:
-        """A collision in words: with which body, when, and how near."""
+        """A collision in words: the body, the time, and the distance."""
         gaps = self.approach(t, state)[0]
         if not _checks.known(gaps):
             return "the particle collided with one of the scene's bodies"
@@ -54,7 +54,7 @@ class AbstractReversible(AbstractScene):
         return state_transition.transition(self, numbers, t, rtol, atol)
 
     def monodromy(self, orbit: PeriodicOrbit) -> Float[Array, "6 6"]:
-        """The transition matrix over one period; its eigenvalues say whether the orbit is stable.
+        """The transition matrix over one period; its eigenvalues determine the orbit's stability.
 
         Two of the six are 1, the others come as λ, 1/λ (Szebehely 1967, sec. 8.6).
         """
@@ -63,7 +63,7 @@ class AbstractReversible(AbstractScene):
     def stability_indices(self, orbit: PeriodicOrbit) -> Complex[Array, "2"]:
         """The two ν = ½(λ + 1/λ) of the multipliers that are not 1, larger real part first.
 
-        The orbit is stable to first order where both are real and |ν| ≤ 1. Many:
+        The orbit is stable to first order if both are real and |ν| ≤ 1. Many:
         `jax.vmap(scene.stability_indices)(scene.family(…))`.
 
         Source: Howell 1984, doi:10.1007/BF01358403; from traces: Bray and Goudas 1967, Adv.

@@ -17,12 +17,13 @@ def guess(
     """A start on the xz-plane near the orbit about L1, L2 or L3 of the given amplitude.
 
     **Arguments:** `mu` μ; `point` 1, 2 or 3; one of `along_x` (a planar Lyapunov orbit) and
-    `along_z` (a halo orbit, its sign the branch), in units of the primaries' distance. Good where
-    the amplitude is a small part of the distance to the nearer body.
+    `along_z` (a halo orbit, its sign the branch), in units of the primaries' distance. It is good
+    if the amplitude is a small part of the distance to the nearer body.
 
     Source: Richardson 1980, Celest. Mech. 22, 241, doi:10.1007/BF01229511, at τ = 0.
 
-    **Raises:** `ValueError` for another point; where no halo orbit is that small, for known values.
+    **Raises:** `ValueError` for another point, and for a known amplitude that is too small for a
+    halo orbit.
 
     >>> round(float(guess(jnp.asarray(0.0121505856), 1, 0.01, None).period), 2)
     2.71

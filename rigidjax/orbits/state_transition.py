@@ -1,4 +1,4 @@
-"""From a start to a later time, and its derivative: what periodic orbits are corrected with."""
+"""The flow of a scene and its derivative, for the correction of periodic orbits."""
 
 from typing import Any
 
@@ -16,7 +16,7 @@ from rigidjax.frames.point import Point
 
 @eqx.filter_jit
 def flow(scene: AbstractScene, state: Point, t: ScalarLike, rtol: float, atol: float) -> Point:
-    """Where `scene` takes `state` in the time `t`; derivatives in forward mode.
+    """The state of `scene` a time `t` after `state`; derivatives in forward mode.
 
     >>> from rigidjax.frames import scenes
     >>> flow(scenes.turntable(0.0), Point([0.0, 0, 0], [1.0, 0, 0]), 2.0, 1e-9, 1e-9).x.tolist()
@@ -28,7 +28,7 @@ def flow(scene: AbstractScene, state: Point, t: ScalarLike, rtol: float, atol: f
 
 @eqx.filter_jit
 def attempt(scene: AbstractScene, state: Point, t: ScalarLike, rtol: float, atol: float) -> Point:
-    """As `flow`, but NaN where the solve fails: for starts that Newton's method only tries."""
+    """As `flow`, but NaN if the solve fails: for starts that Newton's method only tries."""
     end, result = _end(scene, state, t, rtol, atol)
     good = result == dfx.RESULTS.successful
     return jax.tree.map(lambda leaf: jnp.where(good, leaf, jnp.full_like(leaf, jnp.nan)), end)
@@ -75,7 +75,7 @@ def transition(
 
 
 def smallest_distance(dtype: Any) -> float:
-    """The distance, of a unit, below which an attraction has lost its digits: eps^0.4.
+    """The distance, in the scene's unit, below which an attraction has lost its digits: eps^0.4.
 
     x − x₁ is then known to eps/r = eps^0.6 only (4e-10 in float64); adaptive steps become tiny.
 

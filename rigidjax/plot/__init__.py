@@ -1,7 +1,7 @@
 """Pictures (extra `view`): matplotlib and viser are imported when a function is called.
 
-Each function draws into axes of yours (`ax=`) or into new ones, and returns the axes. Colours are
-Okabe and Ito's, told apart by everyone.
+Each function draws into your axes (`ax=`) or into new ones, and returns the axes. Colours are Okabe
+and Ito's, distinct also for colour-blind readers.
 """
 
 from rigidjax._names import show

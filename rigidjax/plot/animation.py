@@ -1,4 +1,4 @@
-"""A tumbling body as an animation: a film, or a page of its own that is turned with the mouse."""
+"""A tumbling body as an animation: a film, or an interactive page."""
 
 import base64
 import html
@@ -42,9 +42,9 @@ class Film(eqx.Module):
     def save(self, path: str | Path) -> Path:
         """Write the file; **returns** its path.
 
-        **Arguments:** `path` that ends in `.gif` or `.html`; `.mp4` where the program ffmpeg is
+        **Arguments:** `path` that ends in `.gif` or `.html`, or `.mp4` if the program ffmpeg is
         installed. A page of `player` is `.html` only. **Raises** `ValueError` for another suffix,
-        `FileNotFoundError` where ffmpeg is wanted and missing.
+        `FileNotFoundError` if ffmpeg is needed and missing.
         """
         path = Path(path)
         suffix = path.suffix.lower()
@@ -96,12 +96,12 @@ def tumble(
     """A GIF of the body's box as it tumbles, with the path of its longest axis.
 
     The box is the uniform solid one with the same 𝔖: it moves exactly as the body does. Faces
-    across its principal axes are blue, orange and green, shortest axis first, those on the negative
-    side pale, so that a flip is seen; the origin is held still.
+    across its principal axes are blue, orange and green, shortest axis first; faces on the negative
+    side are pale, to show a flip; the origin is fixed.
 
     **Arguments:** `body`; `ts` (T,) s; `states` of one body with a leading time axis, close enough
-    together that it turns by less than a quarter turn from one to the next; `seconds` the film
-    takes, by default as many as the motion, 20 at most; `fps` pictures a second; `size` px of a
+    together that it turns by less than a quarter turn from one to the next; `seconds` of the film,
+    by default as many as the motion, 20 at most; `fps` pictures a second; `size` px of a
     side; `title`. **Returns** a `Film`, shown by a notebook; `.save(path)`.
 
     **Raises** `ValueError` for a batch, other lengths or numbers that are not positive; `TypeError`
@@ -124,14 +124,14 @@ def tumble(
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection
     from PIL import Image
 
-    # Not pyplot's: a film must not leave a figure behind, nor open a window.
+    # Without pyplot: a film must not keep a figure, nor open a window.
     figure = Figure(figsize=(3.6, 3.6), dpi=size / 3.6)
     canvas = FigureCanvasAgg(figure)
     ax: Any = figure.add_axes((0.0, 0.08, 0.86, 0.84), projection="3d")
     corners = (CORNERS * half) @ turn.T
     m = matrices(q)
     longest = np.argmax(half)
-    # At every state that was given: at the pictures alone the path would be a zigzag.
+    # At every given state: at the pictures alone the path would be a zigzag.
     when = np.asarray(ts, dtype=float)
     tips = matrices(attitudes(states)) @ turn[:, longest] * half[longest]
     reach = float(np.linalg.norm(half))
@@ -162,7 +162,7 @@ def tumble(
 
 
 def _length(ts: Any, seconds: float | int | None, fps: float | int) -> tuple[float, int]:
-    """How many seconds a film takes, and how many pictures it has."""
+    """The seconds of a film, and its number of pictures."""
     if seconds is None:
         when = _checks.on_host(ts, "ts")
         seconds = min(abs(float(when[-1] - when[0])), 20.0) if when.ndim == 1 and when.size else 1.0
@@ -185,15 +185,15 @@ def player(
     fps: float | int = 20,
     height: int = 420,
 ) -> Film:
-    """A page that plays the motion in 3-D, to be turned and zoomed while it runs.
+    """A page that plays the motion in 3-D; you can turn and zoom it while it runs.
 
     The box is the uniform solid one with the same 𝔖, the line the path of its longest axis. The
-    page holds everything, viser's program too (0.8 MB): a notebook shows it without a network or a
-    running kernel, `.save("tumble.html")` makes it a file.
+    page contains everything, also viser's program (0.8 MB): a notebook shows it without a network
+    or a running kernel, `.save("tumble.html")` writes it to a file.
 
     **Arguments:** as `tumble`; `height` px in a notebook. **Returns** a `Film`.
 
-    **Raises** `ModuleNotFoundError` where viser is missing (extra `view`); else as `tumble`.
+    **Raises** `ModuleNotFoundError` if viser is missing (extra `view`); else as `tumble`.
     """
     seconds, pictures = _length(ts, seconds, fps)
     _, q = evenly(ts, states, pictures)
@@ -206,7 +206,7 @@ def player(
         ) from error
     import rich
 
-    # Viser records what a server is told; nobody has to connect to it, or to be told its address.
+    # Viser records the commands to a server; no client has to connect to it.
     console = rich.get_console()
     told, console.quiet = console.quiet, True
     try:
@@ -278,5 +278,5 @@ def box_of(body: Inertia | MassProperties) -> tuple[np.ndarray, np.ndarray]:
         size = size * np.sqrt(3 / float(body.mass))
     else:
         size = size / size.max()
-    # A plate or rod is given a little thickness, to be seen.
+    # A plate or rod gets a little thickness, to be visible.
     return np.maximum(size, 0.02 * size.max()), matrices(np.asarray(q, dtype=float)[None])[0]

@@ -1,4 +1,4 @@
-"""A body as the ellipsoid that moves as it does, and how sure a fit is of it."""
+"""A body as the ellipsoid with the same motion, and its uncertainty by a fit."""
 
 from typing import Any
 
@@ -22,18 +22,18 @@ def inertia_ellipsoid(
     title: str = "",
     ax: Any = None,
 ) -> Any:
-    """The outline of a body's ellipsoid from three sides; of a fit, with its uncertainty.
+    """The outline of a body's ellipsoid from three sides; for a fit with its uncertainty.
 
-    The ellipsoid `r·𝔖⁻¹r = const` is long where the body is long and moves as the body does. Of a
-    `MassProperties` it is the uniform solid one of the same mass, in m; of an `Inertia`, which has
-    no size, it is drawn in units of √Tr 𝔖 of the body given (of the fit's best). Thin lines are
-    bodies drawn from the fit's Gaussian: where they lie apart, the data do not say.
+    The ellipsoid `r·𝔖⁻¹r = const` is long where the body is long and moves as the body does. For
+    `MassProperties` it is the uniform solid one of the same mass, in m. An `Inertia` has no size:
+    its unit is √Tr 𝔖 of the given body (of the fit's best). Thin lines are bodies drawn from the
+    fit's Gaussian: the data do not determine the shape where they differ.
 
     **Arguments:** `body` an `Inertia`, a `MassProperties` or a `rigidjax.identify.Fit`; `truth` a
-    body to compare with, drawn broken; `samples` how many thin lines; `title`; `ax` three axes of
-    yours. **Returns** the axes (3,), planes xy, xz and yz of the body frame.
+    body to compare with, as a broken line; `samples` the number of thin lines; `title`; `ax` three
+    axes. **Returns** the axes (3,), planes xy, xz and yz of the body frame.
 
-    **Raises** `TypeError` for what is none of these, `ValueError` for a body without extension.
+    **Raises** `TypeError` for anything but these, `ValueError` for a body without extension.
 
     >>> import rigidjax as rj
     >>> [one.get_xlabel() for one in inertia_ellipsoid(rj.shapes.box(1.0, [1.0, 2.0, 3.0]))]
@@ -49,7 +49,7 @@ def inertia_ellipsoid(
         shapes["cloud"] = np.asarray(jax.vmap(_shape)(drawn)) / size
     if truth is not None:
         other = np.asarray(_shape(truth))
-        # A body known up to scale only is compared in shape.
+        # Only the shape is compared if the scale is unknown.
         own = solid and isinstance(truth, MassProperties)
         shapes["truth"] = other[None] / (1.0 if own else float(np.trace(other)))
     ax = several_axes(ax, (3,), ncols=3, figsize=(10.5, 3.9))
@@ -84,7 +84,7 @@ def _given(body: Any, samples: int) -> tuple[Inertia | MassProperties, Any]:
 
 def _outlines(ax: Any, shapes: dict[str, np.ndarray], unit: str) -> None:
     """The outlines of `body`, `cloud` and `truth`, each (n, 3, 3), on the three planes."""
-    # The outline reaches √A_ii along axis i. One scale for all three: the panels can be compared.
+    # The outline reaches √A_ii along axis i. All three panels have one scale, for comparison.
     reaches = {name: np.sqrt(np.einsum("nii->ni", shape)) for name, shape in shapes.items()}
     reach = 1.1 * max(float(one.max()) for one in reaches.values())
     apart = np.abs(reaches.get("cloud", reaches["body"]) - reaches["body"]).max(initial=0.0)

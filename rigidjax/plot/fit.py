@@ -16,11 +16,11 @@ def fit(
 ) -> Any:
     """Data and fit of each sensor above, the residuals below.
 
-    **Arguments:** `found` a `rigidjax.identify.Fit`; `index` which of its recordings; `time_unit`
+    **Arguments:** `found` a `rigidjax.identify.Fit`; `index` of the recording; `time_unit`
     `s` or `day`; `rate_unit` `rad/s`, `deg/s` or `deg/day`; `title`. **Returns** the matplotlib
     figure.
 
-    **Raises** `ModuleNotFoundError` where matplotlib is missing (install the extra `view`).
+    **Raises** `ModuleNotFoundError` if matplotlib is missing (install the extra `view`).
 
     >>> import jax.numpy as jnp, rigidjax as rj
     >>> ts = jnp.linspace(0.0, 10.0, 80)
@@ -88,7 +88,7 @@ def _one_sensor(
     scale, unit, line_t = 1.0, sensor.unit, t
     if sensor.reading_shape == (4,):
         read, scale = _long_axis(values), 180 / np.pi
-        # The reading turned back by its error is the prediction.
+        # The prediction is the reading, turned back by its error.
         back = jax.vmap(lambda q, e: quaternion.multiply(q, quaternion.exp(-e)))
         line = _long_axis(back(jnp.asarray(values), jnp.asarray(errors)))
         names = tuple(f"{axis} of body z" for axis in "xyz")

@@ -1,4 +1,4 @@
-"""One path, seen from a moving frame and from an inertial one."""
+"""One path, in a moving frame and in an inertial one."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -26,7 +26,7 @@ def frames(
 ) -> Any:
     """The path in the moving frame on the left, in the inertial one on the right.
 
-    **Arguments:** `frame` the `MovingFrame`; `ts` (T,); `inside` the path as the frame sees it, a
+    **Arguments:** `frame` the `MovingFrame`; `ts` (T,); `inside` the path in the moving frame, a
     `Point` with a leading time axis (`frame.from_inertial` makes it from the other); `plane` two of
     `xyz`; `unit` of length; `marks` places at rest in the frame, name → (3,); `title`; `ax` two
     axes of yours. **Returns** the axes (2,).

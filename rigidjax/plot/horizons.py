@@ -1,4 +1,4 @@
-"""Errors of predictions, by how far ahead they look."""
+"""Errors of predictions by horizon."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -29,17 +29,16 @@ def horizons(
     title: str = "",
     ax: Any = None,
 ) -> Any:
-    """Open-loop errors against how far ahead they are, a picture for each kind of state.
+    """Open-loop errors against the horizon, one picture for each kind of state.
 
     **Arguments:** `found` a `Horizons`, as `WindowFit.predict` and `Windows.held`
     return them, or several by name, to be compared: of a model, of a prediction that holds the
     start, of other windows; `step` s between samples, for a scale of time in the place of steps;
     `measure` `mean_absolute` (of a component), `mean_norm` or `rms` (of the vector); `title`; `ax`
-    as many axes of yours as there are kinds, else new ones. Both scales are linear, for errors
-    start at zero.
-    **Returns** the axes, one for each of position, velocity, attitude, body rate that there is.
+    one for each kind, else new ones. Both scales are linear, since errors start at zero.
+    **Returns** the axes, one for each of position, velocity, attitude, body rate in the state.
 
-    **Raises** `TypeError` for what are no errors by horizon; `ValueError` for none, for kinds that
+    **Raises** `TypeError` for anything but errors by horizon; `ValueError` for none, for kinds that
     differ, an unknown measure, a step that is not positive, another number of axes.
 
     >>> import rigidjax as rj

@@ -33,13 +33,13 @@ def phase_portrait(
 ) -> Any:
     """Tilt θ against θ̇ of a symmetric top, with the curves of equal energy around its path.
 
-    `E = ½ I₁ θ̇² + (p_φ − p_ψ cos θ)²/(2 I₁ sin²θ) + m g l cos θ` with the momenta p_φ about the
-    vertical and p_ψ about the top's axis of the first state. Source: Landau and Lifshitz,
+    `E = ½ I₁ θ̇² + (p_φ − p_ψ cos θ)²/(2 I₁ sin²θ) + m g l cos θ` with the momenta of the initial
+    state, p_φ about the vertical and p_ψ about the top's axis. Source: Landau and Lifshitz,
     Mechanics, § 35, problem 1. The cross is steady precession, the least energy.
 
     **Arguments:** `inertia` about the pivot; `top` weight and place of the centre of mass, which
-    lies on the axis of symmetry; `states` of one body with a leading time axis; `levels` how many
-    thin curves; `title`; `ax` axes of yours. **Returns** the axes.
+    lies on the axis of symmetry; `states` of one body with a leading time axis; `levels` the number
+    of thin curves; `title`; `ax` your axes. **Returns** the axes.
 
     **Raises** `ValueError` for a body that is not symmetric about its centre of mass's axis, no
     weight, or a batch; `TypeError` for states without an attitude.

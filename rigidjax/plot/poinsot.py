@@ -30,10 +30,10 @@ from rigidjax.plot.style import (
 def body_axes(states: HasAttitude, *, title: str = "", ax: Any = None) -> Any:
     """The paths of the three body axes on the unit sphere, world frame.
 
-    A dot marks the start, a triangle the end; what lies behind the sphere is faint.
+    A dot marks the start, a triangle the end; the path behind the sphere is faint.
 
-    **Arguments:** `states` of one body with a leading time axis; `title`; `ax` 3-D axes of yours,
-    turned as you like (`view_init`) before the call. **Returns** the axes.
+    **Arguments:** `states` of one body with a leading time axis; `title`; `ax` your 3-D axes, with
+    the view set before the call (`view_init`). **Returns** the axes.
 
     **Raises** `TypeError` for states without an attitude or flat axes, `ValueError` for a batch.
 
@@ -65,14 +65,14 @@ def polhode(
 ) -> Any:
     """The path of Π = IΩ where the momentum sphere |Π| = h meets the ellipsoid ΣΠᵢ²/Iᵢ = 2T.
 
-    Drawn along the principal axes (ascending moments), in units of h = |Π| of the first state.
+    Drawn along the principal axes (ascending moments), with unit h, the initial |Π|.
     Thin lines are other energies at the same h; the broken ones the separatrix through the middle
-    axis. What lies behind the sphere is dotted (this motion) or faint (the others).
+    axis. Lines behind the sphere are dotted (this motion) or faint (the others).
 
     Source: Landau and Lifshitz, Mechanics, § 37.
 
-    **Arguments:** `inertia`; `states` of one body with a leading time axis; `energies` how many
-    thin lines; `title`; `ax` 3-D axes of yours. **Returns** the axes.
+    **Arguments:** `inertia`; `states` of one body with a leading time axis; `energies` the number
+    of thin lines; `title`; `ax` your 3-D axes. **Returns** the axes.
 
     **Raises** `ValueError` for a body at rest, a zero moment or a batch; `TypeError` for flat axes.
 
@@ -97,12 +97,12 @@ def polhode(
     twice_energy = float(np.sum(pi[0] ** 2 / i))
 
     ax = solid_axes(ax)
-    # We say what lies in front. matplotlib takes one depth for a whole surface, and would draw the
+    # The order is set here. matplotlib takes one depth for a whole surface, and would draw the
     # sphere over the path.
     ax.computed_zorder = False
     globe(ax, (1.0, 1.0, 1.0), COLOURS[5], 0.15)
     cage(ax, np.sqrt(twice_energy * i), COLOURS[4], lw=0.5, alpha=0.8, zorder=2)
-    # All energies are the same one if all moments are equal: there are no lines to draw.
+    # All energies are equal if all moments are equal: there are no lines to draw.
     if i[2] - i[0] > 1e-9 * i[2]:
         _others(ax, i, energies)
     hidden = {"alpha": 1.0, "ls": (0, (1, 1)), "lw": 1.8}
@@ -152,8 +152,8 @@ def _curves(ax: Any, curves: Any, **how: Any) -> None:
 def herpolhode(inertia: Inertia, states: HasAttitude, *, title: str = "", ax: Any = None) -> Any:
     """The path of the world rate ω on the invariable plane, across the angular momentum.
 
-    Free motion only: there the part of ω along the momentum is 2T/h and stays. The circles are the
-    least and the largest distance that this motion reaches.
+    It needs a free motion: the part of ω along the momentum is then 2T/h and constant. The circles
+    are the least and the largest distance of this motion.
 
     **Arguments:** `inertia`; `states` (`Attitude`) of one body with a leading time axis; `title`;
     `ax` axes of yours. **Returns** the axes.

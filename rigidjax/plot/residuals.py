@@ -1,4 +1,4 @@
-"""Residuals of a fit: are they noise?"""
+"""Residuals of a fit, and a comparison with white noise."""
 
 from typing import Any
 
@@ -18,14 +18,14 @@ def residuals(
     From left to right: they should scatter evenly within ±2 (what lies beyond ±8 is a triangle at
     the edge); their histogram against the normal curve; the correlation of each with a later one,
     which for white noise stays inside the band ±2/√N; their power spectrum, which for white noise
-    of the given size is 1 at all frequencies (Welch's estimate; Lomb's where times are uneven).
+    of the given size is 1 at all frequencies (Welch's estimate; Lomb's for uneven times).
     A line in the spectrum is a motion or a torque that the model lacks.
 
-    **Arguments:** `found` a `rigidjax.identify.Fit`; `index` which of its recordings; `time_unit`
-    `s`, `min`, `h` or `day`; `title`; `ax` axes of yours (sensors, 4). **Returns** the axes.
+    **Arguments:** `found` a `rigidjax.identify.Fit`; `index` of the recording; `time_unit` `s`,
+    `min`, `h` or `day`; `title`; `ax` your axes (sensors, 4). **Returns** the axes.
 
-    **Raises** `ModuleNotFoundError` where matplotlib is missing; `ValueError` for an unknown unit
-    or axes of another shape; `IndexError` for a recording that is not there.
+    **Raises** `ModuleNotFoundError` if matplotlib is missing; `ValueError` for an unknown unit or
+    axes of another shape; `IndexError` for a missing recording.
 
     >>> import jax.numpy as jnp, rigidjax as rj
     >>> ts = jnp.linspace(0.0, 10.0, 80)

@@ -1,4 +1,4 @@
-"""What all pictures share: colours, axes, matplotlib when wanted, checks of what comes."""
+"""Shared parts of all pictures: colours, axes, the import of matplotlib, checks of arguments."""
 
 from typing import Any
 
@@ -10,7 +10,7 @@ from rigidjax import _checks
 from rigidjax._checks import plain as plain
 from rigidjax.rotation import quaternion
 
-# Okabe and Ito's colours, told apart by everyone (Okabe and Ito 2008, "Color Universal Design").
+# Okabe and Ito's colours, distinct also for colour-blind readers (2008, "Color Universal Design").
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 AXES = "xyz"
 TIMES = {"s": 1.0, "min": 60.0, "h": 3600.0, "day": 86400.0}
@@ -32,12 +32,12 @@ def pyplot() -> Any:
 
 
 def unit(name: str, known: dict[str, float], what: str) -> float:
-    """How many SI units, or SI in how many, by name; `ValueError` lists what is known."""
+    """The factor of a unit to or from SI, by name; `ValueError` lists the known ones."""
     return known[_checks.word(name, tuple(known), what)]
 
 
 def of_fit(found: Any, index: Any) -> int:
-    """Which recording of a fit; raises in words where it is no fit, or has none of that number."""
+    """The recording of a fit; raises in words if it is no fit, or has no such recording."""
     if np.shape(getattr(found, "chi2", 0.0)) != ():
         raise ValueError("found: wanted one Fit, got one with leading axes; draw them one by one")
     wanted = ("problem", "parameters", "residuals")
@@ -87,7 +87,7 @@ def legend_below(ax: Any, *entries: Any, down: float = 0.16) -> None:
 
 
 def times(ts: Any, count: int, what: str = "the states have") -> np.ndarray:
-    """Times (T,) as NumPy float64; `ValueError` where there are not as many as states."""
+    """Times (T,) as NumPy float64; `ValueError` unless there are as many as states."""
     t = _checks.on_host(ts, "ts")
     if t.shape != (count,):
         raise ValueError(f"ts: wanted ({count},) as {what}, got {t.shape}")
@@ -97,7 +97,7 @@ def times(ts: Any, count: int, what: str = "the states have") -> np.ndarray:
 def rows(values: Any, width: int, name: str) -> np.ndarray:
     """Values of one body over time (T, width) as NumPy float64.
 
-    **Raises** `ValueError` for another shape: most often a batch, of which one is to be picked.
+    **Raises** `ValueError` for another shape, most often a batch: pick one body of it.
     """
     out = _checks.on_host(values, name)
     if out.ndim != 2 or out.shape[1] != width:
@@ -109,7 +109,7 @@ def rows(values: Any, width: int, name: str) -> np.ndarray:
 
 
 def attitudes(states: Any, name: str = "states") -> np.ndarray:
-    """Quaternions (T, 4) of states that have them; `TypeError` for those that have none."""
+    """Quaternions (T, 4) of states; `TypeError` for states without them."""
     if not hasattr(states, "q"):
         raise TypeError(
             f"{name}: wanted states with an attitude (Attitude, Rigid), got {type(states).__name__}"
@@ -140,10 +140,10 @@ def around_ball(
     behind: dict[str, Any] | None = None,
     **how: Any,
 ) -> None:
-    """A line on a ball: drawn in full where it faces the eye, otherwise where the ball hides it.
+    """A line on a ball: full in front of the ball, in another style behind it.
 
-    **Arguments:** `path` (T, 3); `centre_free` (T, 3) the outward normals there; `behind` how the
-    hidden part differs, faint unless said otherwise; `how` of matplotlib's lines.
+    **Arguments:** `path` (T, 3); `centre_free` (T, 3) the outward normals there; `behind` the style
+    of the hidden part, by default faint; `how` options of matplotlib's lines.
     """
     up, around = np.radians(ax.elev), np.radians(ax.azim)
     eye = np.array([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)])
@@ -166,7 +166,7 @@ def globe(ax: Any, semi_axes: Any, colour: str, alpha: float) -> None:
 
 
 def cage(ax: Any, semi_axes: Any, colour: str, **how: Any) -> None:
-    """An ellipsoid along the axes by meridians and parallels: what is inside stays visible."""
+    """An ellipsoid along the axes by meridians and parallels: its inside stays visible."""
     shape = _ellipsoid(semi_axes)
     ax.plot_wireframe(*shape, color=colour, rstride=4, cstride=6, **how)
 

@@ -1,4 +1,4 @@
-"""Attitude and spin against time."""
+"""Attitude and body rate against time."""
 
 from typing import Any
 
@@ -31,13 +31,13 @@ def motion(
     title: str = "",
     ax: Any = None,
 ) -> Any:
-    """Body rate against time, and above it the attitude where the states have one.
+    """Body rate against time, and above it the attitude if the states have one.
 
     **Arguments:** `ts` (T,) s; `states` of one body with a leading time axis, such as `sol.ys`;
-    `attitude` how it is shown: `quaternion` (w, x, y, z), `axes` (the height of each body axis
+    `attitude` its form: `quaternion` (w, x, y, z), `axes` (the height of each body axis
     along world z) or `angles` (3-1-3, notes eq 31, deg); `time_unit` `s`, `min`, `h`, `day`;
-    `rate_unit` `rad/s`, `deg/s`, `rpm`, `deg/day`; `title`; `ax` two axes (one for a `Spin`) of
-    yours, else new ones. **Returns** the axes, (2,) or (1,).
+    `rate_unit` `rad/s`, `deg/s`, `rpm`, `deg/day`; `title`; `ax` your two axes (one for a `Spin`),
+    else new ones. **Returns** the axes, (2,) or (1,).
 
     **Raises** `ValueError` for an unknown unit, or a batch instead of one body.
 
@@ -62,7 +62,7 @@ def motion(
     for one in ax:
         one.margins(x=0)
         one.grid(alpha=0.3)
-        # Beside the picture: a legend inside would lie on some line sooner or later.
+        # Beside the picture: a legend inside would cover a line.
         one.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
     if title:
         ax[0].set_title(plain(title))
@@ -95,7 +95,7 @@ def _angles(q: np.ndarray) -> np.ndarray:
         axis=-1,
     )
     degrees = np.degrees(angles)
-    # A line across the whole picture where an angle goes from 180° to −180° would be no motion.
+    # A line across the whole picture at a jump of an angle from 180° to −180° would be no motion.
     jump = np.abs(np.diff(degrees, axis=0)) > 180
     degrees[1:][jump] = np.nan
     return degrees

@@ -1,4 +1,4 @@
-"""Keep XLA from computing numbers again in each place that reads them."""
+"""A barrier, so that XLA does not compute numbers again for each use."""
 
 from typing import TypeVar
 
@@ -9,24 +9,24 @@ from jaxtyping import Array
 
 Tree = TypeVar("Tree")
 
-# XLA on CPU drops barriers before it fuses, which is where it repeats what is shared: a solve of
-# order 8 at 900 times took minutes, not milliseconds.
+# XLA on CPU drops barriers before fusion, which repeats shared values: a solve of order 8 at 900
+# times took minutes, not milliseconds.
 _DROPPED = jax.__version_info__ < (0, 11)
 
 
 def barrier(tree: Tree) -> Tree:
-    """The same numbers, computed once: `jax.lax.optimization_barrier`, also where XLA drops those.
+    """The same numbers, computed once: `jax.lax.optimization_barrier`, also if XLA drops it.
 
-    There each number goes through `once`.
+    In that case each number goes through `once`.
     """
     return jax.tree.map(_real_once, tree) if _DROPPED else lax.optimization_barrier(tree)
 
 
 def once(x: Array) -> Array:
-    """The same number, computed once however often it is used, here and in the gradient.
+    """The same number, computed once for all uses, here and in the gradient.
 
-    A division by one (by 2 for NaN): XLA on CPU computes a quotient once, where it would repeat
-    anything cheaper, with all that leads to it, for every component.
+    It divides by one (by 2 for NaN): XLA on CPU computes a quotient once, but repeats anything
+    cheaper, with all its inputs, for every component.
     """
     return x / jnp.where(x == x, 1, 2)
 

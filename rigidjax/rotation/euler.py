@@ -1,15 +1,16 @@
 """Euler angles in all 24 sequences; the 3-1-3 of the notes, "ZXZ", first.
 
 A sequence is three letters, the angles are listed in its order, and every angle is active and in
-radians. **Capitals are intrinsic**: each turn is about the axis as already turned, and
+radians. **Capitals are intrinsic**: each turn is about the moved axis, and
 M = R_1(a) R_2(b) R_3(c) (notes, eqs 12, 27–31). **Lower case is extrinsic**: each turn is about a
 fixed axis of the world, and M = R_3(c) R_2(b) R_1(a). SciPy uses the same letters.
 
 **The singular case** ("gimbal lock"): middle angle 0 or π when first and last letter are the same,
 ±π/2 when all three differ. Only the sum or the difference of the outer angles is then defined.
-The choice here, wherever the sine or cosine that vanishes is below 4 units of round-off: **the
+The choice here, if the vanishing sine or cosine is below 4 units of round-off: **the
 last angle listed is 0** (likewise its rate), and the matrix is reproduced all the same. Derivatives
-there are finite: those of the remaining chart, with the middle angle held. `is_singular` tells.
+there are finite: they belong to the remaining chart, with the middle angle held. `is_singular`
+tests for the case.
 """
 
 import warnings
@@ -58,10 +59,10 @@ def to_matrix(angles: Vec3Like, sequence: str = "ZXZ") -> Mat3:
 def from_matrix(matrix: Mat3Like, sequence: str = "ZXZ") -> Vec3:
     """The Euler angles of a rotation matrix, rad, in the order of `sequence`.
 
-    **Arguments:** `matrix` (3, 3) rotation, body → world; values are not looked at (`so3.check`).
+    **Arguments:** `matrix` (3, 3) rotation, body → world; values are not checked (`so3.check`).
 
     **Returns:** (3,): outer angles in (−π, π]; the middle one in [0, π] if first and last letter
-    agree, else in [−π/2, π/2]. In the singular case the last is 0. **Raises:** `ValueError` for an
+    agree, else in [−π/2, π/2]. The last is 0 in the singular case. **Raises:** `ValueError` for an
     unknown sequence.
 
     >>> angles = jnp.array([0.3, 0.2, 0.1])
@@ -75,8 +76,8 @@ def from_quaternion(q: QuatLike, sequence: str = "ZXZ") -> Vec3:
     """The Euler angles of a quaternion, rad, in the order of `sequence`; same bits for q and −q.
 
     **Arguments:** `q` (4,) of any length, body → world. **Raises:** `ValueError` for zero or NaN,
-    and an unknown sequence. Half the sum and half the difference of the
-    outer angles come from two atan2, so that near the singular case the matrix keeps all its digits
+    and an unknown sequence. Half the sum and half the difference of the outer angles come from two
+    atan2, so that the matrix keeps all its digits near the singular case
     (Bernardes & Viollet 2022, doi:10.1371/journal.pone.0276302).
 
     >>> from_quaternion(jnp.array([1.0, 0.0, 0.0, 0.0])).tolist()
@@ -159,8 +160,8 @@ def omega_to_rates(
 
     **Arguments:** `angles` (3,), rad, in the order of `sequence`; `omega` (3,), rad/s, in `frame`.
 
-    **Returns:** (3,) rad/s. In the singular case (`is_singular`) the last rate is 0, the others
-    follow, and the part of `omega` that no rates can make is dropped. **Raises:** `ValueError` for
+    **Returns:** (3,) rad/s. The last rate is 0 in the singular case (`is_singular`), the others
+    follow, and the part of `omega` outside their range is dropped. **Raises:** `ValueError` for
     an unknown sequence or frame.
 
     >>> omega_to_rates(jnp.array([0.1, 0.2, 0.3]), jnp.array([0.0, 0.0, 2.0])).tolist()
@@ -235,7 +236,7 @@ def _wrap(angle: Scalar) -> Scalar:
 
 
 def _turning_axes(axes: tuple[int, int, int], angles: tuple) -> tuple[Vec3, Vec3, Vec3]:
-    """The three axes of turning, seen from the body: what each unit rate adds to Ω."""
+    """The three axes of turning, in the body frame: the contribution of each unit rate to Ω."""
     _, j, k = axes
     first, second, third = (jnp.eye(3, dtype=angles[0].dtype)[axis] for axis in axes)
     middle, last = _about(j, angles[1]), _about(k, angles[2])
@@ -244,7 +245,7 @@ def _turning_axes(axes: tuple[int, int, int], angles: tuple) -> tuple[Vec3, Vec3
 
 
 def _vanishing(middle: Scalar, axes: tuple[int, int, int]) -> tuple[Scalar, Bool[Array, ""]]:
-    """Of the turning axes, first · (third × second), and whether it is 0 to round-off."""
+    """The product first · (third × second) of the axes, and whether it is 0 to round-off."""
     i, j, k = axes
     size = jnp.sin(middle) if i == k else -_handed(i, j) * jnp.cos(middle)
     return size, jnp.abs(size) < 4 * jnp.finfo(middle.dtype).eps

@@ -3,7 +3,7 @@
 No singular value decomposition and no eigenvectors: their derivatives are NaN at every rotation,
 where all three singular values are 1. The best rotation R of a 3×3 matrix B, the one with the
 largest Tr(RᵀB), has the derivative dR = R hat(x), (Tr(S) 1 − S) x = 2 vee(Rᵀ dB), S = sym(RᵀB),
-which is regular wherever the answer is unique.
+which is regular if the answer is unique.
 """
 
 from functools import partial
@@ -34,12 +34,12 @@ from rigidjax.rotation.validation import direction, rotation_matrix, unit_quater
 
 
 def project(matrix: Mat3Like) -> Mat3:
-    """The rotation nearest to a matrix (Frobenius norm), with the right derivative on SO(3) too.
+    """The rotation nearest to a matrix (Frobenius norm), with the correct derivative also on SO(3).
 
     **Arguments:** `matrix` (3, 3), det > 0. **Returns:** (3, 3) with RᵀR = 1 to round-off.
 
     **Raises:** `ValueError` if a matrix known now is left-handed (a mirror image has no nearest
-    rotation), singular, or not finite; under `jit` put `so3.check` or a test of your own before.
+    rotation), singular, or not finite; under `jit` call `so3.check` or your own test before.
 
     >>> project(2.0 * jnp.eye(3)).round(12).tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
@@ -49,7 +49,7 @@ def project(matrix: Mat3Like) -> Mat3:
         _checks.finite(matrix, "matrix")
         direction(matrix.reshape(9), "matrix")
         size = np.max(np.abs(np.asarray(matrix)))
-        # Of the matrix over its largest entry: that of itself may overflow.
+        # For the matrix over its largest entry: its own determinant may overflow.
         found = np.linalg.det(np.asarray(matrix) / size)
         if found <= 0:
             raise ValueError(
@@ -69,9 +69,9 @@ def wahba(
     `weights` (n,), not negative, 1 if not given. Solved for the largest root of the quartic of
     Markley 1993 (FOAM, J. Astronaut. Sci. 41, 261), then by Newton's method on the group.
 
-    **Raises:** an error, under `jit` too, if the directions leave a turn free: fewer than two, or
-    all parallel (to 5e-4 rad in float64, 4° in float32, where half the digits would be gone);
-    `ValueError` for NaN, and for all zeros, where they are known.
+    **Raises:** an error, also under `jit`, if the directions do not determine the rotation: fewer
+    than two, or all parallel (to 5e-4 rad in float64, 4° in float32, where half the digits would be
+    lost); `ValueError` for known NaN, and for all zeros.
 
     >>> wahba(jnp.eye(3)[:2], jnp.eye(3)[:2]).round(12).tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
@@ -97,10 +97,10 @@ def align(a: Vec3Like, b: Vec3Like) -> Mat3:
     """The smallest rotation that takes the direction of a into that of b.
 
     **Arguments:** `a`, `b` (3,), in one frame, any lengths. **Returns:** (3, 3), R a ∥ b.
-    **Raises:** `ValueError` for zero or NaN where they are known.
-    For directions that are opposite to round-off: half a turn about the axis normal to a that is
-    nearest to the basis vector along which a is smallest. No digits are lost near there: the
-    quaternion is (½|m|, a × m/|m|), m = a + b, and m is small but exact.
+    **Raises:** `ValueError` for known zero or NaN. For directions opposite to round-off it is half
+    a turn about the axis normal to a that is nearest to the basis vector along which a is smallest.
+    No digits are lost near that case: the quaternion is (½|m|, a × m/|m|), m = a + b, and m is
+    small but exact.
 
     >>> align(jnp.array([1.0, 0, 0]), jnp.array([0, 2.0, 0])).round(12)[:, 0].tolist()
     [0.0, 1.0, 0.0]
@@ -110,7 +110,7 @@ def align(a: Vec3Like, b: Vec3Like) -> Mat3:
     a, b = a / jnp.sqrt(dot(a, a)), b / jnp.sqrt(dot(b, b))
     middle = a + b
     n2, normal = dot(middle, middle), cross(a, middle)
-    # Both lengths are 1 to round-off only: what is left of m may lie along a.
+    # Both lengths are 1 to round-off only: the rest of m may lie along a.
     least = 2 * float(jnp.finfo(a.dtype).eps)
     opposite = (n2 < 1) & (dot(normal, normal) <= least * least)
     length = jnp.sqrt(jnp.where(opposite, 1, n2))
@@ -128,8 +128,8 @@ def mean(matrices: Float[ArrayLike, "n 3 3"], weights: Float[ArrayLike, "n"] | N
     unique (Karcher 1977, doi:10.1002/cpa.3160300502); `weights` (n,), not negative.
 
     **Returns:** (3, 3), with first and second derivatives from the last two Newton steps alone.
-    **Raises:** as `so3.check`, if the matrices are known now; `ValueError` for weights that make no
-    mean.
+    **Raises:** as `so3.check`, if the matrices are known now; `ValueError` for negative weights, or
+    only zeros.
 
     >>> mean(jnp.stack([jnp.eye(3), jnp.eye(3)])).round(12).tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
@@ -156,7 +156,7 @@ def mean_quaternion(
     return _karcher(q, of_order_one(weights_of(weights, q[:, 0], "quaternions")))
 
 
-# Compiled once: called from the prompt, the loop would be compiled anew each time.
+# Compiled once: outside of `jit` the loop would be compiled again at each call.
 @partial(jax.jit, inline=True)
 def _karcher(q: Float[Array, "n 4"], w: Float[Array, "n"]) -> Quat:
 
@@ -177,12 +177,12 @@ def _karcher(q: Float[Array, "n 4"], w: Float[Array, "n"]) -> Quat:
 
 
 def of_order_one(x: Array) -> Array:
-    """The same but for a power of two, where only ratios count: no product overflows."""
+    """The same times a power of two, for formulas of ratios: no product overflows."""
     return near_one(jnp.max(jnp.abs(x))) * x
 
 
 def weights_of(weights: Any, like: Array, of: str) -> Array:
-    """One weight for each, 1 if not given; refused where it is known that no mean has them."""
+    """One weight for each, 1 if not given; known weights without a mean are refused."""
     if like.shape[0] == 0:
         raise ValueError(f"{of}: wanted at least one row, got none")
     if weights is None:
@@ -211,7 +211,7 @@ def _quartic(b: Mat3) -> tuple[Scalar, Scalar]:
 
 
 def _curvature(r: Mat3, b: Mat3) -> Mat3:
-    """Tr(S) 1 − S, S = sym(Rᵀb): how sharply the gain Tr(Rᵀb) falls off around R."""
+    """Tr(S) 1 − S, S = sym(Rᵀb): the curvature of the gain Tr(Rᵀb) around R."""
     m = product(r.T, b)
     s = 0.5 * (m + m.T)
     return (s[0, 0] + s[1, 1] + s[2, 2]) * jnp.eye(3, dtype=r.dtype) - s
@@ -226,7 +226,7 @@ def nearest(b: Mat3) -> Mat3:
     kappa = 0.5 * (root * root - 1)
     rough = ((kappa + 1) * b + root * cofactors(b) - product(b, product(b.T, b))) / zeta
     q = matrix_to_quaternion(rough)
-    # The root of the quartic may have half its digits; Newton steps on the group mend that.
+    # The root of the quartic may have half its digits; Newton steps on the group correct that.
     for _ in range(3):
         r = quaternion.to_matrix(q)
         turn = solve(_curvature(r, b), 2 * vee(product(r.T, b)))

@@ -1,6 +1,6 @@
-"""The costly maps without their checks, compiled once also when called from the prompt.
+"""The costly maps without their checks, compiled once also outside of `jit`.
 
-`quaternion` and `so3` are the public face of these; nothing here looks at shapes or values.
+`quaternion` and `so3` are their public versions; nothing here checks shapes or values.
 """
 
 from collections.abc import Sequence
@@ -83,7 +83,7 @@ def _log(q: Quat) -> Vec3:
 def _log_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
     (q,), (dq,) = primals, tangents
     v = _log(q)
-    # Of any length: both are made shorter alike.
+    # Any length is allowed: both are scaled by the same factor.
     scale = near_one(*components(q))
     w, *u = parts = components(scale * q)
     dw, *du = components(scale * dq)

@@ -1,9 +1,10 @@
 """Vectors and 3×3 matrices, written on components.
 
-`@` on 3×3 matrices is slow in gradients on CPU and runs in TF32 on some GPUs; these do neither.
+`@` on 3×3 matrices is slow in gradients on CPU and runs in TF32 on some GPUs; these functions avoid
+both.
 
-Range: the products that a formula has (two entries in `cross`, `dot`, `product` and `apply`, three
-in `determinant`, four in `solve`) must be numbers: entries from 1e-75 to 1e75 always are (float32:
+Range: the products in a formula (two entries in `cross`, `dot`, `product` and `apply`, three in
+`determinant`, four in `solve`) must be finite: entries from 1e-75 to 1e75 always are (float32:
 1e-9 to 1e9).
 """
 
@@ -68,8 +69,8 @@ def square(v: Sequence[Scalar]) -> Scalar:
 def near_one(*parts: Scalar) -> Scalar:
     """A power of two that brings the largest of some scalars near 1.
 
-    What it multiplies keeps all its digits and can be squared and summed: for formulas in which the
-    length of their argument drops out. Its derivative is taken as zero.
+    A number times it keeps all its digits and can be squared and summed: for formulas that do not
+    depend on the length of their argument. Its derivative is set to zero.
     """
     sizes = [jnp.abs(lax.stop_gradient(part)) for part in parts]
     info = jnp.finfo(sizes[0].dtype)

@@ -1,9 +1,9 @@
 """Modified Rodrigues parameters σ = n tan(θ/4), and their shadow set.
 
-Three numbers without a sine: regular up to a full turn, where σ runs to infinity. σ and its shadow
+Three numbers without a sine, regular up to a full turn, where σ goes to infinity. σ and its shadow
 −σ/|σ|² are the same rotation; switching at |σ| = 1 keeps to θ ≤ π. Source: Schaub & Junkins, 2018,
-Analytical Mechanics of Space Systems, sec. 3.5.2. Range: any σ, and up to 1e75 (float32:
-1e9) where it meets rates, which are as well.
+Analytical Mechanics of Space Systems, sec. 3.5.2. Range: any σ; with rates, both up to 1e75
+(float32: 1e9).
 """
 
 import jax.numpy as jnp

@@ -2,14 +2,13 @@
 
 q and −q are the same rotation. `log`, and every error built on it, gives the same bits for both.
 The maps here take one quaternion and normalise nothing, so that they cost little in a vector field;
-`check` is for data from outside. Where one says that it refuses values, those are meant
-that are known (not traced).
+`check` is for data from outside. A map refuses only known values, not traced ones.
 
-Range: what does not ask for the length of a quaternion or an axis (`normalise`, `log`, `angle`,
-`about_axis`) takes any, down to 1e-307 and up to 1e308 (float32: 1e-37 to 1e38). Of an angle beyond
-1/ε, 4.5e15 rad (float32: 8.4e6), no digit is left: `exp` and what is made of it refuse it; a traced
-one gives some rotation, and NaN beyond 1e150 (1e18). Where a unit quaternion is asked for,
-vectors and rates may have components up to 1e307 (1e37).
+Range: functions of a quaternion or axis of any length (`normalise`, `log`, `angle`, `about_axis`)
+take lengths from 1e-307 to 1e308 (float32: 1e-37 to 1e38). An angle beyond 1/ε, 4.5e15 rad
+(float32: 8.4e6), has no correct digit: `exp` and functions based on it refuse it; a traced one
+gives an arbitrary rotation, and NaN beyond 1e150 (1e18). Vectors and rates beside a unit quaternion
+may have components up to 1e307 (1e37).
 """
 
 from collections.abc import Sequence
@@ -49,7 +48,7 @@ def exp(v: Vec3Like) -> Quat:
     **Arguments:** `v` (3,) rotation vector, rad (notes, eqs 17, 18, with v = γ y). The angle is
     known to ε|v|. **Raises:** `ValueError` for NaN, and beyond 1/ε (see the head of this module).
 
-    **Returns:** (4,) of norm 1; value and derivatives are right at v = 0 too.
+    **Returns:** (4,) of norm 1; value and derivatives are correct also at v = 0.
 
     >>> exp(jnp.array([0.0, 0.0, jnp.pi])).round(12).tolist()
     [0.0, 0.0, 0.0, 1.0]
@@ -63,9 +62,9 @@ def log(q: QuatLike) -> Vec3:
     **Arguments:** `q` (4,); its length does not matter. **Raises:** `ValueError` for zero or NaN.
 
     **Returns:** v = 2 atan2(|q_v|, q_w) q_v/|q_v| (3,), from q or −q, whichever has q_w > 0; at
-    q_w = 0 the one whose first nonzero component is positive. The derivative is that of
-    Q(q)/|q|, by the inverse right Jacobian, and right from 0 to π (Solà 2018, arXiv:1711.02508;
-    the angle is halved twice so that nothing cancels or branches).
+    q_w = 0 the one whose first nonzero component is positive. The derivative is that of Q(q)/|q|,
+    by the inverse right Jacobian, and correct from 0 to π (Solà 2018, arXiv:1711.02508; the angle
+    is halved twice to avoid cancellation and branches).
 
     >>> abs(log(jnp.array([0.0, 0.0, 0.0, -1.0]))).round(6).tolist()
     [0.0, 0.0, 3.141593]
@@ -123,11 +122,12 @@ def rotate_inverse(q: QuatLike, y: Vec3Like) -> Vec3:
 
 
 def check(q: Float[ArrayLike, "*batch 4"], *, name: str = "q") -> Float[Array, "*batch 4"]:
-    """Check a quaternion that comes from outside: normalised, or refused.
+    """Check a quaternion from outside: normalise it, or refuse it.
 
-    **Arguments:** `q` (..., 4), scalar first; `name` how messages call it. **Returns:** it, with
-    length 1 to round-off. **Raises:** for NaN, a zero quaternion, and a length off by more than
-    1e-6 (float32: 1e-3); a `ValueError`, or under `jit` `equinox.error_if` with the same words.
+    **Arguments:** `q` (..., 4), scalar first; `name` its name in messages. **Returns:** the
+    quaternion, with length 1 to round-off. **Raises:** for NaN, a zero quaternion, and a length off
+    by more than 1e-6 (float32: 1e-3); a `ValueError`, or under `jit` `equinox.error_if` with the
+    same words.
 
     >>> check(jnp.array([1.0, 0.0, 0.0, 1e-9])).tolist()[0]
     1.0
@@ -209,7 +209,7 @@ def interpolate(p: QuatLike, q: QuatLike, s: ScalarLike) -> Quat:
 
     **Arguments:** `p`, `q` (4,) unit, either sign; `s` dimensionless, may lie beyond [0, 1]
     (Shoemake 1985, doi:10.1145/325334.325242; here p exp(s log(p̄ q)), regular at p = q).
-    **Raises:** `ValueError` where the product p̄ q is zero or NaN.
+    **Raises:** `ValueError` if the product p̄ q is zero or NaN.
 
     >>> p, q = exp(jnp.array([0, 0, 1.0])), exp(jnp.array([0, 0, 2.0]))
     >>> bool(abs(interpolate(p, q, 0.5) - exp(jnp.array([0, 0, 1.5]))).max() < 1e-15)
@@ -244,7 +244,7 @@ def normalise(q: QuatLike) -> Quat:
 
 
 def canonical(q: QuatLike) -> Quat:
-    """Of q and −q, the one with w > 0; if w = 0, the one whose first nonzero component is positive.
+    """The one of q and −q with w > 0; if w = 0, the one with a positive first nonzero component.
 
     **Arguments:** `q` (4,). The same bits come back for q and −q.
 
@@ -258,8 +258,8 @@ def canonical(q: QuatLike) -> Quat:
 def angle(q: QuatLike) -> Scalar:
     """The angle of a rotation, rad, in [0, π]; the same bits for q and −q.
 
-    **Arguments:** `q` (4,); its length does not matter. 2 atan2(|q_v|, |q_w|). At the identity the
-    derivative does not exist; 0 is returned, the shortest subgradient. **Raises:** `ValueError` for
+    **Arguments:** `q` (4,); its length does not matter. 2 atan2(|q_v|, |q_w|). The derivative does
+    not exist at the identity; 0 is returned, the shortest subgradient. **Raises:** `ValueError` for
     zero or NaN.
 
     >>> round(float(angle(exp(jnp.array([0.0, 1e-9, 0.0]))) * 1e9), 9)
@@ -268,7 +268,7 @@ def angle(q: QuatLike) -> Scalar:
     q = direction(_checks.floating(q, (4,), "q", hint=_HINT), "q")
     w, *u = components(near_one(*components(q)) * q)
     n2 = dot_components(u, u)
-    # Both atan2 and the root see ones, not zeros, where their derivative would be 0/0.
+    # Both atan2 and the root get ones, not zeros, if their derivative would be 0/0.
     there = n2 != 0
     half = jnp.arctan2(jnp.sqrt(jnp.where(there, n2, 1)), jnp.abs(w))
     return jnp.where(there, 2 * half, 0)
@@ -290,10 +290,10 @@ def from_matrix(matrix: Mat3Like) -> Quat:
     """The canonical unit quaternion of a rotation matrix.
 
     **Arguments:** `matrix` (3, 3) rotation, body → world. **Raises:** as `so3.check`, if its values
-    are known now; inside `jit`, `grad` and `vmap` nothing is looked at.
+    are known now; nothing is checked inside `jit`, `grad` and `vmap`.
 
     **Returns:** (4,) with w ≥ 0: the largest of the four rows of 4 q qᵀ, normalised (Shepperd 1978,
-    doi:10.2514/3.55767b), so that no case loses digits; the derivative goes through that row only.
+    doi:10.2514/3.55767b), so that no case loses digits; the derivative uses that row only.
 
     >>> from_matrix(jnp.diag(jnp.array([-1.0, -1.0, 1.0]))).tolist()
     [0.0, 0.0, 0.0, 1.0]

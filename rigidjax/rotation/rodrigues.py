@@ -1,9 +1,9 @@
 """Rodrigues (Gibbs, Cayley) parameters g = n tan(θ/2).
 
 Rational in both directions, and without a double cover; a half turn lies at infinity, and
-`is_singular` tells. M = (1 + hat g)(1 − hat g)⁻¹ is Cayley's transform. Source: Schaub & Junkins,
-2018, Analytical Mechanics of Space Systems, sec. 3.5.1. Range: any g, and up to 1e75 (float32:
-1e9) where it meets rates, which are as well.
+`is_singular` tests for it. M = (1 + hat g)(1 − hat g)⁻¹ is Cayley's transform. Source: Schaub &
+Junkins, 2018, Analytical Mechanics of Space Systems, sec. 3.5.1. Range: any g; with rates, both up
+to 1e75 (float32: 1e9).
 """
 
 import jax.numpy as jnp
@@ -67,7 +67,7 @@ def to_matrix(g: Vec3Like) -> Mat3:
 
 
 def is_singular(q: QuatLike) -> Bool[Array, ""]:
-    """Whether a rotation is a half turn to 4 units of round-off, where g has no digits left.
+    """Whether a rotation is a half turn to 4 units of round-off, where g has no correct digit.
 
     **Arguments:** `q` (4,) unit.
 

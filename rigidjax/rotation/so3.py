@@ -1,7 +1,7 @@
 """Rotation matrices M, active, body → world, and their tangent vectors.
 
 `exp` and `log` take and return one rotation; batch with `jax.vmap`. Every kernel is a smooth
-function of θ², so that values and derivatives of any order are right at θ = 0. Range: as in
+function of θ², so that values and derivatives of any order are correct at θ = 0. Range: as in
 `rigidjax.quaternion`.
 """
 
@@ -56,8 +56,8 @@ def log(matrix: Mat3Like) -> Vec3:
 
     **Arguments:** `matrix` (3, 3) rotation. **Raises:** as `check`, if its values are known now.
 
-    **Returns:** (3,), by way of the quaternion: right to round-off, with its derivatives, from 0
-    to π. At a half turn, of v and −v the one whose first nonzero component is positive.
+    **Returns:** (3,), by way of the quaternion: correct to round-off, with its derivatives, from 0
+    to π. At a half turn it is v or −v, whichever has a positive first nonzero component.
 
     >>> bool(abs(log(exp(jnp.array([0.1, 0.2, 0.3]))) - jnp.array([0.1, 0.2, 0.3])).max() < 1e-15)
     True
@@ -66,7 +66,7 @@ def log(matrix: Mat3Like) -> Vec3:
 
 
 def left_jacobian(v: Vec3Like) -> Mat3:
-    """J_l with exp(v + dv) = exp(J_l dv) exp(v): what dv turns, seen from the world.
+    """J_l with exp(v + dv) = exp(J_l dv) exp(v): the turn by dv in the world frame.
 
     **Arguments:** `v` (3,) rotation vector, rad. J_l = 1 + B hat v + C (hat v)², C = (θ − sin θ)/θ³
     (Chirikjian 2012, doi:10.1007/978-0-8176-4944-9; Solà 2018, eq 145). **Raises:** as `exp`.
@@ -80,7 +80,7 @@ def left_jacobian(v: Vec3Like) -> Mat3:
 
 
 def right_jacobian(v: Vec3Like) -> Mat3:
-    """J_r with exp(v + dv) = exp(v) exp(J_r dv): what dv turns, seen from the body.
+    """J_r with exp(v + dv) = exp(v) exp(J_r dv): the turn by dv in the body frame.
 
     **Arguments:** `v` (3,) rotation vector, rad. J_r(v) = J_l(−v) = J_l(v)ᵀ (Solà 2018, eq 143).
 
@@ -116,9 +116,9 @@ def distance(a: Mat3Like, b: Mat3Like) -> Scalar:
     """The angle of the rotation from a to b, rad, in [0, π].
 
     **Arguments:** `a`, `b` (3, 3) rotations. By atan2 of the quaternion of aᵀb, right from 1e-12 to
-    π (arccos of the trace is useless below 1e-8). Its derivative does not exist where a = b; 0 is
+    π (arccos of the trace is useless below 1e-8). Its derivative does not exist at a = b; 0 is
     returned there, the shortest subgradient. For a loss take |log(aᵀb)|², which is smooth.
-    **Raises:** `ValueError` for NaN, and for what is far from a rotation.
+    **Raises:** `ValueError` for NaN, and for matrices far from a rotation.
 
     >>> round(float(distance(jnp.eye(3), exp(jnp.array([0.0, 3e-9, 0.0]))) * 1e9), 9)
     3.0
@@ -182,7 +182,7 @@ def to_body(matrix: Mat3Like, y: Vec3Like) -> Vec3:
 
 
 def conjugate(turn: Mat3Like, matrix: Mat3Like) -> Mat3:
-    """A turn known in the body frame, as the world sees it: M T Mᵀ (notes, eqs 25, 26).
+    """A turn given in the body frame, transformed to the world frame: M T Mᵀ (notes, eqs 25, 26).
 
     **Arguments:** `turn` (3, 3) in the frame of the body; `matrix` (3, 3), body → world.
 
@@ -210,7 +210,7 @@ def body_rate(matrix: Mat3Like, rate: Mat3Like) -> Vec3:
     """Ω from M and dM/dt: Ω_i = ½ Tr(Mᵀ Ṁ J_iᵀ) (notes, eqs 48–50, 80).
 
     **Arguments:** `matrix` (3, 3), body → world; `rate` (3, 3), 1/s. **Returns:** (3,) rad/s, body
-    frame. What is not antisymmetric in MᵀṀ is dropped.
+    frame. The symmetric part of MᵀṀ is dropped.
 
     >>> body_rate(jnp.eye(3), hat(jnp.array([1.0, 2.0, 3.0]))).tolist()
     [1.0, 2.0, 3.0]
@@ -262,9 +262,9 @@ def uniform(key: PRNGKeyArray, dtype: Any = float) -> Mat3:
 def check(
     matrix: Float[ArrayLike, "*batch 3 3"], *, name: str = "matrix"
 ) -> Float[Array, "*batch 3 3"]:
-    """Check a matrix that comes from outside: returned as it is, or refused.
+    """Check a matrix from outside: return it unchanged, or refuse it.
 
-    **Arguments:** `matrix` (..., 3, 3); `name` how messages call it. **Raises:** for NaN, a
+    **Arguments:** `matrix` (..., 3, 3); `name` its name in messages. **Raises:** for NaN, a
     left-handed frame (det < 0), and |MᵀM − 1| above 1e-6 (float32: 1e-3); a `ValueError`, or under
     `jit` `equinox.error_if` with the same words. `project` gives the nearest rotation.
 

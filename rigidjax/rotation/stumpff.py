@@ -1,4 +1,4 @@
-"""Smooth kernels of θ², right with all their derivatives from θ = 0 upwards.
+"""Smooth kernels of θ², correct with all their derivatives from θ = 0 upwards.
 
 Rotations need sin θ/θ, (1 − cos θ)/θ², (θ − sin θ)/θ³, … as functions of t = θ². These are the
 Stumpff functions c_k(t) = Σ (−t)ⁿ/(k + 2n)!  (Stumpff 1959; Battin 1999, sec. 4.5). Their
@@ -7,7 +7,7 @@ derivatives are Stumpff functions again,
     c_k' = ½ (k c_{k+2} − c_{k+1}),
 
 so that every derivative, of any order, is computed without a cancelling quotient. Polynomials on a
-reduced range stand in for libm's sine and cosine, which run one lane at a time on CPU.
+reduced range replace libm's sine and cosine, which run one lane at a time on CPU.
 """
 
 import math
@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-# Largest tan² of an eighth of a turn's quarter: the reach of `arctan_ratio`.
+# The largest argument of `arctan_ratio`, tan²(π/8).
 _REACH = math.tan(math.pi / 8) ** 2
 
 
@@ -81,12 +81,12 @@ def _cosine_or_sinc(k: int, t: Float[Array, "..."]) -> Float[Array, "..."]:
     head, tail = _split_pi(t.dtype)
     # turns × head is exact (Cody & Waite 1980), so the remainder is as good as θ itself.
     remainder = (theta - turns * head) - turns * tail
-    # Of a θ beyond 1/ε nothing is left but its round-off: keep to where polynomials are good.
+    # A θ beyond 1/ε is only round-off: stay in the range of the polynomials.
     remainder = jnp.clip(remainder, -2.0, 2.0)
     value = _polynomial(k, jnp.where(far, remainder * remainder, t), limit)
     value = value * jnp.where(far, remainder, 1) if k else value
-    # The sign goes into a division although a product would do: XLA on CPU computes a quotient
-    # once, but repeats a polynomial in each place where it is used.
+    # The sign enters by a division, not a product: XLA on CPU computes a quotient once, but repeats
+    # a polynomial for each use.
     sign = 1 - 2 * (turns - 2 * jnp.floor(0.5 * turns))
     return value / jnp.where(far, sign * theta if k else sign, 1)
 

@@ -1,8 +1,8 @@
 """Checks of input: matrices and quaternions that are no rotation are refused.
 
 Measured on one CPU core: these checks add 0.7 µs to a compiled call on one matrix, but make a
-batch of 1e5 logarithms five times slower. So the maps do not look at traced values; `so3.check` and
-`quaternion.check` do, the same in and out of `jit`, and stand where data come in.
+batch of 1e5 logarithms five times slower. The maps therefore do not check traced values.
+`so3.check` and `quaternion.check` do, inside and outside of `jit`; call them on data from outside.
 """
 
 import jax.numpy as jnp
@@ -13,7 +13,7 @@ from rigidjax import _checks
 
 
 def tolerance(dtype: object) -> float:
-    """How far from a rotation input may be: 1e-6 in float64, 1e-3 in float32."""
+    """The tolerance for a rotation as input: 1e-6 in float64, 1e-3 in float32."""
     return 1e-6 if dtype == jnp.float64 else 1e-3
 
 
@@ -30,7 +30,7 @@ def direction(v: Float[Array, "n"], name: str) -> Float[Array, "n"]:
 
 
 def turn(v: Float[Array, "*n"], name: str) -> Float[Array, "*n"]:
-    """Refuse, where it is known, a rotation vector or an angle of which no digit is left."""
+    """Refuse a known rotation vector or angle without a correct digit."""
     if _checks.known(v) and not _largest(v) <= (limit := 1 / float(jnp.finfo(v.dtype).eps)):
         _checks.finite(v, name)
         raise ValueError(
@@ -46,7 +46,7 @@ def _largest(v: Float[Array, "*n"]) -> float:
 
 
 def rotation_matrix(m: Float[Array, "*batch 3 3"], name: str) -> Float[Array, "*batch 3 3"]:
-    """Refuse what is not a rotation matrix."""
+    """Refuse any matrix but a rotation."""
     m = _checks.finite(m, name)
     known = _checks.known(m)
     xp, values = (np, np.asarray(m)) if known else (jnp, m)

@@ -22,11 +22,11 @@ from rigidjax.solve.tableaus import Tableau
 
 
 class Found(NamedTuple):
-    """What `adaptive` returns.
+    """The result of `adaptive`.
 
     **Fields:** `ys` the states, of the type of `y0`, with a leading time axis; `num_steps`,
-    `num_rejected` of the whole run; `result` a `diffrax.RESULTS`; `last_time`, `last` where the run
-    ended.
+    `num_rejected` of the whole run; `result` a `diffrax.RESULTS`; `last_time`, `last` the time and
+    state at the end.
     """
 
     ys: Any
@@ -50,7 +50,7 @@ def adaptive(
     jumps: Array | None = None,
     halt: Callable[..., Any] | None = None,
 ) -> Found:
-    """The states at `ts`, with steps as long as the tolerances allow.
+    """The states at `ts`, with adaptive steps.
 
     The norm, the control of the step (integral, safety 0.9) and the first step are those of
     `diffrax.PIDController`.
@@ -58,7 +58,7 @@ def adaptive(
     **Arguments:** `solver` an explicit method of this package; `field` a vector field
     `f(t, y, args)` as of `equations_of_motion`; `ts` (T,) s; `y0` the state at `ts[0]`; `rtol`,
     `atol` scalars; `dt0` the first step, s, or `None`; `jumps` times, s, in any order, at which the
-    field jumps: steps end there; `halt(t, y)` a condition, looked at after each step, that ends the
+    field jumps: steps end there; `halt(t, y)` a condition, tested after each step, that ends the
     run. Derivatives are by all numbers of the field, `ts`, `jumps` and
     `y0`, lengths of steps held; not by tolerances.
 
@@ -102,7 +102,7 @@ def adaptive(
 
 
 class _Program(NamedTuple):
-    """What is compiled: a method whose `field(constants, t, y)` is of one body.
+    """The compiled program: a method whose `field(constants, t, y)` is for one body.
 
     **Fields:** `halt(constants, t, y)` the condition that ends a run, or `None`; `smooth` which of
     the constants have derivatives.
@@ -198,8 +198,8 @@ def _solved(program: _Program, constants: Arrays, run: Run) -> Answer:
         return mapped(_recorded, 0, *args)
 
     def tangents_of(primals: Any, tangents: Any, pull: Any = None) -> tuple[Arrays, Arrays]:
-        """What `recorded` gives, and the tangents of its states; transposed by `pull`."""
-        # A number without a tangent is none that derivatives have to be taken by.
+        """The result of `recorded`, and the tangents of its states; transposed by `pull`."""
+        # A number without a tangent needs no derivative.
         there = [not isinstance(t, SymbolicZero) for t in tangents]
         smooth = tuple(s and t for s, t in zip(program.smooth, there[:number], strict=True))
         moving = _Moving(smooth, tuple(there[number:]))
@@ -231,7 +231,7 @@ def _solved(program: _Program, constants: Arrays, run: Run) -> Answer:
 
 
 class _Moving(NamedTuple):
-    """Which of the constants and of the numbers of a run have tangents."""
+    """A mask of the constants and the numbers of a run that have tangents."""
 
     constants: tuple[bool, ...]
     run: tuple[bool, ...]

@@ -1,4 +1,4 @@
-"""Steps as long as the tolerances allow, for one body or many, with the states at any times.
+"""Adaptive steps, for one body or many, with the states at any times.
 
 For states between and for derivatives the steps are recorded in segments: the start of each is
 kept, and the steps of the last one; derivatives run the others once more.
@@ -84,7 +84,7 @@ def start(method: Method, constants: list[Array], run: Run) -> LoopState:
     """A loop about to begin."""
     t0, y0 = run.t0, run.y0
     h, f0 = first_step(method, constants, run)
-    # Where f(t0) is not finite, no step is short enough.
+    # No step is short enough if f(t0) is not finite.
     sound = jnp.all(jnp.isfinite(f0), 0) & jnp.all(jnp.isfinite(y0), 0)
     sound = sound & jnp.isfinite(t0) & jnp.isfinite(run.stops[-1])
     h = jnp.where(sound, jnp.where(jnp.isnan(run.h0), h, run.h0), jnp.nan)
@@ -154,7 +154,7 @@ def recorded(
     rows: Rows,
     until: Array | None,
 ) -> tuple[LoopState, Rows, Array]:
-    """From here on, as far as there is room for rows; and how many there were."""
+    """The loop from here until the rows are full; and the number of rows."""
     many = max(1, min(_MOST, _BLOCK // run.y0.dtype.itemsize // rows.shape[1]))
 
     def block(state: Any) -> Any:

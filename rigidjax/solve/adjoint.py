@@ -1,10 +1,10 @@
-"""A recorded run once more, for its tangents, and back along it, for cotangents.
+"""A second pass over a recorded run, for its tangents, and a pass back, for cotangents.
 
-The derivative is that of the steps that were taken, their lengths held but for those cut short at a
-stop, which follow it, as in `diffrax.RecursiveCheckpointAdjoint`. Both go through the segments of
-`rigidjax.solve.adaptive_loop`; all but the last are run once more. Where another program rounds
-otherwise, such a segment may take other steps between the same two ends: then the derivative is
-that of those, the same to the tolerance.
+The derivative is that of the steps taken, with fixed lengths, except that steps cut short at a stop
+follow it, as in `diffrax.RecursiveCheckpointAdjoint`. Both go through the segments of
+`rigidjax.solve.adaptive_loop`; all but the last are run once more. Such a segment may take other
+steps between the same two ends if another program rounds differently: the derivative is then that
+of these steps, the same to the tolerance.
 """
 
 from collections.abc import Sequence

@@ -1,8 +1,8 @@
 """Batches of a program: bodies in the last axis of every array, whatever `jax.vmap` is outside.
 
-XLA on CPU makes vector instructions of arrays whose last axis is the batch; `jax.vmap` puts it
-first, which is many times slower in a loop over small states. So each program is written for
-arrays with a trailing axis of bodies (or none), and `custom_vmap` brings them there.
+XLA on CPU makes vector instructions for arrays whose last axis is the batch; `jax.vmap` puts it
+first, which is many times slower in a loop over small states. Each program is therefore written for
+arrays with a trailing axis of bodies (or none), and `custom_vmap` moves the axis there.
 """
 
 from collections.abc import Callable
@@ -20,7 +20,7 @@ BLOCK = 16
 
 
 class Layout(NamedTuple):
-    """Which axes the arrays of a program have beyond those of one body.
+    """The axes of a program's arrays beyond those of one body.
 
     **Fields:** `bodies` a last axis of bodies; `shared` which constants have none all the same.
     """

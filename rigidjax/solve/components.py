@@ -1,7 +1,7 @@
 """A state as a tuple of scalars, or as one vector, and back.
 
 XLA on CPU runs a loop over a tuple of scalars as one kernel and, batched, over a tuple of (N,)
-arrays in vector instructions; of a loop over (7,) or (N, 7) arrays it makes many small kernels.
+arrays in vector instructions. A loop over (7,) or (N, 7) arrays becomes many small kernels.
 """
 
 import math
@@ -47,7 +47,7 @@ def join(parts: Atoms, like: Any) -> Any:
 
 
 def leaf_sizes(like: Any) -> list[int]:
-    """How many numbers each array has.
+    """The number of numbers in each array.
 
     >>> leaf_sizes((jnp.zeros((2, 3)), jnp.ones(())))
     [6, 1]

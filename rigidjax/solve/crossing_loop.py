@@ -1,11 +1,11 @@
-"""Where a function of the motion crosses zero: a march in steps, and Newton within the step.
+"""The zeros of a function along the motion: steps, and Newton's method within a step.
 
-A pass through the loop is one step of the method from where a body is: an attempt at the next step,
-or a part of it, up to where the crossing is looked for. So a crossing is as accurate as a step, and
-costs about three passes. It is the start of the next step: two crossings in one step are nothing
-special. Where the cubic through both ends of a step, with their slopes, has more zeros than their
-signs tell, or g turns back before zero and the tangents at both ends do not show that it stays
-there, the step is taken again, as far as the turn.
+A pass through the loop is one step of the method from the present state: an attempt at the next
+step, or a part of it, up to the trial time of the crossing. A crossing is therefore as accurate as
+a step, and costs about three passes. The next step starts at the crossing, so two crossings in one
+step are no special case. The step is taken again, up to the extremum of g, in two cases: the cubic
+through both ends, with their slopes, has more zeros than their signs show; or g turns back before
+zero and the tangents at both ends do not exclude a zero.
 
 Nothing here is differentiated.
 """
@@ -28,7 +28,7 @@ _MOST = 70
 
 
 class Motion(NamedTuple):
-    """How a body gets on, on (n, *bodies).
+    """The motion of a body, on (n, *bodies).
 
     **Fields:** `attempt(step) → (y, norm)` the state a step later, its error over the tolerance;
     `order` of the method; `longest` step; `condition(t, y) → (g, dg/dt, dy/dt, round-off of g)`;
@@ -44,7 +44,7 @@ class Motion(NamedTuple):
 
 
 class Search(NamedTuple):
-    """What is looked for: crossings upwards (1), downwards (−1) or both (0); so many at most."""
+    """The crossings to find: upwards (1), downwards (−1) or both (0); so many at most."""
 
     direction: int
     many: int

@@ -1,8 +1,8 @@
 """The crossings of one body: found without derivatives, then corrected with them.
 
 A crossing at t* of g(t, y(t)) = 0 moves with every number of the scene. The motion is run again to
-the times found, which stay as they are, and what is left of g there, its rates ġ and g̈ along the
-motion give the time and the state by one step of Chebyshev's method,
+the times found, which are held fixed. The rest of g there and its rates ġ and g̈ along the motion
+give the time and the state by one step of Chebyshev's method,
 
     τ = −(g/ġ)(1 + ½ g g̈/ġ²),   y = y* + f τ + ½ (df/dt) τ².
 
@@ -48,7 +48,7 @@ _CLEAR = 16
 
 
 class Section(NamedTuple):
-    """What is crossed, and by what motion, in s = σt, which increases.
+    """The section and the motion, in s = σt, which increases.
 
     **Fields:** `solver` a method of ours, or `None` for the closed form; `motion(constants, s, y)`
     dy/ds, or the state itself in closed form; `rates(constants, s, y)` g, dg/ds and dy/ds; `like` a
@@ -185,7 +185,7 @@ def _seen(section: Section, constants: Arrays, s: Array, y: Array) -> tuple[Arra
 
 
 def _clear(section: Section, constants: Arrays, s: Array, y: Array) -> Array:
-    """How many times faster g goes through zero than by round-off."""
+    """The ratio of the rate of g through zero to its round-off."""
     rates, like = partial(section.rates, constants, s), section.like
     _, rate, slope = rates(y)
     shift = jax.jvp(lambda y: rates(y)[2], (y,), (_push(like, y),))[1]

@@ -1,4 +1,4 @@
-"""Where a motion meets a condition: the event that ends a run, and all crossings of a section."""
+"""Times at which a motion meets a condition: the event that ends a run, and section crossings."""
 
 from collections.abc import Callable
 from functools import partial
@@ -33,7 +33,7 @@ State = TypeVar("State", Spin, Attitude, Rigid, Point, Coupled)
 
 
 class Event(eqx.Module):
-    """What ends a run of `simulate`: the first zero of a condition.
+    """The event that ends a run of `simulate`: the first zero of a condition.
 
     **Arguments:**
 
@@ -42,15 +42,15 @@ class Event(eqx.Module):
       `Coupled`: `state.motion.omega`, `state.own`.
     - `direction`: 1 for a zero on the way up, −1 on the way down, 0 for both (as in SciPy), in the
       order in which the run meets them.
-    - `max_step`: the longest step, s. Zeros are found where the condition has changed its sign at
-      the end of a step, or has one extremum within it; a condition that is much faster than the
-      motion needs shorter steps.
+    - `max_step`: the longest step, s. A zero is found if the condition has changed its sign at the
+      end of a step, or has one extremum within it; a condition that is much faster than the motion
+      needs shorter steps.
 
-    A start at a zero does not count, nor a condition that is zero all along, also if that is so but
-    for round-off (see `crossings`).
+    A start at a zero does not count, nor does a condition that is always zero to round-off (see
+    `crossings`).
 
-    **Raises:** `TypeError`, `ValueError` for what is no function, another direction, a step that is
-    not positive.
+    **Raises:** `TypeError`, `ValueError` for anything but a function, another direction, a step
+    that is not positive.
 
     >>> import rigidjax as rj
     >>> body, start = rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([0.0, 1.0, 0.01])
@@ -84,12 +84,12 @@ class Event(eqx.Module):
 
 
 class Crossings(eqx.Module, Generic[State]):
-    """What `crossings` returns.
+    """The result of `crossings`.
 
     **Fields:** `times` (K,) s, in the order of the run, NaN beyond the last; `states` there, of the
-    type of `state0`, with a leading axis; `count` how many; `result` a `diffrax.RESULTS`:
-    `successful` where the run came to `t1`, `event_occurred` where it ended with `max_crossings` of
-    them, or why it ended early; `num_steps` of the method, partial ones included.
+    type of `state0`, with a leading axis; `count` their number; `result` a `diffrax.RESULTS`:
+    `successful` if the run reached `t1`, `event_occurred` if it ended with `max_crossings` of them,
+    or why it ended early; `num_steps` of the method, partial ones included.
 
     >>> import rigidjax as rj
     >>> body, start = rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([0.0, 1.0, 0.01])
@@ -126,7 +126,7 @@ def crossings(
     atol: ScalarLike | None = None,
     max_steps: int = 1_000_000,
 ) -> Crossings[State]:
-    """Where the motion crosses a section: all zeros of a condition between two times.
+    """The crossings of a section: all zeros of a condition between two times.
 
     **Arguments:**
 
@@ -134,21 +134,21 @@ def crossings(
     - `t0`, `t1`: s; `t1 < t0` goes back in time.
     - `condition`: a Module or function `(t, state, body) → scalar`, smooth along the motion. It may
       hold traced numbers, and depend on the time (a stroboscopic section is `sin(½(t − t₀)ω)`).
-      Under a law with states of its own the state is a `Coupled`, as in what is returned.
+      The state is a `Coupled`, as in the result, if a torque has states of its own.
     - `direction`: 1 for zeros on the way up, −1 on the way down, 0 for both, in the order of the
       run.
-    - `max_crossings`: K, the length of what is returned; the run ends with the last of them.
+    - `max_crossings`: K, the length of the results; the run ends with the last of them.
     - `max_step`: the longest step, s, for a condition that is much faster than the motion: several
-      zeros in one step are found where the cubic through its ends, with their slopes, shows them.
+      zeros in one step are found if the cubic through its ends, with their slopes, shows them.
     - `solver`: `None` is the closed form for a free body, else `rigidjax.solvers.DormandPrince8`;
       or an explicit method of `rigidjax.solvers`. `rtol`, `atol` as for `simulate`; a crossing is
       as accurate as a step, that of a free body to round-off.
     - `max_steps`: parts of steps included.
 
     A start on the section does not count, and a tangential contact may be missed. A condition that
-    is zero all along has no crossing, nor has one that is so but for round-off, such as an energy
-    minus its value: a zero counts where the condition goes through it 16 times as fast as round-off
-    could make it (in closed form; else times the root of the number of steps). Many bodies:
+    is always zero to round-off, such as an energy minus its value, has no crossing: a zero counts
+    if the condition goes through it 16 times as fast as round-off could make it (in closed form;
+    else times the root of the number of steps). Many bodies:
     `jax.vmap(lambda start: rj.crossings(body, start, …))`.
 
     **Returns** `times`, `states`, their `count`, `result` and `num_steps` (`Crossings`). Times and
@@ -156,11 +156,11 @@ def crossings(
     `condition` and of `state0`, forward and reverse; near a tangential contact they grow without
     bound, as the true ones do.
 
-    Source: Newton's method on the step from the last accepted state, in the place of Hénon's change
-    of variable (Hénon 1982, doi:10.1016/0167-2789(82)90034-3): two to three parts of a step.
+    Source: Newton's method on the step from the last accepted state, instead of Hénon's change of
+    variable (Hénon 1982, doi:10.1016/0167-2789(82)90034-3): two to three parts of a step.
 
-    **Raises:** `TypeError`, `ValueError` as `simulate`, for times that are equal, and for a
-    condition that is no number, is NaN at the start, or looks at what the state has not.
+    **Raises:** `TypeError`, `ValueError` as `simulate`, for equal times, and for a condition that
+    is no number, is NaN at the start, or reads a part that the state does not have.
 
     >>> import rigidjax as rj
     >>> body, start = rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([0.0, 1.0, 0.01])
@@ -215,8 +215,8 @@ def value(event: Event, body: Any, t: Any, y: Any) -> Array:
     found = event.condition(t, y, body)
     if jnp.issubdtype(getattr(found, "dtype", type(found)), jnp.bool_):
         raise TypeError(
-            "condition: wanted one real number, zero at the event, got whether it is so; give "
-            "the difference, not whether it is positive"
+            "condition: wanted one real number, zero at the event, got a truth value; give the "
+            "difference, not its sign"
         )
     return _checks.floating(found, (), "condition", hint="one real number, zero at the event")
 
@@ -228,7 +228,7 @@ _value = eqx.filter_jit(value)
 def solve_until(
     setup: Free | Loop, event: Event, state0: Any, ts: Array
 ) -> tuple[Any, dict[str, Any], dfx.RESULTS, Array, Any]:
-    """As `solve`, as far as the event; and the event's time and state, NaN where there is none.
+    """As `solve`, up to the event; and the event's time and state, NaN if there is none.
 
     The run is done twice: to find the event, and up to it, with derivatives.
     """

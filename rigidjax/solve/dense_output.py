@@ -60,7 +60,7 @@ def saved(
 
 
 def known(run: Run, part: Segment) -> Array:
-    """How many of the times between the run has passed at the start of each row, and at the end."""
+    """The number of saved times passed at the start of each row, and at the end."""
     ends = jnp.concatenate([jnp.minimum(part.times, part.end[None]), part.end[None]])
     search = lambda ts, t: jnp.searchsorted(ts, t, side="right").astype(jnp.int32)  # noqa: E731
     return _per_body(run, search)(lax.stop_gradient(run.between), ends)

@@ -58,7 +58,7 @@ def advance(
     is not to be `t + h` rounded.
 
     Without the barriers XLA makes of each result of a step one kernel, which repeats all stages
-    before it. On one trajectory LLVM finds the copies; in a batch, or beside tangents, it cannot.
+    before it. LLVM removes the copies for one trajectory, but not in a batch, or beside tangents.
     """
     end = t + h if end is None else end
     slopes = [barrier(field(t, y))]

@@ -1,4 +1,4 @@
-"""Lyapunov exponents: how fast small errors grow in the long run, in every direction."""
+"""Lyapunov exponents: the long-term growth rates of small errors, in every direction."""
 
 from collections.abc import Callable
 from typing import Any
@@ -25,12 +25,13 @@ _PARTS = 20
 
 
 class Exponents(eqx.Module):
-    """What `lyapunov_exponents` returns.
+    """The result of `lyapunov_exponents`.
 
     **Fields:** `values` (k,) 1/s, the largest first; `errors` (k,) one standard deviation of them,
-    from how much the means of twenty parts of the run differ, and the tolerance of each step added
-    up; `times` (N,) the ends of the intervals, s; `running` (N, k) what the values would have been
-    by then; `state` at the end; `result` a `diffrax.RESULTS`: `successful`, or why a run failed.
+    from the differences between the means of twenty parts of the run, plus the sum of the steps'
+    tolerances; `times` (N,) the ends of the intervals, s; `running` (N, k) the values up to then;
+    `state` at the end; `result` a `diffrax.RESULTS`: `successful`, or why a run
+    failed.
 
     >>> still = lambda t, y, args: jnp.array([0.5, -1.0]) * y
     >>> found = lyapunov_exponents(still, jnp.zeros(2), 40.0, intervals=40, transient=20)
@@ -63,17 +64,17 @@ def lyapunov_exponents(
     """The spectrum of Lyapunov exponents along a motion, the largest first.
 
     An orthonormal frame of tangents is solved along with the motion (continuous QR), to the same
-    tolerances, with the logarithms of what it would have grown by: the exponents are their means.
+    tolerances, with the logarithms of its growth: the exponents are their means.
     Tangents of an attitude are small turns in body axes, three numbers: |q| is no direction.
 
     **Arguments:**
 
     - `field`: f(t, y, args), such as `rj.equations_of_motion(body, state0, torque)`, `scene.field`,
       or your own on any array or Module of one dtype.
-    - `state0`: the state at `t0`; `time`: how long, s.
-    - `number`: k, how many exponents; `None` for all, 6 for an `Attitude`.
-    - `intervals`: N, after each of which the frame is made orthonormal to round-off. Directions may
-      grow apart in one by as much as they like: the frame itself does not grow.
+    - `state0`: the state at `t0`; `time`: the length of the run, s.
+    - `number`: k, the number of exponents; `None` for all, 6 for an `Attitude`.
+    - `intervals`: N; the frame is made orthonormal to round-off after each. Directions may
+      grow apart in one by any amount: the frame itself does not grow.
     - `transient`: intervals at the beginning that are not counted: the state approaches its
       attractor, and the tangents to their directions.
     - `solver`, `rtol`, `atol`, `max_steps` (in an interval): as for `simulate`.
@@ -85,10 +86,10 @@ def lyapunov_exponents(
     **Returns** `values` and `errors`, `times` and `running`, `state`, `result` (`Exponents`). Where
     a run fails they are NaN, and `result` says why.
 
-    Source: Dieci, Russell and Van Vleck 1997, doi:10.1137/S0036142993247311; that frames are to be
-    held orthonormal: Christiansen and Rugh 1997, doi:10.1088/0951-7715/10/5/004.
+    Source: Dieci, Russell and Van Vleck 1997, doi:10.1137/S0036142993247311; for orthonormal
+    frames: Christiansen and Rugh 1997, doi:10.1088/0951-7715/10/5/004.
 
-    **Raises:** `TypeError`, `ValueError` for numbers that are none.
+    **Raises:** `TypeError`, `ValueError` for invalid numbers.
 
     >>> still = lambda t, y, args: jnp.array([0.5, -1.0]) * y
     >>> found = lyapunov_exponents(still, jnp.zeros(2), 40.0, intervals=40, transient=20)
@@ -150,7 +151,7 @@ class _How(eqx.Module):
 
 
 def _product(a: Array, b: Array) -> Array:
-    """`a @ b` of small matrices, which XLA fuses with what is around it."""
+    """`a @ b` of small matrices, which XLA fuses with the code around it."""
     return jnp.sum(a[:, :, None] * b[None], 1)
 
 

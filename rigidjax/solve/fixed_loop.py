@@ -1,7 +1,7 @@
-"""Equal steps: nothing carried but a time, a step and the state's numbers.
+"""Fixed steps: the loop carries only a time, a step and the state's numbers.
 
-`diffrax.diffeqsolve` can do more, at some cost in each step. There is no interpolation: at saved
-times, too, the error is the method's own.
+`diffrax.diffeqsolve` can do more, at some cost in each step. There is no interpolation: the error
+at saved times is also the method's own.
 """
 
 import functools
@@ -30,7 +30,7 @@ def fixed(
     substeps: Any,
     last: Any = None,
 ) -> Any:
-    """`substeps` equal steps between each two times of `ts`.
+    """`substeps` fixed steps between each two times of `ts`.
 
     **Arguments:** `solver` a method of `rigidjax.solvers`; `field` a vector field `f(t, y, args)`
     as of `equations_of_motion`; `ts` (T,) s; `y0` the state at `ts[0]`; `substeps` a whole number;
@@ -70,7 +70,7 @@ def fixed(
 
 
 def first_rows(many: Any, one: Callable[..., Any], y: Any, rows: Any) -> Any:
-    """`rows` with the first `many` of those that `lax.scan` of `one(y, i)` stacks.
+    """`rows` with the first `many` rows that `lax.scan` of `one(y, i)` stacks.
 
     **Arguments:** `many` may be traced (no reverse mode); `one(y, i)` the next y and row i.
     """
@@ -113,7 +113,8 @@ def step(
 def delayed_rows(
     delays: Sequence[tuple[str, Array]], h: Array, i: Array, inputs: Any, before: int
 ) -> tuple[Array, list[Array], list[Array]]:
-    """Where in step `i` each delayed input changes (m,), from 0 to 1, and its values on both sides.
+    """The place in step `i` where each delayed input changes (m,), from 0 to 1, and its values on
+    both sides.
 
     Beyond the rows that there are the first, or the last, holds.
     """
@@ -129,7 +130,7 @@ def delayed_rows(
 
 
 def first_row(law: Any, h: Array, inputs: Any) -> Any:
-    """What the inputs of a law are when the first of their rows begins, for `bind`."""
+    """The inputs of a torque at the start of their first row, for `bind`."""
     delays = delays_of(law)
     now = jax.tree.map(lambda a: a[0], inputs)
     if not delays:

@@ -1,4 +1,4 @@
-"""A linear function that comes with its own transpose, for forward and for reverse mode.
+"""A linear function with its own transpose, for forward and for reverse mode.
 
 A loop of unknown length can be differentiated forwards but not transposed, and `jax.custom_vjp`
 gives a transpose but no forward mode. Here the rule for tangents is a primitive that knows both

@@ -1,7 +1,7 @@
 """A step of order 4 for torques that do not depend on the attitude: Runge–Kutta, then one rotation.
 
-Euler's equations are then closed in the body rate. So the four stages carry three numbers instead
-of seven, and the attitude is turned once a step, by the exponential of Magnus' series.
+Euler's equations are then closed in the body rate. The four stages therefore carry three numbers
+instead of seven, and the attitude turns once a step, by the exponential of Magnus' series.
 """
 
 from collections.abc import Callable
@@ -71,7 +71,7 @@ def _product(q: Four, half: Triple) -> Four:
 
 
 class Magnus4(dfx.AbstractSolver):
-    """Order 4 at equal steps, for free bodies and torques of time and body rate only.
+    """Order 4 with fixed steps, for free bodies and torques of time and body rate only.
 
     The step that `rigidjax.batch.rollout` takes unless told otherwise, as a `diffrax` solver: less
     work and a smaller error than `rigidjax.solvers.RungeKutta4` at the same step.
@@ -79,7 +79,7 @@ class Magnus4(dfx.AbstractSolver):
 
     Source: Magnus 1954, doi:10.1002/cpa.3160070404; see `turned`.
 
-    **Raises:** `TypeError` for a torque that looks at the attitude, or another state.
+    **Raises:** `TypeError` for a torque that depends on the attitude, or another state.
 
     >>> import diffrax, rigidjax as rj
     >>> start = rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 1])

@@ -1,4 +1,4 @@
-"""What diffrax runs: any solver, kept on the group, and any control of its steps, ended by NaN."""
+"""Wrappers for diffrax: any solver kept on the group, any step controller ended by NaN."""
 
 from typing import Any
 
@@ -15,7 +15,7 @@ from rigidjax.solve.step_control import NONFINITE, finite
 class GroupInterpolation(dfx.AbstractLocalInterpolation):
     """Dense output of another interpolation, its quaternion scaled to length 1.
 
-    Saved times fall between steps, so projecting the steps alone leaves what is saved off the
+    Saved times fall between steps, so a projection of the steps alone leaves saved states off the
     group by the error of the interpolation (|q|−1 = 3e-3 at a tolerance of 1e-3).
     """
 
@@ -42,8 +42,8 @@ class _Build(eqx.Module):
 class Projected(dfx.AbstractWrappedSolver):
     """Wraps a diffrax solver so that attitudes stay unit quaternions.
 
-    Each accepted step ends with q ← q/|q|, and so does every value of the dense output; inside the
-    stages nothing is touched, because that changes the order (jaxsim#192). The kinematics is linear
+    Each accepted step ends with q ← q/|q|, and so does every value of the dense output; the stages
+    are unchanged, because a change there alters the order (jaxsim#192). The kinematics is linear
     in q, so scaling q commutes with the exact flow and the order of the wrapped solver is kept. A
     state without a quaternion passes through. A step that gives NaN or infinity ends the run with
     `RESULTS.nonfinite`.
@@ -115,13 +115,13 @@ class Projected(dfx.AbstractWrappedSolver):
 
 
 class Watched(dfx.AbstractAdaptiveStepSizeController):
-    """Wraps an adaptive step controller so that a run without a way on ends at once.
+    """Wraps an adaptive step controller so that a run that cannot continue ends at once.
 
-    Where the vector field is NaN, `diffrax.PIDController` tries smaller and smaller steps until
-    `max_steps`, and in a batch all the others wait for it. Here a start without a slope, and a
-    rejected step whose successor would be below a few units of round-off of the time, end the run:
-    with `RESULTS.nonfinite` where there was NaN or infinity, else with `RESULTS.dt_min_reached`.
-    The steps of a healthy run are not touched.
+    `diffrax.PIDController` tries smaller and smaller steps until `max_steps` if the vector field is
+    NaN, and all other bodies of a batch wait. Here two cases end the run: a start without a finite
+    derivative, and a rejected step whose successor would be below a few units of round-off of the
+    time. The result is `RESULTS.nonfinite` after NaN or infinity, else `RESULTS.dt_min_reached`.
+    The steps of other runs do not change.
 
     **Arguments:** `controller` any adaptive controller of diffrax.
 

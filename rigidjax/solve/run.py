@@ -48,7 +48,7 @@ class Setup(eqx.Module):
 
 
 class Loop(eqx.Module):
-    """A solve of which nothing is asked but states and derivatives: our own loop.
+    """A solve for states and derivatives alone: our own loop.
 
     `sign` of the direction of time; `None` where it is known to go forwards. `cuts` times at which
     a step has to end, beside the jumps of the torque.
@@ -69,7 +69,7 @@ class Loop(eqx.Module):
 class Ends(eqx.Module):
     """The condition that ends a run of a scene, as `diffrax.Event` asks it.
 
-    A scene may end a run, instead of ever smaller steps: at a collision, where it is lost, …
+    A scene may end a run at a collision or another singularity, instead of ever smaller steps.
 
     **Arguments:** `scene` any with `ends(t, state) → bool` and `end_words(t, state) → str`.
 
@@ -190,7 +190,7 @@ def refuse(ys: Any, result: dfx.RESULTS) -> Any:
         ys,
         result == NONFINITE,
         "simulate: the motion became NaN or infinite. Is the torque finite at every time and state "
-        "of the run? With equal steps: are they short enough for this spin? throw=False keeps "
+        "of the run? With fixed steps: are they short enough for this spin? throw=False keeps "
         "what came before",
     )
     ys = eqx.error_if(

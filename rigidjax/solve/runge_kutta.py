@@ -1,8 +1,8 @@
 """A step of an explicit Runge–Kutta method, its tangent and its transpose.
 
-The stages are a loop: one evaluation of the field is all that XLA has to compile, and one vjp of
-it for the gradient, which takes a tenth of the time that twelve copies take, and the loop runs as
-fast to a fifth. States are (n, *bodies): numbers first, bodies last.
+The stages are a loop: XLA compiles only one evaluation of the field, and one vjp of it for the
+gradient. This takes a tenth of the compile time of twelve copies, and the loop runs as fast to a
+fifth. States are (n, *bodies): numbers first, bodies last.
 """
 
 from collections.abc import Callable
@@ -55,7 +55,7 @@ class Weights(NamedTuple):
 
 
 def stage_counts(tableau: Tableau) -> tuple[int, int]:
-    """How many stages a step has, and how many with those that dense output needs.
+    """The number of stages of a step, and the number with those for dense output.
 
     >>> from rigidjax.solve.tableaus import DORMAND_PRINCE8
     >>> stage_counts(DORMAND_PRINCE8)
@@ -103,8 +103,8 @@ def stages(
 ) -> Stages:
     """All stages of a step; `end` is not projected.
 
-    **Arguments:** `dense` whether the stages of dense output are wanted. If it is traced and they
-    are not, they are the state at the start, and their slopes 0.
+    **Arguments:** `dense` whether to compute the stages of dense output. If it is traced and false,
+    these stages are the state at the start, and their slopes 0.
     """
     count = stage_counts(tableau)[dense is not False]
     w = weights(tableau, step.y.dtype, count)

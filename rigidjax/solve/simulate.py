@@ -25,7 +25,7 @@ from rigidjax.solve.solution import Kept, Solution, State, told
 from rigidjax.solve.splitting import AbstractSplitting
 from rigidjax.solve.vector_field import direction
 
-# A law must take the state that there is: gravity on a `Spin` is an error that type checkers see.
+# A torque must accept the given state: gravity on a `Spin` is an error that type checkers see.
 Law = Callable[[Any, State, Any], Any] | AbstractScene | MovingFrame | None
 
 # Made once: building a Module costs as much as ten steps, and `jit` compares it leaf by leaf.
@@ -65,27 +65,26 @@ def simulate(
     - `body`: `Inertia` for `Spin` and `Attitude`, about the point that the body turns about;
       `MassProperties` for `Rigid`; `None` for a `Point`.
     - `state0`: `Spin(omega)`, `Attitude(q, omega)` or `Rigid(x, v, q, omega)` at `ts[0]`. Take the
-      first of these that has what is asked for. One body; for many,
-      `jax.vmap(lambda body, state: rj.simulate(body, state, ts).ys)`, and with `throw=False` take
-      `.result` along: one for each body.
-    - `ts`: (T,) increasing times, s, or decreasing ones, to go back. The first is the start.
-    - `torque`: a law of `rigidjax.torques` (the jumps of a schedule are given to the stepper), or
-      any callable Module `(t, state, body) → (3,)`, N m, body frame; `None` for a free body. The
-      states of a law that has some (`rigidjax.torques.AbstractTorque`) are in `own`. For a
-      `Point` a scene of `rigidjax.scenes`, a `MovingFrame` to see it from, or a force per mass
-      `(t, state, None) → (3,)`, m/s².
-    - `solver`: `None` is the cheapest that is right: the closed form (`rigidjax.exact`) for a free
-      body, else `rigidjax.solvers.DormandPrince8` (order 8), however many times are saved. The
-      explicit methods of `rigidjax.solvers` run in a loop of our own; so does the default, unless a
+      first of these with the quantities that you need. It is one body; for many,
+      `jax.vmap(lambda body, state: rj.simulate(body, state, ts).ys)`, and with `throw=False` return
+      `.result`, too: one for each body.
+    - `ts`: (T,) increasing times, s, or decreasing ones, backwards in time. The first is the start.
+    - `torque`: a torque of `rigidjax.torques` (the stepper gets the jumps of a schedule), or any
+      callable Module `(t, state, body) → (3,)`, N m, body frame; `None` for a free body. A torque's
+      own states (`rigidjax.torques.AbstractTorque`) are in `own`. For a `Point` it is a scene of
+      `rigidjax.scenes`, a `MovingFrame`, or a force per mass `(t, state, None) → (3,)`, m/s².
+    - `solver`: `None` is the cheapest accurate choice: the closed form (`rigidjax.exact`) for a
+      free body, else `rigidjax.solvers.DormandPrince8` (order 8), for any number of saved times.
+      The explicit methods of `rigidjax.solvers` run in our own loop; so does the default, unless a
       controller, a progress meter, `max_steps=None` or `adjoint=diffrax.ForwardMode()` is given:
-      then diffrax runs its Dopri8. Any `diffrax.AbstractSolver` may be given; it is wrapped so that
-      attitudes stay unit quaternions, at every step and every saved time. Between its steps the
-      error of `DormandPrince8` is up to ten times `rtol` (7 was the largest found), that of Dopri8
+      then diffrax runs its Dopri8. It may be any `diffrax.AbstractSolver`; a wrapper keeps
+      attitudes unit quaternions, at every step and every saved time. The error of `DormandPrince8`
+      between its steps is up to ten times `rtol` (7 was the largest found), that of Dopri8
       up to 26 times below `rtol=1e-10`.
     - `rtol`, `atol`: tolerances of the adaptive steps; 1e-9 and 1e-12 in float64, 2e-5 and 1e-7 in
       float32. Traced ones are not checked, and other values do not compile again. Scale `atol` to
-      the smallest number that matters: the time of a flip about the middle axis depends on the rate
-      off the axis at the start; where this is below `atol`, it has no meaning. The closed form uses
+      the smallest number that matters: the time of a flip about the middle axis depends on the
+      initial rate off the axis, and has no meaning if this is below `atol`. The closed form uses
       neither.
     - `accuracy`: in the place of tolerances, how far the states may be from the exact motion: rad,
       and relative to the largest value in the run. Two or more cheap runs find the tolerance.
@@ -97,29 +96,29 @@ def simulate(
       `diffrax.RecursiveCheckpointAdjoint()` for `jax.grad`, with 4096 checkpoints where `rtol` is
       known to be below 1e-10; `diffrax.ForwardMode()` is for `jax.jacfwd`. Our loop and the closed
       form need none: `jax.grad`, `jax.jacfwd`, `jax.jacrev` and `jax.hessian` (forward over
-      reverse) go through, and `jax.grad` of a `jax.grad` is refused. Still, where only `jax.jacfwd`
-      of a body is wanted, say `diffrax.ForwardMode()`: it takes a quarter (hundreds of saved times)
+      reverse) work, and `jax.grad` of a `jax.grad` is refused. Give `diffrax.ForwardMode()` if you
+      need only `jax.jacfwd` of a body: it takes a quarter (hundreds of saved times)
       to four fifths (two) of the time of our loop; a particle with few saved times takes longer.
-    - `event`: `(t, state, body) → scalar`, or an `Event` of it: the run ends where it is first
-      zero. `event_time` and `event_state` of the solution are exact to the tolerances, with first
-      and second derivatives with respect to everything, the condition's own numbers, too; `ys`
-      beyond are NaN, and `result` is `event_occurred`. Where it is not met they are NaN and the run
-      goes on (`jax_debug_nans` takes these NaN for mistakes). In our own loop and the closed form;
-      for a solver of diffrax give `diffrax.Event` there.
+    - `event`: `(t, state, body) → scalar`, or an `Event` of it: the run ends at its first zero.
+      `event_time` and `event_state` of the solution are exact to the tolerances, with first and
+      second derivatives with respect to all numbers, also the condition's own; later `ys` are NaN,
+      and `result` is `event_occurred`. Without an event they are NaN and the run goes to its end
+      (`jax_debug_nans` reports these NaN as errors). Events work in our own loop and the closed
+      form; for a solver of diffrax give `diffrax.Event` there.
     - `max_steps`, `progress_meter`: as in `diffrax.diffeqsolve`.
-    - `throw`: `False` never raises for what happens during the run, or for a bad start in a batch:
-      `result` says what happened, states not reached are NaN, as are their derivatives, and other
-      bodies of the batch get what they would get without the bad one, to the last bit. The motion
-      of a traced body that cannot be (a mass that is not positive, moments that no body has) is
-      NaN, its `result` is `nonfinite_input`. Known numbers that are wrong are refused in any case.
+    - `throw`: with `False` no event of the run, and no bad start in a batch, raises an error:
+      `result` gives the reason, states not reached are NaN, as are their derivatives, and other
+      bodies of the batch get the same results as without the bad one, to the last bit. The motion
+      of an invalid traced body (a mass that is not positive, moments of no real body) is NaN, its
+      `result` is `nonfinite_input`. Known wrong numbers are refused in any case.
 
     **Returns** a `Solution`. A second call with other numbers of the same shapes does not compile
     again.
 
     Source: the equations of Newton and Euler (notes, eqs 50, 79, 84).
 
-    **Raises:** `TypeError` where body, state and torque do not fit; `ValueError` for times that
-    neither increase nor decrease, NaN, or a quaternion that is not unit (`EquinoxRuntimeError`
+    **Raises:** `TypeError` if body, state and torque do not fit together; `ValueError` for times
+    that neither increase nor decrease, NaN, or a quaternion that is not unit (`EquinoxRuntimeError`
     under `jit`).
 
     >>> import rigidjax as rj
@@ -217,7 +216,7 @@ def _controller(
     watched = make(rtol, atol)
     if not hasattr(torque, "jump_times") or not jumps_of(torque).size:
         return watched
-    # An adaptive step passes over a short pulse without seeing it.
+    # An adaptive step may pass over a short pulse.
     return dfx.ClipStepSizeController(watched, jump_ts=jnp.sort(jumps_of(torque).astype(dtype)))
 
 

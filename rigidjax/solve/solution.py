@@ -48,12 +48,12 @@ def _is_array(leaf: Any) -> bool:
 
 
 class Solution(eqx.Module, Generic[State]):
-    """What `simulate` returns.
+    """The result of `simulate`.
 
-    **Fields:** `ts` (T,) the times asked for, s; `ys` the states there, of the type of `state0`,
-    with a leading time axis, NaN where the run did not get to; `stats` a dict with `num_steps`,
-    `num_accepted_steps`, `num_rejected_steps`, for a `Point` also `drift` of what its scene
-    conserves; `result` a `diffrax.RESULTS`: `successful`, or why the run ended early, such as
+    **Fields:** `ts` (T,) the given times, s; `ys` the states there, of the type of `state0`, with a
+    leading time axis, NaN at times that the run did not reach; `stats` a dict with `num_steps`,
+    `num_accepted_steps`, `num_rejected_steps`, for a `Point` also `drift` of its scene's conserved
+    quantities; `result` a `diffrax.RESULTS`: `successful`, or why the run ended early, such as
     `max_steps_reached`, `nonfinite`, `nonfinite_input` (no body has these numbers),
     `dt_min_reached`; `event_occurred` where the event was met.
     `event_time` s, `event_state` of the type of `state0` (under a law with states `.motion` is
@@ -92,10 +92,10 @@ class Solution(eqx.Module, Generic[State]):
 
     @property
     def drift(self) -> dict[str, Array]:
-        """How far each quantity that the scene conserves moved, relative to its size.
+        """The drift of each conserved quantity of the scene, relative to its size.
 
         See `rigidjax.drift`: energy, angular momentum in the world, its component along gravity…,
-        whichever this scene conserves; for a `Point` what its scene says. Zero is best.
+        whichever this scene conserves; for a `Point` its scene decides. Zero is best.
         """
         if "drift" in self.stats:
             return self.stats["drift"]
@@ -103,17 +103,16 @@ class Solution(eqx.Module, Generic[State]):
 
     @property
     def growth(self) -> Float[Array, " times"]:
-        """‖∂y(t)/∂y(t₀)‖ at each of `ts`: by how much a small error at the start has grown.
+        """‖∂y(t)/∂y(t₀)‖ at each of `ts`: the growth of a small error at the start.
 
-        Computed when asked for, by forward mode: about as many runs as the state has numbers. It
-        has no unit: each of q, Ω, x, v counts relative to its largest size in the run, and the norm
-        is the largest singular value.
+        It is computed at the first use, by forward mode: about as many runs as the state has
+        numbers. It has no unit: each of q, Ω, x, v counts relative to its largest size in the run,
+        and the norm is the largest singular value.
 
-        A solver's own errors grow as much. Where `growth * rtol` exceeds 1, the states there are
-        not known to a single digit and gradients through them have no meaning, finite or not,
-        whatever the adjoint: a `UserWarning` names the first such time. So look at it once
-        before differentiating through a long run; then end the run earlier, or fit it in pieces
-        (multiple shooting).
+        A solver's own errors grow as much. If `growth * rtol` exceeds 1, the states have no correct
+        digit, and gradients through them have no meaning, finite or not, for any adjoint: a
+        `UserWarning` names the first such time. Check it once before you differentiate through a
+        long run; then end the run earlier, or fit it in pieces (multiple shooting).
 
         Source: the largest finite-time Lyapunov exponent is its logarithm over t (Eckmann and
         Ruelle 1985, doi:10.1103/RevModPhys.57.617).
@@ -162,8 +161,8 @@ class Solution(eqx.Module, Generic[State]):
 
         Rows and columns are small changes: Ω for a `Spin` (n = 3); δθ, Ω for an `Attitude` (6);
         x, v, δθ, Ω for a `Rigid` (12); x, v for a `Point` (6). δθ, rad, is a turn in body axes,
-        q ⊗ exp(½δθ): three numbers. The columns are forward-mode derivatives, NaN where the run
-        did not get to. An event does not end this run.
+        q ⊗ exp(½δθ): three numbers. The columns are forward-mode derivatives, NaN at times that the
+        run did not reach. An event does not end this run.
 
         >>> import rigidjax as rj
         >>> body, start = rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([0.0, 0.0, 1.0])
@@ -176,10 +175,10 @@ class Solution(eqx.Module, Generic[State]):
     def evaluate(self, t: ScalarLike) -> State:
         """The state at any `t` between the first and the last of `ts`, s.
 
-        The motion is computed again from the last saved state before `t`, with steps of its own,
-        and the attitude is on the group.
+        The motion is computed again from the last saved state before `t`, with its own steps, and
+        the attitude is on the group.
 
-        **Raises:** `ValueError` (`EquinoxRuntimeError` under `jit`) where `t` is outside.
+        **Raises:** `ValueError` (`EquinoxRuntimeError` under `jit`) if `t` is outside.
         """
         t = _checks.floating(t, (), "t").astype(self.ts.dtype)
         way = jnp.sign(self.ts[-1] - self.ts[0])

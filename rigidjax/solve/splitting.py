@@ -1,9 +1,9 @@
 """Splittings on the exact free flow: free motion in closed form, torque as kicks of momentum.
 
 `A` is the free body (`rigidjax.exact`), `B` the kick `Π ← Π + c h τ(t, q)` at a fixed attitude; a
-step is `B(b1) A(a1) B(b2) … A(a1) B(b1)`, symmetric, so that it also runs back onto itself. Each
-part is an exact flow of its own Hamiltonian: the energy's error stays bounded for as long as the
-steps are equal, and a torque-free scene costs one formula and no error at all.
+step is `B(b1) A(a1) B(b2) … A(a1) B(b1)`, symmetric, so that it is reversible in time. Each part is
+an exact flow of its own Hamiltonian: the energy's error stays bounded with fixed steps, and a
+torque-free scene costs one formula and has no error.
 """
 
 from typing import Any, ClassVar, NamedTuple
@@ -129,11 +129,11 @@ class AbstractSplitting(dfx.AbstractSolver):
 class Splitting2(AbstractSplitting):
     """Order 2: half a kick, the exact free motion, half a kick (Strang).
 
-    For long runs, equal steps and torques that are small beside the free motion. The torque may
-    depend on time and attitude, not on the body rate. Attitude keeps |q| = 1, and without a torque
-    momentum in space and energy are kept to round-off.
+    It is for long runs, fixed steps and torques that are small against the free motion. The torque
+    may depend on time and attitude, not on the body rate. Attitude keeps |q| = 1; momentum in space
+    and energy are conserved to round-off without a torque.
 
-    Use equal steps: an adaptive controller destroys the bounded energy error, and there is no error
+    Use fixed steps: an adaptive controller destroys the bounded energy error, and there is no error
     estimate. Dense output is on the group with the order of the method.
 
     Source: Strang 1968, doi:10.1137/0705041, with the free flow of `rigidjax.exact.free_body`.
@@ -150,7 +150,7 @@ class Splitting2(AbstractSplitting):
 
 
 class Splitting4(AbstractSplitting):
-    """Order 4: seven kicks and six free flows. For long runs; see `Splitting2` for what it asks.
+    """Order 4: seven kicks and six free flows. For long runs; see `Splitting2` for its conditions.
 
     Source: Blanes and Moan 2002, doi:10.1016/S0377-0427(01)00492-7, method SRKN6b.
 

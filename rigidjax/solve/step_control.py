@@ -1,4 +1,4 @@
-"""A run with adaptive steps: what it is made of, what is kept of it, how long a step is.
+"""A run with adaptive steps: its parts, its record, its step control.
 
 Bodies are in the last axis.
 """
@@ -26,7 +26,7 @@ _SAFETY, _SMALLEST, _LARGEST = 0.9, 0.2, 10.0
 
 
 class Method(NamedTuple):
-    """What a run is made of, beside its numbers.
+    """The parts of a run besides its numbers.
 
     **Fields:** `tableau`; `field` and `project`, on (n, *bodies); `halt(t, y)` whether the run ends
     here, or `None`; `sizes` how many numbers each array of the state has; `max_steps`.
@@ -64,7 +64,7 @@ class Run(NamedTuple):
 
 
 class LoopState(NamedTuple):
-    """Where the loop is: time, next step, index of the next stop, counters, state."""
+    """The state of the loop: time, next step, index of the next stop, counters, state."""
 
     t: Array
     h: Array
@@ -89,7 +89,7 @@ def packed(loop: LoopState) -> Array:
 
 
 def unpacked(row: Array) -> LoopState:
-    """What was `packed`."""
+    """The inverse of `packed`."""
     head = len(LoopState._fields) - 1
     stop, steps, rejected = row[2:head].astype(jnp.int32)
     return LoopState(row[0], row[1], stop, steps, rejected, row[head:])
@@ -227,7 +227,7 @@ def controlled(
 
 
 def outcome(h: Array, t: Array, end: Array, met: Array) -> dfx.RESULTS:
-    """How a run ended: its next step and time, the last time, whether it met what ends it."""
+    """The end of a run: its next step and time, the last time, whether it met what ends it."""
     result = dfx.RESULTS.dt_min_reached
     for there, word in (
         (jnp.isnan(h), NONFINITE),

@@ -1,11 +1,11 @@
-"""A step of equal length of a method, a body and a torque: all that a loop has to know of them.
+"""A fixed step of a method, a body and a torque: their interface to a loop.
 
 The numbers are carried one by one: XLA on CPU runs a loop over a tuple of scalars as one kernel
 and, batched, over a tuple of (N,) arrays in vector instructions; of a loop over (7,) or (N, 7)
 arrays it makes many small kernels. Torques are called on arrays all the same: XLA sees through the
 stacks and slices between.
 
-A body that turns carries the momentum Π = IΩ in the place of Ω. Runge–Kutta methods do not notice a
+A body that turns carries the momentum Π = IΩ instead of Ω. Runge–Kutta methods do not notice a
 constant linear change of variables, so these are the steps that `diffrax` takes with the same
 solver, to round-off; and each of their stages is a third cheaper.
 """
@@ -93,7 +93,7 @@ def _stepper_of(solver: Any, field: Callable[..., Any], y0: Any) -> Stepper:
         return _split(solver, field, y0)
     if not isinstance(solver, AbstractExplicit | Rolled):
         raise TypeError(
-            f"no equal steps of {type(solver).__name__} on {type(y0).__name__}; wanted "
+            f"no fixed steps of {type(solver).__name__} on {type(y0).__name__}; wanted "
             "RungeKutta4, Tsitouras5 or DormandPrince8 of rigidjax.solvers, or, for an Attitude, "
             "Magnus4 or a Splitting of rigidjax.solvers; for others use simulate with "
             "stepsize_controller=diffrax.ConstantStepSize() under jax.vmap"

@@ -1,4 +1,4 @@
-"""Checks of what `simulate` is given, before anything is integrated."""
+"""Checks of the arguments of `simulate`, before anything is integrated."""
 
 import warnings
 from typing import Any
@@ -21,8 +21,8 @@ from rigidjax.rotation.validation import tolerance
 
 
 def scene(body: Any, state0: Any, ts: Any, torque: Any, throw: bool) -> tuple[Any, Any, Array]:
-    """Body, start and times of a run, of one dtype, or an error; with `throw=False` what is traced
-    and cannot be is NaN.
+    """Body, start and times of a run, of one dtype, or an error; with `throw=False` invalid traced
+    numbers become NaN.
     """
     ts = times(ts, throw)
     state0 = start(state0, throw)
@@ -40,7 +40,7 @@ def scene(body: Any, state0: Any, ts: Any, torque: Any, throw: bool) -> tuple[An
 
 
 def require_fit(body: Any, state0: Any, torque: Any) -> None:
-    """Raise `TypeError` unless body, state and torque fit."""
+    """Raise `TypeError` unless body, state and torque fit together."""
     if isinstance(state0, Point) and body is not None:
         raise TypeError(f"Point is no body: wanted None in its place, got {type(body).__name__}")
     if isinstance(torque, AbstractScene | MovingFrame) and not isinstance(state0, Point):
@@ -66,7 +66,7 @@ def require_fit(body: Any, state0: Any, torque: Any) -> None:
 
 
 def _body_of(numbers: Any, moves: bool = False) -> str:
-    """What to write in the place of bare numbers."""
+    """The advice for bare numbers."""
     if not isinstance(numbers, (list, tuple, np.ndarray, jax.Array)):
         return ""
     if moves:
@@ -105,7 +105,7 @@ def _single(value: Any, name: str) -> None:
 
 
 def tolerances(rtol: Any, atol: Any, dtype: Any) -> tuple[Any, Any]:
-    """`rtol` and `atol`, by default what `dtype` is good for; a warning where it cannot reach them.
+    """`rtol` and `atol`, by default suited to `dtype`; a warning if it cannot reach them.
 
     Traced ones are taken as they are.
 

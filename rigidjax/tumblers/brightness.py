@@ -1,8 +1,8 @@
-"""How bright a lit body looks: ellipsoids in closed form, convex meshes by their faces.
+"""The brightness of a lit body: ellipsoids in closed form, convex meshes by their faces.
 
-The brightness is the light that reaches the observer from all that is lit and seen,
-`∫ f(μ₀, μ) dA`, with μ₀ and μ the cosines of incidence and emission. It is counted as an area: the
-laws are scaled so that a sphere of radius r at zero phase has π r² under each of them.
+The brightness is the light to the observer from all lit and visible surface,
+`∫ f(μ₀, μ) dA`, with μ₀ and μ the cosines of incidence and emission. Its unit is an area: each
+scattering law is scaled so that a sphere of radius r at zero phase has π r².
 """
 
 import jax.numpy as jnp
@@ -30,8 +30,8 @@ def ellipsoid(
 
     **Arguments:** `semi_axes` (3,) along x, y, z, m; `sun`, `observer` (3,) directions from the
     body to them, body frame, any length; `scattering` the law: `LommelSeeliger()` (also for
-    `None`), `Geometric()`, `Lambert()`. Differentiable in all numbers, at zero phase and for a
-    sphere, too. For many directions use `jax.vmap`.
+    `None`), `Geometric()`, `Lambert()`. It is differentiable in all numbers, also at zero phase and
+    for a sphere. For many directions use `jax.vmap`.
 
     **Raises:** `ValueError`, `TypeError` for a wrong shape, a semi-axis that is not positive, a
     direction of length zero, NaN (`equinox` error under `jit`).
@@ -56,12 +56,12 @@ def mesh(
     observer: Vector,
     scattering: AbstractScattering | None = None,
 ) -> Scalar:
-    """Brightness of a convex body by its faces, m²: `Σ f(μ₀, μ) area` of those lit and seen.
+    """Brightness of a convex body by its faces, m²: `Σ f(μ₀, μ) area` of the lit, visible ones.
 
-    For a body that is not convex it is the brightness without shadows.
+    It is the brightness without shadows if the body is not convex.
 
     **Arguments:** `vertices`, `faces` as for `rigidjax.shapes.mesh`; the others as for `ellipsoid`.
-    Differentiable in the vertices and directions: a face that is just coming to light has the
+    Differentiable in the vertices and directions: a face at the edge of the light has the
     derivative of a dark one.
 
     Source: Kaasalainen and Torppa 2001, Icarus 153:24, doi:10.1006/icar.2001.6673.
@@ -87,7 +87,7 @@ def mesh(
     lit, seen = (double * s[None, :]).sum(axis=1), (double * o[None, :]).sum(axis=1)
     size = (double * double).sum(axis=1)
     both = (lit > 0) & (seen > 0) & (size > 0)
-    # What is dark must not reach the derivative.
+    # Dark faces must not reach the derivative.
     length = jnp.sqrt(jnp.where(both, size, 1.0))
     sent = law.per_area(
         jnp.where(both, lit, length) / length, jnp.where(both, seen, length) / length

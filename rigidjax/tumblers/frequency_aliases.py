@@ -1,19 +1,19 @@
-"""Pairs of frequencies that the times of the readings hardly tell apart, and their refinement."""
+"""Pairs of frequencies that the times of the readings hardly distinguish, and their refinement."""
 
 import numpy as np
 
 from rigidjax.tumblers.lattice_series import Sums, misfits_of, side_peaks
 
-# Pairs nearer than that, in 1/span, are one.
+# Pairs nearer than this, in 1/span, count as one.
 NEAR = 0.25
 # Pairs whose aliases are tried, in at most so many rounds.
 SEEDS, ROUNDS = 16, 3
 
 
 def aliases_of(pairs: np.ndarray, peaks: np.ndarray) -> np.ndarray:
-    """Pairs (M, 2) that may be behind the same readings: moved by side peaks, and related ones.
+    """Pairs (M, 2) that may fit the same readings: moved by side peaks, and related ones.
 
-    A line of 2 f₁ that is off by a peak means an f₁ that is off by half of it.
+    A line of 2 f₁ moved by a peak means an f₁ moved by half of it.
     """
     moves = np.unique(np.concatenate([[0.0], *((p, -p, p / 2, -p / 2) for p in peaks)]))
     first, second = pairs.T[:, :, None]
@@ -30,7 +30,7 @@ def aliases_of(pairs: np.ndarray, peaks: np.ndarray) -> np.ndarray:
 def with_aliases(
     table: Sums, pairs: np.ndarray, misfits: np.ndarray, highest: float, order: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The pairs, and aliases of the best of them: in rounds, as long as a better one is found."""
+    """The pairs, and aliases of the best of them, in rounds until no better one is found."""
     peaks = side_peaks(table, highest)
     around = 0.2 * np.array([(a, b) for a in (-1, 0, 1) for b in (-1, 0, 1)], float)
     for _ in range(ROUNDS):
@@ -50,7 +50,7 @@ def with_aliases(
 
 
 def distinct(pairs: np.ndarray, misfits: np.ndarray, count: int) -> list[int]:
-    """Which pairs these are, the best first."""
+    """The indices of these pairs, the best first."""
     kept: list[int] = []
     for index in np.argsort(misfits)[:20_000]:
         if not kept or np.abs(pairs[kept] - pairs[index]).max(axis=1).min() > NEAR:

@@ -11,8 +11,8 @@ from jaxtyping import Array, Complex, Float
 
 # Multiples of the first frequency: a brightness squared is of second order in directions.
 FIRST = 2
-# Entries of the table in 1/span, and of how many of them a sum is interpolated: times are in an
-# interval of length one, so the error is below 1e-8 of the sum of the weights.
+# Entries of the table in 1/span, and their number in an interpolation: times are in an interval of
+# length one, so the error is below 1e-8 of the sum of the weights.
 DENSE, NEAR = 16, 8
 # Programs are compiled for tables in multiples of so many, and for so many pairs at a time.
 ROWS, BATCH, FEW, MANY = 4096, 32, 256, 2048
@@ -80,7 +80,7 @@ def _at(table: Array, f: Array) -> Array:
 def lattice_misfits(pairs: Array, table: Sums, order: int) -> Float[Array, " pairs"]:
     """χ² of the series of each pair (P, 2), in 1/span: `Σ c_jk exp 2πi (j f₁ + k f₂) t`.
 
-    The normal matrix has but few different entries, Σ w² exp 2πi (m f₁ + n f₂) t, and these are
+    The normal matrix has only few different entries, Σ w² exp 2πi (m f₁ + n f₂) t, and these are
     values of one function of a frequency.
     """
     js, ks = np.meshgrid(np.arange(-FIRST, FIRST + 1), np.arange(-order, order + 1), indexing="ij")
@@ -98,7 +98,7 @@ def lattice_misfits(pairs: Array, table: Sums, order: int) -> Float[Array, " pai
         window = rows(table.window, pair, 2 * FIRST, 2 * order)
         side = jnp.conj(rows(table.data, pair, FIRST, order).ravel())
         gram = window[dj, dk]
-        # Columns that the times do not tell apart.
+        # Columns that the times do not distinguish.
         gram = gram + 1e-7 * window[2 * FIRST, 2 * order] * jnp.eye(js.size, dtype=gram.dtype)
         factor = jax.scipy.linalg.cho_factor(gram, lower=True)
         c = jax.scipy.linalg.cho_solve(factor, side)
@@ -124,7 +124,7 @@ def misfits_of(table: Sums, pairs: np.ndarray, order: int) -> np.ndarray:
 
 
 def side_peaks(table: Sums, highest: float) -> np.ndarray:
-    """Where the spectral window has its highest side peaks, in 1/span, the highest first.
+    """The highest side peaks of the spectral window, in 1/span, the highest first.
 
     A line moved by one of these is nearly the same curve at the times of the readings.
     """

@@ -1,4 +1,4 @@
-"""A tumbling body from its brightness alone: every motion that explains it, none left out."""
+"""A tumbling body from its brightness alone: all motions that explain it."""
 
 import dataclasses
 from collections.abc import Callable
@@ -36,27 +36,27 @@ from rigidjax.tumblers.search import (
 from rigidjax.tumblers.sensor import Brightness
 from rigidjax.tumblers.two_frequencies import TwoFrequencies, two_frequencies
 
-# Motions are the same where both periods and both ratios of moments differ by less than that, or
-# by less than so many of their standard deviations.
+# Motions are the same if both periods and both ratios of moments differ by less than this, or by
+# less than so many standard deviations.
 SAME, REACH = np.array([1e-3, 1e-3, 0.05, 0.05]), 5.0
-# Log-likelihood within which a rival explains the data nearly as well: e¹⁰ to one.
+# A rival explains the data nearly as well within this log-likelihood: e¹⁰ to one.
 MARGIN = 10.0
-# Seen from a side a real body is brighter or fainter than its ellipsoid by this standard deviation.
+# A real body is brighter or fainter than its ellipsoid from a side by this standard deviation.
 SHAPE = 0.04
-# χ² of the best above its mean by so many deviations is not believed: with a wrong alias the errors
-# may be hardly larger than the noise, and a fit by itself is content with five.
+# A best χ² above its mean by so many deviations is rejected: with a wrong alias the errors may be
+# hardly larger than the noise, and a fit by itself accepts five.
 CONTENT = 3.0
-# Pairs that are tried in any case, and beyond them those with χ² so much above the best.
+# The number of pairs always tried; further pairs need a χ² within this of the best.
 LEAST, ABOVE = 12, 40.0
 
 
 class Alias(eqx.Module):
-    """A motion that a search ended at.
+    """The motion at the end of a search.
 
     **Fields:** `parameters`; `cost` half of χ²; `rotation` the body period, s, `precession` the
     mean precession period, s (`rigidjax.exact.body_period`, `precession_period`); `mode` `"long"`
-    or `"short"`: the axis that is circulated; `ratios` (2,) the two smaller moments over the
-    largest; `explains` whether it does so nearly as well as the best.
+    or `"short"`: the circulated axis; `ratios` (2,) the two smaller moments over the largest;
+    `explains` whether it explains the data nearly as well as the best.
     """
 
     parameters: Parameters
@@ -76,15 +76,14 @@ class Alias(eqx.Module):
 
 
 class LightCurve(eqx.Module):
-    """What `fit_light_curve` returns.
+    """The result of `fit_light_curve`.
 
     **Fields:** `fit` of the best motion, its covariance with an allowance for a body that is no
-    ellipsoid (see `fit_light_curve`); `aliases` all motions that were found, the best first,
-    then by their misfit; `deviations` (4,) relative standard deviations of the best one's rotation,
-    precession and two ratios; `pairs` the frequencies that they came from; `search` and `model` the
-    two answers as of a `Fit`: also `not alone` where another of the aliases explains the data
-    nearly as well, and `leaves a part` where χ² is three deviations above what the given noise
-    makes.
+    ellipsoid (see `fit_light_curve`); `aliases` all motions found, the best first, then by their
+    misfit; `deviations` (4,) relative standard deviations of the best one's rotation, precession
+    and two ratios; `pairs` their frequencies; `search` and `model` the two answers as of a `Fit`:
+    also `not alone` if another alias explains the data nearly as well, and `leaves a part` if χ² is
+    three deviations above its mean for the given noise.
     """
 
     fit: Fit
@@ -96,12 +95,12 @@ class LightCurve(eqx.Module):
 
     @property
     def status(self) -> str:
-        """Both answers in one line; `ok` where there is nothing else to say."""
+        """Both answers in one line; `ok` if both are good and have no reasons."""
         return answers.status(self.search, self.model)
 
     @property
     def ok(self) -> bool:
-        """Whether the fit is, and no other motion explains the data nearly as well."""
+        """Whether the fit is ok, and no other motion explains the data nearly as well."""
         return self.status == "ok"
 
     @property
@@ -124,22 +123,22 @@ def fit_light_curve(
 ) -> LightCurve:
     """The motion of a free tumbler from one light curve, without a guess.
 
-    Pairs of frequencies from the squared flux (`two_frequencies`); each read as precession and
+    Pairs of frequencies come from the squared flux (`two_frequencies`). Each pair is precession and
     twice the rotation, in long- and short-axis mode (Kaasalainen 2001), over a grid of bodies and
-    phases; the best of them fitted with the sensor itself; the best of these fitted to the end. All
-    that were found are listed. What brightness leaves free by symmetry (half turns of the world,
-    see `Brightness`, and of the body about its axes) is one motion here: periods, moments and mode
-    are the same.
+    phases. The best starts are fitted with the sensor itself, and the best of these fits are
+    continued to convergence. The result lists all motions found. Motions that differ by a symmetry
+    of the brightness (half turns of the world, see `Brightness`, and of the body about its axes)
+    count as one: periods, moments and mode are the same.
 
-    Intervals allow for a real shape as consider parameters do (Tapley, Schutz and Born 2004,
-    Statistical Orbit Determination, ch. 6): as though the brightness were multiplied by 1 + n·S n,
+    Intervals allow for a real shape by consider parameters (Tapley, Schutz and Born 2004,
+    Statistical Orbit Determination, ch. 6): the brightness has a factor 1 + n·S n,
     n half way between sun and observer, body frame, the entries of S independent of deviation 4 %.
 
     **Arguments:** `problem` of one recording with one `Brightness` sensor and no torque; let a
     `Free` move the sensor's `level` unless it is known. `shortest` period of a line in the
     spectrum, s, `None` for four times the median distance of the samples; `count` pairs of
-    frequencies at most: fewer are tried where the others fit worse, and where more of them fit the
-    search has `not ended`; `tolerance` as of `fit`; `progress` is called with a line of text.
+    frequencies at most: fewer are tried if the others fit worse, and the search has `not ended` if
+    more of them fit; `tolerance` as of `fit`; `progress` is called with a line of text.
 
     Sources: Pravec et al. 2005, Icarus 173:108, doi:10.1016/j.icarus.2004.07.021; Kaasalainen 2001,
     A&A 376:302, doi:10.1051/0004-6361:20010935.
@@ -173,7 +172,7 @@ def fit_light_curve(
 
 
 def _used(found: TwoFrequencies) -> int:
-    """How many of the pairs fit well enough to be tried."""
+    """The number of pairs that fit well enough to be tried."""
     above = ABOVE * max(1.0, float(found.misfits[0]) / found.dof)
     return max(LEAST, int((found.misfits <= found.misfits[0] + above).sum()))
 
@@ -299,12 +298,12 @@ def _told(best: Fit, aliases: list[Alias], found: TwoFrequencies, cut: bool) -> 
         carried(slopes, np.asarray(one.seen), np.asarray(one.null_directions))
         for one in (best, wider)
     )
-    # The misfits of a search that stopped on its way to the same motion are no rival's.
+    # A search that stopped on its way to the same motion is no rival.
     near = np.fmax(SAME, REACH * own)
     # Costs of the search, all with one noise: a fit may have estimated another.
     first = _alias(best.problem, best.parameters, aliases[0].cost)
     others = [alias for alias in aliases if not _same(alias, first, near)]
-    # Where the noise is larger than was said, misfits count for less.
+    # Misfits count for less if the noise is larger than given.
     count = int(best.problem.records.readings[0].seen.sum())
     margin = MARGIN * max(1.0, 2.0 * first.cost / count) * max(best.correlation, 1.0)
     marked = tuple(
@@ -318,7 +317,7 @@ def _told(best: Fit, aliases: list[Alias], found: TwoFrequencies, cut: bool) -> 
         search = Answer(NOT_ALONE, (f"{some} the light curve nearly as well",))
     elif cut and best.ok:
         search = Answer(NOT_ENDED, ("more pairs of frequencies fit than were tried",))
-    # Under a robust loss χ² is the outliers'.
+    # Outliers dominate χ² under a robust loss.
     above = best.chi2 - best.dof if best.problem.loss is None else 0.0
     if search == Answer(FOUND) and best.ok and above > CONTENT * np.sqrt(2.0 * best.dof):
         why = "another motion that was not found, or more noise than was said"

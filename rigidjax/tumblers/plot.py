@@ -27,11 +27,11 @@ def light_curve(
 ) -> Any:
     """A light curve against time, and below it folded with each of some periods.
 
-    A body that turns about a principal axis gives one curve when folded with its period; a tumbler
-    a band, for a second period moves it from cycle to cycle: the colour tells which.
+    A body that turns about a principal axis gives one curve when folded with its period. A tumbler
+    gives a band, since a second period moves it from cycle to cycle; the colour shows the cycle.
 
-    **Arguments:** `ts` (T,) s; `values` (T,) as read, NaN where there is nothing; `periods` s, one
-    or several, or none; `model` (T,) what a motion predicts at `ts`, such as
+    **Arguments:** `ts` (T,) s; `values` (T,) readings, NaN for a gap; `periods` s, one or several,
+    or none; `model` (T,) the prediction of a motion at `ts`, such as
     `values − fit.residuals[0][:, 0]`, or `None`; `quantity` `mag` (bright is up) or `flux`;
     `time_unit` `s`, `min`, `h`, `day`; `title`; `ax` one axes and one more for each period, else
     new ones. **Returns** the axes (1 + periods,).
@@ -77,16 +77,16 @@ def light_curve(
 def _against(ax: Any, t: np.ndarray, read: np.ndarray, predicted: np.ndarray | None) -> None:
     ax.plot(t, read, ".", color=COLOURS[6], ms=3, label="read")
     if predicted is not None:
-        # No line over a gap: nothing is known of the motion's light there.
+        # No line over a gap: the motion's brightness there is unknown.
         wide = np.append(np.diff(t) > 10 * np.median(np.diff(t)), False)
         ax.plot(t, np.where(wide, np.nan, predicted), color=COLOURS[1], lw=1.0, label="motion")
-        # Beside the picture: inside it would lie on some night.
+        # Beside the picture: a legend inside would cover data.
         ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
 
 
 def _folded(ax: Any, turns: np.ndarray, read: np.ndarray, predicted: np.ndarray | None) -> None:
     phase = turns % 1.0
-    # Once more beyond the end: what joins there is seen.
+    # The start is drawn again after the end, to show that they join.
     both, twice = np.concatenate([phase, phase + 1.0]), np.concatenate([turns, turns])
     if predicted is not None:
         ax.plot(both, np.tile(predicted, 2), ".", color=COLOURS[1], ms=1.5, alpha=0.6)

@@ -1,8 +1,8 @@
-"""Laws of scattering: what a piece of surface sends, and an ellipsoid as a whole.
+"""Scattering laws: the light from a piece of surface, and from a whole ellipsoid.
 
-With r = A u and |u| = 1 an ellipsoid becomes a sphere: `μ₀ dA = det A (p·u) du`, p = A⁻¹ s, and
-what is lit and seen becomes the lune between p and q = A⁻¹ o. All of it depends on `|p|, |q|, p·q`
-alone, so on the tensor A² and not on its axes: nothing is singular for a sphere.
+With r = A u and |u| = 1 an ellipsoid becomes a sphere: `μ₀ dA = det A (p·u) du`, p = A⁻¹ s, and the
+lit and visible part becomes the lune between p and q = A⁻¹ o. The result depends on `|p|, |q|, p·q`
+alone, so on the tensor A² and not on its axes: a sphere is not singular.
 """
 
 import abc
@@ -19,7 +19,7 @@ from rigidjax._types import Mat3, Numbers, Scalar, Vec3, Vec3Like
 from rigidjax.body.scaling import exponent_of, times_power_of_two
 from rigidjax.rotation.linalg3 import apply, cofactors, cross, determinant, dot
 
-# Below it the function of Lommel and Seeliger's law is a series, of so many terms.
+# The function of Lommel and Seeliger's law is a series of so many terms below this.
 _SMALL, _TERMS = 0.1, 16
 # Gauss–Legendre points of both integrals of Lambert's law.
 _POINTS = 32
@@ -28,7 +28,7 @@ Faces = Float[Array, "*faces"]
 
 
 class AbstractScattering(eqx.Module):
-    """A law of scattering: what a piece of surface sends, and a whole ellipsoid.
+    """A scattering law: the light from a piece of surface, and from a whole ellipsoid.
 
     >>> class Flat(AbstractScattering):  # all that is lit and seen is equally bright
     ...     def per_area(self, incidence, emission):
@@ -49,7 +49,7 @@ class AbstractScattering(eqx.Module):
 
 
 class Geometric(AbstractScattering):
-    """Every lit piece equally bright: what is lit and seen, as it is projected, m².
+    """Every lit piece equally bright: the projected area of the lit and visible part, m².
 
     Ostro and Connelly 1984, Icarus 57:443, doi:10.1016/0019-1035(84)90127-X.
 
@@ -66,13 +66,13 @@ class Geometric(AbstractScattering):
 
 
 class LommelSeeliger(AbstractScattering):
-    """Light scattered once, `2 μ₀ μ/(μ₀ + μ)`: the law of dark surfaces, as asteroids have.
+    """Single scattering, `2 μ₀ μ/(μ₀ + μ)`: the law of dark surfaces, such as asteroids.
 
     An ellipsoid has `π (|p||q| + p·q)/(|p| + |q|) [1 − (1 − z²) artanh(z)/z]/z²` with
     `z = |p + q|/(|p| + |q|)`, p and q times the product of the semi-axes. A form of the closed
     result of Muinonen and Lumme 2015, A&A 584:A23, doi:10.1051/0004-6361/201526456, that keeps its
-    digits at any phase. At zero phase exactly the second derivative by a direction is −∞ (the
-    brightness is like φ² ln φ there); what is returned is finite and wrong.
+    digits at any phase. The second derivative by a direction is −∞ at zero phase itself (the
+    brightness is like φ² ln φ there); the computed value is finite and wrong.
 
     >>> float(LommelSeeliger().per_area(jnp.asarray(0.5), jnp.asarray(0.5)))
     0.5
@@ -89,7 +89,7 @@ class LommelSeeliger(AbstractScattering):
 class Lambert(AbstractScattering):
     """`3/2 μ₀ μ`: the law of bright, rough surfaces.
 
-    It has no elementary form for a triaxial ellipsoid: there are two integrals of one variable, by
+    It has no elementary form for a triaxial ellipsoid: it needs two integrals of one variable, by
     32 points each. The relative error is below 1e-9 for axes up to 30 : 1 at phases up to 170°;
     errors of first and second derivatives are below 1e-8 and 1e-6 of the brightness.
 
@@ -105,7 +105,7 @@ class Lambert(AbstractScattering):
 
 
 def law_of(scattering: AbstractScattering | None) -> AbstractScattering:
-    """The law; of `None` Lommel and Seeliger's. **Raises** `TypeError` for what is none."""
+    """The law; for `None` Lommel and Seeliger's. **Raises** `TypeError` for another type."""
     if scattering is None:
         return LommelSeeliger()
     wanted = "LommelSeeliger(), Geometric() or Lambert()"
@@ -155,11 +155,13 @@ def _excess(w: Array, rest: Array) -> Array:
 
 
 def _lambert(shape: Mat3, sun: Vec3, observer: Vec3) -> Scalar:
-    """`∫ μ₀ μ dA` over what is lit and seen, as an integral over normals: dA = det E/(n·En)² dn.
+    """`∫ μ₀ μ dA` over the lit and visible part, as an integral over normals: dA = det E/(n·En)²
+    dn.
 
     Over all that is lit, with μ < 0 where it is not seen, it is `sun·T observer`,
     `T = π det E ∫ (E + τ²)⁻¹ det(E + τ²)^(−½) dτ` from 0 on (both are one Gaussian integral). So
-    `B(sun, observer) = sun·T observer + B(sun, −observer)`: the smaller one is left, over a lune.
+    `B(sun, observer) = sun·T observer + B(sun, −observer)`: the smaller integral remains, over a
+    lune.
     """
     minors = cofactors(shape)
     total, of_sun = shape[0, 0] + shape[1, 1] + shape[2, 2], apply(minors, sun)
@@ -186,7 +188,7 @@ def _across_the_lune(shape: Mat3, minors: Mat3, sun: Vec3, observer: Vec3) -> Sc
     """
     pole = cross(sun, observer)
     sine, apart = _root(dot(pole, pole)), dot(pole, pole) > jnp.finfo(pole.dtype).eps ** 2
-    # Any pole will do if there is hardly a lune.
+    # Any pole is good if there is hardly a lune.
     least = jnp.eye(3, dtype=pole.dtype)[jnp.argmin(jnp.abs(sun))]
     pole = jnp.where(apart, pole, cross(sun, least))
     pole = pole / jnp.sqrt(dot(pole, pole))

@@ -90,7 +90,7 @@ def starts_of(
     for pair in found.frequencies[:used]:
         for mode in starts.MODES:
             some = starts.candidates(pair, mode, light, half_way, areas, 3)
-            # One of each reading of each pair: a grid alone cannot tell which of them is true.
+            # One start for each mode of each pair: a grid alone cannot decide between them.
             best_of += some[: len(starts.ABOUT)]
             others += some[len(starts.ABOUT) :]
     best_of.sort(key=lambda one: one.misfit)
@@ -134,7 +134,7 @@ def noise_of(
 def descended(
     problem: Problem, starts: list[Parameters], noise: Any, tolerance: float
 ) -> list[Tried]:
-    """All starts a little way down, then the best of them to the end."""
+    """A few steps from all starts, then the best of them to convergence."""
     parameters, costs = [], []
     for first in range(0, len(starts), FIRST):
         # Always as many: one program.
@@ -161,7 +161,7 @@ def descended(
 def _many(
     starts: Parameters, problem: Problem, noise: Any, settings: Settings, count: Any
 ) -> Tried:
-    """The first `count` of the starts (a leading axis) down, one after another.
+    """The search from the first `count` starts (a leading axis), one after another.
 
     By differences of the errors: the closed form of the motion alone takes a hundredth of the time
     that it takes with its derivatives, and here they need not be right to the last digit.
@@ -192,7 +192,7 @@ def _many(
 
 @eqx.filter_jit
 def _levelled(starts: Parameters, problem: Problem) -> Parameters:
-    """Starts with the level at which they fit best, where it is free."""
+    """Starts with the level at which they fit best, if it is free."""
     leaves, structure = jax.tree.flatten(problem.records)
     numbered: Any = jax.tree.unflatten(structure, list(range(len(leaves))))
     at = numbered.readings[0].sensor.level

@@ -1,4 +1,4 @@
-"""A sensor that sees only how bright a body is: a light curve."""
+"""A sensor of a body's brightness: a light curve."""
 
 import math
 from typing import Any, ClassVar
@@ -27,27 +27,28 @@ UNITS = ("flux", "mag")
 
 
 class Brightness(AbstractSensor):
-    """Reads how bright an ellipsoid is that is lit by the sun: a light curve.
+    """Reads the brightness of an ellipsoid lit by the sun: a light curve.
 
     `level · B/(π (abc)^⅔)` as a flux, `level − 2.5 log₁₀(B/(π (abc)^⅔))` in magnitudes, B as
     `rj.tumblers.brightness.ellipsoid`: a sphere of the same volume at zero phase has the level.
-    Only the ratios of the semi-axes count. Readings are those at unit distances.
+    Only the ratios of the semi-axes count. Readings are reduced to unit distances.
 
     **Arguments:** `sun`, `observer` directions from the body to them, world frame, any length:
     (3,), or a callable Module of time, t → (3,), such as `torques.Linear(times, directions)`;
     `scattering` the law: `LommelSeeliger()` (also for `None`), `Geometric()`, `Lambert()` of
-    `rj.tumblers.brightness`; `noise` standard deviation in the unit of a reading, `None` to have
-    it estimated; `unit` of a reading, `"flux"` or `"mag"`; `level` flux or magnitude as above,
-    `None` for 1 and 0: seldom known, let a `Free` move it; `semi_axes` (3,) along the body's axes,
+    `rj.tumblers.brightness`; `noise` standard deviation in the unit of a reading, `None` to
+    estimate it; `unit` of a reading, `"flux"` or `"mag"`; `level` flux or magnitude as above,
+    `None` for 1 and 0: it is seldom known, so let a `Free` move it; `semi_axes` (3,) along the
+    body's axes,
     or `None`: then the ellipsoid is the uniform one that turns as the body does (semi-axes √λ_k of
     its second moment 𝔖); `offset` s as for `Gyro`. Readings are (T,).
 
-    Brightness alone leaves the world's turns free that leave it unchanged: with fixed directions
-    the half turns about `sun × observer`, and, but for `Geometric`, about their sum and difference.
-    A `fit` takes the body for an ellipsoid; `fit_light_curve` allows for one that is none.
+    Brightness alone does not determine turns of the world that leave it unchanged: for fixed
+    directions the half turns about `sun × observer`, and, except for `Geometric`, about their sum
+    and difference. A `fit` assumes an ellipsoid; `fit_light_curve` allows for other shapes.
 
     **Raises** `ValueError` for a direction of length zero, a noise or semi-axis that is not
-    positive, a wrong shape, NaN; `TypeError` for another kind of argument.
+    positive, a wrong shape, NaN; `TypeError` for arguments of another type.
 
     Source: as `rigidjax.tumblers.brightness`; of light curves of tumblers Kaasalainen 2001, A&A
     376:302, doi:10.1051/0004-6361:20010935.
@@ -114,12 +115,12 @@ class Brightness(AbstractSensor):
         relative = seen / (math.pi * jnp.cbrt(determinant(shape)))
         if self.unit == "flux":
             return self.level * relative
-        # A body that hides its lit side is not seen: it is fainter than any reading.
+        # A body that hides its lit side is invisible: it is fainter than any reading.
         some = relative > 1e-12
         return self.level - 2.5 / math.log(10.0) * jnp.log(jnp.where(some, relative, 1e-12))
 
     def typical_rate(self, t: np.ndarray, values: np.ndarray) -> float:
-        """About how fast the body turns, rad/s: half the strongest frequency of the first 1000."""
+        """The rough rate of the body, rad/s: half the strongest frequency of 1000 readings."""
         t, values = t[:1000], values[:1000]
         if t.size < 10 or np.ptp(values) == 0:
             return 0.0

@@ -1,11 +1,11 @@
-"""From two frequencies of a light curve to motions that may be behind it: a grid of bodies.
+"""From two frequencies of a light curve to possible motions: a grid of bodies.
 
 Squared, the brightness of an ellipsoid is nearly a quadratic form of the direction n half way
 between sun and observer (at zero phase, under the law of projected areas, it is one):
-`F² ∝ Σ_k M_k (n·r_k)²`, r_k the body's axes in the world and `M = (bc)², (ca)², (ab)²`. So for a
-body, an energy and a phase it is linear in the six numbers of n nᵀ, seen from a frame along the
-angular momentum: least squares finds the direction of the momentum, the first angle and the level
-at once, and what is left for a grid is the shape and the phase in the rotation.
+`F² ∝ Σ_k M_k (n·r_k)²`, r_k the body's axes in the world and `M = (bc)², (ca)², (ab)²`. For a body,
+an energy and a phase it is therefore linear in the six numbers of n nᵀ, in a frame along the
+angular momentum. Least squares finds the direction of the momentum, the initial angle and the level
+at once; the grid covers the shape and the phase in the rotation.
 """
 
 import math
@@ -30,7 +30,7 @@ MODES = ("long", "short")
 
 
 class Candidate(NamedTuple):
-    """A motion to start from.
+    """A starting motion.
 
     **Fields:** `moments` (3,) ascending, the largest one; `q` (4,), `omega` (3,) at the first time,
     in principal axes; `misfit` χ².
@@ -62,7 +62,7 @@ def candidates(
     """The best of the grid whose precession and rotation have these frequencies, the best first.
 
     **Arguments:** `pair` (2,) of the mean precession and of twice the rotation, 1/s; `mode` of
-    `MODES`: the axis that is circulated; `light` times since the first, s, squared fluxes and ones
+    `MODES`: the circulated axis; `light` times since the first, s, squared fluxes and ones
     over their noise, and zeros where there is none; `half_way` (3,) the direction half way, world
     frame; `areas` M (3,) of a known ellipsoid, or `None` for the uniform one of each body; `count`
     how many bodies, each with all turns of `ABOUT`.

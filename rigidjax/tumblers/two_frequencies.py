@@ -1,4 +1,4 @@
-"""Two frequencies behind a light curve: the Fourier series in both that fits best."""
+"""The two frequencies of a light curve: the Fourier series in both that fits best."""
 
 import math
 from typing import Any
@@ -15,9 +15,9 @@ from rigidjax.tumblers.lattice_series import BATCH, FIRST, Sums, filled, misfits
 
 # Lines through which pairs are laid, and the grid of the first frequency, in 1/span.
 LINES, STEP = 3, 0.1
-# How far up the second frequency is looked for, over the highest of these lines.
+# The largest second frequency of the search, over the highest of these lines.
 SECOND = 1.5
-# How many pairs are refined for each that is wanted.
+# The number of pairs refined for each returned one.
 TRIED = 2
 # Squares of what is larger may overflow; a spectrum of more lines takes hours.
 LARGEST, MOST = 1e100, 1e5
@@ -26,7 +26,7 @@ BLOCK = 256
 
 
 class TwoFrequencies(eqx.Module):
-    """What `two_frequencies` returns, the best first.
+    """The result of `two_frequencies`, the best first.
 
     **Fields:** `frequencies` (n, 2) in 1/s; `misfits` (n,) χ² of each pair's series, and `dof`;
     `scatter` the standard deviation of the best one's residuals, in the unit of the values; `lines`
@@ -60,8 +60,8 @@ def two_frequencies(
     One of the three strongest lines of the spectrum must be j f₁ + k f₂. All pairs along these
     curves are tried, then the best ones are refined. Then their aliases are tried: either
     frequency, or both, moved by a side peak of the spectral window (readings at night have such
-    peaks at one and two a day) or by half of it, halved, doubled, or f₂ by f₁. A set of lines has
-    several pairs that make it: all that fit are returned, for a motion to choose among them.
+    peaks at one and two a day) or by half of it, halved, doubled, or f₂ by f₁. Several pairs give
+    the same set of lines: all that fit are returned, and a fit of the motion decides.
 
     **Arguments:** `t` (T,) increasing times, s, gaps allowed; `values` (T,) fluxes or their
     squares; `noise` their standard deviation, one or (T,), `None` if it is not known; `order` k up
@@ -173,7 +173,7 @@ def _spectrum(grid: Array, x: ArrayLike, z: ArrayLike, w: ArrayLike) -> tuple[Ar
 
 
 def _scan(table: Sums, lines: np.ndarray, order: int) -> tuple[np.ndarray, np.ndarray]:
-    """All pairs of which one of the lines is made, and their misfits."""
+    """All pairs that give one of the lines, and their misfits."""
     highest = float(lines[:LINES].max())
     grid = np.arange(0.5, 0.8 * highest + 0.5, STEP)
     whole = np.arange(0.5, SECOND * highest, STEP)

@@ -1,4 +1,4 @@
-"""Error against cost, of the value and of the gradient: what to choose for a scene.
+"""Error against cost, of the value and of the gradient: the choice of a method for a scene.
 
 `measure(scene)` runs methods on a scene, `draw` makes the chart with those that nothing beats,
 `choose` the short table. `python -m rigidjax workprecision` is all of it.

@@ -14,17 +14,17 @@ _COLOURS = {"ours": "tab20", "jax": "Set2", "peer": "Dark2"}
 def draw(records: Iterable[Record], *, title: str | None = None) -> Any:
     """Error against time, log–log: values on the left, gradients on the right, the front marked.
 
-    One scene a row. Beside the time of a run stands that of a first answer, compiling and one run,
-    where it is known. The grey band is the front: what nothing beats in both error and time, peers
-    included; its points are ringed. The coloured band is the front of what runs in JAX. Error bars
-    are quartiles of the time.
+    Each scene has a row. Beside the time of a run it shows the time of a first answer, compiling
+    and one run, if it is known. The grey band is the Pareto front of error and time, peers
+    included; its points are ringed. The coloured band is the front of the methods in JAX. Error
+    bars are quartiles of the time.
 
     **Arguments:** `records` as measured; `title` of the whole.
 
     **Returns** a `matplotlib` figure.
 
-    **Raises:** `ModuleNotFoundError` where matplotlib is missing (`pip install 'rigidjax[view]'`);
-    `ValueError` where there is nothing to draw.
+    **Raises:** `ModuleNotFoundError` if matplotlib is missing (`pip install 'rigidjax[view]'`);
+    `ValueError` if there is nothing to draw.
     """
     records = [r for r in listed(records) if r.error == r.error]
     if not records:

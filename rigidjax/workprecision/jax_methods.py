@@ -1,4 +1,4 @@
-"""What runs in JAX: ours and diffrax's solvers, on the same field, each compiled once."""
+"""The methods in JAX: ours and diffrax's solvers, on the same field, each compiled once."""
 
 import time
 from collections.abc import Callable
@@ -46,7 +46,7 @@ def compiled(scene: Scene, flow: Flow) -> Ready:
 
 
 def flow_of(scene: Scene, run: Callable[[Any, Any, Any, Any], tuple[Any, Any]]) -> Flow:
-    """The flow of `run`: body, first state, both times, setting → states over time, steps."""
+    """The flow of `run`: body, initial state, both times, setting → states over time, steps."""
 
     def flow(numbers: Any, setting: Any) -> tuple[Any, Any]:
         body, start = scene.assembled(numbers)
@@ -109,7 +109,7 @@ def _in_diffrax(scene: Scene, solver: Any, adjoint: Any = None) -> Flow:
 
 
 def _diffrax(scene: Scene, solver: Any, adjoint: Any = None) -> Flow:
-    """What a user would have without us: equations written by hand, one array, constants once."""
+    """A user's own code: equations written by hand, one array, constants once."""
     plain = scene.plain
     if plain is None:
         return _in_diffrax(scene, solver, adjoint)

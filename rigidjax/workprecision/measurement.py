@@ -1,4 +1,4 @@
-"""Measurements: methods made ready for a scene and timed in turn; the drift of a very long run."""
+"""Measurements: methods prepared for a scene and timed in turn; the drift of a very long run."""
 
 import dataclasses
 import time
@@ -57,13 +57,13 @@ def measure(
 ) -> list[Record]:
     """Error and cost of each method at each of its settings, of the value and of its gradient.
 
-    All in this process, in turn, round after round; compilation apart. A method that cannot do the
-    scene is left out; a run that is wrong by more than half a radian (or itself) is kept out of
-    the records.
+    All runs are in this process, in turn, round after round; compilation is timed separately. The
+    records omit methods that cannot do the scene, and runs with an error of more than half a radian
+    (or 100 %).
 
     **Arguments:** `scene`; `methods` (all of `methods()` by default); `peers` more of them;
-    `gradients` whether gradients are measured, too; `thin` take every `thin`-th setting; `rounds`
-    how often each run is timed at least; `progress` is told a line now and then.
+    `gradients` whether gradients are measured, too; `thin` takes every `thin`-th setting; `rounds`
+    the least number of timings of each run; `progress` is called with a line of text.
 
     **Raises:** `TypeError` for something that is no `Scene` or `Method`.
     """
@@ -90,7 +90,7 @@ def measure(
 
 
 def worked_out(scene: Scene, gradients: bool = True) -> Reference:
-    """A reference for a scene that has none: order 8 at equal steps, and at half as many.
+    """A reference for a scene without one: order 8 with fixed steps, and with half as many.
 
     Its error is their difference, no less than a hundred units of round-off: far above what the
     stored references have.
@@ -116,7 +116,7 @@ def worked_out(scene: Scene, gradients: bool = True) -> Reference:
 
 
 def _turn(scene: Scene) -> float:
-    """About how many radians the scene turns through; of a point, nothing is known."""
+    """The rough turn in the scene, rad; unknown for a point."""
     return 50.0 if scene.body is None else max(50.0, scene.size[1] * scene.end)
 
 
@@ -168,7 +168,7 @@ def _gradient_errors(scene: Scene, run: Run, right: Reference) -> dict[str, floa
 
 
 def drifts(scene: Scene, end: Any) -> tuple[float, float]:
-    """How far energy and momentum (of a point its integral, and nothing) moved, relative."""
+    """The relative drift of energy and momentum (for a point of its integral alone)."""
     if scene.body is None:
         law: Any = scene_of(scene.torque)
         state: Any = scene.state0
@@ -218,8 +218,8 @@ def long_drift(
 ) -> list[Record]:
     """Largest drift of energy and momentum over `steps` equal steps of an asymmetric heavy top.
 
-    Two records for each method, of the first hundredth of the run and of all of it: where they
-    agree the drift is bounded, where the second is a hundred times the first it grows with time.
+    There are two records for each method, of the first hundredth of the run and of all of it. The
+    drift is bounded if they agree; it grows with time if the second is a hundred times the first.
     `setting` is the length of a step, s; there is no error of the attitude (the motion forgets its
     start long before), `error` is the energy's. Timed once: it is a run of seconds.
 

@@ -1,4 +1,4 @@
-"""Who is on the front, how long an error takes, and the short table that follows from it."""
+"""The Pareto front, the time to an error, and the short table that follows from them."""
 
 import dataclasses
 import itertools
@@ -13,10 +13,10 @@ WANTED = (1e-4, 1e-7, 1e-10)
 
 
 def front(records: Iterable[Record]) -> list[Record]:
-    """Those records of one scene and kind that nothing beats in both error and time.
+    """The records of one scene and kind on the Pareto front of error and time.
 
     A record is compared with the curves of the others, log–log between their settings, not only
-    with the points that happened to be measured. Give records of one scene, and of values or
+    with the measured points. Give records of one scene, and of values or
     gradients only. **Returns** the records by falling error.
 
     **Raises:** `ValueError` for a mixture.
@@ -45,7 +45,7 @@ def front(records: Iterable[Record]) -> list[Record]:
 def first_answers(records: Iterable[Record]) -> list[Record]:
     """The same records with the time that a first answer takes: compiling and one run.
 
-    A method that is not compiled, or was made ready in no known time, counts with its run alone.
+    A method without compilation, or with an unknown time of it, counts with its run alone.
 
     >>> cold = Record("scene", "method", "ours", "value", "", 1e-6, time=1e-3, compile=2.0)
     >>> first_answers([cold])[0].time
@@ -93,8 +93,8 @@ class Choice(NamedTuple):
 
     **Fields:** for `scene` and the `wanted` error the quickest `method` of ours and its `time`, s;
     the way to the `gradient` at the same relative error and its `gradient_time`; `default` and
-    `default_gradient`, times of `simulate` as it stands; `peer`, `peer_time`: who is quicker than
-    ours, if anyone.
+    `default_gradient`, times of `simulate` as it stands; `peer`, `peer_time`: a quicker method than
+    ours, if there is one.
 
     >>> Choice._fields[:2]
     ('scene', 'wanted')
@@ -113,7 +113,7 @@ class Choice(NamedTuple):
 
 
 def choose(records: Iterable[Record], wanted: Sequence[float] = WANTED) -> list[Choice]:
-    """For each scene and wanted error: the quickest method of ours, and whoever is quicker.
+    """For each scene and wanted error: the quickest method of ours, and a quicker peer.
 
     **Arguments:** `records` as measured, of any scenes; `wanted` errors, rad.
 

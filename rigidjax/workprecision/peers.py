@@ -145,7 +145,7 @@ def _taylor(scene: Scene) -> Ready | None:
 
 
 def _varied(scene: Scene) -> Ready | None:
-    """Variational equations by the first state and the inertia, contracted with the scalar's."""
+    """Variational equations by the initial state and the inertia, contracted with the scalar's."""
     if scene.plain is None:
         return None
     hy: Any = importlib.import_module("heyoka")
@@ -167,7 +167,7 @@ def _varied(scene: Scene) -> Ready | None:
         stepper = stepper_of(setting)
         steps = stepper.propagate_until(scene.end)[3]
         slope = np.asarray(pull(stepper.state[:n])) @ stepper.state[n:].reshape(n, -1)
-        # By the first state, carried on to the numbers of the scene; then by the parameters.
+        # By the initial state, carried on to the numbers of the scene; then by the parameters.
         found = slope[:n] @ chain
         found[:size] += slope[n : n + size]
         return Run(found, steps)
@@ -176,7 +176,7 @@ def _varied(scene: Scene) -> Ready | None:
 
 
 def methods_outside() -> list[Method]:
-    """Those of SciPy, numba, MuJoCo and heyoka that can be imported here.
+    """The peers that can be imported here, of SciPy, numba, MuJoCo and heyoka.
 
     heyoka.py's adaptive Taylor method: Biscani and Izzo 2021, doi:10.1093/mnras/stab1032.
     """

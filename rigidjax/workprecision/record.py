@@ -1,4 +1,4 @@
-"""What is measured, one line for each run; its file; and what moved since a stored table.
+"""Records of measurements, one line for each run; their file; changes from a stored table.
 
 Tables are compared by errors, steps, and ratios of times, never by absolute times.
 """
@@ -19,7 +19,7 @@ BASE = "diffrax Dopri8"
 
 @dataclasses.dataclass(frozen=True)
 class Record:
-    """One method at one setting on one scene: what it got wrong and what it cost.
+    """One method at one setting on one scene: its errors and its cost.
 
     **Fields:** `scene`, `method` names; `group` `ours`, `jax` or `peer`; `kind` `value` or
     `gradient`; `adjoint` how a gradient was taken; `setting` the tolerance, or the number of equal
@@ -125,9 +125,9 @@ def _written(value: object) -> str:
 
 
 def moved(records: Iterable[Record], stored: Iterable[Record]) -> tuple[list[str], list[str]]:
-    """What differs between two tables: (what is wrong, what is only slower or quicker), in words.
+    """The differences of two tables in words: (changed errors or steps, changed times).
 
-    Compared line by line, as far as both have it, peers left out: an error more than three times as
+    Lines that both have are compared, without peers: an error more than three times as
     large or as small, steps by more than 2 %; and the median time over that of `diffrax Dopri8` on
     the same scene, each at its finest common settings, by more than a factor of 2.
 
@@ -165,7 +165,8 @@ def moved(records: Iterable[Record], stored: Iterable[Record]) -> tuple[list[str
 
 
 def kept(records: Iterable[Record]) -> list[Record]:
-    """What a stored table keeps: no peers, no absolute times but multiples of the base's median.
+    """The contents of a stored table: no peers, no absolute times but multiples of the base's
+    median.
 
     >>> kept([Record("s", BASE, "jax", "value", "", 1e-6, error=1e-7, time=3.0)])[0].time
     1.0

@@ -1,4 +1,4 @@
-"""What is compared: a scene, with its right answer, and a method, made ready for it and run."""
+"""A scene with its reference, and a method that is prepared for it and run."""
 
 import functools
 import json
@@ -22,7 +22,7 @@ A, B, C = (0.6, -0.48, 0.64), (0.36, 0.8, -0.48), (0.28, -0.5, 0.82)
 
 
 class Reference(NamedTuple):
-    """Where a scene ends, and the gradient of its scalar.
+    """The end of a scene, and the gradient of its scalar.
 
     **Fields:** `end` the state as one tuple; `error` of its largest number, as estimated by the
     method that made it; `gradient`, `gradient_error` the same, empty where there is none;
@@ -59,14 +59,14 @@ def stored(name: str) -> Reference | None:
 
 
 class Scene(eqx.Module):
-    """One motion that methods are compared on.
+    """One motion for the comparison of methods.
 
     **Fields:** `name`, `title` words; `body` an `Inertia`, `None` for a `Point`; `state0` an
     `Attitude` or a `Point`; `torque` as for `rigidjax.simulate`; `end` s, the run is from 0 to
     `end`; `plain` the same equations without JAX, `plain(numbers, sin, cos, sqrt) → f(t, y)`, for
-    peers and references (`None`: peers are left out); `reference` the right answer, `None`: worked
-    out by our own method at small steps; `slow` whether only a full run looks at it; `notes` what
-    a peer needs to know beyond the equations.
+    peers and references (`None`: peers are left out); `reference` the correct answer, `None`:
+    computed by our own method at small steps; `slow` whether only a full run uses it; `notes` data
+    for a peer beyond the equations.
 
     >>> from rigidjax import Attitude, Inertia, torques
     >>> scene = Scene("mine", "my body", Inertia(jnp.eye(3)),
@@ -103,7 +103,7 @@ class Scene(eqx.Module):
 
     @property
     def numbers(self) -> Float[Array, " parameters"]:
-        """What gradients are by: Ixx Iyy Izz Ixy Ixz Iyz, Ω0, q0 (13), or x0, v0 (6)."""
+        """The variables of gradients: Ixx Iyy Izz Ixy Ixz Iyz, Ω0, q0 (13), or x0, v0 (6)."""
         if self.body is None:
             return jnp.concatenate([self.state0.x, self.state0.v])  # pyright: ignore
         t = self.body.tensor
@@ -113,13 +113,13 @@ class Scene(eqx.Module):
 
     @property
     def blocks(self) -> dict[str, slice]:
-        """Which of `numbers` are what."""
+        """The parts of `numbers`."""
         if self.body is None:
             return {"x0": slice(0, 3), "v0": slice(3, 6)}
         return {"inertia": slice(0, 6), "omega0": slice(6, 9), "q0": slice(9, 13)}
 
     def assembled(self, numbers: Float[Array, " parameters"]) -> tuple[Any, Any]:
-        """Body and first state of these `numbers`."""
+        """Body and initial state of these `numbers`."""
         if self.body is None:
             return None, Point(numbers[:3], numbers[3:])
         xx, yy, zz, xy, xz, yz = (numbers[i] for i in range(6))
@@ -134,7 +134,7 @@ class Scene(eqx.Module):
 
     @property
     def size(self) -> tuple[float, float]:
-        """What errors of the halves of the state are relative to: 1 rad and |Ω0|, or lengths."""
+        """The scales of errors of the halves of the state: 1 rad and |Ω0|, or lengths."""
         if self.body is None:
             state: Any = self.state0
             length = float(np.linalg.norm(state.x))
@@ -168,7 +168,7 @@ def distance(scene: Scene, end: Any, right: Any) -> tuple[float, float]:
 
 
 class Run(NamedTuple):
-    """What one run gives.
+    """The result of one run.
 
     **Fields:** `numbers` the last state (or the gradient) as one vector; `steps` taken.
 
@@ -181,7 +181,7 @@ class Run(NamedTuple):
 
 
 class Ready(NamedTuple):
-    """A method made ready for a scene.
+    """A method prepared for a scene.
 
     **Fields:** `run` setting → `Run`, complete when it returns; `compile` s that making it took,
     `memory` bytes of temporaries, each NaN where unknown.

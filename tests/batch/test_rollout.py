@@ -265,7 +265,7 @@ def test_words(unhooked):
         run(bodies, rj.Attitude(states.q.at[2].mul(2.0), states.omega), 0.1, 4)
     with pytest.raises(TypeError, match="depends on the attitude"):
         run(bodies, states, 0.1, 4, TOP, solver=rj.solvers.Magnus4())
-    with pytest.raises(TypeError, match="no equal steps of Dopri8"):
+    with pytest.raises(TypeError, match="no fixed steps of Dopri8"):
         run(bodies, states, 0.1, 4, TOP, solver=dfx.Dopri8())
     with pytest.raises(TypeError, match="HasAttitude"):
         run(bodies, rj.Spin(states.omega), 0.1, 4, TOP)

@@ -129,7 +129,7 @@ def test_words(unhooked):
     bodies, states = batch(3)
     with pytest.raises(ValueError, match="increasing times"):
         rj.batch.simulate(bodies, states, [0.0, 2.0, 1.0])
-    with pytest.raises(ValueError, match="Magnus4 takes equal steps"):
+    with pytest.raises(ValueError, match="Magnus4 takes fixed steps"):
         rj.batch.simulate(bodies, states, TS, solver=rj.solvers.Magnus4())
     with pytest.raises(TypeError, match="wanted Spin, Attitude or Rigid"):
         rj.batch.simulate(bodies, states.omega, TS)

@@ -142,7 +142,7 @@ def test_windows_say_that_a_body_is_flat_and_what_is_not_known():
         return rj.Inertia.from_second_moment(shape * jnp.exp(v[5])), None
 
     found = identify.fit_windows(windows, scene, jnp.zeros(6))
-    assert "the body is flat: (I1 + I2 − I3)/I3 = " in found.message
+    assert "the fitted body is flat: (I1 + I2 − I3)/I3 = " in found.message
     # A free body does not show its scale.
     assert "some combination of the free numbers changes nothing" in found.message
 

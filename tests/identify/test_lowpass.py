@@ -139,7 +139,7 @@ def test_mistakes_are_named():
         identify.LowPass(1.0)(jnp.zeros(3), jnp.ones((3, 1)))
     with pytest.raises(TypeError, match=r"lowpass: wanted LowPass\(cutoff in Hz\)"):
         identify.Gyro(0.1, lowpass=20.0)
-    with pytest.raises(ValueError, match="say something only beside a g_sensitivity"):
+    with pytest.raises(ValueError, match="place and gravity need a g_sensitivity"):
         identify.Gyro(0.1, place=[0, 0, 0])
     with pytest.raises(ValueError, match=r"g_sensitivity: wanted shape \(3, 3\)"):
         identify.Gyro(0.1, g_sensitivity=[0.0, 0, 0])

@@ -97,14 +97,14 @@ def test_mistakes_are_named():
     spin = rj.Spin([0.0, 0.0, 1.0])
     with pytest.raises(TypeError, match="AttitudeSensor needs a state with HasAttitude, got Spin"):
         simulate_readings(identify.AttitudeSensor(), TOP, spin, TS)
-    with pytest.raises(ValueError, match="Gyro: noise=None says no size"):
+    with pytest.raises(ValueError, match="Gyro: noise=None gives no size"):
         simulate_readings(identify.Gyro(), TOP, spin, TS, key=jax.random.key(0))
     with pytest.raises(ValueError, match=r"Compass: .*write a method reading_of"):
         simulate_readings(Compass(), TOP, STEADY, TS)
     with pytest.raises(TypeError, match=r"state0: wanted .* got Inertia; the order is sensor, b"):
         simulate_readings(identify.Gyro(), spin, TOP, TS)
     record = identify.Recording([0.0, 1.0], (identify.Gyro(), np.ones((2, 3))))
-    with pytest.raises(TypeError, match=r"got Inertia; a body that is known is Known\(body\)"):
+    with pytest.raises(TypeError, match=r"got Inertia; give a known body as Known\(body\)"):
         identify.Problem(record, TOP)
-    with pytest.raises(TypeError, match=r"typical: .*one number, kg m², got Inertia; a body that"):
+    with pytest.raises(TypeError, match=r"typical: .*one number, kg m², got Inertia; give a known"):
         identify.Principal(TOP)

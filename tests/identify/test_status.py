@@ -150,8 +150,8 @@ WRONG = {
 
 # What the causes say of some of them; the others have none that is one of the table's.
 CAUSES = {
-    "skew of 3 degrees": "off a right angle",
-    "axes that are not principal": "axes that are turned",
+    "skew of 3 degrees": "axes not orthogonal",
+    "axes that are not principal": "axes turned by",
     "a bias left out": "a bias left out, (0.039, -0.041, 0.053) rad/s",
     "deg/s, a gyro alone": "deg/s read as rad/s",
     "time stamps that scatter": "time stamps that scatter by 42 ms",
@@ -161,18 +161,18 @@ CAUSES = {
     "sign of one axis": "the z axis mirrored",
     "two axes swapped": "x and y swapped",
     "axes in another order": "axes in the order y, z, x",
-    "a clock that is 5 % fast": "scales that are off by (0.048, 0.051, 0.046)",
+    "a clock that is 5 % fast": "scale errors of (0.048, 0.051, 0.046)",
     "scalar last": "the quaternion's scalar last",
     "world to body": "the quaternion from world to body",
-    "gyro turned by 6 degrees": "axes that are turned",
-    "one scale 5 % off": "scales that are off by (0.048,",
+    "gyro turned by 6 degrees": "axes turned by",
+    "one scale 5 % off": "scale errors of (0.048,",
     "a bias that drifts": "a bias that drifts by (0.0099, -0.01, 0.005)",
-    "g read as m/s²": "scales that are off by (-0.9, -0.89, -0.9)",
-    "a still wheel not named": "a constant angular momentum",
+    "g read as m/s²": "scale errors of (-0.9, -0.89, -0.9)",
+    "a still wheel not named": "a constant internal angular momentum",
     "an axis mirrored beside a wheel": "the y axis mirrored",
     "the wheel the other way": "the torque with the other sign",
     "the wheel about x": "axes in the order y, z, x",
-    "the wheel's log late": "a clock that is off by 0.4",
+    "the wheel's log late": "a clock offset of 0.4",
     "drag left out": "a torque against the rate",
 }
 
@@ -241,7 +241,7 @@ def test_a_fit_prints_its_table_its_answers_and_what_follows():
     assert "2.25 times the noise" in lines[1] and lines[2] == str(found.causes[0])
     assert lines[3] == found.advice and "let a Free move the sensor's bias" in found.advice
     # The other body that has these rates with an axis mirrored.
-    assert any("with an axis mirrored or two swapped" in line for line in lines)
+    assert any("with an axis mirrored or two axes swapped" in line for line in lines)
     assert "Ix/Iz" in found._repr_html_() and "search: found" in found._repr_html_()
     held = identify.report.as_dict(found)
     assert held["search"] == {"answer": "found", "reasons": []}

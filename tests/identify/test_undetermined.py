@@ -71,7 +71,7 @@ def test_combinations_are_told_apart_and_named():
         "Ix, Iy and Iz rise together: only their ratios are determined.",
         "No reading changes where these change together: Ωz by +0.0005 rad/s, bias z by "
         "−0.0005 rad/s.",
-        "The first attitude about the world's z is not determined: no reading changes with it.",
+        "The initial attitude about the world's z is not determined: no reading changes with it.",
     ]
 
 
@@ -93,7 +93,7 @@ def test_axes_that_turn_are_named_by_the_tensor():
 def test_a_fit_that_explains_nothing_calls_nothing_determined():
     lost = "does not explain the readings"
     (line,) = fit_with(identify.Principal(1.5), [grown], model=lost).identifiability
-    assert "does not explain the data, so that nothing is determined by it" in line
+    assert "does not explain the data, so it determines nothing" in line
     failed = fit_with(identify.Principal(1.5), [grown], "not ended").identifiability
     assert "did not end in a minimum" in failed[0]
     assert "Ix, Iy and Iz rise together: only their ratios are determined." in failed

@@ -331,7 +331,7 @@ def test_full_is_told_and_bodies_are_alone():
 
 def test_words(unhooked):
     run = lambda **how: rj.simulate(BODY, FLIPPING, [0.0, 1.0], Nothing(), **how)
-    with pytest.raises(TypeError, match="the difference, not whether it is positive"):
+    with pytest.raises(TypeError, match="the difference, not its sign"):
         run(event=lambda t, state, body: state.omega[1] > 0)
     with pytest.raises(ValueError, match=r"condition: .*one real number, zero at the event"):
         run(event=lambda t, state, body: state.omega)

@@ -1,4 +1,4 @@
-"""What a recording was read with."""
+"""Sensors of a recording."""
 
 from rigidjax._names import show
 from rigidjax.identify.sensors.attitude import (

@@ -1,4 +1,4 @@
-"""Sensors that see which way the body points or where its parts are."""
+"""Sensors of the attitude, of directions, and of the positions of points of the body."""
 
 import dataclasses
 from typing import Any, ClassVar
@@ -31,7 +31,7 @@ class AttitudeSensor(AbstractSensor):
     `jax.vmap(lambda a: rj.euler.to_quaternion(a, "ZYX"))(jnp.deg2rad(angles))` makes them.
 
     **Arguments:** `noise` standard deviation of each component of that vector, rad, one number or
-    (3,); `None` has it estimated; `mounting` (3,) rotation vector from the body's axes to the
+    (3,); `None` estimates it; `mounting` (3,) rotation vector from the body's axes to the
     sensor's, rad, or `None`; `offset` s as for `Gyro`. **Raises** `ValueError` for a noise that is
     not positive, a wrong shape, NaN; the recording for a matrix that is no rotation.
 
@@ -94,13 +94,13 @@ def _unit(world: Any) -> Vec3:
 
 
 class Direction(AbstractSensor):
-    """Reads the direction, in its own axes, of something whose direction in the world is known.
+    """Reads the direction, in its own axes, of an object with a known direction in the world.
 
-    A sun sensor, a star, the vertical. The error is the chord from the prediction to the reading,
-    taken in the plane across the reading (two numbers, rad for small errors, 2 at most).
+    Examples: a sun sensor, a star, the vertical. The error is the chord from the prediction to the
+    reading, taken in the plane across the reading (two numbers, rad for small errors, 2 at most).
 
     **Arguments:** `world` (3,) the direction in the world frame, any length; `noise` rad across the
-    line of sight, one number or (2,), `None` to have it estimated; `mounting`, `offset` as for
+    line of sight, one number or (2,), `None` to estimate it; `mounting`, `offset` as for
     `AttitudeSensor`. Readings (T, 3) are unit vectors.
 
     **Raises** `ValueError` for a direction of length zero, a noise that is not positive, NaN.
@@ -128,9 +128,11 @@ class Direction(AbstractSensor):
         return -jnp.stack([dot(first, seen), dot(second, seen)]) / half
 
     def reading_of(self, now: SensorInput, error: Float[Array, "2"]) -> Vec3:
-        """A reading (3,) whose error is as long as this one (2,), and for small ones is this one.
+        """A reading (3,) with an error of the same length as this one (2,), and equal for small
+        errors.
 
-        The two axes across the prediction are those across the reading but for the angle between.
+        The two axes across the prediction are the axes across the reading, turned by the angle
+        between.
         """
         seen = self._seen(now)
         first, second = _across(seen)
@@ -154,7 +156,7 @@ def _not_unit(rows: np.ndarray) -> np.ndarray:
 
 
 def _across(line: Vec3) -> tuple[Vec3, Vec3]:
-    """Two unit vectors across a unit vector, and each other."""
+    """Two unit vectors orthogonal to a unit vector and to each other."""
     least = jnp.eye(3, dtype=line.dtype)[jnp.argmin(jnp.abs(line))]
     first = cross(line, least)
     first = first / jnp.sqrt(dot(first, first))
@@ -162,12 +164,12 @@ def _across(line: Vec3) -> tuple[Vec3, Vec3]:
 
 
 class Marker(AbstractSensor):
-    """Reads the position, in the world, of a point that is fixed in the body: `x + R r`, m.
+    """Reads the position, in the world, of a point fixed in the body: `x + R r`, m.
 
-    **Arguments:** `place` (3,) where on the body, m, body frame; `noise` m, one number or (3,),
-    `None` to have it estimated; `origin` (3,) m, world frame: where the fixed point of a body on a
-    pivot is; `None` for a body that moves (`Rigid`, with `MassProperties`, whose frame `place` is
-    then in); `offset` s as for `Gyro`. **Raises** `ValueError` as `Gyro`.
+    **Arguments:** `place` (3,) the point, m, body frame; `noise` m, one number or (3,), `None` to
+    estimate it; `origin` (3,) m, world frame: the fixed point of a body on a pivot; `None` for a
+    body that moves (`Rigid`, with `MassProperties`; `place` is then in their frame); `offset` s as
+    for `Gyro`. **Raises** `ValueError` as `Gyro`.
 
     >>> import rigidjax as rj
     >>> body = rj.MassProperties(1.0, [0.0, 0, 0], jnp.eye(3))

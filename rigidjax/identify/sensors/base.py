@@ -1,4 +1,4 @@
-"""What a sensor is: what it reads of a motion at one time, and how far a reading is from that."""
+"""The base class of sensors: the prediction of a motion at one time, and the error of a reading."""
 
 import abc
 from collections.abc import Callable
@@ -15,7 +15,7 @@ from rigidjax.rotation import quaternion
 
 
 class SensorInput(eqx.Module):
-    """What a sensor reads: a motion at one time.
+    """The input of a sensor: a motion at one time.
 
     **Fields:** `t` s; `state` of the kind that the problem needs; `body` the `Inertia` or
     `MassProperties`; `field` the equations of motion `f(t, state, args)`, with the states of its
@@ -41,25 +41,25 @@ class SensorInput(eqx.Module):
         return self.field(self.t, self.state, None)
 
     def lever(self, place: Vec3) -> Vec3:
-        """From the point that the state is about to a `place` (3,) in the body frame, m."""
+        """From the reference point of the state to a `place` (3,) in the body frame, m."""
         return place - self.body.com if isinstance(self.body, MassProperties) else place
 
 
 class AbstractSensor(eqx.Module):
     """A sensor: the shape of its readings, the state it needs, and the error of a reading.
 
-    Subclass it for your own: say `reading_shape`, `feels` (`HasSpin`, `HasAttitude` or `HasPose`),
-    how many `components` the error has and in which `unit`, `noise` (k,) the standard deviation of
-    each component, or `None` to have it estimated; and write `error`.
+    Subclass it for your own sensor: set `reading_shape`, `feels` (`HasSpin`, `HasAttitude` or
+    `HasPose`), the number of `components` of the error and its `unit`, `noise` (k,) the standard
+    deviation of each component, or `None` to estimate it; and write `error`.
 
-    Optional members: `offset`, s: the sensor's clock is behind, it shows at t what was at
-    t + offset; `limit` (k,): where a channel saturates, in the unit of the error; `lowpass` a
-    `LowPass`, where the error is reading minus prediction; a method `refusal(values)`: which rows
-    cannot be readings, (T,) true where wrong, and why; a method `typical_rate(t, values)`: about
-    how fast the body turns, rad/s, by the readings seen, where no other sensor tells; where the
-    error is not reading minus prediction, a method `reading_of(now, error)`, the reading that has
-    this error, for `simulate_readings`; `suspect`: name, words and remedy of what a fit
-    names as the cause of its errors where no other shows.
+    Optional members: `offset`, s: the sensor's clock is behind, its reading at t belongs to t +
+    offset; `limit` (k,): the full scale of a channel, in the unit of the error; `lowpass` a
+    `LowPass`, if the error is reading minus prediction; a method `refusal(values)`: the rows that
+    cannot be readings, (T,) true where wrong, and why; a method `typical_rate(t, values)`: the
+    rough rate of the body, rad/s, from the unmasked readings, if no other sensor shows it; a method
+    `reading_of(now, error)`, the reading with this error, for `simulate_readings`, if the error is
+    not reading minus prediction; `suspect`: name, words and remedy of the cause that a fit names
+    for its errors if it finds no other.
 
     >>> import rigidjax as rj
     >>> class Tachometer(AbstractSensor):  # the size of the body rate, rad/s
@@ -83,7 +83,7 @@ class AbstractSensor(eqx.Module):
 
 
 def required(name: str, shape: tuple[int, ...] = (3,)) -> Callable[[Any], Array]:
-    """What makes a field of finite numbers, which a fit may move: `equinox.field(converter=…)`."""
+    """A converter to finite numbers, which a fit may move, for `equinox.field(converter=…)`."""
 
     def converted(value: Any) -> Array:
         if value is None:
@@ -94,18 +94,18 @@ def required(name: str, shape: tuple[int, ...] = (3,)) -> Callable[[Any], Array]
 
 
 def optional(name: str, shape: tuple[int, ...] = (3,)) -> Callable[[Any], Array | None]:
-    """The same of a field that may be `None`."""
+    """The same for a field that may be `None`."""
     converted = required(name, shape)
     return lambda value: None if value is None else converted(value)
 
 
 def deviations(size: int = 3) -> Callable[[Any], Array | None]:
-    """What makes a field of standard deviations (size,), of one number or as many; or `None`."""
+    """A converter of one number or `size` numbers to standard deviations (size,); `None` stays."""
     return lambda value: _positive(value, "noise", "a positive standard deviation", size)
 
 
 def full_scale(limit: Any) -> Vec3 | None:
-    """Where the channels saturate (3,), one number or three, positive; or `None`."""
+    """The full scale of the channels (3,), from one number or three, positive; or `None`."""
     return _positive(limit, "limit", "a positive full scale", 3)
 
 
@@ -127,13 +127,13 @@ def shown(
     mounting: Vec3 | None,
     skew: Vec3 | None = None,
 ) -> Vec3:
-    """What a vector sensor shows: `scale · S exp(−mounting) v + bias`.
+    """The prediction of a vector sensor: `scale · S exp(−mounting) v + bias`.
 
     Its axes need not be orthogonal: `S = [[1, a, b], [0, 1, c], [0, 0, 1]]` of the skew (a, b, c).
 
     **Arguments:** `truth` v (3,) body frame; `bias` (3,) in the sensor's unit; `scale` (3,) per
     channel; `mounting` (3,) rotation vector that turns the body's axes onto the sensor's, rad;
-    `skew` (3,) what x shows of y, x of z, and y of z.
+    `skew` (3,) the shares of y in x, of z in x, and of z in y.
     """
     seen = truth
     if mounting is not None:

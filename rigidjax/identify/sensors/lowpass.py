@@ -1,4 +1,4 @@
-"""A filter that readings went through before they were logged."""
+"""A low-pass filter of readings before they were logged."""
 
 import math
 from types import NoneType
@@ -13,24 +13,25 @@ from jaxtyping import Array, Float
 from rigidjax import _checks
 from rigidjax._types import Scalar, ScalarLike
 
-# After a gap of so many usual intervals what was before it says nothing.
+# Samples before a gap of so many usual intervals are ignored after it.
 _GAP = 3.0
-# Third powers of numbers and of intervals stay within float32, too.
+# Third powers of numbers and intervals must stay within float32, too.
 _LARGEST = 1e12
 
 
 class LowPass(eqx.Module):
-    """A low-pass filter of first or second order (Butterworth), as the chips of gyros have them.
+    """A low-pass filter of first or second order (Butterworth), as in the chips of gyros.
 
-    Give it to a sensor (`Gyro(0.01, lowpass=LowPass(40.0))`): then what the model shows goes
-    through the same filter as the readings did. Without it the filter's lag is taken for an offset
-    of the clock, and what it takes away from faster rates for another motion.
+    Give it to a sensor (`Gyro(0.01, lowpass=LowPass(40.0))`): then the predictions go through the
+    same filter as the readings. Without it a fit mistakes the filter's lag for an offset of the
+    clock, and its damping of faster rates for another motion.
 
     `ẏ = w(u − y)`, or `ÿ + √2 w ẏ + w² y = w² u`, with w = 2π · cutoff; solved exactly, from sample
-    to sample, for a cubic between samples of u. Before the first sample u is taken to be the cubic
-    through the first four of them, after a gap of more than three intervals a straight line.
+    to sample, for a cubic between samples of u. Before the first sample u is the cubic through the
+    first four samples. Before a sample that follows a gap of more than three intervals u is a
+    straight line.
 
-    **Arguments:** `cutoff` Hz, where the gain is 1/√2 (a `Free` may move it); `order` 1 or 2.
+    **Arguments:** `cutoff` Hz, the frequency of gain 1/√2 (a `Free` may move it); `order` 1 or 2.
 
     Source: Butterworth 1930, Experimental Wireless 7:536.
 
@@ -55,12 +56,12 @@ class LowPass(eqx.Module):
     def __call__(
         self, t: Float[Array, " times"], values: Float[Array, "times k"]
     ) -> Float[Array, "times k"]:
-        """What the filter makes of samples.
+        """The filtered samples.
 
         **Arguments:** `t` (T,) increasing times, s; `values` (T, k), of any unit.
 
-        **Raises** `ValueError` for shapes that do not agree; where numbers are known, for times
-        that do not increase, NaN, numbers whose cubes overflow.
+        **Raises** `ValueError` for shapes that do not agree; for times that do not increase, NaN,
+        and numbers whose cubes overflow, if they are known.
         """
         values = _checks.numbers(values, "values")
         if values.ndim != 2:
@@ -128,8 +129,8 @@ def _begin(gaps: Array, chord: Array) -> tuple[Array, Array, Array]:
 
 
 def _first(w: Array, u0: Array, du0: Any, u1: Array, du1: Any) -> tuple[Any, Any, Any]:
-    """The filter's answer to the cubic itself at both ends of each interval, and how what differs
-    from it decays.
+    """The filter's answer to the cubic itself at both ends of each interval, and the decay of the
+    difference from it.
     """
 
     def own(u: Array, du: Any) -> Array:
@@ -158,7 +159,7 @@ def _second(w: Array, u0: Array, du0: Any, u1: Array, du1: Any) -> tuple[Any, An
 
 
 def _along(begin: Array, y0: Array, y1: Array, decay: Any, gaps: Array, fresh: Array) -> Array:
-    """From interval to interval: what differs from the cubic's own answer is carried over."""
+    """From interval to interval: the difference from the cubic's own answer carries over."""
 
     def step(state: Array, row: Any) -> tuple[Array, Array]:
         own0, own1, following, h, gap = row

@@ -1,4 +1,4 @@
-"""Sensors that see where the body is and how fast it moves."""
+"""Sensors of the position and the velocity of the body."""
 
 import dataclasses
 from typing import ClassVar
@@ -21,10 +21,10 @@ from rigidjax.rotation.linalg3 import cross, dot
 
 
 class Position(AbstractSensor):
-    """Reads where the centre of mass is, in the world: `x + bias`, m. Another point: `Marker`.
+    """Reads the centre of mass, in the world: `x + bias`, m. Use `Marker` for another point.
 
-    **Arguments:** `noise` m, one number or (3,), `None` to have it estimated; `bias` (3,) m, world
-    frame, or `None`; `offset` s as for `Gyro`. For a `Rigid`.
+    **Arguments:** `noise` m, one number or (3,), `None` to estimate it; `bias` (3,) m, world frame,
+    or `None`; `offset` s as for `Gyro`. For a `Rigid`.
 
     **Raises** `ValueError` as `Gyro`.
 
@@ -49,11 +49,11 @@ class Position(AbstractSensor):
 class Velocity(AbstractSensor):
     """Reads the velocity of a point of the body: `v + R (Ω × r)`, in the world or in its own axes.
 
-    **Arguments:** `noise` m/s, one number or (3,), `None` to have it estimated; `place` (3,) where
-    it sits, m, in the frame of the `MassProperties`, from which r is counted from the centre of
-    mass; `None` for the centre of mass itself; `mounting` (3,) rotation vector that turns the
-    body's axes onto the sensor's, rad, for one that moves along, such as a Doppler log (zeros for
-    the body's axes); `None` for the world's axes, such as of satellite navigation; `bias` (3,) m/s
+    **Arguments:** `noise` m/s, one number or (3,), `None` to estimate it; `place` (3,) the point,
+    m, in the frame of the `MassProperties` (r is the vector to it from the centre of mass); `None`
+    for the centre of mass itself; `mounting` (3,) rotation vector that turns the body's axes onto
+    the sensor's, rad, for a sensor on the body, such as a Doppler log (zeros for the body's axes);
+    `None` for the world's axes, as in satellite navigation; `bias` (3,) m/s
     or `None`; `offset` s as for `Gyro`. For a `Rigid`.
 
     Source: velocity of a point of a rigid body, Landau and Lifshitz, Mechanics, eq 31.2.
@@ -90,11 +90,11 @@ class Velocity(AbstractSensor):
 class Range(AbstractSensor):
     """Reads the distance from a station to a point of the body: `|x + R r − s| + bias`, m.
 
-    **Arguments:** `station` s (3,) m, world frame; `noise` m, `None` to have it estimated; `place`
-    (3,) the point, m, in the frame of the `MassProperties`; `None` for the centre of mass; `bias`
+    **Arguments:** `station` s (3,) m, world frame; `noise` m, `None` to estimate it; `place` (3,)
+    the point, m, in the frame of the `MassProperties`; `None` for the centre of mass; `bias`
     m, or `None`; `offset` s as for `Gyro`. Readings (T,). For a `Rigid`.
 
-    **Raises** `ValueError` as `Gyro`, for a reading below zero, too.
+    **Raises** `ValueError` as `Gyro`, and for a reading below zero.
 
     >>> Range([0.0, 0.0, 100.0], noise=0.05).reading_shape
     ()
@@ -116,7 +116,7 @@ class Range(AbstractSensor):
         line = state.x - self.station
         if self.place is not None:
             line = line + quaternion.rotate(state.q, now.lever(self.place))
-        # At the station itself there is no direction, and no derivative: it is taken as 0.
+        # There is no direction at the station itself, and no derivative: it is set to 0.
         square = dot(line, line)
         length = jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)
         found = length if self.bias is None else length + self.bias

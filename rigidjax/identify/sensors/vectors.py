@@ -25,16 +25,17 @@ from rigidjax.rotation.linalg3 import apply, cross
 class Gyro(AbstractSensor):
     """Reads the body rate: `scale · S exp(−mounting) Ω + bias + G f`, rad/s.
 
-    **Arguments:** `noise` standard deviation of a reading, rad/s, one number or (3,); `None` has it
-    estimated from the residuals. Then, `None` unless the sensor has it (give a value to let a
-    `Free` move it): `bias` (3,) rad/s; `scale` (3,) per channel; `mounting` (3,) rotation vector
-    from the body's axes to the sensor's, rad; `skew` (3,) what its x axis shows of y, x of z, and y
-    of z, where they are not orthogonal: `S = [[1, a, b], [0, 1, c], [0, 0, 1]]`; `limit` full
-    scale, rad/s, one number or (3,): a reading at it counts as "at least that much", `None` has it
-    found; `offset` s: it shows at t what was at t + offset; `lowpass` a `LowPass` that the readings
-    went through; `g_sensitivity` G (3, 3), rad/s per m/s²: what each channel shows of the specific
-    force f, in the body's axes, where the gyro sits: `place` (3,) m and `gravity` (3,) m/s² as for
-    `Accelerometer`, the centre of mass and `None` unless given.
+    **Arguments:** `noise` standard deviation of a reading, rad/s, one number or (3,); `None`
+    estimates it from the residuals. The others are `None` unless the sensor has them (give a value
+    to let a `Free` move it): `bias` (3,) rad/s; `scale` (3,) per channel; `mounting` (3,) rotation
+    vector from the body's axes to the sensor's, rad; `skew` (3,) the shares of y in its x axis, of
+    z in x, and of z in y, for axes that are not orthogonal:
+    `S = [[1, a, b], [0, 1, c], [0, 0, 1]]`; `limit` full scale, rad/s, one number or (3,): a
+    reading at it counts as "at least that much", `None` finds it from the readings; `offset` s: the
+    reading at t belongs to t + offset; `lowpass` the `LowPass` of the readings; `g_sensitivity` G
+    (3, 3), rad/s per m/s²: the effect on each channel of the specific force f, in the body's axes,
+    at the gyro's place: `place` (3,) m and `gravity` (3,) m/s² as for `Accelerometer`, the centre
+    of mass and `None` unless given.
 
     **Raises** `ValueError` for a noise or limit that is not positive, a wrong shape, NaN.
 
@@ -66,7 +67,7 @@ class Gyro(AbstractSensor):
         self.feels = HasSpin if self.gravity is None else HasAttitude
         if self.g_sensitivity is None:
             if self.place is not None or self.gravity is not None:
-                wanted = "place and gravity say something only beside a g_sensitivity"
+                wanted = "place and gravity need a g_sensitivity"
                 raise ValueError(f"Gyro: {wanted}")
         elif self.place is None:
             self.place = jnp.zeros(3)
@@ -92,14 +93,14 @@ def specific_force(now: SensorInput, place: Vec3, gravity: Vec3 | None) -> Vec3:
 
 
 class Accelerometer(AbstractSensor):
-    """Reads the specific force where it sits: `scale · S exp(−mounting) f + bias`, m/s².
+    """Reads the specific force at its place: `scale · S exp(−mounting) f + bias`, m/s².
 
     `f = Rᵀ(a − g) + dΩ/dt × r + Ω × (Ω × r)` in the body frame (notes, eq 88, seen from the body),
     with r the lever arm from the centre of mass, or from the fixed point of a body on a pivot. A
-    body that falls freely has a = g: then only the terms of r are left.
+    body in free fall has a = g: then only the terms of r remain.
 
-    **Arguments:** `noise` m/s², one number or (3,), `None` to have it estimated; `place` (3,) where
-    it sits, m, body frame: from the point that the `Inertia` is about, or in the frame of the
+    **Arguments:** `noise` m/s², one number or (3,), `None` to estimate it; `place` (3,) the
+    sensor's place, m, body frame: from the reference point of the `Inertia`, or in the frame of the
     `MassProperties`; `gravity` (3,) m/s², world frame: `None` for a body in free fall (`Spin`,
     `Attitude`), needed by a body on a pivot and by a `Rigid`; `bias`, `scale`, `mounting`, `skew`,
     `limit`, `offset`, `lowpass` as for `Gyro`.
@@ -133,10 +134,10 @@ class Accelerometer(AbstractSensor):
 
 
 class Magnetometer(AbstractSensor):
-    """Reads a field that is known in the world: `scale · S exp(−mounting) Rᵀ b + bias`.
+    """Reads a known field of the world: `scale · S exp(−mounting) Rᵀ b + bias`.
 
-    **Arguments:** `noise` in the field's unit, one number or (3,), `None` to have it estimated;
-    `field` (3,) b, world frame, any unit; `bias` (the body's own magnetism), `scale`, `mounting`,
+    **Arguments:** `noise` in the field's unit, one number or (3,), `None` to estimate it; `field`
+    (3,) b, world frame, any unit; `bias` (the body's own magnetism), `scale`, `mounting`,
     `skew`, `limit`, `offset`, `lowpass` as for `Gyro`. For a direction without a strength use
     `Direction`.
 

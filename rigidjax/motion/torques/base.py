@@ -1,4 +1,4 @@
-"""What a torque or a force is, and how a field asks it for its value."""
+"""The base classes of torques and forces, and their evaluation in a vector field."""
 
 import abc
 import dataclasses
@@ -27,7 +27,7 @@ from rigidjax.motion.torques.states import Frozen, require_frozen
 
 
 class Wrench(eqx.Module):
-    """A force on the centre of mass and a torque about it: what a force law returns.
+    """A force on the centre of mass and a torque about it: the value of a force model.
 
     **Arguments:** `force` (3,) N, **world** frame; `torque` (3,) N m, **body** frame, about the
     centre of mass; none by default.
@@ -51,11 +51,12 @@ class Wrench(eqx.Module):
 
 
 class AbstractTorque(eqx.Module):
-    """A torque on a body: called with the time, the state and the body, gives N m in body axes.
+    """A torque on a body: a function of time, state and body, in N m, body axes.
 
-    Subclass it for your own, or give any callable Module. `feels` is the lowest state that has what
-    you read from the state: `HasSpin` (`.omega`), `HasAttitude` (also `.q`) or `HasPose` (also
-    `.x`, `.v`). `body` is what `simulate` was given: an `Inertia`, or `MassProperties` for `Rigid`.
+    Subclass it for your own, or give any callable Module. `feels` is the smallest state with the
+    parts that you read: `HasSpin` (`.omega`), `HasAttitude` (also `.q`) or `HasPose` (also
+    `.x`, `.v`). `body` is the argument of `simulate`: an `Inertia`, or `MassProperties` for
+    `Rigid`.
 
     A law that feels a `rigidjax.motion.HasPose` may return a `Wrench`, a force as well as a torque.
 
@@ -67,12 +68,12 @@ class AbstractTorque(eqx.Module):
     nothing outside turns the body: what the law holds inside; a property `jump_times` (n,), s,
     where it jumps or has a kink.
 
-    **States of its own** (a motor's speed, a wheel, a bias that drifts): a law that has `state0`,
-    an array or a tree of arrays, or a method `(t, state, body)` that gives it, and a method
-    `rate(t, own, state, body)`, their derivative, is called as `(t, state, body, own)`. Loops
-    integrate them with the body's state: `simulate` (`sol.own`), `batch.rollout`, `batch.simulate`,
-    `identify.fit` and `identify.fit_windows`. A function of time inside a law may have some, too
-    (`Lagged`), and is called as `(t, own)`. No base class is needed:
+    **States of its own** (a motor's speed, a wheel, a bias that drifts): give the torque `state0`,
+    an array or a tree of arrays, or a method `(t, state, body)` that returns it, and a method
+    `rate(t, own, state, body)`, their derivative. It is then called as `(t, state, body, own)`.
+    Loops integrate them with the body's state: `simulate` (`sol.own`), `batch.rollout`,
+    `batch.simulate`, `identify.fit` and `identify.fit_windows`. A function of time inside a torque
+    may have some, too (`Lagged`), and is called as `(t, own)`. No base class is needed:
 
     >>> import equinox as eqx, jax.numpy as jnp, rigidjax as rj
     >>> class Fading(eqx.Module):
@@ -117,7 +118,7 @@ class AbstractForce(eqx.Module):
 
 
 class OfTime(AbstractTorque):
-    """A torque of vectors, one of which may be a function of time."""
+    """A torque with vectors as fields; one of them may be a function of time."""
 
     @property
     def steady(self) -> bool:
@@ -133,14 +134,14 @@ class OfTime(AbstractTorque):
 # A user's own callable Module need not subclass anything.
 Torque = AbstractTorque | AbstractForce | Callable[[Any, Any, Any], Any]
 
-# From the lowest: the states that a torque may act on.
+# The states that a torque may act on, the smallest first.
 LADDER = (HasSpin, HasAttitude, HasPose)
 # A hint for gravity.
 WORLD = "a vector in world axes, such as [0, 0, -9.81]"
 
 
 def require_law(torque: object, name: str = "torque") -> None:
-    """Raise `TypeError` unless `torque` is something that can be called for its value."""
+    """Raise `TypeError` unless `torque` can be called for its value."""
     if isinstance(torque, type):
         raise TypeError(
             f"{name}: got the class {torque.__name__}, wanted one made from it: "
@@ -156,24 +157,24 @@ def require_law(torque: object, name: str = "torque") -> None:
             f"{name}: wanted a torque or force of rigidjax.torques, or a callable (t, state, "
             f"body), got {type(torque).__name__}{advice}"
         )
-    if not isinstance(torque, eqx.Module):  # A law with states takes these, too.
+    if not isinstance(torque, eqx.Module):  # A torque with states takes these, too.
         _checks.function(torque, name, "(t, state, body) → torque (3,), N m, body frame")
 
 
 def sees_attitude(torque: Torque | None) -> bool:
-    """Whether a law may look at the attitude: it says so by `feels`, or has none."""
+    """Whether a torque may read the attitude, by `feels`; true without it."""
     if hasattr(torque, "parts"):
         return any(sees_attitude(part) for part in torque.parts)  # pyright: ignore
     return torque is not None and getattr(torque, "feels", None) is not HasSpin
 
 
 def sees_rate(torque: Torque | None) -> bool:
-    """Whether a law may look at the body rate: it has not said that it is `rate_free`."""
+    """Whether a torque may read the body rate: it is not declared `rate_free`."""
     return torque is not None and not getattr(torque, "rate_free", False)
 
 
 def require_rung(torque: Torque, state: object) -> None:
-    """Raise `TypeError` unless `torque` is a law and `state` has what it feels."""
+    """Raise `TypeError` unless `torque` can be called and `state` has the parts that it reads."""
     require_law(torque)
     feels = getattr(torque, "feels", None)
     if feels is not None and not isinstance(state, feels):
@@ -184,7 +185,7 @@ def require_rung(torque: Torque, state: object) -> None:
 
 
 def require_scene(law: Torque | None, state: object, body: object) -> None:
-    """Raise in words unless these are a body, a state, and one law that can be called, or none."""
+    """Raise in words unless these are a body, a state, and one torque or none."""
     _checks.single(state, HasSpin, "state", wanted="a Spin, an Attitude or a Rigid")
     if law is not None:
         require_rung(law, state)
@@ -196,7 +197,7 @@ def require_scene(law: Torque | None, state: object, body: object) -> None:
 def evaluate(torque: Torque, t: ScalarLike, state: HasSpin, body: Inertia | MassProperties) -> Vec3:
     """The torque's value (3,), N m, body frame, its shape checked.
 
-    **Arguments:** `torque` any law; `t` s; `state`; `body`. The law is taken in the precision of
+    **Arguments:** `torque`; `t` s; `state`; `body`. The torque is computed in the precision of
     `state.omega`. **Raises:** `TypeError` for a force, which acts on `Rigid` only; `ValueError` for
     a wrong shape.
     """
@@ -229,19 +230,19 @@ def act(
             raise
         hint = "; a subclass of AbstractTorque says what it looks at by feels"
         raise TypeError(told + hint) from wrong
-    # Not by class: laws of the moving frames give one too, and know nothing of this floor.
+    # Not by class: torques of moving frames give one, too, and do not import this module.
     if hasattr(found, "force"):
         return found.force.astype(dtype), found.torque.astype(dtype)
     value = _checks.floating(found, (3,), f"torque {type(law).__name__}", hint="body-frame N m")
     return None, value.astype(dtype)
 
 
-# What a state of the next rung has, and which that is.
+# The parts of the next larger state, and its name.
 _HIGHER = {"q": "Attitude(q, omega)", "x": "Rigid(x, v, q, omega)", "v": "Rigid(x, v, q, omega)"}
 
 
 def lacking(who: str, wrong: AttributeError) -> str | None:
-    """What to say of a user's function that looks at what its state does not have, if that is it.
+    """The message if a user's function reads a part that its state does not have.
 
     >>> import rigidjax as rj
     >>> try:
@@ -260,9 +261,10 @@ def lacking(who: str, wrong: AttributeError) -> str | None:
 
 
 def one_law(law: Any) -> None:
-    """Raise `ValueError` where an array of one of our laws has not the shape that its field says.
+    """Raise `ValueError` if an array of one of our torques has another shape than its field
+    declares.
 
-    Its constructor saw to that; `jax.vmap` and `jax.tree.map` make laws of many bodies.
+    Its constructor checked that; `jax.vmap` and `jax.tree.map` make torques of many bodies.
     """
     if not type(law).__module__.startswith(__package__ or ""):
         return
@@ -298,7 +300,7 @@ def stays(source: Any) -> Vec3 | None:
 
 
 def vector(name: str, *, hint: str = "") -> Callable[[Vector], Array]:
-    """What makes a field of three numbers, for `equinox.field(converter=…)`."""
+    """A converter to a field of three numbers, for `equinox.field(converter=…)`."""
 
     def converted(value: Vector) -> Array:
         return _checks.given(value, (3,), name, hint=hint)
@@ -307,7 +309,7 @@ def vector(name: str, *, hint: str = "") -> Callable[[Vector], Array]:
 
 
 def number(name: str) -> Callable[[ScalarLike], Array]:
-    """What makes a field of one number."""
+    """A converter to a field of one number."""
 
     def converted(value: ScalarLike) -> Array:
         return _checks.given(value, (), name)
@@ -323,9 +325,9 @@ def constant_or_callable(source: Any, name: str, size: int = 3) -> Any:
 
 
 def jumps_of(source: object) -> Float[Array, " n"]:
-    """The times at which a law or a function of time jumps, s; empty if it has none.
+    """The times at which a torque or a function of time jumps, s; empty if it has none.
 
-    **Arguments:** `source` a law, or a function of time, with or without `jump_times`.
+    **Arguments:** `source` a torque, or a function of time, with or without `jump_times`.
 
     >>> from rigidjax import torques
     >>> jumps_of(torques.Pulses([1.0, 2.0], [[0.0, 0.0, 1.0]]))
@@ -336,7 +338,7 @@ def jumps_of(source: object) -> Float[Array, " n"]:
 
 
 def jumps_in(*sources: object) -> Float[Array, " n"]:
-    """The times at which any of several laws or functions of time jumps, s, in order."""
+    """The times at which any of several torques or functions of time jumps, s, in order."""
     times = [found for source in sources if (found := jumps_of(source)).shape[0]]
     if len(times) < 2:
         return times[0] if times else jnp.zeros(0)
@@ -345,7 +347,7 @@ def jumps_in(*sources: object) -> Float[Array, " n"]:
 
 
 def unit_rows(value: Any, name: str, count: int) -> Float[Array, "n 3"]:
-    """Directions (count, 3), unit where they are known."""
+    """Directions (count, 3), checked to be unit if they are known."""
     rows = _checks.given(value, (count, 3), name)
     if _checks.known(rows):
         lengths = np.linalg.norm(np.asarray(rows, float), axis=1)
@@ -355,7 +357,7 @@ def unit_rows(value: Any, name: str, count: int) -> Float[Array, "n 3"]:
 
 
 def count_of(value: Any, name: str, one: str) -> int:
-    """How many rows (x, y, z) there are, one for each of what `one` says: at least one."""
+    """The number of rows (x, y, z), one for each `one`: at least one."""
     shape = _checks.numbers(value, name).shape
     if len(shape) != 2 or shape[1] != 3 or not shape[0]:
         raise ValueError(f"{name}: wanted (R, 3), one row a {one}, got shape {shape}")
@@ -368,7 +370,7 @@ def each(value: Any, count: int, name: str) -> Array:
 
 
 def length_or_zero(v: Vec3Like) -> Scalar:
-    """|v|, whose derivative at v = 0 is taken as 0: for |v| v, which has one and it is 0."""
+    """|v|, with the derivative at v = 0 set to 0: for |v| v, whose derivative there is 0."""
     v = _checks.floating(v, (3,), "v")
     square = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
     return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)

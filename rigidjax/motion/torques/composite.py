@@ -1,4 +1,4 @@
-"""Several torques at once, and those on a body whose inertia changes in time."""
+"""Several torques at once, and torques on a body whose inertia changes in time."""
 
 from collections.abc import Callable
 from typing import Any
@@ -17,7 +17,7 @@ from rigidjax.rotation.linalg3 import cross
 
 
 class Sum(eqx.Module):
-    """Several torques and forces at once; it needs the highest state that a part needs.
+    """Several torques and forces at once; it needs the largest state of its parts.
 
     **Arguments:** `*parts` torques, forces, your own callables.
 
@@ -44,7 +44,7 @@ class Sum(eqx.Module):
 
     @property
     def feels(self) -> type:
-        """The highest state that a part needs."""
+        """The largest state that a part needs."""
         rungs = [getattr(part, "feels", base.LADDER[0]) for part in self.parts]
         return max(
             rungs, key=lambda r: base.LADDER.index(r) if r in base.LADDER else len(base.LADDER)
@@ -52,7 +52,7 @@ class Sum(eqx.Module):
 
     @property
     def rate_free(self) -> bool:
-        """Whether no part looks at the body rate."""
+        """Whether no part depends on the body rate."""
         return all(not base.sees_rate(part) for part in self.parts)
 
     @property
@@ -72,23 +72,23 @@ class Sum(eqx.Module):
 
 
 class ChangingInertia(eqx.Module):
-    """What a changing inertia does to a body: `I(t) dΩ/dt = I(t)Ω × Ω − İΩ + τ`.
+    """The effect of a changing inertia on a body: `I(t) dΩ/dt = I(t)Ω × Ω − İΩ + τ`.
 
     **Arguments:** `inertia` a function of time, t → (3, 3), kg m², body frame, about the point that
     the body turns about (the centre of mass of a `Rigid`), whose derivative is taken: such as
-    `Linear(times, tensors)`; `torque` all else that acts, or `None`: it stands inside, not beside
-    in a `Sum`, because its τ turns I(t), and it is given the body as it is at t.
+    `Linear(times, tensors)`; `torque` all other torques, or `None`: give them here, not beside it
+    in a `Sum`, because their τ acts on I(t), and they get the body at time t.
 
-    The body that `simulate` is given only sets the state's units: its inertia is replaced. What is
-    moved about inside is symmetric enough to have no momentum of its own in the body frame (Σ m r ×
-    ṙ = 0), as booms that go out in a straight line from the centre have none; else add it as the
-    momentum of a `Flywheel` to `torque`. Fuel that is thrown out takes its share of İΩ along: then
-    add İΩ to `torque`.
+    The body given to `simulate` only sets the state's units: its inertia is replaced. Parts that
+    move inside must have no momentum in the body frame (Σ m r × ṙ = 0), such as booms that extend
+    in a straight line from the centre; else add their momentum as a `Flywheel` to `torque`. Ejected
+    fuel carries its share of İΩ away: then add İΩ to `torque`.
 
-    Source: Hughes 1986, Spacecraft Attitude Dynamics, ch. 3; without τ the momentum `R I(t) Ω` is
-    kept.
+    Source: Hughes 1986, Spacecraft Attitude Dynamics, ch. 3; the momentum `R I(t) Ω` is conserved
+    without τ.
 
-    **Raises:** `TypeError` for what cannot be called; `ValueError` for a value that is not (3, 3).
+    **Raises:** `TypeError` for anything but a function; `ValueError` for a value that is not (3,
+    3).
 
     >>> import rigidjax as rj
     >>> grows = ChangingInertia(lambda t: (1.0 + t) * jnp.eye(3))
@@ -108,7 +108,7 @@ class ChangingInertia(eqx.Module):
 
     @property
     def feels(self) -> type:
-        """The lowest state that the torque inside acts on."""
+        """The smallest state that the torque inside acts on."""
         return getattr(self.torque, "feels", HasSpin)
 
     @property

@@ -1,4 +1,4 @@
-"""Torques that stay the same, in the body or in space, and torques against the spin."""
+"""Constant torques, in the body or in space, and torques against the body rate."""
 
 from typing import ClassVar
 
@@ -11,7 +11,7 @@ from rigidjax.rotation import quaternion
 
 
 class ConstantTorque(base.AbstractTorque):
-    """A torque that stays the same in the body, such as a thruster: `τ = const`.
+    """A constant torque in the body frame, such as a thruster's: `τ = const`.
 
     **Arguments:** `torque` (3,) N m, body frame. About a principal axis it spins the body up
     linearly (Euler 1758); for one in space see `InSpace`.
@@ -33,12 +33,12 @@ class ConstantTorque(base.AbstractTorque):
 
 
 class InSpace(base.OfTime):
-    """A torque whose direction is given in space: `τ = Rᵀ τ_w`.
+    """A torque given in the world frame: `τ = Rᵀ τ_w`.
 
     **Arguments:** `torque` τ_w, N m, world frame: (3,), or a callable Module of time, t → (3,),
     such as `Linear(times, values)`.
 
-    A constant τ_w keeps the angular momentum across it, and adds τ_w t along it.
+    A constant τ_w conserves the angular momentum across it, and adds τ_w t along it.
 
     **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
 
@@ -60,7 +60,7 @@ class InSpace(base.OfTime):
 
 
 class _Against(base.AbstractTorque):
-    """A torque against the spin, with a coefficient for each body axis."""
+    """A torque against the body rate, with a coefficient for each body axis."""
 
     feels: ClassVar[type] = HasSpin
     steady: ClassVar[bool] = True
@@ -93,7 +93,7 @@ class QuadraticDamping(_Against):
     principal axis then slows as Ω0/(1 + c Ω0 t/I): drag at a large Reynolds number (Newton,
     Principia, Book II, Section II).
 
-    At Ω = 0 the first derivative is right, and zero; a second does not exist there.
+    The first derivative at Ω = 0 is zero; a second does not exist there.
 
     **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
 

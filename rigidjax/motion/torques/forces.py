@@ -16,7 +16,7 @@ from rigidjax.rotation.linalg3 import apply, cross, dot
 
 
 class UniformGravity(base.AbstractForce):
-    """The same acceleration everywhere: `F = m g`, no torque about the centre, `U = −m g·x`.
+    """Uniform acceleration: `F = m g`, no torque about the centre, `U = −m g·x`.
 
     **Arguments:** `gravity` (3,) g, m/s², world frame, such as [0, 0, −9.81].
 
@@ -40,7 +40,7 @@ class UniformGravity(base.AbstractForce):
         return -body.mass * dot(self.gravity, state.x)
 
     def internal_momentum(self, t: ScalarLike) -> Vec3:
-        """Zero, N m s: it does not turn the body, and nothing turns inside."""
+        """Zero, N m s: no torque on the body, and no momentum inside."""
         return jnp.zeros_like(self.gravity)
 
     def __call__(self, t: ScalarLike, state: HasPose, body: MassProperties) -> base.Wrench:
@@ -51,7 +51,7 @@ class CentralGravity(base.AbstractForce):
     """A centre of attraction at the world's origin, on a body of some size.
 
     `U = −μ m/r − (μ/2r³)(Tr I − 3 r̂·I_w r̂)` (MacCullagh's formula), with its force and its torque,
-    so that the energy and the momentum about the origin are kept. `I_w = R I Rᵀ`.
+    so that the energy and the momentum about the origin are conserved. `I_w = R I Rᵀ`.
 
     **Arguments:** `mu` μ = G M, m³/s². Source: Hughes, Spacecraft Attitude Dynamics, §8.1.
 
@@ -94,10 +94,11 @@ class Drag(base.AbstractForce):
 
     **Arguments:** `coefficient` k = ½ ρ C_d A, kg/m; `centre` (3,) the point where it acts, m, body
     frame, from the centre of mass (there `τ = c × RᵀF`); `wind` (3,) the fluid's velocity, m/s,
-    world frame. The body's own turning is not counted in u: that is `Damping`, `QuadraticDamping`.
+    world frame. u does not contain the body's own rotation: for that take `Damping`,
+    `QuadraticDamping`.
 
-    Source: Newton, Principia, Book II, Section II. At u = 0 the first derivative is right, and
-    zero; a second does not exist there.
+    Source: Newton, Principia, Book II, Section II. The first derivative at u = 0 is zero; a second
+    does not exist there.
 
     **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
 

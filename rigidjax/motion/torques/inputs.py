@@ -1,4 +1,4 @@
-"""What drives a law: quantities by name, of a loop or functions of time; what delays, what lags."""
+"""Inputs of a torque: quantities by name, from a loop or functions of time; delays and lags."""
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple, TypeVar
@@ -17,10 +17,10 @@ Law = TypeVar("Law")
 
 
 class Input(eqx.Module):
-    """A quantity that the loop gives, by name: the place in a law for `rollout(…, inputs=…)`.
+    """A named input of a torque, which the loop sets: see `rollout(…, inputs=…)`.
 
-    **Arguments:** `name` the key among the inputs. A law calls it with the time; it has a value
-    once the law is `bind`-ed.
+    **Arguments:** `name` the key among the inputs. A torque calls it with the time; it has a value
+    after `bind`.
 
     >>> law = bind(Input("speed"), {"speed": jnp.array([3.0])})
     >>> law(0.0)
@@ -48,20 +48,19 @@ class _Now(eqx.Module):
 
 
 class Delayed(eqx.Module):
-    """A function of time that comes later: `t → source(t − delay)`.
+    """A delayed function of time: `t → source(t − delay)`.
 
     **Arguments:** `source` a function of time such as `Held(times, values)`, or `Input("u")`;
-    `delay` s, one number, which may be free in a fit; negative for what comes earlier.
+    `delay` s, one number, which may be free in a fit; negative for an earlier time.
 
     Its `jump_times` move with the delay, and so does a run of `simulate`: the derivative by the
-    delay is right although the source jumps. In `rigidjax.batch.rollout` and
-    `identify.fit_windows`, whose samples are held through a step, a delayed input changes inside
-    a step: that step is then taken in two, up to the change and from it on, which is exact, too.
-    Before the first sample the first one holds, after the last the last. (`Linear` and `Series`
-    are smooth enough to be delayed anywhere.)
+    delay is correct although the source jumps. `rigidjax.batch.rollout` and `identify.fit_windows`
+    hold samples through a step, and a delayed input changes inside a step: that step is then split
+    in two at the change, which is exact, too. The first sample holds before it, the last one after
+    it. (`Linear` and `Series` are smooth enough to be delayed anywhere.)
 
-    **Raises:** `TypeError` for a source that cannot be called, or that has states: delay what goes
-    into it, `Lagged(Delayed(u, d), T)`; `ValueError` for a delay that is not finite, or is as
+    **Raises:** `TypeError` for a source that cannot be called, or that has states: delay its input,
+    `Lagged(Delayed(u, d), T)`; `ValueError` for a delay that is not finite, or is as
     long as the record.
 
     >>> from rigidjax import torques
@@ -76,8 +75,8 @@ class Delayed(eqx.Module):
         source = _checks.function(source, "source", "of time")
         if has_states(source):
             raise TypeError(
-                f"Delayed: {type(source).__name__} has states, whose past is not kept; delay what "
-                "goes into it: Lagged(Delayed(source, delay), time)"
+                f"Delayed: {type(source).__name__} has states, whose past is not kept; delay its "
+                "input: Lagged(Delayed(source, delay), time)"
             )
         self.delay = _checks.given(delay, (), "delay").astype(jnp.result_type(float))
         if isinstance(source, Delayed):
@@ -99,7 +98,7 @@ class Delayed(eqx.Module):
 
     @property
     def jump_times(self) -> Float[Array, " n"]:
-        """Times, s, where the value jumps: those of the source, later by the delay."""
+        """Times, s, where the value jumps: the source's times plus the delay."""
         times = jumps_of(self.source)
         return times + self.delay.astype(times.dtype)
 
@@ -110,8 +109,8 @@ class Delayed(eqx.Module):
 class Lagged(eqx.Module):
     """A lag of first order, such as a motor's: `T dy/dt = u(t) − y`, whose value is y.
 
-    A state of its own, integrated with the body's (see `AbstractTorque`); it stands where a
-    function of time may: `Rotors(…, speeds=Lagged(Input("speeds"), 0.05))`.
+    It has a state of its own, integrated with the body's (see `AbstractTorque`), and replaces a
+    function of time: `Rotors(…, speeds=Lagged(Input("speeds"), 0.05))`.
 
     **Arguments:** `source` u, a function of time such as `Held(times, values)`, or `Input("u")`;
     `time` T, s, > 0: one number, or one a channel; it may be free in a fit; `start` y at the start;
@@ -171,9 +170,9 @@ def _channels(value: Any, name: str) -> Array:
 
 
 class Row(NamedTuple):
-    """What the inputs are through a step, or a part of one.
+    """The inputs in a step, or in a part of one.
 
-    **Fields:** `values` by name; `delayed` of each `Delayed` input, as they stand in the law.
+    **Fields:** `values` by name; `delayed` of each `Delayed` input, in their order in the torque.
     """
 
     values: Mapping[str, Any]
@@ -181,13 +180,12 @@ class Row(NamedTuple):
 
 
 def bind(law: Law, inputs: Mapping[str, Any] | Row | None) -> Law:
-    """The law with values in the place of its `Input`s.
+    """The torque with values in the place of its `Input`s.
 
-    **Arguments:** `law` a torque, a force, or anything that holds them; `inputs` by name an array,
-    which stays as it is, or a function of time such as `Held(times, values)`; `None` leaves the law
-    as it is.
+    **Arguments:** `law` a torque, a force, or a tree of them; `inputs` by name an array, which is
+    constant, or a function of time such as `Held(times, values)`; `None` changes nothing.
 
-    **Raises:** `ValueError` for an input that is not among them.
+    **Raises:** `ValueError` for an input of the torque without a value.
 
     >>> bind(Input("u"), {"u": rj.torques.Held([0.0, 1.0], [2.0, 4.0])})(1.0)
     Array(4., dtype=float64)
@@ -223,22 +221,22 @@ def _is_delayed(node: Any) -> bool:
 
 
 def delays_of(law: Any) -> list[tuple[str, Array]]:
-    """The name and the delay of each delayed input, as they stand in the law."""
+    """The name and the delay of each delayed input, in their order in the torque."""
     nodes = jax.tree.leaves(law, is_leaf=_is_delayed)
     return [(node.source.name, node.delay) for node in nodes if _is_delayed(node)]
 
 
 def inputs_of(law: Any) -> list[str]:
-    """The names of the inputs that a law reads."""
+    """The names of the inputs that a torque reads."""
     nodes = jax.tree.leaves(law, is_leaf=lambda node: isinstance(node, Input))
     return list(dict.fromkeys(node.name for node in nodes if isinstance(node, Input)))
 
 
 def require_inputs(law: Any, inputs: Any) -> Mapping[str, Any]:
-    """`inputs` (none: empty), if they are those that the law reads.
+    """`inputs` (none: empty), if they are the inputs that the torque reads.
 
-    **Raises:** `ValueError` for one that is missing, or that the law does not read; `TypeError` for
-    what is no mapping.
+    **Raises:** `ValueError` for a missing input, or one that the torque does not read; `TypeError`
+    for anything but a mapping.
     """
     read, found = inputs_of(law), {} if inputs is None else inputs
     if not isinstance(found, Mapping):

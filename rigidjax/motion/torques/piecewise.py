@@ -1,4 +1,4 @@
-"""Numbers in a table against time: straight lines between rows, or constant pieces."""
+"""Tables of numbers over time: straight lines between rows, or constant pieces."""
 
 from collections.abc import Sequence
 from typing import Any, ClassVar
@@ -36,8 +36,8 @@ class Linear(_Table):
 
     **Arguments:** `times` (n,) s, increasing; `values` (n, *k), any number of channels: (n, 3) for
     `InSpace`, `Flywheel`, `MagneticDipole`, `GravityGradient`, (n, R) for `Rotors`, (n, 3, 3) for
-    `ChangingInertia`. Both may be traced. At a row the derivative is that of the line after it.
-    For a cubic spline through evenly spaced rows, which has no kinks, see `Series`.
+    `ChangingInertia`. Both may be traced. The derivative at a row is the slope of the line after
+    it. For a cubic spline through evenly spaced rows, which has no kinks, see `Series`.
 
     **Raises:** `ValueError` for fewer than two rows, numbers of rows that differ, times that do not
     increase, NaN.
@@ -58,8 +58,8 @@ class Held(_Table):
     **Arguments:** `times` (n,) s, increasing; `values` (n, *k), row i from time i on, the first
     also before it. Both may be traced.
 
-    The value jumps at `times`: a law that reads it hands its `jump_times` on, and adaptive steps
-    end there. For equal steps give the samples to `rigidjax.batch.rollout` as `inputs`.
+    The value jumps at `times`: a torque that reads it passes its `jump_times` on, and adaptive
+    steps end there. For fixed steps give the samples to `rigidjax.batch.rollout` as `inputs`.
 
     **Raises:** `ValueError` for fewer than two rows, numbers of rows that differ, times that do not
     increase, NaN.
@@ -80,8 +80,8 @@ class Tabulated(AbstractTorque):
     **Arguments:** `times` (n,) s, increasing; `torques` (n, 3) N m, body frame. In space:
     `InSpace(Linear(times, torques))`. Constant pieces: `Pulses`.
 
-    A solver that steps over a kink loses its order, one that steps over a pulse never sees it:
-    `jump_times` are for its step controller, and `simulate` hands them over.
+    A solver that steps over a kink loses its order, and a step over a pulse misses it: `jump_times`
+    are for the step controller, and `simulate` passes them on.
 
     **Raises:** `ValueError` for fewer than two rows, numbers of rows that differ, times that do not
     increase, NaN.
@@ -116,8 +116,8 @@ class Pulses(AbstractTorque):
     **Arguments:** `edges` (n + 1,) s, increasing; `torques` (n, 3) N m, body frame: row i acts from
     edge i until edge i + 1. One pulse: `Pulses([1.0, 1.5], [[0.0, 0.0, 3.0]])`.
 
-    The value at a time does not show how it depends on the edges; a solver that ends its steps at
-    `jump_times` does. `impulse` is exact.
+    The value at a time has no derivative in the edges; a solver that ends its steps at `jump_times`
+    gives it. `impulse` is exact.
 
     **Raises:** `ValueError` unless there is one edge more than rows, for edges that do not
     increase, NaN.
@@ -153,7 +153,8 @@ class Pulses(AbstractTorque):
 
 def _row(times: Float[Array, " n"], t: Scalar) -> Any:
     """The last row whose time is not after t. At a jump this is the piece that begins."""
-    # Comparing all keeps a short table inside the solver's one kernel; a search is a loop.
+    # A comparison with all rows keeps a short table inside the solver's one kernel; a search is a
+    # loop.
     method = "compare_all" if times.shape[0] <= 128 else "scan"
     return jnp.searchsorted(times, t, side="right", method=method) - 1
 

@@ -1,4 +1,4 @@
-"""Torques of a potential: gravity on what only turns, a magnet in a field, any U(q)."""
+"""Torques with a potential: gravity on a body with a fixed point, a magnet in a field, any U(q)."""
 
 from collections.abc import Callable
 from typing import Any, ClassVar
@@ -25,7 +25,7 @@ class HeavyTop(base.AbstractTorque):
     one **about the fixed point** (`MassProperties.inertia_about`, `Inertia.shifted`). Any top:
     Lagrange's, Kovalevskaya's, Goryachev–Chaplygin's, a general one, and the physical pendulum.
 
-    Keeps the energy and the momentum along g. Source: Landau and Lifshitz, Mechanics, §35;
+    It conserves the energy and the momentum along g. Source: Landau and Lifshitz, Mechanics, §35;
     Arnold, Mathematical Methods of Classical Mechanics, §30.
 
     **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype; `TypeError` on a `Rigid`,
@@ -70,8 +70,8 @@ class GravityGradient(base.OfTime):
     the central body to the body or back (the sign does not matter): constant, or a callable Module
     of time, t → (3,), for an orbit.
 
-    `U = (μ/2r³)(3 r̂'·I r̂' − Tr I)`, the second term of MacCullagh's formula; the orbit itself is
-    not changed by it. Source: Hughes, Spacecraft Attitude Dynamics, §8.1; Goldstein, Poole and
+    `U = (μ/2r³)(3 r̂'·I r̂' − Tr I)`, the second term of MacCullagh's formula; it does not change
+    the orbit itself. Source: Hughes, Spacecraft Attitude Dynamics, §8.1; Goldstein, Poole and
     Safko, Classical Mechanics, eq 5.86.
 
     **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype; `ValueError` for no distance.
@@ -99,7 +99,7 @@ class GravityGradient(base.OfTime):
 
     @property
     def axis(self) -> Vec3 | None:
-        """The direction without torque about it, world frame, if it stays: the position's."""
+        """The direction without torque about it, world frame, if it is constant: the position's."""
         return base.stays(self.position)
 
     def energy(self, t: ScalarLike, state: HasAttitude, body: Inertia | MassProperties) -> Scalar:
@@ -151,7 +151,7 @@ class MagneticDipole(base.OfTime):
 
     @property
     def axis(self) -> Vec3 | None:
-        """The direction about which there is no torque, world frame, if it stays: the field's."""
+        """The direction without torque about it, world frame, if it is constant: the field's."""
         return base.stays(self.field)
 
     def energy(self, t: ScalarLike, state: HasAttitude, body: object) -> Scalar:
@@ -173,7 +173,7 @@ class FromPotential(base.AbstractTorque):
     `τ_i = −∂U/∂q · ½ q ⊗ e_i`, the derivative along a turn about body axis i. Source: Landau and
     Lifshitz, Mechanics, §34.
 
-    **Raises:** `TypeError` for what cannot be called, `ValueError` for a U that is not a number.
+    **Raises:** `TypeError` for anything but a function, `ValueError` for a U that is not a number.
 
     >>> class Spring(eqx.Module):
     ...     k: Array

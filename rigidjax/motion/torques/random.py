@@ -16,8 +16,8 @@ class RandomTorque(AbstractTorque):
     **Arguments:** `density` N² m² s, one number or one for each body axis (3,), ≥ 0: about an axis
     of moment I the angular momentum then changes by about √(density · t) in a time t.
 
-    Its mean is zero, and that is what `simulate` and a fit of `rigidjax.identify` see. What makes
-    use of the noise is `rigidjax.estimate`: `sample` draws a motion, `filter`, `smooth` and
+    Its mean is zero, and `simulate` and a fit of `rigidjax.identify` use the mean.
+    `rigidjax.estimate` uses the noise: `sample` draws a motion, `filter`, `smooth` and
     `log_likelihood` allow for it. Add it to other torques by `Sum`. Gelb, Applied Optimal
     Estimation (1974), §3.6.
 
@@ -42,11 +42,11 @@ class CorrelatedTorque(AbstractTorque):
     """Correlated torque noise (Ornstein–Uhlenbeck): `T dτ/dt = −τ + white noise`.
 
     **Arguments:** `density` N² m² s of the white noise that drives it, one number or (3,), ≥ 0;
-    `time` T, s, positive: over which the torque keeps its value. `E[τ(t) τ(s)] = density/(2T)
+    `time` T, s, positive: the correlation time. `E[τ(t) τ(s)] = density/(2T)
     exp(−|t − s|/T)` about each body axis: for T → 0 a `RandomTorque` of the same density.
 
-    Its mean is zero, and that is what `simulate` and a fit see; see `RandomTorque`. A filter holds
-    the torque itself as part of its state. Uhlenbeck and Ornstein 1930, doi:10.1103/PhysRev.36.823.
+    Its mean is zero, and `simulate` and a fit use the mean; see `RandomTorque`. A filter has the
+    torque itself as part of its state. Uhlenbeck and Ornstein 1930, doi:10.1103/PhysRev.36.823.
 
     **Raises:** `ValueError` for a density below zero, a time that is not positive, NaN or a wrong
     shape.
@@ -75,7 +75,7 @@ class CorrelatedTorque(AbstractTorque):
 
 
 def density_of(value: Any, name: str = "density", size: int = 3) -> Array:
-    """A spectral density (size,) of one number or as many, none below zero."""
+    """A spectral density (size,) from one number or `size` numbers, none below zero."""
     density = _checks.numbers(value, name)
     if density.shape not in ((), (size,)):
         raise ValueError(f"{name}: wanted one number or {size}, got shape {density.shape}")

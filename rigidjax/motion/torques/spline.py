@@ -18,7 +18,7 @@ Samples = Float[ArrayLike, "n *channels"] | Sequence[Any]
 
 
 class Series(eqx.Module):
-    """A cubic spline through evenly spaced samples; beyond the ends, the last value.
+    """A cubic spline through evenly spaced samples; constant beyond the ends.
 
     The interval of a time is found by division, not by search, so that it costs little in a solver;
     its derivative is continuous, so that a step may pass over a sample.
@@ -29,8 +29,8 @@ class Series(eqx.Module):
     The slopes at the samples are those of the spline whose third derivative does not jump at the
     second and the last but one ("not a knot": de Boor, A Practical Guide to Splines, ch. IV).
 
-    **Raises:** `ValueError` (`equinox` error under `jit`) for fewer than four samples, numbers that
-    differ, NaN, uneven times; `TypeError` for what is no number.
+    **Raises:** `ValueError` (`equinox` error under `jit`) for fewer than four samples, lengths that
+    differ, NaN, uneven times; `TypeError` for anything but numbers.
 
     >>> Series([0.0, 1.0, 2.0, 3.0], [0.0, 1.0, 4.0, 9.0])(1.5)
     Array(2.25, dtype=float64)
@@ -70,7 +70,7 @@ class Series(eqx.Module):
         i = jnp.clip(jnp.floor(place).astype(jnp.int32), 0, n - 2)
         s = place - i.astype(place.dtype)
         rows = self.values[i], self.values[i + 1], self.slopes[i], self.slopes[i + 1]
-        # XLA:CPU would read the table again for every number that comes of it.
+        # XLA:CPU would read the table again for every number computed from it.
         s, (left, right, out, into) = barrier((s, rows))
         # Cubic Hermite form, from the left value.
         bend = 3.0 * (right - left) - 2.0 * out - into
@@ -79,7 +79,7 @@ class Series(eqx.Module):
 
 
 def _numbers(value: Any, name: str) -> Any:
-    """NumPy's float64 where the numbers are known: times of a log have more than seven digits."""
+    """NumPy's float64 if the numbers are known: times of a log have more than seven digits."""
     if _checks.known(value):
         return _checks.on_host(value, f"Series: {name}")
     return _checks.numbers(value, f"Series: {name}").astype(jnp.result_type(float))
@@ -103,13 +103,13 @@ def _slopes(values: Float[Array, "n *channels"]) -> Float[Array, "n *channels"]:
 class Wheel(eqx.Module):
     """The momentum of a wheel about a fixed axis whose speed was logged: `h = J s(t) a`.
 
-    Give it to `Flywheel`: a known momentum inside is what shows the absolute inertia of a body.
+    Give it to `Flywheel`: a known internal momentum shows the absolute inertia of a body.
 
     **Arguments:** `inertia` J, kg m², about the axis; `axis` (3,) a, body frame, unit; `speed`
     rad/s relative to the body, a callable Module of time such as `Series(times, speeds)`; `delay`
-    s: the log shows at t what was at t − delay; `None` for none; `tilt` (2,) tangents (rad, where
-    small) of how far the axis is tilted towards two directions across it (about x, y and z: the
-    next two axes in turn, y and z, z and x, x and y); `None` for none.
+    s: the log's value at t belongs to t − delay; `None` for none; `tilt` (2,) tangents (rad, if
+    small) of the axis's tilt towards two directions across it (about x, y and z: the next two axes
+    in turn, y and z, z and x, x and y); `None` for none.
 
     **Raises:** `ValueError` for an axis that is not a unit vector.
 
@@ -153,7 +153,7 @@ class Wheel(eqx.Module):
         """The axis with its tilt, unit."""
         if self.tilt is None:
             return self.axis
-        # The axis that is nearest to ±x, ±y or ±z says which two are across it.
+        # The nearest of ±x, ±y and ±z determines the two directions across.
         next_one = jnp.roll(jnp.eye(3, dtype=self.axis.dtype), 1, axis=1)
         first = next_one[jnp.argmax(jnp.abs(self.axis))]
         first = first - dot(first, self.axis) * self.axis

@@ -1,8 +1,7 @@
-"""Laws and functions of time that have states of their own, integrated with the body's.
+"""Torques and functions of time with states of their own, integrated with the body's.
 
-Such a law has `state0`, its states at the start, and `rate`, their derivative; it is called with
-its states last. Everything else of the library sees it as a plain law once they are put in:
-`freeze`.
+Such a torque has `state0`, its initial states, and `rate`, their derivative; it is called with its
+states last. `freeze` puts the states in, and makes it a plain torque for the rest of the library.
 """
 
 from collections.abc import Callable
@@ -16,14 +15,15 @@ from rigidjax import _checks
 from rigidjax._types import ScalarLike
 
 Tree = TypeVar("Tree")
-# What a law says of itself that depends on its states.
+# The members of a torque that depend on its states.
 _OF_STATES = ("energy", "internal_momentum")
 
 
 class Frozen(eqx.Module):
-    """A law with its states put in: a plain law, or a plain function of time. `freeze` makes it.
+    """A torque or function of time with its states put in, without states itself. `freeze` makes
+    it.
 
-    **Arguments:** `law`; `own` its states, in a tuple of one.
+    **Arguments:** `law` the torque; `own` its states, in a tuple of one.
     """
 
     law: Any
@@ -33,7 +33,7 @@ class Frozen(eqx.Module):
         return self.law(*args, self.own[0])
 
     def __getattr__(self, name: str) -> Any:
-        # What the law says of itself (`feels`, `jump_times`, …), but that it has states.
+        # The torque's members (`feels`, `jump_times`, …), except those of its states.
         if name.startswith("_") or name in ("law", "own", "state0", "rate"):
             raise AttributeError(name)
         found = getattr(self.law, name)
@@ -41,17 +41,17 @@ class Frozen(eqx.Module):
 
 
 def has_own(node: object) -> bool:
-    """Whether this law, or function of time, itself has states: `state0` and `rate`."""
+    """Whether this torque, or function of time, itself has states: `state0` and `rate`."""
     return not isinstance(node, type) and hasattr(node, "state0") and hasattr(node, "rate")
 
 
 def has_states(law: Any) -> bool:
-    """Whether a law, or anything inside it, has states of its own."""
+    """Whether a torque, or any part of it, has states of its own."""
     return any(map(has_own, jax.tree.leaves(law, is_leaf=_stop)))
 
 
 def require_stateless(law: Any, what: str) -> None:
-    """Raise `ValueError` for a law with states of its own where they are not followed."""
+    """Raise `ValueError` for a torque with states that `what` does not integrate."""
     if has_states(law):
         raise ValueError(
             f"{what}: wanted a torque without states of its own, got one that has some (such as "
@@ -61,13 +61,12 @@ def require_stateless(law: Any, what: str) -> None:
 
 
 def freeze(law: Tree, own: tuple[Any, ...]) -> Tree:
-    """The law with its states put in, so that it can be called as any other.
+    """The torque with its states put in, so that it can be called without them.
 
-    **Arguments:** `law` a torque, a force, or anything that holds them; `own` a tuple of the states
-    of each that has some, in the order in which they stand in the law, what is inside another
-    first: a row of `Solution.own`.
+    **Arguments:** `law` a torque, a force, or a tree of them; `own` a tuple of the states of each
+    part with states, in their order in `law`, inner parts first: a row of `Solution.own`.
 
-    **Raises:** `ValueError` for another number of them.
+    **Raises:** `ValueError` for another number of states.
 
     >>> from rigidjax import torques
     >>> law = torques.ConstantTorque([0.0, 0.0, 1.0])
@@ -84,11 +83,11 @@ def freeze(law: Tree, own: tuple[Any, ...]) -> Tree:
 
 
 def first_states(law: Any, t: ScalarLike, state: Any, body: Any) -> tuple[Any, ...]:
-    """The states of a law at the start, in the precision of the body's state: see `freeze`.
+    """The initial states of a torque, in the precision of the body's state: see `freeze`.
 
     **Arguments:** `t` s; `state` of the body at the start; `body`.
 
-    **Raises:** `TypeError` for states that are no numbers.
+    **Raises:** `TypeError` for states that are not numbers.
     """
     found: list[Any] = []
 
@@ -109,7 +108,7 @@ def rates_of(
 ) -> tuple[Any, ...]:
     """The derivative of each state, as `own` (see `freeze`).
 
-    **Raises:** `ValueError` where a `rate` is not shaped as its `state0`.
+    **Raises:** `ValueError` if a `rate` has another shape than its `state0`.
     """
     queue, found = list(own), []
 
@@ -128,7 +127,7 @@ def rates_of(
 
 
 def require_frozen(law: Any) -> None:
-    """Raise `TypeError` for a law that was to be called without its states."""
+    """Raise `TypeError` for a torque that is called without its states."""
     if has_own(law):
         raise TypeError(
             f"{type(law).__name__} has states of its own (state0, rate): simulate, batch.rollout, "
@@ -138,7 +137,7 @@ def require_frozen(law: Any) -> None:
 
 
 def _visit(tree: Any, own_of: Callable[[Any], Any]) -> Any:
-    """The tree with all that has states frozen; `own_of(node)` gives them, what is inside first."""
+    """The tree with all states frozen; `own_of(node)` gives them, inner parts first."""
 
     def stop(node: Any) -> bool:
         return node is not tree and _stop(node)

@@ -17,22 +17,22 @@ from rigidjax.motion.torques.states import has_states
 from rigidjax.rotation.linalg3 import cross
 
 Numbers = Float[ArrayLike, "*wheels"] | Any
-# Where a wheel's top speed is near, what its motor can still give falls to nothing.
+# The motor's torque falls to zero near a wheel's top speed.
 _FADE = 0.05
 
 
 class Flywheel(base.OfTime):
-    """What wheels inside do to the body that carries them: `τ = h × Ω − dh/dt`.
+    """The torque of internal wheels on the body: `τ = h × Ω − dh/dt`.
 
     **Arguments:** `momentum` h, N m s, body frame: (3,) for wheels that run at constant speed, or a
     callable Module of time, t → (3,), for wheels that are spun up, such as `Linear(times, values)`.
     Several wheels: give the sum.
 
-    The body's `Inertia` goes with the meaning of h. With the wheels counted as if locked, h is
-    their momentum relative to the body. With the wheels' axial moments taken out (I − Σ J a aᵀ),
-    h is their whole axial momentum, and dh/dt is the torque of the motors.
+    The body's `Inertia` must fit the meaning of h. If it includes the wheels as locked, h is their
+    momentum relative to the body. If the wheels' axial moments are subtracted (I − Σ J a aᵀ), h is
+    their whole axial momentum, and dh/dt is the torque of the motors.
 
-    The momentum in space, `R (IΩ + h)`, is kept; the energy `½ Ω·IΩ` too while h is constant.
+    The momentum in space, `R (IΩ + h)`, is conserved; so is the energy `½ Ω·IΩ` if h is constant.
     Source: Zhukovsky 1885, Volterra 1898; Hughes, Spacecraft Attitude Dynamics, chs. 3, 6.
 
     **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
@@ -76,28 +76,28 @@ class ReactionWheels(base.AbstractTorque):
 
     - `axes` a (R, 3), body frame, unit; `inertia` J (R,) kg m² about them; `speeds` s (R,) rad/s
       relative to the body, at the start.
-    - `motor`: the torque of each motor on its wheel (R,), N m, positive where it adds to s:
+    - `motor`: the torque of each motor on its wheel (R,), N m, positive if it increases s:
       constant, a function of time such as `Held(times, values)`, `Input("motor")`, or `None`.
     - `feedback`: a function `(t, state, speeds) → (R,)`, N m, added to `motor`; or `None`.
     - `max_torque` N m, `max_speed` rad/s, each one number, (R,), or `None` for no limit: the
       motors' torque is limited to `max_torque`; a torque that would bring a wheel beyond
       `max_speed` decreases to zero over the last 5 % below it, as 6 x⁵ − 15 x⁴ + 10 x³, so that
-      derivatives of runs that meet it are right to their tolerance (along a straight line: to 1e-4
-      at `rtol=1e-9`).
+      derivatives of runs that reach it are accurate to their tolerance (along a straight line: to
+      1e-4 at `rtol=1e-9`).
     - `viscous` c, N m s/rad, and `coulomb` d, N m, of the bearings, each one number, (R,), or
       `None`: the friction `−c s − d tanh(s/s₀)`; `turn_over` s₀, rad/s, over which Coulomb friction
-      changes its sign, smooth so that it can be differentiated and met by long steps.
+      changes its sign, smoothly, for derivatives and long steps.
 
-    The states are the wheels' whole axial momenta `h = J (s + a·Ω)`, and u is what motor and
-    bearing put on a wheel. The body's inertia is **without** J a aᵀ: `without_wheels` takes them
-    out of one that was measured with the wheels locked. For wheels that are balanced and symmetric
-    about their axes nothing of it is an approximation.
+    The states are the wheels' whole axial momenta `h = J (s + a·Ω)`, and u is the torque of motor
+    and bearing on a wheel. The body's inertia is **without** J a aᵀ: `without_wheels` subtracts
+    them from an inertia with the wheels locked. The equations are exact for wheels that are
+    balanced and symmetric about their axes.
 
-    `R (IΩ + Σ h a)` is kept, whatever the motors do; `½ Ω·IΩ + Σ h²/2J` changes by `Σ u s`.
+    `R (IΩ + Σ h a)` is conserved for any motor torque; `½ Ω·IΩ + Σ h²/2J` changes by `Σ u s`.
 
     Source: Markley and Crassidis 2014, Fundamentals of Spacecraft Attitude Determination and
     Control, §3.3.5, doi:10.1007/978-1-4939-0802-8; friction: §4.8 there, after Bialke 1998, with
-    tanh in the place of sign (Andersson, Söderberg and Björklund 2007,
+    tanh instead of sign (Andersson, Söderberg and Björklund 2007,
     doi:10.1016/j.triboint.2005.11.014).
 
     **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype; `ValueError` for an axis that
@@ -156,7 +156,7 @@ class ReactionWheels(base.AbstractTorque):
 
     @property
     def steady(self) -> bool:
-        """Whether nothing changes the wheels' momenta: then the energy is kept."""
+        """Whether nothing changes the wheels' momenta: then the energy is conserved."""
         parts = (self.motor, self.feedback, self.viscous, self.coulomb)
         return all(part is None for part in parts)
 
@@ -183,7 +183,7 @@ class ReactionWheels(base.AbstractTorque):
         return own / self.inertia - along
 
     def torques_of(self, t: ScalarLike, own: Array, state: HasSpin) -> Float[Array, " wheels"]:
-        """What motor and bearing put on each wheel about its axis, (R,), N m."""
+        """The torque of motor and bearing on each wheel about its axis, (R,), N m."""
         speeds = self.speeds_of(own, state)
         t = _checks.floating(t, (), "t")
         count, total = self.inertia.shape[0], jnp.zeros_like(speeds)
@@ -238,7 +238,7 @@ def _smooth(x: Array) -> Array:
 
 
 def _each(value: Any, count: int, name: str, wanted: str) -> Array | None:
-    """A number for all wheels, or one a wheel: "> 0" or "≥ 0"."""
+    """One number for all wheels, or one for each: "> 0" or "≥ 0"."""
     if value is None:
         return None
     found = base.each(value, count, name)
