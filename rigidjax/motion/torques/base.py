@@ -226,7 +226,7 @@ def act(
         told = lacking(f"torque {type(law).__name__}", wrong)
         if told is None:
             raise
-        hint = "; a subclass of AbstractTorque says what it looks at by feels"
+        hint = "; a subclass of AbstractTorque declares the state that it reads by feels"
         raise TypeError(told + hint) from wrong
     # Not by class: torques of moving frames give one, too, and do not import this module.
     if hasattr(found, "force"):
