@@ -150,7 +150,7 @@ def require_law(torque: object, name: str = "torque") -> None:
         if isinstance(torque, list | tuple) and any(callable(part) for part in torque):
             advice = "; several go in a Sum: Sum(a, b)"
         elif isinstance(torque, list | tuple | np.ndarray | jax.Array):
-            advice = "; one that stays the same is ConstantTorque([x, y, z])"
+            advice = "; a constant one is ConstantTorque([x, y, z])"
         raise TypeError(
             f"{name}: wanted a torque or force of rigidjax.torques, or a callable (t, state, "
             f"body), got {type(torque).__name__}{advice}"
