@@ -132,7 +132,7 @@ def _where(there: Array, a: Array) -> Array:
 def _again(
     method: Method, constants: list[Array], run: Run, record: Record, number: Array
 ) -> Segment:
-    """A segment of the record: the last as it is, else run once more."""
+    """A segment of the record; any but the last is run once more."""
     loop, after = (unpacked(record.starts[i]) for i in (number, number + 1))
     again = number < jnp.max(record.number) - 1
     # Nothing is left to do of the last one.

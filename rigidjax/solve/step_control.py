@@ -107,8 +107,8 @@ class Record(NamedTuple):
 
 
 class Answer(NamedTuple):
-    """States `between` (K, n, *bodies) and at the `end` (n, *bodies), NaN where not reached; time,
-    state and next step of the loop when it ended (0, NaN where none is left to try, `HALTED`), and
+    """States `between` (K, n, *bodies) and at the `end` (n, *bodies), NaN if not reached; time,
+    state and next step of the loop at its end (0 or NaN if no step is left to try, `HALTED`), and
     its counters.
     """
 

@@ -69,7 +69,7 @@ def ahead(
     ts: Array,
     jumps: Array,
 ) -> tuple[Callable[..., Any], Any, Array, Array]:
-    """A vector field f(t, y, args), a condition `(t, y)`, times, and those of jumps, in s = σt.
+    """A vector field f(t, y, args), a condition `(t, y)`, times and jump times, in s = σt.
 
     **Arguments:** `sign` σ of the direction of time, 1 or −1, `None` for s = t.
 

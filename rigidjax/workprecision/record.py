@@ -77,7 +77,7 @@ def write_csv(records: Iterable[Record], path: str | Path) -> None:
 
     **Arguments:** `records`; `path` of the file, written over.
 
-    **Raises:** `OSError` where the file cannot be written.
+    **Raises:** `OSError` if the file cannot be written.
 
     >>> import tempfile
     >>> path = Path(tempfile.mkdtemp()) / "records.csv"

@@ -167,7 +167,7 @@ def test_mistakes_in_a_sensor_of_ones_own_are_named():
     with pytest.raises(ValueError, match=r"Scalar.error: wanted .* of shape \(1,\), .*got \(\)"):
         errors(Scalar())
     with pytest.raises(
-        TypeError, match=r"Pointing.error: 'Spin' .*say feels = rj.motion.HasAttitude"
+        TypeError, match=r"Pointing.error: 'Spin' .*set feels = rj.motion.HasAttitude"
     ):
         errors(Pointing())
     with pytest.raises(ValueError, match=r"Tachometer: noise: wanted an array of shape \(1,\)"):

@@ -343,7 +343,7 @@ def test_energy_adds_up():
         (lambda: torques.Sum([TOP, WHEEL]), r"got list; several go in a Sum: Sum\(a, b\)"),
         (lambda: torques.Sum(TOP, torques.Damping), r"got the class Damping, wanted one.*Damping\(\.\.\.\)"),
         (lambda: base.require_rung([TOP], ATTITUDE), r"torque: wanted a torque.*got list"),
-        (lambda: base.require_law([0.0, 0.0, 1.0]), r"got list; one that stays the same is ConstantTorque\(\["),
+        (lambda: base.require_law([0.0, 0.0, 1.0]), r"got list; a constant one is ConstantTorque\(\["),
         (lambda: base.require_rung(torques.Damping, SPIN), "torque: got the class Damping"),
         (lambda: torques.Damping([1.0, np.nan, 1.0]), "coefficient: contains NaN"),
         (lambda: torques.GravityGradient(1.0, np.zeros(3)), "position: .*got zero"),

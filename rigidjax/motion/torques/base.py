@@ -152,7 +152,7 @@ def require_law(torque: object, name: str = "torque") -> None:
         if isinstance(torque, list | tuple) and any(callable(part) for part in torque):
             advice = "; several go in a Sum: Sum(a, b)"
         elif isinstance(torque, list | tuple | np.ndarray | jax.Array):
-            advice = "; one that stays the same is ConstantTorque([x, y, z])"
+            advice = "; a constant one is ConstantTorque([x, y, z])"
         raise TypeError(
             f"{name}: wanted a torque or force of rigidjax.torques, or a callable (t, state, "
             f"body), got {type(torque).__name__}{advice}"
@@ -228,7 +228,7 @@ def act(
         told = lacking(f"torque {type(law).__name__}", wrong)
         if told is None:
             raise
-        hint = "; a subclass of AbstractTorque says what it looks at by feels"
+        hint = "; a subclass of AbstractTorque declares the state that it reads by feels"
         raise TypeError(told + hint) from wrong
     # Not by class: torques of moving frames give one, too, and do not import this module.
     if hasattr(found, "force"):
