@@ -52,11 +52,11 @@ from rigidjax.solve import (
     Event as Event,
     crossings as crossings,
     equations_of_motion as equations_of_motion,
-    error_of as error_of,
     lyapunov_exponents as lyapunov_exponents,
     simulate as simulate,
     solvers as solvers,
 )
+from rigidjax.solve.error import error_of as error_of
 
 if TYPE_CHECKING:
     from rigidjax import (

@@ -6,11 +6,6 @@ from rigidjax.solve.crossings import (
     Event as Event,
     crossings as crossings,
 )
-from rigidjax.solve.error import (
-    Error as Error,
-    FunctionError as FunctionError,
-    error_of as error_of,
-)
 from rigidjax.solve.exponents import (
     lyapunov_exponents as lyapunov_exponents,
 )

@@ -128,14 +128,9 @@ def simulate(
     """
     max_steps = None if max_steps is None else _checks.whole(max_steps, "max_steps", 1)
     body, state0, times = validation.scene(body, state0, ts, torque, throw)
+    _require_one((rtol, atol), accuracy, stepsize_controller)
     if stepsize_controller is None:
-        if accuracy is not None and (rtol is not None or atol is not None):
-            raise ValueError("simulate: give either an accuracy or rtol and atol, not both")
-        if accuracy is not None and _checks.known(accuracy):
-            accuracy = _checks.positive(accuracy, "accuracy")
         rtol, atol = validation.tolerances(rtol, atol, times.dtype)
-    elif rtol is not None or atol is not None or accuracy is not None:
-        raise ValueError("simulate: give either rtol and atol or a stepsize_controller, not both")
     if torque is None and solver is None and stepsize_controller is None and body is not None:
         found = _solution(Free(body, throw), event, state0, times)
         return found if accuracy is None else told(found, found.error, accuracy)
@@ -148,9 +143,8 @@ def simulate(
     if plain and isinstance(adjoint, _EITHER_MODE) and not forward:
         way = direction(times)
         loop = Loop(body, torque, method, rtol, atol, first, way, max_steps, throw)  # pyright: ignore
-        if accuracy is None:
-            return _solution(loop, event, state0, times)
-        return _accurate(loop, event, state0, times, accuracy)
+        scene = loop, event, state0, times
+        return _solution(*scene) if accuracy is None else _accurate(*scene, accuracy)
     if accuracy is not None:
         raise ValueError(
             "simulate: an accuracy is for the closed form and our own loop: leave solver, adjoint, "
@@ -175,6 +169,18 @@ def simulate(
         throw=throw,
     )
     return _solution(setup, None, state0, times)
+
+
+def _require_one(tolerances: tuple, accuracy: Any, controller: Any) -> None:
+    """Only one of three says how long steps are. **Raises** `ValueError` for more of them."""
+    given = any(one is not None for one in tolerances)
+    if controller is not None and (given or accuracy is not None):
+        raise ValueError("simulate: give either rtol and atol or a stepsize_controller, not both")
+    if accuracy is not None:
+        if given:
+            raise ValueError("simulate: give either an accuracy or rtol and atol, not both")
+        if _checks.known(accuracy):
+            _checks.positive(accuracy, "accuracy")
 
 
 def _accurate(loop: Loop, event: Any, state0: Any, times: Array, accuracy: Any) -> Solution:
