@@ -20,7 +20,7 @@ from jax import lax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float
 
-from rigidjax import _checks
+from rigidjax import _checks, _show
 from rigidjax._types import ScalarLike
 from rigidjax.motion.manifold import minus, names, parts
 from rigidjax.solve import validation
@@ -69,6 +69,13 @@ class Error(eqx.Module):
     steps: dict[str, Float[Array, " times"]]
     round_off: dict[str, Float[Array, " times"]]
     sizes: dict[str, Float[Array, ""]]
+
+    def __repr__(self) -> str:
+        if not _checks.known(self) or np.ndim(self.ts) != 1:
+            return eqx.tree_pformat(self)
+        last = ", ".join(f"{name} {float(part[-1]):.1e}" for name, part in self.total.items())
+        known = f"known until {float(self.known_until):g} s"
+        return f"Error(at {float(self.ts[-1]):g} s: {last}; {known})"
 
     @property
     def total(self) -> dict[str, Float[Array, " times"]]:
@@ -292,6 +299,9 @@ class FunctionError(eqx.Module):
     value_error: Array
     derivative: Any
     derivative_error: Any
+
+    def __repr__(self) -> str:
+        return _show.numbers(self)
 
     @property
     def known(self) -> Bool[Array, ""]:
