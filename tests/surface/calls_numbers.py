@@ -7,6 +7,8 @@ from surface import public, scenes as s
 from surface.calls import leave_out, row
 from surface.scenes import SECOND, SYMMETRIC, M, N, P, Q, V, W, Y
 
+import rigidjax as rj
+
 # Elliptic functions.
 for name in ("am", "sncndn"):
     row(f"elliptic.{name}", dict(u=0.7, m=0.4, m1=0.6))

@@ -14,6 +14,7 @@ from surface.values_numbers import derivative
 
 import rigidjax as rj
 from rigidjax import frames, orbits, scenes
+from rigidjax.frames.frame_dynamics import InFrame
 from rigidjax.rotation import quaternion as q4
 
 # A frame about any axis, whose angle is ½ k t², at X (1 + t²).
