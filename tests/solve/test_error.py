@@ -212,6 +212,7 @@ def test_another_accuracy_does_not_compile_again():
     assert float(found[0][1]) < 1e-4 and float(found[1][1]) < 1e-9
 
 
+@pytest.mark.oldest
 def test_derivatives_go_through_an_accuracy():
     def end(omega, **how):
         return rj.simulate(BODY, rj.Attitude(start().q, omega), TS[:2], TOP, **how).ys.omega[-1, 0]
