@@ -55,7 +55,7 @@ class Error(eqx.Module):
     `own.0`, …): of a quaternion the angle of the turn, rad, of others the length of the difference
     (rad/s, m, m/s). `steps` is known to some percent (of `accuracy=`: too large by up to ten).
     `round_off` is three standard deviations, and has the last digits of body, torque and start in
-    it; far below the other it is a bound. NaN where the run did not get to, inf where a run to
+    it, in closed form of the times, too; far below the other it is a bound. NaN where the run did not get to, inf where a run to
     compare with did not. `sizes` by name what is large: 1 rad, the largest value in the run.
 
     >>> import rigidjax as rj

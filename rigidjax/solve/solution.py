@@ -138,11 +138,11 @@ class Solution(eqx.Module, Generic[State]):
     def error(self) -> Error:
         """How far the states are from the exact motion of the given numbers: an `Error`.
 
-        A `UserWarning` says from which time on nothing is known, as in chaos.
-
-        Computed when asked for: a run at a hundredth of the tolerances (of equal steps: with half
-        of them), and, where round-off may count, three with the last digits of body, torque and
-        start changed; of the closed form these three alone. Under `jit` and `vmap`, too.
+        It is computed when it is read: by a run with a hundredth of the tolerances (for fixed
+        steps: with half of the step), and, if round-off may count, by three runs with changed last
+        digits of body, torque and start. The closed form needs only these three, with changed
+        times. It works under `jit` and `vmap`. A `UserWarning` names the time after which nothing
+        is known, as in chaos.
 
         >>> import rigidjax as rj
         >>> body, start = rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([0.0, 0.5, 1.0])
