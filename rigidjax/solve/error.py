@@ -54,9 +54,10 @@ class Error(eqx.Module):
     **Fields:** `ts` (T,) s; `steps`, `round_off` an array (T,) by name (`q`, `omega`, `x`, `v`,
     `own.0`, …): of a quaternion the angle of the turn, rad, of others the length of the difference
     (rad/s, m, m/s). `steps` is known to some percent (of `accuracy=`: too large by up to ten).
-    `round_off` is three standard deviations, and has the last digits of body, torque and start in
-    it, in closed form of the times, too; far below the other it is a bound. NaN where the run did not get to, inf where a run to
-    compare with did not. `sizes` by name what is large: 1 rad, the largest value in the run.
+    `round_off` is three standard deviations, and includes the effect of the last digits of body,
+    torque and start (in closed form also of the times); it is a bound if it is far below `steps`.
+    Both are NaN at times that the run did not reach, inf if a run for comparison did not. `sizes`
+    has the scale of each name: 1 rad, or the largest value in the run.
 
     >>> import rigidjax as rj
     >>> body, start = rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([0.0, 1.0, 0.01])
