@@ -174,7 +174,7 @@ class Dynamics(eqx.Module):
                 slopes.append((root * push(pair, share) - torque) / memory)
             return self.pushed(self.field(t + since, motion, None), total), tuple(slopes)
 
-        (motion, torques), _ = advance(KUTTA4, rate, jnp.zeros_like(h), h, (x.motion, x.torques), h)
+        motion, torques = advance(KUTTA4, rate, jnp.zeros_like(h), h, (x.motion, x.torques))
         if isinstance(motion, HasAttitude):
             motion = eqx.tree_at(lambda s: s.q, motion, normalised(motion.q))
         return Extended(motion, torques, x.walks)

@@ -141,7 +141,7 @@ def shifted(field: Callable[..., Any], t: Array, state: Any, offset: Array) -> A
     """The state `offset` s later or earlier: four steps of the classical method of order 4."""
     h = offset / 4.0
     for index in range(4):
-        state, _ = advance(KUTTA4, lambda t, y: field(t, y, None), t + index * h, h, state)
+        state = advance(KUTTA4, lambda t, y: field(t, y, None), t + index * h, h, state)
     return state
 
 

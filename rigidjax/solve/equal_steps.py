@@ -40,19 +40,24 @@ def in_a_loop(solver: Any) -> Any:
     return Rolled(solver) if few else solver
 
 
-def end_of_step(
+def change_in(
     solver: AbstractExplicit | Rolled, field: Field, t: Any, h: Array, y: Any, end: Any
 ) -> Any:
-    """The end of a step from `t` to `end`, of length `h`, not projected."""
+    """How `y` changes in a step from `t` to `end`, of length `h`, not projected."""
     if isinstance(solver, Rolled):
         return _rolled(solver.solver.tableau, field, t, h, y, end)
-    return advance(solver.tableau, field, t, h, y, end)[0]
+    return change_and_slope(solver.tableau, field, t, h, y, end)[0]
 
 
-def advance(
+def advance(tableau: Tableau, field: Field, t: Any, h: Array, y: Any) -> Any:
+    """The end of one step from `y`, not projected."""
+    return jax.tree.map(jnp.add, y, change_and_slope(tableau, field, t, h, y)[0])
+
+
+def change_and_slope(
     tableau: Tableau, field: Field, t: Any, h: Array, y: Any, end: Any = None
 ) -> tuple[Any, Any]:
-    """One step from `y`, written out and not projected, and the slope at its start.
+    """The change in one step from `y`, written out and not projected, and the slope at its start.
 
     **Arguments:** `t`, `h` scalars; `end` the time of the stages at the end of the step, where it
     is not to be `t + h` rounded.
@@ -63,21 +68,21 @@ def advance(
     end = t + h if end is None else end
     slopes = [barrier(field(t, y))]
     for node, row in zip(tableau.c, tableau.a, strict=True):
-        place = barrier(_along(y, h, row, slopes))
+        place = barrier(jax.tree.map(jnp.add, y, _along(h, row, slopes)))
         slopes.append(barrier(field(end if node == 1 else t + node * h, place)))
-    return _along(y, h, tableau.b, slopes), slopes[0]
+    return _along(h, tableau.b, slopes), slopes[0]
 
 
-def _along(y: Any, h: Array, row: Row, slopes: list[Any]) -> Any:
-    def moved(a: Array, *slopes: Array) -> Array:
+def _along(h: Array, row: Row, slopes: list[Any]) -> Any:
+    def moved(*slopes: Array) -> Array:
         first, *rest = [w * k for w, k in zip(row.values(), slopes, strict=True)]
-        return a + h.astype(a.dtype) * sum(rest, first)
+        return h.astype(first.dtype) * sum(rest, first)
 
-    return jax.tree.map(moved, y, *[slopes[i] for i in row])
+    return jax.tree.map(moved, *[slopes[i] for i in row])
 
 
 def _rolled(tableau: Tableau, field: Field, t: Any, h: Array, y: Any, end: Any) -> Any:
-    """The end of a step whose stages are a loop, which carries the slopes that a row looks back."""
+    """The change in a step whose stages are a loop that carries the slopes which a row needs."""
     count = len(tableau.a) + 1
     rows = np.zeros((count, max(i - min(row) for i, row in enumerate(tableau.a, 1))))
     for i, row in enumerate(tableau.a, 1):
@@ -96,7 +101,7 @@ def _rolled(tableau: Tableau, field: Field, t: Any, h: Array, y: Any, end: Any) 
     rest = [jax.tree.map(jnp.zeros_like, y)] * rows.shape[1]
     each = [jnp.stack([jnp.asarray(time, h.dtype) for time in times])]
     each += [jnp.asarray(part, h.dtype) for part in (rows, shares)]
-    return lax.scan(stage, (y, rest), each)[0][0]
+    return lax.scan(stage, (jax.tree.map(jnp.zeros_like, y), rest), each)[0][0]
 
 
 def _plus(y: Any, part: Array, slope: Any) -> Any:

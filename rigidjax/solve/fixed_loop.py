@@ -19,7 +19,7 @@ from rigidjax.solve.equal_steps import Rolled
 from rigidjax.solve.explicit import AbstractExplicit
 from rigidjax.solve.magnus import Magnus4
 from rigidjax.solve.splitting import AbstractSplitting
-from rigidjax.solve.steppers import Stepper, stepper_of
+from rigidjax.solve.steppers import Steps, stepper_of
 
 
 def fixed(
@@ -48,7 +48,7 @@ def fixed(
     >>> ys.q[1, 3]
     Array(0.47942554, dtype=float64)
     """
-    stepper = stepper_of(solver, field, y0)
+    stepper = stepper_of(solver, field, y0, substeps * (ts.size - 1))
 
     def span(y: Any, ends: tuple[Array, Array]) -> tuple[Any, Any]:
         left, right = ends
@@ -84,7 +84,7 @@ def first_rows(many: Any, one: Callable[..., Any], y: Any, rows: Any) -> Any:
 
 
 def step(
-    stepper: Stepper, h: Array, t0: Array, i: Array, y: Any, inputs: Any = None, before: int = 0
+    stepper: Steps, h: Array, t0: Array, i: Array, y: Any, inputs: Any = None, before: int = 0
 ) -> Any:
     """Step number `i` since `t0`; `inputs` by name (before + steps, …), of which this step has row
     `before + i`: the first `before` rows are those before `t0`.
@@ -145,7 +145,7 @@ def _row(a: Array, i: Any) -> Array:
 
 
 def march(
-    stepper: Stepper, h: Array, t0: Array, first: Array, count: int, y: Any, inputs: Any = None
+    stepper: Steps, h: Array, t0: Array, first: Array, count: int, y: Any, inputs: Any = None
 ) -> Any:
     """`count` steps from number `first` on; `inputs` as for `step`.
 

@@ -12,40 +12,38 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from rigidjax.exact.components3 import Four, Triple, cross
+from rigidjax.exact.components3 import Four, Triple, cross, plus
 from rigidjax.motion import Attitude
-from rigidjax.motion.equations import AttitudeEquations
+from rigidjax.motion.equations import AttitudeEquations, on_the_group
 from rigidjax.motion.torques.base import sees_attitude
 from rigidjax.rotation.barrier import barrier
-from rigidjax.rotation.kernels import product4, square4
+from rigidjax.rotation.kernels import product4
 from rigidjax.solve.components import join, split
-from rigidjax.solve.equal_steps import advance
+from rigidjax.solve.equal_steps import change_and_slope
 from rigidjax.solve.explicit import NestedInterpolation, cubic_rows
 from rigidjax.solve.tableaus import KUTTA4
 
 
-def turned(
+def change_and_turn(
     slope: Callable[[Any, Triple], Triple],
     rate: Callable[[Triple], Triple],
     t: Any,
     end: Any,
     h: Array,
-    q: Four,
     p: Triple,
-) -> tuple[Four, Triple]:
-    """One step of attitude `q` and momentum (or rate) `p`, from `t` to `end`.
+) -> tuple[Triple, Four]:
+    """How momentum (or rate) `p` changes in a step from `t` to `end`, and the body turns in it.
 
     **Arguments:** `slope(t, p)` dp/dt; `rate(p)` Ω; `h` the step, s. The rotation vector of the
     step is `∫Ω dt + h²/12 Ω(t) × Ω(t+h)`, the integral by Simpson's rule with the middle of the
     cubic through both ends. Source: Magnus 1954, doi:10.1002/cpa.3160070404; Iserles, Munthe-Kaas,
     Nørsett and Zanna 2000, doi:10.1017/S0962492900002154, section 5.
     """
-    after, first = advance(KUTTA4, slope, t, h, p, end)
-    after = barrier(after)
+    change, first = change_and_slope(KUTTA4, slope, t, h, p, end)
+    after = barrier(plus(p, change))
     last = slope(end, after)
     middle = tuple(
-        0.5 * (a + b) + 0.125 * h * (k - m)
-        for a, b, k, m in zip(p, after, first, last, strict=True)
+        a + 0.5 * b + 0.125 * h * (k - m) for a, b, k, m in zip(p, change, first, last, strict=True)
     )
     left, between, right = rate(p), rate(middle), rate(after)
     third, square = h / 12.0, h * h / 24.0
@@ -54,20 +52,11 @@ def turned(
         for a, b, c, d in zip(left, between, right, cross(left, right), strict=True)
     )
     half = barrier(half)
-    return _product(q, half), after
-
-
-def _product(q: Four, half: Triple) -> Four:
-    """`q ⊗ exp(half)`, of length 1."""
     # Short series: a step that turns by more than a radian has no digits to lose.
     x = half[0] * half[0] + half[1] * half[1] + half[2] * half[2]
-    c = 1.0 + x * (-1 / 2 + x * (1 / 24 + x * (-1 / 720 + x * (1 / 40320))))
+    c = x * (-1 / 2 + x * (1 / 24 + x * (-1 / 720 + x * (1 / 40320))))
     s = 1.0 + x * (-1 / 6 + x * (1 / 120 + x * (-1 / 5040 + x * (1 / 362880))))
-    c, x, y, z = barrier((c, *(s * a for a in half)))
-    out = product4(q, (c, x, y, z))
-    # One of Newton's steps to length 1, which is near already.
-    scale = 1.5 - 0.5 * square4(out)
-    return tuple(scale * a for a in barrier(out))
+    return change, barrier((c, *(s * a for a in half)))
 
 
 class Magnus4(dfx.AbstractSolver):
@@ -77,7 +66,7 @@ class Magnus4(dfx.AbstractSolver):
     work and a smaller error than `rigidjax.solvers.RungeKutta4` at the same step.
     The attitude keeps |q| = 1. A step should turn the body by less than a radian.
 
-    Source: Magnus 1954, doi:10.1002/cpa.3160070404; see `turned`.
+    Source: Magnus 1954, doi:10.1002/cpa.3160070404; see `change_and_turn`.
 
     **Raises:** `TypeError` for a torque that depends on the attitude, or another state.
 
@@ -111,8 +100,9 @@ class Magnus4(dfx.AbstractSolver):
         def slope(t: Any, omega: Triple) -> Triple:
             return split(terms.vf(t, Attitude(nowhere, jnp.stack(omega)), args).omega)
 
-        q1, omega1 = turned(slope, lambda omega: omega, t0, t1, h, q, omega)
-        y1: Any = join((*q1, *omega1), y0)
+        change, turn = change_and_turn(slope, lambda omega: omega, t0, t1, h, omega)
+        change = join((*product4(q, turn), *change), y0)
+        y1 = on_the_group(jax.tree.map(jnp.add, y0, change))
         left, right = terms.vf(t0, y0, args), terms.vf(t1, y1, args)
 
         def rows(a: Array, b: Array, k: Array, m: Array) -> Array:

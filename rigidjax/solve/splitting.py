@@ -15,7 +15,15 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from rigidjax.exact.components3 import Six, Triple, adjugate, determinant, plus, times
+from rigidjax.exact.components3 import (
+    Six,
+    Triple,
+    adjugate,
+    determinant,
+    plus,
+    times,
+    turned_back,
+)
 from rigidjax.exact.derivatives import flow
 from rigidjax.exact.principal_axes import into, out_of, principal_frame
 from rigidjax.motion import Attitude
@@ -117,8 +125,9 @@ class AbstractSplitting(dfx.AbstractSolver):
     ) -> Any:
         field, way = field_of(terms)
         state, h = (y0.q, enter(solver_state, y0.omega)), jnp.asarray(t1 - t0) * way
-        q, p = compose(self.composition, field, solver_state, jnp.asarray(t0) * way, h, state)
-        y1 = Attitude(q, leave(solver_state, p))
+        change = compose(self.composition, field, solver_state, jnp.asarray(t0) * way, h, state)
+        q, p = jax.tree.map(jnp.add, state, change)
+        y1 = Attitude(quaternion.normalise(q), leave(solver_state, p))
         dense = dict(y0=y0, coefficients=_dense_rows(terms, t0, t1, args, y0, y1))
         return y1, None, dense, solver_state, dfx.RESULTS.successful
 
@@ -202,53 +211,42 @@ def leave(frame: Frame, momentum: Triple) -> Array:
 def compose(
     composition: Composition, field: AttitudeEquations, frame: Frame, t: Any, h: Any, state: Any
 ) -> tuple[Array, Triple]:
-    """One step of (q, Π in principal axes)."""
+    """How (q, Π in principal axes) changes in one step; q is not projected."""
     dtype = state[0].dtype
 
-    def kicked(t: Any, weight: Any, q: Array, momentum: Triple) -> Triple:
+    def kicked(t: Any, weight: Any, q: Array, change: Triple) -> Triple:
         if field.euler.torque is None:
-            return momentum
+            return change
         # A torque that says that it does not depend on the rate gets none.
         at = Attitude(q, jnp.full(3, jnp.nan, dtype))
         torque = into(frame.axes, evaluate(field.euler.torque, t, at, field.euler.inertia))
-        return plus(momentum, tuple(weight * a for a in torque))
+        return plus(change, tuple(weight * a for a in torque))
 
     # A loop, not twelve copies: the flow is long to compile.
     def stage(carry: Any, weights: tuple[Array, Array]) -> tuple[Any, None]:
-        t, q, momentum = carry
+        t, dq, change = carry
         drift, kick = weights
         length = drift.astype(dtype)
-        before = momentum
-        momentum, (w, x, y, z) = flow(frame.moments, before, length)
-        momentum = _as_long_as(before, momentum)
-        q = quaternion.multiply(q, jnp.stack([w, *out_of(frame.axes, (x, y, z))]))
+        momentum = plus(state[1], change)
+        _, (w, x, y, z) = flow(frame.moments, momentum, length)
+        # What the turn changes: momentum keeps its length to the last digit of this change.
+        change = plus(change, turned_back((w, x, y, z), momentum))
+        turn = jnp.stack([-(x * x + y * y + z * z) / (1 + w), *out_of(frame.axes, (x, y, z))])
+        dq = dq + quaternion.multiply(state[0] + dq, turn)
         t = t + drift
-        return (t, q, kicked(t, kick.astype(dtype), q, momentum)), None
+        return (t, dq, kicked(t, kick.astype(dtype), state[0] + dq, change)), None
 
-    q, momentum = state
     h = jnp.asarray(h)
     t = jnp.asarray(t, h.dtype)
     first, *rest = composition.kicks
-    momentum = kicked(t, (first * h).astype(dtype), q, momentum)
+    still = jax.tree.map(jnp.zeros_like, state)
+    change = kicked(t, (first * h).astype(dtype), state[0], still[1])
     weights = (
         jnp.asarray(composition.flows, h.dtype) * h,
         jnp.asarray(rest, h.dtype) * h,
     )
-    (_, q, momentum), _ = lax.scan(stage, (t, q, momentum), weights)
-    # Products of unit quaternions: off by round-off only, which would add up.
-    return quaternion.normalise(q), momentum
-
-
-def _as_long_as(before: Triple, after: Triple) -> Triple:
-    """`after`, as long as `before` to round-off.
-
-    A free flow turns Π; its own round-off is not even, and would add up over a million steps.
-    """
-    a, b = (sum(x * x for x in v) for v in (before, after))
-    # One of Newton's steps, as what is to be added: a factor near 1 is not rounded evenly.
-    more = 0.5 * (a - b) / jnp.where(a == 0, jnp.ones_like(a), a)
-    more = lax.stop_gradient(more)
-    return tuple(x + more * x for x in after)
+    (_, dq, change), _ = lax.scan(stage, (t, still[0], change), weights)
+    return dq, change
 
 
 def _dense_rows(terms: Any, t0: Any, t1: Any, args: Any, y0: Any, y1: Any) -> Any:
