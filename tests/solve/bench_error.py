@@ -1,6 +1,6 @@
 """Is the error that a run states its true one? Random scenes of every class, the truth in more digits.
 
-    python tests/solve/bench_error.py [--scenes 200] [--seed 0] [--what states,gradients,accuracy] [--only top,orbit]
+    python tests/solve/bench_error.py [--scenes 200] [--seed 0] [--what states,gradients,accuracy,cost] [--only top,orbit]
 
 Scenes: free bodies of every class (closed form, and by steps; a third beside the middle axis), heavy
 tops, sleeping tops that pass the vertical, gravity gradient, wheels, damping, pulses with jumps; 1 to
@@ -319,6 +319,67 @@ def accuracies(kind, n, seed, dtype, table):
         )
 
 
+def costs(kind, n, seed, dtype, table):
+    """CPU time of each scene alone: `sol.error` over a run, an accuracy over the best tolerance."""
+    rng, p, start, lengths = drawn(kind, n, seed, dtype)
+    rtol = tolerances(rng, n, dtype)
+    asked = 10 ** (rng.uniform(-12, -3, n) if dtype == np.float64 else rng.uniform(-5, -2, n))
+    plain = jax.jit(lambda p, y, rtol: last(run(kind, p, y, rtol=rtol, atol=1e-3 * rtol)))
+
+    @jax.jit
+    def with_error(p, start, rtol):
+        sol = run(kind, p, start, rtol=rtol, atol=1e-3 * rtol)
+        return last(sol), sol.error.total
+
+    @jax.jit
+    def to(p, start, asked):
+        sol = run(kind, p, start, accuracy=asked)
+        return last(sol), sol.error.relative[-1]
+
+    def timed(f, *args):
+        jax.block_until_ready(f(*args))
+        spans = []
+        for _ in range(3):
+            begun = time.process_time()
+            out = jax.block_until_ready(f(*args))
+            spans.append(time.process_time() - begun)
+        return min(spans), out
+
+    grid = np.maximum(10 ** -np.arange(2.0, 14.0, 0.25), 20 * np.finfo(dtype).eps).astype(dtype)
+    truth, low = extrapolated.ends(p, start)
+    ratios, reached = [], []
+    for i in range(n):
+        mine, begin = {name: a[i] for name, a in p.items()}, start[i]
+        ratios.append(
+            timed(with_error, mine, begin, rtol[i])[0] / timed(plain, mine, begin, rtol[i])[0]
+        )
+        ends = np.stack([plain(mine, begin, tolerance) for tolerance in grid])
+        true = np.max(apart(ends, truth[i : i + 1], low[i : i + 1]) / sized(truth)[i], 1)
+        if not (had := true <= asked[i]).any():
+            continue
+        best, _ = timed(plain, mine, begin, grid[np.argmax(had)])
+        span, (_, stated) = timed(to, mine, begin, dtype(asked[i]))
+        if stated <= asked[i]:
+            reached.append(span / best)
+    table.append((f"{kind}, {dtype.__name__}", np.array(ratios), np.array(reached)))
+
+
+def show_costs(what, table):
+    print(
+        "\n| cost, median and quartiles | `sol.error` over a run | an accuracy over the best tolerance |"
+    )
+    print("| --- | --- | --- |")
+    table.append(("all", *(np.concatenate([row[i] for row in table]) for i in (1, 2))))
+    for name, *parts in table:
+        three = [
+            "{1:.2f} ({0:.2f}–{2:.2f})".format(*np.quantile(part, [0.25, 0.5, 0.75]))
+            if part.size
+            else "–"
+            for part in parts
+        ]
+        print(f"| {name} | " + " | ".join(three) + " |")
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--scenes", type=int, default=200, help="of each class and dtype")
@@ -328,12 +389,17 @@ def main():
     given = parser.parse_args()
     for what in given.what.split(","):
         table, begun = [], time.perf_counter()
-        doing = {"states": states, "gradients": gradients, "accuracy": accuracies}[what]
+        doing = {
+            "states": states,
+            "gradients": gradients,
+            "accuracy": accuracies,
+            "cost": costs,
+        }[what]
         for dtype in (np.float64, np.float32):
             for kind in given.only.split(","):
-                if what != "accuracy" or kind != "free":
+                if what not in ("accuracy", "cost") or kind != "free":
                     doing(kind, given.scenes, given.seed, dtype, table)
-        show = show_accuracy if what == "accuracy" else show_ratios
+        show = {"accuracy": show_accuracy, "cost": show_costs}.get(what, show_ratios)
         show(what, table)
         print(
             f"({what}: {given.scenes} scenes of each row, {time.perf_counter() - begun:.0f} s)\n",
