@@ -1,6 +1,6 @@
 """Charts of error against time. matplotlib is imported only when a chart is asked for."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 from rigidjax._checks import plain
@@ -15,7 +15,8 @@ def draw(records: Iterable[Record], *, title: str | None = None) -> Any:
     """Error against time, log–log: values on the left, gradients on the right, the front marked.
 
     Each scene has a row. Beside the time of a run it shows the time of a first answer, compiling
-    and one run, if it is known. The grey band is the Pareto front of error and time, peers
+    and one run, if it is known, and the error of each value against the tolerance or accuracy that
+    was asked for. The grey band is the Pareto front of error and time, peers
     included; its points are ringed. The coloured band is the front of the methods in JAX. Error
     bars are quartiles of the time.
 
@@ -37,13 +38,18 @@ def draw(records: Iterable[Record], *, title: str | None = None) -> Any:
     if any(r.compile == r.compile for r in records):
         runs.append((", first answer", first_answers(records)))
     panels = [(kind, words, times) for words, times in runs for kind in kinds]
+    asked = [r for r in records if r.kind == "value" and 0 < r.setting < 1]
+    columns = len(panels) + bool(asked)
     figure, axes = plt.subplots(
-        len(names), len(panels), figsize=(6.6 * len(panels), 5.4 * len(names)), squeeze=False,
+        len(names), columns, figsize=(6.6 * columns, 5.4 * len(names)), squeeze=False,
         layout="constrained",
     )  # fmt: skip
     labels = list(dict.fromkeys((r.label, r.group) for r in records))
     for row, name in zip(axes, names, strict=True):
-        for axis, (kind, words, times) in zip(row, panels, strict=True):
+        if asked:
+            _reached(row[-1], [r for r in asked if r.scene == name], labels)
+            row[-1].set_title(plain(f"{name}: asked and reached"), fontsize=10)
+        for axis, (kind, words, times) in zip(row, panels, strict=False):
             of = [r for r in times if (r.scene, r.kind) == (name, kind)]
             if not of:
                 axis.set_axis_off()
@@ -64,7 +70,8 @@ def _places(records: list[Record]) -> tuple[list[float], list[float]]:
     return [max(r.error, 1e-16) for r in records], [1e3 * r.time for r in records]
 
 
-def _one(axis: Any, records: list[Record], labels: list[tuple[str, str]]) -> None:
+def _curves(records: list[Record], labels: list[tuple[str, str]]) -> Iterator[tuple[list, dict]]:
+    """The records of each method, from the smallest setting on, and how they are drawn."""
     import matplotlib as mpl
 
     for i, (label, group) in enumerate(labels):
@@ -72,16 +79,33 @@ def _one(axis: Any, records: list[Record], labels: list[tuple[str, str]]) -> Non
         if not of:
             continue
         same, colours = [name for name, g in labels if g == group], mpl.colormaps[_COLOURS[group]]
-        colour = colours(same.index(label) % colours.N)
+        yield (
+            of,
+            dict(
+                label=plain(label), color=colours(same.index(label) % colours.N),
+                marker=_MARKS[i % len(_MARKS)], markersize=4,
+                linewidth=1.6 if group == "ours" else 0.9,
+                linestyle="-" if group == "ours" else "--" if group == "jax" else ":",
+            ),
+        )  # fmt: skip
+
+
+def _reached(axis: Any, records: list[Record], labels: list[tuple[str, str]]) -> None:
+    for of, how in _curves(records, labels):
+        axis.plot([r.setting for r in of], [max(r.error, 1e-16) for r in of], **how)
+    wanted = sorted(r.setting for r in records)
+    axis.plot(wanted, wanted, color="0.6", linewidth=6, alpha=0.3, zorder=0, label="as asked")
+    axis.set(xlabel="tolerance or accuracy asked for", ylabel="error reached")
+    _dressed(axis)
+
+
+def _one(axis: Any, records: list[Record], labels: list[tuple[str, str]]) -> None:
+    for of, how in _curves(records, labels):
         bars = [
             [max(1e3 * (r.time - r.time_low), 0.0) for r in of],
             [max(1e3 * (r.time_high - r.time), 0.0) for r in of],
         ]
-        axis.errorbar(
-            *_places(of), bars, label=plain(label), color=colour, marker=_MARKS[i % len(_MARKS)],
-            markersize=4, linewidth=1.6 if group == "ours" else 0.9, elinewidth=0.6,
-            linestyle="-" if group == "ours" else "--" if group == "jax" else ":",
-        )  # fmt: skip
+        axis.errorbar(*_places(of), bars, elinewidth=0.6, **how)
     for best, colour, what in (
         (front(records), "0.6", "front"),
         (front(r for r in records if r.group != "peer"), "tab:cyan", "front in JAX"),
@@ -89,6 +113,10 @@ def _one(axis: Any, records: list[Record], labels: list[tuple[str, str]]) -> Non
         axis.plot(*_places(best), "-", color=colour, linewidth=6, alpha=0.3, zorder=0, label=what)
     ringed = dict(color="k", markerfacecolor="none", markersize=9, zorder=5)
     axis.plot(*_places(front(records)), "o", **ringed)
+    _dressed(axis)
+
+
+def _dressed(axis: Any) -> None:
     axis.set(xscale="log", yscale="log")
     # Better is to the right and down.
     axis.invert_xaxis()

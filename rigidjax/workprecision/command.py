@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from rigidjax.workprecision import chart, pareto
-from rigidjax.workprecision.measurement import long_drift, measure
+from rigidjax.workprecision.measurement import in_float32, long_drift, measure
 from rigidjax.workprecision.peers import methods
 from rigidjax.workprecision.record import Record, kept, moved, read_csv, write_csv
 from rigidjax.workprecision.scene import Method
@@ -36,6 +36,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "scene": dict(nargs="*", metavar="SCENE", help="which scenes (default: all)"),
     "--quick": _FLAG | dict(help="three scenes, few settings"),
     "--no-peers": _FLAG | dict(help="only what runs in JAX"),
+    "--float32": _FLAG | dict(help="in single precision, only what runs in JAX"),
     "--no-gradients": _FLAG | dict(help="values only"),
     "--thin": dict(type=int, default=1, metavar="N", help="every N-th setting"),
     "--csv": _FILE | dict(help="keep the records"),
@@ -112,11 +113,12 @@ def _measured(options: argparse.Namespace) -> list[Record]:
         if name == DRIFT:
             found += long_drift(progress=say)
             continue
-        chosen = [m for m in methods() if not (options.no_peers and m.group == "peer")]
+        alone = options.no_peers or options.float32
+        chosen = [m for m in methods() if not (alone and m.group == "peer")]
         if quick:
             chosen = [smaller(m) for m in chosen if m.name in SMALL]
         found += measure(
-            scenes()[name](), chosen,
+            in_float32(scenes()[name]()) if options.float32 else scenes()[name](), chosen,
             gradients=not options.no_gradients and (name in GRADED or bool(options.scene)),
             progress=say,
             thin=4 if quick else options.thin,

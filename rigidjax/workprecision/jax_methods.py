@@ -29,7 +29,7 @@ def compiled(scene: Scene, flow: Flow) -> Ready:
     """One compiled call for all settings, timed as a user would call it: nothing but numbers in."""
     numbers = scene.numbers
     start = time.perf_counter()
-    ready = jax.jit(flow).lower(numbers, jnp.asarray(1.0)).compile()
+    ready = jax.jit(flow).lower(numbers, jnp.asarray(1.0, numbers.dtype)).compile()
     spent = time.perf_counter() - start
     memory = ready.memory_analysis()
     held = float(memory.temp_size_in_bytes) if memory is not None else float("nan")
@@ -39,7 +39,7 @@ def compiled(scene: Scene, flow: Flow) -> Ready:
 
     def run(setting: float) -> Run:
         if setting not in there:
-            there[setting] = jnp.asarray(float(setting))
+            there[setting] = jnp.asarray(float(setting), numbers.dtype)
         return Run(*jax.block_until_ready(ready(numbers, there[setting])))
 
     return Ready(run, spent, held)
@@ -64,17 +64,19 @@ def _closed(scene: Scene) -> Flow | None:
     return flow_of(scene, run) if scene.torque is None and scene.body is not None else None
 
 
-def _simulate(scene: Scene) -> Flow | None:
+def _simulate(scene: Scene, wanted: Callable[[Any], dict[str, Any]] | None = None) -> Flow | None:
     """`simulate` with its defaults, but for the tolerance: traced, so that one program does."""
 
     def run(body: Any, start: Any, ts: Any, setting: Any) -> tuple[Any, Any]:
-        out = simulate(
-            body, start, ts, scene.torque, rtol=setting, atol=1e-3 * setting, throw=False,
-            max_steps=MOST,
-        )  # fmt: skip
+        how = dict(rtol=setting, atol=1e-3 * setting) if wanted is None else wanted(setting)
+        out = simulate(body, start, ts, scene.torque, throw=False, max_steps=MOST, **how)
         return out.ys, out.stats["num_steps"]
 
     return None if scene.torque is None else flow_of(scene, run)
+
+
+def _to_accuracy(setting: Any) -> dict[str, Any]:
+    return {"accuracy": setting}
 
 
 def _adaptive(scene: Scene, solver: Any) -> Flow:
@@ -203,6 +205,7 @@ def methods_in_jax() -> list[Method]:
     return [
         _ours("closed form", (0.0,), _closed, MODES),
         _ours("simulate", TOLERANCES, _simulate, MODES),
+        _ours("simulate, accuracy", TOLERANCES, partial(_simulate, wanted=_to_accuracy)),
         _ours("DormandPrince8", TOLERANCES, partial(_adaptive, solver=eight), MODES),
         _ours("Tsitouras5", TOLERANCES, partial(_adaptive, solver=five)),
         *(

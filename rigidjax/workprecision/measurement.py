@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -37,6 +38,9 @@ RUNS = {
     "DormandPrince8": (0.1, solvers.DormandPrince8),
     "RungeKutta4": (0.02, solvers.RungeKutta4),
 }
+
+
+_PARTS = ("body", "state0", "torque")
 
 
 class _Job(NamedTuple):
@@ -115,6 +119,29 @@ def worked_out(scene: Scene, gradients: bool = True) -> Reference:
     return Reference(tuple(map(float, ends[0])), error, slope, off, source)
 
 
+def in_float32(scene: Scene) -> Scene:
+    """The scene in single precision; the reference is worked out in double for its rounded numbers.
+
+    **Arguments:** `scene` in float64.
+
+    >>> from rigidjax.workprecision import scenes
+    >>> in_float32(scenes()["heavy-top"]()).numbers.dtype
+    dtype('float32')
+    """
+
+    def cast(given: Scene, dtype: Any) -> Scene:
+        def one(a: Any) -> Any:
+            return jnp.asarray(a, dtype) if eqx.is_inexact_array(a) else a
+
+        parts = {name: jax.tree.map(one, getattr(given, name)) for name in _PARTS}
+        return dataclasses.replace(given, **parts)
+
+    low = cast(scene, jnp.float32)
+    right = worked_out(dataclasses.replace(cast(low, jnp.float64), reference=None))
+    # The equations by hand have constants in double.
+    return dataclasses.replace(low, name=f"{scene.name}, float32", reference=right, plain=None)
+
+
 def _turn(scene: Scene) -> float:
     """The rough turn in the scene, rad; unknown for a point."""
     return 50.0 if scene.body is None else max(50.0, scene.size[1] * scene.end)
@@ -124,7 +151,9 @@ def _settings(scene: Scene, method: Method, thin: int) -> list[float]:
     found = list(method.settings)[::-1][::thin][::-1]
     if method.equal:
         return [float(round(s * _turn(scene) / 50)) for s in found]
-    return [float(s) for s in found]
+    # Below ten roundings a step is rejected until no step is left.
+    least = 10 * float(jnp.finfo(scene.numbers.dtype).eps)
+    return [float(s) for s in found if s == 0 or s > least]
 
 
 def _looked_at(

@@ -24,7 +24,7 @@ from rigidjax.workprecision import (
     scenes,
     table,
 )
-from rigidjax.workprecision.measurement import long_drift, worked_out
+from rigidjax.workprecision.measurement import in_float32, long_drift, worked_out
 from rigidjax.workprecision.pareto import front, time_to
 from rigidjax.workprecision.record import Record, moved, read_csv, write_csv
 from rigidjax.workprecision.scene import Method, Ready, Run, distance
@@ -153,6 +153,21 @@ def test_the_gradient_is_compared_with_the_reference():
     assert max(found[0].by_inertia, found[0].by_rate, found[0].by_attitude) < 1e-8
 
 
+def test_a_scene_in_single_precision():
+    """Its truth is that of the rounded numbers."""
+    double = scenes()["heavy-top"]()
+    scene = in_float32(double)
+    assert {leaf.dtype for leaf in jax.tree.leaves(scene.torque)} == {jnp.dtype("float32")}
+    rounded, _ = distance(double, scene.reference.end, double.reference.end)
+    chosen = [m for m in methods() if m.name in ("RungeKutta4, equal steps", "simulate, accuracy")]
+    records = measure(scene, chosen, gradients=False, thin=3, rounds=1)
+    stepped = [r.error for r in records if r.method.startswith("Runge")]
+    assert 1e-8 < rounded < 1e-5
+    assert min(stepped) < 2e-5
+    assert all(r.error <= r.setting for r in records if r.setting == 1e-3)
+    assert all(r.setting > 1e-6 for r in records)
+
+
 def test_the_front_and_the_table():
     ladder = [line("a", 1e-2, 1.0), line("a", 1e-6, 2.0), line("a", 1e-12, 8.0)]
     other = [line("b", 1e-4, 1.2, group="jax"), line("b", 1e-8, 9.0, group="jax")]
@@ -201,7 +216,8 @@ def test_files_and_charts(tmp_path):
         read_csv(tmp_path / "other.csv")
     pytest.importorskip("matplotlib").use("Agg")
     figure = draw([*records, line(scene="elsewhere")], title="two scenes")
-    assert len(figure.axes) == 4
+    # Of each scene values and gradients, and what was reached of what was asked.
+    assert len(figure.axes) == 6
     assert figure.axes[0].get_xscale() == "log"
     with pytest.raises(ValueError, match="draw: wanted records"):
         draw([])
