@@ -22,7 +22,6 @@ def divergence(body: MassProperties, reference: MassProperties) -> Scalar:
     Kullback–Leibler divergence for the mass seen as a Gaussian.
 
     **Arguments:** `body`; `reference` a body with a positive definite 𝔖; the same frame and units.
-
     Source: Lee, Wensing and Park 2020, "Geometric robot dynamic identification: a convex
     programming approach", IEEE T-RO 36:348, doi:10.1109/TRO.2019.2926491.
 

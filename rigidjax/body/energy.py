@@ -36,14 +36,11 @@ from rigidjax.rotation.linalg3 import apply, cross, dot, product
 def kinetic_energy(body: Inertia | MassProperties, state: HasSpin | Vector) -> Scalar:
     """Kinetic energy of a body in a state of motion, J.
 
-    **Arguments:** `body` an `Inertia` about the point it turns about, or `MassProperties`;
-    `state` anything with `.omega` (Ω, rad/s, body frame), or Ω (3,) itself. Translation counts,
-    too, for `MassProperties` and a state that moves (`.v`, m/s, of the centre of mass, world
-    frame).
+    **Arguments:** `body` an `Inertia` about the point it turns about, or `MassProperties`; `state`
+    anything with `.omega` (Ω, rad/s, body frame), or Ω (3,) itself. Translation counts, too, for
+    `MassProperties` and a state that moves (`.v`, m/s, of the centre of mass, world frame).
 
     `T = ½ m |v|² + ½ Ω·IΩ`. Source: notes, eqs 75 and 79, in any body axes.
-
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
 
     >>> kinetic_energy(Inertia.from_principal(1.0, 2.0, 3.0), [1.0, 1.0, 1.0])
     Array(3., dtype=float64)
@@ -63,11 +60,8 @@ def kinetic_energy_about(
     `T = ½ m |V|² + m V·R(Ω × c) + ½ Ω·I_o Ω`: the notes drop the cross term by choosing the origin
     at the centre of mass (eqs 54–57).
 
-    **Arguments:** `body`; the point is its origin, the zero of `com`. `q` (4,)
-    (w, x, y, z), body → world; `velocity` (3,) V of that point, m/s, world frame; `omega` (3,) Ω,
-    rad/s, body frame.
-
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
+    **Arguments:** `body`; the point is its origin, the zero of `com`. `q` (4,) (w, x, y, z), body →
+    world; `velocity` (3,) V of that point, m/s, world frame; `omega` (3,) Ω, rad/s, body frame.
 
     >>> ball = MassProperties(1.0, [1.0, 0, 0], [[0.0, 0, 0], [0, 0, 0], [0, 0, 0]])
     >>> kinetic_energy_about(ball, [1.0, 0, 0, 0], [0.0, 1, 0], [0.0, 0, 1])
@@ -104,8 +98,6 @@ def angular_momentum(body: Inertia | MassProperties, state: HasSpin | Vector) ->
     **Arguments:** `body` an `Inertia` about the point it turns about, or `MassProperties` (then
     about the centre of mass); `state` anything with `.omega`, or Ω (3,) itself, rad/s, body frame.
 
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
-
     >>> angular_momentum(Inertia.from_principal(1.0, 2.0, 3.0), [1.0, 1.0, 1.0])
     Array([1., 2., 3.], dtype=float64)
     """
@@ -117,9 +109,8 @@ def spatial_angular_momentum(body: Inertia | MassProperties, state: HasAttitude)
 
     **Arguments:** as `angular_momentum`; `state` has `.q` (4,), body → world, and `.omega`. The
     orbital part `m x × v` about the world's origin is added for `MassProperties` and a state that
-    moves (`.x`, `.v`).
-
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype, or a state without attitude.
+    moves (`.x`, `.v`). **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype, or a state
+    without attitude.
 
     >>> from rigidjax import Attitude
     >>> turned = Attitude([0.0, 1.0, 0, 0], [0.0, 0, 1])
@@ -153,10 +144,9 @@ def ellipsoid(
       m, of `MassProperties`, without a `size`. It moves exactly as the body does.
 
     **Returns** `(semi_axes, q)`: (3,) in the order of ascending moments (of `"mass"`: ascending),
-    and (4,) the rotation principal axes → body axes.
-
-    **Raises:** `ValueError` for another kind, a zero moment or a negative number (`equinox` error
-    under `jit`), `TypeError` for a `size` that is missing or too much.
+    and (4,) the rotation principal axes → body axes. **Raises:** `ValueError` for another kind, a
+    zero moment or a negative number (`equinox` error under `jit`), `TypeError` for a `size` that is
+    missing or too much.
 
     >>> ellipsoid(Inertia.from_principal(1.0, 2.0, 2.0), "energy", 4.0)[0]
     Array([2.82842712, 2.        , 2.        ], dtype=float64)

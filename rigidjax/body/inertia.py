@@ -47,8 +47,6 @@ class Inertia(eqx.Module):
     The object stores I, not 𝔖: `from_tensor` is then the identity, and the small moment of a rod
     keeps all its digits. Source: notes, eqs 76–78.
 
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
-
     >>> Inertia.from_principal(1.0, 2.0, 2.5).moments
     Array([1. , 2. , 2.5], dtype=float64)
     """
@@ -65,11 +63,10 @@ class Inertia(eqx.Module):
     def from_tensor(tensor: Matrix) -> "Inertia":
         """A body with this inertia tensor.
 
-        **Arguments:** `tensor` (3, 3), kg m², body frame, about the point it turns about.
-        Plates, rods and points (zero second moments) are bodies.
-
-        **Raises:** `ValueError` (`equinox` error under `jit`) if it is not symmetric to a few
-        units of round-off, has a negative moment, or breaks `I1 + I2 ≥ I3`.
+        **Arguments:** `tensor` (3, 3), kg m², body frame, about the point it turns about. Plates,
+        rods and points (zero second moments) are bodies. **Raises:** `ValueError` (`equinox` error
+        under `jit`) if it is not symmetric to a few units of round-off, has a negative moment, or
+        breaks `I1 + I2 ≥ I3`.
 
         >>> Inertia.from_tensor([[2.0, 0.1, 0], [0.1, 2, 0], [0, 0, 3]]).tensor.shape
         (3, 3)
@@ -82,7 +79,6 @@ class Inertia(eqx.Module):
         """A body whose principal axes are the body axes.
 
         **Arguments:** `i1`, `i2`, `i3` scalars, kg m², about the first, second and third axis.
-
         **Raises:** as `from_tensor`.
 
         >>> Inertia.from_principal(1.0, 2.0, 3.0).tensor[2, 2]
@@ -96,10 +92,8 @@ class Inertia(eqx.Module):
         """A body with this second moment: `I = Tr(𝔖) 1 − 𝔖`.
 
         **Arguments:** `second_moment` (3, 3) 𝔖 = ∫ r rᵀ dm, kg m², body frame, about the point it
-        turns about. Source: notes, eqs 60, 76–78.
-
-        **Raises:** `ValueError` (`equinox` error under `jit`) if it is not symmetric, or not
-        positive semi-definite, to a few units of round-off.
+        turns about. Source: notes, eqs 60, 76–78. **Raises:** `ValueError` (`equinox` error under
+        `jit`) if it is not symmetric, or not positive semi-definite, to a few units of round-off.
 
         >>> import jax.numpy as jnp
         >>> Inertia.from_second_moment(jnp.diag(jnp.array([2.0, 1.0, 0.0]))).moments

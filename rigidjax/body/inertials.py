@@ -22,10 +22,9 @@ def read_inertials(path: str | Path) -> dict[str, MassProperties]:
     `inertia`. MuJoCo: `<inertial>` with `mass`, `pos`, `quat`, `diaginertia` or `fullinertia`;
     an inertia that MuJoCo would compute from geometry is not read.
 
-    **Arguments:** `path` of the file. **Returns** name → `MassProperties`, in order.
-
-    **Raises:** `ValueError`, naming file and body, for a file that is missing or of another format,
-    an invalid number, an orientation in another form, an inertia of no real body.
+    **Arguments:** `path` of the file. **Returns** name → `MassProperties`, in order. **Raises:**
+    `ValueError`, naming file and body, for a file that is missing or of another format, an invalid
+    number, an orientation in another form, an inertia of no real body.
 
     >>> read_inertials("missing.urdf")
     Traceback (most recent call last):
@@ -51,10 +50,9 @@ def write_inertials(
     """A copy of a URDF or MuJoCo XML file with the inertials of these bodies in it.
 
     **Arguments:** `path` of the new file; `bodies` name → `MassProperties`, in the frames of the
-    file's links or bodies; `source` the file to copy; the rest of it stays.
-
-    **Raises:** `ValueError` as `read_inertials`, and for a name that is not in the file;
-    `TypeError` for anything but `MassProperties`.
+    file's links or bodies; `source` the file to copy; the rest of it stays. **Raises:**
+    `ValueError` as `read_inertials`, and for a name that is not in the file; `TypeError` for
+    anything but `MassProperties`.
 
     >>> write_inertials("new.urdf", {}, "old.urdf")
     Traceback (most recent call last):

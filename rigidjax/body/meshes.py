@@ -32,7 +32,6 @@ def mesh(
     **Arguments:** `vertices` (n, 3) m, body frame; `faces` (m, 3) vertex numbers from 0, counter-
     clockwise seen from outside; holes inside are closed meshes turned the other way; `density`
     kg/m³. Differentiable in `vertices` and `density`. Faces without area are harmless and allowed.
-
     Source: integrals over a tetrahedron, e.g. Tonon 2004, J. Math. Stat. 1:8.
 
     **Raises:** `ValueError` for a mesh that is open, whose faces disagree about outside, that is
@@ -66,11 +65,9 @@ def mesh_file(
     """The solid inside a closed mesh read from a file: STL, OBJ, PLY, OFF, GLB, …
 
     Needs `trimesh` (`pip install "rigidjax[mesh]"`), which also merges equal vertices.
-
     **Arguments:** `path` of the file; `density` kg/m³; `scale` metres per unit of the file (most
-    STL files are in millimetres: 1e-3).
-
-    **Raises:** `FileNotFoundError`; `ImportError` without trimesh; otherwise as `mesh`.
+    STL files are in millimetres: 1e-3). **Raises:** `FileNotFoundError`; `ImportError` without
+    trimesh; otherwise as `mesh`.
 
     >>> import tempfile
     >>> corner = "v 0 0 0;v 1 0 0;v 0 1 0;v 0 0 1;f 1 3 2;f 1 2 4;f 1 4 3;f 2 3 4"

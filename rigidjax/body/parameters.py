@@ -33,7 +33,6 @@ def pack(body: MassProperties) -> Float[Array, "10"]:
     **Arguments:** `body`, also a plate or a rod. **Returns** (10,)
     `(α, ρ, d1, d2, s12, s23, s13, t1, t2, t3)`: `mass = e^{2α}`, `com = t` (m, body frame), and
     about the centre of mass `𝔖 / mass` as in `pack_second_moment`, ρ the logarithm of a length (m).
-
     **Raises:** `ValueError` (`equinox` error under `jit`) for a point.
 
     >>> import rigidjax as rj
@@ -59,8 +58,6 @@ def unpack(vector: Float[ArrayLike, "10"] | Numbers) -> MassProperties:
     (|α|, |α + ρ| over 330 in float64, 31 in float32) grow logarithmically instead, so that an
     optimiser's step that is much too long gives a large body and not an infinity.
 
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
-
     >>> import jax.numpy as jnp
     >>> unpack(jnp.zeros(10)).inertia.moments
     Array([2., 2., 2.], dtype=float64)
@@ -75,9 +72,8 @@ def pack_second_moment(second_moment: Matrix) -> Float[Array, "6"]:
     """Six unconstrained numbers of a second moment.
 
     **Arguments:** `second_moment` (3, 3) 𝔖, kg m², positive semi-definite. **Returns** (6,)
-    `(ρ, d1, d2, s12, s23, s13)`: `Tr 𝔖 = 3 e^{2ρ}`, and the shape as in `pack_shape`.
-
-    **Raises:** `ValueError` (`equinox` error under `jit`) for an invalid or zero second moment.
+    `(ρ, d1, d2, s12, s23, s13)`: `Tr 𝔖 = 3 e^{2ρ}`, and the shape as in `pack_shape`. **Raises:**
+    `ValueError` (`equinox` error under `jit`) for an invalid or zero second moment.
 
     >>> import jax.numpy as jnp
     >>> pack_second_moment(jnp.eye(3))
@@ -90,8 +86,6 @@ def unpack_second_moment(vector: Float[ArrayLike, "6"] | Numbers) -> Mat3:
     """The second moment (3, 3), kg m², of six unconstrained numbers.
 
     **Arguments:** `vector` (6,) as `pack_second_moment` returns them.
-
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
 
     >>> import jax.numpy as jnp
     >>> unpack_second_moment(jnp.zeros(6))[0]
@@ -123,8 +117,6 @@ def unpack_shape(vector: Float[ArrayLike, "5"] | Numbers) -> Mat3:
 
     **Arguments:** `vector` (5,) as `pack_shape` returns them.
 
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
-
     >>> import jax.numpy as jnp
     >>> float(jnp.trace(unpack_shape(jnp.ones(5))))
     1.0
@@ -137,7 +129,6 @@ def pack_moments(moments: Vector) -> Float[Array, "3"]:
 
     **Arguments:** `moments` (3,) I1, I2, I3 in any order, kg m². **Returns** (3,) `(ρ, d1, d2)` as
     in `pack_second_moment`, of the second moments `λ1 = ½(I2 + I3 − I1)`, … (notes, eqs 76–78).
-
     **Raises:** `ValueError` (`equinox` error under `jit`) for moments of no body, or of a point.
 
     >>> pack_moments([2.0, 2.0, 2.0])
@@ -154,8 +145,6 @@ def unpack_moments(vector: Float[ArrayLike, "3"] | Numbers) -> Vec3:
     """Principal moments (3,), kg m², of three unconstrained numbers, always a body's.
 
     **Arguments:** `vector` (3,) as `pack_moments` returns them.
-
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
 
     >>> unpack_moments([0.0, 0.0, 0.0])
     Array([2., 2., 2.], dtype=float64)
@@ -177,8 +166,6 @@ def flat_bend(
     its derivative in the root A along n nᵀ. Zero where the body is not flat, or not pushed.
 
     **Arguments:** `shape` (5,) as in `pack_shape`; `slope` (5,) the misfit's derivative in it.
-
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
 
     >>> plate = pack_shape(jnp.diag(jnp.array([4.0, 4.0, 1e-12])))
     >>> flat_bend(plate, -1e-6 * jnp.ones(5)).shape

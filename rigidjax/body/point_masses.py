@@ -20,9 +20,8 @@ def points(
     """The body made of point masses: `𝔖 = Σ m (r − c)(r − c)ᵀ` (notes, eq 60).
 
     **Arguments:** `masses` (n,) kg, none negative; `positions` (n, 3) m, body frame, at any
-    distance from the origin: they are shifted before anything is multiplied.
-
-    **Raises:** `ValueError`, `TypeError` for shapes that do not match, a negative mass, or NaN.
+    distance from the origin: they are shifted before anything is multiplied. **Raises:**
+    `ValueError`, `TypeError` for shapes that do not match, a negative mass, or NaN.
 
     >>> points([1.0, 1.0], [[1.0, 0, 0], [-1.0, 0, 0]]).inertia.moments
     Array([0., 2., 2.], dtype=float64)
@@ -43,11 +42,10 @@ def voxels(
 ) -> MassProperties:
     """The body of a density given on the cells of a box, constant in each cell.
 
-    Exact for that density: each cell adds its own `m h²/12`. **Arguments:** `density`
-    (nx, ny, nz) kg/m³, none negative, indexed x, y, z; `spacing` (3,) edges of a cell, m;
-    `corner` (3,) of cell [0, 0, 0] with the smallest x, y, z, m, body frame.
-
-    **Raises:** `ValueError`, `TypeError` for a wrong shape, a negative density, or NaN.
+    Exact for that density: each cell adds its own `m h²/12`. **Arguments:** `density` (nx, ny, nz)
+    kg/m³, none negative, indexed x, y, z; `spacing` (3,) edges of a cell, m; `corner` (3,) of cell
+    [0, 0, 0] with the smallest x, y, z, m, body frame. **Raises:** `ValueError`, `TypeError` for a
+    wrong shape, a negative density, or NaN.
 
     >>> import jax.numpy as jnp
     >>> voxels(jnp.ones((1, 2, 3)), [1.0, 1.0, 1.0], [0.0, 0.0, 0.0]).com
@@ -78,9 +76,8 @@ def quadrature(
     `2·order − 1`. It is differentiable in all numbers of `density` and `place`.
 
     **Arguments:** `density` ρ, from r (3,) m to kg/m³; `place` from u (3,) in [0, 1]³ to r (3,) m,
-    body frame, one to one inside; `order` points along each direction.
-
-    **Raises:** `ValueError` for an order below 1, NaN, or if the result is no body.
+    body frame, one to one inside; `order` points along each direction. **Raises:** `ValueError` for
+    an order below 1, NaN, or if the result is no body.
 
     >>> import jax.numpy as jnp
     >>> body = quadrature(lambda r: jnp.ones(()), lambda u: u * jnp.array([1.0, 2.0, 3.0]), 2)

@@ -51,8 +51,6 @@ def principal(tensor: Mat3Like) -> tuple[Vec3, Quat]:
 
     Source: notes, eqs 71–72; first-order perturbation theory, Kato 1966, II.2.
 
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
-
     >>> moments, q = principal(jnp.diag(jnp.array([1.0, 2.0, 3.0])))
     >>> moments, q
     (Array([1., 2., 3.], dtype=float64), Array([1., 0., 0., 0.], dtype=float64))
@@ -162,8 +160,6 @@ def matrix_function(function: Callable[[Scalar], Scalar], tensor: Mat3Like) -> M
     **Arguments:** `function` f, scalar → scalar, written in `jax.numpy`, smooth on the spectrum; it
     may depend on differentiated values; `tensor` (3, 3) symmetric, I or 𝔖, any units.
     **Returns** (3, 3), same frame.
-
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
 
     >>> matrix_function(jnp.sqrt, 4.0 * jnp.eye(3))[0]
     Array([2., 0., 0.], dtype=float64)

@@ -20,9 +20,8 @@ def exponent_of(x: Float[Array, "..."]) -> Int[Array, ""]:
 def times_power_of_two(x: Float[Array, "..."], n: Int[Array, ""]) -> Float[Array, "..."]:
     """`x 2ⁿ`, exact, as are its derivatives by x, wherever the product is a normal number.
 
-    2ⁿ itself may be out of range: it is multiplied by as two factors.
-
-    **Arguments:** `x` of any shape; `n` scalar, |n| ≤ 2044 (float32: 252).
+    2ⁿ itself may be out of range: it is multiplied by as two factors. **Arguments:** `x` of any
+    shape; `n` scalar, |n| ≤ 2044 (float32: 252).
     """
     half = n // 2
     # XLA would multiply the two together first where it knows n.

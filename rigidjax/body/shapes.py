@@ -143,10 +143,8 @@ def capsule(mass: ScalarLike, radius: ScalarLike, length: ScalarLike) -> MassPro
 def cone(mass: ScalarLike, radius: ScalarLike, height: ScalarLike) -> MassProperties:
     """A solid cone along z. `𝔖 = m diag(3r²/20, 3r²/20, 3h²/80)`.
 
-    Its centre of mass, put at the origin, lies `height/4` from the base.
-
-    **Arguments:** `mass` kg; `radius` of the base, `height` m. **Raises:** `ValueError` for a
-    mass ≤ 0 or a negative length.
+    Its centre of mass, put at the origin, lies `height/4` from the base. **Arguments:** `mass` kg;
+    `radius` of the base, `height` m. **Raises:** `ValueError` for a mass ≤ 0 or a negative length.
 
     >>> cone(80.0, 1.0, 2.0).inertia.moments
     Array([24., 24., 24.], dtype=float64)
@@ -172,10 +170,8 @@ def rod(mass: ScalarLike, length: ScalarLike) -> MassProperties:
     """A rod along z without thickness. `𝔖 = m diag(0, 0, ℓ²/12)`.
 
     Its moment about z is zero: the equations of motion refuse it. Use `cylinder` for a rod with
-    thickness.
-
-    **Arguments:** `mass` kg; `length` m. **Raises:** `ValueError` for a mass ≤ 0 or a negative
-    length.
+    thickness. **Arguments:** `mass` kg; `length` m. **Raises:** `ValueError` for a mass ≤ 0 or a
+    negative length.
 
     >>> rod(12.0, 1.0).inertia.moments
     Array([0., 1., 1.], dtype=float64)

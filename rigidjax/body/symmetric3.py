@@ -20,8 +20,6 @@ def inverse(tensor: Mat3Like) -> Mat3:
     **Returns** (3, 3), reciprocal units. The matrix is divided by its trace first, so that a
     body of 1e-20 or of 1e37 kg m² neither underflows nor overflows. A zero moment gives
     infinities: `Inertia.invertible` refuses it in words.
-
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
     """
     return _inverse(_checks.floating(tensor, (3, 3), "tensor"))
 

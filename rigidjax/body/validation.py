@@ -67,9 +67,8 @@ def possible(body: Any, tensor: Float[Array, "*batch 3 3"], mass: Any, throw: bo
     """Return `body` if some mass has these numbers and no moment is zero.
 
     Other numbers are refused with the cause if they are known, or if `throw`. Without `throw` all
-    numbers of a traced body, and its motion, become NaN, but no other body's.
-
-    **Arguments:** `tensor` the inertia, kg m²; `mass` kg, `None` for a body that only turns.
+    numbers of a traced body, and its motion, become NaN, but no other body's. **Arguments:**
+    `tensor` the inertia, kg m²; `mass` kg, `None` for a body that only turns.
     """
     tensor = _checks.numbers(tensor, "inertia tensor")
     is_known = _checks.known((tensor, mass))

@@ -19,7 +19,6 @@ def common(**named: Any) -> tuple[Result, ...]:
     """All arguments as floating arrays of one dtype, broadcast to one shape.
 
     Python numbers take the dtype of the arrays beside them; without arrays it is JAX's default.
-
     **Raises:** `TypeError` unless it is float32, float64 or an integer; `ValueError` for shapes
     that do not broadcast.
     """

@@ -29,9 +29,8 @@ def rf(x: Real, y: Real, z: Real) -> Result:
     negative argument gives NaN.
 
     **Returns:** DLMF 19.16.1, by Carlson 1995 (doi 10.1007/BF02198293). ∂R_F/∂z = −R_D(x, y, z)/6
-    (DLMF 19.18.1), so the derivative with respect to an argument that is 0 is −∞.
-
-    **Raises:** `TypeError` for half precision; `ValueError` for shapes that do not broadcast.
+    (DLMF 19.18.1), so the derivative with respect to an argument that is 0 is −∞. **Raises:**
+    `TypeError` for half precision; `ValueError` for shapes that do not broadcast.
 
     >>> float(rf(4.0, 4.0, 4.0))
     0.5
@@ -44,10 +43,8 @@ def rd(x: Real, y: Real, z: Real) -> Result:
 
     **Arguments:** `x`, `y` ≥ 0, at most one of them 0, and `z` > 0, of shapes that broadcast; any
     one unit. Symmetric in x and y. z = 0 or x = y = 0 give infinity, negative arguments NaN.
-
-    **Returns:** DLMF 19.16.5, by Carlson 1995 (doi 10.1007/BF02198293).
-
-    **Raises:** `TypeError` for half precision; `ValueError` for shapes that do not broadcast.
+    **Returns:** DLMF 19.16.5, by Carlson 1995 (doi 10.1007/BF02198293). **Raises:** `TypeError` for
+    half precision; `ValueError` for shapes that do not broadcast.
 
     >>> float(rd(4.0, 4.0, 4.0))
     0.125
@@ -58,12 +55,10 @@ def rd(x: Real, y: Real, z: Real) -> Result:
 def rj_(x: Real, y: Real, z: Real, p: Real) -> Result:
     """R_J(x, y, z, p) = (3/2) ∫₀^∞ dt / ((t+p) √((t+x)(t+y)(t+z))), of the third kind.
 
-    The underscore keeps the name apart from `import rigidjax as rj`.
-
-    **Arguments:** `x`, `y`, `z` ≥ 0, at most one of them 0, and `p` > 0, of shapes that broadcast;
-    any one unit. p = 0 gives infinity; p < 0 (a principal value) is not offered and gives NaN.
-
-    **Returns:** DLMF 19.16.2, by the trapezoidal rule in ln t, exact to round-off.
+    The underscore keeps the name apart from `import rigidjax as rj`. **Arguments:** `x`, `y`, `z` ≥
+    0, at most one of them 0, and `p` > 0, of shapes that broadcast; any one unit. p = 0 gives
+    infinity; p < 0 (a principal value) is not offered and gives NaN. **Returns:** DLMF 19.16.2, by
+    the trapezoidal rule in ln t, exact to round-off.
 
     **Raises:** `TypeError` for half precision; `ValueError` for shapes that do not broadcast.
 
@@ -76,12 +71,10 @@ def rj_(x: Real, y: Real, z: Real, p: Real) -> Result:
 def rc(x: Real, y: Real) -> Result:
     """R_C(x, y) = ½ ∫₀^∞ dt / ((t+y) √(t+x)), the elementary one: arctangents and logarithms.
 
-    **Arguments:** `x` ≥ 0 and `y` ≠ 0 of shapes that broadcast; any one unit. For y < 0 the
-    Cauchy principal value (DLMF 19.2.20). y = 0 gives infinity, x < 0 gives NaN.
-
-    **Returns:** DLMF 19.2.17; R_C(x, y) = R_F(x, y, y), by Carlson 1995 (doi 10.1007/BF02198293).
-
-    **Raises:** `TypeError` for half precision; `ValueError` for shapes that do not broadcast.
+    **Arguments:** `x` ≥ 0 and `y` ≠ 0 of shapes that broadcast; any one unit. For y < 0 the Cauchy
+    principal value (DLMF 19.2.20). y = 0 gives infinity, x < 0 gives NaN. **Returns:** DLMF
+    19.2.17; R_C(x, y) = R_F(x, y, y), by Carlson 1995 (doi 10.1007/BF02198293). **Raises:**
+    `TypeError` for half precision; `ValueError` for shapes that do not broadcast.
 
     >>> float(rc(4.0, 4.0))
     0.5

@@ -37,12 +37,10 @@ def sncndn(u: Real, m: Real, m1: Real | None = None) -> tuple[Result, Result, Re
     1 − m would lose digits; then the functions are functions of m1 alone, value and derivative, and
     m only lends its digits where it is small. Shapes broadcast.
 
-    **Returns:** three arrays (DLMF 22.2.4–6). m = 0 gives sin, cos, 1; m = 1 gives tanh, sech,
-    sech (DLMF 22.5.3–4); m < 0 and m > 1 by DLMF 22.17. Exact derivatives of every order in u
-    (DLMF 22.13(i)), m, m1.
-
-    **Raises:** `TypeError` for half precision; `ValueError` for shapes that do not broadcast or
-    m + m1 ≠ 1.
+    **Returns:** three arrays (DLMF 22.2.4–6). m = 0 gives sin, cos, 1; m = 1 gives tanh, sech, sech
+    (DLMF 22.5.3–4); m < 0 and m > 1 by DLMF 22.17. Exact derivatives of every order in u (DLMF
+    22.13(i)), m, m1. **Raises:** `TypeError` for half precision; `ValueError` for shapes that do
+    not broadcast or m + m1 ≠ 1.
 
     >>> [round(float(x), 12) for x in sncndn(1.0, 0.5)]
     [0.803001824896, 0.595976567672, 0.823161001632]
@@ -56,11 +54,8 @@ def am(u: Real, m: Real, m1: Real | None = None) -> Result:
     """Jacobi's amplitude φ = ∫₀^u dn(v|m) dv, rad: the inverse of F(φ|m) for m ≤ 1.
 
     **Arguments:** as `sncndn`. For m ≤ 1 the amplitude grows by π each half period 2K, without
-    jumps; for m > 1 it swings within |φ| ≤ arcsin(1/√m).
-
-    **Returns:** DLMF 22.16.1–3.
-
-    **Raises:** as `sncndn`.
+    jumps; for m > 1 it swings within |φ| ≤ arcsin(1/√m). **Returns:** DLMF 22.16.1–3. **Raises:**
+    as `sncndn`.
 
     >>> round(float(am(1.0, 0.5)), 12)
     0.932315079884

@@ -36,11 +36,9 @@ def ellipk(m: Real, m1: Real | None = None) -> Result:
     """Complete elliptic integral of the first kind, K(m) = ∫₀^{π/2} dθ/√(1 − m sin²θ).
 
     **Arguments:** `m` the parameter k², not the modulus; m < 1 (infinite at 1, NaN beyond; negative
-    is fine). `m1` = 1 − m given exactly, where m is so near 1 that 1 − m would lose digits: then
-    it alone decides, value and derivative. Shapes broadcast.
-
-    **Returns:** π/(2 agm(1, √m1)) (DLMF 19.8.5), the arithmetic–geometric mean by a number of steps
-    fixed by the dtype.
+    is fine). `m1` = 1 − m given exactly, where m is so near 1 that 1 − m would lose digits: then it
+    alone decides, value and derivative. Shapes broadcast. **Returns:** π/(2 agm(1, √m1)) (DLMF
+    19.8.5), the arithmetic–geometric mean by a number of steps fixed by the dtype.
 
     **Raises:** `TypeError` for half precision; `ValueError` for shapes that do not broadcast or
     m + m1 ≠ 1.
@@ -56,11 +54,8 @@ def ellipe(m: Real, m1: Real | None = None) -> Result:
     """Complete elliptic integral of the second kind, E(m) = ∫₀^{π/2} √(1 − m sin²θ) dθ.
 
     **Arguments:** `m` ≤ 1 the parameter k² (NaN beyond 1); `m1` = 1 − m given exactly, see
-    `ellipk`. Shapes broadcast.
-
-    **Returns:** DLMF 19.25.1 in Carlson's integrals, a sum of positive terms.
-
-    **Raises:** as `ellipk`.
+    `ellipk`. Shapes broadcast. **Returns:** DLMF 19.25.1 in Carlson's integrals, a sum of positive
+    terms. **Raises:** as `ellipk`.
 
     >>> float(ellipe(1.0))
     1.0
@@ -77,9 +72,7 @@ def ellippi(n: Real, m: Real, m1: Real | None = None, n1: Real | None = None) ->
     exactly, see `ellipk`. Shapes broadcast. The order is Wolfram's and mpmath's.
 
     **Returns:** DLMF 19.2.8 as one half-line integral with a positive integrand: full accuracy for
-    any n < 1, circular and hyperbolic.
-
-    **Raises:** as `ellipk`.
+    any n < 1, circular and hyperbolic. **Raises:** as `ellipk`.
 
     >>> round(float(ellippi(0.5, 0.5)), 12)
     2.701287762095
@@ -92,11 +85,8 @@ def ellipf(phi: Real, m: Real, m1: Real | None = None) -> Result:
     """Incomplete elliptic integral of the first kind, F(φ|m) = ∫₀^φ dθ/√(1 − m sin²θ).
 
     **Arguments:** `phi` the amplitude, rad, any size; `m` the parameter k², m sin²φ < 1 (NaN
-    beyond); `m1` = 1 − m given exactly, see `ellipk`. Shapes broadcast.
-
-    **Returns:** DLMF 19.25.5 in Carlson's R_F after reduction to |φ| ≤ π/2 (DLMF 19.2.10).
-
-    **Raises:** as `ellipk`.
+    beyond); `m1` = 1 − m given exactly, see `ellipk`. Shapes broadcast. **Returns:** DLMF 19.25.5
+    in Carlson's R_F after reduction to |φ| ≤ π/2 (DLMF 19.2.10). **Raises:** as `ellipk`.
 
     >>> round(float(ellipf(1.0, 0.5)), 12)
     1.083216772845
@@ -108,12 +98,9 @@ def ellipf(phi: Real, m: Real, m1: Real | None = None) -> Result:
 def ellipeinc(phi: Real, m: Real, m1: Real | None = None) -> Result:
     """Incomplete elliptic integral of the second kind, E(φ|m) = ∫₀^φ √(1 − m sin²θ) dθ.
 
-    **Arguments:** `phi` the amplitude, rad, any size; `m` ≤ 1 the parameter k² (NaN beyond 1);
-    `m1` = 1 − m given exactly, see `ellipk`. Shapes broadcast.
-
-    **Returns:** DLMF 19.25.9 or 19.25.10 in Carlson's integrals, whichever has positive terms,
-    after reduction to |φ| ≤ π/2 (DLMF 19.2.10).
-
+    **Arguments:** `phi` the amplitude, rad, any size; `m` ≤ 1 the parameter k² (NaN beyond 1); `m1`
+    = 1 − m given exactly, see `ellipk`. Shapes broadcast. **Returns:** DLMF 19.25.9 or 19.25.10 in
+    Carlson's integrals, whichever has positive terms, after reduction to |φ| ≤ π/2 (DLMF 19.2.10).
     **Raises:** as `ellipk`.
 
     >>> round(float(ellipeinc(1.0, 0.5)), 12)
@@ -130,9 +117,8 @@ def ellippiinc(
 
     **Arguments:** `n` the characteristic, n sin²φ < 1; `phi` the amplitude, rad, any size; `m` the
     parameter k², m sin²φ < 1 (NaN beyond either bound); `m1` = 1 − m and `n1` = 1 − n given
-    exactly, see `ellipk`. Shapes broadcast. The order is Wolfram's and mpmath's.
-
-    **Returns:** DLMF 19.2.7 as one half-line integral after reduction to |φ| ≤ π/2 (19.2.10).
+    exactly, see `ellipk`. Shapes broadcast. The order is Wolfram's and mpmath's. **Returns:** DLMF
+    19.2.7 as one half-line integral after reduction to |φ| ≤ π/2 (19.2.10).
 
     **Raises:** as `ellipk`.
 

@@ -206,9 +206,8 @@ def foucault(
 
     **Arguments:** `latitude` λ, rad, north positive; `length` of the string, m; `gravity` m/s²,
     along the plumb line; `rate` of the Earth, rad/s (WGS84 unless given). Any may be traced: the
-    latitude and the rate can be fitted to a record.
-
-    **Raises:** `ValueError` for a length or gravity that is not positive, a latitude in degrees.
+    latitude and the rate can be fitted to a record. **Raises:** `ValueError` for a length or
+    gravity that is not positive, a latitude in degrees.
 
     >>> pendulum = foucault(0.85, 67.0)
     >>> pendulum.start(3.0, 0.0).v.tolist()

@@ -103,14 +103,10 @@ class BodyInFrame(eqx.Module):
 
     I dΩ'/dt = IΩ' × Ω' + [τ + IΩ_abs × Ω_abs − IΩ' × Ω' − I(Q'ᵀ dΩ/dt − Ω' × W)].
 
-    and the centre of mass moves as a `Point` does (eq 91).
-
-    **Arguments:** `frame` the `MovingFrame` S'; `torque` the real τ,
-    `(t, state in S', body) → (3,)`, N m, body axes, or a model of it that gives a `Wrench`, with
-    its force in the axes of S'; or `None`.
-
-    Source: notes, eqs 50, 91, for a body instead of a point. **Raises:** `TypeError` for a force on
-    a state that only turns.
+    and the centre of mass moves as a `Point` does (eq 91). **Arguments:** `frame` the `MovingFrame`
+    S'; `torque` the real τ, `(t, state in S', body) → (3,)`, N m, body axes, or a model of it that
+    gives a `Wrench`, with its force in the axes of S'; or `None`. Source: notes, eqs 50, 91, for a
+    body instead of a point. **Raises:** `TypeError` for a force on a state that only turns.
 
     >>> import rigidjax as rj
     >>> frame = MovingFrame(rj.frames.Uniform([0.0, 0.0, 1.0]))

@@ -18,9 +18,7 @@ class Tide(eqx.Module):
     """Gravity-gradient torque 3n² u × I u on a circular orbit, seen from the orbital frame.
 
     u is the direction away from the planet, the first axis of that frame. Source: Hughes 1986,
-    Spacecraft Attitude Dynamics, sec. 8.1.
-
-    **Arguments:** `rate` n, rad/s, scalar array.
+    Spacecraft Attitude Dynamics, sec. 8.1. **Arguments:** `rate` n, rad/s, scalar array.
     """
 
     feels: ClassVar[type] = HasAttitude
@@ -40,9 +38,8 @@ def libration(rate: ScalarLike) -> BodyInFrame:
     at n about z. `q` takes body axes to it, `omega` is the rate relative to it, in body axes.
 
     **Arguments:** `rate` n of the orbit, rad/s. Small librations in the plane of a body with
-    principal moments (a, b, c) along (x, y, z) have the rate n √(3 (b − a)/c).
-
-    Source: Hughes 1986, ch. 9; notes, eqs 50, 91.
+    principal moments (a, b, c) along (x, y, z) have the rate n √(3 (b − a)/c). Source: Hughes 1986,
+    ch. 9; notes, eqs 50, 91.
 
     >>> import rigidjax as rj
     >>> body = rj.Inertia.from_principal(1.0, 2.0, 2.5)

@@ -19,7 +19,6 @@ class MovingFrame(eqx.Module):
     """A frame S' that turns and moves in any differentiable way, relative to an inertial S.
 
     Coordinates transform as x = X(t) + M(t) x' (notes, eqs 85, 86, with an origin added).
-
     **Arguments:**
 
     - `rotation`: a function of time, s, to M (3, 3) or to its unit quaternion (4,), S' → S; or a
@@ -33,7 +32,6 @@ class MovingFrame(eqx.Module):
       differentiation.
 
     Its numbers may be traced: gradients with respect to a rate or an origin pass through.
-
     **Raises:** `TypeError` for a `rotation` that is neither; when used, `ValueError` for a value
     that is no rotation (checked where the value is known, that is outside `jit`).
 

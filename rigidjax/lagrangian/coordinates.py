@@ -23,8 +23,6 @@ class Coordinates(eqx.Module):
     **Arguments:** `q` (n,) generalised coordinates, in the Lagrangian's units; `rate` (n,) dq/dt,
     per second. Leading axes are allowed in a container of many states; functions take one.
 
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
-
     >>> Coordinates([0.1, 0.2], [0.0, 1.0]).rate.shape
     (2,)
     """
@@ -85,15 +83,12 @@ def equations_of_motion(
 
     **Arguments:** `lagrangian` a callable, best a Module (its numbers can then be differentiated
     and changed without compiling again), `(q, q̇) → L`, J, with `q`, `q̇` (n,); `force` generalised
-    forces without a potential, `(t, q, q̇) → Q` (n,), or `None`.
+    forces without a potential, `(t, q, q̇) → Q` (n,), or `None`. **Returns** a Module, for
+    `diffrax.ODETerm`. Up to three coordinates are solved by cofactors, more by LU (`lineax`).
 
-    **Returns** a Module, for `diffrax.ODETerm`. Up to three coordinates are solved by cofactors,
-    more by LU (`lineax`).
-
-    Source: Landau and Lifshitz, Mechanics, eq 2.6; the notes mention it after eq 57.
-
-    **Raises:** `TypeError` for anything but functions; `ValueError` if L is not one number. A
-    singular ∂²L/∂q̇∂q̇ (a chart's singularity, a coordinate without mass) gives infinities or NaN.
+    Source: Landau and Lifshitz, Mechanics, eq 2.6; the notes mention it after eq 57. **Raises:**
+    `TypeError` for anything but functions; `ValueError` if L is not one number. A singular
+    ∂²L/∂q̇∂q̇ (a chart's singularity, a coordinate without mass) gives infinities or NaN.
 
     >>> pendulum = equations_of_motion(lambda q, v: 0.5 * v[0] ** 2 + 9.81 * jnp.cos(q[0]))
     >>> pendulum(0.0, Coordinates([jnp.pi / 2], [0.0])).rate
@@ -112,9 +107,8 @@ class EulerAngleTop(eqx.Module):
     with a potential that does not depend on time, such as `HeavyTop`, or `None`.
 
     A call with the angles (φ, θ, ψ), sequence 3-1-3, rad, and their rates returns L, J. Source:
-    notes, eqs 33, 75, 81–83. Singular at sin θ = 0.
-
-    **Raises:** `TypeError` for a torque without a potential.
+    notes, eqs 33, 75, 81–83. Singular at sin θ = 0. **Raises:** `TypeError` for a torque without a
+    potential.
 
     >>> from rigidjax import Inertia
     >>> free = EulerAngleTop(Inertia.from_principal(1.0, 1.0, 2.0))
@@ -162,10 +156,9 @@ def to_attitude(y: Coordinates) -> Attitude:
 def from_attitude(state: HasAttitude) -> Coordinates:
     """3-1-3 Euler angles and their rates of an attitude and a body rate.
 
-    **Arguments:** `state` with `.q` (4,), body → world, and `.omega` (3,), rad/s.
-
-    **Raises:** `ValueError` (`EquinoxRuntimeError` under `jit`) at sin θ = 0, where the angles are
-    not unique and the rates do not exist.
+    **Arguments:** `state` with `.q` (4,), body → world, and `.omega` (3,), rad/s. **Raises:**
+    `ValueError` (`EquinoxRuntimeError` under `jit`) at sin θ = 0, where the angles are not unique
+    and the rates do not exist.
 
     >>> back = from_attitude(to_attitude(Coordinates([0.1, 0.2, 0.3], [1.0, 2.0, 3.0])))
     >>> back.rate.round(12).tolist()

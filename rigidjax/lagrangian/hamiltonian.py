@@ -21,8 +21,6 @@ class Momentum(eqx.Module):
     **Arguments:** `pi` (3,) Π = IΩ, N m s, body frame. Leading axes are allowed in a container of
     many states; functions take one.
 
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
-
     >>> Momentum([1.0, 0.0, 0.0]).pi.shape
     (3,)
     """
@@ -38,7 +36,6 @@ class MomentumAndDirection(eqx.Module):
 
     **Arguments:** `pi` (3,) Π, N m s, body frame; `gamma` (3,) γ = Rᵀ d of a vector d that is fixed
     in the world, body frame. Any length and unit: for `HeavyTopHamiltonian` d = g, m/s².
-
     **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype, or leading axes that differ.
 
     >>> MomentumAndDirection([1.0, 0.0, 0.0], [0.0, 0.0, -9.81]).gamma.shape
@@ -85,9 +82,8 @@ def lie_poisson(hamiltonian: Callable[[Any], Any]) -> LiePoisson:
 
     **Arguments:** `hamiltonian` a callable, best a Module, `Π → H`, J, with Π (3,), N m s, body
     frame; ∇H is then the body rate Ω. For `½ Π·I⁻¹Π`, `RotationalHamiltonian(inertia)`, these are
-    Euler's equations. Keeps H and the Casimir |Π|².
-
-    Source: Marsden and Ratiu, Introduction to Mechanics and Symmetry, §§1.2, 1.3.
+    Euler's equations. Keeps H and the Casimir |Π|². Source: Marsden and Ratiu, Introduction to
+    Mechanics and Symmetry, §§1.2, 1.3.
 
     **Raises:** `TypeError` for what cannot be called; `ValueError` where H is not one number.
 
@@ -103,12 +99,9 @@ def lie_poisson_with_direction(hamiltonian: Callable[[Any, Any], Any]) -> LiePoi
     """The heavy-top form: `dΠ/dt = Π × ∂H/∂Π + γ × ∂H/∂γ`, `dγ/dt = γ × ∂H/∂Π`, of any H(Π, γ).
 
     **Arguments:** `hamiltonian` a callable, best a Module, `(Π, γ) → H`, J. For a heavy top give
-    `HeavyTopHamiltonian(inertia, top)`. It conserves H and the Casimirs |γ|² and Π·γ.
-
-    Source: the Lie–Poisson equations of se(3)*; Marsden and Ratiu, Introduction to Mechanics and
-    Symmetry, §1.4.
-
-    **Raises:** `TypeError` for what cannot be called; `ValueError` where H is not one number.
+    `HeavyTopHamiltonian(inertia, top)`. It conserves H and the Casimirs |γ|² and Π·γ. Source: the
+    Lie–Poisson equations of se(3)*; Marsden and Ratiu, Introduction to Mechanics and Symmetry,
+    §1.4. **Raises:** `TypeError` for what cannot be called; `ValueError` where H is not one number.
 
     >>> field = lie_poisson_with_direction(lambda p, g: 0.5 * dot(p, p) - g[2])
     >>> field(0.0, MomentumAndDirection([0.0, 0, 1], [1.0, 0, 0])).pi.tolist()
@@ -126,7 +119,6 @@ class RotationalHamiltonian(eqx.Module):
     """H = ½ Π·I⁻¹Π, the energy of rotation.
 
     **Arguments:** `inertia` about the centre of mass or a fixed point. Called with Π (3,), gives J.
-
     **Raises:** `TypeError` for anything but an `Inertia`; `ValueError` for a moment known to be
     zero.
 
@@ -149,10 +141,9 @@ class HeavyTopHamiltonian(eqx.Module):
     """H = ½ Π·I⁻¹Π − m c·γ with γ = Rᵀ g, the energy of a heavy top.
 
     **Arguments:** `inertia` about the fixed point; `top` a `HeavyTop`, of which m and c are used.
-    Called with Π (3,) and γ (3,), m/s², body frame, gives J. `start` makes the state.
-
-    **Raises:** `TypeError` for an `inertia` that is no `Inertia`, or a `top` that is no `HeavyTop`:
-    another torque has no such Hamiltonian; `ValueError` for a moment known to be zero.
+    Called with Π (3,) and γ (3,), m/s², body frame, gives J. `start` makes the state. **Raises:**
+    `TypeError` for an `inertia` that is no `Inertia`, or a `top` that is no `HeavyTop`: another
+    torque has no such Hamiltonian; `ValueError` for a moment known to be zero.
 
     >>> import rigidjax as rj
     >>> top = rj.torques.HeavyTop(2.0, [0.0, 0, 0.5], [0.0, 0, -9.81])

@@ -31,9 +31,8 @@ def energy(
 
     `T + U`, `T = ½ m |v|² + ½ Ω·IΩ` (notes, eq 79). Wheels inside count as no energy, but for
     `ReactionWheels`. Under a torque with states of its own `state` is a `Coupled`, as
-    `batch.rollout` and `crossings` give it.
-
-    **Raises:** `TypeError` for a torque without a potential.
+    `batch.rollout` and `crossings` give it. **Raises:** `TypeError` for a torque without a
+    potential.
 
     >>> import rigidjax as rj
     >>> top = rj.torques.HeavyTop(2.0, [0.0, 0.0, 0.5], [0.0, 0.0, -9.81])
@@ -62,9 +61,8 @@ def conserved(
 
     **Arguments:** `body`, `state`, `torque` as for `simulate`; `t` s. A torque declares its
     conserved quantities by optional members, see `rigidjax.torques.AbstractTorque`; without them
-    nothing is conserved.
-
-    **Returns** a dict of the conserved quantities here, the same names at all times:
+    nothing is conserved. **Returns** a dict of the conserved quantities here, the same names at all
+    times:
 
     - `energy`, J: every torque has a potential and none depends on time;
     - `momentum` (3,), kg m²/s, world frame, `R(IΩ + h)`, and `momentum_squared`, the Casimir
@@ -120,10 +118,9 @@ def drift(
     """The drift of each conserved quantity during a run, relative to its size.
 
     **Arguments:** `ts` (T,) s; `ys` states with a leading time axis, a `Coupled` of them under a
-    torque with states of its own; `body`, `torque` as for `simulate`.
-
-    **Returns** for each name of `conserved` the largest distance from its value at `ts[0]`, divided
-    by the largest kinetic energy, momentum, or momentum squared of the run. Zero is perfect.
+    torque with states of its own; `body`, `torque` as for `simulate`. **Returns** for each name of
+    `conserved` the largest distance from its value at `ts[0]`, divided by the largest kinetic
+    energy, momentum, or momentum squared of the run. Zero is perfect.
 
     >>> import jax, rigidjax as rj
     >>> body, ts = rj.Inertia.from_principal(1.0, 2.0, 3.0), jax.numpy.linspace(0.0, 9.0, 4)

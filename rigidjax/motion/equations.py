@@ -27,8 +27,6 @@ class Spin(eqx.Module):
     **Arguments:** `omega` (3,) angular velocity Ω in the body frame, rad/s (notes, eq 49). Leading
     axes are allowed in a container of many states; functions take one.
 
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
-
     >>> Spin([1.0, 0.0, 0.0]).omega.shape
     (3,)
     """
@@ -109,10 +107,8 @@ class EulerEquations(eqx.Module):
 
     **Arguments:** `inertia` the body, about the point that it turns about; `torque` τ in the body
     frame, N m, or `None` for a free body. A field for `diffrax.ODETerm`; `args` is not used. Its
-    values are in the precision of `state.omega`.
-
-    Source: Lie–Poisson form `dΠ/dt = Π × ∇H(Π) + τ` with `Π = IΩ`, `H = ½ Π·I⁻¹Π`; Landau and
-    Lifshitz, Mechanics, eq 36.4.
+    values are in the precision of `state.omega`. Source: Lie–Poisson form `dΠ/dt = Π × ∇H(Π) + τ`
+    with `Π = IΩ`, `H = ½ Π·I⁻¹Π`; Landau and Lifshitz, Mechanics, eq 36.4.
 
     **Raises:** `ValueError` for a rod or a point, since the equations divide by the zero moment, if
     the numbers are known; under `jit` call `Inertia.invertible` first.
@@ -163,7 +159,6 @@ class AttitudeEquations(eqx.Module):
 
     The state holds Ω, not Π = IΩ: two heavy tops at tolerances 1e-6, 1e-9, 1e-12 took the same
     number of steps with either to 3 % (diffrax.Dopri8), and their errors differed by up to a third.
-
     Source: `dM/dt = M J'` (notes, eq 50), written for the quaternion of M.
 
     >>> import rigidjax as rj
@@ -189,11 +184,7 @@ class NewtonEuler(eqx.Module):
     **Arguments:** `body` mass properties; the inertia used is the one about its centre of mass;
     `torque` a torque τ about the centre of mass, N m, body frame, or a force model that returns a
     `Wrench` (F in N, world frame, and τ), or `None`. A field for `diffrax.ODETerm`; `args` is not
-    used.
-
-    Source: notes, eqs 1, 50, 56, 84.
-
-    **Raises:** as `EulerEquations`.
+    used. Source: notes, eqs 1, 50, 56, 84. **Raises:** as `EulerEquations`.
 
     >>> import rigidjax as rj
     >>> field = NewtonEuler(rj.shapes.box(2.0, [0.1, 0.2, 0.3]))

@@ -40,12 +40,10 @@ def family(
 
     Each member starts from the one before and its tangent, and is corrected as by `periodic_orbit`.
 
-    **Arguments:** `orbit` one near the first of them; `values` (N,), neighbours near one
-    another; `hold` `"x"`, `"z"`, `"vy"` or `"period"`, which must be monotone along the family (use
-    `follow` past a fold).
-
-    **Returns** a `PeriodicOrbit` with a leading axis; its derivatives with respect to μ and
-    `values` are those of the family, forward and reverse.
+    **Arguments:** `orbit` one near the first of them; `values` (N,), neighbours near one another;
+    `hold` `"x"`, `"z"`, `"vy"` or `"period"`, which must be monotone along the family (use `follow`
+    past a fold). **Returns** a `PeriodicOrbit` with a leading axis; its derivatives with respect to
+    μ and `values` are those of the family, forward and reverse.
 
     **Raises:** `ValueError` (`EquinoxRuntimeError` under `jit`) with the value at which it was
     lost.
@@ -111,10 +109,9 @@ def _at_values(scene: Any, start: Array, held: Array, index: int, tolerance: flo
 def family_slope(scene: Any, orbit: PeriodicOrbit, *, hold: str = "x") -> PeriodicOrbit:
     """The change of an orbit's start and period along its family, per unit of `hold`.
 
-    **Arguments:** `orbit` a member of it; `hold` as in `family`. **Returns** the derivatives in
-    the shape of an orbit: `.period` is d period/d hold. Exact (implicit function theorem).
-
-    **Raises:** `ValueError` at a fold of the family in `hold`.
+    **Arguments:** `orbit` a member of it; `hold` as in `family`. **Returns** the derivatives in the
+    shape of an orbit: `.period` is d period/d hold. Exact (implicit function theorem). **Raises:**
+    `ValueError` at a fold of the family in `hold`.
 
     >>> from rigidjax import Point, orbits
     >>> hill, start = orbits.hill(), Point([0.3, 0, 0], [0.0, 1.6, 0])
@@ -143,16 +140,13 @@ def follow(
 ) -> PeriodicOrbit:
     """The next `count` members of a family, at fixed steps of arclength, past its folds.
 
-    Pseudo-arclength continuation in (x, z, v_y, T/2): each start lies at `step` along the
-    tangent, and Newton's method goes back across it (Keller 1977, in
-    Applications of Bifurcation Theory).
+    Pseudo-arclength continuation in (x, z, v_y, T/2): each start lies at `step` along the tangent,
+    and Newton's method goes back across it (Keller 1977, in Applications of Bifurcation Theory).
 
     **Arguments:** `orbit` a member, not returned; `step` arclength, with the sign of the direction;
-    `rising` the number that grows at first for a positive `step`.
-
-    **Returns** a `PeriodicOrbit` with a leading axis. To differentiate one give it to
-    `periodic_orbit`. **Raises:** `ValueError` (`EquinoxRuntimeError` under `jit`) with the number
-    of members before it was lost.
+    `rising` the number that grows at first for a positive `step`. **Returns** a `PeriodicOrbit`
+    with a leading axis. To differentiate one give it to `periodic_orbit`. **Raises:** `ValueError`
+    (`EquinoxRuntimeError` under `jit`) with the number of members before it was lost.
     """
     start, index = crossing(orbit), named(rising)
     length = _checks.floating(step, (), "step").astype(start.dtype)
@@ -233,12 +227,10 @@ def bifurcation(
     period; at cos(2πp/q) one of q times the period. `index` 1 of planar Lyapunov orbits is the one
     across the plane; the halo orbits begin at its value 1.
 
-    **Arguments:** `orbit`, `other` two members near each other, between which the index passes
-    the value; `index` 0 or 1 of `stability_indices`; `value` of it; `hold` the number of the family
-    for the search, `"x"`, `"z"`, `"vy"` or `"period"`. It works on the host.
-
-    Source: Howell 1984, doi:10.1007/BF01358403; Robin and Markellos 1980,
-    doi:10.1007/BF01231183.
+    **Arguments:** `orbit`, `other` two members near each other, between which the index passes the
+    value; `index` 0 or 1 of `stability_indices`; `value` of it; `hold` the number of the family for
+    the search, `"x"`, `"z"`, `"vy"` or `"period"`. It works on the host. Source: Howell 1984,
+    doi:10.1007/BF01358403; Robin and Markellos 1980, doi:10.1007/BF01231183.
 
     **Raises:** `ValueError` if the value does not lie between, or the indices are complex.
     """

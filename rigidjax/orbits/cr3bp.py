@@ -170,9 +170,8 @@ def cr3bp(mu: ScalarLike, radii: Float[Array, "2"] | object = (0.0, 0.0)) -> Thr
 
     **Arguments:** `mu` μ = m₂/(m₁ + m₂), 0 < μ ≤ ½ (Earth–Moon 0.01215…); `radii` (2,) of the two
     bodies in units of their distance: a run that comes closer ends with a collision's body, time
-    and distance. With zeros it ends at a distance that float64 can no longer resolve.
-
-    **Raises:** `ValueError` for μ outside (0, ½] (`EquinoxRuntimeError` under `jit`).
+    and distance. With zeros it ends at a distance that float64 can no longer resolve. **Raises:**
+    `ValueError` for μ outside (0, ½] (`EquinoxRuntimeError` under `jit`).
 
     Source: notes, eq 91, with a uniform Ω = (0, 0, 1); Szebehely 1967, Theory of Orbits.
 

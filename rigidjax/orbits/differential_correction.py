@@ -55,12 +55,10 @@ def periodic_orbit(
     its family (`"x"` for Lyapunov orbits, `"z"` for halo orbits); `tolerance` largest |y|, |v_x|,
     |v_z| at the half period, 1e-12 unless given (1e-4 in float32).
 
-    **Returns** a `PeriodicOrbit`. Its derivatives with respect to μ and the held number are
-    those of the family, by the implicit function theorem, forward and reverse.
-
-    Source: Howell 1984, doi:10.1007/BF01358403.
-
-    **Raises:** `ValueError` (`EquinoxRuntimeError` under `jit`) if Newton does not converge.
+    **Returns** a `PeriodicOrbit`. Its derivatives with respect to μ and the held number are those
+    of the family, by the implicit function theorem, forward and reverse. Source: Howell 1984,
+    doi:10.1007/BF01358403. **Raises:** `ValueError` (`EquinoxRuntimeError` under `jit`) if Newton
+    does not converge.
 
     >>> from rigidjax import orbits
     >>> moon = orbits.cr3bp(0.0121505856)

@@ -62,9 +62,8 @@ class Hill(AbstractReversible):
 def hill(radius: ScalarLike = 0.0) -> Hill:
     """Hill's problem, the limit of `cr3bp(mu)` as μ → 0 in units of μ^{1/3}.
 
-    **Arguments:** `radius` of the small body, in these units, for collisions.
-
-    Source: Hill 1878, doi:10.2307/2369430; Szebehely 1967, sec. 10.4.
+    **Arguments:** `radius` of the small body, in these units, for collisions. Source: Hill 1878,
+    doi:10.2307/2369430; Szebehely 1967, sec. 10.4.
 
     >>> hill().lagrange_points[1].round(12).tolist()
     [0.693361274351, 0.0, 0.0]

@@ -137,12 +137,10 @@ def manifold(
     other; `count` N motions, from equal phases of the orbit; `samples` T times of each;
     `distance` of the starts from the orbit, in (x, v): their error is of the order of its square.
 
-    The direction is the eigenvector of the monodromy whose multiplier is the largest, carried
-    along the orbit by the transition matrix; the stable manifold is the mirror image, in
-    y → −y, of the unstable one.
-
-    **Returns** a `Manifold`. Source: Koon, Lo, Marsden and Ross 2011, Dynamical Systems, the
-    Three-Body Problem and Space Mission Design, sec. 7.4.
+    The direction is the eigenvector of the monodromy whose multiplier is the largest, carried along
+    the orbit by the transition matrix; the stable manifold is the mirror image, in y → −y, of the
+    unstable one. **Returns** a `Manifold`. Source: Koon, Lo, Marsden and Ross 2011, Dynamical
+    Systems, the Three-Body Problem and Space Mission Design, sec. 7.4.
 
     **Raises:** `ValueError` for an orbit without such a multiplier, and for another word.
 

@@ -64,10 +64,8 @@ class AbstractReversible(AbstractScene):
         """The two ν = ½(λ + 1/λ) of the multipliers that are not 1, larger real part first.
 
         The orbit is stable to first order if both are real and |ν| ≤ 1. Many:
-        `jax.vmap(scene.stability_indices)(scene.family(…))`.
-
-        Source: Howell 1984, doi:10.1007/BF01358403; from traces: Bray and Goudas 1967, Adv.
-        Astron. Astrophys. 5, 71.
+        `jax.vmap(scene.stability_indices)(scene.family(…))`. Source: Howell 1984,
+        doi:10.1007/BF01358403; from traces: Bray and Goudas 1967, Adv. Astron. Astrophys. 5, 71.
         """
         return continuation.stability_indices(self.monodromy(orbit))
 

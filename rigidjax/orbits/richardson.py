@@ -18,9 +18,8 @@ def guess(
 
     **Arguments:** `mu` μ; `point` 1, 2 or 3; one of `along_x` (a planar Lyapunov orbit) and
     `along_z` (a halo orbit, its sign the branch), in units of the primaries' distance. It is good
-    if the amplitude is a small part of the distance to the nearer body.
-
-    Source: Richardson 1980, Celest. Mech. 22, 241, doi:10.1007/BF01229511, at τ = 0.
+    if the amplitude is a small part of the distance to the nearer body. Source: Richardson 1980,
+    Celest. Mech. 22, 241, doi:10.1007/BF01229511, at τ = 0.
 
     **Raises:** `ValueError` for another point, and for a known amplitude that is too small for a
     halo orbit.

@@ -191,9 +191,8 @@ def player(
     page contains everything, also viser's program (0.8 MB): a notebook shows it without a network
     or a running kernel, `.save("tumble.html")` writes it to a file.
 
-    **Arguments:** as `tumble`; `height` px in a notebook. **Returns** a `Film`.
-
-    **Raises** `ModuleNotFoundError` if viser is missing (extra `view`); else as `tumble`.
+    **Arguments:** as `tumble`; `height` px in a notebook. **Returns** a `Film`. **Raises**
+    `ModuleNotFoundError` if viser is missing (extra `view`); else as `tumble`.
     """
     seconds, pictures = _length(ts, seconds, fps)
     _, q = evenly(ts, states, pictures)

@@ -31,9 +31,8 @@ def inertia_ellipsoid(
 
     **Arguments:** `body` an `Inertia`, a `MassProperties` or a `rigidjax.identify.Fit`; `truth` a
     body to compare with, as a broken line; `samples` the number of thin lines; `title`; `ax` three
-    axes. **Returns** the axes (3,), planes xy, xz and yz of the body frame.
-
-    **Raises** `TypeError` for anything but these, `ValueError` for a body without extension.
+    axes. **Returns** the axes (3,), planes xy, xz and yz of the body frame. **Raises** `TypeError`
+    for anything but these, `ValueError` for a body without extension.
 
     >>> import rigidjax as rj
     >>> [one.get_xlabel() for one in inertia_ellipsoid(rj.shapes.box(1.0, [1.0, 2.0, 3.0]))]

@@ -16,10 +16,8 @@ def fit(
 ) -> Any:
     """Data and fit of each sensor above, the residuals below.
 
-    **Arguments:** `found` a `rigidjax.identify.Fit`; `index` of the recording; `time_unit`
-    `s` or `day`; `rate_unit` `rad/s`, `deg/s` or `deg/day`; `title`. **Returns** the matplotlib
-    figure.
-
+    **Arguments:** `found` a `rigidjax.identify.Fit`; `index` of the recording; `time_unit` `s` or
+    `day`; `rate_unit` `rad/s`, `deg/s` or `deg/day`; `title`. **Returns** the matplotlib figure.
     **Raises** `ModuleNotFoundError` if matplotlib is missing (install the extra `view`).
 
     >>> import jax.numpy as jnp, rigidjax as rj

@@ -30,12 +30,10 @@ from rigidjax.plot.style import (
 def body_axes(states: HasAttitude, *, title: str = "", ax: Any = None) -> Any:
     """The paths of the three body axes on the unit sphere, world frame.
 
-    A dot marks the start, a triangle the end; the path behind the sphere is faint.
-
-    **Arguments:** `states` of one body with a leading time axis; `title`; `ax` your 3-D axes, with
-    the view set before the call (`view_init`). **Returns** the axes.
-
-    **Raises** `TypeError` for states without an attitude or flat axes, `ValueError` for a batch.
+    A dot marks the start, a triangle the end; the path behind the sphere is faint. **Arguments:**
+    `states` of one body with a leading time axis; `title`; `ax` your 3-D axes, with the view set
+    before the call (`view_init`). **Returns** the axes. **Raises** `TypeError` for states without
+    an attitude or flat axes, `ValueError` for a batch.
 
     >>> import rigidjax as rj
     >>> sol = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 3.0),
@@ -65,16 +63,14 @@ def polhode(
 ) -> Any:
     """The path of Π = IΩ where the momentum sphere |Π| = h meets the ellipsoid ΣΠᵢ²/Iᵢ = 2T.
 
-    Drawn along the principal axes (ascending moments), with unit h, the initial |Π|.
-    Thin lines are other energies at the same h; the broken ones the separatrix through the middle
-    axis. Lines behind the sphere are dotted (this motion) or faint (the others).
-
-    Source: Landau and Lifshitz, Mechanics, § 37.
+    Drawn along the principal axes (ascending moments), with unit h, the initial |Π|. Thin lines are
+    other energies at the same h; the broken ones the separatrix through the middle axis. Lines
+    behind the sphere are dotted (this motion) or faint (the others). Source: Landau and Lifshitz,
+    Mechanics, § 37.
 
     **Arguments:** `inertia`; `states` of one body with a leading time axis; `energies` the number
-    of thin lines; `title`; `ax` your 3-D axes. **Returns** the axes.
-
-    **Raises** `ValueError` for a body at rest, a zero moment or a batch; `TypeError` for flat axes.
+    of thin lines; `title`; `ax` your 3-D axes. **Returns** the axes. **Raises** `ValueError` for a
+    body at rest, a zero moment or a batch; `TypeError` for flat axes.
 
     >>> import rigidjax as rj
     >>> body = rj.Inertia.from_principal(1.0, 2.0, 3.0)
@@ -156,10 +152,9 @@ def herpolhode(inertia: Inertia, states: HasAttitude, *, title: str = "", ax: An
     are the least and the largest distance of this motion.
 
     **Arguments:** `inertia`; `states` (`Attitude`) of one body with a leading time axis; `title`;
-    `ax` axes of yours. **Returns** the axes.
-
-    **Raises** `ValueError` for a body at rest, a batch, or a momentum that turned by more than
-    1e-3 rad (that is no free motion); `TypeError` for states without an attitude.
+    `ax` axes of yours. **Returns** the axes. **Raises** `ValueError` for a body at rest, a batch,
+    or a momentum that turned by more than 1e-3 rad (that is no free motion); `TypeError` for states
+    without an attitude.
 
     >>> import rigidjax as rj
     >>> body = rj.Inertia.from_principal(1.0, 2.0, 3.0)

@@ -22,10 +22,9 @@ def residuals(
     A line in the spectrum is a motion or a torque that the model lacks.
 
     **Arguments:** `found` a `rigidjax.identify.Fit`; `index` of the recording; `time_unit` `s`,
-    `min`, `h` or `day`; `title`; `ax` your axes (sensors, 4). **Returns** the axes.
-
-    **Raises** `ModuleNotFoundError` if matplotlib is missing; `ValueError` for an unknown unit or
-    axes of another shape; `IndexError` for a missing recording.
+    `min`, `h` or `day`; `title`; `ax` your axes (sensors, 4). **Returns** the axes. **Raises**
+    `ModuleNotFoundError` if matplotlib is missing; `ValueError` for an unknown unit or axes of
+    another shape; `IndexError` for a missing recording.
 
     >>> import jax.numpy as jnp, rigidjax as rj
     >>> ts = jnp.linspace(0.0, 10.0, 80)

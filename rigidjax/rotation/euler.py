@@ -6,11 +6,10 @@ M = R_1(a) R_2(b) R_3(c) (notes, eqs 12, 27–31). **Lower case is extrinsic**: 
 fixed axis of the world, and M = R_3(c) R_2(b) R_1(a). SciPy uses the same letters.
 
 **The singular case** ("gimbal lock"): middle angle 0 or π when first and last letter are the same,
-±π/2 when all three differ. Only the sum or the difference of the outer angles is then defined.
-The choice here, if the vanishing sine or cosine is below 4 units of round-off: **the
-last angle listed is 0** (likewise its rate), and the matrix is reproduced all the same. Derivatives
-there are finite: they belong to the remaining chart, with the middle angle held. `is_singular`
-tests for the case.
+±π/2 when all three differ. Only the sum or the difference of the outer angles is then defined. The
+choice here, if the vanishing sine or cosine is below 4 units of round-off: **the last angle listed
+is 0** (likewise its rate), and the matrix is reproduced all the same. Derivatives there are finite:
+they belong to the remaining chart, with the middle angle held. `is_singular` tests for the case.
 """
 
 import warnings
@@ -60,7 +59,6 @@ def from_matrix(matrix: Mat3Like, sequence: str = "ZXZ") -> Vec3:
     """The Euler angles of a rotation matrix, rad, in the order of `sequence`.
 
     **Arguments:** `matrix` (3, 3) rotation, body → world; values are not checked (`so3.check`).
-
     **Returns:** (3,): outer angles in (−π, π]; the middle one in [0, π] if first and last letter
     agree, else in [−π/2, π/2]. The last is 0 in the singular case. **Raises:** `ValueError` for an
     unknown sequence.
@@ -159,10 +157,9 @@ def omega_to_rates(
     """Rates of the Euler angles from the angular velocity: eqs 81–83 of the notes, solved.
 
     **Arguments:** `angles` (3,), rad, in the order of `sequence`; `omega` (3,), rad/s, in `frame`.
-
     **Returns:** (3,) rad/s. The last rate is 0 in the singular case (`is_singular`), the others
-    follow, and the part of `omega` outside their range is dropped. **Raises:** `ValueError` for
-    an unknown sequence or frame.
+    follow, and the part of `omega` outside their range is dropped. **Raises:** `ValueError` for an
+    unknown sequence or frame.
 
     >>> omega_to_rates(jnp.array([0.1, 0.2, 0.3]), jnp.array([0.0, 0.0, 2.0])).tolist()
     [0.0, 0.0, 2.0]

@@ -37,7 +37,6 @@ def project(matrix: Mat3Like) -> Mat3:
     """The rotation nearest to a matrix (Frobenius norm), with the correct derivative also on SO(3).
 
     **Arguments:** `matrix` (3, 3), det > 0. **Returns:** (3, 3) with RᵀR = 1 to round-off.
-
     **Raises:** `ValueError` if a matrix known now is left-handed (a mirror image has no nearest
     rotation), singular, or not finite; under `jit` call `so3.check` or your own test before.
 
@@ -125,11 +124,9 @@ def mean(matrices: Float[ArrayLike, "n 3 3"], weights: Float[ArrayLike, "n"] | N
     """The Karcher mean: the rotation least in Σ w_i |angle to R_i|².
 
     **Arguments:** `matrices` (n, 3, 3) rotations, within a quarter turn of the mean, where it is
-    unique (Karcher 1977, doi:10.1002/cpa.3160300502); `weights` (n,), not negative.
-
-    **Returns:** (3, 3), with first and second derivatives from the last two Newton steps alone.
-    **Raises:** as `so3.check`, if the matrices are known now; `ValueError` for negative weights, or
-    only zeros.
+    unique (Karcher 1977, doi:10.1002/cpa.3160300502); `weights` (n,), not negative. **Returns:**
+    (3, 3), with first and second derivatives from the last two Newton steps alone. **Raises:** as
+    `so3.check`, if the matrices are known now; `ValueError` for negative weights, or only zeros.
 
     >>> mean(jnp.stack([jnp.eye(3), jnp.eye(3)])).round(12).tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]

@@ -47,7 +47,6 @@ def exp(v: Vec3Like) -> Quat:
 
     **Arguments:** `v` (3,) rotation vector, rad (notes, eqs 17, 18, with v = γ y). The angle is
     known to ε|v|. **Raises:** `ValueError` for NaN, and beyond 1/ε (see the head of this module).
-
     **Returns:** (4,) of norm 1; value and derivatives are correct also at v = 0.
 
     >>> exp(jnp.array([0.0, 0.0, jnp.pi])).round(12).tolist()
@@ -290,10 +289,9 @@ def from_matrix(matrix: Mat3Like) -> Quat:
     """The canonical unit quaternion of a rotation matrix.
 
     **Arguments:** `matrix` (3, 3) rotation, body → world. **Raises:** as `so3.check`, if its values
-    are known now; nothing is checked inside `jit`, `grad` and `vmap`.
-
-    **Returns:** (4,) with w ≥ 0: the largest of the four rows of 4 q qᵀ, normalised (Shepperd 1978,
-    doi:10.2514/3.55767b), so that no case loses digits; the derivative uses that row only.
+    are known now; nothing is checked inside `jit`, `grad` and `vmap`. **Returns:** (4,) with w ≥ 0:
+    the largest of the four rows of 4 q qᵀ, normalised (Shepperd 1978, doi:10.2514/3.55767b), so
+    that no case loses digits; the derivative uses that row only.
 
     >>> from_matrix(jnp.diag(jnp.array([-1.0, -1.0, 1.0]))).tolist()
     [0.0, 0.0, 0.0, 1.0]

@@ -55,7 +55,6 @@ def log(matrix: Mat3Like) -> Vec3:
     """The shortest rotation vector of a rotation matrix, rad, |v| ≤ π.
 
     **Arguments:** `matrix` (3, 3) rotation. **Raises:** as `check`, if its values are known now.
-
     **Returns:** (3,), by way of the quaternion: correct to round-off, with its derivatives, from 0
     to π. At a half turn it is v or −v, whichever has a positive first nonzero component.
 

@@ -27,11 +27,10 @@ _REACH = math.tan(math.pi / 8) ** 2
 def stumpff(k: int, t: Float[Array, "..."]) -> Float[Array, "..."]:
     """Stumpff function c_k(t) = Σ (−t)ⁿ/(k + 2n)!, for t = θ² ≥ 0.
 
-    **Arguments:** `k` ≥ 0, a Python integer: 0 is cos θ, 1 is sin θ/θ, 2 is (1 − cos θ)/θ², 3 is
-    (θ − sin θ)/θ³. `t` of any shape, dimensionless.
-
-    **Returns:** an array like `t`, right to a few units of round-off of 1/k!; so are its
-    derivatives of every order (c_k' = ½ (k c_{k+2} − c_{k+1}); Battin 1999, eq 4.80 and problem).
+    **Arguments:** `k` ≥ 0, a Python integer: 0 is cos θ, 1 is sin θ/θ, 2 is (1 − cos θ)/θ², 3 is (θ
+    − sin θ)/θ³. `t` of any shape, dimensionless. **Returns:** an array like `t`, right to a few
+    units of round-off of 1/k!; so are its derivatives of every order (c_k' = ½ (k c_{k+2} −
+    c_{k+1}); Battin 1999, eq 4.80 and problem).
     """
     if k < 2:
         return _cosine_or_sinc(k, t)

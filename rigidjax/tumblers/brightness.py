@@ -58,12 +58,9 @@ def mesh(
 ) -> Scalar:
     """Brightness of a convex body by its faces, m²: `Σ f(μ₀, μ) area` of the lit, visible ones.
 
-    It is the brightness without shadows if the body is not convex.
-
-    **Arguments:** `vertices`, `faces` as for `rigidjax.shapes.mesh`; the others as for `ellipsoid`.
-    Differentiable in the vertices and directions: a face at the edge of the light has the
-    derivative of a dark one.
-
+    It is the brightness without shadows if the body is not convex. **Arguments:** `vertices`,
+    `faces` as for `rigidjax.shapes.mesh`; the others as for `ellipsoid`. Differentiable in the
+    vertices and directions: a face at the edge of the light has the derivative of a dark one.
     Source: Kaasalainen and Torppa 2001, Icarus 153:24, doi:10.1006/icar.2001.6673.
 
     **Raises:** as `ellipsoid`, and as `rigidjax.shapes.mesh` for faces.

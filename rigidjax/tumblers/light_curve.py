@@ -141,10 +141,8 @@ def fit_light_curve(
     more of them fit; `tolerance` as of `fit`; `progress` is called with a line of text.
 
     Sources: Pravec et al. 2005, Icarus 173:108, doi:10.1016/j.icarus.2004.07.021; Kaasalainen 2001,
-    A&A 376:302, doi:10.1051/0004-6361:20010935.
-
-    **Raises:** `ValueError` for a problem with other sensors, several recordings or a torque;
-    `TypeError` under a trace.
+    A&A 376:302, doi:10.1051/0004-6361:20010935. **Raises:** `ValueError` for a problem with other
+    sensors, several recordings or a torque; `TypeError` under a trace.
     """
     reading = _only(problem)
     _checks.whole(count, "count", 1)

@@ -39,19 +39,17 @@ class Brightness(AbstractSensor):
     `rj.tumblers.brightness`; `noise` standard deviation in the unit of a reading, `None` to
     estimate it; `unit` of a reading, `"flux"` or `"mag"`; `level` flux or magnitude as above,
     `None` for 1 and 0: it is seldom known, so let a `Free` move it; `semi_axes` (3,) along the
-    body's axes,
-    or `None`: then the ellipsoid is the uniform one that turns as the body does (semi-axes √λ_k of
-    its second moment 𝔖); `offset` s as for `Gyro`. Readings are (T,).
+    body's axes, or `None`: then the ellipsoid is the uniform one that turns as the body does
+    (semi-axes √λ_k of its second moment 𝔖); `offset` s as for `Gyro`. Readings are (T,).
 
     Brightness alone does not determine turns of the world that leave it unchanged: for fixed
     directions the half turns about `sun × observer`, and, except for `Geometric`, about their sum
     and difference. A `fit` assumes an ellipsoid; `fit_light_curve` allows for other shapes.
 
     **Raises** `ValueError` for a direction of length zero, a noise or semi-axis that is not
-    positive, a wrong shape, NaN; `TypeError` for arguments of another type.
-
-    Source: as `rigidjax.tumblers.brightness`; of light curves of tumblers Kaasalainen 2001, A&A
-    376:302, doi:10.1051/0004-6361:20010935.
+    positive, a wrong shape, NaN; `TypeError` for arguments of another type. Source: as
+    `rigidjax.tumblers.brightness`; of light curves of tumblers Kaasalainen 2001, A&A 376:302,
+    doi:10.1051/0004-6361:20010935.
 
     >>> Brightness([1.0, 0.0, 0.0], [0.0, 1.0, 0.0], noise=0.02, unit="mag").components
     1

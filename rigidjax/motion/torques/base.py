@@ -32,8 +32,6 @@ class Wrench(eqx.Module):
     **Arguments:** `force` (3,) N, **world** frame; `torque` (3,) N m, **body** frame, about the
     centre of mass; none by default.
 
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
-
     >>> Wrench([0.0, 0.0, -9.81]).torque
     Array([0., 0., 0.], dtype=float64)
     """
@@ -54,9 +52,8 @@ class AbstractTorque(eqx.Module):
     """A torque on a body: a function of time, state and body, in N m, body axes.
 
     Subclass it for your own, or give any callable Module. `feels` is the smallest state with the
-    parts that you read: `HasSpin` (`.omega`), `HasAttitude` (also `.q`) or `HasPose` (also
-    `.x`, `.v`). `body` is the argument of `simulate`: an `Inertia`, or `MassProperties` for
-    `Rigid`.
+    parts that you read: `HasSpin` (`.omega`), `HasAttitude` (also `.q`) or `HasPose` (also `.x`,
+    `.v`). `body` is the argument of `simulate`: an `Inertia`, or `MassProperties` for `Rigid`.
 
     A law that feels a `rigidjax.motion.HasPose` may return a `Wrench`, a force as well as a torque.
 

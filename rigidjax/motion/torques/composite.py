@@ -19,9 +19,8 @@ from rigidjax.rotation.linalg3 import cross
 class Sum(eqx.Module):
     """Several torques and forces at once; it needs the largest state of its parts.
 
-    **Arguments:** `*parts` torques, forces, your own callables.
-
-    **Raises:** `TypeError` for a part that cannot be called; `ValueError` for none at all.
+    **Arguments:** `*parts` torques, forces, your own callables. **Raises:** `TypeError` for a part
+    that cannot be called; `ValueError` for none at all.
 
     >>> from rigidjax import torques
     >>> Sum(torques.Damping([1.0, 1, 1]), torques.HeavyTop(1.0, [0.0, 0, 1], [0.0, 0, -9.81])).feels
@@ -85,10 +84,8 @@ class ChangingInertia(eqx.Module):
     fuel carries its share of İΩ away: then add İΩ to `torque`.
 
     Source: Hughes 1986, Spacecraft Attitude Dynamics, ch. 3; the momentum `R I(t) Ω` is conserved
-    without τ.
-
-    **Raises:** `TypeError` for anything but a function; `ValueError` for a value that is not (3,
-    3).
+    without τ. **Raises:** `TypeError` for anything but a function; `ValueError` for a value that is
+    not (3, 3).
 
     >>> import rigidjax as rj
     >>> grows = ChangingInertia(lambda t: (1.0 + t) * jnp.eye(3))

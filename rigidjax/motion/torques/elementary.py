@@ -16,8 +16,6 @@ class ConstantTorque(base.AbstractTorque):
     **Arguments:** `torque` (3,) N m, body frame. About a principal axis it spins the body up
     linearly (Euler 1758); for one in space see `InSpace`.
 
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
-
     >>> import rigidjax as rj
     >>> ConstantTorque([0.0, 0.0, 1.0])(0.0, rj.Spin([0.0, 0.0, 5.0]), None).tolist()
     [0.0, 0.0, 1.0]
@@ -39,8 +37,6 @@ class InSpace(base.OfTime):
     such as `Linear(times, values)`.
 
     A constant τ_w conserves the angular momentum across it, and adds τ_w t along it.
-
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
 
     >>> import rigidjax as rj
     >>> turned = rj.Attitude([0.0, 1.0, 0.0, 0.0], [0.0, 0, 0])  # half a turn about x
@@ -76,8 +72,6 @@ class Damping(_Against):
     slows as exp(−c t/I). For a ball in a viscous fluid c = 8πηr³ (Kirchhoff 1876; Lamb,
     Hydrodynamics, §334).
 
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
-
     >>> Damping([0.1, 0.1, 0.1]).coefficient.shape
     (3,)
     """
@@ -94,8 +88,6 @@ class QuadraticDamping(_Against):
     Principia, Book II, Section II).
 
     The first derivative at Ω = 0 is zero; a second does not exist there.
-
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
 
     >>> QuadraticDamping([0.1, 0.1, 0.1]).coefficient.shape
     (3,)

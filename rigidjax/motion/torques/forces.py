@@ -18,11 +18,7 @@ from rigidjax.rotation.linalg3 import apply, cross, dot
 class UniformGravity(base.AbstractForce):
     """Uniform acceleration: `F = m g`, no torque about the centre, `U = −m g·x`.
 
-    **Arguments:** `gravity` (3,) g, m/s², world frame, such as [0, 0, −9.81].
-
-    Source: notes, eq 84.
-
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
+    **Arguments:** `gravity` (3,) g, m/s², world frame, such as [0, 0, −9.81]. Source: notes, eq 84.
 
     >>> import rigidjax as rj
     >>> body = rj.MassProperties(2.0, [0.0, 0, 0], jnp.eye(3))
@@ -50,12 +46,9 @@ class UniformGravity(base.AbstractForce):
 class CentralGravity(base.AbstractForce):
     """A centre of attraction at the world's origin, on a body of some size.
 
-    `U = −μ m/r − (μ/2r³)(Tr I − 3 r̂·I_w r̂)` (MacCullagh's formula), with its force and its torque,
-    so that the energy and the momentum about the origin are conserved. `I_w = R I Rᵀ`.
-
+    `U = −μ m/r − (μ/2r³)(Tr I − 3 r̂·I_w r̂)` (MacCullagh's formula), with its force and its
+    torque, so that the energy and the momentum about the origin are conserved. `I_w = R I Rᵀ`.
     **Arguments:** `mu` μ = G M, m³/s². Source: Hughes, Spacecraft Attitude Dynamics, §8.1.
-
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
 
     >>> import rigidjax as rj
     >>> body = rj.MassProperties(2.0, [0.0, 0, 0], 1e-9 * jnp.eye(3))
@@ -100,8 +93,6 @@ class Drag(base.AbstractForce):
     Source: Newton, Principia, Book II, Section II. The first derivative at u = 0 is zero; a second
     does not exist there.
 
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
-
     >>> import rigidjax as rj
     >>> body = rj.MassProperties(2.0, [0.0, 0, 0], jnp.eye(3))
     >>> state = rj.Rigid([0.0, 0, 0], [3.0, 0, 0], [1.0, 0, 0, 0], [0.0, 0, 0])
@@ -131,10 +122,8 @@ class Rotors(base.AbstractForce):
     time such as `Held(times, values)`, or `Input("speeds")`.
 
     Source: Mahony, Kumar and Corke 2012, Multirotor aerial vehicles, eqs 4–6,
-    doi:10.1109/MRA.2012.2206474.
-
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype; `ValueError` for a direction
-    that is not a unit vector, or a spin that is not 1 or −1.
+    doi:10.1109/MRA.2012.2206474. **Raises:** `ValueError` for a direction that is not a unit
+    vector, or a spin that is not 1 or −1.
 
     >>> from rigidjax import Rigid, shapes
     >>> up = Rotors([[0.1, 0.0, 0.0]], [[0.0, 0.0, 1.0]], [1.0], 2.0, 0.5, [3.0])
@@ -196,8 +185,6 @@ class BodyDrag(base.AbstractForce):
 
     Source: Faessler, Franchi and Scaramuzza 2018, eq 5, doi:10.1109/LRA.2017.2776353, for the
     linear part; Hoerner 1965, Fluid-Dynamic Drag, for the other. |u| u is taken axis by axis.
-
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
 
     >>> from rigidjax import Rigid, shapes
     >>> fast = Rigid([0.0, 0, 0], [2.0, 0, 0], [1.0, 0, 0, 0], [0.0, 0, 0])

@@ -117,10 +117,8 @@ class Lagged(eqx.Module):
     `None` for u there.
 
     For a u that jumps from 0 to 1 it is `1 − exp(−t/T)`. Source: any text on control, such as
-    Åström and Murray, Feedback Systems.
-
-    **Raises:** `TypeError` for a source that cannot be called; `ValueError` for a time that is
-    known and not positive, or wrong shapes.
+    Åström and Murray, Feedback Systems. **Raises:** `TypeError` for a source that cannot be called;
+    `ValueError` for a time that is known and not positive, or wrong shapes.
 
     >>> import rigidjax as rj
     >>> push = rj.torques.InSpace(Lagged(lambda t: jnp.array([0.0, 0.0, 1.0]), 0.5, jnp.zeros(3)))
@@ -184,7 +182,6 @@ def bind(law: Law, inputs: Mapping[str, Any] | Row | None) -> Law:
 
     **Arguments:** `law` a torque, a force, or a tree of them; `inputs` by name an array, which is
     constant, or a function of time such as `Held(times, values)`; `None` changes nothing.
-
     **Raises:** `ValueError` for an input of the torque without a value.
 
     >>> bind(Input("u"), {"u": rj.torques.Held([0.0, 1.0], [2.0, 4.0])})(1.0)

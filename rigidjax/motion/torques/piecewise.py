@@ -60,7 +60,6 @@ class Held(_Table):
 
     The value jumps at `times`: a torque that reads it passes its `jump_times` on, and adaptive
     steps end there. For fixed steps give the samples to `rigidjax.batch.rollout` as `inputs`.
-
     **Raises:** `ValueError` for fewer than two rows, numbers of rows that differ, times that do not
     increase, NaN.
 
@@ -81,10 +80,8 @@ class Tabulated(AbstractTorque):
     `InSpace(Linear(times, torques))`. Constant pieces: `Pulses`.
 
     A solver that steps over a kink loses its order, and a step over a pulse misses it: `jump_times`
-    are for the step controller, and `simulate` passes them on.
-
-    **Raises:** `ValueError` for fewer than two rows, numbers of rows that differ, times that do not
-    increase, NaN.
+    are for the step controller, and `simulate` passes them on. **Raises:** `ValueError` for fewer
+    than two rows, numbers of rows that differ, times that do not increase, NaN.
 
     >>> Tabulated([0.0, 2.0], [[0.0, 0, 0], [0.0, 0, 4]]).jump_times
     Array([0., 2.], dtype=float64)
@@ -117,10 +114,8 @@ class Pulses(AbstractTorque):
     edge i until edge i + 1. One pulse: `Pulses([1.0, 1.5], [[0.0, 0.0, 3.0]])`.
 
     The value at a time has no derivative in the edges; a solver that ends its steps at `jump_times`
-    gives it. `impulse` is exact.
-
-    **Raises:** `ValueError` unless there is one edge more than rows, for edges that do not
-    increase, NaN.
+    gives it. `impulse` is exact. **Raises:** `ValueError` unless there is one edge more than rows,
+    for edges that do not increase, NaN.
 
     >>> Pulses([1.0, 1.5], [[0.0, 0.0, 3.0]]).impulse
     Array([0. , 0. , 1.5], dtype=float64)

@@ -26,9 +26,7 @@ class HeavyTop(base.AbstractTorque):
     Lagrange's, Kovalevskaya's, Goryachev–Chaplygin's, a general one, and the physical pendulum.
 
     It conserves the energy and the momentum along g. Source: Landau and Lifshitz, Mechanics, §35;
-    Arnold, Mathematical Methods of Classical Mechanics, §30.
-
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype; `TypeError` on a `Rigid`,
+    Arnold, Mathematical Methods of Classical Mechanics, §30. **Raises:** `TypeError` on a `Rigid`,
     which has no fixed point.
 
     >>> top = HeavyTop(2.0, [0.0, 0.0, 0.5], [0.0, 0.0, -9.81])
@@ -72,9 +70,7 @@ class GravityGradient(base.OfTime):
 
     `U = (μ/2r³)(3 r̂'·I r̂' − Tr I)`, the second term of MacCullagh's formula; it does not change
     the orbit itself. Source: Hughes, Spacecraft Attitude Dynamics, §8.1; Goldstein, Poole and
-    Safko, Classical Mechanics, eq 5.86.
-
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype; `ValueError` for no distance.
+    Safko, Classical Mechanics, eq 5.86. **Raises:** `ValueError` for no distance.
 
     >>> import rigidjax as rj
     >>> law, body = GravityGradient(1.0, [1.0, 1.0, 0.0]), rj.Inertia.from_principal(1.0, 2.0, 2.5)
@@ -128,11 +124,8 @@ class MagneticDipole(base.OfTime):
     """A magnetic moment fixed in the body, in a uniform field: `τ = m × RᵀB`, `U = −m·RᵀB`.
 
     **Arguments:** `moment` (3,) m, A m², body frame; `field` B, T, world frame: (3,), or a callable
-    Module of time, t → (3,), for a field that changes along an orbit.
-
-    Source: Jackson, Classical Electrodynamics, eqs 5.71, 5.72.
-
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
+    Module of time, t → (3,), for a field that changes along an orbit. Source: Jackson, Classical
+    Electrodynamics, eqs 5.71, 5.72.
 
     >>> import rigidjax as rj
     >>> state = rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 0])
@@ -171,9 +164,8 @@ class FromPotential(base.AbstractTorque):
     **Arguments:** `potential` a callable Module `q → U`, J, with `q` (4,) unit, body → world.
 
     `τ_i = −∂U/∂q · ½ q ⊗ e_i`, the derivative along a turn about body axis i. Source: Landau and
-    Lifshitz, Mechanics, §34.
-
-    **Raises:** `TypeError` for anything but a function, `ValueError` for a U that is not a number.
+    Lifshitz, Mechanics, §34. **Raises:** `TypeError` for anything but a function, `ValueError` for
+    a U that is not a number.
 
     >>> class Spring(eqx.Module):
     ...     k: Array

@@ -47,7 +47,6 @@ class CorrelatedTorque(AbstractTorque):
 
     Its mean is zero, and `simulate` and a fit use the mean; see `RandomTorque`. A filter has the
     torque itself as part of its state. Uhlenbeck and Ornstein 1930, doi:10.1103/PhysRev.36.823.
-
     **Raises:** `ValueError` for a density below zero, a time that is not positive, NaN or a wrong
     shape.
 

@@ -28,7 +28,6 @@ class Series(eqx.Module):
 
     The slopes at the samples are those of the spline whose third derivative does not jump at the
     second and the last but one ("not a knot": de Boor, A Practical Guide to Splines, ch. IV).
-
     **Raises:** `ValueError` (`equinox` error under `jit`) for fewer than four samples, lengths that
     differ, NaN, uneven times; `TypeError` for anything but numbers.
 

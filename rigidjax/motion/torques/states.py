@@ -65,7 +65,6 @@ def freeze(law: Tree, own: tuple[Any, ...]) -> Tree:
 
     **Arguments:** `law` a torque, a force, or a tree of them; `own` a tuple of the states of each
     part with states, in their order in `law`, inner parts first: a row of `Solution.own`.
-
     **Raises:** `ValueError` for another number of states.
 
     >>> from rigidjax import torques
@@ -85,9 +84,8 @@ def freeze(law: Tree, own: tuple[Any, ...]) -> Tree:
 def first_states(law: Any, t: ScalarLike, state: Any, body: Any) -> tuple[Any, ...]:
     """The initial states of a torque, in the precision of the body's state: see `freeze`.
 
-    **Arguments:** `t` s; `state` of the body at the start; `body`.
-
-    **Raises:** `TypeError` for states that are not numbers.
+    **Arguments:** `t` s; `state` of the body at the start; `body`. **Raises:** `TypeError` for
+    states that are not numbers.
     """
     found: list[Any] = []
 

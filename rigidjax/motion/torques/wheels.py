@@ -35,8 +35,6 @@ class Flywheel(base.OfTime):
     The momentum in space, `R (IΩ + h)`, is conserved; so is the energy `½ Ω·IΩ` if h is constant.
     Source: Zhukovsky 1885, Volterra 1898; Hughes, Spacecraft Attitude Dynamics, chs. 3, 6.
 
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
-
     >>> Flywheel([0.0, 0.0, 2.0]).internal_momentum(0.0)
     Array([0., 0., 2.], dtype=float64)
     """
@@ -100,8 +98,8 @@ class ReactionWheels(base.AbstractTorque):
     tanh instead of sign (Andersson, Söderberg and Björklund 2007,
     doi:10.1016/j.triboint.2005.11.014).
 
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype; `ValueError` for an axis that
-    is not a unit vector, an inertia, limit or turn-over that is not positive.
+    **Raises:** `ValueError` for an axis that is not a unit vector, an inertia, limit or turn-over
+    that is not positive.
 
     >>> import rigidjax as rj
     >>> wheels = ReactionWheels([[0.0, 0, 1]], [0.1], [0.0], motor=[0.2])
