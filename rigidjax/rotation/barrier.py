@@ -1,4 +1,4 @@
-"""A barrier, so that XLA does not compute numbers again for each use."""
+"""A barrier that keeps XLA from computing numbers again for each use."""
 
 from typing import TypeVar
 
@@ -15,9 +15,8 @@ _DROPPED = jax.__version_info__ < (0, 11)
 
 
 def barrier(tree: Tree) -> Tree:
-    """The same numbers, computed once: `jax.lax.optimization_barrier`, also if XLA drops it.
-
-    In that case each number goes through `once`.
+    """The same numbers, computed once: `jax.lax.optimization_barrier`, or `once` where XLA drops
+    it.
     """
     return jax.tree.map(_real_once, tree) if _DROPPED else lax.optimization_barrier(tree)
 
@@ -25,7 +24,7 @@ def barrier(tree: Tree) -> Tree:
 def once(x: Array) -> Array:
     """The same number, computed once for all uses, here and in the gradient.
 
-    It divides by one (by 2 for NaN): XLA on CPU computes a quotient once, but repeats anything
+    It is divided by one (by 2 if NaN): XLA on CPU computes a quotient once, but repeats anything
     cheaper, with all its inputs, for every component.
     """
     return x / jnp.where(x == x, 1, 2)

@@ -1,11 +1,9 @@
 """Vectors and 3×3 matrices, written on components.
 
 `@` on 3×3 matrices is slow in gradients on CPU and runs in TF32 on some GPUs; these functions avoid
-both.
-
-Range: the products in a formula (two entries in `cross`, `dot`, `product` and `apply`, three in
-`determinant`, four in `solve`) must be finite: entries from 1e-75 to 1e75 always are (float32:
-1e-9 to 1e9).
+both. Range: the products in a formula (of two entries in `cross`, `dot`, `product` and `apply`, of
+three in `determinant`, of four in `solve`) must be finite. Entries from 1e-75 to 1e75 are always in
+range (float32: 1e-9 to 1e9).
 """
 
 import functools
@@ -24,17 +22,14 @@ from rigidjax.rotation.barrier import once
 def components(v: Float[Array, "n"]) -> tuple[Scalar, ...]:
     """The entries of a vector, as scalars.
 
-    **Arguments:** `v` (n,), n fixed. One `lax.split`, whose transpose is one concatenation:
-    indexing entry by entry makes gradients several times slower on CPU.
+    By one `lax.split`, whose transpose is one concatenation: indexing each entry makes gradients
+    several times slower on CPU.
     """
     return tuple(part.reshape(()) for part in lax.split(v, (1,) * v.shape[0]))
 
 
 def entries(m: Float[Array, "3 3"]) -> tuple[Scalar, ...]:
-    """The nine entries of a 3×3 matrix, row by row, as scalars.
-
-    **Arguments:** `m` (3, 3).
-    """
+    """The nine entries of a 3×3 matrix, row by row, as scalars."""
     return components(m.reshape(9))
 
 
@@ -62,15 +57,15 @@ def dot_components(a: Sequence[Scalar], b: Sequence[Scalar]) -> Scalar:
 
 
 def square(v: Sequence[Scalar]) -> Scalar:
-    """Squared length of a triple of scalars, to be fed to a costly function."""
+    """Squared length of a triple of scalars, as the argument of a costly function."""
     return once(dot_components(v, v))
 
 
 def near_one(*parts: Scalar) -> Scalar:
-    """A power of two that brings the largest of some scalars near 1.
+    """A power of two that brings the largest of some scalars near 1, with derivative zero.
 
-    A number times it keeps all its digits and can be squared and summed: for formulas that do not
-    depend on the length of their argument. Its derivative is set to zero.
+    For formulas that do not depend on the length of their argument: times this number, it keeps all
+    its digits, and its squares do not overflow.
     """
     sizes = [jnp.abs(lax.stop_gradient(part)) for part in parts]
     info = jnp.finfo(sizes[0].dtype)
@@ -95,8 +90,8 @@ def hat(w: Vec3Like) -> Mat3:
 def vee(matrix: Mat3Like) -> Vec3:
     """The vector w of an antisymmetric matrix; of any matrix, w_i = ½ Tr(A J_iᵀ) (notes, eq 53).
 
-    **Arguments:** `matrix` (3, 3). A symmetric part is dropped, as the projection of eqs 52, 53
-    does.
+    **Arguments:** `matrix` (3, 3). Its symmetric part is dropped, as in the projection of eqs 52,
+    53.
 
     >>> vee(hat(jnp.array([1.0, 2.0, 3.0]))).tolist()
     [1.0, 2.0, 3.0]
@@ -108,9 +103,8 @@ def vee(matrix: Mat3Like) -> Vec3:
 def basis(dtype: Any = float) -> Float[Array, "3 3 3"]:
     """The matrices J_1, J_2, J_3: J_i y = e_i × y, ½ Tr(J_iᵀ J_j) = δ_ij (notes, eqs 41–43, 53).
 
-    **Arguments:** `dtype` of the (3, 3, 3) array.
-
-    Eq 16 of the notes prints J_3 transposed, that is −J_3 of eq 42; eq 42 holds.
+    **Arguments:** `dtype` of the (3, 3, 3) array. Eq 16 of the notes prints −J_3, the transpose of
+    J_3; eq 42 is right.
 
     >>> vee(basis()[2]).tolist()
     [0.0, 0.0, 1.0]
@@ -171,10 +165,7 @@ def determinant(a: Mat3Like) -> Scalar:
 
 
 def cofactors(a: Mat3) -> Mat3:
-    """The matrix of cofactors: det a · a⁻ᵀ, also where there is no inverse.
-
-    **Arguments:** `a` (3, 3).
-    """
+    """The matrix of cofactors, det a · a⁻ᵀ; a need not have an inverse."""
     m = entries(a)
     p, q, r = m[:3], m[3:6], m[6:]
     return jnp.stack([jnp.stack(cross_components(*two)) for two in ((q, r), (r, p), (p, q))])

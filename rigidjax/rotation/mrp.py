@@ -1,7 +1,7 @@
 """Modified Rodrigues parameters σ = n tan(θ/4), and their shadow set.
 
-Three numbers without a sine, regular up to a full turn, where σ goes to infinity. σ and its shadow
-−σ/|σ|² are the same rotation; switching at |σ| = 1 keeps to θ ≤ π. Source: Schaub & Junkins, 2018,
+Three numbers without a sine, regular up to a full turn, where σ is infinite. σ and its shadow
+−σ/|σ|² are the same rotation; a switch at |σ| = 1 keeps θ ≤ π. Source: Schaub & Junkins, 2018,
 Analytical Mechanics of Space Systems, sec. 3.5.2. Range: any σ; with rates, both up to 1e75
 (float32: 1e9).
 """
@@ -69,8 +69,8 @@ def to_matrix(sigma: Vec3Like) -> Mat3:
 def shadow(sigma: Vec3Like) -> Vec3:
     """The other parameters of the same rotation, −σ/|σ|² (Schaub & Junkins, eq 3.145).
 
-    **Arguments:** `sigma` (3,), not zero: the shadow of no rotation lies at infinity. **Raises:**
-    `ValueError` for zero or NaN.
+    **Arguments:** `sigma` (3,), not zero: its shadow is infinite. **Raises:** `ValueError` for zero
+    or NaN.
 
     >>> shadow(jnp.array([0.0, 0.5, 0.0])).tolist()
     [-0.0, -2.0, -0.0]
@@ -79,9 +79,9 @@ def shadow(sigma: Vec3Like) -> Vec3:
 
 
 def switch(sigma: Vec3Like) -> Vec3:
-    """σ if |σ| ≤ 1, else its shadow: the parameters of the shorter way round.
+    """σ if |σ| ≤ 1, else its shadow: the parameters of the shorter turn.
 
-    **Arguments:** `sigma` (3,) dimensionless. Do it between steps of a solver, not inside one.
+    **Arguments:** `sigma` (3,) dimensionless. Switch between the steps of a solver, not inside one.
 
     >>> switch(jnp.array([0.0, 2.0, 0.0])).tolist()
     [-0.0, -0.5, -0.0]
