@@ -25,7 +25,6 @@ def divergence(body: MassProperties, reference: MassProperties) -> Scalar:
     Source: Lee, Wensing and Park 2020, "Geometric robot dynamic identification: a convex
     programming approach", IEEE T-RO 36:348, doi:10.1109/TRO.2019.2926491.
 
-    >>> import rigidjax as rj
     >>> body = rj.shapes.box(1.0, [1.0, 2.0, 3.0])
     >>> abs(float(divergence(body, body))) < 1e-14
     True

@@ -112,8 +112,7 @@ def spatial_angular_momentum(body: Inertia | MassProperties, state: HasAttitude)
     moves (`.x`, `.v`). **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype, or a state
     without attitude.
 
-    >>> from rigidjax import Attitude
-    >>> turned = Attitude([0.0, 1.0, 0, 0], [0.0, 0, 1])
+    >>> turned = rj.Attitude([0.0, 1.0, 0, 0], [0.0, 0, 1])
     >>> spatial_angular_momentum(Inertia.from_principal(1.0, 2.0, 3.0), turned)[2]
     Array(-3., dtype=float64)
     """
@@ -150,7 +149,6 @@ def ellipsoid(
 
     >>> ellipsoid(Inertia.from_principal(1.0, 2.0, 2.0), "energy", 4.0)[0]
     Array([2.82842712, 2.        , 2.        ], dtype=float64)
-    >>> import rigidjax as rj
     >>> ellipsoid(rj.shapes.ellipsoid(3.0, [1.0, 2.0, 3.0]), "mass")[0]
     Array([1., 2., 3.], dtype=float64)
     """

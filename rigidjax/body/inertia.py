@@ -95,7 +95,6 @@ class Inertia(eqx.Module):
         turns about. Source: notes, eqs 60, 76–78. **Raises:** `ValueError` (`equinox` error under
         `jit`) if it is not symmetric, or not positive semi-definite, to a few units of round-off.
 
-        >>> import jax.numpy as jnp
         >>> Inertia.from_second_moment(jnp.diag(jnp.array([2.0, 1.0, 0.0]))).moments
         Array([1., 2., 3.], dtype=float64)
         """

@@ -35,7 +35,6 @@ def pack(body: MassProperties) -> Float[Array, "10"]:
     about the centre of mass `𝔖 / mass` as in `pack_second_moment`, ρ the logarithm of a length (m).
     **Raises:** `ValueError` (`equinox` error under `jit`) for a point.
 
-    >>> import rigidjax as rj
     >>> vector = pack(rj.shapes.box(2.0, [0.1, 0.2, 0.3]))
     >>> round(float(unpack(vector).mass), 12)
     2.0
@@ -58,7 +57,6 @@ def unpack(vector: Float[ArrayLike, "10"] | Numbers) -> MassProperties:
     (|α|, |α + ρ| over 330 in float64, 31 in float32) grow logarithmically instead, so that an
     optimiser's step that is much too long gives a large body and not an infinity.
 
-    >>> import jax.numpy as jnp
     >>> unpack(jnp.zeros(10)).inertia.moments
     Array([2., 2., 2.], dtype=float64)
     """
@@ -75,7 +73,6 @@ def pack_second_moment(second_moment: Matrix) -> Float[Array, "6"]:
     `(ρ, d1, d2, s12, s23, s13)`: `Tr 𝔖 = 3 e^{2ρ}`, and the shape as in `pack_shape`. **Raises:**
     `ValueError` (`equinox` error under `jit`) for an invalid or zero second moment.
 
-    >>> import jax.numpy as jnp
     >>> pack_second_moment(jnp.eye(3))
     Array([0., 0., 0., 0., 0., 0.], dtype=float64)
     """
@@ -87,7 +84,6 @@ def unpack_second_moment(vector: Float[ArrayLike, "6"] | Numbers) -> Mat3:
 
     **Arguments:** `vector` (6,) as `pack_second_moment` returns them.
 
-    >>> import jax.numpy as jnp
     >>> unpack_second_moment(jnp.zeros(6))[0]
     Array([1., 0., 0.], dtype=float64)
     """
@@ -105,7 +101,6 @@ def pack_shape(second_moment: Matrix) -> Float[Array, "5"]:
 
     **Raises:** `ValueError` (`equinox` error under `jit`) for an invalid or zero second moment.
 
-    >>> import jax.numpy as jnp
     >>> pack_shape(jnp.diag(jnp.array([4.0, 4.0, 0.0])))  # a plate
     Array([0.5, 0.5, 0. , 0. , 0. ], dtype=float64)
     """
@@ -117,7 +112,6 @@ def unpack_shape(vector: Float[ArrayLike, "5"] | Numbers) -> Mat3:
 
     **Arguments:** `vector` (5,) as `pack_shape` returns them.
 
-    >>> import jax.numpy as jnp
     >>> float(jnp.trace(unpack_shape(jnp.ones(5))))
     1.0
     """

@@ -47,7 +47,6 @@ def voxels(
     [0, 0, 0] with the smallest x, y, z, m, body frame. **Raises:** `ValueError`, `TypeError` for a
     wrong shape, a negative density, or NaN.
 
-    >>> import jax.numpy as jnp
     >>> voxels(jnp.ones((1, 2, 3)), [1.0, 1.0, 1.0], [0.0, 0.0, 0.0]).com
     Array([0.5, 1. , 1.5], dtype=float64)
     """
@@ -79,7 +78,6 @@ def quadrature(
     body frame, one to one inside; `order` points along each direction. **Raises:** `ValueError` for
     an order below 1, NaN, or if the result is no body.
 
-    >>> import jax.numpy as jnp
     >>> body = quadrature(lambda r: jnp.ones(()), lambda u: u * jnp.array([1.0, 2.0, 3.0]), 2)
     >>> round(float(body.mass), 12), round(float(body.com[2]), 12)
     (6.0, 1.5)

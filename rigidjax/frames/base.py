@@ -49,9 +49,8 @@ class AbstractScene(eqx.Module):
 
         **Arguments:** `ts` (T,), `ys` states with a leading time axis, as in `simulate`'s solution.
 
-        >>> from rigidjax.frames import scenes
         >>> still = Point(jnp.zeros((2, 3)), jnp.zeros((2, 3)))
-        >>> float(scenes.earth(0.8).drift(jnp.arange(2.0), still)["jacobi"])
+        >>> float(rj.scenes.earth(0.8).drift(jnp.arange(2.0), still)["jacobi"])
         0.0
         """
         values = jax.vmap(self.conserved)(ts, ys)

@@ -28,7 +28,6 @@ class InFrame(AbstractScene):
       differentiation. `conserved` then has the Jacobi integral in a uniformly turning frame with no
       other force.
 
-    >>> import rigidjax as rj
     >>> scene = InFrame(MovingFrame(rj.frames.Uniform([0.0, 0.0, 1.0])))
     >>> scene.acceleration(0.0, rj.frames.Point([2.0, 0, 0], [0.0, 0, 0])).tolist()
     [2.0, 0.0, 0.0]
@@ -108,7 +107,6 @@ class BodyInFrame(eqx.Module):
     gives a `Wrench`, with its force in the axes of S'; or `None`. Source: notes, eqs 50, 91, for a
     body instead of a point. **Raises:** `TypeError` for a force on a state that only turns.
 
-    >>> import rigidjax as rj
     >>> frame = MovingFrame(rj.frames.Uniform([0.0, 0.0, 1.0]))
     >>> still = rj.Attitude([1.0, 0, 0, 0], [0.0, 0, -1.0])
     >>> BodyInFrame(frame)(0.0, still, rj.Inertia.from_principal(1.0, 2.0, 3.0)).tolist()

@@ -16,7 +16,6 @@ class Instant(eqx.Module):
     rad/s², both in the axes of S'; `origin`, `origin_velocity`, `origin_acceleration` of S', (3,),
     in the axes of S. `MovingFrame.at(t)` makes one. x', v' below are in S'.
 
-    >>> import rigidjax as rj
     >>> now = rj.frames.MovingFrame(rj.frames.Uniform([0.0, 0.0, 2.0])).at(0.0)
     >>> now.rate.tolist(), now.coriolis([1.0, 0.0, 0.0]).tolist()
     ([0.0, 0.0, 2.0], [0.0, -4.0, 0.0])

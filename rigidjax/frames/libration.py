@@ -41,7 +41,6 @@ def libration(rate: ScalarLike) -> BodyInFrame:
     principal moments (a, b, c) along (x, y, z) have the rate n √(3 (b − a)/c). Source: Hughes 1986,
     ch. 9; notes, eqs 50, 91.
 
-    >>> import rigidjax as rj
     >>> body = rj.Inertia.from_principal(1.0, 2.0, 2.5)
     >>> at_rest = rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 0])
     >>> libration(0.001)(0.0, at_rest, body).tolist()
@@ -58,7 +57,6 @@ def libration_integral(state: Any, body: Any, rate: ScalarLike) -> Scalar:
     **Arguments:** `state` an `Attitude` in the orbital frame; `body` an `Inertia`; `rate` n, rad/s.
     u and w are the frame's first and third axes in body axes (Hughes 1986, sec. 9.1).
 
-    >>> import rigidjax as rj
     >>> body = rj.Inertia.from_principal(1.0, 2.0, 2.5)
     >>> at_rest = rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 0])
     >>> float(libration_integral(at_rest, body, 2.0))

@@ -105,7 +105,6 @@ class MovingFrame(eqx.Module):
 
         Many: `jax.vmap(frame.to_inertial)(states, times)`.
 
-        >>> import rigidjax as rj
         >>> frame = MovingFrame(rj.frames.Uniform([0.0, 0.0, 2.0]))
         >>> frame.to_inertial(rj.frames.Point([1.0, 0, 0], [0.0, 0, 0]), 0.0).v.tolist()
         [0.0, 2.0, 0.0]
@@ -117,7 +116,6 @@ class MovingFrame(eqx.Module):
 
         **Arguments:** as there. x' = Mᵀ(x − X), v' = Mᵀ(v − dX/dt) − Ω × x' (notes, eqs 86–88).
 
-        >>> import rigidjax as rj
         >>> frame = MovingFrame(rj.frames.Uniform([0.0, 0.0, 2.0]))
         >>> frame.from_inertial(rj.frames.Point([1.0, 0, 0], [0.0, 2, 0]), 0.0).v.tolist()
         [0.0, 0.0, 0.0]

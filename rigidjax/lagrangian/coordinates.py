@@ -110,8 +110,7 @@ class EulerAngleTop(eqx.Module):
     notes, eqs 33, 75, 81–83. Singular at sin θ = 0. **Raises:** `TypeError` for a torque without a
     potential.
 
-    >>> from rigidjax import Inertia
-    >>> free = EulerAngleTop(Inertia.from_principal(1.0, 1.0, 2.0))
+    >>> free = EulerAngleTop(rj.Inertia.from_principal(1.0, 1.0, 2.0))
     >>> free(jnp.array([0.0, 1.0, 0.0]), jnp.array([0.0, 0.0, 2.0]))
     Array(4., dtype=float64)
     """

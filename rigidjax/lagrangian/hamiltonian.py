@@ -87,7 +87,6 @@ def lie_poisson(hamiltonian: Callable[[Any], Any]) -> LiePoisson:
 
     **Raises:** `TypeError` for what cannot be called; `ValueError` where H is not one number.
 
-    >>> import rigidjax as rj
     >>> H = RotationalHamiltonian(rj.Inertia.from_principal(1.0, 2.0, 2.0))
     >>> lie_poisson(H)(0.0, Momentum([1.0, 1.0, 1.0])).pi
     Array([ 0. ,  0.5, -0.5], dtype=float64)
@@ -122,7 +121,6 @@ class RotationalHamiltonian(eqx.Module):
     **Raises:** `TypeError` for anything but an `Inertia`; `ValueError` for a moment known to be
     zero.
 
-    >>> import rigidjax as rj
     >>> RotationalHamiltonian(rj.Inertia.from_principal(1.0, 1.0, 2.0))([0.0, 0.0, 2.0])
     Array(1., dtype=float64)
     """
@@ -145,7 +143,6 @@ class HeavyTopHamiltonian(eqx.Module):
     `TypeError` for an `inertia` that is no `Inertia`, or a `top` that is no `HeavyTop`: another
     torque has no such Hamiltonian; `ValueError` for a moment known to be zero.
 
-    >>> import rigidjax as rj
     >>> top = rj.torques.HeavyTop(2.0, [0.0, 0, 0.5], [0.0, 0, -9.81])
     >>> H = HeavyTopHamiltonian(rj.Inertia.from_principal(1.0, 1.0, 2.0), top)
     >>> H([0.0, 0.0, 2.0], [0.0, 0.0, -9.81])

@@ -34,7 +34,6 @@ def energy(
     `batch.rollout` and `crossings` give it. **Raises:** `TypeError` for a torque without a
     potential.
 
-    >>> import rigidjax as rj
     >>> top = rj.torques.HeavyTop(2.0, [0.0, 0.0, 0.5], [0.0, 0.0, -9.81])
     >>> start = rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 1])
     >>> energy(rj.Inertia.from_principal(1.0, 1.0, 1.0), start, top)
@@ -75,7 +74,6 @@ def conserved(
     Source: Noether's theorem; Marsden and Ratiu, Introduction to Mechanics and Symmetry, §§1.3,
     1.4.
 
-    >>> import rigidjax as rj
     >>> body = rj.Inertia.from_principal(1.0, 2.0, 3.0)
     >>> sorted(conserved(body, rj.Spin([1.0, 0, 0])))
     ['energy', 'momentum_squared']
@@ -122,7 +120,7 @@ def drift(
     `conserved` the largest distance from its value at `ts[0]`, divided by the largest kinetic
     energy, momentum, or momentum squared of the run. Zero is perfect.
 
-    >>> import jax, rigidjax as rj
+    >>> import jax
     >>> body, ts = rj.Inertia.from_principal(1.0, 2.0, 3.0), jax.numpy.linspace(0.0, 9.0, 4)
     >>> ys = rj.simulate(body, rj.Spin([0.1, 1.0, 0.0]), ts).ys
     >>> bool(drift(ts, ys, body)["energy"] < 1e-8)

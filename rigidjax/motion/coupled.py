@@ -22,9 +22,8 @@ class Coupled(eqx.Module):
     **Arguments:** `motion` a `Spin`, `Attitude` or `Rigid`; `own` a tuple of the states of each
     law that has some, as `Solution.own`.
 
-    >>> from rigidjax import Inertia, Spin, torques
-    >>> wheel = torques.ReactionWheels([[0.0, 0, 1]], [0.1], [30.0])
-    >>> Coupled.start(Inertia.from_principal(1.0, 2.0, 3.0), Spin([0.0, 0, 2.0]), wheel).own
+    >>> wheel = rj.torques.ReactionWheels([[0.0, 0, 1]], [0.1], [30.0])
+    >>> Coupled.start(rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([0.0, 0, 2.0]), wheel).own
     (Array([3.2], dtype=float64),)
     """
 

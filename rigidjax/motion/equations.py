@@ -113,7 +113,6 @@ class EulerEquations(eqx.Module):
     **Raises:** `ValueError` for a rod or a point, since the equations divide by the zero moment, if
     the numbers are known; under `jit` call `Inertia.invertible` first.
 
-    >>> import rigidjax as rj
     >>> EulerEquations(rj.Inertia.from_principal(1.0, 2.0, 3.0))(0.0, Spin([1.0, 1, 1]), None)
     Spin(omega=[-1, 1, -0.333333])
     """
@@ -161,7 +160,6 @@ class AttitudeEquations(eqx.Module):
     number of steps with either to 3 % (diffrax.Dopri8), and their errors differed by up to a third.
     Source: `dM/dt = M J'` (notes, eq 50), written for the quaternion of M.
 
-    >>> import rigidjax as rj
     >>> field = AttitudeEquations(rj.Inertia.from_principal(1.0, 2.0, 3.0))
     >>> field(0.0, Attitude([1.0, 0, 0, 0], [0.0, 0, 1]), None).q
     Array([-0. ,  0. ,  0. ,  0.5], dtype=float64)
@@ -186,7 +184,6 @@ class NewtonEuler(eqx.Module):
     `Wrench` (F in N, world frame, and τ), or `None`. A field for `diffrax.ODETerm`; `args` is not
     used. Source: notes, eqs 1, 50, 56, 84. **Raises:** as `EulerEquations`.
 
-    >>> import rigidjax as rj
     >>> field = NewtonEuler(rj.shapes.box(2.0, [0.1, 0.2, 0.3]))
     >>> field(0.0, Rigid([0.0, 0, 0], [1.0, 0, 0], [1.0, 0, 0, 0], [0.0, 0, 1]), None).x
     Array([1., 0., 0.], dtype=float64)
@@ -217,7 +214,6 @@ def on_the_group(state: State) -> State:
 
     **Raises:** `ValueError` for a quaternion known to be zero, or too short to have a direction.
 
-    >>> import rigidjax as rj
     >>> on_the_group(rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 1])).q.tolist()
     [1.0, 0.0, 0.0, 0.0]
     """

@@ -24,7 +24,6 @@ from rigidjax.rotation.linalg3 import components
 def dimension(state: Any) -> int:
     """The number of numbers in a change of `state`: one less than its own for each quaternion.
 
-    >>> import rigidjax as rj
     >>> dimension(rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 0]))
     6
     """
@@ -34,7 +33,6 @@ def dimension(state: Any) -> int:
 def names(state: Any) -> tuple[str, ...]:
     """The names of the leaves, in the order of their numbers in a change.
 
-    >>> import rigidjax as rj
     >>> names(rj.Rigid([0.0, 0, 0], [0.0, 0, 0], [1.0, 0, 0, 0], [0.0, 0, 0]))
     ('x', 'v', 'q', 'omega')
     """
@@ -45,7 +43,6 @@ def names(state: Any) -> tuple[str, ...]:
 def parts(state: Any, change: Float[Array, "*batch n"]) -> dict[str, Float[Array, "*batch _"]]:
     """The numbers of each leaf in a change, by name; those of a quaternion are three.
 
-    >>> import rigidjax as rj
     >>> parts(rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 0]), jnp.arange(6.0))["omega"].tolist()
     [3.0, 4.0, 5.0]
     """
@@ -55,7 +52,6 @@ def parts(state: Any, change: Float[Array, "*batch n"]) -> dict[str, Float[Array
 def turns(state: Any) -> tuple[slice, ...]:
     """The places of the rotation vectors in a change, one for each quaternion.
 
-    >>> import rigidjax as rj
     >>> turns(rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 0]))
     (slice(0, 3, None),)
     """
@@ -69,7 +65,6 @@ def turns(state: Any) -> tuple[slice, ...]:
 def plus(state: Any, change: Float[Array, " n"]) -> Any:
     """`state ⊕ change`: q exp(δθ), and sums; exactly `state` at 0.
 
-    >>> import rigidjax as rj
     >>> plus(rj.Spin([1.0, 0, 0]), jnp.array([0.0, 0.5, 0.0])).omega.tolist()
     [1.0, 0.5, 0.0]
     """
@@ -83,7 +78,6 @@ def plus(state: Any, change: Float[Array, " n"]) -> Any:
 def minus(state: Any, reference: Any) -> Float[Array, " n"]:
     """`state ⊖ reference`: the change with `plus(reference, change) = state`, a turn of up to π.
 
-    >>> import rigidjax as rj
     >>> minus(rj.Spin([1.0, 0.5, 0.0]), rj.Spin([1.0, 0, 0])).tolist()
     [0.0, 0.5, 0.0]
     """
@@ -100,7 +94,6 @@ def minus_small(state: Any, reference: Any) -> Float[Array, " n"]:
 
     It is correct to second order in θ, without an arctangent, which derivatives would double.
 
-    >>> import rigidjax as rj
     >>> minus_small(rj.Spin([1.0, 0.5, 0.0]), rj.Spin([1.0, 0, 0])).tolist()
     [0.0, 0.5, 0.0]
     """
@@ -116,7 +109,6 @@ def minus_small(state: Any, reference: Any) -> Float[Array, " n"]:
 def tangent(state: Any, change: Float[Array, " n"]) -> Any:
     """The derivative of `plus(state, ·)` at zero along a change: a tangent, as JAX has them.
 
-    >>> import rigidjax as rj
     >>> at = rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 0])
     >>> float(tangent(at, jnp.array([0.0, 0.0, 2.0, 0.0, 0.0, 0.0])).q[3])
     1.0
@@ -127,7 +119,6 @@ def tangent(state: Any, change: Float[Array, " n"]) -> Any:
 def coordinates(state: Any, along: Any) -> Float[Array, " n"]:
     """The change whose `tangent` at `state` is `along`: the inverse of `tangent`.
 
-    >>> import rigidjax as rj
     >>> at, change = rj.Attitude([0.6, 0, 0.8, 0], [0.0, 0, 0]), jnp.arange(6.0)
     >>> coordinates(at, tangent(at, change)).round(12).tolist()
     [0.0, 1.0, 2.0, 3.0, 4.0, 5.0]

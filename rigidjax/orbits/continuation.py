@@ -48,8 +48,7 @@ def family(
     **Raises:** `ValueError` (`EquinoxRuntimeError` under `jit`) with the value at which it was
     lost.
 
-    >>> from rigidjax import orbits
-    >>> moon = orbits.cr3bp(0.0121505856)
+    >>> moon = rj.orbits.cr3bp(0.0121505856)
     >>> start = moon.lyapunov_guess(1, 0.01)
     >>> found = moon.family(start, start.state.x[0] - jnp.array([0.0, 0.01]))
     >>> [round(float(p), 3) for p in found.period]
@@ -113,9 +112,8 @@ def family_slope(scene: Any, orbit: PeriodicOrbit, *, hold: str = "x") -> Period
     shape of an orbit: `.period` is d period/d hold. Exact (implicit function theorem). **Raises:**
     `ValueError` at a fold of the family in `hold`.
 
-    >>> from rigidjax import Point, orbits
-    >>> hill, start = orbits.hill(), Point([0.3, 0, 0], [0.0, 1.6, 0])
-    >>> orbit = hill.periodic_orbit(orbits.PeriodicOrbit(start, 1.2))
+    >>> hill, start = rj.orbits.hill(), rj.Point([0.3, 0, 0], [0.0, 1.6, 0])
+    >>> orbit = hill.periodic_orbit(rj.orbits.PeriodicOrbit(start, 1.2))
     >>> round(float(hill.family_slope(orbit).period), 3)
     12.076
     """

@@ -65,8 +65,7 @@ class ThreeBody(AbstractReversible):
     def jacobi_constant(self, state: Point) -> Scalar:
         """C = 2U − |v|², conserved along the motion (Szebehely 1967, eq 1.5(20)).
 
-        >>> from rigidjax import orbits
-        >>> float(orbits.cr3bp(0.5).jacobi_constant(Point([0.0, 0, 0], [0.0, 0, 0])))
+        >>> float(rj.orbits.cr3bp(0.5).jacobi_constant(Point([0.0, 0, 0], [0.0, 0, 0])))
         4.0
         """
         require_point(state)
@@ -92,8 +91,7 @@ class ThreeBody(AbstractReversible):
         **Arguments:** `xs`, `ys` places along the axes. `matplotlib.pyplot.contour(xs, ys, grid,
         levels=[C])` draws the curve of zero velocity (Szebehely 1967, sec. 4.7).
 
-        >>> from rigidjax import orbits
-        >>> orbits.cr3bp(0.5).zero_velocity([0.0], [0.0]).tolist()
+        >>> rj.orbits.cr3bp(0.5).zero_velocity([0.0], [0.0]).tolist()
         [[4.0]]
         """
         columns, rows = _checks.numbers(xs, "xs"), _checks.numbers(ys, "ys")
@@ -135,8 +133,7 @@ class ThreeBody(AbstractReversible):
         In the plane λ⁴ + (4 − U_xx − U_yy) λ² + U_xx U_yy − U_xy² = 0, across it λ² = U_zz
         (Szebehely 1967, sec. 5.2).
 
-        >>> from rigidjax import orbits
-        >>> moon = orbits.cr3bp(0.0121505856)
+        >>> moon = rj.orbits.cr3bp(0.0121505856)
         >>> bool((moon.exponents(moon.lagrange_points[3]).real < 1e-12).all())
         True
         """

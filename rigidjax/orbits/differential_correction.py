@@ -60,8 +60,7 @@ def periodic_orbit(
     doi:10.1007/BF01358403. **Raises:** `ValueError` (`EquinoxRuntimeError` under `jit`) if Newton
     does not converge.
 
-    >>> from rigidjax import orbits
-    >>> moon = orbits.cr3bp(0.0121505856)
+    >>> moon = rj.orbits.cr3bp(0.0121505856)
     >>> orbit = moon.periodic_orbit(moon.lyapunov_guess(1, 0.01))
     >>> round(float(orbit.period), 4)
     2.712
@@ -137,8 +136,7 @@ def usual_tolerance(numbers: Array) -> float:
 def miss(scene: Any, numbers: Float[Array, "4"]) -> Float[Array, "3"]:
     """y, v_x and v_z at the half period: an orbit is periodic if they vanish.
 
-    >>> from rigidjax import orbits
-    >>> miss(orbits.hill(), jnp.array([3.0 ** (-1 / 3), 0.0, 0.0, 0.0])).tolist()
+    >>> miss(rj.orbits.hill(), jnp.array([3.0 ** (-1 / 3), 0.0, 0.0, 0.0])).tolist()
     [0.0, 0.0, 0.0]
     """
     orbit = orbit_of(numbers)

@@ -144,8 +144,7 @@ def manifold(
 
     **Raises:** `ValueError` for an orbit without such a multiplier, and for another word.
 
-    >>> from rigidjax import orbits
-    >>> moon = orbits.cr3bp(0.0121505856)
+    >>> moon = rj.orbits.cr3bp(0.0121505856)
     >>> orbit = moon.periodic_orbit(moon.lyapunov_guess(1, 0.01))
     >>> moon.manifold(orbit, "unstable", count=3, samples=5).states.x.shape
     (3, 5, 3)
@@ -182,8 +181,7 @@ def manifold_start(
     `manifold`. Derivatives, by `phase`, by the orbit and by the scene's numbers, are in
     forward mode: connections between orbits are found with them by Newton's method.
 
-    >>> from rigidjax import orbits
-    >>> moon = orbits.cr3bp(0.0121505856)
+    >>> moon = rj.orbits.cr3bp(0.0121505856)
     >>> orbit = moon.periodic_orbit(moon.lyapunov_guess(1, 0.01))
     >>> start = moon.manifold_start(orbit, 0.0, "stable")
     >>> bool(abs(start.x[0] - orbit.state.x[0]) < 1e-5)

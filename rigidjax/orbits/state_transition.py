@@ -18,8 +18,7 @@ from rigidjax.frames.point import Point
 def flow(scene: AbstractScene, state: Point, t: ScalarLike, rtol: float, atol: float) -> Point:
     """The state of `scene` a time `t` after `state`; derivatives in forward mode.
 
-    >>> from rigidjax.frames import scenes
-    >>> flow(scenes.turntable(0.0), Point([0.0, 0, 0], [1.0, 0, 0]), 2.0, 1e-9, 1e-9).x.tolist()
+    >>> flow(rj.scenes.turntable(0.0), Point([0.0, 0, 0], [1.0, 0, 0]), 2.0, 1e-9, 1e-9).x.tolist()
     [2.0, 0.0, 0.0]
     """
     end, result = _end(scene, state, t, rtol, atol)

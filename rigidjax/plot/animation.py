@@ -107,7 +107,6 @@ def tumble(
     **Raises** `ValueError` for a batch, other lengths or numbers that are not positive; `TypeError`
     for states without an attitude.
 
-    >>> import rigidjax as rj
     >>> body = rj.shapes.box(1.0, [0.1, 0.2, 0.3])
     >>> sol = rj.simulate(body.inertia, rj.Attitude([1.0, 0, 0, 0], [0, 1, 0.1]), [0.0, 0.5, 1.0])
     >>> tumble(body, sol.ts, sol.ys, fps=2).data[:6]

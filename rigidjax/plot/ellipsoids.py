@@ -34,7 +34,6 @@ def inertia_ellipsoid(
     axes. **Returns** the axes (3,), planes xy, xz and yz of the body frame. **Raises** `TypeError`
     for anything but these, `ValueError` for a body without extension.
 
-    >>> import rigidjax as rj
     >>> [one.get_xlabel() for one in inertia_ellipsoid(rj.shapes.box(1.0, [1.0, 2.0, 3.0]))]
     ['x, m', 'x, m', 'y, m']
     """

@@ -33,7 +33,6 @@ def frames(
 
     **Raises** `ValueError` for an unknown plane, other lengths, or a batch.
 
-    >>> import rigidjax as rj
     >>> turntable = MovingFrame(rj.frames.Uniform([0.0, 0.0, 1.0]))
     >>> ts = jnp.linspace(0.0, 3.0, 20)
     >>> seen = rj.simulate(None, Point([1.0, 0, 0], [0.0, 0, 0]), ts, turntable).ys

@@ -41,7 +41,6 @@ def horizons(
     **Raises** `TypeError` for anything but errors by horizon; `ValueError` for none, for kinds that
     differ, an unknown measure, a step that is not positive, another number of axes.
 
-    >>> import rigidjax as rj
     >>> t = np.arange(8.0)
     >>> cut = rj.identify.windows(t, rj.Spin(np.ones((8, 3)) * t[:, None]), length=3)
     >>> horizons({"held": cut.held()})[0].get_ylabel()

@@ -44,7 +44,6 @@ def phase_portrait(
     **Raises** `ValueError` for a body that is not symmetric about its centre of mass's axis, no
     weight, or a batch; `TypeError` for states without an attitude.
 
-    >>> import rigidjax as rj
     >>> body = rj.Inertia.from_principal(2.0, 2.0, 1.0)
     >>> top = rj.torques.HeavyTop(1.0, [0.0, 0, 1.0], [0, 0, -9.81])
     >>> start = rj.Attitude(rj.quaternion.exp(jnp.array([0.4, 0.0, 0.0])), [0, 0, 20.0])

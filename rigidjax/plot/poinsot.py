@@ -35,7 +35,6 @@ def body_axes(states: HasAttitude, *, title: str = "", ax: Any = None) -> Any:
     before the call (`view_init`). **Returns** the axes. **Raises** `TypeError` for states without
     an attitude or flat axes, `ValueError` for a batch.
 
-    >>> import rigidjax as rj
     >>> sol = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 3.0),
     ...                   rj.Attitude([1.0, 0, 0, 0], [0, 1, 0.1]), [0.0, 1.0, 2.0])
     >>> body_axes(sol.ys).get_zlabel()
@@ -72,7 +71,6 @@ def polhode(
     of thin lines; `title`; `ax` your 3-D axes. **Returns** the axes. **Raises** `ValueError` for a
     body at rest, a zero moment or a batch; `TypeError` for flat axes.
 
-    >>> import rigidjax as rj
     >>> body = rj.Inertia.from_principal(1.0, 2.0, 3.0)
     >>> sol = rj.simulate(body, rj.Spin([0.1, 1.0, 0.0]), [0.0, 1.0, 2.0])
     >>> polhode(body, sol.ys).get_zlabel()
@@ -156,7 +154,6 @@ def herpolhode(inertia: Inertia, states: HasAttitude, *, title: str = "", ax: An
     or a momentum that turned by more than 1e-3 rad (that is no free motion); `TypeError` for states
     without an attitude.
 
-    >>> import rigidjax as rj
     >>> body = rj.Inertia.from_principal(1.0, 2.0, 3.0)
     >>> sol = rj.simulate(body, rj.Attitude([1.0, 0, 0, 0], [0.1, 1.0, 0.0]), [0.0, 1.0, 2.0])
     >>> herpolhode(body, sol.ys).get_xlabel()

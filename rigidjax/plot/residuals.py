@@ -26,7 +26,6 @@ def residuals(
     `ModuleNotFoundError` if matplotlib is missing; `ValueError` for an unknown unit or axes of
     another shape; `IndexError` for a missing recording.
 
-    >>> import jax.numpy as jnp, rigidjax as rj
     >>> ts = jnp.linspace(0.0, 10.0, 80)
     >>> motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1, 0.1, 1.0]), ts)
     >>> record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), motion.ys.omega))

@@ -41,7 +41,6 @@ def motion(
 
     **Raises** `ValueError` for an unknown unit, or a batch instead of one body.
 
-    >>> import rigidjax as rj
     >>> body = rj.Inertia.from_principal(1.0, 2.0, 3.0)
     >>> sol = rj.simulate(body, rj.Spin([0, 1, 0.1]), [0.0, 1.0, 2.0])
     >>> motion(sol.ts, sol.ys)[0].get_ylabel()

@@ -72,7 +72,7 @@ class AbstractTorque(eqx.Module):
     `batch.simulate`, `identify.fit` and `identify.fit_windows`. A function of time inside a torque
     may have some, too (`Lagged`), and is called as `(t, own)`. No base class is needed:
 
-    >>> import equinox as eqx, jax.numpy as jnp, rigidjax as rj
+    >>> import equinox as eqx
     >>> class Fading(eqx.Module):
     ...     state0: jnp.ndarray
     ...     def rate(self, t, own, state, body):
@@ -96,7 +96,6 @@ class AbstractForce(eqx.Module):
 
     It acts on `Rigid` states only; `body` is a `MassProperties`.
 
-    >>> import rigidjax as rj
     >>> class Thrust(AbstractForce):  # 2 N along world z through the centre of mass
     ...     feels = rj.motion.HasPose
     ...     def __call__(self, t, state, body):
@@ -241,7 +240,6 @@ _HIGHER = {"q": "Attitude(q, omega)", "x": "Rigid(x, v, q, omega)", "v": "Rigid(
 def lacking(who: str, wrong: AttributeError) -> str | None:
     """The message if a user's function reads a part that its state does not have.
 
-    >>> import rigidjax as rj
     >>> try:
     ...     rj.Spin([0.0, 0.0, 1.0]).q
     ... except AttributeError as wrong:
@@ -326,8 +324,7 @@ def jumps_of(source: object) -> Float[Array, " n"]:
 
     **Arguments:** `source` a torque, or a function of time, with or without `jump_times`.
 
-    >>> from rigidjax import torques
-    >>> jumps_of(torques.Pulses([1.0, 2.0], [[0.0, 0.0, 1.0]]))
+    >>> jumps_of(rj.torques.Pulses([1.0, 2.0], [[0.0, 0.0, 1.0]]))
     Array([1., 2.], dtype=float64)
     """
     found = getattr(source, "jump_times", None)

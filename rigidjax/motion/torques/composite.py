@@ -22,8 +22,7 @@ class Sum(eqx.Module):
     **Arguments:** `*parts` torques, forces, your own callables. **Raises:** `TypeError` for a part
     that cannot be called; `ValueError` for none at all.
 
-    >>> from rigidjax import torques
-    >>> Sum(torques.Damping([1.0, 1, 1]), torques.HeavyTop(1.0, [0.0, 0, 1], [0.0, 0, -9.81])).feels
+    >>> Sum(rj.torques.Damping([1.0, 1, 1]), rj.torques.HeavyTop(1.0, [0.0, 0, 1], [0.0, 0, -9.81])).feels
     <class 'rigidjax._types.HasAttitude'>
     """
 
@@ -87,7 +86,6 @@ class ChangingInertia(eqx.Module):
     without τ. **Raises:** `TypeError` for anything but a function; `ValueError` for a value that is
     not (3, 3).
 
-    >>> import rigidjax as rj
     >>> grows = ChangingInertia(lambda t: (1.0 + t) * jnp.eye(3))
     >>> body = rj.Inertia(jnp.eye(3))
     >>> rj.simulate(body, rj.Spin([0.0, 0, 1.0]), [0.0, 1.0], grows).ys.omega[-1, 2]

@@ -16,7 +16,6 @@ class ConstantTorque(base.AbstractTorque):
     **Arguments:** `torque` (3,) N m, body frame. About a principal axis it spins the body up
     linearly (Euler 1758); for one in space see `InSpace`.
 
-    >>> import rigidjax as rj
     >>> ConstantTorque([0.0, 0.0, 1.0])(0.0, rj.Spin([0.0, 0.0, 5.0]), None).tolist()
     [0.0, 0.0, 1.0]
     """
@@ -38,7 +37,6 @@ class InSpace(base.OfTime):
 
     A constant τ_w conserves the angular momentum across it, and adds τ_w t along it.
 
-    >>> import rigidjax as rj
     >>> turned = rj.Attitude([0.0, 1.0, 0.0, 0.0], [0.0, 0, 0])  # half a turn about x
     >>> InSpace([0.0, 0.0, 1.0])(0.0, turned, None).tolist()  # in body axes
     [0.0, 0.0, -1.0]

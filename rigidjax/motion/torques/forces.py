@@ -20,7 +20,6 @@ class UniformGravity(base.AbstractForce):
 
     **Arguments:** `gravity` (3,) g, m/s², world frame, such as [0, 0, −9.81]. Source: notes, eq 84.
 
-    >>> import rigidjax as rj
     >>> body = rj.MassProperties(2.0, [0.0, 0, 0], jnp.eye(3))
     >>> state = rj.Rigid([0.0, 0, 0], [0.0, 0, 0], [1.0, 0, 0, 0], [0.0, 0, 0])
     >>> UniformGravity([0.0, 0.0, -9.8])(0.0, state, body).force.tolist()  # N
@@ -50,7 +49,6 @@ class CentralGravity(base.AbstractForce):
     torque, so that the energy and the momentum about the origin are conserved. `I_w = R I Rᵀ`.
     **Arguments:** `mu` μ = G M, m³/s². Source: Hughes, Spacecraft Attitude Dynamics, §8.1.
 
-    >>> import rigidjax as rj
     >>> body = rj.MassProperties(2.0, [0.0, 0, 0], 1e-9 * jnp.eye(3))
     >>> state = rj.Rigid([2.0, 0, 0], [0.0, 0, 0], [1.0, 0, 0, 0], [0.0, 0, 0])
     >>> round(float(CentralGravity(8.0)(0.0, state, body).force[0]), 6)  # N, −m μ/r²
@@ -93,7 +91,6 @@ class Drag(base.AbstractForce):
     Source: Newton, Principia, Book II, Section II. The first derivative at u = 0 is zero; a second
     does not exist there.
 
-    >>> import rigidjax as rj
     >>> body = rj.MassProperties(2.0, [0.0, 0, 0], jnp.eye(3))
     >>> state = rj.Rigid([0.0, 0, 0], [3.0, 0, 0], [1.0, 0, 0, 0], [0.0, 0, 0])
     >>> float(Drag(0.5)(0.0, state, body).force[0])  # N, −0.5 · 3²
@@ -125,10 +122,9 @@ class Rotors(base.AbstractForce):
     doi:10.1109/MRA.2012.2206474. **Raises:** `ValueError` for a direction that is not a unit
     vector, or a spin that is not 1 or −1.
 
-    >>> from rigidjax import Rigid, shapes
     >>> up = Rotors([[0.1, 0.0, 0.0]], [[0.0, 0.0, 1.0]], [1.0], 2.0, 0.5, [3.0])
-    >>> rest = Rigid([0.0, 0, 0], [0.0, 0, 0], [1.0, 0, 0, 0], [0.0, 0, 0])
-    >>> up(0.0, rest, shapes.sphere(1.0, 1.0)).torque.tolist()
+    >>> rest = rj.Rigid([0.0, 0, 0], [0.0, 0, 0], [1.0, 0, 0, 0], [0.0, 0, 0])
+    >>> up(0.0, rest, rj.shapes.sphere(1.0, 1.0)).torque.tolist()
     [0.0, -1.8, -4.5]
     """
 
@@ -186,9 +182,8 @@ class BodyDrag(base.AbstractForce):
     Source: Faessler, Franchi and Scaramuzza 2018, eq 5, doi:10.1109/LRA.2017.2776353, for the
     linear part; Hoerner 1965, Fluid-Dynamic Drag, for the other. |u| u is taken axis by axis.
 
-    >>> from rigidjax import Rigid, shapes
-    >>> fast = Rigid([0.0, 0, 0], [2.0, 0, 0], [1.0, 0, 0, 0], [0.0, 0, 0])
-    >>> BodyDrag([1.0, 1, 1], [0.5, 0, 0])(0.0, fast, shapes.sphere(1.0, 1.0)).force.tolist()
+    >>> fast = rj.Rigid([0.0, 0, 0], [2.0, 0, 0], [1.0, 0, 0, 0], [0.0, 0, 0])
+    >>> BodyDrag([1.0, 1, 1], [0.5, 0, 0])(0.0, fast, rj.shapes.sphere(1.0, 1.0)).force.tolist()
     [-4.0, 0.0, 0.0]
     """
 

@@ -63,8 +63,7 @@ class Delayed(eqx.Module):
     `Lagged(Delayed(u, d), T)`; `ValueError` for a delay that is not finite, or is as
     long as the record.
 
-    >>> from rigidjax import torques
-    >>> float(Delayed(torques.Held([0.0, 1.0, 2.0], [5.0, 6.0, 7.0]), 0.7)(1.5))
+    >>> float(Delayed(rj.torques.Held([0.0, 1.0, 2.0], [5.0, 6.0, 7.0]), 0.7)(1.5))
     5.0
     """
 
@@ -120,7 +119,6 @@ class Lagged(eqx.Module):
     Åström and Murray, Feedback Systems. **Raises:** `TypeError` for a source that cannot be called;
     `ValueError` for a time that is known and not positive, or wrong shapes.
 
-    >>> import rigidjax as rj
     >>> push = rj.torques.InSpace(Lagged(lambda t: jnp.array([0.0, 0.0, 1.0]), 0.5, jnp.zeros(3)))
     >>> body, start = rj.Inertia(jnp.eye(3)), rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 0])
     >>> rj.simulate(body, start, [0.0, 0.5], push).own[0][-1, 2]  # 1 − 1/e

@@ -30,8 +30,7 @@ class HeavyTop(base.AbstractTorque):
     which has no fixed point.
 
     >>> top = HeavyTop(2.0, [0.0, 0.0, 0.5], [0.0, 0.0, -9.81])
-    >>> from rigidjax import Attitude, Inertia
-    >>> top.energy(0.0, Attitude([1.0, 0, 0, 0], [0.0, 0, 1]), Inertia(jnp.eye(3)))
+    >>> top.energy(0.0, rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 1]), rj.Inertia(jnp.eye(3)))
     Array(9.81, dtype=float64)
     """
 
@@ -72,7 +71,6 @@ class GravityGradient(base.OfTime):
     the orbit itself. Source: Hughes, Spacecraft Attitude Dynamics, §8.1; Goldstein, Poole and
     Safko, Classical Mechanics, eq 5.86. **Raises:** `ValueError` for no distance.
 
-    >>> import rigidjax as rj
     >>> law, body = GravityGradient(1.0, [1.0, 1.0, 0.0]), rj.Inertia.from_principal(1.0, 2.0, 2.5)
     >>> state = rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 0])
     >>> round(float(law(0.0, state, body)[2]), 6)  # 3/r³ · ½ (I₂ − I₁), r = √2
@@ -127,7 +125,6 @@ class MagneticDipole(base.OfTime):
     Module of time, t → (3,), for a field that changes along an orbit. Source: Jackson, Classical
     Electrodynamics, eqs 5.71, 5.72.
 
-    >>> import rigidjax as rj
     >>> state = rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 0])
     >>> MagneticDipole([0.0, 0.0, 2.0], [3.0, 0.0, 0.0])(0.0, state, None).tolist()  # z × x = y
     [0.0, 6.0, 0.0]
@@ -171,8 +168,7 @@ class FromPotential(base.AbstractTorque):
     ...     k: Array
     ...     def __call__(self, q):
     ...         return 2.0 * self.k * (q[1] ** 2 + q[2] ** 2 + q[3] ** 2)
-    >>> from rigidjax import Attitude, quaternion
-    >>> at = Attitude(quaternion.exp(jnp.array([0.0, 0.0, 1e-3])), [0.0, 0, 0])
+    >>> at = rj.Attitude(rj.quaternion.exp(jnp.array([0.0, 0.0, 1e-3])), [0.0, 0, 0])
     >>> FromPotential(Spring(jnp.array(2.0)))(0.0, at, None).round(5).tolist()
     [-0.0, -0.0, -0.002]
     """

@@ -67,8 +67,7 @@ def freeze(law: Tree, own: tuple[Any, ...]) -> Tree:
     part with states, in their order in `law`, inner parts first: a row of `Solution.own`.
     **Raises:** `ValueError` for another number of states.
 
-    >>> from rigidjax import torques
-    >>> law = torques.ConstantTorque([0.0, 0.0, 1.0])
+    >>> law = rj.torques.ConstantTorque([0.0, 0.0, 1.0])
     >>> freeze(law, ()) is law
     True
     """

@@ -101,7 +101,6 @@ class ReactionWheels(base.AbstractTorque):
     **Raises:** `ValueError` for an axis that is not a unit vector, an inertia, limit or turn-over
     that is not positive.
 
-    >>> import rigidjax as rj
     >>> wheels = ReactionWheels([[0.0, 0, 1]], [0.1], [0.0], motor=[0.2])
     >>> body = wheels.without_wheels(rj.Inertia.from_principal(1.0, 2.0, 2.1))
     >>> sol = rj.simulate(body, rj.Spin([0.0, 0, 0]), [0.0, 5.0], wheels)
