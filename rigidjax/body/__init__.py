@@ -1,4 +1,4 @@
-"""Bodies: inertia, mass, second moments. Beside it: `rj.shapes`, `rj.volumes`, `rj.parameters`."""
+"""Bodies: inertia, mass, second moments; see also `rj.shapes`, `rj.volumes`, `rj.parameters`."""
 
 from rigidjax._names import show
 from rigidjax.body.divergence import divergence as divergence

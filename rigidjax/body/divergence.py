@@ -1,4 +1,4 @@
-"""The distance of one body from another, the same in every frame: a prior for fits."""
+"""The divergence of two bodies, a prior for fits that does not depend on the frame."""
 
 from functools import partial
 
@@ -15,11 +15,11 @@ def divergence(body: MassProperties, reference: MassProperties) -> Scalar:
     """Entropic (Bregman, log-determinant) divergence of two bodies, without units.
 
     `D = Tr(J₀⁻¹ J) − log det(J₀⁻¹ J) − 4` with the 4×4 pseudo-inertia
-    `J = [[𝔖 + m c cᵀ, m c], [m cᵀ, m]]`: zero only if the bodies are equal, convex in J, infinite
-    at plates and rods, and unchanged when both bodies are seen from another frame or in other
-    units. Its error is the round-off of the trace. Add `weight * divergence(body, guess)` to a
-    loss, so that quantities which the data do not determine stay near the guess. It is twice the
-    Kullback–Leibler divergence for the mass seen as a Gaussian.
+    `J = [[𝔖 + m c cᵀ, m c], [m cᵀ, m]]`. It is zero only if the bodies are equal, convex in J, and
+    infinite at plates and rods. It does not change if both bodies are seen from another frame or in
+    other units. It is twice the Kullback–Leibler divergence of the masses as Gaussians; its error
+    is the round-off of the trace. Add `weight * divergence(body, guess)` to a loss: quantities that
+    the data do not determine then stay near the guess.
 
     **Arguments:** `body`; `reference` a body with a positive definite 𝔖; the same frame and units.
     Source: Lee, Wensing and Park 2020, "Geometric robot dynamic identification: a convex

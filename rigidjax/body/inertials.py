@@ -16,14 +16,15 @@ ROUNDED = 1e-6
 
 
 def read_inertials(path: str | Path) -> dict[str, MassProperties]:
-    """The bodies with inertia in a URDF or MuJoCo XML file, by name.
+    """The bodies with inertia in a URDF or MuJoCo XML file, by name, in the frame of the link or
+    body.
 
-    In the frame of the link or body. URDF: `<inertial>` with `origin` (`xyz`, `rpy`), `mass`,
-    `inertia`. MuJoCo: `<inertial>` with `mass`, `pos`, `quat`, `diaginertia` or `fullinertia`;
-    an inertia that MuJoCo would compute from geometry is not read.
+    URDF: `<inertial>` with `origin` (`xyz`, `rpy`), `mass`, `inertia`. MuJoCo: `<inertial>` with
+    `mass`, `pos`, `quat`, `diaginertia` or `fullinertia`; an inertia that MuJoCo would compute from
+    geometry is not read.
 
     **Arguments:** `path` of the file. **Returns** name → `MassProperties`, in order. **Raises:**
-    `ValueError`, naming file and body, for a file that is missing or of another format, an invalid
+    `ValueError`, with file and body, for a file that is missing or of another format, an invalid
     number, an orientation in another form, an inertia of no real body.
 
     >>> read_inertials("missing.urdf")
@@ -47,12 +48,12 @@ def read_inertials(path: str | Path) -> dict[str, MassProperties]:
 def write_inertials(
     path: str | Path, bodies: Mapping[str, MassProperties], source: str | Path
 ) -> None:
-    """A copy of a URDF or MuJoCo XML file with the inertials of these bodies in it.
+    """Copy a URDF or MuJoCo XML file, with these bodies in the place of its inertials.
 
     **Arguments:** `path` of the new file; `bodies` name → `MassProperties`, in the frames of the
-    file's links or bodies; `source` the file to copy; the rest of it stays. **Raises:**
-    `ValueError` as `read_inertials`, and for a name that is not in the file; `TypeError` for
-    anything but `MassProperties`.
+    file's links or bodies; `source` the file to copy; its other content does not change.
+    **Raises:** `ValueError` as `read_inertials`, and for a name that is not in the file;
+    `TypeError` for anything but `MassProperties`.
 
     >>> write_inertials("new.urdf", {}, "old.urdf")
     Traceback (most recent call last):

@@ -1,10 +1,9 @@
 """Mass properties of the solid inside a closed triangle mesh, by exact integrals.
 
-The solid is a signed sum of tetrahedra from one inner point to each face; over a tetrahedron with
-corners 0, a, b, c the integrals of 1, r and r rᵀ are polynomials of a, b, c. The result is
-therefore exact up to round-off and differentiable in the vertices. The mesh is first shifted to its
-centroid, to keep all digits far from the origin: a sum about the origin subtracts numbers of size
-(distance)⁵.
+The solid is a signed sum of tetrahedra from one inner point to each face. Over a tetrahedron with
+corners 0, a, b, c the integrals of 1, r and r rᵀ are polynomials of a, b, c, so that the result is
+exact to round-off and differentiable in the vertices. The mesh is first shifted to its centroid:
+far from the origin a sum about the origin would subtract numbers of size (distance)⁵.
 """
 
 import os
@@ -29,14 +28,14 @@ def mesh(
 ) -> MassProperties:
     """The solid of one density inside a closed triangle mesh.
 
-    **Arguments:** `vertices` (n, 3) m, body frame; `faces` (m, 3) vertex numbers from 0, counter-
-    clockwise seen from outside; holes inside are closed meshes turned the other way; `density`
-    kg/m³. Differentiable in `vertices` and `density`. Faces without area are harmless and allowed.
-    Source: integrals over a tetrahedron, e.g. Tonon 2004, J. Math. Stat. 1:8.
+    **Arguments:** `vertices` (n, 3) m, body frame; `faces` (m, 3) vertex numbers from 0,
+    counter-clockwise seen from outside (a hole inside is a closed mesh with the opposite order);
+    `density` kg/m³. It is differentiable in `vertices` and `density`. Faces without area are
+    allowed. Source: integrals over a tetrahedron, e.g. Tonon 2004, J. Math. Stat. 1:8.
 
     **Raises:** `ValueError` for a mesh that is open, whose faces disagree about outside, that is
-    inside out, or has a face with a repeated or missing vertex; `TypeError`, `ValueError` for
-    dtypes and shapes. Under `jit` the faces are checked if they are known.
+    inside out, or has a face with a repeated or missing vertex. Under `jit` the faces are checked
+    if they are known.
 
     >>> corners = [[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]
     >>> body = mesh(corners, [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], density=6.0)
@@ -64,7 +63,8 @@ def mesh_file(
 ) -> MassProperties:
     """The solid inside a closed mesh read from a file: STL, OBJ, PLY, OFF, GLB, …
 
-    Needs `trimesh` (`pip install "rigidjax[mesh]"`), which also merges equal vertices.
+    It needs `trimesh` (`pip install "rigidjax[mesh]"`), which also merges equal vertices.
+
     **Arguments:** `path` of the file; `density` kg/m³; `scale` metres per unit of the file (most
     STL files are in millimetres: 1e-3). **Raises:** `FileNotFoundError`; `ImportError` without
     trimesh; otherwise as `mesh`.
@@ -142,7 +142,7 @@ def _outward(volume, corners, faces):
 
 
 def faces_of(faces: Any, n: int) -> Array:
-    """The faces as an array (m, 3) of vertex numbers below n, checked where they are known."""
+    """The faces as an array (m, 3) of vertex numbers below n, checked if they are known."""
     if not _checks.known(faces):
         return faces
     try:

@@ -1,11 +1,11 @@
 """Unconstrained numbers ↔ real bodies.
 
-The second moment is the square of a symmetric matrix, 𝔖 ∝ (1 + V)² with V trace-free, so that any
-vector is a body: an optimiser needs no constraint and always has a real body. Plates and rods are
-ordinary points: their root has a zero eigenvalue. In the log-Cholesky chart (Rucker and Wensing
-2022, doi:10.1109/LRA.2022.3144517) they lie at infinity; in Cholesky's factor itself a small turn
-of a plate is a large step. A vector with a negative eigenvalue of 1 + V has the same body as
-another vector without one, which `pack` returns.
+The second moment is the square of a symmetric matrix, 𝔖 ∝ (1 + V)² with V trace-free. Every vector
+is then a real body, and an optimiser needs no constraint. Plates and rods are ordinary points:
+their root has a zero eigenvalue. (In the log-Cholesky chart of Rucker and Wensing 2022,
+doi:10.1109/LRA.2022.3144517, they lie at infinity; in Cholesky's factor itself a small turn of a
+plate is a large step.) If 1 + V has a negative eigenvalue, another vector without one has the same
+body; `pack` returns that vector.
 """
 
 from collections.abc import Callable
@@ -32,8 +32,8 @@ def pack(body: MassProperties) -> Float[Array, "10"]:
 
     **Arguments:** `body`, also a plate or a rod. **Returns** (10,)
     `(α, ρ, d1, d2, s12, s23, s13, t1, t2, t3)`: `mass = e^{2α}`, `com = t` (m, body frame), and
-    about the centre of mass `𝔖 / mass` as in `pack_second_moment`, ρ the logarithm of a length (m).
-    **Raises:** `ValueError` (`equinox` error under `jit`) for a point.
+    `𝔖 / mass` about the centre of mass as in `pack_second_moment`, with ρ the logarithm of a length
+    (m). **Raises:** `ValueError` (`equinox` error under `jit`) for a point.
 
     >>> vector = pack(rj.shapes.box(2.0, [0.1, 0.2, 0.3]))
     >>> round(float(unpack(vector).mass), 12)
@@ -51,11 +51,11 @@ def pack(body: MassProperties) -> Float[Array, "10"]:
 
 
 def unpack(vector: Float[ArrayLike, "10"] | Numbers) -> MassProperties:
-    """The body of ten unconstrained numbers: any ten.
+    """The body of any ten unconstrained numbers.
 
-    **Arguments:** `vector` (10,) as `pack` returns them. Exponents beyond what the dtype can hold
-    (|α|, |α + ρ| over 330 in float64, 31 in float32) grow logarithmically instead, so that an
-    optimiser's step that is much too long gives a large body and not an infinity.
+    **Arguments:** `vector` (10,) as `pack` returns them. Exponents beyond the range of the dtype
+    (|α|, |α + ρ| over 330 in float64, 31 in float32) grow logarithmically instead: a step of an
+    optimiser that is much too long gives a large body, not an infinite one.
 
     >>> unpack(jnp.zeros(10)).inertia.moments
     Array([2., 2., 2.], dtype=float64)
@@ -92,14 +92,13 @@ def unpack_second_moment(vector: Float[ArrayLike, "6"] | Numbers) -> Mat3:
 
 
 def pack_shape(second_moment: Matrix) -> Float[Array, "5"]:
-    """Five unconstrained numbers of a second moment up to its scale.
+    """Five unconstrained numbers of a second moment up to its scale: free motion depends only on
+    them.
 
-    Free motion depends only on this: the ratios of inertia and the axes. **Arguments:**
-    `second_moment` (3, 3) 𝔖, positive semi-definite, any units. **Returns** (5,)
-    `(d1, d2, s12, s23, s13)`: the root √𝔖 scaled to trace 3 is `1 + V`, V symmetric with
-    `(d1, d2, −d1 − d2)` on its diagonal and `s_ij` beside it.
-
-    **Raises:** `ValueError` (`equinox` error under `jit`) for an invalid or zero second moment.
+    **Arguments:** `second_moment` (3, 3) 𝔖, positive semi-definite, any units. **Returns** (5,)
+    `(d1, d2, s12, s23, s13)`: the root √𝔖 scaled to trace 3 is `1 + V`, where V is symmetric with
+    the diagonal `(d1, d2, −d1 − d2)` and the other entries `s_ij`. **Raises:** `ValueError`
+    (`equinox` error under `jit`) for an invalid or zero second moment.
 
     >>> pack_shape(jnp.diag(jnp.array([4.0, 4.0, 0.0])))  # a plate
     Array([0.5, 0.5, 0. , 0. , 0. ], dtype=float64)
@@ -119,7 +118,7 @@ def unpack_shape(vector: Float[ArrayLike, "5"] | Numbers) -> Mat3:
 
 
 def pack_moments(moments: Vector) -> Float[Array, "3"]:
-    """Three unconstrained numbers of principal moments, the axes being known.
+    """Three unconstrained numbers of principal moments whose axes are known.
 
     **Arguments:** `moments` (3,) I1, I2, I3 in any order, kg m². **Returns** (3,) `(ρ, d1, d2)` as
     in `pack_second_moment`, of the second moments `λ1 = ½(I2 + I3 − I1)`, … (notes, eqs 76–78).
@@ -136,7 +135,7 @@ def pack_moments(moments: Vector) -> Float[Array, "3"]:
 
 
 def unpack_moments(vector: Float[ArrayLike, "3"] | Numbers) -> Vec3:
-    """Principal moments (3,), kg m², of three unconstrained numbers, always a body's.
+    """Principal moments (3,), kg m², of three unconstrained numbers: always those of a real body.
 
     **Arguments:** `vector` (3,) as `pack_moments` returns them.
 
@@ -152,14 +151,15 @@ def unpack_moments(vector: Float[ArrayLike, "3"] | Numbers) -> Vec3:
 def flat_bend(
     shape: Float[ArrayLike, "5"] | Numbers, slope: Float[ArrayLike, "5"] | Numbers
 ) -> Float[Array, "3 5"]:
-    """Rows b whose squares are the second derivative of a misfit that the chart's bend gives.
+    """Rows b; the sum of b bᵀ is the second derivative of a misfit that the chart's curvature adds.
 
-    Near a flat body the least second moment is a square, λ = a² in a number a of the chart: a
-    misfit that pushes towards λ < 0 has a least at a = 0, which products of first derivatives do
-    not see. With n the axis of a, `d²λ = 2 |dA n|²`; what the misfit changes by in λ is the part of
-    its derivative in the root A along n nᵀ. Zero where the body is not flat, or not pushed.
+    Near a flat body the least second moment is a square, λ = a² with a number a of the chart. A
+    misfit that decreases towards λ < 0 has its minimum at a = 0, and products of first derivatives
+    do not show this curvature. With n the axis of a, `d²λ = 2 |dA n|²`; the derivative of the
+    misfit by λ is the part along n nᵀ of its derivative by the root A. The rows are zero if the
+    body is not flat, or the misfit does not decrease so.
 
-    **Arguments:** `shape` (5,) as in `pack_shape`; `slope` (5,) the misfit's derivative in it.
+    **Arguments:** `shape` (5,) as in `pack_shape`; `slope` (5,) the misfit's derivative by it.
 
     >>> plate = pack_shape(jnp.diag(jnp.array([4.0, 4.0, 1e-12])))
     >>> flat_bend(plate, -1e-6 * jnp.ones(5)).shape
@@ -251,7 +251,7 @@ def _not_a_point(total: Scalar) -> Scalar:
 
 
 def _hold(exponent: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """The exponent itself, but growing only logarithmically past the dtype's range."""
+    """The exponent, which grows only logarithmically beyond the range of the dtype."""
     return _bent(exponent, jnp.log1p)
 
 

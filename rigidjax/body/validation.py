@@ -1,8 +1,8 @@
-"""Checks that a body has these numbers, with the error in words.
+"""Checks that a body has these numbers, with errors in words.
 
-Each returns its argument, and refuses numbers of no real body. They work on known values (plain
-exceptions, with the numbers) and under `jit` (`equinox.error_if`, without them). A few units of
-round-off are tolerated, so that plates, rods and points, which lie on the boundary, pass.
+Each returns its argument, and refuses numbers of no real body: known values with plain exceptions
+and the numbers, traced ones with `equinox.error_if`, without them. A few units of round-off are
+tolerated: plates, rods and points lie on the boundary and pass.
 """
 
 from typing import Any
@@ -29,7 +29,7 @@ def real_mass(mass: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
 
 
 def mass_of_a_body(mass: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
-    """A positive mass as it is; another is refused if it is known, and NaN if it is traced."""
+    """The mass if it is positive; another is refused if it is known, and NaN if it is traced."""
     return real_mass(mass) if _checks.known(mass) else jnp.where(mass > 0, mass, jnp.nan)
 
 
@@ -67,8 +67,8 @@ def possible(body: Any, tensor: Float[Array, "*batch 3 3"], mass: Any, throw: bo
     """Return `body` if some mass has these numbers and no moment is zero.
 
     Other numbers are refused with the cause if they are known, or if `throw`. Without `throw` all
-    numbers of a traced body, and its motion, become NaN, but no other body's. **Arguments:**
-    `tensor` the inertia, kg m²; `mass` kg, `None` for a body that only turns.
+    numbers of a traced body become NaN, but no other body's. `tensor` is the inertia, kg m²; `mass`
+    kg, `None` for a body that only turns.
     """
     tensor = _checks.numbers(tensor, "inertia tensor")
     is_known = _checks.known((tensor, mass))
@@ -112,8 +112,8 @@ _THIN = (
 def _impossible(xp: Any, tensor: Any, slack: float) -> tuple[Any, Any]:
     """Whether a moment is zero to round-off or NaN, and whether no mass has these moments.
 
-    No mass has them unless 𝔖 = ½Tr(I) 1 − I is positive semi-definite: its principal minors show
-    this, at a tenth of the cost of eigenvalues in a batch.
+    A body has them if the principal minors of 𝔖 = ½Tr(I) 1 − I are not negative: in a batch this
+    takes a tenth of the time of eigenvalues.
     """
 
     def minors(a: Any) -> tuple[Any, ...]:
@@ -139,7 +139,7 @@ _PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 
 def unit_quaternion(q: Quaternion) -> Quat:
-    """A unit quaternion (w, x, y, z): normalised if off by round-off, refused if by more."""
+    """A unit quaternion (w, x, y, z): normalised if off by round-off, else refused."""
     q = _checks.given(q, (4,), "q", hint="a quaternion is (w, x, y, z)")
     return quaternion.normalise(near_unit(q, "q", tolerance(q.dtype)))
 
