@@ -1,4 +1,4 @@
-"""Symmetric 3×3 matrices written out in components, for the reasons of `rigidjax.rotation.linalg3`."""
+"""Symmetric 3×3 matrices written out in components, as in `rigidjax.rotation.linalg3`."""
 
 import jax
 import jax.numpy as jnp
@@ -12,8 +12,8 @@ from rigidjax.rotation.linalg3 import apply as apply, entries, product as produc
 def inverse(a: Mat3) -> Mat3:
     """The inverse of a symmetric 3×3 matrix with trace > 0, by cofactors.
 
-    The matrix is divided by its trace first: a body of 1e-20 or of 1e37 kg m² neither underflows nor
-    overflows. A zero moment gives infinities; `Inertia.invertible` refuses it in words.
+    The matrix is divided by its trace first: 1e-20 or 1e37 kg m² neither underflow nor overflow. A
+    zero moment gives infinities; `Inertia.invertible` refuses it in words.
     """
     xx, _, _, _, yy, _, _, _, zz = entries(a)
     scale = xx + yy + zz

@@ -1,7 +1,7 @@
-"""The tumbling asteroid 4179 Toutatis as radar saw it in December 1992.
+"""The tumbling asteroid 4179 Toutatis, observed by radar in December 1992.
 
-Published figures, typed in: Y. Takahashi, M. W. Busch, D. J. Scheeres, "Spin state and moment of
-inertia characterization of 4179 Toutatis", The Astronomical Journal 146:95 (2013), table 3,
+Published figures: Y. Takahashi, M. W. Busch, D. J. Scheeres, "Spin state and moment of inertia
+characterization of 4179 Toutatis", The Astronomical Journal 146:95 (2013), table 3,
 doi:10.1088/0004-6256/146/4/95; from the radar imaging of R. S. Hudson and S. J. Ostro, Science
 270:84 (1995).
 """
@@ -76,7 +76,7 @@ def recording() -> Recording:
 
 
 def problem() -> Problem:
-    """Free motion with the body axes principal, outliers counted linearly.
+    """Free motion with the body axes principal; a robust loss counts outliers linearly.
 
     >>> problem().body.log_names
     ('Ix/Iz', 'Iy/Iz')
@@ -132,7 +132,7 @@ def rms_degrees(fit: Fit) -> float:
 
 
 def remarks(fit: Fit) -> str:
-    """The observations furthest from the fit, and how the noise compares, in words."""
+    """The observations furthest from the `fit`, and a comparison of the noise, in words."""
     lines = []
     scatter = rms_degrees(fit) / np.sqrt(3)
     if scatter < 0.5 * ATTITUDE_NOISE_DEG:

@@ -14,12 +14,11 @@ GRAVITY = 9.80665
 
 
 class Earth(AbstractScene):
-    """Free fall and throws near one place of the turning Earth: make one with `scenes.earth`.
+    """Free fall and throws near one place of the turning Earth; `scenes.earth` makes it.
 
     Axes east, north, up; up is the plumb line. Gravity is uniform and contains the centrifugal
-    acceleration at the origin; its change with x' is added separately.
-
-    **Fields:** `latitude` rad, `gravity` m/s², `rate` rad/s.
+    acceleration at the origin; the change of the latter with x' is added. **Fields:** `latitude`
+    rad, `gravity` m/s², `rate` rad/s.
 
     >>> scene = earth(0.5)
     >>> float(scene.latitude), float(scene.gravity)
@@ -65,10 +64,10 @@ class Earth(AbstractScene):
         return 0.5 * (speed - moved) + self.gravity.astype(dtype) * x[2]
 
     def eastward_deflection(self, height: ScalarLike) -> Scalar:
-        """The eastward deflection of a dropped body, m, to first order in Ω: ⅓ Ω g cos λ
-        (2h/g)^{3/2}.
+        """The eastward deflection of a dropped body, m, to first order in Ω.
 
-        **Arguments:** `height` h, m. Source: Landau and Lifshitz, Mechanics, sec. 39, problem 1.
+        It is ⅓ Ω g cos λ (2h/g)^{3/2}. **Arguments:** `height` h, m. Source: Landau and Lifshitz,
+        Mechanics, sec. 39, problem 1.
 
         >>> round(float(earth(0.0).eastward_deflection(100.0)), 5)
         0.02195
@@ -83,10 +82,9 @@ def earth(latitude: ScalarLike, gravity: ScalarLike = GRAVITY, rate: ScalarLike 
     """A place on the turning Earth, for dropped and thrown bodies.
 
     **Arguments:** `latitude` λ, rad, geodetic, north positive; `gravity` along the plumb line,
-    m/s²; `rate` Ω of the Earth, rad/s (WGS84: 7.292115e-5, one turn in 86164.1 s).
-
-    States are `Point(x, v)` in east, north, up from that place. **Raises:** `ValueError` for a
-    latitude beyond a right angle (degrees?) or gravity that is not positive.
+    m/s²; `rate` Ω of the Earth, rad/s (WGS84: 7.292115e-5, one turn in 86164.1 s). States are
+    `Point(x, v)` in east, north, up from that place. **Raises:** `ValueError` for a latitude beyond
+    a right angle (degrees?) or gravity that is not positive.
 
     >>> earth(0.5).acceleration(0.0, Point([0.0, 0, 0], [0.0, 0, 0])).tolist()
     [0.0, 0.0, -9.80665]
@@ -95,13 +93,11 @@ def earth(latitude: ScalarLike, gravity: ScalarLike = GRAVITY, rate: ScalarLike 
 
 
 class Foucault(AbstractScene):
-    """A pendulum on the turning Earth: make one with `scenes.foucault`.
+    """A pendulum on the turning Earth; `scenes.foucault` makes it.
 
     The bob keeps the distance `length` from the pivot at the origin; axes east, north, up. The
-    string's pull is eliminated, so the length is kept to the solver's tolerance, not exactly:
-    `drift` reports it.
-
-    **Fields:** `place` the `Earth` scene it hangs in; `length` m.
+    string's force is eliminated: the length is kept to the solver's tolerance, not exactly, and
+    `drift` reports it. **Fields:** `place` the `Earth` scene; `length` m.
 
     >>> pendulum = foucault(0.85, 67.0)
     >>> float(pendulum.length), float(pendulum.place.latitude)
@@ -112,7 +108,7 @@ class Foucault(AbstractScene):
     length: Scalar
 
     def acceleration(self, t: ScalarLike, state: Point) -> Vec3:
-        """d²x'/dt² (3,), m/s²: the free one minus the part along the string (notes, eq 91)."""
+        """d²x'/dt² (3,), m/s²: the free one minus its part along the string (notes, eq 91)."""
         x, v = components(state.x), components(state.v)
         a = components(self.place.acceleration(t, state))
         pull = (dot_components(x, a) + dot_components(v, v)) / dot_components(x, x)
@@ -123,7 +119,7 @@ class Foucault(AbstractScene):
         return {"jacobi": self.place.jacobi_integral(state), "length": length}
 
     def start(self, east: ScalarLike, north: ScalarLike) -> Point:
-        """The bob held at rest, `east` and `north` of its lowest place, m.
+        """The bob at rest, `east` and `north` of its lowest place, m.
 
         >>> foucault(0.5, 10.0).start(6.0, 0.0).x.tolist()
         [6.0, 0.0, -8.0]
@@ -155,10 +151,10 @@ class Foucault(AbstractScene):
         return Point(jnp.stack([e, n, up]), jnp.stack([ve, vn, -(e * ve + n * vn) / up]))
 
     def small_swing(self, state: Point, t: ScalarLike) -> Point:
-        """The position of small swings at `t`, s: the closed form.
+        """The state of small swings at `t`, s, in closed form.
 
-        With s = east + i north and Ω_z = Ω sin λ, s'' + 2iΩ_z s' + ω₀² s = 0 has the solution
-        s = e^{−iΩ_z t} (A cos ωt + B sin ωt), ω² = ω₀² + Ω_z², ω₀² = g/L (Landau and Lifshitz,
+        s = east + i north and Ω_z = Ω sin λ obey s'' + 2iΩ_z s' + ω₀² s = 0. The solution is s =
+        e^{−iΩ_z t} (A cos ωt + B sin ωt), ω² = ω₀² + Ω_z², ω₀² = g/L (Landau and Lifshitz,
         Mechanics, sec. 39, problem 3). Its error is of the order of (amplitude/length)².
 
         **Arguments:** `state` at t = 0. **Returns** a `Point` at the height of the lowest place.
@@ -188,7 +184,7 @@ class Foucault(AbstractScene):
     def precession_rate(self) -> Scalar:
         """The rate of the plane of small swings, rad/s, −Ω sin λ: clockwise in the north.
 
-        One turn takes a sidereal day over sin λ.
+        One turn takes a sidereal day divided by sin λ.
 
         >>> round(float(2 * jnp.pi / -foucault(jnp.pi / 6, 67.0).precession_rate()))
         172328
@@ -205,9 +201,9 @@ def foucault(
     """Foucault's pendulum.
 
     **Arguments:** `latitude` λ, rad, north positive; `length` of the string, m; `gravity` m/s²,
-    along the plumb line; `rate` of the Earth, rad/s (WGS84 unless given). Any may be traced: the
-    latitude and the rate can be fitted to a record. **Raises:** `ValueError` for a length or
-    gravity that is not positive, a latitude in degrees.
+    along the plumb line; `rate` of the Earth, rad/s (WGS84 by default). All may be traced: latitude
+    and rate can be fitted to a record. **Raises:** `ValueError` for a length or gravity that is not
+    positive, a latitude in degrees.
 
     >>> pendulum = foucault(0.85, 67.0)
     >>> pendulum.start(3.0, 0.0).v.tolist()
@@ -222,7 +218,7 @@ def foucault(
 def checked(
     latitude: ScalarLike, gravity: ScalarLike, rate: ScalarLike
 ) -> tuple[Scalar, Scalar, Scalar]:
-    """Latitude, gravity and rate as scalars of one dtype, or the likely mistake."""
+    """Latitude, gravity and rate as scalars of one dtype; else raise with the likely mistake."""
     lat, g, w = _checks.scalars(latitude=latitude, gravity=gravity, rate=rate)
     lat = _checks.refuse(
         lat,

@@ -15,10 +15,10 @@ from rigidjax.rotation import linalg3, quaternion
 
 
 class Tide(eqx.Module):
-    """Gravity-gradient torque 3n² u × I u on a circular orbit, seen from the orbital frame.
+    """Gravity-gradient torque 3n² u × I u on a circular orbit of rate n, in the orbital frame.
 
-    u is the direction away from the planet, the first axis of that frame. Source: Hughes 1986,
-    Spacecraft Attitude Dynamics, sec. 8.1. **Arguments:** `rate` n, rad/s, scalar array.
+    u is the direction away from the planet, the first axis of that frame (Hughes 1986, Spacecraft
+    Attitude Dynamics, sec. 8.1).
     """
 
     feels: ClassVar[type] = HasAttitude
@@ -35,10 +35,10 @@ def libration(rate: ScalarLike) -> BodyInFrame:
     """The torque on a body in a circular orbit, for `simulate` with `Attitude` states.
 
     Orbital frame: x away from the planet, y along the motion, z along the orbit's normal; it turns
-    at n about z. `q` takes body axes to it, `omega` is the rate relative to it, in body axes.
+    at n about z. `q` takes body axes to it; `omega` is the rate relative to it, in body axes.
 
-    **Arguments:** `rate` n of the orbit, rad/s. Small librations in the plane of a body with
-    principal moments (a, b, c) along (x, y, z) have the rate n √(3 (b − a)/c). Source: Hughes 1986,
+    **Arguments:** `rate` n of the orbit, rad/s. Small librations in the orbital plane of a body
+    with moments (a, b, c) about (x, y, z) have the rate n √(3 (b − a)/c). Source: Hughes 1986,
     ch. 9; notes, eqs 50, 91.
 
     >>> body = rj.Inertia.from_principal(1.0, 2.0, 2.5)

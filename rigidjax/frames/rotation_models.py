@@ -39,7 +39,7 @@ class Uniform(eqx.Module):
 
 
 class AboutAxis(eqx.Module):
-    """A turn about a fixed axis by any angle(t): turntables that speed up, pendula that swing.
+    """A turn about a fixed axis by any angle(t): turntables whose rate changes, pendula.
 
     **Arguments:** `axis` (3,), of any length but zero; `angle` a function of time to rad.
 
@@ -70,9 +70,9 @@ class AboutAxis(eqx.Module):
 
 
 def differentiable(rotation: Any) -> Any:
-    """`rotation`, with its own solves made ready for forward differentiation.
+    """`rotation`, with its own solves in forward mode: a frame needs dΩ/dt.
 
-    A frame needs dΩ/dt, and the default adjoint of a solution of `simulate` refuses that.
+    The default adjoint of a solution of `simulate` refuses that derivative.
     """
 
     def reverse(part: Any) -> bool:
@@ -87,7 +87,7 @@ def state_of(rotation: Any, t: Array) -> Any:
 
 
 def matrix(rotation: Any, t: Array) -> Mat3:
-    """M(t) of the rotation given to a frame: a function to (3, 3) or (4,), or a solution."""
+    """M(t) of the rotation of a frame: a function to (3, 3) or (4,), or a solution."""
     value = state_of(rotation, t)
     value = getattr(value, "q", value)
     shape = jnp.shape(value)

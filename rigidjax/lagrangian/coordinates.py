@@ -21,7 +21,7 @@ class Coordinates(eqx.Module):
     """The state of a Lagrangian system: coordinates and their rates.
 
     **Arguments:** `q` (n,) generalised coordinates, in the Lagrangian's units; `rate` (n,) dq/dt,
-    per second. Leading axes are allowed in a container of many states; functions take one.
+    per second. A container of many states has leading axes; functions take one state.
 
     >>> Coordinates([0.1, 0.2], [0.0, 1.0]).rate.shape
     (2,)
@@ -81,14 +81,14 @@ def equations_of_motion(
 
     `d/dt ∂L/∂q̇ = ∂L/∂q + Q`, solved for q̈: `(∂²L/∂q̇∂q̇) q̈ = ∂L/∂q − (∂²L/∂q̇∂q) q̇ + Q`.
 
-    **Arguments:** `lagrangian` a callable, best a Module (its numbers can then be differentiated
-    and changed without compiling again), `(q, q̇) → L`, J, with `q`, `q̇` (n,); `force` generalised
+    **Arguments:** `lagrangian` a callable, best a Module (its numbers can be differentiated, and
+    changed without compiling again), `(q, q̇) → L`, J, with `q`, `q̇` (n,); `force` generalised
     forces without a potential, `(t, q, q̇) → Q` (n,), or `None`. **Returns** a Module, for
-    `diffrax.ODETerm`. Up to three coordinates are solved by cofactors, more by LU (`lineax`).
+    `diffrax.ODETerm`. It solves for up to three coordinates by cofactors, for more by LU
+    (`lineax`). Source: Landau and Lifshitz, Mechanics, eq 2.6; the notes mention it after eq 57.
 
-    Source: Landau and Lifshitz, Mechanics, eq 2.6; the notes mention it after eq 57. **Raises:**
-    `TypeError` for anything but functions; `ValueError` if L is not one number. A singular
-    ∂²L/∂q̇∂q̇ (a chart's singularity, a coordinate without mass) gives infinities or NaN.
+    **Raises:** `TypeError` for anything but functions; `ValueError` if L is not one number. A
+    singular ∂²L/∂q̇∂q̇ (a singular chart, a coordinate without mass) gives infinities or NaN.
 
     >>> pendulum = equations_of_motion(lambda q, v: 0.5 * v[0] ** 2 + 9.81 * jnp.cos(q[0]))
     >>> pendulum(0.0, Coordinates([jnp.pi / 2], [0.0])).rate
@@ -101,13 +101,12 @@ def equations_of_motion(
 
 
 class EulerAngleTop(eqx.Module):
-    """The worked case: L = ½ Ω·IΩ − U of a body about a fixed point, in the notes' Euler angles.
+    """L = ½ Ω·IΩ − U of a body about a fixed point, in the notes' Euler angles.
 
     **Arguments:** `inertia` about the fixed point (or the centre of mass, if free); `torque` one
-    with a potential that does not depend on time, such as `HeavyTop`, or `None`.
-
-    A call with the angles (φ, θ, ψ), sequence 3-1-3, rad, and their rates returns L, J. Source:
-    notes, eqs 33, 75, 81–83. Singular at sin θ = 0. **Raises:** `TypeError` for a torque without a
+    with a potential that does not depend on time, such as `HeavyTop`, or `None`. It is called with
+    the angles (φ, θ, ψ), sequence 3-1-3, rad, and their rates, and returns L, J. It is singular at
+    sin θ = 0. Source: notes, eqs 33, 75, 81–83. **Raises:** `TypeError` for a torque without a
     potential.
 
     >>> free = EulerAngleTop(rj.Inertia.from_principal(1.0, 1.0, 2.0))

@@ -18,8 +18,8 @@ from rigidjax.rotation.linalg3 import apply, cross, dot
 class Momentum(eqx.Module):
     """The state of Lie–Poisson motion: the angular momentum in the body.
 
-    **Arguments:** `pi` (3,) Π = IΩ, N m s, body frame. Leading axes are allowed in a container of
-    many states; functions take one.
+    **Arguments:** `pi` (3,) Π = IΩ, N m s, body frame. A container of many states has leading axes;
+    functions take one state.
 
     >>> Momentum([1.0, 0.0, 0.0]).pi.shape
     (3,)
@@ -34,9 +34,9 @@ class Momentum(eqx.Module):
 class MomentumAndDirection(eqx.Module):
     """The state of a heavy top reduced by its symmetry: momentum, and a fixed direction.
 
-    **Arguments:** `pi` (3,) Π, N m s, body frame; `gamma` (3,) γ = Rᵀ d of a vector d that is fixed
-    in the world, body frame. Any length and unit: for `HeavyTopHamiltonian` d = g, m/s².
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype, or leading axes that differ.
+    **Arguments:** `pi` (3,) Π, N m s, body frame; `gamma` (3,) γ = Rᵀ d, body frame, of a vector d
+    that is fixed in the world. Any length and unit: for `HeavyTopHamiltonian` d = g, m/s².
+    **Raises:** `ValueError` for leading axes that differ.
 
     >>> MomentumAndDirection([1.0, 0.0, 0.0], [0.0, 0.0, -9.81]).gamma.shape
     (3,)
@@ -52,7 +52,7 @@ class MomentumAndDirection(eqx.Module):
 
 
 class LiePoisson(eqx.Module):
-    """`dΠ/dt = Π × ∇H(Π)` as a vector field, H the `hamiltonian`; made by `lie_poisson`."""
+    """`dΠ/dt = Π × ∇H(Π)` as a vector field, H the `hamiltonian`; `lie_poisson` makes it."""
 
     hamiltonian: Callable[[Any], Any]
 
@@ -61,10 +61,7 @@ class LiePoisson(eqx.Module):
 
 
 class LiePoissonWithDirection(eqx.Module):
-    """The same with a direction carried along, `hamiltonian` H(Π, γ).
-
-    `lie_poisson_with_direction` makes it.
-    """
+    """`LiePoisson` for a `hamiltonian` H(Π, γ); `lie_poisson_with_direction` makes it."""
 
     hamiltonian: Callable[[Any, Any], Any]
 
@@ -82,10 +79,9 @@ def lie_poisson(hamiltonian: Callable[[Any], Any]) -> LiePoisson:
 
     **Arguments:** `hamiltonian` a callable, best a Module, `Π → H`, J, with Π (3,), N m s, body
     frame; ∇H is then the body rate Ω. For `½ Π·I⁻¹Π`, `RotationalHamiltonian(inertia)`, these are
-    Euler's equations. Keeps H and the Casimir |Π|². Source: Marsden and Ratiu, Introduction to
-    Mechanics and Symmetry, §§1.2, 1.3.
-
-    **Raises:** `TypeError` for what cannot be called; `ValueError` where H is not one number.
+    Euler's equations. H and the Casimir |Π|² are conserved. Source: Marsden and Ratiu, Introduction
+    to Mechanics and Symmetry, §§1.2, 1.3. **Raises:** `TypeError` for what cannot be called;
+    `ValueError` if H is not one number.
 
     >>> H = RotationalHamiltonian(rj.Inertia.from_principal(1.0, 2.0, 2.0))
     >>> lie_poisson(H)(0.0, Momentum([1.0, 1.0, 1.0])).pi
@@ -97,10 +93,10 @@ def lie_poisson(hamiltonian: Callable[[Any], Any]) -> LiePoisson:
 def lie_poisson_with_direction(hamiltonian: Callable[[Any, Any], Any]) -> LiePoissonWithDirection:
     """The heavy-top form: `dΠ/dt = Π × ∂H/∂Π + γ × ∂H/∂γ`, `dγ/dt = γ × ∂H/∂Π`, of any H(Π, γ).
 
-    **Arguments:** `hamiltonian` a callable, best a Module, `(Π, γ) → H`, J. For a heavy top give
-    `HeavyTopHamiltonian(inertia, top)`. It conserves H and the Casimirs |γ|² and Π·γ. Source: the
+    **Arguments:** `hamiltonian` a callable, best a Module, `(Π, γ) → H`, J; for a heavy top
+    `HeavyTopHamiltonian(inertia, top)`. H and the Casimirs |γ|² and Π·γ are conserved. Source: the
     Lie–Poisson equations of se(3)*; Marsden and Ratiu, Introduction to Mechanics and Symmetry,
-    §1.4. **Raises:** `TypeError` for what cannot be called; `ValueError` where H is not one number.
+    §1.4. **Raises:** as `lie_poisson`.
 
     >>> field = lie_poisson_with_direction(lambda p, g: 0.5 * dot(p, p) - g[2])
     >>> field(0.0, MomentumAndDirection([0.0, 0, 1], [1.0, 0, 0])).pi.tolist()
@@ -115,11 +111,10 @@ def _invertible(inertia: Any) -> _inertia.Inertia:
 
 
 class RotationalHamiltonian(eqx.Module):
-    """H = ½ Π·I⁻¹Π, the energy of rotation.
+    """H = ½ Π·I⁻¹Π, the energy of rotation, J, a function of Π (3,).
 
-    **Arguments:** `inertia` about the centre of mass or a fixed point. Called with Π (3,), gives J.
-    **Raises:** `TypeError` for anything but an `Inertia`; `ValueError` for a moment known to be
-    zero.
+    **Arguments:** `inertia` about the centre of mass or a fixed point. **Raises:** `TypeError` for
+    anything but an `Inertia`; `ValueError` for a moment known to be zero.
 
     >>> RotationalHamiltonian(rj.Inertia.from_principal(1.0, 1.0, 2.0))([0.0, 0.0, 2.0])
     Array(1., dtype=float64)
@@ -136,12 +131,12 @@ class RotationalHamiltonian(eqx.Module):
 
 
 class HeavyTopHamiltonian(eqx.Module):
-    """H = ½ Π·I⁻¹Π − m c·γ with γ = Rᵀ g, the energy of a heavy top.
+    """H = ½ Π·I⁻¹Π − m c·γ with γ = Rᵀ g, the energy of a heavy top, J.
 
-    **Arguments:** `inertia` about the fixed point; `top` a `HeavyTop`, of which m and c are used.
-    Called with Π (3,) and γ (3,), m/s², body frame, gives J. `start` makes the state. **Raises:**
-    `TypeError` for an `inertia` that is no `Inertia`, or a `top` that is no `HeavyTop`: another
-    torque has no such Hamiltonian; `ValueError` for a moment known to be zero.
+    **Arguments:** `inertia` about the fixed point; `top` a `HeavyTop`, which gives m and c. It is a
+    function of Π (3,) and γ (3,), m/s², body frame; `start` makes the state. **Raises:**
+    `TypeError` for an `inertia` that is no `Inertia`, or a `top` that is no `HeavyTop` (another
+    torque has no such Hamiltonian); `ValueError` for a moment known to be zero.
 
     >>> top = rj.torques.HeavyTop(2.0, [0.0, 0, 0.5], [0.0, 0, -9.81])
     >>> H = HeavyTopHamiltonian(rj.Inertia.from_principal(1.0, 1.0, 2.0), top)

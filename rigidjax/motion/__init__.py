@@ -1,4 +1,4 @@
-"""States and what a motion conserves: model no more than the scene needs."""
+"""States of a body, and what a motion conserves."""
 
 from rigidjax._names import show
 from rigidjax._types import (

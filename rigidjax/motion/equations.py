@@ -22,10 +22,10 @@ _HINT = "Inertia.from_tensor makes one of a matrix; of MassProperties pass .iner
 
 
 class Spin(eqx.Module):
-    """A body rate alone: the state of a turning body without its attitude.
+    """The state of a turning body without its attitude: the body rate alone.
 
-    **Arguments:** `omega` (3,) angular velocity Ω in the body frame, rad/s (notes, eq 49). Leading
-    axes are allowed in a container of many states; functions take one.
+    **Arguments:** `omega` (3,) angular velocity Ω in the body frame, rad/s (notes, eq 49). A
+    container of many states has leading axes; functions take one state.
 
     >>> Spin([1.0, 0.0, 0.0]).omega.shape
     (3,)
@@ -40,15 +40,12 @@ class Spin(eqx.Module):
 
 
 class Attitude(eqx.Module):
-    """Attitude and body rate: a body that turns.
+    """The state of a body that turns: attitude and body rate.
 
     **Arguments:** `q` (4,) unit quaternion (w, x, y, z), **scalar first**, body → world (the `M` of
-    the notes, eq 8); `omega` (3,) Ω in the body frame, rad/s. Leading axes are allowed in a
-    container of many states; functions take one.
-
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype, or leading axes that differ.
-    Whether `q` is a unit quaternion is checked where it is used (`simulate`,
-    `rigidjax.exact.free_body`).
+    the notes, eq 8); `omega` (3,) Ω in the body frame, rad/s. A container of many states has
+    leading axes; functions take one state. **Raises:** `ValueError` for leading axes that differ.
+    `simulate` and `rigidjax.exact.free_body` check that `q` is a unit quaternion.
 
     >>> Attitude([1.0, 0, 0, 0], [0.0, 0, 1]).q.shape
     (4,)
@@ -68,14 +65,13 @@ class Attitude(eqx.Module):
 
 
 class Rigid(eqx.Module):
-    """Position and velocity of the centre of mass, attitude, body rate: a body that moves.
+    """The state of a body that moves: place and velocity of its centre of mass, attitude, body
+    rate.
 
     **Arguments:** `x` (3,) position of the centre of mass, m, world frame (the `X` of the notes,
     eq 1); `v` (3,) its velocity, m/s, world frame; `q` (4,) unit quaternion (w, x, y, z), scalar
-    first, body → world; `omega` (3,) Ω in the body frame, rad/s. Leading axes are allowed in a
-    container of many states; functions take one.
-
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype, or leading axes that differ.
+    first, body → world; `omega` (3,) Ω in the body frame, rad/s. A container of many states has
+    leading axes; functions take one state. **Raises:** `ValueError` for leading axes that differ.
 
     >>> Rigid([0.0, 0, 0], [1.0, 0, 0], [1.0, 0, 0, 0], [0.0, 0, 1]).v.shape
     (3,)
@@ -105,16 +101,10 @@ class Rigid(eqx.Module):
 class EulerEquations(eqx.Module):
     """Euler's equations `I dΩ/dt = IΩ × Ω + τ` as a vector field `f(t, y, args)`.
 
-    **Arguments:** `inertia` the body, about the point that it turns about; `torque` τ in the body
-    frame, N m, or `None` for a free body. A field for `diffrax.ODETerm`; `args` is not used. Its
-    values are in the precision of `state.omega`. Source: Lie–Poisson form `dΠ/dt = Π × ∇H(Π) + τ`
-    with `Π = IΩ`, `H = ½ Π·I⁻¹Π`; Landau and Lifshitz, Mechanics, eq 36.4.
-
-    **Raises:** `ValueError` for a rod or a point, since the equations divide by the zero moment, if
-    the numbers are known; under `jit` call `Inertia.invertible` first.
-
-    >>> EulerEquations(rj.Inertia.from_principal(1.0, 2.0, 3.0))(0.0, Spin([1.0, 1, 1]), None)
-    Spin(omega=[-1, 1, -0.333333])
+    `inertia` is about the point that the body turns about; `torque` τ in the body frame, N m, or
+    `None`. Values are in the precision of `state.omega`. Source: Lie–Poisson form
+    `dΠ/dt = Π × ∇H(Π) + τ` with `Π = IΩ`, `H = ½ Π·I⁻¹Π`; Landau and Lifshitz, Mechanics, eq 36.4.
+    **Raises:** `ValueError` for a known rod or point: the equations divide by the zero moment.
     """
 
     inertia: Inertia
@@ -152,17 +142,9 @@ class EulerEquations(eqx.Module):
 
 
 class AttitudeEquations(eqx.Module):
-    """Euler's equations and the kinematics `dq/dt = ½ q ⊗ (0, Ω)` as a vector field.
+    """Euler's equations and the kinematics `dq/dt = ½ q ⊗ (0, Ω)` (notes, eq 50) as a vector field.
 
-    **Arguments:** as for `EulerEquations`. A field for `diffrax.ODETerm`; `args` is not used.
-
-    The state holds Ω, not Π = IΩ: two heavy tops at tolerances 1e-6, 1e-9, 1e-12 took the same
-    number of steps with either to 3 % (diffrax.Dopri8), and their errors differed by up to a third.
-    Source: `dM/dt = M J'` (notes, eq 50), written for the quaternion of M.
-
-    >>> field = AttitudeEquations(rj.Inertia.from_principal(1.0, 2.0, 3.0))
-    >>> field(0.0, Attitude([1.0, 0, 0, 0], [0.0, 0, 1]), None).q
-    Array([-0. ,  0. ,  0. ,  0.5], dtype=float64)
+    The state holds Ω, not Π = IΩ: the numbers of steps differ by at most 3 % for heavy tops.
     """
 
     euler: EulerEquations
@@ -175,18 +157,10 @@ class AttitudeEquations(eqx.Module):
 
 
 class NewtonEuler(eqx.Module):
-    """Newton–Euler equations about the centre of mass as a vector field `f(t, y, args)`.
+    """Newton–Euler equations about the centre of mass as a vector field (notes, eqs 1, 50, 56, 84).
 
-    `m dv/dt = F`, `I dΩ/dt = IΩ × Ω + τ`, `dq/dt = ½ q ⊗ (0, Ω)`.
-
-    **Arguments:** `body` mass properties; the inertia used is the one about its centre of mass;
-    `torque` a torque τ about the centre of mass, N m, body frame, or a force model that returns a
-    `Wrench` (F in N, world frame, and τ), or `None`. A field for `diffrax.ODETerm`; `args` is not
-    used. Source: notes, eqs 1, 50, 56, 84. **Raises:** as `EulerEquations`.
-
-    >>> field = NewtonEuler(rj.shapes.box(2.0, [0.1, 0.2, 0.3]))
-    >>> field(0.0, Rigid([0.0, 0, 0], [1.0, 0, 0], [1.0, 0, 0, 0], [0.0, 0, 1]), None).x
-    Array([1., 0., 0.], dtype=float64)
+    `m dv/dt = F`, `I dΩ/dt = IΩ × Ω + τ`, `dq/dt = ½ q ⊗ (0, Ω)`; `torque` gives τ (N m, body
+    frame), or a `Wrench` of F (N, world frame) and τ.
     """
 
     euler: EulerEquations
@@ -210,12 +184,8 @@ class NewtonEuler(eqx.Module):
 
 
 def on_the_group(state: State) -> State:
-    """The same state with its quaternion, if it has one, scaled to length 1.
-
-    **Raises:** `ValueError` for a quaternion known to be zero, or too short to have a direction.
-
-    >>> on_the_group(rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 1])).q.tolist()
-    [1.0, 0.0, 0.0, 0.0]
+    """The same state with its quaternion, if it has one, scaled to length 1; a known zero is
+    refused.
     """
     if isinstance(state, Coupled):
         return eqx.tree_at(lambda s: s.motion, state, on_the_group(state.motion))
@@ -232,9 +202,9 @@ def _unit(q: Quat) -> Quat:
     """q/|q|, with the same rounding in every program.
 
     XLA replaces q/√n by a product with 1/√n in some programs. Reverse mode runs steps again in
-    another program: a different last digit there changes the error estimate, and at tight
-    tolerances the step lengths. The gradient then belongs to another discretisation (an error of
-    7e-6 at a tolerance of 1e-11). A separate root and quotient are exact to the last digit in every
-    program, and for every body of a batch.
+    another program: a different last digit changes the error estimate, and at tight tolerances the
+    step lengths, so that the gradient belongs to another discretisation (an error of 7e-6 at a
+    tolerance of 1e-11). A separate root and quotient are exact to the last digit in every program,
+    and for every body of a batch.
     """
     return q / lax.optimization_barrier(jnp.sqrt(square4(components(q))))

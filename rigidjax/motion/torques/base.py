@@ -51,26 +51,25 @@ class Wrench(eqx.Module):
 class AbstractTorque(eqx.Module):
     """A torque on a body: a function of time, state and body, in N m, body axes.
 
-    Subclass it for your own, or give any callable Module. `feels` is the smallest state with the
-    parts that you read: `HasSpin` (`.omega`), `HasAttitude` (also `.q`) or `HasPose` (also `.x`,
-    `.v`). `body` is the argument of `simulate`: an `Inertia`, or `MassProperties` for `Rigid`.
+    Subclass it, or give any callable Module. `feels` is the smallest state with the parts that the
+    torque reads: `HasSpin` (`.omega`), `HasAttitude` (also `.q`) or `HasPose` (also `.x`, `.v`);
+    one that feels `HasPose` may return a `Wrench`, a force as well as a torque. `body` is the
+    argument of `simulate`: an `Inertia`, or `MassProperties` for `Rigid`.
 
-    A law that feels a `rigidjax.motion.HasPose` may return a `Wrench`, a force as well as a torque.
-
-    Optional members. A property `rate_free`, whether the law does not look at the body rate: then
-    `rigidjax.solvers.Splitting4` and its like can be used. What is conserved (see
-    `rigidjax.conserved`): a method `energy(t, state, body)`, J, if the law has a potential; a
-    property `steady`, whether the law is free of explicit time; a property `axis` (3,), world
-    frame, about which it has no torque; a method `internal_momentum(t)` (3,), N m s, body frame, if
-    nothing outside turns the body: what the law holds inside; a property `jump_times` (n,), s,
-    where it jumps or has a kink.
+    Optional members. `rate_free`: the torque does not depend on the body rate, and
+    `rigidjax.solvers.Splitting4` and others can be used. For `rigidjax.conserved`: a method
+    `energy(t, state, body)`, J, if it has a potential; `steady`: it does not depend on time; `axis`
+    (3,), world frame, about which it has no torque; a method `internal_momentum(t)` (3,), N m s,
+    body frame, the momentum inside a body that nothing outside turns. `jump_times` (n,), s: the
+    torque jumps or has a kink there.
 
     **States of its own** (a motor's speed, a wheel, a bias that drifts): give the torque `state0`,
-    an array or a tree of arrays, or a method `(t, state, body)` that returns it, and a method
-    `rate(t, own, state, body)`, their derivative. It is then called as `(t, state, body, own)`.
-    Loops integrate them with the body's state: `simulate` (`sol.own`), `batch.rollout`,
-    `batch.simulate`, `identify.fit` and `identify.fit_windows`. A function of time inside a torque
-    may have some, too (`Lagged`), and is called as `(t, own)`. No base class is needed:
+    a tree of arrays or a method `(t, state, body)` that returns one, and a method
+    `rate(t, own, state, body)`, their derivative. The torque is then called as
+    `(t, state, body, own)`. `simulate` (`sol.own`), `batch.rollout`, `batch.simulate`,
+    `identify.fit` and `identify.fit_windows` integrate them with the body's state. A function of
+    time inside a torque may have states, too (`Lagged`); it is called as `(t, own)`. No base class
+    is needed:
 
     >>> import equinox as eqx
     >>> class Fading(eqx.Module):
@@ -158,7 +157,7 @@ def require_law(torque: object, name: str = "torque") -> None:
 
 
 def sees_attitude(torque: Torque | None) -> bool:
-    """Whether a torque may read the attitude, by `feels`; true without it."""
+    """Whether a torque may read the attitude, by `feels`; true if it has none."""
     if hasattr(torque, "parts"):
         return any(sees_attitude(part) for part in torque.parts)  # pyright: ignore
     return torque is not None and getattr(torque, "feels", None) is not HasSpin
@@ -191,11 +190,8 @@ def require_scene(law: Torque | None, state: object, body: object) -> None:
 
 
 def evaluate(torque: Torque, t: ScalarLike, state: HasSpin, body: Inertia | MassProperties) -> Vec3:
-    """The torque's value (3,), N m, body frame, its shape checked.
-
-    **Arguments:** `torque`; `t` s; `state`; `body`. The torque is computed in the precision of
-    `state.omega`. **Raises:** `TypeError` for a force, which acts on `Rigid` only; `ValueError` for
-    a wrong shape.
+    """The torque's value (3,), N m, body frame; `TypeError` for a force, which acts on `Rigid`
+    only.
     """
     force, value = act(torque, t, state, body)
     if force is not None:
@@ -209,10 +205,10 @@ def evaluate(torque: Torque, t: ScalarLike, state: HasSpin, body: Inertia | Mass
 def act(
     law: Torque, t: ScalarLike, state: HasSpin, body: Inertia | MassProperties
 ) -> tuple[Vec3 | None, Vec3]:
-    """Force on the centre of mass (N, world frame; `None` if there is none) and torque about it.
+    """Force on the centre of mass (3,), N, world frame, or `None`, and the torque about it (3,), N
+    m.
 
-    **Arguments** as for `evaluate`. **Returns** a force (3,) or `None`, and a torque (3,), N m,
-    body frame, in the precision of `state.omega`.
+    Both are in the precision of `state.omega`; the torque is in the body frame.
     """
     require_scene(law, state, body)
     dtype = state.omega.dtype
@@ -322,8 +318,6 @@ def constant_or_callable(source: Any, name: str, size: int = 3) -> Any:
 def jumps_of(source: object) -> Float[Array, " n"]:
     """The times at which a torque or a function of time jumps, s; empty if it has none.
 
-    **Arguments:** `source` a torque, or a function of time, with or without `jump_times`.
-
     >>> jumps_of(rj.torques.Pulses([1.0, 2.0], [[0.0, 0.0, 1.0]]))
     Array([1., 2.], dtype=float64)
     """
@@ -364,7 +358,7 @@ def each(value: Any, count: int, name: str) -> Array:
 
 
 def length_or_zero(v: Vec3Like) -> Scalar:
-    """|v|, with the derivative at v = 0 set to 0: for |v| v, whose derivative there is 0."""
+    """|v|, with derivative 0 at v = 0: for |v| v, whose derivative there is 0."""
     v = _checks.floating(v, (3,), "v")
     square = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
     return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)

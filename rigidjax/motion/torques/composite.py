@@ -22,7 +22,8 @@ class Sum(eqx.Module):
     **Arguments:** `*parts` torques, forces, your own callables. **Raises:** `TypeError` for a part
     that cannot be called; `ValueError` for none at all.
 
-    >>> Sum(rj.torques.Damping([1.0, 1, 1]), rj.torques.HeavyTop(1.0, [0.0, 0, 1], [0.0, 0, -9.81])).feels
+    >>> damping = rj.torques.Damping([1.0, 1, 1])
+    >>> Sum(damping, rj.torques.HeavyTop(1.0, [0.0, 0, 1], [0.0, 0, -9.81])).feels
     <class 'rigidjax._types.HasAttitude'>
     """
 
@@ -72,19 +73,19 @@ class Sum(eqx.Module):
 class ChangingInertia(eqx.Module):
     """The effect of a changing inertia on a body: `I(t) dΩ/dt = I(t)Ω × Ω − İΩ + τ`.
 
-    **Arguments:** `inertia` a function of time, t → (3, 3), kg m², body frame, about the point that
-    the body turns about (the centre of mass of a `Rigid`), whose derivative is taken: such as
-    `Linear(times, tensors)`; `torque` all other torques, or `None`: give them here, not beside it
-    in a `Sum`, because their τ acts on I(t), and they get the body at time t.
+    **Arguments:** `inertia` a differentiable function of time, t → (3, 3), kg m², body frame, about
+    the point that the body turns about (the centre of mass of a `Rigid`), such as
+    `Linear(times, tensors)`; `torque` all other torques, or `None`. They act on I(t) and get the
+    body at time t: give them here, not beside it in a `Sum`.
 
-    The body given to `simulate` only sets the state's units: its inertia is replaced. Parts that
-    move inside must have no momentum in the body frame (Σ m r × ṙ = 0), such as booms that extend
-    in a straight line from the centre; else add their momentum as a `Flywheel` to `torque`. Ejected
-    fuel carries its share of İΩ away: then add İΩ to `torque`.
+    The inertia of the body given to `simulate` is replaced. Parts that move inside must have no
+    momentum in the body frame (Σ m r × ṙ = 0), such as booms that extend in a straight line from
+    the centre; else add their momentum to `torque` as a `Flywheel`. Ejected fuel carries its share
+    of İΩ away: then add İΩ to `torque`. Source: Hughes 1986, Spacecraft Attitude Dynamics, ch. 3;
+    without τ the momentum `R I(t) Ω` is conserved.
 
-    Source: Hughes 1986, Spacecraft Attitude Dynamics, ch. 3; the momentum `R I(t) Ω` is conserved
-    without τ. **Raises:** `TypeError` for anything but a function; `ValueError` for a value that is
-    not (3, 3).
+    **Raises:** `TypeError` for anything but a function; `ValueError` for a value that is not (3,
+    3).
 
     >>> grows = ChangingInertia(lambda t: (1.0 + t) * jnp.eye(3))
     >>> body = rj.Inertia(jnp.eye(3))

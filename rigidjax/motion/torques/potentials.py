@@ -22,8 +22,9 @@ class HeavyTop(base.AbstractTorque):
 
     **Arguments:** `mass` m, kg; `com` (3,) c, from the fixed point to the centre of mass, m, body
     frame; `gravity` (3,) g, m/s², world frame, such as [0, 0, −9.81]. The body's `Inertia` is the
-    one **about the fixed point** (`MassProperties.inertia_about`, `Inertia.shifted`). Any top:
-    Lagrange's, Kovalevskaya's, Goryachev–Chaplygin's, a general one, and the physical pendulum.
+    one **about the fixed point** (`MassProperties.inertia_about`, `Inertia.shifted`). Any top is
+    allowed: Lagrange's, Kovalevskaya's, Goryachev–Chaplygin's, a general one, the physical
+    pendulum.
 
     It conserves the energy and the momentum along g. Source: Landau and Lifshitz, Mechanics, §35;
     Arnold, Mathematical Methods of Classical Mechanics, §30. **Raises:** `TypeError` on a `Rigid`,
@@ -63,13 +64,13 @@ class HeavyTop(base.AbstractTorque):
 class GravityGradient(base.OfTime):
     """The torque of a far central body: `τ = (3μ/r³) r̂' × I r̂'`, `r̂' = Rᵀ r̂`.
 
-    **Arguments:** `mu` μ = G M of the central body, m³/s²; `position` r (3,) m, world frame, from
-    the central body to the body or back (the sign does not matter): constant, or a callable Module
-    of time, t → (3,), for an orbit.
+    **Arguments:** `mu` μ = G M of the central body, m³/s²; `position` r (3,) m, world frame,
+    between the central body and the body (either sign): constant, or a callable Module of time, t →
+    (3,), for an orbit. **Raises:** `ValueError` for a distance of zero.
 
-    `U = (μ/2r³)(3 r̂'·I r̂' − Tr I)`, the second term of MacCullagh's formula; it does not change
-    the orbit itself. Source: Hughes, Spacecraft Attitude Dynamics, §8.1; Goldstein, Poole and
-    Safko, Classical Mechanics, eq 5.86. **Raises:** `ValueError` for no distance.
+    `U = (μ/2r³)(3 r̂'·I r̂' − Tr I)`, the second term of MacCullagh's formula; the orbit itself
+    does not change. Source: Hughes, Spacecraft Attitude Dynamics, §8.1; Goldstein, Poole and Safko,
+    Classical Mechanics, eq 5.86.
 
     >>> law, body = GravityGradient(1.0, [1.0, 1.0, 0.0]), rj.Inertia.from_principal(1.0, 2.0, 2.5)
     >>> state = rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 0])
@@ -158,11 +159,10 @@ class MagneticDipole(base.OfTime):
 class FromPotential(base.AbstractTorque):
     """The torque of any potential `U(q)` on the attitude, by differentiation.
 
-    **Arguments:** `potential` a callable Module `q → U`, J, with `q` (4,) unit, body → world.
-
-    `τ_i = −∂U/∂q · ½ q ⊗ e_i`, the derivative along a turn about body axis i. Source: Landau and
-    Lifshitz, Mechanics, §34. **Raises:** `TypeError` for anything but a function, `ValueError` for
-    a U that is not a number.
+    **Arguments:** `potential` a callable Module `q → U`, J, with `q` (4,) unit, body → world. The
+    torque about body axis i is `τ_i = −∂U/∂q · ½ q ⊗ e_i`, the derivative along a turn about it.
+    Source: Landau and Lifshitz, Mechanics, §34. **Raises:** `TypeError` for anything but a
+    function, `ValueError` for a U that is not a number.
 
     >>> class Spring(eqx.Module):
     ...     k: Array
