@@ -17,13 +17,12 @@ from rigidjax.rotation.linalg3 import components
 
 
 class ThreeBody(AbstractReversible):
-    """A particle under two bodies on circular orbits: make one with `orbits.cr3bp(mu)`.
+    """A particle under two bodies on circular orbits; `orbits.cr3bp(mu)` makes it.
 
     Rotating axes, origin at the common centre of mass, the first body (mass 1 − μ) at (−μ, 0, 0),
     the second (mass μ) at (1 − μ, 0, 0). Units: their distance, their total mass, and 1/(their
-    angular rate); their period is 2π.
-
-    **Fields:** `mu` μ, scalar; `radii` (2,) of the bodies, for collisions.
+    angular rate); their period is 2π. **Fields:** `mu` μ, scalar; `radii` (2,) of the bodies, for
+    collisions.
 
     >>> scene = cr3bp(0.5)
     >>> [float(r) for r in scene.distances(jnp.array([0.0, 0.0, 0.0]))]
@@ -46,9 +45,8 @@ class ThreeBody(AbstractReversible):
         return jnp.stack([2 * vy + x - a1 * first - a2 * second, y - 2 * vx - pull * y, -pull * z])
 
     def potential(self, x: Vector) -> Scalar:
-        """U = ½(x² + y²) + (1 − μ)/r₁ + μ/r₂ (Szebehely 1967, sec. 1.5, without its constant).
-
-        **Arguments:** `x` (3,), rotating axes.
+        """U = ½(x² + y²) + (1 − μ)/r₁ + μ/r₂ at `x` (3,) (Szebehely 1967, sec. 1.5, without his
+        constant).
         """
         x = _checks.floating(x, (3,), "x")
         r1, r2 = self.distances(x)
@@ -72,10 +70,10 @@ class ThreeBody(AbstractReversible):
         return self.speed_squared(state.x, 0.0) - jnp.sum(state.v * state.v)
 
     def speed_squared(self, x: Vector, jacobi: ScalarLike) -> Scalar:
-        """|v|² = 2U(x) − C at a place; it is 0 on zero-velocity curves.
+        """|v|² = 2U(x) − C at a place `x` (3,), for the constant C `jacobi`; 0 on zero-velocity
+        curves.
 
-        **Arguments:** `x` (3,); `jacobi` C. It is negative at places that a particle with this C
-        cannot reach. Draw `matplotlib.pyplot.contour(…, levels=[0])` of it.
+        It is negative where a particle with this C cannot be.
         """
         u = self.potential(x)
         return 2 * u - _checks.floating(jacobi, (), "jacobi").astype(u.dtype)
@@ -85,8 +83,8 @@ class ThreeBody(AbstractReversible):
         xs: Float[ArrayLike, " columns"] | Sequence[float],
         ys: Float[ArrayLike, " rows"] | Sequence[float],
     ) -> Float[Array, "rows columns"]:
-        """2U on a grid of the plane z = 0 (rows along y): a particle with constant C stays where it
-        is ≥ C.
+        """2U on a grid of the plane z = 0, rows along y; a particle with constant C stays where 2U
+        ≥ C.
 
         **Arguments:** `xs`, `ys` places along the axes. `matplotlib.pyplot.contour(xs, ys, grid,
         levels=[C])` draws the curve of zero velocity (Szebehely 1967, sec. 4.7).
@@ -128,9 +126,9 @@ class ThreeBody(AbstractReversible):
     def exponents(self, x: Vector) -> Complex[Array, "6"]:
         """The six exponents λ of small motions about an equilibrium in the plane, e^{λt}.
 
-        **Arguments:** `x` (3,), such as a row of `lagrange_points`. It is stable (to first order)
-        if no real part is positive: L4 and L5 below Routh's μ = ½(1 − √(23/27)), L1–L3 never.
-        In the plane λ⁴ + (4 − U_xx − U_yy) λ² + U_xx U_yy − U_xy² = 0, across it λ² = U_zz
+        **Arguments:** `x` (3,), such as a row of `lagrange_points`. The equilibrium is stable to
+        first order if no real part is positive: L4 and L5 below Routh's μ = ½(1 − √(23/27)), L1–L3
+        never. In the plane λ⁴ + (4 − U_xx − U_yy) λ² + U_xx U_yy − U_xy² = 0, across it λ² = U_zz
         (Szebehely 1967, sec. 5.2).
 
         >>> moon = rj.orbits.cr3bp(0.0121505856)
@@ -156,8 +154,8 @@ class ThreeBody(AbstractReversible):
     def halo_guess(self, point: int, amplitude: ScalarLike) -> PeriodicOrbit:
         """A start near a halo orbit about L1, L2 or L3, for `periodic_orbit(…, hold="z")`.
 
-        **Arguments:** `point` 1, 2 or 3; `amplitude` along z, its sign the branch. Source:
-        Richardson 1980, doi:10.1007/BF01229511 (third order).
+        **Arguments:** `point` 1, 2 or 3; `amplitude` along z, whose sign is that of the branch.
+        Source: Richardson 1980, doi:10.1007/BF01229511 (third order).
         """
         return richardson.guess(self.mu, point, None, amplitude)
 
@@ -166,11 +164,10 @@ def cr3bp(mu: ScalarLike, radii: Float[Array, "2"] | object = (0.0, 0.0)) -> Thr
     """The circular restricted three-body problem with mass ratio μ.
 
     **Arguments:** `mu` μ = m₂/(m₁ + m₂), 0 < μ ≤ ½ (Earth–Moon 0.01215…); `radii` (2,) of the two
-    bodies in units of their distance: a run that comes closer ends with a collision's body, time
-    and distance. With zeros it ends at a distance that float64 can no longer resolve. **Raises:**
-    `ValueError` for μ outside (0, ½] (`EquinoxRuntimeError` under `jit`).
-
-    Source: notes, eq 91, with a uniform Ω = (0, 0, 1); Szebehely 1967, Theory of Orbits.
+    bodies in units of their distance. A run that comes closer ends, with the collision's body, time
+    and distance; for radii of zero it ends at a distance that float64 cannot resolve. **Raises:**
+    `ValueError` for μ outside (0, ½] (`EquinoxRuntimeError` under `jit`). Source: notes, eq 91,
+    with a uniform Ω = (0, 0, 1); Szebehely 1967, Theory of Orbits.
 
     >>> cr3bp(0.5).lagrange_points[3].round(12).tolist()
     [0.0, 0.866025403784, 0.0]

@@ -12,7 +12,7 @@ from rigidjax.rotation.linalg3 import components
 
 
 class Hill(AbstractReversible):
-    """A particle near a small body on a circular orbit about a large one: see `orbits.hill()`.
+    """A particle near a small body on a circular orbit about a large one; `orbits.hill()` makes it.
 
     Rotating axes centred on the small body, x away from the large one. Units: μ^{1/3} of the
     bodies' distance, and 1/(their angular rate). **Field:** `radius` of the small body.

@@ -8,14 +8,10 @@ from rigidjax._types import Scalar
 
 
 def points(mu: Scalar) -> Float[Array, "5 3"]:
-    """L1 … L5 (5, 3), in units of the distance of the primaries, rotating axes.
+    """L1 … L5 (5, 3) for 0 < μ ≤ ½, in units of the distance of the primaries, rotating axes.
 
-    L1, L2, L3 from the roots of Euler's quintics (Szebehely 1967, sec. 4.4), L4 and L5 at the tips
-    of equilateral triangles. **Arguments:** `mu` mass ratio μ, scalar array, 0 < μ ≤ ½.
-    They have derivatives of any order with respect to μ.
-
-    >>> points(jnp.asarray(0.5))[0].tolist()
-    [0.0, 0.0, 0.0]
+    L1, L2, L3 are roots of Euler's quintics (Szebehely 1967, sec. 4.4), L4 and L5 tips of
+    equilateral triangles. Derivatives by μ exist to any order.
     """
     between, beyond, opposite = distances(mu)
     zero = jnp.zeros_like(mu)
@@ -42,7 +38,7 @@ def distances(mu: Scalar) -> tuple[Scalar, Scalar, Scalar]:
 
 
 def _root(coefficients: list[Scalar], start: Scalar) -> Scalar:
-    """Newton's root of a polynomial, highest power first; the start is near for every μ."""
+    """Newton's root of a polynomial, highest power first; `start` is near it for every μ."""
 
     def step(_: object, x: Scalar) -> Scalar:
         value, slope = coefficients[0], jnp.zeros_like(x)

@@ -23,10 +23,10 @@ class AbstractReversible(AbstractScene):
 
     @abc.abstractmethod
     def approach(self, t: ScalarLike, state: Point) -> tuple[Array, Array]:
-        """Distances from the bodies (k,), and those at which a run ends, named as a collision."""
+        """Distances from the bodies (k,), and the distances at which a run ends as a collision."""
 
     def ends(self, t: ScalarLike, state: Point) -> Bool[Array, ""]:
-        """Whether the particle has collided with one of the bodies, which ends a run."""
+        """Whether the particle has collided with one of the bodies."""
         gaps, least = self.approach(t, state)
         return jnp.any(gaps <= least)
 
@@ -44,24 +44,26 @@ class AbstractReversible(AbstractScene):
     def transition(
         self, state: Point, t: ScalarLike, *, rtol: float = 1e-13, atol: float = 1e-14
     ) -> Float[Array, "6 6"]:
-        """The state-transition matrix ∂(x, v)(t)/∂(x, v)(0) (6, 6), by forward differentiation.
+        """The state-transition matrix ∂(x, v)(t)/∂(x, v)(0) (6, 6), of determinant 1, by forward
+        mode.
 
-        **Arguments:** `state` the start; `t` when. Its determinant is 1.
+        **Arguments:** `state` at 0; `t` the time; `rtol`, `atol` of the solver.
         """
         _checks.instance(state, Point, "state", wanted="a Point(x, v)")
         t = _checks.finite(_checks.floating(t, (), "t"), "t")
         numbers = jnp.concatenate([state.x, state.v])
-        return state_transition.transition(self, numbers, t, rtol, atol)
+        return state_transition.transition(self, numbers, t, rtol=rtol, atol=atol)
 
     def monodromy(self, orbit: PeriodicOrbit) -> Float[Array, "6 6"]:
-        """The transition matrix over one period; its eigenvalues determine the orbit's stability.
+        """The transition matrix (6, 6) over one period; its eigenvalues determine the orbit's
+        stability.
 
         Two of the six are 1, the others come as λ, 1/λ (Szebehely 1967, sec. 8.6).
         """
         return self.transition(orbit.state, orbit.period)
 
     def stability_indices(self, orbit: PeriodicOrbit) -> Complex[Array, "2"]:
-        """The two ν = ½(λ + 1/λ) of the multipliers that are not 1, larger real part first.
+        """The two ν = ½(λ + 1/λ) of the multipliers λ that are not 1, larger real part first.
 
         The orbit is stable to first order if both are real and |ν| ≤ 1. Many:
         `jax.vmap(scene.stability_indices)(scene.family(…))`. Source: Howell 1984,

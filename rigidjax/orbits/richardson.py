@@ -14,18 +14,12 @@ from rigidjax.orbits.lagrange_points import distances, points
 def guess(
     mu: Scalar, point: int, along_x: ScalarLike | None, along_z: ScalarLike | None
 ) -> PeriodicOrbit:
-    """A start on the xz-plane near the orbit about L1, L2 or L3 of the given amplitude.
+    """A start on the xz-plane near the orbit about L1, L2 or L3 (`point`) of the given amplitude.
 
-    **Arguments:** `mu` μ; `point` 1, 2 or 3; one of `along_x` (a planar Lyapunov orbit) and
-    `along_z` (a halo orbit, its sign the branch), in units of the primaries' distance. It is good
-    if the amplitude is a small part of the distance to the nearer body. Source: Richardson 1980,
-    Celest. Mech. 22, 241, doi:10.1007/BF01229511, at τ = 0.
-
-    **Raises:** `ValueError` for another point, and for a known amplitude that is too small for a
-    halo orbit.
-
-    >>> round(float(guess(jnp.asarray(0.0121505856), 1, 0.01, None).period), 2)
-    2.71
+    One of `along_x` (a planar Lyapunov orbit) and `along_z` (a halo orbit, its sign is the branch)
+    is given, in units of the primaries' distance. The start is good if the amplitude is a small
+    part of the distance to the nearer body. Source: Richardson 1980, Celest. Mech. 22, 241,
+    doi:10.1007/BF01229511, at τ = 0.
     """
     if point not in (1, 2, 3):
         raise ValueError(f"point: wanted 1, 2 or 3, the collinear ones, got {point}")

@@ -24,15 +24,15 @@ def inertia_ellipsoid(
 ) -> Any:
     """The outline of a body's ellipsoid from three sides; for a fit with its uncertainty.
 
-    The ellipsoid `r·𝔖⁻¹r = const` is long where the body is long and moves as the body does. For
-    `MassProperties` it is the uniform solid one of the same mass, in m. An `Inertia` has no size:
-    its unit is √Tr 𝔖 of the given body (of the fit's best). Thin lines are bodies drawn from the
-    fit's Gaussian: the data do not determine the shape where they differ.
+    The ellipsoid `r·𝔖⁻¹r = const` is long along the body's long axis and moves as the body does.
+    For `MassProperties` it is the uniform solid one of the same mass, in m. An `Inertia` has no
+    size: its unit is √Tr 𝔖 of the given body (of the fit's best). Thin lines are bodies drawn from
+    the fit's Gaussian: the data do not determine the shape where the lines differ.
 
     **Arguments:** `body` an `Inertia`, a `MassProperties` or a `rigidjax.identify.Fit`; `truth` a
     body to compare with, as a broken line; `samples` the number of thin lines; `title`; `ax` three
     axes. **Returns** the axes (3,), planes xy, xz and yz of the body frame. **Raises** `TypeError`
-    for anything but these, `ValueError` for a body without extension.
+    for another type, `ValueError` for a body without extension.
 
     >>> [one.get_xlabel() for one in inertia_ellipsoid(rj.shapes.box(1.0, [1.0, 2.0, 3.0]))]
     ['x, m', 'x, m', 'y, m']

@@ -31,15 +31,14 @@ def horizons(
 ) -> Any:
     """Open-loop errors against the horizon, one picture for each kind of state.
 
-    **Arguments:** `found` a `Horizons`, as `WindowFit.predict` and `Windows.held`
-    return them, or several by name, to be compared: of a model, of a prediction that holds the
-    start, of other windows; `step` s between samples, for a scale of time in the place of steps;
-    `measure` `mean_absolute` (of a component), `mean_norm` or `rms` (of the vector); `title`; `ax`
-    one for each kind, else new ones. Both scales are linear, since errors start at zero.
-    **Returns** the axes, one for each of position, velocity, attitude, body rate in the state.
-
-    **Raises** `TypeError` for anything but errors by horizon; `ValueError` for none, for kinds that
-    differ, an unknown measure, a step that is not positive, another number of axes.
+    **Arguments:** `found` a `Horizons`, as `WindowFit.predict` and `Windows.held` return them, or
+    several by name, to compare models, windows, or a prediction that holds the start; `step` s
+    between samples, for a scale of time instead of steps; `measure` `mean_absolute` (of a
+    component), `mean_norm` or `rms` (of the vector); `title`; `ax` one for each kind. Both scales
+    are linear, since errors start at zero. **Returns** the axes, one for each of position,
+    velocity, attitude, body rate in the state. **Raises** `TypeError` for anything but errors by
+    horizon; `ValueError` for none, for kinds that differ, an unknown measure, a step that is not
+    positive, another number of axes.
 
     >>> t = np.arange(8.0)
     >>> cut = rj.identify.windows(t, rj.Spin(np.ones((8, 3)) * t[:, None]), length=3)

@@ -34,15 +34,14 @@ def phase_portrait(
     """Tilt θ against θ̇ of a symmetric top, with the curves of equal energy around its path.
 
     `E = ½ I₁ θ̇² + (p_φ − p_ψ cos θ)²/(2 I₁ sin²θ) + m g l cos θ` with the momenta of the initial
-    state, p_φ about the vertical and p_ψ about the top's axis. Source: Landau and Lifshitz,
-    Mechanics, § 35, problem 1. The cross is steady precession, the least energy.
+    state, p_φ about the vertical and p_ψ about the top's axis. The cross is steady precession, the
+    least energy. Source: Landau and Lifshitz, Mechanics, § 35, problem 1.
 
-    **Arguments:** `inertia` about the pivot; `top` weight and place of the centre of mass, which
-    lies on the axis of symmetry; `states` of one body with a leading time axis; `levels` the number
-    of thin curves; `title`; `ax` your axes. **Returns** the axes.
-
-    **Raises** `ValueError` for a body that is not symmetric about its centre of mass's axis, no
-    weight, or a batch; `TypeError` for states without an attitude.
+    **Arguments:** `inertia` about the pivot; `top` weight and place of the centre of mass, which is
+    on the axis of symmetry; `states` of one body with a leading time axis; `levels` the number of
+    thin curves; `title`; `ax`. **Returns** the axes. **Raises** `ValueError` for a body that is not
+    symmetric about its centre of mass's axis, no weight, or a batch; `TypeError` for states without
+    an attitude.
 
     >>> body = rj.Inertia.from_principal(2.0, 2.0, 1.0)
     >>> top = rj.torques.HeavyTop(1.0, [0.0, 0, 1.0], [0, 0, -9.81])

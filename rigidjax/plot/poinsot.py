@@ -31,7 +31,7 @@ def body_axes(states: HasAttitude, *, title: str = "", ax: Any = None) -> Any:
     """The paths of the three body axes on the unit sphere, world frame.
 
     A dot marks the start, a triangle the end; the path behind the sphere is faint. **Arguments:**
-    `states` of one body with a leading time axis; `title`; `ax` your 3-D axes, with the view set
+    `states` of one body with a leading time axis; `title`; `ax` your 3-D axes; set their view
     before the call (`view_init`). **Returns** the axes. **Raises** `TypeError` for states without
     an attitude or flat axes, `ValueError` for a batch.
 
@@ -60,10 +60,10 @@ def body_axes(states: HasAttitude, *, title: str = "", ax: Any = None) -> Any:
 def polhode(
     inertia: Inertia, states: HasSpin, *, energies: int = 9, title: str = "", ax: Any = None
 ) -> Any:
-    """The path of Π = IΩ where the momentum sphere |Π| = h meets the ellipsoid ΣΠᵢ²/Iᵢ = 2T.
+    """The path of Π = IΩ on the intersection of the sphere |Π| = h and the ellipsoid ΣΠᵢ²/Iᵢ = 2T.
 
-    Drawn along the principal axes (ascending moments), with unit h, the initial |Π|. Thin lines are
-    other energies at the same h; the broken ones the separatrix through the middle axis. Lines
+    The axes are the principal ones (ascending moments), the unit is h, the initial |Π|. Thin lines
+    are other energies at the same h; broken lines are the separatrix through the middle axis. Lines
     behind the sphere are dotted (this motion) or faint (the others). Source: Landau and Lifshitz,
     Mechanics, § 37.
 
@@ -146,13 +146,11 @@ def _curves(ax: Any, curves: Any, **how: Any) -> None:
 def herpolhode(inertia: Inertia, states: HasAttitude, *, title: str = "", ax: Any = None) -> Any:
     """The path of the world rate ω on the invariable plane, across the angular momentum.
 
-    It needs a free motion: the part of ω along the momentum is then 2T/h and constant. The circles
-    are the least and the largest distance of this motion.
-
-    **Arguments:** `inertia`; `states` (`Attitude`) of one body with a leading time axis; `title`;
-    `ax` axes of yours. **Returns** the axes. **Raises** `ValueError` for a body at rest, a batch,
-    or a momentum that turned by more than 1e-3 rad (that is no free motion); `TypeError` for states
-    without an attitude.
+    The motion must be free: the part of ω along the momentum is then 2T/h and constant. The circles
+    are the least and the largest distance of this motion. **Arguments:** `inertia`; `states`
+    (`Attitude`) of one body with a leading time axis; `title`; `ax`. **Returns** the axes.
+    **Raises** `ValueError` for a body at rest, a batch, or a momentum that turned by more than 1e-3
+    rad; `TypeError` for states without an attitude.
 
     >>> body = rj.Inertia.from_principal(1.0, 2.0, 3.0)
     >>> sol = rj.simulate(body, rj.Attitude([1.0, 0, 0, 0], [0.1, 1.0, 0.0]), [0.0, 1.0, 2.0])

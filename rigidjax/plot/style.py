@@ -18,10 +18,7 @@ RATES = {"rad/s": 1.0, "deg/s": 180 / np.pi, "rpm": 30 / np.pi, "deg/day": 86400
 
 
 def pyplot() -> Any:
-    """`matplotlib.pyplot`, imported now.
-
-    **Raises** `ModuleNotFoundError` that names the extra `view`.
-    """
+    """`matplotlib.pyplot`, imported now; `ModuleNotFoundError` names the extra `view`."""
     try:
         import matplotlib.pyplot as plt
     except ModuleNotFoundError as error:
@@ -95,10 +92,7 @@ def times(ts: Any, count: int, what: str = "the states have") -> np.ndarray:
 
 
 def rows(values: Any, width: int, name: str) -> np.ndarray:
-    """Values of one body over time (T, width) as NumPy float64.
-
-    **Raises** `ValueError` for another shape, most often a batch: pick one body of it.
-    """
+    """Values of one body over time (T, width) as NumPy float64; `ValueError` for another shape."""
     out = _checks.on_host(values, name)
     if out.ndim != 2 or out.shape[1] != width:
         hint = "; of a batch draw one body at a time" if out.ndim == 3 else ""
@@ -135,19 +129,19 @@ def on_sphere(around: np.ndarray, down: np.ndarray) -> np.ndarray:
 def around_ball(
     ax: Any,
     path: np.ndarray,
-    centre_free: np.ndarray,
+    normals: np.ndarray,
     *,
     behind: dict[str, Any] | None = None,
     **how: Any,
 ) -> None:
     """A line on a ball: full in front of the ball, in another style behind it.
 
-    **Arguments:** `path` (T, 3); `centre_free` (T, 3) the outward normals there; `behind` the style
-    of the hidden part, by default faint; `how` options of matplotlib's lines.
+    `path` (T, 3) has the outward normals `normals` (T, 3); `behind` is the style of the hidden
+    part, by default faint; `how` has options of matplotlib's lines.
     """
     up, around = np.radians(ax.elev), np.radians(ax.azim)
     eye = np.array([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)])
-    front = centre_free @ eye > 0
+    front = normals @ eye > 0
     label = how.pop("label", None)
     alpha = how.pop("alpha", 1.0)
     hidden = {"alpha": 0.25 * alpha, **(behind or {})}

@@ -13,7 +13,7 @@ SEEDS, ROUNDS = 16, 3
 def aliases_of(pairs: np.ndarray, peaks: np.ndarray) -> np.ndarray:
     """Pairs (M, 2) that may fit the same readings: moved by side peaks, and related ones.
 
-    A line of 2 f₁ moved by a peak means an f₁ moved by half of it.
+    If 2 f₁ is a line, a move of this line by a peak is a move of f₁ by half of it.
     """
     moves = np.unique(np.concatenate([[0.0], *((p, -p, p / 2, -p / 2) for p in peaks)]))
     first, second = pairs.T[:, :, None]
@@ -50,7 +50,7 @@ def with_aliases(
 
 
 def distinct(pairs: np.ndarray, misfits: np.ndarray, count: int) -> list[int]:
-    """The indices of these pairs, the best first."""
+    """The indices of `count` pairs that differ, in the order of their misfits."""
     kept: list[int] = []
     for index in np.argsort(misfits)[:20_000]:
         if not kept or np.abs(pairs[kept] - pairs[index]).max(axis=1).min() > NEAR:
@@ -61,7 +61,7 @@ def distinct(pairs: np.ndarray, misfits: np.ndarray, count: int) -> list[int]:
 
 
 def refined(table: Sums, pairs: np.ndarray, order: int) -> tuple[np.ndarray, np.ndarray]:
-    """Downhill from neighbour to neighbour, the steps shorter where none is lower."""
+    """Descend from neighbour to neighbour; the steps become shorter if no neighbour is lower."""
     steps = np.array([(a, b) for a in (-1, 0, 1) for b in (-1, 0, 1)], float)
     size = np.full(len(pairs), 0.08)
     least = np.full(len(pairs), np.inf)

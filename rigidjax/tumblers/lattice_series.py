@@ -1,4 +1,4 @@
-"""χ² of a Fourier series in two frequencies, for very many pairs: sums from a table."""
+"""χ² of a Fourier series in two frequencies, for very many pairs, from a table of sums."""
 
 import functools
 import math
@@ -23,7 +23,7 @@ SIDES, HIGH = 2, 0.3
 class Sums(NamedTuple):
     """Sums over the times at f = −4/DENSE, −3/DENSE …, with x the time over the span, less ½.
 
-    **Fields:** `window` Σ w² exp 2πi f x; `data` Σ w z exp 2πi f x; `total` Σ z².
+    `window` is Σ w² exp 2πi f x; `data` Σ w z exp 2πi f x; `total` Σ z².
     """
 
     window: Complex[Array, " f"]
@@ -34,8 +34,8 @@ class Sums(NamedTuple):
 def sums(light: tuple[Array, ...], highest: float) -> Sums:
     """The table up to a frequency, 1/span.
 
-    **Arguments:** `light` times over the span, from 0 to 1, values over the noise, and ones over
-    the noise, all (T,); zeros where there is none.
+    `light` is times over the span, from 0 to 1, values over the noise, and ones over the noise,
+    each (T,), with zeros for missing readings.
     """
     size = math.ceil(highest * DENSE) + 2 * NEAR
     grid = (np.arange(-(-size // ROWS) * ROWS) - NEAR // 2) / DENSE
@@ -80,8 +80,8 @@ def _at(table: Array, f: Array) -> Array:
 def lattice_misfits(pairs: Array, table: Sums, order: int) -> Float[Array, " pairs"]:
     """χ² of the series of each pair (P, 2), in 1/span: `Σ c_jk exp 2πi (j f₁ + k f₂) t`.
 
-    The normal matrix has only few different entries, Σ w² exp 2πi (m f₁ + n f₂) t, and these are
-    values of one function of a frequency.
+    The normal matrix has few different entries, Σ w² exp 2πi (m f₁ + n f₂) t, the values of one
+    function of a frequency.
     """
     js, ks = np.meshgrid(np.arange(-FIRST, FIRST + 1), np.arange(-order, order + 1), indexing="ij")
     js, ks = js.ravel(), ks.ravel()
@@ -124,7 +124,7 @@ def misfits_of(table: Sums, pairs: np.ndarray, order: int) -> np.ndarray:
 
 
 def side_peaks(table: Sums, highest: float) -> np.ndarray:
-    """The highest side peaks of the spectral window, in 1/span, the highest first.
+    """The highest side peaks of the spectral window, in 1/span, in the order of their height.
 
     A line moved by one of these is nearly the same curve at the times of the readings.
     """

@@ -51,7 +51,7 @@ LEAST, ABOVE = 12, 40.0
 
 
 class Alias(eqx.Module):
-    """The motion at the end of a search.
+    """A motion found by a search.
 
     **Fields:** `parameters`; `cost` half of χ²; `rotation` the body period, s, `precession` the
     mean precession period, s (`rigidjax.exact.body_period`, `precession_period`); `mode` `"long"`
@@ -78,12 +78,12 @@ class Alias(eqx.Module):
 class LightCurve(eqx.Module):
     """The result of `fit_light_curve`.
 
-    **Fields:** `fit` of the best motion, its covariance with an allowance for a body that is no
-    ellipsoid (see `fit_light_curve`); `aliases` all motions found, the best first, then by their
-    misfit; `deviations` (4,) relative standard deviations of the best one's rotation, precession
-    and two ratios; `pairs` their frequencies; `search` and `model` the two answers as of a `Fit`:
-    also `not alone` if another alias explains the data nearly as well, and `leaves a part` if χ² is
-    three deviations above its mean for the given noise.
+    **Fields:** `fit` of the best motion, whose covariance allows for a body that is no ellipsoid;
+    `aliases` all motions found, in the order of their misfits; `deviations` (4,) relative standard
+    deviations of the best one's rotation, precession and two ratios; `pairs` their frequencies;
+    `search` and `model` the two answers as of a `Fit`. The search is also `not alone` if another
+    alias explains the data nearly as well; the model `leaves a part` also if χ² is three deviations
+    above its mean for the given noise.
     """
 
     fit: Fit
@@ -123,7 +123,7 @@ def fit_light_curve(
 ) -> LightCurve:
     """The motion of a free tumbler from one light curve, without a guess.
 
-    Pairs of frequencies come from the squared flux (`two_frequencies`). Each pair is precession and
+    `two_frequencies` finds pairs of frequencies in the squared flux. Each pair is precession and
     twice the rotation, in long- and short-axis mode (Kaasalainen 2001), over a grid of bodies and
     phases. The best starts are fitted with the sensor itself, and the best of these fits are
     continued to convergence. The result lists all motions found. Motions that differ by a symmetry
@@ -131,14 +131,15 @@ def fit_light_curve(
     count as one: periods, moments and mode are the same.
 
     Intervals allow for a real shape by consider parameters (Tapley, Schutz and Born 2004,
-    Statistical Orbit Determination, ch. 6): the brightness has a factor 1 + n·S n,
-    n half way between sun and observer, body frame, the entries of S independent of deviation 4 %.
+    Statistical Orbit Determination, ch. 6): the brightness has a factor 1 + n·S n, where n is half
+    way between sun and observer, body frame, and the entries of S are independent with deviation 4
+    %.
 
     **Arguments:** `problem` of one recording with one `Brightness` sensor and no torque; let a
     `Free` move the sensor's `level` unless it is known. `shortest` period of a line in the
-    spectrum, s, `None` for four times the median distance of the samples; `count` pairs of
-    frequencies at most: fewer are tried if the others fit worse, and the search has `not ended` if
-    more of them fit; `tolerance` as of `fit`; `progress` is called with a line of text.
+    spectrum, s, `None` for four times the median distance of the samples; `count` the largest
+    number of pairs of frequencies. Pairs that fit worse are not tried; if more than `count` fit,
+    the search has `not ended`. `tolerance` as of `fit`; `progress` is called with a line of text.
 
     Sources: Pravec et al. 2005, Icarus 173:108, doi:10.1016/j.icarus.2004.07.021; Kaasalainen 2001,
     A&A 376:302, doi:10.1051/0004-6361:20010935. **Raises:** `ValueError` for a problem with other

@@ -49,7 +49,8 @@ def relative_flux(
 def of_few_lengths(problem: Problem) -> Problem:
     """The problem with masked readings up to one of four lengths an octave.
 
-    Light curves of about as many readings are one program: it takes longer to compile than to run.
+    Light curves of about as many readings then share one program, which takes longer to compile
+    than to run.
     """
     record = problem.recording
     octaves = math.ceil(4.0 * math.log2(record.t.shape[0])) / 4.0
@@ -122,7 +123,7 @@ def _place(q: Array, turn: Array, reference: Array) -> Array:
 def noise_of(
     problem: Problem, reading: Any, flux: np.ndarray, found: TwoFrequencies
 ) -> tuple[Float[Array, "1 1"], ...]:
-    """The noise (1, 1) in the sensor's unit; where it is not known what the series leave over."""
+    """The noise (1, 1) in the sensor's unit; if it is not known, the residuals of the series."""
     sensor = reading.sensor
     if sensor.noise is not None:
         return (sensor.noise[None],)
@@ -163,8 +164,8 @@ def _many(
 ) -> Tried:
     """The search from the first `count` starts (a leading axis), one after another.
 
-    By differences of the errors: the closed form of the motion alone takes a hundredth of the time
-    that it takes with its derivatives, and here they need not be right to the last digit.
+    Slopes are differences of the errors: the closed form without derivatives takes a hundredth of
+    the time, and the slopes need few digits here.
     """
 
     def one(given: tuple[Parameters, Array]) -> Tried:

@@ -26,7 +26,7 @@ BLOCK = 256
 
 
 class TwoFrequencies(eqx.Module):
-    """The result of `two_frequencies`, the best first.
+    """The result of `two_frequencies`, in the order of the misfits.
 
     **Fields:** `frequencies` (n, 2) in 1/s; `misfits` (n,) χ² of each pair's series, and `dof`;
     `scatter` the standard deviation of the best one's residuals, in the unit of the values; `lines`
@@ -58,21 +58,21 @@ def two_frequencies(
     """Pairs (f₁, f₂) whose Fourier series fit best: `Σ c_jk exp 2πi (j f₁ + k f₂) t`, |j| ≤ 2.
 
     One of the three strongest lines of the spectrum must be j f₁ + k f₂. All pairs along these
-    curves are tried, then the best ones are refined. Then their aliases are tried: either
-    frequency, or both, moved by a side peak of the spectral window (readings at night have such
-    peaks at one and two a day) or by half of it, halved, doubled, or f₂ by f₁. Several pairs give
-    the same set of lines: all that fit are returned, and a fit of the motion decides.
+    curves are tried, then the best ones are refined. Then their aliases are tried: one frequency or
+    both moved by a side peak of the spectral window (readings at night have such peaks at one and
+    two a day) or by half of it, halved, doubled, or f₂ moved by f₁. Several pairs give the same set
+    of lines. All pairs that fit are returned, and a fit of the motion decides.
 
     **Arguments:** `t` (T,) increasing times, s, gaps allowed; `values` (T,) fluxes or their
-    squares; `noise` their standard deviation, one or (T,), `None` if it is not known; `order` k up
-    to which multiples of f₂ are taken; `shortest` period that a line may have, s, `None` for four
-    times the median distance of the times; `count` how many pairs are returned at most.
-    **Returns** `frequencies`, `misfits`, `dof`, `scatter` and `lines` (`TwoFrequencies`).
+    squares; `noise` their standard deviation, one or (T,), `None` if it is not known; `order` the
+    largest multiple k of f₂; `shortest` period of a line, s, `None` for four times the median
+    distance of the times; `count` the largest number of pairs. **Returns** `frequencies`,
+    `misfits`, `dof`, `scatter` and `lines` (`TwoFrequencies`).
 
     Source: Pravec et al. 2005, Icarus 173:108, doi:10.1016/j.icarus.2004.07.021 (with all |j| and
     |k| up to one order); the linear fit is that of Lomb 1976, doi:10.1007/BF00648343, for many
-    lines. **Raises:** `ValueError`, `TypeError` for wrong shapes, times that do not increase, NaN,
-    too few values.
+    lines. **Raises:** `ValueError` for wrong shapes, times that do not increase, NaN, too few
+    values.
 
     >>> t = np.linspace(0.0, 60.0, 300)
     >>> y = 1 + np.cos(2 * np.pi * 0.4 * t) + 0.5 * np.cos(2 * np.pi * 0.7 * t + 1.0)
@@ -137,7 +137,7 @@ def _padded(x: np.ndarray, z: np.ndarray, w: np.ndarray) -> tuple[Array, Array, 
 
 
 def strongest(light: Any, highest: float, count: int) -> np.ndarray:
-    """The strongest lines, one after another taken away, in 1/span."""
+    """The strongest lines, in 1/span: each is subtracted before the next is searched."""
     grid = np.arange(0.5, max(highest, 2.0), 0.2)
     x, z, w = (np.asarray(v) for v in light)
     found = []
