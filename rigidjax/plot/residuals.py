@@ -23,7 +23,7 @@ def residuals(
 
     **Arguments:** `found` a `rigidjax.identify.Fit`; `index` of the recording; `time_unit` `s`,
     `min`, `h` or `day`; `title`; `ax` your axes (sensors, 4). **Returns** the axes. **Raises**
-    `ValueError` for an unknown unit or axes of another shape; `IndexError` for a missing recording.
+    `ValueError` for an unknown unit, a missing recording, or axes of another shape.
 
     >>> ts = jnp.linspace(0.0, 10.0, 80)
     >>> motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1, 0.1, 1.0]), ts)
