@@ -25,6 +25,7 @@ Vector = Vec3Like | Numbers
 Matrix = Mat3Like | Numbers
 Quaternion = QuatLike | Numbers
 Vectors = Float[ArrayLike, "*batch 3"] | Numbers
+Quaternions = Float[ArrayLike, "*batch 4"] | Numbers
 Matrices = Float[ArrayLike, "*batch 3 3"] | Numbers
 Scalars = Float[ArrayLike, "*batch"] | Numbers | float
 

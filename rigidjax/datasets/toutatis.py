@@ -104,20 +104,18 @@ def rows(fit: Fit) -> list[Row]:
     **Arguments:** `fit` of `problem()`. **Returns** rows (name, value, low, high, unit): days, and
     degrees of ecliptic longitude and latitude (J2000), with 95 % intervals.
     """
-    out: list[Row] = []
-    middle = np.exp(np.asarray(_periods(fit.body, fit.state0)))
-    # What the data do not determine has an end at infinity.
-    with np.errstate(over="ignore"):
-        bounds = fit.interval_of(lambda point: _periods(point.body, point.state0))
-        low, high = (np.exp(bound) for bound in bounds)
+
+    def ranges(of: Any, names: tuple[str, str], shown: Any) -> Any:
+        bounds = fit.interval_of(lambda point: of(point.body, point.state0))
+        # What the data do not determine has an end at infinity.
+        with np.errstate(over="ignore"):
+            numbers = [shown(np.asarray(v)) for v in (of(fit.body, fit.state0), *bounds)]
+        return zip(names, *numbers, strict=True)
+
     names = ("rotation about the long axis", "precession of the long axis")
-    for name, *numbers in zip(names, middle, low, high, strict=True):
-        out.append((name, *numbers, "day"))
-    middle = np.degrees(np.asarray(_direction(fit.body, fit.state0)))
-    bounds = fit.interval_of(lambda point: _direction(point.body, point.state0))
-    low, high = (np.degrees(bound) for bound in bounds)
+    out: list[Row] = [(*row, "day") for row in ranges(_periods, names, np.exp)]
     names = ("angular momentum, longitude", "angular momentum, latitude")
-    for name, *numbers in zip(names, middle, low, high, strict=True):
+    for name, *numbers in ranges(_direction, names, np.degrees):
         turn = 360.0 if "longitude" in name and numbers[0] < 0 else 0.0
         out.append((name, *(number + turn for number in numbers), "deg, ecliptic J2000"))
     return out

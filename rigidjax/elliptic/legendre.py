@@ -155,7 +155,7 @@ def _integral_jvp(orders: Any, primals: Any, tangents: Any) -> tuple[Any, Any]:
         ds = jnp.zeros_like(s) if isinstance(ds, SymbolicZero) else ds
         dc = jnp.zeros_like(c) if isinstance(dc, SymbolicZero) else dc
         delta2 = c * c + m1 * s * s
-        rate = s ** (2 * j) * _odd_power(delta2, -k)
+        rate = s ** (2 * j) * jax.lax.integer_pow(delta2, -k) * jax.lax.rsqrt(delta2)
         if last:
             rate = rate / (c * c + n1 * s * s) ** last
         tangent = tangent + rate * (c * ds - s * dc)
@@ -223,8 +223,3 @@ def half_turns(angle: Any) -> tuple[Any, Any]:
     # Cody & Waite 1980: n × head and n × middle are exact, so that r keeps the digits of the angle.
     head, middle, tail = PI_PARTS[np.dtype(angle.dtype)]
     return turns, ((angle - turns * head) - turns * middle) - turns * tail
-
-
-def _odd_power(x: Any, k: int) -> Any:
-    """x^(k − ½)."""
-    return jax.lax.integer_pow(x, k) * jax.lax.rsqrt(x)

@@ -89,7 +89,14 @@ def earth(latitude: ScalarLike, gravity: ScalarLike = GRAVITY, rate: ScalarLike 
     >>> earth(0.5).acceleration(0.0, Point([0.0, 0, 0], [0.0, 0, 0])).tolist()
     [0.0, 0.0, -9.80665]
     """
-    return Earth(*checked(latitude, gravity, rate))
+    lat, g, w = _checks.scalars(latitude=latitude, gravity=gravity, rate=rate)
+    lat = _checks.refuse(
+        lat,
+        ~(jnp.abs(lat) <= 0.5000001 * jnp.pi),
+        "latitude: wanted radians between −π/2 and π/2; were these degrees?",
+    )
+    g = _checks.sign(g, "gravity", "a positive number, m/s²; it points down")
+    return Earth(lat, g, _checks.refuse(w, ~jnp.isfinite(w), "rate: wanted a finite number, rad/s"))
 
 
 class Foucault(AbstractScene):
@@ -209,21 +216,7 @@ def foucault(
     >>> pendulum.start(3.0, 0.0).v.tolist()
     [0.0, 0.0, 0.0]
     """
-    place = Earth(*checked(latitude, gravity, rate))
+    place = earth(latitude, gravity, rate)
     string = _checks.floating(length, (), "length")
     string = _checks.sign(string, "length", "a positive number, m")
     return Foucault(place, string.astype(jnp.promote_types(string.dtype, place.rate.dtype)))
-
-
-def checked(
-    latitude: ScalarLike, gravity: ScalarLike, rate: ScalarLike
-) -> tuple[Scalar, Scalar, Scalar]:
-    """Latitude, gravity and rate as scalars of one dtype; else raise with the likely mistake."""
-    lat, g, w = _checks.scalars(latitude=latitude, gravity=gravity, rate=rate)
-    lat = _checks.refuse(
-        lat,
-        ~(jnp.abs(lat) <= 0.5000001 * jnp.pi),
-        "latitude: wanted radians between −π/2 and π/2; were these degrees?",
-    )
-    g = _checks.sign(g, "gravity", "a positive number, m/s²; it points down")
-    return lat, g, _checks.refuse(w, ~jnp.isfinite(w), "rate: wanted a finite number, rad/s")

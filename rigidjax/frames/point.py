@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rigidjax import _checks, _show
+from rigidjax._types import Vectors
 
 
 class Point(eqx.Module):
@@ -26,7 +27,7 @@ class Point(eqx.Module):
 
     __repr__ = _show.numbers
 
-    def __init__(self, x: Float[Array, "*batch 3"] | object, v: Float[Array, "*batch 3"] | object):
+    def __init__(self, x: Vectors, v: Vectors):
         hint = "a plane problem has z = 0; functions take one particle, batch with jax.vmap"
         x = _checks.floating(x, (3,), "x", batched=True, hint=hint)
         v = _checks.floating(v, (3,), "v", batched=True, hint=hint)

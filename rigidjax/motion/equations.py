@@ -8,8 +8,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from rigidjax import _checks, _show
-from rigidjax._types import HasAttitude, HasPose, HasSpin, Mat3, Quat, ScalarLike, Vec3
+from rigidjax import _checks, _show, _types
+from rigidjax._types import HasAttitude, HasPose, HasSpin, Mat3, Quat, ScalarLike, Vec3, Vectors
 from rigidjax.body.inertia import Inertia, MassProperties, apply, inverse
 from rigidjax.motion.coupled import Coupled
 from rigidjax.motion.torques.base import Torque, act, evaluate, require_law
@@ -35,7 +35,7 @@ class Spin(eqx.Module):
 
     __repr__ = _show.numbers
 
-    def __init__(self, omega: Float[Array, "*batch 3"] | object):
+    def __init__(self, omega: Vectors):
         self.omega = _checks.floating(omega, (3,), "omega", batched=True)
 
 
@@ -56,9 +56,7 @@ class Attitude(eqx.Module):
 
     __repr__ = _show.numbers
 
-    def __init__(
-        self, q: Float[Array, "*batch 4"] | object, omega: Float[Array, "*batch 3"] | object
-    ):
+    def __init__(self, q: _types.Quaternions, omega: Vectors):
         self.q = _checks.floating(q, (4,), "q", batched=True, hint="a quaternion is (w, x, y, z)")
         self.omega = _checks.floating(omega, (3,), "omega", batched=True)
         _checks.same_batch(q=(self.q, 1), omega=(self.omega, 1))
@@ -84,13 +82,7 @@ class Rigid(eqx.Module):
 
     __repr__ = _show.numbers
 
-    def __init__(
-        self,
-        x: Float[Array, "*batch 3"] | object,
-        v: Float[Array, "*batch 3"] | object,
-        q: Float[Array, "*batch 4"] | object,
-        omega: Float[Array, "*batch 3"] | object,
-    ):
+    def __init__(self, x: Vectors, v: Vectors, q: _types.Quaternions, omega: Vectors):
         self.x = _checks.floating(x, (3,), "x", batched=True)
         self.v = _checks.floating(v, (3,), "v", batched=True)
         self.q = _checks.floating(q, (4,), "q", batched=True, hint="a quaternion is (w, x, y, z)")

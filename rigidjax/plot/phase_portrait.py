@@ -11,15 +11,8 @@ from rigidjax._types import HasAttitude
 from rigidjax.body.energy import spatial_angular_momentum
 from rigidjax.body.inertia import Inertia
 from rigidjax.motion.torques import HeavyTop
-from rigidjax.plot.style import (
-    COLOURS,
-    attitudes,
-    flat_axes,
-    legend_below,
-    matrices,
-    plain,
-    rows,
-)
+from rigidjax.plot import style
+from rigidjax.plot.style import COLOURS, plain, rows
 
 
 def phase_portrait(
@@ -54,7 +47,7 @@ def phase_portrait(
         _checks.floating(getattr(_checks.instance(top, HeavyTop, "top"), name), size, f"top.{name}")
     levels = _checks.whole(levels, "levels", 1)
     across, along, axis, weight, up = _symmetric(inertia, top)
-    m = matrices(attitudes(states))
+    m = style.matrices(style.attitudes(states))
     omega = np.einsum("tij,tj->ti", m, rows(states.omega, 3, "states.omega"))
     first = jax.tree.map(lambda leaf: jnp.asarray(leaf)[0], states)
     about_up = float(np.asarray(spatial_angular_momentum(inertia, first)) @ up)
@@ -69,7 +62,7 @@ def phase_portrait(
         turning = (about_up - about_axis * np.cos(theta)) ** 2 / (2 * across * np.sin(theta) ** 2)
         return turning + weight * np.cos(theta)
 
-    ax = flat_axes(ax)
+    ax = style.flat_axes(ax)
     seen = np.isfinite(rate)
     reach = 1.6 * max(float(np.abs(rate[seen]).max(initial=0.0)), 0.2 * np.sqrt(weight / across))
     middle, half = 0.5 * (tilt.max() + tilt.min()), 0.5 * np.ptp(tilt)
@@ -92,7 +85,7 @@ def phase_portrait(
         ax.plot(np.degrees(lowest), 0, color=COLOURS[1], marker="x", ms=8, ls="", label="steady")
     ax.set(xlabel="tilt θ, deg", ylabel="dθ/dt, rad/s", ylim=(-reach, reach))
     ax.set_title(plain(title) or "phase portrait; thin: equal energy, same momenta")
-    legend_below(ax)
+    style.legend_below(ax)
     return ax
 
 

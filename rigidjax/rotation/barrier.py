@@ -18,7 +18,10 @@ def barrier(tree: Tree) -> Tree:
     """The same numbers, computed once: `jax.lax.optimization_barrier`, or `once` where XLA drops
     it.
     """
-    return jax.tree.map(_real_once, tree) if _DROPPED else lax.optimization_barrier(tree)
+    if not _DROPPED:
+        return lax.optimization_barrier(tree)
+    real = lambda x: jnp.issubdtype(x.dtype, jnp.floating)  # noqa: E731
+    return jax.tree.map(lambda x: once(x) if real(x) else x, tree)
 
 
 def once(x: Array) -> Array:
@@ -28,7 +31,3 @@ def once(x: Array) -> Array:
     cheaper, with all its inputs, for every component.
     """
     return x / jnp.where(x == x, 1, 2)
-
-
-def _real_once(x: Array) -> Array:
-    return once(x) if jnp.issubdtype(x.dtype, jnp.floating) else x

@@ -12,7 +12,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from rigidjax import _checks, exact
-from rigidjax.body.inertia import MassProperties
+from rigidjax.body.inertia import Inertia, tensor_of
 from rigidjax.identify import answers, padding, uncertainty
 from rigidjax.identify.answers import FAILS, FOUND, LEAVES, NOT_ALONE, NOT_ENDED, Answer
 from rigidjax.identify.checkpoint import Tried
@@ -154,7 +154,9 @@ def fit_light_curve(
     t, flux, noise = relative_flux(problem, reading)
     squares, spread = flux**2, None if noise is None else 2.0 * flux * noise
     found = two_frequencies(t, squares, spread, shortest=shortest, count=count)
-    used = _used(found)
+    # The pairs that fit well enough to be tried.
+    above = ABOVE * max(1.0, float(found.misfits[0]) / found.dof)
+    used = max(LEAST, int((found.misfits <= found.misfits[0] + above).sum()))
     starts = starts_of(problem, reading, t, squares, spread, found, used)
     say(f"{used} pairs of frequencies, χ² {found.misfits[0]:.6g} of {found.dof}")
     say(f"{len(starts)} starts")
@@ -168,12 +170,6 @@ def fit_light_curve(
     # Of the readings as they were given.
     own = eqx.tree_at(lambda p: p.slots, problem, best.problem.slots)
     return eqx.tree_at(lambda one: one.fit.problem, told, own)
-
-
-def _used(found: TwoFrequencies) -> int:
-    """The number of pairs that fit well enough to be tried."""
-    above = ABOVE * max(1.0, float(found.misfits[0]) / found.dof)
-    return max(LEAST, int((found.misfits <= found.misfits[0] + above).sum()))
 
 
 def _only(problem: Problem) -> Any:
@@ -204,7 +200,7 @@ def _only(problem: Problem) -> Any:
 def _read(parameters: Parameters, problem: Problem) -> tuple[Array, Array]:
     """Logarithms (4,) of both periods and both ratios, and h²/2T over the middle moment."""
     body: Any = problem.bodies(parameters)
-    inertia = body.inertia if isinstance(body, MassProperties) else body
+    inertia = Inertia(tensor_of(body))
     omega = parameters.own.spin[0] * problem.reference.rate[0]
     moments, momentum = inertia.moments, apply(inertia.tensor, omega)
     rotation = exact.body_period(inertia, omega)
@@ -255,7 +251,7 @@ def _same(a: Alias, b: Alias, near: np.ndarray) -> bool:
 def _half_way(parameters: Parameters, problem: Problem) -> Float[Array, "times 3"]:
     """Directions half way between sun and observer, body frame."""
     body, state0 = problem.unpack(parameters)
-    inertia = body.inertia if isinstance(body, MassProperties) else body
+    inertia = Inertia(tensor_of(body))
     motion, t = exact.FreeBody(inertia, state0), problem.records.t[0]
     sensor = padding.one(problem.records.readings[0], 0).sensor
 

@@ -129,15 +129,12 @@ class Brightness(AbstractSensor):
         return 0.5 * float(turns[np.argmax(power)])
 
     def refusal(self, values: np.ndarray) -> tuple[np.ndarray, str]:
+        noise = np.std(values) if self.noise is None else np.asarray(self.noise)[0]
         wrong = values < 0 if self.unit == "flux" else np.zeros(values.shape, bool)
-        wrong = wrong & (np.abs(values) > 10 * _scatter(self.noise, values))
+        wrong = wrong & (np.abs(values) > 10 * noise)
         return wrong, (
             "the flux at index {index} is far below zero; magnitudes are read with unit='mag'"
         )
-
-
-def _scatter(noise: Array | None, values: np.ndarray) -> float:
-    return float(np.std(values)) if noise is None else float(np.asarray(noise)[0])
 
 
 def _source(source: Any, name: str) -> Any:

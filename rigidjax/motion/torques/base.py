@@ -285,11 +285,6 @@ def vector_at(source: Any, t: ScalarLike, name: str, size: int = 3) -> Float[Arr
     return _checks.floating(source(t), (size,), f"{name}(t)") if callable(source) else source
 
 
-def stays(source: Any) -> Vec3 | None:
-    """A vector that is constant; `None` for a function of time."""
-    return None if callable(source) else source
-
-
 def vector(name: str, *, hint: str = "") -> Callable[[Vector], Array]:
     """A converter to a field of three numbers, for `equinox.field(converter=…)`."""
 

@@ -95,7 +95,7 @@ class GravityGradient(base.OfTime):
     @property
     def axis(self) -> Vec3 | None:
         """The direction without torque about it, world frame, if it is constant: the position's."""
-        return base.stays(self.position)
+        return None if callable(self.position) else self.position
 
     def energy(self, t: ScalarLike, state: HasAttitude, body: Inertia | MassProperties) -> Scalar:
         """Potential energy of the attitude, J: `U = (μ/2r³)(3 r̂'·I r̂' − Tr I)`."""
@@ -143,7 +143,7 @@ class MagneticDipole(base.OfTime):
     @property
     def axis(self) -> Vec3 | None:
         """The direction without torque about it, world frame, if it is constant: the field's."""
-        return base.stays(self.field)
+        return None if callable(self.field) else self.field
 
     def energy(self, t: ScalarLike, state: HasAttitude, body: object) -> Scalar:
         """Potential energy, J: `U = −m·RᵀB`."""
@@ -186,15 +186,8 @@ class FromPotential(base.AbstractTorque):
         return self._value(state.q)
 
     def __call__(self, t: ScalarLike, state: HasAttitude, body: object) -> Vec3:
-        w, x, y, z = state.q
-        dw, dx, dy, dz = jax.grad(self._value)(state.q)
-        return -0.5 * jnp.stack(
-            [
-                -x * dw + w * dx + z * dy - y * dz,
-                -y * dw - z * dx + w * dy + x * dz,
-                -z * dw + y * dx - x * dy + w * dz,
-            ]
-        )
+        slope = jax.grad(self._value)(state.q)
+        return -0.5 * quaternion.multiply(quaternion.conjugate(state.q), slope)[1:]
 
     def _value(self, q):
         return _checks.floating(self.potential(q), (), "potential", hint="one number, J")
