@@ -15,9 +15,6 @@ from rigidjax.body.inertials import (
     read_inertials as read_inertials,
     write_inertials as write_inertials,
 )
-from rigidjax.body.principal_axes import (
-    matrix_function as matrix_function,
-    principal as principal,
-)
+from rigidjax.body.principal_axes import matrix_function as matrix_function, principal as principal
 
 show(__name__)

@@ -18,11 +18,7 @@ from rigidjax._names import show
 from rigidjax._types import Numbers, ScalarLike, Vector
 from rigidjax.body.inertia import MassProperties
 from rigidjax.body.meshes import mesh as mesh, mesh_file as mesh_file
-from rigidjax.body.point_masses import (
-    points as points,
-    quadrature as quadrature,
-    voxels as voxels,
-)
+from rigidjax.body.point_masses import points as points, quadrature as quadrature, voxels as voxels
 
 
 def box(mass: ScalarLike, size: Vector) -> MassProperties:

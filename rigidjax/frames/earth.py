@@ -200,10 +200,7 @@ class Foucault(AbstractScene):
 
 
 def foucault(
-    latitude: ScalarLike,
-    length: ScalarLike,
-    gravity: ScalarLike = GRAVITY,
-    rate: ScalarLike = RATE,
+    latitude: ScalarLike, length: ScalarLike, gravity: ScalarLike = GRAVITY, rate: ScalarLike = RATE
 ) -> Foucault:
     """Foucault's pendulum.
 

@@ -30,13 +30,7 @@ from rigidjax.rotation.kernels import (
     quaternion_to_vector,
     vector_to_quaternion,
 )
-from rigidjax.rotation.linalg3 import (
-    components,
-    cross_components,
-    dot,
-    dot_components,
-    near_one,
-)
+from rigidjax.rotation.linalg3 import components, cross_components, dot, dot_components, near_one
 from rigidjax.rotation.validation import direction, rotation_matrix, turn, unit_quaternion
 
 _HINT = "one quaternion is (w, x, y, z), scalar first; batch with jax.vmap"

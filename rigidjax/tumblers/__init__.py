@@ -7,8 +7,6 @@ from rigidjax.tumblers.light_curve import (
     fit_light_curve as fit_light_curve,
 )
 from rigidjax.tumblers.sensor import Brightness as Brightness
-from rigidjax.tumblers.two_frequencies import (
-    two_frequencies as two_frequencies,
-)
+from rigidjax.tumblers.two_frequencies import two_frequencies as two_frequencies
 
 show(__name__)

@@ -51,9 +51,7 @@ class Series(eqx.Module):
         step = (t[-1] - t[0]) / (t.size - 1)
         uneven = ~((step > 0) & (abs(t[1:] - t[:-1] - step).max() <= 1e-6 * step))
         step = _checks.refuse(
-            step,
-            uneven,
-            "Series: wanted evenly spaced, increasing times; resample, or use Linear",
+            step, uneven, "Series: wanted evenly spaced, increasing times; resample, or use Linear"
         )
         dtype = jnp.result_type(float)
         self.start, self.step = jnp.asarray(t[0], dtype), jnp.asarray(step, dtype)
