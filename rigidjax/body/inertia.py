@@ -57,7 +57,9 @@ class Inertia(eqx.Module):
 
     def __init__(self, tensor: Matrices):
         hint = "of principal moments Inertia.from_principal makes one"
-        self.tensor = _checks.floating(tensor, (3, 3), "tensor", batched=True, hint=hint)
+        self.tensor = _checks.floating(
+            tensor, (3, 3), "tensor", batched=True, hint=hint, unit="kg m²"
+        )
 
     @staticmethod
     def from_tensor(tensor: Matrix) -> "Inertia":
@@ -98,7 +100,7 @@ class Inertia(eqx.Module):
         >>> Inertia.from_second_moment(jnp.diag(jnp.array([2.0, 1.0, 0.0]))).moments
         Array([1., 2., 3.], dtype=float64)
         """
-        s = _checks.floating(second_moment, (3, 3), "second moment")
+        s = _checks.floating(second_moment, (3, 3), "second moment", unit="kg m²")
         return Inertia(swap_trace(validation.real_second_moment(s)))
 
     @property
@@ -133,7 +135,7 @@ class Inertia(eqx.Module):
         >>> Inertia.from_principal(1.0, 1.0, 1.0).shifted([0.0, 0.0, 2.0], 3.0).moments
         Array([ 1., 13., 13.], dtype=float64)
         """
-        r, m = _checks.floating(r, (3,), "r"), _checks.floating(mass, (), "mass")
+        r, m = _checks.floating(r, (3,), "r", unit="m"), _checks.floating(mass, (), "mass")
         return Inertia(self.tensor + swap_trace(m * outer(r, r)))
 
     def rotated(self, q: Quaternion) -> "Inertia":
@@ -195,7 +197,9 @@ class MassProperties(eqx.Module):
                 "second_moment: wanted 𝔖 = ∫ r rᵀ dm about the centre of mass, (3, 3), got an "
                 "Inertia; give its .second_moment"
             )
-        second_moment = _checks.floating(second_moment, (3, 3), "second_moment", batched=True)
+        second_moment = _checks.floating(
+            second_moment, (3, 3), "second_moment", batched=True, unit="kg m²"
+        )
         _checks.same_batch(mass=(mass, 0), com=(com, 1), second_moment=(second_moment, 2))
         dtype = jnp.result_type(mass, com, second_moment)
         self.mass = validation.mass_of_a_body(mass.astype(dtype))

@@ -181,7 +181,7 @@ def plate(mass: ScalarLike, size: Float[ArrayLike, "2"] | Numbers) -> MassProper
 
 
 def _lengths(value, shape, name):
-    lengths = _checks.given(value, shape, name)
+    lengths = _checks.given(value, shape, name, unit="m")
     return _checks.if_known(_checks.sign, lengths, name, "lengths ≥ 0 (m)", zero=True)
 
 

@@ -83,8 +83,8 @@ class Rigid(eqx.Module):
     __repr__ = _show.numbers
 
     def __init__(self, x: Vectors, v: Vectors, q: _types.Quaternions, omega: Vectors):
-        self.x = _checks.floating(x, (3,), "x", batched=True)
-        self.v = _checks.floating(v, (3,), "v", batched=True)
+        self.x = _checks.floating(x, (3,), "x", batched=True, unit="m")
+        self.v = _checks.floating(v, (3,), "v", batched=True, unit="m/s")
         self.q = _checks.floating(q, (4,), "q", batched=True, hint="a quaternion is (w, x, y, z)")
         self.omega = _checks.floating(omega, (3,), "omega", batched=True)
         _checks.same_batch(x=(self.x, 1), v=(self.v, 1), q=(self.q, 1), omega=(self.omega, 1))

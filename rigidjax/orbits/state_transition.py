@@ -49,7 +49,7 @@ def solved(
     )
 
 
-def after(scene: AbstractScene, numbers: Float[Array, "6"], t: Any, **how: float) -> Array:
+def after(scene: AbstractScene, numbers: Float[Array, "6"], t: Any, **how: Any) -> Array:
     """`flow` on (x, v) as one vector."""
     out = flow(scene, Point(numbers[:3], numbers[3:]), t, **how)
     return jnp.concatenate([out.x, out.v])
@@ -57,7 +57,7 @@ def after(scene: AbstractScene, numbers: Float[Array, "6"], t: Any, **how: float
 
 @eqx.filter_jit
 def transition(
-    scene: AbstractScene, numbers: Float[Array, "6"], t: Any, **how: float
+    scene: AbstractScene, numbers: Float[Array, "6"], t: Any, **how: Any
 ) -> Float[Array, "6 6"]:
     """∂(x, v)(t)/∂(x, v)(0): the tangents are solved along with the motion."""
     return jax.jacfwd(lambda numbers: after(scene, numbers, t, **how))(numbers)

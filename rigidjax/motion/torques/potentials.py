@@ -95,7 +95,8 @@ class GravityGradient(base.OfTime):
     @property
     def axis(self) -> Vec3 | None:
         """The direction without torque about it, world frame, if it is constant: the position's."""
-        return None if callable(self.position) else self.position
+        source: Any = self.position
+        return None if callable(source) else source
 
     def energy(self, t: ScalarLike, state: HasAttitude, body: Inertia | MassProperties) -> Scalar:
         """Potential energy of the attitude, J: `U = (μ/2r³)(3 r̂'·I r̂' − Tr I)`."""
@@ -143,7 +144,8 @@ class MagneticDipole(base.OfTime):
     @property
     def axis(self) -> Vec3 | None:
         """The direction without torque about it, world frame, if it is constant: the field's."""
-        return None if callable(self.field) else self.field
+        source: Any = self.field
+        return None if callable(source) else source
 
     def energy(self, t: ScalarLike, state: HasAttitude, body: object) -> Scalar:
         """Potential energy, J: `U = −m·RᵀB`."""
