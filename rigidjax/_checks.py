@@ -74,6 +74,8 @@ def _and(hint: str) -> str:
 
 def kind(value: Any) -> str:
     """The name of a value's type for a message, or of the class if it is one."""
+    if isinstance(value, jax.Array):
+        return f"an array of shape {value.shape}"
     return f"the class {value.__name__}" if isinstance(value, type) else type(value).__name__
 
 
@@ -258,6 +260,9 @@ def instance(
     if not wanted:
         several = kinds if isinstance(kinds, tuple) else (kinds,)
         wanted = " or ".join(kind.__name__ for kind in several)
+    # A whole solution in the place of its states, a body with mass in the place of its inertia.
+    own = [name for name in ("ys", "inertia") if isinstance(getattr(value, name, None), kinds)]
+    hint = hint or (f"give its .{own[0]}" if own else "")
     raise TypeError(f"{name}: wanted {wanted}, got {kind(value)}{_and(hint)}")
 
 
@@ -359,7 +364,8 @@ def on_host(value: Any, name: str) -> np.ndarray:
     except (TypeError, ValueError) as error:
         raise TypeError(f"{name}: wanted numbers, got {type(value).__name__}") from error
     if array.dtype.kind not in "iuf" and array.dtype != jnp.bfloat16:
-        raise TypeError(f"{name}: wanted numbers, got {type(value).__name__} of {array.dtype}")
+        found = kind(value) if array.dtype == object else f"{kind(value)} of {array.dtype}"
+        raise TypeError(f"{name}: wanted numbers, got {found}")
     return array.astype(float)
 
 

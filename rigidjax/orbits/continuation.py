@@ -46,7 +46,7 @@ def family(
     start, index = crossing(orbit), named(hold)
     length = np.shape(values)
     if len(length) != 1 or length[0] < 1:
-        raise ValueError(f"values: wanted shape (N,), numbers that {hold} takes, got {length}")
+        raise ValueError(f"values: wanted shape (N,), values of {hold}, got shape {length}")
     values = _checks.finite(_checks.floating(values, length, "values"), "values")
     values = values.astype(start.dtype)
     held = 0.5 * values if hold == "period" else values

@@ -66,7 +66,7 @@ def _given(body: Any, samples: int) -> tuple[Inertia | MassProperties, Any]:
     if not hasattr(body, "parameters") or not hasattr(body, "problem"):
         raise TypeError(
             "inertia_ellipsoid: wanted an Inertia, a MassProperties or a Fit, got "
-            f"{type(body).__name__}"
+            f"{_checks.kind(body)}"
         )
     if isinstance(body.body, dict):
         raise ValueError(

@@ -82,14 +82,14 @@ def wahba(
         direction(rows.reshape(-1), name)
     w, world, body = (of_order_one(x) for x in (w, world, body))
     b = (w[:, None, None] * world[:, :, None] * body[:, None, :]).sum(0)
-    best = nearest(b)
+    words = "wahba: these directions do not fix the attitude; two that are not parallel are needed"
+    try:
+        best = nearest(b)
+    except ValueError:
+        raise ValueError(words) from None
     # (σ1 + σ2)(σ2 + σ3)(σ3 + σ1), σ3 with the sign of det b: 0 where a turn is free.
     firmness = determinant(_curvature(best, b / jnp.sqrt((b * b).sum())))
-    return _checks.refuse(
-        best,
-        ~(firmness > 4 * np.sqrt(jnp.finfo(b.dtype).eps)),
-        "wahba: these directions do not fix the attitude; two that are not parallel are needed",
-    )
+    return _checks.refuse(best, ~(firmness > 4 * np.sqrt(jnp.finfo(b.dtype).eps)), words)
 
 
 def align(a: Vec3Like, b: Vec3Like) -> Mat3:
