@@ -153,7 +153,7 @@ def ellipsoid(
     _checks.word(kind, ("energy", "momentum", "mass"), "kind")
     if (size is None) != (kind == "mass"):
         words = {"mass": "no size", "energy": "the energy, J", "momentum": "the momentum, kg m²/s"}
-        raise TypeError(f"size: of the ellipsoid of {kind} wanted {words[kind]}, got {size!r}")
+        raise TypeError(f"size: wanted {words[kind]} for the ellipsoid of {kind}, got {size!r}")
     if kind == "mass":
         solid = _checks.single(body, MassProperties, "body")
         second_moments, q = principal(solid.second_moment)
@@ -169,5 +169,5 @@ def _omega(state):
 
 
 def _tensor(body: Inertia | MassProperties) -> Mat3:
-    hint = "Inertia.from_tensor makes one of a matrix"
+    hint = "Inertia.from_tensor takes a matrix"
     return tensor_of(_checks.single(body, (Inertia, MassProperties), "body", hint=hint))

@@ -56,7 +56,7 @@ class Inertia(eqx.Module):
     __repr__ = _show.numbers
 
     def __init__(self, tensor: Matrices):
-        hint = "of principal moments Inertia.from_principal makes one"
+        hint = "Inertia.from_principal takes principal moments"
         self.tensor = _checks.floating(
             tensor, (3, 3), "tensor", batched=True, hint=hint, unit="kg m²"
         )

@@ -188,7 +188,7 @@ def faces_of(faces: Any, n: int) -> Array:
         if paired[edge] != paired.get(back, 0):
             raise ValueError(
                 f"mesh: the edge {_tuple((edge // n, edge % n))} is used {paired[edge]} times one "
-                f"way and {paired.get(back, 0)} times the other; it must be as often both ways"
+                f"way and {paired.get(back, 0)} times the other; both numbers must be equal"
             )
     return jnp.asarray(table)
 

@@ -41,7 +41,7 @@ def pack(body: MassProperties) -> Float[Array, "10"]:
     """
     if not isinstance(body, MassProperties):
         raise TypeError(
-            f"pack: wanted MassProperties, got {type(body).__name__}; of an Inertia use "
+            f"pack: wanted MassProperties, got {type(body).__name__}; for an Inertia use "
             "pack_second_moment(body.second_moment), or pack_shape for its ratios alone"
         )
     _checks.single(body, MassProperties, "body")

@@ -28,7 +28,7 @@ def points(
     """
     masses = _checks.rows(masses, (), "masses")
     n = masses.shape[0]
-    hint = f"{n} masses have as many rows"
+    hint = f"one row for each of {n} masses"
     positions = _checks.floating(positions, (n, 3), "positions", hint=hint)
     if n == 0:
         raise ValueError("masses: wanted at least one, got none")

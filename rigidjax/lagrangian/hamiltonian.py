@@ -151,7 +151,7 @@ class HeavyTopHamiltonian(eqx.Module):
     def __init__(self, inertia: _inertia.Inertia, top: HeavyTop):
         self.inertia = _invertible(inertia)
         self.top = _checks.instance(
-            top, HeavyTop, "top", hint="this Hamiltonian is that of gravity alone"
+            top, HeavyTop, "top", hint="this Hamiltonian is for gravity alone"
         )
         self.inverse = _inertia.inverse(self.inertia.tensor)
 

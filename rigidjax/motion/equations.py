@@ -18,7 +18,7 @@ from rigidjax.rotation.kernels import square4
 from rigidjax.rotation.linalg3 import components, cross
 
 State = TypeVar("State")
-_HINT = "Inertia.from_tensor makes one of a matrix; of MassProperties pass .inertia"
+_HINT = "Inertia.from_tensor takes a matrix; from MassProperties pass .inertia"
 
 
 class Spin(eqx.Module):

@@ -142,9 +142,9 @@ def follow(
     start, index = crossing(orbit), named(rising)
     length = _checks.floating(step, (), "step").astype(start.dtype)
     bad = ~(jnp.isfinite(length) & (length != 0))
-    length = _checks.refuse(length, bad, "step: wanted a number not 0")
+    length = _checks.refuse(length, bad, "step: wanted a number that is not 0")
     if isinstance(count, bool) or not isinstance(count, int) or count < 1:
-        raise ValueError(f"count: wanted how many members, an integer ≥ 1, got {count!r}")
+        raise ValueError(f"count: wanted the number of members, an integer ≥ 1, got {count!r}")
     tolerance = correction.usual_tolerance(start)
     numbers, left = _follow(scene, start, length, count, index, tolerance)
     moved = jnp.diff(jnp.concatenate([start[None], numbers]), axis=0)

@@ -175,7 +175,7 @@ def cr3bp(mu: ScalarLike, radii: Float[Array, "2"] | object = (0.0, 0.0)) -> Thr
     ratio = _checks.floating(mu, (), "mu")
     bad = ~((ratio > 0) & (ratio <= 0.5))
     ratio = _checks.refuse(
-        ratio, bad, "mu: wanted 0 < mu ≤ ½, the mass of the lighter body over that of both"
+        ratio, bad, "mu: wanted 0 < mu ≤ ½, the mass of the lighter body over the mass of both"
     )
     radii = _checks.floating(list(radii) if isinstance(radii, tuple) else radii, (2,), "radii")
     return ThreeBody(ratio, _checks.refuse(radii, ~(radii >= 0), "radii: wanted two numbers ≥ 0"))

@@ -87,7 +87,7 @@ def branch(
     """The start at `phase`, and the multiplier: see `manifold_start`."""
     _checks.word(which, ("stable", "unstable"), "which")
     if isinstance(side, bool) or side not in (1, -1):
-        raise ValueError(f"side: wanted 1, to larger x at the orbit's start, or -1, got {side!r}")
+        raise ValueError(f"side: wanted 1 (to larger x at the orbit's start) or -1, got {side!r}")
     crossing(orbit)
     return _branch(scene, orbit, phase, which, side, distance)
 

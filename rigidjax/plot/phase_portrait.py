@@ -106,6 +106,6 @@ def _symmetric(
     if np.abs(tensor - symmetric).max() > 1e-6 * np.abs(tensor).max():
         raise ValueError(
             "phase_portrait: wanted a body symmetric about the axis through its centre of mass "
-            f"(two equal moments across {axis.round(3).tolist()}); other tops have no such plane"
+            f"(two equal moments across {axis.round(3).tolist()}); other tops have no such portrait"
         )
     return across, along, axis, weight, -gravity / pull

@@ -100,7 +100,7 @@ def _one_sensor(row: Any, t: np.ndarray, scaled: np.ndarray, seen: np.ndarray) -
     memory.axhline(0, color="0.6", lw=0.8)
     memory.set(xlabel="lag, samples", ylabel="correlation", ylim=(-1, 1))
     spectrum.axhline(1, color="0.6", lw=0.8)
-    spectrum.set(yscale="log", ylabel="power / that of the noise")
+    spectrum.set(yscale="log", ylabel="power / power of the noise")
 
 
 def power(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

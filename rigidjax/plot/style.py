@@ -72,7 +72,7 @@ def several_axes(ax: Any, shape: tuple[int, ...], **how: Any) -> Any:
     ax = np.atleast_1d(np.asarray(ax, dtype=object))
     if ax.shape != shape:
         words = f"{shape[0]} axes" + (" in a row" if "ncols" in how else "")
-        words = words if len(shape) == 1 else f"{shape} axes, a row a sensor"
+        words = words if len(shape) == 1 else f"{shape} axes, one row for each sensor"
         raise ValueError(f"ax: wanted {words}, got shape {ax.shape}")
     return ax
 
@@ -95,7 +95,7 @@ def rows(values: Any, width: int, name: str) -> np.ndarray:
     """Values of one body over time (T, width) as NumPy float64; `ValueError` for another shape."""
     out = _checks.on_host(values, name)
     if out.ndim != 2 or out.shape[1] != width:
-        hint = "; of a batch draw one body at a time" if out.ndim == 3 else ""
+        hint = "; draw one body of a batch at a time" if out.ndim == 3 else ""
         raise ValueError(f"{name}: wanted shape (times, {width}), got {out.shape}{hint}")
     if not np.isfinite(out).any():
         raise ValueError(f"{name}: nothing to draw, every value is NaN or infinite")

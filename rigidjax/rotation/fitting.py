@@ -185,7 +185,7 @@ def weights_of(weights: Any, like: Array, of: str) -> Array:
         return jnp.ones_like(like)
     w = _checks.floating(weights, like.shape, "weights")
     if _checks.known(w):
-        words = "numbers ≥ 0, of which one at least is positive"
+        words = "numbers ≥ 0, at least one of them positive"
         _checks.sign(_checks.finite(w, "weights"), "weights", words, zero=True)
         _checks.refuse(w, ~(w > 0).any(), f"weights: wanted {words}")
     return w

@@ -97,6 +97,6 @@ def unit_quaternion(q: Float[Array, "*batch 4"], name: str) -> Float[Array, "*ba
         q,
         ~(off.max() <= limit),
         f"{name}: not a unit quaternion{found} (limit 1 ± {limit:g}); quaternion.normalise makes "
-        "one. Four numbers of another meaning?",
+        "one. Do these numbers mean something else?",
     )
     return q / length

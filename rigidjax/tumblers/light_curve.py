@@ -315,6 +315,6 @@ def _told(best: Fit, aliases: list[Alias], found: TwoFrequencies, cut: bool) -> 
     # Outliers dominate χ² under a robust loss.
     above = best.chi2 - best.dof if best.problem.loss is None else 0.0
     if search == Answer(FOUND) and best.ok and above > CONTENT * np.sqrt(2.0 * best.dof):
-        why = "another motion that was not found, or more noise than was said"
+        why = "another motion that was not found, or more noise than given"
         model = Answer(LEAVES, (f"χ² is {best.chi2:.6g} of {best.dof}: {why}",))
     return LightCurve(wider, marked, deviations, found, search, model)

@@ -264,7 +264,7 @@ def one_law(law: Any) -> None:
         if eqx.is_array(value) and not isinstance(value, kind):  # pyright: ignore[reportArgumentType]
             raise ValueError(
                 f"torque {type(law).__name__}: {field.name} has the shape {value.shape}, which is "
-                "not that of one law; for a law a body use jax.vmap, or torque_axes=0 in "
+                "not that of one torque; for one torque per body use jax.vmap, or torque_axes=0 in "
                 "rigidjax.batch"
             )
 
@@ -343,7 +343,7 @@ def count_of(value: Any, name: str, one: str) -> int:
     """The number of rows (x, y, z), one for each `one`: at least one."""
     shape = _checks.numbers(value, name).shape
     if len(shape) != 2 or shape[1] != 3 or not shape[0]:
-        raise ValueError(f"{name}: wanted (R, 3), one row a {one}, got shape {shape}")
+        raise ValueError(f"{name}: wanted (R, 3), one row for each {one}, got shape {shape}")
     return shape[0]
 
 
@@ -353,7 +353,7 @@ def each(value: Any, count: int, name: str) -> Array:
 
 
 def length_or_zero(v: Vec3Like) -> Scalar:
-    """|v|, with derivative 0 at v = 0: for |v| v, whose derivative there is 0."""
+    """|v|, with derivative 0 at v = 0, as a factor of |v| v."""
     v = _checks.floating(v, (3,), "v")
     square = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
     return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)

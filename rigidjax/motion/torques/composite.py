@@ -36,7 +36,7 @@ class Sum(eqx.Module):
             base.require_law(part, "Sum")
             if isinstance(part, ChangingInertia) and len(parts) > 1:
                 raise TypeError(
-                    "Sum: ChangingInertia divides all torques by the inertia at their time: put "
+                    "Sum: ChangingInertia divides all torques by the inertia at time t: put "
                     "the others inside it, ChangingInertia(inertia, Sum(a, b))"
                 )
         self.parts = parts

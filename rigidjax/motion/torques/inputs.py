@@ -199,9 +199,8 @@ def bind(law: Law, inputs: Mapping[str, Any] | Row | None) -> Law:
         if not isinstance(node, Input):
             return node
         if node.name not in values:
-            raise ValueError(
-                f"inputs: the law reads {node.name!r}, got {', '.join(map(repr, values)) or 'none'}"
-            )
+            found = ", ".join(map(repr, values)) or "none"
+            raise ValueError(f"inputs: the torque reads {node.name!r}, got {found}")
         found = values[node.name]
         return found if callable(found) else _Now(jnp.asarray(found))
 
@@ -233,7 +232,7 @@ def require_inputs(law: Any, inputs: Any) -> Mapping[str, Any]:
         raise TypeError(f"inputs: wanted arrays by name, got {type(found).__name__}")
     if set(read) != set(found):
         raise ValueError(
-            f"inputs: the law reads {', '.join(map(repr, read)) or 'none'}, got "
+            f"inputs: the torque reads {', '.join(map(repr, read)) or 'none'}, got "
             f"{', '.join(map(repr, found)) or 'none'}"
         )
     return found

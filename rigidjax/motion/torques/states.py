@@ -71,7 +71,7 @@ def freeze(law: Tree, own: tuple[Any, ...]) -> Tree:
         return law
     frozen = _visit(law, lambda node: queue.pop(0) if queue else _missing(node))
     if queue:
-        raise ValueError(f"own: the law has {len(own) - len(queue)} with states, got {len(own)}")
+        raise ValueError(f"own: the torque has {len(own) - len(queue)} with states, got {len(own)}")
     return frozen
 
 
