@@ -78,10 +78,7 @@ class Inertia(eqx.Module):
 
     @staticmethod
     def from_principal(i1: ScalarLike, i2: ScalarLike, i3: ScalarLike) -> "Inertia":
-        """A body whose principal axes are the body axes.
-
-        **Arguments:** `i1`, `i2`, `i3` scalars, kg m², about the first, second and third axis.
-        **Raises:** as `from_tensor`.
+        """A body with moments `i1`, `i2`, `i3`, kg m², about the body axes; else as `from_tensor`.
 
         >>> Inertia.from_principal(1.0, 2.0, 3.0).tensor[2, 2]
         Array(3., dtype=float64)
@@ -241,9 +238,7 @@ class MassProperties(eqx.Module):
         return self.second_moment + self.mass * outer(d, d)
 
     def inertia_about(self, point: Vector) -> Inertia:
-        """The inertia about another point of the body, such as a pivot.
-
-        **Arguments:** `point` (3,) m, body frame.
+        """The inertia about another `point` (3,) of the body, m, body frame, such as a pivot.
 
         >>> body = MassProperties(2.0, [1.0, 0, 0], [[1.0, 0, 0], [0, 1, 0], [0, 0, 1]])
         >>> body.inertia_about([0.0, 0, 0]).moments
@@ -263,9 +258,7 @@ class MassProperties(eqx.Module):
         )
 
     def rotated(self, q: Quaternion) -> "MassProperties":
-        """The body turned about its origin: `c → R c`, `𝔖 → R 𝔖 Rᵀ`.
-
-        **Arguments:** `q` (4,) unit quaternion (w, x, y, z), active.
+        """The body turned about its origin by `q` (4,) unit, active: `c → R c`, `𝔖 → R 𝔖 Rᵀ`.
 
         >>> body = MassProperties(2.0, [1.0, 0, 0], [[1.0, 0, 0], [0, 1, 0], [0, 0, 1]])
         >>> body.rotated([0.0, 0, 0, 1]).com

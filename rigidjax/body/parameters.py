@@ -80,9 +80,7 @@ def pack_second_moment(second_moment: Matrix) -> Float[Array, "6"]:
 
 
 def unpack_second_moment(vector: Float[ArrayLike, "6"] | Numbers) -> Mat3:
-    """The second moment (3, 3), kg m², of six unconstrained numbers.
-
-    **Arguments:** `vector` (6,) as `pack_second_moment` returns them.
+    """The second moment (3, 3), kg m², of a `vector` (6,) as of `pack_second_moment`.
 
     >>> unpack_second_moment(jnp.zeros(6))[0]
     Array([1., 0., 0.], dtype=float64)
@@ -107,9 +105,7 @@ def pack_shape(second_moment: Matrix) -> Float[Array, "5"]:
 
 
 def unpack_shape(vector: Float[ArrayLike, "5"] | Numbers) -> Mat3:
-    """The second moment (3, 3) of trace 1 (so `Tr I = 2`) of five unconstrained numbers.
-
-    **Arguments:** `vector` (5,) as `pack_shape` returns them.
+    """The second moment (3, 3) of trace 1 (so `Tr I = 2`) of a `vector` (5,) as of `pack_shape`.
 
     >>> float(jnp.trace(unpack_shape(jnp.ones(5))))
     1.0
@@ -135,9 +131,7 @@ def pack_moments(moments: Vector) -> Float[Array, "3"]:
 
 
 def unpack_moments(vector: Float[ArrayLike, "3"] | Numbers) -> Vec3:
-    """Principal moments (3,), kg m², of three unconstrained numbers: always those of a real body.
-
-    **Arguments:** `vector` (3,) as `pack_moments` returns them.
+    """Principal moments (3,), kg m², of a `vector` (3,) as of `pack_moments`: of a real body.
 
     >>> unpack_moments([0.0, 0.0, 0.0])
     Array([2., 2., 2.], dtype=float64)

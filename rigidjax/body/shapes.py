@@ -22,10 +22,7 @@ from rigidjax.body.point_masses import points as points, quadrature as quadratur
 
 
 def box(mass: ScalarLike, size: Vector) -> MassProperties:
-    """A solid box. `𝔖 = m diag(a², b², c²)/12`.
-
-    **Arguments:** `mass` kg; `size` (3,) full edge lengths along x, y, z, m; a zero edge gives a
-    plate.
+    """A solid box of `mass` kg and full edge lengths `size` (3,), m. `𝔖 = m diag(a², b², c²)/12`.
 
     >>> box(12.0, [1.0, 2.0, 3.0]).inertia.moments
     Array([ 5., 10., 13.], dtype=float64)
@@ -35,9 +32,7 @@ def box(mass: ScalarLike, size: Vector) -> MassProperties:
 
 
 def ellipsoid(mass: ScalarLike, semi_axes: Vector) -> MassProperties:
-    """A solid ellipsoid. `𝔖 = m diag(a², b², c²)/5`.
-
-    **Arguments:** `mass` kg; `semi_axes` (3,) along x, y, z, m.
+    """A solid ellipsoid of `mass` kg and `semi_axes` (3,), m. `𝔖 = m diag(a², b², c²)/5`.
 
     >>> ellipsoid(5.0, [1.0, 2.0, 3.0]).inertia.moments
     Array([ 5., 10., 13.], dtype=float64)
@@ -47,9 +42,7 @@ def ellipsoid(mass: ScalarLike, semi_axes: Vector) -> MassProperties:
 
 
 def sphere(mass: ScalarLike, radius: ScalarLike) -> MassProperties:
-    """A solid sphere. `𝔖 = m r²/5 · 1`, so `I = ⅖ m r² · 1`.
-
-    **Arguments:** `mass` kg; `radius` m.
+    """A solid sphere of `mass` kg, `radius` m. `𝔖 = m r²/5 · 1`, so `I = ⅖ m r² · 1`.
 
     >>> sphere(5.0, 1.0).inertia.moments
     Array([2., 2., 2.], dtype=float64)
@@ -74,9 +67,7 @@ def hollow_sphere(mass: ScalarLike, inner: ScalarLike, outer: ScalarLike) -> Mas
 
 
 def shell(mass: ScalarLike, radius: ScalarLike) -> MassProperties:
-    """A thin spherical shell. `𝔖 = m r²/3 · 1`.
-
-    **Arguments:** `mass` kg; `radius` m.
+    """A thin spherical shell of `mass` kg, `radius` m. `𝔖 = m r²/3 · 1`.
 
     >>> shell(3.0, 1.0).inertia.moments
     Array([2., 2., 2.], dtype=float64)
@@ -156,10 +147,10 @@ def torus(mass: ScalarLike, major: ScalarLike, minor: ScalarLike) -> MassPropert
 
 
 def rod(mass: ScalarLike, length: ScalarLike) -> MassProperties:
-    """A rod along z without thickness. `𝔖 = m diag(0, 0, ℓ²/12)`.
+    """A rod along z without thickness, of `mass` kg, `length` m. `𝔖 = m diag(0, 0, ℓ²/12)`.
 
-    **Arguments:** `mass` kg; `length` m. Its moment about z is zero, and the equations of motion
-    refuse it: a rod with thickness is a `cylinder`.
+    Its moment about z is zero, and the equations of motion refuse it: a rod with thickness is a
+    `cylinder`.
 
     >>> rod(12.0, 1.0).inertia.moments
     Array([0., 1., 1.], dtype=float64)
@@ -169,9 +160,7 @@ def rod(mass: ScalarLike, length: ScalarLike) -> MassProperties:
 
 
 def plate(mass: ScalarLike, size: Float[ArrayLike, "2"] | Numbers) -> MassProperties:
-    """A rectangular plate in the x–y plane without thickness. `𝔖 = m diag(a², b², 0)/12`.
-
-    **Arguments:** `mass` kg; `size` (2,) edge lengths along x, y, m.
+    """A plate in the x–y plane of `mass` kg and `size` (2,), m. `𝔖 = m diag(a², b², 0)/12`.
 
     >>> plate(12.0, [1.0, 2.0]).inertia.moments
     Array([1., 4., 5.], dtype=float64)

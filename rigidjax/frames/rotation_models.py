@@ -16,9 +16,7 @@ from rigidjax.rotation.validation import near_unit, tolerance
 
 
 class Uniform(eqx.Module):
-    """A uniform turn M(t) = exp(t hat Ω), which is 1 at t = 0 (notes, eqs 17, 18).
-
-    **Arguments:** `omega` Ω (3,), rad/s: the same numbers in S and in S'.
+    """A uniform turn M(t) = exp(t hat Ω), M(0) = 1, of `omega` Ω (3,), rad/s, axes of S or S'.
 
     >>> Uniform([0.0, 0.0, 1.0])(jnp.pi).round(12)[0].tolist()
     [-1.0, -0.0, 0.0]

@@ -139,9 +139,8 @@ class EulerAngleTop(eqx.Module):
 
 
 def to_attitude(y: Coordinates) -> Attitude:
-    """Attitude and body rate of 3-1-3 Euler angles and their rates (notes, eqs 33, 81–83).
-
-    **Arguments:** `y` with `q` = (φ, θ, ψ), rad, and `rate`, rad/s.
+    """Attitude and body rate of `y`, 3-1-3 Euler angles, rad, and rates, rad/s (notes, eqs 33,
+    81–83).
 
     >>> to_attitude(Coordinates([0.0, 0.0, 0.0], [0.0, 0.0, 2.0])).omega.tolist()
     [0.0, 0.0, 2.0]

@@ -34,9 +34,7 @@ def entries(m: Float[Array, "3 3"]) -> tuple[Scalar, ...]:
 
 
 def cross(a: Vec3Like, b: Vec3Like) -> Vec3:
-    """Vector product a × b.
-
-    **Arguments:** `a`, `b` (3,), in one frame, any units.
+    """Vector product a × b of two vectors (3,) in one frame, any units.
 
     >>> cross(jnp.array([1.0, 0.0, 0.0]), jnp.array([0.0, 1.0, 0.0])).tolist()
     [0.0, 0.0, 1.0]
@@ -75,9 +73,7 @@ def near_one(*parts: Scalar) -> Scalar:
 
 
 def hat(w: Vec3Like) -> Mat3:
-    """The matrix J with J y = w × y (notes, eqs 41–43, 49).
-
-    **Arguments:** `w` (3,), any units and frame; J acts in the same frame.
+    """The matrix J with J y = w × y (notes, eqs 41–43, 49), of `w` (3,) in any units and frame.
 
     >>> hat(jnp.array([1.0, 2.0, 3.0])).tolist()
     [[0.0, -3.0, 2.0], [3.0, 0.0, -1.0], [-2.0, 1.0, 0.0]]
@@ -114,9 +110,8 @@ def basis(dtype: Any = float) -> Float[Array, "3 3 3"]:
 
 
 def product(a: Mat3Like, b: Mat3Like) -> Mat3:
-    """Matrix product a b on components: full precision on every device, cheap in gradients.
-
-    **Arguments:** `a`, `b` (3, 3).
+    """Matrix product of `a`, `b` (3, 3) on components: full precision on every device, cheap in
+    gradients.
 
     >>> product(jnp.eye(3), 2.0 * jnp.eye(3)).tolist()
     [[2.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 2.0]]
@@ -126,9 +121,7 @@ def product(a: Mat3Like, b: Mat3Like) -> Mat3:
 
 
 def apply(a: Mat3Like, y: Vec3Like) -> Vec3:
-    """Matrix times vector a y on components.
-
-    **Arguments:** `a` (3, 3), `y` (3,).
+    """Matrix `a` (3, 3) times vector `y` (3,), on components.
 
     >>> apply(2.0 * jnp.eye(3), jnp.array([1.0, 2.0, 3.0])).tolist()
     [2.0, 4.0, 6.0]
@@ -138,9 +131,7 @@ def apply(a: Mat3Like, y: Vec3Like) -> Vec3:
 
 
 def solve(a: Mat3Like, y: Vec3Like) -> Vec3:
-    """Solve a x = y by cofactors (Cramer's rule).
-
-    **Arguments:** `a` (3, 3), well conditioned; `y` (3,).
+    """Solve a x = y by cofactors (Cramer's rule); `a` (3, 3) well conditioned, `y` (3,).
 
     >>> solve(2.0 * jnp.eye(3), jnp.array([2.0, 4.0, 6.0])).tolist()
     [1.0, 2.0, 3.0]
@@ -153,9 +144,7 @@ def solve(a: Mat3Like, y: Vec3Like) -> Vec3:
 
 
 def determinant(a: Mat3Like) -> Scalar:
-    """Determinant of a 3×3 matrix: +1 for a rotation, −1 for a reflection (notes, eq 10).
-
-    **Arguments:** `a` (3, 3).
+    """Determinant of `a` (3, 3): +1 for a rotation, −1 for a reflection (notes, eq 10).
 
     >>> float(determinant(jnp.eye(3)))
     1.0
@@ -172,9 +161,7 @@ def cofactors(a: Mat3) -> Mat3:
 
 
 def dot(a: Vec3Like, b: Vec3Like) -> Scalar:
-    """Scalar product a · b.
-
-    **Arguments:** `a`, `b` (3,), in one frame.
+    """Scalar product a · b of two vectors (3,) in one frame.
 
     >>> float(dot(jnp.array([1.0, 2.0, 3.0]), jnp.array([1.0, 1.0, 1.0])))
     6.0

@@ -17,9 +17,7 @@ from rigidjax.rotation.validation import direction
 
 
 def from_quaternion(q: QuatLike) -> Vec3:
-    """σ = q_v/(1 + q_w) of the canonical quaternion: |σ| ≤ 1, the same bits for q and −q.
-
-    **Arguments:** `q` (4,) unit, body → world. **Returns:** (3,) dimensionless.
+    """σ = q_v/(1 + q_w) of the canonical `q` (4,) unit, |σ| ≤ 1: the same bits for q and −q.
 
     >>> from_quaternion(jnp.array([-1.0, 0.0, 0.0, 0.0])).tolist()
     [-0.0, -0.0, -0.0]
@@ -29,9 +27,7 @@ def from_quaternion(q: QuatLike) -> Vec3:
 
 
 def to_quaternion(sigma: Vec3Like) -> Quat:
-    """The unit quaternion ((1 − s), 2σ)/(1 + s), s = |σ|²; for the shadow it is −q.
-
-    **Arguments:** `sigma` (3,) dimensionless.
+    """The unit quaternion ((1 − s), 2σ)/(1 + s), s = |σ|², of `sigma` (3,); −q for the shadow.
 
     >>> to_quaternion(jnp.array([0.0, 0.0, 1.0])).tolist()
     [0.0, 0.0, 0.0, 1.0]
@@ -45,9 +41,8 @@ def to_quaternion(sigma: Vec3Like) -> Quat:
 
 
 def from_matrix(matrix: Mat3Like) -> Vec3:
-    """The parameters, |σ| ≤ 1, of a rotation matrix, body → world.
-
-    **Arguments:** `matrix` (3, 3) rotation; values are not looked at (`so3.check`).
+    """The parameters, |σ| ≤ 1, of a rotation `matrix` (3, 3), body → world, unchecked
+    (`so3.check`).
 
     >>> from_matrix(jnp.eye(3)).tolist()
     [0.0, 0.0, 0.0]
@@ -56,9 +51,7 @@ def from_matrix(matrix: Mat3Like) -> Vec3:
 
 
 def to_matrix(sigma: Vec3Like) -> Mat3:
-    """The rotation matrix, body → world; the same for the shadow.
-
-    **Arguments:** `sigma` (3,) dimensionless.
+    """The rotation matrix, body → world, of `sigma` (3,); the same for the shadow.
 
     >>> to_matrix(jnp.zeros(3)).tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]

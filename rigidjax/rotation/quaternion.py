@@ -77,9 +77,7 @@ def multiply(p: QuatLike, q: QuatLike) -> Quat:
 
 
 def conjugate(q: QuatLike) -> Quat:
-    """The opposite rotation of a unit quaternion, (w, −x, −y, −z).
-
-    **Arguments:** `q` (4,).
+    """The opposite rotation (w, −x, −y, −z) of a unit quaternion `q` (4,).
 
     >>> conjugate(jnp.array([1.0, 2.0, 3.0, 4.0])).tolist()
     [1.0, -2.0, -3.0, -4.0]
@@ -101,9 +99,7 @@ def rotate(q: QuatLike, y: Vec3Like) -> Vec3:
 
 
 def rotate_inverse(q: QuatLike, y: Vec3Like) -> Vec3:
-    """World components → body components, Mᵀ y (notes, eqs 8, 22).
-
-    **Arguments:** `q` (4,) unit; `y` (3,) in the world frame, any units.
+    """World components `y` (3,) → body components, Mᵀ y, by `q` (4,) unit (notes, eqs 8, 22).
 
     >>> rotate_inverse(jnp.array([0.0, 0.0, 0.0, 1.0]), jnp.array([1.0, 2.0, 3.0])).tolist()
     [-1.0, -2.0, 3.0]
@@ -126,9 +122,7 @@ def check(q: Float[ArrayLike, "*batch 4"], *, name: str = "q") -> Float[Array, "
 
 
 def from_xyzw(xyzw: QuatLike) -> Quat:
-    """Scalar-last components (SciPy, ROS, glTF) → (w, x, y, z).
-
-    **Arguments:** `xyzw` (4,).
+    """Scalar-last components `xyzw` (4,) (SciPy, ROS, glTF) → (w, x, y, z).
 
     >>> from_xyzw(jnp.array([0.0, 0.0, 0.0, 1.0])).tolist()
     [1.0, 0.0, 0.0, 0.0]
@@ -137,9 +131,7 @@ def from_xyzw(xyzw: QuatLike) -> Quat:
 
 
 def to_xyzw(q: QuatLike) -> Float[Array, "4"]:
-    """(w, x, y, z) → scalar-last components (SciPy, ROS, glTF).
-
-    **Arguments:** `q` (4,).
+    """`q` (4,), (w, x, y, z) → scalar-last components (SciPy, ROS, glTF).
 
     >>> to_xyzw(jnp.array([1.0, 0.0, 0.0, 0.0])).tolist()
     [0.0, 0.0, 0.0, 1.0]
@@ -223,9 +215,7 @@ def uniform(key: PRNGKeyArray, dtype: Any = float) -> Quat:
 
 
 def normalise(q: QuatLike) -> Quat:
-    """The quaternion of length 1 in the direction of q.
-
-    **Arguments:** `q` (4,). The sign is kept. **Raises:** `ValueError` for zero or NaN.
+    """`q` (4,) scaled to length 1, with its sign. **Raises:** `ValueError` for zero or NaN.
 
     >>> normalise(jnp.array([0.0, 4.0, 0.0, 0.0])).tolist()
     [0.0, 1.0, 0.0, 0.0]
@@ -265,9 +255,7 @@ def angle(q: QuatLike) -> Scalar:
 
 
 def to_matrix(q: QuatLike) -> Mat3:
-    """The rotation matrix M, body → world, of a unit quaternion.
-
-    **Arguments:** `q` (4,) unit. **Returns:** (3, 3); bits are the same for −q.
+    """The rotation matrix M (3, 3), body → world, of `q` (4,) unit; the same bits for −q.
 
     >>> to_matrix(jnp.array([0.0, 0.0, 0.0, 1.0])).tolist()
     [[-1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]]

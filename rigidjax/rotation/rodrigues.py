@@ -33,9 +33,7 @@ def from_quaternion(q: QuatLike) -> Vec3:
 
 
 def to_quaternion(g: Vec3Like) -> Quat:
-    """The unit quaternion (1, g)/√(1 + |g|²), with w > 0.
-
-    **Arguments:** `g` (3,) dimensionless, finite.
+    """The unit quaternion (1, g)/√(1 + |g|²), with w > 0, of `g` (3,) dimensionless, finite.
 
     >>> to_quaternion(jnp.zeros(3)).tolist()
     [1.0, 0.0, 0.0, 0.0]
@@ -45,9 +43,7 @@ def to_quaternion(g: Vec3Like) -> Quat:
 
 
 def from_matrix(matrix: Mat3Like) -> Vec3:
-    """The parameters of a rotation matrix, body → world; infinite at a half turn.
-
-    **Arguments:** `matrix` (3, 3) rotation; values are not looked at (`so3.check`).
+    """The parameters of a rotation `matrix` (3, 3), unchecked; infinite at a half turn.
 
     >>> from_matrix(jnp.eye(3)).tolist()
     [0.0, 0.0, 0.0]
@@ -56,9 +52,7 @@ def from_matrix(matrix: Mat3Like) -> Vec3:
 
 
 def to_matrix(g: Vec3Like) -> Mat3:
-    """Cayley's transform (1 + hat g)(1 − hat g)⁻¹, the rotation matrix, body → world.
-
-    **Arguments:** `g` (3,) dimensionless, finite.
+    """Cayley's transform (1 + hat g)(1 − hat g)⁻¹, body → world, of `g` (3,), finite.
 
     >>> to_matrix(jnp.array([0.0, 0.0, 1.0])).round(12)[0].tolist()
     [0.0, -1.0, 0.0]
@@ -67,9 +61,7 @@ def to_matrix(g: Vec3Like) -> Mat3:
 
 
 def is_singular(q: QuatLike) -> Bool[Array, ""]:
-    """Whether a rotation is a half turn to 4 units of round-off, where g has no correct digit.
-
-    **Arguments:** `q` (4,) unit.
+    """Whether `q` (4,) unit is a half turn to 4 units of round-off: g then has no correct digit.
 
     >>> bool(is_singular(jnp.array([0.0, 0.0, 0.0, 1.0])))
     True

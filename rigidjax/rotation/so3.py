@@ -101,9 +101,7 @@ def left_jacobian_inverse(v: Vec3Like) -> Mat3:
 
 
 def right_jacobian_inverse(v: Vec3Like) -> Mat3:
-    """Inverse of the right Jacobian, 1 + ½ hat v + g (hat v)².
-
-    **Arguments:** `v` (3,) rotation vector, rad, |v| < 2π (Solà 2018, eq 144).
+    """Inverse of the right Jacobian, 1 + ½ hat v + g (hat v)², of `v` (3,), rad, |v| < 2π.
 
     >>> right_jacobian_inverse(jnp.zeros(3)).tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
@@ -148,9 +146,7 @@ def about_axis(axis: Vec3Like, angle: ScalarLike) -> Mat3:
 
 
 def adjoint(matrix: Mat3Like) -> Mat3:
-    """Ad_M, with M hat(w) Mᵀ = hat(Ad_M w): on SO(3) it is M itself (notes, eq 48 with Mᵀ).
-
-    **Arguments:** `matrix` (3, 3) rotation.
+    """Ad_M with M hat(w) Mᵀ = hat(Ad_M w): the `matrix` (3, 3) itself (notes, eq 48 with Mᵀ).
 
     >>> adjoint(jnp.eye(3)).tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
@@ -159,9 +155,7 @@ def adjoint(matrix: Mat3Like) -> Mat3:
 
 
 def to_world(matrix: Mat3Like, y: Vec3Like) -> Vec3:
-    """Body components → world components, y = M y' (notes, eqs 8, 21).
-
-    **Arguments:** `matrix` (3, 3) rotation, body → world; `y` (3,) in the body frame.
+    """Body components `y` (3,) → world components M y, by `matrix` (3, 3) (notes, eqs 8, 21).
 
     >>> to_world(jnp.eye(3), jnp.array([1.0, 2.0, 3.0])).tolist()
     [1.0, 2.0, 3.0]
@@ -170,9 +164,7 @@ def to_world(matrix: Mat3Like, y: Vec3Like) -> Vec3:
 
 
 def to_body(matrix: Mat3Like, y: Vec3Like) -> Vec3:
-    """World components → body components, y' = Mᵀ y (notes, eqs 8, 22).
-
-    **Arguments:** `matrix` (3, 3) rotation, body → world; `y` (3,) in the world frame.
+    """World components `y` (3,) → body components Mᵀ y, by `matrix` (3, 3) (notes, eqs 8, 22).
 
     >>> to_body(jnp.eye(3), jnp.array([1.0, 2.0, 3.0])).tolist()
     [1.0, 2.0, 3.0]
@@ -181,9 +173,7 @@ def to_body(matrix: Mat3Like, y: Vec3Like) -> Vec3:
 
 
 def conjugate(turn: Mat3Like, matrix: Mat3Like) -> Mat3:
-    """A turn in the body frame, transformed to the world frame: M T Mᵀ (notes, eqs 25, 26).
-
-    **Arguments:** `turn` (3, 3) in the body frame; `matrix` (3, 3), body → world.
+    """A `turn` (3, 3) in the body frame → world frame, M T Mᵀ, by `matrix` (notes, eqs 25, 26).
 
     >>> conjugate(jnp.eye(3), jnp.eye(3)).tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
@@ -194,9 +184,7 @@ def conjugate(turn: Mat3Like, matrix: Mat3Like) -> Mat3:
 
 
 def rate(matrix: Mat3Like, omega: Vec3Like) -> Mat3:
-    """dM/dt = M hat(Ω) (notes, eq 50).
-
-    **Arguments:** `matrix` (3, 3), body → world; `omega` (3,) rad/s, body frame.
+    """dM/dt = M hat(Ω) of `matrix` (3, 3) and `omega` (3,), rad/s, body frame (notes, eq 50).
 
     >>> rate(jnp.eye(3), jnp.array([0.0, 0.0, 2.0]))[1].tolist()
     [2.0, 0.0, 0.0]
@@ -247,9 +235,7 @@ def interpolate(a: Mat3Like, b: Mat3Like, s: ScalarLike) -> Mat3:
 
 
 def uniform(key: PRNGKeyArray, dtype: Any = float) -> Mat3:
-    """A uniformly distributed random rotation (Haar measure).
-
-    **Arguments:** `key` of `jax.random`; `dtype` float32 or float64.
+    """A uniformly distributed random rotation (Haar): `key` of `jax.random`, `dtype` of floats.
 
     >>> import jax
     >>> uniform(jax.random.key(0)).shape
