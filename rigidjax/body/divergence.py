@@ -37,9 +37,5 @@ def divergence(body: MassProperties, reference: MassProperties) -> Scalar:
     seen = partial(solve_triangular, root, lower=True)
     overlap = seen(seen(body.second_moment / body.mass).T)
     d = seen(body.com - reference.com)
-    return (
-        ratio * (jnp.trace(overlap) + dot(d, d) + 1.0)
-        - jnp.linalg.slogdet(overlap)[1]
-        - 4.0 * jnp.log(ratio)
-        - 4.0
-    )
+    distance = ratio * (jnp.trace(overlap) + dot(d, d) + 1.0) - jnp.linalg.slogdet(overlap)[1]
+    return distance - 4.0 * jnp.log(ratio) - 4.0

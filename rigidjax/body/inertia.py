@@ -190,10 +190,8 @@ class MassProperties(eqx.Module):
         mass = _checks.floating(mass, (), "mass", batched=True)
         com = _checks.floating(com, (3,), "com", batched=True)
         if isinstance(second_moment, Inertia):
-            raise TypeError(
-                "second_moment: wanted 𝔖 = ∫ r rᵀ dm about the centre of mass, (3, 3), got an "
-                "Inertia; give its .second_moment"
-            )
+            words = "second_moment: wanted 𝔖 about the centre of mass, got an Inertia"
+            raise TypeError(f"{words}; give its .second_moment")
         second_moment = _checks.floating(
             second_moment, (3, 3), "second_moment", batched=True, unit="kg m²"
         )

@@ -134,10 +134,7 @@ def _body(mass: float, place: np.ndarray, turn: Any, tensor: np.ndarray) -> Mass
     moments = np.linalg.eigvalsh(tensor)
     if not moments[2] > 0 or least < -ROUNDED * moments[2]:
         shown = ", ".join(f"{moment:.6g}" for moment in moments)
-        raise ValueError(
-            f"no body has the moments {shown}: the largest is more than the sum of the others, or "
-            "one is not positive"
-        )
+        raise ValueError(f"no body has the moments {shown}: I1 + I2 ≥ I3 and I1 ≥ 0 are wanted")
     if least < 0:
         second = second - least * np.eye(3)
     return MassProperties(mass, place, second)

@@ -130,15 +130,10 @@ def _outward(volume, corners, faces):
     area = 0.5 * jnp.sqrt((jnp.cross(b - a, c - a) ** 2).sum(axis=1)).sum()
     slack = 4.0 * jnp.finfo(corners.dtype).eps * jax.lax.stop_gradient(longest) * area
     found = f" (volume {float(volume):.6g} m³)" if _checks.known(volume) else ""
-    volume = _checks.refuse(
-        volume,
-        volume < -slack,
-        f"mesh: it is inside out{found}: its faces turn clockwise seen from outside; give "
-        "faces[:, ::-1]",
-    )
-    return _checks.refuse(
-        volume, ~(volume > slack), f"mesh: it encloses no volume{found}; for a flat body use plate"
-    )
+    words = f"mesh: it is inside out{found}: its faces are clockwise; give faces[:, ::-1]"
+    volume = _checks.refuse(volume, volume < -slack, words)
+    words = f"mesh: it encloses no volume{found}; for a flat body use plate"
+    return _checks.refuse(volume, ~(volume > slack), words)
 
 
 def faces_of(faces: Any, n: int) -> Array:
@@ -154,16 +149,13 @@ def faces_of(faces: Any, n: int) -> Array:
     if table.ndim != 2 or table.shape[1] != 3 or len(table) == 0:
         raise ValueError(f"faces: wanted shape (m, 3), triangles, got {table.shape}")
     if table.min() < 0 or table.max() >= n:
-        raise ValueError(
-            f"faces: wanted vertex numbers from 0 to {n - 1}, got {table.min()} to {table.max()}; "
-            "OBJ files count from 1"
-        )
+        found = f"{table.min()} to {table.max()}; OBJ files count from 1"
+        raise ValueError(f"faces: wanted vertex numbers from 0 to {n - 1}, got {found}")
     repeated = (table == np.roll(table, 1, axis=1)).any(axis=1)
     if repeated.any():
         which = int(np.argmax(repeated))
-        raise ValueError(
-            f"mesh: face {which} is degenerate, it names a vertex twice: {_tuple(table[which])}"
-        )
+        words = f"mesh: face {which} is degenerate, it names a vertex twice"
+        raise ValueError(f"{words}: {_tuple(table[which])}")
     edges = np.concatenate([table[:, [0, 1]], table[:, [1, 2]], table[:, [2, 0]]])
     number, reverse = (edges[:, k] * np.int64(n) + edges[:, 1 - k] for k in (0, 1))
     unique, counts = np.unique(number, return_counts=True)

@@ -180,13 +180,8 @@ def flat_bend(
     size = size / jnp.where(flat, jnp.abs(a), 1.0)
     x, y, z = n
     nil = jnp.zeros((), n.dtype)
-    return size * jnp.stack(
-        [
-            jnp.stack([x, nil, y, nil, z]),
-            jnp.stack([nil, y, x, z, nil]),
-            jnp.stack([-z, -z, nil, y, x]),
-        ]
-    )
+    rows = [x, nil, y, nil, z], [nil, y, x, z, nil], [-z, -z, nil, y, x]
+    return size * jnp.stack([jnp.stack(row) for row in rows])
 
 
 def _squares(root: Vec3) -> Vec3:
@@ -239,9 +234,8 @@ def _radius(total: Scalar) -> Scalar:
 
 
 def _not_a_point(total: Scalar) -> Scalar:
-    return _checks.refuse(
-        total, ~(total > 0), "pack: the second moment is zero: a point has no shape"
-    )
+    words = "pack: the second moment is zero: a point has no shape"
+    return _checks.refuse(total, ~(total > 0), words)
 
 
 def _hold(exponent: Float[Array, "*n"]) -> Float[Array, "*n"]:

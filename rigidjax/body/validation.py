@@ -64,11 +64,9 @@ def real_second_moment(s: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3 
 
 
 def possible(body: Any, tensor: Float[Array, "*batch 3 3"], mass: Any, throw: bool) -> Any:
-    """Return `body` if some mass has these numbers and no moment is zero.
+    """Return `body` if some mass has these numbers and no moment is zero; `mass` may be `None`.
 
-    Other numbers are refused with the cause if they are known, or if `throw`. Without `throw` all
-    numbers of a traced body become NaN, but no other body's. `tensor` is the inertia, kg m²; `mass`
-    kg, `None` for a body that only turns.
+    Other numbers are refused if they are known, or if `throw`; else the traced body becomes NaN.
     """
     tensor = _checks.numbers(tensor, "inertia tensor")
     is_known = _checks.known((tensor, mass))
@@ -112,8 +110,7 @@ _THIN = (
 def _impossible(xp: Any, tensor: Any, slack: float) -> tuple[Any, Any]:
     """Whether a moment is zero to round-off or NaN, and whether no mass has these moments.
 
-    A body has them if the principal minors of 𝔖 = ½Tr(I) 1 − I are not negative: in a batch this
-    takes a tenth of the time of eigenvalues.
+    By the principal minors of 𝔖 = ½Tr(I) 1 − I: a tenth of the time of eigenvalues in a batch.
     """
 
     def minors(a: Any) -> tuple[Any, ...]:

@@ -141,10 +141,9 @@ def remarks(fit: Fit) -> str:
         )
     errors = np.linalg.norm(np.degrees(np.asarray(fit.residuals[1])) * DAY, axis=1)
     for index in np.flatnonzero(errors > 3 * RATE_NOISE_DEG_A_DAY):
-        lines.append(
-            f"outlier: the rate of {OBSERVATIONS[index][0][:10]} is {errors[index]:.0f} deg/day "
-            "off (it counts linearly, not quadratically)"
-        )
+        day = OBSERVATIONS[index][0][:10]
+        words = f"outlier: the rate of {day} is {errors[index]:.0f} deg/day off"
+        lines.append(f"{words} (it counts linearly, not quadratically)")
     return "\n".join(lines)
 
 

@@ -29,15 +29,10 @@ _UNIT = {np.dtype("float64"): 1.0, np.dtype("float32"): 2.0**24}
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def r_integral(powers: tuple[float, ...], arguments: tuple[Result, ...]) -> Result:
-    """∫₀^∞ ∏ (t + aᵢ)^(−bᵢ) dt for aᵢ ≥ 0, to a few units of round-off.
+    """∫₀^∞ ∏ (t + aᵢ)^(−bᵢ) dt for aᵢ ≥ 0 and multiples bᵢ of ½ (`powers`) with Σ bᵢ > 1.
 
-    `powers` are the bᵢ, multiples of ½ with Σ bᵢ > 1, some of which may be negative; `arguments`
-    the aᵢ, of one shape. The result is infinite if the integral diverges at 0, and NaN for a
-    negative argument. It is accurate to round-off for ratios of the aᵢ up to 1e35, and to 1e-13 at
-    1e60. An argument that is not differentiated costs nothing and may be 0.
-
-    >>> round(float(r_integral((2.0,), (jnp.asarray(4.0),))), 12)
-    0.25
+    It is infinite if the integral diverges at 0, NaN for a negative argument, and accurate to
+    round-off for ratios of the aᵢ up to 1e35 (to 1e-13 at 1e60).
     """
     scale = scale_of(arguments)
     dtype = np.dtype(arguments[0].dtype)

@@ -108,11 +108,8 @@ def _core(u: Any, m: Any, m1: Any) -> tuple[Any, Any, Any]:
     e = jnp.exp(-jnp.minimum(jnp.abs(u), largest))
     sech = 2 * e / (1 + e * e)
     hyperbolic = m1 == 0
-    return (
-        jnp.where(hyperbolic, jnp.tanh(u), s),
-        jnp.where(hyperbolic, sech, c),
-        jnp.where(hyperbolic, sech, d),
-    )
+    s, c, d = (jnp.where(hyperbolic, a, b) for a, b in ((jnp.tanh(u), s), (sech, c), (sech, d)))
+    return s, c, d
 
 
 @partial(_core.defjvp, symbolic_zeros=True)
@@ -142,11 +139,8 @@ def _slopes_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
     ds, dc, dd = jnp.zeros_like(u), jnp.zeros_like(u), jnp.zeros_like(u)
     if not isinstance(du, SymbolicZero):
         s, c, d = _core(u, m, m1)
-        ds, dc, dd = (
-            (cm * d + c * dm) * du,
-            -(sm * d + s * dm) * du,
-            -(s * c + m * (sm * c + s * cm)) * du,
-        )
+        ds, dc = (cm * d + c * dm) * du, -(sm * d + s * dm) * du
+        dd = -(s * c + m * (sm * c + s * cm)) * du
     if not isinstance(dm1, SymbolicZero):
         # For small u the images cancel to leave u³, and the integral has no large terms.
         near = (m1 < LARGEST_M1) & (jnp.abs(u) > 1)

@@ -90,11 +90,8 @@ def earth(latitude: ScalarLike, gravity: ScalarLike = GRAVITY, rate: ScalarLike 
     [0.0, 0.0, -9.80665]
     """
     lat, g, w = _checks.scalars(latitude=latitude, gravity=gravity, rate=rate)
-    lat = _checks.refuse(
-        lat,
-        ~(jnp.abs(lat) <= 0.5000001 * jnp.pi),
-        "latitude: wanted radians between −π/2 and π/2; were these degrees?",
-    )
+    words = "latitude: wanted radians between −π/2 and π/2; were these degrees?"
+    lat = _checks.refuse(lat, ~(jnp.abs(lat) <= 0.5000001 * jnp.pi), words)
     g = _checks.sign(g, "gravity", "a positive number, m/s²; it points down")
     return Earth(lat, g, _checks.refuse(w, ~jnp.isfinite(w), "rate: wanted a finite number, rad/s"))
 
@@ -143,17 +140,11 @@ class Foucault(AbstractScene):
         >>> foucault(0.5, 10.0).state(6.0, 0.0, 4.0, 0.0).v.tolist()
         [4.0, 0.0, 3.0]
         """
-        length, e, n, ve, vn = _checks.scalars(
-            length=self.length,
-            east=east,
-            north=north,
-            east_speed=east_speed,
-            north_speed=north_speed,
-        )
+        named = dict(east=east, north=north, east_speed=east_speed, north_speed=north_speed)
+        length, e, n, ve, vn = _checks.scalars(length=self.length, **named)
         below = length**2 - e * e - n * n
-        below = _checks.refuse(
-            below, ~(below > 0), "foucault: the start lies beyond the length of the string"
-        )
+        words = "foucault: the start lies beyond the length of the string"
+        below = _checks.refuse(below, ~(below > 0), words)
         up = -jnp.sqrt(below)
         return Point(jnp.stack([e, n, up]), jnp.stack([ve, vn, -(e * ve + n * vn) / up]))
 

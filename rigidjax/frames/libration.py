@@ -15,11 +15,7 @@ from rigidjax.rotation import linalg3, quaternion
 
 
 class Tide(eqx.Module):
-    """Gravity-gradient torque 3n² u × I u on a circular orbit of rate n, in the orbital frame.
-
-    u is the direction away from the planet, the first axis of that frame (Hughes 1986, Spacecraft
-    Attitude Dynamics, sec. 8.1).
-    """
+    """Gravity-gradient torque 3n² u × I u, u away from the planet (Hughes 1986, sec. 8.1)."""
 
     feels: ClassVar[type] = HasAttitude
     rate_free: ClassVar[bool] = True

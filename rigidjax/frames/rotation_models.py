@@ -68,10 +68,7 @@ class AboutAxis(eqx.Module):
 
 
 def differentiable(rotation: Any) -> Any:
-    """`rotation`, with its own solves in forward mode: a frame needs dΩ/dt.
-
-    The default adjoint of a solution of `simulate` refuses that derivative.
-    """
+    """`rotation`, with its own solves in forward mode, which dΩ/dt needs."""
 
     def reverse(part: Any) -> bool:
         return isinstance(part, dfx.RecursiveCheckpointAdjoint)
@@ -95,9 +92,8 @@ def matrix(rotation: Any, t: Array) -> Mat3:
     m = _checks.floating(value, (3, 3), "rotation", hint="wanted a matrix or a quaternion (4,)")
     if _checks.known(m):
         off = jnp.max(jnp.abs(linalg3.product(m.T, m) - jnp.eye(3, dtype=m.dtype)))
-        _checks.refuse(
-            m, ~(off < tolerance(m.dtype)), "rotation: Mᵀ M is not 1, so this is no rotation"
-        )
+        words = "rotation: Mᵀ M is not 1, so this is no rotation"
+        _checks.refuse(m, ~(off < tolerance(m.dtype)), words)
         left = linalg3.determinant(m) < 0
         _checks.refuse(m, left, "rotation: left-handed axes, det = −1 (notes, eq 10)")
     return m.astype(t.dtype)

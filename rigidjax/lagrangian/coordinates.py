@@ -163,12 +163,8 @@ def from_attitude(state: HasAttitude) -> Coordinates:
     """
     _checks.single(state, HasAttitude, "state", wanted="an Attitude")
     angles = euler.from_quaternion(state.q)
-    angles = _checks.refuse(
-        angles,
-        euler.is_singular(angles),
-        "from_attitude: sin θ = 0, where Euler angles (3-1-3) are singular; solve for an "
-        "Attitude, which has no singular attitude",
-    )
+    words = "from_attitude: Euler angles (3-1-3) are singular at sin θ = 0; solve for an Attitude"
+    angles = _checks.refuse(angles, euler.is_singular(angles), words)
     return Coordinates(angles, euler.omega_to_rates(angles, state.omega))
 
 

@@ -40,11 +40,8 @@ def energy(
     turning, parts, t = _scene(body, state, torque, t)
     for part in parts:
         if not hasattr(part, "energy"):
-            raise TypeError(
-                f"energy: {type(part).__name__} has no potential (no method energy(t, state, "
-                "body)), so it conserves no energy; give only the torques that have one, or see "
-                "kinetic_energy"
-            )
+            words = f"energy: {type(part).__name__} has no potential (no energy(t, state, body))"
+            raise TypeError(f"{words}; give only the torques that have one, or see kinetic_energy")
     return _energy(in_precision(body, turning.omega.dtype), turning, parts, t)
 
 

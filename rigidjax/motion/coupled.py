@@ -40,10 +40,8 @@ class Coupled(eqx.Module):
 
 
 class CoupledEquations(eqx.Module):
-    """The equations of a body and of its torques' states as a vector field `f(t, y, args)`.
-
-    `field` is that of the body, such as `AttitudeEquations`; `rigidjax.equations_of_motion` makes
-    it.
+    """The equations of a body (`field`) and of its torques' states as a vector field
+    `f(t, y, args)`.
     """
 
     field: Callable[..., Any]

@@ -94,9 +94,8 @@ class EulerEquations(eqx.Module):
     """Euler's equations `I dΩ/dt = IΩ × Ω + τ` as a vector field `f(t, y, args)`.
 
     `inertia` is about the point that the body turns about; `torque` τ in the body frame, N m, or
-    `None`. Values are in the precision of `state.omega`. Source: Lie–Poisson form
-    `dΠ/dt = Π × ∇H(Π) + τ` with `Π = IΩ`, `H = ½ Π·I⁻¹Π`; Landau and Lifshitz, Mechanics, eq 36.4.
-    **Raises:** `ValueError` for a known rod or point: the equations divide by the zero moment.
+    `None`. Source: Lie–Poisson form `dΠ/dt = Π × ∇H(Π) + τ` with `Π = IΩ`, `H = ½ Π·I⁻¹Π`; Landau
+    and Lifshitz, Mechanics, eq 36.4. A known rod or point is refused.
     """
 
     inertia: Inertia
@@ -134,10 +133,7 @@ class EulerEquations(eqx.Module):
 
 
 class AttitudeEquations(eqx.Module):
-    """Euler's equations and the kinematics `dq/dt = ½ q ⊗ (0, Ω)` (notes, eq 50) as a vector field.
-
-    The state holds Ω, not Π = IΩ: the numbers of steps differ by at most 3 % for heavy tops.
-    """
+    """Euler's equations and `dq/dt = ½ q ⊗ (0, Ω)` (notes, eq 50) as a vector field."""
 
     euler: EulerEquations
 
@@ -151,8 +147,7 @@ class AttitudeEquations(eqx.Module):
 class NewtonEuler(eqx.Module):
     """Newton–Euler equations about the centre of mass as a vector field (notes, eqs 1, 50, 56, 84).
 
-    `m dv/dt = F`, `I dΩ/dt = IΩ × Ω + τ`, `dq/dt = ½ q ⊗ (0, Ω)`; `torque` gives τ (N m, body
-    frame), or a `Wrench` of F (N, world frame) and τ.
+    `m dv/dt = F`, `I dΩ/dt = IΩ × Ω + τ`, `dq/dt = ½ q ⊗ (0, Ω)`; `torque` gives τ, or a `Wrench`.
     """
 
     euler: EulerEquations
@@ -194,9 +189,8 @@ def _unit(q: Quat) -> Quat:
     """q/|q|, with the same rounding in every program.
 
     XLA replaces q/√n by a product with 1/√n in some programs. Reverse mode runs steps again in
-    another program: a different last digit changes the error estimate, and at tight tolerances the
-    step lengths, so that the gradient belongs to another discretisation (an error of 7e-6 at a
-    tolerance of 1e-11). A separate root and quotient are exact to the last digit in every program,
-    and for every body of a batch.
+    another program: a different last digit changes step lengths, and the gradient belongs to
+    another discretisation (an error of 7e-6 at a tolerance of 1e-11). A separate root and quotient
+    are exact.
     """
     return q / lax.optimization_barrier(jnp.sqrt(square4(components(q))))

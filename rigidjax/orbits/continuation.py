@@ -55,12 +55,11 @@ def family(
     where = ""
     if _checks.known(lost) and bool(lost.any()):
         where = f" at {hold} = {float(values[np.argmax(np.asarray(lost))]):.9g}"
-    numbers = _checks.refuse(
-        numbers,
-        lost.any(),
+    words = (
         f"family: lost{where}; take smaller steps, or the family turns back there: hold another of "
-        "x, z, vy, period, or use follow",
     )
+    words += "x, z, vy, period, or use follow"
+    numbers = _checks.refuse(numbers, lost.any(), words)
     return jax.vmap(orbit_of)(numbers)
 
 
@@ -230,10 +229,8 @@ def bifurcation(
     left, right = (scene.periodic_orbit(one, hold=hold) for one in (orbit, other))
     low, high = (_index(scene, one, index) - value for one in (left, right))
     if not low * high <= 0:
-        raise ValueError(
-            f"bifurcation: the index is {low + value:.6g} at one orbit, {high + value:.6g} at the "
-            f"other: {value:g} does not lie between"
-        )
+        ends = f"{low + value:.6g} at one orbit, {high + value:.6g} at the other"
+        raise ValueError(f"bifurcation: the index is {ends}: {value:g} does not lie between")
     a, b = float(ends[0][place]), float(ends[1][place])
     width = abs(b - a)
     found, at_found = (left, low) if abs(low) < abs(high) else (right, high)
@@ -258,10 +255,8 @@ def bifurcation(
 def _index(scene: Any, orbit: PeriodicOrbit, index: int) -> float:
     found = np.asarray(_indices(scene, orbit))[index]
     if abs(found.imag) > 1e-9 * max(1.0, abs(found)):
-        raise ValueError(
-            "bifurcation: the stability indices are complex at a member between the orbits; give "
-            "orbits nearer to each other"
-        )
+        words = "the stability indices are complex at a member between the orbits"
+        raise ValueError(f"bifurcation: {words}; give orbits nearer to each other")
     return float(found.real)
 
 

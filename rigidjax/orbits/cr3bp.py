@@ -94,10 +94,8 @@ class ThreeBody(AbstractReversible):
         """
         columns, rows = _checks.numbers(xs, "xs"), _checks.numbers(ys, "ys")
         if columns.ndim != 1 or rows.ndim != 1 or 0 in (columns.size, rows.size):
-            raise ValueError(
-                f"zero_velocity: wanted xs (N,) and ys (M,), got {columns.shape} and {rows.shape}; "
-                "give the axes, not a mesh"
-            )
+            shapes = f"{columns.shape} and {rows.shape}; give the axes, not a mesh"
+            raise ValueError(f"zero_velocity: wanted xs (N,) and ys (M,), got {shapes}")
 
         def value(x: Scalar, y: Scalar) -> Scalar:
             return 2 * self.potential(jnp.stack([x, y, jnp.zeros_like(x)]))
@@ -174,8 +172,7 @@ def cr3bp(mu: ScalarLike, radii: Float[Array, "2"] | object = (0.0, 0.0)) -> Thr
     """
     ratio = _checks.floating(mu, (), "mu")
     bad = ~((ratio > 0) & (ratio <= 0.5))
-    ratio = _checks.refuse(
-        ratio, bad, "mu: wanted 0 < mu ≤ ½, the mass of the lighter body over the mass of both"
-    )
+    words = "mu: wanted 0 < mu ≤ ½, the mass of the lighter body over the mass of both"
+    ratio = _checks.refuse(ratio, bad, words)
     radii = _checks.floating(list(radii) if isinstance(radii, tuple) else radii, (2,), "radii")
     return ThreeBody(ratio, _checks.refuse(radii, ~(radii >= 0), "radii: wanted two numbers ≥ 0"))

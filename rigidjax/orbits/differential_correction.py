@@ -72,21 +72,17 @@ def periodic_orbit(
     unknown, left = _solve(scene, numbers[free], numbers[index], index, tolerance)
     bad = ~(left <= tolerance)
     said = f" ({float(left):.1e} left at half period)" if _checks.known(left) else ""
-    unknown = _checks.refuse(
-        unknown,
-        bad,
-        f"periodic_orbit: Newton's method found no orbit near the guess{said}; start nearer, "
-        "hold another of x, z, vy, period, or loosen the tolerance",
-    )
+    words = f"periodic_orbit: Newton's method found no orbit near the guess{said}; start nearer, "
+    words += "hold another of x, z, vy, period, or loosen the tolerance"
+    unknown = _checks.refuse(unknown, bad, words)
     found = together(unknown, numbers[index], index)
     # A half period of zero solves the equations of every start.
     ratio = found[3] / numbers[3]
-    found = _checks.refuse(
-        found,
-        ~((ratio > 0.5) & (ratio < 2)),
+    words = (
         "periodic_orbit: Newton's method went from the guess to an orbit of less than half or more "
-        "than twice its period; start nearer",
     )
+    words += "than twice its period; start nearer"
+    found = _checks.refuse(found, ~((ratio > 0.5) & (ratio < 2)), words)
     return orbit_of(found)
 
 

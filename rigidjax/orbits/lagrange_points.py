@@ -10,8 +10,7 @@ from rigidjax._types import Scalar
 def points(mu: Scalar) -> Float[Array, "5 3"]:
     """L1 … L5 (5, 3) for 0 < μ ≤ ½, in units of the distance of the primaries, rotating axes.
 
-    L1, L2, L3 are roots of Euler's quintics (Szebehely 1967, sec. 4.4), L4 and L5 tips of
-    equilateral triangles. Derivatives by μ exist to any order.
+    By Euler's quintics (Szebehely 1967, sec. 4.4), differentiable by μ to any order.
     """
     between, beyond, opposite = distances(mu)
     zero = jnp.zeros_like(mu)

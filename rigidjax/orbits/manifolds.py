@@ -48,8 +48,7 @@ class Manifold(eqx.Module):
 def unstable(monodromy: Float[Array, "6 6"]) -> tuple[Scalar, Float[Array, "6"]]:
     """The multiplier λ of an orbit with the largest size, and its eigenvector, of length 1.
 
-    λ comes from traces (`stability_indices`), the vector from inverse iteration and one bordered
-    solve, which has its derivative. Both are NaN if no multiplier is real and larger than 1.
+    From traces, inverse iteration and one bordered solve; NaN if none is real and larger than 1.
     """
     index = continuation.stability_indices(monodromy)
     real = jnp.abs(index.imag) <= 1e-6 * jnp.abs(index)
@@ -145,12 +144,9 @@ def manifold(
     distance = _positive(distance, "distance", dtype)
     phases = jnp.arange(count).astype(distance.dtype) / count
     starts, value = jax.vmap(lambda p: branch(scene, orbit, p, which, side, distance))(phases)
-    value = _checks.refuse(
-        value[0],
-        jnp.isnan(value[0]),
-        "manifold: the orbit has no multiplier that is real and larger than 1: it is stable to "
-        "first order, or spirals",
-    )
+    words = "manifold: the orbit has no multiplier that is real and larger than 1: it is stable to "
+    words += "first order, or spirals"
+    value = _checks.refuse(value[0], jnp.isnan(value[0]), words)
     length = 2 * orbit.period if time is None else _positive(time, "time", dtype)
     ts = jnp.linspace(jnp.zeros_like(length), length, samples)
     states = _paths(scene, starts, ts, which)

@@ -36,10 +36,8 @@ class AbstractReversible(AbstractScene):
         if not _checks.known(gaps):
             return "the particle collided with one of the scene's bodies"
         near, when = np.asarray(gaps), float(np.asarray(t))
-        return (
-            f"collision with body {int(near.argmin()) + 1} of the scene at t = {when:.9g}, "
-            f"distance {near.min():.3g}"
-        )
+        which = f"body {int(near.argmin()) + 1} of the scene"
+        return f"collision with {which} at t = {when:.9g}, distance {near.min():.3g}"
 
     def transition(
         self, state: Point, t: ScalarLike, *, rtol: float = 1e-13, atol: float = 1e-14

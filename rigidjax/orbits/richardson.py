@@ -17,9 +17,8 @@ def guess(
     """A start on the xz-plane near the orbit about L1, L2 or L3 (`point`) of the given amplitude.
 
     One of `along_x` (a planar Lyapunov orbit) and `along_z` (a halo orbit, its sign is the branch)
-    is given, in units of the primaries' distance. The start is good if the amplitude is a small
-    part of the distance to the nearer body. Source: Richardson 1980, Celest. Mech. 22, 241,
-    doi:10.1007/BF01229511, at τ = 0.
+    is given, small beside the distance to the nearer body. Source: Richardson 1980, Celest. Mech.
+    22, 241, doi:10.1007/BF01229511, at τ = 0.
     """
     if point not in (1, 2, 3):
         raise ValueError(f"point: wanted 1, 2 or 3, the collinear ones, got {point}")
@@ -65,9 +64,8 @@ def guess(
         a1 = -1.5 * c3 * (2 * a21 + a23 + 5 * d21) - 0.375 * c4 * (12 - k2)
         a2 = 1.5 * c3 * (a24 - 2 * a22) + 1.125 * c4
         square = -((a2 + 2 * w2 * s2) * az * az + w2 - c2) / (a1 + 2 * w2 * s1)
-        square = _checks.refuse(
-            square, ~(square > 0), "halo_guess: no halo orbit of this amplitude by the expansion"
-        )
+        words = "halo_guess: no halo orbit of this amplitude by the expansion"
+        square = _checks.refuse(square, ~(square > 0), words)
         ax = jnp.sqrt(square)
     x2, z2 = ax * ax, az * az
     sweep = w * (1 + s1 * x2 + s2 * z2)

@@ -259,10 +259,9 @@ def evenly(ts: Any, states: Any, count: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def box_of(body: Inertia | MassProperties) -> tuple[np.ndarray, np.ndarray]:
-    """Half-lengths (3,) of the uniform box with the body's 𝔖, and its axes (3, 3) in the body.
+    """Half-lengths (3,) a of the uniform box with λ = m a²/3, and its axes (3, 3) in the body.
 
-    A box of half-length a has λ = m a²/3. The unit is m for `MassProperties`; for an `Inertia` the
-    longest is 1.
+    In m for `MassProperties`; for an `Inertia` the longest is 1.
     """
     second, q = principal(body.second_moment)
     size = np.sqrt(np.maximum(np.asarray(second, dtype=float), 0.0))

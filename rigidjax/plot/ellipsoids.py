@@ -64,14 +64,13 @@ def _given(body: Any, samples: int) -> tuple[Inertia | MassProperties, Any]:
     if isinstance(body, Inertia | MassProperties):
         return _checks.single(body, (Inertia, MassProperties), "body"), None
     if not hasattr(body, "parameters") or not hasattr(body, "problem"):
+        found = _checks.kind(body)
         raise TypeError(
-            "inertia_ellipsoid: wanted an Inertia, a MassProperties or a Fit, got "
-            f"{_checks.kind(body)}"
+            f"inertia_ellipsoid: wanted an Inertia, a MassProperties or a Fit, got {found}"
         )
     if isinstance(body.body, dict):
-        raise ValueError(
-            "inertia_ellipsoid: wanted one body, got a Fit of several: give fit.body[name]"
-        )
+        words = "wanted one body, got a Fit of several: give fit.body[name]"
+        raise ValueError(f"inertia_ellipsoid: {words}")
     flat, restore = ravel_pytree(body.beside)
     values, vectors = np.linalg.eigh(np.asarray(body.seen))
     # A fixed seed: the same fit gives the same picture.

@@ -50,19 +50,17 @@ def horizons(
         raise ValueError("found: wanted at least one Horizons, got none")
     for one in named.values():
         if not all(hasattr(one, name) for name in ("steps", *_MEASURES)) or isinstance(one, type):
+            found = _checks.kind(one)
             raise TypeError(
-                "found: wanted a Horizons of rigidjax.identify, or several by name, got "
-                f"{one.__name__ if isinstance(one, type) else type(one).__name__}"
+                f"found: wanted Horizons of rigidjax.identify, some by name, got {found}"
             )
     _checks.word(measure, tuple(_MEASURES), "measure")
     scale = 1.0 if step is None else _checks.positive(step, "step", "a positive time, s")
     kinds = [kind for kind in _KINDS if kind in getattr(next(iter(named.values())), measure)]
     for name, one in named.items():
         if sorted(getattr(one, measure)) != sorted(kinds):
-            raise ValueError(
-                f"found: wanted the same kinds of errors, got {kinds} and {name!r} with "
-                f"{sorted(getattr(one, measure))}"
-            )
+            others = f"{name!r} with {sorted(getattr(one, measure))}"
+            raise ValueError(f"found: wanted the same kinds of errors, got {kinds} and {others}")
     count = len(kinds)
     ax = several_axes(ax, (count,), ncols=count, figsize=(3.4 * count + 0.6, 3.2))
     for one_ax, kind in zip(ax, kinds, strict=True):

@@ -156,10 +156,10 @@ def herpolhode(inertia: Inertia, states: HasAttitude, *, title: str = "", ax: An
     up = momenta[0] / size[0]
     turned = np.linalg.norm(np.cross(momenta, up), axis=1) / size
     if turned.max() > 1e-3:
-        raise ValueError(
+        words = (
             f"herpolhode: the angular momentum turned by {turned.max():.2g} rad: a torque acts, "
-            "and there is no invariable plane"
         )
+        raise ValueError(words + "and there is no invariable plane")
     first = omega[0] - (omega[0] @ up) * up
     if np.linalg.norm(first) < 1e-9 * np.linalg.norm(omega[0]):
         # A spin about a principal axis: any direction across will do.

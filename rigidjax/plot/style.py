@@ -59,9 +59,7 @@ def solid_axes(ax: Any, **how: Any) -> Any:
         figure = pyplot().figure(layout="constrained", **{"figsize": (6.0, 5.6), **how})
         return figure.add_subplot(projection="3d")
     if not hasattr(ax, "zaxis"):
-        raise TypeError(
-            "ax: wanted 3-D axes, got flat ones; make them with projection='3d' in add_subplot"
-        )
+        raise TypeError("ax: wanted 3-D axes, got flat ones; make them with projection='3d'")
     return ax
 
 
@@ -105,9 +103,8 @@ def rows(values: Any, width: int, name: str) -> np.ndarray:
 def attitudes(states: Any, name: str = "states") -> np.ndarray:
     """Quaternions (T, 4) of states; `TypeError` for states without them."""
     if not hasattr(states, "q"):
-        raise TypeError(
-            f"{name}: wanted states with an attitude (Attitude, Rigid), got {type(states).__name__}"
-        )
+        found = type(states).__name__
+        raise TypeError(f"{name}: wanted states with an attitude (Attitude, Rigid), got {found}")
     return rows(states.q, 4, f"{name}.q")
 
 
@@ -119,11 +116,8 @@ def matrices(q: np.ndarray) -> np.ndarray:
 
 def on_sphere(around: np.ndarray, down: np.ndarray) -> np.ndarray:
     """Places (3, …) on the unit sphere, by the angles about z and from it."""
-    return np.stack(
-        np.broadcast_arrays(
-            np.cos(around) * np.sin(down), np.sin(around) * np.sin(down), np.cos(down)
-        )
-    )
+    ring, height = np.sin(down), np.cos(down)
+    return np.stack(np.broadcast_arrays(np.cos(around) * ring, np.sin(around) * ring, height))
 
 
 def around_ball(
@@ -134,11 +128,7 @@ def around_ball(
     behind: dict[str, Any] | None = None,
     **how: Any,
 ) -> None:
-    """A line on a ball: full in front of the ball, in another style behind it.
-
-    `path` (T, 3) has the outward normals `normals` (T, 3); `behind` is the style of the hidden
-    part, by default faint; `how` has options of matplotlib's lines.
-    """
+    """A line `path` (T, 3) on a ball with outward `normals`; `behind` is the style of its far side."""
     up, around = np.radians(ax.elev), np.radians(ax.azim)
     eye = np.array([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)])
     front = normals @ eye > 0

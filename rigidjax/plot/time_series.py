@@ -37,10 +37,8 @@ def motion(
     >>> motion(sol.ts, sol.ys)[0].get_ylabel()
     'body rate Ω, rad/s'
     """
-    turned, seconds = (
-        style.unit(rate_unit, RATES, "rate_unit"),
-        style.unit(time_unit, TIMES, "time_unit"),
-    )
+    turned = style.unit(rate_unit, RATES, "rate_unit")
+    seconds = style.unit(time_unit, TIMES, "time_unit")
     _checks.instance(states, HasSpin, "states", wanted="a Spin, an Attitude or a Rigid")
     omega = rows(states.omega, 3, "states.omega") * turned
     t = style.times(ts, omega.shape[0]) / seconds

@@ -22,11 +22,11 @@ _REACH = math.tan(math.pi / 8) ** 2
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def stumpff(k: int, t: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Stumpff function c_k(t) = Σ (−t)ⁿ/(k + 2n)!, for t = θ² ≥ 0 of any shape.
+    """Stumpff function c_k(t) = Σ (−t)ⁿ/(k + 2n)! for t = θ² ≥ 0 (Battin 1999, eq 4.80 and
+    problem).
 
-    `k` ≥ 0, a Python integer: 0 is cos θ, 1 is sin θ/θ, 2 is (1 − cos θ)/θ², 3 is (θ − sin θ)/θ³.
-    Values and derivatives of every order are right to a few units of round-off of 1/k! (Battin
-    1999, eq 4.80 and problem).
+    c_0 is cos θ, c_1 sin θ/θ, c_2 (1 − cos θ)/θ², c_3 (θ − sin θ)/θ³. Values and derivatives of
+    every order are right to a few units of round-off of 1/k!.
     """
     if k < 2:
         return _cosine_or_sinc(k, t)
@@ -49,11 +49,7 @@ def _stumpff_jvp(k: int, primals: Any, tangents: Any) -> tuple[Any, Any]:
 
 
 def inverse_kernel(t: Float[Array, "..."]) -> Float[Array, "..."]:
-    """The kernel (1 − (θ/2) cot(θ/2))/θ² of the inverse Jacobians, for t = θ² < (2π)².
-
-    As (c_3 − 2c_4)/c_1(t/4)² it is 1/12 at 0, without a quotient of vanishing numbers, and 1/π² at
-    a half turn.
-    """
+    """The kernel (1 − (θ/2) cot(θ/2))/θ² of the inverse Jacobians, t = θ² < (2π)²: 1/12 at 0."""
     return (stumpff(3, t) - 2 * stumpff(4, t)) / stumpff(1, 0.25 * t) ** 2
 
 

@@ -72,10 +72,8 @@ def mesh(
     if _checks.known(corners):
         _checks.finite(corners, "vertices")
     table = faces_of(faces, corners.shape[0])
-    s, o = (
-        direction(v, name).astype(corners.dtype)
-        for v, name in ((sun, "sun"), (observer, "observer"))
-    )
+    s = direction(sun, "sun").astype(corners.dtype)
+    o = direction(observer, "observer").astype(corners.dtype)
     first, second, third = (corners[table[:, k]] for k in range(3))
     double = jnp.cross(second - first, third - first)
     lit, seen = (double * s[None, :]).sum(axis=1), (double * o[None, :]).sum(axis=1)

@@ -11,9 +11,8 @@ SEEDS, ROUNDS = 16, 3
 
 
 def aliases_of(pairs: np.ndarray, peaks: np.ndarray) -> np.ndarray:
-    """Pairs (M, 2) that may fit the same readings: moved by side peaks, and related ones.
-
-    If 2 f₁ is a line, a move of this line by a peak is a move of f₁ by half of it.
+    """Pairs (M, 2) that may fit the same readings: moved by side peaks or half of them, and
+    related.
     """
     moves = np.unique(np.concatenate([[0.0], *((p, -p, p / 2, -p / 2) for p in peaks)]))
     first, second = pairs.T[:, :, None]

@@ -176,10 +176,8 @@ def _only(problem: Problem) -> Any:
     """The reading of the only sensor, one light curve of a free body."""
     one_problem(problem)
     if not _checks.known(problem):
-        raise TypeError(
-            "problem: wanted known numbers, got traced ones; a search works on the host: call it "
-            "outside of jax.jit, jax.grad and jax.vmap"
-        )
+        words = "got traced ones; call it outside of jax.jit, jax.grad and jax.vmap"
+        raise TypeError(f"problem: wanted known numbers, {words}")
     readings = problem.records.readings
     kinds = ", ".join(type(r.sensor).__name__ for r in readings)
     if len(readings) != 1 or not isinstance(readings[0].sensor, Brightness):

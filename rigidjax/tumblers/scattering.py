@@ -115,9 +115,8 @@ def law_of(scattering: AbstractScattering | None) -> AbstractScattering:
 def direction(value: Vec3Like | Numbers, name: str) -> Vec3:
     """A vector (3,) of length one along `value`. **Raises** for length zero, NaN, a wrong shape."""
     v = _checks.finite(_checks.floating(value, (3,), name), name)
-    v = _checks.refuse(
-        v, ~(jnp.abs(v) > 0).any(), f"{name}: wanted a direction, got a vector of length zero"
-    )
+    words = f"{name}: wanted a direction, got a vector of length zero"
+    v = _checks.refuse(v, ~(jnp.abs(v) > 0).any(), words)
     # The square of a star's 1e200 m would overflow.
     v = times_power_of_two(v, -exponent_of(v))
     return v / jnp.sqrt(dot(v, v))
@@ -182,10 +181,7 @@ def _lambert(shape: Mat3, sun: Vec3, observer: Vec3) -> Scalar:
 
 
 def _across_the_lune(shape: Mat3, minors: Mat3, sun: Vec3, observer: Vec3) -> Scalar:
-    """`∫ (n·sun)(n·observer)/(n·En)² dn` over the normals n for which both factors are positive.
-
-    Along the lune, `n ∝ a + t pole` with a across it, and the integral over t is elementary.
-    """
+    """`∫ (n·sun)(n·observer)/(n·En)² dn` over the normals n for which both factors are positive."""
     pole = cross(sun, observer)
     sine, apart = _root(dot(pole, pole)), dot(pole, pole) > jnp.finfo(pole.dtype).eps ** 2
     # Any pole is good if there is hardly a lune.

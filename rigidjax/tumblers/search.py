@@ -47,10 +47,8 @@ def relative_flux(
 
 
 def of_few_lengths(problem: Problem) -> Problem:
-    """The problem with masked readings up to one of four lengths an octave.
-
-    Light curves of about as many readings then share one program, which takes longer to compile
-    than to run.
+    """The problem with masked readings up to one of four lengths an octave, to compile few
+    programs.
     """
     record = problem.recording
     octaves = math.ceil(4.0 * math.log2(record.t.shape[0])) / 4.0
@@ -162,10 +160,9 @@ def descended(
 def _many(
     starts: Parameters, problem: Problem, noise: Any, settings: Settings, count: Any
 ) -> Tried:
-    """The search from the first `count` starts (a leading axis), one after another.
+    """The search from the first `count` starts, one after another, with slopes by differences.
 
-    Slopes are differences of the errors: the closed form without derivatives takes a hundredth of
-    the time, and the slopes need few digits here.
+    The closed form without derivatives takes a hundredth of the time.
     """
 
     def one(given: tuple[Parameters, Array]) -> Tried:

@@ -30,11 +30,7 @@ MODES = ("long", "short")
 
 
 class Candidate(NamedTuple):
-    """A starting motion.
-
-    `moments` (3,) ascending, over the largest; `q` (4,), `omega` (3,) at the first time, in
-    principal axes; `misfit` χ².
-    """
+    """A starting motion: `moments` over the largest; `q`, `omega`, principal axes; `misfit` χ²."""
 
     moments: np.ndarray
     q: np.ndarray
@@ -61,11 +57,10 @@ def candidates(
 ) -> list[Candidate]:
     """The best of the grid whose precession and rotation have these frequencies, in order.
 
-    `pair` (2,) has the frequencies of the mean precession and of twice the rotation, 1/s; `mode` of
-    `MODES` is the circulated axis; `light` times since the first, s, squared fluxes and ones over
-    their noise, with zeros for missing readings; `half_way` (3,) the direction half way, world
-    frame; `areas` M (3,) of a known ellipsoid, or `None` for the uniform one of each body; `count`
-    the number of bodies, each with all turns of `ABOUT`.
+    `pair` has the frequencies of the mean precession and of twice the rotation, 1/s; `mode` is the
+    circulated axis; `light` times since the first, squared fluxes and ones over their noise;
+    `half_way` (3,) in the world frame; `areas` M (3,) of a known ellipsoid, or `None`; `count` of
+    bodies.
     """
     semi_axes, moments = bodies_of_grid()
     forms = (np.prod(semi_axes, axis=1, keepdims=True) / semi_axes) ** 2
@@ -88,10 +83,7 @@ def candidates(
 
 
 def _placed(side: np.ndarray, half_way: np.ndarray) -> list[np.ndarray]:
-    """Turns (4,) that take the frame of the momentum to the world.
-
-    They belong to the matrix of rank one that is nearest to the result of least squares.
-    """
+    """Turns (4,) from the frame of the momentum to the world, by the best n nᵀ of rank one."""
     xx, yy, zz, xy, xz, yz = side
     _, axes = np.linalg.eigh(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
     n = axes[:, -1]
@@ -136,10 +128,7 @@ def periods(moments: Array, omega: Array) -> tuple[Array, Array]:
 
 
 def _energy(moments: Array, ratio: Array, long: Array) -> tuple[Array, Array, Array]:
-    """A rate whose periods have this ratio, its precession period, and whether there is one.
-
-    The ratio is largest for a spin about the axis of the mode, and 0 at the separatrix.
-    """
+    """A rate whose periods have this ratio, its precession period, and whether there is one."""
     pure = jnp.where(long, moments[0], moments[2])
 
     def halved(_: Any, tried: tuple[Array, ...]) -> tuple[Array, ...]:

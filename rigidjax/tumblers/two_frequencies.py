@@ -86,7 +86,7 @@ def two_frequencies(
     if t.ndim != 1 or y.shape != t.shape:
         raise ValueError(f"values: wanted (T,) as t has, got shapes {t.shape} and {y.shape}")
     if t.size <= unknowns:
-        raise ValueError(f"t: wanted more than {unknowns} times, as the series has, got {t.size}")
+        raise ValueError(f"t: wanted more times than the {unknowns} unknowns, got {t.size}")
     if not (np.isfinite(t).all() and np.isfinite(y).all()):
         raise ValueError("two_frequencies: t or values contain NaN or infinity; leave gaps out")
     if not (np.diff(t) > 0).all():
@@ -110,10 +110,8 @@ def two_frequencies(
     typical = float(np.median(np.diff(t)))
     least = 4.0 * typical if shortest is None else _checks.positive(shortest, "shortest")
     if span / least > MOST:
-        raise ValueError(
-            f"shortest: {least:.3g} s, and a light curve of {span:.3g} s: wanted at most "
-            f"{MOST:.0e} periods in it"
-        )
+        words = f"{least:.3g} s, and a light curve of {span:.3g} s"
+        raise ValueError(f"shortest: {words}: wanted at most {MOST:.0e} periods in it")
     light = _padded((t - t[0]) / span, y / sigma, 1.0 / sigma)
     lines = strongest(light, span / least, 2 * LINES)
     highest = SECOND * float(lines[:LINES].max())

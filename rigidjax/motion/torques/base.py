@@ -41,11 +41,8 @@ class Wrench(eqx.Module):
 
     def __init__(self, force: Vector, torque: Vector | None = None):
         self.force = _checks.floating(force, (3,), "force", hint="world-frame N")
-        self.torque = (
-            jnp.zeros_like(self.force)
-            if torque is None
-            else _checks.floating(torque, (3,), "torque", hint="body-frame N m")
-        )
+        torque = jnp.zeros_like(self.force) if torque is None else torque
+        self.torque = _checks.floating(torque, (3,), "torque", hint="body-frame N m")
 
 
 class AbstractTorque(eqx.Module):
@@ -91,19 +88,7 @@ class AbstractTorque(eqx.Module):
 
 
 class AbstractForce(eqx.Module):
-    """A force on a body that moves: as `AbstractTorque`, but returns a `Wrench`.
-
-    It acts on `Rigid` states only; `body` is a `MassProperties`.
-
-    >>> class Thrust(AbstractForce):  # 2 N along world z through the centre of mass
-    ...     feels = rj.motion.HasPose
-    ...     def __call__(self, t, state, body):
-    ...         return Wrench(force=[0.0, 0.0, 2.0])
-    >>> body = rj.MassProperties(4.0, [0.0, 0, 0], jnp.eye(3))
-    >>> start = rj.Rigid([0.0, 0, 0], [0.0, 0, 0], [1.0, 0, 0, 0], [0.0, 0, 1])
-    >>> rj.simulate(body, start, [0.0, 2.0], Thrust()).ys.v[-1].round(9).tolist()
-    [0.0, 0.0, 1.0]
-    """
+    """A force on a `Rigid` with `MassProperties`: as `AbstractTorque`, but returns a `Wrench`."""
 
     feels: eqx.AbstractVar[type]
 
@@ -123,7 +108,7 @@ class OfTime(AbstractTorque):
     @property
     def jump_times(self) -> Float[Array, " n"]:
         """Times, s, where a vector jumps or has a kink."""
-        return jumps_in(*vars(self).values())
+        return jumps_of_parts(self)
 
 
 # A user's own callable Module need not subclass anything.
@@ -138,10 +123,8 @@ WORLD = "a vector in world axes, such as [0, 0, -9.81]"
 def require_law(torque: object, name: str = "torque") -> None:
     """Raise `TypeError` unless `torque` can be called for its value."""
     if isinstance(torque, type):
-        raise TypeError(
-            f"{name}: got the class {torque.__name__}, wanted one made from it: "
-            f"{torque.__name__}(...)"
-        )
+        made = f"{torque.__name__}(...)"
+        raise TypeError(f"{name}: got the class {torque.__name__}, wanted one made from it: {made}")
     if not callable(torque):
         advice = ""
         if isinstance(torque, list | tuple) and any(callable(part) for part in torque):
@@ -205,10 +188,8 @@ def evaluate(torque: Torque, t: ScalarLike, state: HasSpin, body: Inertia | Mass
 def act(
     law: Torque, t: ScalarLike, state: HasSpin, body: Inertia | MassProperties
 ) -> tuple[Vec3 | None, Vec3]:
-    """Force on the centre of mass (3,), N, world frame, or `None`, and the torque about it (3,), N
-    m.
-
-    Both are in the precision of `state.omega`; the torque is in the body frame.
+    """Force on the centre of mass (N, world frame; or `None`) and torque about it (N m, body
+    frame).
     """
     require_scene(law, state, body)
     dtype = state.omega.dtype
@@ -234,28 +215,19 @@ _HIGHER = {"q": "Attitude(q, omega)", "x": "Rigid(x, v, q, omega)", "v": "Rigid(
 
 
 def lacking(who: str, wrong: AttributeError) -> str | None:
-    """The message if a user's function reads a part that its state does not have.
-
-    >>> try:
-    ...     rj.Spin([0.0, 0.0, 1.0]).q
-    ... except AttributeError as wrong:
-    ...     lacking("condition", wrong)
-    'condition looks at state.q, the attitude, and Spin has none: start from Attitude(q, omega)'
-    """
+    """The message if a user's function reads a part that its state does not have; else `None`."""
     if wrong.name not in _HIGHER or not isinstance(wrong.obj, HasSpin):
         return None
     what = {"q": "attitude", "x": "position", "v": "velocity"}[wrong.name]
-    return (
-        f"{who} looks at state.{wrong.name}, the {what}, and {type(wrong.obj).__name__} has none: "
-        f"start from {_HIGHER[wrong.name]}"
-    )
+    has_none = f"the {what}, and {type(wrong.obj).__name__} has none"
+    return f"{who} looks at state.{wrong.name}, {has_none}: start from {_HIGHER[wrong.name]}"
 
 
 def one_law(law: Any) -> None:
     """Raise `ValueError` if an array of one of our torques has another shape than its field
     declares.
 
-    Its constructor checked that; `jax.vmap` and `jax.tree.map` make torques of many bodies.
+    `jax.vmap` and `jax.tree.map` make such torques of many bodies, past the constructor.
     """
     if not type(law).__module__.startswith(__package__ or ""):
         return
@@ -311,11 +283,7 @@ def constant_or_callable(source: Any, name: str, size: int = 3) -> Any:
 
 
 def jumps_of(source: object) -> Float[Array, " n"]:
-    """The times at which a torque or a function of time jumps, s; empty if it has none.
-
-    >>> jumps_of(rj.torques.Pulses([1.0, 2.0], [[0.0, 0.0, 1.0]]))
-    Array([1., 2.], dtype=float64)
-    """
+    """The times at which a torque or a function of time jumps, s; empty if it has none."""
     found = getattr(source, "jump_times", None)
     return jnp.zeros(0) if found is None else found
 
@@ -327,6 +295,11 @@ def jumps_in(*sources: object) -> Float[Array, " n"]:
         return times[0] if times else jnp.zeros(0)
     dtype = jnp.result_type(*times)
     return jnp.sort(jnp.concatenate([found.astype(dtype) for found in times]))
+
+
+def jumps_of_parts(law: object) -> Float[Array, " n"]:
+    """Times, s, where a part of it jumps or has a kink, in order."""
+    return jumps_in(*vars(law).values())
 
 
 def unit_rows(value: Any, name: str, count: int) -> Float[Array, "n 3"]:

@@ -107,10 +107,7 @@ class ChangingInertia(eqx.Module):
         """The smallest state that the torque inside acts on."""
         return getattr(self.torque, "feels", HasSpin)
 
-    @property
-    def jump_times(self) -> Float[Array, " n"]:
-        """Times, s, where the inertia has a kink, or the torque jumps."""
-        return base.jumps_in(self.inertia, self.torque)
+    jump_times = property(base.jumps_of_parts)
 
     def tensor(self, t: ScalarLike) -> Mat3:
         """I(t), (3, 3), kg m²."""

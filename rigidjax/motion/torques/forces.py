@@ -152,10 +152,7 @@ class Rotors(base.AbstractForce):
         self.thrust, self.drag = base.each(thrust, count, "thrust"), base.each(drag, count, "drag")
         self.speeds = base.constant_or_callable(speeds, "speeds", count)
 
-    @property
-    def jump_times(self) -> Float[Array, " n"]:
-        """Times, s, where the speeds jump or have a kink."""
-        return base.jumps_of(self.speeds)
+    jump_times = property(base.jumps_of_parts)
 
     def __call__(self, t: ScalarLike, state: HasPose, body: MassProperties) -> base.Wrench:
         n = base.vector_at(self.speeds, t, "speeds", self.spins.shape[0]).astype(self.spins.dtype)

@@ -73,27 +73,22 @@ class Delayed(eqx.Module):
     def __init__(self, source: Any, delay: ScalarLike):
         source = _checks.function(source, "source", "of time")
         if has_states(source):
-            raise TypeError(
-                f"Delayed: {type(source).__name__} has states, whose past is not kept; delay its "
-                "input: Lagged(Delayed(source, delay), time)"
-            )
+            words = "has states, whose past is not kept; delay its input"
+            words += ": Lagged(Delayed(source, delay), time)"
+            raise TypeError(f"Delayed: {type(source).__name__} {words}")
         self.delay = _checks.given(delay, (), "delay").astype(jnp.result_type(float))
         if isinstance(source, Delayed):
             source, self.delay = source.source, self.delay + source.delay
         if not isinstance(source, Input) and inputs_of(source):
-            raise TypeError(
-                f"Delayed: {type(source).__name__} reads an Input; delay the Input itself, inside "
-                "it"
-            )
+            words = "reads an Input; delay the Input itself, inside it"
+            raise TypeError(f"Delayed: {type(source).__name__} {words}")
         self.source = source
         times = getattr(source, "times", None)
         if times is not None and _checks.known((times, self.delay)):
             length = float(times[-1] - times[0])
             if abs(float(self.delay)) >= length:
-                raise ValueError(
-                    f"delay: {float(self.delay):.6g} s is as long as the record of {length:.6g} s "
-                    "and more; is it in seconds?"
-                )
+                words = f"{float(self.delay):.6g} s, not shorter than the record of {length:.6g} s"
+                raise ValueError(f"delay: {words}; is it in seconds?")
 
     @property
     def jump_times(self) -> Float[Array, " n"]:

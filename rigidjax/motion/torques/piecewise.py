@@ -168,11 +168,9 @@ def _rows(
     if extra is None and rows.shape[:1] != times.shape:
         raise ValueError(f"{other}: wanted a row for each of {count} times, got {rows.shape}")
     if extra is not None and rows.shape != (count - extra, 3):
-        advice = (
-            "n constant pieces have n + 1 edges (Tabulated draws lines between n rows)"
-            if extra
-            else "n times go with n rows (constant pieces: Pulses)"
-        )
+        lines = "n times go with n rows (constant pieces: Pulses)"
+        pieces = "n constant pieces have n + 1 edges (Tabulated draws lines between n rows)"
+        advice = pieces if extra else lines
         raise ValueError(
             f"{other}: wanted {count - extra} rows of 3, got shape {rows.shape}; {advice}"
         )

@@ -88,9 +88,8 @@ class GravityGradient(base.OfTime):
         self.position = base.constant_or_callable(position, "position")
         at: Any = self.position
         if not callable(at) and _checks.known(at) and not np.asarray(at).any():
-            raise ValueError(
-                "position: wanted the vector between the body and the central body, got zero"
-            )
+            words = "the vector between the body and the central body"
+            raise ValueError(f"position: wanted {words}, got zero")
 
     @property
     def axis(self) -> Vec3 | None:
@@ -114,10 +113,8 @@ class GravityGradient(base.OfTime):
         r = base.vector_at(self.position, t, "position")
         distance = jnp.sqrt(dot(r, r))
         # r³ overflows in float32 beyond 7e12 m: divide by r three times instead.
-        return (
-            quaternion.rotate_inverse(state.q, r / distance),
-            self.mu / distance / distance / distance,
-        )
+        strength = self.mu / distance / distance / distance
+        return quaternion.rotate_inverse(state.q, r / distance), strength
 
 
 class MagneticDipole(base.OfTime):

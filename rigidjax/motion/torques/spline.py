@@ -43,16 +43,13 @@ class Series(eqx.Module):
     def __init__(self, times: Float[ArrayLike, " n"] | Sequence[Any], values: Samples):
         t, rows = _numbers(times, "times"), _numbers(values, "values")
         if t.ndim != 1 or t.size < 4 or rows.shape[:1] != t.shape:
-            raise ValueError(
-                f"Series: wanted at least four times and as many rows, got shapes {t.shape} and "
-                f"{rows.shape}"
-            )
+            words = f"got shapes {t.shape} and {rows.shape}"
+            raise ValueError(f"Series: wanted at least four times and as many rows, {words}")
         t, rows = _checks.finite(t, "Series: times"), _checks.finite(rows, "Series: values")
         step = (t[-1] - t[0]) / (t.size - 1)
         uneven = ~((step > 0) & (abs(t[1:] - t[:-1] - step).max() <= 1e-6 * step))
-        step = _checks.refuse(
-            step, uneven, "Series: wanted evenly spaced, increasing times; resample, or use Linear"
-        )
+        words = "Series: wanted evenly spaced, increasing times; resample, or use Linear"
+        step = _checks.refuse(step, uneven, words)
         dtype = jnp.result_type(float)
         self.start, self.step = jnp.asarray(t[0], dtype), jnp.asarray(step, dtype)
         self.values = jnp.asarray(rows, dtype)
@@ -132,11 +129,8 @@ class Wheel(eqx.Module):
         axis = _checks.floating(axis, (3,), "axis")
         x, y, z = _checks.namespace(axis).asarray(axis)
         found = f", got {np.asarray(axis)}" if _checks.known(axis) else ""
-        axis = _checks.refuse(
-            axis,
-            ~(abs(x * x + y * y + z * z - 1) < 2e-6),
-            f"axis: wanted a unit vector (3,){found}",
-        )
+        off = ~(abs(x * x + y * y + z * z - 1) < 2e-6)
+        axis = _checks.refuse(axis, off, f"axis: wanted a unit vector (3,){found}")
         _checks.function(speed, "speed", "of time to rad/s")
         kind = jnp.result_type(float)
         self.inertia = _checks.given(inertia, (), "inertia").astype(kind)

@@ -59,12 +59,7 @@ def require_stateless(law: Any, what: str) -> None:
 def freeze(law: Tree, own: tuple[Any, ...]) -> Tree:
     """The torque with its states put in, so that it can be called without them.
 
-    `own` is a tuple of the states of each part with states, in their order in `law`, inner parts
-    first: a row of `Solution.own`. **Raises:** `ValueError` for another number of states.
-
-    >>> law = rj.torques.ConstantTorque([0.0, 0.0, 1.0])
-    >>> freeze(law, ()) is law
-    True
+    `own` has the states of each part with states, in their order in `law`, inner parts first.
     """
     queue = list(own)
     if not queue and not has_states(law):
@@ -116,11 +111,9 @@ def rates_of(
 def require_frozen(law: Any) -> None:
     """Raise `TypeError` for a torque that is called without its states."""
     if has_own(law):
-        raise TypeError(
-            f"{type(law).__name__} has states of its own (state0, rate): simulate, batch.rollout, "
-            "batch.simulate and identify.fit_windows integrate them; elsewhere call it with "
-            "its states last: law(t, state, body, own)"
-        )
+        words = "has states of its own (state0, rate): simulate, batch.rollout, batch.simulate and "
+        words += "identify.fit_windows integrate them; else its states are its last argument"
+        raise TypeError(f"{type(law).__name__} {words}: law(t, state, body, own)")
 
 
 def _visit(tree: Any, own_of: Callable[[Any], Any]) -> Any:

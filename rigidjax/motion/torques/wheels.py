@@ -44,10 +44,8 @@ class Flywheel(base.OfTime):
     def __init__(self, momentum: object):
         self.momentum = base.constant_or_callable(momentum, "momentum")
         if has_states(momentum):
-            raise TypeError(
-                "Flywheel: wanted a momentum whose derivative by time is known, got one with "
-                "states of its own; see ReactionWheels"
-            )
+            words = "wanted a momentum whose derivative by time is known, got one with states"
+            raise TypeError(f"Flywheel: {words}; see ReactionWheels")
 
     def internal_momentum(self, t: ScalarLike) -> Vec3:
         """The wheels' momentum h at `t`, (3,), N m s, body frame."""
@@ -155,10 +153,7 @@ class ReactionWheels(base.AbstractTorque):
         parts = (self.motor, self.feedback, self.viscous, self.coulomb)
         return all(part is None for part in parts)
 
-    @property
-    def jump_times(self) -> Float[Array, " n"]:
-        """Times, s, where the motors' torques jump or have a kink."""
-        return base.jumps_of(self.motor)
+    jump_times = property(base.jumps_of_parts)
 
     def without_wheels(self, body: Body) -> Body:
         """The `body` (`Inertia` or `MassProperties`, wheels locked) without their moments,
