@@ -131,7 +131,7 @@ def _dimension(value: Any, unit: Any) -> dict[str, float] | None:
         return None
     base = unit.decompose()
     parts = zip(base.bases, base.powers, strict=True)
-    return {part.name: power for part, power in parts if part.name != "rad"}
+    return {str(part.name): power for part, power in parts if part.name != "rad"}
 
 
 def _has_units(values: Any) -> bool:

@@ -128,7 +128,7 @@ def around_ball(
     behind: dict[str, Any] | None = None,
     **how: Any,
 ) -> None:
-    """A line `path` (T, 3) on a ball with outward `normals`; `behind` is the style of its far side."""
+    """A line `path` (T, 3) on a ball with outward `normals`, in the style `behind` where hidden."""
     up, around = np.radians(ax.elev), np.radians(ax.azim)
     eye = np.array([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)])
     front = normals @ eye > 0
