@@ -149,10 +149,7 @@ class Inertia(eqx.Module):
         return Inertia(product(m, product(self.tensor, m.T)))
 
     def invertible(self) -> "Inertia":
-        """The same body, refused if a moment is zero: Euler's equations divide by all three.
-
-        **Raises:** `ValueError` (`equinox` error under `jit`) for a thin rod or a point.
-        """
+        """The same body; `ValueError` if a moment is zero: Euler's equations divide by all of them."""
         return validation.possible(self, self.tensor, None, throw=True)
 
     def __add__(self, other: "Inertia") -> "Inertia":
@@ -216,10 +213,7 @@ class MassProperties(eqx.Module):
         )
 
     def invertible(self) -> "MassProperties":
-        """The same body, refused if a moment about its centre of mass is zero.
-
-        **Raises:** `ValueError` (`equinox` error under `jit`) for a thin rod or a point.
-        """
+        """The same body; `ValueError` if a moment about its centre of mass is zero."""
         return validation.possible(self, self.inertia.tensor, self.mass, throw=True)
 
     def second_moment_about(self, point: Vector) -> Mat3:

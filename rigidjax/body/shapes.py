@@ -77,9 +77,7 @@ def shell(mass: ScalarLike, radius: ScalarLike) -> MassProperties:
 
 
 def cylinder(mass: ScalarLike, radius: ScalarLike, height: ScalarLike) -> MassProperties:
-    """A solid cylinder along z. `𝔖 = m diag(r²/4, r²/4, h²/12)`; height 0 is a disc.
-
-    **Arguments:** `mass` kg; `radius`, `height` m.
+    """A solid cylinder along z of `mass` kg, `radius`, `height` m. `𝔖 = m diag(r²/4, r²/4, h²/12)`.
 
     >>> cylinder(12.0, 1.0, 1.0).inertia.moments
     Array([4., 4., 6.], dtype=float64)
@@ -147,10 +145,7 @@ def torus(mass: ScalarLike, major: ScalarLike, minor: ScalarLike) -> MassPropert
 
 
 def rod(mass: ScalarLike, length: ScalarLike) -> MassProperties:
-    """A rod along z without thickness, of `mass` kg, `length` m. `𝔖 = m diag(0, 0, ℓ²/12)`.
-
-    Its moment about z is zero, and the equations of motion refuse it: a rod with thickness is a
-    `cylinder`.
+    """A thin rod along z of `mass` kg, `length` m (no moment about z). `𝔖 = m diag(0, 0, ℓ²/12)`.
 
     >>> rod(12.0, 1.0).inertia.moments
     Array([0., 1., 1.], dtype=float64)

@@ -108,10 +108,7 @@ _THIN = (
 
 
 def _impossible(xp: Any, tensor: Any, slack: float) -> tuple[Any, Any]:
-    """Whether a moment is zero to round-off or NaN, and whether no mass has these moments.
-
-    By the principal minors of 𝔖 = ½Tr(I) 1 − I: a tenth of the time of eigenvalues in a batch.
-    """
+    """Whether a moment is zero or NaN, and whether no mass has these moments, by minors of 𝔖."""
 
     def minors(a: Any) -> tuple[Any, ...]:
         xx, yy, zz, xy, xz, yz = (a[..., i, j] for i, j in _PAIRS)

@@ -122,10 +122,7 @@ def rows(fit: Fit) -> list[Row]:
 
 
 def rms_degrees(fit: Fit) -> float:
-    """Root mean square angle between the observed and the fitted attitudes, degrees.
-
-    **Arguments:** `fit` of `problem()`, whose first sensor gives attitudes.
-    """
+    """Root mean square angle between observed and fitted attitudes of `fit`, degrees."""
     return float(np.degrees(fit.rms[0]))
 
 

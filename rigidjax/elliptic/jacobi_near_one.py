@@ -25,10 +25,7 @@ _IMAGES = {np.dtype("float64"): 8, np.dtype("float32"): 4}
 
 
 def near_one(u: Result, m: Result, m1: Result) -> tuple[Result, Result, Result]:
-    """(sn, cn, dn) for 0 ≤ m1 ≤ 0.1, to round-off of 1, with right derivatives in m.
-
-    `u`, `m` and `m1` = 1 − m have one shape. A tangent of m must be minus the tangent of m1.
-    """
+    """(sn, cn, dn) for 0 ≤ m1 ≤ 0.1, to round-off of 1; tangents of m must be minus those of m1."""
     root = jnp.sqrt(m)
     fourth = jnp.sqrt(root)
     # DLMF 19.5.5–6, the difference 1 − m^(1/4) written as a quotient.

@@ -45,9 +45,8 @@ class AbstractScene(eqx.Module):
         return Point(y.v, self.acceleration(t, y))
 
     def drift(self, ts: Float[Array, " times"], ys: Any) -> dict[str, Scalar]:
-        """The largest departure of each conserved quantity from its first value.
-
-        **Arguments:** `ts` (T,), `ys` states with a leading time axis, as in `simulate`'s solution.
+        """The largest departure of each conserved quantity of `ys` at `ts` (T,) from its first
+        value.
 
         >>> still = Point(jnp.zeros((2, 3)), jnp.zeros((2, 3)))
         >>> float(rj.scenes.earth(0.8).drift(jnp.arange(2.0), still)["jacobi"])

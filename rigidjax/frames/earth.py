@@ -64,10 +64,9 @@ class Earth(AbstractScene):
         return 0.5 * (speed - moved) + self.gravity.astype(dtype) * x[2]
 
     def eastward_deflection(self, height: ScalarLike) -> Scalar:
-        """The eastward deflection of a dropped body, m, to first order in Ω.
+        """The eastward deflection of a body dropped from `height` h, m: ⅓ Ω g cos λ (2h/g)^{3/2}.
 
-        It is ⅓ Ω g cos λ (2h/g)^{3/2}. **Arguments:** `height` h, m. Source: Landau and Lifshitz,
-        Mechanics, sec. 39, problem 1.
+        To first order in Ω (Landau and Lifshitz, Mechanics, sec. 39, problem 1).
 
         >>> round(float(earth(0.0).eastward_deflection(100.0)), 5)
         0.02195
@@ -133,9 +132,8 @@ class Foucault(AbstractScene):
     def state(
         self, east: ScalarLike, north: ScalarLike, east_speed: ScalarLike, north_speed: ScalarLike
     ) -> Point:
-        """The bob below the pivot at a horizontal place, m, with a horizontal velocity, m/s.
-
-        **Raises:** `ValueError` for a place beyond the string (`EquinoxRuntimeError` under `jit`).
+        """The bob below the pivot at a horizontal place, m, within the string, with a velocity,
+        m/s.
 
         >>> foucault(0.5, 10.0).state(6.0, 0.0, 4.0, 0.0).v.tolist()
         [4.0, 0.0, 3.0]
@@ -181,8 +179,6 @@ class Foucault(AbstractScene):
 
     def precession_rate(self) -> Scalar:
         """The rate of the plane of small swings, rad/s, −Ω sin λ: clockwise in the north.
-
-        One turn takes a sidereal day divided by sin λ.
 
         >>> round(float(2 * jnp.pi / -foucault(jnp.pi / 6, 67.0).precession_rate()))
         172328

@@ -66,9 +66,7 @@ class MovingFrame(eqx.Module):
         return rotation_models.matrix(self.rotation, t)
 
     def at(self, t: ScalarLike) -> Instant:
-        """The frame at time `t`, s: M, Ω, dΩ/dt, and the origin with two derivatives.
-
-        Call it once if you need several of the methods below at the same time.
+        """The frame at time `t`, s: M, Ω, dΩ/dt, and the origin with its two derivatives.
 
         >>> MovingFrame(rj.frames.Uniform([0.0, 0.0, 2.0])).at(0.0).rate.tolist()
         [0.0, 0.0, 2.0]
@@ -162,10 +160,7 @@ class MovingFrame(eqx.Module):
         return free if force is None else _checks.floating(force, (3,), "force") + free
 
     def acceleration_to_inertial(self, x: Vector, v: Vector, a: Vector, t: ScalarLike) -> Vec3:
-        """The acceleration in S (3,), m/s² (notes, eqs 89, 90, with a moving origin).
-
-        **Arguments:** `x`, `v`, `a` (3,) position, velocity and acceleration in S'; `t` s.
-        """
+        """The acceleration in S (3,), m/s², of `x`, `v`, `a` (3,) in S' at `t` (notes, eqs 89, 90)."""
         now, a = self.at(t), _checks.floating(a, (3,), "a")
         return now.outward(a - now.fictitious(x, v))
 

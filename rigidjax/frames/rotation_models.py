@@ -37,9 +37,7 @@ class Uniform(eqx.Module):
 
 
 class AboutAxis(eqx.Module):
-    """A turn about a fixed axis by any angle(t): turntables whose rate changes, pendula.
-
-    **Arguments:** `axis` (3,), of any length but zero; `angle` a function of time to rad.
+    """A turn about a fixed `axis` (3,), of any length, by any `angle`, a function of time to rad.
 
     >>> float(AboutAxis([0.0, 0.0, 2.0], lambda t: 3.0 * t**2).rate(1.0)[2])
     6.0

@@ -44,9 +44,7 @@ class Coordinates(eqx.Module):
 
 
 class LagrangeEquations(eqx.Module):
-    """Lagrange's equations as a vector field; made by `equations_of_motion`.
-
-    **Fields:** `lagrangian` and `force` as given there.
+    """Lagrange's equations as a vector field of `lagrangian` and `force`, by `equations_of_motion`.
 
     >>> pendulum = equations_of_motion(lambda q, v: 0.5 * v[0] ** 2 + 9.81 * jnp.cos(q[0]))
     >>> round(float(pendulum.energy(Coordinates([0.0], [2.0]))), 6)  # ½ v² − 9.81 cos q

@@ -66,10 +66,7 @@ def minus(state: Any, reference: Any) -> Float[Array, " n"]:
 
 
 def minus_small(state: Any, reference: Any) -> Float[Array, " n"]:
-    """`minus` for a state near the reference: a turn by θ gives 2 sin(θ/2), not θ.
-
-    It is correct to second order in θ, without an arctangent, whose derivatives would take longer.
-    """
+    """`minus` for a state near the reference, without an arctangent: a turn by θ gives 2 sin(θ/2)."""
 
     def turn(q: Array, q0: Array) -> Array:
         w, *u = components(quaternion.multiply(quaternion.conjugate(q0), q))

@@ -185,10 +185,7 @@ def _follow(scene: Any, start: Array, step: Array, count: int, index: int, toler
 
 
 def stability_indices(monodromy: Float[Array, "6 6"]) -> Complex[Array, "2"]:
-    """The two ν = ½(λ + 1/λ) of the multipliers λ that are not 1, from tr M and tr M².
-
-    Eigenvalues beside a double one have an error of the root of round-off; these do not.
-    """
+    """The two ν = ½(λ + 1/λ) of the multipliers λ that are not 1, from tr M and tr M²."""
     total = jnp.trace(monodromy) - 2
     squares = jnp.sum(monodromy * monodromy.T) + 2
     half = 0.5 * total

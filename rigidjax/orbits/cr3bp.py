@@ -70,10 +70,8 @@ class ThreeBody(AbstractReversible):
         return self.speed_squared(state.x, 0.0) - jnp.sum(state.v * state.v)
 
     def speed_squared(self, x: Vector, jacobi: ScalarLike) -> Scalar:
-        """|v|² = 2U(x) − C at a place `x` (3,), for the constant C `jacobi`; 0 on zero-velocity
-        curves.
-
-        It is negative where a particle with this C cannot be.
+        """|v|² = 2U(x) − C at a place `x` (3,) for C = `jacobi`; negative where no such particle
+        is.
         """
         u = self.potential(x)
         return 2 * u - _checks.floating(jacobi, (), "jacobi").astype(u.dtype)

@@ -8,10 +8,7 @@ from rigidjax._types import Scalar
 
 
 def points(mu: Scalar) -> Float[Array, "5 3"]:
-    """L1 … L5 (5, 3) for 0 < μ ≤ ½, in units of the distance of the primaries, rotating axes.
-
-    By Euler's quintics (Szebehely 1967, sec. 4.4), differentiable by μ to any order.
-    """
+    """L1 … L5 (5, 3) of 0 < μ ≤ ½ by Euler's quintics (Szebehely 1967, sec. 4.4), rotating axes."""
     between, beyond, opposite = distances(mu)
     zero = jnp.zeros_like(mu)
     height = jnp.full_like(mu, 0.75**0.5)

@@ -42,22 +42,14 @@ class AbstractReversible(AbstractScene):
     def transition(
         self, state: Point, t: ScalarLike, *, rtol: float = 1e-13, atol: float = 1e-14
     ) -> Float[Array, "6 6"]:
-        """The state-transition matrix ∂(x, v)(t)/∂(x, v)(0) (6, 6), of determinant 1, by forward
-        mode.
-
-        **Arguments:** `state` at 0; `t` the time; `rtol`, `atol` of the solver.
-        """
+        """The state-transition matrix ∂(x, v)(t)/∂(x, v)(0) (6, 6) of `state`, by forward mode."""
         _checks.instance(state, Point, "state", wanted="a Point(x, v)")
         t = _checks.finite(_checks.floating(t, (), "t"), "t")
         numbers = jnp.concatenate([state.x, state.v])
         return state_transition.transition(self, numbers, t, rtol=rtol, atol=atol)
 
     def monodromy(self, orbit: PeriodicOrbit) -> Float[Array, "6 6"]:
-        """The transition matrix (6, 6) over one period; its eigenvalues determine the orbit's
-        stability.
-
-        Two of the six are 1, the others come as λ, 1/λ (Szebehely 1967, sec. 8.6).
-        """
+        """The transition matrix over one period; its eigenvalues are 1, 1 and pairs λ, 1/λ."""
         return self.transition(orbit.state, orbit.period)
 
     def stability_indices(self, orbit: PeriodicOrbit) -> Complex[Array, "2"]:

@@ -18,10 +18,7 @@ from rigidjax.frames.point import Point
 def flow(
     scene: AbstractScene, state: Point, t: ScalarLike, rtol: float, atol: float, throw: bool = True
 ) -> Point:
-    """The state of `scene` a time `t` after `state`; derivatives in forward mode.
-
-    A failed solve is an error, or NaN without `throw`: for starts that Newton's method only tries.
-    """
+    """The state a time `t` after `state`, in forward mode; if the solve fails, an error or NaN."""
     out = solved(scene, state, _checks.floating(t, (), "t").astype(state.x.dtype), rtol, atol)
     end = jax.tree.map(lambda leaf: leaf[0], out.ys)
     good = out.result == dfx.RESULTS.successful
@@ -64,8 +61,5 @@ def transition(
 
 
 def smallest_distance(dtype: Any) -> float:
-    """The distance, in the scene's unit, below which an attraction has lost its digits: eps^0.4.
-
-    x − x₁ is then known only to eps/r = eps^0.6 (4e-10 in float64), and adaptive steps become tiny.
-    """
+    """The distance at which an attraction is known only to eps/r = eps^0.6: eps^0.4."""
     return float(jnp.finfo(dtype).eps) ** 0.4

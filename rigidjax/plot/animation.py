@@ -24,9 +24,7 @@ FACES = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (
 
 
 class Film(eqx.Module):
-    """An animation in memory: a notebook shows it, `save` writes it.
-
-    **Fields:** `data` the file; `kind` `gif` or `html`; `height` px in a notebook.
+    """An animation in memory: a notebook shows it, `save` writes it (`data`, `kind`, `height` px).
 
     >>> Film(b"<p>hello</p>", "html", 100)._repr_html_()[:7]
     '<iframe'

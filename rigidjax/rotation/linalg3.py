@@ -20,11 +20,7 @@ from rigidjax.rotation.barrier import once
 
 
 def components(v: Float[Array, "n"]) -> tuple[Scalar, ...]:
-    """The entries of a vector, as scalars.
-
-    By one `lax.split`, whose transpose is one concatenation: indexing each entry makes gradients
-    several times slower on CPU.
-    """
+    """The entries of a vector, as scalars. One `lax.split` makes gradients faster than indices do."""
     return tuple(part.reshape(()) for part in lax.split(v, (1,) * v.shape[0]))
 
 
@@ -84,10 +80,7 @@ def hat(w: Vec3Like) -> Mat3:
 
 
 def vee(matrix: Mat3Like) -> Vec3:
-    """The vector w of an antisymmetric matrix; of any matrix, w_i = ½ Tr(A J_iᵀ) (notes, eq 53).
-
-    **Arguments:** `matrix` (3, 3). Its symmetric part is dropped, as in the projection of eqs 52,
-    53.
+    """The vector of an antisymmetric `matrix` (3, 3); else w_i = ½ Tr(A J_iᵀ) (notes, eqs 52, 53).
 
     >>> vee(hat(jnp.array([1.0, 2.0, 3.0]))).tolist()
     [1.0, 2.0, 3.0]

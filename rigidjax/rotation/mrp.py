@@ -60,10 +60,7 @@ def to_matrix(sigma: Vec3Like) -> Mat3:
 
 
 def shadow(sigma: Vec3Like) -> Vec3:
-    """The other parameters of the same rotation, −σ/|σ|² (Schaub & Junkins, eq 3.145).
-
-    **Arguments:** `sigma` (3,), not zero: its shadow is infinite. **Raises:** `ValueError` for zero
-    or NaN.
+    """The other parameters of `sigma` (3,), −σ/|σ|² (eq 3.145); `ValueError` for zero or NaN.
 
     >>> shadow(jnp.array([0.0, 0.5, 0.0])).tolist()
     [-0.0, -2.0, -0.0]
@@ -72,9 +69,7 @@ def shadow(sigma: Vec3Like) -> Vec3:
 
 
 def switch(sigma: Vec3Like) -> Vec3:
-    """σ if |σ| ≤ 1, else its shadow: the parameters of the shorter turn.
-
-    **Arguments:** `sigma` (3,) dimensionless. Switch between the steps of a solver, not inside one.
+    """`sigma` (3,) if |σ| ≤ 1, else its shadow, the shorter turn. Switch between steps only.
 
     >>> switch(jnp.array([0.0, 2.0, 0.0])).tolist()
     [-0.0, -0.5, -0.0]
@@ -91,9 +86,9 @@ def _shadow(sigma: Vec3) -> Vec3:
 
 
 def omega_to_rates(sigma: Vec3Like, omega: Vec3Like) -> Vec3:
-    """dσ/dt = ¼ [(1 − s) Ω + 2 σ × Ω + 2 σ (σ·Ω)] (Schaub & Junkins, eq 3.160); never singular.
+    """dσ/dt = ¼ [(1 − s) Ω + 2 σ × Ω + 2 σ (σ·Ω)], 1/s, never singular (eq 3.160).
 
-    **Arguments:** `sigma` (3,) dimensionless; `omega` (3,) rad/s, body frame. **Returns:** 1/s.
+    **Arguments:** `sigma` (3,) dimensionless; `omega` (3,) rad/s, body frame.
 
     >>> omega_to_rates(jnp.zeros(3), jnp.array([0.0, 0.0, 4.0])).tolist()
     [0.0, 0.0, 1.0]

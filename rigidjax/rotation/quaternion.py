@@ -87,9 +87,7 @@ def conjugate(q: QuatLike) -> Quat:
 
 
 def rotate(q: QuatLike, y: Vec3Like) -> Vec3:
-    """Body components → world components, M y' (notes, eqs 8, 21).
-
-    **Arguments:** `q` (4,) unit; `y` (3,) in the body frame, any units. Bits are the same for −q.
+    """Body components `y` (3,) → world components M y', by `q` (4,) unit (notes, eqs 8, 21).
 
     >>> rotate(jnp.array([0.0, 0.0, 0.0, 1.0]), jnp.array([1.0, 2.0, 3.0])).tolist()
     [-1.0, -2.0, 3.0]
@@ -171,10 +169,7 @@ def advance(q: QuatLike, omega: Vec3Like, dt: ScalarLike) -> Quat:
 
 
 def rate(q: QuatLike, omega: Vec3Like) -> Quat:
-    """dq/dt = ½ q (0, Ω), with Ω in the body frame.
-
-    **Arguments:** `q` (4,) unit, body → world; `omega` (3,) rad/s, body frame. **Returns:** 1/s.
-    Source: notes, eq 50, on unit quaternions.
+    """dq/dt = ½ q (0, Ω), 1/s, of `q` (4,) unit and `omega` (3,), rad/s, body frame (notes, eq 50).
 
     >>> float(rate(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.array([0.0, 0.0, 2.0]))[3])
     1.0
@@ -224,9 +219,7 @@ def normalise(q: QuatLike) -> Quat:
 
 
 def canonical(q: QuatLike) -> Quat:
-    """The one of q and −q with w > 0; if w = 0, the one with a positive first nonzero component.
-
-    **Arguments:** `q` (4,). The result has the same bits for q and −q.
+    """The one of `q` (4,) and −q with w > 0; if w = 0, its first nonzero component is positive.
 
     >>> canonical(jnp.array([-1.0, 0.0, 0.0, 0.0])).tolist()
     [1.0, -0.0, -0.0, -0.0]

@@ -71,9 +71,7 @@ def is_singular(q: QuatLike) -> Bool[Array, ""]:
 
 
 def omega_to_rates(g: Vec3Like, omega: Vec3Like) -> Vec3:
-    """dg/dt = ½ [Ω + g × Ω + g (g·Ω)] (Schaub & Junkins, eq 3.130).
-
-    **Arguments:** `g` (3,) dimensionless; `omega` (3,) rad/s, body frame. **Returns:** 1/s.
+    """dg/dt = ½ [Ω + g × Ω + g (g·Ω)], 1/s, of `g` and `omega` (3,), rad/s, body frame (eq 3.130).
 
     >>> omega_to_rates(jnp.zeros(3), jnp.array([0.0, 0.0, 2.0])).tolist()
     [0.0, 0.0, 1.0]
@@ -83,9 +81,7 @@ def omega_to_rates(g: Vec3Like, omega: Vec3Like) -> Vec3:
 
 
 def rates_to_omega(g: Vec3Like, rates: Vec3Like) -> Vec3:
-    """Ω = 2/(1 + |g|²) [ġ − g × ġ], body frame (Schaub & Junkins, eq 3.132).
-
-    **Arguments:** `g` (3,) dimensionless; `rates` (3,) 1/s. **Returns:** (3,) rad/s.
+    """Ω = 2/(1 + |g|²) [ġ − g × ġ], rad/s, body frame, of `g` and `rates` (3,), 1/s (eq 3.132).
 
     >>> rates_to_omega(jnp.zeros(3), jnp.array([0.0, 0.0, 1.0])).tolist()
     [0.0, 0.0, 2.0]

@@ -79,9 +79,7 @@ def left_jacobian(v: Vec3Like) -> Mat3:
 
 
 def right_jacobian(v: Vec3Like) -> Mat3:
-    """J_r with exp(v + dv) = exp(v) exp(J_r dv): the turn by dv in the body frame.
-
-    **Arguments:** `v` (3,) rotation vector, rad. J_r(v) = J_l(−v) = J_l(v)ᵀ (Solà 2018, eq 143).
+    """J_r with exp(v + dv) = exp(v) exp(J_r dv), of `v` (3,), rad: J_l(v)ᵀ (Solà 2018, eq 143).
 
     >>> right_jacobian(jnp.zeros(3)).tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]

@@ -32,10 +32,7 @@ class Sums(NamedTuple):
 
 
 def sums(light: tuple[Array, ...], highest: float) -> Sums:
-    """The table up to a frequency, 1/span.
-
-    `light` is times over the span, values and ones over the noise, each (T,), 0 where missing.
-    """
+    """The table up to a frequency, 1/span; `light` is times over the span, values and weights."""
     size = math.ceil(highest * DENSE) + 2 * NEAR
     grid = (np.arange(-(-size // ROWS) * ROWS) - NEAR // 2) / DENSE
     x, z, w = light

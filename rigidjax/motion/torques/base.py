@@ -224,11 +224,7 @@ def lacking(who: str, wrong: AttributeError) -> str | None:
 
 
 def one_law(law: Any) -> None:
-    """Raise `ValueError` if an array of one of our torques has another shape than its field
-    declares.
-
-    `jax.vmap` and `jax.tree.map` make such torques of many bodies, past the constructor.
-    """
+    """Raise `ValueError` for an array of another shape than declared, as `jax.vmap` makes them."""
     if not type(law).__module__.startswith(__package__ or ""):
         return
     for field in dataclasses.fields(law):
