@@ -149,7 +149,7 @@ class Inertia(eqx.Module):
         return Inertia(product(m, product(self.tensor, m.T)))
 
     def invertible(self) -> "Inertia":
-        """The same body; `ValueError` if a moment is zero: Euler's equations divide by all of them."""
+        """The same body; `ValueError` if a moment, by which Euler's equations divide, is zero."""
         return validation.possible(self, self.tensor, None, throw=True)
 
     def __add__(self, other: "Inertia") -> "Inertia":

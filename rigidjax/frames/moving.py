@@ -160,7 +160,7 @@ class MovingFrame(eqx.Module):
         return free if force is None else _checks.floating(force, (3,), "force") + free
 
     def acceleration_to_inertial(self, x: Vector, v: Vector, a: Vector, t: ScalarLike) -> Vec3:
-        """The acceleration in S (3,), m/s², of `x`, `v`, `a` (3,) in S' at `t` (notes, eqs 89, 90)."""
+        """The acceleration in S (3,), m/s², of `x`, `v`, `a` (3,) in S' at `t` (eqs 89, 90)."""
         now, a = self.at(t), _checks.floating(a, (3,), "a")
         return now.outward(a - now.fictitious(x, v))
 

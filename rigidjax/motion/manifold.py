@@ -66,7 +66,7 @@ def minus(state: Any, reference: Any) -> Float[Array, " n"]:
 
 
 def minus_small(state: Any, reference: Any) -> Float[Array, " n"]:
-    """`minus` for a state near the reference, without an arctangent: a turn by θ gives 2 sin(θ/2)."""
+    """`minus` for a near state, without an arctangent: a turn by θ gives 2 sin(θ/2), not θ."""
 
     def turn(q: Array, q0: Array) -> Array:
         w, *u = components(quaternion.multiply(quaternion.conjugate(q0), q))

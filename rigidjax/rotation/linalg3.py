@@ -20,7 +20,7 @@ from rigidjax.rotation.barrier import once
 
 
 def components(v: Float[Array, "n"]) -> tuple[Scalar, ...]:
-    """The entries of a vector, as scalars. One `lax.split` makes gradients faster than indices do."""
+    """The entries of a vector, as scalars: one `lax.split` is faster in gradients than indices."""
     return tuple(part.reshape(()) for part in lax.split(v, (1,) * v.shape[0]))
 
 
