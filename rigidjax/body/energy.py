@@ -132,7 +132,7 @@ def ellipsoid(
     kind: Literal["energy", "momentum", "mass"],
     size: ScalarLike | None = None,
 ) -> tuple[Vec3, Quat]:
-    """An ellipsoid of a body: of the rates Ω of one energy or momentum, or of equal inertia.
+    """The ellipsoid of the rates Ω of one energy or momentum, or the uniform one of equal inertia.
 
     **Arguments:** `body`; `kind` and `size`:
 

@@ -162,7 +162,7 @@ def _follow(scene: Any, start: Array, step: Array, count: int, index: int, toler
         return correction.miss(scene, numbers)
 
     def tangent(matrix: Array, before: Array) -> Array:
-        """The direction in which the residual stays 0, on the side of the one before."""
+        """The direction in which the residual stays 0, on the side of `before`."""
         rows = jnp.concatenate([matrix, before[None]])
         along = jnp.linalg.solve(rows, jnp.zeros(4, start.dtype).at[3].set(1))
         return along / jnp.sqrt(jnp.sum(along * along))

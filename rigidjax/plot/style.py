@@ -29,7 +29,7 @@ def pyplot() -> Any:
 
 
 def unit(name: str, known: dict[str, float], what: str) -> float:
-    """The factor of a unit to or from SI, by name; `ValueError` lists the known ones."""
+    """The factor of a unit, by its name, to or from SI; `ValueError` lists the known names."""
     return known[_checks.word(name, tuple(known), what)]
 
 

@@ -1,4 +1,4 @@
-"""The costly maps of `quaternion` and `so3` without checks, compiled once also outside of `jit`."""
+"""The costly maps of `quaternion` and `so3`, without checks; also compiled outside of `jit`."""
 
 from collections.abc import Sequence
 from functools import partial

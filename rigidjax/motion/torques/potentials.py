@@ -44,7 +44,7 @@ class HeavyTop(base.AbstractTorque):
 
     @property
     def axis(self) -> Vec3:
-        """The direction about which there is no torque: gravity's, world frame."""
+        """Gravity, world frame: there is no torque about it."""
         return self.gravity
 
     def energy(self, t: ScalarLike, state: HasAttitude, body: object) -> Scalar:
@@ -93,7 +93,7 @@ class GravityGradient(base.OfTime):
 
     @property
     def axis(self) -> Vec3 | None:
-        """The direction without torque about it, world frame, if it is constant: the position's."""
+        """The position, world frame, if it is constant: there is no torque about it."""
         source: Any = self.position
         return None if callable(source) else source
 
@@ -140,7 +140,7 @@ class MagneticDipole(base.OfTime):
 
     @property
     def axis(self) -> Vec3 | None:
-        """The direction without torque about it, world frame, if it is constant: the field's."""
+        """The field, world frame, if it is constant: there is no torque about it."""
         source: Any = self.field
         return None if callable(source) else source
 
