@@ -9,6 +9,7 @@ import numpy as np
 
 from rigidjax import _checks
 from rigidjax.body.inertia import MassProperties
+from rigidjax.body.symmetric3 import PAIRS
 from rigidjax.rotation import euler, quaternion
 
 # The tolerance of the triangle inequality, since files are rounded.
@@ -163,9 +164,8 @@ def _to_urdf(inertial: Tree.Element, body: MassProperties) -> None:
     tensor = np.asarray(body.inertia.tensor)
     Tree.SubElement(inertial, "origin", xyz=_text(body.com), rpy="0 0 0")
     Tree.SubElement(inertial, "mass", value=_text(body.mass))
-    entries = zip(
-        ("ixx", "ixy", "ixz", "iyy", "iyz", "izz"), tensor[np.triu_indices(3)], strict=True
-    )
+    names = "ixx", "ixy", "ixz", "iyy", "iyz", "izz"
+    entries = zip(names, tensor[np.triu_indices(3)], strict=True)
     Tree.SubElement(inertial, "inertia", {key: _text(entry) for key, entry in entries})
 
 
@@ -173,5 +173,4 @@ def _to_mujoco(inertial: Tree.Element, body: MassProperties) -> None:
     tensor = np.asarray(body.inertia.tensor)
     inertial.set("mass", _text(body.mass))
     inertial.set("pos", _text(body.com))
-    order = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
-    inertial.set("fullinertia", _text([tensor[at] for at in order]))
+    inertial.set("fullinertia", _text([tensor[at] for at in PAIRS]))

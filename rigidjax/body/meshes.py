@@ -18,7 +18,7 @@ from jaxtyping import Array, ArrayLike, Float, Int
 from rigidjax import _checks
 from rigidjax._types import Numbers, ScalarLike
 from rigidjax.body.inertia import MassProperties
-from rigidjax.body.symmetric3 import from_components
+from rigidjax.body.symmetric3 import PAIRS, from_components
 
 
 def mesh(
@@ -110,9 +110,7 @@ def _second_moment(corners, faces):
         corner = a[:, i] * a[:, j] + b[:, i] * b[:, j] + c[:, i] * c[:, j]
         return (six * (s[:, i] * s[:, j] + corner)).sum() / 120.0
 
-    return from_components(
-        entry(0, 0), entry(1, 1), entry(2, 2), entry(0, 1), entry(0, 2), entry(1, 2)
-    )
+    return from_components(*(entry(i, j) for i, j in PAIRS))
 
 
 def _six_volumes(a, b, c):

@@ -38,6 +38,10 @@ def _inverse_jvp(primals: tuple[Mat3], tangents: tuple[Mat3]) -> tuple[Mat3, Mat
     return out, -product(product(out * scale, da / scale), out)
 
 
+# The places of the components in the order of `from_components`.
+PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+
+
 def from_components(
     xx: Float[ArrayLike, ""],
     yy: Float[ArrayLike, ""],

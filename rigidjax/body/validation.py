@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 
 from rigidjax import _checks
 from rigidjax._types import Quat, Quaternion
+from rigidjax.body.symmetric3 import PAIRS
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.validation import near_unit, tolerance
 
@@ -111,7 +112,7 @@ def _impossible(xp: Any, tensor: Any, slack: float) -> tuple[Any, Any]:
     """Whether a moment is zero or NaN, and whether no mass has these moments, by minors of 𝔖."""
 
     def minors(a: Any) -> tuple[Any, ...]:
-        xx, yy, zz, xy, xz, yz = (a[..., i, j] for i, j in _PAIRS)
+        xx, yy, zz, xy, xz, yz = (a[..., i, j] for i, j in PAIRS)
         two = xx * yy - xy * xy, xx * zz - xz * xz, yy * zz - yz * yz
         whole = xx * two[2] - xy * (xy * zz - xz * yz) + xz * (xy * yz - xz * yy)
         return xx, yy, zz, *two, whole
@@ -127,9 +128,6 @@ def _impossible(xp: Any, tensor: Any, slack: float) -> tuple[Any, Any]:
     # The product of the two larger moments is 1/9 to 1/4 of the squared trace.
     determinant = minors(a)[-1]
     return ~(trace > 0) | ~(determinant > 0.125 * slack), broken
-
-
-_PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 
 def unit_quaternion(q: Quaternion) -> Quat:

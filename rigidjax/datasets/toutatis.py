@@ -68,11 +68,9 @@ def recording() -> Recording:
     # order of eq 31 of the notes make M, body → ecliptic.
     attitudes = [euler.to_quaternion(a, sequence="ZXZ") for a in angles]
     rates = np.radians([row[4:7] for row in OBSERVATIONS]) / DAY
-    return Recording(
-        t,
-        (AttitudeSensor(np.radians(ATTITUDE_NOISE_DEG)), np.stack(attitudes)),
-        (Gyro(np.radians(RATE_NOISE_DEG_A_DAY) / DAY), rates),
-    )
+    sensor = AttitudeSensor(np.radians(ATTITUDE_NOISE_DEG))
+    gyro = Gyro(np.radians(RATE_NOISE_DEG_A_DAY) / DAY)
+    return Recording(t, (sensor, np.stack(attitudes)), (gyro, rates))
 
 
 def problem() -> Problem:

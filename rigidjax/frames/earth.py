@@ -41,13 +41,9 @@ class Earth(AbstractScene):
         _, north, up = components(self.angular_velocity().astype(dtype))
         along, gravity = north * x[1] + up * x[2], self.gravity.astype(dtype)
         square = north * north + up * up
-        return jnp.stack(
-            [
-                square * x[0] + 2 * (up * v[1] - north * v[2]),
-                square * x[1] - along * north - 2 * up * v[0],
-                square * x[2] - along * up + 2 * north * v[0] - gravity,
-            ]
-        )
+        east = square * x[0] + 2 * (up * v[1] - north * v[2])
+        across = square * x[1] - along * north - 2 * up * v[0]
+        return jnp.stack([east, across, square * x[2] - along * up + 2 * north * v[0] - gravity])
 
     def conserved(self, t: ScalarLike, state: Point) -> dict[str, Scalar]:
         return {"jacobi": self.jacobi_integral(state)}

@@ -36,7 +36,7 @@ class Coordinates(eqx.Module):
         self.q = _checks.numbers(q, "q")
         if self.q.ndim == 0 or self.q.size == 0:
             raise ValueError(
-                f"q: wanted generalised coordinates (n,), got shape {self.q.shape}; give one as [q]"
+                f"q: wanted generalised coordinates (n,), got {self.q.shape}; for one give [q]"
             )
         self.rate = _checks.floating(
             rate, self.q.shape, "rate", hint="one rate for each coordinate"

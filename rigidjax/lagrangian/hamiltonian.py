@@ -68,9 +68,8 @@ class LiePoissonWithDirection(eqx.Module):
     def __call__(
         self, t: ScalarLike, y: MomentumAndDirection, args: object = None
     ) -> MomentumAndDirection:
-        turn, pull = jax.grad(lambda p, g: _number(self.hamiltonian(p, g)), argnums=(0, 1))(
-            y.pi, y.gamma
-        )
+        value = lambda p, g: _number(self.hamiltonian(p, g))  # noqa: E731
+        turn, pull = jax.grad(value, argnums=(0, 1))(y.pi, y.gamma)
         return MomentumAndDirection(cross(y.pi, turn) + cross(y.gamma, pull), cross(y.gamma, turn))
 
 

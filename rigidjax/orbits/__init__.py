@@ -4,8 +4,7 @@
 """
 
 from rigidjax._names import show
-from rigidjax.orbits.cr3bp import ThreeBody as ThreeBody, cr3bp as cr3bp
+from rigidjax.orbits.cr3bp import Hill as Hill, ThreeBody as ThreeBody, cr3bp as cr3bp, hill as hill
 from rigidjax.orbits.differential_correction import PeriodicOrbit as PeriodicOrbit
-from rigidjax.orbits.hill import Hill as Hill, hill as hill
 
 show(__name__)

@@ -31,19 +31,10 @@ def solved(
     scene: AbstractScene, state: Point, t: Array, rtol: float, atol: float, **how: Any
 ) -> dfx.Solution:
     """The motion from 0 to `t`, with derivatives in forward mode; `how` as for `diffeqsolve`."""
-    return dfx.diffeqsolve(
-        dfx.ODETerm(scene.field),
-        dfx.Dopri8(),
-        jnp.zeros_like(t),
-        t,
-        None,
-        state,
-        stepsize_controller=dfx.PIDController(rtol=rtol, atol=atol),
-        adjoint=dfx.ForwardMode(),
-        max_steps=100_000,
-        throw=False,
-        **how,
-    )
+    motion = dfx.ODETerm(scene.field), dfx.Dopri8(), jnp.zeros_like(t), t, None, state
+    how |= dict(adjoint=dfx.ForwardMode(), max_steps=100_000, throw=False)
+    how["stepsize_controller"] = dfx.PIDController(rtol=rtol, atol=atol)
+    return dfx.diffeqsolve(*motion, **how)
 
 
 def after(scene: AbstractScene, numbers: Float[Array, "6"], t: Any, **how: Any) -> Array:

@@ -52,7 +52,7 @@ def horizons(
         if not all(hasattr(one, name) for name in ("steps", *_MEASURES)) or isinstance(one, type):
             found = _checks.kind(one)
             raise TypeError(
-                f"found: wanted Horizons of rigidjax.identify, some by name, got {found}"
+                f"found: wanted a Horizons of rigidjax.identify, or some by name, got {found}"
             )
     _checks.word(measure, tuple(_MEASURES), "measure")
     scale = 1.0 if step is None else _checks.positive(step, "step", "a positive time, s")

@@ -38,8 +38,8 @@ def ellipsoid(
     6.0
     """
     law = law_of(scattering)
-    a = _checks.finite(_checks.floating(semi_axes, (3,), "semi_axes"), "semi_axes")
-    a = _checks.refuse(a, (~(a > 0)).any(), "semi_axes: wanted three positive lengths, m")
+    a = _checks.floating(semi_axes, (3,), "semi_axes", unit="m")
+    a = _checks.sign(a, "semi_axes", "three positive lengths, m")
     s, o = direction(sun, "sun").astype(a.dtype), direction(observer, "observer").astype(a.dtype)
     # The fourth power of the axes is taken: a power of two keeps it in range.
     size = exponent_of(a)

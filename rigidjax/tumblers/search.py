@@ -173,9 +173,8 @@ def _many(
             return problem.errors(restore(point))[0][:, 0] / noise[0][0, 0]
 
         def evaluated(point: Array) -> tuple[Any, Array, Array, Array]:
-            moved = point[None] + DIFFERENCE * jnp.concatenate(
-                [jnp.zeros((1, flat.size)), jnp.eye(flat.size)]
-            )
+            steps = jnp.concatenate([jnp.zeros((1, flat.size)), jnp.eye(flat.size)])
+            moved = point[None] + DIFFERENCE * steps
             e = jax.lax.map(errors, moved)
             rows = (e[1:] - e[:1]) / DIFFERENCE
             return (), 0.5 * jnp.sum(e[0] ** 2), rows @ rows.T, rows @ e[0]

@@ -91,7 +91,12 @@ class Brightness(AbstractSensor):
         if unit == "flux":
             found = _checks.refuse(found, ~(found > 0), "level: wanted a positive flux")
         self.level = found
-        self.semi_axes = None if semi_axes is None else _lengths(semi_axes)
+        if semi_axes is not None:
+            semi_axes = _checks.floating(semi_axes, (3,), "semi_axes").astype(
+                jnp.result_type(float)
+            )
+            semi_axes = _checks.sign(semi_axes, "semi_axes", "three positive lengths")
+        self.semi_axes = semi_axes
         self.offset = optional("offset", ())(offset)
 
     def error(self, now: SensorInput, reading: Array) -> Float[Array, "1"]:
@@ -147,9 +152,3 @@ def _source(source: Any, name: str) -> Any:
             "for each time is rigidjax.torques.Linear(times, directions)"
         )
     return direction(source, name).astype(jnp.result_type(float))
-
-
-def _lengths(semi_axes: Any) -> Array:
-    a = _checks.finite(_checks.floating(semi_axes, (3,), "semi_axes"), "semi_axes")
-    a = jnp.asarray(a, jnp.result_type(float))
-    return _checks.refuse(a, ~(a > 0).all(), "semi_axes: wanted three positive lengths")

@@ -45,9 +45,8 @@ class Sum(eqx.Module):
     def feels(self) -> type:
         """The largest state that a part needs."""
         rungs = [getattr(part, "feels", base.LADDER[0]) for part in self.parts]
-        return max(
-            rungs, key=lambda r: base.LADDER.index(r) if r in base.LADDER else len(base.LADDER)
-        )
+        order = lambda r: base.LADDER.index(r) if r in base.LADDER else len(base.LADDER)  # noqa: E731
+        return max(rungs, key=order)
 
     @property
     def rate_free(self) -> bool:

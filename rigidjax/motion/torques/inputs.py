@@ -87,8 +87,8 @@ class Delayed(eqx.Module):
         if times is not None and _checks.known((times, self.delay)):
             length = float(times[-1] - times[0])
             if abs(float(self.delay)) >= length:
-                words = f"{float(self.delay):.6g} s, not shorter than the record of {length:.6g} s"
-                raise ValueError(f"delay: {words}; is it in seconds?")
+                words = f"{float(self.delay):.6g} s is as long as the record of {length:.6g} s"
+                raise ValueError(f"delay: {words} or longer; is it in seconds?")
 
     @property
     def jump_times(self) -> Float[Array, " n"]:
