@@ -145,13 +145,13 @@ def unpack_moments(vector: Float[ArrayLike, "3"] | Numbers) -> Vec3:
 def flat_bend(
     shape: Float[ArrayLike, "5"] | Numbers, slope: Float[ArrayLike, "5"] | Numbers
 ) -> Float[Array, "3 5"]:
-    """Rows b; the sum of b bᵀ is the second derivative of a misfit that the chart's curvature adds.
+    """Rows b (3, 5): the chart's curvature adds Σ b bᵀ to the second derivative of a misfit.
 
     Near a flat body the least second moment is a square, λ = a² with a number a of the chart. A
     misfit that decreases towards λ < 0 has its minimum at a = 0, and products of first derivatives
     do not show this curvature. With n the axis of a, `d²λ = 2 |dA n|²`; the derivative of the
-    misfit by λ is the part along n nᵀ of its derivative by the root A. The rows are zero if the
-    body is not flat, or the misfit does not decrease so.
+    misfit by λ is the part along n nᵀ of its derivative by the root A. The rows are zero for a body
+    that is not flat, or another misfit.
 
     **Arguments:** `shape` (5,) as in `pack_shape`; `slope` (5,) the misfit's derivative by it.
 

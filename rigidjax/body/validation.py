@@ -30,7 +30,7 @@ def real_mass(mass: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
 
 
 def mass_of_a_body(mass: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
-    """The mass if it is positive; another is refused if it is known, and NaN if it is traced."""
+    """A positive mass; another one is refused if it is known, and becomes NaN if it is traced."""
     return real_mass(mass) if _checks.known(mass) else jnp.where(mass > 0, mass, jnp.nan)
 
 

@@ -35,12 +35,10 @@ class Coordinates(eqx.Module):
     ):
         self.q = _checks.numbers(q, "q")
         if self.q.ndim == 0 or self.q.size == 0:
-            raise ValueError(
-                f"q: wanted generalised coordinates (n,), got {self.q.shape}; for one give [q]"
-            )
-        self.rate = _checks.floating(
-            rate, self.q.shape, "rate", hint="one rate for each coordinate"
-        )
+            words = f"wanted generalised coordinates (n,), got {self.q.shape}; for one give [q]"
+            raise ValueError(f"q: {words}")
+        hint = "one rate for each coordinate"
+        self.rate = _checks.floating(rate, self.q.shape, "rate", hint=hint)
 
 
 class LagrangeEquations(eqx.Module):
@@ -167,7 +165,6 @@ def from_attitude(state: HasAttitude) -> Coordinates:
 
 
 def _solve(matrix: Float[Array, "n n"], push: Float[Array, " n"]) -> Float[Array, " n"]:
-    """The x with matrix x = push."""
     n = push.shape[0]
     if n == 1:
         return push / matrix[0]

@@ -149,9 +149,8 @@ class HeavyTopHamiltonian(eqx.Module):
 
     def __init__(self, inertia: _inertia.Inertia, top: HeavyTop):
         self.inertia = _invertible(inertia)
-        self.top = _checks.instance(
-            top, HeavyTop, "top", hint="this Hamiltonian is for gravity alone"
-        )
+        hint = "this Hamiltonian is for gravity alone"
+        self.top = _checks.instance(top, HeavyTop, "top", hint=hint)
         self.inverse = _inertia.inverse(self.inertia.tensor)
 
     def __call__(

@@ -19,7 +19,7 @@ from rigidjax.identify.problem import Problem
 from rigidjax.motion.torques.base import vector_at
 from rigidjax.rotation import quaternion
 from rigidjax.tumblers import starts
-from rigidjax.tumblers.two_frequencies import BLOCK, TwoFrequencies
+from rigidjax.tumblers.two_frequencies import TwoFrequencies, padded
 
 # Starts of the first round, its steps; those that go on, and how far.
 FIRST, STEPS, SECOND, MORE = 96, 12, 24, 60
@@ -74,8 +74,7 @@ def starts_of(
     """The best starting points over all pairs of frequencies."""
     sensor = reading.sensor
     sigma = np.ones(t.shape) if spread is None else spread
-    more = -t.size % BLOCK
-    light = tuple(jnp.asarray(np.pad(v, (0, more))) for v in (t, squares, 1.0 / sigma))
+    light = padded(t, squares, 1.0 / sigma)
     middle = problem.records.t[0][0] + 0.5 * t[-1]
     sides = [np.asarray(vector_at(s, middle, "")) for s in (sensor.sun, sensor.observer)]
     half_way = sum(v / np.linalg.norm(v) for v in sides)

@@ -124,7 +124,7 @@ def two_frequencies(
     if span / least > MOST:
         words = f"{least:.3g} s, and a light curve of {span:.3g} s"
         raise ValueError(f"shortest: {words}: wanted at most {MOST:.0e} periods in it")
-    light = _padded((t - t[0]) / span, y / sigma, 1.0 / sigma)
+    light = padded((t - t[0]) / span, y / sigma, 1.0 / sigma)
     lines = strongest(light, span / least, 2 * LINES)
     highest = SECOND * float(lines[:LINES].max())
     # All multiples of a pair, and what a step of the refinement adds.
@@ -140,7 +140,7 @@ def two_frequencies(
     return TwoFrequencies(pairs[keep] / span, misfits[keep] * scale, dof, scatter, lines / span)
 
 
-def _padded(x: np.ndarray, z: np.ndarray, w: np.ndarray) -> tuple[Array, Array, Array]:
+def padded(x: np.ndarray, z: np.ndarray, w: np.ndarray) -> tuple[Array, Array, Array]:
     """Times over the span, values and ones over the noise, with zeros up to a whole block."""
     more = -x.size % BLOCK
     return tuple(jnp.asarray(np.pad(v, (0, more))) for v in (x, z, w))  # pyright: ignore
