@@ -16,9 +16,7 @@ Result = Float[Array, "..."]
 
 
 def common(**named: Any) -> tuple[Result, ...]:
-    """All arguments as floating arrays of one dtype and one shape; Python numbers take the dtype of
-    the arrays.
-    """
+    """All arguments as arrays of one dtype and shape; Python numbers take the arrays' dtype."""
     arrays = {
         name: _checks.floating(value, (), name, batched=True) for name, value in named.items()
     }

@@ -160,9 +160,7 @@ def _slopes_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
 
 
 def _slopes_from_integral(u: Any, m: Any, m1: Any) -> tuple[Any, Any, Any]:
-    """The derivatives of sn, cn, dn by φ, times dn X. X is Carlson's R_D of u reduced by half
-    periods.
-    """
+    """The derivatives by φ times dn X; X is Carlson's R_D of u reduced by half periods."""
     s, c, d = _core(u, m, m1)
     turns = _turns(jax.lax.stop_gradient(u), jax.lax.stop_gradient(m1))[0]
     sign = _parity(turns)

@@ -124,9 +124,7 @@ def ellippiinc(
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def integral(orders: tuple[int, int, int], sine: Any, cosine: Any, m1: Any, n1: Any) -> Any:
-    """I_jkl of the sine and cosine of an amplitude |φ| ≤ π/2: near π/2 no digit is lost. `orders`
-    is (j, k, l).
-    """
+    """I_jkl, `orders` (j, k, l), by sine and cosine of |φ| ≤ π/2: no digit is lost near π/2."""
     j, k, last = orders
     s, c2 = sine, cosine * cosine
     one, delta2 = jnp.ones_like(s), c2 + m1 * s * s

@@ -171,9 +171,7 @@ class NewtonEuler(eqx.Module):
 
 
 def on_the_group(state: State) -> State:
-    """The same state with its quaternion, if it has one, scaled to length 1; a known zero is
-    refused.
-    """
+    """The same state with its quaternion, if it has one, scaled to length 1; zero is refused."""
     if isinstance(state, Coupled):
         return eqx.tree_at(lambda s: s.motion, state, on_the_group(state.motion))
     if isinstance(state, HasAttitude):

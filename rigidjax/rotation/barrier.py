@@ -15,9 +15,7 @@ _DROPPED = jax.__version_info__ < (0, 11)
 
 
 def barrier(tree: Tree) -> Tree:
-    """The same numbers, computed once: `jax.lax.optimization_barrier`, or `once` where XLA drops
-    it.
-    """
+    """The same numbers, computed once: `lax.optimization_barrier`, or `once` if XLA drops it."""
     if not _DROPPED:
         return lax.optimization_barrier(tree)
     real = lambda x: jnp.issubdtype(x.dtype, jnp.floating)  # noqa: E731

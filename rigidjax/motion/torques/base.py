@@ -173,9 +173,7 @@ def require_scene(law: Torque | None, state: object, body: object) -> None:
 
 
 def evaluate(torque: Torque, t: ScalarLike, state: HasSpin, body: Inertia | MassProperties) -> Vec3:
-    """The torque's value (3,), N m, body frame; `TypeError` for a force, which acts on `Rigid`
-    only.
-    """
+    """The torque's value (3,), N m, body frame; `TypeError` for a force, which needs a `Rigid`."""
     force, value = act(torque, t, state, body)
     if force is not None:
         raise TypeError(

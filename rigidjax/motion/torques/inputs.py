@@ -161,9 +161,7 @@ def _channels(value: Any, name: str) -> Array:
 
 
 class Row(NamedTuple):
-    """The inputs in a step, or in a part of one: `values` by name, and `delayed` of each `Delayed`
-    input.
-    """
+    """The inputs in (a part of) a step: `values` by name, `delayed` of each `Delayed` input."""
 
     values: Mapping[str, Any]
     delayed: tuple[Any, ...]

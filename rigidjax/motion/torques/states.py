@@ -89,9 +89,7 @@ def first_states(law: Any, t: ScalarLike, state: Any, body: Any) -> tuple[Any, .
 def rates_of(
     law: Any, t: ScalarLike, own: tuple[Any, ...], state: Any, body: Any
 ) -> tuple[Any, ...]:
-    """The derivative of each state, as `own` (see `freeze`); `ValueError` for a shape unlike
-    `state0`.
-    """
+    """The derivative of each state, as `own`; `ValueError` for another shape than `state0`."""
     queue, found = list(own), []
 
     def one(node: Any) -> Any:
