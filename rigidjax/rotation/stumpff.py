@@ -61,7 +61,7 @@ def arctan_ratio(z: Float[Array, "..."]) -> Float[Array, "..."]:
 
 
 def _cosine_or_sinc(k: int, t: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Cos θ (k = 0) or sin θ/θ (k = 1) of t = θ²; beyond π/2, θ is reduced by multiples of π."""
+    """The cosine (k = 0) or sin θ/θ (k = 1) of t = θ²; a θ beyond π/2 is reduced first."""
     limit = (math.pi / 2) ** 2
     far = t > limit
     theta = jnp.sqrt(jnp.where(far, t, 1))
