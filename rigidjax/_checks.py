@@ -123,7 +123,7 @@ def _in_si(value: Any, name: str, wanted: str = "") -> Any:
     )
 
 
-def _dimension(value: Any, unit: Any) -> dict[str, float] | None:
+def _dimension(value: Any, unit: Any) -> dict[str, Any] | None:
     """The powers of SI units in a unit of astropy or pint, angles left out; else `None`."""
     if hasattr(value, "dimensionality"):
         return {_PINT.get(name, str(name)): power for name, power in value.dimensionality.items()}
