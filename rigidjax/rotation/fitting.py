@@ -96,9 +96,9 @@ def align(a: Vec3Like, b: Vec3Like) -> Mat3:
     """The smallest rotation that takes the direction of a into that of b.
 
     **Arguments:** `a`, `b` (3,), in one frame, any lengths. **Returns:** (3, 3), R a ∥ b. If a and
-    b are opposite to round-off it is half a turn; its axis is the normal to a nearest to the basis
-    vector along which a is smallest. The quaternion is (½|m|, a × m/|m|) with m = a + b, which
-    keeps its digits near that case. **Raises:** `ValueError` for known zero or NaN.
+    b are opposite to round-off it is half a turn about a normal to a, as near as possible to the
+    basis vector along which a is smallest. The quaternion is (½|m|, a × m/|m|) with m = a + b,
+    which keeps its digits near that case. **Raises:** `ValueError` for known zero or NaN.
 
     >>> align(jnp.array([1.0, 0, 0]), jnp.array([0, 2.0, 0])).round(12)[:, 0].tolist()
     [0.0, 1.0, 0.0]
