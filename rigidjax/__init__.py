@@ -2,8 +2,12 @@
 
 From the ground up: `quaternion`, `so3`, `euler` and `body`, `motion` and `torques`, `frames`,
 `exact` and `solve` (the motion in closed form, or by a solver), and what uses them: `identify`,
-`estimate`, `batch`, `workprecision`, `plot`. Fields of their own are loaded when they are asked
-for: `elliptic`, `lagrangian`, `orbits`, `tumblers`. Most programs begin with `simulate`.
+`estimate`, `batch`, `workprecision`, `plot`. `elliptic`, `lagrangian`, `orbits` and `tumblers` are
+loaded when they are asked for. Most programs begin with `simulate`.
+
+Every function raises `TypeError` for an argument of another type (also half precision) and
+`ValueError` for a wrong shape; docstrings list the other errors. Under `jit` they are errors of
+`equinox`. Examples know `import rigidjax as rj` and `import jax.numpy as jnp`.
 """
 
 import importlib

@@ -18,20 +18,39 @@ from jaxtyping import Array, ArrayLike, Bool
 
 Numbers = TypeVar("Numbers", bound=Any)
 
+# The units of arguments whose names mean one kind of quantity in the whole library.
+_UNITS = {
+    "omega": "rad/s", "angle": "rad", "angles": "rad", "latitude": "rad",
+    "t": "s", "ts": "s", "dt": "s", "delay": "s", "mass": "kg", "com": "m", "gravity": "m/s²",
+    "i1": "kg m²", "i2": "kg m²", "i3": "kg m²", "inertia tensor": "kg m²", "torque": "N m",
+}  # fmt: skip
+_DIMENSIONS: dict[str, dict[str, int]] = {
+    "rad": {}, "rad/s": {"s": -1}, "s": {"s": 1}, "kg": {"kg": 1}, "m": {"m": 1},
+    "m/s": {"m": 1, "s": -1}, "m/s²": {"m": 1, "s": -2}, "kg m²": {"kg": 1, "m": 2},
+    "N m": {"kg": 1, "m": 2, "s": -2},
+}  # fmt: skip
+_PINT = {"[length]": "m", "[mass]": "kg", "[time]": "s"}
+
 
 def floating(
-    value: Any, shape: tuple[int, ...], name: str, *, hint: str = "", batched: bool = False
+    value: Any,
+    shape: tuple[int, ...],
+    name: str,
+    *,
+    hint: str = "",
+    batched: bool = False,
+    unit: str = "",
 ) -> Array:
     """Return `value` as a float32 or float64 array of exactly `shape`, or say what is wrong.
 
-    **Arguments:** `value` anything array-like; integers become the default float type. `shape` the
-    shape wanted; with `batched` any leading axes may stand before it. `name` the argument's name in
-    the message. `hint` a likely cause, added to a shape message.
+    Integers become the default float type; with `batched`, leading axes may be before `shape`.
+    `name` is the argument's name in messages, and `hint` a likely cause of a wrong shape. A
+    quantity with a unit must be of the kind of `unit`, or of the name's, if there is one.
 
-    **Raises:** `TypeError` for anything but an array of real numbers, and for half precision (its 3
-    digits cannot hold a rotation); `ValueError` for a wrong shape.
+    **Raises:** `TypeError` for anything but an array of real numbers, for half precision (its 3
+    digits cannot hold a rotation), and for another unit; `ValueError` for a wrong shape.
     """
-    array = numbers(value, name)
+    array = numbers(value, name, unit)
     found = array.shape[array.ndim - len(shape) :] if batched else array.shape
     if found != shape:
         many = array.ndim > len(shape) and array.shape[array.ndim - len(shape) :] == shape
@@ -55,12 +74,14 @@ def _and(hint: str) -> str:
 
 def kind(value: Any) -> str:
     """The name of a value's type for a message, or of the class if it is one."""
+    if isinstance(value, jax.Array):
+        return f"an array of shape {value.shape}"
     return f"the class {value.__name__}" if isinstance(value, type) else type(value).__name__
 
 
-def numbers(value: Any, name: str) -> Array:
+def numbers(value: Any, name: str, unit: str = "") -> Array:
     """Return `value` as a float32 or float64 array of any shape, as `floating` does."""
-    value = _in_si(value, name)
+    value = _in_si(value, name, unit)
     try:
         array = jnp.asarray(value)
     except (TypeError, ValueError) as error:
@@ -79,13 +100,19 @@ def numbers(value: Any, name: str) -> Array:
     return array
 
 
-def _in_si(value: Any, name: str) -> Any:
+def _in_si(value: Any, name: str, wanted: str = "") -> Any:
     """Quantities of astropy or pint as numbers in SI; other values as they are."""
     if isinstance(value, (list, tuple)):
-        return type(value)(_in_si(item, name) for item in value) if _has_units(value) else value
+        if not _has_units(value):
+            return value
+        return type(value)(_in_si(item, name, wanted) for item in value)
     unit = getattr(value, "unit", getattr(value, "units", None))
     if unit is None or isinstance(value, jax.Array):
         return value
+    wanted = wanted or _UNITS.get(name, "")
+    kind = _dimension(value, unit)
+    if wanted and kind is not None and kind != _DIMENSIONS[wanted]:
+        raise TypeError(f"{name}: wanted a unit such as {wanted}, got {unit or 'no unit'}")
     if hasattr(value, "si"):
         return np.asarray(value.si.value)
     if hasattr(value, "to_base_units"):
@@ -94,6 +121,17 @@ def _in_si(value: Any, name: str) -> Any:
         f"{name}: wanted plain numbers in SI units, got {type(value).__name__} in {unit}; convert "
         "it to m, kg, s, rad and give its numbers"
     )
+
+
+def _dimension(value: Any, unit: Any) -> dict[str, Any] | None:
+    """The powers of SI units in a unit of astropy or pint, angles left out; else `None`."""
+    if hasattr(value, "dimensionality"):
+        return {_PINT.get(name, str(name)): power for name, power in value.dimensionality.items()}
+    if not hasattr(unit, "decompose"):
+        return None
+    base = unit.decompose()
+    parts = zip(base.bases, base.powers, strict=True)
+    return {str(part.name): power for part, power in parts if part.name != "rad"}
 
 
 def _has_units(values: Any) -> bool:
@@ -178,9 +216,9 @@ def finite(value: Numbers, name: str) -> Numbers:
     return refuse(value, bad.any(), f"{name}: contains NaN or infinity{where}")
 
 
-def given(value: Any, shape: tuple[int, ...], name: str, *, hint: str = "") -> Array:
+def given(value: Any, shape: tuple[int, ...], name: str, **how: Any) -> Array:
     """Return `value` as `floating` does; its numbers must be finite if they are known."""
-    array = floating(value, shape, name, hint=hint)
+    array = floating(value, shape, name, **how)
     return finite(array, name) if known(array) else array
 
 
@@ -222,6 +260,9 @@ def instance(
     if not wanted:
         several = kinds if isinstance(kinds, tuple) else (kinds,)
         wanted = " or ".join(kind.__name__ for kind in several)
+    # A whole solution in the place of its states, a body with mass in the place of its inertia.
+    own = [name for name in ("ys", "inertia") if isinstance(getattr(value, name, None), kinds)]
+    hint = hint or (f"give its .{own[0]}" if own else "")
     raise TypeError(f"{name}: wanted {wanted}, got {kind(value)}{_and(hint)}")
 
 
@@ -323,7 +364,8 @@ def on_host(value: Any, name: str) -> np.ndarray:
     except (TypeError, ValueError) as error:
         raise TypeError(f"{name}: wanted numbers, got {type(value).__name__}") from error
     if array.dtype.kind not in "iuf" and array.dtype != jnp.bfloat16:
-        raise TypeError(f"{name}: wanted numbers, got {type(value).__name__} of {array.dtype}")
+        found = kind(value) if array.dtype == object else f"{kind(value)} of {array.dtype}"
+        raise TypeError(f"{name}: wanted numbers, got {found}")
     return array.astype(float)
 
 

@@ -13,14 +13,14 @@ MOST = 16
 
 
 def numbers(self: Any) -> str:
-    """`Name(field=numbers, …)`; of a traced array or a large one its shape."""
+    """`Name(field=numbers, …)`; a traced or large array is shown by its shape."""
     fields = [(f.name, getattr(self, f.name)) for f in dataclasses.fields(self) if f.repr]
     parts = ", ".join(f"{name}={shown(value)}" for name, value in fields)
     return f"{type(self).__name__}({parts})"
 
 
 def shown(value: Any) -> str:
-    """Numbers; of traced ones or many their shape."""
+    """The numbers of an array, or its shape if it is traced or has many."""
     known = isinstance(value, (jax.Array, np.ndarray)) and not isinstance(value, Tracer)
     if not known or value.size > MOST:
         return eqx.tree_pformat(value)

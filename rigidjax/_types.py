@@ -25,6 +25,7 @@ Vector = Vec3Like | Numbers
 Matrix = Mat3Like | Numbers
 Quaternion = QuatLike | Numbers
 Vectors = Float[ArrayLike, "*batch 3"] | Numbers
+Quaternions = Float[ArrayLike, "*batch 4"] | Numbers
 Matrices = Float[ArrayLike, "*batch 3 3"] | Numbers
 Scalars = Float[ArrayLike, "*batch"] | Numbers | float
 
@@ -33,7 +34,6 @@ Scalars = Float[ArrayLike, "*batch"] | Numbers | float
 class HasSpin(Protocol):
     """A state with a body rate `omega` (rad/s, body frame).
 
-    >>> import rigidjax as rj
     >>> isinstance(rj.Spin([0.0, 0.0, 1.0]), HasSpin), isinstance(rj.Inertia(jnp.eye(3)), HasSpin)
     (True, False)
     """
@@ -46,7 +46,6 @@ class HasSpin(Protocol):
 class HasAttitude(HasSpin, Protocol):
     """A state with a body rate and an attitude `q` (w, x, y, z), body → world.
 
-    >>> import rigidjax as rj
     >>> isinstance(rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 1]), HasAttitude)
     True
     """
@@ -59,7 +58,6 @@ class HasAttitude(HasSpin, Protocol):
 class HasPose(HasAttitude, Protocol):
     """A state with a rate, an attitude, and `x`, `v` of the centre of mass (m, m/s, world frame).
 
-    >>> import rigidjax as rj
     >>> isinstance(rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 1]), HasPose)  # it has no position
     False
     """

@@ -48,6 +48,30 @@ def test_units_become_si(library):
     np.testing.assert_allclose(np.ravel(record.readings[0].sensor.noise), 0.5 * DEGREE)
 
 
+@pytest.mark.usefixtures("unhooked")
+@pytest.mark.parametrize("library", LIBRARIES.values(), ids=LIBRARIES)
+def test_a_unit_of_another_kind_is_refused(library):
+    body = rj.Inertia.from_principal(1.0, 2.0, 2.5)
+    wrong = {
+        "omega: wanted a unit such as rad/s, got m": lambda m, s: rj.Spin([1.0, 2, 3] * m),
+        "omega: wanted a unit such as rad/s": lambda m, s: rj.Attitude([1.0, 0, 0, 0], [1.0 * s, 1 * s, 1 * s]),
+        "x: wanted a unit such as m,": lambda m, s: rj.Rigid([1.0, 0, 0] * s, np.zeros(3), [1.0, 0, 0, 0], np.zeros(3)),
+        "ts: wanted a unit such as s": lambda m, s: rj.simulate(body, rj.Spin([1.0, 0, 0]), [0.0, 1.0] * m),
+        "mass: wanted a unit such as kg": lambda m, s: rj.shapes.sphere(1.0 * m, 1.0),
+        "radius: wanted a unit such as m": lambda m, s: rj.shapes.sphere(1.0, 1.0 * s),
+        "tensor: wanted a unit such as kg m²": lambda m, s: rj.Inertia(np.eye(3) * m),
+        "gravity: wanted a unit such as m/s²": lambda m, s: rj.torques.UniformGravity([0.0, 0, -9.8] * m),
+        "angle: wanted a unit such as rad": lambda m, s: rj.quaternion.about_axis([0.0, 0, 1], 1.0 * m),
+    }  # fmt: skip
+    for words, call in wrong.items():
+        with pytest.raises(TypeError, match=words):
+            call(library("m") * 1.0, library("s") * 1.0)
+    # Angles count as pure numbers, and so a frequency as a rate.
+    rates = of([1.0, 2.0, 3.0], "1 / s", library)
+    assert rj.Spin(rates).omega.tolist() == [1.0, 2.0, 3.0]
+    assert float(rj.quaternion.about_axis([0.0, 0, 1], of(np.pi, "", library))[3]) == 1.0
+
+
 class Foreign:
     units = "deg/s"
 

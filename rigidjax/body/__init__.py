@@ -1,4 +1,4 @@
-"""Bodies: inertia, mass, second moments. Beside it: `rj.shapes`, `rj.volumes`, `rj.parameters`."""
+"""Bodies: inertia, mass, second moments; see also `rj.shapes`, `rj.volumes`, `rj.parameters`."""
 
 from rigidjax._names import show
 from rigidjax.body.divergence import divergence as divergence
@@ -15,9 +15,6 @@ from rigidjax.body.inertials import (
     read_inertials as read_inertials,
     write_inertials as write_inertials,
 )
-from rigidjax.body.principal_axes import (
-    matrix_function as matrix_function,
-    principal as principal,
-)
+from rigidjax.body.principal_axes import matrix_function as matrix_function, principal as principal
 
 show(__name__)

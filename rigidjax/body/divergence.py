@@ -1,4 +1,4 @@
-"""The distance of one body from another, the same in every frame: a prior for fits."""
+"""The divergence of two bodies, a prior for fits that does not depend on the frame."""
 
 from functools import partial
 
@@ -15,18 +15,16 @@ def divergence(body: MassProperties, reference: MassProperties) -> Scalar:
     """Entropic (Bregman, log-determinant) divergence of two bodies, without units.
 
     `D = Tr(J₀⁻¹ J) − log det(J₀⁻¹ J) − 4` with the 4×4 pseudo-inertia
-    `J = [[𝔖 + m c cᵀ, m c], [m cᵀ, m]]`: zero only if the bodies are equal, convex in J, infinite
-    at plates and rods, and unchanged when both bodies are seen from another frame or in other
-    units. Its error is the round-off of the trace. Add `weight * divergence(body, guess)` to a
-    loss, so that quantities which the data do not determine stay near the guess. It is twice the
-    Kullback–Leibler divergence for the mass seen as a Gaussian.
+    `J = [[𝔖 + m c cᵀ, m c], [m cᵀ, m]]`. It is zero only if the bodies are equal, convex in J, and
+    infinite at plates and rods. It does not change if both bodies are seen from another frame or in
+    other units. It is twice the Kullback–Leibler divergence of the masses as Gaussians; its error
+    is the round-off of the trace. Add `weight * divergence(body, guess)` to a loss: quantities that
+    the data do not determine then stay near the guess.
 
     **Arguments:** `body`; `reference` a body with a positive definite 𝔖; the same frame and units.
-
     Source: Lee, Wensing and Park 2020, "Geometric robot dynamic identification: a convex
     programming approach", IEEE T-RO 36:348, doi:10.1109/TRO.2019.2926491.
 
-    >>> import rigidjax as rj
     >>> body = rj.shapes.box(1.0, [1.0, 2.0, 3.0])
     >>> abs(float(divergence(body, body))) < 1e-14
     True
@@ -39,9 +37,5 @@ def divergence(body: MassProperties, reference: MassProperties) -> Scalar:
     seen = partial(solve_triangular, root, lower=True)
     overlap = seen(seen(body.second_moment / body.mass).T)
     d = seen(body.com - reference.com)
-    return (
-        ratio * (jnp.trace(overlap) + dot(d, d) + 1.0)
-        - jnp.linalg.slogdet(overlap)[1]
-        - 4.0 * jnp.log(ratio)
-        - 4.0
-    )
+    distance = ratio * (jnp.trace(overlap) + dot(d, d) + 1.0) - jnp.linalg.slogdet(overlap)[1]
+    return distance - 4.0 * jnp.log(ratio) - 4.0

@@ -1,11 +1,11 @@
 """Kinetic energy and angular momentum of a turning body, and its ellipsoids.
 
-The notes write the energy of rotation in three forms. Printed eqs 61–65 lack the factor ½ that
-eqs 57 and 73–75 have; here all have it and agree. Eqs 73–75, in principal axes, are
-`kinetic_energy` of `Inertia.from_second_moment(jnp.diag(λ))`.
+The notes write the energy of rotation in three forms. Printed eqs 61–65 lack the factor ½ of eqs 57
+and 73–75; here all have it and agree. `kinetic_energy` of `Inertia.from_second_moment(jnp.diag(λ))`
+is eqs 73–75, in principal axes.
 
-Poinsot: free motion rolls the energy ellipsoid on a fixed plane; the rate in the body frame stays
-on the curve where the two ellipsoids of Ω meet. Source: Landau and Lifshitz, Mechanics, § 37.
+Poinsot: in free motion the energy ellipsoid rolls on a fixed plane; the rate in the body frame
+stays on the intersection of the two ellipsoids of Ω. Source: Landau and Lifshitz, Mechanics, § 37.
 """
 
 from typing import Literal
@@ -34,16 +34,12 @@ from rigidjax.rotation.linalg3 import apply, cross, dot, product
 
 
 def kinetic_energy(body: Inertia | MassProperties, state: HasSpin | Vector) -> Scalar:
-    """Kinetic energy of a body in a state of motion, J.
+    """Kinetic energy of a body in a state of motion, J: `T = ½ m |v|² + ½ Ω·IΩ`.
 
-    **Arguments:** `body` an `Inertia` about the point it turns about, or `MassProperties`;
-    `state` anything with `.omega` (Ω, rad/s, body frame), or Ω (3,) itself. Translation counts,
-    too, for `MassProperties` and a state that moves (`.v`, m/s, of the centre of mass, world
-    frame).
-
-    `T = ½ m |v|² + ½ Ω·IΩ`. Source: notes, eqs 75 and 79, in any body axes.
-
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
+    **Arguments:** `body` an `Inertia` about the point it turns about, or `MassProperties`; `state`
+    anything with `.omega` (Ω, rad/s, body frame), or Ω (3,) itself. The first term counts for
+    `MassProperties` and a state that moves (`.v`, m/s, of the centre of mass, world frame). Source:
+    notes, eqs 75 and 79, in any body axes.
 
     >>> kinetic_energy(Inertia.from_principal(1.0, 2.0, 3.0), [1.0, 1.0, 1.0])
     Array(3., dtype=float64)
@@ -60,21 +56,19 @@ def kinetic_energy_about(
 ) -> Scalar:
     """Kinetic energy by the velocity of a point other than the centre of mass, J.
 
-    `T = ½ m |V|² + m V·R(Ω × c) + ½ Ω·I_o Ω`: the notes drop the cross term by choosing the origin
-    at the centre of mass (eqs 54–57).
+    `T = ½ m |V|² + m V·R(Ω × c) + ½ Ω·I_o Ω`. The notes (eqs 54–57) have no cross term: their
+    origin is the centre of mass.
 
-    **Arguments:** `body`; the point is its origin, the zero of `com`. `q` (4,)
-    (w, x, y, z), body → world; `velocity` (3,) V of that point, m/s, world frame; `omega` (3,) Ω,
-    rad/s, body frame.
-
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
+    **Arguments:** `body`; the point is its origin, the zero of `com`. `q` (4,) (w, x, y, z), body →
+    world; `velocity` (3,) V of that point, m/s, world frame; `omega` (3,) Ω, rad/s, body frame.
 
     >>> ball = MassProperties(1.0, [1.0, 0, 0], [[0.0, 0, 0], [0, 0, 0], [0, 0, 0]])
     >>> kinetic_energy_about(ball, [1.0, 0, 0, 0], [0.0, 1, 0], [0.0, 0, 1])
     Array(2., dtype=float64)
     """
     _checks.single(body, MassProperties, "body")
-    velocity, omega = _vector(velocity, "velocity"), _vector(omega, "omega")
+    velocity = _checks.floating(velocity, (3,), "velocity")
+    omega = _omega(omega)
     about_origin = body.inertia_about(jnp.zeros_like(body.com)).tensor
     swing = quaternion.rotate(unit_quaternion(q), cross(omega, body.com))
     return (
@@ -104,8 +98,6 @@ def angular_momentum(body: Inertia | MassProperties, state: HasSpin | Vector) ->
     **Arguments:** `body` an `Inertia` about the point it turns about, or `MassProperties` (then
     about the centre of mass); `state` anything with `.omega`, or Ω (3,) itself, rad/s, body frame.
 
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
-
     >>> angular_momentum(Inertia.from_principal(1.0, 2.0, 3.0), [1.0, 1.0, 1.0])
     Array([1., 2., 3.], dtype=float64)
     """
@@ -115,14 +107,11 @@ def angular_momentum(body: Inertia | MassProperties, state: HasSpin | Vector) ->
 def spatial_angular_momentum(body: Inertia | MassProperties, state: HasAttitude) -> Vec3:
     """Angular momentum in the world frame, `R Π`, (3,), kg m²/s: constant for a free body.
 
-    **Arguments:** as `angular_momentum`; `state` has `.q` (4,), body → world, and `.omega`. The
-    orbital part `m x × v` about the world's origin is added for `MassProperties` and a state that
-    moves (`.x`, `.v`).
+    **Arguments:** as `angular_momentum`; `state` has `.q` (4,), body → world, and `.omega`. For
+    `MassProperties` and a state that moves (`.x`, `.v`) the orbital part `m x × v` about the
+    world's origin is added. **Raises:** `TypeError` for a state without attitude.
 
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype, or a state without attitude.
-
-    >>> from rigidjax import Attitude
-    >>> turned = Attitude([0.0, 1.0, 0, 0], [0.0, 0, 1])
+    >>> turned = rj.Attitude([0.0, 1.0, 0, 0], [0.0, 0, 1])
     >>> spatial_angular_momentum(Inertia.from_principal(1.0, 2.0, 3.0), turned)[2]
     Array(-3., dtype=float64)
     """
@@ -143,7 +132,7 @@ def ellipsoid(
     kind: Literal["energy", "momentum", "mass"],
     size: ScalarLike | None = None,
 ) -> tuple[Vec3, Quat]:
-    """An ellipsoid of a body: of the rates Ω of one energy or momentum, or of equal inertia.
+    """The ellipsoid of the rates Ω of one energy or momentum, or the uniform one of equal inertia.
 
     **Arguments:** `body`; `kind` and `size`:
 
@@ -152,45 +141,33 @@ def ellipsoid(
     - `"mass"`: the uniform solid ellipsoid of the same mass, centre and 𝔖, semi-axes `√(5 λ_k/m)`,
       m, of `MassProperties`, without a `size`. It moves exactly as the body does.
 
-    **Returns** `(semi_axes, q)`: (3,) in the order of ascending moments (of `"mass"`: ascending),
-    and (4,) the rotation principal axes → body axes.
-
-    **Raises:** `ValueError` for another kind, a zero moment or a negative number (`equinox` error
-    under `jit`), `TypeError` for a `size` that is missing or too much.
+    **Returns** `(semi_axes, q)`: (3,) in the order of ascending moments (`"mass"`: ascending), and
+    (4,) the rotation principal axes → body axes. **Raises:** `ValueError` for another kind, a zero
+    moment or a negative number; `TypeError` for a `size` that is missing or not wanted.
 
     >>> ellipsoid(Inertia.from_principal(1.0, 2.0, 2.0), "energy", 4.0)[0]
     Array([2.82842712, 2.        , 2.        ], dtype=float64)
-    >>> import rigidjax as rj
     >>> ellipsoid(rj.shapes.ellipsoid(3.0, [1.0, 2.0, 3.0]), "mass")[0]
     Array([1., 2., 3.], dtype=float64)
     """
     _checks.word(kind, ("energy", "momentum", "mass"), "kind")
     if (size is None) != (kind == "mass"):
         words = {"mass": "no size", "energy": "the energy, J", "momentum": "the momentum, kg m²/s"}
-        raise TypeError(f"size: of the ellipsoid of {kind} wanted {words[kind]}, got {size!r}")
+        raise TypeError(f"size: wanted {words[kind]} for the ellipsoid of {kind}, got {size!r}")
     if kind == "mass":
         solid = _checks.single(body, MassProperties, "body")
         second_moments, q = principal(solid.second_moment)
         return jnp.sqrt(5.0 * second_moments / solid.mass), q
     moments, q = Inertia(_tensor(body)).invertible().principal()
-    if kind == "energy":
-        return jnp.sqrt(2.0 * _not_negative(size, "size", "J") / moments), q
-    return _not_negative(size, "size", "kg m²/s") / moments, q
+    wanted = "a number ≥ 0, J" if kind == "energy" else "a number ≥ 0, kg m²/s"
+    size = _checks.sign(_checks.floating(size, (), "size"), "size", wanted, zero=True)
+    return (jnp.sqrt(2.0 * size / moments) if kind == "energy" else size / moments), q
 
 
 def _omega(state):
-    return _vector(state.omega if isinstance(state, HasSpin) else state, "omega")
-
-
-def _not_negative(value: ScalarLike | None, name: str, unit: str) -> Scalar:
-    number = _checks.floating(value, (), name)
-    return _checks.sign(number, name, f"a number ≥ 0, {unit}", zero=True)
-
-
-def _vector(value, name):
-    return _checks.floating(value, (3,), name)
+    return _checks.floating(state.omega if isinstance(state, HasSpin) else state, (3,), "omega")
 
 
 def _tensor(body: Inertia | MassProperties) -> Mat3:
-    hint = "Inertia.from_tensor makes one of a matrix"
+    hint = "Inertia.from_tensor takes a matrix"
     return tensor_of(_checks.single(body, (Inertia, MassProperties), "body", hint=hint))

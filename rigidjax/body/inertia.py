@@ -1,8 +1,8 @@
 """The inertia of a body, and its mass, centre of mass and second moment.
 
-Two tensors have the same information: the second moment `𝔖 = ∫ r rᵀ dm` (notes, eq 60) and the
-inertia tensor `I = Tr(𝔖) 1 − 𝔖` (eqs 76–78). A matrix is the 𝔖 of a real body exactly if it is
-positive semi-definite; this is the triangle inequality of the moments of I.
+The second moment `𝔖 = ∫ r rᵀ dm` (notes, eq 60) and the inertia tensor `I = Tr(𝔖) 1 − 𝔖`
+(eqs 76–78) have the same information. A matrix is the 𝔖 of a real body exactly if it is positive
+semi-definite; for the moments of I this is the triangle inequality.
 """
 
 from typing import TypeVar
@@ -41,13 +41,11 @@ class Inertia(eqx.Module):
     """The inertia tensor I of a body about the point it turns about.
 
     **Arguments:** `tensor` (3, 3), kg m², body frame. The constructor checks shape and dtype only;
-    `from_tensor`, `from_principal` and `from_second_moment` also check that the body is real.
-    Leading axes are allowed in a container of many bodies; methods take one.
+    `from_tensor`, `from_principal` and `from_second_moment` also check that the body is real. A
+    container of many bodies has leading axes; methods take one body.
 
-    The object stores I, not 𝔖: `from_tensor` is then the identity, and the small moment of a rod
-    keeps all its digits. Source: notes, eqs 76–78.
-
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
+    The object stores I, not 𝔖: `from_tensor` changes no digit, and the small moment of a rod keeps
+    all its digits. Source: notes, eqs 76–78.
 
     >>> Inertia.from_principal(1.0, 2.0, 2.5).moments
     Array([1. , 2. , 2.5], dtype=float64)
@@ -58,18 +56,19 @@ class Inertia(eqx.Module):
     __repr__ = _show.numbers
 
     def __init__(self, tensor: Matrices):
-        hint = "of principal moments Inertia.from_principal makes one"
-        self.tensor = _checks.floating(tensor, (3, 3), "tensor", batched=True, hint=hint)
+        hint = "Inertia.from_principal takes principal moments"
+        self.tensor = _checks.floating(
+            tensor, (3, 3), "tensor", batched=True, hint=hint, unit="kg m²"
+        )
 
     @staticmethod
     def from_tensor(tensor: Matrix) -> "Inertia":
         """A body with this inertia tensor.
 
-        **Arguments:** `tensor` (3, 3), kg m², body frame, about the point it turns about.
-        Plates, rods and points (zero second moments) are bodies.
-
-        **Raises:** `ValueError` (`equinox` error under `jit`) if it is not symmetric to a few
-        units of round-off, has a negative moment, or breaks `I1 + I2 ≥ I3`.
+        **Arguments:** `tensor` (3, 3), kg m², body frame, about the point it turns about. Plates,
+        rods and points (zero second moments) are bodies. **Raises:** `ValueError` (`equinox` error
+        under `jit`) if it is not symmetric to a few units of round-off, has a negative moment, or
+        breaks `I1 + I2 ≥ I3`.
 
         >>> Inertia.from_tensor([[2.0, 0.1, 0], [0.1, 2, 0], [0, 0, 3]]).tensor.shape
         (3, 3)
@@ -79,11 +78,7 @@ class Inertia(eqx.Module):
 
     @staticmethod
     def from_principal(i1: ScalarLike, i2: ScalarLike, i3: ScalarLike) -> "Inertia":
-        """A body whose principal axes are the body axes.
-
-        **Arguments:** `i1`, `i2`, `i3` scalars, kg m², about the first, second and third axis.
-
-        **Raises:** as `from_tensor`.
+        """A body with moments `i1`, `i2`, `i3`, kg m², about the body axes; else as `from_tensor`.
 
         >>> Inertia.from_principal(1.0, 2.0, 3.0).tensor[2, 2]
         Array(3., dtype=float64)
@@ -93,19 +88,16 @@ class Inertia(eqx.Module):
 
     @staticmethod
     def from_second_moment(second_moment: Matrix) -> "Inertia":
-        """A body with this second moment: `I = Tr(𝔖) 1 − 𝔖`.
+        """A body with this second moment: `I = Tr(𝔖) 1 − 𝔖` (notes, eqs 60, 76–78).
 
         **Arguments:** `second_moment` (3, 3) 𝔖 = ∫ r rᵀ dm, kg m², body frame, about the point it
-        turns about. Source: notes, eqs 60, 76–78.
+        turns about. **Raises:** `ValueError` (`equinox` error under `jit`) if it is not symmetric
+        and positive semi-definite to a few units of round-off.
 
-        **Raises:** `ValueError` (`equinox` error under `jit`) if it is not symmetric, or not
-        positive semi-definite, to a few units of round-off.
-
-        >>> import jax.numpy as jnp
         >>> Inertia.from_second_moment(jnp.diag(jnp.array([2.0, 1.0, 0.0]))).moments
         Array([1., 2., 3.], dtype=float64)
         """
-        s = _checks.floating(second_moment, (3, 3), "second moment")
+        s = _checks.floating(second_moment, (3, 3), "second moment", unit="kg m²")
         return Inertia(swap_trace(validation.real_second_moment(s)))
 
     @property
@@ -122,8 +114,8 @@ class Inertia(eqx.Module):
         """Principal moments, ascending, and the rotation principal axes → body axes.
 
         **Returns** `(moments, q)`, (3,) kg m² and (4,), with `I = R(q) diag(moments) R(q)ᵀ`.
-        Derivatives are finite for any body, also at equal moments: see `rigidjax.body.principal`
-        for their meaning there.
+        Derivatives are finite for any body; `rigidjax.body.principal` says what they mean at equal
+        moments.
 
         >>> Inertia.from_principal(3.0, 2.0, 2.5).principal()[0]
         Array([2. , 2.5, 3. ], dtype=float64)
@@ -131,22 +123,22 @@ class Inertia(eqx.Module):
         return principal(self.tensor)
 
     def shifted(self, r: Vector, mass: ScalarLike) -> "Inertia":
-        """The inertia about a point away from the centre of mass (parallel axis).
+        """The inertia about a point away from the centre of mass: `I + m (|r|² 1 − r rᵀ)`.
 
-        `I + m (|r|² 1 − r rᵀ)`. **Arguments:** `self` about the centre of mass; `r` (3,) from the
-        centre of mass to the new point (or back: the sign does not matter), m, body frame; `mass`
-        kg. A negative `mass` undoes a shift. Source: Steiner; Landau and Lifshitz, eq 32.12.
+        **Arguments:** `self` about the centre of mass; `r` (3,) from the centre of mass to the new
+        point or back, m, body frame; `mass` kg; a negative one undoes a shift. Source: Steiner;
+        Landau and Lifshitz, eq 32.12.
 
         >>> Inertia.from_principal(1.0, 1.0, 1.0).shifted([0.0, 0.0, 2.0], 3.0).moments
         Array([ 1., 13., 13.], dtype=float64)
         """
-        r, m = _checks.floating(r, (3,), "r"), _checks.floating(mass, (), "mass")
+        r, m = _checks.floating(r, (3,), "r", unit="m"), _checks.floating(mass, (), "mass")
         return Inertia(self.tensor + swap_trace(m * outer(r, r)))
 
     def rotated(self, q: Quaternion) -> "Inertia":
         """The same body turned, or seen from other axes: `R(q) I R(q)ᵀ`.
 
-        **Arguments:** `q` (4,) unit quaternion (w, x, y, z), active: a feature at `r` is then at
+        **Arguments:** `q` (4,) unit quaternion (w, x, y, z), active: what was at `r` is then at
         `R(q) r`. With q body → world this is the inertia in world axes.
 
         >>> half = 0.5**0.5
@@ -157,13 +149,7 @@ class Inertia(eqx.Module):
         return Inertia(product(m, product(self.tensor, m.T)))
 
     def invertible(self) -> "Inertia":
-        """The same body, refused if a moment is zero: Euler's equations divide by all three.
-
-        **Raises:** `ValueError` (`equinox` error under `jit`) for a thin rod or a point.
-
-        >>> Inertia.from_principal(1.0, 2.0, 2.5).invertible().moments
-        Array([1. , 2. , 2.5], dtype=float64)
-        """
+        """The same body; `ValueError` if a moment, by which Euler's equations divide, is zero."""
         return validation.possible(self, self.tensor, None, throw=True)
 
     def __add__(self, other: "Inertia") -> "Inertia":
@@ -179,13 +165,13 @@ class MassProperties(eqx.Module):
     """Mass, centre of mass and second moment of a body.
 
     **Arguments:** `mass` m, kg; `com` (3,) centre of mass c, m, body frame (from the body's
-    origin); `second_moment` (3, 3) 𝔖 **about the centre of mass**, kg m², body axes (notes,
-    eq 60). Values that are known (not traced) are checked; under `jit` call `checked`. Leading
-    axes are allowed in a container of many bodies; methods take one.
+    origin); `second_moment` (3, 3) 𝔖 **about the centre of mass**, kg m², body axes (notes, eq 60).
+    Known values are checked; for traced ones call `checked`. A container of many bodies has leading
+    axes; methods take one body.
 
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype, leading axes that differ (a
-    body has one mass, not one for each axis), a mass that is not positive, a centre of mass that is
-    not finite, a second moment that is not symmetric and positive semi-definite.
+    **Raises:** `ValueError` for leading axes that differ (a body has one mass, not one for each
+    axis), a mass that is not positive, a centre of mass that is not finite, a second moment that is
+    not symmetric and positive semi-definite.
 
     >>> MassProperties(2.0, [0.0, 0, 0], [[1.0, 0, 0], [0, 1, 0], [0, 0, 1]]).inertia.moments
     Array([2., 2., 2.], dtype=float64)
@@ -201,11 +187,11 @@ class MassProperties(eqx.Module):
         mass = _checks.floating(mass, (), "mass", batched=True)
         com = _checks.floating(com, (3,), "com", batched=True)
         if isinstance(second_moment, Inertia):
-            raise TypeError(
-                "second_moment: wanted 𝔖 = ∫ r rᵀ dm about the centre of mass, (3, 3), got an "
-                "Inertia; give its .second_moment"
-            )
-        second_moment = _checks.floating(second_moment, (3, 3), "second_moment", batched=True)
+            words = "second_moment: wanted 𝔖 about the centre of mass, got an Inertia"
+            raise TypeError(f"{words}; give its .second_moment")
+        second_moment = _checks.floating(
+            second_moment, (3, 3), "second_moment", batched=True, unit="kg m²"
+        )
         _checks.same_batch(mass=(mass, 0), com=(com, 1), second_moment=(second_moment, 2))
         dtype = jnp.result_type(mass, com, second_moment)
         self.mass = validation.mass_of_a_body(mass.astype(dtype))
@@ -219,13 +205,7 @@ class MassProperties(eqx.Module):
         return Inertia(swap_trace(self.second_moment))
 
     def checked(self) -> "MassProperties":
-        """The same body, its values checked also under `jit`.
-
-        **Raises:** `ValueError` (`equinox` error under `jit`) as the constructor.
-
-        >>> MassProperties(1.0, [0.0, 0, 0], [[1.0, 0, 0], [0, 1, 0], [0, 0, 1]]).checked().mass
-        Array(1., dtype=float64)
-        """
+        """The same body, its values checked also under `jit`. **Raises:** as the constructor."""
         return MassProperties(
             validation.real_mass(self.mass),
             _checks.finite(self.com, "com"),
@@ -233,20 +213,14 @@ class MassProperties(eqx.Module):
         )
 
     def invertible(self) -> "MassProperties":
-        """The same body, refused if a moment about its centre of mass is zero.
-
-        **Raises:** `ValueError` (`equinox` error under `jit`) for a thin rod or a point.
-
-        >>> MassProperties(1.0, [0.0, 0, 0], [[1.0, 0, 0], [0, 1, 0], [0, 0, 1]]).invertible().mass
-        Array(1., dtype=float64)
-        """
+        """The same body; `ValueError` if a moment about its centre of mass is zero."""
         return validation.possible(self, self.inertia.tensor, self.mass, throw=True)
 
     def second_moment_about(self, point: Vector) -> Mat3:
-        """𝔖 about another point: `𝔖 + m d dᵀ`, `d = c − point`.
+        """𝔖 about another point, (3, 3), kg m², body axes: `𝔖 + m d dᵀ`, `d = c − point`.
 
-        **Arguments:** `point` (3,) m, body frame. **Returns** (3, 3), kg m², body axes. Source:
-        eq 60 of the notes with `r' = (r' − c) + d`; the cross terms vanish.
+        **Arguments:** `point` (3,) m, body frame. Source: eq 60 of the notes with
+        `r' = (r' − c) + d`; the cross terms vanish.
 
         >>> body = MassProperties(2.0, [1.0, 0, 0], [[1.0, 0, 0], [0, 1, 0], [0, 0, 1]])
         >>> body.second_moment_about([0.0, 0, 0])[0, 0]
@@ -256,9 +230,7 @@ class MassProperties(eqx.Module):
         return self.second_moment + self.mass * outer(d, d)
 
     def inertia_about(self, point: Vector) -> Inertia:
-        """The inertia about another point of the body, such as a pivot.
-
-        **Arguments:** `point` (3,) m, body frame.
+        """The inertia about another `point` (3,) of the body, m, body frame, such as a pivot.
 
         >>> body = MassProperties(2.0, [1.0, 0, 0], [[1.0, 0, 0], [0, 1, 0], [0, 0, 1]])
         >>> body.inertia_about([0.0, 0, 0]).moments
@@ -278,9 +250,7 @@ class MassProperties(eqx.Module):
         )
 
     def rotated(self, q: Quaternion) -> "MassProperties":
-        """The body turned about its origin: `c → R c`, `𝔖 → R 𝔖 Rᵀ`.
-
-        **Arguments:** `q` (4,) unit quaternion (w, x, y, z), active.
+        """The body turned about its origin by `q` (4,) unit, active: `c → R c`, `𝔖 → R 𝔖 Rᵀ`.
 
         >>> body = MassProperties(2.0, [1.0, 0, 0], [[1.0, 0, 0], [0, 1, 0], [0, 0, 1]])
         >>> body.rotated([0.0, 0, 0, 1]).com

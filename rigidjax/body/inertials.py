@@ -9,6 +9,7 @@ import numpy as np
 
 from rigidjax import _checks
 from rigidjax.body.inertia import MassProperties
+from rigidjax.body.symmetric3 import PAIRS
 from rigidjax.rotation import euler, quaternion
 
 # The tolerance of the triangle inequality, since files are rounded.
@@ -16,16 +17,16 @@ ROUNDED = 1e-6
 
 
 def read_inertials(path: str | Path) -> dict[str, MassProperties]:
-    """The bodies with inertia in a URDF or MuJoCo XML file, by name.
+    """The bodies with inertia in a URDF or MuJoCo XML file, by name, in the frame of the link or
+    body.
 
-    In the frame of the link or body. URDF: `<inertial>` with `origin` (`xyz`, `rpy`), `mass`,
-    `inertia`. MuJoCo: `<inertial>` with `mass`, `pos`, `quat`, `diaginertia` or `fullinertia`;
-    an inertia that MuJoCo would compute from geometry is not read.
+    URDF: `<inertial>` with `origin` (`xyz`, `rpy`), `mass`, `inertia`. MuJoCo: `<inertial>` with
+    `mass`, `pos`, `quat`, `diaginertia` or `fullinertia`; an inertia that MuJoCo would compute from
+    geometry is not read.
 
-    **Arguments:** `path` of the file. **Returns** name → `MassProperties`, in order.
-
-    **Raises:** `ValueError`, naming file and body, for a file that is missing or of another format,
-    an invalid number, an orientation in another form, an inertia of no real body.
+    **Arguments:** `path` of the file. **Returns** name → `MassProperties`, in order. **Raises:**
+    `ValueError`, with file and body, for a file that is missing or of another format, an invalid
+    number, an orientation in another form, an inertia of no real body.
 
     >>> read_inertials("missing.urdf")
     Traceback (most recent call last):
@@ -48,11 +49,10 @@ def read_inertials(path: str | Path) -> dict[str, MassProperties]:
 def write_inertials(
     path: str | Path, bodies: Mapping[str, MassProperties], source: str | Path
 ) -> None:
-    """A copy of a URDF or MuJoCo XML file with the inertials of these bodies in it.
+    """Copy a URDF or MuJoCo XML file, with these bodies in the place of its inertials.
 
     **Arguments:** `path` of the new file; `bodies` name → `MassProperties`, in the frames of the
-    file's links or bodies; `source` the file to copy; the rest of it stays.
-
+    file's links or bodies; `source` the file to copy; its other content does not change.
     **Raises:** `ValueError` as `read_inertials`, and for a name that is not in the file;
     `TypeError` for anything but `MassProperties`.
 
@@ -135,10 +135,7 @@ def _body(mass: float, place: np.ndarray, turn: Any, tensor: np.ndarray) -> Mass
     moments = np.linalg.eigvalsh(tensor)
     if not moments[2] > 0 or least < -ROUNDED * moments[2]:
         shown = ", ".join(f"{moment:.6g}" for moment in moments)
-        raise ValueError(
-            f"no body has the moments {shown}: the largest is more than the sum of the others, or "
-            "one is not positive"
-        )
+        raise ValueError(f"no body has the moments {shown}: I1 + I2 ≥ I3 and I1 ≥ 0 are wanted")
     if least < 0:
         second = second - least * np.eye(3)
     return MassProperties(mass, place, second)
@@ -167,9 +164,8 @@ def _to_urdf(inertial: Tree.Element, body: MassProperties) -> None:
     tensor = np.asarray(body.inertia.tensor)
     Tree.SubElement(inertial, "origin", xyz=_text(body.com), rpy="0 0 0")
     Tree.SubElement(inertial, "mass", value=_text(body.mass))
-    entries = zip(
-        ("ixx", "ixy", "ixz", "iyy", "iyz", "izz"), tensor[np.triu_indices(3)], strict=True
-    )
+    names = "ixx", "ixy", "ixz", "iyy", "iyz", "izz"
+    entries = zip(names, tensor[np.triu_indices(3)], strict=True)
     Tree.SubElement(inertial, "inertia", {key: _text(entry) for key, entry in entries})
 
 
@@ -177,5 +173,4 @@ def _to_mujoco(inertial: Tree.Element, body: MassProperties) -> None:
     tensor = np.asarray(body.inertia.tensor)
     inertial.set("mass", _text(body.mass))
     inertial.set("pos", _text(body.com))
-    order = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
-    inertial.set("fullinertia", _text([tensor[at] for at in order]))
+    inertial.set("fullinertia", _text([tensor[at] for at in PAIRS]))

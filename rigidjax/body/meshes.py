@@ -1,10 +1,9 @@
 """Mass properties of the solid inside a closed triangle mesh, by exact integrals.
 
-The solid is a signed sum of tetrahedra from one inner point to each face; over a tetrahedron with
-corners 0, a, b, c the integrals of 1, r and r rᵀ are polynomials of a, b, c. The result is
-therefore exact up to round-off and differentiable in the vertices. The mesh is first shifted to its
-centroid, to keep all digits far from the origin: a sum about the origin subtracts numbers of size
-(distance)⁵.
+The solid is a signed sum of tetrahedra from one inner point to each face. Over a tetrahedron with
+corners 0, a, b, c the integrals of 1, r and r rᵀ are polynomials of a, b, c, so that the result is
+exact to round-off and differentiable in the vertices. The mesh is first shifted to its centroid:
+far from the origin a sum about the origin would subtract numbers of size (distance)⁵.
 """
 
 import os
@@ -19,7 +18,7 @@ from jaxtyping import Array, ArrayLike, Float, Int
 from rigidjax import _checks
 from rigidjax._types import Numbers, ScalarLike
 from rigidjax.body.inertia import MassProperties
-from rigidjax.body.symmetric3 import from_components
+from rigidjax.body.symmetric3 import PAIRS, from_components
 
 
 def mesh(
@@ -29,15 +28,14 @@ def mesh(
 ) -> MassProperties:
     """The solid of one density inside a closed triangle mesh.
 
-    **Arguments:** `vertices` (n, 3) m, body frame; `faces` (m, 3) vertex numbers from 0, counter-
-    clockwise seen from outside; holes inside are closed meshes turned the other way; `density`
-    kg/m³. Differentiable in `vertices` and `density`. Faces without area are harmless and allowed.
-
-    Source: integrals over a tetrahedron, e.g. Tonon 2004, J. Math. Stat. 1:8.
+    **Arguments:** `vertices` (n, 3) m, body frame; `faces` (m, 3) vertex numbers from 0,
+    counter-clockwise seen from outside (a hole inside is a closed mesh with the opposite order);
+    `density` kg/m³. It is differentiable in `vertices` and `density`. Faces without area are
+    allowed. Source: integrals over a tetrahedron, e.g. Tonon 2004, J. Math. Stat. 1:8.
 
     **Raises:** `ValueError` for a mesh that is open, whose faces disagree about outside, that is
-    inside out, or has a face with a repeated or missing vertex; `TypeError`, `ValueError` for
-    dtypes and shapes. Under `jit` the faces are checked if they are known.
+    inside out, or has a face with a repeated or missing vertex. Under `jit` the faces are checked
+    if they are known.
 
     >>> corners = [[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]
     >>> body = mesh(corners, [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], density=6.0)
@@ -65,12 +63,11 @@ def mesh_file(
 ) -> MassProperties:
     """The solid inside a closed mesh read from a file: STL, OBJ, PLY, OFF, GLB, …
 
-    Needs `trimesh` (`pip install "rigidjax[mesh]"`), which also merges equal vertices.
+    It needs `trimesh` (`pip install "rigidjax[mesh]"`), which also merges equal vertices.
 
     **Arguments:** `path` of the file; `density` kg/m³; `scale` metres per unit of the file (most
-    STL files are in millimetres: 1e-3).
-
-    **Raises:** `FileNotFoundError`; `ImportError` without trimesh; otherwise as `mesh`.
+    STL files are in millimetres: 1e-3). **Raises:** `FileNotFoundError`; `ImportError` without
+    trimesh; otherwise as `mesh`.
 
     >>> import tempfile
     >>> corner = "v 0 0 0;v 1 0 0;v 0 1 0;v 0 0 1;f 1 3 2;f 1 2 4;f 1 4 3;f 2 3 4"
@@ -113,9 +110,7 @@ def _second_moment(corners, faces):
         corner = a[:, i] * a[:, j] + b[:, i] * b[:, j] + c[:, i] * c[:, j]
         return (six * (s[:, i] * s[:, j] + corner)).sum() / 120.0
 
-    return from_components(
-        entry(0, 0), entry(1, 1), entry(2, 2), entry(0, 1), entry(0, 2), entry(1, 2)
-    )
+    return from_components(*(entry(i, j) for i, j in PAIRS))
 
 
 def _six_volumes(a, b, c):
@@ -133,19 +128,14 @@ def _outward(volume, corners, faces):
     area = 0.5 * jnp.sqrt((jnp.cross(b - a, c - a) ** 2).sum(axis=1)).sum()
     slack = 4.0 * jnp.finfo(corners.dtype).eps * jax.lax.stop_gradient(longest) * area
     found = f" (volume {float(volume):.6g} m³)" if _checks.known(volume) else ""
-    volume = _checks.refuse(
-        volume,
-        volume < -slack,
-        f"mesh: it is inside out{found}: its faces turn clockwise seen from outside; give "
-        "faces[:, ::-1]",
-    )
-    return _checks.refuse(
-        volume, ~(volume > slack), f"mesh: it encloses no volume{found}; for a flat body use plate"
-    )
+    words = f"mesh: it is inside out{found}: its faces are clockwise; give faces[:, ::-1]"
+    volume = _checks.refuse(volume, volume < -slack, words)
+    words = f"mesh: it encloses no volume{found}; for a flat body use plate"
+    return _checks.refuse(volume, ~(volume > slack), words)
 
 
 def faces_of(faces: Any, n: int) -> Array:
-    """The faces as an array (m, 3) of vertex numbers below n, checked where they are known."""
+    """The faces as an array (m, 3) of vertex numbers below n, checked if they are known."""
     if not _checks.known(faces):
         return faces
     try:
@@ -157,16 +147,13 @@ def faces_of(faces: Any, n: int) -> Array:
     if table.ndim != 2 or table.shape[1] != 3 or len(table) == 0:
         raise ValueError(f"faces: wanted shape (m, 3), triangles, got {table.shape}")
     if table.min() < 0 or table.max() >= n:
-        raise ValueError(
-            f"faces: wanted vertex numbers from 0 to {n - 1}, got {table.min()} to {table.max()}; "
-            "OBJ files count from 1"
-        )
+        found = f"{table.min()} to {table.max()}; OBJ files count from 1"
+        raise ValueError(f"faces: wanted vertex numbers from 0 to {n - 1}, got {found}")
     repeated = (table == np.roll(table, 1, axis=1)).any(axis=1)
     if repeated.any():
         which = int(np.argmax(repeated))
-        raise ValueError(
-            f"mesh: face {which} is degenerate, it names a vertex twice: {_tuple(table[which])}"
-        )
+        words = f"mesh: face {which} is degenerate, it names a vertex twice"
+        raise ValueError(f"{words}: {_tuple(table[which])}")
     edges = np.concatenate([table[:, [0, 1]], table[:, [1, 2]], table[:, [2, 0]]])
     number, reverse = (edges[:, k] * np.int64(n) + edges[:, 1 - k] for k in (0, 1))
     unique, counts = np.unique(number, return_counts=True)
@@ -191,7 +178,7 @@ def faces_of(faces: Any, n: int) -> Array:
         if paired[edge] != paired.get(back, 0):
             raise ValueError(
                 f"mesh: the edge {_tuple((edge // n, edge % n))} is used {paired[edge]} times one "
-                f"way and {paired.get(back, 0)} times the other; it must be as often both ways"
+                f"way and {paired.get(back, 0)} times the other; both numbers must be equal"
             )
     return jnp.asarray(table)
 

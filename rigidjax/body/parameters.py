@@ -1,11 +1,11 @@
 """Unconstrained numbers ↔ real bodies.
 
-The second moment is the square of a symmetric matrix, 𝔖 ∝ (1 + V)² with V trace-free, so that any
-vector is a body: an optimiser needs no constraint and always has a real body. Plates and rods are
-ordinary points: their root has a zero eigenvalue. In the log-Cholesky chart (Rucker and Wensing
-2022, doi:10.1109/LRA.2022.3144517) they lie at infinity; in Cholesky's factor itself a small turn
-of a plate is a large step. A vector with a negative eigenvalue of 1 + V has the same body as
-another vector without one, which `pack` returns.
+The second moment is the square of a symmetric matrix, 𝔖 ∝ (1 + V)² with V trace-free. Every vector
+is then a real body, and an optimiser needs no constraint. Plates and rods are ordinary points:
+their root has a zero eigenvalue. (In the log-Cholesky chart of Rucker and Wensing 2022,
+doi:10.1109/LRA.2022.3144517, they lie at infinity; in Cholesky's factor itself a small turn of a
+plate is a large step.) If 1 + V has a negative eigenvalue, another vector without one has the same
+body; `pack` returns that vector.
 """
 
 from collections.abc import Callable
@@ -32,18 +32,16 @@ def pack(body: MassProperties) -> Float[Array, "10"]:
 
     **Arguments:** `body`, also a plate or a rod. **Returns** (10,)
     `(α, ρ, d1, d2, s12, s23, s13, t1, t2, t3)`: `mass = e^{2α}`, `com = t` (m, body frame), and
-    about the centre of mass `𝔖 / mass` as in `pack_second_moment`, ρ the logarithm of a length (m).
+    `𝔖 / mass` about the centre of mass as in `pack_second_moment`, with ρ the logarithm of a length
+    (m). **Raises:** `ValueError` (`equinox` error under `jit`) for a point.
 
-    **Raises:** `ValueError` (`equinox` error under `jit`) for a point.
-
-    >>> import rigidjax as rj
     >>> vector = pack(rj.shapes.box(2.0, [0.1, 0.2, 0.3]))
     >>> round(float(unpack(vector).mass), 12)
     2.0
     """
     if not isinstance(body, MassProperties):
         raise TypeError(
-            f"pack: wanted MassProperties, got {type(body).__name__}; of an Inertia use "
+            f"pack: wanted MassProperties, got {type(body).__name__}; for an Inertia use "
             "pack_second_moment(body.second_moment), or pack_shape for its ratios alone"
         )
     _checks.single(body, MassProperties, "body")
@@ -53,15 +51,12 @@ def pack(body: MassProperties) -> Float[Array, "10"]:
 
 
 def unpack(vector: Float[ArrayLike, "10"] | Numbers) -> MassProperties:
-    """The body of ten unconstrained numbers: any ten.
+    """The body of any ten unconstrained numbers.
 
-    **Arguments:** `vector` (10,) as `pack` returns them. Exponents beyond what the dtype can hold
-    (|α|, |α + ρ| over 330 in float64, 31 in float32) grow logarithmically instead, so that an
-    optimiser's step that is much too long gives a large body and not an infinity.
+    **Arguments:** `vector` (10,) as `pack` returns them. Exponents beyond the range of the dtype
+    (|α|, |α + ρ| over 330 in float64, 31 in float32) grow logarithmically instead: a step of an
+    optimiser that is much too long gives a large body, not an infinite one.
 
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
-
-    >>> import jax.numpy as jnp
     >>> unpack(jnp.zeros(10)).inertia.moments
     Array([2., 2., 2.], dtype=float64)
     """
@@ -75,11 +70,9 @@ def pack_second_moment(second_moment: Matrix) -> Float[Array, "6"]:
     """Six unconstrained numbers of a second moment.
 
     **Arguments:** `second_moment` (3, 3) 𝔖, kg m², positive semi-definite. **Returns** (6,)
-    `(ρ, d1, d2, s12, s23, s13)`: `Tr 𝔖 = 3 e^{2ρ}`, and the shape as in `pack_shape`.
+    `(ρ, d1, d2, s12, s23, s13)`: `Tr 𝔖 = 3 e^{2ρ}`, and the shape as in `pack_shape`. **Raises:**
+    `ValueError` (`equinox` error under `jit`) for an invalid or zero second moment.
 
-    **Raises:** `ValueError` (`equinox` error under `jit`) for an invalid or zero second moment.
-
-    >>> import jax.numpy as jnp
     >>> pack_second_moment(jnp.eye(3))
     Array([0., 0., 0., 0., 0., 0.], dtype=float64)
     """
@@ -87,13 +80,8 @@ def pack_second_moment(second_moment: Matrix) -> Float[Array, "6"]:
 
 
 def unpack_second_moment(vector: Float[ArrayLike, "6"] | Numbers) -> Mat3:
-    """The second moment (3, 3), kg m², of six unconstrained numbers.
+    """The second moment (3, 3), kg m², of a `vector` (6,) as of `pack_second_moment`.
 
-    **Arguments:** `vector` (6,) as `pack_second_moment` returns them.
-
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
-
-    >>> import jax.numpy as jnp
     >>> unpack_second_moment(jnp.zeros(6))[0]
     Array([1., 0., 0.], dtype=float64)
     """
@@ -102,16 +90,14 @@ def unpack_second_moment(vector: Float[ArrayLike, "6"] | Numbers) -> Mat3:
 
 
 def pack_shape(second_moment: Matrix) -> Float[Array, "5"]:
-    """Five unconstrained numbers of a second moment up to its scale.
+    """Five unconstrained numbers of a second moment up to its scale: free motion depends only on
+    them.
 
-    Free motion depends only on this: the ratios of inertia and the axes. **Arguments:**
-    `second_moment` (3, 3) 𝔖, positive semi-definite, any units. **Returns** (5,)
-    `(d1, d2, s12, s23, s13)`: the root √𝔖 scaled to trace 3 is `1 + V`, V symmetric with
-    `(d1, d2, −d1 − d2)` on its diagonal and `s_ij` beside it.
+    **Arguments:** `second_moment` (3, 3) 𝔖, positive semi-definite, any units. **Returns** (5,)
+    `(d1, d2, s12, s23, s13)`: the root √𝔖 scaled to trace 3 is `1 + V`, where V is symmetric with
+    the diagonal `(d1, d2, −d1 − d2)` and the other entries `s_ij`. **Raises:** `ValueError`
+    (`equinox` error under `jit`) for an invalid or zero second moment.
 
-    **Raises:** `ValueError` (`equinox` error under `jit`) for an invalid or zero second moment.
-
-    >>> import jax.numpy as jnp
     >>> pack_shape(jnp.diag(jnp.array([4.0, 4.0, 0.0])))  # a plate
     Array([0.5, 0.5, 0. , 0. , 0. ], dtype=float64)
     """
@@ -119,13 +105,8 @@ def pack_shape(second_moment: Matrix) -> Float[Array, "5"]:
 
 
 def unpack_shape(vector: Float[ArrayLike, "5"] | Numbers) -> Mat3:
-    """The second moment (3, 3) of trace 1 (so `Tr I = 2`) of five unconstrained numbers.
+    """The second moment (3, 3) of trace 1 (so `Tr I = 2`) of a `vector` (5,) as of `pack_shape`.
 
-    **Arguments:** `vector` (5,) as `pack_shape` returns them.
-
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
-
-    >>> import jax.numpy as jnp
     >>> float(jnp.trace(unpack_shape(jnp.ones(5))))
     1.0
     """
@@ -133,11 +114,10 @@ def unpack_shape(vector: Float[ArrayLike, "5"] | Numbers) -> Mat3:
 
 
 def pack_moments(moments: Vector) -> Float[Array, "3"]:
-    """Three unconstrained numbers of principal moments, the axes being known.
+    """Three unconstrained numbers of principal moments whose axes are known.
 
     **Arguments:** `moments` (3,) I1, I2, I3 in any order, kg m². **Returns** (3,) `(ρ, d1, d2)` as
     in `pack_second_moment`, of the second moments `λ1 = ½(I2 + I3 − I1)`, … (notes, eqs 76–78).
-
     **Raises:** `ValueError` (`equinox` error under `jit`) for moments of no body, or of a point.
 
     >>> pack_moments([2.0, 2.0, 2.0])
@@ -151,11 +131,7 @@ def pack_moments(moments: Vector) -> Float[Array, "3"]:
 
 
 def unpack_moments(vector: Float[ArrayLike, "3"] | Numbers) -> Vec3:
-    """Principal moments (3,), kg m², of three unconstrained numbers, always a body's.
-
-    **Arguments:** `vector` (3,) as `pack_moments` returns them.
-
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
+    """Principal moments (3,), kg m², of a `vector` (3,) as of `pack_moments`: of a real body.
 
     >>> unpack_moments([0.0, 0.0, 0.0])
     Array([2., 2., 2.], dtype=float64)
@@ -169,16 +145,15 @@ def unpack_moments(vector: Float[ArrayLike, "3"] | Numbers) -> Vec3:
 def flat_bend(
     shape: Float[ArrayLike, "5"] | Numbers, slope: Float[ArrayLike, "5"] | Numbers
 ) -> Float[Array, "3 5"]:
-    """Rows b whose squares are the second derivative of a misfit that the chart's bend gives.
+    """Rows b (3, 5): the chart's curvature adds Σ b bᵀ to the second derivative of a misfit.
 
-    Near a flat body the least second moment is a square, λ = a² in a number a of the chart: a
-    misfit that pushes towards λ < 0 has a least at a = 0, which products of first derivatives do
-    not see. With n the axis of a, `d²λ = 2 |dA n|²`; what the misfit changes by in λ is the part of
-    its derivative in the root A along n nᵀ. Zero where the body is not flat, or not pushed.
+    Near a flat body the least second moment is a square, λ = a² with a number a of the chart. A
+    misfit that decreases towards λ < 0 has its minimum at a = 0, and products of first derivatives
+    do not show this curvature. With n the axis of a, `d²λ = 2 |dA n|²`; the derivative of the
+    misfit by λ is the part along n nᵀ of its derivative by the root A. The rows are zero for a body
+    that is not flat, or another misfit.
 
-    **Arguments:** `shape` (5,) as in `pack_shape`; `slope` (5,) the misfit's derivative in it.
-
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
+    **Arguments:** `shape` (5,) as in `pack_shape`; `slope` (5,) the misfit's derivative by it.
 
     >>> plate = pack_shape(jnp.diag(jnp.array([4.0, 4.0, 1e-12])))
     >>> flat_bend(plate, -1e-6 * jnp.ones(5)).shape
@@ -205,13 +180,8 @@ def flat_bend(
     size = size / jnp.where(flat, jnp.abs(a), 1.0)
     x, y, z = n
     nil = jnp.zeros((), n.dtype)
-    return size * jnp.stack(
-        [
-            jnp.stack([x, nil, y, nil, z]),
-            jnp.stack([nil, y, x, z, nil]),
-            jnp.stack([-z, -z, nil, y, x]),
-        ]
-    )
+    rows = [x, nil, y, nil, z], [nil, y, x, z, nil], [-z, -z, nil, y, x]
+    return size * jnp.stack([jnp.stack(row) for row in rows])
 
 
 def _squares(root: Vec3) -> Vec3:
@@ -264,13 +234,12 @@ def _radius(total: Scalar) -> Scalar:
 
 
 def _not_a_point(total: Scalar) -> Scalar:
-    return _checks.refuse(
-        total, ~(total > 0), "pack: the second moment is zero: a point has no shape"
-    )
+    words = "pack: the second moment is zero: a point has no shape"
+    return _checks.refuse(total, ~(total > 0), words)
 
 
 def _hold(exponent: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """The exponent itself, but growing only logarithmically past the dtype's range."""
+    """The exponent, which grows only logarithmically beyond the range of the dtype."""
     return _bent(exponent, jnp.log1p)
 
 

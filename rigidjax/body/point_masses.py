@@ -20,16 +20,15 @@ def points(
     """The body made of point masses: `𝔖 = Σ m (r − c)(r − c)ᵀ` (notes, eq 60).
 
     **Arguments:** `masses` (n,) kg, none negative; `positions` (n, 3) m, body frame, at any
-    distance from the origin: they are shifted before anything is multiplied.
-
-    **Raises:** `ValueError`, `TypeError` for shapes that do not match, a negative mass, or NaN.
+    distance from the origin: they are shifted to the centre first. **Raises:** `ValueError` for
+    shapes that do not match, a negative mass, or NaN.
 
     >>> points([1.0, 1.0], [[1.0, 0, 0], [-1.0, 0, 0]]).inertia.moments
     Array([0., 2., 2.], dtype=float64)
     """
     masses = _checks.rows(masses, (), "masses")
     n = masses.shape[0]
-    hint = f"{n} masses have as many rows"
+    hint = f"one row for each of {n} masses"
     positions = _checks.floating(positions, (n, 3), "positions", hint=hint)
     if n == 0:
         raise ValueError("masses: wanted at least one, got none")
@@ -43,13 +42,11 @@ def voxels(
 ) -> MassProperties:
     """The body of a density given on the cells of a box, constant in each cell.
 
-    Exact for that density: each cell adds its own `m h²/12`. **Arguments:** `density`
-    (nx, ny, nz) kg/m³, none negative, indexed x, y, z; `spacing` (3,) edges of a cell, m;
-    `corner` (3,) of cell [0, 0, 0] with the smallest x, y, z, m, body frame.
+    It is exact for that density: each cell adds its own `m h²/12`. **Arguments:** `density` (nx,
+    ny, nz) kg/m³, none negative, indexed x, y, z; `spacing` (3,) edges of a cell, m; `corner` (3,)
+    of cell [0, 0, 0] with the smallest x, y, z, m, body frame. **Raises:** `ValueError` for a
+    negative density, or NaN.
 
-    **Raises:** `ValueError`, `TypeError` for a wrong shape, a negative density, or NaN.
-
-    >>> import jax.numpy as jnp
     >>> voxels(jnp.ones((1, 2, 3)), [1.0, 1.0, 1.0], [0.0, 0.0, 0.0]).com
     Array([0.5, 1. , 1.5], dtype=float64)
     """
@@ -74,15 +71,12 @@ def quadrature(
 ) -> MassProperties:
     """The body that fills a parametrised volume: `∫ ρ(r(u)) |∂r/∂u| d³u` over the unit cube.
 
-    Gauss–Legendre points, `order` in each direction: exact for polynomials of degree
-    `2·order − 1`. It is differentiable in all numbers of `density` and `place`.
+    `order` Gauss–Legendre points in each direction are exact for polynomials of degree
+    `2·order − 1`. It is differentiable in all numbers of `density` and `place`. **Arguments:**
+    `density` ρ, from r (3,) m to kg/m³; `place` from u (3,) in [0, 1]³ to r (3,) m, body frame, one
+    to one inside; `order`. **Raises:** `ValueError` for an order below 1, NaN, or a result that is
+    no body.
 
-    **Arguments:** `density` ρ, from r (3,) m to kg/m³; `place` from u (3,) in [0, 1]³ to r (3,) m,
-    body frame, one to one inside; `order` points along each direction.
-
-    **Raises:** `ValueError` for an order below 1, NaN, or if the result is no body.
-
-    >>> import jax.numpy as jnp
     >>> body = quadrature(lambda r: jnp.ones(()), lambda u: u * jnp.array([1.0, 2.0, 3.0]), 2)
     >>> round(float(body.mass), 12), round(float(body.com[2]), 12)
     (6.0, 1.5)
@@ -109,7 +103,7 @@ def quadrature(
 
 
 def summed(masses: Float[Array, "n"], positions: Float[Array, "n 3"]) -> MassProperties:
-    """Mass, centre and second moment of points, without checks of the single masses."""
+    """Mass, centre and second moment of points; single masses are not checked."""
     start = jax.lax.stop_gradient(positions[0])
     from_start = positions - start[None, :]
     mass = masses.sum()

@@ -1,7 +1,7 @@
-"""Principal moments and axes, functions of a symmetric matrix: inside a differentiated function.
+"""Principal moments and axes, and functions of a symmetric matrix, for differentiated functions.
 
-`eigh`'s own derivative divides by differences of eigenvalues: NaN for a sphere and for every
-symmetric top, and, as implemented in JAX, for distinct moments above 1e16 kg m² (jax#669).
+The derivative of `eigh` divides by differences of eigenvalues: it is NaN for a sphere and for every
+symmetric top, and in JAX also for distinct moments above 1e16 kg m² (jax#669).
 """
 
 import itertools
@@ -37,21 +37,17 @@ _TRIPLE = _TRIPLE.reshape(3, 3, 3)
 def principal(tensor: Mat3Like) -> tuple[Vec3, Quat]:
     """Principal moments, ascending, and the rotation principal axes → body axes.
 
-    **Arguments:** `tensor` (3, 3) symmetric: I (kg m²) or 𝔖 (kg m²), body frame.
-    **Returns** `(moments, q)`: (3,), ascending, in the units of `tensor`, and (4,) a unit
-    quaternion (w, x, y, z) with `A = R(q) diag(moments) R(q)ᵀ`. The sign is the one of four
-    right-handed choices that is closest to no rotation, hence `w ≥ ½`.
+    **Arguments:** `tensor` (3, 3) symmetric: I (kg m²) or 𝔖 (kg m²), body frame. **Returns**
+    `(moments, q)`: (3,), ascending, in the units of `tensor`, and (4,) a unit quaternion (w, x, y,
+    z) with `A = R(q) diag(moments) R(q)ᵀ`. Of the four right-handed choices it is the smallest
+    turn, hence `w ≥ ½`.
 
-    The derivative is exact where moments differ. Moments that are equal to round-off are one
-    eigenspace: the axes do not turn inside it, and its moments move by their own diagonal
-    entries. That is the correct derivative of any function of the eigenspaces that is symmetric in
-    the moments. No finite tangent of an axis describes a mixing of axes inside an eigenspace: use
-    `rigidjax.body.matrix_function` for a smooth function of the whole matrix, such as a square
-    root; to solve, use the matrix itself.
-
-    Source: notes, eqs 71–72; first-order perturbation theory, Kato 1966, II.2.
-
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
+    The derivative is exact if the moments differ. Moments that are equal to round-off have one
+    eigenspace: their derivatives are their own diagonal entries, and the axes do not turn inside
+    it. This is right for every function of the eigenspaces that is symmetric in the moments. No
+    finite derivative of an axis describes how axes mix inside an eigenspace. For a smooth function
+    of the whole matrix, such as a square root, use `rigidjax.body.matrix_function`; to solve, use
+    the matrix itself. Source: notes, eqs 71–72; first-order perturbation theory, Kato 1966, II.2.
 
     >>> moments, q = principal(jnp.diag(jnp.array([1.0, 2.0, 3.0])))
     >>> moments, q
@@ -66,9 +62,8 @@ def principal(tensor: Mat3Like) -> tuple[Vec3, Quat]:
 def eigensystem(a: Mat3) -> tuple[Vec3, Mat3]:
     """Ascending eigenvalues and a right-handed matrix of eigenvectors, as columns.
 
-    Cyclic Jacobi rotations on components (Golub and Van Loan 2013, section 8.5): in a batch eight
-    times as fast as LAPACK's `eigh` matrix by matrix, and the small moment of a slender body whose
-    axes lie along the body's keeps its relative accuracy.
+    By cyclic Jacobi rotations (Golub and Van Loan 2013, section 8.5): in a batch eight times as
+    fast as LAPACK's `eigh`, and accurate for the small moment of a slender body along the axes.
     """
     # A power of two, so that scaling costs no digit.
     exponent = exponent_of(a)
@@ -109,18 +104,14 @@ def _sweep(_, state):
         x, y = opposite[j], opposite[i]  # the entries (k, i) and (k, j)
         opposite = _with(opposite, {k: jnp.zeros_like(e), j: c * x - s * y, i: s * x + c * y})
         u, v = axes[i], axes[j]
-        axes = _with(
-            axes,
-            {
-                i: tuple(c * p - s * q for p, q in zip(u, v, strict=True)),
-                j: tuple(s * p + c * q for p, q in zip(u, v, strict=True)),
-            },
-        )
+        low = tuple(c * p - s * q for p, q in zip(u, v, strict=True))
+        high = tuple(s * p + c * q for p, q in zip(u, v, strict=True))
+        axes = _with(axes, {i: low, j: high})
     return values, opposite, axes
 
 
 def _ascending(values, axes):
-    """Sort by exchanges; each turns one axis round, so that they stay right-handed."""
+    """Sort by exchanges; each exchange reverses one axis, so that they stay right-handed."""
     for i, j in ((0, 1), (1, 2), (0, 1)):
         wrong = values[i] > values[j]
         low = jnp.where(wrong, values[j], values[i])
@@ -132,7 +123,7 @@ def _ascending(values, axes):
 
 
 def _nearest_signs(axes) -> Mat3:
-    """Turn two axes round, or none: whichever gives the largest trace."""
+    """Reverse two axes, or none, so that the trace is largest."""
     d0, d1, d2 = axes[0][0], axes[1][1], axes[2][2]
     traces = jnp.stack([d0 + d1 + d2, d0 - d1 - d2, d1 - d0 - d2, d2 - d0 - d1])
     signs = jnp.asarray([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]], traces.dtype)
@@ -154,16 +145,14 @@ def matrix_function(function: Callable[[Scalar], Scalar], tensor: Mat3Like) -> M
     """`f(A) = R diag(f(λ)) Rᵀ` of a symmetric matrix, such as its square root or exponential.
 
     Its first and second derivatives are correct for every body, also for a sphere and a symmetric
-    top, where the principal axes have none. The axes are held; the change is `E = Rᵀ dA R`, and
-    `f(Λ + E)_ij = f(λ_i) δ_ij + f[λ_i, λ_j] E_ij + Σ_k f[λ_i, λ_k, λ_j] E_ik E_kj + …` with divided
-    differences, which are smooth where eigenvalues meet (Daleckii and Krein 1965; Higham 2008,
-    "Functions of Matrices", section 3.2). Third derivatives are not available.
+    top, whose principal axes have none; third derivatives are not available. With fixed axes and
+    the change `E = Rᵀ dA R`, `f(Λ + E)_ij = f(λ_i) δ_ij + f[λ_i, λ_j] E_ij + Σ_k f[λ_i, λ_k, λ_j]
+    E_ik E_kj + …`; its divided differences are smooth at equal eigenvalues (Daleckii and Krein
+    1965; Higham 2008, "Functions of Matrices", section 3.2).
 
     **Arguments:** `function` f, scalar → scalar, written in `jax.numpy`, smooth on the spectrum; it
-    may depend on differentiated values; `tensor` (3, 3) symmetric, I or 𝔖, any units.
-    **Returns** (3, 3), same frame.
-
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
+    may depend on differentiated values; `tensor` (3, 3) symmetric, I or 𝔖, any units. **Returns**
+    (3, 3), same frame.
 
     >>> matrix_function(jnp.sqrt, 4.0 * jnp.eye(3))[0]
     Array([2., 0., 0.], dtype=float64)
@@ -198,7 +187,7 @@ def _divided_differences(f, values):
 
 
 def _first(f, x, y, close):
-    """f[x, y]: the mean of f' between x and y (Hermite–Genocchi where they are close)."""
+    """f[x, y], x ≤ y: the mean of f' between x and y (Hermite–Genocchi if they are close)."""
     near = y - x <= close
     end = jnp.where(near, y, x)
     slope = jax.vmap(lambda s: jax.grad(f)(x + s * (end - x)))(jnp.asarray(_NODES, x.dtype))
@@ -207,7 +196,7 @@ def _first(f, x, y, close):
 
 
 def _second(f, x, y, z, close):
-    """f[x, y, z], x ≤ y ≤ z: an integral of f'' over the triangle that they span."""
+    """f[x, y, z], x ≤ y ≤ z: an integral of f'' over the triangle of the three."""
     near = z - x <= close
     middle, end = jnp.where(near, y, x), jnp.where(near, z, x)
     u = np.repeat(_NODES, len(_NODES))

@@ -10,20 +10,12 @@ from jaxtyping import Array, Float, Int
 
 
 def exponent_of(x: Float[Array, "..."]) -> Int[Array, ""]:
-    """The integer n with 2ⁿ⁻¹ ≤ max |x| < 2ⁿ, held fixed in derivatives; 0 for x = 0.
-
-    **Arguments:** `x` of any shape, finite. **Returns** a scalar.
-    """
+    """The integer n with 2ⁿ⁻¹ ≤ max |x| < 2ⁿ, held fixed in derivatives; 0 for x = 0."""
     return jnp.frexp(jax.lax.stop_gradient(jnp.max(jnp.abs(x))))[1]
 
 
 def times_power_of_two(x: Float[Array, "..."], n: Int[Array, ""]) -> Float[Array, "..."]:
-    """`x 2ⁿ`, exact, as are its derivatives by x, wherever the product is a normal number.
-
-    2ⁿ itself may be out of range: it is multiplied by as two factors.
-
-    **Arguments:** `x` of any shape; `n` scalar, |n| ≤ 2044 (float32: 252).
-    """
+    """`x 2ⁿ`, |n| ≤ 2044 (float32: 252), exact with its derivatives if it is a normal number."""
     half = n // 2
     # XLA would multiply the two together first where it knows n.
     first, second = jax.lax.optimization_barrier(

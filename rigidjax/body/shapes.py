@@ -1,12 +1,13 @@
 """Mass properties of solids, shells, plates and rods in closed form.
 
-Each function takes the mass and then the dimensions, and is differentiable in all of them. Every
-shape lies with its **centre of mass at the origin** and its axis of symmetry, if it has one, along
-z; place it with `.rotated` and `.shifted`, join with `+`, cut away with `-`. For a density, use
-`rigidjax.body.volumes`: `box(density * volumes.box(size), size)`.
+Each function takes the mass and then the dimensions, and is differentiable in all of them. It
+raises `ValueError` for a mass ≤ 0 or a negative length. Every shape has its **centre of mass at the
+origin** and its axis of symmetry, if it has one, along z. Place it with `.rotated` and `.shifted`,
+join bodies with `+`, cut away with `-`. For a density use `rigidjax.volumes`:
+`box(density * volumes.box(size), size)`.
 
-The formulas give the second moment 𝔖 = ∫ r rᵀ dm (notes, eq 60), diagonal in these axes;
-`I1 = λ2 + λ3`, … (eqs 76–78) turns it into the textbook moments of inertia.
+The formulas give the second moment 𝔖 = ∫ r rᵀ dm (notes, eq 60), diagonal in these axes; the
+moments of inertia are `I1 = λ2 + λ3`, … (eqs 76–78).
 """
 
 import jax.numpy as jnp
@@ -17,18 +18,11 @@ from rigidjax._names import show
 from rigidjax._types import Numbers, ScalarLike, Vector
 from rigidjax.body.inertia import MassProperties
 from rigidjax.body.meshes import mesh as mesh, mesh_file as mesh_file
-from rigidjax.body.point_masses import (
-    points as points,
-    quadrature as quadrature,
-    voxels as voxels,
-)
+from rigidjax.body.point_masses import points as points, quadrature as quadrature, voxels as voxels
 
 
 def box(mass: ScalarLike, size: Vector) -> MassProperties:
-    """A solid box. `𝔖 = m diag(a², b², c²)/12`.
-
-    **Arguments:** `mass` kg; `size` (3,) full edge lengths along x, y, z, m. A zero edge gives a
-    plate. **Raises:** `ValueError` for a mass ≤ 0 or a negative length.
+    """A solid box of `mass` kg and full edge lengths `size` (3,), m. `𝔖 = m diag(a², b², c²)/12`.
 
     >>> box(12.0, [1.0, 2.0, 3.0]).inertia.moments
     Array([ 5., 10., 13.], dtype=float64)
@@ -38,10 +32,7 @@ def box(mass: ScalarLike, size: Vector) -> MassProperties:
 
 
 def ellipsoid(mass: ScalarLike, semi_axes: Vector) -> MassProperties:
-    """A solid ellipsoid. `𝔖 = m diag(a², b², c²)/5`.
-
-    **Arguments:** `mass` kg; `semi_axes` (3,) along x, y, z, m.
-    **Raises:** `ValueError` for a mass ≤ 0 or a negative length.
+    """A solid ellipsoid of `mass` kg and `semi_axes` (3,), m. `𝔖 = m diag(a², b², c²)/5`.
 
     >>> ellipsoid(5.0, [1.0, 2.0, 3.0]).inertia.moments
     Array([ 5., 10., 13.], dtype=float64)
@@ -51,10 +42,7 @@ def ellipsoid(mass: ScalarLike, semi_axes: Vector) -> MassProperties:
 
 
 def sphere(mass: ScalarLike, radius: ScalarLike) -> MassProperties:
-    """A solid sphere. `𝔖 = m r²/5 · 1`, so `I = ⅖ m r² · 1`.
-
-    **Arguments:** `mass` kg; `radius` m. **Raises:** `ValueError` for a mass ≤ 0 or a negative
-    length.
+    """A solid sphere of `mass` kg, `radius` m. `𝔖 = m r²/5 · 1`, so `I = ⅖ m r² · 1`.
 
     >>> sphere(5.0, 1.0).inertia.moments
     Array([2., 2., 2.], dtype=float64)
@@ -66,8 +54,7 @@ def sphere(mass: ScalarLike, radius: ScalarLike) -> MassProperties:
 def hollow_sphere(mass: ScalarLike, inner: ScalarLike, outer: ScalarLike) -> MassProperties:
     """A ball with a concentric hole. `λ = m/5 · (R⁵ − r⁵)/(R³ − r³)`, the quotient divided out.
 
-    **Arguments:** `mass` kg; `inner` r, `outer` R radii, m; they may be equal (a shell).
-    **Raises:** `ValueError` for a mass ≤ 0, a negative length, or `inner > outer`.
+    **Arguments:** `mass` kg; `inner` r ≤ `outer` R radii, m; equal ones give a shell.
 
     >>> hollow_sphere(3.0, 1.0, 1.0).inertia.moments
     Array([2., 2., 2.], dtype=float64)
@@ -80,10 +67,7 @@ def hollow_sphere(mass: ScalarLike, inner: ScalarLike, outer: ScalarLike) -> Mas
 
 
 def shell(mass: ScalarLike, radius: ScalarLike) -> MassProperties:
-    """A thin spherical shell. `𝔖 = m r²/3 · 1`.
-
-    **Arguments:** `mass` kg; `radius` m. **Raises:** `ValueError` for a mass ≤ 0 or a negative
-    length.
+    """A thin spherical shell of `mass` kg, `radius` m. `𝔖 = m r²/3 · 1`.
 
     >>> shell(3.0, 1.0).inertia.moments
     Array([2., 2., 2.], dtype=float64)
@@ -93,10 +77,7 @@ def shell(mass: ScalarLike, radius: ScalarLike) -> MassProperties:
 
 
 def cylinder(mass: ScalarLike, radius: ScalarLike, height: ScalarLike) -> MassProperties:
-    """A solid cylinder along z. `𝔖 = m diag(r²/4, r²/4, h²/12)`; height 0 is a disc.
-
-    **Arguments:** `mass` kg; `radius`, `height` m. **Raises:** `ValueError` for a mass ≤ 0 or a
-    negative length.
+    """A solid cylinder along z of `mass` kg, `radius`, `height` m. `𝔖 = m diag(r²/4, r²/4, h²/12)`.
 
     >>> cylinder(12.0, 1.0, 1.0).inertia.moments
     Array([4., 4., 6.], dtype=float64)
@@ -110,8 +91,7 @@ def hollow_cylinder(
 ) -> MassProperties:
     """A tube along z. `𝔖 = m diag((R² + r²)/4, (R² + r²)/4, h²/12)`; equal radii: a thin one.
 
-    **Arguments:** `mass` kg; `inner` r, `outer` R radii and `height` h, m.
-    **Raises:** `ValueError` for a mass ≤ 0, a negative length, or `inner > outer`.
+    **Arguments:** `mass` kg; `inner` r ≤ `outer` R radii and `height` h, m.
 
     >>> hollow_cylinder(2.0, 1.0, 1.0, 0.0).inertia.moments
     Array([1., 1., 2.], dtype=float64)
@@ -124,10 +104,8 @@ def capsule(mass: ScalarLike, radius: ScalarLike, length: ScalarLike) -> MassPro
     """A cylinder along z with a half ball on each end, of one density.
 
     With `f = h/(h + 4r/3)` of the mass in the cylinder: across, `f r²/4 + (1 − f) r²/5`; along,
-    `f h²/12 + (1 − f)(r²/5 + 3hr/8 + h²/4)`.
-
-    **Arguments:** `mass` kg; `radius` r > 0, m; `length` h of the cylindrical part alone, m.
-    **Raises:** `ValueError` for a mass ≤ 0 or a negative length.
+    `f h²/12 + (1 − f)(r²/5 + 3hr/8 + h²/4)`. **Arguments:** `mass` kg; `radius` r > 0, m; `length`
+    h of the cylindrical part alone, m.
 
     >>> capsule(5.0, 1.0, 0.0).inertia.moments
     Array([2., 2., 2.], dtype=float64)
@@ -143,10 +121,8 @@ def capsule(mass: ScalarLike, radius: ScalarLike, length: ScalarLike) -> MassPro
 def cone(mass: ScalarLike, radius: ScalarLike, height: ScalarLike) -> MassProperties:
     """A solid cone along z. `𝔖 = m diag(3r²/20, 3r²/20, 3h²/80)`.
 
-    Its centre of mass, put at the origin, lies `height/4` from the base.
-
-    **Arguments:** `mass` kg; `radius` of the base, `height` m. **Raises:** `ValueError` for a
-    mass ≤ 0 or a negative length.
+    **Arguments:** `mass` kg; `radius` of the base, `height` m. Its centre of mass, at the origin,
+    is `height/4` above the base.
 
     >>> cone(80.0, 1.0, 2.0).inertia.moments
     Array([24., 24., 24.], dtype=float64)
@@ -158,8 +134,8 @@ def cone(mass: ScalarLike, radius: ScalarLike, height: ScalarLike) -> MassProper
 def torus(mass: ScalarLike, major: ScalarLike, minor: ScalarLike) -> MassProperties:
     """A solid ring around z. `𝔖 = m diag(R²/2 + 3r²/8, R²/2 + 3r²/8, r²/4)`; minor 0: a hoop.
 
-    **Arguments:** `mass` kg; `major` R from the centre to the middle of the tube, `minor` r of
-    the tube, m. **Raises:** `ValueError` for a mass ≤ 0, a negative length, or `minor > major`.
+    **Arguments:** `mass` kg; `major` R from the centre to the middle of the tube, `minor` r ≤ R of
+    the tube, m.
 
     >>> torus(2.0, 1.0, 0.0).inertia.moments
     Array([1., 1., 2.], dtype=float64)
@@ -169,13 +145,7 @@ def torus(mass: ScalarLike, major: ScalarLike, minor: ScalarLike) -> MassPropert
 
 
 def rod(mass: ScalarLike, length: ScalarLike) -> MassProperties:
-    """A rod along z without thickness. `𝔖 = m diag(0, 0, ℓ²/12)`.
-
-    Its moment about z is zero: the equations of motion refuse it. Use `cylinder` for a rod with
-    thickness.
-
-    **Arguments:** `mass` kg; `length` m. **Raises:** `ValueError` for a mass ≤ 0 or a negative
-    length.
+    """A thin rod along z of `mass` kg, `length` m (no moment about z). `𝔖 = m diag(0, 0, ℓ²/12)`.
 
     >>> rod(12.0, 1.0).inertia.moments
     Array([0., 1., 1.], dtype=float64)
@@ -185,10 +155,7 @@ def rod(mass: ScalarLike, length: ScalarLike) -> MassProperties:
 
 
 def plate(mass: ScalarLike, size: Float[ArrayLike, "2"] | Numbers) -> MassProperties:
-    """A rectangular plate in the x–y plane without thickness. `𝔖 = m diag(a², b², 0)/12`.
-
-    **Arguments:** `mass` kg; `size` (2,) edge lengths along x, y, m. **Raises:** `ValueError` for
-    a mass ≤ 0 or a negative length.
+    """A plate in the x–y plane of `mass` kg and `size` (2,), m. `𝔖 = m diag(a², b², 0)/12`.
 
     >>> plate(12.0, [1.0, 2.0]).inertia.moments
     Array([1., 4., 5.], dtype=float64)
@@ -198,7 +165,7 @@ def plate(mass: ScalarLike, size: Float[ArrayLike, "2"] | Numbers) -> MassProper
 
 
 def _lengths(value, shape, name):
-    lengths = _checks.given(value, shape, name)
+    lengths = _checks.given(value, shape, name, unit="m")
     return _checks.if_known(_checks.sign, lengths, name, "lengths ≥ 0 (m)", zero=True)
 
 

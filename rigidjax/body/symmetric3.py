@@ -1,48 +1,20 @@
-"""Symmetric 3×3 matrices written out in components.
-
-Products are spelled out instead of `@`: on CPU the gradient of a 3×3 `@` inside a differentiated
-loop costs fifty times its value, and on GPUs `@` may round to ten bits (TF32).
-"""
+"""Symmetric 3×3 matrices written out in components, as in `rigidjax.rotation.linalg3`."""
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from rigidjax import _checks
-from rigidjax._types import Mat3, Mat3Like, Scalar
+from rigidjax._types import Mat3
 from rigidjax.rotation.linalg3 import apply as apply, entries, product as product
 
 
-def inverse(tensor: Mat3Like) -> Mat3:
-    """The inverse of a symmetric 3×3 matrix, by cofactors.
-
-    **Arguments:** `tensor` (3, 3) symmetric, trace > 0, such as an inertia tensor (kg m²).
-    **Returns** (3, 3), reciprocal units. The matrix is divided by its trace first, so that a
-    body of 1e-20 or of 1e37 kg m² neither underflows nor overflows. A zero moment gives
-    infinities: `Inertia.invertible` refuses it in words.
-
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
-    """
-    return _inverse(_checks.floating(tensor, (3, 3), "tensor"))
-
-
 @jax.custom_jvp
-def _inverse(a: Mat3) -> Mat3:
-    relative, scale = _relative_inverse(a)
-    return relative / scale
+def inverse(a: Mat3) -> Mat3:
+    """The inverse of a symmetric 3×3 matrix with trace > 0, by cofactors.
 
-
-@_inverse.defjvp
-def _inverse_jvp(primals: tuple[Mat3], tangents: tuple[Mat3]) -> tuple[Mat3, Mat3]:
-    # −A⁻¹ dA A⁻¹: two products, where the cofactors' own derivative is nine sums of nine.
-    (a,), (da,) = primals, tangents
-    out = _inverse(a)
-    scale = a[0, 0] + a[1, 1] + a[2, 2]
-    return out, -product(product(out * scale, da / scale), out)
-
-
-def _relative_inverse(a: Mat3) -> tuple[Mat3, Scalar]:
-    """The inverse of a divided by its trace, and the trace."""
+    The matrix is divided by its trace first: 1e-20 or 1e37 kg m² neither underflow nor overflow. A
+    zero moment gives infinities; `Inertia.invertible` refuses it in words.
+    """
     xx, _, _, _, yy, _, _, _, zz = entries(a)
     scale = xx + yy + zz
     # One split, and one concatenation in the gradient: indexed, each entry is a kernel.
@@ -54,7 +26,20 @@ def _relative_inverse(a: Mat3) -> tuple[Mat3, Scalar]:
     c12 = xy * zx - xx * zy
     c22 = xx * yy - xy * yx
     determinant = xx * c00 + xy * c01 + xz * c02
-    return from_components(c00, c11, c22, c01, c02, c12) / determinant, scale
+    return from_components(c00, c11, c22, c01, c02, c12) / determinant / scale
+
+
+@inverse.defjvp
+def _inverse_jvp(primals: tuple[Mat3], tangents: tuple[Mat3]) -> tuple[Mat3, Mat3]:
+    # −A⁻¹ dA A⁻¹: two products, where the cofactors' own derivative is nine sums of nine.
+    (a,), (da,) = primals, tangents
+    out = inverse(a)
+    scale = a[0, 0] + a[1, 1] + a[2, 2]
+    return out, -product(product(out * scale, da / scale), out)
+
+
+# The places of the components in the order of `from_components`.
+PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 
 def from_components(

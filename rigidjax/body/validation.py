@@ -1,8 +1,8 @@
-"""Checks that a body has these numbers, with the error in words.
+"""Checks that a body has these numbers, with errors in words.
 
-Each returns its argument, and refuses numbers of no real body. They work on known values (plain
-exceptions, with the numbers) and under `jit` (`equinox.error_if`, without them). A few units of
-round-off are tolerated, so that plates, rods and points, which lie on the boundary, pass.
+Each returns its argument, and refuses numbers of no real body: known values with plain exceptions
+and the numbers, traced ones with `equinox.error_if`, without them. A few units of round-off are
+tolerated: plates, rods and points lie on the boundary and pass.
 """
 
 from typing import Any
@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 
 from rigidjax import _checks
 from rigidjax._types import Quat, Quaternion
+from rigidjax.body.symmetric3 import PAIRS
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.validation import near_unit, tolerance
 
@@ -29,7 +30,7 @@ def real_mass(mass: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
 
 
 def mass_of_a_body(mass: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
-    """A positive mass as it is; another is refused if it is known, and NaN if it is traced."""
+    """A positive mass; another one is refused if it is known, and becomes NaN if it is traced."""
     return real_mass(mass) if _checks.known(mass) else jnp.where(mass > 0, mass, jnp.nan)
 
 
@@ -64,12 +65,9 @@ def real_second_moment(s: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3 
 
 
 def possible(body: Any, tensor: Float[Array, "*batch 3 3"], mass: Any, throw: bool) -> Any:
-    """Return `body` if some mass has these numbers and no moment is zero.
+    """Return `body` if some mass has these numbers and no moment is zero; `mass` may be `None`.
 
-    Other numbers are refused with the cause if they are known, or if `throw`. Without `throw` all
-    numbers of a traced body, and its motion, become NaN, but no other body's.
-
-    **Arguments:** `tensor` the inertia, kg m²; `mass` kg, `None` for a body that only turns.
+    Other numbers are refused if they are known, or if `throw`; else the traced body becomes NaN.
     """
     tensor = _checks.numbers(tensor, "inertia tensor")
     is_known = _checks.known((tensor, mass))
@@ -111,14 +109,10 @@ _THIN = (
 
 
 def _impossible(xp: Any, tensor: Any, slack: float) -> tuple[Any, Any]:
-    """Whether a moment is zero to round-off or NaN, and whether no mass has these moments.
-
-    No mass has them unless 𝔖 = ½Tr(I) 1 − I is positive semi-definite: its principal minors show
-    this, at a tenth of the cost of eigenvalues in a batch.
-    """
+    """Whether a moment is zero or NaN, and whether no mass has these moments, by minors of 𝔖."""
 
     def minors(a: Any) -> tuple[Any, ...]:
-        xx, yy, zz, xy, xz, yz = (a[..., i, j] for i, j in _PAIRS)
+        xx, yy, zz, xy, xz, yz = (a[..., i, j] for i, j in PAIRS)
         two = xx * yy - xy * xy, xx * zz - xz * xz, yy * zz - yz * yz
         whole = xx * two[2] - xy * (xy * zz - xz * yz) + xz * (xy * yz - xz * yy)
         return xx, yy, zz, *two, whole
@@ -136,11 +130,8 @@ def _impossible(xp: Any, tensor: Any, slack: float) -> tuple[Any, Any]:
     return ~(trace > 0) | ~(determinant > 0.125 * slack), broken
 
 
-_PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
-
-
 def unit_quaternion(q: Quaternion) -> Quat:
-    """A unit quaternion (w, x, y, z): normalised if off by round-off, refused if by more."""
+    """A unit quaternion (w, x, y, z): normalised if off by round-off, else refused."""
     q = _checks.given(q, (4,), "q", hint="a quaternion is (w, x, y, z)")
     return quaternion.normalise(near_unit(q, "q", tolerance(q.dtype)))
 

@@ -1,7 +1,7 @@
-"""The tumbling asteroid 4179 Toutatis as radar saw it in December 1992.
+"""The tumbling asteroid 4179 Toutatis, observed by radar in December 1992.
 
-Published figures, typed in: Y. Takahashi, M. W. Busch, D. J. Scheeres, "Spin state and moment of
-inertia characterization of 4179 Toutatis", The Astronomical Journal 146:95 (2013), table 3,
+Published figures: Y. Takahashi, M. W. Busch, D. J. Scheeres, "Spin state and moment of inertia
+characterization of 4179 Toutatis", The Astronomical Journal 146:95 (2013), table 3,
 doi:10.1088/0004-6256/146/4/95; from the radar imaging of R. S. Hudson and S. J. Ostro, Science
 270:84 (1995).
 """
@@ -68,15 +68,13 @@ def recording() -> Recording:
     # order of eq 31 of the notes make M, body → ecliptic.
     attitudes = [euler.to_quaternion(a, sequence="ZXZ") for a in angles]
     rates = np.radians([row[4:7] for row in OBSERVATIONS]) / DAY
-    return Recording(
-        t,
-        (AttitudeSensor(np.radians(ATTITUDE_NOISE_DEG)), np.stack(attitudes)),
-        (Gyro(np.radians(RATE_NOISE_DEG_A_DAY) / DAY), rates),
-    )
+    sensor = AttitudeSensor(np.radians(ATTITUDE_NOISE_DEG))
+    gyro = Gyro(np.radians(RATE_NOISE_DEG_A_DAY) / DAY)
+    return Recording(t, (sensor, np.stack(attitudes)), (gyro, rates))
 
 
 def problem() -> Problem:
-    """Free motion with the body axes principal, outliers counted linearly.
+    """Free motion with the body axes principal; a robust loss counts outliers linearly.
 
     >>> problem().body.log_names
     ('Ix/Iz', 'Iy/Iz')
@@ -104,35 +102,30 @@ def rows(fit: Fit) -> list[Row]:
     **Arguments:** `fit` of `problem()`. **Returns** rows (name, value, low, high, unit): days, and
     degrees of ecliptic longitude and latitude (J2000), with 95 % intervals.
     """
-    out: list[Row] = []
-    middle = np.exp(np.asarray(_periods(fit.body, fit.state0)))
-    # What the data do not determine has an end at infinity.
-    with np.errstate(over="ignore"):
-        bounds = fit.interval_of(lambda point: _periods(point.body, point.state0))
-        low, high = (np.exp(bound) for bound in bounds)
+
+    def ranges(of: Any, names: tuple[str, str], shown: Any) -> Any:
+        bounds = fit.interval_of(lambda point: of(point.body, point.state0))
+        # What the data do not determine has an end at infinity.
+        with np.errstate(over="ignore"):
+            numbers = [shown(np.asarray(v)) for v in (of(fit.body, fit.state0), *bounds)]
+        return zip(names, *numbers, strict=True)
+
     names = ("rotation about the long axis", "precession of the long axis")
-    for name, *numbers in zip(names, middle, low, high, strict=True):
-        out.append((name, *numbers, "day"))
-    middle = np.degrees(np.asarray(_direction(fit.body, fit.state0)))
-    bounds = fit.interval_of(lambda point: _direction(point.body, point.state0))
-    low, high = (np.degrees(bound) for bound in bounds)
+    out: list[Row] = [(*row, "day") for row in ranges(_periods, names, np.exp)]
     names = ("angular momentum, longitude", "angular momentum, latitude")
-    for name, *numbers in zip(names, middle, low, high, strict=True):
+    for name, *numbers in ranges(_direction, names, np.degrees):
         turn = 360.0 if "longitude" in name and numbers[0] < 0 else 0.0
         out.append((name, *(number + turn for number in numbers), "deg, ecliptic J2000"))
     return out
 
 
 def rms_degrees(fit: Fit) -> float:
-    """Root mean square angle between the observed and the fitted attitudes, degrees.
-
-    **Arguments:** `fit` of `problem()`, whose first sensor gives attitudes.
-    """
+    """Root mean square angle between observed and fitted attitudes of `fit`, degrees."""
     return float(np.degrees(fit.rms[0]))
 
 
 def remarks(fit: Fit) -> str:
-    """The observations furthest from the fit, and how the noise compares, in words."""
+    """The observations furthest from the `fit`, and a comparison of the noise, in words."""
     lines = []
     scatter = rms_degrees(fit) / np.sqrt(3)
     if scatter < 0.5 * ATTITUDE_NOISE_DEG:
@@ -143,10 +136,9 @@ def remarks(fit: Fit) -> str:
         )
     errors = np.linalg.norm(np.degrees(np.asarray(fit.residuals[1])) * DAY, axis=1)
     for index in np.flatnonzero(errors > 3 * RATE_NOISE_DEG_A_DAY):
-        lines.append(
-            f"outlier: the rate of {OBSERVATIONS[index][0][:10]} is {errors[index]:.0f} deg/day "
-            "off (it counts linearly, not quadratically)"
-        )
+        day = OBSERVATIONS[index][0][:10]
+        words = f"outlier: the rate of {day} is {errors[index]:.0f} deg/day off"
+        lines.append(f"{words} (it counts linearly, not quadratically)")
     return "\n".join(lines)
 
 

@@ -1,13 +1,12 @@
-"""Elliptic functions and integrals: the public face, `rj.elliptic`.
+"""Elliptic functions and integrals, `rj.elliptic`: Jacobi's functions, Legendre's and Carlson's
+integrals.
 
-Jacobi's functions (`jacobi.py`), Legendre's integrals (`legendre.py`), Carlson's (`carlson.py`).
-Everything takes the parameter m = k², as SciPy and mpmath do, and optionally its complement
-m1 = 1 − m, without which nothing can be right as m → 1: 1 − m rounds to 0 there.
-
-All functions follow their arguments' dtype (float32 or float64), broadcast, and work under `jit`
-and `vmap`. Derivatives of every order, forward and reverse, in every argument, are written down
-as functions of the same families; no iteration is differentiated, and all loops have a length
-fixed by the dtype.
+The parameter is m = k², as in SciPy and mpmath. Its complement m1 = 1 − m is an optional argument:
+as m → 1 the difference 1 − m loses its digits and finally rounds to 0. Results have the dtype of
+the arguments (float32 or float64), and the shapes of the arguments are broadcast. Derivatives of
+every order, in forward and reverse mode and by every argument, are functions of the same families:
+no iteration is differentiated, and the dtype fixes the length of every loop. **Raises:**
+`TypeError` for half precision, `ValueError` for shapes that do not broadcast.
 """
 
 from rigidjax._names import show

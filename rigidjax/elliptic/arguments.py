@@ -1,4 +1,4 @@
-"""Checks and conversions of the special functions' arguments."""
+"""Checks and conversions of the arguments of elliptic functions."""
 
 from typing import Any
 
@@ -16,13 +16,7 @@ Result = Float[Array, "..."]
 
 
 def common(**named: Any) -> tuple[Result, ...]:
-    """All arguments as floating arrays of one dtype, broadcast to one shape.
-
-    Python numbers take the dtype of the arrays beside them; without arrays it is JAX's default.
-
-    **Raises:** `TypeError` unless it is float32, float64 or an integer; `ValueError` for shapes
-    that do not broadcast.
-    """
+    """All arguments as arrays of one dtype and shape; Python numbers take the arrays' dtype."""
     arrays = {
         name: _checks.floating(value, (), name, batched=True) for name, value in named.items()
     }
@@ -36,10 +30,7 @@ def common(**named: Any) -> tuple[Result, ...]:
 
 
 def complementary(name: str, value: Any, complement: Any) -> dict[str, Any]:
-    """The pair (value, 1 − value) for `common`, the second computed if it was not given.
-
-    **Raises:** `ValueError` when both are given, are concrete, and do not add up to 1.
-    """
+    """The pair (value, 1 − value) for `common`; a complement that is given must fit the value."""
     value = _checks.floating(value, (), name, batched=True)
     if complement is None:
         return {name: value, name + "1": 1 - value}
@@ -58,7 +49,7 @@ def complementary(name: str, value: Any, complement: Any) -> dict[str, Any]:
 
 @jax.custom_jvp
 def exact_complement(value: Result, complement: Result) -> Any:
-    """`value` with its own digits, but as a function of its `complement` alone: slope −1."""
+    """`value`, whose derivative by its `complement` is −1 and by itself 0."""
     return value
 
 

@@ -1,9 +1,10 @@
 """Carlson's symmetric elliptic integrals R_F, R_D, R_J, R_C.
 
-R_F and R_D by duplication (Carlson 1995, doi 10.1007/BF02198293; DLMF 19.36(i)): each step
-replaces every argument a by (a + λ)/4, which first halves the logarithm of their ratio and then
-quarters their distance, until a Taylor series about the mean is exact to round-off. R_J is the
-half-line integral it is defined by. Derivatives are integrals of the same kind (DLMF 19.18).
+R_F and R_D by duplication (Carlson 1995, doi 10.1007/BF02198293; DLMF 19.36(i)). Each step replaces
+every argument a by (a + λ)/4: this first halves the logarithm of the arguments' ratio, then divides
+their distance by four. In the end a Taylor series about their mean is exact to round-off. R_J is
+computed from its definition as an integral. Derivatives are integrals of the same kind (DLMF
+19.18).
 """
 
 from functools import partial
@@ -24,14 +25,10 @@ _STEPS = {np.dtype("float64"): 13, np.dtype("float32"): 8}
 def rf(x: Real, y: Real, z: Real) -> Result:
     """R_F(x, y, z) = ½ ∫₀^∞ dt / √((t+x)(t+y)(t+z)), Carlson's integral of the first kind.
 
-    **Arguments:** `x`, `y`, `z` ≥ 0 of shapes that broadcast, at most one of them 0; any one unit
-    (the result has that unit to the power −½). Symmetric in all three. Two zeros give infinity, a
-    negative argument gives NaN.
-
-    **Returns:** DLMF 19.16.1, by Carlson 1995 (doi 10.1007/BF02198293). ∂R_F/∂z = −R_D(x, y, z)/6
-    (DLMF 19.18.1), so the derivative with respect to an argument that is 0 is −∞.
-
-    **Raises:** `TypeError` for half precision; `ValueError` for shapes that do not broadcast.
+    **Arguments:** `x`, `y`, `z` ≥ 0, at most one of them 0, in one unit; the result has the power
+    −½ of this unit. Two zeros give infinity, a negative argument gives NaN. **Returns:** R_F (DLMF
+    19.16.1), symmetric in all three arguments. Its derivative ∂R_F/∂z = −R_D(x, y, z)/6 (DLMF
+    19.18.1) is −∞ at z = 0.
 
     >>> float(rf(4.0, 4.0, 4.0))
     0.5
@@ -42,12 +39,9 @@ def rf(x: Real, y: Real, z: Real) -> Result:
 def rd(x: Real, y: Real, z: Real) -> Result:
     """R_D(x, y, z) = (3/2) ∫₀^∞ dt / ((t+z) √((t+x)(t+y)(t+z))), of the second kind.
 
-    **Arguments:** `x`, `y` ≥ 0, at most one of them 0, and `z` > 0, of shapes that broadcast; any
-    one unit. Symmetric in x and y. z = 0 or x = y = 0 give infinity, negative arguments NaN.
-
-    **Returns:** DLMF 19.16.5, by Carlson 1995 (doi 10.1007/BF02198293).
-
-    **Raises:** `TypeError` for half precision; `ValueError` for shapes that do not broadcast.
+    **Arguments:** `x`, `y` ≥ 0, at most one of them 0, and `z` > 0, in one unit. The result is
+    infinite for z = 0 or x = y = 0, and NaN for negative arguments. **Returns:** R_D (DLMF
+    19.16.5), symmetric in x and y.
 
     >>> float(rd(4.0, 4.0, 4.0))
     0.125
@@ -58,14 +52,10 @@ def rd(x: Real, y: Real, z: Real) -> Result:
 def rj_(x: Real, y: Real, z: Real, p: Real) -> Result:
     """R_J(x, y, z, p) = (3/2) ∫₀^∞ dt / ((t+p) √((t+x)(t+y)(t+z))), of the third kind.
 
-    The underscore keeps the name apart from `import rigidjax as rj`.
-
-    **Arguments:** `x`, `y`, `z` ≥ 0, at most one of them 0, and `p` > 0, of shapes that broadcast;
-    any one unit. p = 0 gives infinity; p < 0 (a principal value) is not offered and gives NaN.
-
-    **Returns:** DLMF 19.16.2, by the trapezoidal rule in ln t, exact to round-off.
-
-    **Raises:** `TypeError` for half precision; `ValueError` for shapes that do not broadcast.
+    The underscore distinguishes the name from `import rigidjax as rj`. **Arguments:** `x`, `y`, `z`
+    ≥ 0, at most one of them 0, and `p` > 0, in one unit. p = 0 gives infinity, p < 0 gives NaN (not
+    the principal value). **Returns:** R_J (DLMF 19.16.2) by the trapezoidal rule in ln t, exact to
+    round-off.
 
     >>> round(float(rj_(4.0, 4.0, 4.0, 4.0)), 14)
     0.125
@@ -74,14 +64,10 @@ def rj_(x: Real, y: Real, z: Real, p: Real) -> Result:
 
 
 def rc(x: Real, y: Real) -> Result:
-    """R_C(x, y) = ½ ∫₀^∞ dt / ((t+y) √(t+x)), the elementary one: arctangents and logarithms.
+    """R_C(x, y) = ½ ∫₀^∞ dt / ((t+y) √(t+x)) = R_F(x, y, y): arctangents and logarithms.
 
-    **Arguments:** `x` ≥ 0 and `y` ≠ 0 of shapes that broadcast; any one unit. For y < 0 the
-    Cauchy principal value (DLMF 19.2.20). y = 0 gives infinity, x < 0 gives NaN.
-
-    **Returns:** DLMF 19.2.17; R_C(x, y) = R_F(x, y, y), by Carlson 1995 (doi 10.1007/BF02198293).
-
-    **Raises:** `TypeError` for half precision; `ValueError` for shapes that do not broadcast.
+    **Arguments:** `x` ≥ 0 and `y` ≠ 0 in one unit. y = 0 gives infinity, x < 0 gives NaN.
+    **Returns:** R_C (DLMF 19.2.17); for y < 0 the Cauchy principal value (DLMF 19.2.20).
 
     >>> float(rc(4.0, 4.0))
     0.5
@@ -161,7 +147,7 @@ def _lambda(x: Any, y: Any, z: Any) -> Any:
 
 
 def _domain(value: Any, arguments: Any) -> Any:
-    """Infinity where two arguments vanish, NaN where one is negative (or NaN)."""
+    """Infinity if two arguments are 0, NaN if one is negative or NaN, else the value."""
     zeros, wrong = jnp.zeros_like(value), jnp.zeros_like(value, dtype=bool)
     for a in arguments:
         zeros = zeros + jnp.where(a == 0, 1, 0).astype(zeros.dtype)

@@ -2,11 +2,11 @@
 
     H(b; a) = ∫₀^∞ ∏ (t + aᵢ)^(−bᵢ) dt = R_{1−Σb}(b; a) / (Σb − 1)        (DLMF 19.16.9)
 
-R_F, R_D, R_J are of this form (DLMF 19.16.1, 19.16.2, 19.16.5), and the family is closed under
-differentiation: ∂H/∂aᵢ = −bᵢ H(b + eᵢ; a). The integrand is positive, so nothing cancels,
-whatever the order. In s = ln t it is analytic for |Im s| < π and decays exponentially: the plain
-trapezoidal rule converges like exp(−2π²/h) (Trefethen & Weideman 2014, doi 10.1137/130932132), and
-a number of nodes fixed by the dtype reaches round-off for arguments of very different sizes.
+R_F, R_D, R_J have this form (DLMF 19.16.1, 19.16.2, 19.16.5), and so have their derivatives: ∂H/∂aᵢ
+= −bᵢ H(b + eᵢ; a). The integrand is positive: nothing cancels at any order. As a function of s = ln
+t it is analytic for |Im s| < π and decays exponentially. The trapezoidal rule therefore converges
+like exp(−2π²/h) (Trefethen & Weideman 2014, doi 10.1137/130932132), and a fixed number of nodes
+reaches round-off, also for arguments of very different sizes.
 """
 
 import functools
@@ -29,18 +29,10 @@ _UNIT = {np.dtype("float64"): 1.0, np.dtype("float32"): 2.0**24}
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def r_integral(powers: tuple[float, ...], arguments: tuple[Result, ...]) -> Result:
-    """∫₀^∞ ∏ (t + aᵢ)^(−bᵢ) dt for aᵢ ≥ 0, to a few units of round-off.
+    """∫₀^∞ ∏ (t + aᵢ)^(−bᵢ) dt for aᵢ ≥ 0 and multiples bᵢ of ½ (`powers`) with Σ bᵢ > 1.
 
-    **Arguments:** `powers` the bᵢ, multiples of ½ with Σ bᵢ > 1 (negative ones may be among them).
-    `arguments` the aᵢ, of one shape and dtype, dimensionless or of one unit.
-
-    **Returns:** an array of that shape. Infinite where the integral diverges at 0 (zero arguments
-    whose powers add up to 1 or more); NaN for a negative argument. Derivatives of every order by
-    the same rule; an argument that is not differentiated costs nothing and may be 0. Full accuracy
-    for ratios of the aᵢ up to 1e35; 1e-13 at 1e60.
-
-    >>> round(float(r_integral((2.0,), (jnp.asarray(4.0),))), 12)
-    0.25
+    It is infinite if the integral diverges at 0, NaN for a negative argument, and accurate to
+    round-off for ratios of the aᵢ up to 1e35 (to 1e-13 at 1e60).
     """
     scale = scale_of(arguments)
     dtype = np.dtype(arguments[0].dtype)
@@ -91,7 +83,7 @@ def change(powers: tuple[float, ...], arguments: Any, directions: Any) -> Any:
 
 
 def scale_of(arguments: Any) -> Any:
-    """The largest argument: all integrals are homogeneous, and squares must not overflow."""
+    """The largest argument. The integrals are homogeneous: scaled by it, no square overflows."""
     largest = functools.reduce(jnp.maximum, arguments)
     return jnp.where(largest > 0, largest, 1)
 

@@ -1,15 +1,15 @@
 """Jacobi's elliptic functions sn, cn, dn and the amplitude, for every real parameter.
 
-Values: the argument is reduced by the half period 2K, then Bulirsch's descending transformation
-(1965, doi 10.1007/BF01397975) works with 1 − m, so that nothing is lost as m → 1.
+Values: the argument is reduced by the half period 2K. Bulirsch's descending transformation (1965,
+doi 10.1007/BF01397975) then works with 1 − m, and no digit is lost as m → 1.
 
-Derivatives: with φ = am(u|m) and u = F(φ|m), keeping u fixed gives ∂φ/∂m = dn X with
+Derivatives: with φ = am(u|m) and u = F(φ|m), the derivative at fixed u is ∂φ/∂m = dn X with
 
     X = −∂F/∂m = −½ ∫₀^u sd²(v) dv.
 
 The integrand is positive: X has all its digits at m = 0 and as m → 1, where the textbook formulas
-(Byrd & Friedman 1971, 710.51–53) divide a small difference by m m1. The second derivative in m
-comes from X too for m ≤ 0.9 or |u| ≤ 1; elsewhere from a sum over images (`jacobi_near_one.py`).
+(Byrd & Friedman 1971, 710.51–53) divide a small difference by m m1. The second derivative in m also
+comes from X for m ≤ 0.9 or |u| ≤ 1, and else from a sum over images (`jacobi_near_one.py`).
 """
 
 import math
@@ -32,17 +32,13 @@ _FLOOR = {np.dtype("float64"): 1e-40, np.dtype("float32"): 1e-8}
 def sncndn(u: Real, m: Real, m1: Real | None = None) -> tuple[Result, Result, Result]:
     """Jacobi's sn(u|m), cn(u|m), dn(u|m).
 
-    **Arguments:** `u` real; the error grows as |u| eps. `m` the parameter k², not the modulus: any
-    real number, also negative or above 1. `m1` = 1 − m given exactly, where m is so near 1 that
-    1 − m would lose digits; then the functions are functions of m1 alone, value and derivative, and
-    m only lends its digits where it is small. Shapes broadcast.
+    **Arguments:** `u` real; the error grows as |u| eps. `m` the parameter k² (not the modulus k),
+    any real number. `m1` = 1 − m: give it if m is so near 1 that 1 − m loses digits. Values and
+    derivatives then belong to m1, and m is used only where it is small.
 
-    **Returns:** three arrays (DLMF 22.2.4–6). m = 0 gives sin, cos, 1; m = 1 gives tanh, sech,
-    sech (DLMF 22.5.3–4); m < 0 and m > 1 by DLMF 22.17. Exact derivatives of every order in u
-    (DLMF 22.13(i)), m, m1.
-
-    **Raises:** `TypeError` for half precision; `ValueError` for shapes that do not broadcast or
-    m + m1 ≠ 1.
+    **Returns:** three arrays (DLMF 22.2.4–6). m = 0 gives sin, cos, 1; m = 1 gives tanh, sech, sech
+    (DLMF 22.5.3–4); m < 0 and m > 1 follow from DLMF 22.17. Derivatives of every order by u (DLMF
+    22.13(i)), m and m1 are exact. **Raises:** `ValueError` if m + m1 ≠ 1.
 
     >>> [round(float(x), 12) for x in sncndn(1.0, 0.5)]
     [0.803001824896, 0.595976567672, 0.823161001632]
@@ -55,12 +51,9 @@ def sncndn(u: Real, m: Real, m1: Real | None = None) -> tuple[Result, Result, Re
 def am(u: Real, m: Real, m1: Real | None = None) -> Result:
     """Jacobi's amplitude φ = ∫₀^u dn(v|m) dv, rad: the inverse of F(φ|m) for m ≤ 1.
 
-    **Arguments:** as `sncndn`. For m ≤ 1 the amplitude grows by π each half period 2K, without
-    jumps; for m > 1 it swings within |φ| ≤ arcsin(1/√m).
-
-    **Returns:** DLMF 22.16.1–3.
-
-    **Raises:** as `sncndn`.
+    **Arguments:** as `sncndn`. **Returns:** φ (DLMF 22.16.1–3). For m ≤ 1 it grows by π in each
+    half period 2K, without jumps; for m > 1 it oscillates within |φ| ≤ arcsin(1/√m). **Raises:** as
+    `sncndn`.
 
     >>> round(float(am(1.0, 0.5)), 12)
     0.932315079884
@@ -115,11 +108,8 @@ def _core(u: Any, m: Any, m1: Any) -> tuple[Any, Any, Any]:
     e = jnp.exp(-jnp.minimum(jnp.abs(u), largest))
     sech = 2 * e / (1 + e * e)
     hyperbolic = m1 == 0
-    return (
-        jnp.where(hyperbolic, jnp.tanh(u), s),
-        jnp.where(hyperbolic, sech, c),
-        jnp.where(hyperbolic, sech, d),
-    )
+    s, c, d = (jnp.where(hyperbolic, a, b) for a, b in ((jnp.tanh(u), s), (sech, c), (sech, d)))
+    return s, c, d
 
 
 @partial(_core.defjvp, symbolic_zeros=True)
@@ -149,11 +139,8 @@ def _slopes_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
     ds, dc, dd = jnp.zeros_like(u), jnp.zeros_like(u), jnp.zeros_like(u)
     if not isinstance(du, SymbolicZero):
         s, c, d = _core(u, m, m1)
-        ds, dc, dd = (
-            (cm * d + c * dm) * du,
-            -(sm * d + s * dm) * du,
-            -(s * c + m * (sm * c + s * cm)) * du,
-        )
+        ds, dc = (cm * d + c * dm) * du, -(sm * d + s * dm) * du
+        dd = -(s * c + m * (sm * c + s * cm)) * du
     if not isinstance(dm1, SymbolicZero):
         # For small u the images cancel to leave u³, and the integral has no large terms.
         near = (m1 < LARGEST_M1) & (jnp.abs(u) > 1)
@@ -173,7 +160,7 @@ def _slopes_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
 
 
 def _slopes_from_integral(u: Any, m: Any, m1: Any) -> tuple[Any, Any, Any]:
-    """The slopes in φ times dn X, X by Carlson's R_D over the rest of u after half periods."""
+    """The derivatives by φ times dn X; X is Carlson's R_D of u reduced by half periods."""
     s, c, d = _core(u, m, m1)
     turns = _turns(jax.lax.stop_gradient(u), jax.lax.stop_gradient(m1))[0]
     sign = _parity(turns)

@@ -6,8 +6,9 @@ imaginary transformation, §22.6(iv)),
     dn u = B Σᵢ sech(B(u − 2iK))            cn u = (B/k) Σᵢ (−1)ⁱ sech(B(u − 2iK))
     sn u = (B/k) Σᵢ (−1)ⁱ tanh(B(u − 2iK)),     i = −∞ … ∞,     e^(−2BK) = p.
 
-B, k and p are analytic in m1 at 0, so every derivative in m, at m = 1 and near it, is that of an
-explicit sum. It serves the second derivatives: through ∂F/∂m they lose all digits as m1 → 0.
+B, k and p are analytic in m1 at 0, so every derivative in m, at m = 1 and near it, is the
+derivative of an explicit sum. The sums give the second derivatives, which lose all digits through
+∂F/∂m as m1 → 0.
 """
 
 from typing import Any
@@ -24,10 +25,7 @@ _IMAGES = {np.dtype("float64"): 8, np.dtype("float32"): 4}
 
 
 def near_one(u: Result, m: Result, m1: Result) -> tuple[Result, Result, Result]:
-    """(sn, cn, dn) for 0 ≤ m1 ≤ 0.1, to round-off of 1, with right derivatives in m.
-
-    **Arguments:** `u`, `m` and `m1` = 1 − m of one shape; a tangent of m must be minus that of m1.
-    """
+    """(sn, cn, dn) for 0 ≤ m1 ≤ 0.1, to round-off of 1; tangents of m must be minus those of m1."""
     root = jnp.sqrt(m)
     fourth = jnp.sqrt(root)
     # DLMF 19.5.5–6, the difference 1 − m^(1/4) written as a quotient.
@@ -62,8 +60,8 @@ def near_one(u: Result, m: Result, m1: Result) -> tuple[Result, Result, Result]:
 
 @jax.custom_jvp
 def _power_exp(p: Any, y: Any, n: Any) -> Any:
-    """pⁿ e^y with the derivative n pⁿ⁻¹ e^y: exactly 0 the second time for n = 1, where the
-    derivatives of exp(y + n ln p) would be differences of large numbers.
+    """pⁿ e^y. For n = 1 its second derivative by p is exactly 0; by exp(y + n ln p) it would be a
+    difference of large numbers.
     """
     return jnp.exp(y + jnp.where(n == 0, 0, n * jnp.log(p)))
 

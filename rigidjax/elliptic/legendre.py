@@ -1,4 +1,4 @@
-"""Legendre's elliptic integrals, complete and incomplete, on the parameter m = k².
+"""Legendre's elliptic integrals, complete and incomplete, with the parameter m = k².
 
 All of them, and all their derivatives, belong to one family that is closed under differentiation:
 
@@ -6,7 +6,7 @@ All of them, and all their derivatives, belong to one family that is closed unde
     dI_jkl = [integrand at φ] dφ + (k + ½) I_{j+1,k+1,l} dm + l I_{j+1,k,l+1} dn
 
 F is I_000, E is I_{0,−1,0}, Π is I_001. Every integrand is positive, so no derivative is a
-difference of large numbers: the textbook formulas (DLMF 19.4) divide such differences by m m1.
+difference of large numbers. The textbook formulas (DLMF 19.4) divide such differences by m m1.
 """
 
 import math
@@ -35,15 +35,10 @@ PI_PARTS = {
 def ellipk(m: Real, m1: Real | None = None) -> Result:
     """Complete elliptic integral of the first kind, K(m) = ∫₀^{π/2} dθ/√(1 − m sin²θ).
 
-    **Arguments:** `m` the parameter k², not the modulus; m < 1 (infinite at 1, NaN beyond; negative
-    is fine). `m1` = 1 − m given exactly, where m is so near 1 that 1 − m would lose digits: then
-    it alone decides, value and derivative. Shapes broadcast.
-
-    **Returns:** π/(2 agm(1, √m1)) (DLMF 19.8.5), the arithmetic–geometric mean by a number of steps
-    fixed by the dtype.
-
-    **Raises:** `TypeError` for half precision; `ValueError` for shapes that do not broadcast or
-    m + m1 ≠ 1.
+    **Arguments:** `m` < 1 the parameter k² (not the modulus k), also negative; 1 gives infinity, a
+    larger m NaN. `m1` = 1 − m: give it if m is so near 1 that 1 − m loses digits. Value and
+    derivative then depend on m1 alone. **Returns:** π/(2 agm(1, √m1)) (DLMF 19.8.5). **Raises:**
+    `ValueError` if m + m1 ≠ 1.
 
     >>> round(float(ellipk(1.0, 1e-30)), 12)
     35.925070756031
@@ -55,12 +50,9 @@ def ellipk(m: Real, m1: Real | None = None) -> Result:
 def ellipe(m: Real, m1: Real | None = None) -> Result:
     """Complete elliptic integral of the second kind, E(m) = ∫₀^{π/2} √(1 − m sin²θ) dθ.
 
-    **Arguments:** `m` ≤ 1 the parameter k² (NaN beyond 1); `m1` = 1 − m given exactly, see
-    `ellipk`. Shapes broadcast.
-
-    **Returns:** DLMF 19.25.1 in Carlson's integrals, a sum of positive terms.
-
-    **Raises:** as `ellipk`.
+    **Arguments:** `m` ≤ 1 the parameter k² (a larger one gives NaN); `m1` as for `ellipk`.
+    **Returns:** DLMF 19.25.1 in Carlson's integrals, a sum of positive terms. **Raises:** as
+    `ellipk`.
 
     >>> float(ellipe(1.0))
     1.0
@@ -72,14 +64,10 @@ def ellipe(m: Real, m1: Real | None = None) -> Result:
 def ellippi(n: Real, m: Real, m1: Real | None = None, n1: Real | None = None) -> Result:
     """Complete elliptic integral of the third kind, ∫₀^{π/2} dθ/((1 − n sin²θ) √(1 − m sin²θ)).
 
-    **Arguments:** `n` < 1 the characteristic (DLMF's α²; infinite at 1; the principal value for
-    n > 1 is not offered: NaN), `m` < 1 the parameter k²; `m1` = 1 − m and `n1` = 1 − n given
-    exactly, see `ellipk`. Shapes broadcast. The order is Wolfram's and mpmath's.
-
-    **Returns:** DLMF 19.2.8 as one half-line integral with a positive integrand: full accuracy for
-    any n < 1, circular and hyperbolic.
-
-    **Raises:** as `ellipk`.
+    **Arguments:** `n` < 1 the characteristic (DLMF's α²): 1 gives infinity, a larger n NaN (not the
+    principal value); `m` < 1 the parameter k²; `m1` = 1 − m and `n1` = 1 − n as for `ellipk`. The
+    order is Wolfram's and mpmath's. **Returns:** DLMF 19.2.8 as one integral with a positive
+    integrand, accurate to round-off for any n < 1. **Raises:** as `ellipk`.
 
     >>> round(float(ellippi(0.5, 0.5)), 12)
     2.701287762095
@@ -91,12 +79,9 @@ def ellippi(n: Real, m: Real, m1: Real | None = None, n1: Real | None = None) ->
 def ellipf(phi: Real, m: Real, m1: Real | None = None) -> Result:
     """Incomplete elliptic integral of the first kind, F(φ|m) = ∫₀^φ dθ/√(1 − m sin²θ).
 
-    **Arguments:** `phi` the amplitude, rad, any size; `m` the parameter k², m sin²φ < 1 (NaN
-    beyond); `m1` = 1 − m given exactly, see `ellipk`. Shapes broadcast.
-
-    **Returns:** DLMF 19.25.5 in Carlson's R_F after reduction to |φ| ≤ π/2 (DLMF 19.2.10).
-
-    **Raises:** as `ellipk`.
+    **Arguments:** `phi` the amplitude, rad, any size; `m` the parameter k² with m sin²φ < 1 (else
+    NaN); `m1` as for `ellipk`. **Returns:** DLMF 19.25.5 in Carlson's R_F after reduction to |φ| ≤
+    π/2 (DLMF 19.2.10). **Raises:** as `ellipk`.
 
     >>> round(float(ellipf(1.0, 0.5)), 12)
     1.083216772845
@@ -108,13 +93,10 @@ def ellipf(phi: Real, m: Real, m1: Real | None = None) -> Result:
 def ellipeinc(phi: Real, m: Real, m1: Real | None = None) -> Result:
     """Incomplete elliptic integral of the second kind, E(φ|m) = ∫₀^φ √(1 − m sin²θ) dθ.
 
-    **Arguments:** `phi` the amplitude, rad, any size; `m` ≤ 1 the parameter k² (NaN beyond 1);
-    `m1` = 1 − m given exactly, see `ellipk`. Shapes broadcast.
-
-    **Returns:** DLMF 19.25.9 or 19.25.10 in Carlson's integrals, whichever has positive terms,
-    after reduction to |φ| ≤ π/2 (DLMF 19.2.10).
-
-    **Raises:** as `ellipk`.
+    **Arguments:** `phi` the amplitude, rad, any size; `m` ≤ 1 the parameter k² (a larger one gives
+    NaN); `m1` as for `ellipk`. **Returns:** DLMF 19.25.9 or 19.25.10 in Carlson's integrals,
+    whichever has positive terms, after reduction to |φ| ≤ π/2 (DLMF 19.2.10). **Raises:** as
+    `ellipk`.
 
     >>> round(float(ellipeinc(1.0, 0.5)), 12)
     0.927329883624
@@ -128,13 +110,10 @@ def ellippiinc(
 ) -> Result:
     """Incomplete elliptic integral of the third kind, ∫₀^φ dθ/((1 − n sin²θ) √(1 − m sin²θ)).
 
-    **Arguments:** `n` the characteristic, n sin²φ < 1; `phi` the amplitude, rad, any size; `m` the
-    parameter k², m sin²φ < 1 (NaN beyond either bound); `m1` = 1 − m and `n1` = 1 − n given
-    exactly, see `ellipk`. Shapes broadcast. The order is Wolfram's and mpmath's.
-
-    **Returns:** DLMF 19.2.7 as one half-line integral after reduction to |φ| ≤ π/2 (19.2.10).
-
-    **Raises:** as `ellipk`.
+    **Arguments:** `n` the characteristic with n sin²φ < 1; `phi` the amplitude, rad, any size; `m`
+    the parameter k² with m sin²φ < 1 (beyond either bound: NaN); `m1` = 1 − m and `n1` = 1 − n as
+    for `ellipk`. The order is Wolfram's and mpmath's. **Returns:** DLMF 19.2.7 as one integral
+    after reduction to |φ| ≤ π/2 (19.2.10). **Raises:** as `ellipk`.
 
     >>> round(float(ellippiinc(0.5, 1.0, 0.5)), 12)
     1.288978174245
@@ -145,10 +124,7 @@ def ellippiinc(
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def integral(orders: tuple[int, int, int], sine: Any, cosine: Any, m1: Any, n1: Any) -> Any:
-    """I_jkl from the sine and cosine of an amplitude |φ| ≤ π/2, so that φ near π/2 loses nothing.
-
-    `orders` is (j, k, l); `m1` = 1 − m, `n1` = 1 − n (anything where l = 0).
-    """
+    """I_jkl, `orders` (j, k, l), by sine and cosine of |φ| ≤ π/2: no digit is lost near π/2."""
     j, k, last = orders
     s, c2 = sine, cosine * cosine
     one, delta2 = jnp.ones_like(s), c2 + m1 * s * s
@@ -177,7 +153,7 @@ def _integral_jvp(orders: Any, primals: Any, tangents: Any) -> tuple[Any, Any]:
         ds = jnp.zeros_like(s) if isinstance(ds, SymbolicZero) else ds
         dc = jnp.zeros_like(c) if isinstance(dc, SymbolicZero) else dc
         delta2 = c * c + m1 * s * s
-        rate = s ** (2 * j) * _odd_power(delta2, -k)
+        rate = s ** (2 * j) * jax.lax.integer_pow(delta2, -k) * jax.lax.rsqrt(delta2)
         if last:
             rate = rate / (c * c + n1 * s * s) ** last
         tangent = tangent + rate * (c * ds - s * dc)
@@ -209,7 +185,7 @@ def _complete_first_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
 
 
 def _second_kind(s: Any, c2: Any, delta2: Any, m1: Any) -> Any:
-    """E, for 0 ≤ m ≤ 1 by DLMF 19.25.10, for m < 0 by 19.25.9: every term is positive."""
+    """E, by DLMF 19.25.10 for 0 ≤ m ≤ 1 and by 19.25.9 for m < 0: every term is positive."""
     m, one = 1 - m1, jnp.ones_like(s)
     # E(φ|1) = sin φ: at φ = π/2 the terms below have no values of their own.
     end = delta2 == 0
@@ -245,8 +221,3 @@ def half_turns(angle: Any) -> tuple[Any, Any]:
     # Cody & Waite 1980: n × head and n × middle are exact, so that r keeps the digits of the angle.
     head, middle, tail = PI_PARTS[np.dtype(angle.dtype)]
     return turns, ((angle - turns * head) - turns * middle) - turns * tail
-
-
-def _odd_power(x: Any, k: int) -> Any:
-    """x^(k − ½)."""
-    return jax.lax.integer_pow(x, k) * jax.lax.rsqrt(x)

@@ -2,9 +2,7 @@
 
 from rigidjax._names import show
 from rigidjax.frames.base import AbstractScene as AbstractScene, Force as Force
-from rigidjax.frames.frame_dynamics import (
-    BodyInFrame as BodyInFrame,
-)
+from rigidjax.frames.frame_dynamics import BodyInFrame as BodyInFrame
 from rigidjax.frames.moving import MovingFrame as MovingFrame
 from rigidjax.frames.point import Point as Point
 from rigidjax.frames.rotation_models import AboutAxis as AboutAxis, Uniform as Uniform

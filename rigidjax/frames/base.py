@@ -15,13 +15,13 @@ from rigidjax.frames.point import Point
 
 
 class AbstractScene(eqx.Module):
-    """The equations of motion of a particle: subclass it, give `acceleration` and `conserved`.
+    """The equations of motion of a particle: subclass it with `acceleration` and `conserved`.
 
     `rigidjax.simulate(None, Point(x, v), ts, scene)` solves it; `diffrax.ODETerm(scene.field)` is
-    the same in plain diffrax. A scene that ends a run, as at a collision, has two more methods:
-    `ends(t, state)`, true at the end, and `end_words(t, state)`, the reason (under `jit` both are
-    traced: words without numbers); `stats` of the solution then has `ended`, `end_time` and
-    `end_state`. Only scenes of a particle end runs so.
+    the same in plain diffrax. A scene that ends a run, for example at a collision, has two more
+    methods: `ends(t, state)`, true at the end, and `end_words(t, state)`, the reason (under `jit`
+    both are traced: words without numbers). `stats` of the solution then has `ended`, `end_time`
+    and `end_state`. Only scenes of a particle end runs so.
 
     >>> class Spring(AbstractScene):
     ...     def acceleration(self, t, state):
@@ -45,13 +45,11 @@ class AbstractScene(eqx.Module):
         return Point(y.v, self.acceleration(t, y))
 
     def drift(self, ts: Float[Array, " times"], ys: Any) -> dict[str, Scalar]:
-        """The largest departure of each conserved quantity from its first value.
+        """The largest departure of each conserved quantity of `ys` at `ts` (T,) from its first
+        value.
 
-        **Arguments:** `ts` (T,), `ys` states with a leading time axis, as in `simulate`'s solution.
-
-        >>> from rigidjax.frames import scenes
         >>> still = Point(jnp.zeros((2, 3)), jnp.zeros((2, 3)))
-        >>> float(scenes.earth(0.8).drift(jnp.arange(2.0), still)["jacobi"])
+        >>> float(rj.scenes.earth(0.8).drift(jnp.arange(2.0), still)["jacobi"])
         0.0
         """
         values = jax.vmap(self.conserved)(ts, ys)
@@ -61,8 +59,8 @@ class AbstractScene(eqx.Module):
 class Force(AbstractScene):
     """Your own force per mass as a scene, in an inertial frame (notes, eq 84).
 
-    **Arguments:** `force` a callable Module `(t, state, body) → (3,)`, m/s²; `body` is `None`. A
-    `force` of `None` is a free particle.
+    **Arguments:** `force` a callable Module `(t, state, body) → (3,)`, m/s²; `body` is `None`. For
+    a free particle `force` is `None`.
 
     >>> fall = Force(lambda t, state, body: jnp.array([0.0, 0.0, -9.8]))
     >>> fall.field(0.0, Point([0.0, 0, 0], [1.0, 0, 0])).v.tolist()
@@ -85,7 +83,7 @@ class Force(AbstractScene):
 
 
 def per_mass(value: Any, force: object) -> Vec3:
-    """A force's value with its shape checked: a user's own may return anything."""
+    """The value of a force, its shape checked: a user's force may return anything."""
     name = getattr(force, "__name__", type(force).__name__)
     return _checks.floating(value, (3,), f"force {name}", hint="force per mass, m/s²")
 

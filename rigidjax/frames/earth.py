@@ -14,12 +14,11 @@ GRAVITY = 9.80665
 
 
 class Earth(AbstractScene):
-    """Free fall and throws near one place of the turning Earth: make one with `scenes.earth`.
+    """Free fall and throws near one place of the turning Earth; `scenes.earth` makes it.
 
     Axes east, north, up; up is the plumb line. Gravity is uniform and contains the centrifugal
-    acceleration at the origin; its change with x' is added separately.
-
-    **Fields:** `latitude` rad, `gravity` m/s², `rate` rad/s.
+    acceleration at the origin; the change of the latter with x' is added. **Fields:** `latitude`
+    rad, `gravity` m/s², `rate` rad/s.
 
     >>> scene = earth(0.5)
     >>> float(scene.latitude), float(scene.gravity)
@@ -42,13 +41,9 @@ class Earth(AbstractScene):
         _, north, up = components(self.angular_velocity().astype(dtype))
         along, gravity = north * x[1] + up * x[2], self.gravity.astype(dtype)
         square = north * north + up * up
-        return jnp.stack(
-            [
-                square * x[0] + 2 * (up * v[1] - north * v[2]),
-                square * x[1] - along * north - 2 * up * v[0],
-                square * x[2] - along * up + 2 * north * v[0] - gravity,
-            ]
-        )
+        east = square * x[0] + 2 * (up * v[1] - north * v[2])
+        across = square * x[1] - along * north - 2 * up * v[0]
+        return jnp.stack([east, across, square * x[2] - along * up + 2 * north * v[0] - gravity])
 
     def conserved(self, t: ScalarLike, state: Point) -> dict[str, Scalar]:
         return {"jacobi": self.jacobi_integral(state)}
@@ -65,10 +60,9 @@ class Earth(AbstractScene):
         return 0.5 * (speed - moved) + self.gravity.astype(dtype) * x[2]
 
     def eastward_deflection(self, height: ScalarLike) -> Scalar:
-        """The eastward deflection of a dropped body, m, to first order in Ω: ⅓ Ω g cos λ
-        (2h/g)^{3/2}.
+        """The eastward deflection of a body dropped from `height` h, m: ⅓ Ω g cos λ (2h/g)^{3/2}.
 
-        **Arguments:** `height` h, m. Source: Landau and Lifshitz, Mechanics, sec. 39, problem 1.
+        To first order in Ω (Landau and Lifshitz, Mechanics, sec. 39, problem 1).
 
         >>> round(float(earth(0.0).eastward_deflection(100.0)), 5)
         0.02195
@@ -83,25 +77,26 @@ def earth(latitude: ScalarLike, gravity: ScalarLike = GRAVITY, rate: ScalarLike 
     """A place on the turning Earth, for dropped and thrown bodies.
 
     **Arguments:** `latitude` λ, rad, geodetic, north positive; `gravity` along the plumb line,
-    m/s²; `rate` Ω of the Earth, rad/s (WGS84: 7.292115e-5, one turn in 86164.1 s).
-
-    States are `Point(x, v)` in east, north, up from that place. **Raises:** `ValueError` for a
-    latitude beyond a right angle (degrees?) or gravity that is not positive.
+    m/s²; `rate` Ω of the Earth, rad/s (WGS84: 7.292115e-5, one turn in 86164.1 s). States are
+    `Point(x, v)` in east, north, up from that place. **Raises:** `ValueError` for a latitude beyond
+    a right angle (degrees?) or gravity that is not positive.
 
     >>> earth(0.5).acceleration(0.0, Point([0.0, 0, 0], [0.0, 0, 0])).tolist()
     [0.0, 0.0, -9.80665]
     """
-    return Earth(*checked(latitude, gravity, rate))
+    lat, g, w = _checks.scalars(latitude=latitude, gravity=gravity, rate=rate)
+    words = "latitude: wanted radians between −π/2 and π/2; were these degrees?"
+    lat = _checks.refuse(lat, ~(jnp.abs(lat) <= 0.5000001 * jnp.pi), words)
+    g = _checks.sign(g, "gravity", "a positive number, m/s²; it points down")
+    return Earth(lat, g, _checks.refuse(w, ~jnp.isfinite(w), "rate: wanted a finite number, rad/s"))
 
 
 class Foucault(AbstractScene):
-    """A pendulum on the turning Earth: make one with `scenes.foucault`.
+    """A pendulum on the turning Earth; `scenes.foucault` makes it.
 
     The bob keeps the distance `length` from the pivot at the origin; axes east, north, up. The
-    string's pull is eliminated, so the length is kept to the solver's tolerance, not exactly:
-    `drift` reports it.
-
-    **Fields:** `place` the `Earth` scene it hangs in; `length` m.
+    string's force is eliminated: the length is kept to the solver's tolerance, not exactly, and
+    `drift` reports it. **Fields:** `place` the `Earth` scene; `length` m.
 
     >>> pendulum = foucault(0.85, 67.0)
     >>> float(pendulum.length), float(pendulum.place.latitude)
@@ -112,7 +107,7 @@ class Foucault(AbstractScene):
     length: Scalar
 
     def acceleration(self, t: ScalarLike, state: Point) -> Vec3:
-        """d²x'/dt² (3,), m/s²: the free one minus the part along the string (notes, eq 91)."""
+        """d²x'/dt² (3,), m/s²: the free one minus its part along the string (notes, eq 91)."""
         x, v = components(state.x), components(state.v)
         a = components(self.place.acceleration(t, state))
         pull = (dot_components(x, a) + dot_components(v, v)) / dot_components(x, x)
@@ -123,7 +118,7 @@ class Foucault(AbstractScene):
         return {"jacobi": self.place.jacobi_integral(state), "length": length}
 
     def start(self, east: ScalarLike, north: ScalarLike) -> Point:
-        """The bob held at rest, `east` and `north` of its lowest place, m.
+        """The bob at rest, `east` and `north` of its lowest place, m.
 
         >>> foucault(0.5, 10.0).start(6.0, 0.0).x.tolist()
         [6.0, 0.0, -8.0]
@@ -133,32 +128,25 @@ class Foucault(AbstractScene):
     def state(
         self, east: ScalarLike, north: ScalarLike, east_speed: ScalarLike, north_speed: ScalarLike
     ) -> Point:
-        """The bob below the pivot at a horizontal place, m, with a horizontal velocity, m/s.
-
-        **Raises:** `ValueError` for a place beyond the string (`EquinoxRuntimeError` under `jit`).
+        """The bob below the pivot at a horizontal place, m, within the string, with a velocity,
+        m/s.
 
         >>> foucault(0.5, 10.0).state(6.0, 0.0, 4.0, 0.0).v.tolist()
         [4.0, 0.0, 3.0]
         """
-        length, e, n, ve, vn = _checks.scalars(
-            length=self.length,
-            east=east,
-            north=north,
-            east_speed=east_speed,
-            north_speed=north_speed,
-        )
+        named = dict(east=east, north=north, east_speed=east_speed, north_speed=north_speed)
+        length, e, n, ve, vn = _checks.scalars(length=self.length, **named)
         below = length**2 - e * e - n * n
-        below = _checks.refuse(
-            below, ~(below > 0), "foucault: the start lies beyond the length of the string"
-        )
+        words = "foucault: the start lies beyond the length of the string"
+        below = _checks.refuse(below, ~(below > 0), words)
         up = -jnp.sqrt(below)
         return Point(jnp.stack([e, n, up]), jnp.stack([ve, vn, -(e * ve + n * vn) / up]))
 
     def small_swing(self, state: Point, t: ScalarLike) -> Point:
-        """The position of small swings at `t`, s: the closed form.
+        """The state of small swings at `t`, s, in closed form.
 
-        With s = east + i north and Ω_z = Ω sin λ, s'' + 2iΩ_z s' + ω₀² s = 0 has the solution
-        s = e^{−iΩ_z t} (A cos ωt + B sin ωt), ω² = ω₀² + Ω_z², ω₀² = g/L (Landau and Lifshitz,
+        s = east + i north and Ω_z = Ω sin λ obey s'' + 2iΩ_z s' + ω₀² s = 0. The solution is s =
+        e^{−iΩ_z t} (A cos ωt + B sin ωt), ω² = ω₀² + Ω_z², ω₀² = g/L (Landau and Lifshitz,
         Mechanics, sec. 39, problem 3). Its error is of the order of (amplitude/length)².
 
         **Arguments:** `state` at t = 0. **Returns** a `Point` at the height of the lowest place.
@@ -188,8 +176,6 @@ class Foucault(AbstractScene):
     def precession_rate(self) -> Scalar:
         """The rate of the plane of small swings, rad/s, −Ω sin λ: clockwise in the north.
 
-        One turn takes a sidereal day over sin λ.
-
         >>> round(float(2 * jnp.pi / -foucault(jnp.pi / 6, 67.0).precession_rate()))
         172328
         """
@@ -197,38 +183,20 @@ class Foucault(AbstractScene):
 
 
 def foucault(
-    latitude: ScalarLike,
-    length: ScalarLike,
-    gravity: ScalarLike = GRAVITY,
-    rate: ScalarLike = RATE,
+    latitude: ScalarLike, length: ScalarLike, gravity: ScalarLike = GRAVITY, rate: ScalarLike = RATE
 ) -> Foucault:
     """Foucault's pendulum.
 
     **Arguments:** `latitude` λ, rad, north positive; `length` of the string, m; `gravity` m/s²,
-    along the plumb line; `rate` of the Earth, rad/s (WGS84 unless given). Any may be traced: the
-    latitude and the rate can be fitted to a record.
-
-    **Raises:** `ValueError` for a length or gravity that is not positive, a latitude in degrees.
+    along the plumb line; `rate` of the Earth, rad/s (WGS84 by default). All may be traced: latitude
+    and rate can be fitted to a record. **Raises:** `ValueError` for a length or gravity that is not
+    positive, a latitude in degrees.
 
     >>> pendulum = foucault(0.85, 67.0)
     >>> pendulum.start(3.0, 0.0).v.tolist()
     [0.0, 0.0, 0.0]
     """
-    place = Earth(*checked(latitude, gravity, rate))
+    place = earth(latitude, gravity, rate)
     string = _checks.floating(length, (), "length")
     string = _checks.sign(string, "length", "a positive number, m")
     return Foucault(place, string.astype(jnp.promote_types(string.dtype, place.rate.dtype)))
-
-
-def checked(
-    latitude: ScalarLike, gravity: ScalarLike, rate: ScalarLike
-) -> tuple[Scalar, Scalar, Scalar]:
-    """Latitude, gravity and rate as scalars of one dtype, or the likely mistake."""
-    lat, g, w = _checks.scalars(latitude=latitude, gravity=gravity, rate=rate)
-    lat = _checks.refuse(
-        lat,
-        ~(jnp.abs(lat) <= 0.5000001 * jnp.pi),
-        "latitude: wanted radians between −π/2 and π/2; were these degrees?",
-    )
-    g = _checks.sign(g, "gravity", "a positive number, m/s²; it points down")
-    return lat, g, _checks.refuse(w, ~jnp.isfinite(w), "rate: wanted a finite number, rad/s")

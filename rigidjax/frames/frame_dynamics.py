@@ -1,4 +1,4 @@
-"""Integrate inside a moving frame: a particle, or the attitude of a body."""
+"""Integrate inside a moving frame: a particle, or a body."""
 
 from collections.abc import Callable
 from typing import Any, ClassVar
@@ -17,7 +17,7 @@ from rigidjax.rotation import linalg3, quaternion
 
 
 class InFrame(AbstractScene):
-    """A particle seen and solved in a moving frame: eq 91 of the notes, corrected.
+    """A particle whose motion is solved in a moving frame: eq 91 of the notes, corrected.
 
     **Arguments:**
 
@@ -25,10 +25,9 @@ class InFrame(AbstractScene):
     - `inside`: force per mass in S', `(t, Point in S') → (3,)`, m/s², axes of S'.
     - `outside`: force per mass in S, `(t, Point in S) → (3,)`, m/s², axes of S.
     - `potential`: V(x') per mass, `(3,) → ()`, m²/s²; its force −∇V is taken by automatic
-      differentiation. `conserved` then has the Jacobi integral in a uniformly turning frame with no
-      other force.
+      differentiation. In a uniformly turning frame without other forces `conserved` has the Jacobi
+      integral.
 
-    >>> import rigidjax as rj
     >>> scene = InFrame(MovingFrame(rj.frames.Uniform([0.0, 0.0, 1.0])))
     >>> scene.acceleration(0.0, rj.frames.Point([2.0, 0, 0], [0.0, 0, 0])).tolist()
     [2.0, 0.0, 0.0]
@@ -69,10 +68,7 @@ class InFrame(AbstractScene):
 
 
 def scene_of(force: Any) -> AbstractScene:
-    """The scene that `simulate` solves: a scene, a frame seen from inside, or a plain force.
-
-    **Raises:** `TypeError` for anything else.
-    """
+    """The scene that `simulate` solves: a scene, a frame seen from inside, or a plain force."""
     if isinstance(force, AbstractScene):
         return force
     if isinstance(force, MovingFrame):
@@ -95,24 +91,17 @@ class FrameWrench(eqx.Module):
 class BodyInFrame(eqx.Module):
     """The torque, and for `Rigid` the force, that make a body's equations valid in a moving frame.
 
-    Give it to `simulate` as the torque of an `Attitude` or `Rigid` state in S': q' body → S', and
-    Ω' the rate relative to S', in body axes; x', v' of the centre of mass.
+    Give it to `simulate` as the torque of an `Attitude` or `Rigid` state in S': q' body → S'; Ω'
+    the rate relative to S', in body axes; x', v' of the centre of mass. With W = Q'ᵀ Ω the frame's
+    rate in body axes, Ω' = Ω_abs − W, and I dΩ_abs/dt = IΩ_abs × Ω_abs + τ, the equation of Ω' is
 
-    With W = Q'ᵀ Ω the frame's rate in body axes, Ω' = Ω_abs − W, and from I dΩ_abs/dt =
-    IΩ_abs × Ω_abs + τ follows
+    I dΩ'/dt = IΩ' × Ω' + [τ + IΩ_abs × Ω_abs − IΩ' × Ω' − I(Q'ᵀ dΩ/dt − Ω' × W)],
 
-    I dΩ'/dt = IΩ' × Ω' + [τ + IΩ_abs × Ω_abs − IΩ' × Ω' − I(Q'ᵀ dΩ/dt − Ω' × W)].
+    and the centre of mass moves as a `Point` does (eq 91). **Arguments:** `frame` the `MovingFrame`
+    S'; `torque` the real τ, `(t, state in S', body) → (3,)`, N m, body axes, or a model of it that
+    gives a `Wrench`, with its force in the axes of S'; or `None`. Source: notes, eqs 50, 91, for a
+    body instead of a point. **Raises:** `TypeError` for a force on a state that only turns.
 
-    and the centre of mass moves as a `Point` does (eq 91).
-
-    **Arguments:** `frame` the `MovingFrame` S'; `torque` the real τ,
-    `(t, state in S', body) → (3,)`, N m, body axes, or a model of it that gives a `Wrench`, with
-    its force in the axes of S'; or `None`.
-
-    Source: notes, eqs 50, 91, for a body instead of a point. **Raises:** `TypeError` for a force on
-    a state that only turns.
-
-    >>> import rigidjax as rj
     >>> frame = MovingFrame(rj.frames.Uniform([0.0, 0.0, 1.0]))
     >>> still = rj.Attitude([1.0, 0, 0, 0], [0.0, 0, -1.0])
     >>> BodyInFrame(frame)(0.0, still, rj.Inertia.from_principal(1.0, 2.0, 3.0)).tolist()

@@ -1,4 +1,4 @@
-"""A moving frame at one instant: the kinematics of section 3 of the notes, on plain numbers."""
+"""A moving frame at one instant: the kinematics of section 3 of the notes."""
 
 from typing import Any
 
@@ -10,13 +10,13 @@ from rigidjax.rotation import linalg3, quaternion
 
 
 class Instant(eqx.Module):
-    """The position, rotation and motion of a moving frame S' at one time.
+    """The position, rotation and motion of a moving frame S' at one time; `MovingFrame.at(t)` makes
+    it.
 
     **Fields:** `rotation` M (3, 3), S' → S; `rate` Ω (3,), rad/s, and `rate_change` dΩ/dt (3,),
     rad/s², both in the axes of S'; `origin`, `origin_velocity`, `origin_acceleration` of S', (3,),
-    in the axes of S. `MovingFrame.at(t)` makes one. x', v' below are in S'.
+    in the axes of S. The methods take x', v' in S'.
 
-    >>> import rigidjax as rj
     >>> now = rj.frames.MovingFrame(rj.frames.Uniform([0.0, 0.0, 2.0])).at(0.0)
     >>> now.rate.tolist(), now.coriolis([1.0, 0.0, 0.0]).tolist()
     ([0.0, 0.0, 2.0], [0.0, -4.0, 0.0])

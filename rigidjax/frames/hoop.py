@@ -15,11 +15,10 @@ from rigidjax.rotation.linalg3 import components
 
 
 class Hoop(AbstractScene):
-    """A bead that slides on a hoop turning about its vertical diameter: see `scenes.hoop`.
+    """A bead that slides on a hoop turning about its vertical diameter; `scenes.hoop` makes it.
 
-    Axes of the hoop: x in its plane, y across it, z up; the centre is the origin.
-
-    **Fields:** `radius` m, `rate` rad/s, `gravity` m/s².
+    Axes of the hoop: x in its plane, y across it, z up; the centre is the origin. **Fields:**
+    `radius` m, `rate` rad/s, `gravity` m/s².
 
     >>> scene = hoop(2.0, 0.0)
     >>> float(scene.radius), float(scene.gravity)
@@ -46,7 +45,7 @@ class Hoop(AbstractScene):
         return {"jacobi": jacobi, "radius": jnp.sqrt(x * x + z * z)}
 
     def side_push(self, state: Point) -> Scalar:
-        """The hoop's force per mass across its plane, m/s² along y: 2Ω v_x, against Coriolis.
+        """The hoop's force per mass across its plane, m/s² along y: 2Ω v_x, opposite to Coriolis.
 
         >>> float(hoop(1.0, 3.0).side_push(Point([0.0, 0, -1], [2.0, 0, 0])))
         12.0
@@ -81,9 +80,8 @@ def hoop(radius: ScalarLike, rate: ScalarLike, gravity: ScalarLike = GRAVITY) ->
     """A bead without friction on a hoop that turns about its vertical diameter.
 
     **Arguments:** `radius` R, m; `rate` Ω, rad/s; `gravity` m/s². Source: Goldstein, Mechanics,
-    sec. 2.7 (θ'' = sin θ (Ω² cos θ − g/R)); notes, eq 91.
-
-    **Raises:** `ValueError` for a radius that is not positive.
+    sec. 2.7 (θ'' = sin θ (Ω² cos θ − g/R)); notes, eq 91. **Raises:** `ValueError` for a radius
+    that is not positive.
 
     >>> hoop(1.0, 5.0).acceleration(0.0, Point([0.0, 0, -1], [0.0, 0, 0])).tolist()
     [0.0, 0.0, 0.0]
@@ -108,7 +106,7 @@ def turntable(rate: ScalarLike, growth: ScalarLike = 0.0) -> InFrame:
     """A frictionless table that turns about z, and the motion of a puck in its frame.
 
     **Arguments:** `rate` Ω at t = 0, rad/s; `growth` dΩ/dt, rad/s². The puck moves straight in the
-    inertial frame; `turntable(…).frame` transforms states both ways (notes, eqs 85–91).
+    inertial frame; `turntable(…).frame` transforms states in both directions (notes, eqs 85–91).
 
     >>> turntable(2.0).acceleration(0.0, Point([1.0, 0, 0], [0.0, 0, 0])).tolist()
     [4.0, 0.0, 0.0]

@@ -15,13 +15,7 @@ from rigidjax.rotation import linalg3, quaternion
 
 
 class Tide(eqx.Module):
-    """Gravity-gradient torque 3n² u × I u on a circular orbit, seen from the orbital frame.
-
-    u is the direction away from the planet, the first axis of that frame. Source: Hughes 1986,
-    Spacecraft Attitude Dynamics, sec. 8.1.
-
-    **Arguments:** `rate` n, rad/s, scalar array.
-    """
+    """Gravity-gradient torque 3n² u × I u, u away from the planet (Hughes 1986, sec. 8.1)."""
 
     feels: ClassVar[type] = HasAttitude
     rate_free: ClassVar[bool] = True
@@ -37,14 +31,12 @@ def libration(rate: ScalarLike) -> BodyInFrame:
     """The torque on a body in a circular orbit, for `simulate` with `Attitude` states.
 
     Orbital frame: x away from the planet, y along the motion, z along the orbit's normal; it turns
-    at n about z. `q` takes body axes to it, `omega` is the rate relative to it, in body axes.
+    at n about z. `q` takes body axes to it; `omega` is the rate relative to it, in body axes.
 
-    **Arguments:** `rate` n of the orbit, rad/s. Small librations in the plane of a body with
-    principal moments (a, b, c) along (x, y, z) have the rate n √(3 (b − a)/c).
+    **Arguments:** `rate` n of the orbit, rad/s. Small librations in the orbital plane of a body
+    with moments (a, b, c) about (x, y, z) have the rate n √(3 (b − a)/c). Source: Hughes 1986,
+    ch. 9; notes, eqs 50, 91.
 
-    Source: Hughes 1986, ch. 9; notes, eqs 50, 91.
-
-    >>> import rigidjax as rj
     >>> body = rj.Inertia.from_principal(1.0, 2.0, 2.5)
     >>> at_rest = rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 0])
     >>> libration(0.001)(0.0, at_rest, body).tolist()
@@ -61,7 +53,6 @@ def libration_integral(state: Any, body: Any, rate: ScalarLike) -> Scalar:
     **Arguments:** `state` an `Attitude` in the orbital frame; `body` an `Inertia`; `rate` n, rad/s.
     u and w are the frame's first and third axes in body axes (Hughes 1986, sec. 9.1).
 
-    >>> import rigidjax as rj
     >>> body = rj.Inertia.from_principal(1.0, 2.0, 2.5)
     >>> at_rest = rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 0])
     >>> float(libration_integral(at_rest, body, 2.0))

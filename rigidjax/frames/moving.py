@@ -19,23 +19,19 @@ class MovingFrame(eqx.Module):
     """A frame S' that turns and moves in any differentiable way, relative to an inertial S.
 
     Coordinates transform as x = X(t) + M(t) x' (notes, eqs 85, 86, with an origin added).
-
     **Arguments:**
 
-    - `rotation`: a function of time, s, to M (3, 3) or to its unit quaternion (4,), S' → S; or a
+    - `rotation`: a function of time, s, to M (3, 3) or to its unit quaternion (4,), S' → S. Or a
       function to a state with `q` and `omega`, such as a solution of `simulate` (its `evaluate` is
-      called) or a `FreeBody`: then the frame is fixed in the body, and derivatives through a solved
+      called) or a `FreeBody`: the frame is then fixed in the body, and derivatives through a solved
       motion are in forward mode only. A Module (`frames.Uniform`) does not compile again for other
       numbers; a new `lambda` does.
-    - `origin`: a function of time to X (3,), m, axes of S; `None` where the origins coincide.
-    - `rate`: Ω (3,), rad/s, **axes of S'**, as a function of time, if it is known; else it is Ω =
-      vee(Mᵀ dM/dt) (eqs 45–50) by automatic differentiation. dΩ/dt always comes from automatic
-      differentiation.
+    - `origin`: a function of time to X (3,), m, axes of S; `None` if the origins coincide.
+    - `rate`: Ω (3,), rad/s, **axes of S'**, as a function of time, if it is known; else Ω =
+      vee(Mᵀ dM/dt) (eqs 45–50) by automatic differentiation, which always gives dΩ/dt.
 
-    Its numbers may be traced: gradients with respect to a rate or an origin pass through.
-
-    **Raises:** `TypeError` for a `rotation` that is neither; when used, `ValueError` for a value
-    that is no rotation (checked where the value is known, that is outside `jit`).
+    Its numbers may be traced: a rate or an origin has gradients. **Raises:** `TypeError` for
+    another `rotation`; when used, `ValueError` for a known value that is no rotation.
 
     >>> turntable = MovingFrame(rj.frames.Uniform([0.0, 0.0, 2.0]))
     >>> turntable.centrifugal([1.0, 0.0, 0.0], 0.3).tolist()
@@ -70,9 +66,7 @@ class MovingFrame(eqx.Module):
         return rotation_models.matrix(self.rotation, t)
 
     def at(self, t: ScalarLike) -> Instant:
-        """The frame at time `t`, s: M, Ω, dΩ/dt, and the origin with two derivatives.
-
-        Call it once if you need several of the methods below at the same time.
+        """The frame at time `t`, s: M, Ω, dΩ/dt, and the origin with its two derivatives.
 
         >>> MovingFrame(rj.frames.Uniform([0.0, 0.0, 2.0])).at(0.0).rate.tolist()
         [0.0, 0.0, 2.0]
@@ -102,12 +96,11 @@ class MovingFrame(eqx.Module):
         **Arguments:** `state` a `Point`, `Attitude` or `Rigid`, or any Module with `x` and `v`,
         with `q` and `omega`, or with all four; one state. `t` time, s. Then
 
-        x = X + M x',  v = dX/dt + M (v' + Ω × x')  (notes, eqs 85, 87, 88),
-        q = q_M q',  Ω_body = Ω'_body + (M')ᵀ Ω, in body axes both.
+        x = X + M x',  v = dX/dt + M (v' + Ω × x')  (notes, eqs 85, 87, 88), q = q_M q',  Ω_body =
+        Ω'_body + (M')ᵀ Ω, both in body axes.
 
         Many: `jax.vmap(frame.to_inertial)(states, times)`.
 
-        >>> import rigidjax as rj
         >>> frame = MovingFrame(rj.frames.Uniform([0.0, 0.0, 2.0]))
         >>> frame.to_inertial(rj.frames.Point([1.0, 0, 0], [0.0, 0, 0]), 0.0).v.tolist()
         [0.0, 2.0, 0.0]
@@ -119,7 +112,6 @@ class MovingFrame(eqx.Module):
 
         **Arguments:** as there. x' = Mᵀ(x − X), v' = Mᵀ(v − dX/dt) − Ω × x' (notes, eqs 86–88).
 
-        >>> import rigidjax as rj
         >>> frame = MovingFrame(rj.frames.Uniform([0.0, 0.0, 2.0]))
         >>> frame.from_inertial(rj.frames.Point([1.0, 0, 0], [0.0, 2, 0]), 0.0).v.tolist()
         [0.0, 0.0, 0.0]
@@ -127,23 +119,20 @@ class MovingFrame(eqx.Module):
         return self.at(t).from_inertial(state)
 
     def centrifugal(self, x: Vector, t: ScalarLike) -> Vec3:
-        """Centrifugal acceleration −Ω × (Ω × x') (3,), m/s², axes of S' (notes, eq 91).
-
-        **Arguments:** `x` (3,) position in S', m; `t` s.
+        """Centrifugal acceleration −Ω × (Ω × x') (3,), m/s², axes of S' (notes, eq 91), of a place
+        `x`, m.
         """
         return self.at(t).centrifugal(x)
 
     def coriolis(self, v: Vector, t: ScalarLike) -> Vec3:
-        """Coriolis acceleration −2 Ω × v' (3,), m/s², axes of S' (notes, eq 91).
-
-        **Arguments:** `v` (3,) velocity in S', m/s; `t` s.
+        """Coriolis acceleration −2 Ω × v' (3,), m/s², axes of S' (notes, eq 91), of a velocity `v`,
+        m/s.
         """
         return self.at(t).coriolis(v)
 
     def euler_acceleration(self, x: Vector, t: ScalarLike) -> Vec3:
-        """Euler acceleration −dΩ/dt × x' (3,), m/s², axes of S' (notes, eq 91, "inercial").
-
-        **Arguments:** `x` (3,) position in S', m; `t` s.
+        """Euler acceleration −dΩ/dt × x' (3,), m/s², axes of S' (eq 91, "inercial"), of a place
+        `x`, m.
         """
         return self.at(t).euler_acceleration(x)
 
@@ -157,7 +146,7 @@ class MovingFrame(eqx.Module):
         """The acceleration in S': eq 91 of the notes, corrected, with a moving origin.
 
         d²x'/dt² = f − Ω×(Ω×x') − 2Ω×v' − dΩ/dt×x' − Mᵀ d²X/dt². (Eq 91 prints one more x'' inside
-        its bracket; eq 90 shows that it is a slip.)
+        its bracket, a slip: see eq 90.)
 
         **Arguments:** `x`, `v` (3,) in S', m and m/s; `t` s; `force` f = MᵀF (3,) per mass, m/s²,
         **axes of S'** (`force_from_inertial` makes it from F), `None` for a free particle.
@@ -171,10 +160,7 @@ class MovingFrame(eqx.Module):
         return free if force is None else _checks.floating(force, (3,), "force") + free
 
     def acceleration_to_inertial(self, x: Vector, v: Vector, a: Vector, t: ScalarLike) -> Vec3:
-        """The acceleration in S (3,), m/s² (notes, eqs 89, 90, with a moving origin).
-
-        **Arguments:** `x`, `v`, `a` (3,) position, velocity and acceleration in S'; `t` s.
-        """
+        """The acceleration in S (3,), m/s², of `x`, `v`, `a` (3,) in S' at `t` (eqs 89, 90)."""
         now, a = self.at(t), _checks.floating(a, (3,), "a")
         return now.outward(a - now.fictitious(x, v))
 
@@ -189,8 +175,8 @@ class MovingFrame(eqx.Module):
     def jacobi_integral(self, state: Any, t: ScalarLike, potential: ScalarLike = 0.0) -> Scalar:
         """½|v'|² − ½|Ω × x'|² + V, m²/s²: conserved if Ω and V(x') do not depend on time.
 
-        **Arguments:** `state` a `Point` in S'; `t` s; `potential` V per mass there, m²/s².
-        Source: Goldstein, Mechanics, sec. 3.12 (as h = −C/2 in the three-body problem).
+        **Arguments:** `state` a `Point` in S'; `t` s; `potential` V per mass at its place, m²/s².
+        Source: Goldstein, Mechanics, sec. 3.12 (in the three-body problem it is −C/2).
         """
         require_point(state)
         speed = linalg3.dot(state.v, state.v)
@@ -209,7 +195,7 @@ class MovingFrame(eqx.Module):
         return MovingFrame(both.rotation, both.origin, both.rate)
 
     def inverse(self) -> "MovingFrame":
-        """S relative to S': M → Mᵀ, X → −MᵀX. `frame.then(frame.inverse())` is no motion at all."""
+        """S relative to S': M → Mᵀ, X → −MᵀX. `frame.then(frame.inverse())` does not move."""
         back = _Inverse(self)
         return MovingFrame(back.rotation, back.origin, back.rate)
 

@@ -7,16 +7,16 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rigidjax import _checks, _show
+from rigidjax._types import Vectors
 
 
 class Point(eqx.Module):
     """Position and velocity of a particle, in the frame of its scene.
 
     **Arguments:** `x` (3,) position, m; `v` (3,) its velocity **in that frame**, m/s. Scenes with
-    units of their own (the restricted three-body problem) say so. Leading axes are allowed in a
-    container of many states; functions take one. Source: notes, eq 84 (x, and ẋ).
-
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype, or leading axes that differ.
+    units of their own (the restricted three-body problem) say so. A container of many states has
+    leading axes; functions take one state. Source: notes, eq 84 (x, and ẋ). **Raises:**
+    `ValueError` for leading axes that differ.
 
     >>> Point([1.0, 0, 0], [0.0, 2, 0]).v.shape
     (3,)
@@ -27,7 +27,7 @@ class Point(eqx.Module):
 
     __repr__ = _show.numbers
 
-    def __init__(self, x: Float[Array, "*batch 3"] | object, v: Float[Array, "*batch 3"] | object):
+    def __init__(self, x: Vectors, v: Vectors):
         hint = "a plane problem has z = 0; functions take one particle, batch with jax.vmap"
         x = _checks.floating(x, (3,), "x", batched=True, hint=hint)
         v = _checks.floating(v, (3,), "v", batched=True, hint=hint)

@@ -16,9 +16,7 @@ from rigidjax.rotation.validation import near_unit, tolerance
 
 
 class Uniform(eqx.Module):
-    """A uniform turn M(t) = exp(t hat Ω), which is 1 at t = 0 (notes, eqs 17, 18).
-
-    **Arguments:** `omega` Ω (3,), rad/s: the same numbers in S and in S'.
+    """A uniform turn M(t) = exp(t hat Ω), M(0) = 1, of `omega` Ω (3,), rad/s, axes of S or S'.
 
     >>> Uniform([0.0, 0.0, 1.0])(jnp.pi).round(12)[0].tolist()
     [-1.0, -0.0, 0.0]
@@ -39,9 +37,7 @@ class Uniform(eqx.Module):
 
 
 class AboutAxis(eqx.Module):
-    """A turn about a fixed axis by any angle(t): turntables that speed up, pendula that swing.
-
-    **Arguments:** `axis` (3,), of any length but zero; `angle` a function of time to rad.
+    """A turn about a fixed `axis` (3,), of any length, by any `angle`, a function of time to rad.
 
     >>> float(AboutAxis([0.0, 0.0, 2.0], lambda t: 3.0 * t**2).rate(1.0)[2])
     6.0
@@ -70,10 +66,7 @@ class AboutAxis(eqx.Module):
 
 
 def differentiable(rotation: Any) -> Any:
-    """`rotation`, with its own solves made ready for forward differentiation.
-
-    A frame needs dΩ/dt, and the default adjoint of a solution of `simulate` refuses that.
-    """
+    """`rotation`, with its own solves in forward mode, which dΩ/dt needs."""
 
     def reverse(part: Any) -> bool:
         return isinstance(part, dfx.RecursiveCheckpointAdjoint)
@@ -87,7 +80,7 @@ def state_of(rotation: Any, t: Array) -> Any:
 
 
 def matrix(rotation: Any, t: Array) -> Mat3:
-    """M(t) of the rotation given to a frame: a function to (3, 3) or (4,), or a solution."""
+    """M(t) of the rotation of a frame: a function to (3, 3) or (4,), or a solution."""
     value = state_of(rotation, t)
     value = getattr(value, "q", value)
     shape = jnp.shape(value)
@@ -97,9 +90,8 @@ def matrix(rotation: Any, t: Array) -> Mat3:
     m = _checks.floating(value, (3, 3), "rotation", hint="wanted a matrix or a quaternion (4,)")
     if _checks.known(m):
         off = jnp.max(jnp.abs(linalg3.product(m.T, m) - jnp.eye(3, dtype=m.dtype)))
-        _checks.refuse(
-            m, ~(off < tolerance(m.dtype)), "rotation: Mᵀ M is not 1, so this is no rotation"
-        )
+        words = "rotation: Mᵀ M is not 1, so this is no rotation"
+        _checks.refuse(m, ~(off < tolerance(m.dtype)), words)
         left = linalg3.determinant(m) < 0
         _checks.refuse(m, left, "rotation: left-handed axes, det = −1 (notes, eq 10)")
     return m.astype(t.dtype)

@@ -1,9 +1,8 @@
-"""Equations of motion from any Lagrangian by differentiation; Euler angles as the worked case.
+"""Equations of motion from any Lagrangian by differentiation, and from any Hamiltonian.
 
-It serves as a cross-check, for teaching, and for scenes with their own coordinates. The equations
-of `Attitude` cost less for a rigid body and have no singular attitude: the equations in Euler
-angles are singular at sin θ = 0, and need many small steps near it. `lie_poisson` is the
-Hamiltonian side.
+For cross-checks, for teaching, and for scenes with their own coordinates. For a rigid body the
+equations of `Attitude` cost less and have no singular attitude. Those in Euler angles are singular
+at sin θ = 0, and need many small steps near it. `lie_poisson` is the Hamiltonian side.
 """
 
 from rigidjax._names import show

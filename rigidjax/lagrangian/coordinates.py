@@ -21,9 +21,7 @@ class Coordinates(eqx.Module):
     """The state of a Lagrangian system: coordinates and their rates.
 
     **Arguments:** `q` (n,) generalised coordinates, in the Lagrangian's units; `rate` (n,) dq/dt,
-    per second. Leading axes are allowed in a container of many states; functions take one.
-
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
+    per second. A container of many states has leading axes; functions take one state.
 
     >>> Coordinates([0.1, 0.2], [0.0, 1.0]).rate.shape
     (2,)
@@ -37,18 +35,14 @@ class Coordinates(eqx.Module):
     ):
         self.q = _checks.numbers(q, "q")
         if self.q.ndim == 0 or self.q.size == 0:
-            raise ValueError(
-                f"q: wanted generalised coordinates (n,), got shape {self.q.shape}; of one give [q]"
-            )
-        self.rate = _checks.floating(
-            rate, self.q.shape, "rate", hint="one rate for each coordinate"
-        )
+            words = f"wanted generalised coordinates (n,), got {self.q.shape}; for one give [q]"
+            raise ValueError(f"q: {words}")
+        hint = "one rate for each coordinate"
+        self.rate = _checks.floating(rate, self.q.shape, "rate", hint=hint)
 
 
 class LagrangeEquations(eqx.Module):
-    """Lagrange's equations as a vector field; made by `equations_of_motion`.
-
-    **Fields:** `lagrangian` and `force` as given there.
+    """Lagrange's equations as a vector field of `lagrangian` and `force`, by `equations_of_motion`.
 
     >>> pendulum = equations_of_motion(lambda q, v: 0.5 * v[0] ** 2 + 9.81 * jnp.cos(q[0]))
     >>> round(float(pendulum.energy(Coordinates([0.0], [2.0]))), 6)  # ½ v² − 9.81 cos q
@@ -83,17 +77,14 @@ def equations_of_motion(
 
     `d/dt ∂L/∂q̇ = ∂L/∂q + Q`, solved for q̈: `(∂²L/∂q̇∂q̇) q̈ = ∂L/∂q − (∂²L/∂q̇∂q) q̇ + Q`.
 
-    **Arguments:** `lagrangian` a callable, best a Module (its numbers can then be differentiated
-    and changed without compiling again), `(q, q̇) → L`, J, with `q`, `q̇` (n,); `force` generalised
-    forces without a potential, `(t, q, q̇) → Q` (n,), or `None`.
-
-    **Returns** a Module, for `diffrax.ODETerm`. Up to three coordinates are solved by cofactors,
-    more by LU (`lineax`).
-
-    Source: Landau and Lifshitz, Mechanics, eq 2.6; the notes mention it after eq 57.
+    **Arguments:** `lagrangian` a callable, best a Module (its numbers can be differentiated, and
+    changed without compiling again), `(q, q̇) → L`, J, with `q`, `q̇` (n,); `force` generalised
+    forces without a potential, `(t, q, q̇) → Q` (n,), or `None`. **Returns** a Module, for
+    `diffrax.ODETerm`. It solves for up to three coordinates by cofactors, for more by LU
+    (`lineax`). Source: Landau and Lifshitz, Mechanics, eq 2.6; the notes mention it after eq 57.
 
     **Raises:** `TypeError` for anything but functions; `ValueError` if L is not one number. A
-    singular ∂²L/∂q̇∂q̇ (a chart's singularity, a coordinate without mass) gives infinities or NaN.
+    singular ∂²L/∂q̇∂q̇ (a singular chart, a coordinate without mass) gives infinities or NaN.
 
     >>> pendulum = equations_of_motion(lambda q, v: 0.5 * v[0] ** 2 + 9.81 * jnp.cos(q[0]))
     >>> pendulum(0.0, Coordinates([jnp.pi / 2], [0.0])).rate
@@ -106,18 +97,15 @@ def equations_of_motion(
 
 
 class EulerAngleTop(eqx.Module):
-    """The worked case: L = ½ Ω·IΩ − U of a body about a fixed point, in the notes' Euler angles.
+    """L = ½ Ω·IΩ − U of a body about a fixed point, in the notes' Euler angles.
 
     **Arguments:** `inertia` about the fixed point (or the centre of mass, if free); `torque` one
-    with a potential that does not depend on time, such as `HeavyTop`, or `None`.
+    with a potential that does not depend on time, such as `HeavyTop`, or `None`. It is called with
+    the angles (φ, θ, ψ), sequence 3-1-3, rad, and their rates, and returns L, J. It is singular at
+    sin θ = 0. Source: notes, eqs 33, 75, 81–83. **Raises:** `TypeError` for a torque without a
+    potential.
 
-    A call with the angles (φ, θ, ψ), sequence 3-1-3, rad, and their rates returns L, J. Source:
-    notes, eqs 33, 75, 81–83. Singular at sin θ = 0.
-
-    **Raises:** `TypeError` for a torque without a potential.
-
-    >>> from rigidjax import Inertia
-    >>> free = EulerAngleTop(Inertia.from_principal(1.0, 1.0, 2.0))
+    >>> free = EulerAngleTop(rj.Inertia.from_principal(1.0, 1.0, 2.0))
     >>> free(jnp.array([0.0, 1.0, 0.0]), jnp.array([0.0, 0.0, 2.0]))
     Array(4., dtype=float64)
     """
@@ -147,9 +135,8 @@ class EulerAngleTop(eqx.Module):
 
 
 def to_attitude(y: Coordinates) -> Attitude:
-    """Attitude and body rate of 3-1-3 Euler angles and their rates (notes, eqs 33, 81–83).
-
-    **Arguments:** `y` with `q` = (φ, θ, ψ), rad, and `rate`, rad/s.
+    """Attitude and body rate of `y`, 3-1-3 Euler angles, rad, and rates, rad/s (notes, eqs 33,
+    81–83).
 
     >>> to_attitude(Coordinates([0.0, 0.0, 0.0], [0.0, 0.0, 2.0])).omega.tolist()
     [0.0, 0.0, 2.0]
@@ -162,10 +149,9 @@ def to_attitude(y: Coordinates) -> Attitude:
 def from_attitude(state: HasAttitude) -> Coordinates:
     """3-1-3 Euler angles and their rates of an attitude and a body rate.
 
-    **Arguments:** `state` with `.q` (4,), body → world, and `.omega` (3,), rad/s.
-
-    **Raises:** `ValueError` (`EquinoxRuntimeError` under `jit`) at sin θ = 0, where the angles are
-    not unique and the rates do not exist.
+    **Arguments:** `state` with `.q` (4,), body → world, and `.omega` (3,), rad/s. **Raises:**
+    `ValueError` (`EquinoxRuntimeError` under `jit`) at sin θ = 0, where the angles are not unique
+    and the rates do not exist.
 
     >>> back = from_attitude(to_attitude(Coordinates([0.1, 0.2, 0.3], [1.0, 2.0, 3.0])))
     >>> back.rate.round(12).tolist()
@@ -173,17 +159,12 @@ def from_attitude(state: HasAttitude) -> Coordinates:
     """
     _checks.single(state, HasAttitude, "state", wanted="an Attitude")
     angles = euler.from_quaternion(state.q)
-    angles = _checks.refuse(
-        angles,
-        euler.is_singular(angles),
-        "from_attitude: sin θ = 0, where Euler angles (3-1-3) are singular; solve for an "
-        "Attitude, which has no singular attitude",
-    )
+    words = "from_attitude: Euler angles (3-1-3) are singular at sin θ = 0; solve for an Attitude"
+    angles = _checks.refuse(angles, euler.is_singular(angles), words)
     return Coordinates(angles, euler.omega_to_rates(angles, state.omega))
 
 
 def _solve(matrix: Float[Array, "n n"], push: Float[Array, " n"]) -> Float[Array, " n"]:
-    """The x with matrix x = push."""
     n = push.shape[0]
     if n == 1:
         return push / matrix[0]

@@ -18,10 +18,8 @@ from rigidjax.rotation.linalg3 import apply, cross, dot
 class Momentum(eqx.Module):
     """The state of Lie–Poisson motion: the angular momentum in the body.
 
-    **Arguments:** `pi` (3,) Π = IΩ, N m s, body frame. Leading axes are allowed in a container of
-    many states; functions take one.
-
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
+    **Arguments:** `pi` (3,) Π = IΩ, N m s, body frame. A container of many states has leading axes;
+    functions take one state.
 
     >>> Momentum([1.0, 0.0, 0.0]).pi.shape
     (3,)
@@ -36,10 +34,9 @@ class Momentum(eqx.Module):
 class MomentumAndDirection(eqx.Module):
     """The state of a heavy top reduced by its symmetry: momentum, and a fixed direction.
 
-    **Arguments:** `pi` (3,) Π, N m s, body frame; `gamma` (3,) γ = Rᵀ d of a vector d that is fixed
-    in the world, body frame. Any length and unit: for `HeavyTopHamiltonian` d = g, m/s².
-
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype, or leading axes that differ.
+    **Arguments:** `pi` (3,) Π, N m s, body frame; `gamma` (3,) γ = Rᵀ d, body frame, of a vector d
+    that is fixed in the world. Any length and unit: for `HeavyTopHamiltonian` d = g, m/s².
+    **Raises:** `ValueError` for leading axes that differ.
 
     >>> MomentumAndDirection([1.0, 0.0, 0.0], [0.0, 0.0, -9.81]).gamma.shape
     (3,)
@@ -55,7 +52,7 @@ class MomentumAndDirection(eqx.Module):
 
 
 class LiePoisson(eqx.Module):
-    """`dΠ/dt = Π × ∇H(Π)` as a vector field, H the `hamiltonian`; made by `lie_poisson`."""
+    """`dΠ/dt = Π × ∇H(Π)` as a vector field, H the `hamiltonian`; `lie_poisson` makes it."""
 
     hamiltonian: Callable[[Any], Any]
 
@@ -64,19 +61,15 @@ class LiePoisson(eqx.Module):
 
 
 class LiePoissonWithDirection(eqx.Module):
-    """The same with a direction carried along, `hamiltonian` H(Π, γ).
-
-    `lie_poisson_with_direction` makes it.
-    """
+    """`LiePoisson` for a `hamiltonian` H(Π, γ); `lie_poisson_with_direction` makes it."""
 
     hamiltonian: Callable[[Any, Any], Any]
 
     def __call__(
         self, t: ScalarLike, y: MomentumAndDirection, args: object = None
     ) -> MomentumAndDirection:
-        turn, pull = jax.grad(lambda p, g: _number(self.hamiltonian(p, g)), argnums=(0, 1))(
-            y.pi, y.gamma
-        )
+        value = lambda p, g: _number(self.hamiltonian(p, g))  # noqa: E731
+        turn, pull = jax.grad(value, argnums=(0, 1))(y.pi, y.gamma)
         return MomentumAndDirection(cross(y.pi, turn) + cross(y.gamma, pull), cross(y.gamma, turn))
 
 
@@ -85,13 +78,10 @@ def lie_poisson(hamiltonian: Callable[[Any], Any]) -> LiePoisson:
 
     **Arguments:** `hamiltonian` a callable, best a Module, `Π → H`, J, with Π (3,), N m s, body
     frame; ∇H is then the body rate Ω. For `½ Π·I⁻¹Π`, `RotationalHamiltonian(inertia)`, these are
-    Euler's equations. Keeps H and the Casimir |Π|².
+    Euler's equations. H and the Casimir |Π|² are conserved. Source: Marsden and Ratiu, Introduction
+    to Mechanics and Symmetry, §§1.2, 1.3. **Raises:** `TypeError` for what cannot be called;
+    `ValueError` if H is not one number.
 
-    Source: Marsden and Ratiu, Introduction to Mechanics and Symmetry, §§1.2, 1.3.
-
-    **Raises:** `TypeError` for what cannot be called; `ValueError` where H is not one number.
-
-    >>> import rigidjax as rj
     >>> H = RotationalHamiltonian(rj.Inertia.from_principal(1.0, 2.0, 2.0))
     >>> lie_poisson(H)(0.0, Momentum([1.0, 1.0, 1.0])).pi
     Array([ 0. ,  0.5, -0.5], dtype=float64)
@@ -102,13 +92,10 @@ def lie_poisson(hamiltonian: Callable[[Any], Any]) -> LiePoisson:
 def lie_poisson_with_direction(hamiltonian: Callable[[Any, Any], Any]) -> LiePoissonWithDirection:
     """The heavy-top form: `dΠ/dt = Π × ∂H/∂Π + γ × ∂H/∂γ`, `dγ/dt = γ × ∂H/∂Π`, of any H(Π, γ).
 
-    **Arguments:** `hamiltonian` a callable, best a Module, `(Π, γ) → H`, J. For a heavy top give
-    `HeavyTopHamiltonian(inertia, top)`. It conserves H and the Casimirs |γ|² and Π·γ.
-
-    Source: the Lie–Poisson equations of se(3)*; Marsden and Ratiu, Introduction to Mechanics and
-    Symmetry, §1.4.
-
-    **Raises:** `TypeError` for what cannot be called; `ValueError` where H is not one number.
+    **Arguments:** `hamiltonian` a callable, best a Module, `(Π, γ) → H`, J; for a heavy top
+    `HeavyTopHamiltonian(inertia, top)`. H and the Casimirs |γ|² and Π·γ are conserved. Source: the
+    Lie–Poisson equations of se(3)*; Marsden and Ratiu, Introduction to Mechanics and Symmetry,
+    §1.4. **Raises:** as `lie_poisson`.
 
     >>> field = lie_poisson_with_direction(lambda p, g: 0.5 * dot(p, p) - g[2])
     >>> field(0.0, MomentumAndDirection([0.0, 0, 1], [1.0, 0, 0])).pi.tolist()
@@ -123,14 +110,11 @@ def _invertible(inertia: Any) -> _inertia.Inertia:
 
 
 class RotationalHamiltonian(eqx.Module):
-    """H = ½ Π·I⁻¹Π, the energy of rotation.
+    """H = ½ Π·I⁻¹Π, the energy of rotation, J, a function of Π (3,).
 
-    **Arguments:** `inertia` about the centre of mass or a fixed point. Called with Π (3,), gives J.
+    **Arguments:** `inertia` about the centre of mass or a fixed point. **Raises:** `TypeError` for
+    anything but an `Inertia`; `ValueError` for a moment known to be zero.
 
-    **Raises:** `TypeError` for anything but an `Inertia`; `ValueError` for a moment known to be
-    zero.
-
-    >>> import rigidjax as rj
     >>> RotationalHamiltonian(rj.Inertia.from_principal(1.0, 1.0, 2.0))([0.0, 0.0, 2.0])
     Array(1., dtype=float64)
     """
@@ -146,15 +130,13 @@ class RotationalHamiltonian(eqx.Module):
 
 
 class HeavyTopHamiltonian(eqx.Module):
-    """H = ½ Π·I⁻¹Π − m c·γ with γ = Rᵀ g, the energy of a heavy top.
+    """H = ½ Π·I⁻¹Π − m c·γ with γ = Rᵀ g, the energy of a heavy top, J.
 
-    **Arguments:** `inertia` about the fixed point; `top` a `HeavyTop`, of which m and c are used.
-    Called with Π (3,) and γ (3,), m/s², body frame, gives J. `start` makes the state.
+    **Arguments:** `inertia` about the fixed point; `top` a `HeavyTop`, which gives m and c. It is a
+    function of Π (3,) and γ (3,), m/s², body frame; `start` makes the state. **Raises:**
+    `TypeError` for an `inertia` that is no `Inertia`, or a `top` that is no `HeavyTop` (another
+    torque has no such Hamiltonian); `ValueError` for a moment known to be zero.
 
-    **Raises:** `TypeError` for an `inertia` that is no `Inertia`, or a `top` that is no `HeavyTop`:
-    another torque has no such Hamiltonian; `ValueError` for a moment known to be zero.
-
-    >>> import rigidjax as rj
     >>> top = rj.torques.HeavyTop(2.0, [0.0, 0, 0.5], [0.0, 0, -9.81])
     >>> H = HeavyTopHamiltonian(rj.Inertia.from_principal(1.0, 1.0, 2.0), top)
     >>> H([0.0, 0.0, 2.0], [0.0, 0.0, -9.81])
@@ -167,9 +149,8 @@ class HeavyTopHamiltonian(eqx.Module):
 
     def __init__(self, inertia: _inertia.Inertia, top: HeavyTop):
         self.inertia = _invertible(inertia)
-        self.top = _checks.instance(
-            top, HeavyTop, "top", hint="this Hamiltonian is that of gravity alone"
-        )
+        hint = "this Hamiltonian is for gravity alone"
+        self.top = _checks.instance(top, HeavyTop, "top", hint=hint)
         self.inverse = _inertia.inverse(self.inertia.tensor)
 
     def __call__(

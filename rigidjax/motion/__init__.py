@@ -1,20 +1,8 @@
-"""States and what a motion conserves: model no more than the scene needs."""
+"""States of a body, and what a motion conserves."""
 
 from rigidjax._names import show
-from rigidjax._types import (
-    HasAttitude as HasAttitude,
-    HasPose as HasPose,
-    HasSpin as HasSpin,
-)
-from rigidjax.motion.conserved import (
-    conserved as conserved,
-    drift as drift,
-    energy as energy,
-)
-from rigidjax.motion.equations import (
-    Attitude as Attitude,
-    Rigid as Rigid,
-    Spin as Spin,
-)
+from rigidjax._types import HasAttitude as HasAttitude, HasPose as HasPose, HasSpin as HasSpin
+from rigidjax.motion.conserved import conserved as conserved, drift as drift, energy as energy
+from rigidjax.motion.equations import Attitude as Attitude, Rigid as Rigid, Spin as Spin
 
 show(__name__)

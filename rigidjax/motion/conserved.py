@@ -24,18 +24,14 @@ def energy(
     torque: Torque | None = None,
     t: ScalarLike = 0.0,
 ) -> Scalar:
-    """Kinetic energy plus the potential energy of every torque and force, J.
+    """Kinetic energy plus the potential energy of every torque and force, J:
+    `½ m |v|² + ½ Ω·IΩ + U`.
 
     **Arguments:** `body`, `state`, `torque` as for `simulate`; `t` s, for torques that depend on
-    time.
-
-    `T + U`, `T = ½ m |v|² + ½ Ω·IΩ` (notes, eq 79). Wheels inside count as no energy, but for
-    `ReactionWheels`. Under a torque with states of its own `state` is a `Coupled`, as
-    `batch.rollout` and `crossings` give it.
-
+    time. Wheels add no energy, except for `ReactionWheels`. Under a torque with states of its own
+    `state` is a `Coupled`, as `batch.rollout` and `crossings` return it. Source: notes, eq 79.
     **Raises:** `TypeError` for a torque without a potential.
 
-    >>> import rigidjax as rj
     >>> top = rj.torques.HeavyTop(2.0, [0.0, 0.0, 0.5], [0.0, 0.0, -9.81])
     >>> start = rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 1])
     >>> energy(rj.Inertia.from_principal(1.0, 1.0, 1.0), start, top)
@@ -44,11 +40,8 @@ def energy(
     turning, parts, t = _scene(body, state, torque, t)
     for part in parts:
         if not hasattr(part, "energy"):
-            raise TypeError(
-                f"energy: {type(part).__name__} has no potential (no method energy(t, state, "
-                "body)), so it conserves no energy; give only the torques that have one, or see "
-                "kinetic_energy"
-            )
+            words = f"energy: {type(part).__name__} has no potential (no energy(t, state, body))"
+            raise TypeError(f"{words}; give only the torques that have one, or see kinetic_energy")
     return _energy(in_precision(body, turning.omega.dtype), turning, parts, t)
 
 
@@ -60,24 +53,21 @@ def conserved(
 ) -> dict[str, Float[Array, "..."]]:
     """The conserved quantities of this scene's exact motion, at one state.
 
-    **Arguments:** `body`, `state`, `torque` as for `simulate`; `t` s. A torque declares its
-    conserved quantities by optional members, see `rigidjax.torques.AbstractTorque`; without them
-    nothing is conserved.
-
-    **Returns** a dict of the conserved quantities here, the same names at all times:
+    **Arguments:** `body`, `state`, `torque` as for `simulate`; `t` s. A torque declares what it
+    conserves by optional members (see `rigidjax.torques.AbstractTorque`); without them nothing is
+    conserved. **Returns** a dict of the conserved quantities here, the same names at all times:
 
     - `energy`, J: every torque has a potential and none depends on time;
     - `momentum` (3,), kg m²/s, world frame, `R(IΩ + h)`, and `momentum_squared`, the Casimir
       `|IΩ + h|²`: no external torque (h is the wheels' momentum);
-    - `momentum_along_axis`, kg m²/s: one torque, with none about this axis (gravity, a field);
-    - `linear_momentum` (3,), kg m/s, world frame: no force acts on it;
+    - `momentum_along_axis`, kg m²/s: the only torque has no part along this axis (gravity, field);
+    - `linear_momentum` (3,), kg m/s, world frame: no force acts on the body;
     - `momentum_about_origin` (3,), kg m²/s, world frame, `m x × v + R(IΩ + h)`: free, or attracted
       by the origin.
 
     Source: Noether's theorem; Marsden and Ratiu, Introduction to Mechanics and Symmetry, §§1.3,
     1.4.
 
-    >>> import rigidjax as rj
     >>> body = rj.Inertia.from_principal(1.0, 2.0, 3.0)
     >>> sorted(conserved(body, rj.Spin([1.0, 0, 0])))
     ['energy', 'momentum_squared']
@@ -119,13 +109,12 @@ def drift(
 ) -> dict[str, Scalar]:
     """The drift of each conserved quantity during a run, relative to its size.
 
-    **Arguments:** `ts` (T,) s; `ys` states with a leading time axis, a `Coupled` of them under a
-    torque with states of its own; `body`, `torque` as for `simulate`.
+    **Arguments:** `ts` (T,) s; `ys` states with a leading time axis, as a `Coupled` if the torque
+    has states of its own; `body`, `torque` as for `simulate`. **Returns** for each name of
+    `conserved` the largest distance from its value at `ts[0]`, divided by the largest kinetic
+    energy, momentum, or momentum squared of the run.
 
-    **Returns** for each name of `conserved` the largest distance from its value at `ts[0]`, divided
-    by the largest kinetic energy, momentum, or momentum squared of the run. Zero is perfect.
-
-    >>> import jax, rigidjax as rj
+    >>> import jax
     >>> body, ts = rj.Inertia.from_principal(1.0, 2.0, 3.0), jax.numpy.linspace(0.0, 9.0, 4)
     >>> ys = rj.simulate(body, rj.Spin([0.1, 1.0, 0.0]), ts).ys
     >>> bool(drift(ts, ys, body)["energy"] < 1e-8)
@@ -159,7 +148,7 @@ def drift(
 
 
 def _scene(body: Any, state: Any, torque: Any, t: Any) -> tuple[Any, tuple[Any, ...], Scalar]:
-    """The body's state, the torques on it with their own states put in, and the time."""
+    """The body's state, its torques with their own states put in, and the time."""
     if isinstance(state, Coupled):
         state, torque = state.motion, freeze(torque, state.own)
     parts = _parts(torque)

@@ -15,16 +15,13 @@ from rigidjax.motion.torques.states import first_states, freeze, has_states, rat
 class Coupled(eqx.Module):
     """The state of a body whose torque has states of its own, for the integrators.
 
-    `simulate` makes it itself, and returns its parts: `sol.ys` and `sol.own`.
-    `rigidjax.batch.rollout` returns it for such a torque, and `rigidjax.conserved` and `energy`
-    take it.
+    `simulate` makes it itself and returns its parts, `sol.ys` and `sol.own`;
+    `rigidjax.batch.rollout` returns it; `rigidjax.conserved` and `energy` take it. **Arguments:**
+    `motion` a `Spin`, `Attitude` or `Rigid`; `own` a tuple of the states of each torque that has
+    some, as `Solution.own`.
 
-    **Arguments:** `motion` a `Spin`, `Attitude` or `Rigid`; `own` a tuple of the states of each
-    law that has some, as `Solution.own`.
-
-    >>> from rigidjax import Inertia, Spin, torques
-    >>> wheel = torques.ReactionWheels([[0.0, 0, 1]], [0.1], [30.0])
-    >>> Coupled.start(Inertia.from_principal(1.0, 2.0, 3.0), Spin([0.0, 0, 2.0]), wheel).own
+    >>> wheel = rj.torques.ReactionWheels([[0.0, 0, 1]], [0.1], [30.0])
+    >>> Coupled.start(rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([0.0, 0, 2.0]), wheel).own
     (Array([3.2], dtype=float64),)
     """
 
@@ -43,10 +40,8 @@ class Coupled(eqx.Module):
 
 
 class CoupledEquations(eqx.Module):
-    """The equations of a body and of its torques' states as a vector field `f(t, y, args)`.
-
-    **Arguments:** `field` the body's own, such as `AttitudeEquations`, with a torque that has
-    states; `body`. `rigidjax.equations_of_motion` makes it for a `Coupled`.
+    """The equations of a body (`field`) and of its torques' states as a vector field
+    `f(t, y, args)`.
     """
 
     field: Callable[..., Any]

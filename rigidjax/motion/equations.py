@@ -8,8 +8,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from rigidjax import _checks, _show
-from rigidjax._types import HasAttitude, HasPose, HasSpin, Mat3, Quat, ScalarLike, Vec3
+from rigidjax import _checks, _show, _types
+from rigidjax._types import HasAttitude, HasPose, HasSpin, Mat3, Quat, ScalarLike, Vec3, Vectors
 from rigidjax.body.inertia import Inertia, MassProperties, apply, inverse
 from rigidjax.motion.coupled import Coupled
 from rigidjax.motion.torques.base import Torque, act, evaluate, require_law
@@ -18,16 +18,14 @@ from rigidjax.rotation.kernels import square4
 from rigidjax.rotation.linalg3 import components, cross
 
 State = TypeVar("State")
-_HINT = "Inertia.from_tensor makes one of a matrix; of MassProperties pass .inertia"
+_HINT = "Inertia.from_tensor takes a matrix; from MassProperties pass .inertia"
 
 
 class Spin(eqx.Module):
-    """A body rate alone: the state of a turning body without its attitude.
+    """The state of a turning body without its attitude: the body rate alone.
 
-    **Arguments:** `omega` (3,) angular velocity Ω in the body frame, rad/s (notes, eq 49). Leading
-    axes are allowed in a container of many states; functions take one.
-
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
+    **Arguments:** `omega` (3,) angular velocity Ω in the body frame, rad/s (notes, eq 49). A
+    container of many states has leading axes; functions take one state.
 
     >>> Spin([1.0, 0.0, 0.0]).omega.shape
     (3,)
@@ -37,20 +35,17 @@ class Spin(eqx.Module):
 
     __repr__ = _show.numbers
 
-    def __init__(self, omega: Float[Array, "*batch 3"] | object):
+    def __init__(self, omega: Vectors):
         self.omega = _checks.floating(omega, (3,), "omega", batched=True)
 
 
 class Attitude(eqx.Module):
-    """Attitude and body rate: a body that turns.
+    """The state of a body that turns: attitude and body rate.
 
     **Arguments:** `q` (4,) unit quaternion (w, x, y, z), **scalar first**, body → world (the `M` of
-    the notes, eq 8); `omega` (3,) Ω in the body frame, rad/s. Leading axes are allowed in a
-    container of many states; functions take one.
-
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype, or leading axes that differ.
-    Whether `q` is a unit quaternion is checked where it is used (`simulate`,
-    `rigidjax.exact.free_body`).
+    the notes, eq 8); `omega` (3,) Ω in the body frame, rad/s. A container of many states has
+    leading axes; functions take one state. **Raises:** `ValueError` for leading axes that differ.
+    `simulate` and `rigidjax.exact.free_body` check that `q` is a unit quaternion.
 
     >>> Attitude([1.0, 0, 0, 0], [0.0, 0, 1]).q.shape
     (4,)
@@ -61,23 +56,20 @@ class Attitude(eqx.Module):
 
     __repr__ = _show.numbers
 
-    def __init__(
-        self, q: Float[Array, "*batch 4"] | object, omega: Float[Array, "*batch 3"] | object
-    ):
+    def __init__(self, q: _types.Quaternions, omega: Vectors):
         self.q = _checks.floating(q, (4,), "q", batched=True, hint="a quaternion is (w, x, y, z)")
         self.omega = _checks.floating(omega, (3,), "omega", batched=True)
         _checks.same_batch(q=(self.q, 1), omega=(self.omega, 1))
 
 
 class Rigid(eqx.Module):
-    """Position and velocity of the centre of mass, attitude, body rate: a body that moves.
+    """The state of a body that moves: place and velocity of its centre of mass, attitude, body
+    rate.
 
     **Arguments:** `x` (3,) position of the centre of mass, m, world frame (the `X` of the notes,
     eq 1); `v` (3,) its velocity, m/s, world frame; `q` (4,) unit quaternion (w, x, y, z), scalar
-    first, body → world; `omega` (3,) Ω in the body frame, rad/s. Leading axes are allowed in a
-    container of many states; functions take one.
-
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype, or leading axes that differ.
+    first, body → world; `omega` (3,) Ω in the body frame, rad/s. A container of many states has
+    leading axes; functions take one state. **Raises:** `ValueError` for leading axes that differ.
 
     >>> Rigid([0.0, 0, 0], [1.0, 0, 0], [1.0, 0, 0, 0], [0.0, 0, 1]).v.shape
     (3,)
@@ -90,15 +82,9 @@ class Rigid(eqx.Module):
 
     __repr__ = _show.numbers
 
-    def __init__(
-        self,
-        x: Float[Array, "*batch 3"] | object,
-        v: Float[Array, "*batch 3"] | object,
-        q: Float[Array, "*batch 4"] | object,
-        omega: Float[Array, "*batch 3"] | object,
-    ):
-        self.x = _checks.floating(x, (3,), "x", batched=True)
-        self.v = _checks.floating(v, (3,), "v", batched=True)
+    def __init__(self, x: Vectors, v: Vectors, q: _types.Quaternions, omega: Vectors):
+        self.x = _checks.floating(x, (3,), "x", batched=True, unit="m")
+        self.v = _checks.floating(v, (3,), "v", batched=True, unit="m/s")
         self.q = _checks.floating(q, (4,), "q", batched=True, hint="a quaternion is (w, x, y, z)")
         self.omega = _checks.floating(omega, (3,), "omega", batched=True)
         _checks.same_batch(x=(self.x, 1), v=(self.v, 1), q=(self.q, 1), omega=(self.omega, 1))
@@ -107,19 +93,9 @@ class Rigid(eqx.Module):
 class EulerEquations(eqx.Module):
     """Euler's equations `I dΩ/dt = IΩ × Ω + τ` as a vector field `f(t, y, args)`.
 
-    **Arguments:** `inertia` the body, about the point that it turns about; `torque` τ in the body
-    frame, N m, or `None` for a free body. A field for `diffrax.ODETerm`; `args` is not used. Its
-    values are in the precision of `state.omega`.
-
-    Source: Lie–Poisson form `dΠ/dt = Π × ∇H(Π) + τ` with `Π = IΩ`, `H = ½ Π·I⁻¹Π`; Landau and
-    Lifshitz, Mechanics, eq 36.4.
-
-    **Raises:** `ValueError` for a rod or a point, since the equations divide by the zero moment, if
-    the numbers are known; under `jit` call `Inertia.invertible` first.
-
-    >>> import rigidjax as rj
-    >>> EulerEquations(rj.Inertia.from_principal(1.0, 2.0, 3.0))(0.0, Spin([1.0, 1, 1]), None)
-    Spin(omega=[-1, 1, -0.333333])
+    `inertia` is about the point that the body turns about; `torque` τ in the body frame, N m, or
+    `None`. Source: Lie–Poisson form `dΠ/dt = Π × ∇H(Π) + τ` with `Π = IΩ`, `H = ½ Π·I⁻¹Π`; Landau
+    and Lifshitz, Mechanics, eq 36.4. A known rod or point is refused.
     """
 
     inertia: Inertia
@@ -157,20 +133,7 @@ class EulerEquations(eqx.Module):
 
 
 class AttitudeEquations(eqx.Module):
-    """Euler's equations and the kinematics `dq/dt = ½ q ⊗ (0, Ω)` as a vector field.
-
-    **Arguments:** as for `EulerEquations`. A field for `diffrax.ODETerm`; `args` is not used.
-
-    The state holds Ω, not Π = IΩ: two heavy tops at tolerances 1e-6, 1e-9, 1e-12 took the same
-    number of steps with either to 3 % (diffrax.Dopri8), and their errors differed by up to a third.
-
-    Source: `dM/dt = M J'` (notes, eq 50), written for the quaternion of M.
-
-    >>> import rigidjax as rj
-    >>> field = AttitudeEquations(rj.Inertia.from_principal(1.0, 2.0, 3.0))
-    >>> field(0.0, Attitude([1.0, 0, 0, 0], [0.0, 0, 1]), None).q
-    Array([-0. ,  0. ,  0. ,  0.5], dtype=float64)
-    """
+    """Euler's equations and `dq/dt = ½ q ⊗ (0, Ω)` (notes, eq 50) as a vector field."""
 
     euler: EulerEquations
 
@@ -182,23 +145,9 @@ class AttitudeEquations(eqx.Module):
 
 
 class NewtonEuler(eqx.Module):
-    """Newton–Euler equations about the centre of mass as a vector field `f(t, y, args)`.
+    """Newton–Euler equations about the centre of mass as a vector field (notes, eqs 1, 50, 56, 84).
 
-    `m dv/dt = F`, `I dΩ/dt = IΩ × Ω + τ`, `dq/dt = ½ q ⊗ (0, Ω)`.
-
-    **Arguments:** `body` mass properties; the inertia used is the one about its centre of mass;
-    `torque` a torque τ about the centre of mass, N m, body frame, or a force model that returns a
-    `Wrench` (F in N, world frame, and τ), or `None`. A field for `diffrax.ODETerm`; `args` is not
-    used.
-
-    Source: notes, eqs 1, 50, 56, 84.
-
-    **Raises:** as `EulerEquations`.
-
-    >>> import rigidjax as rj
-    >>> field = NewtonEuler(rj.shapes.box(2.0, [0.1, 0.2, 0.3]))
-    >>> field(0.0, Rigid([0.0, 0, 0], [1.0, 0, 0], [1.0, 0, 0, 0], [0.0, 0, 1]), None).x
-    Array([1., 0., 0.], dtype=float64)
+    `m dv/dt = F`, `I dΩ/dt = IΩ × Ω + τ`, `dq/dt = ½ q ⊗ (0, Ω)`; `torque` gives τ, or a `Wrench`.
     """
 
     euler: EulerEquations
@@ -222,14 +171,7 @@ class NewtonEuler(eqx.Module):
 
 
 def on_the_group(state: State) -> State:
-    """The same state with its quaternion, if it has one, scaled to length 1.
-
-    **Raises:** `ValueError` for a quaternion known to be zero, or too short to have a direction.
-
-    >>> import rigidjax as rj
-    >>> on_the_group(rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 1])).q.tolist()
-    [1.0, 0.0, 0.0, 0.0]
-    """
+    """The same state with its quaternion, if it has one, scaled to length 1; zero is refused."""
     if isinstance(state, Coupled):
         return eqx.tree_at(lambda s: s.motion, state, on_the_group(state.motion))
     if isinstance(state, HasAttitude):
@@ -245,9 +187,8 @@ def _unit(q: Quat) -> Quat:
     """q/|q|, with the same rounding in every program.
 
     XLA replaces q/√n by a product with 1/√n in some programs. Reverse mode runs steps again in
-    another program: a different last digit there changes the error estimate, and at tight
-    tolerances the step lengths. The gradient then belongs to another discretisation (an error of
-    7e-6 at a tolerance of 1e-11). A separate root and quotient are exact to the last digit in every
-    program, and for every body of a batch.
+    another program: a different last digit changes step lengths, and the gradient belongs to
+    another discretisation (an error of 7e-6 at a tolerance of 1e-11). A separate root and quotient
+    are exact.
     """
     return q / lax.optimization_barrier(jnp.sqrt(square4(components(q))))

@@ -1,10 +1,10 @@
-"""Small changes of a state: ⊕, ⊖, how many numbers a change has, and their names.
+"""Small changes of a state: ⊕, ⊖, the size of a change, and the names of its parts.
 
 A state is any tree of arrays: a `Spin`, an `Attitude`, a `Rigid`, a `Coupled`, a `frames.Point`, an
-array. A change of it is one vector, the numbers of the leaves in their own order; a quaternion q of
-a state with an attitude counts as three, the rotation vector δθ (rad, body frame) of `q exp(δθ)`.
-So a change of a `Rigid` is (x, v, δθ, Ω). Source: Solà, Deray and Atchuthan 2018, arXiv:1812.01537,
-right-⊕ and right-⊖.
+array. A change of it is one vector, the numbers of the leaves in their order. A quaternion q of a
+state with an attitude has three, the rotation vector δθ (rad, body frame) of `q exp(δθ)`: a change
+of a `Rigid` is (x, v, δθ, Ω). Source: Solà, Deray and Atchuthan 2018, arXiv:1812.01537, right-⊕ and
+right-⊖.
 """
 
 import math
@@ -22,43 +22,23 @@ from rigidjax.rotation.linalg3 import components
 
 
 def dimension(state: Any) -> int:
-    """The number of numbers in a change of `state`: one less than its own for each quaternion.
-
-    >>> import rigidjax as rj
-    >>> dimension(rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 0]))
-    6
-    """
+    """The size of a change of `state`: one less than its numbers for each quaternion."""
     return sum(_sizes(state))
 
 
 def names(state: Any) -> tuple[str, ...]:
-    """The names of the leaves, in the order of their numbers in a change.
-
-    >>> import rigidjax as rj
-    >>> names(rj.Rigid([0.0, 0, 0], [0.0, 0, 0], [1.0, 0, 0, 0], [0.0, 0, 0]))
-    ('x', 'v', 'q', 'omega')
-    """
+    """The names of the leaves, in the order of their numbers in a change."""
     paths = jax.tree.leaves_with_path(state)
     return tuple(jax.tree_util.keystr(path, simple=True, separator=".") for path, _ in paths)
 
 
 def parts(state: Any, change: Float[Array, "*batch n"]) -> dict[str, Float[Array, "*batch _"]]:
-    """The numbers of each leaf in a change, by name; those of a quaternion are three.
-
-    >>> import rigidjax as rj
-    >>> parts(rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 0]), jnp.arange(6.0))["omega"].tolist()
-    [3.0, 4.0, 5.0]
-    """
+    """The numbers of each leaf in a change, by name; a quaternion has three."""
     return dict(zip(names(state), _cut(state, change), strict=True))
 
 
 def turns(state: Any) -> tuple[slice, ...]:
-    """The places of the rotation vectors in a change, one for each quaternion.
-
-    >>> import rigidjax as rj
-    >>> turns(rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 0]))
-    (slice(0, 3, None),)
-    """
+    """The places of the rotation vectors in a change, one for each quaternion."""
     sizes, end, out = _sizes(state), 0, []
     for size, turned in zip(sizes, _turned(state), strict=True):
         end += size
@@ -67,12 +47,7 @@ def turns(state: Any) -> tuple[slice, ...]:
 
 
 def plus(state: Any, change: Float[Array, " n"]) -> Any:
-    """`state ⊕ change`: q exp(δθ), and sums; exactly `state` at 0.
-
-    >>> import rigidjax as rj
-    >>> plus(rj.Spin([1.0, 0, 0]), jnp.array([0.0, 0.5, 0.0])).omega.tolist()
-    [1.0, 0.5, 0.0]
-    """
+    """`state ⊕ change`: q exp(δθ), and sums; exactly `state` at 0."""
 
     def turned(q: Array, part: Array) -> Array:
         return quaternion.multiply(q, vector_to_quaternion(part))
@@ -81,12 +56,7 @@ def plus(state: Any, change: Float[Array, " n"]) -> Any:
 
 
 def minus(state: Any, reference: Any) -> Float[Array, " n"]:
-    """`state ⊖ reference`: the change with `plus(reference, change) = state`, a turn of up to π.
-
-    >>> import rigidjax as rj
-    >>> minus(rj.Spin([1.0, 0.5, 0.0]), rj.Spin([1.0, 0, 0])).tolist()
-    [0.0, 0.5, 0.0]
-    """
+    """`state ⊖ reference`: the change with `plus(reference, change) = state`, a turn of up to π."""
     return _vector(
         state,
         reference,
@@ -96,14 +66,7 @@ def minus(state: Any, reference: Any) -> Float[Array, " n"]:
 
 
 def minus_small(state: Any, reference: Any) -> Float[Array, " n"]:
-    """`minus` for a state near the reference: a turn by θ gives 2 sin(θ/2), not θ.
-
-    It is correct to second order in θ, without an arctangent, which derivatives would double.
-
-    >>> import rigidjax as rj
-    >>> minus_small(rj.Spin([1.0, 0.5, 0.0]), rj.Spin([1.0, 0, 0])).tolist()
-    [0.0, 0.5, 0.0]
-    """
+    """`minus` for a near state, without an arctangent: a turn by θ gives 2 sin(θ/2), not θ."""
 
     def turn(q: Array, q0: Array) -> Array:
         w, *u = components(quaternion.multiply(quaternion.conjugate(q0), q))
@@ -114,24 +77,12 @@ def minus_small(state: Any, reference: Any) -> Float[Array, " n"]:
 
 
 def tangent(state: Any, change: Float[Array, " n"]) -> Any:
-    """The derivative of `plus(state, ·)` at zero along a change: a tangent, as JAX has them.
-
-    >>> import rigidjax as rj
-    >>> at = rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 0])
-    >>> float(tangent(at, jnp.array([0.0, 0.0, 2.0, 0.0, 0.0, 0.0])).q[3])
-    1.0
-    """
+    """The derivative of `plus(state, ·)` at zero along a change: a tangent vector of JAX."""
     return _leaf_by_leaf(state, change, quaternion.rate, lambda _, part: part)
 
 
 def coordinates(state: Any, along: Any) -> Float[Array, " n"]:
-    """The change whose `tangent` at `state` is `along`: the inverse of `tangent`.
-
-    >>> import rigidjax as rj
-    >>> at, change = rj.Attitude([0.6, 0, 0.8, 0], [0.0, 0, 0]), jnp.arange(6.0)
-    >>> coordinates(at, tangent(at, change)).round(12).tolist()
-    [0.0, 1.0, 2.0, 3.0, 4.0, 5.0]
-    """
+    """The change whose `tangent` at `state` is `along`: the inverse of `tangent`."""
     return _vector(
         along,
         state,

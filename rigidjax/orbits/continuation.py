@@ -12,18 +12,8 @@ from jaxtyping import Array, ArrayLike, Complex, Float
 
 from rigidjax import _checks
 from rigidjax._types import Scalar, ScalarLike
-from rigidjax.orbits.differential_correction import (
-    PeriodicOrbit,
-    corrected,
-    crossing,
-    miss,
-    named,
-    newton,
-    orbit_of,
-    together,
-    usual_tolerance,
-    value_and_jacobian,
-)
+from rigidjax.orbits import differential_correction as correction
+from rigidjax.orbits.differential_correction import PeriodicOrbit, crossing, named, orbit_of
 
 # Steps of the search for a branching.
 _MOST = 60
@@ -38,20 +28,16 @@ def family(
 ) -> PeriodicOrbit:
     """The members of the family of `orbit` at which `hold` has these values, one by one.
 
-    Each member starts from the one before and its tangent, and is corrected as by `periodic_orbit`.
+    The start of each member comes from the member before and its tangent; `periodic_orbit` corrects
+    it.
 
-    **Arguments:** `orbit` one near the first of them; `values` (N,), neighbours near one
-    another; `hold` `"x"`, `"z"`, `"vy"` or `"period"`, which must be monotone along the family (use
-    `follow` past a fold).
+    **Arguments:** `orbit` one near the first of them; `values` (N,), each near the one before;
+    `hold` `"x"`, `"z"`, `"vy"` or `"period"`, which must be monotone along the family (use `follow`
+    past a fold). **Returns** a `PeriodicOrbit` with a leading axis; its derivatives by μ and
+    `values` are those of the family, forward and reverse. **Raises:** `ValueError`
+    (`EquinoxRuntimeError` under `jit`) with the value at which it was lost.
 
-    **Returns** a `PeriodicOrbit` with a leading axis; its derivatives with respect to μ and
-    `values` are those of the family, forward and reverse.
-
-    **Raises:** `ValueError` (`EquinoxRuntimeError` under `jit`) with the value at which it was
-    lost.
-
-    >>> from rigidjax import orbits
-    >>> moon = orbits.cr3bp(0.0121505856)
+    >>> moon = rj.orbits.cr3bp(0.0121505856)
     >>> start = moon.lyapunov_guess(1, 0.01)
     >>> found = moon.family(start, start.state.x[0] - jnp.array([0.0, 0.01]))
     >>> [round(float(p), 3) for p in found.period]
@@ -60,34 +46,33 @@ def family(
     start, index = crossing(orbit), named(hold)
     length = np.shape(values)
     if len(length) != 1 or length[0] < 1:
-        raise ValueError(f"values: wanted shape (N,), numbers that {hold} takes, got {length}")
+        raise ValueError(f"values: wanted shape (N,), values of {hold}, got shape {length}")
     values = _checks.finite(_checks.floating(values, length, "values"), "values")
     values = values.astype(start.dtype)
     held = 0.5 * values if hold == "period" else values
-    numbers, left = _at_values(scene, start, held, index, usual_tolerance(start))
+    numbers, left = _at_values(scene, start, held, index, correction.usual_tolerance(start))
     lost = _lost(start, numbers, left)
     where = ""
     if _checks.known(lost) and bool(lost.any()):
         where = f" at {hold} = {float(values[np.argmax(np.asarray(lost))]):.9g}"
-    numbers = _checks.refuse(
-        numbers,
-        lost.any(),
+    words = (
         f"family: lost{where}; take smaller steps, or the family turns back there: hold another of "
-        "x, z, vy, period, or use follow",
     )
+    words += "x, z, vy, period, or use follow"
+    numbers = _checks.refuse(numbers, lost.any(), words)
     return jax.vmap(orbit_of)(numbers)
 
 
 def _lost(start: Array, numbers: Array, left: Array) -> Array:
-    """The members that Newton's method did not find, or replaced by another solution."""
+    """The members that Newton's method did not find, or for which it found another solution."""
     before = jnp.concatenate([start[None], numbers[:-1]])
     ratio = numbers[:, 3] / before[:, 3]
-    return ~((left <= usual_tolerance(start)) & (ratio > 0.5) & (ratio < 2))
+    return ~((left <= correction.usual_tolerance(start)) & (ratio > 0.5) & (ratio < 2))
 
 
 @eqx.filter_jit
 def _at_values(scene: Any, start: Array, held: Array, index: int, tolerance: float) -> Any:
-    free = np.array([i for i in range(4) if i != index])
+    free = np.delete(np.arange(4), index)
     still = jax.tree.map(
         lambda leaf: lax.stop_gradient(leaf) if eqx.is_array(leaf) else leaf, scene
     )
@@ -95,30 +80,28 @@ def _at_values(scene: Any, start: Array, held: Array, index: int, tolerance: flo
     def step(last: Array, value: Scalar) -> Any:
         # The start of Newton's method has no derivative: the orbit found does not depend on it.
         last, aim = lax.stop_gradient(last), lax.stop_gradient(value)
-        _, matrix = value_and_jacobian(lambda n: miss(still, n), last)
-        slope = -jnp.linalg.solve(matrix[:, free], matrix[:, index])
-        guess = last[free] + slope * (aim - last[index])
-        found, left = corrected(index, tolerance, scene, guess, value)
-        numbers = together(found, value, index)
+        guess = last[free] + _along(still, last, index) * (aim - last[index])
+        found, left = correction.corrected(index, tolerance, scene, guess, value)
+        numbers = correction.together(found, value, index)
         return numbers, (numbers, left)
 
     # A first correction: its tangent is wanted at an orbit, not at a guess.
-    found, _ = corrected(index, tolerance, still, start[free], lax.stop_gradient(start[index]))
-    _, out = lax.scan(step, together(found, start[index], index), held)
+    found, _ = correction.corrected(
+        index, tolerance, still, start[free], lax.stop_gradient(start[index])
+    )
+    _, out = lax.scan(step, correction.together(found, start[index], index), held)
     return out
 
 
 def family_slope(scene: Any, orbit: PeriodicOrbit, *, hold: str = "x") -> PeriodicOrbit:
-    """The change of an orbit's start and period along its family, per unit of `hold`.
+    """The derivative of an orbit's start and period along its family, by `hold`.
 
-    **Arguments:** `orbit` a member of it; `hold` as in `family`. **Returns** the derivatives in
-    the shape of an orbit: `.period` is d period/d hold. Exact (implicit function theorem).
-
+    **Arguments:** `orbit` a member of it; `hold` as in `family`. **Returns** the derivatives in the
+    shape of an orbit: `.period` is d period/d hold. They are exact (implicit function theorem).
     **Raises:** `ValueError` at a fold of the family in `hold`.
 
-    >>> from rigidjax import Point, orbits
-    >>> hill, start = orbits.hill(), Point([0.3, 0, 0], [0.0, 1.6, 0])
-    >>> orbit = hill.periodic_orbit(orbits.PeriodicOrbit(start, 1.2))
+    >>> hill, start = rj.orbits.hill(), rj.Point([0.3, 0, 0], [0.0, 1.6, 0])
+    >>> orbit = hill.periodic_orbit(rj.orbits.PeriodicOrbit(start, 1.2))
     >>> round(float(hill.family_slope(orbit).period), 3)
     12.076
     """
@@ -128,12 +111,16 @@ def family_slope(scene: Any, orbit: PeriodicOrbit, *, hold: str = "x") -> Period
     return _checks.refuse(change, turned, words)
 
 
+def _along(scene: Any, numbers: Array, index: int) -> Float[Array, "3"]:
+    """The derivative of the other numbers of an orbit by the held one, along its family."""
+    _, matrix = correction.value_and_jacobian(lambda n: correction.miss(scene, n), numbers)
+    return -jnp.linalg.solve(matrix[:, np.delete(np.arange(4), index)], matrix[:, index])
+
+
 @eqx.filter_jit
 def _slope(scene: Any, numbers: Array, index: int) -> PeriodicOrbit:
-    free = np.array([i for i in range(4) if i != index])
-    _, matrix = value_and_jacobian(lambda n: miss(scene, n), numbers)
-    unknown = -jnp.linalg.solve(matrix[:, free], matrix[:, index])
-    change = orbit_of(together(unknown, jnp.ones_like(unknown[0]), index))
+    unknown = _along(scene, numbers, index)
+    change = orbit_of(correction.together(unknown, jnp.ones_like(unknown[0]), index))
     # `period` held means the whole of it, the number in `numbers` is the half.
     return jax.tree.map(lambda leaf: 0.5 * leaf, change) if index == 3 else change
 
@@ -143,24 +130,21 @@ def follow(
 ) -> PeriodicOrbit:
     """The next `count` members of a family, at fixed steps of arclength, past its folds.
 
-    Pseudo-arclength continuation in (x, z, v_y, T/2): each start lies at `step` along the
-    tangent, and Newton's method goes back across it (Keller 1977, in
-    Applications of Bifurcation Theory).
+    Pseudo-arclength continuation in (x, z, v_y, T/2): a member is a `step` along the tangent,
+    corrected by Newton's method across it (Keller 1977, in Applications of Bifurcation Theory).
 
     **Arguments:** `orbit` a member, not returned; `step` arclength, with the sign of the direction;
-    `rising` the number that grows at first for a positive `step`.
-
-    **Returns** a `PeriodicOrbit` with a leading axis. To differentiate one give it to
-    `periodic_orbit`. **Raises:** `ValueError` (`EquinoxRuntimeError` under `jit`) with the number
-    of members before it was lost.
+    `rising` the number that grows at first for a positive `step`. **Returns** a `PeriodicOrbit`
+    with a leading axis; for derivatives of a member give it to `periodic_orbit`. **Raises:**
+    `ValueError` (`EquinoxRuntimeError` under `jit`) with the number of members before it was lost.
     """
     start, index = crossing(orbit), named(rising)
     length = _checks.floating(step, (), "step").astype(start.dtype)
     bad = ~(jnp.isfinite(length) & (length != 0))
-    length = _checks.refuse(length, bad, "step: wanted a number not 0")
+    length = _checks.refuse(length, bad, "step: wanted a number that is not 0")
     if isinstance(count, bool) or not isinstance(count, int) or count < 1:
-        raise ValueError(f"count: wanted how many members, an integer ≥ 1, got {count!r}")
-    tolerance = usual_tolerance(start)
+        raise ValueError(f"count: wanted the number of members, an integer ≥ 1, got {count!r}")
+    tolerance = correction.usual_tolerance(start)
     numbers, left = _follow(scene, start, length, count, index, tolerance)
     moved = jnp.diff(jnp.concatenate([start[None], numbers]), axis=0)
     far = jnp.sqrt(jnp.sum(moved * moved, axis=1)) > 2 * jnp.abs(length)
@@ -175,23 +159,23 @@ def follow(
 @eqx.filter_jit
 def _follow(scene: Any, start: Array, step: Array, count: int, index: int, tolerance: float) -> Any:
     def missed(numbers: Array) -> Array:
-        return miss(scene, numbers)
+        return correction.miss(scene, numbers)
 
     def tangent(matrix: Array, before: Array) -> Array:
-        """The direction in which the residual stays 0, on the side of the one before."""
+        """The direction in which the residual stays 0, on the side of `before`."""
         rows = jnp.concatenate([matrix, before[None]])
         along = jnp.linalg.solve(rows, jnp.zeros(4, start.dtype).at[3].set(1))
         return along / jnp.sqrt(jnp.sum(along * along))
 
     def forward(carry: Any, _member: Any) -> Any:
         last, before = carry
-        _, matrix = value_and_jacobian(missed, last)
+        _, matrix = correction.value_and_jacobian(missed, last)
         along = tangent(matrix, before)
 
         def across(numbers: Array) -> Array:
             return jnp.append(missed(numbers), jnp.sum(along * (numbers - last)) - step)
 
-        found = newton(across, last + step * along, tolerance)
+        found = correction.newton(across, last + step * along, tolerance)
         return (found, along), (found, jnp.max(jnp.abs(missed(found))))
 
     first = jnp.zeros(4, start.dtype).at[index].set(1)
@@ -201,14 +185,7 @@ def _follow(scene: Any, start: Array, step: Array, count: int, index: int, toler
 
 
 def stability_indices(monodromy: Float[Array, "6 6"]) -> Complex[Array, "2"]:
-    """The two ν = ½(λ + 1/λ) of the multipliers λ that are not 1: `ThreeBody.stability_indices`.
-
-    The pair of multipliers 1 is removed, and the others come from tr M and tr M². Eigenvalues
-    beside a double one have an error of the root of round-off; these have not.
-
-    >>> stability_indices(jnp.eye(6)).tolist()
-    [(1+0j), (1+0j)]
-    """
+    """The two ν = ½(λ + 1/λ) of the multipliers λ that are not 1, from tr M and tr M²."""
     total = jnp.trace(monodromy) - 2
     squares = jnp.sum(monodromy * monodromy.T) + 2
     half = 0.5 * total
@@ -227,20 +204,17 @@ def bifurcation(
     value: float = 1.0,
     hold: str = "x",
 ) -> PeriodicOrbit:
-    """The member of a family between two others at which a stability index takes a value.
+    """The member of a family between two others at which a stability index has a given value.
 
     At 1 a family of the same period branches off, or the family has a fold; at −1 one of twice the
-    period; at cos(2πp/q) one of q times the period. `index` 1 of planar Lyapunov orbits is the one
-    across the plane; the halo orbits begin at its value 1.
+    period; at cos(2πp/q) one of q times the period. `index` 1 of planar Lyapunov orbits belongs to
+    motion across the plane; the halo orbits begin at its value 1.
 
-    **Arguments:** `orbit`, `other` two members near each other, between which the index passes
-    the value; `index` 0 or 1 of `stability_indices`; `value` of it; `hold` the number of the family
-    for the search, `"x"`, `"z"`, `"vy"` or `"period"`. It works on the host.
-
-    Source: Howell 1984, doi:10.1007/BF01358403; Robin and Markellos 1980,
-    doi:10.1007/BF01231183.
-
-    **Raises:** `ValueError` if the value does not lie between, or the indices are complex.
+    **Arguments:** `orbit`, `other` two members near each other, with the value between their
+    indices; `index` 0 or 1 of `stability_indices`; `value` of it; `hold` the number of the family
+    for the search, `"x"`, `"z"`, `"vy"` or `"period"`. It works on the host. Source: Howell 1984,
+    doi:10.1007/BF01358403; Robin and Markellos 1980, doi:10.1007/BF01231183. **Raises:**
+    `ValueError` if the value does not lie between, or the indices are complex.
     """
     place = named(hold)
     if isinstance(index, bool) or index not in (0, 1):
@@ -252,10 +226,8 @@ def bifurcation(
     left, right = (scene.periodic_orbit(one, hold=hold) for one in (orbit, other))
     low, high = (_index(scene, one, index) - value for one in (left, right))
     if not low * high <= 0:
-        raise ValueError(
-            f"bifurcation: the index is {low + value:.6g} at one orbit, {high + value:.6g} at the "
-            f"other: {value:g} does not lie between"
-        )
+        ends = f"{low + value:.6g} at one orbit, {high + value:.6g} at the other"
+        raise ValueError(f"bifurcation: the index is {ends}: {value:g} does not lie between")
     a, b = float(ends[0][place]), float(ends[1][place])
     width = abs(b - a)
     found, at_found = (left, low) if abs(low) < abs(high) else (right, high)
@@ -280,10 +252,8 @@ def bifurcation(
 def _index(scene: Any, orbit: PeriodicOrbit, index: int) -> float:
     found = np.asarray(_indices(scene, orbit))[index]
     if abs(found.imag) > 1e-9 * max(1.0, abs(found)):
-        raise ValueError(
-            "bifurcation: the stability indices are complex at a member between the orbits; give "
-            "orbits nearer to each other"
-        )
+        words = "the stability indices are complex at a member between the orbits"
+        raise ValueError(f"bifurcation: {words}; give orbits nearer to each other")
     return float(found.real)
 
 

@@ -1,4 +1,4 @@
-"""The circular restricted three-body problem, in the plane and in space."""
+"""The circular restricted three-body problem, and its limit near the small body: Hill's problem."""
 
 from collections.abc import Sequence
 
@@ -9,7 +9,7 @@ from jaxtyping import Array, ArrayLike, Complex, Float
 from rigidjax import _checks
 from rigidjax._types import Mat3, Scalar, ScalarLike, Vec3, Vector
 from rigidjax.frames.point import Point, require_point
-from rigidjax.orbits import lagrange_points, richardson
+from rigidjax.orbits import richardson
 from rigidjax.orbits.differential_correction import PeriodicOrbit
 from rigidjax.orbits.reversible_scene import AbstractReversible
 from rigidjax.orbits.state_transition import smallest_distance
@@ -17,13 +17,12 @@ from rigidjax.rotation.linalg3 import components
 
 
 class ThreeBody(AbstractReversible):
-    """A particle under two bodies on circular orbits: make one with `orbits.cr3bp(mu)`.
+    """A particle under two bodies on circular orbits; `orbits.cr3bp(mu)` makes it.
 
     Rotating axes, origin at the common centre of mass, the first body (mass 1 − μ) at (−μ, 0, 0),
     the second (mass μ) at (1 − μ, 0, 0). Units: their distance, their total mass, and 1/(their
-    angular rate); their period is 2π.
-
-    **Fields:** `mu` μ, scalar; `radii` (2,) of the bodies, for collisions.
+    angular rate); their period is 2π. **Fields:** `mu` μ, scalar; `radii` (2,) of the bodies, for
+    collisions.
 
     >>> scene = cr3bp(0.5)
     >>> [float(r) for r in scene.distances(jnp.array([0.0, 0.0, 0.0]))]
@@ -46,9 +45,8 @@ class ThreeBody(AbstractReversible):
         return jnp.stack([2 * vy + x - a1 * first - a2 * second, y - 2 * vx - pull * y, -pull * z])
 
     def potential(self, x: Vector) -> Scalar:
-        """U = ½(x² + y²) + (1 − μ)/r₁ + μ/r₂ (Szebehely 1967, sec. 1.5, without its constant).
-
-        **Arguments:** `x` (3,), rotating axes.
+        """U = ½(x² + y²) + (1 − μ)/r₁ + μ/r₂ at `x` (3,) (Szebehely 1967, sec. 1.5, without his
+        constant).
         """
         x = _checks.floating(x, (3,), "x")
         r1, r2 = self.distances(x)
@@ -65,18 +63,15 @@ class ThreeBody(AbstractReversible):
     def jacobi_constant(self, state: Point) -> Scalar:
         """C = 2U − |v|², conserved along the motion (Szebehely 1967, eq 1.5(20)).
 
-        >>> from rigidjax import orbits
-        >>> float(orbits.cr3bp(0.5).jacobi_constant(Point([0.0, 0, 0], [0.0, 0, 0])))
+        >>> float(rj.orbits.cr3bp(0.5).jacobi_constant(Point([0.0, 0, 0], [0.0, 0, 0])))
         4.0
         """
         require_point(state)
         return self.speed_squared(state.x, 0.0) - jnp.sum(state.v * state.v)
 
     def speed_squared(self, x: Vector, jacobi: ScalarLike) -> Scalar:
-        """|v|² = 2U(x) − C at a place; it is 0 on zero-velocity curves.
-
-        **Arguments:** `x` (3,); `jacobi` C. It is negative at places that a particle with this C
-        cannot reach. Draw `matplotlib.pyplot.contour(…, levels=[0])` of it.
+        """|v|² = 2U(x) − C at a place `x` (3,) for C = `jacobi`; negative where no such particle
+        is.
         """
         u = self.potential(x)
         return 2 * u - _checks.floating(jacobi, (), "jacobi").astype(u.dtype)
@@ -86,22 +81,19 @@ class ThreeBody(AbstractReversible):
         xs: Float[ArrayLike, " columns"] | Sequence[float],
         ys: Float[ArrayLike, " rows"] | Sequence[float],
     ) -> Float[Array, "rows columns"]:
-        """2U on a grid of the plane z = 0 (rows along y): a particle with constant C stays where it
-        is ≥ C.
+        """2U on a grid of the plane z = 0, rows along y; a particle with constant C stays where 2U
+        ≥ C.
 
         **Arguments:** `xs`, `ys` places along the axes. `matplotlib.pyplot.contour(xs, ys, grid,
         levels=[C])` draws the curve of zero velocity (Szebehely 1967, sec. 4.7).
 
-        >>> from rigidjax import orbits
-        >>> orbits.cr3bp(0.5).zero_velocity([0.0], [0.0]).tolist()
+        >>> rj.orbits.cr3bp(0.5).zero_velocity([0.0], [0.0]).tolist()
         [[4.0]]
         """
         columns, rows = _checks.numbers(xs, "xs"), _checks.numbers(ys, "ys")
         if columns.ndim != 1 or rows.ndim != 1 or 0 in (columns.size, rows.size):
-            raise ValueError(
-                f"zero_velocity: wanted xs (N,) and ys (M,), got {columns.shape} and {rows.shape}; "
-                "give the axes, not a mesh"
-            )
+            shapes = f"{columns.shape} and {rows.shape}; give the axes, not a mesh"
+            raise ValueError(f"zero_velocity: wanted xs (N,) and ys (M,), got {shapes}")
 
         def value(x: Scalar, y: Scalar) -> Scalar:
             return 2 * self.potential(jnp.stack([x, y, jnp.zeros_like(x)]))
@@ -120,8 +112,8 @@ class ThreeBody(AbstractReversible):
 
     @property
     def lagrange_points(self) -> Float[Array, "5 3"]:
-        """L1 … L5 (5, 3): see `rigidjax.orbits.lagrange_points.points`."""
-        return lagrange_points.points(self.mu)
+        """L1 … L5 (5, 3), rotating axes (Szebehely 1967, sec. 4.4), differentiable by μ."""
+        return richardson.points(self.mu)
 
     def hessian(self, x: Vector) -> Mat3:
         """The second derivatives of U (3, 3) at a place."""
@@ -130,13 +122,12 @@ class ThreeBody(AbstractReversible):
     def exponents(self, x: Vector) -> Complex[Array, "6"]:
         """The six exponents λ of small motions about an equilibrium in the plane, e^{λt}.
 
-        **Arguments:** `x` (3,), such as a row of `lagrange_points`. It is stable (to first order)
-        if no real part is positive: L4 and L5 below Routh's μ = ½(1 − √(23/27)), L1–L3 never.
-        In the plane λ⁴ + (4 − U_xx − U_yy) λ² + U_xx U_yy − U_xy² = 0, across it λ² = U_zz
+        **Arguments:** `x` (3,), such as a row of `lagrange_points`. The equilibrium is stable to
+        first order if no real part is positive: L4 and L5 below Routh's μ = ½(1 − √(23/27)), L1–L3
+        never. In the plane λ⁴ + (4 − U_xx − U_yy) λ² + U_xx U_yy − U_xy² = 0, across it λ² = U_zz
         (Szebehely 1967, sec. 5.2).
 
-        >>> from rigidjax import orbits
-        >>> moon = orbits.cr3bp(0.0121505856)
+        >>> moon = rj.orbits.cr3bp(0.0121505856)
         >>> bool((moon.exponents(moon.lagrange_points[3]).real < 1e-12).all())
         True
         """
@@ -159,8 +150,8 @@ class ThreeBody(AbstractReversible):
     def halo_guess(self, point: int, amplitude: ScalarLike) -> PeriodicOrbit:
         """A start near a halo orbit about L1, L2 or L3, for `periodic_orbit(…, hold="z")`.
 
-        **Arguments:** `point` 1, 2 or 3; `amplitude` along z, its sign the branch. Source:
-        Richardson 1980, doi:10.1007/BF01229511 (third order).
+        **Arguments:** `point` 1, 2 or 3; `amplitude` along z, whose sign is that of the branch.
+        Source: Richardson 1980, doi:10.1007/BF01229511 (third order).
         """
         return richardson.guess(self.mu, point, None, amplitude)
 
@@ -169,20 +160,78 @@ def cr3bp(mu: ScalarLike, radii: Float[Array, "2"] | object = (0.0, 0.0)) -> Thr
     """The circular restricted three-body problem with mass ratio μ.
 
     **Arguments:** `mu` μ = m₂/(m₁ + m₂), 0 < μ ≤ ½ (Earth–Moon 0.01215…); `radii` (2,) of the two
-    bodies in units of their distance: a run that comes closer ends with a collision's body, time
-    and distance. With zeros it ends at a distance that float64 can no longer resolve.
-
-    **Raises:** `ValueError` for μ outside (0, ½] (`EquinoxRuntimeError` under `jit`).
-
-    Source: notes, eq 91, with a uniform Ω = (0, 0, 1); Szebehely 1967, Theory of Orbits.
+    bodies in units of their distance. A run that comes closer ends, with the collision's body, time
+    and distance; for radii of zero it ends at a distance that float64 cannot resolve. **Raises:**
+    `ValueError` for μ outside (0, ½] (`EquinoxRuntimeError` under `jit`). Source: notes, eq 91,
+    with a uniform Ω = (0, 0, 1); Szebehely 1967, Theory of Orbits.
 
     >>> cr3bp(0.5).lagrange_points[3].round(12).tolist()
     [0.0, 0.866025403784, 0.0]
     """
     ratio = _checks.floating(mu, (), "mu")
     bad = ~((ratio > 0) & (ratio <= 0.5))
-    ratio = _checks.refuse(
-        ratio, bad, "mu: wanted 0 < mu ≤ ½, the mass of the lighter body over that of both"
-    )
+    words = "mu: wanted 0 < mu ≤ ½, the mass of the lighter body over the mass of both"
+    ratio = _checks.refuse(ratio, bad, words)
     radii = _checks.floating(list(radii) if isinstance(radii, tuple) else radii, (2,), "radii")
     return ThreeBody(ratio, _checks.refuse(radii, ~(radii >= 0), "radii: wanted two numbers ≥ 0"))
+
+
+class Hill(AbstractReversible):
+    """A particle near a small body on a circular orbit about a large one; `orbits.hill()` makes it.
+
+    Rotating axes centred on the small body, x away from the large one. Units: μ^{1/3} of the
+    bodies' distance, and 1/(their angular rate). **Field:** `radius` of the small body.
+
+    >>> scene = hill()
+    >>> float(scene.acceleration(0.0, Point([1.0, 0, 0], [0.0, 0, 0]))[0])  # 3 x − x/r³
+    2.0
+    """
+
+    radius: Scalar
+
+    def acceleration(self, t: ScalarLike, state: Point) -> Vec3:
+        """d²x/dt² = 2 v_y + 3x − x/r³, −2 v_x − y/r³, −z − z/r³."""
+        x, y, z = components(state.x)
+        vx, vy, _ = components(state.v)
+        square = x * x + y * y + z * z
+        pull = 1 / (square * jnp.sqrt(square))
+        return jnp.stack([2 * vy + 3 * x - pull * x, -2 * vx - pull * y, -z - pull * z])
+
+    def jacobi_constant(self, state: Point) -> Scalar:
+        """C = 3x² − z² + 2/r − |v|² (Hill 1878).
+
+        >>> float(Hill(jnp.asarray(0.0)).jacobi_constant(Point([1.0, 0, 0], [0.0, 0, 0])))
+        5.0
+        """
+        require_point(state)
+        x, y, z = components(state.x)
+        speed = jnp.sum(state.v * state.v)
+        return 3 * x * x - z * z + 2 / jnp.sqrt(x * x + y * y + z * z) - speed
+
+    def conserved(self, t: ScalarLike, state: Point) -> dict[str, Scalar]:
+        return {"jacobi": self.jacobi_constant(state)}
+
+    def approach(self, t: ScalarLike, state: Point) -> tuple[Float[Array, "1"], Float[Array, "1"]]:
+        """Distance from the small body, and the distance of a collision, which ends a run."""
+        gap = jnp.sqrt(jnp.sum(state.x * state.x, keepdims=True))
+        least = jnp.maximum(self.radius.astype(gap.dtype), smallest_distance(gap.dtype))
+        return gap, least.reshape(1)
+
+    @property
+    def lagrange_points(self) -> Float[Array, "2 3"]:
+        """L1 and L2 (2, 3), at x = ∓3^{−1/3}."""
+        place = jnp.zeros(3, self.radius.dtype).at[0].set(3.0 ** (-1 / 3))
+        return jnp.stack([-place, place])
+
+
+def hill(radius: ScalarLike = 0.0) -> Hill:
+    """Hill's problem, the limit of `cr3bp(mu)` as μ → 0 in units of μ^{1/3}.
+
+    **Arguments:** `radius` of the small body, in these units, for collisions. Source: Hill 1878,
+    doi:10.2307/2369430; Szebehely 1967, sec. 10.4.
+
+    >>> hill().lagrange_points[1].round(12).tolist()
+    [0.693361274351, 0.0, 0.0]
+    """
+    radius = _checks.floating(radius, (), "radius")
+    return Hill(_checks.refuse(radius, ~(radius >= 0), "radius: wanted a number ≥ 0"))

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from rigidjax import _checks
 from rigidjax._types import Scalar, ScalarLike
 from rigidjax.frames.point import Point
-from rigidjax.orbits.state_transition import attempt
+from rigidjax.orbits.state_transition import flow
 from rigidjax.rotation.linalg3 import components
 
 _NAMES = ("x", "z", "vy", "period")
@@ -23,8 +23,8 @@ MAX_STEPS = 25
 class PeriodicOrbit(eqx.Module):
     """A periodic orbit: a state on it, and its period.
 
-    **Arguments:** `state` a `Point`; `period` its period, in the scene's unit of time. Many: the
-    same leading axes before both.
+    **Arguments:** `state` a `Point`; `period` its period, in the scene's unit of time. A container
+    of many orbits has the same leading axes in both.
 
     >>> float(PeriodicOrbit(Point([0.9, 0, 0], [0.0, -0.5, 0]), 3.0).period)
     3.0
@@ -47,49 +47,42 @@ def periodic_orbit(
     """The periodic orbit near `guess`, by differentiable correction.
 
     It finds orbits symmetric about the xz-plane: Lyapunov, halo, Arenstorf's and most others in
-    use. They cross it at a right angle (y = v_x = v_z = 0) twice a period. Newton's method on three
-    of (x, z, v_y, T/2) makes y, v_x, v_z vanish at the half period.
+    use. They cross this plane at a right angle (y = v_x = v_z = 0) twice a period. Newton's method
+    on three of (x, z, v_y, T/2) makes y, v_x, v_z vanish at the half period.
 
-    **Arguments:** `guess` a `PeriodicOrbit(state, period)` whose state crosses at a right
-    angle; `hold` the fixed one of `"x"`, `"z"`, `"vy"`, `"period"`, which labels the orbit within
-    its family (`"x"` for Lyapunov orbits, `"z"` for halo orbits); `tolerance` largest |y|, |v_x|,
-    |v_z| at the half period, 1e-12 unless given (1e-4 in float32).
+    **Arguments:** `guess` a `PeriodicOrbit(state, period)` whose state crosses at a right angle;
+    `hold` the fixed one of `"x"`, `"z"`, `"vy"`, `"period"`, which labels the orbit within its
+    family (`"x"` for Lyapunov orbits, `"z"` for halo orbits); `tolerance` largest |y|, |v_x|, |v_z|
+    at the half period, 1e-12 by default (1e-4 in float32).
 
-    **Returns** a `PeriodicOrbit`. Its derivatives with respect to μ and the held number are
-    those of the family, by the implicit function theorem, forward and reverse.
+    **Returns** a `PeriodicOrbit`. Its derivatives by μ and the held number are those of the family,
+    by the implicit function theorem, forward and reverse. Source: Howell 1984,
+    doi:10.1007/BF01358403. **Raises:** `ValueError` (`EquinoxRuntimeError` under `jit`) if Newton's
+    method does not converge.
 
-    Source: Howell 1984, doi:10.1007/BF01358403.
-
-    **Raises:** `ValueError` (`EquinoxRuntimeError` under `jit`) if Newton does not converge.
-
-    >>> from rigidjax import orbits
-    >>> moon = orbits.cr3bp(0.0121505856)
+    >>> moon = rj.orbits.cr3bp(0.0121505856)
     >>> orbit = moon.periodic_orbit(moon.lyapunov_guess(1, 0.01))
     >>> round(float(orbit.period), 4)
     2.712
     """
     numbers, index = crossing(guess), named(hold)
-    free = np.array([i for i in range(4) if i != index])
+    free = np.delete(np.arange(4), index)
     if tolerance is None:
         tolerance = usual_tolerance(numbers)
     unknown, left = _solve(scene, numbers[free], numbers[index], index, tolerance)
     bad = ~(left <= tolerance)
     said = f" ({float(left):.1e} left at half period)" if _checks.known(left) else ""
-    unknown = _checks.refuse(
-        unknown,
-        bad,
-        f"periodic_orbit: Newton's method found no orbit near the guess{said}; start nearer, "
-        "hold another of x, z, vy, period, or loosen the tolerance",
-    )
+    words = f"periodic_orbit: Newton's method found no orbit near the guess{said}; start nearer, "
+    words += "hold another of x, z, vy, period, or loosen the tolerance"
+    unknown = _checks.refuse(unknown, bad, words)
     found = together(unknown, numbers[index], index)
     # A half period of zero solves the equations of every start.
     ratio = found[3] / numbers[3]
-    found = _checks.refuse(
-        found,
-        ~((ratio > 0.5) & (ratio < 2)),
+    words = (
         "periodic_orbit: Newton's method went from the guess to an orbit of less than half or more "
-        "than twice its period; start nearer",
     )
+    words += "than twice its period; start nearer"
+    found = _checks.refuse(found, ~((ratio > 0.5) & (ratio < 2)), words)
     return orbit_of(found)
 
 
@@ -99,11 +92,7 @@ def named(hold: str) -> int:
 
 
 def crossing(guess: PeriodicOrbit) -> Float[Array, "4"]:
-    """The four numbers of an orbit that crosses y = 0 at a right angle: x, z, v_y, T/2.
-
-    >>> crossing(PeriodicOrbit(Point([0.9, 0, 0.1], [0.0, -0.5, 0]), 3.0)).tolist()
-    [0.9, 0.1, -0.5, 1.5]
-    """
+    """The four numbers of an orbit that crosses y = 0 at a right angle: x, z, v_y, T/2."""
     made = "lyapunov_guess and halo_guess make one"
     wanted = "a PeriodicOrbit(state, period)"
     _checks.instance(guess, PeriodicOrbit, "guess", wanted=wanted, hint=made)
@@ -125,7 +114,7 @@ def orbit_of(numbers: Float[Array, "4"]) -> PeriodicOrbit:
 
 
 def together(unknown: Float[Array, "3"], held: Scalar, index: int) -> Float[Array, "4"]:
-    """The four numbers of a crossing, the held one put in its place among the others."""
+    """The four numbers of a crossing, with the held one in its place among the others."""
     parts = [unknown[0], unknown[1], unknown[2]]
     parts.insert(index, held)
     return jnp.stack(parts)
@@ -137,15 +126,10 @@ def usual_tolerance(numbers: Array) -> float:
 
 
 def miss(scene: Any, numbers: Float[Array, "4"]) -> Float[Array, "3"]:
-    """y, v_x and v_z at the half period: an orbit is periodic if they vanish.
-
-    >>> from rigidjax import orbits
-    >>> miss(orbits.hill(), jnp.array([3.0 ** (-1 / 3), 0.0, 0.0, 0.0])).tolist()
-    [0.0, 0.0, 0.0]
-    """
+    """y, v_x and v_z at the half period: an orbit is periodic if they vanish."""
     orbit = orbit_of(numbers)
     tight = float(jnp.finfo(numbers.dtype).eps)
-    end = attempt(scene, orbit.state, 0.5 * orbit.period, 200 * tight, 10 * tight)
+    end = flow(scene, orbit.state, 0.5 * orbit.period, 200 * tight, 10 * tight, throw=False)
     return jnp.stack([end.x[1], end.v[0], end.v[2]])
 
 
@@ -219,6 +203,6 @@ def _corrected_jvp(primals: Any, tangents: Any) -> Any:
 
 
 def _tangents(numbers: Any, dots: Any) -> list[Any]:
-    """The tangents that belong to the leaves of `numbers`; `None` where there is none."""
+    """The tangents of the leaves of `numbers`; `None` for a leaf without one."""
     paths = {path: leaf for path, leaf in jax.tree.leaves_with_path(dots) if leaf is not None}
     return [paths.get(path) for path, _ in jax.tree.leaves_with_path(numbers)]

@@ -1,5 +1,6 @@
 """Stable and unstable manifolds of periodic orbits."""
 
+from functools import partial
 from typing import Any
 
 import diffrax as dfx
@@ -27,10 +28,10 @@ _ITERATIONS = 12
 class Manifold(eqx.Module):
     """Motions from a periodic orbit, or towards it.
 
-    **Fields:** `ts` (T,) since the start near the orbit, in the scene's unit: falling for a stable
-    manifold; `states` a `Point` with axes (N, T): one motion for each phase, NaN after a collision;
-    `phases` (N,) of their starts on the orbit, in periods; `multiplier` λ of a small distance along
-    it in a period.
+    **Fields:** `ts` (T,) since the start near the orbit, in the scene's unit, decreasing for a
+    stable manifold; `states` a `Point` with axes (N, T), one motion for each phase, NaN after a
+    collision; `phases` (N,) of their starts on the orbit, in periods; `multiplier` λ of a small
+    distance along it in a period.
 
     >>> ts, phases = jnp.array([0.0, 0.1]), jnp.array([0.0])
     >>> states = Point(jnp.zeros((1, 2, 3)), jnp.zeros((1, 2, 3)))
@@ -47,12 +48,7 @@ class Manifold(eqx.Module):
 def unstable(monodromy: Float[Array, "6 6"]) -> tuple[Scalar, Float[Array, "6"]]:
     """The multiplier λ of an orbit with the largest size, and its eigenvector, of length 1.
 
-    λ is from traces (`stability_indices`), the vector by inverse iteration and one bordered solve,
-    which has the derivative of the vector. It is NaN if no multiplier is real and larger than 1.
-
-    >>> value, vector = unstable(jnp.diag(jnp.array([4.0, 0.25, 1.0, 1.0, 1.0, 1.0])))
-    >>> round(float(value), 12), round(float(vector[0]), 12)
-    (4.0, 1.0)
+    From traces, inverse iteration and one bordered solve; NaN if none is real and larger than 1.
     """
     index = continuation.stability_indices(monodromy)
     real = jnp.abs(index.imag) <= 1e-6 * jnp.abs(index)
@@ -90,7 +86,7 @@ def branch(
     """The start at `phase`, and the multiplier: see `manifold_start`."""
     _checks.word(which, ("stable", "unstable"), "which")
     if isinstance(side, bool) or side not in (1, -1):
-        raise ValueError(f"side: wanted 1, to larger x at the orbit's start, or -1, got {side!r}")
+        raise ValueError(f"side: wanted 1 (to larger x at the orbit's start) or -1, got {side!r}")
     crossing(orbit)
     return _branch(scene, orbit, phase, which, side, distance)
 
@@ -103,12 +99,7 @@ def _branch(
     # The mirror turns the unstable manifold into the stable one, and the phase round.
     turned = phase if which == "unstable" else -phase
     turned = turned - lax.stop_gradient(jnp.floor(turned))
-
-    def later(numbers: Array) -> Array:
-        start = Point(numbers[:3], numbers[3:])
-        end = state_transition.flow(scene, start, turned * orbit.period, **_TIGHT)
-        return jnp.concatenate([end.x, end.v])
-
+    later = partial(state_transition.after, scene, t=turned * orbit.period, **_TIGHT)
     start = jnp.concatenate([orbit.state.x, orbit.state.v])
     there, along = jax.jvp(later, (start,), (vector,))
     numbers = there + side * distance * along / jnp.sqrt(jnp.sum(along * along))
@@ -131,23 +122,19 @@ def manifold(
 ) -> Manifold:
     """Motions from an unstable periodic orbit, or towards it: its invariant manifolds.
 
-    **Arguments:** `orbit` as of `periodic_orbit`; `which` `"unstable"` (they leave it) or
-    `"stable"` (they come to it: the times go back); `time` their length, two periods unless given;
-    `side` 1 for the branch that goes to larger x at the orbit's start, −1 for the
-    other; `count` N motions, from equal phases of the orbit; `samples` T times of each;
-    `distance` of the starts from the orbit, in (x, v): their error is of the order of its square.
+    **Arguments:** `orbit` as of `periodic_orbit`; `which` `"unstable"` (motions leave it) or
+    `"stable"` (they approach it, and times decrease); `time` their length, two periods by default;
+    `side` 1 for the branch that goes to larger x at the orbit's start, −1 for the other; `count` N
+    motions, from equal phases of the orbit; `samples` T times of each; `distance` of the starts
+    from the orbit, in (x, v): their error is of the order of its square.
 
-    The direction is the eigenvector of the monodromy whose multiplier is the largest, carried
-    along the orbit by the transition matrix; the stable manifold is the mirror image, in
-    y → −y, of the unstable one.
+    The direction is the eigenvector of the monodromy matrix with the largest multiplier, moved
+    along the orbit by the transition matrix. The stable manifold is the mirror image, in y → −y, of
+    the unstable one. **Returns** a `Manifold`. Source: Koon, Lo, Marsden and Ross 2011, Dynamical
+    Systems, the Three-Body Problem and Space Mission Design, sec. 7.4. **Raises:** `ValueError` for
+    an orbit without such a multiplier, and for another word.
 
-    **Returns** a `Manifold`. Source: Koon, Lo, Marsden and Ross 2011, Dynamical Systems, the
-    Three-Body Problem and Space Mission Design, sec. 7.4.
-
-    **Raises:** `ValueError` for an orbit without such a multiplier, and for another word.
-
-    >>> from rigidjax import orbits
-    >>> moon = orbits.cr3bp(0.0121505856)
+    >>> moon = rj.orbits.cr3bp(0.0121505856)
     >>> orbit = moon.periodic_orbit(moon.lyapunov_guess(1, 0.01))
     >>> moon.manifold(orbit, "unstable", count=3, samples=5).states.x.shape
     (3, 5, 3)
@@ -157,12 +144,9 @@ def manifold(
     distance = _positive(distance, "distance", dtype)
     phases = jnp.arange(count).astype(distance.dtype) / count
     starts, value = jax.vmap(lambda p: branch(scene, orbit, p, which, side, distance))(phases)
-    value = _checks.refuse(
-        value[0],
-        jnp.isnan(value[0]),
-        "manifold: the orbit has no multiplier that is real and larger than 1: it is stable to "
-        "first order, or spirals",
-    )
+    words = "manifold: the orbit has no multiplier that is real and larger than 1: it is stable to "
+    words += "first order, or spirals"
+    value = _checks.refuse(value[0], jnp.isnan(value[0]), words)
     length = 2 * orbit.period if time is None else _positive(time, "time", dtype)
     ts = jnp.linspace(jnp.zeros_like(length), length, samples)
     states = _paths(scene, starts, ts, which)
@@ -180,12 +164,11 @@ def manifold_start(
 ) -> Point:
     """The start of the motion of a manifold that belongs to a phase of the orbit.
 
-    **Arguments:** `phase` in periods from the orbit's start, of any size; others as for
-    `manifold`. Derivatives, by `phase`, by the orbit and by the scene's numbers, are in
-    forward mode: connections between orbits are found with them by Newton's method.
+    **Arguments:** `phase` in periods from the orbit's start, of any size; others as for `manifold`.
+    Derivatives by `phase`, the orbit and the scene's numbers are in forward mode: with them
+    Newton's method finds connections between orbits.
 
-    >>> from rigidjax import orbits
-    >>> moon = orbits.cr3bp(0.0121505856)
+    >>> moon = rj.orbits.cr3bp(0.0121505856)
     >>> orbit = moon.periodic_orbit(moon.lyapunov_guess(1, 0.01))
     >>> start = moon.manifold_start(orbit, 0.0, "stable")
     >>> bool(abs(start.x[0] - orbit.state.x[0]) < 1e-5)

@@ -23,10 +23,10 @@ class AbstractReversible(AbstractScene):
 
     @abc.abstractmethod
     def approach(self, t: ScalarLike, state: Point) -> tuple[Array, Array]:
-        """Distances from the bodies (k,), and those at which a run ends, named as a collision."""
+        """Distances from the bodies (k,), and the distances at which a run ends as a collision."""
 
     def ends(self, t: ScalarLike, state: Point) -> Bool[Array, ""]:
-        """Whether the particle has collided with one of the bodies, which ends a run."""
+        """Whether the particle has collided with one of the bodies."""
         gaps, least = self.approach(t, state)
         return jnp.any(gaps <= least)
 
@@ -36,38 +36,28 @@ class AbstractReversible(AbstractScene):
         if not _checks.known(gaps):
             return "the particle collided with one of the scene's bodies"
         near, when = np.asarray(gaps), float(np.asarray(t))
-        return (
-            f"collision with body {int(near.argmin()) + 1} of the scene at t = {when:.9g}, "
-            f"distance {near.min():.3g}"
-        )
+        which = f"body {int(near.argmin()) + 1} of the scene"
+        return f"collision with {which} at t = {when:.9g}, distance {near.min():.3g}"
 
     def transition(
         self, state: Point, t: ScalarLike, *, rtol: float = 1e-13, atol: float = 1e-14
     ) -> Float[Array, "6 6"]:
-        """The state-transition matrix ∂(x, v)(t)/∂(x, v)(0) (6, 6), by forward differentiation.
-
-        **Arguments:** `state` the start; `t` when. Its determinant is 1.
-        """
+        """The state-transition matrix ∂(x, v)(t)/∂(x, v)(0) (6, 6) of `state`, by forward mode."""
         _checks.instance(state, Point, "state", wanted="a Point(x, v)")
         t = _checks.finite(_checks.floating(t, (), "t"), "t")
         numbers = jnp.concatenate([state.x, state.v])
-        return state_transition.transition(self, numbers, t, rtol, atol)
+        return state_transition.transition(self, numbers, t, rtol=rtol, atol=atol)
 
     def monodromy(self, orbit: PeriodicOrbit) -> Float[Array, "6 6"]:
-        """The transition matrix over one period; its eigenvalues determine the orbit's stability.
-
-        Two of the six are 1, the others come as λ, 1/λ (Szebehely 1967, sec. 8.6).
-        """
+        """The transition matrix over one period; its eigenvalues are 1, 1 and pairs λ, 1/λ."""
         return self.transition(orbit.state, orbit.period)
 
     def stability_indices(self, orbit: PeriodicOrbit) -> Complex[Array, "2"]:
-        """The two ν = ½(λ + 1/λ) of the multipliers that are not 1, larger real part first.
+        """The two ν = ½(λ + 1/λ) of the multipliers λ that are not 1, larger real part first.
 
         The orbit is stable to first order if both are real and |ν| ≤ 1. Many:
-        `jax.vmap(scene.stability_indices)(scene.family(…))`.
-
-        Source: Howell 1984, doi:10.1007/BF01358403; from traces: Bray and Goudas 1967, Adv.
-        Astron. Astrophys. 5, 71.
+        `jax.vmap(scene.stability_indices)(scene.family(…))`. Source: Howell 1984,
+        doi:10.1007/BF01358403; from traces: Bray and Goudas 1967, Adv. Astron. Astrophys. 5, 71.
         """
         return continuation.stability_indices(self.monodromy(orbit))
 

@@ -1,32 +1,63 @@
-"""Starts near Lyapunov and halo orbits: Richardson's expansion of the third order."""
+"""The equilibrium points, and starts near Lyapunov and halo orbits: Richardson's third order."""
 
 import math
 
 import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
 
 from rigidjax import _checks
 from rigidjax._types import Scalar, ScalarLike
 from rigidjax.frames.point import Point
 from rigidjax.orbits.differential_correction import PeriodicOrbit
-from rigidjax.orbits.lagrange_points import distances, points
+
+
+def points(mu: Scalar) -> Float[Array, "5 3"]:
+    """L1 … L5 (5, 3) of 0 < μ ≤ ½ by Euler's quintics (Szebehely 1967, sec. 4.4), rotating axes."""
+    between, beyond, opposite = distances(mu)
+    zero = jnp.zeros_like(mu)
+    height = jnp.full_like(mu, 0.75**0.5)
+    rows = [
+        [1 - mu - between, zero, zero],
+        [1 - mu + beyond, zero, zero],
+        [-mu - opposite, zero, zero],
+        [0.5 - mu, height, zero],
+        [0.5 - mu, -height, zero],
+    ]
+    return jnp.stack([jnp.stack(row) for row in rows])
+
+
+def distances(mu: Scalar) -> tuple[Scalar, Scalar, Scalar]:
+    """The distances of L1 and L2 from the second primary, and of L3 from the first."""
+    one = jnp.ones_like(mu)
+    hill = jnp.cbrt(mu / (3 * (1 - mu)))
+    between = _root([one, mu - 3, 3 - 2 * mu, -mu, 2 * mu, -mu], hill * (1 - hill / 3))
+    beyond = _root([one, 3 - mu, 3 - 2 * mu, -mu, -2 * mu, -mu], hill * (1 + hill / 3))
+    rest = mu - 1
+    opposite = _root([one, 2 + mu, 1 + 2 * mu, rest, 2 * rest, rest], 1 - 7 * mu / 12)
+    return between, beyond, opposite
+
+
+def _root(coefficients: list[Scalar], start: Scalar) -> Scalar:
+    """Newton's root of a polynomial, highest power first; `start` is near it for every μ."""
+
+    def step(_: object, x: Scalar) -> Scalar:
+        value, slope = coefficients[0], jnp.zeros_like(x)
+        for c in coefficients[1:]:
+            value, slope = value * x + c, slope * x + value
+        return x - value / slope
+
+    return lax.fori_loop(0, 7, step, start)
 
 
 def guess(
     mu: Scalar, point: int, along_x: ScalarLike | None, along_z: ScalarLike | None
 ) -> PeriodicOrbit:
-    """A start on the xz-plane near the orbit about L1, L2 or L3 of the given amplitude.
+    """A start on the xz-plane near the orbit about L1, L2 or L3 (`point`) of the given amplitude.
 
-    **Arguments:** `mu` μ; `point` 1, 2 or 3; one of `along_x` (a planar Lyapunov orbit) and
-    `along_z` (a halo orbit, its sign the branch), in units of the primaries' distance. It is good
-    if the amplitude is a small part of the distance to the nearer body.
-
-    Source: Richardson 1980, Celest. Mech. 22, 241, doi:10.1007/BF01229511, at τ = 0.
-
-    **Raises:** `ValueError` for another point, and for a known amplitude that is too small for a
-    halo orbit.
-
-    >>> round(float(guess(jnp.asarray(0.0121505856), 1, 0.01, None).period), 2)
-    2.71
+    One of `along_x` (a planar Lyapunov orbit) and `along_z` (a halo orbit, its sign is the branch)
+    is given, small beside the distance to the nearer body. Source: Richardson 1980, Celest. Mech.
+    22, 241, doi:10.1007/BF01229511, at τ = 0.
     """
     if point not in (1, 2, 3):
         raise ValueError(f"point: wanted 1, 2 or 3, the collinear ones, got {point}")
@@ -72,9 +103,8 @@ def guess(
         a1 = -1.5 * c3 * (2 * a21 + a23 + 5 * d21) - 0.375 * c4 * (12 - k2)
         a2 = 1.5 * c3 * (a24 - 2 * a22) + 1.125 * c4
         square = -((a2 + 2 * w2 * s2) * az * az + w2 - c2) / (a1 + 2 * w2 * s1)
-        square = _checks.refuse(
-            square, ~(square > 0), "halo_guess: no halo orbit of this amplitude by the expansion"
-        )
+        words = "halo_guess: no halo orbit of this amplitude by the expansion"
+        square = _checks.refuse(square, ~(square > 0), words)
         ax = jnp.sqrt(square)
     x2, z2 = ax * ax, az * az
     sweep = w * (1 + s1 * x2 + s2 * z2)

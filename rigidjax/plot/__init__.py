@@ -1,7 +1,8 @@
 """Pictures (extra `view`): matplotlib and viser are imported when a function is called.
 
-Each function draws into your axes (`ax=`) or into new ones, and returns the axes. Colours are Okabe
-and Ito's, distinct also for colour-blind readers.
+Each function draws into your axes (`ax`) or into new ones, and returns the axes. Okabe and Ito's
+colours are distinct also for colour-blind readers. **Raises:** `ModuleNotFoundError`, with the
+command that installs what is missing.
 """
 
 from rigidjax._names import show

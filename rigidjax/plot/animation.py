@@ -24,9 +24,7 @@ FACES = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (
 
 
 class Film(eqx.Module):
-    """An animation in memory: a notebook shows it, `save` writes it.
-
-    **Fields:** `data` the file; `kind` `gif` or `html`; `height` px in a notebook.
+    """An animation in memory: a notebook shows it, `save` writes it (`data`, `kind`, `height` px).
 
     >>> Film(b"<p>hello</p>", "html", 100)._repr_html_()[:7]
     '<iframe'
@@ -44,7 +42,7 @@ class Film(eqx.Module):
 
         **Arguments:** `path` that ends in `.gif` or `.html`, or `.mp4` if the program ffmpeg is
         installed. A page of `player` is `.html` only. **Raises** `ValueError` for another suffix,
-        `FileNotFoundError` if ffmpeg is needed and missing.
+        `FileNotFoundError` if ffmpeg is missing.
         """
         path = Path(path)
         suffix = path.suffix.lower()
@@ -95,19 +93,16 @@ def tumble(
 ) -> Film:
     """A GIF of the body's box as it tumbles, with the path of its longest axis.
 
-    The box is the uniform solid one with the same 𝔖: it moves exactly as the body does. Faces
-    across its principal axes are blue, orange and green, shortest axis first; faces on the negative
-    side are pale, to show a flip; the origin is fixed.
+    The box is the uniform solid one with the same 𝔖, which moves as the body does. Faces across its
+    principal axes are blue, orange and green, shortest axis first; faces on the negative side are
+    pale, to show a flip; the origin is fixed.
 
-    **Arguments:** `body`; `ts` (T,) s; `states` of one body with a leading time axis, close enough
-    together that it turns by less than a quarter turn from one to the next; `seconds` of the film,
-    by default as many as the motion, 20 at most; `fps` pictures a second; `size` px of a
-    side; `title`. **Returns** a `Film`, shown by a notebook; `.save(path)`.
+    **Arguments:** `body`; `ts` (T,) s; `states` of one body with a leading time axis, with less
+    than a quarter turn from one to the next; `seconds` of the film, by default the duration of the
+    motion, 20 at most; `fps` pictures a second; `size` px of a side; `title`. **Returns** a `Film`,
+    shown by a notebook; `.save(path)`. **Raises** `ValueError` for a batch, other lengths or
+    numbers that are not positive; `TypeError` for states without an attitude.
 
-    **Raises** `ValueError` for a batch, other lengths or numbers that are not positive; `TypeError`
-    for states without an attitude.
-
-    >>> import rigidjax as rj
     >>> body = rj.shapes.box(1.0, [0.1, 0.2, 0.3])
     >>> sol = rj.simulate(body.inertia, rj.Attitude([1.0, 0, 0, 0], [0, 1, 0.1]), [0.0, 0.5, 1.0])
     >>> tumble(body, sol.ts, sol.ys, fps=2).data[:6]
@@ -189,11 +184,8 @@ def player(
 
     The box is the uniform solid one with the same 𝔖, the line the path of its longest axis. The
     page contains everything, also viser's program (0.8 MB): a notebook shows it without a network
-    or a running kernel, `.save("tumble.html")` writes it to a file.
-
-    **Arguments:** as `tumble`; `height` px in a notebook. **Returns** a `Film`.
-
-    **Raises** `ModuleNotFoundError` if viser is missing (extra `view`); else as `tumble`.
+    or a running kernel, and `.save("tumble.html")` writes it to a file. **Arguments:** as `tumble`;
+    `height` px in a notebook. **Returns** a `Film`. **Raises** as `tumble`.
     """
     seconds, pictures = _length(ts, seconds, fps)
     _, q = evenly(ts, states, pictures)
@@ -265,10 +257,9 @@ def evenly(ts: Any, states: Any, count: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def box_of(body: Inertia | MassProperties) -> tuple[np.ndarray, np.ndarray]:
-    """Half-lengths (3,) of the uniform box with the body's 𝔖, and its axes (3, 3) in the body.
+    """Half-lengths (3,) a of the uniform box with λ = m a²/3, and its axes (3, 3) in the body.
 
-    A box of half-length a has λ = m a²/3. In m for a `MassProperties`; for an `Inertia` the longest
-    is 1.
+    In m for `MassProperties`; for an `Inertia` the longest is 1.
     """
     second, q = principal(body.second_moment)
     size = np.sqrt(np.maximum(np.asarray(second, dtype=float), 0.0))

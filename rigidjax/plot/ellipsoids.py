@@ -24,18 +24,16 @@ def inertia_ellipsoid(
 ) -> Any:
     """The outline of a body's ellipsoid from three sides; for a fit with its uncertainty.
 
-    The ellipsoid `r·𝔖⁻¹r = const` is long where the body is long and moves as the body does. For
-    `MassProperties` it is the uniform solid one of the same mass, in m. An `Inertia` has no size:
-    its unit is √Tr 𝔖 of the given body (of the fit's best). Thin lines are bodies drawn from the
-    fit's Gaussian: the data do not determine the shape where they differ.
+    The ellipsoid `r·𝔖⁻¹r = const` is long along the body's long axis and moves as the body does.
+    For `MassProperties` it is the uniform solid one of the same mass, in m. An `Inertia` has no
+    size: its unit is √Tr 𝔖 of the given body (of the fit's best). Thin lines are bodies drawn from
+    the fit's Gaussian: the data do not determine the shape where the lines differ.
 
     **Arguments:** `body` an `Inertia`, a `MassProperties` or a `rigidjax.identify.Fit`; `truth` a
     body to compare with, as a broken line; `samples` the number of thin lines; `title`; `ax` three
-    axes. **Returns** the axes (3,), planes xy, xz and yz of the body frame.
+    axes. **Returns** the axes (3,), planes xy, xz and yz of the body frame. **Raises** `TypeError`
+    for another type, `ValueError` for a body without extension.
 
-    **Raises** `TypeError` for anything but these, `ValueError` for a body without extension.
-
-    >>> import rigidjax as rj
     >>> [one.get_xlabel() for one in inertia_ellipsoid(rj.shapes.box(1.0, [1.0, 2.0, 3.0]))]
     ['x, m', 'x, m', 'y, m']
     """
@@ -66,14 +64,13 @@ def _given(body: Any, samples: int) -> tuple[Inertia | MassProperties, Any]:
     if isinstance(body, Inertia | MassProperties):
         return _checks.single(body, (Inertia, MassProperties), "body"), None
     if not hasattr(body, "parameters") or not hasattr(body, "problem"):
+        found = _checks.kind(body)
         raise TypeError(
-            "inertia_ellipsoid: wanted an Inertia, a MassProperties or a Fit, got "
-            f"{type(body).__name__}"
+            f"inertia_ellipsoid: wanted an Inertia, a MassProperties or a Fit, got {found}"
         )
     if isinstance(body.body, dict):
-        raise ValueError(
-            "inertia_ellipsoid: wanted one body, got a Fit of several: give fit.body[name]"
-        )
+        words = "wanted one body, got a Fit of several: give fit.body[name]"
+        raise ValueError(f"inertia_ellipsoid: {words}")
     flat, restore = ravel_pytree(body.beside)
     values, vectors = np.linalg.eigh(np.asarray(body.seen))
     # A fixed seed: the same fit gives the same picture.

@@ -16,13 +16,9 @@ def fit(
 ) -> Any:
     """Data and fit of each sensor above, the residuals below.
 
-    **Arguments:** `found` a `rigidjax.identify.Fit`; `index` of the recording; `time_unit`
-    `s` or `day`; `rate_unit` `rad/s`, `deg/s` or `deg/day`; `title`. **Returns** the matplotlib
-    figure.
+    **Arguments:** `found` a `rigidjax.identify.Fit`; `index` of the recording; `time_unit` `s` or
+    `day`; `rate_unit` `rad/s`, `deg/s` or `deg/day`; `title`. **Returns** the matplotlib figure.
 
-    **Raises** `ModuleNotFoundError` if matplotlib is missing (install the extra `view`).
-
-    >>> import jax.numpy as jnp, rigidjax as rj
     >>> ts = jnp.linspace(0.0, 10.0, 80)
     >>> motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1, 0.1, 1.0]), ts)
     >>> record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), motion.ys.omega))

@@ -31,17 +31,15 @@ def horizons(
 ) -> Any:
     """Open-loop errors against the horizon, one picture for each kind of state.
 
-    **Arguments:** `found` a `Horizons`, as `WindowFit.predict` and `Windows.held`
-    return them, or several by name, to be compared: of a model, of a prediction that holds the
-    start, of other windows; `step` s between samples, for a scale of time in the place of steps;
-    `measure` `mean_absolute` (of a component), `mean_norm` or `rms` (of the vector); `title`; `ax`
-    one for each kind, else new ones. Both scales are linear, since errors start at zero.
-    **Returns** the axes, one for each of position, velocity, attitude, body rate in the state.
+    **Arguments:** `found` a `Horizons`, as `WindowFit.predict` and `Windows.held` return them, or
+    several by name, to compare models, windows, or a prediction that holds the start; `step` s
+    between samples, for a scale of time instead of steps; `measure` `mean_absolute` (of a
+    component), `mean_norm` or `rms` (of the vector); `title`; `ax` one for each kind. Both scales
+    are linear, since errors start at zero. **Returns** the axes, one for each of position,
+    velocity, attitude, body rate in the state. **Raises** `TypeError` for anything but errors by
+    horizon; `ValueError` for none, for kinds that differ, an unknown measure, a step that is not
+    positive, another number of axes.
 
-    **Raises** `TypeError` for anything but errors by horizon; `ValueError` for none, for kinds that
-    differ, an unknown measure, a step that is not positive, another number of axes.
-
-    >>> import rigidjax as rj
     >>> t = np.arange(8.0)
     >>> cut = rj.identify.windows(t, rj.Spin(np.ones((8, 3)) * t[:, None]), length=3)
     >>> horizons({"held": cut.held()})[0].get_ylabel()
@@ -52,19 +50,17 @@ def horizons(
         raise ValueError("found: wanted at least one Horizons, got none")
     for one in named.values():
         if not all(hasattr(one, name) for name in ("steps", *_MEASURES)) or isinstance(one, type):
+            found = _checks.kind(one)
             raise TypeError(
-                "found: wanted a Horizons of rigidjax.identify, or several by name, got "
-                f"{one.__name__ if isinstance(one, type) else type(one).__name__}"
+                f"found: wanted a Horizons of rigidjax.identify, or some by name, got {found}"
             )
     _checks.word(measure, tuple(_MEASURES), "measure")
     scale = 1.0 if step is None else _checks.positive(step, "step", "a positive time, s")
     kinds = [kind for kind in _KINDS if kind in getattr(next(iter(named.values())), measure)]
     for name, one in named.items():
         if sorted(getattr(one, measure)) != sorted(kinds):
-            raise ValueError(
-                f"found: wanted the same kinds of errors, got {kinds} and {name!r} with "
-                f"{sorted(getattr(one, measure))}"
-            )
+            others = f"{name!r} with {sorted(getattr(one, measure))}"
+            raise ValueError(f"found: wanted the same kinds of errors, got {kinds} and {others}")
     count = len(kinds)
     ax = several_axes(ax, (count,), ncols=count, figsize=(3.4 * count + 0.6, 3.2))
     for one_ax, kind in zip(ax, kinds, strict=True):

@@ -11,15 +11,8 @@ from rigidjax._types import HasAttitude
 from rigidjax.body.energy import spatial_angular_momentum
 from rigidjax.body.inertia import Inertia
 from rigidjax.motion.torques import HeavyTop
-from rigidjax.plot.style import (
-    COLOURS,
-    attitudes,
-    flat_axes,
-    legend_below,
-    matrices,
-    plain,
-    rows,
-)
+from rigidjax.plot import style
+from rigidjax.plot.style import COLOURS, plain, rows
 
 
 def phase_portrait(
@@ -34,17 +27,15 @@ def phase_portrait(
     """Tilt θ against θ̇ of a symmetric top, with the curves of equal energy around its path.
 
     `E = ½ I₁ θ̇² + (p_φ − p_ψ cos θ)²/(2 I₁ sin²θ) + m g l cos θ` with the momenta of the initial
-    state, p_φ about the vertical and p_ψ about the top's axis. Source: Landau and Lifshitz,
-    Mechanics, § 35, problem 1. The cross is steady precession, the least energy.
+    state, p_φ about the vertical and p_ψ about the top's axis. The cross is steady precession, the
+    least energy. Source: Landau and Lifshitz, Mechanics, § 35, problem 1.
 
-    **Arguments:** `inertia` about the pivot; `top` weight and place of the centre of mass, which
-    lies on the axis of symmetry; `states` of one body with a leading time axis; `levels` the number
-    of thin curves; `title`; `ax` your axes. **Returns** the axes.
+    **Arguments:** `inertia` about the pivot; `top` weight and place of the centre of mass, which is
+    on the axis of symmetry; `states` of one body with a leading time axis; `levels` the number of
+    thin curves; `title`; `ax`. **Returns** the axes. **Raises** `ValueError` for a body that is not
+    symmetric about its centre of mass's axis, no weight, or a batch; `TypeError` for states without
+    an attitude.
 
-    **Raises** `ValueError` for a body that is not symmetric about its centre of mass's axis, no
-    weight, or a batch; `TypeError` for states without an attitude.
-
-    >>> import rigidjax as rj
     >>> body = rj.Inertia.from_principal(2.0, 2.0, 1.0)
     >>> top = rj.torques.HeavyTop(1.0, [0.0, 0, 1.0], [0, 0, -9.81])
     >>> start = rj.Attitude(rj.quaternion.exp(jnp.array([0.4, 0.0, 0.0])), [0, 0, 20.0])
@@ -56,7 +47,7 @@ def phase_portrait(
         _checks.floating(getattr(_checks.instance(top, HeavyTop, "top"), name), size, f"top.{name}")
     levels = _checks.whole(levels, "levels", 1)
     across, along, axis, weight, up = _symmetric(inertia, top)
-    m = matrices(attitudes(states))
+    m = style.matrices(style.attitudes(states))
     omega = np.einsum("tij,tj->ti", m, rows(states.omega, 3, "states.omega"))
     first = jax.tree.map(lambda leaf: jnp.asarray(leaf)[0], states)
     about_up = float(np.asarray(spatial_angular_momentum(inertia, first)) @ up)
@@ -71,7 +62,7 @@ def phase_portrait(
         turning = (about_up - about_axis * np.cos(theta)) ** 2 / (2 * across * np.sin(theta) ** 2)
         return turning + weight * np.cos(theta)
 
-    ax = flat_axes(ax)
+    ax = style.flat_axes(ax)
     seen = np.isfinite(rate)
     reach = 1.6 * max(float(np.abs(rate[seen]).max(initial=0.0)), 0.2 * np.sqrt(weight / across))
     middle, half = 0.5 * (tilt.max() + tilt.min()), 0.5 * np.ptp(tilt)
@@ -94,7 +85,7 @@ def phase_portrait(
         ax.plot(np.degrees(lowest), 0, color=COLOURS[1], marker="x", ms=8, ls="", label="steady")
     ax.set(xlabel="tilt θ, deg", ylabel="dθ/dt, rad/s", ylim=(-reach, reach))
     ax.set_title(plain(title) or "phase portrait; thin: equal energy, same momenta")
-    legend_below(ax)
+    style.legend_below(ax)
     return ax
 
 
@@ -115,6 +106,6 @@ def _symmetric(
     if np.abs(tensor - symmetric).max() > 1e-6 * np.abs(tensor).max():
         raise ValueError(
             "phase_portrait: wanted a body symmetric about the axis through its centre of mass "
-            f"(two equal moments across {axis.round(3).tolist()}); other tops have no such plane"
+            f"(two equal moments across {axis.round(3).tolist()}); other tops have no such portrait"
         )
     return across, along, axis, weight, -gravity / pull

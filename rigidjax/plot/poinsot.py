@@ -10,52 +10,36 @@ from rigidjax import _checks
 from rigidjax._types import HasAttitude, HasSpin
 from rigidjax.body.energy import spatial_angular_momentum
 from rigidjax.body.inertia import Inertia
-from rigidjax.plot.style import (
-    COLOURS,
-    around_ball,
-    attitudes,
-    cage,
-    cube,
-    flat_axes,
-    globe,
-    legend_below,
-    matrices,
-    on_sphere,
-    plain,
-    rows,
-    solid_axes,
-)
+from rigidjax.plot import style
+from rigidjax.plot.style import COLOURS, plain, rows
 
 
 def body_axes(states: HasAttitude, *, title: str = "", ax: Any = None) -> Any:
     """The paths of the three body axes on the unit sphere, world frame.
 
-    A dot marks the start, a triangle the end; the path behind the sphere is faint.
+    A dot marks the start, a triangle the end; the path behind the sphere is faint. **Arguments:**
+    `states` of one body with a leading time axis; `title`; `ax` your 3-D axes; set their view
+    before the call (`view_init`). **Returns** the axes. **Raises** `TypeError` for states without
+    an attitude or flat axes, `ValueError` for a batch.
 
-    **Arguments:** `states` of one body with a leading time axis; `title`; `ax` your 3-D axes, with
-    the view set before the call (`view_init`). **Returns** the axes.
-
-    **Raises** `TypeError` for states without an attitude or flat axes, `ValueError` for a batch.
-
-    >>> import rigidjax as rj
     >>> sol = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 3.0),
     ...                   rj.Attitude([1.0, 0, 0, 0], [0, 1, 0.1]), [0.0, 1.0, 2.0])
     >>> body_axes(sol.ys).get_zlabel()
     'z'
     """
-    m = matrices(attitudes(states))
-    ax = solid_axes(ax)
-    globe(ax, (1.0, 1.0, 1.0), "0.8", 0.12)
+    m = style.matrices(style.attitudes(states))
+    ax = style.solid_axes(ax)
+    style.globe(ax, (1.0, 1.0, 1.0), "0.8", 0.12)
     for axis, colour in enumerate(COLOURS[:3]):
         path = m[:, :, axis]
-        around_ball(ax, path, path, color=colour, lw=1.6, label=f"body {'xyz'[axis]} axis")
+        style.around_ball(ax, path, path, color=colour, lw=1.6, label=f"body {'xyz'[axis]} axis")
         ax.plot(*path[:1].T, color=colour, marker="o", ms=6, ls="")
         ax.plot(*path[-1:].T, color=colour, marker="^", ms=7, ls="")
     # Of no axis: grey.
     for mark, name in (("o", "start"), ("^", "end")):
         ax.plot([], [], [], color="0.4", marker=mark, ms=6, ls="", label=name)
-    cube(ax, 1.0, ("x", "y", "z"))
-    legend_below(ax, down=0.06)
+    style.cube(ax, 1.0, ("x", "y", "z"))
+    style.legend_below(ax, down=0.06)
     ax.set_title(plain(title) or "body axes on the unit sphere, world frame")
     return ax
 
@@ -63,20 +47,17 @@ def body_axes(states: HasAttitude, *, title: str = "", ax: Any = None) -> Any:
 def polhode(
     inertia: Inertia, states: HasSpin, *, energies: int = 9, title: str = "", ax: Any = None
 ) -> Any:
-    """The path of Π = IΩ where the momentum sphere |Π| = h meets the ellipsoid ΣΠᵢ²/Iᵢ = 2T.
+    """The path of Π = IΩ on the intersection of the sphere |Π| = h and the ellipsoid ΣΠᵢ²/Iᵢ = 2T.
 
-    Drawn along the principal axes (ascending moments), with unit h, the initial |Π|.
-    Thin lines are other energies at the same h; the broken ones the separatrix through the middle
-    axis. Lines behind the sphere are dotted (this motion) or faint (the others).
-
-    Source: Landau and Lifshitz, Mechanics, § 37.
+    The axes are the principal ones (ascending moments), the unit is h, the initial |Π|. Thin lines
+    are other energies at the same h; broken lines are the separatrix through the middle axis. Lines
+    behind the sphere are dotted (this motion) or faint (the others). Source: Landau and Lifshitz,
+    Mechanics, § 37.
 
     **Arguments:** `inertia`; `states` of one body with a leading time axis; `energies` the number
-    of thin lines; `title`; `ax` your 3-D axes. **Returns** the axes.
+    of thin lines; `title`; `ax` your 3-D axes. **Returns** the axes. **Raises** `ValueError` for a
+    body at rest, a zero moment or a batch; `TypeError` for flat axes.
 
-    **Raises** `ValueError` for a body at rest, a zero moment or a batch; `TypeError` for flat axes.
-
-    >>> import rigidjax as rj
     >>> body = rj.Inertia.from_principal(1.0, 2.0, 3.0)
     >>> sol = rj.simulate(body, rj.Spin([0.1, 1.0, 0.0]), [0.0, 1.0, 2.0])
     >>> polhode(body, sol.ys).get_zlabel()
@@ -87,7 +68,7 @@ def polhode(
     energies = _checks.whole(energies, "energies", 0)
     moments, q = inertia.invertible().principal()
     i = np.asarray(moments, dtype=float)
-    turn = matrices(np.asarray(q, dtype=float)[None])[0]
+    turn = style.matrices(np.asarray(q, dtype=float)[None])[0]
     omega = rows(states.omega, 3, "states.omega")
     pi = omega @ turn * i
     size = float(np.linalg.norm(pi[0]))
@@ -96,34 +77,36 @@ def polhode(
     pi = pi / size
     twice_energy = float(np.sum(pi[0] ** 2 / i))
 
-    ax = solid_axes(ax)
+    ax = style.solid_axes(ax)
     # The order is set here. matplotlib takes one depth for a whole surface, and would draw the
     # sphere over the path.
     ax.computed_zorder = False
-    globe(ax, (1.0, 1.0, 1.0), COLOURS[5], 0.15)
-    cage(ax, np.sqrt(twice_energy * i), COLOURS[4], lw=0.5, alpha=0.8, zorder=2)
+    style.globe(ax, (1.0, 1.0, 1.0), COLOURS[5], 0.15)
+    style.cage(ax, np.sqrt(twice_energy * i), COLOURS[4], lw=0.5, alpha=0.8, zorder=2)
     # All energies are equal if all moments are equal: there are no lines to draw.
     if i[2] - i[0] > 1e-9 * i[2]:
         _others(ax, i, energies)
     hidden = {"alpha": 1.0, "ls": (0, (1, 1)), "lw": 1.8}
-    around_ball(ax, pi, pi, behind=hidden, color=COLOURS[1], lw=2.6, label="this motion", zorder=5)
+    style.around_ball(
+        ax, pi, pi, behind=hidden, color=COLOURS[1], lw=2.6, label="this motion", zorder=5
+    )
     ax.plot(*pi[:1].T, color=COLOURS[1], marker="o", ms=6, ls="", label="start", zorder=6)
     reach = max(1.0, float(np.sqrt(twice_energy * i).max()))
-    cube(ax, reach, ("Π₁ / h", "Π₂ / h", "Π₃ / h"))
+    style.cube(ax, reach, ("Π₁ / h", "Π₂ / h", "Π₃ / h"))
     handles, names = ax.get_legend_handles_labels()
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
     handles += [Patch(color=COLOURS[5], alpha=0.4), Line2D([], [], color=COLOURS[4], lw=0.8)]
     names += ["momentum sphere", "energy ellipsoid"]
-    legend_below(ax, handles, names, down=0.06)
+    style.legend_below(ax, handles, names, down=0.06)
     ax.set_title(plain(title) or "polhode, principal axes of the body")
     return ax
 
 
 def _about_middle(around: np.ndarray, down: np.ndarray) -> np.ndarray:
     """`on_sphere` with the pole along the middle axis."""
-    return on_sphere(around, down)[[1, 2, 0]]
+    return style.on_sphere(around, down)[[1, 2, 0]]
 
 
 def _others(ax: Any, i: np.ndarray, energies: int) -> None:
@@ -145,29 +128,25 @@ def _others(ax: Any, i: np.ndarray, energies: int) -> None:
 def _curves(ax: Any, curves: Any, **how: Any) -> None:
     for curve in curves:
         path = _about_middle(*np.asarray(curve).T).T
-        around_ball(ax, path, path, **how)
+        style.around_ball(ax, path, path, **how)
         how.pop("label", None)
 
 
 def herpolhode(inertia: Inertia, states: HasAttitude, *, title: str = "", ax: Any = None) -> Any:
     """The path of the world rate ω on the invariable plane, across the angular momentum.
 
-    It needs a free motion: the part of ω along the momentum is then 2T/h and constant. The circles
-    are the least and the largest distance of this motion.
+    The motion must be free: the part of ω along the momentum is then 2T/h and constant. The circles
+    are the least and the largest distance of this motion. **Arguments:** `inertia`; `states`
+    (`Attitude`) of one body with a leading time axis; `title`; `ax`. **Returns** the axes.
+    **Raises** `ValueError` for a body at rest, a batch, or a momentum that turned by more than 1e-3
+    rad; `TypeError` for states without an attitude.
 
-    **Arguments:** `inertia`; `states` (`Attitude`) of one body with a leading time axis; `title`;
-    `ax` axes of yours. **Returns** the axes.
-
-    **Raises** `ValueError` for a body at rest, a batch, or a momentum that turned by more than
-    1e-3 rad (that is no free motion); `TypeError` for states without an attitude.
-
-    >>> import rigidjax as rj
     >>> body = rj.Inertia.from_principal(1.0, 2.0, 3.0)
     >>> sol = rj.simulate(body, rj.Attitude([1.0, 0, 0, 0], [0.1, 1.0, 0.0]), [0.0, 1.0, 2.0])
     >>> herpolhode(body, sol.ys).get_xlabel()
     'ω along e₁, rad/s'
     """
-    m = matrices(attitudes(states))
+    m = style.matrices(style.attitudes(states))
     omega = np.einsum("tij,tj->ti", m, rows(states.omega, 3, "states.omega"))
     each = jax.vmap(lambda state: spatial_angular_momentum(inertia, state))
     momenta = np.asarray(each(jax.tree.map(jnp.asarray, states)), dtype=float)
@@ -177,10 +156,10 @@ def herpolhode(inertia: Inertia, states: HasAttitude, *, title: str = "", ax: An
     up = momenta[0] / size[0]
     turned = np.linalg.norm(np.cross(momenta, up), axis=1) / size
     if turned.max() > 1e-3:
-        raise ValueError(
+        words = (
             f"herpolhode: the angular momentum turned by {turned.max():.2g} rad: a torque acts, "
-            "and there is no invariable plane"
         )
+        raise ValueError(words + "and there is no invariable plane")
     first = omega[0] - (omega[0] @ up) * up
     if np.linalg.norm(first) < 1e-9 * np.linalg.norm(omega[0]):
         # A spin about a principal axis: any direction across will do.
@@ -188,7 +167,7 @@ def herpolhode(inertia: Inertia, states: HasAttitude, *, title: str = "", ax: An
     first = first / np.linalg.norm(first)
     path = np.stack([omega @ first, omega @ np.cross(up, first)], axis=-1)
 
-    ax = flat_axes(ax, figsize=(5.2, 5.0))
+    ax = style.flat_axes(ax, figsize=(5.2, 5.0))
     ax.plot(*path.T, color=COLOURS[0], lw=1.2)
     ax.plot(*path[0], color=COLOURS[1], marker="o", ms=6, ls="", label="start")
     distance = np.linalg.norm(path, axis=1)
@@ -199,5 +178,5 @@ def herpolhode(inertia: Inertia, states: HasAttitude, *, title: str = "", ax: An
     ax.set_aspect("equal")
     ax.set(xlabel="ω along e₁, rad/s", ylabel="ω along e₂, rad/s")
     ax.set_title(plain(title) or "herpolhode, across the angular momentum")
-    legend_below(ax)
+    style.legend_below(ax)
     return ax

@@ -15,19 +15,16 @@ def residuals(
 ) -> Any:
     """Residuals of each sensor over its noise: in time, histogram, autocorrelation, spectrum.
 
-    From left to right: they should scatter evenly within ±2 (what lies beyond ±8 is a triangle at
-    the edge); their histogram against the normal curve; the correlation of each with a later one,
-    which for white noise stays inside the band ±2/√N; their power spectrum, which for white noise
-    of the given size is 1 at all frequencies (Welch's estimate; Lomb's for uneven times).
-    A line in the spectrum is a motion or a torque that the model lacks.
+    From left to right: the residuals, evenly within ±2 for a good fit (those beyond ±8 are
+    triangles at the edge); their histogram against the normal curve; the correlation of each with a
+    later one, inside the band ±2/√N for white noise; their power spectrum, 1 at all frequencies for
+    white noise of the given size (Welch's estimate; Lomb's for uneven times). A line in the
+    spectrum is a motion or a torque that the model lacks.
 
     **Arguments:** `found` a `rigidjax.identify.Fit`; `index` of the recording; `time_unit` `s`,
-    `min`, `h` or `day`; `title`; `ax` your axes (sensors, 4). **Returns** the axes.
+    `min`, `h` or `day`; `title`; `ax` your axes (sensors, 4). **Returns** the axes. **Raises**
+    `ValueError` for an unknown unit, a missing recording, or axes of another shape.
 
-    **Raises** `ModuleNotFoundError` if matplotlib is missing; `ValueError` for an unknown unit or
-    axes of another shape; `IndexError` for a missing recording.
-
-    >>> import jax.numpy as jnp, rigidjax as rj
     >>> ts = jnp.linspace(0.0, 10.0, 80)
     >>> motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1, 0.1, 1.0]), ts)
     >>> record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), motion.ys.omega))
@@ -103,7 +100,7 @@ def _one_sensor(row: Any, t: np.ndarray, scaled: np.ndarray, seen: np.ndarray) -
     memory.axhline(0, color="0.6", lw=0.8)
     memory.set(xlabel="lag, samples", ylabel="correlation", ylim=(-1, 1))
     spectrum.axhline(1, color="0.6", lw=0.8)
-    spectrum.set(yscale="log", ylabel="power / that of the noise")
+    spectrum.set(yscale="log", ylabel="power / power of the noise")
 
 
 def power(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -18,10 +18,7 @@ RATES = {"rad/s": 1.0, "deg/s": 180 / np.pi, "rpm": 30 / np.pi, "deg/day": 86400
 
 
 def pyplot() -> Any:
-    """`matplotlib.pyplot`, imported now.
-
-    **Raises** `ModuleNotFoundError` that names the extra `view`.
-    """
+    """`matplotlib.pyplot`, imported now; `ModuleNotFoundError` names the extra `view`."""
     try:
         import matplotlib.pyplot as plt
     except ModuleNotFoundError as error:
@@ -32,7 +29,7 @@ def pyplot() -> Any:
 
 
 def unit(name: str, known: dict[str, float], what: str) -> float:
-    """The factor of a unit to or from SI, by name; `ValueError` lists the known ones."""
+    """The factor of a unit, by its name, to or from SI; `ValueError` lists the known names."""
     return known[_checks.word(name, tuple(known), what)]
 
 
@@ -62,9 +59,7 @@ def solid_axes(ax: Any, **how: Any) -> Any:
         figure = pyplot().figure(layout="constrained", **{"figsize": (6.0, 5.6), **how})
         return figure.add_subplot(projection="3d")
     if not hasattr(ax, "zaxis"):
-        raise TypeError(
-            "ax: wanted 3-D axes, got flat ones; make them with projection='3d' in add_subplot"
-        )
+        raise TypeError("ax: wanted 3-D axes, got flat ones; make them with projection='3d'")
     return ax
 
 
@@ -75,7 +70,7 @@ def several_axes(ax: Any, shape: tuple[int, ...], **how: Any) -> Any:
     ax = np.atleast_1d(np.asarray(ax, dtype=object))
     if ax.shape != shape:
         words = f"{shape[0]} axes" + (" in a row" if "ncols" in how else "")
-        words = words if len(shape) == 1 else f"{shape} axes, a row a sensor"
+        words = words if len(shape) == 1 else f"{shape} axes, one row for each sensor"
         raise ValueError(f"ax: wanted {words}, got shape {ax.shape}")
     return ax
 
@@ -95,13 +90,10 @@ def times(ts: Any, count: int, what: str = "the states have") -> np.ndarray:
 
 
 def rows(values: Any, width: int, name: str) -> np.ndarray:
-    """Values of one body over time (T, width) as NumPy float64.
-
-    **Raises** `ValueError` for another shape, most often a batch: pick one body of it.
-    """
+    """Values of one body over time (T, width) as NumPy float64; `ValueError` for another shape."""
     out = _checks.on_host(values, name)
     if out.ndim != 2 or out.shape[1] != width:
-        hint = "; of a batch draw one body at a time" if out.ndim == 3 else ""
+        hint = "; draw one body of a batch at a time" if out.ndim == 3 else ""
         raise ValueError(f"{name}: wanted shape (times, {width}), got {out.shape}{hint}")
     if not np.isfinite(out).any():
         raise ValueError(f"{name}: nothing to draw, every value is NaN or infinite")
@@ -111,9 +103,8 @@ def rows(values: Any, width: int, name: str) -> np.ndarray:
 def attitudes(states: Any, name: str = "states") -> np.ndarray:
     """Quaternions (T, 4) of states; `TypeError` for states without them."""
     if not hasattr(states, "q"):
-        raise TypeError(
-            f"{name}: wanted states with an attitude (Attitude, Rigid), got {type(states).__name__}"
-        )
+        found = type(states).__name__
+        raise TypeError(f"{name}: wanted states with an attitude (Attitude, Rigid), got {found}")
     return rows(states.q, 4, f"{name}.q")
 
 
@@ -125,29 +116,22 @@ def matrices(q: np.ndarray) -> np.ndarray:
 
 def on_sphere(around: np.ndarray, down: np.ndarray) -> np.ndarray:
     """Places (3, …) on the unit sphere, by the angles about z and from it."""
-    return np.stack(
-        np.broadcast_arrays(
-            np.cos(around) * np.sin(down), np.sin(around) * np.sin(down), np.cos(down)
-        )
-    )
+    ring, height = np.sin(down), np.cos(down)
+    return np.stack(np.broadcast_arrays(np.cos(around) * ring, np.sin(around) * ring, height))
 
 
 def around_ball(
     ax: Any,
     path: np.ndarray,
-    centre_free: np.ndarray,
+    normals: np.ndarray,
     *,
     behind: dict[str, Any] | None = None,
     **how: Any,
 ) -> None:
-    """A line on a ball: full in front of the ball, in another style behind it.
-
-    **Arguments:** `path` (T, 3); `centre_free` (T, 3) the outward normals there; `behind` the style
-    of the hidden part, by default faint; `how` options of matplotlib's lines.
-    """
+    """A line `path` (T, 3) on a ball with outward `normals`, in the style `behind` where hidden."""
     up, around = np.radians(ax.elev), np.radians(ax.azim)
     eye = np.array([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)])
-    front = centre_free @ eye > 0
+    front = normals @ eye > 0
     label = how.pop("label", None)
     alpha = how.pop("alpha", 1.0)
     hidden = {"alpha": 0.25 * alpha, **(behind or {})}

@@ -2,23 +2,16 @@
 
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike, Float
 
 from rigidjax import _checks
 from rigidjax._types import HasSpin
-from rigidjax.plot.style import (
-    COLOURS,
-    RATES,
-    TIMES,
-    attitudes,
-    matrices,
-    plain,
-    rows,
-    several_axes,
-    times,
-    unit,
-)
+from rigidjax.plot import style
+from rigidjax.plot.style import COLOURS, RATES, TIMES, plain, rows
+from rigidjax.rotation import euler
 
 
 def motion(
@@ -34,28 +27,26 @@ def motion(
     """Body rate against time, and above it the attitude if the states have one.
 
     **Arguments:** `ts` (T,) s; `states` of one body with a leading time axis, such as `sol.ys`;
-    `attitude` its form: `quaternion` (w, x, y, z), `axes` (the height of each body axis
-    along world z) or `angles` (3-1-3, notes eq 31, deg); `time_unit` `s`, `min`, `h`, `day`;
-    `rate_unit` `rad/s`, `deg/s`, `rpm`, `deg/day`; `title`; `ax` your two axes (one for a `Spin`),
-    else new ones. **Returns** the axes, (2,) or (1,).
+    `attitude` its form: `quaternion` (w, x, y, z), `axes` (the height of each body axis along world
+    z) or `angles` (3-1-3, notes eq 31, deg); `time_unit` `s`, `min`, `h`, `day`; `rate_unit`
+    `rad/s`, `deg/s`, `rpm`, `deg/day`; `title`; `ax` two axes (one for a `Spin`). **Returns** the
+    axes, (2,) or (1,). **Raises** `ValueError` for an unknown unit, or a batch instead of one body.
 
-    **Raises** `ValueError` for an unknown unit, or a batch instead of one body.
-
-    >>> import rigidjax as rj
     >>> body = rj.Inertia.from_principal(1.0, 2.0, 3.0)
     >>> sol = rj.simulate(body, rj.Spin([0, 1, 0.1]), [0.0, 1.0, 2.0])
     >>> motion(sol.ts, sol.ys)[0].get_ylabel()
     'body rate Ω, rad/s'
     """
-    turned, seconds = unit(rate_unit, RATES, "rate_unit"), unit(time_unit, TIMES, "time_unit")
+    turned = style.unit(rate_unit, RATES, "rate_unit")
+    seconds = style.unit(time_unit, TIMES, "time_unit")
     _checks.instance(states, HasSpin, "states", wanted="a Spin, an Attitude or a Rigid")
     omega = rows(states.omega, 3, "states.omega") * turned
-    t = times(ts, omega.shape[0]) / seconds
+    t = style.times(ts, omega.shape[0]) / seconds
     both = hasattr(states, "q")
     count = 2 if both else 1
-    ax = several_axes(ax, (count,), nrows=count, sharex=True, figsize=(7.2, 2.6 * count))
+    ax = style.several_axes(ax, (count,), nrows=count, sharex=True, figsize=(7.2, 2.6 * count))
     if both:
-        _attitude(ax[0], t, attitudes(states), attitude)
+        _attitude(ax[0], t, style.attitudes(states), attitude)
     for values, name, colour in zip(omega.T, "xyz", COLOURS[:3], strict=True):
         ax[-1].plot(t, values, color=colour, label=f"Ω{name}", lw=1.4)
     ax[-1].set(xlabel=f"time, {time_unit}", ylabel=f"body rate Ω, {rate_unit}")
@@ -75,7 +66,7 @@ def _attitude(ax: Any, t: np.ndarray, q: np.ndarray, how: str) -> None:
         names, lines, label = [f"q{n}" for n in "wxyz"], q.T, "attitude q"
     elif how == "axes":
         names = [f"{n}' · z" for n in "xyz"]
-        lines, label = matrices(q)[:, 2, :].T, "body axes along world z"
+        lines, label = style.matrices(q)[:, 2, :].T, "body axes along world z"
     else:
         names, lines, label = ["φ", "θ", "ψ"], _angles(q).T, "3-1-3 angles, deg"
     colours = (COLOURS[6], *COLOURS[:3]) if len(names) == 4 else COLOURS[:3]
@@ -85,16 +76,7 @@ def _attitude(ax: Any, t: np.ndarray, q: np.ndarray, how: str) -> None:
 
 
 def _angles(q: np.ndarray) -> np.ndarray:
-    m = matrices(q)
-    angles = np.stack(
-        [
-            np.arctan2(m[:, 0, 2], -m[:, 1, 2]),
-            np.arctan2(np.hypot(m[:, 0, 2], m[:, 1, 2]), m[:, 2, 2]),
-            np.arctan2(m[:, 2, 0], m[:, 2, 1]),
-        ],
-        axis=-1,
-    )
-    degrees = np.degrees(angles)
+    degrees = np.degrees(np.asarray(jax.vmap(euler.from_quaternion)(jnp.asarray(q))))
     # A line across the whole picture at a jump of an angle from 180° to −180° would be no motion.
     jump = np.abs(np.diff(degrees, axis=0)) > 180
     degrees[1:][jump] = np.nan

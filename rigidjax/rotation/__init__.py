@@ -1,4 +1,1 @@
-"""Rotations: matrices, quaternions, Euler angles, Rodrigues parameters.
-
-Public as `rj.so3`, `rj.quaternion`, `rj.euler`, `rj.mrp` and `rj.rodrigues`.
-"""
+"""Rotations, public as `rj.so3`, `rj.quaternion`, `rj.euler`, `rj.mrp` and `rj.rodrigues`."""

@@ -1,4 +1,4 @@
-"""A barrier, so that XLA does not compute numbers again for each use."""
+"""A barrier that keeps XLA from computing numbers again for each use."""
 
 from typing import TypeVar
 
@@ -15,21 +15,17 @@ _DROPPED = jax.__version_info__ < (0, 11)
 
 
 def barrier(tree: Tree) -> Tree:
-    """The same numbers, computed once: `jax.lax.optimization_barrier`, also if XLA drops it.
-
-    In that case each number goes through `once`.
-    """
-    return jax.tree.map(_real_once, tree) if _DROPPED else lax.optimization_barrier(tree)
+    """The same numbers, computed once: `lax.optimization_barrier`, or `once` if XLA drops it."""
+    if not _DROPPED:
+        return lax.optimization_barrier(tree)
+    real = lambda x: jnp.issubdtype(x.dtype, jnp.floating)  # noqa: E731
+    return jax.tree.map(lambda x: once(x) if real(x) else x, tree)
 
 
 def once(x: Array) -> Array:
     """The same number, computed once for all uses, here and in the gradient.
 
-    It divides by one (by 2 for NaN): XLA on CPU computes a quotient once, but repeats anything
+    It is divided by one (by 2 if NaN): XLA on CPU computes a quotient once, but repeats anything
     cheaper, with all its inputs, for every component.
     """
     return x / jnp.where(x == x, 1, 2)
-
-
-def _real_once(x: Array) -> Array:
-    return once(x) if jnp.issubdtype(x.dtype, jnp.floating) else x

@@ -1,16 +1,15 @@
-"""Euler angles in all 24 sequences; the 3-1-3 of the notes, "ZXZ", first.
+"""Euler angles in all 24 sequences; the default is 3-1-3, "ZXZ", as in the notes.
 
-A sequence is three letters, the angles are listed in its order, and every angle is active and in
-radians. **Capitals are intrinsic**: each turn is about the moved axis, and
-M = R_1(a) R_2(b) R_3(c) (notes, eqs 12, 27–31). **Lower case is extrinsic**: each turn is about a
-fixed axis of the world, and M = R_3(c) R_2(b) R_1(a). SciPy uses the same letters.
+A sequence is three letters; the angles have its order, and all are active, in radians. **Capitals
+are intrinsic**: each turn is about the moved axis, and M = R_1(a) R_2(b) R_3(c) (notes, eqs 12,
+27–31). **Lower case is extrinsic**: each turn is about a fixed axis of the world, and M = R_3(c)
+R_2(b) R_1(a). SciPy uses the same letters.
 
-**The singular case** ("gimbal lock"): middle angle 0 or π when first and last letter are the same,
-±π/2 when all three differ. Only the sum or the difference of the outer angles is then defined.
-The choice here, if the vanishing sine or cosine is below 4 units of round-off: **the
-last angle listed is 0** (likewise its rate), and the matrix is reproduced all the same. Derivatives
-there are finite: they belong to the remaining chart, with the middle angle held. `is_singular`
-tests for the case.
+**The singular case** ("gimbal lock") is a middle angle of 0 or π if the first and the last letter
+agree, and of ±π/2 if all three differ. Only the sum or the difference of the outer angles is then
+defined. If the sine or cosine that vanishes there is below 4 units of round-off, **the last angle
+listed is 0**, and so is its rate; the matrix is still right. Derivatives are then finite: they are
+those of the other two angles at a fixed middle angle. `is_singular` tests for the case.
 """
 
 import warnings
@@ -34,7 +33,7 @@ def to_quaternion(angles: Vec3Like, sequence: str = "ZXZ") -> Quat:
     """The unit quaternion, body → world, of three Euler angles.
 
     **Arguments:** `angles` (3,), rad, in the order of `sequence`. **Raises:** `ValueError` for an
-    unknown sequence. **Warns** if an angle known now is beyond four turns: degrees, perhaps.
+    unknown sequence. **Warns** if a known angle is beyond four turns: it may be in degrees.
 
     >>> to_quaternion(jnp.array([0.0, jnp.pi, 0.0])).round(12).tolist()
     [0.0, 1.0, 0.0, 0.0]
@@ -60,10 +59,9 @@ def from_matrix(matrix: Mat3Like, sequence: str = "ZXZ") -> Vec3:
     """The Euler angles of a rotation matrix, rad, in the order of `sequence`.
 
     **Arguments:** `matrix` (3, 3) rotation, body → world; values are not checked (`so3.check`).
-
-    **Returns:** (3,): outer angles in (−π, π]; the middle one in [0, π] if first and last letter
-    agree, else in [−π/2, π/2]. The last is 0 in the singular case. **Raises:** `ValueError` for an
-    unknown sequence.
+    **Returns:** (3,): outer angles in (−π, π], the middle one in [0, π] if the first and the last
+    letter agree, else in [−π/2, π/2]. The last is 0 in the singular case. **Raises:** `ValueError`
+    for an unknown sequence.
 
     >>> angles = jnp.array([0.3, 0.2, 0.1])
     >>> bool(abs(from_matrix(to_matrix(angles, "xyz"), "xyz") - angles).max() < 1e-15)
@@ -73,12 +71,13 @@ def from_matrix(matrix: Mat3Like, sequence: str = "ZXZ") -> Vec3:
 
 
 def from_quaternion(q: QuatLike, sequence: str = "ZXZ") -> Vec3:
-    """The Euler angles of a quaternion, rad, in the order of `sequence`; same bits for q and −q.
+    """The Euler angles of a quaternion, rad, in the order of `sequence`; the same bits for q and
+    −q.
 
-    **Arguments:** `q` (4,) of any length, body → world. **Raises:** `ValueError` for zero or NaN,
-    and an unknown sequence. Half the sum and half the difference of the outer angles come from two
-    atan2, so that the matrix keeps all its digits near the singular case
-    (Bernardes & Viollet 2022, doi:10.1371/journal.pone.0276302).
+    **Arguments:** `q` (4,) of any length, body → world. **Raises:** `ValueError` for zero, NaN or
+    an unknown sequence. Half the sum and half the difference of the outer angles come from two
+    atan2, so that the matrix keeps all its digits near the singular case (Bernardes & Viollet 2022,
+    doi:10.1371/journal.pone.0276302).
 
     >>> from_quaternion(jnp.array([1.0, 0.0, 0.0, 0.0])).tolist()
     [0.0, 0.0, 0.0]
@@ -112,9 +111,9 @@ def from_quaternion(q: QuatLike, sequence: str = "ZXZ") -> Vec3:
 
 
 def is_singular(angles: Vec3Like, sequence: str = "ZXZ") -> Bool[Array, ""]:
-    """Whether these angles are singular: their outer turns have one axis, to 4 units of round-off.
+    """Whether the outer turns of these angles have one axis, to 4 units of round-off.
 
-    **Arguments:** `angles` (3,), rad, in the order of `sequence`; of a matrix,
+    **Arguments:** `angles` (3,), rad, in the order of `sequence`. For a matrix:
     `is_singular(from_matrix(matrix, sequence), sequence)`.
 
     >>> bool(is_singular(jnp.array([0.1, 0.0, 0.0]), "ZXZ"))
@@ -159,10 +158,9 @@ def omega_to_rates(
     """Rates of the Euler angles from the angular velocity: eqs 81–83 of the notes, solved.
 
     **Arguments:** `angles` (3,), rad, in the order of `sequence`; `omega` (3,), rad/s, in `frame`.
-
-    **Returns:** (3,) rad/s. The last rate is 0 in the singular case (`is_singular`), the others
-    follow, and the part of `omega` outside their range is dropped. **Raises:** `ValueError` for
-    an unknown sequence or frame.
+    **Returns:** (3,) rad/s. In the singular case (`is_singular`) the last rate is 0, and the part
+    of `omega` that no rates give is dropped. **Raises:** `ValueError` for an unknown sequence or
+    frame.
 
     >>> omega_to_rates(jnp.array([0.1, 0.2, 0.3]), jnp.array([0.0, 0.0, 2.0])).tolist()
     [0.0, 0.0, 2.0]
@@ -184,7 +182,7 @@ def omega_to_rates(
 
 
 def _axes(sequence: str) -> tuple[tuple[int, int, int], bool]:
-    """Axis numbers of the turns, intrinsic, and whether the angles are listed the other way."""
+    """Axis numbers of the turns, intrinsic, and whether the angles are listed in reverse."""
     extrinsic = isinstance(sequence, str) and sequence.islower()
     letters = "xyz" if extrinsic else "XYZ"
     if not isinstance(sequence, str) or len(sequence) != 3 or not set(sequence) <= set(letters):
@@ -205,11 +203,10 @@ def _unknown(sequence: object, reason: str) -> str:
 def _angles(angles: Vec3Like) -> Vec3:
     angles = turn(_checks.floating(angles, (3,), "angles"), "angles")
     if _checks.known(angles) and bool(np.any(np.abs(np.asarray(angles)) > _MANY_TURNS)):
-        warnings.warn(
-            f"angles {angles.tolist()} rad are more than four turns: are they degrees? "
-            "use jnp.deg2rad",
-            stacklevel=3,
+        words = (
+            f"angles {angles.tolist()} rad are over four turns: are they degrees? use jnp.deg2rad"
         )
+        warnings.warn(words, stacklevel=3)
     return angles
 
 
@@ -236,7 +233,7 @@ def _wrap(angle: Scalar) -> Scalar:
 
 
 def _turning_axes(axes: tuple[int, int, int], angles: tuple) -> tuple[Vec3, Vec3, Vec3]:
-    """The three axes of turning, in the body frame: the contribution of each unit rate to Ω."""
+    """The axes of the three turns in the body frame: what each unit rate adds to Ω."""
     _, j, k = axes
     first, second, third = (jnp.eye(3, dtype=angles[0].dtype)[axis] for axis in axes)
     middle, last = _about(j, angles[1]), _about(k, angles[2])

@@ -1,9 +1,9 @@
 """The rotation that fits best: projection, alignment, Wahba's problem, the mean of rotations.
 
-No singular value decomposition and no eigenvectors: their derivatives are NaN at every rotation,
-where all three singular values are 1. The best rotation R of a 3×3 matrix B, the one with the
-largest Tr(RᵀB), has the derivative dR = R hat(x), (Tr(S) 1 − S) x = 2 vee(Rᵀ dB), S = sym(RᵀB),
-which is regular if the answer is unique.
+Singular values and eigenvectors are not used: their derivatives are NaN at every rotation, where
+all three singular values are 1. The best rotation R of a 3×3 matrix B, with the largest Tr(RᵀB),
+has the derivative dR = R hat(x), (Tr(S) 1 − S) x = 2 vee(Rᵀ dB), S = sym(RᵀB). It is regular if R
+is unique.
 """
 
 from functools import partial
@@ -37,9 +37,8 @@ def project(matrix: Mat3Like) -> Mat3:
     """The rotation nearest to a matrix (Frobenius norm), with the correct derivative also on SO(3).
 
     **Arguments:** `matrix` (3, 3), det > 0. **Returns:** (3, 3) with RᵀR = 1 to round-off.
-
-    **Raises:** `ValueError` if a matrix known now is left-handed (a mirror image has no nearest
-    rotation), singular, or not finite; under `jit` call `so3.check` or your own test before.
+    **Raises:** `ValueError` if a known matrix is left-handed (no rotation is nearest to a mirror
+    image), singular, or not finite. Under `jit` call `so3.check` first, or a test of your own.
 
     >>> project(2.0 * jnp.eye(3)).round(12).tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
@@ -66,8 +65,8 @@ def wahba(
     """The rotation M, body → world, least in Σ w_i |world_i − M body_i|² (Wahba 1965).
 
     **Arguments:** `body`, `world` (n, 3), n ≥ 2: the same directions in both frames, any units;
-    `weights` (n,), not negative, 1 if not given. Solved for the largest root of the quartic of
-    Markley 1993 (FOAM, J. Astronaut. Sci. 41, 261), then by Newton's method on the group.
+    `weights` (n,), not negative, 1 if not given. It solves the quartic of Markley 1993 (FOAM, J.
+    Astronaut. Sci. 41, 261), then takes Newton steps on the group.
 
     **Raises:** an error, also under `jit`, if the directions do not determine the rotation: fewer
     than two, or all parallel (to 5e-4 rad in float64, 4° in float32, where half the digits would be
@@ -83,24 +82,23 @@ def wahba(
         direction(rows.reshape(-1), name)
     w, world, body = (of_order_one(x) for x in (w, world, body))
     b = (w[:, None, None] * world[:, :, None] * body[:, None, :]).sum(0)
-    best = nearest(b)
+    words = "wahba: these directions do not fix the attitude; two that are not parallel are needed"
+    try:
+        best = nearest(b)
+    except ValueError:
+        raise ValueError(words) from None
     # (σ1 + σ2)(σ2 + σ3)(σ3 + σ1), σ3 with the sign of det b: 0 where a turn is free.
     firmness = determinant(_curvature(best, b / jnp.sqrt((b * b).sum())))
-    return _checks.refuse(
-        best,
-        ~(firmness > 4 * np.sqrt(jnp.finfo(b.dtype).eps)),
-        "wahba: these directions do not fix the attitude; two that are not parallel are needed",
-    )
+    return _checks.refuse(best, ~(firmness > 4 * np.sqrt(jnp.finfo(b.dtype).eps)), words)
 
 
 def align(a: Vec3Like, b: Vec3Like) -> Mat3:
     """The smallest rotation that takes the direction of a into that of b.
 
-    **Arguments:** `a`, `b` (3,), in one frame, any lengths. **Returns:** (3, 3), R a ∥ b.
-    **Raises:** `ValueError` for known zero or NaN. For directions opposite to round-off it is half
-    a turn about the axis normal to a that is nearest to the basis vector along which a is smallest.
-    No digits are lost near that case: the quaternion is (½|m|, a × m/|m|), m = a + b, and m is
-    small but exact.
+    **Arguments:** `a`, `b` (3,), in one frame, any lengths. **Returns:** (3, 3), R a ∥ b. If a and
+    b are opposite to round-off it is half a turn about a normal to a, as near as possible to the
+    basis vector along which a is smallest. The quaternion is (½|m|, a × m/|m|) with m = a + b,
+    which keeps its digits near that case. **Raises:** `ValueError` for known zero or NaN.
 
     >>> align(jnp.array([1.0, 0, 0]), jnp.array([0, 2.0, 0])).round(12)[:, 0].tolist()
     [0.0, 1.0, 0.0]
@@ -124,12 +122,10 @@ def align(a: Vec3Like, b: Vec3Like) -> Mat3:
 def mean(matrices: Float[ArrayLike, "n 3 3"], weights: Float[ArrayLike, "n"] | None = None) -> Mat3:
     """The Karcher mean: the rotation least in Σ w_i |angle to R_i|².
 
-    **Arguments:** `matrices` (n, 3, 3) rotations, within a quarter turn of the mean, where it is
-    unique (Karcher 1977, doi:10.1002/cpa.3160300502); `weights` (n,), not negative.
-
-    **Returns:** (3, 3), with first and second derivatives from the last two Newton steps alone.
-    **Raises:** as `so3.check`, if the matrices are known now; `ValueError` for negative weights, or
-    only zeros.
+    **Arguments:** `matrices` (n, 3, 3) rotations within a quarter turn of the mean: it is then
+    unique (Karcher 1977, doi:10.1002/cpa.3160300502); `weights` (n,), not negative. **Returns:**
+    (3, 3). Its first and second derivatives come from the last two Newton steps alone. **Raises:**
+    as `so3.check` for known matrices; `ValueError` for weights that are negative or all zero.
 
     >>> mean(jnp.stack([jnp.eye(3), jnp.eye(3)])).round(12).tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
@@ -177,19 +173,19 @@ def _karcher(q: Float[Array, "n 4"], w: Float[Array, "n"]) -> Quat:
 
 
 def of_order_one(x: Array) -> Array:
-    """The same times a power of two, for formulas of ratios: no product overflows."""
+    """The array times a power of two, for formulas of ratios: no product overflows."""
     return near_one(jnp.max(jnp.abs(x))) * x
 
 
 def weights_of(weights: Any, like: Array, of: str) -> Array:
-    """One weight for each, 1 if not given; known weights without a mean are refused."""
+    """One weight for each row, 1 if not given; known weights must have a positive sum."""
     if like.shape[0] == 0:
         raise ValueError(f"{of}: wanted at least one row, got none")
     if weights is None:
         return jnp.ones_like(like)
     w = _checks.floating(weights, like.shape, "weights")
     if _checks.known(w):
-        words = "numbers ≥ 0, of which one at least is positive"
+        words = "numbers ≥ 0, at least one of them positive"
         _checks.sign(_checks.finite(w, "weights"), "weights", words, zero=True)
         _checks.refuse(w, ~(w > 0).any(), f"weights: wanted {words}")
     return w
@@ -219,7 +215,7 @@ def _curvature(r: Mat3, b: Mat3) -> Mat3:
 
 @jax.custom_jvp
 def nearest(b: Mat3) -> Mat3:
-    """The rotation R with the largest Tr(Rᵀb), of a matrix of any size."""
+    """The rotation R with the largest Tr(Rᵀb), for a matrix of any size."""
     b = of_order_one(b)
     b = b / jnp.sqrt((b * b).sum())
     root, zeta = _quartic(b)

@@ -1,7 +1,4 @@
-"""The costly maps without their checks, compiled once also outside of `jit`.
-
-`quaternion` and `so3` are their public versions; nothing here checks shapes or values.
-"""
+"""The costly maps of `quaternion` and `so3`, without checks; also compiled outside of `jit`."""
 
 from collections.abc import Sequence
 from functools import partial

@@ -1,11 +1,9 @@
 """Vectors and 3×3 matrices, written on components.
 
 `@` on 3×3 matrices is slow in gradients on CPU and runs in TF32 on some GPUs; these functions avoid
-both.
-
-Range: the products in a formula (two entries in `cross`, `dot`, `product` and `apply`, three in
-`determinant`, four in `solve`) must be finite: entries from 1e-75 to 1e75 always are (float32:
-1e-9 to 1e9).
+both. Range: the products in a formula (of two entries in `cross`, `dot`, `product` and `apply`, of
+three in `determinant`, of four in `solve`) must be finite. Entries from 1e-75 to 1e75 are always in
+range (float32: 1e-9 to 1e9).
 """
 
 import functools
@@ -22,26 +20,17 @@ from rigidjax.rotation.barrier import once
 
 
 def components(v: Float[Array, "n"]) -> tuple[Scalar, ...]:
-    """The entries of a vector, as scalars.
-
-    **Arguments:** `v` (n,), n fixed. One `lax.split`, whose transpose is one concatenation:
-    indexing entry by entry makes gradients several times slower on CPU.
-    """
+    """The entries of a vector, as scalars: one `lax.split` is faster in gradients than indices."""
     return tuple(part.reshape(()) for part in lax.split(v, (1,) * v.shape[0]))
 
 
 def entries(m: Float[Array, "3 3"]) -> tuple[Scalar, ...]:
-    """The nine entries of a 3×3 matrix, row by row, as scalars.
-
-    **Arguments:** `m` (3, 3).
-    """
+    """The nine entries of a 3×3 matrix, row by row, as scalars."""
     return components(m.reshape(9))
 
 
 def cross(a: Vec3Like, b: Vec3Like) -> Vec3:
-    """Vector product a × b.
-
-    **Arguments:** `a`, `b` (3,), in one frame, any units.
+    """Vector product a × b of two vectors (3,) in one frame, any units.
 
     >>> cross(jnp.array([1.0, 0.0, 0.0]), jnp.array([0.0, 1.0, 0.0])).tolist()
     [0.0, 0.0, 1.0]
@@ -62,15 +51,15 @@ def dot_components(a: Sequence[Scalar], b: Sequence[Scalar]) -> Scalar:
 
 
 def square(v: Sequence[Scalar]) -> Scalar:
-    """Squared length of a triple of scalars, to be fed to a costly function."""
+    """Squared length of a triple of scalars, as the argument of a costly function."""
     return once(dot_components(v, v))
 
 
 def near_one(*parts: Scalar) -> Scalar:
-    """A power of two that brings the largest of some scalars near 1.
+    """A power of two that brings the largest of some scalars near 1, with derivative zero.
 
-    A number times it keeps all its digits and can be squared and summed: for formulas that do not
-    depend on the length of their argument. Its derivative is set to zero.
+    For formulas that do not depend on the length of their argument: times this number, it keeps all
+    its digits, and its squares do not overflow.
     """
     sizes = [jnp.abs(lax.stop_gradient(part)) for part in parts]
     info = jnp.finfo(sizes[0].dtype)
@@ -80,9 +69,7 @@ def near_one(*parts: Scalar) -> Scalar:
 
 
 def hat(w: Vec3Like) -> Mat3:
-    """The matrix J with J y = w × y (notes, eqs 41–43, 49).
-
-    **Arguments:** `w` (3,), any units and frame; J acts in the same frame.
+    """The matrix J with J y = w × y (notes, eqs 41–43, 49), of `w` (3,) in any units and frame.
 
     >>> hat(jnp.array([1.0, 2.0, 3.0])).tolist()
     [[0.0, -3.0, 2.0], [3.0, 0.0, -1.0], [-2.0, 1.0, 0.0]]
@@ -93,10 +80,7 @@ def hat(w: Vec3Like) -> Mat3:
 
 
 def vee(matrix: Mat3Like) -> Vec3:
-    """The vector w of an antisymmetric matrix; of any matrix, w_i = ½ Tr(A J_iᵀ) (notes, eq 53).
-
-    **Arguments:** `matrix` (3, 3). A symmetric part is dropped, as the projection of eqs 52, 53
-    does.
+    """The vector of an antisymmetric `matrix` (3, 3); else w_i = ½ Tr(A J_iᵀ) (notes, eqs 52, 53).
 
     >>> vee(hat(jnp.array([1.0, 2.0, 3.0]))).tolist()
     [1.0, 2.0, 3.0]
@@ -108,9 +92,8 @@ def vee(matrix: Mat3Like) -> Vec3:
 def basis(dtype: Any = float) -> Float[Array, "3 3 3"]:
     """The matrices J_1, J_2, J_3: J_i y = e_i × y, ½ Tr(J_iᵀ J_j) = δ_ij (notes, eqs 41–43, 53).
 
-    **Arguments:** `dtype` of the (3, 3, 3) array.
-
-    Eq 16 of the notes prints J_3 transposed, that is −J_3 of eq 42; eq 42 holds.
+    **Arguments:** `dtype` of the (3, 3, 3) array. Eq 16 of the notes prints −J_3, the transpose of
+    J_3; eq 42 is right.
 
     >>> vee(basis()[2]).tolist()
     [0.0, 0.0, 1.0]
@@ -120,9 +103,8 @@ def basis(dtype: Any = float) -> Float[Array, "3 3 3"]:
 
 
 def product(a: Mat3Like, b: Mat3Like) -> Mat3:
-    """Matrix product a b on components: full precision on every device, cheap in gradients.
-
-    **Arguments:** `a`, `b` (3, 3).
+    """Matrix product of `a`, `b` (3, 3) on components: full precision on every device, cheap in
+    gradients.
 
     >>> product(jnp.eye(3), 2.0 * jnp.eye(3)).tolist()
     [[2.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 2.0]]
@@ -132,9 +114,7 @@ def product(a: Mat3Like, b: Mat3Like) -> Mat3:
 
 
 def apply(a: Mat3Like, y: Vec3Like) -> Vec3:
-    """Matrix times vector a y on components.
-
-    **Arguments:** `a` (3, 3), `y` (3,).
+    """Matrix `a` (3, 3) times vector `y` (3,), on components.
 
     >>> apply(2.0 * jnp.eye(3), jnp.array([1.0, 2.0, 3.0])).tolist()
     [2.0, 4.0, 6.0]
@@ -144,9 +124,7 @@ def apply(a: Mat3Like, y: Vec3Like) -> Vec3:
 
 
 def solve(a: Mat3Like, y: Vec3Like) -> Vec3:
-    """Solve a x = y by cofactors (Cramer's rule).
-
-    **Arguments:** `a` (3, 3), well conditioned; `y` (3,).
+    """Solve a x = y by cofactors (Cramer's rule); `a` (3, 3) well conditioned, `y` (3,).
 
     >>> solve(2.0 * jnp.eye(3), jnp.array([2.0, 4.0, 6.0])).tolist()
     [1.0, 2.0, 3.0]
@@ -159,9 +137,7 @@ def solve(a: Mat3Like, y: Vec3Like) -> Vec3:
 
 
 def determinant(a: Mat3Like) -> Scalar:
-    """Determinant of a 3×3 matrix: +1 for a rotation, −1 for a reflection (notes, eq 10).
-
-    **Arguments:** `a` (3, 3).
+    """Determinant of `a` (3, 3): +1 for a rotation, −1 for a reflection (notes, eq 10).
 
     >>> float(determinant(jnp.eye(3)))
     1.0
@@ -171,19 +147,14 @@ def determinant(a: Mat3Like) -> Scalar:
 
 
 def cofactors(a: Mat3) -> Mat3:
-    """The matrix of cofactors: det a · a⁻ᵀ, also where there is no inverse.
-
-    **Arguments:** `a` (3, 3).
-    """
+    """The matrix of cofactors, det a · a⁻ᵀ; a need not have an inverse."""
     m = entries(a)
     p, q, r = m[:3], m[3:6], m[6:]
     return jnp.stack([jnp.stack(cross_components(*two)) for two in ((q, r), (r, p), (p, q))])
 
 
 def dot(a: Vec3Like, b: Vec3Like) -> Scalar:
-    """Scalar product a · b.
-
-    **Arguments:** `a`, `b` (3,), in one frame.
+    """Scalar product a · b of two vectors (3,) in one frame.
 
     >>> float(dot(jnp.array([1.0, 2.0, 3.0]), jnp.array([1.0, 1.0, 1.0])))
     6.0

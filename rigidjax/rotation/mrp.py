@@ -1,7 +1,7 @@
 """Modified Rodrigues parameters σ = n tan(θ/4), and their shadow set.
 
-Three numbers without a sine, regular up to a full turn, where σ goes to infinity. σ and its shadow
-−σ/|σ|² are the same rotation; switching at |σ| = 1 keeps to θ ≤ π. Source: Schaub & Junkins, 2018,
+Three numbers without a sine, regular up to a full turn, where σ is infinite. σ and its shadow
+−σ/|σ|² are the same rotation; a switch at |σ| = 1 keeps θ ≤ π. Source: Schaub & Junkins, 2018,
 Analytical Mechanics of Space Systems, sec. 3.5.2. Range: any σ; with rates, both up to 1e75
 (float32: 1e9).
 """
@@ -17,9 +17,7 @@ from rigidjax.rotation.validation import direction
 
 
 def from_quaternion(q: QuatLike) -> Vec3:
-    """σ = q_v/(1 + q_w) of the canonical quaternion: |σ| ≤ 1, the same bits for q and −q.
-
-    **Arguments:** `q` (4,) unit, body → world. **Returns:** (3,) dimensionless.
+    """σ = q_v/(1 + q_w) of the canonical `q` (4,) unit, |σ| ≤ 1: the same bits for q and −q.
 
     >>> from_quaternion(jnp.array([-1.0, 0.0, 0.0, 0.0])).tolist()
     [-0.0, -0.0, -0.0]
@@ -29,9 +27,7 @@ def from_quaternion(q: QuatLike) -> Vec3:
 
 
 def to_quaternion(sigma: Vec3Like) -> Quat:
-    """The unit quaternion ((1 − s), 2σ)/(1 + s), s = |σ|²; for the shadow it is −q.
-
-    **Arguments:** `sigma` (3,) dimensionless.
+    """The unit quaternion ((1 − s), 2σ)/(1 + s), s = |σ|², of `sigma` (3,); −q for the shadow.
 
     >>> to_quaternion(jnp.array([0.0, 0.0, 1.0])).tolist()
     [0.0, 0.0, 0.0, 1.0]
@@ -45,9 +41,8 @@ def to_quaternion(sigma: Vec3Like) -> Quat:
 
 
 def from_matrix(matrix: Mat3Like) -> Vec3:
-    """The parameters, |σ| ≤ 1, of a rotation matrix, body → world.
-
-    **Arguments:** `matrix` (3, 3) rotation; values are not looked at (`so3.check`).
+    """The parameters, |σ| ≤ 1, of a rotation `matrix` (3, 3), body → world, unchecked
+    (`so3.check`).
 
     >>> from_matrix(jnp.eye(3)).tolist()
     [0.0, 0.0, 0.0]
@@ -56,9 +51,7 @@ def from_matrix(matrix: Mat3Like) -> Vec3:
 
 
 def to_matrix(sigma: Vec3Like) -> Mat3:
-    """The rotation matrix, body → world; the same for the shadow.
-
-    **Arguments:** `sigma` (3,) dimensionless.
+    """The rotation matrix, body → world, of `sigma` (3,); the same for the shadow.
 
     >>> to_matrix(jnp.zeros(3)).tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
@@ -67,10 +60,7 @@ def to_matrix(sigma: Vec3Like) -> Mat3:
 
 
 def shadow(sigma: Vec3Like) -> Vec3:
-    """The other parameters of the same rotation, −σ/|σ|² (Schaub & Junkins, eq 3.145).
-
-    **Arguments:** `sigma` (3,), not zero: the shadow of no rotation lies at infinity. **Raises:**
-    `ValueError` for zero or NaN.
+    """The other parameters of `sigma` (3,), −σ/|σ|² (eq 3.145); `ValueError` for zero or NaN.
 
     >>> shadow(jnp.array([0.0, 0.5, 0.0])).tolist()
     [-0.0, -2.0, -0.0]
@@ -79,9 +69,7 @@ def shadow(sigma: Vec3Like) -> Vec3:
 
 
 def switch(sigma: Vec3Like) -> Vec3:
-    """σ if |σ| ≤ 1, else its shadow: the parameters of the shorter way round.
-
-    **Arguments:** `sigma` (3,) dimensionless. Do it between steps of a solver, not inside one.
+    """`sigma` (3,) if |σ| ≤ 1, else its shadow, the shorter turn. Switch between steps only.
 
     >>> switch(jnp.array([0.0, 2.0, 0.0])).tolist()
     [-0.0, -0.5, -0.0]
@@ -98,9 +86,9 @@ def _shadow(sigma: Vec3) -> Vec3:
 
 
 def omega_to_rates(sigma: Vec3Like, omega: Vec3Like) -> Vec3:
-    """dσ/dt = ¼ [(1 − s) Ω + 2 σ × Ω + 2 σ (σ·Ω)] (Schaub & Junkins, eq 3.160); never singular.
+    """dσ/dt = ¼ [(1 − s) Ω + 2 σ × Ω + 2 σ (σ·Ω)], 1/s, never singular (eq 3.160).
 
-    **Arguments:** `sigma` (3,) dimensionless; `omega` (3,) rad/s, body frame. **Returns:** 1/s.
+    **Arguments:** `sigma` (3,) dimensionless; `omega` (3,) rad/s, body frame.
 
     >>> omega_to_rates(jnp.zeros(3), jnp.array([0.0, 0.0, 4.0])).tolist()
     [0.0, 0.0, 1.0]

@@ -1,12 +1,12 @@
 """Unit quaternions (w, x, y, z), scalar first: q turns body vectors into world vectors.
 
-q and −q are the same rotation. `log`, and every error built on it, gives the same bits for both.
-The maps here take one quaternion and normalise nothing, so that they cost little in a vector field;
-`check` is for data from outside. A map refuses only known values, not traced ones.
+q and −q are the same rotation. `log`, and every error computed with it, gives the same bits for
+both. The maps take one quaternion and do not normalise it, so that they cost little in a vector
+field; `check` is for data from outside. Maps refuse known values, not traced ones.
 
 Range: functions of a quaternion or axis of any length (`normalise`, `log`, `angle`, `about_axis`)
 take lengths from 1e-307 to 1e308 (float32: 1e-37 to 1e38). An angle beyond 1/ε, 4.5e15 rad
-(float32: 8.4e6), has no correct digit: `exp` and functions based on it refuse it; a traced one
+(float32: 8.4e6), has no correct digit: `exp` and the functions that use it refuse it. A traced one
 gives an arbitrary rotation, and NaN beyond 1e150 (1e18). Vectors and rates beside a unit quaternion
 may have components up to 1e307 (1e37).
 """
@@ -30,13 +30,7 @@ from rigidjax.rotation.kernels import (
     quaternion_to_vector,
     vector_to_quaternion,
 )
-from rigidjax.rotation.linalg3 import (
-    components,
-    cross_components,
-    dot,
-    dot_components,
-    near_one,
-)
+from rigidjax.rotation.linalg3 import components, cross_components, dot, dot_components, near_one
 from rigidjax.rotation.validation import direction, rotation_matrix, turn, unit_quaternion
 
 _HINT = "one quaternion is (w, x, y, z), scalar first; batch with jax.vmap"
@@ -46,9 +40,8 @@ def exp(v: Vec3Like) -> Quat:
     """The quaternion of a rotation vector: (cos θ/2, ½ v sin(θ/2)/(θ/2)), θ = |v|.
 
     **Arguments:** `v` (3,) rotation vector, rad (notes, eqs 17, 18, with v = γ y). The angle is
-    known to ε|v|. **Raises:** `ValueError` for NaN, and beyond 1/ε (see the head of this module).
-
-    **Returns:** (4,) of norm 1; value and derivatives are correct also at v = 0.
+    known to ε|v|. **Returns:** (4,) of norm 1; value and derivatives are correct also at v = 0.
+    **Raises:** `ValueError` for NaN, and beyond 1/ε (see the head of this module).
 
     >>> exp(jnp.array([0.0, 0.0, jnp.pi])).round(12).tolist()
     [0.0, 0.0, 0.0, 1.0]
@@ -59,12 +52,10 @@ def exp(v: Vec3Like) -> Quat:
 def log(q: QuatLike) -> Vec3:
     """The shortest rotation vector of a quaternion, rad, |v| ≤ π.
 
-    **Arguments:** `q` (4,); its length does not matter. **Raises:** `ValueError` for zero or NaN.
-
-    **Returns:** v = 2 atan2(|q_v|, q_w) q_v/|q_v| (3,), from q or −q, whichever has q_w > 0; at
-    q_w = 0 the one whose first nonzero component is positive. The derivative is that of Q(q)/|q|,
-    by the inverse right Jacobian, and correct from 0 to π (Solà 2018, arXiv:1711.02508; the angle
-    is halved twice to avoid cancellation and branches).
+    **Arguments:** `q` (4,) of any length. **Returns:** v = 2 atan2(|q_v|, q_w) q_v/|q_v| (3,) of
+    `canonical(q)`. The derivative is that of q/|q|, by the inverse right Jacobian, and correct from
+    0 to π (Solà 2018, arXiv:1711.02508; the angle is halved twice to avoid cancellation and
+    branches). **Raises:** `ValueError` for zero or NaN.
 
     >>> abs(log(jnp.array([0.0, 0.0, 0.0, -1.0]))).round(6).tolist()
     [0.0, 0.0, 3.141593]
@@ -75,8 +66,8 @@ def log(q: QuatLike) -> Vec3:
 def multiply(p: QuatLike, q: QuatLike) -> Quat:
     """Product p q: first turn by q, then by p (the matrices multiply in the same order).
 
-    **Arguments:** `p`, `q` (4,). With q body → world, `multiply(q, d)` turns by d seen from the
-    body and `multiply(d, q)` by d seen from the world (notes, eqs 27–29).
+    **Arguments:** `p`, `q` (4,). With q body → world, `multiply(q, d)` is a turn by d about axes of
+    the body, and `multiply(d, q)` about axes of the world (notes, eqs 27–29).
 
     >>> multiply(jnp.array([0.0, 1.0, 0.0, 0.0]), jnp.array([0.0, 0.0, 1.0, 0.0])).tolist()
     [0.0, 0.0, 0.0, 1.0]
@@ -86,9 +77,7 @@ def multiply(p: QuatLike, q: QuatLike) -> Quat:
 
 
 def conjugate(q: QuatLike) -> Quat:
-    """The opposite rotation of a unit quaternion, (w, −x, −y, −z).
-
-    **Arguments:** `q` (4,).
+    """The opposite rotation (w, −x, −y, −z) of a unit quaternion `q` (4,).
 
     >>> conjugate(jnp.array([1.0, 2.0, 3.0, 4.0])).tolist()
     [1.0, -2.0, -3.0, -4.0]
@@ -98,9 +87,7 @@ def conjugate(q: QuatLike) -> Quat:
 
 
 def rotate(q: QuatLike, y: Vec3Like) -> Vec3:
-    """Body components → world components, M y' (notes, eqs 8, 21).
-
-    **Arguments:** `q` (4,) unit; `y` (3,) in the body frame, any units. Bits are the same for −q.
+    """Body components `y` (3,) → world components M y', by `q` (4,) unit (notes, eqs 8, 21).
 
     >>> rotate(jnp.array([0.0, 0.0, 0.0, 1.0]), jnp.array([1.0, 2.0, 3.0])).tolist()
     [-1.0, -2.0, 3.0]
@@ -110,9 +97,7 @@ def rotate(q: QuatLike, y: Vec3Like) -> Vec3:
 
 
 def rotate_inverse(q: QuatLike, y: Vec3Like) -> Vec3:
-    """World components → body components, Mᵀ y (notes, eqs 8, 22).
-
-    **Arguments:** `q` (4,) unit; `y` (3,) in the world frame, any units.
+    """World components `y` (3,) → body components, Mᵀ y, by `q` (4,) unit (notes, eqs 8, 22).
 
     >>> rotate_inverse(jnp.array([0.0, 0.0, 0.0, 1.0]), jnp.array([1.0, 2.0, 3.0])).tolist()
     [-1.0, -2.0, 3.0]
@@ -122,12 +107,11 @@ def rotate_inverse(q: QuatLike, y: Vec3Like) -> Vec3:
 
 
 def check(q: Float[ArrayLike, "*batch 4"], *, name: str = "q") -> Float[Array, "*batch 4"]:
-    """Check a quaternion from outside: normalise it, or refuse it.
+    """Normalise a quaternion from outside, or refuse it.
 
     **Arguments:** `q` (..., 4), scalar first; `name` its name in messages. **Returns:** the
-    quaternion, with length 1 to round-off. **Raises:** for NaN, a zero quaternion, and a length off
-    by more than 1e-6 (float32: 1e-3); a `ValueError`, or under `jit` `equinox.error_if` with the
-    same words.
+    quaternion, with length 1 to round-off. **Raises:** `ValueError` (under `jit`
+    `equinox.error_if`) for NaN, zero, and a length off by more than 1e-6 (float32: 1e-3).
 
     >>> check(jnp.array([1.0, 0.0, 0.0, 1e-9])).tolist()[0]
     1.0
@@ -136,9 +120,7 @@ def check(q: Float[ArrayLike, "*batch 4"], *, name: str = "q") -> Float[Array, "
 
 
 def from_xyzw(xyzw: QuatLike) -> Quat:
-    """Scalar-last components (SciPy, ROS, glTF) → (w, x, y, z).
-
-    **Arguments:** `xyzw` (4,).
+    """Scalar-last components `xyzw` (4,) (SciPy, ROS, glTF) → (w, x, y, z).
 
     >>> from_xyzw(jnp.array([0.0, 0.0, 0.0, 1.0])).tolist()
     [1.0, 0.0, 0.0, 0.0]
@@ -147,9 +129,7 @@ def from_xyzw(xyzw: QuatLike) -> Quat:
 
 
 def to_xyzw(q: QuatLike) -> Float[Array, "4"]:
-    """(w, x, y, z) → scalar-last components (SciPy, ROS, glTF).
-
-    **Arguments:** `q` (4,).
+    """`q` (4,), (w, x, y, z) → scalar-last components (SciPy, ROS, glTF).
 
     >>> to_xyzw(jnp.array([1.0, 0.0, 0.0, 0.0])).tolist()
     [0.0, 0.0, 0.0, 1.0]
@@ -161,7 +141,7 @@ def about_axis(axis: Vec3Like, angle: ScalarLike) -> Quat:
     """The rotation by an angle about an axis (notes, eqs 17, 18).
 
     **Arguments:** `axis` (3,) of any length; `angle` rad, right-handed about it. **Raises:**
-    `ValueError` for an axis that is zero, for NaN, and for an angle as `exp`.
+    `ValueError` for an axis of zero, for NaN, and for an angle as `exp`.
 
     >>> about_axis(jnp.array([0.0, 0.0, 2.0]), jnp.pi).round(12).tolist()
     [0.0, 0.0, 0.0, 1.0]
@@ -176,8 +156,8 @@ def about_axis(axis: Vec3Like, angle: ScalarLike) -> Quat:
 def advance(q: QuatLike, omega: Vec3Like, dt: ScalarLike) -> Quat:
     """The attitude after a constant body rate for a time dt: q exp(Ω dt), exact.
 
-    **Arguments:** `q` (4,) unit, body → world; `omega` (3,) rad/s, body frame; `dt` s.
-    **Raises:** as `exp`.
+    **Arguments:** `q` (4,) unit, body → world; `omega` (3,) rad/s, body frame; `dt` s. **Raises:**
+    as `exp`.
 
     >>> advance(jnp.array([1.0, 0, 0, 0]), jnp.array([0, 0, jnp.pi]), 1.0).round(12).tolist()
     [0.0, 0.0, 0.0, 1.0]
@@ -189,10 +169,7 @@ def advance(q: QuatLike, omega: Vec3Like, dt: ScalarLike) -> Quat:
 
 
 def rate(q: QuatLike, omega: Vec3Like) -> Quat:
-    """dq/dt = ½ q (0, Ω), with Ω in the body frame.
-
-    **Arguments:** `q` (4,) unit, body → world; `omega` (3,) rad/s, body frame. **Returns:** 1/s.
-    Source: notes, eq 50, on unit quaternions.
+    """dq/dt = ½ q (0, Ω), 1/s, of `q` (4,) unit and `omega` (3,), rad/s, body frame (notes, eq 50).
 
     >>> float(rate(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.array([0.0, 0.0, 2.0]))[3])
     1.0
@@ -207,9 +184,9 @@ def rate(q: QuatLike, omega: Vec3Like) -> Quat:
 def interpolate(p: QuatLike, q: QuatLike, s: ScalarLike) -> Quat:
     """The point at s of the shortest turn from p (s = 0) to q (s = 1), at a constant rate.
 
-    **Arguments:** `p`, `q` (4,) unit, either sign; `s` dimensionless, may lie beyond [0, 1]
-    (Shoemake 1985, doi:10.1145/325334.325242; here p exp(s log(p̄ q)), regular at p = q).
-    **Raises:** `ValueError` if the product p̄ q is zero or NaN.
+    **Arguments:** `p`, `q` (4,) unit, either sign; `s` dimensionless, also beyond [0, 1]. It is p
+    exp(s log(p̄ q)), regular at p = q (Shoemake 1985, doi:10.1145/325334.325242). **Raises:**
+    `ValueError` if the product p̄ q is zero or NaN.
 
     >>> p, q = exp(jnp.array([0, 0, 1.0])), exp(jnp.array([0, 0, 2.0]))
     >>> bool(abs(interpolate(p, q, 0.5) - exp(jnp.array([0, 0, 1.5]))).max() < 1e-15)
@@ -233,9 +210,7 @@ def uniform(key: PRNGKeyArray, dtype: Any = float) -> Quat:
 
 
 def normalise(q: QuatLike) -> Quat:
-    """The quaternion of length 1 in the direction of q.
-
-    **Arguments:** `q` (4,). The sign is kept. **Raises:** `ValueError` for zero or NaN.
+    """`q` (4,) scaled to length 1, with its sign. **Raises:** `ValueError` for zero or NaN.
 
     >>> normalise(jnp.array([0.0, 4.0, 0.0, 0.0])).tolist()
     [0.0, 1.0, 0.0, 0.0]
@@ -244,9 +219,7 @@ def normalise(q: QuatLike) -> Quat:
 
 
 def canonical(q: QuatLike) -> Quat:
-    """The one of q and −q with w > 0; if w = 0, the one with a positive first nonzero component.
-
-    **Arguments:** `q` (4,). The same bits come back for q and −q.
+    """The one of `q` (4,) and −q with w > 0; if w = 0, its first nonzero component is positive.
 
     >>> canonical(jnp.array([-1.0, 0.0, 0.0, 0.0])).tolist()
     [1.0, -0.0, -0.0, -0.0]
@@ -258,9 +231,9 @@ def canonical(q: QuatLike) -> Quat:
 def angle(q: QuatLike) -> Scalar:
     """The angle of a rotation, rad, in [0, π]; the same bits for q and −q.
 
-    **Arguments:** `q` (4,); its length does not matter. 2 atan2(|q_v|, |q_w|). The derivative does
-    not exist at the identity; 0 is returned, the shortest subgradient. **Raises:** `ValueError` for
-    zero or NaN.
+    **Arguments:** `q` (4,) of any length. The angle is 2 atan2(|q_v|, |q_w|). At the identity it
+    has no derivative: 0 is returned, the shortest subgradient. **Raises:** `ValueError` for zero or
+    NaN.
 
     >>> round(float(angle(exp(jnp.array([0.0, 1e-9, 0.0]))) * 1e9), 9)
     1.0
@@ -275,9 +248,7 @@ def angle(q: QuatLike) -> Scalar:
 
 
 def to_matrix(q: QuatLike) -> Mat3:
-    """The rotation matrix M, body → world, of a unit quaternion.
-
-    **Arguments:** `q` (4,) unit. **Returns:** (3, 3); bits are the same for −q.
+    """The rotation matrix M (3, 3), body → world, of `q` (4,) unit; the same bits for −q.
 
     >>> to_matrix(jnp.array([0.0, 0.0, 0.0, 1.0])).tolist()
     [[-1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]]
@@ -289,11 +260,10 @@ def to_matrix(q: QuatLike) -> Mat3:
 def from_matrix(matrix: Mat3Like) -> Quat:
     """The canonical unit quaternion of a rotation matrix.
 
-    **Arguments:** `matrix` (3, 3) rotation, body → world. **Raises:** as `so3.check`, if its values
-    are known now; nothing is checked inside `jit`, `grad` and `vmap`.
-
-    **Returns:** (4,) with w ≥ 0: the largest of the four rows of 4 q qᵀ, normalised (Shepperd 1978,
-    doi:10.2514/3.55767b), so that no case loses digits; the derivative uses that row only.
+    **Arguments:** `matrix` (3, 3) rotation, body → world. **Returns:** (4,) with w ≥ 0: the largest
+    of the four rows of 4 q qᵀ, normalised (Shepperd 1978, doi:10.2514/3.55767b). No case loses
+    digits; the derivative uses that row only. **Raises:** as `so3.check` for known values; nothing
+    is checked inside `jit`, `grad` and `vmap`.
 
     >>> from_matrix(jnp.diag(jnp.array([-1.0, -1.0, 1.0]))).tolist()
     [0.0, 0.0, 0.0, 1.0]

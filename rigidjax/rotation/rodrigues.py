@@ -1,9 +1,9 @@
 """Rodrigues (Gibbs, Cayley) parameters g = n tan(θ/2).
 
-Rational in both directions, and without a double cover; a half turn lies at infinity, and
-`is_singular` tests for it. M = (1 + hat g)(1 − hat g)⁻¹ is Cayley's transform. Source: Schaub &
-Junkins, 2018, Analytical Mechanics of Space Systems, sec. 3.5.1. Range: any g; with rates, both up
-to 1e75 (float32: 1e9).
+Rational in both directions, and without a double cover. They are infinite at a half turn, for which
+`is_singular` tests. M = (1 + hat g)(1 − hat g)⁻¹ is Cayley's transform. Source: Schaub & Junkins,
+2018, Analytical Mechanics of Space Systems, sec. 3.5.1. Range: any g; with rates, both up to 1e75
+(float32: 1e9).
 """
 
 import jax.numpy as jnp
@@ -33,9 +33,7 @@ def from_quaternion(q: QuatLike) -> Vec3:
 
 
 def to_quaternion(g: Vec3Like) -> Quat:
-    """The unit quaternion (1, g)/√(1 + |g|²), with w > 0.
-
-    **Arguments:** `g` (3,) dimensionless, finite.
+    """The unit quaternion (1, g)/√(1 + |g|²), with w > 0, of `g` (3,) dimensionless, finite.
 
     >>> to_quaternion(jnp.zeros(3)).tolist()
     [1.0, 0.0, 0.0, 0.0]
@@ -45,9 +43,7 @@ def to_quaternion(g: Vec3Like) -> Quat:
 
 
 def from_matrix(matrix: Mat3Like) -> Vec3:
-    """The parameters of a rotation matrix, body → world; infinite at a half turn.
-
-    **Arguments:** `matrix` (3, 3) rotation; values are not looked at (`so3.check`).
+    """The parameters of a rotation `matrix` (3, 3), unchecked; infinite at a half turn.
 
     >>> from_matrix(jnp.eye(3)).tolist()
     [0.0, 0.0, 0.0]
@@ -56,9 +52,7 @@ def from_matrix(matrix: Mat3Like) -> Vec3:
 
 
 def to_matrix(g: Vec3Like) -> Mat3:
-    """Cayley's transform (1 + hat g)(1 − hat g)⁻¹, the rotation matrix, body → world.
-
-    **Arguments:** `g` (3,) dimensionless, finite.
+    """Cayley's transform (1 + hat g)(1 − hat g)⁻¹, body → world, of `g` (3,), finite.
 
     >>> to_matrix(jnp.array([0.0, 0.0, 1.0])).round(12)[0].tolist()
     [0.0, -1.0, 0.0]
@@ -67,9 +61,7 @@ def to_matrix(g: Vec3Like) -> Mat3:
 
 
 def is_singular(q: QuatLike) -> Bool[Array, ""]:
-    """Whether a rotation is a half turn to 4 units of round-off, where g has no correct digit.
-
-    **Arguments:** `q` (4,) unit.
+    """Whether `q` (4,) unit is a half turn to 4 units of round-off: g then has no correct digit.
 
     >>> bool(is_singular(jnp.array([0.0, 0.0, 0.0, 1.0])))
     True
@@ -79,9 +71,7 @@ def is_singular(q: QuatLike) -> Bool[Array, ""]:
 
 
 def omega_to_rates(g: Vec3Like, omega: Vec3Like) -> Vec3:
-    """dg/dt = ½ [Ω + g × Ω + g (g·Ω)] (Schaub & Junkins, eq 3.130).
-
-    **Arguments:** `g` (3,) dimensionless; `omega` (3,) rad/s, body frame. **Returns:** 1/s.
+    """dg/dt = ½ [Ω + g × Ω + g (g·Ω)], 1/s, of `g` and `omega` (3,), rad/s, body frame (eq 3.130).
 
     >>> omega_to_rates(jnp.zeros(3), jnp.array([0.0, 0.0, 2.0])).tolist()
     [0.0, 0.0, 1.0]
@@ -91,9 +81,7 @@ def omega_to_rates(g: Vec3Like, omega: Vec3Like) -> Vec3:
 
 
 def rates_to_omega(g: Vec3Like, rates: Vec3Like) -> Vec3:
-    """Ω = 2/(1 + |g|²) [ġ − g × ġ], body frame (Schaub & Junkins, eq 3.132).
-
-    **Arguments:** `g` (3,) dimensionless; `rates` (3,) 1/s. **Returns:** (3,) rad/s.
+    """Ω = 2/(1 + |g|²) [ġ − g × ġ], rad/s, body frame, of `g` and `rates` (3,), 1/s (eq 3.132).
 
     >>> rates_to_omega(jnp.zeros(3), jnp.array([0.0, 0.0, 1.0])).tolist()
     [0.0, 0.0, 2.0]

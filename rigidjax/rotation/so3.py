@@ -1,7 +1,7 @@
 """Rotation matrices M, active, body → world, and their tangent vectors.
 
 `exp` and `log` take and return one rotation; batch with `jax.vmap`. Every kernel is a smooth
-function of θ², so that values and derivatives of any order are correct at θ = 0. Range: as in
+function of θ²: values and derivatives of any order are correct at θ = 0. Range: as in
 `rigidjax.quaternion`.
 """
 
@@ -42,8 +42,8 @@ from rigidjax.rotation.validation import rotation_matrix, turn
 def exp(v: Vec3Like) -> Mat3:
     """The rotation by |v| about v: 1 + A hat v + B (hat v)² (notes, eqs 15, 17, 18).
 
-    **Arguments:** `v` (3,) rotation vector, rad. A = sin θ/θ, B = (1 − cos θ)/θ² (Rodrigues 1840),
-    both from half the angle, known to ε|v|. **Raises:** as `quaternion.exp`.
+    **Arguments:** `v` (3,) rotation vector, rad. A = sin θ/θ and B = (1 − cos θ)/θ² (Rodrigues
+    1840) are both computed from θ/2. The angle is known to ε|v|. **Raises:** as `quaternion.exp`.
 
     >>> exp(jnp.array([0.0, 0.0, jnp.pi / 2])).round(12)[0].tolist()
     [0.0, -1.0, 0.0]
@@ -54,10 +54,9 @@ def exp(v: Vec3Like) -> Mat3:
 def log(matrix: Mat3Like) -> Vec3:
     """The shortest rotation vector of a rotation matrix, rad, |v| ≤ π.
 
-    **Arguments:** `matrix` (3, 3) rotation. **Raises:** as `check`, if its values are known now.
-
-    **Returns:** (3,), by way of the quaternion: correct to round-off, with its derivatives, from 0
-    to π. At a half turn it is v or −v, whichever has a positive first nonzero component.
+    **Arguments:** `matrix` (3, 3) rotation. **Returns:** (3,), by the quaternion: correct to
+    round-off, with its derivatives, from 0 to π. At a half turn the first nonzero component is
+    positive. **Raises:** as `check` for known values.
 
     >>> bool(abs(log(exp(jnp.array([0.1, 0.2, 0.3]))) - jnp.array([0.1, 0.2, 0.3])).max() < 1e-15)
     True
@@ -80,9 +79,7 @@ def left_jacobian(v: Vec3Like) -> Mat3:
 
 
 def right_jacobian(v: Vec3Like) -> Mat3:
-    """J_r with exp(v + dv) = exp(v) exp(J_r dv): the turn by dv in the body frame.
-
-    **Arguments:** `v` (3,) rotation vector, rad. J_r(v) = J_l(−v) = J_l(v)ᵀ (Solà 2018, eq 143).
+    """J_r with exp(v + dv) = exp(v) exp(J_r dv), of `v` (3,), rad: J_l(v)ᵀ (Solà 2018, eq 143).
 
     >>> right_jacobian(jnp.zeros(3)).tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
@@ -93,7 +90,7 @@ def right_jacobian(v: Vec3Like) -> Mat3:
 def left_jacobian_inverse(v: Vec3Like) -> Mat3:
     """Inverse of the left Jacobian, 1 − ½ hat v + g (hat v)², g = (1 − (θ/2) cot(θ/2))/θ².
 
-    **Arguments:** `v` (3,) rotation vector, rad, |v| < 2π, where it ends (Solà 2018, eq 146).
+    **Arguments:** `v` (3,) rotation vector, rad, |v| < 2π (Solà 2018, eq 146).
 
     >>> left_jacobian_inverse(jnp.zeros(3)).tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
@@ -102,9 +99,7 @@ def left_jacobian_inverse(v: Vec3Like) -> Mat3:
 
 
 def right_jacobian_inverse(v: Vec3Like) -> Mat3:
-    """Inverse of the right Jacobian, 1 + ½ hat v + g (hat v)².
-
-    **Arguments:** `v` (3,) rotation vector, rad, |v| < 2π (Solà 2018, eq 144).
+    """Inverse of the right Jacobian, 1 + ½ hat v + g (hat v)², of `v` (3,), rad, |v| < 2π.
 
     >>> right_jacobian_inverse(jnp.zeros(3)).tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
@@ -115,10 +110,10 @@ def right_jacobian_inverse(v: Vec3Like) -> Mat3:
 def distance(a: Mat3Like, b: Mat3Like) -> Scalar:
     """The angle of the rotation from a to b, rad, in [0, π].
 
-    **Arguments:** `a`, `b` (3, 3) rotations. By atan2 of the quaternion of aᵀb, right from 1e-12 to
-    π (arccos of the trace is useless below 1e-8). Its derivative does not exist at a = b; 0 is
-    returned there, the shortest subgradient. For a loss take |log(aᵀb)|², which is smooth.
-    **Raises:** `ValueError` for NaN, and for matrices far from a rotation.
+    **Arguments:** `a`, `b` (3, 3) rotations. Computed by atan2 of the quaternion of aᵀb, it is
+    right from 1e-12 to π (arccos of the trace is useless below 1e-8). At a = b it has no
+    derivative: 0 is returned, the shortest subgradient. For a loss take |log(aᵀb)|², which is
+    smooth. **Raises:** `ValueError` for NaN, and for matrices far from a rotation.
 
     >>> round(float(distance(jnp.eye(3), exp(jnp.array([0.0, 3e-9, 0.0]))) * 1e9), 9)
     3.0
@@ -149,9 +144,7 @@ def about_axis(axis: Vec3Like, angle: ScalarLike) -> Mat3:
 
 
 def adjoint(matrix: Mat3Like) -> Mat3:
-    """Ad_M, with M hat(w) Mᵀ = hat(Ad_M w): on SO(3) it is M itself (notes, eq 48 with Mᵀ).
-
-    **Arguments:** `matrix` (3, 3) rotation.
+    """Ad_M with M hat(w) Mᵀ = hat(Ad_M w): the `matrix` (3, 3) itself (notes, eq 48 with Mᵀ).
 
     >>> adjoint(jnp.eye(3)).tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
@@ -160,9 +153,7 @@ def adjoint(matrix: Mat3Like) -> Mat3:
 
 
 def to_world(matrix: Mat3Like, y: Vec3Like) -> Vec3:
-    """Body components → world components, y = M y' (notes, eqs 8, 21).
-
-    **Arguments:** `matrix` (3, 3) rotation, body → world; `y` (3,) in the body frame.
+    """Body components `y` (3,) → world components M y, by `matrix` (3, 3) (notes, eqs 8, 21).
 
     >>> to_world(jnp.eye(3), jnp.array([1.0, 2.0, 3.0])).tolist()
     [1.0, 2.0, 3.0]
@@ -171,9 +162,7 @@ def to_world(matrix: Mat3Like, y: Vec3Like) -> Vec3:
 
 
 def to_body(matrix: Mat3Like, y: Vec3Like) -> Vec3:
-    """World components → body components, y' = Mᵀ y (notes, eqs 8, 22).
-
-    **Arguments:** `matrix` (3, 3) rotation, body → world; `y` (3,) in the world frame.
+    """World components `y` (3,) → body components Mᵀ y, by `matrix` (3, 3) (notes, eqs 8, 22).
 
     >>> to_body(jnp.eye(3), jnp.array([1.0, 2.0, 3.0])).tolist()
     [1.0, 2.0, 3.0]
@@ -182,9 +171,7 @@ def to_body(matrix: Mat3Like, y: Vec3Like) -> Vec3:
 
 
 def conjugate(turn: Mat3Like, matrix: Mat3Like) -> Mat3:
-    """A turn given in the body frame, transformed to the world frame: M T Mᵀ (notes, eqs 25, 26).
-
-    **Arguments:** `turn` (3, 3) in the frame of the body; `matrix` (3, 3), body → world.
+    """A `turn` (3, 3) in the body frame → world frame, M T Mᵀ, by `matrix` (notes, eqs 25, 26).
 
     >>> conjugate(jnp.eye(3), jnp.eye(3)).tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
@@ -195,9 +182,7 @@ def conjugate(turn: Mat3Like, matrix: Mat3Like) -> Mat3:
 
 
 def rate(matrix: Mat3Like, omega: Vec3Like) -> Mat3:
-    """dM/dt = M hat(Ω) (notes, eq 50).
-
-    **Arguments:** `matrix` (3, 3), body → world; `omega` (3,) rad/s, body frame.
+    """dM/dt = M hat(Ω) of `matrix` (3, 3) and `omega` (3,), rad/s, body frame (notes, eq 50).
 
     >>> rate(jnp.eye(3), jnp.array([0.0, 0.0, 2.0]))[1].tolist()
     [2.0, 0.0, 0.0]
@@ -210,7 +195,7 @@ def body_rate(matrix: Mat3Like, rate: Mat3Like) -> Vec3:
     """Ω from M and dM/dt: Ω_i = ½ Tr(Mᵀ Ṁ J_iᵀ) (notes, eqs 48–50, 80).
 
     **Arguments:** `matrix` (3, 3), body → world; `rate` (3, 3), 1/s. **Returns:** (3,) rad/s, body
-    frame. The symmetric part of MᵀṀ is dropped.
+    frame; the symmetric part of MᵀṀ is dropped.
 
     >>> body_rate(jnp.eye(3), hat(jnp.array([1.0, 2.0, 3.0]))).tolist()
     [1.0, 2.0, 3.0]
@@ -235,8 +220,8 @@ def world_rate(matrix: Mat3Like, rate: Mat3Like) -> Vec3:
 def interpolate(a: Mat3Like, b: Mat3Like, s: ScalarLike) -> Mat3:
     """The point at s of the shortest turn from a (s = 0) to b (s = 1): a exp(s log(aᵀb)).
 
-    **Arguments:** `a`, `b` (3, 3) rotations; `s` dimensionless, may lie beyond [0, 1]. **Raises:**
-    as `distance`.
+    **Arguments:** `a`, `b` (3, 3) rotations; `s` dimensionless, also beyond [0, 1]. **Raises:** as
+    `distance`.
 
     >>> interpolate(jnp.eye(3), exp(jnp.array([0.0, 0.0, 2.0])), 0.5).round(6)[0].tolist()
     [0.540302, -0.841471, 0.0]
@@ -248,9 +233,7 @@ def interpolate(a: Mat3Like, b: Mat3Like, s: ScalarLike) -> Mat3:
 
 
 def uniform(key: PRNGKeyArray, dtype: Any = float) -> Mat3:
-    """A uniformly distributed random rotation (Haar measure).
-
-    **Arguments:** `key` of `jax.random`; `dtype` float32 or float64.
+    """A uniformly distributed random rotation (Haar): `key` of `jax.random`, `dtype` of floats.
 
     >>> import jax
     >>> uniform(jax.random.key(0)).shape
@@ -262,11 +245,11 @@ def uniform(key: PRNGKeyArray, dtype: Any = float) -> Mat3:
 def check(
     matrix: Float[ArrayLike, "*batch 3 3"], *, name: str = "matrix"
 ) -> Float[Array, "*batch 3 3"]:
-    """Check a matrix from outside: return it unchanged, or refuse it.
+    """Return a matrix from outside unchanged if it is a rotation, else refuse it.
 
-    **Arguments:** `matrix` (..., 3, 3); `name` its name in messages. **Raises:** for NaN, a
-    left-handed frame (det < 0), and |MᵀM − 1| above 1e-6 (float32: 1e-3); a `ValueError`, or under
-    `jit` `equinox.error_if` with the same words. `project` gives the nearest rotation.
+    **Arguments:** `matrix` (..., 3, 3); `name` its name in messages. **Raises:** `ValueError`
+    (under `jit` `equinox.error_if`) for NaN, a left-handed frame (det < 0), and |MᵀM − 1| above
+    1e-6 (float32: 1e-3). `project` gives the nearest rotation.
 
     >>> check(jnp.eye(3)).shape
     (3, 3)

@@ -2,12 +2,9 @@
 
 Rotations need sin θ/θ, (1 − cos θ)/θ², (θ − sin θ)/θ³, … as functions of t = θ². These are the
 Stumpff functions c_k(t) = Σ (−t)ⁿ/(k + 2n)!  (Stumpff 1959; Battin 1999, sec. 4.5). Their
-derivatives are Stumpff functions again,
-
-    c_k' = ½ (k c_{k+2} − c_{k+1}),
-
-so that every derivative, of any order, is computed without a cancelling quotient. Polynomials on a
-reduced range replace libm's sine and cosine, which run one lane at a time on CPU.
+derivatives are Stumpff functions too, c_k' = ½ (k c_{k+2} − c_{k+1}), so that no derivative needs a
+cancelling quotient. Polynomials on a reduced range replace libm's sine and cosine, which run one
+lane at a time on CPU.
 """
 
 import math
@@ -25,13 +22,11 @@ _REACH = math.tan(math.pi / 8) ** 2
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def stumpff(k: int, t: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Stumpff function c_k(t) = Σ (−t)ⁿ/(k + 2n)!, for t = θ² ≥ 0.
+    """Stumpff function c_k(t) = Σ (−t)ⁿ/(k + 2n)! for t = θ² ≥ 0 (Battin 1999, eq 4.80 and
+    problem).
 
-    **Arguments:** `k` ≥ 0, a Python integer: 0 is cos θ, 1 is sin θ/θ, 2 is (1 − cos θ)/θ², 3 is
-    (θ − sin θ)/θ³. `t` of any shape, dimensionless.
-
-    **Returns:** an array like `t`, right to a few units of round-off of 1/k!; so are its
-    derivatives of every order (c_k' = ½ (k c_{k+2} − c_{k+1}); Battin 1999, eq 4.80 and problem).
+    c_0 is cos θ, c_1 sin θ/θ, c_2 (1 − cos θ)/θ², c_3 (θ − sin θ)/θ³. Values and derivatives of
+    every order are right to a few units of round-off of 1/k!.
     """
     if k < 2:
         return _cosine_or_sinc(k, t)
@@ -54,26 +49,19 @@ def _stumpff_jvp(k: int, primals: Any, tangents: Any) -> tuple[Any, Any]:
 
 
 def inverse_kernel(t: Float[Array, "..."]) -> Float[Array, "..."]:
-    """The kernel (1 − (θ/2) cot(θ/2))/θ² of the inverse Jacobians, for t = θ² < (2π)².
-
-    **Arguments:** `t` of any shape, dimensionless. Written as (c_3 − 2c_4)/c_1(t/4)², which is
-    1/12 at 0 without a quotient of vanishing numbers, and 1/π² at a half turn.
-    """
+    """The kernel (1 − (θ/2) cot(θ/2))/θ² of the inverse Jacobians, t = θ² < (2π)²: 1/12 at 0."""
     return (stumpff(3, t) - 2 * stumpff(4, t)) / stumpff(1, 0.25 * t) ** 2
 
 
 def arctan_ratio(z: Float[Array, "..."]) -> Float[Array, "..."]:
-    """arctan(√z)/√z for 0 ≤ z ≤ tan²(π/8), by its Taylor series (Abramowitz & Stegun 4.4.42).
-
-    **Arguments:** `z` of any shape, dimensionless. Halve an angle twice to come into this range.
-    """
+    """arctan(√z)/√z for 0 ≤ z ≤ tan²(π/8), by its Taylor series (Abramowitz & Stegun 4.4.42)."""
     tiny = jnp.finfo(z.dtype).eps / 4
     terms = next(n for n in range(1, 40) if _REACH**n / (2 * n + 1) < tiny)
     return _horner([(-1) ** n / (2 * n + 1) for n in range(terms)], z)
 
 
 def _cosine_or_sinc(k: int, t: Float[Array, "..."]) -> Float[Array, "..."]:
-    """The cosine (k = 0) or sin θ/θ (k = 1) from t = θ²; beyond π/2, θ is reduced by kπ."""
+    """The cosine (k = 0) or sin θ/θ (k = 1) of t = θ²; a θ beyond π/2 is reduced first."""
     limit = (math.pi / 2) ** 2
     far = t > limit
     theta = jnp.sqrt(jnp.where(far, t, 1))
@@ -92,7 +80,7 @@ def _cosine_or_sinc(k: int, t: Float[Array, "..."]) -> Float[Array, "..."]:
 
 
 def _split_pi(dtype: Any) -> tuple[float, float]:
-    """π = head + tail, the head short enough that head × (whole number) is exact."""
+    """π = head + tail; head times a whole number is exact."""
     bits = 20 if dtype == jnp.float64 else 10
     head = float(np.floor(math.pi * 2.0 ** (jnp.finfo(dtype).nmant - bits)))
     head *= 2.0 ** (bits - jnp.finfo(dtype).nmant)
@@ -101,7 +89,7 @@ def _split_pi(dtype: Any) -> tuple[float, float]:
 
 
 def _polynomial(k: int, t: Float[Array, "..."], limit: float) -> Float[Array, "..."]:
-    """As many Taylor terms of c_k as reach round-off at t = limit."""
+    """The Taylor polynomial of c_k that is exact to round-off for t up to `limit`."""
     tiny = jnp.finfo(t.dtype).eps / 8
     size = 1 / math.factorial(k)
     terms = next(n for n in range(1, 40) if limit**n / math.factorial(k + 2 * n) < tiny * size)

@@ -1,4 +1,4 @@
-"""Tumbling bodies as points of light: brightness, light curves, the body from one light curve."""
+"""Tumbling bodies as points of light: brightness, light curves, and a body from one light curve."""
 
 from rigidjax._names import show
 from rigidjax.tumblers import brightness as brightness, plot as plot
@@ -7,8 +7,6 @@ from rigidjax.tumblers.light_curve import (
     fit_light_curve as fit_light_curve,
 )
 from rigidjax.tumblers.sensor import Brightness as Brightness
-from rigidjax.tumblers.two_frequencies import (
-    two_frequencies as two_frequencies,
-)
+from rigidjax.tumblers.two_frequencies import two_frequencies as two_frequencies
 
 show(__name__)

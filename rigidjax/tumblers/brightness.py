@@ -1,8 +1,8 @@
 """The brightness of a lit body: ellipsoids in closed form, convex meshes by their faces.
 
-The brightness is the light to the observer from all lit and visible surface,
-`∫ f(μ₀, μ) dA`, with μ₀ and μ the cosines of incidence and emission. Its unit is an area: each
-scattering law is scaled so that a sphere of radius r at zero phase has π r².
+The brightness is the light to the observer from all lit and visible surface, `∫ f(μ₀, μ) dA`, where
+μ₀ and μ are the cosines of incidence and emission. Its unit is an area: each scattering law f is
+scaled so that a sphere of radius r at zero phase has π r².
 """
 
 import jax.numpy as jnp
@@ -31,17 +31,15 @@ def ellipsoid(
     **Arguments:** `semi_axes` (3,) along x, y, z, m; `sun`, `observer` (3,) directions from the
     body to them, body frame, any length; `scattering` the law: `LommelSeeliger()` (also for
     `None`), `Geometric()`, `Lambert()`. It is differentiable in all numbers, also at zero phase and
-    for a sphere. For many directions use `jax.vmap`.
-
-    **Raises:** `ValueError`, `TypeError` for a wrong shape, a semi-axis that is not positive, a
-    direction of length zero, NaN (`equinox` error under `jit`).
+    for a sphere. For many directions use `jax.vmap`. **Raises:** `ValueError` for a semi-axis that
+    is not positive, a direction of length zero, NaN (`equinox` error under `jit`).
 
     >>> round(float(ellipsoid([3.0, 2.0, 1.0], [0, 0, 1.0], [0, 0, 1.0])) / jnp.pi, 12)
     6.0
     """
     law = law_of(scattering)
-    a = _checks.finite(_checks.floating(semi_axes, (3,), "semi_axes"), "semi_axes")
-    a = _checks.refuse(a, (~(a > 0)).any(), "semi_axes: wanted three positive lengths, m")
+    a = _checks.floating(semi_axes, (3,), "semi_axes", unit="m")
+    a = _checks.sign(a, "semi_axes", "three positive lengths, m")
     s, o = direction(sun, "sun").astype(a.dtype), direction(observer, "observer").astype(a.dtype)
     # The fourth power of the axes is taken: a power of two keeps it in range.
     size = exponent_of(a)
@@ -56,17 +54,13 @@ def mesh(
     observer: Vector,
     scattering: AbstractScattering | None = None,
 ) -> Scalar:
-    """Brightness of a convex body by its faces, m²: `Σ f(μ₀, μ) area` of the lit, visible ones.
+    """Brightness of a convex body by its faces, m²: `Σ f(μ₀, μ) area` of the lit and visible ones.
 
-    It is the brightness without shadows if the body is not convex.
-
-    **Arguments:** `vertices`, `faces` as for `rigidjax.shapes.mesh`; the others as for `ellipsoid`.
-    Differentiable in the vertices and directions: a face at the edge of the light has the
-    derivative of a dark one.
-
-    Source: Kaasalainen and Torppa 2001, Icarus 153:24, doi:10.1006/icar.2001.6673.
-
-    **Raises:** as `ellipsoid`, and as `rigidjax.shapes.mesh` for faces.
+    For another body it is the brightness without shadows. **Arguments:** `vertices`, `faces` as for
+    `rigidjax.shapes.mesh`; the others as for `ellipsoid`. It is differentiable in the vertices and
+    directions: a face at the edge of the light has the derivative of a dark one. Source:
+    Kaasalainen and Torppa 2001, Icarus 153:24, doi:10.1006/icar.2001.6673. **Raises:** as
+    `ellipsoid`, and as `rigidjax.shapes.mesh` for faces.
 
     >>> corners = [[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]
     >>> sides = [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]
@@ -78,10 +72,8 @@ def mesh(
     if _checks.known(corners):
         _checks.finite(corners, "vertices")
     table = faces_of(faces, corners.shape[0])
-    s, o = (
-        direction(v, name).astype(corners.dtype)
-        for v, name in ((sun, "sun"), (observer, "observer"))
-    )
+    s = direction(sun, "sun").astype(corners.dtype)
+    o = direction(observer, "observer").astype(corners.dtype)
     first, second, third = (corners[table[:, k]] for k in range(3))
     double = jnp.cross(second - first, third - first)
     lit, seen = (double * s[None, :]).sum(axis=1), (double * o[None, :]).sum(axis=1)

@@ -1,4 +1,4 @@
-"""χ² of a Fourier series in two frequencies, for very many pairs: sums from a table."""
+"""χ² of a Fourier series in two frequencies, for very many pairs, from a table of sums."""
 
 import functools
 import math
@@ -21,9 +21,9 @@ SIDES, HIGH = 2, 0.3
 
 
 class Sums(NamedTuple):
-    """Sums over the times at f = −4/DENSE, −3/DENSE …, with x the time over the span, less ½.
+    """Sums over times at f = −4/DENSE, −3/DENSE …; x is the time over the span, less ½.
 
-    **Fields:** `window` Σ w² exp 2πi f x; `data` Σ w z exp 2πi f x; `total` Σ z².
+    `window` is Σ w² exp 2πi f x; `data` Σ w z exp 2πi f x; `total` Σ z².
     """
 
     window: Complex[Array, " f"]
@@ -32,11 +32,7 @@ class Sums(NamedTuple):
 
 
 def sums(light: tuple[Array, ...], highest: float) -> Sums:
-    """The table up to a frequency, 1/span.
-
-    **Arguments:** `light` times over the span, from 0 to 1, values over the noise, and ones over
-    the noise, all (T,); zeros where there is none.
-    """
+    """The table up to a frequency, 1/span; `light` is times over the span, values and weights."""
     size = math.ceil(highest * DENSE) + 2 * NEAR
     grid = (np.arange(-(-size // ROWS) * ROWS) - NEAR // 2) / DENSE
     x, z, w = light
@@ -78,11 +74,7 @@ def _at(table: Array, f: Array) -> Array:
 
 @functools.partial(jax.jit, static_argnums=2)
 def lattice_misfits(pairs: Array, table: Sums, order: int) -> Float[Array, " pairs"]:
-    """χ² of the series of each pair (P, 2), in 1/span: `Σ c_jk exp 2πi (j f₁ + k f₂) t`.
-
-    The normal matrix has only few different entries, Σ w² exp 2πi (m f₁ + n f₂) t, and these are
-    values of one function of a frequency.
-    """
+    """χ² of the series of each pair (P, 2), in 1/span: `Σ c_jk exp 2πi (j f₁ + k f₂) t`."""
     js, ks = np.meshgrid(np.arange(-FIRST, FIRST + 1), np.arange(-order, order + 1), indexing="ij")
     js, ks = js.ravel(), ks.ravel()
     dj, dk = js[None, :] - js[:, None] + 2 * FIRST, ks[None, :] - ks[:, None] + 2 * order
@@ -124,10 +116,7 @@ def misfits_of(table: Sums, pairs: np.ndarray, order: int) -> np.ndarray:
 
 
 def side_peaks(table: Sums, highest: float) -> np.ndarray:
-    """The highest side peaks of the spectral window, in 1/span, the highest first.
-
-    A line moved by one of these is nearly the same curve at the times of the readings.
-    """
+    """The highest side peaks of the spectral window, in 1/span: a line moved by one looks alike."""
     size = math.ceil(highest * DENSE)
     window = np.abs(np.asarray(table.window))[NEAR // 2 : NEAR // 2 + size]
     # Away from the main peak, and the highest within 1/span.

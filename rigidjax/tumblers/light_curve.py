@@ -12,7 +12,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from rigidjax import _checks, exact
-from rigidjax.body.inertia import MassProperties
+from rigidjax.body.inertia import Inertia, tensor_of
 from rigidjax.identify import answers, padding, uncertainty
 from rigidjax.identify.answers import FAILS, FOUND, LEAVES, NOT_ALONE, NOT_ENDED, Answer
 from rigidjax.identify.checkpoint import Tried
@@ -51,7 +51,7 @@ LEAST, ABOVE = 12, 40.0
 
 
 class Alias(eqx.Module):
-    """The motion at the end of a search.
+    """A motion found by a search.
 
     **Fields:** `parameters`; `cost` half of χ²; `rotation` the body period, s, `precession` the
     mean precession period, s (`rigidjax.exact.body_period`, `precession_period`); `mode` `"long"`
@@ -78,12 +78,12 @@ class Alias(eqx.Module):
 class LightCurve(eqx.Module):
     """The result of `fit_light_curve`.
 
-    **Fields:** `fit` of the best motion, its covariance with an allowance for a body that is no
-    ellipsoid (see `fit_light_curve`); `aliases` all motions found, the best first, then by their
-    misfit; `deviations` (4,) relative standard deviations of the best one's rotation, precession
-    and two ratios; `pairs` their frequencies; `search` and `model` the two answers as of a `Fit`:
-    also `not alone` if another alias explains the data nearly as well, and `leaves a part` if χ² is
-    three deviations above its mean for the given noise.
+    **Fields:** `fit` of the best motion, whose covariance allows for a body that is no ellipsoid;
+    `aliases` all motions found, in the order of their misfits; `deviations` (4,) relative standard
+    deviations of the best one's rotation, precession and two ratios; `pairs` their frequencies;
+    `search` and `model` the two answers as of a `Fit`. The search is also `not alone` if another
+    alias explains the data nearly as well; the model `leaves a part` also if χ² is three deviations
+    above its mean for the given noise.
     """
 
     fit: Fit
@@ -123,7 +123,7 @@ def fit_light_curve(
 ) -> LightCurve:
     """The motion of a free tumbler from one light curve, without a guess.
 
-    Pairs of frequencies come from the squared flux (`two_frequencies`). Each pair is precession and
+    `two_frequencies` finds pairs of frequencies in the squared flux. Each pair is precession and
     twice the rotation, in long- and short-axis mode (Kaasalainen 2001), over a grid of bodies and
     phases. The best starts are fitted with the sensor itself, and the best of these fits are
     continued to convergence. The result lists all motions found. Motions that differ by a symmetry
@@ -131,20 +131,19 @@ def fit_light_curve(
     count as one: periods, moments and mode are the same.
 
     Intervals allow for a real shape by consider parameters (Tapley, Schutz and Born 2004,
-    Statistical Orbit Determination, ch. 6): the brightness has a factor 1 + n·S n,
-    n half way between sun and observer, body frame, the entries of S independent of deviation 4 %.
+    Statistical Orbit Determination, ch. 6): the brightness has a factor 1 + n·S n, where n is half
+    way between sun and observer, body frame, and the entries of S are independent with deviation 4
+    %.
 
     **Arguments:** `problem` of one recording with one `Brightness` sensor and no torque; let a
     `Free` move the sensor's `level` unless it is known. `shortest` period of a line in the
-    spectrum, s, `None` for four times the median distance of the samples; `count` pairs of
-    frequencies at most: fewer are tried if the others fit worse, and the search has `not ended` if
-    more of them fit; `tolerance` as of `fit`; `progress` is called with a line of text.
+    spectrum, s, `None` for four times the median distance of the samples; `count` the largest
+    number of pairs of frequencies. Pairs that fit worse are not tried; if more than `count` fit,
+    the search has `not ended`. `tolerance` as of `fit`; `progress` is called with a line of text.
 
     Sources: Pravec et al. 2005, Icarus 173:108, doi:10.1016/j.icarus.2004.07.021; Kaasalainen 2001,
-    A&A 376:302, doi:10.1051/0004-6361:20010935.
-
-    **Raises:** `ValueError` for a problem with other sensors, several recordings or a torque;
-    `TypeError` under a trace.
+    A&A 376:302, doi:10.1051/0004-6361:20010935. **Raises:** `ValueError` for a problem with other
+    sensors, several recordings or a torque; `TypeError` under a trace.
     """
     reading = _only(problem)
     _checks.whole(count, "count", 1)
@@ -155,7 +154,9 @@ def fit_light_curve(
     t, flux, noise = relative_flux(problem, reading)
     squares, spread = flux**2, None if noise is None else 2.0 * flux * noise
     found = two_frequencies(t, squares, spread, shortest=shortest, count=count)
-    used = _used(found)
+    # The pairs that fit well enough to be tried.
+    above = ABOVE * max(1.0, float(found.misfits[0]) / found.dof)
+    used = max(LEAST, int((found.misfits <= found.misfits[0] + above).sum()))
     starts = starts_of(problem, reading, t, squares, spread, found, used)
     say(f"{used} pairs of frequencies, χ² {found.misfits[0]:.6g} of {found.dof}")
     say(f"{len(starts)} starts")
@@ -171,20 +172,12 @@ def fit_light_curve(
     return eqx.tree_at(lambda one: one.fit.problem, told, own)
 
 
-def _used(found: TwoFrequencies) -> int:
-    """The number of pairs that fit well enough to be tried."""
-    above = ABOVE * max(1.0, float(found.misfits[0]) / found.dof)
-    return max(LEAST, int((found.misfits <= found.misfits[0] + above).sum()))
-
-
 def _only(problem: Problem) -> Any:
     """The reading of the only sensor, one light curve of a free body."""
     one_problem(problem)
     if not _checks.known(problem):
-        raise TypeError(
-            "problem: wanted known numbers, got traced ones; a search works on the host: call it "
-            "outside of jax.jit, jax.grad and jax.vmap"
-        )
+        words = "got traced ones; call it outside of jax.jit, jax.grad and jax.vmap"
+        raise TypeError(f"problem: wanted known numbers, {words}")
     readings = problem.records.readings
     kinds = ", ".join(type(r.sensor).__name__ for r in readings)
     if len(readings) != 1 or not isinstance(readings[0].sensor, Brightness):
@@ -205,7 +198,7 @@ def _only(problem: Problem) -> Any:
 def _read(parameters: Parameters, problem: Problem) -> tuple[Array, Array]:
     """Logarithms (4,) of both periods and both ratios, and h²/2T over the middle moment."""
     body: Any = problem.bodies(parameters)
-    inertia = body.inertia if isinstance(body, MassProperties) else body
+    inertia = Inertia(tensor_of(body))
     omega = parameters.own.spin[0] * problem.reference.rate[0]
     moments, momentum = inertia.moments, apply(inertia.tensor, omega)
     rotation = exact.body_period(inertia, omega)
@@ -256,7 +249,7 @@ def _same(a: Alias, b: Alias, near: np.ndarray) -> bool:
 def _half_way(parameters: Parameters, problem: Problem) -> Float[Array, "times 3"]:
     """Directions half way between sun and observer, body frame."""
     body, state0 = problem.unpack(parameters)
-    inertia = body.inertia if isinstance(body, MassProperties) else body
+    inertia = Inertia(tensor_of(body))
     motion, t = exact.FreeBody(inertia, state0), problem.records.t[0]
     sensor = padding.one(problem.records.readings[0], 0).sensor
 
@@ -320,6 +313,6 @@ def _told(best: Fit, aliases: list[Alias], found: TwoFrequencies, cut: bool) -> 
     # Outliers dominate χ² under a robust loss.
     above = best.chi2 - best.dof if best.problem.loss is None else 0.0
     if search == Answer(FOUND) and best.ok and above > CONTENT * np.sqrt(2.0 * best.dof):
-        why = "another motion that was not found, or more noise than was said"
+        why = "another motion that was not found, or more noise than given"
         model = Answer(LEAVES, (f"χ² is {best.chi2:.6g} of {best.dof}: {why}",))
     return LightCurve(wider, marked, deviations, found, search, model)

@@ -1,8 +1,8 @@
 """Scattering laws: the light from a piece of surface, and from a whole ellipsoid.
 
-With r = A u and |u| = 1 an ellipsoid becomes a sphere: `μ₀ dA = det A (p·u) du`, p = A⁻¹ s, and the
-lit and visible part becomes the lune between p and q = A⁻¹ o. The result depends on `|p|, |q|, p·q`
-alone, so on the tensor A² and not on its axes: a sphere is not singular.
+r = A u with |u| = 1 maps a sphere to an ellipsoid: `μ₀ dA = det A (p·u) du`, p = A⁻¹ s, and the lit
+and visible part becomes the lune between p and q = A⁻¹ o. The result depends only on
+`|p|, |q|, p·q`, so on the tensor A² and not on its axes: a sphere is not singular.
 """
 
 import abc
@@ -51,7 +51,7 @@ class AbstractScattering(eqx.Module):
 class Geometric(AbstractScattering):
     """Every lit piece equally bright: the projected area of the lit and visible part, m².
 
-    Ostro and Connelly 1984, Icarus 57:443, doi:10.1016/0019-1035(84)90127-X.
+    Source: Ostro and Connelly 1984, Icarus 57:443, doi:10.1016/0019-1035(84)90127-X.
 
     >>> float(Geometric().per_area(jnp.asarray(0.5), jnp.asarray(0.25)))
     0.25
@@ -68,11 +68,11 @@ class Geometric(AbstractScattering):
 class LommelSeeliger(AbstractScattering):
     """Single scattering, `2 μ₀ μ/(μ₀ + μ)`: the law of dark surfaces, such as asteroids.
 
-    An ellipsoid has `π (|p||q| + p·q)/(|p| + |q|) [1 − (1 − z²) artanh(z)/z]/z²` with
-    `z = |p + q|/(|p| + |q|)`, p and q times the product of the semi-axes. A form of the closed
-    result of Muinonen and Lumme 2015, A&A 584:A23, doi:10.1051/0004-6361/201526456, that keeps its
-    digits at any phase. The second derivative by a direction is −∞ at zero phase itself (the
-    brightness is like φ² ln φ there); the computed value is finite and wrong.
+    An ellipsoid has `π (|p||q| + p·q)/(|p| + |q|) [1 − (1 − z²) artanh(z)/z]/z²` with `z = |p +
+    q|/(|p| + |q|)`, p and q times the product of the semi-axes. This form of the result of Muinonen
+    and Lumme 2015, A&A 584:A23, doi:10.1051/0004-6361/201526456, keeps its digits at any phase. At
+    zero phase the second derivative by a direction is −∞ (the brightness is like φ² ln φ there);
+    the computed value is finite and wrong.
 
     >>> float(LommelSeeliger().per_area(jnp.asarray(0.5), jnp.asarray(0.5)))
     0.5
@@ -89,9 +89,9 @@ class LommelSeeliger(AbstractScattering):
 class Lambert(AbstractScattering):
     """`3/2 μ₀ μ`: the law of bright, rough surfaces.
 
-    It has no elementary form for a triaxial ellipsoid: it needs two integrals of one variable, by
-    32 points each. The relative error is below 1e-9 for axes up to 30 : 1 at phases up to 170°;
-    errors of first and second derivatives are below 1e-8 and 1e-6 of the brightness.
+    A triaxial ellipsoid has no elementary form: it needs two integrals of one variable, with 32
+    points each. The relative error is below 1e-9 for axes up to 30 : 1 at phases up to 170°. Errors
+    of first and second derivatives are below 1e-8 and 1e-6 of the brightness.
 
     >>> float(Lambert().per_area(jnp.asarray(1.0), jnp.asarray(0.5)))
     0.75
@@ -105,7 +105,7 @@ class Lambert(AbstractScattering):
 
 
 def law_of(scattering: AbstractScattering | None) -> AbstractScattering:
-    """The law; for `None` Lommel and Seeliger's. **Raises** `TypeError` for another type."""
+    """The law; `None` is Lommel and Seeliger's. **Raises** `TypeError` for another type."""
     if scattering is None:
         return LommelSeeliger()
     wanted = "LommelSeeliger(), Geometric() or Lambert()"
@@ -115,9 +115,8 @@ def law_of(scattering: AbstractScattering | None) -> AbstractScattering:
 def direction(value: Vec3Like | Numbers, name: str) -> Vec3:
     """A vector (3,) of length one along `value`. **Raises** for length zero, NaN, a wrong shape."""
     v = _checks.finite(_checks.floating(value, (3,), name), name)
-    v = _checks.refuse(
-        v, ~(jnp.abs(v) > 0).any(), f"{name}: wanted a direction, got a vector of length zero"
-    )
+    words = f"{name}: wanted a direction, got a vector of length zero"
+    v = _checks.refuse(v, ~(jnp.abs(v) > 0).any(), words)
     # The square of a star's 1e200 m would overflow.
     v = times_power_of_two(v, -exponent_of(v))
     return v / jnp.sqrt(dot(v, v))
@@ -158,10 +157,10 @@ def _lambert(shape: Mat3, sun: Vec3, observer: Vec3) -> Scalar:
     """`∫ μ₀ μ dA` over the lit and visible part, as an integral over normals: dA = det E/(n·En)²
     dn.
 
-    Over all that is lit, with μ < 0 where it is not seen, it is `sun·T observer`,
+    Over all that is lit, with μ < 0 on its hidden part, it is `sun·T observer`, where
     `T = π det E ∫ (E + τ²)⁻¹ det(E + τ²)^(−½) dτ` from 0 on (both are one Gaussian integral). So
-    `B(sun, observer) = sun·T observer + B(sun, −observer)`: the smaller integral remains, over a
-    lune.
+    `B(sun, observer) = sun·T observer + B(sun, −observer)`, and the integral over the smaller lune
+    is computed.
     """
     minors = cofactors(shape)
     total, of_sun = shape[0, 0] + shape[1, 1] + shape[2, 2], apply(minors, sun)
@@ -182,10 +181,7 @@ def _lambert(shape: Mat3, sun: Vec3, observer: Vec3) -> Scalar:
 
 
 def _across_the_lune(shape: Mat3, minors: Mat3, sun: Vec3, observer: Vec3) -> Scalar:
-    """`∫ (n·sun)(n·observer)/(n·En)² dn` over the normals n where both factors are positive.
-
-    Along the lune, `n ∝ a + t pole` with a across it, the integral over t is elementary.
-    """
+    """`∫ (n·sun)(n·observer)/(n·En)² dn` over the normals n for which both factors are positive."""
     pole = cross(sun, observer)
     sine, apart = _root(dot(pole, pole)), dot(pole, pole) > jnp.finfo(pole.dtype).eps ** 2
     # Any pole is good if there is hardly a lune.
@@ -234,12 +230,12 @@ def _across_the_lune(shape: Mat3, minors: Mat3, sun: Vec3, observer: Vec3) -> Sc
 
 
 def _root(x: Scalar) -> Scalar:
-    """√x, with no derivative at zero: an ellipsoid without thickness, seen edge on."""
+    """√x, with derivative 0 at zero: an ellipsoid without thickness, seen edge on."""
     some = x > 0
     return jnp.where(some, jnp.sqrt(jnp.where(some, x, 1.0)), 0.0)
 
 
 def _over(x: Scalar, y: Scalar) -> Scalar:
-    """x/y, and 0 where y is none."""
+    """x/y, and 0 if y is 0."""
     some = y > 0
     return jnp.where(some, x / jnp.where(some, y, 1.0), 0.0)

@@ -19,7 +19,7 @@ from rigidjax.identify.problem import Problem
 from rigidjax.motion.torques.base import vector_at
 from rigidjax.rotation import quaternion
 from rigidjax.tumblers import starts
-from rigidjax.tumblers.two_frequencies import BLOCK, TwoFrequencies
+from rigidjax.tumblers.two_frequencies import TwoFrequencies, padded
 
 # Starts of the first round, its steps; those that go on, and how far.
 FIRST, STEPS, SECOND, MORE = 96, 12, 24, 60
@@ -47,9 +47,8 @@ def relative_flux(
 
 
 def of_few_lengths(problem: Problem) -> Problem:
-    """The problem with masked readings up to one of four lengths an octave.
-
-    Light curves of about as many readings are one program: it takes longer to compile than to run.
+    """The problem with masked readings up to one of four lengths an octave, to compile few
+    programs.
     """
     record = problem.recording
     octaves = math.ceil(4.0 * math.log2(record.t.shape[0])) / 4.0
@@ -75,8 +74,7 @@ def starts_of(
     """The best starting points over all pairs of frequencies."""
     sensor = reading.sensor
     sigma = np.ones(t.shape) if spread is None else spread
-    more = -t.size % BLOCK
-    light = tuple(jnp.asarray(np.pad(v, (0, more))) for v in (t, squares, 1.0 / sigma))
+    light = padded(t, squares, 1.0 / sigma)
     middle = problem.records.t[0][0] + 0.5 * t[-1]
     sides = [np.asarray(vector_at(s, middle, "")) for s in (sensor.sun, sensor.observer)]
     half_way = sum(v / np.linalg.norm(v) for v in sides)
@@ -122,7 +120,7 @@ def _place(q: Array, turn: Array, reference: Array) -> Array:
 def noise_of(
     problem: Problem, reading: Any, flux: np.ndarray, found: TwoFrequencies
 ) -> tuple[Float[Array, "1 1"], ...]:
-    """The noise (1, 1) in the sensor's unit; where it is not known what the series leave over."""
+    """The noise (1, 1) in the sensor's unit; if it is not known, the residuals of the series."""
     sensor = reading.sensor
     if sensor.noise is not None:
         return (sensor.noise[None],)
@@ -161,10 +159,9 @@ def descended(
 def _many(
     starts: Parameters, problem: Problem, noise: Any, settings: Settings, count: Any
 ) -> Tried:
-    """The search from the first `count` starts (a leading axis), one after another.
+    """The search from the first `count` starts, one after another, with slopes by differences.
 
-    By differences of the errors: the closed form of the motion alone takes a hundredth of the time
-    that it takes with its derivatives, and here they need not be right to the last digit.
+    The closed form without derivatives takes a hundredth of the time.
     """
 
     def one(given: tuple[Parameters, Array]) -> Tried:
@@ -175,9 +172,8 @@ def _many(
             return problem.errors(restore(point))[0][:, 0] / noise[0][0, 0]
 
         def evaluated(point: Array) -> tuple[Any, Array, Array, Array]:
-            moved = point[None] + DIFFERENCE * jnp.concatenate(
-                [jnp.zeros((1, flat.size)), jnp.eye(flat.size)]
-            )
+            steps = jnp.concatenate([jnp.zeros((1, flat.size)), jnp.eye(flat.size)])
+            moved = point[None] + DIFFERENCE * steps
             e = jax.lax.map(errors, moved)
             rows = (e[1:] - e[:1]) / DIFFERENCE
             return (), 0.5 * jnp.sum(e[0] ** 2), rows @ rows.T, rows @ e[0]

@@ -29,29 +29,26 @@ UNITS = ("flux", "mag")
 class Brightness(AbstractSensor):
     """Reads the brightness of an ellipsoid lit by the sun: a light curve.
 
-    `level · B/(π (abc)^⅔)` as a flux, `level − 2.5 log₁₀(B/(π (abc)^⅔))` in magnitudes, B as
+    A flux is `level · B/(π (abc)^⅔)`, a magnitude `level − 2.5 log₁₀(B/(π (abc)^⅔))`, with B as
     `rj.tumblers.brightness.ellipsoid`: a sphere of the same volume at zero phase has the level.
-    Only the ratios of the semi-axes count. Readings are reduced to unit distances.
+    Only the ratios of the semi-axes count. Readings (T,) are reduced to unit distances.
 
     **Arguments:** `sun`, `observer` directions from the body to them, world frame, any length:
     (3,), or a callable Module of time, t → (3,), such as `torques.Linear(times, directions)`;
     `scattering` the law: `LommelSeeliger()` (also for `None`), `Geometric()`, `Lambert()` of
     `rj.tumblers.brightness`; `noise` standard deviation in the unit of a reading, `None` to
     estimate it; `unit` of a reading, `"flux"` or `"mag"`; `level` flux or magnitude as above,
-    `None` for 1 and 0: it is seldom known, so let a `Free` move it; `semi_axes` (3,) along the
-    body's axes,
-    or `None`: then the ellipsoid is the uniform one that turns as the body does (semi-axes √λ_k of
-    its second moment 𝔖); `offset` s as for `Gyro`. Readings are (T,).
+    `None` for 1 or 0 (it is seldom known: let a `Free` move it); `semi_axes` (3,) along the body's
+    axes, or `None` for the uniform ellipsoid with the body's motion (semi-axes √λ_k of its second
+    moment 𝔖); `offset` s as for `Gyro`.
 
-    Brightness alone does not determine turns of the world that leave it unchanged: for fixed
+    Some turns of the world do not change the brightness, and it does not determine them: for fixed
     directions the half turns about `sun × observer`, and, except for `Geometric`, about their sum
-    and difference. A `fit` assumes an ellipsoid; `fit_light_curve` allows for other shapes.
-
-    **Raises** `ValueError` for a direction of length zero, a noise or semi-axis that is not
-    positive, a wrong shape, NaN; `TypeError` for arguments of another type.
-
-    Source: as `rigidjax.tumblers.brightness`; of light curves of tumblers Kaasalainen 2001, A&A
-    376:302, doi:10.1051/0004-6361:20010935.
+    and difference. A `fit` assumes an ellipsoid; `fit_light_curve` allows for other shapes. Source:
+    as `rigidjax.tumblers.brightness`; for tumblers Kaasalainen 2001, A&A 376:302,
+    doi:10.1051/0004-6361:20010935. **Raises** `ValueError` for a direction of length zero, a noise
+    or semi-axis that is not positive, a wrong shape, NaN; `TypeError` for arguments of another
+    type.
 
     >>> Brightness([1.0, 0.0, 0.0], [0.0, 1.0, 0.0], noise=0.02, unit="mag").components
     1
@@ -94,7 +91,12 @@ class Brightness(AbstractSensor):
         if unit == "flux":
             found = _checks.refuse(found, ~(found > 0), "level: wanted a positive flux")
         self.level = found
-        self.semi_axes = None if semi_axes is None else _lengths(semi_axes)
+        if semi_axes is not None:
+            semi_axes = _checks.floating(semi_axes, (3,), "semi_axes").astype(
+                jnp.result_type(float)
+            )
+            semi_axes = _checks.sign(semi_axes, "semi_axes", "three positive lengths")
+        self.semi_axes = semi_axes
         self.offset = optional("offset", ())(offset)
 
     def error(self, now: SensorInput, reading: Array) -> Float[Array, "1"]:
@@ -132,15 +134,12 @@ class Brightness(AbstractSensor):
         return 0.5 * float(turns[np.argmax(power)])
 
     def refusal(self, values: np.ndarray) -> tuple[np.ndarray, str]:
+        noise = np.std(values) if self.noise is None else np.asarray(self.noise)[0]
         wrong = values < 0 if self.unit == "flux" else np.zeros(values.shape, bool)
-        wrong = wrong & (np.abs(values) > 10 * _scatter(self.noise, values))
+        wrong = wrong & (np.abs(values) > 10 * noise)
         return wrong, (
             "the flux at index {index} is far below zero; magnitudes are read with unit='mag'"
         )
-
-
-def _scatter(noise: Array | None, values: np.ndarray) -> float:
-    return float(np.std(values)) if noise is None else float(np.asarray(noise)[0])
 
 
 def _source(source: Any, name: str) -> Any:
@@ -153,9 +152,3 @@ def _source(source: Any, name: str) -> Any:
             "for each time is rigidjax.torques.Linear(times, directions)"
         )
     return direction(source, name).astype(jnp.result_type(float))
-
-
-def _lengths(semi_axes: Any) -> Array:
-    a = _checks.finite(_checks.floating(semi_axes, (3,), "semi_axes"), "semi_axes")
-    a = jnp.asarray(a, jnp.result_type(float))
-    return _checks.refuse(a, ~(a > 0).all(), "semi_axes: wanted three positive lengths")

@@ -1,11 +1,11 @@
 """From two frequencies of a light curve to possible motions: a grid of bodies.
 
-Squared, the brightness of an ellipsoid is nearly a quadratic form of the direction n half way
-between sun and observer (at zero phase, under the law of projected areas, it is one):
-`F² ∝ Σ_k M_k (n·r_k)²`, r_k the body's axes in the world and `M = (bc)², (ca)², (ab)²`. For a body,
-an energy and a phase it is therefore linear in the six numbers of n nᵀ, in a frame along the
-angular momentum. Least squares finds the direction of the momentum, the initial angle and the level
-at once; the grid covers the shape and the phase in the rotation.
+The squared brightness of an ellipsoid is nearly a quadratic form of the direction n half way
+between sun and observer: `F² ∝ Σ_k M_k (n·r_k)²`, with r_k the body's axes in the world and
+`M = (bc)², (ca)², (ab)²` (exactly at zero phase, for projected areas). For a given body, energy and
+phase it is therefore linear in the six numbers of n nᵀ, in a frame along the angular momentum.
+Least squares finds the direction of the momentum, the initial angle and the level at once; the grid
+covers the shape and the phase of the rotation.
 """
 
 import math
@@ -30,11 +30,7 @@ MODES = ("long", "short")
 
 
 class Candidate(NamedTuple):
-    """A starting motion.
-
-    **Fields:** `moments` (3,) ascending, the largest one; `q` (4,), `omega` (3,) at the first time,
-    in principal axes; `misfit` χ².
-    """
+    """A starting motion: `moments` over the largest; `q`, `omega`, principal axes; `misfit` χ²."""
 
     moments: np.ndarray
     q: np.ndarray
@@ -43,7 +39,7 @@ class Candidate(NamedTuple):
 
 
 def bodies_of_grid() -> tuple[np.ndarray, np.ndarray]:
-    """Semi-axes and moments (S, 3) of uniform ellipsoids: the longest and the largest are one."""
+    """Semi-axes and moments (S, 3) of uniform ellipsoids, each over its largest."""
     b, ratio = np.meshgrid(MIDDLE, SHORT, indexing="ij")
     semi_axes = np.stack([np.ones(b.size), b.ravel(), (b * ratio).ravel()], axis=1)
     second = semi_axes**2
@@ -59,13 +55,12 @@ def candidates(
     areas: np.ndarray | None,
     count: int,
 ) -> list[Candidate]:
-    """The best of the grid whose precession and rotation have these frequencies, the best first.
+    """The best of the grid whose precession and rotation have these frequencies, in order.
 
-    **Arguments:** `pair` (2,) of the mean precession and of twice the rotation, 1/s; `mode` of
-    `MODES`: the circulated axis; `light` times since the first, s, squared fluxes and ones
-    over their noise, and zeros where there is none; `half_way` (3,) the direction half way, world
-    frame; `areas` M (3,) of a known ellipsoid, or `None` for the uniform one of each body; `count`
-    how many bodies, each with all turns of `ABOUT`.
+    `pair` has the frequencies of the mean precession and of twice the rotation, 1/s; `mode` is the
+    circulated axis; `light` times since the first, squared fluxes and ones over their noise;
+    `half_way` (3,) in the world frame; `areas` M (3,) of a known ellipsoid, or `None`; `count` of
+    bodies.
     """
     semi_axes, moments = bodies_of_grid()
     forms = (np.prod(semi_axes, axis=1, keepdims=True) / semi_axes) ** 2
@@ -88,10 +83,7 @@ def candidates(
 
 
 def _placed(side: np.ndarray, half_way: np.ndarray) -> list[np.ndarray]:
-    """Turns (4,) that take the frame of the momentum to the world.
-
-    They are those of the matrix of rank one that is nearest to what least squares found.
-    """
+    """Turns (4,) from the frame of the momentum to the world, by the best n nᵀ of rank one."""
     xx, yy, zz, xy, xz, yz = side
     _, axes = np.linalg.eigh(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
     n = axes[:, -1]
@@ -136,10 +128,7 @@ def periods(moments: Array, omega: Array) -> tuple[Array, Array]:
 
 
 def _energy(moments: Array, ratio: Array, long: Array) -> tuple[Array, Array, Array]:
-    """A rate whose periods have this ratio, its precession period, and whether there is one.
-
-    From a spin about the axis of the mode, where it is largest, to the separatrix, where it is 0.
-    """
+    """A rate whose periods have this ratio, its precession period, and whether there is one."""
     pure = jnp.where(long, moments[0], moments[2])
 
     def halved(_: Any, tried: tuple[Array, ...]) -> tuple[Array, ...]:

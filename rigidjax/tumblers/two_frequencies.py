@@ -10,8 +10,15 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from rigidjax import _checks
-from rigidjax.tumblers.frequency_aliases import distinct, refined, with_aliases
-from rigidjax.tumblers.lattice_series import BATCH, FIRST, Sums, filled, misfits_of, sums
+from rigidjax.tumblers.lattice_series import (
+    BATCH,
+    FIRST,
+    Sums,
+    filled,
+    misfits_of,
+    side_peaks,
+    sums,
+)
 
 # Lines through which pairs are laid, and the grid of the first frequency, in 1/span.
 LINES, STEP = 3, 0.1
@@ -24,9 +31,14 @@ LARGEST, MOST = 1e100, 1e5
 # Programs are compiled for times in multiples of so many.
 BLOCK = 256
 
+# Pairs nearer than this, in 1/span, count as one.
+NEAR = 0.25
+# Pairs whose aliases are tried, in at most so many rounds.
+SEEDS, ROUNDS = 16, 3
+
 
 class TwoFrequencies(eqx.Module):
-    """The result of `two_frequencies`, the best first.
+    """The result of `two_frequencies`, in the order of the misfits.
 
     **Fields:** `frequencies` (n, 2) in 1/s; `misfits` (n,) χ² of each pair's series, and `dof`;
     `scatter` the standard deviation of the best one's residuals, in the unit of the values; `lines`
@@ -58,22 +70,20 @@ def two_frequencies(
     """Pairs (f₁, f₂) whose Fourier series fit best: `Σ c_jk exp 2πi (j f₁ + k f₂) t`, |j| ≤ 2.
 
     One of the three strongest lines of the spectrum must be j f₁ + k f₂. All pairs along these
-    curves are tried, then the best ones are refined. Then their aliases are tried: either
-    frequency, or both, moved by a side peak of the spectral window (readings at night have such
-    peaks at one and two a day) or by half of it, halved, doubled, or f₂ by f₁. Several pairs give
-    the same set of lines: all that fit are returned, and a fit of the motion decides.
+    curves are tried, then the best ones are refined. Then their aliases are tried: one frequency or
+    both moved by a side peak of the spectral window (readings at night have such peaks at one and
+    two a day) or by half of it, halved, doubled, or f₂ moved by f₁. Several pairs give the same set
+    of lines. All pairs that fit are returned, and a fit of the motion decides.
 
     **Arguments:** `t` (T,) increasing times, s, gaps allowed; `values` (T,) fluxes or their
-    squares; `noise` their standard deviation, one or (T,), `None` if it is not known; `order` k up
-    to which multiples of f₂ are taken; `shortest` period that a line may have, s, `None` for four
-    times the median distance of the times; `count` how many pairs are returned at most.
-    **Returns** `frequencies`, `misfits`, `dof`, `scatter` and `lines` (`TwoFrequencies`).
+    squares; `noise` their standard deviation, one or (T,), `None` if it is not known; `order` the
+    largest multiple k of f₂; `shortest` period of a line, s, `None` for four times the median
+    distance of the times; `count` the largest number of pairs. **Returns** `frequencies`,
+    `misfits`, `dof`, `scatter` and `lines` (`TwoFrequencies`).
 
     Source: Pravec et al. 2005, Icarus 173:108, doi:10.1016/j.icarus.2004.07.021 (with all |j| and
     |k| up to one order); the linear fit is that of Lomb 1976, doi:10.1007/BF00648343, for many
-    lines.
-
-    **Raises:** `ValueError`, `TypeError` for wrong shapes, times that do not increase, NaN, too few
+    lines. **Raises:** `ValueError` for wrong shapes, times that do not increase, NaN, too few
     values.
 
     >>> t = np.linspace(0.0, 60.0, 300)
@@ -88,7 +98,7 @@ def two_frequencies(
     if t.ndim != 1 or y.shape != t.shape:
         raise ValueError(f"values: wanted (T,) as t has, got shapes {t.shape} and {y.shape}")
     if t.size <= unknowns:
-        raise ValueError(f"t: wanted more than {unknowns} times, as the series has, got {t.size}")
+        raise ValueError(f"t: wanted more times than the {unknowns} unknowns, got {t.size}")
     if not (np.isfinite(t).all() and np.isfinite(y).all()):
         raise ValueError("two_frequencies: t or values contain NaN or infinity; leave gaps out")
     if not (np.diff(t) > 0).all():
@@ -112,11 +122,9 @@ def two_frequencies(
     typical = float(np.median(np.diff(t)))
     least = 4.0 * typical if shortest is None else _checks.positive(shortest, "shortest")
     if span / least > MOST:
-        raise ValueError(
-            f"shortest: {least:.3g} s, and a light curve of {span:.3g} s: wanted at most "
-            f"{MOST:.0e} periods in it"
-        )
-    light = _padded((t - t[0]) / span, y / sigma, 1.0 / sigma)
+        words = f"{least:.3g} s, and a light curve of {span:.3g} s"
+        raise ValueError(f"shortest: {words}: wanted at most {MOST:.0e} periods in it")
+    light = padded((t - t[0]) / span, y / sigma, 1.0 / sigma)
     lines = strongest(light, span / least, 2 * LINES)
     highest = SECOND * float(lines[:LINES].max())
     # All multiples of a pair, and what a step of the refinement adds.
@@ -132,14 +140,14 @@ def two_frequencies(
     return TwoFrequencies(pairs[keep] / span, misfits[keep] * scale, dof, scatter, lines / span)
 
 
-def _padded(x: np.ndarray, z: np.ndarray, w: np.ndarray) -> tuple[Array, Array, Array]:
+def padded(x: np.ndarray, z: np.ndarray, w: np.ndarray) -> tuple[Array, Array, Array]:
     """Times over the span, values and ones over the noise, with zeros up to a whole block."""
     more = -x.size % BLOCK
     return tuple(jnp.asarray(np.pad(v, (0, more))) for v in (x, z, w))  # pyright: ignore
 
 
 def strongest(light: Any, highest: float, count: int) -> np.ndarray:
-    """The strongest lines, one after another taken away, in 1/span."""
+    """The strongest lines, in 1/span: each is subtracted before the next is searched."""
     grid = np.arange(0.5, max(highest, 2.0), 0.2)
     x, z, w = (np.asarray(v) for v in light)
     found = []
@@ -187,3 +195,67 @@ def _scan(table: Sums, lines: np.ndarray, order: int) -> tuple[np.ndarray, np.nd
     pairs = np.concatenate(rows)
     pairs = pairs[(pairs[:, 1] > 0.5) & (pairs[:, 1] < SECOND * highest)]
     return pairs, misfits_of(table, pairs, order)
+
+
+def aliases_of(pairs: np.ndarray, peaks: np.ndarray) -> np.ndarray:
+    """Pairs (M, 2) that may fit the same readings: moved by side peaks or half of them, and
+    related.
+    """
+    moves = np.unique(np.concatenate([[0.0], *((p, -p, p / 2, -p / 2) for p in peaks)]))
+    first, second = pairs.T[:, :, None]
+    moved = [
+        np.stack([first + a, second + b], axis=-1) for a in moves for b in moves if a != 0 or b != 0
+    ]
+    related = ((first / 2, second), (2 * first, second), (first, second / 2), (first, 2 * second))
+    related += ((first, second + first), (first, second - first))
+    rows = [*moved, *(np.stack(one, axis=-1) for one in related)]
+    # (f₁, −f₂) makes the same lines.
+    return np.abs(np.concatenate(rows).reshape(-1, 2))
+
+
+def with_aliases(
+    table: Sums, pairs: np.ndarray, misfits: np.ndarray, highest: float, order: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """The pairs, and aliases of the best of them, in rounds until no better one is found."""
+    peaks = side_peaks(table, highest)
+    around = 0.2 * np.array([(a, b) for a in (-1, 0, 1) for b in (-1, 0, 1)], float)
+    for _ in range(ROUNDS):
+        seeds = pairs[distinct(pairs, misfits, SEEDS)]
+        more = aliases_of(seeds, peaks)
+        more = (more[:, None] + around).reshape(-1, 2)
+        more = more[((more > 0.5) & (more < highest)).all(axis=1)]
+        if not len(more):
+            break
+        best = distinct(more, misfits_of(table, more, order), 2 * SEEDS)
+        more, new = refined(table, more[best], order)
+        before = misfits.min()
+        pairs, misfits = np.concatenate([pairs, more]), np.concatenate([misfits, new])
+        if not new.min() < before * (1 - 1e-3):
+            break
+    return pairs, misfits
+
+
+def distinct(pairs: np.ndarray, misfits: np.ndarray, count: int) -> list[int]:
+    """The indices of `count` pairs that differ, in the order of their misfits."""
+    kept: list[int] = []
+    for index in np.argsort(misfits)[:20_000]:
+        if not kept or np.abs(pairs[kept] - pairs[index]).max(axis=1).min() > NEAR:
+            kept.append(int(index))
+        if len(kept) == count:
+            break
+    return kept
+
+
+def refined(table: Sums, pairs: np.ndarray, order: int) -> tuple[np.ndarray, np.ndarray]:
+    """Descend from neighbour to neighbour; the steps become shorter if no neighbour is lower."""
+    steps = np.array([(a, b) for a in (-1, 0, 1) for b in (-1, 0, 1)], float)
+    size = np.full(len(pairs), 0.08)
+    least = np.full(len(pairs), np.inf)
+    for _ in range(9):
+        around = pairs[:, None] + size[:, None, None] * steps
+        found = misfits_of(table, around.reshape(-1, 2), order).reshape(len(pairs), -1)
+        best = found.argmin(axis=1)
+        least = found.min(axis=1)
+        pairs = pairs + size[:, None] * steps[best]
+        size = np.where(best == 4, 0.4 * size, size)
+    return pairs, least

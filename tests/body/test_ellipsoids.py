@@ -49,7 +49,9 @@ def test_a_rod_has_none(unhooked):
 
 
 def test_a_size_that_is_missing_or_too_much_is_refused():
-    with pytest.raises(TypeError, match="of momentum wanted the momentum, kg m²/s, got None"):
+    with pytest.raises(
+        TypeError, match="wanted the momentum, kg m²/s for the ellipsoid of momentum, got None"
+    ):
         ellipsoid(INERTIA, "momentum")
-    with pytest.raises(TypeError, match=r"of mass wanted no size, got 1\.0"):
+    with pytest.raises(TypeError, match=r"wanted no size for the ellipsoid of mass, got 1\.0"):
         ellipsoid(shapes.box(2.0, [1.0, 2.0, 3.0]), "mass", 1.0)

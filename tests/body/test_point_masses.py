@@ -91,7 +91,7 @@ def test_a_cloud_weighs_the_same_in_any_order_and_frame():
 WRONG = {
     "rows": (
         lambda: shapes.points([1.0, 2.0], np.zeros((3, 3))),
-        r"positions: wanted shape .*masses have as many rows",
+        r"positions: wanted shape .*one row for each of 2 masses",
     ),
     "negative": (lambda: shapes.points([1.0, -2.0], np.zeros((2, 3))), "masses ≥ 0, got -2.0"),
     "massless": (lambda: shapes.points([0.0, 0.0], np.zeros((2, 3))), "mass"),

@@ -220,7 +220,7 @@ SPINS = rj.Spin(np.ones((10, 3)))
         (lambda: identify.fit_windows(identify.windows(np.arange(10.0), SPINS, {"u": np.ones(10)}, length=2), lambda x: (BODY, Push(x, torques.Delayed(torques.Input("u"), -3.0))), jnp.ones(3)), r"inputs\['u'\]: a delay of -3 s reaches beyond the end of windows of 2 s"),
         (lambda: identify.Windows.joined(), "wanted at least one"),
         (lambda: identify.Windows.joined(*(identify.windows(np.arange(10.0), SPINS, length=k) for k in (2, 3))), "wanted one step, length"),
-        (lambda: identify.fit_windows(identify.windows(np.arange(10.0), SPINS, length=2), scene, GUESS), "the law reads 'u', got none"),
+        (lambda: identify.fit_windows(identify.windows(np.arange(10.0), SPINS, length=2), scene, GUESS), "the torque reads 'u', got none"),
         (lambda: identify.fit_windows(identify.windows(np.arange(10.0), SPINS, length=2), lambda x: (BODY, None), jnp.ones(1), noise={"q": 1.0}), "noise: wanted a number for each of"),
         (lambda: identify.fit_windows(identify.windows(np.arange(10.0), SPINS, length=2), lambda x: (BODY, None), ()), "guess: wanted a tree of floating numbers"),
         (lambda: identify.fit_windows(identify.windows(np.arange(10.0), SPINS, length=2), lambda x: (BODY, rj.torques.Damping(-1e200 * x * jnp.ones(3))), jnp.ones(1)), "guess: the runs from it are not finite"),

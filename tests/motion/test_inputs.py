@@ -56,9 +56,9 @@ def test_by_attitude_by_magnus_and_by_sensitivity():
 @pytest.mark.parametrize(
     ("change", "kind", "words"),
     [
-        ({"inputs": None}, ValueError, "inputs: the law reads 'u', got none"),
-        ({"inputs": {"v": RAMP}}, ValueError, "the law reads 'u', got 'v'"),
-        ({"inputs": {"u": RAMP, "v": RAMP}}, ValueError, "the law reads 'u', got 'u', 'v'"),
+        ({"inputs": None}, ValueError, "inputs: the torque reads 'u', got none"),
+        ({"inputs": {"v": RAMP}}, ValueError, "the torque reads 'u', got 'v'"),
+        ({"inputs": {"u": RAMP, "v": RAMP}}, ValueError, "the torque reads 'u', got 'u', 'v'"),
         ({"inputs": [RAMP]}, TypeError, "wanted arrays by name, got list"),
         (
             {"inputs": {"u": RAMP[:, :-1]}},
@@ -79,7 +79,7 @@ def test_other_mistakes_are_named():
         rj.simulate(BODY, rj.Spin([0.0, 0.0, 0.3]), [0.0, 1.0], law)
     with pytest.raises(ValueError, match=r"inputs are for Steps\(size, number\).*torques.Held"):
         rj.batch.simulate(BODY, spins(2), [0.0, 1.0], law, inputs={"u": RAMP})
-    with pytest.raises(ValueError, match="inputs: the law reads 'u', got none"):
+    with pytest.raises(ValueError, match="inputs: the torque reads 'u', got none"):
         torques.bind(law, {})
     with pytest.raises(ValueError, match="times: wanted increasing times"):
         torques.Held([0.0, 0.0], [1.0, 2.0])

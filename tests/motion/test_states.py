@@ -334,7 +334,7 @@ def made(**change):
         (lambda: base.evaluate(WHEELS, 0.0, START, BODY), TypeError, r"ReactionWheels has states of its own.*its states last"),
         (lambda: rj.conserved(BODY, START, WHEELS), TypeError, "has states of its own"),
         (lambda: freeze(WHEELS, ()), ValueError, "own: no states for ReactionWheels"),
-        (lambda: freeze(WHEELS, (1.0, 2.0)), ValueError, "own: the law has 1 with states, got 2"),
+        (lambda: freeze(WHEELS, (1.0, 2.0)), ValueError, "own: the torque has 1 with states, got 2"),
         (lambda: torques.Flywheel(torques.Lagged(lambda t: jnp.ones(3), 1.0)), TypeError, "see ReactionWheels"),
         (lambda: torques.Lagged(1.0, 1.0), TypeError, "source: wanted a function of time"),
         (lambda: torques.Lagged(lambda t: t, 0.0), ValueError, "time: wanted a positive time"),

@@ -259,8 +259,8 @@ def test_a_long_walk_finds_the_stable_band(mu, stable):
         (lambda o: MOON.family(o, [0.8, np.nan]), "values: contains NaN or infinity at index"),
         (lambda o: MOON.family(o, [0.82, 0.6]), "family: lost at x = .*; take smaller steps"),
         (lambda o: MOON.family_slope(o, hold="z"), "has a fold in z here"),
-        (lambda o: MOON.follow(o, 0.0, 3), "step: wanted a number not 0"),
-        (lambda o: MOON.follow(o, 0.1, 0), "count: wanted how many members"),
+        (lambda o: MOON.follow(o, 0.0, 3), "step: wanted a number that is not 0"),
+        (lambda o: MOON.follow(o, 0.1, 0), "count: wanted the number of members"),
         pytest.param(
             lambda o: MOON.follow(o, -1.0, 2),
             "follow: lost after 0 of 2 members; take smaller",

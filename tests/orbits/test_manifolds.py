@@ -194,7 +194,7 @@ def test_words(unhooked):
     orbit = MOON.lyapunov_guess(1, 0.01)
     with pytest.raises(ValueError, match="which: wanted one of stable, unstable, got 'up'"):
         MOON.manifold_start(orbit, 0.0, "up")
-    with pytest.raises(ValueError, match="side: wanted 1, to larger x"):
+    with pytest.raises(ValueError, match=r"side: wanted 1 \(to larger x"):
         MOON.manifold_start(orbit, 0.0, "stable", side=2)
     with pytest.raises(TypeError, match=r"wanted a PeriodicOrbit"):
         MOON.manifold_start(orbit.state, 0.0, "stable")

@@ -322,7 +322,7 @@ def test_the_player_is_one_page_without_a_network(flip, capsys):
 
 def test_words_on_mistakes(flip, monkeypatch):
     still = spun([0.0, 0.0, 0.0])
-    with pytest.raises(ValueError, match="of a batch draw one body at a time"):
+    with pytest.raises(ValueError, match="draw one body of a batch at a time"):
         rj.plot.polhode(BODY, batch(flip.ys))
     with pytest.raises(ValueError, match="wanted one of s, min, h, day, got 'days'"):
         rj.plot.motion(flip.ts, flip.ys, time_unit="days")

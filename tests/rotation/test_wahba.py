@@ -97,6 +97,8 @@ def test_wahba_derivative():
 def test_wahba_refuses_a_free_turn(body, unhooked):
     body = np.array(body)
     with pytest.raises(ValueError, match="do not fix the attitude"):
+        so3.wahba([[1.0, 0.0, 0.0]], [[1.0, 0.0, 0.0]])
+    with pytest.raises(ValueError, match="do not fix the attitude"):
         so3.wahba(body, body)
     with pytest.raises(RuntimeError, match="do not fix the attitude"):
         jax.block_until_ready(jax.jit(so3.wahba)(body, body))

@@ -1,10 +1,7 @@
-"""Torques and forces. Each names the smallest state that it acts on."""
+"""Torques and forces. Each declares the smallest state that it acts on."""
 
 from rigidjax._names import show
-from rigidjax.motion.torques.base import (
-    AbstractTorque as AbstractTorque,
-    Wrench as Wrench,
-)
+from rigidjax.motion.torques.base import AbstractTorque as AbstractTorque, Wrench as Wrench
 from rigidjax.motion.torques.composite import ChangingInertia as ChangingInertia, Sum as Sum
 from rigidjax.motion.torques.elementary import (
     ConstantTorque as ConstantTorque,

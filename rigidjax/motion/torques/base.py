@@ -32,8 +32,6 @@ class Wrench(eqx.Module):
     **Arguments:** `force` (3,) N, **world** frame; `torque` (3,) N m, **body** frame, about the
     centre of mass; none by default.
 
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
-
     >>> Wrench([0.0, 0.0, -9.81]).torque
     Array([0., 0., 0.], dtype=float64)
     """
@@ -43,39 +41,34 @@ class Wrench(eqx.Module):
 
     def __init__(self, force: Vector, torque: Vector | None = None):
         self.force = _checks.floating(force, (3,), "force", hint="world-frame N")
-        self.torque = (
-            jnp.zeros_like(self.force)
-            if torque is None
-            else _checks.floating(torque, (3,), "torque", hint="body-frame N m")
-        )
+        torque = jnp.zeros_like(self.force) if torque is None else torque
+        self.torque = _checks.floating(torque, (3,), "torque", hint="body-frame N m")
 
 
 class AbstractTorque(eqx.Module):
     """A torque on a body: a function of time, state and body, in N m, body axes.
 
-    Subclass it for your own, or give any callable Module. `feels` is the smallest state with the
-    parts that you read: `HasSpin` (`.omega`), `HasAttitude` (also `.q`) or `HasPose` (also
-    `.x`, `.v`). `body` is the argument of `simulate`: an `Inertia`, or `MassProperties` for
-    `Rigid`.
+    Subclass it, or give any callable Module. `feels` is the smallest state with the parts that the
+    torque reads: `HasSpin` (`.omega`), `HasAttitude` (also `.q`) or `HasPose` (also `.x`, `.v`);
+    one that feels `HasPose` may return a `Wrench`, a force as well as a torque. `body` is the
+    argument of `simulate`: an `Inertia`, or `MassProperties` for `Rigid`.
 
-    A law that feels a `rigidjax.motion.HasPose` may return a `Wrench`, a force as well as a torque.
-
-    Optional members. A property `rate_free`, whether the law does not look at the body rate: then
-    `rigidjax.solvers.Splitting4` and its like can be used. What is conserved (see
-    `rigidjax.conserved`): a method `energy(t, state, body)`, J, if the law has a potential; a
-    property `steady`, whether the law is free of explicit time; a property `axis` (3,), world
-    frame, about which it has no torque; a method `internal_momentum(t)` (3,), N m s, body frame, if
-    nothing outside turns the body: what the law holds inside; a property `jump_times` (n,), s,
-    where it jumps or has a kink.
+    Optional members. `rate_free`: the torque does not depend on the body rate, and
+    `rigidjax.solvers.Splitting4` and others can be used. For `rigidjax.conserved`: a method
+    `energy(t, state, body)`, J, if it has a potential; `steady`: it does not depend on time; `axis`
+    (3,), world frame, about which it has no torque; a method `internal_momentum(t)` (3,), N m s,
+    body frame, the momentum inside a body that nothing outside turns. `jump_times` (n,), s: the
+    torque jumps or has a kink there.
 
     **States of its own** (a motor's speed, a wheel, a bias that drifts): give the torque `state0`,
-    an array or a tree of arrays, or a method `(t, state, body)` that returns it, and a method
-    `rate(t, own, state, body)`, their derivative. It is then called as `(t, state, body, own)`.
-    Loops integrate them with the body's state: `simulate` (`sol.own`), `batch.rollout`,
-    `batch.simulate`, `identify.fit` and `identify.fit_windows`. A function of time inside a torque
-    may have some, too (`Lagged`), and is called as `(t, own)`. No base class is needed:
+    a tree of arrays or a method `(t, state, body)` that returns one, and a method
+    `rate(t, own, state, body)`, their derivative. The torque is then called as
+    `(t, state, body, own)`. `simulate` (`sol.own`), `batch.rollout`, `batch.simulate`,
+    `identify.fit` and `identify.fit_windows` integrate them with the body's state. A function of
+    time inside a torque may have states, too (`Lagged`); it is called as `(t, own)`. No base class
+    is needed:
 
-    >>> import equinox as eqx, jax.numpy as jnp, rigidjax as rj
+    >>> import equinox as eqx
     >>> class Fading(eqx.Module):
     ...     state0: jnp.ndarray
     ...     def rate(self, t, own, state, body):
@@ -95,20 +88,7 @@ class AbstractTorque(eqx.Module):
 
 
 class AbstractForce(eqx.Module):
-    """A force on a body that moves: as `AbstractTorque`, but returns a `Wrench`.
-
-    It acts on `Rigid` states only; `body` is a `MassProperties`.
-
-    >>> import rigidjax as rj
-    >>> class Thrust(AbstractForce):  # 2 N along world z through the centre of mass
-    ...     feels = rj.motion.HasPose
-    ...     def __call__(self, t, state, body):
-    ...         return Wrench(force=[0.0, 0.0, 2.0])
-    >>> body = rj.MassProperties(4.0, [0.0, 0, 0], jnp.eye(3))
-    >>> start = rj.Rigid([0.0, 0, 0], [0.0, 0, 0], [1.0, 0, 0, 0], [0.0, 0, 1])
-    >>> rj.simulate(body, start, [0.0, 2.0], Thrust()).ys.v[-1].round(9).tolist()
-    [0.0, 0.0, 1.0]
-    """
+    """A force on a `Rigid` with `MassProperties`: as `AbstractTorque`, but returns a `Wrench`."""
 
     feels: eqx.AbstractVar[type]
 
@@ -128,7 +108,7 @@ class OfTime(AbstractTorque):
     @property
     def jump_times(self) -> Float[Array, " n"]:
         """Times, s, where a vector jumps or has a kink."""
-        return jumps_in(*vars(self).values())
+        return jumps_of_parts(self)
 
 
 # A user's own callable Module need not subclass anything.
@@ -143,10 +123,8 @@ WORLD = "a vector in world axes, such as [0, 0, -9.81]"
 def require_law(torque: object, name: str = "torque") -> None:
     """Raise `TypeError` unless `torque` can be called for its value."""
     if isinstance(torque, type):
-        raise TypeError(
-            f"{name}: got the class {torque.__name__}, wanted one made from it: "
-            f"{torque.__name__}(...)"
-        )
+        made = f"{torque.__name__}(...)"
+        raise TypeError(f"{name}: got the class {torque.__name__}, wanted one made from it: {made}")
     if not callable(torque):
         advice = ""
         if isinstance(torque, list | tuple) and any(callable(part) for part in torque):
@@ -162,7 +140,7 @@ def require_law(torque: object, name: str = "torque") -> None:
 
 
 def sees_attitude(torque: Torque | None) -> bool:
-    """Whether a torque may read the attitude, by `feels`; true without it."""
+    """Whether a torque may read the attitude, by `feels`; true if it has none."""
     if hasattr(torque, "parts"):
         return any(sees_attitude(part) for part in torque.parts)  # pyright: ignore
     return torque is not None and getattr(torque, "feels", None) is not HasSpin
@@ -195,12 +173,7 @@ def require_scene(law: Torque | None, state: object, body: object) -> None:
 
 
 def evaluate(torque: Torque, t: ScalarLike, state: HasSpin, body: Inertia | MassProperties) -> Vec3:
-    """The torque's value (3,), N m, body frame, its shape checked.
-
-    **Arguments:** `torque`; `t` s; `state`; `body`. The torque is computed in the precision of
-    `state.omega`. **Raises:** `TypeError` for a force, which acts on `Rigid` only; `ValueError` for
-    a wrong shape.
-    """
+    """The torque's value (3,), N m, body frame; `TypeError` for a force, which needs a `Rigid`."""
     force, value = act(torque, t, state, body)
     if force is not None:
         raise TypeError(
@@ -213,10 +186,8 @@ def evaluate(torque: Torque, t: ScalarLike, state: HasSpin, body: Inertia | Mass
 def act(
     law: Torque, t: ScalarLike, state: HasSpin, body: Inertia | MassProperties
 ) -> tuple[Vec3 | None, Vec3]:
-    """Force on the centre of mass (N, world frame; `None` if there is none) and torque about it.
-
-    **Arguments** as for `evaluate`. **Returns** a force (3,) or `None`, and a torque (3,), N m,
-    body frame, in the precision of `state.omega`.
+    """Force on the centre of mass (N, world frame; or `None`) and torque about it (N m, body
+    frame).
     """
     require_scene(law, state, body)
     dtype = state.omega.dtype
@@ -242,30 +213,16 @@ _HIGHER = {"q": "Attitude(q, omega)", "x": "Rigid(x, v, q, omega)", "v": "Rigid(
 
 
 def lacking(who: str, wrong: AttributeError) -> str | None:
-    """The message if a user's function reads a part that its state does not have.
-
-    >>> import rigidjax as rj
-    >>> try:
-    ...     rj.Spin([0.0, 0.0, 1.0]).q
-    ... except AttributeError as wrong:
-    ...     lacking("condition", wrong)
-    'condition looks at state.q, the attitude, and Spin has none: start from Attitude(q, omega)'
-    """
+    """The message if a user's function reads a part that its state does not have; else `None`."""
     if wrong.name not in _HIGHER or not isinstance(wrong.obj, HasSpin):
         return None
     what = {"q": "attitude", "x": "position", "v": "velocity"}[wrong.name]
-    return (
-        f"{who} looks at state.{wrong.name}, the {what}, and {type(wrong.obj).__name__} has none: "
-        f"start from {_HIGHER[wrong.name]}"
-    )
+    has_none = f"the {what}, and {type(wrong.obj).__name__} has none"
+    return f"{who} looks at state.{wrong.name}, {has_none}: start from {_HIGHER[wrong.name]}"
 
 
 def one_law(law: Any) -> None:
-    """Raise `ValueError` if an array of one of our torques has another shape than its field
-    declares.
-
-    Its constructor checked that; `jax.vmap` and `jax.tree.map` make torques of many bodies.
-    """
+    """Raise `ValueError` for an array of another shape than declared, as `jax.vmap` makes them."""
     if not type(law).__module__.startswith(__package__ or ""):
         return
     for field in dataclasses.fields(law):
@@ -273,7 +230,7 @@ def one_law(law: Any) -> None:
         if eqx.is_array(value) and not isinstance(value, kind):  # pyright: ignore[reportArgumentType]
             raise ValueError(
                 f"torque {type(law).__name__}: {field.name} has the shape {value.shape}, which is "
-                "not that of one law; for a law a body use jax.vmap, or torque_axes=0 in "
+                "not that of one torque; for one torque per body use jax.vmap, or torque_axes=0 in "
                 "rigidjax.batch"
             )
 
@@ -292,11 +249,6 @@ def in_precision(tree: Any, dtype: Any) -> Any:
 def vector_at(source: Any, t: ScalarLike, name: str, size: int = 3) -> Float[Array, " size"]:
     """A vector that is constant, or the value at `t` of a callable Module of time."""
     return _checks.floating(source(t), (size,), f"{name}(t)") if callable(source) else source
-
-
-def stays(source: Any) -> Vec3 | None:
-    """A vector that is constant; `None` for a function of time."""
-    return None if callable(source) else source
 
 
 def vector(name: str, *, hint: str = "") -> Callable[[Vector], Array]:
@@ -325,14 +277,7 @@ def constant_or_callable(source: Any, name: str, size: int = 3) -> Any:
 
 
 def jumps_of(source: object) -> Float[Array, " n"]:
-    """The times at which a torque or a function of time jumps, s; empty if it has none.
-
-    **Arguments:** `source` a torque, or a function of time, with or without `jump_times`.
-
-    >>> from rigidjax import torques
-    >>> jumps_of(torques.Pulses([1.0, 2.0], [[0.0, 0.0, 1.0]]))
-    Array([1., 2.], dtype=float64)
-    """
+    """The times at which a torque or a function of time jumps, s; empty if it has none."""
     found = getattr(source, "jump_times", None)
     return jnp.zeros(0) if found is None else found
 
@@ -344,6 +289,11 @@ def jumps_in(*sources: object) -> Float[Array, " n"]:
         return times[0] if times else jnp.zeros(0)
     dtype = jnp.result_type(*times)
     return jnp.sort(jnp.concatenate([found.astype(dtype) for found in times]))
+
+
+def jumps_of_parts(law: object) -> Float[Array, " n"]:
+    """Times, s, where a part of it jumps or has a kink, in order."""
+    return jumps_in(*vars(law).values())
 
 
 def unit_rows(value: Any, name: str, count: int) -> Float[Array, "n 3"]:
@@ -360,7 +310,7 @@ def count_of(value: Any, name: str, one: str) -> int:
     """The number of rows (x, y, z), one for each `one`: at least one."""
     shape = _checks.numbers(value, name).shape
     if len(shape) != 2 or shape[1] != 3 or not shape[0]:
-        raise ValueError(f"{name}: wanted (R, 3), one row a {one}, got shape {shape}")
+        raise ValueError(f"{name}: wanted (R, 3), one row for each {one}, got shape {shape}")
     return shape[0]
 
 
@@ -370,7 +320,7 @@ def each(value: Any, count: int, name: str) -> Array:
 
 
 def length_or_zero(v: Vec3Like) -> Scalar:
-    """|v|, with the derivative at v = 0 set to 0: for |v| v, whose derivative there is 0."""
+    """|v|, with derivative 0 at v = 0, as a factor of |v| v."""
     v = _checks.floating(v, (3,), "v")
     square = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
     return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)

@@ -19,12 +19,11 @@ from rigidjax.rotation.linalg3 import cross
 class Sum(eqx.Module):
     """Several torques and forces at once; it needs the largest state of its parts.
 
-    **Arguments:** `*parts` torques, forces, your own callables.
+    **Arguments:** `*parts` torques, forces, your own callables. **Raises:** `TypeError` for a part
+    that cannot be called; `ValueError` for none at all.
 
-    **Raises:** `TypeError` for a part that cannot be called; `ValueError` for none at all.
-
-    >>> from rigidjax import torques
-    >>> Sum(torques.Damping([1.0, 1, 1]), torques.HeavyTop(1.0, [0.0, 0, 1], [0.0, 0, -9.81])).feels
+    >>> damping = rj.torques.Damping([1.0, 1, 1])
+    >>> Sum(damping, rj.torques.HeavyTop(1.0, [0.0, 0, 1], [0.0, 0, -9.81])).feels
     <class 'rigidjax._types.HasAttitude'>
     """
 
@@ -37,7 +36,7 @@ class Sum(eqx.Module):
             base.require_law(part, "Sum")
             if isinstance(part, ChangingInertia) and len(parts) > 1:
                 raise TypeError(
-                    "Sum: ChangingInertia divides all torques by the inertia at their time: put "
+                    "Sum: ChangingInertia divides all torques by the inertia at time t: put "
                     "the others inside it, ChangingInertia(inertia, Sum(a, b))"
                 )
         self.parts = parts
@@ -46,9 +45,8 @@ class Sum(eqx.Module):
     def feels(self) -> type:
         """The largest state that a part needs."""
         rungs = [getattr(part, "feels", base.LADDER[0]) for part in self.parts]
-        return max(
-            rungs, key=lambda r: base.LADDER.index(r) if r in base.LADDER else len(base.LADDER)
-        )
+        order = lambda r: base.LADDER.index(r) if r in base.LADDER else len(base.LADDER)  # noqa: E731
+        return max(rungs, key=order)
 
     @property
     def rate_free(self) -> bool:
@@ -74,23 +72,20 @@ class Sum(eqx.Module):
 class ChangingInertia(eqx.Module):
     """The effect of a changing inertia on a body: `I(t) dΩ/dt = I(t)Ω × Ω − İΩ + τ`.
 
-    **Arguments:** `inertia` a function of time, t → (3, 3), kg m², body frame, about the point that
-    the body turns about (the centre of mass of a `Rigid`), whose derivative is taken: such as
-    `Linear(times, tensors)`; `torque` all other torques, or `None`: give them here, not beside it
-    in a `Sum`, because their τ acts on I(t), and they get the body at time t.
+    **Arguments:** `inertia` a differentiable function of time, t → (3, 3), kg m², body frame, about
+    the point that the body turns about (the centre of mass of a `Rigid`), such as
+    `Linear(times, tensors)`; `torque` all other torques, or `None`. They act on I(t) and get the
+    body at time t: give them here, not beside it in a `Sum`.
 
-    The body given to `simulate` only sets the state's units: its inertia is replaced. Parts that
-    move inside must have no momentum in the body frame (Σ m r × ṙ = 0), such as booms that extend
-    in a straight line from the centre; else add their momentum as a `Flywheel` to `torque`. Ejected
-    fuel carries its share of İΩ away: then add İΩ to `torque`.
-
-    Source: Hughes 1986, Spacecraft Attitude Dynamics, ch. 3; the momentum `R I(t) Ω` is conserved
-    without τ.
+    The inertia of the body given to `simulate` is replaced. Parts that move inside must have no
+    momentum in the body frame (Σ m r × ṙ = 0), such as booms that extend in a straight line from
+    the centre; else add their momentum to `torque` as a `Flywheel`. Ejected fuel carries its share
+    of İΩ away: then add İΩ to `torque`. Source: Hughes 1986, Spacecraft Attitude Dynamics, ch. 3;
+    without τ the momentum `R I(t) Ω` is conserved.
 
     **Raises:** `TypeError` for anything but a function; `ValueError` for a value that is not (3,
     3).
 
-    >>> import rigidjax as rj
     >>> grows = ChangingInertia(lambda t: (1.0 + t) * jnp.eye(3))
     >>> body = rj.Inertia(jnp.eye(3))
     >>> rj.simulate(body, rj.Spin([0.0, 0, 1.0]), [0.0, 1.0], grows).ys.omega[-1, 2]
@@ -111,10 +106,7 @@ class ChangingInertia(eqx.Module):
         """The smallest state that the torque inside acts on."""
         return getattr(self.torque, "feels", HasSpin)
 
-    @property
-    def jump_times(self) -> Float[Array, " n"]:
-        """Times, s, where the inertia has a kink, or the torque jumps."""
-        return base.jumps_in(self.inertia, self.torque)
+    jump_times = property(base.jumps_of_parts)
 
     def tensor(self, t: ScalarLike) -> Mat3:
         """I(t), (3, 3), kg m²."""

@@ -1,4 +1,4 @@
-"""Constant torques, in the body or in space, and torques against the body rate."""
+"""Constant torques in the body frame or in the world frame, and torques against the body rate."""
 
 from typing import ClassVar
 
@@ -13,12 +13,9 @@ from rigidjax.rotation import quaternion
 class ConstantTorque(base.AbstractTorque):
     """A constant torque in the body frame, such as a thruster's: `τ = const`.
 
-    **Arguments:** `torque` (3,) N m, body frame. About a principal axis it spins the body up
-    linearly (Euler 1758); for one in space see `InSpace`.
+    **Arguments:** `torque` (3,) N m, body frame (in the world frame: `InSpace`). About a principal
+    axis it spins the body up linearly (Euler 1758).
 
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
-
-    >>> import rigidjax as rj
     >>> ConstantTorque([0.0, 0.0, 1.0])(0.0, rj.Spin([0.0, 0.0, 5.0]), None).tolist()
     [0.0, 0.0, 1.0]
     """
@@ -36,13 +33,9 @@ class InSpace(base.OfTime):
     """A torque given in the world frame: `τ = Rᵀ τ_w`.
 
     **Arguments:** `torque` τ_w, N m, world frame: (3,), or a callable Module of time, t → (3,),
-    such as `Linear(times, values)`.
+    such as `Linear(times, values)`. A constant τ_w adds τ_w t to the angular momentum; the part
+    across it is conserved.
 
-    A constant τ_w conserves the angular momentum across it, and adds τ_w t along it.
-
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
-
-    >>> import rigidjax as rj
     >>> turned = rj.Attitude([0.0, 1.0, 0.0, 0.0], [0.0, 0, 0])  # half a turn about x
     >>> InSpace([0.0, 0.0, 1.0])(0.0, turned, None).tolist()  # in body axes
     [0.0, 0.0, -1.0]
@@ -72,11 +65,9 @@ class _Against(base.AbstractTorque):
 class Damping(_Against):
     """Linear damping `τ = −c Ω`, component by component.
 
-    **Arguments:** `coefficient` (3,) c along the body axes, N m s/rad. A sphere of inertia I then
-    slows as exp(−c t/I). For a ball in a viscous fluid c = 8πηr³ (Kirchhoff 1876; Lamb,
+    **Arguments:** `coefficient` (3,) c along the body axes, N m s/rad. The rate of a sphere of
+    inertia I decays as exp(−c t/I); a ball in a viscous fluid has c = 8πηr³ (Kirchhoff 1876; Lamb,
     Hydrodynamics, §334).
-
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
 
     >>> Damping([0.1, 0.1, 0.1]).coefficient.shape
     (3,)
@@ -87,15 +78,11 @@ class Damping(_Against):
 
 
 class QuadraticDamping(_Against):
-    """Quadratic damping `τ = −c |Ω| Ω`, component by component.
+    """Quadratic damping `τ = −c |Ω| Ω`, component by component: drag at a large Reynolds number.
 
-    **Arguments:** `coefficient` (3,) c along the body axes, N m s²/rad². A body turning about a
-    principal axis then slows as Ω0/(1 + c Ω0 t/I): drag at a large Reynolds number (Newton,
-    Principia, Book II, Section II).
-
-    The first derivative at Ω = 0 is zero; a second does not exist there.
-
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
+    **Arguments:** `coefficient` (3,) c along the body axes, N m s²/rad². A rate about a principal
+    axis decays as Ω0/(1 + c Ω0 t/I) (Newton, Principia, Book II, Section II). At Ω = 0 the first
+    derivative is zero, and a second does not exist.
 
     >>> QuadraticDamping([0.1, 0.1, 0.1]).coefficient.shape
     (3,)

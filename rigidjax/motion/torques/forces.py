@@ -18,13 +18,8 @@ from rigidjax.rotation.linalg3 import apply, cross, dot
 class UniformGravity(base.AbstractForce):
     """Uniform acceleration: `F = m g`, no torque about the centre, `U = −m g·x`.
 
-    **Arguments:** `gravity` (3,) g, m/s², world frame, such as [0, 0, −9.81].
+    **Arguments:** `gravity` (3,) g, m/s², world frame, such as [0, 0, −9.81]. Source: notes, eq 84.
 
-    Source: notes, eq 84.
-
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
-
-    >>> import rigidjax as rj
     >>> body = rj.MassProperties(2.0, [0.0, 0, 0], jnp.eye(3))
     >>> state = rj.Rigid([0.0, 0, 0], [0.0, 0, 0], [1.0, 0, 0, 0], [0.0, 0, 0])
     >>> UniformGravity([0.0, 0.0, -9.8])(0.0, state, body).force.tolist()  # N
@@ -48,16 +43,12 @@ class UniformGravity(base.AbstractForce):
 
 
 class CentralGravity(base.AbstractForce):
-    """A centre of attraction at the world's origin, on a body of some size.
+    """A centre of attraction at the world's origin, for a body of some size.
 
-    `U = −μ m/r − (μ/2r³)(Tr I − 3 r̂·I_w r̂)` (MacCullagh's formula), with its force and its torque,
-    so that the energy and the momentum about the origin are conserved. `I_w = R I Rᵀ`.
+    `U = −μ m/r − (μ/2r³)(Tr I − 3 r̂·I_w r̂)` (MacCullagh's formula), `I_w = R I Rᵀ`, with its
+    force and its torque: the energy and the momentum about the origin are conserved. **Arguments:**
+    `mu` μ = G M, m³/s². Source: Hughes, Spacecraft Attitude Dynamics, §8.1.
 
-    **Arguments:** `mu` μ = G M, m³/s². Source: Hughes, Spacecraft Attitude Dynamics, §8.1.
-
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
-
-    >>> import rigidjax as rj
     >>> body = rj.MassProperties(2.0, [0.0, 0, 0], 1e-9 * jnp.eye(3))
     >>> state = rj.Rigid([2.0, 0, 0], [0.0, 0, 0], [1.0, 0, 0, 0], [0.0, 0, 0])
     >>> round(float(CentralGravity(8.0)(0.0, state, body).force[0]), 6)  # N, −m μ/r²
@@ -92,17 +83,12 @@ def _seen_from_centre(state: HasPose, tensor: Mat3) -> tuple[Scalar, Vec3, Vec3,
 class Drag(base.AbstractForce):
     """Drag of a fluid: `F = −k |u| u`, `u = v − wind`, at a point of the body.
 
-    **Arguments:** `coefficient` k = ½ ρ C_d A, kg/m; `centre` (3,) the point where it acts, m, body
-    frame, from the centre of mass (there `τ = c × RᵀF`); `wind` (3,) the fluid's velocity, m/s,
-    world frame. u does not contain the body's own rotation: for that take `Damping`,
-    `QuadraticDamping`.
+    **Arguments:** `coefficient` k = ½ ρ C_d A, kg/m; `centre` (3,) c the point where it acts, m,
+    body frame, from the centre of mass (`τ = c × RᵀF`); `wind` (3,) the fluid's velocity, m/s,
+    world frame. The body's rotation does not enter u; for its drag take `Damping` or
+    `QuadraticDamping`. At u = 0 the first derivative is zero, and a second does not exist. Source:
+    Newton, Principia, Book II, Section II.
 
-    Source: Newton, Principia, Book II, Section II. The first derivative at u = 0 is zero; a second
-    does not exist there.
-
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
-
-    >>> import rigidjax as rj
     >>> body = rj.MassProperties(2.0, [0.0, 0, 0], jnp.eye(3))
     >>> state = rj.Rigid([0.0, 0, 0], [3.0, 0, 0], [1.0, 0, 0, 0], [0.0, 0, 0])
     >>> float(Drag(0.5)(0.0, state, body).force[0])  # N, −0.5 · 3²
@@ -124,22 +110,19 @@ class Drag(base.AbstractForce):
 class Rotors(base.AbstractForce):
     """Propellers: thrust `F_i = k_i n_i² d_i` at r_i, and the reaction `τ_i = −s_i c_i n_i² d_i`.
 
-    **Arguments:** `positions` r (R, 3) m, body frame, from the centre of mass; `directions` d
-    (R, 3) of the thrusts, body frame, unit; `spins` s (R,), 1 where a rotor turns about d by the
-    right-hand rule, −1 where it turns the other way; `thrust` k, N s²/rad², and `drag` c,
-    N m s²/rad², each one number or (R,); `speeds` n (R,) rad/s: constant, a callable Module of
-    time such as `Held(times, values)`, or `Input("speeds")`.
+    **Arguments:** `positions` r (R, 3) m, body frame, from the centre of mass; `directions` d (R,
+    3) of the thrusts, body frame, unit; `spins` s (R,), 1 for a rotor that turns about d by the
+    right-hand rule, −1 for the opposite; `thrust` k, N s²/rad², and `drag` c, N m s²/rad², each one
+    number or (R,); `speeds` n (R,) rad/s: constant, a callable Module of time such as
+    `Held(times, values)`, or `Input("speeds")`. Source: Mahony, Kumar and Corke 2012, Multirotor
+    aerial vehicles, eqs 4–6, doi:10.1109/MRA.2012.2206474.
 
-    Source: Mahony, Kumar and Corke 2012, Multirotor aerial vehicles, eqs 4–6,
-    doi:10.1109/MRA.2012.2206474.
+    **Raises:** `ValueError` for a direction that is not a unit vector, or a spin that is not 1 or
+    −1.
 
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype; `ValueError` for a direction
-    that is not a unit vector, or a spin that is not 1 or −1.
-
-    >>> from rigidjax import Rigid, shapes
     >>> up = Rotors([[0.1, 0.0, 0.0]], [[0.0, 0.0, 1.0]], [1.0], 2.0, 0.5, [3.0])
-    >>> rest = Rigid([0.0, 0, 0], [0.0, 0, 0], [1.0, 0, 0, 0], [0.0, 0, 0])
-    >>> up(0.0, rest, shapes.sphere(1.0, 1.0)).torque.tolist()
+    >>> rest = rj.Rigid([0.0, 0, 0], [0.0, 0, 0], [1.0, 0, 0, 0], [0.0, 0, 0])
+    >>> up(0.0, rest, rj.shapes.sphere(1.0, 1.0)).torque.tolist()
     [0.0, -1.8, -4.5]
     """
 
@@ -169,10 +152,7 @@ class Rotors(base.AbstractForce):
         self.thrust, self.drag = base.each(thrust, count, "thrust"), base.each(drag, count, "drag")
         self.speeds = base.constant_or_callable(speeds, "speeds", count)
 
-    @property
-    def jump_times(self) -> Float[Array, " n"]:
-        """Times, s, where the speeds jump or have a kink."""
-        return base.jumps_of(self.speeds)
+    jump_times = property(base.jumps_of_parts)
 
     def __call__(self, t: ScalarLike, state: HasPose, body: MassProperties) -> base.Wrench:
         n = base.vector_at(self.speeds, t, "speeds", self.spins.shape[0]).astype(self.spins.dtype)
@@ -190,18 +170,15 @@ class Rotors(base.AbstractForce):
 class BodyDrag(base.AbstractForce):
     """Drag along the body's axes: `F = −R (a ∘ u + b ∘ |u| u)`, `τ = c × RᵀF`, `u = Rᵀ (v − wind)`.
 
-    **Arguments:** `linear` a (3,) kg/s, such as of rotors in a cross-flow; `quadratic` b (3,) kg/m;
-    `centre` c (3,) the point where it acts, m, body frame, from the centre of mass; `wind` (3,) the
-    air's velocity, m/s, world frame. For a sphere see `Drag`.
+    **Arguments:** `linear` a (3,) kg/s, such as of rotors in a cross-flow; `quadratic` b (3,) kg/m,
+    |u| u taken axis by axis; `centre` c (3,) the point where it acts, m, body frame, from the
+    centre of mass; `wind` (3,) the air's velocity, m/s, world frame. For a sphere see `Drag`.
 
     Source: Faessler, Franchi and Scaramuzza 2018, eq 5, doi:10.1109/LRA.2017.2776353, for the
-    linear part; Hoerner 1965, Fluid-Dynamic Drag, for the other. |u| u is taken axis by axis.
+    linear part; Hoerner 1965, Fluid-Dynamic Drag, for the other.
 
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
-
-    >>> from rigidjax import Rigid, shapes
-    >>> fast = Rigid([0.0, 0, 0], [2.0, 0, 0], [1.0, 0, 0, 0], [0.0, 0, 0])
-    >>> BodyDrag([1.0, 1, 1], [0.5, 0, 0])(0.0, fast, shapes.sphere(1.0, 1.0)).force.tolist()
+    >>> fast = rj.Rigid([0.0, 0, 0], [2.0, 0, 0], [1.0, 0, 0, 0], [0.0, 0, 0])
+    >>> BodyDrag([1.0, 1, 1], [0.5, 0, 0])(0.0, fast, rj.shapes.sphere(1.0, 1.0)).force.tolist()
     [-4.0, 0.0, 0.0]
     """
 

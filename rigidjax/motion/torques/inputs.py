@@ -1,4 +1,4 @@
-"""Inputs of a torque: quantities by name, from a loop or functions of time; delays and lags."""
+"""Inputs of a torque by name, from a loop or as functions of time; delays and lags."""
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple, TypeVar
@@ -19,8 +19,8 @@ Law = TypeVar("Law")
 class Input(eqx.Module):
     """A named input of a torque, which the loop sets: see `rollout(…, inputs=…)`.
 
-    **Arguments:** `name` the key among the inputs. A torque calls it with the time; it has a value
-    after `bind`.
+    **Arguments:** `name` its key among the inputs. A torque calls it with the time; `bind` gives it
+    a value.
 
     >>> law = bind(Input("speed"), {"speed": jnp.array([3.0])})
     >>> law(0.0)
@@ -53,18 +53,17 @@ class Delayed(eqx.Module):
     **Arguments:** `source` a function of time such as `Held(times, values)`, or `Input("u")`;
     `delay` s, one number, which may be free in a fit; negative for an earlier time.
 
-    Its `jump_times` move with the delay, and so does a run of `simulate`: the derivative by the
-    delay is correct although the source jumps. `rigidjax.batch.rollout` and `identify.fit_windows`
-    hold samples through a step, and a delayed input changes inside a step: that step is then split
-    in two at the change, which is exact, too. The first sample holds before it, the last one after
-    it. (`Linear` and `Series` are smooth enough to be delayed anywhere.)
+    Its `jump_times` move with the delay. `simulate` ends steps there: its derivative by the delay
+    is correct although the source jumps. `rigidjax.batch.rollout` and `identify.fit_windows` hold
+    samples through a step; a delayed sample changes inside the step, which is split in two there:
+    that is exact, too. The first sample also holds before its time, the last one after it. `Linear`
+    and `Series` can be delayed anywhere.
 
-    **Raises:** `TypeError` for a source that cannot be called, or that has states: delay its input,
-    `Lagged(Delayed(u, d), T)`; `ValueError` for a delay that is not finite, or is as
-    long as the record.
+    **Raises:** `TypeError` for a source that cannot be called, or that has states (delay its input:
+    `Lagged(Delayed(u, d), T)`); `ValueError` for a delay that is not finite, or as long as the
+    record.
 
-    >>> from rigidjax import torques
-    >>> float(Delayed(torques.Held([0.0, 1.0, 2.0], [5.0, 6.0, 7.0]), 0.7)(1.5))
+    >>> float(Delayed(rj.torques.Held([0.0, 1.0, 2.0], [5.0, 6.0, 7.0]), 0.7)(1.5))
     5.0
     """
 
@@ -74,27 +73,22 @@ class Delayed(eqx.Module):
     def __init__(self, source: Any, delay: ScalarLike):
         source = _checks.function(source, "source", "of time")
         if has_states(source):
-            raise TypeError(
-                f"Delayed: {type(source).__name__} has states, whose past is not kept; delay its "
-                "input: Lagged(Delayed(source, delay), time)"
-            )
+            words = "has states, whose past is not kept; delay its input"
+            words += ": Lagged(Delayed(source, delay), time)"
+            raise TypeError(f"Delayed: {type(source).__name__} {words}")
         self.delay = _checks.given(delay, (), "delay").astype(jnp.result_type(float))
         if isinstance(source, Delayed):
             source, self.delay = source.source, self.delay + source.delay
         if not isinstance(source, Input) and inputs_of(source):
-            raise TypeError(
-                f"Delayed: {type(source).__name__} reads an Input; delay the Input itself, inside "
-                "it"
-            )
+            words = "reads an Input; delay the Input itself, inside it"
+            raise TypeError(f"Delayed: {type(source).__name__} {words}")
         self.source = source
         times = getattr(source, "times", None)
         if times is not None and _checks.known((times, self.delay)):
             length = float(times[-1] - times[0])
             if abs(float(self.delay)) >= length:
-                raise ValueError(
-                    f"delay: {float(self.delay):.6g} s is as long as the record of {length:.6g} s "
-                    "and more; is it in seconds?"
-                )
+                words = f"{float(self.delay):.6g} s is as long as the record of {length:.6g} s"
+                raise ValueError(f"delay: {words} or longer; is it in seconds?")
 
     @property
     def jump_times(self) -> Float[Array, " n"]:
@@ -113,16 +107,13 @@ class Lagged(eqx.Module):
     function of time: `Rotors(…, speeds=Lagged(Input("speeds"), 0.05))`.
 
     **Arguments:** `source` u, a function of time such as `Held(times, values)`, or `Input("u")`;
-    `time` T, s, > 0: one number, or one a channel; it may be free in a fit; `start` y at the start;
-    `None` for u there.
+    `time` T, s, > 0: one number, or one a channel, which may be free in a fit; `start` y at the
+    start, `None` for u at the start. If u jumps from 0 to 1, y is `1 − exp(−t/T)` (Åström and
+    Murray, Feedback Systems).
 
-    For a u that jumps from 0 to 1 it is `1 − exp(−t/T)`. Source: any text on control, such as
-    Åström and Murray, Feedback Systems.
+    **Raises:** `TypeError` for a source that cannot be called; `ValueError` for a known time that
+    is not positive, or wrong shapes.
 
-    **Raises:** `TypeError` for a source that cannot be called; `ValueError` for a time that is
-    known and not positive, or wrong shapes.
-
-    >>> import rigidjax as rj
     >>> push = rj.torques.InSpace(Lagged(lambda t: jnp.array([0.0, 0.0, 1.0]), 0.5, jnp.zeros(3)))
     >>> body, start = rj.Inertia(jnp.eye(3)), rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 0])
     >>> rj.simulate(body, start, [0.0, 0.5], push).own[0][-1, 2]  # 1 − 1/e
@@ -170,10 +161,7 @@ def _channels(value: Any, name: str) -> Array:
 
 
 class Row(NamedTuple):
-    """The inputs in a step, or in a part of one.
-
-    **Fields:** `values` by name; `delayed` of each `Delayed` input, in their order in the torque.
-    """
+    """The inputs in (a part of) a step: `values` by name, `delayed` of each `Delayed` input."""
 
     values: Mapping[str, Any]
     delayed: tuple[Any, ...]
@@ -184,7 +172,6 @@ def bind(law: Law, inputs: Mapping[str, Any] | Row | None) -> Law:
 
     **Arguments:** `law` a torque, a force, or a tree of them; `inputs` by name an array, which is
     constant, or a function of time such as `Held(times, values)`; `None` changes nothing.
-
     **Raises:** `ValueError` for an input of the torque without a value.
 
     >>> bind(Input("u"), {"u": rj.torques.Held([0.0, 1.0], [2.0, 4.0])})(1.0)
@@ -205,9 +192,8 @@ def bind(law: Law, inputs: Mapping[str, Any] | Row | None) -> Law:
         if not isinstance(node, Input):
             return node
         if node.name not in values:
-            raise ValueError(
-                f"inputs: the law reads {node.name!r}, got {', '.join(map(repr, values)) or 'none'}"
-            )
+            found = ", ".join(map(repr, values)) or "none"
+            raise ValueError(f"inputs: the torque reads {node.name!r}, got {found}")
         found = values[node.name]
         return found if callable(found) else _Now(jnp.asarray(found))
 
@@ -233,17 +219,13 @@ def inputs_of(law: Any) -> list[str]:
 
 
 def require_inputs(law: Any, inputs: Any) -> Mapping[str, Any]:
-    """`inputs` (none: empty), if they are the inputs that the torque reads.
-
-    **Raises:** `ValueError` for a missing input, or one that the torque does not read; `TypeError`
-    for anything but a mapping.
-    """
+    """`inputs` (none: empty), if they are those that the torque reads; `ValueError` for others."""
     read, found = inputs_of(law), {} if inputs is None else inputs
     if not isinstance(found, Mapping):
         raise TypeError(f"inputs: wanted arrays by name, got {type(found).__name__}")
     if set(read) != set(found):
         raise ValueError(
-            f"inputs: the law reads {', '.join(map(repr, read)) or 'none'}, got "
+            f"inputs: the torque reads {', '.join(map(repr, read)) or 'none'}, got "
             f"{', '.join(map(repr, found)) or 'none'}"
         )
     return found

@@ -37,7 +37,7 @@ class Linear(_Table):
     **Arguments:** `times` (n,) s, increasing; `values` (n, *k), any number of channels: (n, 3) for
     `InSpace`, `Flywheel`, `MagneticDipole`, `GravityGradient`, (n, R) for `Rotors`, (n, 3, 3) for
     `ChangingInertia`. Both may be traced. The derivative at a row is the slope of the line after
-    it. For a cubic spline through evenly spaced rows, which has no kinks, see `Series`.
+    it. `Series` is a cubic spline through evenly spaced rows, which has no kinks.
 
     **Raises:** `ValueError` for fewer than two rows, numbers of rows that differ, times that do not
     increase, NaN.
@@ -56,13 +56,9 @@ class Held(_Table):
     """A function of time, t → (*k), that holds each sample until the next one (zero-order hold).
 
     **Arguments:** `times` (n,) s, increasing; `values` (n, *k), row i from time i on, the first
-    also before it. Both may be traced.
-
-    The value jumps at `times`: a torque that reads it passes its `jump_times` on, and adaptive
-    steps end there. For fixed steps give the samples to `rigidjax.batch.rollout` as `inputs`.
-
-    **Raises:** `ValueError` for fewer than two rows, numbers of rows that differ, times that do not
-    increase, NaN.
+    also before it. Both may be traced. The value jumps at `times`: a torque that reads it passes
+    its `jump_times` on, and adaptive steps end there. For fixed steps give the samples to
+    `rigidjax.batch.rollout` as `inputs`. **Raises:** as `Linear`.
 
     >>> Held([0.0, 1.0, 2.0], [[5.0], [6.0], [7.0]])(1.5)
     Array([6.], dtype=float64)
@@ -78,13 +74,10 @@ class Tabulated(AbstractTorque):
     """A torque from a table: straight lines between rows, none before the first or after the last.
 
     **Arguments:** `times` (n,) s, increasing; `torques` (n, 3) N m, body frame. In space:
-    `InSpace(Linear(times, torques))`. Constant pieces: `Pulses`.
+    `InSpace(Linear(times, torques))`. Constant pieces: `Pulses`. **Raises:** as `Linear`.
 
-    A solver that steps over a kink loses its order, and a step over a pulse misses it: `jump_times`
-    are for the step controller, and `simulate` passes them on.
-
-    **Raises:** `ValueError` for fewer than two rows, numbers of rows that differ, times that do not
-    increase, NaN.
+    A solver that steps over a kink loses its order, and a step over a pulse misses it: `simulate`
+    gives `jump_times` to the step controller.
 
     >>> Tabulated([0.0, 2.0], [[0.0, 0, 0], [0.0, 0, 4]]).jump_times
     Array([0., 2.], dtype=float64)
@@ -114,13 +107,11 @@ class Pulses(AbstractTorque):
     """A torque in constant pieces, such as thruster firings: none before or after them.
 
     **Arguments:** `edges` (n + 1,) s, increasing; `torques` (n, 3) N m, body frame: row i acts from
-    edge i until edge i + 1. One pulse: `Pulses([1.0, 1.5], [[0.0, 0.0, 3.0]])`.
+    edge i until edge i + 1. One pulse: `Pulses([1.0, 1.5], [[0.0, 0.0, 3.0]])`. **Raises:**
+    `ValueError` for another number of edges, edges that do not increase, NaN.
 
-    The value at a time has no derivative in the edges; a solver that ends its steps at `jump_times`
-    gives it. `impulse` is exact.
-
-    **Raises:** `ValueError` unless there is one edge more than rows, for edges that do not
-    increase, NaN.
+    The torque at a time has no derivative by the edges. A motion has one if the solver ends its
+    steps at `jump_times`. `impulse` is exact.
 
     >>> Pulses([1.0, 1.5], [[0.0, 0.0, 3.0]]).impulse
     Array([0. , 0. , 1.5], dtype=float64)
@@ -177,11 +168,9 @@ def _rows(
     if extra is None and rows.shape[:1] != times.shape:
         raise ValueError(f"{other}: wanted a row for each of {count} times, got {rows.shape}")
     if extra is not None and rows.shape != (count - extra, 3):
-        advice = (
-            "n constant pieces have n + 1 edges (Tabulated draws lines between n rows)"
-            if extra
-            else "n times go with n rows (constant pieces: Pulses)"
-        )
+        lines = "n times go with n rows (constant pieces: Pulses)"
+        pieces = "n constant pieces have n + 1 edges (Tabulated draws lines between n rows)"
+        advice = pieces if extra else lines
         raise ValueError(
             f"{other}: wanted {count - extra} rows of 3, got shape {rows.shape}; {advice}"
         )

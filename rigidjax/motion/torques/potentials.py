@@ -22,18 +22,16 @@ class HeavyTop(base.AbstractTorque):
 
     **Arguments:** `mass` m, kg; `com` (3,) c, from the fixed point to the centre of mass, m, body
     frame; `gravity` (3,) g, m/s², world frame, such as [0, 0, −9.81]. The body's `Inertia` is the
-    one **about the fixed point** (`MassProperties.inertia_about`, `Inertia.shifted`). Any top:
-    Lagrange's, Kovalevskaya's, Goryachev–Chaplygin's, a general one, and the physical pendulum.
+    one **about the fixed point** (`MassProperties.inertia_about`, `Inertia.shifted`). Any top is
+    allowed: Lagrange's, Kovalevskaya's, Goryachev–Chaplygin's, a general one, the physical
+    pendulum.
 
     It conserves the energy and the momentum along g. Source: Landau and Lifshitz, Mechanics, §35;
-    Arnold, Mathematical Methods of Classical Mechanics, §30.
-
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype; `TypeError` on a `Rigid`,
+    Arnold, Mathematical Methods of Classical Mechanics, §30. **Raises:** `TypeError` on a `Rigid`,
     which has no fixed point.
 
     >>> top = HeavyTop(2.0, [0.0, 0.0, 0.5], [0.0, 0.0, -9.81])
-    >>> from rigidjax import Attitude, Inertia
-    >>> top.energy(0.0, Attitude([1.0, 0, 0, 0], [0.0, 0, 1]), Inertia(jnp.eye(3)))
+    >>> top.energy(0.0, rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 1]), rj.Inertia(jnp.eye(3)))
     Array(9.81, dtype=float64)
     """
 
@@ -46,7 +44,7 @@ class HeavyTop(base.AbstractTorque):
 
     @property
     def axis(self) -> Vec3:
-        """The direction about which there is no torque: gravity's, world frame."""
+        """Gravity, world frame: there is no torque about it."""
         return self.gravity
 
     def energy(self, t: ScalarLike, state: HasAttitude, body: object) -> Scalar:
@@ -66,17 +64,14 @@ class HeavyTop(base.AbstractTorque):
 class GravityGradient(base.OfTime):
     """The torque of a far central body: `τ = (3μ/r³) r̂' × I r̂'`, `r̂' = Rᵀ r̂`.
 
-    **Arguments:** `mu` μ = G M of the central body, m³/s²; `position` r (3,) m, world frame, from
-    the central body to the body or back (the sign does not matter): constant, or a callable Module
-    of time, t → (3,), for an orbit.
+    **Arguments:** `mu` μ = G M of the central body, m³/s²; `position` r (3,) m, world frame,
+    between the central body and the body (either sign): constant, or a callable Module of time, t →
+    (3,), for an orbit. **Raises:** `ValueError` for a distance of zero.
 
-    `U = (μ/2r³)(3 r̂'·I r̂' − Tr I)`, the second term of MacCullagh's formula; it does not change
-    the orbit itself. Source: Hughes, Spacecraft Attitude Dynamics, §8.1; Goldstein, Poole and
-    Safko, Classical Mechanics, eq 5.86.
+    `U = (μ/2r³)(3 r̂'·I r̂' − Tr I)`, the second term of MacCullagh's formula; the orbit itself
+    does not change. Source: Hughes, Spacecraft Attitude Dynamics, §8.1; Goldstein, Poole and Safko,
+    Classical Mechanics, eq 5.86.
 
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype; `ValueError` for no distance.
-
-    >>> import rigidjax as rj
     >>> law, body = GravityGradient(1.0, [1.0, 1.0, 0.0]), rj.Inertia.from_principal(1.0, 2.0, 2.5)
     >>> state = rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 0])
     >>> round(float(law(0.0, state, body)[2]), 6)  # 3/r³ · ½ (I₂ − I₁), r = √2
@@ -93,14 +88,14 @@ class GravityGradient(base.OfTime):
         self.position = base.constant_or_callable(position, "position")
         at: Any = self.position
         if not callable(at) and _checks.known(at) and not np.asarray(at).any():
-            raise ValueError(
-                "position: wanted the vector between the body and the central body, got zero"
-            )
+            words = "the vector between the body and the central body"
+            raise ValueError(f"position: wanted {words}, got zero")
 
     @property
     def axis(self) -> Vec3 | None:
-        """The direction without torque about it, world frame, if it is constant: the position's."""
-        return base.stays(self.position)
+        """The position, world frame, if it is constant: there is no torque about it."""
+        source: Any = self.position
+        return None if callable(source) else source
 
     def energy(self, t: ScalarLike, state: HasAttitude, body: Inertia | MassProperties) -> Scalar:
         """Potential energy of the attitude, J: `U = (μ/2r³)(3 r̂'·I r̂' − Tr I)`."""
@@ -118,23 +113,17 @@ class GravityGradient(base.OfTime):
         r = base.vector_at(self.position, t, "position")
         distance = jnp.sqrt(dot(r, r))
         # r³ overflows in float32 beyond 7e12 m: divide by r three times instead.
-        return (
-            quaternion.rotate_inverse(state.q, r / distance),
-            self.mu / distance / distance / distance,
-        )
+        strength = self.mu / distance / distance / distance
+        return quaternion.rotate_inverse(state.q, r / distance), strength
 
 
 class MagneticDipole(base.OfTime):
     """A magnetic moment fixed in the body, in a uniform field: `τ = m × RᵀB`, `U = −m·RᵀB`.
 
     **Arguments:** `moment` (3,) m, A m², body frame; `field` B, T, world frame: (3,), or a callable
-    Module of time, t → (3,), for a field that changes along an orbit.
+    Module of time, t → (3,), for a field that changes along an orbit. Source: Jackson, Classical
+    Electrodynamics, eqs 5.71, 5.72.
 
-    Source: Jackson, Classical Electrodynamics, eqs 5.71, 5.72.
-
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
-
-    >>> import rigidjax as rj
     >>> state = rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 0])
     >>> MagneticDipole([0.0, 0.0, 2.0], [3.0, 0.0, 0.0])(0.0, state, None).tolist()  # z × x = y
     [0.0, 6.0, 0.0]
@@ -151,8 +140,9 @@ class MagneticDipole(base.OfTime):
 
     @property
     def axis(self) -> Vec3 | None:
-        """The direction without torque about it, world frame, if it is constant: the field's."""
-        return base.stays(self.field)
+        """The field, world frame, if it is constant: there is no torque about it."""
+        source: Any = self.field
+        return None if callable(source) else source
 
     def energy(self, t: ScalarLike, state: HasAttitude, body: object) -> Scalar:
         """Potential energy, J: `U = −m·RᵀB`."""
@@ -168,19 +158,16 @@ class MagneticDipole(base.OfTime):
 class FromPotential(base.AbstractTorque):
     """The torque of any potential `U(q)` on the attitude, by differentiation.
 
-    **Arguments:** `potential` a callable Module `q → U`, J, with `q` (4,) unit, body → world.
-
-    `τ_i = −∂U/∂q · ½ q ⊗ e_i`, the derivative along a turn about body axis i. Source: Landau and
-    Lifshitz, Mechanics, §34.
-
-    **Raises:** `TypeError` for anything but a function, `ValueError` for a U that is not a number.
+    **Arguments:** `potential` a callable Module `q → U`, J, with `q` (4,) unit, body → world. The
+    torque about body axis i is `τ_i = −∂U/∂q · ½ q ⊗ e_i`, the derivative along a turn about it.
+    Source: Landau and Lifshitz, Mechanics, §34. **Raises:** `TypeError` for anything but a
+    function, `ValueError` for a U that is not a number.
 
     >>> class Spring(eqx.Module):
     ...     k: Array
     ...     def __call__(self, q):
     ...         return 2.0 * self.k * (q[1] ** 2 + q[2] ** 2 + q[3] ** 2)
-    >>> from rigidjax import Attitude, quaternion
-    >>> at = Attitude(quaternion.exp(jnp.array([0.0, 0.0, 1e-3])), [0.0, 0, 0])
+    >>> at = rj.Attitude(rj.quaternion.exp(jnp.array([0.0, 0.0, 1e-3])), [0.0, 0, 0])
     >>> FromPotential(Spring(jnp.array(2.0)))(0.0, at, None).round(5).tolist()
     [-0.0, -0.0, -0.002]
     """
@@ -198,15 +185,8 @@ class FromPotential(base.AbstractTorque):
         return self._value(state.q)
 
     def __call__(self, t: ScalarLike, state: HasAttitude, body: object) -> Vec3:
-        w, x, y, z = state.q
-        dw, dx, dy, dz = jax.grad(self._value)(state.q)
-        return -0.5 * jnp.stack(
-            [
-                -x * dw + w * dx + z * dy - y * dz,
-                -y * dw - z * dx + w * dy + x * dz,
-                -z * dw + y * dx - x * dy + w * dz,
-            ]
-        )
+        slope = jax.grad(self._value)(state.q)
+        return -0.5 * quaternion.multiply(quaternion.conjugate(state.q), slope)[1:]
 
     def _value(self, q):
         return _checks.floating(self.potential(q), (), "potential", hint="one number, J")

@@ -13,15 +13,13 @@ from rigidjax.motion.torques.base import AbstractTorque
 class RandomTorque(AbstractTorque):
     """White torque noise: `E[τᵢ(t) τᵢ(s)] = density δ(t − s)`, independent along the body axes.
 
-    **Arguments:** `density` N² m² s, one number or one for each body axis (3,), ≥ 0: about an axis
-    of moment I the angular momentum then changes by about √(density · t) in a time t.
+    **Arguments:** `density` N² m² s, one number or one for each body axis (3,), ≥ 0. In a time t
+    the rate about an axis of moment I changes by about √(density · t)/I.
 
-    Its mean is zero, and `simulate` and a fit of `rigidjax.identify` use the mean.
-    `rigidjax.estimate` uses the noise: `sample` draws a motion, `filter`, `smooth` and
-    `log_likelihood` allow for it. Add it to other torques by `Sum`. Gelb, Applied Optimal
-    Estimation (1974), §3.6.
-
-    **Raises:** `ValueError` for a density below zero, NaN or a wrong shape.
+    `simulate` and a fit of `rigidjax.identify` use its mean, zero. `rigidjax.estimate` uses the
+    noise: `sample` draws a motion, `filter`, `smooth` and `log_likelihood` allow for it. Add it to
+    other torques by `Sum`. Source: Gelb, Applied Optimal Estimation (1974), §3.6. **Raises:**
+    `ValueError` for a density below zero, NaN or a wrong shape.
 
     >>> RandomTorque(1e-4).density
     Array([0.0001, 0.0001, 0.0001], dtype=float64)
@@ -41,15 +39,13 @@ class RandomTorque(AbstractTorque):
 class CorrelatedTorque(AbstractTorque):
     """Correlated torque noise (Ornstein–Uhlenbeck): `T dτ/dt = −τ + white noise`.
 
-    **Arguments:** `density` N² m² s of the white noise that drives it, one number or (3,), ≥ 0;
-    `time` T, s, positive: the correlation time. `E[τ(t) τ(s)] = density/(2T)
-    exp(−|t − s|/T)` about each body axis: for T → 0 a `RandomTorque` of the same density.
+    **Arguments:** `density` N² m² s of the white noise, one number or (3,), ≥ 0; `time` T, s,
+    positive: the correlation time. `E[τ(t) τ(s)] = density/(2T) exp(−|t − s|/T)` about each body
+    axis: for T → 0 it is a `RandomTorque` of the same density.
 
-    Its mean is zero, and `simulate` and a fit use the mean; see `RandomTorque`. A filter has the
-    torque itself as part of its state. Uhlenbeck and Ornstein 1930, doi:10.1103/PhysRev.36.823.
-
-    **Raises:** `ValueError` for a density below zero, a time that is not positive, NaN or a wrong
-    shape.
+    `simulate` and a fit use its mean, zero; see `RandomTorque`. The state of a filter contains the
+    torque. Source: Uhlenbeck and Ornstein 1930, doi:10.1103/PhysRev.36.823. **Raises:**
+    `ValueError` for a density below zero, a time that is not positive, NaN or a wrong shape.
 
     >>> CorrelatedTorque(2e-4, 0.5).deviation
     Array([0.01414214, 0.01414214, 0.01414214], dtype=float64)

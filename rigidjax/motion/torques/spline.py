@@ -20,14 +20,13 @@ Samples = Float[ArrayLike, "n *channels"] | Sequence[Any]
 class Series(eqx.Module):
     """A cubic spline through evenly spaced samples; constant beyond the ends.
 
-    The interval of a time is found by division, not by search, so that it costs little in a solver;
-    its derivative is continuous, so that a step may pass over a sample.
+    A division finds the interval of a time, so that it costs little in a solver; its derivative is
+    continuous, so that a step may pass over a sample.
 
     **Arguments:** `times` (n,) s, evenly spaced to 1e-6 of a step; `values` (n,) or (n, k). Both
-    may be traced: it can be made under `jit`, `vmap` and `grad`.
-
-    The slopes at the samples are those of the spline whose third derivative does not jump at the
-    second and the last but one ("not a knot": de Boor, A Practical Guide to Splines, ch. IV).
+    may be traced: it can be made under `jit`, `vmap` and `grad`. The third derivative does not jump
+    at the second sample and the last but one ("not a knot": de Boor, A Practical Guide to Splines,
+    ch. IV).
 
     **Raises:** `ValueError` (`equinox` error under `jit`) for fewer than four samples, lengths that
     differ, NaN, uneven times; `TypeError` for anything but numbers.
@@ -44,18 +43,13 @@ class Series(eqx.Module):
     def __init__(self, times: Float[ArrayLike, " n"] | Sequence[Any], values: Samples):
         t, rows = _numbers(times, "times"), _numbers(values, "values")
         if t.ndim != 1 or t.size < 4 or rows.shape[:1] != t.shape:
-            raise ValueError(
-                f"Series: wanted at least four times and as many rows, got shapes {t.shape} and "
-                f"{rows.shape}"
-            )
+            words = f"got shapes {t.shape} and {rows.shape}"
+            raise ValueError(f"Series: wanted at least four times and as many rows, {words}")
         t, rows = _checks.finite(t, "Series: times"), _checks.finite(rows, "Series: values")
         step = (t[-1] - t[0]) / (t.size - 1)
         uneven = ~((step > 0) & (abs(t[1:] - t[:-1] - step).max() <= 1e-6 * step))
-        step = _checks.refuse(
-            step,
-            uneven,
-            "Series: wanted evenly spaced, increasing times; resample, or use Linear",
-        )
+        words = "Series: wanted evenly spaced, increasing times; resample, or use Linear"
+        step = _checks.refuse(step, uneven, words)
         dtype = jnp.result_type(float)
         self.start, self.step = jnp.asarray(t[0], dtype), jnp.asarray(step, dtype)
         self.values = jnp.asarray(rows, dtype)
@@ -103,15 +97,14 @@ def _slopes(values: Float[Array, "n *channels"]) -> Float[Array, "n *channels"]:
 class Wheel(eqx.Module):
     """The momentum of a wheel about a fixed axis whose speed was logged: `h = J s(t) a`.
 
-    Give it to `Flywheel`: a known internal momentum shows the absolute inertia of a body.
+    Give it to `Flywheel`: a known internal momentum determines the absolute inertia of a body.
 
-    **Arguments:** `inertia` J, kg m², about the axis; `axis` (3,) a, body frame, unit; `speed`
-    rad/s relative to the body, a callable Module of time such as `Series(times, speeds)`; `delay`
-    s: the log's value at t belongs to t − delay; `None` for none; `tilt` (2,) tangents (rad, if
-    small) of the axis's tilt towards two directions across it (about x, y and z: the next two axes
-    in turn, y and z, z and x, x and y); `None` for none.
-
-    **Raises:** `ValueError` for an axis that is not a unit vector.
+    **Arguments:** `inertia` J, kg m², about the axis; `axis` (3,) a, body frame, unit; `speed` s,
+    rad/s, relative to the body, a callable Module of time such as `Series(times, speeds)`; `delay`
+    s: the log's value at t belongs to t − delay; `tilt` (2,) tangents (rad, if small) of the axis's
+    tilt towards two directions across it (about x, y and z: the next two axes in turn, y and z, z
+    and x, x and y). `None` is no delay, no tilt. **Raises:** `ValueError` for an axis that is not a
+    unit vector.
 
     >>> speed = Series([0.0, 1.0, 2.0, 3.0], [0.0, 10.0, 20.0, 30.0])
     >>> bool(abs(Wheel(2.0, [0.0, 0.0, 1.0], speed)(0.5)[2] - 10.0) < 1e-12)
@@ -136,11 +129,8 @@ class Wheel(eqx.Module):
         axis = _checks.floating(axis, (3,), "axis")
         x, y, z = _checks.namespace(axis).asarray(axis)
         found = f", got {np.asarray(axis)}" if _checks.known(axis) else ""
-        axis = _checks.refuse(
-            axis,
-            ~(abs(x * x + y * y + z * z - 1) < 2e-6),
-            f"axis: wanted a unit vector (3,){found}",
-        )
+        off = ~(abs(x * x + y * y + z * z - 1) < 2e-6)
+        axis = _checks.refuse(axis, off, f"axis: wanted a unit vector (3,){found}")
         _checks.function(speed, "speed", "of time to rad/s")
         kind = jnp.result_type(float)
         self.inertia = _checks.given(inertia, (), "inertia").astype(kind)

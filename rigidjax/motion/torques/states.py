@@ -1,7 +1,7 @@
 """Torques and functions of time with states of their own, integrated with the body's.
 
-Such a torque has `state0`, its initial states, and `rate`, their derivative; it is called with its
-states last. `freeze` puts the states in, and makes it a plain torque for the rest of the library.
+Such a torque has `state0`, its initial states, and `rate`, their derivative; its states are its
+last argument. `freeze` puts the states in: the rest of the library then sees a plain torque.
 """
 
 from collections.abc import Callable
@@ -20,11 +20,7 @@ _OF_STATES = ("energy", "internal_momentum")
 
 
 class Frozen(eqx.Module):
-    """A torque or function of time with its states put in, without states itself. `freeze` makes
-    it.
-
-    **Arguments:** `law` the torque; `own` its states, in a tuple of one.
-    """
+    """A torque or function of time `law` with its states put in; `freeze` makes it."""
 
     law: Any
     own: tuple[Any]
@@ -63,32 +59,19 @@ def require_stateless(law: Any, what: str) -> None:
 def freeze(law: Tree, own: tuple[Any, ...]) -> Tree:
     """The torque with its states put in, so that it can be called without them.
 
-    **Arguments:** `law` a torque, a force, or a tree of them; `own` a tuple of the states of each
-    part with states, in their order in `law`, inner parts first: a row of `Solution.own`.
-
-    **Raises:** `ValueError` for another number of states.
-
-    >>> from rigidjax import torques
-    >>> law = torques.ConstantTorque([0.0, 0.0, 1.0])
-    >>> freeze(law, ()) is law
-    True
+    `own` has the states of each part with states, in their order in `law`, inner parts first.
     """
     queue = list(own)
     if not queue and not has_states(law):
         return law
     frozen = _visit(law, lambda node: queue.pop(0) if queue else _missing(node))
     if queue:
-        raise ValueError(f"own: the law has {len(own) - len(queue)} with states, got {len(own)}")
+        raise ValueError(f"own: the torque has {len(own) - len(queue)} with states, got {len(own)}")
     return frozen
 
 
 def first_states(law: Any, t: ScalarLike, state: Any, body: Any) -> tuple[Any, ...]:
-    """The initial states of a torque, in the precision of the body's state: see `freeze`.
-
-    **Arguments:** `t` s; `state` of the body at the start; `body`.
-
-    **Raises:** `TypeError` for states that are not numbers.
-    """
+    """The initial states of a torque, in the precision of the body's state: see `freeze`."""
     found: list[Any] = []
 
     def begin(node: Any) -> Any:
@@ -106,10 +89,7 @@ def first_states(law: Any, t: ScalarLike, state: Any, body: Any) -> tuple[Any, .
 def rates_of(
     law: Any, t: ScalarLike, own: tuple[Any, ...], state: Any, body: Any
 ) -> tuple[Any, ...]:
-    """The derivative of each state, as `own` (see `freeze`).
-
-    **Raises:** `ValueError` if a `rate` has another shape than its `state0`.
-    """
+    """The derivative of each state, as `own`; `ValueError` for another shape than `state0`."""
     queue, found = list(own), []
 
     def one(node: Any) -> Any:
@@ -129,11 +109,9 @@ def rates_of(
 def require_frozen(law: Any) -> None:
     """Raise `TypeError` for a torque that is called without its states."""
     if has_own(law):
-        raise TypeError(
-            f"{type(law).__name__} has states of its own (state0, rate): simulate, batch.rollout, "
-            "batch.simulate and identify.fit_windows integrate them; elsewhere call it with "
-            "its states last: law(t, state, body, own)"
-        )
+        words = "has states of its own (state0, rate): simulate, batch.rollout, batch.simulate and "
+        words += "identify.fit_windows integrate them; elsewhere call it with its states last"
+        raise TypeError(f"{type(law).__name__} {words}: law(t, state, body, own)")
 
 
 def _visit(tree: Any, own_of: Callable[[Any], Any]) -> Any:

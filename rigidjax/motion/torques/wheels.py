@@ -1,4 +1,4 @@
-"""Wheels inside the body (a gyrostat): of known momentum, or with speeds of their own."""
+"""Wheels inside the body (a gyrostat): with a known momentum, or with speeds that are states."""
 
 from collections.abc import Callable
 from typing import Any, ClassVar
@@ -24,18 +24,15 @@ _FADE = 0.05
 class Flywheel(base.OfTime):
     """The torque of internal wheels on the body: `τ = h × Ω − dh/dt`.
 
-    **Arguments:** `momentum` h, N m s, body frame: (3,) for wheels that run at constant speed, or a
-    callable Module of time, t → (3,), for wheels that are spun up, such as `Linear(times, values)`.
-    Several wheels: give the sum.
+    **Arguments:** `momentum` h, N m s, body frame, the sum over all wheels: (3,) for wheels of
+    constant speed, or a callable Module of time, t → (3,), such as `Linear(times, values)`.
 
-    The body's `Inertia` must fit the meaning of h. If it includes the wheels as locked, h is their
-    momentum relative to the body. If the wheels' axial moments are subtracted (I − Σ J a aᵀ), h is
-    their whole axial momentum, and dh/dt is the torque of the motors.
+    The body's `Inertia` must fit h. If it includes the wheels as locked, h is their momentum
+    relative to the body. If the wheels' axial moments are subtracted (I − Σ J a aᵀ), h is their
+    whole axial momentum, and dh/dt is the torque of the motors.
 
     The momentum in space, `R (IΩ + h)`, is conserved; so is the energy `½ Ω·IΩ` if h is constant.
     Source: Zhukovsky 1885, Volterra 1898; Hughes, Spacecraft Attitude Dynamics, chs. 3, 6.
-
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
 
     >>> Flywheel([0.0, 0.0, 2.0]).internal_momentum(0.0)
     Array([0., 0., 2.], dtype=float64)
@@ -47,10 +44,8 @@ class Flywheel(base.OfTime):
     def __init__(self, momentum: object):
         self.momentum = base.constant_or_callable(momentum, "momentum")
         if has_states(momentum):
-            raise TypeError(
-                "Flywheel: wanted a momentum whose derivative by time is known, got one with "
-                "states of its own; see ReactionWheels"
-            )
+            words = "wanted a momentum whose derivative by time is known, got one with states"
+            raise TypeError(f"Flywheel: {words}; see ReactionWheels")
 
     def internal_momentum(self, t: ScalarLike) -> Vec3:
         """The wheels' momentum h at `t`, (3,), N m s, body frame."""
@@ -79,31 +74,29 @@ class ReactionWheels(base.AbstractTorque):
     - `motor`: the torque of each motor on its wheel (R,), N m, positive if it increases s:
       constant, a function of time such as `Held(times, values)`, `Input("motor")`, or `None`.
     - `feedback`: a function `(t, state, speeds) → (R,)`, N m, added to `motor`; or `None`.
-    - `max_torque` N m, `max_speed` rad/s, each one number, (R,), or `None` for no limit: the
-      motors' torque is limited to `max_torque`; a torque that would bring a wheel beyond
-      `max_speed` decreases to zero over the last 5 % below it, as 6 x⁵ − 15 x⁴ + 10 x³, so that
-      derivatives of runs that reach it are accurate to their tolerance (along a straight line: to
-      1e-4 at `rtol=1e-9`).
+    - `max_torque` N m, `max_speed` rad/s, each one number, (R,), or `None` for no limit. The
+      motors' torque is limited to `max_torque`. A torque that would bring a wheel beyond
+      `max_speed` decreases to zero over the last 5 % below it, as 6 x⁵ − 15 x⁴ + 10 x³: derivatives
+      of runs that reach it are then accurate to their tolerance (along a straight line: to 1e-4 at
+      `rtol=1e-9`).
     - `viscous` c, N m s/rad, and `coulomb` d, N m, of the bearings, each one number, (R,), or
-      `None`: the friction `−c s − d tanh(s/s₀)`; `turn_over` s₀, rad/s, over which Coulomb friction
-      changes its sign, smoothly, for derivatives and long steps.
+      `None`: the friction `−c s − d tanh(s/s₀)`; `turn_over` s₀, rad/s: Coulomb friction changes
+      its sign smoothly over this speed, for derivatives and long steps.
 
-    The states are the wheels' whole axial momenta `h = J (s + a·Ω)`, and u is the torque of motor
-    and bearing on a wheel. The body's inertia is **without** J a aᵀ: `without_wheels` subtracts
-    them from an inertia with the wheels locked. The equations are exact for wheels that are
-    balanced and symmetric about their axes.
-
-    `R (IΩ + Σ h a)` is conserved for any motor torque; `½ Ω·IΩ + Σ h²/2J` changes by `Σ u s`.
+    The states are the wheels' whole axial momenta `h = J (s + a·Ω)`; u is the torque of motor and
+    bearing on a wheel. The body's inertia is **without** J a aᵀ: `without_wheels` subtracts them
+    from an inertia with the wheels locked. The equations are exact for balanced wheels, symmetric
+    about their axes. `R (IΩ + Σ h a)` is conserved for any motor torque; `½ Ω·IΩ + Σ h²/2J` changes
+    by `Σ u s`.
 
     Source: Markley and Crassidis 2014, Fundamentals of Spacecraft Attitude Determination and
     Control, §3.3.5, doi:10.1007/978-1-4939-0802-8; friction: §4.8 there, after Bialke 1998, with
     tanh instead of sign (Andersson, Söderberg and Björklund 2007,
     doi:10.1016/j.triboint.2005.11.014).
 
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype; `ValueError` for an axis that
-    is not a unit vector, an inertia, limit or turn-over that is not positive.
+    **Raises:** `ValueError` for an axis that is not a unit vector, or an inertia, limit or
+    turn-over that is not positive.
 
-    >>> import rigidjax as rj
     >>> wheels = ReactionWheels([[0.0, 0, 1]], [0.1], [0.0], motor=[0.2])
     >>> body = wheels.without_wheels(rj.Inertia.from_principal(1.0, 2.0, 2.1))
     >>> sol = rj.simulate(body, rj.Spin([0.0, 0, 0]), [0.0, 5.0], wheels)
@@ -160,15 +153,11 @@ class ReactionWheels(base.AbstractTorque):
         parts = (self.motor, self.feedback, self.viscous, self.coulomb)
         return all(part is None for part in parts)
 
-    @property
-    def jump_times(self) -> Float[Array, " n"]:
-        """Times, s, where the motors' torques jump or have a kink."""
-        return base.jumps_of(self.motor)
+    jump_times = property(base.jumps_of_parts)
 
     def without_wheels(self, body: Body) -> Body:
-        """The body without the wheels' axial moments: `I − Σ J a aᵀ`.
-
-        **Arguments:** `body` an `Inertia`, or `MassProperties`, with the wheels locked.
+        """The `body` (`Inertia` or `MassProperties`, wheels locked) without their moments,
+        `I − Σ J a aᵀ`.
         """
         _checks.single(body, (Inertia, MassProperties), "body")
         rows = (j * outer(a, a) for j, a in zip(self.inertia, self.axes, strict=True))
