@@ -1,9 +1,10 @@
 """Adaptive steps, for one body or many, with the states at any times.
 
-For states between and for derivatives the steps are recorded in segments: the start of each is
-kept, and the steps of the last one; derivatives run the others once more.
+For saved states and derivatives the steps are recorded in segments: the start of each is kept, and
+the steps of the last one; derivatives run the others once more.
 """
 
+from functools import partial
 from typing import Any
 
 import jax.numpy as jnp
@@ -57,8 +58,7 @@ def value(method: Method, constants: list[Array], run: Run) -> Answer:
 def recording(method: Method, constants: list[Array], run: Run) -> tuple[Answer, Record]:
     """The answer, and what derivatives need."""
     loop = start(method, constants, run)
-    most = method.max_steps + run.stops.shape[0]
-    first = packed(loop)
+    first, most = packed(loop), method.max_steps + run.stops.shape[0]
     starts = jnp.zeros((-(-most // SEGMENT) + 1, *first.shape), first.dtype)
     ys = jnp.full((run.between.shape[0], *run.y0.shape), jnp.nan, run.y0.dtype)
     rows = jnp.zeros((SEGMENT + _MORE + _MOST, HEAD + run.y0.shape[0], *run.t0.shape), ys.dtype)
@@ -77,7 +77,8 @@ def recording(method: Method, constants: list[Array], run: Run) -> tuple[Answer,
     state = (loop, ys, Record(starts.at[0].set(first), zero, rows, zero))
     more = lambda state: jnp.any(going(method, run, state[0], None))  # noqa: E731
     loop, ys, record = lax.while_loop(more, one, state)
-    return _answer(run, loop, ys), record
+    number, filled = (jnp.broadcast_to(a, run.t0.shape) for a in (record.number, record.filled))
+    return _answer(run, loop, ys), record._replace(number=number, filled=filled)
 
 
 def start(method: Method, constants: list[Array], run: Run) -> LoopState:
@@ -85,7 +86,7 @@ def start(method: Method, constants: list[Array], run: Run) -> LoopState:
     t0, y0 = run.t0, run.y0
     h, f0 = first_step(method, constants, run)
     # No step is short enough if f(t0) is not finite.
-    sound = jnp.all(jnp.isfinite(f0), 0) & jnp.all(jnp.isfinite(y0), 0)
+    sound = jnp.all(jnp.isfinite(f0) & jnp.isfinite(y0), 0)
     sound = sound & jnp.isfinite(t0) & jnp.isfinite(run.stops[-1])
     h = jnp.where(sound, jnp.where(jnp.isnan(run.h0), h, run.h0), jnp.nan)
     h = lax.stop_gradient(_unless_halted(method, t0, y0, h))
@@ -124,8 +125,7 @@ def _attempt(
     accept = moving & good
     following = jnp.where(moving, following, own)
     if until is None:
-        ended = _unless_halted(method, late, y, following)
-        following = jnp.where(accept, ended, following)
+        following = jnp.where(accept, _unless_halted(method, late, y, following), following)
     reached = accept & last & ~cut
     after = LoopState(
         t=jnp.where(accept, jnp.where(reached, begin, late), loop.t),
@@ -147,38 +147,30 @@ def _unless_halted(method: Method, t: Array, y: Array, h: Array) -> Array:
 
 
 def recorded(
-    method: Method,
-    constants: list[Array],
-    run: Run,
-    loop: LoopState,
-    rows: Rows,
-    until: Array | None,
+    method: Method, constants: list[Array], run: Run, loop: LoopState, rows: Rows, until: Any
 ) -> tuple[LoopState, Rows, Array]:
     """The loop from here until the rows are full; and the number of rows."""
     many = max(1, min(_MOST, _BLOCK // run.y0.dtype.itemsize // rows.shape[1]))
 
+    room = rows.shape[0] - (_MORE if until is None else 0) - _MOST
+    none = jnp.zeros((), jnp.int32)
+
+    def more(most: int, state: Any) -> Array:
+        loop, _, count = state
+        return jnp.any(going(method, run, loop, until)) & (count < most)
+
+    def attempt(state: Any) -> Any:
+        loop, few, k = state
+        loop, row = _attempt(method, constants, run, loop, until)
+        return loop, lax.dynamic_update_slice_in_dim(few, row[None], k, 0), k + 1
+
     def block(state: Any) -> Any:
         loop, rows, count = state
-
-        def attempt(state: Any) -> Any:
-            loop, few, k = state
-            loop, row = _attempt(method, constants, run, loop, until)
-            return loop, lax.dynamic_update_slice_in_dim(few, row[None], k, 0), k + 1
-
-        def more(state: Any) -> Array:
-            return jnp.any(going(method, run, state[0], until)) & (state[-1] < many)
-
         few = jnp.zeros((many, *rows.shape[1:]), rows.dtype)
-        loop, few, k = lax.while_loop(more, attempt, (loop, few, jnp.zeros((), jnp.int32)))
+        loop, few, k = lax.while_loop(partial(more, many), attempt, (loop, few, none))
         return loop, lax.dynamic_update_slice_in_dim(rows, few, count, 0), count + k
 
-    room = rows.shape[0] - (_MORE if until is None else 0) - _MOST
-
-    def more(state: Any) -> Array:
-        loop, _, count = state
-        return jnp.any(going(method, run, loop, until)) & (count < room)
-
-    return lax.while_loop(more, block, (loop, rows, jnp.zeros((), jnp.int32)))
+    return lax.while_loop(partial(more, room), block, (loop, rows, none))
 
 
 def segment(rows: Rows, begin: Array, end: Array, count: Array) -> Segment:

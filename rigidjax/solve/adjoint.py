@@ -1,10 +1,9 @@
 """A second pass over a recorded run, for its tangents, and a pass back, for cotangents.
 
 The derivative is that of the steps taken, with fixed lengths, except that steps cut short at a stop
-follow it, as in `diffrax.RecursiveCheckpointAdjoint`. Both go through the segments of
-`rigidjax.solve.adaptive_loop`; all but the last are run once more. Such a segment may take other
-steps between the same two ends if another program rounds differently: the derivative is then that
-of these steps, the same to the tolerance.
+follow it, as in `diffrax.RecursiveCheckpointAdjoint`. All segments but the last are run once more;
+they may take other steps between the same two ends if another program rounds differently: the
+derivative is then that of these steps, the same to the tolerance.
 """
 
 from collections.abc import Sequence
@@ -84,8 +83,8 @@ def cotangents(
             k = part.number - 1 - k
             row = part.rows[k]
             by = lambda t0, stops: times_of(run._replace(t0=t0, stops=stops), row)  # noqa: E731
-            (t, h, end), of_times = jax.vjp(by, run.t0, run.stops)
-            here = Step(t, h, end, row[HEAD:])
+            (*times, end), of_times = jax.vjp(by, run.t0, run.stops)
+            here = Step(*times, end, row[HEAD:])
             dense, seeds, of_slopes, between = False, [], None, of_run.between
             if known is not None:
                 dense = jnp.any(known[k] < known[k + 1])
@@ -93,15 +92,9 @@ def cotangents(
             bar = jax.vjp(method.project, there.end)[1](of_run.y0)[0]
             if known is not None:
                 between, *seeds, of_slopes = dense_output.pulled(
-                    method,
-                    run,
-                    here,
-                    there.slopes,
-                    known[k],
-                    known[k + 1],
-                    bars[0],
+                    method, run, here, there.slopes, known[k], known[k + 1], bars[0],
                     between if timed else None,
-                )
+                )  # fmt: skip
             by_constants, *rest = runge_kutta.pulled(
                 method.tableau, method.field, constants, here, there, bar, of_slopes, dense
             )

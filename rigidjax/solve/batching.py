@@ -1,8 +1,7 @@
 """Batches of a program: bodies in the last axis of every array, whatever `jax.vmap` is outside.
 
-XLA on CPU makes vector instructions for arrays whose last axis is the batch; `jax.vmap` puts it
-first, which is many times slower in a loop over small states. Each program is therefore written for
-arrays with a trailing axis of bodies (or none), and `custom_vmap` moves the axis there.
+XLA on CPU makes vector instructions for arrays whose last axis is the batch. `jax.vmap` puts it
+first, which is many times slower in a loop over small states; `custom_vmap` moves it to the end.
 """
 
 from collections.abc import Callable
@@ -42,17 +41,15 @@ def in_lanes(
 ) -> Arrays:
     """The program, whose `jax.vmap` is itself on longer last axes.
 
-    **Arguments:** `constants` arrays that bodies may share; `each` arrays that every body has its
-    own of; in the last `linear` of them the program is linear: many such directions of one motion
-    are no bodies. No `None` among them.
+    **Arguments:** `constants` arrays that bodies may share; `each` arrays of each body. In the last
+    `linear` of these the program is linear: many such directions of one motion are no bodies.
     """
     was = Layout(False, (True,) * len(constants)) if layout is None else layout
     number = len(constants)
 
     @jax.custom_batching.custom_vmap
     def call(*args: Any) -> Arrays:
-        constants, each = list(args[:number]), list(args[number:])
-        return _in_blocks(program, was, constants, each)
+        return _in_blocks(program, was, list(args[:number]), list(args[number:]))
 
     @call.def_vmap
     def _(size: int, batched: Any, *args: Any) -> Any:

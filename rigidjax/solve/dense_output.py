@@ -1,7 +1,7 @@
 """States at times inside the steps of a run: dense output, on the group.
 
 The loop does not look at the times that are asked for. Its steps with such times in them are taken
-once more: of one body many side by side, of many bodies one of each.
+once more: many of one body side by side, or one of each of many bodies.
 """
 
 from collections.abc import Callable

@@ -1,7 +1,7 @@
 """A step of order 4 for torques that do not depend on the attitude: Runge–Kutta, then one rotation.
 
-Euler's equations are then closed in the body rate. The four stages therefore carry three numbers
-instead of seven, and the attitude turns once a step, by the exponential of Magnus' series.
+Euler's equations are then closed in the body rate: the four stages carry three numbers instead of
+seven. The attitude turns once a step, by the exponential of Magnus' series.
 """
 
 from collections.abc import Callable
@@ -25,14 +25,9 @@ from rigidjax.solve.tableaus import KUTTA4
 
 
 def turned(
-    slope: Callable[[Any, Triple], Triple],
-    rate: Callable[[Triple], Triple],
-    t: Any,
-    end: Any,
-    h: Array,
-    q: Four,
-    p: Triple,
-) -> tuple[Four, Triple]:
+    slope: Callable[[Any, Triple], Triple], rate: Callable[[Triple], Triple],
+    t: Any, end: Any, h: Array, q: Four, p: Triple,
+) -> tuple[Four, Triple]:  # fmt: skip
     """One step of attitude `q` and momentum (or rate) `p`, from `t` to `end`.
 
     **Arguments:** `slope(t, p)` dp/dt; `rate(p)` Ω; `h` the step, s. The rotation vector of the
@@ -54,12 +49,7 @@ def turned(
         for a, b, c, d in zip(left, between, right, cross(left, right), strict=True)
     )
     half = barrier(half)
-    return _product(q, half), after
-
-
-def _product(q: Four, half: Triple) -> Four:
-    """`q ⊗ exp(half)`, of length 1."""
-    # Short series: a step that turns by more than a radian has no digits to lose.
+    # q ⊗ exp(half). Short series: a step that turns by more than a radian has no digits to lose.
     x = half[0] * half[0] + half[1] * half[1] + half[2] * half[2]
     c = 1.0 + x * (-1 / 2 + x * (1 / 24 + x * (-1 / 720 + x * (1 / 40320))))
     s = 1.0 + x * (-1 / 6 + x * (1 / 120 + x * (-1 / 5040 + x * (1 / 362880))))
@@ -67,15 +57,15 @@ def _product(q: Four, half: Triple) -> Four:
     out = product4(q, (c, x, y, z))
     # One of Newton's steps to length 1, which is near already.
     scale = 1.5 - 0.5 * square4(out)
-    return tuple(scale * a for a in barrier(out))
+    return tuple(scale * a for a in barrier(out)), after
 
 
 class Magnus4(dfx.AbstractSolver):
     """Order 4 with fixed steps, for free bodies and torques of time and body rate only.
 
-    The step that `rigidjax.batch.rollout` takes unless told otherwise, as a `diffrax` solver: less
-    work and a smaller error than `rigidjax.solvers.RungeKutta4` at the same step.
-    The attitude keeps |q| = 1. A step should turn the body by less than a radian.
+    It does less work, with a smaller error, than `rigidjax.solvers.RungeKutta4` at the same step,
+    and is the default of `rigidjax.batch.rollout`. The attitude keeps |q| = 1. A step should turn
+    the body by less than a radian.
 
     Source: Magnus 1954, doi:10.1002/cpa.3160070404; see `turned`.
 

@@ -13,11 +13,7 @@ from rigidjax.solve.step_control import NONFINITE, finite
 
 
 class GroupInterpolation(dfx.AbstractLocalInterpolation):
-    """Dense output of another interpolation, its quaternion scaled to length 1.
-
-    Saved times fall between steps, so a projection of the steps alone leaves saved states off the
-    group by the error of the interpolation (|q|−1 = 3e-3 at a tolerance of 1e-3).
-    """
+    """Dense output of another interpolation, its quaternion scaled to length 1."""
 
     t0: Any
     t1: Any
@@ -42,10 +38,9 @@ class _Build(eqx.Module):
 class Projected(dfx.AbstractWrappedSolver):
     """Wraps a diffrax solver so that attitudes stay unit quaternions.
 
-    Each accepted step ends with q ← q/|q|, and so does every value of the dense output; the stages
-    are unchanged, because a change there alters the order (jaxsim#192). The kinematics is linear
-    in q, so scaling q commutes with the exact flow and the order of the wrapped solver is kept. A
-    state without a quaternion passes through. A step that gives NaN or infinity ends the run with
+    Each accepted step ends with q ← q/|q|, and so does every value of the dense output. The stages
+    are unchanged, because a change there alters the order (jaxsim#192). A state without a
+    quaternion passes through. A step that gives NaN or infinity ends the run with
     `RESULTS.nonfinite`.
 
     **Arguments:** `solver` any `diffrax.AbstractSolver` on `Spin`, `Attitude` or `Rigid` states.
@@ -118,10 +113,9 @@ class Watched(dfx.AbstractAdaptiveStepSizeController):
     """Wraps an adaptive step controller so that a run that cannot continue ends at once.
 
     `diffrax.PIDController` tries smaller and smaller steps until `max_steps` if the vector field is
-    NaN, and all other bodies of a batch wait. Here two cases end the run: a start without a finite
-    derivative, and a rejected step whose successor would be below a few units of round-off of the
-    time. The result is `RESULTS.nonfinite` after NaN or infinity, else `RESULTS.dt_min_reached`.
-    The steps of other runs do not change.
+    NaN, and all other bodies of a batch wait. Here a start without a finite derivative, or a
+    rejected step whose successor would be below a few units of round-off of the time, ends the run:
+    with `RESULTS.nonfinite` after NaN or infinity, else with `RESULTS.dt_min_reached`.
 
     **Arguments:** `controller` any adaptive controller of diffrax.
 
@@ -150,16 +144,9 @@ class Watched(dfx.AbstractAdaptiveStepSizeController):
         return Watched(self.controller.wrap(direction))
 
     def init(
-        self,
-        terms: Any,
-        t0: Any,
-        t1: Any,
-        y0: Any,
-        dt0: Any,
-        args: Any,
-        func: Any,
+        self, terms: Any, t0: Any, t1: Any, y0: Any, dt0: Any, args: Any, func: Any,
         error_order: Any,
-    ) -> tuple[Any, Any]:
+    ) -> tuple[Any, Any]:  # fmt: skip
         first, inner = self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
         # At t = 0 the round-off of t vanishes: that of the length of the run is taken.
         least = jnp.finfo(t0.dtype).eps * jnp.abs(t1 - t0)
@@ -167,16 +154,9 @@ class Watched(dfx.AbstractAdaptiveStepSizeController):
         return first, (inner, least, ~finite((y0, func(terms, t0, y0, args))))
 
     def adapt_step_size(
-        self,
-        t0: Any,
-        t1: Any,
-        y0: Any,
-        y1_candidate: Any,
-        args: Any,
-        y_error: Any,
-        error_order: Any,
-        controller_state: Any,
-    ) -> tuple[Any, Any, Any, Any, Any, dfx.RESULTS]:
+        self, t0: Any, t1: Any, y0: Any, y1_candidate: Any, args: Any, y_error: Any,
+        error_order: Any, controller_state: Any,
+    ) -> tuple[Any, Any, Any, Any, Any, dfx.RESULTS]:  # fmt: skip
         inner, least, lost = controller_state
         keep, left, right, jumped, inner, result = self.controller.adapt_step_size(
             t0, t1, y0, y1_candidate, args, y_error, error_order, inner
@@ -186,11 +166,5 @@ class Watched(dfx.AbstractAdaptiveStepSizeController):
         stuck = stuck & (result == dfx.RESULTS.successful)
         ill = lost | ~finite((right, y1_candidate, y_error))
         why = dfx.RESULTS.where(ill, NONFINITE, dfx.RESULTS.dt_min_reached)
-        return (
-            keep,
-            left,
-            right,
-            jumped,
-            (inner, least, lost),
-            dfx.RESULTS.where(stuck, why, result),
-        )
+        result = dfx.RESULTS.where(stuck, why, result)
+        return keep, left, right, jumped, (inner, least, lost), result

@@ -25,6 +25,9 @@ from rigidjax.solve.step_control import NONFINITE, finite, of_body
 from rigidjax.solve.vector_field import ahead, equations_of_motion
 
 
+_COUNTS = ("num_steps", "num_accepted_steps", "num_rejected_steps")
+
+
 class Free(eqx.Module):
     """A free body: the closed form, any time at the cost of one."""
 
@@ -48,9 +51,9 @@ class Setup(eqx.Module):
 
 
 class Loop(eqx.Module):
-    """A solve for states and derivatives alone: our own loop.
+    """A solve by our own loop.
 
-    `sign` of the direction of time; `None` where it is known to go forwards. `cuts` times at which
+    `sign` of the direction of time, `None` where it is known to go forwards; `cuts` times at which
     a step has to end, beside the jumps of the torque.
     """
 
@@ -67,15 +70,9 @@ class Loop(eqx.Module):
 
 
 class Ends(eqx.Module):
-    """The condition that ends a run of a scene, as `diffrax.Event` asks it.
-
-    A scene may end a run at a collision or another singularity, instead of ever smaller steps.
+    """The condition that ends a run of a scene, such as a collision, as `diffrax.Event` asks it.
 
     **Arguments:** `scene` any with `ends(t, state) → bool` and `end_words(t, state) → str`.
-
-    >>> from rigidjax import orbits
-    >>> bool(Ends(orbits.hill(0.1))(0.0, rj.Point([0.05, 0, 0], [0.0, 0, 0])))
-    True
     """
 
     scene: Any
@@ -89,54 +86,47 @@ def solve(
     setup: Free | Loop | Setup, state0: Any, ts: Array
 ) -> tuple[Any, dict[str, Any], dfx.RESULTS]:
     # One jit around everything: an operation outside of it costs as much as a hundred steps.
-    state0 = on_the_group(state0)
-    run = _free if isinstance(setup, Free) else _in_steps
-    ys, stats, result = run(setup, state0, ts)  # pyright: ignore[reportArgumentType]
-    inputs = (setup.body, setup.torque, state0, ts)
+    state0 = given = on_the_group(state0)
+    if isinstance(setup, Free):
+        ys, stats, result = _free(setup, state0, ts)
+    else:
+        # With the states of the torque, where it has some.
+        state0 = started(setup.body, state0, setup.torque, ts[0])
+        scene: Any = scene_of(setup.torque) if isinstance(state0, Point) else None
+        watch = Ends(scene) if hasattr(scene, "ends") else None
+        run: Any = _loop if isinstance(setup, Loop) else _by_diffrax
+        ys, stats, result, end = run(setup, watch, state0, ts)
+        if setup.throw:
+            ys = refuse(ys, result)
+        if watch is not None:
+            ended = result == dfx.RESULTS.event_occurred
+            stats |= {"ended": ended, "end_time": end[0], "end_state": end[1]}
+        if scene is not None:
+            stats["drift"] = scene.drift(ts, ys)
+    inputs = (setup.body, setup.torque, given, ts)
     return nan_derivatives(ys, inputs), stats, of_body(result, setup.body)
-
-
-def _in_steps(
-    setup: Loop | Setup, state0: Any, ts: Array
-) -> tuple[Any, dict[str, Any], dfx.RESULTS]:
-    # With the states of the torque, where it has some.
-    state0 = started(setup.body, state0, setup.torque, ts[0])
-    scene: Any = scene_of(setup.torque) if isinstance(state0, Point) else None
-    watch = Ends(scene) if hasattr(scene, "ends") else None
-    run: Any = _loop if isinstance(setup, Loop) else _by_diffrax
-    ys, stats, result, end = run(setup, watch, state0, ts)
-    if setup.throw:
-        ys = refuse(ys, result)
-    if watch is not None:
-        ended = result == dfx.RESULTS.event_occurred
-        stats |= {"ended": ended, "end_time": end[0], "end_state": end[1]}
-    if scene is not None:
-        stats["drift"] = scene.drift(ts, ys)
-    return ys, stats, result
 
 
 def _by_diffrax(
     setup: Setup, watch: Ends | None, state0: Any, ts: Array
 ) -> tuple[Any, dict[str, Any], dfx.RESULTS, Any]:
     subs = [dfx.SubSaveAt(ts=ts)] + [dfx.SubSaveAt(t1=True)] * (watch is not None)
+    term = dfx.ODETerm(equations_of_motion(setup.body, state0, setup.torque))
     out = dfx.diffeqsolve(
-        dfx.ODETerm(equations_of_motion(setup.body, state0, setup.torque)),
-        setup.solver,
-        ts[0],
-        ts[-1],
-        setup.dt0,
-        state0,
-        saveat=dfx.SaveAt(subs=subs),
-        stepsize_controller=setup.controller,
-        adjoint=setup.adjoint,
-        max_steps=setup.max_steps,
-        throw=False,
-        progress_meter=setup.progress_meter,
+        term, setup.solver, ts[0], ts[-1], setup.dt0, state0,
+        saveat=dfx.SaveAt(subs=subs), stepsize_controller=setup.controller, adjoint=setup.adjoint,
+        max_steps=setup.max_steps, throw=False, progress_meter=setup.progress_meter,
         event=None if watch is None else dfx.Event(watch),
-    )
+    )  # fmt: skip
     stats: dict[str, Any] = {k: value for k, value in out.stats.items() if k != "max_steps"}
     (times, *last_time), (ys, *last) = out.ts, out.ys  # pyright: ignore
-    ys, result = _reached(ys, times), out.result
+
+    def reached(leaf: Array) -> Array:
+        # Where nothing was saved, diffrax says t = inf: not to be taken for a state.
+        there = jnp.isfinite(times).reshape(-1, *[1] * (leaf.ndim - 1))
+        return jnp.where(there, leaf, jnp.full_like(leaf, jnp.nan))
+
+    ys, result = jax.tree.map(reached, ys), out.result
     if not isinstance(setup.controller, dfx.AbstractAdaptiveStepSizeController):
         # Equal steps look at no error, and would go on with NaN.
         ill = (result == dfx.RESULTS.successful) & ~finite(ys)
@@ -152,36 +142,12 @@ def _loop(
     if setup.cuts is not None:
         jumps = jnp.concatenate([jumps.astype(ts.dtype), setup.cuts])
     field, watch, along, jumps = ahead(setup.sign, field, watch, ts, jumps)
-    out = adaptive(
-        setup.solver,
-        field,
-        along,
-        state0,
-        rtol=setup.rtol,
-        atol=setup.atol,
-        dt0=setup.dt0,
-        max_steps=setup.max_steps,
-        jumps=jumps,
-        halt=watch,
-    )
-    stats: dict[str, Any] = {
-        "num_steps": out.num_steps,
-        "num_accepted_steps": out.num_steps - out.num_rejected,
-        "num_rejected_steps": out.num_rejected,
-    }
+    how = dict(rtol=setup.rtol, atol=setup.atol, dt0=setup.dt0, max_steps=setup.max_steps)
+    out = adaptive(setup.solver, field, along, state0, jumps=jumps, halt=watch, **how)
+    taken = (out.num_steps, out.num_steps - out.num_rejected, out.num_rejected)
     sign = setup.sign
     last_time = out.last_time if sign is None else sign.astype(ts.dtype) * out.last_time
-    return out.ys, stats, out.result, (last_time, out.last)
-
-
-def _reached(ys: Any, times: Array) -> Any:
-    """NaN where nothing was saved, there diffrax says t = inf: not to be taken for a state."""
-
-    def mark(leaf: Array) -> Array:
-        there = jnp.isfinite(times).reshape(-1, *[1] * (leaf.ndim - 1))
-        return jnp.where(there, leaf, jnp.full_like(leaf, jnp.nan))
-
-    return jax.tree.map(mark, ys)
+    return out.ys, dict(zip(_COUNTS, taken, strict=True)), out.result, (last_time, out.last)
 
 
 def refuse(ys: Any, result: dfx.RESULTS) -> Any:
@@ -207,8 +173,7 @@ def refuse(ys: Any, result: dfx.RESULTS) -> Any:
 
 def _free(setup: Free, state0: Any, ts: Array) -> tuple[Any, dict[str, Any], dfx.RESULTS]:
     ys = FreeMotion(setup.body, state0)(ts - ts[0])
-    none = jnp.zeros((), int)
-    stats = {"num_steps": none, "num_accepted_steps": none, "num_rejected_steps": none}
+    stats = dict.fromkeys(_COUNTS, jnp.zeros((), int))
     if setup.throw:
         ys = eqx.error_if(
             ys,
@@ -221,14 +186,10 @@ def _free(setup: Free, state0: Any, ts: Array) -> tuple[Any, dict[str, Any], dfx
 
 
 def refuse_ended(scene: Any, ys: Any, stats: dict[str, Any], ts: Any) -> Any:
-    """The states `ys`, unless the scene has ended the run: then an error in the scene's words.
+    """The states `ys` saved at `ts`, unless the scene has ended the run: an error in its words.
 
-    **Arguments:** `scene` as of `Ends`; `ys` the states saved at `ts`; `stats` with `ended`,
-    `end_time` and `end_state`. **Raises:** `ValueError` with the last time saved before; under
-    `jit` or `vmap` `EquinoxRuntimeError` without numbers.
-
-    >>> refuse_ended(None, 0.0, {"ended": np.asarray(False)}, None)
-    0.0
+    **Raises:** `ValueError` with the last time saved before; under `jit` or `vmap`
+    `EquinoxRuntimeError` without numbers.
     """
     ended, advice = stats["ended"], "; give throw=False to keep what came before it"
     if _checks.known(ended) and not np.any(np.asarray(ended)):

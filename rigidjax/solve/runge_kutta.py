@@ -1,8 +1,7 @@
 """A step of an explicit Runge–Kutta method, its tangent and its transpose.
 
-The stages are a loop: XLA compiles only one evaluation of the field, and one vjp of it for the
-gradient. This takes a tenth of the compile time of twelve copies, and the loop runs as fast to a
-fifth. States are (n, *bodies): numbers first, bodies last.
+The stages are a loop, so that XLA compiles only one evaluation of the field, and one vjp of it for
+the gradient. States are (n, *bodies): numbers first, bodies last.
 """
 
 from collections.abc import Callable
@@ -55,23 +54,13 @@ class Weights(NamedTuple):
 
 
 def stage_counts(tableau: Tableau) -> tuple[int, int]:
-    """The number of stages of a step, and the number with those for dense output.
-
-    >>> from rigidjax.solve.tableaus import DORMAND_PRINCE8
-    >>> stage_counts(DORMAND_PRINCE8)
-    (12, 16)
-    """
+    """The number of stages of a step, and the number with those for dense output."""
     whole = len(tableau.a) + 2 + len(tableau.extra_a)
     return max(len(tableau.a), *tableau.errors[0]) + 1, whole
 
 
 def weights(tableau: Tableau, dtype: Any, count: int) -> Weights:
-    """The weights of the first `count` stages of a tableau.
-
-    >>> from rigidjax.solve.tableaus import KUTTA4
-    >>> weights(KUTTA4, jnp.float64, 4).a[3].tolist()
-    [0.0, 0.0, 1.0, 0.0]
-    """
+    """The weights of the first `count` stages of a tableau."""
     rows = [{}, *tableau.a, tableau.b, *tableau.extra_a]
     c = np.array([0.0, *tableau.c, 1.0, *tableau.extra_c])[:count]
     whole = len(rows)
@@ -109,8 +98,8 @@ def stages(
     count = stage_counts(tableau)[dense is not False]
     w = weights(tableau, step.y.dtype, count)
 
-    def stage(i: Array, both: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        times, places, slopes = both
+    def stage(i: Array, sofar: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        times, places, slopes = sofar
         t, y, slope = _stage(w, field, constants, step, i, slopes)
         times = lax.dynamic_update_slice_in_dim(times, t[None], i, 0)
         return times, _put(places, y, i), _put(slopes, slope, i)
@@ -172,10 +161,7 @@ def error_estimate(tableau: Tableau, sizes: list[int], h: Array, slopes: Array) 
     """The error of a step (n, *bodies).
 
     Two estimates e5, e3 make e5 |e5|/√(|e5|² + 0.01 |e3|²), which falls as h⁸ (Hairer, Nørsett and
-    Wanner 1993, II.10). The lengths are those of one array of the state, of `sizes` numbers: scales
-    are not mixed.
-
-    **Arguments:** `slopes` (n, s, *bodies).
+    Wanner 1993, II.10). The lengths are those of each array of the state, of `sizes` numbers.
     """
     count, dtype = slopes.shape[1], slopes.dtype
     ones = [1] * (slopes.ndim - 2)
@@ -195,15 +181,9 @@ def error_estimate(tableau: Tableau, sizes: list[int], h: Array, slopes: Array) 
 
 
 def pulled(
-    tableau: Tableau,
-    field: Field,
-    constants: list[Array],
-    step: Step,
-    there: Stages,
-    cotangent: Array,
-    of_slopes: Array | None = None,
-    dense: Any = False,
-) -> tuple[list[Array], Array, Array, Array]:
+    tableau: Tableau, field: Field, constants: list[Array], step: Step, there: Stages,
+    cotangent: Array, of_slopes: Array | None = None, dense: Any = False,
+) -> tuple[list[Array], Array, Array, Array]:  # fmt: skip
     """The transpose of a step: cotangents of the constants, of time, of length, of the state.
 
     **Arguments:** `cotangent` of the state at the end; `of_slopes` (n, s, *bodies) of all slopes;

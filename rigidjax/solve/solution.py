@@ -25,26 +25,12 @@ from rigidjax.solve.run import Free, Loop, Setup, solve
 State = TypeVar("State", Spin, Attitude, Rigid, Point)
 
 
-class Kept(eqx.Module):
+def kept(setup: Free | Loop | Setup) -> tuple[Any, tuple[tuple[Any, ...], Any]]:
     """A set-up as arrays and the rest, so that `jax.jit` and `jax.vmap` can return it."""
-
-    arrays: Any
-    rest: tuple[tuple[Any, ...], Any] = eqx.field(static=True)
-
-    def __init__(self, setup: Free | Loop | Setup):
-        self.arrays, rest = eqx.partition(setup, _is_array)
-        leaves, structure = jax.tree.flatten(rest)
-        self.rest = tuple(leaves), structure
-
-    @property
-    def setup(self) -> Any:
-        """The set-up itself."""
-        leaves, structure = self.rest
-        return eqx.combine(self.arrays, jax.tree.unflatten(structure, leaves))
-
-
-def _is_array(leaf: Any) -> bool:
-    return isinstance(leaf, (jax.Array, np.ndarray, np.generic))
+    numbers = (jax.Array, np.ndarray, np.generic)
+    arrays, rest = eqx.partition(setup, lambda leaf: isinstance(leaf, numbers))
+    leaves, structure = jax.tree.flatten(rest)
+    return arrays, (tuple(leaves), structure)
 
 
 class Solution(eqx.Module, Generic[State]):
@@ -72,7 +58,8 @@ class Solution(eqx.Module, Generic[State]):
     ys: State
     stats: dict[str, Any]
     result: dfx.RESULTS
-    _kept: "Kept"
+    _arrays: Any
+    _rest: tuple[tuple[Any, ...], Any] = eqx.field(static=True)
     event_time: Float[Array, ""] | None = None
     event_state: Any = None
     own: Any = None
@@ -105,14 +92,14 @@ class Solution(eqx.Module, Generic[State]):
     def growth(self) -> Float[Array, " times"]:
         """‖∂y(t)/∂y(t₀)‖ at each of `ts`: the growth of a small error at the start.
 
-        It is computed at the first use, by forward mode: about as many runs as the state has
+        It is computed when it is read, by forward mode: about as many runs as the state has
         numbers. It has no unit: each of q, Ω, x, v counts relative to its largest size in the run,
         and the norm is the largest singular value.
 
         A solver's own errors grow as much. If `growth * rtol` exceeds 1, the states have no correct
-        digit, and gradients through them have no meaning, finite or not, for any adjoint: a
-        `UserWarning` names the first such time. Check it once before you differentiate through a
-        long run; then end the run earlier, or fit it in pieces (multiple shooting).
+        digit, and gradients through them mean nothing, for any adjoint: a `UserWarning` names the
+        first such time. Check it once before you differentiate through a long run; then end the
+        run earlier, or fit it in pieces (multiple shooting).
 
         Source: the largest finite-time Lyapunov exponent is its logarithm over t (Eckmann and
         Ruelle 1985, doi:10.1103/RevModPhys.57.617).
@@ -192,8 +179,9 @@ class Solution(eqx.Module, Generic[State]):
         return motion_of(jax.tree.map(lambda leaf: leaf[-1], ys))
 
     @property
-    def _setup(self) -> Free | Loop | Setup:
-        return self._kept.setup
+    def _setup(self) -> Any:
+        leaves, structure = self._rest
+        return eqx.combine(self._arrays, jax.tree.unflatten(structure, leaves))
 
     @property
     def _states(self) -> Any:
@@ -229,10 +217,8 @@ def _drift(setup: Free | Loop | Setup, ts: Array, ys: Any) -> dict[str, Array]:
 
 def _forward(setup: Free | Loop | Setup) -> Free | Loop | Setup:
     """The same run, which raises nothing, and which forward mode goes through."""
-    setup = dataclasses.replace(setup, throw=False)
-    return (
-        dataclasses.replace(setup, adjoint=dfx.ForwardMode()) if isinstance(setup, Setup) else setup
-    )
+    more = dict(adjoint=dfx.ForwardMode()) if isinstance(setup, Setup) else {}
+    return dataclasses.replace(setup, throw=False, **more)
 
 
 @eqx.filter_jit

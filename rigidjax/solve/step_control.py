@@ -1,7 +1,4 @@
-"""A run with adaptive steps: its parts, its record, its step control.
-
-Bodies are in the last axis.
-"""
+"""A run with adaptive steps: its parts, its record, its step control. Bodies are in the last axis."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -19,7 +16,6 @@ from rigidjax.solve.tableaus import Tableau
 
 # diffrax inherits it from optimistix, where type checkers do not follow.
 NONFINITE: Any = dfx.RESULTS.nonfinite
-_IMPOSSIBLE: Any = dfx.RESULTS.nonfinite_input
 
 # The defaults of diffrax.PIDController: the same steps, so that figures can be compared.
 _SAFETY, _SMALLEST, _LARGEST = 0.9, 0.2, 10.0
@@ -148,10 +144,6 @@ def times_of(run: Run, rows: Rows) -> tuple[Array, Array, Array]:
     return t, h, jnp.where(last, end, t + h)
 
 
-# So few rows that it is quicker to add up all of them than to look for one, also in derivatives.
-_FEW = 8
-
-
 def at(a: Array, index: Array) -> Array:
     """a[index] of each body; a (J, *bodies), index (*many, *bodies)."""
     count = a.shape[0]
@@ -159,7 +151,8 @@ def at(a: Array, index: Array) -> Array:
     if count == 1:
         return jnp.broadcast_to(a[0], index.shape)
     index = jnp.clip(index, 0, count - 1)
-    if count <= _FEW:
+    # It is quicker to add up so few rows than to look for one, also in derivatives.
+    if count <= 8:
         each = jnp.arange(count, dtype=index.dtype).reshape(-1, *[1] * index.ndim)
         return jnp.sum(jnp.where(each == index[None], a, 0), 0)
     a = jnp.broadcast_to(a, (count, *index.shape))
@@ -167,11 +160,7 @@ def at(a: Array, index: Array) -> Array:
 
 
 def finite(tree: Any) -> Bool[Array, ""]:
-    """Whether every number in `tree` is finite.
-
-    >>> bool(finite((jnp.ones(2), jnp.array(jnp.nan))))
-    False
-    """
+    """Whether every number in `tree` is finite."""
     good = jnp.asarray(True)
     for leaf in jax.tree.leaves(tree):
         good = good & jnp.all(jnp.isfinite(leaf))
@@ -179,21 +168,12 @@ def finite(tree: Any) -> Bool[Array, ""]:
 
 
 def of_body(result: dfx.RESULTS, body: Any) -> dfx.RESULTS:
-    """The result of a run; `nonfinite_input` where no body has these numbers.
-
-    **Arguments:** `body` as `validation.real_or_nan` gives it, NaN where it cannot be.
-
-    >>> of_body(dfx.RESULTS.nonfinite, jnp.nan) == dfx.RESULTS.nonfinite_input
-    Array(True, dtype=bool)
-    """
-    return dfx.RESULTS.where(finite(body), result, _IMPOSSIBLE)
+    """The result of a run; `nonfinite_input` where the body is NaN: no body has its numbers."""
+    return dfx.RESULTS.where(finite(body), result, dfx.RESULTS.nonfinite_input)  # pyright: ignore
 
 
 def tried(method: Method, constants: list[Array], run: Run, step: Step) -> tuple[Array, Array]:
-    """The state a step later, and its error over the tolerance; inf for NaN.
-
-    Their root mean square, as `diffrax.PIDController` takes it.
-    """
+    """The state a step later, and the root mean square of its error over the tolerance."""
     there = stages(method.tableau, method.field, constants, step)
     left, right = step.y, method.project(there.end)
     error = error_estimate(method.tableau, method.sizes, step.h, there.slopes)

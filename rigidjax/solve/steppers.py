@@ -1,16 +1,15 @@
 """A fixed step of a method, a body and a torque: their interface to a loop.
 
-The numbers are carried one by one: XLA on CPU runs a loop over a tuple of scalars as one kernel
-and, batched, over a tuple of (N,) arrays in vector instructions; of a loop over (7,) or (N, 7)
-arrays it makes many small kernels. Torques are called on arrays all the same: XLA sees through the
-stacks and slices between.
+The numbers are carried one by one (see `components`); torques are called on arrays all the same:
+XLA sees through the stacks and slices between.
 
-A body that turns carries the momentum Π = IΩ instead of Ω. Runge–Kutta methods do not notice a
-constant linear change of variables, so these are the steps that `diffrax` takes with the same
-solver, to round-off; and each of their stages is a third cheaper.
+A body that turns carries the momentum Π = IΩ instead of Ω, which makes each stage a third cheaper.
+Runge–Kutta methods do not notice a constant linear change of variables, so these are the steps that
+`diffrax` takes with the same solver, to round-off.
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -19,14 +18,7 @@ from jax import lax
 from jaxtyping import Array
 
 from rigidjax.body.inertia import Inertia
-from rigidjax.exact.components3 import (
-    Six,
-    Triple,
-    cross,
-    half_product,
-    plus,
-    times,
-)
+from rigidjax.exact.components3 import Six, Triple, cross, half_product, plus, times
 from rigidjax.exact.principal_axes import out_of
 from rigidjax.motion import Attitude, Spin
 from rigidjax.motion.equations import AttitudeEquations, EulerEquations, on_the_group
@@ -60,24 +52,12 @@ def stepper_of(solver: Any, field: Callable[..., Any], y0: Any) -> Stepper:
 
     **Arguments:** `solver` of `rigidjax.solvers`, or `None`; `field` as of `equations_of_motion`;
     `y0` a state. **Raises:** `TypeError` for a solver that has no such step.
-
-    >>> import rigidjax as rj
-    >>> start = rj.Spin([1.0, 0.0, 0.0])
-    >>> field = rj.equations_of_motion(rj.Inertia.from_principal(1.0, 2.0, 2.5), start)
-    >>> stepper = stepper_of(None, field, start)
-    >>> [float(number) for number in stepper.start]
-    [1.0, 0.0, 0.0]
     """
     return _stepper_of(solver, field, y0)._replace(delays=tuple(delays_of(field)))
 
 
 def cheapest(field: Callable[..., Any]) -> Magnus4 | RungeKutta4:
-    """The method of order 4 that takes the least work.
-
-    >>> import rigidjax as rj
-    >>> type(cheapest(EulerEquations(rj.Inertia.from_principal(1.0, 2.0, 2.5)))).__name__
-    'RungeKutta4'
-    """
+    """The method of order 4 that takes the least work."""
     attitude = isinstance(field, AttitudeEquations)
     blind = attitude and not sees_attitude(field.euler.torque)
     return Magnus4() if blind else RungeKutta4()
@@ -98,9 +78,7 @@ def _stepper_of(solver: Any, field: Callable[..., Any], y0: Any) -> Stepper:
             "Magnus4 or a Splitting of rigidjax.solvers; for others use simulate with "
             "stepsize_controller=diffrax.ConstantStepSize() under jax.vmap"
         )
-    if turning is None:
-        return _general(solver, field, y0)
-    return _explicit(solver, turning, y0)
+    return _general(solver, field, y0) if turning is None else _explicit(solver, turning, y0)
 
 
 class _Turning(NamedTuple):
@@ -130,11 +108,8 @@ def _free(body: Inertia, state0: Attitude) -> Stepper:
     one, none = jnp.ones_like(a), jnp.zeros_like(a)
 
     def step(t: Any, end: Any, h: Any, y: Atoms, inputs: Any) -> Atoms:
-        q, p = turned(
-            lambda _, p: _free_slope(weights, gaps, p),
-            lambda p: splitting.rate_of(weights, p),
-            t, end, h, y[:4], y[4:],
-        )  # fmt: skip
+        slope = lambda _, p: _free_slope(weights, gaps, p)  # noqa: E731
+        q, p = turned(slope, partial(splitting.rate_of, weights), t, end, h, y[:4], y[4:])
         return (*q, *p)
 
     def state(y: Atoms) -> Attitude:
@@ -166,10 +141,7 @@ def _entries(a: Array) -> Six:
 
 def _magnus(turning: _Turning, state0: Attitude) -> Stepper:
     body, weights, torque = turning
-    start = split(state0)
-
-    def rate(p: Triple) -> Triple:
-        return times(weights, p)
+    start, rate = split(state0), partial(times, weights)
 
     def step(t: Any, end: Any, h: Any, y: Atoms, inputs: Any) -> Atoms:
         law = bind(torque, inputs)

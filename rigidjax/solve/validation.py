@@ -21,9 +21,7 @@ from rigidjax.rotation.validation import tolerance
 
 
 def scene(body: Any, state0: Any, ts: Any, torque: Any, throw: bool) -> tuple[Any, Any, Array]:
-    """Body, start and times of a run, of one dtype, or an error; with `throw=False` invalid traced
-    numbers become NaN.
-    """
+    """Body, start and times of a run, of one dtype; with `throw=False` bad traced numbers are NaN."""
     ts = times(ts, throw)
     state0 = start(state0, throw)
     dtype = ts.dtype
@@ -76,11 +74,7 @@ def _body_of(numbers: Any, moves: bool = False) -> str:
 
 
 def real_or_nan(body: Inertia | MassProperties) -> Any:
-    """The body; where its numbers are traced and no body has them, all of them are NaN.
-
-    >>> real_or_nan(Inertia.from_principal(1.0, 2.0, 2.5)).moments
-    Array([1. , 2. , 2.5], dtype=float64)
-    """
+    """The body; where its numbers are traced and no body has them, all of them are NaN."""
     matter = isinstance(body, MassProperties)
     tensor = body.inertia.tensor if matter else body.tensor
     return possible(body, tensor, body.mass if matter else None, throw=False)
@@ -108,9 +102,6 @@ def tolerances(rtol: Any, atol: Any, dtype: Any) -> tuple[Any, Any]:
     """`rtol` and `atol`, by default suited to `dtype`; a warning if it cannot reach them.
 
     Traced ones are taken as they are.
-
-    >>> tolerances(None, 1e-10, jnp.float64)
-    (1e-09, 1e-10)
     """
     double = dtype == jnp.float64
     rtol = (1e-9 if double else 2e-5) if rtol is None else rtol
@@ -135,11 +126,8 @@ def tolerances(rtol: Any, atol: Any, dtype: Any) -> tuple[Any, Any]:
 
 
 def times(ts: Any, throw: bool) -> Array:
-    """`ts` as an array of times that increase, or decrease; poisoned where they do neither, are
-    traced and may not throw.
-
-    >>> times([0, 1, 2], True).shape
-    (3,)
+    """`ts` as an array of times that increase, or decrease; NaN where they do neither, are traced
+    and may not throw.
     """
     if isinstance(ts, (Spin, Attitude, Rigid, Point)):
         raise TypeError(f"ts: wanted times, got {type(ts).__name__}; the state comes before them")
@@ -175,9 +163,6 @@ def times(ts: Any, throw: bool) -> Array:
 def first_step(dt0: Any, times: Array) -> Array | None:
     """The length of `dt0` in the precision of `times`; refused where it is no step, goes against
     them, or is too short to count.
-
-    >>> first_step(0.5, jnp.array([0.0, 1.0]))
-    Array(0.5, dtype=float64)
     """
     if dt0 is None:
         return None
@@ -191,18 +176,19 @@ def first_step(dt0: Any, times: Array) -> Array | None:
             f"dt0: wanted a positive step, s, got {dt0}; to go back in time give decreasing ts"
         )
     if known:
-        gap = float(np.spacing(np.abs(np.asarray(times)).max()))
+        far = np.abs(np.asarray(times)).max()
+        gap = float(np.spacing(far))
         if abs(float(step)) < 8 * gap:
             raise ValueError(
                 f"dt0: steps of {dt0} s are too short for {times.dtype}, whose times near "
-                f"{float(np.abs(np.asarray(times)).max()):g} s are {gap:.2g} s apart; count time "
-                "from a later origin, or use float64"
+                f"{float(far):g} s are {gap:.2g} s apart; count time from a later origin, or use "
+                "float64"
             )
     return abs(step)
 
 
 def start(state0: Any, throw: bool) -> Any:
-    """`state0` of one body, finite, with a unit quaternion; poisoned as `times` does it."""
+    """`state0` of one body, finite, with a unit quaternion; or NaN, as for `times`."""
     if not isinstance(state0, Spin | Attitude | Rigid | Point):
         raise TypeError(
             "state0: wanted Spin, Attitude or Rigid, or Point without a body, got "

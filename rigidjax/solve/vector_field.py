@@ -39,21 +39,16 @@ def equations_of_motion(
     validation.require_fit(body, state0, torque)
     if isinstance(state0, Point):
         return scene_of(torque).field
-    matter: Any = body
-    turning: Any = torque
+    kind: Any = EulerEquations
     if isinstance(body, MassProperties):
-        return NewtonEuler(body, turning)
-    if isinstance(state0, Attitude):
-        return AttitudeEquations(matter, turning)
-    return EulerEquations(matter, turning)
+        kind = NewtonEuler
+    elif isinstance(state0, Attitude):
+        kind = AttitudeEquations
+    return kind(body, torque)
 
 
 def direction(times: Array) -> Int[Array, ""] | None:
-    """`None` for times known to increase; else the sign of t's change, known or traced.
-
-    >>> direction(jnp.array([0.0, 1.0])), int(direction(jnp.array([1.0, 0.0])))
-    (None, -1)
-    """
+    """`None` for times known to increase; else the sign of t's change, known or traced."""
     ends = _checks.namespace(times).asarray(times)
     change = ends[-1] - ends[0]
     if _checks.known(times) and change > 0:
@@ -63,27 +58,15 @@ def direction(times: Array) -> Int[Array, ""] | None:
 
 
 def ahead(
-    sign: Array | None,
-    field: Callable[..., Any],
-    condition: Callable[..., Any] | None,
-    ts: Array,
-    jumps: Array,
+    sign: Array | None, field: Callable[..., Any], condition: Any, ts: Array, jumps: Array
 ) -> tuple[Callable[..., Any], Any, Array, Array]:
     """A vector field f(t, y, args), a condition `(t, y)`, times and jump times, in s = σt.
 
     **Arguments:** `sign` σ of the direction of time, 1 or −1, `None` for s = t.
-
-    >>> field, _, ts, _ = ahead(
-    ...     jnp.asarray(-1), lambda t, y, args: t * y, None, jnp.arange(2.0), jnp.zeros(0)
-    ... )
-    >>> float(field(jnp.asarray(-3.0), jnp.asarray(2.0), None)), ts.tolist()
-    (-6.0, [-0.0, -1.0])
     """
     if sign is None:
         return field, condition, ts, jumps
-
-    def time(s: Array) -> Array:
-        return sign.astype(s.dtype) * s
+    time = lambda s: sign.astype(s.dtype) * s  # noqa: E731
 
     def directed(s: Array, y: Any, args: Any = None) -> Any:
         t = time(s)
@@ -94,8 +77,7 @@ def ahead(
             still = lax.stop_gradient(t)
             before = jnp.nextafter(still, jnp.full_like(still, -jnp.inf))
             t = t + jnp.where(sign < 0, before - still, jnp.zeros_like(still))
-        slope = field(t, y, args)
-        return jax.tree.map(lambda leaf: sign.astype(leaf.dtype) * leaf, slope)
+        return jax.tree.map(lambda leaf: sign.astype(leaf.dtype) * leaf, field(t, y, args))
 
     asked = None if condition is None else lambda s, y: condition(time(s), y)
     return directed, asked, time(ts), time(jumps)
