@@ -95,13 +95,12 @@ def simulate(
     - `solver`: `None` takes the closed form for free bodies, `rigidjax.solvers.DormandPrince8`
       under a torque, and the choice of `rollout` for `Steps`. With times any
       `diffrax.AbstractSolver` may be given; the explicit ones of `rigidjax.solvers` run in our own
-      loop (256 heavy tops at 1e-9 take a seventh of the time that `jax.vmap` of plain
-      `diffrax.Dopri8` takes).
+      loop.
     - `rtol`, `atol`, `max_steps`, `adjoint`: as for `rigidjax.simulate`.
 
-    Bodies of one chunk take steps until the last of them has arrived. Bodies are therefore ordered
-    by their initial rate, so that bodies of a chunk are alike. A body that becomes NaN ends within
-    two steps. The other bodies get the same bits whatever happens to one.
+    Bodies of one chunk take steps until the last of them has arrived; they are therefore computed
+    in the order of their initial rates. A body that becomes NaN ends within two steps. The other
+    bodies get the same bits whatever happens to one.
 
     **Returns** `ts`, `ys`, `result`, `num_steps` and `own` of each body (`Batch`). Nothing is
     raised for what happens during a run: look at `result`.
@@ -130,55 +129,35 @@ def simulate(
         max_steps = _checks.whole(max_steps, "max_steps", 1)
         rtol, atol = validation.tolerances(rtol, atol, batch.dtype)
         solver = DormandPrince8() if solver is None else solver
-    chunk, mesh = chunk_of(chunk, batch.dtype, batch.many), mesh_of(devices)
-    plan = _Plan(solver, rtol, atol, max_steps, adjoint, chunk, mesh)
+    how = dict(solver=solver, rtol=rtol, atol=atol, max_steps=max_steps, adjoint=adjoint)
+    among = chunk_of(chunk, batch.dtype, batch.many), mesh_of(devices)
     numbers = (batch.shared, batch.each, ts)
-    ys, result, steps, own = _compiled(plan, batch.rest, numbers)
-    return Batch(ts, ys, result, steps, own)
+    return Batch(ts, *_compiled(how, among, batch.rest, numbers))
 
 
-class _Plan(eqx.Module):
-    """The compiled program. Without a solver it is the closed form."""
-
-    solver: dfx.AbstractSolver | None
-    rtol: float | None = eqx.field(static=True)
-    atol: float | None = eqx.field(static=True)
-    max_steps: int = eqx.field(static=True)
-    adjoint: dfx.AbstractAdjoint | None
-    chunk: int = eqx.field(static=True)
-    mesh: Any = eqx.field(static=True)
-
-
-def _run(plan: _Plan, rest: Any, numbers: Any) -> Any:
-    shared, each, ts = numbers
+def _run(how: dict[str, Any], among: Any, rest: Any, numbers: Any) -> Any:
+    (shared, each, ts), (chunk, mesh) = numbers, among
 
     def one(given: Any, each: Any) -> Any:
         shared, ts = given
         body, state0, torque = one_of(shared, each, rest)
-        if plan.solver is None:
-            return _free(body, state0, ts)
-        return _adaptive(plan, body, state0, torque, ts)
+        if how["solver"] is None:
+            later = FreeMotion(body, state0)(ts[1:] - ts[0])
+            ys = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), state0, later)
+            return ys, _status(ys, body), jnp.zeros((), jnp.int32), None
+        found = simulate_one(body, state0, ts, torque, throw=False, **how)
+        return found.ys, found.result, jnp.asarray(found.stats["num_steps"], jnp.int32), found.own
 
-    if plan.solver is None:
-        return over_bodies(one, (shared, ts), each, plan.chunk, plan.mesh)
-
-    def quick(each: Any) -> Array:
-        return quickness(*one_of(shared, each, rest), ts[0])
-
-    parts = 1 if plan.mesh is None else plan.mesh.devices.size
-    order, back = dealt(jax.vmap(quick)(each), plan.chunk, parts)
+    if how["solver"] is None:
+        return over_bodies(one, (shared, ts), each, chunk, mesh)
+    quick = jax.vmap(lambda each: quickness(*one_of(shared, each, rest), ts[0]))(each)
+    order, back = dealt(quick, chunk, 1 if mesh is None else mesh.devices.size)
     each = jax.tree.map(lambda a: a[order], each)
-    out = over_bodies(one, (shared, ts), each, plan.chunk, plan.mesh)
+    out = over_bodies(one, (shared, ts), each, chunk, mesh)
     return jax.tree.map(lambda a: a[back], out)
 
 
 _compiled = Compiled(_run)
-
-
-def _free(body: Any, state0: Any, ts: Array) -> Any:
-    later = FreeMotion(body, state0)(ts[1:] - ts[0])
-    ys = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), state0, later)
-    return ys, _status(ys, body), jnp.zeros((), jnp.int32), None
 
 
 def _status(ys: Any, body: Any) -> dfx.RESULTS:
@@ -192,14 +171,6 @@ def _statuses(batch: BodyBatch, ys: Any) -> dfx.RESULTS:
         return _status(ys, one_of(batch.shared, each, batch.rest)[0])
 
     return jax.vmap(one)(batch.each, ys)
-
-
-def _adaptive(plan: _Plan, body: Any, state0: Any, torque: Any, ts: Array) -> Any:
-    names = ("solver", "rtol", "atol", "max_steps", "adjoint")
-    how: Any = {name: getattr(plan, name) for name in names}
-    found = simulate_one(body, state0, ts, torque, throw=False, **how)
-    steps = jnp.asarray(found.stats["num_steps"], jnp.int32)
-    return found.ys, found.result, steps, found.own
 
 
 def _equal(steps: Steps, bodies: Any, states0: Any, torque: Any, **how: Any) -> Batch[Any]:
@@ -216,10 +187,7 @@ def _equal(steps: Steps, bodies: Any, states0: Any, torque: Any, **how: Any) -> 
 
 
 def quickness(body: Any, state0: Any, torque: Any, t0: Array) -> Array:
-    """The rate of change of the motion at the start, rad/s; the number of steps grows with it.
-
-    **Returns** a scalar, `|Ω| + √|dΩ/dt|`; NaN if the derivative is NaN.
-    """
+    """`|Ω| + √|dΩ/dt|` at the start, rad/s: the number of steps grows with it."""
     y0 = started(body, state0, torque, t0)
     slope = motion_of(equations_of_motion(body, y0, torque)(t0, y0, None))
     rate, change = jnp.sum(state0.omega**2), jnp.sum(slope.omega**2)
@@ -230,10 +198,6 @@ def dealt(key: Array, chunk: int, parts: int) -> tuple[Array, Array]:
     """An order by `key` (N,), NaN last, and the way back from it.
 
     Several devices get chunks in turn, so that each has quick and slow ones.
-
-    >>> order, back = dealt(jnp.array([3.0, 1.0, 2.0]), 128, 1)
-    >>> order.tolist(), back.tolist()
-    ([1, 2, 0], [2, 0, 1])
     """
     order, count = jnp.argsort(key), key.shape[0]
     chunk = min(chunk, -(-count // parts))

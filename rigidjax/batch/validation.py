@@ -89,13 +89,11 @@ def bodies_of(bodies: Any, states0: Any, torque: Any, torque_axes: Any) -> BodyB
         _own_torque(arrays[2], torque_axes, count),
     )
     each, shared = eqx.partition(arrays, axes)
-    found = BodyBatch(shared, each, rest, count, dtype)
     # Shapes are enough for an Inertia; taking a row costs as much as many steps.
     shape = lambda a: jax.ShapeDtypeStruct(a.shape[1:], a.dtype)  # noqa: E731
-    matter = isinstance(bodies, MassProperties)
-    first = jax.tree.map((lambda a: a[0]) if matter else shape, each)
-    validation.require_fit(*eqx.combine(shared, first, rest))
-    return found
+    row = (lambda a: a[0]) if isinstance(bodies, MassProperties) else shape
+    validation.require_fit(*eqx.combine(shared, jax.tree.map(row, each), rest))
+    return BodyBatch(shared, each, rest, count, dtype)
 
 
 def driven_by(inputs: Any, torque: Any, states0: Any, count: int, h: Array) -> Any:
@@ -106,11 +104,13 @@ def driven_by(inputs: Any, torque: Any, states0: Any, count: int, h: Array) -> A
     a mapping.
     """
     for name, delay in delays_of(torque):
-        if _checks.known((delay, h)) and (np.abs(np.asarray(delay)) >= count * float(h)).any():
-            raise ValueError(
-                f"inputs[{name!r}]: a delay of {np.abs(np.asarray(delay)).max():.6g} s, and a run "
-                f"of {count * float(h):.6g} s: none of it would be seen"
-            )
+        if _checks.known((delay, h)):
+            longest, whole = np.abs(np.asarray(delay)).max(), count * float(h)
+            if longest >= whole:
+                raise ValueError(
+                    f"inputs[{name!r}]: a delay of {longest:.6g} s, and a run of {whole:.6g} s: "
+                    "none of it would be seen"
+                )
     wanted = (*states0.omega.shape[:1], count)
     found = {}
     for name, value in require_inputs(torque, inputs).items():

@@ -37,12 +37,11 @@ def cpu_flags() -> CpuFlags:
     """The flag to export before Python starts, for loops over one or few bodies on CPU.
 
     XLA compiles a small loop as one kernel; this undocumented option sets the limit of small. It
-    helps if the loop's state is larger than a kilobyte and the arrays are short: on
-    jaxlib 0.12.0.1 one heavy top with `diffrax.Dopri8` took 0.7 of the time, in our own loop 0.8,
-    and a `rollout` of one free body 0.45. `rollout` of many bodies is as fast without. It acts on
-    the whole process, and only if it is there before JAX first looks for devices. This function
-    only tells; it sets nothing. **Returns** `xla_flags`, whether they are `set`, the versions of
-    jaxlib that were `checked`, and the `jaxlib` in use (`CpuFlags`).
+    helps if the loop's state is larger than a kilobyte and the arrays are short: on jaxlib 0.12.0.1
+    a `rollout` of one free body took 0.45 of the time; of many bodies it is as fast without. It
+    acts on the whole process, and only if it is there before JAX first looks for devices. This
+    function sets nothing. **Returns** `xla_flags`, whether they are `set`, the versions of jaxlib
+    that were `checked`, and the `jaxlib` in use (`CpuFlags`).
 
     >>> print(cpu_flags().xla_flags.split()[-1])
     --xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=10000000

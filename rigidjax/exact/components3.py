@@ -9,6 +9,8 @@ from rigidjax._types import Scalar
 Triple = tuple[Scalar, ...]
 Four = tuple[Scalar, ...]
 Six = tuple[Scalar, ...]
+# ½ a : b of two symmetric matrices is the sum of these times the products of their entries.
+HALF = (0.5, 0.5, 0.5, 1.0, 1.0, 1.0)
 
 
 def plus(a: Triple, b: Triple) -> Triple:

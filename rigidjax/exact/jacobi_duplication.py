@@ -5,10 +5,9 @@ A free body needs only the solution of
     S' = C D,   C' = −p S D,   D' = −q S C,   S(0) = 0, C(0) = D(0) = 1,
 
 with `C² = 1 − p S²`, `D² = 1 − q S²`: sn, cn, dn in a scaling that needs neither `p > q` nor
-`p, q ≠ 0`. With p = q = 0 (a sphere, or rest) it is S = t; with p = q it is the separatrix; with
-q = 0 a symmetric top or a spin about an axis. No case is special, and nothing is divided by p, q
-or p − q. Start from the Taylor series at `u/2^N` and apply the duplication formula N times (DLMF
-22.6(ii)). Three things keep the digits:
+`p, q ≠ 0`. p = q = 0 is a sphere, or rest; p = q the separatrix; q = 0 a symmetric top or a spin
+about an axis. Nothing is divided by p, q or p − q. Start from the Taylor series at `u/2^N` and
+apply the duplication formula N times (DLMF 22.6(ii)). Three things keep the digits:
 
 * p − q is a separate number: `C(2u) ∝ C⁴ − p(p − q)S⁴` keeps its digits near the separatrix,
   whereas `1 − m` from m would lose them;

@@ -93,9 +93,10 @@ def adaptive(
     if jumps is not None and jumps.size:
         inside = jnp.clip(jnp.sort(jumps.astype(ts.dtype)), ts[0], ts[-1])
         stops = jnp.concatenate([inside, stops])
-    tolerances = (jnp.asarray(a, numbers.dtype) for a in (rtol, atol))
+    rtol, atol = (jnp.asarray(a, numbers.dtype) for a in (rtol, atol))
     h0 = jnp.asarray(jnp.nan if dt0 is None else dt0, ts.dtype)
-    out = _solved(method, smooth, constants, Run(ts[0], stops, ts[1:-1], numbers, *tolerances, h0))
+    run = Run(ts[0], stops, ts[1:-1], numbers, rtol, atol, h0)
+    out = _solved(method, smooth, constants, run)
     result = outcome(out.h, out.t, ts[-1], out.h == HALTED)
     rows = jnp.concatenate([numbers[None], out.between, out.end[None]])
     ys = jax.vmap(partial(unflat, like=y0))(rows)
@@ -141,7 +142,7 @@ def _solved(method: Method, smooth: list[bool], constants: Arrays, run: Run) -> 
         # A number without a tangent needs no derivative.
         there = [not isinstance(t, SymbolicZero) for t in tangents]
         moving = [s and t for s, t in zip(smooth, there[:number], strict=True)], there[number:]
-        along = [t for t, m in zip(tangents, sum(moving, []), strict=True) if m]
+        along = [t for t, m in zip(tangents, [*moving[0], *moving[1]], strict=True) if m]
         found = recorded(*primals)
         push = partial(mapped, partial(_pushed, moving), len(along))
         given = [*primals, *found[head:]]
@@ -210,8 +211,8 @@ def _again(
 
     def of_moving(chosen: Arrays, t: Array, y: Array) -> Array:
         rest = iter(chosen)
-        whole = [next(rest) if m else c for c, m in zip(constants, moving[0], strict=True)]
-        return method.field(whole, t, y)
+        mixed = [next(rest) if m else c for c, m in zip(constants, moving[0], strict=True)]
+        return method.field(mixed, t, y)
 
     chosen = [c for c, m in zip(constants, moving[0], strict=True) if m]
     return method._replace(field=of_moving), chosen, run, record, each[whole:]

@@ -83,8 +83,8 @@ def cotangents(
             k = part.number - 1 - k
             row = part.rows[k]
             by = lambda t0, stops: times_of(run._replace(t0=t0, stops=stops), row)  # noqa: E731
-            (*times, end), of_times = jax.vjp(by, run.t0, run.stops)
-            here = Step(*times, end, row[HEAD:])
+            (t, h, end), of_times = jax.vjp(by, run.t0, run.stops)
+            here = Step(t, h, end, row[HEAD:])
             dense, seeds, of_slopes, between = False, [], None, of_run.between
             if known is not None:
                 dense = jnp.any(known[k] < known[k + 1])

@@ -37,7 +37,6 @@ from rigidjax.solve.crossing_loop import Located, Motion, Search
 from rigidjax.solve.explicit import AbstractExplicit
 from rigidjax.solve.linear_map import no_tangent
 from rigidjax.solve.run import Free, Loop
-from rigidjax.solve.runge_kutta import Step
 from rigidjax.solve.step_control import Method, Run, first_step, tried
 from rigidjax.solve.vector_field import ahead, equations_of_motion
 
@@ -50,9 +49,8 @@ _CLEAR = 16
 class Section(NamedTuple):
     """The section and the motion, in s = σt, which increases.
 
-    **Fields:** `solver` a method of ours, or `None` for the closed form; `motion(constants, s, y)`
-    dy/ds, or the state itself in closed form; `rates(constants, s, y)` g, dg/ds and dy/ds; `like` a
-    state; `sign` σ.
+    **Fields:** `solver` `None` for the closed form; `motion(constants, s, y)` dy/ds, or the state
+    itself in closed form; `rates(constants, s, y)` g, dg/ds and dy/ds; `like` a state; `sign` σ.
     """
 
     solver: AbstractExplicit | None
@@ -92,10 +90,8 @@ def section(
 
     def rates(s: Array, y: Array) -> tuple[Array, Array, Array]:
         there = slope(s, y)
-        g, rate = jax.jvp(
-            lambda s, y: condition(s, unflat(y, state0)), (s, y), (jnp.ones_like(s), there)
-        )
-        return g, rate, there
+        of_y = lambda s, y: condition(s, unflat(y, state0))  # noqa: E731
+        return *jax.jvp(of_y, (s, y), (jnp.ones_like(s), there)), there
 
     if isinstance(setup, Loop):
         solver, motion = setup.solver, slope
@@ -119,9 +115,8 @@ def _spacing(body: Any, state0: Any, whole: Array) -> Array:
     tensor, omega = lax.stop_gradient((inertia.tensor, state0.omega))
     momentum = jnp.sum(tensor * omega[None], axis=1)
     least = jnp.linalg.eigvalsh(tensor)[0]
-    rate = jnp.minimum(
-        jnp.sqrt(jnp.sum(momentum * omega) / least), jnp.sqrt(jnp.sum(momentum**2)) / least
-    )
+    by_energy = jnp.sqrt(jnp.sum(momentum * omega) / least)
+    rate = jnp.minimum(by_energy, jnp.sqrt(jnp.sum(momentum**2)) / least)
     return jnp.where(rate * whole > 1, 2 * np.pi / (_SAMPLES * rate), whole / _SAMPLES)
 
 
@@ -149,10 +144,8 @@ def _located(
         many = 1 if solver is None else jnp.sqrt(1 + steps.astype(y.dtype))
         return ~(clear(s, y) < _CLEAR * many)
 
-    def in_closed_form(step: Step) -> tuple[Array, Array]:
-        return motion(constants, step.end, step.y), jnp.zeros_like(run.rtol)
-
-    attempt, order = in_closed_form, 1
+    order, still = 1, jnp.zeros_like(run.rtol)
+    attempt: Any = lambda step: (motion(constants, step.end, step.y), still)  # noqa: E731
     if solver is not None:
         method = Method(solver.tableau, motion, project, None, leaf_sizes(section.like), 0)
         h0, _ = first_step(method, constants, run)
@@ -202,8 +195,7 @@ def crossings_of(section: Section, what: Search, numbers: Numbers) -> Located:
     @answer.defjvp
     def _(primals: Any, tangents: Any) -> Any:
         found = located(section, what, *primals)
-        again = partial(_corrected, section, what, found)
-        value, moved = jax.jvp(again, primals, tangents)
+        value, moved = jax.jvp(partial(_corrected, section, what, found), primals, tangents)
         rest = [no_tangent(a) for a in found[2:]]
         return Located(*value, *found[2:]), Located(*moved, *rest)  # pyright: ignore
 
@@ -221,23 +213,19 @@ def _corrected(
     if section.solver is None:
         ys = jax.vmap(lambda s: section.motion(constants, s, run.y0))(ts)
     else:
-        out = adaptive(
-            section.solver,
-            lambda s, y, args: unflat(section.motion(constants, s, flat(y)), section.like),
-            jnp.concatenate([run.t0[None], ts]),
-            unflat(run.y0, section.like),
-            rtol=lax.stop_gradient(run.rtol),
-            atol=lax.stop_gradient(run.atol),
-            dt0=lax.stop_gradient(run.h0),
-            max_steps=what.max_steps,
-            jumps=run.stops[:-1],
+        field = lambda s, y, args: unflat(  # noqa: E731
+            section.motion(constants, s, flat(y)), section.like
         )
+        rtol, atol, h0 = lax.stop_gradient((run.rtol, run.atol, run.h0))
+        out = adaptive(
+            section.solver, field, jnp.concatenate([run.t0[None], ts]),
+            unflat(run.y0, section.like), rtol=rtol, atol=atol, dt0=h0, max_steps=what.max_steps,
+            jumps=run.stops[:-1],
+        )  # fmt: skip
         ys = jax.vmap(flat)(out.ys)[1:]
-    times, states = jax.vmap(partial(correction, section, constants))(ts, ys, there)
-    times, states = (
-        value + (a - lax.stop_gradient(a))
-        for value, a in ((ts, times), (lax.stop_gradient(found.states), states))
-    )
+    moved = jax.vmap(partial(correction, section, constants))(ts, ys, there)
+    known = ts, lax.stop_gradient(found.states)
+    times, states = (a + (b - lax.stop_gradient(b)) for a, b in zip(known, moved, strict=True))
     return jnp.where(there, times, jnp.nan), jnp.where(there[:, None], states, jnp.nan)
 
 

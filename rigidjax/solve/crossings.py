@@ -23,7 +23,7 @@ from rigidjax.solve import validation
 from rigidjax.solve.components import flat, unflat
 from rigidjax.solve.crossing_loop import Search
 from rigidjax.solve.crossing_search import correction, crossings_of, located, section
-from rigidjax.solve.explicit import AbstractExplicit, DormandPrince8
+from rigidjax.solve.explicit import AbstractExplicit, explicit
 from rigidjax.solve.linear_map import nan_derivatives
 from rigidjax.solve.run import Free, Loop, solve
 from rigidjax.solve.step_control import of_body, outcome
@@ -71,10 +71,8 @@ class Event(eqx.Module):
     ):
         self.condition = _checks.function(condition, "condition", "(t, state, body) → scalar")
         if isinstance(direction, bool) or direction not in (-1, 0, 1):
-            raise ValueError(
-                "direction: wanted 1 (on the way up), -1 (on the way down) or 0 (both), got "
-                f"{direction!r}"
-            )
+            words = "direction: wanted 1 (on the way up), -1 (on the way down) or 0 (both), got "
+            raise ValueError(f"{words}{direction!r}")
         self.direction = int(direction)
         self.max_step = max_step
         if max_step is not None:
@@ -147,9 +145,8 @@ def crossings(
 
     A start on the section does not count, and a tangential contact may be missed. A condition that
     is always zero to round-off, such as an energy minus its value, has no crossing: a zero counts
-    if the condition goes through it 16 times as fast as round-off could make it (in closed form;
-    else times the root of the number of steps). Many bodies:
-    `jax.vmap(lambda start: rj.crossings(body, start, …))`.
+    if the condition goes through it 16 times as fast as round-off could make it (under a solver,
+    times the root of the number of steps). For many bodies use `jax.vmap`.
 
     **Returns** `times`, `states`, their `count`, `result` and `num_steps` (`Crossings`). Times and
     states have first and second derivatives with respect to all numbers of the scene, of
@@ -174,21 +171,15 @@ def crossings(
     begin, end = _checks.time(t0, "t0"), _checks.time(t1, "t1")
     if _checks.known((begin, end)) and float(begin) == float(end):
         raise ValueError(f"t1: wanted another time than t0, got {float(end):g} for both")
-    body, state0, times = validation.scene(
-        body, state0, jnp.stack([begin, end]), torque, throw=False
-    )
+    ts = jnp.stack([begin, end])
+    body, state0, times = validation.scene(body, state0, ts, torque, throw=False)
     state0 = ready(event, body, state0, torque, times[0])
-    setup: Free | Loop
     if torque is None and solver is None and body is not None:
-        setup = Free(body, False)
-    else:
-        solver = DormandPrince8() if solver is None else solver
-        _checks.instance(
-            solver, AbstractExplicit, "solver", wanted="an explicit method of rigidjax.solvers"
-        )
-        rtol, atol = validation.tolerances(rtol, atol, times.dtype)
-        way = direction_of(times)
-        setup = Loop(body, torque, solver, rtol, atol, None, way, max_steps, False)
+        return _solved(Free(body, False), event, many, max_steps, state0, times)
+    solver = explicit(solver)
+    rtol, atol = validation.tolerances(rtol, atol, times.dtype)
+    way = direction_of(times)
+    setup = Loop(body, torque, solver, rtol, atol, None, way, max_steps, False)
     return _solved(setup, event, many, max_steps, state0, times)
 
 

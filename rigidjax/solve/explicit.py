@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
+from rigidjax import _checks
 from rigidjax.motion.equations import on_the_group
 from rigidjax.solve.components import flat, leaf_sizes, unflat
 from rigidjax.solve.runge_kutta import Step, dense_rows, error_estimate, nested, stages
@@ -122,3 +123,10 @@ class DormandPrince8(AbstractExplicit):
     """
 
     tableau: ClassVar[Tableau] = DORMAND_PRINCE8
+
+
+def explicit(solver: AbstractExplicit | None) -> AbstractExplicit:
+    """The solver, `DormandPrince8` for `None`; `TypeError` for one that is not explicit."""
+    solver = DormandPrince8() if solver is None else solver
+    wanted = "an explicit method of rigidjax.solvers"
+    return _checks.instance(solver, AbstractExplicit, "solver", wanted=wanted)

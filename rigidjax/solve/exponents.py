@@ -18,7 +18,7 @@ from rigidjax.motion.manifold import dimension, minus_small, plus
 from rigidjax.solve import validation
 from rigidjax.solve.adaptive import adaptive
 from rigidjax.solve.components import flat
-from rigidjax.solve.explicit import AbstractExplicit, DormandPrince8
+from rigidjax.solve.explicit import AbstractExplicit, explicit
 
 # Neighbouring intervals are not independent: the error is that of the means of so many parts.
 _PARTS = 20
@@ -84,7 +84,9 @@ def lyapunov_exponents(
     system the exponents come in pairs ±λ; their sum is the mean divergence of `field` always.
 
     **Returns** `values` and `errors`, `times` and `running`, `state`, `result` (`Exponents`). Where
-    a run fails they are NaN, and `result` says why. Source: Dieci, Russell and Van Vleck 1997, doi:10.1137/S0036142993247311; for orthonormal
+    a run fails they are NaN, and `result` says why.
+
+    Source: Dieci, Russell and Van Vleck 1997, doi:10.1137/S0036142993247311; for orthonormal
     frames: Christiansen and Rugh 1997, doi:10.1088/0951-7715/10/5/004.
 
     **Raises:** `TypeError`, `ValueError` for invalid numbers.
@@ -117,10 +119,7 @@ def lyapunov_exponents(
     length = _checks.time(time, "time").astype(start.dtype)
     length = _checks.refuse(length, ~(length > 0), "time: wanted a positive time, s")
     rtol, atol = validation.tolerances(rtol, atol, start.dtype)
-    solver = DormandPrince8() if solver is None else solver
-    _checks.instance(
-        solver, AbstractExplicit, "solver", wanted="an explicit method of rigidjax.solvers"
-    )
+    solver = explicit(solver)
     begin = _checks.time(t0, "t0").astype(start.dtype)
     shapes = eqx.filter_eval_shape(lambda t, y: field(t, y, None), begin, state0)
     wanted, found = (jax.tree.map(jnp.shape, tree) for tree in (state0, shapes))

@@ -24,7 +24,6 @@ from rigidjax.solve.linear_map import nan_derivatives
 from rigidjax.solve.step_control import NONFINITE, finite, of_body
 from rigidjax.solve.vector_field import ahead, equations_of_motion
 
-
 _COUNTS = ("num_steps", "num_accepted_steps", "num_rejected_steps")
 
 
@@ -173,7 +172,7 @@ def refuse(ys: Any, result: dfx.RESULTS) -> Any:
 
 def _free(setup: Free, state0: Any, ts: Array) -> tuple[Any, dict[str, Any], dfx.RESULTS]:
     ys = FreeMotion(setup.body, state0)(ts - ts[0])
-    stats = dict.fromkeys(_COUNTS, jnp.zeros((), int))
+    stats: Any = dict.fromkeys(_COUNTS, jnp.zeros((), int))
     if setup.throw:
         ys = eqx.error_if(
             ys,

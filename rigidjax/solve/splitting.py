@@ -216,8 +216,8 @@ def compose(
         (drift, kick), before = weights, momentum
         length = drift.astype(dtype)
         momentum, (w, x, y, z) = flow(frame.moments, before, length)
-        # The flow's own round-off of |Π| is not even, and would add up over a million steps. This is
-        # one of Newton's steps, as what is to be added: a factor near 1 is not rounded evenly.
+        # The flow's round-off of |Π| is not even, and would add up over a million steps. Newton's
+        # step gives what is to be added: a factor near 1 is not rounded evenly.
         a, b = (sum(x * x for x in v) for v in (before, momentum))
         more = lax.stop_gradient(0.5 * (a - b) / jnp.where(a == 0, jnp.ones_like(a), a))
         momentum = tuple(x + more * x for x in momentum)

@@ -1,4 +1,4 @@
-"""A run with adaptive steps: its parts, its record, its step control. Bodies are in the last axis."""
+"""The parts of a run with adaptive steps, its record, its control. Bodies are in the last axis."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple

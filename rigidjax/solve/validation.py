@@ -21,7 +21,7 @@ from rigidjax.rotation.validation import tolerance
 
 
 def scene(body: Any, state0: Any, ts: Any, torque: Any, throw: bool) -> tuple[Any, Any, Array]:
-    """Body, start and times of a run, of one dtype; with `throw=False` bad traced numbers are NaN."""
+    """Body, start, times of a run, of one dtype; with `throw=False` bad traced numbers are NaN."""
     ts = times(ts, throw)
     state0 = start(state0, throw)
     dtype = ts.dtype
