@@ -21,9 +21,9 @@ from rigidjax.exact.free_body import FreeMotion
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.coupled import Coupled, motion_of, started
 from rigidjax.solve import equations_of_motion, simulate as simulate_one, validation
+from rigidjax.solve.adaptive_loop import NONFINITE, finite, of_body
 from rigidjax.solve.explicit import DormandPrince8
 from rigidjax.solve.magnus import Magnus4
-from rigidjax.solve.step_control import NONFINITE, finite, of_body
 
 State = TypeVar("State", Spin, Attitude, Rigid)
 

@@ -13,11 +13,11 @@ from jaxtyping import Array
 
 from rigidjax.motion.equations import on_the_group
 from rigidjax.solve import adaptive_loop, adjoint
+from rigidjax.solve.adaptive_loop import HALTED, Answer, Method, Record, Run, outcome
 from rigidjax.solve.batching import Arrays, Layout, in_lanes
 from rigidjax.solve.components import flat, leaf_sizes, unflat
 from rigidjax.solve.explicit import AbstractExplicit
 from rigidjax.solve.linear_map import is_smooth, linear_map, no_tangent, refuse
-from rigidjax.solve.step_control import HALTED, Answer, Method, Record, Run, outcome
 
 
 class Found(NamedTuple):
@@ -179,13 +179,15 @@ def _over_bodies(method: Method, layout: Layout, constants: Arrays) -> Method:
 
 
 def _value(method: Method, layout: Layout, constants: Arrays, each: Arrays) -> Arrays:
-    method = _over_bodies(method, layout, constants)
-    return list(adaptive_loop.value(method, constants, Run(*each)))
+    method, run = _over_bodies(method, layout, constants), Run(*each)
+    if run.between.shape[0]:
+        return list(adaptive_loop.recording(method, constants, run, adjoint.saved)[0])
+    return list(adaptive_loop.value(method, constants, run))
 
 
 def _recorded(method: Method, layout: Layout, constants: Arrays, each: Arrays) -> Arrays:
     method = _over_bodies(method, layout, constants)
-    answer, record = adaptive_loop.recording(method, constants, Run(*each))
+    answer, record = adaptive_loop.recording(method, constants, Run(*each), adjoint.saved)
     return [*answer, *record]
 
 

@@ -1,38 +1,29 @@
-"""Adaptive steps, for one body or many, with the states at any times.
+"""Adaptive steps, for one body or many, with the states at any times. Bodies are in the last axis.
 
 For saved states and derivatives the steps are recorded in segments: the start of each is kept, and
 the steps of the last one; derivatives run the others once more.
 """
 
+from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
+import diffrax as dfx
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
-from jaxtyping import Array
+from jaxtyping import Array, Bool
 
-from rigidjax.solve import dense_output
 from rigidjax.solve.components import lift
-from rigidjax.solve.runge_kutta import Step
-from rigidjax.solve.step_control import (
-    HALTED,
-    HEAD,
-    LAST,
-    NONE,
-    STEP,
-    Answer,
-    LoopState,
-    Method,
-    Record,
-    Rows,
-    Run,
-    Segment,
-    at,
-    controlled,
-    first_step,
-    packed,
-    tried,
-)
+from rigidjax.solve.runge_kutta import Field, Step, error_estimate, stages
+from rigidjax.solve.tableaus import Tableau
+
+# diffrax inherits it from optimistix, where type checkers do not follow.
+NONFINITE: Any = dfx.RESULTS.nonfinite
+
+# The defaults of diffrax.PIDController: the same steps, so that figures can be compared.
+_SAFETY, _SMALLEST, _LARGEST = 0.9, 0.2, 10.0
 
 # Steps in a segment, rejected ones included.
 SEGMENT = 512
@@ -43,10 +34,237 @@ _MORE = 64
 _BLOCK, _MOST = 560, 8
 
 
+class Method(NamedTuple):
+    """The parts of a run besides its numbers.
+
+    **Fields:** `tableau`; `field` and `project`, on (n, *bodies); `halt(t, y)` whether the run ends
+    here, or `None`; `sizes` how many numbers each array of the state has; `max_steps`.
+    """
+
+    tableau: Tableau
+    field: Field
+    project: Callable[[Array], Array]
+    halt: Callable[[Array, Array], Array] | None
+    sizes: list[int]
+    max_steps: int
+
+
+class Run(NamedTuple):
+    """The numbers of a run, a last axis of bodies in each.
+
+    **Fields:** `t0`; `stops` (J,) where the torque jumps, and the last time; `between` (K,) times
+    asked for; `y0` (n,); `rtol`, `atol`; `h0` the first step, NaN to choose one.
+    """
+
+    t0: Array
+    stops: Array
+    between: Array
+    y0: Array
+    rtol: Array
+    atol: Array
+    h0: Array
+
+    @property
+    def before(self) -> Array:
+        """The last moment before each stop (J,): a stage there sees the torque before the jump."""
+        jumps = lax.stop_gradient(self.stops[:-1])
+        gap = jnp.nextafter(jumps, jnp.full_like(jumps, -jnp.inf)) - jumps
+        return jnp.concatenate([self.stops[:-1] + gap, self.stops[-1:]])
+
+
+class LoopState(NamedTuple):
+    """The state of the loop: time, next step, index of the next stop, counters, state."""
+
+    t: Array
+    h: Array
+    stop: Array
+    steps: Array
+    rejected: Array
+    y: Array
+
+
+# A recorded attempt is one row (4 + n, *bodies): start, length, kind, index of the stop ahead, and
+# the state at the start. Kinds: no step was taken; a step; a step that ends on the stop.
+Rows = Array
+HEAD = 4
+NONE, STEP, LAST = range(3)
+# The next step of a run that has met the condition that ends it.
+HALTED = -1.0
+
+
+def packed(loop: LoopState) -> Array:
+    """A `LoopState` as one row. Whole numbers are exact in it up to 2²⁴ in float32."""
+    return jnp.concatenate([jnp.stack([a.astype(loop.y.dtype) for a in loop[:-1]]), loop.y])
+
+
+def unpacked(row: Array) -> LoopState:
+    """The inverse of `packed`."""
+    head = len(LoopState._fields) - 1
+    stop, steps, rejected = row[2:head].astype(jnp.int32)
+    return LoopState(row[0], row[1], stop, steps, rejected, row[head:])
+
+
+class Record(NamedTuple):
+    """A recorded run: the start of each segment (S, 5 + n, *bodies) and the end of the last, how
+    many segments there are, and the last one's rows and how many they are.
+    """
+
+    starts: Array
+    number: Array
+    rows: Rows
+    filled: Array
+
+
+class Answer(NamedTuple):
+    """States `between` (K, n, *bodies) and at the `end` (n, *bodies), NaN if not reached; time,
+    state and next step of the loop at its end (0 or NaN if no step is left to try, `HALTED`), and
+    its counters.
+    """
+
+    between: Array
+    end: Array
+    t: Array
+    last: Array
+    h: Array
+    steps: Array
+    rejected: Array
+
+
+class Segment(NamedTuple):
+    """A part of a run: its rows, the time at which each begins (inf where there is none), times of
+    its start and end, and the number of rows.
+    """
+
+    rows: Rows
+    times: Array
+    begin: Array
+    end: Array
+    number: Array
+
+
+def times_of(run: Run, rows: Rows) -> tuple[Array, Array, Array]:
+    """Start, length and end of the steps of rows (4 + n, *bodies).
+
+    The start moves with the stop before it, the length of a step that ends on a stop with both; all
+    other lengths are held.
+    """
+    t, h, kind, stop = lax.stop_gradient(rows[:HEAD])
+    stop, last = stop.astype(jnp.int32), kind == LAST
+    begun = at(jnp.concatenate([run.t0[None], run.stops]), stop)
+    t = t + (begun - lax.stop_gradient(begun))
+    end = at(run.before, stop)
+    h = jnp.where(last, end - t, h)
+    return t, h, jnp.where(last, end, t + h)
+
+
+def at(a: Array, index: Array) -> Array:
+    """a[index] of each body; a (J, *bodies), index (*many, *bodies)."""
+    count = a.shape[0]
+    a = a.reshape(count, *[1] * (index.ndim + 1 - a.ndim), *a.shape[1:])
+    if count == 1:
+        return jnp.broadcast_to(a[0], index.shape)
+    index = jnp.clip(index, 0, count - 1)
+    # It is quicker to add up so few rows than to look for one, also in derivatives.
+    if count <= 8:
+        each = jnp.arange(count, dtype=index.dtype).reshape(-1, *[1] * index.ndim)
+        return jnp.sum(jnp.where(each == index[None], a, 0), 0)
+    a = jnp.broadcast_to(a, (count, *index.shape))
+    return jnp.take_along_axis(a, index[None], 0)[0]
+
+
+def finite(tree: Any) -> Bool[Array, ""]:
+    """Whether every number in `tree` is finite."""
+    good = jnp.asarray(True)
+    for leaf in jax.tree.leaves(tree):
+        good = good & jnp.all(jnp.isfinite(leaf))
+    return good
+
+
+def of_body(result: dfx.RESULTS, body: Any) -> dfx.RESULTS:
+    """The result of a run; `nonfinite_input` where the body is NaN: no body has its numbers."""
+    return dfx.RESULTS.where(finite(body), result, dfx.RESULTS.nonfinite_input)  # pyright: ignore
+
+
+def tried(method: Method, constants: list[Array], run: Run, step: Step) -> tuple[Array, Array]:
+    """The state a step later, and the root mean square of its error over the tolerance."""
+    there = stages(method.tableau, method.field, constants, step)
+    left, right = step.y, method.project(there.end)
+    error = error_estimate(method.tableau, method.sizes, step.h, there.slopes)
+    largest = jnp.maximum(jnp.abs(left), jnp.abs(right))
+    scale = lift(run.atol, left) + lift(run.rtol, left) * largest
+    tiny = float(jnp.finfo(error.dtype).tiny)
+    norm = jnp.sqrt(jnp.mean((error / scale) ** 2, 0) + tiny)
+    # NaN in a step too long says as little as infinity: try a shorter one.
+    return right, jnp.where(jnp.isnan(norm), jnp.inf, norm)
+
+
+def controlled(
+    norm: Array, order: int, t: Array, h: Array, kept: Array, last: Array, length: Array
+) -> tuple[Array, Array]:
+    """Whether a step is accepted, and the next one: 0 where none is left to try, NaN after a NaN.
+
+    **Arguments:** `norm` of the error over the tolerance, as of `tried`; `t` and `h` of the
+    step, `last` whether it was cut short at a stop, `kept` what the controller had wanted there;
+    `length` of the run, whose round-off counts where that of `t` vanishes.
+    """
+    norm, h, kept = lax.stop_gradient((norm, h, kept))
+    good = norm < 1
+    factor = jnp.clip(_SAFETY * norm ** (-1 / order), _SMALLEST, _LARGEST)
+    following = h * factor.astype(h.dtype)
+    eps = jnp.finfo(h.dtype).eps
+    unit = 8 * eps * jnp.maximum(jnp.abs(t), eps * length)
+    why = jnp.where(jnp.isfinite(norm), 0.0, jnp.nan).astype(h.dtype)
+    shorter = jnp.where(following > unit, following, why)
+    longer = jnp.where(last, jnp.maximum(following, kept), following)
+    return good, jnp.where(good, longer, shorter)
+
+
+def outcome(h: Array, t: Array, end: Array, met: Array) -> dfx.RESULTS:
+    """The end of a run: its next step and time, the last time, whether it met what ends it."""
+    result = dfx.RESULTS.dt_min_reached
+    for there, word in (
+        (jnp.isnan(h), NONFINITE),
+        (h > 0, dfx.RESULTS.max_steps_reached),
+        (t >= end, dfx.RESULTS.successful),
+        (met, dfx.RESULTS.event_occurred),
+    ):
+        result = dfx.RESULTS.where(there, word, result)
+    return result
+
+
+def first_step(method: Method, constants: list[Array], run: Run) -> tuple[Array, Array]:
+    """The starting step of Hairer, Nørsett and Wanner (1993), II.4; the slope at the start."""
+    y0, t0 = run.y0, run.t0
+    scale = lift(run.atol, y0) + lift(run.rtol, y0) * jnp.abs(y0)
+
+    def norm(a: Array) -> Array:
+        return jnp.sqrt(jnp.mean((a / scale) ** 2, 0))
+
+    d0 = norm(y0)
+
+    def slope(_: Array, state: Any) -> Any:
+        # At the start, then after a short step of Euler's: one field to compile.
+        h, first, _ = state
+        now = method.field(constants, t0 + h.astype(t0.dtype), y0 + lift(h, y0) * first)
+        d1 = norm(now)
+        small = (d0 < 1e-5) | (d1 < 1e-5)
+        short = jnp.where(small, 1e-6, 0.01 * d0 / jnp.where(small, 1.0, d1)).astype(d0.dtype)
+        begun = h != 0
+        return jnp.where(begun, h, short), jnp.where(lift(begun, y0), first, now), now
+
+    h = jnp.zeros_like(d0)
+    state = (h, jnp.zeros_like(y0), jnp.zeros_like(y0))
+    h, first, last = lax.fori_loop(np.int32(0), np.int32(2), slope, state)
+    d2 = norm(last - first) / h
+    largest = jnp.maximum(norm(first), d2)
+    flat = largest <= 1e-15
+    guess = (0.01 / jnp.where(flat, 1.0, largest)) ** (1 / method.tableau.order)
+    h = jnp.minimum(100 * h, jnp.where(flat, jnp.maximum(1e-6, 1e-3 * h), guess))
+    return h.astype(t0.dtype), first
+
+
 def value(method: Method, constants: list[Array], run: Run) -> Answer:
-    """The answer, with nothing kept."""
-    if run.between.shape[0]:
-        return recording(method, constants, run)[0]
+    """The answer, with nothing kept: without states between."""
     loop = lax.while_loop(
         lambda loop: jnp.any(going(method, run, loop, None)),
         lambda loop: _attempt(method, constants, run, loop, None)[0],
@@ -55,8 +273,10 @@ def value(method: Method, constants: list[Array], run: Run) -> Answer:
     return _answer(run, loop, run.y0[None][:0])
 
 
-def recording(method: Method, constants: list[Array], run: Run) -> tuple[Answer, Record]:
-    """The answer, and what derivatives need."""
+def recording(
+    method: Method, constants: list[Array], run: Run, saved: Callable[..., Array]
+) -> tuple[Answer, Record]:
+    """The answer, and what derivatives need; `saved` as of `rigidjax.solve.adjoint`."""
     loop = start(method, constants, run)
     first, most = packed(loop), method.max_steps + run.stops.shape[0]
     starts = jnp.zeros((-(-most // SEGMENT) + 1, *first.shape), first.dtype)
@@ -69,7 +289,7 @@ def recording(method: Method, constants: list[Array], run: Run) -> tuple[Answer,
         after, rows, count = recorded(method, constants, run, loop, record.rows, None)
         if run.between.shape[0]:
             part = segment(rows, loop.t, after.t, count)
-            ys = dense_output.saved(method, constants, run, part, rows[:, HEAD:], ys)
+            ys = saved(method, constants, run, part, rows[:, HEAD:], ys)
         number = record.number + 1
         starts = lax.dynamic_update_index_in_dim(record.starts, packed(after), number, 0)
         return after, ys, Record(starts, number, rows, count)

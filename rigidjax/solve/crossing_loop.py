@@ -17,9 +17,9 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
+from rigidjax.solve.adaptive_loop import Run, at, controlled
 from rigidjax.solve.components import lift
 from rigidjax.solve.runge_kutta import Step
-from rigidjax.solve.step_control import Run, at, controlled
 
 # Newton's guesses in a step, from then on halves; and how often a step is taken again for a turn.
 _GUESSES = 8

@@ -31,14 +31,13 @@ from rigidjax.motion.equations import on_the_group
 from rigidjax.motion.torques.base import jumps_of
 from rigidjax.solve import crossing_loop
 from rigidjax.solve.adaptive import adaptive, taken_out
+from rigidjax.solve.adaptive_loop import Method, Run, first_step, tried
 from rigidjax.solve.batching import Arrays, Layout, in_lanes
 from rigidjax.solve.components import flat, leaf_sizes, unflat
 from rigidjax.solve.crossing_loop import Located, Motion, Search
 from rigidjax.solve.explicit import AbstractExplicit
 from rigidjax.solve.linear_map import no_tangent
-from rigidjax.solve.run import Free, Loop
-from rigidjax.solve.step_control import Method, Run, first_step, tried
-from rigidjax.solve.vector_field import ahead, equations_of_motion
+from rigidjax.solve.run import Free, Loop, ahead, equations_of_motion
 
 # Samples of a free body's condition in one turn at its largest rate.
 _SAMPLES = 16

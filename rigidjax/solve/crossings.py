@@ -20,14 +20,13 @@ from rigidjax.motion.coupled import Coupled, started
 from rigidjax.motion.equations import on_the_group
 from rigidjax.motion.torques.base import lacking
 from rigidjax.solve import validation
+from rigidjax.solve.adaptive_loop import of_body, outcome
 from rigidjax.solve.components import flat, unflat
 from rigidjax.solve.crossing_loop import Search
 from rigidjax.solve.crossing_search import correction, crossings_of, located, section
 from rigidjax.solve.explicit import AbstractExplicit, explicit
 from rigidjax.solve.linear_map import nan_derivatives
-from rigidjax.solve.run import Free, Loop, solve
-from rigidjax.solve.step_control import of_body, outcome
-from rigidjax.solve.vector_field import direction as direction_of
+from rigidjax.solve.run import Free, Loop, direction as direction_of, solve
 
 State = TypeVar("State", Spin, Attitude, Rigid, Point, Coupled)
 

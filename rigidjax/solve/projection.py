@@ -9,7 +9,7 @@ import jax.tree_util as jtu
 
 from rigidjax import _checks
 from rigidjax.motion.equations import on_the_group
-from rigidjax.solve.step_control import NONFINITE, finite
+from rigidjax.solve.adaptive_loop import NONFINITE, finite
 
 
 class GroupInterpolation(dfx.AbstractLocalInterpolation):

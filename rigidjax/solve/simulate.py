@@ -20,10 +20,9 @@ from rigidjax.solve.crossings import Event, ready, solve_until
 from rigidjax.solve.error import foreseen_error, solve_to
 from rigidjax.solve.explicit import AbstractExplicit, DormandPrince8
 from rigidjax.solve.projection import Projected, Watched
-from rigidjax.solve.run import Free, Loop, Setup, refuse, refuse_ended, solve
+from rigidjax.solve.run import Free, Loop, Setup, direction, refuse, refuse_ended, solve
 from rigidjax.solve.solution import Solution, State, kept, told
 from rigidjax.solve.splitting import AbstractSplitting
-from rigidjax.solve.vector_field import direction
 
 # A torque must accept the given state: gravity on a `Spin` is an error that type checkers see.
 Law = Callable[[Any, State, Any], Any] | AbstractScene | MovingFrame | None
