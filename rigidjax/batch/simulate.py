@@ -52,13 +52,6 @@ class Batch(eqx.Module, Generic[State]):
     `diffrax.RESULTS` for each body: `successful`, `nonfinite`, `nonfinite_input` (no body has these
     numbers), `max_steps_reached`, `dt_min_reached`. `num_steps` (N,) accepted and rejected, 0 for
     the closed form. `own` a tuple of the torques' own states, as `ys`, or `None`.
-
-    >>> import rigidjax as rj
-    >>> bodies = rj.Inertia(jnp.diag(jnp.array([1.0, 2.0, 3.0])))
-    >>> states = rj.Attitude(jnp.tile(jnp.eye(4)[0], (5, 1)), jnp.tile(jnp.eye(3)[2], (5, 1)))
-    >>> found = rj.batch.simulate(bodies, states, [0.0, 1.0])
-    >>> found.ys.q.shape, found.num_steps.tolist()
-    ((5, 2, 4), [0, 0, 0, 0, 0])
     """
 
     ts: Float[Array, " times"]

@@ -8,6 +8,7 @@ import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array
 
@@ -98,9 +99,12 @@ def adaptive(
     run = Run(ts[0], stops, ts[1:-1], numbers, rtol, atol, h0)
     out = _solved(method, smooth, constants, run)
     result = outcome(out.h, out.t, ts[-1], out.h == HALTED)
-    rows = jnp.concatenate([numbers[None], out.between, out.end[None]])
-    ys = jax.vmap(partial(unflat, like=y0))(rows)
-    return Found(ys, out.steps, out.rejected, result, out.t, unflat(out.last, y0))
+    end = jnp.where(out.t >= ts[-1], out.last, jnp.nan)
+    ys = jax.vmap(partial(unflat, like=y0))(
+        jnp.concatenate([numbers[None], out.between, end[None]])
+    )
+    last = unflat(lax.stop_gradient(out.last), y0)
+    return Found(ys, out.steps, out.rejected, result, out.t, last)
 
 
 def taken_out(

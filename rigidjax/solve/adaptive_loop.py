@@ -116,15 +116,13 @@ class Record(NamedTuple):
 
 
 class Answer(NamedTuple):
-    """States `between` (K, n, *bodies) and at the `end` (n, *bodies), NaN if not reached; time,
-    state and next step of the loop at its end (0 or NaN if no step is left to try, `HALTED`), and
-    its counters.
+    """States `between` (K, n, *bodies), NaN if not reached; state (n, *bodies), time and next step
+    of the loop at its end (0 or NaN if no step is left to try, `HALTED`), and its counters.
     """
 
     between: Array
-    end: Array
-    t: Array
     last: Array
+    t: Array
     h: Array
     steps: Array
     rejected: Array
@@ -270,7 +268,7 @@ def value(method: Method, constants: list[Array], run: Run) -> Answer:
         lambda loop: _attempt(method, constants, run, loop, None)[0],
         start(method, constants, run),
     )
-    return _answer(run, loop, run.y0[None][:0])
+    return Answer(run.y0[None][:0], loop.y, loop.t, loop.h, loop.steps, loop.rejected)
 
 
 def recording(
@@ -298,7 +296,8 @@ def recording(
     more = lambda state: jnp.any(going(method, run, state[0], None))  # noqa: E731
     loop, ys, record = lax.while_loop(more, one, state)
     number, filled = (jnp.broadcast_to(a, run.t0.shape) for a in (record.number, record.filled))
-    return _answer(run, loop, ys), record._replace(number=number, filled=filled)
+    answer = Answer(ys, loop.y, loop.t, loop.h, loop.steps, loop.rejected)
+    return answer, record._replace(number=number, filled=filled)
 
 
 def start(method: Method, constants: list[Array], run: Run) -> LoopState:
@@ -399,9 +398,3 @@ def segment(rows: Rows, begin: Array, end: Array, count: Array) -> Segment:
     there = jnp.arange(rows.shape[0], dtype=jnp.int32).reshape(-1, *[1] * begin.ndim) < count
     times = jnp.where(there, lax.stop_gradient(rows[:, 0]), jnp.inf)
     return Segment(rows, times, begin, end, count)
-
-
-def _answer(run: Run, loop: LoopState, between: Array) -> Answer:
-    there = loop.stop >= run.stops.shape[0]
-    end = jnp.where(lift(there, loop.y), loop.y, jnp.nan)
-    return Answer(between, end, loop.t, loop.y, loop.h, loop.steps, loop.rejected)

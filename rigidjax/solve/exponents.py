@@ -30,13 +30,7 @@ class Exponents(eqx.Module):
     **Fields:** `values` (k,) 1/s, the largest first; `errors` (k,) one standard deviation of them,
     from the differences between the means of twenty parts of the run, plus the sum of the steps'
     tolerances; `times` (N,) the ends of the intervals, s; `running` (N, k) the values up to then;
-    `state` at the end; `result` a `diffrax.RESULTS`: `successful`, or why a run
-    failed.
-
-    >>> still = lambda t, y, args: jnp.array([0.5, -1.0]) * y
-    >>> found = lyapunov_exponents(still, jnp.zeros(2), 40.0, intervals=40, transient=20)
-    >>> found.running.shape, bool(found.errors.max() < 1e-7)
-    ((20, 2), True)
+    `state` at the end; `result` a `diffrax.RESULTS`: `successful`, or why a run failed.
     """
 
     values: Float[Array, " k"]

@@ -9,7 +9,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from rigidjax import _checks, motion
@@ -17,7 +16,7 @@ from rigidjax._types import ScalarLike
 from rigidjax.frames import Point
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.coupled import Coupled, motion_of
-from rigidjax.motion.manifold import dimension, minus_small, plus
+from rigidjax.motion.manifold import dimension, minus_small, parts, plus, turns
 from rigidjax.motion.torques.states import require_stateless
 from rigidjax.solve.error import Error, error_of_run
 from rigidjax.solve.run import Free, Loop, Setup, solve
@@ -104,7 +103,7 @@ class Solution(eqx.Module, Generic[State]):
         Source: the largest finite-time Lyapunov exponent is its logarithm over t (Eckmann and
         Ruelle 1985, doi:10.1103/RevModPhys.57.617).
         """
-        found = _growth(_forward(self._setup), self.ts, self._states)
+        found = _growth(self._setup, self.ts, self._states)
         how = self._setup.controller if isinstance(self._setup, Setup) else self._setup
         rtol = getattr(how, "rtol", None)
         if rtol is None:
@@ -157,7 +156,7 @@ class Solution(eqx.Module, Generic[State]):
         [0.0, 0.0, 1.0]
         """
         require_stateless(self._setup.torque, "transition_matrix")
-        return _transition(_forward(self._setup), self.ts, self.ys)
+        return _transition(self._setup, self.ts, self.ys)
 
     def evaluate(self, t: ScalarLike) -> State:
         """The state at any `t` between the first and the last of `ts`, s.
@@ -215,35 +214,32 @@ def _drift(setup: Free | Loop | Setup, ts: Array, ys: Any) -> dict[str, Array]:
     return motion.drift(ts, ys, setup.body, setup.torque)  # pyright: ignore[reportArgumentType]
 
 
-def _forward(setup: Free | Loop | Setup) -> Free | Loop | Setup:
-    """The same run, which raises nothing, and which forward mode goes through."""
-    more = dict(adjoint=dfx.ForwardMode()) if isinstance(setup, Setup) else {}
-    return dataclasses.replace(setup, throw=False, **more)
-
-
-@eqx.filter_jit
-def _growth(setup: Free | Loop | Setup, ts: Array, ys: Any) -> Float[Array, " times"]:
-    """The largest singular value of dy(t)/dy(t0), each part relative to its largest size."""
-    sizes = jax.tree.map(_size, ys)
-    start = jax.tree.map(lambda leaf, size: leaf[0] / size, ys, sizes)
-    numbers, unravel = ravel_pytree(start)
-
-    def end(numbers: Array) -> Array:
-        y0 = jax.tree.map(lambda leaf, size: leaf * size, unravel(numbers), sizes)
-        rows = jax.tree.map(lambda leaf, size: leaf / size, solve(setup, y0, ts)[0], sizes)
-        return jax.vmap(lambda row: ravel_pytree(row)[0])(rows)
-
-    return jnp.linalg.norm(jax.jacfwd(end)(numbers), ord=2, axis=(1, 2))
-
-
 @eqx.filter_jit
 def _transition(setup: Free | Loop | Setup, ts: Array, ys: Any) -> Float[Array, "times n n"]:
+    # A run that raises nothing, and which forward mode goes through.
+    more = dict(adjoint=dfx.ForwardMode()) if isinstance(setup, Setup) else {}
+    setup = dataclasses.replace(setup, throw=False, **more)
     start = jax.tree.map(lambda leaf: leaf[0], ys)
 
     def changes(change: Array) -> Array:
         return jax.vmap(minus_small)(solve(setup, plus(start, change), ts)[0], ys)
 
     return jax.jacfwd(changes)(jnp.zeros(dimension(start), ts.dtype))
+
+
+@eqx.filter_jit
+def _growth(setup: Free | Loop | Setup, ts: Array, ys: Any) -> Float[Array, " times"]:
+    """The largest singular value of dy(t)/dy(t0), each part relative to its largest size."""
+    start = jax.tree.map(lambda leaf: leaf[0], ys)
+    each = parts(start, jnp.ones(dimension(start), ts.dtype)).values()
+    sizes = jnp.concatenate(
+        [a.reshape(-1) * _size(b) for a, b in zip(each, jax.tree.leaves(ys), strict=True)]
+    )
+    # A turn by δθ changes q by half of it.
+    for turned in turns(start):
+        sizes = sizes.at[turned].multiply(2)
+    change = _transition(setup, ts, ys) * sizes / sizes[:, None]
+    return jnp.linalg.norm(change, ord=2, axis=(1, 2))
 
 
 def _size(leaf: Array) -> Array:
