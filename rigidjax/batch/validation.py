@@ -20,15 +20,11 @@ from rigidjax.solve.components import one_dtype
 
 
 class BodyBatch(NamedTuple):
-    """A batch, split into the arrays that all bodies share and the arrays of each.
+    """A batch `(body, state0, torque)`, split into three trees."""
 
-    **Fields:** `shared`, `each` trees of the same shape, `(body, state0, torque)`, with `None`
-    where the other has the array; `rest` the leaves that are no arrays; `many` N; `dtype`.
-    """
-
-    shared: Any
-    each: Any
-    rest: Any
+    shared: Any  # the arrays that all bodies share, `None` elsewhere
+    each: Any  # the arrays of each body
+    rest: Any  # the leaves that are no arrays
     many: int
     dtype: Any
 
@@ -40,12 +36,7 @@ def one_of(shared: Any, each: Any, rest: Any) -> tuple[Any, Any, Any]:
 
 
 def bodies_of(bodies: Any, states0: Any, torque: Any, torque_axes: Any) -> BodyBatch:
-    """The batch.
-
-    **Raises:** `TypeError` for anything but bodies and states that fit together, and for states of
-    several dtypes; `ValueError` for shapes that do not agree, and, if numbers are known, for a
-    moment that is not positive or a quaternion whose length is not 1, naming the first such body.
-    """
+    """The batch; an error names the first body with a known number that is wrong."""
     if not isinstance(states0, Spin | Attitude | Rigid):
         raise TypeError(
             f"states0: wanted Spin, Attitude or Rigid, got {type(states0).__name__}; for points in "
@@ -97,12 +88,7 @@ def bodies_of(bodies: Any, states0: Any, torque: Any, torque_axes: Any) -> BodyB
 
 
 def driven_by(inputs: Any, torque: Any, states0: Any, count: int, h: Array) -> Any:
-    """The inputs of each body, by name (N, steps, *k), in the precision of the states.
-
-    **Raises:** `ValueError` for an input that is missing, or that the torque does not read, for
-    another number of bodies or steps, NaN, a delay as long as the run; `TypeError` for anything but
-    a mapping.
-    """
+    """The inputs of each body, by name (N, steps, *k), in the precision of the states."""
     for name, delay in delays_of(torque):
         if _checks.known((delay, h)):
             longest, whole = np.abs(np.asarray(delay)).max(), count * float(h)
@@ -197,11 +183,7 @@ def _unit(q: Array) -> None:
 
 
 def step_of(step_size: Any, num_steps: Any, dtype: Any) -> tuple[Array, int]:
-    """The step, s, and the number of steps.
-
-    **Raises:** `ValueError` for a step that is not positive; `TypeError` for a number of steps that
-    is not a known whole number.
-    """
+    """The step, s, and the number of steps."""
     h = _checks.floating(step_size, (), "step_size").astype(dtype)
     if _checks.known(h) and not 0 < float(h) < np.inf:
         raise ValueError(

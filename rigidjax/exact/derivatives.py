@@ -214,10 +214,7 @@ def inputs_of(moments: Six, momentum: Triple) -> tuple[Scalar, ...]:
 
 @jax.custom_jvp
 def first_order(moments: Six, momentum: Triple, t: Scalar):
-    """The result of `flow`; the derivatives of Π(t) − Π(0) by `inputs_of` and t; G = ∫ Π Πᵀ dt.
-
-    One loop of doublings gives them all.
-    """
+    """The result of `flow`; the derivatives of Π(t) − Π(0) by `inputs_of` and t; G = ∫ Π Πᵀ dt."""
     return _first_order(orbit(moments[:3], momentum), moments, momentum, t)
 
 

@@ -149,14 +149,11 @@ def elliptic(u: Scalar, m: Modulus, mu: Scalar, turn: Scalar) -> Elliptic:
 
 
 class HalfPeriod(NamedTuple):
-    """Over half a period: the time, the phase ξ, and the mean of S².
+    """What half a period gathers."""
 
-    On the separatrix the time is infinite.
-    """
-
-    time: Scalar
-    phase: Scalar
-    mean: Scalar
+    time: Scalar  # infinite on the separatrix
+    phase: Scalar  # ξ
+    mean: Scalar  # of S²
 
 
 def half_period(m: Modulus, mu: Scalar, turn: Scalar) -> HalfPeriod:
@@ -189,10 +186,7 @@ def half_period(m: Modulus, mu: Scalar, turn: Scalar) -> HalfPeriod:
 
 
 def _mean(_: Array, state: tuple[Scalar, ...]) -> tuple[Scalar, ...]:
-    """A step of the arithmetic–geometric mean, and of the sums along it.
-
-    `ratio` carries 2^{n−1}.
-    """
+    """A step of the arithmetic–geometric mean and of its sums; `ratio` carries 2^{n−1}."""
     a, b, c, ratio, total, point, part, sum_parts = state
     square, product = point * point, a * b
     part = 0.5 * part * (square - product) / (square + product)

@@ -22,12 +22,7 @@ from rigidjax.solve.linear_map import is_smooth, linear_map, no_tangent, refuse
 
 
 class Found(NamedTuple):
-    """The result of `adaptive`.
-
-    **Fields:** `ys` the states, of the type of `y0`, with a leading time axis; `num_steps`,
-    `num_rejected` of the whole run; `result` a `diffrax.RESULTS`; `last_time`, `last` the time and
-    state at the end.
-    """
+    """The result of `adaptive`; `last` is the state at the end, `last_time`."""
 
     ys: Any
     num_steps: Array
@@ -62,9 +57,10 @@ def adaptive(
     run. Derivatives are by all numbers of the field, `ts`, `jumps` and
     `y0`, lengths of steps held; not by tolerances.
 
-    **Returns** `ys`, `num_steps`, `num_rejected`, `result`, `last_time`, `last` (`Found`). A run
-    that needs more than `max_steps`, is halted, or meets a NaN that no shorter step avoids, ends
-    early: its `result` says so, and the states not reached are NaN.
+    **Returns** the states `ys`, of the type of `y0`, with a leading time axis, `num_steps`,
+    `num_rejected`, `result`, `last_time` and state `last` (`Found`). A run that needs more than
+    `max_steps`, is halted, or meets a NaN that no shorter step avoids, ends early: its `result`
+    says so, and the states not reached are NaN.
 
     **Raises:** `TypeError` for a state of several dtypes, or of another than `ts`.
 
@@ -110,10 +106,7 @@ def adaptive(
 def taken_out(
     functions: list[Callable[..., Any]], *like: Any
 ) -> tuple[list[Callable[..., Any]], Arrays, int]:
-    """Each function as `f(constants, *args)`; the constants: what they depend on, also by closure.
-
-    **Returns** the functions, the constants of all, and how many of these are the first one's.
-    """
+    """Each function as `f(constants, *args)`; the constants of all, and how many the first has."""
     constants: Arrays = []
     out, counts = [], []
     for function in functions:

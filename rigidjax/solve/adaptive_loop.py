@@ -35,34 +35,26 @@ _BLOCK, _MOST = 560, 8
 
 
 class Method(NamedTuple):
-    """The parts of a run besides its numbers.
-
-    **Fields:** `tableau`; `field` and `project`, on (n, *bodies); `halt(t, y)` whether the run ends
-    here, or `None`; `sizes` how many numbers each array of the state has; `max_steps`.
-    """
+    """The parts of a run besides its numbers."""
 
     tableau: Tableau
-    field: Field
+    field: Field  # on (n, *bodies), as `project`
     project: Callable[[Array], Array]
-    halt: Callable[[Array, Array], Array] | None
-    sizes: list[int]
+    halt: Callable[..., Array] | None  # (t, y): whether the run ends here
+    sizes: list[int]  # of the arrays of the state
     max_steps: int
 
 
 class Run(NamedTuple):
-    """The numbers of a run, a last axis of bodies in each.
-
-    **Fields:** `t0`; `stops` (J,) where the torque jumps, and the last time; `between` (K,) times
-    asked for; `y0` (n,); `rtol`, `atol`; `h0` the first step, NaN to choose one.
-    """
+    """The numbers of a run, a last axis of bodies in each."""
 
     t0: Array
-    stops: Array
-    between: Array
-    y0: Array
+    stops: Array  # (J,) where the torque jumps, and the last time
+    between: Array  # (K,) times asked for
+    y0: Array  # (n,)
     rtol: Array
     atol: Array
-    h0: Array
+    h0: Array  # the first step, NaN to choose one
 
     @property
     def before(self) -> Array:
@@ -105,46 +97,39 @@ def unpacked(row: Array) -> LoopState:
 
 
 class Record(NamedTuple):
-    """A recorded run: the start of each segment (S, 5 + n, *bodies) and the end of the last, how
-    many segments there are, and the last one's rows and how many they are.
-    """
+    """A recorded run."""
 
-    starts: Array
-    number: Array
-    rows: Rows
-    filled: Array
+    starts: Array  # of each segment (S, 5 + n, *bodies), and the end of the last
+    number: Array  # of segments
+    rows: Rows  # of the last segment
+    filled: Array  # their number
 
 
 class Answer(NamedTuple):
-    """States `between` (K, n, *bodies), NaN if not reached; state (n, *bodies), time and next step
-    of the loop at its end (0 or NaN if no step is left to try, `HALTED`), and its counters.
-    """
+    """States between, and where the loop has ended."""
 
-    between: Array
-    last: Array
+    between: Array  # (K, n, *bodies), NaN if not reached
+    last: Array  # (n, *bodies)
     t: Array
-    h: Array
+    h: Array  # the next step: 0 or NaN if none is left to try, `HALTED`
     steps: Array
     rejected: Array
 
 
 class Segment(NamedTuple):
-    """A part of a run: its rows, the time at which each begins (inf where there is none), times of
-    its start and end, and the number of rows.
-    """
+    """A part of a run."""
 
     rows: Rows
-    times: Array
+    times: Array  # at which each row begins, inf where there is none
     begin: Array
     end: Array
-    number: Array
+    number: Array  # of rows
 
 
 def times_of(run: Run, rows: Rows) -> tuple[Array, Array, Array]:
     """Start, length and end of the steps of rows (4 + n, *bodies).
 
-    The start moves with the stop before it, the length of a step that ends on a stop with both; all
-    other lengths are held.
+    The start moves with the stop before it, the length of a step that ends on a stop with both.
     """
     t, h, kind, stop = lax.stop_gradient(rows[:HEAD])
     stop, last = stop.astype(jnp.int32), kind == LAST
@@ -201,9 +186,8 @@ def controlled(
 ) -> tuple[Array, Array]:
     """Whether a step is accepted, and the next one: 0 where none is left to try, NaN after a NaN.
 
-    **Arguments:** `norm` of the error over the tolerance, as of `tried`; `t` and `h` of the
-    step, `last` whether it was cut short at a stop, `kept` what the controller had wanted there;
-    `length` of the run, whose round-off counts where that of `t` vanishes.
+    `norm` as of `tried`; `kept` what the controller had wanted before a step was cut short as the
+    `last` before a stop; `length` of the run, whose round-off counts where that of `t` vanishes.
     """
     norm, h, kept = lax.stop_gradient((norm, h, kept))
     good = norm < 1

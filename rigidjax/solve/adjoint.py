@@ -42,10 +42,7 @@ _TOGETHER = 16
 def saved(
     method: Method, constants: list[Array], run: Run, part: Segment, path: Array, ys: Array
 ) -> Array:
-    """`ys` (K, n, *bodies) with the states at those times that are in this part of the run.
-
-    **Arguments:** `path` (R, n, *bodies) the states at the start of each row.
-    """
+    """`ys` (K, n, *bodies) with the states in this part of a run; `path` those that rows start at."""
     size, many, field, project = run.between.shape[0], run.t0.ndim, method.field, method.project
     width = 1 if many else min(size, _TOGETHER)
     if not many:
@@ -88,12 +85,10 @@ def of_saved(
     method: Method, run: Run, step: Step, slopes: Array, first: Array, last: Array, bars: Array,
     between: Array | None,
 ) -> tuple[Array | None, Array, Array, Array, Array]:  # fmt: skip
-    """The transpose of the states at the times in a step: cotangents of the times between
-    (K, *bodies), and of the step: its time, length, state at the start and slopes.
+    """The transpose of the states at the times in a step, from number `first` to before `last`.
 
-    **Arguments:** `first`, `last` (*bodies) the numbers of the first of these times and of the
-    first one behind; `bars` (K, n, *bodies) cotangents of all states; `between` what is added
-    to, or `None`.
+    **Returns** `between`, if it is not `None`, with the cotangents of the times added, and those of
+    the step: its time, length, state and slopes. `bars` (K, n, *bodies) of all states.
     """
     size = run.between.shape[0]
     width = min(size, max(4, min(size // 50, 16)))
@@ -120,10 +115,8 @@ def of_saved(
 
 
 def _rows_at(run: Run, part: Segment) -> tuple[Array, Array]:
-    """The index of the row that each time between is in (K, *bodies), whether there is one.
-
-    All at once: in a loop each search would be many small kernels.
-    """
+    """The index of the row that each time between is in (K, *bodies), whether there is one."""
+    # All at once: in a loop each search would be many small kernels.
     ts = lax.stop_gradient(run.between)
     search = _per_body(run, lambda begun, ts: jnp.searchsorted(begun, ts).astype(jnp.int32) - 1)
     index = search(part.times, ts)
@@ -163,10 +156,7 @@ def _states(
 def replayed(
     method: Method, constants: list[Array], run: Run, record: Record
 ) -> tuple[Array, Array, Array, Array]:
-    """The states between and at the end, the starts and the rows by the steps of the record.
-
-    These are held: so the tangents of all four are those of the run.
-    """
+    """States between and at the end, starts and rows by the steps of the record, which are held."""
     head = record.starts.shape[1] - run.y0.shape[0]
 
     def one(i: Array, state: tuple[Array, Array, Array, Array]) -> Any:
@@ -205,9 +195,7 @@ def cotangents(
 ) -> tuple[list[Array], Run]:
     """The transpose of the tangents of `replayed`: cotangents of the constants and of the run.
 
-    Those of times only where they are `timed`; those of tolerances and of the first step are 0.
-
-    **Arguments:** `bars` of the states between (K, n, *bodies) and at the end (n, *bodies).
+    Those of times only where they are `timed`; `bars` of the states between and at the end.
     """
     number, size = jnp.max(record.number), run.between.shape[0]
 

@@ -19,13 +19,10 @@ BLOCK = 16
 
 
 class Layout(NamedTuple):
-    """The axes of a program's arrays beyond those of one body.
+    """The axes of a program's arrays beyond those of one body."""
 
-    **Fields:** `bodies` a last axis of bodies; `shared` which constants have none all the same.
-    """
-
-    bodies: bool
-    shared: tuple[bool, ...]
+    bodies: bool  # a last axis
+    shared: tuple[bool, ...]  # which constants have none all the same
 
 
 # `program(layout, constants, each)` returns a list of arrays of each body.
@@ -39,10 +36,9 @@ def in_lanes(
     linear: int = 0,
     layout: Layout | None = None,
 ) -> Arrays:
-    """The program, whose `jax.vmap` is itself on longer last axes.
+    """The program, whose `jax.vmap` is itself on longer last axes; bodies may share `constants`.
 
-    **Arguments:** `constants` arrays that bodies may share; `each` arrays of each body. In the last
-    `linear` of these the program is linear: many such directions of one motion are no bodies.
+    In the last `linear` of `each` it is linear: many such directions of one motion are no bodies.
     """
     was = Layout(False, (True,) * len(constants)) if layout is None else layout
     number = len(constants)

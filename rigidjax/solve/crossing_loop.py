@@ -27,18 +27,13 @@ _MOST = 70
 
 
 class Motion(NamedTuple):
-    """The motion of a body, on (n, *bodies).
+    """The motion of a body, on (n, *bodies)."""
 
-    **Fields:** `attempt(step) → (y, norm)` the state a step later, its error over the tolerance;
-    `order` of the method; `longest` step; `condition(t, y) → (g, dg/dt, dy/dt, round-off of g)`;
-    `counts(t, y, steps)` whether a zero is one of the motion, not of its round-off; `project`.
-    """
-
-    attempt: Callable[[Step], tuple[Array, Array]]
+    attempt: Callable[[Step], tuple[Array, Array]]  # the state a step later, error over tolerance
     order: int
-    longest: Array
-    condition: Callable[[Array, Array], tuple[Array, ...]]
-    counts: Callable[[Array, Array, Array], Array]
+    longest: Array  # step
+    condition: Callable[[Array, Array], tuple[Array, ...]]  # (t, y): g, dg/dt, dy/dt, g's round-off
+    counts: Callable[[Array, Array, Array], Array]  # (t, y, steps): whether a zero is no round-off
     project: Callable[[Array], Array]
 
 
@@ -51,16 +46,14 @@ class Search(NamedTuple):
 
 
 class Located(NamedTuple):
-    """Times (K, *bodies), NaN beyond the last, states (K, n, *bodies), their number (*bodies), the
-    time at which each body is at the end, its next step (NaN where it met one), and passes.
-    """
+    """The crossings found."""
 
-    times: Array
-    states: Array
+    times: Array  # (K, *bodies), NaN beyond the last
+    states: Array  # (K, n, *bodies)
     number: Array
-    t: Array
-    h: Array
-    steps: Array
+    t: Array  # at the end
+    h: Array  # the next step, NaN where one was met
+    steps: Array  # passes
 
 
 class _End(NamedTuple):

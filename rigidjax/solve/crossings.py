@@ -234,10 +234,8 @@ _value = eqx.filter_jit(value)
 def solve_until(
     setup: Free | Loop, event: Event, state0: Any, ts: Array
 ) -> tuple[Any, dict[str, Any], dfx.RESULTS, Array, Any]:
-    """As `solve`, up to the event; and the event's time and state, NaN if there is none.
-
-    The run is done twice: to find the event, and up to it, with derivatives.
-    """
+    """As `solve`, up to the event; and the event's time and state, NaN if there is none."""
+    # The run is done twice: to find the event, and up to it, with derivatives.
     state0 = on_the_group(state0)
     condition = lambda t, y: value(event, setup.body, t, y)  # noqa: E731
     crossed, numbers = section(setup, condition, event.max_step, state0, ts)
@@ -286,15 +284,11 @@ _CLEAR = 16
 
 
 class Section(NamedTuple):
-    """The section and the motion, in s = σt, which increases.
+    """The section and the motion, in s = σt, which increases."""
 
-    **Fields:** `solver` `None` for the closed form; `motion(constants, s, y)` dy/ds, or the state
-    itself in closed form; `rates(constants, s, y)` g, dg/ds and dy/ds; `like` a state; `sign` σ.
-    """
-
-    solver: AbstractExplicit | None
-    motion: Callable[[Arrays, Array, Array], Array]
-    rates: Callable[[Arrays, Array, Array], tuple[Array, Array, Array]]
+    solver: AbstractExplicit | None  # None: the closed form
+    motion: Callable[[Arrays, Array, Array], Array]  # dy/ds, or y itself in closed form
+    rates: Callable[[Arrays, Array, Array], tuple[Array, Array, Array]]  # g, dg/ds, dy/ds
     like: Any
     sign: Array
 

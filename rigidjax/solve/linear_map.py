@@ -23,11 +23,9 @@ _ZERO: Any = ad.Zero
 
 
 def linear_map(function: Map, transposed: Map, given: Arrays, tangents: Arrays) -> Arrays:
-    """`function(*given, *tangents)`, whose transpose in `tangents` is `transposed`.
+    """`function(*given, *tangents)`, linear in these; its transpose is `transposed(*given, *bars)`.
 
-    **Arguments:** `function(*given, *tangents)` linear in the tangents, `transposed(*given,
-    *cotangents)` its transpose, both to lists of arrays; neither may close over tracers.
-    Derivatives with respect to `given` are taken in forward mode only.
+    Neither may close over tracers. Derivatives by `given` are taken in forward mode only.
     """
     outs = jax.eval_shape(lambda g, t: function(*g, *t), given, tangents)
     inputs, results = (

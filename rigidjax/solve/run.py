@@ -58,11 +58,7 @@ class Setup(eqx.Module):
 
 
 class Loop(eqx.Module):
-    """A solve by our own loop.
-
-    `sign` of the direction of time, `None` where it is known to go forwards; `cuts` times at which
-    a step has to end, beside the jumps of the torque.
-    """
+    """A solve by our own loop."""
 
     body: Inertia | MassProperties | None
     torque: Any
@@ -70,19 +66,16 @@ class Loop(eqx.Module):
     rtol: Any
     atol: Any
     dt0: Any
-    sign: Array | None
+    sign: Array | None  # of the direction of time; None: known to go forwards
     max_steps: int = eqx.field(static=True)
     throw: bool = eqx.field(static=True)
-    cuts: Array | None = None
+    cuts: Array | None = None  # where a step has to end, beside the jumps of the torque
 
 
 class Ends(eqx.Module):
-    """The condition that ends a run of a scene, such as a collision, as `diffrax.Event` asks it.
+    """The condition that ends a run of a scene, such as a collision, as `diffrax.Event` asks it."""
 
-    **Arguments:** `scene` any with `ends(t, state) → bool` and `end_words(t, state) → str`.
-    """
-
-    scene: Any
+    scene: Any  # with ends(t, state) → bool and end_words(t, state) → str
 
     def __call__(self, t: ScalarLike, y: Any, args: object = None, **_: object) -> Bool[Array, ""]:
         return self.scene.ends(t, y)
@@ -129,10 +122,7 @@ def direction(times: Array) -> Int[Array, ""] | None:
 def ahead(
     sign: Array | None, field: Callable[..., Any], condition: Any, ts: Array, jumps: Array
 ) -> tuple[Callable[..., Any], Any, Array, Array]:
-    """A vector field f(t, y, args), a condition `(t, y)`, times and jump times, in s = σt.
-
-    **Arguments:** `sign` σ of the direction of time, 1 or −1, `None` for s = t.
-    """
+    """A vector field, a condition, times and jump times in s = σt; `sign` σ is `None` for s = t."""
     if sign is None:
         return field, condition, ts, jumps
     time = lambda s: sign.astype(s.dtype) * s  # noqa: E731
@@ -257,11 +247,7 @@ def _free(setup: Free, state0: Any, ts: Array) -> tuple[Any, dict[str, Any], dfx
 
 
 def refuse_ended(scene: Any, ys: Any, stats: dict[str, Any], ts: Any) -> Any:
-    """The states `ys` saved at `ts`, unless the scene has ended the run: an error in its words.
-
-    **Raises:** `ValueError` with the last time saved before; under `jit` or `vmap`
-    `EquinoxRuntimeError` without numbers.
-    """
+    """The states `ys` saved at `ts`, unless the scene has ended the run: an error in its words."""
     ended, advice = stats["ended"], "; give throw=False to keep what came before it"
     if _checks.known(ended) and not np.any(np.asarray(ended)):
         return ys

@@ -21,14 +21,11 @@ Field = Callable[[list[Array], Array, Array], Array]
 
 
 class Step(NamedTuple):
-    """Time, length and end of a step (*bodies), state at its start (n, *bodies).
-
-    `end` is `t + h` but for the last digit: before a jump it is the last moment before it.
-    """
+    """A step: its time and length (*bodies), the state at its start (n, *bodies)."""
 
     t: Array
     h: Array
-    end: Array
+    end: Array  # t + h but for the last digit: before a jump it is the last moment before it
     y: Array
 
 
@@ -42,15 +39,13 @@ class Stages(NamedTuple):
 
 
 class Weights(NamedTuple):
-    """The tableau as arrays: `a` (s, s), `b`, `c` (s,); `last` whether c is 1; `dense` (r, s) the
-    rows of dense output.
-    """
+    """The tableau as arrays."""
 
-    a: Array
-    b: Array
+    a: Array  # (s, s)
+    b: Array  # (s,)
     c: Array
-    last: Array
-    dense: Array
+    last: Array  # whether c is 1
+    dense: Array  # (r, s) the rows of dense output
 
 
 def stage_counts(tableau: Tableau) -> tuple[int, int]:
@@ -90,10 +85,9 @@ def _put(record: Array, row: Array, i: Array) -> Array:
 def stages(
     tableau: Tableau, field: Field, constants: list[Array], step: Step, dense: Any = False
 ) -> Stages:
-    """All stages of a step; `end` is not projected.
+    """All stages of a step, if `dense` also those of dense output; `end` is not projected.
 
-    **Arguments:** `dense` whether to compute the stages of dense output. If it is traced and false,
-    these stages are the state at the start, and their slopes 0.
+    If `dense` is traced and false, its stages are the state at the start, and their slopes 0.
     """
     count = stage_counts(tableau)[dense is not False]
     w = weights(tableau, step.y.dtype, count)
@@ -134,10 +128,7 @@ def _last(tableau: Tableau, dense: Any) -> Any:
 
 
 def dense_rows(tableau: Tableau, field: Field, step: Step, slopes: Array) -> Array:
-    """The rows F0, F1, … of `nested` (r, n) of one body, times the length of the step.
-
-    The stages that only they need are worked out here, apart from those of the step.
-    """
+    """The rows F0, F1, … of `nested` (r, n) of one body, times the length of the step."""
     count, whole = stage_counts(tableau)
     w = weights(tableau, slopes.dtype, whole)
     slopes = jnp.concatenate([slopes, jnp.zeros((slopes.shape[0], whole - count), slopes.dtype)], 1)
@@ -186,8 +177,7 @@ def pulled(
 ) -> tuple[list[Array], Array, Array, Array]:  # fmt: skip
     """The transpose of a step: cotangents of the constants, of time, of length, of the state.
 
-    **Arguments:** `cotangent` of the state at the end; `of_slopes` (n, s, *bodies) of all slopes;
-    `dense` as for `stages`.
+    `cotangent` is of the state at the end, `of_slopes` (n, s, *bodies) of all slopes.
     """
     count = there.slopes.shape[1]
     w = weights(tableau, step.y.dtype, count)

@@ -66,14 +66,11 @@ SRKN11 = _symmetric(
 
 
 class Frame(NamedTuple):
-    """The principal frame of a body: moments in it, their inverse, and its axes as columns.
-
-    The off-diagonal entries of both are zero; they carry the tangents.
-    """
+    """The principal frame of a body; off-diagonal entries are zero and carry the tangents."""
 
     moments: Six
-    weights: Six
-    axes: Array
+    weights: Six  # the inverse
+    axes: Array  # columns
 
 
 def principal(tensor: Array) -> Frame:
@@ -171,11 +168,8 @@ class Splitting6(AbstractSplitting):
 
 
 def frame_of(field: Any, y0: Any) -> Frame:
-    """The principal frame of the field's body.
-
-    **Raises:** `TypeError` for another field than that of an `Attitude`, or a torque that feels the
-    body rate: a kick at a fixed attitude is then no exact flow, and the order falls to 1.
-    """
+    """The principal frame of the field's body; `TypeError` for a field that is no `Attitude`'s."""
+    # Under a torque that feels the body rate a kick is no exact flow: the order would fall to 1.
     torque = require_attitude("Splitting", field, y0, "DormandPrince8").euler.torque
     if sees_rate(torque):
         raise TypeError(

@@ -35,24 +35,16 @@ from rigidjax.solve.splitting import AbstractSplitting
 
 
 class Stepper(NamedTuple):
-    """Numbers to start from, `step(t, end, h, y, inputs)`, and `state(y)` of such numbers.
+    """A step of one body."""
 
-    `inputs` are those of the law by name, the same through the whole step, or `None`; `delays` name
-    and delay, s, of each delayed one.
-    """
-
-    start: Any
-    step: Callable[[Any, Any, Any, Any, Any], Any]
-    state: Callable[[Any], Any]
-    delays: tuple[tuple[str, Array], ...] = ()
+    start: Any  # numbers y
+    step: Callable[[Any, Any, Any, Any, Any], Any]  # (t, end, h, y, inputs of the law or None)
+    state: Callable[[Any], Any]  # of y
+    delays: tuple[tuple[str, Array], ...] = ()  # name and delay, s, of each delayed input
 
 
 def stepper_of(solver: Any, field: Callable[..., Any], y0: Any) -> Stepper:
-    """The stepper of a vector field under `solver`, or under the cheapest that is right.
-
-    **Arguments:** `solver` of `rigidjax.solvers`, or `None`; `field` as of `equations_of_motion`;
-    `y0` a state. **Raises:** `TypeError` for a solver that has no such step.
-    """
+    """The stepper of a vector field under `solver`, or, for `None`, the cheapest that is right."""
     return _stepper_of(solver, field, y0)._replace(delays=tuple(delays_of(field)))
 
 
@@ -205,10 +197,7 @@ def _of_slope(solver: Any, slope_under: Any, start: Atoms, state: Any, like: Any
 
 
 def _split(solver: AbstractSplitting, field: Any, state0: Any) -> Stepper:
-    """The attitude and the momentum in principal axes.
-
-    No step goes through Ω = I⁻¹Π and back, so that |Π| drifts by round-off of the flow alone.
-    """
+    # No step goes through Ω = I⁻¹Π and back, so that |Π| drifts by round-off of the flow alone.
     frame = splitting.frame_of(field, state0)
 
     def step(t: Any, end: Any, h: Any, y: Any, inputs: Any) -> Any:

@@ -85,10 +85,7 @@ _SHAPES = {"tensor": (3, 3), "mass": (), "second_moment": (3, 3), "q": (4,)}
 
 
 def _single(value: Any, name: str) -> None:
-    """Raise `ValueError` unless every leaf of `value` has the shape of one body.
-
-    Constructors see to it that shapes agree; `jax.tree.map` and `eqx.tree_at` do not.
-    """
+    """Refuse leaves of another shape than that of one body: `jax.tree.map` may alter it."""
     for path, leaf in jax.tree.leaves_with_path(value):
         part = str(path[-1]).lstrip(".")
         if leaf.shape != (wanted := _SHAPES.get(part, (3,))):
@@ -99,10 +96,7 @@ def _single(value: Any, name: str) -> None:
 
 
 def tolerances(rtol: Any, atol: Any, dtype: Any) -> tuple[Any, Any]:
-    """`rtol` and `atol`, by default suited to `dtype`; a warning if it cannot reach them.
-
-    Traced ones are taken as they are.
-    """
+    """`rtol` and `atol`, by default suited to `dtype`; a warning if it cannot reach known ones."""
     double = dtype == jnp.float64
     rtol = (1e-9 if double else 2e-5) if rtol is None else rtol
     atol = (1e-12 if double else 1e-7) if atol is None else atol
@@ -126,9 +120,7 @@ def tolerances(rtol: Any, atol: Any, dtype: Any) -> tuple[Any, Any]:
 
 
 def times(ts: Any, throw: bool) -> Array:
-    """`ts` as an array of times that increase, or decrease; NaN where they do neither, are traced
-    and may not throw.
-    """
+    """`ts` as an array of times that increase, or decrease; or NaN, if traced and not to throw."""
     if isinstance(ts, (Spin, Attitude, Rigid, Point)):
         raise TypeError(f"ts: wanted times, got {type(ts).__name__}; the state comes before them")
     try:
@@ -161,9 +153,7 @@ def times(ts: Any, throw: bool) -> Array:
 
 
 def first_step(dt0: Any, times: Array) -> Array | None:
-    """The length of `dt0` in the precision of `times`; refused where it is no step, goes against
-    them, or is too short to count.
-    """
+    """The length of `dt0` in the precision of `times`; refused if it is no step to go on with."""
     if dt0 is None:
         return None
     step = _checks.floating(dt0, (), "dt0").astype(times.dtype)
