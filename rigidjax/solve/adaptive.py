@@ -225,9 +225,7 @@ def _pushed(
     still = zip(run, moving[1], strict=True)
     of_run = Run(*(next(rest) if moves else jnp.zeros_like(a) for a, moves in still))
 
-    def again(chosen: Arrays, run: Run) -> tuple[Array, ...]:
-        return adjoint.replayed(method, chosen, run, record)
-
+    again = lambda chosen, run: adjoint.replayed(method, chosen, run, record)  # noqa: E731
     return list(jax.jvp(again, (chosen, run), (along[: len(chosen)], of_run))[1])
 
 

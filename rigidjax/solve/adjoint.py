@@ -42,7 +42,7 @@ _TOGETHER = 16
 def saved(
     method: Method, constants: list[Array], run: Run, part: Segment, path: Array, ys: Array
 ) -> Array:
-    """`ys` (K, n, *bodies) with the states in this part of a run; `path` those that rows start at."""
+    """`ys` (K, n, *bodies) with the states in a part of a run; `path` those at which rows start."""
     size, many, field, project = run.between.shape[0], run.t0.ndim, method.field, method.project
     width = 1 if many else min(size, _TOGETHER)
     if not many:
@@ -221,7 +221,7 @@ def cotangents(
                     between if timed else None,
                 )  # fmt: skip
             by_constants, *rest = runge_kutta.pulled(
-                method.tableau, method.field, constants, here, there, bar, of_slopes, dense
+                method.tableau, method.field, constants, here, there, bar, of_slopes
             )
             if seeds:
                 rest = [a + b for a, b in zip(rest, seeds, strict=True)]

@@ -72,6 +72,14 @@ class Loop(eqx.Module):
     cuts: Array | None = None  # where a step has to end, beside the jumps of the torque
 
 
+def kept(setup: Free | Loop | Setup) -> tuple[Any, tuple[tuple[Any, ...], Any]]:
+    """A set-up as arrays and the rest, so that `jax.jit` and `jax.vmap` can return it."""
+    numbers = (jax.Array, np.ndarray, np.generic)
+    arrays, rest = eqx.partition(setup, lambda leaf: isinstance(leaf, numbers))
+    leaves, structure = jax.tree.flatten(rest)
+    return arrays, (tuple(leaves), structure)
+
+
 class Ends(eqx.Module):
     """The condition that ends a run of a scene, such as a collision, as `diffrax.Event` asks it."""
 

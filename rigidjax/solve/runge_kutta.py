@@ -36,6 +36,7 @@ class Stages(NamedTuple):
     places: Array
     slopes: Array
     end: Array
+    number: Any  # of the stages taken
 
 
 class Weights(NamedTuple):
@@ -78,10 +79,6 @@ def _sum(row: Array, slopes: Array) -> Array:
     return jnp.sum(row.reshape(1, -1, *[1] * (slopes.ndim - 2)) * slopes, 1)
 
 
-def _put(record: Array, row: Array, i: Array) -> Array:
-    return lax.dynamic_update_slice_in_dim(record, row[:, None], i, 1)
-
-
 def stages(
     tableau: Tableau, field: Field, constants: list[Array], step: Step, dense: Any = False
 ) -> Stages:
@@ -89,42 +86,33 @@ def stages(
 
     If `dense` is traced and false, its stages are the state at the start, and their slopes 0.
     """
-    count = stage_counts(tableau)[dense is not False]
+    plain, whole = (np.int32(count) for count in stage_counts(tableau))
+    count, number = (whole, whole) if dense is not False else (plain, plain)
     w = weights(tableau, step.y.dtype, count)
 
-    def stage(i: Array, sofar: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        times, places, slopes = sofar
-        t, y, slope = _stage(w, field, constants, step, i, slopes)
-        times = lax.dynamic_update_slice_in_dim(times, t[None], i, 0)
-        return times, _put(places, y, i), _put(slopes, slope, i)
+    def stage(i: Array, sofar: tuple[Array, Array, Array]) -> Any:
+        new = _stage(w, field, constants, step, i, sofar[2])
+        put = lax.dynamic_update_index_in_dim
+        return tuple(put(a, b, i, axis) for a, b, axis in zip(sofar, new, (0, 1, 1), strict=True))
 
     empty = jnp.zeros((step.y.shape[0], count, *step.y.shape[1:]), step.y.dtype)
     times, places = jnp.zeros((count, *step.t.shape), step.t.dtype), empty
     if not isinstance(dense, bool):
         # Where a field may have no value at 0, a stage that is left out must be somewhere else.
         times, places = times + step.t[None], places + step.y[:, None]
-    times, places, slopes = lax.fori_loop(
-        np.int32(0), _last(tableau, dense), stage, (times, places, empty)
-    )
-    return Stages(times, places, slopes, step.y + _length(step) * _sum(w.b, slopes))
+        number = jnp.where(dense, whole, plain)
+    done = lax.fori_loop(np.int32(0), number, stage, (times, places, empty))
+    h = lift(step.h.astype(step.y.dtype), step.y)
+    return Stages(*done, step.y + h * _sum(w.b, done[2]), number)
 
 
 def _stage(
     w: Weights, field: Field, constants: list[Array], step: Step, i: Array, slopes: Array
 ) -> tuple[Array, Array, Array]:
-    y = step.y + _length(step) * _sum(w.a[i], slopes)
+    # Time may be kept in another precision than the state.
+    y = step.y + lift(step.h.astype(step.y.dtype), step.y) * _sum(w.a[i], slopes)
     t = jnp.where(w.last[i], step.end, step.t + w.c[i].astype(step.t.dtype) * step.h)
     return t, y, field(constants, t, y)
-
-
-def _length(step: Step) -> Array:
-    # Time may be kept in another precision than the state.
-    return lift(step.h.astype(step.y.dtype), step.y)
-
-
-def _last(tableau: Tableau, dense: Any) -> Any:
-    plain, whole = (np.int32(count) for count in stage_counts(tableau))
-    return (plain, whole)[dense] if isinstance(dense, bool) else jnp.where(dense, whole, plain)
 
 
 def dense_rows(tableau: Tableau, field: Field, step: Step, slopes: Array) -> Array:
@@ -132,7 +120,11 @@ def dense_rows(tableau: Tableau, field: Field, step: Step, slopes: Array) -> Arr
     count, whole = stage_counts(tableau)
     w = weights(tableau, slopes.dtype, whole)
     slopes = jnp.concatenate([slopes, jnp.zeros((slopes.shape[0], whole - count), slopes.dtype)], 1)
-    more = lambda i, slopes: _put(slopes, _stage(w, field, [], step, i, slopes)[2], i)  # noqa: E731
+
+    def more(i: Array, slopes: Array) -> Array:
+        slope = _stage(w, field, [], step, i, slopes)[2]
+        return lax.dynamic_update_index_in_dim(slopes, slope, i, 1)
+
     slopes = lax.fori_loop(count, whole, more, slopes)
     return step.h.astype(slopes.dtype) * jnp.sum(w.dense[:, None] * slopes[None], 2)
 
@@ -173,7 +165,7 @@ def error_estimate(tableau: Tableau, sizes: list[int], h: Array, slopes: Array) 
 
 def pulled(
     tableau: Tableau, field: Field, constants: list[Array], step: Step, there: Stages,
-    cotangent: Array, of_slopes: Array | None = None, dense: Any = False,
+    cotangent: Array, of_slopes: Array | None = None,
 ) -> tuple[list[Array], Array, Array, Array]:  # fmt: skip
     """The transpose of a step: cotangents of the constants, of time, of length, of the state.
 
@@ -181,20 +173,20 @@ def pulled(
     """
     count = there.slopes.shape[1]
     w = weights(tableau, step.y.dtype, count)
-    h, last = step.h.astype(step.y.dtype), _last(tableau, dense)
+    h, put = step.h.astype(step.y.dtype), lax.dynamic_update_index_in_dim
 
     def stage(i: Array, both: tuple[Array, Array]) -> tuple[Array, Array]:
-        m = last - 1 - i
+        m = there.number - 1 - i
         below, seeds = both
         seed = w.b[m] * cotangent + _sum(w.a[:, m], below)
         bar = lift(h, seed) * seed
         if of_slopes is not None:
             bar = bar + of_slopes[:, m]
         pull = jax.vjp(lambda y: field(constants, there.times[m], y), there.places[:, m])[1]
-        return _put(below, pull(bar)[0], m), _put(seeds, seed, m)
+        return put(below, pull(bar)[0], m, 1), put(seeds, seed, m, 1)
 
     none = jnp.zeros_like(there.slopes)
-    below, seeds = lax.fori_loop(np.int32(0), last, stage, (none, none))
+    below, seeds = lax.fori_loop(np.int32(0), there.number, stage, (none, none))
     # The constants' share of all stages at once: it does not wait for the others. Each stage has
     # constants of its own, and their shares are summed last: else each number is a kernel.
     every = jax.vmap(lambda c, t, y: field(c, t, y), (0, 0, 1), 1)

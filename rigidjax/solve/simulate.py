@@ -20,8 +20,8 @@ from rigidjax.solve.crossings import Event, ready, solve_until
 from rigidjax.solve.error import foreseen_error, solve_to
 from rigidjax.solve.explicit import AbstractExplicit, DormandPrince8
 from rigidjax.solve.projection import Projected, Watched
-from rigidjax.solve.run import Free, Loop, Setup, direction, refuse, refuse_ended, solve
-from rigidjax.solve.solution import Solution, State, kept, told
+from rigidjax.solve.run import Free, Loop, Setup, direction, kept, refuse, refuse_ended, solve
+from rigidjax.solve.solution import Solution, State, told
 from rigidjax.solve.splitting import AbstractSplitting
 
 # A torque must accept the given state: gravity on a `Spin` is an error that type checkers see.
@@ -139,7 +139,7 @@ def simulate(
     plain = plain and stepsize_controller is None and progress_meter is None
     # Where forward mode is all that is asked, diffrax is quicker: tangents go along with the run.
     forward = isinstance(adjoint, dfx.ForwardMode) and solver is None and event is None
-    first = validation.first_step(dt0, times)
+    first = None if dt0 is None else validation.first_step(dt0, times)
     if plain and isinstance(adjoint, _EITHER_MODE) and not forward:
         way = direction(times)
         loop = Loop(body, torque, method, rtol, atol, first, way, max_steps, throw)  # pyright: ignore

@@ -24,14 +24,6 @@ from rigidjax.solve.run import Free, Loop, Setup, solve
 State = TypeVar("State", Spin, Attitude, Rigid, Point)
 
 
-def kept(setup: Free | Loop | Setup) -> tuple[Any, tuple[tuple[Any, ...], Any]]:
-    """A set-up as arrays and the rest, so that `jax.jit` and `jax.vmap` can return it."""
-    numbers = (jax.Array, np.ndarray, np.generic)
-    arrays, rest = eqx.partition(setup, lambda leaf: isinstance(leaf, numbers))
-    leaves, structure = jax.tree.flatten(rest)
-    return arrays, (tuple(leaves), structure)
-
-
 class Solution(eqx.Module, Generic[State]):
     """The result of `simulate`.
 

@@ -33,7 +33,7 @@ def scene(body: Any, state0: Any, ts: Any, torque: Any, throw: bool) -> tuple[An
     )
     require_fit(body, state0, torque)
     if body is not None:
-        body = body.invertible() if throw else real_or_nan(body)
+        body = real_or_nan(body, throw)
     return body, state0, ts
 
 
@@ -73,11 +73,11 @@ def _body_of(numbers: Any, moves: bool = False) -> str:
     return f"; rj.Inertia{'.from_principal(*moments)' if moments else '(tensor)'} makes one of them"
 
 
-def real_or_nan(body: Inertia | MassProperties) -> Any:
-    """The body; where its numbers are traced and no body has them, all of them are NaN."""
+def real_or_nan(body: Inertia | MassProperties, throw: bool = False) -> Any:
+    """The body; traced numbers of no real body are NaN, unless they may `throw`."""
     matter = isinstance(body, MassProperties)
     tensor = body.inertia.tensor if matter else body.tensor
-    return possible(body, tensor, body.mass if matter else None, throw=False)
+    return possible(body, tensor, body.mass if matter else None, throw)
 
 
 # The arrays of one body or one state that are no vectors.
@@ -98,8 +98,10 @@ def _single(value: Any, name: str) -> None:
 def tolerances(rtol: Any, atol: Any, dtype: Any) -> tuple[Any, Any]:
     """`rtol` and `atol`, by default suited to `dtype`; a warning if it cannot reach known ones."""
     double = dtype == jnp.float64
-    rtol = (1e-9 if double else 2e-5) if rtol is None else rtol
-    atol = (1e-12 if double else 1e-7) if atol is None else atol
+    usual, given = (1e-9, 1e-12) if double else (2e-5, 1e-7), (rtol, atol)
+    rtol, atol = (u if g is None else g for u, g in zip(usual, given, strict=True))
+    if given == (None, None):
+        return rtol, atol
     if not _checks.known((rtol, atol)):
         return jnp.asarray(rtol, dtype), jnp.asarray(atol, dtype)
     # Floats of Python: those of NumPy would lift a float32 run to float64.
@@ -152,10 +154,8 @@ def times(ts: Any, throw: bool) -> Array:
     return _guard(found, ~ahead.all(), f"ts: wanted {kind} times{where}", throw)
 
 
-def first_step(dt0: Any, times: Array) -> Array | None:
+def first_step(dt0: Any, times: Array) -> Array:
     """The length of `dt0` in the precision of `times`; refused if it is no step to go on with."""
-    if dt0 is None:
-        return None
     step = _checks.floating(dt0, (), "dt0").astype(times.dtype)
     known = _checks.known(times)
     if not _checks.known(step):
