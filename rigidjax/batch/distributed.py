@@ -71,9 +71,8 @@ def share(tree: Any) -> Any:
 def gather(tree: Any, checkpoint: str | os.PathLike[str] | None = None) -> Any:
     """All processes' rows, on every process, in order.
 
-    **Arguments:** `tree` arrays with this process's rows, as from `share`; `checkpoint` a
-    folder: the rows are written there first, as `share-3.npz`, for `recover`.
-    **Returns** the tree with the rows of all, in host memory.
+    **Arguments:** `tree` arrays with this process's rows, as from `share`; `checkpoint` a folder to
+    `save` them to first. **Returns** the tree with the rows of all, in host memory.
 
     **Raises:** `TypeError` for traced arrays; `RuntimeError` if another process has ended. This
     process should end then: JAX's arrays are of no use any more.
@@ -110,10 +109,9 @@ def total(tree: Any, checkpoint: str | os.PathLike[str] | None = None) -> Any:
 
 
 def save(tree: Any, folder: str | os.PathLike[str]) -> Path:
-    """Write this process's rows to `folder/share-<process>.npz`, all or nothing.
+    """Write this process's rows, a `tree` of arrays, to `folder/share-<process>.npz`.
 
-    **Arguments:** `tree` of arrays, whose first axis is this process's share; `folder` that all
-    processes see. **Returns** the path of the file.
+    It writes all or nothing. **Returns** the path of the file.
 
     >>> import tempfile
     >>> with tempfile.TemporaryDirectory() as folder:

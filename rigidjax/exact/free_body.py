@@ -126,9 +126,8 @@ def free_body(inertia: Inertia, state0: State, t: ScalarLike) -> State:
     They grow with e^{λt} on an unstable axis, up to λt ≈ 150 (float32: 40).
 
     **Raises:** `TypeError`, `ValueError` for a wrong shape or dtype, dtypes that differ, a `Rigid`
-    state; if values are known (not inside `jit`), also for NaN, a moment that is not positive,
-    a quaternion whose length is off 1 by more than 1e-6 (float32: 1e-3), and a time in which the
-    body turns by more than 1/eps rad, so that no digit of its attitude is left.
+    state; if values are known, also for NaN, a moment that is not positive, a quaternion that is
+    not unit, and a time in which the body turns by more than 1/eps rad.
 
     >>> import rigidjax as rj
     >>> state0 = rj.Attitude([1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 1e-4])

@@ -5,6 +5,7 @@ arrays in vector instructions. A loop over (7,) or (N, 7) arrays becomes many sm
 """
 
 import math
+from itertools import accumulate
 from typing import Any
 
 import jax
@@ -69,12 +70,9 @@ def flat(tree: Any) -> Array:
 def unflat(vector: Array, like: Any) -> Any:
     """The tree shaped as `like` whose numbers are those of `vector`."""
     leaves, tree = jax.tree.flatten(like)
-    out, begin = [], 0
-    for leaf in leaves:
-        shape = jnp.shape(leaf)
-        out.append(vector[begin : begin + math.prod(shape)].reshape(shape))
-        begin += math.prod(shape)
-    return jax.tree.unflatten(tree, out)
+    pieces = jnp.split(vector, list(accumulate(leaf_sizes(like)))[:-1])
+    shaped = [piece.reshape(jnp.shape(a)) for piece, a in zip(pieces, leaves, strict=True)]
+    return jax.tree.unflatten(tree, shaped)
 
 
 def lift(a: Array, like: Array) -> Array:

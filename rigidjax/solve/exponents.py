@@ -67,15 +67,13 @@ def lyapunov_exponents(
       or your own on any array or Module of one dtype.
     - `state0`: the state at `t0`; `time`: the length of the run, s.
     - `number`: k, the number of exponents; `None` for all, 6 for an `Attitude`.
-    - `intervals`: N; the frame is made orthonormal to round-off after each. Directions may
-      grow apart in one by any amount: the frame itself does not grow.
+    - `intervals`: N; the frame is made orthonormal to round-off after each.
     - `transient`: intervals at the beginning that are not counted: the state approaches its
       attractor, and the tangents to their directions.
     - `solver`, `rtol`, `atol`, `max_steps` (in an interval): as for `simulate`.
 
     Each conserved quantity, and the direction of the motion itself, gives a zero; it decreases as
-    (log t)/t, and `errors` does not include such a trend: look at `running`. In a Hamiltonian
-    system the exponents come in pairs ±λ; their sum is the mean divergence of `field` always.
+    (log t)/t, and `errors` does not include such a trend: look at `running`.
 
     **Returns** `values` and `errors`, `times` and `running`, `state`, `result` (`Exponents`). Where
     a run fails they are NaN, and `result` says why.

@@ -35,6 +35,10 @@ class _Build(eqx.Module):
         return GroupInterpolation(t0, t1, self.inner_cls(t0=t0, t1=t1, **dense_info))
 
 
+def _of(part: str, name: str) -> Any:
+    return property(lambda self: getattr(getattr(self, part), name))
+
+
 class Projected(dfx.AbstractWrappedSolver):
     """Wraps a diffrax solver so that attitudes stay unit quaternions.
 
@@ -55,30 +59,16 @@ class Projected(dfx.AbstractWrappedSolver):
     def __check_init__(self) -> None:
         _checks.instance(self.solver, dfx.AbstractSolver, "solver")
 
-    @property
-    def term_structure(self) -> Any:
-        return self.solver.term_structure
+    term_structure = _of("solver", "term_structure")
+    term_compatible_contr_kwargs = _of("solver", "term_compatible_contr_kwargs")
+    # Adjoints set the one, controllers the others, on whatever is a Runge–Kutta or implicit method.
+    scan_kind = _of("solver", "scan_kind")
+    root_finder = _of("solver", "root_finder")
+    root_find_max_steps = _of("solver", "root_find_max_steps")
 
     @property
     def interpolation_cls(self) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
         return _Build(self.solver.interpolation_cls)
-
-    @property
-    def term_compatible_contr_kwargs(self) -> Any:  # pyright: ignore
-        return self.solver.term_compatible_contr_kwargs
-
-    # Adjoints set the one, controllers the other, on whatever is a Runge–Kutta or implicit method.
-    @property
-    def scan_kind(self) -> Any:
-        return self.solver.scan_kind  # pyright: ignore[reportAttributeAccessIssue]
-
-    @property
-    def root_finder(self) -> Any:
-        return self.solver.root_finder  # pyright: ignore[reportAttributeAccessIssue]
-
-    @property
-    def root_find_max_steps(self) -> Any:
-        return self.solver.root_find_max_steps  # pyright: ignore[reportAttributeAccessIssue]
 
     def order(self, terms: Any) -> int | None:
         return self.solver.order(terms)
@@ -128,17 +118,9 @@ class Watched(dfx.AbstractAdaptiveStepSizeController):
     def __init__(self, controller: Any):
         self.controller = controller
 
-    @property
-    def rtol(self) -> Any:
-        return self.controller.rtol
-
-    @property
-    def atol(self) -> Any:
-        return self.controller.atol
-
-    @property
-    def norm(self) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
-        return self.controller.norm
+    rtol = _of("controller", "rtol")
+    atol = _of("controller", "atol")
+    norm = _of("controller", "norm")
 
     def wrap(self, direction: Any) -> "Watched":
         return Watched(self.controller.wrap(direction))

@@ -80,9 +80,7 @@ def simulate(
       `DormandPrince8` is up to ten times `rtol`, that of Dopri8 up to 26 times below `rtol=1e-10`.
     - `rtol`, `atol`: tolerances of the adaptive steps; 1e-9 and 1e-12 in float64, 2e-5 and 1e-7 in
       float32. Traced ones are not checked, and other values do not compile again. Scale `atol` to
-      the smallest number that matters: the time of a flip about the middle axis depends on the
-      initial rate off the axis, and has no meaning if this is below `atol`. The closed form uses
-      neither.
+      the smallest number that matters. The closed form uses neither.
     - `accuracy`: in the place of tolerances, how far the states may be from the exact motion: rad,
       and relative to the largest value in the run. Two or more cheap runs find the tolerance.
       `sol.error` is then known without more runs. Where it exceeds the accuracy (chaos, round-off),
@@ -98,15 +96,15 @@ def simulate(
     - `event`: `(t, state, body) → scalar`, or an `Event` of it: the run ends at its first zero.
       `event_time` and `event_state` of the solution are exact to the tolerances, with first and
       second derivatives with respect to all numbers, also the condition's own; later `ys` are NaN,
-      and `result` is `event_occurred`. Without an event they are NaN and the run goes to its end
-      (`jax_debug_nans` reports these NaN as errors). Events work in our own loop and the closed
-      form; for a solver of diffrax give `diffrax.Event` there.
+      and `result` is `event_occurred`. Without a zero they are NaN and the run goes to its end.
+      Events work in our own loop and the closed form; for a solver of diffrax give `diffrax.Event`
+      there.
     - `max_steps`, `progress_meter`: as in `diffrax.diffeqsolve`.
-    - `throw`: with `False` no event of the run, and no bad start in a batch, raises an error:
-      `result` gives the reason, states not reached are NaN, as are their derivatives, and other
-      bodies of the batch get the same results as without the bad one, to the last bit. The motion
-      of an invalid traced body (a mass that is not positive, moments of no real body) is NaN, its
-      `result` is `nonfinite_input`. Known wrong numbers are refused in any case.
+    - `throw`: with `False` nothing in a run, and no bad start in a batch, raises an error: `result`
+      gives the reason, states not reached are NaN, as are their derivatives, and other bodies of
+      the batch get the same bits as without the bad one. The motion of an invalid traced body (a
+      mass that is not positive, moments of no real body) is NaN, its `result` `nonfinite_input`.
+      Known wrong numbers are refused in any case.
 
     **Returns** a `Solution`. A second call with other numbers of the same shapes does not compile
     again. Source: the equations of Newton and Euler (notes, eqs 50, 79, 84).

@@ -32,11 +32,10 @@ class Solution(eqx.Module, Generic[State]):
     `num_accepted_steps`, `num_rejected_steps`, for a `Point` also `drift` of its scene's conserved
     quantities; `result` a `diffrax.RESULTS`: `successful`, or why the run ended early, such as
     `max_steps_reached`, `nonfinite`, `nonfinite_input` (no body has these numbers),
-    `dt_min_reached`; `event_occurred` where the event was met.
-    `event_time` s, `event_state` of the type of `state0` (under a law with states `.motion` is
-    that, `.own` the law's): NaN where it was not met, `None` where there is no event. `own` a tuple
-    of the states of the laws that have some, in the order of the laws, what is inside another
-    first, as `ys` with a leading time axis, or `None`.
+    `dt_min_reached`, `event_occurred`. `event_time` s, `event_state` of the type of `state0` (under
+    a law with states a `Coupled`): NaN where it was not met, `None` where there is no event. `own`
+    a tuple of the states of the laws that have some, in the order of the laws, what is inside
+    another first, with a leading time axis, or `None`.
 
     >>> import rigidjax as rj
     >>> body, start = rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([0.0, 0.0, 1.0])
@@ -118,9 +117,8 @@ class Solution(eqx.Module, Generic[State]):
 
         It is computed when it is read: by a run with a hundredth of the tolerances (for fixed
         steps: with half of the step), and, if round-off may count, by three runs with changed last
-        digits of body, torque and start. The closed form needs only these three, with changed
-        times. It works under `jit` and `vmap`. A `UserWarning` names the time after which nothing
-        is known, as in chaos.
+        digits of body, torque and start (in closed form, of the times). A `UserWarning` names the
+        time after which nothing is known, as in chaos.
 
         >>> import rigidjax as rj
         >>> body, start = rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([0.0, 0.5, 1.0])
@@ -153,8 +151,7 @@ class Solution(eqx.Module, Generic[State]):
     def evaluate(self, t: ScalarLike) -> State:
         """The state at any `t` between the first and the last of `ts`, s.
 
-        The motion is computed again from the last saved state before `t`, with its own steps, and
-        the attitude is on the group.
+        The motion is computed again from the last saved state before `t`, with its own steps.
 
         **Raises:** `ValueError` (`EquinoxRuntimeError` under `jit`) if `t` is outside.
         """
