@@ -19,10 +19,7 @@ ends all end within `patience`; shares written before are recovered, the others 
 from rigidjax._names import show
 from rigidjax.batch import distributed as distributed
 from rigidjax.batch.rollout import rollout as rollout
-from rigidjax.batch.sharding import (
-    compiler_options as compiler_options,
-    cpu_flags as cpu_flags,
-)
+from rigidjax.batch.sharding import compiler_options as compiler_options, cpu_flags as cpu_flags
 from rigidjax.batch.simulate import Steps as Steps, simulate as simulate
 
 show(__name__)

@@ -30,11 +30,7 @@ Program = Callable[[Layout, Arrays, Arrays], Arrays]
 
 
 def in_lanes(
-    program: Program,
-    constants: Arrays,
-    each: Arrays,
-    linear: int = 0,
-    layout: Layout | None = None,
+    program: Program, constants: Arrays, each: Arrays, linear: int = 0, layout: Layout | None = None
 ) -> Arrays:
     """The program, whose `jax.vmap` is itself on longer last axes; bodies may share `constants`.
 

@@ -88,10 +88,7 @@ class Event(eqx.Module):
     max_step: Any
 
     def __init__(
-        self,
-        condition: Callable[..., Any],
-        direction: int = 0,
-        max_step: ScalarLike | None = None,
+        self, condition: Callable[..., Any], direction: int = 0, max_step: ScalarLike | None = None
     ):
         self.condition = _checks.function(condition, "condition", "(t, state, body) → scalar")
         if isinstance(direction, bool) or direction not in (-1, 0, 1):

@@ -191,6 +191,5 @@ ad.primitive_jvps[_linear_map] = _differentiated
 ad.primitive_transposes[_linear_map] = _transposed
 batching.primitive_batchers[_linear_map] = _batched
 mlir.register_lowering(
-    _linear_map,
-    mlir.lower_fun(lambda *args, function, **_: function(*args), multiple_results=True),
+    _linear_map, mlir.lower_fun(lambda *args, function, **_: function(*args), multiple_results=True)
 )
