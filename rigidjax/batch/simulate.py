@@ -17,7 +17,6 @@ from rigidjax.batch.rollout import Inputs, rollout
 from rigidjax.batch.sharding import Compiled, chunk_of, mesh_of, over_bodies
 from rigidjax.batch.validation import BodyBatch, bodies_of, one_of, step_of
 from rigidjax.body.inertia import Inertia, MassProperties
-from rigidjax.exact.free_body import FreeMotion
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.coupled import Coupled, motion_of, started
 from rigidjax.solve import equations_of_motion, simulate as simulate_one, validation
@@ -107,8 +106,18 @@ def simulate(
     (5, 2, 4)
     """
     if isinstance(ts_or_steps, Steps):
-        how = dict(solver=solver, inputs=inputs, torque_axes=torque_axes)
-        return _equal(ts_or_steps, bodies, states0, torque, chunk=chunk, devices=devices, **how)
+        size, number, save_every, t0 = ts_or_steps
+        every = number if save_every is None else save_every
+        how = dict(solver=solver, inputs=inputs, torque_axes=torque_axes, chunk=chunk)
+        how |= dict(save_every=every, t0=t0, devices=devices)
+        ys: Any = rollout(bodies, states0, size, number, torque, **how)
+        batch = bodies_of(bodies, states0, torque, torque_axes)
+        h, count = step_of(size, number, batch.dtype)
+        ts = h * jnp.arange(every, count + 1, every).astype(h.dtype)
+        ts = _checks.time(t0, "t0").astype(h.dtype) + ts
+        taken = jnp.full(batch.many, count, jnp.int32)
+        own = ys.own if isinstance(ys, Coupled) else None
+        return Batch(ts, motion_of(ys), _statuses(batch, ys), taken, own)
     if inputs is not None:
         raise ValueError(
             "simulate: inputs are for Steps(size, number); with times put torques.Held(times, "
@@ -134,17 +143,21 @@ def _run(how: dict[str, Any], among: Any, rest: Any, numbers: Any) -> Any:
     def one(given: Any, each: Any) -> Any:
         shared, ts = given
         body, state0, torque = one_of(shared, each, rest)
-        if how["solver"] is None:
-            later = FreeMotion(body, state0)(ts[1:] - ts[0])
-            ys = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), state0, later)
-            return ys, _status(ys, body), jnp.zeros((), jnp.int32), None
         found = simulate_one(body, state0, ts, torque, throw=False, **how)
         return found.ys, found.result, jnp.asarray(found.stats["num_steps"], jnp.int32), found.own
 
     if how["solver"] is None:
         return over_bodies(one, (shared, ts), each, chunk, mesh)
-    quick = jax.vmap(lambda each: quickness(*one_of(shared, each, rest), ts[0]))(each)
-    order, back = dealt(quick, chunk, 1 if mesh is None else mesh.devices.size)
+
+    def quick(each: Any) -> Array:
+        # |Ω| + √|dΩ/dt| at the start, rad/s: the number of steps grows with it.
+        body, state0, torque = one_of(shared, each, rest)
+        y0 = started(body, state0, torque, ts[0])
+        slope = motion_of(equations_of_motion(body, y0, torque)(ts[0], y0, None))
+        rate, change = jnp.sum(state0.omega**2), jnp.sum(slope.omega**2)
+        return lax.stop_gradient(jnp.sqrt(rate) + jnp.sqrt(jnp.sqrt(change)))
+
+    order, back = dealt(jax.vmap(quick)(each), chunk, 1 if mesh is None else mesh.devices.size)
     each = jax.tree.map(lambda a: a[order], each)
     out = over_bodies(one, (shared, ts), each, chunk, mesh)
     return jax.tree.map(lambda a: a[back], out)
@@ -153,38 +166,13 @@ def _run(how: dict[str, Any], among: Any, rest: Any, numbers: Any) -> Any:
 _compiled = Compiled(_run)
 
 
-def _status(ys: Any, body: Any) -> dfx.RESULTS:
-    result = dfx.RESULTS.where(finite(ys), dfx.RESULTS.successful, NONFINITE)
-    return of_body(result, body)
-
-
 @eqx.filter_jit
 def _statuses(batch: BodyBatch, ys: Any) -> dfx.RESULTS:
     def one(each: Any, ys: Any) -> dfx.RESULTS:
-        return _status(ys, one_of(batch.shared, each, batch.rest)[0])
+        result = dfx.RESULTS.where(finite(ys), dfx.RESULTS.successful, NONFINITE)
+        return of_body(result, one_of(batch.shared, each, batch.rest)[0])
 
     return jax.vmap(one)(batch.each, ys)
-
-
-def _equal(steps: Steps, bodies: Any, states0: Any, torque: Any, **how: Any) -> Batch[Any]:
-    every = steps.number if steps.save_every is None else steps.save_every
-    how |= dict(save_every=every, t0=steps.t0)
-    ys: Any = rollout(bodies, states0, steps.size, steps.number, torque, **how)
-    batch = bodies_of(bodies, states0, torque, how["torque_axes"])
-    h, count = step_of(steps.size, steps.number, batch.dtype)
-    ts = h * jnp.arange(every, count + 1, every).astype(h.dtype)
-    ts = _checks.time(steps.t0, "t0").astype(h.dtype) + ts
-    taken = jnp.full(batch.many, count, jnp.int32)
-    own = ys.own if isinstance(ys, Coupled) else None
-    return Batch(ts, motion_of(ys), _statuses(batch, ys), taken, own)
-
-
-def quickness(body: Any, state0: Any, torque: Any, t0: Array) -> Array:
-    """`|Ω| + √|dΩ/dt|` at the start, rad/s: the number of steps grows with it."""
-    y0 = started(body, state0, torque, t0)
-    slope = motion_of(equations_of_motion(body, y0, torque)(t0, y0, None))
-    rate, change = jnp.sum(state0.omega**2), jnp.sum(slope.omega**2)
-    return lax.stop_gradient(jnp.sqrt(rate) + jnp.sqrt(jnp.sqrt(change)))
 
 
 def dealt(key: Array, chunk: int, parts: int) -> tuple[Array, Array]:

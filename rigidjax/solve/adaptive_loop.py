@@ -15,6 +15,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool
 
+from rigidjax.solve.batching import Arrays
 from rigidjax.solve.components import lift
 from rigidjax.solve.runge_kutta import Field, Step, error_estimate, stages
 from rigidjax.solve.tableaus import Tableau
@@ -168,7 +169,7 @@ def of_body(result: dfx.RESULTS, body: Any) -> dfx.RESULTS:
     return dfx.RESULTS.where(finite(body), result, dfx.RESULTS.nonfinite_input)  # pyright: ignore
 
 
-def tried(method: Method, constants: list[Array], run: Run, step: Step) -> tuple[Array, Array]:
+def tried(method: Method, constants: Arrays, run: Run, step: Step) -> tuple[Array, Array]:
     """The state a step later, and the root mean square of its error over the tolerance."""
     there = stages(method.tableau, method.field, constants, step)
     left, right = step.y, method.project(there.end)
@@ -214,7 +215,7 @@ def outcome(h: Array, t: Array, end: Array, met: Array) -> dfx.RESULTS:
     return result
 
 
-def first_step(method: Method, constants: list[Array], run: Run) -> tuple[Array, Array]:
+def first_step(method: Method, constants: Arrays, run: Run) -> tuple[Array, Array]:
     """The starting step of Hairer, Nørsett and Wanner (1993), II.4; the slope at the start."""
     y0, t0 = run.y0, run.t0
     scale = lift(run.atol, y0) + lift(run.rtol, y0) * jnp.abs(y0)
@@ -245,7 +246,7 @@ def first_step(method: Method, constants: list[Array], run: Run) -> tuple[Array,
     return h.astype(t0.dtype), first
 
 
-def value(method: Method, constants: list[Array], run: Run) -> Answer:
+def value(method: Method, constants: Arrays, run: Run) -> Answer:
     """The answer, with nothing kept: without states between."""
     loop = lax.while_loop(
         lambda loop: jnp.any(going(method, run, loop, None)),
@@ -256,7 +257,7 @@ def value(method: Method, constants: list[Array], run: Run) -> Answer:
 
 
 def recording(
-    method: Method, constants: list[Array], run: Run, saved: Callable[..., Array]
+    method: Method, constants: Arrays, run: Run, saved: Callable[..., Array]
 ) -> tuple[Answer, Record]:
     """The answer, and what derivatives need; `saved` as of `rigidjax.solve.adjoint`."""
     loop = start(method, constants, run)
@@ -284,7 +285,7 @@ def recording(
     return answer, record._replace(number=number, filled=filled)
 
 
-def start(method: Method, constants: list[Array], run: Run) -> LoopState:
+def start(method: Method, constants: Arrays, run: Run) -> LoopState:
     """A loop about to begin."""
     t0, y0 = run.t0, run.y0
     h, f0 = first_step(method, constants, run)
@@ -305,7 +306,7 @@ def going(method: Method, run: Run, loop: LoopState, until: Array | None) -> Arr
 
 
 def _attempt(
-    method: Method, constants: list[Array], run: Run, loop: LoopState, until: Array | None
+    method: Method, constants: Arrays, run: Run, loop: LoopState, until: Array | None
 ) -> tuple[LoopState, Array]:
     """One attempt at a step of every body, and its row."""
     on = going(method, run, loop, until)
@@ -350,7 +351,7 @@ def _unless_halted(method: Method, t: Array, y: Array, h: Array) -> Array:
 
 
 def recorded(
-    method: Method, constants: list[Array], run: Run, loop: LoopState, rows: Rows, until: Any
+    method: Method, constants: Arrays, run: Run, loop: LoopState, rows: Rows, until: Any
 ) -> tuple[LoopState, Rows, Array]:
     """The loop from here until the rows are full; and the number of rows."""
     many = max(1, min(_MOST, _BLOCK // run.y0.dtype.itemsize // rows.shape[1]))

@@ -9,7 +9,7 @@ they may take other steps between the same two ends if another program rounds di
 derivative is then that of these steps, the same to the tolerance.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -32,6 +32,7 @@ from rigidjax.solve.adaptive_loop import (
     times_of,
     unpacked,
 )  # fmt: skip
+from rigidjax.solve.batching import Arrays
 from rigidjax.solve.components import lift
 from rigidjax.solve.runge_kutta import Step, nested, stages, weights
 
@@ -40,7 +41,7 @@ _TOGETHER = 16
 
 
 def saved(
-    method: Method, constants: list[Array], run: Run, part: Segment, path: Array, ys: Array
+    method: Method, constants: Arrays, run: Run, part: Segment, path: Array, ys: Array
 ) -> Array:
     """`ys` (K, n, *bodies) with the states in a part of a run; `path` those at which rows start."""
     size, many, field, project = run.between.shape[0], run.t0.ndim, method.field, method.project
@@ -154,7 +155,7 @@ def _states(
 
 
 def replayed(
-    method: Method, constants: list[Array], run: Run, record: Record
+    method: Method, constants: Arrays, run: Run, record: Record
 ) -> tuple[Array, Array, Array, Array]:
     """States between and at the end, starts and rows by the steps of the record, which are held."""
     head = record.starts.shape[1] - run.y0.shape[0]
@@ -186,24 +187,19 @@ def replayed(
 
 
 def cotangents(
-    method: Method,
-    constants: list[Array],
-    run: Run,
-    record: Record,
-    bars: Sequence[Array],
-    timed: bool,
-) -> tuple[list[Array], Run]:
+    method: Method, constants: Arrays, run: Run, record: Record, bars: Arrays, timed: bool
+) -> tuple[Arrays, Run]:
     """The transpose of the tangents of `replayed`: cotangents of the constants and of the run.
 
     Those of times only where they are `timed`; `bars` of the states between and at the end.
     """
     number, size = jnp.max(record.number), run.between.shape[0]
 
-    def one(i: Array, sums: tuple[list[Array], Run]) -> tuple[list[Array], Run]:
+    def one(i: Array, sums: tuple[Arrays, Run]) -> tuple[Arrays, Run]:
         part = _again(method, constants, run, record, number - 1 - i)
         known = passed(run, part) if size else None
 
-        def step(k: Array, sums: tuple[list[Array], Run]) -> tuple[list[Array], Run]:
+        def step(k: Array, sums: tuple[Arrays, Run]) -> tuple[Arrays, Run]:
             total, of_run = sums
             k = part.number - 1 - k
             row = part.rows[k]
@@ -247,9 +243,7 @@ def _where(there: Array, a: Array) -> Array:
     return jnp.where(lift(there, a), a, jnp.zeros_like(a))
 
 
-def _again(
-    method: Method, constants: list[Array], run: Run, record: Record, number: Array
-) -> Segment:
+def _again(method: Method, constants: Arrays, run: Run, record: Record, number: Array) -> Segment:
     """A segment of the record; any but the last is run once more."""
     loop, after = (unpacked(record.starts[i]) for i in (number, number + 1))
     again = number < jnp.max(record.number) - 1

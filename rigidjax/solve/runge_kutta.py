@@ -13,11 +13,12 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
+from rigidjax.solve.batching import Arrays
 from rigidjax.solve.components import lift
 from rigidjax.solve.tableaus import Tableau
 
 # field(constants, t, y) → dy/dt, for t (*bodies), y (n, *bodies).
-Field = Callable[[list[Array], Array, Array], Array]
+Field = Callable[[Arrays, Array, Array], Array]
 
 
 class Step(NamedTuple):
@@ -80,7 +81,7 @@ def _sum(row: Array, slopes: Array) -> Array:
 
 
 def stages(
-    tableau: Tableau, field: Field, constants: list[Array], step: Step, dense: Any = False
+    tableau: Tableau, field: Field, constants: Arrays, step: Step, dense: Any = False
 ) -> Stages:
     """All stages of a step, if `dense` also those of dense output; `end` is not projected.
 
@@ -107,7 +108,7 @@ def stages(
 
 
 def _stage(
-    w: Weights, field: Field, constants: list[Array], step: Step, i: Array, slopes: Array
+    w: Weights, field: Field, constants: Arrays, step: Step, i: Array, slopes: Array
 ) -> tuple[Array, Array, Array]:
     # Time may be kept in another precision than the state.
     y = step.y + lift(step.h.astype(step.y.dtype), step.y) * _sum(w.a[i], slopes)
@@ -164,9 +165,9 @@ def error_estimate(tableau: Tableau, sizes: list[int], h: Array, slopes: Array) 
 
 
 def pulled(
-    tableau: Tableau, field: Field, constants: list[Array], step: Step, there: Stages,
+    tableau: Tableau, field: Field, constants: Arrays, step: Step, there: Stages,
     cotangent: Array, of_slopes: Array | None = None,
-) -> tuple[list[Array], Array, Array, Array]:  # fmt: skip
+) -> tuple[Arrays, Array, Array, Array]:  # fmt: skip
     """The transpose of a step: cotangents of the constants, of time, of length, of the state.
 
     `cotangent` is of the state at the end, `of_slopes` (n, s, *bodies) of all slopes.
