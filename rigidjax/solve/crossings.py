@@ -18,7 +18,7 @@ i belongs to, taken of ẏ and of the change of ẏ where each y changes by the 
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Any, Generic, NamedTuple
 
 import diffrax as dfx
 import equinox as eqx
@@ -32,9 +32,7 @@ from rigidjax import _checks
 from rigidjax._types import ScalarLike
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.exact.free_body import FreeMotion
-from rigidjax.frames import Point
-from rigidjax.motion import Attitude, Rigid, Spin
-from rigidjax.motion.coupled import Coupled, started
+from rigidjax.motion.coupled import started
 from rigidjax.motion.equations import on_the_group
 from rigidjax.motion.torques.base import jumps_of, lacking
 from rigidjax.solve import crossing_loop, validation
@@ -53,8 +51,7 @@ from rigidjax.solve.run import (
     equations_of_motion,
     solve,
 )
-
-State = TypeVar("State", Spin, Attitude, Rigid, Point, Coupled)
+from rigidjax.solve.solution import State
 
 
 class Event(eqx.Module):
@@ -160,13 +157,12 @@ def crossings(
     if the condition goes through it 16 times as fast as round-off could make it (under a solver,
     times the root of the number of steps). For many bodies use `jax.vmap`.
 
-    **Returns** `times`, `states`, their `count`, `result` and `num_steps` (`Crossings`). Times and
-    states have first and second derivatives with respect to all numbers of the scene, of
-    `condition` and of `state0`, forward and reverse; near a tangential contact they grow without
-    bound, as the true ones do.
+    **Returns** a `Crossings`. Times and states have first and second derivatives with respect to
+    all numbers of the scene, of `condition` and of `state0`, forward and reverse; near a tangential
+    contact they grow without bound, as the true ones do.
 
     Source: Newton's method on the step from the last accepted state, instead of Hénon's change of
-    variable (Hénon 1982, doi:10.1016/0167-2789(82)90034-3): two to three parts of a step.
+    variable (Hénon 1982, doi:10.1016/0167-2789(82)90034-3).
 
     **Raises:** `TypeError`, `ValueError` as `simulate`, for equal times, and for a condition that
     is no number, is NaN at the start, or reads a part that the state does not have.
@@ -206,10 +202,8 @@ def ready(event: Event, body: Any, state0: Any, torque: Any, t: Array) -> Any:
             raise
         raise TypeError(told) from wrong
     if _checks.known((event, body, t, state0)) and bool(jnp.isnan(_value(event, body, t, state0))):
-        raise ValueError(
-            f"condition: wanted a number wherever the motion goes, got NaN at the start, t = "
-            f"{float(t):g}"
-        )
+        words = "condition: wanted a number wherever the motion goes, got NaN at the start, t = "
+        raise ValueError(f"{words}{float(t):g}")
     return state0
 
 
@@ -234,8 +228,7 @@ def solve_until(
     """As `solve`, up to the event; and the event's time and state, NaN if there is none."""
     # The run is done twice: to find the event, and up to it, with derivatives.
     state0 = on_the_group(state0)
-    condition = lambda t, y: value(event, setup.body, t, y)  # noqa: E731
-    crossed, numbers = section(setup, condition, event.max_step, state0, ts)
+    crossed, numbers = section(setup, event, state0, ts)
     steps = setup.max_steps if isinstance(setup, Loop) else 1_000_000
     found = located(crossed, Search(event.direction, 1, steps), numbers)
     met, last = found.number > 0, lax.stop_gradient(ts[-1])
@@ -263,9 +256,18 @@ def _solved(
     setup: Free | Loop, event: Event, many: int, max_steps: int, state0: Any, ts: Array
 ) -> Crossings:
     state0 = on_the_group(state0)
-    condition = lambda t, y: value(event, setup.body, t, y)  # noqa: E731
-    crossed, numbers = section(setup, condition, event.max_step, state0, ts)
-    found = crossings_of(crossed, Search(event.direction, many, max_steps), numbers)
+    crossed, numbers = section(setup, event, state0, ts)
+    what = Search(event.direction, many, max_steps)
+    answer: Any = jax.custom_jvp(partial(located, crossed, what))
+
+    @answer.defjvp
+    def _(primals: Any, tangents: Any) -> Any:
+        found = located(crossed, what, *primals)
+        out, moved = jax.jvp(partial(_corrected, crossed, what, found), primals, tangents)
+        rest = [no_tangent(a) for a in found[2:]]
+        return Located(*out, *found[2:]), Located(*moved, *rest)  # pyright: ignore
+
+    found = answer(numbers)
     states = jax.vmap(partial(unflat, like=state0))(found.states)
     inputs = (event.condition, setup.body, setup.torque, state0, ts)
     times, states = nan_derivatives((crossed.time(found.times), states), inputs)
@@ -301,10 +303,9 @@ class Section(NamedTuple):
 Numbers = tuple[Arrays, Run, Array]
 
 
-def section(
-    setup: Free | Loop, condition: Callable[..., Any], max_step: Any, state0: Any, ts: Array
-) -> tuple[Section, Numbers]:
-    """The section `condition(t, y)` = 0 between `ts[0]` and `ts[-1]`, and what it is made of."""
+def section(setup: Free | Loop, event: Event, state0: Any, ts: Array) -> tuple[Section, Numbers]:
+    """The section between `ts[0]` and `ts[-1]`, and what it is made of."""
+    condition: Any = lambda t, y: value(event, setup.body, t, y)  # noqa: E731
     y0, dtype = flat(state0), ts.dtype
     sign = jnp.sign(ts[-1] - ts[0]).astype(jnp.int32)
     way = setup.sign if isinstance(setup, Loop) else sign
@@ -312,8 +313,8 @@ def section(
     field: Any = equations_of_motion(setup.body, state0, setup.torque)
     field, condition, along, jumps = ahead(way, field, condition, ts[jnp.array([0, -1])], jumps)
     longest = whole = lax.stop_gradient(along[1] - along[0])
-    if max_step is not None:
-        longest = lax.stop_gradient(jnp.asarray(max_step, dtype))
+    if event.max_step is not None:
+        longest = lax.stop_gradient(jnp.asarray(event.max_step, dtype))
 
     def slope(s: Array, y: Array) -> Array:
         return flat(field(s, unflat(y, state0), None))
@@ -416,20 +417,6 @@ def _clear(section: Section, constants: Arrays, s: Array, y: Array) -> Array:
     sizes = _lengths(like, slope) + _lengths(like, shift)
     terms = jnp.abs(by_s) + jnp.sum(jnp.abs(by_y) * sizes)
     return jnp.abs(rate) / (jnp.finfo(y.dtype).eps * terms)
-
-
-def crossings_of(section: Section, what: Search, numbers: Numbers) -> Located:
-    """As `located`; times and states are differentiable in all numbers."""
-    answer: Any = jax.custom_jvp(partial(located, section, what))
-
-    @answer.defjvp
-    def _(primals: Any, tangents: Any) -> Any:
-        found = located(section, what, *primals)
-        value, moved = jax.jvp(partial(_corrected, section, what, found), primals, tangents)
-        rest = [no_tangent(a) for a in found[2:]]
-        return Located(*value, *found[2:]), Located(*moved, *rest)  # pyright: ignore
-
-    return answer(numbers)
 
 
 def _corrected(

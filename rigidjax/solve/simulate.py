@@ -120,13 +120,7 @@ def simulate(
     """
     max_steps = None if max_steps is None else _checks.whole(max_steps, "max_steps", 1)
     body, state0, times = validation.scene(body, state0, ts, torque, throw)
-    given = rtol is not None or atol is not None
-    if stepsize_controller is not None and (given or accuracy is not None):
-        raise ValueError("simulate: give either rtol and atol or a stepsize_controller, not both")
-    if accuracy is not None and given:
-        raise ValueError("simulate: give either an accuracy or rtol and atol, not both")
-    if accuracy is not None and _checks.known(accuracy):
-        _checks.positive(accuracy, "accuracy")
+    _require_one(rtol is not None or atol is not None, accuracy, stepsize_controller)
     if stepsize_controller is None:
         rtol, atol = validation.tolerances(rtol, atol, times.dtype)
     if torque is None and solver is None and stepsize_controller is None and body is not None:
@@ -143,11 +137,7 @@ def simulate(
         loop = Loop(body, torque, method, rtol, atol, first, way, max_steps, throw)  # pyright: ignore
         if accuracy is None:
             return _solution(loop, event, state0, times)
-        found, run, tried = solve_to(loop, state0, times, jnp.asarray(accuracy, times.dtype))
-        found = dataclasses.replace(found, throw=throw)
-        sol = _solution(found, event, state0, times, None if event is not None else run)
-        error = foreseen_error(found, times, sol._states, sol.stats["num_steps"], tried)
-        return told(sol, error, accuracy)
+        return _accurate(loop, event, state0, times, accuracy)
     if accuracy is not None:
         raise ValueError(
             "simulate: an accuracy is for the closed form and our own loop: leave solver, adjoint, "
@@ -163,14 +153,35 @@ def simulate(
     # Ours project inside their one kernel; a second time outside of it breaks the kernel up.
     if not isinstance(solver, AbstractExplicit | AbstractSplitting | Projected):
         solver = SOLVER if solver is None else Projected(solver)
-    if adjoint is None:
-        finest = getattr(controller, "rtol", None)
-        tight = finest is not None and _checks.known(finest) and float(finest) < _TIGHT
-        adjoint = _EVERY_STEP if tight else ADJOINT
+    adjoint = _adjoint(controller) if adjoint is None else adjoint
     dt0 = None if first is None else first * jnp.sign(times[-1] - times[0])
     meter = NO_METER if progress_meter is None else progress_meter
     setup = Setup(body, torque, solver, controller, dt0, adjoint, meter, max_steps, throw)
     return _solution(setup, None, state0, times)
+
+
+def _require_one(given: bool, accuracy: Any, controller: Any) -> None:
+    """Refuse more than one of tolerances, accuracy and controller."""
+    if controller is not None and (given or accuracy is not None):
+        raise ValueError("simulate: give either rtol and atol or a stepsize_controller, not both")
+    if accuracy is not None and given:
+        raise ValueError("simulate: give either an accuracy or rtol and atol, not both")
+    if accuracy is not None and _checks.known(accuracy):
+        _checks.positive(accuracy, "accuracy")
+
+
+def _accurate(loop: Loop, event: Any, state0: Any, times: Array, accuracy: Any) -> Solution:
+    found, run, tried = solve_to(loop, state0, times, jnp.asarray(accuracy, times.dtype))
+    found = dataclasses.replace(found, throw=loop.throw)
+    sol = _solution(found, event, state0, times, None if event is not None else run)
+    error = foreseen_error(found, times, sol._states, sol.stats["num_steps"], tried)
+    return told(sol, error, accuracy)
+
+
+def _adjoint(controller: dfx.AbstractStepSizeController) -> dfx.AbstractAdjoint:
+    rtol = getattr(controller, "rtol", None)
+    tight = rtol is not None and _checks.known(rtol) and float(rtol) < _TIGHT
+    return _EVERY_STEP if tight else ADJOINT
 
 
 def _solution(setup: Any, event: Any, state0: Any, times: Array, run: Any = None) -> Solution:
