@@ -37,10 +37,10 @@ def connect(address: str, processes: int, process: int, *, patience: int = 20) -
         raise ValueError(f"process: wanted a number from 0 to {processes - 1}, got {process}")
     if ":" not in address:
         raise ValueError(f'address: wanted "host:port" of process 0, got {address!r}')
-    times = dict(heartbeat_timeout_seconds=patience, shutdown_timeout_seconds=patience)
     jax.distributed.initialize(
-        address, processes, process, initialization_timeout=3 * patience, **times
-    )
+        address, processes, process, initialization_timeout=3 * patience,
+        heartbeat_timeout_seconds=patience, shutdown_timeout_seconds=patience,
+    )  # fmt: skip
 
 
 def share(tree: Any) -> Any:

@@ -87,8 +87,8 @@ def stages(
 
     If `dense` is traced and false, its stages are the state at the start, and their slopes 0.
     """
-    plain, whole = (np.int32(count) for count in stage_counts(tableau))
-    count, number = (whole, whole) if dense is not False else (plain, plain)
+    plain, whole = stage_counts(tableau)
+    count, number = (whole, np.int32(whole)) if dense is not False else (plain, np.int32(plain))
     w = weights(tableau, step.y.dtype, count)
 
     def stage(i: Array, sofar: tuple[Array, Array, Array]) -> Any:
@@ -101,10 +101,11 @@ def stages(
     if not isinstance(dense, bool):
         # Where a field may have no value at 0, a stage that is left out must be somewhere else.
         times, places = times + step.t[None], places + step.y[:, None]
-        number = jnp.where(dense, whole, plain)
-    done = lax.fori_loop(np.int32(0), number, stage, (times, places, empty))
+        number = jnp.where(dense, np.int32(whole), np.int32(plain))
+    begun = (times, places, empty)
+    times, places, slopes = lax.fori_loop(np.int32(0), number, stage, begun)
     h = lift(step.h.astype(step.y.dtype), step.y)
-    return Stages(*done, step.y + h * _sum(w.b, done[2]), number)
+    return Stages(times, places, slopes, step.y + h * _sum(w.b, slopes), number)
 
 
 def _stage(
