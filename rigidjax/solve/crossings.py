@@ -18,7 +18,7 @@ i belongs to, taken of ẏ and of the change of ẏ where each y changes by the 
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, Generic, NamedTuple
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import diffrax as dfx
 import equinox as eqx
@@ -32,7 +32,9 @@ from rigidjax import _checks
 from rigidjax._types import ScalarLike
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.exact.free_body import FreeMotion
-from rigidjax.motion.coupled import started
+from rigidjax.frames import Point
+from rigidjax.motion import Attitude, Rigid, Spin
+from rigidjax.motion.coupled import Coupled, started
 from rigidjax.motion.equations import on_the_group
 from rigidjax.motion.torques.base import jumps_of, lacking
 from rigidjax.solve import crossing_loop, validation
@@ -51,7 +53,8 @@ from rigidjax.solve.run import (
     equations_of_motion,
     solve,
 )
-from rigidjax.solve.solution import State
+
+State = TypeVar("State", Spin, Attitude, Rigid, Point, Coupled)
 
 
 class Event(eqx.Module):
