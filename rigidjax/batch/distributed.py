@@ -1,8 +1,7 @@
 """Several hosts: each works on its own share of the bodies; only results are sent.
 
-Bodies are independent: a run itself sends nothing, and the results of a share are the same bits as
-on one process alone. Gathering fails if another process has ended. A share is therefore written to
-disk first, and the run then ends with an error.
+A run itself sends nothing, and the results of a share are the same bits as on one process alone.
+Gathering fails if another process has ended: a share is therefore written to disk first.
 """
 
 import os
@@ -19,11 +18,8 @@ from jax.experimental import multihost_utils
 from rigidjax import _checks
 from rigidjax._names import show
 
-# Seconds without a sign of life after which a peer counts as dead.
-PATIENCE = 20
 
-
-def connect(address: str, processes: int, process: int, *, patience: int = PATIENCE) -> None:
+def connect(address: str, processes: int, process: int, *, patience: int = 20) -> None:
     """Join the other processes; call it before anything else of JAX.
 
     **Arguments:** `address` "host:port" of process 0; `processes` their number; `process` the index
@@ -42,13 +38,9 @@ def connect(address: str, processes: int, process: int, *, patience: int = PATIE
     if ":" not in address:
         raise ValueError(f'address: wanted "host:port" of process 0, got {address!r}')
     jax.distributed.initialize(
-        address,
-        processes,
-        process,
-        initialization_timeout=3 * patience,
-        heartbeat_timeout_seconds=patience,
-        shutdown_timeout_seconds=patience,
-    )
+        address, processes, process, initialization_timeout=3 * patience,
+        heartbeat_timeout_seconds=patience, shutdown_timeout_seconds=patience,
+    )  # fmt: skip
 
 
 def share(tree: Any) -> Any:
@@ -79,9 +71,8 @@ def share(tree: Any) -> Any:
 def gather(tree: Any, checkpoint: str | os.PathLike[str] | None = None) -> Any:
     """All processes' rows, on every process, in order.
 
-    **Arguments:** `tree` arrays with this process's rows, as from `share`; `checkpoint` a
-    folder: the rows are written there first, as `share-3.npz`, for `recover`.
-    **Returns** the tree with the rows of all, in host memory.
+    **Arguments:** `tree` arrays with this process's rows, as from `share`; `checkpoint` a folder to
+    `save` them to first. **Returns** the tree with the rows of all, in host memory.
 
     **Raises:** `TypeError` for traced arrays; `RuntimeError` if another process has ended. This
     process should end then: JAX's arrays are of no use any more.
@@ -89,7 +80,17 @@ def gather(tree: Any, checkpoint: str | os.PathLike[str] | None = None) -> Any:
     >>> gather(jnp.arange(3)).tolist()
     [0, 1, 2]
     """
-    return _together(_rows_of_all, _known(tree, "gather"), checkpoint)
+
+    def rows_of_all(leaf: Any) -> np.ndarray:
+        # Shares differ by a row at most: fill up, send, cut.
+        rows = np.asarray(leaf)
+        counts = np.asarray(multihost_utils.process_allgather(jnp.asarray(rows.shape[0])))
+        most = int(counts.max())
+        filled = np.concatenate([rows, np.repeat(rows[-1:], most - rows.shape[0], axis=0)])
+        sent = np.asarray(multihost_utils.process_allgather(jnp.asarray(filled)))
+        return np.concatenate([part[:n] for part, n in zip(sent, counts, strict=True)])
+
+    return _together(rows_of_all, _known(tree, "gather"), checkpoint)
 
 
 def total(tree: Any, checkpoint: str | os.PathLike[str] | None = None) -> Any:
@@ -103,14 +104,14 @@ def total(tree: Any, checkpoint: str | os.PathLike[str] | None = None) -> Any:
     >>> total(jnp.ones(2)).tolist()
     [1.0, 1.0]
     """
-    return _together(_sum_of_all, _known(tree, "total"), checkpoint)
+    add = lambda leaf: multihost_utils.process_allgather(jnp.asarray(leaf)).sum(axis=0)  # noqa: E731
+    return _together(add, _known(tree, "total"), checkpoint)
 
 
 def save(tree: Any, folder: str | os.PathLike[str]) -> Path:
-    """Write this process's rows to `folder/share-<process>.npz`, all or nothing.
+    """Write this process's rows, a `tree` of arrays, to `folder/share-<process>.npz`.
 
-    **Arguments:** `tree` of arrays, whose first axis is this process's share; `folder` that all
-    processes see. **Returns** the path of the file.
+    It writes all or nothing. **Returns** the path of the file.
 
     >>> import tempfile
     >>> with tempfile.TemporaryDirectory() as folder:
@@ -172,20 +173,6 @@ def _known(tree: Any, name: str) -> Any:
             "processes: call it outside of jax.jit, jax.grad and jax.vmap"
         )
     return jax.tree.map(np.asarray, tree)
-
-
-def _sum_of_all(leaf: Any) -> Any:
-    return multihost_utils.process_allgather(jnp.asarray(leaf)).sum(axis=0)
-
-
-def _rows_of_all(leaf: Any) -> np.ndarray:
-    # Shares differ by a row at most: fill up, send, cut.
-    rows = np.asarray(leaf)
-    counts = np.asarray(multihost_utils.process_allgather(jnp.asarray(rows.shape[0])))
-    most = int(counts.max())
-    filled = np.concatenate([rows, np.repeat(rows[-1:], most - rows.shape[0], axis=0)])
-    sent = np.asarray(multihost_utils.process_allgather(jnp.asarray(filled)))
-    return np.concatenate([part[:n] for part, n in zip(sent, counts, strict=True)])
 
 
 def _together(send: Callable[[Any], Any], tree: Any, checkpoint: Any) -> Any:

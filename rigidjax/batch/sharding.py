@@ -1,11 +1,9 @@
-"""Many bodies in chunks that fit the cache, and in shares for devices.
-
-The functions here do not depend on the computation for a body.
-"""
+"""Many bodies in chunks that fit the cache, and in shares for devices, whatever is computed."""
 
 import functools
+import os
 from collections.abc import Callable, Sequence
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import equinox as eqx
 import jax
@@ -16,6 +14,10 @@ from jax.sharding import AxisType, Mesh, PartitionSpec as P
 
 from rigidjax import _checks
 
+_OPTION = "xla_cpu_small_while_loop_byte_threshold"
+_FLAG = f"--xla_backend_extra_options={_OPTION}=10000000"
+# The versions of the measurement: `python tests/batch/bench_batch.py --flag`.
+CHECKED = ("0.12.0.1",)
 AXIS = "bodies"
 # Bytes of one number of every body in a chunk: the arrays of a step then stay in the first cache.
 _ROW = 1024
@@ -27,14 +29,53 @@ def compiler_options() -> dict[str, Any]:
     """Options for `jax.jit(f, compiler_options=…)` around code that calls `rigidjax.batch`.
 
     They enable 512-bit vectors on CPU, which XLA does not use by default: 1.5 to 2 times the speed
-    on cores with AVX-512, no change on others. `rollout` and `simulate` use them outside of any
-    transformation. JAX takes options only at the outermost `jit`: give them there if it is your
-    own. They are empty unless the backend is CPU.
+    on cores with AVX-512. `rollout` and `simulate` use them outside of any transformation. JAX
+    takes options only at the outermost `jit`: give them there if it is your own. They are empty
+    unless the backend is CPU.
 
     >>> bool(jax.jit(lambda x: x + 1, compiler_options=compiler_options())(1.0) == 2)
     True
     """
     return dict(_WIDE) if jax.default_backend() == "cpu" else {}
+
+
+class CpuFlags(NamedTuple):
+    """The result of `cpu_flags`.
+
+    **Fields:** `xla_flags` the value for the environment variable `XLA_FLAGS`, with its present
+    contents; `set` whether the flag is there; `checked` versions of jaxlib it was measured on;
+    `jaxlib` the one in use.
+    """
+
+    xla_flags: str
+    set: bool
+    checked: tuple[str, ...]
+    jaxlib: str
+
+    def __str__(self) -> str:
+        state = "set" if self.set else "not set"
+        known = "" if self.jaxlib in self.checked else f"; not checked on jaxlib {self.jaxlib}"
+        return f"export XLA_FLAGS='{self.xla_flags}'    # {state}{known}"
+
+
+def cpu_flags() -> CpuFlags:
+    """The flag to export before Python starts, for loops over one or few bodies on CPU.
+
+    XLA compiles a small loop as one kernel; this undocumented option sets the limit of small. It
+    helps if the loop's state is larger than a kilobyte and the arrays are short: on jaxlib 0.12.0.1
+    a `rollout` of one free body took 0.45 of the time; of many bodies it is as fast without. It
+    acts on the whole process, and only if it is there before JAX first looks for devices. This
+    function sets nothing. **Returns** a `CpuFlags`.
+
+    >>> print(cpu_flags().xla_flags.split()[-1])
+    --xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=10000000
+    """
+    import jaxlib
+
+    given = os.environ.get("XLA_FLAGS", "")
+    there = _OPTION in given
+    wanted = given if there else f"{given} {_FLAG}".strip()
+    return CpuFlags(wanted, there, CHECKED, getattr(jaxlib, "__version__", jax.__version__))
 
 
 class Compiled:
@@ -59,11 +100,7 @@ class Compiled:
 
 
 def mesh_of(devices: Any) -> Mesh | None:
-    """A mesh of one axis over the devices, or `None` for JAX's default device.
-
-    **Arguments:** `devices` `None`, `"all"` (every device of this process), or a sequence of them.
-    **Raises:** `ValueError` for none, or devices of another process.
-    """
+    """A mesh of one axis over `devices`, as for `rollout`; `None` for JAX's default device."""
     if devices is None:
         return None
     if devices == "all":
@@ -97,8 +134,7 @@ def over_bodies(
 ) -> Any:
     """`one(shared, a body's part of each)` for all bodies, stacked along a new first axis.
 
-    **Arguments:** `shared`, `each` trees of arrays, those of `each` with a leading axis of bodies.
-    Bodies are independent: devices exchange nothing.
+    Arrays of `each` have a leading axis of bodies. Devices exchange nothing.
     """
     count = jax.tree.leaves(each)[0].shape[0]
     parts = 1 if mesh is None else mesh.devices.size
@@ -115,18 +151,16 @@ def over_bodies(
         out = lax.map(lambda row: side_by_side(shared, row), rows)
         return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), out)
 
-    padded = jax.tree.map(lambda a: _padded(a, room), each)
+    def padded(a: Any) -> Any:
+        # The last body again in the empty places.
+        return a if room == count else jnp.concatenate([a, jnp.repeat(a[-1:], room - count, 0)])
+
+    filled = jax.tree.map(padded, each)
     if mesh is None:
-        out = some(shared, padded)
+        out = some(shared, filled)
     else:
         # check_vma: a loop's carry that starts as a constant is not of the varying type it ends as.
         out = jax.shard_map(
             some, mesh=mesh, in_specs=(P(), P(AXIS)), out_specs=P(AXIS), check_vma=False
-        )(shared, padded)
+        )(shared, filled)
     return jax.tree.map(lambda a: a[:count], out)
-
-
-def _padded(a: Any, room: int) -> Any:
-    """The last body again in the empty places."""
-    more = room - a.shape[0]
-    return a if not more else jnp.concatenate([a, jnp.repeat(a[-1:], more, axis=0)])

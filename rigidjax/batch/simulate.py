@@ -17,13 +17,12 @@ from rigidjax.batch.rollout import Inputs, rollout
 from rigidjax.batch.sharding import Compiled, chunk_of, mesh_of, over_bodies
 from rigidjax.batch.validation import BodyBatch, bodies_of, one_of, step_of
 from rigidjax.body.inertia import Inertia, MassProperties
-from rigidjax.exact.free_body import FreeMotion
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.coupled import Coupled, motion_of, started
 from rigidjax.solve import equations_of_motion, simulate as simulate_one, validation
+from rigidjax.solve.adaptive_loop import NONFINITE, finite, of_body
 from rigidjax.solve.explicit import DormandPrince8
 from rigidjax.solve.magnus import Magnus4
-from rigidjax.solve.step_control import NONFINITE, finite, of_body
 
 State = TypeVar("State", Spin, Attitude, Rigid)
 
@@ -52,13 +51,6 @@ class Batch(eqx.Module, Generic[State]):
     `diffrax.RESULTS` for each body: `successful`, `nonfinite`, `nonfinite_input` (no body has these
     numbers), `max_steps_reached`, `dt_min_reached`. `num_steps` (N,) accepted and rejected, 0 for
     the closed form. `own` a tuple of the torques' own states, as `ys`, or `None`.
-
-    >>> import rigidjax as rj
-    >>> bodies = rj.Inertia(jnp.diag(jnp.array([1.0, 2.0, 3.0])))
-    >>> states = rj.Attitude(jnp.tile(jnp.eye(4)[0], (5, 1)), jnp.tile(jnp.eye(3)[2], (5, 1)))
-    >>> found = rj.batch.simulate(bodies, states, [0.0, 1.0])
-    >>> found.ys.q.shape, found.num_steps.tolist()
-    ((5, 2, 4), [0, 0, 0, 0, 0])
     """
 
     ts: Float[Array, " times"]
@@ -95,13 +87,12 @@ def simulate(
     - `solver`: `None` takes the closed form for free bodies, `rigidjax.solvers.DormandPrince8`
       under a torque, and the choice of `rollout` for `Steps`. With times any
       `diffrax.AbstractSolver` may be given; the explicit ones of `rigidjax.solvers` run in our own
-      loop (256 heavy tops at 1e-9 take a seventh of the time that `jax.vmap` of plain
-      `diffrax.Dopri8` takes).
+      loop.
     - `rtol`, `atol`, `max_steps`, `adjoint`: as for `rigidjax.simulate`.
 
-    Bodies of one chunk take steps until the last of them has arrived. Bodies are therefore ordered
-    by their initial rate, so that bodies of a chunk are alike. A body that becomes NaN ends within
-    two steps. The other bodies get the same bits whatever happens to one.
+    Bodies of one chunk take steps until the last of them has arrived; they are therefore computed
+    in the order of their initial rates. A body that becomes NaN ends within two steps. The other
+    bodies get the same bits whatever happens to one.
 
     **Returns** `ts`, `ys`, `result`, `num_steps` and `own` of each body (`Batch`). Nothing is
     raised for what happens during a run: look at `result`.
@@ -115,8 +106,18 @@ def simulate(
     (5, 2, 4)
     """
     if isinstance(ts_or_steps, Steps):
-        how = dict(solver=solver, inputs=inputs, torque_axes=torque_axes)
-        return _equal(ts_or_steps, bodies, states0, torque, chunk=chunk, devices=devices, **how)
+        size, number, save_every, t0 = ts_or_steps
+        every = number if save_every is None else save_every
+        how = dict(solver=solver, inputs=inputs, torque_axes=torque_axes, chunk=chunk)
+        how |= dict(save_every=every, t0=t0, devices=devices)
+        ys: Any = rollout(bodies, states0, size, number, torque, **how)
+        batch = bodies_of(bodies, states0, torque, torque_axes)
+        h, count = step_of(size, number, batch.dtype)
+        ts = h * jnp.arange(every, count + 1, every).astype(h.dtype)
+        ts = _checks.time(t0, "t0").astype(h.dtype) + ts
+        taken = jnp.full(batch.many, count, jnp.int32)
+        own = ys.own if isinstance(ys, Coupled) else None
+        return Batch(ts, motion_of(ys), _statuses(batch, ys), taken, own)
     if inputs is not None:
         raise ValueError(
             "simulate: inputs are for Steps(size, number); with times put torques.Held(times, "
@@ -130,110 +131,54 @@ def simulate(
         max_steps = _checks.whole(max_steps, "max_steps", 1)
         rtol, atol = validation.tolerances(rtol, atol, batch.dtype)
         solver = DormandPrince8() if solver is None else solver
-    chunk, mesh = chunk_of(chunk, batch.dtype, batch.many), mesh_of(devices)
-    plan = _Plan(solver, rtol, atol, max_steps, adjoint, chunk, mesh)
+    how = dict(solver=solver, rtol=rtol, atol=atol, max_steps=max_steps, adjoint=adjoint)
+    among = chunk_of(chunk, batch.dtype, batch.many), mesh_of(devices)
     numbers = (batch.shared, batch.each, ts)
-    ys, result, steps, own = _compiled(plan, batch.rest, numbers)
-    return Batch(ts, ys, result, steps, own)
+    return Batch(ts, *_compiled(how, among, batch.rest, numbers))
 
 
-class _Plan(eqx.Module):
-    """The compiled program. Without a solver it is the closed form."""
-
-    solver: dfx.AbstractSolver | None
-    rtol: float | None = eqx.field(static=True)
-    atol: float | None = eqx.field(static=True)
-    max_steps: int = eqx.field(static=True)
-    adjoint: dfx.AbstractAdjoint | None
-    chunk: int = eqx.field(static=True)
-    mesh: Any = eqx.field(static=True)
-
-
-def _run(plan: _Plan, rest: Any, numbers: Any) -> Any:
-    shared, each, ts = numbers
+def _run(how: dict[str, Any], among: Any, rest: Any, numbers: Any) -> Any:
+    (shared, each, ts), (chunk, mesh) = numbers, among
 
     def one(given: Any, each: Any) -> Any:
         shared, ts = given
         body, state0, torque = one_of(shared, each, rest)
-        if plan.solver is None:
-            return _free(body, state0, ts)
-        return _adaptive(plan, body, state0, torque, ts)
+        found = simulate_one(body, state0, ts, torque, throw=False, **how)
+        return found.ys, found.result, jnp.asarray(found.stats["num_steps"], jnp.int32), found.own
 
-    if plan.solver is None:
-        return over_bodies(one, (shared, ts), each, plan.chunk, plan.mesh)
+    if how["solver"] is None:
+        return over_bodies(one, (shared, ts), each, chunk, mesh)
 
     def quick(each: Any) -> Array:
-        return quickness(*one_of(shared, each, rest), ts[0])
+        # |Ω| + √|dΩ/dt| at the start, rad/s: the number of steps grows with it.
+        body, state0, torque = one_of(shared, each, rest)
+        y0 = started(body, state0, torque, ts[0])
+        slope = motion_of(equations_of_motion(body, y0, torque)(ts[0], y0, None))
+        rate, change = jnp.sum(state0.omega**2), jnp.sum(slope.omega**2)
+        return lax.stop_gradient(jnp.sqrt(rate) + jnp.sqrt(jnp.sqrt(change)))
 
-    parts = 1 if plan.mesh is None else plan.mesh.devices.size
-    order, back = dealt(jax.vmap(quick)(each), plan.chunk, parts)
+    order, back = dealt(jax.vmap(quick)(each), chunk, 1 if mesh is None else mesh.devices.size)
     each = jax.tree.map(lambda a: a[order], each)
-    out = over_bodies(one, (shared, ts), each, plan.chunk, plan.mesh)
+    out = over_bodies(one, (shared, ts), each, chunk, mesh)
     return jax.tree.map(lambda a: a[back], out)
 
 
 _compiled = Compiled(_run)
 
 
-def _free(body: Any, state0: Any, ts: Array) -> Any:
-    later = FreeMotion(body, state0)(ts[1:] - ts[0])
-    ys = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), state0, later)
-    return ys, _status(ys, body), jnp.zeros((), jnp.int32), None
-
-
-def _status(ys: Any, body: Any) -> dfx.RESULTS:
-    result = dfx.RESULTS.where(finite(ys), dfx.RESULTS.successful, NONFINITE)
-    return of_body(result, body)
-
-
 @eqx.filter_jit
 def _statuses(batch: BodyBatch, ys: Any) -> dfx.RESULTS:
     def one(each: Any, ys: Any) -> dfx.RESULTS:
-        return _status(ys, one_of(batch.shared, each, batch.rest)[0])
+        result = dfx.RESULTS.where(finite(ys), dfx.RESULTS.successful, NONFINITE)
+        return of_body(result, one_of(batch.shared, each, batch.rest)[0])
 
     return jax.vmap(one)(batch.each, ys)
-
-
-def _adaptive(plan: _Plan, body: Any, state0: Any, torque: Any, ts: Array) -> Any:
-    names = ("solver", "rtol", "atol", "max_steps", "adjoint")
-    how: Any = {name: getattr(plan, name) for name in names}
-    found = simulate_one(body, state0, ts, torque, throw=False, **how)
-    steps = jnp.asarray(found.stats["num_steps"], jnp.int32)
-    return found.ys, found.result, steps, found.own
-
-
-def _equal(steps: Steps, bodies: Any, states0: Any, torque: Any, **how: Any) -> Batch[Any]:
-    every = steps.number if steps.save_every is None else steps.save_every
-    how |= dict(save_every=every, t0=steps.t0)
-    ys: Any = rollout(bodies, states0, steps.size, steps.number, torque, **how)
-    batch = bodies_of(bodies, states0, torque, how["torque_axes"])
-    h, count = step_of(steps.size, steps.number, batch.dtype)
-    ts = h * jnp.arange(every, count + 1, every).astype(h.dtype)
-    ts = _checks.time(steps.t0, "t0").astype(h.dtype) + ts
-    taken = jnp.full(batch.many, count, jnp.int32)
-    own = ys.own if isinstance(ys, Coupled) else None
-    return Batch(ts, motion_of(ys), _statuses(batch, ys), taken, own)
-
-
-def quickness(body: Any, state0: Any, torque: Any, t0: Array) -> Array:
-    """The rate of change of the motion at the start, rad/s; the number of steps grows with it.
-
-    **Returns** a scalar, `|Ω| + √|dΩ/dt|`; NaN if the derivative is NaN.
-    """
-    y0 = started(body, state0, torque, t0)
-    slope = motion_of(equations_of_motion(body, y0, torque)(t0, y0, None))
-    rate, change = jnp.sum(state0.omega**2), jnp.sum(slope.omega**2)
-    return lax.stop_gradient(jnp.sqrt(rate) + jnp.sqrt(jnp.sqrt(change)))
 
 
 def dealt(key: Array, chunk: int, parts: int) -> tuple[Array, Array]:
     """An order by `key` (N,), NaN last, and the way back from it.
 
     Several devices get chunks in turn, so that each has quick and slow ones.
-
-    >>> order, back = dealt(jnp.array([3.0, 1.0, 2.0]), 128, 1)
-    >>> order.tolist(), back.tolist()
-    ([1, 2, 0], [2, 0, 1])
     """
     order, count = jnp.argsort(key), key.shape[0]
     chunk = min(chunk, -(-count // parts))

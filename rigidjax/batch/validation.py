@@ -20,15 +20,11 @@ from rigidjax.solve.components import one_dtype
 
 
 class BodyBatch(NamedTuple):
-    """A batch, split into the arrays that all bodies share and the arrays of each.
+    """A batch `(body, state0, torque)`, split into three trees."""
 
-    **Fields:** `shared`, `each` trees of the same shape, `(body, state0, torque)`, with `None`
-    where the other has the array; `rest` the leaves that are no arrays; `many` N; `dtype`.
-    """
-
-    shared: Any
-    each: Any
-    rest: Any
+    shared: Any  # the arrays that all bodies share, `None` elsewhere
+    each: Any  # the arrays of each body
+    rest: Any  # the leaves that are no arrays
     many: int
     dtype: Any
 
@@ -40,12 +36,7 @@ def one_of(shared: Any, each: Any, rest: Any) -> tuple[Any, Any, Any]:
 
 
 def bodies_of(bodies: Any, states0: Any, torque: Any, torque_axes: Any) -> BodyBatch:
-    """The batch.
-
-    **Raises:** `TypeError` for anything but bodies and states that fit together, and for states of
-    several dtypes; `ValueError` for shapes that do not agree, and, if numbers are known, for a
-    moment that is not positive or a quaternion whose length is not 1, naming the first such body.
-    """
+    """The batch; an error names the first body with a known number that is wrong."""
     if not isinstance(states0, Spin | Attitude | Rigid):
         raise TypeError(
             f"states0: wanted Spin, Attitude or Rigid, got {type(states0).__name__}; for points in "
@@ -89,28 +80,23 @@ def bodies_of(bodies: Any, states0: Any, torque: Any, torque_axes: Any) -> BodyB
         _own_torque(arrays[2], torque_axes, count),
     )
     each, shared = eqx.partition(arrays, axes)
-    found = BodyBatch(shared, each, rest, count, dtype)
     # Shapes are enough for an Inertia; taking a row costs as much as many steps.
     shape = lambda a: jax.ShapeDtypeStruct(a.shape[1:], a.dtype)  # noqa: E731
-    matter = isinstance(bodies, MassProperties)
-    first = jax.tree.map((lambda a: a[0]) if matter else shape, each)
-    validation.require_fit(*eqx.combine(shared, first, rest))
-    return found
+    row = (lambda a: a[0]) if isinstance(bodies, MassProperties) else shape
+    validation.require_fit(*eqx.combine(shared, jax.tree.map(row, each), rest))
+    return BodyBatch(shared, each, rest, count, dtype)
 
 
 def driven_by(inputs: Any, torque: Any, states0: Any, count: int, h: Array) -> Any:
-    """The inputs of each body, by name (N, steps, *k), in the precision of the states.
-
-    **Raises:** `ValueError` for an input that is missing, or that the torque does not read, for
-    another number of bodies or steps, NaN, a delay as long as the run; `TypeError` for anything but
-    a mapping.
-    """
+    """The inputs of each body, by name (N, steps, *k), in the precision of the states."""
     for name, delay in delays_of(torque):
-        if _checks.known((delay, h)) and (np.abs(np.asarray(delay)) >= count * float(h)).any():
-            raise ValueError(
-                f"inputs[{name!r}]: a delay of {np.abs(np.asarray(delay)).max():.6g} s, and a run "
-                f"of {count * float(h):.6g} s: none of it would be seen"
-            )
+        if _checks.known((delay, h)):
+            longest, whole = np.abs(np.asarray(delay)).max(), count * float(h)
+            if longest >= whole:
+                raise ValueError(
+                    f"inputs[{name!r}]: a delay of {longest:.6g} s, and a run of {whole:.6g} s: "
+                    "none of it would be seen"
+                )
     wanted = (*states0.omega.shape[:1], count)
     found = {}
     for name, value in require_inputs(torque, inputs).items():
@@ -197,11 +183,7 @@ def _unit(q: Array) -> None:
 
 
 def step_of(step_size: Any, num_steps: Any, dtype: Any) -> tuple[Array, int]:
-    """The step, s, and the number of steps.
-
-    **Raises:** `ValueError` for a step that is not positive; `TypeError` for a number of steps that
-    is not a known whole number.
-    """
+    """The step, s, and the number of steps."""
     h = _checks.floating(step_size, (), "step_size").astype(dtype)
     if _checks.known(h) and not 0 < float(h) < np.inf:
         raise ValueError(

@@ -1,13 +1,11 @@
 """Hints to XLA on CPU, so that scalar formulas compile and run fast.
 
 XLA copies cheap arithmetic into each kernel that needs it: a chain of stages that all feed one
-another grows exponentially, in compile time and in run time. It does not copy divisions. A division
-by a 1 that is unknown to XLA keeps a stage whole, and changes no bit (`fence`).
+another grows exponentially. It does not copy divisions: a division by a 1 that is unknown to XLA
+keeps a stage whole, and changes no bit (`fence`).
 
-A kernel of one body costs 5 to 10 ms to compile, whatever its size. A loop with a small state
-becomes one kernel; single computations are therefore put into a loop (`one_kernel`).
-
-XLA calls the scalar sine of the C library in batches of float64 (`sincos`).
+A kernel of one body takes long to compile, whatever its size. A loop with a small state becomes one
+kernel; single computations are therefore put into a loop (`one_kernel`).
 """
 
 import functools
@@ -100,9 +98,9 @@ _COS32 = (4.166664568298827e-2, -1.388731625493765e-3, 2.443315711809948e-5)
 def sincos(x: Scalar) -> tuple[Scalar, Scalar]:
     """Sin x and cos x of an angle in radians, by short polynomials. Not for differentiation.
 
-    Cody and Waite 1980 (reduction by π/2 in parts), fdlibm's and Cephes' minimax kernels. The error
-    is one or two units in the last place up to 1e6 rad; beyond that it is within the round-off of
-    the argument.
+    In batches of float64 XLA calls the scalar sine of the C library. Cody and Waite 1980 (reduction
+    by π/2 in parts), fdlibm's and Cephes' minimax kernels. The error is one or two units in the
+    last place up to 1e6 rad; beyond that it is within the round-off of the argument.
     """
     wide = x.dtype == jnp.float64
     parts, sines, cosines = (_PARTS64, _SIN64, _COS64) if wide else (_PARTS32, _SIN32, _COS32)

@@ -24,24 +24,19 @@ from rigidjax.exact.jacobi_duplication import (
 
 
 class Orbit(NamedTuple):
-    """The constants of a free motion. Axes are labelled 1, 2, 3 in order.
+    """The constants of a free motion, in principal axes labelled 1, 2, 3 in order."""
 
-    `a` the largest-or-smallest reciprocal moment, `d12, d13, d23` differences of reciprocal
-    moments, `P` the initial momentum and `h` its length, all in principal axes after the
-    labelling; `swapped` says which of the two monotone labellings is used.
-    """
-
-    a: Scalar
-    d12: Scalar
+    a: Scalar  # the largest or smallest reciprocal moment
+    d12: Scalar  # differences of reciprocal moments
     d13: Scalar
     d23: Scalar
-    P: Triple
-    h: Scalar
+    P: Triple  # the initial momentum
+    h: Scalar  # its length
     modulus: Modulus
     mu: Scalar
     turn: Scalar
     half: HalfPeriod
-    swapped: Float[Array, ""]
+    swapped: Float[Array, ""]  # which of the two monotone labellings is used
 
 
 @one_kernel
@@ -70,15 +65,11 @@ def orbit(moments: Triple, momentum: Triple) -> Orbit:
 
 
 class Reduced(NamedTuple):
-    """A time minus whole half periods.
+    """A time minus whole half periods."""
 
-    `halves` half periods, `rest` the remaining time, `near` the same, but cut on the separatrix
-    after the time to come to rest.
-    """
-
-    halves: Scalar
+    halves: Scalar  # their number
     rest: Scalar
-    near: Scalar
+    near: Scalar  # the rest, on the separatrix cut at the time to come to rest
 
 
 def reduced(u: Scalar, half: Scalar, m: Modulus) -> Reduced:

@@ -4,11 +4,14 @@ Written on components so that XLA makes one kernel of a batch (a stacked array c
 """
 
 from rigidjax._types import Scalar
+from rigidjax.rotation.linalg3 import cross_components as cross
 
 # Of 3, 4 and 6 entries; generators do not carry their length for a type checker.
 Triple = tuple[Scalar, ...]
 Four = tuple[Scalar, ...]
 Six = tuple[Scalar, ...]
+# ½ a : b of two symmetric matrices is the sum of these times the products of their entries.
+HALF = (0.5, 0.5, 0.5, 1.0, 1.0, 1.0)
 
 
 def plus(a: Triple, b: Triple) -> Triple:
@@ -54,10 +57,6 @@ def adjugate(m: Six) -> Six:
         x * z - y * b,
         x * y - z * a,
     )
-
-
-def cross(a: Triple, b: Triple) -> Triple:
-    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
 def half_product(q: Four, v: Triple) -> Four:

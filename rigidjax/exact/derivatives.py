@@ -25,6 +25,7 @@ from rigidjax.exact import sigma_form
 from rigidjax.exact._xla import fence, one_kernel, opaque_one
 from rigidjax.exact.closed_form import Orbit, from_functions, momentum_and_turn, orbit, reduced
 from rigidjax.exact.components3 import (
+    HALF,
     Four,
     Six,
     Triple,
@@ -35,7 +36,7 @@ from rigidjax.exact.components3 import (
     plus,
     times,
     turned_back,
-)
+)  # fmt: skip
 from rigidjax.exact.jacobian import integrals, jacobian_and_integral
 from rigidjax.exact.principal_axes import in_axes, into, out_of, principal_frame
 from rigidjax.exact.sigma_form import Differences
@@ -45,9 +46,8 @@ from rigidjax.rotation.linalg3 import components
 _STILL = {jnp.dtype("float32"): 1e-4, jnp.dtype("float64"): 1e-9}
 
 
-# Up to so many times a loop over them compiles in 0.65 to 0.7 of the time of one batch (values and
-# gradients at 301 times), and is as fast or faster for derivatives and many bodies. Values of one
-# body take 1.6 times as long at 301 times (0.1 ms more), four times at 900.
+# Up to so many times a loop over them compiles sooner than one batch, and is as fast but for the
+# values of one body.
 _LOOPED = 1000
 
 
@@ -182,8 +182,7 @@ def slopes(moments: Six, momentum: Triple, t: Scalar) -> tuple[tuple[Triple, Fou
     r = 1.0 / jnp.where(still, 1.0, h2)
     rate, r = fence((times(k, momentum), r), one)
     squares = (p1 * p1, p2 * p2, p3 * p3, p1 * p2, p1 * p3, p2 * p3)
-    half = (0.5, 0.5, 0.5, 1.0, 1.0, 1.0)
-    weights = fence(tuple(c * (t * a + b) for c, a, b in zip(half, squares, g, strict=True)), one)
+    weights = fence(tuple(c * (t * a + b) for c, a, b in zip(HALF, squares, g, strict=True)), one)
 
     def column(e, change):
         e12, e23, o12, o13, o23, e1, e2, e3, e11, et = e
@@ -215,10 +214,7 @@ def inputs_of(moments: Six, momentum: Triple) -> tuple[Scalar, ...]:
 
 @jax.custom_jvp
 def first_order(moments: Six, momentum: Triple, t: Scalar):
-    """The result of `flow`; the derivatives of Π(t) − Π(0) by `inputs_of` and t; G = ∫ Π Πᵀ dt.
-
-    One loop of doublings gives them all.
-    """
+    """The result of `flow`; the derivatives of Π(t) − Π(0) by `inputs_of` and t; G = ∫ Π Πᵀ dt."""
     return _first_order(orbit(moments[:3], momentum), moments, momentum, t)
 
 
@@ -229,9 +225,8 @@ def _first_order(o: Orbit, moments: Six, momentum: Triple, t: Scalar):
     f = at.f._replace(
         C=jnp.where(o.swapped, at.f.D, at.f.C), D=jnp.where(o.swapped, at.f.C, at.f.D)
     )
-    whole = jnp.where(u.halves == 0, 0.0, 2.0 * u.halves) * jnp.where(
-        u.halves == 0, 0.0, o.half.time
-    )
+    none = u.halves == 0
+    whole = jnp.where(none, 0.0, 2.0 * u.halves) * jnp.where(none, 0.0, o.half.time)
     body, _, _ = reciprocal(moments, momentum)
     half = at._replace(f=f)
     rows, g = jacobian_and_integral(body, momentum, t, half, u.halves, whole, o.half.mean)

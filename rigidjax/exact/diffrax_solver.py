@@ -23,7 +23,6 @@ class FreeInterpolation(dfx.AbstractLocalInterpolation):
     direction: Any
 
     def evaluate(self, t0: Any, t1: Any = None, left: bool = True) -> PyTree[Array]:
-        del left
         motion = FreeBody(self.inertia, self.y0)
         state = motion(self.direction * (t0 - self.t0))
         if t1 is None:
@@ -35,9 +34,8 @@ class FreeSolver(dfx.AbstractSolver):
     """A diffrax solver for torque-free spins and attitudes; its step is the closed form.
 
     Use it with `diffrax.ODETerm(rigidjax.equations_of_motion(inertia, y0))` of a `Spin` or an
-    `Attitude`, with no torque. Steps may be as long as one likes, so `ConstantStepSize` with one
-    step over the whole interval does; events, `SaveAt(ts=…, dense=True)` and every adjoint work as
-    with any solver. Without events, `rigidjax.exact.free_body` is the shorter way.
+    `Attitude`, with no torque. Steps may be as long as one likes: one over the whole interval does.
+    Events, `SaveAt(ts=…, dense=True)` and every adjoint work as with any solver.
 
     **Raises:** `ValueError` for another term, or one with a torque.
 
@@ -67,9 +65,9 @@ class FreeSolver(dfx.AbstractSolver):
     def step(
         self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: None, made_jump: Any
     ) -> tuple[Any, Any, dict[str, Any], None, dfx.RESULTS]:
-        del args, solver_state, made_jump
-        inertia = _field(terms).inertia
-        direction = _direction(terms, jnp.asarray(t0))
+        inertia, zero = _field(terms).inertia, jnp.zeros_like(t0)
+        # −1 where diffrax integrates backwards, its times running as −t: the control of [0, 1].
+        direction = terms.contr(zero, jnp.ones_like(zero))
         y1 = FreeBody(inertia, y0)(direction * (t1 - t0))
         error = jax.tree.map(jnp.zeros_like, y0)
         dense = dict(y0=y0, inertia=inertia, direction=direction)
@@ -96,8 +94,3 @@ def _field(terms: Any) -> EulerEquations:
             "solver that steps"
         )
     return euler
-
-
-def _direction(terms: Any, like: Any) -> Any:
-    """−1 where diffrax integrates backwards, its times running as −t: the control of [0, 1]."""
-    return terms.contr(jnp.zeros_like(like), jnp.ones_like(like))

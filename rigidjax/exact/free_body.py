@@ -24,11 +24,9 @@ State = TypeVar("State", bound=HasSpin)
 
 
 class FreeBody(eqx.Module):
-    """The whole motion of a free body; call it with a time.
+    """The whole motion of a free body; call it with a time, or `at` with many.
 
-    Its constants are computed once. `at` gives the motion at many times.
-
-    **Arguments:** as for `free_body`.
+    Its constants are computed once. **Arguments:** as for `free_body`.
 
     >>> import rigidjax as rj
     >>> motion = FreeBody(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([0.0, 0.0, 1.0]))
@@ -52,7 +50,7 @@ class FreeBody(eqx.Module):
         self.state0 = state0
 
     def __call__(self, t: ScalarLike) -> HasSpin:
-        return self._at(_time(t, self.state0.omega))
+        return self.at(_time(t, self.state0.omega))
 
     def at(self, ts: Float[Array, "*n"]) -> HasSpin:
         """The states at `ts` (n,), s since `state0`: as by `jax.vmap`, quicker to compile.
@@ -63,10 +61,7 @@ class FreeBody(eqx.Module):
         Array([[0., 0., 1.],
                [0., 0., 1.]], dtype=float64)
         """
-        return self._at(ts)
-
-    def _at(self, t: Array) -> HasSpin:
-        t = t.astype(self.tensor.dtype)
+        t = ts.astype(self.tensor.dtype)
         # After so many turns the dtype has no digit within one turn: then there is no state.
         turned = jnp.abs(t) * jnp.max(jnp.abs(self.state0.omega))
         t = jnp.where(turned <= 1 / jnp.finfo(t.dtype).eps, t, jnp.nan)
@@ -83,19 +78,7 @@ class FreeBody(eqx.Module):
 class FreeMotion(eqx.Module):
     """The motion of a free body of any kind: `FreeBody`, and x + v t of a `Rigid`.
 
-    Call it with a time (scalar) or with times (n,), s since `state0`. Times that are too long give
-    NaN.
-
-    **Arguments:** `body` an `Inertia`, or `MassProperties` for a `Rigid`; `state0` a `Spin`,
-    `Attitude` or `Rigid`.
-
-    **Raises:** as `free_body`.
-
-    >>> import rigidjax as rj
-    >>> body = rj.MassProperties(2.0, [0.0, 0, 0], [[1.0, 0, 0], [0, 1, 0], [0, 0, 1]])
-    >>> start = rj.Rigid([0.0, 0, 0], [1.0, 0, 0], [1.0, 0, 0, 0], [0.0, 0, 1])
-    >>> FreeMotion(body, start)(jnp.array([0.0, 2.0])).x[1]
-    Array([2., 0., 0.], dtype=float64)
+    Call it with a time, or with times (n,), s since `state0`. Times that are too long give NaN.
     """
 
     state0: Any
@@ -136,18 +119,15 @@ def free_body(inertia: Inertia, state0: State, t: ScalarLike) -> State:
     formula divides by a difference of moments, a rate or an energy: sphere, symmetric tops, plates,
     spins about any axis, the separatrix and rest are ordinary points. The quaternion is continuous
     in t (it does not jump between q and −q), has length 1, and `R(q) I Ω` is constant to round-off.
-
     A traced time in which the body turns by more than 1/eps rad gives NaN.
 
-    Derivatives with respect to all arguments are closed forms and correct to second order at all
-    these points: they come from the motion as a function of the whole tensor
-    (`rigidjax.exact.sigma_form`), never from principal axes. They grow with e^{λt} on an unstable
-    axis, as the true ones do; beyond λt ≈ 150 (float32: 40) they stop growing.
+    Derivatives with respect to all arguments are closed forms, correct to second order at all these
+    points: those of the motion as a function of the whole tensor (`rigidjax.exact.sigma_form`).
+    They grow with e^{λt} on an unstable axis, up to λt ≈ 150 (float32: 40).
 
     **Raises:** `TypeError`, `ValueError` for a wrong shape or dtype, dtypes that differ, a `Rigid`
-    state; if values are known (not inside `jit`), also for NaN, a moment that is not positive,
-    a quaternion whose length is off 1 by more than 1e-6 (float32: 1e-3), and a time in which the
-    body turns by more than 1/eps rad, so that no digit of its attitude is left.
+    state; if values are known, also for NaN, a moment that is not positive, a quaternion that is
+    not unit, and a time in which the body turns by more than 1/eps rad.
 
     >>> import rigidjax as rj
     >>> state0 = rj.Attitude([1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 1e-4])
@@ -159,7 +139,7 @@ def free_body(inertia: Inertia, state0: State, t: ScalarLike) -> State:
     return _jitted(inertia, state0, _time(t, state0.omega))
 
 
-_jitted = jax.jit(lambda inertia, state0, t: FreeBody(inertia, state0)._at(t))
+_jitted = jax.jit(lambda inertia, state0, t: FreeBody(inertia, state0).at(t))
 
 
 def _time(t: ScalarLike, omega: Array) -> Scalar:

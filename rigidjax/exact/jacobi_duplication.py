@@ -5,10 +5,9 @@ A free body needs only the solution of
     S' = C D,   C' = −p S D,   D' = −q S C,   S(0) = 0, C(0) = D(0) = 1,
 
 with `C² = 1 − p S²`, `D² = 1 − q S²`: sn, cn, dn in a scaling that needs neither `p > q` nor
-`p, q ≠ 0`. With p = q = 0 (a sphere, or rest) it is S = t; with p = q it is the separatrix; with
-q = 0 a symmetric top or a spin about an axis. No case is special, and nothing is divided by p, q
-or p − q. Start from the Taylor series at `u/2^N` and apply the duplication formula N times (DLMF
-22.6(ii)). Three things keep the digits:
+`p, q ≠ 0`. p = q = 0 is a sphere, or rest; p = q the separatrix; q = 0 a symmetric top or a spin
+about an axis. Nothing is divided by p, q or p − q. Start from the Taylor series at `u/2^N` and
+apply the duplication formula N times (DLMF 22.6(ii)). Three things keep the digits:
 
 * p − q is a separate number: `C(2u) ∝ C⁴ − p(p − q)S⁴` keeps its digits near the separatrix,
   whereas `1 − m` from m would lose them;
@@ -150,14 +149,11 @@ def elliptic(u: Scalar, m: Modulus, mu: Scalar, turn: Scalar) -> Elliptic:
 
 
 class HalfPeriod(NamedTuple):
-    """Over half a period: the time, the phase ξ, and the mean of S².
+    """What half a period gathers."""
 
-    On the separatrix the time is infinite.
-    """
-
-    time: Scalar
-    phase: Scalar
-    mean: Scalar
+    time: Scalar  # infinite on the separatrix
+    phase: Scalar  # ξ
+    mean: Scalar  # of S²
 
 
 def half_period(m: Modulus, mu: Scalar, turn: Scalar) -> HalfPeriod:
@@ -190,10 +186,7 @@ def half_period(m: Modulus, mu: Scalar, turn: Scalar) -> HalfPeriod:
 
 
 def _mean(_: Array, state: tuple[Scalar, ...]) -> tuple[Scalar, ...]:
-    """A step of the arithmetic–geometric mean, and of the sums along it.
-
-    `ratio` carries 2^{n−1}.
-    """
+    """A step of the arithmetic–geometric mean and of its sums; `ratio` carries 2^{n−1}."""
     a, b, c, ratio, total, point, part, sum_parts = state
     square, product = point * point, a * b
     part = 0.5 * part * (square - product) / (square + product)

@@ -18,14 +18,7 @@ import jax.numpy as jnp
 
 from rigidjax._types import Scalar
 from rigidjax.exact.components3 import Six, Triple
-from rigidjax.exact.jacobi_duplication import (
-    Elliptic,
-    Modulus,
-    duplicate,
-    growth,
-    limits,
-    series,
-)
+from rigidjax.exact.jacobi_duplication import Elliptic, Modulus, duplicate, growth, limits, series
 from rigidjax.exact.sigma_form import Differences, invariants
 
 

@@ -11,7 +11,7 @@ from rigidjax.body import validation
 from rigidjax.body.inertia import Inertia
 from rigidjax.body.scaling import exponent_of, times_power_of_two
 from rigidjax.exact import sigma_form
-from rigidjax.exact.components3 import Six, Triple, times
+from rigidjax.exact.components3 import HALF, Six, Triple, times
 from rigidjax.exact.derivatives import first_order, reciprocal
 from rigidjax.exact.jacobi_duplication import Modulus, half_period, is_endless
 from rigidjax.exact.principal_axes import into, principal_frame
@@ -21,16 +21,16 @@ def body_period(inertia: Inertia, omega0: Vec3Like) -> Scalar:
     """Time after which the body rates repeat: one rotation about the circulated axis.
 
     The angular momentum circles the axis of the smallest or of the largest moment in the body
-    frame. This is the time of one round: the rotation period about that axis (5.41 days about the
-    long axis for 4179 Toutatis). It is the limit, the period of small wobbles, for a spin about a
-    stable axis. It is infinite on the separatrix, for a sphere and at rest.
+    frame. This is the time of one round (5.41 days about the long axis for 4179 Toutatis); for a
+    spin about a stable axis the period of small wobbles. It is infinite on the separatrix, for a
+    sphere and at rest.
 
     **Arguments:** `inertia` of the body about its centre of mass (kg m²); `omega0` (3,) Ω at any
     moment, rad/s, body frame. **Returns** a scalar, s.
 
     `T = 2π/agm(√(e₁ − e₂), √(e₁ − e₃))`, eᵢ the roots in `rigidjax.exact.sigma_form` (DLMF
-    19.8.5; Landau and Lifshitz, Mechanics, eq 37.11). Its derivatives are correct wherever it is
-    finite, also for symmetric tops and principal axes.
+    19.8.5; Landau and Lifshitz, Mechanics, eq 37.11). Its derivatives are correct where it is
+    finite.
 
     **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype, or a moment known to be zero.
 
@@ -47,9 +47,8 @@ def precession_period(inertia: Inertia, omega0: Vec3Like) -> Scalar:
 
     The axis of the smallest or largest moment, whichever the momentum circles in the body, turns
     about the fixed angular momentum at a rate that varies within `body_period`; this is 2π over its
-    mean (7.35 days for the long axis of 4179 Toutatis). It is the period of the turn about the
-    middle axis, `2π I₂/|L|`, its limit, if no axis is circulated (separatrix, sphere). It is
-    infinite at rest.
+    mean (7.35 days for the long axis of 4179 Toutatis). If no axis is circulated (separatrix,
+    sphere) it is the limit, `2π I₂/|L|`. It is infinite at rest.
 
     **Arguments:** as for `body_period`. **Returns** a scalar, s.
 
@@ -78,12 +77,7 @@ def _both(tensor: Mat3, omega: Vec3) -> tuple[Scalar, Scalar]:
     """Both periods: one program, since outside of a trace each operation would be compiled."""
     exponent = exponent_of(omega)
     moments, axes = principal_frame(times_power_of_two(tensor, -exponent_of(tensor)))
-    rate = into(axes, times_power_of_two(omega, -exponent))
-    body, precession = _periods(moments, times(moments, rate))
-    return times_power_of_two(body, -exponent), times_power_of_two(precession, -exponent)
-
-
-def _periods(moments: Six, momentum: Triple) -> tuple[Scalar, Scalar]:
+    momentum = times(moments, into(axes, times_power_of_two(omega, -exponent)))
     body, _, _ = reciprocal(moments, momentum)
     v = sigma_form.invariants(body, momentum)
     h = jnp.sqrt(sum(p * p for p in momentum))
@@ -100,23 +94,20 @@ def _periods(moments: Six, momentum: Triple) -> tuple[Scalar, Scalar]:
     still = h == 0
     middle = 2.0 * math.pi * moments[1] / jnp.where(still, 1.0, h)
     precession = jnp.where(endless, middle, 2.0 * math.pi * period / angle)
-    return jnp.where(endless, jnp.inf, period), jnp.where(still, jnp.inf, precession)
+    period, precession = jnp.where(endless, jnp.inf, period), jnp.where(still, jnp.inf, precession)
+    return times_power_of_two(period, -exponent), times_power_of_two(precession, -exponent)
 
 
 @jax.custom_jvp
 def _precession(moments: Six, momentum: Triple, period: Scalar) -> Scalar:
     """Angle of the circulated axis about the momentum in one period of the body rates."""
-    (i1, i2, i3, *_), (p1, p2, p3) = moments, momentum
-    r1, r2, r3 = 1.0 / i1, 1.0 / i2, 1.0 / i3
-    d12, d13, d23 = (i2 - i1) * (r1 * r2), (i3 - i1) * (r1 * r3), (i3 - i2) * (r2 * r3)
-    A1, A3 = d12 * p2 * p2 + d13 * p3 * p3, d13 * p1 * p1 + d23 * p2 * p2
-    A2 = d23 * p3 * p3 - d12 * p1 * p1
-    about_three = A2 > 0
-    m = Modulus(d23 * A1, d12 * A3, d13 * A2)
-    h = jnp.sqrt(p1 * p1 + p2 * p2 + p3 * p3)
-    mu = jnp.where(about_three, d23 * A3, d12 * A1)
-    half = half_period(m, mu, jnp.where(about_three, -d13, d13) * h * mu)
-    turn = jnp.where(about_three, r3, r1) * h * period - 2.0 * half.phase
+    body, k, _ = reciprocal(moments, momentum)
+    v = sigma_form.invariants(body, momentum)
+    about_three, h = v.a2 > 0, jnp.sqrt(v.h2)
+    mu = jnp.where(about_three, body.d23 * v.a3, body.d12 * v.a1)
+    rate = jnp.where(about_three, -body.d13, body.d13) * h * mu
+    half = half_period(Modulus(v.p, v.q, v.gap), mu, rate)
+    turn = jnp.where(about_three, k[2], k[0]) * h * period - 2.0 * half.phase
     return turn + jnp.where(about_three, 2.0 * math.pi, -2.0 * math.pi)
 
 
@@ -126,8 +117,6 @@ def _precession_jvp(primals, tangents):
     (_, _, energy2), (_, d_k, d_energy2) = jax.jvp(reciprocal, (moments, momentum), tangents[:2])
     _, _, g = first_order(moments, momentum, period)
     along = 0.5 * period * d_energy2 + energy2 * tangents[2]
-    along = (
-        along + 0.5 * sum(g[i] * d_k[i] for i in range(3)) + sum(g[i] * d_k[i] for i in range(3, 6))
-    )
+    along = along + sum(w * a * b for w, a, b in zip(HALF, g, d_k, strict=True))
     h = jnp.sqrt(sum(p * p for p in momentum))
     return _precession(*primals), along / h

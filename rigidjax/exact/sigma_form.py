@@ -238,9 +238,7 @@ def period(v: Invariants) -> Scalar:
     def differences(z):
         # z − E₁₁ and z − E₃₃ without subtraction where z is one of them.
         extra = z - top
-        x1 = jnp.where(three, v.gap, jnp.zeros_like(z)) + extra
-        x3 = jnp.where(three, jnp.zeros_like(z), -v.gap) + extra
-        return x1, z, x3
+        return jnp.where(three, v.gap, 0.0) + extra, z, jnp.where(three, 0.0, -v.gap) + extra
 
     def slope(x1, x2, x3):
         return x1 * x2 + x1 * x3 + x2 * x3 - (off[0] + off[1] + off[2])

@@ -2,16 +2,11 @@
 
 from rigidjax._names import show
 from rigidjax.solve.adaptive import adaptive as adaptive
-from rigidjax.solve.crossings import (
-    Event as Event,
-    crossings as crossings,
-)
-from rigidjax.solve.exponents import (
-    lyapunov_exponents as lyapunov_exponents,
-)
+from rigidjax.solve.crossings import Event as Event, crossings as crossings
+from rigidjax.solve.exponents import lyapunov_exponents as lyapunov_exponents
 from rigidjax.solve.fixed_loop import fixed as fixed
+from rigidjax.solve.run import equations_of_motion as equations_of_motion
 from rigidjax.solve.simulate import simulate as simulate
 from rigidjax.solve.solution import Solution as Solution
-from rigidjax.solve.vector_field import equations_of_motion as equations_of_motion
 
 show(__name__)

@@ -8,26 +8,21 @@ import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array
 
 from rigidjax.motion.equations import on_the_group
 from rigidjax.solve import adaptive_loop, adjoint
+from rigidjax.solve.adaptive_loop import HALTED, Answer, Method, Record, Run, outcome
 from rigidjax.solve.batching import Arrays, Layout, in_lanes
 from rigidjax.solve.components import flat, leaf_sizes, unflat
 from rigidjax.solve.explicit import AbstractExplicit
 from rigidjax.solve.linear_map import is_smooth, linear_map, no_tangent, refuse
-from rigidjax.solve.step_control import HALTED, Answer, Method, Record, Run, outcome
-from rigidjax.solve.tableaus import Tableau
 
 
 class Found(NamedTuple):
-    """The result of `adaptive`.
-
-    **Fields:** `ys` the states, of the type of `y0`, with a leading time axis; `num_steps`,
-    `num_rejected` of the whole run; `result` a `diffrax.RESULTS`; `last_time`, `last` the time and
-    state at the end.
-    """
+    """The result of `adaptive`; `last` is the state at the end, `last_time`."""
 
     ys: Any
     num_steps: Array
@@ -62,9 +57,10 @@ def adaptive(
     run. Derivatives are by all numbers of the field, `ts`, `jumps` and
     `y0`, lengths of steps held; not by tolerances.
 
-    **Returns** `ys`, `num_steps`, `num_rejected`, `result`, `last_time`, `last` (`Found`). A run
-    that needs more than `max_steps`, is halted, or meets a NaN that no shorter step avoids, ends
-    early: its `result` says so, and the states not reached are NaN.
+    **Returns** the states `ys`, of the type of `y0`, with a leading time axis, `num_steps`,
+    `num_rejected`, `result`, `last_time` and state `last` (`Found`). A run that needs more than
+    `max_steps`, is halted, or meets a NaN that no shorter step avoids, ends early: its `result`
+    says so, and the states not reached are NaN.
 
     **Raises:** `TypeError` for a state of several dtypes, or of another than `ts`.
 
@@ -80,100 +76,45 @@ def adaptive(
         raise TypeError(
             f"adaptive: wanted times and state of one dtype, got {ts.dtype} and {numbers.dtype}"
         )
-    program, constants = _program(solver.tableau, field, halt, ts[0], y0, max_steps)
+    like = jax.eval_shape(lambda: y0)
+    functions: list[Any] = [lambda t, y: flat(field(t, unflat(y, like), None))]
+    if halt is not None:
+        functions.append(lambda t, y: halt(t, unflat(y, like)))
+    (of_one, *ended), constants, count = taken_out(functions, ts[0], numbers)
+    # The condition that ends a run has no derivative.
+    smooth = [i < count and is_smooth(c) for i, c in enumerate(constants)]
+    project = lambda y: flat(on_the_group(unflat(y, like)))  # noqa: E731
+    ends = ended[0] if ended else None
+    method = Method(solver.tableau, of_one, project, ends, leaf_sizes(like), max_steps)
     stops = ts[-1:]
     if jumps is not None and jumps.size:
         inside = jnp.clip(jnp.sort(jumps.astype(ts.dtype)), ts[0], ts[-1])
         stops = jnp.concatenate([inside, stops])
-    run = Run(
-        ts[0],
-        stops,
-        ts[1:-1],
-        numbers,
-        jnp.asarray(rtol, numbers.dtype),
-        jnp.asarray(atol, numbers.dtype),
-        jnp.asarray(jnp.nan if dt0 is None else dt0, ts.dtype),
-    )
-    out = _solved(program, constants, run)
+    rtol, atol = (jnp.asarray(a, numbers.dtype) for a in (rtol, atol))
+    h0 = jnp.asarray(jnp.nan if dt0 is None else dt0, ts.dtype)
+    run = Run(ts[0], stops, ts[1:-1], numbers, rtol, atol, h0)
+    out = _solved(method, smooth, constants, run)
     result = outcome(out.h, out.t, ts[-1], out.h == HALTED)
-    rows = jnp.concatenate([numbers[None], out.between, out.end[None]])
-    ys = jax.vmap(partial(unflat, like=y0))(rows)
-    return Found(ys, out.steps, out.rejected, result, out.t, unflat(out.last, y0))
-
-
-class _Program(NamedTuple):
-    """The compiled program: a method whose `field(constants, t, y)` is for one body.
-
-    **Fields:** `halt(constants, t, y)` the condition that ends a run, or `None`; `smooth` which of
-    the constants have derivatives.
-    """
-
-    method: Method
-    halt: Callable[..., Any] | None
-    smooth: tuple[bool, ...]
-
-    def of(self, layout: Layout, constants: Arrays) -> tuple[Method, Arrays]:
-        """The method on (n, *bodies), and those of the constants that have derivatives."""
-        method, field, halt = self.method, self.method.field, self.halt
-        if layout.bodies:
-            shared = [None if s else -1 for s in layout.shared]
-            field = jax.vmap(field, (shared, -1, -1), -1)
-            halt = None if halt is None else jax.vmap(halt, (shared, -1, -1), -1)
-            method = method._replace(project=jax.vmap(method.project, -1, -1))
-
-        def of_smooth(chosen: Arrays, t: Array, y: Array) -> Array:
-            mixed, rest = iter(chosen), constants
-            both = [next(mixed) if s else c for c, s in zip(rest, self.smooth, strict=True)]
-            return field(both, t, y)
-
-        chosen = [c for c, s in zip(constants, self.smooth, strict=True) if s]
-        if halt is not None:
-            method = method._replace(halt=partial(halt, constants))
-        return method._replace(field=of_smooth), chosen
-
-
-def _program(
-    tableau: Tableau,
-    field: Callable[..., Any],
-    halt: Callable[..., Any] | None,
-    t0: Array,
-    y0: Any,
-    max_steps: int,
-) -> tuple[_Program, Arrays]:
-    like = jax.tree.map(lambda a: jax.ShapeDtypeStruct(jnp.shape(a), jnp.result_type(a)), y0)
-
-    def flat_field(t: Array, y: Array) -> Array:
-        return flat(field(t, unflat(y, like), None))
-
-    def project(y: Array) -> Array:
-        return flat(on_the_group(unflat(y, like)))
-
-    functions: list[Any] = [flat_field]
-    if halt is not None:
-        functions.append(lambda t, y: halt(t, unflat(y, like)))
-    (of_one, *ended), constants, count = taken_out(functions, t0, flat(y0))
-    # The condition that ends a run has no derivative.
-    smooth = [i < count and is_smooth(c) for i, c in enumerate(constants)]
-    method = Method(tableau, of_one, project, None, leaf_sizes(like), max_steps)
-    return _Program(method, ended[0] if ended else None, tuple(smooth)), constants
+    end = jnp.where(out.t >= ts[-1], out.last, jnp.nan)
+    ys = jax.vmap(partial(unflat, like=y0))(
+        jnp.concatenate([numbers[None], out.between, end[None]])
+    )
+    last = unflat(lax.stop_gradient(out.last), y0)
+    return Found(ys, out.steps, out.rejected, result, out.t, last)
 
 
 def taken_out(
     functions: list[Callable[..., Any]], *like: Any
 ) -> tuple[list[Callable[..., Any]], Arrays, int]:
-    """Each function as `f(constants, *args)`; the constants: what they depend on, also by closure.
-
-    **Returns** the functions, the constants of all, and how many of these are the first one's.
-    """
+    """Each function as `f(constants, *args)`; the constants of all, and how many the first has."""
     constants: Arrays = []
     out, counts = [], []
     for function in functions:
         arrays, rest = eqx.partition(eqx.filter_closure_convert(function, *like), eqx.is_array)
         own, tree = jax.tree.flatten(arrays)
         counts.append(len(own))
-        out.append(
-            partial(_of_constants, slice(len(constants), len(constants) + len(own)), tree, rest)
-        )
+        part = slice(len(constants), len(constants) + len(own))
+        out.append(partial(_of_constants, part, tree, rest))
         constants += own
     return out, constants, counts[0]
 
@@ -182,31 +123,26 @@ def _of_constants(part: slice, tree: Any, rest: Any, constants: Arrays, *args: A
     return eqx.combine(jax.tree.unflatten(tree, constants[part]), rest)(*args)
 
 
-def _solved(program: _Program, constants: Arrays, run: Run) -> Answer:
+def _solved(method: Method, smooth: list[bool], constants: Arrays, run: Run) -> Answer:
+    """The run; `smooth` says which of the constants have derivatives."""
     # The states between and at the end are what has derivatives.
-    number, ends = len(constants), 2
+    number, ends, head = len(constants), 2, len(Answer._fields)
 
-    def mapped(kind: Any, linear: int, *args: Any) -> Arrays:
-        return in_lanes(partial(kind, program), list(args[:number]), list(args[number:]), linear)
+    def mapped(program: Any, linear: int, *args: Any) -> Arrays:
+        return in_lanes(partial(program, method), list(args[:number]), list(args[number:]), linear)
 
-    @jax.custom_jvp
-    def answer(*args: Any) -> Arrays:
-        return mapped(_value, 0, *args)
-
-    @jax.custom_jvp
-    def recorded(*args: Any) -> Arrays:
-        return mapped(_recorded, 0, *args)
+    answer: Any = jax.custom_jvp(partial(mapped, _value, 0))
+    recorded: Any = jax.custom_jvp(partial(mapped, _recorded, 0))
 
     def tangents_of(primals: Any, tangents: Any, pull: Any = None) -> tuple[Arrays, Arrays]:
         """The result of `recorded`, and the tangents of its states; transposed by `pull`."""
         # A number without a tangent needs no derivative.
         there = [not isinstance(t, SymbolicZero) for t in tangents]
-        smooth = tuple(s and t for s, t in zip(program.smooth, there[:number], strict=True))
-        moving = _Moving(smooth, tuple(there[number:]))
-        along = [t for t, m in zip(tangents, (*smooth, *moving.run), strict=True) if m]
+        moving = [s and t for s, t in zip(smooth, there[:number], strict=True)], there[number:]
+        along = [t for t, m in zip(tangents, [*moving[0], *moving[1]], strict=True) if m]
         found = recorded(*primals)
-        given = [*primals, *found[len(Answer._fields) :]]
         push = partial(mapped, partial(_pushed, moving), len(along))
+        given = [*primals, *found[head:]]
         if pull is None:
             return found, linear_map(push, refuse, given, along)
         back = partial(mapped, partial(pull, moving), ends)
@@ -214,14 +150,11 @@ def _solved(program: _Program, constants: Arrays, run: Run) -> Answer:
 
     def of_answer(primals: Any, tangents: Any) -> Any:
         found, moved = tangents_of(primals, tangents, _pulled)
-        out = found[: len(Answer._fields)]
-        return out, [*moved, *(no_tangent(a) for a in out[ends:])]
+        return found[:head], [*moved, *(no_tangent(a) for a in found[ends:head])]
 
     def of_record(primals: Any, tangents: Any) -> Any:
-        found, moved = tangents_of(primals, tangents)
+        found, (between, end, starts, rows) = tangents_of(primals, tangents)
         rest = [no_tangent(a) for a in found]
-        between, end, starts, rows = moved
-        head = len(Answer._fields)
         record = Record(*rest[head:])._replace(starts=starts, rows=rows)
         return found, [between, end, *rest[ends:head], *record]
 
@@ -230,62 +163,75 @@ def _solved(program: _Program, constants: Arrays, run: Run) -> Answer:
     return Answer(*answer(*constants, *run))
 
 
-class _Moving(NamedTuple):
-    """A mask of the constants and the numbers of a run that have tangents."""
+def _over_bodies(method: Method, layout: Layout, constants: Arrays) -> Method:
+    """The method on (n, *bodies); that of one body has `halt(constants, t, y)`."""
+    halt = method.halt
+    if layout.bodies:
+        over = partial(jax.vmap, in_axes=([None if s else -1 for s in layout.shared], -1, -1))
+        halt = None if halt is None else over(halt, out_axes=-1)
+        method = method._replace(
+            field=over(method.field, out_axes=-1), project=jax.vmap(method.project, -1, -1)
+        )
+    return method._replace(halt=None if halt is None else partial(halt, constants))
 
-    constants: tuple[bool, ...]
-    run: tuple[bool, ...]
+
+def _value(method: Method, layout: Layout, constants: Arrays, each: Arrays) -> Arrays:
+    method, run = _over_bodies(method, layout, constants), Run(*each)
+    if run.between.shape[0]:
+        return list(adaptive_loop.recording(method, constants, run, adjoint.saved)[0])
+    return list(adaptive_loop.value(method, constants, run))
 
 
-def _value(program: _Program, layout: Layout, constants: Arrays, each: Arrays) -> Arrays:
-    method, chosen = program.of(layout, constants)
-    return list(adaptive_loop.value(method, chosen, Run(*each)))
+def _recorded(method: Method, layout: Layout, constants: Arrays, each: Arrays) -> Arrays:
+    method = _over_bodies(method, layout, constants)
+    answer, record = adaptive_loop.recording(method, constants, Run(*each), adjoint.saved)
+    return [*answer, *record]
 
 
-def _recorded(program: _Program, layout: Layout, constants: Arrays, each: Arrays) -> Arrays:
-    method, chosen = program.of(layout, constants)
-    run = Run(*each)
-    answer, record = adaptive_loop.recording(method, chosen, run)
-    number, filled = (jnp.broadcast_to(a, run.t0.shape) for a in (record.number, record.filled))
-    return [*answer, *record._replace(number=number, filled=filled)]
+# Which of the constants and which numbers of a run have tangents.
+Moving = tuple[list[bool], list[bool]]
 
 
 def _again(
-    moving: _Moving, program: _Program, layout: Layout, constants: Arrays, each: Arrays
+    moving: Moving, method: Method, layout: Layout, constants: Arrays, each: Arrays
 ) -> tuple[Method, Arrays, Run, Record, Arrays]:
-    """A recorded run, those of the constants that move one a body; tangents or cotangents."""
+    """A recorded run, the constants that move, one a body; and tangents or cotangents."""
     many, whole = len(Run._fields), len(Run._fields) + len(Record._fields)
     run, record = Run(*each[:many]), Record(*each[many:whole])
     if layout.bodies:
-        own = zip(constants, layout.shared, moving.constants, strict=True)
+        own = [s and m for s, m in zip(layout.shared, moving[0], strict=True)]
         constants = [
-            jnp.broadcast_to(c[..., None], (*c.shape, *run.t0.shape)) if shared and moves else c
-            for c, shared, moves in own
+            jnp.broadcast_to(c[..., None], (*c.shape, *run.t0.shape)) if o else c
+            for c, o in zip(constants, own, strict=True)
         ]
-        shared = (a and not b for a, b in zip(layout.shared, moving.constants, strict=True))
-        layout = layout._replace(shared=tuple(shared))
-    method, chosen = program._replace(smooth=moving.constants).of(layout, constants)
-    return method, chosen, run, record, each[whole:]
+        shared = tuple(s and not o for s, o in zip(layout.shared, own, strict=True))
+        layout = layout._replace(shared=shared)
+    method = _over_bodies(method, layout, constants)
+
+    def of_moving(chosen: Arrays, t: Array, y: Array) -> Array:
+        rest = iter(chosen)
+        mixed = [next(rest) if m else c for c, m in zip(constants, moving[0], strict=True)]
+        return method.field(mixed, t, y)
+
+    chosen = [c for c, m in zip(constants, moving[0], strict=True) if m]
+    return method._replace(field=of_moving), chosen, run, record, each[whole:]
 
 
 def _pushed(
-    moving: _Moving, program: _Program, layout: Layout, constants: Arrays, each: Arrays
+    moving: Moving, method: Method, layout: Layout, constants: Arrays, each: Arrays
 ) -> Arrays:
-    method, chosen, run, record, along = _again(moving, program, layout, constants, each)
+    method, chosen, run, record, along = _again(moving, method, layout, constants, each)
     rest = iter(along[len(chosen) :])
-    still = zip(run, moving.run, strict=True)
+    still = zip(run, moving[1], strict=True)
     of_run = Run(*(next(rest) if moves else jnp.zeros_like(a) for a, moves in still))
 
-    def again(chosen: Arrays, run: Run) -> tuple[Array, ...]:
-        return adjoint.replayed(method, chosen, run, record)
-
+    again = lambda chosen, run: adjoint.replayed(method, chosen, run, record)  # noqa: E731
     return list(jax.jvp(again, (chosen, run), (along[: len(chosen)], of_run))[1])
 
 
 def _pulled(
-    moving: _Moving, program: _Program, layout: Layout, constants: Arrays, each: Arrays
+    moving: Moving, method: Method, layout: Layout, constants: Arrays, each: Arrays
 ) -> Arrays:
-    method, chosen, run, record, bars = _again(moving, program, layout, constants, each)
-    timed = any(moving.run[:3])
-    total, of_run = adjoint.cotangents(method, chosen, run, record, bars, timed)
-    return [*total, *(a for a, moves in zip(of_run, moving.run, strict=True) if moves)]
+    method, chosen, run, record, bars = _again(moving, method, layout, constants, each)
+    total, of_run = adjoint.cotangents(method, chosen, run, record, bars, any(moving[1][:3]))
+    return [*total, *(a for a, moves in zip(of_run, moving[1], strict=True) if moves)]

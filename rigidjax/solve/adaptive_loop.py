@@ -1,37 +1,30 @@
-"""Adaptive steps, for one body or many, with the states at any times.
+"""Adaptive steps, for one body or many, with the states at any times. Bodies are in the last axis.
 
-For states between and for derivatives the steps are recorded in segments: the start of each is
-kept, and the steps of the last one; derivatives run the others once more.
+For saved states and derivatives the steps are recorded in segments: the start of each is kept, and
+the steps of the last one; derivatives run the others once more.
 """
 
-from typing import Any
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
 
+import diffrax as dfx
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
-from jaxtyping import Array
+from jaxtyping import Array, Bool
 
-from rigidjax.solve import dense_output
+from rigidjax.solve.batching import Arrays
 from rigidjax.solve.components import lift
-from rigidjax.solve.runge_kutta import Step
-from rigidjax.solve.step_control import (
-    HALTED,
-    HEAD,
-    LAST,
-    NONE,
-    STEP,
-    Answer,
-    LoopState,
-    Method,
-    Record,
-    Rows,
-    Run,
-    Segment,
-    at,
-    controlled,
-    first_step,
-    packed,
-    tried,
-)
+from rigidjax.solve.runge_kutta import Field, Step, error_estimate, stages
+from rigidjax.solve.tableaus import Tableau
+
+# diffrax inherits it from optimistix, where type checkers do not follow.
+NONFINITE: Any = dfx.RESULTS.nonfinite
+
+# The defaults of diffrax.PIDController: the same steps, so that figures can be compared.
+_SAFETY, _SMALLEST, _LARGEST = 0.9, 0.2, 10.0
 
 # Steps in a segment, rejected ones included.
 SEGMENT = 512
@@ -42,23 +35,233 @@ _MORE = 64
 _BLOCK, _MOST = 560, 8
 
 
-def value(method: Method, constants: list[Array], run: Run) -> Answer:
-    """The answer, with nothing kept."""
-    if run.between.shape[0]:
-        return recording(method, constants, run)[0]
+class Method(NamedTuple):
+    """The parts of a run besides its numbers."""
+
+    tableau: Tableau
+    field: Field  # on (n, *bodies), as `project`
+    project: Callable[[Array], Array]
+    halt: Callable[..., Array] | None  # (t, y): whether the run ends here
+    sizes: list[int]  # of the arrays of the state
+    max_steps: int
+
+
+class Run(NamedTuple):
+    """The numbers of a run, a last axis of bodies in each."""
+
+    t0: Array
+    stops: Array  # (J,) where the torque jumps, and the last time
+    between: Array  # (K,) times asked for
+    y0: Array  # (n,)
+    rtol: Array
+    atol: Array
+    h0: Array  # the first step, NaN to choose one
+
+    @property
+    def before(self) -> Array:
+        """The last moment before each stop (J,): a stage there sees the torque before the jump."""
+        jumps = lax.stop_gradient(self.stops[:-1])
+        gap = jnp.nextafter(jumps, jnp.full_like(jumps, -jnp.inf)) - jumps
+        return jnp.concatenate([self.stops[:-1] + gap, self.stops[-1:]])
+
+
+class LoopState(NamedTuple):
+    """The state of the loop: time, next step, index of the next stop, counters, state."""
+
+    t: Array
+    h: Array
+    stop: Array
+    steps: Array
+    rejected: Array
+    y: Array
+
+
+# A recorded attempt is one row (4 + n, *bodies): start, length, kind, index of the stop ahead, and
+# the state at the start. Kinds: no step was taken; a step; a step that ends on the stop.
+Rows = Array
+HEAD = 4
+NONE, STEP, LAST = range(3)
+# The next step of a run that has met the condition that ends it.
+HALTED = -1.0
+
+
+def packed(loop: LoopState) -> Array:
+    """A `LoopState` as one row. Whole numbers are exact in it up to 2²⁴ in float32."""
+    return jnp.concatenate([jnp.stack([a.astype(loop.y.dtype) for a in loop[:-1]]), loop.y])
+
+
+def unpacked(row: Array) -> LoopState:
+    """The inverse of `packed`."""
+    head = len(LoopState._fields) - 1
+    stop, steps, rejected = row[2:head].astype(jnp.int32)
+    return LoopState(row[0], row[1], stop, steps, rejected, row[head:])
+
+
+class Record(NamedTuple):
+    """A recorded run."""
+
+    starts: Array  # of each segment (S, 5 + n, *bodies), and the end of the last
+    number: Array  # of segments
+    rows: Rows  # of the last segment
+    filled: Array  # their number
+
+
+class Answer(NamedTuple):
+    """States between, and where the loop has ended."""
+
+    between: Array  # (K, n, *bodies), NaN if not reached
+    last: Array  # (n, *bodies)
+    t: Array
+    h: Array  # the next step: 0 or NaN if none is left to try, `HALTED`
+    steps: Array
+    rejected: Array
+
+
+class Segment(NamedTuple):
+    """A part of a run."""
+
+    rows: Rows
+    times: Array  # at which each row begins, inf where there is none
+    begin: Array
+    end: Array
+    number: Array  # of rows
+
+
+def times_of(run: Run, rows: Rows) -> tuple[Array, Array, Array]:
+    """Start, length and end of the steps of rows (4 + n, *bodies).
+
+    The start moves with the stop before it, the length of a step that ends on a stop with both.
+    """
+    t, h, kind, stop = lax.stop_gradient(rows[:HEAD])
+    stop, last = stop.astype(jnp.int32), kind == LAST
+    begun = at(jnp.concatenate([run.t0[None], run.stops]), stop)
+    t = t + (begun - lax.stop_gradient(begun))
+    end = at(run.before, stop)
+    h = jnp.where(last, end - t, h)
+    return t, h, jnp.where(last, end, t + h)
+
+
+def at(a: Array, index: Array) -> Array:
+    """a[index] of each body; a (J, *bodies), index (*many, *bodies)."""
+    count = a.shape[0]
+    a = a.reshape(count, *[1] * (index.ndim + 1 - a.ndim), *a.shape[1:])
+    if count == 1:
+        return jnp.broadcast_to(a[0], index.shape)
+    index = jnp.clip(index, 0, count - 1)
+    # It is quicker to add up so few rows than to look for one, also in derivatives.
+    if count <= 8:
+        each = jnp.arange(count, dtype=index.dtype).reshape(-1, *[1] * index.ndim)
+        return jnp.sum(jnp.where(each == index[None], a, 0), 0)
+    a = jnp.broadcast_to(a, (count, *index.shape))
+    return jnp.take_along_axis(a, index[None], 0)[0]
+
+
+def finite(tree: Any) -> Bool[Array, ""]:
+    """Whether every number in `tree` is finite."""
+    good = jnp.asarray(True)
+    for leaf in jax.tree.leaves(tree):
+        good = good & jnp.all(jnp.isfinite(leaf))
+    return good
+
+
+def of_body(result: dfx.RESULTS, body: Any) -> dfx.RESULTS:
+    """The result of a run; `nonfinite_input` where the body is NaN: no body has its numbers."""
+    return dfx.RESULTS.where(finite(body), result, dfx.RESULTS.nonfinite_input)  # pyright: ignore
+
+
+def tried(method: Method, constants: Arrays, run: Run, step: Step) -> tuple[Array, Array]:
+    """The state a step later, and the root mean square of its error over the tolerance."""
+    there = stages(method.tableau, method.field, constants, step)
+    left, right = step.y, method.project(there.end)
+    error = error_estimate(method.tableau, method.sizes, step.h, there.slopes)
+    largest = jnp.maximum(jnp.abs(left), jnp.abs(right))
+    scale = lift(run.atol, left) + lift(run.rtol, left) * largest
+    tiny = float(jnp.finfo(error.dtype).tiny)
+    norm = jnp.sqrt(jnp.mean((error / scale) ** 2, 0) + tiny)
+    # NaN in a step too long says as little as infinity: try a shorter one.
+    return right, jnp.where(jnp.isnan(norm), jnp.inf, norm)
+
+
+def controlled(
+    norm: Array, order: int, t: Array, h: Array, kept: Array, last: Array, length: Array
+) -> tuple[Array, Array]:
+    """Whether a step is accepted, and the next one: 0 where none is left to try, NaN after a NaN.
+
+    `norm` as of `tried`; `kept` what the controller had wanted before a step was cut short as the
+    `last` before a stop; `length` of the run, whose round-off counts where that of `t` vanishes.
+    """
+    norm, h, kept = lax.stop_gradient((norm, h, kept))
+    good = norm < 1
+    factor = jnp.clip(_SAFETY * norm ** (-1 / order), _SMALLEST, _LARGEST)
+    following = h * factor.astype(h.dtype)
+    eps = jnp.finfo(h.dtype).eps
+    unit = 8 * eps * jnp.maximum(jnp.abs(t), eps * length)
+    why = jnp.where(jnp.isfinite(norm), 0.0, jnp.nan).astype(h.dtype)
+    shorter = jnp.where(following > unit, following, why)
+    longer = jnp.where(last, jnp.maximum(following, kept), following)
+    return good, jnp.where(good, longer, shorter)
+
+
+def outcome(h: Array, t: Array, end: Array, met: Array) -> dfx.RESULTS:
+    """The end of a run: its next step and time, the last time, whether it met what ends it."""
+    result = dfx.RESULTS.dt_min_reached
+    for there, word in (
+        (jnp.isnan(h), NONFINITE),
+        (h > 0, dfx.RESULTS.max_steps_reached),
+        (t >= end, dfx.RESULTS.successful),
+        (met, dfx.RESULTS.event_occurred),
+    ):
+        result = dfx.RESULTS.where(there, word, result)
+    return result
+
+
+def first_step(method: Method, constants: Arrays, run: Run) -> tuple[Array, Array]:
+    """The starting step of Hairer, Nørsett and Wanner (1993), II.4; the slope at the start."""
+    y0, t0 = run.y0, run.t0
+    scale = lift(run.atol, y0) + lift(run.rtol, y0) * jnp.abs(y0)
+
+    def norm(a: Array) -> Array:
+        return jnp.sqrt(jnp.mean((a / scale) ** 2, 0))
+
+    d0 = norm(y0)
+
+    def slope(_: Array, state: Any) -> Any:
+        # At the start, then after a short step of Euler's: one field to compile.
+        h, first, _ = state
+        now = method.field(constants, t0 + h.astype(t0.dtype), y0 + lift(h, y0) * first)
+        d1 = norm(now)
+        small = (d0 < 1e-5) | (d1 < 1e-5)
+        short = jnp.where(small, 1e-6, 0.01 * d0 / jnp.where(small, 1.0, d1)).astype(d0.dtype)
+        begun = h != 0
+        return jnp.where(begun, h, short), jnp.where(lift(begun, y0), first, now), now
+
+    h = jnp.zeros_like(d0)
+    state = (h, jnp.zeros_like(y0), jnp.zeros_like(y0))
+    h, first, last = lax.fori_loop(np.int32(0), np.int32(2), slope, state)
+    d2 = norm(last - first) / h
+    largest = jnp.maximum(norm(first), d2)
+    flat = largest <= 1e-15
+    guess = (0.01 / jnp.where(flat, 1.0, largest)) ** (1 / method.tableau.order)
+    h = jnp.minimum(100 * h, jnp.where(flat, jnp.maximum(1e-6, 1e-3 * h), guess))
+    return h.astype(t0.dtype), first
+
+
+def value(method: Method, constants: Arrays, run: Run) -> Answer:
+    """The answer, with nothing kept: without states between."""
     loop = lax.while_loop(
         lambda loop: jnp.any(going(method, run, loop, None)),
         lambda loop: _attempt(method, constants, run, loop, None)[0],
         start(method, constants, run),
     )
-    return _answer(run, loop, run.y0[None][:0])
+    return Answer(run.y0[None][:0], loop.y, loop.t, loop.h, loop.steps, loop.rejected)
 
 
-def recording(method: Method, constants: list[Array], run: Run) -> tuple[Answer, Record]:
-    """The answer, and what derivatives need."""
+def recording(
+    method: Method, constants: Arrays, run: Run, saved: Callable[..., Array]
+) -> tuple[Answer, Record]:
+    """The answer, and what derivatives need; `saved` as of `rigidjax.solve.adjoint`."""
     loop = start(method, constants, run)
-    most = method.max_steps + run.stops.shape[0]
-    first = packed(loop)
+    first, most = packed(loop), method.max_steps + run.stops.shape[0]
     starts = jnp.zeros((-(-most // SEGMENT) + 1, *first.shape), first.dtype)
     ys = jnp.full((run.between.shape[0], *run.y0.shape), jnp.nan, run.y0.dtype)
     rows = jnp.zeros((SEGMENT + _MORE + _MOST, HEAD + run.y0.shape[0], *run.t0.shape), ys.dtype)
@@ -69,7 +272,7 @@ def recording(method: Method, constants: list[Array], run: Run) -> tuple[Answer,
         after, rows, count = recorded(method, constants, run, loop, record.rows, None)
         if run.between.shape[0]:
             part = segment(rows, loop.t, after.t, count)
-            ys = dense_output.saved(method, constants, run, part, rows[:, HEAD:], ys)
+            ys = saved(method, constants, run, part, rows[:, HEAD:], ys)
         number = record.number + 1
         starts = lax.dynamic_update_index_in_dim(record.starts, packed(after), number, 0)
         return after, ys, Record(starts, number, rows, count)
@@ -77,15 +280,17 @@ def recording(method: Method, constants: list[Array], run: Run) -> tuple[Answer,
     state = (loop, ys, Record(starts.at[0].set(first), zero, rows, zero))
     more = lambda state: jnp.any(going(method, run, state[0], None))  # noqa: E731
     loop, ys, record = lax.while_loop(more, one, state)
-    return _answer(run, loop, ys), record
+    number, filled = (jnp.broadcast_to(a, run.t0.shape) for a in (record.number, record.filled))
+    answer = Answer(ys, loop.y, loop.t, loop.h, loop.steps, loop.rejected)
+    return answer, record._replace(number=number, filled=filled)
 
 
-def start(method: Method, constants: list[Array], run: Run) -> LoopState:
+def start(method: Method, constants: Arrays, run: Run) -> LoopState:
     """A loop about to begin."""
     t0, y0 = run.t0, run.y0
     h, f0 = first_step(method, constants, run)
     # No step is short enough if f(t0) is not finite.
-    sound = jnp.all(jnp.isfinite(f0), 0) & jnp.all(jnp.isfinite(y0), 0)
+    sound = jnp.all(jnp.isfinite(f0) & jnp.isfinite(y0), 0)
     sound = sound & jnp.isfinite(t0) & jnp.isfinite(run.stops[-1])
     h = jnp.where(sound, jnp.where(jnp.isnan(run.h0), h, run.h0), jnp.nan)
     h = lax.stop_gradient(_unless_halted(method, t0, y0, h))
@@ -101,7 +306,7 @@ def going(method: Method, run: Run, loop: LoopState, until: Array | None) -> Arr
 
 
 def _attempt(
-    method: Method, constants: list[Array], run: Run, loop: LoopState, until: Array | None
+    method: Method, constants: Arrays, run: Run, loop: LoopState, until: Array | None
 ) -> tuple[LoopState, Array]:
     """One attempt at a step of every body, and its row."""
     on = going(method, run, loop, until)
@@ -124,8 +329,7 @@ def _attempt(
     accept = moving & good
     following = jnp.where(moving, following, own)
     if until is None:
-        ended = _unless_halted(method, late, y, following)
-        following = jnp.where(accept, ended, following)
+        following = jnp.where(accept, _unless_halted(method, late, y, following), following)
     reached = accept & last & ~cut
     after = LoopState(
         t=jnp.where(accept, jnp.where(reached, begin, late), loop.t),
@@ -147,38 +351,30 @@ def _unless_halted(method: Method, t: Array, y: Array, h: Array) -> Array:
 
 
 def recorded(
-    method: Method,
-    constants: list[Array],
-    run: Run,
-    loop: LoopState,
-    rows: Rows,
-    until: Array | None,
+    method: Method, constants: Arrays, run: Run, loop: LoopState, rows: Rows, until: Any
 ) -> tuple[LoopState, Rows, Array]:
     """The loop from here until the rows are full; and the number of rows."""
     many = max(1, min(_MOST, _BLOCK // run.y0.dtype.itemsize // rows.shape[1]))
 
+    room = rows.shape[0] - (_MORE if until is None else 0) - _MOST
+    none = jnp.zeros((), jnp.int32)
+
+    def more(most: int, state: Any) -> Array:
+        loop, _, count = state
+        return jnp.any(going(method, run, loop, until)) & (count < most)
+
+    def attempt(state: Any) -> Any:
+        loop, few, k = state
+        loop, row = _attempt(method, constants, run, loop, until)
+        return loop, lax.dynamic_update_slice_in_dim(few, row[None], k, 0), k + 1
+
     def block(state: Any) -> Any:
         loop, rows, count = state
-
-        def attempt(state: Any) -> Any:
-            loop, few, k = state
-            loop, row = _attempt(method, constants, run, loop, until)
-            return loop, lax.dynamic_update_slice_in_dim(few, row[None], k, 0), k + 1
-
-        def more(state: Any) -> Array:
-            return jnp.any(going(method, run, state[0], until)) & (state[-1] < many)
-
         few = jnp.zeros((many, *rows.shape[1:]), rows.dtype)
-        loop, few, k = lax.while_loop(more, attempt, (loop, few, jnp.zeros((), jnp.int32)))
+        loop, few, k = lax.while_loop(partial(more, many), attempt, (loop, few, none))
         return loop, lax.dynamic_update_slice_in_dim(rows, few, count, 0), count + k
 
-    room = rows.shape[0] - (_MORE if until is None else 0) - _MOST
-
-    def more(state: Any) -> Array:
-        loop, _, count = state
-        return jnp.any(going(method, run, loop, until)) & (count < room)
-
-    return lax.while_loop(more, block, (loop, rows, jnp.zeros((), jnp.int32)))
+    return lax.while_loop(partial(more, room), block, (loop, rows, none))
 
 
 def segment(rows: Rows, begin: Array, end: Array, count: Array) -> Segment:
@@ -187,9 +383,3 @@ def segment(rows: Rows, begin: Array, end: Array, count: Array) -> Segment:
     there = jnp.arange(rows.shape[0], dtype=jnp.int32).reshape(-1, *[1] * begin.ndim) < count
     times = jnp.where(there, lax.stop_gradient(rows[:, 0]), jnp.inf)
     return Segment(rows, times, begin, end, count)
-
-
-def _answer(run: Run, loop: LoopState, between: Array) -> Answer:
-    there = loop.stop >= run.stops.shape[0]
-    end = jnp.where(lift(there, loop.y), loop.y, jnp.nan)
-    return Answer(between, end, loop.t, loop.y, loop.h, loop.steps, loop.rejected)

@@ -1,13 +1,16 @@
-"""A second pass over a recorded run, for its tangents, and a pass back, for cotangents.
+"""A second pass over a recorded run: for states between its steps, for tangents and cotangents.
+
+The loop does not look at the times that are asked for. Its steps with such times in them are taken
+once more: many of one body side by side, or one of each of many bodies.
 
 The derivative is that of the steps taken, with fixed lengths, except that steps cut short at a stop
-follow it, as in `diffrax.RecursiveCheckpointAdjoint`. Both go through the segments of
-`rigidjax.solve.adaptive_loop`; all but the last are run once more. Such a segment may take other
-steps between the same two ends if another program rounds differently: the derivative is then that
-of these steps, the same to the tolerance.
+follow it, as in `diffrax.RecursiveCheckpointAdjoint`. All segments but the last are run once more;
+they may take other steps between the same two ends if another program rounds differently: the
+derivative is then that of these steps, the same to the tolerance.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
@@ -15,20 +18,146 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from rigidjax.solve import dense_output, runge_kutta
-from rigidjax.solve.adaptive_loop import going, recorded, segment
+from rigidjax.solve import runge_kutta
+from rigidjax.solve.adaptive_loop import (
+    HEAD,
+    STEP,
+    Method,
+    Record,
+    Run,
+    Segment,
+    going,
+    recorded,
+    segment,
+    times_of,
+    unpacked,
+)  # fmt: skip
+from rigidjax.solve.batching import Arrays
 from rigidjax.solve.components import lift
-from rigidjax.solve.runge_kutta import Step
-from rigidjax.solve.step_control import HEAD, STEP, Method, Record, Run, Segment, times_of, unpacked
+from rigidjax.solve.runge_kutta import Step, nested, stages, weights
+
+# Times of one body that are taken together.
+_TOGETHER = 16
+
+
+def saved(
+    method: Method, constants: Arrays, run: Run, part: Segment, path: Array, ys: Array
+) -> Array:
+    """`ys` (K, n, *bodies) with the states in a part of a run; `path` those at which rows start."""
+    size, many, field, project = run.between.shape[0], run.t0.ndim, method.field, method.project
+    width = 1 if many else min(size, _TOGETHER)
+    if not many:
+        field = jax.vmap(field, (None, -1, -1), -1)
+        project = jax.vmap(project, -1, -1)
+    index, inside = _rows_at(run, part)
+    # What is not inside stands still at the first state, where the field has a value.
+    still = part.rows[0].at[1:3].set(0)
+    still = still if many else still[:, None]
+
+    def window(i: Array, ys: Array) -> Array:
+        # A window beyond the last time is moved back: states that are there are worked out again.
+        number = jnp.minimum(first + i * width, size - width)
+        cut = partial(_cut, number, width, many)
+        there, where = cut(inside), cut(index)
+        rows = jnp.where(there[None], _picked(many, part.rows, where), still)
+        ts = jnp.where(there, cut(run.between), rows[0])
+        step = Step(*times_of(run, rows), _picked(many, path, where))
+        slopes = stages(method.tableau, field, constants, step, True).slopes
+        new = _states(method, project, ts[None], step.t, step.h, step.y, slopes)[0]
+        new = jnp.where(there[None], new, cut(ys))
+        rows = new[None] if many else new.T
+        return lax.dynamic_update_slice_in_dim(ys, rows, number, 0)
+
+    used = jnp.any(inside.reshape(size, -1), 1)
+    first = jnp.argmax(used).astype(jnp.int32)
+    length = size - jnp.argmax(used[::-1]).astype(jnp.int32) - first
+    count = jnp.where(jnp.any(used), (length + width - 1) // width, 0)
+    return lax.fori_loop(jnp.zeros_like(count), count, window, ys)
+
+
+def passed(run: Run, part: Segment) -> Array:
+    """The number of saved times passed at the start of each row, and at the end."""
+    ends = jnp.concatenate([jnp.minimum(part.times, part.end[None]), part.end[None]])
+    search = lambda ts, t: jnp.searchsorted(ts, t, side="right").astype(jnp.int32)  # noqa: E731
+    return _per_body(run, search)(lax.stop_gradient(run.between), ends)
+
+
+def of_saved(
+    method: Method, run: Run, step: Step, slopes: Array, first: Array, last: Array, bars: Array,
+    between: Array | None,
+) -> tuple[Array | None, Array, Array, Array, Array]:  # fmt: skip
+    """The transpose of the states at the times in a step, from number `first` to before `last`.
+
+    **Returns** `between`, if it is not `None`, with the cotangents of the times added, and those of
+    the step: its time, length, state and slopes. `bars` (K, n, *bodies) of all states.
+    """
+    size = run.between.shape[0]
+    width = min(size, max(4, min(size // 50, 16)))
+    states = partial(_states, method, method.project)
+
+    def window(state: Any) -> Any:
+        begin, total, by = state
+        number = jnp.arange(width, dtype=jnp.int32).reshape(-1, *[1] * first.ndim)
+        number = begin[None] + number
+        inside = number < last[None]
+        number = jnp.minimum(number, size - 1)
+        pick = _per_body(run, lambda a, index: a[index])
+        ts = jnp.where(inside, pick(run.between, number), step.t[None])
+        bar = jnp.where(jnp.expand_dims(inside, 1), pick(bars, number), 0)
+        by_ts, *more = jax.vjp(states, ts, step.t, step.h, step.y, slopes)[1](bar)
+        if total is not None:
+            total = _per_body(run, lambda a, i, b: a.at[i].add(b))(total, number, by_ts)
+        return begin + width, total, [a + b for a, b in zip(by, more, strict=True)]
+
+    none = [jnp.zeros_like(a) for a in (step.t, step.h, step.y, slopes)]
+    start = (first, between, none)
+    _, total, by = lax.while_loop(lambda state: jnp.any(state[0] < last), window, start)
+    return total, *by
+
+
+def _rows_at(run: Run, part: Segment) -> tuple[Array, Array]:
+    """The index of the row that each time between is in (K, *bodies), whether there is one."""
+    # All at once: in a loop each search would be many small kernels.
+    ts = lax.stop_gradient(run.between)
+    search = _per_body(run, lambda begun, ts: jnp.searchsorted(begun, ts).astype(jnp.int32) - 1)
+    index = search(part.times, ts)
+    return jnp.maximum(index, 0), (index >= 0) & (ts <= part.end[None])
+
+
+def _per_body(run: Run, function: Callable[..., Any]) -> Callable[..., Any]:
+    """A function of one body's arrays as one of arrays with a last axis of bodies, if there is."""
+    return jax.vmap(function, in_axes=-1, out_axes=-1) if run.t0.ndim else function
+
+
+def _cut(number: Array, width: int, many: int, a: Array) -> Array:
+    """Some rows of `a` (K, …, *bodies), in lanes (…, lanes)."""
+    if many:
+        return lax.dynamic_index_in_dim(a, number, 0, False)
+    return jnp.moveaxis(lax.dynamic_slice_in_dim(a, number, width, 0), 0, -1)
+
+
+def _picked(many: int, rows: Array, index: Array) -> Array:
+    """Those of the rows (R, c, *bodies), in lanes: (c, lanes)."""
+    return jnp.take_along_axis(rows, index[None, None], 0)[0] if many else rows[index].T
+
+
+def _states(
+    method: Method, project: Any, ts: Array, t: Array, h: Array, y: Array, slopes: Array
+) -> Array:
+    """The states (W, n, lanes) at times `ts` (W, lanes), all in one step of each lane."""
+    theta = ((ts - t[None]) / jnp.where(h == 0, 1, h)[None]).astype(slopes.dtype)
+    # Weights of the slopes are one number a stage; the rows F_r would be n.
+    rows = weights(method.tableau, slopes.dtype, slopes.shape[1]).dense
+    rows = rows.reshape(rows.shape[0], 1, -1, *[1] * (theta.ndim - 1))
+    shares = nested(jnp.expand_dims(theta, 1), rows)
+    rise = jnp.sum(jnp.expand_dims(shares, 1) * slopes[None], 2)
+    return jax.vmap(project)(y[None] + lift(h.astype(y.dtype), rise) * rise)
 
 
 def replayed(
-    method: Method, constants: list[Array], run: Run, record: Record
+    method: Method, constants: Arrays, run: Run, record: Record
 ) -> tuple[Array, Array, Array, Array]:
-    """The states between and at the end, the starts and the rows by the steps of the record.
-
-    These are held: so the tangents of all four are those of the run.
-    """
+    """States between and at the end, starts and rows by the steps of the record, which are held."""
     head = record.starts.shape[1] - run.y0.shape[0]
 
     def one(i: Array, state: tuple[Array, Array, Array, Array]) -> Any:
@@ -39,15 +168,13 @@ def replayed(
         def step(k: Array, both: tuple[Array, Array]) -> tuple[Array, Array]:
             y, rows = both
             row = part.rows[k]
-            there = runge_kutta.stages(
-                method.tableau, method.field, constants, Step(*times_of(run, row), y)
-            )
+            there = stages(method.tableau, method.field, constants, Step(*times_of(run, row), y))
             rows = lax.dynamic_update_index_in_dim(rows, row.at[HEAD:].set(y), k, 0)
             return jnp.where(lift(row[2] >= STEP, y), method.project(there.end), y), rows
 
         y, rows = lax.fori_loop(0, part.number, step, (y, part.rows))
         if run.between.shape[0]:
-            ys = dense_output.saved(method, constants, run, part, rows[:, HEAD:], ys)
+            ys = saved(method, constants, run, part, rows[:, HEAD:], ys)
         return y, ys, starts, rows
 
     still, held = lax.stop_gradient(((constants, run), record))
@@ -60,26 +187,19 @@ def replayed(
 
 
 def cotangents(
-    method: Method,
-    constants: list[Array],
-    run: Run,
-    record: Record,
-    bars: Sequence[Array],
-    timed: bool,
-) -> tuple[list[Array], Run]:
+    method: Method, constants: Arrays, run: Run, record: Record, bars: Arrays, timed: bool
+) -> tuple[Arrays, Run]:
     """The transpose of the tangents of `replayed`: cotangents of the constants and of the run.
 
-    Those of times only where they are `timed`; those of tolerances and of the first step are 0.
-
-    **Arguments:** `bars` of the states between (K, n, *bodies) and at the end (n, *bodies).
+    Those of times only where they are `timed`; `bars` of the states between and at the end.
     """
     number, size = jnp.max(record.number), run.between.shape[0]
 
-    def one(i: Array, sums: tuple[list[Array], Run]) -> tuple[list[Array], Run]:
+    def one(i: Array, sums: tuple[Arrays, Run]) -> tuple[Arrays, Run]:
         part = _again(method, constants, run, record, number - 1 - i)
-        known = dense_output.known(run, part) if size else None
+        known = passed(run, part) if size else None
 
-        def step(k: Array, sums: tuple[list[Array], Run]) -> tuple[list[Array], Run]:
+        def step(k: Array, sums: tuple[Arrays, Run]) -> tuple[Arrays, Run]:
             total, of_run = sums
             k = part.number - 1 - k
             row = part.rows[k]
@@ -89,21 +209,15 @@ def cotangents(
             dense, seeds, of_slopes, between = False, [], None, of_run.between
             if known is not None:
                 dense = jnp.any(known[k] < known[k + 1])
-            there = runge_kutta.stages(method.tableau, method.field, constants, here, dense)
+            there = stages(method.tableau, method.field, constants, here, dense)
             bar = jax.vjp(method.project, there.end)[1](of_run.y0)[0]
             if known is not None:
-                between, *seeds, of_slopes = dense_output.pulled(
-                    method,
-                    run,
-                    here,
-                    there.slopes,
-                    known[k],
-                    known[k + 1],
-                    bars[0],
+                between, *seeds, of_slopes = of_saved(
+                    method, run, here, there.slopes, known[k], known[k + 1], bars[0],
                     between if timed else None,
-                )
+                )  # fmt: skip
             by_constants, *rest = runge_kutta.pulled(
-                method.tableau, method.field, constants, here, there, bar, of_slopes, dense
+                method.tableau, method.field, constants, here, there, bar, of_slopes
             )
             if seeds:
                 rest = [a + b for a, b in zip(rest, seeds, strict=True)]
@@ -129,9 +243,7 @@ def _where(there: Array, a: Array) -> Array:
     return jnp.where(lift(there, a), a, jnp.zeros_like(a))
 
 
-def _again(
-    method: Method, constants: list[Array], run: Run, record: Record, number: Array
-) -> Segment:
+def _again(method: Method, constants: Arrays, run: Run, record: Record, number: Array) -> Segment:
     """A segment of the record; any but the last is run once more."""
     loop, after = (unpacked(record.starts[i]) for i in (number, number + 1))
     again = number < jnp.max(record.number) - 1

@@ -1,8 +1,7 @@
 """Batches of a program: bodies in the last axis of every array, whatever `jax.vmap` is outside.
 
-XLA on CPU makes vector instructions for arrays whose last axis is the batch; `jax.vmap` puts it
-first, which is many times slower in a loop over small states. Each program is therefore written for
-arrays with a trailing axis of bodies (or none), and `custom_vmap` moves the axis there.
+XLA on CPU makes vector instructions for arrays whose last axis is the batch. `jax.vmap` puts it
+first, which is many times slower in a loop over small states; `custom_vmap` moves it to the end.
 """
 
 from collections.abc import Callable
@@ -20,13 +19,10 @@ BLOCK = 16
 
 
 class Layout(NamedTuple):
-    """The axes of a program's arrays beyond those of one body.
+    """The axes of a program's arrays beyond those of one body."""
 
-    **Fields:** `bodies` a last axis of bodies; `shared` which constants have none all the same.
-    """
-
-    bodies: bool
-    shared: tuple[bool, ...]
+    bodies: bool  # a last axis
+    shared: tuple[bool, ...]  # which constants have none all the same
 
 
 # `program(layout, constants, each)` returns a list of arrays of each body.
@@ -34,25 +30,18 @@ Program = Callable[[Layout, Arrays, Arrays], Arrays]
 
 
 def in_lanes(
-    program: Program,
-    constants: Arrays,
-    each: Arrays,
-    linear: int = 0,
-    layout: Layout | None = None,
+    program: Program, constants: Arrays, each: Arrays, linear: int = 0, layout: Layout | None = None
 ) -> Arrays:
-    """The program, whose `jax.vmap` is itself on longer last axes.
+    """The program, whose `jax.vmap` is itself on longer last axes; bodies may share `constants`.
 
-    **Arguments:** `constants` arrays that bodies may share; `each` arrays that every body has its
-    own of; in the last `linear` of them the program is linear: many such directions of one motion
-    are no bodies. No `None` among them.
+    In the last `linear` of `each` it is linear: many such directions of one motion are no bodies.
     """
     was = Layout(False, (True,) * len(constants)) if layout is None else layout
     number = len(constants)
 
     @jax.custom_batching.custom_vmap
     def call(*args: Any) -> Arrays:
-        constants, each = list(args[:number]), list(args[number:])
-        return _in_blocks(program, was, constants, each)
+        return _in_blocks(program, was, list(args[:number]), list(args[number:]))
 
     @call.def_vmap
     def _(size: int, batched: Any, *args: Any) -> Any:

@@ -5,6 +5,7 @@ arrays in vector instructions. A loop over (7,) or (N, 7) arrays becomes many sm
 """
 
 import math
+from itertools import accumulate
 from typing import Any
 
 import jax
@@ -47,11 +48,7 @@ def join(parts: Atoms, like: Any) -> Any:
 
 
 def leaf_sizes(like: Any) -> list[int]:
-    """The number of numbers in each array.
-
-    >>> leaf_sizes((jnp.zeros((2, 3)), jnp.ones(())))
-    [6, 1]
-    """
+    """The number of numbers in each array."""
     return [math.prod(jnp.shape(leaf)) for leaf in jax.tree.leaves(like)]
 
 
@@ -65,11 +62,7 @@ def one_dtype(tree: Any, name: str, advice: str = "") -> Any:
 
 
 def flat(tree: Any) -> Array:
-    """The numbers of a tree of arrays of one dtype as a vector.
-
-    >>> flat((jnp.zeros(2), jnp.ones(())))
-    Array([0., 0., 1.], dtype=float64)
-    """
+    """The numbers of a tree of arrays of one dtype as a vector."""
     one_dtype(tree, "state", "; convert its arrays to one, or use a solver of diffrax")
     return jnp.concatenate([jnp.reshape(leaf, -1) for leaf in jax.tree.leaves(tree)])
 
@@ -77,18 +70,11 @@ def flat(tree: Any) -> Array:
 def unflat(vector: Array, like: Any) -> Any:
     """The tree shaped as `like` whose numbers are those of `vector`."""
     leaves, tree = jax.tree.flatten(like)
-    out, begin = [], 0
-    for leaf in leaves:
-        shape = jnp.shape(leaf)
-        out.append(vector[begin : begin + math.prod(shape)].reshape(shape))
-        begin += math.prod(shape)
-    return jax.tree.unflatten(tree, out)
+    pieces = jnp.split(vector, list(accumulate(leaf_sizes(like)))[:-1])
+    shaped = [piece.reshape(jnp.shape(a)) for piece, a in zip(pieces, leaves, strict=True)]
+    return jax.tree.unflatten(tree, shaped)
 
 
 def lift(a: Array, like: Array) -> Array:
-    """`a` with leading axes of length 1, as many axes as `like`: last axes are those they share.
-
-    >>> lift(jnp.zeros(3), jnp.zeros((5, 2, 3))).shape
-    (1, 1, 3)
-    """
+    """`a` with leading axes of length 1, as many axes as `like`: last axes are those they share."""
     return a.reshape((1,) * (like.ndim - a.ndim) + a.shape)

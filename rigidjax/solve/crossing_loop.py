@@ -2,10 +2,9 @@
 
 A pass through the loop is one step of the method from the present state: an attempt at the next
 step, or a part of it, up to the trial time of the crossing. A crossing is therefore as accurate as
-a step, and costs about three passes. The next step starts at the crossing, so two crossings in one
-step are no special case. The step is taken again, up to the extremum of g, in two cases: the cubic
-through both ends, with their slopes, has more zeros than their signs show; or g turns back before
-zero and the tangents at both ends do not exclude a zero.
+a step. The next step starts at the crossing. The step is taken again, up to the extremum of g, in
+two cases: the cubic through both ends, with their slopes, has more zeros than their signs show; or
+g turns back before zero and the tangents at both ends do not exclude a zero.
 
 Nothing here is differentiated.
 """
@@ -18,9 +17,9 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
+from rigidjax.solve.adaptive_loop import Run, at, controlled
 from rigidjax.solve.components import lift
 from rigidjax.solve.runge_kutta import Step
-from rigidjax.solve.step_control import Run, at, controlled
 
 # Newton's guesses in a step, from then on halves; and how often a step is taken again for a turn.
 _GUESSES = 8
@@ -28,18 +27,13 @@ _MOST = 70
 
 
 class Motion(NamedTuple):
-    """The motion of a body, on (n, *bodies).
+    """The motion of a body, on (n, *bodies)."""
 
-    **Fields:** `attempt(step) → (y, norm)` the state a step later, its error over the tolerance;
-    `order` of the method; `longest` step; `condition(t, y) → (g, dg/dt, dy/dt, round-off of g)`;
-    `counts(t, y, steps)` whether a zero is one of the motion, not of its round-off; `project`.
-    """
-
-    attempt: Callable[[Step], tuple[Array, Array]]
+    attempt: Callable[[Step], tuple[Array, Array]]  # the state a step later, error over tolerance
     order: int
-    longest: Array
-    condition: Callable[[Array, Array], tuple[Array, ...]]
-    counts: Callable[[Array, Array, Array], Array]
+    longest: Array  # step
+    condition: Callable[[Array, Array], tuple[Array, ...]]  # (t, y): g, dg/dt, dy/dt, g's round-off
+    counts: Callable[[Array, Array, Array], Array]  # (t, y, steps): whether a zero is no round-off
     project: Callable[[Array], Array]
 
 
@@ -52,16 +46,14 @@ class Search(NamedTuple):
 
 
 class Located(NamedTuple):
-    """Times (K, *bodies), NaN beyond the last, states (K, n, *bodies), their number (*bodies),
-    where each body is at the end, its next step (NaN where it met one), and passes.
-    """
+    """The crossings found."""
 
-    times: Array
-    states: Array
+    times: Array  # (K, *bodies), NaN beyond the last
+    states: Array  # (K, n, *bodies)
     number: Array
-    t: Array
-    h: Array
-    steps: Array
+    t: Array  # at the end
+    h: Array  # the next step, NaN where one was met
+    steps: Array  # passes
 
 
 class _End(NamedTuple):
@@ -73,19 +65,16 @@ class _End(NamedTuple):
 
 
 class _Body(NamedTuple):
-    """Time, state, next step; the side of zero that g is on, g and dg/dt there; index of the next
-    stop; whether a zero is looked for in a step, where, between which ends; counters; whether it
-    was found.
-    """
+    """The state of the loop."""
 
     t: Array
     y: Array
-    h: Array
-    side: Array
+    h: Array  # the next step
+    side: Array  # of zero that g is on
     g: Array
     rate: Array
-    stop: Array
-    refining: Array
+    stop: Array  # the index of the next one
+    refining: Array  # whether a zero is looked for in a step: at x, between two ends
     x: Array
     low: _End
     high: _End
@@ -95,10 +84,7 @@ class _Body(NamedTuple):
 
 
 def locate(motion: Motion, search: Search, run: Run) -> Located:
-    """The crossings on the way from `run.t0` through `run.stops`, from the first step `run.h0`.
-
-    A start on the section is none.
-    """
+    """The crossings after `run.t0` on the way through `run.stops`, from the first step `run.h0`."""
     t0, y0 = run.t0, run.y0
     g, rate, *_ = motion.condition(t0, y0)
     # On the section but for round-off of the time: then the side is where g goes.
@@ -108,14 +94,11 @@ def locate(motion: Motion, search: Search, run: Run) -> Located:
     side = jnp.where(there, jnp.sign(rate), jnp.sign(g))
     zero, none, no = jnp.zeros(t0.shape, jnp.int32), jnp.zeros_like(g), jnp.zeros(t0.shape, bool)
     sound = jnp.isfinite(g) & jnp.isfinite(run.stops[-1]) & jnp.all(jnp.isfinite(y0), 0)
-    end = _End(jnp.zeros_like(t0), none, none)
-    body = _Body(
-        t0, y0, jnp.where(sound, run.h0, jnp.nan), side, jnp.where(there, none, g), rate, zero, no,
-        jnp.zeros_like(t0), end, end, zero, zero, no,
-    )  # fmt: skip
-
-    def on(body: _Body) -> Array:
-        return jnp.any(_going(search, run, body))
+    h, x = jnp.where(sound, run.h0, jnp.nan), jnp.zeros_like(t0)
+    end = _End(x, none, none)
+    g = jnp.where(there, none, g)
+    body = _Body(t0, y0, h, side, g, rate, zero, no, x, end, end, zero, zero, no)
+    on = lambda body: jnp.any(_going(search, run, body))  # noqa: E731
 
     def next_zero(body: _Body) -> _Body:
         body = lax.while_loop(on, partial(_pass, motion, search, run), body)
@@ -245,12 +228,8 @@ def _hidden(side: Array, low: _End, high: _End, blur: Array) -> tuple[Array, Arr
     # The slope grows through zero at the least value, and falls at the largest.
     least, most = jnp.where(c < 0, other, one), jnp.where(c < 0, one, other)
 
-    def value(x: Array) -> Array:
-        return first + x * (a + x * (0.5 * c + x * d / 3))
-
-    def within(x: Array) -> Array:
-        return (x > 0) & (x < 1)
-
+    value = lambda x: first + x * (a + x * (0.5 * c + x * d / 3))  # noqa: E731
+    within = lambda x: (x > 0) & (x < 1)  # noqa: E731
     # Both tangents meet beyond zero: of a g that turns once nothing else is known.
     meet = (last - b - first) / jnp.where(a == b, 1, a - b)
     touch = (a < 0) & (b > 0) & (first + a * meet < -blur)

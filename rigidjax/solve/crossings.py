@@ -1,33 +1,58 @@
-"""Times at which a motion meets a condition: the event that ends a run, and section crossings."""
+"""Times at which a motion meets a condition: the event that ends a run, and section crossings.
+
+Crossings are found without derivatives, then corrected with them. A crossing at t* of
+g(t, y(t)) = 0 moves with every number of the scene. The motion is run again to the times found,
+which are held fixed. The rest of g there and its rates ġ and g̈ along the motion give the time and
+the state by one step of Chebyshev's method,
+
+    τ = −(g/ġ)(1 + ½ g g̈/ġ²),   y = y* + f τ + ½ (df/dt) τ².
+
+τ is zero but for the error of dense output, and its first and second derivatives are those of the
+crossing (the error is of third order in what moves). At a touch, ġ = 0, there is none.
+
+A zero of round-off, of what the motion conserves or of a component that stays at zero, is none. Its
+ġ is not more than round-off makes of it, which is some ε (|∂g/∂t| + Σ |∂g/∂yᵢ| rᵢ), times the root
+of the number of steps. The size rᵢ of the terms of ẏᵢ is the length of the array of the state that
+i belongs to, taken of ẏ and of the change of ẏ where each y changes by the length of its array.
+"""
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
 from rigidjax import _checks
 from rigidjax._types import ScalarLike
 from rigidjax.body.inertia import Inertia, MassProperties
+from rigidjax.exact.free_body import FreeMotion
 from rigidjax.frames import Point
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.coupled import Coupled, started
 from rigidjax.motion.equations import on_the_group
-from rigidjax.motion.torques.base import lacking
-from rigidjax.solve import validation
-from rigidjax.solve.components import flat, unflat
-from rigidjax.solve.crossing_loop import Search
-from rigidjax.solve.crossing_search import correction, crossings_of, located, section
-from rigidjax.solve.explicit import AbstractExplicit, DormandPrince8
-from rigidjax.solve.linear_map import nan_derivatives
-from rigidjax.solve.run import Free, Loop, solve
-from rigidjax.solve.step_control import of_body, outcome
-from rigidjax.solve.vector_field import direction as direction_of
+from rigidjax.motion.torques.base import jumps_of, lacking
+from rigidjax.solve import crossing_loop, validation
+from rigidjax.solve.adaptive import adaptive, taken_out
+from rigidjax.solve.adaptive_loop import Method, Run, first_step, of_body, outcome, tried
+from rigidjax.solve.batching import Arrays, Layout, in_lanes
+from rigidjax.solve.components import flat, leaf_sizes, unflat
+from rigidjax.solve.crossing_loop import Located, Motion, Search
+from rigidjax.solve.explicit import AbstractExplicit, explicit
+from rigidjax.solve.linear_map import nan_derivatives, no_tangent
+from rigidjax.solve.run import (
+    Free,
+    Loop,
+    ahead,
+    direction as direction_of,
+    equations_of_motion,
+    solve,
+)
 
 State = TypeVar("State", Spin, Attitude, Rigid, Point, Coupled)
 
@@ -37,14 +62,13 @@ class Event(eqx.Module):
 
     **Arguments:**
 
-    - `condition`: a Module or function `(t, state, body) → scalar`, smooth along the motion; it
-      may hold traced numbers. Under a law with states of its own the state is a
-      `Coupled`: `state.motion.omega`, `state.own`.
+    - `condition`: a Module or function `(t, state, body) → scalar`, smooth along the motion; it may
+      hold traced numbers. Under a law with states of its own the state is a `Coupled`:
+      `state.motion.omega`, `state.own`.
     - `direction`: 1 for a zero on the way up, −1 on the way down, 0 for both (as in SciPy), in the
       order in which the run meets them.
     - `max_step`: the longest step, s. A zero is found if the condition has changed its sign at the
-      end of a step, or has one extremum within it; a condition that is much faster than the motion
-      needs shorter steps.
+      end of a step, or has one extremum within it.
 
     A start at a zero does not count, nor does a condition that is always zero to round-off (see
     `crossings`).
@@ -64,17 +88,12 @@ class Event(eqx.Module):
     max_step: Any
 
     def __init__(
-        self,
-        condition: Callable[..., Any],
-        direction: int = 0,
-        max_step: ScalarLike | None = None,
+        self, condition: Callable[..., Any], direction: int = 0, max_step: ScalarLike | None = None
     ):
         self.condition = _checks.function(condition, "condition", "(t, state, body) → scalar")
         if isinstance(direction, bool) or direction not in (-1, 0, 1):
-            raise ValueError(
-                "direction: wanted 1 (on the way up), -1 (on the way down) or 0 (both), got "
-                f"{direction!r}"
-            )
+            words = "direction: wanted 1 (on the way up), -1 (on the way down) or 0 (both), got "
+            raise ValueError(f"{words}{direction!r}")
         self.direction = int(direction)
         self.max_step = max_step
         if max_step is not None:
@@ -90,12 +109,6 @@ class Crossings(eqx.Module, Generic[State]):
     type of `state0`, with a leading axis; `count` their number; `result` a `diffrax.RESULTS`:
     `successful` if the run reached `t1`, `event_occurred` if it ended with `max_crossings` of them,
     or why it ended early; `num_steps` of the method, partial ones included.
-
-    >>> import rigidjax as rj
-    >>> body, start = rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([0.0, 1.0, 0.01])
-    >>> flips = rj.crossings(body, start, 0.0, 40.0, lambda t, state, body: state.omega[1])
-    >>> [round(float(t), 3) for t in flips.times[: flips.count]]
-    [9.426, 28.277]
     """
 
     times: Float[Array, " crossings"]
@@ -132,11 +145,8 @@ def crossings(
 
     - `body`, `state0`, `torque`: as for `simulate`; `state0` at `t0`.
     - `t0`, `t1`: s; `t1 < t0` goes back in time.
-    - `condition`: a Module or function `(t, state, body) → scalar`, smooth along the motion. It may
-      hold traced numbers, and depend on the time (a stroboscopic section is `sin(½(t − t₀)ω)`).
-      The state is a `Coupled`, as in the result, if a torque has states of its own.
-    - `direction`: 1 for zeros on the way up, −1 on the way down, 0 for both, in the order of the
-      run.
+    - `condition`, `direction`: as for `Event`. The condition may depend on the time (a stroboscopic
+      section is `sin(½(t − t₀)ω)`).
     - `max_crossings`: K, the length of the results; the run ends with the last of them.
     - `max_step`: the longest step, s, for a condition that is much faster than the motion: several
       zeros in one step are found if the cubic through its ends, with their slopes, shows them.
@@ -147,17 +157,15 @@ def crossings(
 
     A start on the section does not count, and a tangential contact may be missed. A condition that
     is always zero to round-off, such as an energy minus its value, has no crossing: a zero counts
-    if the condition goes through it 16 times as fast as round-off could make it (in closed form;
-    else times the root of the number of steps). Many bodies:
-    `jax.vmap(lambda start: rj.crossings(body, start, …))`.
+    if the condition goes through it 16 times as fast as round-off could make it (under a solver,
+    times the root of the number of steps). For many bodies use `jax.vmap`.
 
-    **Returns** `times`, `states`, their `count`, `result` and `num_steps` (`Crossings`). Times and
-    states have first and second derivatives with respect to all numbers of the scene, of
-    `condition` and of `state0`, forward and reverse; near a tangential contact they grow without
-    bound, as the true ones do.
+    **Returns** a `Crossings`. Times and states have first and second derivatives with respect to
+    all numbers of the scene, of `condition` and of `state0`, forward and reverse; near a tangential
+    contact they grow without bound, as the true ones do.
 
     Source: Newton's method on the step from the last accepted state, instead of Hénon's change of
-    variable (Hénon 1982, doi:10.1016/0167-2789(82)90034-3): two to three parts of a step.
+    variable (Hénon 1982, doi:10.1016/0167-2789(82)90034-3).
 
     **Raises:** `TypeError`, `ValueError` as `simulate`, for equal times, and for a condition that
     is no number, is NaN at the start, or reads a part that the state does not have.
@@ -174,21 +182,15 @@ def crossings(
     begin, end = _checks.time(t0, "t0"), _checks.time(t1, "t1")
     if _checks.known((begin, end)) and float(begin) == float(end):
         raise ValueError(f"t1: wanted another time than t0, got {float(end):g} for both")
-    body, state0, times = validation.scene(
-        body, state0, jnp.stack([begin, end]), torque, throw=False
-    )
+    ts = jnp.stack([begin, end])
+    body, state0, times = validation.scene(body, state0, ts, torque, throw=False)
     state0 = ready(event, body, state0, torque, times[0])
-    setup: Free | Loop
     if torque is None and solver is None and body is not None:
-        setup = Free(body, False)
-    else:
-        solver = DormandPrince8() if solver is None else solver
-        _checks.instance(
-            solver, AbstractExplicit, "solver", wanted="an explicit method of rigidjax.solvers"
-        )
-        rtol, atol = validation.tolerances(rtol, atol, times.dtype)
-        way = direction_of(times)
-        setup = Loop(body, torque, solver, rtol, atol, None, way, max_steps, False)
+        return _solved(Free(body, False), event, many, max_steps, state0, times)
+    solver = explicit(solver)
+    rtol, atol = validation.tolerances(rtol, atol, times.dtype)
+    way = direction_of(times)
+    setup = Loop(body, torque, solver, rtol, atol, None, way, max_steps, False)
     return _solved(setup, event, many, max_steps, state0, times)
 
 
@@ -203,10 +205,8 @@ def ready(event: Event, body: Any, state0: Any, torque: Any, t: Array) -> Any:
             raise
         raise TypeError(told) from wrong
     if _checks.known((event, body, t, state0)) and bool(jnp.isnan(_value(event, body, t, state0))):
-        raise ValueError(
-            f"condition: wanted a number wherever the motion goes, got NaN at the start, t = "
-            f"{float(t):g}"
-        )
+        words = "condition: wanted a number wherever the motion goes, got NaN at the start, t = "
+        raise ValueError(f"{words}{float(t):g}")
     return state0
 
 
@@ -228,13 +228,10 @@ _value = eqx.filter_jit(value)
 def solve_until(
     setup: Free | Loop, event: Event, state0: Any, ts: Array
 ) -> tuple[Any, dict[str, Any], dfx.RESULTS, Array, Any]:
-    """As `solve`, up to the event; and the event's time and state, NaN if there is none.
-
-    The run is done twice: to find the event, and up to it, with derivatives.
-    """
+    """As `solve`, up to the event; and the event's time and state, NaN if there is none."""
+    # The run is done twice: to find the event, and up to it, with derivatives.
     state0 = on_the_group(state0)
-    condition = lambda t, y: value(event, setup.body, t, y)  # noqa: E731
-    crossed, numbers = section(setup, condition, event.max_step, state0, ts)
+    crossed, numbers = section(setup, event, state0, ts)
     steps = setup.max_steps if isinstance(setup, Loop) else 1_000_000
     found = located(crossed, Search(event.direction, 1, steps), numbers)
     met, last = found.number > 0, lax.stop_gradient(ts[-1])
@@ -262,12 +259,208 @@ def _solved(
     setup: Free | Loop, event: Event, many: int, max_steps: int, state0: Any, ts: Array
 ) -> Crossings:
     state0 = on_the_group(state0)
-    condition = lambda t, y: value(event, setup.body, t, y)  # noqa: E731
-    crossed, numbers = section(setup, condition, event.max_step, state0, ts)
-    found = crossings_of(crossed, Search(event.direction, many, max_steps), numbers)
+    crossed, numbers = section(setup, event, state0, ts)
+    what = Search(event.direction, many, max_steps)
+    answer: Any = jax.custom_jvp(partial(located, crossed, what))
+
+    @answer.defjvp
+    def _(primals: Any, tangents: Any) -> Any:
+        found = located(crossed, what, *primals)
+        out, moved = jax.jvp(partial(_corrected, crossed, what, found), primals, tangents)
+        rest = [no_tangent(a) for a in found[2:]]
+        return Located(*out, *found[2:]), Located(*moved, *rest)  # pyright: ignore
+
+    found = answer(numbers)
     states = jax.vmap(partial(unflat, like=state0))(found.states)
     inputs = (event.condition, setup.body, setup.torque, state0, ts)
     times, states = nan_derivatives((crossed.time(found.times), states), inputs)
     result = outcome(found.h, found.t, crossed.time(ts[-1]), found.number >= many)
     result = of_body(result, setup.body)
     return Crossings(times, states, found.number, result, found.steps)
+
+
+# Samples of a free body's condition in one turn at its largest rate.
+_SAMPLES = 16
+# How many times its round-off the slope of a crossing is at least.
+_CLEAR = 16
+
+
+class Section(NamedTuple):
+    """The section and the motion, in s = σt, which increases."""
+
+    solver: AbstractExplicit | None  # None: the closed form
+    motion: Callable[[Arrays, Array, Array], Array]  # dy/ds, or y itself in closed form
+    rates: Callable[[Arrays, Array, Array], tuple[Array, Array, Array]]  # g, dg/ds, dy/ds
+    like: Any
+    sign: Array
+
+    def project(self, y: Array) -> Array:
+        return flat(on_the_group(unflat(y, self.like)))
+
+    def time(self, s: Array) -> Array:
+        """Time t at s, and the other way."""
+        return self.sign.astype(s.dtype) * s
+
+
+# The constants of a section's functions, the run, its longest step.
+Numbers = tuple[Arrays, Run, Array]
+
+
+def section(setup: Free | Loop, event: Event, state0: Any, ts: Array) -> tuple[Section, Numbers]:
+    """The section between `ts[0]` and `ts[-1]`, and what it is made of."""
+    condition: Any = lambda t, y: value(event, setup.body, t, y)  # noqa: E731
+    y0, dtype = flat(state0), ts.dtype
+    sign = jnp.sign(ts[-1] - ts[0]).astype(jnp.int32)
+    way = setup.sign if isinstance(setup, Loop) else sign
+    jumps = jumps_of(setup.torque).astype(dtype)
+    field: Any = equations_of_motion(setup.body, state0, setup.torque)
+    field, condition, along, jumps = ahead(way, field, condition, ts[jnp.array([0, -1])], jumps)
+    longest = whole = lax.stop_gradient(along[1] - along[0])
+    if event.max_step is not None:
+        longest = lax.stop_gradient(jnp.asarray(event.max_step, dtype))
+
+    def slope(s: Array, y: Array) -> Array:
+        return flat(field(s, unflat(y, state0), None))
+
+    def rates(s: Array, y: Array) -> tuple[Array, Array, Array]:
+        there = slope(s, y)
+        of_y = lambda s, y: condition(s, unflat(y, state0))  # noqa: E731
+        return *jax.jvp(of_y, (s, y), (jnp.ones_like(s), there)), there
+
+    if isinstance(setup, Loop):
+        solver, motion = setup.solver, slope
+        rtol, atol = (jnp.asarray(a, y0.dtype) for a in (setup.rtol, setup.atol))
+        h0 = jnp.asarray(jnp.nan if setup.dt0 is None else setup.dt0, dtype)
+    else:
+        solver, free = None, FreeMotion(setup.body, state0)
+        motion = lambda s, _: flat(free(sign.astype(s.dtype) * s - ts[0]))  # noqa: E731
+        longest = jnp.minimum(longest, _spacing(setup.body, state0, whole))
+        rtol, atol, h0 = jnp.zeros((), y0.dtype), jnp.zeros((), y0.dtype), longest
+    (of_motion, of_rates), constants, _ = taken_out([motion, rates], along[0], y0)
+    stops = jnp.concatenate([jnp.clip(jnp.sort(jumps), along[0], along[1]), along[1:]])
+    crossed = Section(solver, of_motion, of_rates, state0, sign)
+    run = Run(along[0], stops, stops[:0], y0, rtol, atol, h0)
+    return crossed, (constants, run, longest)
+
+
+def _spacing(body: Any, state0: Any, whole: Array) -> Array:
+    """A part of the time of one turn at the largest rate that energy and momentum allow."""
+    inertia = body if isinstance(body, Inertia) else body.inertia
+    tensor, omega = lax.stop_gradient((inertia.tensor, state0.omega))
+    momentum = jnp.sum(tensor * omega[None], axis=1)
+    least = jnp.linalg.eigvalsh(tensor)[0]
+    by_energy = jnp.sqrt(jnp.sum(momentum * omega) / least)
+    rate = jnp.minimum(by_energy, jnp.sqrt(jnp.sum(momentum**2)) / least)
+    return jnp.where(rate * whole > 1, 2 * np.pi / (_SAMPLES * rate), whole / _SAMPLES)
+
+
+def located(section: Section, what: Search, numbers: Numbers) -> Located:
+    """The first crossings on the way through `run.stops`, without derivatives."""
+    constants, run, longest = lax.stop_gradient(numbers)
+    program = partial(_located, section, what)
+    return Located(*in_lanes(program, constants, [*run, longest]))
+
+
+def _located(
+    section: Section, what: Search, layout: Layout, constants: Arrays, each: Arrays
+) -> Arrays:
+    run, longest = Run(*each[:-1]), each[-1]
+    solver, project, over = section.solver, section.project, lambda f: f
+    if layout.bodies:
+        shared = [None if s else -1 for s in layout.shared]
+        over = lambda f: jax.vmap(f, (shared, -1, -1), -1)  # noqa: E731
+        project = jax.vmap(project, -1, -1)
+    motion = over(section.motion)
+    seen, clear = (partial(over(partial(f, section)), constants) for f in (_seen, _clear))
+
+    def counts(s: Array, y: Array, steps: Array) -> Array:
+        # The round-off of steps adds up as a random walk does.
+        many = 1 if solver is None else jnp.sqrt(1 + steps.astype(y.dtype))
+        return ~(clear(s, y) < _CLEAR * many)
+
+    order, still = 1, jnp.zeros_like(run.rtol)
+    attempt: Any = lambda step: (motion(constants, step.end, step.y), still)  # noqa: E731
+    if solver is not None:
+        method = Method(solver.tableau, motion, project, None, leaf_sizes(section.like), 0)
+        h0, _ = first_step(method, constants, run)
+        h0 = jnp.minimum(jnp.where(jnp.isnan(run.h0), h0, run.h0), longest)
+        run = run._replace(h0=h0)
+        attempt, order = partial(tried, method, constants, run), solver.tableau.order
+    moving = Motion(attempt, order, longest, seen, counts, project)
+    return list(crossing_loop.locate(moving, what, run))
+
+
+def _lengths(like: Any, a: Array) -> Array:
+    """The length of the array of a state that each number belongs to."""
+    which = np.repeat(np.arange(len(leaf_sizes(like))), leaf_sizes(like))
+    same = jnp.asarray(which[:, None] == which[None], a.dtype)
+    return jnp.sqrt(jnp.sum(same * (a * a)[None], 1))
+
+
+def _push(like: Any, y: Array) -> Array:
+    """A change of each number by the length of its array, in a direction along no body's axis."""
+    return jnp.asarray(np.cos(1 + np.arange(y.size)), y.dtype) * _lengths(like, y)
+
+
+def _seen(section: Section, constants: Arrays, s: Array, y: Array) -> tuple[Array, ...]:
+    """g, dg/ds, dy/ds, and what g may be by round-off."""
+    of_g = lambda s, y: section.rates(constants, s, y)[0]  # noqa: E731
+    noise = jax.jvp(of_g, (s, y), (s, _push(section.like, y)))[1]
+    blur = _CLEAR * jnp.finfo(y.dtype).eps * jnp.abs(noise)
+    g, rate, slope = section.rates(constants, s, y)
+    return jnp.asarray(g), jnp.asarray(rate), slope, blur
+
+
+def _clear(section: Section, constants: Arrays, s: Array, y: Array) -> Array:
+    """The ratio of the rate of g through zero to its round-off."""
+    rates, like = partial(section.rates, constants, s), section.like
+    _, rate, slope = rates(y)
+    shift = jax.jvp(lambda y: rates(y)[2], (y,), (_push(like, y),))[1]
+    by_s, by_y = jax.jacfwd(lambda s, y: section.rates(constants, s, y)[0], (0, 1))(s, y)
+    sizes = _lengths(like, slope) + _lengths(like, shift)
+    terms = jnp.abs(by_s) + jnp.sum(jnp.abs(by_y) * sizes)
+    return jnp.abs(rate) / (jnp.finfo(y.dtype).eps * terms)
+
+
+def _corrected(
+    section: Section, what: Search, found: Located, numbers: Numbers
+) -> tuple[Array, Array]:
+    """The times and states found as functions of all numbers."""
+    constants, run, _ = numbers
+    there = jnp.arange(what.many, dtype=jnp.int32) < found.number
+    last = jnp.max(jnp.where(there, found.times, lax.stop_gradient(run.t0)))
+    ts = lax.stop_gradient(jnp.where(there, found.times, last))
+    if section.solver is None:
+        ys = jax.vmap(lambda s: section.motion(constants, s, run.y0))(ts)
+    else:
+        field = lambda s, y, args: unflat(  # noqa: E731
+            section.motion(constants, s, flat(y)), section.like
+        )
+        rtol, atol, h0 = lax.stop_gradient((run.rtol, run.atol, run.h0))
+        out = adaptive(
+            section.solver, field, jnp.concatenate([run.t0[None], ts]),
+            unflat(run.y0, section.like), rtol=rtol, atol=atol, dt0=h0, max_steps=what.max_steps,
+            jumps=run.stops[:-1],
+        )  # fmt: skip
+        ys = jax.vmap(flat)(out.ys)[1:]
+    moved = jax.vmap(partial(correction, section, constants))(ts, ys, there)
+    known = ts, lax.stop_gradient(found.states)
+    times, states = (a + (b - lax.stop_gradient(b)) for a, b in zip(known, moved, strict=True))
+    return jnp.where(there, times, jnp.nan), jnp.where(there[:, None], states, jnp.nan)
+
+
+def correction(
+    section: Section, constants: Arrays, s: Array, y: Array, there: Array
+) -> tuple[Array, Array]:
+    """The crossing near `s`, and the state, by Chebyshev's method; as they are if not `there`."""
+    rates = partial(section.rates, constants)
+    g, rate, slope = rates(s, y)
+    # These two meet only the square of what is zero: their derivatives are not wanted.
+    here = lax.stop_gradient((s, y))
+    _, moved = jax.jvp(rates, here, (jnp.ones_like(s), lax.stop_gradient(slope)))
+    _, second, turn = lax.stop_gradient(moved)
+    rate = jnp.where(there, rate, jnp.ones_like(rate))
+    newton = -g / rate
+    move = jnp.where(there, newton * (1 - 0.5 * newton * second / rate), jnp.zeros_like(newton))
+    state = y + slope * move + 0.5 * turn * move * move
+    return s + move.astype(s.dtype), section.project(state)

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
+from rigidjax import _checks
 from rigidjax.motion.equations import on_the_group
 from rigidjax.solve.components import flat, leaf_sizes, unflat
 from rigidjax.solve.runge_kutta import Step, dense_rows, error_estimate, nested, stages
@@ -33,9 +34,7 @@ class NestedInterpolation(dfx.AbstractLocalInterpolation):
         safe = jnp.where(length == 0, jnp.ones_like(length), length)
         theta = jnp.where(length == 0, jnp.zeros_like(length), (t0 - self.t0) / safe)
 
-        def value(y: Array, rows: Array) -> Array:
-            return y + nested(theta.astype(y.dtype), rows)
-
+        value = lambda y, rows: y + nested(theta.astype(y.dtype), rows)  # noqa: E731
         return on_the_group(jax.tree.map(value, self.y0, self.coefficients))
 
 
@@ -81,9 +80,8 @@ class AbstractExplicit(dfx.AbstractAdaptiveSolver):
 class RungeKutta4(AbstractExplicit):
     """The classical Runge–Kutta method: order 4, four stages, an estimate of order 3.
 
-    For coarse tolerances (1e-3) and torques known to few digits. A state with a quaternion `q` is
-    scaled to |q| = 1 once per step, in dense output too (cubic, as accurate as the steps
-    themselves).
+    For coarse tolerances (1e-3) and torques known to few digits. A quaternion is scaled to |q| = 1
+    once per step, and in dense output (cubic, as accurate as the steps themselves).
 
     Source: Kutta 1901; Hairer, Nørsett and Wanner (1993), II.1, doi:10.1007/978-3-540-78862-1.
 
@@ -101,9 +99,7 @@ class RungeKutta4(AbstractExplicit):
 class Tsitouras5(AbstractExplicit):
     """Tsitouras' method of order 5, six stages, with an estimate of order 4.
 
-    For tolerances about 1e-4 to 1e-6. Projection and dense output (quartic) as for
-    `RungeKutta4`.
-
+    For tolerances about 1e-4 to 1e-6. Projection and dense output (quartic) as for `RungeKutta4`.
     Source: Tsitouras 2011, doi:10.1016/j.camwa.2011.06.002.
 
     >>> Tsitouras5().order(None)
@@ -117,8 +113,7 @@ class DormandPrince8(AbstractExplicit):
     """The method DOP853 of order 8: twelve stages, estimates of orders 5 and 3.
 
     For everything smooth, from 1e-4 to round-off. Projection as for `RungeKutta4`; dense output of
-    degree 7, whose three more stages are computed
-    only where it is asked for.
+    degree 7 has three more stages, computed only where it is asked for.
 
     Source: Hairer, Nørsett and Wanner (1993), II.5 and II.6, doi:10.1007/978-3-540-78862-1; after
     Prince and Dormand 1981, doi:10.1016/0771-050X(81)90010-3.
@@ -128,3 +123,10 @@ class DormandPrince8(AbstractExplicit):
     """
 
     tableau: ClassVar[Tableau] = DORMAND_PRINCE8
+
+
+def explicit(solver: AbstractExplicit | None) -> AbstractExplicit:
+    """The solver, `DormandPrince8` for `None`; `TypeError` for one that is not explicit."""
+    solver = DormandPrince8() if solver is None else solver
+    wanted = "an explicit method of rigidjax.solvers"
+    return _checks.instance(solver, AbstractExplicit, "solver", wanted=wanted)

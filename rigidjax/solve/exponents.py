@@ -18,7 +18,7 @@ from rigidjax.motion.manifold import dimension, minus_small, plus
 from rigidjax.solve import validation
 from rigidjax.solve.adaptive import adaptive
 from rigidjax.solve.components import flat
-from rigidjax.solve.explicit import AbstractExplicit, DormandPrince8
+from rigidjax.solve.explicit import AbstractExplicit, explicit
 
 # Neighbouring intervals are not independent: the error is that of the means of so many parts.
 _PARTS = 20
@@ -30,13 +30,7 @@ class Exponents(eqx.Module):
     **Fields:** `values` (k,) 1/s, the largest first; `errors` (k,) one standard deviation of them,
     from the differences between the means of twenty parts of the run, plus the sum of the steps'
     tolerances; `times` (N,) the ends of the intervals, s; `running` (N, k) the values up to then;
-    `state` at the end; `result` a `diffrax.RESULTS`: `successful`, or why a run
-    failed.
-
-    >>> still = lambda t, y, args: jnp.array([0.5, -1.0]) * y
-    >>> found = lyapunov_exponents(still, jnp.zeros(2), 40.0, intervals=40, transient=20)
-    >>> found.running.shape, bool(found.errors.max() < 1e-7)
-    ((20, 2), True)
+    `state` at the end; `result` a `diffrax.RESULTS`: `successful`, or why a run failed.
     """
 
     values: Float[Array, " k"]
@@ -73,15 +67,13 @@ def lyapunov_exponents(
       or your own on any array or Module of one dtype.
     - `state0`: the state at `t0`; `time`: the length of the run, s.
     - `number`: k, the number of exponents; `None` for all, 6 for an `Attitude`.
-    - `intervals`: N; the frame is made orthonormal to round-off after each. Directions may
-      grow apart in one by any amount: the frame itself does not grow.
+    - `intervals`: N; the frame is made orthonormal to round-off after each.
     - `transient`: intervals at the beginning that are not counted: the state approaches its
       attractor, and the tangents to their directions.
     - `solver`, `rtol`, `atol`, `max_steps` (in an interval): as for `simulate`.
 
     Each conserved quantity, and the direction of the motion itself, gives a zero; it decreases as
-    (log t)/t, and `errors` does not include such a trend: look at `running`. In a Hamiltonian
-    system the exponents come in pairs ±λ; their sum is the mean divergence of `field` always.
+    (log t)/t, and `errors` does not include such a trend: look at `running`.
 
     **Returns** `values` and `errors`, `times` and `running`, `state`, `result` (`Exponents`). Where
     a run fails they are NaN, and `result` says why.
@@ -119,35 +111,17 @@ def lyapunov_exponents(
     length = _checks.time(time, "time").astype(start.dtype)
     length = _checks.refuse(length, ~(length > 0), "time: wanted a positive time, s")
     rtol, atol = validation.tolerances(rtol, atol, start.dtype)
-    solver = DormandPrince8() if solver is None else solver
-    _checks.instance(
-        solver, AbstractExplicit, "solver", wanted="an explicit method of rigidjax.solvers"
-    )
-    _require_slope(field, state0)
-    how = _How(solver, many, intervals, transient, max_steps)
+    solver = explicit(solver)
     begin = _checks.time(t0, "t0").astype(start.dtype)
-    return _solved(how, field, state0, begin, length, rtol, atol)
-
-
-def _require_slope(field: Any, state0: Any) -> None:
-    time = jnp.zeros((), flat(state0).dtype)
-    found = eqx.filter_eval_shape(lambda t, y: field(t, y, None), time, state0)
-    wanted = jax.tree.map(jnp.shape, state0)
-    shapes = jax.tree.map(jnp.shape, found)
-    same = jax.tree.structure(found) == jax.tree.structure(state0) and shapes == wanted
-    if not same:
+    shapes = eqx.filter_eval_shape(lambda t, y: field(t, y, None), begin, state0)
+    wanted, found = (jax.tree.map(jnp.shape, tree) for tree in (state0, shapes))
+    if jax.tree.structure(shapes) != jax.tree.structure(state0) or found != wanted:
         raise TypeError(
-            f"field: wanted dy/dt of the shape of state0, {wanted}, got {shapes}; it is called as "
+            f"field: wanted dy/dt of the shape of state0, {wanted}, got {found}; it is called as "
             "f(t, y, None)"
         )
-
-
-class _How(eqx.Module):
-    solver: AbstractExplicit
-    many: int = eqx.field(static=True)
-    intervals: int = eqx.field(static=True)
-    transient: int = eqx.field(static=True)
-    max_steps: int = eqx.field(static=True)
+    how = (solver, many, intervals, transient, max_steps)
+    return _solved(how, field, state0, begin, length, rtol, atol)
 
 
 def _product(a: Array, b: Array) -> Array:
@@ -157,10 +131,12 @@ def _product(a: Array, b: Array) -> Array:
 
 @eqx.filter_jit
 def _solved(
-    how: _How, field: Any, state0: Any, t0: Array, length: Array, rtol: Any, atol: Any
+    how: Any, field: Any, state0: Any, t0: Array, length: Array, rtol: Any, atol: Any
 ) -> Exponents:
+    # Whole numbers of Python are no arrays: `filter_jit` compiles for each.
+    solver, many, intervals, transient, max_steps = how
     state0 = on_the_group(state0)
-    step = length / how.intervals
+    step = length / intervals
 
     def along(t: Array, y: Coupled, args: None) -> Coupled:
         frame, _ = y.own
@@ -183,29 +159,29 @@ def _solved(
         state, frame = carry
         ts = t0 + jnp.stack([i, i + 1]).astype(t0.dtype) * step
         # Logarithms count from 1: `rtol` of them is then the same of what the tangents grow by.
-        start = Coupled(state, (frame, jnp.ones(how.many, t0.dtype)))
-        run = adaptive(how.solver, along, ts, start, rtol=rtol, atol=atol, max_steps=how.max_steps)
+        start = Coupled(state, (frame, jnp.ones(many, t0.dtype)))
+        run = adaptive(solver, along, ts, start, rtol=rtol, atol=atol, max_steps=max_steps)
         there = jax.tree.map(lambda leaf: leaf[-1], run.ys)
         frame, logs = there.own
         off = run.num_steps.astype(t0.dtype) * (rtol * (1 + jnp.abs(logs - 1)) + atol)
         return (there.motion, jnp.linalg.qr(frame)[0]), (logs - 1, off, run.result)
 
     # Any directions: along the axes they could be those of a part that nothing leaves.
-    shape = (dimension(state0), how.many)
+    shape = (dimension(state0), many)
     frame = jnp.linalg.qr(jax.random.normal(jax.random.key(0), shape, t0.dtype))[0]
-    numbers = jnp.arange(how.intervals, dtype=jnp.int32)
+    numbers = jnp.arange(intervals, dtype=jnp.int32)
     (state, _), (logs, off, results) = lax.scan(interval, (state0, frame), numbers)
-    rates = logs[how.transient :] / step
+    rates = logs[transient:] / step
     count = rates.shape[0]
-    times = t0 + jnp.arange(how.transient + 1, how.intervals + 1).astype(t0.dtype) * step
+    times = t0 + jnp.arange(transient + 1, intervals + 1).astype(t0.dtype) * step
     index = jnp.arange(1, count + 1).astype(t0.dtype)
     running = jnp.cumsum(rates, axis=0) / index[:, None]
     whole = count // _PARTS * _PARTS
-    means = jnp.mean(rates[count - whole :].reshape(_PARTS, -1, how.many), axis=1)
+    means = jnp.mean(rates[count - whole :].reshape(_PARTS, -1, many), axis=1)
     apart = jnp.var(means, axis=0, ddof=1) / _PARTS
     # What the twenty equal parts leave out, up to 19 intervals at the start, counts whole.
     left = running[-1] - jnp.mean(means, axis=0)
-    errors = jnp.sqrt(apart + left**2 + (jnp.mean(off[how.transient :], axis=0) / step) ** 2)
+    errors = jnp.sqrt(apart + left**2 + (jnp.mean(off[transient:], axis=0) / step) ** 2)
     first = jnp.argmax(jax.vmap(lambda result: result != dfx.RESULTS.successful)(results))
     result = jax.tree.map(lambda leaf: leaf[first], results)
     return Exponents(running[-1], errors, times, running, state, result)

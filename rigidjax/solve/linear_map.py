@@ -1,8 +1,7 @@
-"""A linear function with its own transpose, for forward and for reverse mode.
+"""A linear function with its own transpose: `jax.custom_vjp` has no forward mode.
 
-A loop of unknown length can be differentiated forwards but not transposed, and `jax.custom_vjp`
-gives a transpose but no forward mode. Here the rule for tangents is a primitive that knows both
-directions, so that `jax.jvp`, `jax.vjp`, `jax.vmap` and forward over reverse all go through.
+The rule for tangents is a primitive that knows both directions, so that `jax.jvp`, `jax.vjp`,
+`jax.vmap` and forward over reverse all go through a loop of unknown length.
 """
 
 from collections.abc import Callable
@@ -24,22 +23,17 @@ _ZERO: Any = ad.Zero
 
 
 def linear_map(function: Map, transposed: Map, given: Arrays, tangents: Arrays) -> Arrays:
-    """`function(*given, *tangents)`, whose transpose in `tangents` is `transposed`.
+    """`function(*given, *tangents)`, linear in these; its transpose is `transposed(*given, *bars)`.
 
-    **Arguments:** `function(*given, *tangents)` linear in the tangents, `transposed(*given,
-    *cotangents)` its transpose, both to lists of arrays; neither may close over tracers.
-    Derivatives with respect to `given` are taken in forward mode only.
+    Neither may close over tracers. Derivatives by `given` are taken in forward mode only.
     """
     outs = jax.eval_shape(lambda g, t: function(*g, *t), given, tangents)
-    return _linear_map.bind(
-        *given,
-        *tangents,
-        function=function,
-        transposed=transposed,
-        number=len(given),
-        inputs=tuple(_shape(t) for t in tangents),
-        results=tuple(_shape(o) for o in outs),
+    inputs, results = (
+        tuple((tuple(jnp.shape(a)), jnp.result_type(a)) for a in arrays)
+        for arrays in (tangents, outs)
     )
+    how = dict(number=len(given), inputs=inputs, results=results)
+    return _linear_map.bind(*given, *tangents, function=function, transposed=transposed, **how)
 
 
 def nan_derivatives(tree: Any, inputs: Any) -> Any:
@@ -84,10 +78,6 @@ def _(count: int, primals: Any, tangents: Any) -> Any:
     return outs, linear_map(along, back, given, list(tangents))
 
 
-def _shape(a: Any) -> tuple[tuple[int, ...], Any]:
-    return tuple(jnp.shape(a)), jnp.result_type(a)
-
-
 def is_smooth(a: Any) -> bool:
     """Whether a number may have a derivative."""
     return bool(jnp.issubdtype(jnp.result_type(a), jnp.inexact))
@@ -125,12 +115,11 @@ def _differentiated(primals: Any, tangents: Any, **params: Any) -> Any:
     if any(which):
 
         def push(*args: Any) -> Arrays:
-            given, along, rest = (
-                args[:number],
-                args[number : len(primals)],
-                iter(args[len(primals) :]),
-            )
-            moved = [next(rest) if w else no_tangent(g) for g, w in zip(given, which, strict=True)]
+            given, along, rest = args[:number], args[number : len(primals)], args[len(primals) :]
+            moving = iter(rest)
+            moved = [
+                next(moving) if w else no_tangent(g) for g, w in zip(given, which, strict=True)
+            ]
             return jax.jvp(lambda *g: function(*g, *along), tuple(given), tuple(moved))[1]
 
         moved = [t for t, w in zip(tangents, which, strict=False) if w]
@@ -167,7 +156,7 @@ def _transposed(cotangents: Any, *args: Any, **params: Any) -> Any:
         inputs=params["results"],
         results=params["inputs"],
     )
-    return [None] * number + list(found)
+    return [None] * number + found
 
 
 def _batched(args: Any, dims: Any, **params: Any) -> Any:
@@ -185,14 +174,15 @@ def _batched(args: Any, dims: Any, **params: Any) -> Any:
     def longer(shapes: Any) -> Any:
         return tuple(((size, *shape), dtype) for shape, dtype in shapes)
 
+    inputs, results = params["inputs"], params["results"]
     out = _linear_map.bind(
         *given,
         *along,
-        function=over(params["function"], len(params["inputs"])),
-        transposed=over(params["transposed"], len(params["results"])),
+        function=over(params["function"], len(inputs)),
+        transposed=over(params["transposed"], len(results)),
         number=number,
-        inputs=longer(params["inputs"]),
-        results=longer(params["results"]),
+        inputs=longer(inputs),
+        results=longer(results),
     )
     return out, [0] * len(out)
 
@@ -201,6 +191,5 @@ ad.primitive_jvps[_linear_map] = _differentiated
 ad.primitive_transposes[_linear_map] = _transposed
 batching.primitive_batchers[_linear_map] = _batched
 mlir.register_lowering(
-    _linear_map,
-    mlir.lower_fun(lambda *args, function, **_: function(*args), multiple_results=True),
+    _linear_map, mlir.lower_fun(lambda *args, function, **_: function(*args), multiple_results=True)
 )

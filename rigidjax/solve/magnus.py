@@ -1,7 +1,7 @@
 """A step of order 4 for torques that do not depend on the attitude: Runge–Kutta, then one rotation.
 
-Euler's equations are then closed in the body rate. The four stages therefore carry three numbers
-instead of seven, and the attitude turns once a step, by the exponential of Magnus' series.
+Euler's equations are then closed in the body rate: the four stages carry three numbers instead of
+seven. The attitude turns once a step, by the exponential of Magnus' series.
 """
 
 from collections.abc import Callable
@@ -25,13 +25,9 @@ from rigidjax.solve.tableaus import KUTTA4
 
 
 def change_and_turn(
-    slope: Callable[[Any, Triple], Triple],
-    rate: Callable[[Triple], Triple],
-    t: Any,
-    end: Any,
-    h: Array,
-    p: Triple,
-) -> tuple[Triple, Four]:
+    slope: Callable[[Any, Triple], Triple], rate: Callable[[Triple], Triple],
+    t: Any, end: Any, h: Array, p: Triple,
+) -> tuple[Triple, Four]:  # fmt: skip
     """How momentum (or rate) `p` changes in a step from `t` to `end`, and the body turns in it.
 
     **Arguments:** `slope(t, p)` dp/dt; `rate(p)` Ω; `h` the step, s. The rotation vector of the
@@ -62,9 +58,9 @@ def change_and_turn(
 class Magnus4(dfx.AbstractSolver):
     """Order 4 with fixed steps, for free bodies and torques of time and body rate only.
 
-    The step that `rigidjax.batch.rollout` takes unless told otherwise, as a `diffrax` solver: less
-    work and a smaller error than `rigidjax.solvers.RungeKutta4` at the same step.
-    The attitude keeps |q| = 1. A step should turn the body by less than a radian.
+    It does less work, with a smaller error, than `rigidjax.solvers.RungeKutta4` at the same step,
+    and is the default of `rigidjax.batch.rollout`. The attitude keeps |q| = 1. A step should turn
+    the body by less than a radian.
 
     Source: Magnus 1954, doi:10.1002/cpa.3160070404; see `change_and_turn`.
 

@@ -9,15 +9,11 @@ import jax.tree_util as jtu
 
 from rigidjax import _checks
 from rigidjax.motion.equations import on_the_group
-from rigidjax.solve.step_control import NONFINITE, finite
+from rigidjax.solve.adaptive_loop import NONFINITE, finite
 
 
 class GroupInterpolation(dfx.AbstractLocalInterpolation):
-    """Dense output of another interpolation, its quaternion scaled to length 1.
-
-    Saved times fall between steps, so a projection of the steps alone leaves saved states off the
-    group by the error of the interpolation (|q|−1 = 3e-3 at a tolerance of 1e-3).
-    """
+    """Dense output of another interpolation, its quaternion scaled to length 1."""
 
     t0: Any
     t1: Any
@@ -39,13 +35,16 @@ class _Build(eqx.Module):
         return GroupInterpolation(t0, t1, self.inner_cls(t0=t0, t1=t1, **dense_info))
 
 
+def _of(part: str, name: str) -> Any:
+    return property(lambda self: getattr(getattr(self, part), name))
+
+
 class Projected(dfx.AbstractWrappedSolver):
     """Wraps a diffrax solver so that attitudes stay unit quaternions.
 
-    Each accepted step ends with q ← q/|q|, and so does every value of the dense output; the stages
-    are unchanged, because a change there alters the order (jaxsim#192). The kinematics is linear
-    in q, so scaling q commutes with the exact flow and the order of the wrapped solver is kept. A
-    state without a quaternion passes through. A step that gives NaN or infinity ends the run with
+    Each accepted step ends with q ← q/|q|, and so does every value of the dense output. The stages
+    are unchanged, because a change there alters the order (jaxsim#192). A state without a
+    quaternion passes through. A step that gives NaN or infinity ends the run with
     `RESULTS.nonfinite`.
 
     **Arguments:** `solver` any `diffrax.AbstractSolver` on `Spin`, `Attitude` or `Rigid` states.
@@ -60,30 +59,16 @@ class Projected(dfx.AbstractWrappedSolver):
     def __check_init__(self) -> None:
         _checks.instance(self.solver, dfx.AbstractSolver, "solver")
 
-    @property
-    def term_structure(self) -> Any:
-        return self.solver.term_structure
+    term_structure = _of("solver", "term_structure")
+    term_compatible_contr_kwargs = _of("solver", "term_compatible_contr_kwargs")
+    # Adjoints set the one, controllers the others, on whatever is a Runge–Kutta or implicit method.
+    scan_kind = _of("solver", "scan_kind")
+    root_finder = _of("solver", "root_finder")
+    root_find_max_steps = _of("solver", "root_find_max_steps")
 
     @property
     def interpolation_cls(self) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
         return _Build(self.solver.interpolation_cls)
-
-    @property
-    def term_compatible_contr_kwargs(self) -> Any:  # pyright: ignore
-        return self.solver.term_compatible_contr_kwargs
-
-    # Adjoints set the one, controllers the other, on whatever is a Runge–Kutta or implicit method.
-    @property
-    def scan_kind(self) -> Any:
-        return self.solver.scan_kind  # pyright: ignore[reportAttributeAccessIssue]
-
-    @property
-    def root_finder(self) -> Any:
-        return self.solver.root_finder  # pyright: ignore[reportAttributeAccessIssue]
-
-    @property
-    def root_find_max_steps(self) -> Any:
-        return self.solver.root_find_max_steps  # pyright: ignore[reportAttributeAccessIssue]
 
     def order(self, terms: Any) -> int | None:
         return self.solver.order(terms)
@@ -118,10 +103,9 @@ class Watched(dfx.AbstractAdaptiveStepSizeController):
     """Wraps an adaptive step controller so that a run that cannot continue ends at once.
 
     `diffrax.PIDController` tries smaller and smaller steps until `max_steps` if the vector field is
-    NaN, and all other bodies of a batch wait. Here two cases end the run: a start without a finite
-    derivative, and a rejected step whose successor would be below a few units of round-off of the
-    time. The result is `RESULTS.nonfinite` after NaN or infinity, else `RESULTS.dt_min_reached`.
-    The steps of other runs do not change.
+    NaN, and all other bodies of a batch wait. Here a start without a finite derivative, or a
+    rejected step whose successor would be below a few units of round-off of the time, ends the run:
+    with `RESULTS.nonfinite` after NaN or infinity, else with `RESULTS.dt_min_reached`.
 
     **Arguments:** `controller` any adaptive controller of diffrax.
 
@@ -134,32 +118,17 @@ class Watched(dfx.AbstractAdaptiveStepSizeController):
     def __init__(self, controller: Any):
         self.controller = controller
 
-    @property
-    def rtol(self) -> Any:
-        return self.controller.rtol
-
-    @property
-    def atol(self) -> Any:
-        return self.controller.atol
-
-    @property
-    def norm(self) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
-        return self.controller.norm
+    rtol = _of("controller", "rtol")
+    atol = _of("controller", "atol")
+    norm = _of("controller", "norm")
 
     def wrap(self, direction: Any) -> "Watched":
         return Watched(self.controller.wrap(direction))
 
     def init(
-        self,
-        terms: Any,
-        t0: Any,
-        t1: Any,
-        y0: Any,
-        dt0: Any,
-        args: Any,
-        func: Any,
+        self, terms: Any, t0: Any, t1: Any, y0: Any, dt0: Any, args: Any, func: Any,
         error_order: Any,
-    ) -> tuple[Any, Any]:
+    ) -> tuple[Any, Any]:  # fmt: skip
         first, inner = self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
         # At t = 0 the round-off of t vanishes: that of the length of the run is taken.
         least = jnp.finfo(t0.dtype).eps * jnp.abs(t1 - t0)
@@ -167,16 +136,9 @@ class Watched(dfx.AbstractAdaptiveStepSizeController):
         return first, (inner, least, ~finite((y0, func(terms, t0, y0, args))))
 
     def adapt_step_size(
-        self,
-        t0: Any,
-        t1: Any,
-        y0: Any,
-        y1_candidate: Any,
-        args: Any,
-        y_error: Any,
-        error_order: Any,
-        controller_state: Any,
-    ) -> tuple[Any, Any, Any, Any, Any, dfx.RESULTS]:
+        self, t0: Any, t1: Any, y0: Any, y1_candidate: Any, args: Any, y_error: Any,
+        error_order: Any, controller_state: Any,
+    ) -> tuple[Any, Any, Any, Any, Any, dfx.RESULTS]:  # fmt: skip
         inner, least, lost = controller_state
         keep, left, right, jumped, inner, result = self.controller.adapt_step_size(
             t0, t1, y0, y1_candidate, args, y_error, error_order, inner
@@ -186,11 +148,5 @@ class Watched(dfx.AbstractAdaptiveStepSizeController):
         stuck = stuck & (result == dfx.RESULTS.successful)
         ill = lost | ~finite((right, y1_candidate, y_error))
         why = dfx.RESULTS.where(ill, NONFINITE, dfx.RESULTS.dt_min_reached)
-        return (
-            keep,
-            left,
-            right,
-            jumped,
-            (inner, least, lost),
-            dfx.RESULTS.where(stuck, why, result),
-        )
+        result = dfx.RESULTS.where(stuck, why, result)
+        return keep, left, right, jumped, (inner, least, lost), result

@@ -1,5 +1,6 @@
 """A run in one compiled piece: by the closed form, by diffrax, or by our own loop."""
 
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import diffrax as dfx
@@ -7,22 +8,31 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool
+from jax import lax
+from jaxtyping import Array, Bool, Int
 
 from rigidjax import _checks
 from rigidjax._types import ScalarLike
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.exact.free_body import FreeMotion
-from rigidjax.frames import Point
+from rigidjax.frames import AbstractScene, MovingFrame, Point
 from rigidjax.frames.frame_dynamics import scene_of
-from rigidjax.motion.coupled import started
-from rigidjax.motion.equations import on_the_group
-from rigidjax.motion.torques.base import jumps_of
+from rigidjax.motion import Attitude, Rigid, Spin
+from rigidjax.motion.coupled import Coupled, CoupledEquations, started
+from rigidjax.motion.equations import (
+    AttitudeEquations,
+    EulerEquations,
+    NewtonEuler,
+    on_the_group,
+)  # fmt: skip
+from rigidjax.motion.torques.base import Torque, jumps_of
+from rigidjax.solve import validation
 from rigidjax.solve.adaptive import adaptive
+from rigidjax.solve.adaptive_loop import NONFINITE, finite, of_body
 from rigidjax.solve.explicit import AbstractExplicit
 from rigidjax.solve.linear_map import nan_derivatives
-from rigidjax.solve.step_control import NONFINITE, finite, of_body
-from rigidjax.solve.vector_field import ahead, equations_of_motion
+
+_COUNTS = ("num_steps", "num_accepted_steps", "num_rejected_steps")
 
 
 class Free(eqx.Module):
@@ -48,11 +58,7 @@ class Setup(eqx.Module):
 
 
 class Loop(eqx.Module):
-    """A solve for states and derivatives alone: our own loop.
-
-    `sign` of the direction of time; `None` where it is known to go forwards. `cuts` times at which
-    a step has to end, beside the jumps of the torque.
-    """
+    """A solve by our own loop."""
 
     body: Inertia | MassProperties | None
     torque: Any
@@ -60,28 +66,88 @@ class Loop(eqx.Module):
     rtol: Any
     atol: Any
     dt0: Any
-    sign: Array | None
+    sign: Array | None  # of the direction of time; None: known to go forwards
     max_steps: int = eqx.field(static=True)
     throw: bool = eqx.field(static=True)
-    cuts: Array | None = None
+    cuts: Array | None = None  # where a step has to end, beside the jumps of the torque
+
+
+def kept(setup: Free | Loop | Setup) -> tuple[Any, tuple[tuple[Any, ...], Any]]:
+    """A set-up as arrays and the rest, so that `jax.jit` and `jax.vmap` can return it."""
+    numbers = (jax.Array, np.ndarray, np.generic)
+    arrays, rest = eqx.partition(setup, lambda leaf: isinstance(leaf, numbers))
+    leaves, structure = jax.tree.flatten(rest)
+    return arrays, (tuple(leaves), structure)
 
 
 class Ends(eqx.Module):
-    """The condition that ends a run of a scene, as `diffrax.Event` asks it.
+    """The condition that ends a run of a scene, such as a collision, as `diffrax.Event` asks it."""
 
-    A scene may end a run at a collision or another singularity, instead of ever smaller steps.
-
-    **Arguments:** `scene` any with `ends(t, state) → bool` and `end_words(t, state) → str`.
-
-    >>> from rigidjax import orbits
-    >>> bool(Ends(orbits.hill(0.1))(0.0, rj.Point([0.05, 0, 0], [0.0, 0, 0])))
-    True
-    """
-
-    scene: Any
+    scene: Any  # with ends(t, state) → bool and end_words(t, state) → str
 
     def __call__(self, t: ScalarLike, y: Any, args: object = None, **_: object) -> Bool[Array, ""]:
         return self.scene.ends(t, y)
+
+
+def equations_of_motion(
+    body: Inertia | MassProperties | None,
+    state0: Spin | Attitude | Rigid | Point | Coupled,
+    torque: Torque | AbstractScene | MovingFrame | None = None,
+) -> Callable[..., Any]:
+    """The vector field of this body for states like `state0`, for plain `diffrax.ODETerm`.
+
+    **Arguments** `body`, `state0`, `torque` as for `simulate`; under a torque with states of its
+    own `state0` is a `rigidjax.motion.coupled.Coupled`. **Raises** `TypeError` where they do not
+    fit.
+
+    >>> import rigidjax as rj
+    >>> type(equations_of_motion(rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([1.0, 0, 0])))
+    <class 'rigidjax.motion.equations.EulerEquations'>
+    """
+    if isinstance(state0, Coupled):
+        return CoupledEquations(equations_of_motion(body, state0.motion, torque), body)
+    validation.require_fit(body, state0, torque)
+    if isinstance(state0, Point):
+        return scene_of(torque).field
+    kind: Any = EulerEquations
+    if isinstance(body, MassProperties):
+        kind = NewtonEuler
+    elif isinstance(state0, Attitude):
+        kind = AttitudeEquations
+    return kind(body, torque)
+
+
+def direction(times: Array) -> Int[Array, ""] | None:
+    """`None` for times known to increase; else the sign of t's change, known or traced."""
+    ends = _checks.namespace(times).asarray(times)
+    change = ends[-1] - ends[0]
+    if _checks.known(times) and change > 0:
+        return None
+    # A whole number: derivatives do not carry it along.
+    return jnp.asarray(jnp.sign(change), jnp.int32)
+
+
+def ahead(
+    sign: Array | None, field: Callable[..., Any], condition: Any, ts: Array, jumps: Array
+) -> tuple[Callable[..., Any], Any, Array, Array]:
+    """A vector field, a condition, times and jump times in s = σt; `sign` σ is `None` for s = t."""
+    if sign is None:
+        return field, condition, ts, jumps
+    time = lambda s: sign.astype(s.dtype) * s  # noqa: E731
+
+    def directed(s: Array, y: Any, args: Any = None) -> Any:
+        t = time(s)
+        if jumps.size:
+            # A law has its new value from the jump on. A step back that begins there wants the old
+            # one, and one that ends there, at the last moment before it in s, the new one.
+            # The oldest JAX has no derivative of `nextafter`, not even one to be stopped.
+            still = lax.stop_gradient(t)
+            before = jnp.nextafter(still, jnp.full_like(still, -jnp.inf))
+            t = t + jnp.where(sign < 0, before - still, jnp.zeros_like(still))
+        return jax.tree.map(lambda leaf: sign.astype(leaf.dtype) * leaf, field(t, y, args))
+
+    asked = None if condition is None else lambda s, y: condition(time(s), y)
+    return directed, asked, time(ts), time(jumps)
 
 
 @eqx.filter_jit
@@ -89,54 +155,47 @@ def solve(
     setup: Free | Loop | Setup, state0: Any, ts: Array
 ) -> tuple[Any, dict[str, Any], dfx.RESULTS]:
     # One jit around everything: an operation outside of it costs as much as a hundred steps.
-    state0 = on_the_group(state0)
-    run = _free if isinstance(setup, Free) else _in_steps
-    ys, stats, result = run(setup, state0, ts)  # pyright: ignore[reportArgumentType]
-    inputs = (setup.body, setup.torque, state0, ts)
+    state0 = given = on_the_group(state0)
+    if isinstance(setup, Free):
+        ys, stats, result = _free(setup, state0, ts)
+    else:
+        # With the states of the torque, where it has some.
+        state0 = started(setup.body, state0, setup.torque, ts[0])
+        scene: Any = scene_of(setup.torque) if isinstance(state0, Point) else None
+        watch = Ends(scene) if hasattr(scene, "ends") else None
+        run: Any = _loop if isinstance(setup, Loop) else _by_diffrax
+        ys, stats, result, end = run(setup, watch, state0, ts)
+        if setup.throw:
+            ys = refuse(ys, result)
+        if watch is not None:
+            ended = result == dfx.RESULTS.event_occurred
+            stats |= {"ended": ended, "end_time": end[0], "end_state": end[1]}
+        if scene is not None:
+            stats["drift"] = scene.drift(ts, ys)
+    inputs = (setup.body, setup.torque, given, ts)
     return nan_derivatives(ys, inputs), stats, of_body(result, setup.body)
-
-
-def _in_steps(
-    setup: Loop | Setup, state0: Any, ts: Array
-) -> tuple[Any, dict[str, Any], dfx.RESULTS]:
-    # With the states of the torque, where it has some.
-    state0 = started(setup.body, state0, setup.torque, ts[0])
-    scene: Any = scene_of(setup.torque) if isinstance(state0, Point) else None
-    watch = Ends(scene) if hasattr(scene, "ends") else None
-    run: Any = _loop if isinstance(setup, Loop) else _by_diffrax
-    ys, stats, result, end = run(setup, watch, state0, ts)
-    if setup.throw:
-        ys = refuse(ys, result)
-    if watch is not None:
-        ended = result == dfx.RESULTS.event_occurred
-        stats |= {"ended": ended, "end_time": end[0], "end_state": end[1]}
-    if scene is not None:
-        stats["drift"] = scene.drift(ts, ys)
-    return ys, stats, result
 
 
 def _by_diffrax(
     setup: Setup, watch: Ends | None, state0: Any, ts: Array
 ) -> tuple[Any, dict[str, Any], dfx.RESULTS, Any]:
     subs = [dfx.SubSaveAt(ts=ts)] + [dfx.SubSaveAt(t1=True)] * (watch is not None)
+    term = dfx.ODETerm(equations_of_motion(setup.body, state0, setup.torque))
     out = dfx.diffeqsolve(
-        dfx.ODETerm(equations_of_motion(setup.body, state0, setup.torque)),
-        setup.solver,
-        ts[0],
-        ts[-1],
-        setup.dt0,
-        state0,
-        saveat=dfx.SaveAt(subs=subs),
-        stepsize_controller=setup.controller,
-        adjoint=setup.adjoint,
-        max_steps=setup.max_steps,
-        throw=False,
-        progress_meter=setup.progress_meter,
+        term, setup.solver, ts[0], ts[-1], setup.dt0, state0,
+        saveat=dfx.SaveAt(subs=subs), stepsize_controller=setup.controller, adjoint=setup.adjoint,
+        max_steps=setup.max_steps, throw=False, progress_meter=setup.progress_meter,
         event=None if watch is None else dfx.Event(watch),
-    )
+    )  # fmt: skip
     stats: dict[str, Any] = {k: value for k, value in out.stats.items() if k != "max_steps"}
     (times, *last_time), (ys, *last) = out.ts, out.ys  # pyright: ignore
-    ys, result = _reached(ys, times), out.result
+
+    def reached(leaf: Array) -> Array:
+        # Where nothing was saved, diffrax says t = inf: not to be taken for a state.
+        there = jnp.isfinite(times).reshape(-1, *[1] * (leaf.ndim - 1))
+        return jnp.where(there, leaf, jnp.full_like(leaf, jnp.nan))
+
+    ys, result = jax.tree.map(reached, ys), out.result
     if not isinstance(setup.controller, dfx.AbstractAdaptiveStepSizeController):
         # Equal steps look at no error, and would go on with NaN.
         ill = (result == dfx.RESULTS.successful) & ~finite(ys)
@@ -152,36 +211,12 @@ def _loop(
     if setup.cuts is not None:
         jumps = jnp.concatenate([jumps.astype(ts.dtype), setup.cuts])
     field, watch, along, jumps = ahead(setup.sign, field, watch, ts, jumps)
-    out = adaptive(
-        setup.solver,
-        field,
-        along,
-        state0,
-        rtol=setup.rtol,
-        atol=setup.atol,
-        dt0=setup.dt0,
-        max_steps=setup.max_steps,
-        jumps=jumps,
-        halt=watch,
-    )
-    stats: dict[str, Any] = {
-        "num_steps": out.num_steps,
-        "num_accepted_steps": out.num_steps - out.num_rejected,
-        "num_rejected_steps": out.num_rejected,
-    }
+    how = dict(rtol=setup.rtol, atol=setup.atol, dt0=setup.dt0, max_steps=setup.max_steps)
+    out = adaptive(setup.solver, field, along, state0, jumps=jumps, halt=watch, **how)
+    taken = (out.num_steps, out.num_steps - out.num_rejected, out.num_rejected)
     sign = setup.sign
     last_time = out.last_time if sign is None else sign.astype(ts.dtype) * out.last_time
-    return out.ys, stats, out.result, (last_time, out.last)
-
-
-def _reached(ys: Any, times: Array) -> Any:
-    """NaN where nothing was saved, there diffrax says t = inf: not to be taken for a state."""
-
-    def mark(leaf: Array) -> Array:
-        there = jnp.isfinite(times).reshape(-1, *[1] * (leaf.ndim - 1))
-        return jnp.where(there, leaf, jnp.full_like(leaf, jnp.nan))
-
-    return jax.tree.map(mark, ys)
+    return out.ys, dict(zip(_COUNTS, taken, strict=True)), out.result, (last_time, out.last)
 
 
 def refuse(ys: Any, result: dfx.RESULTS) -> Any:
@@ -207,8 +242,7 @@ def refuse(ys: Any, result: dfx.RESULTS) -> Any:
 
 def _free(setup: Free, state0: Any, ts: Array) -> tuple[Any, dict[str, Any], dfx.RESULTS]:
     ys = FreeMotion(setup.body, state0)(ts - ts[0])
-    none = jnp.zeros((), int)
-    stats = {"num_steps": none, "num_accepted_steps": none, "num_rejected_steps": none}
+    stats: Any = dict.fromkeys(_COUNTS, jnp.zeros((), int))
     if setup.throw:
         ys = eqx.error_if(
             ys,
@@ -221,15 +255,7 @@ def _free(setup: Free, state0: Any, ts: Array) -> tuple[Any, dict[str, Any], dfx
 
 
 def refuse_ended(scene: Any, ys: Any, stats: dict[str, Any], ts: Any) -> Any:
-    """The states `ys`, unless the scene has ended the run: then an error in the scene's words.
-
-    **Arguments:** `scene` as of `Ends`; `ys` the states saved at `ts`; `stats` with `ended`,
-    `end_time` and `end_state`. **Raises:** `ValueError` with the last time saved before; under
-    `jit` or `vmap` `EquinoxRuntimeError` without numbers.
-
-    >>> refuse_ended(None, 0.0, {"ended": np.asarray(False)}, None)
-    0.0
-    """
+    """The states `ys` saved at `ts`, unless the scene has ended the run: an error in its words."""
     ended, advice = stats["ended"], "; give throw=False to keep what came before it"
     if _checks.known(ended) and not np.any(np.asarray(ended)):
         return ys

@@ -1,8 +1,7 @@
 """A step of an explicit Runge–Kutta method, its tangent and its transpose.
 
-The stages are a loop: XLA compiles only one evaluation of the field, and one vjp of it for the
-gradient. This takes a tenth of the compile time of twelve copies, and the loop runs as fast to a
-fifth. States are (n, *bodies): numbers first, bodies last.
+The stages are a loop, so that XLA compiles only one evaluation of the field, and one vjp of it for
+the gradient. States are (n, *bodies): numbers first, bodies last.
 """
 
 from collections.abc import Callable
@@ -14,22 +13,20 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
+from rigidjax.solve.batching import Arrays
 from rigidjax.solve.components import lift
 from rigidjax.solve.tableaus import Tableau
 
 # field(constants, t, y) → dy/dt, for t (*bodies), y (n, *bodies).
-Field = Callable[[list[Array], Array, Array], Array]
+Field = Callable[[Arrays, Array, Array], Array]
 
 
 class Step(NamedTuple):
-    """Time, length and end of a step (*bodies), state at its start (n, *bodies).
-
-    `end` is `t + h` but for the last digit: before a jump it is the last moment before it.
-    """
+    """A step: its time and length (*bodies), the state at its start (n, *bodies)."""
 
     t: Array
     h: Array
-    end: Array
+    end: Array  # t + h but for the last digit: before a jump it is the last moment before it
     y: Array
 
 
@@ -40,38 +37,27 @@ class Stages(NamedTuple):
     places: Array
     slopes: Array
     end: Array
+    number: Any  # of the stages taken
 
 
 class Weights(NamedTuple):
-    """The tableau as arrays: `a` (s, s), `b`, `c` (s,); `last` whether c is 1; `dense` (r, s) the
-    rows of dense output.
-    """
+    """The tableau as arrays."""
 
-    a: Array
-    b: Array
+    a: Array  # (s, s)
+    b: Array  # (s,)
     c: Array
-    last: Array
-    dense: Array
+    last: Array  # whether c is 1
+    dense: Array  # (r, s) the rows of dense output
 
 
 def stage_counts(tableau: Tableau) -> tuple[int, int]:
-    """The number of stages of a step, and the number with those for dense output.
-
-    >>> from rigidjax.solve.tableaus import DORMAND_PRINCE8
-    >>> stage_counts(DORMAND_PRINCE8)
-    (12, 16)
-    """
+    """The number of stages of a step, and the number with those for dense output."""
     whole = len(tableau.a) + 2 + len(tableau.extra_a)
     return max(len(tableau.a), *tableau.errors[0]) + 1, whole
 
 
 def weights(tableau: Tableau, dtype: Any, count: int) -> Weights:
-    """The weights of the first `count` stages of a tableau.
-
-    >>> from rigidjax.solve.tableaus import KUTTA4
-    >>> weights(KUTTA4, jnp.float64, 4).a[3].tolist()
-    [0.0, 0.0, 1.0, 0.0]
-    """
+    """The weights of the first `count` stages of a tableau."""
     rows = [{}, *tableau.a, tableau.b, *tableau.extra_a]
     c = np.array([0.0, *tableau.c, 1.0, *tableau.extra_c])[:count]
     whole = len(rows)
@@ -94,65 +80,53 @@ def _sum(row: Array, slopes: Array) -> Array:
     return jnp.sum(row.reshape(1, -1, *[1] * (slopes.ndim - 2)) * slopes, 1)
 
 
-def _put(record: Array, row: Array, i: Array) -> Array:
-    return lax.dynamic_update_slice_in_dim(record, row[:, None], i, 1)
-
-
 def stages(
-    tableau: Tableau, field: Field, constants: list[Array], step: Step, dense: Any = False
+    tableau: Tableau, field: Field, constants: Arrays, step: Step, dense: Any = False
 ) -> Stages:
-    """All stages of a step; `end` is not projected.
+    """All stages of a step, if `dense` also those of dense output; `end` is not projected.
 
-    **Arguments:** `dense` whether to compute the stages of dense output. If it is traced and false,
-    these stages are the state at the start, and their slopes 0.
+    If `dense` is traced and false, its stages are the state at the start, and their slopes 0.
     """
-    count = stage_counts(tableau)[dense is not False]
+    plain, whole = stage_counts(tableau)
+    count, number = (whole, np.int32(whole)) if dense is not False else (plain, np.int32(plain))
     w = weights(tableau, step.y.dtype, count)
 
-    def stage(i: Array, both: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        times, places, slopes = both
-        t, y, slope = _stage(w, field, constants, step, i, slopes)
-        times = lax.dynamic_update_slice_in_dim(times, t[None], i, 0)
-        return times, _put(places, y, i), _put(slopes, slope, i)
+    def stage(i: Array, sofar: tuple[Array, Array, Array]) -> Any:
+        new = _stage(w, field, constants, step, i, sofar[2])
+        put = lax.dynamic_update_index_in_dim
+        return tuple(put(a, b, i, axis) for a, b, axis in zip(sofar, new, (0, 1, 1), strict=True))
 
     empty = jnp.zeros((step.y.shape[0], count, *step.y.shape[1:]), step.y.dtype)
     times, places = jnp.zeros((count, *step.t.shape), step.t.dtype), empty
     if not isinstance(dense, bool):
         # Where a field may have no value at 0, a stage that is left out must be somewhere else.
         times, places = times + step.t[None], places + step.y[:, None]
-    times, places, slopes = lax.fori_loop(
-        np.int32(0), _last(tableau, dense), stage, (times, places, empty)
-    )
-    return Stages(times, places, slopes, step.y + _length(step) * _sum(w.b, slopes))
+        number = jnp.where(dense, np.int32(whole), np.int32(plain))
+    begun = (times, places, empty)
+    times, places, slopes = lax.fori_loop(np.int32(0), number, stage, begun)
+    h = lift(step.h.astype(step.y.dtype), step.y)
+    return Stages(times, places, slopes, step.y + h * _sum(w.b, slopes), number)
 
 
 def _stage(
-    w: Weights, field: Field, constants: list[Array], step: Step, i: Array, slopes: Array
+    w: Weights, field: Field, constants: Arrays, step: Step, i: Array, slopes: Array
 ) -> tuple[Array, Array, Array]:
-    y = step.y + _length(step) * _sum(w.a[i], slopes)
+    # Time may be kept in another precision than the state.
+    y = step.y + lift(step.h.astype(step.y.dtype), step.y) * _sum(w.a[i], slopes)
     t = jnp.where(w.last[i], step.end, step.t + w.c[i].astype(step.t.dtype) * step.h)
     return t, y, field(constants, t, y)
 
 
-def _length(step: Step) -> Array:
-    # Time may be kept in another precision than the state.
-    return lift(step.h.astype(step.y.dtype), step.y)
-
-
-def _last(tableau: Tableau, dense: Any) -> Any:
-    plain, whole = (np.int32(count) for count in stage_counts(tableau))
-    return (plain, whole)[dense] if isinstance(dense, bool) else jnp.where(dense, whole, plain)
-
-
 def dense_rows(tableau: Tableau, field: Field, step: Step, slopes: Array) -> Array:
-    """The rows F0, F1, … of `nested` (r, n) of one body, times the length of the step.
-
-    The stages that only they need are worked out here, apart from those of the step.
-    """
+    """The rows F0, F1, … of `nested` (r, n) of one body, times the length of the step."""
     count, whole = stage_counts(tableau)
     w = weights(tableau, slopes.dtype, whole)
     slopes = jnp.concatenate([slopes, jnp.zeros((slopes.shape[0], whole - count), slopes.dtype)], 1)
-    more = lambda i, slopes: _put(slopes, _stage(w, field, [], step, i, slopes)[2], i)  # noqa: E731
+
+    def more(i: Array, slopes: Array) -> Array:
+        slope = _stage(w, field, [], step, i, slopes)[2]
+        return lax.dynamic_update_index_in_dim(slopes, slope, i, 1)
+
     slopes = lax.fori_loop(count, whole, more, slopes)
     return step.h.astype(slopes.dtype) * jnp.sum(w.dense[:, None] * slopes[None], 2)
 
@@ -172,10 +146,7 @@ def error_estimate(tableau: Tableau, sizes: list[int], h: Array, slopes: Array) 
     """The error of a step (n, *bodies).
 
     Two estimates e5, e3 make e5 |e5|/√(|e5|² + 0.01 |e3|²), which falls as h⁸ (Hairer, Nørsett and
-    Wanner 1993, II.10). The lengths are those of one array of the state, of `sizes` numbers: scales
-    are not mixed.
-
-    **Arguments:** `slopes` (n, s, *bodies).
+    Wanner 1993, II.10). The lengths are those of each array of the state, of `sizes` numbers.
     """
     count, dtype = slopes.shape[1], slopes.dtype
     ones = [1] * (slopes.ndim - 2)
@@ -195,36 +166,29 @@ def error_estimate(tableau: Tableau, sizes: list[int], h: Array, slopes: Array) 
 
 
 def pulled(
-    tableau: Tableau,
-    field: Field,
-    constants: list[Array],
-    step: Step,
-    there: Stages,
-    cotangent: Array,
-    of_slopes: Array | None = None,
-    dense: Any = False,
-) -> tuple[list[Array], Array, Array, Array]:
+    tableau: Tableau, field: Field, constants: Arrays, step: Step, there: Stages,
+    cotangent: Array, of_slopes: Array | None = None,
+) -> tuple[Arrays, Array, Array, Array]:  # fmt: skip
     """The transpose of a step: cotangents of the constants, of time, of length, of the state.
 
-    **Arguments:** `cotangent` of the state at the end; `of_slopes` (n, s, *bodies) of all slopes;
-    `dense` as for `stages`.
+    `cotangent` is of the state at the end, `of_slopes` (n, s, *bodies) of all slopes.
     """
     count = there.slopes.shape[1]
     w = weights(tableau, step.y.dtype, count)
-    h, last = step.h.astype(step.y.dtype), _last(tableau, dense)
+    h, put = step.h.astype(step.y.dtype), lax.dynamic_update_index_in_dim
 
     def stage(i: Array, both: tuple[Array, Array]) -> tuple[Array, Array]:
-        m = last - 1 - i
+        m = there.number - 1 - i
         below, seeds = both
         seed = w.b[m] * cotangent + _sum(w.a[:, m], below)
         bar = lift(h, seed) * seed
         if of_slopes is not None:
             bar = bar + of_slopes[:, m]
         pull = jax.vjp(lambda y: field(constants, there.times[m], y), there.places[:, m])[1]
-        return _put(below, pull(bar)[0], m), _put(seeds, seed, m)
+        return put(below, pull(bar)[0], m, 1), put(seeds, seed, m, 1)
 
     none = jnp.zeros_like(there.slopes)
-    below, seeds = lax.fori_loop(np.int32(0), last, stage, (none, none))
+    below, seeds = lax.fori_loop(np.int32(0), there.number, stage, (none, none))
     # The constants' share of all stages at once: it does not wait for the others. Each stage has
     # constants of its own, and their shares are summed last: else each number is a kernel.
     every = jax.vmap(lambda c, t, y: field(c, t, y), (0, 0, 1), 1)

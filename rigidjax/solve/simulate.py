@@ -20,10 +20,9 @@ from rigidjax.solve.crossings import Event, ready, solve_until
 from rigidjax.solve.error import foreseen_error, solve_to
 from rigidjax.solve.explicit import AbstractExplicit, DormandPrince8
 from rigidjax.solve.projection import Projected, Watched
-from rigidjax.solve.run import Free, Loop, Setup, refuse, refuse_ended, solve
-from rigidjax.solve.solution import Kept, Solution, State, told
+from rigidjax.solve.run import Free, Loop, Setup, direction, kept, refuse, refuse_ended, solve
+from rigidjax.solve.solution import Solution, State, told
 from rigidjax.solve.splitting import AbstractSplitting
-from rigidjax.solve.vector_field import direction
 
 # A torque must accept the given state: gravity on a `Spin` is an error that type checkers see.
 Law = Callable[[Any, State, Any], Any] | AbstractScene | MovingFrame | None
@@ -64,10 +63,9 @@ def simulate(
 
     - `body`: `Inertia` for `Spin` and `Attitude`, about the point that the body turns about;
       `MassProperties` for `Rigid`; `None` for a `Point`.
-    - `state0`: `Spin(omega)`, `Attitude(q, omega)` or `Rigid(x, v, q, omega)` at `ts[0]`. Take the
-      first of these with the quantities that you need. It is one body; for many,
-      `jax.vmap(lambda body, state: rj.simulate(body, state, ts).ys)`, and with `throw=False` return
-      `.result`, too: one for each body.
+    - `state0`: `Spin(omega)`, `Attitude(q, omega)` or `Rigid(x, v, q, omega)` at `ts[0]`, of one
+      body. For many, `jax.vmap(lambda body, state: rj.simulate(body, state, ts).ys)`; with
+      `throw=False` return `.result`, too: one for each body.
     - `ts`: (T,) increasing times, s, or decreasing ones, backwards in time. The first is the start.
     - `torque`: a torque of `rigidjax.torques` (the stepper gets the jumps of a schedule), or any
       callable Module `(t, state, body) → (3,)`, N m, body frame; `None` for a free body. A torque's
@@ -78,14 +76,11 @@ def simulate(
       The explicit methods of `rigidjax.solvers` run in our own loop; so does the default, unless a
       controller, a progress meter, `max_steps=None` or `adjoint=diffrax.ForwardMode()` is given:
       then diffrax runs its Dopri8. It may be any `diffrax.AbstractSolver`; a wrapper keeps
-      attitudes unit quaternions, at every step and every saved time. The error of `DormandPrince8`
-      between its steps is up to ten times `rtol` (7 was the largest found), that of Dopri8
-      up to 26 times below `rtol=1e-10`.
+      attitudes unit quaternions, at every step and every saved time. Between its steps the error of
+      `DormandPrince8` is up to ten times `rtol`, that of Dopri8 up to 26 times below `rtol=1e-10`.
     - `rtol`, `atol`: tolerances of the adaptive steps; 1e-9 and 1e-12 in float64, 2e-5 and 1e-7 in
       float32. Traced ones are not checked, and other values do not compile again. Scale `atol` to
-      the smallest number that matters: the time of a flip about the middle axis depends on the
-      initial rate off the axis, and has no meaning if this is below `atol`. The closed form uses
-      neither.
+      the smallest number that matters. The closed form uses neither.
     - `accuracy`: in the place of tolerances, how far the states may be from the exact motion: rad,
       and relative to the largest value in the run. Two or more cheap runs find the tolerance.
       `sol.error` is then known without more runs. Where it exceeds the accuracy (chaos, round-off),
@@ -96,26 +91,23 @@ def simulate(
       `diffrax.RecursiveCheckpointAdjoint()` for `jax.grad`, with 4096 checkpoints where `rtol` is
       known to be below 1e-10; `diffrax.ForwardMode()` is for `jax.jacfwd`. Our loop and the closed
       form need none: `jax.grad`, `jax.jacfwd`, `jax.jacrev` and `jax.hessian` (forward over
-      reverse) work, and `jax.grad` of a `jax.grad` is refused. Give `diffrax.ForwardMode()` if you
-      need only `jax.jacfwd` of a body: it takes a quarter (hundreds of saved times)
-      to four fifths (two) of the time of our loop; a particle with few saved times takes longer.
+      reverse) work, and `jax.grad` of a `jax.grad` is refused. If you need only `jax.jacfwd` of a
+      body, `diffrax.ForwardMode()` is faster; it is not for a particle with few saved times.
     - `event`: `(t, state, body) → scalar`, or an `Event` of it: the run ends at its first zero.
       `event_time` and `event_state` of the solution are exact to the tolerances, with first and
       second derivatives with respect to all numbers, also the condition's own; later `ys` are NaN,
-      and `result` is `event_occurred`. Without an event they are NaN and the run goes to its end
-      (`jax_debug_nans` reports these NaN as errors). Events work in our own loop and the closed
-      form; for a solver of diffrax give `diffrax.Event` there.
+      and `result` is `event_occurred`. Without a zero they are NaN and the run goes to its end.
+      Events work in our own loop and the closed form; for a solver of diffrax give `diffrax.Event`
+      there.
     - `max_steps`, `progress_meter`: as in `diffrax.diffeqsolve`.
-    - `throw`: with `False` no event of the run, and no bad start in a batch, raises an error:
-      `result` gives the reason, states not reached are NaN, as are their derivatives, and other
-      bodies of the batch get the same results as without the bad one, to the last bit. The motion
-      of an invalid traced body (a mass that is not positive, moments of no real body) is NaN, its
-      `result` is `nonfinite_input`. Known wrong numbers are refused in any case.
+    - `throw`: with `False` nothing in a run, and no bad start in a batch, raises an error: `result`
+      gives the reason, states not reached are NaN, as are their derivatives, and other bodies of
+      the batch get the same bits as without the bad one. The motion of an invalid traced body (a
+      mass that is not positive, moments of no real body) is NaN, its `result` `nonfinite_input`.
+      Known wrong numbers are refused in any case.
 
     **Returns** a `Solution`. A second call with other numbers of the same shapes does not compile
-    again.
-
-    Source: the equations of Newton and Euler (notes, eqs 50, 79, 84).
+    again. Source: the equations of Newton and Euler (notes, eqs 50, 79, 84).
 
     **Raises:** `TypeError` if body, state and torque do not fit together; `ValueError` for times
     that neither increase nor decrease, NaN, or a quaternion that is not unit (`EquinoxRuntimeError`
@@ -128,7 +120,7 @@ def simulate(
     """
     max_steps = None if max_steps is None else _checks.whole(max_steps, "max_steps", 1)
     body, state0, times = validation.scene(body, state0, ts, torque, throw)
-    _require_one((rtol, atol), accuracy, stepsize_controller)
+    _require_one(rtol is not None or atol is not None, accuracy, stepsize_controller)
     if stepsize_controller is None:
         rtol, atol = validation.tolerances(rtol, atol, times.dtype)
     if torque is None and solver is None and stepsize_controller is None and body is not None:
@@ -139,12 +131,13 @@ def simulate(
     plain = plain and stepsize_controller is None and progress_meter is None
     # Where forward mode is all that is asked, diffrax is quicker: tangents go along with the run.
     forward = isinstance(adjoint, dfx.ForwardMode) and solver is None and event is None
-    first = validation.first_step(dt0, times)
+    first = None if dt0 is None else validation.first_step(dt0, times)
     if plain and isinstance(adjoint, _EITHER_MODE) and not forward:
         way = direction(times)
         loop = Loop(body, torque, method, rtol, atol, first, way, max_steps, throw)  # pyright: ignore
-        scene = loop, event, state0, times
-        return _solution(*scene) if accuracy is None else _accurate(*scene, accuracy)
+        if accuracy is None:
+            return _solution(loop, event, state0, times)
+        return _accurate(loop, event, state0, times, accuracy)
     if accuracy is not None:
         raise ValueError(
             "simulate: an accuracy is for the closed form and our own loop: leave solver, adjoint, "
@@ -157,30 +150,24 @@ def simulate(
             "of rigidjax.solvers), or give diffrax.Event to diffrax.diffeqsolve"
         )
     controller = _controller(stepsize_controller, rtol, atol, torque, times.dtype)
-    setup = Setup(
-        body=body,
-        torque=torque,
-        solver=_on_the_group(solver),
-        controller=controller,
-        dt0=None if first is None else first * jnp.sign(times[-1] - times[0]),
-        adjoint=_adjoint(controller) if adjoint is None else adjoint,
-        progress_meter=NO_METER if progress_meter is None else progress_meter,
-        max_steps=max_steps,
-        throw=throw,
-    )
+    # Ours project inside their one kernel; a second time outside of it breaks the kernel up.
+    if not isinstance(solver, AbstractExplicit | AbstractSplitting | Projected):
+        solver = SOLVER if solver is None else Projected(solver)
+    adjoint = _adjoint(controller) if adjoint is None else adjoint
+    dt0 = None if first is None else first * jnp.sign(times[-1] - times[0])
+    meter = NO_METER if progress_meter is None else progress_meter
+    setup = Setup(body, torque, solver, controller, dt0, adjoint, meter, max_steps, throw)
     return _solution(setup, None, state0, times)
 
 
-def _require_one(tolerances: tuple, accuracy: Any, controller: Any) -> None:
-    """Only one of three says how long steps are. **Raises** `ValueError` for more of them."""
-    given = any(one is not None for one in tolerances)
+def _require_one(given: bool, accuracy: Any, controller: Any) -> None:
+    """Refuse more than one of tolerances, accuracy and controller."""
     if controller is not None and (given or accuracy is not None):
         raise ValueError("simulate: give either rtol and atol or a stepsize_controller, not both")
-    if accuracy is not None:
-        if given:
-            raise ValueError("simulate: give either an accuracy or rtol and atol, not both")
-        if _checks.known(accuracy):
-            _checks.positive(accuracy, "accuracy")
+    if accuracy is not None and given:
+        raise ValueError("simulate: give either an accuracy or rtol and atol, not both")
+    if accuracy is not None and _checks.known(accuracy):
+        _checks.positive(accuracy, "accuracy")
 
 
 def _accurate(loop: Loop, event: Any, state0: Any, times: Array, accuracy: Any) -> Solution:
@@ -189,6 +176,12 @@ def _accurate(loop: Loop, event: Any, state0: Any, times: Array, accuracy: Any) 
     sol = _solution(found, event, state0, times, None if event is not None else run)
     error = foreseen_error(found, times, sol._states, sol.stats["num_steps"], tried)
     return told(sol, error, accuracy)
+
+
+def _adjoint(controller: dfx.AbstractStepSizeController) -> dfx.AbstractAdjoint:
+    rtol = getattr(controller, "rtol", None)
+    tight = rtol is not None and _checks.known(rtol) and float(rtol) < _TIGHT
+    return _EVERY_STEP if tight else ADJOINT
 
 
 def _solution(setup: Any, event: Any, state0: Any, times: Array, run: Any = None) -> Solution:
@@ -208,8 +201,8 @@ def _solution(setup: Any, event: Any, state0: Any, times: Array, run: Any = None
     if setup.throw and "ended" in stats:
         ys = refuse_ended(setup.torque, ys, stats, times)
     own = ys.own if isinstance(ys, Coupled) else None
-    kept = Kept(setup)
-    return Solution(times, motion_of(ys), stats, result, kept, event_time, event_state, own)
+    ys = motion_of(ys)
+    return Solution(times, ys, stats, result, *kept(setup), event_time, event_state, own)
 
 
 def _controller(
@@ -229,17 +222,3 @@ def _controller(
 @functools.cache
 def _watched(rtol: Any, atol: Any) -> Watched:
     return Watched(dfx.PIDController(rtol=rtol, atol=atol))
-
-
-def _adjoint(controller: dfx.AbstractStepSizeController) -> dfx.AbstractAdjoint:
-    rtol = getattr(controller, "rtol", None)
-    if rtol is not None and _checks.known(rtol) and float(rtol) < _TIGHT:
-        return _EVERY_STEP
-    return ADJOINT
-
-
-def _on_the_group(solver: dfx.AbstractSolver | None) -> dfx.AbstractSolver:
-    # Ours project inside their one kernel; a second time outside of it breaks the kernel up.
-    if isinstance(solver, AbstractExplicit | AbstractSplitting | Projected):
-        return solver
-    return SOLVER if solver is None else Projected(solver)

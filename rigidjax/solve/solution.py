@@ -9,7 +9,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from rigidjax import _checks, motion
@@ -17,34 +16,12 @@ from rigidjax._types import ScalarLike
 from rigidjax.frames import Point
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.coupled import Coupled, motion_of
-from rigidjax.motion.manifold import dimension, minus_small, plus
+from rigidjax.motion.manifold import dimension, minus_small, parts, plus, turns
 from rigidjax.motion.torques.states import require_stateless
 from rigidjax.solve.error import Error, error_of_run
 from rigidjax.solve.run import Free, Loop, Setup, solve
 
 State = TypeVar("State", Spin, Attitude, Rigid, Point)
-
-
-class Kept(eqx.Module):
-    """A set-up as arrays and the rest, so that `jax.jit` and `jax.vmap` can return it."""
-
-    arrays: Any
-    rest: tuple[tuple[Any, ...], Any] = eqx.field(static=True)
-
-    def __init__(self, setup: Free | Loop | Setup):
-        self.arrays, rest = eqx.partition(setup, _is_array)
-        leaves, structure = jax.tree.flatten(rest)
-        self.rest = tuple(leaves), structure
-
-    @property
-    def setup(self) -> Any:
-        """The set-up itself."""
-        leaves, structure = self.rest
-        return eqx.combine(self.arrays, jax.tree.unflatten(structure, leaves))
-
-
-def _is_array(leaf: Any) -> bool:
-    return isinstance(leaf, (jax.Array, np.ndarray, np.generic))
 
 
 class Solution(eqx.Module, Generic[State]):
@@ -55,11 +32,10 @@ class Solution(eqx.Module, Generic[State]):
     `num_accepted_steps`, `num_rejected_steps`, for a `Point` also `drift` of its scene's conserved
     quantities; `result` a `diffrax.RESULTS`: `successful`, or why the run ended early, such as
     `max_steps_reached`, `nonfinite`, `nonfinite_input` (no body has these numbers),
-    `dt_min_reached`; `event_occurred` where the event was met.
-    `event_time` s, `event_state` of the type of `state0` (under a law with states `.motion` is
-    that, `.own` the law's): NaN where it was not met, `None` where there is no event. `own` a tuple
-    of the states of the laws that have some, in the order of the laws, what is inside another
-    first, as `ys` with a leading time axis, or `None`.
+    `dt_min_reached`, `event_occurred`. `event_time` s, `event_state` of the type of `state0` (under
+    a law with states a `Coupled`): NaN where it was not met, `None` where there is no event. `own`
+    a tuple of the states of the laws that have some, in the order of the laws, what is inside
+    another first, with a leading time axis, or `None`.
 
     >>> import rigidjax as rj
     >>> body, start = rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([0.0, 0.0, 1.0])
@@ -72,7 +48,8 @@ class Solution(eqx.Module, Generic[State]):
     ys: State
     stats: dict[str, Any]
     result: dfx.RESULTS
-    _kept: "Kept"
+    _arrays: Any
+    _rest: tuple[tuple[Any, ...], Any] = eqx.field(static=True)
     event_time: Float[Array, ""] | None = None
     event_state: Any = None
     own: Any = None
@@ -105,19 +82,19 @@ class Solution(eqx.Module, Generic[State]):
     def growth(self) -> Float[Array, " times"]:
         """‖∂y(t)/∂y(t₀)‖ at each of `ts`: the growth of a small error at the start.
 
-        It is computed at the first use, by forward mode: about as many runs as the state has
+        It is computed when it is read, by forward mode: about as many runs as the state has
         numbers. It has no unit: each of q, Ω, x, v counts relative to its largest size in the run,
         and the norm is the largest singular value.
 
         A solver's own errors grow as much. If `growth * rtol` exceeds 1, the states have no correct
-        digit, and gradients through them have no meaning, finite or not, for any adjoint: a
-        `UserWarning` names the first such time. Check it once before you differentiate through a
-        long run; then end the run earlier, or fit it in pieces (multiple shooting).
+        digit, and gradients through them mean nothing, for any adjoint: a `UserWarning` names the
+        first such time. Check it once before you differentiate through a long run; then end the
+        run earlier, or fit it in pieces (multiple shooting).
 
         Source: the largest finite-time Lyapunov exponent is its logarithm over t (Eckmann and
         Ruelle 1985, doi:10.1103/RevModPhys.57.617).
         """
-        found = _growth(_forward(self._setup), self.ts, self._states)
+        found = _growth(self._setup, self.ts, self._states)
         how = self._setup.controller if isinstance(self._setup, Setup) else self._setup
         rtol = getattr(how, "rtol", None)
         if rtol is None:
@@ -140,9 +117,8 @@ class Solution(eqx.Module, Generic[State]):
 
         It is computed when it is read: by a run with a hundredth of the tolerances (for fixed
         steps: with half of the step), and, if round-off may count, by three runs with changed last
-        digits of body, torque and start. The closed form needs only these three, with changed
-        times. It works under `jit` and `vmap`. A `UserWarning` names the time after which nothing
-        is known, as in chaos.
+        digits of body, torque and start (in closed form, of the times). A `UserWarning` names the
+        time after which nothing is known, as in chaos.
 
         >>> import rigidjax as rj
         >>> body, start = rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([0.0, 0.5, 1.0])
@@ -170,13 +146,12 @@ class Solution(eqx.Module, Generic[State]):
         [0.0, 0.0, 1.0]
         """
         require_stateless(self._setup.torque, "transition_matrix")
-        return _transition(_forward(self._setup), self.ts, self.ys)
+        return _transition(self._setup, self.ts, self.ys)
 
     def evaluate(self, t: ScalarLike) -> State:
         """The state at any `t` between the first and the last of `ts`, s.
 
-        The motion is computed again from the last saved state before `t`, with its own steps, and
-        the attitude is on the group.
+        The motion is computed again from the last saved state before `t`, with its own steps.
 
         **Raises:** `ValueError` (`EquinoxRuntimeError` under `jit`) if `t` is outside.
         """
@@ -192,8 +167,9 @@ class Solution(eqx.Module, Generic[State]):
         return motion_of(jax.tree.map(lambda leaf: leaf[-1], ys))
 
     @property
-    def _setup(self) -> Free | Loop | Setup:
-        return self._kept.setup
+    def _setup(self) -> Any:
+        leaves, structure = self._rest
+        return eqx.combine(self._arrays, jax.tree.unflatten(structure, leaves))
 
     @property
     def _states(self) -> Any:
@@ -227,37 +203,32 @@ def _drift(setup: Free | Loop | Setup, ts: Array, ys: Any) -> dict[str, Array]:
     return motion.drift(ts, ys, setup.body, setup.torque)  # pyright: ignore[reportArgumentType]
 
 
-def _forward(setup: Free | Loop | Setup) -> Free | Loop | Setup:
-    """The same run, which raises nothing, and which forward mode goes through."""
-    setup = dataclasses.replace(setup, throw=False)
-    return (
-        dataclasses.replace(setup, adjoint=dfx.ForwardMode()) if isinstance(setup, Setup) else setup
-    )
-
-
-@eqx.filter_jit
-def _growth(setup: Free | Loop | Setup, ts: Array, ys: Any) -> Float[Array, " times"]:
-    """The largest singular value of dy(t)/dy(t0), each part relative to its largest size."""
-    sizes = jax.tree.map(_size, ys)
-    start = jax.tree.map(lambda leaf, size: leaf[0] / size, ys, sizes)
-    numbers, unravel = ravel_pytree(start)
-
-    def end(numbers: Array) -> Array:
-        y0 = jax.tree.map(lambda leaf, size: leaf * size, unravel(numbers), sizes)
-        rows = jax.tree.map(lambda leaf, size: leaf / size, solve(setup, y0, ts)[0], sizes)
-        return jax.vmap(lambda row: ravel_pytree(row)[0])(rows)
-
-    return jnp.linalg.norm(jax.jacfwd(end)(numbers), ord=2, axis=(1, 2))
-
-
 @eqx.filter_jit
 def _transition(setup: Free | Loop | Setup, ts: Array, ys: Any) -> Float[Array, "times n n"]:
+    # A run that raises nothing, and which forward mode goes through.
+    more = dict(adjoint=dfx.ForwardMode()) if isinstance(setup, Setup) else {}
+    setup = dataclasses.replace(setup, throw=False, **more)
     start = jax.tree.map(lambda leaf: leaf[0], ys)
 
     def changes(change: Array) -> Array:
         return jax.vmap(minus_small)(solve(setup, plus(start, change), ts)[0], ys)
 
     return jax.jacfwd(changes)(jnp.zeros(dimension(start), ts.dtype))
+
+
+@eqx.filter_jit
+def _growth(setup: Free | Loop | Setup, ts: Array, ys: Any) -> Float[Array, " times"]:
+    """The largest singular value of dy(t)/dy(t0), each part relative to its largest size."""
+    start = jax.tree.map(lambda leaf: leaf[0], ys)
+    each = parts(start, jnp.ones(dimension(start), ts.dtype)).values()
+    sizes = jnp.concatenate(
+        [a.reshape(-1) * _size(b) for a, b in zip(each, jax.tree.leaves(ys), strict=True)]
+    )
+    # A turn by δθ changes q by half of it.
+    for turned in turns(start):
+        sizes = sizes.at[turned].multiply(2)
+    change = _transition(setup, ts, ys) * sizes / sizes[:, None]
+    return jnp.linalg.norm(change, ord=2, axis=(1, 2))
 
 
 def _size(leaf: Array) -> Array:

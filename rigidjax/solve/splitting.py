@@ -2,8 +2,7 @@
 
 `A` is the free body (`rigidjax.exact`), `B` the kick `Π ← Π + c h τ(t, q)` at a fixed attitude; a
 step is `B(b1) A(a1) B(b2) … A(a1) B(b1)`, symmetric, so that it is reversible in time. Each part is
-an exact flow of its own Hamiltonian: the energy's error stays bounded with fixed steps, and a
-torque-free scene costs one formula and has no error.
+an exact flow of its own Hamiltonian: the energy's error stays bounded with fixed steps.
 """
 
 from typing import Any, ClassVar, NamedTuple
@@ -75,14 +74,11 @@ SRKN11 = _symmetric(
 
 
 class Frame(NamedTuple):
-    """The principal frame of a body: moments in it, their inverse, and its axes as columns.
-
-    The off-diagonal entries of both are zero; they carry the tangents.
-    """
+    """The principal frame of a body; off-diagonal entries are zero and carry the tangents."""
 
     moments: Six
-    weights: Six
-    axes: Array
+    weights: Six  # the inverse
+    axes: Array  # columns
 
 
 def principal(tensor: Array) -> Frame:
@@ -139,11 +135,9 @@ class Splitting2(AbstractSplitting):
     """Order 2: half a kick, the exact free motion, half a kick (Strang).
 
     It is for long runs, fixed steps and torques that are small against the free motion. The torque
-    may depend on time and attitude, not on the body rate. Attitude keeps |q| = 1; momentum in space
-    and energy are conserved to round-off without a torque.
-
-    Use fixed steps: an adaptive controller destroys the bounded energy error, and there is no error
-    estimate. Dense output is on the group with the order of the method.
+    may depend on time and attitude, not on the body rate. Without a torque, momentum in space and
+    energy are conserved to round-off. An adaptive controller destroys the bounded energy error, and
+    there is no error estimate. Dense output is on the group with the order of the method.
 
     Source: Strang 1968, doi:10.1137/0705041, with the free flow of `rigidjax.exact.free_body`.
 
@@ -183,11 +177,8 @@ class Splitting6(AbstractSplitting):
 
 
 def frame_of(field: Any, y0: Any) -> Frame:
-    """The principal frame of the field's body.
-
-    **Raises:** `TypeError` for another field than that of an `Attitude`, or a torque that feels the
-    body rate: a kick at a fixed attitude is then no exact flow, and the order falls to 1.
-    """
+    """The principal frame of the field's body; `TypeError` for a field that is no `Attitude`'s."""
+    # Under a torque that feels the body rate a kick is no exact flow: the order would fall to 1.
     torque = require_attitude("Splitting", field, y0, "DormandPrince8").euler.torque
     if sees_rate(torque):
         raise TypeError(
@@ -241,10 +232,7 @@ def compose(
     first, *rest = composition.kicks
     still = jax.tree.map(jnp.zeros_like, state)
     change = kicked(t, (first * h).astype(dtype), state[0], still[1])
-    weights = (
-        jnp.asarray(composition.flows, h.dtype) * h,
-        jnp.asarray(rest, h.dtype) * h,
-    )
+    weights = tuple(jnp.asarray(part, h.dtype) * h for part in (composition.flows, rest))
     (_, dq, change), _ = lax.scan(stage, (t, still[0], change), weights)
     return dq, change
 

@@ -1,16 +1,15 @@
 """A fixed step of a method, a body and a torque: their interface to a loop.
 
-The numbers are carried one by one: XLA on CPU runs a loop over a tuple of scalars as one kernel
-and, batched, over a tuple of (N,) arrays in vector instructions; of a loop over (7,) or (N, 7)
-arrays it makes many small kernels. Torques are called on arrays all the same: XLA sees through the
-stacks and slices between.
+The numbers are carried one by one (see `components`); torques are called on arrays all the same:
+XLA sees through the stacks and slices between.
 
-A body that turns carries the momentum Π = IΩ instead of Ω. Runge–Kutta methods do not notice a
-constant linear change of variables, so these are the steps that `diffrax` takes with the same
-solver, to round-off; and each of their stages is a third cheaper.
+A body that turns carries the momentum Π = IΩ instead of Ω, which makes each stage a third cheaper.
+Runge–Kutta methods do not notice a constant linear change of variables, so these are the steps that
+`diffrax` takes with the same solver, to round-off.
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -21,14 +20,7 @@ from jaxtyping import Array
 
 from rigidjax._types import HasAttitude
 from rigidjax.body.inertia import Inertia
-from rigidjax.exact.components3 import (
-    Six,
-    Triple,
-    cross,
-    half_product,
-    plus,
-    times,
-)
+from rigidjax.exact.components3 import Six, Triple, cross, half_product, plus, times
 from rigidjax.exact.principal_axes import out_of
 from rigidjax.motion import Attitude, Spin
 from rigidjax.motion.coupled import motion_of
@@ -51,16 +43,12 @@ _MANY = 10_000
 
 
 class Stepper(NamedTuple):
-    """Numbers to start from, `change(t, end, h, y, inputs)` of them in a step, and `state(y)`.
+    """A step of one body."""
 
-    `inputs` are those of the law by name, the same through the whole step, or `None`; `delays` name
-    and delay, s, of each delayed one.
-    """
-
-    start: Any
-    change: Callable[[Any, Any, Any, Any, Any], Any]
-    state: Callable[[Any], Any]
-    delays: tuple[tuple[str, Array], ...] = ()
+    start: Any  # numbers y
+    change: Callable[[Any, Any, Any, Any, Any], Any]  # (t, end, h, y, inputs of the law or None)
+    state: Callable[[Any], Any]  # of y
+    delays: tuple[tuple[str, Array], ...] = ()  # name and delay, s, of each delayed input
 
     def step(self, t: Any, end: Any, h: Any, y: Any, inputs: Any) -> Any:
         return jax.tree.map(jnp.add, y, self.change(t, end, h, y, inputs))
@@ -98,30 +86,16 @@ Steps = Stepper | Carrying
 
 
 def stepper_of(solver: Any, field: Callable[..., Any], y0: Any, count: Any = 1) -> Steps:
-    """The stepper of a vector field under `solver`, or under the cheapest that is right.
+    """The stepper of a vector field under `solver`, or, for `None`, the cheapest that is right.
 
-    **Arguments:** `solver` of `rigidjax.solvers`, or `None`; `field` as of `equations_of_motion`;
-    `y0` a state; `count` how many steps are to be taken: many carry what additions lose.
-    **Raises:** `TypeError` for a solver that has no such step.
-
-    >>> import rigidjax as rj
-    >>> start = rj.Spin([1.0, 0.0, 0.0])
-    >>> field = rj.equations_of_motion(rj.Inertia.from_principal(1.0, 2.0, 2.5), start)
-    >>> stepper = stepper_of(None, field, start)
-    >>> [float(number) for number in stepper.start]
-    [1.0, 0.0, 0.0]
+    Many steps (`count`) carry what additions lose.
     """
     stepper = _stepper_of(solver, field, y0)._replace(delays=tuple(delays_of(field)))
     return Carrying(stepper) if not isinstance(count, int) or count >= _MANY else stepper
 
 
 def cheapest(field: Callable[..., Any]) -> Magnus4 | RungeKutta4:
-    """The method of order 4 that takes the least work.
-
-    >>> import rigidjax as rj
-    >>> type(cheapest(EulerEquations(rj.Inertia.from_principal(1.0, 2.0, 2.5)))).__name__
-    'RungeKutta4'
-    """
+    """The method of order 4 that takes the least work."""
     attitude = isinstance(field, AttitudeEquations)
     blind = attitude and not sees_attitude(field.euler.torque)
     return Magnus4() if blind else RungeKutta4()
@@ -142,9 +116,7 @@ def _stepper_of(solver: Any, field: Callable[..., Any], y0: Any) -> Stepper:
             "Magnus4 or a Splitting of rigidjax.solvers; for others use simulate with "
             "stepsize_controller=diffrax.ConstantStepSize() under jax.vmap"
         )
-    if turning is None:
-        return _general(solver, field, y0)
-    return _explicit(solver, turning, y0)
+    return _general(solver, field, y0) if turning is None else _explicit(solver, turning, y0)
 
 
 class _Turning(NamedTuple):
@@ -174,11 +146,8 @@ def _free(body: Inertia, state0: Attitude) -> Stepper:
     one, none = jnp.ones_like(a), jnp.zeros_like(a)
 
     def change(t: Any, end: Any, h: Any, y: Atoms, inputs: Any) -> Atoms:
-        dp, turn = change_and_turn(
-            lambda _, p: _free_slope(weights, gaps, p),
-            lambda p: splitting.rate_of(weights, p),
-            t, end, h, y[4:],
-        )  # fmt: skip
+        slope = lambda _, p: _free_slope(weights, gaps, p)  # noqa: E731
+        dp, turn = change_and_turn(slope, partial(splitting.rate_of, weights), t, end, h, y[4:])
         return (*product4(y[:4], turn), *dp)
 
     def state(y: Atoms) -> Attitude:
@@ -211,10 +180,7 @@ def _entries(a: Array) -> Six:
 
 def _magnus(turning: _Turning, state0: Attitude) -> Stepper:
     body, weights, torque = turning
-    start = split(state0)
-
-    def rate(p: Triple) -> Triple:
-        return times(weights, p)
+    start, rate = split(state0), partial(times, weights)
 
     def change(t: Any, end: Any, h: Any, y: Atoms, inputs: Any) -> Atoms:
         law = bind(torque, inputs)
@@ -292,10 +258,7 @@ def _on_the_group(y: Atoms, change: Atoms, like: Any) -> Atoms:
 
 
 def _split(solver: AbstractSplitting, field: Any, state0: Any) -> Stepper:
-    """The attitude and the momentum in principal axes.
-
-    No step goes through Ω = I⁻¹Π and back, so that |Π| drifts by round-off of the flow alone.
-    """
+    # No step goes through Ω = I⁻¹Π and back, so that |Π| drifts by round-off of the flow alone.
     frame = splitting.frame_of(field, state0)
 
     def change(t: Any, end: Any, h: Any, y: Any, inputs: Any) -> Any:

@@ -21,9 +21,7 @@ from rigidjax.rotation.validation import tolerance
 
 
 def scene(body: Any, state0: Any, ts: Any, torque: Any, throw: bool) -> tuple[Any, Any, Array]:
-    """Body, start and times of a run, of one dtype, or an error; with `throw=False` invalid traced
-    numbers become NaN.
-    """
+    """Body, start, times of a run, of one dtype; with `throw=False` bad traced numbers are NaN."""
     ts = times(ts, throw)
     state0 = start(state0, throw)
     dtype = ts.dtype
@@ -35,7 +33,7 @@ def scene(body: Any, state0: Any, ts: Any, torque: Any, throw: bool) -> tuple[An
     )
     require_fit(body, state0, torque)
     if body is not None:
-        body = body.invertible() if throw else real_or_nan(body)
+        body = real_or_nan(body, throw)
     return body, state0, ts
 
 
@@ -75,15 +73,11 @@ def _body_of(numbers: Any, moves: bool = False) -> str:
     return f"; rj.Inertia{'.from_principal(*moments)' if moments else '(tensor)'} makes one of them"
 
 
-def real_or_nan(body: Inertia | MassProperties) -> Any:
-    """The body; where its numbers are traced and no body has them, all of them are NaN.
-
-    >>> real_or_nan(Inertia.from_principal(1.0, 2.0, 2.5)).moments
-    Array([1. , 2. , 2.5], dtype=float64)
-    """
+def real_or_nan(body: Inertia | MassProperties, throw: bool = False) -> Any:
+    """The body; traced numbers of no real body are NaN, unless they may `throw`."""
     matter = isinstance(body, MassProperties)
     tensor = body.inertia.tensor if matter else body.tensor
-    return possible(body, tensor, body.mass if matter else None, throw=False)
+    return possible(body, tensor, body.mass if matter else None, throw)
 
 
 # The arrays of one body or one state that are no vectors.
@@ -91,10 +85,7 @@ _SHAPES = {"tensor": (3, 3), "mass": (), "second_moment": (3, 3), "q": (4,)}
 
 
 def _single(value: Any, name: str) -> None:
-    """Raise `ValueError` unless every leaf of `value` has the shape of one body.
-
-    Constructors see to it that shapes agree; `jax.tree.map` and `eqx.tree_at` do not.
-    """
+    """Refuse leaves of another shape than that of one body: `jax.tree.map` may alter it."""
     for path, leaf in jax.tree.leaves_with_path(value):
         part = str(path[-1]).lstrip(".")
         if leaf.shape != (wanted := _SHAPES.get(part, (3,))):
@@ -105,16 +96,12 @@ def _single(value: Any, name: str) -> None:
 
 
 def tolerances(rtol: Any, atol: Any, dtype: Any) -> tuple[Any, Any]:
-    """`rtol` and `atol`, by default suited to `dtype`; a warning if it cannot reach them.
-
-    Traced ones are taken as they are.
-
-    >>> tolerances(None, 1e-10, jnp.float64)
-    (1e-09, 1e-10)
-    """
+    """`rtol` and `atol`, by default suited to `dtype`; a warning if it cannot reach known ones."""
     double = dtype == jnp.float64
-    rtol = (1e-9 if double else 2e-5) if rtol is None else rtol
-    atol = (1e-12 if double else 1e-7) if atol is None else atol
+    usual, given = (1e-9, 1e-12) if double else (2e-5, 1e-7), (rtol, atol)
+    rtol, atol = (u if g is None else g for u, g in zip(usual, given, strict=True))
+    if given == (None, None):
+        return rtol, atol
     if not _checks.known((rtol, atol)):
         return jnp.asarray(rtol, dtype), jnp.asarray(atol, dtype)
     # Floats of Python: those of NumPy would lift a float32 run to float64.
@@ -135,12 +122,7 @@ def tolerances(rtol: Any, atol: Any, dtype: Any) -> tuple[Any, Any]:
 
 
 def times(ts: Any, throw: bool) -> Array:
-    """`ts` as an array of times that increase, or decrease; poisoned where they do neither, are
-    traced and may not throw.
-
-    >>> times([0, 1, 2], True).shape
-    (3,)
-    """
+    """`ts` as an array of times that increase, or decrease; or NaN, if traced and not to throw."""
     if isinstance(ts, (Spin, Attitude, Rigid, Point)):
         raise TypeError(f"ts: wanted times, got {type(ts).__name__}; the state comes before them")
     try:
@@ -172,15 +154,8 @@ def times(ts: Any, throw: bool) -> Array:
     return _guard(found, ~ahead.all(), f"ts: wanted {kind} times{where}", throw)
 
 
-def first_step(dt0: Any, times: Array) -> Array | None:
-    """The length of `dt0` in the precision of `times`; refused where it is no step, goes against
-    them, or is too short to count.
-
-    >>> first_step(0.5, jnp.array([0.0, 1.0]))
-    Array(0.5, dtype=float64)
-    """
-    if dt0 is None:
-        return None
+def first_step(dt0: Any, times: Array) -> Array:
+    """The length of `dt0` in the precision of `times`; refused if it is no step to go on with."""
     step = _checks.floating(dt0, (), "dt0").astype(times.dtype)
     known = _checks.known(times)
     if not _checks.known(step):
@@ -191,18 +166,19 @@ def first_step(dt0: Any, times: Array) -> Array | None:
             f"dt0: wanted a positive step, s, got {dt0}; to go back in time give decreasing ts"
         )
     if known:
-        gap = float(np.spacing(np.abs(np.asarray(times)).max()))
+        far = np.abs(np.asarray(times)).max()
+        gap = float(np.spacing(far))
         if abs(float(step)) < 8 * gap:
             raise ValueError(
                 f"dt0: steps of {dt0} s are too short for {times.dtype}, whose times near "
-                f"{float(np.abs(np.asarray(times)).max()):g} s are {gap:.2g} s apart; count time "
-                "from a later origin, or use float64"
+                f"{float(far):g} s are {gap:.2g} s apart; count time from a later origin, or use "
+                "float64"
             )
     return abs(step)
 
 
 def start(state0: Any, throw: bool) -> Any:
-    """`state0` of one body, finite, with a unit quaternion; poisoned as `times` does it."""
+    """`state0` of one body, finite, with a unit quaternion; or NaN, as for `times`."""
     if not isinstance(state0, Spin | Attitude | Rigid | Point):
         raise TypeError(
             "state0: wanted Spin, Attitude or Rigid, or Point without a body, got "
