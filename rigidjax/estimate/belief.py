@@ -10,11 +10,9 @@ from jaxtyping import Array, Float
 
 from rigidjax import _checks
 from rigidjax._types import HasSpin
-from rigidjax.estimate.scene import Extended, Model, not_negative
-from rigidjax.estimate.sensing import sensors_of
-from rigidjax.identify.direct_estimates import attitudes
+from rigidjax.estimate.scene import Extended, Model, not_negative, sensors_of
 from rigidjax.identify.recording import Recording
-from rigidjax.identify.reference_states import first_rate
+from rigidjax.identify.reference_states import attitudes, first_rate
 from rigidjax.motion import Attitude, Spin
 from rigidjax.motion.equations import on_the_group
 from rigidjax.motion.manifold import names

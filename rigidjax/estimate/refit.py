@@ -19,8 +19,7 @@ from jaxtyping import Array, Bool, Float
 
 from rigidjax import _checks
 from rigidjax._types import Scalar
-from rigidjax.estimate.density import LogDensity, of_draws
-from rigidjax.estimate.terms import curvature
+from rigidjax.estimate.density import LogDensity, curvature, of_draws
 from rigidjax.identify.levenberg_marquardt import Settings, made_of, search
 from rigidjax.identify.parameters import Unpacked
 from rigidjax.identify.quantities import carried

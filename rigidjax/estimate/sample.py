@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from rigidjax import _checks
 from rigidjax._types import HasSpin
-from rigidjax.estimate.grid import longest_step, steps_of
+from rigidjax.estimate.filter import longest_step, steps_of
 from rigidjax.estimate.scene import Dynamics, Extended, Model
 from rigidjax.motion.equations import on_the_group
 

@@ -13,8 +13,17 @@ from rigidjax._types import Scalar
 from rigidjax.estimate import linear, roots
 from rigidjax.estimate.belief import Belief
 from rigidjax.estimate.filter import WORDS, Task, looked_at, scan_filter, status_of, told
-from rigidjax.estimate.scene import Dynamics, Extended, Model, reset, reset_inverse
-from rigidjax.estimate.sensing import Read, Sensors, Stops, absorb_all
+from rigidjax.estimate.scene import (
+    Dynamics,
+    Extended,
+    Model,
+    Read,
+    Sensors,
+    Stops,
+    absorb_all,
+    reset,
+    reset_inverse,
+)
 from rigidjax.identify.recording import Recording
 from rigidjax.motion.manifold import minus, plus
 

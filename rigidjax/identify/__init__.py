@@ -24,13 +24,17 @@ from rigidjax.identify.design import (
     fisher as fisher,
 )
 from rigidjax.identify.fit import fit as fit
-from rigidjax.identify.free_parameters import Free as Free
-from rigidjax.identify.loss import AbstractLoss as AbstractLoss, Huber as Huber, SoftL1 as SoftL1
+from rigidjax.identify.loss import (
+    AbstractLoss as AbstractLoss,
+    Entropic as Entropic,
+    Huber as Huber,
+    SoftL1 as SoftL1,
+)
 from rigidjax.identify.parameters import (
+    Free as Free,
     Parameters as Parameters,
     Unpacked as Unpacked,
 )
-from rigidjax.identify.prior import Entropic as Entropic
 from rigidjax.identify.problem import Problem as Problem
 from rigidjax.identify.profile import profile as profile
 from rigidjax.identify.propagation import (

@@ -18,10 +18,16 @@ from rigidjax.identify.body_charts import (
     Ratios,
     Tensor,
 )
-from rigidjax.identify.csv_io import UNITS, LogError, increasing, read_table
-from rigidjax.identify.free_parameters import Free
-from rigidjax.identify.layouts import USUAL as USUAL, layout_of as layout_of
+from rigidjax.identify.csv_io import (
+    UNITS,
+    USUAL as USUAL,
+    LogError,
+    increasing,
+    layout_of as layout_of,
+    read_table,
+)
 from rigidjax.identify.loss import Huber, SoftL1
+from rigidjax.identify.parameters import Free
 from rigidjax.identify.problem import Problem
 from rigidjax.identify.recording import Recording
 from rigidjax.identify.sensors import (

@@ -3,16 +3,144 @@
 import csv
 import itertools
 import math
+import re
+import struct
 from array import array
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any, NamedTuple, TextIO
 
 import numpy as np
 
 from rigidjax import _checks
-from rigidjax.identify import blackbox
-from rigidjax.identify.layouts import read_header
+
+SUFFIXES = (".bbl", ".bfl")
+# The rates in deg/s, the time in µs.
+COLUMNS = ("time", "gyroADC[0]", "gyroADC[1]", "gyroADC[2]")
+
+
+def read_blackbox(path: Path, columns: Sequence[str]) -> tuple[list[str], dict[str, Any]]:
+    """The names of all fields, and those that are wanted, of the first flight in a file.
+
+    Rates (`gyroADC[i]`) come in deg/s and accelerations (`accSmooth[i]`) in g, by the scales in the
+    header; other fields as logged, the time in µs. A log without its last mark, as after a crash,
+    is read up to its end.
+
+    Source: the parser is that of the package orangebox; the scales are those of the flight
+    controllers' own viewer: raw × gyro_scale is deg/s (Baseflight: rad/µs), raw / acc_1G is g.
+
+    **Raises:** `ModuleNotFoundError` if orangebox is missing; orangebox's own errors for a file of
+    another kind.
+    """
+    try:
+        from orangebox import Parser
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError(
+            f"{path}: Blackbox logs are read by orangebox, which is missing: pip install "
+            "'rigidjax[blackbox]'"
+        ) from error
+    parser = Parser.load(str(path))
+    names = parser.field_names
+    wanted = {name: (names.index(name), array("d")) for name in columns if name in names}
+    try:
+        for frame in parser.frames():
+            for place, numbers in wanted.values():
+                numbers.append(float(frame.data[place]))
+    except (RuntimeError, IndexError, TypeError):
+        # At the end of a log without a last mark the parser raises one of these.
+        if parser.reader.tell() < len(parser.reader):
+            raise
+    scales = _scales(parser.headers)
+    return names, {
+        name: np.frombuffer(numbers, float) * scales.get(name.partition("[")[0], 1.0)
+        for name, (_, numbers) in wanted.items()
+    }
+
+
+def _scales(headers: dict[str, Any]) -> dict[str, float]:
+    """The factors of the raw numbers of some fields."""
+    found = {}
+    if "gyro_scale" in headers:
+        value = headers["gyro_scale"]
+        # Written as the bits of a float, which the parser takes for a whole number.
+        scale = struct.unpack("f", struct.pack("I", value))[0] if isinstance(value, int) else value
+        baseflight = "baseflight" in str(headers.get("Firmware type", "")).lower()
+        found["gyroADC"] = scale * (1e6 * 180 / math.pi if baseflight else 1.0)
+    if "acc_1G" in headers:
+        found["accSmooth"] = 1.0 / float(headers["acc_1G"])
+    return found
+
+
+SEPARATORS = ",;\t"
+
+
+class Layout(NamedTuple):
+    """Names of the time and the three rate columns, the unit of the rates, that of the time."""
+
+    columns: tuple[str, str, str, str]
+    unit: str
+    time_unit: str
+
+
+USUAL = Layout(("t", "wx", "wy", "wz"), "rad/s", "s")
+
+
+def layout_of(path: str | Path) -> Layout:
+    """The layout of a log: phyphox or Blackbox if the names match, else `USUAL`.
+
+    phyphox writes `Time (s)` and three columns such as `Gyroscope x (rad/s)`, in the language of
+    the phone. It raises nothing: errors of a file are raised when it is read.
+    """
+    path = Path(path)
+    if path.suffix.lower() in SUFFIXES:
+        return Layout(COLUMNS, "deg/s", "us")
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            names = read_header(file).names
+    except (OSError, UnicodeDecodeError):
+        return USUAL
+    times = [name for name in names if re.search(r"\(s\)$", name)]
+    rates = [name for axis in "xyz" for name in names if re.search(rf"\b{axis} \(rad/s\)$", name)]
+    if len(times) == 1 and len(rates) == 3:
+        x, y, z = rates
+        return Layout((times[0], x, y, z), "rad/s", "s")
+    return USUAL
+
+
+class Header(NamedTuple):
+    """Column names; their separator; the number of their line; the lines read after it."""
+
+    names: list[str]
+    separator: str
+    line: int
+    after: list[str]
+
+
+def read_header(file: TextIO) -> Header:
+    """The header of a text, read from its beginning: the first line, below comments (`#`).
+
+    It may be the last comment, as `numpy.savetxt` writes it: then numbers follow.
+    """
+    comments, first, line = "", file.readline(_LONGEST), 1
+    while first.startswith("#") or (first and not first.strip()):
+        comments = first if first.startswith("#") else comments
+        first, line = file.readline(_LONGEST), line + 1
+    names, separator = _split(first)
+    if comments and (not first or any(map(_NUMBER.fullmatch, names))):
+        return Header(*_split(comments.lstrip("#")), line - 1, [first])
+    return Header(names, separator, line, [])
+
+
+# A file of one endless line is not read for its header; what `csv` takes as one cell.
+_LONGEST = 131_072
+_NUMBER = re.compile(r"[-+.\d][-+.\deE]*")
+
+
+def _split(first: str) -> tuple[list[str], str]:
+    """The names in a line, and what separates them: whichever gives most of them."""
+    separator = max(SEPARATORS, key=first.count)
+    return [name.strip() for name in next(csv.reader([first], delimiter=separator), [])], separator
+
 
 # All units become SI.
 UNITS = {
@@ -74,7 +202,7 @@ def read_table(path: str | Path, columns: Sequence[str]) -> dict[str, np.ndarray
         raise LogError(f"{path}: no such file")
     if path.is_dir():
         raise LogError(f"{path}: is a folder, not a log")
-    if path.suffix.lower() in (".npz", ".mat", *blackbox.SUFFIXES):
+    if path.suffix.lower() in (".npz", ".mat", *SUFFIXES):
         return _arrays(path, columns)
     return _csv(path, columns)
 
@@ -204,4 +332,4 @@ def _mat(path: Path, columns: Sequence[str]) -> tuple[list[str], dict[str, Any]]
         return names, loadmat(raw, variable_names=list(columns))
 
 
-_readers = {".npz": _npz, ".mat": _mat} | dict.fromkeys(blackbox.SUFFIXES, blackbox.read_blackbox)
+_readers = {".npz": _npz, ".mat": _mat} | dict.fromkeys(SUFFIXES, read_blackbox)

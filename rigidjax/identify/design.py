@@ -12,10 +12,10 @@ from jaxtyping import Array, Float
 from rigidjax import _checks
 from rigidjax._types import Scalar, Vec3
 from rigidjax.identify import flat_limit
-from rigidjax.identify.jacobian import normal_matrix, with_blocks
 from rigidjax.identify.parameters import Parameters, places
 from rigidjax.identify.problem import Problem, fits, one_problem
 from rigidjax.identify.quantities import Quantity, quantities, values_and_slopes
+from rigidjax.identify.terms import normal_matrix, with_blocks
 from rigidjax.identify.uncertainty import inverted
 
 

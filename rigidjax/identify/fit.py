@@ -24,12 +24,10 @@ from rigidjax.identify.checkpoint import (
     require_folder,
 )
 from rigidjax.identify.initial_guess import starting_points
-from rigidjax.identify.jacobian import all_errors
 from rigidjax.identify.multiple_shooting import WIDTHS, joined, pieces as in_pieces, with_width
-from rigidjax.identify.parameters import Parameters
+from rigidjax.identify.parameters import Parameters, by_slot, numbered
 from rigidjax.identify.problem import Problem, fits
 from rigidjax.identify.propagation import AbstractIntegrator, Adaptive, FixedSteps
-from rigidjax.identify.residual import Noise
 from rigidjax.identify.result import Fit
 from rigidjax.identify.search import (
     CAREFUL,
@@ -44,7 +42,7 @@ from rigidjax.identify.search import (
     whole,
 )
 from rigidjax.identify.stochastic_gradient import Descent, descend
-from rigidjax.identify.widths import with_widths
+from rigidjax.identify.terms import Noise, all_errors
 
 # More fixed steps than this between two samples cost more than adaptive steps.
 FINEST = 32
@@ -335,3 +333,44 @@ def _first_noise(problem: Problem) -> Noise:
             size = jnp.sqrt(jnp.mean(jnp.sum(values**2, axis=-1)) + 1e-300)
             out.append(jnp.full((problem.count, sensor.components), 0.1) * size)
     return tuple(out)
+
+
+# Rounds, and the relative change at which they end; a width below so much of the first one is zero.
+_ROUNDS, _SETTLED, _LEAST = 40, 0.01, 1e-4
+
+
+def with_widths(
+    problem: Problem, best: Tried, noise: Noise, tolerance: float, max_steps: int
+) -> tuple[Problem, Tried]:
+    """The problem with the estimated widths, and its best point near `best`."""
+    wanted = [index for index, slot in enumerate(problem.slots) if slot.estimated]
+    if not wanted:
+        return problem, best
+    least = _LEAST * _widths(problem)[wanted]
+    for _ in range(_ROUNDS):
+        before = _widths(problem)[wanted]
+        found = np.maximum(_expected(problem, best.parameters, noise)[wanted], least)
+        new = [jnp.asarray(width) for width in found]
+        problem = eqx.tree_at(lambda p: [p.slots[i].spread for i in wanted], problem, new)
+        best = again(best, problem, noise, tolerance, max_steps)
+        if (np.abs(found - before) < _SETTLED * before).all() or (found <= least).all():
+            break
+    return problem, best
+
+
+def _widths(problem: Problem) -> np.ndarray:
+    """The width of each `Free`, in steps; 1 for a `Free` without one."""
+    return np.array([1.0 if s.spread is None else float(s.spread) for s in problem.slots])
+
+
+def _expected(problem: Problem, parameters: Parameters, noise: Noise) -> np.ndarray:
+    """The root mean square of each one's deviations, with their uncertainty included."""
+    linear = uncertainty.linearise(problem, parameters, noise)
+    variance = np.diag(uncertainty.of_white(linear).seen)
+    values, places = (by_slot(problem, of) for of in (parameters, numbered(parameters)))
+    out = np.ones(len(problem.slots))
+    for index, slot in enumerate(problem.slots):
+        if slot.spread is not None:
+            deviation, where = np.asarray(values[index][2]), np.ravel(places[index][2]).astype(int)
+            out[index] = np.sqrt(np.mean(deviation**2) + np.mean(variance[where]))
+    return out

@@ -9,10 +9,9 @@ from jaxtyping import Array, Float
 
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.body.symmetric3 import swap_trace
-from rigidjax.identify.body_charts import AbstractBodyChart
+from rigidjax.identify.body_charts import AbstractBodyChart, charts_of, in_a_row
 from rigidjax.identify.parameters import Parameters
 from rigidjax.identify.problem import Problem
-from rigidjax.identify.several_bodies import charts_of, in_a_row
 
 # Derivatives are taken where the least second moment is at least this share of the trace.
 THIN = 1e-4
@@ -171,3 +170,26 @@ def limits(
         for (name, value, slope), one in zip(rows, kept, strict=True)
         if one
     )
+
+
+def unreal(body: Any) -> str | None:
+    """The error in a body's numbers, in words; `None` for a real body."""
+    try:
+        if isinstance(body, MassProperties):
+            MassProperties(body.mass, body.com, body.second_moment)
+        else:
+            Inertia.from_tensor(body.tensor)
+    except ValueError as refused:
+        return f"no real body has these numbers: {refused}"
+    return None
+
+
+def of_charts(charts: list[tuple[str, AbstractBodyChart]], bodies: list[Any]) -> list[str]:
+    """`unreal` for the bodies of charts by users: every point of our charts is a real body."""
+    out = []
+    for (name, chart), body in zip(charts, bodies, strict=True):
+        ours = type(chart).__module__ == AbstractBodyChart.__module__
+        wrong = None if ours else unreal(body)
+        if wrong is not None:
+            out.append(wrong + name)
+    return out

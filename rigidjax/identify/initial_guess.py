@@ -11,13 +11,12 @@ from jaxtyping import PRNGKeyArray
 from rigidjax._types import HasSpin
 from rigidjax.body.inertia import Inertia
 from rigidjax.identify import padding
-from rigidjax.identify.body_charts import COMPONENTS
-from rigidjax.identify.direct_estimates import rates
+from rigidjax.identify.body_charts import COMPONENTS, Bodies
 from rigidjax.identify.parameters import Parameters
 from rigidjax.identify.problem import Problem
 from rigidjax.identify.recording import Recording, readings_of
+from rigidjax.identify.reference_states import rates
 from rigidjax.identify.sensors import Gyro
-from rigidjax.identify.several_bodies import Bodies
 from rigidjax.motion import Spin
 from rigidjax.motion.torques.base import Torque, evaluate
 from rigidjax.motion.torques.states import has_states

@@ -11,13 +11,20 @@ from jax import lax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
-from rigidjax.identify.jacobian import along, normal_matrix, with_blocks, with_jacobian
+from rigidjax.identify.body_charts import charts_of
 from rigidjax.identify.parameters import Parameters, places
 from rigidjax.identify.problem import Problem
 from rigidjax.identify.propagation import FirstPart, FixedSteps
 from rigidjax.identify.reference_states import ReferenceStates
-from rigidjax.identify.residual import Noise, beside, seen_rows
-from rigidjax.identify.several_bodies import charts_of
+from rigidjax.identify.terms import (
+    Noise,
+    along,
+    beside,
+    normal_matrix,
+    seen_rows,
+    with_blocks,
+    with_jacobian,
+)
 
 # Damping is in units of the diagonal of the normal equations (Marquardt's): one is a step half as
 # long as Gauss and Newton's.

@@ -9,10 +9,10 @@ import numpy as np
 
 from rigidjax import _checks
 from rigidjax.identify import padding
+from rigidjax.identify.body_charts import Bodies
 from rigidjax.identify.parameters import Own, Parameters
 from rigidjax.identify.problem import Links, Problem, one_problem
 from rigidjax.identify.recording import Reading, Recording
-from rigidjax.identify.several_bodies import Bodies
 from rigidjax.motion.torques.states import has_states
 
 # The widths of the gaps, in turn: first the pieces are nearly free, at the end they are joined.

@@ -14,22 +14,29 @@ from rigidjax import _checks
 from rigidjax._types import HasAttitude, HasPose, Scalar
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.identify import padding
-from rigidjax.identify.body_charts import AbstractBodyChart
-from rigidjax.identify.free_parameters import Free, Slot, find, grouped, shares
+from rigidjax.identify.body_charts import AbstractBodyChart, Bodies, charts_of, has_mass
 from rigidjax.identify.full_scale import with_limits
-from rigidjax.identify.jacobian import (
+from rigidjax.identify.loss import AbstractLoss, Entropic
+from rigidjax.identify.parameters import (
+    Free,
+    Own,
+    Parameters,
+    Slot,
+    by_slot,
+    find,
+    grouped,
+    local,
+    shares,
+)
+from rigidjax.identify.propagation import AbstractIntegrator, integrator_for
+from rigidjax.identify.recording import Recording
+from rigidjax.identify.reference_states import ReferenceStates, first_rates, reference_of
+from rigidjax.identify.terms import (
     all_errors,
     filled,
     over_records,
     states_of_one,
 )
-from rigidjax.identify.loss import AbstractLoss
-from rigidjax.identify.parameters import Own, Parameters, by_slot, local
-from rigidjax.identify.prior import Entropic
-from rigidjax.identify.propagation import AbstractIntegrator, integrator_for
-from rigidjax.identify.recording import Recording
-from rigidjax.identify.reference_states import ReferenceStates, first_rates, reference_of
-from rigidjax.identify.several_bodies import Bodies, charts_of, has_mass
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.coupled import motion_of
 from rigidjax.motion.torques import Sum

@@ -10,9 +10,9 @@ from jaxtyping import Array
 
 from rigidjax.identify import quantities
 from rigidjax.identify.parameters import Parameters
-from rigidjax.identify.residual import residuals
 from rigidjax.identify.result import Fit, one_fit
 from rigidjax.identify.search import cost_of, misfit
+from rigidjax.identify.terms import residuals
 
 
 def profile(fit: Fit, name: str, level: float = 0.95) -> tuple[float, float]:

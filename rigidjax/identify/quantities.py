@@ -12,10 +12,9 @@ from jaxtyping import Array
 
 from rigidjax import _checks
 from rigidjax.identify import flat_limit
-from rigidjax.identify.body_charts import AbstractBodyChart, Ratios
+from rigidjax.identify.body_charts import AbstractBodyChart, Bodies, Ratios, in_a_row
 from rigidjax.identify.parameters import Parameters, Unpacked
 from rigidjax.identify.problem import Problem
-from rigidjax.identify.several_bodies import Bodies, in_a_row
 
 if TYPE_CHECKING:
     from rigidjax.identify.result import Fit

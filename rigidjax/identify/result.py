@@ -13,12 +13,11 @@ from rigidjax.identify.answers import Answer, Cause
 from rigidjax.identify.causes import causes
 from rigidjax.identify.flat_limit import Limit
 from rigidjax.identify.full_scale import at_limit
+from rigidjax.identify.identifiability import Combination, undetermined
 from rigidjax.identify.parameters import Parameters, Unpacked
 from rigidjax.identify.problem import Problem
 from rigidjax.identify.quantities import Quantity, interval_of, quantile
-from rigidjax.identify.residual import Noise
-from rigidjax.identify.undetermined import Combination, undetermined
-from rigidjax.identify.widths import widths
+from rigidjax.identify.terms import Noise
 
 
 class Start(eqx.Module):
@@ -146,7 +145,8 @@ class Fit(eqx.Module):
     @property
     def spreads(self) -> dict[str, Array]:
         """The spread of each `Free` that has one, by name, in its unit: given or estimated."""
-        return widths(self.problem)
+        slots = self.problem.slots
+        return {s.name: s.spread * s.scale for s in slots if s.spread is not None}
 
     @property
     def noise(self) -> tuple[Float[Array, "*records _"], ...]:

@@ -21,7 +21,7 @@ from rigidjax.identify.levenberg_marquardt import (
 from rigidjax.identify.parameters import Parameters
 from rigidjax.identify.problem import Problem
 from rigidjax.identify.recording import count_of
-from rigidjax.identify.residual import Noise, residuals
+from rigidjax.identify.terms import Noise, residuals
 
 # The beginning of the record is fitted first: a long record has many wrong minima (the phase slips
 # by whole turns), a short one has not.

@@ -11,7 +11,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from rigidjax import _checks
 from rigidjax.body.inertia import Inertia, MassProperties
-from rigidjax.identify.sensor_inputs import sensor_inputs, what_turns
+from rigidjax.identify.propagation import sensor_inputs, what_turns
 from rigidjax.identify.sensors import AbstractSensor, SensorInput
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.coupled import Coupled

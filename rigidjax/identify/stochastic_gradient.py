@@ -12,8 +12,8 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from rigidjax import _checks
 from rigidjax.identify.parameters import Parameters
 from rigidjax.identify.problem import Problem
-from rigidjax.identify.residual import Noise, residuals
 from rigidjax.identify.search import half_sum
+from rigidjax.identify.terms import Noise, residuals
 
 if TYPE_CHECKING:
     import optax

@@ -14,8 +14,8 @@ from rigidjax.identify.full_scale import at_limit
 from rigidjax.identify.levenberg_marquardt import beside_rows
 from rigidjax.identify.parameters import Parameters, places
 from rigidjax.identify.problem import Problem
-from rigidjax.identify.residual import Noise, weights_of, whitened, with_rows
 from rigidjax.identify.search import evaluate
+from rigidjax.identify.terms import Noise, weights_of, whitened, with_rows
 
 # A direction is undetermined if its singular value is below this share of the largest.
 BLIND = 1e-8

@@ -13,18 +13,137 @@ from jaxtyping import Array, Float
 
 from rigidjax import _checks
 from rigidjax.identify import flat_limit
-from rigidjax.identify.horizons import Horizons, by_horizon, held_errors
-from rigidjax.identify.jacobian import with_jacobian
+from rigidjax.identify.flat_limit import unreal
 from rigidjax.identify.levenberg_marquardt import BOLD, Search, Settings, search
-from rigidjax.identify.open_loop import all_errors, open_loop_errors
 from rigidjax.identify.quantities import carried
-from rigidjax.identify.real_bodies import unreal
+from rigidjax.identify.terms import with_jacobian
 from rigidjax.identify.uncertainty import inverted
-from rigidjax.identify.window_starts import eliminated, precisions, require_kinds
-from rigidjax.identify.windows import Windows
-from rigidjax.motion.manifold import names, parts, plus
-from rigidjax.motion.torques.inputs import delays_of, require_inputs
+from rigidjax.identify.windows import Horizons, Windows, by_horizon, held_errors
+from rigidjax.motion.coupled import Coupled, motion_of, started
+from rigidjax.motion.manifold import minus_small, names, parts, plus
+from rigidjax.motion.torques.inputs import bind, delays_of, require_inputs
+from rigidjax.solve import equations_of_motion
+from rigidjax.solve.components import split
+from rigidjax.solve.equal_steps import in_a_loop
+from rigidjax.solve.fixed_loop import first_row, first_rows, step
+from rigidjax.solve.steppers import cheapest, stepper_of
 from rigidjax.solve.validation import require_fit
+
+
+def open_loop_errors(
+    scene: Any,
+    h: float,
+    value: Any,
+    start: Any,
+    wanted: Any,
+    inputs: Any,
+    steps: Any = None,
+) -> Float[Array, "steps n"]:
+    """The errors of one window, as changes from the measured states.
+
+    With `steps` given (a traced number: no reverse mode), only the first `steps` of the window
+    count; the others are zero.
+    """
+    body, law = scene(value)
+    size, length = jnp.asarray(h, wanted.omega.dtype), wanted.omega.shape[0]
+    before = next(iter(inputs.values())).shape[0] - length if inputs else 0
+    start = started(body, start, bind(law, first_row(law, size, inputs)), 0.0)
+    field = equations_of_motion(body, start, law)
+    stepper = stepper_of(in_a_loop(cheapest(field)), field, start)
+
+    def one(y: Any, i: Array) -> tuple[Any, Any]:
+        y = step(stepper, size, jnp.zeros_like(size), i, y, inputs or None, before)
+        return y, motion_of(stepper.state(y))
+
+    def ahead(y: Any, i: Array) -> tuple[Any, None]:
+        # The torque's own states follow the inputs; the body keeps its measured state.
+        y = step(stepper, size, jnp.zeros_like(size), i, y, inputs, before)
+        return split(Coupled(start.motion, stepper.state(y).own)), None
+
+    y0 = stepper.start
+    if before and isinstance(start, Coupled):
+        y0, _ = lax.scan(ahead, y0, jnp.arange(-before, 0, dtype=jnp.int32))
+    states = first_rows(length if steps is None else steps, one, y0, wanted)
+    return jax.vmap(minus_small)(states, wanted)
+
+
+@eqx.filter_jit
+def all_errors(windows: Windows, scene: Any, value: Any) -> Float[Array, "windows steps n"]:
+    """The errors of a model with these numbers."""
+
+    def one(window: Any) -> Array:
+        return open_loop_errors(scene, windows.step, value, *window)
+
+    parts = (windows.starts, windows.wanted, windows.inputs)
+    return lax.map(one, parts, batch_size=min(128, windows.count))
+
+
+# Steps of Gauss and Newton's for each start; residuals of a short run are nearly linear in it.
+_STEPS = 3
+
+
+def precisions(
+    starts: Any, kinds: tuple[str, ...], noise: Mapping[str, float] | None
+) -> Float[Array, " m"] | None:
+    """The precision of each number of the starts, (noise/deviation)²; `None` for exact starts.
+
+    **Raises:** `TypeError`, `ValueError` for unknown kinds, deviations that are not positive, or a
+    missing noise.
+    """
+    if starts is None:
+        return None
+    require_kinds(starts, kinds, "starts")
+    if noise is None:
+        raise ValueError(
+            "starts: deviations of the starts need the noise of the readings: give noise={…}, too"
+        )
+    found = []
+    for kind in kinds:
+        deviation = _checks.number(starts[kind], f"starts[{kind!r}]")
+        if not deviation > 0:
+            raise ValueError(
+                f"starts[{kind!r}]: wanted a positive deviation, or infinity for a start that is "
+                f"free, got {deviation}"
+            )
+        found += 3 * [(np.float64(noise[kind]) / deviation) ** 2]
+    return jnp.asarray(np.array(found))
+
+
+def require_kinds(given: Any, kinds: tuple[str, ...], name: str) -> None:
+    """Raise `TypeError`, `ValueError` for anything but a mapping with these keys."""
+    _checks.instance(given, Mapping, name, wanted="numbers by kind")
+    if set(given) != set(kinds):
+        raise ValueError(f"{name}: wanted a number for each of {kinds}, got {tuple(given)}")
+
+
+def eliminated(
+    residual: Callable[[Array, Array], Array], x: Array, firm: Float[Array, " m"]
+) -> tuple[Array, Array, Array]:
+    """Cost, normal matrix (n, n) and gradient (n,) of one window, the best start put in.
+
+    **Arguments:** `residual(x, step)`; `x` (n,); `firm` (m,) precisions of the start's numbers. The
+    cost is `½ |r|² + ½ Σ firm step²` at its least in `step`.
+    """
+    number = x.size
+
+    def better(_: Any, step: Array) -> Array:
+        jacobian, found = with_jacobian(lambda s: residual(x, s), step)
+        normal = jacobian.T @ jacobian + jnp.diag(firm)
+        return step - jnp.linalg.solve(normal, jacobian.T @ found + firm * step)
+
+    step = lax.fori_loop(0, _STEPS, better, jnp.zeros_like(firm))
+    both = jnp.concatenate([x, step])
+    jacobian, found = with_jacobian(lambda z: residual(z[:number], z[number:]), both)
+    gram, slope = jacobian.T @ jacobian, jacobian.T @ found
+    beside = gram[number:, number:] + jnp.diag(firm)
+    # The part of each number's effect that the start absorbs, and the remaining gradient.
+    sides = jnp.concatenate(
+        [gram[number:, :number], (slope[number:] + firm * step)[:, None]], axis=1
+    )
+    taken = gram[:number, number:] @ jnp.linalg.solve(beside, sides)
+    cost = 0.5 * (found @ found + jnp.sum(firm * step * step))
+    return cost, gram[:number, :number] - taken[:, :number], slope[:number] - taken[:, number]
+
 
 Value = TypeVar("Value")
 # Windows in one batch: with their tangents they fill the first cache.
