@@ -190,11 +190,9 @@ def _definite(covariance: np.ndarray) -> bool:
 
 
 class Terms(NamedTuple):
-    """The numbers read in each recording, each one normal given the earlier ones.
-
-    **Fields:** `error` (R, N) the reading minus its prediction, in standard deviations;
-    `log_variance` (R, N) the logarithm of 2π times its variance. Both are zero for a masked
-    reading; a channel at its limit counts by its probability, and has no variance.
+    """Each number read, normal given the earlier ones: its `error` (R, N) in standard deviations,
+    and `log_variance` (R, N), the logarithm of 2π times its variance; both zero where masked. A
+    channel at its limit counts by its probability, and has no variance.
     """
 
     error: Float[Array, "*records n"]
@@ -207,11 +205,7 @@ class Terms(NamedTuple):
 
 
 class Curvature(NamedTuple):
-    """The cost, minus a log-density, near a point.
-
-    **Fields:** `cost`; `slope` (n,) its gradient; `gram` (n, n) Fisher's information: the
-    expectation of its second derivative over readings that the point itself explains.
-    """
+    """The cost, minus a log-density, its gradient (n,), and Fisher's information (n, n)."""
 
     cost: Scalar
     slope: Float[Array, " n"]
@@ -282,11 +276,7 @@ def grown_noises(noises: tuple, steps: tuple) -> tuple[Float[Array, "*records k"
 
 
 def own_numbers(density: LogDensity, x: Array) -> Any:
-    """The numbers of x that each recording depends on, with a leading axis.
-
-    They are the problem's numbers, the logarithms of the noises' factors, and the process's
-    numbers.
-    """
+    """The problem's numbers, factors of noises and the process's numbers of each recording."""
     problem = density.problem
     parameters, factors, logs = ravel_pytree(density.like)[1](x)
     groups = groups_of(problem)
@@ -315,9 +305,8 @@ def _with_blocks(density: LogDensity, rows: Array) -> tuple[Terms, Terms]:
 def _of_one(
     density: LogDensity, own: tuple[Array, Any], record: Recording, ref: Any, which: Any
 ) -> Terms:
-    """The terms of one recording, the unknown torque integrated out by the filter.
-
-    **Arguments:** `own` its row of `_rows`, and the noises (k,) of its sensors at the fit.
+    """The terms of one recording, of its row `own` and the noises at the fit; the filter integrates
+    the unknown torque out.
     """
     problem = density.problem
     restore = ravel_pytree(padding.one(own_numbers(density, density.x0), 0))[1]

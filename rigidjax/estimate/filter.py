@@ -36,9 +36,7 @@ MEMORY_A_STEP = 0.25
 
 
 class Grid(NamedTuple):
-    """**Fields:** `t` (N,) s; `source` (N,) which row of the recording is next; `real` (N,) whether
-    it is of this time; `rows` (T,) where each time of the recording is.
-    """
+    """Times `t` (N,) s; the next row of the recording, and if it is `real`; where each row is."""
 
     t: Float[Array, " n"]
     source: Int[Array, " n"]
@@ -47,10 +45,7 @@ class Grid(NamedTuple):
 
 
 def grid_of(model: Model, recording: Recording, first: Belief, substeps: int | None) -> Grid | None:
-    """The times of the steps; `None` if the recording's own times are enough.
-
-    **Raises:** `ValueError` for a recording that begins before the belief that it starts from.
-    """
+    """The times of the steps; `None` if the recording's own times are enough."""
     t, t0 = recording.t, first.t
     if _checks.known((t, t0)):
         begin = np.asarray(t)[0]

@@ -123,10 +123,8 @@ class Joint(NamedTuple):
 
 
 def joint(grown: Array, noise: Array, root: Array) -> Joint:
-    """The roots of the predicted and of the conditional covariance, and the smoother's gain.
-
-    From one triangularisation of `[[F S, G], [S, 0]]`: Park and Kailath 1995,
-    doi:10.1080/00207179508921582.
+    """Roots of the predicted and the conditional covariance, and the smoother's gain, from the
+    triangle of `[[F S, G], [S, 0]]`: Park and Kailath 1995, doi:10.1080/00207179508921582.
     """
     n, m = noise.shape
     upper = jnp.concatenate([roots.product(grown, root), noise], 1)
@@ -143,10 +141,7 @@ def smoothed(
     """Means and roots at all times, and means and covariances of the unit noise of all steps.
 
     The pass back (Rauch, Tung, Striebel 1965), and of the noise (m, m) with `Z = L⁻¹ G`, L the
-    predicted root: `1 − ZᵀZ + (Zᵀ L⁻¹ S)(Zᵀ L⁻¹ S)ᵀ`, where S is the smoothed root after the step.
-
-    **Arguments:** for each step the result of `joint`, the mean before it, the `predicted` mean
-    after it, and G; `end` mean and root at the last time.
+    predicted root: `1 − ZᵀZ + (Zᵀ L⁻¹ S)(Zᵀ L⁻¹ S)ᵀ`, S the smoothed root after the step.
     """
 
     def kick(noise: Array, lower: Array, off: Array, root: Array) -> tuple[Array, Array]:

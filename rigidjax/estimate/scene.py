@@ -97,14 +97,8 @@ def bare(model: Model) -> Model:
 
 
 class Extended(eqx.Module):
-    """The state that a filter follows.
-
-    **Fields:** `motion` a `Spin`, `Attitude` or `Rigid`; `torques` the value (3,) of each
-    `CorrelatedTorque`, N m, body frame; `walks` the value of each `Walk`.
-
-    Errors of it are changes as `motion.manifold` counts them: first, for a `Rigid`, of x and v
-    (world frame); of the attitude, where there is one, δθ (rad, body frame); of Ω; then of torques
-    and walks.
+    """The state that a filter follows: the motion, each `CorrelatedTorque` (3,), N m, body frame,
+    and each `Walk`. Its errors are changes as `motion.manifold` counts them, in this order.
     """
 
     motion: Any
@@ -184,9 +178,8 @@ class Dynamics(eqx.Module):
     def predict(
         self, t: Scalar, h: Scalar, x: Extended, kicks: Array | None = None
     ) -> tuple[Extended, Float[Array, "n n"], Float[Array, "n m"]]:
-        """`x` a time `h` later, how errors grow, F (n, n), and the root of the noise, G (n, m).
-
-        Linearised about `kicks` (kicks,), `None` for none; drifts of walks come last in G.
+        """`x` a time `h` later, F (n, n) of its errors, and the root G (n, m) of the noise, about
+        `kicks`; drifts of walks come last in G.
         """
         kicks = jnp.zeros(self.kicks, x.motion.omega.dtype) if kicks is None else kicks
         after, push = jax.linearize(lambda y, k: self.advance(t, h, y, k), x, kicks)
@@ -250,11 +243,7 @@ def not_negative(value: Any, name: str) -> Array:
 
 
 class ReadingRow(NamedTuple):
-    """The reading of one sensor, linearised about a state.
-
-    **Fields:** `matrix` (k, n) how the prediction changes with an error e of the state; `error`
-    (k,) reading minus prediction; `variance` (k,) of the noise; `seen` (k,) whether it counts.
-    """
+    """One sensor's reading about a state: `matrix` (k, n) of the prediction, `error`, variance."""
 
     matrix: Float[Array, "k n"]
     error: Float[Array, " k"]
@@ -273,9 +262,8 @@ class _Recorded(eqx.Module):
 
 
 class Sensors(eqx.Module):
-    """The sensors of a recording, without its readings, and which of their numbers drift.
-
-    No function is kept, so that a second model of the same form does not compile again.
+    """The sensors without readings, and the leaves that drift. No function is kept: a second model
+    of the same form does not compile again.
     """
 
     readings: tuple[Mounted, ...]
@@ -353,10 +341,8 @@ def _rows(dynamics: Dynamics, sensors: Sensors, stop: Stops, x: Extended) -> lis
 
 
 class Read(NamedTuple):
-    """The innovations of one sensor's readings.
-
-    **Fields:** `innovation` (k,) the reading minus its prediction from all readings before, also
-    from the sensor's earlier components; `variance` (k,) of it; `seen` (k,).
+    """Innovations of one sensor, each reading minus its prediction from all numbers read before;
+    their variances.
     """
 
     innovation: Float[Array, "*times k"]

@@ -210,10 +210,7 @@ def _iterate(
     path: Extended,
     kicks: Array,
 ) -> tuple[Extended, _Solved]:
-    """One linearisation about `path`, at each time of the filter, and its exact solution.
-
-    It is also about the `kicks` between these times, in which the motion is not linear either.
-    """
+    """One linearisation about `path` and the `kicks` between its times, and its exact solution."""
     before = jnp.concatenate([first.t[None], stops.t[:-1]])
     dtype = first.root.dtype
     x0 = jax.tree.map(lambda leaf: leaf[0], path)

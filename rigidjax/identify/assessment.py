@@ -30,10 +30,8 @@ HALF, QUARTER, TENTH = 0.5, 0.25, 0.1
 
 
 class Goodness(eqx.Module):
-    """The agreement of the errors with the sensors' noise.
-
-    **Fields:** `chi2`, `dof` of the sensors whose noise was given; `model` the answer; `left` the
-    indices of the sensors whose errors the model does not explain.
+    """χ² and its degrees of freedom (sensors of given noise), the answer, the sensors left
+    unexplained.
     """
 
     chi2: float
@@ -46,15 +44,10 @@ def goodness(problem: Problem, linear: Linearised, times: Times, free: int) -> G
     """χ² of the sensors with a given noise, and the sensors whose errors the model does not
     explain.
 
-    The size of each sensor's errors is compared with a given noise (five standard deviations of χ²,
-    or of the median of the squared errors under a robust loss), and with the variance of its
-    readings. Ljung and Box's test says whether the errors are white (with one false alarm in 1e5).
-    Readings at full scale take no part.
-
-    **Arguments:** `linear` the problem at its best point; `times` the errors' correlation; `free`
-    how many numbers are free.
-
-    Source: Ljung and Box 1978, doi:10.1093/biomet/65.2.297.
+    The size of the errors is compared with a given noise (five standard deviations of χ², or of the
+    median of the squares under a robust loss) and with the variance of the readings; Ljung and
+    Box's test (1978, doi:10.1093/biomet/65.2.297) says whether they are white. Readings at full
+    scale take no part.
     """
     chi2, count, word = 0.0, 0, EXPLAINS
     words: list[str] = []
@@ -169,9 +162,8 @@ def median_of_chi2(size: int) -> tuple[float, float]:
 
 
 def _white(e: np.ndarray, kept: np.ndarray, given: bool) -> bool:
-    """Whether whitened errors (R, T, k) are white, in all channels together.
-
-    Errors far below a `given` noise are no evidence against a fit.
+    """Whether whitened errors (R, T, k) are white; errors far below a `given` noise are no
+    evidence.
     """
     from scipy.special import chdtrc
 
@@ -205,11 +197,8 @@ AT_THE_END = 0.05
 
 
 def _margin(problem: Problem, best_cost: float, longest: float) -> float:
-    """The largest excess over the best misfit with which a start still explains the data.
-
-    Ten units of log-likelihood: a point further above the best is e¹⁰ times less likely. The cost
-    of the best point is half the number of readings if the noise is estimated there. Autocorrelated
-    errors count as fewer.
+    """The largest excess over the best misfit with which a start still explains the data: ten units
+    of log-likelihood, of the noise as estimated; autocorrelated errors count as fewer.
     """
     guessed = any(sensor.noise is None for sensor in problem.records.sensors)
     unit = 2 * best_cost / problem.records.size if guessed else 1.0
@@ -252,10 +241,7 @@ def assess(
     best_cost: float,
     interrupted: Sequence[str] = (),
 ) -> Fit:
-    """The `Fit` of the best point of all starts, converged or not.
-
-    `interrupted` gives the point of the search in words.
-    """
+    """The `Fit` of the best point of all starts, converged or not."""
     value = best.parameters
     near = flat_limit.beside(problem, value)
     linear = uncertainty.linearise(problem, value, noise, best.found, near)

@@ -375,12 +375,8 @@ def _padded(x: Float[Array, "*rows n"], before: int, after: int) -> Float[Array,
 
 
 class Bodies(eqx.Module):
-    """The charts of several bodies, by name; their numbers follow one another.
-
-    Charts of the same kind are kept stacked, so that one program serves all recordings.
-
-    **Arguments:** `charts` name → chart. **Raises** `ValueError` if some bodies have a mass and
-    some have none.
+    """The charts of several bodies, by name; their numbers follow one another. Charts of the same
+    kind are kept stacked, so that one program serves all recordings.
     """
 
     names: tuple[str, ...] = eqx.field(static=True)

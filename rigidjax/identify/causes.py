@@ -56,9 +56,8 @@ ATTITUDES = {
 def misread(recordings: Sequence[Recording]) -> Cause | None:
     """The mistake in reading the rates of one body, if there is one.
 
-    The rates are compared with the rates between attitudes. Without attitudes they are compared
-    with Euler's equations, integrated over the record, for the best body: a correction counts only
-    if that is a real body. A mirrored axis cannot be detected without a torque.
+    Rates are compared with those between attitudes, or else with Euler's equations for the best
+    body: a correction counts only if that is real. A mirrored axis shows only under a torque.
     """
     gyros = readings_of(recordings[0], Gyro)
     if not gyros or not _as_the_body(gyros[0].sensor):
@@ -258,9 +257,8 @@ def _table(
 def _response(
     problem: Problem, parameters: Parameters, noise: Noise, linear: Linearised, index: int
 ) -> Callable[[np.ndarray], np.ndarray]:
-    """The effect of torques (R, T, 3, c) on rates: `Φ(t) ∫ Φ⁻¹ I⁻¹ τ dt` (variation of constants).
-
-    Φ is the derivative of the rates in the initial rate, which the fit of a gyro has computed.
+    """The effect of torques (R, T, 3, c) on rates: `Φ(t) ∫ Φ⁻¹ I⁻¹ τ dt` with Φ = dΩ/dΩ₀ of the
+    fit.
     """
     if not isinstance(problem.records.readings[index].sensor, Gyro):
         return np.zeros_like
@@ -288,9 +286,8 @@ def _explained(
     free: np.ndarray,
     direction: np.ndarray,
 ) -> tuple[float, np.ndarray]:
-    """The share of squared errors that a direction (R, T, k, c) explains, and its coefficient.
-
-    `free` (R, N, m) are orthonormal columns of the free numbers; of the sensors in `which`.
+    """The share of squared errors that a direction (R, T, k, c) explains beside the orthonormal
+    columns `free` (R, N, m) of the free numbers, and its coefficient.
     """
     roots = [np.sqrt(weight)[..., None] for weight in linear.weights]
     errors = [e * root for e, root in zip(linear.errors, roots, strict=True)]

@@ -58,9 +58,7 @@ SENSOR_UNITS = {
 
 
 class Channel(eqx.Module):
-    """One sensor of a log: what kind, which columns, in which unit, how noisy (in that unit; one
-    figure or one for each axis), and its full scale (in that unit).
-    """
+    """One sensor of a log; noise (one figure or one for each axis) and full scale in its unit."""
 
     kind: str
     columns: tuple[str, ...]
@@ -242,14 +240,8 @@ def problem_of(
     free: Sequence[str] = (),
     loss: str = "soft-l1",
 ) -> Problem:
-    """The problem of these recordings.
-
-    **Arguments:** `recordings` of `read_log`; `model` one of `ratios`, `principal-ratios`,
-    `tensor`, `principal`; `typical` kg m², the rough size of the moments; `free` as for `read_log`:
-    a drag coefficient for all, a bias and a delay for each recording; `loss` the weight of an
-    outlier: `soft-l1`, `huber` (both linear), `none` (squared).
-
-    **Raises** `LogError` for an unknown model, or a scale that no reading can show.
+    """The problem of recordings of `read_log`: a drag for all, a bias and a delay for each
+    recording.
     """
     if model not in MODELS:
         raise LogError(f"model: wanted one of {', '.join(MODELS)}, got {model!r}")

@@ -20,17 +20,10 @@ COLUMNS = ("time", "gyroADC[0]", "gyroADC[1]", "gyroADC[2]")
 
 
 def read_blackbox(path: Path, columns: Sequence[str]) -> tuple[list[str], dict[str, Any]]:
-    """The names of all fields, and those that are wanted, of the first flight in a file.
+    """The names of all fields, and the wanted ones, of the first flight in a file.
 
-    Rates (`gyroADC[i]`) come in deg/s and accelerations (`accSmooth[i]`) in g, by the scales in the
-    header; other fields as logged, the time in µs. A log without its last mark, as after a crash,
-    is read up to its end.
-
-    Source: the parser is that of the package orangebox; the scales are those of the flight
-    controllers' own viewer: raw × gyro_scale is deg/s (Baseflight: rad/µs), raw / acc_1G is g.
-
-    **Raises:** `ModuleNotFoundError` if orangebox is missing; orangebox's own errors for a file of
-    another kind.
+    Rates come in deg/s and accelerations in g by the scales in the header, as in the flight
+    controllers' own viewer; other fields as logged. A log without its last mark is read to its end.
     """
     try:
         from orangebox import Parser
@@ -86,11 +79,7 @@ USUAL = Layout(("t", "wx", "wy", "wz"), "rad/s", "s")
 
 
 def layout_of(path: str | Path) -> Layout:
-    """The layout of a log: phyphox or Blackbox if the names match, else `USUAL`.
-
-    phyphox writes `Time (s)` and three columns such as `Gyroscope x (rad/s)`, in the language of
-    the phone. It raises nothing: errors of a file are raised when it is read.
-    """
+    """The layout of a log: phyphox (any language) or Blackbox if the names match, else `USUAL`."""
     path = Path(path)
     if path.suffix.lower() in SUFFIXES:
         return Layout(COLUMNS, "deg/s", "us")

@@ -299,8 +299,8 @@ def _errors_alone(parameters: Parameters, problem: Problem) -> tuple[Float[Array
 
 
 def _finer(problem: Problem, best: Tried, noise: Noise) -> AbstractIntegrator | None:
-    """A finer integrator if twice as many fixed steps change predictions by a twentieth of the
-    noise: more fixed steps, or adaptive ones; else `None`.
+    """A finer integrator, if twice as many fixed steps change predictions by a twentieth of the
+    noise.
     """
     steps = problem.integrator
     if not isinstance(steps, FixedSteps):

@@ -20,11 +20,8 @@ ONE_SIDED = 1.645
 
 
 class Limit(eqx.Module):
-    """The distance of a body from a flat one: `flatness = (I1 + I2 − I3) / I3`, never negative.
-
-    **Fields:** `where` the suffix of the names of the body's quantities; `flatness` at the best
-    point; `free` its value in the linear problem, which may be negative; `slope`
-    (n,) its derivative in the free numbers.
+    """The distance of a body from a flat one: `flatness = (I1 + I2 − I3) / I3` at the best point,
+    `free` its value in the linear problem, which may be negative, `slope` (n,) its derivative.
     """
 
     where: str
@@ -87,9 +84,8 @@ def in_words(body: Inertia | MassProperties) -> str | None:
 def beside(problem: Problem, parameters: Parameters) -> Parameters | None:
     """The same numbers, but flat bodies a little thicker; `None` if no body is flat.
 
-    The chart has a derivative of zero at a flat body: no reading changes with the thickness. The
-    information about the tensor itself is regular there and hardly changes over such a small
-    thickness.
+    The chart has a derivative of zero at a flat body; the information about the tensor itself is
+    regular there and hardly changes over such a small thickness.
     """
     vectors, first, changed = [], 0, False
     bodies = bodies_of(problem, parameters)
@@ -159,9 +155,8 @@ def limits(
 ) -> tuple[Limit, ...]:
     """The limit of each body whose moments are free.
 
-    **Arguments:** `found` numbers and their derivatives, the last ones being the flatness of each
-    body; `step` (n,) to the least misfit of the linear problem; `names` the suffixes of the names
-    of a body's quantities.
+    `found` are numbers and derivatives, the flatness of each body last; `step` (n,) leads to the
+    least misfit of the linear problem; `names` are the suffixes of the bodies' quantities.
     """
     rows = zip(names, *(part[-len(names) :] for part in found), strict=True)
     kept = [_has_limit(chart) for chart in charts_of(problem.body)]

@@ -16,10 +16,8 @@ MOST = 0.7
 
 
 def plateau(values: np.ndarray) -> float | None:
-    """The full scale (> 0) of one channel (T,) if its largest readings are cut off, else `None`.
-
-    It is the largest magnitude if more readings in a row have it than at the top of a smooth wave:
-    with the last digit d and second differences a the top has `2 √(2d/a)` equal readings.
+    """The full scale of one channel (T,) if its largest readings are cut off: more readings in a
+    row than the `2 √(2d/a)` at the top of a smooth wave of last digit d, second differences a.
     """
     size = np.abs(values)
     top = float(size.max(initial=0.0))
@@ -38,10 +36,7 @@ def plateau(values: np.ndarray) -> float | None:
 
 
 def with_limits(recordings: Sequence[Recording]) -> list[Recording]:
-    """The recordings, with the full scale found in the sensors that were cut off.
-
-    A sensor keeps its `limit` if it has one.
-    """
+    """The recordings, with the full scale found in the sensors that have no `limit` yet."""
     found = [[_limits(reading) for reading in r.readings] for r in recordings]
     out = list(recordings)
     for index in range(len(found[0])):

@@ -91,9 +91,8 @@ TENSOR = dict(zip(Tensor.plain_names, COMPONENTS, strict=True))
 def undetermined(fit: "Fit") -> tuple[Combination, ...]:
     """The combinations that the data do not determine at all, each of few numbers.
 
-    The rows of `Fit.null_directions` are an arbitrary basis. Here each row has a number that no
-    other has (the reduced echelon form). Initial attitudes are in the axes, world or body, that
-    need fewer numbers.
+    Each row has a number that no other has (reduced echelon form); initial attitudes are in the
+    axes, world or body, that need fewer numbers.
     """
     null = np.asarray(fit.null_directions)
     if not null.size:
@@ -163,10 +162,8 @@ def _names(problem: Problem) -> list[list[tuple[str, str, bool]]]:
 
 @eqx.filter_jit
 def _slopes(problem: Problem, parameters: Parameters) -> tuple[Array, Array]:
-    """The derivatives (2, M, n) of the named numbers in the free ones, and their values (M,).
-
-    They are all reported quantities, the tensors of the bodies, and the initial attitudes,
-    positions and velocities; the attitudes in the world's axes, then in the body's.
+    """Derivatives (2, M, n) of the named numbers, attitudes in the world's or body's axes; values
+    (M,).
     """
     flat, restore = ravel_pytree(parameters)
     reference = problem.reference
@@ -193,9 +190,7 @@ def _slopes(problem: Problem, parameters: Parameters) -> tuple[Array, Array]:
 
 
 def _kept(fit: "Fit", names: list[str], changes: np.ndarray) -> np.ndarray:
-    """The numbers that name the changes (k, M): the moments of each body, or the components of its
-    tensor if the principal axes turn.
-    """
+    """The numbers that name changes (k, M): moments, or the tensor's components if axes turn."""
     rows = in_a_row(fit.problem.bodies(fit.beside))
     kept = np.ones(len(names), bool)
     for (where, chart), body in zip(charts(fit.problem), rows, strict=True):
@@ -242,10 +237,7 @@ def _signed(number: float) -> str:
 
 
 def identifiability(fit: "Fit") -> tuple[str, ...]:
-    """The quantities that the data determine well, weakly, and not at all.
-
-    Nothing is called determined if the fit does not explain the data, or did not end.
-    """
+    """The quantities that the data determine well, weakly, and not at all."""
     lost = fit.model.word == FAILS
     if lost or fit.search.word == NOT_ENDED:
         why = "does not explain the data" if lost else "did not end in a minimum"
@@ -357,10 +349,7 @@ def scale_is_unseen(fit: "Fit") -> bool:
 
 
 def correlations(fit: "Fit") -> list[str]:
-    """Pairs of reported quantities whose errors are correlated (|ρ| > 0.95).
-
-    An inertia tensor enters by its principal moments, not by its components.
-    """
+    """Pairs of reported quantities (moments, not components) whose errors have |ρ| > 0.95."""
     covariance = reported_covariance(fit)
     deviation = np.array([quantity.deviation for quantity in fit.quantities])
     good = np.isfinite(deviation) & (deviation > 0)

@@ -52,14 +52,12 @@ def _float(value: Any) -> np.ndarray:
 
 
 class Settings(eqx.Module):
-    """The settings of a search: arrays, so as not to compile again.
+    """The settings of a search, as arrays: another value does not compile again.
 
-    **Fields:** `tolerance`: steps of so many standard deviations (of each parameter with all others
-    fixed) end it; `damping` at the start; `steps` at most; `aim` a misfit reached by another
-    search: this one ends if it would need more than `PATIENCE` steps at its pace to reach it; 0 for
-    none; `level`: a step with about the predicted gain also ends it, if that gain is less than this
-    part of the gain that a fit has from noise alone (see `search`); `near` a misfit that is low
-    enough to end at; 0 for none.
+    Steps of `tolerance` standard deviations (of each number alone) end it, and more than `steps`;
+    if it would need more than `PATIENCE` steps at its pace to an `aim` of another search; if a step
+    of about the predicted gain gains less than `level` of what a fit gains from noise; at a cost of
+    `near`. Zero for none.
     """
 
     tolerance: Any = eqx.field(converter=_float)
@@ -71,13 +69,9 @@ class Settings(eqx.Module):
 
 
 class Search(eqx.Module):
-    """The state of a search.
-
-    **Fields:** `first` the cost at the start; `point` (n,) the best so far, its `cost`, the normal
-    matrix `gram` (n, n) and the gradient `slope` (n,) there; `trial` (n,) the next point, `hoped`
-    its predicted gain; `damping`; `pace` the decrease of the logarithm of the cost in a step;
-    `taken` evaluations; `done`, `converged`; `found` the result of the last evaluation (see
-    `with_blocks`), `here` whether that was at `point`.
+    """The state of a search: the best `point` so far, with `gram` (n, n) and `slope` there; the
+    `trial` next, and its `hoped` gain; `pace` of the logarithm of the cost; evaluations `taken`;
+    `found` of the last one, whether `here` at the best point.
     """
 
     first: Float[Array, ""]
@@ -163,16 +157,13 @@ def search(
 ) -> Search:
     """At most `settings.steps` steps down from `start`; with none, `start` is evaluated.
 
-    **Arguments:** `evaluated` point (n,) → values to keep from the last evaluation, the cost, the
-    normal matrix (n, n), the gradient (n,): half a sum of squares, or minus a log-density with
-    Fisher's information as the normal matrix (scoring); `made` (n,) one for numbers scaled to order
-    one, which no step moves far, else zero; `nothing` zeros of the shapes of the kept values;
-    `by_noise` the kept values, the normal matrix → the expected excess of the cost at the true
-    numbers over the least, for `settings.level`.
+    **Arguments:** `evaluated` point → values to keep, cost, normal matrix, gradient: of half a sum
+    of squares, or minus a log-density with Fisher's information (scoring); `made` (n,) one for
+    numbers of order one, which no step moves far, else zero; `nothing` zeros like the kept values;
+    `by_noise` of them and the normal matrix: the expected excess of the cost at the true numbers.
 
-    Source: Marquardt 1963, doi:10.1137/0111030; the damping by the ratio of actual to predicted
-    gain, Madsen, Nielsen and Tingleff 2004, Methods for non-linear least squares
-    problems, section 3.2.
+    Source: Marquardt 1963, doi:10.1137/0111030; damping by the ratio of actual to predicted gain:
+    Madsen, Nielsen and Tingleff 2004, Methods for non-linear least squares problems, section 3.2.
     """
     number, kind = start.size, start.dtype
 
@@ -290,10 +281,8 @@ def _nothing(problem: Problem, start: Parameters, columns: int, kind: Any) -> An
 
 
 def made_of(parameters: Parameters) -> Float[Array, " n"]:
-    """One for the numbers scaled to order one, zero for the numbers of a `Free`.
-
-    The unit of a `Free` is a user's guess. The scale of the others is at most one, so that a
-    weakly observed number takes no large steps.
+    """One for numbers scaled to order one, zero for those of a `Free`, whose unit is a user's
+    guess.
     """
     ones, zeros = (jax.tree.map(of, parameters) for of in (jnp.ones_like, jnp.zeros_like))
     marked = eqx.tree_at(lambda p: (p.shared, p.own.each), ones, (zeros.shared, zeros.own.each))

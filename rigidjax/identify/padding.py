@@ -14,10 +14,8 @@ from rigidjax.motion.torques import Linear, Series
 
 
 def stack(recordings: Sequence[Recording]) -> tuple[Recording, tuple[int, ...]]:
-    """One recording with a leading axis, and the number of times of each original one.
-
-    The shorter ones are continued with masked readings at their last time, tables of time with
-    their last value. **Raises** `ValueError` if sensors or torques differ in kind.
+    """One recording with a leading axis, and the number of times of each: shorter ones are
+    continued with masked readings at their last time, tables of time with their last value.
     """
     counts = tuple(int(r.t.shape[0]) for r in recordings)
     longest = max(counts)

@@ -93,12 +93,8 @@ def shares(each: Any, name: str) -> bool | str | tuple[Any, ...]:
 
 
 class Slot(eqx.Module):
-    """A `Free` found in the recordings: which leaf it is. No function is kept, so that a second
-    problem of the same form does not compile again.
-
-    **Fields:** `each` whether every recording has its own; `groups` (R,) the index of each
-    recording's value if groups share values, `labels` of the groups; `prior`, `spread` in steps,
-    `estimated` whether the spread is only a first guess.
+    """A `Free` found in the recordings: which leaf it is, and the group of each recording (R,).
+    `prior` and `spread` are in steps. No function is kept: a second problem does not compile again.
     """
 
     leaf: int = eqx.field(static=True)
@@ -139,11 +135,7 @@ class Slot(eqx.Module):
 def grouped(
     each: str | tuple[Any, ...], of: Sequence[str], name: str
 ) -> tuple[Array, tuple[str, ...]]:
-    """The index of each recording's group, and the groups' labels.
-
-    **Arguments:** `each` `"body"`, or one label for each recording; `of` the name of each
-    recording's body; `name` for messages. **Raises** `ValueError` for another number of labels.
-    """
+    """The index of each recording's group, and the groups' labels: of bodies, or as given."""
     row = list(of) if isinstance(each, str) else list(each)
     if len(row) != len(of):
         raise ValueError(
@@ -155,11 +147,7 @@ def grouped(
 
 
 def find(free: Sequence[Free], recording: Recording, of: Sequence[str] = ("",)) -> tuple[Slot, ...]:
-    """The leaf of the recording that each `Free` moves; `of` the name of each recording's body.
-
-    **Raises** `ValueError` if it picks nothing, something other than numbers, or the same numbers
-    twice.
-    """
+    """The leaf of the recording that each `Free` moves; `of` the name of each recording's body."""
     slots: list[Slot] = []
     for item in free:
         _checks.instance(item, Free, "free", wanted="Free(where, name)")
@@ -187,11 +175,7 @@ def find(free: Sequence[Free], recording: Recording, of: Sequence[str] = ("",)) 
 
 
 def leaf_at(where: Callable[[Any], Any], tree: Any, name: str, what: str) -> tuple[int, Any]:
-    """The index of the leaf that `where` picks, and the leaf: an array of numbers.
-
-    **Arguments:** `name` for messages; `what` needs a starting value instead of `None`.
-    **Raises** `ValueError` if it picks nothing, several leaves, or something other than numbers.
-    """
+    """The index of the leaf that `where` picks, and the leaf: an array of numbers."""
     leaves, structure = jax.tree.flatten(tree)
     try:
         index = where(jax.tree.unflatten(structure, list(range(len(leaves)))))
@@ -307,10 +291,8 @@ class Unpacked(eqx.Module):
 
 
 class Local(eqx.Module):
-    """The free numbers that one recording depends on.
-
-    **Fields:** `body` (K,) of its body, padded to the largest chart; `steps` one for each `Free`;
-    `place`, `speed`, `turn`, `spin` as in `Own`.
+    """What one recording depends on: numbers of its body (padded to the largest chart), one step
+    for each `Free`, and the initial state as in `Own`.
     """
 
     body: Float[Array, "*records chart"]
@@ -361,9 +343,8 @@ def _of_each(slot: "Slot", shared: Array, count: int) -> Array:
 
 
 def columns(problem: "Problem", one: Local) -> np.ndarray:
-    """The recording's number that belongs to each column of its block.
-
-    All numbers in order; then again the numbers made of a shared value and a deviation.
+    """The recording's number of each column of its block: all; then shared ones with a deviation
+    again.
     """
     counted = numbered(one)
     twice = [

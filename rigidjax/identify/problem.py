@@ -280,10 +280,7 @@ class Problem(eqx.Module):
 
 
 def one_problem(problem: Any) -> Problem:
-    """`problem`, if it is a valid `Problem`.
-
-    **Raises:** `TypeError` for another type, `ValueError` for arrays of other shapes.
-    """
+    """`problem`, if it is one `Problem`; else `TypeError`, `ValueError`."""
     _checks.instance(problem, Problem, "problem")
     records, rate = problem.records, problem.reference.rate
     shapes = {records.t.shape, *(reading.mask.shape for reading in records.readings)}
@@ -298,11 +295,7 @@ def one_problem(problem: Any) -> Problem:
 
 
 def fits(problem: Problem, parameters: Parameters) -> Parameters:
-    """`parameters`, if they are of this problem.
-
-    **Raises:** `TypeError` for another type or dtype, `ValueError` for other shapes, and for known
-    NaN.
-    """
+    """`parameters`, if they are of this problem; else `TypeError`, `ValueError`."""
     one_problem(problem)
     hint = "problem.start(body) makes them"
     _checks.instance(parameters, Parameters, "parameters", hint=hint)
@@ -346,10 +339,8 @@ def _shapes(problem: Problem) -> dict[str, list[tuple[int, ...]]]:
 
 
 class Links(eqx.Module):
-    """The condition that each recording starts at the end of the one before: pieces of a long one.
-
-    **Fields:** `on` (R,) one if the recording continues in the next, else zero; `width` the
-    standard deviation of the gap between them, in order-one numbers.
+    """Pieces of a long recording: `on` (R,) one if it continues in the next, else zero; `width` the
+    standard deviation of the gap, in order-one numbers.
     """
 
     on: Float[Array, " records"]

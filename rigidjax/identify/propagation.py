@@ -73,10 +73,7 @@ class FixedSteps(AbstractIntegrator):
 
 
 class FirstPart(AbstractIntegrator):
-    """`FixedSteps` up to the last time that a part of the record needs.
-
-    **Fields:** `steps`; `last` the number of the last time that is needed, `None` for all.
-    """
+    """`FixedSteps` up to the number of the `last` time that is needed, `None` for all."""
 
     steps: FixedSteps
     last: Int[Array, ""] | None
@@ -164,12 +161,8 @@ def what_turns(body: Any, rung: type) -> Any:
 def sensor_inputs(
     sensor: Any, body: Any, torque: Any, ts: Array, state0: Any, states: Any
 ) -> tuple[Array, Any, Callable[[Array, Any], SensorInput]]:
-    """The times that a sensor shows at `ts` (T,), the states then, and its input at one time.
-
-    Times and states differ from `ts` and `states` if the sensor's clock has an `offset`.
-
-    **Arguments:** `state0` the initial state, without the torques' own; `states` with a leading
-    time axis, `Coupled` if a torque has states of its own.
+    """The times that a sensor shows at `ts` (T,), by its clock; the states then; its input at one
+    time. `states` are `Coupled` if a torque has states of its own.
     """
     turned = what_turns(body, type(state0))
     field = equations_of_motion(turned, state0, torque)

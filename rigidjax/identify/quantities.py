@@ -157,11 +157,8 @@ def quantities(
     null: np.ndarray,
     limits: tuple[flat_limit.Limit, ...] = (),
 ) -> tuple[Quantity, ...]:
-    """Every reported quantity with its standard deviation.
-
-    **Arguments:** `found` the result of `values_and_slopes`; `covariance` (n, n) within the
-    determined directions; `null` (k, n) the undetermined directions; `limits` that cut the
-    intervals.
+    """Every reported quantity with its standard deviation, of `values_and_slopes`; `covariance`
+    within the determined directions, `null` (k, n) the others; `limits` cut the intervals.
     """
     names = labels(problem)
     values, slope = (part[: len(names)] for part in found)
@@ -208,9 +205,7 @@ def covariance(fit: "Fit") -> np.ndarray:
 def carried(slope: np.ndarray, covariance: np.ndarray, null: np.ndarray) -> np.ndarray:
     """Standard deviations of functions with this derivative (…, n); all intervals use them.
 
-    It is infinite if the function changes along a direction of `null` (k, n). It is NaN, not
-    determined, if the function changes along a direction of negative variance, or its variance is
-    round-off.
+    Infinite along a direction of `null` (k, n); NaN along one of negative variance or round-off.
     """
     if not np.isfinite(covariance).all():
         return np.full(slope.shape[:-1], np.nan)
@@ -255,9 +250,8 @@ def interval_of(
 
 
 def quantile(fit: "Fit", level: float) -> float:
-    """Half-width of an interval in standard deviations: Student's where the noise is estimated.
-
-    Autocorrelated errors count as fewer independent ones.
+    """Half-width of an interval in standard deviations: Student's where the noise is estimated, by
+    the number of independent errors.
     """
     level = _checks.fraction(level, "interval", "a level between 0 and 1")
     from scipy.special import ndtri, stdtrit

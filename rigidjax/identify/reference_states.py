@@ -35,11 +35,8 @@ _FIRM = 1e-3
 
 
 def attitudes(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
-    """Times (n,), s, and attitudes (n, 4), body → world, that the readings show; n may be 0.
-
-    They come from an attitude sensor. Otherwise, at times with readings of all sensors, they are
-    the rotation that best takes the markers' places and directions from the body to the world
-    (`rigidjax.so3.wahba`), from at least three markers not in line, or two directions.
+    """Times (n,), s, and attitudes (n, 4), body → world, that the readings show; n may be 0: of an
+    attitude sensor, or by `rigidjax.so3.wahba` from three markers or two directions.
     """
     t = np.asarray(recording.t)
     for reading in readings_of(recording, AttitudeSensor):
@@ -169,10 +166,8 @@ def _first_attitude(recording: Recording) -> np.ndarray:
 
 
 def _first_place(recording: Recording) -> tuple[np.ndarray, np.ndarray, float]:
-    """First position and velocity of the body's frame, m and m/s, and a typical length, m.
-
-    They belong to the frame's origin if attitudes give its distance from the markers, and to the
-    centre of mass if its position, or ranges to it, were read.
+    """First position and velocity, m and m/s, and a typical length, m: of the centre of mass, or of
+    the body's frame if only markers were read.
     """
     direct = _read_place(recording)
     if direct is not None:
@@ -231,11 +226,8 @@ def _read_place(recording: Recording) -> tuple[np.ndarray, np.ndarray, float] | 
 
 
 def _from_ranges(stations: np.ndarray, lengths: np.ndarray) -> np.ndarray:
-    """Places (n, 3) that distances (n, k) to stations (k, 3) show.
-
-    The differences of `|x|² − 2 s·x + |s|² = d²` from their mean are linear in x; along
-    undetermined directions (fewer than four stations, or stations in a plane) it is the stations'
-    centre.
+    """Places (n, 3) of distances (n, k) to stations: differences of `|x|² − 2 s·x + |s|² = d²` are
+    linear in x; along directions that these leave open it is the stations' centre.
     """
     centre = stations.mean(axis=0)
     s = stations - centre

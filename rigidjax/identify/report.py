@@ -213,10 +213,7 @@ def as_dict(fit: Fit, files: Sequence[str] = (), more: Sequence[Row] = ()) -> di
 
 
 def _rms_of_axes(fit: Fit) -> list[tuple[str, list[float], str]]:
-    """Root mean square error of each component of each sensor, without readings at full scale.
-
-    **Returns** for each sensor its name, the figures, and their unit.
-    """
+    """Name, rms of each component without readings at full scale, and unit of sensors."""
     one_fit(fit)
     readings = fit.problem.records.readings
     out = []

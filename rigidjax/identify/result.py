@@ -208,10 +208,7 @@ class Fit(eqx.Module):
 
 
 def one_fit(found: Any, name: str = "fit") -> Fit:
-    """`found`, if it is one `Fit`, not many in one container.
-
-    **Raises:** `TypeError` for another type, `ValueError` for leading axes.
-    """
+    """`found`, if it is one `Fit`, not many in one container; else `TypeError`, `ValueError`."""
     _checks.instance(found, Fit, name)
     if np.shape(found.chi2) != ():
         raise ValueError(

@@ -45,9 +45,7 @@ def least_squares(
     aim: float = 0.0,
     near: float = 0.0,
 ) -> Tried:
-    """At most `max_steps` steps from `start`; fewer if they do not lead to an `aim`, or are `near`
-    (see `Settings`).
-    """
+    """At most `max_steps` steps from `start` (see `Settings`)."""
     settings = Settings(tolerance, damping, max_steps, aim, near=near)
     return _ended(*_descend(start, problem, noise, weights, settings))
 
@@ -68,10 +66,7 @@ def _descend(
 
 
 def evaluate(parameters: Parameters, problem: Problem) -> Any:
-    """Errors and last states with their derivatives (see `with_blocks`).
-
-    It uses the program of the search, so that no other one for the motion is compiled.
-    """
+    """Errors and last states with their derivatives, by the program of the search."""
     kind = problem.records.t.dtype
     noise = tuple(
         jnp.asarray(np.ones((problem.count, reading.sensor.components), kind))
@@ -137,12 +132,9 @@ def settle(
     strides: int = 0,
     aim: float = 0.0,
 ) -> Tried:
-    """Strides from the end of `tried` until one more changes nothing.
-
-    A search may report convergence only because of large damping: it has converged if a new search
-    from its end stays there. `tried.cost` is the misfit at its end, infinite if unknown; `near`
-    says that it is near the minimum already; `strides` the number before it; `aim` see `Settings`.
-    `look` is called after each stride, with the number so far and whether it was the last.
+    """Strides from the end of `tried` until one more changes nothing: large damping alone can look
+    like convergence. `near` says that it is near the minimum; `strides` were made before; `look` is
+    called after each stride, with their number and whether it was the last.
     """
     if strides and bool(tried.converged):
         look(tried, strides, True)
@@ -196,10 +188,8 @@ def climb(
     look: Callable[[SearchState], None] = lambda position: None,
     aim: float = 0.0,
 ) -> Tried:
-    """The search from one start; `look` is called after each stride with its state.
-
-    It fits the whole record at once if that explains it, else the horizons in turn. `aim` is the
-    misfit of another start that explains the record: a search that does not lead there ends early.
+    """The search from one start: the whole record at once if that explains it, else the horizons in
+    turn; it ends early if it does not lead to `aim`. `look` is called after each stride.
     """
     tried, start, level = _at_once(start, problem, noise, tolerance, max_steps, aim)
     for stage in range(start.stage, len(HORIZONS)):
@@ -256,8 +246,8 @@ def _at_once(
 
 
 def enough(problem: Problem) -> float:
-    """A misfit that only the true motion reaches: twice the mean of χ²; errors of a hundredth of
-    the signal if the noise was guessed at a tenth.
+    """A misfit that only the true motion reaches: twice the mean of χ², or a hundredth of the
+    signal.
     """
     total = 0.0
     for reading in problem.records.readings:

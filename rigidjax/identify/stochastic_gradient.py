@@ -62,12 +62,8 @@ def descend(
     key: PRNGKeyArray,
     progress: Callable[[str], Any] | None = None,
 ) -> tuple[Parameters, bool]:
-    """The end of the steps of `how`, or the last point before the misfit became NaN.
-
-    **Arguments:** `start`; `problem` of any number of recordings; `noise` (R, k) of each sensor;
-    `how`; `key` of the draws; `progress` called with a line of text now and then. **Returns** the
-    point, and whether the steps were not interrupted (Ctrl-C). **Raises** `ValueError` if a batch
-    is larger than the number of recordings, or the recordings are pieces of one.
+    """The end of the steps, or the last point before a misfit of NaN; and whether it was not
+    interrupted.
     """
     if how.batch > problem.count:
         raise ValueError(
@@ -112,10 +108,7 @@ def _stride(
 
 
 def _misfit_of(point: Parameters, problem: Problem, noise: Noise, rows: Array) -> Float[Array, ""]:
-    """The estimate of the whole misfit by these recordings: theirs times the number of batches.
-
-    Priors count once.
-    """
+    """These recordings' misfit times the number of batches; priors count once."""
     few, mine, theirs = only(problem, rows), _rows(point.own, rows), tuple(n[rows] for n in noise)
     weights = jnp.ones_like(few.records.t)
     read, beside = residuals(Parameters(point.body, point.shared, mine), (few, theirs, weights))
@@ -123,10 +116,7 @@ def _misfit_of(point: Parameters, problem: Problem, noise: Noise, rows: Array) -
 
 
 def only(problem: Problem, rows: Array) -> Problem:
-    """The problem of some of its recordings, by their indices (which may be traced).
-
-    It serves misfits alone: its `recordings` are not cut to their own lengths.
-    """
+    """The problem of some recordings (traced indices), for misfits: they keep their padding."""
 
     def pick(at: Any, whole: Any) -> Any:
         return whole if at(whole) is None else eqx.tree_at(at, whole, _rows(at(whole), rows))

@@ -36,10 +36,7 @@ def filled(problem: "Problem", mine: Local, record: Recording) -> Recording:
 def states_of_one(
     problem: "Problem", mine: Local, record: Recording, ref: ReferenceStates, which: Array | None
 ) -> tuple[Recording, Any, Any, Any]:
-    """One recording with its values filled in, its body, its initial state and its states.
-
-    The states are `Coupled` if a torque has states of its own.
-    """
+    """One recording with its values filled in, its body, initial state and states."""
     record = filled(problem, mine, record)
     body = matter(problem.body, mine.body, which)
     state0 = ref.moved(mine)
@@ -51,11 +48,7 @@ def states_of_one(
 def errors_of_one(
     problem: "Problem", mine: Local, record: Recording, ref: ReferenceStates, which: Array | None
 ) -> tuple[tuple[Array, ...], Any]:
-    """The errors (T, k) of each sensor in one recording, and the last state.
-
-    **Arguments:** `mine` the numbers that it depends on; `record`, `ref`; `which` the index of its
-    body among several.
-    """
+    """The errors (T, k) of each sensor in one recording, and the last state."""
     record, body, state0, states = states_of_one(problem, mine, record, ref, which)
     out = []
     for reading in record.readings:
@@ -101,9 +94,8 @@ def _error_of(sensor: Any, now: SensorInput, value: Array) -> Array:
 def over_records(function: Any, problem: "Problem", mine: Any) -> Any:
     """`function(mine, record, reference, which)` of every recording.
 
-    On a CPU recordings run one after another: XLA makes one kernel of a loop over a few dozen
-    numbers. For many recordings at once it does not; that compiles twice as long and runs longer.
-    Batches have size one, since scalars within another loop run at half the speed.
+    On a CPU one after another: XLA makes one kernel of a loop over a few dozen numbers, and scalars
+    within an inner loop run at half the speed.
     """
     trees = mine, problem.records, problem.reference, problem.which
     if problem.count == 1:
@@ -117,10 +109,8 @@ def over_records(function: Any, problem: "Problem", mine: Any) -> Any:
 
 @eqx.filter_custom_jvp
 def all_errors(parameters: Parameters, problem: "Problem") -> tuple[tuple[Array, ...], Any]:
-    """The errors (R, T, k) of each sensor, and the last states (R, …).
-
-    Its derivative is computed recording by recording: each has a block for the numbers that it
-    depends on, and no zeros pass through the motion.
+    """The errors (R, T, k) of each sensor, and the last states; differentiated recording by
+    recording.
     """
 
     def of_one(*trees: Any) -> Any:
@@ -166,9 +156,8 @@ def normal_matrix(blocks: Sequence[Array], where: Array, size: int) -> Array:
 
 
 def with_blocks(parameters: Parameters, problem: "Problem") -> tuple[Any, Any]:
-    """The errors and last states, and their derivatives (…, n) in what each recording depends on.
-
-    `places` gives the flattened parameter of each of the n columns.
+    """The errors and last states, and their derivatives (…, n) in the recording's numbers; `places`
+    gives each column's place.
     """
     mine = local(problem, parameters)
     single = padding.one(mine, 0)
@@ -221,10 +210,8 @@ def standardised(
     sigma: Float[Array, " k"],
     limit: Float[Array, " k"] | None,
 ) -> tuple[Float[Array, "times k"], Bool[Array, "times k"]]:
-    """Errors in standard deviations, saturated channels by their probability; and a mask of these.
-
-    A channel at its limit says "at least that much": it counts as `√(−2 log Φ(z))`, with z the
-    excess of the prediction over the limit in standard deviations (Tobin 1958,
+    """Errors in standard deviations, and the mask of saturated channels: these say "at least that
+    much", and count as `√(−2 log Φ(z))`, z the prediction's excess over the limit (Tobin 1958,
     doi:10.2307/1907382).
     """
     scaled = error / sigma[None]
@@ -243,11 +230,7 @@ def _censored(z: Float[Array, "..."]) -> Float[Array, "..."]:
 
 
 def residuals(parameters: Parameters, args: Any) -> Any:
-    """All residuals of a fit, as a tree: readings, priors, joints between pieces.
-
-    **Arguments:** `parameters`; `args` the problem, the noise of each sensor, and weights (R, T)
-    of the times.
-    """
+    """All residuals of a fit, as a tree, of `args`: problem, noise of sensors, weights (R, T)."""
     problem, noise, weights = args
     errors, ends = all_errors(parameters, problem)
     return seen(problem, errors, noise, weights), beside(parameters, problem, ends)

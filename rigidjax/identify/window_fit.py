@@ -39,11 +39,7 @@ def open_loop_errors(
     inputs: Any,
     steps: Any = None,
 ) -> Float[Array, "steps n"]:
-    """The errors of one window, as changes from the measured states.
-
-    With `steps` given (a traced number: no reverse mode), only the first `steps` of the window
-    count; the others are zero.
-    """
+    """The errors of one window, as changes from the measured states; zero beyond `steps`."""
     body, law = scene(value)
     size, length = jnp.asarray(h, wanted.omega.dtype), wanted.omega.shape[0]
     before = next(iter(inputs.values())).shape[0] - length if inputs else 0
@@ -85,11 +81,7 @@ _STEPS = 3
 def precisions(
     starts: Any, kinds: tuple[str, ...], noise: Mapping[str, float] | None
 ) -> Float[Array, " m"] | None:
-    """The precision of each number of the starts, (noise/deviation)²; `None` for exact starts.
-
-    **Raises:** `TypeError`, `ValueError` for unknown kinds, deviations that are not positive, or a
-    missing noise.
-    """
+    """The precision of each number of the starts, (noise/deviation)²; `None` for exact starts."""
     if starts is None:
         return None
     require_kinds(starts, kinds, "starts")
@@ -119,10 +111,8 @@ def require_kinds(given: Any, kinds: tuple[str, ...], name: str) -> None:
 def eliminated(
     residual: Callable[[Array, Array], Array], x: Array, firm: Float[Array, " m"]
 ) -> tuple[Array, Array, Array]:
-    """Cost, normal matrix (n, n) and gradient (n,) of one window, the best start put in.
-
-    **Arguments:** `residual(x, step)`; `x` (n,); `firm` (m,) precisions of the start's numbers. The
-    cost is `½ |r|² + ½ Σ firm step²` at its least in `step`.
+    """Cost `½ |r|² + ½ Σ firm step²`, normal matrix and gradient of one window, the best start put
+    in (variable projection: Golub and Pereyra 2003, doi:10.1088/0266-5611/19/2/201).
     """
     number = x.size
 
@@ -374,9 +364,7 @@ def _scales(windows: Windows, steps: int, noise: Mapping[str, float] | None) -> 
 
 
 def _padded(windows: Windows) -> tuple[Any, Any, Any]:
-    """Starts, states and inputs of the windows. The last window is repeated until their number is a
-    multiple of the batch: a remainder would need a second program.
-    """
+    """Starts, states and inputs, the last repeated to full batches: a rest needs a program more."""
     order = np.minimum(
         np.arange(-(-windows.count // _SIDE_BY_SIDE) * _SIDE_BY_SIDE), windows.count - 1
     )
@@ -396,9 +384,8 @@ def _searched(
     settings: Settings,
     steps: Any,
 ) -> Search:
-    """The search from `guess`; it keeps the spread of the windows' gradients (n, n).
-
-    `count` of the windows, the first ones, take part, and the first `steps` of each.
+    """The search from `guess` over the first `steps` of the first `count` windows; it keeps the
+    spread of the windows' gradients (n, n).
     """
     x, back = ravel_pytree(guess)
 
@@ -443,10 +430,8 @@ def _searched(
 
 
 def _by_noise(spread: Array, gram: Array) -> Array:
-    """½ tr(K G⁻¹): the mean excess of the cost at the true numbers over the least cost.
-
-    It is half a residual's variance for each number if residuals are independent. Source: Takeuchi
-    1976; Burnham and Anderson 2002, doi:10.1007/b97636, section 7.2.
+    """½ tr(K G⁻¹), the mean excess of the cost at the true numbers: Takeuchi 1976; Burnham and
+    Anderson 2002, doi:10.1007/b97636, section 7.2.
     """
     felt = jnp.diagonal(gram)
     root = jnp.sqrt(jnp.maximum(felt, 1e-12 * jnp.max(felt)))

@@ -127,13 +127,8 @@ def shown(
     mounting: Vec3 | None,
     skew: Vec3 | None = None,
 ) -> Vec3:
-    """The prediction of a vector sensor: `scale · S exp(−mounting) v + bias`.
-
-    Its axes need not be orthogonal: `S = [[1, a, b], [0, 1, c], [0, 0, 1]]` of the skew (a, b, c).
-
-    **Arguments:** `truth` v (3,) body frame; `bias` (3,) in the sensor's unit; `scale` (3,) per
-    channel; `mounting` (3,) rotation vector that turns the body's axes onto the sensor's, rad;
-    `skew` (3,) the shares of y in x, of z in x, and of z in y.
+    """`scale · S exp(−mounting) v + bias` with `S = [[1, a, b], [0, 1, c], [0, 0, 1]]` of the skew
+    (a, b, c): what a vector sensor shows of `truth` v (3,), body frame.
     """
     seen = truth
     if mounting is not None:

@@ -108,9 +108,7 @@ def _within(t: np.ndarray, values: np.ndarray) -> None:
 
 
 def _slopes(gaps: Array, steps: Array, fresh: Array) -> tuple[Array, Array]:
-    """du/dt at both ends of each interval, of the parabola through the three nearest samples; of
-    the chord beside a gap.
-    """
+    """du/dt at both ends of each interval, of the nearest parabola; of the chord beside a gap."""
     h, chord = gaps[:, None], steps / gaps[:, None]
     apart = (fresh[1:] | fresh[:-1])[:, None]
     bend = jnp.where(apart, 0.0, jnp.diff(chord, axis=0) / (h[1:] + h[:-1]))
@@ -129,9 +127,7 @@ def _begin(gaps: Array, chord: Array) -> tuple[Array, Array, Array]:
 
 
 def _first(w: Array, u0: Array, du0: Any, u1: Array, du1: Any) -> tuple[Any, Any, Any]:
-    """The filter's answer to the cubic itself at both ends of each interval, and the decay of the
-    difference from it.
-    """
+    """The answer to the cubic itself at both ends of each interval; the decay of what differs."""
 
     def own(u: Array, du: Any) -> Array:
         return (u - du[0] / w + du[1] / w**2 - du[2] / w**3)[..., None]
