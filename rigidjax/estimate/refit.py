@@ -20,9 +20,10 @@ from jaxtyping import Array, Bool, Float
 from rigidjax import _checks
 from rigidjax._types import Scalar
 from rigidjax.estimate.density import LogDensity, curvature, of_draws
-from rigidjax.identify.levenberg_marquardt import Settings, made_of, search
+from rigidjax.identify.levenberg_marquardt import Settings, search
 from rigidjax.identify.parameters import Unpacked
 from rigidjax.identify.quantities import carried
+from rigidjax.identify.search import made_of
 
 # Steps of so many standard deviations end the search; its damping at the start.
 _SMALL, _DAMPING = 1e-3, 1e-2

@@ -29,28 +29,25 @@ class AbstractBodyChart(eqx.Module):
     """A chart of bodies: `size` numbers → an `Inertia` or `MassProperties`, and back.
 
     `log_names`, `unit` and `logs(body)` describe the positive quantities that are reported, through
-    their logarithms; `plain_names` and `plain(body)` describe quantities of either sign.
+    their logarithms; `plain_names` and `plain(body)` quantities of either sign, none unless given.
 
     >>> class Spheres(AbstractBodyChart):  # one number: the logarithm of the moment
-    ...     size, in_words, unit = 1, "the moment of a sphere", "kg m²"
-    ...     log_names, plain_names = ("I",), ()
+    ...     size, in_words, unit, log_names = 1, "the moment of a sphere", "kg m²", ("I",)
     ...     def body(self, vector):
     ...         return Inertia.from_principal(*jnp.exp(vector[0]) * jnp.ones(3))
     ...     def vector(self, body):
     ...         return self.logs(body)
     ...     def logs(self, body):
     ...         return jnp.log(body.tensor[0, 0])[None]
-    ...     def plain(self, body):
-    ...         return jnp.zeros(0)
     >>> Spheres().body(jnp.zeros(1)).tensor[0].tolist()
     [1.0, 0.0, 0.0]
     """
 
     size: eqx.AbstractVar[int]
-    in_words: eqx.AbstractClassVar[str]
-    log_names: eqx.AbstractClassVar[tuple[str, ...]]
-    plain_names: eqx.AbstractClassVar[tuple[str, ...]]
-    unit: eqx.AbstractClassVar[str]
+    in_words: eqx.AbstractVar[str]
+    log_names: eqx.AbstractVar[tuple[str, ...]]
+    plain_names: ClassVar[tuple[str, ...]] = ()
+    unit: ClassVar[str] = ""
 
     @abc.abstractmethod
     def body(self, vector: Float[Array, " chart"]) -> Inertia | MassProperties:
@@ -66,8 +63,7 @@ class AbstractBodyChart(eqx.Module):
         """Rows whose squares are the second derivative of a misfit from the chart's curvature.
 
         They matter if a body may be flat (`rigidjax.body.parameters.flat_bend`); else there are
-        none.
-        **Arguments:** `slope` the misfit's derivative in the chart's numbers.
+        none. **Arguments:** `slope` the misfit's derivative in the chart's numbers.
         """
         return jnp.zeros((0, self.size), vector.dtype)
 
@@ -75,9 +71,9 @@ class AbstractBodyChart(eqx.Module):
     def logs(self, body: Any) -> Float[Array, " logs"]:
         """Logarithms of the positive quantities that are reported."""
 
-    @abc.abstractmethod
     def plain(self, body: Any) -> Float[Array, " plain"]:
         """The other quantities that are reported."""
+        return jnp.zeros(0)
 
 
 class Ratios(AbstractBodyChart):
@@ -93,8 +89,6 @@ class Ratios(AbstractBodyChart):
     size: ClassVar[int] = 5
     in_words: ClassVar[str] = "the inertia tensor up to scale"
     log_names: ClassVar[tuple[str, ...]] = ("I1/I3", "I2/I3")
-    plain_names: ClassVar[tuple[str, ...]] = ()
-    unit: ClassVar[str] = ""
 
     def body(self, vector: Float[Array, " chart"]) -> Inertia:
         return Inertia(swap_trace(charts.unpack_shape(vector)))
@@ -111,9 +105,6 @@ class Ratios(AbstractBodyChart):
         moments = jnp.log(body.moments)
         return moments[:2] - moments[2]
 
-    def plain(self, body: Inertia) -> Float[Array, "0"]:
-        return jnp.zeros(0, body.tensor.dtype)
-
 
 class PrincipalRatios(AbstractBodyChart):
     """Two ratios of moments, where the body axes are known to be principal.
@@ -128,12 +119,9 @@ class PrincipalRatios(AbstractBodyChart):
     size: ClassVar[int] = 2
     in_words: ClassVar[str] = "two ratios of moments, the body axes being principal"
     log_names: ClassVar[tuple[str, ...]] = ("Ix/Iz", "Iy/Iz")
-    plain_names: ClassVar[tuple[str, ...]] = ()
-    unit: ClassVar[str] = ""
 
     def body(self, vector: Float[Array, " chart"]) -> Inertia:
-        moments = charts.unpack_moments(jnp.concatenate([jnp.zeros(1, vector.dtype), vector]))
-        return Inertia(jnp.diag(moments / 3.0))
+        return Inertia(jnp.diag(charts.unpack_moments(_padded(vector, 1, 0)) / 3.0))
 
     def vector(self, body: Inertia) -> Float[Array, " chart"]:
         return charts.pack_moments(jnp.diagonal(body.tensor))[1:]
@@ -146,9 +134,6 @@ class PrincipalRatios(AbstractBodyChart):
     def logs(self, body: Inertia) -> Float[Array, "2"]:
         i = jnp.diagonal(body.tensor)
         return jnp.log(i[:2] / i[2])
-
-    def plain(self, body: Inertia) -> Float[Array, "0"]:
-        return jnp.zeros(0, body.tensor.dtype)
 
 
 def _typical(value: Any) -> Array:
@@ -182,8 +167,7 @@ class Tensor(AbstractBodyChart):
     unit: ClassVar[str] = "kg m²"
 
     def body(self, vector: Float[Array, " chart"]) -> Inertia:
-        s = charts.unpack_second_moment(vector) * (0.5 * self.typical)
-        return Inertia(swap_trace(s))
+        return Inertia(swap_trace(charts.unpack_second_moment(vector) * (0.5 * self.typical)))
 
     def vector(self, body: Inertia) -> Float[Array, " chart"]:
         return charts.pack_second_moment(body.second_moment / (0.5 * self.typical))
@@ -191,7 +175,7 @@ class Tensor(AbstractBodyChart):
     def bend(
         self, vector: Float[Array, " chart"], slope: Float[Array, " chart"]
     ) -> Float[Array, "rows chart"]:
-        return _padded(charts.flat_bend(vector[1:], slope[1:]), 1, 0)
+        return _padded(Ratios().bend(vector[1:], slope[1:]), 1, 0)
 
     def logs(self, body: Inertia) -> Float[Array, "3"]:
         return jnp.log(body.moments)
@@ -215,7 +199,6 @@ class Principal(AbstractBodyChart):
     size: ClassVar[int] = 3
     in_words: ClassVar[str] = "three moments, the body axes being principal"
     log_names: ClassVar[tuple[str, ...]] = ("Ix", "Iy", "Iz")
-    plain_names: ClassVar[tuple[str, ...]] = ()
     unit: ClassVar[str] = "kg m²"
 
     def body(self, vector: Float[Array, " chart"]) -> Inertia:
@@ -227,14 +210,10 @@ class Principal(AbstractBodyChart):
     def bend(
         self, vector: Float[Array, " chart"], slope: Float[Array, " chart"]
     ) -> Float[Array, "rows chart"]:
-        shape, slope = (_padded(x[1:], 0, 3) for x in (vector, slope))
-        return _padded(charts.flat_bend(shape, slope)[:, :2], 1, 0)
+        return _padded(PrincipalRatios().bend(vector[1:], slope[1:]), 1, 0)
 
     def logs(self, body: Inertia) -> Float[Array, "3"]:
         return jnp.log(jnp.diagonal(body.tensor))
-
-    def plain(self, body: Inertia) -> Float[Array, "0"]:
-        return jnp.zeros(0, body.tensor.dtype)
 
 
 class Mass(AbstractBodyChart):
@@ -258,6 +237,10 @@ class Mass(AbstractBodyChart):
 
     guess: MassProperties
     free: tuple[str, ...] = eqx.field(static=True)
+    size: int = eqx.field(static=True)
+    in_words: str = eqx.field(static=True)
+    log_names: tuple[str, ...] = eqx.field(static=True)
+    plain_names: tuple[str, ...] = eqx.field(static=True)  # pyright: ignore
     unit: ClassVar[str] = "SI"
 
     def __init__(self, guess: MassProperties, free: Sequence[str] = tuple(_PARTS)):
@@ -270,28 +253,12 @@ class Mass(AbstractBodyChart):
         if not chosen:
             raise ValueError("free: wanted mass, inertia or com, got none; see Known")
         self.free = tuple(name for name in _PARTS if name in chosen)
-
-    @property
-    def size(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """The number of free numbers."""
-        return len(self._places)
-
-    @property
-    def in_words(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """The free parts, in words."""
+        self.size = len(self._places)
         *most, last = [_PARTS[name][0] for name in self.free]
-        return f"{', '.join(most)} and {last}" if most else last
-
-    @property
-    def log_names(self) -> tuple[str, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """The positive quantities."""
-        mass = ("mass",) if "mass" in self.free else ()
-        return (*mass, "I1", "I2", "I3") if "inertia" in self.free else mass
-
-    @property
-    def plain_names(self) -> tuple[str, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """The others."""
-        return ("com x", "com y", "com z") if "com" in self.free else ()
+        self.in_words = f"{', '.join(most)} and {last}" if most else last
+        moments = ("I1", "I2", "I3") if "inertia" in chosen else ()
+        self.log_names = ("mass", *moments) if "mass" in chosen else moments
+        self.plain_names = ("com x", "com y", "com z") if "com" in chosen else ()
 
     @property
     def _places(self) -> list[int]:
@@ -350,8 +317,6 @@ class Known(AbstractBodyChart):
     size: ClassVar[int] = 0
     in_words: ClassVar[str] = "nothing of the body"
     log_names: ClassVar[tuple[str, ...]] = ()
-    plain_names: ClassVar[tuple[str, ...]] = ()
-    unit: ClassVar[str] = ""
 
     def __check_init__(self) -> None:
         _checks.single(self.known, (Inertia, MassProperties), "known")
@@ -363,9 +328,6 @@ class Known(AbstractBodyChart):
         return jnp.zeros(0, body.tensor.dtype)
 
     def logs(self, body: Any) -> Float[Array, "0"]:
-        return jnp.zeros(0)
-
-    def plain(self, body: Any) -> Float[Array, "0"]:
         return jnp.zeros(0)
 
 

@@ -22,8 +22,8 @@ class Tried(eqx.Module):
     """
 
     parameters: Parameters
-    cost: Float[Array, ""]
-    converged: Bool[Array, ""]
+    cost: Float[Array, "*starts"] = eqx.field(converter=jnp.asarray, default=np.inf)
+    converged: Bool[Array, "*starts"] = eqx.field(converter=jnp.asarray, default=False)
     found: Any = None
 
 

@@ -12,8 +12,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from rigidjax import _checks
 from rigidjax.identify.parameters import Parameters
 from rigidjax.identify.problem import Problem
-from rigidjax.identify.search import half_sum
-from rigidjax.identify.terms import Noise, residuals
+from rigidjax.identify.terms import Noise, half_sum, residuals
 
 if TYPE_CHECKING:
     import optax

@@ -298,3 +298,8 @@ def weights_of(problem: "Problem", errors: tuple, noise: Noise) -> tuple[Float[A
     weight = jax.vmap(jax.vmap(problem.loss.weight))
     scaled = whitened(problem, errors, noise)
     return tuple(jnp.where(mask, weight(e), 0.0) for mask, e in zip(masks, scaled, strict=True))
+
+
+def half_sum(tree: Any) -> Float[Array, ""]:
+    """Half the sum of the squares of all leaves."""
+    return 0.5 * sum((jnp.sum(leaf**2) for leaf in jax.tree.leaves(tree)), jnp.zeros(()))

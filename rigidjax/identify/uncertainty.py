@@ -11,10 +11,9 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from rigidjax.identify.full_scale import at_limit
-from rigidjax.identify.levenberg_marquardt import beside_rows
 from rigidjax.identify.parameters import Parameters, places
 from rigidjax.identify.problem import Problem
-from rigidjax.identify.search import evaluate
+from rigidjax.identify.search import beside_rows, evaluate
 from rigidjax.identify.terms import Noise, weights_of, whitened, with_rows
 
 # A direction is undetermined if its singular value is below this share of the largest.
