@@ -81,9 +81,7 @@ def start(
     initial attitude and rate from the recording (`Spin` if no sensor shows an attitude). Then
     standard deviations, one number or three, zero for known values: `rate` of Ω, rad/s; `attitude`
     rad; `position` m and `velocity` m/s of a `Rigid`. Torques start from their model's stationary
-    distribution.
-
-    **Returns** a `Belief`: `t`, `state`, `deviation`, `covariance`.
+    distribution. **Returns** a `Belief`: `t`, `state`, `deviation`, `covariance`.
 
     **Raises:** `ValueError` for a deviation that is missing or below zero, `TypeError` for
     arguments of another type.

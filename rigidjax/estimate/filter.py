@@ -173,10 +173,8 @@ def filter(
     readings are gaps, channels at their full scale are left out, a sensor's `offset` is a delay;
     `first` of `start`; `substeps` fixed steps from one time to the next, `None` chooses them by the
     rate if the numbers are known, else one. `throw`: with `False` no event of the run raises an
-    error; see `status`.
-
-    **Returns** `belief`, `readings`, `log_likelihood`, `status` and `lost_at` (`Filtered`). It may
-    be jitted, differentiated, and batched over any argument.
+    error; see `status`. **Returns** `belief`, `readings`, `log_likelihood`, `status` and `lost_at`
+    (`Filtered`). It may be jitted, differentiated, and batched over any argument.
 
     **Raises:** `ValueError` for a sensor without noise, and readings before `first`; with `throw`
     also for a lost filter: no reading was within 6 deviations of its prediction for a second and
@@ -231,12 +229,9 @@ def step(model: Model, belief: Belief, t: ScalarLike, *readings: tuple) -> Belie
     `where` finds the sensors as `r.readings[i].sensor`, in this order, so each call gives them all.
 
     This is one step of the classical method: the time between readings must be short against a
-    turn.
-
-    **Returns** the `Belief` at `t`: `state`, `deviation`, `covariance`, and what is of its torques.
-
-    **Raises:** `ValueError` for a `t` before the belief, or a reading with NaN, if the numbers are
-    known.
+    turn. **Returns** the `Belief` at `t`: `state`, `deviation`, `covariance`, and what is of its
+    torques. **Raises:** `ValueError` for a `t` before the belief, or a reading with NaN, if the
+    numbers are known.
 
     >>> import jax, rigidjax as rj
     >>> gyro = rj.identify.Gyro(0.1)

@@ -20,9 +20,8 @@ class LinearModel(eqx.Module):
     `matrix` H (k, n); `deviation` r (k,) of the noise of each number read; then, `None` for zero,
     `push` d (n,) and `offset` c (k,). Each may have a leading axis: F, G, d over the steps between
     T times (T − 1), H, r, c over the times (T). Make correlated noise independent first: divide y,
-    H, c by the Cholesky factor of its covariance.
-
-    **Raises:** `ValueError` for shapes that do not fit, and a deviation that is not positive.
+    H, c by the Cholesky factor of its covariance. **Raises:** `ValueError` for shapes that do not
+    fit, and a deviation that is not positive.
 
     >>> walk = LinearModel(jnp.eye(1), 0.1 * jnp.eye(1), jnp.eye(1), jnp.ones(1))
     >>> walk.size
@@ -174,9 +173,7 @@ def linear_filter(
 
     **Arguments:** `model`; `readings` y (T, k); `mean` (n,) and `root` (n, n), a root of the
     covariance, at the first time before its reading; `seen` (T, k) which numbers count, `None` all.
-
     **Returns** `mean`, `root`, `innovation`, `variance` and `log_likelihood` (`LinearEstimate`).
-
     **Raises:** `ValueError` for shapes that do not fit, NaN that is not masked.
 
     >>> walk = LinearModel(jnp.eye(1), 0.1 * jnp.eye(1), jnp.eye(1), jnp.ones(1))

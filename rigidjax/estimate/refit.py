@@ -126,12 +126,9 @@ def refit(
     each recording is long. `estimate.posterior` draws from any density.
 
     **Arguments:** `density` a `LogDensity`; `max_steps` at most; `draws` how many; `key` of
-    `jax.random` for them, by default always the same.
-
-    **Returns** a `Refit`; `converged` is false if it ended early, or if some combination of the
-    numbers changes neither readings nor priors: `weights` are then NaN.
-
-    **Raises:** `TypeError` for arguments of another type.
+    `jax.random` for them, by default always the same. **Returns** a `Refit`; `converged` is false
+    if it ended early, or if some combination of the numbers changes neither readings nor priors:
+    `weights` are then NaN. **Raises:** `TypeError` for arguments of another type.
 
     >>> import rigidjax as rj
     >>> ts = jnp.linspace(0.0, 10.0, 80)

@@ -47,12 +47,9 @@ def sample(key: Any, model: Model, state0: Any, ts: Any, *, substeps: int | None
 
     **Arguments:** `key` of `jax.random`; `model`; `state0` a `Spin`, `Attitude` or `Rigid`; `ts`
     (T,) increasing times, s, the first is of `state0`; `substeps` fixed steps between two times,
-    `None` chooses them by the rate if it is known, else one.
-
-    **Returns** `t`, `states` and `torques` at these times (`Sampled`).
-
-    **Raises:** `ValueError` for times that do not increase, `TypeError` for arguments of another
-    type.
+    `None` chooses them by the rate if it is known, else one. **Returns** `t`, `states` and
+    `torques` at these times (`Sampled`). **Raises:** `ValueError` for times that do not increase,
+    `TypeError` for arguments of another type.
 
     >>> import jax, rigidjax as rj
     >>> body = rj.Inertia.from_principal(1.0, 2.0, 2.5)

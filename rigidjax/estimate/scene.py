@@ -32,7 +32,6 @@ class Walk(eqx.Module):
     **Arguments:** `where` picks it as a `Free` does: `lambda r: r.readings[0].sensor.bias`; its
     value in the recording is the initial value; `deviation` of that value, one number or one for
     each component, in its unit; `density` of the drift, unit² / s, ≥ 0: zero for a constant error.
-
     **Raises** `ValueError` for a deviation or density below zero.
 
     >>> Walk(lambda r: r.readings[0].sensor.bias, 0.01).density.tolist()
@@ -55,9 +54,7 @@ class Model(eqx.Module):
 
     **Arguments:** `body` an `Inertia`, or `MassProperties` for a `Rigid` state; `torque` any
     torques, among them `RandomTorque` and `CorrelatedTorque`, several in a `Sum`; `None` for a free
-    body without noise; `walks` the `Walk`s.
-
-    **Raises:** `TypeError` for arguments of another type.
+    body without noise; `walks` the `Walk`s. **Raises:** `TypeError` for arguments of another type.
 
     >>> import rigidjax as rj
     >>> model = Model(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.torques.RandomTorque(1e-4))
@@ -72,11 +69,7 @@ class Model(eqx.Module):
     walks: tuple[Walk, ...]
 
     def __init__(
-        self,
-        body: Inertia | MassProperties,
-        torque: Torque | None = None,
-        *,
-        walks: Any = (),
+        self, body: Inertia | MassProperties, torque: Torque | None = None, *, walks: Any = ()
     ):
         self.body = _checks.single(body, (Inertia, MassProperties), "body")
         parts = [] if torque is None else _parts(torque)

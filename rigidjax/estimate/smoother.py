@@ -107,12 +107,9 @@ def smooth(
 
     **Arguments:** as for `filter`; `iterations` at most; it ends when no number moved by more than
     `tolerance` of its standard deviation (the error that remains is about the square of that).
-
     **Returns** `belief`, `rows`, `pushes`, `readings`, `log_likelihood`, `change`, `iterations`,
     `status` and `lost_at` (`Smoothed`). It may be jitted, differentiated in forward mode, and
-    batched.
-
-    **Raises:** as `filter`; with `throw` also for a motion that still moves by a standard
+    batched. **Raises:** as `filter`; with `throw` also for a motion that still moves by a standard
     deviation.
 
     >>> import rigidjax as rj
@@ -203,12 +200,7 @@ def _smooth(task: Task, iterations: int, tolerance: float) -> Smoothed:
 
 
 def _iterate(
-    dynamics: Dynamics,
-    sensors: Sensors,
-    first: Belief,
-    stops: Stops,
-    path: Extended,
-    kicks: Array,
+    dynamics: Dynamics, sensors: Sensors, first: Belief, stops: Stops, path: Extended, kicks: Array
 ) -> tuple[Extended, _Solved]:
     """One linearisation about `path` and the `kicks` between its times, and its exact solution."""
     before = jnp.concatenate([first.t[None], stops.t[:-1]])

@@ -225,9 +225,8 @@ class Mass(AbstractBodyChart):
     numbers that are not free; `free` the parts that a fit may move: `"mass"` (the second moment
     keeps its ratio to the mass unless the inertia is free, too), `"inertia"` about the centre of
     mass, `"com"`. Take `free=["inertia"]` for a body that was weighed and balanced, `["mass"]` for
-    a load of known shape, `["com"]` for a centre that moved.
-
-    **Raises:** `TypeError` for a guess of another type; `ValueError` for another word, or none.
+    a load of known shape, `["com"]` for a centre that moved. **Raises:** `TypeError` for a guess of
+    another type; `ValueError` for another word, or none.
 
     >>> import rigidjax as rj
     >>> box = rj.shapes.box(2.0, [1.0, 1.0, 1.0])

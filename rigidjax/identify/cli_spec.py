@@ -30,12 +30,7 @@ from rigidjax.identify.loss import Huber, SoftL1
 from rigidjax.identify.parameters import Free
 from rigidjax.identify.problem import Problem
 from rigidjax.identify.recording import Recording
-from rigidjax.identify.sensors import (
-    AbstractSensor,
-    Accelerometer,
-    AttitudeSensor,
-    Gyro,
-)
+from rigidjax.identify.sensors import AbstractSensor, Accelerometer, AttitudeSensor, Gyro
 from rigidjax.motion.torques import Damping, Flywheel, Series, Sum, Wheel
 from rigidjax.motion.torques.base import Torque
 from rigidjax.rotation import euler
@@ -154,9 +149,8 @@ def read_log(
 
     **Arguments:** `path`; `channels`; `time`, `time_unit` the time column; `window` (from, to), s,
     or `None` for all; `wheels`; `free` some of `bias`, `drag`, `delay`: sensors and torque get
-    these numbers, so that a fit can move them. An empty cell is a gap.
-
-    **Raises** `LogError` as `read_table`.
+    these numbers, so that a fit can move them. An empty cell is a gap. **Raises** `LogError` as
+    `read_table`.
 
     >>> read_log("missing.csv", [channel("gyro=wx,wy,wz")])
     Traceback (most recent call last):

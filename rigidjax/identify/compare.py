@@ -43,9 +43,7 @@ def compare(fits: Mapping[str, Fit]) -> tuple[Comparison, ...]:
 
     **Arguments:** `fits` name → `Fit`, all of the same readings. **Raises** `ValueError` for none,
     or for fits of other readings. **Returns** for each `name`, `free`, `rms`, `correlation` and
-    `information` (`Comparison`).
-
-    Source: Schwarz 1978, doi:10.1214/aos/1176344136.
+    `information` (`Comparison`). Source: Schwarz 1978, doi:10.1214/aos/1176344136.
 
     >>> import rigidjax as rj
     >>> ts = jnp.linspace(0.0, 10.0, 80)
@@ -86,9 +84,7 @@ def compare(fits: Mapping[str, Fit]) -> tuple[Comparison, ...]:
 
 
 def cross_validate(
-    build: Callable[[Sequence[Recording]], Problem],
-    recordings: Sequence[Recording],
-    **options: Any,
+    build: Callable[[Sequence[Recording]], Problem], recordings: Sequence[Recording], **options: Any
 ) -> tuple[tuple[float, ...], ...]:
     """The errors of each recording under a body fitted to all other recordings.
 

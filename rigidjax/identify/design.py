@@ -25,9 +25,8 @@ def expected(problem: Problem, parameters: Parameters) -> tuple[Quantity, ...]:
     **Arguments:** `problem` whose recordings give times, sensors with known noise, and torques (the
     readings themselves do not matter); `parameters` the motion that is planned. **Returns** the
     quantities of `Fit.quantities` (`name`, `value`, `deviation`, `unit`) with the standard
-    deviations of the Cramér–Rao bound, infinite where the motion would show nothing.
-
-    **Raises:** `ValueError` for a sensor whose noise is not given, or numbers that are not finite.
+    deviations of the Cramér–Rao bound, infinite where the motion would show nothing. **Raises:**
+    `ValueError` for a sensor whose noise is not given, or numbers that are not finite.
 
     >>> import rigidjax as rj
     >>> ts = jnp.linspace(0.0, 5.0, 50)
@@ -105,10 +104,8 @@ def best_first_rate(
     through Fisher's information. It finds the best direction near `omega`: try several.
 
     **Arguments:** `problem`, `body` as for `Problem.start`; `omega` (3,) rad/s, body frame, where
-    the search starts and how fast the body can be thrown; `max_steps`. **Returns** the rate
-    (3,) and what to expect from it (`expected`).
-
-    **Raises:** as `fisher`.
+    the search starts and how fast the body can be thrown; `max_steps`. **Returns** the rate (3,)
+    and what to expect from it (`expected`). **Raises:** as `fisher`.
     """
     one_problem(problem)
     max_steps = _checks.whole(max_steps, "max_steps", 1)

@@ -93,10 +93,9 @@ def fit(
     the search and keeps the best point so far; the status says so, and is not `ok`.
 
     The method is Levenberg–Marquardt on normal equations, with Jacobians by forward mode through
-    the motion.
-
-    **Raises:** `TypeError` unless `problem` is a `Problem`, `ValueError` for fewer than one start,
-    a checkpoint that is damaged or of another problem, or one in a folder that does not exist.
+    the motion. **Raises:** `TypeError` unless `problem` is a `Problem`, `ValueError` for fewer than
+    one start, a checkpoint that is damaged or of another problem, or one in a folder that does not
+    exist.
 
     >>> import jax.numpy as jnp, rigidjax as rj
     >>> ts = jnp.linspace(0.0, 10.0, 80)

@@ -86,7 +86,6 @@ def search(
     of squares, or minus a log-density with Fisher's information (scoring); `made` (n,) one for
     numbers of order one, which no step moves far, else zero; `nothing` zeros like the kept values;
     `by_noise` of them and the normal matrix: the expected excess of the cost at the true numbers.
-
     Source: Marquardt 1963, doi:10.1137/0111030; damping by the ratio of actual to predicted gain:
     Madsen, Nielsen and Tingleff 2004, Methods for non-linear least squares problems, section 3.2.
     """

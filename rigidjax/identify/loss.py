@@ -46,9 +46,8 @@ class SoftL1(AbstractLoss):
     Convex, unlike Cauchy's, which can add local minima.
 
     **Arguments:** `scale` c, where quadratic turns to linear, in standard deviations. **Raises:**
-    `ValueError` where it is not positive.
-
-    Source: Charbonnier et al. 1997, doi:10.1109/83.551699 (as `soft_l1` in SciPy).
+    `ValueError` where it is not positive. Source: Charbonnier et al. 1997, doi:10.1109/83.551699
+    (as `soft_l1` in SciPy).
 
     >>> import jax.numpy as jnp
     >>> bool(jnp.linalg.norm(SoftL1(3.0).shrink(jnp.array([300.0, 0, 0]))) < 45)
@@ -69,9 +68,7 @@ class Huber(AbstractLoss):
     """Quadratic up to c, linear beyond: `ρ(s) = s` for s ≤ c², else `2c√s − c²`.
 
     **Arguments:** `scale` c, in standard deviations. **Raises:** `ValueError` where it is not
-    positive.
-
-    Source: Huber 1964, doi:10.1214/aoms/1177703732.
+    positive. Source: Huber 1964, doi:10.1214/aoms/1177703732.
 
     >>> import jax.numpy as jnp
     >>> Huber(3.0).weight(jnp.array([6.0, 0.0, 0.0]))
@@ -104,10 +101,8 @@ class Entropic(eqx.Module):
     `D = Σ_{i>j} c_ij² + Σ_i (c_ii² − 1 − 2 log c_ii)`.
 
     **Arguments:** `guess` an `Inertia`, or `MassProperties` for a `Mass` chart; `weight` w > 0.
-
-    Source: Lee, Wensing and Park 2020, doi:10.1109/TRO.2019.2926491 (the divergence).
-
-    **Raises:** `TypeError`, `ValueError` for arguments of another type or shape.
+    Source: Lee, Wensing and Park 2020, doi:10.1109/TRO.2019.2926491 (the divergence). **Raises:**
+    `TypeError`, `ValueError` for arguments of another type or shape.
 
     >>> import rigidjax as rj
     >>> body = rj.Inertia.from_principal(1.0, 2.0, 2.5)

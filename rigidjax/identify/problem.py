@@ -31,12 +31,7 @@ from rigidjax.identify.parameters import (
 from rigidjax.identify.propagation import AbstractIntegrator, integrator_for
 from rigidjax.identify.recording import Recording
 from rigidjax.identify.reference_states import ReferenceStates, first_rates, reference_of
-from rigidjax.identify.terms import (
-    all_errors,
-    filled,
-    over_records,
-    states_of_one,
-)
+from rigidjax.identify.terms import all_errors, filled, over_records, states_of_one
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.coupled import motion_of
 from rigidjax.motion.torques import Sum
@@ -71,9 +66,8 @@ class Problem(eqx.Module):
     least that much", as with a sensor's `limit`.
 
     The motion starts at the first time of each recording. Its state is the smallest that sensors
-    and torque need: `Spin`, `Attitude`, `Rigid`.
-
-    **Raises:** `TypeError` for arguments of another type; `ValueError` if they do not fit together.
+    and torque need: `Spin`, `Attitude`, `Rigid`. **Raises:** `TypeError` for arguments of another
+    type; `ValueError` if they do not fit together.
 
     >>> import rigidjax as rj
     >>> record = rj.identify.Recording([0.0, 1.0], (rj.identify.Gyro(), [[1.0, 0, 0]] * 2))
@@ -188,10 +182,9 @@ class Problem(eqx.Module):
 
         **Arguments:** `body` an `Inertia` or `MassProperties`, a sphere for `None`; of several
         bodies a dict of those that are known about. `omega` (3,) initial rate, rad/s, body frame,
-        of all recordings; for `None` the first readings of a gyro, or the turn between attitudes
-        (0 where these are traced). What else is free stays as the recordings give it.
-
-        **Raises:** `ValueError` for a body that the chart does not hold, or a wrong shape.
+        of all recordings; for `None` the first readings of a gyro, or the turn between attitudes (0
+        where these are traced). What else is free stays as the recordings give it. **Raises:**
+        `ValueError` for a body that the chart does not hold, or a wrong shape.
         """
         one_problem(self)
         if isinstance(self.body, Bodies):

@@ -25,10 +25,7 @@ def profile(fit: Fit, name: str, level: float = 0.95) -> tuple[float, float]:
 
     **Arguments:** `fit`; `name` as in `fit.interval()`; `level` the probability. **Returns** the
     interval, infinite or 0 on a side where the misfit never grows that far within a factor of 1e3
-    (or 1e3 standard deviations).
-
-    Source: Raue et al. 2009, doi:10.1093/bioinformatics/btp358.
-
+    (or 1e3 standard deviations). Source: Raue et al. 2009, doi:10.1093/bioinformatics/btp358.
     **Raises:** `ValueError` for a name that is not reported, a level outside (0, 1).
 
     >>> import jax.numpy as jnp, rigidjax as rj

@@ -51,9 +51,8 @@ def rows(fit: Fit, rate_unit: str = "rad/s") -> list[Row]:
 def table(lines: list[Row]) -> str:
     """Rows as text, rounded by their intervals.
 
-    **Arguments:** `lines` rows of (name, value, low, high, unit), such as `rows` gives.
-
-    **Raises:** `TypeError` for anything but rows; `ValueError` for none.
+    **Arguments:** `lines` rows of (name, value, low, high, unit), such as `rows` gives. **Raises:**
+    `TypeError` for anything but rows; `ValueError` for none.
 
     >>> print(table([("I1", 1.23456, 1.2, 1.27, "kg m²")]))
                  value  95 % interval
@@ -76,7 +75,6 @@ def numbers(value: float, low: float, high: float) -> list[str]:
     """Value, low and high as text, rounded by the interval.
 
     **Arguments:** `value`; `low` and `high`, the ends of its interval, in the same unit.
-
     **Raises:** `TypeError`, `ValueError` for anything but numbers.
 
     >>> numbers(1.23456, 1.2, 1.27)

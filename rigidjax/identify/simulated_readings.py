@@ -63,13 +63,12 @@ def simulate_readings(
     and full scale come from the sensor. The residuals of a fit with the same sensor are the noise.
     The function is differentiable, and works under `jax.jit` and `jax.vmap`.
 
-    **Arguments:** `sensor` an `AbstractSensor`, or a sequence of them along one motion;
-    `body`, `state0`, `ts` (T,) s, `torque` as for `rigidjax.simulate`; `MassProperties` are allowed
-    for all states (a sensor's `place` is then in their frame). `key` of `jax.random`: normal noise
-    of the sensor's standard deviation `noise` is added; `None` for readings without noise.
-
-    **Returns** readings (T, …) by the sensor's `reading_shape`, in its unit, for
-    `Recording(ts, (sensor, readings), torque=torque)`; for a sequence a tuple of them.
+    **Arguments:** `sensor` an `AbstractSensor`, or a sequence of them along one motion; `body`,
+    `state0`, `ts` (T,) s, `torque` as for `rigidjax.simulate`; `MassProperties` are allowed for all
+    states (a sensor's `place` is then in their frame). `key` of `jax.random`: normal noise of the
+    sensor's standard deviation `noise` is added; `None` for readings without noise. **Returns**
+    readings (T, …) by the sensor's `reading_shape`, in its unit, for `Recording(ts, (sensor,
+    readings), torque=torque)`; for a sequence a tuple of them.
 
     **Raises:** `TypeError` for anything but a sensor, and for a state without the parts that the
     sensor reads; `ValueError` for a key if the sensor's noise is `None`, and for a sensor of your

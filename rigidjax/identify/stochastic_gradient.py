@@ -29,11 +29,9 @@ class Descent(eqx.Module):
     `Problem` are unconstrained and of order one, so that a learning rate is a share of order one.
 
     **Arguments:** `optimiser` any `optax.GradientTransformation`; `steps` their number; `batch` the
-    number of recordings in a step, drawn without replacement.
-
-    Source: Robbins and Monro 1951, doi:10.1214/aoms/1177729586; the optimisers are optax's.
-
-    **Raises:** `TypeError` for anything but an optimiser, `ValueError` for counts below one.
+    number of recordings in a step, drawn without replacement. Source: Robbins and Monro 1951,
+    doi:10.1214/aoms/1177729586; the optimisers are optax's. **Raises:** `TypeError` for anything
+    but an optimiser, `ValueError` for counts below one.
 
     >>> import optax, rigidjax as rj
     >>> rj.identify.Descent(optax.adam(1e-2), steps=200, batch=4).batch

@@ -165,9 +165,8 @@ def spread(linear: Linearised, times: "Times", white: Spread | None = None) -> S
     is white, the rest decays. Fitted errors do not show the decay time well, so that each number
     gets the largest variance over all times from two samples to half a record; they are too small,
     so that M is multiplied by n/(n − p) for n independent errors. The variance between many
-    recordings counts if it is larger.
-
-    Source: White 1980, doi:10.2307/1912934; Liang and Zeger 1986, doi:10.1093/biomet/73.1.13.
+    recordings counts if it is larger. Source: White 1980, doi:10.2307/1912934; Liang and Zeger
+    1986, doi:10.1093/biomet/73.1.13.
     """
     white = of_white(linear) if white is None else white
     if times.longest <= 1.5 or not np.isfinite(white.seen).all():

@@ -31,13 +31,7 @@ from rigidjax.solve.validation import require_fit
 
 
 def open_loop_errors(
-    scene: Any,
-    h: float,
-    value: Any,
-    start: Any,
-    wanted: Any,
-    inputs: Any,
-    steps: Any = None,
+    scene: Any, h: float, value: Any, start: Any, wanted: Any, inputs: Any, steps: Any = None
 ) -> Float[Array, "steps n"]:
     """The errors of one window, as changes from the measured states; zero beyond `steps`."""
     body, law = scene(value)
@@ -210,10 +204,9 @@ def fit_windows(
     at the guess). The search ends when a step gains less than 0.05² of the gain of a fit from noise
     alone: about 0.05 standard deviations.
 
-    **Returns** a `WindowFit`; a fit that ends early returns its best point and says so.
-
-    **Raises:** `ValueError` for missing inputs, unknown kinds, and a guess with runs that are not
-    finite; `TypeError` if body, states and torque do not fit together.
+    **Returns** a `WindowFit`; a fit that ends early returns its best point and says so. **Raises:**
+    `ValueError` for missing inputs, unknown kinds, and a guess with runs that are not finite;
+    `TypeError` if body, states and torque do not fit together.
 
     >>> import rigidjax as rj
     >>> t = np.linspace(0.0, 1.0, 11)

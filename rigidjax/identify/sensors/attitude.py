@@ -101,9 +101,8 @@ class Direction(AbstractSensor):
 
     **Arguments:** `world` (3,) the direction in the world frame, any length; `noise` rad across the
     line of sight, one number or (2,), `None` to estimate it; `mounting`, `offset` as for
-    `AttitudeSensor`. Readings (T, 3) are unit vectors.
-
-    **Raises** `ValueError` for a direction of length zero, a noise that is not positive, NaN.
+    `AttitudeSensor`. Readings (T, 3) are unit vectors. **Raises** `ValueError` for a direction of
+    length zero, a noise that is not positive, NaN.
 
     >>> Direction([0.0, 0.0, 2.0], noise=0.01).world
     Array([0., 0., 1.], dtype=float64)
@@ -200,9 +199,7 @@ class Position(AbstractSensor):
     """Reads the centre of mass, in the world: `x + bias`, m. Use `Marker` for another point.
 
     **Arguments:** `noise` m, one number or (3,), `None` to estimate it; `bias` (3,) m, world frame,
-    or `None`; `offset` s as for `Gyro`. For a `Rigid`.
-
-    **Raises** `ValueError` as `Gyro`.
+    or `None`; `offset` s as for `Gyro`. For a `Rigid`. **Raises** `ValueError` as `Gyro`.
 
     >>> Position(noise=0.01).unit
     'm'
@@ -232,9 +229,8 @@ class Velocity(AbstractSensor):
     `None` for the world's axes, as in satellite navigation; `bias` (3,) m/s
     or `None`; `offset` s as for `Gyro`. For a `Rigid`.
 
-    Source: velocity of a point of a rigid body, Landau and Lifshitz, Mechanics, eq 31.2.
-
-    **Raises** `ValueError` as `Gyro`.
+    Source: velocity of a point of a rigid body, Landau and Lifshitz, Mechanics, eq 31.2. **Raises**
+    `ValueError` as `Gyro`.
 
     >>> Velocity(noise=0.1, mounting=[0.0, 0.0, 0.0]).unit
     'm/s'
@@ -267,10 +263,9 @@ class Range(AbstractSensor):
     """Reads the distance from a station to a point of the body: `|x + R r − s| + bias`, m.
 
     **Arguments:** `station` s (3,) m, world frame; `noise` m, `None` to estimate it; `place` (3,)
-    the point, m, in the frame of the `MassProperties`; `None` for the centre of mass; `bias`
-    m, or `None`; `offset` s as for `Gyro`. Readings (T,). For a `Rigid`.
-
-    **Raises** `ValueError` as `Gyro`, and for a reading below zero.
+    the point, m, in the frame of the `MassProperties`; `None` for the centre of mass; `bias` m, or
+    `None`; `offset` s as for `Gyro`. Readings (T,). For a `Rigid`. **Raises** `ValueError` as
+    `Gyro`, and for a reading below zero.
 
     >>> Range([0.0, 0.0, 100.0], noise=0.05).reading_shape
     ()

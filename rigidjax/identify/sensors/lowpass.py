@@ -32,10 +32,8 @@ class LowPass(eqx.Module):
     straight line.
 
     **Arguments:** `cutoff` Hz, the frequency of gain 1/√2 (a `Free` may move it); `order` 1 or 2.
-
-    Source: Butterworth 1930, Experimental Wireless 7:536.
-
-    **Raises** `ValueError` for a cutoff that is not positive, another order.
+    Source: Butterworth 1930, Experimental Wireless 7:536. **Raises** `ValueError` for a cutoff that
+    is not positive, another order.
 
     >>> slow = LowPass(0.5)(jnp.arange(4.0), jnp.ones((4, 1)))
     >>> bool(jnp.allclose(slow, 1.0))
@@ -58,10 +56,9 @@ class LowPass(eqx.Module):
     ) -> Float[Array, "times k"]:
         """The filtered samples.
 
-        **Arguments:** `t` (T,) increasing times, s; `values` (T, k), of any unit.
-
-        **Raises** `ValueError` for shapes that do not agree; for times that do not increase, NaN,
-        and numbers whose cubes overflow, if they are known.
+        **Arguments:** `t` (T,) increasing times, s; `values` (T, k), of any unit. **Raises**
+        `ValueError` for shapes that do not agree; for times that do not increase, NaN, and numbers
+        whose cubes overflow, if they are known.
         """
         values = _checks.numbers(values, "values")
         if values.ndim != 2:

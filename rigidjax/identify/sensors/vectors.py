@@ -122,9 +122,7 @@ class Accelerometer(_Vector):
     sensor's place, m, body frame: from the reference point of the `Inertia`, or in the frame of the
     `MassProperties`; `gravity` (3,) m/s², world frame: `None` for a body in free fall (`Spin`,
     `Attitude`), needed by a body on a pivot and by a `Rigid`; `bias`, `scale`, `mounting`, `skew`,
-    `limit`, `offset`, `lowpass` as for `Gyro`.
-
-    **Raises** `ValueError` as `Gyro`.
+    `limit`, `offset`, `lowpass` as for `Gyro`. **Raises** `ValueError` as `Gyro`.
 
     >>> Accelerometer(noise=0.1, place=[0.01, 0.0, 0.0]).unit
     'm/s²'
@@ -146,10 +144,8 @@ class Magnetometer(_Vector):
     """Reads a known field of the world: `scale · S exp(−mounting) Rᵀ b + bias`.
 
     **Arguments:** `noise` in the field's unit, one number or (3,), `None` to estimate it; `field`
-    (3,) b, world frame, any unit; `bias` (the body's own magnetism), `scale`, `mounting`,
-    `skew`, `limit`, `offset`, `lowpass` as for `Gyro`. For a direction without a strength use
-    `Direction`.
-
+    (3,) b, world frame, any unit; `bias` (the body's own magnetism), `scale`, `mounting`, `skew`,
+    `limit`, `offset`, `lowpass` as for `Gyro`. For a direction without a strength use `Direction`.
     **Raises** `ValueError` as `Gyro`.
 
     >>> Magnetometer(noise=1e-7, field=[2e-5, 0.0, 4e-5]).reading_shape
