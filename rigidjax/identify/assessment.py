@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from typing import Any
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
@@ -14,7 +13,6 @@ from rigidjax.identify.causes import clock
 from rigidjax.identify.checkpoint import Tried
 from rigidjax.identify.flat_limit import of_charts
 from rigidjax.identify.full_scale import at_limit
-from rigidjax.identify.parameters import Parameters
 from rigidjax.identify.problem import Problem
 from rigidjax.identify.quantities import charts, quantities as quantities_of, values_and_slopes
 from rigidjax.identify.result import Fit, Start
@@ -29,20 +27,10 @@ LAGS = 10
 HALF, QUARTER, TENTH = 0.5, 0.25, 0.1
 
 
-class Goodness(eqx.Module):
-    """χ² and its degrees of freedom (sensors of given noise), the answer, the sensors left
-    unexplained.
-    """
-
-    chi2: float
-    dof: int
-    model: Answer
-    left: tuple[int, ...]
-
-
-def goodness(problem: Problem, linear: Linearised, times: Times, free: int) -> Goodness:
-    """χ² of the sensors with a given noise, and the sensors whose errors the model does not
-    explain.
+def goodness(
+    problem: Problem, linear: Linearised, times: Times, free: int
+) -> tuple[float, int, Answer, tuple[int, ...]]:
+    """χ² and its degrees of freedom (sensors of given noise), the answer, the sensors left over.
 
     The size of the errors is compared with a given noise (five standard deviations of χ², or of the
     median of the squares under a robust loss) and with the variance of the readings; Ljung and
@@ -81,7 +69,7 @@ def goodness(problem: Problem, linear: Linearised, times: Times, free: int) -> G
         share = left / varies if varies > tiny and _differences(reading) else None
         span = None if white else times.longest
         words.append(_in_words(problem, reading, error, kept, factor, share, span))
-    return Goodness(chi2, max(count - free, 1), Answer(word, tuple(words)), tuple(sensors))
+    return chi2, max(count - free, 1), Answer(word, tuple(words)), tuple(sensors)
 
 
 def _differences(reading: Any) -> bool:
@@ -205,20 +193,6 @@ def _margin(problem: Problem, best_cost: float, longest: float) -> float:
     return 10.0 * unit * max(longest, 1.0)
 
 
-def _start(tried: Tried, level: float) -> Start:
-    """A start for the user; it fits if its misfit is not above `level`."""
-    cost = float(tried.cost)
-    return Start(tried.parameters, cost, bool(tried.converged), cost <= level)
-
-
-def _elsewhere(
-    linear: uncertainty.Linearised, other: Parameters, value: Parameters, margin: float
-) -> bool:
-    """Whether the readings distinguish two points; in a flat valley they do not."""
-    away = ravel_pytree(other)[0] - ravel_pytree(value)[0]
-    return float(np.sum((linear.rows @ np.asarray(away)) ** 2)) > 2 * margin
-
-
 def _search(
     best_cost: float, done: bool, rivals: str, interrupted: Sequence[str], remarks: Sequence[str]
 ) -> Answer:
@@ -255,24 +229,26 @@ def assess(
     held = [limit.slope for limit in limits if limit.free < 0]
     done = bool(best.converged) or uncertainty.distance(linear, white, held) < AT_THE_END
     free = ravel_pytree(value)[0].size
-    seen = goodness(problem, linear, times, free)
-    believable = seen.model.word != FAILS
+    chi2, dof, model, left = goodness(problem, linear, times, free)
+    believable = model.word != FAILS
     margin = _margin(problem, best_cost, times.longest)
 
     level = best_cost + margin if believable else -np.inf
-    starts = [_start(item, level) for item in tried]
-    rivals = [
-        s
-        for s in starts
-        if s.fits and s.converged and s.cost > best_cost + 0.01 * margin
-        if _elsewhere(linear, s.parameters, value, margin)
-    ]
+    starts, rivals = [], []
+    for item in tried:
+        cost, found = float(item.cost), bool(item.converged)
+        starts.append(Start(item.parameters, cost, found, cost <= level))
+        if cost <= level and found and cost > best_cost + 0.01 * margin:
+            away = ravel_pytree(item.parameters)[0] - ravel_pytree(value)[0]
+            # In a flat valley readings do not tell two points apart.
+            if float(np.sum((linear.rows @ np.asarray(away)) ** 2)) > 2 * margin:
+                rivals.append(item)
     rival = f"{len(rivals)} of {len(starts)} starts fit as well elsewhere" if rivals else ""
     lost = believable and not any(start.fits for start in starts)
     remarks = ("no single start came near the best point",) if lost else ()
     search = _search(best_cost, done, rival, interrupted, remarks)
     unreal = of_charts(charts(problem), flat_limit.bodies_of(problem, value))
-    model = Answer(seen.model.word, (*unreal, *seen.model.reasons))
+    model = Answer(model.word, (*unreal, *model.reasons))
     model = model if np.isfinite(best_cost) else Answer(FAILS)
     return Fit(
         problem,
@@ -282,8 +258,8 @@ def assess(
         spread.kind,
         noise,
         tuple(starts),
-        seen.chi2,
-        seen.dof,
+        chi2,
+        dof,
         times.longest,
         times.independent,
         jnp.asarray(spread.singular_values),
@@ -291,7 +267,7 @@ def assess(
         quantities_of(problem, numbers, spread.seen, spread.null_directions, limits),
         search,
         model,
-        seen.left,
+        left,
         limits,
         near,
     )

@@ -181,10 +181,8 @@ def unreal(body: Any) -> str | None:
 
 def of_charts(charts: list[tuple[str, AbstractBodyChart]], bodies: list[Any]) -> list[str]:
     """`unreal` for the bodies of charts by users: every point of our charts is a real body."""
-    out = []
-    for (name, chart), body in zip(charts, bodies, strict=True):
-        ours = type(chart).__module__ == AbstractBodyChart.__module__
-        wrong = None if ours else unreal(body)
-        if wrong is not None:
-            out.append(wrong + name)
-    return out
+    ours = AbstractBodyChart.__module__
+    theirs = [
+        (n, b) for (n, c), b in zip(charts, bodies, strict=True) if type(c).__module__ != ours
+    ]
+    return [wrong + name for name, body in theirs if (wrong := unreal(body))]

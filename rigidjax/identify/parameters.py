@@ -311,79 +311,57 @@ def firsts(own: Own | Local) -> list[Any]:
 
 def local(problem: "Problem", parameters: Parameters) -> Local:
     """The numbers that each recording depends on, with a leading axis over recordings."""
+    return Local(*_of_each(problem, parameters, 0, jnp.add))
+
+
+def _of_each(problem: "Problem", parameters: Parameters, fill: int, join: Any) -> tuple[Any, ...]:
+    """The fields of `local`: body numbers padded with `fill`, shared and own steps joined."""
     own, steps = parameters.own, []
     for slot, shared, each in by_slot(problem, parameters):
         if shared is None:
             steps.append(each)
             continue
-        step = _of_each(slot, shared, problem.count)
-        steps.append(step if each is None else step + each)
-    body = spread(problem.body, parameters.body, problem.which, problem.count)
-    return Local(body, tuple(steps), own.place, own.speed, own.turn, own.spin)
+        # A shared number is repeated for each recording.
+        wide = (problem.count, *shared.shape)
+        step = jnp.broadcast_to(shared, wide) if slot.groups is None else shared[slot.groups]
+        steps.append(step if each is None else join(step, each))
+    body = spread(problem.body, parameters.body, problem.which, problem.count, fill=fill)
+    return body, tuple(steps), own.place, own.speed, own.turn, own.spin
 
 
 def by_slot(problem: "Problem", parameters: Parameters) -> list[tuple["Slot", Any, Any]]:
     """Each `Free` with its shared number and the recordings' own numbers; `None` if it has none."""
-    of_all, of_each = iter(parameters.shared), iter(parameters.own.each)
-    return [
-        (
-            slot,
-            None if slot.each else next(of_all),
-            next(of_each) if slot.each or slot.spread is not None else None,
-        )
-        for slot in problem.slots
-    ]
-
-
-def _of_each(slot: "Slot", shared: Array, count: int) -> Array:
-    """A shared number repeated for each recording, (R, …)."""
-    if slot.groups is not None:
-        return shared[slot.groups]
-    return jnp.broadcast_to(shared, (count, *shared.shape))
+    shared, each = iter(parameters.shared), iter(parameters.own.each)
+    of_all = [None if slot.each else next(shared) for slot in problem.slots]
+    alone = [slot.each or slot.spread is not None for slot in problem.slots]
+    of_each = [next(each) if own else None for own in alone]
+    return list(zip(problem.slots, of_all, of_each, strict=True))
 
 
 def columns(problem: "Problem", one: Local) -> np.ndarray:
     """The recording's number of each column of its block: all; then shared ones with a deviation
     again.
     """
-    counted = numbered(one)
-    twice = [
-        np.ravel(step)
-        for slot, step in zip(problem.slots, counted.steps, strict=True)
-        if slot.spread is not None
-    ]
+    steps = zip(problem.slots, numbered(one).steps, strict=True)
+    twice = [np.ravel(step) for slot, step in steps if slot.spread is not None]
     size = sum(np.size(leaf) for leaf in jax.tree.leaves(one))
     return np.concatenate([np.arange(size), *twice]).astype(int)
 
 
 def places(problem: "Problem", parameters: Parameters) -> Int[Array, "records columns"]:
     """Each column's place in the flattened parameters; n for a column of no number."""
-    count, size = problem.count, ravel_pytree(parameters)[0].size
-    counted = numbered(parameters)
-    parts, deviations = [], []
-
-    def rows(leaf: Any) -> Array:
-        return jnp.asarray(leaf, jnp.int32).reshape(count, -1)
-
-    for slot, shared, each in by_slot(problem, counted):
-        if shared is None:
-            parts.append(rows(each))
-            continue
-        parts.append(rows(_of_each(slot, jnp.asarray(shared, jnp.int32), count)))
-        if each is not None:
-            deviations.append(rows(each))
-    first = [rows(leaf) for leaf in firsts(counted.own)]
-    numbers = jnp.asarray(counted.body, jnp.int32)
-    body = spread(problem.body, numbers, problem.which, count, fill=size)
-    return jnp.concatenate([body, *parts, *first, *deviations], axis=1)
+    counted = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.int32), numbered(parameters))
+    size = ravel_pytree(parameters)[0].size
+    first = _of_each(problem, counted, size, lambda shared, each: shared)
+    twice = [each for slot, _, each in by_slot(problem, counted) if slot.spread is not None]
+    rows = [leaf.reshape(problem.count, -1) for leaf in (*jax.tree.leaves(first), *twice)]
+    return jnp.concatenate(rows, axis=1)
 
 
 def numbered(tree: Any) -> Any:
     """The same tree with its numbers counted from zero in the order of `ravel_pytree`."""
     leaves, structure = jax.tree.flatten(tree)
     ends = np.cumsum([np.size(leaf) for leaf in leaves])
-    counted = [
-        np.arange(end - np.size(leaf), end).reshape(np.shape(leaf))
-        for leaf, end in zip(leaves, ends, strict=True)
-    ]
-    return jax.tree.unflatten(structure, counted)
+    counted = np.split(np.arange(ends[-1] if leaves else 0), ends[:-1])
+    shaped = [row.reshape(np.shape(leaf)) for row, leaf in zip(counted, leaves, strict=True)]
+    return jax.tree.unflatten(structure, shaped)

@@ -26,9 +26,10 @@ from rigidjax.identify.terms import (
     half_sum,
     normal_matrix,
     residuals,
-    seen_rows,
+    seen,
     with_blocks,
     with_jacobian,
+    with_rows,
 )
 
 # The beginning of the record is fitted first: a long record has many wrong minima (the phase slips
@@ -77,7 +78,7 @@ def descend(
         found = with_blocks(here, problem)
         (errors, ends), (slopes, end_slopes) = found
         total, slope = jnp.zeros((), kind), jnp.zeros(number + 1, kind)
-        read, blocks = seen_rows(problem, errors, slopes, noise, weights)
+        read, blocks = with_rows(lambda e: seen(problem, e, noise, weights), errors, slopes)
         for e, rows in zip(read, blocks, strict=True):
             total = total + jnp.sum(e**2)
             slope = slope.at[where].add(jnp.einsum("rtki,rtk->ri", rows, e))

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import Any, overload
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -12,40 +12,15 @@ from jaxtyping import Array, ArrayLike, Float
 from rigidjax import _checks
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.identify.propagation import sensor_inputs, what_turns
-from rigidjax.identify.sensors import AbstractSensor, SensorInput
+from rigidjax.identify.sensors import AbstractSensor
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.coupled import Coupled
 from rigidjax.motion.torques.base import Torque
 from rigidjax.solve import simulate
 
-Readings = Float[Array, "times ..."]
 Body = Inertia | MassProperties
 State = Spin | Attitude | Rigid
 Times = Float[ArrayLike, " times"] | Sequence[float]
-
-
-@overload
-def simulate_readings(
-    sensor: AbstractSensor,
-    body: Body,
-    state0: State,
-    ts: Times,
-    torque: Torque | None = None,
-    *,
-    key: Any = None,
-) -> Readings: ...
-
-
-@overload
-def simulate_readings(
-    sensor: Sequence[AbstractSensor],
-    body: Body,
-    state0: State,
-    ts: Times,
-    torque: Torque | None = None,
-    *,
-    key: Any = None,
-) -> tuple[Readings, ...]: ...
 
 
 def simulate_readings(
@@ -56,7 +31,7 @@ def simulate_readings(
     torque: Torque | None = None,
     *,
     key: Any = None,
-) -> Readings | tuple[Readings, ...]:
+) -> Any:
     """The readings of a sensor along a known motion, with noise: data to test a fit.
 
     The motion comes from `rigidjax.simulate`; bias, scale, mounting, clock offset, low-pass filter
@@ -112,33 +87,24 @@ def _readings(
     state0: Any,
     states: Any,
     key: Any,
-) -> Readings:
+) -> Float[Array, "times ..."]:
     times, states, now = sensor_inputs(sensor, body, torque, ts, state0, states)
     error = jnp.zeros((ts.shape[0], sensor.components), ts.dtype)
     if key is not None:
         assert sensor.noise is not None
         error = sensor.noise[None] * jax.random.normal(key, error.shape, ts.dtype)
     lowpass = getattr(sensor, "lowpass", None)
-    if lowpass is not None:
+    reading = getattr(sensor, "reading_of", None)
+    if reading is not None:
+        values = jax.vmap(lambda t, y, e: reading(now(t, y), e))(times, states, error)
+    else:
+        # The error is reading minus prediction.
         nothing = jnp.zeros(sensor.reading_shape, ts.dtype)
         shown = jax.vmap(lambda t, y: -sensor.error(now(t, y), nothing))(times, states)
-        values = lowpass(times, shown) + error
-    else:
-        reading = getattr(sensor, "reading_of", None) or _Plain(sensor)
-        values = jax.vmap(lambda t, y, e: reading(now(t, y), e))(times, states, error)
+        shown = shown if lowpass is None else lowpass(times, shown)
+        values = (shown + error).reshape(ts.shape[0], *sensor.reading_shape)
     limit = getattr(sensor, "limit", None)
     return values if limit is None else jnp.clip(values, -limit[None], limit[None])
-
-
-class _Plain(eqx.Module):
-    """Prediction plus error, for a sensor whose error is reading minus prediction."""
-
-    sensor: AbstractSensor
-
-    def __call__(self, now: SensorInput, error: Array) -> Array:
-        shape = self.sensor.reading_shape
-        nothing = jnp.zeros(shape, error.dtype)
-        return (error - self.sensor.error(now, nothing)).reshape(shape)
 
 
 def _fits(sensor: Any, state0: Any, key: Any) -> None:

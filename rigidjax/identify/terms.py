@@ -246,17 +246,6 @@ def seen(problem: "Problem", errors: tuple, noise: Noise, weights: Array) -> tup
     return tuple(read)
 
 
-def seen_rows(
-    problem: "Problem", errors: tuple, blocks: tuple, noise: Noise, weights: Array
-) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
-    """`seen`, and its derivatives (R, T, k, n) for each sensor, of those of the errors."""
-
-    def of(errors: tuple) -> tuple[Array, ...]:
-        return seen(problem, errors, noise, weights)
-
-    return with_rows(of, errors, blocks)
-
-
 def with_rows(of: Callable[[tuple], tuple], errors: tuple, blocks: tuple) -> tuple[tuple, tuple]:
     """`of(errors)`, and its derivatives (R, T, k, n) of those of the errors, `blocks`."""
     # Each residual depends on its own error alone: a product of small matrices.
@@ -277,17 +266,12 @@ def beside(parameters: Parameters, problem: "Problem", ends: Any) -> tuple[Array
         body = problem.body.body(parameters.body)
         out.append(problem.prior.residuals(body, scaled=problem.body.unit != ""))
     if problem.links is not None:
-        out.append(gaps(parameters, problem, ends) / problem.links.width)
+        # From a piece's end to the next one's start, in typical units; zero at the last.
+        starts = jax.vmap(ReferenceStates.moved)(problem.reference, parameters.own)
+        following = jax.tree.map(lambda leaf: jnp.roll(leaf, -1, axis=0), starts)
+        gaps = jax.vmap(minus)(ends, following) / problem.reference.units
+        out.append(gaps * problem.links.on[:, None] / problem.links.width)
     return tuple(out)
-
-
-def gaps(parameters: Parameters, problem: "Problem", ends: Any) -> Float[Array, "records n"]:
-    """The gap between a piece's end and the next one's start, typical units; zero at the last."""
-    assert problem.links is not None
-    ref = problem.reference
-    starts = jax.vmap(ReferenceStates.moved)(ref, parameters.own)
-    following = jax.tree.map(lambda leaf: jnp.roll(leaf, -1, axis=0), starts)
-    return jax.vmap(minus)(ends, following) / ref.units * problem.links.on[:, None]
 
 
 def weights_of(problem: "Problem", errors: tuple, noise: Noise) -> tuple[Float[Array, "..."], ...]:

@@ -85,11 +85,7 @@ class Linearised(eqx.Module):
 @eqx.filter_jit
 def _linearised(problem: Problem, parameters: Parameters, noise: Noise, found: Any) -> Any:
     (errors, ends), (blocks, end_blocks) = found
-
-    def of(errors: tuple) -> tuple[Array, ...]:
-        return whitened(problem, errors, noise)
-
-    out, slopes = with_rows(of, errors, blocks)
+    out, slopes = with_rows(lambda e: whitened(problem, e, noise), errors, blocks)
     flat, restore = ravel_pytree(parameters)
     extra, extra_slopes = beside_rows(problem, flat, restore, ends, end_blocks)
     weights = weights_of(problem, errors, noise)
