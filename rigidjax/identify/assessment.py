@@ -50,7 +50,8 @@ def goodness(
         if given:
             own, many = float(np.sum((weight[..., None] * e**2)[kept])), int(kept.sum())
             chi2, count = chi2 + own, count + many
-            factor = _above(own, many, free)
+            dof = max(many - free, 1)
+            factor = float(np.sqrt(own / dof)) if own > dof + 5 * np.sqrt(2 * dof) else 1.0
             if problem.loss is not None and many:
                 rows = kept.all(axis=-1) & (weight > 0)
                 factor = _median_above(np.sum(e[rows] ** 2, axis=-1), e.shape[-1])
@@ -95,7 +96,11 @@ def _in_words(
     if factor > 1.0:
         words.append(f"{factor:.3g} times the noise")
     if span is not None:
-        words.append(f"{_over_scatter(error, kept):.3g} times their scatter between neighbours")
+        channels = [np.moveaxis(x, -1, 0).reshape(-1, x.shape[1]) for x in (error, kept)]
+        rows = [row[seen] for row, seen in zip(*channels, strict=True)]
+        apart = scatter(rows)
+        over = np.sqrt(np.mean(np.concatenate(rows) ** 2) / apart) if apart > 0 else np.inf
+        words.append(f"{over:.3g} times their scatter between neighbours")
         words.append(f"autocorrelated over {span:.0f} samples")
     return f"{', '.join(words)}, {_where(problem, error, kept)}"
 
@@ -120,12 +125,6 @@ def _sizes(reading: Any, error: np.ndarray, kept: np.ndarray) -> tuple[float, fl
     values = np.asarray(reading.values)[reading.seen]
     varies = float(np.sum((values - values.mean(axis=0)) ** 2))
     return float(np.sum(error[kept] ** 2)), varies, 1e-12 * float(np.sum(values**2))
-
-
-def _above(own: float, many: int, free: int) -> float:
-    """The ratio of the errors to the noise by χ²; one if they agree."""
-    dof = max(many - free, 1)
-    return float(np.sqrt(own / dof)) if own > dof + 5 * np.sqrt(2 * dof) else 1.0
 
 
 def _median_above(squares: np.ndarray, size: int) -> float:
@@ -172,25 +171,8 @@ def _white(e: np.ndarray, kept: np.ndarray, given: bool) -> bool:
     return degrees == 0 or bool(chdtrc(degrees, total) > RARE)
 
 
-def _over_scatter(error: np.ndarray, kept: np.ndarray) -> float:
-    """The errors over their scatter, which second differences give."""
-    channels = [np.moveaxis(x, -1, 0).reshape(-1, x.shape[1]) for x in (error, kept)]
-    rows = [row[seen] for row, seen in zip(*channels, strict=True)]
-    apart = scatter(rows)
-    return float(np.sqrt(np.mean(np.concatenate(rows) ** 2) / apart)) if apart > 0 else np.inf
-
-
 # A search may end so near to the least misfit, in standard deviations.
 AT_THE_END = 0.05
-
-
-def _margin(problem: Problem, best_cost: float, longest: float) -> float:
-    """The largest excess over the best misfit with which a start still explains the data: ten units
-    of log-likelihood, of the noise as estimated; autocorrelated errors count as fewer.
-    """
-    guessed = any(sensor.noise is None for sensor in problem.records.sensors)
-    unit = 2 * best_cost / problem.records.size if guessed else 1.0
-    return 10.0 * unit * max(longest, 1.0)
 
 
 def _search(
@@ -231,7 +213,10 @@ def assess(
     free = ravel_pytree(value)[0].size
     chi2, dof, model, left = goodness(problem, linear, times, free)
     believable = model.word != FAILS
-    margin = _margin(problem, best_cost, times.longest)
+    # Ten units of log-likelihood, of the noise as estimated; autocorrelated errors count as fewer.
+    guessed = any(sensor.noise is None for sensor in problem.records.sensors)
+    unit = 2 * best_cost / problem.records.size if guessed else 1.0
+    margin = 10.0 * unit * max(times.longest, 1.0)
 
     level = best_cost + margin if believable else -np.inf
     starts, rivals = [], []

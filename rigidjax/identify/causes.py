@@ -12,12 +12,11 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from rigidjax._types import HasSpin
 from rigidjax.identify import padding
 from rigidjax.identify.answers import Cause
 from rigidjax.identify.body_charts import in_a_row, tensor_of
 from rigidjax.identify.full_scale import at_limit
-from rigidjax.identify.initial_guess import balance, tensor_and_margin
+from rigidjax.identify.initial_guess import balance, of_rates, tensor_and_margin
 from rigidjax.identify.parameters import Parameters, numbered
 from rigidjax.identify.problem import Problem
 from rigidjax.identify.recording import Recording, readings_of
@@ -25,7 +24,6 @@ from rigidjax.identify.reference_states import attitudes, rates_of
 from rigidjax.identify.sensors import Gyro
 from rigidjax.identify.terms import Noise
 from rigidjax.identify.uncertainty import Linearised
-from rigidjax.motion.torques.states import has_states
 
 # Corrected rates must leave less than this share of the error as read, and of the whole signal.
 BETTER, LITTLE = 0.5, 0.3
@@ -60,7 +58,13 @@ def misread(recordings: Sequence[Recording]) -> Cause | None:
     body: a correction counts only if that is real. A mirrored axis shows only under a torque.
     """
     gyros = readings_of(recordings[0], Gyro)
-    if not gyros or not _as_the_body(gyros[0].sensor):
+    if not gyros:
+        return None
+    turn, scale = (getattr(gyros[0].sensor, name) for name in ("mounting", "scale"))
+    # Given axes and scales that are far from those of the body are no mistake.
+    if turn is not None and np.abs(turn).max() >= 0.1:
+        return None
+    if scale is not None and np.abs(np.asarray(scale) - 1).max() >= 0.1:
         return None
     known = [attitudes(recording) for recording in recordings]
     if all(len(t) > 10 for t, _ in known):
@@ -69,7 +73,7 @@ def misread(recordings: Sequence[Recording]) -> Cause | None:
         for name, change in ATTITUDES.items():
             changed = [(t, change(q)) for t, q in known]
             found[name] = _of_attitudes(recordings, changed, _SAME)
-    elif all(_of_rates(recording.torque) for recording in recordings):
+    elif all(of_rates(recording.torque) for recording in recordings):
         bound, margin = _of_euler(recordings, _SAME)
         # Sensor errors alone can give numbers of no real body.
         bound *= BETTER if margin > -0.8 else EQUAL
@@ -85,17 +89,6 @@ def misread(recordings: Sequence[Recording]) -> Cause | None:
         return None
     words = " or ".join(name for name, left in found.items() if left <= EQUAL * least)
     return Cause("misread", "Gyro", 1.0, f"most likely {words}", f"read the log again: {words}")
-
-
-def _as_the_body(gyro: Gyro) -> bool:
-    """Whether a gyro's given axes and scales are close to those of the body."""
-    turn, scale = (np.asarray(0.0 if x is None else x) for x in (gyro.mounting, gyro.scale))
-    return bool(np.abs(turn).max() < 0.1 and (gyro.scale is None or np.abs(scale - 1).max() < 0.1))
-
-
-def _of_rates(torque: Any) -> bool:
-    """Whether there is no torque, or it depends on time and rate alone."""
-    return torque is None or (getattr(torque, "feels", None) is HasSpin and not has_states(torque))
 
 
 def _of_euler(

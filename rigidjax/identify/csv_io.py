@@ -193,7 +193,13 @@ def read_table(path: str | Path, columns: Sequence[str]) -> dict[str, np.ndarray
         raise LogError(f"{path}: is a folder, not a log")
     if path.suffix.lower() in (".npz", ".mat", *SUFFIXES):
         return _arrays(path, columns)
-    return _csv(path, columns)
+    try:
+        # Line by line: only the numbers of a large file stay in memory.
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            return _rows(path, file, columns)
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        why = f"{type(error).__name__}: {error}".splitlines()[0]
+        raise LogError(f"{path}: cannot be read as text ({why})") from None
 
 
 def increasing(path: str | Path, t: np.ndarray, name: str) -> None:
@@ -211,16 +217,6 @@ def increasing(path: str | Path, t: np.ndarray, name: str) -> None:
             f"{path}: column {name!r}: row {row + 1}: time {t[row]:g} is not above the "
             f"{t[row - 1]:g} before it"
         )
-
-
-def _csv(path: Path, columns: Sequence[str]) -> dict[str, np.ndarray]:
-    try:
-        # Line by line: only the numbers of a large file stay in memory.
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            return _rows(path, file, columns)
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        why = f"{type(error).__name__}: {error}".splitlines()[0]
-        raise LogError(f"{path}: cannot be read as text ({why})") from None
 
 
 def _rows(path: Path, file: TextIO, columns: Sequence[str]) -> dict[str, np.ndarray]:

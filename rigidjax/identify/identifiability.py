@@ -1,5 +1,6 @@
 """The numbers that a fit determines, and those that it does not, in words."""
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import equinox as eqx
@@ -250,7 +251,11 @@ def identifiability(fit: "Fit") -> tuple[str, ...]:
         return (*out, *in_words(fit.problem.records.readings))
     reach = quantile(fit, 0.95)
     out = []
-    for quantity in _moments(fit):
+    moments, first = [], 0
+    for _, chart in charts(fit.problem):
+        moments += fit.quantities[first : first + len(chart.log_names)]
+        first += len(chart.log_names) + len(chart.plain_names)
+    for quantity in moments:
         wide = reach * quantity.deviation
         # Half-width over value for a narrow interval; a factor for a wide one.
         if not np.isfinite(wide) or wide > 1.5:
@@ -262,8 +267,15 @@ def identifiability(fit: "Fit") -> tuple[str, ...]:
             )
         else:
             out.append(f"{quantity.name} is well determined, to ±{wide:.2g} of its value.")
-    out += _flat(fit, reach)
-    out.append(_rate(fit, reach))
+    seen = np.asarray(fit.seen)
+    out += [
+        f"A flat body{limit.where} fits as well: (I1 + I2 − I3)/I3 ≤ "
+        f"{limit.bound(seen):.2g} (95 %). Intervals end at the limit of real bodies."
+        for limit in fit.limits
+        if limit.is_near(seen, reach)
+    ]
+    count = fit.problem.count
+    out.append(_rate(fit.quantities[first : first + 3 * count], count, reach))
     out += _unseen(fit)
     out += correlations(fit)
     if fit.problem.torque is None:
@@ -280,40 +292,18 @@ def identifiability(fit: "Fit") -> tuple[str, ...]:
     return tuple(out)
 
 
-def _moments(fit: "Fit") -> list[Quantity]:
-    """The positive quantities of the bodies."""
-    out, first = [], 0
-    for _, chart in charts(fit.problem):
-        out += fit.quantities[first : first + len(chart.log_names)]
-        first += len(chart.log_names) + len(chart.plain_names)
-    return out
-
-
-def _flat(fit: "Fit", reach: float) -> list[str]:
-    """Remarks on bodies that may be flat."""
-    covariance = np.asarray(fit.seen)
-    return [
-        f"A flat body{limit.where} fits as well: (I1 + I2 − I3)/I3 ≤ "
-        f"{limit.bound(covariance):.2g} (95 %). Intervals end at the limit of real bodies."
-        for limit in fit.limits
-        if limit.is_near(covariance, reach)
-    ]
-
-
-def _rate(fit: "Fit", reach: float) -> str:
-    first = sum(len(c.log_names) + len(c.plain_names) for _, c in charts(fit.problem))
-    rates = fit.quantities[first : first + 3 * fit.problem.count]
+def _rate(rates: Sequence[Quantity], count: int, reach: float) -> str:
     shares = []
-    for index in range(fit.problem.count):
+    for index in range(count):
         three = rates[3 * index : 3 * index + 3]
         length = np.linalg.norm([q.value for q in three])
         shares.append(reach * np.max([q.deviation for q in three]) / max(length, 1e-300))
     wide = np.max(shares)
-    what = "The initial body rate is" if fit.problem.count == 1 else "The initial body rates are"
+    what = "The initial body rate is" if count == 1 else "The initial body rates are"
     if not wide < 1.0:
         return f"{what} not determined by these data."
     grade = "well" if wide < 0.1 else "weakly"
-    its = "its length" if fit.problem.count == 1 else "their lengths"
+    its = "its length" if count == 1 else "their lengths"
     return f"{what} {grade} determined, to ±{wide:.2g} of {its}."
 
 

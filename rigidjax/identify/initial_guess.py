@@ -66,9 +66,12 @@ def regress_inertia(recordings: tuple[Recording, ...]) -> Inertia | None:
     """
     found = []
     for recording in recordings:
-        found.append(_equations(recording))
-        if found[-1] is None:
+        t, w = _rates(recording)
+        if t.size < 10 or np.median(np.diff(t)) * np.linalg.norm(w, axis=1).max() > 0.5:
             return None
+        if not of_rates(recording.torque):
+            return None
+        found.append(balance(recording, np.eye(3)))
     matrix, side, _ = (np.concatenate(part) for part in zip(*found, strict=True))
     components, _ = tensor_and_margin(matrix, side)
     if not components[:3].sum() > 0:
@@ -95,16 +98,9 @@ def tensor_and_margin(matrix: np.ndarray, side: np.ndarray) -> tuple[np.ndarray,
     return components, float(values[0] / max(np.abs(values).max(), 1e-300))
 
 
-def _equations(recording: Recording) -> tuple[np.ndarray, ...] | None:
-    """As `balance`; `None` if rates are too far apart, or the torque needs more than a rate."""
-    t, w = _rates(recording)
-    if t.size < 10 or np.median(np.diff(t)) * np.linalg.norm(w, axis=1).max() > 0.5:
-        return None
-    if recording.torque is not None:
-        felt: Any = getattr(recording.torque, "feels", None)
-        if felt is not HasSpin or has_states(recording.torque):
-            return None
-    return balance(recording, np.eye(3))
+def of_rates(torque: Any) -> bool:
+    """Whether there is no torque, or it depends on time and rate alone."""
+    return torque is None or (getattr(torque, "feels", None) is HasSpin and not has_states(torque))
 
 
 def _rates(recording: Recording) -> tuple[np.ndarray, np.ndarray]:

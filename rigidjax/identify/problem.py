@@ -246,7 +246,10 @@ class Problem(eqx.Module):
             if step is None:
                 out[slot.name] = value
                 continue
-            first = 0 if slot.groups is None else _firsts(slot)
+            first: Any = 0
+            if slot.groups is not None:
+                groups = jnp.arange(len(slot.labels), dtype=slot.groups.dtype)
+                first = jnp.argmax(slot.groups[None, :] == groups[:, None], axis=1)
             out[slot.name] = slot.move(slot.read(self.records)[first], step)
             if slot.spread is not None:
                 out[f"{slot.name}, own"] = value
@@ -412,13 +415,6 @@ def _vector(chart: AbstractBodyChart, body: Any) -> Float[Array, " chart"]:
 def _zeros(*shape: int) -> Array:
     """Zeros by NumPy: JAX compiles a program for each shape."""
     return jnp.asarray(np.zeros(shape, jnp.result_type(float)))
-
-
-def _firsts(slot: Slot) -> Array:
-    """The first recording of each group."""
-    assert slot.groups is not None
-    rows = jnp.arange(len(slot.labels), dtype=slot.groups.dtype)
-    return jnp.argmax(slot.groups[None, :] == rows[:, None], axis=1)
 
 
 def _with(recording: Recording, torque: Torque) -> Recording:

@@ -129,7 +129,7 @@ class ReferenceStates(eqx.Module):
 
 def reference_of(recordings: Sequence[Recording], rung: type) -> ReferenceStates:
     """From the first readings of each recording, for the kind of state in use."""
-    turns = [_first_attitude(r) for r in recordings]
+    turns = [[*attitudes(r)[1], np.array([1.0, 0.0, 0.0, 0.0])][0] for r in recordings]
     places = [_first_place(r) for r in recordings]
     dtype = recordings[0].t.dtype
     # Arrays, not floats: another recording must not compile again.
@@ -144,25 +144,16 @@ def _typical_rate(recording: Recording) -> float:
     gyros = readings_of(recording, Gyro)
     if gyros:
         values = np.asarray(gyros[0].values)[gyros[0].seen]
-        rate = float(np.sqrt(np.mean(np.sum(values**2, axis=1))))
-    else:
-        rate = float(np.linalg.norm(first_rate(recording))) or _rate_of_readings(recording)
-    return rate if rate > 0 else 1.0
-
-
-def _rate_of_readings(recording: Recording) -> float:
-    """The rate by the first sensor whose readings show one, rad/s; 0 without such a sensor."""
-    for reading in recording.readings:
+        return float(np.sqrt(np.mean(np.sum(values**2, axis=1)))) or 1.0
+    rate = float(np.linalg.norm(first_rate(recording)))
+    # Else by the first sensor whose readings show one.
+    for reading in recording.readings if rate == 0 else ():
         sensor: Any = reading.sensor
         if hasattr(sensor, "typical_rate"):
             t, values = np.asarray(recording.t), np.asarray(reading.values)
-            return sensor.typical_rate(t[reading.seen], values[reading.seen])
-    return 0.0
-
-
-def _first_attitude(recording: Recording) -> np.ndarray:
-    _, q = attitudes(recording)
-    return q[0] if len(q) else np.array([1.0, 0.0, 0.0, 0.0])
+            rate = sensor.typical_rate(t[reading.seen], values[reading.seen])
+            break
+    return rate if rate > 0 else 1.0
 
 
 def _first_place(recording: Recording) -> tuple[np.ndarray, np.ndarray, float]:
