@@ -81,10 +81,8 @@ def start(
     initial attitude and rate from the recording (`Spin` if no sensor shows an attitude). Then
     standard deviations, one number or three, zero for known values: `rate` of Ω, rad/s; `attitude`
     rad; `position` m and `velocity` m/s of a `Rigid`. Torques start from their model's stationary
-    distribution. **Returns** a `Belief`: `t`, `state`, `deviation`, `covariance`.
-
-    **Raises:** `ValueError` for a deviation that is missing or below zero, `TypeError` for
-    arguments of another type.
+    distribution. **Returns** a `Belief`. **Raises:** `ValueError` for a deviation that is missing
+    or below zero, `TypeError` for arguments of another type.
 
     >>> import rigidjax as rj
     >>> record = rj.identify.Recording([0.0, 1.0], (rj.identify.Gyro(0.1), [[1.0, 0, 0]] * 2))

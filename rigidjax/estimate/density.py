@@ -47,32 +47,28 @@ class LogDensity(eqx.Module):
     """The logarithm of the posterior density of a fitted problem, of one vector x.
 
     Call it with x (n,), real numbers without bounds: the problem's `Parameters` (body chart,
-    `Free`s, initial states), then logarithms of factors of the unknown noises (one for each noise
-    that the fit estimates) and of the process's numbers. `unpack(x)` gives body, states and values,
-    `x0` is the fit. `covariance` is Laplace's, for a sampler's start and mass matrix; it is smaller
-    than the fit's if errors are autocorrelated.
+    `Free`s, initial states), then logarithms of factors of the noises that the fit estimates and of
+    the process's numbers. `unpack(x)` gives body, states and values, `x0` is the fit. `covariance`
+    is Laplace's, for a sampler's start and mass matrix; it is smaller than the fit's if errors are
+    autocorrelated.
 
-    With a `process` the filter integrates the unknown torque out, from the initial state in x.
-    Without it the readings are independent and normal about the motion: this is too narrow if the
-    fit says that its errors are autocorrelated; keep fewer readings then, or give a process. Priors
-    are the problem's: `Free`s with a prior, an `Entropic` one; the prior of all other numbers is
-    flat in x.
+    With a `process` the filter integrates the unknown torque out. Without it the readings are
+    independent and normal about the motion: this is too narrow if errors are autocorrelated; keep
+    fewer readings then, or give a process. Priors are the problem's: `Free`s with a prior, an
+    `Entropic` one; the prior of all other numbers is flat in x.
 
-    **Arguments:** `fit` of `identify.fit`; with a process a first guess is enough,
-    `fit(problem, starts=1, max_steps=1)`, since a motion without the torque may not explain the
-    readings; `process` a `RandomTorque` or `CorrelatedTorque` or `None`; `deviation` of the normal
-    prior of the logarithms of its density and time about the given values, `None` for a known
-    process. The density scales with the square of a moment if only ratios of moments are
+    **Arguments:** `fit` of `identify.fit`; with a process a first guess is enough, `fit(problem,
+    starts=1, max_steps=1)`; `process` a `RandomTorque` or `CorrelatedTorque` or `None`; `deviation`
+    of the normal prior of the logarithms of its density and time about the given values, `None` for
+    a known process. The density scales with the square of a moment if only ratios of moments are
     determined, as by a gyro alone: compare `density / moment**2`, and give the prior in the fit's
-    own unit of inertia (`fit.body`).
-
-    **Raises:** `TypeError` for arguments of another type; `ValueError` for a robust loss, which is
-    no density, and for directions that neither data nor a prior determine.
+    own unit of inertia (`fit.body`). **Raises:** `TypeError` for arguments of another type;
+    `ValueError` for a robust loss, which is no density, and for directions that neither data nor a
+    prior determine.
 
     For numpyro: `numpyro.infer.MCMC(NUTS(potential_fn=lambda x: -density(x)), …)`; for blackjax:
     `blackjax.nuts(density, …)`, or `estimate.posterior`. Gradients are computed recording by
-    recording in forward mode, also under `jax.grad`. It is a Module of arrays: compile it by
-    `equinox.filter_jit(density)`.
+    recording in forward mode, also under `jax.grad`; compile it by `equinox.filter_jit(density)`.
 
     >>> import rigidjax as rj
     >>> ts = jnp.linspace(0.0, 10.0, 80)

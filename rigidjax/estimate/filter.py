@@ -165,9 +165,8 @@ def filter(
 
     The multiplicative extended Kalman filter: the estimate is a state on the group, its error a
     rotation vector and numbers (Lefferts, Markley and Shuster 1982, doi:10.2514/3.56190). Between
-    readings both follow the equations of motion, by the classical method of order 4 and its exact
-    derivative. The covariance is kept as a root: Gram–Schmidt carries it from step to step,
-    Potter's formula updates it by each number read.
+    readings both follow the equations of motion, by the classical method of order 4. The covariance
+    is kept as a root, updated by Potter's formula for each number read.
 
     **Arguments:** `model`; `recording` a `Recording` whose sensors have their noise; masked
     readings are gaps, channels at their full scale are left out, a sensor's `offset` is a delay;
@@ -205,11 +204,9 @@ def log_likelihood(
 ) -> Scalar:
     """The logarithm of the density of all readings, the unknown torques integrated out.
 
-    `Σ log N(ν; 0, s)` over innovations (Schweppe 1965, doi:10.1109/TIT.1965.1053737). Maximise it
-    over the unknowns: moments, a density, a noise, an initial state. It is the likelihood of a
-    deterministic fit if the initial state is known and no torque is random.
-
-    **Arguments** and **raises** as for `filter`; differentiable in forward and reverse mode.
+    `Σ log N(ν; 0, s)` over innovations (Schweppe 1965, doi:10.1109/TIT.1965.1053737): maximise it
+    over moments, a density, a noise, an initial state. **Arguments** and **raises** as for
+    `filter`; differentiable in forward and reverse mode.
 
     >>> import rigidjax as rj
     >>> record = rj.identify.Recording([0.0, 0.1], (rj.identify.Gyro(1.0), [[1.0, 0, 0]] * 2))
@@ -227,11 +224,9 @@ def step(model: Model, belief: Belief, t: ScalarLike, *readings: tuple) -> Belie
     **Arguments:** `model`; `belief` of `start` or the last `step`; `t` s, not before it; `readings`
     pairs `(sensor, value)` or triples `(sensor, value, seen)`, `seen` a truth value. The walks'
     `where` finds the sensors as `r.readings[i].sensor`, in this order, so each call gives them all.
-
     This is one step of the classical method: the time between readings must be short against a
-    turn. **Returns** the `Belief` at `t`: `state`, `deviation`, `covariance`, and what is of its
-    torques. **Raises:** `ValueError` for a `t` before the belief, or a reading with NaN, if the
-    numbers are known.
+    turn. **Returns** the `Belief` at `t`. **Raises:** `ValueError` for a `t` before the belief, or
+    a reading with NaN, if the numbers are known.
 
     >>> import jax, rigidjax as rj
     >>> gyro = rj.identify.Gyro(0.1)

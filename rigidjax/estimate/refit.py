@@ -116,14 +116,13 @@ def refit(
     """The maximum of the posterior density, and weighted draws around it for intervals.
 
     A fit that allows for an unknown torque: `refit(LogDensity(fit, RandomTorque(1e-4)))` finds
-    body, initial states, all `Free`s, and the torque's density, starting from `fit`. The method is
-    Fisher's scoring: Levenberg and Marquardt's search with the expected information of the
-    innovations as the normal matrix (Gupta and Mehra 1974, doi:10.1109/TAC.1974.1100714), added up
-    recording by recording. The draws come from Student's t about that point, with a covariance
-    wider than the inverse information; the weight of a draw is the density over that of the t
-    (importance sampling: Geweke 1989, doi:10.2307/1913710). Draws of more than some dozen numbers
-    are worth little (`effective`); intervals then come from the information, which is enough if
-    each recording is long. `estimate.posterior` draws from any density.
+    body, initial states, all `Free`s, and the torque's density, starting from `fit`, by Fisher's
+    scoring: Levenberg–Marquardt with the expected information of the innovations as the normal
+    matrix (Gupta and Mehra 1974, doi:10.1109/TAC.1974.1100714). The draws come from a wide
+    Student's t about that point, weighted by the density over that of the t (importance sampling:
+    Geweke 1989, doi:10.2307/1913710). Draws of more than some dozen numbers are worth little
+    (`effective`); intervals then come from the information, which is enough if each recording is
+    long. `estimate.posterior` draws from any density.
 
     **Arguments:** `density` a `LogDensity`; `max_steps` at most; `draws` how many; `key` of
     `jax.random` for them, by default always the same. **Returns** a `Refit`; `converged` is false

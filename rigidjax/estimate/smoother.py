@@ -100,10 +100,10 @@ def smooth(
 ) -> Smoothed:
     """Attitude, rate, unknown torque and sensor errors from all readings, with their deviations.
 
-    This is the motion of largest posterior density, by Gauss and Newton's method. Each iteration
-    linearises dynamics and sensors about the last motion. It solves the linear problem exactly by a
-    Kalman filter and the backward pass of Rauch, Tung and Striebel, on roots of covariances (Bell
-    1994, doi:10.1137/0804035). The first motion is the result of `filter`.
+    The motion of largest posterior density, by Gauss and Newton's method: each iteration linearises
+    dynamics and sensors about the last motion, at first that of `filter`, and solves the linear
+    problem exactly by a Kalman filter and the pass of Rauch, Tung and Striebel (Bell 1994,
+    doi:10.1137/0804035).
 
     **Arguments:** as for `filter`; `iterations` at most; it ends when no number moved by more than
     `tolerance` of its standard deviation (the error that remains is about the square of that).

@@ -219,14 +219,13 @@ class Principal(AbstractBodyChart):
 class Mass(AbstractBodyChart):
     """Mass, centre of mass and inertia: all ten numbers, if forces show them, or some of them.
 
-    The chart of `rigidjax.body.parameters.pack` around a `guess`, which is where it starts.
-
     **Arguments:** `guess` a `MassProperties` of about the right size, with the true values of all
-    numbers that are not free; `free` the parts that a fit may move: `"mass"` (the second moment
-    keeps its ratio to the mass unless the inertia is free, too), `"inertia"` about the centre of
-    mass, `"com"`. Take `free=["inertia"]` for a body that was weighed and balanced, `["mass"]` for
-    a load of known shape, `["com"]` for a centre that moved. **Raises:** `TypeError` for a guess of
-    another type; `ValueError` for another word, or none.
+    numbers that are not free, where the chart of `rigidjax.body.parameters.pack` starts; `free` the
+    parts that a fit may move: `"mass"` (the second moment keeps its ratio to the mass unless the
+    inertia is free, too), `"inertia"` about the centre of mass, `"com"`: `["inertia"]` for a body
+    that was weighed and balanced, `["mass"]` for a load of known shape, `["com"]` for a centre that
+    moved. **Raises:** `TypeError` for a guess of another type; `ValueError` for another word, or
+    none.
 
     >>> import rigidjax as rj
     >>> box = rj.shapes.box(2.0, [1.0, 1.0, 1.0])

@@ -35,15 +35,14 @@ class Comparison(eqx.Module):
 
 
 def compare(fits: Mapping[str, Fit]) -> tuple[Comparison, ...]:
-    """Models of the same data, best first, by Schwarz's criterion.
+    """Models of the same data, best first, by Schwarz's criterion (1978,
+    doi:10.1214/aos/1176344136).
 
     `N log s² + p log N` with s² the mean square of each sensor's errors and N the number of
-    independent readings: the number of readings divided by the samples over which the errors of the
-    best model are autocorrelated, the same for all.
-
-    **Arguments:** `fits` name → `Fit`, all of the same readings. **Raises** `ValueError` for none,
-    or for fits of other readings. **Returns** for each `name`, `free`, `rms`, `correlation` and
-    `information` (`Comparison`). Source: Schwarz 1978, doi:10.1214/aos/1176344136.
+    independent readings, those read divided by the samples over which the errors of the best model
+    are autocorrelated. **Arguments:** `fits` name → `Fit`, all of the same readings. **Returns**
+    for each `name`, `free`, `rms`, `correlation` and `information` (`Comparison`). **Raises**
+    `ValueError` for none, or for fits of other readings.
 
     >>> import rigidjax as rj
     >>> ts = jnp.linspace(0.0, 10.0, 80)
@@ -88,13 +87,11 @@ def cross_validate(
 ) -> tuple[tuple[float, ...], ...]:
     """The errors of each recording under a body fitted to all other recordings.
 
-    The body and all shared numbers come from the other recordings. The fit to the recording left
-    out moves only its own numbers: its initial state and the `Free`s with one value for each.
-
-    **Arguments:** `build` the problem of a sequence of recordings; `recordings` two at least;
-    `options` for `fit`. **Returns** for each recording the root mean square error of each sensor.
-    The model whose errors are smallest predicts best. **Raises** `ValueError` for fewer than two
-    recordings.
+    The body and all shared numbers come from the others; the fit to the recording left out moves
+    only its initial state and the `Free`s with one value for each. **Arguments:** `build` the
+    problem of a sequence of recordings; `recordings` two at least; `options` for `fit`. **Returns**
+    for each recording the root mean square error of each sensor: the model with the smallest
+    predicts best. **Raises** `ValueError` for fewer than two recordings.
 
     >>> cross_validate(lambda records: None, [])
     Traceback (most recent call last):

@@ -162,15 +162,14 @@ class LogError(ValueError):
 
 
 def read_table(path: str | Path, columns: Sequence[str]) -> dict[str, np.ndarray]:
-    """Columns of a log by name: text with a header, `.npz`, `.mat` (MATLAB up to v7), or a
-    Blackbox log of a flight controller, `.bbl` or `.bfl` (with the extra `blackbox`).
+    """Columns of a log by name: text with a header, `.npz`, `.mat` (MATLAB up to v7), or a Blackbox
+    log of a flight controller, `.bbl` or `.bfl` (with the extra `blackbox`).
 
     **Arguments:** `path`; `columns` the names that are wanted, others are ignored. Text is
     separated by commas, semicolons or tabs, whichever splits the header line into most names; its
-    decimals have a point. Lines that begin with `#` may stand above the header, and the header may
-    be the last of them, as `numpy.savetxt` writes it. **Returns** name → (T,) numbers. An empty
-    cell is a gap and comes back as NaN. A text is read line by line; the memory needed is up to
-    three times its numbers.
+    decimals have a point. Lines that begin with `#` may stand above the header, which may be the
+    last of them, as `numpy.savetxt` writes it. **Returns** name → (T,) numbers, NaN for an empty
+    cell. A text is read line by line; the memory needed is up to three times its numbers.
 
     **Raises:** `ValueError`, one line naming file, line and column, for a file that is missing, cut
     or not of its kind, a missing column or two of its name, a name that is wanted twice, a cell

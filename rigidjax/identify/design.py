@@ -100,9 +100,7 @@ def best_first_rate(
     """The direction of the initial rate that determines the body best; its length is kept.
 
     It minimises the mean logarithm of the standard deviations of the body's free numbers
-    (D-optimality of the body, other numbers free as well), by BFGS of optimistix on the gradient
-    through Fisher's information. It finds the best direction near `omega`: try several.
-
+    (D-optimality, other numbers free as well), by BFGS of optimistix near `omega`: try several.
     **Arguments:** `problem`, `body` as for `Problem.start`; `omega` (3,) rad/s, body frame, where
     the search starts and how fast the body can be thrown; `max_steps`. **Returns** the rate (3,)
     and what to expect from it (`expected`). **Raises:** as `fisher`.

@@ -75,27 +75,23 @@ def fit(
       deviations (of each parameter with all others fixed) with an equally small change of the
       misfit, or after `max_steps` steps.
     - `together`: the number of starts in one `vmap`.
-    - `pieces`: if more than one, the record is first fitted in so many pieces with joined ends (see
-      `pieces`), and the result is the first start.
+    - `pieces`: if more than one, the record is first fitted in so many pieces with joined ends.
     - `descent`: a `Descent(optimiser, steps=…, batch=…)` of optax first improves each start on a
       few recordings at a time: for many recordings, when a step of least squares is expensive.
     - `checkpoint`: a file that keeps the state of the search after every 25 steps. A second call
-      with the same problem and options continues from there. It ends at the same point to the last
-      bit on the same machine and versions, wherever the first was killed. `together` = 1 only.
+      with the same problem and options continues from there, and ends at the same point to the
+      last bit on the same machine and versions. `together` = 1 only.
     - `progress`: called with a line of text after each start, such as `print`.
 
-    **Returns** a `Fit`. It always holds the best point reached, and two answers.
-    `fit.search`: `found`, `not alone` (another motion fits as well), or `not ended`. `fit.model`:
-    `explains the readings` (the errors are white and of the sensor's size), `leaves a part` (how
-    large, and where), or `does not explain the readings`. `fit.causes` names the most likely causes
-    of the remaining errors, `fit.advice` says whether the intervals can be trusted and gives
-    advice, `fit.status` is both answers in a line, `ok` if all is well. An interrupt (Ctrl-C) ends
-    the search and keeps the best point so far; the status says so, and is not `ok`.
+    **Returns** a `Fit` of the best point reached, with two answers. `fit.search`: `found`, `not
+    alone` (another motion fits as well), or `not ended`. `fit.model`: `explains the readings` (the
+    errors are white and of the sensor's size), `leaves a part` (how large, and where), or `does not
+    explain the readings`. `fit.causes` and `fit.advice` say what most likely makes the errors and
+    whether the intervals can be trusted; `fit.status` is both answers in a line, `ok` if all is
+    well. An interrupt (Ctrl-C) ends the search and keeps the best point so far; the status says so.
 
-    The method is Levenberg–Marquardt on normal equations, with Jacobians by forward mode through
-    the motion. **Raises:** `TypeError` unless `problem` is a `Problem`, `ValueError` for fewer than
-    one start, a checkpoint that is damaged or of another problem, or one in a folder that does not
-    exist.
+    **Raises:** `TypeError` unless `problem` is a `Problem`, `ValueError` for fewer than one start,
+    a checkpoint that is damaged or of another problem, or one in a folder that does not exist.
 
     >>> import jax.numpy as jnp, rigidjax as rj
     >>> ts = jnp.linspace(0.0, 10.0, 80)

@@ -35,8 +35,8 @@ def simulate_readings(
     """The readings of a sensor along a known motion, with noise: data to test a fit.
 
     The motion comes from `rigidjax.simulate`; bias, scale, mounting, clock offset, low-pass filter
-    and full scale come from the sensor. The residuals of a fit with the same sensor are the noise.
-    The function is differentiable, and works under `jax.jit` and `jax.vmap`.
+    and full scale from the sensor. The residuals of a fit with the same sensor are the noise. The
+    function is differentiable, and works under `jax.jit` and `jax.vmap`.
 
     **Arguments:** `sensor` an `AbstractSensor`, or a sequence of them along one motion; `body`,
     `state0`, `ts` (T,) s, `torque` as for `rigidjax.simulate`; `MassProperties` are allowed for all
@@ -47,8 +47,7 @@ def simulate_readings(
 
     **Raises:** `TypeError` for anything but a sensor, and for a state without the parts that the
     sensor reads; `ValueError` for a key if the sensor's noise is `None`, and for a sensor of your
-    own without a method `reading_of` if its readings have another shape than its error; as
-    `rigidjax.simulate`.
+    own without a method `reading_of` if its readings have another shape than its error.
 
     >>> import rigidjax as rj
     >>> body, start = rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([0.0, 0.0, 2.0])

@@ -24,14 +24,12 @@ STRIDE = 50
 class Descent(eqx.Module):
     """The first descent of a fit, on a few recordings at a time.
 
-    Each step draws `batch` recordings, differentiates their misfit (exactly, by forward mode within
-    each recording) and hands the gradient of all parameters to `optimiser`. The parameters of a
-    `Problem` are unconstrained and of order one, so that a learning rate is a share of order one.
-
-    **Arguments:** `optimiser` any `optax.GradientTransformation`; `steps` their number; `batch` the
-    number of recordings in a step, drawn without replacement. Source: Robbins and Monro 1951,
-    doi:10.1214/aoms/1177729586; the optimisers are optax's. **Raises:** `TypeError` for anything
-    but an optimiser, `ValueError` for counts below one.
+    Each step draws `batch` recordings without replacement, differentiates their misfit and hands
+    the gradient of all parameters to `optimiser`. The parameters are unconstrained and of order
+    one: a learning rate is a share of order one. **Arguments:** `optimiser` any
+    `optax.GradientTransformation`; `steps` their number; `batch`. **Raises:** `TypeError` for
+    anything but an optimiser, `ValueError` for counts below one. Source: Robbins and Monro 1951,
+    doi:10.1214/aoms/1177729586.
 
     >>> import optax, rigidjax as rj
     >>> rj.identify.Descent(optax.adam(1e-2), steps=200, batch=4).batch

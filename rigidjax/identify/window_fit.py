@@ -196,13 +196,10 @@ def fit_windows(
     the starts as measured; `max_steps` of the search. The motion is computed by `RungeKutta4`, one
     step a sample.
 
-    Levenberg–Marquardt (`rigidjax.identify.levenberg_marquardt`) on normal equations that are
-    summed window by window, so that memory does not grow with their number. Uncertain starts are
-    found window by window, and eliminated from the normal equations (variable projection). A long
-    run from a poor guess diverges: the search first uses a ninth and a third of long windows, with
-    ten steps at most for each, and continues from there (from the guess, if the cost is higher than
-    at the guess). The search ends when a step gains less than 0.05² of the gain of a fit from noise
-    alone: about 0.05 standard deviations.
+    Levenberg–Marquardt on normal equations that are summed window by window. Uncertain starts are
+    found window by window, and eliminated (variable projection). The search first uses a ninth and
+    a third of long windows, since a long run from a poor guess diverges, and ends when a step gains
+    less than 0.05² of the gain of a fit from noise alone: about 0.05 standard deviations.
 
     **Returns** a `WindowFit`; a fit that ends early returns its best point and says so. **Raises:**
     `ValueError` for missing inputs, unknown kinds, and a guess with runs that are not finite;

@@ -125,11 +125,9 @@ def windows(
     with a leading axis (T,); `inputs` by name (T, *k), each held until the next sample, for the
     `rigidjax.torques.Input`s of a torque; `before` the number of input samples kept before each
     start, for a torque that delays them (`rigidjax.torques.Delayed`) or has states of its own, such
-    as `Lagged`. These states begin there, and follow the inputs up to the start, with the body held
-    at its measured start. No window, with the samples before it, goes across a gap.
-
-    **Raises:** `ValueError` for shapes that do not agree, NaN, times that are uneven, a record
-    without a window of this length; `TypeError` for other states.
+    as `Lagged`: these follow the inputs up to the start, with the body held there. No window, with
+    the samples before it, goes across a gap. **Raises:** `ValueError` for shapes that do not agree,
+    NaN, uneven times, a record without a window of this length; `TypeError` for other states.
 
     >>> t = np.arange(6.0)
     >>> windows(t, Spin(np.ones((6, 3))), length=2, stride=2).count

@@ -23,17 +23,15 @@ class LowPass(eqx.Module):
     """A low-pass filter of first or second order (Butterworth), as in the chips of gyros.
 
     Give it to a sensor (`Gyro(0.01, lowpass=LowPass(40.0))`): then the predictions go through the
-    same filter as the readings. Without it a fit mistakes the filter's lag for an offset of the
-    clock, and its damping of faster rates for another motion.
+    same filter as the readings; else a fit mistakes its lag for an offset of the clock.
 
     `ẏ = w(u − y)`, or `ÿ + √2 w ẏ + w² y = w² u`, with w = 2π · cutoff; solved exactly, from sample
     to sample, for a cubic between samples of u. Before the first sample u is the cubic through the
-    first four samples. Before a sample that follows a gap of more than three intervals u is a
-    straight line.
+    first four, before a sample after a gap of more than three intervals a straight line.
 
     **Arguments:** `cutoff` Hz, the frequency of gain 1/√2 (a `Free` may move it); `order` 1 or 2.
-    Source: Butterworth 1930, Experimental Wireless 7:536. **Raises** `ValueError` for a cutoff that
-    is not positive, another order.
+    **Raises** `ValueError` for a cutoff that is not positive, another order. Source: Butterworth
+    1930, Experimental Wireless 7:536.
 
     >>> slow = LowPass(0.5)(jnp.arange(4.0), jnp.ones((4, 1)))
     >>> bool(jnp.allclose(slow, 1.0))
