@@ -206,7 +206,7 @@ def assess(
     white = uncertainty.of_white(linear)
     spread = uncertainty.spread(linear, times, white)
     numbers, names = values_and_slopes(problem, value, near), [n for n, _ in charts(problem)]
-    limits = flat_limit.limits(problem, numbers, uncertainty.step(linear, white), names)
+    limits = flat_limit.limits(problem, numbers, -white.seen @ linear.slope, names)
     # Steps stay short in a long curved valley, although hardly anything is left to gain.
     held = [limit.slope for limit in limits if limit.free < 0]
     done = bool(best.converged) or uncertainty.distance(linear, white, held) < AT_THE_END

@@ -23,7 +23,7 @@ from rigidjax.identify.checkpoint import (
     require_folder,
 )
 from rigidjax.identify.initial_guess import starting_points
-from rigidjax.identify.multiple_shooting import WIDTHS, joined, pieces as in_pieces, with_width
+from rigidjax.identify.multiple_shooting import WIDTHS, joined, pieces as in_pieces
 from rigidjax.identify.parameters import Parameters, by_slot, numbered
 from rigidjax.identify.problem import Problem, fits
 from rigidjax.identify.propagation import AbstractIntegrator, Adaptive, FixedSteps
@@ -171,7 +171,7 @@ def _from_pieces(problem: Problem, count: int, tolerance: float, max_steps: int)
         starting_points(cut, 1, None)[0],
     )
     for width in WIDTHS:
-        narrowed = task._replace(problem=with_width(cut, width))
+        narrowed = eqx.tree_at(lambda t: t.problem.links.width, task, jnp.asarray(width))
         point = least_squares(point, narrowed, whole(cut), max_steps, CAREFUL).parameters
     return joined(problem, cut, point)
 

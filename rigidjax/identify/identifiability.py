@@ -18,10 +18,10 @@ from rigidjax.identify.problem import Problem
 from rigidjax.identify.quantities import (
     Quantity,
     charts,
-    covariance as reported_covariance,
     labels,
     quantile,
     recording_names,
+    value_and_slope,
     vector,
 )
 from rigidjax.identify.reference_states import ReferenceStates
@@ -340,7 +340,8 @@ def scale_is_unseen(fit: "Fit") -> bool:
 
 def correlations(fit: "Fit") -> list[str]:
     """Pairs of reported quantities (moments, not components) whose errors have |ρ| > 0.95."""
-    covariance = reported_covariance(fit)
+    slope = np.asarray(value_and_slope(fit.problem, fit.beside)[1])[: len(fit.quantities)]
+    covariance = slope @ np.asarray(fit.seen) @ slope.T
     deviation = np.array([quantity.deviation for quantity in fit.quantities])
     good = np.isfinite(deviation) & (deviation > 0)
     follow = {f"{plain}{name}" for name, c in charts(fit.problem) for plain in c.plain_names}

@@ -65,12 +65,6 @@ def pieces(problem: Problem, count: int, *, width: float = WIDTHS[-1]) -> Proble
     )
 
 
-def with_width(problem: Problem, width: float) -> Problem:
-    """The same pieces with another width of the gaps."""
-    assert problem.links is not None
-    return eqx.tree_at(lambda p: p.links.width, problem, jnp.asarray(float(width)))
-
-
 def joined(problem: Problem, cut: Problem, found: Parameters) -> Parameters:
     """The parameters of the uncut problem, taken from the first piece."""
     first = padding.one(found.own, 0)

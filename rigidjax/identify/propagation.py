@@ -1,4 +1,4 @@
-"""From a body and an initial state to the states at a recording's times."""
+"""From a body and an initial state to the states at a recording's times, and to sensors' input."""
 
 import abc
 import math
@@ -63,26 +63,17 @@ class FixedSteps(AbstractIntegrator):
 
     substeps: int = eqx.field(static=True, default=1)
     solver: AbstractExplicit = solvers.Tsitouras5()
+    # The number of the last time that is needed, `None` for all.
+    last: Int[Array, ""] | None = eqx.field(default=None, repr=False)
 
     def __check_init__(self):
         _checks.whole(self.substeps, "substeps", 1)
         _checks.instance(self.solver, AbstractExplicit, "solver", wanted="one of rigidjax.solvers")
 
     def states(self, body: Any, state0: Any, ts: Float[Array, " times"], torque: Torque) -> Any:
-        return FirstPart(self, None).states(body, state0, ts, torque)
-
-
-class FirstPart(AbstractIntegrator):
-    """`FixedSteps` up to the number of the `last` time that is needed, `None` for all."""
-
-    steps: FixedSteps
-    last: Int[Array, ""] | None
-
-    def states(self, body: Any, state0: Any, ts: Float[Array, " times"], torque: Torque) -> Any:
         y0 = started(body, state0, torque, ts[0])
         field = equations_of_motion(body, y0, torque)
-        solver = in_a_loop(self.steps.solver)
-        return fixed(solver, field, ts, y0, self.steps.substeps, self.last)
+        return fixed(in_a_loop(self.solver), field, ts, y0, self.substeps, self.last)
 
 
 class Adaptive(AbstractIntegrator):
@@ -102,11 +93,13 @@ class Adaptive(AbstractIntegrator):
         _checks.not_negative(self.atol, "atol")
 
     def states(self, body: Any, state0: Any, ts: Float[Array, " times"], torque: Torque) -> Any:
-        # A solver refuses repeated times (the tail of a shorter record).
+        # A solver refuses repeated times, the tail of a shorter record: they grow by round-off.
+        first = jnp.zeros(1, bool)
+        again = jnp.cumsum(jnp.concatenate([first, jnp.diff(ts) <= 0]).astype(ts.dtype))
         out = simulate(
             body,
             state0,
-            _increasing(ts),
+            ts + 1e-9 * (ts[-1] - ts[0]) * again,
             torque,
             rtol=self.rtol,
             atol=self.atol,
@@ -144,13 +137,6 @@ def shifted(field: Callable[..., Any], t: Array, state: Any, offset: Array) -> A
     for index in range(4):
         state, _ = advance(KUTTA4, lambda t, y: field(t, y, None), t + index * h, h, state)
     return state
-
-
-def _increasing(ts: Float[Array, " times"]) -> Float[Array, " times"]:
-    """The same times, with the repeated ones at the end increased by a few units of round-off."""
-    gap = 1e-9 * (ts[-1] - ts[0])
-    again = jnp.cumsum(jnp.concatenate([jnp.zeros(1, bool), jnp.diff(ts) <= 0]).astype(ts.dtype))
-    return ts + gap * again
 
 
 def what_turns(body: Any, rung: type) -> Any:

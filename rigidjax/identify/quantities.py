@@ -129,7 +129,7 @@ def vector(problem: Problem, parameters: Parameters) -> Array:
 
 
 @eqx.filter_jit
-def _value_and_slope(problem: Problem, parameters: Parameters) -> tuple[Array, Array]:
+def value_and_slope(problem: Problem, parameters: Parameters) -> tuple[Array, Array]:
     """The reported quantities and the flatness of each body, and their derivatives."""
     flat, restore = ravel_pytree(parameters)
 
@@ -144,9 +144,9 @@ def values_and_slopes(
     problem: Problem, parameters: Parameters, near: Parameters | None
 ) -> tuple[np.ndarray, np.ndarray]:
     """The reported quantities and the flatness of each body, with their derivatives at `near`."""
-    values, slopes = (np.asarray(x) for x in _value_and_slope(problem, parameters))
+    values, slopes = (np.asarray(x) for x in value_and_slope(problem, parameters))
     if near is not None:
-        slopes = np.asarray(_value_and_slope(problem, near)[1])
+        slopes = np.asarray(value_and_slope(problem, near)[1])
     return values, slopes
 
 
@@ -194,12 +194,6 @@ def _cuts(
                 rho = slope @ covariance @ limit.slope / (deviations * wide)
             out.append((np.where(np.isfinite(rho), rho, 0.0), limit.free / wide))
     return out
-
-
-def covariance(fit: "Fit") -> np.ndarray:
-    """Covariance of the reported quantities, with logarithms of the positive ones."""
-    slope = np.asarray(_value_and_slope(fit.problem, fit.beside)[1])[: len(labels(fit.problem))]
-    return slope @ np.asarray(fit.seen) @ slope.T
 
 
 def carried(slope: np.ndarray, covariance: np.ndarray, null: np.ndarray) -> np.ndarray:

@@ -16,7 +16,7 @@ from rigidjax.identify.checkpoint import SearchState, Tried
 from rigidjax.identify.levenberg_marquardt import BOLD, CAREFUL, Search, Settings, search
 from rigidjax.identify.parameters import Parameters, places
 from rigidjax.identify.problem import Problem
-from rigidjax.identify.propagation import FirstPart, FixedSteps
+from rigidjax.identify.propagation import FixedSteps
 from rigidjax.identify.recording import count_of
 from rigidjax.identify.reference_states import ReferenceStates
 from rigidjax.identify.terms import (
@@ -117,7 +117,9 @@ def _as_far_as(problem: Problem, weights: Float[Array, "records times"]) -> Prob
     counts = jnp.any(weights > 0, axis=0)
     place = jnp.arange(counts.size, dtype=jnp.int32)
     last = jnp.minimum(jnp.max(jnp.where(counts, place, 0)) + _BEYOND, counts.size - 1)
-    return eqx.tree_at(lambda p: p.integrator, problem, FirstPart(steps, last))
+    return eqx.tree_at(
+        lambda p: p.integrator, problem, FixedSteps(steps.substeps, steps.solver, last)
+    )
 
 
 def _nothing(problem: Problem, start: Parameters, columns: int, kind: Any) -> Any:

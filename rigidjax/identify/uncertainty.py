@@ -193,11 +193,6 @@ def inverted(information: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return half, null / np.linalg.norm(null, axis=1, keepdims=True)
 
 
-def step(linear: Linearised, white: Spread) -> np.ndarray:
-    """The step (n,) to the linear least misfit, −(JᵀWJ)⁻¹g in determined directions."""
-    return -white.seen @ linear.slope
-
-
 def distance(linear: Linearised, white: Spread, held: Sequence[np.ndarray] = ()) -> float:
     """The distance to the least misfit in standard deviations, √(gᵀ(JᵀWJ)⁻¹g), as MINUIT's (James
     and Roos 1975, doi:10.1016/0010-4655(75)90039-9); derivatives `held` (n,) stay fixed.
