@@ -58,24 +58,19 @@ def compare(fits: Mapping[str, Fit]) -> tuple[Comparison, ...]:
         _checks.instance(found, Fit, f"fits[{name!r}]")
     if not fits:
         raise ValueError("compare: wanted at least one fit")
-    counts = {
-        name: tuple(count_of(reading) for reading in found.problem.records.readings)
-        for name, found in fits.items()
-    }
+    readings = {name: found.problem.records.readings for name, found in fits.items()}
+    counts = {name: tuple(map(count_of, some)) for name, some in readings.items()}
     if len(set(counts.values())) > 1:
         raise ValueError(f"compare: wanted fits of the same readings, got {counts}")
     shortest = max(min(found.correlation for found in fits.values()), 1.0)
     rows = []
     for name, found in fits.items():
         size = int(found.covariance.shape[0])
-        total = 0.0
-        for count, rms in zip(counts[name], found.rms, strict=True):
-            total += count / shortest * 2.0 * np.log(max(rms, 1e-300))
-        independent = sum(counts[name]) / shortest
-        total += size * np.log(max(independent, 2.0))
-        rows.append((total, name, size, found))
-    best = min(total for total, *_ in rows)
+        independent = np.array(counts[name]) / shortest
+        misfit = independent @ (2.0 * np.log(np.maximum(found.rms, 1e-300)))
+        rows.append((misfit + size * np.log(max(independent.sum(), 2.0)), name, size, found))
     rows.sort(key=lambda row: row[0])
+    best = rows[0][0]
     return tuple(
         Comparison(name, size, found.rms, found.correlation, float(total - best))
         for total, name, size, found in rows

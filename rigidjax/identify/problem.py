@@ -136,11 +136,11 @@ class Problem(eqx.Module):
         elif not isinstance(apart, bool):
             self.noise_groups, _ = grouped(apart, of, "noise_each")
         self.slots = find(free, recordings[0], of)
-        for one in charts_of(chart):
-            for slot in self.slots:
-                if slot.name in (*one.log_names, *one.plain_names, "Ωx", "Ωy", "Ωz"):
-                    wanted = "a quantity of the body has this name; give another"
-                    raise ValueError(f"Free {slot.name!r}: {wanted}")
+        taken = {name for one in charts_of(chart) for name in (*one.log_names, *one.plain_names)}
+        for slot in self.slots:
+            if slot.name in taken | {"Ωx", "Ωy", "Ωz"}:
+                wanted = "a quantity of the body has this name; give another"
+                raise ValueError(f"Free {slot.name!r}: {wanted}")
         self.rung = _rung(recordings[0], chart)
         self.reference = reference_of(recordings, self.rung)
         if integrator is None and self.records.torque is not None:

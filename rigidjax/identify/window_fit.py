@@ -1,6 +1,7 @@
 """The fit of a model to many short open-loop runs: Gauss and Newton over windows."""
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any, Generic, TypeVar
 
 import equinox as eqx
@@ -60,12 +61,9 @@ def open_loop_errors(
 @eqx.filter_jit
 def all_errors(windows: Windows, scene: Any, value: Any) -> Float[Array, "windows steps n"]:
     """The errors of a model with these numbers."""
-
-    def one(window: Any) -> Array:
-        return open_loop_errors(scene, windows.step, value, *window)
-
+    of = partial(open_loop_errors, scene, windows.step, value)
     parts = (windows.starts, windows.wanted, windows.inputs)
-    return lax.map(one, parts, batch_size=min(128, windows.count))
+    return lax.map(lambda window: of(*window), parts, batch_size=min(128, windows.count))
 
 
 # Steps of Gauss and Newton's for each start; residuals of a short run are nearly linear in it.
@@ -121,9 +119,7 @@ def eliminated(
     gram, slope = jacobian.T @ jacobian, jacobian.T @ found
     beside = gram[number:, number:] + jnp.diag(firm)
     # The part of each number's effect that the start absorbs, and the remaining gradient.
-    sides = jnp.concatenate(
-        [gram[number:, :number], (slope[number:] + firm * step)[:, None]], axis=1
-    )
+    sides = jnp.c_[gram[number:, :number], slope[number:] + firm * step]
     taken = gram[:number, number:] @ jnp.linalg.solve(beside, sides)
     cost = 0.5 * (found @ found + jnp.sum(firm * step * step))
     return cost, gram[:number, :number] - taken[:, :number], slope[:number] - taken[:, number]
@@ -220,7 +216,13 @@ def fit_windows(
     x, back = _numbers(guess, windows.starts.omega.dtype)
     guess = back(x)
     start = jax.tree.map(lambda a: a[0], windows.starts)
-    _require_scene(windows, start, scene(guess))
+    made = scene(guess)
+    if not isinstance(made, tuple) or len(made) != 2:
+        raise TypeError(f"scene: wanted (body, torque), got {type(made).__name__}")
+    require_fit(made[0], start, made[1])
+    require_inputs(made[1], windows.inputs)
+    if wrong := _too_late(windows, made[1]):
+        raise ValueError(wrong)
     whole = windows.length
     scales = _scales(windows, whole, noise)
     firm = precisions(starts, names(windows.starts), noise)
@@ -234,7 +236,11 @@ def fit_windows(
 
     evaluated = Settings(_SETTLED, BOLD, 0)
     last = Settings(_SETTLED, BOLD, max_steps, level=_LEVEL)
-    begin = _grown(searched, guess, back, whole)
+    begin = guess
+    for part in _PARTS:
+        if whole // part >= _SHORTEST:
+            end = searched(begin, Settings(_SETTLED, BOLD, _FEW, level=_ROUGH), whole // part)
+            begin = back(end.point) if np.isfinite(end.cost) else begin
     end = searched(begin, last, whole)
     if begin is not guess and not end.cost <= searched(guess, evaluated, whole).cost:
         end = searched(guess, last, whole)
@@ -282,22 +288,11 @@ def _deviations(there: Search, point: np.ndarray, count: int) -> tuple[np.ndarra
     return deviation, message
 
 
-def _grown(searched: Any, guess: Any, back: Any, length: int) -> Any:
-    """The end of searches over the first parts of the windows, one after another."""
-    value = guess
-    for part in _PARTS:
-        if length // part >= _SHORTEST:
-            end = searched(value, Settings(_SETTLED, BOLD, _FEW, level=_ROUGH), length // part)
-            if np.isfinite(end.cost):
-                value = back(end.point)
-    return value
-
-
 def _require_windows(windows: Any) -> None:
     _checks.instance(windows, Windows, "windows", wanted="what identify.windows returns")
-    for name in ("starts", "wanted"):
+    for name, wanted in (("starts", 2), ("wanted", 3)):
         for leaf in jax.tree.leaves(getattr(windows, name)):
-            if leaf.ndim != (2 if name == "starts" else 3) or not leaf.shape[0]:
+            if leaf.ndim != wanted or not leaf.shape[0]:
                 raise ValueError(
                     f"windows: wanted a row for each of N windows in {name}, got {leaf.shape}"
                 )
@@ -312,16 +307,6 @@ def _numbers(guess: Any, kind: Any) -> tuple[Float[Array, " n"], Callable[[Array
     if not x.size:
         raise ValueError("guess: wanted a tree of floating numbers, at least one")
     return x, back
-
-
-def _require_scene(windows: Windows, start: Any, made: Any) -> None:
-    if not isinstance(made, tuple) or len(made) != 2:
-        raise TypeError(f"scene: wanted (body, torque), got {type(made).__name__}")
-    body, law = made
-    require_fit(body, start, law)
-    require_inputs(law, windows.inputs)
-    if wrong := _too_late(windows, law):
-        raise ValueError(wrong)
 
 
 def _too_late(windows: Windows, law: Any) -> str | None:
@@ -355,9 +340,8 @@ def _scales(windows: Windows, steps: int, noise: Mapping[str, float] | None) -> 
 
 def _padded(windows: Windows) -> tuple[Any, Any, Any]:
     """Starts, states and inputs, the last repeated to full batches: a rest needs a program more."""
-    order = np.minimum(
-        np.arange(-(-windows.count // _SIDE_BY_SIDE) * _SIDE_BY_SIDE), windows.count - 1
-    )
+    batches = -(-windows.count // _SIDE_BY_SIDE)
+    order = np.minimum(np.arange(batches * _SIDE_BY_SIDE), windows.count - 1)
     parts = (windows.starts, windows.wanted, windows.inputs)
     return jax.tree.map(lambda a: jnp.asarray(np.asarray(a)[order]), parts)
 
