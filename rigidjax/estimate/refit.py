@@ -92,7 +92,14 @@ class Refit(eqx.Module):
         if float(self.effective) >= _LEAST:
             each = np.asarray(of_draws(of, self.density, self.draws))
             tails = np.array([0.5 - 0.5 * level, 0.5 + 0.5 * level])
-            ends = np.apply_along_axis(_quantiles, 0, each, np.asarray(self.weights), tails)
+            weights = np.asarray(self.weights)
+
+            def quantiles(values: np.ndarray) -> np.ndarray:
+                order = np.argsort(values)
+                below = np.cumsum(weights[order]) - 0.5 * weights[order]
+                return np.interp(tails, below, values[order])
+
+            ends = np.apply_along_axis(quantiles, 0, each)
             return np.asarray(ends[0]), np.asarray(ends[1])
 
         def value(x: Array) -> Array:
@@ -102,12 +109,6 @@ class Refit(eqx.Module):
         deviation = carried(slope, np.asarray(self.covariance), np.zeros((0, self.x.size)))
         reach = NormalDist().inv_cdf(0.5 + 0.5 * level) * deviation
         return np.asarray(centre - reach), np.asarray(centre + reach)
-
-
-def _quantiles(values: np.ndarray, weights: np.ndarray, at: np.ndarray) -> np.ndarray:
-    order = np.argsort(values)
-    below = np.cumsum(weights[order]) - 0.5 * weights[order]
-    return np.interp(at, below, values[order])
 
 
 def refit(

@@ -205,13 +205,12 @@ def assess(
     times = uncertainty.correlation_times(linear, cut)
     white = uncertainty.of_white(linear)
     spread = uncertainty.spread(linear, times, white)
-    numbers, names = values_and_slopes(problem, value, near), [n for n, _ in charts(problem)]
-    limits = flat_limit.limits(problem, numbers, -white.seen @ linear.slope, names)
+    numbers, of = values_and_slopes(problem, value, near), charts(problem)
+    limits = flat_limit.limits(problem, numbers, -white.seen @ linear.slope, [n for n, _ in of])
     # Steps stay short in a long curved valley, although hardly anything is left to gain.
     held = [limit.slope for limit in limits if limit.free < 0]
     done = bool(best.converged) or uncertainty.distance(linear, white, held) < AT_THE_END
-    free = ravel_pytree(value)[0].size
-    chi2, dof, model, left = goodness(problem, linear, times, free)
+    chi2, dof, model, left = goodness(problem, linear, times, linear.size)
     believable = model.word != FAILS
     # Ten units of log-likelihood, of the noise as estimated; autocorrelated errors count as fewer.
     guessed = any(sensor.noise is None for sensor in problem.records.sensors)
@@ -232,7 +231,7 @@ def assess(
     lost = believable and not any(start.fits for start in starts)
     remarks = ("no single start came near the best point",) if lost else ()
     search = _search(best_cost, done, rival, interrupted, remarks)
-    unreal = of_charts(charts(problem), flat_limit.bodies_of(problem, value))
+    unreal = of_charts(of, flat_limit.bodies_of(problem, value))
     model = Answer(model.word, (*unreal, *model.reasons))
     model = model if np.isfinite(best_cost) else Answer(FAILS)
     return Fit(

@@ -15,12 +15,8 @@ from rigidjax.body import parameters as charts
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.body.symmetric3 import swap_trace
 
-# The parts of a `MassProperties` that may be free: in words, and their places in `pack`.
-_PARTS = {
-    "mass": ("mass", (0,)),
-    "com": ("centre of mass", (7, 8, 9)),
-    "inertia": ("inertia tensor", (1, 2, 3, 4, 5, 6)),
-}
+# The parts of a `MassProperties` that may be free, and their places in `pack`.
+_PARTS = {"mass": (0,), "com": (7, 8, 9), "inertia": (1, 2, 3, 4, 5, 6)}
 # Components of a tensor in the order of their names.
 COMPONENTS = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))
 
@@ -32,7 +28,7 @@ class AbstractBodyChart(eqx.Module):
     their logarithms; `plain_names` and `plain(body)` quantities of either sign, none unless given.
 
     >>> class Spheres(AbstractBodyChart):  # one number: the logarithm of the moment
-    ...     size, in_words, unit, log_names = 1, "the moment of a sphere", "kg m²", ("I",)
+    ...     size, unit, log_names = 1, "kg m²", ("I",)
     ...     def body(self, vector):
     ...         return Inertia.from_principal(*jnp.exp(vector[0]) * jnp.ones(3))
     ...     def vector(self, body):
@@ -44,7 +40,6 @@ class AbstractBodyChart(eqx.Module):
     """
 
     size: eqx.AbstractVar[int]
-    in_words: eqx.AbstractVar[str]
     log_names: eqx.AbstractVar[tuple[str, ...]]
     plain_names: ClassVar[tuple[str, ...]] = ()
     unit: ClassVar[str] = ""
@@ -87,7 +82,6 @@ class Ratios(AbstractBodyChart):
     """
 
     size: ClassVar[int] = 5
-    in_words: ClassVar[str] = "the inertia tensor up to scale"
     log_names: ClassVar[tuple[str, ...]] = ("I1/I3", "I2/I3")
 
     def body(self, vector: Float[Array, " chart"]) -> Inertia:
@@ -117,7 +111,6 @@ class PrincipalRatios(AbstractBodyChart):
     """
 
     size: ClassVar[int] = 2
-    in_words: ClassVar[str] = "two ratios of moments, the body axes being principal"
     log_names: ClassVar[tuple[str, ...]] = ("Ix/Iz", "Iy/Iz")
 
     def body(self, vector: Float[Array, " chart"]) -> Inertia:
@@ -161,7 +154,6 @@ class Tensor(AbstractBodyChart):
 
     typical: Float[Array, ""] = eqx.field(converter=_typical, default=1.0)
     size: ClassVar[int] = 6
-    in_words: ClassVar[str] = "the inertia tensor"
     log_names: ClassVar[tuple[str, ...]] = ("I1", "I2", "I3")
     plain_names: ClassVar[tuple[str, ...]] = ("Ixx", "Iyy", "Izz", "Iyz", "Ixz", "Ixy")
     unit: ClassVar[str] = "kg m²"
@@ -197,7 +189,6 @@ class Principal(AbstractBodyChart):
 
     typical: Float[Array, ""] = eqx.field(converter=_typical, default=1.0)
     size: ClassVar[int] = 3
-    in_words: ClassVar[str] = "three moments, the body axes being principal"
     log_names: ClassVar[tuple[str, ...]] = ("Ix", "Iy", "Iz")
     unit: ClassVar[str] = "kg m²"
 
@@ -236,7 +227,6 @@ class Mass(AbstractBodyChart):
     guess: MassProperties
     free: tuple[str, ...] = eqx.field(static=True)
     size: int = eqx.field(static=True)
-    in_words: str = eqx.field(static=True)
     log_names: tuple[str, ...] = eqx.field(static=True)
     plain_names: tuple[str, ...] = eqx.field(static=True)  # pyright: ignore
     unit: ClassVar[str] = "SI"
@@ -252,15 +242,13 @@ class Mass(AbstractBodyChart):
             raise ValueError("free: wanted mass, inertia or com, got none; see Known")
         self.free = tuple(name for name in _PARTS if name in chosen)
         self.size = len(self._places)
-        *most, last = [_PARTS[name][0] for name in self.free]
-        self.in_words = f"{', '.join(most)} and {last}" if most else last
         moments = ("I1", "I2", "I3") if "inertia" in chosen else ()
         self.log_names = ("mass", *moments) if "mass" in chosen else moments
         self.plain_names = ("com x", "com y", "com z") if "com" in chosen else ()
 
     @property
     def _places(self) -> list[int]:
-        return sorted(place for name in self.free for place in _PARTS[name][1])
+        return sorted(place for name in self.free for place in _PARTS[name])
 
     @property
     def _length(self) -> Array:
@@ -313,7 +301,6 @@ class Known(AbstractBodyChart):
 
     known: Inertia | MassProperties
     size: ClassVar[int] = 0
-    in_words: ClassVar[str] = "nothing of the body"
     log_names: ClassVar[tuple[str, ...]] = ()
 
     def __check_init__(self) -> None:
@@ -375,12 +362,6 @@ class Bodies(eqx.Module):
     def widest(self) -> int:
         """The number of free numbers of the largest chart."""
         return max(chart.size for chart in self.charts)
-
-    @property
-    def in_words(self) -> str:
-        """The free parts of the bodies, in words."""
-        parts = (f"{c.in_words} ({n})" for n, c in zip(self.names, self.charts, strict=True))
-        return ", ".join(parts)
 
     def parts(self, vector: Array) -> dict[str, Array]:
         """The numbers of each body."""

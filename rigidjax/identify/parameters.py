@@ -303,12 +303,6 @@ class Local(eqx.Module):
     spin: Float[Array, "*records 3"]
 
 
-def firsts(own: Own | Local) -> list[Any]:
-    """The numbers of the initial state in use, in the order of a change of a state."""
-    parts = (own.place, own.speed, own.turn, own.spin)
-    return [part for part in parts if part is not None]
-
-
 def local(problem: "Problem", parameters: Parameters) -> Local:
     """The numbers that each recording depends on, with a leading axis over recordings."""
     return Local(*_of_each(problem, parameters, 0, jnp.add))

@@ -1,6 +1,6 @@
 """The quantities that a fit reports by name, their values, standard deviations and intervals."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
@@ -13,7 +13,7 @@ from jaxtyping import Array
 from rigidjax import _checks
 from rigidjax.identify import flat_limit
 from rigidjax.identify.body_charts import AbstractBodyChart, Bodies, Ratios, in_a_row
-from rigidjax.identify.parameters import Parameters, Unpacked
+from rigidjax.identify.parameters import Parameters
 from rigidjax.identify.problem import Problem
 
 if TYPE_CHECKING:
@@ -163,7 +163,7 @@ def quantities(
     names = labels(problem)
     values, slope = (part[: len(names)] for part in found)
     deviations = carried(slope, covariance, null)
-    cuts = _cuts(slope, covariance, deviations, limits)
+    cuts = cuts_of(slope, covariance, deviations, limits)
     # A number that changes with no fitted number is not determined.
     deviations = np.where(np.any(slope != 0, axis=-1), deviations, np.nan)
     out = []
@@ -179,7 +179,7 @@ def quantities(
     return tuple(out)
 
 
-def _cuts(
+def cuts_of(
     slope: np.ndarray,
     covariance: np.ndarray,
     deviations: np.ndarray,
@@ -215,32 +215,6 @@ def carried(slope: np.ndarray, covariance: np.ndarray, null: np.ndarray) -> np.n
     variance = along**2 @ np.maximum(values, 0.0)
     lost = (length > 0) & (unreal | (variance <= least * length**2))
     return np.where(touched, np.inf, np.where(lost, np.nan, np.sqrt(variance)))
-
-
-def interval_of(
-    fit: "Fit", of: Callable[[Unpacked], Any], level: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """See `Fit.interval_of`."""
-    _checks.function(of, "of", "of `Unpacked` to an array")
-    if not _checks.known(fit.parameters):
-        raise TypeError(
-            "Fit: wanted known numbers, got traced ones; intervals are made on the host: call "
-            "interval_of outside of jax.jit, jax.grad and jax.vmap"
-        )
-    flat, restore = ravel_pytree(fit.parameters)
-
-    def value(x: Array) -> Array:
-        parameters = restore(x)
-        body, state0 = fit.problem.unpack(parameters)
-        point = Unpacked(parameters, body, state0, fit.problem.values(parameters), fit.noises)
-        return _checks.numbers(of(point), "of(point)")
-
-    middle = np.asarray(_checks.finite(value(flat), "of(point)"))
-    slope = np.asarray(jax.jacfwd(value)(ravel_pytree(fit.beside)[0]))
-    seen = np.asarray(fit.seen)
-    found = carried(slope, seen, np.asarray(fit.null_directions))
-    low, high = cut_ends(quantile(fit, level), _cuts(slope, seen, found, fit.limits))
-    return np.asarray(middle + low * found), np.asarray(middle + high * found)
 
 
 def quantile(fit: "Fit", level: float) -> float:

@@ -11,7 +11,6 @@ from jaxtyping import Array, ArrayLike, Float
 
 from rigidjax import _checks
 from rigidjax.identify import padding
-from rigidjax.identify.parameters import firsts
 from rigidjax.identify.recording import Recording, readings_of
 from rigidjax.identify.sensors import (
     AttitudeSensor,
@@ -124,7 +123,9 @@ class ReferenceStates(eqx.Module):
 
     def moved(self, own: Any) -> Any:
         """The initial state of one recording; `own` an `Own` or a `Local`."""
-        return plus(self.state, self.units * jnp.concatenate(firsts(own)))
+        parts = (own.place, own.speed, own.turn, own.spin)
+        change = jnp.concatenate([part for part in parts if part is not None])
+        return plus(self.state, self.units * change)
 
 
 def reference_of(recordings: Sequence[Recording], rung: type) -> ReferenceStates:

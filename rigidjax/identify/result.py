@@ -4,7 +4,9 @@ from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
+import jax
 import numpy as np
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from rigidjax import _checks
@@ -16,7 +18,7 @@ from rigidjax.identify.full_scale import at_limit
 from rigidjax.identify.identifiability import Combination, undetermined
 from rigidjax.identify.parameters import Parameters, Unpacked
 from rigidjax.identify.problem import Problem
-from rigidjax.identify.quantities import Quantity, interval_of, quantile
+from rigidjax.identify.quantities import Quantity, carried, cut_ends, cuts_of, quantile
 from rigidjax.identify.terms import Noise
 
 
@@ -190,7 +192,26 @@ class Fit(eqx.Module):
 
         It comes from the covariance and the function's derivative. **Raises** as `interval`.
         """
-        return interval_of(self, of, level)
+        _checks.function(of, "of", "of `Unpacked` to an array")
+        if not _checks.known(self.parameters):
+            raise TypeError(
+                "Fit: wanted known numbers, got traced ones; intervals are made on the host: call "
+                "interval_of outside of jax.jit, jax.grad and jax.vmap"
+            )
+        flat, restore = ravel_pytree(self.parameters)
+
+        def value(x: Array) -> Array:
+            parameters = restore(x)
+            body, state0 = self.problem.unpack(parameters)
+            point = Unpacked(parameters, body, state0, self.problem.values(parameters), self.noises)
+            return _checks.numbers(of(point), "of(point)")
+
+        middle = np.asarray(_checks.finite(value(flat), "of(point)"))
+        slope = np.asarray(jax.jacfwd(value)(ravel_pytree(self.beside)[0]))
+        seen = np.asarray(self.seen)
+        found = carried(slope, seen, np.asarray(self.null_directions))
+        low, high = cut_ends(quantile(self, level), cuts_of(slope, seen, found, self.limits))
+        return np.asarray(middle + low * found), np.asarray(middle + high * found)
 
     @property
     def undetermined(self) -> tuple[Combination, ...]:

@@ -219,14 +219,10 @@ def standardised(
         return scaled, jnp.zeros(scaled.shape, bool)
     full = (jnp.abs(values) >= limit[None] * (1 - 1e-6)) & mask[:, None]
     side = jnp.sign(values)
-    beyond = jnp.where(full, -side * scaled, 0.0)
-    return jnp.where(full, -side * _censored(beyond), scaled), full
-
-
-def _censored(z: Float[Array, "..."]) -> Float[Array, "..."]:
+    z = jnp.where(full, -side * scaled, 0.0)
     # The term vanishes beyond five standard deviations, and the root has no derivative there.
-    inside = jnp.minimum(z, 5.0)
-    return jnp.where(z < 5.0, jnp.sqrt(-2.0 * jax.scipy.special.log_ndtr(inside)), 0.0)
+    root = jnp.sqrt(-2.0 * jax.scipy.special.log_ndtr(jnp.minimum(z, 5.0)))
+    return jnp.where(full, -side * jnp.where(z < 5.0, root, 0.0), scaled), full
 
 
 def residuals(parameters: Parameters, args: Any) -> Any:

@@ -660,7 +660,7 @@ leave_out(
     "identify.Combination.in_words", "identify.Fit.ok", "tumblers.LightCurve.ok",
     "identify.Fit.status", "tumblers.LightCurve.status", "identify.Fit.advice", "identify.Fit.causes",
     "identify.Answer", "identify.Cause",
-    "identify.Mass.in_words", "identify.Mass.log_names", "identify.Mass.plain_names",
+    "identify.Mass.log_names", "identify.Mass.plain_names",
     "identify.Mass.size", "identify.Problem.count", "identify.Recording.size",
     "identify.Descent", "identify.Combination",
 )  # fmt: skip
