@@ -205,8 +205,8 @@ def log_likelihood(
     """The logarithm of the density of all readings, the unknown torques integrated out.
 
     `Σ log N(ν; 0, s)` over innovations (Schweppe 1965, doi:10.1109/TIT.1965.1053737): maximise it
-    over moments, a density, a noise, an initial state. **Arguments** and **raises** as for
-    `filter`; differentiable in forward and reverse mode.
+    over moments, a density, a noise, an initial state. Arguments and errors are as for `filter`;
+    differentiable in forward and reverse mode.
 
     >>> import rigidjax as rj
     >>> record = rj.identify.Recording([0.0, 0.1], (rj.identify.Gyro(1.0), [[1.0, 0, 0]] * 2))

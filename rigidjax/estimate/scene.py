@@ -90,8 +90,9 @@ def bare(model: Model) -> Model:
 
 
 class Extended(eqx.Module):
-    """The state that a filter follows: the motion, each `CorrelatedTorque` (3,), N m, body frame,
-    and each `Walk`. Its errors are changes as `motion.manifold` counts them, in this order.
+    """The state that a filter follows: `motion`, `torques` the value (3,) of each
+    `CorrelatedTorque`, N m, body frame, and `walks` those of each `Walk`. Its errors are changes as
+    `motion.manifold` counts them, in this order.
     """
 
     motion: Any
@@ -334,8 +335,8 @@ def _rows(dynamics: Dynamics, sensors: Sensors, stop: Stops, x: Extended) -> lis
 
 
 class Read(NamedTuple):
-    """Innovations of one sensor, each reading minus its prediction from all numbers read before;
-    their variances.
+    """Of one sensor each `innovation`, the reading minus its prediction from all numbers read
+    before, its `variance`, and whether it was `seen`.
     """
 
     innovation: Float[Array, "*times k"]

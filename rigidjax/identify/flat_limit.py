@@ -21,7 +21,8 @@ ONE_SIDED = 1.645
 
 class Limit(eqx.Module):
     """The distance of a body from a flat one: `flatness = (I1 + I2 − I3) / I3` at the best point,
-    `free` its value in the linear problem, which may be negative, `slope` (n,) its derivative.
+    `free` its value in the linear problem, which may be negative, `slope` (n,) its derivative;
+    `where` is the suffix of the names of the body's quantities.
     """
 
     where: str

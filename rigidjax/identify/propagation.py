@@ -55,7 +55,8 @@ class FixedSteps(AbstractIntegrator):
     `Adaptive`.
 
     **Arguments:** `substeps` the number of steps between two samples; `solver` the method, one of
-    `rigidjax.solvers`: Tsitouras's of order 5 unless given.
+    `rigidjax.solvers`: Tsitouras's of order 5 unless given; `last` the number of the last time
+    that is needed, `None` for all.
 
     >>> FixedSteps(2).substeps
     2
@@ -63,7 +64,6 @@ class FixedSteps(AbstractIntegrator):
 
     substeps: int = eqx.field(static=True, default=1)
     solver: AbstractExplicit = solvers.Tsitouras5()
-    # The number of the last time that is needed, `None` for all.
     last: Int[Array, ""] | None = eqx.field(default=None, repr=False)
 
     def __check_init__(self):

@@ -97,11 +97,11 @@ def _readings(
     if reading is not None:
         values = jax.vmap(lambda t, y, e: reading(now(t, y), e))(times, states, error)
     else:
-        # The error is reading minus prediction.
+        # The error of a zero reading is the prediction with the opposite sign.
         nothing = jnp.zeros(sensor.reading_shape, ts.dtype)
-        shown = jax.vmap(lambda t, y: -sensor.error(now(t, y), nothing))(times, states)
-        shown = shown if lowpass is None else lowpass(times, shown)
-        values = (shown + error).reshape(ts.shape[0], *sensor.reading_shape)
+        missed = jax.vmap(lambda t, y: sensor.error(now(t, y), nothing))(times, states)
+        missed = missed if lowpass is None else -lowpass(times, -missed)
+        values = (error - missed).reshape(ts.shape[0], *sensor.reading_shape)
     limit = getattr(sensor, "limit", None)
     return values if limit is None else jnp.clip(values, -limit[None], limit[None])
 

@@ -684,7 +684,7 @@ leave_out(
 )  # fmt: skip
 leave_out(
     "abstract: made by subclassing",
-    "identify.AbstractBodyChart", "identify.AbstractLoss",
+    "identify.AbstractBodyChart", "identify.AbstractBodyChart.plain", "identify.AbstractLoss",
     "identify.AbstractSensor",
 )  # fmt: skip
 leave_out(

@@ -36,7 +36,7 @@ class _Vector(AbstractSensor):
     offset: Scalar | None = eqx.field(converter=optional("offset", ()), default=None)
     lowpass: LowPass | None = eqx.field(converter=lowpass_of, default=None)
 
-    def shown(self, truth: Vec3) -> Vec3:
+    def _shown(self, truth: Vec3) -> Vec3:
         """The prediction of `truth` v (3,), body frame, with
         `S = [[1, a, b], [0, 1, c], [0, 0, 1]]` of the skew (a, b, c).
         """
@@ -92,7 +92,7 @@ class Gyro(_Vector):
             self.place = jnp.zeros(3)
 
     def error(self, now: SensorInput, reading: Array) -> Vec3:
-        seen = self.shown(now.state.omega)
+        seen = self._shown(now.state.omega)
         if self.g_sensitivity is not None:
             assert self.place is not None
             force = specific_force(now, self.place, self.gravity)
@@ -137,7 +137,7 @@ class Accelerometer(_Vector):
 
     def error(self, now: SensorInput, reading: Array) -> Vec3:
         force = specific_force(now, self.place, self.gravity)
-        return reading - self.shown(force)
+        return reading - self._shown(force)
 
 
 class Magnetometer(_Vector):
@@ -159,4 +159,4 @@ class Magnetometer(_Vector):
 
     def error(self, now: SensorInput, reading: Array) -> Vec3:
         seen = quaternion.rotate(quaternion.conjugate(now.state.q), self.field)
-        return reading - self.shown(seen)
+        return reading - self._shown(seen)
