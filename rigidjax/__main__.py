@@ -288,7 +288,10 @@ def _logs(options: argparse.Namespace) -> int:
     except ValueError as error:
         return _error(error)
     for path, record in zip(options.logs, records, strict=True):
-        _say(f"{path}: {_extent(record)}")
+        gaps = sum(int((~reading.seen).sum()) for reading in record.readings) + record.dropped
+        told = f", {gaps} gap{'s' if gaps > 1 else ''}" if gaps else ""
+        count, span = record.t.shape[0] + record.dropped, record.t[-1] - record.t[0]
+        _say(f"{path}: {count} samples over {span:.4g} s{told}")
     print()
     found = _fit(problem, options, 8)
     if found is None:
@@ -319,13 +322,6 @@ def _fit(problem: rj.identify.Problem, options: argparse.Namespace, starts: int)
     except (OSError, ValueError) as error:
         _error(error)
         return None
-
-
-def _extent(record: rj.identify.Recording) -> str:
-    gaps = sum(int((~reading.seen).sum()) for reading in record.readings) + record.dropped
-    told = f", {gaps} gap{'s' if gaps > 1 else ''}" if gaps else ""
-    count = record.t.shape[0] + record.dropped
-    return f"{count} samples over {record.t[-1] - record.t[0]:.4g} s{told}"
 
 
 def _write(

@@ -18,11 +18,7 @@ from rigidjax.estimate.linear import (
     linear_filter as linear_filter,
     linear_smooth as linear_smooth,
 )
-from rigidjax.estimate.posterior import (
-    Nuts as Nuts,
-    Posterior as Posterior,
-    posterior as posterior,
-)
+from rigidjax.estimate.posterior import Nuts as Nuts, Posterior as Posterior, posterior as posterior
 from rigidjax.estimate.refit import Refit as Refit, refit as refit
 from rigidjax.estimate.sample import sample as sample
 from rigidjax.estimate.scene import Model as Model, Walk as Walk

@@ -10,11 +10,9 @@ from jaxtyping import Array, Float
 
 from rigidjax import _checks
 from rigidjax._types import HasSpin
-from rigidjax.estimate.scene import Extended, Model, not_negative
-from rigidjax.estimate.sensing import sensors_of
-from rigidjax.identify.direct_estimates import attitudes
+from rigidjax.estimate.scene import Extended, Model, not_negative, sensors_of
 from rigidjax.identify.recording import Recording
-from rigidjax.identify.reference_states import first_rate
+from rigidjax.identify.reference_states import attitudes, first_rate
 from rigidjax.motion import Attitude, Spin
 from rigidjax.motion.equations import on_the_group
 from rigidjax.motion.manifold import names
@@ -83,12 +81,8 @@ def start(
     initial attitude and rate from the recording (`Spin` if no sensor shows an attitude). Then
     standard deviations, one number or three, zero for known values: `rate` of Ω, rad/s; `attitude`
     rad; `position` m and `velocity` m/s of a `Rigid`. Torques start from their model's stationary
-    distribution.
-
-    **Returns** a `Belief`: `t`, `state`, `deviation`, `covariance`.
-
-    **Raises:** `ValueError` for a deviation that is missing or below zero, `TypeError` for
-    arguments of another type.
+    distribution. **Returns** a `Belief`. **Raises:** `ValueError` for a deviation that is missing
+    or below zero, `TypeError` for arguments of another type.
 
     >>> import rigidjax as rj
     >>> record = rj.identify.Recording([0.0, 1.0], (rj.identify.Gyro(0.1), [[1.0, 0, 0]] * 2))

@@ -20,9 +20,8 @@ class LinearModel(eqx.Module):
     `matrix` H (k, n); `deviation` r (k,) of the noise of each number read; then, `None` for zero,
     `push` d (n,) and `offset` c (k,). Each may have a leading axis: F, G, d over the steps between
     T times (T − 1), H, r, c over the times (T). Make correlated noise independent first: divide y,
-    H, c by the Cholesky factor of its covariance.
-
-    **Raises:** `ValueError` for shapes that do not fit, and a deviation that is not positive.
+    H, c by the Cholesky factor of its covariance. **Raises:** `ValueError` for shapes that do not
+    fit, and a deviation that is not positive.
 
     >>> walk = LinearModel(jnp.eye(1), 0.1 * jnp.eye(1), jnp.eye(1), jnp.ones(1))
     >>> walk.size
@@ -123,10 +122,8 @@ class Joint(NamedTuple):
 
 
 def joint(grown: Array, noise: Array, root: Array) -> Joint:
-    """The roots of the predicted and of the conditional covariance, and the smoother's gain.
-
-    From one triangularisation of `[[F S, G], [S, 0]]`: Park and Kailath 1995,
-    doi:10.1080/00207179508921582.
+    """Roots of the predicted and the conditional covariance, and the smoother's gain, from the
+    triangle of `[[F S, G], [S, 0]]`: Park and Kailath 1995, doi:10.1080/00207179508921582.
     """
     n, m = noise.shape
     upper = jnp.concatenate([roots.product(grown, root), noise], 1)
@@ -143,10 +140,7 @@ def smoothed(
     """Means and roots at all times, and means and covariances of the unit noise of all steps.
 
     The pass back (Rauch, Tung, Striebel 1965), and of the noise (m, m) with `Z = L⁻¹ G`, L the
-    predicted root: `1 − ZᵀZ + (Zᵀ L⁻¹ S)(Zᵀ L⁻¹ S)ᵀ`, where S is the smoothed root after the step.
-
-    **Arguments:** for each step the result of `joint`, the mean before it, the `predicted` mean
-    after it, and G; `end` mean and root at the last time.
+    predicted root: `1 − ZᵀZ + (Zᵀ L⁻¹ S)(Zᵀ L⁻¹ S)ᵀ`, S the smoothed root after the step.
     """
 
     def kick(noise: Array, lower: Array, off: Array, root: Array) -> tuple[Array, Array]:
@@ -179,9 +173,7 @@ def linear_filter(
 
     **Arguments:** `model`; `readings` y (T, k); `mean` (n,) and `root` (n, n), a root of the
     covariance, at the first time before its reading; `seen` (T, k) which numbers count, `None` all.
-
     **Returns** `mean`, `root`, `innovation`, `variance` and `log_likelihood` (`LinearEstimate`).
-
     **Raises:** `ValueError` for shapes that do not fit, NaN that is not masked.
 
     >>> walk = LinearModel(jnp.eye(1), 0.1 * jnp.eye(1), jnp.eye(1), jnp.ones(1))

@@ -29,11 +29,10 @@ class Nuts(eqx.Module):
     """The no-U-turn sampler of blackjax, its step and mass matrix adapted first.
 
     **Arguments:** `samples` kept, `warmup` before them, of each chain; `acceptance` the mean
-    acceptance probability of a trajectory's points, which sets the step: 0.8 is
-    careful, 0.65 takes half as many gradients where the density is nearly normal. It needs
-    blackjax: `pip install rigidjax[posterior]`. Hoffman and Gelman 2014, JMLR 15:1593.
-
-    **Raises:** `ValueError` for numbers below 1 and an `acceptance` that is not between 0 and 1.
+    acceptance probability of a trajectory's points, which sets the step: 0.8 is careful, 0.65 takes
+    half as many gradients where the density is nearly normal. It needs blackjax: `pip install
+    rigidjax[posterior]`. Hoffman and Gelman 2014, JMLR 15:1593. **Raises:** `ValueError` for
+    numbers below 1 and an `acceptance` that is not between 0 and 1.
 
     >>> Nuts(samples=500).samples
     500
@@ -168,14 +167,12 @@ def posterior(
 ) -> Posterior:
     """Draws of body, initial states, all `Free`s, noise and process, given all readings.
 
-    **Arguments:** `density` a `LogDensity`; `key` of `jax.random`; `sampler` a function of a key,
-    a log-density and a first vector to draws (samples, n), `Nuts()` unless given; its numbers have
+    **Arguments:** `density` a `LogDensity`; `key` of `jax.random`; `sampler` a function of a key, a
+    log-density and a first vector to draws (samples, n), `Nuts()` unless given; its numbers have
     the identity as covariance by Laplace's method, and it starts from a draw of that. `chains` run
-    together under `vmap`, or one after another with eight recordings and more.
-
-    **Returns** a `Posterior`.
-
-    **Raises:** `TypeError` for arguments of another type, `ImportError` if blackjax is missing.
+    together under `vmap`, or one after another with eight recordings and more. **Returns** a
+    `Posterior`. **Raises:** `TypeError` for arguments of another type, `ImportError` if blackjax is
+    missing.
 
     >>> import jax, rigidjax as rj
     >>> ts = jnp.linspace(0.0, 10.0, 80)

@@ -19,11 +19,11 @@ from jaxtyping import Array, Bool, Float
 
 from rigidjax import _checks
 from rigidjax._types import Scalar
-from rigidjax.estimate.density import LogDensity, of_draws
-from rigidjax.estimate.terms import curvature
-from rigidjax.identify.levenberg_marquardt import Settings, made_of, search
+from rigidjax.estimate.density import LogDensity, curvature, of_draws
+from rigidjax.identify.levenberg_marquardt import Settings, search
 from rigidjax.identify.parameters import Unpacked
 from rigidjax.identify.quantities import carried
+from rigidjax.identify.search import made_of
 
 # Steps of so many standard deviations end the search; its damping at the start.
 _SMALL, _DAMPING = 1e-3, 1e-2
@@ -92,7 +92,14 @@ class Refit(eqx.Module):
         if float(self.effective) >= _LEAST:
             each = np.asarray(of_draws(of, self.density, self.draws))
             tails = np.array([0.5 - 0.5 * level, 0.5 + 0.5 * level])
-            ends = np.apply_along_axis(_quantiles, 0, each, np.asarray(self.weights), tails)
+            weights = np.asarray(self.weights)
+
+            def quantiles(values: np.ndarray) -> np.ndarray:
+                order = np.argsort(values)
+                below = np.cumsum(weights[order]) - 0.5 * weights[order]
+                return np.interp(tails, below, values[order])
+
+            ends = np.apply_along_axis(quantiles, 0, each)
             return np.asarray(ends[0]), np.asarray(ends[1])
 
         def value(x: Array) -> Array:
@@ -104,34 +111,24 @@ class Refit(eqx.Module):
         return np.asarray(centre - reach), np.asarray(centre + reach)
 
 
-def _quantiles(values: np.ndarray, weights: np.ndarray, at: np.ndarray) -> np.ndarray:
-    order = np.argsort(values)
-    below = np.cumsum(weights[order]) - 0.5 * weights[order]
-    return np.interp(at, below, values[order])
-
-
 def refit(
     density: LogDensity, *, max_steps: int = 200, draws: int = 1000, key: Any = None
 ) -> Refit:
     """The maximum of the posterior density, and weighted draws around it for intervals.
 
     A fit that allows for an unknown torque: `refit(LogDensity(fit, RandomTorque(1e-4)))` finds
-    body, initial states, all `Free`s, and the torque's density, starting from `fit`. The method is
-    Fisher's scoring: Levenberg and Marquardt's search with the expected information of the
-    innovations as the normal matrix (Gupta and Mehra 1974, doi:10.1109/TAC.1974.1100714), added up
-    recording by recording. The draws come from Student's t about that point, with a covariance
-    wider than the inverse information; the weight of a draw is the density over that of the t
-    (importance sampling: Geweke 1989, doi:10.2307/1913710). Draws of more than some dozen numbers
-    are worth little (`effective`); intervals then come from the information, which is enough if
-    each recording is long. `estimate.posterior` draws from any density.
+    body, initial states, all `Free`s, and the torque's density, starting from `fit`, by Fisher's
+    scoring: Levenberg–Marquardt with the expected information of the innovations as the normal
+    matrix (Gupta and Mehra 1974, doi:10.1109/TAC.1974.1100714). The draws come from a wide
+    Student's t about that point, weighted by the density over that of the t (importance sampling:
+    Geweke 1989, doi:10.2307/1913710). Draws of more than some dozen numbers are worth little
+    (`effective`); intervals then come from the information, which is enough if each recording is
+    long. `estimate.posterior` draws from any density.
 
     **Arguments:** `density` a `LogDensity`; `max_steps` at most; `draws` how many; `key` of
-    `jax.random` for them, by default always the same.
-
-    **Returns** a `Refit`; `converged` is false if it ended early, or if some combination of the
-    numbers changes neither readings nor priors: `weights` are then NaN.
-
-    **Raises:** `TypeError` for arguments of another type.
+    `jax.random` for them, by default always the same. **Returns** a `Refit`; `converged` is false
+    if it ended early, or if some combination of the numbers changes neither readings nor priors:
+    `weights` are then NaN. **Raises:** `TypeError` for arguments of another type.
 
     >>> import rigidjax as rj
     >>> ts = jnp.linspace(0.0, 10.0, 80)

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from rigidjax import _checks
 from rigidjax._types import HasSpin
-from rigidjax.estimate.grid import longest_step, steps_of
+from rigidjax.estimate.filter import longest_step, steps_of
 from rigidjax.estimate.scene import Dynamics, Extended, Model
 from rigidjax.motion.equations import on_the_group
 
@@ -38,21 +38,16 @@ class Sampled(eqx.Module):
 def sample(key: Any, model: Model, state0: Any, ts: Any, *, substeps: int | None = None) -> Sampled:
     """One motion that the model's random torques could have made.
 
-    Each step draws the integral and the first moment of the white noise. These are enough for order
-    1.5 if the noise does not depend on the state. The step then follows the equations of motion
-    under the polynomial with these moments, by the classical method of order 4, and normalises the
-    quaternion. A step is therefore exact for a body at rest, and no Brownian path is stored
-    (diffrax's solvers for additive noise use the same moments: Foster, Lyons and Oberhauser 2020,
-    doi:10.1137/19M1261912). A `CorrelatedTorque` starts from its stationary distribution.
+    Each step draws the integral and the first moment of the white noise, and follows the equations
+    of motion under the polynomial with these moments by the classical method of order 4: of order
+    1.5, and exact for a body at rest (Foster, Lyons and Oberhauser 2020, doi:10.1137/19M1261912). A
+    `CorrelatedTorque` starts from its stationary distribution.
 
     **Arguments:** `key` of `jax.random`; `model`; `state0` a `Spin`, `Attitude` or `Rigid`; `ts`
     (T,) increasing times, s, the first is of `state0`; `substeps` fixed steps between two times,
-    `None` chooses them by the rate if it is known, else one.
-
-    **Returns** `t`, `states` and `torques` at these times (`Sampled`).
-
-    **Raises:** `ValueError` for times that do not increase, `TypeError` for arguments of another
-    type.
+    `None` chooses them by the rate if it is known, else one. **Returns** `t`, `states` and
+    `torques` at these times (`Sampled`). **Raises:** `ValueError` for times that do not increase,
+    `TypeError` for arguments of another type.
 
     >>> import jax, rigidjax as rj
     >>> body = rj.Inertia.from_principal(1.0, 2.0, 2.5)

@@ -1,19 +1,21 @@
 """The state equations of a filter: the motion, correlated torques, drifting sensor errors."""
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.scipy.linalg import block_diag
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from rigidjax import _checks
 from rigidjax._types import HasAttitude, Mat3, Scalar
 from rigidjax.body.inertia import Inertia, MassProperties, inverse
 from rigidjax.estimate import roots
-from rigidjax.identify.sensor_inputs import what_turns
+from rigidjax.identify.parameters import leaf_at
+from rigidjax.identify.propagation import shifted, what_turns
+from rigidjax.identify.sensors import AbstractSensor, SensorInput
 from rigidjax.motion.manifold import coordinates, dimension, tangent, turns
 from rigidjax.motion.torques import CorrelatedTorque, RandomTorque, Sum
 from rigidjax.motion.torques.base import Torque, in_precision, require_law, tensor_of
@@ -30,7 +32,6 @@ class Walk(eqx.Module):
     **Arguments:** `where` picks it as a `Free` does: `lambda r: r.readings[0].sensor.bias`; its
     value in the recording is the initial value; `deviation` of that value, one number or one for
     each component, in its unit; `density` of the drift, unit² / s, ≥ 0: zero for a constant error.
-
     **Raises** `ValueError` for a deviation or density below zero.
 
     >>> Walk(lambda r: r.readings[0].sensor.bias, 0.01).density.tolist()
@@ -53,9 +54,7 @@ class Model(eqx.Module):
 
     **Arguments:** `body` an `Inertia`, or `MassProperties` for a `Rigid` state; `torque` any
     torques, among them `RandomTorque` and `CorrelatedTorque`, several in a `Sum`; `None` for a free
-    body without noise; `walks` the `Walk`s.
-
-    **Raises:** `TypeError` for arguments of another type.
+    body without noise; `walks` the `Walk`s. **Raises:** `TypeError` for arguments of another type.
 
     >>> import rigidjax as rj
     >>> model = Model(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.torques.RandomTorque(1e-4))
@@ -70,11 +69,7 @@ class Model(eqx.Module):
     walks: tuple[Walk, ...]
 
     def __init__(
-        self,
-        body: Inertia | MassProperties,
-        torque: Torque | None = None,
-        *,
-        walks: Any = (),
+        self, body: Inertia | MassProperties, torque: Torque | None = None, *, walks: Any = ()
     ):
         self.body = _checks.single(body, (Inertia, MassProperties), "body")
         parts = [] if torque is None else _parts(torque)
@@ -95,14 +90,9 @@ def bare(model: Model) -> Model:
 
 
 class Extended(eqx.Module):
-    """The state that a filter follows.
-
-    **Fields:** `motion` a `Spin`, `Attitude` or `Rigid`; `torques` the value (3,) of each
-    `CorrelatedTorque`, N m, body frame; `walks` the value of each `Walk`.
-
-    Errors of it are changes as `motion.manifold` counts them: first, for a `Rigid`, of x and v
-    (world frame); of the attitude, where there is one, δθ (rad, body frame); of Ω; then of torques
-    and walks.
+    """The state that a filter follows: `motion`, `torques` the value (3,) of each
+    `CorrelatedTorque`, N m, body frame, and `walks` those of each `Walk`. Its errors are changes as
+    `motion.manifold` counts them, in this order.
     """
 
     motion: Any
@@ -182,9 +172,8 @@ class Dynamics(eqx.Module):
     def predict(
         self, t: Scalar, h: Scalar, x: Extended, kicks: Array | None = None
     ) -> tuple[Extended, Float[Array, "n n"], Float[Array, "n m"]]:
-        """`x` a time `h` later, how errors grow, F (n, n), and the root of the noise, G (n, m).
-
-        Linearised about `kicks` (kicks,), `None` for none; drifts of walks come last in G.
+        """`x` a time `h` later, F (n, n) of its errors, and the root G (n, m) of the noise, about
+        `kicks`; drifts of walks come last in G.
         """
         kicks = jnp.zeros(self.kicks, x.motion.omega.dtype) if kicks is None else kicks
         after, push = jax.linearize(lambda y, k: self.advance(t, h, y, k), x, kicks)
@@ -245,3 +234,131 @@ def not_negative(value: Any, name: str) -> Array:
     if not array.size:
         raise ValueError(f"{name}: wanted {wanted}, got none")
     return _checks.sign(array, name, wanted, zero=True)
+
+
+class ReadingRow(NamedTuple):
+    """One sensor's reading about a state: `matrix` (k, n) of the prediction, `error`, variance."""
+
+    matrix: Float[Array, "k n"]
+    error: Float[Array, " k"]
+    variance: Float[Array, " k"]
+    seen: Bool[Array, " k"]
+
+
+class Mounted(eqx.Module):
+    """A sensor without its readings; `Walk.where` finds it as in a `Recording`."""
+
+    sensor: AbstractSensor
+
+
+class _Recorded(eqx.Module):
+    readings: tuple[Mounted, ...]
+
+
+class Sensors(eqx.Module):
+    """The sensors without readings, and the leaves that drift. No function is kept: a second model
+    of the same form does not compile again.
+    """
+
+    readings: tuple[Mounted, ...]
+    leaves: tuple[int, ...] = eqx.field(static=True)
+    densities: tuple[Array, ...]
+
+    def drifted(self, walks: Sequence[Array]) -> tuple[Mounted, ...]:
+        """The sensors with the walks' values in them."""
+        leaves, structure = jax.tree.flatten(self.readings)
+        for leaf, value in zip(self.leaves, walks, strict=True):
+            leaves[leaf] = value
+        return jax.tree.unflatten(structure, leaves)
+
+
+def sensors_of(sensors: Sequence[AbstractSensor], model: Model) -> Sensors:
+    """The checked sensors: each has a noise, and each walk finds its numbers."""
+    for sensor in sensors:
+        _checks.instance(sensor, AbstractSensor, "sensor")
+        name = type(sensor).__name__
+        if sensor.noise is None:
+            raise ValueError(
+                f"{name}: wanted its noise, a filter weighs each reading by it; give "
+                f"{name}(noise=…), such as identify.fit estimates it"
+            )
+        if getattr(sensor, "lowpass", None) is not None:
+            raise ValueError(
+                f"{name}: a lowpass has states of its own, which the filter does not estimate; "
+                "leave it out, and give its lag as offset"
+            )
+    readings = tuple(Mounted(sensor) for sensor in sensors)
+    tree = _Recorded(readings)
+    leaves = tuple(leaf_at(walk.where, tree, "Walk", "the sensor")[0] for walk in model.walks)
+    return Sensors(readings, leaves, tuple(walk.density for walk in model.walks))
+
+
+class Stops(NamedTuple):
+    """The times of the filter's steps, and the readings then."""
+
+    t: Array
+    values: tuple[Array, ...]
+    masks: tuple[Array, ...]
+
+
+def _rows(dynamics: Dynamics, sensors: Sensors, stop: Stops, x: Extended) -> list[ReadingRow]:
+    """The reading of each sensor at one time, linearised about the state x."""
+    dtype = x.motion.omega.dtype
+    t = stop.t.astype(dtype)
+    basis = jax.vmap(lambda e: tangent(x, e))(jnp.eye(dimension(x), dtype=dtype))
+    out = []
+    for index, (value, mask) in enumerate(zip(stop.values, stop.masks, strict=True)):
+        sensor = in_precision(sensors.readings[index].sensor, dtype)
+
+        def error(y: Extended, index: int = index, value: Array = value) -> Array:
+            seeing = in_precision(sensors.drifted(y.walks)[index].sensor, dtype)
+
+            def field(t: Any, state: Any, args: Any = None) -> Any:
+                torque = sum(y.torques[1:], y.torques[0]) if y.torques else None
+                return dynamics.pushed(dynamics.field(t, state, args), torque)
+
+            motion, when = y.motion, t
+            offset = getattr(seeing, "offset", None)
+            if offset is not None:
+                motion, when = shifted(field, t, motion, offset), t + offset
+            return seeing.error(SensorInput(when, motion, dynamics.body, field), value)
+
+        found, push = jax.linearize(error, x)
+        matrix = -jax.vmap(push, out_axes=1)(basis)
+        seen = jnp.broadcast_to(mask, found.shape)
+        limit = getattr(sensor, "limit", None)
+        if limit is not None:
+            seen = seen & (jnp.abs(value) < limit * (1 - 1e-6))
+        assert sensor.noise is not None
+        out.append(ReadingRow(matrix, found, sensor.noise**2, seen))
+    return out
+
+
+class Read(NamedTuple):
+    """Of one sensor each `innovation`, the reading minus its prediction from all numbers read
+    before, its `variance`, and whether it was `seen`.
+    """
+
+    innovation: Float[Array, "*times k"]
+    variance: Float[Array, "*times k"]
+    seen: Bool[Array, "*times k"]
+
+    @property
+    def log_density(self) -> Array:
+        """The sum of the logarithms of the normal densities."""
+        return jnp.sum(roots.log_normal(self.innovation, self.variance, self.seen))
+
+
+def absorb_all(
+    dynamics: Dynamics, sensors: Sensors, stop: Stops, x: Extended, step: Array, root: Array
+) -> tuple[Array, Array, tuple[Read, ...]]:
+    """Potter's update by all numbers of all sensors, one by one, of an error of mean `step`."""
+    rows = _rows(dynamics, sensors, stop, x)
+    stacked = ReadingRow(*(jnp.concatenate(parts) for parts in zip(*rows, strict=True)))
+    found = roots.absorb_all(step, root, *stacked)
+    out, at = [], 0
+    for row in rows:
+        here = slice(at, at + row.error.shape[0])
+        out.append(Read(found.innovation[here], found.variance[here], row.seen))
+        at = here.stop
+    return found.step, found.root, tuple(out)

@@ -13,8 +13,17 @@ from rigidjax._types import Scalar
 from rigidjax.estimate import linear, roots
 from rigidjax.estimate.belief import Belief
 from rigidjax.estimate.filter import WORDS, Task, looked_at, scan_filter, status_of, told
-from rigidjax.estimate.scene import Dynamics, Extended, Model, reset, reset_inverse
-from rigidjax.estimate.sensing import Read, Sensors, Stops, absorb_all
+from rigidjax.estimate.scene import (
+    Dynamics,
+    Extended,
+    Model,
+    Read,
+    Sensors,
+    Stops,
+    absorb_all,
+    reset,
+    reset_inverse,
+)
 from rigidjax.identify.recording import Recording
 from rigidjax.motion.manifold import minus, plus
 
@@ -91,19 +100,16 @@ def smooth(
 ) -> Smoothed:
     """Attitude, rate, unknown torque and sensor errors from all readings, with their deviations.
 
-    This is the motion of largest posterior density, by Gauss and Newton's method. Each iteration
-    linearises dynamics and sensors about the last motion. It solves the linear problem exactly by a
-    Kalman filter and the backward pass of Rauch, Tung and Striebel, on roots of covariances (Bell
-    1994, doi:10.1137/0804035). The first motion is the result of `filter`.
+    The motion of largest posterior density, by Gauss and Newton's method: each iteration linearises
+    dynamics and sensors about the last motion, at first that of `filter`, and solves the linear
+    problem exactly by a Kalman filter and the pass of Rauch, Tung and Striebel (Bell 1994,
+    doi:10.1137/0804035).
 
     **Arguments:** as for `filter`; `iterations` at most; it ends when no number moved by more than
     `tolerance` of its standard deviation (the error that remains is about the square of that).
-
     **Returns** `belief`, `rows`, `pushes`, `readings`, `log_likelihood`, `change`, `iterations`,
     `status` and `lost_at` (`Smoothed`). It may be jitted, differentiated in forward mode, and
-    batched.
-
-    **Raises:** as `filter`; with `throw` also for a motion that still moves by a standard
+    batched. **Raises:** as `filter`; with `throw` also for a motion that still moves by a standard
     deviation.
 
     >>> import rigidjax as rj
@@ -194,17 +200,9 @@ def _smooth(task: Task, iterations: int, tolerance: float) -> Smoothed:
 
 
 def _iterate(
-    dynamics: Dynamics,
-    sensors: Sensors,
-    first: Belief,
-    stops: Stops,
-    path: Extended,
-    kicks: Array,
+    dynamics: Dynamics, sensors: Sensors, first: Belief, stops: Stops, path: Extended, kicks: Array
 ) -> tuple[Extended, _Solved]:
-    """One linearisation about `path`, at each time of the filter, and its exact solution.
-
-    It is also about the `kicks` between these times, in which the motion is not linear either.
-    """
+    """One linearisation about `path` and the `kicks` between its times, and its exact solution."""
     before = jnp.concatenate([first.t[None], stops.t[:-1]])
     dtype = first.root.dtype
     x0 = jax.tree.map(lambda leaf: leaf[0], path)

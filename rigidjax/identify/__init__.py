@@ -11,32 +11,28 @@ from rigidjax.identify.body_charts import (
     Ratios as Ratios,
     Tensor as Tensor,
 )
-from rigidjax.identify.compare import (
-    compare as compare,
-    cross_validate as cross_validate,
-)
-from rigidjax.identify.csv_io import (
-    read_table as read_table,
-)
+from rigidjax.identify.compare import compare as compare, cross_validate as cross_validate
+from rigidjax.identify.csv_io import read_table as read_table
 from rigidjax.identify.design import (
     best_first_rate as best_first_rate,
     expected as expected,
     fisher as fisher,
 )
 from rigidjax.identify.fit import fit as fit
-from rigidjax.identify.free_parameters import Free as Free
-from rigidjax.identify.loss import AbstractLoss as AbstractLoss, Huber as Huber, SoftL1 as SoftL1
+from rigidjax.identify.loss import (
+    AbstractLoss as AbstractLoss,
+    Entropic as Entropic,
+    Huber as Huber,
+    SoftL1 as SoftL1,
+)
 from rigidjax.identify.parameters import (
+    Free as Free,
     Parameters as Parameters,
     Unpacked as Unpacked,
 )
-from rigidjax.identify.prior import Entropic as Entropic
 from rigidjax.identify.problem import Problem as Problem
 from rigidjax.identify.profile import profile as profile
-from rigidjax.identify.propagation import (
-    Adaptive as Adaptive,
-    FixedSteps as FixedSteps,
-)
+from rigidjax.identify.propagation import Adaptive as Adaptive, FixedSteps as FixedSteps
 from rigidjax.identify.recording import Recording as Recording
 from rigidjax.identify.result import Fit as Fit
 from rigidjax.identify.sensors import (

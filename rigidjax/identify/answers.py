@@ -56,9 +56,8 @@ def status(search: Answer, model: Answer) -> str:
 def advice(
     search: Answer, model: Answer, causes: tuple[Cause, ...], kind: str, above: float
 ) -> str:
-    """Whether the intervals can be trusted, and what to try.
-
-    **Arguments:** `kind` of the covariance; `above`, the errors over the noise that was given.
+    """Whether the intervals can be trusted, and what to try; `above` the errors over the given
+    noise.
     """
     remedies = list(dict.fromkeys(cause.remedy for cause in causes))
     tries = f" Try: {'; '.join(remedies)}." if remedies else ""

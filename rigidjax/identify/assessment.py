@@ -1,51 +1,178 @@
 """The quality of a fit: covariance, status, and whether other starts explain the data as well."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from rigidjax.identify import flat_limit, uncertainty
-from rigidjax.identify.answers import FAILS, FOUND, NOT_ALONE, NOT_ENDED, Answer
+from rigidjax.identify.answers import EXPLAINS, FAILS, FOUND, LEAVES, NOT_ALONE, NOT_ENDED, Answer
+from rigidjax.identify.causes import clock
 from rigidjax.identify.checkpoint import Tried
+from rigidjax.identify.flat_limit import of_charts
 from rigidjax.identify.full_scale import at_limit
-from rigidjax.identify.goodness import goodness
-from rigidjax.identify.parameters import Parameters
 from rigidjax.identify.problem import Problem
 from rigidjax.identify.quantities import charts, quantities as quantities_of, values_and_slopes
-from rigidjax.identify.real_bodies import of_charts
-from rigidjax.identify.residual import Noise
 from rigidjax.identify.result import Fit, Start
+from rigidjax.identify.terms import Noise
+from rigidjax.identify.uncertainty import Linearised, Times, scatter
+
+# The false-alarm rate of the test for autocorrelated errors.
+RARE = 1e-5
+# Lags in the test for whiteness.
+LAGS = 10
+# A model explains too little if its errors exceed this share of the readings' variance.
+HALF, QUARTER, TENTH = 0.5, 0.25, 0.1
+
+
+def goodness(
+    problem: Problem, linear: Linearised, times: Times, free: int
+) -> tuple[float, int, Answer, tuple[int, ...]]:
+    """χ² and its degrees of freedom (sensors of given noise), the answer, the sensors left over.
+
+    The size of the errors is compared with a given noise (five standard deviations of χ², or of the
+    median of the squares under a robust loss) and with the variance of the readings; Ljung and
+    Box's test (1978, doi:10.1093/biomet/65.2.297) says whether they are white. Readings at full
+    scale take no part.
+    """
+    chi2, count, word = 0.0, 0, EXPLAINS
+    words: list[str] = []
+    sensors: list[int] = []
+    cut = at_limit(problem.records.readings)
+    for index, (reading, error, e, weight, full) in enumerate(
+        zip(problem.records.readings, linear.raw, linear.errors, linear.weights, cut, strict=True)
+    ):
+        kept, given = (weight > 0)[..., None] & ~full, reading.sensor.noise is not None
+        left, varies, tiny = _sizes(reading, error, kept)
+        factor = 1.0
+        if given:
+            own, many = float(np.sum((weight[..., None] * e**2)[kept])), int(kept.sum())
+            chi2, count = chi2 + own, count + many
+            dof = max(many - free, 1)
+            factor = float(np.sqrt(own / dof)) if own > dof + 5 * np.sqrt(2 * dof) else 1.0
+            if problem.loss is not None and many:
+                rows = kept.all(axis=-1) & (weight > 0)
+                factor = _median_above(np.sum(e[rows] ** 2, axis=-1), e.shape[-1])
+        white = left <= tiny or _white(e * np.sqrt(weight)[..., None], kept, given)
+        late = left > tiny and clock(problem, linear, index) is not None
+        # Errors below a given noise cannot hide a missing part of the model.
+        small = given or left <= QUARTER * varies + tiny
+        if factor == 1.0 and white and small and not late:
+            continue
+        lasting = max(times.closeness, 0.0) * left
+        missed = left > HALF * varies + tiny or lasting > TENTH * varies + tiny
+        if missed and (factor > 1.0 or not given):
+            word = FAILS
+        word = LEAVES if word == EXPLAINS else word
+        sensors.append(index)
+        share = left / varies if varies > tiny and _differences(reading) else None
+        span = None if white else times.longest
+        words.append(_in_words(problem, reading, error, kept, factor, share, span))
+    return chi2, max(count - free, 1), Answer(word, tuple(words)), tuple(sensors)
+
+
+def _differences(reading: Any) -> bool:
+    """Whether an error has as many numbers as a reading, and so its unit."""
+    return int(np.prod(reading.sensor.reading_shape)) == reading.sensor.components
+
+
+def _in_words(
+    problem: Problem,
+    reading: Any,
+    error: np.ndarray,
+    kept: np.ndarray,
+    factor: float,
+    share: float | None,
+    span: float | None,
+) -> str:
+    """Size and place of errors in words; `share` of the variance, `span` of samples or `None`."""
+    sensor, many = reading.sensor, max(int(kept.any(axis=-1).sum()), 1)
+    size = np.sqrt(np.sum(error[kept] ** 2) / many)
+    words = [f"the errors of the {type(sensor).__name__} are {size:.3g} {sensor.unit}"]
+    if share is not None:
+        words.append(f"{100 * np.sqrt(share):.2g} % of what varies in its readings")
+    if factor > 1.0:
+        words.append(f"{factor:.3g} times the noise")
+    if span is not None:
+        channels = [np.moveaxis(x, -1, 0).reshape(-1, x.shape[1]) for x in (error, kept)]
+        rows = [row[seen] for row, seen in zip(*channels, strict=True)]
+        apart = scatter(rows)
+        over = np.sqrt(np.mean(np.concatenate(rows) ** 2) / apart) if apart > 0 else np.inf
+        words.append(f"{over:.3g} times their scatter between neighbours")
+        words.append(f"autocorrelated over {span:.0f} samples")
+    return f"{', '.join(words)}, {_where(problem, error, kept)}"
+
+
+def _where(problem: Problem, error: np.ndarray, kept: np.ndarray) -> str:
+    """The shortest time in which half of the squared errors are."""
+    squares = np.sum(np.where(kept, error, 0.0) ** 2, axis=-1)
+    row = int(np.argmax(squares.sum(axis=1)))
+    count = problem.counts[row]
+    t, total = np.asarray(problem.records.t)[row, :count], np.cumsum(squares[row, :count])
+    last = np.searchsorted(total, total - squares[row, :count] + 0.5 * total[-1])
+    first = int(np.argmin(np.where(last < count, t[np.minimum(last, count - 1)] - t, np.inf)))
+    begin, end = t[first], t[min(last[first], count - 1)]
+    if end - begin > 0.4 * (t[-1] - t[0]):
+        return "all along"
+    of = f" of recording {row}" if problem.count > 1 else ""
+    return f"half of the squared ones from {begin:.4g} to {end:.4g} s{of}"
+
+
+def _sizes(reading: Any, error: np.ndarray, kept: np.ndarray) -> tuple[float, float, float]:
+    """Sums of squares: of the errors, of the readings about their mean, and of round-off."""
+    values = np.asarray(reading.values)[reading.seen]
+    varies = float(np.sum((values - values.mean(axis=0)) ** 2))
+    return float(np.sum(error[kept] ** 2)), varies, 1e-12 * float(np.sum(values**2))
+
+
+def _median_above(squares: np.ndarray, size: int) -> float:
+    """The same by the median: outliers are expected, and dominate χ²."""
+    if not squares.size:
+        return 1.0
+    middle = float(np.median(squares))
+    half, density = median_of_chi2(size)
+    # The deviation of a sample's median is 1 / (2 f √n), f the density there.
+    wide = 0.5 / (density * np.sqrt(squares.size))
+    return float(np.sqrt(middle / half)) if middle > half + 5 * wide else 1.0
+
+
+def median_of_chi2(size: int) -> tuple[float, float]:
+    """The median of χ² with `size` degrees of freedom, and the density there."""
+    from scipy.special import chdtri, gammaln
+
+    median = float(chdtri(size, 0.5))
+    power = 0.5 * size - 1
+    density = 0.5 * np.exp(power * np.log(0.5 * median) - 0.5 * median - gammaln(0.5 * size))
+    return median, float(density)
+
+
+def _white(e: np.ndarray, kept: np.ndarray, given: bool) -> bool:
+    """Whether whitened errors (R, T, k) are white; errors far below a `given` noise are no
+    evidence.
+    """
+    from scipy.special import chdtrc
+
+    total, degrees = 0.0, 0
+    for channel in range(e.shape[-1]):
+        rows = [x[seen] for x, seen in zip(e[..., channel], kept[..., channel], strict=True)]
+        rows = [row - row.mean() for row in rows if row.size >= 2 * LAGS]
+        size = sum(row.size for row in rows)
+        squares = sum(float(row @ row) for row in rows)
+        squares = max(squares, float(size)) if given else squares
+        if not squares > 0:
+            continue
+        for lag in range(1, LAGS + 1):
+            pairs = size - lag * len(rows)
+            rho = sum(float(row[lag:] @ row[:-lag]) for row in rows) / squares
+            total += size * (size + 2.0) * rho**2 / pairs
+            degrees += 1
+    return degrees == 0 or bool(chdtrc(degrees, total) > RARE)
+
 
 # A search may end so near to the least misfit, in standard deviations.
 AT_THE_END = 0.05
-
-
-def _margin(problem: Problem, best_cost: float, longest: float) -> float:
-    """The largest excess over the best misfit with which a start still explains the data.
-
-    Ten units of log-likelihood: a point further above the best is e¹⁰ times less likely. The cost
-    of the best point is half the number of readings if the noise is estimated there. Autocorrelated
-    errors count as fewer.
-    """
-    guessed = any(sensor.noise is None for sensor in problem.records.sensors)
-    unit = 2 * best_cost / problem.records.size if guessed else 1.0
-    return 10.0 * unit * max(longest, 1.0)
-
-
-def _start(tried: Tried, level: float) -> Start:
-    """A start for the user; it fits if its misfit is not above `level`."""
-    cost = float(tried.cost)
-    return Start(tried.parameters, cost, bool(tried.converged), cost <= level)
-
-
-def _elsewhere(
-    linear: uncertainty.Linearised, other: Parameters, value: Parameters, margin: float
-) -> bool:
-    """Whether the readings distinguish two points; in a flat valley they do not."""
-    away = ravel_pytree(other)[0] - ravel_pytree(value)[0]
-    return float(np.sum((linear.rows @ np.asarray(away)) ** 2)) > 2 * margin
 
 
 def _search(
@@ -70,10 +197,7 @@ def assess(
     best_cost: float,
     interrupted: Sequence[str] = (),
 ) -> Fit:
-    """The `Fit` of the best point of all starts, converged or not.
-
-    `interrupted` gives the point of the search in words.
-    """
+    """The `Fit` of the best point of all starts, converged or not."""
     value = best.parameters
     near = flat_limit.beside(problem, value)
     linear = uncertainty.linearise(problem, value, noise, best.found, near)
@@ -81,30 +205,34 @@ def assess(
     times = uncertainty.correlation_times(linear, cut)
     white = uncertainty.of_white(linear)
     spread = uncertainty.spread(linear, times, white)
-    numbers, names = values_and_slopes(problem, value, near), [n for n, _ in charts(problem)]
-    limits = flat_limit.limits(problem, numbers, uncertainty.step(linear, white), names)
+    numbers, of = values_and_slopes(problem, value, near), charts(problem)
+    limits = flat_limit.limits(problem, numbers, -white.seen @ linear.slope, [n for n, _ in of])
     # Steps stay short in a long curved valley, although hardly anything is left to gain.
     held = [limit.slope for limit in limits if limit.free < 0]
     done = bool(best.converged) or uncertainty.distance(linear, white, held) < AT_THE_END
-    free = ravel_pytree(value)[0].size
-    seen = goodness(problem, linear, times, free)
-    believable = seen.model.word != FAILS
-    margin = _margin(problem, best_cost, times.longest)
+    chi2, dof, model, left = goodness(problem, linear, times, linear.size)
+    believable = model.word != FAILS
+    # Ten units of log-likelihood, of the noise as estimated; autocorrelated errors count as fewer.
+    guessed = any(sensor.noise is None for sensor in problem.records.sensors)
+    unit = 2 * best_cost / problem.records.size if guessed else 1.0
+    margin = 10.0 * unit * max(times.longest, 1.0)
 
     level = best_cost + margin if believable else -np.inf
-    starts = [_start(item, level) for item in tried]
-    rivals = [
-        s
-        for s in starts
-        if s.fits and s.converged and s.cost > best_cost + 0.01 * margin
-        if _elsewhere(linear, s.parameters, value, margin)
-    ]
+    starts, rivals = [], []
+    for item in tried:
+        cost, found = float(item.cost), bool(item.converged)
+        starts.append(Start(item.parameters, cost, found, cost <= level))
+        if cost <= level and found and cost > best_cost + 0.01 * margin:
+            away = ravel_pytree(item.parameters)[0] - ravel_pytree(value)[0]
+            # In a flat valley readings do not tell two points apart.
+            if float(np.sum((linear.rows @ np.asarray(away)) ** 2)) > 2 * margin:
+                rivals.append(item)
     rival = f"{len(rivals)} of {len(starts)} starts fit as well elsewhere" if rivals else ""
     lost = believable and not any(start.fits for start in starts)
     remarks = ("no single start came near the best point",) if lost else ()
     search = _search(best_cost, done, rival, interrupted, remarks)
-    unreal = of_charts(charts(problem), flat_limit.bodies_of(problem, value))
-    model = Answer(seen.model.word, (*unreal, *seen.model.reasons))
+    unreal = of_charts(of, flat_limit.bodies_of(problem, value))
+    model = Answer(model.word, (*unreal, *model.reasons))
     model = model if np.isfinite(best_cost) else Answer(FAILS)
     return Fit(
         problem,
@@ -114,8 +242,8 @@ def assess(
         spread.kind,
         noise,
         tuple(starts),
-        seen.chi2,
-        seen.dof,
+        chi2,
+        dof,
         times.longest,
         times.independent,
         jnp.asarray(spread.singular_values),
@@ -123,7 +251,7 @@ def assess(
         quantities_of(problem, numbers, spread.seen, spread.null_directions, limits),
         search,
         model,
-        seen.left,
+        left,
         limits,
         near,
     )

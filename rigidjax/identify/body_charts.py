@@ -1,25 +1,22 @@
 """Unconstrained numbers ↔ the body, for a fit. Every point is a real body."""
 
 import abc
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from rigidjax import _checks
 from rigidjax.body import parameters as charts
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.body.symmetric3 import swap_trace
 
-# The parts of a `MassProperties` that may be free: in words, and their places in `pack`.
-_PARTS = {
-    "mass": ("mass", (0,)),
-    "com": ("centre of mass", (7, 8, 9)),
-    "inertia": ("inertia tensor", (1, 2, 3, 4, 5, 6)),
-}
+# The parts of a `MassProperties` that may be free, and their places in `pack`.
+_PARTS = {"mass": (0,), "com": (7, 8, 9), "inertia": (1, 2, 3, 4, 5, 6)}
 # Components of a tensor in the order of their names.
 COMPONENTS = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))
 
@@ -28,28 +25,24 @@ class AbstractBodyChart(eqx.Module):
     """A chart of bodies: `size` numbers → an `Inertia` or `MassProperties`, and back.
 
     `log_names`, `unit` and `logs(body)` describe the positive quantities that are reported, through
-    their logarithms; `plain_names` and `plain(body)` describe quantities of either sign.
+    their logarithms; `plain_names` and `plain(body)` quantities of either sign, none unless given.
 
     >>> class Spheres(AbstractBodyChart):  # one number: the logarithm of the moment
-    ...     size, in_words, unit = 1, "the moment of a sphere", "kg m²"
-    ...     log_names, plain_names = ("I",), ()
+    ...     size, unit, log_names = 1, "kg m²", ("I",)
     ...     def body(self, vector):
     ...         return Inertia.from_principal(*jnp.exp(vector[0]) * jnp.ones(3))
     ...     def vector(self, body):
     ...         return self.logs(body)
     ...     def logs(self, body):
     ...         return jnp.log(body.tensor[0, 0])[None]
-    ...     def plain(self, body):
-    ...         return jnp.zeros(0)
     >>> Spheres().body(jnp.zeros(1)).tensor[0].tolist()
     [1.0, 0.0, 0.0]
     """
 
     size: eqx.AbstractVar[int]
-    in_words: eqx.AbstractClassVar[str]
-    log_names: eqx.AbstractClassVar[tuple[str, ...]]
-    plain_names: eqx.AbstractClassVar[tuple[str, ...]]
-    unit: eqx.AbstractClassVar[str]
+    log_names: eqx.AbstractVar[tuple[str, ...]]
+    plain_names: ClassVar[tuple[str, ...]] = ()
+    unit: ClassVar[str] = ""
 
     @abc.abstractmethod
     def body(self, vector: Float[Array, " chart"]) -> Inertia | MassProperties:
@@ -65,8 +58,7 @@ class AbstractBodyChart(eqx.Module):
         """Rows whose squares are the second derivative of a misfit from the chart's curvature.
 
         They matter if a body may be flat (`rigidjax.body.parameters.flat_bend`); else there are
-        none.
-        **Arguments:** `slope` the misfit's derivative in the chart's numbers.
+        none. **Arguments:** `slope` the misfit's derivative in the chart's numbers.
         """
         return jnp.zeros((0, self.size), vector.dtype)
 
@@ -74,9 +66,9 @@ class AbstractBodyChart(eqx.Module):
     def logs(self, body: Any) -> Float[Array, " logs"]:
         """Logarithms of the positive quantities that are reported."""
 
-    @abc.abstractmethod
     def plain(self, body: Any) -> Float[Array, " plain"]:
         """The other quantities that are reported."""
+        return jnp.zeros(0)
 
 
 class Ratios(AbstractBodyChart):
@@ -90,10 +82,7 @@ class Ratios(AbstractBodyChart):
     """
 
     size: ClassVar[int] = 5
-    in_words: ClassVar[str] = "the inertia tensor up to scale"
     log_names: ClassVar[tuple[str, ...]] = ("I1/I3", "I2/I3")
-    plain_names: ClassVar[tuple[str, ...]] = ()
-    unit: ClassVar[str] = ""
 
     def body(self, vector: Float[Array, " chart"]) -> Inertia:
         return Inertia(swap_trace(charts.unpack_shape(vector)))
@@ -110,9 +99,6 @@ class Ratios(AbstractBodyChart):
         moments = jnp.log(body.moments)
         return moments[:2] - moments[2]
 
-    def plain(self, body: Inertia) -> Float[Array, "0"]:
-        return jnp.zeros(0, body.tensor.dtype)
-
 
 class PrincipalRatios(AbstractBodyChart):
     """Two ratios of moments, where the body axes are known to be principal.
@@ -125,14 +111,10 @@ class PrincipalRatios(AbstractBodyChart):
     """
 
     size: ClassVar[int] = 2
-    in_words: ClassVar[str] = "two ratios of moments, the body axes being principal"
     log_names: ClassVar[tuple[str, ...]] = ("Ix/Iz", "Iy/Iz")
-    plain_names: ClassVar[tuple[str, ...]] = ()
-    unit: ClassVar[str] = ""
 
     def body(self, vector: Float[Array, " chart"]) -> Inertia:
-        moments = charts.unpack_moments(jnp.concatenate([jnp.zeros(1, vector.dtype), vector]))
-        return Inertia(jnp.diag(moments / 3.0))
+        return Inertia(jnp.diag(charts.unpack_moments(_padded(vector, 1, 0)) / 3.0))
 
     def vector(self, body: Inertia) -> Float[Array, " chart"]:
         return charts.pack_moments(jnp.diagonal(body.tensor))[1:]
@@ -145,9 +127,6 @@ class PrincipalRatios(AbstractBodyChart):
     def logs(self, body: Inertia) -> Float[Array, "2"]:
         i = jnp.diagonal(body.tensor)
         return jnp.log(i[:2] / i[2])
-
-    def plain(self, body: Inertia) -> Float[Array, "0"]:
-        return jnp.zeros(0, body.tensor.dtype)
 
 
 def _typical(value: Any) -> Array:
@@ -175,14 +154,12 @@ class Tensor(AbstractBodyChart):
 
     typical: Float[Array, ""] = eqx.field(converter=_typical, default=1.0)
     size: ClassVar[int] = 6
-    in_words: ClassVar[str] = "the inertia tensor"
     log_names: ClassVar[tuple[str, ...]] = ("I1", "I2", "I3")
     plain_names: ClassVar[tuple[str, ...]] = ("Ixx", "Iyy", "Izz", "Iyz", "Ixz", "Ixy")
     unit: ClassVar[str] = "kg m²"
 
     def body(self, vector: Float[Array, " chart"]) -> Inertia:
-        s = charts.unpack_second_moment(vector) * (0.5 * self.typical)
-        return Inertia(swap_trace(s))
+        return Inertia(swap_trace(charts.unpack_second_moment(vector) * (0.5 * self.typical)))
 
     def vector(self, body: Inertia) -> Float[Array, " chart"]:
         return charts.pack_second_moment(body.second_moment / (0.5 * self.typical))
@@ -190,7 +167,7 @@ class Tensor(AbstractBodyChart):
     def bend(
         self, vector: Float[Array, " chart"], slope: Float[Array, " chart"]
     ) -> Float[Array, "rows chart"]:
-        return _padded(charts.flat_bend(vector[1:], slope[1:]), 1, 0)
+        return _padded(Ratios().bend(vector[1:], slope[1:]), 1, 0)
 
     def logs(self, body: Inertia) -> Float[Array, "3"]:
         return jnp.log(body.moments)
@@ -212,9 +189,7 @@ class Principal(AbstractBodyChart):
 
     typical: Float[Array, ""] = eqx.field(converter=_typical, default=1.0)
     size: ClassVar[int] = 3
-    in_words: ClassVar[str] = "three moments, the body axes being principal"
     log_names: ClassVar[tuple[str, ...]] = ("Ix", "Iy", "Iz")
-    plain_names: ClassVar[tuple[str, ...]] = ()
     unit: ClassVar[str] = "kg m²"
 
     def body(self, vector: Float[Array, " chart"]) -> Inertia:
@@ -226,28 +201,22 @@ class Principal(AbstractBodyChart):
     def bend(
         self, vector: Float[Array, " chart"], slope: Float[Array, " chart"]
     ) -> Float[Array, "rows chart"]:
-        shape, slope = (_padded(x[1:], 0, 3) for x in (vector, slope))
-        return _padded(charts.flat_bend(shape, slope)[:, :2], 1, 0)
+        return _padded(PrincipalRatios().bend(vector[1:], slope[1:]), 1, 0)
 
     def logs(self, body: Inertia) -> Float[Array, "3"]:
         return jnp.log(jnp.diagonal(body.tensor))
-
-    def plain(self, body: Inertia) -> Float[Array, "0"]:
-        return jnp.zeros(0, body.tensor.dtype)
 
 
 class Mass(AbstractBodyChart):
     """Mass, centre of mass and inertia: all ten numbers, if forces show them, or some of them.
 
-    The chart of `rigidjax.body.parameters.pack` around a `guess`, which is where it starts.
-
     **Arguments:** `guess` a `MassProperties` of about the right size, with the true values of all
-    numbers that are not free; `free` the parts that a fit may move: `"mass"` (the second moment
-    keeps its ratio to the mass unless the inertia is free, too), `"inertia"` about the centre of
-    mass, `"com"`. Take `free=["inertia"]` for a body that was weighed and balanced, `["mass"]` for
-    a load of known shape, `["com"]` for a centre that moved.
-
-    **Raises:** `TypeError` for a guess of another type; `ValueError` for another word, or none.
+    numbers that are not free, where the chart of `rigidjax.body.parameters.pack` starts; `free` the
+    parts that a fit may move: `"mass"` (the second moment keeps its ratio to the mass unless the
+    inertia is free, too), `"inertia"` about the centre of mass, `"com"`: `["inertia"]` for a body
+    that was weighed and balanced, `["mass"]` for a load of known shape, `["com"]` for a centre that
+    moved. **Raises:** `TypeError` for a guess of another type; `ValueError` for another word, or
+    none.
 
     >>> import rigidjax as rj
     >>> box = rj.shapes.box(2.0, [1.0, 1.0, 1.0])
@@ -257,6 +226,9 @@ class Mass(AbstractBodyChart):
 
     guess: MassProperties
     free: tuple[str, ...] = eqx.field(static=True)
+    size: int = eqx.field(static=True)
+    log_names: tuple[str, ...] = eqx.field(static=True)
+    plain_names: tuple[str, ...] = eqx.field(static=True)  # pyright: ignore
     unit: ClassVar[str] = "SI"
 
     def __init__(self, guess: MassProperties, free: Sequence[str] = tuple(_PARTS)):
@@ -269,32 +241,14 @@ class Mass(AbstractBodyChart):
         if not chosen:
             raise ValueError("free: wanted mass, inertia or com, got none; see Known")
         self.free = tuple(name for name in _PARTS if name in chosen)
-
-    @property
-    def size(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """The number of free numbers."""
-        return len(self._places)
-
-    @property
-    def in_words(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """The free parts, in words."""
-        *most, last = [_PARTS[name][0] for name in self.free]
-        return f"{', '.join(most)} and {last}" if most else last
-
-    @property
-    def log_names(self) -> tuple[str, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """The positive quantities."""
-        mass = ("mass",) if "mass" in self.free else ()
-        return (*mass, "I1", "I2", "I3") if "inertia" in self.free else mass
-
-    @property
-    def plain_names(self) -> tuple[str, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """The others."""
-        return ("com x", "com y", "com z") if "com" in self.free else ()
+        self.size = len(self._places)
+        moments = ("I1", "I2", "I3") if "inertia" in chosen else ()
+        self.log_names = ("mass", *moments) if "mass" in chosen else moments
+        self.plain_names = ("com x", "com y", "com z") if "com" in chosen else ()
 
     @property
     def _places(self) -> list[int]:
-        return sorted(place for name in self.free for place in _PARTS[name][1])
+        return sorted(place for name in self.free for place in _PARTS[name])
 
     @property
     def _length(self) -> Array:
@@ -347,10 +301,7 @@ class Known(AbstractBodyChart):
 
     known: Inertia | MassProperties
     size: ClassVar[int] = 0
-    in_words: ClassVar[str] = "nothing of the body"
     log_names: ClassVar[tuple[str, ...]] = ()
-    plain_names: ClassVar[tuple[str, ...]] = ()
-    unit: ClassVar[str] = ""
 
     def __check_init__(self) -> None:
         _checks.single(self.known, (Inertia, MassProperties), "known")
@@ -364,10 +315,126 @@ class Known(AbstractBodyChart):
     def logs(self, body: Any) -> Float[Array, "0"]:
         return jnp.zeros(0)
 
-    def plain(self, body: Any) -> Float[Array, "0"]:
-        return jnp.zeros(0)
-
 
 def _padded(x: Float[Array, "*rows n"], before: int, after: int) -> Float[Array, "*rows m"]:
     """The same numbers with zeros before and after them."""
     return jnp.pad(x, [(0, 0)] * (x.ndim - 1) + [(before, after)])
+
+
+class Bodies(eqx.Module):
+    """The charts of several bodies, by name; their numbers follow one another. Charts of the same
+    kind are kept stacked, so that one program serves all recordings.
+    """
+
+    names: tuple[str, ...] = eqx.field(static=True)
+    charts: tuple[AbstractBodyChart, ...]
+    kinds: tuple[AbstractBodyChart, ...]
+    kind_of: tuple[int, ...] = eqx.field(static=True)
+    row_of: tuple[int, ...] = eqx.field(static=True)
+
+    def __init__(self, charts: Mapping[str, AbstractBodyChart]):
+        self.names, self.charts = tuple(charts), tuple(charts.values())
+        members: dict[Any, list[AbstractBodyChart]] = {}
+        kind_of, row_of = [], []
+        for chart in self.charts:
+            leaves, structure = jax.tree.flatten(chart)
+            form = structure, tuple(np.shape(leaf) for leaf in leaves)
+            alike = members.setdefault(form, [])
+            kind_of.append(list(members).index(form))
+            row_of.append(len(alike))
+            alike.append(chart)
+        self.kind_of, self.row_of = tuple(kind_of), tuple(row_of)
+        self.kinds = tuple(
+            jax.tree.map(lambda *x: jnp.stack(x), *alike) for alike in members.values()
+        )
+        if len({has_mass(chart) for chart in self.charts}) > 1:
+            raise ValueError(
+                "body: wanted a mass for all bodies or for none, got "
+                + ", ".join(f"{n}: {type(c).__name__}" for n, c in charts.items())
+            )
+
+    @property
+    def size(self) -> int:
+        """The number of free numbers of all bodies."""
+        return sum(chart.size for chart in self.charts)
+
+    @property
+    def widest(self) -> int:
+        """The number of free numbers of the largest chart."""
+        return max(chart.size for chart in self.charts)
+
+    def parts(self, vector: Array) -> dict[str, Array]:
+        """The numbers of each body."""
+        out, first = {}, 0
+        for name, chart in zip(self.names, self.charts, strict=True):
+            out[name] = vector[first : first + chart.size]
+            first += chart.size
+        return out
+
+    def all(self, vector: Float[Array, " numbers"]) -> dict[str, Any]:
+        """Every body by its name."""
+        parts = self.parts(vector)
+        return {n: c.body(parts[n]) for n, c in zip(self.names, self.charts, strict=True)}
+
+    def body(self, vector: Float[Array, " chart"], which: Int[Array, ""]) -> Any:
+        """The body at the index `which`, from its numbers, padded with zeros."""
+        kind, row = jnp.asarray(self.kind_of)[which], jnp.asarray(self.row_of)[which]
+        found: Any = None
+        for index, alike in enumerate(self.kinds):
+            here = jnp.where(kind == index, row, 0)
+            chart = jax.tree.map(lambda leaf, at=here: leaf[at], alike)
+            body = chart.body(vector[: chart.size])
+            if found is not None:
+                mine = kind == index
+                body = jax.tree.map(lambda a, b, mine=mine: jnp.where(mine, a, b), body, found)
+            found = body
+        return found
+
+
+def spread(
+    body: AbstractBodyChart | Bodies,
+    vector: Array,
+    which: Int[Array, " records"] | None,
+    count: int,
+    fill: int = 0,
+) -> Array:
+    """The numbers of each recording's body, (R, K), padded with `fill`."""
+    if not isinstance(body, Bodies):
+        return jnp.broadcast_to(vector, (count, body.size))
+    widest = body.widest
+    rows = [
+        jnp.concatenate([part, jnp.full(widest - part.shape[0], fill, part.dtype)])
+        for part in body.parts(vector).values()
+    ]
+    return jnp.stack(rows)[which]
+
+
+def matter(
+    body: AbstractBodyChart | Bodies, vector: Float[Array, " chart"], which: Int[Array, ""] | None
+) -> Inertia | MassProperties:
+    """The body of one recording."""
+    if not isinstance(body, Bodies):
+        return body.body(vector)
+    assert which is not None
+    return body.body(vector, which)
+
+
+def charts_of(body: Any) -> tuple[Any, ...]:
+    """The charts of a problem's body or bodies."""
+    return body.charts if isinstance(body, Bodies) else (body,)
+
+
+def in_a_row(bodies: Any) -> list[Any]:
+    """The bodies of `Problem.bodies`, of one or of several."""
+    return list(bodies.values()) if isinstance(bodies, dict) else [bodies]
+
+
+def tensor_of(body: Inertia | MassProperties) -> Float[Array, "3 3"]:
+    """The inertia tensor of a body, about its centre of mass if it has one, kg m²."""
+    return (body.inertia if isinstance(body, MassProperties) else body).tensor
+
+
+def has_mass(chart: AbstractBodyChart) -> bool:
+    """Whether the chart's bodies have a mass."""
+    sample: Any = eqx.filter_eval_shape(chart.body, jnp.zeros(chart.size))
+    return isinstance(sample, MassProperties)

@@ -17,14 +17,13 @@ from rigidjax.identify.parameters import Parameters
 
 
 class Tried(eqx.Module):
-    """The end of one start: its parameters, misfit (½ Σ of squares), and whether it converged.
-
-    `found` is the result of `with_blocks` at the parameters, if the search evaluated it last.
+    """The end of one start; `cost` is ½ Σ of squares; `found` that of `with_blocks` there, if
+    known.
     """
 
     parameters: Parameters
-    cost: Float[Array, ""]
-    converged: Bool[Array, ""]
+    cost: Float[Array, "*starts"] = eqx.field(converter=jnp.asarray, default=np.inf)
+    converged: Bool[Array, "*starts"] = eqx.field(converter=jnp.asarray, default=False)
     found: Any = None
 
 
@@ -34,11 +33,7 @@ def bare(tried: Tried) -> Tried:
 
 
 class SearchState(NamedTuple):
-    """The state of the search from one start; the rest of the search depends on nothing else.
-
-    **Fields:** `stage` the index of the next horizon, or their number at the end; `strides` the
-    number taken there; `tried` the result.
-    """
+    """The search from one start: the next horizon (their number at the end), strides, result."""
 
     stage: int
     strides: int
@@ -55,10 +50,7 @@ def require_folder(path: str | Path) -> None:
 
 
 def fingerprint(*trees: Any) -> str:
-    """A hash of the numbers' bytes and of the structure: the same in every process.
-
-    A function counts by its name.
-    """
+    """A hash of numbers and structure, the same in every process; a function counts by its name."""
     leaves, structure = jax.tree.flatten(trees)
     words, found = [repr(structure)], hashlib.sha256()
     for leaf in leaves:
@@ -73,11 +65,8 @@ def fingerprint(*trees: Any) -> str:
 class Checkpoint:
     """The results of a long search so far, on disk after every stride of steps.
 
-    **Arguments:** `path` of the file, or `None` to keep nothing; `like` a `Tried` of the right
-    shapes; `print_of` the `fingerprint` of everything that the search depends on.
-
-    **Raises:** `ValueError` for a file that is no checkpoint, is cut, or belongs to another
-    problem; it is not overwritten.
+    `like` is a `Tried` of the right shapes, `print_of` the `fingerprint` of all that the search
+    depends on. A file of another problem raises `ValueError`, and is not overwritten.
     """
 
     def __init__(self, path: str | Path | None, like: Tried, print_of: str):

@@ -18,18 +18,19 @@ from rigidjax.identify.body_charts import (
     Ratios,
     Tensor,
 )
-from rigidjax.identify.csv_io import UNITS, LogError, increasing, read_table
-from rigidjax.identify.free_parameters import Free
-from rigidjax.identify.layouts import USUAL as USUAL, layout_of as layout_of
+from rigidjax.identify.csv_io import (
+    UNITS,
+    USUAL as USUAL,
+    LogError,
+    increasing,
+    layout_of as layout_of,
+    read_table,
+)
 from rigidjax.identify.loss import Huber, SoftL1
+from rigidjax.identify.parameters import Free
 from rigidjax.identify.problem import Problem
 from rigidjax.identify.recording import Recording
-from rigidjax.identify.sensors import (
-    AbstractSensor,
-    Accelerometer,
-    AttitudeSensor,
-    Gyro,
-)
+from rigidjax.identify.sensors import AbstractSensor, Accelerometer, AttitudeSensor, Gyro
 from rigidjax.motion.torques import Damping, Flywheel, Series, Sum, Wheel
 from rigidjax.motion.torques.base import Torque
 from rigidjax.rotation import euler
@@ -52,9 +53,7 @@ SENSOR_UNITS = {
 
 
 class Channel(eqx.Module):
-    """One sensor of a log: what kind, which columns, in which unit, how noisy (in that unit; one
-    figure or one for each axis), and its full scale (in that unit).
-    """
+    """One sensor of a log; noise (one figure or one for each axis) and full scale in its unit."""
 
     kind: str
     columns: tuple[str, ...]
@@ -150,9 +149,8 @@ def read_log(
 
     **Arguments:** `path`; `channels`; `time`, `time_unit` the time column; `window` (from, to), s,
     or `None` for all; `wheels`; `free` some of `bias`, `drag`, `delay`: sensors and torque get
-    these numbers, so that a fit can move them. An empty cell is a gap.
-
-    **Raises** `LogError` as `read_table`.
+    these numbers, so that a fit can move them. An empty cell is a gap. **Raises** `LogError` as
+    `read_table`.
 
     >>> read_log("missing.csv", [channel("gyro=wx,wy,wz")])
     Traceback (most recent call last):
@@ -236,14 +234,8 @@ def problem_of(
     free: Sequence[str] = (),
     loss: str = "soft-l1",
 ) -> Problem:
-    """The problem of these recordings.
-
-    **Arguments:** `recordings` of `read_log`; `model` one of `ratios`, `principal-ratios`,
-    `tensor`, `principal`; `typical` kg m², the rough size of the moments; `free` as for `read_log`:
-    a drag coefficient for all, a bias and a delay for each recording; `loss` the weight of an
-    outlier: `soft-l1`, `huber` (both linear), `none` (squared).
-
-    **Raises** `LogError` for an unknown model, or a scale that no reading can show.
+    """The problem of recordings of `read_log`: a drag for all, a bias and a delay for each
+    recording.
     """
     if model not in MODELS:
         raise LogError(f"model: wanted one of {', '.join(MODELS)}, got {model!r}")

@@ -35,17 +35,14 @@ class Comparison(eqx.Module):
 
 
 def compare(fits: Mapping[str, Fit]) -> tuple[Comparison, ...]:
-    """Models of the same data, best first, by Schwarz's criterion.
+    """Models of the same data, best first, by Schwarz's criterion (1978,
+    doi:10.1214/aos/1176344136).
 
     `N log s² + p log N` with s² the mean square of each sensor's errors and N the number of
-    independent readings: the number of readings divided by the samples over which the errors of the
-    best model are autocorrelated, the same for all.
-
-    **Arguments:** `fits` name → `Fit`, all of the same readings. **Raises** `ValueError` for none,
-    or for fits of other readings. **Returns** for each `name`, `free`, `rms`, `correlation` and
-    `information` (`Comparison`).
-
-    Source: Schwarz 1978, doi:10.1214/aos/1176344136.
+    independent readings, those read divided by the samples over which the errors of the best model
+    are autocorrelated. **Arguments:** `fits` name → `Fit`, all of the same readings. **Returns**
+    for each `name`, `free`, `rms`, `correlation` and `information` (`Comparison`). **Raises**
+    `ValueError` for none, or for fits of other readings.
 
     >>> import rigidjax as rj
     >>> ts = jnp.linspace(0.0, 10.0, 80)
@@ -61,24 +58,19 @@ def compare(fits: Mapping[str, Fit]) -> tuple[Comparison, ...]:
         _checks.instance(found, Fit, f"fits[{name!r}]")
     if not fits:
         raise ValueError("compare: wanted at least one fit")
-    counts = {
-        name: tuple(count_of(reading) for reading in found.problem.records.readings)
-        for name, found in fits.items()
-    }
+    readings = {name: found.problem.records.readings for name, found in fits.items()}
+    counts = {name: tuple(map(count_of, some)) for name, some in readings.items()}
     if len(set(counts.values())) > 1:
         raise ValueError(f"compare: wanted fits of the same readings, got {counts}")
     shortest = max(min(found.correlation for found in fits.values()), 1.0)
     rows = []
     for name, found in fits.items():
         size = int(found.covariance.shape[0])
-        total = 0.0
-        for count, rms in zip(counts[name], found.rms, strict=True):
-            total += count / shortest * 2.0 * np.log(max(rms, 1e-300))
-        independent = sum(counts[name]) / shortest
-        total += size * np.log(max(independent, 2.0))
-        rows.append((total, name, size, found))
-    best = min(total for total, *_ in rows)
+        independent = np.array(counts[name]) / shortest
+        misfit = independent @ (2.0 * np.log(np.maximum(found.rms, 1e-300)))
+        rows.append((misfit + size * np.log(max(independent.sum(), 2.0)), name, size, found))
     rows.sort(key=lambda row: row[0])
+    best = rows[0][0]
     return tuple(
         Comparison(name, size, found.rms, found.correlation, float(total - best))
         for total, name, size, found in rows
@@ -86,19 +78,15 @@ def compare(fits: Mapping[str, Fit]) -> tuple[Comparison, ...]:
 
 
 def cross_validate(
-    build: Callable[[Sequence[Recording]], Problem],
-    recordings: Sequence[Recording],
-    **options: Any,
+    build: Callable[[Sequence[Recording]], Problem], recordings: Sequence[Recording], **options: Any
 ) -> tuple[tuple[float, ...], ...]:
     """The errors of each recording under a body fitted to all other recordings.
 
-    The body and all shared numbers come from the other recordings. The fit to the recording left
-    out moves only its own numbers: its initial state and the `Free`s with one value for each.
-
-    **Arguments:** `build` the problem of a sequence of recordings; `recordings` two at least;
-    `options` for `fit`. **Returns** for each recording the root mean square error of each sensor.
-    The model whose errors are smallest predicts best. **Raises** `ValueError` for fewer than two
-    recordings.
+    The body and all shared numbers come from the others; the fit to the recording left out moves
+    only its initial state and the `Free`s with one value for each. **Arguments:** `build` the
+    problem of a sequence of recordings; `recordings` two at least; `options` for `fit`. **Returns**
+    for each recording the root mean square error of each sensor: the model with the smallest
+    predicts best. **Raises** `ValueError` for fewer than two recordings.
 
     >>> cross_validate(lambda records: None, [])
     Traceback (most recent call last):

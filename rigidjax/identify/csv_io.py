@@ -3,16 +3,133 @@
 import csv
 import itertools
 import math
+import re
+import struct
 from array import array
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any, NamedTuple, TextIO
 
 import numpy as np
 
 from rigidjax import _checks
-from rigidjax.identify import blackbox
-from rigidjax.identify.layouts import read_header
+
+SUFFIXES = (".bbl", ".bfl")
+# The rates in deg/s, the time in µs.
+COLUMNS = ("time", "gyroADC[0]", "gyroADC[1]", "gyroADC[2]")
+
+
+def read_blackbox(path: Path, columns: Sequence[str]) -> tuple[list[str], dict[str, Any]]:
+    """The names of all fields, and the wanted ones, of the first flight in a file.
+
+    Rates come in deg/s and accelerations in g by the scales in the header, as in the flight
+    controllers' own viewer; other fields as logged. A log without its last mark is read to its end.
+    """
+    try:
+        from orangebox import Parser
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError(
+            f"{path}: Blackbox logs are read by orangebox, which is missing: pip install "
+            "'rigidjax[blackbox]'"
+        ) from error
+    parser = Parser.load(str(path))
+    names = parser.field_names
+    wanted = {name: (names.index(name), array("d")) for name in columns if name in names}
+    try:
+        for frame in parser.frames():
+            for place, numbers in wanted.values():
+                numbers.append(float(frame.data[place]))
+    except (RuntimeError, IndexError, TypeError):
+        # At the end of a log without a last mark the parser raises one of these.
+        if parser.reader.tell() < len(parser.reader):
+            raise
+    scales = _scales(parser.headers)
+    return names, {
+        name: np.frombuffer(numbers, float) * scales.get(name.partition("[")[0], 1.0)
+        for name, (_, numbers) in wanted.items()
+    }
+
+
+def _scales(headers: dict[str, Any]) -> dict[str, float]:
+    """The factors of the raw numbers of some fields."""
+    found = {}
+    if "gyro_scale" in headers:
+        value = headers["gyro_scale"]
+        # Written as the bits of a float, which the parser takes for a whole number.
+        scale = struct.unpack("f", struct.pack("I", value))[0] if isinstance(value, int) else value
+        baseflight = "baseflight" in str(headers.get("Firmware type", "")).lower()
+        found["gyroADC"] = scale * (1e6 * 180 / math.pi if baseflight else 1.0)
+    if "acc_1G" in headers:
+        found["accSmooth"] = 1.0 / float(headers["acc_1G"])
+    return found
+
+
+SEPARATORS = ",;\t"
+
+
+class Layout(NamedTuple):
+    """Names of the time and the three rate columns, the unit of the rates, that of the time."""
+
+    columns: tuple[str, str, str, str]
+    unit: str
+    time_unit: str
+
+
+USUAL = Layout(("t", "wx", "wy", "wz"), "rad/s", "s")
+
+
+def layout_of(path: str | Path) -> Layout:
+    """The layout of a log: phyphox (any language) or Blackbox if the names match, else `USUAL`."""
+    path = Path(path)
+    if path.suffix.lower() in SUFFIXES:
+        return Layout(COLUMNS, "deg/s", "us")
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            names = read_header(file).names
+    except (OSError, UnicodeDecodeError):
+        return USUAL
+    times = [name for name in names if re.search(r"\(s\)$", name)]
+    rates = [name for axis in "xyz" for name in names if re.search(rf"\b{axis} \(rad/s\)$", name)]
+    if len(times) == 1 and len(rates) == 3:
+        x, y, z = rates
+        return Layout((times[0], x, y, z), "rad/s", "s")
+    return USUAL
+
+
+class Header(NamedTuple):
+    """Column names; their separator; the number of their line; the lines read after it."""
+
+    names: list[str]
+    separator: str
+    line: int
+    after: list[str]
+
+
+def read_header(file: TextIO) -> Header:
+    """The header of a text, read from its beginning: the first line, below comments (`#`).
+
+    It may be the last comment, as `numpy.savetxt` writes it: then numbers follow.
+    """
+    comments, first, line = "", file.readline(_LONGEST), 1
+    while first.startswith("#") or (first and not first.strip()):
+        comments = first if first.startswith("#") else comments
+        first, line = file.readline(_LONGEST), line + 1
+    names, separator = _split(first)
+    if comments and (not first or any(map(_NUMBER.fullmatch, names))):
+        return Header(*_split(comments.lstrip("#")), line - 1, [first])
+    return Header(names, separator, line, [])
+
+
+# A file of one endless line is not read for its header; what `csv` takes as one cell.
+_LONGEST = 131_072
+_NUMBER = re.compile(r"[-+.\d][-+.\deE]*")
+
+
+def _split(first: str) -> tuple[list[str], str]:
+    """The names in a line, and what separates them: whichever gives most of them."""
+    separator = max(SEPARATORS, key=first.count)
+    return [name.strip() for name in next(csv.reader([first], delimiter=separator), [])], separator
+
 
 # All units become SI.
 UNITS = {
@@ -45,15 +162,14 @@ class LogError(ValueError):
 
 
 def read_table(path: str | Path, columns: Sequence[str]) -> dict[str, np.ndarray]:
-    """Columns of a log by name: text with a header, `.npz`, `.mat` (MATLAB up to v7), or a
-    Blackbox log of a flight controller, `.bbl` or `.bfl` (with the extra `blackbox`).
+    """Columns of a log by name: text with a header, `.npz`, `.mat` (MATLAB up to v7), or a Blackbox
+    log of a flight controller, `.bbl` or `.bfl` (with the extra `blackbox`).
 
     **Arguments:** `path`; `columns` the names that are wanted, others are ignored. Text is
     separated by commas, semicolons or tabs, whichever splits the header line into most names; its
-    decimals have a point. Lines that begin with `#` may stand above the header, and the header may
-    be the last of them, as `numpy.savetxt` writes it. **Returns** name → (T,) numbers. An empty
-    cell is a gap and comes back as NaN. A text is read line by line; the memory needed is up to
-    three times its numbers.
+    decimals have a point. Lines that begin with `#` may stand above the header, which may be the
+    last of them, as `numpy.savetxt` writes it. **Returns** name → (T,) numbers, NaN for an empty
+    cell. A text is read line by line; the memory needed is up to three times its numbers.
 
     **Raises:** `ValueError`, one line naming file, line and column, for a file that is missing, cut
     or not of its kind, a missing column or two of its name, a name that is wanted twice, a cell
@@ -74,9 +190,15 @@ def read_table(path: str | Path, columns: Sequence[str]) -> dict[str, np.ndarray
         raise LogError(f"{path}: no such file")
     if path.is_dir():
         raise LogError(f"{path}: is a folder, not a log")
-    if path.suffix.lower() in (".npz", ".mat", *blackbox.SUFFIXES):
+    if path.suffix.lower() in (".npz", ".mat", *SUFFIXES):
         return _arrays(path, columns)
-    return _csv(path, columns)
+    try:
+        # Line by line: only the numbers of a large file stay in memory.
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            return _rows(path, file, columns)
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        why = f"{type(error).__name__}: {error}".splitlines()[0]
+        raise LogError(f"{path}: cannot be read as text ({why})") from None
 
 
 def increasing(path: str | Path, t: np.ndarray, name: str) -> None:
@@ -94,16 +216,6 @@ def increasing(path: str | Path, t: np.ndarray, name: str) -> None:
             f"{path}: column {name!r}: row {row + 1}: time {t[row]:g} is not above the "
             f"{t[row - 1]:g} before it"
         )
-
-
-def _csv(path: Path, columns: Sequence[str]) -> dict[str, np.ndarray]:
-    try:
-        # Line by line: only the numbers of a large file stay in memory.
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            return _rows(path, file, columns)
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        why = f"{type(error).__name__}: {error}".splitlines()[0]
-        raise LogError(f"{path}: cannot be read as text ({why})") from None
 
 
 def _rows(path: Path, file: TextIO, columns: Sequence[str]) -> dict[str, np.ndarray]:
@@ -204,4 +316,4 @@ def _mat(path: Path, columns: Sequence[str]) -> tuple[list[str], dict[str, Any]]
         return names, loadmat(raw, variable_names=list(columns))
 
 
-_readers = {".npz": _npz, ".mat": _mat} | dict.fromkeys(blackbox.SUFFIXES, blackbox.read_blackbox)
+_readers = {".npz": _npz, ".mat": _mat} | dict.fromkeys(SUFFIXES, read_blackbox)

@@ -12,10 +12,10 @@ from jaxtyping import Array, Float
 from rigidjax import _checks
 from rigidjax._types import Scalar, Vec3
 from rigidjax.identify import flat_limit
-from rigidjax.identify.jacobian import normal_matrix, with_blocks
 from rigidjax.identify.parameters import Parameters, places
 from rigidjax.identify.problem import Problem, fits, one_problem
 from rigidjax.identify.quantities import Quantity, quantities, values_and_slopes
+from rigidjax.identify.terms import normal_matrix, with_blocks
 from rigidjax.identify.uncertainty import inverted
 
 
@@ -25,9 +25,8 @@ def expected(problem: Problem, parameters: Parameters) -> tuple[Quantity, ...]:
     **Arguments:** `problem` whose recordings give times, sensors with known noise, and torques (the
     readings themselves do not matter); `parameters` the motion that is planned. **Returns** the
     quantities of `Fit.quantities` (`name`, `value`, `deviation`, `unit`) with the standard
-    deviations of the Cramér–Rao bound, infinite where the motion would show nothing.
-
-    **Raises:** `ValueError` for a sensor whose noise is not given, or numbers that are not finite.
+    deviations of the Cramér–Rao bound, infinite where the motion would show nothing. **Raises:**
+    `ValueError` for a sensor whose noise is not given, or numbers that are not finite.
 
     >>> import rigidjax as rj
     >>> ts = jnp.linspace(0.0, 5.0, 50)
@@ -101,14 +100,10 @@ def best_first_rate(
     """The direction of the initial rate that determines the body best; its length is kept.
 
     It minimises the mean logarithm of the standard deviations of the body's free numbers
-    (D-optimality of the body, other numbers free as well), by BFGS of optimistix on the gradient
-    through Fisher's information. It finds the best direction near `omega`: try several.
-
+    (D-optimality, other numbers free as well), by BFGS of optimistix near `omega`: try several.
     **Arguments:** `problem`, `body` as for `Problem.start`; `omega` (3,) rad/s, body frame, where
-    the search starts and how fast the body can be thrown; `max_steps`. **Returns** the rate
-    (3,) and what to expect from it (`expected`).
-
-    **Raises:** as `fisher`.
+    the search starts and how fast the body can be thrown; `max_steps`. **Returns** the rate (3,)
+    and what to expect from it (`expected`). **Raises:** as `fisher`.
     """
     one_problem(problem)
     max_steps = _checks.whole(max_steps, "max_steps", 1)

@@ -13,7 +13,6 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from rigidjax import _checks
-from rigidjax.identify import uncertainty
 from rigidjax.identify.assessment import assess
 from rigidjax.identify.checkpoint import (
     Checkpoint,
@@ -24,27 +23,26 @@ from rigidjax.identify.checkpoint import (
     require_folder,
 )
 from rigidjax.identify.initial_guess import starting_points
-from rigidjax.identify.jacobian import all_errors
-from rigidjax.identify.multiple_shooting import WIDTHS, joined, pieces as in_pieces, with_width
-from rigidjax.identify.parameters import Parameters
+from rigidjax.identify.multiple_shooting import WIDTHS, joined, pieces as in_pieces
+from rigidjax.identify.parameters import Parameters, by_slot, numbered
 from rigidjax.identify.problem import Problem, fits
 from rigidjax.identify.propagation import AbstractIntegrator, Adaptive, FixedSteps
-from rigidjax.identify.residual import Noise
 from rigidjax.identify.result import Fit
 from rigidjax.identify.search import (
     CAREFUL,
+    Task,
     again,
     climb,
     climb_together,
     cost_of,
     enough,
     evaluate,
-    fresh,
     least_squares,
     whole,
 )
 from rigidjax.identify.stochastic_gradient import Descent, descend
-from rigidjax.identify.widths import with_widths
+from rigidjax.identify.terms import Noise, all_errors
+from rigidjax.identify.uncertainty import estimate_noise, linearise, of_white
 
 # More fixed steps than this between two samples cost more than adaptive steps.
 FINEST = 32
@@ -77,25 +75,20 @@ def fit(
       deviations (of each parameter with all others fixed) with an equally small change of the
       misfit, or after `max_steps` steps.
     - `together`: the number of starts in one `vmap`.
-    - `pieces`: if more than one, the record is first fitted in so many pieces with joined ends (see
-      `pieces`), and the result is the first start.
+    - `pieces`: if more than one, the record is first fitted in so many pieces with joined ends.
     - `descent`: a `Descent(optimiser, steps=…, batch=…)` of optax first improves each start on a
       few recordings at a time: for many recordings, when a step of least squares is expensive.
     - `checkpoint`: a file that keeps the state of the search after every 25 steps. A second call
-      with the same problem and options continues from there. It ends at the same point to the last
-      bit on the same machine and versions, wherever the first was killed. `together` = 1 only.
+      with the same problem and options continues from there, and ends at the same point to the
+      last bit on the same machine and versions. `together` = 1 only.
     - `progress`: called with a line of text after each start, such as `print`.
 
-    **Returns** a `Fit`. It always holds the best point reached, and two answers.
-    `fit.search`: `found`, `not alone` (another motion fits as well), or `not ended`. `fit.model`:
-    `explains the readings` (the errors are white and of the sensor's size), `leaves a part` (how
-    large, and where), or `does not explain the readings`. `fit.causes` names the most likely causes
-    of the remaining errors, `fit.advice` says whether the intervals can be trusted and gives
-    advice, `fit.status` is both answers in a line, `ok` if all is well. An interrupt (Ctrl-C) ends
-    the search and keeps the best point so far; the status says so, and is not `ok`.
-
-    The method is Levenberg–Marquardt on normal equations, with Jacobians by forward mode through
-    the motion.
+    **Returns** a `Fit` of the best point reached, with two answers. `fit.search`: `found`, `not
+    alone` (another motion fits as well), or `not ended`. `fit.model`: `explains the readings` (the
+    errors are white and of the sensor's size), `leaves a part` (how large, and where), or `does not
+    explain the readings`. `fit.causes` and `fit.advice` say what most likely makes the errors and
+    whether the intervals can be trusted; `fit.status` is both answers in a line, `ok` if all is
+    well. An interrupt (Ctrl-C) ends the search and keeps the best point so far; the status says so.
 
     **Raises:** `TypeError` unless `problem` is a `Problem`, `ValueError` for fewer than one start,
     a checkpoint that is damaged or of another problem, or one in a folder that does not exist.
@@ -122,69 +115,70 @@ def fit(
         if together > 1:
             raise ValueError("fit: a checkpoint goes with together=1, one start after another")
         require_folder(checkpoint)
-    given = (initial is not None) + (pieces > 1)
-    points = starting_points(problem, starts - given, key) if starts > given else []
-    noise = _first_noise(problem)
-    _checks.instance(descent, (Descent, NoneType), "fit", wanted="a Descent(optimiser, …) or None")
+    wanted = "a Descent(optimiser, …) or None"
+    _checks.instance(descent, (Descent, NoneType), "fit", wanted=wanted)
+    task = Task(problem, _first_noise(problem), tolerance, max_steps)
+    points = [] if initial is None else [initial]
     if pieces > 1:
-        points = [_from_pieces(problem, pieces, tolerance, max_steps), *points][:starts]
-    if initial is not None:
-        points = [initial, *points][:starts]
-    cut: list[str] = []
+        points.append(_from_pieces(problem, pieces, tolerance, max_steps))
+    if starts > len(points):
+        points += starting_points(problem, starts - len(points), key)
+    points, cut = points[:starts], []
     if descent is not None:
-        points = _descended(points, problem, noise, descent, key, progress, cut)
+        points = _descended(points, task, descent, key, progress, cut)
     if together > 1:
-        tried = _together(points, problem, noise, tolerance, max_steps, together, progress, cut)
+        tried = _together(points, task, together, progress, cut)
     else:
-        tried = _one_by_one(points, problem, noise, tolerance, max_steps, checkpoint, progress, cut)
-    best = min(
-        tried, key=lambda item: float(item.cost) if np.isfinite(float(item.cost)) else np.inf
-    )
+        tried = _one_by_one(points, task, checkpoint, progress, cut)
+    best = min(tried, key=_cost)
     lowest = float(best.cost)
-    best, noise = _with_noise(problem, best, noise, tolerance, max_steps)
-    problem, best = with_widths(problem, best, noise, tolerance, max_steps)
-    best = _evaluated(best, problem)
-    while (finer := _finer(problem, best, noise)) is not None:
-        problem = eqx.tree_at(lambda p: p.integrator, problem, finer)
-        best = again(best, problem, noise, tolerance, max_steps)
-        best, noise = _with_noise(problem, best, noise, tolerance, max_steps)
-        best = _evaluated(best, problem)
-    return assess(problem, best, noise, tried, lowest, cut)
+    best, task = _with_noise(best, task)
+    best, task = _with_widths(best, task)
+    best = _evaluated(best, task.problem)
+    while (finer := _finer(best, task)) is not None:
+        task = task._replace(problem=eqx.tree_at(lambda p: p.integrator, task.problem, finer))
+        best, task = _with_noise(again(best, task), task)
+        best = _evaluated(best, task.problem)
+    return assess(task.problem, best, task.noise, tried, lowest, cut)
 
 
-def _with_noise(
-    problem: Problem, best: Tried, noise: Noise, tolerance: float, max_steps: int
-) -> tuple[Tried, Noise]:
+def _cost(tried: Tried) -> float:
+    cost = float(tried.cost)
+    return cost if np.isfinite(cost) else np.inf
+
+
+def _with_noise(best: Tried, task: Task) -> tuple[Tried, Task]:
     """The best point together with its noise, if some noise is to be estimated."""
-    if all(sensor.noise is not None for sensor in problem.records.sensors):
-        return best, noise
+    if all(sensor.noise is not None for sensor in task.problem.records.sensors):
+        return best, task
 
-    def estimated(noise: Noise) -> Noise:
-        (errors, _), _ = _evaluated(best, problem).found
-        return uncertainty.estimate_noise(problem, errors, noise, best.parameters)
+    def estimated(best: Tried, task: Task) -> Task:
+        (errors, _), _ = _evaluated(best, task.problem).found
+        noise = estimate_noise(task.problem, errors, task.noise, best.parameters)
+        return task._replace(noise=noise)
 
     # Twice: the weights of the channels and the robust loss both depend on the noise.
     for _ in range(2):
-        noise = estimated(noise)
-        best = again(best, problem, noise, tolerance, max_steps)
-    return best, estimated(noise)
+        task = estimated(best, task)
+        best = again(best, task)
+    return best, estimated(best, task)
 
 
 def _from_pieces(problem: Problem, count: int, tolerance: float, max_steps: int) -> Parameters:
     cut = in_pieces(problem, count)
-    noise, everywhere = _first_noise(cut), whole(cut)
-    point = starting_points(cut, 1, None)[0]
+    task, point = (
+        Task(cut, _first_noise(cut), tolerance, max_steps),
+        starting_points(cut, 1, None)[0],
+    )
     for width in WIDTHS:
-        narrowed = with_width(cut, width)
-        end = least_squares(point, narrowed, noise, everywhere, tolerance, max_steps, CAREFUL)
-        point = end.parameters
+        narrowed = eqx.tree_at(lambda t: t.problem.links.width, task, jnp.asarray(width))
+        point = least_squares(point, narrowed, whole(cut), max_steps, CAREFUL).parameters
     return joined(problem, cut, point)
 
 
 def _descended(
     points: list[Parameters],
-    problem: Problem,
-    noise: Noise,
+    task: Task,
     descent: Descent,
     key: PRNGKeyArray | None,
     progress: Callable[[str], Any] | None,
@@ -193,7 +187,7 @@ def _descended(
     keys = jax.random.split(jax.random.key(1) if key is None else key, len(points))
     out: list[Parameters] = []
     for point, own in zip(points, keys, strict=True):
-        near, whole = descend(point, problem, noise, descent, own, progress)
+        near, whole = descend(point, task.problem, task.noise, descent, own, progress)
         out.append(near)
         if not whole:
             cut.append(f"interrupted in the descent of start {len(out)} of {len(points)}")
@@ -203,66 +197,53 @@ def _descended(
 
 def _one_by_one(
     points: list[Parameters],
-    problem: Problem,
-    noise: Noise,
-    tolerance: float,
-    max_steps: int,
+    task: Task,
     checkpoint: str | Path | None,
     progress: Callable[[str], Any] | None,
     cut: list[str],
 ) -> list[Tried]:
-    like = Tried(points[0], jnp.asarray(jnp.inf), jnp.asarray(False))
-    print_of = ""
+    like, print_of = Tried(points[0]), ""
     if checkpoint is not None:
         # The misfits as well: the fingerprint contains only the name of a torque function.
-        costs = [cost_of(point, problem, noise) for point in points]
-        print_of = fingerprint(points, problem, noise, costs, tolerance, max_steps)
+        costs = [cost_of(point, task.problem, task.noise) for point in points]
+        print_of = fingerprint(points, task, costs)
     keep = Checkpoint(checkpoint, like, print_of)
-    tried, latest = list(keep.done), [keep.position.tried]
+    tried, latest = list(keep.done), keep.position.tried
+
+    def look(position: SearchState) -> None:
+        nonlocal latest
+        # A part of the record is no measure of the whole.
+        if np.isfinite(float(position.tried.cost)):
+            latest = position.tried
+        keep.save(tried, position)
+
     try:
-        for number, point in enumerate(points, 1):
-            if number <= len(keep.done):
-                continue
+        for number, point in enumerate(points[len(keep.done) :], len(keep.done) + 1):
             resumed = number == len(keep.done) + 1 and keep.position.stage > 0
-            latest = [like]
-
-            def look(position: SearchState) -> None:
-                # This is a part of the record: its misfit is no measure of the whole.
-                if np.isfinite(float(position.tried.cost)):
-                    latest[0] = position.tried  # noqa: B023
-                keep.save(tried, position)
-
-            start = keep.position if resumed else SearchState(0, 0, fresh(point))
+            latest = like
+            start = keep.position if resumed else SearchState(0, 0, Tried(point))
             # After a start that explains the record, other starts only show whether it is unique.
             aim = min((float(item.cost) for item in tried if bool(item.converged)), default=np.inf)
-            aim = aim if aim <= enough(problem) else 0.0
-            out = climb(start, problem, noise, tolerance, max_steps, look=look, aim=aim)
-            latest = [like]
-            tried[:] = _with_one_found([*tried, out])
+            aim = aim if aim <= enough(task.problem) else 0.0
+            out, latest = climb(start, task, look=look, aim=aim), like
+            tried.append(out)
+            # Only the best start keeps its derivatives, which need memory.
+            best = min(tried, key=_cost)
+            tried[:] = [item if item is best else bare(item) for item in tried]
             keep.save(tried, SearchState(0, 0, like))
             _say(progress, number, len(points), tried)
     except KeyboardInterrupt:
         cut.append(f"interrupted after {len(tried)} of {len(points)} starts")
-        if np.isfinite(float(latest[0].cost)):
-            tried.append(latest[0])
+        if np.isfinite(float(latest.cost)):
+            tried.append(latest)
         if not tried:
             raise
     return tried
 
 
-def _with_one_found(tried: list[Tried]) -> list[Tried]:
-    """The same; only the best start keeps its derivatives, which need memory."""
-    costs = [float(item.cost) for item in tried]
-    lowest = int(np.argmin([cost if np.isfinite(cost) else np.inf for cost in costs]))
-    return [item if index == lowest else bare(item) for index, item in enumerate(tried)]
-
-
 def _together(
     points: list[Parameters],
-    problem: Problem,
-    noise: Noise,
-    tolerance: float,
-    max_steps: int,
+    task: Task,
     together: int,
     progress: Callable[[str], Any] | None,
     cut: list[str],
@@ -272,7 +253,7 @@ def _together(
         for first in range(0, len(points), together):
             batch = points[first : first + together]
             stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *batch)
-            tried += climb_together(stacked, problem, noise, tolerance, max_steps)
+            tried += climb_together(stacked, task)
             _say(progress, len(tried), len(points), tried)
     except KeyboardInterrupt:
         cut.append(f"interrupted after {len(tried)} of {len(points)} starts")
@@ -300,22 +281,21 @@ def _errors_alone(parameters: Parameters, problem: Problem) -> tuple[Float[Array
     return all_errors(parameters, problem)[0]
 
 
-def _finer(problem: Problem, best: Tried, noise: Noise) -> AbstractIntegrator | None:
-    """A finer integrator if twice as many fixed steps change predictions by a twentieth of the
-    noise: more fixed steps, or adaptive ones; else `None`.
+def _finer(best: Tried, task: Task) -> AbstractIntegrator | None:
+    """A finer integrator, if twice as many fixed steps change predictions by a twentieth of the
+    noise.
     """
-    steps = problem.integrator
+    problem, steps = task.problem, task.problem.integrator
     if not isinstance(steps, FixedSteps):
         return None
-    count, parameters = steps.substeps, best.parameters
-    (coarse, _), _ = best.found
+    count, (coarse, _) = steps.substeps, best.found[0]
     # Steps given by the user are tried in any case.
     while count <= max(FINEST, steps.substeps):
-        finer: AbstractIntegrator = FixedSteps(2 * count, steps.solver)
-        exact = _errors_alone(parameters, eqx.tree_at(lambda p: p.integrator, problem, finer))
+        finer = eqx.tree_at(lambda p: p.integrator, problem, FixedSteps(2 * count, steps.solver))
+        exact = _errors_alone(best.parameters, finer)
         apart = max(
             float(np.max(np.abs(np.asarray(a) - np.asarray(b)) / np.asarray(sigma)[:, None]))
-            for a, b, sigma in zip(coarse, exact, noise, strict=True)
+            for a, b, sigma in zip(coarse, exact, task.noise, strict=True)
         )
         if apart <= 0.05:
             return None if count == steps.substeps else FixedSteps(count, steps.solver)
@@ -335,3 +315,38 @@ def _first_noise(problem: Problem) -> Noise:
             size = jnp.sqrt(jnp.mean(jnp.sum(values**2, axis=-1)) + 1e-300)
             out.append(jnp.full((problem.count, sensor.components), 0.1) * size)
     return tuple(out)
+
+
+# The width of the recordings' deviations from a shared number, by expectation and maximisation
+# (Dempster, Laird and Rubin 1977; Laird and Ware 1982, doi:10.2307/2529876): its rounds, the
+# relative change at which they end; a width below so much of the first one is zero.
+_ROUNDS, _SETTLED, _LEAST = 40, 0.01, 1e-4
+
+
+def _with_widths(best: Tried, task: Task) -> tuple[Tried, Task]:
+    """The best point together with the estimated widths, and the task with them."""
+    wanted = [index for index, slot in enumerate(task.problem.slots) if slot.estimated]
+    if not wanted:
+        return best, task
+    before = np.asarray([task.problem.slots[i].spread for i in wanted], float)
+    least = _LEAST * before
+    for _ in range(_ROUNDS):
+        found = np.maximum(_expected(best.parameters, task, wanted), least)
+        new = [jnp.asarray(width) for width in found]
+        problem = eqx.tree_at(lambda p: [p.slots[i].spread for i in wanted], task.problem, new)
+        task = task._replace(problem=problem)
+        best = again(best, task)
+        if (np.abs(found - before) < _SETTLED * before).all() or (found <= least).all():
+            break
+        before = found
+    return best, task
+
+
+def _expected(parameters: Parameters, task: Task, wanted: list[int]) -> np.ndarray:
+    """The root mean square of each one's deviations, with their posterior variance (Laplace)."""
+    problem = task.problem
+    variance = np.diag(of_white(linearise(problem, parameters, task.noise)).seen)
+    values, places = (by_slot(problem, of) for of in (parameters, numbered(parameters)))
+    squares = [np.mean(np.asarray(values[i][2]) ** 2) for i in wanted]
+    own = [np.mean(variance[np.ravel(places[i][2]).astype(int)]) for i in wanted]
+    return np.sqrt(np.add(squares, own))

@@ -9,10 +9,9 @@ from jaxtyping import Array, Float
 
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.body.symmetric3 import swap_trace
-from rigidjax.identify.body_charts import AbstractBodyChart
+from rigidjax.identify.body_charts import AbstractBodyChart, charts_of, in_a_row
 from rigidjax.identify.parameters import Parameters
 from rigidjax.identify.problem import Problem
-from rigidjax.identify.several_bodies import charts_of, in_a_row
 
 # Derivatives are taken where the least second moment is at least this share of the trace.
 THIN = 1e-4
@@ -21,11 +20,9 @@ ONE_SIDED = 1.645
 
 
 class Limit(eqx.Module):
-    """The distance of a body from a flat one: `flatness = (I1 + I2 − I3) / I3`, never negative.
-
-    **Fields:** `where` the suffix of the names of the body's quantities; `flatness` at the best
-    point; `free` its value in the linear problem, which may be negative; `slope`
-    (n,) its derivative in the free numbers.
+    """The distance of a body from a flat one: `flatness = (I1 + I2 − I3) / I3` at the best point,
+    `free` its value in the linear problem, which may be negative, `slope` (n,) its derivative;
+    `where` is the suffix of the names of the body's quantities.
     """
 
     where: str
@@ -88,9 +85,8 @@ def in_words(body: Inertia | MassProperties) -> str | None:
 def beside(problem: Problem, parameters: Parameters) -> Parameters | None:
     """The same numbers, but flat bodies a little thicker; `None` if no body is flat.
 
-    The chart has a derivative of zero at a flat body: no reading changes with the thickness. The
-    information about the tensor itself is regular there and hardly changes over such a small
-    thickness.
+    The chart has a derivative of zero at a flat body; the information about the tensor itself is
+    regular there and hardly changes over such a small thickness.
     """
     vectors, first, changed = [], 0, False
     bodies = bodies_of(problem, parameters)
@@ -160,9 +156,8 @@ def limits(
 ) -> tuple[Limit, ...]:
     """The limit of each body whose moments are free.
 
-    **Arguments:** `found` numbers and their derivatives, the last ones being the flatness of each
-    body; `step` (n,) to the least misfit of the linear problem; `names` the suffixes of the names
-    of a body's quantities.
+    `found` are numbers and derivatives, the flatness of each body last; `step` (n,) leads to the
+    least misfit of the linear problem; `names` are the suffixes of the bodies' quantities.
     """
     rows = zip(names, *(part[-len(names) :] for part in found), strict=True)
     kept = [_has_limit(chart) for chart in charts_of(problem.body)]
@@ -171,3 +166,24 @@ def limits(
         for (name, value, slope), one in zip(rows, kept, strict=True)
         if one
     )
+
+
+def unreal(body: Any) -> str | None:
+    """The error in a body's numbers, in words; `None` for a real body."""
+    try:
+        if isinstance(body, MassProperties):
+            MassProperties(body.mass, body.com, body.second_moment)
+        else:
+            Inertia.from_tensor(body.tensor)
+    except ValueError as refused:
+        return f"no real body has these numbers: {refused}"
+    return None
+
+
+def of_charts(charts: list[tuple[str, AbstractBodyChart]], bodies: list[Any]) -> list[str]:
+    """`unreal` for the bodies of charts by users: every point of our charts is a real body."""
+    ours = AbstractBodyChart.__module__
+    theirs = [
+        (n, b) for (n, c), b in zip(charts, bodies, strict=True) if type(c).__module__ != ours
+    ]
+    return [wrong + name for name, body in theirs if (wrong := unreal(body))]

@@ -16,10 +16,8 @@ MOST = 0.7
 
 
 def plateau(values: np.ndarray) -> float | None:
-    """The full scale (> 0) of one channel (T,) if its largest readings are cut off, else `None`.
-
-    It is the largest magnitude if more readings in a row have it than at the top of a smooth wave:
-    with the last digit d and second differences a the top has `2 √(2d/a)` equal readings.
+    """The full scale of one channel (T,) if its largest readings are cut off: more readings in a
+    row than the `2 √(2d/a)` at the top of a smooth wave of last digit d, second differences a.
     """
     size = np.abs(values)
     top = float(size.max(initial=0.0))
@@ -38,19 +36,21 @@ def plateau(values: np.ndarray) -> float | None:
 
 
 def with_limits(recordings: Sequence[Recording]) -> list[Recording]:
-    """The recordings, with the full scale found in the sensors that were cut off.
-
-    A sensor keeps its `limit` if it has one.
-    """
-    found = [[_limits(reading) for reading in r.readings] for r in recordings]
+    """The recordings, with the full scale found in the sensors that have no `limit` yet."""
     out = list(recordings)
-    for index in range(len(found[0])):
-        column = [row[index] if index < len(row) else None for row in found]
-        if not any(limits is not None and np.isfinite(limits).any() for limits in column):
+    for index in range(max(len(r.readings) for r in recordings)):
+        found = {}
+        for place, recording in enumerate(recordings):
+            for reading in recording.readings[index : index + 1]:
+                sensor: Any = reading.sensor
+                plain = sensor.reading_shape == (sensor.components,)
+                if plain and getattr(sensor, "limit", 0) is None:
+                    values = np.asarray(reading.values)[reading.seen]
+                    levels = [plateau(channel) for channel in values.T]
+                    found[place] = np.array([np.inf if one is None else one for one in levels])
+        if not any(np.isfinite(limits).any() for limits in found.values()):
             continue
-        for place, limits in enumerate(column):
-            if limits is None:
-                continue
+        for place, limits in found.items():
             out[place] = eqx.tree_at(
                 lambda r, i=index: r.readings[i].sensor.limit,
                 out[place],
@@ -58,16 +58,6 @@ def with_limits(recordings: Sequence[Recording]) -> list[Recording]:
                 is_leaf=lambda node: node is None,
             )
     return out
-
-
-def _limits(reading: Any) -> np.ndarray | None:
-    """The full scale of each channel, infinite if none is found; `None` if none is sought."""
-    sensor = reading.sensor
-    if getattr(sensor, "limit", 0) is not None or sensor.reading_shape != (sensor.components,):
-        return None
-    values = np.asarray(reading.values)[reading.seen]
-    found = [plateau(values[:, channel]) for channel in range(values.shape[1])]
-    return np.array([np.inf if level is None else level for level in found])
 
 
 def at_limit(readings: Sequence[Any]) -> tuple[np.ndarray, ...]:

@@ -11,13 +11,12 @@ from jaxtyping import PRNGKeyArray
 from rigidjax._types import HasSpin
 from rigidjax.body.inertia import Inertia
 from rigidjax.identify import padding
-from rigidjax.identify.body_charts import COMPONENTS
-from rigidjax.identify.direct_estimates import rates
+from rigidjax.identify.body_charts import COMPONENTS, Bodies
 from rigidjax.identify.parameters import Parameters
 from rigidjax.identify.problem import Problem
 from rigidjax.identify.recording import Recording, readings_of
+from rigidjax.identify.reference_states import rates
 from rigidjax.identify.sensors import Gyro
-from rigidjax.identify.several_bodies import Bodies
 from rigidjax.motion import Spin
 from rigidjax.motion.torques.base import Torque, evaluate
 from rigidjax.motion.torques.states import has_states
@@ -29,13 +28,8 @@ for _k, (_i, _j) in enumerate(COMPONENTS):
 
 
 def starting_points(problem: Problem, count: int, key: PRNGKeyArray | None) -> list[Parameters]:
-    """`count` starting points, the best informed first.
-
-    **Arguments:** `problem`; `count` ≥ 1; `key` a JAX random key, or `None`. The initial body rate
-    is the first reading (or the turn between attitudes over its time). The inertia comes from the
-    regression on Euler's equations if samples are close enough, else it is a sphere; further starts
-    scatter the shape over the whole chart and the rate by a tenth. A `Free` starts at its given
-    value.
+    """`count` starting points: the regression first, then scattered around it or over the whole
+    chart, the rate by a tenth. A `Free` starts at its given value.
     """
     recordings = padding.on_host(problem.records, problem.counts)
     if isinstance(problem.body, Bodies):
@@ -64,21 +58,20 @@ def starting_points(problem: Problem, count: int, key: PRNGKeyArray | None) -> l
 
 
 def regress_inertia(recordings: tuple[Recording, ...]) -> Inertia | None:
-    """The inertia from a regression on Euler's equations in integral form; without torque up to
-    scale.
+    """The inertia from a regression on Euler's equations in integral form.
 
-    Between two samples `I ΔΩ + ∫ Ω × IΩ dt = ∫ τ dt` is linear in the six components of I. The
-    answer is the smallest right singular vector of all such rows if there is no torque, or a torque
-    that starts at zero, such as a drag. Otherwise it is the least squares solution, with the torque
-    at its starting values along the measured rates. The answer is moved to the nearest second
-    moment with positive eigenvalues. It is `None` without a gyro or attitudes, if samples are too
-    far apart, or if the torque needs more than a rate or has states of its own.
+    `I ΔΩ + ∫ Ω × IΩ dt = ∫ τ dt` is linear in the six components of I: the smallest right singular
+    vector without torque (up to scale), else least squares, moved to the nearest real body. It is
+    `None` if samples are too far apart, or the torque needs more than a rate.
     """
     found = []
     for recording in recordings:
-        found.append(_equations(recording))
-        if found[-1] is None:
+        t, w = _rates(recording)
+        if t.size < 10 or np.median(np.diff(t)) * np.linalg.norm(w, axis=1).max() > 0.5:
             return None
+        if not of_rates(recording.torque):
+            return None
+        found.append(balance(recording, np.eye(3)))
     matrix, side, _ = (np.concatenate(part) for part in zip(*found, strict=True))
     components, _ = tensor_and_margin(matrix, side)
     if not components[:3].sum() > 0:
@@ -91,10 +84,8 @@ def regress_inertia(recordings: tuple[Recording, ...]) -> Inertia | None:
 
 
 def tensor_and_margin(matrix: np.ndarray, side: np.ndarray) -> tuple[np.ndarray, float]:
-    """The six components of I that rows (n, 6) fit best, and how real a body it is.
-
-    The second result is the least eigenvalue of its second moment over the largest, above zero for
-    a real body. The trace of the components is one if the right sides (n,) are zero.
+    """The six components that rows (n, 6) fit best (of trace one if all sides are zero), and the
+    least eigenvalue of its second moment over the largest: above zero for a real body.
     """
     if np.abs(side).max() > 0:
         components = np.linalg.lstsq(matrix, side, rcond=None)[0]
@@ -107,16 +98,9 @@ def tensor_and_margin(matrix: np.ndarray, side: np.ndarray) -> tuple[np.ndarray,
     return components, float(values[0] / max(np.abs(values).max(), 1e-300))
 
 
-def _equations(recording: Recording) -> tuple[np.ndarray, ...] | None:
-    """As `balance`; `None` if rates are too far apart, or the torque needs more than a rate."""
-    t, w = _rates(recording)
-    if t.size < 10 or np.median(np.diff(t)) * np.linalg.norm(w, axis=1).max() > 0.5:
-        return None
-    if recording.torque is not None:
-        felt: Any = getattr(recording.torque, "feels", None)
-        if felt is not HasSpin or has_states(recording.torque):
-            return None
-    return balance(recording, np.eye(3))
+def of_rates(torque: Any) -> bool:
+    """Whether there is no torque, or it depends on time and rate alone."""
+    return torque is None or (getattr(torque, "feels", None) is HasSpin and not has_states(torque))
 
 
 def _rates(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
@@ -128,9 +112,8 @@ def _rates(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
 
 
 def balance(recording: Recording, turn: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The integral of Euler's equations over one recording: rows (n, 6), right sides (n,).
-
-    And the rows of the momentum itself. The rates are taken as `turn` (3, 3) times what was read.
+    """Euler's equations integrated over a recording, of rates turned by `turn`: rows (n, 6), right
+    sides (n,), rows of the momentum itself.
     """
     t, w = _rates(recording)
     w, pushed = w @ turn.T, np.zeros((t.size, 3))

@@ -1,4 +1,4 @@
-"""Levenberg–Marquardt on normal equations that are added up recording by recording."""
+"""Levenberg and Marquardt's search on any normal equations."""
 
 from collections.abc import Callable
 from typing import Any
@@ -8,16 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
-
-from rigidjax.identify.jacobian import along, normal_matrix, with_blocks, with_jacobian
-from rigidjax.identify.parameters import Parameters, places
-from rigidjax.identify.problem import Problem
-from rigidjax.identify.propagation import FirstPart, FixedSteps
-from rigidjax.identify.reference_states import ReferenceStates
-from rigidjax.identify.residual import Noise, beside, seen_rows
-from rigidjax.identify.several_bodies import charts_of
 
 # Damping is in units of the diagonal of the normal equations (Marquardt's): one is a step half as
 # long as Gauss and Newton's.
@@ -33,8 +24,6 @@ LINEAR = 0.05
 # Steps that a search may still be away from where another one ended; its pace is by how much the
 # logarithm of the misfit falls in a step, of the last ones half as much each as the one after it.
 PATIENCE, FIRST_PACE = 25.0, 4.0
-# Samples after the last one with weight: a low-pass filter looks ahead.
-_BEYOND = 2
 # Damping beyond which nothing moves.
 STUCK = 1e12
 
@@ -45,14 +34,12 @@ def _float(value: Any) -> np.ndarray:
 
 
 class Settings(eqx.Module):
-    """The settings of a search: arrays, so as not to compile again.
+    """The settings of a search, as arrays: another value does not compile again.
 
-    **Fields:** `tolerance`: steps of so many standard deviations (of each parameter with all others
-    fixed) end it; `damping` at the start; `steps` at most; `aim` a misfit reached by another
-    search: this one ends if it would need more than `PATIENCE` steps at its pace to reach it; 0 for
-    none; `level`: a step with about the predicted gain also ends it, if that gain is less than this
-    part of the gain that a fit has from noise alone (see `search`); `near` a misfit that is low
-    enough to end at; 0 for none.
+    Steps of `tolerance` standard deviations (of each number alone) end it, and more than `steps`;
+    if it would need more than `PATIENCE` steps at its pace to an `aim` of another search; if a step
+    of about the predicted gain gains less than `level` of what a fit gains from noise; at a cost of
+    `near`. Zero for none.
     """
 
     tolerance: Any = eqx.field(converter=_float)
@@ -64,13 +51,9 @@ class Settings(eqx.Module):
 
 
 class Search(eqx.Module):
-    """The state of a search.
-
-    **Fields:** `first` the cost at the start; `point` (n,) the best so far, its `cost`, the normal
-    matrix `gram` (n, n) and the gradient `slope` (n,) there; `trial` (n,) the next point, `hoped`
-    its predicted gain; `damping`; `pace` the decrease of the logarithm of the cost in a step;
-    `taken` evaluations; `done`, `converged`; `found` the result of the last evaluation (see
-    `with_blocks`), `here` whether that was at `point`.
+    """The state of a search: the best `point` so far, with `gram` (n, n) and `slope` there; the
+    `trial` next, and its `hoped` gain; `pace` of the logarithm of the cost; evaluations `taken`;
+    `found` of the last one, whether `here` at the best point.
     """
 
     first: Float[Array, ""]
@@ -89,63 +72,6 @@ class Search(eqx.Module):
     here: Bool[Array, ""]
 
 
-def descend(
-    start: Parameters,
-    problem: Problem,
-    noise: Noise,
-    weights: Float[Array, "records times"],
-    settings: Settings,
-) -> tuple[Parameters, Search]:
-    """`search` for the free numbers of a problem."""
-    flat, restore = ravel_pytree(start)
-    where, made = places(problem, start), made_of(start)
-    number, kind = flat.size, flat.dtype
-    problem = _as_far_as(problem, weights)
-
-    def evaluated(point: Array) -> tuple[Any, Array, Array, Array]:
-        here = restore(point)
-        found = with_blocks(here, problem)
-        (errors, ends), (slopes, end_slopes) = found
-        total, slope = jnp.zeros((), kind), jnp.zeros(number + 1, kind)
-        read, blocks = seen_rows(problem, errors, slopes, noise, weights)
-        for e, rows in zip(read, blocks, strict=True):
-            total = total + jnp.sum(e**2)
-            slope = slope.at[where].add(jnp.einsum("rtki,rtk->ri", rows, e))
-        gram, slope = normal_matrix(blocks, where, number), slope[:-1]
-        e, rows = beside_rows(problem, point, restore, ends, end_slopes)
-        if e.size:
-            total = total + jnp.sum(e**2)
-            gram, slope = gram + rows.T @ rows, slope + e @ rows
-        rows = _bends(problem, here.body, slope)
-        return found, 0.5 * total, gram + rows.T @ rows, slope
-
-    nothing = _nothing(problem, start, where.shape[1], kind)
-    end = search(evaluated, flat, made, settings, nothing)
-    return restore(end.point), end
-
-
-def _bends(problem: Problem, numbers: Array, slope: Float[Array, " n"]) -> Array:
-    """The rows (m, n) of the Jacobian from the curvature of the charts of bodies."""
-    out, first = [jnp.zeros((0, slope.size), slope.dtype)], 0
-    for chart in charts_of(problem.body):
-        mine = slice(first, first + chart.size)
-        rows = chart.bend(numbers[mine], slope[mine])
-        out.append(jnp.zeros((rows.shape[0], slope.size), slope.dtype).at[:, mine].set(rows))
-        first += chart.size
-    return jnp.concatenate(out)
-
-
-def _as_far_as(problem: Problem, weights: Float[Array, "records times"]) -> Problem:
-    """The problem, with its motion followed to the last time with weight."""
-    steps = problem.integrator
-    if not isinstance(steps, FixedSteps) or problem.links is not None:
-        return problem
-    counts = jnp.any(weights > 0, axis=0)
-    place = jnp.arange(counts.size, dtype=jnp.int32)
-    last = jnp.minimum(jnp.max(jnp.where(counts, place, 0)) + _BEYOND, counts.size - 1)
-    return eqx.tree_at(lambda p: p.integrator, problem, FirstPart(steps, last))
-
-
 def search(
     evaluated: Callable[[Array], tuple[Any, Array, Array, Array]],
     start: Float[Array, " n"],
@@ -156,16 +82,12 @@ def search(
 ) -> Search:
     """At most `settings.steps` steps down from `start`; with none, `start` is evaluated.
 
-    **Arguments:** `evaluated` point (n,) → values to keep from the last evaluation, the cost, the
-    normal matrix (n, n), the gradient (n,): half a sum of squares, or minus a log-density with
-    Fisher's information as the normal matrix (scoring); `made` (n,) one for numbers scaled to order
-    one, which no step moves far, else zero; `nothing` zeros of the shapes of the kept values;
-    `by_noise` the kept values, the normal matrix → the expected excess of the cost at the true
-    numbers over the least, for `settings.level`.
-
-    Source: Marquardt 1963, doi:10.1137/0111030; the damping by the ratio of actual to predicted
-    gain, Madsen, Nielsen and Tingleff 2004, Methods for non-linear least squares
-    problems, section 3.2.
+    **Arguments:** `evaluated` point → values to keep, cost, normal matrix, gradient: of half a sum
+    of squares, or minus a log-density with Fisher's information (scoring); `made` (n,) one for
+    numbers of order one, which no step moves far, else zero; `nothing` zeros like the kept values;
+    `by_noise` of them and the normal matrix: the expected excess of the cost at the true numbers.
+    Source: Marquardt 1963, doi:10.1137/0111030; damping by the ratio of actual to predicted gain:
+    Madsen, Nielsen and Tingleff 2004, Methods for non-linear least squares problems, section 3.2.
     """
     number, kind = start.size, start.dtype
 
@@ -265,50 +187,3 @@ def _damped(gram: Array, slope: Array, made: Array, damping: Array) -> tuple[Arr
     move = -jax.scipy.linalg.cho_solve(factor, slope / root) / root
     far = jnp.max(jnp.abs(move) * made)
     return move * jnp.minimum(1.0, LONGEST / jnp.maximum(far, 1e-300)), root
-
-
-def _nothing(problem: Problem, start: Parameters, columns: int, kind: Any) -> Any:
-    """Zeros of the shapes that `with_blocks` returns: to trace it once more takes seconds."""
-    count, times = problem.records.t.shape
-    errors = tuple(
-        jnp.zeros((count, times, reading.sensor.components), kind)
-        for reading in problem.records.readings
-    )
-    ends = jax.tree.map(
-        lambda leaf: jnp.zeros(leaf.shape, kind),
-        eqx.filter_eval_shape(jax.vmap(ReferenceStates.moved), problem.reference, start.own),
-    )
-    blocks = jax.tree.map(lambda leaf: jnp.zeros((*leaf.shape, columns), kind), (errors, ends))
-    return (errors, ends), blocks
-
-
-def made_of(parameters: Parameters) -> Float[Array, " n"]:
-    """One for the numbers scaled to order one, zero for the numbers of a `Free`.
-
-    The unit of a `Free` is a user's guess. The scale of the others is at most one, so that a
-    weakly observed number takes no large steps.
-    """
-    ones, zeros = (jax.tree.map(of, parameters) for of in (jnp.ones_like, jnp.zeros_like))
-    marked = eqx.tree_at(lambda p: (p.shared, p.own.each), ones, (zeros.shared, zeros.own.each))
-    return ravel_pytree(marked)[0]
-
-
-def beside_rows(
-    problem: Problem, point: Array, restore: Any, ends: Any, end_slopes: Any
-) -> tuple[Array, Array]:
-    """Priors and joints between pieces as one vector, and its Jacobian (m, n)."""
-
-    @jax.custom_jvp
-    def last(vector: Array) -> Any:
-        return ends
-
-    @last.defjvp
-    def _(primals: Any, tangents: Any) -> Any:
-        return ends, along(problem, end_slopes, restore(tangents[0]))
-
-    def value(vector: Array) -> Array:
-        parts = [leaf.reshape(-1) for leaf in beside(restore(vector), problem, last(vector))]
-        return jnp.concatenate(parts) if parts else jnp.zeros(0, vector.dtype)
-
-    rows, e = with_jacobian(value, point)
-    return e, rows

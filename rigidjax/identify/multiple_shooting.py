@@ -9,10 +9,10 @@ import numpy as np
 
 from rigidjax import _checks
 from rigidjax.identify import padding
+from rigidjax.identify.body_charts import Bodies
 from rigidjax.identify.parameters import Own, Parameters
 from rigidjax.identify.problem import Links, Problem, one_problem
 from rigidjax.identify.recording import Reading, Recording
-from rigidjax.identify.several_bodies import Bodies
 from rigidjax.motion.torques.states import has_states
 
 # The widths of the gaps, in turn: first the pieces are nearly free, at the end they are joined.
@@ -20,20 +20,11 @@ WIDTHS = (1.0, 1e-1, 1e-2, 1e-3)
 
 
 def pieces(problem: Problem, count: int, *, width: float = WIDTHS[-1]) -> Problem:
-    """The problem with its recording cut into pieces, each with its own initial state.
+    """The problem with its recording cut into `count` pieces, each with its own initial state.
 
-    The misfit of one initial state has many local minima and very large derivatives if errors grow
-    along the record; over a short piece it has not. The end of each piece is held to the start of
-    the next by a residual of standard deviation `width`.
-
-    **Arguments:** `problem` with one recording; `count` ≥ 2 pieces of about as many samples each;
-    `width` of the gaps, in typical rates and rad. **Returns** a problem with `count` recordings:
-    `fit` takes it like any other (its `state0` then has a leading axis); or call
-    `fit(problem, pieces=count)`, which then fits one initial state.
-
-    Source: Bock 1983, doi:10.1007/978-1-4684-7324-7_8.
-
-    **Raises:** `ValueError` for several recordings, or fewer than four samples in a piece.
+    Over a long record one initial state has many local minima; over a short piece it has not. The
+    end of each piece is held to the start of the next by a residual of deviation `width`, in
+    typical rates and rad. Source: Bock 1983, doi:10.1007/978-1-4684-7324-7_8.
 
     >>> import rigidjax as rj
     >>> record = rj.identify.Recording(range(20), (rj.identify.Gyro(), [[1.0, 0, 0]] * 20))
@@ -72,12 +63,6 @@ def pieces(problem: Problem, count: int, *, width: float = WIDTHS[-1]) -> Proble
         (rate, slots, problem.integrator, links),
         is_leaf=lambda node: node is None,
     )
-
-
-def with_width(problem: Problem, width: float) -> Problem:
-    """The same pieces with another width of the gaps."""
-    assert problem.links is not None
-    return eqx.tree_at(lambda p: p.links.width, problem, jnp.asarray(float(width)))
 
 
 def joined(problem: Problem, cut: Problem, found: Parameters) -> Parameters:

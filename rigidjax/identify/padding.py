@@ -14,18 +14,16 @@ from rigidjax.motion.torques import Linear, Series
 
 
 def stack(recordings: Sequence[Recording]) -> tuple[Recording, tuple[int, ...]]:
-    """One recording with a leading axis, and the number of times of each original one.
-
-    The shorter ones are continued with masked readings at their last time, tables of time with
-    their last value. **Raises** `ValueError` if sensors or torques differ in kind.
+    """One recording with a leading axis, and the number of times of each: shorter ones are
+    continued with masked readings at their last time, tables of time with their last value.
     """
     counts = tuple(int(r.t.shape[0]) for r in recordings)
     longest = max(counts)
     rows = max((_rows(_tabled(r)) for r in recordings), default=0)
     alike = [lengthened(r, longest, rows) for r in recordings]
-    first = jax.tree.structure(alike[0])
-    for index, other in enumerate(alike):
-        if jax.tree.structure(other) != first or _shapes(other) != _shapes(alike[0]):
+    forms = [(jax.tree.structure(r), [np.shape(x) for x in jax.tree.leaves(r)]) for r in alike]
+    for index, form in enumerate(forms):
+        if form != forms[0]:
             raise ValueError(
                 f"recordings: the one at index {index} differs from the first in its sensors or "
                 "its torque; give all recordings the same kinds in the same order, with the same "
@@ -55,14 +53,9 @@ def one(records: Any, index: int) -> Any:
 def on_host(records: Recording, counts: Sequence[int]) -> tuple[Recording, ...]:
     """The recordings one by one, in NumPy's arrays, so that no JAX operation is needed."""
     known = jax.tree.map(lambda leaf: np.asarray(leaf) if eqx.is_array(leaf) else leaf, records)
-
-    def pick(leaf: Any, index: int) -> Any:
-        return leaf[index] if isinstance(leaf, np.ndarray) else leaf
-
-    return tuple(
-        cut(jax.tree.map(lambda leaf, i=i: pick(leaf, i), known), count)
-        for i, count in enumerate(counts)
-    )
+    arrays, rest = eqx.partition(known, eqx.is_array)
+    rows = (jax.tree.map(lambda leaf, i=i: leaf[i], arrays) for i in range(len(counts)))
+    return tuple(cut(eqx.combine(row, rest), n) for row, n in zip(rows, counts, strict=True))
 
 
 def cut(recording: Recording, count: int) -> Recording:
@@ -74,10 +67,6 @@ def cut(recording: Recording, count: int) -> Recording:
         return [r.t, *(part for reading in r.readings for part in (reading.values, reading.mask))]
 
     return eqx.tree_at(long, recording, [leaf[:count] for leaf in long(recording)])
-
-
-def _shapes(tree: Any) -> list[tuple[int, ...]]:
-    return [np.shape(leaf) for leaf in jax.tree.leaves(tree)]
 
 
 def _is_table(node: Any) -> bool:

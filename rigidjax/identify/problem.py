@@ -14,22 +14,24 @@ from rigidjax import _checks
 from rigidjax._types import HasAttitude, HasPose, Scalar
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.identify import padding
-from rigidjax.identify.body_charts import AbstractBodyChart
-from rigidjax.identify.free_parameters import Free, Slot, find, grouped, shares
+from rigidjax.identify.body_charts import AbstractBodyChart, Bodies, charts_of, has_mass
 from rigidjax.identify.full_scale import with_limits
-from rigidjax.identify.jacobian import (
-    all_errors,
-    filled,
-    over_records,
-    states_of_one,
+from rigidjax.identify.loss import AbstractLoss, Entropic
+from rigidjax.identify.parameters import (
+    Free,
+    Own,
+    Parameters,
+    Slot,
+    by_slot,
+    find,
+    grouped,
+    local,
+    shares,
 )
-from rigidjax.identify.loss import AbstractLoss
-from rigidjax.identify.parameters import Own, Parameters, by_slot, local
-from rigidjax.identify.prior import Entropic
 from rigidjax.identify.propagation import AbstractIntegrator, integrator_for
 from rigidjax.identify.recording import Recording
 from rigidjax.identify.reference_states import ReferenceStates, first_rates, reference_of
-from rigidjax.identify.several_bodies import Bodies, charts_of, has_mass
+from rigidjax.identify.terms import all_errors, filled, over_records, states_of_one
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.coupled import motion_of
 from rigidjax.motion.torques import Sum
@@ -64,9 +66,8 @@ class Problem(eqx.Module):
     least that much", as with a sensor's `limit`.
 
     The motion starts at the first time of each recording. Its state is the smallest that sensors
-    and torque need: `Spin`, `Attitude`, `Rigid`.
-
-    **Raises:** `TypeError` for arguments of another type; `ValueError` if they do not fit together.
+    and torque need: `Spin`, `Attitude`, `Rigid`. **Raises:** `TypeError` for arguments of another
+    type; `ValueError` if they do not fit together.
 
     >>> import rigidjax as rj
     >>> record = rj.identify.Recording([0.0, 1.0], (rj.identify.Gyro(), [[1.0, 0, 0]] * 2))
@@ -135,11 +136,11 @@ class Problem(eqx.Module):
         elif not isinstance(apart, bool):
             self.noise_groups, _ = grouped(apart, of, "noise_each")
         self.slots = find(free, recordings[0], of)
-        for one in charts_of(chart):
-            for slot in self.slots:
-                if slot.name in (*one.log_names, *one.plain_names, "Ωx", "Ωy", "Ωz"):
-                    wanted = "a quantity of the body has this name; give another"
-                    raise ValueError(f"Free {slot.name!r}: {wanted}")
+        taken = {name for one in charts_of(chart) for name in (*one.log_names, *one.plain_names)}
+        for slot in self.slots:
+            if slot.name in taken | {"Ωx", "Ωy", "Ωz"}:
+                wanted = "a quantity of the body has this name; give another"
+                raise ValueError(f"Free {slot.name!r}: {wanted}")
         self.rung = _rung(recordings[0], chart)
         self.reference = reference_of(recordings, self.rung)
         if integrator is None and self.records.torque is not None:
@@ -181,10 +182,9 @@ class Problem(eqx.Module):
 
         **Arguments:** `body` an `Inertia` or `MassProperties`, a sphere for `None`; of several
         bodies a dict of those that are known about. `omega` (3,) initial rate, rad/s, body frame,
-        of all recordings; for `None` the first readings of a gyro, or the turn between attitudes
-        (0 where these are traced). What else is free stays as the recordings give it.
-
-        **Raises:** `ValueError` for a body that the chart does not hold, or a wrong shape.
+        of all recordings; for `None` the first readings of a gyro, or the turn between attitudes (0
+        where these are traced). What else is free stays as the recordings give it. **Raises:**
+        `ValueError` for a body that the chart does not hold, or a wrong shape.
         """
         one_problem(self)
         if isinstance(self.body, Bodies):
@@ -246,7 +246,10 @@ class Problem(eqx.Module):
             if step is None:
                 out[slot.name] = value
                 continue
-            first = 0 if slot.groups is None else _firsts(slot)
+            first: Any = 0
+            if slot.groups is not None:
+                groups = jnp.arange(len(slot.labels), dtype=slot.groups.dtype)
+                first = jnp.argmax(slot.groups[None, :] == groups[:, None], axis=1)
             out[slot.name] = slot.move(slot.read(self.records)[first], step)
             if slot.spread is not None:
                 out[f"{slot.name}, own"] = value
@@ -273,10 +276,7 @@ class Problem(eqx.Module):
 
 
 def one_problem(problem: Any) -> Problem:
-    """`problem`, if it is a valid `Problem`.
-
-    **Raises:** `TypeError` for another type, `ValueError` for arrays of other shapes.
-    """
+    """`problem`, if it is one `Problem`; else `TypeError`, `ValueError`."""
     _checks.instance(problem, Problem, "problem")
     records, rate = problem.records, problem.reference.rate
     shapes = {records.t.shape, *(reading.mask.shape for reading in records.readings)}
@@ -291,11 +291,7 @@ def one_problem(problem: Any) -> Problem:
 
 
 def fits(problem: Problem, parameters: Parameters) -> Parameters:
-    """`parameters`, if they are of this problem.
-
-    **Raises:** `TypeError` for another type or dtype, `ValueError` for other shapes, and for known
-    NaN.
-    """
+    """`parameters`, if they are of this problem; else `TypeError`, `ValueError`."""
     one_problem(problem)
     hint = "problem.start(body) makes them"
     _checks.instance(parameters, Parameters, "parameters", hint=hint)
@@ -339,10 +335,8 @@ def _shapes(problem: Problem) -> dict[str, list[tuple[int, ...]]]:
 
 
 class Links(eqx.Module):
-    """The condition that each recording starts at the end of the one before: pieces of a long one.
-
-    **Fields:** `on` (R,) one if the recording continues in the next, else zero; `width` the
-    standard deviation of the gap between them, in order-one numbers.
+    """Pieces of a long recording: `on` (R,) one if it continues in the next, else zero; `width` the
+    standard deviation of the gap, in order-one numbers.
     """
 
     on: Float[Array, " records"]
@@ -421,13 +415,6 @@ def _vector(chart: AbstractBodyChart, body: Any) -> Float[Array, " chart"]:
 def _zeros(*shape: int) -> Array:
     """Zeros by NumPy: JAX compiles a program for each shape."""
     return jnp.asarray(np.zeros(shape, jnp.result_type(float)))
-
-
-def _firsts(slot: Slot) -> Array:
-    """The first recording of each group."""
-    assert slot.groups is not None
-    rows = jnp.arange(len(slot.labels), dtype=slot.groups.dtype)
-    return jnp.argmax(slot.groups[None, :] == rows[:, None], axis=1)
 
 
 def _with(recording: Recording, torque: Torque) -> Recording:

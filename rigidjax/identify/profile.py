@@ -10,26 +10,23 @@ from jaxtyping import Array
 
 from rigidjax.identify import quantities
 from rigidjax.identify.parameters import Parameters
-from rigidjax.identify.residual import residuals
 from rigidjax.identify.result import Fit, one_fit
 from rigidjax.identify.search import cost_of, misfit
+from rigidjax.identify.terms import residuals
 
 
 def profile(fit: Fit, name: str, level: float = 0.95) -> tuple[float, float]:
     """The profile interval (low, high) of one reported quantity.
 
     The other numbers are fitted again with the quantity held at a value; at the ends twice the
-    misfit has grown by the square of the quantile, `t²`. Trust this interval if the misfit is not
-    quadratic (a weakly determined quantity, or one near a boundary). The growth is divided by the
-    number of samples over which errors are autocorrelated, as in `Fit.interval`.
+    misfit has grown by the square of the quantile, `t²`, times the samples over which errors are
+    autocorrelated. Trust it if the misfit is not quadratic (a weakly determined quantity, or one
+    near a boundary). **Arguments:** `fit`; `name` as in `fit.interval()`; `level` the probability.
+    **Returns** the interval, infinite or 0 on a side where the misfit never grows that far within a
+    factor of 1e3 (or 1e3 standard deviations).
 
-    **Arguments:** `fit`; `name` as in `fit.interval()`; `level` the probability. **Returns** the
-    interval, infinite or 0 on a side where the misfit never grows that far within a factor of 1e3
-    (or 1e3 standard deviations).
-
-    Source: Raue et al. 2009, doi:10.1093/bioinformatics/btp358.
-
-    **Raises:** `ValueError` for a name that is not reported, a level outside (0, 1).
+    **Raises:** `ValueError` for a name that is not reported, a level outside (0, 1). Source: Raue
+    et al. 2009, doi:10.1093/bioinformatics/btp358.
 
     >>> import jax.numpy as jnp, rigidjax as rj
     >>> ts = jnp.linspace(0.0, 10.0, 80)

@@ -1,4 +1,4 @@
-"""From a body and an initial state to the states at a recording's times."""
+"""From a body and an initial state to the states at a recording's times, and to sensors' input."""
 
 import abc
 import math
@@ -7,14 +7,18 @@ from typing import Any
 
 import diffrax as dfx
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from rigidjax import _checks
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.exact.free_body import FreeMotion
-from rigidjax.motion.coupled import Coupled, started
+from rigidjax.identify.sensors import SensorInput
+from rigidjax.motion import Rigid
+from rigidjax.motion.coupled import Coupled, CoupledEquations, started
 from rigidjax.motion.torques.base import Torque
+from rigidjax.motion.torques.states import freeze
 from rigidjax.solve import equations_of_motion, fixed, simulate, solvers
 from rigidjax.solve.equal_steps import advance, in_a_loop
 from rigidjax.solve.explicit import AbstractExplicit
@@ -51,7 +55,8 @@ class FixedSteps(AbstractIntegrator):
     `Adaptive`.
 
     **Arguments:** `substeps` the number of steps between two samples; `solver` the method, one of
-    `rigidjax.solvers`: Tsitouras's of order 5 unless given.
+    `rigidjax.solvers`: Tsitouras's of order 5 unless given; `last` the number of the last time
+    that is needed, `None` for all.
 
     >>> FixedSteps(2).substeps
     2
@@ -59,29 +64,16 @@ class FixedSteps(AbstractIntegrator):
 
     substeps: int = eqx.field(static=True, default=1)
     solver: AbstractExplicit = solvers.Tsitouras5()
+    last: Int[Array, ""] | None = eqx.field(default=None, repr=False)
 
     def __check_init__(self):
         _checks.whole(self.substeps, "substeps", 1)
         _checks.instance(self.solver, AbstractExplicit, "solver", wanted="one of rigidjax.solvers")
 
     def states(self, body: Any, state0: Any, ts: Float[Array, " times"], torque: Torque) -> Any:
-        return FirstPart(self, None).states(body, state0, ts, torque)
-
-
-class FirstPart(AbstractIntegrator):
-    """`FixedSteps` up to the last time that a part of the record needs.
-
-    **Fields:** `steps`; `last` the number of the last time that is needed, `None` for all.
-    """
-
-    steps: FixedSteps
-    last: Int[Array, ""] | None
-
-    def states(self, body: Any, state0: Any, ts: Float[Array, " times"], torque: Torque) -> Any:
         y0 = started(body, state0, torque, ts[0])
         field = equations_of_motion(body, y0, torque)
-        solver = in_a_loop(self.steps.solver)
-        return fixed(solver, field, ts, y0, self.steps.substeps, self.last)
+        return fixed(in_a_loop(self.solver), field, ts, y0, self.substeps, self.last)
 
 
 class Adaptive(AbstractIntegrator):
@@ -101,11 +93,13 @@ class Adaptive(AbstractIntegrator):
         _checks.not_negative(self.atol, "atol")
 
     def states(self, body: Any, state0: Any, ts: Float[Array, " times"], torque: Torque) -> Any:
-        # A solver refuses repeated times (the tail of a shorter record).
+        # A solver refuses repeated times, the tail of a shorter record: they grow by round-off.
+        first = jnp.zeros(1, bool)
+        again = jnp.cumsum(jnp.concatenate([first, jnp.diff(ts) <= 0]).astype(ts.dtype))
         out = simulate(
             body,
             state0,
-            _increasing(ts),
+            ts + 1e-9 * (ts[-1] - ts[0]) * again,
             torque,
             rtol=self.rtol,
             atol=self.atol,
@@ -145,8 +139,31 @@ def shifted(field: Callable[..., Any], t: Array, state: Any, offset: Array) -> A
     return state
 
 
-def _increasing(ts: Float[Array, " times"]) -> Float[Array, " times"]:
-    """The same times, with the repeated ones at the end increased by a few units of round-off."""
-    gap = 1e-9 * (ts[-1] - ts[0])
-    again = jnp.cumsum(jnp.concatenate([jnp.zeros(1, bool), jnp.diff(ts) <= 0]).astype(ts.dtype))
-    return ts + gap * again
+def what_turns(body: Any, rung: type) -> Any:
+    """The body of the equations of motion: a body at a fixed point needs no mass."""
+    return body.inertia if isinstance(body, MassProperties) and rung is not Rigid else body
+
+
+def sensor_inputs(
+    sensor: Any, body: Any, torque: Any, ts: Array, state0: Any, states: Any
+) -> tuple[Array, Any, Callable[[Array, Any], SensorInput]]:
+    """The times that a sensor shows at `ts` (T,), by its clock; the states then; its input at one
+    time. `states` are `Coupled` if a torque has states of its own.
+    """
+    turned = what_turns(body, type(state0))
+    field = equations_of_motion(turned, state0, torque)
+    offset, times = getattr(sensor, "offset", None), ts
+    if offset is not None:
+        times = ts + offset
+        if torque is None:
+            states = FreeMotion(turned, state0)(times - ts[0])
+        else:
+            whole = CoupledEquations(field, turned) if isinstance(states, Coupled) else field
+            states = jax.vmap(lambda t, y: shifted(whole, t, y, offset))(ts, states)
+
+    def now(t: Array, state: Any) -> SensorInput:
+        if not isinstance(state, Coupled):
+            return SensorInput(t, state, body, field)
+        return SensorInput(t, state.motion, body, freeze(field, state.own), state.own)
+
+    return times, states, now

@@ -1,6 +1,6 @@
 """The quantities that a fit reports by name, their values, standard deviations and intervals."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
@@ -12,10 +12,9 @@ from jaxtyping import Array
 
 from rigidjax import _checks
 from rigidjax.identify import flat_limit
-from rigidjax.identify.body_charts import AbstractBodyChart, Ratios
-from rigidjax.identify.parameters import Parameters, Unpacked
+from rigidjax.identify.body_charts import AbstractBodyChart, Bodies, Ratios, in_a_row
+from rigidjax.identify.parameters import Parameters
 from rigidjax.identify.problem import Problem
-from rigidjax.identify.several_bodies import Bodies, in_a_row
 
 if TYPE_CHECKING:
     from rigidjax.identify.result import Fit
@@ -130,7 +129,7 @@ def vector(problem: Problem, parameters: Parameters) -> Array:
 
 
 @eqx.filter_jit
-def _value_and_slope(problem: Problem, parameters: Parameters) -> tuple[Array, Array]:
+def value_and_slope(problem: Problem, parameters: Parameters) -> tuple[Array, Array]:
     """The reported quantities and the flatness of each body, and their derivatives."""
     flat, restore = ravel_pytree(parameters)
 
@@ -145,9 +144,9 @@ def values_and_slopes(
     problem: Problem, parameters: Parameters, near: Parameters | None
 ) -> tuple[np.ndarray, np.ndarray]:
     """The reported quantities and the flatness of each body, with their derivatives at `near`."""
-    values, slopes = (np.asarray(x) for x in _value_and_slope(problem, parameters))
+    values, slopes = (np.asarray(x) for x in value_and_slope(problem, parameters))
     if near is not None:
-        slopes = np.asarray(_value_and_slope(problem, near)[1])
+        slopes = np.asarray(value_and_slope(problem, near)[1])
     return values, slopes
 
 
@@ -158,16 +157,13 @@ def quantities(
     null: np.ndarray,
     limits: tuple[flat_limit.Limit, ...] = (),
 ) -> tuple[Quantity, ...]:
-    """Every reported quantity with its standard deviation.
-
-    **Arguments:** `found` the result of `values_and_slopes`; `covariance` (n, n) within the
-    determined directions; `null` (k, n) the undetermined directions; `limits` that cut the
-    intervals.
+    """Every reported quantity with its standard deviation, of `values_and_slopes`; `covariance`
+    within the determined directions, `null` (k, n) the others; `limits` cut the intervals.
     """
     names = labels(problem)
     values, slope = (part[: len(names)] for part in found)
     deviations = carried(slope, covariance, null)
-    cuts = _cuts(slope, covariance, deviations, limits)
+    cuts = cuts_of(slope, covariance, deviations, limits)
     # A number that changes with no fitted number is not determined.
     deviations = np.where(np.any(slope != 0, axis=-1), deviations, np.nan)
     out = []
@@ -183,7 +179,7 @@ def quantities(
     return tuple(out)
 
 
-def _cuts(
+def cuts_of(
     slope: np.ndarray,
     covariance: np.ndarray,
     deviations: np.ndarray,
@@ -200,18 +196,10 @@ def _cuts(
     return out
 
 
-def covariance(fit: "Fit") -> np.ndarray:
-    """Covariance of the reported quantities, with logarithms of the positive ones."""
-    slope = np.asarray(_value_and_slope(fit.problem, fit.beside)[1])[: len(labels(fit.problem))]
-    return slope @ np.asarray(fit.seen) @ slope.T
-
-
 def carried(slope: np.ndarray, covariance: np.ndarray, null: np.ndarray) -> np.ndarray:
     """Standard deviations of functions with this derivative (…, n); all intervals use them.
 
-    It is infinite if the function changes along a direction of `null` (k, n). It is NaN, not
-    determined, if the function changes along a direction of negative variance, or its variance is
-    round-off.
+    Infinite along a direction of `null` (k, n); NaN along one of negative variance or round-off.
     """
     if not np.isfinite(covariance).all():
         return np.full(slope.shape[:-1], np.nan)
@@ -229,36 +217,9 @@ def carried(slope: np.ndarray, covariance: np.ndarray, null: np.ndarray) -> np.n
     return np.where(touched, np.inf, np.where(lost, np.nan, np.sqrt(variance)))
 
 
-def interval_of(
-    fit: "Fit", of: Callable[[Unpacked], Any], level: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """See `Fit.interval_of`."""
-    _checks.function(of, "of", "of `Unpacked` to an array")
-    if not _checks.known(fit.parameters):
-        raise TypeError(
-            "Fit: wanted known numbers, got traced ones; intervals are made on the host: call "
-            "interval_of outside of jax.jit, jax.grad and jax.vmap"
-        )
-    flat, restore = ravel_pytree(fit.parameters)
-
-    def value(x: Array) -> Array:
-        parameters = restore(x)
-        body, state0 = fit.problem.unpack(parameters)
-        point = Unpacked(parameters, body, state0, fit.problem.values(parameters), fit.noises)
-        return _checks.numbers(of(point), "of(point)")
-
-    middle = np.asarray(_checks.finite(value(flat), "of(point)"))
-    slope = np.asarray(jax.jacfwd(value)(ravel_pytree(fit.beside)[0]))
-    seen = np.asarray(fit.seen)
-    found = carried(slope, seen, np.asarray(fit.null_directions))
-    low, high = cut_ends(quantile(fit, level), _cuts(slope, seen, found, fit.limits))
-    return np.asarray(middle + low * found), np.asarray(middle + high * found)
-
-
 def quantile(fit: "Fit", level: float) -> float:
-    """Half-width of an interval in standard deviations: Student's where the noise is estimated.
-
-    Autocorrelated errors count as fewer independent ones.
+    """Half-width of an interval in standard deviations: Student's where the noise is estimated, by
+    the number of independent errors.
     """
     level = _checks.fraction(level, "interval", "a level between 0 and 1")
     from scipy.special import ndtri, stdtrit

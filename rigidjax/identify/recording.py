@@ -156,7 +156,13 @@ def _reading(
         turned = "; transposed?" if values.shape == wanted[::-1] else ""
         many = f"; t has {t.size} times" if values.shape[1:] == wanted[1:] else turned
         raise ValueError(f"{name}: wanted readings of shape {wanted}, got {values.shape}{many}")
-    mask = np.ones(t.size, bool) if mask is None else _flags(mask, name)
+    try:
+        flags = np.ones(t.size, bool) if mask is None else np.asarray(mask)
+    except ValueError as error:
+        raise ValueError(f"{name}: wanted a mask (T,), got rows of different lengths") from error
+    if flags.dtype.kind not in "biu":
+        raise TypeError(f"{name}: wanted a mask of true and false, got {flags.dtype}")
+    mask = flags.astype(bool)
     if mask.shape != t.shape:
         raise ValueError(f"{name}: wanted a mask of shape {t.shape}, got {mask.shape}")
     across = tuple(range(1, values.ndim))
@@ -178,13 +184,3 @@ def _reading(
         if wrong.any():
             raise ValueError(f"{name}: {why.format(index=int(np.argmax(wrong)))}")
     return sensor, values, mask
-
-
-def _flags(mask: Any, name: str) -> np.ndarray:
-    try:
-        flags = np.asarray(mask)
-    except ValueError as error:
-        raise ValueError(f"{name}: wanted a mask (T,), got rows of different lengths") from error
-    if flags.dtype.kind not in "biu":
-        raise TypeError(f"{name}: wanted a mask of true and false, got {flags.dtype}")
-    return flags.astype(bool)

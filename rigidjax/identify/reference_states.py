@@ -7,17 +7,100 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from rigidjax import _checks
 from rigidjax.identify import padding
-from rigidjax.identify.direct_estimates import attitudes, rates
-from rigidjax.identify.parameters import firsts
 from rigidjax.identify.recording import Recording, readings_of
-from rigidjax.identify.sensors import Gyro, Marker, Position, Range, Velocity
+from rigidjax.identify.sensors import (
+    AttitudeSensor,
+    Direction,
+    Gyro,
+    Marker,
+    Position,
+    Range,
+    Velocity,
+)
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.manifold import names, plus
-from rigidjax.rotation import quaternion
+from rigidjax.rotation import quaternion, so3
+
+# The turn, rad, between two attitudes that give a rate: large against noise, small enough that the
+# axis hardly moves.
+_TURN = 0.3
+# A turn is undetermined if two singular values of Σ world bodyᵀ are below this share of the
+# largest.
+_FIRM = 1e-3
+
+
+def attitudes(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
+    """Times (n,), s, and attitudes (n, 4), body → world, that the readings show; n may be 0: of an
+    attitude sensor, or by `rigidjax.so3.wahba` from three markers or two directions.
+    """
+    t = np.asarray(recording.t)
+    for reading in readings_of(recording, AttitudeSensor):
+        q, mounting = np.asarray(reading.values)[reading.seen], reading.sensor.mounting
+        if mounting is not None:
+            back = quaternion.exp(-mounting)
+            q = np.asarray(jax.vmap(quaternion.multiply, (0, None))(jnp.asarray(q), back))
+        return t[reading.seen], q
+    body, world, seen = [], [], np.ones(t.shape, bool)
+    markers = readings_of(recording, Marker)
+    if len(markers) >= 3:
+        places = np.stack([np.asarray(r.sensor.place) for r in markers])
+        there = np.stack([np.asarray(r.values) for r in markers], axis=1)
+        size = np.linalg.norm(places - places.mean(axis=0), axis=1).max() or 1.0
+        body.append(np.broadcast_to((places - places.mean(axis=0)) / size, there.shape))
+        world.append((there - there.mean(axis=1, keepdims=True)) / size)
+        seen = seen & np.all([r.seen for r in markers], axis=0)
+    for reading in readings_of(recording, Direction):
+        along, sensor = np.asarray(reading.values), reading.sensor
+        if sensor.mounting is not None:
+            along = along @ np.asarray(so3.exp(sensor.mounting)).T
+        body.append(along[:, None, :])
+        world.append(np.broadcast_to(np.asarray(sensor.world), along.shape)[:, None, :])
+        seen = seen & reading.seen
+    if not body:
+        return np.zeros(0), np.zeros((0, 4))
+    rows, sides = np.concatenate(body, axis=1)[seen], np.concatenate(world, axis=1)[seen]
+    b = np.einsum("tni,tnj->tij", sides, rows)
+    s = np.linalg.svd(b, compute_uv=False)
+    firm = s[:, 1] + np.sign(np.linalg.det(b)) * s[:, 2] > _FIRM * s[:, 0]
+    if not firm.any():
+        return np.zeros(0), np.zeros((0, 4))
+    return t[seen][firm], np.asarray(_nearest(rows[firm], sides[firm]))
+
+
+@jax.jit
+def _nearest(body: ArrayLike, world: ArrayLike) -> Array:
+    return jax.vmap(lambda a, b: quaternion.from_matrix(so3.wahba(a, b)))(body, world)
+
+
+def rates(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
+    """Times (n,), s, and body rates (n, 3), rad/s, between attitudes; n may be 0."""
+    return rates_of(*attitudes(recording))
+
+
+def rates_of(t: np.ndarray, q: np.ndarray | Array) -> tuple[np.ndarray, np.ndarray]:
+    """The same of attitudes (n, 4) at times (n,)."""
+    if t.size < 2:
+        return np.zeros(0), np.zeros((0, 3))
+    turned = np.concatenate([[0.0], np.cumsum(np.linalg.norm(_turns(q[:-1], q[1:]), axis=1))])
+    first = np.arange(t.size - 1)
+    last = np.searchsorted(turned, turned[first] + _TURN, side="right") - 1
+    last = np.clip(np.maximum(last, first + 1), 1, t.size - 1)
+    gap = t[last] - t[first]
+    return 0.5 * (t[first] + t[last]), np.asarray(_turns(q[first], q[last])) / gap[:, None]
+
+
+@jax.jit
+def _turns(p: ArrayLike, q: ArrayLike) -> Array:
+    """Rotation vectors (n, 3) from p to q, body axes, the short way, whatever the signs."""
+
+    def turn(a: Array, b: Array) -> Array:
+        return quaternion.log(quaternion.multiply(quaternion.conjugate(a), b))
+
+    return jax.vmap(turn)(jnp.asarray(p), jnp.asarray(q))
 
 
 class ReferenceStates(eqx.Module):
@@ -40,12 +123,14 @@ class ReferenceStates(eqx.Module):
 
     def moved(self, own: Any) -> Any:
         """The initial state of one recording; `own` an `Own` or a `Local`."""
-        return plus(self.state, self.units * jnp.concatenate(firsts(own)))
+        parts = (own.place, own.speed, own.turn, own.spin)
+        change = jnp.concatenate([part for part in parts if part is not None])
+        return plus(self.state, self.units * change)
 
 
 def reference_of(recordings: Sequence[Recording], rung: type) -> ReferenceStates:
     """From the first readings of each recording, for the kind of state in use."""
-    turns = [_first_attitude(r) for r in recordings]
+    turns = [[*attitudes(r)[1], np.array([1.0, 0.0, 0.0, 0.0])][0] for r in recordings]
     places = [_first_place(r) for r in recordings]
     dtype = recordings[0].t.dtype
     # Arrays, not floats: another recording must not compile again.
@@ -60,32 +145,21 @@ def _typical_rate(recording: Recording) -> float:
     gyros = readings_of(recording, Gyro)
     if gyros:
         values = np.asarray(gyros[0].values)[gyros[0].seen]
-        rate = float(np.sqrt(np.mean(np.sum(values**2, axis=1))))
-    else:
-        rate = float(np.linalg.norm(first_rate(recording))) or _rate_of_readings(recording)
-    return rate if rate > 0 else 1.0
-
-
-def _rate_of_readings(recording: Recording) -> float:
-    """The rate by the first sensor whose readings show one, rad/s; 0 without such a sensor."""
-    for reading in recording.readings:
+        return float(np.sqrt(np.mean(np.sum(values**2, axis=1)))) or 1.0
+    rate = float(np.linalg.norm(first_rate(recording)))
+    # Else by the first sensor whose readings show one.
+    for reading in recording.readings if rate == 0 else ():
         sensor: Any = reading.sensor
         if hasattr(sensor, "typical_rate"):
             t, values = np.asarray(recording.t), np.asarray(reading.values)
-            return sensor.typical_rate(t[reading.seen], values[reading.seen])
-    return 0.0
-
-
-def _first_attitude(recording: Recording) -> np.ndarray:
-    _, q = attitudes(recording)
-    return q[0] if len(q) else np.array([1.0, 0.0, 0.0, 0.0])
+            rate = sensor.typical_rate(t[reading.seen], values[reading.seen])
+            break
+    return rate if rate > 0 else 1.0
 
 
 def _first_place(recording: Recording) -> tuple[np.ndarray, np.ndarray, float]:
-    """First position and velocity of the body's frame, m and m/s, and a typical length, m.
-
-    They belong to the frame's origin if attitudes give its distance from the markers, and to the
-    centre of mass if its position, or ranges to it, were read.
+    """First position and velocity, m and m/s, and a typical length, m: of the centre of mass, or of
+    the body's frame if only markers were read.
     """
     direct = _read_place(recording)
     if direct is not None:
@@ -144,11 +218,8 @@ def _read_place(recording: Recording) -> tuple[np.ndarray, np.ndarray, float] | 
 
 
 def _from_ranges(stations: np.ndarray, lengths: np.ndarray) -> np.ndarray:
-    """Places (n, 3) that distances (n, k) to stations (k, 3) show.
-
-    The differences of `|x|² − 2 s·x + |s|² = d²` from their mean are linear in x; along
-    undetermined directions (fewer than four stations, or stations in a plane) it is the stations'
-    centre.
+    """Places (n, 3) of distances (n, k) to stations: differences of `|x|² − 2 s·x + |s|² = d²` are
+    linear in x; along directions that these leave open it is the stations' centre.
     """
     centre = stations.mean(axis=0)
     s = stations - centre

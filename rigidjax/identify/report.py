@@ -1,6 +1,7 @@
 """A fit as a table for the terminal, as JSON, and as a self-contained page of HTML."""
 
 import base64
+import dataclasses
 import html
 import io
 import json
@@ -39,21 +40,20 @@ def rows(fit: Fit, rate_unit: str = "rad/s") -> list[Row]:
     out: list[Row] = []
     for quantity in fit.quantities:
         low, high = bounds[quantity.name]
+        row = (quantity.name, quantity.value, low, high, quantity.unit)
         if quantity.name.startswith("Ω"):
-            axis, _, where = quantity.name.partition(" ")
-            name = f"{axis} at the start{' ' + where if where else ''}"
-            out.append((name, quantity.value * scale, low * scale, high * scale, rate_unit))
-        else:
-            out.append((quantity.name, quantity.value, low, high, quantity.unit))
+            axis, *where = quantity.name.split(" ", 1)
+            name = " ".join([axis, "at the start", *where])
+            row = (name, quantity.value * scale, low * scale, high * scale, rate_unit)
+        out.append(row)
     return out
 
 
 def table(lines: list[Row]) -> str:
     """Rows as text, rounded by their intervals.
 
-    **Arguments:** `lines` rows of (name, value, low, high, unit), such as `rows` gives.
-
-    **Raises:** `TypeError` for anything but rows; `ValueError` for none.
+    **Arguments:** `lines` rows of (name, value, low, high, unit), such as `rows` gives. **Raises:**
+    `TypeError` for anything but rows; `ValueError` for none.
 
     >>> print(table([("I1", 1.23456, 1.2, 1.27, "kg m²")]))
                  value  95 % interval
@@ -76,7 +76,6 @@ def numbers(value: float, low: float, high: float) -> list[str]:
     """Value, low and high as text, rounded by the interval.
 
     **Arguments:** `value`; `low` and `high`, the ends of its interval, in the same unit.
-
     **Raises:** `TypeError`, `ValueError` for anything but numbers.
 
     >>> numbers(1.23456, 1.2, 1.27)
@@ -164,16 +163,7 @@ def as_dict(fit: Fit, files: Sequence[str] = (), more: Sequence[Row] = ()) -> di
         "status": fit.status,
         "search": {"answer": fit.search.word, "reasons": list(fit.search.reasons)},
         "model": {"answer": fit.model.word, "reasons": list(fit.model.reasons)},
-        "causes": [
-            {
-                "name": cause.name,
-                "sensor": cause.sensor,
-                "share": cause.share,
-                "words": cause.words,
-                "remedy": cause.remedy,
-            }
-            for cause in fit.causes
-        ],
+        "causes": [dataclasses.asdict(cause) for cause in fit.causes],
         "advice": fit.advice,
         "quantities": {
             name: {"value": plain(value), "interval_95": [plain(low), plain(high)], "unit": unit}
@@ -213,10 +203,7 @@ def as_dict(fit: Fit, files: Sequence[str] = (), more: Sequence[Row] = ()) -> di
 
 
 def _rms_of_axes(fit: Fit) -> list[tuple[str, list[float], str]]:
-    """Root mean square error of each component of each sensor, without readings at full scale.
-
-    **Returns** for each sensor its name, the figures, and their unit.
-    """
+    """Name, rms of each component without readings at full scale, and unit of sensors."""
     one_fit(fit)
     readings = fit.problem.records.readings
     out = []
@@ -290,10 +277,11 @@ def write_html(
         )
         for number, start in enumerate(fit.starts, 1)
     )
-    pictures = "".join(
-        f'<img alt="figure {index}" src="data:image/png;base64,{_png(figure)}">'
-        for index, figure in enumerate(figures, 1)
-    )
+    pictures = ""
+    for index, figure in enumerate(figures, 1):
+        figure.savefig(buffer := io.BytesIO(), format="png", dpi=110)
+        shown = base64.b64encode(buffer.getvalue()).decode("ascii")
+        pictures += f'<img alt="figure {index}" src="data:image/png;base64,{shown}">'
     read = ", ".join(html.escape(str(name)) for name in files)
     page = f"""<!doctype html>
 <html lang="en"><meta charset="utf-8"><title>{html.escape(title)}</title>
@@ -345,12 +333,6 @@ def _cells(lines: Iterable[tuple[str, ...]]) -> str:
     """Lines of a table."""
     cells = ("".join(f"<td>{html.escape(cell)}</td>" for cell in line) for line in lines)
     return "".join(f"<tr>{line}</tr>" for line in cells)
-
-
-def _png(figure: Any) -> str:
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=110)
-    return base64.b64encode(buffer.getvalue()).decode("ascii")
 
 
 show(__name__)

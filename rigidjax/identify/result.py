@@ -4,7 +4,9 @@ from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
+import jax
 import numpy as np
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from rigidjax import _checks
@@ -13,12 +15,11 @@ from rigidjax.identify.answers import Answer, Cause
 from rigidjax.identify.causes import causes
 from rigidjax.identify.flat_limit import Limit
 from rigidjax.identify.full_scale import at_limit
+from rigidjax.identify.identifiability import Combination, undetermined
 from rigidjax.identify.parameters import Parameters, Unpacked
 from rigidjax.identify.problem import Problem
-from rigidjax.identify.quantities import Quantity, interval_of, quantile
-from rigidjax.identify.residual import Noise
-from rigidjax.identify.undetermined import Combination, undetermined
-from rigidjax.identify.widths import widths
+from rigidjax.identify.quantities import Quantity, carried, cut_ends, cuts_of, quantile
+from rigidjax.identify.terms import Noise
 
 
 class Start(eqx.Module):
@@ -146,7 +147,8 @@ class Fit(eqx.Module):
     @property
     def spreads(self) -> dict[str, Array]:
         """The spread of each `Free` that has one, by name, in its unit: given or estimated."""
-        return widths(self.problem)
+        slots = self.problem.slots
+        return {s.name: s.spread * s.scale for s in slots if s.spread is not None}
 
     @property
     def noise(self) -> tuple[Float[Array, "*records _"], ...]:
@@ -190,7 +192,26 @@ class Fit(eqx.Module):
 
         It comes from the covariance and the function's derivative. **Raises** as `interval`.
         """
-        return interval_of(self, of, level)
+        _checks.function(of, "of", "of `Unpacked` to an array")
+        if not _checks.known(self.parameters):
+            raise TypeError(
+                "Fit: wanted known numbers, got traced ones; intervals are made on the host: call "
+                "interval_of outside of jax.jit, jax.grad and jax.vmap"
+            )
+        flat, restore = ravel_pytree(self.parameters)
+
+        def value(x: Array) -> Array:
+            parameters = restore(x)
+            body, state0 = self.problem.unpack(parameters)
+            point = Unpacked(parameters, body, state0, self.problem.values(parameters), self.noises)
+            return _checks.numbers(of(point), "of(point)")
+
+        middle = np.asarray(_checks.finite(value(flat), "of(point)"))
+        slope = np.asarray(jax.jacfwd(value)(ravel_pytree(self.beside)[0]))
+        seen = np.asarray(self.seen)
+        found = carried(slope, seen, np.asarray(self.null_directions))
+        low, high = cut_ends(quantile(self, level), cuts_of(slope, seen, found, self.limits))
+        return np.asarray(middle + low * found), np.asarray(middle + high * found)
 
     @property
     def undetermined(self) -> tuple[Combination, ...]:
@@ -208,10 +229,7 @@ class Fit(eqx.Module):
 
 
 def one_fit(found: Any, name: str = "fit") -> Fit:
-    """`found`, if it is one `Fit`, not many in one container.
-
-    **Raises:** `TypeError` for another type, `ValueError` for leading axes.
-    """
+    """`found`, if it is one `Fit`, not many in one container; else `TypeError`, `ValueError`."""
     _checks.instance(found, Fit, name)
     if np.shape(found.chi2) != ():
         raise ValueError(

@@ -2,26 +2,35 @@
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
+from rigidjax.identify.body_charts import charts_of
 from rigidjax.identify.checkpoint import SearchState, Tried
-from rigidjax.identify.levenberg_marquardt import (
-    BOLD as BOLD,
-    CAREFUL as CAREFUL,
-    Search,
-    Settings,
-    descend,
-)
-from rigidjax.identify.parameters import Parameters
+from rigidjax.identify.levenberg_marquardt import BOLD, CAREFUL, Search, Settings, search
+from rigidjax.identify.parameters import Parameters, places
 from rigidjax.identify.problem import Problem
+from rigidjax.identify.propagation import FixedSteps
 from rigidjax.identify.recording import count_of
-from rigidjax.identify.residual import Noise, residuals
+from rigidjax.identify.reference_states import ReferenceStates
+from rigidjax.identify.terms import (
+    Noise,
+    along,
+    beside,
+    half_sum,
+    normal_matrix,
+    residuals,
+    seen,
+    with_blocks,
+    with_jacobian,
+    with_rows,
+)
 
 # The beginning of the record is fitted first: a long record has many wrong minima (the phase slips
 # by whole turns), a short one has not.
@@ -32,83 +41,169 @@ STRIDE = 25
 SETTLED = 1e-7
 # A fit to a part of the record may raise the misfit of the whole by at most this factor.
 WILD = 100.0
+# Samples after the last one with weight: a low-pass filter looks ahead.
+_BEYOND = 2
 
 
-def least_squares(
+class Task(NamedTuple):
+    """What is fitted, with which noise, how closely, and in how many steps at most."""
+
+    problem: Problem
+    noise: Noise
+    tolerance: float
+    max_steps: int
+
+    @property
+    def stride(self) -> int:
+        """Steps before the next look at clock and keyboard."""
+        return min(STRIDE, self.max_steps)
+
+
+@eqx.filter_jit
+def descend(
     start: Parameters,
     problem: Problem,
     noise: Noise,
     weights: Float[Array, "records times"],
-    tolerance: float,
-    max_steps: int,
+    settings: Settings,
+) -> tuple[Tried, Search]:
+    """`search` for the free numbers of a problem, on normal equations added up by recordings."""
+    flat, restore = ravel_pytree(start)
+    where, made = places(problem, start), made_of(start)
+    number, kind = flat.size, flat.dtype
+    problem = _as_far_as(problem, weights)
+
+    def evaluated(point: Array) -> tuple[Any, Array, Array, Array]:
+        here = restore(point)
+        found = with_blocks(here, problem)
+        (errors, ends), (slopes, end_slopes) = found
+        total, slope = jnp.zeros((), kind), jnp.zeros(number + 1, kind)
+        read, blocks = with_rows(lambda e: seen(problem, e, noise, weights), errors, slopes)
+        for e, rows in zip(read, blocks, strict=True):
+            total = total + jnp.sum(e**2)
+            slope = slope.at[where].add(jnp.einsum("rtki,rtk->ri", rows, e))
+        gram, slope = normal_matrix(blocks, where, number), slope[:-1]
+        e, rows = beside_rows(problem, point, restore, ends, end_slopes)
+        if e.size:
+            total = total + jnp.sum(e**2)
+            gram, slope = gram + rows.T @ rows, slope + e @ rows
+        rows = _bends(problem, here.body, slope)
+        return found, 0.5 * total, gram + rows.T @ rows, slope
+
+    nothing = _nothing(problem, start, where.shape[1], kind)
+    end = search(evaluated, flat, made, settings, nothing)
+    # A wild step can end in NaN: the start is then the better point.
+    lost = ~jnp.isfinite(end.cost)
+    value = restore(jnp.where(lost, flat, end.point))
+    return Tried(value, jnp.where(lost, jnp.inf, end.cost), end.converged & ~lost), end
+
+
+def _bends(problem: Problem, numbers: Array, slope: Float[Array, " n"]) -> Array:
+    """The rows (m, n) of the Jacobian from the curvature of the charts of bodies."""
+    out, first = [jnp.zeros((0, slope.size), slope.dtype)], 0
+    for chart in charts_of(problem.body):
+        mine = slice(first, first + chart.size)
+        rows = chart.bend(numbers[mine], slope[mine])
+        out.append(jnp.zeros((rows.shape[0], slope.size), slope.dtype).at[:, mine].set(rows))
+        first += chart.size
+    return jnp.concatenate(out)
+
+
+def _as_far_as(problem: Problem, weights: Float[Array, "records times"]) -> Problem:
+    """The problem, with its motion followed to the last time with weight."""
+    steps = problem.integrator
+    if not isinstance(steps, FixedSteps) or problem.links is not None:
+        return problem
+    counts = jnp.any(weights > 0, axis=0)
+    place = jnp.arange(counts.size, dtype=jnp.int32)
+    last = jnp.minimum(jnp.max(jnp.where(counts, place, 0)) + _BEYOND, counts.size - 1)
+    return eqx.tree_at(
+        lambda p: p.integrator, problem, FixedSteps(steps.substeps, steps.solver, last)
+    )
+
+
+def _nothing(problem: Problem, start: Parameters, columns: int, kind: Any) -> Any:
+    """Zeros of the shapes that `with_blocks` returns: to trace it once more takes seconds."""
+    count, times = problem.records.t.shape
+    errors = tuple(
+        jnp.zeros((count, times, reading.sensor.components), kind)
+        for reading in problem.records.readings
+    )
+    ends = jax.tree.map(
+        lambda leaf: jnp.zeros(leaf.shape, kind),
+        eqx.filter_eval_shape(jax.vmap(ReferenceStates.moved), problem.reference, start.own),
+    )
+    blocks = jax.tree.map(lambda leaf: jnp.zeros((*leaf.shape, columns), kind), (errors, ends))
+    return (errors, ends), blocks
+
+
+def made_of(parameters: Parameters) -> Float[Array, " n"]:
+    """One for numbers scaled to order one, zero for those of a `Free`, whose unit is a user's
+    guess.
+    """
+    ones, zeros = (jax.tree.map(of, parameters) for of in (jnp.ones_like, jnp.zeros_like))
+    marked = eqx.tree_at(lambda p: (p.shared, p.own.each), ones, (zeros.shared, zeros.own.each))
+    return ravel_pytree(marked)[0]
+
+
+def beside_rows(
+    problem: Problem, point: Array, restore: Any, ends: Any, end_slopes: Any
+) -> tuple[Array, Array]:
+    """Priors and joints between pieces as one vector, and its Jacobian (m, n)."""
+
+    @jax.custom_jvp
+    def last(vector: Array) -> Any:
+        return ends
+
+    @last.defjvp
+    def _(primals: Any, tangents: Any) -> Any:
+        return ends, along(problem, end_slopes, restore(tangents[0]))
+
+    def value(vector: Array) -> Array:
+        parts = [leaf.reshape(-1) for leaf in beside(restore(vector), problem, last(vector))]
+        return jnp.concatenate(parts) if parts else jnp.zeros(0, vector.dtype)
+
+    rows, e = with_jacobian(value, point)
+    return e, rows
+
+
+def least_squares(
+    start: Parameters,
+    task: Task,
+    weights: Float[Array, "records times"],
+    steps: int,
     damping: float,
     aim: float = 0.0,
     near: float = 0.0,
 ) -> Tried:
-    """At most `max_steps` steps from `start`; fewer if they do not lead to an `aim`, or are `near`
-    (see `Settings`).
-    """
-    settings = Settings(tolerance, damping, max_steps, aim, near=near)
-    return _ended(*_descend(start, problem, noise, weights, settings))
+    """At most `steps` steps from `start` (see `Settings`)."""
+    settings = Settings(task.tolerance, damping, steps, aim, near=near)
+    return _ended(*descend(start, task.problem, task.noise, weights, settings))
 
 
 def _ended(tried: Tried, end: Search) -> Tried:
     return dataclasses.replace(tried, found=end.found) if bool(end.here) else tried
 
 
-@eqx.filter_jit
-def _descend(
-    start: Parameters, problem: Problem, noise: Noise, weights: Array, settings: Settings
-) -> tuple[Tried, Search]:
-    value, end = descend(start, problem, noise, weights, settings)
-    # A wild step can end in NaN: the start is then the better point.
-    lost = ~jnp.isfinite(end.cost)
-    value = jax.tree.map(lambda a, b: jnp.where(lost, b, a), value, start)
-    return Tried(value, jnp.where(lost, jnp.inf, end.cost), end.converged & ~lost), end
+def _at(parameters: Parameters, problem: Problem, noise: Noise) -> Search:
+    return descend(parameters, problem, noise, whole(problem), Settings(0.0, 1.0, 0))[1]
 
 
 def evaluate(parameters: Parameters, problem: Problem) -> Any:
-    """Errors and last states with their derivatives (see `with_blocks`).
-
-    It uses the program of the search, so that no other one for the motion is compiled.
-    """
-    kind = problem.records.t.dtype
-    noise = tuple(
-        jnp.asarray(np.ones((problem.count, reading.sensor.components), kind))
-        for reading in problem.records.readings
-    )
-    return _at(parameters, problem, noise, whole(problem)).found
-
-
-def _at(parameters: Parameters, problem: Problem, noise: Noise, weights: Array) -> Search:
-    return _descend(parameters, problem, noise, weights, Settings(0.0, 1.0, 0))[1]
-
-
-@eqx.filter_jit
-def many(
-    starts: Parameters,
-    problem: Problem,
-    noise: Noise,
-    weights: Float[Array, "records times"],
-    settings: Settings,
-) -> Tried:
-    """`least_squares` from many starts at once (a leading axis on `starts`)."""
-    return jax.vmap(lambda start: _descend(start, problem, noise, weights, settings)[0])(starts)
+    """Errors and last states with their derivatives, by the program of the search."""
+    kind, readings = problem.records.t.dtype, problem.records.readings
+    ones = (np.ones((problem.count, reading.sensor.components), kind) for reading in readings)
+    return _at(parameters, problem, tuple(map(jnp.asarray, ones))).found
 
 
 def cost_of(parameters: Parameters, problem: Problem, noise: Noise) -> float:
     """The misfit over the whole of the records."""
-    return float(_at(parameters, problem, noise, whole(problem)).cost)
+    return float(_at(parameters, problem, noise).cost)
 
 
 def misfit(parameters: Parameters, args: Any) -> Float[Array, ""]:
     """Half the sum of the squares of all residuals."""
     return half_sum(residuals(parameters, args))
-
-
-def half_sum(tree: Any) -> Float[Array, ""]:
-    """Half the sum of the squares of all leaves."""
-    return 0.5 * sum((jnp.sum(leaf**2) for leaf in jax.tree.leaves(tree)), jnp.zeros(()))
 
 
 def whole(problem: Problem) -> Float[Array, "records times"]:
@@ -126,39 +221,28 @@ def horizon(problem: Problem, part: float) -> Float[Array, "records times"]:
 
 def settle(
     tried: Tried,
-    problem: Problem,
-    noise: Noise,
+    task: Task,
     weights: Float[Array, "records times"],
-    tolerance: float,
-    max_steps: int,
     look: Callable[[Tried, int, bool], None] = lambda tried, strides, over: None,
     *,
     near: bool = False,
     strides: int = 0,
     aim: float = 0.0,
 ) -> Tried:
-    """Strides from the end of `tried` until one more changes nothing.
-
-    A search may report convergence only because of large damping: it has converged if a new search
-    from its end stays there. `tried.cost` is the misfit at its end, infinite if unknown; `near`
-    says that it is near the minimum already; `strides` the number before it; `aim` see `Settings`.
-    `look` is called after each stride, with the number so far and whether it was the last.
+    """Strides from the end of `tried` until one more changes nothing: large damping alone can look
+    like convergence. `near` says that it is near the minimum; `strides` were made before; `look` is
+    called after each stride, with their number and whether it was the last.
     """
     if strides and bool(tried.converged):
         look(tried, strides, True)
         return tried
-    for first in range(strides * STRIDE, max_steps, STRIDE):
-        before = float(tried.cost)
-        count = min(STRIDE, max_steps)
-        strides += 1
+    for first in range(strides * STRIDE, task.max_steps, STRIDE):
+        before, strides = float(tried.cost), strides + 1
         bold = BOLD if first or near else CAREFUL
-        after = least_squares(
-            tried.parameters, problem, noise, weights, tolerance, count, bold, aim
-        )
+        after = least_squares(tried.parameters, task, weights, task.stride, bold, aim)
         if not np.isfinite(float(after.cost)):
             # The residuals are no longer finite: go back to the point before these iterations.
-            cost = jnp.asarray(cost_of(tried.parameters, problem, noise))
-            tried = Tried(tried.parameters, cost, jnp.asarray(False))
+            tried = Tried(tried.parameters, cost_of(tried.parameters, task.problem, task.noise))
             look(tried, strides, True)
             break
         tried = after
@@ -167,59 +251,54 @@ def settle(
         settled = bool(tried.converged) or stands
         # The same gain again would not reach the aim.
         hopeless = aim > 0 and not settled and float(tried.cost) ** 2 > aim * before
-        over = settled or hopeless or first + STRIDE >= max_steps
-        tried = dataclasses.replace(tried, converged=jnp.asarray(settled))
+        over = settled or hopeless or first + STRIDE >= task.max_steps
+        tried = dataclasses.replace(tried, converged=settled)
         look(tried, strides, over)
         if over:
             break
     return tried
 
 
-def fresh(point: Parameters) -> Tried:
-    """A start before its misfit is known."""
-    return Tried(point, jnp.asarray(jnp.inf), jnp.asarray(False))
-
-
-def again(best: Tried, problem: Problem, noise: Noise, tolerance: float, max_steps: int) -> Tried:
+def again(best: Tried, task: Task) -> Tried:
     """`settle` over the whole of the records from a point near the minimum."""
-    near = fresh(best.parameters)
-    return settle(near, problem, noise, whole(problem), tolerance, max_steps, near=True)
+    return settle(Tried(best.parameters), task, whole(task.problem), near=True)
 
 
 def climb(
     start: SearchState,
-    problem: Problem,
-    noise: Noise,
-    tolerance: float,
-    max_steps: int,
+    task: Task,
     *,
     look: Callable[[SearchState], None] = lambda position: None,
     aim: float = 0.0,
 ) -> Tried:
-    """The search from one start; `look` is called after each stride with its state.
-
-    It fits the whole record at once if that explains it, else the horizons in turn. `aim` is the
-    misfit of another start that explains the record: a search that does not lead there ends early.
+    """The search from one start: the whole record at once if that explains it, else the horizons in
+    turn; it ends early if it does not lead to `aim`. `look` is called after each stride.
     """
-    tried, start, level = _at_once(start, problem, noise, tolerance, max_steps, aim)
+    problem, noise, *_ = task
+    tried, level = start.tried, None
+    if not start.stage and not start.strides:
+        settings = Settings(task.tolerance, CAREFUL, task.stride, aim)
+        found, end = descend(tried.parameters, problem, noise, whole(problem), settings)
+        if bool(found.converged) and float(found.cost) <= enough(problem):
+            tried = _ended(found, end)
+            start = SearchState(len(HORIZONS) - 1, 1, tried)
+        else:
+            level = float(end.first)
     for stage in range(start.stage, len(HORIZONS)):
         seen = horizon(problem, HORIZONS[stage])
         if stage < len(HORIZONS) - 1:
             # A part of the record need not be fitted to convergence.
-            count, before = min(STRIDE, max_steps), tried.parameters
-            part = aim * HORIZONS[stage]
-            found = least_squares(
-                before, problem, noise, seen, tolerance, count, CAREFUL, aim=part, near=part
-            )
+            before, part = tried.parameters, aim * HORIZONS[stage]
+            found = least_squares(before, task, seen, task.stride, CAREFUL, aim=part, near=part)
             after = found.parameters
             # A point that explains a part alone may be wrong beyond it, such as a negative drag.
             first = cost_of(before, problem, noise) if level is None else level
             level = cost_of(after, problem, noise)
             kept = level < WILD * max(first, 1e-300)
-            tried, level = fresh(after if kept else before), level if kept else first
+            tried, level = Tried(after if kept else before), level if kept else first
             if part > 0 and not bool(found.converged) and float(found.cost) > WILD * part:
                 # It does not even explain this part, which another start explains.
-                tried = Tried(tried.parameters, jnp.asarray(level), tried.converged)
+                tried = Tried(tried.parameters, level)
                 look(SearchState(len(HORIZONS), 0, tried))
                 break
             look(SearchState(stage + 1, 0, tried))
@@ -229,52 +308,30 @@ def climb(
             look(SearchState(stage + over, strides, now))
 
         done = start.strides if stage == start.stage else 0
-        tried = settle(
-            tried, problem, noise, seen, tolerance, max_steps, at_last, strides=done, aim=aim
-        )
+        tried = settle(tried, task, seen, at_last, strides=done, aim=aim)
     return tried
 
 
-def _at_once(
-    start: SearchState,
-    problem: Problem,
-    noise: Noise,
-    tolerance: float,
-    max_steps: int,
-    aim: float,
-) -> tuple[Tried, SearchState, float | None]:
-    """The start fitted to the whole record, if that explains it; else the start and its misfit."""
-    if start.stage or start.strides:
-        return start.tried, start, None
-    seen, count = whole(problem), min(STRIDE, max_steps)
-    here = start.tried.parameters
-    tried, end = _descend(here, problem, noise, seen, Settings(tolerance, CAREFUL, count, aim))
-    if not bool(tried.converged) or float(tried.cost) > enough(problem):
-        return start.tried, start, float(end.first)
-    found = _ended(tried, end)
-    return found, SearchState(len(HORIZONS) - 1, 1, found), None
-
-
 def enough(problem: Problem) -> float:
-    """A misfit that only the true motion reaches: twice the mean of χ²; errors of a hundredth of
-    the signal if the noise was guessed at a tenth.
+    """A misfit that only the true motion reaches: twice the mean of χ², or a hundredth of the
+    signal.
     """
-    total = 0.0
-    for reading in problem.records.readings:
-        share = 0.01 if reading.sensor.noise is None else 1.0
-        total += share * count_of(reading)
-    return total
+    return sum(
+        (0.01 if reading.sensor.noise is None else 1.0) * count_of(reading)
+        for reading in problem.records.readings
+    )
 
 
-def climb_together(
-    points: Parameters, problem: Problem, noise: Noise, tolerance: float, max_steps: int
-) -> list[Tried]:
+@eqx.filter_jit
+def _many(starts: Parameters, *of: Any) -> Tried:
+    """`descend` from many starts at once (a leading axis on `starts`)."""
+    return jax.vmap(lambda start: descend(start, *of)[0])(starts)
+
+
+def climb_together(points: Parameters, task: Task) -> list[Tried]:
     """Many starts over the horizons in one `vmap` (a leading axis on `points`)."""
-    tried, settings = None, Settings(tolerance, CAREFUL, max_steps)
+    problem, noise, tolerance, max_steps = task
+    tried, settings = Tried(points), Settings(tolerance, CAREFUL, max_steps)
     for part in HORIZONS:
-        seen = horizon(problem, part)
-        tried = many(points, problem, noise, seen, settings)
-        points = tried.parameters
-    assert tried is not None
-    count = int(tried.cost.shape[0])
-    return [jax.tree.map(lambda leaf, i=i: leaf[i], tried) for i in range(count)]
+        tried = _many(tried.parameters, problem, noise, horizon(problem, part), settings)
+    return [jax.tree.map(lambda leaf, i=i: leaf[i], tried) for i in range(tried.cost.shape[0])]

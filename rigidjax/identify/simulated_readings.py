@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import Any, overload
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -11,41 +11,16 @@ from jaxtyping import Array, ArrayLike, Float
 
 from rigidjax import _checks
 from rigidjax.body.inertia import Inertia, MassProperties
-from rigidjax.identify.sensor_inputs import sensor_inputs, what_turns
-from rigidjax.identify.sensors import AbstractSensor, SensorInput
+from rigidjax.identify.propagation import sensor_inputs, what_turns
+from rigidjax.identify.sensors import AbstractSensor
 from rigidjax.motion import Attitude, Rigid, Spin
 from rigidjax.motion.coupled import Coupled
 from rigidjax.motion.torques.base import Torque
 from rigidjax.solve import simulate
 
-Readings = Float[Array, "times ..."]
 Body = Inertia | MassProperties
 State = Spin | Attitude | Rigid
 Times = Float[ArrayLike, " times"] | Sequence[float]
-
-
-@overload
-def simulate_readings(
-    sensor: AbstractSensor,
-    body: Body,
-    state0: State,
-    ts: Times,
-    torque: Torque | None = None,
-    *,
-    key: Any = None,
-) -> Readings: ...
-
-
-@overload
-def simulate_readings(
-    sensor: Sequence[AbstractSensor],
-    body: Body,
-    state0: State,
-    ts: Times,
-    torque: Torque | None = None,
-    *,
-    key: Any = None,
-) -> tuple[Readings, ...]: ...
 
 
 def simulate_readings(
@@ -56,25 +31,23 @@ def simulate_readings(
     torque: Torque | None = None,
     *,
     key: Any = None,
-) -> Readings | tuple[Readings, ...]:
+) -> Any:
     """The readings of a sensor along a known motion, with noise: data to test a fit.
 
     The motion comes from `rigidjax.simulate`; bias, scale, mounting, clock offset, low-pass filter
-    and full scale come from the sensor. The residuals of a fit with the same sensor are the noise.
-    The function is differentiable, and works under `jax.jit` and `jax.vmap`.
+    and full scale from the sensor. The residuals of a fit with the same sensor are the noise. The
+    function is differentiable, and works under `jax.jit` and `jax.vmap`.
 
-    **Arguments:** `sensor` an `AbstractSensor`, or a sequence of them along one motion;
-    `body`, `state0`, `ts` (T,) s, `torque` as for `rigidjax.simulate`; `MassProperties` are allowed
-    for all states (a sensor's `place` is then in their frame). `key` of `jax.random`: normal noise
-    of the sensor's standard deviation `noise` is added; `None` for readings without noise.
-
-    **Returns** readings (T, …) by the sensor's `reading_shape`, in its unit, for
-    `Recording(ts, (sensor, readings), torque=torque)`; for a sequence a tuple of them.
+    **Arguments:** `sensor` an `AbstractSensor`, or a sequence of them along one motion; `body`,
+    `state0`, `ts` (T,) s, `torque` as for `rigidjax.simulate`; `MassProperties` are allowed for all
+    states (a sensor's `place` is then in their frame). `key` of `jax.random`: normal noise of the
+    sensor's standard deviation `noise` is added; `None` for readings without noise. **Returns**
+    readings (T, …) by the sensor's `reading_shape`, in its unit, for `Recording(ts, (sensor,
+    readings), torque=torque)`; for a sequence a tuple of them.
 
     **Raises:** `TypeError` for anything but a sensor, and for a state without the parts that the
     sensor reads; `ValueError` for a key if the sensor's noise is `None`, and for a sensor of your
-    own without a method `reading_of` if its readings have another shape than its error; as
-    `rigidjax.simulate`.
+    own without a method `reading_of` if its readings have another shape than its error.
 
     >>> import rigidjax as rj
     >>> body, start = rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([0.0, 0.0, 2.0])
@@ -113,33 +86,24 @@ def _readings(
     state0: Any,
     states: Any,
     key: Any,
-) -> Readings:
+) -> Float[Array, "times ..."]:
     times, states, now = sensor_inputs(sensor, body, torque, ts, state0, states)
     error = jnp.zeros((ts.shape[0], sensor.components), ts.dtype)
     if key is not None:
         assert sensor.noise is not None
         error = sensor.noise[None] * jax.random.normal(key, error.shape, ts.dtype)
     lowpass = getattr(sensor, "lowpass", None)
-    if lowpass is not None:
-        nothing = jnp.zeros(sensor.reading_shape, ts.dtype)
-        shown = jax.vmap(lambda t, y: -sensor.error(now(t, y), nothing))(times, states)
-        values = lowpass(times, shown) + error
-    else:
-        reading = getattr(sensor, "reading_of", None) or _Plain(sensor)
+    reading = getattr(sensor, "reading_of", None)
+    if reading is not None:
         values = jax.vmap(lambda t, y, e: reading(now(t, y), e))(times, states, error)
+    else:
+        # The error of a zero reading is the prediction with the opposite sign.
+        nothing = jnp.zeros(sensor.reading_shape, ts.dtype)
+        missed = jax.vmap(lambda t, y: sensor.error(now(t, y), nothing))(times, states)
+        missed = missed if lowpass is None else -lowpass(times, -missed)
+        values = (error - missed).reshape(ts.shape[0], *sensor.reading_shape)
     limit = getattr(sensor, "limit", None)
     return values if limit is None else jnp.clip(values, -limit[None], limit[None])
-
-
-class _Plain(eqx.Module):
-    """Prediction plus error, for a sensor whose error is reading minus prediction."""
-
-    sensor: AbstractSensor
-
-    def __call__(self, now: SensorInput, error: Array) -> Array:
-        shape = self.sensor.reading_shape
-        nothing = jnp.zeros(shape, error.dtype)
-        return (error - self.sensor.error(now, nothing)).reshape(shape)
 
 
 def _fits(sensor: Any, state0: Any, key: Any) -> None:

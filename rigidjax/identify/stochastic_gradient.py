@@ -12,8 +12,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from rigidjax import _checks
 from rigidjax.identify.parameters import Parameters
 from rigidjax.identify.problem import Problem
-from rigidjax.identify.residual import Noise, residuals
-from rigidjax.identify.search import half_sum
+from rigidjax.identify.terms import Noise, half_sum, residuals
 
 if TYPE_CHECKING:
     import optax
@@ -25,16 +24,12 @@ STRIDE = 50
 class Descent(eqx.Module):
     """The first descent of a fit, on a few recordings at a time.
 
-    Each step draws `batch` recordings, differentiates their misfit (exactly, by forward mode within
-    each recording) and hands the gradient of all parameters to `optimiser`. The parameters of a
-    `Problem` are unconstrained and of order one, so that a learning rate is a share of order one.
-
-    **Arguments:** `optimiser` any `optax.GradientTransformation`; `steps` their number; `batch` the
-    number of recordings in a step, drawn without replacement.
-
-    Source: Robbins and Monro 1951, doi:10.1214/aoms/1177729586; the optimisers are optax's.
-
-    **Raises:** `TypeError` for anything but an optimiser, `ValueError` for counts below one.
+    Each step draws `batch` recordings without replacement, differentiates their misfit and hands
+    the gradient of all parameters to `optimiser`. The parameters are unconstrained and of order
+    one: a learning rate is a share of order one. **Arguments:** `optimiser` any
+    `optax.GradientTransformation`; `steps` their number; `batch`. **Raises:** `TypeError` for
+    anything but an optimiser, `ValueError` for counts below one. Source: Robbins and Monro 1951,
+    doi:10.1214/aoms/1177729586.
 
     >>> import optax, rigidjax as rj
     >>> rj.identify.Descent(optax.adam(1e-2), steps=200, batch=4).batch
@@ -62,12 +57,8 @@ def descend(
     key: PRNGKeyArray,
     progress: Callable[[str], Any] | None = None,
 ) -> tuple[Parameters, bool]:
-    """The end of the steps of `how`, or the last point before the misfit became NaN.
-
-    **Arguments:** `start`; `problem` of any number of recordings; `noise` (R, k) of each sensor;
-    `how`; `key` of the draws; `progress` called with a line of text now and then. **Returns** the
-    point, and whether the steps were not interrupted (Ctrl-C). **Raises** `ValueError` if a batch
-    is larger than the number of recordings, or the recordings are pieces of one.
+    """The end of the steps, or the last point before a misfit of NaN; and whether it was not
+    interrupted.
     """
     if how.batch > problem.count:
         raise ValueError(
@@ -112,10 +103,7 @@ def _stride(
 
 
 def _misfit_of(point: Parameters, problem: Problem, noise: Noise, rows: Array) -> Float[Array, ""]:
-    """The estimate of the whole misfit by these recordings: theirs times the number of batches.
-
-    Priors count once.
-    """
+    """These recordings' misfit times the number of batches; priors count once."""
     few, mine, theirs = only(problem, rows), _rows(point.own, rows), tuple(n[rows] for n in noise)
     weights = jnp.ones_like(few.records.t)
     read, beside = residuals(Parameters(point.body, point.shared, mine), (few, theirs, weights))
@@ -123,10 +111,7 @@ def _misfit_of(point: Parameters, problem: Problem, noise: Noise, rows: Array) -
 
 
 def only(problem: Problem, rows: Array) -> Problem:
-    """The problem of some of its recordings, by their indices (which may be traced).
-
-    It serves misfits alone: its `recordings` are not cut to their own lengths.
-    """
+    """The problem of some recordings (traced indices), for misfits: they keep their padding."""
 
     def pick(at: Any, whole: Any) -> Any:
         return whole if at(whole) is None else eqx.tree_at(at, whole, _rows(at(whole), rows))

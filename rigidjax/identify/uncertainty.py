@@ -11,11 +11,10 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from rigidjax.identify.full_scale import at_limit
-from rigidjax.identify.levenberg_marquardt import beside_rows
 from rigidjax.identify.parameters import Parameters, places
 from rigidjax.identify.problem import Problem
-from rigidjax.identify.residual import Noise, weights_of, whitened, with_rows
-from rigidjax.identify.search import evaluate
+from rigidjax.identify.search import beside_rows, evaluate
+from rigidjax.identify.terms import Noise, weights_of, whitened, with_rows
 
 # A direction is undetermined if its singular value is below this share of the largest.
 BLIND = 1e-8
@@ -24,12 +23,9 @@ WEAKEST = 1e-6
 
 
 class Linearised(eqx.Module):
-    """A problem about its best point: whitened errors, their derivatives, their weights.
-
-    **Fields:** for each sensor `raw` errors (R, T, k) in its unit, whitened `errors` (R, T, k),
-    `slopes` (R, T, k, m) in the m numbers that a recording depends on, `weights` (R, T); `places`
-    (R, m) of these among the n free numbers, n for none; `extra` (j,) and `extra_slopes`
-    (j, n) of priors and joints.
+    """A problem about its best point. For each sensor `raw` errors (R, T, k) in its unit, whitened
+    `errors`, `slopes` (R, T, k, m) in a recording's numbers, `weights` (R, T); their `places` (R,
+    m) among the n free numbers; `extra` (j,), `extra_slopes` (j, n) of priors and joints.
     """
 
     raw: tuple[np.ndarray, ...]
@@ -61,11 +57,7 @@ class Linearised(eqx.Module):
 
     @property
     def rows(self) -> np.ndarray:
-        """Rows (N, n) whose Gram matrix is that of the Jacobian, each row weighted.
-
-        The rows of a recording are reduced to a triangle: as many as the numbers that it depends
-        on.
-        """
+        """Rows (N, n) with the Gram matrix of the weighted Jacobian, reduced to triangles."""
         if not np.isfinite(self.dense).all():
             return np.full((1, self.size), np.nan)
         return np.concatenate([*self.apart(np.linalg.qr(self.dense, mode="r")), self.extra_slopes])
@@ -93,11 +85,7 @@ class Linearised(eqx.Module):
 @eqx.filter_jit
 def _linearised(problem: Problem, parameters: Parameters, noise: Noise, found: Any) -> Any:
     (errors, ends), (blocks, end_blocks) = found
-
-    def of(errors: tuple) -> tuple[Array, ...]:
-        return whitened(problem, errors, noise)
-
-    out, slopes = with_rows(of, errors, blocks)
+    out, slopes = with_rows(lambda e: whitened(problem, e, noise), errors, blocks)
     flat, restore = ravel_pytree(parameters)
     extra, extra_slopes = beside_rows(problem, flat, restore, ends, end_blocks)
     weights = weights_of(problem, errors, noise)
@@ -116,10 +104,8 @@ def linearise(
     found: Any = None,
     near: Parameters | None = None,
 ) -> Linearised:
-    """Errors, derivatives and weights at these parameters, as NumPy arrays.
-
-    **Arguments:** `found` the result of `evaluate` there, if known; `near` another point for the
-    derivatives beside a flat body (`rigidjax.identify.flat_limit.beside`).
+    """Errors, derivatives and weights as NumPy arrays; `found` that of `evaluate`, if known; `near`
+    the point of the derivatives beside a flat body.
     """
     found = evaluate(parameters, problem) if found is None else found
     (errors, slopes, weights), where, extra, extra_slopes = jax.tree.map(
@@ -133,13 +119,9 @@ def linearise(
 
 
 class Spread(eqx.Module):
-    """Covariance of the parameters and its method.
-
-    **Fields:** `covariance` (n, n), infinite for a number that depends on an undetermined
-    direction; `seen` (n, n) the same within the determined directions; `kind` the method in words;
-    `singular_values` (n,) of the weighted Jacobian, its columns of length one; `null_directions`
-    (k, n) that the data do not determine; `root` (n, m) of the covariance of white errors,
-    `root rootᵀ`.
+    """Covariance of the parameters, infinite along undetermined directions, `seen` within the
+    determined ones, and its method; `singular_values` of the weighted Jacobian with columns of
+    length one; `null_directions` (k, n); `root` (n, m) of the covariance of white errors.
     """
 
     covariance: np.ndarray
@@ -151,10 +133,7 @@ class Spread(eqx.Module):
 
 
 def of_white(linear: Linearised) -> Spread:
-    """`(JᵀWJ)⁻¹`, for white and other errors: the result of Laplace's method.
-
-    A direction has infinite variance if its singular value is below 1e-8 of the largest.
-    """
+    """`(JᵀWJ)⁻¹`; infinite for singular values below 1e-8 of the largest."""
     rows = linear.rows
     n = rows.shape[1]
     if not np.isfinite(rows).all():
@@ -178,17 +157,12 @@ def of_white(linear: Linearised) -> Spread:
 def spread(linear: Linearised, times: "Times", white: Spread | None = None) -> Spread:
     """`(JᵀWJ)⁻¹` for white errors, else the sandwich `H⁻¹ M H⁻¹`.
 
-    `M = Jᵀ C J` with C the errors' own covariance in time. The part of each channel that its second
-    differences show is white; the rest decays exponentially. Fitted errors do not show the decay
-    time well, since a fit removes their slow part. Each number gets the largest variance over all
-    times from two samples to half a record. Fitted errors are smaller than true ones, the more so
-    the fewer are independent: M is multiplied by n/(n − p) for n independent errors. With many
-    recordings the variance between recordings is used if it is larger.
-
-    **Arguments:** `linear`; `times` the errors' autocorrelation times; `white` the result of
-    `of_white`, if known.
-
-    Source: White 1980, doi:10.2307/1912934; Liang and Zeger 1986, doi:10.1093/biomet/73.1.13.
+    `M = Jᵀ C J` with C the errors' covariance in time: of each channel what second differences show
+    is white, the rest decays. Fitted errors do not show the decay time well, so that each number
+    gets the largest variance over all times from two samples to half a record; they are too small,
+    so that M is multiplied by n/(n − p) for n independent errors. The variance between many
+    recordings counts if it is larger. Source: White 1980, doi:10.2307/1912934; Liang and Zeger
+    1986, doi:10.1093/biomet/73.1.13.
     """
     white = of_white(linear) if white is None else white
     if times.longest <= 1.5 or not np.isfinite(white.seen).all():
@@ -219,17 +193,9 @@ def inverted(information: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return half, null / np.linalg.norm(null, axis=1, keepdims=True)
 
 
-def step(linear: Linearised, white: Spread) -> np.ndarray:
-    """The step (n,) to the linear least misfit, −(JᵀWJ)⁻¹g in determined directions."""
-    return -white.seen @ linear.slope
-
-
 def distance(linear: Linearised, white: Spread, held: Sequence[np.ndarray] = ()) -> float:
-    """The distance to the least misfit in standard deviations of white errors, √(gᵀ(JᵀWJ)⁻¹g).
-
-    It is the linear problem's distance in determined directions: the criterion of MINUIT (James and
-    Roos 1975, doi:10.1016/0010-4655(75)90039-9). **Arguments:** `white` the result of `of_white`;
-    `held` derivatives (n,) of a quantity held fixed.
+    """The distance to the least misfit in standard deviations, √(gᵀ(JᵀWJ)⁻¹g), as MINUIT's (James
+    and Roos 1975, doi:10.1016/0010-4655(75)90039-9); derivatives `held` (n,) stay fixed.
     """
     covariance = white.seen
     for row in held:
@@ -239,10 +205,8 @@ def distance(linear: Linearised, white: Spread, held: Sequence[np.ndarray] = ())
 
 
 def _sandwich(linear: Linearised, half: np.ndarray, times: "Times") -> np.ndarray:
-    """The sandwich whose bread is `half halfᵀ`.
-
-    The meat is computed for orthonormal columns. For slopes between two breads, round-off would
-    make the variance of a weakly determined direction negative.
+    """The sandwich of bread `half halfᵀ`; its meat is of orthonormal columns, for round-off between
+    two breads would make variances negative.
     """
     columns, triangles = np.linalg.qr(linear.dense)
     seen = np.concatenate(linear.apart(triangles)) @ half
@@ -268,10 +232,7 @@ def _sandwich(linear: Linearised, half: np.ndarray, times: "Times") -> np.ndarra
 
 
 def _channels(linear: Linearised, columns: np.ndarray) -> Iterator[tuple[np.ndarray, float, float]]:
-    """For each channel the `columns` (R, T, m), the variance of its errors, its smooth share.
-
-    `columns` (R, N, m) of each recording, rows as in `Linearised.dense`.
-    """
+    """For each channel its `columns` (R, T, m), the variance of its errors, their smooth share."""
     first = 0
     for error, weight in zip(linear.errors, linear.weights, strict=True):
         root, last = np.sqrt(weight), first + error[0].size
@@ -322,11 +283,8 @@ def _fading(x: np.ndarray, rho: float) -> np.ndarray:
 
 
 class Times(eqx.Module):
-    """The number of samples over which errors are autocorrelated, for each channel of each sensor.
-
-    **Fields:** `spans` one tuple for each sensor, 1 for white errors; `closeness` the correlation
-    from one sample to the next in the channel of the longest; `independent` the number of
-    independent errors.
+    """The samples over which errors are autocorrelated (1: white), a tuple for each sensor;
+    `closeness` the correlation of neighbours in the worst channel; `independent` errors in all.
     """
 
     spans: tuple[tuple[float, ...], ...]
@@ -340,10 +298,8 @@ class Times(eqx.Module):
 
 
 def correlation_times(linear: Linearised, cut: tuple[np.ndarray, ...] | None = None) -> Times:
-    """The integrated autocorrelation time `1 + 2 Σ ρ_l` of each channel.
-
-    The sum ends at the first lag at which ρ falls below twice its own scatter. Readings at full
-    scale (`cut`, (R, T, k) for each sensor) take no part.
+    """The autocorrelation time `1 + 2 Σ ρ_l` of each channel, up to the first ρ below twice its
+    scatter; readings at full scale (`cut`) take no part.
     """
     cut = tuple(np.zeros(e.shape, bool) for e in linear.errors) if cut is None else cut
     spans, longest, closest, independent = [], 1.0, 0.0, 0.0
@@ -384,10 +340,8 @@ def _channel_time(e: np.ndarray, seen: np.ndarray) -> tuple[float, float]:
 
 
 def estimate_noise(problem: Problem, errors: tuple, noise: Noise, parameters: Parameters) -> Noise:
-    """Noise (R, k) of each sensor: as given, or the weighted scatter of its errors.
-
-    It is one figure for all channels of a sensor and all recordings of a group. The number of free
-    parameters is subtracted from the number of errors.
+    """Noise (R, k) of each sensor: as given, or the weighted scatter of its errors, one figure for
+    all channels and the recordings of a group.
     """
     free = ravel_pytree(parameters)[0].size
     weights = weights_of(problem, errors, noise)

@@ -1,6 +1,7 @@
 """The fit of a model to many short open-loop runs: Gauss and Newton over windows."""
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any, Generic, TypeVar
 
 import equinox as eqx
@@ -13,18 +14,116 @@ from jaxtyping import Array, Float
 
 from rigidjax import _checks
 from rigidjax.identify import flat_limit
-from rigidjax.identify.horizons import Horizons, by_horizon, held_errors
-from rigidjax.identify.jacobian import with_jacobian
+from rigidjax.identify.flat_limit import unreal
 from rigidjax.identify.levenberg_marquardt import BOLD, Search, Settings, search
-from rigidjax.identify.open_loop import all_errors, open_loop_errors
 from rigidjax.identify.quantities import carried
-from rigidjax.identify.real_bodies import unreal
+from rigidjax.identify.terms import with_jacobian
 from rigidjax.identify.uncertainty import inverted
-from rigidjax.identify.window_starts import eliminated, precisions, require_kinds
-from rigidjax.identify.windows import Windows
-from rigidjax.motion.manifold import names, parts, plus
-from rigidjax.motion.torques.inputs import delays_of, require_inputs
+from rigidjax.identify.windows import Horizons, Windows, by_horizon, held_errors
+from rigidjax.motion.coupled import Coupled, motion_of, started
+from rigidjax.motion.manifold import minus_small, names, parts, plus
+from rigidjax.motion.torques.inputs import bind, delays_of, require_inputs
+from rigidjax.solve import equations_of_motion
+from rigidjax.solve.components import split
+from rigidjax.solve.equal_steps import in_a_loop
+from rigidjax.solve.fixed_loop import first_row, first_rows, step
+from rigidjax.solve.steppers import cheapest, stepper_of
 from rigidjax.solve.validation import require_fit
+
+
+def open_loop_errors(
+    scene: Any, h: float, value: Any, start: Any, wanted: Any, inputs: Any, steps: Any = None
+) -> Float[Array, "steps n"]:
+    """The errors of one window, as changes from the measured states; zero beyond `steps`."""
+    body, law = scene(value)
+    size, length = jnp.asarray(h, wanted.omega.dtype), wanted.omega.shape[0]
+    before = next(iter(inputs.values())).shape[0] - length if inputs else 0
+    start = started(body, start, bind(law, first_row(law, size, inputs)), 0.0)
+    field = equations_of_motion(body, start, law)
+    stepper = stepper_of(in_a_loop(cheapest(field)), field, start)
+
+    def one(y: Any, i: Array) -> tuple[Any, Any]:
+        y = step(stepper, size, jnp.zeros_like(size), i, y, inputs or None, before)
+        return y, motion_of(stepper.state(y))
+
+    def ahead(y: Any, i: Array) -> tuple[Any, None]:
+        # The torque's own states follow the inputs; the body keeps its measured state.
+        y = step(stepper, size, jnp.zeros_like(size), i, y, inputs, before)
+        return split(Coupled(start.motion, stepper.state(y).own)), None
+
+    y0 = stepper.start
+    if before and isinstance(start, Coupled):
+        y0, _ = lax.scan(ahead, y0, jnp.arange(-before, 0, dtype=jnp.int32))
+    states = first_rows(length if steps is None else steps, one, y0, wanted)
+    return jax.vmap(minus_small)(states, wanted)
+
+
+@eqx.filter_jit
+def all_errors(windows: Windows, scene: Any, value: Any) -> Float[Array, "windows steps n"]:
+    """The errors of a model with these numbers."""
+    of = partial(open_loop_errors, scene, windows.step, value)
+    parts = (windows.starts, windows.wanted, windows.inputs)
+    return lax.map(lambda window: of(*window), parts, batch_size=min(128, windows.count))
+
+
+# Steps of Gauss and Newton's for each start; residuals of a short run are nearly linear in it.
+_STEPS = 3
+
+
+def precisions(
+    starts: Any, kinds: tuple[str, ...], noise: Mapping[str, float] | None
+) -> Float[Array, " m"] | None:
+    """The precision of each number of the starts, (noise/deviation)²; `None` for exact starts."""
+    if starts is None:
+        return None
+    require_kinds(starts, kinds, "starts")
+    if noise is None:
+        raise ValueError(
+            "starts: deviations of the starts need the noise of the readings: give noise={…}, too"
+        )
+    found = []
+    for kind in kinds:
+        deviation = _checks.number(starts[kind], f"starts[{kind!r}]")
+        if not deviation > 0:
+            raise ValueError(
+                f"starts[{kind!r}]: wanted a positive deviation, or infinity for a start that is "
+                f"free, got {deviation}"
+            )
+        found += 3 * [(np.float64(noise[kind]) / deviation) ** 2]
+    return jnp.asarray(np.array(found))
+
+
+def require_kinds(given: Any, kinds: tuple[str, ...], name: str) -> None:
+    """Raise `TypeError`, `ValueError` for anything but a mapping with these keys."""
+    _checks.instance(given, Mapping, name, wanted="numbers by kind")
+    if set(given) != set(kinds):
+        raise ValueError(f"{name}: wanted a number for each of {kinds}, got {tuple(given)}")
+
+
+def eliminated(
+    residual: Callable[[Array, Array], Array], x: Array, firm: Float[Array, " m"]
+) -> tuple[Array, Array, Array]:
+    """Cost `½ |r|² + ½ Σ firm step²`, normal matrix and gradient of one window, the best start put
+    in (variable projection: Golub and Pereyra 2003, doi:10.1088/0266-5611/19/2/201).
+    """
+    number = x.size
+
+    def better(_: Any, step: Array) -> Array:
+        jacobian, found = with_jacobian(lambda s: residual(x, s), step)
+        normal = jacobian.T @ jacobian + jnp.diag(firm)
+        return step - jnp.linalg.solve(normal, jacobian.T @ found + firm * step)
+
+    step = lax.fori_loop(0, _STEPS, better, jnp.zeros_like(firm))
+    both = jnp.concatenate([x, step])
+    jacobian, found = with_jacobian(lambda z: residual(z[:number], z[number:]), both)
+    gram, slope = jacobian.T @ jacobian, jacobian.T @ found
+    beside = gram[number:, number:] + jnp.diag(firm)
+    # The part of each number's effect that the start absorbs, and the remaining gradient.
+    sides = jnp.c_[gram[number:, :number], slope[number:] + firm * step]
+    taken = gram[:number, number:] @ jnp.linalg.solve(beside, sides)
+    cost = 0.5 * (found @ found + jnp.sum(firm * step * step))
+    return cost, gram[:number, :number] - taken[:, :number], slope[:number] - taken[:, number]
+
 
 Value = TypeVar("Value")
 # Windows in one batch: with their tangents they fill the first cache.
@@ -93,18 +192,14 @@ def fit_windows(
     the starts as measured; `max_steps` of the search. The motion is computed by `RungeKutta4`, one
     step a sample.
 
-    Levenberg–Marquardt (`rigidjax.identify.levenberg_marquardt`) on normal equations that are
-    summed window by window, so that memory does not grow with their number. Uncertain starts are
-    found window by window, and eliminated from the normal equations (variable projection). A long
-    run from a poor guess diverges: the search first uses a ninth and a third of long windows, with
-    ten steps at most for each, and continues from there (from the guess, if the cost is higher than
-    at the guess). The search ends when a step gains less than 0.05² of the gain of a fit from noise
-    alone: about 0.05 standard deviations.
+    Levenberg–Marquardt on normal equations that are summed window by window. Uncertain starts are
+    found window by window, and eliminated (variable projection). The search first uses a ninth and
+    a third of long windows, since a long run from a poor guess diverges, and ends when a step gains
+    less than 0.05² of the gain of a fit from noise alone: about 0.05 standard deviations.
 
-    **Returns** a `WindowFit`; a fit that ends early returns its best point and says so.
-
-    **Raises:** `ValueError` for missing inputs, unknown kinds, and a guess with runs that are not
-    finite; `TypeError` if body, states and torque do not fit together.
+    **Returns** a `WindowFit`; a fit that ends early returns its best point and says so. **Raises:**
+    `ValueError` for missing inputs, unknown kinds, and a guess with runs that are not finite;
+    `TypeError` if body, states and torque do not fit together.
 
     >>> import rigidjax as rj
     >>> t = np.linspace(0.0, 1.0, 11)
@@ -121,7 +216,13 @@ def fit_windows(
     x, back = _numbers(guess, windows.starts.omega.dtype)
     guess = back(x)
     start = jax.tree.map(lambda a: a[0], windows.starts)
-    _require_scene(windows, start, scene(guess))
+    made = scene(guess)
+    if not isinstance(made, tuple) or len(made) != 2:
+        raise TypeError(f"scene: wanted (body, torque), got {type(made).__name__}")
+    require_fit(made[0], start, made[1])
+    require_inputs(made[1], windows.inputs)
+    if wrong := _too_late(windows, made[1]):
+        raise ValueError(wrong)
     whole = windows.length
     scales = _scales(windows, whole, noise)
     firm = precisions(starts, names(windows.starts), noise)
@@ -135,7 +236,11 @@ def fit_windows(
 
     evaluated = Settings(_SETTLED, BOLD, 0)
     last = Settings(_SETTLED, BOLD, max_steps, level=_LEVEL)
-    begin = _grown(searched, guess, back, whole)
+    begin = guess
+    for part in _PARTS:
+        if whole // part >= _SHORTEST:
+            end = searched(begin, Settings(_SETTLED, BOLD, _FEW, level=_ROUGH), whole // part)
+            begin = back(end.point) if np.isfinite(end.cost) else begin
     end = searched(begin, last, whole)
     if begin is not guess and not end.cost <= searched(guess, evaluated, whole).cost:
         end = searched(guess, last, whole)
@@ -183,22 +288,11 @@ def _deviations(there: Search, point: np.ndarray, count: int) -> tuple[np.ndarra
     return deviation, message
 
 
-def _grown(searched: Any, guess: Any, back: Any, length: int) -> Any:
-    """The end of searches over the first parts of the windows, one after another."""
-    value = guess
-    for part in _PARTS:
-        if length // part >= _SHORTEST:
-            end = searched(value, Settings(_SETTLED, BOLD, _FEW, level=_ROUGH), length // part)
-            if np.isfinite(end.cost):
-                value = back(end.point)
-    return value
-
-
 def _require_windows(windows: Any) -> None:
     _checks.instance(windows, Windows, "windows", wanted="what identify.windows returns")
-    for name in ("starts", "wanted"):
+    for name, wanted in (("starts", 2), ("wanted", 3)):
         for leaf in jax.tree.leaves(getattr(windows, name)):
-            if leaf.ndim != (2 if name == "starts" else 3) or not leaf.shape[0]:
+            if leaf.ndim != wanted or not leaf.shape[0]:
                 raise ValueError(
                     f"windows: wanted a row for each of N windows in {name}, got {leaf.shape}"
                 )
@@ -213,16 +307,6 @@ def _numbers(guess: Any, kind: Any) -> tuple[Float[Array, " n"], Callable[[Array
     if not x.size:
         raise ValueError("guess: wanted a tree of floating numbers, at least one")
     return x, back
-
-
-def _require_scene(windows: Windows, start: Any, made: Any) -> None:
-    if not isinstance(made, tuple) or len(made) != 2:
-        raise TypeError(f"scene: wanted (body, torque), got {type(made).__name__}")
-    body, law = made
-    require_fit(body, start, law)
-    require_inputs(law, windows.inputs)
-    if wrong := _too_late(windows, law):
-        raise ValueError(wrong)
 
 
 def _too_late(windows: Windows, law: Any) -> str | None:
@@ -255,12 +339,9 @@ def _scales(windows: Windows, steps: int, noise: Mapping[str, float] | None) -> 
 
 
 def _padded(windows: Windows) -> tuple[Any, Any, Any]:
-    """Starts, states and inputs of the windows. The last window is repeated until their number is a
-    multiple of the batch: a remainder would need a second program.
-    """
-    order = np.minimum(
-        np.arange(-(-windows.count // _SIDE_BY_SIDE) * _SIDE_BY_SIDE), windows.count - 1
-    )
+    """Starts, states and inputs, the last repeated to full batches: a rest needs a program more."""
+    batches = -(-windows.count // _SIDE_BY_SIDE)
+    order = np.minimum(np.arange(batches * _SIDE_BY_SIDE), windows.count - 1)
     parts = (windows.starts, windows.wanted, windows.inputs)
     return jax.tree.map(lambda a: jnp.asarray(np.asarray(a)[order]), parts)
 
@@ -277,9 +358,8 @@ def _searched(
     settings: Settings,
     steps: Any,
 ) -> Search:
-    """The search from `guess`; it keeps the spread of the windows' gradients (n, n).
-
-    `count` of the windows, the first ones, take part, and the first `steps` of each.
+    """The search from `guess` over the first `steps` of the first `count` windows; it keeps the
+    spread of the windows' gradients (n, n).
     """
     x, back = ravel_pytree(guess)
 
@@ -324,10 +404,8 @@ def _searched(
 
 
 def _by_noise(spread: Array, gram: Array) -> Array:
-    """½ tr(K G⁻¹): the mean excess of the cost at the true numbers over the least cost.
-
-    It is half a residual's variance for each number if residuals are independent. Source: Takeuchi
-    1976; Burnham and Anderson 2002, doi:10.1007/b97636, section 7.2.
+    """½ tr(K G⁻¹), the mean excess of the cost at the true numbers: Takeuchi 1976; Burnham and
+    Anderson 2002, doi:10.1007/b97636, section 7.2.
     """
     felt = jnp.diagonal(gram)
     root = jnp.sqrt(jnp.maximum(felt, 1e-12 * jnp.max(felt)))

@@ -15,13 +15,13 @@ from rigidjax import _checks, exact
 from rigidjax.body.inertia import Inertia, tensor_of
 from rigidjax.identify import answers, padding, uncertainty
 from rigidjax.identify.answers import FAILS, FOUND, LEAVES, NOT_ALONE, NOT_ENDED, Answer
+from rigidjax.identify.body_charts import Bodies
 from rigidjax.identify.checkpoint import Tried
 from rigidjax.identify.fit import fit
 from rigidjax.identify.parameters import Parameters
 from rigidjax.identify.problem import Problem, one_problem
 from rigidjax.identify.quantities import carried, quantities, values_and_slopes
 from rigidjax.identify.result import Fit
-from rigidjax.identify.several_bodies import Bodies
 from rigidjax.motion.torques.base import vector_at
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.linalg3 import apply, dot

@@ -14,7 +14,7 @@ from estimate import records
 
 import rigidjax as rj
 from rigidjax import estimate, identify
-from rigidjax.estimate.terms import curvature
+from rigidjax.estimate.density import curvature
 from rigidjax.identify.answers import Answer
 
 

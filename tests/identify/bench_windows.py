@@ -27,8 +27,9 @@ jax.config.update("jax_enable_x64", True)
 
 import rigidjax as rj
 from rigidjax import identify, torques
-from rigidjax.identify import horizons, open_loop, window_fit
+from rigidjax.identify import window_fit
 from rigidjax.identify.levenberg_marquardt import Settings
+from rigidjax.identify.windows import by_horizon
 
 _spec = importlib.util.spec_from_file_location(
     "nanodrone", Path(__file__).with_name("bench_nanodrone.py")
@@ -248,8 +249,8 @@ def main():
         )  # fmt: skip
 
     def alone():
-        found = open_loop.all_errors(windows, scene, jnp.asarray(GUESS))
-        horizons.by_horizon(windows.starts, found)
+        found = window_fit.all_errors(windows, scene, jnp.asarray(GUESS))
+        by_horizon(windows.starts, found)
 
     timed("ours, errors alone and their means", alone, options.repeats)
     once = timed("ours, errors and derivatives", evaluated, options.repeats)

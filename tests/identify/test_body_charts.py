@@ -41,7 +41,7 @@ def test_what_is_known_stays(free):
 
 def test_all_is_free_by_default():
     chart = identify.Mass(BOX)
-    assert (chart.size, chart.in_words) == (10, "mass, centre of mass and inertia tensor")
+    assert chart.size == 10
     assert (*chart.log_names, *chart.plain_names) == (
         "mass",
         "I1",

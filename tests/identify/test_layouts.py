@@ -8,8 +8,7 @@ import pytest
 
 from rigidjax.__main__ import main
 from rigidjax.identify import read_table
-from rigidjax.identify.csv_io import LogError
-from rigidjax.identify.layouts import USUAL, layout_of
+from rigidjax.identify.csv_io import USUAL, LogError, layout_of
 
 PHYPHOX = '"Time (s)","{0} x (rad/s)","{0} y (rad/s)","{0} z (rad/s)","{1} (rad/s)"\n'
 

@@ -19,10 +19,10 @@ from rigidjax.__main__ import main
 from rigidjax.identify import checkpoint, cli_spec, quantities, search
 from rigidjax.identify.checkpoint import Tried
 from rigidjax.identify.csv_io import LogError
-from rigidjax.identify.jacobian import errors_of_one, with_blocks
 from rigidjax.identify.multiple_shooting import pieces
 from rigidjax.identify.padding import one
 from rigidjax.identify.parameters import local, places
+from rigidjax.identify.terms import errors_of_one, with_blocks
 
 BODY = rj.Inertia.from_principal(1.0, 1.6, 2.1)
 DRAG = [0.05, 0.08, 0.02]

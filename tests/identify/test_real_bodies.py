@@ -7,7 +7,7 @@ from scipy.integrate import solve_ivp
 
 import rigidjax as rj
 from rigidjax import identify
-from rigidjax.identify.real_bodies import of_charts, unreal
+from rigidjax.identify.flat_limit import of_charts, unreal
 
 T = np.linspace(0.0, 3.0, 61)
 TORQUE = np.array([0.1, -0.2, 0.15])
@@ -16,7 +16,7 @@ TORQUE = np.array([0.1, -0.2, 0.15])
 class Moments(identify.AbstractBodyChart):
     """Three moments, each by its logarithm: nothing keeps the triangle inequality."""
 
-    size, in_words, unit = 3, "three moments", "kg m²"
+    size, unit = 3, "kg m²"
     log_names, plain_names = ("A", "B", "C"), ()
 
     def body(self, vector):

@@ -14,8 +14,8 @@ import rigidjax as rj
 from rigidjax import identify
 from rigidjax.identify import search
 from rigidjax.identify.checkpoint import SearchState, Tried
-from rigidjax.identify.levenberg_marquardt import Search, Settings, descend
-from rigidjax.identify.search import climb, fresh, horizon, misfit, settle, whole
+from rigidjax.identify.levenberg_marquardt import Search, Settings
+from rigidjax.identify.search import Task, climb, descend, horizon, misfit, settle, whole
 
 TS = np.linspace(0.0, 1.0, 8)
 
@@ -54,7 +54,7 @@ def test_a_stride_that_is_lost_leaves_where_it_began_and_its_misfit(problem, mon
     def note(tried, strides, over):
         seen.append((strides, over))
 
-    out = settle(fresh(at(problem, 2.0)), problem, (), jnp.ones((1, 8)), 1e-4, 100, note)
+    out = settle(Tried(at(problem, 2.0)), Task(problem, (), 1e-4, 100), jnp.ones((1, 8)), note)
     assert place(out.parameters) == 2.0 and float(out.cost) == 7.0
     assert not bool(out.converged) and seen == [(1, True)]
 
@@ -70,9 +70,9 @@ def test_a_part_is_not_fitted_at_the_cost_of_the_whole(problem, monkeypatch, bey
         tried = Tried(at(problem, 1.0), jnp.asarray(1e3), jnp.asarray(True))
         return tried, an_end(1.0)
 
-    monkeypatch.setattr(search, "_descend", step)
+    monkeypatch.setattr(search, "descend", step)
     monkeypatch.setattr(search, "cost_of", lambda point, *_: 1.0 if place(point) == 0.0 else beyond)
-    climb(SearchState(0, 0, fresh(at(problem, 0.0))), problem, (), 1e-4, 25)
+    climb(SearchState(0, 0, Tried(at(problem, 0.0))), Task(problem, (), 1e-4, 25))
     assert [shown for _, shown in begun] == [1.0, 0.25, 0.5, 1.0]
     assert [start for start, _ in begun] == [0.0, 0.0, kept, kept]
 
@@ -85,8 +85,8 @@ def test_what_explains_the_whole_record_at_once_is_not_fitted_in_parts(problem, 
         tried = Tried(at(problem, 1.0), jnp.asarray(12.0), jnp.asarray(True))
         return tried, an_end(1.0)
 
-    monkeypatch.setattr(search, "_descend", step)
-    out = climb(SearchState(0, 0, fresh(at(problem, 0.0))), problem, (), 1e-4, 25)
+    monkeypatch.setattr(search, "descend", step)
+    out = climb(SearchState(0, 0, Tried(at(problem, 0.0))), Task(problem, (), 1e-4, 25))
     assert begun == [1.0] and place(out.parameters) == 1.0 and bool(out.converged)
 
 

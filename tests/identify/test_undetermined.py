@@ -10,7 +10,7 @@ from jax.flatten_util import ravel_pytree
 import rigidjax as rj
 from rigidjax import identify
 from rigidjax.identify.answers import Answer
-from rigidjax.identify.undetermined import Combination
+from rigidjax.identify.identifiability import Combination
 
 TS = np.linspace(0.0, 1.0, 5)
 BODY = rj.Inertia.from_principal(1.0, 1.6, 2.1)

@@ -5,17 +5,15 @@ from rigidjax.identify.sensors.attitude import (
     AttitudeSensor as AttitudeSensor,
     Direction as Direction,
     Marker as Marker,
+    Position as Position,
+    Range as Range,
+    Velocity as Velocity,
 )
 from rigidjax.identify.sensors.base import (
     AbstractSensor as AbstractSensor,
     SensorInput as SensorInput,
 )
 from rigidjax.identify.sensors.lowpass import LowPass as LowPass
-from rigidjax.identify.sensors.position import (
-    Position as Position,
-    Range as Range,
-    Velocity as Velocity,
-)
 from rigidjax.identify.sensors.vectors import (
     Accelerometer as Accelerometer,
     Gyro as Gyro,

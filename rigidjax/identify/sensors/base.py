@@ -11,7 +11,6 @@ from jaxtyping import Array, Float
 from rigidjax import _checks
 from rigidjax._types import Scalar, Vec3
 from rigidjax.body.inertia import MassProperties
-from rigidjax.rotation import quaternion
 
 
 class SensorInput(eqx.Module):
@@ -118,29 +117,3 @@ def _positive(value: Any, name: str, wanted: str, size: int) -> Array | None:
         raise ValueError(f"{name}: wanted one number or {count}, got shape {numbers.shape}")
     numbers = jnp.broadcast_to(numbers, (size,))
     return _checks.refuse(numbers, ~(numbers > 0), f"{name}: wanted {wanted}")
-
-
-def shown(
-    truth: Vec3,
-    bias: Vec3 | None,
-    scale: Vec3 | None,
-    mounting: Vec3 | None,
-    skew: Vec3 | None = None,
-) -> Vec3:
-    """The prediction of a vector sensor: `scale · S exp(−mounting) v + bias`.
-
-    Its axes need not be orthogonal: `S = [[1, a, b], [0, 1, c], [0, 0, 1]]` of the skew (a, b, c).
-
-    **Arguments:** `truth` v (3,) body frame; `bias` (3,) in the sensor's unit; `scale` (3,) per
-    channel; `mounting` (3,) rotation vector that turns the body's axes onto the sensor's, rad;
-    `skew` (3,) the shares of y in x, of z in x, and of z in y.
-    """
-    seen = truth
-    if mounting is not None:
-        seen = quaternion.rotate(quaternion.exp(-mounting), seen)
-    if skew is not None:
-        x, y, z = seen[0], seen[1], seen[2]
-        seen = jnp.stack([x + skew[0] * y + skew[1] * z, y + skew[2] * z, z])
-    if scale is not None:
-        seen = scale * seen
-    return seen if bias is None else seen + bias

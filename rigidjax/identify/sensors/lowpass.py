@@ -23,19 +23,15 @@ class LowPass(eqx.Module):
     """A low-pass filter of first or second order (Butterworth), as in the chips of gyros.
 
     Give it to a sensor (`Gyro(0.01, lowpass=LowPass(40.0))`): then the predictions go through the
-    same filter as the readings. Without it a fit mistakes the filter's lag for an offset of the
-    clock, and its damping of faster rates for another motion.
+    same filter as the readings; else a fit mistakes its lag for an offset of the clock.
 
     `ẏ = w(u − y)`, or `ÿ + √2 w ẏ + w² y = w² u`, with w = 2π · cutoff; solved exactly, from sample
     to sample, for a cubic between samples of u. Before the first sample u is the cubic through the
-    first four samples. Before a sample that follows a gap of more than three intervals u is a
-    straight line.
+    first four, before a sample after a gap of more than three intervals a straight line.
 
     **Arguments:** `cutoff` Hz, the frequency of gain 1/√2 (a `Free` may move it); `order` 1 or 2.
-
-    Source: Butterworth 1930, Experimental Wireless 7:536.
-
-    **Raises** `ValueError` for a cutoff that is not positive, another order.
+    **Raises** `ValueError` for a cutoff that is not positive, another order. Source: Butterworth
+    1930, Experimental Wireless 7:536.
 
     >>> slow = LowPass(0.5)(jnp.arange(4.0), jnp.ones((4, 1)))
     >>> bool(jnp.allclose(slow, 1.0))
@@ -58,10 +54,9 @@ class LowPass(eqx.Module):
     ) -> Float[Array, "times k"]:
         """The filtered samples.
 
-        **Arguments:** `t` (T,) increasing times, s; `values` (T, k), of any unit.
-
-        **Raises** `ValueError` for shapes that do not agree; for times that do not increase, NaN,
-        and numbers whose cubes overflow, if they are known.
+        **Arguments:** `t` (T,) increasing times, s; `values` (T, k), of any unit. **Raises**
+        `ValueError` for shapes that do not agree; for times that do not increase, NaN, and numbers
+        whose cubes overflow, if they are known.
         """
         values = _checks.numbers(values, "values")
         if values.ndim != 2:
@@ -108,9 +103,7 @@ def _within(t: np.ndarray, values: np.ndarray) -> None:
 
 
 def _slopes(gaps: Array, steps: Array, fresh: Array) -> tuple[Array, Array]:
-    """du/dt at both ends of each interval, of the parabola through the three nearest samples; of
-    the chord beside a gap.
-    """
+    """du/dt at both ends of each interval, of the nearest parabola; of the chord beside a gap."""
     h, chord = gaps[:, None], steps / gaps[:, None]
     apart = (fresh[1:] | fresh[:-1])[:, None]
     bend = jnp.where(apart, 0.0, jnp.diff(chord, axis=0) / (h[1:] + h[:-1]))
@@ -129,9 +122,7 @@ def _begin(gaps: Array, chord: Array) -> tuple[Array, Array, Array]:
 
 
 def _first(w: Array, u0: Array, du0: Any, u1: Array, du1: Any) -> tuple[Any, Any, Any]:
-    """The filter's answer to the cubic itself at both ends of each interval, and the decay of the
-    difference from it.
-    """
+    """The answer to the cubic itself at both ends of each interval; the decay of what differs."""
 
     def own(u: Array, du: Any) -> Array:
         return (u - du[0] / w + du[1] / w**2 - du[2] / w**3)[..., None]

@@ -15,14 +15,43 @@ from rigidjax.identify.sensors.base import (
     full_scale,
     optional,
     required,
-    shown,
 )
 from rigidjax.identify.sensors.lowpass import LowPass, lowpass_of
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.linalg3 import apply, cross
 
 
-class Gyro(AbstractSensor):
+class _Vector(AbstractSensor):
+    """A sensor that reads a vector in its own axes: `scale · S exp(−mounting) v + bias`."""
+
+    reading_shape: ClassVar[tuple[int, ...]] = (3,)
+    components: ClassVar[int] = 3
+    noise: Vec3 | None = eqx.field(converter=deviations(), default=None)
+    _: dataclasses.KW_ONLY
+    bias: Vec3 | None = eqx.field(converter=optional("bias"), default=None)
+    scale: Vec3 | None = eqx.field(converter=optional("scale"), default=None)
+    mounting: Vec3 | None = eqx.field(converter=optional("mounting"), default=None)
+    skew: Vec3 | None = eqx.field(converter=optional("skew"), default=None)
+    limit: Vec3 | None = eqx.field(converter=full_scale, default=None)
+    offset: Scalar | None = eqx.field(converter=optional("offset", ()), default=None)
+    lowpass: LowPass | None = eqx.field(converter=lowpass_of, default=None)
+
+    def _shown(self, truth: Vec3) -> Vec3:
+        """The prediction of `truth` v (3,), body frame, with
+        `S = [[1, a, b], [0, 1, c], [0, 0, 1]]` of the skew (a, b, c).
+        """
+        seen = truth
+        if self.mounting is not None:
+            seen = quaternion.rotate(quaternion.exp(-self.mounting), seen)
+        if self.skew is not None:
+            (x, y, z), (a, b, c) = seen, self.skew
+            seen = jnp.stack([x + a * y + b * z, y + c * z, z])
+        if self.scale is not None:
+            seen = self.scale * seen
+        return seen if self.bias is None else seen + self.bias
+
+
+class Gyro(_Vector):
     """Reads the body rate: `scale · S exp(−mounting) Ω + bias + G f`, rad/s.
 
     **Arguments:** `noise` standard deviation of a reading, rad/s, one number or (3,); `None`
@@ -43,18 +72,8 @@ class Gyro(AbstractSensor):
     (3,)
     """
 
-    reading_shape: ClassVar[tuple[int, ...]] = (3,)
-    components: ClassVar[int] = 3
     unit: ClassVar[str] = "rad/s"
-    noise: Vec3 | None = eqx.field(converter=deviations(), default=None)
     _: dataclasses.KW_ONLY
-    bias: Vec3 | None = eqx.field(converter=optional("bias"), default=None)
-    scale: Vec3 | None = eqx.field(converter=optional("scale"), default=None)
-    mounting: Vec3 | None = eqx.field(converter=optional("mounting"), default=None)
-    skew: Vec3 | None = eqx.field(converter=optional("skew"), default=None)
-    limit: Vec3 | None = eqx.field(converter=full_scale, default=None)
-    offset: Scalar | None = eqx.field(converter=optional("offset", ()), default=None)
-    lowpass: LowPass | None = eqx.field(converter=lowpass_of, default=None)
     g_sensitivity: Float[Array, "3 3"] | None = eqx.field(
         converter=optional("g_sensitivity", (3, 3)), default=None
     )
@@ -73,7 +92,7 @@ class Gyro(AbstractSensor):
             self.place = jnp.zeros(3)
 
     def error(self, now: SensorInput, reading: Array) -> Vec3:
-        seen = shown(now.state.omega, self.bias, self.scale, self.mounting, self.skew)
+        seen = self._shown(now.state.omega)
         if self.g_sensitivity is not None:
             assert self.place is not None
             force = specific_force(now, self.place, self.gravity)
@@ -92,7 +111,7 @@ def specific_force(now: SensorInput, place: Vec3, gravity: Vec3 | None) -> Vec3:
     return force + quaternion.rotate(quaternion.conjugate(state.q), carried - gravity)
 
 
-class Accelerometer(AbstractSensor):
+class Accelerometer(_Vector):
     """Reads the specific force at its place: `scale · S exp(−mounting) f + bias`, m/s².
 
     `f = Rᵀ(a − g) + dΩ/dt × r + Ω × (Ω × r)` in the body frame (notes, eq 88, seen from the body),
@@ -103,65 +122,41 @@ class Accelerometer(AbstractSensor):
     sensor's place, m, body frame: from the reference point of the `Inertia`, or in the frame of the
     `MassProperties`; `gravity` (3,) m/s², world frame: `None` for a body in free fall (`Spin`,
     `Attitude`), needed by a body on a pivot and by a `Rigid`; `bias`, `scale`, `mounting`, `skew`,
-    `limit`, `offset`, `lowpass` as for `Gyro`.
-
-    **Raises** `ValueError` as `Gyro`.
+    `limit`, `offset`, `lowpass` as for `Gyro`. **Raises** `ValueError` as `Gyro`.
 
     >>> Accelerometer(noise=0.1, place=[0.01, 0.0, 0.0]).unit
     'm/s²'
     """
 
-    reading_shape: ClassVar[tuple[int, ...]] = (3,)
-    components: ClassVar[int] = 3
     # Only gravity needs the attitude.
     feels: ClassVar[Any] = property(lambda self: HasSpin if self.gravity is None else HasAttitude)
     unit: ClassVar[str] = "m/s²"
-    noise: Vec3 | None = eqx.field(converter=deviations(), default=None)
     _: dataclasses.KW_ONLY
     place: Vec3 = eqx.field(converter=required("place"), default=None)
     gravity: Vec3 | None = eqx.field(converter=optional("gravity"), default=None)
-    bias: Vec3 | None = eqx.field(converter=optional("bias"), default=None)
-    scale: Vec3 | None = eqx.field(converter=optional("scale"), default=None)
-    mounting: Vec3 | None = eqx.field(converter=optional("mounting"), default=None)
-    skew: Vec3 | None = eqx.field(converter=optional("skew"), default=None)
-    limit: Vec3 | None = eqx.field(converter=full_scale, default=None)
-    offset: Scalar | None = eqx.field(converter=optional("offset", ()), default=None)
-    lowpass: LowPass | None = eqx.field(converter=lowpass_of, default=None)
 
     def error(self, now: SensorInput, reading: Array) -> Vec3:
         force = specific_force(now, self.place, self.gravity)
-        return reading - shown(force, self.bias, self.scale, self.mounting, self.skew)
+        return reading - self._shown(force)
 
 
-class Magnetometer(AbstractSensor):
+class Magnetometer(_Vector):
     """Reads a known field of the world: `scale · S exp(−mounting) Rᵀ b + bias`.
 
     **Arguments:** `noise` in the field's unit, one number or (3,), `None` to estimate it; `field`
-    (3,) b, world frame, any unit; `bias` (the body's own magnetism), `scale`, `mounting`,
-    `skew`, `limit`, `offset`, `lowpass` as for `Gyro`. For a direction without a strength use
-    `Direction`.
-
+    (3,) b, world frame, any unit; `bias` (the body's own magnetism), `scale`, `mounting`, `skew`,
+    `limit`, `offset`, `lowpass` as for `Gyro`. For a direction without a strength use `Direction`.
     **Raises** `ValueError` as `Gyro`.
 
     >>> Magnetometer(noise=1e-7, field=[2e-5, 0.0, 4e-5]).reading_shape
     (3,)
     """
 
-    reading_shape: ClassVar[tuple[int, ...]] = (3,)
-    components: ClassVar[int] = 3
     feels: ClassVar[type] = HasAttitude
     unit: ClassVar[str] = "of the field"
-    noise: Vec3 | None = eqx.field(converter=deviations(), default=None)
     _: dataclasses.KW_ONLY
     field: Vec3 = eqx.field(converter=required("field"), default=None)
-    bias: Vec3 | None = eqx.field(converter=optional("bias"), default=None)
-    scale: Vec3 | None = eqx.field(converter=optional("scale"), default=None)
-    mounting: Vec3 | None = eqx.field(converter=optional("mounting"), default=None)
-    skew: Vec3 | None = eqx.field(converter=optional("skew"), default=None)
-    limit: Vec3 | None = eqx.field(converter=full_scale, default=None)
-    offset: Scalar | None = eqx.field(converter=optional("offset", ()), default=None)
-    lowpass: LowPass | None = eqx.field(converter=lowpass_of, default=None)
 
     def error(self, now: SensorInput, reading: Array) -> Vec3:
         seen = quaternion.rotate(quaternion.conjugate(now.state.q), self.field)
-        return reading - shown(seen, self.bias, self.scale, self.mounting, self.skew)
+        return reading - self._shown(seen)

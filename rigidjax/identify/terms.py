@@ -8,18 +8,17 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from rigidjax.identify import padding
-from rigidjax.identify.free_parameters import put
-from rigidjax.identify.parameters import Local, Parameters, columns, local, places
-from rigidjax.identify.propagation import states_at
+from rigidjax.identify.body_charts import Bodies, matter
+from rigidjax.identify.parameters import Local, Parameters, by_slot, columns, local, places, put
+from rigidjax.identify.propagation import sensor_inputs, states_at, what_turns
 from rigidjax.identify.recording import Recording
 from rigidjax.identify.reference_states import ReferenceStates
-from rigidjax.identify.sensor_inputs import sensor_inputs, what_turns
 from rigidjax.identify.sensors import SensorInput
-from rigidjax.identify.several_bodies import matter
 from rigidjax.motion.coupled import motion_of
+from rigidjax.motion.manifold import minus
 
 if TYPE_CHECKING:
     from rigidjax.identify.problem import Problem
@@ -37,10 +36,7 @@ def filled(problem: "Problem", mine: Local, record: Recording) -> Recording:
 def states_of_one(
     problem: "Problem", mine: Local, record: Recording, ref: ReferenceStates, which: Array | None
 ) -> tuple[Recording, Any, Any, Any]:
-    """One recording with its values filled in, its body, its initial state and its states.
-
-    The states are `Coupled` if a torque has states of its own.
-    """
+    """One recording with its values filled in, its body, initial state and states."""
     record = filled(problem, mine, record)
     body = matter(problem.body, mine.body, which)
     state0 = ref.moved(mine)
@@ -52,11 +48,7 @@ def states_of_one(
 def errors_of_one(
     problem: "Problem", mine: Local, record: Recording, ref: ReferenceStates, which: Array | None
 ) -> tuple[tuple[Array, ...], Any]:
-    """The errors (T, k) of each sensor in one recording, and the last state.
-
-    **Arguments:** `mine` the numbers that it depends on; `record`, `ref`; `which` the index of its
-    body among several.
-    """
+    """The errors (T, k) of each sensor in one recording, and the last state."""
     record, body, state0, states = states_of_one(problem, mine, record, ref, which)
     out = []
     for reading in record.readings:
@@ -102,9 +94,8 @@ def _error_of(sensor: Any, now: SensorInput, value: Array) -> Array:
 def over_records(function: Any, problem: "Problem", mine: Any) -> Any:
     """`function(mine, record, reference, which)` of every recording.
 
-    On a CPU recordings run one after another: XLA makes one kernel of a loop over a few dozen
-    numbers. For many recordings at once it does not; that compiles twice as long and runs longer.
-    Batches have size one, since scalars within another loop run at half the speed.
+    On a CPU one after another: XLA makes one kernel of a loop over a few dozen numbers, and scalars
+    within an inner loop run at half the speed.
     """
     trees = mine, problem.records, problem.reference, problem.which
     if problem.count == 1:
@@ -118,10 +109,8 @@ def over_records(function: Any, problem: "Problem", mine: Any) -> Any:
 
 @eqx.filter_custom_jvp
 def all_errors(parameters: Parameters, problem: "Problem") -> tuple[tuple[Array, ...], Any]:
-    """The errors (R, T, k) of each sensor, and the last states (R, …).
-
-    Its derivative is computed recording by recording: each has a block for the numbers that it
-    depends on, and no zeros pass through the motion.
+    """The errors (R, T, k) of each sensor, and the last states; differentiated recording by
+    recording.
     """
 
     def of_one(*trees: Any) -> Any:
@@ -167,9 +156,8 @@ def normal_matrix(blocks: Sequence[Array], where: Array, size: int) -> Array:
 
 
 def with_blocks(parameters: Parameters, problem: "Problem") -> tuple[Any, Any]:
-    """The errors and last states, and their derivatives (…, n) in what each recording depends on.
-
-    `places` gives the flattened parameter of each of the n columns.
+    """The errors and last states, and their derivatives (…, n) in the recording's numbers; `places`
+    gives each column's place.
     """
     mine = local(problem, parameters)
     single = padding.one(mine, 0)
@@ -199,3 +187,99 @@ def with_jacobian(function: Callable[[Array], Any], at: Float[Array, " n"]) -> t
         return found, found
 
     return jax.jacfwd(twice, has_aux=True)(at)
+
+
+# One (R, k) for each sensor: R recordings, k components.
+Noise = tuple[Float[Array, "records _"], ...]
+
+
+def whitened(problem: "Problem", errors: tuple, noise: Noise) -> tuple[Float[Array, "..."], ...]:
+    """Errors in standard deviations, (R, T, k) for each sensor: see `standardised`."""
+    out = []
+    for reading, error, sigma in zip(problem.records.readings, errors, noise, strict=True):
+        limit = getattr(reading.sensor, "limit", None)
+        scaled, _ = jax.vmap(standardised)(reading.values, reading.mask, error, sigma, limit)
+        out.append(scaled)
+    return tuple(out)
+
+
+def standardised(
+    values: Float[Array, "times *components"],
+    mask: Bool[Array, " times"],
+    error: Float[Array, "times k"],
+    sigma: Float[Array, " k"],
+    limit: Float[Array, " k"] | None,
+) -> tuple[Float[Array, "times k"], Bool[Array, "times k"]]:
+    """Errors in standard deviations, and the mask of saturated channels: these say "at least that
+    much", and count as `√(−2 log Φ(z))`, z the prediction's excess over the limit (Tobin 1958,
+    doi:10.2307/1907382).
+    """
+    scaled = error / sigma[None]
+    if limit is None:
+        return scaled, jnp.zeros(scaled.shape, bool)
+    full = (jnp.abs(values) >= limit[None] * (1 - 1e-6)) & mask[:, None]
+    side = jnp.sign(values)
+    z = jnp.where(full, -side * scaled, 0.0)
+    # The term vanishes beyond five standard deviations, and the root has no derivative there.
+    root = jnp.sqrt(-2.0 * jax.scipy.special.log_ndtr(jnp.minimum(z, 5.0)))
+    return jnp.where(full, -side * jnp.where(z < 5.0, root, 0.0), scaled), full
+
+
+def residuals(parameters: Parameters, args: Any) -> Any:
+    """All residuals of a fit, as a tree, of `args`: problem, noise of sensors, weights (R, T)."""
+    problem, noise, weights = args
+    errors, ends = all_errors(parameters, problem)
+    return seen(problem, errors, noise, weights), beside(parameters, problem, ends)
+
+
+def seen(problem: "Problem", errors: tuple, noise: Noise, weights: Array) -> tuple[Array, ...]:
+    """The readings' residuals (R, T, k) for least squares."""
+    read = []
+    for scaled in whitened(problem, errors, noise):
+        if problem.loss is not None:
+            scaled = jax.vmap(jax.vmap(problem.loss.shrink))(scaled)
+        read.append(scaled * weights[..., None])
+    return tuple(read)
+
+
+def with_rows(of: Callable[[tuple], tuple], errors: tuple, blocks: tuple) -> tuple[tuple, tuple]:
+    """`of(errors)`, and its derivatives (R, T, k, n) of those of the errors, `blocks`."""
+    # Each residual depends on its own error alone: a product of small matrices.
+    read, push = jax.linearize(of, errors)
+    return read, jax.vmap(push, in_axes=-1, out_axes=-1)(blocks)
+
+
+def beside(parameters: Parameters, problem: "Problem", ends: Any) -> tuple[Array, ...]:
+    """Residuals that are no readings: priors, and joints between pieces of one recording."""
+    out = []
+    for slot, shared, each in by_slot(problem, parameters):
+        if slot.prior is not None:
+            out.append((each if shared is None else shared) / slot.prior)
+        if slot.spread is not None:
+            out.append(each / slot.spread)
+    if problem.prior is not None:
+        assert not isinstance(problem.body, Bodies)
+        body = problem.body.body(parameters.body)
+        out.append(problem.prior.residuals(body, scaled=problem.body.unit != ""))
+    if problem.links is not None:
+        # From a piece's end to the next one's start, in typical units; zero at the last.
+        starts = jax.vmap(ReferenceStates.moved)(problem.reference, parameters.own)
+        following = jax.tree.map(lambda leaf: jnp.roll(leaf, -1, axis=0), starts)
+        gaps = jax.vmap(minus)(ends, following) / problem.reference.units
+        out.append(gaps * problem.links.on[:, None] / problem.links.width)
+    return tuple(out)
+
+
+def weights_of(problem: "Problem", errors: tuple, noise: Noise) -> tuple[Float[Array, "..."], ...]:
+    """The weight (R, T) of each reading in the normal equations: the loss's, zero if masked."""
+    masks = [reading.mask for reading in problem.records.readings]
+    if problem.loss is None:
+        return tuple(mask.astype(e.dtype) for mask, e in zip(masks, errors, strict=True))
+    weight = jax.vmap(jax.vmap(problem.loss.weight))
+    scaled = whitened(problem, errors, noise)
+    return tuple(jnp.where(mask, weight(e), 0.0) for mask, e in zip(masks, scaled, strict=True))
+
+
+def half_sum(tree: Any) -> Float[Array, ""]:
+    """Half the sum of the squares of all leaves."""
+    return 0.5 * sum((jnp.sum(leaf**2) for leaf in jax.tree.leaves(tree)), jnp.zeros(()))
