@@ -45,6 +45,9 @@ class CpuFlags(NamedTuple):
     **Fields:** `xla_flags` the value for the environment variable `XLA_FLAGS`, with its present
     contents; `set` whether the flag is there; `checked` versions of jaxlib it was measured on;
     `jaxlib` the one in use.
+
+    >>> str(CpuFlags("--some_flag", False, ("1.0",), "1.0"))
+    "export XLA_FLAGS='--some_flag'    # not set"
     """
 
     xla_flags: str

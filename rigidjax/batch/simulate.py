@@ -51,6 +51,11 @@ class Batch(eqx.Module, Generic[State]):
     `diffrax.RESULTS` for each body: `successful`, `nonfinite`, `nonfinite_input` (no body has these
     numbers), `max_steps_reached`, `dt_min_reached`. `num_steps` (N,) accepted and rejected, 0 for
     the closed form. `own` a tuple of the torques' own states, as `ys`, or `None`.
+
+    >>> import rigidjax as rj
+    >>> bodies, omega = rj.Inertia(jnp.diag(jnp.array([1.0, 2.0, 3.0]))), jnp.ones((5, 3))
+    >>> rj.batch.simulate(bodies, rj.Spin(omega), [0.0, 1.0]).ys.omega.shape
+    (5, 2, 3)
     """
 
     ts: Float[Array, " times"]

@@ -22,7 +22,11 @@ from rigidjax.solve.linear_map import is_smooth, linear_map, no_tangent, refuse
 
 
 class Found(NamedTuple):
-    """The result of `adaptive`; `last` is the state at the end, `last_time`."""
+    """The result of `adaptive`.
+
+    **Fields:** `ys` the states at `ts`; `num_steps` accepted and rejected, `num_rejected` of these;
+    `result` a `diffrax.RESULTS`; `last` the state at the end, `last_time`.
+    """
 
     ys: Any
     num_steps: Array

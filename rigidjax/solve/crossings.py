@@ -109,6 +109,12 @@ class Crossings(eqx.Module, Generic[State]):
     type of `state0`, with a leading axis; `count` their number; `result` a `diffrax.RESULTS`:
     `successful` if the run reached `t1`, `event_occurred` if it ended with `max_crossings` of them,
     or why it ended early; `num_steps` of the method, partial ones included.
+
+    >>> import rigidjax as rj
+    >>> body, start = rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([0.0, 1.0, 0.01])
+    >>> flips = rj.crossings(body, start, 0.0, 40.0, lambda t, state, body: state.omega[1])
+    >>> int(flips.count), bool(flips.full)
+    (2, False)
     """
 
     times: Float[Array, " crossings"]

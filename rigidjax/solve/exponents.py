@@ -31,6 +31,10 @@ class Exponents(eqx.Module):
     from the differences between the means of twenty parts of the run, plus the sum of the steps'
     tolerances; `times` (N,) the ends of the intervals, s; `running` (N, k) the values up to then;
     `state` at the end; `result` a `diffrax.RESULTS`: `successful`, or why a run failed.
+
+    >>> still = lambda t, y, args: jnp.array([0.5, -1.0]) * y
+    >>> lyapunov_exponents(still, jnp.zeros(2), 40.0, intervals=40, transient=20).running.shape
+    (20, 2)
     """
 
     values: Float[Array, " k"]

@@ -134,6 +134,8 @@ def simulate(
     first = None if dt0 is None else validation.first_step(dt0, times)
     if plain and isinstance(adjoint, _EITHER_MODE) and not forward:
         way = direction(times)
+        # As arrays: another tolerance does not compile again.
+        rtol, atol = (jnp.asarray(a, times.dtype) for a in (rtol, atol))
         loop = Loop(body, torque, method, rtol, atol, first, way, max_steps, throw)  # pyright: ignore
         if accuracy is None:
             return _solution(loop, event, state0, times)
