@@ -36,15 +36,8 @@ from rigidjax.body import (
     volumes as volumes,
 )
 from rigidjax.frames import Point as Point, scenes as scenes
-from rigidjax.motion import (
-    Attitude as Attitude,
-    Rigid as Rigid,
-    Spin as Spin,
-    conserved as conserved,
-    drift as drift,
-    energy as energy,
-    torques as torques,
-)
+from rigidjax.motion import Attitude as Attitude, Rigid as Rigid, Spin as Spin, torques as torques
+from rigidjax.motion.conserved import conserved as conserved, drift as drift, energy as energy
 from rigidjax.rotation import (
     euler as euler,
     mrp as mrp,

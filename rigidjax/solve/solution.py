@@ -11,10 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from rigidjax import _checks, motion
+from rigidjax import _checks
 from rigidjax._types import ScalarLike
 from rigidjax.frames import Point
 from rigidjax.motion import Attitude, Rigid, Spin
+from rigidjax.motion.conserved import drift
 from rigidjax.motion.coupled import Coupled, motion_of
 from rigidjax.motion.manifold import dimension, minus_small, parts, plus, turns
 from rigidjax.motion.torques.states import require_stateless
@@ -200,7 +201,7 @@ def _say(error: Error, most: Any, words: str) -> None:
 
 @eqx.filter_jit
 def _drift(setup: Free | Loop | Setup, ts: Array, ys: Any) -> dict[str, Array]:
-    return motion.drift(ts, ys, setup.body, setup.torque)  # pyright: ignore[reportArgumentType]
+    return drift(ts, ys, setup.body, setup.torque)  # pyright: ignore[reportArgumentType]
 
 
 @eqx.filter_jit

@@ -13,7 +13,8 @@ import numpy as np
 from rigidjax import _checks
 from rigidjax.body.inertia import Inertia
 from rigidjax.frames.frame_dynamics import scene_of
-from rigidjax.motion import Attitude, drift
+from rigidjax.motion import Attitude
+from rigidjax.motion.conserved import drift
 from rigidjax.motion.equations import AttitudeEquations
 from rigidjax.motion.torques import HeavyTop
 from rigidjax.solve import fixed, solvers

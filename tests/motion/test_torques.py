@@ -11,7 +11,7 @@ from once import once
 
 import rigidjax as rj
 from rigidjax import torques
-from rigidjax.motion import conserved, drift, energy
+from rigidjax.motion.conserved import conserved, drift, energy
 from rigidjax.motion.equations import AttitudeEquations, EulerEquations, NewtonEuler
 from rigidjax.motion.torques import base
 from rigidjax.motion.torques.base import jumps_of

@@ -321,7 +321,7 @@ def accuracies(kind, n, seed, dtype, table):
 
 def costs(kind, n, seed, dtype, table):
     """CPU time of each scene alone: `sol.error` over a run, an accuracy over the best tolerance."""
-    rng, p, start, lengths = drawn(kind, n, seed, dtype)
+    rng, p, start, _ = drawn(kind, n, seed, dtype)
     rtol = tolerances(rng, n, dtype)
     asked = 10 ** (rng.uniform(-12, -3, n) if dtype == np.float64 else rng.uniform(-5, -2, n))
     plain = jax.jit(lambda p, y, rtol: last(run(kind, p, y, rtol=rtol, atol=1e-3 * rtol)))

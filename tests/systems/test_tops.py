@@ -8,7 +8,7 @@ from systems import tops_mp
 
 import rigidjax as rj
 from rigidjax import lagrangian, torques
-from rigidjax.motion import drift, energy
+from rigidjax.motion.conserved import drift, energy
 
 DOWN = np.array([0.0, 0.0, -9.81])
 
