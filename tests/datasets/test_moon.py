@@ -35,7 +35,7 @@ def test_the_tables_lose_nothing():
         share = read.constants["EMRAT"] / (1 + read.constants["EMRAT"])
         np.testing.assert_allclose(read.earth(t * moon.DAY), -moons, rtol=0, atol=1e-3)  # m
         wanted = sun - middle - share * moons
-        np.testing.assert_allclose(read.sun(t * moon.DAY), wanted, rtol=0, atol=1e-3)  # of 1.5e11 m
+        np.testing.assert_allclose(read.sun(t * moon.DAY), wanted, rtol=0, atol=1e-2)  # of 1.5e11 m
         wanted = from_package("librations", day)
         np.testing.assert_allclose(read.angles(t * moon.DAY), wanted, rtol=0, atol=1e-12)
 

@@ -141,20 +141,20 @@ class ChangingInertia(eqx.Module):
             now = self.tensor(t, here, body).astype(omega.dtype)
             return apply(now, omega), now
 
-        # Ω̇ is not known yet: I(Ω) Ω is linear in it, at these t and q.
+        # Ω̇ is not known yet: I(Ω) Ω is linear in it. One program along four ways: t and q, e_i.
         (held, now), along = jax.linearize(momentum, t, q, omega)
-        still, one = jnp.zeros_like(omega), jnp.eye(3, dtype=omega.dtype)
-        turns = None if q is None else quaternion.rate(q, omega)
-        rests = None if q is None else jnp.zeros_like(q)
-        turning = cross(held, omega) - along(jnp.ones_like(t), turns, still)[0]
-        slopes = [along(jnp.zeros_like(t), rests, one[i])[0] for i in range(3)]
+        still, first = jnp.zeros((1, 3), omega.dtype), jnp.eye(4, 1, dtype=omega.dtype)
+        turns = None if q is None else first * quaternion.rate(q, omega)
+        ways = jnp.concatenate([still, jnp.eye(3, dtype=omega.dtype)])
+        slopes, _ = jax.vmap(along)(first[:, 0], turns, ways)
+        turning = cross(held, omega) - slopes[0]
         force = None
         if self.torque is not None:
             force, torque = base.act(self.torque, t, state, with_tensor(body, now))
             turning = turning + torque
         # The body's own equations have its own inertia: the torque that brings them to this.
         fixed = tensor_of(body)
-        slope = solve(jnp.stack(slopes, axis=1), turning)
+        slope = solve(slopes[1:].T, turning)
         torque = apply(fixed, slope) - cross(apply(fixed, omega), omega)
         return torque if force is None else base.Wrench(force, torque)
 
