@@ -19,6 +19,7 @@ from rigidjax import _checks
 from rigidjax._names import show
 from rigidjax._types import HasAttitude, ScalarLike
 from rigidjax.body.inertia import Inertia
+from rigidjax.identify.body_charts import AbstractBodyChart
 from rigidjax.motion import Attitude
 from rigidjax.motion.torques import ChangingInertia, Chebyshev, GravityGradient, Sum, Tide
 from rigidjax.rotation import euler
@@ -109,6 +110,10 @@ class Moon(eqx.Module):
         whole = Inertia(largest * jnp.diag(ones))
         return whole - self._core if core else whole
 
+    def chart(self, *, core: bool = False) -> AbstractBodyChart:
+        """The chart of `body` for a fit: β and γ are free."""
+        return _Shape(self, core)
+
     def torque(self, degree: int = 4, *, tide: bool = False, core: bool = False) -> Any:
         """The torque of Earth and Sun.
 
@@ -163,6 +168,37 @@ class Moon(eqx.Module):
     @property
     def _radius(self) -> float:
         return 1e3 * self.constants["AM"]
+
+
+class _Shape(AbstractBodyChart):
+    """β and γ: the logarithms of their ratios to DE421's, in thousandths."""
+
+    size: ClassVar[int] = 2
+    in_words: ClassVar[str] = "β and γ of the Moon"
+    log_names: ClassVar[tuple[str, ...]] = ("β", "γ")
+    plain_names: ClassVar[tuple[str, ...]] = ()
+    unit: ClassVar[str] = ""
+    moon: Moon
+    core: bool = eqx.field(static=True)
+
+    def body(self, vector: Array) -> Inertia:
+        beta, gamma = jnp.exp(1e-3 * vector + self._known)
+        return self.moon.body(beta, gamma, core=self.core)
+
+    def vector(self, body: Any) -> Array:
+        return 1e3 * (self.logs(body) - self._known)
+
+    def logs(self, body: Any) -> Array:
+        tensor = body.tensor + self.moon._core.tensor if self.core else body.tensor
+        a, b, c = (tensor[i, i] for i in range(3))
+        return jnp.log(jnp.stack([(c - a) / b, (b - a) / c]))
+
+    def plain(self, body: Any) -> Array:
+        return jnp.zeros(0)
+
+    @property
+    def _known(self) -> Array:
+        return jnp.log(jnp.array([self.moon.constants[name] for name in ("LBET", "LGAM")]))
 
 
 class _Core(eqx.Module):

@@ -65,6 +65,21 @@ def test_without_the_package_it_says_what_to_install(monkeypatch):
         moon.Moon(1970.0, 1971.0)
 
 
+@there
+@pytest.mark.parametrize("core", [False, True])
+def test_the_chart_of_its_shape(core):
+    read = moon.Moon(moon.EPOCH, 1970.0)
+    chart, here = read.chart(core=core), read.body(6.3e-4, 2.3e-4, core=core)
+    np.testing.assert_allclose(jnp.exp(chart.logs(here)), [6.3e-4, 2.3e-4], rtol=1e-11)
+    np.testing.assert_allclose(chart.body(chart.vector(here)).tensor, here.tensor, rtol=1e-12)
+    # J2 of any shape is DE421's.
+    c, (x, y, z) = read.constants, np.diagonal(read.body(6.3e-4, 2.3e-4).tensor)
+    radius, mass = 1e3 * c["AM"], read._mass
+    np.testing.assert_allclose((z - (x + y) / 2) / mass / radius**2, c["J2M"], rtol=1e-11)
+    wanted = (read.body().tensor[1, 1] - read.body().tensor[0, 0]) / (4 * mass * radius**2)
+    np.testing.assert_allclose(wanted, c["C22M"], rtol=1e-11)
+
+
 # Root mean square about x, y, z in arcsec over the years, with nothing fitted: as measured, rounded
 # up. The bar of the third degree is 3.6 an axis.
 RUNGS = [
@@ -87,3 +102,24 @@ def test_the_moon_turns_as_in_the_ephemeris(years, parts, most):
     off = jax.vmap(lambda p, q: rj.quaternion.log(rj.quaternion.multiply(p, q)))(back, ys.q)
     rms = np.degrees(np.sqrt(np.mean(off**2, axis=0))) * 3600
     assert (rms <= most).all(), rms
+
+
+@there
+@pytest.mark.slow
+@pytest.mark.parametrize(("parts", "most", "ok"), [(dict(degree=3), 0.6, False), (dict(core=True, tide=True), 0.01, True)])  # fmt: skip
+def test_a_fit_of_six_years(parts, most, ok):
+    """β within 1e-4 and γ within 1e-3 of DE421's with all physics; otherwise the status says no."""
+    read = moon.Moon(moon.EPOCH, moon.EPOCH + 6)
+    ts, core = jnp.arange(0.0, 6 * 365.25, 20.0) * moon.DAY, "core" in parts
+    seen = jax.vmap(lambda t: read.attitude(t).q)(ts)
+    mas = np.radians(1 / 3.6e6)
+    record = rj.identify.Recording(ts, (rj.identify.AttitudeSensor(5 * mas), seen))
+    steps = rj.identify.Adaptive(1e-9, 1e-15)
+    problem = rj.identify.Problem(record, read.chart(core=core), torque=read.torque(**parts), integrator=steps)  # fmt: skip
+    start = problem.start(read.body(core=core), read.attitude(0.0).omega)
+    fit = rj.identify.fit(problem, initial=start, starts=1)
+    rms = np.sqrt(np.mean(np.asarray(fit.residuals[0]) ** 2, axis=0)) / mas / 1e3
+    assert (rms <= most).all() and fit.ok == ok
+    logs = read.chart(core=core).logs(fit.body) - read.chart()._known
+    near = abs(logs) < np.array([1e-4, 1e-3])
+    assert near.all() == ok
