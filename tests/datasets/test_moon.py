@@ -91,7 +91,6 @@ RUNGS = [
 
 
 @there
-@pytest.mark.long
 @pytest.mark.parametrize(("years", "parts", "most"), RUNGS)
 def test_the_moon_turns_as_in_the_ephemeris(years, parts, most):
     read = moon.Moon(moon.EPOCH, moon.EPOCH + years)

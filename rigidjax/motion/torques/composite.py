@@ -144,7 +144,7 @@ class ChangingInertia(eqx.Module):
         # Ω̇ is not known yet: I(Ω) Ω is linear in it. One program along four ways: t and q, e_i.
         (held, now), along = jax.linearize(momentum, t, q, omega)
         still, first = jnp.zeros((1, 3), omega.dtype), jnp.eye(4, 1, dtype=omega.dtype)
-        turns = None if q is None else first * quaternion.rate(q, omega)
+        turns = None if q is None else first * quaternion.rate(q, omega)[None]
         ways = jnp.concatenate([still, jnp.eye(3, dtype=omega.dtype)])
         slopes, _ = jax.vmap(along)(first[:, 0], turns, ways)
         turning = cross(held, omega) - slopes[0]
