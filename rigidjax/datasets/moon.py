@@ -22,6 +22,7 @@ from rigidjax.body.inertia import Inertia
 from rigidjax.identify.body_charts import AbstractBodyChart
 from rigidjax.motion import Attitude
 from rigidjax.motion.torques import ChangingInertia, Chebyshev, GravityGradient, Sum, Tide
+from rigidjax.motion.torques.base import evaluate
 from rigidjax.rotation import euler
 from rigidjax.rotation.linalg3 import cross
 
@@ -114,20 +115,29 @@ class Moon(eqx.Module):
         """The chart of `body` for a fit: β and γ are free."""
         return _Shape(self, core)
 
-    def torque(self, degree: int = 4, *, tide: bool = False, core: bool = False) -> Any:
+    def torque(
+        self, degree: int = 4, *, tide: bool = False, core: bool = False, figure: bool = False
+    ) -> Any:
         """The torque of Earth and Sun.
 
         **Arguments:** `degree` of the Moon's gravity in the Earth's field, 2 to 4; `tide` whether
         the Earth and the spin deform the Moon; `core` whether a liquid core turns in the mantle,
-        with DE421's own initial rate: then `first` is `EPOCH`. **Raises** `ValueError` otherwise.
+        with DE421's own initial rate: then `first` is `EPOCH`, otherwise it **raises**
+        `ValueError`; `figure` whether the Earth is oblate.
         """
         c = self.constants
         rows = []
         for n in range(3, degree + 1):
             pairs = [c[f"{k}{n}{m}M"] for m in range(1, n + 1) for k in "CS" if f"{k}{n}{m}M" in c]
             rows.append(self._mass * self._radius**n * jnp.array([-c[f"J{n}M"], *pairs]))
+        earths = [(self._mu_earth, 0.0)]
+        if figure:
+            # Of the same J2: two negative masses on the axis, at the radius of the equator. The
+            # axis is that of the ICRF, from which precession takes the Earth's by 0.1° in 20 years.
+            few, radius = -0.5 * c["J2E"] * self._mu_earth, 1e3 * c["AE"]
+            earths = [(self._mu_earth - 2 * few, 0.0), (few, radius), (few, -radius)]
         law: Any = Sum(
-            GravityGradient(self._mu_earth, self.earth, rows),
+            *(GravityGradient(mu, _raised(self.earth, z), rows) for mu, z in earths),
             GravityGradient(c["GMS"] * self._in_si, self.sun),
         )
         if core:
@@ -227,7 +237,13 @@ class _Core(eqx.Module):
 
     def __call__(self, t: ScalarLike, state: Any, body: Inertia, own: Array) -> Array:
         whole = Inertia(body.tensor + self.tensor)
-        return self.gravity(t, state, whole) + self.on_mantle(state, own)
+        return evaluate(self.gravity, t, state, whole) + self.on_mantle(state, own)
+
+
+def _raised(table: Chebyshev, z: float) -> Chebyshev:
+    """The same places, higher by z."""
+    moved = table.coefficients.at[:, 2, 0].add(z)
+    return eqx.tree_at(lambda t: t.coefficients, table, moved)
 
 
 def _split(rows: np.ndarray, parts: int) -> np.ndarray:
