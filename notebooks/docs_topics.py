@@ -33,6 +33,7 @@ GROUPS = {
         "rj.estimate",
         "rj.datasets",
         "rj.datasets.toutatis",
+        "rj.datasets.moon",
     ),
     "Many bodies": ("rj.batch", "rj.batch.distributed"),
     "Frames and space": (
@@ -54,16 +55,15 @@ GROUPS = {
 TOPICS = {
     "rj.motion": {
         "States": "Spin Attitude Rigid",
-        "Conserved quantities": "energy conserved drift",
         "What a state has": "HasSpin HasAttitude HasPose",
     },
     "rj.torques": {
-        "Gravity and fields": "HeavyTop GravityGradient MagneticDipole FromPotential",
+        "Gravity and fields": "HeavyTop GravityGradient MagneticDipole FromPotential Tide",
         "Given torques": "ConstantTorque InSpace Tabulated Pulses",
         "Air": "Damping QuadraticDamping Drag BodyDrag",
         "Wheels and propellers": "Flywheel Wheel ReactionWheels Rotors",
         "Forces": "UniformGravity CentralGravity Wrench",
-        "Functions of time, measured inputs": "Linear Series Held Input bind Delayed Lagged",
+        "Functions of time, measured inputs": "Linear Series Chebyshev Held Input bind Delayed Lagged",
         "Unknown torques": "RandomTorque CorrelatedTorque",
         "Laws together, laws of your own": "Sum AbstractTorque ChangingInertia",
     },

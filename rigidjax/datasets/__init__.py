@@ -1,6 +1,6 @@
 """Published recordings, ready to be fitted."""
 
 from rigidjax._names import show
-from rigidjax.datasets import toutatis as toutatis
+from rigidjax.datasets import moon as moon, toutatis as toutatis
 
 show(__name__)

@@ -266,6 +266,9 @@ for name in ("write_html", "write_json"):
 for name in ("problem", "recording"):
     row(f"datasets.toutatis.{name}", transforms=())
 leave_out(
+    "reads an ephemeris that is no dependency: tests/datasets/test_moon.py", "datasets.moon.Moon"
+)
+leave_out(
     "for the fit of one example: tests/datasets/test_toutatis.py",
     *(f"datasets.toutatis.{name}" for name in ("remarks", "rms_degrees", "rows")),
 )

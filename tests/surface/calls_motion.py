@@ -73,6 +73,8 @@ LAWS = {
     "Pulses": dict(edges=TS, torques=np.stack([V, W, Y])),
     "Wrench": dict(force=V, torque=W),
     "BodyDrag": dict(linear=np.abs(V), quadratic=np.abs(W), centre=Y, wind=V),
+    "Chebyshev": dict(start=-1.0, step=0.7, coefficients=np.arange(45.0).reshape(3, 3, 5) / 10),
+    "Tide": dict(response=0.1, delay=0.2, mu=3.1, position=Y, mean_rate=0.3),
     "Held": dict(times=TS, values=np.stack([V, W, Y, V])),
     "Rotors": dict(
         positions=np.stack([V, W]),

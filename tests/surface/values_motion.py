@@ -306,6 +306,56 @@ def unscaled(rng, i):
     return v.inertia(rng, i % 5)
 
 
+def third_energy(mu, r, i, q, c):
+    x, y, z = u = v.matrix_of(q).T @ r / v.norm(r)
+    s = u * u
+    h = (
+        c[0] * z * (2 * s[2] - 3 * (s[0] + s[1])) / 2
+        + (c[1] * x + c[2] * y) * (4 * s[2] - s[0] - s[1]) * 3 / 2
+        + 15 * z * (c[3] * (s[0] - s[1]) + 2 * c[4] * x * y)
+        + 15 * (c[5] * x * (s[0] - 3 * s[1]) + c[6] * y * (3 * s[0] - s[1]))
+    )  # fmt: skip
+    return gradient_energy(mu, r, i, q) - mu / v.norm(r) ** 4 * h
+
+
+way(
+    "motion.torques.GravityGradient motion.torques.GravityGradient.energy (third degree)",
+    lambda mu, r, i, q, c: (
+        laws.GravityGradient(mu, r, (c,))(0.0, rj.Attitude(q, r), rj.Inertia(i)),
+        laws.GravityGradient(mu, r, (c,)).energy(0.0, rj.Attitude(q, r), rj.Inertia(i)),
+    ),
+    (between(1, 9), v.ordinary, unscaled, v.quaternion, between(-1, 1, 7)),
+    lambda mu, r, i, q, c: (
+        gradient(lambda q: third_energy(mu, r, i, q, c), q), third_energy(mu, r, i, q, c)),
+    norm=True,
+)  # fmt: skip
+way(
+    "motion.torques.Chebyshev",
+    lambda start, step, rows, part: laws.Chebyshev(start, step, rows)(start + step * part),
+    (between(-2, 2), between(1, 2), between(-1, 1, 3, 2, 5), between(0.01, 2.99)),
+    lambda start, step, rows, part: sum(
+        rows[int(part), :, n] * mp.chebyt(n, 2 * (part - int(part)) - 1) for n in range(5)
+    ),
+)
+
+
+def bulge(k, delay, mu, r, n, i, q, w):
+    before = v.times(q, v.quaternion_of(-delay * w))
+    u = v.matrix_of(before).T @ r / v.norm(r)
+    pull = mu / v.norm(r) ** 3 * (np.outer(u, u) - v.eye() / 3)
+    spin = np.outer(w, w) - v.dot(w, w) * v.eye() / 3
+    spin = spin - n * n * (np.outer(v.eye()[2], v.eye()[2]) - v.eye() / 3)
+    return i + k * (spin / 3 - pull)
+
+
+way(
+    "motion.torques.Tide",
+    lambda k, delay, mu, r, n, i, q, w: laws.Tide(k, delay, mu, r, n)(
+        0.3, rj.Attitude(q, w), rj.Inertia(i)),
+    (between(0, 1), between(0.1, 1), between(1, 9), v.ordinary, between(0, 2), unscaled, v.quaternion, v.ordinary),
+    bulge,
+    norm=True,
+)  # fmt: skip
 # The body that is given sets nothing but, by its inverse, how many digits are left.
 way(
     "motion.torques.ChangingInertia motion.torques.ChangingInertia.tensor",

@@ -1,8 +1,16 @@
 """Torques and forces. Each declares the smallest state that it acts on."""
 
 from rigidjax._names import show
-from rigidjax.motion.torques.base import AbstractTorque as AbstractTorque, Wrench as Wrench
-from rigidjax.motion.torques.composite import ChangingInertia as ChangingInertia, Sum as Sum
+from rigidjax.motion.torques.base import (
+    AbstractTorque as AbstractTorque,
+    Wrench as Wrench,
+)
+from rigidjax.motion.torques.chebyshev import Chebyshev as Chebyshev
+from rigidjax.motion.torques.composite import (
+    ChangingInertia as ChangingInertia,
+    Sum as Sum,
+    Tide as Tide,
+)
 from rigidjax.motion.torques.elementary import (
     ConstantTorque as ConstantTorque,
     Damping as Damping,

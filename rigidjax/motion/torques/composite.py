@@ -1,7 +1,7 @@
 """Several torques at once, and torques on a body whose inertia changes in time."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -9,11 +9,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rigidjax import _checks
-from rigidjax._types import HasSpin, Mat3, ScalarLike, Vec3
+from rigidjax._types import HasAttitude, HasSpin, Mat3, Scalar, ScalarLike, Vec3
 from rigidjax.body.inertia import Inertia, tensor_of, with_tensor
-from rigidjax.body.symmetric3 import apply, inverse
+from rigidjax.body.symmetric3 import from_components
 from rigidjax.motion.torques import base
-from rigidjax.rotation.linalg3 import cross
+from rigidjax.rotation import quaternion
+from rigidjax.rotation.linalg3 import apply, components, cross, dot, solve
 
 
 class Sum(eqx.Module):
@@ -70,18 +71,21 @@ class Sum(eqx.Module):
 
 
 class ChangingInertia(eqx.Module):
-    """The effect of a changing inertia on a body: `I(t) dΩ/dt = I(t)Ω × Ω − İΩ + τ`.
+    """The effect of a changing inertia: `d(IΩ)/dt = IΩ × Ω + τ`, that is `I dΩ/dt = … − İΩ + τ`.
 
-    **Arguments:** `inertia` a differentiable function of time, t → (3, 3), kg m², body frame, about
-    the point that the body turns about (the centre of mass of a `Rigid`), such as
-    `Linear(times, tensors)`; `torque` all other torques, or `None`. They act on I(t) and get the
-    body at time t: give them here, not beside it in a `Sum`.
+    **Arguments:** `inertia` kg m², body frame, about the point that the body turns about (the
+    centre of mass of a `Rigid`): a function of time, t → (3, 3), such as `Linear(times, tensors)`,
+    or a Module with `feels` (as torques have) of `(t, state, body)`, such as `Tide`. Its derivative
+    along the motion is taken. `torque` all other torques, or `None`: give them here, not beside it
+    in a `Sum`, because their τ acts on I, and they get the body with I.
 
-    The inertia of the body given to `simulate` is replaced. Parts that move inside must have no
-    momentum in the body frame (Σ m r × ṙ = 0), such as booms that extend in a straight line from
-    the centre; else add their momentum to `torque` as a `Flywheel`. Ejected fuel carries its share
-    of İΩ away: then add İΩ to `torque`. Source: Hughes 1986, Spacecraft Attitude Dynamics, ch. 3;
-    without τ the momentum `R I(t) Ω` is conserved.
+    A function of time replaces the inertia of the body given to `simulate`. Parts that move inside
+    must have no momentum in the body frame (Σ m r × ṙ = 0), such as booms that extend
+    in a straight line from the centre; else add their momentum as a `Flywheel` to `torque`. Ejected
+    fuel carries its share of İΩ away: then add İΩ to `torque`.
+
+    Source: Hughes 1986, Spacecraft Attitude Dynamics, ch. 3; the momentum `R I(t) Ω` is conserved
+    without τ.
 
     **Raises:** `TypeError` for anything but a function; `ValueError` for a value that is not (3,
     3).
@@ -92,40 +96,120 @@ class ChangingInertia(eqx.Module):
     Array(0.5, dtype=float64)
     """
 
-    inertia: Callable[[Any], Any]
+    inertia: Callable[..., Any]
     torque: Any
 
-    def __init__(self, inertia: Callable[[Any], Any], torque: base.Torque | None = None):
-        self.inertia = _checks.function(inertia, "inertia", "of time to (3, 3), kg m²")
+    def __init__(self, inertia: Callable[..., Any], torque: base.Torque | None = None):
+        if hasattr(inertia, "feels"):
+            base.require_law(inertia, "inertia")
+        else:
+            _checks.function(inertia, "inertia", "of time to (3, 3), kg m²")
+        self.inertia = inertia
         if torque is not None:
             base.require_law(torque)
         self.torque = torque
 
     @property
     def feels(self) -> type:
-        """The smallest state that the torque inside acts on."""
-        return getattr(self.torque, "feels", HasSpin)
+        """The smallest state that the inertia and the torque inside act on."""
+        rungs = [getattr(part, "feels", HasSpin) for part in (self.inertia, self.torque)]
+        return max(rungs, key=base.LADDER.index)
 
     jump_times = property(base.jumps_of_parts)
 
-    def tensor(self, t: ScalarLike) -> Mat3:
-        """I(t), (3, 3), kg m²."""
-        found = self.inertia(t)
+    def tensor(self, t: ScalarLike, state: Any = None, body: Any = None) -> Mat3:
+        """I, (3, 3), kg m²; of a function of time without `state` and `body`."""
+        seen = (t, state, body) if hasattr(self.inertia, "feels") else (t,)
+        found = self.inertia(*seen)
         found = found.tensor if isinstance(found, Inertia) else found
         return _checks.floating(found, (3, 3), "inertia(t)")
 
     def __call__(self, t: ScalarLike, state: HasSpin, body: Any) -> Vec3 | base.Wrench:
         omega = state.omega
         t = jnp.asarray(t, omega.dtype)
-        now, rate = jax.jvp(self.tensor, (t,), (jnp.ones_like(t),))
-        now, rate = now.astype(omega.dtype), rate.astype(omega.dtype)
-        turning = cross(apply(now, omega), omega) - apply(rate, omega)
+        q = state.q if isinstance(state, HasAttitude) else None
+
+        def momentum(t: Any, q: Any, omega: Any) -> tuple[Vec3, Mat3]:
+            here = eqx.tree_at(lambda s: s.omega, state, omega)
+            here = here if q is None else eqx.tree_at(lambda s: s.q, here, q)
+            now = self.tensor(t, here, body).astype(omega.dtype)
+            return apply(now, omega), now
+
+        # Ω̇ is not known yet: I(Ω) Ω is linear in it. One program along four ways: t and q, e_i.
+        (held, now), along = jax.linearize(momentum, t, q, omega)
+        still, first = jnp.zeros((1, 3), omega.dtype), jnp.eye(4, 1, dtype=omega.dtype)
+        turns = None if q is None else first * quaternion.rate(q, omega)[None]
+        ways = jnp.concatenate([still, jnp.eye(3, dtype=omega.dtype)])
+        slopes, _ = jax.vmap(along)(first[:, 0], turns, ways)
+        turning = cross(held, omega) - slopes[0]
         force = None
         if self.torque is not None:
             force, torque = base.act(self.torque, t, state, with_tensor(body, now))
             turning = turning + torque
         # The body's own equations have its own inertia: the torque that brings them to this.
         fixed = tensor_of(body)
-        slope = apply(inverse(now), turning)
+        slope = solve(slopes[1:].T, turning)
         torque = apply(fixed, slope) - cross(apply(fixed, omega), omega)
         return torque if force is None else base.Wrench(force, torque)
+
+
+class Tide(eqx.Module):
+    """The inertia tensor of an elastic body that a point mass and its own spin deform.
+
+    `I = I₀ − κ (μ/r³)(u uᵀ − ⅓) + ⅓ κ (Ω Ωᵀ − ⅓ Ω² − n² (e_z e_zᵀ − ⅓))` with the inertia I₀ of
+    the body and `u = Rᵀr/r`, both of a time `delay` ago. For
+    `ChangingInertia`, which adds İΩ: `ChangingInertia(Tide(…), torque)`.
+
+    **Arguments:** `response` κ = k₂R⁵/G, kg m² s², of a Love number k₂ and a radius R; `delay` s;
+    `mu` G M of the point mass, m³/s²; `position` r (3,) m, world frame, from the body to it:
+    constant, or a callable Module of time; `mean_rate` n rad/s about body z, the spin whose
+    deformation I₀ contains.
+
+    The attitude a time ago is that of a turn at the present body rate. Source: Folkner, Williams,
+    Boggs, Park, Kuchynka 2014, The planetary and lunar ephemerides DE430 and DE431, IPN Progress
+    Report 42-196, section III.
+
+    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
+
+    >>> import rigidjax as rj
+    >>> tide, body = Tide(3.0, 0.0, 1.0, [1.0, 0.0, 0.0]), rj.Inertia(4.0 * jnp.eye(3))
+    >>> tide(0.0, rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 0]), body).diagonal()
+    Array([2., 5., 5.], dtype=float64)
+    """
+
+    feels: ClassVar[type] = HasAttitude
+    response: Scalar = eqx.field(converter=base.number("response"))
+    delay: Scalar = eqx.field(converter=base.number("delay"))
+    mu: Scalar = eqx.field(converter=base.number("mu"))
+    position: Any
+    mean_rate: Scalar
+
+    def __init__(
+        self,
+        response: ScalarLike,
+        delay: ScalarLike,
+        mu: ScalarLike,
+        position: object,
+        mean_rate: ScalarLike = 0.0,
+    ):
+        self.response, self.delay, self.mu = response, delay, mu  # pyright: ignore
+        self.position = base.constant_or_callable(position, "position")
+        self.mean_rate = _checks.given(mean_rate, (), "mean_rate")
+
+    def __call__(self, t: ScalarLike, state: HasAttitude, body: Any) -> Mat3:
+        before = quaternion.multiply(state.q, quaternion.exp(-self.delay * state.omega))
+        r = base.vector_at(self.position, t - self.delay, "position")
+        distance = jnp.sqrt(dot(r, r))
+        x, y, z = components(quaternion.rotate_inverse(before, r / distance))
+        a, b, c = components(state.omega)
+        pull, spin = self.mu / distance / distance / distance, self.mean_rate**2
+        third = (pull - (a * a + b * b + c * c - spin) / 3) / 3
+        added = from_components(
+            third - pull * x * x + a * a / 3,
+            third - pull * y * y + b * b / 3,
+            third - pull * z * z + (c * c - spin) / 3,
+            a * b / 3 - pull * x * y,
+            a * c / 3 - pull * x * z,
+            b * c / 3 - pull * y * z,
+        )
+        return tensor_of(body) + self.response * added

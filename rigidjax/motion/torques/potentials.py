@@ -1,20 +1,20 @@
 """Torques with a potential: gravity on a body with a fixed point, a magnet in a field, any U(q)."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from rigidjax import _checks
 from rigidjax._types import HasAttitude, HasPose, Scalar, ScalarLike, Vec3, Vector
 from rigidjax.body.inertia import Inertia, MassProperties, tensor_of
 from rigidjax.motion.torques import base
 from rigidjax.rotation import quaternion
-from rigidjax.rotation.linalg3 import apply, cross, dot
+from rigidjax.rotation.linalg3 import apply, components, cross, dot
 
 
 class HeavyTop(base.AbstractTorque):
@@ -62,15 +62,18 @@ class HeavyTop(base.AbstractTorque):
 
 
 class GravityGradient(base.OfTime):
-    """The torque of a far central body: `τ = (3μ/r³) r̂' × I r̂'`, `r̂' = Rᵀ r̂`.
+    """The torque of a far point mass: `τ = (3μ/r³) u × Iu − Σ (μ/rⁿ⁺¹) u × ∇Hₙ(u)`, `u = Rᵀr/r`.
 
-    **Arguments:** `mu` μ = G M of the central body, m³/s²; `position` r (3,) m, world frame,
-    between the central body and the body (either sign): constant, or a callable Module of time, t →
-    (3,), for an orbit. **Raises:** `ValueError` for a distance of zero.
+    **Arguments:** `mu` μ = G M of the point mass, m³/s²; `position` r (3,) m, world frame, from the
+    body to it (without `harmonics` the sign does not matter): constant, or a callable Module of
+    time, t → (3,), for an orbit; `harmonics` the body's gravity of higher degree n in body axes:
+    an array (2n + 1,) for each n = 3, 4, …, kg mⁿ, its mass times Rⁿ times the Stokes coefficients
+    (Cn0, Cn1, Sn1, Cn2, Sn2, …), not normalised, of a radius R. Several masses: a `Sum`.
 
-    `U = (μ/2r³)(3 r̂'·I r̂' − Tr I)`, the second term of MacCullagh's formula; the orbit itself
-    does not change. Source: Hughes, Spacecraft Attitude Dynamics, §8.1; Goldstein, Poole and Safko,
-    Classical Mechanics, eq 5.86.
+    Hₙ is the solid harmonic `Σ rⁿ Pₙₘ (C cos mλ + S sin mλ)` of degree n. The potential is
+    `U = (μ/2r³)(3 u·Iu − Tr I) − Σ (μ/rⁿ⁺¹) Hₙ(u)`, MacCullagh's formula and its next terms; it
+    does not change the orbit itself. Source: Hughes, Spacecraft Attitude Dynamics, §8.1; Goldstein,
+    Poole and Safko, Classical Mechanics, eq 5.86; Montenbruck and Gill, Satellite Orbits, §3.2.
 
     >>> law, body = GravityGradient(1.0, [1.0, 1.0, 0.0]), rj.Inertia.from_principal(1.0, 2.0, 2.5)
     >>> state = rj.Attitude([1.0, 0, 0, 0], [0.0, 0, 0])
@@ -82,10 +85,15 @@ class GravityGradient(base.OfTime):
     rate_free: ClassVar[bool] = True
     mu: Float[Array, ""]
     position: eqx.Module | Float[Array, "3"]
+    harmonics: tuple[Float[Array, " orders"], ...]
 
-    def __init__(self, mu: ScalarLike, position: object):
+    def __init__(self, mu: ScalarLike, position: object, harmonics: Sequence[ArrayLike] = ()):
         self.mu = _checks.given(mu, (), "mu")
         self.position = base.constant_or_callable(position, "position")
+        self.harmonics = tuple(
+            _checks.given(row, (2 * n + 1,), f"harmonics: degree {n}")
+            for n, row in enumerate(harmonics, 3)
+        )
         at: Any = self.position
         if not callable(at) and _checks.known(at) and not np.asarray(at).any():
             words = "the vector between the body and the central body"
@@ -98,23 +106,69 @@ class GravityGradient(base.OfTime):
         return None if callable(source) else source
 
     def energy(self, t: ScalarLike, state: HasAttitude, body: Inertia | MassProperties) -> Scalar:
-        """Potential energy of the attitude, J: `U = (μ/2r³)(3 r̂'·I r̂' − Tr I)`."""
+        """Potential energy of the attitude, J: `U = (μ/2r³)(3 u·Iu − Tr I) − Σ (μ/rⁿ⁺¹) Hₙ(u)`."""
         tensor = tensor_of(body)
-        down, strength = self._down(t, state)
+        u, strength, slopes = self._seen(t, state)
         trace = tensor[0, 0] + tensor[1, 1] + tensor[2, 2]
-        return 0.5 * strength * (3 * dot(down, apply(tensor, down)) - trace)
+        potential = 0.5 * strength * (3 * dot(u, apply(tensor, u)) - trace)
+        for n, slope in enumerate(slopes, 3):
+            potential = potential - dot(u, slope) / n  # Euler: u·∇H = n H
+        return potential
 
     def __call__(self, t: ScalarLike, state: HasAttitude, body: Inertia | MassProperties) -> Vec3:
-        down, strength = self._down(t, state)
-        return cross(3 * strength * down, apply(tensor_of(body), down))
+        u, strength, slopes = self._seen(t, state)
+        pull = 3 * strength * apply(tensor_of(body), u)
+        for slope in slopes:
+            pull = pull - slope
+        return cross(u, pull)
 
-    def _down(self, t, state):
-        """Direction of the central body in body axes, and μ/r³."""
+    def _seen(self, t, state):
+        """Direction of the point mass in body axes, μ/r³, and (μ/rⁿ⁺¹) ∇Hₙ of each degree."""
         r = base.vector_at(self.position, t, "position")
         distance = jnp.sqrt(dot(r, r))
         # r³ overflows in float32 beyond 7e12 m: divide by r three times instead.
         strength = self.mu / distance / distance / distance
-        return quaternion.rotate_inverse(state.q, r / distance), strength
+        u = quaternion.rotate_inverse(state.q, r / distance)
+        slopes, factor = [], strength
+        for slope in _slopes(self.harmonics, u):
+            factor = factor / distance
+            slopes.append(factor * slope)
+        return u, strength, slopes
+
+
+def _slopes(harmonics: Sequence[Array], u: Vec3) -> list[Vec3]:
+    """∇Hₙ at a unit vector, n = 3, 4, … (Cunningham 1970, doi:10.1007/BF01229495)."""
+    x, y, z = components(u)
+    zero = jnp.zeros_like(z)
+    # Real and imaginary part of rⁿ Pₙₘ exp(imλ), m = 0 … n + 1, of this degree and the one before.
+    before, here = [(zero, zero)] * 2, [(jnp.ones_like(z), zero), (zero, zero)]
+    out = []
+    for n in range(1, len(harmonics) + 3):
+        if n >= 3:
+            out.append(_slope(components(harmonics[n - 3]), n, here))
+        k = 2 * n - 1
+        (re, im), following = here[n - 1], []
+        for m in range(n):
+            (a, b), (p, q), left = here[m], before[m], n - m
+            following.append(
+                ((k * z * a - (n + m - 1) * p) / left, (k * z * b - (n + m - 1) * q) / left)
+            )
+        top = k * (x * re - y * im), k * (x * im + y * re)
+        before, here = [*here, (zero, zero)], [*following, top, (zero, zero)]
+    return out
+
+
+def _slope(row: Sequence[Scalar], n: int, lower: Sequence[tuple[Scalar, Scalar]]) -> Vec3:
+    """∇Hₙ of the coefficients of one degree, by the solid harmonics of the degree below."""
+    along, flat_x, flat_y = n * row[0] * lower[0][0], -row[0] * lower[1][0], -row[0] * lower[1][1]
+    for m in range(1, n + 1):
+        c, s = row[2 * m - 1 : 2 * m + 1]
+        (a, b), (p, q) = lower[m - 1], lower[m + 1] if m < n else (0.0, 0.0)
+        half = 0.5 * (n + m) * (n + m - 1)
+        along = along + (n + m) * (c * lower[m][0] + s * lower[m][1])
+        flat_x = flat_x + c * (half * a - 0.5 * p) + s * (half * b - 0.5 * q)
+        flat_y = flat_y - c * (half * b + 0.5 * q) + s * (half * a + 0.5 * p)
+    return jnp.stack([flat_x, flat_y, along])
 
 
 class MagneticDipole(base.OfTime):

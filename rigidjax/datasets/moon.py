@@ -1,0 +1,263 @@
+"""The Moon's place and attitude from JPL's ephemeris DE421, 1900 to 2199.
+
+W. M. Folkner, J. G. Williams, D. H. Boggs, "The planetary and lunar ephemeris DE421", IPN Progress
+Report 42-178 (2009). Read from the package `de421` (`pip install 'rigidjax[moon]'`). World axes are
+those of the ICRF, body axes the Moon's principal ones; times are barycentric dynamical time.
+"""
+
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from rigidjax import _checks
+from rigidjax._names import show
+from rigidjax._types import HasAttitude, ScalarLike
+from rigidjax.body.inertia import Inertia
+from rigidjax.identify.body_charts import AbstractBodyChart
+from rigidjax.motion import Attitude
+from rigidjax.motion.torques import ChangingInertia, Chebyshev, GravityGradient, Sum, Tide
+from rigidjax.motion.torques.base import evaluate
+from rigidjax.rotation import euler
+from rigidjax.rotation.linalg3 import cross
+
+CITATION = "Folkner, Williams & Boggs 2009, IPN Progress Report 42-178"
+DAY = 86400.0
+# Only the units of mass depend on it, no motion does.
+_G = 6.6743e-11
+# Julian date of the start, and the blocks of 32 days.
+_FIRST, _BLOCK, _BLOCKS = 2414992.5, 32, 3426
+# The year at which DE421's constants give the Moon's and the core's motion: 28 June 1969.
+EPOCH = 2000 + (2440400.5 - 2451545.0) / 365.25
+
+
+class Moon(eqx.Module):
+    """Years of the ephemeris, as functions of the time in s from the first year.
+
+    **Arguments:** `first`, `last` year, such as 1970.0 and 1976.0: Julian years, 2000.0 is Julian
+    date 2451545.0. Tables begin and end at least ten days beyond them.
+
+    **Fields:** `earth`, `sun` Chebyshev tables of their places as seen from the Moon, m, ICRF;
+    `angles` of the 3-1-3 Euler angles (φ, θ, ψ), rad, body → ICRF; `constants` DE421's own, by
+    name, in its units (au, day, km); `first`.
+
+    **Raises:** `ModuleNotFoundError` without the package; `ValueError` for years outside of 1900
+    to 2199, or not in order.
+
+    >>> Moon(1970.0, 1971.0).earth.coefficients.shape  # doctest: +SKIP
+    (104, 3, 13)
+    """
+
+    earth: Chebyshev
+    sun: Chebyshev
+    angles: Chebyshev
+    constants: dict[str, float] = eqx.field(static=True)
+    first: float = eqx.field(static=True)
+
+    def __init__(self, first: float, last: float):
+        found = find_spec("de421")
+        if found is None or found.origin is None:
+            raise ModuleNotFoundError(
+                "datasets.moon reads the package de421: pip install 'rigidjax[moon]'", name="de421"
+            )
+        days = [(_checks.number(year, "year") - 2000) * 365.25 + 2451545.0 - _FIRST
+                for year in (first, last)]  # fmt: skip
+        low, high = int((days[0] - 10) // _BLOCK), int((days[1] + 10) // _BLOCK) + 1
+        if not (days[0] < days[1] and 10 <= days[0] and high <= _BLOCKS):
+            raise ValueError(f"Moon: wanted years in order in 1900 to 2199, got {first}, {last}")
+
+        def table(name: str, step: int) -> np.ndarray:
+            """Coefficients on intervals of `step` days."""
+            rows = np.load(Path(found.origin or "").parent / f"jpl-{name}.npy", mmap_mode="r")
+            a_block = len(rows) // _BLOCKS
+            return _split(rows[low * a_block : high * a_block], _BLOCK // a_block // step)
+
+        numbers = np.load(Path(found.origin).parent / "constants.npy")
+        self.constants = {name.decode(): float(value) for name, value in numbers}
+        # The ephemeris has the Earth–Moon barycentre, and the Moon as seen from the Earth.
+        share = self.constants["EMRAT"] / (1 + self.constants["EMRAT"])
+        moon, middle, sun = (1e3 * table(name, 4) for name in ("moon", "earthmoon", "sun"))
+        sun = np.pad(sun, ((0, 0), (0, 0), (0, moon.shape[2] - sun.shape[2])))
+        start = (_BLOCK * low - days[0]) * DAY
+        self.earth = Chebyshev(start, 4 * DAY, -moon)
+        self.sun = Chebyshev(start, 4 * DAY, sun - middle - share * moon)
+        self.angles = Chebyshev(start, 8 * DAY, table("librations", 8))
+        self.first = first
+
+    def attitude(self, t: ScalarLike) -> Attitude:
+        """Attitude and body rate at `t`, s."""
+        t = jnp.asarray(t, float)
+        angles, rates = jax.jvp(self.angles, (t,), (jnp.ones_like(t),))
+        turned = jnp.remainder(angles, 2 * jnp.pi)
+        return Attitude(euler.to_quaternion(turned), euler.rates_to_omega(turned, rates))
+
+    def body(
+        self, beta: ScalarLike | None = None, gamma: ScalarLike | None = None, *, core: bool = False
+    ) -> Inertia:
+        """The inertia, kg m², of DE421's J2, β = (C − A)/B and γ = (B − A)/C, or other ones.
+
+        With `core` that of the mantle alone, which then turns under `torque(core=True)`.
+        """
+        c = self.constants
+        b = jnp.asarray(c["LBET"] if beta is None else beta)
+        g = jnp.asarray(c["LGAM"] if gamma is None else gamma)
+        largest = self._mass * self._radius**2 * c["J2M"] * 2 * (1 + b) / (2 * b - g + b * g)
+        ones = jnp.stack([(1 - b * g) / (1 + b), (1 + g) / (1 + b), jnp.ones_like(b)])
+        whole = Inertia(largest * jnp.diag(ones))
+        return whole - self._core if core else whole
+
+    def chart(self, *, core: bool = False) -> AbstractBodyChart:
+        """The chart of `body` for a fit: β and γ are free."""
+        return _Shape(self, core)
+
+    def torque(
+        self, degree: int = 4, *, tide: bool = False, core: bool = False, figure: bool = False
+    ) -> Any:
+        """The torque of Earth and Sun.
+
+        **Arguments:** `degree` of the Moon's gravity in the Earth's field, 2 to 4; `tide` whether
+        the Earth and the spin deform the Moon; `core` whether a liquid core turns in the mantle,
+        with DE421's own initial rate: then `first` is `EPOCH`, otherwise it **raises**
+        `ValueError`; `figure` whether the Earth is oblate.
+        """
+        c = self.constants
+        rows = []
+        for n in range(3, degree + 1):
+            pairs = [c[f"{k}{n}{m}M"] for m in range(1, n + 1) for k in "CS" if f"{k}{n}{m}M" in c]
+            rows.append(self._mass * self._radius**n * jnp.array([-c[f"J{n}M"], *pairs]))
+        earths = [(self._mu_earth, 0.0)]
+        if figure:
+            # Of the same J2: two negative masses on the axis, at the radius of the equator. The
+            # axis is that of the ICRF, from which precession takes the Earth's by 0.1° in 20 years.
+            few, radius = -0.5 * c["J2E"] * self._mu_earth, 1e3 * c["AE"]
+            earths = [(self._mu_earth - 2 * few, 0.0), (few, radius), (few, -radius)]
+        law: Any = Sum(
+            *(GravityGradient(mu, _raised(self.earth, z), rows) for mu, z in earths),
+            GravityGradient(c["GMS"] * self._in_si, self.sun),
+        )
+        if core:
+            if self.first != EPOCH:
+                raise ValueError(
+                    "torque: the core's rate is known at the year EPOCH: Moon(EPOCH, …)"
+                )
+            rate = jnp.array([c["OMGCX"], c["OMGCY"], c["OMGCZ"]]) / DAY
+            friction = c["KVC"] / DAY * self.body().tensor[2, 2]
+            law = _Core(rate, self._core.tensor, friction, law)
+        if tide:
+            response, turn = c["K2M"] * self._radius**5 / _G, 2 * np.pi / (27.321661 * DAY)
+            bulge = Tide(response, c["TAUM"] * DAY, self._mu_earth, self.earth, turn)
+            law = ChangingInertia(bulge, law)
+        return law
+
+    @property
+    def _core(self) -> Inertia:
+        """The core's inertia: a share of the Moon's largest, flattened."""
+        c = self.constants
+        share, flat = c["IFAC"] * self.body().tensor[2, 2], 1 - c["COBLAT"]
+        return Inertia(share * jnp.diag(jnp.array([flat, flat, 1.0])))
+
+    @property
+    def _in_si(self) -> float:
+        """m³/s² of one au³/day²."""
+        return (1e3 * self.constants["AU"]) ** 3 / DAY**2
+
+    @property
+    def _mu_earth(self) -> float:
+        c = self.constants
+        return self._in_si * c["GMB"] * c["EMRAT"] / (1 + c["EMRAT"])
+
+    @property
+    def _mass(self) -> float:
+        return self._mu_earth / self.constants["EMRAT"] / _G
+
+    @property
+    def _radius(self) -> float:
+        return 1e3 * self.constants["AM"]
+
+
+class _Shape(AbstractBodyChart):
+    """β and γ: the logarithms of their ratios to DE421's, in thousandths."""
+
+    size: ClassVar[int] = 2
+    in_words: ClassVar[str] = "β and γ of the Moon"
+    log_names: ClassVar[tuple[str, ...]] = ("β", "γ")
+    plain_names: ClassVar[tuple[str, ...]] = ()
+    unit: ClassVar[str] = ""
+    moon: Moon
+    core: bool = eqx.field(static=True)
+
+    def body(self, vector: Array) -> Inertia:
+        beta, gamma = jnp.exp(1e-3 * vector + self._known)
+        return self.moon.body(beta, gamma, core=self.core)
+
+    def vector(self, body: Any) -> Array:
+        return 1e3 * (self.logs(body) - self._known)
+
+    def logs(self, body: Any) -> Array:
+        tensor = body.tensor + self.moon._core.tensor if self.core else body.tensor
+        a, b, c = (tensor[i, i] for i in range(3))
+        return jnp.log(jnp.stack([(c - a) / b, (b - a) / c]))
+
+    def plain(self, body: Any) -> Array:
+        return jnp.zeros(0)
+
+    @property
+    def _known(self) -> Array:
+        return jnp.log(jnp.array([self.moon.constants[name] for name in ("LBET", "LGAM")]))
+
+
+class _Core(eqx.Module):
+    """A liquid core in the mantle: friction at the boundary, and its flattening.
+
+    Its own state is its angular velocity (3,), rad/s, mantle frame. Source: Folkner and others 2014
+    (DE430), section III; Williams and others 2001, Lunar rotational dissipation in solid body and
+    molten core, JGR 106:27933.
+    """
+
+    feels: ClassVar[type] = HasAttitude
+    state0: Array
+    tensor: Array
+    friction: Array
+    gravity: Sum
+
+    def on_mantle(self, state: Any, own: Array) -> Array:
+        x, y, z = own
+        flat = self.tensor[2, 2] - self.tensor[0, 0]
+        pushed = flat * z * jnp.stack([-y, x, jnp.zeros_like(z)])
+        return self.friction * (own - state.omega) + pushed
+
+    def rate(self, t: ScalarLike, own: Array, state: Any, body: Inertia) -> Array:
+        moments = jnp.stack([self.tensor[i, i] for i in range(3)])
+        return (cross(moments * own, state.omega) - self.on_mantle(state, own)) / moments
+
+    def __call__(self, t: ScalarLike, state: Any, body: Inertia, own: Array) -> Array:
+        whole = Inertia(body.tensor + self.tensor)
+        return evaluate(self.gravity, t, state, whole) + self.on_mantle(state, own)
+
+
+def _raised(table: Chebyshev, z: float) -> Chebyshev:
+    """The same places, higher by z."""
+    moved = table.coefficients.at[:, 2, 0].add(z)
+    return eqx.tree_at(lambda t: t.coefficients, table, moved)
+
+
+def _split(rows: np.ndarray, parts: int) -> np.ndarray:
+    """The same polynomials (intervals, k, terms) on intervals of a fraction of the length."""
+    count, k, terms = rows.shape
+    if parts == 1:
+        return rows
+    nodes = np.cos(np.pi * (np.arange(terms) + 0.5) / terms)
+    back = np.linalg.inv(np.polynomial.chebyshev.chebvander(nodes, terms - 1))
+    out = np.empty((count, parts, k, terms))
+    for part in range(parts):
+        at = np.polynomial.chebyshev.chebvander((2 * part + 1 + nodes) / parts - 1, terms - 1)
+        out[:, part] = rows @ (back @ at).T
+    return out.reshape(count * parts, k, terms)
+
+
+show(__name__)

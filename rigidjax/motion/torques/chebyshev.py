@@ -1,0 +1,61 @@
+"""A function of time as Chebyshev polynomials on equal intervals, as ephemerides are published."""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float
+
+from rigidjax import _checks
+from rigidjax._types import Scalar, ScalarLike
+from rigidjax.rotation.barrier import barrier
+
+
+class Chebyshev(eqx.Module):
+    """A function of time, t → (k,): a Chebyshev series on each of many equal intervals.
+
+    **Arguments:** `start` s, the beginning of the first interval; `step` s, the length of each;
+    `coefficients` (intervals, k, terms): `Σ_n c_n T_n(x)` with x from −1 to 1 along the interval,
+    the layout of JPL's ephemerides. All may be traced.
+
+    A place at any time for `GravityGradient` and `Tide`, without a loss of digits of the table. NaN
+    outside of the intervals. Sum by Clenshaw's recurrence (1955, Mathematical Tables 9:118).
+
+    **Raises:** `ValueError` for a wrong shape, NaN, a step that is not positive.
+
+    >>> Chebyshev(0.0, 2.0, [[[1.0, 0.0, 1.0]]])(2.0)  # 1 + T₂(1)
+    Array([2.], dtype=float64)
+    """
+
+    start: Scalar
+    step: Scalar
+    coefficients: Float[Array, "intervals k terms"]
+
+    def __init__(
+        self, start: ScalarLike, step: ScalarLike, coefficients: Float[ArrayLike, "n k m"]
+    ):
+        rows = _checks.numbers(coefficients, "coefficients")
+        if rows.ndim != 3 or 0 in rows.shape:
+            raise ValueError(
+                f"coefficients: wanted (intervals, k, terms), got the shape {rows.shape}"
+            )
+        dtype = jnp.result_type(float)
+        self.coefficients = _checks.finite(rows, "coefficients").astype(dtype)
+        self.start, step = _checks.given(start, (), "start"), _checks.given(step, (), "step")
+        self.start = self.start.astype(dtype)
+        self.step = _checks.sign(step, "step", "a positive length, s").astype(dtype)
+
+    def __call__(self, t: ScalarLike) -> Any:
+        """The value at `t` (s), (k,)."""
+        count, _, terms = self.coefficients.shape
+        place = (jnp.asarray(t, self.start.dtype) - self.start) / self.step
+        i = jnp.clip(jnp.floor(place).astype(jnp.int32), 0, count - 1)
+        x = 2 * (place - i.astype(place.dtype)) - 1
+        # XLA:CPU would read the table again for every number computed from it.
+        x, row = barrier((x, self.coefficients[i]))
+        value, before = jnp.zeros_like(row[:, 0]), jnp.zeros_like(row[:, 0])
+        for n in range(terms - 1, 0, -1):
+            value, before = row[:, n] + 2 * x * value - before, value
+        value = row[:, 0] + x * value - before
+        inside = (place >= 0) & (place <= count)
+        return jnp.where(inside, value, jnp.nan)
