@@ -1,5 +1,6 @@
 """A function of time as Chebyshev polynomials on equal intervals, as ephemerides are published."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -32,7 +33,10 @@ class Chebyshev(eqx.Module):
     coefficients: Float[Array, "intervals k terms"]
 
     def __init__(
-        self, start: ScalarLike, step: ScalarLike, coefficients: Float[ArrayLike, "n k m"]
+        self,
+        start: ScalarLike,
+        step: ScalarLike,
+        coefficients: Float[ArrayLike, "n k terms"] | Sequence[Any],
     ):
         rows = _checks.numbers(coefficients, "coefficients")
         if rows.ndim != 3 or 0 in rows.shape:
