@@ -10,7 +10,7 @@ from jax.test_util import check_grads
 
 import rigidjax as rj
 from rigidjax import torques
-from rigidjax.motion import conserved
+from rigidjax.motion.conserved import conserved
 from rigidjax.motion.equations import AttitudeEquations
 from rigidjax.motion.torques import base
 
