@@ -230,7 +230,6 @@ def assess(
     rival = f"{len(rivals)} of {len(starts)} starts fit as well elsewhere" if rivals else ""
     lost = believable and not any(start.fits for start in starts)
     remarks = ("no single start came near the best point",) if lost else ()
-    search = _search(best_cost, done, rival, interrupted, remarks)
     unreal = of_charts(of, flat_limit.bodies_of(problem, value))
     model = Answer(model.word, (*unreal, *model.reasons))
     model = model if np.isfinite(best_cost) else Answer(FAILS)
@@ -249,7 +248,7 @@ def assess(
         jnp.asarray(spread.singular_values),
         jnp.asarray(spread.null_directions),
         quantities_of(problem, numbers, spread.seen, spread.null_directions, limits),
-        search,
+        _search(best_cost, done, rival, interrupted, remarks),
         model,
         left,
         limits,

@@ -252,21 +252,22 @@ def fit_windows(
     converged = bool(end.converged)
     message = [] if converged else [f"stopped after {taken} steps: its best point"]
     deviation, words = _deviations(there, np.asarray(end.point), windows.count)
-    message += words
-    body, law = scene(value)
-    told = (unreal(body) or flat_limit.in_words(body), _too_late(windows, law))
-    message += [wrong for wrong in told if wrong]
-    kinds = {k: float(v[0]) for k, v in parts(start, scales).items()}
+    message += [*words, *_remarks(windows, *scene(value))]
     return WindowFit(
         value,
         back(jnp.asarray(deviation)),
         float(end.cost) / (windows.count * windows.length),
-        kinds,
+        {kind: float(part[0]) for kind, part in parts(start, scales).items()},
         taken,
         converged,
         "; ".join(message),
         scene,
     )
+
+
+def _remarks(windows: Windows, body: Any, law: Any) -> list[str]:
+    told = (unreal(body) or flat_limit.in_words(body), _too_late(windows, law))
+    return [wrong for wrong in told if wrong]
 
 
 def _deviations(there: Search, point: np.ndarray, count: int) -> tuple[np.ndarray, list[str]]:
