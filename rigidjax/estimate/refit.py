@@ -62,7 +62,7 @@ class Refit(eqx.Module):
 
     @property
     def point(self) -> Unpacked:
-        """The meaning of x: body, initial states, values, noise, process."""
+        """The body, initial states, values, noise and process that the vector x stands for."""
         return self.density.unpack(self.x)
 
     @property

@@ -218,8 +218,10 @@ def _read_place(recording: Recording) -> tuple[np.ndarray, np.ndarray, float] | 
 
 
 def _from_ranges(stations: np.ndarray, lengths: np.ndarray) -> np.ndarray:
-    """Places (n, 3) of distances (n, k) to stations: differences of `|x|² − 2 s·x + |s|² = d²` are
-    linear in x; along directions that these leave open it is the stations' centre.
+    """Places (n, 3) with these distances (n, k) to stations.
+
+    Differences of the equations `|x|² − 2 s·x + |s|² = d²` are linear in x. A component of x that
+    they do not determine is that of the stations' centre.
     """
     centre = stations.mean(axis=0)
     s = stations - centre

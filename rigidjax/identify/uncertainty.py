@@ -205,8 +205,10 @@ def distance(linear: Linearised, white: Spread, held: Sequence[np.ndarray] = ())
 
 
 def _sandwich(linear: Linearised, half: np.ndarray, times: "Times") -> np.ndarray:
-    """The sandwich of bread `half halfᵀ`; its meat is of orthonormal columns, for round-off between
-    two breads would make variances negative.
+    """White's covariance, with `half halfᵀ` as the covariance of independent errors.
+
+    Products of derivatives are taken in orthonormal columns: otherwise round-off could make
+    variances negative.
     """
     columns, triangles = np.linalg.qr(linear.dense)
     seen = np.concatenate(linear.apart(triangles)) @ half

@@ -191,7 +191,8 @@ def cotangents(
 ) -> tuple[Arrays, Run]:
     """The transpose of the tangents of `replayed`: cotangents of the constants and of the run.
 
-    Those of times only where they are `timed`; `bars` of the states between and at the end.
+    `bars` are the cotangents of the states at the saved times and at the end. Times have some only
+    where `timed`.
     """
     number, size = jnp.max(record.number), run.between.shape[0]
 

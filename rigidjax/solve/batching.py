@@ -32,9 +32,10 @@ Program = Callable[[Layout, Arrays, Arrays], Arrays]
 def in_lanes(
     program: Program, constants: Arrays, each: Arrays, linear: int = 0, layout: Layout | None = None
 ) -> Arrays:
-    """The program, whose `jax.vmap` is itself on longer last axes; bodies may share `constants`.
+    """The result of `program`; under `jax.vmap` its arrays get longer last axes (the bodies).
 
-    In the last `linear` of `each` it is linear: many such directions of one motion are no bodies.
+    Bodies may share `constants`. The program is linear in the last `linear` of `each`: many
+    directions of one motion are not counted as bodies.
     """
     was = Layout(False, (True,) * len(constants)) if layout is None else layout
     number = len(constants)
