@@ -62,7 +62,8 @@ def regress_inertia(recordings: tuple[Recording, ...]) -> Inertia | None:
 
     `I ΔΩ + ∫ Ω × IΩ dt = ∫ τ dt` is linear in the six components of I. With a torque they are found
     by least squares, without one as the smallest right singular vector (up to scale). The result
-    is moved to the nearest real body. It is `None` if samples are too far apart, or the torque needs more than a rate.
+    is moved to the nearest real body. It is `None` if samples are too far apart, or the torque
+    needs more than a rate.
     """
     found = []
     for recording in recordings:
