@@ -228,7 +228,7 @@ def _growth(setup: Free | Loop | Setup, ts: Array, ys: Any) -> Float[Array, " ti
     # A turn by δθ changes q by half of it.
     for turned in turns(start):
         sizes = sizes.at[turned].multiply(2)
-    change = _transition(setup, ts, ys) * sizes / sizes[:, None]
+    change = _transition(setup, ts, ys) * (sizes[None] / sizes[:, None])[None]
     return jnp.linalg.norm(change, ord=2, axis=(1, 2))
 
 
