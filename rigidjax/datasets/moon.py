@@ -184,10 +184,7 @@ class _Shape(AbstractBodyChart):
     """β and γ: the logarithms of their ratios to DE421's, in thousandths."""
 
     size: ClassVar[int] = 2
-    in_words: ClassVar[str] = "β and γ of the Moon"
     log_names: ClassVar[tuple[str, ...]] = ("β", "γ")
-    plain_names: ClassVar[tuple[str, ...]] = ()
-    unit: ClassVar[str] = ""
     moon: Moon
     core: bool = eqx.field(static=True)
 
@@ -202,9 +199,6 @@ class _Shape(AbstractBodyChart):
         tensor = body.tensor + self.moon._core.tensor if self.core else body.tensor
         a, b, c = (tensor[i, i] for i in range(3))
         return jnp.log(jnp.stack([(c - a) / b, (b - a) / c]))
-
-    def plain(self, body: Any) -> Array:
-        return jnp.zeros(0)
 
     @property
     def _known(self) -> Array:
