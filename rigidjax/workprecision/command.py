@@ -117,12 +117,10 @@ def _measured(options: argparse.Namespace) -> list[Record]:
         chosen = [m for m in methods() if not (alone and m.group == "peer")]
         if quick:
             chosen = [smaller(m) for m in chosen if m.name in SMALL]
-        found += measure(
-            in_float32(scenes()[name]()) if options.float32 else scenes()[name](), chosen,
-            gradients=not options.no_gradients and (name in GRADED or bool(options.scene)),
-            progress=say,
-            thin=4 if quick else options.thin,
-        )  # fmt: skip
+        graded = not options.no_gradients and (name in GRADED or bool(options.scene))
+        scene, thin = scenes()[name](), 4 if quick else options.thin
+        scene = in_float32(scene, graded) if options.float32 else scene
+        found += measure(scene, chosen, gradients=graded, progress=say, thin=thin)
     return found
 
 

@@ -120,13 +120,13 @@ def worked_out(scene: Scene, gradients: bool = True) -> Reference:
     return Reference(tuple(map(float, ends[0])), error, slope, off, source)
 
 
-def in_float32(scene: Scene) -> Scene:
+def in_float32(scene: Scene, gradients: bool = True) -> Scene:
     """The scene in single precision; the reference is worked out in double for its rounded numbers.
 
-    **Arguments:** `scene` in float64.
+    **Arguments:** `scene` in float64; `gradients` whether the gradient is worked out, too.
 
     >>> from rigidjax.workprecision import scenes
-    >>> in_float32(scenes()["heavy-top"]()).numbers.dtype
+    >>> in_float32(scenes()["heavy-top"](), gradients=False).numbers.dtype
     dtype('float32')
     """
 
@@ -138,7 +138,7 @@ def in_float32(scene: Scene) -> Scene:
         return dataclasses.replace(given, **parts)
 
     low = cast(scene, jnp.float32)
-    right = worked_out(dataclasses.replace(cast(low, jnp.float64), reference=None))
+    right = worked_out(dataclasses.replace(cast(low, jnp.float64), reference=None), gradients)
     # The equations by hand have constants in double.
     return dataclasses.replace(low, name=f"{scene.name}, float32", reference=right, plain=None)
 
