@@ -19,7 +19,7 @@ from rigidjax.solve.equal_steps import Rolled
 from rigidjax.solve.explicit import AbstractExplicit
 from rigidjax.solve.magnus import Magnus4
 from rigidjax.solve.splitting import AbstractSplitting
-from rigidjax.solve.steppers import Steps, stepper_of
+from rigidjax.solve.steppers import AnyStepper, stepper_of
 
 
 def fixed(
@@ -84,7 +84,7 @@ def first_rows(many: Any, one: Callable[..., Any], y: Any, rows: Any) -> Any:
 
 
 def step(
-    stepper: Steps, h: Array, t0: Array, i: Array, y: Any, inputs: Any = None, before: int = 0
+    stepper: AnyStepper, h: Array, t0: Array, i: Array, y: Any, inputs: Any = None, before: int = 0
 ) -> Any:
     """Step number `i` since `t0`; `inputs` by name (before + steps, …), of which this step has row
     `before + i`: the first `before` rows are those before `t0`.
@@ -145,7 +145,7 @@ def _row(a: Array, i: Any) -> Array:
 
 
 def march(
-    stepper: Steps, h: Array, t0: Array, first: Array, count: int, y: Any, inputs: Any = None
+    stepper: AnyStepper, h: Array, t0: Array, first: Array, count: int, y: Any, inputs: Any = None
 ) -> Any:
     """`count` steps from number `first` on; `inputs` as for `step`.
 

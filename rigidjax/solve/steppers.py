@@ -82,10 +82,10 @@ class Carrying(NamedTuple):
         return self.of.state(y[0])
 
 
-Steps = Stepper | Carrying
+AnyStepper = Stepper | Carrying
 
 
-def stepper_of(solver: Any, field: Callable[..., Any], y0: Any, count: Any = 1) -> Steps:
+def stepper_of(solver: Any, field: Callable[..., Any], y0: Any, count: Any = 1) -> AnyStepper:
     """The stepper of a vector field under `solver`, or, for `None`, the cheapest that is right.
 
     Many steps (`count`) carry what additions lose.
