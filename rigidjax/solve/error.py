@@ -32,6 +32,7 @@ _CLOSER = 1e-2
 _CUTS = 8
 # Three deviations of four runs hold half of the true error in all but few of a thousand runs.
 _NEIGHBOURS, _DEVIATIONS = 3, 3.0
+# In float64 neighbours take at least this tolerance, for fewer steps.
 _LOOSE = 1.5e-8
 # Half a radian, or half of the largest rate: errors do not add up any more.
 _LOST = 0.5

@@ -237,12 +237,12 @@ def _general(solver: AbstractExplicit | Rolled, field: Callable[..., Any], state
 
 def _of_slope(solver: Any, slope_under: Any, start: Atoms, state: Any, like: Any) -> Stepper:
     def change(t: Any, end: Any, h: Any, y: Atoms, inputs: Any) -> Atoms:
-        return _on_the_group(y, change_in(solver, slope_under(inputs), t, h, y, end), like)
+        return _to_unit_length(y, change_in(solver, slope_under(inputs), t, h, y, end), like)
 
     return Stepper(start, change, state)
 
 
-def _on_the_group(y: Atoms, change: Atoms, like: Any) -> Atoms:
+def _to_unit_length(y: Atoms, change: Atoms, like: Any) -> Atoms:
     """The change that ends at a quaternion of length 1."""
     if not isinstance(motion_of(like), HasAttitude):
         return change
