@@ -183,7 +183,7 @@ def _search(
         return Answer(NOT_ENDED, ("no start gave a finite misfit",))
     if not done:
         why = interrupted or ("max_steps reached",)
-        return Answer(NOT_ENDED, (*why, "this is the best point found"))
+        return Answer(NOT_ENDED, (*why, *remarks, "this is the best point found"))
     if rivals:
         return Answer(NOT_ALONE, (rivals, *interrupted, *remarks))
     return Answer(FOUND, (*interrupted, *remarks))
@@ -196,6 +196,7 @@ def assess(
     tried: list[Tried],
     best_cost: float,
     interrupted: Sequence[str] = (),
+    remarks: Sequence[str] = (),
 ) -> Fit:
     """The `Fit` of the best point of all starts, converged or not."""
     value = best.parameters
@@ -229,7 +230,8 @@ def assess(
                 rivals.append(item)
     rival = f"{len(rivals)} of {len(starts)} starts fit as well elsewhere" if rivals else ""
     lost = believable and not any(start.fits for start in starts)
-    remarks = ("no single start came near the best point",) if lost else ()
+    if lost:
+        remarks = ("no single start came near the best point", *remarks)
     unreal = of_charts(of, flat_limit.bodies_of(problem, value))
     model = Answer(model.word, (*unreal, *model.reasons))
     model = model if np.isfinite(best_cost) else Answer(FAILS)

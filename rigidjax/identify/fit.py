@@ -26,7 +26,7 @@ from rigidjax.identify.initial_guess import starting_points
 from rigidjax.identify.multiple_shooting import WIDTHS, joined, pieces as in_pieces
 from rigidjax.identify.parameters import Parameters, by_slot, numbered
 from rigidjax.identify.problem import Problem, fits
-from rigidjax.identify.propagation import AbstractIntegrator, Adaptive, FixedSteps
+from rigidjax.identify.propagation import AbstractIntegrator
 from rigidjax.identify.result import Fit
 from rigidjax.identify.search import (
     CAREFUL,
@@ -44,8 +44,8 @@ from rigidjax.identify.stochastic_gradient import Descent, descend
 from rigidjax.identify.terms import Noise, all_errors
 from rigidjax.identify.uncertainty import estimate_noise, linearise, of_white
 
-# More fixed steps than this between two samples cost more than adaptive steps.
-FINEST = 32
+# Steps are fine enough if finer ones change no prediction by more of its noise.
+_MATTERS = 0.05
 
 
 def fit(
@@ -135,11 +135,12 @@ def fit(
     best, task = _with_noise(best, task)
     best, task = _with_widths(best, task)
     best = _evaluated(best, task.problem)
-    while (finer := _finer(best, task)) is not None:
+    rough: list[str] = []
+    while (finer := _finer(best, task, rough)) is not None:
         task = task._replace(problem=eqx.tree_at(lambda p: p.integrator, task.problem, finer))
         best, task = _with_noise(again(best, task), task)
         best = _evaluated(best, task.problem)
-    return assess(task.problem, best, task.noise, tried, lowest, cut)
+    return assess(task.problem, best, task.noise, tried, lowest, cut, rough)
 
 
 def _cost(tried: Tried) -> float:
@@ -281,26 +282,26 @@ def _errors_alone(parameters: Parameters, problem: Problem) -> tuple[Float[Array
     return all_errors(parameters, problem)[0]
 
 
-def _finer(best: Tried, task: Task) -> AbstractIntegrator | None:
-    """A finer integrator, if twice as many fixed steps change predictions by a twentieth of the
-    noise.
+def _finer(best: Tried, task: Task, rough: list[str]) -> AbstractIntegrator | None:
+    """The integrator whose predictions finer steps do not change, `None` if it is the one in use.
+
+    If there is none, `rough` says so.
     """
-    problem, steps = task.problem, task.problem.integrator
-    if not isinstance(steps, FixedSteps):
-        return None
-    count, (coarse, _) = steps.substeps, best.found[0]
-    # Steps given by the user are tried in any case.
-    while count <= max(FINEST, steps.substeps):
-        finer = eqx.tree_at(lambda p: p.integrator, problem, FixedSteps(2 * count, steps.solver))
-        exact = _errors_alone(best.parameters, finer)
+    problem, (errors, _) = task.problem, best.found[0]
+    steps, apart = problem.integrator, 0.0
+    while steps is not None and (finer := steps.finer()) is not None:
+        exact = _errors_alone(best.parameters, eqx.tree_at(lambda p: p.integrator, problem, finer))
         apart = max(
             float(np.max(np.abs(np.asarray(a) - np.asarray(b)) / np.asarray(sigma)[:, None]))
-            for a, b, sigma in zip(coarse, exact, task.noise, strict=True)
+            for a, b, sigma in zip(errors, exact, task.noise, strict=True)
         )
-        if apart <= 0.05:
-            return None if count == steps.substeps else FixedSteps(count, steps.solver)
-        count, coarse = 2 * count, exact
-    return Adaptive()
+        if apart <= _MATTERS:
+            break
+        steps, errors = finer, exact
+    else:
+        if apart > _MATTERS:
+            rough.append(f"the shortest steps still change readings by {apart:.1g} of their noise")
+    return None if steps is problem.integrator else steps
 
 
 def _first_noise(problem: Problem) -> Noise:

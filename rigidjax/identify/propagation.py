@@ -29,8 +29,17 @@ from rigidjax.solve.tableaus import KUTTA4
 TURN_A_STEP, TURN_OF_ORDER_4 = 0.1, 0.02
 
 
+# More fixed steps than this between two samples cost more than adaptive steps.
+FINEST = 32
+# The least relative tolerance at which steps are compared, and the part of one to the next.
+_LEAST, _CLOSER = 1e-13, 1e-2
+
+
 class AbstractIntegrator(eqx.Module):
     """The integrator of a forced motion inside a fit, differentiable in forward mode.
+
+    At its end a fit compares the predictions with those of `finer` steps, and goes on with these if
+    a prediction changes by more than a twentieth of its noise.
 
     >>> class Halves(AbstractIntegrator):  # two equal steps from one sample to the next
     ...     def states(self, body, state0, ts, torque):
@@ -46,13 +55,15 @@ class AbstractIntegrator(eqx.Module):
         They are a `motion.Coupled` if a torque has states of its own and a sensor needs them.
         """
 
+    def finer(self) -> "AbstractIntegrator | None":
+        """Shorter steps that a fit compares its own with; `None` if there are none."""
+        return None
+
 
 class FixedSteps(AbstractIntegrator):
     """The same number of fixed steps between any two samples.
 
-    It is the cheapest if samples are close together, as in logs of 100 Hz and more. A fit checks
-    its result against finer steps. If the steps were too long, it says so and continues with
-    `Adaptive`.
+    It is the cheapest if samples are close together, as in logs of 100 Hz and more.
 
     **Arguments:** `substeps` the number of steps between two samples; `solver` the method, one of
     `rigidjax.solvers`: Tsitouras's of order 5 unless given; `last` the number of the last time
@@ -74,6 +85,11 @@ class FixedSteps(AbstractIntegrator):
         y0 = started(body, state0, torque, ts[0])
         field = equations_of_motion(body, y0, torque)
         return fixed(in_a_loop(self.solver), field, ts, y0, self.substeps, self.last)
+
+    def finer(self) -> AbstractIntegrator:
+        if self.substeps > FINEST:
+            return Adaptive()
+        return FixedSteps(2 * self.substeps, self.solver, self.last)
 
 
 class Adaptive(AbstractIntegrator):
@@ -107,6 +123,12 @@ class Adaptive(AbstractIntegrator):
             throw=False,
         )
         return out.ys if out.own is None else Coupled(out.ys, out.own)
+
+    def finer(self) -> "Adaptive | None":
+        if self.rtol <= _LEAST:
+            return None
+        rtol = max(_CLOSER * self.rtol, _LEAST)
+        return Adaptive(rtol, self.atol * (rtol / self.rtol))
 
 
 def integrator_for(widest: float, rate: float) -> AbstractIntegrator:

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -549,3 +550,32 @@ def test_steps_that_were_asked_for_are_kept_where_they_do():
     found = identify.fit(identify.Problem(record, identify.Known(body), integrator=steps), starts=1)
     assert found.problem.integrator == steps
     np.testing.assert_allclose(found.state0.omega, omega[0], atol=1e-6)
+
+
+@pytest.mark.parametrize("steps", [identify.FixedSteps(1), identify.Adaptive(1e-2, 1e-5)])
+def test_steps_that_are_too_long_become_finer(steps):
+    body, ts = rj.Inertia.from_principal(1.0, 2.0, 2.5), jnp.linspace(0.0, 8.0, 6)
+    law, start = rj.torques.Damping([0.1, 0.2, 0.1]), rj.Spin([0.3, 2.0, 0.2])
+    omega = rj.simulate(body, start, ts, law).ys.omega
+    record = identify.Recording(ts, (identify.Gyro(1e-4), omega), torque=law)
+    problem = identify.Problem(record, identify.Known(body), integrator=steps)
+    there = eqx.tree_at(lambda p: p.own.spin, problem.start(), omega[:1] / problem.typical_rate)
+    assert np.abs(problem.errors(there)[0]).max() > 1e-4
+    found = identify.fit(problem, starts=1)
+    assert found.problem.integrator != steps
+    np.testing.assert_allclose(found.state0.omega, omega[0], atol=1e-5)
+
+
+def test_a_motion_that_outlasts_its_digits_is_named():
+    """No tolerance suffices for a chaotic top: without a word its fit would look like any other."""
+    # The chaotic top of row D14.
+    body, ts = rj.Inertia.from_principal(1.0, 1.6, 2.2), jnp.linspace(0.0, 200.0, 100)
+    top = rj.torques.HeavyTop(1.0, [1.0, 0.4, 0.7], [0.0, 0.0, -1.0])
+    q = np.array([0.29457358, 0.51677653, 0.16788989, 0.78611794])
+    start = rj.Attitude(q / np.linalg.norm(q), [1.40904798, 2.72002574, -1.26857553])
+    ys = rj.simulate(body, start, ts, top).ys
+    sensors = ((identify.AttitudeSensor(0.01), ys.q), (identify.Gyro(0.01), ys.omega))
+    record = identify.Recording(ts, *sensors, torque=top)
+    problem = identify.Problem(record, identify.Known(body), integrator=identify.Adaptive())
+    found = identify.fit(problem, starts=1, max_steps=2)
+    assert "the shortest steps still change readings by" in found.status
