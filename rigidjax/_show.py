@@ -15,6 +15,7 @@ MOST = 16
 def numbers(self: Any) -> str:
     """`Name(field=numbers, …)`; a traced or large array is shown by its shape."""
     fields = [(f.name, getattr(self, f.name)) for f in dataclasses.fields(self) if f.repr]
+    fields = [(name, value) for name, value in fields if value is not None]
     parts = ", ".join(f"{name}={shown(value)}" for name, value in fields)
     return f"{type(self).__name__}({parts})"
 

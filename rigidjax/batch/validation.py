@@ -84,6 +84,7 @@ def bodies_of(bodies: Any, states0: Any, torque: Any, torque_axes: Any) -> BodyB
     shape = lambda a: jax.ShapeDtypeStruct(a.shape[1:], a.dtype)  # noqa: E731
     row = (lambda a: a[0]) if isinstance(bodies, MassProperties) else shape
     validation.require_fit(*eqx.combine(shared, jax.tree.map(row, each), rest))
+    validation.warn_of_scale(bodies, torque)
     return BodyBatch(shared, each, rest, count, dtype)
 
 

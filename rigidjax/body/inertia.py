@@ -42,7 +42,9 @@ class Inertia(eqx.Module):
 
     **Arguments:** `tensor` (3, 3), kg m², body frame. The constructor checks shape and dtype only;
     `from_tensor`, `from_principal` and `from_second_moment` also check that the body is real. A
-    container of many bodies has leading axes; methods take one body.
+    container of many bodies has leading axes; methods take one body. `scale` "arbitrary" if only
+    the ratios of the components are known, as after a fit of free motion: `simulate` then warns of
+    torques, and `shifted` raises `ValueError`.
 
     The object stores I, not 𝔖: `from_tensor` changes no digit, and the small moment of a rod keeps
     all its digits. Source: notes, eqs 76–78.
@@ -52,14 +54,16 @@ class Inertia(eqx.Module):
     """
 
     tensor: Float[Array, "*batch 3 3"]
+    scale: str | None = eqx.field(static=True)
 
     __repr__ = _show.numbers
 
-    def __init__(self, tensor: Matrices):
+    def __init__(self, tensor: Matrices, scale: str | None = None):
         hint = "Inertia.from_principal takes principal moments"
         self.tensor = _checks.floating(
             tensor, (3, 3), "tensor", batched=True, hint=hint, unit="kg m²"
         )
+        self.scale = None if scale is None else _checks.word(scale, ("arbitrary",), "scale")
 
     @staticmethod
     def from_tensor(tensor: Matrix) -> "Inertia":
@@ -133,6 +137,8 @@ class Inertia(eqx.Module):
         Array([ 1., 13., 13.], dtype=float64)
         """
         r, m = _checks.floating(r, (3,), "r", unit="m"), _checks.floating(mass, (), "mass")
+        if self.scale is not None:
+            raise ValueError("shifted: wanted an inertia in kg m², got one of arbitrary scale")
         return Inertia(self.tensor + swap_trace(m * outer(r, r)))
 
     def rotated(self, q: Quaternion) -> "Inertia":
@@ -146,7 +152,7 @@ class Inertia(eqx.Module):
         Array(2., dtype=float64)
         """
         m = quaternion.to_matrix(validation.unit_quaternion(q))
-        return Inertia(product(m, product(self.tensor, m.T)))
+        return Inertia(product(m, product(self.tensor, m.T)), self.scale)
 
     def invertible(self) -> "Inertia":
         """The same body; `ValueError` if a moment, by which Euler's equations divide, is zero."""

@@ -85,7 +85,7 @@ class Ratios(AbstractBodyChart):
     log_names: ClassVar[tuple[str, ...]] = ("I1/I3", "I2/I3")
 
     def body(self, vector: Float[Array, " chart"]) -> Inertia:
-        return Inertia(swap_trace(charts.unpack_shape(vector)))
+        return Inertia(swap_trace(charts.unpack_shape(vector)), scale="arbitrary")
 
     def vector(self, body: Inertia) -> Float[Array, " chart"]:
         return charts.pack_shape(body.second_moment)
@@ -114,7 +114,8 @@ class PrincipalRatios(AbstractBodyChart):
     log_names: ClassVar[tuple[str, ...]] = ("Ix/Iz", "Iy/Iz")
 
     def body(self, vector: Float[Array, " chart"]) -> Inertia:
-        return Inertia(jnp.diag(charts.unpack_moments(_padded(vector, 1, 0)) / 3.0))
+        moments = charts.unpack_moments(_padded(vector, 1, 0)) / 3.0
+        return Inertia(jnp.diag(moments), scale="arbitrary")
 
     def vector(self, body: Inertia) -> Float[Array, " chart"]:
         return charts.pack_moments(jnp.diagonal(body.tensor))[1:]

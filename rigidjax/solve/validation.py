@@ -16,6 +16,7 @@ from rigidjax.body.validation import possible
 from rigidjax.frames import AbstractScene, MovingFrame, Point
 from rigidjax.frames.frame_dynamics import scene_of
 from rigidjax.motion import Attitude, Rigid, Spin
+from rigidjax.motion.torques import GravityGradient
 from rigidjax.motion.torques.base import require_rung
 from rigidjax.rotation.validation import tolerance
 
@@ -32,6 +33,7 @@ def scene(body: Any, state0: Any, ts: Any, torque: Any, throw: bool) -> tuple[An
         lambda leaf: leaf if leaf.dtype == dtype else leaf.astype(dtype), (ts, state0)
     )
     require_fit(body, state0, torque)
+    warn_of_scale(body, torque)
     if body is not None:
         body = real_or_nan(body, throw)
     return body, state0, ts
@@ -61,6 +63,18 @@ def require_fit(body: Any, state0: Any, torque: Any) -> None:
             + ("; pass body.inertia" if isinstance(body, MassProperties) else _body_of(body))
         )
     _single(body, "body")
+
+
+def warn_of_scale(body: Any, torque: Any) -> None:
+    """Warn of a torque on a body whose scale is arbitrary, unless it has the same scale."""
+    relative = isinstance(body, Inertia) and body.scale is not None
+    alike = isinstance(torque, GravityGradient) and not torque.harmonics
+    if relative and torque is not None and not alike:
+        warnings.warn(
+            f"the body has an arbitrary scale, and {type(torque).__name__} gives N m; take "
+            "rj.Inertia(size * body.tensor) with the size in kg m²",
+            stacklevel=5,
+        )
 
 
 def _body_of(numbers: Any, moves: bool = False) -> str:

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import rigidjax as rj
 from rigidjax.body import shapes
 from rigidjax.body.inertia import Inertia, MassProperties, inverse
 from rigidjax.rotation import quaternion
@@ -300,3 +301,23 @@ def test_containers_carry_a_batch():
 def test_an_inertia_in_place_of_its_second_moment_is_named():
     with pytest.raises(TypeError, match=r"got an Inertia; give its \.second_moment"):
         MassProperties(1.0, ORIGIN, Inertia.from_principal(1.0, 1.6, 2.2))
+
+
+def test_a_body_of_arbitrary_scale_says_so():
+    body = Inertia(np.diag([0.5, 0.7, 0.8]), "arbitrary")
+    assert "scale='arbitrary'" in repr(body) and "scale" not in repr(Inertia(body.tensor))
+    assert jax.jit(lambda b: b.rotated([1.0, 0, 0, 0]))(body).scale == "arbitrary"
+    with pytest.raises(ValueError, match="in kg m², got one of arbitrary scale"):
+        body.shifted([0.0, 0, 1], 1.0)
+    with pytest.raises(ValueError, match="scale: wanted one of arbitrary, got 'g'"):
+        Inertia(body.tensor, "g")
+    spin, attitude = rj.Spin([1.0, 0, 0]), rj.Attitude([1.0, 0, 0, 0], [1.0, 0, 0])
+    far = rj.torques.GravityGradient(1.0, [3.0, 0, 0])
+    rj.simulate(body, spin, [0.0, 1.0])
+    rj.simulate(body, attitude, [0.0, 1.0], far)
+    top = rj.torques.HeavyTop(1.0, [0.0, 0, 1], [0.0, 0, -9.81])
+    with pytest.warns(UserWarning, match="arbitrary scale, and HeavyTop gives N m"):
+        rj.simulate(body, attitude, [0.0, 1.0], top)
+    many = jax.tree.map(lambda leaf: jnp.stack([leaf] * 2), attitude)
+    with pytest.warns(UserWarning, match="arbitrary scale, and HeavyTop gives N m"):
+        rj.batch.simulate(body, many, [0.0, 1.0], top)

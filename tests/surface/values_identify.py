@@ -529,8 +529,8 @@ def our_states(i, q, w, c, d):
     ts = jnp.asarray(TIMES_OF_RUN)
     found = [
         way_of.states(body, start, ts, law)
-        for way_of in (identify.Adaptive(1e-11, 1e-14),
-                       identify.FixedSteps(40, rj.solvers.DormandPrince8()))
+        for way_of in (identify.Adaptive(1e-9, 1e-12).finer(),
+                       identify.FixedSteps(20, rj.solvers.DormandPrince8()).finer())
     ]  # fmt: skip
     read = identify.simulate_readings(
         identify.Gyro(0.1, bias=c, scale=1.0 + d), body, start, ts, law
@@ -544,7 +544,8 @@ def states(i, q, w, c, d):
 
 
 way(
-    "identify.Adaptive identify.Adaptive.states identify.FixedSteps identify.FixedSteps.states "
+    "identify.Adaptive identify.Adaptive.states identify.Adaptive.finer identify.FixedSteps "
+    "identify.FixedSteps.states identify.FixedSteps.finer "
     "identify.simulate_readings",
     our_states, TOP, states, plain=True, rtol=1e-8, batched=False, cost=4,
 )  # fmt: skip
