@@ -3,11 +3,13 @@
 import importlib
 import importlib.util
 import math
+import os
 import time
 from collections.abc import Callable
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from rigidjax import _checks
@@ -17,6 +19,7 @@ from rigidjax.workprecision.scene import Method, Ready, Run, Scene
 TOLERANCES = (1e-4, 1e-7, 1e-10, 1e-13)
 TAYLOR = (1e-4, 1e-6, 1e-8, 1e-10, 1e-12, 1e-14)
 STEPS = (5e-2, 2e-2, 5e-3)
+RECORDED = (1e-4, 1e-6, 1e-8, 1e-10, 1e-12)
 
 
 def _start(scene: Scene) -> np.ndarray:
@@ -175,16 +178,91 @@ def _varied(scene: Scene) -> Ready | None:
     return Ready(run, spent)
 
 
+class _Ensemble:
+    """A scene as gradsolve wants it, an ensemble of one; its parameters are the scene's numbers."""
+
+    is_stiff, t0 = False, 0.0
+
+    @staticmethod
+    def can(scene: Scene) -> bool:
+        # To import it sets JAX to float64.
+        return scene.plain is not None and scene.numbers.dtype == jnp.float64
+
+    def __init__(self, scene: Scene) -> None:
+        # One scene is recorded by NumPy otherwise, a thousand times as slowly.
+        os.environ.setdefault("GRADSOLVE_RECORDER", "jax")
+        self.module: Any = importlib.import_module("gradsolve")
+        self.name, self.plain, self.t1 = scene.name, scene.plain, scene.end
+        self.start, self.numbers = _start(scene)[None], np.asarray(scene.numbers)[None]
+        self.dim = self.start.shape[1]
+
+    def f_jax(self, t: Any, y: Any, p: Any) -> Any:
+        assert self.plain is not None
+        return jnp.stack(self.plain(tuple(p), jnp.sin, jnp.cos, jnp.sqrt)(t, y))
+
+    def call(self, name: str, setting: float, **how: Any) -> Any:
+        how |= dict(engine="vern7_replay", fused=False, rtol=setting, atol=1e-3 * setting)
+        return getattr(self.module, name)(self, self.start, self.numbers, **how)
+
+
+def _recorded(scene: Scene) -> Ready | None:
+    if not _Ensemble.can(scene):
+        return None
+    ensemble = _Ensemble(scene)
+    begin = time.perf_counter()
+    ensemble.call("solve", TOLERANCES[0])
+    spent = time.perf_counter() - begin
+
+    def run(setting: float) -> Run:
+        found = ensemble.call("solve", setting)
+        return Run(found.y_final[0], int(found.accepted_steps[0]))
+
+    return Ready(run, spent)
+
+
+def _replayed(scene: Scene) -> Ready | None:
+    """The gradient through recorded steps; they are recorded once, and not timed."""
+    if not _Ensemble.can(scene):
+        return None
+    ensemble = _Ensemble(scene)
+    made: dict[float, Any] = {}
+
+    def gradient_of(setting: float) -> Any:
+        end = ensemble.call("grad_closure", setting, wrt=("y0", "params"))
+        count = int(ensemble.call("solve", setting).accepted_steps[0])
+
+        def loss(numbers: Any) -> Any:
+            start = scene.flat(scene.assembled(numbers)[1])
+            return scene.loss(end(start[None], numbers[None])[0])
+
+        return jax.jit(jax.grad(loss)).lower(scene.numbers).compile(), count
+
+    def run(setting: float) -> Run:
+        if setting not in made:
+            made[setting] = gradient_of(setting)
+        gradient, count = made[setting]
+        return Run(jax.block_until_ready(gradient(scene.numbers)), count)
+
+    begin = time.perf_counter()
+    run(TOLERANCES[0])
+    spent = time.perf_counter() - begin
+    return Ready(run, spent)
+
+
 def methods_outside() -> list[Method]:
-    """The peers that can be imported here, of SciPy, numba, MuJoCo and heyoka.
+    """The peers that can be imported here, of SciPy, numba, MuJoCo, heyoka and gradsolve.
 
     heyoka.py's adaptive Taylor method: Biscani and Izzo 2021, doi:10.1093/mnras/stab1032.
+    gradsolve's replay of the recorded steps of Verner's method of order 7: arXiv:2609.02876.
     """
     peers = {
         "scipy": Method("scipy DOP853", "peer", TOLERANCES, _scipy),
         "numba": Method("scipy DOP853, numba", "peer", TOLERANCES, _numba),
         "mujoco": Method("MuJoCo RK4", "peer", STEPS, _mujoco),
         "heyoka": Method("heyoka Taylor", "peer", TAYLOR, _taylor, {"variational": _varied}),
+        "gradsolve": Method(
+            "gradsolve Vern7", "peer", TOLERANCES, _recorded, {"replay": _replayed}
+        ),
     }
     return [method for name, method in peers.items() if importlib.util.find_spec(name)]
 
