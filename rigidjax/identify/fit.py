@@ -26,7 +26,7 @@ from rigidjax.identify.initial_guess import starting_points
 from rigidjax.identify.multiple_shooting import WIDTHS, joined, pieces as in_pieces
 from rigidjax.identify.parameters import Parameters, by_slot, numbered
 from rigidjax.identify.problem import Problem, fits
-from rigidjax.identify.propagation import AbstractIntegrator
+from rigidjax.identify.propagation import AbstractIntegrator, Adaptive
 from rigidjax.identify.result import Fit
 from rigidjax.identify.search import (
     CAREFUL,
@@ -123,7 +123,11 @@ def fit(
         points.append(_from_pieces(problem, pieces, tolerance, max_steps))
     if starts > len(points):
         points += starting_points(problem, starts - len(points), key)
-    points, cut = points[:starts], []
+    points, cut, rough = points[:starts], [], []
+    if isinstance(problem.integrator, Adaptive):
+        # Another tolerance is no other program: the noise of long steps would slow down the search.
+        finer = _finer(Tried(points[0], found=evaluate(points[0], problem)), task, rough)
+        task = task if rough else task._replace(problem=_with(problem, finer))
     if descent is not None:
         points = _descended(points, task, descent, key, progress, cut)
     if together > 1:
@@ -135,9 +139,9 @@ def fit(
     best, task = _with_noise(best, task)
     best, task = _with_widths(best, task)
     best = _evaluated(best, task.problem)
-    rough: list[str] = []
+    rough.clear()
     while (finer := _finer(best, task, rough)) is not None:
-        task = task._replace(problem=eqx.tree_at(lambda p: p.integrator, task.problem, finer))
+        task = task._replace(problem=_with(task.problem, finer))
         best, task = _with_noise(again(best, task), task)
         best = _evaluated(best, task.problem)
     return assess(task.problem, best, task.noise, tried, lowest, cut, rough)
@@ -282,6 +286,12 @@ def _errors_alone(parameters: Parameters, problem: Problem) -> tuple[Float[Array
     return all_errors(parameters, problem)[0]
 
 
+def _with(problem: Problem, integrator: AbstractIntegrator | None) -> Problem:
+    if integrator is None:
+        return problem
+    return eqx.tree_at(lambda p: p.integrator, problem, integrator)
+
+
 def _finer(best: Tried, task: Task, rough: list[str]) -> AbstractIntegrator | None:
     """The integrator whose predictions finer steps do not change, `None` if it is the one in use.
 
@@ -290,7 +300,11 @@ def _finer(best: Tried, task: Task, rough: list[str]) -> AbstractIntegrator | No
     problem, (errors, _) = task.problem, best.found[0]
     steps, apart = problem.integrator, 0.0
     while steps is not None and (finer := steps.finer()) is not None:
-        exact = _errors_alone(best.parameters, eqx.tree_at(lambda p: p.integrator, problem, finer))
+        closer = _with(problem, finer)
+        if jax.tree.structure(finer) == jax.tree.structure(problem.integrator):
+            (exact, _), _ = evaluate(best.parameters, closer)
+        else:
+            exact = _errors_alone(best.parameters, closer)
         apart = max(
             float(np.max(np.abs(np.asarray(a) - np.asarray(b)) / np.asarray(sigma)[:, None]))
             for a, b, sigma in zip(errors, exact, task.noise, strict=True)
@@ -298,6 +312,9 @@ def _finer(best: Tried, task: Task, rough: list[str]) -> AbstractIntegrator | No
         if apart <= _MATTERS:
             break
         steps, errors = finer, exact
+        if apart <= 8 * _MATTERS:
+            # What is left of it with twice as many steps, or a hundredth of the tolerance.
+            break
     else:
         if apart > _MATTERS:
             rough.append(f"the shortest steps still change readings by {apart:.1g} of their noise")

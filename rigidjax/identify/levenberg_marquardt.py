@@ -26,6 +26,10 @@ LINEAR = 0.05
 PATIENCE, FIRST_PACE = 25.0, 4.0
 # Damping beyond which nothing moves.
 STUCK = 1e12
+# Shorter steps of a smooth cost rise less and less above the predicted gain. Where two refused ones
+# in a row rise more, the second by so many times the gain, and that is so small a part of the cost,
+# the cost has noise, as that of adaptive steps has.
+NOISY, LITTLE = 10.0, 1e-4
 
 
 def _float(value: Any) -> np.ndarray:
@@ -53,7 +57,8 @@ class Settings(eqx.Module):
 class Search(eqx.Module):
     """The state of a search: the best `point` so far, with `gram` (n, n) and `slope` there; the
     `trial` next, and its `hoped` gain; `pace` of the logarithm of the cost; evaluations `taken`;
-    `found` of the last one, whether `here` at the best point.
+    `found` of the last one, whether `here` at the best point; `rise` of the last trial over its
+    predicted gain, zero if it was better.
     """
 
     first: Float[Array, ""]
@@ -70,6 +75,7 @@ class Search(eqx.Module):
     converged: Bool[Array, ""]
     found: Any
     here: Bool[Array, ""]
+    rise: Float[Array, ""]
 
 
 def search(
@@ -106,6 +112,7 @@ def search(
         jnp.asarray(False),
         nothing,
         jnp.asarray(False),
+        jnp.zeros((), kind),
     )
 
     def step(now: Search) -> Search:
@@ -138,6 +145,8 @@ def _after(
     level = better & ~first & (ratio > FAIR) & (now.damping <= FREE)
     if by_noise is not None:
         level = level & (now.cost - cost < settings.level * by_noise(found, gram))
+    rise = jnp.where(better | ~finite, 0.0, -ratio)
+    noisy = (now.rise > 0) & (rise > jnp.maximum(now.rise, NOISY)) & (now.hoped < LITTLE * now.cost)
     point, cost, gram, slope = jax.tree.map(
         lambda new, old: jnp.where(better, new, old),
         (now.trial, cost, gram, slope),
@@ -151,7 +160,7 @@ def _after(
     # Round-off refuses every step at the minimum itself.
     bottom = hoped <= 1e-14 * jnp.abs(cost)
     ended = small if by_noise is None else small | level
-    converged = sound & (ended | (bottom & ~better & ~first))
+    converged = sound & (ended | noisy | (bottom & ~better & ~first))
     lost = ~finite & first
     done = converged | lost | (damping > STUCK) | (~sound & (damping > 1.0))
     done = done | ((settings.aim > 0) & (cost > settings.aim * jnp.exp(PATIENCE * pace)))
@@ -172,6 +181,7 @@ def _after(
         converged,
         found,
         better,
+        rise,
     )
 
 

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from rigidjax import _checks
+from rigidjax._types import ScalarLike
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.exact.free_body import FreeMotion
 from rigidjax.identify.sensors import SensorInput
@@ -32,7 +33,7 @@ TURN_A_STEP, TURN_OF_ORDER_4 = 0.1, 0.02
 # More fixed steps than this between two samples cost more than adaptive steps.
 FINEST = 32
 # The least relative tolerance at which steps are compared, and the part of one to the next.
-_LEAST, _CLOSER = 1e-13, 1e-2
+_LEAST, _CLOSER = 2.5e-14, 1e-2
 
 
 class AbstractIntegrator(eqx.Module):
@@ -92,17 +93,21 @@ class FixedSteps(AbstractIntegrator):
         return FixedSteps(2 * self.substeps, self.solver, self.last)
 
 
+def _tolerance(value: ScalarLike) -> Array:
+    return jnp.asarray(_checks.number(value, "a tolerance"), jnp.result_type(float))
+
+
 class Adaptive(AbstractIntegrator):
-    """Steps chosen by the tolerances, through `rigidjax.simulate`.
+    """Steps chosen by the tolerances, through `rigidjax.simulate`; others do not compile again.
 
-    **Arguments:** `rtol`, `atol` as there.
+    **Arguments:** `rtol`, `atol` as there. In float32 `rtol` is at least 1.2e-5.
 
-    >>> Adaptive().rtol
+    >>> float(Adaptive().rtol)
     1e-09
     """
 
-    rtol: float = eqx.field(static=True, default=1e-9)
-    atol: float = eqx.field(static=True, default=1e-12)
+    rtol: Float[Array, ""] = eqx.field(converter=_tolerance, default=1e-9)
+    atol: Float[Array, ""] = eqx.field(converter=_tolerance, default=1e-12)
 
     def __check_init__(self):
         _checks.positive(self.rtol, "rtol")
@@ -117,7 +122,7 @@ class Adaptive(AbstractIntegrator):
             state0,
             ts + 1e-9 * (ts[-1] - ts[0]) * again,
             torque,
-            rtol=self.rtol,
+            rtol=jnp.maximum(self.rtol.astype(ts.dtype), 100 * jnp.finfo(ts.dtype).eps),
             atol=self.atol,
             adjoint=dfx.ForwardMode(),
             throw=False,
@@ -127,7 +132,7 @@ class Adaptive(AbstractIntegrator):
     def finer(self) -> "Adaptive | None":
         if self.rtol <= _LEAST:
             return None
-        rtol = max(_CLOSER * self.rtol, _LEAST)
+        rtol = jnp.maximum(_CLOSER * self.rtol, _LEAST)
         return Adaptive(rtol, self.atol * (rtol / self.rtol))
 
 

@@ -12,7 +12,7 @@ from jaxtyping import Array
 
 import rigidjax as rj
 from rigidjax import identify
-from rigidjax.identify import search
+from rigidjax.identify import levenberg_marquardt, search
 from rigidjax.identify.checkpoint import SearchState, Tried
 from rigidjax.identify.levenberg_marquardt import Search, Settings
 from rigidjax.identify.search import Task, climb, descend, horizon, misfit, settle, whole
@@ -35,8 +35,8 @@ def an_end(first):
     """A search that began at a cost of `first`, and keeps nothing of where it ended."""
     one, line, no = jnp.asarray(first), jnp.zeros(5), jnp.asarray(False)
     return Search(
-        one, line, one, jnp.zeros((5, 5)), line, line, one, one, one, jnp.asarray(1), no, no, (), no
-    )
+        one, line, one, jnp.zeros((5, 5)), line, line, one, one, one, jnp.asarray(1), no, no, (), no, one
+    )  # fmt: skip
 
 
 def place(point):
@@ -154,3 +154,20 @@ def test_a_search_may_end_near(pushed):
     assert bool(end.converged) and not bool(early.converged)
     assert least < float(early.cost) <= 1.5 * least
     assert int(early.taken) < int(end.taken)
+
+
+def test_a_search_ends_in_the_noise_of_its_cost():
+    """Adaptive steps give it: the misfit jumps where the number of steps changes."""
+    scale = jnp.array([1.0, 10.0, 100.0])
+
+    def evaluated(x):
+        error = scale * (x - 0.5)
+        cost = 1e3 + 0.5 * jnp.sum(error**2) + 0.1 * jnp.sin(7e11 * x.sum())
+        return (), cost, jnp.diag(scale**2), scale * error
+
+    settings = Settings(1e-15, 1.0, 100)
+    end = jax.jit(lambda x: levenberg_marquardt.search(evaluated, x, jnp.ones(3), settings, ()))(
+        jnp.zeros(3)
+    )
+    assert bool(end.converged) and int(end.taken) < 15
+    np.testing.assert_allclose(scale * (end.point - 0.5), 0, atol=0.5)
