@@ -1,6 +1,6 @@
 """A quadrotor from windows: fitted on all runs but two, predicted open-loop on those two.
 
-Run `python tests/identify/bench_nanodrone.py FOLDER [--stride 40]`, FOLDER with the csv files of
+Run `python tests/identify/bench_nanodrone.py FOLDER [--stride 40] [--only square]`, FOLDER with the csv files of
 the nano-drone benchmark (arXiv 2512.14450): prints the mean absolute errors of a component, and the
 mean lengths of the vectors, at 1, 10 and 50 samples ahead and their sum, beside a prediction that
 holds the state, the free numbers with their deviations, and times. The files have no licence and are not part of this project.
@@ -108,10 +108,15 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--stride", type=int, default=40)
+    parser.add_argument("--only", default="", help="fit the runs whose name begins so")
     options = parser.parse_args()
     runs = {path.stem: path for path in sorted(options.folder.glob("*.csv"))}
     train = identify.Windows.joined(
-        *(cut(p, 50, options.stride) for n, p in runs.items() if n not in HELD_OUT)
+        *(
+            cut(path, 50, options.stride)
+            for name, path in runs.items()
+            if name not in HELD_OUT and name.startswith(options.only)
+        )
     )
     begin = time.process_time()
     found = identify.fit_windows(train, scene, GUESS)
@@ -123,9 +128,10 @@ if __name__ == "__main__":
         value, deviation = (np.asarray(getattr(c, name)) for c in (found.value, found.deviation))
         print(name, np.round(value, 3), "±", np.round(deviation, 3))
     print("I =", np.asarray(scene(found.value)[0].inertia.tensor), "kg m²")
-    test = identify.Windows.joined(*(cut(runs[name], 50, 1) for name in HELD_OUT))
-    model, held = found.predict(test), test.held()
-    for measure in ("mean_absolute", "mean_norm"):
-        print(measure)
-        shown("model", getattr(model, measure))
-        shown("state held", getattr(held, measure))
+    of_each = {name: cut(runs[name], 50, 1) for name in HELD_OUT}
+    for name, test in {"both": identify.Windows.joined(*of_each.values()), **of_each}.items():
+        model, held = found.predict(test), test.held()
+        for measure in ("mean_absolute", "mean_norm"):
+            print(name, measure)
+            shown("model", getattr(model, measure))
+            shown("state held", getattr(held, measure))
