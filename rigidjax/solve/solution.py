@@ -116,7 +116,7 @@ class Solution(eqx.Module, Generic[State]):
     def error(self) -> Error:
         """How far the states are from the exact motion of the given numbers: an `Error`.
 
-        It is computed when it is read: by a run with a hundredth of the tolerances (for fixed
+        It is computed when it is read: by a run with a fiftieth of the tolerances (for fixed
         steps: with half of the step), and, if round-off may count, by three runs with changed last
         digits of body, torque and start (in closed form, of the times). A `UserWarning` names the
         time after which nothing is known, as in chaos.

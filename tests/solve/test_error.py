@@ -144,7 +144,7 @@ def test_in_a_batch_under_jit_and_backwards():
 
 
 def test_a_run_of_three_steps_is_not_compared_with_itself():
-    # The second run at a hundredth of the tolerance would take the same steps: nothing limits them.
+    # The second run at a fiftieth of the tolerance would take the same steps: nothing limits them.
     scene = rj.orbits.cr3bp(0.0017093877946129851)
     point = rj.Point([1.14934308, 0.35553803, -0.10433587], [-0.05262428, 0.0004922, 0.01500983])
     short = rj.simulate(None, point, [0.0, 0.32], scene, rtol=6e-6, atol=6e-9)
