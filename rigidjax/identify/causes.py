@@ -172,7 +172,7 @@ def clock(problem: Problem, linear: Linearised, index: int) -> Cause | None:
     scatter = 1e3 * np.sqrt(along / moved[moving].sum())
     return _cause(
         "clock", sensor, share, f"time stamps that scatter by {scatter:.2g} ms",
-        "take times from the sensor's own count of samples, or give a larger noise",
+        "take times from the sensor's own count of samples, or a gyro that expects it (the guide)",
     )  # fmt: skip
 
 
