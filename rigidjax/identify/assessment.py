@@ -109,7 +109,7 @@ def _where(problem: Problem, error: np.ndarray, kept: np.ndarray) -> str:
     """The shortest time in which half of the squared errors are."""
     squares = np.sum(np.where(kept, error, 0.0) ** 2, axis=-1)
     row = int(np.argmax(squares.sum(axis=1)))
-    count = problem.counts[row]
+    count = int(problem.counts[row])
     t, total = np.asarray(problem.records.t)[row, :count], np.cumsum(squares[row, :count])
     last = np.searchsorted(total, total - squares[row, :count] + 0.5 * total[-1])
     first = int(np.argmin(np.where(last < count, t[np.minimum(last, count - 1)] - t, np.inf)))

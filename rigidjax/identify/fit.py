@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from rigidjax import _checks
+from rigidjax.identify import padding
 from rigidjax.identify.assessment import assess
 from rigidjax.identify.checkpoint import (
     Checkpoint,
@@ -117,12 +118,13 @@ def fit(
         require_folder(checkpoint)
     wanted = "a Descent(optimiser, …) or None"
     _checks.instance(descent, (Descent, NoneType), "fit", wanted=wanted)
+    given, problem = problem, padding.of_few_lengths(problem)
     task = Task(problem, _first_noise(problem), tolerance, max_steps)
     points = [] if initial is None else [initial]
     if pieces > 1:
-        points.append(_from_pieces(problem, pieces, tolerance, max_steps))
+        points.append(_from_pieces(given, pieces, tolerance, max_steps))
     if starts > len(points):
-        points += starting_points(problem, starts - len(points), key)
+        points += starting_points(given, starts - len(points), key)
     points, cut, rough = points[:starts], [], []
     if isinstance(problem.integrator, Adaptive):
         # Another tolerance is no other program: the noise of long steps would slow down the search.
@@ -144,7 +146,10 @@ def fit(
         task = task._replace(problem=_with(task.problem, finer))
         best, task = _with_noise(again(best, task), task)
         best = _evaluated(best, task.problem)
-    return assess(task.problem, best, task.noise, tried, lowest, cut, rough)
+    found = assess(task.problem, best, task.noise, tried, lowest, cut, rough)
+    # Of the readings as they were given.
+    own = eqx.tree_at(lambda p: p.records, task.problem, given.records)
+    return eqx.tree_at(lambda one: one.problem, found, own)
 
 
 def _cost(tried: Tried) -> float:

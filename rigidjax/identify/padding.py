@@ -1,6 +1,6 @@
 """Several recordings of one body as one tree with a leading axis, so that one program fits them."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -13,13 +13,17 @@ from rigidjax.identify.recording import Reading, Recording
 from rigidjax.motion.torques import Linear, Series
 
 
-def stack(recordings: Sequence[Recording]) -> tuple[Recording, tuple[int, ...]]:
+def stack(
+    recordings: Sequence[Recording], length: Callable[[int], int] = lambda count: count
+) -> tuple[Recording, np.ndarray]:
     """One recording with a leading axis, and the number of times of each: shorter ones are
-    continued with masked readings at their last time, tables of time with their last value.
+    continued with masked readings at their last time, tables of time with their last value, up to
+    the `length` for the longest.
     """
-    counts = tuple(int(r.t.shape[0]) for r in recordings)
-    longest = max(counts)
+    counts = np.array([r.t.shape[0] for r in recordings], np.int32)
+    longest = length(int(counts.max()))
     rows = max((_rows(_tabled(r)) for r in recordings), default=0)
+    rows = length(rows) if rows else 0
     alike = [lengthened(r, longest, rows) for r in recordings]
     forms = [(jax.tree.structure(r), [np.shape(x) for x in jax.tree.leaves(r)]) for r in alike]
     for index, form in enumerate(forms):
@@ -30,6 +34,21 @@ def stack(recordings: Sequence[Recording]) -> tuple[Recording, tuple[int, ...]]:
                 "options"
             )
     return jax.tree.map(_stacked, *alike), counts
+
+
+def of_few_lengths(problem: Any) -> Any:
+    """The problem with masked readings up to one of four lengths an octave, to compile few
+    programs.
+    """
+    records, _ = stack(problem.recordings, _length)
+    return eqx.tree_at(lambda p: p.records, problem, records)
+
+
+def _length(count: int) -> int:
+    """The least of these lengths that is not below `count`."""
+    octaves = np.array([-1, 0]) + np.ceil(4.0 * np.log2(count))
+    lengths = 16 * np.ceil(2.0 ** (octaves / 4.0) / 16)
+    return int(lengths[0] if lengths[0] >= count else lengths[1])
 
 
 def _stacked(*leaves: Any) -> Any:
@@ -50,12 +69,15 @@ def one(records: Any, index: int) -> Any:
     return jax.tree.map(pick, records)
 
 
-def on_host(records: Recording, counts: Sequence[int]) -> tuple[Recording, ...]:
+def on_host(records: Recording, counts: Any) -> tuple[Recording, ...]:
     """The recordings one by one, in NumPy's arrays, so that no JAX operation is needed."""
     known = jax.tree.map(lambda leaf: np.asarray(leaf) if eqx.is_array(leaf) else leaf, records)
     arrays, rest = eqx.partition(known, eqx.is_array)
     rows = (jax.tree.map(lambda leaf, i=i: leaf[i], arrays) for i in range(len(counts)))
-    return tuple(cut(eqx.combine(row, rest), n) for row, n in zip(rows, counts, strict=True))
+    return tuple(
+        cut(eqx.combine(row, rest), n)
+        for row, n in zip(rows, np.asarray(counts).tolist(), strict=True)
+    )
 
 
 def cut(recording: Recording, count: int) -> Recording:

@@ -76,7 +76,7 @@ class Problem(eqx.Module):
     """
 
     records: Recording
-    counts: tuple[int, ...] = eqx.field(static=True)
+    counts: Int[np.ndarray, " records"]
     body: AbstractBodyChart | Bodies
     of: tuple[str, ...] = eqx.field(static=True)
     which: Int[Array, " records"] | None
@@ -159,7 +159,7 @@ class Problem(eqx.Module):
         """The recordings, one by one."""
         return tuple(
             padding.cut(padding.one(self.records, index), count)
-            for index, count in enumerate(self.counts)
+            for index, count in enumerate(np.asarray(self.counts).tolist())
         )
 
     @property

@@ -230,7 +230,7 @@ def _from_ranges(stations: np.ndarray, lengths: np.ndarray) -> np.ndarray:
     return centre + np.linalg.lstsq(s, sides.T, rcond=1e-9)[0].T
 
 
-def first_rates(records: Recording, counts: tuple[int, ...]) -> Float[Array, "records 3"]:
+def first_rates(records: Recording, counts: Any) -> Float[Array, "records 3"]:
     """`first_rate` of each of several recordings (a leading axis), also of traced ones."""
     for reading in readings_of(records, Gyro):
         xp: Any = np if _checks.known(reading) else jnp

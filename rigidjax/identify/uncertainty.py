@@ -327,7 +327,7 @@ def _channel_time(e: np.ndarray, seen: np.ndarray) -> tuple[float, float]:
         return 1.0, 0.0
     total, first = 1.0, 0.0
     noise = 2.0 / np.sqrt(max(seen.sum(), 1))
-    for lag in range(1, max(2, e.shape[1] // 3)):
+    for lag in range(1, max(2, int(np.max(np.nonzero(seen)[1], initial=0) + 1) // 3)):
         # Each lag has fewer pairs than lag zero.
         pairs = np.sum(seen[:, lag:] & seen[:, :-lag])
         if pairs < 10:

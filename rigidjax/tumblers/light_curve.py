@@ -29,7 +29,6 @@ from rigidjax.tumblers.search import (
     MAGNITUDE,
     descended,
     noise_of,
-    of_few_lengths,
     relative_flux,
     starts_of,
 )
@@ -161,7 +160,7 @@ def fit_light_curve(
     say(f"{used} pairs of frequencies, χ² {found.misfits[0]:.6g} of {found.dof}")
     say(f"{len(starts)} starts")
     sigma = noise_of(problem, reading, flux, found)
-    whole = of_few_lengths(problem)
+    whole = padding.of_few_lengths(problem)
     ends = descended(whole, starts, sigma, tolerance)
     aliases = _aliases(whole, ends)
     say(f"{len(aliases)} motions, misfit {aliases[0].cost:.6g}")

@@ -1,6 +1,5 @@
 """From pairs of frequencies to motions of a tumbler: starts on a grid, and the search from them."""
 
-import math
 from typing import Any
 
 import equinox as eqx
@@ -11,7 +10,6 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from rigidjax.body.inertia import Inertia
-from rigidjax.identify import padding
 from rigidjax.identify.checkpoint import Tried
 from rigidjax.identify.levenberg_marquardt import CAREFUL, Settings, search
 from rigidjax.identify.parameters import Parameters
@@ -44,22 +42,6 @@ def relative_flux(
         flux = np.maximum(values, 1e-3 * np.median(values)) / np.median(values)
         spread = None if noise is None else np.full(flux.shape, noise / np.median(values))
     return t[keep] - t[0], flux, spread
-
-
-def of_few_lengths(problem: Problem) -> Problem:
-    """The problem with masked readings up to one of four lengths an octave, to compile few
-    programs.
-    """
-    record = problem.recording
-    octaves = math.ceil(4.0 * math.log2(record.t.shape[0])) / 4.0
-    longer = padding.lengthened(record, 16 * math.ceil(2.0**octaves / 16))
-    chart: Any = problem.body
-    whole = Problem(longer, chart, loss=problem.loss, prior=problem.prior)
-
-    def same(p: Problem) -> tuple:
-        return p.reference, p.slots, p.integrator, p.noise_groups
-
-    return eqx.tree_at(same, whole, same(problem), is_leaf=lambda node: node is None)
 
 
 def starts_of(

@@ -4,6 +4,7 @@ Most of a fit is compiling. Fits of `PrincipalRatios` to 80 readings of a gyro o
 and in other files, are one set of programs.
 """
 
+import re
 from pathlib import Path
 
 import jax
@@ -13,6 +14,8 @@ import optax
 import pytest
 
 import rigidjax as rj
+from rigidjax import identify
+from rigidjax.identify import padding
 
 BRICK = Path(__file__).parents[3] / "shared" / "data" / "nesc_brick" / "tumbling_brick.csv"
 MOMENTS = np.array([1.0, 1.6, 2.1])
@@ -252,3 +255,32 @@ def test_other_mistakes_are_named(tumble):
         rj.identify.Gyro(noise=[1.0, 2.0])
     with pytest.raises(ValueError, match=r"level between 0 and 1, got 95"):
         rj.identify.fit(problem, starts=1).interval(95)
+
+
+def test_a_record_of_another_length_is_the_same_program(caplog):
+    """The appended readings change nothing: neither the result, nor its intervals, nor a word."""
+
+    def fitted(count):
+        ts = jnp.linspace(0.0, 8.0, 100)[:count]
+        law = rj.torques.Damping([0.02, 0.02, 0.02])
+        motion = rj.simulate(rj.Inertia.from_principal(1.0, 1.6, 2.1), rj.Spin([0.4, 1.2, -0.3]), ts, law)  # fmt: skip
+        noise = np.random.default_rng(0).normal(size=(100, 3))[:count]
+        record = identify.Recording(ts, (identify.Gyro(), motion.ys.omega + 0.01 * noise), torque=law)  # fmt: skip
+        return identify.fit(identify.Problem(record, identify.Tensor(1.0)), starts=1)
+
+    fitted(95)
+    with jax.log_compiles(), caplog.at_level("WARNING"):
+        short = fitted(92)
+    # `simulate` is another one, with what it does beside.
+    programs = set(re.findall(r"Compiling jit\((\w+)\)", caplog.text))
+    assert not programs & {"descend", "_errors_alone", "_linearised", "value_and_slope"}
+    assert short.residuals[0].shape == (92, 3) and short.problem.recording.t.shape == (92,)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(padding, "of_few_lengths", lambda problem: problem)
+        plain = fitted(92)
+    assert short.status == plain.status and short.independent == plain.independent
+    assert jax.tree.structure(short) == jax.tree.structure(plain)
+    np.testing.assert_allclose(
+        np.array(list(short.interval().values())), np.array(list(plain.interval().values())),
+        rtol=1e-6, atol=1e-9,
+    )  # fmt: skip

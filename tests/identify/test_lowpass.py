@@ -148,3 +148,18 @@ def test_mistakes_are_named():
     record = identify.Recording(t, (gyro, jnp.ones((20, 3))))
     with pytest.raises(ValueError, match="a lowpass has states of its own"):
         rj.estimate.start(rj.estimate.Model(BODY), record, rate=0.1)
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_a_shorter_record_is_filtered_as_if_it_were_alone(order):
+    """Beside a longer one it is continued at its last time, where the filter was NaN."""
+    t = jnp.linspace(0.0, 1.0, 30)
+    omega = rj.simulate(BODY, rj.Spin([3.0, 0.5, 4.0]), t).ys.omega
+    gyro = identify.Gyro(1e-3, lowpass=identify.LowPass(4.0, order))
+    long, short = (identify.Recording(t[:n], (gyro, omega[:n])) for n in (30, 17))
+    errors = []
+    for records in ([short], [long, short]):
+        problem = identify.Problem(records, identify.PrincipalRatios())
+        errors.append(problem.errors(problem.start(BODY, [3.0, 0.5, 4.0]))[0])
+    np.testing.assert_allclose(errors[1][1, :17], errors[0][:17], rtol=0, atol=1e-13)
+    assert np.isfinite(errors[1]).all()

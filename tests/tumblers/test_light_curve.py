@@ -11,8 +11,8 @@ from tumblers import simulated
 
 from rigidjax import identify, tumblers
 from rigidjax.identify import Gyro
+from rigidjax.identify.padding import of_few_lengths
 from rigidjax.tumblers import Brightness, lattice_series, two_frequencies
-from rigidjax.tumblers.search import of_few_lengths
 from rigidjax.tumblers.two_frequencies import with_aliases
 
 TS = np.linspace(0.0, 1e5, 300)

@@ -70,9 +70,12 @@ class LowPass(eqx.Module):
             return values
         w = 2 * math.pi * self.cutoff.astype(values.dtype)
         gaps = jnp.diff(t)
-        usual = jnp.median(gaps)
+        # A shorter record is continued at its last time; those samples are not looked at.
+        beyond = gaps <= 0
+        usual = jnp.nanmedian(jnp.where(beyond, jnp.nan, gaps))
+        gaps = jnp.where(beyond, usual, gaps)
         fresh = gaps > _GAP * usual
-        before, after = _slopes(gaps, jnp.diff(values, axis=0), fresh)
+        before, after = _slopes(gaps, jnp.diff(values, axis=0), fresh, beyond)
         # On each interval u = u₀ + b s + c s² + d s³.
         h = gaps[:, None]
         chord = jnp.diff(values, axis=0) / h
@@ -102,11 +105,13 @@ def _within(t: np.ndarray, values: np.ndarray) -> None:
         raise ValueError("t: wanted increasing times")
 
 
-def _slopes(gaps: Array, steps: Array, fresh: Array) -> tuple[Array, Array]:
+def _slopes(gaps: Array, steps: Array, fresh: Array, beyond: Array) -> tuple[Array, Array]:
     """du/dt at both ends of each interval, of the nearest parabola; of the chord beside a gap."""
     h, chord = gaps[:, None], steps / gaps[:, None]
     apart = (fresh[1:] | fresh[:-1])[:, None]
     bend = jnp.where(apart, 0.0, jnp.diff(chord, axis=0) / (h[1:] + h[:-1]))
+    # The last interval has no next one.
+    bend = jnp.where(beyond[1:, None], jnp.roll(bend, 1, axis=0), bend)
     begin = jnp.concatenate([bend[:1] * h[:1], bend * h[1:]]) if bend.shape[0] else 0.0 * chord
     end = jnp.concatenate([bend * h[:-1], bend[-1:] * h[-1:]]) if bend.shape[0] else 0.0 * chord
     return chord - begin, chord + end
