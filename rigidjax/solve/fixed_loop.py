@@ -103,7 +103,9 @@ def step(
 
     def part(y: Any, ends: tuple[Array, Array]) -> tuple[Any, None]:
         left, right = ends
-        values = [jnp.where(left < p, a, b) for p, a, b in zip(parts, early, late, strict=True)]
+        # By its end: a part without length, of a delay of whole steps, still has the early value,
+        # by which the derivative with respect to the delay is multiplied.
+        values = [jnp.where(right <= p, a, b) for p, a, b in zip(parts, early, late, strict=True)]
         t, end = at(i) + left * h, jnp.where(right == 1, at(i + 1), at(i) + right * h)
         return stepper.step(t, end, (right - left) * h, y, Row(now, tuple(values))), None
 
