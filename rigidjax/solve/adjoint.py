@@ -63,7 +63,7 @@ def saved(
         ts = jnp.where(there, cut(run.between), rows[0])
         step = Step(*times_of(run, rows), _picked(many, path, where))
         slopes = stages(method.tableau, field, constants, step, True).slopes
-        new = _states(method, project, ts[None], step.t, step.h, step.y, slopes)[0]
+        new = _states(method, project, ts, step.t, step.h, step.y, slopes)
         new = jnp.where(there[None], new, cut(ys))
         rows = new[None] if many else new.T
         return lax.dynamic_update_slice_in_dim(ys, rows, number, 0)
@@ -91,27 +91,23 @@ def of_saved(
     **Returns** `between`, if it is not `None`, with the cotangents of the times added, and those of
     the step: its time, length, state and slopes. `bars` (K, n, *bodies) of all states.
     """
-    size = run.between.shape[0]
-    width = min(size, max(4, min(size // 50, 16)))
-    states = partial(_states, method, method.project)
+    states, most = partial(_states, method, method.project), run.between.shape[0] - 1
+    pick = _per_body(run, lambda a, index: a[index])
 
-    def window(state: Any) -> Any:
-        begin, total, by = state
-        number = jnp.arange(width, dtype=jnp.int32).reshape(-1, *[1] * first.ndim)
-        number = begin[None] + number
-        inside = number < last[None]
-        number = jnp.minimum(number, size - 1)
-        pick = _per_body(run, lambda a, index: a[index])
-        ts = jnp.where(inside, pick(run.between, number), step.t[None])
-        bar = jnp.where(jnp.expand_dims(inside, 1), pick(bars, number), 0)
-        by_ts, *more = jax.vjp(states, ts, step.t, step.h, step.y, slopes)[1](bar)
+    # One at a time: of many bodies few have as many in a step as one of them has.
+    def one(state: Any) -> Any:
+        number, total, by = state
+        inside, there = number < last, jnp.minimum(number, most)
+        t = jnp.where(inside, pick(run.between, there), step.t)
+        bar = jnp.where(inside[None], pick(bars, there), 0)
+        by_t, *more = jax.vjp(states, t, step.t, step.h, step.y, slopes)[1](bar)
         if total is not None:
-            total = _per_body(run, lambda a, i, b: a.at[i].add(b))(total, number, by_ts)
-        return begin + width, total, [a + b for a, b in zip(by, more, strict=True)]
+            total = _per_body(run, lambda a, i, b: a.at[i].add(b))(total, there, by_t)
+        return number + 1, total, [a + b for a, b in zip(by, more, strict=True)]
 
     none = [jnp.zeros_like(a) for a in (step.t, step.h, step.y, slopes)]
     start = (first, between, none)
-    _, total, by = lax.while_loop(lambda state: jnp.any(state[0] < last), window, start)
+    _, total, by = lax.while_loop(lambda state: jnp.any(state[0] < last), one, start)
     return total, *by
 
 
@@ -144,14 +140,13 @@ def _picked(many: int, rows: Array, index: Array) -> Array:
 def _states(
     method: Method, project: Any, ts: Array, t: Array, h: Array, y: Array, slopes: Array
 ) -> Array:
-    """The states (W, n, lanes) at times `ts` (W, lanes), all in one step of each lane."""
-    theta = ((ts - t[None]) / jnp.where(h == 0, 1, h)[None]).astype(slopes.dtype)
+    """The states (n, lanes) at times `ts` (lanes), each in a step of its own."""
+    theta = ((ts - t) / jnp.where(h == 0, 1, h)).astype(slopes.dtype)
     # Weights of the slopes are one number a stage; the rows F_r would be n.
     rows = weights(method.tableau, slopes.dtype, slopes.shape[1]).dense
-    rows = rows.reshape(rows.shape[0], 1, -1, *[1] * (theta.ndim - 1))
-    shares = nested(jnp.expand_dims(theta, 1), rows)
-    rise = jnp.sum(jnp.expand_dims(shares, 1) * slopes[None], 2)
-    return jax.vmap(project)(y[None] + lift(h.astype(y.dtype), rise) * rise)
+    shares = nested(theta[None], rows.reshape(*rows.shape, *[1] * theta.ndim))
+    rise = jnp.sum(shares[None] * slopes, 1)
+    return project(y + lift(h.astype(y.dtype), rise) * rise)
 
 
 def replayed(
