@@ -224,13 +224,14 @@ def _again(
 def _pushed(
     moving: Moving, method: Method, layout: Layout, constants: Arrays, each: Arrays
 ) -> Arrays:
-    method, chosen, run, record, along = _again(moving, method, layout, constants, each)
+    method, chosen, run, _, along = _again(moving, method, layout, constants, each)
     rest = iter(along[len(chosen) :])
     still = zip(run, moving[1], strict=True)
     of_run = Run(*(next(rest) if moves else jnp.zeros_like(a) for a, moves in still))
 
-    again = lambda chosen, run: adjoint.replayed(method, chosen, run, record)  # noqa: E731
-    return list(jax.jvp(again, (chosen, run), (along[: len(chosen)], of_run))[1])
+    again = lambda *both: adaptive_loop.recording(method, *both, adjoint.saved)  # noqa: E731
+    answer, record = jax.jvp(again, (chosen, run), (along[: len(chosen)], of_run))[1]
+    return [answer.between, answer.last, record.starts, record.rows]
 
 
 def _pulled(

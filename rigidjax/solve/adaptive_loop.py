@@ -122,7 +122,6 @@ class Segment(NamedTuple):
 
     rows: Rows
     times: Array  # at which each row begins, inf where there is none
-    begin: Array
     end: Array
     number: Array  # of rows
 
@@ -172,9 +171,11 @@ def of_body(result: dfx.RESULTS, body: Any) -> dfx.RESULTS:
 def tried(method: Method, constants: Arrays, run: Run, step: Step) -> tuple[Array, Array]:
     """The state a step later, and the root mean square of its error over the tolerance."""
     there = stages(method.tableau, method.field, constants, step)
-    left, right = step.y, method.project(there.end)
-    error = error_estimate(method.tableau, method.sizes, step.h, there.slopes)
-    largest = jnp.maximum(jnp.abs(left), jnp.abs(right))
+    right = method.project(there.end)
+    # Which steps are taken is no thing to differentiate.
+    left, after, h, slopes = lax.stop_gradient((step.y, right, step.h, there.slopes))
+    error = error_estimate(method.tableau, method.sizes, h, slopes)
+    largest = jnp.maximum(jnp.abs(left), jnp.abs(after))
     scale = lift(run.atol, left) + lift(run.rtol, left) * largest
     tiny = float(jnp.finfo(error.dtype).tiny)
     norm = jnp.sqrt(jnp.mean((error / scale) ** 2, 0) + tiny)
@@ -271,7 +272,7 @@ def recording(
         loop, ys, record = state
         after, rows, count = recorded(method, constants, run, loop, record.rows, None)
         if run.between.shape[0]:
-            part = segment(rows, loop.t, after.t, count)
+            part = segment(rows, after.t, count)
             ys = saved(method, constants, run, part, rows[:, HEAD:], ys)
         number = record.number + 1
         starts = lax.dynamic_update_index_in_dim(record.starts, packed(after), number, 0)
@@ -288,7 +289,7 @@ def recording(
 def start(method: Method, constants: Arrays, run: Run) -> LoopState:
     """A loop about to begin."""
     t0, y0 = run.t0, run.y0
-    h, f0 = first_step(method, constants, run)
+    h, f0 = first_step(method, *lax.stop_gradient((constants, run)))
     # No step is short enough if f(t0) is not finite.
     sound = jnp.all(jnp.isfinite(f0) & jnp.isfinite(y0), 0)
     sound = sound & jnp.isfinite(t0) & jnp.isfinite(run.stops[-1])
@@ -377,9 +378,8 @@ def recorded(
     return lax.while_loop(partial(more, room), block, (loop, rows, none))
 
 
-def segment(rows: Rows, begin: Array, end: Array, count: Array) -> Segment:
+def segment(rows: Rows, end: Array, count: Array) -> Segment:
     """A part of a run from its rows, of which there are `count`."""
-    begin, end = lax.stop_gradient((begin, end))
-    there = jnp.arange(rows.shape[0], dtype=jnp.int32).reshape(-1, *[1] * begin.ndim) < count
+    there = jnp.arange(rows.shape[0], dtype=jnp.int32).reshape(-1, *[1] * end.ndim) < count
     times = jnp.where(there, lax.stop_gradient(rows[:, 0]), jnp.inf)
-    return Segment(rows, times, begin, end, count)
+    return Segment(rows, times, lax.stop_gradient(end), count)

@@ -1,4 +1,4 @@
-"""A second pass over a recorded run: for states between its steps, for tangents and cotangents.
+"""A second pass over a recorded run: for the states between its steps, and for cotangents.
 
 The loop does not look at the times that are asked for. Its steps with such times in them are taken
 once more: many of one body side by side, or one of each of many bodies.
@@ -149,42 +149,10 @@ def _states(
     return project(y + lift(h.astype(y.dtype), rise) * rise)
 
 
-def replayed(
-    method: Method, constants: Arrays, run: Run, record: Record
-) -> tuple[Array, Array, Array, Array]:
-    """States between and at the end, starts and rows by the steps of the record, which are held."""
-    head = record.starts.shape[1] - run.y0.shape[0]
-
-    def one(i: Array, state: tuple[Array, Array, Array, Array]) -> Any:
-        y, ys, starts, _ = state
-        part = _again(method, *still, held, i)
-        starts = lax.dynamic_update_index_in_dim(starts, starts[i].at[head:].set(y), i, 0)
-
-        def step(k: Array, both: tuple[Array, Array]) -> tuple[Array, Array]:
-            y, rows = both
-            row = part.rows[k]
-            there = stages(method.tableau, method.field, constants, Step(*times_of(run, row), y))
-            rows = lax.dynamic_update_index_in_dim(rows, row.at[HEAD:].set(y), k, 0)
-            return jnp.where(lift(row[2] >= STEP, y), method.project(there.end), y), rows
-
-        y, rows = lax.fori_loop(0, part.number, step, (y, part.rows))
-        if run.between.shape[0]:
-            ys = saved(method, constants, run, part, rows[:, HEAD:], ys)
-        return y, ys, starts, rows
-
-    still, held = lax.stop_gradient(((constants, run), record))
-    number = jnp.max(held.number)
-    ys = jnp.zeros((run.between.shape[0], *run.y0.shape), run.y0.dtype)
-    state = (run.y0, ys, held.starts, held.rows)
-    y, ys, starts, rows = lax.fori_loop(0, number, one, state)
-    starts = lax.dynamic_update_index_in_dim(starts, starts[number].at[head:].set(y), number, 0)
-    return ys, y, starts, rows
-
-
 def cotangents(
     method: Method, constants: Arrays, run: Run, record: Record, bars: Arrays, timed: bool
 ) -> tuple[Arrays, Run]:
-    """The transpose of the tangents of `replayed`: cotangents of the constants and of the run.
+    """The transpose of a recorded run: cotangents of the constants and of the run.
 
     `bars` are the cotangents of the states at the saved times and at the end. Times have some only
     where `timed`.
@@ -250,4 +218,4 @@ def _again(method: Method, constants: Arrays, run: Run, record: Record, number: 
     short = jnp.where(jnp.any(going(method, run, end, until)), jnp.nan, 0.0)
     rows = rows.at[:, HEAD:].add(short.astype(rows.dtype))
     count = jnp.where(again, count, jnp.max(record.filled))
-    return segment(rows, loop.t, after.t, count)
+    return segment(rows, after.t, count)
