@@ -5,7 +5,6 @@ the steps of the last one; derivatives run the others once more.
 """
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any, NamedTuple
 
 import diffrax as dfx
@@ -30,9 +29,6 @@ _SAFETY, _SMALLEST, _LARGEST = 0.9, 0.2, 10.0
 SEGMENT = 512
 # More rows for one that is run again: it may take a few steps more.
 _MORE = 64
-# XLA on CPU makes one kernel of a loop whose state is smaller than a kilobyte: steps are written
-# into a block that small, and blocks into the record.
-_BLOCK, _MOST = 560, 8
 
 
 class Method(NamedTuple):
@@ -265,7 +261,7 @@ def recording(
     first, most = packed(loop), method.max_steps + run.stops.shape[0]
     starts = jnp.zeros((-(-most // SEGMENT) + 1, *first.shape), first.dtype)
     ys = jnp.full((run.between.shape[0], *run.y0.shape), jnp.nan, run.y0.dtype)
-    rows = jnp.zeros((SEGMENT + _MORE + _MOST, HEAD + run.y0.shape[0], *run.t0.shape), ys.dtype)
+    rows = jnp.zeros((SEGMENT + _MORE, HEAD + run.y0.shape[0], *run.t0.shape), ys.dtype)
     zero = jnp.zeros((), jnp.int32)
 
     def one(state: Any) -> Any:
@@ -355,27 +351,18 @@ def recorded(
     method: Method, constants: Arrays, run: Run, loop: LoopState, rows: Rows, until: Any
 ) -> tuple[LoopState, Rows, Array]:
     """The loop from here until the rows are full; and the number of rows."""
-    many = max(1, min(_MOST, _BLOCK // run.y0.dtype.itemsize // rows.shape[1]))
+    room = rows.shape[0] - (_MORE if until is None else 0)
 
-    room = rows.shape[0] - (_MORE if until is None else 0) - _MOST
-    none = jnp.zeros((), jnp.int32)
-
-    def more(most: int, state: Any) -> Array:
+    def more(state: Any) -> Array:
         loop, _, count = state
-        return jnp.any(going(method, run, loop, until)) & (count < most)
+        return jnp.any(going(method, run, loop, until)) & (count < room)
 
     def attempt(state: Any) -> Any:
-        loop, few, k = state
+        loop, rows, k = state
         loop, row = _attempt(method, constants, run, loop, until)
-        return loop, lax.dynamic_update_slice_in_dim(few, row[None], k, 0), k + 1
+        return loop, lax.dynamic_update_slice_in_dim(rows, row[None], k, 0), k + 1
 
-    def block(state: Any) -> Any:
-        loop, rows, count = state
-        few = jnp.zeros((many, *rows.shape[1:]), rows.dtype)
-        loop, few, k = lax.while_loop(partial(more, many), attempt, (loop, few, none))
-        return loop, lax.dynamic_update_slice_in_dim(rows, few, count, 0), count + k
-
-    return lax.while_loop(partial(more, room), block, (loop, rows, none))
+    return lax.while_loop(more, attempt, (loop, rows, jnp.zeros((), jnp.int32)))
 
 
 def segment(rows: Rows, end: Array, count: Array) -> Segment:
