@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rigidjax._types import Scalar
-from rigidjax.exact._xla import fence, one_kernel, opaque_one, sincos
+from rigidjax.exact._xla import fence, one_kernel, opaque_one
 from rigidjax.exact.components3 import Four, Triple
 from rigidjax.exact.jacobi_duplication import (
     Elliptic,
@@ -146,7 +146,8 @@ def from_functions(o: Orbit, f: Elliptic, u: Reduced, t: Scalar) -> tuple[Triple
     size = jnp.maximum(jnp.maximum(jnp.abs(b0), jnp.abs(b2)), jnp.abs(b3))
     b0, b2, b3 = fence((b0 / size, b2 / size, b3 / size), one)
     r = 1.0 / jnp.sqrt((b0 * b0 + b2 * b2 + b3 * b3) * (f.x * f.x + f.y * f.y))
-    sine, cosine = sincos(0.5 * o.a * o.h * t - phase)
+    angle = 0.5 * o.a * o.h * t - phase
+    sine, cosine = jnp.sin(angle), jnp.cos(angle)
     c, s = r * (cosine * f.x + sine * f.y), r * (sine * f.x - cosine * f.y)
     still = o.h <= 0
     c, s = fence((c, jnp.where(still, 0.0, s / jnp.where(still, 1.0, o.h))), one)
