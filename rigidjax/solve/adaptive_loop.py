@@ -62,14 +62,14 @@ class Run(NamedTuple):
 
 
 class LoopState(NamedTuple):
-    """The state of the loop: time, next step, index of the next stop, counters, state."""
+    """The state of the loop, and the end of a run."""
 
+    y: Array  # (n, *bodies)
     t: Array
-    h: Array
-    stop: Array
+    h: Array  # the next step: 0 or NaN if none is left to try, `HALTED`
+    stop: Array  # index of the next one
     steps: Array
     rejected: Array
-    y: Array
 
 
 # A recorded attempt is one row (4 + n, *bodies): start, length, kind, index of the stop ahead, and
@@ -83,14 +83,14 @@ HALTED = -1.0
 
 def packed(loop: LoopState) -> Array:
     """A `LoopState` as one row. Whole numbers are exact in it up to 2²⁴ in float32."""
-    return jnp.concatenate([jnp.stack([a.astype(loop.y.dtype) for a in loop[:-1]]), loop.y])
+    return jnp.concatenate([jnp.stack([a.astype(loop.y.dtype) for a in loop[1:]]), loop.y])
 
 
 def unpacked(row: Array) -> LoopState:
     """The inverse of `packed`."""
     head = len(LoopState._fields) - 1
     stop, steps, rejected = row[2:head].astype(jnp.int32)
-    return LoopState(row[0], row[1], stop, steps, rejected, row[head:])
+    return LoopState(row[head:], row[0], row[1], stop, steps, rejected)
 
 
 class Record(NamedTuple):
@@ -100,17 +100,6 @@ class Record(NamedTuple):
     number: Array  # of segments
     rows: Rows  # of the last segment
     filled: Array  # their number
-
-
-class Answer(NamedTuple):
-    """States between, and where the loop has ended."""
-
-    between: Array  # (K, n, *bodies), NaN if not reached
-    last: Array  # (n, *bodies)
-    t: Array
-    h: Array  # the next step: 0 or NaN if none is left to try, `HALTED`
-    steps: Array
-    rejected: Array
 
 
 class Segment(NamedTuple):
@@ -243,20 +232,22 @@ def first_step(method: Method, constants: Arrays, run: Run) -> tuple[Array, Arra
     return h.astype(t0.dtype), first
 
 
-def value(method: Method, constants: Arrays, run: Run) -> Answer:
-    """The answer, with nothing kept: without states between."""
-    loop = lax.while_loop(
+def value(method: Method, constants: Arrays, run: Run) -> LoopState:
+    """The end of a run without states between."""
+    return lax.while_loop(
         lambda loop: jnp.any(going(method, run, loop, None)),
         lambda loop: _attempt(method, constants, run, loop, None)[0],
         start(method, constants, run),
     )
-    return Answer(run.y0[None][:0], loop.y, loop.t, loop.h, loop.steps, loop.rejected)
 
 
 def recording(
     method: Method, constants: Arrays, run: Run, saved: Callable[..., Array]
-) -> tuple[Answer, Record]:
-    """The answer, and what derivatives need; `saved` as of `rigidjax.solve.adjoint`."""
+) -> tuple[Array, LoopState, Record]:
+    """States between (K, n, *bodies), NaN if not reached; the end; what derivatives need.
+
+    `saved` as of `rigidjax.solve.adjoint`.
+    """
     loop = start(method, constants, run)
     first, most = packed(loop), method.max_steps + run.stops.shape[0]
     starts = jnp.zeros((-(-most // SEGMENT) + 1, *first.shape), first.dtype)
@@ -278,8 +269,7 @@ def recording(
     more = lambda state: jnp.any(going(method, run, state[0], None))  # noqa: E731
     loop, ys, record = lax.while_loop(more, one, state)
     number, filled = (jnp.broadcast_to(a, run.t0.shape) for a in (record.number, record.filled))
-    answer = Answer(ys, loop.y, loop.t, loop.h, loop.steps, loop.rejected)
-    return answer, record._replace(number=number, filled=filled)
+    return ys, loop, record._replace(number=number, filled=filled)
 
 
 def start(method: Method, constants: Arrays, run: Run) -> LoopState:
@@ -292,7 +282,7 @@ def start(method: Method, constants: Arrays, run: Run) -> LoopState:
     h = jnp.where(sound, jnp.where(jnp.isnan(run.h0), h, run.h0), jnp.nan)
     h = lax.stop_gradient(_unless_halted(method, t0, y0, h))
     zero = jnp.zeros(t0.shape, jnp.int32)
-    return LoopState(t0, h, zero, zero, zero, y0)
+    return LoopState(y0, t0, h, zero, zero, zero)
 
 
 def going(method: Method, run: Run, loop: LoopState, until: Array | None) -> Array:
@@ -329,12 +319,12 @@ def _attempt(
         following = jnp.where(accept, _unless_halted(method, late, y, following), following)
     reached = accept & last & ~cut
     after = LoopState(
+        y=jnp.where(lift(accept, y), y, loop.y),
         t=jnp.where(accept, jnp.where(reached, begin, late), loop.t),
         h=lax.stop_gradient(following),
         stop=loop.stop + (arrived | reached).astype(jnp.int32),
         steps=loop.steps + moving.astype(jnp.int32),
         rejected=loop.rejected + (moving & ~accept).astype(jnp.int32),
-        y=jnp.where(lift(accept, y), y, loop.y),
     )
     kind = jnp.where(accept, jnp.where(reached, LAST, STEP), NONE)
     head = [a.astype(h.dtype) for a in (loop.t, h, kind, loop.stop)]
