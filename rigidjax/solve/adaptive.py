@@ -184,14 +184,14 @@ def _over_bodies(method: Method, layout: Layout, constants: Arrays) -> Method:
 def _value(method: Method, layout: Layout, constants: Arrays, each: Arrays) -> Arrays:
     method, run = _over_bodies(method, layout, constants), Run(*each)
     if run.between.shape[0]:
-        between, end, _ = adaptive_loop.recording(method, constants, run, adjoint.saved)
+        between, end, _ = adaptive_loop.recording(method, constants, run)
         return [between, *end]
     return [run.y0[None][:0], *adaptive_loop.value(method, constants, run)]
 
 
 def _recorded(method: Method, layout: Layout, constants: Arrays, each: Arrays) -> Arrays:
     method = _over_bodies(method, layout, constants)
-    between, end, record = adaptive_loop.recording(method, constants, Run(*each), adjoint.saved)
+    between, end, record = adaptive_loop.recording(method, constants, Run(*each))
     return [between, *end, *record]
 
 
@@ -232,7 +232,7 @@ def _pushed(
     still = zip(run, moving[1], strict=True)
     of_run = Run(*(next(rest) if moves else jnp.zeros_like(a) for a, moves in still))
 
-    again = lambda *both: adaptive_loop.recording(method, *both, adjoint.saved)  # noqa: E731
+    again = lambda *both: adaptive_loop.recording(method, *both)  # noqa: E731
     between, end, record = jax.jvp(again, (chosen, run), (along[: len(chosen)], of_run))[1]
     return [between, end.y, record.starts, record.rows]
 

@@ -1,10 +1,13 @@
 """Adaptive steps, for one body or many, with the states at any times. Bodies are in the last axis.
 
 For saved states and derivatives the steps are recorded in segments: the start of each is kept, and
-the steps of the last one; derivatives run the others once more.
+the steps of the last one; derivatives run the others once more. The loop does not look at the times
+that are asked for. Its steps with such times in them are taken once more: many of one body side by
+side, or one of each of many bodies.
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import diffrax as dfx
@@ -16,7 +19,7 @@ from jaxtyping import Array, Bool
 
 from rigidjax.solve.batching import Arrays
 from rigidjax.solve.components import lift
-from rigidjax.solve.runge_kutta import Field, Step, error_estimate, stages
+from rigidjax.solve.runge_kutta import Field, Step, error_estimate, nested, stages, weights
 from rigidjax.solve.tableaus import Tableau
 
 # diffrax inherits it from optimistix, where type checkers do not follow.
@@ -29,6 +32,8 @@ _SAFETY, _SMALLEST, _LARGEST = 0.9, 0.2, 10.0
 SEGMENT = 512
 # More rows for one that is run again: it may take a few steps more.
 _MORE = 64
+# Times of one body that are taken together.
+_TOGETHER = 16
 
 
 class Method(NamedTuple):
@@ -241,13 +246,8 @@ def value(method: Method, constants: Arrays, run: Run) -> LoopState:
     )
 
 
-def recording(
-    method: Method, constants: Arrays, run: Run, saved: Callable[..., Array]
-) -> tuple[Array, LoopState, Record]:
-    """States between (K, n, *bodies), NaN if not reached; the end; what derivatives need.
-
-    `saved` as of `rigidjax.solve.adjoint`.
-    """
+def recording(method: Method, constants: Arrays, run: Run) -> tuple[Array, LoopState, Record]:
+    """States between (K, n, *bodies), NaN if not reached; the end; what derivatives need."""
     loop = start(method, constants, run)
     first, most = packed(loop), method.max_steps + run.stops.shape[0]
     starts = jnp.zeros((-(-most // SEGMENT) + 1, *first.shape), first.dtype)
@@ -260,7 +260,7 @@ def recording(
         after, rows, count = recorded(method, constants, run, loop, record.rows, None)
         if run.between.shape[0]:
             part = segment(rows, after.t, count)
-            ys = saved(method, constants, run, part, rows[:, HEAD:], ys)
+            ys = _saved(method, constants, run, part, ys)
         number = record.number + 1
         starts = lax.dynamic_update_index_in_dim(record.starts, packed(after), number, 0)
         return after, ys, Record(starts, number, rows, count)
@@ -360,3 +360,74 @@ def segment(rows: Rows, end: Array, count: Array) -> Segment:
     there = jnp.arange(rows.shape[0], dtype=jnp.int32).reshape(-1, *[1] * end.ndim) < count
     times = jnp.where(there, lax.stop_gradient(rows[:, 0]), jnp.inf)
     return Segment(rows, times, lax.stop_gradient(end), count)
+
+
+def _saved(method: Method, constants: Arrays, run: Run, part: Segment, ys: Array) -> Array:
+    """`ys` (K, n, *bodies) with the states in a part of a run."""
+    size, many, field, project = run.between.shape[0], run.t0.ndim, method.field, method.project
+    width = 1 if many else min(size, _TOGETHER)
+    if not many:
+        field = jax.vmap(field, (None, -1, -1), -1)
+        project = jax.vmap(project, -1, -1)
+    index, inside = _rows_at(run, part)
+    # What is not inside stands still at the first state, where the field has a value.
+    still = part.rows[0].at[1:3].set(0)
+    still = still if many else still[:, None]
+
+    def window(i: Array, ys: Array) -> Array:
+        # A window beyond the last time is moved back: states that are there are worked out again.
+        number = jnp.minimum(first + i * width, size - width)
+        cut = partial(_cut, number, width, many)
+        there, where = cut(inside), cut(index)
+        rows = jnp.where(there[None], _picked(many, part.rows, where), still)
+        ts = jnp.where(there, cut(run.between), rows[0])
+        step = Step(*times_of(run, rows), rows[HEAD:])
+        slopes = stages(method.tableau, field, constants, step, True).slopes
+        new = states_in_step(method, project, ts, step.t, step.h, step.y, slopes)
+        new = jnp.where(there[None], new, cut(ys))
+        rows = new[None] if many else new.T
+        return lax.dynamic_update_slice_in_dim(ys, rows, number, 0)
+
+    used = jnp.any(inside.reshape(size, -1), 1)
+    first = jnp.argmax(used).astype(jnp.int32)
+    length = size - jnp.argmax(used[::-1]).astype(jnp.int32) - first
+    count = jnp.where(jnp.any(used), (length + width - 1) // width, 0)
+    return lax.fori_loop(jnp.zeros_like(count), count, window, ys)
+
+
+def _rows_at(run: Run, part: Segment) -> tuple[Array, Array]:
+    """The index of the row that each time between is in (K, *bodies), whether there is one."""
+    # All at once: in a loop each search would be many small kernels.
+    ts = lax.stop_gradient(run.between)
+    search = per_body(run, lambda begun, ts: jnp.searchsorted(begun, ts).astype(jnp.int32) - 1)
+    index = search(part.times, ts)
+    return jnp.maximum(index, 0), (index >= 0) & (ts <= part.end[None])
+
+
+def per_body(run: Run, function: Callable[..., Any]) -> Callable[..., Any]:
+    """A function of one body's arrays as one of arrays with a last axis of bodies, if there is."""
+    return jax.vmap(function, in_axes=-1, out_axes=-1) if run.t0.ndim else function
+
+
+def _cut(number: Array, width: int, many: int, a: Array) -> Array:
+    """Some rows of `a` (K, …, *bodies), in lanes (…, lanes)."""
+    if many:
+        return lax.dynamic_index_in_dim(a, number, 0, False)
+    return jnp.moveaxis(lax.dynamic_slice_in_dim(a, number, width, 0), 0, -1)
+
+
+def _picked(many: int, rows: Array, index: Array) -> Array:
+    """Those of the rows (R, c, *bodies), in lanes: (c, lanes)."""
+    return jnp.take_along_axis(rows, index[None, None], 0)[0] if many else rows[index].T
+
+
+def states_in_step(
+    method: Method, project: Any, ts: Array, t: Array, h: Array, y: Array, slopes: Array
+) -> Array:
+    """The states (n, lanes) at times `ts` (lanes), each in a step of its own."""
+    theta = ((ts - t) / jnp.where(h == 0, 1, h)).astype(slopes.dtype)
+    # Weights of the slopes are one number a stage; the rows F_r would be n.
+    rows = weights(method.tableau, slopes.dtype, slopes.shape[1]).dense
+    shares = nested(theta[None], rows.reshape(*rows.shape, *[1] * theta.ndim))
+    rise = jnp.sum(shares[None] * slopes, 1)
+    return project(y + lift(h.astype(y.dtype), rise) * rise)
