@@ -7,7 +7,6 @@ side, or one of each of many bodies.
 """
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any, NamedTuple
 
 import diffrax as dfx
@@ -364,29 +363,39 @@ def segment(rows: Rows, end: Array, count: Array) -> Segment:
 
 def _saved(method: Method, constants: Arrays, run: Run, part: Segment, ys: Array) -> Array:
     """`ys` (K, n, *bodies) with the states in a part of a run."""
-    size, many, field, project = run.between.shape[0], run.t0.ndim, method.field, method.project
+    size, many = run.between.shape[0], run.t0.ndim > 0
     width = 1 if many else min(size, _TOGETHER)
-    if not many:
-        field = jax.vmap(field, (None, -1, -1), -1)
-        project = jax.vmap(project, -1, -1)
-    index, inside = _rows_at(run, part)
+    # All at once: in a loop each search would be many small kernels.
+    ts = lax.stop_gradient(run.between)
+    search = per_body(run, lambda begun, ts: jnp.searchsorted(begun, ts).astype(jnp.int32) - 1)
+    index = search(part.times, ts)
+    index, inside = jnp.maximum(index, 0), (index >= 0) & (ts <= part.end[None])
     # What is not inside stands still at the first state, where the field has a value.
     still = part.rows[0].at[1:3].set(0)
-    still = still if many else still[:, None]
+    pick = jax.vmap(lambda rows, i: rows[i], (-1 if many else None, -1), -1)
+    if not many:
+        # Times of one body lie side by side as bodies do.
+        field, project = (
+            jax.vmap(method.field, (None, -1, -1), -1),
+            jax.vmap(method.project, -1, -1),
+        )
+        method, still = method._replace(field=field, project=project), still[:, None]
 
     def window(i: Array, ys: Array) -> Array:
         # A window beyond the last time is moved back: states that are there are worked out again.
         number = jnp.minimum(first + i * width, size - width)
-        cut = partial(_cut, number, width, many)
-        there, where = cut(inside), cut(index)
-        rows = jnp.where(there[None], _picked(many, part.rows, where), still)
-        ts = jnp.where(there, cut(run.between), rows[0])
-        step = Step(*times_of(run, rows), rows[HEAD:])
-        slopes = stages(method.tableau, field, constants, step, True).slopes
-        new = states_in_step(method, project, ts, step.t, step.h, step.y, slopes)
-        new = jnp.where(there[None], new, cut(ys))
-        rows = new[None] if many else new.T
-        return lax.dynamic_update_slice_in_dim(ys, rows, number, 0)
+
+        def cut(a: Array) -> Array:
+            a = jnp.moveaxis(lax.dynamic_slice_in_dim(a, number, width), 0, -1)
+            return a[..., 0] if many else a
+
+        there, old = cut(inside), cut(ys)
+        row = jnp.where(there[None], pick(part.rows, cut(index)), still)
+        step = Step(*times_of(run, row), row[HEAD:])
+        slopes = stages(method.tableau, method.field, constants, step, True).slopes
+        new = state_in_step(method, jnp.where(there, cut(run.between), row[0]), step, slopes)
+        new = jnp.where(there[None], new, old)
+        return lax.dynamic_update_slice_in_dim(ys, new[None] if many else new.T, number, 0)
 
     used = jnp.any(inside.reshape(size, -1), 1)
     first = jnp.argmax(used).astype(jnp.int32)
@@ -395,39 +404,16 @@ def _saved(method: Method, constants: Arrays, run: Run, part: Segment, ys: Array
     return lax.fori_loop(jnp.zeros_like(count), count, window, ys)
 
 
-def _rows_at(run: Run, part: Segment) -> tuple[Array, Array]:
-    """The index of the row that each time between is in (K, *bodies), whether there is one."""
-    # All at once: in a loop each search would be many small kernels.
-    ts = lax.stop_gradient(run.between)
-    search = per_body(run, lambda begun, ts: jnp.searchsorted(begun, ts).astype(jnp.int32) - 1)
-    index = search(part.times, ts)
-    return jnp.maximum(index, 0), (index >= 0) & (ts <= part.end[None])
-
-
 def per_body(run: Run, function: Callable[..., Any]) -> Callable[..., Any]:
     """A function of one body's arrays as one of arrays with a last axis of bodies, if there is."""
     return jax.vmap(function, in_axes=-1, out_axes=-1) if run.t0.ndim else function
 
 
-def _cut(number: Array, width: int, many: int, a: Array) -> Array:
-    """Some rows of `a` (K, …, *bodies), in lanes (…, lanes)."""
-    if many:
-        return lax.dynamic_index_in_dim(a, number, 0, False)
-    return jnp.moveaxis(lax.dynamic_slice_in_dim(a, number, width, 0), 0, -1)
-
-
-def _picked(many: int, rows: Array, index: Array) -> Array:
-    """Those of the rows (R, c, *bodies), in lanes: (c, lanes)."""
-    return jnp.take_along_axis(rows, index[None, None], 0)[0] if many else rows[index].T
-
-
-def states_in_step(
-    method: Method, project: Any, ts: Array, t: Array, h: Array, y: Array, slopes: Array
-) -> Array:
-    """The states (n, lanes) at times `ts` (lanes), each in a step of its own."""
-    theta = ((ts - t) / jnp.where(h == 0, 1, h)).astype(slopes.dtype)
+def state_in_step(method: Method, t: Array, step: Step, slopes: Array) -> Array:
+    """The state at a time `t` (*bodies) in a step."""
+    theta = ((t - step.t) / jnp.where(step.h == 0, 1, step.h)).astype(slopes.dtype)
     # Weights of the slopes are one number a stage; the rows F_r would be n.
     rows = weights(method.tableau, slopes.dtype, slopes.shape[1]).dense
     shares = nested(theta[None], rows.reshape(*rows.shape, *[1] * theta.ndim))
     rise = jnp.sum(shares[None] * slopes, 1)
-    return project(y + lift(h.astype(y.dtype), rise) * rise)
+    return method.project(step.y + lift(step.h.astype(rise.dtype), rise) * rise)

@@ -26,7 +26,7 @@ from rigidjax.solve.adaptive_loop import (
     per_body,
     recorded,
     segment,
-    states_in_step,
+    state_in_step,
     times_of,
     unpacked,
 )  # fmt: skip
@@ -45,13 +45,13 @@ def passed(run: Run, part: Segment) -> Array:
 def of_saved(
     method: Method, run: Run, step: Step, slopes: Array, first: Array, last: Array, bars: Array,
     between: Array | None,
-) -> tuple[Array | None, Array, Array, Array, Array]:  # fmt: skip
+) -> tuple[Array | None, Step, Array]:  # fmt: skip
     """The transpose of the states at the times in a step, from number `first` to before `last`.
 
     **Returns** `between`, if it is not `None`, with the cotangents of the times added, and those of
-    the step: its time, length, state and slopes. `bars` (K, n, *bodies) of all states.
+    the step and its slopes. `bars` (K, n, *bodies) of all states.
     """
-    states, most = partial(states_in_step, method, method.project), run.between.shape[0] - 1
+    state_at, most = partial(state_in_step, method), run.between.shape[0] - 1
     pick = per_body(run, lambda a, index: a[index])
 
     # One at a time: of many bodies few have as many in a step as one of them has.
@@ -60,13 +60,12 @@ def of_saved(
         inside, there = number < last, jnp.minimum(number, most)
         t = jnp.where(inside, pick(run.between, there), step.t)
         bar = jnp.where(inside[None], pick(bars, there), 0)
-        by_t, *more = jax.vjp(states, t, step.t, step.h, step.y, slopes)[1](bar)
+        by_t, *more = jax.vjp(state_at, t, step, slopes)[1](bar)
         if total is not None:
             total = per_body(run, lambda a, i, b: a.at[i].add(b))(total, there, by_t)
-        return number + 1, total, [a + b for a, b in zip(by, more, strict=True)]
+        return number + 1, total, jax.tree.map(jnp.add, by, more)
 
-    none = [jnp.zeros_like(a) for a in (step.t, step.h, step.y, slopes)]
-    start = (first, between, none)
+    start = (first, between, jax.tree.map(jnp.zeros_like, [step, slopes]))
     _, total, by = lax.while_loop(lambda state: jnp.any(state[0] < last), one, start)
     return total, *by
 
@@ -92,21 +91,21 @@ def cotangents(
             by = lambda t0, stops: times_of(run._replace(t0=t0, stops=stops), row)  # noqa: E731
             (t, h, end), of_times = jax.vjp(by, run.t0, run.stops)
             here = Step(t, h, end, row[HEAD:])
-            dense, seeds, of_slopes, between = False, [], None, of_run.between
+            dense, seeds, of_slopes, between = False, None, None, of_run.between
             if known is not None:
                 dense = jnp.any(known[k] < known[k + 1])
             there = stages(method.tableau, method.field, constants, here, dense)
             bar = jax.vjp(method.project, there.end)[1](of_run.y0)[0]
             if known is not None:
-                between, *seeds, of_slopes = of_saved(
+                between, seeds, of_slopes = of_saved(
                     method, run, here, there.slopes, known[k], known[k + 1], bars[0],
                     between if timed else None,
                 )  # fmt: skip
             by_constants, *rest = runge_kutta.pulled(
                 method.tableau, method.field, constants, here, there, bar, of_slopes
             )
-            if seeds:
-                rest = [a + b for a, b in zip(rest, seeds, strict=True)]
+            if seeds is not None:
+                rest = [a + b for a, b in zip(rest, (seeds.t, seeds.h, seeds.y), strict=True)]
             # A body that has no step here may be NaN.
             on = row[2] >= STEP
             by_t, by_h, by_y = (_where(on, a) for a in rest)
