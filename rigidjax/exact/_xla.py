@@ -15,22 +15,8 @@ from typing import Any, TypeVar
 import jax
 import jax.numpy as jnp
 
-from rigidjax._types import Scalar
-
 Tree = TypeVar("Tree")
 Function = TypeVar("Function", bound=Callable[..., Any])
-
-
-def opaque_one(t: Scalar) -> Scalar:
-    """1, unless t is NaN; XLA does not know."""
-    return jax.lax.stop_gradient(jnp.where(t == t, jnp.ones_like(t), t))
-
-
-def fence(tree: Tree, one: Scalar) -> Tree:
-    """The same numbers, computed once."""
-    return jax.tree.map(
-        lambda x: x / (one if x.ndim == 0 else jnp.broadcast_to(one, x.shape)), tree
-    )
 
 
 def one_kernel(function: Function) -> Function:

@@ -227,14 +227,13 @@ def _again(
 def _pushed(
     moving: Moving, method: Method, layout: Layout, constants: Arrays, each: Arrays
 ) -> Arrays:
-    method, chosen, run, _, along = _again(moving, method, layout, constants, each)
+    method, chosen, run, record, along = _again(moving, method, layout, constants, each)
     rest = iter(along[len(chosen) :])
     still = zip(run, moving[1], strict=True)
     of_run = Run(*(next(rest) if moves else jnp.zeros_like(a) for a, moves in still))
 
-    again = lambda *both: adaptive_loop.recording(method, *both)  # noqa: E731
-    between, end, record = jax.jvp(again, (chosen, run), (along[: len(chosen)], of_run))[1]
-    return [between, end.y, record.starts, record.rows]
+    again = lambda chosen, run: adjoint.replayed(method, chosen, run, record)  # noqa: E731
+    return list(jax.jvp(again, (chosen, run), (along[: len(chosen)], of_run))[1])
 
 
 def _pulled(

@@ -259,7 +259,7 @@ def recording(method: Method, constants: Arrays, run: Run) -> tuple[Array, LoopS
         after, rows, count = recorded(method, constants, run, loop, record.rows, None)
         if run.between.shape[0]:
             part = segment(rows, after.t, count)
-            ys = _saved(method, constants, run, part, ys)
+            ys = saved(method, constants, run, part, ys)
         number = record.number + 1
         starts = lax.dynamic_update_index_in_dim(record.starts, packed(after), number, 0)
         return after, ys, Record(starts, number, rows, count)
@@ -361,7 +361,7 @@ def segment(rows: Rows, end: Array, count: Array) -> Segment:
     return Segment(rows, times, lax.stop_gradient(end), count)
 
 
-def _saved(method: Method, constants: Arrays, run: Run, part: Segment, ys: Array) -> Array:
+def saved(method: Method, constants: Arrays, run: Run, part: Segment, ys: Array) -> Array:
     """`ys` (K, n, *bodies) with the states in a part of a run."""
     size, many = run.between.shape[0], run.t0.ndim > 0
     width = 1 if many else min(size, _TOGETHER)

@@ -1,4 +1,4 @@
-"""The transpose of a recorded run: a second pass over its steps, from the last to the first.
+"""A second pass over a recorded run: for tangents and cotangents.
 
 The derivative is that of the steps taken, with fixed lengths, except that steps cut short at a stop
 follow it, as in `diffrax.RecursiveCheckpointAdjoint`. All segments but the last are run once more;
@@ -25,6 +25,7 @@ from rigidjax.solve.adaptive_loop import (
     going,
     per_body,
     recorded,
+    saved,
     segment,
     state_in_step,
     times_of,
@@ -70,10 +71,45 @@ def of_saved(
     return total, *by
 
 
+def replayed(
+    method: Method, constants: Arrays, run: Run, record: Record
+) -> tuple[Array, Array, Array, Array]:
+    """States between and at the end, starts and rows by the steps of the record, which are held.
+
+    A loop that takes its own steps again could take others, and its rows would not be these.
+    """
+    head = record.starts.shape[1] - run.y0.shape[0]
+
+    def one(i: Array, state: tuple[Array, Array, Array, Array]) -> Any:
+        y, ys, starts, _ = state
+        part = _again(method, *still, held, i)
+        starts = lax.dynamic_update_index_in_dim(starts, starts[i].at[head:].set(y), i, 0)
+
+        def step(k: Array, both: tuple[Array, Array]) -> tuple[Array, Array]:
+            y, rows = both
+            row = part.rows[k]
+            there = stages(method.tableau, method.field, constants, Step(*times_of(run, row), y))
+            rows = lax.dynamic_update_index_in_dim(rows, row.at[HEAD:].set(y), k, 0)
+            return jnp.where(lift(row[2] >= STEP, y), method.project(there.end), y), rows
+
+        y, rows = lax.fori_loop(0, part.number, step, (y, part.rows))
+        if run.between.shape[0]:
+            ys = saved(method, constants, run, part._replace(rows=rows), ys)
+        return y, ys, starts, rows
+
+    still, held = lax.stop_gradient(((constants, run), record))
+    number = jnp.max(held.number)
+    ys = jnp.zeros((run.between.shape[0], *run.y0.shape), run.y0.dtype)
+    state = (run.y0, ys, held.starts, held.rows)
+    y, ys, starts, rows = lax.fori_loop(0, number, one, state)
+    starts = lax.dynamic_update_index_in_dim(starts, starts[number].at[head:].set(y), number, 0)
+    return ys, y, starts, rows
+
+
 def cotangents(
     method: Method, constants: Arrays, run: Run, record: Record, bars: Arrays, timed: bool
 ) -> tuple[Arrays, Run]:
-    """The transpose of a recorded run: cotangents of the constants and of the run.
+    """The transpose of the tangents of `replayed`: cotangents of the constants and of the run.
 
     `bars` are the cotangents of the states at the saved times and at the end. Times have some only
     where `timed`.
