@@ -1,11 +1,7 @@
-"""Hints to XLA on CPU, so that scalar formulas compile and run fast.
-
-XLA copies cheap arithmetic into each kernel that needs it: a chain of stages that all feed one
-another grows exponentially. It does not copy divisions: a division by a 1 that is unknown to XLA
-keeps a stage whole, and changes no bit (`fence`).
+"""A hint to XLA on CPU, so that scalar formulas compile and run fast.
 
 A kernel of one body takes long to compile, whatever its size. A loop with a small state becomes one
-kernel; single computations are therefore put into a loop (`one_kernel`).
+kernel; single computations are therefore put into a loop.
 """
 
 import functools
@@ -15,7 +11,6 @@ from typing import Any, TypeVar
 import jax
 import jax.numpy as jnp
 
-Tree = TypeVar("Tree")
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
