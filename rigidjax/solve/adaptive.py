@@ -171,14 +171,9 @@ def _solved(
 
 def _over_bodies(method: Method, layout: Layout, constants: Arrays) -> Method:
     """The method on (n, *bodies); that of one body has `halt(constants, t, y)`."""
-    halt = method.halt
-    if layout.bodies:
-        over = partial(jax.vmap, in_axes=([None if s else -1 for s in layout.shared], -1, -1))
-        halt = None if halt is None else over(halt, out_axes=-1)
-        method = method._replace(
-            field=over(method.field, out_axes=-1), project=jax.vmap(method.project, -1, -1)
-        )
-    return method._replace(halt=None if halt is None else partial(halt, constants))
+    halt = None if method.halt is None else partial(layout.over(method.halt), constants)
+    project = jax.vmap(method.project, -1, -1) if layout.bodies else method.project
+    return method._replace(field=layout.over(method.field), project=project, halt=halt)
 
 
 def _value(method: Method, layout: Layout, constants: Arrays, each: Arrays) -> Arrays:
