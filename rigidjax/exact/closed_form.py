@@ -10,7 +10,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rigidjax._types import Scalar
-from rigidjax.exact._xla import one_kernel
 from rigidjax.exact.components3 import Four, Triple
 from rigidjax.exact.jacobi_duplication import (
     Elliptic,
@@ -21,7 +20,7 @@ from rigidjax.exact.jacobi_duplication import (
     half_period,
     until_rest,
 )
-from rigidjax.rotation.barrier import barrier
+from rigidjax.rotation.barrier import barrier, one_kernel
 
 
 class Orbit(NamedTuple):

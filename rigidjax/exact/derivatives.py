@@ -22,7 +22,6 @@ from jaxtyping import Array, Float
 
 from rigidjax._types import Mat3, Quat, Scalar, Vec3
 from rigidjax.exact import sigma_form
-from rigidjax.exact._xla import one_kernel
 from rigidjax.exact.closed_form import Orbit, from_functions, momentum_and_turn, orbit, reduced
 from rigidjax.exact.components3 import (
     HALF,
@@ -40,6 +39,7 @@ from rigidjax.exact.components3 import (
 from rigidjax.exact.jacobian import integrals, jacobian_and_integral
 from rigidjax.exact.principal_axes import in_axes, into, out_of, principal_frame
 from rigidjax.exact.sigma_form import Differences
+from rigidjax.rotation.barrier import one_kernel
 from rigidjax.rotation.linalg3 import components
 
 # A series of second order in time is accurate to round-off below this turn (rad).
