@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from typing import Any, TypeVar, overload
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
@@ -162,30 +161,13 @@ def rollout(
     start = jax.tree.map(jnp.asarray, initial)
     begin = _checks.time(t0, "t0").astype(batch.dtype)
     numbers = (batch.shared, (batch.each, driven), start, h, begin)
-    plan = _Plan(
-        solver,
-        count,
-        every,
-        save_every is not None and reduce is None,
-        chunk_of(chunk, batch.dtype, batch.many),
-        mesh_of(devices),
-    )
-    return _compiled(plan, reduce, batch.rest, numbers)
+    steps = solver, count, every, save_every is not None and reduce is None
+    among = chunk_of(chunk, batch.dtype, batch.many), mesh_of(devices)
+    return _compiled(steps, among, reduce, batch.rest, numbers)
 
 
-class _Plan(eqx.Module):
-    """The compiled program."""
-
-    solver: Any
-    count: int = eqx.field(static=True)
-    every: int = eqx.field(static=True)
-    keep: bool = eqx.field(static=True)
-    chunk: int = eqx.field(static=True)
-    mesh: Any = eqx.field(static=True)
-
-
-def _run(plan: _Plan, reduce: Reduce | None, rest: Any, numbers: Any) -> Any:
-    shared, each, initial, h, t0 = numbers
+def _run(steps: Any, among: Any, reduce: Reduce | None, rest: Any, numbers: Any) -> Any:
+    (solver, count, every, keep), (shared, each, initial, h, t0) = steps, numbers
 
     def one(given: Any, each: Any) -> Any:
         shared, initial, h, t0 = given
@@ -193,32 +175,32 @@ def _run(plan: _Plan, reduce: Reduce | None, rest: Any, numbers: Any) -> Any:
         body, state0, torque = one_of(shared, own, rest)
         state0 = started(body, state0, bind(torque, first_row(torque, h, inputs)), t0)
         field = equations_of_motion(body, state0, torque)
-        stepper = stepper_of(plan.solver, field, state0, plan.count)
+        stepper = stepper_of(solver, field, state0, count)
 
         def piece(carry: Any, first: Array) -> Any:
             y, carried = carry
-            y = march(stepper, h, t0, first, plan.every, y, inputs)
+            y = march(stepper, h, t0, first, every, y, inputs)
             if reduce is not None:
-                t = t0 + (first + plan.every).astype(h.dtype) * h
+                t = t0 + (first + every).astype(h.dtype) * h
                 carried = reduce(carried, t, stepper.state(y))
-            return (y, carried), stepper.state(y) if plan.keep else None
+            return (y, carried), stepper.state(y) if keep else None
 
         begin = (stepper.start, initial)
-        if plan.every == plan.count:
+        if every == count:
             (y, carried), kept = piece(begin, jnp.zeros((), jnp.int32))
             kept = jax.tree.map(lambda leaf: leaf[None], kept)
         else:
-            firsts = jnp.arange(0, plan.count, plan.every, dtype=jnp.int32)
+            firsts = jnp.arange(0, count, every, dtype=jnp.int32)
             (y, carried), kept = lax.scan(piece, begin, firsts)
         if reduce is not None:
             return stepper.state(y), carried
-        return kept if plan.keep else stepper.state(y)
+        return kept if keep else stepper.state(y)
 
     size = sum(leaf.size for leaf in jax.tree.leaves(each[0])) * h.dtype.itemsize
-    if size * (plan.count // plan.every) * (plan.every // piece_length(plan.every) + 1) > _KEPT:
+    if size * (count // every) * (every // piece_length(every) + 1) > _KEPT:
         # A reverse pass computes a chunk again: else every chunk's pieces would be kept.
         one = jax.checkpoint(one)
-    return over_bodies(one, (shared, initial, h, t0), each, plan.chunk, plan.mesh)
+    return over_bodies(one, (shared, initial, h, t0), each, *among)
 
 
 _compiled = Compiled(_run)

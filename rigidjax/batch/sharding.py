@@ -144,15 +144,12 @@ def over_bodies(
     chunk = min(chunk, -(-count // parts))
     room = -(-count // (chunk * parts)) * chunk * parts
 
-    def side_by_side(shared: Any, row: Any) -> Any:
-        # Fences, so that each chunk gets the same program, to the last bit.
-        shared, row = lax.optimization_barrier((shared, row))
-        return lax.optimization_barrier(jax.vmap(one, (None, 0))(shared, row))
-
     def some(shared: Any, each: Any) -> Any:
-        rows = jax.tree.map(lambda a: a.reshape(-1, chunk, *a.shape[1:]), each)
-        out = lax.map(lambda row: side_by_side(shared, row), rows)
-        return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), out)
+        def alone(row: Any) -> Any:
+            # Fences, so that each chunk gets the same program, to the last bit.
+            return lax.optimization_barrier(one(*lax.optimization_barrier((shared, row))))
+
+        return lax.map(alone, each, batch_size=chunk)
 
     def padded(a: Any) -> Any:
         # The last body again in the empty places.

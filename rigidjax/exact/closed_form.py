@@ -10,7 +10,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rigidjax._types import Scalar
-from rigidjax.exact._xla import fence, one_kernel, opaque_one, sincos
 from rigidjax.exact.components3 import Four, Triple
 from rigidjax.exact.jacobi_duplication import (
     Elliptic,
@@ -21,6 +20,7 @@ from rigidjax.exact.jacobi_duplication import (
     half_period,
     until_rest,
 )
+from rigidjax.rotation.barrier import barrier, one_kernel
 
 
 class Orbit(NamedTuple):
@@ -60,7 +60,7 @@ def orbit(moments: Triple, momentum: Triple) -> Orbit:
     h = jnp.sqrt(p1 * p1 + p2 * p2 + p3 * p3)
     turn = d13 * h * mu
     m = Modulus(p, q, gap)
-    m, mu, turn, half = fence((m, mu, turn, half_period(m, mu, turn)), opaque_one(h))
+    m, mu, turn, half = barrier((m, mu, turn, half_period(m, mu, turn)))
     return Orbit(a, d12, d13, d23, (p1, p2, p3), h, m, mu, turn, half, swap)
 
 
@@ -135,21 +135,21 @@ def momentum_and_turn(o: Orbit, t: Scalar) -> tuple[Triple, Four]:
 
 def from_functions(o: Orbit, f: Elliptic, u: Reduced, t: Scalar) -> tuple[Triple, Four]:
     """Momentum and turn from the elliptic functions at `u.near`."""
-    one = opaque_one(t)
-    f, phase = fence(restored(o, f, u), one)
-    full = fence(duplicate(f, o.modulus, o.mu, o.turn), one)
-    _, k2, k3 = fence(momentum_at(o, f), one)
-    m1, m2, m3 = fence(momentum_at(o, full), one)
+    f, phase = barrier(restored(o, f, u))
+    full = barrier(duplicate(f, o.modulus, o.mu, o.turn))
+    _, k2, k3 = barrier(momentum_at(o, f))
+    m1, m2, m3 = barrier(momentum_at(o, full))
 
     # b turns about (half way) momentum's partner axes, the rest is a turn about the momentum.
     b0, b2, b3 = f.C, -o.d12 * f.S * k2 * f.C, -o.d13 * f.S * k3
     size = jnp.maximum(jnp.maximum(jnp.abs(b0), jnp.abs(b2)), jnp.abs(b3))
-    b0, b2, b3 = fence((b0 / size, b2 / size, b3 / size), one)
+    b0, b2, b3 = barrier((b0 / size, b2 / size, b3 / size))
     r = 1.0 / jnp.sqrt((b0 * b0 + b2 * b2 + b3 * b3) * (f.x * f.x + f.y * f.y))
-    sine, cosine = sincos(0.5 * o.a * o.h * t - phase)
+    angle = 0.5 * o.a * o.h * t - phase
+    sine, cosine = jnp.sin(angle), jnp.cos(angle)
     c, s = r * (cosine * f.x + sine * f.y), r * (sine * f.x - cosine * f.y)
     still = o.h <= 0
-    c, s = fence((c, jnp.where(still, 0.0, s / jnp.where(still, 1.0, o.h))), one)
+    c, s = barrier((c, jnp.where(still, 0.0, s / jnp.where(still, 1.0, o.h))))
     p1, p2, p3 = o.P
     w = c * b0 - s * (p2 * b2 + p3 * b3)
     x = s * (p1 * b0 + p2 * b3 - p3 * b2)

@@ -22,7 +22,6 @@ from jaxtyping import Array, Float
 
 from rigidjax._types import Mat3, Quat, Scalar, Vec3
 from rigidjax.exact import sigma_form
-from rigidjax.exact._xla import fence, one_kernel, opaque_one
 from rigidjax.exact.closed_form import Orbit, from_functions, momentum_and_turn, orbit, reduced
 from rigidjax.exact.components3 import (
     HALF,
@@ -40,6 +39,7 @@ from rigidjax.exact.components3 import (
 from rigidjax.exact.jacobian import integrals, jacobian_and_integral
 from rigidjax.exact.principal_axes import in_axes, into, out_of, principal_frame
 from rigidjax.exact.sigma_form import Differences
+from rigidjax.rotation.barrier import one_kernel
 from rigidjax.rotation.linalg3 import components
 
 # A series of second order in time is accurate to round-off below this turn (rad).
@@ -81,9 +81,8 @@ class Setting(NamedTuple):
 @one_kernel
 def set_up(tensor: Mat3, omega: Vec3) -> Setting:
     """Principal axes, and the orbit of the momentum in them."""
-    one = opaque_one(tensor[0, 0])
-    moments, axes = fence(principal_frame(tensor), one)
-    momentum = fence(times(moments, into(axes, omega)), one)
+    moments, axes = principal_frame(tensor)
+    momentum = times(moments, into(axes, omega))
     return Setting(axes, moments[:3], momentum, orbit(moments[:3], momentum))
 
 
@@ -128,11 +127,8 @@ def _each(function, t):
 @one_kernel
 def _values(s: Setting, t: Scalar) -> tuple[Vec3, Quat]:
     momentum, (w, *axis) = momentum_and_turn(s.orbit, t)
-    one = opaque_one(t)
-    momentum, w, axis = fence((momentum, w, axis), one)
-    rate = fence(tuple(p / i for p, i in zip(momentum, s.moments, strict=True)), one)
-    turn = jnp.stack([w, *fence(out_of(s.axes, tuple(axis)), one)])
-    return jnp.stack(out_of(s.axes, rate)), turn
+    rate = tuple(p / i for p, i in zip(momentum, s.moments, strict=True))
+    return jnp.stack(out_of(s.axes, rate)), jnp.stack([w, *out_of(s.axes, tuple(axis))])
 
 
 def _in_axes(tensor: Mat3, omega: Vec3, s: Setting) -> tuple[Six, Triple]:
@@ -151,10 +147,9 @@ def _by_body(body: Float[Array, "12"], s: Setting) -> Float[Array, "9 12"]:
 
 @one_kernel
 def _body_slopes(tensor: Mat3, omega: Vec3, s: Setting, t: Scalar):
-    one = opaque_one(t)
-    moments, momentum = fence(_in_axes(tensor, omega, s), one)
-    ((out, (w, *axis)), rows) = fence(slopes(moments, momentum, t), one)
-    rate = out_of(s.axes, fence(times(reciprocal(moments, momentum)[1], out), one))
+    moments, momentum = _in_axes(tensor, omega, s)
+    (out, (w, *axis)), rows = slopes(moments, momentum, t)
+    rate = out_of(s.axes, times(reciprocal(moments, momentum)[1], out))
     turn = jnp.stack([w, *out_of(s.axes, tuple(axis))])
     # Rows, not matrices: to stack them costs a batch five times what they are.
     in_body = jax.vmap(lambda *v: out_of(s.axes, v))
@@ -172,17 +167,15 @@ class Slopes(NamedTuple):
 @one_kernel
 def slopes(moments: Six, momentum: Triple, t: Scalar) -> tuple[tuple[Triple, Four], Slopes]:
     """The result of `flow`, and its derivatives."""
-    one = opaque_one(t)
-    (out, turn), rows, g = fence(first_order(moments, momentum, t), one)
+    (out, turn), rows, g = first_order(moments, momentum, t)
     _, k, energy2 = reciprocal(moments, momentum)
-    k, energy2 = fence((k, energy2), one)
     p1, p2, p3 = momentum
     h2 = p1 * p1 + p2 * p2 + p3 * p3
     still = jax.lax.stop_gradient(h2 * (k[0] * k[0]) * (t * t)) <= _STILL[t.dtype] ** 2
     r = 1.0 / jnp.where(still, 1.0, h2)
-    rate, r = fence((times(k, momentum), r), one)
+    rate = times(k, momentum)
     squares = (p1 * p1, p2 * p2, p3 * p3, p1 * p2, p1 * p3, p2 * p3)
-    weights = fence(tuple(c * (t * a + b) for c, a, b in zip(HALF, squares, g, strict=True)), one)
+    weights = [c * (t * a + b) for c, a, b in zip(HALF, squares, g, strict=True)]
 
     def column(e, change):
         e12, e23, o12, o13, o23, e1, e2, e3, e11, et = e
@@ -192,7 +185,6 @@ def slopes(moments: Six, momentum: Triple, t: Scalar) -> tuple[tuple[Triple, Fou
         across = cross(out, tuple(a - b for a, b in zip(back, change, strict=True)))
         along = sum(a * b for a, b in zip(weights, d_k, strict=True))
         along = along + t * sum(a * b for a, b in zip(rate, start, strict=True)) + energy2 * et
-        d_out, across, along = fence((d_out, across, along), one)
         theta = tuple(r * (a + b * along) for a, b in zip(across, out, strict=True))
         # At rest, to second order in time.
         faster = plus(times(d_k, momentum), times(k, start))
@@ -201,7 +193,7 @@ def slopes(moments: Six, momentum: Triple, t: Scalar) -> tuple[tuple[Triple, Fou
         near = zip(faster, bent, times(k, out), strict=True)
         near = tuple(t * (a + 0.5 * t * b) + et * c for a, b, c in near)
         theta = tuple(jnp.where(still, a, b) for a, b in zip(near, theta, strict=True))
-        return fence((d_out, theta, plus(times(k, d_out), times(d_k, out))), one)
+        return d_out, theta, plus(times(k, d_out), times(d_k, out))
 
     return (out, turn), Slopes(*jax.vmap(column)(jnp.eye(10, dtype=t.dtype), rows))
 

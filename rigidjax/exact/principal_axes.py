@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 
 from rigidjax._types import Mat3, Scalar, Vec3
-from rigidjax.exact._xla import one_kernel
 from rigidjax.exact.components3 import Six, Triple
+from rigidjax.rotation.barrier import one_kernel
 
 # Cyclic Jacobi converges quadratically; 3×3 needs four or five sweeps from anywhere.
 _SWEEPS = 6

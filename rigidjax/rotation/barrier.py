@@ -1,6 +1,8 @@
-"""A barrier that keeps XLA from computing numbers again for each use."""
+"""Hints to XLA: numbers that are computed once for all their uses, and single kernels."""
 
-from typing import TypeVar
+import functools
+from collections.abc import Callable
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -8,6 +10,7 @@ from jax import lax
 from jaxtyping import Array
 
 Tree = TypeVar("Tree")
+Function = TypeVar("Function", bound=Callable[..., Any])
 
 # XLA on CPU drops barriers before fusion, which repeats shared values: a solve of order 8 at 900
 # times took minutes, not milliseconds.
@@ -29,3 +32,45 @@ def once(x: Array) -> Array:
     cheaper, with all its inputs, for every component.
     """
     return x / jnp.where(x == x, 1, 2)
+
+
+def one_kernel(function: Function) -> Function:
+    """The same function of trees of arrays, compiled as one kernel if it is not batched.
+
+    A kernel of one body takes long to compile, whatever its size; XLA on CPU makes one of a loop
+    with a small state. This is a loop of one turn: XLA knows neither the number of turns nor that
+    the arguments stay, so it moves nothing out of the loop. Batches and derivatives use `function`
+    itself.
+    """
+    # Traced once for all the uses below.
+    plain = jax.jit(function, inline=True)
+
+    @jax.custom_jvp
+    @functools.wraps(function)
+    def call(*args: Any) -> Any:
+        return alone(*args)
+
+    @jax.custom_batching.custom_vmap
+    def alone(*args: Any) -> Any:
+        first = jax.tree.leaves(args)[0].ravel()[0]
+        step = jnp.where(first == first, 1, 2)
+        blank = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(plain, *args))
+
+        def turn(carry: Any) -> Any:
+            i, args, _ = carry
+            return i + step, jax.tree.map(jnp.zeros_like, args), plain(*args)
+
+        return lax.while_loop(lambda c: c[0] < 1, turn, (jnp.zeros_like(step), args, blank))[2]
+
+    @alone.def_vmap
+    def _batched(size: int, batched: Any, *args: Any) -> Any:
+        del size
+        axes = jax.tree.map(lambda b: 0 if b else None, tuple(batched))
+        out = jax.vmap(plain, axes)(*args)
+        return out, jax.tree.map(lambda _: True, out)
+
+    @call.defjvp
+    def _jvp(primals: Any, tangents: Any) -> Any:
+        return jax.jvp(plain, primals, tangents)
+
+    return call  # pyright: ignore[reportReturnType]

@@ -14,7 +14,7 @@ from jaxtyping import Array
 
 from rigidjax.motion.equations import on_the_group
 from rigidjax.solve import adaptive_loop, adjoint
-from rigidjax.solve.adaptive_loop import HALTED, Answer, Method, Record, Run, outcome
+from rigidjax.solve.adaptive_loop import HALTED, LoopState, Method, Record, Run, outcome
 from rigidjax.solve.batching import Arrays, Layout, in_lanes
 from rigidjax.solve.components import flat, leaf_sizes, unflat
 from rigidjax.solve.explicit import AbstractExplicit
@@ -97,14 +97,13 @@ def adaptive(
     rtol, atol = (jnp.asarray(a, numbers.dtype) for a in (rtol, atol))
     h0 = jnp.asarray(jnp.nan if dt0 is None else dt0, ts.dtype)
     run = Run(ts[0], stops, ts[1:-1], numbers, rtol, atol, h0)
-    out = _solved(method, smooth, constants, run)
-    result = outcome(out.h, out.t, ts[-1], out.h == HALTED)
-    end = jnp.where(out.t >= ts[-1], out.last, jnp.nan)
-    ys = jax.vmap(partial(unflat, like=y0))(
-        jnp.concatenate([numbers[None], out.between, end[None]])
-    )
-    last = unflat(lax.stop_gradient(out.last), y0)
-    return Found(ys, out.steps, out.rejected, result, out.t, last)
+    between, end = _solved(method, smooth, constants, run)
+    result = outcome(end.h, end.t, ts[-1], end.h == HALTED)
+    last = jnp.where(end.t >= ts[-1], end.y, jnp.nan)
+    ys = jnp.concatenate([numbers[None], between, last[None]])
+    ys = jax.vmap(partial(unflat, like=y0))(ys)
+    last = unflat(lax.stop_gradient(end.y), y0)
+    return Found(ys, end.steps, end.rejected, result, end.t, last)
 
 
 def taken_out(
@@ -127,10 +126,12 @@ def _of_constants(part: slice, tree: Any, rest: Any, constants: Arrays, *args: A
     return eqx.combine(jax.tree.unflatten(tree, constants[part]), rest)(*args)
 
 
-def _solved(method: Method, smooth: list[bool], constants: Arrays, run: Run) -> Answer:
-    """The run; `smooth` says which of the constants have derivatives."""
+def _solved(
+    method: Method, smooth: list[bool], constants: Arrays, run: Run
+) -> tuple[Array, LoopState]:
+    """The states between, and the end; `smooth` says which of the constants have derivatives."""
     # The states between and at the end are what has derivatives.
-    number, ends, head = len(constants), 2, len(Answer._fields)
+    number, ends, head = len(constants), 2, 1 + len(LoopState._fields)
 
     def mapped(program: Any, linear: int, *args: Any) -> Arrays:
         return in_lanes(partial(program, method), list(args[:number]), list(args[number:]), linear)
@@ -164,32 +165,29 @@ def _solved(method: Method, smooth: list[bool], constants: Arrays, run: Run) -> 
 
     answer.defjvp(of_answer, symbolic_zeros=True)
     recorded.defjvp(of_record, symbolic_zeros=True)
-    return Answer(*answer(*constants, *run))
+    between, *end = answer(*constants, *run)
+    return between, LoopState(*end)
 
 
 def _over_bodies(method: Method, layout: Layout, constants: Arrays) -> Method:
     """The method on (n, *bodies); that of one body has `halt(constants, t, y)`."""
-    halt = method.halt
-    if layout.bodies:
-        over = partial(jax.vmap, in_axes=([None if s else -1 for s in layout.shared], -1, -1))
-        halt = None if halt is None else over(halt, out_axes=-1)
-        method = method._replace(
-            field=over(method.field, out_axes=-1), project=jax.vmap(method.project, -1, -1)
-        )
-    return method._replace(halt=None if halt is None else partial(halt, constants))
+    halt = None if method.halt is None else partial(layout.over(method.halt), constants)
+    project = jax.vmap(method.project, -1, -1) if layout.bodies else method.project
+    return method._replace(field=layout.over(method.field), project=project, halt=halt)
 
 
 def _value(method: Method, layout: Layout, constants: Arrays, each: Arrays) -> Arrays:
     method, run = _over_bodies(method, layout, constants), Run(*each)
     if run.between.shape[0]:
-        return list(adaptive_loop.recording(method, constants, run, adjoint.saved)[0])
-    return list(adaptive_loop.value(method, constants, run))
+        between, end, _ = adaptive_loop.recording(method, constants, run)
+        return [between, *end]
+    return [run.y0[None][:0], *adaptive_loop.value(method, constants, run)]
 
 
 def _recorded(method: Method, layout: Layout, constants: Arrays, each: Arrays) -> Arrays:
     method = _over_bodies(method, layout, constants)
-    answer, record = adaptive_loop.recording(method, constants, Run(*each), adjoint.saved)
-    return [*answer, *record]
+    between, end, record = adaptive_loop.recording(method, constants, Run(*each))
+    return [between, *end, *record]
 
 
 # Which of the constants and which numbers of a run have tangents.

@@ -1,7 +1,9 @@
 """Adaptive steps, for one body or many, with the states at any times. Bodies are in the last axis.
 
 For saved states and derivatives the steps are recorded in segments: the start of each is kept, and
-the steps of the last one; derivatives run the others once more.
+the steps of the last one; derivatives run the others once more. The loop does not look at the times
+that are asked for. Its steps with such times in them are taken once more: many of one body side by
+side, or one of each of many bodies.
 """
 
 from collections.abc import Callable
@@ -17,7 +19,7 @@ from jaxtyping import Array, Bool
 
 from rigidjax.solve.batching import Arrays
 from rigidjax.solve.components import lift
-from rigidjax.solve.runge_kutta import Field, Step, error_estimate, stages
+from rigidjax.solve.runge_kutta import Field, Step, error_estimate, nested, stages, weights
 from rigidjax.solve.tableaus import Tableau
 
 # diffrax inherits it from optimistix, where type checkers do not follow.
@@ -31,8 +33,11 @@ SEGMENT = 512
 # More rows for one that is run again: it may take a few steps more.
 _MORE = 64
 # XLA on CPU makes one kernel of a loop whose state is smaller than a kilobyte: steps are written
-# into a block that small, and blocks into the record.
+# into a block that small, and blocks into the record. (Written row by row, second derivatives of
+# several blocks of bodies with segments run again were wrong, on jaxlib 0.12.0.1.)
 _BLOCK, _MOST = 560, 8
+# Times of one body that are taken together.
+_TOGETHER = 16
 
 
 class Method(NamedTuple):
@@ -66,14 +71,14 @@ class Run(NamedTuple):
 
 
 class LoopState(NamedTuple):
-    """The state of the loop: time, next step, index of the next stop, counters, state."""
+    """The state of the loop, and the end of a run."""
 
+    y: Array  # (n, *bodies)
     t: Array
-    h: Array
-    stop: Array
+    h: Array  # the next step: 0 or NaN if none is left to try, `HALTED`
+    stop: Array  # index of the next one
     steps: Array
     rejected: Array
-    y: Array
 
 
 # A recorded attempt is one row (4 + n, *bodies): start, length, kind, index of the stop ahead, and
@@ -87,14 +92,14 @@ HALTED = -1.0
 
 def packed(loop: LoopState) -> Array:
     """A `LoopState` as one row. Whole numbers are exact in it up to 2²⁴ in float32."""
-    return jnp.concatenate([jnp.stack([a.astype(loop.y.dtype) for a in loop[:-1]]), loop.y])
+    return jnp.concatenate([jnp.stack([a.astype(loop.y.dtype) for a in loop[1:]]), loop.y])
 
 
 def unpacked(row: Array) -> LoopState:
     """The inverse of `packed`."""
     head = len(LoopState._fields) - 1
     stop, steps, rejected = row[2:head].astype(jnp.int32)
-    return LoopState(row[0], row[1], stop, steps, rejected, row[head:])
+    return LoopState(row[head:], row[0], row[1], stop, steps, rejected)
 
 
 class Record(NamedTuple):
@@ -106,23 +111,11 @@ class Record(NamedTuple):
     filled: Array  # their number
 
 
-class Answer(NamedTuple):
-    """States between, and where the loop has ended."""
-
-    between: Array  # (K, n, *bodies), NaN if not reached
-    last: Array  # (n, *bodies)
-    t: Array
-    h: Array  # the next step: 0 or NaN if none is left to try, `HALTED`
-    steps: Array
-    rejected: Array
-
-
 class Segment(NamedTuple):
     """A part of a run."""
 
     rows: Rows
     times: Array  # at which each row begins, inf where there is none
-    begin: Array
     end: Array
     number: Array  # of rows
 
@@ -172,9 +165,11 @@ def of_body(result: dfx.RESULTS, body: Any) -> dfx.RESULTS:
 def tried(method: Method, constants: Arrays, run: Run, step: Step) -> tuple[Array, Array]:
     """The state a step later, and the root mean square of its error over the tolerance."""
     there = stages(method.tableau, method.field, constants, step)
-    left, right = step.y, method.project(there.end)
-    error = error_estimate(method.tableau, method.sizes, step.h, there.slopes)
-    largest = jnp.maximum(jnp.abs(left), jnp.abs(right))
+    right = method.project(there.end)
+    # Which steps are taken is no thing to differentiate.
+    left, after, h, slopes = lax.stop_gradient((step.y, right, step.h, there.slopes))
+    error = error_estimate(method.tableau, method.sizes, h, slopes)
+    largest = jnp.maximum(jnp.abs(left), jnp.abs(after))
     scale = lift(run.atol, left) + lift(run.rtol, left) * largest
     tiny = float(jnp.finfo(error.dtype).tiny)
     norm = jnp.sqrt(jnp.mean((error / scale) ** 2, 0) + tiny)
@@ -246,20 +241,17 @@ def first_step(method: Method, constants: Arrays, run: Run) -> tuple[Array, Arra
     return h.astype(t0.dtype), first
 
 
-def value(method: Method, constants: Arrays, run: Run) -> Answer:
-    """The answer, with nothing kept: without states between."""
-    loop = lax.while_loop(
+def value(method: Method, constants: Arrays, run: Run) -> LoopState:
+    """The end of a run without states between."""
+    return lax.while_loop(
         lambda loop: jnp.any(going(method, run, loop, None)),
         lambda loop: _attempt(method, constants, run, loop, None)[0],
         start(method, constants, run),
     )
-    return Answer(run.y0[None][:0], loop.y, loop.t, loop.h, loop.steps, loop.rejected)
 
 
-def recording(
-    method: Method, constants: Arrays, run: Run, saved: Callable[..., Array]
-) -> tuple[Answer, Record]:
-    """The answer, and what derivatives need; `saved` as of `rigidjax.solve.adjoint`."""
+def recording(method: Method, constants: Arrays, run: Run) -> tuple[Array, LoopState, Record]:
+    """States between (K, n, *bodies), NaN if not reached; the end; what derivatives need."""
     loop = start(method, constants, run)
     first, most = packed(loop), method.max_steps + run.stops.shape[0]
     starts = jnp.zeros((-(-most // SEGMENT) + 1, *first.shape), first.dtype)
@@ -271,8 +263,8 @@ def recording(
         loop, ys, record = state
         after, rows, count = recorded(method, constants, run, loop, record.rows, None)
         if run.between.shape[0]:
-            part = segment(rows, loop.t, after.t, count)
-            ys = saved(method, constants, run, part, rows[:, HEAD:], ys)
+            part = segment(rows, after.t, count)
+            ys = saved(method, constants, run, part, ys)
         number = record.number + 1
         starts = lax.dynamic_update_index_in_dim(record.starts, packed(after), number, 0)
         return after, ys, Record(starts, number, rows, count)
@@ -281,21 +273,20 @@ def recording(
     more = lambda state: jnp.any(going(method, run, state[0], None))  # noqa: E731
     loop, ys, record = lax.while_loop(more, one, state)
     number, filled = (jnp.broadcast_to(a, run.t0.shape) for a in (record.number, record.filled))
-    answer = Answer(ys, loop.y, loop.t, loop.h, loop.steps, loop.rejected)
-    return answer, record._replace(number=number, filled=filled)
+    return ys, loop, record._replace(number=number, filled=filled)
 
 
 def start(method: Method, constants: Arrays, run: Run) -> LoopState:
     """A loop about to begin."""
     t0, y0 = run.t0, run.y0
-    h, f0 = first_step(method, constants, run)
+    h, f0 = first_step(method, *lax.stop_gradient((constants, run)))
     # No step is short enough if f(t0) is not finite.
     sound = jnp.all(jnp.isfinite(f0) & jnp.isfinite(y0), 0)
     sound = sound & jnp.isfinite(t0) & jnp.isfinite(run.stops[-1])
     h = jnp.where(sound, jnp.where(jnp.isnan(run.h0), h, run.h0), jnp.nan)
     h = lax.stop_gradient(_unless_halted(method, t0, y0, h))
     zero = jnp.zeros(t0.shape, jnp.int32)
-    return LoopState(t0, h, zero, zero, zero, y0)
+    return LoopState(y0, t0, h, zero, zero, zero)
 
 
 def going(method: Method, run: Run, loop: LoopState, until: Array | None) -> Array:
@@ -332,12 +323,12 @@ def _attempt(
         following = jnp.where(accept, _unless_halted(method, late, y, following), following)
     reached = accept & last & ~cut
     after = LoopState(
+        y=jnp.where(lift(accept, y), y, loop.y),
         t=jnp.where(accept, jnp.where(reached, begin, late), loop.t),
         h=lax.stop_gradient(following),
         stop=loop.stop + (arrived | reached).astype(jnp.int32),
         steps=loop.steps + moving.astype(jnp.int32),
         rejected=loop.rejected + (moving & ~accept).astype(jnp.int32),
-        y=jnp.where(lift(accept, y), y, loop.y),
     )
     kind = jnp.where(accept, jnp.where(reached, LAST, STEP), NONE)
     head = [a.astype(h.dtype) for a in (loop.t, h, kind, loop.stop)]
@@ -377,9 +368,66 @@ def recorded(
     return lax.while_loop(partial(more, room), block, (loop, rows, none))
 
 
-def segment(rows: Rows, begin: Array, end: Array, count: Array) -> Segment:
+def segment(rows: Rows, end: Array, count: Array) -> Segment:
     """A part of a run from its rows, of which there are `count`."""
-    begin, end = lax.stop_gradient((begin, end))
-    there = jnp.arange(rows.shape[0], dtype=jnp.int32).reshape(-1, *[1] * begin.ndim) < count
+    there = jnp.arange(rows.shape[0], dtype=jnp.int32).reshape(-1, *[1] * end.ndim) < count
     times = jnp.where(there, lax.stop_gradient(rows[:, 0]), jnp.inf)
-    return Segment(rows, times, begin, end, count)
+    return Segment(rows, times, lax.stop_gradient(end), count)
+
+
+def saved(method: Method, constants: Arrays, run: Run, part: Segment, ys: Array) -> Array:
+    """`ys` (K, n, *bodies) with the states in a part of a run."""
+    size, many = run.between.shape[0], run.t0.ndim > 0
+    width = 1 if many else min(size, _TOGETHER)
+    # All at once: in a loop each search would be many small kernels.
+    ts = lax.stop_gradient(run.between)
+    search = per_body(run, lambda begun, ts: jnp.searchsorted(begun, ts).astype(jnp.int32) - 1)
+    index = search(part.times, ts)
+    index, inside = jnp.maximum(index, 0), (index >= 0) & (ts <= part.end[None])
+    # What is not inside stands still at the first state, where the field has a value.
+    still = part.rows[0].at[1:3].set(0)
+    pick = jax.vmap(lambda rows, i: rows[i], (-1 if many else None, -1), -1)
+    if not many:
+        # Times of one body lie side by side as bodies do.
+        field, project = (
+            jax.vmap(method.field, (None, -1, -1), -1),
+            jax.vmap(method.project, -1, -1),
+        )
+        method, still = method._replace(field=field, project=project), still[:, None]
+
+    def window(i: Array, ys: Array) -> Array:
+        # A window beyond the last time is moved back: states that are there are worked out again.
+        number = jnp.minimum(first + i * width, size - width)
+
+        def cut(a: Array) -> Array:
+            a = jnp.moveaxis(lax.dynamic_slice_in_dim(a, number, width), 0, -1)
+            return a[..., 0] if many else a
+
+        there, old = cut(inside), cut(ys)
+        row = jnp.where(there[None], pick(part.rows, cut(index)), still)
+        step = Step(*times_of(run, row), row[HEAD:])
+        slopes = stages(method.tableau, method.field, constants, step, True).slopes
+        new = state_in_step(method, jnp.where(there, cut(run.between), row[0]), step, slopes)
+        new = jnp.where(there[None], new, old)
+        return lax.dynamic_update_slice_in_dim(ys, new[None] if many else new.T, number, 0)
+
+    used = jnp.any(inside.reshape(size, -1), 1)
+    first = jnp.argmax(used).astype(jnp.int32)
+    length = size - jnp.argmax(used[::-1]).astype(jnp.int32) - first
+    count = jnp.where(jnp.any(used), (length + width - 1) // width, 0)
+    return lax.fori_loop(jnp.zeros_like(count), count, window, ys)
+
+
+def per_body(run: Run, function: Callable[..., Any]) -> Callable[..., Any]:
+    """A function of one body's arrays as one of arrays with a last axis of bodies, if there is."""
+    return jax.vmap(function, in_axes=-1, out_axes=-1) if run.t0.ndim else function
+
+
+def state_in_step(method: Method, t: Array, step: Step, slopes: Array) -> Array:
+    """The state at a time `t` (*bodies) in a step."""
+    theta = ((t - step.t) / jnp.where(step.h == 0, 1, step.h)).astype(slopes.dtype)
+    # Weights of the slopes are one number a stage; the rows F_r would be n.
+    rows = weights(method.tableau, slopes.dtype, slopes.shape[1]).dense
+    shares = nested(theta[None], rows.reshape(*rows.shape, *[1] * theta.ndim))
+    rise = jnp.sum(shares[None] * slopes, 1)
+    return method.project(step.y + lift(step.h.astype(rise.dtype), rise) * rise)

@@ -1,7 +1,4 @@
-"""A second pass over a recorded run: for states between its steps, for tangents and cotangents.
-
-The loop does not look at the times that are asked for. Its steps with such times in them are taken
-once more: many of one body side by side, or one of each of many bodies.
+"""A second pass over a recorded run: for tangents and cotangents.
 
 The derivative is that of the steps taken, with fixed lengths, except that steps cut short at a stop
 follow it, as in `diffrax.RecursiveCheckpointAdjoint`. All segments but the last are run once more;
@@ -9,7 +6,6 @@ they may take other steps between the same two ends if another program rounds di
 derivative is then that of these steps, the same to the tolerance.
 """
 
-from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -27,137 +23,61 @@ from rigidjax.solve.adaptive_loop import (
     Run,
     Segment,
     going,
+    per_body,
     recorded,
+    saved,
     segment,
+    state_in_step,
     times_of,
     unpacked,
 )  # fmt: skip
 from rigidjax.solve.batching import Arrays
 from rigidjax.solve.components import lift
-from rigidjax.solve.runge_kutta import Step, nested, stages, weights
-
-# Times of one body that are taken together.
-_TOGETHER = 16
-
-
-def saved(
-    method: Method, constants: Arrays, run: Run, part: Segment, path: Array, ys: Array
-) -> Array:
-    """`ys` (K, n, *bodies) with the states in a part of a run; `path` those at which rows start."""
-    size, many, field, project = run.between.shape[0], run.t0.ndim, method.field, method.project
-    width = 1 if many else min(size, _TOGETHER)
-    if not many:
-        field = jax.vmap(field, (None, -1, -1), -1)
-        project = jax.vmap(project, -1, -1)
-    index, inside = _rows_at(run, part)
-    # What is not inside stands still at the first state, where the field has a value.
-    still = part.rows[0].at[1:3].set(0)
-    still = still if many else still[:, None]
-
-    def window(i: Array, ys: Array) -> Array:
-        # A window beyond the last time is moved back: states that are there are worked out again.
-        number = jnp.minimum(first + i * width, size - width)
-        cut = partial(_cut, number, width, many)
-        there, where = cut(inside), cut(index)
-        rows = jnp.where(there[None], _picked(many, part.rows, where), still)
-        ts = jnp.where(there, cut(run.between), rows[0])
-        step = Step(*times_of(run, rows), _picked(many, path, where))
-        slopes = stages(method.tableau, field, constants, step, True).slopes
-        new = _states(method, project, ts[None], step.t, step.h, step.y, slopes)[0]
-        new = jnp.where(there[None], new, cut(ys))
-        rows = new[None] if many else new.T
-        return lax.dynamic_update_slice_in_dim(ys, rows, number, 0)
-
-    used = jnp.any(inside.reshape(size, -1), 1)
-    first = jnp.argmax(used).astype(jnp.int32)
-    length = size - jnp.argmax(used[::-1]).astype(jnp.int32) - first
-    count = jnp.where(jnp.any(used), (length + width - 1) // width, 0)
-    return lax.fori_loop(jnp.zeros_like(count), count, window, ys)
+from rigidjax.solve.runge_kutta import Step, stages
 
 
 def passed(run: Run, part: Segment) -> Array:
     """The number of saved times passed at the start of each row, and at the end."""
     ends = jnp.concatenate([jnp.minimum(part.times, part.end[None]), part.end[None]])
     search = lambda ts, t: jnp.searchsorted(ts, t, side="right").astype(jnp.int32)  # noqa: E731
-    return _per_body(run, search)(lax.stop_gradient(run.between), ends)
+    return per_body(run, search)(lax.stop_gradient(run.between), ends)
 
 
 def of_saved(
     method: Method, run: Run, step: Step, slopes: Array, first: Array, last: Array, bars: Array,
     between: Array | None,
-) -> tuple[Array | None, Array, Array, Array, Array]:  # fmt: skip
+) -> tuple[Array | None, Step, Array]:  # fmt: skip
     """The transpose of the states at the times in a step, from number `first` to before `last`.
 
     **Returns** `between`, if it is not `None`, with the cotangents of the times added, and those of
-    the step: its time, length, state and slopes. `bars` (K, n, *bodies) of all states.
+    the step and its slopes. `bars` (K, n, *bodies) of all states.
     """
-    size = run.between.shape[0]
-    width = min(size, max(4, min(size // 50, 16)))
-    states = partial(_states, method, method.project)
+    state_at, most = partial(state_in_step, method), run.between.shape[0] - 1
+    pick = per_body(run, lambda a, index: a[index])
 
-    def window(state: Any) -> Any:
-        begin, total, by = state
-        number = jnp.arange(width, dtype=jnp.int32).reshape(-1, *[1] * first.ndim)
-        number = begin[None] + number
-        inside = number < last[None]
-        number = jnp.minimum(number, size - 1)
-        pick = _per_body(run, lambda a, index: a[index])
-        ts = jnp.where(inside, pick(run.between, number), step.t[None])
-        bar = jnp.where(jnp.expand_dims(inside, 1), pick(bars, number), 0)
-        by_ts, *more = jax.vjp(states, ts, step.t, step.h, step.y, slopes)[1](bar)
+    # One at a time: of many bodies few have as many in a step as one of them has.
+    def one(state: Any) -> Any:
+        number, total, by = state
+        inside, there = number < last, jnp.minimum(number, most)
+        t = jnp.where(inside, pick(run.between, there), step.t)
+        bar = jnp.where(inside[None], pick(bars, there), 0)
+        by_t, *more = jax.vjp(state_at, t, step, slopes)[1](bar)
         if total is not None:
-            total = _per_body(run, lambda a, i, b: a.at[i].add(b))(total, number, by_ts)
-        return begin + width, total, [a + b for a, b in zip(by, more, strict=True)]
+            total = per_body(run, lambda a, i, b: a.at[i].add(b))(total, there, by_t)
+        return number + 1, total, jax.tree.map(jnp.add, by, more)
 
-    none = [jnp.zeros_like(a) for a in (step.t, step.h, step.y, slopes)]
-    start = (first, between, none)
-    _, total, by = lax.while_loop(lambda state: jnp.any(state[0] < last), window, start)
+    start = (first, between, jax.tree.map(jnp.zeros_like, [step, slopes]))
+    _, total, by = lax.while_loop(lambda state: jnp.any(state[0] < last), one, start)
     return total, *by
-
-
-def _rows_at(run: Run, part: Segment) -> tuple[Array, Array]:
-    """The index of the row that each time between is in (K, *bodies), whether there is one."""
-    # All at once: in a loop each search would be many small kernels.
-    ts = lax.stop_gradient(run.between)
-    search = _per_body(run, lambda begun, ts: jnp.searchsorted(begun, ts).astype(jnp.int32) - 1)
-    index = search(part.times, ts)
-    return jnp.maximum(index, 0), (index >= 0) & (ts <= part.end[None])
-
-
-def _per_body(run: Run, function: Callable[..., Any]) -> Callable[..., Any]:
-    """A function of one body's arrays as one of arrays with a last axis of bodies, if there is."""
-    return jax.vmap(function, in_axes=-1, out_axes=-1) if run.t0.ndim else function
-
-
-def _cut(number: Array, width: int, many: int, a: Array) -> Array:
-    """Some rows of `a` (K, …, *bodies), in lanes (…, lanes)."""
-    if many:
-        return lax.dynamic_index_in_dim(a, number, 0, False)
-    return jnp.moveaxis(lax.dynamic_slice_in_dim(a, number, width, 0), 0, -1)
-
-
-def _picked(many: int, rows: Array, index: Array) -> Array:
-    """Those of the rows (R, c, *bodies), in lanes: (c, lanes)."""
-    return jnp.take_along_axis(rows, index[None, None], 0)[0] if many else rows[index].T
-
-
-def _states(
-    method: Method, project: Any, ts: Array, t: Array, h: Array, y: Array, slopes: Array
-) -> Array:
-    """The states (W, n, lanes) at times `ts` (W, lanes), all in one step of each lane."""
-    theta = ((ts - t[None]) / jnp.where(h == 0, 1, h)[None]).astype(slopes.dtype)
-    # Weights of the slopes are one number a stage; the rows F_r would be n.
-    rows = weights(method.tableau, slopes.dtype, slopes.shape[1]).dense
-    rows = rows.reshape(rows.shape[0], 1, -1, *[1] * (theta.ndim - 1))
-    shares = nested(jnp.expand_dims(theta, 1), rows)
-    rise = jnp.sum(jnp.expand_dims(shares, 1) * slopes[None], 2)
-    return jax.vmap(project)(y[None] + lift(h.astype(y.dtype), rise) * rise)
 
 
 def replayed(
     method: Method, constants: Arrays, run: Run, record: Record
 ) -> tuple[Array, Array, Array, Array]:
-    """States between and at the end, starts and rows by the steps of the record, which are held."""
+    """States between and at the end, starts and rows by the steps of the record, which are held.
+
+    A loop that takes its own steps again could take others, and its rows would not be these.
+    """
     head = record.starts.shape[1] - run.y0.shape[0]
 
     def one(i: Array, state: tuple[Array, Array, Array, Array]) -> Any:
@@ -174,7 +94,7 @@ def replayed(
 
         y, rows = lax.fori_loop(0, part.number, step, (y, part.rows))
         if run.between.shape[0]:
-            ys = saved(method, constants, run, part, rows[:, HEAD:], ys)
+            ys = saved(method, constants, run, part._replace(rows=rows), ys)
         return y, ys, starts, rows
 
     still, held = lax.stop_gradient(((constants, run), record))
@@ -207,21 +127,21 @@ def cotangents(
             by = lambda t0, stops: times_of(run._replace(t0=t0, stops=stops), row)  # noqa: E731
             (t, h, end), of_times = jax.vjp(by, run.t0, run.stops)
             here = Step(t, h, end, row[HEAD:])
-            dense, seeds, of_slopes, between = False, [], None, of_run.between
+            dense, seeds, of_slopes, between = False, None, None, of_run.between
             if known is not None:
                 dense = jnp.any(known[k] < known[k + 1])
             there = stages(method.tableau, method.field, constants, here, dense)
             bar = jax.vjp(method.project, there.end)[1](of_run.y0)[0]
             if known is not None:
-                between, *seeds, of_slopes = of_saved(
+                between, seeds, of_slopes = of_saved(
                     method, run, here, there.slopes, known[k], known[k + 1], bars[0],
                     between if timed else None,
                 )  # fmt: skip
             by_constants, *rest = runge_kutta.pulled(
                 method.tableau, method.field, constants, here, there, bar, of_slopes
             )
-            if seeds:
-                rest = [a + b for a, b in zip(rest, seeds, strict=True)]
+            if seeds is not None:
+                rest = [a + b for a, b in zip(rest, (seeds.t, seeds.h, seeds.y), strict=True)]
             # A body that has no step here may be NaN.
             on = row[2] >= STEP
             by_t, by_h, by_y = (_where(on, a) for a in rest)
@@ -255,4 +175,4 @@ def _again(method: Method, constants: Arrays, run: Run, record: Record, number: 
     short = jnp.where(jnp.any(going(method, run, end, until)), jnp.nan, 0.0)
     rows = rows.at[:, HEAD:].add(short.astype(rows.dtype))
     count = jnp.where(again, count, jnp.max(record.filled))
-    return segment(rows, loop.t, after.t, count)
+    return segment(rows, after.t, count)

@@ -24,6 +24,11 @@ class Layout(NamedTuple):
     bodies: bool  # a last axis
     shared: tuple[bool, ...]  # which constants have none all the same
 
+    def over(self, function: Callable[..., Any]) -> Callable[..., Any]:
+        """`function(constants, t, y)` of one body on the arrays of all."""
+        axes = [None if s else -1 for s in self.shared]
+        return jax.vmap(function, (axes, -1, -1), -1) if self.bodies else function
+
 
 # `program(layout, constants, each)` returns a list of arrays of each body.
 Program = Callable[[Layout, Arrays, Arrays], Arrays]

@@ -371,13 +371,9 @@ def _located(
     section: Section, what: Search, layout: Layout, constants: Arrays, each: Arrays
 ) -> Arrays:
     run, longest = Run(*each[:-1]), each[-1]
-    solver, project, over = section.solver, section.project, lambda f: f
-    if layout.bodies:
-        shared = [None if s else -1 for s in layout.shared]
-        over = lambda f: jax.vmap(f, (shared, -1, -1), -1)  # noqa: E731
-        project = jax.vmap(project, -1, -1)
-    motion = over(section.motion)
-    seen, clear = (partial(over(partial(f, section)), constants) for f in (_seen, _clear))
+    solver, motion = section.solver, layout.over(section.motion)
+    project = jax.vmap(section.project, -1, -1) if layout.bodies else section.project
+    seen, clear = (partial(layout.over(partial(f, section)), constants) for f in (_seen, _clear))
 
     def counts(s: Array, y: Array, steps: Array) -> Array:
         # The round-off of steps adds up as a random walk does.
