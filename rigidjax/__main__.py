@@ -163,9 +163,10 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "--demo": _FLAG | dict(help="the tumbling of 4179 Toutatis"),
     "--columns": dict(
         nargs=4, metavar=("T", "WX", "WY", "WZ"), help="names of the time column and of the three "
-        "body rates (default: t wx wy wz; those of phyphox and Blackbox are known)"),
+        "body rates (default: t wx wy wz; those of phyphox and of binary logs are known)"),
     "--unit": dict(
-        choices=("rad/s", "deg/s"), help="of the rates (default: rad/s; Blackbox deg/s)"),
+        choices=("rad/s", "deg/s"),
+        help="of the rates (default: rad/s; Blackbox and Crazyflie deg/s)"),
     "--noise": dict(
         nargs="+", type=float, help="standard deviation of a rate, in --unit, one number or one "
         "for each axis (default: estimated)"),
@@ -180,7 +181,8 @@ OPTIONS: dict[str, dict[str, Any]] = {
         help="instead of --columns: gyro=wx,wy,wz:deg/s:0.1, accelerometer=ax,ay,az:m/s2, "
         "quaternion=qw,qx,qy,qz, euler-ZYX=yaw,pitch,roll:deg (body to world); may be repeated"),
     "--time-unit": dict(
-        choices=("s", "ms", "us"), help="of the time column (default: s; Blackbox us)"),
+        choices=("s", "ms", "us"),
+        help="of the time column (default: s; Blackbox, PX4 and Crazyflie us)"),
     "--window": dict(
         nargs=2, type=float, metavar=("FROM", "TO"), help="use these seconds only"),
     "--wheel": dict(
@@ -217,7 +219,8 @@ def _parser() -> argparse.ArgumentParser:
         "identify",
         help="fit a body and its motion to recordings",
         description="Fit a body's inertia and motion to logs (.csv with a header line, .npz, "
-        ".mat, Blackbox's .bbl and .bfl), several together if several are given; or, with --demo, "
+        ".mat, Blackbox's .bbl and .bfl, PX4's .ulg, .mcap, a Crazyflie's), several together if "
+        "several are given; or, with --demo, "
         "to the radar observations of asteroid 4179 Toutatis.",
         epilog="A throw with a gyro and a flywheel whose inertia is known: identify throw1.csv "
         "throw2.csv --wheel flywheel:1.2e-6:z --model tensor --typical 3e-4 --free drag bias "

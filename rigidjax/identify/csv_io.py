@@ -4,7 +4,6 @@ import csv
 import itertools
 import math
 import re
-import struct
 from array import array
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,76 +12,23 @@ from typing import Any, NamedTuple, TextIO
 import numpy as np
 
 from rigidjax import _checks
-
-SUFFIXES = (".bbl", ".bfl")
-# The rates in deg/s, the time in µs.
-COLUMNS = ("time", "gyroADC[0]", "gyroADC[1]", "gyroADC[2]")
-
-
-def read_blackbox(path: Path, columns: Sequence[str]) -> tuple[list[str], dict[str, Any]]:
-    """The names of all fields, and the wanted ones, of the first flight in a file.
-
-    Rates come in deg/s and accelerations in g by the scales in the header, as in the flight
-    controllers' own viewer; other fields as logged. A log without its last mark is read to its end.
-    """
-    try:
-        from orangebox import Parser
-    except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(
-            f"{path}: Blackbox logs are read by orangebox, which is missing: pip install "
-            "'rigidjax[blackbox]'"
-        ) from error
-    parser = Parser.load(str(path))
-    names = parser.field_names
-    wanted = {name: (names.index(name), array("d")) for name in columns if name in names}
-    try:
-        for frame in parser.frames():
-            for place, numbers in wanted.values():
-                numbers.append(float(frame.data[place]))
-    except (RuntimeError, IndexError, TypeError):
-        # At the end of a log without a last mark the parser raises one of these.
-        if parser.reader.tell() < len(parser.reader):
-            raise
-    scales = _scales(parser.headers)
-    return names, {
-        name: np.frombuffer(numbers, float) * scales.get(name.partition("[")[0], 1.0)
-        for name, (_, numbers) in wanted.items()
-    }
-
-
-def _scales(headers: dict[str, Any]) -> dict[str, float]:
-    """The factors of the raw numbers of some fields."""
-    found = {}
-    if "gyro_scale" in headers:
-        value = headers["gyro_scale"]
-        # Written as the bits of a float, which the parser takes for a whole number.
-        scale = struct.unpack("f", struct.pack("I", value))[0] if isinstance(value, int) else value
-        baseflight = "baseflight" in str(headers.get("Firmware type", "")).lower()
-        found["gyroADC"] = scale * (1e6 * 180 / math.pi if baseflight else 1.0)
-    if "acc_1G" in headers:
-        found["accSmooth"] = 1.0 / float(headers["acc_1G"])
-    return found
-
+from rigidjax.identify import flight_logs
+from rigidjax.identify.flight_logs import Layout
 
 SEPARATORS = ",;\t"
-
-
-class Layout(NamedTuple):
-    """Names of the time and the three rate columns, the unit of the rates, that of the time."""
-
-    columns: tuple[str, str, str, str]
-    unit: str
-    time_unit: str
-
 
 USUAL = Layout(("t", "wx", "wy", "wz"), "rad/s", "s")
 
 
 def layout_of(path: str | Path) -> Layout:
-    """The layout of a log: phyphox (any language) or Blackbox if the names match, else `USUAL`."""
+    """The layout of a log: phyphox (any language) or a binary one if it has rates, else `USUAL`."""
     path = Path(path)
-    if path.suffix.lower() in SUFFIXES:
-        return Layout(COLUMNS, "deg/s", "us")
+    if flight_logs.kind_of(path) in flight_logs.READERS:
+        try:
+            return flight_logs.usual(path) or USUAL
+        except Exception:
+            # Whoever reads it says what is wrong.
+            return USUAL
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
             names = read_header(file).names
@@ -162,8 +108,9 @@ class LogError(ValueError):
 
 
 def read_table(path: str | Path, columns: Sequence[str]) -> dict[str, np.ndarray]:
-    """Columns of a log by name: text with a header, `.npz`, `.mat` (MATLAB up to v7), or a Blackbox
-    log of a flight controller, `.bbl` or `.bfl` (with the extra `blackbox`).
+    """Columns of a log by name: text with a header, `.npz`, `.mat` (MATLAB up to v7), a Crazyflie's
+    µSD log (without ending, or `.usd`), and with the extra of that name `blackbox` (`.bbl`,
+    `.bfl`), `ulog` of PX4 (`.ulg`), `mcap` (JSON and ROS 2).
 
     **Arguments:** `path`; `columns` the names that are wanted, others are ignored. Text is
     separated by commas, semicolons or tabs, whichever splits the header line into most names; its
@@ -190,7 +137,7 @@ def read_table(path: str | Path, columns: Sequence[str]) -> dict[str, np.ndarray
         raise LogError(f"{path}: no such file")
     if path.is_dir():
         raise LogError(f"{path}: is a folder, not a log")
-    if path.suffix.lower() in (".npz", ".mat", *SUFFIXES):
+    if flight_logs.kind_of(path) in _readers:
         return _arrays(path, columns)
     try:
         # Line by line: only the numbers of a large file stay in memory.
@@ -275,18 +222,18 @@ def _number(cell: str) -> float:
 def _arrays(path: Path, columns: Sequence[str]) -> dict[str, np.ndarray]:
     # The readers raise many kinds of errors for an empty or a cut file.
     try:
-        names, held = _readers[path.suffix.lower()](path, columns)
+        names, held = _readers[flight_logs.kind_of(path)](path, columns)
     except ModuleNotFoundError as error:
         raise LogError(str(error)) from None
     except Exception as error:
         why = f"{type(error).__name__}: {error}".splitlines()[0]
         raise LogError(
-            f"{path}: cannot be read; is it whole, and a {path.suffix} file? ({why})"
+            f"{path}: cannot be read; is it whole, and a {flight_logs.kind_of(path)} file? ({why})"
         ) from None
     out = {}
     for name in columns:
         if name not in held:
-            raise LogError(f"{path}: no array {name!r}; the arrays are {', '.join(names)}")
+            raise LogError(f"{path}: no array {name!r}; the arrays are {_listed(names)}")
         if np.asarray(held[name]).dtype.kind not in "biuf":
             raise LogError(f"{path}: array {name!r} does not hold real numbers")
         out[name] = np.asarray(held[name], float).reshape(-1)
@@ -300,6 +247,11 @@ def _arrays(path: Path, columns: Sequence[str]) -> dict[str, np.ndarray]:
     if len(set(sizes.values())) > 1:
         raise LogError(f"{path}: arrays of different lengths: {sizes}")
     return out
+
+
+def _listed(names: Sequence[str]) -> str:
+    more = f", and {len(names) - 40} more" if len(names) > 40 else ""
+    return ", ".join(names[:40]) + more
 
 
 def _npz(path: Path, columns: Sequence[str]) -> tuple[list[str], dict[str, Any]]:
@@ -316,4 +268,4 @@ def _mat(path: Path, columns: Sequence[str]) -> tuple[list[str], dict[str, Any]]
         return names, loadmat(raw, variable_names=list(columns))
 
 
-_readers = {".npz": _npz, ".mat": _mat} | dict.fromkeys(SUFFIXES, read_blackbox)
+_readers = {".npz": _npz, ".mat": _mat} | flight_logs.READERS
