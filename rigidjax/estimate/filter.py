@@ -58,7 +58,7 @@ def grid_of(model: Model, recording: Recording, first: Belief, substeps: int | N
         counts = np.full(t.shape, _checks.whole(substeps, "substeps", 1))
     elif _checks.known((t, t0, first.x.motion.omega, model.coloured)):
         gaps = np.diff(np.concatenate([[float(t0)], np.asarray(t)]))
-        counts = steps_of(gaps, longest_step(model, _fastest(recording, first)))
+        counts = steps_of(model, _fastest(recording, first), gaps)
     else:
         return None
     if (counts == 1).all():
@@ -74,14 +74,10 @@ def grid_of(model: Model, recording: Recording, first: Belief, substeps: int | N
     return Grid(*map(jnp.asarray, (times, index, part == 1, rows)))
 
 
-def longest_step(model: Model, rate: float) -> float:
-    """The longest step, s, of a body that turns at `rate` rad/s."""
+def steps_of(model: Model, rate: float, span: Any) -> Any:
+    """The number of fixed steps in `span` s of a body that turns at `rate` rad/s."""
     times = [MEMORY_A_STEP * float(law.time) for law in model.coloured]
-    return min([TURN_A_STEP / rate if rate > 0 else math.inf, *times])
-
-
-def steps_of(span: Any, longest: float) -> Any:
-    """The number of fixed steps of at most `longest` in an interval of `span` s."""
+    longest = min([TURN_A_STEP / rate if rate > 0 else math.inf, *times])
     return np.maximum(1, np.ceil(span / longest * (1 - 1e-9))).astype(int)
 
 

@@ -1,12 +1,13 @@
 """Any linear model with normal noise: the Kalman filter and smoother, in square-root form."""
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from rigidjax import _checks
 from rigidjax._types import Scalar
@@ -180,7 +181,7 @@ def linear_filter(
     >>> linear_filter(walk, jnp.ones((3, 1)), jnp.zeros(1), jnp.eye(1)).mean[0]
     Array([0.5], dtype=float64)
     """
-    return _filter(model, *_given(model, readings, mean, root, seen))
+    return _solved(model, *_given(model, readings, mean, root, seen), back=False)
 
 
 def linear_smooth(
@@ -198,7 +199,7 @@ def linear_smooth(
     >>> bool(found.mean[0, 0] > 0.5), found.kicks.shape
     (True, (2, 1))
     """
-    return _smooth(model, *_given(model, readings, mean, root, seen))
+    return _solved(model, *_given(model, readings, mean, root, seen), back=True)
 
 
 def _given(model: LinearModel, readings: Any, mean: Any, root: Any, seen: Any) -> tuple:
@@ -249,8 +250,11 @@ def _read(row: Any, y: Array, seen: Array, mean: Array, root: Array) -> roots.Ab
     return roots.absorb_all(mean, root, matrix, error, deviation**2, seen)
 
 
-def _pass(model: LinearModel, readings: Array, mean: Array, root: Array, seen: Array, step: Any):
-    """Forward through all times; `step(F, G, root)` gives the predicted root, and more to keep."""
+@partial(jax.jit, static_argnames="back")
+def _solved(
+    model: LinearModel, readings: Array, mean: Array, root: Array, seen: Array, *, back: bool
+) -> LinearEstimate:
+    """The filter forward through all times, and with `back` the smoother's pass after it."""
     steps, times = _moving(model, _STEPS), _moving(model, _TIMES)
     now, later = (jax.tree.map(lambda leaf, at=at: leaf[at], times) for at in (0, slice(1, None)))
     first = _read(_now(model, _TIMES, now), readings[0], seen[0], mean, root)
@@ -261,7 +265,8 @@ def _pass(model: LinearModel, readings: Array, mean: Array, root: Array, seen: A
         predicted = jnp.sum(grown * mean[None], 1)
         if push is not None:
             predicted = predicted + push
-        before, kept = step(grown, noise, root)
+        kept = joint(grown, noise, root) if back else None
+        before = roots.predicted(grown, root, noise) if kept is None else kept.predicted
         passed = _read(_now(model, _TIMES, now[1]), now[2], now[3], predicted, before)
         return (passed.step, passed.root), (passed, predicted, kept)
 
@@ -269,31 +274,10 @@ def _pass(model: LinearModel, readings: Array, mean: Array, root: Array, seen: A
         body, (first.step, first.root), (steps, later, readings[1:], seen[1:])
     )
     passed = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first, rest)
-    total = jnp.sum(roots.log_normal(passed.innovation, passed.variance, seen))
-    return passed, predicted, kept, total
-
-
-@jax.jit
-def _filter(
-    model: LinearModel, readings: Array, mean: Array, root: Array, seen: Bool[Array, "..."]
-) -> LinearEstimate:
-    def step(grown: Array, noise: Array, root: Array) -> tuple[Array, None]:
-        return roots.predicted(grown, root, noise), None
-
-    passed, _, _, total = _pass(model, readings, mean, root, seen, step)
-    mean, root, innovation, variance = passed
-    return LinearEstimate(mean, root, innovation, variance, total, None, None)
-
-
-@jax.jit
-def _smooth(
-    model: LinearModel, readings: Array, mean: Array, root: Array, seen: Bool[Array, "..."]
-) -> LinearEstimate:
-    def step(grown: Array, noise: Array, root: Array) -> tuple[Array, Joint]:
-        kept = joint(grown, noise, root)
-        return kept.predicted, kept
-
-    passed, predicted, kept, total = _pass(model, readings, mean, root, seen, step)
-    end = passed.step[-1], passed.root[-1]
-    means, spread, *kicks = smoothed(kept, passed.step[:-1], predicted, model.noise, end)
-    return LinearEstimate(means, spread, passed.innovation, passed.variance, total, *kicks)
+    means, spread, innovation, variance = passed
+    total = jnp.sum(roots.log_normal(innovation, variance, seen))
+    kicks = None, None
+    if back:
+        end = means[-1], spread[-1]
+        means, spread, *kicks = smoothed(kept, means[:-1], predicted, model.noise, end)
+    return LinearEstimate(means, spread, innovation, variance, total, *kicks)

@@ -7,8 +7,6 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from rigidjax._types import Scalar
-
 
 def triangular(a: Float[Array, "n m"]) -> Float[Array, "n n"]:
     """The lower triangular root L of `a aᵀ`, its diagonal ≥ 0.
@@ -78,33 +76,6 @@ class Absorbed(NamedTuple):
     variance: Float[Array, "*k"]
 
 
-def absorb(
-    step: Float[Array, " n"],
-    root: Float[Array, "n n"],
-    row: Float[Array, " n"],
-    error: Scalar,
-    variance: Scalar,
-    seen: Bool[Array, ""],
-) -> Absorbed:
-    """Potter's update by one number `error = row · e + noise`, of an e of mean `step`.
-
-    `s = |Sᵀh|² + r`, `S ← S − S v vᵀ/(s + √(rs))` with `v = Sᵀh`: Potter, in Battin, Astronautical
-    Guidance (1964), §9.6; Bierman, Factorization Methods (1977), §II.4.
-
-    >>> one = jnp.array(1.0)
-    >>> absorb(jnp.zeros(1), jnp.eye(1), jnp.ones(1), one, one, jnp.array(True)).step.tolist()
-    [0.5]
-    """
-    across = jnp.where(seen, jnp.sum(row[:, None] * root, 0), 0)
-    variance = jnp.where(seen, variance, 1)
-    total = jnp.sum(across * across) + variance
-    innovation = jnp.where(seen, error - jnp.sum(row * step), 0)
-    along = jnp.sum(root * across[None], 1)
-    step = step + along * (innovation / total)
-    shrink = 1 / (total + jnp.sqrt(total * variance))
-    return Absorbed(step, root - (along * shrink)[:, None] * across[None], innovation, total)
-
-
 def absorb_all(
     step: Float[Array, " n"],
     root: Float[Array, "n n"],
@@ -113,18 +84,29 @@ def absorb_all(
     variance: Float[Array, " k"],
     seen: Bool[Array, " k"],
 ) -> Absorbed:
-    """`absorb` of k numbers, one after another.
+    """Potter's update by k numbers `error = row · e + noise`, one by one, of an e of mean `step`.
+
+    `s = |Sᵀh|² + r`, `S ← S − S v vᵀ/(s + √(rs))` with `v = Sᵀh`: Potter, in Battin, Astronautical
+    Guidance (1964), §9.6; Bierman, Factorization Methods (1977), §II.4.
 
     >>> one = jnp.ones(2)
     >>> absorb_all(jnp.zeros(1), jnp.eye(1), one[:, None], one, one, one > 0).variance.tolist()
     [2.0, 1.5]
     """
 
-    def one(now: tuple[Array, Array], number: tuple) -> tuple[Any, Any]:
-        found = absorb(*now, *number)
-        return (found.step, found.root), (found.innovation, found.variance)
+    def absorb(now: tuple[Array, Array], number: tuple) -> tuple[Any, Any]:
+        (step, root), (row, error, variance, seen) = now, number
+        across = jnp.where(seen, jnp.sum(row[:, None] * root, 0), 0)
+        variance = jnp.where(seen, variance, 1)
+        total = jnp.sum(across * across) + variance
+        innovation = jnp.where(seen, error - jnp.sum(row * step), 0)
+        along = jnp.sum(root * across[None], 1)
+        step = step + along * (innovation / total)
+        shrink = 1 / (total + jnp.sqrt(total * variance))
+        return (step, root - (along * shrink)[:, None] * across[None]), (innovation, total)
 
-    (step, root), (innovation, total) = lax.scan(one, (step, root), (matrix, error, variance, seen))
+    numbers = (matrix, error, variance, seen)
+    (step, root), (innovation, total) = lax.scan(absorb, (step, root), numbers)
     return Absorbed(step, root, innovation, total)
 
 

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from rigidjax import _checks
 from rigidjax._types import HasSpin
-from rigidjax.estimate.filter import longest_step, steps_of
+from rigidjax.estimate.filter import steps_of
 from rigidjax.estimate.scene import Dynamics, Extended, Model
 from rigidjax.motion.equations import on_the_group
 
@@ -69,7 +69,7 @@ def sample(key: Any, model: Model, state0: Any, ts: Any, *, substeps: int | None
         pieces = _checks.whole(substeps, "substeps", 1)
     elif _checks.known((times, state0.omega, model.coloured)):
         rate = float(np.linalg.norm(np.asarray(state0.omega)))
-        pieces = int(steps_of(np.diff(np.asarray(times)).max(), longest_step(model, rate)))
+        pieces = int(steps_of(model, rate, np.diff(np.asarray(times)).max()))
     else:
         pieces = 1
     return _sample(key, model, on_the_group(state0), times, pieces)

@@ -251,10 +251,6 @@ class Mounted(eqx.Module):
     sensor: AbstractSensor
 
 
-class _Recorded(eqx.Module):
-    readings: tuple[Mounted, ...]
-
-
 class Sensors(eqx.Module):
     """The sensors without readings, and the leaves that drift. No function is kept: a second model
     of the same form does not compile again.
@@ -288,7 +284,7 @@ def sensors_of(sensors: Sequence[AbstractSensor], model: Model) -> Sensors:
                 "leave it out, and give its lag as offset"
             )
     readings = tuple(Mounted(sensor) for sensor in sensors)
-    tree = _Recorded(readings)
+    tree = Sensors(readings, (), ())
     leaves = tuple(leaf_at(walk.where, tree, "Walk", "the sensor")[0] for walk in model.walks)
     return Sensors(readings, leaves, tuple(walk.density for walk in model.walks))
 

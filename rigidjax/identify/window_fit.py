@@ -252,7 +252,9 @@ def fit_windows(
     converged = bool(end.converged)
     message = [] if converged else [f"stopped after {taken} steps: its best point"]
     deviation, words = _deviations(there, np.asarray(end.point), windows.count)
-    message += [*words, *_remarks(windows, *scene(value))]
+    body, law = scene(value)
+    remarks = (unreal(body) or flat_limit.in_words(body), _too_late(windows, law))
+    message += [*words, *(remark for remark in remarks if remark)]
     return WindowFit(
         value,
         back(jnp.asarray(deviation)),
@@ -263,11 +265,6 @@ def fit_windows(
         "; ".join(message),
         scene,
     )
-
-
-def _remarks(windows: Windows, body: Any, law: Any) -> list[str]:
-    told = (unreal(body) or flat_limit.in_words(body), _too_late(windows, law))
-    return [wrong for wrong in told if wrong]
 
 
 def _deviations(there: Search, point: np.ndarray, count: int) -> tuple[np.ndarray, list[str]]:
@@ -371,15 +368,14 @@ def _searched(
             found = open_loop_errors(scene, h, back(x), start, wanted, inputs, steps)
             return (found / scales[None]).reshape(-1)
 
-        if firm is not None:
+        if firm is None:
+            jacobian, flat = with_jacobian(lambda x: errors(x, start), x)
+            cost, gram, slope = 0.5 * flat @ flat, jacobian.T @ jacobian, jacobian.T @ flat
+        else:
             cost, gram, slope = eliminated(
                 lambda x, step: errors(x, plus(start, scales * step)), x, firm
             )
-            return slope[:, None] * slope[None], cost, gram, slope
-
-        jacobian, flat = with_jacobian(lambda x: errors(x, start), x)
-        slope = jacobian.T @ flat
-        return slope[:, None] * slope[None], 0.5 * flat @ flat, jacobian.T @ jacobian, slope
+        return slope[:, None] * slope[None], cost, gram, slope
 
     def evaluated(x: Array) -> Any:
         def side_by_side(i: Array, total: Any) -> Any:

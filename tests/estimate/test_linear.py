@@ -85,14 +85,14 @@ def test_roots_of_a_covariance_that_is_singular():
 
 def test_a_million_to_one_in_single_precision():
     # Where the covariance itself loses its sign: P = diag(1, 1) read to 1e-6 along (1, 1).
-    one = jnp.float32(1.0)
-    found = roots.absorb(
+    one = jnp.ones(1, jnp.float32)
+    found = roots.absorb_all(
         jnp.zeros(2, jnp.float32),
         jnp.eye(2, dtype=jnp.float32),
-        jnp.ones(2, jnp.float32),
+        jnp.ones((1, 2), jnp.float32),
         one,
-        jnp.float32(1e-12),
-        jnp.array(True),
+        1e-12 * one,
+        one > 0,
     )
     root = np.asarray(found.root, float)
     across = np.array([1.0, -1.0]) / np.sqrt(2)
