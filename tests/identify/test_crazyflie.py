@@ -42,5 +42,10 @@ def test_moments_lag_and_delay(cells):
     assert 1.96 * 50 * deviation.lag < 5
 
 
+def test_deviations_by_windows_are_too_small(cells):
+    # About y most of the motion lies in three seconds.
+    assert cells["spread"][1] > 2 * cells["by_windows"][1]
+
+
 def test_rates_are_predicted_at_half_the_error_of_holding_them(cells):
     assert cells["both"] < 0.45
