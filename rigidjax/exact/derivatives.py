@@ -42,8 +42,9 @@ from rigidjax.exact.sigma_form import Differences
 from rigidjax.rotation.barrier import one_kernel
 from rigidjax.rotation.linalg3 import components
 
-# A series of second order in time is accurate to round-off below this turn (rad).
-_STILL = {jnp.dtype("float32"): 1e-4, jnp.dtype("float64"): 1e-9}
+# Below this turn, rad, a series of third order in time is used. Its second derivatives are off by
+# the square of the turn, those of the other form by round-off over the turn.
+_STILL = {jnp.dtype("float32"): 5e-3, jnp.dtype("float64"): 5e-6}
 
 
 # Up to so many times a loop over them compiles sooner than one batch, and is as fast but for the
@@ -171,9 +172,13 @@ def slopes(moments: Six, momentum: Triple, t: Scalar) -> tuple[tuple[Triple, Fou
     _, k, energy2 = reciprocal(moments, momentum)
     p1, p2, p3 = momentum
     h2 = p1 * p1 + p2 * p2 + p3 * p3
-    still = jax.lax.stop_gradient(h2 * (k[0] * k[0]) * (t * t)) <= _STILL[t.dtype] ** 2
+    most = h2 * (k[0] * k[0] + k[1] * k[1] + k[2] * k[2])
+    still = jax.lax.stop_gradient(most * (t * t)) <= _STILL[t.dtype] ** 2
     r = 1.0 / jnp.where(still, 1.0, h2)
     rate = times(k, momentum)
+    pull = cross(momentum, rate)
+    gain = times(k, pull)
+    pulled = plus(cross(pull, rate), cross(momentum, gain))
     squares = (p1 * p1, p2 * p2, p3 * p3, p1 * p2, p1 * p3, p2 * p3)
     weights = [c * (t * a + b) for c, a, b in zip(HALF, squares, g, strict=True)]
 
@@ -186,12 +191,17 @@ def slopes(moments: Six, momentum: Triple, t: Scalar) -> tuple[tuple[Triple, Fou
         along = sum(a * b for a, b in zip(weights, d_k, strict=True))
         along = along + t * sum(a * b for a, b in zip(rate, start, strict=True)) + energy2 * et
         theta = tuple(r * (a + b * along) for a, b in zip(across, out, strict=True))
-        # At rest, to second order in time.
+        # Near rest by a series: θ' = δΩ − Ω × θ, with Ω = KΠ and Π' = Π × Ω.
         faster = plus(times(d_k, momentum), times(k, start))
-        bent = times(k, plus(cross(start, rate), cross(momentum, faster)))
-        bent = plus(plus(bent, times(d_k, cross(momentum, rate))), cross(faster, rate))
-        near = zip(faster, bent, times(k, out), strict=True)
-        near = tuple(t * (a + 0.5 * t * b) + et * c for a, b, c in near)
+        d_pull = plus(cross(start, rate), cross(momentum, faster))
+        gained = plus(times(d_k, pull), times(k, d_pull))
+        bent = plus(gained, cross(faster, rate))
+        d_jerk = plus(plus(cross(d_pull, rate), cross(pull, faster)), cross(start, gain))
+        jerk = plus(d_jerk, cross(momentum, gained))
+        third = plus(times(d_k, pulled), times(k, jerk))
+        third = plus(plus(third, cross(plus(faster, faster), gain)), cross(bent, rate))
+        near = zip(faster, bent, third, times(k, out), strict=True)
+        near = tuple(t * (a + t * (b / 2 + t * c / 6)) + et * d for a, b, c, d in near)
         theta = tuple(jnp.where(still, a, b) for a, b in zip(near, theta, strict=True))
         return d_out, theta, plus(times(k, d_out), times(d_k, out))
 

@@ -229,12 +229,10 @@ def assess(
             if float(np.sum((linear.rows @ np.asarray(away)) ** 2)) > 2 * margin:
                 rivals.append(item)
     rival = f"{len(rivals)} of {len(starts)} starts fit as well elsewhere" if rivals else ""
-    lost = believable and not any(start.fits for start in starts)
-    if lost:
+    if believable and not any(start.fits for start in starts):
         remarks = ("no single start came near the best point", *remarks)
     unreal = of_charts(of, flat_limit.bodies_of(problem, value))
-    model = Answer(model.word, (*unreal, *model.reasons))
-    model = model if np.isfinite(best_cost) else Answer(FAILS)
+    model = Answer(model.word, (*unreal, *model.reasons)) if best_cost < np.inf else Answer(FAILS)
     return Fit(
         problem,
         value,

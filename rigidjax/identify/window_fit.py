@@ -252,9 +252,7 @@ def fit_windows(
     converged = bool(end.converged)
     message = [] if converged else [f"stopped after {taken} steps: its best point"]
     deviation, words = _deviations(there, np.asarray(end.point), windows.count)
-    body, law = scene(value)
-    remarks = (unreal(body) or flat_limit.in_words(body), _too_late(windows, law))
-    message += [*words, *(remark for remark in remarks if remark)]
+    message += [*words, *_remarks(scene, value, windows)]
     return WindowFit(
         value,
         back(jnp.asarray(deviation)),
@@ -265,6 +263,16 @@ def fit_windows(
         "; ".join(message),
         scene,
     )
+
+
+def _remarks(scene: Any, value: Any, windows: Windows) -> list[str]:
+    try:
+        body, law = scene(value)
+    except ValueError as wrong:
+        # A long fit returns its best point.
+        return [f"at the best point the scene raises: {wrong}"]
+    found = (unreal(body) or flat_limit.in_words(body), _too_late(windows, law))
+    return [remark for remark in found if remark]
 
 
 def _deviations(there: Search, point: np.ndarray, count: int) -> tuple[np.ndarray, list[str]]:

@@ -244,3 +244,22 @@ def test_numbers_of_no_real_body_are_said():
 
     found = identify.fit_windows(cut, scene, jnp.log(jnp.array([1.0, 1.2, 1.5])))
     assert "no real body has these numbers" in found.message
+
+
+def test_a_best_point_that_is_no_body_is_returned_with_a_word():
+    """The scene takes any numbers while they are traced, and refuses those that were found."""
+    t = jnp.linspace(0.0, 1.0, 21)
+    # About y with a moment of 0.9, where the second moment about z, 1, leaves −0.1 about x.
+    rate, angle = jnp.exp(-t / 0.9), 0.9 * (1.0 - jnp.exp(-t / 0.9))
+    zero = jnp.zeros((21, 3))
+    q = jax.vmap(rj.quaternion.exp)(zero.at[:, 1].set(angle))
+    states = rj.Rigid(zero, zero, q, zero.at[:, 1].set(rate))
+    drag = rj.torques.Damping(jnp.ones(3))
+    scene = lambda k: (
+        rj.MassProperties(1.0, jnp.zeros(3), jnp.diag(jnp.stack([k, 1.0, 1.0]))),
+        drag,
+    )
+    windows = rj.identify.windows(t, states, length=10)
+    found = rj.identify.fit_windows(windows, scene, jnp.asarray(0.2), noise={"x": 1.0, "v": 1.0, "q": 1e-3, "omega": 1e-3})  # fmt: skip
+    np.testing.assert_allclose(found.value, -0.1, atol=1e-3)
+    assert "at the best point the scene raises: second moment" in found.message
