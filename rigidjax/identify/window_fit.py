@@ -144,7 +144,8 @@ class WindowFit(eqx.Module, Generic[Value]):
 
     **Fields:** `value` the free numbers, of the type of the guess; `deviation` their standard
     deviations, from the differences between windows (sandwich; they are too small if windows
-    overlap), infinite for a number that no window shows, NaN if windows are too few;
+    overlap, or if neighbours share what the model lacks: then leave out one stretch of the record
+    after the other), infinite for a number that no window shows, NaN if windows are too few;
     `cost` half the mean square, errors in units of `noise`; `noise` by kind; `steps` taken over the
     whole windows;
     `converged`; `message` remarks; `scene` as given.
