@@ -43,6 +43,8 @@ class AbstractBodyChart(eqx.Module):
     log_names: eqx.AbstractVar[tuple[str, ...]]
     plain_names: ClassVar[tuple[str, ...]] = ()
     unit: ClassVar[str] = ""
+    # Of the bodies that `Problem` hands out; within a fit a torque on them is no mistake.
+    scale: ClassVar[str | None] = None
 
     @abc.abstractmethod
     def body(self, vector: Float[Array, " chart"]) -> Inertia | MassProperties:
@@ -83,9 +85,10 @@ class Ratios(AbstractBodyChart):
 
     size: ClassVar[int] = 5
     log_names: ClassVar[tuple[str, ...]] = ("I1/I3", "I2/I3")
+    scale: ClassVar[str | None] = "arbitrary"
 
     def body(self, vector: Float[Array, " chart"]) -> Inertia:
-        return Inertia(swap_trace(charts.unpack_shape(vector)), scale="arbitrary")
+        return Inertia(swap_trace(charts.unpack_shape(vector)))
 
     def vector(self, body: Inertia) -> Float[Array, " chart"]:
         return charts.pack_shape(body.second_moment)
@@ -112,10 +115,10 @@ class PrincipalRatios(AbstractBodyChart):
 
     size: ClassVar[int] = 2
     log_names: ClassVar[tuple[str, ...]] = ("Ix/Iz", "Iy/Iz")
+    scale: ClassVar[str | None] = "arbitrary"
 
     def body(self, vector: Float[Array, " chart"]) -> Inertia:
-        moments = charts.unpack_moments(_padded(vector, 1, 0)) / 3.0
-        return Inertia(jnp.diag(moments), scale="arbitrary")
+        return Inertia(jnp.diag(charts.unpack_moments(_padded(vector, 1, 0)) / 3.0))
 
     def vector(self, body: Inertia) -> Float[Array, " chart"]:
         return charts.pack_moments(jnp.diagonal(body.tensor))[1:]
@@ -375,7 +378,7 @@ class Bodies(eqx.Module):
     def all(self, vector: Float[Array, " numbers"]) -> dict[str, Any]:
         """Every body by its name."""
         parts = self.parts(vector)
-        return {n: c.body(parts[n]) for n, c in zip(self.names, self.charts, strict=True)}
+        return {n: scaled(c, parts[n]) for n, c in zip(self.names, self.charts, strict=True)}
 
     def body(self, vector: Float[Array, " chart"], which: Int[Array, ""]) -> Any:
         """The body at the index `which`, from its numbers, padded with zeros."""
@@ -385,11 +388,21 @@ class Bodies(eqx.Module):
             here = jnp.where(kind == index, row, 0)
             chart = jax.tree.map(lambda leaf, at=here: leaf[at], alike)
             body = chart.body(vector[: chart.size])
+            leaves, form = jax.tree.flatten(body)
             if found is not None:
-                mine = kind == index
-                body = jax.tree.map(lambda a, b, mine=mine: jnp.where(mine, a, b), body, found)
+                # The body of a `Known` may have a scale of its own, which is no number.
+                both = zip(leaves, jax.tree.leaves(found), strict=True)
+                body = jax.tree.unflatten(form, [jnp.where(kind == index, *pair) for pair in both])
             found = body
         return found
+
+
+def scaled(chart: AbstractBodyChart, vector: Float[Array, " chart"]) -> Inertia | MassProperties:
+    """The body of a chart as a user gets it: it says if its scale is arbitrary."""
+    body = chart.body(vector)
+    if chart.scale is None or isinstance(body, MassProperties):
+        return body
+    return Inertia(body.tensor, chart.scale)
 
 
 def spread(

@@ -26,9 +26,9 @@ LINEAR = 0.05
 PATIENCE, FIRST_PACE = 25.0, 4.0
 # Damping beyond which nothing moves.
 STUCK = 1e12
-# Shorter steps of a smooth cost rise less and less above the predicted gain. Where two refused ones
-# in a row rise more, the second by so many times the gain, and that is so small a part of the cost,
-# the cost has noise, as that of adaptive steps has.
+# The cost has noise, as that of adaptive steps has, if the second of two refused steps rises by
+# more of its predicted gain than the first did, by ten times of it at least, and that gain is
+# a small part of the cost. Shorter steps of a smooth cost rise by less and less of it.
 NOISY, LITTLE = 10.0, 1e-4
 
 

@@ -14,7 +14,13 @@ from rigidjax import _checks
 from rigidjax._types import HasAttitude, HasPose, Scalar
 from rigidjax.body.inertia import Inertia, MassProperties
 from rigidjax.identify import padding
-from rigidjax.identify.body_charts import AbstractBodyChart, Bodies, charts_of, has_mass
+from rigidjax.identify.body_charts import (
+    AbstractBodyChart,
+    Bodies,
+    charts_of,
+    has_mass,
+    scaled,
+)
 from rigidjax.identify.full_scale import with_limits
 from rigidjax.identify.loss import AbstractLoss, Entropic
 from rigidjax.identify.parameters import (
@@ -224,7 +230,7 @@ class Problem(eqx.Module):
         """The body that the parameters represent; for several bodies a dict by name."""
         if isinstance(self.body, Bodies):
             return self.body.all(parameters.body)
-        return self.body.body(parameters.body)
+        return scaled(self.body, parameters.body)
 
     def scenes(self, parameters: Parameters) -> Recording:
         """The recordings with the parameters' values in the slots, with a leading axis."""

@@ -98,9 +98,10 @@ def _tolerance(value: ScalarLike) -> Array:
 
 
 class Adaptive(AbstractIntegrator):
-    """Steps chosen by the tolerances, through `rigidjax.simulate`; others do not compile again.
+    """Steps chosen by the tolerances, through `rigidjax.simulate`.
 
-    **Arguments:** `rtol`, `atol` as there. In float32 `rtol` is at least 1.2e-5.
+    **Arguments:** `rtol`, `atol` as there. In float32 `rtol` is at least 1.2e-5. Another tolerance
+    does not compile again.
 
     >>> float(Adaptive().rtol)
     1e-09

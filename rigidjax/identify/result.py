@@ -131,7 +131,7 @@ class Fit(eqx.Module):
 
     @property
     def body(self) -> Any:
-        """The body, up to scale if the chart has none; for several bodies a dict by name."""
+        """The body, of `scale` "arbitrary" if its chart has none; for several a dict by name."""
         return self.problem.unpack(self.parameters)[0]
 
     @property

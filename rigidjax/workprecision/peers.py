@@ -19,7 +19,6 @@ from rigidjax.workprecision.scene import Method, Ready, Run, Scene
 TOLERANCES = (1e-4, 1e-7, 1e-10, 1e-13)
 TAYLOR = (1e-4, 1e-6, 1e-8, 1e-10, 1e-12, 1e-14)
 STEPS = (5e-2, 2e-2, 5e-3)
-RECORDED = (1e-4, 1e-6, 1e-8, 1e-10, 1e-12)
 
 
 def _start(scene: Scene) -> np.ndarray:

@@ -87,3 +87,23 @@ def test_a_free_centre_is_found_from_where_a_body_turns_about():
 def test_mistakes_are_named(free, words):
     with pytest.raises(ValueError, match=words):
         identify.Mass(BOX, free)
+
+
+def test_bodies_with_and_without_a_scale_in_one_problem():
+    """Only what a user gets says so: within a fit a torque on a body of ratios is no mistake."""
+    ts = jnp.linspace(0.0, 3.0, 12)
+    law = rj.torques.Damping([0.1, 0.1, 0.1])
+    omega = rj.simulate(rj.Inertia.from_principal(1.0, 1.6, 2.1), rj.Spin([1.0, 2, 0.3]), ts, law).ys.omega  # fmt: skip
+    record = identify.Recording(ts, (identify.Gyro(0.01), omega), torque=law)
+    known = rj.Inertia(jnp.diag(jnp.array([0.5, 0.7, 0.8])), "arbitrary")
+    charts = {"a": identify.Ratios(), "b": identify.Tensor(1.0), "c": identify.PrincipalRatios()}
+    steps = identify.Adaptive(1e-6, 1e-9)
+    problem = identify.Problem({name: record for name in charts}, charts, integrator=steps)
+    start = problem.start()
+    assert np.isfinite(np.asarray(problem.errors(start)[0])).all()
+    bodies, _ = problem.unpack(start)
+    assert [bodies[name].scale for name in "abc"] == ["arbitrary", None, "arbitrary"]
+    mixed = {"a": identify.Known(known), "b": identify.Tensor(1.0)}
+    problem = identify.Problem({name: record for name in mixed}, mixed)
+    assert np.isfinite(np.asarray(problem.errors(problem.start())[0])).all()
+    assert problem.unpack(problem.start())[0]["a"].scale == "arbitrary"
