@@ -28,19 +28,19 @@ HALF, QUARTER, TENTH = 0.5, 0.25, 0.1
 
 
 def goodness(
-    problem: Problem, linear: Linearised, times: Times, free: int
+    problem: Problem, linear: Linearised, times: Times, covariance: np.ndarray
 ) -> tuple[float, int, Answer, tuple[int, ...]]:
     """χ² and its degrees of freedom (sensors of given noise), the answer, the sensors left over.
 
     The size of the errors is compared with a given noise (five standard deviations of χ², or of the
     median of the squares under a robust loss) and with the variance of the readings; Ljung and
     Box's test (1978, doi:10.1093/biomet/65.2.297) says whether they are white. Readings at full
-    scale take no part.
+    scale take no part. `covariance` (n, n) is that of white errors.
     """
-    chi2, count, word = 0.0, 0, EXPLAINS
+    chi2, count, word, free = 0.0, 0, EXPLAINS, linear.size
     words: list[str] = []
     sensors: list[int] = []
-    cut = at_limit(problem.records.readings)
+    cut, own = at_limit(problem.records.readings), linear.blocks(covariance)
     for index, (reading, error, e, weight, full) in enumerate(
         zip(problem.records.readings, linear.raw, linear.errors, linear.weights, cut, strict=True)
     ):
@@ -48,14 +48,16 @@ def goodness(
         left, varies, tiny = _sizes(reading, error, kept)
         factor = 1.0
         if given:
-            own, many = float(np.sum((weight[..., None] * e**2)[kept])), int(kept.sum())
-            chi2, count = chi2 + own, count + many
+            total, many = float(np.sum((weight[..., None] * e**2)[kept])), int(kept.sum())
+            chi2, count = chi2 + total, count + many
             dof = max(many - free, 1)
-            factor = float(np.sqrt(own / dof)) if own > dof + 5 * np.sqrt(2 * dof) else 1.0
+            factor = float(np.sqrt(total / dof)) if total > dof + 5 * np.sqrt(2 * dof) else 1.0
             if problem.loss is not None and many:
                 rows = kept.all(axis=-1) & (weight > 0)
                 factor = _median_above(np.sum(e[rows] ** 2, axis=-1), e.shape[-1])
-        white = left <= tiny or _white(e * np.sqrt(weight)[..., None], kept, given)
+        root = np.sqrt(weight)[..., None]
+        slope = linear.slopes[index] * root[..., None]
+        white = left <= tiny or _white(e * root, kept, slope, own, given)
         late = left > tiny and clock(problem, linear, index) is not None
         # Errors below a given noise cannot hide a missing part of the model.
         small = given or left <= QUARTER * varies + tiny
@@ -148,24 +150,36 @@ def median_of_chi2(size: int) -> tuple[float, float]:
     return median, float(density)
 
 
-def _white(e: np.ndarray, kept: np.ndarray, given: bool) -> bool:
+def _white(
+    e: np.ndarray, kept: np.ndarray, slope: np.ndarray, covariance: np.ndarray, given: bool
+) -> bool:
     """Whether whitened errors (R, T, k) are white; errors far below a `given` noise are no
     evidence.
+
+    Fitted numbers take `slope covariance slopeᵀ` of white errors away, and leave them correlated,
+    which shows in many short recordings (Box and Pierce 1970, doi:10.1080/01621459.1970.10481180).
     """
     from scipy.special import chdtrc
 
     total, degrees = 0.0, 0
     for channel in range(e.shape[-1]):
-        rows = [x[seen] for x, seen in zip(e[..., channel], kept[..., channel], strict=True)]
-        rows = [row - row.mean() for row in rows if row.size >= 2 * LAGS]
+        rows, taken = [], []
+        for x, seen, j, c in zip(
+            e[..., channel], kept[..., channel], slope[..., channel, :], covariance, strict=True
+        ):
+            if seen.sum() >= 2 * LAGS:
+                j = j[seen] - j[seen].mean(axis=0)
+                rows.append(x[seen] - x[seen].mean())
+                taken.append((j @ c, j))
         size = sum(row.size for row in rows)
-        squares = sum(float(row @ row) for row in rows)
-        squares = max(squares, float(size)) if given else squares
+        own = sum(float(row @ row) for row in rows)
+        squares = max(own, float(size)) if given else own
         if not squares > 0:
             continue
         for lag in range(1, LAGS + 1):
             pairs = size - lag * len(rows)
-            rho = sum(float(row[lag:] @ row[:-lag]) for row in rows) / squares
+            lost = pairs / size * len(rows) + sum(np.sum(a[lag:] * b[:-lag]) for a, b in taken)
+            rho = (sum(float(row[lag:] @ row[:-lag]) for row in rows) + lost * own / size) / squares
             total += size * (size + 2.0) * rho**2 / pairs
             degrees += 1
     return degrees == 0 or bool(chdtrc(degrees, total) > RARE)
@@ -211,7 +225,7 @@ def assess(
     # Steps stay short in a long curved valley, although hardly anything is left to gain.
     held = [limit.slope for limit in limits if limit.free < 0]
     done = bool(best.converged) or uncertainty.distance(linear, white, held) < AT_THE_END
-    chi2, dof, model, left = goodness(problem, linear, times, linear.size)
+    chi2, dof, model, left = goodness(problem, linear, times, white.seen)
     believable = model.word != FAILS
     # Ten units of log-likelihood, of the noise as estimated; autocorrelated errors count as fewer.
     guessed = any(sensor.noise is None for sensor in problem.records.sensors)

@@ -72,6 +72,12 @@ class Linearised(eqx.Module):
         np.add.at(wide.T, where, block.T)
         return wide[..., :-1]
 
+    def blocks(self, covariance: np.ndarray) -> np.ndarray:
+        """The covariance (R, m, m) of each recording's numbers; zero if it is not finite."""
+        known = covariance if np.isfinite(covariance).all() else np.zeros_like(covariance)
+        wide = np.pad(known, (0, 1))
+        return wide[self.places[:, :, None], self.places[:, None, :]]
+
     @property
     def scores(self) -> np.ndarray:
         """The part of each recording in the gradient of the misfit, (R, n)."""

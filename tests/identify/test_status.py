@@ -308,3 +308,15 @@ def test_time_stamps_that_scatter_are_named_and_can_be_a_sensor():
                 low, high = np.array([found.interval()[name] for name in ("I1/I3", "I2/I3")]).T
                 true = np.array([1.0, 1.6]) / 2.2
                 assert (low < true).all() and (true < high).all() and (high - low < 0.02).all()
+
+
+def test_many_short_recordings_are_no_correlated_errors():
+    # Three numbers fitted to each of 120 records of 24 rates take a part of the errors away, and
+    # what is left is correlated, by −1 % at each lag: over all records this shows.
+    ts = jnp.linspace(0.0, 2.0, 24)
+    rates = 3.0 * np.random.default_rng(0).normal(size=(120, 3))
+    motions = jax.vmap(lambda rate: rj.simulate(BODY, rj.Spin(rate), ts).ys.omega)(rates)
+    read = np.asarray(motions) + SIGMA * np.random.default_rng(1).normal(size=motions.shape)
+    records = [identify.Recording(ts, (identify.Gyro(SIGMA), rows)) for rows in read]
+    found = identify.fit(identify.Problem(records, identify.Ratios()), starts=1)
+    assert found.status == "ok"
