@@ -141,6 +141,13 @@ def test_linear_of_any_number_of_channels_under_jit_and_vmap():
     rows = np.stack([t**3, 1 - t**3, 0 * t], 1)
     spline = jax.jit(lambda t, v: torques.Series(t, v)(1.23))(t, rows)
     np.testing.assert_allclose(spline, [1.23**3, 1 - 1.23**3, 0.0], rtol=0, atol=1e-14)
+    # Round-off of the times makes no uneven ones: seconds since 1970, and float32 under `jit`.
+    unix = np.linspace(0.0, 10.0, 80) + 1.7e9
+    lately = torques.Series(unix, np.sin(unix - 1.7e9))(1.7e9 + 3.3)
+    np.testing.assert_allclose(lately, np.sin(3.3), rtol=0, atol=1e-5)
+    short = jnp.linspace(0.0, 10.0, 1000, dtype=jnp.float32)
+    single = jax.jit(lambda t: torques.Series(t, jnp.sin(t))(jnp.float32(3.3)))(short)
+    np.testing.assert_allclose(single, np.sin(3.3), rtol=0, atol=1e-5)
 
 
 @pytest.mark.parametrize(

@@ -23,10 +23,10 @@ class Series(eqx.Module):
     A division finds the interval of a time, so that it costs little in a solver; its derivative is
     continuous, so that a step may pass over a sample.
 
-    **Arguments:** `times` (n,) s, evenly spaced to 1e-6 of a step; `values` (n,) or (n, k). Both
-    may be traced: it can be made under `jit`, `vmap` and `grad`. The third derivative does not jump
-    at the second sample and the last but one ("not a knot": de Boor, A Practical Guide to Splines,
-    ch. IV).
+    **Arguments:** `times` (n,) s, evenly spaced to 1e-6 of a step and the round-off of times such
+    as 1.7e9 s; `values` (n,) or (n, k). Both may be traced: it can be made under `jit`, `vmap` and
+    `grad`. The third derivative does not jump at the second sample and the last but one ("not a
+    knot": de Boor, A Practical Guide to Splines, ch. IV).
 
     **Raises:** `ValueError` (`equinox` error under `jit`) for fewer than four samples, lengths that
     differ, NaN, uneven times; `TypeError` for anything but numbers.
@@ -47,7 +47,8 @@ class Series(eqx.Module):
             raise ValueError(f"Series: wanted at least four times and as many rows, {words}")
         t, rows = _checks.finite(t, "Series: times"), _checks.finite(rows, "Series: values")
         step = (t[-1] - t[0]) / (t.size - 1)
-        uneven = ~((step > 0) & (abs(t[1:] - t[:-1] - step).max() <= 1e-6 * step))
+        slack = 1e-6 * step + 4 * float(jnp.finfo(t.dtype).eps) * abs(t).max()
+        uneven = ~((step > 0) & (abs(t[1:] - t[:-1] - step).max() <= slack))
         words = "Series: wanted evenly spaced, increasing times; resample, or use Linear"
         step = _checks.refuse(step, uneven, words)
         dtype = jnp.result_type(float)
