@@ -47,7 +47,8 @@ class Series(eqx.Module):
             raise ValueError(f"Series: wanted at least four times and as many rows, {words}")
         t, rows = _checks.finite(t, "Series: times"), _checks.finite(rows, "Series: values")
         step = (t[-1] - t[0]) / (t.size - 1)
-        slack = 1e-6 * step + 4 * float(jnp.finfo(t.dtype).eps) * abs(t).max()
+        kind = np.promote_types(getattr(times, "dtype", float), np.float16)
+        slack = 1e-6 * step + 4 * float(jnp.finfo(kind).eps) * abs(t).max()
         uneven = ~((step > 0) & (abs(t[1:] - t[:-1] - step).max() <= slack))
         words = "Series: wanted evenly spaced, increasing times; resample, or use Linear"
         step = _checks.refuse(step, uneven, words)
