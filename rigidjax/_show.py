@@ -28,6 +28,12 @@ def shown(value: Any) -> str:
     return _nested(np.asarray(value).tolist())
 
 
+def time(t: Any, span: Any, digits: int = 6) -> str:
+    """A time, with so many digits of the `span` of its record: seconds since 1970 need more."""
+    more = np.log10(max(abs(float(t)), 1e-300) / float(span)) if span > 0 else 0.0
+    return f"{float(t):.{digits + max(0, int(np.ceil(more)))}g}"
+
+
 def _nested(value: Any) -> str:
     if isinstance(value, list):
         return f"[{', '.join(map(_nested, value))}]"

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
+from rigidjax import _show
 from rigidjax.identify import flat_limit, uncertainty
 from rigidjax.identify.answers import EXPLAINS, FAILS, FOUND, LEAVES, NOT_ALONE, NOT_ENDED, Answer
 from rigidjax.identify.causes import clock
@@ -119,7 +120,8 @@ def _where(problem: Problem, error: np.ndarray, kept: np.ndarray) -> str:
     if end - begin > 0.4 * (t[-1] - t[0]):
         return "all along"
     of = f" of recording {row}" if problem.count > 1 else ""
-    return f"half of the squared ones from {begin:.4g} to {end:.4g} s{of}"
+    times = " to ".join(_show.time(when, t[-1] - t[0], 4) for when in (begin, end))
+    return f"half of the squared ones from {times} s{of}"
 
 
 def _sizes(reading: Any, error: np.ndarray, kept: np.ndarray) -> tuple[float, float, float]:

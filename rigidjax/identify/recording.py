@@ -1,5 +1,6 @@
 """A recording: times, the readings of each sensor, and the torque on the body."""
 
+import warnings
 from types import FunctionType
 from typing import Any
 
@@ -48,8 +49,9 @@ class Recording(eqx.Module):
     logged, a law with coefficients that a `Free` may move; `None` for none.
 
     **Raises** `TypeError` for traced numbers (the times that are kept depend on them) and for
-    anything but a sensor; `ValueError` for times that do not increase, a wrong shape, an unmasked
-    NaN (with its index), or a quaternion that is not unit.
+    anything but a sensor; `ValueError` for times that do not increase, also after rounding to
+    float32 (where this changes a step by a tenth, it warns), a wrong shape, an unmasked NaN (with
+    its index), or a quaternion that is not unit.
 
     >>> import rigidjax as rj
     >>> Recording([0.0, 1.0], (rj.identify.Gyro(0.01), [[1.0, 0, 0], [1.0, 0, 0]])).t.shape
@@ -93,6 +95,7 @@ class Recording(eqx.Module):
         # A long recording must not be copied more than needed.
         kept = used if self.dropped else slice(None)
         self.t = jnp.asarray(t[kept])
+        _require_digits(t[kept], np.asarray(self.t, float), self.t.dtype)
         self.readings = tuple(
             Reading(sensor, jnp.asarray(values[kept]), jnp.asarray(mask[kept]))
             for sensor, values, mask in rows
@@ -106,7 +109,8 @@ class Recording(eqx.Module):
     def __repr__(self) -> str:
         if not _checks.known(self) or np.ndim(self.t) != 1:
             return eqx.tree_pformat(self)
-        ends = f"{float(self.t[0]):g} … {float(self.t[-1]):g} s"
+        t = np.asarray(self.t)
+        ends = " … ".join(_show.time(end, t[-1] - t[0]) for end in (t[0], t[-1])) + " s"
         parts = [f"{self.t.shape[0]} times {ends}"]
         for reading in self.readings:
             first = _show.shown(np.asarray(reading.values)[int(np.argmax(reading.seen))])
@@ -135,6 +139,21 @@ def readings_of(recording: Recording, kind: type) -> list[Any]:
 def count_of(reading: Reading) -> int:
     """The number of numbers read: unmasked readings times the components of an error."""
     return reading.sensor.components * int(reading.seen.sum())
+
+
+def _require_digits(given: np.ndarray, held: np.ndarray, dtype: Any) -> None:
+    """Raise `ValueError` for times that are no longer apart in this dtype, warn of uneven ones."""
+    steps = np.diff(given)
+    off = np.abs(np.diff(held) / steps - 1)
+    index = int(np.argmax(off))
+    words = (
+        f"t: {dtype} changes the step of {steps[index]:.3g} s after {given[index]} s to "
+        f"{np.diff(held)[index]:.3g} s; count time from a later origin, or use float64"
+    )
+    if off[index] >= 1:
+        raise ValueError(words)
+    if off[index] > 0.1:
+        warnings.warn(words, stacklevel=5)
 
 
 def _reading(

@@ -26,6 +26,20 @@ try:
     raise AssertionError("not refused")
 except ValueError as error:
     assert "increasing times" in str(error) and "float32, which cannot tell" in str(error), error
+
+# A recording keeps its times as a fit uses them.
+rates = rj.identify.Gyro(), np.ones((80, 3), np.float32)
+try:
+    rj.identify.Recording(1.7e9 + np.linspace(0.0, 10.0, 80), rates)
+    raise AssertionError("not refused")
+except ValueError as error:
+    assert "float32 changes the step of 0.127 s" in str(error), error
+with warnings.catch_warnings(record=True) as heard:
+    warnings.simplefilter("always")
+    rj.identify.Recording(1e4 + np.linspace(0.0, 10.0, 80), rates)
+    assert not heard, heard
+    rj.identify.Recording(1e6 + np.linspace(0.0, 10.0, 80), rates)
+assert "count time from a later origin" in str(heard[0].message), heard
 """
 
 
