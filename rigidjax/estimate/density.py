@@ -318,7 +318,7 @@ def _of_one(
         is_leaf=lambda node: node is None,
     )
     body = what_turns(matter(problem.body, mine.body, which), problem.rung)
-    state: HasSpin = ref.moved(mine)
+    state: HasSpin = ref.moved(mine.own)
     process = density.grown(logs)
     law = process if record.torque is None else Sum(record.torque, process)
     model = Model(body, law)

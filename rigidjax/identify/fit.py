@@ -287,7 +287,7 @@ def _evaluated(best: Tried, problem: Problem) -> Tried:
 
 @eqx.filter_jit
 def _errors_alone(parameters: Parameters, problem: Problem) -> tuple[Float[Array, "..."], ...]:
-    # Without the derivatives that `errors_at` computes along: less to compile.
+    # Without the derivatives that `evaluate` computes along: less to compile.
     return all_errors(parameters, problem)[0]
 
 

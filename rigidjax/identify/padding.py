@@ -58,13 +58,14 @@ def _stacked(*leaves: Any) -> Any:
     return jnp.stack(leaves)
 
 
-def one(records: Any, index: int) -> Any:
-    """The tree at an index of the leading axis."""
+def one(records: Any, index: Any) -> Any:
+    """The tree at an index of the leading axis, or at several."""
 
     def pick(leaf: Any) -> Any:
         if not eqx.is_array(leaf):
             return leaf
-        return jnp.asarray(np.asarray(leaf)[index]) if _checks.known(leaf) else leaf[index]
+        known = _checks.known((leaf, index))
+        return jnp.asarray(np.asarray(leaf)[index]) if known else leaf[index]
 
     return jax.tree.map(pick, records)
 

@@ -290,27 +290,14 @@ class Unpacked(eqx.Module):
     process: Any = None
 
 
-class Local(eqx.Module):
-    """What one recording depends on: numbers of its body (padded to the largest chart), one step
-    for each `Free`, and the initial state as in `Own`.
+def local(
+    problem: "Problem", parameters: Parameters, fill: int = 0, join: Any = jnp.add
+) -> Parameters:
+    """What each recording depends on, with a leading axis: numbers of its body (padded by `fill` to
+    the largest chart), as `shared` one step for each `Free` (shared and own ones joined), its
+    initial state.
     """
-
-    body: Float[Array, "*records chart"]
-    steps: tuple[Array, ...]
-    place: Float[Array, "*records 3"] | None
-    speed: Float[Array, "*records 3"] | None
-    turn: Float[Array, "*records 3"] | None
-    spin: Float[Array, "*records 3"]
-
-
-def local(problem: "Problem", parameters: Parameters) -> Local:
-    """The numbers that each recording depends on, with a leading axis over recordings."""
-    return Local(*_of_each(problem, parameters, 0, jnp.add))
-
-
-def _of_each(problem: "Problem", parameters: Parameters, fill: int, join: Any) -> tuple[Any, ...]:
-    """The fields of `local`: body numbers padded with `fill`, shared and own steps joined."""
-    own, steps = parameters.own, []
+    steps = []
     for slot, shared, each in by_slot(problem, parameters):
         if shared is None:
             steps.append(each)
@@ -320,7 +307,8 @@ def _of_each(problem: "Problem", parameters: Parameters, fill: int, join: Any) -
         step = jnp.broadcast_to(shared, wide) if slot.groups is None else shared[slot.groups]
         steps.append(step if each is None else join(step, each))
     body = spread(problem.body, parameters.body, problem.which, problem.count, fill=fill)
-    return body, tuple(steps), own.place, own.speed, own.turn, own.spin
+    parts = body, tuple(steps), ()
+    return eqx.tree_at(lambda p: (p.body, p.shared, p.own.each), parameters, parts)
 
 
 def by_slot(problem: "Problem", parameters: Parameters) -> list[tuple["Slot", Any, Any]]:
@@ -332,11 +320,11 @@ def by_slot(problem: "Problem", parameters: Parameters) -> list[tuple["Slot", An
     return list(zip(problem.slots, of_all, of_each, strict=True))
 
 
-def columns(problem: "Problem", one: Local) -> np.ndarray:
+def columns(problem: "Problem", one: Parameters) -> np.ndarray:
     """The recording's number of each column of its block: all; then shared ones with a deviation
     again.
     """
-    steps = zip(problem.slots, numbered(one).steps, strict=True)
+    steps = zip(problem.slots, numbered(one).shared, strict=True)
     twice = [np.ravel(step) for slot, step in steps if slot.spread is not None]
     size = sum(np.size(leaf) for leaf in jax.tree.leaves(one))
     return np.concatenate([np.arange(size), *twice]).astype(int)
@@ -346,7 +334,7 @@ def places(problem: "Problem", parameters: Parameters) -> Int[Array, "records co
     """Each column's place in the flattened parameters; n for a column of no number."""
     counted = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.int32), numbered(parameters))
     size = ravel_pytree(parameters)[0].size
-    first = _of_each(problem, counted, size, lambda shared, each: shared)
+    first = local(problem, counted, size, lambda shared, each: shared)
     twice = [each for slot, _, each in by_slot(problem, counted) if slot.spread is not None]
     rows = [leaf.reshape(problem.count, -1) for leaf in (*jax.tree.leaves(first), *twice)]
     return jnp.concatenate(rows, axis=1)

@@ -122,7 +122,7 @@ class ReferenceStates(eqx.Module):
         return jnp.repeat(jnp.stack([sizes[name] for name in names(self.state)], -1), 3, -1)
 
     def moved(self, own: Any) -> Any:
-        """The initial state of one recording; `own` an `Own` or a `Local`."""
+        """The initial state of one recording."""
         parts = (own.place, own.speed, own.turn, own.spin)
         change = jnp.concatenate([part for part in parts if part is not None])
         return plus(self.state, self.units * change)

@@ -19,6 +19,7 @@ from rigidjax.identify.identifiability import Combination, undetermined
 from rigidjax.identify.parameters import Parameters, Unpacked
 from rigidjax.identify.problem import Problem
 from rigidjax.identify.quantities import Quantity, carried, cut_ends, cuts_of, quantile
+from rigidjax.identify.search import evaluate
 from rigidjax.identify.terms import Noise
 
 
@@ -161,7 +162,7 @@ class Fit(eqx.Module):
 
         With several recordings a leading axis.
         """
-        errors = uncertainty.errors_at(self.parameters, self.problem)
+        errors = evaluate(self.parameters, self.problem)[0][0]
         return tuple(e[0] for e in errors) if self.problem.count == 1 else errors
 
     @property
@@ -169,7 +170,7 @@ class Fit(eqx.Module):
         """Root mean square length of each sensor's error, in its unit; without full scale."""
         out = []
         readings = self.problem.records.readings
-        errors = uncertainty.errors_at(self.parameters, self.problem)
+        errors = evaluate(self.parameters, self.problem)[0][0]
         for error, reading, full in zip(errors, readings, at_limit(readings), strict=True):
             kept = reading.seen & ~full.any(axis=-1)
             lengths = np.sum(np.asarray(error) ** 2, axis=-1)[kept if kept.any() else reading.seen]

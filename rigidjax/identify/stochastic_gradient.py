@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from rigidjax import _checks
+from rigidjax.identify import padding
 from rigidjax.identify.parameters import Parameters
 from rigidjax.identify.problem import Problem
 from rigidjax.identify.terms import Noise, half_sum, residuals
@@ -104,7 +105,7 @@ def _stride(
 
 def _misfit_of(point: Parameters, problem: Problem, noise: Noise, rows: Array) -> Float[Array, ""]:
     """These recordings' misfit times the number of batches; priors count once."""
-    few, mine, theirs = only(problem, rows), _rows(point.own, rows), tuple(n[rows] for n in noise)
+    few, (mine, theirs) = only(problem, rows), padding.one((point.own, noise), rows)
     weights = jnp.ones_like(few.records.t)
     read, beside = residuals(Parameters(point.body, point.shared, mine), (few, theirs, weights))
     return half_sum(read) * (problem.count / rows.shape[0]) + half_sum(beside)
@@ -114,16 +115,9 @@ def only(problem: Problem, rows: Array) -> Problem:
     """The problem of some recordings (traced indices), for misfits: they keep their padding."""
 
     def pick(at: Any, whole: Any) -> Any:
-        return whole if at(whole) is None else eqx.tree_at(at, whole, _rows(at(whole), rows))
+        return whole if at(whole) is None else eqx.tree_at(at, whole, padding.one(at(whole), rows))
 
     for at in (lambda p: p.records, lambda p: p.reference, lambda p: p.which):
         problem = pick(at, problem)
     slots = tuple(pick(lambda slot: slot.groups, slot) for slot in problem.slots)
     return eqx.tree_at(lambda p: p.slots, problem, slots) if slots else problem
-
-
-def _rows(tree: Any, rows: Array) -> Any:
-    def pick(leaf: Any) -> Any:
-        return leaf[rows] if eqx.is_array(leaf) else leaf
-
-    return jax.tree.map(pick, tree)

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float
 
 from rigidjax.identify import padding
 from rigidjax.identify.body_charts import Bodies, matter
-from rigidjax.identify.parameters import Local, Parameters, by_slot, columns, local, places, put
+from rigidjax.identify.parameters import Parameters, by_slot, columns, local, places, put
 from rigidjax.identify.propagation import sensor_inputs, states_at, what_turns
 from rigidjax.identify.recording import Recording
 from rigidjax.identify.reference_states import ReferenceStates
@@ -24,29 +24,33 @@ if TYPE_CHECKING:
     from rigidjax.identify.problem import Problem
 
 
-def filled(problem: "Problem", mine: Local, record: Recording) -> Recording:
+# The index of a recording's body; `None` of one body.
+Which = Array | None
+
+
+def filled(problem: "Problem", mine: Parameters, record: Recording) -> Recording:
     """One recording with the values of the free numbers in it."""
     values = [
         slot.move(slot.read(record), step)
-        for slot, step in zip(problem.slots, mine.steps, strict=True)
+        for slot, step in zip(problem.slots, mine.shared, strict=True)
     ]
     return put(record, problem.slots, values)
 
 
 def states_of_one(
-    problem: "Problem", mine: Local, record: Recording, ref: ReferenceStates, which: Array | None
+    problem: "Problem", mine: Parameters, record: Recording, ref: ReferenceStates, which: Which
 ) -> tuple[Recording, Any, Any, Any]:
     """One recording with its values filled in, its body, initial state and states."""
     record = filled(problem, mine, record)
     body = matter(problem.body, mine.body, which)
-    state0 = ref.moved(mine)
+    state0 = ref.moved(mine.own)
     turned = what_turns(body, problem.rung)
     states = states_at(problem.integrator, turned, state0, record.t, record.torque)
     return record, body, state0, states
 
 
 def errors_of_one(
-    problem: "Problem", mine: Local, record: Recording, ref: ReferenceStates, which: Array | None
+    problem: "Problem", mine: Parameters, record: Recording, ref: ReferenceStates, which: Which
 ) -> tuple[tuple[Array, ...], Any]:
     """The errors (T, k) of each sensor in one recording, and the last state."""
     record, body, state0, states = states_of_one(problem, mine, record, ref, which)
@@ -163,7 +167,7 @@ def with_blocks(parameters: Parameters, problem: "Problem") -> tuple[Any, Any]:
     single = padding.one(mine, 0)
     twice = columns(problem, single)
 
-    def of_one(one: Local, record: Recording, ref: ReferenceStates, which: Array | None) -> Any:
+    def of_one(one: Parameters, record: Recording, ref: ReferenceStates, which: Which) -> Any:
         flat, restore = ravel_pytree(one)
         blocks, out = with_jacobian(
             lambda vector: errors_of_one(problem, restore(vector), record, ref, which), flat

@@ -1,5 +1,6 @@
 """The uncertainty of a fit: covariance, for white and other errors, undetermined directions."""
 
+import dataclasses
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -8,7 +9,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float
 
 from rigidjax.identify.full_scale import at_limit
 from rigidjax.identify.parameters import Parameters, places
@@ -98,11 +98,6 @@ def _linearised(problem: Problem, parameters: Parameters, noise: Noise, found: A
     return (out, slopes, weights), places(problem, parameters), extra, extra_slopes
 
 
-def errors_at(parameters: Parameters, problem: Problem) -> tuple[Float[Array, "..."], ...]:
-    """The errors (R, T, k) of each sensor, by the program that `linearise` runs too."""
-    return evaluate(parameters, problem)[0][0]
-
-
 def linearise(
     problem: Problem,
     parameters: Parameters,
@@ -175,9 +170,8 @@ def spread(linear: Linearised, times: "Times", white: Spread | None = None) -> S
         return white
     covariance = _sandwich(linear, white.root, times)
     kind = f"sandwich: the errors are autocorrelated over {times.longest:.0f} samples"
-    null = white.null_directions
-    shown = _blinded(covariance, null)
-    return Spread(shown, covariance, kind, white.singular_values, null, white.root)
+    shown = _blinded(covariance, white.null_directions)
+    return dataclasses.replace(white, covariance=shown, seen=covariance, kind=kind)
 
 
 def _blinded(covariance: np.ndarray, null: np.ndarray) -> np.ndarray:

@@ -99,8 +99,8 @@ def test_each_recording_depends_on_its_own_body_and_group(found):
     size = sum(x.size for x in (at.body, *at.shared, at.own.spin, *at.own.each))
     np.testing.assert_array_equal(where[0, :6], np.arange(6))
     assert (where[2:, :6] == size).all()
-    np.testing.assert_array_equal(mine.steps[0][0], at.shared[0][0])
-    np.testing.assert_array_equal(mine.steps[0][3], at.shared[0][1])
+    np.testing.assert_array_equal(mine.shared[0][0], at.shared[0][0])
+    np.testing.assert_array_equal(mine.shared[0][3], at.shared[0][1])
     # A shared value and a deviation have the same derivative.
     blocks = np.asarray(evaluate(at, problem)[1][0][0])
     np.testing.assert_array_equal(blocks[..., 9:12], blocks[..., 18:21])
