@@ -135,6 +135,8 @@ _SETTLED = 1e-5
 _LEVEL, _ROUGH = 0.05**2, 1.0
 # A number of order one with a larger deviation than this is unknown.
 VAGUE = 100.0
+# A number hangs on one stretch, of so many at least, if that makes this part of its variance.
+HANGS, FEWEST = 0.85, 6
 # The search first uses a ninth and a third of the windows, if these have so many steps.
 _PARTS, _SHORTEST, _FEW = (9, 3), 5, 10
 
@@ -143,12 +145,11 @@ class WindowFit(eqx.Module, Generic[Value]):
     """The result of `fit_windows`.
 
     **Fields:** `value` the free numbers, of the type of the guess; `deviation` their standard
-    deviations, from the differences between windows (sandwich; they are too small if windows
-    overlap, or if neighbours share what the model lacks: then leave out one stretch of the record
-    after the other), infinite for a number that no window shows, NaN if windows are too few;
-    `cost` half the mean square, errors in units of `noise`; `noise` by kind; `steps` taken over the
-    whole windows;
-    `converged`; `message` remarks; `scene` as given.
+    deviations, by leaving out one stretch of the windows after the other (jackknife: the errors of
+    neighbours may be alike), infinite for a number that no window or only one stretch shows, NaN
+    if windows are too few; `stretches` their number; `cost` half the mean square, errors in units
+    of `noise`; `noise` by kind; `steps` taken over the whole windows; `converged`; `message`
+    remarks; `scene` as given.
 
     >>> import rigidjax as rj
     >>> t = np.linspace(0.0, 1.0, 11)
@@ -162,12 +163,27 @@ class WindowFit(eqx.Module, Generic[Value]):
 
     value: Value
     deviation: Value
+    stretches: int
     cost: float
     noise: dict[str, float]
     steps: int
     converged: bool
     message: str
     scene: Callable[[Value], tuple[Any, Any]]
+
+    def interval(self, level: float = 0.95) -> tuple[Value, Value]:
+        """Low and high of each free number: Student's of one degree of freedom less than there are
+        stretches. **Raises** `ValueError` for a `level` outside (0, 1).
+        """
+        from scipy.special import stdtrit
+
+        level = _checks.fraction(level, "level")
+        reach = float(stdtrit(max(self.stretches - 1, 1), 0.5 + 0.5 * level))
+        low, high = (
+            jax.tree.map(lambda x, d, s=s: x + s * reach * d, self.value, self.deviation)
+            for s in (-1.0, 1.0)
+        )
+        return low, high
 
     def predict(self, windows: Windows) -> Horizons:
         """The errors at every horizon, of these windows or of others: `mean_absolute`, `rms`."""
@@ -181,6 +197,7 @@ def fit_windows(
     *,
     noise: Mapping[str, float] | None = None,
     starts: Mapping[str, float] | None = None,
+    stretches: int = 12,
     max_steps: int = 50,
 ) -> WindowFit[Value]:
     """The free numbers with the least errors of open-loop runs over all windows.
@@ -190,8 +207,9 @@ def fit_windows(
     by kind (`x`, `v`, `q`, `omega`) the unit of an error: by default the rms of a prediction that
     holds the state at the start; `starts` by kind the standard deviation of the measured starts
     (the `noise` of the readings must be given with it; `np.inf`: the start is free); `None` takes
-    the starts as measured; `max_steps` of the search. The motion is computed by `RungeKutta4`, one
-    step a sample.
+    the starts as measured; `stretches` of windows in a row for the deviations: a stretch should be
+    longer than the errors of the model last; `max_steps` of the search. The motion is computed by
+    `RungeKutta4`, one step a sample.
 
     Levenberg–Marquardt on normal equations that are summed window by window. Uncertain starts are
     found window by window, and eliminated (variable projection). The search first uses a ninth and
@@ -212,6 +230,7 @@ def fit_windows(
     0.5
     """
     max_steps = _checks.whole(max_steps, "max_steps", 1)
+    stretches = _checks.whole(stretches, "stretches", 2)
     _require_windows(windows)
     _checks.function(scene, "scene", "of the free numbers to (body, torque)")
     x, back = _numbers(guess, windows.starts.omega.dtype)
@@ -228,11 +247,12 @@ def fit_windows(
     scales = _scales(windows, whole, noise)
     firm = precisions(starts, names(windows.starts), noise)
     padded, count = _padded(windows), np.asarray(windows.count, np.int32)
+    own = min(stretches, windows.count)
 
     def searched(value: Any, settings: Settings, steps: int) -> Search:
         units = scales if steps == whole else _scales(windows, steps, noise)
         return _searched(
-            scene, windows.step, value, padded, count, units, firm, settings, np.int32(steps)
+            scene, windows.step, value, padded, count, units, firm, settings, np.int32(steps), own
         )
 
     evaluated = Settings(_SETTLED, BOLD, 0)
@@ -257,6 +277,7 @@ def fit_windows(
     return WindowFit(
         value,
         back(jnp.asarray(deviation)),
+        own,
         float(end.cost) / (windows.count * windows.length),
         {kind: float(part[0]) for kind, part in parts(start, scales).items()},
         taken,
@@ -277,21 +298,44 @@ def _remarks(scene: Any, value: Any, windows: Windows) -> list[str]:
 
 
 def _deviations(there: Search, point: np.ndarray, count: int) -> tuple[np.ndarray, list[str]]:
-    """Standard deviations (n,) by the differences of `count` windows, and remarks."""
-    half, null = inverted(np.asarray(there.gram))
-    # The meat stands between roots: between covariances round-off would make variances negative.
-    sizes, axes = np.linalg.eigh(half.T @ np.asarray(there.found) @ half)
-    root = half @ axes * np.sqrt(np.maximum(sizes, 0.0))
-    deviation, message = carried(np.eye(point.size), root @ root.T, null), []
-    if len(null):
+    """Standard deviations (n,) by leaving out one stretch after the other, and remarks.
+
+    One step of Gauss and Newton's from the best point each: Miller 1974, doi:10.1093/biomet/61.1.1;
+    of neighbours in one block: Künsch 1989, doi:10.1214/aos/1176347265.
+    """
+    grams, slopes = (np.asarray(a) for a in there.found)
+    gram, many, message = grams.sum(0), len(grams), []
+    nulls = [inverted(gram)[1]]
+    if len(nulls[0]):
         message.append("some combination of the free numbers changes nothing in the windows")
-    if count <= point.size:
-        deviation = np.full(point.size, np.nan)
-        message.append(f"deviations need more windows than free numbers, {point.size}")
-    vague = np.flatnonzero(deviation > VAGUE * np.maximum(1.0, np.abs(point)))
-    if vague.size:
-        listed = ", ".join(f"number {k} (± {deviation[k]:.3g})" for k in vague)
+    if many == 1:
+        message.append("deviations come from the differences between windows, and there is one")
+        return np.full(point.size, np.nan), message
+    steps = np.zeros_like(slopes)
+    for k in range(many):
+        half, null = inverted(gram - grams[k])
+        steps[k] = half @ (half.T @ slopes[k])
+        nulls.append(null)
+    square = (many - 1) / many * steps.T @ steps
+    deviation = carried(np.eye(point.size), square, np.concatenate(nulls))
+    vague = deviation > VAGUE * np.maximum(1.0, np.abs(point))
+    if vague.any():
+        listed = ", ".join(f"number {k} (± {deviation[k]:.3g})" for k in np.flatnonzero(vague))
         message.append(f"these of the flattened free numbers are not determined: {listed}")
+    # Most of a deviation comes from one stretch.
+    most = np.abs(steps).argmax(0)
+    far = np.max(steps**2, 0) > HANGS * np.sum(steps**2, 0)
+    edges = -(-np.arange(many + 1) * count // many)
+    listed = [
+        f"number {k} (without windows {edges[at]} … {edges[at + 1] - 1} it is "
+        f"{point[k] + steps[at, k]:.3g})"
+        for k, at in enumerate(most)
+        if far[k] and many >= FEWEST and np.isfinite(deviation[k]) and not vague[k]
+    ]
+    if listed:
+        message.append(
+            f"these of the flattened free numbers hang on one stretch: {', '.join(listed)}"
+        )
     return deviation, message
 
 
@@ -364,13 +408,14 @@ def _searched(
     firm: Any,
     settings: Settings,
     steps: Any,
+    stretches: int,
 ) -> Search:
-    """The search from `guess` over the first `steps` of the first `count` windows; it keeps the
-    spread of the windows' gradients (n, n).
+    """The search from `guess` over the first `steps` of the first `count` windows; it keeps normal
+    matrix and gradient of each stretch of them, (C, n, n) and (C, n).
     """
     x, back = ravel_pytree(guess)
 
-    def of_one(x: Array, window: Any) -> Any:
+    def of_one(x: Array, window: Any) -> tuple[Array, Array, Array]:
         start, wanted, inputs = window
 
         def errors(x: Array, start: Any) -> Array:
@@ -379,12 +424,8 @@ def _searched(
 
         if firm is None:
             jacobian, flat = with_jacobian(lambda x: errors(x, start), x)
-            cost, gram, slope = 0.5 * flat @ flat, jacobian.T @ jacobian, jacobian.T @ flat
-        else:
-            cost, gram, slope = eliminated(
-                lambda x, step: errors(x, plus(start, scales * step)), x, firm
-            )
-        return slope[:, None] * slope[None], cost, gram, slope
+            return 0.5 * flat @ flat, jacobian.T @ jacobian, jacobian.T @ flat
+        return eliminated(lambda x, step: errors(x, plus(start, scales * step)), x, firm)
 
     def evaluated(x: Array) -> Any:
         def side_by_side(i: Array, total: Any) -> Any:
@@ -393,26 +434,32 @@ def _searched(
                 lambda a: lax.dynamic_slice_in_dim(a, rows[0], _SIDE_BY_SIDE), windows
             )
             found = jax.vmap(lambda window: of_one(x, window))(some)
-            kept = rows < count
+            # Beyond the last window there is no stretch.
+            stretch = jnp.where(rows < count, rows * stretches // count, stretches)
 
             def add(sum_: Array, part: Array) -> Array:
-                seen = kept.reshape(-1, *(1 for _ in part.shape[1:]))
-                return sum_ + jnp.sum(jnp.where(seen, part, 0.0), 0)
+                return sum_.at[stretch].add(part, mode="drop")
 
             return jax.tree.map(add, total, found)
 
-        square, line = jnp.zeros((x.size, x.size), x.dtype), jnp.zeros_like(x)
+        square, line = nothing
         rounds = (count + _SIDE_BY_SIDE - 1) // _SIDE_BY_SIDE
-        return lax.fori_loop(0, rounds, side_by_side, (square, jnp.sum(line), square, line))
+        start = (line[:, 0], square, line)
+        cost, grams, slopes = lax.fori_loop(0, rounds, side_by_side, start)
+        return (grams, slopes), jnp.sum(cost), jnp.sum(grams, 0), jnp.sum(slopes, 0)
 
-    nothing = jnp.zeros((x.size, x.size), x.dtype)
+    nothing = (
+        jnp.zeros((stretches, x.size, x.size), x.dtype),
+        jnp.zeros((stretches, x.size), x.dtype),
+    )
     return search(evaluated, x, jnp.zeros_like(x), settings, nothing, _by_noise)
 
 
-def _by_noise(spread: Array, gram: Array) -> Array:
-    """½ tr(K G⁻¹), the mean excess of the cost at the true numbers: Takeuchi 1976; Burnham and
-    Anderson 2002, doi:10.1007/b97636, section 7.2.
+def _by_noise(parts: tuple[Array, Array], gram: Array) -> Array:
+    """½ tr(K G⁻¹), the mean excess of the cost at the true numbers, K of the gradients of the
+    stretches: Takeuchi 1976; Burnham and Anderson 2002, doi:10.1007/b97636, section 7.2.
     """
+    spread = parts[1].T @ parts[1]
     felt = jnp.diagonal(gram)
     root = jnp.sqrt(jnp.maximum(felt, 1e-12 * jnp.max(felt)))
     units = root[:, None] * root[None, :]

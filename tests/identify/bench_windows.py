@@ -84,7 +84,7 @@ def with_numba(windows, scales):
     starts = np.concatenate([np.asarray(getattr(windows.starts, k)) for k in _KINDS], 1)
     wanted = np.concatenate([np.asarray(getattr(windows.wanted, k)) for k in _KINDS], 2)
     logged, later = (np.asarray(windows.inputs[k]) for k in ("now", "soon"))
-    units = np.repeat([float(scales[k]) for k in _KINDS], 3)
+    units = np.asarray(scales)
 
     @numba.njit(fastmath=True)
     def slope(y, lift, tx, ty, tz, drag, damping, flap, inertia, inverse, out):
@@ -244,7 +244,7 @@ def main():
         jax.block_until_ready(
             window_fit._searched(
                 scene, windows.step, jnp.asarray(GUESS), padded, count, scales, None,
-                Settings(0.0, 1.0, 0), np.int32(LENGTH),
+                Settings(0.0, 1.0, 0), np.int32(LENGTH), 12,
             )
         )  # fmt: skip
 
