@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from rigidjax import _checks
 from rigidjax._types import HasSpin
-from rigidjax.estimate.scene import Extended, Model, not_negative, sensors_of
+from rigidjax.estimate.scene import Extended, Model, not_negative, sensors_of, with_torque
 from rigidjax.identify.recording import Recording
 from rigidjax.identify.reference_states import attitudes, first_rate
 from rigidjax.motion import Attitude, Spin
@@ -92,6 +92,7 @@ def start(
     """
     _checks.instance(model, Model, "model")
     _checks.instance(recording, Recording, "recording")
+    model = with_torque(model, recording.torque)
     sensors = sensors_of(recording.sensors, model)
     if state is None:
         state = _shown(recording)

@@ -65,13 +65,7 @@ def sample(key: Any, model: Model, state0: Any, ts: Any, *, substeps: int | None
     if _checks.known(times):
         words = "ts: wanted increasing times"
         _checks.refuse(times, not (np.diff(np.asarray(times)) > 0).all(), words)
-    if substeps is not None:
-        pieces = _checks.whole(substeps, "substeps", 1)
-    elif _checks.known((times, state0.omega, model.coloured)):
-        rate = float(np.linalg.norm(np.asarray(state0.omega)))
-        pieces = int(steps_of(model, rate, np.diff(np.asarray(times)).max()))
-    else:
-        pieces = 1
+    pieces = int(steps_of(model, times, state0, substeps).max())
     return _sample(key, model, on_the_group(state0), times, pieces)
 
 
