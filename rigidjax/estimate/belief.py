@@ -26,7 +26,6 @@ class Belief(eqx.Module):
     then 3 for each `CorrelatedTorque`, then the walks. After `filter` all fields have a leading
     time axis. `start` makes the first belief.
 
-    >>> import rigidjax as rj
     >>> record = rj.identify.Recording([0.0, 1.0], (rj.identify.Gyro(0.1), [[1.0, 0, 0]] * 2))
     >>> model = Model(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.torques.RandomTorque(1e-4))
     >>> first = start(model, record, rate=0.1)
@@ -84,7 +83,6 @@ def start(
     distribution. **Returns** a `Belief`. **Raises:** `ValueError` for a deviation that is missing
     or below zero, `TypeError` for arguments of another type.
 
-    >>> import rigidjax as rj
     >>> record = rj.identify.Recording([0.0, 1.0], (rj.identify.Gyro(0.1), [[1.0, 0, 0]] * 2))
     >>> model = Model(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.torques.RandomTorque(1e-4))
     >>> start(model, record, rate=0.1).deviation.tolist()

@@ -71,7 +71,6 @@ class LogDensity(eqx.Module):
     `blackjax.nuts(density, …)`, or `estimate.posterior`. Gradients are computed recording by
     recording in forward mode, also under `jax.grad`; compile it by `equinox.filter_jit(density)`.
 
-    >>> import rigidjax as rj
     >>> ts = jnp.linspace(0.0, 10.0, 80)
     >>> motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1, 0.1, 1.0]), ts)
     >>> record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), motion.ys.omega))

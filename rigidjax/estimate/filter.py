@@ -103,7 +103,6 @@ class Filtered(eqx.Module):
     readings; `status` 0 followed, 1 lost, 2 stopped (`words` says it); `lost_at` s, NaN unless
     lost.
 
-    >>> import rigidjax as rj
     >>> record = rj.identify.Recording([0.0, 0.1], (rj.identify.Gyro(0.1), [[1.0, 0, 0]] * 2))
     >>> model = rj.estimate.Model(rj.Inertia.from_principal(1.0, 2.0, 2.5))
     >>> found = rj.estimate.filter(model, record, rj.estimate.start(model, record, rate=1.0))
@@ -171,7 +170,6 @@ def filter(
     also for a lost filter: no reading was within 6 deviations of its prediction for a second and
     three readings.
 
-    >>> import rigidjax as rj
     >>> record = rj.identify.Recording([0.0, 0.1], (rj.identify.Gyro(0.1), [[1.0, 0, 0]] * 2))
     >>> model = rj.estimate.Model(rj.Inertia.from_principal(1.0, 2.0, 2.5))
     >>> found = rj.estimate.filter(model, record, rj.estimate.start(model, record, rate=1.0))
@@ -200,7 +198,6 @@ def log_likelihood(
     over moments, a density, a noise, an initial state. Arguments and errors are as for `filter`;
     differentiable in forward and reverse mode.
 
-    >>> import rigidjax as rj
     >>> record = rj.identify.Recording([0.0, 0.1], (rj.identify.Gyro(1.0), [[1.0, 0, 0]] * 2))
     >>> model = rj.estimate.Model(rj.Inertia.from_principal(1.0, 1.0, 1.0))
     >>> first = rj.estimate.start(model, record, rj.Spin([1.0, 0, 0]), rate=0.0)
@@ -220,7 +217,7 @@ def step(model: Model, belief: Belief, t: ScalarLike, *readings: tuple) -> Belie
     turn. **Returns** the `Belief` at `t`. **Raises:** `ValueError` for a `t` before the belief, or
     a reading with NaN, if the numbers are known.
 
-    >>> import jax, rigidjax as rj
+    >>> import jax
     >>> gyro = rj.identify.Gyro(0.1)
     >>> record = rj.identify.Recording([0.0, 0.1], (gyro, [[1.0, 0, 0]] * 2))
     >>> model = rj.estimate.Model(rj.Inertia.from_principal(1.0, 2.0, 2.5))

@@ -99,7 +99,7 @@ class Posterior(eqx.Module):
     if the chains agree, and `ess` (n,) is the number of independent draws, as in Gelman et al.,
     Bayesian Data Analysis (2013), §11.4, 11.5.
 
-    >>> import jax, rigidjax as rj
+    >>> import jax
     >>> ts = jnp.linspace(0.0, 10.0, 80)
     >>> motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1, 0.1, 1.0]), ts)
     >>> record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), motion.ys.omega))
@@ -174,7 +174,7 @@ def posterior(
     `Posterior`. **Raises:** `TypeError` for arguments of another type, `ImportError` if blackjax is
     missing.
 
-    >>> import jax, rigidjax as rj
+    >>> import jax
     >>> ts = jnp.linspace(0.0, 10.0, 80)
     >>> motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1, 0.1, 1.0]), ts)
     >>> record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), motion.ys.omega))

@@ -41,7 +41,6 @@ class Refit(eqx.Module):
     (m,), which add up to 1, represent the posterior density. `effective` is the number of
     independent draws that they are worth.
 
-    >>> import rigidjax as rj
     >>> ts = jnp.linspace(0.0, 10.0, 80)
     >>> motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1, 0.1, 1.0]), ts)
     >>> record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), motion.ys.omega))
@@ -130,7 +129,6 @@ def refit(
     if it ended early, or if some combination of the numbers changes neither readings nor priors:
     `weights` are then NaN. **Raises:** `TypeError` for arguments of another type.
 
-    >>> import rigidjax as rj
     >>> ts = jnp.linspace(0.0, 10.0, 80)
     >>> motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1, 0.1, 1.0]), ts)
     >>> record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), motion.ys.omega))

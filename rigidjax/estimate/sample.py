@@ -22,7 +22,7 @@ class Sampled(eqx.Module):
     **Fields:** `t` (T,) s; `states` with a leading time axis; `torques` the value (T, 3) of each
     `CorrelatedTorque`, N m, body frame.
 
-    >>> import jax, rigidjax as rj
+    >>> import jax
     >>> body = rj.Inertia.from_principal(1.0, 2.0, 2.5)
     >>> model = rj.estimate.Model(body, rj.torques.RandomTorque(0.01))
     >>> drawn = sample(jax.random.key(0), model, rj.Spin([0.0, 0.0, 1.0]), [0.0, 0.5, 1.0])
@@ -49,7 +49,7 @@ def sample(key: Any, model: Model, state0: Any, ts: Any, *, substeps: int | None
     `torques` at these times (`Sampled`). **Raises:** `ValueError` for times that do not increase,
     `TypeError` for arguments of another type.
 
-    >>> import jax, rigidjax as rj
+    >>> import jax
     >>> body = rj.Inertia.from_principal(1.0, 2.0, 2.5)
     >>> model = rj.estimate.Model(body, rj.torques.RandomTorque(0.01))
     >>> drawn = sample(jax.random.key(0), model, rj.Spin([0.0, 0.0, 1.0]), [0.0, 0.5, 1.0])

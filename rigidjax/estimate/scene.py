@@ -57,7 +57,6 @@ class Model(eqx.Module):
     torques, among them `RandomTorque` and `CorrelatedTorque`, several in a `Sum`; `None` for a free
     body without noise; `walks` the `Walk`s. **Raises:** `TypeError` for arguments of another type.
 
-    >>> import rigidjax as rj
     >>> model = Model(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.torques.RandomTorque(1e-4))
     >>> len(model.white), len(model.coloured), model.torque
     (1, 0, None)

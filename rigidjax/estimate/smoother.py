@@ -55,7 +55,6 @@ class Smoothed(eqx.Module):
     about this motion; `change` how far the last iteration moved it, in standard deviations at most;
     `iterations`; `status`, `lost_at` as of `Filtered`.
 
-    >>> import rigidjax as rj
     >>> record = rj.identify.Recording([0.0, 0.1], (rj.identify.Gyro(0.1), [[1.0, 0, 0]] * 2))
     >>> body = rj.Inertia.from_principal(1.0, 2.0, 2.5)
     >>> model = rj.estimate.Model(body, rj.torques.RandomTorque(1.0))
@@ -114,7 +113,6 @@ def smooth(
     batched. **Raises:** as `filter`; with `throw` also for a motion that still moves by a standard
     deviation.
 
-    >>> import rigidjax as rj
     >>> record = rj.identify.Recording([0.0, 0.1], (rj.identify.Gyro(0.1), [[1.0, 0, 0]] * 2))
     >>> body = rj.Inertia.from_principal(1.0, 2.0, 2.5)
     >>> model = rj.estimate.Model(body, rj.torques.RandomTorque(1.0))

@@ -44,11 +44,7 @@ def compare(fits: Mapping[str, Fit]) -> tuple[Comparison, ...]:
     for each `name`, `free`, `rms`, `correlation` and `information` (`Comparison`). **Raises**
     `ValueError` for none, or for fits of other readings.
 
-    >>> import rigidjax as rj
-    >>> ts = jnp.linspace(0.0, 10.0, 80)
-    >>> motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1, 0.1, 1.0]), ts)
-    >>> record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), motion.ys.omega))
-    >>> found = rj.identify.fit(rj.identify.Problem(record, rj.identify.PrincipalRatios()))
+    >>> found = rj.identify.fit(rj.datasets.toutatis.problem())
     >>> best = compare({"one": found, "the same again": found})[0]
     >>> best.name, best.information
     ('one', 0.0)

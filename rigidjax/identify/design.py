@@ -28,7 +28,6 @@ def expected(problem: Problem, parameters: Parameters) -> tuple[Quantity, ...]:
     deviations of the Cramér–Rao bound, infinite where the motion would show nothing. **Raises:**
     `ValueError` for a sensor whose noise is not given, or numbers that are not finite.
 
-    >>> import rigidjax as rj
     >>> ts = jnp.linspace(0.0, 5.0, 50)
     >>> record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), jnp.zeros((50, 3))))
     >>> problem = rj.identify.Problem(record, rj.identify.PrincipalRatios())
@@ -58,7 +57,6 @@ def fisher(problem: Problem, parameters: Parameters) -> Float[Array, "n n"]:
     parameters, for a design by gradients. **Raises** `ValueError` for a
     sensor whose noise is not given.
 
-    >>> import rigidjax as rj
     >>> ts = jnp.linspace(0.0, 5.0, 50)
     >>> record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), jnp.zeros((50, 3))))
     >>> problem = rj.identify.Problem(record, rj.identify.PrincipalRatios())

@@ -17,7 +17,6 @@ class AbstractLoss(eqx.Module):
 
     A reading counts as a whole, so that the loss does not depend on the frame.
 
-    >>> import jax.numpy as jnp
     >>> class Squares(AbstractLoss):  # no outliers: ρ(s) = s
     ...     def shrink(self, error):
     ...         return error
@@ -49,7 +48,6 @@ class SoftL1(AbstractLoss):
     `ValueError` where it is not positive. Source: Charbonnier et al. 1997, doi:10.1109/83.551699
     (as `soft_l1` in SciPy).
 
-    >>> import jax.numpy as jnp
     >>> bool(jnp.linalg.norm(SoftL1(3.0).shrink(jnp.array([300.0, 0, 0]))) < 45)
     True
     """
@@ -70,7 +68,6 @@ class Huber(AbstractLoss):
     **Arguments:** `scale` c, in standard deviations. **Raises:** `ValueError` where it is not
     positive. Source: Huber 1964, doi:10.1214/aoms/1177703732.
 
-    >>> import jax.numpy as jnp
     >>> Huber(3.0).weight(jnp.array([6.0, 0.0, 0.0]))
     Array(0.5, dtype=float64)
     """
@@ -104,7 +101,6 @@ class Entropic(eqx.Module):
     **Raises:** `TypeError`, `ValueError` for arguments of another type or shape. Source: Lee,
     Wensing and Park 2020, doi:10.1109/TRO.2019.2926491 (the divergence).
 
-    >>> import rigidjax as rj
     >>> body = rj.Inertia.from_principal(1.0, 2.0, 2.5)
     >>> bool(jnp.abs(Entropic(body, 1.0).residuals(body)).max() < 1e-7)
     True

@@ -170,7 +170,6 @@ class Marker(AbstractSensor):
     body that moves (`Rigid`, with `MassProperties`; `place` is then in their frame); `offset` s as
     for `Gyro`. **Raises** `ValueError` as `Gyro`.
 
-    >>> import rigidjax as rj
     >>> body = rj.MassProperties(1.0, [0.0, 0, 0], jnp.eye(3))
     >>> state = rj.Rigid([2.0, 0, 0], [0.0, 0, 0], [1.0, 0, 0, 0], [0.0, 0, 0])
     >>> now = rj.identify.SensorInput(jnp.asarray(0.0), state, body, lambda t, y, args: y)

@@ -21,7 +21,6 @@ class SensorInput(eqx.Module):
     laws put in as they are at `t`; `own` those states, as `Solution.own` orders them: for
     a sensor of one's own that reads a wheel or a motor.
 
-    >>> import rigidjax as rj
     >>> body, state = rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([0.0, 0.0, 1.0])
     >>> now = SensorInput(jnp.asarray(0.0), state, body, rj.equations_of_motion(body, state, None))
     >>> rj.identify.Gyro(0.1).error(now, jnp.array([0.0, 0.0, 1.5])).tolist()
@@ -60,7 +59,6 @@ class AbstractSensor(eqx.Module):
     not reading minus prediction; `suspect`: name, words and remedy of the cause that a fit names
     for its errors if it finds no other.
 
-    >>> import rigidjax as rj
     >>> class Tachometer(AbstractSensor):  # the size of the body rate, rad/s
     ...     reading_shape, components, unit = (), 1, "rad/s"
     ...     feels, noise = rj.motion.HasSpin, None
