@@ -1,6 +1,5 @@
 """Draws from a posterior density, by samplers of other libraries."""
 
-import importlib
 from collections.abc import Callable
 from typing import Any
 
@@ -17,6 +16,9 @@ from rigidjax.identify.parameters import Unpacked
 # A sampler: key, log-density of z, a first z (n,) → draws (samples, n).
 Sampler = Callable[[Any, Callable[[Array], Array], Array], Array]
 
+
+# Module, extra, and who asks.
+_BLACKJAX = ("blackjax", "posterior", "posterior")
 
 # The weight of the first mass matrix, in draws: it is good already if Laplace's method is.
 _WORTH = 50.0
@@ -49,7 +51,7 @@ class Nuts(eqx.Module):
 
     def __call__(self, key: Any, density: Callable[[Array], Array], start: Array) -> Array:
         """Draws (samples, n) of one chain."""
-        blackjax = _blackjax()
+        blackjax = _checks.library(*_BLACKJAX)
         adaptation = blackjax.adaptation
         # The warm-up of `blackjax.window_adaptation` in one loop with the draws: in a loop of its
         # own the density is compiled once more, which takes longer than to draw.
@@ -117,12 +119,12 @@ class Posterior(eqx.Module):
     @property
     def rhat(self) -> Float[Array, " n"]:
         """Potential scale reduction between the chains, near 1 if they agree (blackjax)."""
-        return _blackjax().diagnostics.potential_scale_reduction(self.x)
+        return _checks.library(*_BLACKJAX).diagnostics.potential_scale_reduction(self.x)
 
     @property
     def ess(self) -> Float[Array, " n"]:
         """The effective number of independent draws (blackjax)."""
-        return _blackjax().diagnostics.effective_sample_size(self.x)
+        return _checks.library(*_BLACKJAX).diagnostics.effective_sample_size(self.x)
 
     @property
     def points(self) -> Unpacked:
@@ -144,7 +146,7 @@ class Posterior(eqx.Module):
 
         **Raises:** `ImportError` without arviz (it needs Python 3.12).
         """
-        arviz = _extra("to_arviz", "arviz", " (Python 3.12)")
+        arviz = _checks.library("arviz", "posterior", "to_arviz (Python 3.12)")
         points = self.points
         out = dict(points.values)
         out["omega0"] = points.state0.omega
@@ -190,7 +192,7 @@ def posterior(
     chains = _checks.whole(chains, "chains", 2)
     sampler = Nuts() if sampler is None else _checks.function(sampler, "sampler", "of a key")
     if isinstance(sampler, Nuts):
-        _blackjax()
+        _checks.library(*_BLACKJAX)
     root = jnp.linalg.cholesky(density.covariance)
     x = _draw(density, root, jax.random.split(key, chains), sampler)
     return Posterior(density, x)
@@ -210,15 +212,3 @@ def _draw(density: LogDensity, root: Array, keys: Array, sampler: Any) -> Array:
     if density.problem.count >= _FULL:
         return lax.map(chain, keys)
     return jax.vmap(chain)(keys)
-
-
-def _blackjax() -> Any:
-    return _extra("posterior", "blackjax")
-
-
-def _extra(name: str, module: str, note: str = "") -> Any:
-    try:
-        return importlib.import_module(module)
-    except ImportError as error:
-        words = f"{name}: {module} is missing; pip install 'rigidjax[posterior]'{note}"
-        raise ImportError(words) from error
