@@ -25,12 +25,6 @@ class Belief(eqx.Module):
     `Spin` the errors of Ω; for an `Attitude` δθ (body frame, rad) and Ω; for a `Rigid` x, v, δθ, Ω;
     then 3 for each `CorrelatedTorque`, then the walks. After `filter` all fields have a leading
     time axis. `start` makes the first belief.
-
-    >>> record = rj.identify.Recording([0.0, 1.0], (rj.identify.Gyro(0.1), [[1.0, 0, 0]] * 2))
-    >>> model = Model(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.torques.RandomTorque(1e-4))
-    >>> first = start(model, record, rate=0.1)
-    >>> float(first.t), first.root.shape
-    (0.0, (3, 3))
     """
 
     t: Float[Array, "*times"]

@@ -102,12 +102,6 @@ class Filtered(eqx.Module):
     for each sensor, a `Read`: `innovation`, `variance` and `seen`, (T, k); `log_likelihood` of all
     readings; `status` 0 followed, 1 lost, 2 stopped (`words` says it); `lost_at` s, NaN unless
     lost.
-
-    >>> record = rj.identify.Recording([0.0, 0.1], (rj.identify.Gyro(0.1), [[1.0, 0, 0]] * 2))
-    >>> model = rj.estimate.Model(rj.Inertia.from_principal(1.0, 2.0, 2.5))
-    >>> found = rj.estimate.filter(model, record, rj.estimate.start(model, record, rate=1.0))
-    >>> found.readings[0].innovation.shape, int(found.status)
-    ((2, 3), 0)
     """
 
     belief: Belief
@@ -173,8 +167,8 @@ def filter(
     >>> record = rj.identify.Recording([0.0, 0.1], (rj.identify.Gyro(0.1), [[1.0, 0, 0]] * 2))
     >>> model = rj.estimate.Model(rj.Inertia.from_principal(1.0, 2.0, 2.5))
     >>> found = rj.estimate.filter(model, record, rj.estimate.start(model, record, rate=1.0))
-    >>> found.states.omega.shape, found.words
-    ((2, 3), 'followed')
+    >>> found.states.omega.shape, found.readings[0].innovation.shape, found.words
+    ((2, 3), (2, 3), 'followed')
     """
     out = _filter(*looked_at(model, recording, first, substeps))
     return told(out) if throw else out

@@ -21,13 +21,6 @@ class Sampled(eqx.Module):
 
     **Fields:** `t` (T,) s; `states` with a leading time axis; `torques` the value (T, 3) of each
     `CorrelatedTorque`, N m, body frame.
-
-    >>> import jax
-    >>> body = rj.Inertia.from_principal(1.0, 2.0, 2.5)
-    >>> model = rj.estimate.Model(body, rj.torques.RandomTorque(0.01))
-    >>> drawn = sample(jax.random.key(0), model, rj.Spin([0.0, 0.0, 1.0]), [0.0, 0.5, 1.0])
-    >>> drawn.t.shape, drawn.torques  # white noise has no value at a time
-    ((3,), ())
     """
 
     t: Float[Array, " times"]
@@ -53,8 +46,8 @@ def sample(key: Any, model: Model, state0: Any, ts: Any, *, substeps: int | None
     >>> body = rj.Inertia.from_principal(1.0, 2.0, 2.5)
     >>> model = rj.estimate.Model(body, rj.torques.RandomTorque(0.01))
     >>> drawn = sample(jax.random.key(0), model, rj.Spin([0.0, 0.0, 1.0]), [0.0, 0.5, 1.0])
-    >>> drawn.states.omega.shape
-    (3, 3)
+    >>> drawn.states.omega.shape, drawn.torques  # white noise has no value at a time
+    ((3, 3), ())
     """
     _checks.key(key)
     _checks.instance(model, Model, "model")

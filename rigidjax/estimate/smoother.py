@@ -35,10 +35,6 @@ class Push(NamedTuple):
 
     **Fields:** `mean`, `deviation` (N, 3) N m, body frame; the deviation is large for short steps,
     since white noise has no value at a time.
-
-    >>> shown = Push(jnp.array([[0.0, 0.0, 0.3]]), 0.1 * jnp.ones((1, 3)))
-    >>> (shown.mean / shown.deviation).round(1).tolist()  # about the third axis it turns the body
-    [[0.0, 0.0, 3.0]]
     """
 
     mean: Float[Array, "stops 3"]
@@ -54,13 +50,6 @@ class Smoothed(eqx.Module):
     sensor, of the last linearisation, (N, k); `log_likelihood` of all readings, by Laplace's method
     about this motion; `change` how far the last iteration moved it, in standard deviations at most;
     `iterations`; `status`, `lost_at` as of `Filtered`.
-
-    >>> record = rj.identify.Recording([0.0, 0.1], (rj.identify.Gyro(0.1), [[1.0, 0, 0]] * 2))
-    >>> body = rj.Inertia.from_principal(1.0, 2.0, 2.5)
-    >>> model = rj.estimate.Model(body, rj.torques.RandomTorque(1.0))
-    >>> found = rj.estimate.smooth(model, record, rj.estimate.start(model, record, rate=1.0))
-    >>> found.words, found.rows.tolist()  # of three stops the first and last are readings
-    ('followed', [0, 2])
     """
 
     belief: Belief
@@ -117,8 +106,8 @@ def smooth(
     >>> body = rj.Inertia.from_principal(1.0, 2.0, 2.5)
     >>> model = rj.estimate.Model(body, rj.torques.RandomTorque(1.0))
     >>> found = rj.estimate.smooth(model, record, rj.estimate.start(model, record, rate=1.0))
-    >>> found.states.omega.shape, found.pushes[0].mean.shape  # one stop between
-    ((2, 3), (3, 3))
+    >>> found.pushes[0].mean.shape, found.rows.tolist()  # of three stops two are readings
+    ((3, 3), [0, 2])
     """
     _checks.whole(iterations, "iterations", 1)
     _checks.positive(tolerance, "tolerance")
