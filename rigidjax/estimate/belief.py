@@ -75,7 +75,7 @@ def start(
     standard deviations, one number or three, zero for known values: `rate` of Ω, rad/s; `attitude`
     rad; `position` m and `velocity` m/s of a `Rigid`. Torques start from their model's stationary
     distribution. **Returns** a `Belief`. **Raises:** `ValueError` for a deviation that is missing
-    or below zero, `TypeError` for arguments of another type.
+    or below zero.
 
     >>> record = rj.identify.Recording([0.0, 1.0], (rj.identify.Gyro(0.1), [[1.0, 0, 0]] * 2))
     >>> model = Model(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.torques.RandomTorque(1e-4))

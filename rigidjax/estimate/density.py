@@ -63,9 +63,8 @@ class LogDensity(eqx.Module):
     of the normal prior of the logarithms of its density and time about the given values, `None` for
     a known process. The density scales with the square of a moment if only ratios of moments are
     determined, as by a gyro alone: compare `density / moment**2`, and give the prior in the fit's
-    own unit of inertia (`fit.body`). **Raises:** `TypeError` for arguments of another type;
-    `ValueError` for a robust loss, which is no density, and for directions that neither data nor a
-    prior determine.
+    own unit of inertia (`fit.body`). **Raises:** `ValueError` for a robust loss, which is no
+    density, and for directions that neither data nor a prior determine.
 
     For numpyro: `numpyro.infer.MCMC(NUTS(potential_fn=lambda x: -density(x)), …)`; for blackjax:
     `blackjax.nuts(density, …)`, or `estimate.posterior`. Gradients are computed recording by
@@ -166,9 +165,8 @@ class LogDensity(eqx.Module):
         """The process by the logarithms of the factors of its numbers."""
         if logs is None:
             return self.process
-        leaves, structure = jax.tree.flatten(self.process)
-        grown = [leaf * jnp.exp(log) for leaf, log in zip(leaves, logs, strict=True)]
-        return jax.tree.unflatten(structure, grown)
+        logs = jax.tree.unflatten(jax.tree.structure(self.process), list(logs))
+        return jax.tree.map(lambda leaf, log: leaf * jnp.exp(log), self.process, logs)
 
 
 @eqx.filter_jit
@@ -186,11 +184,11 @@ def _definite(covariance: np.ndarray) -> bool:
 
 
 class Curvature(NamedTuple):
-    """The cost, minus a log-density, its gradient (n,), and Fisher's information (n, n)."""
+    """The cost, minus a log-density; Fisher's information `gram`; the gradient `slope`."""
 
     cost: Scalar
-    slope: Float[Array, " n"]
     gram: Float[Array, "n n"]
+    slope: Float[Array, " n"]
 
 
 def terms(density: LogDensity, x: Float[Array, " n"]) -> Terms:
@@ -230,7 +228,7 @@ def curvature(density: LogDensity, x: Float[Array, " n"]) -> Curvature:
 
     extra, rest = with_jacobian(lambda x: prior_residuals(density, x), x)
     cost = 0.5 * jnp.sum(rest**2) - found.log_density
-    return Curvature(cost, slope + rest @ extra, gram + extra.T @ extra)
+    return Curvature(cost, gram + extra.T @ extra, slope + rest @ extra)
 
 
 def prior_residuals(density: LogDensity, x: Float[Array, " n"]) -> Float[Array, " m"]:
@@ -250,10 +248,8 @@ def groups_of(problem: Problem) -> Int[Array, " records"]:
 
 def grown_noises(noises: tuple, steps: tuple) -> tuple[Float[Array, "*records k"], ...]:
     """The noises of the sensors by the logarithms of their factors, `None` for none."""
-    return tuple(
-        noise if step is None else noise * jnp.exp(step)[..., None]
-        for noise, step in zip(noises, steps, strict=True)
-    )
+    pairs = zip(noises, steps, strict=True)
+    return tuple(n if step is None else n * jnp.exp(step)[..., None] for n, step in pairs)
 
 
 def own_numbers(density: LogDensity, x: Array) -> Any:

@@ -173,8 +173,7 @@ def posterior(
     log-density and a first vector to draws (samples, n), `Nuts()` unless given; its numbers have
     the identity as covariance by Laplace's method, and it starts from a draw of that. `chains` run
     together under `vmap`, or one after another with eight recordings and more. **Returns** a
-    `Posterior`. **Raises:** `TypeError` for arguments of another type, `ImportError` if blackjax is
-    missing.
+    `Posterior`. **Raises** `ImportError` if blackjax is missing.
 
     >>> import jax
     >>> ts = jnp.linspace(0.0, 10.0, 80)

@@ -39,8 +39,7 @@ def sample(key: Any, model: Model, state0: Any, ts: Any, *, substeps: int | None
     **Arguments:** `key` of `jax.random`; `model`; `state0` a `Spin`, `Attitude` or `Rigid`; `ts`
     (T,) increasing times, s, the first is of `state0`; `substeps` fixed steps between two times,
     `None` chooses them by the rate if it is known, else one. **Returns** `t`, `states` and
-    `torques` at these times (`Sampled`). **Raises:** `ValueError` for times that do not increase,
-    `TypeError` for arguments of another type.
+    `torques` at these times (`Sampled`). **Raises** `ValueError` for times that do not increase.
 
     >>> import jax
     >>> body = rj.Inertia.from_principal(1.0, 2.0, 2.5)
@@ -66,11 +65,10 @@ def sample(key: Any, model: Model, state0: Any, ts: Any, *, substeps: int | None
 def _sample(key: PRNGKeyArray, model: Model, state0: Any, ts: Array, pieces: int) -> Sampled:
     dtype = state0.omega.dtype
     first, later = jax.random.split(key)
+    keys = jax.random.split(first, len(model.coloured))
     torques = tuple(
         law.deviation.astype(dtype) * jax.random.normal(one, (3,), dtype)
-        for law, one in zip(
-            model.coloured, jax.random.split(first, len(model.coloured)), strict=True
-        )
+        for law, one in zip(model.coloured, keys, strict=True)
     )
     x0 = Extended(state0, torques, ())
     dynamics = Dynamics(model, x0)

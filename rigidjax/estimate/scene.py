@@ -55,7 +55,7 @@ class Model(eqx.Module):
 
     **Arguments:** `body` an `Inertia`, or `MassProperties` for a `Rigid` state; `torque` any
     torques, among them `RandomTorque` and `CorrelatedTorque`, several in a `Sum`; `None` for a free
-    body without noise; `walks` the `Walk`s. **Raises:** `TypeError` for arguments of another type.
+    body without noise; `walks` the `Walk`s.
 
     >>> model = Model(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.torques.RandomTorque(1e-4))
     >>> len(model.white), len(model.coloured), model.torque
@@ -187,11 +187,11 @@ class Dynamics(eqx.Module):
         """The number of unit normal numbers in one step of motion and torques."""
         return 6 * (len(self.white) + len(self.coloured))
 
-    def pushed(self, change: Any, torque: Array | None) -> Any:
-        """A rate of change of the motion, with a torque beside those of its equations."""
-        if torque is None:
+    def pushed(self, change: Any, torques: Sequence[Array]) -> Any:
+        """A rate of change of the motion, with torques beside those of its equations."""
+        if not torques:
             return change
-        spin = change.omega + jnp.sum(self.inverse * torque[None], 1)
+        spin = change.omega + jnp.sum(self.inverse * sum(torques[1:], torques[0])[None], 1)
         return eqx.tree_at(lambda s: s.omega, change, spin)
 
     def advance(self, t: Scalar, h: Scalar, x: Extended, kicks: Array) -> Extended:
@@ -211,16 +211,10 @@ class Dynamics(eqx.Module):
         def rate(since: Scalar, now: tuple[Any, tuple]) -> tuple[Any, tuple]:
             motion, torques = now
             share = 1.0 - 2.0 * since / safe
-            total = None
-            for root, pair in zip(self.white, pairs, strict=False):
-                more = root * push(pair, share)
-                total = more if total is None else total + more
-            slopes = []
-            later = pairs[len(self.white) :]
-            for (root, memory), pair, torque in zip(self.coloured, later, torques, strict=True):
-                total = torque if total is None else total + torque
-                slopes.append((root * push(pair, share) - torque) / memory)
-            return self.pushed(self.field(t + since, motion, None), total), tuple(slopes)
+            white = [r * push(pair, share) for r, pair in zip(self.white, pairs, strict=False)]
+            later = zip(self.coloured, pairs[len(self.white) :], torques, strict=True)
+            slopes = tuple((r * push(pair, share) - tau) / time for (r, time), pair, tau in later)
+            return self.pushed(self.field(t + since, motion, None), [*white, *torques]), slopes
 
         motion, torques = advance(KUTTA4, rate, jnp.zeros_like(h), h, (x.motion, x.torques))
         if isinstance(motion, HasAttitude):
@@ -319,8 +313,7 @@ def linearised(
             seeing = in_precision(dynamics.sensors.drifted(y.walks)[index].sensor, dtype)
 
             def field(t: Any, state: Any, args: Any = None) -> Any:
-                torque = sum(y.torques[1:], y.torques[0]) if y.torques else None
-                return dynamics.pushed(dynamics.field(t, state, args), torque)
+                return dynamics.pushed(dynamics.field(t, state, args), y.torques)
 
             motion, when = y.motion, t
             offset = getattr(seeing, "offset", None)

@@ -98,8 +98,7 @@ class Entropic(eqx.Module):
     from the guess.
 
     **Arguments:** `guess` an `Inertia`, or `MassProperties` for a `Mass` chart; `weight` w > 0.
-    **Raises:** `TypeError`, `ValueError` for arguments of another type or shape. Source: Lee,
-    Wensing and Park 2020, doi:10.1109/TRO.2019.2926491 (the divergence).
+    Source: Lee, Wensing and Park 2020, doi:10.1109/TRO.2019.2926491 (the divergence).
 
     >>> body = rj.Inertia.from_principal(1.0, 2.0, 2.5)
     >>> bool(jnp.abs(Entropic(body, 1.0).residuals(body)).max() < 1e-7)

@@ -48,8 +48,7 @@ def rows(fit: Fit, rate_unit: str = "rad/s") -> list[Row]:
 def table(lines: list[Row]) -> str:
     """Rows as text, rounded by their intervals.
 
-    **Arguments:** `lines` rows of (name, value, low, high, unit), such as `rows` gives. **Raises:**
-    `TypeError` for anything but rows; `ValueError` for none.
+    **Arguments:** `lines` rows of (name, value, low, high, unit), such as `rows` gives; not none.
 
     >>> print(table([("I1", 1.23456, 1.2, 1.27, "kg m²")]))
                  value  95 % interval
@@ -72,7 +71,6 @@ def numbers(value: float, low: float, high: float) -> list[str]:
     """Value, low and high as text, rounded by the interval.
 
     **Arguments:** `value`; `low` and `high`, the ends of its interval, in the same unit.
-    **Raises:** `TypeError`, `ValueError` for anything but numbers.
 
     >>> numbers(1.23456, 1.2, 1.27)
     ['1.2346', '1.2000', '1.2700']
@@ -110,8 +108,7 @@ def _between(shown: list[str]) -> str:
 def verdict(fit: Fit) -> str:
     """The well and the weakly determined quantities, and the agreement of the starts, in words.
 
-    **Arguments:** `fit` a result of `rigidjax.identify.fit`. **Raises** `TypeError` for another
-    type.
+    **Arguments:** `fit` a result of `rigidjax.identify.fit`.
 
     >>> found = rj.identify.fit(rj.datasets.toutatis.problem())
     >>> verdict(found).splitlines()[0]
@@ -192,7 +189,6 @@ def as_dict(fit: Fit, files: Sequence[str] = (), more: Sequence[Row] = ()) -> di
 
 def _rms_of_axes(fit: Fit) -> list[tuple[str, list[float], str]]:
     """Name, rms of each component without readings at full scale, and unit of sensors."""
-    one_fit(fit)
     readings = fit.problem.records.readings
     out = []
     for error, reading, full in zip(fit.residuals, readings, at_limit(readings), strict=True):
