@@ -145,7 +145,7 @@ def refit(
 
 @eqx.filter_jit
 def _refit(density: LogDensity, settings: Settings, key: Any, count: int) -> Refit:
-    def evaluated(x: Array) -> tuple[None, Array, Array, Array]:
+    def evaluated(x: Array) -> Any:
         return None, *curvature(density, x)
 
     parameters, factors, logs = density.like

@@ -1,8 +1,9 @@
 """The base class of sensors: the prediction of a motion at one time, and the error of a reading."""
 
 import abc
+import dataclasses
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -98,15 +99,11 @@ def optional(name: str, shape: tuple[int, ...] = (3,)) -> Callable[[Any], Array 
 
 def deviations(size: int = 3) -> Callable[[Any], Array | None]:
     """A converter of one number or `size` numbers to standard deviations (size,); `None` stays."""
-    return lambda value: _positive(value, "noise", "a positive standard deviation", size)
+    return lambda value: positive(value, "noise", "a positive standard deviation", size)
 
 
-def full_scale(limit: Any) -> Vec3 | None:
-    """The full scale of the channels (3,), from one number or three, positive; or `None`."""
-    return _positive(limit, "limit", "a positive full scale", 3)
-
-
-def _positive(value: Any, name: str, wanted: str, size: int) -> Array | None:
+def positive(value: Any, name: str, wanted: str, size: int) -> Array | None:
+    """One number or `size` as (size,) positive numbers; `None` stays."""
     if value is None:
         return None
     numbers = _checks.numbers(value, name).astype(jnp.result_type(float))
@@ -115,3 +112,12 @@ def _positive(value: Any, name: str, wanted: str, size: int) -> Array | None:
         raise ValueError(f"{name}: wanted one number or {count}, got shape {numbers.shape}")
     numbers = jnp.broadcast_to(numbers, (size,))
     return _checks.refuse(numbers, ~(numbers > 0), f"{name}: wanted {wanted}")
+
+
+class ClockedSensor(AbstractSensor):
+    """A sensor whose clock may be behind; it reads a vector (3,) unless it says otherwise."""
+
+    reading_shape: ClassVar[tuple[int, ...]] = (3,)
+    components: ClassVar[int] = 3
+    _: dataclasses.KW_ONLY
+    offset: Scalar | None = eqx.field(converter=optional("offset", ()), default=None)
