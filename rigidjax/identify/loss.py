@@ -15,7 +15,7 @@ from rigidjax.body.inertia import Inertia, MassProperties
 class AbstractLoss(eqx.Module):
     """`ρ(s)` of the squared length s of a sensor's error in units of its noise.
 
-    A reading counts as a whole, so that the loss does not depend on the frame.
+    A reading counts as a whole: the loss does not depend on the frame.
 
     >>> class Squares(AbstractLoss):  # no outliers: ρ(s) = s
     ...     def shrink(self, error):
@@ -41,8 +41,6 @@ def _scale(value: Any) -> float:
 
 class SoftL1(AbstractLoss):
     """Quadratic for ordinary errors, linear for large ones: `ρ(s) = 2c²(√(1 + s/c²) − 1)`.
-
-    Convex, unlike Cauchy's, which can add local minima.
 
     **Arguments:** `scale` c, where quadratic turns to linear, in standard deviations. **Raises:**
     `ValueError` where it is not positive. Source: Charbonnier et al. 1997, doi:10.1109/83.551699
