@@ -307,7 +307,7 @@ def _of_one(
     spread = jnp.concatenate([known, *(law.deviation for law in model.coloured)])
     first = Belief(record.t[0], Extended(state, torques, ()), jnp.diag(spread))
     grid = grid_of(model, record, first, density.substeps)
-    _, _, (_, read) = scan_filter(model, sensors, record, first, grid, lambda belief, read: read)
+    _, _, read = scan_filter((model, sensors, record, first, grid), lambda _, read: read)
     return jax.tree.map(jnp.ravel, roots.terms(*read))
 
 

@@ -45,6 +45,11 @@ class Grid(NamedTuple):
     real: Bool[Array, " n"]
     rows: Int[Array, " t"]
 
+    def of_rows(self, kept: Any) -> Any:
+        """Of the values at all times those at the recording's; to pick all would be a copy."""
+        same = self.rows.size == self.t.size
+        return kept if same else jax.tree.map(lambda leaf: leaf[self.rows], kept)
+
 
 def grid_of(model: Model, recording: Recording, first: Belief, substeps: int | None) -> Grid:
     """The times of the steps."""
@@ -170,7 +175,7 @@ def filter(
     >>> found.states.omega.shape, found.readings[0].innovation.shape, found.words
     ((2, 3), (2, 3), 'followed')
     """
-    out = _filter(*looked_at(model, recording, first, substeps))
+    out = _filter(looked_at(model, recording, first, substeps))
     return told(out) if throw else out
 
 
@@ -198,7 +203,7 @@ def log_likelihood(
     >>> log_likelihood(model, record, first).round(6)
     Array(-5.513631, dtype=float64)
     """
-    return _log_likelihood(*looked_at(model, recording, first, substeps))
+    return _log_likelihood(looked_at(model, recording, first, substeps))
 
 
 def step(model: Model, belief: Belief, t: ScalarLike, *readings: tuple) -> Belief:
@@ -267,41 +272,39 @@ def _one(dynamics: Dynamics, belief: Belief, stop: Stops) -> tuple[Belief, Read]
     return Belief(stop.t, plus(x, e), reset(x, e, root)), Read(innovation, variance, seen)
 
 
-def scan_filter(
-    model: Model, sensors: Sensors, recording: Recording, first: Belief, grid: Grid, keep: Any
-) -> tuple[Dynamics, Stops, Any]:
+# The checked arguments of a filter: see `looked_at`.
+Given = tuple[Model, Sensors, Recording, Belief, Grid]
+
+
+def scan_filter(given: Given, keep: Any) -> tuple[Dynamics, Stops, Any]:
     """`lax.scan` of the filter over all stops, which keeps `keep(belief, read)`."""
+    model, sensors, recording, first, grid = given
     dtype = first.root.dtype
     dynamics = Dynamics(model, first.x, sensors)
     values = tuple(r.values.astype(dtype)[grid.source] for r in recording.readings)
     masks = tuple(r.mask[grid.source] & grid.real for r in recording.readings)
     stops = Stops(grid.t, values, masks)
 
-    def body(carry: tuple[Belief, Array], stop: Stops) -> tuple[Any, Any]:
-        belief, total = carry
+    def body(belief: Belief, stop: Stops) -> tuple[Belief, Any]:
         belief, read = _one(dynamics, belief, stop)
-        return (belief, total + roots.terms(*read).log_density), keep(belief, read)
+        return belief, keep(belief, read)
 
     # A reverse pass computes a step again: a step holds some thousand numbers.
     body = jax.checkpoint(body)  # pyright: ignore[reportPrivateImportUsage]
-    return dynamics, stops, lax.scan(body, (first, jnp.zeros((), dtype)), stops)
+    return dynamics, stops, lax.scan(body, first, stops)[1]
 
 
 @eqx.filter_jit
-def _filter(
-    model: Model, sensors: Sensors, recording: Recording, first: Belief, grid: Grid
-) -> Filtered:
-    _, _, ((_, total), kept) = scan_filter(
-        model, sensors, recording, first, grid, lambda belief, read: (belief, read)
-    )
-    beliefs, read = jax.tree.map(lambda leaf: leaf[grid.rows], kept)
-    reads = by_sensor(sensors, read)
+def _filter(given: Given) -> Filtered:
+    _, sensors, _, first, grid = given
+    beliefs, read = grid.of_rows(scan_filter(given, lambda belief, read: (belief, read))[2])
+    reads, total = by_sensor(sensors, read), roots.terms(*read).log_density
     return Filtered(beliefs, reads, total, *status_of(beliefs, reads, first.t))
 
 
 @eqx.filter_jit
-def _log_likelihood(*given: Any) -> Scalar:
-    return scan_filter(*given, keep=lambda belief, read: None)[2][0][1]
+def _log_likelihood(given: Given) -> Scalar:
+    return roots.terms(*scan_filter(given, lambda _, read: read)[2]).log_density
 
 
 def status_of(beliefs: Belief, reads: tuple[Read, ...], t0: Array) -> tuple[Array, Array]:
@@ -322,9 +325,7 @@ def status_of(beliefs: Belief, reads: tuple[Read, ...], t0: Array) -> tuple[Arra
     return status, jnp.where(lost.any(), t[jnp.argmax(lost)], jnp.nan)
 
 
-def looked_at(
-    model: Model, recording: Recording, first: Belief, substeps: int | None
-) -> tuple[Model, Sensors, Recording, Belief, Grid]:
+def looked_at(model: Model, recording: Recording, first: Belief, substeps: int | None) -> Given:
     """The checked arguments of `filter` and `smooth`: model, sensors, recording, belief, times."""
     _checks.instance(model, Model, "model")
     _checks.instance(recording, Recording, "recording")

@@ -12,14 +12,13 @@ from rigidjax import _checks
 from rigidjax._types import Scalar
 from rigidjax.estimate import roots
 from rigidjax.estimate.belief import Belief
-from rigidjax.estimate.filter import WORDS, Grid, looked_at, scan_filter, status_of, told
+from rigidjax.estimate.filter import WORDS, Given, looked_at, scan_filter, status_of, told
 from rigidjax.estimate.linear import LinearEstimate, solved
 from rigidjax.estimate.scene import (
     Dynamics,
     Extended,
     Model,
     Read,
-    Sensors,
     Stops,
     by_sensor,
     linearised,
@@ -111,7 +110,7 @@ def smooth(
     """
     _checks.whole(iterations, "iterations", 1)
     _checks.positive(tolerance, "tolerance")
-    out = _smooth(*looked_at(model, recording, first, substeps), iterations, tolerance)
+    out = _smooth(looked_at(model, recording, first, substeps), iterations, tolerance)
     if not throw:
         return out
     words = (
@@ -123,19 +122,10 @@ def smooth(
 
 
 @eqx.filter_jit
-def _smooth(
-    model: Model,
-    sensors: Sensors,
-    recording: Recording,
-    first: Belief,
-    grid: Grid,
-    iterations: int,
-    tolerance: float,
-) -> Smoothed:
-    dynamics, stops, (_, kept) = scan_filter(
-        model, sensors, recording, first, grid, lambda belief, read: (belief, read)
-    )
-    beliefs, read = jax.tree.map(lambda leaf: leaf[grid.rows], kept)
+def _smooth(given: Given, iterations: int, tolerance: float) -> Smoothed:
+    _, sensors, _, first, grid = given
+    dynamics, stops, kept = scan_filter(given, lambda belief, read: (belief, read))
+    beliefs, read = grid.of_rows(kept)
     status, lost_at = status_of(beliefs, by_sensor(sensors, read), first.t)
     path = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first.x, kept[0].x)
 
@@ -162,17 +152,11 @@ def _smooth(
         size = roots.inverse_root(h)[:, None] * root[None]
         variance = jnp.diagonal(found.kick_covariance, axis1=1, axis2=2)[:, mine]
         pushes.append(Push(size * found.kicks[:, mine], size * jnp.sqrt(variance)))
-    return Smoothed(
-        Belief(stops.t, jax.tree.map(lambda leaf: leaf[1:], path), found.root[1:]),
-        grid.rows,
-        tuple(pushes),
-        by_sensor(sensors, Read(found.innovation[1:], found.variance[1:], kept[1].seen)),
-        found.log_likelihood,
-        change,
-        count,
-        jnp.where(jnp.isfinite(change), status, 2),
-        lost_at,
-    )
+    belief = Belief(stops.t, jax.tree.map(lambda leaf: leaf[1:], path), found.root[1:])
+    reads = by_sensor(sensors, Read(found.innovation[1:], found.variance[1:], kept[1].seen))
+    status = jnp.where(jnp.isfinite(change), status, 2)
+    total = found.log_likelihood
+    return Smoothed(belief, grid.rows, tuple(pushes), reads, total, change, count, status, lost_at)
 
 
 def _iterate(
