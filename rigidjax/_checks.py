@@ -1,6 +1,7 @@
 """Checks at public boundaries: what was wanted, what came, and the likely cause."""
 
 import functools
+import importlib
 import inspect
 import os
 import re
@@ -411,6 +412,15 @@ def key(value: Any, name: str = "key") -> Any:
         f"{name}: wanted one random key, such as jax.random.key(0), got {found}; for many use "
         "jax.vmap over jax.random.split(key, n)"
     )
+
+
+def library(module: str, extra: str, who: str) -> Any:
+    """The module, imported now; `ModuleNotFoundError` says which extra of ours installs it."""
+    try:
+        return importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        words = f"{who}: {module} is missing; pip install 'rigidjax[{extra}]'"
+        raise ModuleNotFoundError(words, name=module) from error
 
 
 def float_type(value: Any, name: str = "dtype") -> Any:

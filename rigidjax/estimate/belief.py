@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from rigidjax import _checks
 from rigidjax._types import HasSpin
-from rigidjax.estimate.scene import Extended, Model, not_negative, sensors_of
+from rigidjax.estimate.scene import Extended, Model, not_negative, sensors_of, with_torque
 from rigidjax.identify.recording import Recording
 from rigidjax.identify.reference_states import attitudes, first_rate
 from rigidjax.motion import Attitude, Spin
@@ -25,13 +25,6 @@ class Belief(eqx.Module):
     `Spin` the errors of Ω; for an `Attitude` δθ (body frame, rad) and Ω; for a `Rigid` x, v, δθ, Ω;
     then 3 for each `CorrelatedTorque`, then the walks. After `filter` all fields have a leading
     time axis. `start` makes the first belief.
-
-    >>> import rigidjax as rj
-    >>> record = rj.identify.Recording([0.0, 1.0], (rj.identify.Gyro(0.1), [[1.0, 0, 0]] * 2))
-    >>> model = Model(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.torques.RandomTorque(1e-4))
-    >>> first = start(model, record, rate=0.1)
-    >>> float(first.t), first.root.shape
-    (0.0, (3, 3))
     """
 
     t: Float[Array, "*times"]
@@ -82,9 +75,8 @@ def start(
     standard deviations, one number or three, zero for known values: `rate` of Ω, rad/s; `attitude`
     rad; `position` m and `velocity` m/s of a `Rigid`. Torques start from their model's stationary
     distribution. **Returns** a `Belief`. **Raises:** `ValueError` for a deviation that is missing
-    or below zero, `TypeError` for arguments of another type.
+    or below zero.
 
-    >>> import rigidjax as rj
     >>> record = rj.identify.Recording([0.0, 1.0], (rj.identify.Gyro(0.1), [[1.0, 0, 0]] * 2))
     >>> model = Model(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.torques.RandomTorque(1e-4))
     >>> start(model, record, rate=0.1).deviation.tolist()
@@ -92,6 +84,7 @@ def start(
     """
     _checks.instance(model, Model, "model")
     _checks.instance(recording, Recording, "recording")
+    model = with_torque(model, recording.torque)
     sensors = sensors_of(recording.sensors, model)
     if state is None:
         state = _shown(recording)

@@ -9,15 +9,16 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
 from rigidjax import _checks
 from rigidjax._types import HasSpin, Scalar
+from rigidjax.estimate import roots
 from rigidjax.estimate.belief import Belief
-from rigidjax.estimate.filter import TURN_A_STEP, Task, grid_of, scan_filter
-from rigidjax.estimate.scene import Extended, Model, sensors_of
+from rigidjax.estimate.filter import TURN_A_STEP, grid_of, scan_filter
+from rigidjax.estimate.roots import Terms
+from rigidjax.estimate.scene import Extended, Model, sensors_of, with_torque
 from rigidjax.identify import padding, uncertainty
 from rigidjax.identify.body_charts import matter
 from rigidjax.identify.parameters import Unpacked, local
@@ -34,7 +35,7 @@ from rigidjax.identify.terms import (
     with_jacobian,
 )
 from rigidjax.motion.manifold import dimension
-from rigidjax.motion.torques import CorrelatedTorque, RandomTorque, Sum
+from rigidjax.motion.torques import CorrelatedTorque, RandomTorque
 
 # The advice if a fit without the torque ended far from the body.
 _GUESS = (
@@ -62,15 +63,13 @@ class LogDensity(eqx.Module):
     of the normal prior of the logarithms of its density and time about the given values, `None` for
     a known process. The density scales with the square of a moment if only ratios of moments are
     determined, as by a gyro alone: compare `density / moment**2`, and give the prior in the fit's
-    own unit of inertia (`fit.body`). **Raises:** `TypeError` for arguments of another type;
-    `ValueError` for a robust loss, which is no density, and for directions that neither data nor a
-    prior determine.
+    own unit of inertia (`fit.body`). **Raises:** `ValueError` for a robust loss, which is no
+    density, and for directions that neither data nor a prior determine.
 
     For numpyro: `numpyro.infer.MCMC(NUTS(potential_fn=lambda x: -density(x)), …)`; for blackjax:
     `blackjax.nuts(density, …)`, or `estimate.posterior`. Gradients are computed recording by
     recording in forward mode, also under `jax.grad`; compile it by `equinox.filter_jit(density)`.
 
-    >>> import rigidjax as rj
     >>> ts = jnp.linspace(0.0, 10.0, 80)
     >>> motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1, 0.1, 1.0]), ts)
     >>> record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), motion.ys.omega))
@@ -166,9 +165,8 @@ class LogDensity(eqx.Module):
         """The process by the logarithms of the factors of its numbers."""
         if logs is None:
             return self.process
-        leaves, structure = jax.tree.flatten(self.process)
-        grown = [leaf * jnp.exp(log) for leaf, log in zip(leaves, logs, strict=True)]
-        return jax.tree.unflatten(structure, grown)
+        logs = jax.tree.unflatten(jax.tree.structure(self.process), list(logs))
+        return jax.tree.map(lambda leaf, log: leaf * jnp.exp(log), self.process, logs)
 
 
 @eqx.filter_jit
@@ -185,27 +183,12 @@ def _definite(covariance: np.ndarray) -> bool:
     return bool(np.linalg.eigvalsh(covariance / np.outer(size, size)).min() > 1e-10)
 
 
-class Terms(NamedTuple):
-    """Each number read, normal given the earlier ones: its `error` (R, N) in standard deviations,
-    and `log_variance` (R, N), the logarithm of 2π times its variance; both zero where masked. A
-    channel at its limit counts by its probability, and has no variance.
-    """
-
-    error: Float[Array, "*records n"]
-    log_variance: Float[Array, "*records n"]
-
-    @property
-    def log_density(self) -> Scalar:
-        """The sum of the logarithms of the normal densities."""
-        return -0.5 * jnp.sum(self.error**2 + self.log_variance)
-
-
 class Curvature(NamedTuple):
-    """The cost, minus a log-density, its gradient (n,), and Fisher's information (n, n)."""
+    """The cost, minus a log-density; Fisher's information `gram`; the gradient `slope`."""
 
     cost: Scalar
-    slope: Float[Array, " n"]
     gram: Float[Array, "n n"]
+    slope: Float[Array, " n"]
 
 
 def terms(density: LogDensity, x: Float[Array, " n"]) -> Terms:
@@ -245,7 +228,7 @@ def curvature(density: LogDensity, x: Float[Array, " n"]) -> Curvature:
 
     extra, rest = with_jacobian(lambda x: prior_residuals(density, x), x)
     cost = 0.5 * jnp.sum(rest**2) - found.log_density
-    return Curvature(cost, slope + rest @ extra, gram + extra.T @ extra)
+    return Curvature(cost, gram + extra.T @ extra, slope + rest @ extra)
 
 
 def prior_residuals(density: LogDensity, x: Float[Array, " n"]) -> Float[Array, " m"]:
@@ -265,10 +248,8 @@ def groups_of(problem: Problem) -> Int[Array, " records"]:
 
 def grown_noises(noises: tuple, steps: tuple) -> tuple[Float[Array, "*records k"], ...]:
     """The noises of the sensors by the logarithms of their factors, `None` for none."""
-    return tuple(
-        noise if step is None else noise * jnp.exp(step)[..., None]
-        for noise, step in zip(noises, steps, strict=True)
-    )
+    pairs = zip(noises, steps, strict=True)
+    return tuple(n if step is None else n * jnp.exp(step)[..., None] for n, step in pairs)
 
 
 def own_numbers(density: LogDensity, x: Array) -> Any:
@@ -319,21 +300,15 @@ def _of_one(
     )
     body = what_turns(matter(problem.body, mine.body, which), problem.rung)
     state: HasSpin = ref.moved(mine.own)
-    process = density.grown(logs)
-    law = process if record.torque is None else Sum(record.torque, process)
-    model = Model(body, law)
-    sensors = [reading.sensor for reading in record.readings]
+    model = with_torque(Model(body, density.grown(logs)), record.torque)
+    sensors = sensors_of([reading.sensor for reading in record.readings], model)
     torques = tuple(jnp.zeros(3, state.omega.dtype) for _ in model.coloured)
-    x = Extended(state, torques, ())
     known = jnp.zeros(dimension(state), state.omega.dtype)
     spread = jnp.concatenate([known, *(law.deviation for law in model.coloured)])
-    first = Belief(record.t[0], x, jnp.diag(spread))
+    first = Belief(record.t[0], Extended(state, torques, ()), jnp.diag(spread))
     grid = grid_of(model, record, first, density.substeps)
-    task = Task(model, sensors_of(sensors, model), record, first, grid)
-    reads = scan_filter(task, lambda belief, read: read)[1][1]
-    error = [jnp.where(r.seen, r.innovation * lax.rsqrt(r.variance), 0) for r in reads]
-    log_variance = [jnp.where(r.seen, jnp.log(2 * math.pi * r.variance), 0) for r in reads]
-    return _flat(error, log_variance)
+    _, _, read = scan_filter((model, sensors, record, first, grid), lambda _, read: read)
+    return jax.tree.map(jnp.ravel, roots.terms(*read))
 
 
 def _of_motion(
@@ -349,10 +324,6 @@ def _of_motion(
         # What a channel at its limit counts is a probability, not a density.
         seen = reading.mask[:, None] & ~full
         log_variance.append(jnp.where(seen, jnp.log(2 * math.pi * noise**2)[None], 0))
-    return _flat(scaled, log_variance)
-
-
-def _flat(error: list[Array], log_variance: list[Array]) -> Terms:
     return Terms(
-        *(jnp.concatenate([a.reshape(-1) for a in part]) for part in (error, log_variance))
+        *(jnp.concatenate([a.reshape(-1) for a in part]) for part in (scaled, log_variance))
     )

@@ -20,10 +20,12 @@ from rigidjax.estimate.scene import (
     Read,
     Sensors,
     Stops,
-    absorb_all,
     bare,
+    by_sensor,
+    linearised,
     reset,
     sensors_of,
+    with_torque,
 )
 from rigidjax.identify.recording import Recording
 from rigidjax.identify.sensors import Gyro
@@ -43,52 +45,50 @@ class Grid(NamedTuple):
     real: Bool[Array, " n"]
     rows: Int[Array, " t"]
 
+    def of_rows(self, kept: Any) -> Any:
+        """Of the values at all times those at the recording's; to pick all would be a copy."""
+        same = self.rows.size == self.t.size
+        return kept if same else jax.tree.map(lambda leaf: leaf[self.rows], kept)
 
-def grid_of(model: Model, recording: Recording, first: Belief, substeps: int | None) -> Grid | None:
-    """The times of the steps; `None` if the recording's own times are enough."""
-    t, t0 = recording.t, first.t
-    if _checks.known((t, t0)):
-        begin = np.asarray(t)[0]
+
+def grid_of(model: Model, recording: Recording, first: Belief, substeps: int | None) -> Grid:
+    """The times of the steps."""
+    xp = _checks.namespace((recording.t, first.t))
+    t, t0 = xp.asarray(recording.t), xp.asarray(first.t)
+    if xp is np:
         words = (
-            f"recording: readings are out of order: the first is at {begin:g} s, before the time "
-            f"of the belief it starts from, {np.asarray(t0):g} s"
+            f"recording: readings are out of order: the first is at {t[0]:g} s, before the time "
+            f"of the belief it starts from, {t0:g} s"
         )
-        _checks.refuse(t, begin < np.asarray(t0), words)
-    if substeps is not None:
-        counts = np.full(t.shape, _checks.whole(substeps, "substeps", 1))
-    elif _checks.known((t, t0, first.x.motion.omega, model.coloured)):
-        gaps = np.diff(np.concatenate([[float(t0)], np.asarray(t)]))
-        counts = steps_of(model, _fastest(recording, first), gaps)
-    else:
-        return None
-    if (counts == 1).all():
-        return None
-    xp = _checks.namespace((t, t0))
+        _checks.refuse(t, t[0] < t0, words)
+    ends = xp.concatenate([t0[None], t])
+    counts = steps_of(model, ends, first.x.motion, substeps, recording)
     index = np.repeat(np.arange(counts.size), counts)
     rows = np.cumsum(counts) - 1
     part = (np.arange(index.size) - np.repeat(rows - counts, counts)) / counts[index]
-    t, t0 = xp.asarray(t), xp.asarray(t0)
-    before = xp.concatenate([t0[None], t[:-1]])
-    times = before[index] + (t - before)[index] * xp.asarray(part, t.dtype)
+    times = ends[index] + (t - ends[:-1])[index] * xp.asarray(part, t.dtype)
     times = xp.where(part == 1, t[index], times)
     return Grid(*map(jnp.asarray, (times, index, part == 1, rows)))
 
 
-def steps_of(model: Model, rate: float, span: Any) -> Any:
-    """The number of fixed steps in `span` s of a body that turns at `rate` rad/s."""
-    times = [MEMORY_A_STEP * float(law.time) for law in model.coloured]
-    longest = min([TURN_A_STEP / rate if rate > 0 else math.inf, *times])
-    return np.maximum(1, np.ceil(span / longest * (1 - 1e-9))).astype(int)
-
-
-def _fastest(recording: Recording, first: Belief) -> float:
-    """The largest rate that the initial state and the gyros show, rad/s."""
-    rate = float(np.linalg.norm(np.asarray(first.x.motion.omega, float)))
-    for reading in recording.readings:
+def steps_of(
+    model: Model, ts: Any, state: Any, substeps: int | None, recording: Recording | None = None
+) -> np.ndarray:
+    """The number of fixed steps from each of the times `ts` to the next: `substeps`, or by the rate
+    of the `state` and of gyros, or one if numbers are not known.
+    """
+    if substeps is not None:
+        return np.full(ts.shape[0] - 1, _checks.whole(substeps, "substeps", 1))
+    if not _checks.known((ts, state.omega, model.coloured)):
+        return np.ones(ts.shape[0] - 1, int)
+    rate = float(np.linalg.norm(np.asarray(state.omega, float)))
+    for reading in () if recording is None else recording.readings:
         if isinstance(reading.sensor, Gyro):
             values = np.asarray(reading.values, float)[reading.seen]
             rate = max(rate, float(np.quantile(np.linalg.norm(values, axis=1), 0.99)))
-    return rate
+    times = [MEMORY_A_STEP * float(law.time) for law in model.coloured]
+    longest = min([TURN_A_STEP / rate if rate > 0 else math.inf, *times])
+    return np.maximum(1, np.ceil(np.diff(ts) / longest * (1 - 1e-9))).astype(int)
 
 
 # A filter is lost if no reading was within so many deviations for so long, s, and so many readings.
@@ -107,13 +107,6 @@ class Filtered(eqx.Module):
     for each sensor, a `Read`: `innovation`, `variance` and `seen`, (T, k); `log_likelihood` of all
     readings; `status` 0 followed, 1 lost, 2 stopped (`words` says it); `lost_at` s, NaN unless
     lost.
-
-    >>> import rigidjax as rj
-    >>> record = rj.identify.Recording([0.0, 0.1], (rj.identify.Gyro(0.1), [[1.0, 0, 0]] * 2))
-    >>> model = rj.estimate.Model(rj.Inertia.from_principal(1.0, 2.0, 2.5))
-    >>> found = rj.estimate.filter(model, record, rj.estimate.start(model, record, rate=1.0))
-    >>> found.readings[0].innovation.shape, int(found.status)
-    ((2, 3), 0)
     """
 
     belief: Belief
@@ -164,23 +157,23 @@ def filter(
     readings both follow the equations of motion, by the classical method of order 4. The covariance
     is kept as a root, updated by Potter's formula for each number read.
 
-    **Arguments:** `model`; `recording` a `Recording` whose sensors have their noise; masked
-    readings are gaps, channels at their full scale are left out, a sensor's `offset` is a delay;
-    `first` of `start`; `substeps` fixed steps from one time to the next, `None` chooses them by the
-    rate if the numbers are known, else one. `throw`: with `False` no event of the run raises an
-    error; see `status`. **Returns** `belief`, `readings`, `log_likelihood`, `status` and `lost_at`
-    (`Filtered`). It may be jitted, differentiated, and batched over any argument.
+    **Arguments:** `model`; `recording` a `Recording` whose sensors have their noise, and whose
+    torque acts beside the model's; masked readings are gaps, channels at their full scale are left
+    out, a sensor's `offset` is a delay; `first` of `start`; `substeps` fixed steps from one time to
+    the next, `None` chooses them by the rate if the numbers are known, else one. `throw`: with
+    `False` no event of the run raises an error; see `status`. **Returns** `belief`, `readings`,
+    `log_likelihood`, `status` and `lost_at` (`Filtered`). It may be jitted, differentiated, and
+    batched over any argument.
 
     **Raises:** `ValueError` for a sensor without noise, and readings before `first`; with `throw`
     also for a lost filter: no reading was within 6 deviations of its prediction for a second and
     three readings.
 
-    >>> import rigidjax as rj
     >>> record = rj.identify.Recording([0.0, 0.1], (rj.identify.Gyro(0.1), [[1.0, 0, 0]] * 2))
     >>> model = rj.estimate.Model(rj.Inertia.from_principal(1.0, 2.0, 2.5))
     >>> found = rj.estimate.filter(model, record, rj.estimate.start(model, record, rate=1.0))
-    >>> found.states.omega.shape, found.words
-    ((2, 3), 'followed')
+    >>> found.states.omega.shape, found.readings[0].innovation.shape, found.words
+    ((2, 3), (2, 3), 'followed')
     """
     out = _filter(looked_at(model, recording, first, substeps))
     return told(out) if throw else out
@@ -204,7 +197,6 @@ def log_likelihood(
     over moments, a density, a noise, an initial state. Arguments and errors are as for `filter`;
     differentiable in forward and reverse mode.
 
-    >>> import rigidjax as rj
     >>> record = rj.identify.Recording([0.0, 0.1], (rj.identify.Gyro(1.0), [[1.0, 0, 0]] * 2))
     >>> model = rj.estimate.Model(rj.Inertia.from_principal(1.0, 1.0, 1.0))
     >>> first = rj.estimate.start(model, record, rj.Spin([1.0, 0, 0]), rate=0.0)
@@ -224,7 +216,7 @@ def step(model: Model, belief: Belief, t: ScalarLike, *readings: tuple) -> Belie
     turn. **Returns** the `Belief` at `t`. **Raises:** `ValueError` for a `t` before the belief, or
     a reading with NaN, if the numbers are known.
 
-    >>> import jax, rigidjax as rj
+    >>> import jax
     >>> gyro = rj.identify.Gyro(0.1)
     >>> record = rj.identify.Recording([0.0, 0.1], (gyro, [[1.0, 0, 0]] * 2))
     >>> model = rj.estimate.Model(rj.Inertia.from_principal(1.0, 2.0, 2.5))
@@ -265,65 +257,54 @@ def _step(
         jnp.where(mask, value, jnp.zeros_like(value).at[0].set(1)).astype(belief.root.dtype)
         for value, mask in zip(values, masks, strict=True)
     )
-    dynamics = Dynamics(model, belief.x, sensors.densities)
-    return _one(dynamics, sensors, belief, Stops(t, values, masks))[0]
+    return _one(Dynamics(model, belief.x, sensors), belief, Stops(t, values, masks))[0]
 
 
-def _one(
-    dynamics: Dynamics, sensors: Sensors, belief: Belief, stop: Stops
-) -> tuple[Belief, tuple[Read, ...]]:
+def _one(dynamics: Dynamics, belief: Belief, stop: Stops) -> tuple[Belief, Read]:
     dtype = belief.root.dtype
     # Times may have more digits than the state: after a thousand seconds seven are too few.
     since = (stop.t - belief.t).astype(dtype)
     x, grown, noise = dynamics.predict(belief.t.astype(dtype), since, belief.x)
     root = roots.predicted(grown, belief.root, noise)
-    e, root, read = absorb_all(dynamics, sensors, stop, x, jnp.zeros_like(root[0]), root)
-    return Belief(stop.t, plus(x, e), reset(x, e, root)), read
+    matrix, error, deviation, seen = linearised(dynamics, stop, x)
+    e = jnp.zeros_like(root[0])
+    e, root, innovation, variance = roots.absorb_all(e, root, matrix, error, deviation**2, seen)
+    return Belief(stop.t, plus(x, e), reset(x, e, root)), Read(innovation, variance, seen)
 
 
-class Task(NamedTuple):
-    """The checked model, readings and times of a filter."""
-
-    model: Model
-    sensors: Sensors
-    recording: Recording
-    first: Belief
-    grid: Grid | None
+# The checked arguments of a filter: see `looked_at`.
+Given = tuple[Model, Sensors, Recording, Belief, Grid]
 
 
-def scan_filter(task: Task, keep: Any) -> tuple[Stops, Any]:
-    """All stops, and `lax.scan` of the filter over them, which keeps `keep(belief, read)`."""
-    model, sensors, recording, first, grid = task
+def scan_filter(given: Given, keep: Any) -> tuple[Dynamics, Stops, Any]:
+    """`lax.scan` of the filter over all stops, which keeps `keep(belief, read)`."""
+    model, sensors, recording, first, grid = given
     dtype = first.root.dtype
-    dynamics = Dynamics(model, first.x, sensors.densities)
-    values = tuple(reading.values.astype(dtype) for reading in recording.readings)
-    stops = Stops(recording.t, values, tuple(reading.mask for reading in recording.readings))
-    if grid is not None:
-        _, values, masks = jax.tree.map(lambda leaf: leaf[grid.source], stops)
-        stops = Stops(grid.t, values, tuple(mask & grid.real for mask in masks))
+    dynamics = Dynamics(model, first.x, sensors)
+    values = tuple(r.values.astype(dtype)[grid.source] for r in recording.readings)
+    masks = tuple(r.mask[grid.source] & grid.real for r in recording.readings)
+    stops = Stops(grid.t, values, masks)
 
-    def body(carry: tuple[Belief, Array], stop: Stops) -> tuple[Any, Any]:
-        belief, total = carry
-        belief, read = _one(dynamics, sensors, belief, stop)
-        total = total + sum(r.log_density for r in read)
-        return (belief, total), keep(belief, read)
+    def body(belief: Belief, stop: Stops) -> tuple[Belief, Any]:
+        belief, read = _one(dynamics, belief, stop)
+        return belief, keep(belief, read)
 
     # A reverse pass computes a step again: a step holds some thousand numbers.
     body = jax.checkpoint(body)  # pyright: ignore[reportPrivateImportUsage]
-    return stops, lax.scan(body, (first, jnp.zeros((), dtype)), stops)
+    return dynamics, stops, lax.scan(body, first, stops)[1]
 
 
 @eqx.filter_jit
-def _filter(task: Task) -> Filtered:
-    grid = task.grid
-    _, ((_, total), kept) = scan_filter(task, lambda belief, read: (belief, read))
-    beliefs, reads = kept if grid is None else jax.tree.map(lambda leaf: leaf[grid.rows], kept)
-    return Filtered(beliefs, reads, total, *status_of(beliefs, reads, task.first.t))
+def _filter(given: Given) -> Filtered:
+    _, sensors, _, first, grid = given
+    beliefs, read = grid.of_rows(scan_filter(given, lambda belief, read: (belief, read))[2])
+    reads, total = by_sensor(sensors, read), roots.terms(*read).log_density
+    return Filtered(beliefs, reads, total, *status_of(beliefs, reads, first.t))
 
 
 @eqx.filter_jit
-def _log_likelihood(task: Task) -> Scalar:
-    return scan_filter(task, lambda belief, read: None)[1][0][1]
+def _log_likelihood(given: Given) -> Scalar:
+    return roots.terms(*scan_filter(given, lambda _, read: read)[2]).log_density
 
 
 def status_of(beliefs: Belief, reads: tuple[Read, ...], t0: Array) -> tuple[Array, Array]:
@@ -344,17 +325,15 @@ def status_of(beliefs: Belief, reads: tuple[Read, ...], t0: Array) -> tuple[Arra
     return status, jnp.where(lost.any(), t[jnp.argmax(lost)], jnp.nan)
 
 
-def looked_at(model: Model, recording: Recording, first: Belief, substeps: int | None) -> Task:
-    """The task of `filter` and `smooth`, its arguments checked in words."""
+def looked_at(model: Model, recording: Recording, first: Belief, substeps: int | None) -> Given:
+    """The checked arguments of `filter` and `smooth`: model, sensors, recording, belief, times."""
     _checks.instance(model, Model, "model")
     _checks.instance(recording, Recording, "recording")
     _checks.instance(first, Belief, "first", hint="estimate.start makes it")
-    if recording.torque is not None:
-        raise ValueError("recording: it has a torque of its own; put it into the model instead")
     for sensor in recording.sensors:
         if not isinstance(first.x.motion, sensor.feels):
             kind, got = sensor.feels.__name__, type(first.x.motion).__name__
             raise TypeError(f"first: a sensor needs a state with {kind}, got a {got}")
+    model = with_torque(model, recording.torque)
     sensors = sensors_of(recording.sensors, model)
-    grid = grid_of(model, recording, first, substeps)
-    return Task(bare(model), sensors, recording, first, grid)
+    return bare(model), sensors, recording, first, grid_of(model, recording, first, substeps)

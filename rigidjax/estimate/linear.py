@@ -88,11 +88,6 @@ class LinearEstimate(eqx.Module):
     **Fields:** `mean` (T, n), `root` (T, n, n), `innovation`, `variance` (T, k) of each number read
     given those before it, and `log_likelihood` of all; of a smoother `kicks` (T − 1, m), the means
     of the noise u, and `kick_covariance` (T − 1, m, m), else `None`.
-
-    >>> walk = LinearModel(jnp.eye(1), 0.1 * jnp.eye(1), jnp.eye(1), jnp.ones(1))
-    >>> found = linear_filter(walk, jnp.ones((3, 1)), jnp.zeros(1), jnp.eye(1))
-    >>> found.mean.shape, found.root.shape, found.innovation[0].tolist()
-    ((3, 1), (3, 1, 1), [1.0])
     """
 
     mean: Float[Array, "times n"]
@@ -112,6 +107,117 @@ class LinearEstimate(eqx.Module):
     def deviation(self) -> Float[Array, "times n"]:
         """The standard deviations."""
         return jnp.sqrt(jnp.sum(self.root**2, -1))
+
+
+def linear_filter(
+    model: LinearModel, readings: Any, mean: Any, root: Any, seen: Any = None
+) -> LinearEstimate:
+    """The Kalman filter of a `LinearModel`: the state at each time from the readings so far.
+
+    **Arguments:** `model`; `readings` y (T, k); `mean` (n,) and `root` (n, n), a root of the
+    covariance, at the first time before its reading; `seen` (T, k) which numbers count, `None` all.
+    **Returns** `mean`, `root`, `innovation`, `variance` and `log_likelihood` (`LinearEstimate`).
+    **Raises:** `ValueError` for shapes that do not fit, NaN that is not masked.
+
+    >>> walk = LinearModel(jnp.eye(1), 0.1 * jnp.eye(1), jnp.eye(1), jnp.ones(1))
+    >>> found = linear_filter(walk, jnp.ones((3, 1)), jnp.zeros(1), jnp.eye(1))
+    >>> found.mean[0].tolist(), found.innovation[0].tolist()
+    ([0.5], [1.0])
+    """
+    return solved(*_given(model, readings, mean, root, seen), back=False)
+
+
+def linear_smooth(
+    model: LinearModel, readings: Any, mean: Any, root: Any, seen: Any = None
+) -> LinearEstimate:
+    """The state at each time, and the noise of each step, from all readings.
+
+    Rauch, Tung and Striebel 1965, doi:10.2514/3.3166, on roots of the covariances.
+
+    **Arguments**, **returns** and **raises** as `linear_filter`, with `kicks`, the noise u of each
+    step, and `kick_covariance`.
+
+    >>> walk = LinearModel(jnp.eye(1), 0.1 * jnp.eye(1), jnp.eye(1), jnp.ones(1))
+    >>> found = linear_smooth(walk, jnp.ones((3, 1)), jnp.zeros(1), jnp.eye(1))
+    >>> bool(found.mean[0, 0] > 0.5), found.kicks.shape
+    (True, (2, 1))
+    """
+    return solved(*_given(model, readings, mean, root, seen), back=True)
+
+
+def _given(model: LinearModel, readings: Any, mean: Any, root: Any, seen: Any) -> tuple:
+    _checks.instance(model, LinearModel, "model")
+    n, k = model.size, model.deviation.shape[-1]
+    readings = _checks.rows(readings, (k,), "readings")
+    mean, root = _checks.floating(mean, (n,), "mean"), _checks.floating(root, (n, n), "root")
+    times = readings.shape[0]
+    if not times:
+        raise ValueError("readings: wanted at least one row, got none")
+    if seen is None:
+        seen = jnp.ones(readings.shape, bool)
+    seen = jnp.asarray(seen)
+    if seen.dtype != bool or seen.shape != readings.shape:
+        raise ValueError(f"seen: wanted truth values {readings.shape}, got {seen.shape}")
+    bad = seen & ~jnp.isfinite(readings)
+    words = "readings: contains NaN or infinity; mask it by `seen` if it is a gap"
+    readings = jnp.where(seen, _checks.refuse(readings, bad.any(), words), 0)
+    parts = {name: getattr(model, name) for name in _AXES}
+    for name, part in _moving(parts).items():
+        wanted = times - 1 if name in _STEPS else times
+        if part.shape[0] != wanted:
+            raise ValueError(f"{name}: wanted {wanted} rows for {times} times, got {part.shape[0]}")
+    return parts, readings, mean, root, seen
+
+
+# The axes of each part of a model; one more if it changes from step to step, or time to time.
+_STEPS = {"transition": 2, "noise": 2, "push": 1}
+_AXES = _STEPS | {"matrix": 2, "deviation": 1, "offset": 1}
+Parts = dict[str, Any]
+
+
+def _moving(parts: Parts) -> Parts:
+    """The parts that change."""
+    return {n: part for n, part in parts.items() if part is not None and part.ndim > _AXES[n]}
+
+
+@partial(jax.jit, static_argnames="back")
+def solved(
+    parts: Parts, readings: Array, mean: Array, root: Array, seen: Array, *, back: bool
+) -> LinearEstimate:
+    """The filter forward through all times, and with `back` the smoother's pass after it; `parts`
+    are a `LinearModel`'s by name.
+    """
+    steps = {name: part for name, part in _moving(parts).items() if name in _STEPS}
+    times = {name: part for name, part in _moving(parts).items() if name not in _STEPS}
+
+    def read(row: tuple, mean: Array, root: Array) -> roots.Absorbed:
+        times, y, seen = row
+        now = parts | times
+        error = y if now["offset"] is None else y - now["offset"]
+        return roots.absorb_all(mean, root, now["matrix"], error, now["deviation"] ** 2, seen)
+
+    def body(carry: tuple[Array, Array], now: Any) -> tuple[Any, Any]:
+        (mean, root), (steps, row) = carry, now
+        grown, noise, push = ((parts | steps)[name] for name in ("transition", "noise", "push"))
+        predicted = jnp.sum(grown * mean[None], 1)
+        if push is not None:
+            predicted = predicted + push
+        kept = joint(grown, noise, root) if back else None
+        before = roots.predicted(grown, root, noise) if kept is None else kept.predicted
+        passed = read(row, predicted, before)
+        return (passed.step, passed.root), (passed, predicted, kept)
+
+    rows = times, readings, seen
+    now, later = (jax.tree.map(lambda leaf, at=at: leaf[at], rows) for at in (0, slice(1, None)))
+    first = read(now, mean, root)
+    _, (rest, predicted, kept) = lax.scan(body, (first.step, first.root), (steps, later))
+    passed = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first, rest)
+    means, spread, innovation, variance = passed
+    total, kicks = roots.terms(innovation, variance, seen).log_density, (None, None)
+    if back:
+        end = means[-1], spread[-1]
+        means, spread, *kicks = smoothed(kept, means[:-1], predicted, parts["noise"], end)
+    return LinearEstimate(means, spread, innovation, variance, total, *kicks)
 
 
 class Joint(NamedTuple):
@@ -165,119 +271,3 @@ def smoothed(
     _, before = lax.scan(back, end, (kept, mean, predicted, moving), reverse=True)
     means, spread = (jnp.concatenate([a, b[None]]) for a, b in zip(before, end, strict=False))
     return means, spread, *before[2:]
-
-
-def linear_filter(
-    model: LinearModel, readings: Any, mean: Any, root: Any, seen: Any = None
-) -> LinearEstimate:
-    """The Kalman filter of a `LinearModel`: the state at each time from the readings so far.
-
-    **Arguments:** `model`; `readings` y (T, k); `mean` (n,) and `root` (n, n), a root of the
-    covariance, at the first time before its reading; `seen` (T, k) which numbers count, `None` all.
-    **Returns** `mean`, `root`, `innovation`, `variance` and `log_likelihood` (`LinearEstimate`).
-    **Raises:** `ValueError` for shapes that do not fit, NaN that is not masked.
-
-    >>> walk = LinearModel(jnp.eye(1), 0.1 * jnp.eye(1), jnp.eye(1), jnp.ones(1))
-    >>> linear_filter(walk, jnp.ones((3, 1)), jnp.zeros(1), jnp.eye(1)).mean[0]
-    Array([0.5], dtype=float64)
-    """
-    return _solved(model, *_given(model, readings, mean, root, seen), back=False)
-
-
-def linear_smooth(
-    model: LinearModel, readings: Any, mean: Any, root: Any, seen: Any = None
-) -> LinearEstimate:
-    """The state at each time, and the noise of each step, from all readings.
-
-    Rauch, Tung and Striebel 1965, doi:10.2514/3.3166, on roots of the covariances.
-
-    **Arguments**, **returns** and **raises** as `linear_filter`, with `kicks`, the noise u of each
-    step, and `kick_covariance`.
-
-    >>> walk = LinearModel(jnp.eye(1), 0.1 * jnp.eye(1), jnp.eye(1), jnp.ones(1))
-    >>> found = linear_smooth(walk, jnp.ones((3, 1)), jnp.zeros(1), jnp.eye(1))
-    >>> bool(found.mean[0, 0] > 0.5), found.kicks.shape
-    (True, (2, 1))
-    """
-    return _solved(model, *_given(model, readings, mean, root, seen), back=True)
-
-
-def _given(model: LinearModel, readings: Any, mean: Any, root: Any, seen: Any) -> tuple:
-    _checks.instance(model, LinearModel, "model")
-    n, k = model.size, model.deviation.shape[-1]
-    readings = _checks.rows(readings, (k,), "readings")
-    mean, root = _checks.floating(mean, (n,), "mean"), _checks.floating(root, (n, n), "root")
-    times = readings.shape[0]
-    if not times:
-        raise ValueError("readings: wanted at least one row, got none")
-    if seen is None:
-        seen = jnp.ones(readings.shape, bool)
-    seen = jnp.asarray(seen)
-    if seen.dtype != bool or seen.shape != readings.shape:
-        raise ValueError(f"seen: wanted truth values {readings.shape}, got {seen.shape}")
-    bad = seen & ~jnp.isfinite(readings)
-    words = "readings: contains NaN or infinity; mask it by `seen` if it is a gap"
-    readings = jnp.where(seen, _checks.refuse(readings, bad.any(), words), 0)
-    for axes, wanted in ((_STEPS, times - 1), (_TIMES, times)):
-        for name, part in _moving(model, axes).items():
-            if part is not None and part.shape[0] != wanted:
-                raise ValueError(
-                    f"{name}: wanted {wanted} rows for {times} times, got {part.shape[0]}"
-                )
-    return readings, mean, root, seen
-
-
-# The parts of a model that may change from step to step, and from time to time: their axes.
-_STEPS = {"transition": 2, "noise": 2, "push": 1}
-_TIMES = {"matrix": 2, "deviation": 1, "offset": 1}
-
-
-def _moving(model: LinearModel, axes: dict[str, int]) -> dict[str, Array | None]:
-    """The parts that change, by name; `None` for the others."""
-    parts = {name: getattr(model, name) for name in axes}
-    return {n: p if p is not None and p.ndim > axes[n] else None for n, p in parts.items()}
-
-
-def _now(model: LinearModel, axes: dict[str, int], moving: dict[str, Array | None]) -> list[Any]:
-    """All parts at one step or time, from the ones that change."""
-    return [getattr(model, n) if moving[n] is None else moving[n] for n in axes]
-
-
-def _read(row: Any, y: Array, seen: Array, mean: Array, root: Array) -> roots.Absorbed:
-    """The update by one row of readings."""
-    matrix, deviation, offset = row
-    error = y if offset is None else y - offset
-    return roots.absorb_all(mean, root, matrix, error, deviation**2, seen)
-
-
-@partial(jax.jit, static_argnames="back")
-def _solved(
-    model: LinearModel, readings: Array, mean: Array, root: Array, seen: Array, *, back: bool
-) -> LinearEstimate:
-    """The filter forward through all times, and with `back` the smoother's pass after it."""
-    steps, times = _moving(model, _STEPS), _moving(model, _TIMES)
-    now, later = (jax.tree.map(lambda leaf, at=at: leaf[at], times) for at in (0, slice(1, None)))
-    first = _read(_now(model, _TIMES, now), readings[0], seen[0], mean, root)
-
-    def body(carry: tuple[Array, Array], now: Any) -> tuple[Any, Any]:
-        grown, noise, push = _now(model, _STEPS, now[0])
-        mean, root = carry
-        predicted = jnp.sum(grown * mean[None], 1)
-        if push is not None:
-            predicted = predicted + push
-        kept = joint(grown, noise, root) if back else None
-        before = roots.predicted(grown, root, noise) if kept is None else kept.predicted
-        passed = _read(_now(model, _TIMES, now[1]), now[2], now[3], predicted, before)
-        return (passed.step, passed.root), (passed, predicted, kept)
-
-    _, (rest, predicted, kept) = lax.scan(
-        body, (first.step, first.root), (steps, later, readings[1:], seen[1:])
-    )
-    passed = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first, rest)
-    means, spread, innovation, variance = passed
-    total = jnp.sum(roots.log_normal(innovation, variance, seen))
-    kicks = None, None
-    if back:
-        end = means[-1], spread[-1]
-        means, spread, *kicks = smoothed(kept, means[:-1], predicted, model.noise, end)
-    return LinearEstimate(means, spread, innovation, variance, total, *kicks)

@@ -1,6 +1,5 @@
 """Draws from a posterior density, by samplers of other libraries."""
 
-import importlib
 from collections.abc import Callable
 from typing import Any
 
@@ -17,6 +16,9 @@ from rigidjax.identify.parameters import Unpacked
 # A sampler: key, log-density of z, a first z (n,) → draws (samples, n).
 Sampler = Callable[[Any, Callable[[Array], Array], Array], Array]
 
+
+# Module, extra, and who asks.
+_BLACKJAX = ("blackjax", "posterior", "posterior")
 
 # The weight of the first mass matrix, in draws: it is good already if Laplace's method is.
 _WORTH = 50.0
@@ -49,7 +51,7 @@ class Nuts(eqx.Module):
 
     def __call__(self, key: Any, density: Callable[[Array], Array], start: Array) -> Array:
         """Draws (samples, n) of one chain."""
-        blackjax = _blackjax()
+        blackjax = _checks.library(*_BLACKJAX)
         adaptation = blackjax.adaptation
         # The warm-up of `blackjax.window_adaptation` in one loop with the draws: in a loop of its
         # own the density is compiled once more, which takes longer than to draw.
@@ -99,7 +101,7 @@ class Posterior(eqx.Module):
     if the chains agree, and `ess` (n,) is the number of independent draws, as in Gelman et al.,
     Bayesian Data Analysis (2013), §11.4, 11.5.
 
-    >>> import jax, rigidjax as rj
+    >>> import jax
     >>> ts = jnp.linspace(0.0, 10.0, 80)
     >>> motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1, 0.1, 1.0]), ts)
     >>> record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), motion.ys.omega))
@@ -117,12 +119,12 @@ class Posterior(eqx.Module):
     @property
     def rhat(self) -> Float[Array, " n"]:
         """Potential scale reduction between the chains, near 1 if they agree (blackjax)."""
-        return _blackjax().diagnostics.potential_scale_reduction(self.x)
+        return _checks.library(*_BLACKJAX).diagnostics.potential_scale_reduction(self.x)
 
     @property
     def ess(self) -> Float[Array, " n"]:
         """The effective number of independent draws (blackjax)."""
-        return _blackjax().diagnostics.effective_sample_size(self.x)
+        return _checks.library(*_BLACKJAX).diagnostics.effective_sample_size(self.x)
 
     @property
     def points(self) -> Unpacked:
@@ -144,7 +146,7 @@ class Posterior(eqx.Module):
 
         **Raises:** `ImportError` without arviz (it needs Python 3.12).
         """
-        arviz = _extra("to_arviz", "arviz", " (Python 3.12)")
+        arviz = _checks.library("arviz", "posterior", "to_arviz (Python 3.12)")
         points = self.points
         out = dict(points.values)
         out["omega0"] = points.state0.omega
@@ -171,10 +173,9 @@ def posterior(
     log-density and a first vector to draws (samples, n), `Nuts()` unless given; its numbers have
     the identity as covariance by Laplace's method, and it starts from a draw of that. `chains` run
     together under `vmap`, or one after another with eight recordings and more. **Returns** a
-    `Posterior`. **Raises:** `TypeError` for arguments of another type, `ImportError` if blackjax is
-    missing.
+    `Posterior`. **Raises** `ImportError` if blackjax is missing.
 
-    >>> import jax, rigidjax as rj
+    >>> import jax
     >>> ts = jnp.linspace(0.0, 10.0, 80)
     >>> motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1, 0.1, 1.0]), ts)
     >>> record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), motion.ys.omega))
@@ -190,7 +191,7 @@ def posterior(
     chains = _checks.whole(chains, "chains", 2)
     sampler = Nuts() if sampler is None else _checks.function(sampler, "sampler", "of a key")
     if isinstance(sampler, Nuts):
-        _blackjax()
+        _checks.library(*_BLACKJAX)
     root = jnp.linalg.cholesky(density.covariance)
     x = _draw(density, root, jax.random.split(key, chains), sampler)
     return Posterior(density, x)
@@ -210,15 +211,3 @@ def _draw(density: LogDensity, root: Array, keys: Array, sampler: Any) -> Array:
     if density.problem.count >= _FULL:
         return lax.map(chain, keys)
     return jax.vmap(chain)(keys)
-
-
-def _blackjax() -> Any:
-    return _extra("posterior", "blackjax")
-
-
-def _extra(name: str, module: str, note: str = "") -> Any:
-    try:
-        return importlib.import_module(module)
-    except ImportError as error:
-        words = f"{name}: {module} is missing; pip install 'rigidjax[posterior]'{note}"
-        raise ImportError(words) from error

@@ -41,7 +41,6 @@ class Refit(eqx.Module):
     (m,), which add up to 1, represent the posterior density. `effective` is the number of
     independent draws that they are worth.
 
-    >>> import rigidjax as rj
     >>> ts = jnp.linspace(0.0, 10.0, 80)
     >>> motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1, 0.1, 1.0]), ts)
     >>> record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), motion.ys.omega))
@@ -99,8 +98,8 @@ class Refit(eqx.Module):
                 below = np.cumsum(weights[order]) - 0.5 * weights[order]
                 return np.interp(tails, below, values[order])
 
-            ends = np.apply_along_axis(quantiles, 0, each)
-            return np.asarray(ends[0]), np.asarray(ends[1])
+            low, high = np.apply_along_axis(quantiles, 0, each)
+            return np.asarray(low), np.asarray(high)
 
         def value(x: Array) -> Array:
             return jnp.asarray(of(self.density.unpack(x)))
@@ -128,9 +127,8 @@ def refit(
     **Arguments:** `density` a `LogDensity`; `max_steps` at most; `draws` how many; `key` of
     `jax.random` for them, by default always the same. **Returns** a `Refit`; `converged` is false
     if it ended early, or if some combination of the numbers changes neither readings nor priors:
-    `weights` are then NaN. **Raises:** `TypeError` for arguments of another type.
+    `weights` are then NaN.
 
-    >>> import rigidjax as rj
     >>> ts = jnp.linspace(0.0, 10.0, 80)
     >>> motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1, 0.1, 1.0]), ts)
     >>> record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), motion.ys.omega))
@@ -147,9 +145,8 @@ def refit(
 
 @eqx.filter_jit
 def _refit(density: LogDensity, settings: Settings, key: Any, count: int) -> Refit:
-    def evaluated(x: Array) -> tuple[None, Array, Array, Array]:
-        found = curvature(density, x)
-        return None, found.cost, found.gram, found.slope
+    def evaluated(x: Array) -> Any:
+        return None, *curvature(density, x)
 
     parameters, factors, logs = density.like
     ones = jax.tree.map(jnp.ones_like, (factors, logs))

@@ -7,6 +7,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from rigidjax._types import Scalar
+
 
 def triangular(a: Float[Array, "n m"]) -> Float[Array, "n n"]:
     """The lower triangular root L of `a aᵀ`, its diagonal ≥ 0.
@@ -110,14 +112,28 @@ def absorb_all(
     return Absorbed(step, root, innovation, total)
 
 
-def log_normal(innovation: Array, variance: Array, seen: Array) -> Array:
-    """The logarithm of a normal density, zero for a masked number.
+class Terms(NamedTuple):
+    """Each number read, normal given the earlier ones: its `error` in standard deviations, and
+    `log_variance`, the logarithm of 2π times its variance; both zero where masked.
+    """
 
-    >>> round(float(log_normal(jnp.array(0.0), jnp.array(1.0), jnp.array(True))), 6)
+    error: Float[Array, "*n"]
+    log_variance: Float[Array, "*n"]
+
+    @property
+    def log_density(self) -> Scalar:
+        """The sum of the logarithms of the normal densities."""
+        return -0.5 * jnp.sum(self.error**2 + self.log_variance)
+
+
+def terms(innovation: Array, variance: Array, seen: Array) -> Terms:
+    """The terms of innovations.
+
+    >>> round(float(terms(jnp.array(0.0), jnp.array(1.0), jnp.array(True)).log_density), 6)
     -0.918939
     """
-    value = -0.5 * (innovation * innovation / variance + jnp.log(variance) + math.log(2 * math.pi))
-    return jnp.where(seen, value, 0)
+    error = jnp.where(seen, innovation * lax.rsqrt(variance), 0)
+    return Terms(error, jnp.where(seen, jnp.log(2 * math.pi * variance), 0))
 
 
 def divide(lower: Float[Array, "n n"], right: Float[Array, "n m"]) -> Float[Array, "n m"]:

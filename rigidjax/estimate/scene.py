@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.scipy.linalg import block_diag
 from jaxtyping import Array, Bool, Float
 
@@ -54,9 +55,8 @@ class Model(eqx.Module):
 
     **Arguments:** `body` an `Inertia`, or `MassProperties` for a `Rigid` state; `torque` any
     torques, among them `RandomTorque` and `CorrelatedTorque`, several in a `Sum`; `None` for a free
-    body without noise; `walks` the `Walk`s. **Raises:** `TypeError` for arguments of another type.
+    body without noise; `walks` the `Walk`s.
 
-    >>> import rigidjax as rj
     >>> model = Model(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.torques.RandomTorque(1e-4))
     >>> len(model.white), len(model.coloured), model.torque
     (1, 0, None)
@@ -84,6 +84,15 @@ class Model(eqx.Module):
         self.walks = walks
 
 
+def with_torque(model: Model, torque: Torque | None) -> Model:
+    """The model with a recording's own torque beside its torques."""
+    if torque is None:
+        return model
+    known = () if model.torque is None else (model.torque,)
+    laws = Sum(*known, torque, *model.white, *model.coloured)
+    return Model(model.body, laws, walks=model.walks)
+
+
 def bare(model: Model) -> Model:
     """The model without its walks, whose functions would have each new one compiled again."""
     return eqx.tree_at(lambda m: m.walks, model, ())
@@ -100,8 +109,55 @@ class Extended(eqx.Module):
     walks: tuple[Array, ...]
 
 
+class Mounted(eqx.Module):
+    """A sensor without its readings; `Walk.where` finds it as in a `Recording`."""
+
+    sensor: AbstractSensor
+
+
+class Sensors(eqx.Module):
+    """The sensors without readings, and the leaves that drift. No function is kept: a second model
+    of the same form does not compile again.
+    """
+
+    readings: tuple[Mounted, ...]
+    leaves: tuple[int, ...] = eqx.field(static=True)
+    densities: tuple[Array, ...]
+
+    def drifted(self, walks: Sequence[Array]) -> tuple[Mounted, ...]:
+        """The sensors with the walks' values in them."""
+        leaves, structure = jax.tree.flatten(self.readings)
+        for leaf, value in zip(self.leaves, walks, strict=True):
+            leaves[leaf] = value
+        return jax.tree.unflatten(structure, leaves)
+
+
+def sensors_of(sensors: Sequence[AbstractSensor], model: Model) -> Sensors:
+    """The checked sensors: each has a noise, and each walk finds its numbers."""
+    for sensor in sensors:
+        _checks.instance(sensor, AbstractSensor, "sensor")
+        name = type(sensor).__name__
+        if sensor.noise is None:
+            raise ValueError(
+                f"{name}: wanted its noise, a filter weighs each reading by it; give "
+                f"{name}(noise=…), such as identify.fit estimates it"
+            )
+        if getattr(sensor, "lowpass", None) is not None:
+            raise ValueError(
+                f"{name}: a lowpass has states of its own, which the filter does not estimate; "
+                "leave it out, and give its lag as offset"
+            )
+    readings = tuple(Mounted(sensor) for sensor in sensors)
+    tree = Sensors(readings, (), ())
+    leaves = tuple(leaf_at(walk.where, tree, "Walk", "the sensor")[0] for walk in model.walks)
+    return Sensors(readings, leaves, tuple(walk.density for walk in model.walks))
+
+
+NO_SENSORS = Sensors((), (), ())
+
+
 class Dynamics(eqx.Module):
-    """A model for one dtype and one kind of state: what does not change is computed once."""
+    """A model and sensors for one dtype and kind of state: what does not change is made once."""
 
     body: Inertia | MassProperties
     field: Callable[..., Any]
@@ -109,8 +165,9 @@ class Dynamics(eqx.Module):
     white: tuple[Array, ...]
     coloured: tuple[tuple[Array, Scalar], ...]
     walks: tuple[Array, ...]
+    sensors: Sensors
 
-    def __init__(self, model: Model, x: Extended, densities: Sequence[Array] = ()):
+    def __init__(self, model: Model, x: Extended, sensors: Sensors = NO_SENSORS):
         dtype = x.motion.omega.dtype
         self.body = what_turns(in_precision(model.body, dtype), type(x.motion))
         self.field = equations_of_motion(self.body, x.motion, in_precision(model.torque, dtype))
@@ -121,19 +178,20 @@ class Dynamics(eqx.Module):
         )
         self.walks = tuple(
             jnp.broadcast_to(jnp.sqrt(density.astype(dtype)), value.shape)
-            for density, value in zip(densities, x.walks, strict=True)
+            for density, value in zip(sensors.densities, x.walks, strict=True)
         )
+        self.sensors = sensors
 
     @property
     def kicks(self) -> int:
         """The number of unit normal numbers in one step of motion and torques."""
         return 6 * (len(self.white) + len(self.coloured))
 
-    def pushed(self, change: Any, torque: Array | None) -> Any:
-        """A rate of change of the motion, with a torque beside those of its equations."""
-        if torque is None:
+    def pushed(self, change: Any, torques: Sequence[Array]) -> Any:
+        """A rate of change of the motion, with torques beside those of its equations."""
+        if not torques:
             return change
-        spin = change.omega + jnp.sum(self.inverse * torque[None], 1)
+        spin = change.omega + jnp.sum(self.inverse * sum(torques[1:], torques[0])[None], 1)
         return eqx.tree_at(lambda s: s.omega, change, spin)
 
     def advance(self, t: Scalar, h: Scalar, x: Extended, kicks: Array) -> Extended:
@@ -153,16 +211,10 @@ class Dynamics(eqx.Module):
         def rate(since: Scalar, now: tuple[Any, tuple]) -> tuple[Any, tuple]:
             motion, torques = now
             share = 1.0 - 2.0 * since / safe
-            total = None
-            for root, pair in zip(self.white, pairs, strict=False):
-                more = root * push(pair, share)
-                total = more if total is None else total + more
-            slopes = []
-            later = pairs[len(self.white) :]
-            for (root, memory), pair, torque in zip(self.coloured, later, torques, strict=True):
-                total = torque if total is None else total + torque
-                slopes.append((root * push(pair, share) - torque) / memory)
-            return self.pushed(self.field(t + since, motion, None), total), tuple(slopes)
+            white = [r * push(pair, share) for r, pair in zip(self.white, pairs, strict=False)]
+            later = zip(self.coloured, pairs[len(self.white) :], torques, strict=True)
+            slopes = tuple((r * push(pair, share) - tau) / time for (r, time), pair, tau in later)
+            return self.pushed(self.field(t + since, motion, None), [*white, *torques]), slopes
 
         motion, torques = advance(KUTTA4, rate, jnp.zeros_like(h), h, (x.motion, x.torques))
         if isinstance(motion, HasAttitude):
@@ -236,59 +288,6 @@ def not_negative(value: Any, name: str) -> Array:
     return _checks.sign(array, name, wanted, zero=True)
 
 
-class ReadingRow(NamedTuple):
-    """One sensor's reading about a state: `matrix` (k, n) of the prediction, `error`, variance."""
-
-    matrix: Float[Array, "k n"]
-    error: Float[Array, " k"]
-    variance: Float[Array, " k"]
-    seen: Bool[Array, " k"]
-
-
-class Mounted(eqx.Module):
-    """A sensor without its readings; `Walk.where` finds it as in a `Recording`."""
-
-    sensor: AbstractSensor
-
-
-class Sensors(eqx.Module):
-    """The sensors without readings, and the leaves that drift. No function is kept: a second model
-    of the same form does not compile again.
-    """
-
-    readings: tuple[Mounted, ...]
-    leaves: tuple[int, ...] = eqx.field(static=True)
-    densities: tuple[Array, ...]
-
-    def drifted(self, walks: Sequence[Array]) -> tuple[Mounted, ...]:
-        """The sensors with the walks' values in them."""
-        leaves, structure = jax.tree.flatten(self.readings)
-        for leaf, value in zip(self.leaves, walks, strict=True):
-            leaves[leaf] = value
-        return jax.tree.unflatten(structure, leaves)
-
-
-def sensors_of(sensors: Sequence[AbstractSensor], model: Model) -> Sensors:
-    """The checked sensors: each has a noise, and each walk finds its numbers."""
-    for sensor in sensors:
-        _checks.instance(sensor, AbstractSensor, "sensor")
-        name = type(sensor).__name__
-        if sensor.noise is None:
-            raise ValueError(
-                f"{name}: wanted its noise, a filter weighs each reading by it; give "
-                f"{name}(noise=…), such as identify.fit estimates it"
-            )
-        if getattr(sensor, "lowpass", None) is not None:
-            raise ValueError(
-                f"{name}: a lowpass has states of its own, which the filter does not estimate; "
-                "leave it out, and give its lag as offset"
-            )
-    readings = tuple(Mounted(sensor) for sensor in sensors)
-    tree = Sensors(readings, (), ())
-    leaves = tuple(leaf_at(walk.where, tree, "Walk", "the sensor")[0] for walk in model.walks)
-    return Sensors(readings, leaves, tuple(walk.density for walk in model.walks))
-
-
 class Stops(NamedTuple):
     """The times of the filter's steps, and the readings then."""
 
@@ -297,21 +296,24 @@ class Stops(NamedTuple):
     masks: tuple[Array, ...]
 
 
-def _rows(dynamics: Dynamics, sensors: Sensors, stop: Stops, x: Extended) -> list[ReadingRow]:
-    """The reading of each sensor at one time, linearised about the state x."""
+def linearised(
+    dynamics: Dynamics, stop: Stops, x: Extended
+) -> tuple[Float[Array, "k n"], Float[Array, " k"], Float[Array, " k"], Bool[Array, " k"]]:
+    """All numbers read at one time about the state x: the matrix of their predictions, their
+    errors, the deviations of these, and which are seen.
+    """
     dtype = x.motion.omega.dtype
     t = stop.t.astype(dtype)
     basis = jax.vmap(lambda e: tangent(x, e))(jnp.eye(dimension(x), dtype=dtype))
     out = []
     for index, (value, mask) in enumerate(zip(stop.values, stop.masks, strict=True)):
-        sensor = in_precision(sensors.readings[index].sensor, dtype)
+        sensor = in_precision(dynamics.sensors.readings[index].sensor, dtype)
 
         def error(y: Extended, index: int = index, value: Array = value) -> Array:
-            seeing = in_precision(sensors.drifted(y.walks)[index].sensor, dtype)
+            seeing = in_precision(dynamics.sensors.drifted(y.walks)[index].sensor, dtype)
 
             def field(t: Any, state: Any, args: Any = None) -> Any:
-                torque = sum(y.torques[1:], y.torques[0]) if y.torques else None
-                return dynamics.pushed(dynamics.field(t, state, args), torque)
+                return dynamics.pushed(dynamics.field(t, state, args), y.torques)
 
             motion, when = y.motion, t
             offset = getattr(seeing, "offset", None)
@@ -326,8 +328,9 @@ def _rows(dynamics: Dynamics, sensors: Sensors, stop: Stops, x: Extended) -> lis
         if limit is not None:
             seen = seen & (jnp.abs(value) < limit * (1 - 1e-6))
         assert sensor.noise is not None
-        out.append(ReadingRow(matrix, found, sensor.noise**2, seen))
-    return out
+        out.append((matrix, found, sensor.noise, seen))
+    matrix, errors, noise, seen = (jnp.concatenate(parts) for parts in zip(*out, strict=True))
+    return matrix, errors, noise, seen
 
 
 class Read(NamedTuple):
@@ -339,22 +342,8 @@ class Read(NamedTuple):
     variance: Float[Array, "*times k"]
     seen: Bool[Array, "*times k"]
 
-    @property
-    def log_density(self) -> Array:
-        """The sum of the logarithms of the normal densities."""
-        return jnp.sum(roots.log_normal(self.innovation, self.variance, self.seen))
 
-
-def absorb_all(
-    dynamics: Dynamics, sensors: Sensors, stop: Stops, x: Extended, step: Array, root: Array
-) -> tuple[Array, Array, tuple[Read, ...]]:
-    """Potter's update by all numbers of all sensors, one by one, of an error of mean `step`."""
-    rows = _rows(dynamics, sensors, stop, x)
-    stacked = ReadingRow(*(jnp.concatenate(parts) for parts in zip(*rows, strict=True)))
-    found = roots.absorb_all(step, root, *stacked)
-    out, at = [], 0
-    for row in rows:
-        here = slice(at, at + row.error.shape[0])
-        out.append(Read(found.innovation[here], found.variance[here], row.seen))
-        at = here.stop
-    return found.step, found.root, tuple(out)
+def by_sensor(sensors: Sensors, read: Read) -> tuple[Read, ...]:
+    """The `Read` of each sensor, from that of all numbers in a row."""
+    ends = np.cumsum([mounted.sensor.components for mounted in sensors.readings])[:-1]
+    return tuple(Read(*own) for own in zip(*(jnp.split(a, ends, -1) for a in read), strict=True))

@@ -10,17 +10,18 @@ from jaxtyping import Array, Float, Int
 
 from rigidjax import _checks
 from rigidjax._types import Scalar
-from rigidjax.estimate import linear, roots
+from rigidjax.estimate import roots
 from rigidjax.estimate.belief import Belief
-from rigidjax.estimate.filter import WORDS, Task, looked_at, scan_filter, status_of, told
+from rigidjax.estimate.filter import WORDS, Given, looked_at, scan_filter, status_of, told
+from rigidjax.estimate.linear import LinearEstimate, solved
 from rigidjax.estimate.scene import (
     Dynamics,
     Extended,
     Model,
     Read,
-    Sensors,
     Stops,
-    absorb_all,
+    by_sensor,
+    linearised,
     reset,
     reset_inverse,
 )
@@ -33,10 +34,6 @@ class Push(NamedTuple):
 
     **Fields:** `mean`, `deviation` (N, 3) N m, body frame; the deviation is large for short steps,
     since white noise has no value at a time.
-
-    >>> shown = Push(jnp.array([[0.0, 0.0, 0.3]]), 0.1 * jnp.ones((1, 3)))
-    >>> (shown.mean / shown.deviation).round(1).tolist()  # about the third axis it turns the body
-    [[0.0, 0.0, 3.0]]
     """
 
     mean: Float[Array, "stops 3"]
@@ -52,14 +49,6 @@ class Smoothed(eqx.Module):
     sensor, of the last linearisation, (N, k); `log_likelihood` of all readings, by Laplace's method
     about this motion; `change` how far the last iteration moved it, in standard deviations at most;
     `iterations`; `status`, `lost_at` as of `Filtered`.
-
-    >>> import rigidjax as rj
-    >>> record = rj.identify.Recording([0.0, 0.1], (rj.identify.Gyro(0.1), [[1.0, 0, 0]] * 2))
-    >>> body = rj.Inertia.from_principal(1.0, 2.0, 2.5)
-    >>> model = rj.estimate.Model(body, rj.torques.RandomTorque(1.0))
-    >>> found = rj.estimate.smooth(model, record, rj.estimate.start(model, record, rate=1.0))
-    >>> found.words, found.rows.tolist()  # of three stops the first and last are readings
-    ('followed', [0, 2])
     """
 
     belief: Belief
@@ -112,18 +101,16 @@ def smooth(
     batched. **Raises:** as `filter`; with `throw` also for a motion that still moves by a standard
     deviation.
 
-    >>> import rigidjax as rj
     >>> record = rj.identify.Recording([0.0, 0.1], (rj.identify.Gyro(0.1), [[1.0, 0, 0]] * 2))
     >>> body = rj.Inertia.from_principal(1.0, 2.0, 2.5)
     >>> model = rj.estimate.Model(body, rj.torques.RandomTorque(1.0))
     >>> found = rj.estimate.smooth(model, record, rj.estimate.start(model, record, rate=1.0))
-    >>> found.states.omega.shape, found.pushes[0].mean.shape  # one stop between
-    ((2, 3), (3, 3))
+    >>> found.pushes[0].mean.shape, found.rows.tolist()  # of three stops two are readings
+    ((3, 3), [0, 2])
     """
     _checks.whole(iterations, "iterations", 1)
     _checks.positive(tolerance, "tolerance")
-    task = looked_at(model, recording, first, substeps)
-    out = _smooth(task, iterations, tolerance)
+    out = _smooth(looked_at(model, recording, first, substeps), iterations, tolerance)
     if not throw:
         return out
     words = (
@@ -134,102 +121,71 @@ def smooth(
     return _checks.refuse(told(out), out.change > 1, words)
 
 
-class _Kept(NamedTuple):
-    joint: linear.Joint
-    before: Array
-    mean: Array
-    noise: Array
-    read: tuple[Read, ...]
-
-
-class _Solved(NamedTuple):
-    root: Array
-    read: tuple[Read, ...]
-    total: Array
-    kicks: Array
-    kick_covariance: Array
-    change: Array
-
-
 @eqx.filter_jit
-def _smooth(task: Task, iterations: int, tolerance: float) -> Smoothed:
-    first = task.first
-    stops, (_, kept) = scan_filter(task, lambda belief, read: (belief, read))
-    here = jnp.arange(stops.t.shape[0]) if task.grid is None else task.grid.rows
-    beliefs, reads = jax.tree.map(lambda leaf: leaf[here], kept)
-    status, lost_at = status_of(beliefs, reads, first.t)
+def _smooth(given: Given, iterations: int, tolerance: float) -> Smoothed:
+    _, sensors, _, first, grid = given
+    dynamics, stops, kept = scan_filter(given, lambda belief, read: (belief, read))
+    beliefs, read = grid.of_rows(kept)
+    status, lost_at = status_of(beliefs, by_sensor(sensors, read), first.t)
     path = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first.x, kept[0].x)
-    dynamics = Dynamics(task.model, first.x, task.sensors.densities)
-
-    def once(path: Extended, kicks: Array) -> tuple[Extended, Any]:
-        return _iterate(dynamics, task.sensors, first, stops, path, kicks)
 
     def more(state: tuple) -> Array:
-        return (state[2] < iterations) & (state[1].change > tolerance)
+        return (state[3] < iterations) & (state[2] > tolerance)
 
     def again(state: tuple) -> tuple:
-        path, out = once(state[0], state[1].kicks[:, : dynamics.kicks])
-        return path, out, state[2] + 1
+        path, found, _, count = state
+        out = _iterate(dynamics, first, stops, path, found.kicks[:, : dynamics.kicks])
+        return *out, count + 1
 
     still = jnp.zeros((stops.t.shape[0], dynamics.kicks), first.root.dtype)
     # Nothing is solved yet: one copy of an iteration is compiled, not two.
     blank = jax.tree.map(
-        lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(once, path, still)[1]
+        lambda leaf: jnp.zeros(leaf.shape, leaf.dtype),
+        jax.eval_shape(lambda: _iterate(dynamics, first, stops, path, still)[1]),
     )
-    blank = blank._replace(change=jnp.full_like(blank.change, jnp.inf))
-    path, out, count = lax.while_loop(more, again, (path, blank, jnp.asarray(0)))
-    x = jax.tree.map(lambda leaf: leaf[1:], path)
-    h = jnp.diff(jnp.concatenate([first.t[None], stops.t])).astype(first.root.dtype)
+    far = jnp.asarray(jnp.inf, first.root.dtype)
+    path, found, change, count = lax.while_loop(more, again, (path, blank, far, jnp.asarray(0)))
+    h = jnp.diff(stops.t, prepend=first.t).astype(first.root.dtype)
     pushes = []
     for index, root in enumerate(dynamics.white):
         mine = slice(6 * index, 6 * index + 3)
         size = roots.inverse_root(h)[:, None] * root[None]
-        variance = jnp.diagonal(out.kick_covariance, axis1=1, axis2=2)[:, mine]
-        pushes.append(Push(size * out.kicks[:, mine], size * jnp.sqrt(variance)))
-    return Smoothed(
-        Belief(stops.t, x, out.root[1:]),
-        here,
-        tuple(pushes),
-        out.read,
-        out.total,
-        out.change,
-        count,
-        jnp.where(jnp.isfinite(out.change), status, 2),
-        lost_at,
-    )
+        variance = jnp.diagonal(found.kick_covariance, axis1=1, axis2=2)[:, mine]
+        pushes.append(Push(size * found.kicks[:, mine], size * jnp.sqrt(variance)))
+    belief = Belief(stops.t, jax.tree.map(lambda leaf: leaf[1:], path), found.root[1:])
+    reads = by_sensor(sensors, Read(found.innovation[1:], found.variance[1:], kept[1].seen))
+    status = jnp.where(jnp.isfinite(change), status, 2)
+    total = found.log_likelihood
+    return Smoothed(belief, grid.rows, tuple(pushes), reads, total, change, count, status, lost_at)
 
 
 def _iterate(
-    dynamics: Dynamics, sensors: Sensors, first: Belief, stops: Stops, path: Extended, kicks: Array
-) -> tuple[Extended, _Solved]:
+    dynamics: Dynamics, first: Belief, stops: Stops, path: Extended, kicks: Array
+) -> tuple[Extended, LinearEstimate, Scalar]:
     """One linearisation about `path` and the `kicks` between its times, and its exact solution."""
-    before = jnp.concatenate([first.t[None], stops.t[:-1]])
     dtype = first.root.dtype
-    x0 = jax.tree.map(lambda leaf: leaf[0], path)
-    off = minus(x0, first.x)
-    start = (-off, reset(x0, off, first.root))
 
-    def forward(carry: tuple[Array, Array], now: Any) -> tuple[Any, _Kept]:
-        mean, root = carry
+    def about(now: tuple) -> tuple:
+        """The step to a stop, and its readings, about the path."""
         t0, stop, x, y, kick = now
-        since = (stop.t - t0).astype(dtype)
-        after, grown, noise = dynamics.predict(t0.astype(dtype), since, x, kick)
-        push = minus(after, y)
-        grown, noise = reset_inverse(y, push, grown), reset_inverse(y, push, noise)
-        push = push - jnp.sum(noise[:, : dynamics.kicks] * kick[None], 1)
-        kept = linear.joint(grown, noise, root)
-        predicted = jnp.sum(grown * mean[None], 1) + push
-        later, root, read = absorb_all(dynamics, sensors, stop, y, predicted, kept.predicted)
-        return (later, root), _Kept(kept, predicted, mean, noise, read)
+        after, grown, noise = dynamics.predict(
+            t0.astype(dtype), (stop.t - t0).astype(dtype), x, kick
+        )
+        off = minus(after, y)
+        grown, noise = reset_inverse(y, off, grown), reset_inverse(y, off, noise)
+        push = off - jnp.sum(noise[:, : dynamics.kicks] * kick[None], 1)
+        return (grown, noise, push), linearised(dynamics, stop, y)
 
-    earlier = jax.tree.map(lambda leaf: leaf[:-1], path)
-    later = jax.tree.map(lambda leaf: leaf[1:], path)
-    end, kept = lax.scan(forward, start, (before, stops, earlier, later, kicks))
-
-    means, spread, kicks, kick_covariance = linear.smoothed(
-        kept.joint, kept.mean, kept.before, kept.noise, end
+    before = jnp.concatenate([first.t[None], stops.t[:-1]])
+    x0, earlier, later = (
+        jax.tree.map(lambda leaf, at=at: leaf[at], path) for at in (0, slice(-1), slice(1, None))
     )
-    change = jnp.max(jnp.abs(means) * roots.inverse_root(jnp.sum(spread**2, -1)))
-    total = jnp.sum(jnp.stack([read.log_density for read in kept.read]))
-    moved = jax.vmap(plus)(path, means)
-    return moved, _Solved(spread, kept.read, total, kicks, kick_covariance, change)
+    steps, rows = lax.map(about, (before, stops, earlier, later, kicks))
+    # Nothing is read at the first time.
+    matrix, error, deviation, seen = (jnp.pad(a, [(1, 0)] + [(0, 0)] * (a.ndim - 1)) for a in rows)
+    parts = dict(zip(("transition", "noise", "push"), steps, strict=True))
+    parts |= {"matrix": matrix, "deviation": deviation, "offset": None}
+    off = minus(x0, first.x)
+    found = solved(parts, error, -off, reset(x0, off, first.root), seen, back=True)
+    change = jnp.max(jnp.abs(found.mean) * roots.inverse_root(jnp.sum(found.root**2, -1)))
+    return jax.vmap(plus)(path, found.mean), found, change

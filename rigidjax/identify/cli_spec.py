@@ -53,7 +53,7 @@ SENSOR_UNITS = {
 
 
 class Channel(eqx.Module):
-    """One sensor of a log; noise (one figure or one for each axis) and full scale in its unit."""
+    """One sensor of a log; noise (of each axis) and full scale in its unit."""
 
     kind: str
     columns: tuple[str, ...]
@@ -106,12 +106,12 @@ def channel(text: str) -> Channel:
 
 
 def noises(noise: Sequence[float], where: str) -> tuple[float, ...]:
-    """One positive noise, or one for each of three axes. **Raises** `LogError` for others."""
+    """The noise of three axes, from one positive number or three; `LogError` for others."""
     if len(noise) not in (1, 3):
         raise LogError(f"{where}: wanted one noise or three, got {len(noise)}")
     if not all(0 < part < np.inf for part in noise):
         raise LogError(f"{where}: wanted a positive noise, got {min(noise):g}")
-    return tuple(noise)
+    return tuple(noise) if len(noise) == 3 else 3 * tuple(noise)
 
 
 def wheel(text: str) -> WheelColumn:
@@ -173,11 +173,7 @@ def read_log(
         values = np.stack([table[name] for name in one.columns], axis=1)
         values *= UNITS[one.unit]
         seen = np.isfinite(values).all(axis=1)
-        noise = None
-        if one.noise is not None:
-            figures = one.noise if len(one.noise) > 1 else 3 * one.noise
-            noise = UNITS[one.unit] * np.array(figures)
-        sensor, values = _sensor(one, values, noise, "bias" in free)
+        sensor, values = _sensor(one, values, "bias" in free)
         readings.append((sensor, values[kept], seen[kept]))
     torque = _torque(path, t, table, wheels, free)
     # A large log is not to be held twice.
@@ -188,10 +184,9 @@ def read_log(
         raise LogError(f"{path}: {error}") from None
 
 
-def _sensor(
-    one: Channel, values: np.ndarray, noise: np.ndarray | None, bias: bool
-) -> tuple[AbstractSensor, np.ndarray]:
+def _sensor(one: Channel, values: np.ndarray, bias: bool) -> tuple[AbstractSensor, np.ndarray]:
     zero = [0.0, 0.0, 0.0] if bias else None
+    noise = None if one.noise is None else UNITS[one.unit] * np.array(one.noise)
     limit = None if one.limit is None else one.limit * UNITS[one.unit]
     if one.kind == "gyro":
         return Gyro(noise, bias=zero, limit=limit), values
@@ -255,10 +250,10 @@ def _free(first: Recording, typical: float, free: Sequence[str]) -> list[Free]:
         return lambda r: attrgetter(path)(r.torque.parts[index])
 
     items: list[Free] = []
-    for index, sensor in enumerate(first.sensors):
-        kind = type(sensor).__name__
-        same = [i for i, other in enumerate(first.sensors) if type(other).__name__ == kind]
-        name = kind.lower() + (f" {same.index(index) + 1}" if len(same) > 1 else "")
+    kinds = [type(sensor).__name__.lower() for sensor in first.sensors]
+    for index, (sensor, kind) in enumerate(zip(first.sensors, kinds, strict=True)):
+        many = kinds.count(kind) > 1
+        name = f"{kind} {kinds[: index + 1].count(kind)}" if many else kind
         if getattr(sensor, "bias", None) is not None:
             size = 0.05 if isinstance(sensor, Gyro) else 0.5
             items.append(Free(of_sensor(index, "bias"), f"{name} bias", scale=size, each=True))

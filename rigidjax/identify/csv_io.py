@@ -1,5 +1,6 @@
 """Reading logs from files. Errors name file, line and column."""
 
+import contextlib
 import csv
 import itertools
 import math
@@ -24,11 +25,10 @@ def layout_of(path: str | Path) -> Layout:
     """The layout of a log: phyphox (any language) or a binary one if it has rates, else `USUAL`."""
     path = Path(path)
     if flight_logs.kind_of(path) in flight_logs.READERS:
-        try:
+        # Whoever reads it says what is wrong.
+        with contextlib.suppress(Exception):
             return flight_logs.usual(path) or USUAL
-        except Exception:
-            # Whoever reads it says what is wrong.
-            return USUAL
+        return USUAL
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
             names = read_header(file).names

@@ -28,13 +28,9 @@ def expected(problem: Problem, parameters: Parameters) -> tuple[Quantity, ...]:
     deviations of the Cramér–Rao bound, infinite where the motion would show nothing. **Raises:**
     `ValueError` for a sensor whose noise is not given, or numbers that are not finite.
 
-    >>> import rigidjax as rj
-    >>> ts = jnp.linspace(0.0, 5.0, 50)
-    >>> record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), jnp.zeros((50, 3))))
-    >>> problem = rj.identify.Problem(record, rj.identify.PrincipalRatios())
-    >>> body = rj.Inertia.from_principal(1.0, 2.0, 2.5)
-    >>> plan = problem.start(body, [1.0, 0.1, 1.0])
-    >>> bool(expected(problem, plan)[0].deviation < 0.05)
+    >>> problem = rj.datasets.toutatis.problem()
+    >>> plan = problem.start(rj.Inertia.from_principal(3.1, 3.2, 1.0))
+    >>> bool(expected(problem, plan)[0].deviation < 1.0)
     True
     """
     _on_host(problem, parameters)
@@ -55,15 +51,11 @@ def fisher(problem: Problem, parameters: Parameters) -> Float[Array, "n n"]:
     """Fisher's information (n, n) of the free numbers: `Jᵀ Σ⁻¹ J` of the predictions.
 
     **Arguments:** `problem` with known noises; `parameters` the motion. It is differentiable in the
-    parameters, for a design by gradients. **Raises** `ValueError` for a
-    sensor whose noise is not given.
+    parameters, for a design by gradients. **Raises** `ValueError` for a sensor without noise.
 
-    >>> import rigidjax as rj
-    >>> ts = jnp.linspace(0.0, 5.0, 50)
-    >>> record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), jnp.zeros((50, 3))))
-    >>> problem = rj.identify.Problem(record, rj.identify.PrincipalRatios())
+    >>> problem = rj.datasets.toutatis.problem()
     >>> fisher(problem, problem.start()).shape
-    (5, 5)
+    (8, 8)
     """
     _look(problem, parameters)
     return _fisher(problem, parameters)

@@ -4,6 +4,7 @@ Blackbox by orangebox, PX4's ULog by pyulog, MCAP (JSON and ROS 2) by mcap, all 
 log of the Crazyflie's µSD card, which has no library, by its own description in its header.
 """
 
+import json
 import math
 import struct
 from array import array
@@ -12,6 +13,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+
+from rigidjax import _checks
 
 # All names, and the arrays of the wanted ones.
 Columns = tuple[list[str], dict[str, Any]]
@@ -25,23 +28,13 @@ class Layout(NamedTuple):
     time_unit: str
 
 
-def _needed(path: Path, kind: str, extra: str) -> ModuleNotFoundError:
-    return ModuleNotFoundError(
-        f"{path}: {kind} need a library that is missing: pip install 'rigidjax[{extra}]'"
-    )
-
-
 def blackbox(path: Path, columns: Sequence[str]) -> Columns:
     """The names of all fields, and the wanted ones, of the first flight in a Blackbox log.
 
     Rates come in deg/s and accelerations in g by the scales in the header, as in the flight
     controllers' own viewer; other fields as logged. A log without its last mark is read to its end.
     """
-    try:
-        from orangebox import Parser
-    except ModuleNotFoundError as error:
-        raise _needed(path, "Blackbox logs", "blackbox") from error
-    parser = Parser.load(str(path))
+    parser = _checks.library("orangebox", "blackbox", str(path)).Parser.load(str(path))
     names = parser.field_names
     wanted = {name: (names.index(name), array("d")) for name in columns if name in names}
     try:
@@ -77,14 +70,10 @@ def ulog(path: Path, columns: Sequence[str]) -> Columns:
     """`topic.field` of a ULog of PX4, as `sensor_combined.gyro_rad[0]`, `topic#1.field` of a second
     instance; times in µs.
     """
-    try:
-        from pyulog import ULog
-    except ModuleNotFoundError as error:
-        raise _needed(path, "logs of PX4", "ulog") from error
-    held = {}
+    reader, held = _checks.library("pyulog", "ulog", str(path)).ULog, {}
     # The library does not close a file that it opened itself and cannot read.
     with path.open("rb") as file:
-        topics = ULog(file).data_list
+        topics = reader(file).data_list
     for data in topics:
         topic = data.name + (f"#{data.multi_id}" if data.multi_id else "")
         held |= {f"{topic}.{name}": values for name, values in data.data.items()}
@@ -96,17 +85,13 @@ def mcap(path: Path, columns: Sequence[str]) -> Columns:
     `/imu.angular_velocity.x`; `topic.log_time` and `topic.stamp` (of its header), s from the first
     message of the file.
     """
-    try:
-        from mcap.reader import make_reader
-        from mcap_ros2.decoder import DecoderFactory
-    except ModuleNotFoundError as error:
-        raise _needed(path, "MCAP files", "mcap") from error
+    make_reader = _checks.library("mcap.reader", "mcap", str(path)).make_reader
+    ros = _checks.library("mcap_ros2.decoder", "mcap", str(path)).DecoderFactory
     names: dict[str, None] = {}
     held: dict[str, array] = {name: array("d") for name in columns}
     first = None
     with path.open("rb") as file:
-        factories: list[Any] = [_Json(), DecoderFactory()]
-        reader = make_reader(file, decoder_factories=factories)
+        reader = make_reader(file, decoder_factories=[_Json(), ros()])
         for number, (_, channel, message, content) in enumerate(reader.iter_decoded_messages()):
             if not columns and number == _ENOUGH:
                 # Only names are asked for.
@@ -132,8 +117,6 @@ class _Json:
     """mcap's interface of a decoder, for messages in JSON."""
 
     def decoder_for(self, encoding: str, schema: Any) -> Callable[[bytes], Any] | None:
-        import json
-
         return json.loads if encoding == "json" else None
 
 
@@ -193,13 +176,7 @@ def crazyflie(path: Path, columns: Sequence[str]) -> Columns:
     return list(dict.fromkeys(every)), {name: held[name] for name in columns if name in held}
 
 
-READERS = {
-    ".bbl": blackbox,
-    ".bfl": blackbox,
-    ".ulg": ulog,
-    ".mcap": mcap,
-    ".usd": crazyflie,
-}
+READERS = {".bbl": blackbox, ".bfl": blackbox, ".ulg": ulog, ".mcap": mcap, ".usd": crazyflie}
 
 
 def kind_of(path: Path) -> str:

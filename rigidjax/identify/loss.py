@@ -15,9 +15,8 @@ from rigidjax.body.inertia import Inertia, MassProperties
 class AbstractLoss(eqx.Module):
     """`ρ(s)` of the squared length s of a sensor's error in units of its noise.
 
-    A reading counts as a whole, so that the loss does not depend on the frame.
+    A reading counts as a whole: the loss does not depend on the frame.
 
-    >>> import jax.numpy as jnp
     >>> class Squares(AbstractLoss):  # no outliers: ρ(s) = s
     ...     def shrink(self, error):
     ...         return error
@@ -43,13 +42,10 @@ def _scale(value: Any) -> float:
 class SoftL1(AbstractLoss):
     """Quadratic for ordinary errors, linear for large ones: `ρ(s) = 2c²(√(1 + s/c²) − 1)`.
 
-    Convex, unlike Cauchy's, which can add local minima.
-
     **Arguments:** `scale` c, where quadratic turns to linear, in standard deviations. **Raises:**
     `ValueError` where it is not positive. Source: Charbonnier et al. 1997, doi:10.1109/83.551699
     (as `soft_l1` in SciPy).
 
-    >>> import jax.numpy as jnp
     >>> bool(jnp.linalg.norm(SoftL1(3.0).shrink(jnp.array([300.0, 0, 0]))) < 45)
     True
     """
@@ -70,7 +66,6 @@ class Huber(AbstractLoss):
     **Arguments:** `scale` c, in standard deviations. **Raises:** `ValueError` where it is not
     positive. Source: Huber 1964, doi:10.1214/aoms/1177703732.
 
-    >>> import jax.numpy as jnp
     >>> Huber(3.0).weight(jnp.array([6.0, 0.0, 0.0]))
     Array(0.5, dtype=float64)
     """
@@ -101,10 +96,8 @@ class Entropic(eqx.Module):
     from the guess.
 
     **Arguments:** `guess` an `Inertia`, or `MassProperties` for a `Mass` chart; `weight` w > 0.
-    **Raises:** `TypeError`, `ValueError` for arguments of another type or shape. Source: Lee,
-    Wensing and Park 2020, doi:10.1109/TRO.2019.2926491 (the divergence).
+    Source: Lee, Wensing and Park 2020, doi:10.1109/TRO.2019.2926491 (the divergence).
 
-    >>> import rigidjax as rj
     >>> body = rj.Inertia.from_principal(1.0, 2.0, 2.5)
     >>> bool(jnp.abs(Entropic(body, 1.0).residuals(body)).max() < 1e-7)
     True

@@ -28,13 +28,9 @@ def profile(fit: Fit, name: str, level: float = 0.95) -> tuple[float, float]:
     **Raises:** `ValueError` for a name that is not reported, a level outside (0, 1). Source: Raue
     et al. 2009, doi:10.1093/bioinformatics/btp358.
 
-    >>> import jax.numpy as jnp, rigidjax as rj
-    >>> ts = jnp.linspace(0.0, 10.0, 80)
-    >>> motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1, 0.1, 1.0]), ts)
-    >>> record = rj.identify.Recording(ts, (rj.identify.Gyro(0.01), motion.ys.omega))
-    >>> found = rj.identify.fit(rj.identify.Problem(record, rj.identify.PrincipalRatios()))
+    >>> found = rj.identify.fit(rj.datasets.toutatis.problem())
     >>> low, high = profile(found, "Ix/Iz")
-    >>> low < 0.4 < high
+    >>> low < 3.1 < high
     True
     """
     one_fit(fit)

@@ -49,7 +49,6 @@ def simulate_readings(
     sensor reads; `ValueError` for a key if the sensor's noise is `None`, and for a sensor of your
     own without a method `reading_of` if its readings have another shape than its error.
 
-    >>> import rigidjax as rj
     >>> body, start = rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([0.0, 0.0, 2.0])
     >>> gyro = rj.identify.Gyro(noise=0.01, bias=[0.0, 0.0, 0.5])
     >>> simulate_readings(gyro, body, start, [0.0, 1.0])[1].tolist()

@@ -239,6 +239,26 @@ def test_a_sensor_that_is_late_is_seen_where_it_was():
     np.testing.assert_allclose(found.states.omega, real.omega[:-1], atol=1e-7)
 
 
+RANDOM, CORRELATED = rj.torques.RandomTorque(1e-4), rj.torques.CorrelatedTorque(1e-2, 0.5)
+DRAG = rj.torques.Damping([0.1, 0.2, 0.3])
+
+
+@pytest.mark.parametrize("more", [(), (DRAG, RANDOM, CORRELATED)])
+def test_a_torque_of_the_recording_acts_beside_the_models(more):
+    short, push = records.spinning(), rj.torques.ConstantTorque([0.0, 0.3, 0.0])
+    readings = [(r.sensor, r.values) for r in short.readings]
+    pushed = identify.Recording(short.t, *readings, torque=push)
+    runs = []
+    for laws, record in (((*more, push), short), (more, pushed), (more, short)):
+        model = estimate.Model(records.BODY, rj.torques.Sum(*laws) if laws else None)
+        first = estimate.start(model, record, rj.Spin(records.START.omega), rate=0.3)
+        runs.append(estimate.filter(model, record, first, substeps=1, throw=False))
+    inside, beside, without = runs
+    for ours, wanted in zip(jax.tree.leaves(beside), jax.tree.leaves(inside), strict=True):
+        np.testing.assert_allclose(ours, wanted, rtol=1e-12, atol=1e-14)
+    assert float(jnp.abs(without.log_likelihood - beside.log_likelihood)) > 0.1
+
+
 def likelihood(x):
     """Of two moments and a density, on the smallest program."""
     body = rj.Inertia.from_principal(x[0], x[1], 2.5)

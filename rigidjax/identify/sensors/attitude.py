@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from rigidjax import _checks
 from rigidjax._types import HasAttitude, HasPose, Scalar, Vec3
 from rigidjax.identify.sensors.base import (
-    AbstractSensor,
+    ClockedSensor,
     SensorInput,
     deviations,
     optional,
@@ -22,7 +22,7 @@ from rigidjax.rotation import quaternion
 from rigidjax.rotation.linalg3 import cross, dot
 
 
-class AttitudeSensor(AbstractSensor):
+class AttitudeSensor(ClockedSensor):
     """Reads the attitude as a quaternion (w, x, y, z), body → world; q and −q read the same.
 
     The error is the rotation vector, in the sensor's axes, that takes the predicted attitude to the
@@ -40,13 +40,11 @@ class AttitudeSensor(AbstractSensor):
     """
 
     reading_shape: ClassVar[tuple[int, ...]] = (4,)
-    components: ClassVar[int] = 3
     feels: ClassVar[type] = HasAttitude
     unit: ClassVar[str] = "rad"
     noise: Vec3 | None = eqx.field(converter=deviations(), default=None)
     _: dataclasses.KW_ONLY
     mounting: Vec3 | None = eqx.field(converter=optional("mounting"), default=None)
-    offset: Scalar | None = eqx.field(converter=optional("offset", ()), default=None)
 
     def error(self, now: SensorInput, reading: Array) -> Vec3:
         q = _mounted(now.state.q, self.mounting)
@@ -93,7 +91,7 @@ def _unit(world: Any) -> Vec3:
     return vector / _checks.refuse(length, ~(length > 0), words)
 
 
-class Direction(AbstractSensor):
+class Direction(ClockedSensor):
     """Reads the direction, in its own axes, of an object with a known direction in the world.
 
     Examples: a sun sensor, a star, the vertical. The error is the chord from the prediction to the
@@ -108,7 +106,6 @@ class Direction(AbstractSensor):
     Array([0., 0., 1.], dtype=float64)
     """
 
-    reading_shape: ClassVar[tuple[int, ...]] = (3,)
     components: ClassVar[int] = 2
     feels: ClassVar[type] = HasAttitude
     unit: ClassVar[str] = "rad"
@@ -116,7 +113,6 @@ class Direction(AbstractSensor):
     noise: Float[Array, "2"] | None = eqx.field(converter=deviations(2), default=None)
     _: dataclasses.KW_ONLY
     mounting: Vec3 | None = eqx.field(converter=optional("mounting"), default=None)
-    offset: Scalar | None = eqx.field(converter=optional("offset", ()), default=None)
 
     def error(self, now: SensorInput, reading: Array) -> Float[Array, "2"]:
         seen = self._seen(now)
@@ -162,7 +158,7 @@ def _across(line: Vec3) -> tuple[Vec3, Vec3]:
     return first, cross(line, first)
 
 
-class Marker(AbstractSensor):
+class Marker(ClockedSensor):
     """Reads the position, in the world, of a point fixed in the body: `x + R r`, m.
 
     **Arguments:** `place` (3,) the point, m, body frame; `noise` m, one number or (3,), `None` to
@@ -170,7 +166,6 @@ class Marker(AbstractSensor):
     body that moves (`Rigid`, with `MassProperties`; `place` is then in their frame); `offset` s as
     for `Gyro`. **Raises** `ValueError` as `Gyro`.
 
-    >>> import rigidjax as rj
     >>> body = rj.MassProperties(1.0, [0.0, 0, 0], jnp.eye(3))
     >>> state = rj.Rigid([2.0, 0, 0], [0.0, 0, 0], [1.0, 0, 0, 0], [0.0, 0, 0])
     >>> now = rj.identify.SensorInput(jnp.asarray(0.0), state, body, lambda t, y, args: y)
@@ -178,8 +173,6 @@ class Marker(AbstractSensor):
     [0.25, 0.0, 0.0]
     """
 
-    reading_shape: ClassVar[tuple[int, ...]] = (3,)
-    components: ClassVar[int] = 3
     # A body on a pivot need not move.
     feels: ClassVar[Any] = property(lambda self: HasPose if self.origin is None else HasAttitude)
     unit: ClassVar[str] = "m"
@@ -187,7 +180,6 @@ class Marker(AbstractSensor):
     noise: Vec3 | None = eqx.field(converter=deviations(), default=None)
     _: dataclasses.KW_ONLY
     origin: Vec3 | None = eqx.field(converter=optional("origin"), default=None)
-    offset: Scalar | None = eqx.field(converter=optional("offset", ()), default=None)
 
     def error(self, now: SensorInput, reading: Array) -> Vec3:
         state = now.state
@@ -195,7 +187,7 @@ class Marker(AbstractSensor):
         return reading - (start + quaternion.rotate(state.q, now.lever(self.place)))
 
 
-class Position(AbstractSensor):
+class Position(ClockedSensor):
     """Reads the centre of mass, in the world: `x + bias`, m. Use `Marker` for another point.
 
     **Arguments:** `noise` m, one number or (3,), `None` to estimate it; `bias` (3,) m, world frame,
@@ -205,21 +197,18 @@ class Position(AbstractSensor):
     'm'
     """
 
-    reading_shape: ClassVar[tuple[int, ...]] = (3,)
-    components: ClassVar[int] = 3
     feels: ClassVar[type] = HasPose
     unit: ClassVar[str] = "m"
     noise: Vec3 | None = eqx.field(converter=deviations(), default=None)
     _: dataclasses.KW_ONLY
     bias: Vec3 | None = eqx.field(converter=optional("bias"), default=None)
-    offset: Scalar | None = eqx.field(converter=optional("offset", ()), default=None)
 
     def error(self, now: SensorInput, reading: Array) -> Vec3:
         place = now.state.x
         return reading - (place if self.bias is None else place + self.bias)
 
 
-class Velocity(AbstractSensor):
+class Velocity(ClockedSensor):
     """Reads the velocity of a point of the body: `v + R (Ω × r)`, in the world or in its own axes.
 
     **Arguments:** `noise` m/s, one number or (3,), `None` to estimate it; `place` (3,) the point,
@@ -236,8 +225,6 @@ class Velocity(AbstractSensor):
     'm/s'
     """
 
-    reading_shape: ClassVar[tuple[int, ...]] = (3,)
-    components: ClassVar[int] = 3
     feels: ClassVar[type] = HasPose
     unit: ClassVar[str] = "m/s"
     noise: Vec3 | None = eqx.field(converter=deviations(), default=None)
@@ -245,7 +232,6 @@ class Velocity(AbstractSensor):
     place: Vec3 | None = eqx.field(converter=optional("place"), default=None)
     mounting: Vec3 | None = eqx.field(converter=optional("mounting"), default=None)
     bias: Vec3 | None = eqx.field(converter=optional("bias"), default=None)
-    offset: Scalar | None = eqx.field(converter=optional("offset", ()), default=None)
 
     def error(self, now: SensorInput, reading: Array) -> Vec3:
         state = now.state
@@ -259,7 +245,7 @@ class Velocity(AbstractSensor):
         return reading - (seen if self.bias is None else seen + self.bias)
 
 
-class Range(AbstractSensor):
+class Range(ClockedSensor):
     """Reads the distance from a station to a point of the body: `|x + R r − s| + bias`, m.
 
     **Arguments:** `station` s (3,) m, world frame; `noise` m, `None` to estimate it; `place` (3,)
@@ -280,7 +266,6 @@ class Range(AbstractSensor):
     _: dataclasses.KW_ONLY
     place: Vec3 | None = eqx.field(converter=optional("place"), default=None)
     bias: Scalar | None = eqx.field(converter=optional("bias", ()), default=None)
-    offset: Scalar | None = eqx.field(converter=optional("offset", ()), default=None)
 
     def error(self, now: SensorInput, reading: Array) -> Float[Array, "1"]:
         state = now.state

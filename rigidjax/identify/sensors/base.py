@@ -1,8 +1,9 @@
 """The base class of sensors: the prediction of a motion at one time, and the error of a reading."""
 
 import abc
+import dataclasses
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -21,7 +22,6 @@ class SensorInput(eqx.Module):
     laws put in as they are at `t`; `own` those states, as `Solution.own` orders them: for
     a sensor of one's own that reads a wheel or a motor.
 
-    >>> import rigidjax as rj
     >>> body, state = rj.Inertia.from_principal(1.0, 2.0, 3.0), rj.Spin([0.0, 0.0, 1.0])
     >>> now = SensorInput(jnp.asarray(0.0), state, body, rj.equations_of_motion(body, state, None))
     >>> rj.identify.Gyro(0.1).error(now, jnp.array([0.0, 0.0, 1.5])).tolist()
@@ -60,7 +60,6 @@ class AbstractSensor(eqx.Module):
     not reading minus prediction; `suspect`: name, words and remedy of the cause that a fit names
     for its errors if it finds no other.
 
-    >>> import rigidjax as rj
     >>> class Tachometer(AbstractSensor):  # the size of the body rate, rad/s
     ...     reading_shape, components, unit = (), 1, "rad/s"
     ...     feels, noise = rj.motion.HasSpin, None
@@ -100,15 +99,11 @@ def optional(name: str, shape: tuple[int, ...] = (3,)) -> Callable[[Any], Array 
 
 def deviations(size: int = 3) -> Callable[[Any], Array | None]:
     """A converter of one number or `size` numbers to standard deviations (size,); `None` stays."""
-    return lambda value: _positive(value, "noise", "a positive standard deviation", size)
+    return lambda value: positive(value, "noise", "a positive standard deviation", size)
 
 
-def full_scale(limit: Any) -> Vec3 | None:
-    """The full scale of the channels (3,), from one number or three, positive; or `None`."""
-    return _positive(limit, "limit", "a positive full scale", 3)
-
-
-def _positive(value: Any, name: str, wanted: str, size: int) -> Array | None:
+def positive(value: Any, name: str, wanted: str, size: int) -> Array | None:
+    """One number or `size` as (size,) positive numbers; `None` stays."""
     if value is None:
         return None
     numbers = _checks.numbers(value, name).astype(jnp.result_type(float))
@@ -117,3 +112,12 @@ def _positive(value: Any, name: str, wanted: str, size: int) -> Array | None:
         raise ValueError(f"{name}: wanted one number or {count}, got shape {numbers.shape}")
     numbers = jnp.broadcast_to(numbers, (size,))
     return _checks.refuse(numbers, ~(numbers > 0), f"{name}: wanted {wanted}")
+
+
+class ClockedSensor(AbstractSensor):
+    """A sensor whose clock may be behind; it reads a vector (3,) unless it says otherwise."""
+
+    reading_shape: ClassVar[tuple[int, ...]] = (3,)
+    components: ClassVar[int] = 3
+    _: dataclasses.KW_ONLY
+    offset: Scalar | None = eqx.field(converter=optional("offset", ()), default=None)

@@ -7,13 +7,13 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from rigidjax._types import HasAttitude, HasPose, HasSpin, Scalar, Vec3
+from rigidjax._types import HasAttitude, HasPose, HasSpin, Vec3
 from rigidjax.identify.sensors.base import (
-    AbstractSensor,
+    ClockedSensor,
     SensorInput,
     deviations,
-    full_scale,
     optional,
+    positive,
     required,
 )
 from rigidjax.identify.sensors.lowpass import LowPass, lowpass_of
@@ -21,19 +21,18 @@ from rigidjax.rotation import quaternion
 from rigidjax.rotation.linalg3 import apply, cross
 
 
-class _Vector(AbstractSensor):
+class _Vector(ClockedSensor):
     """A sensor that reads a vector in its own axes: `scale · S exp(−mounting) v + bias`."""
 
-    reading_shape: ClassVar[tuple[int, ...]] = (3,)
-    components: ClassVar[int] = 3
     noise: Vec3 | None = eqx.field(converter=deviations(), default=None)
     _: dataclasses.KW_ONLY
     bias: Vec3 | None = eqx.field(converter=optional("bias"), default=None)
     scale: Vec3 | None = eqx.field(converter=optional("scale"), default=None)
     mounting: Vec3 | None = eqx.field(converter=optional("mounting"), default=None)
     skew: Vec3 | None = eqx.field(converter=optional("skew"), default=None)
-    limit: Vec3 | None = eqx.field(converter=full_scale, default=None)
-    offset: Scalar | None = eqx.field(converter=optional("offset", ()), default=None)
+    limit: Vec3 | None = eqx.field(
+        converter=lambda limit: positive(limit, "limit", "a positive full scale", 3), default=None
+    )
     lowpass: LowPass | None = eqx.field(converter=lowpass_of, default=None)
 
     def _shown(self, truth: Vec3) -> Vec3:
@@ -86,8 +85,7 @@ class Gyro(_Vector):
         self.feels = HasSpin if self.gravity is None else HasAttitude
         if self.g_sensitivity is None:
             if self.place is not None or self.gravity is not None:
-                wanted = "place and gravity need a g_sensitivity"
-                raise ValueError(f"Gyro: {wanted}")
+                raise ValueError("Gyro: place and gravity need a g_sensitivity")
         elif self.place is None:
             self.place = jnp.zeros(3)
 
@@ -136,8 +134,7 @@ class Accelerometer(_Vector):
     gravity: Vec3 | None = eqx.field(converter=optional("gravity"), default=None)
 
     def error(self, now: SensorInput, reading: Array) -> Vec3:
-        force = specific_force(now, self.place, self.gravity)
-        return reading - self._shown(force)
+        return reading - self._shown(specific_force(now, self.place, self.gravity))
 
 
 class Magnetometer(_Vector):
