@@ -25,13 +25,7 @@ from rigidjax.identify.result import Fit
 from rigidjax.motion.torques.base import vector_at
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.linalg3 import apply, dot
-from rigidjax.tumblers.search import (
-    MAGNITUDE,
-    descended,
-    noise_of,
-    relative_flux,
-    starts_of,
-)
+from rigidjax.tumblers.search import MAGNITUDE, descended, noise_of, relative_flux, starts_of
 from rigidjax.tumblers.sensor import Brightness
 from rigidjax.tumblers.two_frequencies import TwoFrequencies, two_frequencies
 
