@@ -16,15 +16,7 @@ def front(records: Iterable[Record]) -> list[Record]:
     """The records of one scene and kind on the Pareto front of error and time.
 
     A record is compared with the curves of the others, log–log between their settings, not only
-    with the measured points. Give records of one scene, and of values or
-    gradients only. **Returns** the records by falling error.
-
-    **Raises:** `ValueError` for a mixture.
-
-    >>> slow = Record("scene", "slow", "jax", "value", "", 1e-6, error=1e-6, time=2.0)
-    >>> quick = Record("scene", "quick", "jax", "value", "", 1e-6, error=1e-6, time=1.0)
-    >>> [record.method for record in front([slow, quick])]
-    ['quick']
+    with the measured points. The records come by falling error.
     """
     records = [r for r in listed(records) if r.error == r.error and r.time == r.time]
     kinds = {(r.scene, r.kind) for r in records}
@@ -45,8 +37,6 @@ def front(records: Iterable[Record]) -> list[Record]:
 def first_answers(records: Iterable[Record]) -> list[Record]:
     """The same records with the time that a first answer takes: compiling and one run.
 
-    A method without compilation, or with an unknown time of it, counts with its run alone.
-
     >>> cold = Record("scene", "method", "ours", "value", "", 1e-6, time=1e-3, compile=2.0)
     >>> first_answers([cold])[0].time
     2.001
@@ -61,13 +51,7 @@ def first_answers(records: Iterable[Record]) -> list[Record]:
 def time_to(records: Iterable[Record], error: float) -> float:
     """Time, s, that the method of these records takes to an error, between its settings in log–log.
 
-    It is the coarsest setting's time if the error is smaller there already, and NaN if the method
-    never gets to the error.
-
-    >>> rough = Record("scene", "method", "jax", "value", "", 1e-2, error=1e-2, time=1.0)
-    >>> fine = Record("scene", "method", "jax", "value", "", 1e-4, error=1e-4, time=4.0)
-    >>> round(time_to([rough, fine], 1e-3), 6)
-    2.0
+    It is the coarsest setting's if the error is smaller there already, NaN if it is never reached.
     """
     error = _checks.positive(error, "error")
     rungs = sorted((r for r in listed(records) if r.error == r.error), key=lambda r: r.time)
