@@ -122,7 +122,7 @@ def square4(q: Sequence[Scalar]) -> Scalar:
     return q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]
 
 
-def product4(p: Sequence[Any], q: Sequence[Any]) -> tuple[Any, ...]:
+def product4(p: Any, q: Any) -> tuple[Any, ...]:
     """The quaternion product p q of four scalars each, of JAX or NumPy."""
     a, b, c, d = p
     e, f, g, h = q

@@ -22,14 +22,10 @@ TAYLOR = (1e-4, 1e-6, 1e-8, 1e-10, 1e-12, 1e-14)
 STEPS = (5e-2, 2e-2, 5e-3)
 
 
-def _start(scene: Scene) -> np.ndarray:
-    return np.asarray(scene.flat(scene.state0), float)
-
-
-def _rates(scene: Scene, **how: Any) -> Any:
+def _rates(scene: Scene, numbers: np.ndarray, **how: Any) -> Any:
     """The plain equations on floats."""
     plain: Any = scene.plain
-    return plain(tuple(map(float, scene.numbers)), math.sin, math.cos, math.sqrt, **how)
+    return plain(tuple(map(float, numbers)), math.sin, math.cos, math.sqrt, **how)
 
 
 def _written_out(scene: Scene) -> bool:
@@ -46,15 +42,16 @@ def _in_double(scene: Scene) -> bool:
 
 
 def _peer(module: str, can: Callable[[Scene], bool] = _written_out) -> Callable[[Any], Any]:
-    """Of `make(scene, module) → run` a method's `value`: the making is timed, not the import."""
+    """A method's `value` of `make(scene, numbers, start, module) → run`, timed without imports."""
 
-    def wrapped(make: Callable[[Scene, Any], Callable[[float], tuple[Any, Any]]]) -> Any:
+    def wrapped(make: Callable[[Scene, np.ndarray, np.ndarray, Any], Any]) -> Any:
         def ready(scene: Scene) -> Ready | None:
             if not can(scene):
                 return None
+            numbers, start = (np.asarray(v) for v in (scene.numbers, scene.flat(scene.state0)))
             loaded = importlib.import_module(module)
             begin = time.perf_counter()
-            run = make(scene, loaded)
+            run = make(scene, numbers, start.astype(float), loaded)
             return Ready(run, time.perf_counter() - begin)
 
         return ready
@@ -62,14 +59,12 @@ def _peer(module: str, can: Callable[[Scene], bool] = _written_out) -> Callable[
     return wrapped
 
 
-def _stepped(scene: Scene, f: Any) -> Any:
+def _stepped(end: float, start: np.ndarray, f: Any) -> Any:
     from scipy.integrate import DOP853
-
-    start = _start(scene)
 
     def run(setting: float) -> tuple[Any, Any]:
         # The stepper itself: solve_ivp would keep every step.
-        stepper = DOP853(f, 0.0, start, scene.end, rtol=setting, atol=1e-3 * setting)
+        stepper = DOP853(f, 0.0, start, end, rtol=setting, atol=1e-3 * setting)
         steps = 0
         while stepper.status == "running":
             stepper.step()
@@ -80,25 +75,25 @@ def _stepped(scene: Scene, f: Any) -> Any:
 
 
 @_peer("scipy.integrate")
-def _scipy(scene: Scene, _: Any) -> Any:
-    rates = _rates(scene)
-    return _stepped(scene, lambda t, y: np.array(rates(t, y)))
+def _scipy(scene: Scene, numbers: np.ndarray, start: np.ndarray, _: Any) -> Any:
+    rates = _rates(scene, numbers)
+    return _stepped(scene.end, start, lambda t, y: np.array(rates(t, y)))
 
 
 @_peer("numba")
-def _numba(scene: Scene, numba: Any) -> Any:
-    rates = _rates(scene, wrap=numba.njit)
+def _numba(scene: Scene, numbers: np.ndarray, start: np.ndarray, numba: Any) -> Any:
+    rates = _rates(scene, numbers, wrap=numba.njit)
 
     @numba.njit
     def f(t: Any, y: Any) -> Any:
         return np.array(rates(t, y))
 
-    f(0.0, _start(scene))
-    return _stepped(scene, f)
+    f(0.0, start)
+    return _stepped(scene.end, start, f)
 
 
 @_peer("mujoco", _weighed)
-def _mujoco(scene: Scene, mujoco: Any) -> Any:
+def _mujoco(scene: Scene, numbers: np.ndarray, start: np.ndarray, mujoco: Any) -> Any:
     """A body on a ball joint, MuJoCo's own Runge–Kutta 4; tops and free bodies only."""
     notes, body = scene.notes, scene.body
     assert notes is not None and body is not None
@@ -116,7 +111,6 @@ def _mujoco(scene: Scene, mujoco: Any) -> Any:
     data: Any = mujoco.MjData(model)
     # It would write a file into the folder one works in where a step is too long.
     mujoco.set_mju_user_warning(lambda message: None)
-    start = _start(scene)
 
     def run(setting: float) -> tuple[Any, Any]:
         mujoco.mj_resetData(model, data)
@@ -137,17 +131,17 @@ def _system(scene: Scene, hy: Any, numbers: Any) -> Any:
     return list(zip(variables, rates, strict=True))
 
 
-def _propagated(hy: Any, scene: Scene, system: Any, **how: Any) -> Callable[[float], Any]:
+def _propagated(hy: Any, end: float, start: np.ndarray, system: Any, **how: Any) -> Any:
     """Tolerance → the state at the end, steps. Order and code follow from it: each is compiled."""
     made: dict[float, Any] = {}
 
     def run(setting: float) -> tuple[Any, Any]:
         if setting not in made:
-            stepper = hy.taylor_adaptive(system, _start(scene), tol=setting, **how)
+            stepper = hy.taylor_adaptive(system, start, tol=setting, **how)
             made[setting] = stepper, stepper.state.copy()
         stepper, first = made[setting]
         stepper.state[:], stepper.time = first, 0.0
-        steps = stepper.propagate_until(scene.end)[3]
+        steps = stepper.propagate_until(end)[3]
         return stepper.state.copy(), steps
 
     run(TAYLOR[2])
@@ -155,21 +149,21 @@ def _propagated(hy: Any, scene: Scene, system: Any, **how: Any) -> Callable[[flo
 
 
 @_peer("heyoka")
-def _taylor(scene: Scene, hy: Any) -> Any:
-    return _propagated(hy, scene, _system(scene, hy, list(map(float, scene.numbers))))
+def _taylor(scene: Scene, numbers: np.ndarray, start: np.ndarray, hy: Any) -> Any:
+    system = _system(scene, hy, list(map(float, numbers)))
+    return _propagated(hy, scene.end, start, system)
 
 
 @_peer("heyoka")
-def _varied(scene: Scene, hy: Any) -> Any:
+def _varied(scene: Scene, numbers: np.ndarray, start: np.ndarray, hy: Any) -> Any:
     """Variational equations by the initial state and the inertia, contracted with the scalar's."""
-    numbers = np.asarray(scene.numbers)
     size = 6 if scene.body is not None else 0
     symbols = [hy.par[i] for i in range(size)] or list(numbers)
     system = _system(scene, hy, [*symbols, *numbers[size:]] if size else symbols)
     flavour = hy.var_args.vars | hy.var_args.params if size else hy.var_args.vars
     varied = hy.var_ode_sys(system, flavour, order=1)
-    end_of = _propagated(hy, scene, varied, pars=numbers[:size], compact_mode=True)
-    n = len(_start(scene))
+    end_of = _propagated(hy, scene.end, start, varied, pars=numbers[:size], compact_mode=True)
+    n = len(start)
     chain = np.asarray(jax.jacfwd(lambda p: scene.flat(scene.assembled(p)[1]))(scene.numbers))
     pull = jax.jit(jax.grad(scene.loss))
 
@@ -189,12 +183,12 @@ class _Ensemble:
 
     is_stiff, t0 = False, 0.0
 
-    def __init__(self, scene: Scene, module: Any) -> None:
+    def __init__(self, scene: Scene, numbers: np.ndarray, start: np.ndarray, module: Any):
         # One scene is recorded by NumPy otherwise, a thousand times as slowly.
         os.environ.setdefault("GRADSOLVE_RECORDER", "jax")
         self.module, self.plain = module, scene.plain
         self.name, self.t1 = scene.name, scene.end
-        self.start, self.numbers = _start(scene)[None], np.asarray(scene.numbers)[None]
+        self.start, self.numbers = start[None], numbers[None]
         self.dim = self.start.shape[1]
 
     def f_jax(self, t: Any, y: Any, p: Any) -> Any:
@@ -207,8 +201,8 @@ class _Ensemble:
 
 
 @_peer("gradsolve", _in_double)
-def _recorded(scene: Scene, module: Any) -> Any:
-    ensemble = _Ensemble(scene, module)
+def _recorded(scene: Scene, numbers: np.ndarray, start: np.ndarray, module: Any) -> Any:
+    ensemble = _Ensemble(scene, numbers, start, module)
 
     def run(setting: float) -> tuple[Any, Any]:
         found = ensemble.call("solve", setting)
@@ -219,9 +213,9 @@ def _recorded(scene: Scene, module: Any) -> Any:
 
 
 @_peer("gradsolve", _in_double)
-def _replayed(scene: Scene, module: Any) -> Any:
+def _replayed(scene: Scene, numbers: np.ndarray, start: np.ndarray, module: Any) -> Any:
     """The gradient through recorded steps; they are recorded once, and not timed."""
-    ensemble = _Ensemble(scene, module)
+    ensemble = _Ensemble(scene, numbers, start, module)
     made: dict[float, Any] = {}
 
     def gradient_of(setting: float) -> Any:
@@ -229,8 +223,8 @@ def _replayed(scene: Scene, module: Any) -> Any:
         count = int(ensemble.call("solve", setting).accepted_steps[0])
 
         def loss(numbers: Any) -> Any:
-            start = scene.flat(scene.assembled(numbers)[1])
-            return scene.loss(end(start[None], numbers[None])[0])
+            first = scene.flat(scene.assembled(numbers)[1])
+            return scene.loss(end(first[None], numbers[None])[0])
 
         return jax.jit(jax.grad(loss)).lower(scene.numbers).compile(), count
 
