@@ -8,12 +8,8 @@ import numpy as np
 from rigidjax import _checks
 from rigidjax.plot.style import COLOURS, plain, several_axes
 
-_KINDS = {
-    "x": "position, m",
-    "v": "velocity, m/s",
-    "q": "attitude, rad",
-    "omega": "body rate, rad/s",
-}
+_KINDS = {"x": "position, m", "v": "velocity, m/s", "q": "attitude, rad"}
+_KINDS["omega"] = "body rate, rad/s"
 _MEASURES = {
     "mean_absolute": "mean |error| of a component",
     "mean_norm": "mean length of the error",
@@ -50,10 +46,8 @@ def horizons(
         raise ValueError("found: wanted at least one Horizons, got none")
     for one in named.values():
         if not all(hasattr(one, name) for name in ("steps", *_MEASURES)) or isinstance(one, type):
-            found = _checks.kind(one)
-            raise TypeError(
-                f"found: wanted a Horizons of rigidjax.identify, or some by name, got {found}"
-            )
+            words = "found: wanted a Horizons of rigidjax.identify, or some by name, got "
+            raise TypeError(words + _checks.kind(one))
     _checks.word(measure, tuple(_MEASURES), "measure")
     scale = 1.0 if step is None else _checks.positive(step, "step", "a positive time, s")
     kinds = [kind for kind in _KINDS if kind in getattr(next(iter(named.values())), measure)]

@@ -33,18 +33,12 @@ def residuals(
     'lag, samples'
     """
     seconds = unit(time_unit, TIMES, "time_unit")
-    index = of_fit(found, index)
-    record = found.problem.recordings[index]
-    several = found.problem.count > 1
+    record, left, noises = of_fit(found, index)
     count = len(record.readings)
     ax = several_axes(ax, (count, 4), nrows=count, ncols=4, figsize=(14, 3.1 * count))
     t = np.asarray(record.t) / seconds
-    for row, reading, errors, noise in zip(
-        ax, record.readings, found.residuals, found.noise, strict=True
-    ):
-        one = np.asarray(errors[index] if several else errors)[: t.size]
-        sigma = np.asarray(noise[index] if several else noise)
-        _one_sensor(row, t, one / sigma, np.asarray(reading.seen))
+    for row, reading, errors, noise in zip(ax, record.readings, left, noises, strict=True):
+        _one_sensor(row, t, errors / noise, np.asarray(reading.seen))
         row[0].set_ylabel(f"{type(reading.sensor).__name__}\nerror / noise")
         row[0].set_xlabel(f"time, {time_unit}")
         row[3].set_xlabel(f"frequency, {'Hz' if time_unit == 's' else f'1/{time_unit}'}")
