@@ -17,8 +17,7 @@ ROUNDED = 1e-6
 
 
 def read_inertials(path: str | Path) -> dict[str, MassProperties]:
-    """The bodies with inertia in a URDF or MuJoCo XML file, by name, in the frame of the link or
-    body.
+    """The bodies with inertia in a URDF or MuJoCo XML file, by name, in their own frames.
 
     URDF: `<inertial>` with `origin` (`xyz`, `rpy`), `mass`, `inertia`. MuJoCo: `<inertial>` with
     `mass`, `pos`, `quat`, `diaginertia` or `fullinertia`; an inertia that MuJoCo would compute from

@@ -90,8 +90,7 @@ def unpack_second_moment(vector: Float[ArrayLike, "6"] | Numbers) -> Mat3:
 
 
 def pack_shape(second_moment: Matrix) -> Float[Array, "5"]:
-    """Five unconstrained numbers of a second moment up to its scale: free motion depends only on
-    them.
+    """Five unconstrained numbers of a second moment up to its scale, which free motion shows.
 
     **Arguments:** `second_moment` (3, 3) 𝔖, positive semi-definite, any units. **Returns** (5,)
     `(d1, d2, s12, s23, s13)`: the root √𝔖 scaled to trace 3 is `1 + V`, where V is symmetric with

@@ -1,5 +1,4 @@
-"""Elliptic functions and integrals, `rj.elliptic`: Jacobi's functions, Legendre's and Carlson's
-integrals.
+"""Elliptic functions and integrals: Jacobi's functions, Legendre's and Carlson's integrals.
 
 The parameter is m = k², as in SciPy and mpmath. Its complement m1 = 1 − m is an optional argument:
 as m → 1 the difference 1 − m loses its digits and finally rounds to 0. Results have the dtype of

@@ -60,9 +60,7 @@ def near_one(u: Result, m: Result, m1: Result) -> tuple[Result, Result, Result]:
 
 @jax.custom_jvp
 def _power_exp(p: Any, y: Any, n: Any) -> Any:
-    """pⁿ e^y. For n = 1 its second derivative by p is exactly 0; by exp(y + n ln p) it would be a
-    difference of large numbers.
-    """
+    """pⁿ e^y. For n = 1 its second derivative by p is exactly 0; that of exp(y + n ln p) is not."""
     return jnp.exp(y + jnp.where(n == 0, 0, n * jnp.log(p)))
 
 

@@ -10,8 +10,7 @@ from rigidjax.rotation import linalg3, quaternion
 
 
 class Instant(eqx.Module):
-    """The position, rotation and motion of a moving frame S' at one time; `MovingFrame.at(t)` makes
-    it.
+    """Position, rotation and motion of a moving frame S' at one time, by `MovingFrame.at(t)`.
 
     **Fields:** `rotation` M (3, 3), S' → S; `rate` Ω (3,), rad/s, and `rate_change` dΩ/dt (3,),
     rad/s², both in the axes of S'; `origin`, `origin_velocity`, `origin_acceleration` of S', (3,),

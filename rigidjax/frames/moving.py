@@ -119,21 +119,15 @@ class MovingFrame(eqx.Module):
         return self.at(t).from_inertial(state)
 
     def centrifugal(self, x: Vector, t: ScalarLike) -> Vec3:
-        """Centrifugal acceleration −Ω × (Ω × x') (3,), m/s², axes of S' (notes, eq 91), of a place
-        `x`, m.
-        """
+        """Acceleration −Ω × (Ω × x') (3,), m/s², axes of S' (notes, eq 91), at `x` (3,), m."""
         return self.at(t).centrifugal(x)
 
     def coriolis(self, v: Vector, t: ScalarLike) -> Vec3:
-        """Coriolis acceleration −2 Ω × v' (3,), m/s², axes of S' (notes, eq 91), of a velocity `v`,
-        m/s.
-        """
+        """Acceleration −2 Ω × v' (3,), m/s², axes of S' (notes, eq 91), at `v` (3,), m/s."""
         return self.at(t).coriolis(v)
 
     def euler_acceleration(self, x: Vector, t: ScalarLike) -> Vec3:
-        """Euler acceleration −dΩ/dt × x' (3,), m/s², axes of S' (eq 91, "inercial"), of a place
-        `x`, m.
-        """
+        """Acceleration −dΩ/dt × x' (3,), m/s², axes of S' (eq 91, "inercial"), at `x` (3,), m."""
         return self.at(t).euler_acceleration(x)
 
     def translation(self, t: ScalarLike) -> Vec3:

@@ -135,8 +135,7 @@ class EulerAngleTop(eqx.Module):
 
 
 def to_attitude(y: Coordinates) -> Attitude:
-    """Attitude and body rate of `y`, 3-1-3 Euler angles, rad, and rates, rad/s (notes, eqs 33,
-    81–83).
+    """Attitude and body rate of `y`, 3-1-3 Euler angles, rad, and rates (notes, eqs 33, 81–83).
 
     >>> to_attitude(Coordinates([0.0, 0.0, 0.0], [0.0, 0.0, 2.0])).omega.tolist()
     [0.0, 0.0, 2.0]

@@ -24,8 +24,7 @@ def energy(
     torque: Torque | None = None,
     t: ScalarLike = 0.0,
 ) -> Scalar:
-    """Kinetic energy plus the potential energy of every torque and force, J:
-    `½ m |v|² + ½ Ω·IΩ + U`.
+    """Kinetic energy and the potential of each torque and force, J: `½ m |v|² + ½ Ω·IΩ + U`.
 
     **Arguments:** `body`, `state`, `torque` as for `simulate`; `t` s, for torques that depend on
     time. Wheels add no energy, except for `ReactionWheels`. Under a torque with states of its own

@@ -63,8 +63,7 @@ class Attitude(eqx.Module):
 
 
 class Rigid(eqx.Module):
-    """The state of a body that moves: place and velocity of its centre of mass, attitude, body
-    rate.
+    """The state of a body that moves: its place and velocity, attitude and body rate.
 
     **Arguments:** `x` (3,) position of the centre of mass, m, world frame (the `X` of the notes,
     eq 1); `v` (3,) its velocity, m/s, world frame; `q` (4,) unit quaternion (w, x, y, z), scalar

@@ -1,6 +1,6 @@
 """Families of periodic orbits: continuation by the orbit's derivatives, stability, branches."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -51,16 +51,12 @@ def family(
     values = values.astype(start.dtype)
     held = 0.5 * values if hold == "period" else values
     numbers, left = _at_values(scene, start, held, index, correction.usual_tolerance(start))
-    lost = _lost(start, numbers, left)
-    where = ""
-    if _checks.known(lost) and bool(lost.any()):
-        where = f" at {hold} = {float(values[np.argmax(np.asarray(lost))]):.9g}"
-    words = (
-        f"family: lost{where}; take smaller steps, or the family turns back there: hold another of "
+    where = lambda i: f" at {hold} = {values[i]:.9g}"  # noqa: E731
+    advice = (
+        "; take smaller steps, or the family turns back there: hold another of x, z, vy, period, "
     )
-    words += "x, z, vy, period, or use follow"
-    numbers = _checks.refuse(numbers, lost.any(), words)
-    return jax.vmap(orbit_of)(numbers)
+    lost = _lost(start, numbers, left)
+    return _found(numbers, lost, where, "family: lost", advice + "or use follow")
 
 
 def _lost(start: Array, numbers: Array, left: Array) -> Array:
@@ -68,6 +64,15 @@ def _lost(start: Array, numbers: Array, left: Array) -> Array:
     before = jnp.concatenate([start[None], numbers[:-1]])
     ratio = numbers[:, 3] / before[:, 3]
     return ~((left <= correction.usual_tolerance(start)) & (ratio > 0.5) & (ratio < 2))
+
+
+def _found(
+    numbers: Array, lost: Array, where: Callable[[int], str], what: str, advice: str
+) -> PeriodicOrbit:
+    """The members, unless one was lost; a known one is named by `where` of its number."""
+    known = _checks.known(lost) and bool(lost.any())
+    words = what + (where(int(np.argmax(np.asarray(lost)))) if known else "") + advice
+    return jax.vmap(orbit_of)(_checks.refuse(numbers, lost.any(), words))
 
 
 @eqx.filter_jit
@@ -149,11 +154,8 @@ def follow(
     moved = jnp.diff(jnp.concatenate([start[None], numbers]), axis=0)
     far = jnp.sqrt(jnp.sum(moved * moved, axis=1)) > 2 * jnp.abs(length)
     lost = _lost(start, numbers, left) | far
-    where = ""
-    if _checks.known(lost) and bool(lost.any()):
-        where = f" after {int(np.argmax(np.asarray(lost)))} of {count} members"
-    numbers = _checks.refuse(numbers, lost.any(), f"follow: lost{where}; take smaller steps")
-    return jax.vmap(orbit_of)(numbers)
+    where = lambda i: f" after {i} of {count} members"  # noqa: E731
+    return _found(numbers, lost, where, "follow: lost", "; take smaller steps")
 
 
 @eqx.filter_jit

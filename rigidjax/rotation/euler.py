@@ -71,8 +71,7 @@ def from_matrix(matrix: Mat3Like, sequence: str = "ZXZ") -> Vec3:
 
 
 def from_quaternion(q: QuatLike, sequence: str = "ZXZ") -> Vec3:
-    """The Euler angles of a quaternion, rad, in the order of `sequence`; the same bits for q and
-    −q.
+    """The Euler angles of a quaternion, rad, in the order of `sequence`; the same bits for −q.
 
     **Arguments:** `q` (4,) of any length, body → world. **Raises:** `ValueError` for zero, NaN or
     an unknown sequence. Half the sum and half the difference of the outer angles come from two

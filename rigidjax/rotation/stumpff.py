@@ -22,8 +22,7 @@ _REACH = math.tan(math.pi / 8) ** 2
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def stumpff(k: int, t: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Stumpff function c_k(t) = Σ (−t)ⁿ/(k + 2n)! for t = θ² ≥ 0 (Battin 1999, eq 4.80 and
-    problem).
+    """Stumpff function c_k(t) = Σ (−t)ⁿ/(k + 2n)! for t = θ² ≥ 0 (Battin 1999, eq 4.80).
 
     c_0 is cos θ, c_1 sin θ/θ, c_2 (1 − cos θ)/θ², c_3 (θ − sin θ)/θ³. Values and derivatives of
     every order are right to a few units of round-off of 1/k!.

@@ -186,9 +186,7 @@ def evaluate(torque: Torque, t: ScalarLike, state: HasSpin, body: Inertia | Mass
 def act(
     law: Torque, t: ScalarLike, state: HasSpin, body: Inertia | MassProperties
 ) -> tuple[Vec3 | None, Vec3]:
-    """Force on the centre of mass (N, world frame; or `None`) and torque about it (N m, body
-    frame).
-    """
+    """Force on the centre of mass (N, world frame, or `None`), and torque about it (body frame)."""
     require_scene(law, state, body)
     dtype = state.omega.dtype
     t = _checks.floating(t, (), "t").astype(dtype)

@@ -160,9 +160,7 @@ def _line(times: Float[Array, " n"], rows: Float[Array, "n *k"], t: Scalar) -> A
 def _rows(
     name: str, times: Any, other: str, values: Any, extra: int | None = None
 ) -> tuple[Array, Array]:
-    """Times and rows of one precision, checked. With `extra` there are so many more times than
-    rows, and a row has 3 numbers.
-    """
+    """Times and rows, checked. `extra`: so many more times than rows, and rows of 3 numbers."""
     times, rows = _checks.rows(times, (), name), _checks.numbers(values, other)
     count = times.shape[0]
     if count < 2:

@@ -156,9 +156,7 @@ class ReactionWheels(base.AbstractTorque):
     jump_times = property(base.jumps_of_parts)
 
     def without_wheels(self, body: Body) -> Body:
-        """The `body` (`Inertia` or `MassProperties`, wheels locked) without their moments,
-        `I − Σ J a aᵀ`.
-        """
+        """The `body`, an `Inertia` or `MassProperties` with locked wheels, less `Σ J a aᵀ`."""
         _checks.single(body, (Inertia, MassProperties), "body")
         rows = (j * outer(a, a) for j, a in zip(self.inertia, self.axes, strict=True))
         taken = sum(rows, jnp.zeros((3, 3), self.axes.dtype))
