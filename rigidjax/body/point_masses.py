@@ -10,7 +10,7 @@ from jaxtyping import Array, ArrayLike, Float
 from rigidjax import _checks
 from rigidjax._types import Numbers, Vector
 from rigidjax.body.inertia import MassProperties
-from rigidjax.body.symmetric3 import from_components
+from rigidjax.body.symmetric3 import PAIRS, from_components
 from rigidjax.rotation.linalg3 import determinant
 
 
@@ -109,10 +109,5 @@ def summed(masses: Float[Array, "n"], positions: Float[Array, "n 3"]) -> MassPro
     mass = masses.sum()
     com = (masses[:, None] * from_start).sum(axis=0) / mass
     d = from_start - com[None, :]
-    x, y, z = d[:, 0], d[:, 1], d[:, 2]
-    mx, my, mz = masses * x, masses * y, masses * z
-    second = from_components(
-        (mx * x).sum(), (my * y).sum(), (mz * z).sum(),
-        (mx * y).sum(), (mx * z).sum(), (my * z).sum(),
-    )  # fmt: skip
+    second = from_components(*((masses * d[:, i] * d[:, j]).sum() for i, j in PAIRS))
     return MassProperties(mass, start + com, second)

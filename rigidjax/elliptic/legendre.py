@@ -21,15 +21,10 @@ from jax.custom_derivatives import SymbolicZero
 from rigidjax.elliptic.arguments import Real, Result, common, complementary
 from rigidjax.elliptic.carlson import rd, rf
 from rigidjax.elliptic.carlson_r import r_integral
+from rigidjax.rotation.stumpff import half_turns
 
 # Steps after which a and b agree to √eps for b/a down to the square root of the least number.
-MEAN_STEPS = {np.dtype("float64"): 11, np.dtype("float32"): 8}
-
-# π in three parts, the first two of 28 (float64) or 10 (float32) bits.
-PI_PARTS = {
-    np.dtype("float64"): (3.141592651605606, 1.9841871479187034e-09, 1.1442377452219664e-17),
-    np.dtype("float32"): (3.140625, 0.0009670257568359375, 6.278329465203569e-07),
-}
+_MEAN_STEPS = {np.dtype("float64"): 11, np.dtype("float32"): 8}
 
 
 def ellipk(m: Real, m1: Real | None = None) -> Result:
@@ -170,11 +165,18 @@ def complete(orders: tuple[int, int, int], m1: Any, n1: Any = None) -> Any:
     return integral(orders, one, jnp.zeros_like(m1), m1, one if n1 is None else n1)
 
 
+def means(m1: Any) -> list[tuple[Any, Any]]:
+    """The pairs (a, b) of arithmetic and geometric means, from (1, √m1) to their common value."""
+    rows = [(jnp.ones_like(m1), jnp.sqrt(m1))]
+    for _ in range(_MEAN_STEPS[np.dtype(m1.dtype)]):
+        a, b = rows[-1]
+        rows.append((0.5 * (a + b), jnp.sqrt(a * b)))
+    return rows
+
+
 @jax.custom_jvp
 def _complete_first(m1: Any) -> Any:
-    a, b = jnp.ones_like(m1), jnp.sqrt(m1)
-    for _ in range(MEAN_STEPS[np.dtype(m1.dtype)]):
-        a, b = 0.5 * (a + b), jnp.sqrt(a * b)
+    a, b = means(m1)[-1]
     return jnp.where(m1 == 0, jnp.inf, math.pi / (a + b))
 
 
@@ -208,16 +210,6 @@ def _incomplete(orders: tuple[int, int, int], phi: Any, m1: Any, n1: Any = None)
     near = turns == 0
     one = jnp.ones_like(m1)
     safe_m1, safe_n1 = jnp.where(near, one, m1), jnp.where(near, one, n1)
-    if orders == (0, 0, 0):
-        whole = _complete_first(safe_m1)
-    else:
-        whole = complete(orders, safe_m1, safe_n1)
+    first = orders == (0, 0, 0)
+    whole = _complete_first(safe_m1) if first else complete(orders, safe_m1, safe_n1)
     return part + jnp.where(near, 0, 2 * turns * whole)
-
-
-def half_turns(angle: Any) -> tuple[Any, Any]:
-    """(n, r) with angle = nπ + r, |r| ≤ π/2; the tangent of r is that of the angle."""
-    turns = jax.lax.stop_gradient(jnp.round(angle * (1 / math.pi)))
-    # Cody & Waite 1980: n × head and n × middle are exact, so that r keeps the digits of the angle.
-    head, middle, tail = PI_PARTS[np.dtype(angle.dtype)]
-    return turns, ((angle - turns * head) - turns * middle) - turns * tail

@@ -50,7 +50,7 @@ class ThreeBody(AbstractReversible):
         return jnp.stack([2 * vy + x - a1 * first - a2 * second, y - 2 * vx - pull * y, -pull * z])
 
     def potential(self, x: Vector) -> Scalar:
-        """U = ½(x² + y²) + (1 − μ)/r₁ + μ/r₂ at `x` (3,) (Szebehely 1967, sec. 1.5, no constant)."""
+        """U = ½(x² + y²) + (1 − μ)/r₁ + μ/r₂ at `x` (3,) (Szebehely, sec. 1.5, no constant)."""
         x = _checks.floating(x, (3,), "x")
         r1, r2 = self.distances(x)
         mu = self.mu.astype(x.dtype)
