@@ -51,12 +51,12 @@ def mesh(
     _checks.if_known(_checks.sign, density, "density", "a positive number, kg/m³")
 
     centre = jax.lax.stop_gradient(corners.mean(axis=0))
-    six, corner = _tetrahedra(corners - centre[None, :], faces)
-    com = (six[:, None] * sum(corner)).sum(axis=0) / (4.0 * six.sum())
+    six, (a, b, c) = _tetrahedra(corners - centre[None, :], faces)
+    com = (six[:, None] * (a + b + c)).sum(axis=0) / (4.0 * six.sum())
     volume = _outward(six.sum() / 6.0, corners, faces)
     # About the centre of mass itself: nothing is subtracted afterwards.
-    six, corner = _tetrahedra(corners - (centre + com)[None, :], faces)
-    rows = (*corner, sum(corner))
+    six, (a, b, c) = _tetrahedra(corners - (centre + com)[None, :], faces)
+    rows = (a, b, c, a + b + c)
     entries = ((six * sum(r[:, i] * r[:, j] for r in rows)).sum() / 120.0 for i, j in PAIRS)
     return MassProperties(density * volume, centre + com, density * from_components(*entries))
 

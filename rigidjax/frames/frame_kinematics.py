@@ -107,8 +107,7 @@ def _can_travel(state: Any) -> None:
             f"with all four (Rigid), got {type(state).__name__}"
             + (alone if hasattr(state, "omega") else "")
         )
-    hint = "a frame carries one state at one time, batch with "
-    hint += "jax.vmap(frame.to_inertial)(states, times)"
+    hint = "one state at one time; batch with jax.vmap(frame.to_inertial)(states, times)"
     for name, size in (("x", 3), ("v", 3), ("q", 4), ("omega", 3)):
         if hasattr(state, name):
             _checks.floating(getattr(state, name), (size,), name, hint=hint)

@@ -62,8 +62,7 @@ class MovingFrame(eqx.Module):
 
     def matrix(self, t: ScalarLike) -> Mat3:
         """M(t) (3, 3), S' → S (notes, eq 85)."""
-        t = _checks.time(t)
-        return rotation_models.matrix(self.rotation, t)
+        return rotation_models.matrix(self.rotation, _checks.time(t))
 
     def at(self, t: ScalarLike) -> Instant:
         """The frame at time `t`, s: M, Ω, dΩ/dt, and the origin with its two derivatives.

@@ -14,6 +14,8 @@ from rigidjax.motion.torques import HeavyTop
 from rigidjax.rotation import quaternion
 from rigidjax.rotation.linalg3 import apply, cross, dot
 
+_WANTED = "of the momentum to H, J"
+
 
 class Momentum(eqx.Module):
     """The state of Lie–Poisson motion: the angular momentum in the body.
@@ -86,7 +88,7 @@ def lie_poisson(hamiltonian: Callable[[Any], Any]) -> LiePoisson:
     >>> lie_poisson(H)(0.0, Momentum([1.0, 1.0, 1.0])).pi
     Array([ 0. ,  0.5, -0.5], dtype=float64)
     """
-    return LiePoisson(_callable(hamiltonian))
+    return LiePoisson(_checks.function(hamiltonian, "hamiltonian", _WANTED))
 
 
 def lie_poisson_with_direction(hamiltonian: Callable[[Any, Any], Any]) -> LiePoissonWithDirection:
@@ -101,7 +103,7 @@ def lie_poisson_with_direction(hamiltonian: Callable[[Any, Any], Any]) -> LiePoi
     >>> field(0.0, MomentumAndDirection([0.0, 0, 1], [1.0, 0, 0])).pi.tolist()
     [0.0, 1.0, 0.0]
     """
-    return LiePoissonWithDirection(_callable(hamiltonian))
+    return LiePoissonWithDirection(_checks.function(hamiltonian, "hamiltonian", _WANTED))
 
 
 def _invertible(inertia: Any) -> _inertia.Inertia:
@@ -163,10 +165,6 @@ class HeavyTopHamiltonian(eqx.Module):
         """Π = IΩ and γ = Rᵀ g of an attitude and a body rate."""
         pi: Vec3 = apply(self.inertia.tensor, state.omega)
         return MomentumAndDirection(pi, quaternion.rotate_inverse(state.q, self.top.gravity))
-
-
-def _callable(hamiltonian):
-    return _checks.function(hamiltonian, "hamiltonian", "of the momentum to H, J")
 
 
 def _number(value):

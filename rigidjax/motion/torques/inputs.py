@@ -143,10 +143,8 @@ class Lagged(eqx.Module):
     def rate(self, t: ScalarLike, own: Array, state: Any, body: Any) -> Array:
         """dy/dt, in the source's unit per second."""
         wanted = _checks.numbers(self.source(t), "source(t)").astype(own.dtype)
-        if jnp.shape(wanted) != jnp.shape(own):
-            raise ValueError(
-                f"Lagged: start has the shape {jnp.shape(own)}, the source {jnp.shape(wanted)}"
-            )
+        if wanted.shape != own.shape:
+            raise ValueError(f"Lagged: start has the shape {own.shape}, the source {wanted.shape}")
         return (wanted - own) / self.time
 
     def __call__(self, t: ScalarLike, own: Array) -> Array:
@@ -197,9 +195,7 @@ def bind(law: Law, inputs: Mapping[str, Any] | Row | None) -> Law:
         found = values[node.name]
         return found if callable(found) else _Now(jnp.asarray(found))
 
-    return jax.tree.map(
-        value, law, is_leaf=lambda node: isinstance(node, Input) or _is_delayed(node)
-    )
+    return jax.tree.map(value, law, is_leaf=lambda n: isinstance(n, Input) or _is_delayed(n))
 
 
 def _is_delayed(node: Any) -> bool:

@@ -171,8 +171,7 @@ class ReactionWheels(base.AbstractTorque):
 
     def torques_of(self, t: ScalarLike, own: Array, state: HasSpin) -> Float[Array, " wheels"]:
         """The torque of motor and bearing on each wheel about its axis, (R,), N m."""
-        speeds = self.speeds_of(own, state)
-        t = _checks.floating(t, (), "t")
+        speeds, t = self.speeds_of(own, state), _checks.floating(t, (), "t")
         count, total = self.inertia.shape[0], jnp.zeros_like(speeds)
         if self.motor is not None:
             total = total + base.vector_at(self.motor, t, "motor", count).astype(total.dtype)
