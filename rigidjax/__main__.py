@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import jax
+import numpy as np
 
 import rigidjax as rj
 from rigidjax import _checks
@@ -349,12 +350,12 @@ def _write(
     def drawn() -> None:
         rj.plot.fit(found, index=0, title=names[0], **units).savefig(figure, dpi=130)
 
-    def numbers() -> None:
-        report.write_json(found, options.json, read, more)
-
-    wanted = {"figure": (figure, drawn), "numbers": (options.json, numbers)}
-    wanted |= {"report": (options.report, page)}
-    kept = [_made(what, path, make) for what, (path, make) in wanted.items() if path is not None]
+    numbers = functools.partial(report.write_json, found, options.json, read, more)
+    wanted = (
+        ("figure", figure, drawn), ("numbers", options.json, numbers),
+        ("report", options.report, page),
+    )  # fmt: skip
+    kept = [_made(what, path, make) for what, path, make in wanted if path is not None]
     if "interrupted" in found.status:
         _error("interrupted (Ctrl-C): not all starts were made, see the status")
         return 130
@@ -373,17 +374,14 @@ def _made(what: str, path: Path, make: Callable[[], Any]) -> bool:
 
 
 def _figures(found: Any, names: list[str], units: dict[str, str]) -> list[Any]:
-    def left_over() -> Any:
-        return rj.plot.residuals(found, time_unit=units.get("time_unit", "s")).flat[0].figure
-
-    def body() -> Any:
-        return rj.plot.inertia_ellipsoid(found)[0].figure
-
     figures, fit = [], functools.partial(rj.plot.fit, found, **units)
     logs = [functools.partial(fit, index=i, title=name) for i, name in enumerate(names[:12])]
-    for make in (*logs, left_over, body):
+    time_unit = units.get("time_unit", "s")
+    left_over = functools.partial(rj.plot.residuals, found, time_unit=time_unit)
+    for make in (*logs, left_over, functools.partial(rj.plot.inertia_ellipsoid, found)):
         try:
-            figures.append(make())
+            drawn = make()
+            figures.append(drawn.flat[0].figure if isinstance(drawn, np.ndarray) else drawn)
         except Exception as error:
             _error(f"a figure is left out: {type(error).__name__}: {error}")
     return figures

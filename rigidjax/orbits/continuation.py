@@ -218,37 +218,32 @@ def bifurcation(
     doi:10.1007/BF01358403; Robin and Markellos 1980, doi:10.1007/BF01231183. **Raises:**
     `ValueError` if the value does not lie between, or the indices are complex.
     """
+    from scipy.optimize import brentq
+
     place = named(hold)
     if isinstance(index, bool) or index not in (0, 1):
         raise ValueError(f"index: wanted 0 or 1, which of the two stability indices, got {index!r}")
     value = _checks.number(value, "value")
     if not np.isfinite(value):
         raise ValueError(f"value: wanted a finite number, got {value}")
-    ends = [np.asarray(crossing(one)) for one in (orbit, other)]
+    a, b = (float(crossing(one)[place]) for one in (orbit, other))
     left, right = (scene.periodic_orbit(one, hold=hold) for one in (orbit, other))
-    low, high = (_index(scene, one, index) - value for one in (left, right))
+    found = {a: left, b: right}
+
+    def off(held: float) -> float:
+        if held not in found:
+            share = (held - a) / (b - a)
+            guess = jax.tree.map(lambda x, y: (1 - share) * x + share * y, left, right)
+            found[held] = scene.periodic_orbit(guess, hold=hold)
+        away = _index(scene, found[held], index) - value
+        return away if abs(away) > 1e-12 * max(1.0, abs(value)) else 0.0
+
+    low, high = off(a), off(b)
     if not low * high <= 0:
         ends = f"{low + value:.6g} at one orbit, {high + value:.6g} at the other"
         raise ValueError(f"bifurcation: the index is {ends}: {value:g} does not lie between")
-    a, b = float(ends[0][place]), float(ends[1][place])
-    width = abs(b - a)
-    found, at_found = (left, low) if abs(low) < abs(high) else (right, high)
-    for _ in range(_MOST):
-        if abs(b - a) <= 1e-13 * max(1.0, width) or at_found == 0:
-            break
-        part = low / (low - high)
-        middle = a + (b - a) * min(max(part, 1e-3), 1 - 1e-3)
-        share = (middle - a) / (b - a)
-        guess = jax.tree.map(lambda x, y, s=share: (1 - s) * x + s * y, left, right)
-        found = scene.periodic_orbit(guess, hold=hold)
-        at_found = _index(scene, found, index) - value
-        if abs(at_found) < 1e-12 * max(1.0, abs(value)):
-            break
-        if at_found * high > 0:
-            b, right, high, low = middle, found, at_found, 0.5 * low
-        else:
-            a, left, low, high = middle, found, at_found, 0.5 * high
-    return found
+    root: Any = brentq(off, a, b, xtol=1e-13 * max(1.0, abs(b - a)), maxiter=_MOST)
+    return found[root]
 
 
 def _index(scene: Any, orbit: PeriodicOrbit, index: int) -> float:

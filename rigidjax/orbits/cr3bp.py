@@ -101,13 +101,9 @@ class ThreeBody(AbstractReversible):
         along = jax.vmap(value, (0, None))
         return jax.vmap(along, (None, 0))(columns, rows.astype(columns.dtype))
 
-    def conserved(self, t: ScalarLike, state: Point) -> dict[str, Scalar]:
-        return {"jacobi": self.jacobi_constant(state)}
-
     def approach(self, t: ScalarLike, state: Point) -> tuple[Float[Array, "2"], Float[Array, "2"]]:
         """Distances from the two bodies, and the distances of a collision, which ends a run."""
-        first, second = self.distances(state.x)
-        gaps = jnp.stack([first, second])
+        gaps = jnp.stack(self.distances(state.x))
         return gaps, jnp.maximum(self.radii.astype(gaps.dtype), smallest_distance(gaps.dtype))
 
     @property
@@ -207,9 +203,6 @@ class Hill(AbstractReversible):
         x, y, z = components(state.x)
         speed = jnp.sum(state.v * state.v)
         return 3 * x * x - z * z + 2 / jnp.sqrt(x * x + y * y + z * z) - speed
-
-    def conserved(self, t: ScalarLike, state: Point) -> dict[str, Scalar]:
-        return {"jacobi": self.jacobi_constant(state)}
 
     def approach(self, t: ScalarLike, state: Point) -> tuple[Float[Array, "1"], Float[Array, "1"]]:
         """Distance from the small body, and the distance of a collision, which ends a run."""

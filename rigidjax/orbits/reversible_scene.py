@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 
 from rigidjax import _checks
-from rigidjax._types import ScalarLike
+from rigidjax._types import Scalar, ScalarLike
 from rigidjax.frames.base import AbstractScene
 from rigidjax.frames.point import Point
 from rigidjax.orbits import continuation, differential_correction, manifolds
@@ -24,6 +24,13 @@ class AbstractReversible(AbstractScene):
     @abc.abstractmethod
     def approach(self, t: ScalarLike, state: Point) -> tuple[Array, Array]:
         """Distances from the bodies (k,), and the distances at which a run ends as a collision."""
+
+    @abc.abstractmethod
+    def jacobi_constant(self, state: Point) -> Scalar:
+        """Jacobi's constant C of a state."""
+
+    def conserved(self, t: ScalarLike, state: Point) -> dict[str, Scalar]:
+        return {"jacobi": self.jacobi_constant(state)}
 
     def ends(self, t: ScalarLike, state: Point) -> Bool[Array, ""]:
         """Whether the particle has collided with one of the bodies."""

@@ -96,7 +96,12 @@ def run(options: argparse.Namespace) -> int:
     except (OSError, ValueError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    return 0 if before is None else _compared(records, before)
+    if before is None:
+        return 0
+    wrong, paced = moved(records, before)
+    lines = [*(f"moved: {line}" for line in wrong), *(f"time: {line}" for line in paced)]
+    print("\n".join(lines or ["nothing moved"]))
+    return 1 if wrong else 0
 
 
 def _measured(options: argparse.Namespace) -> list[Record]:
@@ -160,10 +165,3 @@ def _drifts(scene: str, records: list[Record]) -> list[str]:
         f"  {r.label:38s} h = {r.setting:<5g} {r.energy:10.1e} {r.momentum:10.1e} {r.time:10.2f}"
         for r in records
     ]
-
-
-def _compared(records: list[Record], before: list[Record]) -> int:
-    wrong, paced = moved(records, before)
-    lines = [*(f"moved: {line}" for line in wrong), *(f"time: {line}" for line in paced)]
-    print("\n".join(lines or ["nothing moved"]))
-    return 1 if wrong else 0
