@@ -41,10 +41,9 @@ class Inertia(eqx.Module):
     """The inertia tensor I of a body about the point it turns about.
 
     **Arguments:** `tensor` (3, 3), kg m², body frame. The constructor checks shape and dtype only;
-    `from_tensor`, `from_principal` and `from_second_moment` also check that the body is real. A
-    container of many bodies has leading axes; methods take one body. `scale` "arbitrary" if only
-    the ratios of the components are known, as after a fit of free motion: `simulate` then warns of
-    torques, and `shifted` raises `ValueError`.
+    `from_tensor`, `from_principal` and `from_second_moment` also check that the body is real.
+    `scale` "arbitrary" if only the ratios of the components are known, as after a fit of free
+    motion: `simulate` then warns of torques, and `shifted` raises `ValueError`.
 
     The object stores I, not 𝔖: `from_tensor` changes no digit, and the small moment of a rod keeps
     all its digits. Source: notes, eqs 76–78.
@@ -172,12 +171,10 @@ class MassProperties(eqx.Module):
 
     **Arguments:** `mass` m, kg; `com` (3,) centre of mass c, m, body frame (from the body's
     origin); `second_moment` (3, 3) 𝔖 **about the centre of mass**, kg m², body axes (notes, eq 60).
-    Known values are checked; for traced ones call `checked`. A container of many bodies has leading
-    axes; methods take one body.
+    Known values are checked; for traced ones call `checked`.
 
-    **Raises:** `ValueError` for leading axes that differ (a body has one mass, not one for each
-    axis), a mass that is not positive, a centre of mass that is not finite, a second moment that is
-    not symmetric and positive semi-definite.
+    **Raises:** `ValueError` for a mass that is not positive, a centre of mass that is not finite, a
+    second moment that is not symmetric and positive semi-definite.
 
     >>> MassProperties(2.0, [0.0, 0, 0], [[1.0, 0, 0], [0, 1, 0], [0, 0, 1]]).inertia.moments
     Array([2., 2., 2.], dtype=float64)

@@ -52,8 +52,7 @@ def write_inertials(
 
     **Arguments:** `path` of the new file; `bodies` name → `MassProperties`, in the frames of the
     file's links or bodies; `source` the file to copy; its other content does not change.
-    **Raises:** `ValueError` as `read_inertials`, and for a name that is not in the file;
-    `TypeError` for anything but `MassProperties`.
+    **Raises:** `ValueError` as `read_inertials`, and for a name that is not in the file.
 
     >>> write_inertials("new.urdf", {}, "old.urdf")
     Traceback (most recent call last):

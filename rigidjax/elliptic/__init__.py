@@ -5,7 +5,7 @@ as m → 1 the difference 1 − m loses its digits and finally rounds to 0. Resu
 the arguments (float32 or float64), and the shapes of the arguments are broadcast. Derivatives of
 every order, in forward and reverse mode and by every argument, are functions of the same families:
 no iteration is differentiated, and the dtype fixes the length of every loop. **Raises:**
-`TypeError` for half precision, `ValueError` for shapes that do not broadcast.
+`TypeError` for half precision, `ValueError` for shapes that do not broadcast, and if m + m1 ≠ 1.
 """
 
 from rigidjax._names import show

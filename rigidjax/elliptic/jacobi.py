@@ -39,7 +39,7 @@ def sncndn(u: Real, m: Real, m1: Real | None = None) -> tuple[Result, Result, Re
 
     **Returns:** three arrays (DLMF 22.2.4–6). m = 0 gives sin, cos, 1; m = 1 gives tanh, sech, sech
     (DLMF 22.5.3–4); m < 0 and m > 1 follow from DLMF 22.17. Derivatives of every order by u (DLMF
-    22.13(i)), m and m1 are exact. **Raises:** `ValueError` if m + m1 ≠ 1.
+    22.13(i)), m and m1 are exact.
 
     >>> [round(float(x), 12) for x in sncndn(1.0, 0.5)]
     [0.803001824896, 0.595976567672, 0.823161001632]
@@ -53,8 +53,7 @@ def am(u: Real, m: Real, m1: Real | None = None) -> Result:
     """Jacobi's amplitude φ = ∫₀^u dn(v|m) dv, rad: the inverse of F(φ|m) for m ≤ 1.
 
     **Arguments:** as `sncndn`. **Returns:** φ (DLMF 22.16.1–3). For m ≤ 1 it grows by π in each
-    half period 2K, without jumps; for m > 1 it oscillates within |φ| ≤ arcsin(1/√m). **Raises:** as
-    `sncndn`.
+    half period 2K, without jumps; for m > 1 it oscillates within |φ| ≤ arcsin(1/√m).
 
     >>> round(float(am(1.0, 0.5)), 12)
     0.932315079884

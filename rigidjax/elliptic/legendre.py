@@ -32,8 +32,7 @@ def ellipk(m: Real, m1: Real | None = None) -> Result:
 
     **Arguments:** `m` < 1 the parameter k² (not the modulus k), also negative; 1 gives infinity, a
     larger m NaN. `m1` = 1 − m: give it if m is so near 1 that 1 − m loses digits. Value and
-    derivative then depend on m1 alone. **Returns:** π/(2 agm(1, √m1)) (DLMF 19.8.5). **Raises:**
-    `ValueError` if m + m1 ≠ 1.
+    derivative then depend on m1 alone. **Returns:** π/(2 agm(1, √m1)) (DLMF 19.8.5).
 
     >>> round(float(ellipk(1.0, 1e-30)), 12)
     35.925070756031
@@ -46,8 +45,7 @@ def ellipe(m: Real, m1: Real | None = None) -> Result:
     """Complete elliptic integral of the second kind, E(m) = ∫₀^{π/2} √(1 − m sin²θ) dθ.
 
     **Arguments:** `m` ≤ 1 the parameter k² (a larger one gives NaN); `m1` as for `ellipk`.
-    **Returns:** DLMF 19.25.1 in Carlson's integrals, a sum of positive terms. **Raises:** as
-    `ellipk`.
+    **Returns:** DLMF 19.25.1 in Carlson's integrals, a sum of positive terms.
 
     >>> float(ellipe(1.0))
     1.0
@@ -62,7 +60,7 @@ def ellippi(n: Real, m: Real, m1: Real | None = None, n1: Real | None = None) ->
     **Arguments:** `n` < 1 the characteristic (DLMF's α²): 1 gives infinity, a larger n NaN (not the
     principal value); `m` < 1 the parameter k²; `m1` = 1 − m and `n1` = 1 − n as for `ellipk`. The
     order is Wolfram's and mpmath's. **Returns:** DLMF 19.2.8 as one integral with a positive
-    integrand, accurate to round-off for any n < 1. **Raises:** as `ellipk`.
+    integrand, accurate to round-off for any n < 1.
 
     >>> round(float(ellippi(0.5, 0.5)), 12)
     2.701287762095
@@ -76,7 +74,7 @@ def ellipf(phi: Real, m: Real, m1: Real | None = None) -> Result:
 
     **Arguments:** `phi` the amplitude, rad, any size; `m` the parameter k² with m sin²φ < 1 (else
     NaN); `m1` as for `ellipk`. **Returns:** DLMF 19.25.5 in Carlson's R_F after reduction to |φ| ≤
-    π/2 (DLMF 19.2.10). **Raises:** as `ellipk`.
+    π/2 (DLMF 19.2.10).
 
     >>> round(float(ellipf(1.0, 0.5)), 12)
     1.083216772845
@@ -90,8 +88,7 @@ def ellipeinc(phi: Real, m: Real, m1: Real | None = None) -> Result:
 
     **Arguments:** `phi` the amplitude, rad, any size; `m` ≤ 1 the parameter k² (a larger one gives
     NaN); `m1` as for `ellipk`. **Returns:** DLMF 19.25.9 or 19.25.10 in Carlson's integrals,
-    whichever has positive terms, after reduction to |φ| ≤ π/2 (DLMF 19.2.10). **Raises:** as
-    `ellipk`.
+    whichever has positive terms, after reduction to |φ| ≤ π/2 (DLMF 19.2.10).
 
     >>> round(float(ellipeinc(1.0, 0.5)), 12)
     0.927329883624
@@ -108,7 +105,7 @@ def ellippiinc(
     **Arguments:** `n` the characteristic with n sin²φ < 1; `phi` the amplitude, rad, any size; `m`
     the parameter k² with m sin²φ < 1 (beyond either bound: NaN); `m1` = 1 − m and `n1` = 1 − n as
     for `ellipk`. The order is Wolfram's and mpmath's. **Returns:** DLMF 19.2.7 as one integral
-    after reduction to |φ| ≤ π/2 (19.2.10). **Raises:** as `ellipk`.
+    after reduction to |φ| ≤ π/2 (19.2.10).
 
     >>> round(float(ellippiinc(0.5, 1.0, 0.5)), 12)
     1.288978174245

@@ -24,8 +24,7 @@ MAX_STEPS = 25
 class PeriodicOrbit(eqx.Module):
     """A periodic orbit: a state on it, and its period.
 
-    **Arguments:** `state` a `Point`; `period` its period, in the scene's unit of time. A container
-    of many orbits has the same leading axes in both.
+    **Arguments:** `state` a `Point`; `period` its period, in the scene's unit of time.
 
     >>> float(PeriodicOrbit(Point([0.9, 0, 0], [0.0, -0.5, 0]), 3.0).period)
     3.0

@@ -103,8 +103,7 @@ def tumble(
     **Arguments:** `body`; `ts` (T,) s; `states` of one body with a leading time axis, with less
     than a quarter turn from one to the next; `seconds` of the film, by default the duration of the
     motion, 20 at most; `fps` pictures a second; `size` px of a side; `title`. **Returns** a `Film`,
-    shown by a notebook; `.save(path)`. **Raises** `ValueError` for a batch, other lengths or
-    numbers that are not positive; `TypeError` for states without an attitude.
+    shown by a notebook; `.save(path)`. **Raises** `ValueError` for numbers that are not positive.
 
     >>> body = rj.shapes.box(1.0, [0.1, 0.2, 0.3])
     >>> sol = rj.simulate(body.inertia, rj.Attitude([1.0, 0, 0, 0], [0, 1, 0.1]), [0.0, 0.5, 1.0])

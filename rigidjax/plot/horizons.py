@@ -32,9 +32,8 @@ def horizons(
     between samples, for a scale of time instead of steps; `measure` `mean_absolute` (of a
     component), `mean_norm` or `rms` (of the vector); `title`; `ax` one for each kind. Both scales
     are linear, since errors start at zero. **Returns** the axes, one for each of position,
-    velocity, attitude, body rate in the state. **Raises** `TypeError` for anything but errors by
-    horizon; `ValueError` for none, for kinds that differ, an unknown measure, a step that is not
-    positive, another number of axes.
+    velocity, attitude, body rate in the state. **Raises** `ValueError` for none, for kinds that
+    differ, a step that is not positive.
 
     >>> t = np.arange(8.0)
     >>> cut = rj.identify.windows(t, rj.Spin(np.ones((8, 3)) * t[:, None]), length=3)

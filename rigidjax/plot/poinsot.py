@@ -19,8 +19,7 @@ def body_axes(states: HasAttitude, *, title: str = "", ax: Any = None) -> Any:
 
     A dot marks the start, a triangle the end; the path behind the sphere is faint. **Arguments:**
     `states` of one body with a leading time axis; `title`; `ax` your 3-D axes; set their view
-    before the call (`view_init`). **Returns** the axes. **Raises** `TypeError` for states without
-    an attitude or flat axes, `ValueError` for a batch.
+    before the call (`view_init`). **Returns** the axes.
 
     >>> sol = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 3.0),
     ...                   rj.Attitude([1.0, 0, 0, 0], [0, 1, 0.1]), [0.0, 1.0, 2.0])
@@ -56,7 +55,7 @@ def polhode(
 
     **Arguments:** `inertia`; `states` of one body with a leading time axis; `energies` the number
     of thin lines; `title`; `ax` your 3-D axes. **Returns** the axes. **Raises** `ValueError` for a
-    body at rest, a zero moment or a batch; `TypeError` for flat axes.
+    body at rest or a zero moment.
 
     >>> body = rj.Inertia.from_principal(1.0, 2.0, 3.0)
     >>> sol = rj.simulate(body, rj.Spin([0.1, 1.0, 0.0]), [0.0, 1.0, 2.0])
@@ -133,8 +132,7 @@ def herpolhode(inertia: Inertia, states: HasAttitude, *, title: str = "", ax: An
     The motion must be free: the part of ω along the momentum is then 2T/h and constant. The circles
     are the least and the largest distance of this motion. **Arguments:** `inertia`; `states`
     (`Attitude`) of one body with a leading time axis; `title`; `ax`. **Returns** the axes.
-    **Raises** `ValueError` for a body at rest, a batch, or a momentum that turned by more than 1e-3
-    rad; `TypeError` for states without an attitude.
+    **Raises** `ValueError` for a body at rest, and a momentum that turned by more than 1e-3 rad.
 
     >>> body = rj.Inertia.from_principal(1.0, 2.0, 3.0)
     >>> sol = rj.simulate(body, rj.Attitude([1.0, 0, 0, 0], [0.1, 1.0, 0.0]), [0.0, 1.0, 2.0])

@@ -22,8 +22,7 @@ def residuals(
     spectrum is a motion or a torque that the model lacks.
 
     **Arguments:** `found` a `rigidjax.identify.Fit`; `index` of the recording; `time_unit` `s`,
-    `min`, `h` or `day`; `title`; `ax` your axes (sensors, 4). **Returns** the axes. **Raises**
-    `ValueError` for an unknown unit, a missing recording, or axes of another shape.
+    `min`, `h` or `day`; `title`; `ax` your axes (sensors, 4). **Returns** the axes.
 
     >>> ts = jnp.linspace(0.0, 10.0, 80)
     >>> motion = rj.simulate(rj.Inertia.from_principal(1.0, 2.0, 2.5), rj.Spin([1, 0.1, 1.0]), ts)

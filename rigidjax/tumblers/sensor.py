@@ -42,8 +42,7 @@ class Brightness(AbstractSensor):
     and difference. A `fit` assumes an ellipsoid; `fit_light_curve` allows for other shapes. Source:
     as `rigidjax.tumblers.brightness`; for tumblers Kaasalainen 2001, A&A 376:302,
     doi:10.1051/0004-6361:20010935. **Raises** `ValueError` for a direction of length zero, a noise
-    or semi-axis that is not positive, a wrong shape, NaN; `TypeError` for arguments of another
-    type.
+    or semi-axis that is not positive.
 
     >>> Brightness([1.0, 0.0, 0.0], [0.0, 1.0, 0.0], noise=0.02, unit="mag").components
     1

@@ -85,8 +85,7 @@ def two_frequencies(
 
     Source: Pravec et al. 2005, Icarus 173:108, doi:10.1016/j.icarus.2004.07.021 (with all |j| and
     |k| up to one order); the linear fit is that of Lomb 1976, doi:10.1007/BF00648343, for many
-    lines. **Raises:** `ValueError` for wrong shapes, times that do not increase, NaN, too few
-    values.
+    lines. **Raises:** `ValueError` for times that do not increase, NaN, too few values.
 
     >>> t = np.linspace(0.0, 60.0, 300)
     >>> y = 1 + np.cos(2 * np.pi * 0.4 * t) + 0.5 * np.cos(2 * np.pi * 0.7 * t + 1.0)

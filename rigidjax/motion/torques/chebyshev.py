@@ -20,9 +20,8 @@ class Chebyshev(eqx.Module):
     the layout of JPL's ephemerides. All may be traced.
 
     A place at any time for `GravityGradient` and `Tide`, without a loss of digits of the table. NaN
-    outside of the intervals. Sum by Clenshaw's recurrence (1955, Mathematical Tables 9:118).
-
-    **Raises:** `ValueError` for a wrong shape, NaN, a step that is not positive.
+    outside of the intervals. **Raises:** `ValueError` for a step that is not positive. Sum by
+    Clenshaw's recurrence (1955, Mathematical Tables 9:118).
 
     >>> Chebyshev(0.0, 2.0, [[[1.0, 0.0, 1.0]]])(2.0)  # 1 + T₂(1)
     Array([2.], dtype=float64)

@@ -87,8 +87,6 @@ class ChangingInertia(eqx.Module):
     Source: Hughes 1986, Spacecraft Attitude Dynamics, ch. 3; the momentum `R I(t) Ω` is conserved
     without τ.
 
-    **Raises:** `TypeError` for anything but a function; `ValueError` for another shape of a value.
-
     >>> grows = ChangingInertia(lambda t: (1.0 + t) * jnp.eye(3))
     >>> body = rj.Inertia(jnp.eye(3))
     >>> rj.simulate(body, rj.Spin([0.0, 0, 1.0]), [0.0, 1.0], grows).ys.omega[-1, 2]
@@ -167,8 +165,6 @@ class Tide(eqx.Module):
     The attitude a time ago is that of a turn at the present body rate. Source: Folkner, Williams,
     Boggs, Park, Kuchynka 2014, The planetary and lunar ephemerides DE430 and DE431, IPN Progress
     Report 42-196, section III.
-
-    **Raises:** `ValueError`, `TypeError` for a wrong shape or dtype.
 
     >>> import rigidjax as rj
     >>> tide, body = Tide(3.0, 0.0, 1.0, [1.0, 0.0, 0.0]), rj.Inertia(4.0 * jnp.eye(3))

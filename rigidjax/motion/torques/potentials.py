@@ -208,8 +208,7 @@ class FromPotential(base.AbstractTorque):
 
     **Arguments:** `potential` a callable Module `q → U`, J, with `q` (4,) unit, body → world. The
     torque about body axis i is `τ_i = −∂U/∂q · ½ q ⊗ e_i`, the derivative along a turn about it.
-    Source: Landau and Lifshitz, Mechanics, §34. **Raises:** `TypeError` for anything but a
-    function, `ValueError` for a U that is not a number.
+    Source: Landau and Lifshitz, Mechanics, §34.
 
     >>> class Spring(eqx.Module):
     ...     k: Array
